@@ -1,0 +1,2 @@
+//! The `flyrig` command.
+fn main() {}

@@ -1,0 +1,116 @@
+//! Typed storage buffers.
+
+use std::marker::PhantomData;
+
+use bytemuck::Pod;
+use wgpu::{Buffer, BufferDescriptor, BufferUsages};
+
+use crate::{GpuContext, GpuError};
+
+/// A GPU array of `T`, usable as storage, copy source and copy target.
+#[derive(Debug)]
+pub struct StorageBuffer<T> {
+    buffer: Buffer,
+    len: usize,
+    element: PhantomData<T>,
+}
+
+impl<T: Pod> StorageBuffer<T> {
+    /// `len` zeroed elements (room for at least one, since empty buffers cannot be bound).
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`] when the adapter cannot bind that many.
+    pub fn zeroed(gpu: &GpuContext, label: &str, len: usize) -> Result<Self, GpuError> {
+        let needed = (len.max(1) as u64 * size_of::<T>() as u64).next_multiple_of(16);
+        let limits = gpu.device.limits();
+        let limit = limits.max_buffer_size.min(limits.max_storage_buffer_binding_size);
+        if needed > limit {
+            return Err(GpuError::TooLarge { what: label.to_owned(), needed, limit });
+        }
+        let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST | BufferUsages::INDIRECT;
+        let buffer = gpu.device.create_buffer(&BufferDescriptor {
+            label: Some(label),
+            size: needed,
+            usage,
+            mapped_at_creation: false,
+        });
+        Ok(Self { buffer, len, element: PhantomData })
+    }
+
+    /// A buffer with the given content.
+    ///
+    /// # Errors
+    /// As [`Self::zeroed`].
+    pub fn from_slice(gpu: &GpuContext, label: &str, content: &[T]) -> Result<Self, GpuError> {
+        let buffer = Self::zeroed(gpu, label, content.len())?;
+        buffer.write(gpu, content);
+        Ok(buffer)
+    }
+
+    /// Queues a copy of the first elements (extra ones are ignored).
+    pub fn write(&self, gpu: &GpuContext, content: &[T]) {
+        let count = content.len().min(self.len);
+        if count > 0 {
+            gpu.queue.write_buffer(&self.buffer, 0, bytemuck::cast_slice(&content[..count]));
+        }
+    }
+
+    /// Elements.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// wgpu's buffer.
+    #[must_use]
+    pub fn raw(&self) -> &Buffer {
+        &self.buffer
+    }
+
+    /// Waits for the GPU and copies the elements out. For tests, exports and published pictures.
+    ///
+    /// # Errors
+    /// [`GpuError::Lost`].
+    pub fn read(&self, gpu: &GpuContext) -> Result<Vec<T>, GpuError> {
+        read_back(gpu, &self.buffer, self.len)
+    }
+}
+
+/// Waits for the GPU and copies the first `len` elements of `buffer` (needs `COPY_SRC`).
+///
+/// # Errors
+/// [`GpuError::Lost`].
+pub fn read_back<T: Pod>(gpu: &GpuContext, buffer: &Buffer, len: usize) -> Result<Vec<T>, GpuError> {
+    if len == 0 {
+        return Ok(Vec::new());
+    }
+    let bytes = len as u64 * size_of::<T>() as u64;
+    let size = bytes.next_multiple_of(wgpu::COPY_BUFFER_ALIGNMENT);
+    let staging = gpu.device.create_buffer(&BufferDescriptor {
+        label: Some("read back"),
+        size,
+        usage: BufferUsages::MAP_READ | BufferUsages::COPY_DST,
+        mapped_at_creation: false,
+    });
+    let mut encoder = gpu.device.create_command_encoder(&Default::default());
+    encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, size);
+    gpu.queue.submit([encoder.finish()]);
+    let (sender, receiver) = std::sync::mpsc::sync_channel(1);
+    staging.map_async(wgpu::MapMode::Read, .., move |result| {
+        let _ = sender.try_send(result);
+    });
+    gpu.wait()?;
+    match receiver.try_recv() {
+        Ok(Ok(())) => {}
+        Ok(Err(error)) => return Err(GpuError::Lost(error.to_string())),
+        Err(_) => return Err(GpuError::Lost("a buffer was not mapped after the wait".to_owned())),
+    }
+    let view = staging.get_mapped_range(..bytes).map_err(|error| GpuError::Lost(error.to_string()))?;
+    Ok(bytemuck::pod_collect_to_vec(&view[..]))
+}

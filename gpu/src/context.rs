@@ -1,0 +1,171 @@
+//! Finding an adapter and opening a device.
+
+use wgpu::{Adapter, AdapterInfo, Backends, Device, DeviceType, Features, Instance, InstanceDescriptor, Queue};
+
+/// Which adapter to open.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum AdapterChoice {
+    /// The fastest kind there is: discrete, integrated, virtual, then software.
+    #[default]
+    Best,
+    /// The first whose name contains this text, ignoring case.
+    Named(String),
+}
+
+/// Why there is no GPU to work with, or what it refused.
+#[derive(Debug, thiserror::Error)]
+pub enum GpuError {
+    /// No adapter at all.
+    #[error(
+        "no graphics adapter found. Install a Vulkan driver: the GPU maker's, or Mesa's software one with \
+         `apt-get install mesa-vulkan-drivers libvulkan1`, then try again"
+    )]
+    NoAdapter,
+    /// None of that name.
+    #[error("no graphics adapter has '{wanted}' in its name; there are: {found}")]
+    NoSuchAdapter {
+        /// The name asked for.
+        wanted: String,
+        /// Names found, comma separated.
+        found: String,
+    },
+    /// The adapter cannot do what we need.
+    #[error(
+        "adapter {adapter}: {limit} is {found}, flyrig needs {needed}; choose another adapter or update its driver"
+    )]
+    Limit {
+        /// Which adapter.
+        adapter: String,
+        /// Which limit.
+        limit: &'static str,
+        /// What it offers.
+        found: u64,
+        /// What we need.
+        needed: u64,
+    },
+    /// The driver did not open the device.
+    #[error("adapter {adapter} did not open: {source}")]
+    Open {
+        /// Which adapter.
+        adapter: String,
+        /// The driver's word.
+        source: wgpu::RequestDeviceError,
+    },
+    /// Too large for one buffer.
+    #[error(
+        "{what} needs {needed} bytes, more than the {limit} bytes one buffer may have on this adapter; use fewer Gaussians, pixels or views"
+    )]
+    TooLarge {
+        /// What was to be stored.
+        what: String,
+        /// Bytes.
+        needed: u64,
+        /// Bytes.
+        limit: u64,
+    },
+    /// Device lost or a wait failed.
+    #[error(
+        "the graphics device stopped answering ({0}); restart flyrig, and check the driver's log when it happens again"
+    )]
+    Lost(String),
+}
+
+/// An open device with its queue. Clones share both.
+#[derive(Debug, Clone)]
+pub struct GpuContext {
+    /// wgpu's device.
+    pub device: Device,
+    /// wgpu's queue.
+    pub queue: Queue,
+    adapter: AdapterInfo,
+}
+
+impl GpuContext {
+    /// Opens the chosen adapter.
+    ///
+    /// # Errors
+    /// [`GpuError`] says what is missing and what to install.
+    pub fn new(choice: &AdapterChoice) -> Result<Self, GpuError> {
+        pollster::block_on(Self::open(choice))
+    }
+
+    async fn open(choice: &AdapterChoice) -> Result<Self, GpuError> {
+        let instance = Instance::new(InstanceDescriptor {
+            backends: Backends::VULKAN | Backends::METAL | Backends::DX12,
+            ..InstanceDescriptor::new_without_display_handle()
+        });
+        let mut adapters = instance.enumerate_adapters(Backends::all()).await;
+        if adapters.is_empty() {
+            return Err(GpuError::NoAdapter);
+        }
+        adapters.sort_by_key(|adapter| rank(adapter.get_info().device_type));
+        let adapter = match choice {
+            AdapterChoice::Best => adapters.swap_remove(0),
+            AdapterChoice::Named(wanted) => {
+                let name = |adapter: &Adapter| adapter.get_info().name;
+                let lower = wanted.to_lowercase();
+                match adapters.iter().position(|adapter| name(adapter).to_lowercase().contains(&lower)) {
+                    Some(index) => adapters.swap_remove(index),
+                    None => {
+                        let found = adapters.iter().map(name).collect::<Vec<_>>().join(", ");
+                        return Err(GpuError::NoSuchAdapter { wanted: wanted.clone(), found });
+                    }
+                }
+            }
+        };
+        let info = adapter.get_info();
+        let limits = adapter.limits();
+        let check = |limit, found: u64, needed: u64| {
+            if found >= needed {
+                Ok(())
+            } else {
+                Err(GpuError::Limit { adapter: info.name.clone(), limit, found, needed })
+            }
+        };
+        check("max_storage_buffers_per_shader_stage", limits.max_storage_buffers_per_shader_stage.into(), 12)?;
+        check("max_compute_invocations_per_workgroup", limits.max_compute_invocations_per_workgroup.into(), 256)?;
+        let wanted = Features::TIMESTAMP_QUERY;
+        let (device, queue) = adapter
+            .request_device(&wgpu::DeviceDescriptor {
+                label: Some("flyrig"),
+                required_features: adapter.features() & wanted,
+                required_limits: limits,
+                ..Default::default()
+            })
+            .await
+            .map_err(|source| GpuError::Open { adapter: info.name.clone(), source })?;
+        tracing::debug!(adapter = %info.name, backend = %info.backend, driver = %info.driver_info, "graphics adapter");
+        Ok(Self { device, queue, adapter: info })
+    }
+
+    /// Name, backend and driver of the adapter, for reports.
+    #[must_use]
+    pub fn adapter_name(&self) -> String {
+        format!("{} ({}, {})", self.adapter.name, self.adapter.backend, self.adapter.driver_info)
+    }
+
+    /// Whether the adapter is a CPU in disguise.
+    #[must_use]
+    pub fn is_software(&self) -> bool {
+        self.adapter.device_type == DeviceType::Cpu
+    }
+
+    /// Waits until all submitted work is done.
+    ///
+    /// # Errors
+    /// [`GpuError::Lost`].
+    pub fn wait(&self) -> Result<(), GpuError> {
+        self.device.poll(wgpu::PollType::wait_indefinitely()).map_err(|error| GpuError::Lost(error.to_string()))?;
+        Ok(())
+    }
+}
+
+fn rank(kind: DeviceType) -> u8 {
+    match kind {
+        DeviceType::DiscreteGpu => 0,
+        DeviceType::IntegratedGpu => 1,
+        DeviceType::VirtualGpu => 2,
+        DeviceType::Other => 3,
+        DeviceType::Cpu => 4,
+    }
+}

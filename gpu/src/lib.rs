@@ -1,0 +1,14 @@
+//! The GPU as flyrig sees it: one device and queue, errors with advice, typed buffers, the camera
+//! model in WGSL and stage timers. Any wgpu adapter will do, Mesa's software rasteriser included.
+
+mod buffer;
+mod camera;
+mod context;
+mod shader;
+mod timer;
+
+pub use buffer::{StorageBuffer, read_back};
+pub use camera::{CAMERA_WGSL, CameraUniform};
+pub use context::{AdapterChoice, GpuContext, GpuError};
+pub use shader::{ComputeKernel, MAX_WORKGROUPS_PER_DIMENSION, bind, dispatch_1d};
+pub use timer::{GpuTimer, StageTime};

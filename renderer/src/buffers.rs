@@ -1,0 +1,69 @@
+//! What the renderer's stages hand to each other on the GPU.
+
+use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
+
+/// The posed, coloured Gaussians of one instant; one element a Gaussian in every buffer.
+#[derive(Debug)]
+pub struct GaussianBuffers {
+    /// World position, metres; w: standard deviation of the isotropic Gaussian, metres.
+    pub center_scale: StorageBuffer<[f32; 4]>,
+    /// World unit normal of the surface; w unused.
+    pub normal: StorageBuffer<[f32; 4]>,
+    /// Linear RGB; w: opacity in 0..=1.
+    pub color: StorageBuffer<[f32; 4]>,
+    /// Canonical position, metres; w unused. Constant over time.
+    pub canonical: StorageBuffer<[f32; 4]>,
+}
+
+impl GaussianBuffers {
+    /// Room for `count` Gaussians, all zero.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn zeroed(gpu: &GpuContext, count: usize) -> Result<Self, GpuError> {
+        Ok(Self {
+            center_scale: StorageBuffer::zeroed(gpu, "Gaussian centres", count)?,
+            normal: StorageBuffer::zeroed(gpu, "Gaussian normals", count)?,
+            color: StorageBuffer::zeroed(gpu, "Gaussian colours", count)?,
+            canonical: StorageBuffer::zeroed(gpu, "Gaussian canonical positions", count)?,
+        })
+    }
+
+    /// Number of Gaussians.
+    #[must_use]
+    pub fn count(&self) -> usize {
+        self.center_scale.len()
+    }
+}
+
+/// Pictures of one view, row by row, one element a pixel.
+#[derive(Debug)]
+pub struct RenderTarget {
+    /// Pixels.
+    pub width: u32,
+    /// Pixels.
+    pub height: u32,
+    /// Linear RGB times alpha; w: alpha (coverage).
+    pub color: StorageBuffer<[f32; 4]>,
+    /// Mean camera-space z of what is seen, metres; 0 where alpha is 0.
+    pub depth: StorageBuffer<f32>,
+    /// Canonical position times alpha, metres; w: alpha.
+    pub canonical: StorageBuffer<[f32; 4]>,
+}
+
+impl RenderTarget {
+    /// Pictures of `width` x `height` pixels, all zero.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn new(gpu: &GpuContext, width: u32, height: u32) -> Result<Self, GpuError> {
+        let pixels = width as usize * height as usize;
+        Ok(Self {
+            width,
+            height,
+            color: StorageBuffer::zeroed(gpu, "rendered colour", pixels)?,
+            depth: StorageBuffer::zeroed(gpu, "rendered depth", pixels)?,
+            canonical: StorageBuffer::zeroed(gpu, "rendered canonical positions", pixels)?,
+        })
+    }
+}
