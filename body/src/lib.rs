@@ -1,0 +1,34 @@
+//! The human template: a skinned mesh with a skeleton, the surface Gaussians and the deformation
+//! graph that hang on it, linear blend skinning, and the importers that bring bodies and motion in.
+//!
+//! # Conventions
+//!
+//! - **Canonical space** is the bind pose of the mesh in metres, glTF axes: y up, the body faces +z,
+//!   its left hand points to +x. The built-in body stands on y = 0.
+//! - **Skinning matrices** are `world_from_canonical`, one a joint: `world_from_joint * joint_from_canonical`.
+//! - **World** of a pose track is that of its source: y up for glTF, z up for BVH.
+
+mod bvh;
+mod default_body;
+mod error;
+mod gltf_import;
+mod gpu_skinner;
+mod graph;
+mod retarget;
+mod shape;
+mod skeleton;
+mod skinning;
+mod surface;
+mod template;
+
+pub use bvh::{BvhClip, BvhJoint, load_bvh, parse_bvh};
+pub use default_body::{default_skeleton_names, default_template, target_names};
+pub use error::BodyError;
+pub use gltf_import::{GltfHuman, load_gltf};
+pub use gpu_skinner::GpuSkinner;
+pub use graph::{DEFAULT_NODE_COUNT, DEFAULT_SIGMA2_M2, DeformationGraph, build_graph};
+pub use shape::ShapeParams;
+pub use skeleton::{Joint, Skeleton};
+pub use skinning::{skin_mesh, skin_normal_f64, skin_point_f64};
+pub use surface::{DEFAULT_GAUSSIAN_COUNT, SurfaceGaussians, sample_surface};
+pub use template::{Part, SkinWeights, Template};

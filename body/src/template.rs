@@ -1,0 +1,76 @@
+//! A body at rest: mesh, skin and skeleton.
+
+use glam::{Vec2, Vec3};
+
+use crate::Skeleton;
+
+/// Which joints move a point, the strongest four; the weights add up to 1.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct SkinWeights {
+    /// Joint indices; 0 where the weight is 0.
+    pub joints: [u16; 4],
+    /// Weights in falling order.
+    pub weights: [f32; 4],
+}
+
+/// Coarse part of the body, from the joint that moves a point most.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Part {
+    /// Head and neck.
+    Head,
+    /// Chest, belly, hips.
+    Torso,
+    /// Left shoulder to wrist.
+    LeftArm,
+    /// Right shoulder to wrist.
+    RightArm,
+    /// Left hand and fingers.
+    LeftHand,
+    /// Right hand and fingers.
+    RightHand,
+    /// Left thigh and shank.
+    LeftLeg,
+    /// Right thigh and shank.
+    RightLeg,
+    /// Left foot.
+    LeftFoot,
+    /// Right foot.
+    RightFoot,
+}
+
+/// A skinned human at rest. All vertex lists have the same length; vertices may be split at UV seams
+/// (see [`Template::welded`]).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Template {
+    /// Name for messages.
+    pub name: String,
+    /// Canonical positions (bind pose), metres, y up, facing +z.
+    pub positions: Vec<Vec3>,
+    /// Canonical unit normals.
+    pub normals: Vec<Vec3>,
+    /// Texture coordinates, v down as in glTF; zero where the source had none.
+    pub uvs: Vec<Vec2>,
+    /// Vertex indices, counter-clockwise seen from outside.
+    pub triangles: Vec<[u32; 3]>,
+    /// Per vertex.
+    pub skin: Vec<SkinWeights>,
+    /// Per vertex.
+    pub parts: Vec<Part>,
+    /// The joints that the skin speaks of.
+    pub skeleton: Skeleton,
+}
+
+impl Template {
+    /// Maps each vertex to its position class: vertices split at UV seams share one.
+    #[must_use]
+    pub fn welded(&self) -> Vec<u32> {
+        let mut classes = std::collections::HashMap::new();
+        self.positions
+            .iter()
+            .map(|p| {
+                let next = classes.len() as u32;
+                *classes.entry(p.to_array().map(f32::to_bits)).or_insert(next)
+            })
+            .collect()
+    }
+}
