@@ -1,0 +1,7 @@
+//! Splats to pictures and back: forward rasteriser, direct appearance, image metrics, splat export.
+
+mod buffers;
+mod raster;
+
+pub use buffers::{GaussianBuffers, RenderTarget};
+pub use raster::{Outputs, RasterSettings, Rasterizer};
