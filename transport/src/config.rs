@@ -1,0 +1,146 @@
+//! Settings of a session.
+
+use serde::{Deserialize, Serialize};
+use zenoh::Config;
+
+use crate::{keys, view::MAX_IMAGE_BYTES, TransportError};
+
+/// Where a rig is found and how its sessions behave; one structure for both sides.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields, rename_all = "kebab-case")]
+pub struct TransportConfig {
+    /// Name of the rig, part of every key: 1 to 64 of `A-Z a-z 0-9 _ . -`.
+    pub rig: String,
+    /// zenoh endpoints to listen on, such as `tcp/127.0.0.1:7447`; port 0 takes a free one.
+    /// There is no access control: listen on other addresses only inside a trusted network.
+    pub listen: Vec<String>,
+    /// zenoh endpoints to connect to: publishers or routers; tried again until they answer.
+    pub connect: Vec<String>,
+    /// Find each other by UDP multicast on the local network.
+    pub multicast: bool,
+    /// Pass large payloads through shared memory between processes of one host.
+    pub shared_memory: bool,
+    /// Send each message at once instead of waiting for others to fill a batch.
+    pub express: bool,
+    /// Publisher: how many subscribers may have a viewpoint of their own.
+    pub max_viewers: usize,
+    /// Publisher: how long a viewpoint lives without being renewed, milliseconds.
+    pub viewpoint_lease_millis: u64,
+}
+
+/// Endpoint where a publisher listens unless told otherwise.
+const DEFAULT_ENDPOINT: &str = "tcp/127.0.0.1:7447";
+
+impl Default for TransportConfig {
+    fn default() -> Self {
+        Self {
+            rig: "rig".to_owned(),
+            listen: vec![],
+            connect: vec![],
+            multicast: false,
+            shared_memory: true,
+            express: true,
+            max_viewers: 4,
+            viewpoint_lease_millis: 3000,
+        }
+    }
+}
+
+impl TransportConfig {
+    /// A publisher that listens on loopback, zenoh's usual port.
+    #[must_use]
+    pub fn publisher(rig: &str) -> Self {
+        Self { rig: rig.to_owned(), listen: vec![DEFAULT_ENDPOINT.to_owned()], ..Self::default() }
+    }
+
+    /// A subscriber that connects to a publisher on this host.
+    #[must_use]
+    pub fn subscriber(rig: &str) -> Self {
+        Self { rig: rig.to_owned(), connect: vec![DEFAULT_ENDPOINT.to_owned()], ..Self::default() }
+    }
+
+    /// Checks names, endpoints and limits.
+    ///
+    /// # Errors
+    /// Names the setting.
+    pub fn validate(&self) -> Result<(), TransportError> {
+        keys::check_name("rig", &self.rig)?;
+        if self.listen.is_empty() && self.connect.is_empty() && !self.multicast {
+            return Err(TransportError::config(
+                "listen, connect",
+                "a session without endpoints and without multicast meets nobody; give one, such as tcp/127.0.0.1:7447",
+            ));
+        }
+        for endpoint in self.listen.iter().chain(&self.connect) {
+            if !endpoint.starts_with("tcp/") {
+                return Err(TransportError::config(
+                    format!("endpoint {endpoint:?}"),
+                    "only TCP is built in; write tcp/HOST:PORT",
+                ));
+            }
+        }
+        if !(100..=600_000).contains(&self.viewpoint_lease_millis) {
+            return Err(TransportError::config(
+                "viewpoint-lease-millis",
+                format!("is {}, expected 100 to 600000", self.viewpoint_lease_millis),
+            ));
+        }
+        if self.max_viewers > 64 {
+            return Err(TransportError::config("max-viewers", format!("is {}, at most 64", self.max_viewers)));
+        }
+        Ok(())
+    }
+
+    /// The zenoh configuration that this means.
+    pub(crate) fn zenoh(&self, listen: &[String]) -> Result<Config, TransportError> {
+        let list = |endpoints: &[String]| serde_json::json!(endpoints).to_string();
+        // Twice the largest picture is room for every message that we make.
+        let largest = (2 * MAX_IMAGE_BYTES).max(crate::splats::MAX_BYTES);
+        let settings = [
+            ("mode", "\"peer\"".to_owned()),
+            ("listen/endpoints", list(listen)),
+            ("connect/endpoints", list(&self.connect)),
+            ("connect/timeout_ms", "-1".to_owned()),
+            ("connect/exit_on_failure", "false".to_owned()),
+            (
+                "connect/retry",
+                r#"{"period_init_ms":100,"period_max_ms":1000,"period_increase_factor":2}"#.to_owned(),
+            ),
+            ("scouting/multicast/enabled", self.multicast.to_string()),
+            // Gossip would connect the viewers of one rig to each other for nothing.
+            ("scouting/gossip/enabled", self.multicast.to_string()),
+            ("transport/shared_memory/enabled", self.shared_memory.to_string()),
+            ("transport/link/rx/max_message_size", largest.to_string()),
+        ];
+        let mut config = Config::default();
+        for (key, value) in settings {
+            config.insert_json5(key, &value).map_err(|error| TransportError::config(key, error.to_string()))?;
+        }
+        Ok(config)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_setting_is_known_to_zenoh() {
+        for config in [TransportConfig::publisher("a"), TransportConfig::subscriber("a")] {
+            config.validate().unwrap();
+            config.zenoh(&config.listen).unwrap();
+        }
+    }
+
+    #[test]
+    fn bad_settings_are_named() {
+        let good = TransportConfig::publisher("a");
+        let refused = |config: TransportConfig| config.validate().unwrap_err().to_string();
+        assert!(refused(TransportConfig { rig: "a/**".into(), ..good.clone() }).contains("a/**"));
+        assert!(refused(TransportConfig { rig: String::new(), ..good.clone() }).contains("rig"));
+        assert!(refused(TransportConfig { listen: vec!["udp/1.2.3.4:5".into()], ..good.clone() }).contains("udp/"));
+        assert!(refused(TransportConfig::default()).contains("meets nobody"));
+        assert!(refused(TransportConfig { viewpoint_lease_millis: 0, ..good.clone() }).contains("lease"));
+        assert!(refused(TransportConfig { max_viewers: 1000, ..good }).contains("max-viewers"));
+    }
+}

@@ -1,0 +1,55 @@
+//! What can go wrong on the wire.
+
+/// Sort of a [`TransportError`], for those who decide what to do next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum TransportErrorKind {
+    /// A setting, name or request of our own side is not usable.
+    Config,
+    /// The zenoh session failed.
+    Session,
+    /// The other side speaks a schema version that we do not know.
+    UnknownVersion,
+    /// A message cannot be what it claims to be.
+    Malformed,
+    /// The session is closed.
+    Closed,
+}
+
+/// An error that names the thing and the mend.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{topic}: {message}")]
+pub struct TransportError {
+    /// Sort.
+    pub kind: TransportErrorKind,
+    /// Key, setting or message part that is meant.
+    pub topic: String,
+    /// What is wrong and what helps.
+    pub message: String,
+}
+
+impl TransportError {
+    pub(crate) fn new(kind: TransportErrorKind, topic: impl Into<String>, message: impl Into<String>) -> Self {
+        Self { kind, topic: topic.into(), message: message.into() }
+    }
+
+    pub(crate) fn config(topic: impl Into<String>, message: impl Into<String>) -> Self {
+        Self::new(TransportErrorKind::Config, topic, message)
+    }
+
+    pub(crate) fn malformed(topic: impl Into<String>, message: impl Into<String>) -> Self {
+        Self::new(TransportErrorKind::Malformed, topic, message)
+    }
+
+    pub(crate) fn session(topic: impl Into<String>, cause: &impl std::fmt::Display) -> Self {
+        Self::new(TransportErrorKind::Session, topic, cause.to_string())
+    }
+
+    pub(crate) fn version(topic: impl Into<String>, found: impl std::fmt::Display) -> Self {
+        let ours = crate::SCHEMA_VERSION;
+        Self::new(
+            TransportErrorKind::UnknownVersion,
+            topic,
+            format!("speaks schema version {found}, this program knows version {ours}; run the same flyrig on both sides"),
+        )
+    }
+}

@@ -1,0 +1,201 @@
+//! What every message carries beside its payload, as the zenoh attachment.
+
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use crate::TransportError;
+
+/// Version of keys, headers and payloads; raised by any change that an older program would misread.
+pub const SCHEMA_VERSION: u16 = 1;
+
+/// Bytes of an encoded [`Header`].
+pub const HEADER_BYTES: usize = 64;
+
+const MAGIC: [u8; 4] = *b"FLYR";
+
+/// Which payload a message has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MessageKind {
+    /// foxglove `CompressedImage`.
+    View,
+    /// [`crate::SplatState`].
+    Splats,
+    /// foxglove `CameraCalibration`.
+    Calibration,
+    /// foxglove `FrameTransforms`.
+    Transforms,
+    /// [`crate::RigStats`].
+    Stats,
+}
+
+impl MessageKind {
+    const ALL: [Self; 5] = [Self::View, Self::Splats, Self::Calibration, Self::Transforms, Self::Stats];
+
+    fn code(self) -> u8 {
+        match self {
+            Self::View => 1,
+            Self::Splats => 2,
+            Self::Calibration => 3,
+            Self::Transforms => 4,
+            Self::Stats => 5,
+        }
+    }
+}
+
+/// Fixed little-endian layout of 64 bytes: magic `FLYR`, version u16, kind u8, 0, then the fields in
+/// their order here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Header {
+    /// Which payload follows.
+    pub kind: MessageKind,
+    /// Counts the messages of this topic from 0; a gap is a loss on the way (or a newer one won).
+    pub sequence: u64,
+    /// The rig's frame number.
+    pub frame: u64,
+    /// `CLOCK_MONOTONIC` of the capturing host.
+    pub capture_nanos: i64,
+    /// Wall clock of the publisher when the message was handed to it, since 1970.
+    pub publish_unix_nanos: i64,
+    /// Tells hosts (and their restarts) apart: only within one host is the latency exact. 0 when unknown.
+    pub host: u64,
+    /// Tells publishers (and their restarts) apart.
+    pub publisher: u64,
+    /// Pixels of a view, else 0.
+    pub width: u32,
+    /// Pixels of a view, else 0.
+    pub height: u32,
+}
+
+impl Header {
+    /// As on the wire.
+    #[must_use]
+    pub fn encode(&self) -> [u8; HEADER_BYTES] {
+        let mut bytes = [0; HEADER_BYTES];
+        bytes[..4].copy_from_slice(&MAGIC);
+        bytes[4..6].copy_from_slice(&SCHEMA_VERSION.to_le_bytes());
+        bytes[6] = self.kind.code();
+        let words = [
+            self.sequence.to_le_bytes(),
+            self.frame.to_le_bytes(),
+            self.capture_nanos.to_le_bytes(),
+            self.publish_unix_nanos.to_le_bytes(),
+            self.host.to_le_bytes(),
+            self.publisher.to_le_bytes(),
+        ];
+        for (at, word) in bytes[8..56].chunks_exact_mut(8).zip(words) {
+            at.copy_from_slice(&word);
+        }
+        bytes[56..60].copy_from_slice(&self.width.to_le_bytes());
+        bytes[60..].copy_from_slice(&self.height.to_le_bytes());
+        bytes
+    }
+
+    /// From the wire.
+    ///
+    /// # Errors
+    /// `UnknownVersion` for another schema version, else `Malformed`; `topic` stands in the text.
+    pub fn decode(topic: &str, bytes: &[u8]) -> Result<Self, TransportError> {
+        let malformed = |message: String| TransportError::malformed(topic, message);
+        let mut reader = Reader(bytes);
+        if reader.take::<4>() != Some(MAGIC) {
+            return Err(malformed("the message has no flyrig header; something else publishes on this key".to_owned()));
+        }
+        // The version comes before any other check: the rest may have another form.
+        let version = reader.take().map(u16::from_le_bytes);
+        if version.is_some_and(|version| version != SCHEMA_VERSION) {
+            return Err(TransportError::version(topic, version.unwrap_or_default()));
+        }
+        if bytes.len() != HEADER_BYTES {
+            return Err(malformed(format!("header of {} bytes, expected {HEADER_BYTES}", bytes.len())));
+        }
+        let short = || malformed("the header is cut short".to_owned());
+        let [code, _reserved] = reader.take::<2>().ok_or_else(short)?;
+        let kind = MessageKind::ALL.into_iter().find(|kind| kind.code() == code);
+        let mut word = || reader.take::<8>().ok_or_else(short);
+        Ok(Self {
+            kind: kind.ok_or_else(|| malformed(format!("message kind {code} is not known")))?,
+            sequence: u64::from_le_bytes(word()?),
+            frame: u64::from_le_bytes(word()?),
+            capture_nanos: i64::from_le_bytes(word()?),
+            publish_unix_nanos: i64::from_le_bytes(word()?),
+            host: u64::from_le_bytes(word()?),
+            publisher: u64::from_le_bytes(word()?),
+            width: u32::from_le_bytes(reader.take().ok_or_else(short)?),
+            height: u32::from_le_bytes(reader.take().ok_or_else(short)?),
+        })
+    }
+}
+
+/// Takes fixed-size pieces off a byte slice.
+pub(crate) struct Reader<'a>(pub &'a [u8]);
+
+impl Reader<'_> {
+    pub(crate) fn take<const N: usize>(&mut self) -> Option<[u8; N]> {
+        let (piece, rest) = self.0.split_first_chunk::<N>()?;
+        self.0 = rest;
+        Some(*piece)
+    }
+}
+
+/// Wall clock, nanoseconds since 1970.
+pub(crate) fn unix_nanos() -> i64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
+}
+
+/// A number for this host since its last boot; 0 where the system does not tell.
+pub(crate) fn host_id() -> u64 {
+    std::fs::read("/proc/sys/kernel/random/boot_id").map_or(0, |id| fnv1a(&id))
+}
+
+/// FNV-1a, 64 bits: short, the same on every machine, not for security.
+pub(crate) fn fnv1a(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &b| (hash ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::TransportErrorKind;
+
+    fn header() -> Header {
+        Header {
+            kind: MessageKind::Splats,
+            sequence: u64::MAX,
+            frame: 7,
+            capture_nanos: -5,
+            publish_unix_nanos: unix_nanos(),
+            host: host_id(),
+            publisher: 3,
+            width: 640,
+            height: u32::MAX,
+        }
+    }
+
+    #[test]
+    fn a_header_survives_the_wire() {
+        assert_eq!(Header::decode("x", &header().encode()).unwrap(), header());
+    }
+
+    #[test]
+    fn another_version_is_named_whatever_its_length() {
+        let mut bytes = header().encode().to_vec();
+        bytes[4] = 9;
+        for end in [6, 20, HEADER_BYTES] {
+            let error = Header::decode("flyrig/v1/a/splats", &bytes[..end]).unwrap_err();
+            assert_eq!(error.kind, TransportErrorKind::UnknownVersion);
+            assert!(error.to_string().contains("schema version 9, this program knows version 1"), "{error}");
+        }
+    }
+
+    #[test]
+    fn cut_long_and_foreign_headers_are_refused() {
+        let good = header().encode();
+        for end in 0..HEADER_BYTES {
+            assert_eq!(Header::decode("x", &good[..end]).unwrap_err().kind, TransportErrorKind::Malformed);
+        }
+        assert!(Header::decode("x", &[good.as_slice(), &[0]].concat()).is_err());
+        let mut kind = good;
+        kind[6] = 200;
+        assert!(Header::decode("x", &kind).unwrap_err().message.contains("kind 200"));
+    }
+}

@@ -1,0 +1,77 @@
+//! The key space.
+
+use crate::{TransportError, SCHEMA_VERSION};
+
+/// Views of this name's beginning belong to one subscriber.
+pub(crate) const VIEWER_PREFIX: &str = "viewer-";
+
+/// Largest length of a name in a key, bytes.
+const MAX_NAME: usize = 64;
+
+/// Whether a name can stand in a key.
+pub(crate) fn check_name(what: &str, name: &str) -> Result<(), TransportError> {
+    let good = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'_' | b'.' | b'-');
+    if (1..=MAX_NAME).contains(&name.len()) && name.bytes().all(good) {
+        return Ok(());
+    }
+    Err(TransportError::config(
+        format!("{what} name {name:?}"),
+        format!("use 1 to {MAX_NAME} of the characters A-Z a-z 0-9 _ . -"),
+    ))
+}
+
+/// `flyrig/v1/<rig>/<rest>`.
+pub(crate) fn key(rig: &str, rest: &str) -> String {
+    format!("flyrig/v{SCHEMA_VERSION}/{rig}/{rest}")
+}
+
+/// Where a view's pictures go.
+pub(crate) fn view(rig: &str, name: &str) -> String {
+    match name.strip_prefix(VIEWER_PREFIX) {
+        Some(subscriber) => key(rig, &format!("viewer/{subscriber}/view")),
+        None => key(rig, &format!("view/{name}")),
+    }
+}
+
+/// Liveliness of publishers of any schema version.
+pub(crate) fn any_version_alive(rig: &str) -> String {
+    format!("flyrig/*/{rig}/alive/*")
+}
+
+/// The part of a key that `*` stands for in `<before>/*<after>`.
+pub(crate) fn name_in<'a>(key: &'a str, before: &str, after: &str) -> Option<&'a str> {
+    let rest = key.strip_prefix("flyrig/")?;
+    let (_version, rest) = rest.split_once('/')?;
+    let (_rig, rest) = rest.split_once('/')?;
+    let name = rest.strip_prefix(before)?.strip_prefix('/')?.strip_suffix(after)?;
+    (!name.is_empty() && !name.contains('/')).then_some(name)
+}
+
+/// The version that a key states, as it is written.
+pub(crate) fn version_in(key: &str) -> Option<&str> {
+    key.strip_prefix("flyrig/")?.split('/').next()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_come_back_out_of_keys() {
+        assert_eq!(view("studio", "front"), "flyrig/v1/studio/view/front");
+        assert_eq!(view("studio", "viewer-ab12"), "flyrig/v1/studio/viewer/ab12/view");
+        assert_eq!(name_in("flyrig/v1/studio/view/front", "view", ""), Some("front"));
+        assert_eq!(name_in("flyrig/v1/studio/viewer/ab12/alive", "viewer", "/alive"), Some("ab12"));
+        assert_eq!(name_in("flyrig/v1/studio/viewer/ab12/view", "viewer", "/alive"), None);
+        assert_eq!(name_in("flyrig/v1", "view", ""), None);
+        assert_eq!(version_in("flyrig/v7/studio/alive/x"), Some("v7"));
+    }
+
+    #[test]
+    fn wild_or_endless_names_are_refused() {
+        for bad in ["", "*", "a/b", "a$b", "é", "a b", &"x".repeat(65)] {
+            assert!(check_name("view", bad).is_err(), "{bad}");
+        }
+        check_name("view", &"x".repeat(64)).unwrap();
+    }
+}

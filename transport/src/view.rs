@@ -1,0 +1,120 @@
+//! Pictures on the wire: foxglove `CompressedImage`.
+
+use foxglove::{
+    messages::{CompressedImage, Timestamp},
+    Decode, Encode,
+};
+use prost::bytes::Bytes;
+
+use crate::TransportError;
+
+/// Largest compressed picture, bytes.
+pub const MAX_IMAGE_BYTES: usize = 32 << 20;
+
+/// How a picture is compressed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ImageFormat {
+    /// JPEG.
+    Jpeg,
+    /// PNG.
+    Png,
+}
+
+impl ImageFormat {
+    /// foxglove's word for it.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Jpeg => "jpeg",
+            Self::Png => "png",
+        }
+    }
+
+    fn from_name(name: &str) -> Option<Self> {
+        [Self::Jpeg, Self::Png].into_iter().find(|format| format.name() == name)
+    }
+}
+
+/// A compressed picture of a view; the caller compresses and decompresses.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ViewFrame {
+    /// Pixels.
+    pub width: u32,
+    /// Pixels.
+    pub height: u32,
+    /// What `bytes` are.
+    pub format: ImageFormat,
+    /// The compressed picture; `Bytes::from(vec)` takes a `Vec<u8>` without copying.
+    pub bytes: Bytes,
+    /// The rig's frame number.
+    pub frame: u64,
+    /// Capture time of the frame set it shows, `CLOCK_MONOTONIC` of the capturing host.
+    pub capture_nanos: i64,
+}
+
+/// foxglove's time; it counts from 0 to 2^32 s, anything else is held at the ends.
+pub(crate) fn timestamp(nanos: i64) -> Timestamp {
+    let nanos = nanos.max(0);
+    let seconds = u32::try_from(nanos / 1_000_000_000).unwrap_or(u32::MAX);
+    Timestamp::new(seconds, (nanos % 1_000_000_000) as u32)
+}
+
+/// Bytes of a foxglove message.
+pub(crate) fn to_bytes<M: Encode>(topic: &str, message: &M) -> Result<Vec<u8>, TransportError> {
+    let mut bytes = Vec::with_capacity(message.encoded_len().unwrap_or(0));
+    message.encode(&mut bytes).map_err(|error| TransportError::malformed(topic, error.to_string()))?;
+    Ok(bytes)
+}
+
+impl ViewFrame {
+    /// Checks what a publisher hands in.
+    pub(crate) fn validate(&self, view: &str) -> Result<(), TransportError> {
+        let side = 1..=flyrig_types::MAX_IMAGE_SIDE;
+        if !side.contains(&self.width) || !side.contains(&self.height) {
+            let (width, height) = (self.width, self.height);
+            return Err(TransportError::config(format!("view {view}"), format!("is {width}x{height} pixels; sides are 1 to 16384")));
+        }
+        check_len(view, self.bytes.len())
+    }
+
+    pub(crate) fn encode(&self, view: &str) -> Result<Vec<u8>, TransportError> {
+        let image = CompressedImage {
+            timestamp: Some(timestamp(self.capture_nanos)),
+            frame_id: view.to_owned(),
+            data: self.bytes.clone(),
+            format: self.format.name().to_owned(),
+        };
+        to_bytes(view, &image)
+    }
+
+    /// Size, frame and time come from the message's header.
+    pub(crate) fn decode(view: &str, header: &crate::Header, payload: Bytes) -> Result<Self, TransportError> {
+        if payload.len() > 2 * MAX_IMAGE_BYTES {
+            return Err(TransportError::malformed(view, format!("{} bytes are too many for a picture", payload.len())));
+        }
+        let image = CompressedImage::decode(payload)
+            .map_err(|error| TransportError::malformed(view, format!("not a CompressedImage: {error}")))?;
+        let format = ImageFormat::from_name(&image.format)
+            .ok_or_else(|| TransportError::malformed(view, format!("format {:?}, expected jpeg or png", image.format)))?;
+        let frame = Self {
+            width: header.width,
+            height: header.height,
+            format,
+            bytes: image.data,
+            frame: header.frame,
+            capture_nanos: header.capture_nanos,
+        };
+        frame.validate(view).map_err(|error| TransportError::malformed(error.topic, error.message))?;
+        Ok(frame)
+    }
+}
+
+fn check_len(view: &str, len: usize) -> Result<(), TransportError> {
+    if (1..=MAX_IMAGE_BYTES).contains(&len) {
+        return Ok(());
+    }
+    Err(TransportError::config(
+        format!("view {view}"),
+        format!("picture of {len} bytes; it must hold 1 to {MAX_IMAGE_BYTES} bytes"),
+    ))
+}
