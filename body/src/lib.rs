@@ -8,12 +8,16 @@
 //! - **Skinning matrices** are `world_from_canonical`, one a joint: `world_from_joint * joint_from_canonical`.
 //! - **World** of a pose track is that of its source: y up for glTF, z up for BVH.
 
+mod body_asset;
 mod bvh;
 mod default_body;
 mod error;
+mod gltf_file;
 mod gltf_import;
+mod gltf_nodes;
 mod gpu_skinner;
 mod graph;
+mod part;
 mod retarget;
 mod shape;
 mod skeleton;
@@ -22,7 +26,7 @@ mod surface;
 mod template;
 
 pub use bvh::{BvhClip, BvhJoint, load_bvh, parse_bvh};
-pub use default_body::{default_skeleton_names, default_template, target_names};
+pub use default_body::{ShapeTarget, default_template, shape_targets};
 pub use error::BodyError;
 pub use gltf_import::{GltfHuman, load_gltf};
 pub use gpu_skinner::GpuSkinner;

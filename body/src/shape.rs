@@ -4,7 +4,12 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-/// Shape target name -> weight. An empty map is the average adult.
+/// Shape target name -> weight; see [`crate::shape_targets`] for what there is. An empty map is the average
+/// of young adult women and men.
+///
+/// Macro targets (`gender` 0 woman .. 1 man, `age` 0 ten years .. 0.5 young adult .. 1 old, `muscle`, `weight`,
+/// `height`, `proportions`) lie in 0..=1 with 0.5 for the average; local measures (`stomach-tone`,
+/// `upperarm-scale-vert`, ...) lie in -1..=1 with 0 for no change.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct ShapeParams(pub BTreeMap<String, f32>);
@@ -15,5 +20,51 @@ impl ShapeParams {
     pub fn with(mut self, name: &str, weight: f32) -> Self {
         self.0.insert(name.to_owned(), weight);
         self
+    }
+
+    fn from_pairs(pairs: &[(&str, f32)]) -> Self {
+        Self(pairs.iter().map(|(name, weight)| ((*name).to_owned(), *weight)).collect())
+    }
+
+    /// Average young man.
+    #[must_use]
+    pub fn man() -> Self {
+        Self::from_pairs(&[("gender", 1.0)])
+    }
+
+    /// Average young woman.
+    #[must_use]
+    pub fn woman() -> Self {
+        Self::from_pairs(&[("gender", 0.0)])
+    }
+
+    /// Child of about ten.
+    #[must_use]
+    pub fn child() -> Self {
+        Self::from_pairs(&[("age", 0.0)])
+    }
+
+    /// Tall man, lean and strong.
+    #[must_use]
+    pub fn athlete() -> Self {
+        Self::from_pairs(&[("gender", 1.0), ("muscle", 0.9), ("weight", 0.4), ("height", 0.75), ("torso-vshape", 0.4)])
+    }
+
+    /// Heavy man with a belly, past his youth.
+    #[must_use]
+    pub fn heavy_man() -> Self {
+        Self::from_pairs(&[
+            ("gender", 1.0),
+            ("age", 0.7),
+            ("weight", 0.95),
+            ("muscle", 0.45),
+            ("stomach-pregnant", 0.3),
+        ])
+    }
+
+    /// Small, slender woman.
+    #[must_use]
+    pub fn petite_woman() -> Self {
+        Self::from_pairs(&[("gender", 0.0), ("weight", 0.3), ("height", 0.25)])
     }
 }

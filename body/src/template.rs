@@ -13,6 +13,30 @@ pub struct SkinWeights {
     pub weights: [f32; 4],
 }
 
+impl SkinWeights {
+    /// The four strongest of any number of (joint, weight) pairs, scaled to the sum 1; repeated joints are added
+    /// up. None when no weight is positive and finite.
+    #[must_use]
+    pub fn strongest(influences: &[(u16, f32)]) -> Option<Self> {
+        let mut merged: Vec<(u16, f32)> = Vec::with_capacity(influences.len());
+        for &(joint, weight) in influences.iter().filter(|(_, weight)| *weight > 0.0 && weight.is_finite()) {
+            match merged.iter_mut().find(|(known, _)| *known == joint) {
+                Some((_, sum)) => *sum += weight,
+                None => merged.push((joint, weight)),
+            }
+        }
+        merged.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+        merged.truncate(4);
+        let total: f32 = merged.iter().map(|(_, weight)| weight).sum();
+        let mut skin = Self::default();
+        for (slot, (joint, weight)) in merged.iter().enumerate() {
+            skin.joints[slot] = *joint;
+            skin.weights[slot] = weight / total;
+        }
+        (total > 0.0 && total.is_finite()).then_some(skin)
+    }
+}
+
 /// Coarse part of the body, from the joint that moves a point most.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Part {

@@ -1,0 +1,134 @@
+//! glTF files as bytes: buffers and accessors, every length checked.
+
+use std::path::Path;
+
+use base64::Engine;
+use gltf::accessor::{DataType, Dimensions};
+use gltf::buffer::Source;
+
+use crate::BodyError;
+
+/// A parsed file with its buffers.
+pub(crate) struct GltfFile<'a> {
+    pub path: &'a Path,
+    pub document: gltf::Document,
+    buffers: Vec<Vec<u8>>,
+}
+
+impl<'a> GltfFile<'a> {
+    /// Reads a `.glb`, or a `.gltf` with its buffers in files beside it or as data URIs.
+    pub fn open(path: &'a Path) -> Result<Self, BodyError> {
+        let read = |path: &Path| std::fs::read(path).map_err(|source| BodyError::Io { path: path.into(), source });
+        let fail = |message: String| BodyError::Gltf { path: path.into(), message };
+        let bytes = read(path)?;
+        // The length stands in the header; the parser would take a cut file's word for it.
+        if let Some(told) = bytes.get(8..12).filter(|_| bytes.starts_with(b"glTF")) {
+            let told = u32::from_le_bytes([told[0], told[1], told[2], told[3]]) as usize;
+            if told > bytes.len() {
+                let found = bytes.len();
+                return Err(fail(format!("cut off: {found} of {told} bytes; copy the file again")));
+            }
+        }
+        let gltf::Gltf { document, mut blob } =
+            gltf::Gltf::from_slice(&bytes).map_err(|error| fail(format!("not a valid glTF 2.0 file: {error}")))?;
+        let mut buffers = Vec::new();
+        for buffer in document.buffers() {
+            let index = buffer.index();
+            let data = match buffer.source() {
+                Source::Bin => blob.take().ok_or_else(|| fail("the binary chunk is missing".to_owned()))?,
+                Source::Uri(uri) => match uri.strip_prefix("data:").and_then(|data| data.split_once("base64,")) {
+                    Some((_, data)) => base64::engine::general_purpose::STANDARD
+                        .decode(data)
+                        .map_err(|error| fail(format!("buffer {index}: {error}")))?,
+                    None => read(&path.with_file_name(uri.replace("%20", " ")))?,
+                },
+            };
+            let (found, told) = (data.len(), buffer.length());
+            if found < told {
+                return Err(fail(format!("buffer {index} is cut off: {found} of {told} bytes")));
+            }
+            buffers.push(data);
+        }
+        Ok(Self { path, document, buffers })
+    }
+
+    /// An error about this file.
+    pub fn fail(&self, message: impl Into<String>) -> BodyError {
+        BodyError::Gltf { path: self.path.into(), message: message.into() }
+    }
+
+    /// Items of `N` numbers; normalised integers become fractions, other numbers keep their value.
+    pub fn numbers<const N: usize>(
+        &self,
+        accessor: &gltf::Accessor<'_>,
+        what: &str,
+    ) -> Result<Vec<[f64; N]>, BodyError> {
+        let wanted = match N {
+            1 => Dimensions::Scalar,
+            2 => Dimensions::Vec2,
+            3 => Dimensions::Vec3,
+            4 => Dimensions::Vec4,
+            _ => Dimensions::Mat4,
+        };
+        let found = accessor.dimensions();
+        if found != wanted {
+            return Err(self.fail(format!("{what} is {found:?}, it must be {wanted:?}")));
+        }
+        if accessor.sparse().is_some() {
+            return Err(self.fail(format!("{what} is stored sparsely; export the file without sparse accessors")));
+        }
+        let count = accessor.count();
+        let Some(view) = accessor.view() else { return Err(self.fail(format!("{what} has no data"))) };
+        let data_type = accessor.data_type();
+        let size = data_type.size() * N;
+        let stride = view.stride().unwrap_or(size);
+        let cut_off = || self.fail(format!("{what} reaches beyond the end of its buffer; the file is damaged"));
+        let buffer = self.buffers.get(view.buffer().index()).ok_or_else(cut_off)?;
+        let end = view.offset().checked_add(view.length()).ok_or_else(cut_off)?;
+        let bytes = buffer.get(view.offset()..end).ok_or_else(cut_off)?;
+        let bytes = bytes.get(accessor.offset()..).ok_or_else(cut_off)?;
+        let needed = match count {
+            0 => Some(0),
+            _ => stride.checked_mul(count - 1).and_then(|bytes| bytes.checked_add(size)),
+        };
+        if stride < size || needed.is_none_or(|needed| needed > bytes.len()) {
+            return Err(cut_off());
+        }
+        let item = |index: usize| {
+            std::array::from_fn(|n| {
+                let at = index * stride + n * data_type.size();
+                number(&bytes[at..at + data_type.size()], data_type, accessor.normalized())
+            })
+        };
+        Ok((0..count).map(item).collect())
+    }
+
+    /// As [`Self::numbers`], and none may be NaN or infinite.
+    pub fn finite<const N: usize>(
+        &self,
+        accessor: &gltf::Accessor<'_>,
+        what: &str,
+    ) -> Result<Vec<[f64; N]>, BodyError> {
+        let items = self.numbers::<N>(accessor, what)?;
+        match items.iter().position(|item| item.iter().any(|x| !x.is_finite())) {
+            Some(index) => Err(self.fail(format!("item {index} of {what} is not a finite number"))),
+            None => Ok(items),
+        }
+    }
+}
+
+/// One little-endian number; `bytes` has the type's size.
+fn number(bytes: &[u8], data_type: DataType, normalized: bool) -> f64 {
+    let mut padded = [0; 4];
+    padded[..bytes.len()].copy_from_slice(bytes);
+    let unsigned = u32::from_le_bytes(padded);
+    let (value, one) = match data_type {
+        DataType::F32 => return f64::from(f32::from_bits(unsigned)),
+        DataType::U32 => (f64::from(unsigned), f64::from(u32::MAX)),
+        DataType::U16 => (f64::from(unsigned), f64::from(u16::MAX)),
+        DataType::U8 => (f64::from(unsigned), f64::from(u8::MAX)),
+        DataType::I16 => (f64::from(unsigned as u16 as i16), f64::from(i16::MAX)),
+        DataType::I8 => (f64::from(unsigned as u8 as i8), f64::from(i8::MAX)),
+    };
+    if normalized { (value / one).max(-1.0) } else { value }
+}
