@@ -1,0 +1,47 @@
+//! Settings of the tracker.
+
+use serde::{Deserialize, Serialize};
+
+/// Settings of [`crate::PoseEstimator`]; the defaults suit a rig a few metres wide.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case", default)]
+pub struct PoseConfig {
+    /// Crops whose presence is lower than this show no person, 0..1.
+    pub presence_threshold: f64,
+    /// Landmarks of lower confidence (the smaller of visibility and presence) are not used, 0..1.
+    pub confidence_threshold: f64,
+    /// Distance in pixels up to which views agree on a landmark, for a person `reference_height_px` high.
+    pub inlier_px: f64,
+    /// Height of a person in pixels for which `inlier_px` and `sigma_px` hold; both scale with the person.
+    pub reference_height_px: f64,
+    /// Standard deviation of a landmark in pixels, for a person `reference_height_px` high.
+    pub sigma_px: f64,
+    /// Standard deviation of a joint's turn between sets at 30 sets a second, radians; smaller is smoother.
+    pub smooth_rad: f64,
+    /// Largest number of solver steps a frame set.
+    pub max_steps: usize,
+    /// Whether bone lengths are fitted by [`crate::PoseEstimator::fit_shape`]; off for a template that
+    /// already is the person.
+    pub fit_shape: bool,
+    /// Whether masks are made; off saves time where the source brings its own.
+    pub masks: bool,
+    /// Frame sets without a person after which the memory of the last pose is dropped.
+    pub forget_after: u32,
+}
+
+impl Default for PoseConfig {
+    fn default() -> Self {
+        Self {
+            presence_threshold: 0.5,
+            confidence_threshold: 0.3,
+            inlier_px: 20.0,
+            reference_height_px: 700.0,
+            sigma_px: 5.0,
+            smooth_rad: 0.15,
+            max_steps: 12,
+            fit_shape: true,
+            masks: true,
+            forget_after: 15,
+        }
+    }
+}

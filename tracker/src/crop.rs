@@ -1,0 +1,176 @@
+//! Turned square crops for the network.
+
+use glam::DVec2;
+
+use crate::landmarks::{LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER};
+use crate::net::{NET_SIDE, NetOutput};
+use crate::pixels::Rgb;
+use crate::{Keypoint, LANDMARK_COUNT, ViewKeypoints};
+
+/// Room around the farthest landmark; the network was trained with a quarter more than the person.
+const MARGIN: f64 = 1.25;
+
+/// A square of a picture, turned so that the person stands upright in it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Crop {
+    /// Middle, pixels of the picture.
+    pub center: DVec2,
+    /// Side, pixels of the picture.
+    pub side: f64,
+    /// Turn in radians: the crop's x axis in the picture is (cos, sin).
+    pub angle: f64,
+}
+
+impl Crop {
+    /// An upright square.
+    pub fn upright(center: DVec2, side: f64) -> Self {
+        Self { center, side, angle: 0.0 }
+    }
+
+    /// The crop for a person's landmarks: centred on the hips, turned hips-to-shoulders up, reaching a
+    /// quarter farther than the farthest landmark. `None` when the points do not span a person.
+    pub fn around(points: &[Option<DVec2>; LANDMARK_COUNT]) -> Option<Self> {
+        let middle = |a: usize, b: usize| Some((points[a]? + points[b]?) * 0.5);
+        let hips = middle(LEFT_HIP, RIGHT_HIP)?;
+        let shoulders = middle(LEFT_SHOULDER, RIGHT_SHOULDER)?;
+        let up = shoulders - hips;
+        let reach = points.iter().flatten().map(|p| (*p - hips).length()).fold(0.0, f64::max);
+        if !(reach.is_finite() && (8.0..1e5).contains(&reach)) {
+            return None;
+        }
+        // Seen from above or below the trunk has no direction in the picture.
+        let angle = if up.length() < 0.08 * reach { 0.0 } else { up.x.atan2(-up.y) };
+        Some(Self { center: hips, side: 2.0 * MARGIN * reach, angle })
+    }
+
+    /// Pixels of the picture that one pixel of the network's crop takes.
+    pub fn scale(&self) -> f64 {
+        self.side / NET_SIDE as f64
+    }
+
+    /// Picture pixel of a crop pixel (pixel centres at integers in both).
+    pub fn to_picture(self, crop_px: DVec2) -> DVec2 {
+        let offset = (crop_px + 0.5 - 0.5 * NET_SIDE as f64) * self.scale();
+        self.center + DVec2::from_angle(self.angle).rotate(offset)
+    }
+
+    /// Crop pixel of a picture pixel.
+    pub fn from_picture(self, picture_px: DVec2) -> DVec2 {
+        let offset = DVec2::from_angle(-self.angle).rotate(picture_px - self.center);
+        offset / self.scale() + 0.5 * NET_SIDE as f64 - 0.5
+    }
+
+    /// The network's input: RGB in 0..=1, black outside the picture. Each value averages enough samples
+    /// that a large crop does not alias.
+    pub fn sample(&self, picture: &Rgb) -> Vec<f32> {
+        let taps = (self.scale().round() as usize).clamp(1, 4);
+        let mut rgb = Vec::with_capacity(NET_SIDE * NET_SIDE * 3);
+        let weight = 1.0 / (255.0 * (taps * taps) as f32);
+        for y in 0..NET_SIDE {
+            for x in 0..NET_SIDE {
+                let mut sum = [0.0f32; 3];
+                for ty in 0..taps {
+                    for tx in 0..taps {
+                        let tap = |t: usize| (t as f64 + 0.5) / taps as f64 - 0.5;
+                        let at = self.to_picture(DVec2::new(x as f64 + tap(tx), y as f64 + tap(ty)));
+                        let color = picture.bilinear(at);
+                        for (s, c) in sum.iter_mut().zip(color) {
+                            *s += c;
+                        }
+                    }
+                }
+                rgb.extend(sum.map(|s| s * weight));
+            }
+        }
+        rgb
+    }
+
+    /// The network's landmarks in the picture.
+    pub fn keypoints(&self, output: &NetOutput) -> ViewKeypoints {
+        std::array::from_fn(|i| {
+            let landmark = output.landmarks[i];
+            Keypoint {
+                pixel: self.to_picture(DVec2::new(landmark.x, landmark.y)),
+                confidence: landmark.confidence,
+            }
+        })
+    }
+}
+
+/// Upright squares of several sizes that cover a picture, the whole picture first.
+pub(crate) fn search_crops(width: u32, height: u32) -> Vec<Crop> {
+    let (width, height) = (f64::from(width), f64::from(height));
+    let long = width.max(height);
+    let mut crops = Vec::new();
+    for fraction in [1.0, 0.66, 0.45] {
+        let side = long * fraction;
+        let centers = |length: f64| -> Vec<f64> {
+            if length <= side * 1.1 {
+                return vec![0.5 * length];
+            }
+            let count = ((length - side) / (0.5 * side)).ceil() as usize + 1;
+            (0..count).map(|i| 0.5 * side + (length - side) * i as f64 / (count - 1).max(1) as f64).collect()
+        };
+        for y in centers(height) {
+            for x in centers(width) {
+                crops.push(Crop::upright(DVec2::new(x, y), side));
+            }
+        }
+    }
+    crops
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_turned_crop_puts_the_shoulders_above_the_hips_and_maps_both_ways() {
+        let mut points = [None; LANDMARK_COUNT];
+        points[LEFT_HIP] = Some(DVec2::new(100.0, 100.0));
+        points[RIGHT_HIP] = Some(DVec2::new(100.0, 120.0));
+        points[LEFT_SHOULDER] = Some(DVec2::new(160.0, 100.0));
+        points[RIGHT_SHOULDER] = Some(DVec2::new(160.0, 120.0));
+        let crop = Crop::around(&points).unwrap();
+        let at = |i: usize| crop.from_picture(points[i].unwrap());
+        assert!(at(LEFT_SHOULDER).y < at(LEFT_HIP).y - 40.0);
+        assert!((at(LEFT_SHOULDER).x - at(LEFT_HIP).x).abs() < 1e-9);
+        let there = DVec2::new(31.0, 77.0);
+        assert!((crop.from_picture(crop.to_picture(there)) - there).length() < 1e-9);
+        assert!((crop.to_picture(DVec2::splat(127.5)) - crop.center).length() < 1e-9);
+    }
+
+    #[test]
+    fn points_that_span_nobody_have_no_crop() {
+        assert_eq!(Crop::around(&[None; LANDMARK_COUNT]), None);
+        assert_eq!(Crop::around(&[Some(DVec2::ONE); LANDMARK_COUNT]), None);
+        assert_eq!(Crop::around(&[Some(DVec2::NAN); LANDMARK_COUNT]), None);
+    }
+
+    #[test]
+    fn search_covers_every_picture_shape() {
+        for (width, height) in [(1, 1), (540, 960), (4000, 300)] {
+            let crops = search_crops(width, height);
+            assert!((3..200).contains(&crops.len()));
+            for corner in [DVec2::ZERO, DVec2::new(f64::from(width), f64::from(height))] {
+                for size in [1.0, 0.66, 0.45] {
+                    let side = f64::from(width.max(height)) * size;
+                    let covered = crops.iter().filter(|c| (c.side - side).abs() < 1e-9);
+                    assert!(
+                        covered.clone().any(|c| (corner - c.center).abs().max_element() <= 0.56 * side),
+                        "{width}x{height} {side} {corner}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_crop_of_one_colour_is_that_colour_inside_and_black_outside() {
+        let picture = Rgb { width: 20, height: 20, bytes: vec![255; 20 * 20 * 3].into() };
+        let samples = Crop::upright(DVec2::new(0.0, 9.5), 20.0).sample(&picture);
+        let pixel = |x: usize, y: usize| samples[(y * NET_SIDE + x) * 3];
+        assert!((pixel(200, 128) - 1.0).abs() < 1e-6);
+        assert!(pixel(20, 128).abs() < 1e-6);
+    }
+}

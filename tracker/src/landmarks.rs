@@ -1,0 +1,109 @@
+//! BlazePose's 33 body landmarks.
+
+use glam::DVec2;
+
+/// How many body landmarks there are.
+pub const LANDMARK_COUNT: usize = 33;
+
+/// Names of the landmarks in the order of the network ("left" is the person's left).
+pub const LANDMARK_NAMES: [&str; LANDMARK_COUNT] = [
+    "nose",
+    "left eye inner",
+    "left eye",
+    "left eye outer",
+    "right eye inner",
+    "right eye",
+    "right eye outer",
+    "left ear",
+    "right ear",
+    "mouth left",
+    "mouth right",
+    "left shoulder",
+    "right shoulder",
+    "left elbow",
+    "right elbow",
+    "left wrist",
+    "right wrist",
+    "left little finger",
+    "right little finger",
+    "left index finger",
+    "right index finger",
+    "left thumb",
+    "right thumb",
+    "left hip",
+    "right hip",
+    "left knee",
+    "right knee",
+    "left ankle",
+    "right ankle",
+    "left heel",
+    "right heel",
+    "left toes",
+    "right toes",
+];
+
+/// Pairs of landmarks that are joined by a line when a person is drawn.
+pub const LANDMARK_BONES: [(usize, usize); 30] = [
+    (0, 2),
+    (2, 7),
+    (0, 5),
+    (5, 8),
+    (9, 10),
+    (11, 12),
+    (11, 13),
+    (13, 15),
+    (15, 17),
+    (15, 19),
+    (15, 21),
+    (12, 14),
+    (14, 16),
+    (16, 18),
+    (16, 20),
+    (16, 22),
+    (11, 23),
+    (12, 24),
+    (23, 24),
+    (23, 25),
+    (25, 27),
+    (27, 29),
+    (29, 31),
+    (27, 31),
+    (24, 26),
+    (26, 28),
+    (28, 30),
+    (30, 32),
+    (28, 32),
+    (17, 19),
+];
+
+/// One landmark in one picture.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Keypoint {
+    /// Pixels of the picture; pixel centres at integers. May lie outside the picture.
+    pub pixel: DVec2,
+    /// 0 unusable (or unseen) to 1 certain.
+    pub confidence: f64,
+}
+
+impl Keypoint {
+    /// Whether the point may be used at all.
+    #[must_use]
+    pub fn usable(&self) -> bool {
+        self.pixel.is_finite() && self.confidence.is_finite() && self.confidence > 0.0
+    }
+}
+
+/// The landmarks of one view.
+pub type ViewKeypoints = [Keypoint; LANDMARK_COUNT];
+
+pub(crate) const NOSE: usize = 0;
+pub(crate) const LEFT_SHOULDER: usize = 11;
+pub(crate) const RIGHT_SHOULDER: usize = 12;
+pub(crate) const LEFT_ELBOW: usize = 13;
+pub(crate) const LEFT_WRIST: usize = 15;
+pub(crate) const LEFT_HIP: usize = 23;
+pub(crate) const RIGHT_HIP: usize = 24;
+pub(crate) const LEFT_KNEE: usize = 25;
+pub(crate) const LEFT_ANKLE: usize = 27;
+pub(crate) const LEFT_HEEL: usize = 29;
+pub(crate) const LEFT_TOES: usize = 31;

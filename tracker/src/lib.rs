@@ -1,0 +1,30 @@
+//! Person masks, keypoints, triangulation and the pose and shape fit of a template.
+//!
+//! Pictures of several calibrated cameras go in as a [`flyrig_types::FrameSet`]; the pose of a
+//! [`flyrig_body::Template`] and one mask a camera come out:
+//!
+//! 1. [`PoseNet`] (BlazePose) finds 33 landmarks and a coarse mask in a turned square crop of each picture;
+//!    the crop follows the person, and is searched over the whole picture after the person was lost.
+//! 2. [`triangulate`] joins the landmarks of the views, leaving out views that disagree.
+//! 3. A damped least-squares fit in pixels turns the template's joints ([`fit_pose`]); the bone lengths are
+//!    fitted once, over the first frames ([`PoseEstimator::fit_shape`]).
+//! 4. Masks come from an empty plate ([`mask_from_plate`]) or from the network, sharpened on the picture and
+//!    gated by the fitted body.
+
+mod config;
+mod error;
+mod estimate;
+mod estimator;
+mod landmarks;
+mod net;
+mod plate;
+mod shape;
+
+pub use config::PoseConfig;
+pub use error::{TrackError, TrackErrorKind};
+pub use estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};
+pub use estimator::PoseEstimator;
+pub use landmarks::{Keypoint, LANDMARK_BONES, LANDMARK_COUNT, LANDMARK_NAMES, ViewKeypoints};
+pub use net::{CropLandmark, NET_SIDE, NetOutput, PoseNet};
+pub use plate::mask_from_plate;
+pub use shape::ShapeFit;

@@ -1,0 +1,159 @@
+//! BlazePose through tract.
+
+use std::sync::Arc;
+
+use tract_onnx::prelude::*;
+
+use crate::{LANDMARK_COUNT, TrackError, TrackErrorKind};
+
+/// Side of the network's picture, pixels.
+pub const NET_SIDE: usize = 256;
+
+/// Floats a landmark takes in the network's output.
+const LANDMARK_STRIDE: usize = 5;
+/// Landmarks the network gives: 33 of the body, 6 helpers of the original's tracking that we do not use.
+const NET_LANDMARKS: usize = 39;
+
+static EMBEDDED: &[u8] = include_bytes!("../assets/pose_full.onnx");
+
+/// A landmark inside the crop.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct CropLandmark {
+    /// Pixels of the crop, centre of the first pixel at 0.
+    pub x: f64,
+    /// Pixels of the crop.
+    pub y: f64,
+    /// Smaller of the probabilities that the landmark is visible and that it lies in the crop.
+    pub confidence: f64,
+    /// Metres from the middle of the hips, axes of the crop: x right, y down, z away from the camera.
+    pub world: [f64; 3],
+}
+
+/// What the network sees in one crop.
+#[derive(Debug, Clone)]
+pub struct NetOutput {
+    /// Body landmarks.
+    pub landmarks: [CropLandmark; LANDMARK_COUNT],
+    /// Probability of a person.
+    pub presence: f64,
+    /// Person probability, 256 x 256, row by row, 0..1.
+    pub mask: Vec<f32>,
+}
+
+/// The landmark network (BlazePose full, Bazarevsky et al. 2020; licence beside the file in `assets`).
+#[derive(Clone)]
+pub struct PoseNet {
+    model: Arc<TypedRunnableModel>,
+}
+
+impl std::fmt::Debug for PoseNet {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("PoseNet")
+    }
+}
+
+impl PoseNet {
+    /// The network built into this crate. Takes a few hundred milliseconds; clone it instead of loading it twice.
+    ///
+    /// # Errors
+    /// Kind [`TrackErrorKind::Net`] when the file does not load.
+    pub fn embedded() -> Result<Self, TrackError> {
+        Self::from_onnx(EMBEDDED)
+    }
+
+    /// A network from the bytes of an ONNX file with BlazePose's outputs (told apart by their sizes).
+    ///
+    /// # Errors
+    /// Kind [`TrackErrorKind::Net`] when the file does not load or has other inputs or outputs.
+    pub fn from_onnx(mut bytes: &[u8]) -> Result<Self, TrackError> {
+        let failed = |error: TractError| {
+            TrackError::new(
+                TrackErrorKind::Net,
+                format!("the pose network does not load ({error:#}); use a BlazePose landmark ONNX file"),
+            )
+        };
+        let side = NET_SIDE as i64;
+        let model = tract_onnx::onnx()
+            .model_for_read(&mut bytes)
+            .and_then(|model| model.with_input_fact(0, f32::fact(tvec!(1, side, side, 3)).into()))
+            .and_then(InferenceModelExt::into_optimized)
+            .and_then(IntoRunnable::into_runnable)
+            .map_err(failed)?;
+        let net = Self { model };
+        net.run(&vec![0.0; NET_SIDE * NET_SIDE * 3])?;
+        Ok(net)
+    }
+
+    /// Runs one crop: 256 x 256 x 3 RGB in 0..=1, row by row.
+    ///
+    /// # Errors
+    /// Kind [`TrackErrorKind::Net`] when the length is wrong or an output is missing or not finite.
+    pub fn run(&self, rgb: &[f32]) -> Result<NetOutput, TrackError> {
+        let failed =
+            |error: TractError| TrackError::new(TrackErrorKind::Net, format!("the pose network failed: {error:#}"));
+        let input = Tensor::from_shape(&[1, NET_SIDE, NET_SIDE, 3], rgb).map_err(failed)?;
+        let outputs = self.model.run(tvec!(input.into())).map_err(failed)?;
+        let find = |count: usize| -> Result<Vec<f32>, TrackError> {
+            for output in &outputs {
+                if output.len() == count {
+                    let values: Vec<f32> = output
+                        .to_plain_array_view::<f32>()
+                        .map_err(failed)?
+                        .iter()
+                        .copied()
+                        .collect();
+                    if values.iter().all(|v| v.is_finite()) {
+                        return Ok(values);
+                    }
+                    return Err(TrackError::new(TrackErrorKind::Net, "the pose network gave a value that is not finite"));
+                }
+            }
+            Err(TrackError::new(
+                TrackErrorKind::Net,
+                format!("the pose network has no output of {count} numbers; use a BlazePose landmark file"),
+            ))
+        };
+        let raw = find(NET_LANDMARKS * LANDMARK_STRIDE)?;
+        let world = find(NET_LANDMARKS * 3)?;
+        let presence = f64::from(find(1)?[0]).clamp(0.0, 1.0);
+        let mask = find(NET_SIDE * NET_SIDE)?.into_iter().map(|logit| 1.0 / (1.0 + (-logit).exp())).collect();
+        let mut landmarks = [CropLandmark::default(); LANDMARK_COUNT];
+        for (i, landmark) in landmarks.iter_mut().enumerate() {
+            let [x, y, _, visible, present] =
+                std::array::from_fn(|k| f64::from(raw[i * LANDMARK_STRIDE + k]));
+            *landmark = CropLandmark {
+                // The network's coordinates have pixel corners at integers.
+                x: x - 0.5,
+                y: y - 0.5,
+                confidence: sigmoid(visible).min(sigmoid(present)),
+                world: std::array::from_fn(|k| f64::from(world[i * 3 + k])),
+            };
+        }
+        Ok(NetOutput { landmarks, presence, mask })
+    }
+}
+
+fn sigmoid(logit: f64) -> f64 {
+    1.0 / (1.0 + (-logit).exp())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_embedded_network_sees_nobody_in_grey_and_refuses_a_wrong_size() {
+        let net = PoseNet::embedded().unwrap();
+        let output = net.run(&vec![0.5; NET_SIDE * NET_SIDE * 3]).unwrap();
+        assert!(output.presence < 0.5, "presence {}", output.presence);
+        assert_eq!(output.mask.len(), NET_SIDE * NET_SIDE);
+        assert!(output.mask.iter().all(|p| (0.0..=1.0).contains(p)));
+        assert_eq!(net.run(&[0.5; 12]).unwrap_err().kind, TrackErrorKind::Net);
+    }
+
+    #[test]
+    fn a_damaged_file_is_an_error() {
+        assert_eq!(PoseNet::from_onnx(b"not an ONNX file").unwrap_err().kind, TrackErrorKind::Net);
+        assert_eq!(PoseNet::from_onnx(&EMBEDDED[..EMBEDDED.len() / 2]).unwrap_err().kind, TrackErrorKind::Net);
+    }
+}

@@ -1,0 +1,84 @@
+//! One camera as the fit needs it: rays of pixels and projection on the undistorted plane.
+
+use flyrig_types::Camera;
+use glam::{DMat3, DVec2, DVec3};
+
+use crate::{LANDMARK_COUNT, ViewKeypoints};
+
+/// Closest distance to the camera's plane that a point may have to be projected, metres.
+const NEAR_M: f64 = 0.1;
+
+/// An undistorted camera: world to camera, and pixels by the mean focal length.
+#[derive(Debug, Clone)]
+pub(crate) struct View {
+    pub rotation: DMat3,
+    pub translation: DVec3,
+    pub focal_px: f64,
+}
+
+impl View {
+    pub fn new(camera: &Camera) -> Self {
+        Self {
+            rotation: DMat3::from_quat(camera.camera_from_world.rotation),
+            translation: camera.camera_from_world.translation,
+            focal_px: 0.5 * (camera.intrinsics.focal_px.x + camera.intrinsics.focal_px.y),
+        }
+    }
+
+    /// Camera coordinates of a world point; `None` when it is not in front of the camera.
+    pub fn to_camera(&self, world: DVec3) -> Option<DVec3> {
+        let point = self.rotation * world + self.translation;
+        (point.is_finite() && point.z > NEAR_M).then_some(point)
+    }
+
+    /// Undistorted pixel offset from the principal point.
+    pub fn project(&self, world: DVec3) -> Option<DVec2> {
+        self.to_camera(world).map(|p| p.truncate() * (self.focal_px / p.z))
+    }
+
+    /// Pixels that a metre takes at a world point.
+    pub fn px_per_m(&self, world: DVec3) -> Option<f64> {
+        self.to_camera(world).map(|p| self.focal_px / p.z)
+    }
+
+    /// The same with its derivative by the world point (rows: du, dv).
+    pub fn project_with_derivative(&self, world: DVec3) -> Option<(DVec2, [DVec3; 2])> {
+        let p = self.to_camera(world)?;
+        let scale = self.focal_px / p.z;
+        let ideal = p.truncate() / p.z;
+        let rows = self.rotation.transpose();
+        let du = rows * DVec3::new(scale, 0.0, -scale * ideal.x);
+        let dv = rows * DVec3::new(0.0, scale, -scale * ideal.y);
+        Some((ideal * self.focal_px, [du, dv]))
+    }
+
+    /// Camera centre in the world.
+    pub fn center(&self) -> DVec3 {
+        -(self.rotation.transpose() * self.translation)
+    }
+}
+
+/// A landmark on the undistorted plane (pixels from the principal point) with its confidence.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Observation {
+    pub ideal_px: DVec2,
+    pub confidence: f64,
+}
+
+/// Undistorts the usable landmarks of one view.
+pub(crate) fn observe(
+    camera: &Camera,
+    view: &View,
+    keypoints: &ViewKeypoints,
+    confidence_threshold: f64,
+) -> [Option<Observation>; LANDMARK_COUNT] {
+    std::array::from_fn(|i| {
+        let keypoint = keypoints[i];
+        if !keypoint.usable() || keypoint.confidence < confidence_threshold {
+            return None;
+        }
+        let distorted = (keypoint.pixel - camera.intrinsics.center_px) / camera.intrinsics.focal_px;
+        let ideal = camera.intrinsics.lens.undistort(distorted)?;
+        Some(Observation { ideal_px: ideal * view.focal_px, confidence: keypoint.confidence.min(1.0) })
+    })
+}
