@@ -1,7 +1,16 @@
 //! Splats to pictures and back: forward rasteriser, direct appearance, image metrics, splat export.
 
+mod appearance;
 mod buffers;
+mod color;
+mod export;
+pub mod metrics;
 mod raster;
 
+pub use appearance::{
+    AppearanceError, AppearanceSettings, DiffusionHierarchy, DiffusionLevel, DirectAppearance, ViewInput,
+};
 pub use buffers::{GaussianBuffers, RenderTarget};
+pub use color::{composite_over, linear_from_srgb, rgba8_from_target, srgb_from_linear};
+pub use export::{ExportError, Splat, read_splats, write_mesh_ply, write_splat_ply};
 pub use raster::{Outputs, RasterSettings, Rasterizer};

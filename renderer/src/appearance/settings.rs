@@ -1,0 +1,139 @@
+//! What goes into direct appearance, and what can be wrong with it.
+
+use flyrig_gpu::{GpuError, StorageBuffer};
+use flyrig_types::{Camera, CameraId};
+
+/// What one camera saw at this instant.
+#[derive(Debug, Clone, Copy)]
+pub struct ViewInput<'a> {
+    /// The camera that took the picture, at the picture's size.
+    pub camera: &'a Camera,
+    /// sRGB rows without padding; a: mask coverage, 255 on the person. The colour is not multiplied by it.
+    pub rgba: &'a [u8],
+    /// The Gaussians' canonical positions as this camera sees them: [`RenderTarget::canonical`](crate::RenderTarget)
+    /// of a rendering with this very camera and the same Gaussians.
+    pub canonical: &'a StorageBuffer<[f32; 4]>,
+}
+
+/// How colours are gathered.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AppearanceSettings {
+    /// Fill what no camera sees from its surroundings on the surface. Off: the paper's baseline, every camera that
+    /// has the point inside its picture gets a small extra weight, visible or not.
+    pub space: bool,
+    /// Remember earlier frames. Off: the memory is neither read nor written.
+    pub time: bool,
+    /// k of Eq. 8 and 11, per metre: beyond 1 / k a point counts as hidden.
+    pub occlusion_per_m: f32,
+    /// w_max of Eq. 10.
+    pub memory_weight_max: f32,
+    /// Mask coverage (0..1) up to which a pixel is not believed at all; above it belief rises linearly to 1.
+    pub min_mask: f32,
+    /// Weight of the colour diffused over the surface against a Gaussian's own observation, whose weight is w_vis
+    /// (0..=1): the larger, the smoother and the less detailed are badly seen regions.
+    pub inpaint_weight: f32,
+    /// Weight of the likeness of neighbouring graph nodes against a node's own observation (0..=1).
+    pub smoothness: f32,
+}
+
+impl Default for AppearanceSettings {
+    fn default() -> Self {
+        Self {
+            space: true,
+            time: true,
+            occlusion_per_m: 20.0,
+            memory_weight_max: 8.0,
+            min_mask: 0.5,
+            inpaint_weight: 0.05,
+            smoothness: 0.005,
+        }
+    }
+}
+
+impl AppearanceSettings {
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// [`AppearanceError::Setting`] names the first bad one.
+    pub fn validate(&self) -> Result<(), AppearanceError> {
+        let check = |name, value: f32, ok: bool, expected| {
+            if ok { Ok(()) } else { Err(AppearanceError::Setting { name, value, expected }) }
+        };
+        let positive = |value: f32| value > 0.0 && value.is_finite();
+        let k = self.occlusion_per_m;
+        check("occlusion_per_m", k, positive(k), "a positive number per metre")?;
+        let memory = self.memory_weight_max;
+        check("memory_weight_max", memory, positive(memory), "a positive number")?;
+        check("min_mask", self.min_mask, (0.0..1.0).contains(&self.min_mask), "0 up to but not including 1")?;
+        let inpaint = self.inpaint_weight;
+        check("inpaint_weight", inpaint, positive(inpaint), "a positive number")?;
+        check("smoothness", self.smoothness, positive(self.smoothness), "a positive number")
+    }
+}
+
+/// Why colours could not be gathered. Nothing was recorded then.
+#[derive(Debug, thiserror::Error)]
+pub enum AppearanceError {
+    /// The GPU refused.
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
+    /// A setting out of its range.
+    #[error("appearance setting {name} is {value}, expected {expected}")]
+    Setting {
+        /// Which.
+        name: &'static str,
+        /// What was found.
+        value: f32,
+        /// What would be right.
+        expected: &'static str,
+    },
+    /// Gaussians and graph do not belong together.
+    #[error("the deformation graph does not fit the Gaussians: {0}; build both from the same template")]
+    Graph(String),
+    /// Other buffers than the ones announced.
+    #[error("appearance was made for {expected} Gaussians but is given {found}; make a new one for another body")]
+    GaussianCount {
+        /// At construction.
+        expected: usize,
+        /// Now.
+        found: usize,
+    },
+    /// More views than announced.
+    #[error("appearance was made for {max} views but is given {found}; raise max_views")]
+    TooManyViews {
+        /// At construction.
+        max: usize,
+        /// Now.
+        found: usize,
+    },
+    /// A picture that does not fit its camera.
+    #[error("camera {camera}: {what} has {found} {unit}, its {width}x{height} picture needs {needed}")]
+    ViewSize {
+        /// Which camera.
+        camera: CameraId,
+        /// Which input.
+        what: &'static str,
+        /// What is counted.
+        unit: &'static str,
+        /// Pixels.
+        width: u32,
+        /// Pixels.
+        height: u32,
+        /// Count needed.
+        needed: usize,
+        /// Count found.
+        found: usize,
+    },
+    /// A picture beyond what the adapter can hold.
+    #[error("camera {camera}: its {width}x{height} picture is larger than the {limit} pixels a side of this adapter")]
+    PictureTooLarge {
+        /// Which camera.
+        camera: CameraId,
+        /// Pixels.
+        width: u32,
+        /// Pixels.
+        height: u32,
+        /// Pixels.
+        limit: u32,
+    },
+}
