@@ -1,0 +1,255 @@
+//! Calibration in the format of EasyMocap and ZJU-MoCap: `intri.yml` and `extri.yml`.
+//!
+//! Per camera `x`: `K_x` 3x3, `dist_x` (k1 k2 p1 p2 k3), `Rot_x` 3x3 or `R_x` as a Rodrigues
+//! vector, `T_x`; `x_camera = Rot x_world + T`. Picture sizes `H_x`, `W_x` are optional.
+
+use std::{
+    collections::BTreeSet,
+    path::{Path, PathBuf},
+};
+
+use flyrig_types::{Camera, CameraError, CameraId, Intrinsics, Isometry, Lens, MAX_IMAGE_SIDE, Rig};
+use glam::{DMat3, DQuat, DVec2, DVec3};
+
+use crate::{
+    CalibError,
+    yaml::{Matrix, YamlFile, YamlWriter},
+};
+
+const INTRINSICS: &str = "intri.yml";
+const EXTRINSICS: &str = "extri.yml";
+
+/// Largest entry of `RᵀR - 1` that rounding in a text file explains.
+const ROTATION_TOLERANCE: f64 = 1e-3;
+
+/// Reads `intri.yml` and `extri.yml` of a folder. `picture_size` gives width and height of a
+/// camera's pictures in pixels for files that do not say it, and is checked against those that do.
+/// The world's axes stay as they are; which of them is up is guessed from the cameras
+/// ([`Rig::guess_world_up`]).
+///
+/// # Errors
+/// [`CalibError`] names the file, the camera and the mend.
+pub fn load_easymocap(dir: &Path, picture_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>) -> Result<Rig, CalibError> {
+    let intri = YamlFile::open(dir.join(INTRINSICS))?;
+    let extri = YamlFile::open(dir.join(EXTRINSICS))?;
+    let with_intrinsics = camera_names(&intri, "K_", "K_<camera>")?;
+    let with_extrinsics = camera_names(&extri, "T_", "T_<camera>")?;
+    for (names, others, file, other) in
+        [(&with_intrinsics, &with_extrinsics, &extri, &intri), (&with_extrinsics, &with_intrinsics, &intri, &extri)]
+    {
+        if let Some(camera) = names.iter().find(|name| !others.contains(name)) {
+            let (path, other) = (file.path().to_owned(), other.path().to_owned());
+            return Err(CalibError::OnlyInOther { path, other, camera: camera.clone() });
+        }
+    }
+    let cameras = with_intrinsics
+        .into_iter()
+        .map(|id| {
+            let intrinsics = read_intrinsics(&intri, &id, picture_size(&id))?;
+            let camera_from_world = read_extrinsics(&extri, &id)?;
+            Ok(Camera { id, intrinsics, camera_from_world })
+        })
+        .collect::<Result<Vec<_>, CalibError>>()?;
+    let world_up = Rig::guess_world_up(&cameras);
+    let rig = Rig { cameras, world_up };
+    validate(&rig, dir)?;
+    Ok(rig)
+}
+
+fn validate(rig: &Rig, dir: &Path) -> Result<(), CalibError> {
+    rig.validate().map_err(|source: CameraError| CalibError::Camera { path: dir.to_owned(), source })
+}
+
+/// The cameras of a file: its `names`, or the rest of every key that begins with `prefix`.
+fn camera_names(file: &YamlFile, prefix: &str, expected: &'static str) -> Result<Vec<CameraId>, CalibError> {
+    let keys = file.keys()?;
+    let names = file.strings("names").unwrap_or_else(|| {
+        let of = |key: &String| key.strip_prefix(prefix).map(str::to_owned);
+        let sorted: BTreeSet<String> = keys.iter().filter_map(of).collect();
+        sorted.into_iter().collect()
+    });
+    if names.is_empty() {
+        return Err(CalibError::NoCameras { path: file.path().to_owned(), expected });
+    }
+    Ok(names.into_iter().map(CameraId::from).collect())
+}
+
+/// One value of one camera in one file, to say errors of.
+struct Entry<'a> {
+    file: &'a YamlFile,
+    camera: &'a CameraId,
+    key: String,
+}
+
+impl<'a> Entry<'a> {
+    fn new(file: &'a YamlFile, camera: &'a CameraId, prefix: &str) -> Self {
+        Self { file, camera, key: format!("{prefix}_{camera}") }
+    }
+
+    fn read(&self) -> Result<Option<Matrix>, CalibError> {
+        self.file.matrix(self.camera, &self.key)
+    }
+
+    fn required(&self, mend: &'static str) -> Result<Matrix, CalibError> {
+        self.read()?.ok_or_else(|| self.missing(mend))
+    }
+
+    fn missing(&self, mend: &'static str) -> CalibError {
+        CalibError::Missing { path: self.path(), camera: self.camera.clone(), key: self.key.clone(), mend }
+    }
+
+    fn wrong(&self, problem: String, mend: &'static str) -> CalibError {
+        CalibError::Value { path: self.path(), camera: self.camera.clone(), key: self.key.clone(), problem, mend }
+    }
+
+    fn path(&self) -> PathBuf {
+        self.file.path().to_owned()
+    }
+
+    fn wrong_shape(&self, matrix: &Matrix, expected: &str) -> CalibError {
+        let problem = format!("is {}x{}, expected {expected}", matrix.rows, matrix.cols);
+        self.wrong(problem, "export the calibration again")
+    }
+
+    fn matrix3(&self, matrix: &Matrix) -> Result<DMat3, CalibError> {
+        match <[f64; 9]>::try_from(matrix.values.as_slice()) {
+            Ok(rows) if matrix.rows == 3 => Ok(DMat3::from_cols_array(&rows).transpose()),
+            _ => Err(self.wrong_shape(matrix, "3x3")),
+        }
+    }
+
+    fn vector3(&self, matrix: &Matrix) -> Result<DVec3, CalibError> {
+        <[f64; 3]>::try_from(matrix.values.as_slice()).map(DVec3::from).map_err(|_| self.wrong_shape(matrix, "3x1"))
+    }
+}
+
+fn read_intrinsics(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>) -> Result<Intrinsics, CalibError> {
+    let entry = Entry::new(file, id, "K");
+    let k = entry.matrix3(&entry.required("calibrate this camera")?)?.transpose();
+    let [[fx, skew, cx], [zero_a, fy, cy], last] = k.to_cols_array_2d();
+    // A skew of a hundredth of a pixel moves nothing that anybody could measure.
+    if skew.abs() > 0.01 || zero_a.abs() > 1e-9 || DVec3::from(last) != DVec3::Z {
+        return Err(entry.wrong(
+            format!("has skew {skew} or an unusual shape, expected [fx 0 cx; 0 fy cy; 0 0 1]"),
+            "calibrate without skew",
+        ));
+    }
+    let (width, height) = picture_size(file, id, pictures)?;
+    Ok(Intrinsics {
+        width,
+        height,
+        focal_px: DVec2::new(fx, fy),
+        center_px: DVec2::new(cx, cy),
+        lens: read_lens(file, id)?,
+    })
+}
+
+fn read_lens(file: &YamlFile, id: &CameraId) -> Result<Lens, CalibError> {
+    let entry = Entry::new(file, id, "dist");
+    let matrix = entry.required("write five zeros when the lens does not distort")?;
+    if matrix.rows != 1 && matrix.cols != 1 || ![4, 5, 8, 12, 14].contains(&matrix.values.len()) {
+        return Err(entry.wrong_shape(&matrix, "a row of 4, 5, 8, 12 or 14 numbers"));
+    }
+    let mut coefficients = matrix.values.clone();
+    coefficients.resize(14, 0.0);
+    if let Some((i, value)) = coefficients.iter().enumerate().skip(5).find(|(_, value)| **value != 0.0) {
+        return Err(entry.wrong(
+            format!("has coefficient {} = {value} of the rational, prism or tilt model", i + 1),
+            "calibrate with k1 k2 p1 p2 k3 only",
+        ));
+    }
+    let [k1, k2, p1, p2, k3] = [0, 1, 2, 3, 4].map(|i| coefficients[i]);
+    Ok(Lens::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] })
+}
+
+fn picture_size(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>) -> Result<(u32, u32), CalibError> {
+    let side =
+        |prefix: &str| -> Result<Option<u32>, CalibError> {
+            let entry = Entry::new(file, id, prefix);
+            match file.number(&entry.key) {
+                None => Ok(None),
+                Some(pixels) if pixels >= 1.0 && pixels <= f64::from(MAX_IMAGE_SIDE) && pixels.fract() == 0.0 => {
+                    Ok(Some(pixels as u32))
+                }
+                Some(pixels) => Err(entry
+                    .wrong(format!("is {pixels}, expected 1 to {MAX_IMAGE_SIDE} pixels"), "correct it or take it out")),
+            }
+        };
+    let calibrated = side("W")?.zip(side("H")?);
+    match (calibrated, pictures) {
+        (Some(calibrated), Some(pictures)) if calibrated != pictures => {
+            Err(CalibError::OtherSize { path: file.path().to_owned(), camera: id.clone(), calibrated, pictures })
+        }
+        (Some(size), _) | (None, Some(size)) => Ok(size),
+        (None, None) => Err(CalibError::UnknownSize { path: file.path().to_owned(), camera: id.clone() }),
+    }
+}
+
+fn read_extrinsics(file: &YamlFile, id: &CameraId) -> Result<Isometry, CalibError> {
+    let entry = Entry::new(file, id, "Rot");
+    let rotation = match entry.read()? {
+        Some(matrix) => rotation_of(&entry, entry.matrix3(&matrix)?)?,
+        None => {
+            let rodrigues = Entry::new(file, id, "R");
+            let matrix = rodrigues.read()?.ok_or_else(|| entry.missing("or give a Rodrigues vector R"))?;
+            if matrix.values.len() == 9 {
+                rotation_of(&rodrigues, rodrigues.matrix3(&matrix)?)?
+            } else {
+                DQuat::from_scaled_axis(rodrigues.vector3(&matrix)?)
+            }
+        }
+    };
+    let entry = Entry::new(file, id, "T");
+    let translation = entry.vector3(&entry.required("calibrate the position of this camera")?)?;
+    Ok(Isometry::new(rotation, translation))
+}
+
+fn rotation_of(entry: &Entry<'_>, matrix: DMat3) -> Result<DQuat, CalibError> {
+    let excess = matrix.transpose() * matrix - DMat3::IDENTITY;
+    let deviation = excess.to_cols_array().into_iter().fold(0.0, |worst: f64, value| worst.max(value.abs()));
+    // Written so that NaN is refused too: entries near the largest double overflow the product.
+    let is_rotation = deviation <= ROTATION_TOLERANCE && matrix.determinant() > 0.0;
+    if !is_rotation {
+        let determinant = matrix.determinant();
+        return Err(entry.wrong(
+            format!("is no rotation (determinant {determinant:.4}, columns {deviation:.2e} from orthonormal)"),
+            "export the calibration again; a mirrored axis gives determinant -1",
+        ));
+    }
+    Ok(DQuat::from_mat3(&matrix).normalize())
+}
+
+/// Writes a rig as `intri.yml` and `extri.yml` with picture sizes, so that [`load_easymocap`] reads
+/// the same cameras back. The format has no place for [`Rig::world_up`]. Both files are made before
+/// the first one is written.
+///
+/// # Errors
+/// [`CalibError`] when a camera is bad or a fisheye, or the folder cannot be written.
+pub fn save_easymocap(dir: &Path, rig: &Rig) -> Result<(), CalibError> {
+    validate(rig, dir)?;
+    let mut intri = YamlWriter::new(dir.join(INTRINSICS))?;
+    let mut extri = YamlWriter::new(dir.join(EXTRINSICS))?;
+    for file in [&mut intri, &mut extri] {
+        file.strings("names", rig.cameras.iter().map(|camera| camera.id.as_str()))?;
+    }
+    for camera in &rig.cameras {
+        let (id, i) = (&camera.id, &camera.intrinsics);
+        let Lens::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] } = i.lens else {
+            return Err(CalibError::FisheyeUnsupported { camera: id.clone() });
+        };
+        intri.matrix(
+            &format!("K_{id}"),
+            3,
+            &[i.focal_px.x, 0.0, i.center_px.x, 0.0, i.focal_px.y, i.center_px.y, 0.0, 0.0, 1.0],
+        )?;
+        intri.matrix(&format!("dist_{id}"), 5, &[k1, k2, p1, p2, k3])?;
+        intri.integer(&format!("H_{id}"), i.height)?;
+        intri.integer(&format!("W_{id}"), i.width)?;
+        let rotation = camera.camera_from_world.rotation;
+        extri.matrix(&format!("R_{id}"), 1, &rotation.to_scaled_axis().to_array())?;
+        extri.matrix(&format!("Rot_{id}"), 3, &DMat3::from_quat(rotation).transpose().to_cols_array())?;
+        extri.matrix(&format!("T_{id}"), 1, &camera.camera_from_world.translation.to_array())?;
+    }
+    intri.finish()?;
+    extri.finish()
+}

@@ -1,0 +1,118 @@
+//! Why a calibration is refused.
+
+use std::path::PathBuf;
+
+use flyrig_types::{CameraError, CameraId};
+
+/// Each text names the file, the camera where there is one, and the mend.
+#[derive(Debug, thiserror::Error)]
+pub enum CalibError {
+    /// The file cannot be read.
+    #[error("{}: cannot be read: {source}; a calibration folder holds intri.yml and extri.yml", path.display())]
+    Read {
+        /// Which file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The file cannot be written.
+    #[error("{}: cannot be written: {reason}", path.display())]
+    Write {
+        /// Which file.
+        path: PathBuf,
+        /// What went wrong.
+        reason: String,
+    },
+    /// Not a file of OpenCV's FileStorage.
+    #[error("{}: is not a YAML file of OpenCV's FileStorage ({reason}); export the calibration again", path.display())]
+    Parse {
+        /// Which file.
+        path: PathBuf,
+        /// What OpenCV said.
+        reason: String,
+    },
+    /// No camera in it.
+    #[error("{}: names no camera; expected a list `names` or matrices {expected}", path.display())]
+    NoCameras {
+        /// Which file.
+        path: PathBuf,
+        /// Keys that would name cameras.
+        expected: &'static str,
+    },
+    /// A camera that only the other file has.
+    #[error(
+        "{}: camera {camera} is missing, but {} has it; calibrate it or take it out of both files",
+        path.display(), other.display()
+    )]
+    OnlyInOther {
+        /// The file without it.
+        path: PathBuf,
+        /// The file with it.
+        other: PathBuf,
+        /// Which camera.
+        camera: CameraId,
+    },
+    /// A key that must be there.
+    #[error("{}: camera {camera}: {key} is missing; {mend}", path.display())]
+    Missing {
+        /// Which file.
+        path: PathBuf,
+        /// Which camera.
+        camera: CameraId,
+        /// Which key.
+        key: String,
+        /// What to do.
+        mend: &'static str,
+    },
+    /// A value that cannot be right, or that we cannot model.
+    #[error("{}: camera {camera}: {key} {problem}; {mend}", path.display())]
+    Value {
+        /// Which file.
+        path: PathBuf,
+        /// Which camera.
+        camera: CameraId,
+        /// Which key.
+        key: String,
+        /// What is wrong, with the value.
+        problem: String,
+        /// What to do.
+        mend: &'static str,
+    },
+    /// Nothing says how large the pictures are.
+    #[error("{}: camera {camera}: the picture size is unknown; add H_{camera} and W_{camera}, or give pictures", path.display())]
+    UnknownSize {
+        /// Which file.
+        path: PathBuf,
+        /// Which camera.
+        camera: CameraId,
+    },
+    /// The calibration is for pictures of another size.
+    #[error(
+        "{}: camera {camera}: calibrated for pictures of {}x{}, but they are {}x{}; scale K with the pictures or replace them",
+        path.display(), calibrated.0, calibrated.1, pictures.0, pictures.1
+    )]
+    OtherSize {
+        /// Which file.
+        path: PathBuf,
+        /// Which camera.
+        camera: CameraId,
+        /// Width and height in the file.
+        calibrated: (u32, u32),
+        /// Width and height of the pictures.
+        pictures: (u32, u32),
+    },
+    /// A camera model that no camera has.
+    #[error("{}: {source}", path.display())]
+    Camera {
+        /// Which folder.
+        path: PathBuf,
+        /// What is wrong.
+        source: CameraError,
+    },
+    /// The format has no place for this lens.
+    #[error("camera {camera}: a fisheye lens cannot be written in EasyMocap's format")]
+    FisheyeUnsupported {
+        /// Which camera.
+        camera: CameraId,
+    },
+}

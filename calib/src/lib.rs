@@ -1,0 +1,15 @@
+//! Where the cameras are and when their pictures were taken: calibration files and time sync.
+//!
+//! Conventions are those of `flyrig_types`: OpenCV camera axes, pixel centres at integers, metres,
+//! nanoseconds.
+
+mod easymocap;
+mod error;
+mod sync;
+#[cfg(test)]
+mod sync_properties;
+mod yaml;
+
+pub use easymocap::{load_easymocap, save_easymocap};
+pub use error::CalibError;
+pub use sync::{DropCounts, SyncConfig, SyncCounts, Synchronizer};

@@ -1,0 +1,418 @@
+//! Sets of frames of one instant out of cameras that run on their own.
+
+use std::{collections::BTreeMap, sync::Arc};
+
+use flyrig_types::{CameraId, Frame, FrameSet, SetKind};
+use serde::{Deserialize, Serialize};
+
+/// Most frames that wait for a set, per camera: a clock gone wild must not eat the memory.
+const MAX_PENDING: usize = 64;
+
+/// How sets are made.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SyncConfig {
+    /// The camera whose frames set the times of the sets; the rig's first when `None`.
+    pub master: Option<CameraId>,
+    /// Largest distance of a frame from its set's time. Up to half the master's frame period the
+    /// nearest set of a frame is unambiguous.
+    pub window_nanos: u64,
+    /// Longest time, by the frames' own clock, that a set waits for a camera. A camera silent for
+    /// longer is waited for no more, and when it is the master, the next camera's clock takes over.
+    pub max_wait_nanos: u64,
+}
+
+impl Default for SyncConfig {
+    /// For 30 frames a second: a window of half a frame, waits for three frames.
+    fn default() -> Self {
+        Self { master: None, window_nanos: 16_666_667, max_wait_nanos: 100_000_000 }
+    }
+}
+
+/// Frames of one camera that came into no set.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DropCounts {
+    /// Came when their set was gone already.
+    pub too_old: u64,
+    /// Had the very time of another frame of the camera.
+    pub duplicate: u64,
+    /// Waited, but a nearer frame was taken, or no set came near enough.
+    pub superseded: u64,
+}
+
+impl DropCounts {
+    /// All of them.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        self.too_old + self.duplicate + self.superseded
+    }
+}
+
+/// What a [`Synchronizer`] has done so far.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SyncCounts {
+    /// Sets with every camera.
+    pub complete: u64,
+    /// Sets that lack a camera.
+    pub partial: u64,
+    /// Frames that came into no set, a slot a camera in rig order.
+    pub dropped_frames: Vec<DropCounts>,
+    /// Frames of cameras that are not in the rig.
+    pub unknown_camera: u64,
+}
+
+/// Makes sets of the frames nearest in time to the frames of a master camera.
+///
+/// A set is emitted as soon as nothing nearer can come (every camera that is not silent has
+/// delivered a frame at or past the set's time) or when it has waited
+/// [`SyncConfig::max_wait_nanos`]. Time is the frames' own: the same frames pushed in the same
+/// order give the same sets. A frame is used once at most, the sets' times grow strictly, and a set
+/// of another clock than the set before lies more than the window after it. All cameras must share
+/// one clock; make a new synchronizer when that clock starts anew.
+#[derive(Debug)]
+pub struct Synchronizer {
+    cameras: Vec<Camera>,
+    /// Slots in the order in which their clocks lead: the master, then the rig's order.
+    clock_order: Vec<usize>,
+    window: u64,
+    max_wait: u64,
+    /// Time of the first frame ever: cameras not seen yet are silent since then.
+    first_nanos: Option<i64>,
+    last_set: Option<(i64, usize)>,
+    sets: u64,
+    counts: SyncCounts,
+}
+
+#[derive(Debug)]
+struct Camera {
+    id: CameraId,
+    /// By time.
+    pending: BTreeMap<i64, Arc<Frame>>,
+    /// Time of the frame pushed last. Not the largest: one absurd time must not last.
+    latest: Option<i64>,
+    /// Time of the frame that went into a set last.
+    used: Option<i64>,
+}
+
+impl Synchronizer {
+    /// For the cameras of a rig, in its order. A master that is not among them is ignored with a
+    /// warning, and the first camera leads.
+    #[must_use]
+    pub fn new(cameras: &[CameraId], config: &SyncConfig) -> Self {
+        let master = config.master.as_ref().and_then(|master| {
+            let slot = cameras.iter().position(|id| id == master);
+            if slot.is_none() {
+                tracing::warn!("sync master {master} is not a camera of the rig; the first camera leads");
+            }
+            slot
+        });
+        let mut clock_order: Vec<usize> = (0..cameras.len()).collect();
+        if let Some(master) = master {
+            clock_order.retain(|&slot| slot != master);
+            clock_order.insert(0, master);
+        }
+        Self {
+            cameras: cameras
+                .iter()
+                .map(|id| Camera { id: id.clone(), pending: BTreeMap::new(), latest: None, used: None })
+                .collect(),
+            clock_order,
+            window: config.window_nanos,
+            max_wait: config.max_wait_nanos,
+            first_nanos: None,
+            last_set: None,
+            sets: 0,
+            counts: SyncCounts { dropped_frames: vec![DropCounts::default(); cameras.len()], ..SyncCounts::default() },
+        }
+    }
+
+    /// Takes a frame and gives the sets that became certain by it, in the order of time.
+    pub fn push(&mut self, frame: Frame) -> Vec<FrameSet> {
+        let Some(slot) = self.cameras.iter().position(|camera| camera.id == frame.camera) else {
+            self.counts.unknown_camera += 1;
+            return Vec::new();
+        };
+        let nanos = frame.capture_nanos;
+        self.first_nanos.get_or_insert(nanos);
+        let outdated = self.last_set.is_some_and(|(set, _)| nanos < set && nanos.abs_diff(set) >= self.window);
+        let camera = &mut self.cameras[slot];
+        let dropped = &mut self.counts.dropped_frames[slot];
+        camera.latest = Some(nanos);
+        if camera.used == Some(nanos) || camera.pending.contains_key(&nanos) {
+            dropped.duplicate += 1;
+        } else if outdated || camera.used.is_some_and(|used| nanos < used) {
+            dropped.too_old += 1;
+        } else {
+            camera.pending.insert(nanos, Arc::new(frame));
+            if camera.pending.len() > MAX_PENDING {
+                camera.pending.pop_first();
+                dropped.superseded += 1;
+            }
+        }
+        self.drain(false)
+    }
+
+    /// Gives the sets that were still waiting, at the end of a stream, and drops the frames that
+    /// came into none.
+    pub fn flush(&mut self) -> Vec<FrameSet> {
+        let sets = self.drain(true);
+        for (camera, dropped) in self.cameras.iter_mut().zip(&mut self.counts.dropped_frames) {
+            dropped.superseded += camera.pending.len() as u64;
+            camera.pending.clear();
+        }
+        sets
+    }
+
+    /// What happened so far.
+    #[must_use]
+    pub fn counts(&self) -> &SyncCounts {
+        &self.counts
+    }
+
+    fn drain(&mut self, flush: bool) -> Vec<FrameSet> {
+        let mut sets = Vec::new();
+        while let Some((clock, nanos)) = self.next_tick() {
+            // Just after a change of clock the instant of the last set is met again.
+            let again = self.last_set.is_some_and(|(last, by)| by != clock && nanos.abs_diff(last) <= self.window);
+            if again {
+                self.cameras[clock].pending.remove(&nanos);
+                self.counts.dropped_frames[clock].superseded += 1;
+            } else if flush || self.is_certain(nanos) {
+                sets.push(self.emit(clock, nanos));
+            } else {
+                break;
+            }
+        }
+        sets
+    }
+
+    /// Time of the newest frame.
+    fn now(&self) -> Option<i64> {
+        self.cameras.iter().filter_map(|camera| camera.latest).max()
+    }
+
+    fn is_silent(&self, slot: usize) -> bool {
+        let since = self.cameras[slot].latest.or(self.first_nanos);
+        matches!((self.now(), since), (Some(now), Some(since)) if now.abs_diff(since) > self.max_wait)
+    }
+
+    /// The next set's time and the camera that gives it.
+    fn next_tick(&self) -> Option<(usize, i64)> {
+        for &slot in &self.clock_order {
+            let after_last = |nanos: &&i64| self.last_set.is_none_or(|(last, _)| **nanos > last);
+            if let Some(nanos) = self.cameras[slot].pending.keys().find(after_last) {
+                return Some((slot, *nanos));
+            }
+            if !self.is_silent(slot) {
+                return None;
+            }
+        }
+        None
+    }
+
+    fn is_certain(&self, nanos: i64) -> bool {
+        let waited = self.now().is_some_and(|now| now > nanos && now.abs_diff(nanos) >= self.max_wait);
+        waited
+            || self.cameras.iter().enumerate().all(|(slot, camera)| {
+                camera.latest.is_some_and(|latest| latest >= nanos)
+                    || camera.pending.contains_key(&nanos)
+                    || self.is_silent(slot)
+            })
+    }
+
+    fn emit(&mut self, clock: usize, nanos: i64) -> FrameSet {
+        let window = self.window;
+        let mut frames = Vec::with_capacity(self.cameras.len());
+        for (slot, camera) in self.cameras.iter_mut().enumerate() {
+            let before = camera.pending.range(..=nanos).next_back().map(|(time, _)| *time);
+            let after = camera.pending.range(nanos..).next().map(|(time, _)| *time);
+            let nearest = before
+                .into_iter()
+                .chain(after)
+                .min_by_key(|time| time.abs_diff(nanos))
+                .filter(|time| slot == clock || time.abs_diff(nanos) <= window);
+            frames.push(nearest.and_then(|time| camera.pending.remove(&time)));
+            if nearest.is_some() {
+                camera.used = nearest;
+            }
+            // What no later set can use: frames before the used one, and frames a window behind.
+            let before_purge = camera.pending.len();
+            camera.pending.retain(|time, _| {
+                nearest.is_none_or(|used| *time > used) && (*time >= nanos || time.abs_diff(nanos) < window)
+            });
+            self.counts.dropped_frames[slot].superseded += (before_purge - camera.pending.len()) as u64;
+        }
+        let set = FrameSet { index: self.sets, master_nanos: nanos, frames };
+        match set.kind() {
+            SetKind::Complete => self.counts.complete += 1,
+            SetKind::Partial => self.counts.partial += 1,
+        }
+        self.sets += 1;
+        self.last_set = Some((nanos, clock));
+        set
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_types::{Image, PixelFormat};
+
+    use super::*;
+
+    const MS: i64 = 1_000_000;
+
+    pub(crate) fn frame(camera: &str, capture_nanos: i64) -> Frame {
+        Frame {
+            camera: camera.into(),
+            sequence: 0,
+            capture_nanos,
+            exposure_nanos: None,
+            image: Image::new(1, 1, PixelFormat::Gray8, vec![0]).unwrap(),
+            mask: None,
+        }
+    }
+
+    fn synchronizer(window_ms: u64, max_wait_ms: u64) -> Synchronizer {
+        let config =
+            SyncConfig { master: None, window_nanos: window_ms * 1_000_000, max_wait_nanos: max_wait_ms * 1_000_000 };
+        Synchronizer::new(&["a".into(), "b".into(), "c".into()], &config)
+    }
+
+    /// Times in ms of a set's frames.
+    fn times(set: &FrameSet) -> Vec<Option<i64>> {
+        set.frames.iter().map(|frame| frame.as_ref().map(|frame| frame.capture_nanos / MS)).collect()
+    }
+
+    fn push_all(sync: &mut Synchronizer, frames: &[(&str, i64)]) -> Vec<FrameSet> {
+        frames.iter().flat_map(|(camera, ms)| sync.push(frame(camera, ms * MS))).collect()
+    }
+
+    #[test]
+    fn a_synchronous_rig_gives_a_set_with_its_last_frame() {
+        let mut sync = synchronizer(16, 100);
+        assert!(push_all(&mut sync, &[("c", 0), ("a", 0)]).is_empty());
+        let sets = push_all(&mut sync, &[("b", 0)]);
+        assert_eq!(sets.len(), 1);
+        assert_eq!((sets[0].index, sets[0].master_nanos, times(&sets[0])), (0, 0, vec![Some(0); 3]));
+        assert_eq!(sync.counts().complete, 1);
+    }
+
+    #[test]
+    fn the_nearest_frames_are_taken_and_keep_their_own_time() {
+        let mut sync = synchronizer(16, 100);
+        // b runs 5 ms behind, c 6 ms ahead of a.
+        let sets = push_all(&mut sync, &[("c", -6), ("a", 0), ("b", 5), ("c", 27), ("a", 33), ("b", 38), ("c", 60)]);
+        assert_eq!(
+            sets.iter().map(times).collect::<Vec<_>>(),
+            [vec![Some(0), Some(5), Some(-6)], vec![Some(33), Some(38), Some(27)]]
+        );
+        assert_eq!(sets[1].master_nanos, 33 * MS);
+    }
+
+    #[test]
+    fn a_frame_outside_the_window_leaves_its_slot_empty() {
+        let mut sync = synchronizer(10, 100);
+        let sets = push_all(&mut sync, &[("a", 0), ("b", 11), ("c", 10)]);
+        assert_eq!(times(&sets[0]), [Some(0), None, Some(10)]);
+        assert_eq!((sync.counts().complete, sync.counts().partial), (0, 1));
+        sync.flush();
+        assert_eq!(sync.counts().dropped_frames[1], DropCounts { superseded: 1, ..DropCounts::default() });
+    }
+
+    #[test]
+    fn a_dead_camera_is_waited_for_once_and_then_no_more() {
+        let mut sync = synchronizer(16, 100);
+        let mut emitted_at = Vec::new();
+        for tick in 0..8 {
+            for camera in ["a", "b"] {
+                for set in push_all(&mut sync, &[(camera, tick * 33)]) {
+                    emitted_at.push((set.master_nanos / MS, tick * 33));
+                }
+            }
+        }
+        // Nothing before c has been silent for more than 100 ms; then at once.
+        assert_eq!(
+            emitted_at,
+            [(0, 132), (33, 132), (66, 132), (99, 132), (132, 132), (165, 165), (198, 198), (231, 231)]
+        );
+        assert_eq!(sync.counts().partial, 8);
+    }
+
+    #[test]
+    fn another_clock_takes_over_from_a_dead_master_and_gives_back() {
+        let mut sync = synchronizer(16, 50);
+        let mut sets = Vec::new();
+        for tick in 0..12 {
+            let ms = tick * 33;
+            if !(3..8).contains(&tick) {
+                sets.extend(push_all(&mut sync, &[("a", ms)]));
+            }
+            sets.extend(push_all(&mut sync, &[("b", ms + 4), ("c", ms + 7)]));
+        }
+        sets.extend(sync.flush());
+        let master: Vec<i64> = sets.iter().map(|set| set.master_nanos / MS).collect();
+        assert_eq!(master[..3], [0, 33, 66]);
+        assert!(master.contains(&(4 * 33 + 4)), "{master:?}: b's clock while a is gone");
+        assert_eq!(master[master.len() - 3..], [9 * 33, 10 * 33, 11 * 33], "a leads again");
+        assert!(master.windows(2).all(|pair| pair[1] - pair[0] > 16), "{master:?}: no instant twice");
+        assert_eq!(sets.len(), 12, "{master:?}");
+    }
+
+    #[test]
+    fn late_and_doubled_frames_are_dropped_and_counted() {
+        let mut sync = synchronizer(16, 100);
+        push_all(&mut sync, &[("a", 100), ("b", 100), ("b", 100), ("c", 100)]);
+        assert!(push_all(&mut sync, &[("a", 100), ("b", 50), ("c", 99), ("nobody", 0)]).is_empty());
+        let counts = sync.counts();
+        assert_eq!(counts.dropped_frames[0].duplicate, 1);
+        assert_eq!((counts.dropped_frames[1].duplicate, counts.dropped_frames[1].too_old), (1, 1));
+        assert_eq!(counts.dropped_frames[2].too_old, 1);
+        assert_eq!(counts.unknown_camera, 1);
+    }
+
+    #[test]
+    fn frames_of_one_camera_may_come_out_of_order() {
+        let mut sync = synchronizer(16, 200);
+        let mut sets = push_all(&mut sync, &[("b", 33), ("b", 0), ("a", 0), ("c", 0), ("a", 33), ("c", 33), ("b", 66)]);
+        sets.extend(sync.flush());
+        assert_eq!(sets.iter().map(times).collect::<Vec<_>>(), [vec![Some(0); 3], vec![Some(33); 3]]);
+    }
+
+    #[test]
+    fn a_camera_that_alone_floods_keeps_a_bounded_queue() {
+        let mut sync = synchronizer(16, u64::MAX / 1_000_000);
+        for tick in 0..1000 {
+            push_all(&mut sync, &[("b", tick * 33)]);
+        }
+        assert!(sync.cameras.iter().all(|camera| camera.pending.len() <= MAX_PENDING));
+        sync.flush();
+        assert_eq!(sync.counts().dropped_frames[1].superseded, 1000);
+    }
+
+    #[test]
+    fn the_ends_of_time_do_not_overflow() {
+        for (window_nanos, max_wait_nanos) in [(0, 0), (u64::MAX, u64::MAX), (5, 0), (0, 5)] {
+            let config = SyncConfig { master: Some("b".into()), window_nanos, max_wait_nanos };
+            let mut sync = Synchronizer::new(&["a".into(), "b".into()], &config);
+            let mut sets = Vec::new();
+            for nanos in [0, i64::MAX, i64::MIN, -1, i64::MAX - 1, i64::MIN + 1] {
+                sets.extend(sync.push(frame("a", nanos)));
+                sets.extend(sync.push(frame("b", nanos)));
+            }
+            sets.extend(sync.flush());
+            let in_sets: usize = sets.iter().map(|set| set.present().count()).sum();
+            let dropped: u64 = sync.counts().dropped_frames.iter().map(DropCounts::total).sum();
+            assert_eq!(in_sets as u64 + dropped, 12);
+            assert!(sets.windows(2).all(|pair| pair[0].master_nanos < pair[1].master_nanos));
+        }
+    }
+
+    #[test]
+    fn an_empty_rig_and_an_unknown_master_do_no_harm() {
+        let mut none = Synchronizer::new(&[], &SyncConfig::default());
+        assert!(none.push(frame("a", 0)).is_empty());
+        let config = SyncConfig { master: Some("zz".into()), ..SyncConfig::default() };
+        let mut sync = Synchronizer::new(&["a".into()], &config);
+        assert_eq!(sync.push(frame("a", 0)).len(), 1);
+    }
+}
