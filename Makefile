@@ -1,0 +1,27 @@
+# Two commands set everything up: `make demo` and `make test`. `make help` lists the rest.
+CARGO ?= cargo
+OUT ?= out/demo
+
+.PHONY: help setup demo test check
+
+help:
+	@echo "make demo    install what is missing, build, run the simulated rig, show the report (OUT=$(OUT))"
+	@echo "make test    install what is missing, build, run every test"
+	@echo "make check   format, lints and documentation, as CI runs them"
+	@echo "make setup   only install what is missing"
+
+setup:
+	@scripts/setup.sh
+
+demo: setup
+	@echo "demo: building flyrig (the first build takes 10 to 20 minutes on two cores, later ones seconds)"
+	$(CARGO) build --release --locked -p flyrig
+	$(CARGO) run --release --locked -q -p flyrig -- demo --out $(OUT)
+
+test: setup
+	$(CARGO) test --release --locked --workspace
+
+check: setup
+	$(CARGO) fmt --all -- --check
+	$(CARGO) clippy --release --locked --workspace --all-targets -- -D warnings
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --release --locked --workspace --no-deps
