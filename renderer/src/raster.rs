@@ -1,12 +1,18 @@
-//! Forward splat rasteriser.
+//! Forward splat rasteriser: what it draws and how it is called.
 
-use flyrig_gpu::{GpuContext, GpuError, GpuTimer};
+use flyrig_gpu::{CameraUniform, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
 use flyrig_types::Camera;
+use wgpu::{BindingResource, CommandEncoder, ComputePass, ComputePassDescriptor};
 
+use crate::raster_buffers::PictureBuffers;
+use crate::raster_kernels::{Frame, RasterKernels, RasterShape};
+use crate::scan::{CHUNK_GROUP, Scan, run};
+use crate::sort::{RadixSort, SortPass};
+use crate::uniforms::{UniformWriter, Uniforms};
 use crate::{GaussianBuffers, RenderTarget};
 
 /// Which pictures of a [`RenderTarget`] are written; the others keep their content.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Outputs {
     /// [`RenderTarget::color`].
     pub color: bool,
@@ -32,7 +38,9 @@ pub struct RasterSettings {
     pub cull_backfacing: bool,
     /// What to write.
     pub outputs: Outputs,
-    /// Variance of the screen-space low-pass filter, square pixels.
+    /// Variance of the low-pass filter that is added to every splat on the screen, square pixels.
+    /// The splat's opacity falls so that its integral stays: Mip-Splatting's 2D Mip filter (Yu et al.
+    /// 2024, Eq. 10). 0.1 is that paper's value for one pixel.
     pub filter_variance_px2: f32,
 }
 
@@ -42,10 +50,39 @@ impl Default for RasterSettings {
     }
 }
 
-/// Draws Gaussians into pictures. Buffers and pipelines are made once and grow with the picture.
+/// What the latest picture needed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RasterStats {
+    /// Gaussians that touch the picture.
+    pub visible_gaussians: u32,
+    /// Pairs of a Gaussian and a tile, at most one more than there is room for.
+    pub pairs: u32,
+    /// Pictures since this rasteriser was made that wanted more pairs than there was room for: they
+    /// lack their farthest Gaussians.
+    pub overflowed_pictures: u32,
+}
+
+/// Draws isotropic Gaussians into pictures: projection through the camera's lens (EWA splatting), stable
+/// sort by depth, lists by tile, and front-to-back blending, all on the GPU without a wait.
+///
+/// - Depth order is that of the centres, in steps of at most 2^-22 of their range; equal depths keep the
+///   order of the buffers. Equal input gives equal bytes on one device.
+/// - `alpha = min(opacity * exp(-r²/2), 0.99)`; below 1/255 a splat does not touch a pixel; a pixel is
+///   finished when less than 1e-4 of the light behind it would pass.
+/// - A Gaussian with any number that is not finite, with scale or opacity not above 0, behind
+///   [`RasterSettings::near_m`], or outside the lens's valid radius is not drawn.
+/// - Buffers and pipelines are made once; they grow with the picture and the number of Gaussians.
 #[derive(Debug)]
 pub struct Rasterizer {
-    max_gaussians: usize,
+    kernels: RasterKernels,
+    scan: Scan,
+    sort: RadixSort,
+    splats: StorageBuffer<[f32; 8]>,
+    rects: StorageBuffer<[u32; 2]>,
+    chunk_pairs: StorageBuffer<u32>,
+    pair_total: StorageBuffer<u32>,
+    stats: StorageBuffer<u32>,
+    picture: Option<PictureBuffers>,
 }
 
 impl Rasterizer {
@@ -53,42 +90,196 @@ impl Rasterizer {
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
-    pub fn new(_gpu: &GpuContext, max_gaussians: usize) -> Result<Self, GpuError> {
-        Ok(Self { max_gaussians })
+    pub fn new(gpu: &GpuContext, max_gaussians: usize) -> Result<Self, GpuError> {
+        Self::with_shape(gpu, max_gaussians, RasterShape::for_adapter(gpu))
     }
 
-    /// Records the rendering of one picture.
+    pub(crate) fn with_shape(gpu: &GpuContext, max_gaussians: usize, shape: RasterShape) -> Result<Self, GpuError> {
+        Ok(Self {
+            kernels: RasterKernels::new(gpu, shape),
+            scan: Scan::new(gpu, shape.sort.chunks)?,
+            sort: RadixSort::new(gpu, max_gaussians, shape.sort)?,
+            splats: StorageBuffer::zeroed(gpu, "splats", max_gaussians)?,
+            rects: StorageBuffer::zeroed(gpu, "splat rectangles", max_gaussians)?,
+            chunk_pairs: StorageBuffer::zeroed(gpu, "pairs a chunk", shape.max_bin_chunks as usize)?,
+            pair_total: StorageBuffer::zeroed(gpu, "pair total", 1)?,
+            stats: StorageBuffer::zeroed(gpu, "raster statistics", 3)?,
+            picture: None,
+        })
+    }
+
+    /// Records the rendering of one picture. Its size is the target's; the camera's own width and height
+    /// do not matter. Any number of pictures can go into one encoder.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`] when buffers must grow and cannot.
     pub fn encode(
         &mut self,
         gpu: &GpuContext,
-        encoder: &mut wgpu::CommandEncoder,
+        encoder: &mut CommandEncoder,
         gaussians: &GaussianBuffers,
         camera: &Camera,
         settings: &RasterSettings,
         target: &RenderTarget,
     ) -> Result<(), GpuError> {
-        self.encode_timed(gpu, encoder, gaussians, camera, settings, target, None)
+        self.encode_timed(gpu, encoder, gaussians, (camera, settings), target, None)
     }
 
-    /// [`Self::encode`] with the time of every stage.
+    /// [`Self::encode`] with the times of its four stages: "project", "depth sort", "tile lists", "blend".
     ///
     /// # Errors
     /// As [`Self::encode`].
-    #[allow(clippy::too_many_arguments)]
     pub fn encode_timed(
         &mut self,
-        _gpu: &GpuContext,
-        _encoder: &mut wgpu::CommandEncoder,
+        gpu: &GpuContext,
+        encoder: &mut CommandEncoder,
         gaussians: &GaussianBuffers,
-        _camera: &Camera,
-        _settings: &RasterSettings,
-        _target: &RenderTarget,
-        _timer: Option<&mut GpuTimer>,
+        (camera, settings): (&Camera, &RasterSettings),
+        target: &RenderTarget,
+        mut timer: Option<&mut GpuTimer>,
     ) -> Result<(), GpuError> {
-        self.max_gaussians = self.max_gaussians.max(gaussians.count());
+        if target.width == 0 || target.height == 0 {
+            return Ok(());
+        }
+        self.grow(gpu, gaussians.count(), target)?;
+        let Some(picture) = &self.picture else { return Ok(()) };
+        let frame = Frame {
+            camera: CameraUniform::from(camera),
+            size: [target.width, target.height],
+            tiles: picture.tiles,
+            gaussians: gaussians.count() as u32,
+            cull_backfacing: settings.cull_backfacing.into(),
+            with_canonical: settings.outputs.canonical.into(),
+            pair_capacity: picture.pairs.len() as u32,
+            near_m: settings.near_m,
+            filter_variance_px2: settings.filter_variance_px2,
+            bin_chunks: picture.bin_chunks,
+            unused: 0,
+        };
+        let uniforms = self.uniforms(gpu, &frame, picture);
+        let blend = self.kernels.blend(gpu, settings.outputs);
+        let stages = Stages { gpu, rasterizer: self, gaussians, target, picture, uniforms: &uniforms };
+        let mut pass = |name, record: &dyn Fn(&mut ComputePass<'_>)| {
+            let timestamp_writes = timer.as_mut().and_then(|timer| timer.stage(name));
+            record(&mut encoder.begin_compute_pass(&ComputePassDescriptor { label: Some(name), timestamp_writes }));
+        };
+        pass("project", &|pass| stages.project(pass));
+        pass("depth sort", &|pass| stages.depth_sort(pass));
+        pass("tile lists", &|pass| stages.tile_lists(pass));
+        pass("blend", &|pass| stages.blend(pass, &blend));
         Ok(())
+    }
+
+    /// Waits for the GPU and tells what the latest picture needed.
+    ///
+    /// # Errors
+    /// [`GpuError::Lost`].
+    pub fn stats(&self, gpu: &GpuContext) -> Result<RasterStats, GpuError> {
+        let stats = self.stats.read(gpu)?;
+        let get = |i: usize| stats.get(i).copied().unwrap_or_default();
+        Ok(RasterStats { visible_gaussians: get(0), pairs: get(1), overflowed_pictures: get(2) })
+    }
+
+    fn grow(&mut self, gpu: &GpuContext, count: usize, target: &RenderTarget) -> Result<(), GpuError> {
+        if count > self.splats.len() {
+            self.sort.grow(gpu, count)?;
+            self.rects = StorageBuffer::zeroed(gpu, "splat rectangles", count)?;
+            self.splats = StorageBuffer::zeroed(gpu, "splats", count)?;
+        }
+        let size = [target.width, target.height];
+        let shape = self.kernels.shape;
+        match &mut self.picture {
+            Some(picture) => picture.fit(gpu, shape, size, self.splats.len()),
+            none => {
+                *none = Some(PictureBuffers::new(gpu, shape, size, self.splats.len())?);
+                Ok(())
+            }
+        }
+    }
+
+    fn uniforms(&self, gpu: &GpuContext, frame: &Frame, picture: &PictureBuffers) -> Uniforms {
+        let mut writer = UniformWriter::default();
+        writer.push(frame);
+        writer.push(&[self.kernels.shape.sort.table_len(), 0, 0, 0]);
+        writer.push(&[picture.table_len(), 0, 0, 0]);
+        for index in 0..self.kernels.shape.sort.digit_passes {
+            writer.push(&SortPass::new(frame.gaussians, index));
+        }
+        writer.finish(gpu)
+    }
+}
+
+/// Places in the [`Uniforms`] of one encoding.
+const FRAME: usize = 0;
+const SORT_TABLE: usize = 1;
+const TILE_TABLE: usize = 2;
+const SORT_PASSES: usize = 3;
+
+/// Everything that one picture's kernels are bound to.
+struct Stages<'a> {
+    gpu: &'a GpuContext,
+    rasterizer: &'a Rasterizer,
+    gaussians: &'a GaussianBuffers,
+    target: &'a RenderTarget,
+    picture: &'a PictureBuffers,
+    uniforms: &'a Uniforms,
+}
+
+impl Stages<'_> {
+    fn project(&self, pass: &mut ComputePass<'_>) {
+        let (r, g) = (self.rasterizer, self.gaussians);
+        let resources = [
+            self.uniforms.get(FRAME),
+            g.center_scale.raw().as_entire_binding(),
+            g.normal.raw().as_entire_binding(),
+            g.color.raw().as_entire_binding(),
+            g.canonical.raw().as_entire_binding(),
+            r.splats.raw().as_entire_binding(),
+            r.rects.raw().as_entire_binding(),
+            r.sort.input().raw().as_entire_binding(),
+        ];
+        run(self.gpu, pass, &r.kernels.project, &resources, dispatch_1d(g.count() as u32, 64));
+    }
+
+    fn depth_sort(&self, pass: &mut ComputePass<'_>) {
+        let r = self.rasterizer;
+        let passes: Vec<_> =
+            (0..r.kernels.shape.sort.digit_passes as usize).map(|i| self.uniforms.get(SORT_PASSES + i)).collect();
+        r.sort.encode(self.gpu, pass, &r.scan, &passes, &self.uniforms.get(SORT_TABLE));
+    }
+
+    fn tile_lists(&self, pass: &mut ComputePass<'_>) {
+        let (r, p) = (self.rasterizer, self.picture);
+        let resources: [BindingResource<'_>; 8] = [
+            self.uniforms.get(FRAME),
+            r.sort.output().raw().as_entire_binding(),
+            r.sort.valid().raw().as_entire_binding(),
+            r.rects.raw().as_entire_binding(),
+            r.chunk_pairs.raw().as_entire_binding(),
+            p.table.raw().as_entire_binding(),
+            p.pairs.raw().as_entire_binding(),
+            r.stats.raw().as_entire_binding(),
+        ];
+        let groups = (p.bin_chunks.div_ceil(CHUNK_GROUP), 1);
+        run(self.gpu, pass, &r.kernels.count_pairs, &resources[..5], groups);
+        run(self.gpu, pass, &r.kernels.count_tiles, &resources[..6], groups);
+        r.scan.encode(self.gpu, pass, &self.uniforms.get(TILE_TABLE), &p.table, &r.pair_total);
+        run(self.gpu, pass, &r.kernels.list_pairs, &resources, groups);
+    }
+
+    fn blend(&self, pass: &mut ComputePass<'_>, kernel: &flyrig_gpu::ComputeKernel) {
+        let (r, p, t) = (self.rasterizer, self.picture, self.target);
+        let resources = [
+            self.uniforms.get(FRAME),
+            r.splats.raw().as_entire_binding(),
+            self.gaussians.color.raw().as_entire_binding(),
+            self.gaussians.canonical.raw().as_entire_binding(),
+            p.table.raw().as_entire_binding(),
+            p.pairs.raw().as_entire_binding(),
+            t.color.raw().as_entire_binding(),
+            t.depth.raw().as_entire_binding(),
+            t.canonical.raw().as_entire_binding(),
+        ];
+        run(self.gpu, pass, kernel, &resources, (p.tiles[0], p.tiles[1]));
     }
 }

@@ -1,0 +1,53 @@
+//! Uniforms of one encoding.
+
+use bytemuck::Pod;
+use wgpu::util::{BufferInitDescriptor, DeviceExt};
+use wgpu::{BindingResource, Buffer, BufferBinding, BufferSize, BufferUsages};
+
+use flyrig_gpu::GpuContext;
+
+/// Offsets in a uniform buffer may be any multiple of this on every adapter (WebGPU's default limit).
+const ALIGNMENT: usize = 256;
+
+/// Several uniforms in one buffer. It is made anew for every encoding: a queued write to a shared
+/// buffer would land before all pictures of a submission, not between them.
+#[derive(Debug, Default)]
+pub(crate) struct UniformWriter {
+    bytes: Vec<u8>,
+    ranges: Vec<(u64, BufferSize)>,
+}
+
+impl UniformWriter {
+    pub(crate) fn push<T: Pod>(&mut self, value: &T) {
+        let offset = self.bytes.len();
+        if let Some(size) = BufferSize::new(size_of::<T>() as u64) {
+            self.ranges.push((offset as u64, size));
+            self.bytes.extend_from_slice(bytemuck::bytes_of(value));
+            self.bytes.resize(self.bytes.len().next_multiple_of(ALIGNMENT), 0);
+        }
+    }
+
+    pub(crate) fn finish(self, gpu: &GpuContext) -> Uniforms {
+        let contents = if self.bytes.is_empty() { &[0; ALIGNMENT] } else { self.bytes.as_slice() };
+        let buffer = gpu.device.create_buffer_init(&BufferInitDescriptor {
+            label: Some("raster uniforms"),
+            contents,
+            usage: BufferUsages::UNIFORM,
+        });
+        Uniforms { buffer, ranges: self.ranges }
+    }
+}
+
+#[derive(Debug)]
+pub(crate) struct Uniforms {
+    buffer: Buffer,
+    ranges: Vec<(u64, BufferSize)>,
+}
+
+impl Uniforms {
+    /// The uniform pushed as number `index`.
+    pub(crate) fn get(&self, index: usize) -> BindingResource<'_> {
+        let (offset, size) = self.ranges.get(index).map_or((0, None), |&(offset, size)| (offset, Some(size)));
+        BindingResource::Buffer(BufferBinding { buffer: &self.buffer, offset, size })
+    }
+}

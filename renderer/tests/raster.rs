@@ -1,0 +1,257 @@
+//! The rasteriser against the f64 reference, over random and poisoned scenes.
+
+mod support;
+
+use std::sync::OnceLock;
+
+use flyrig_gpu::{AdapterChoice, GpuContext};
+use flyrig_renderer::{Outputs, RasterSettings, Rasterizer, RenderTarget};
+use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
+use glam::{DQuat, DVec2, DVec3, Vec3};
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+use support::reference::{self, Scene};
+use support::{Difference, render, upload};
+
+/// A splat whose alpha is at the cut may be counted on one side and not on the other: 1/255 of light.
+const MAX_ERROR: f64 = 1.0 / 255.0 + 1e-3;
+/// Rounding alone.
+const MEAN_ERROR: f64 = 2e-5;
+
+fn gpu() -> &'static GpuContext {
+    static GPU: OnceLock<GpuContext> = OnceLock::new();
+    GPU.get_or_init(|| GpuContext::new(&AdapterChoice::Best).unwrap())
+}
+
+const LENSES: [Lens; 4] = [
+    Lens::PINHOLE,
+    Lens::RadialTangential { radial: [-0.25, 0.08, -0.01], tangential: [0.001, -0.002] },
+    Lens::RadialTangential { radial: [0.1, -0.02, 0.0], tangential: [-0.003, 0.001] },
+    Lens::Fisheye { coefficients: [0.04, -0.01, 0.002, -0.0005] },
+];
+
+fn camera(lens: Lens, width: u32, height: u32, camera_from_world: Isometry) -> Camera {
+    let focal = f64::from(width.max(height));
+    Camera {
+        id: "test".into(),
+        intrinsics: Intrinsics {
+            width,
+            height,
+            focal_px: DVec2::new(focal, focal * 1.02),
+            center_px: DVec2::new(f64::from(width) * 0.5 - 0.3, f64::from(height) * 0.5 + 0.2),
+            lens,
+        },
+        camera_from_world,
+    }
+}
+
+/// Looks along world z, so that depths are the same number in f32 and f64.
+fn straight(lens: Lens, width: u32, height: u32) -> Camera {
+    camera(lens, width, height, Isometry::new(DQuat::IDENTITY, DVec3::new(0.0, 0.0, 2.0)))
+}
+
+fn random_camera(rng: &mut StdRng, lens: Lens, width: u32, height: u32) -> Camera {
+    let mut side = || rng.random_range(-1.0..1.0);
+    let eye = DVec3::new(side(), side(), side()).normalize_or(DVec3::X) * 2.2;
+    let target = DVec3::new(side(), side(), side()) * 0.1;
+    camera(lens, width, height, Isometry::look_at(eye, target, DVec3::Z))
+}
+
+fn random_scene(rng: &mut StdRng, count: usize) -> Scene {
+    let mut scene = Scene::default();
+    for _ in 0..count {
+        let mut signed = || rng.random_range(-1.0f32..1.0);
+        let center = Vec3::new(signed(), signed(), signed());
+        let normal = Vec3::new(signed(), signed(), signed()).normalize_or(Vec3::X);
+        let canonical = Vec3::new(signed(), signed(), signed());
+        let scale = 10f32.powf(rng.random_range(-3.0..-0.8));
+        let opacity = match rng.random_range(0..4) {
+            0 => 1.0,
+            1 => rng.random_range(0.0..0.01),
+            _ => rng.random_range(0.0..1.0),
+        };
+        let mut unit = || rng.random_range(0.0f32..1.0);
+        scene.center_scale.push(center.extend(scale).to_array());
+        scene.normal.push(normal.extend(0.0).to_array());
+        scene.color.push([unit(), unit(), unit(), opacity]);
+        scene.canonical.push(canonical.extend(0.0).to_array());
+    }
+    scene
+}
+
+/// Replaces every third Gaussian's numbers by poison.
+fn poison(rng: &mut StdRng, scene: &mut Scene) {
+    const BAD: [f32; 7] = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX, f32::MIN_POSITIVE, -1.0, 0.0];
+    for i in (0..scene.center_scale.len()).step_by(3) {
+        let bad = BAD[rng.random_range(0..BAD.len())];
+        let axis = rng.random_range(0..4);
+        match rng.random_range(0..4) {
+            0 => scene.center_scale[i][axis] = bad,
+            1 => scene.color[i][3] = bad,
+            2 => scene.center_scale[i][3] = bad,
+            _ if bad.is_finite() => {}
+            _ => [&mut scene.color, &mut scene.normal, &mut scene.canonical][axis % 3][i][axis % 3] = bad,
+        }
+    }
+}
+
+fn check(name: &str, rasterizer: &mut Rasterizer, scene: &Scene, camera: &Camera, settings: &RasterSettings) -> Difference {
+    let size = (camera.intrinsics.width, camera.intrinsics.height);
+    let gaussians = upload(gpu(), scene).unwrap();
+    let ours = render(gpu(), rasterizer, &gaussians, camera, settings, size).unwrap();
+    assert!(ours.is_finite(), "{name}: not finite");
+    let expected = reference::render(scene, camera, settings, size.0, size.1);
+    let d = Difference::between(&ours, &expected);
+    println!(
+        "{name:34} max {:.1e} mean {:.1e} | depth max {:.1e} | canonical max {:.1e} | mean alpha {:.2}",
+        d.color_max,
+        d.color_mean,
+        d.depth_max,
+        d.canonical_max,
+        expected.color.iter().map(|c| c[3]).sum::<f64>() / expected.color.len() as f64,
+    );
+    assert!(d.color_max < MAX_ERROR && d.color_mean < MEAN_ERROR, "{name}: {d:?}");
+    // Depths reach 4 m, canonical coordinates 1 m.
+    assert!(d.depth_max < 4.0 * MAX_ERROR && d.depth_mean < 4.0 * MEAN_ERROR, "{name}: {d:?}");
+    assert!(d.canonical_max < MAX_ERROR && d.canonical_mean < MEAN_ERROR, "{name}: {d:?}");
+    assert_eq!(rasterizer.stats(gpu()).unwrap().overflowed_pictures, 0);
+    d
+}
+
+#[test]
+fn random_scenes_agree_with_the_reference_for_every_lens() {
+    let mut rasterizer = Rasterizer::new(gpu(), 16).unwrap();
+    let mut rng = StdRng::seed_from_u64(1);
+    let (mut max, mut mean, mut scenes) = (0.0f64, 0.0, 0.0);
+    for seed in 0..6 {
+        for (l, lens) in LENSES.into_iter().enumerate() {
+            for poisoned in [false, true] {
+                let count = rng.random_range(1..900);
+                let mut scene = random_scene(&mut rng, count);
+                if poisoned {
+                    poison(&mut rng, &mut scene);
+                }
+                let (width, height) = (rng.random_range(1..140), rng.random_range(1..90));
+                let camera = random_camera(&mut rng, lens, width, height);
+                let settings = RasterSettings { cull_backfacing: seed % 2 == 0, ..Default::default() };
+                let name = format!("lens {l} {width}x{height} n {count} {}", if poisoned { "poisoned" } else { "" });
+                let d = check(&name, &mut rasterizer, &scene, &camera, &settings);
+                max = max.max(d.color_max);
+                mean += d.color_mean;
+                scenes += 1.0;
+            }
+        }
+    }
+    println!("{scenes} scenes on {}: max error {max:.2e}, mean {:.2e}", gpu().adapter_name(), mean / scenes);
+}
+
+#[test]
+fn hard_cases_agree_with_the_reference() {
+    let mut rng = StdRng::seed_from_u64(2);
+    let mut rasterizer = Rasterizer::new(gpu(), 0).unwrap();
+    let settings = RasterSettings { cull_backfacing: false, ..Default::default() };
+    let camera = straight(Lens::PINHOLE, 70, 50);
+    let mut check = |name: &str, scene: &Scene, camera: &Camera| {
+        check(name, &mut rasterizer, scene, camera, &settings);
+    };
+    check("empty scene", &Scene::default(), &camera);
+    let scene = random_scene(&mut rng, 300);
+    check("one pixel", &scene, &straight(Lens::PINHOLE, 1, 1));
+    check("one row", &scene, &straight(Lens::PINHOLE, 301, 1));
+
+    let mut flat = scene.clone();
+    flat.center_scale.iter_mut().for_each(|c| c[2] = 0.5);
+    check("all at one depth", &flat, &camera);
+
+    let mut opaque = scene.clone();
+    opaque.color.iter_mut().for_each(|c| c[3] = 1.0);
+    check("all opaque", &opaque, &camera);
+    opaque.color.iter_mut().for_each(|c| c[3] = 0.0);
+    check("all transparent", &opaque, &camera);
+
+    let mut plane = scene.clone();
+    for (i, c) in plane.center_scale.iter_mut().enumerate() {
+        c[2] = [-2.0, -2.1, 0.5, -5.0, f32::NAN, -1.951][i % 6];
+    }
+    check("on and behind the camera plane", &plane, &camera);
+
+    // Standard deviation 60 m seen from 2 m: the picture lies well inside.
+    let mut wide = scene.clone();
+    wide.center_scale[7] = [0.0, 0.0, 0.0, 300.0];
+    check("a Gaussian 1e4 px wide", &wide, &camera);
+    wide.center_scale.iter_mut().for_each(|c| c[3] = 300.0);
+    check("every Gaussian 1e4 px wide", &wide, &camera);
+}
+
+#[test]
+fn two_runs_give_the_same_bytes_and_one_submission_may_hold_many_pictures() {
+    let mut rng = StdRng::seed_from_u64(3);
+    let scene = random_scene(&mut rng, 5000);
+    let gaussians = upload(gpu(), &scene).unwrap();
+    let settings = RasterSettings::default();
+    let size = (200, 120);
+    let cameras: Vec<_> = LENSES.map(|lens| random_camera(&mut rng, lens, size.0, size.1)).into();
+    let mut rasterizer = Rasterizer::new(gpu(), 5000).unwrap();
+    let targets: Vec<_> = cameras.iter().map(|_| RenderTarget::new(gpu(), size.0, size.1).unwrap()).collect();
+    let mut encoder = gpu().device.create_command_encoder(&Default::default());
+    for (camera, target) in cameras.iter().zip(&targets) {
+        rasterizer.encode(gpu(), &mut encoder, &gaussians, camera, &settings, target).unwrap();
+    }
+    gpu().queue.submit([encoder.finish()]);
+    let mut other = Rasterizer::new(gpu(), 1).unwrap();
+    for (camera, target) in cameras.iter().zip(&targets) {
+        let again = render(gpu(), &mut other, &gaussians, camera, &settings, size).unwrap();
+        assert!(target.color.read(gpu()).unwrap() == again.color, "{:?}", camera.intrinsics.lens);
+        assert!(target.depth.read(gpu()).unwrap() == again.depth);
+        assert!(target.canonical.read(gpu()).unwrap() == again.canonical);
+        assert!(again.color.iter().any(|c| c[3] > 0.5), "something is seen");
+    }
+}
+
+#[test]
+fn pictures_that_were_not_asked_for_keep_their_content_and_the_others_do_not_change() {
+    let mut rng = StdRng::seed_from_u64(4);
+    let scene = random_scene(&mut rng, 400);
+    let gaussians = upload(gpu(), &scene).unwrap();
+    let camera = random_camera(&mut rng, LENSES[1], 90, 60);
+    let mut rasterizer = Rasterizer::new(gpu(), 400).unwrap();
+    let all = render(gpu(), &mut rasterizer, &gaussians, &camera, &RasterSettings::default(), (90, 60)).unwrap();
+    let settings = RasterSettings { outputs: Outputs::COLOR, ..Default::default() };
+    let color = render(gpu(), &mut rasterizer, &gaussians, &camera, &settings, (90, 60)).unwrap();
+    assert!(color.color == all.color);
+    assert!(color.depth.iter().all(|&d| d == 0.0) && color.canonical.as_flattened().iter().all(|&c| c == 0.0));
+}
+
+#[test]
+fn when_the_room_for_pairs_is_spent_the_farthest_are_missing_and_it_is_told() {
+    // 4000 Gaussians that each cover the whole picture: more pairs than there is room for.
+    let mut rng = StdRng::seed_from_u64(5);
+    let count = 4000;
+    let mut scene = random_scene(&mut rng, count);
+    for (i, (c, color)) in scene.center_scale.iter_mut().zip(&mut scene.color).enumerate() {
+        *c = [0.0, 0.0, i as f32 * 1e-3, 300.0];
+        color[3] = 0.005;
+    }
+    let camera = straight(Lens::PINHOLE, 640, 480);
+    let settings = RasterSettings { cull_backfacing: false, ..Default::default() };
+    let gaussians = upload(gpu(), &scene).unwrap();
+    let mut rasterizer = Rasterizer::new(gpu(), count).unwrap();
+    let ours = render(gpu(), &mut rasterizer, &gaussians, &camera, &settings, (640, 480)).unwrap();
+    let stats = rasterizer.stats(gpu()).unwrap();
+    assert_eq!(stats.overflowed_pictures, 1);
+    assert_eq!(stats.visible_gaussians, count as u32);
+    assert!(ours.is_finite());
+    // The nearest that fit, found from what is left in the middle of the picture.
+    let alpha = f64::from(ours.color[240 * 640 + 320][3]);
+    let kept = ((1.0 - alpha).ln() / (1.0f64 - 0.005).ln()).round() as usize;
+    assert!(kept > 10 && kept < count, "{kept}");
+    let cut = |v: &[[f32; 4]]| v[..kept].to_vec();
+    let nearest = Scene {
+        center_scale: cut(&scene.center_scale),
+        normal: cut(&scene.normal),
+        color: cut(&scene.color),
+        canonical: cut(&scene.canonical),
+    };
+    let d = Difference::between(&ours, &reference::render(&nearest, &camera, &settings, 640, 480));
+    assert!(d.color_max < MAX_ERROR, "{kept} kept: {d:?}");
+}
