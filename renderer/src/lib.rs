@@ -6,6 +6,11 @@ mod color;
 mod export;
 pub mod metrics;
 mod raster;
+mod raster_buffers;
+mod raster_kernels;
+mod scan;
+mod sort;
+mod uniforms;
 
 pub use appearance::{
     AppearanceError, AppearanceSettings, DiffusionHierarchy, DiffusionLevel, DirectAppearance, ViewInput,
@@ -13,4 +18,4 @@ pub use appearance::{
 pub use buffers::{GaussianBuffers, RenderTarget};
 pub use color::{composite_over, linear_from_srgb, rgba8_from_target, srgb_from_linear};
 pub use export::{ExportError, Splat, read_splats, write_mesh_ply, write_splat_ply};
-pub use raster::{Outputs, RasterSettings, Rasterizer};
+pub use raster::{Outputs, RasterSettings, RasterStats, Rasterizer};
