@@ -11,6 +11,7 @@
 mod body_asset;
 mod bvh;
 mod default_body;
+mod eliminate;
 mod error;
 mod gltf_file;
 mod gltf_import;
@@ -18,6 +19,7 @@ mod gltf_nodes;
 mod gpu_skinner;
 mod graph;
 mod part;
+mod point_grid;
 mod retarget;
 mod shape;
 mod skeleton;

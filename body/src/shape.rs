@@ -47,7 +47,7 @@ impl ShapeParams {
     /// Tall man, lean and strong.
     #[must_use]
     pub fn athlete() -> Self {
-        Self::from_pairs(&[("gender", 1.0), ("muscle", 0.9), ("weight", 0.4), ("height", 0.75), ("torso-vshape", 0.4)])
+        Self::from_pairs(&[("gender", 1.0), ("muscle", 0.9), ("weight", 0.4), ("height", 0.58), ("torso-vshape", 0.4)])
     }
 
     /// Heavy man with a belly, past his youth.
@@ -65,6 +65,6 @@ impl ShapeParams {
     /// Small, slender woman.
     #[must_use]
     pub fn petite_woman() -> Self {
-        Self::from_pairs(&[("gender", 0.0), ("weight", 0.3), ("height", 0.25)])
+        Self::from_pairs(&[("gender", 0.0), ("weight", 0.35), ("height", 0.44)])
     }
 }

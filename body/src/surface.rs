@@ -1,37 +1,170 @@
 //! Evenly spaced Gaussians on the surface.
 
 use glam::{Vec2, Vec3};
+use rand::{RngExt, SeedableRng};
+use rayon::prelude::*;
 
+use crate::eliminate::eliminate;
+use crate::part::part_of_joints;
+use crate::point_grid::PointGrid;
 use crate::{BodyError, Part, SkinWeights, Template};
 
 /// About 4 mm apart on an adult (FlyHuman, section 3.1).
 pub const DEFAULT_GAUSSIAN_COUNT: usize = 115_000;
 
+/// More would not fit the memory of any machine this runs on.
+const MAX_GAUSSIANS: usize = 10_000_000;
+
+/// Random points thrown for each one kept; more make the spacing evener and take longer.
+const CANDIDATES_PER_GAUSSIAN: usize = 4;
+
+/// Standard deviation of a Gaussian over the distance to its nearest neighbour (FlyHuman, section 3.1).
+const SCALE_OF_SPACING: f32 = 0.75;
+
 /// Gaussians on the canonical surface; all lists have the same length.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct SurfaceGaussians {
     /// Canonical, metres.
     pub positions: Vec<Vec3>,
-    /// Canonical unit normals.
+    /// Canonical unit normals, interpolated.
     pub normals: Vec<Vec3>,
-    /// Texture coordinates.
+    /// Texture coordinates, interpolated.
     pub uvs: Vec<Vec2>,
-    /// Body parts.
+    /// Body part of the joint that moves the Gaussian most.
     pub parts: Vec<Part>,
-    /// Skin weights.
+    /// Skin weights, interpolated, the strongest four.
     pub skin: Vec<SkinWeights>,
-    /// Standard deviation, metres: 0.75 of the distance to the nearest neighbour.
+    /// Standard deviation, metres: 0.75 of the distance to the nearest neighbour on the same side of the body.
     pub scale_m: Vec<f32>,
-    /// Triangle of the template.
+    /// Triangle of the template, ascending.
     pub triangle: Vec<u32>,
-    /// Weights of the triangle's corners.
+    /// Weights of the triangle's corners, sum 1.
     pub barycentric: Vec<[f32; 3]>,
 }
 
-/// `count` evenly spaced Gaussians.
+impl SurfaceGaussians {
+    /// Number of Gaussians.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.positions.len()
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.positions.is_empty()
+    }
+}
+
+/// `count` Gaussians, evenly spaced over the template's surface (blue noise). The same template, count and
+/// seed give the same Gaussians.
 ///
 /// # Errors
-/// [`BodyError::Mesh`].
-pub fn sample_surface(_template: &Template, _count: usize, _seed: u64) -> Result<SurfaceGaussians, BodyError> {
-    Err(BodyError::Asset("not yet".to_owned()))
+/// [`BodyError::Mesh`] when the template's lists disagree, a number is not finite, the surface has no area, or
+/// `count` is 0 or above ten million.
+pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<SurfaceGaussians, BodyError> {
+    template.check()?;
+    let fail = |message: String| BodyError::Mesh { name: template.name.clone(), message };
+    if count == 0 || count > MAX_GAUSSIANS {
+        return Err(fail(format!("{count} Gaussians asked for; choose 1 to {MAX_GAUSSIANS}")));
+    }
+    let mut area = 0.0;
+    let area_up_to: Vec<f64> = template
+        .triangles
+        .iter()
+        .map(|triangle| {
+            let [a, b, c] = corners(template, triangle).map(|p| p.as_dvec3());
+            area += 0.5 * (b - a).cross(c - a).length();
+            area
+        })
+        .collect();
+    if !(area.is_finite() && area > 1e-9) {
+        return Err(fail("the surface has no area; is it in metres?".to_owned()));
+    }
+
+    let mut rng = rand::rngs::StdRng::seed_from_u64(seed);
+    let thrown = count * CANDIDATES_PER_GAUSSIAN;
+    let candidates: Vec<(u32, [f32; 3])> = (0..thrown)
+        .map(|i| {
+            // One point in each of `thrown` equal shares of the area.
+            let at = (i as f64 + rng.random::<f64>()) / thrown as f64 * area;
+            let triangle = area_up_to.partition_point(|&end| end < at).min(area_up_to.len() - 1);
+            let (mut v, mut w): (f32, f32) = (rng.random(), rng.random());
+            if v + w > 1.0 {
+                (v, w) = (1.0 - v, 1.0 - w);
+            }
+            (triangle as u32, [1.0 - v - w, v, w])
+        })
+        .collect();
+    let blend = |list: &[Vec3], (triangle, weights): (u32, [f32; 3])| -> Vec3 {
+        template.triangles[triangle as usize].iter().zip(weights).map(|(&i, w)| list[i as usize] * w).sum()
+    };
+    let normal = |candidate: (u32, [f32; 3])| {
+        let [a, b, c] = corners(template, &template.triangles[candidate.0 as usize]);
+        blend(&template.normals, candidate).try_normalize().unwrap_or((b - a).cross(c - a).normalize_or(Vec3::Y))
+    };
+    let thrown_positions: Vec<Vec3> = candidates.iter().map(|&c| blend(&template.positions, c)).collect();
+    let thrown_normals: Vec<Vec3> = candidates.iter().map(|&c| normal(c)).collect();
+    let kept = eliminate(&thrown_positions, &thrown_normals, count, area);
+
+    let positions: Vec<Vec3> = kept.iter().map(|&i| thrown_positions[i]).collect();
+    let normals: Vec<Vec3> = kept.iter().map(|&i| thrown_normals[i]).collect();
+    let scale_m = nearest_distances(&positions, &normals, (area / count as f64).sqrt() as f32)
+        .into_iter()
+        .map(|distance| distance * SCALE_OF_SPACING)
+        .collect();
+    let part_of_joint = part_of_joints(&template.skeleton);
+    let skin: Vec<SkinWeights> = kept.iter().map(|&i| blend_skin(template, candidates[i])).collect();
+    Ok(SurfaceGaussians {
+        uvs: kept
+            .iter()
+            .map(|&i| {
+                let (triangle, weights) = candidates[i];
+                let corners = template.triangles[triangle as usize];
+                corners.iter().zip(weights).map(|(&corner, w)| template.uvs[corner as usize] * w).sum()
+            })
+            .collect(),
+        parts: skin.iter().map(|s| part_of_joint[usize::from(s.joints[0])]).collect(),
+        skin,
+        scale_m,
+        triangle: kept.iter().map(|&i| candidates[i].0).collect(),
+        barycentric: kept.iter().map(|&i| candidates[i].1).collect(),
+        positions,
+        normals,
+    })
+}
+
+fn corners(template: &Template, triangle: &[u32; 3]) -> [Vec3; 3] {
+    triangle.map(|i| template.positions[i as usize])
+}
+
+fn blend_skin(template: &Template, (triangle, weights): (u32, [f32; 3])) -> SkinWeights {
+    let mut influences = [(0, 0.0); 12];
+    for (slot, influence) in influences.iter_mut().enumerate() {
+        let (corner, k) = (slot / 4, slot % 4);
+        let skin = &template.skin[template.triangles[triangle as usize][corner] as usize];
+        *influence = (skin.joints[k], skin.weights[k] * weights[corner]);
+    }
+    SkinWeights::strongest(&influences).unwrap_or(SkinWeights { joints: [0; 4], weights: [1.0, 0.0, 0.0, 0.0] })
+}
+
+/// Distance of each point to the nearest other one whose normal does not oppose its own; `spacing` where
+/// there is none within 8 spacings.
+fn nearest_distances(points: &[Vec3], normals: &[Vec3], spacing: f32) -> Vec<f32> {
+    let grid = PointGrid::new(points, spacing);
+    let nearest = |i: usize| {
+        for radius in [1.0, 2.0, 4.0, 8.0].map(|factor| factor * spacing) {
+            let mut best = f32::INFINITY;
+            grid.within(points[i], radius, |j, squared| {
+                if j != i && normals[i].dot(normals[j]) > 0.0 {
+                    best = best.min(squared);
+                }
+            });
+            if best.is_finite() {
+                return best.sqrt();
+            }
+        }
+        spacing
+    };
+    (0..points.len()).into_par_iter().map(nearest).collect()
 }

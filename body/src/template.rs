@@ -2,7 +2,7 @@
 
 use glam::{Vec2, Vec3};
 
-use crate::Skeleton;
+use crate::{BodyError, Skeleton};
 
 /// Which joints move a point, the strongest four; the weights add up to 1.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -85,6 +85,36 @@ pub struct Template {
 }
 
 impl Template {
+    /// Whether the lists agree, every index points at something and every number is finite.
+    ///
+    /// # Errors
+    /// [`BodyError::Mesh`] says what is wrong.
+    pub fn check(&self) -> Result<(), BodyError> {
+        let fail = |message: &str| Err(BodyError::Mesh { name: self.name.clone(), message: message.to_owned() });
+        let count = self.positions.len();
+        let lengths = [self.normals.len(), self.uvs.len(), self.skin.len(), self.parts.len()];
+        if lengths != [count; 4] {
+            return fail("positions, normals, texture coordinates, skin and parts differ in number");
+        }
+        if self.triangles.is_empty() {
+            return fail("no triangles");
+        }
+        if self.triangles.iter().flatten().any(|&index| index as usize >= count) {
+            return fail("a triangle names a vertex that does not exist");
+        }
+        let finite = self.positions.iter().chain(&self.normals).all(|v| v.is_finite())
+            && self.uvs.iter().all(|uv| uv.is_finite())
+            && self.skin.iter().flat_map(|skin| skin.weights).all(f32::is_finite);
+        if !finite {
+            return fail("a position, normal, texture coordinate or weight is not a finite number");
+        }
+        let joints = self.skeleton.joints().len();
+        if self.skin.iter().flat_map(|skin| skin.joints).any(|joint| usize::from(joint) >= joints) {
+            return fail("a vertex hangs on a joint that does not exist");
+        }
+        Ok(())
+    }
+
     /// Maps each vertex to its position class: vertices split at UV seams share one.
     #[must_use]
     pub fn welded(&self) -> Vec<u32> {
@@ -92,8 +122,9 @@ impl Template {
         self.positions
             .iter()
             .map(|p| {
+                // Adding zero turns -0.0 into 0.0.
                 let next = classes.len() as u32;
-                *classes.entry(p.to_array().map(f32::to_bits)).or_insert(next)
+                *classes.entry((*p + 0.0).to_array().map(f32::to_bits)).or_insert(next)
             })
             .collect()
     }

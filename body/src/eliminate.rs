@@ -1,0 +1,87 @@
+//! Even spacing by leaving out points: weighted sample elimination (C. Yuksel, "Sample Elimination for
+//! Generating Poisson Disk Sample Sets", Computer Graphics Forum 34(2), 2015).
+
+use std::cmp::Ordering;
+use std::collections::BinaryHeap;
+
+use glam::Vec3;
+use rayon::prelude::*;
+
+use crate::point_grid::PointGrid;
+
+/// Weight function of the paper: (1 - d / 2 r_max)^ALPHA, with distances below
+/// 2 r_min = 2 r_max (1 - (N / M)^GAMMA) BETA taken as 2 r_min.
+const ALPHA: i32 = 8;
+const BETA: f32 = 0.65;
+const GAMMA: f32 = 1.5;
+
+/// Indices, ascending, of `keep` of the points such that they lie evenly on a surface of `area` square metres.
+/// Points whose normals oppose each other lie on different sheets and do not push each other away.
+pub(crate) fn eliminate(points: &[Vec3], normals: &[Vec3], keep: usize, area: f64) -> Vec<usize> {
+    if keep >= points.len() {
+        return (0..points.len()).collect();
+    }
+    // Radius of the densest packing of `keep` discs.
+    let r_max = (area / (2.0 * 3.0f64.sqrt() * keep as f64)).sqrt() as f32;
+    let r_min = r_max * (1.0 - (keep as f32 / points.len() as f32).powf(GAMMA)) * BETA;
+    let weight = |distance: f32| (1.0 - distance.max(2.0 * r_min) / (2.0 * r_max)).max(0.0).powi(ALPHA);
+
+    let grid = PointGrid::new(points, 2.0 * r_max);
+    let neighbors: Vec<Vec<(u32, f32)>> = points
+        .par_iter()
+        .enumerate()
+        .map(|(i, &point)| {
+            let mut list = Vec::new();
+            grid.within(point, 2.0 * r_max, |j, squared| {
+                if j != i && normals[i].dot(normals[j]) > 0.0 {
+                    list.push((j as u32, weight(squared.sqrt())));
+                }
+            });
+            list
+        })
+        .collect();
+    let mut weights: Vec<f32> = neighbors.iter().map(|list| list.iter().map(|(_, w)| w).sum()).collect();
+    let mut heap: BinaryHeap<Entry> =
+        weights.iter().enumerate().map(|(index, &weight)| Entry { weight, index }).collect();
+    let mut alive = vec![true; points.len()];
+    let mut left = points.len();
+    while left > keep {
+        let Some(Entry { weight, index }) = heap.pop() else { break };
+        // Weights only fall, so an entry of old is too high: put it back where it belongs.
+        if weight > weights[index] {
+            heap.push(Entry { weight: weights[index], index });
+            continue;
+        }
+        alive[index] = false;
+        left -= 1;
+        for &(neighbor, w) in &neighbors[index] {
+            weights[neighbor as usize] -= w;
+        }
+    }
+    (0..points.len()).filter(|&i| alive[i]).collect()
+}
+
+struct Entry {
+    weight: f32,
+    index: usize,
+}
+
+impl Ord for Entry {
+    fn cmp(&self, other: &Self) -> Ordering {
+        self.weight.total_cmp(&other.weight).then(other.index.cmp(&self.index))
+    }
+}
+
+impl PartialOrd for Entry {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl PartialEq for Entry {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other) == Ordering::Equal
+    }
+}
+
+impl Eq for Entry {}

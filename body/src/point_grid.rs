@@ -1,0 +1,98 @@
+//! Points in a grid of cubes, for questions about who is near.
+
+use glam::{IVec3, Vec3};
+
+/// Cells beyond this many would cost more memory than they save time.
+const MAX_CELLS: f64 = 16e6;
+
+/// Finite points sorted into cubes.
+pub(crate) struct PointGrid<'a> {
+    points: &'a [Vec3],
+    origin: Vec3,
+    cell: f32,
+    size: IVec3,
+    /// Where each cell's points begin in `sorted`, one more than cells.
+    starts: Vec<u32>,
+    sorted: Vec<u32>,
+}
+
+impl<'a> PointGrid<'a> {
+    /// `cell`: side of a cube, best the radius that will be asked for.
+    pub fn new(points: &'a [Vec3], cell: f32) -> Self {
+        let min = points.iter().copied().reduce(Vec3::min).unwrap_or(Vec3::ZERO);
+        let max = points.iter().copied().reduce(Vec3::max).unwrap_or(Vec3::ZERO);
+        let extent = (max - min).max(Vec3::splat(1e-6));
+        let cells = |cell: f32| (extent / cell).as_dvec3().ceil().max(glam::DVec3::ONE).element_product();
+        let mut cell = cell.max(extent.max_element() * 1e-5).max(1e-6);
+        while cells(cell) > MAX_CELLS {
+            cell *= 1.3;
+        }
+        let size = (extent / cell).as_ivec3() + IVec3::ONE;
+        let mut grid = Self { points, origin: min, cell, size, starts: Vec::new(), sorted: vec![0; points.len()] };
+        let mut starts = vec![0u32; size.element_product() as usize + 1];
+        for &point in points {
+            starts[grid.index(grid.cell_of(point)) + 1] += 1;
+        }
+        for i in 1..starts.len() {
+            starts[i] += starts[i - 1];
+        }
+        let mut next = starts.clone();
+        for (i, &point) in points.iter().enumerate() {
+            let slot = &mut next[grid.index(grid.cell_of(point))];
+            grid.sorted[*slot as usize] = i as u32;
+            *slot += 1;
+        }
+        grid.starts = starts;
+        grid
+    }
+
+    fn cell_of(&self, point: Vec3) -> IVec3 {
+        ((point - self.origin) / self.cell).floor().as_ivec3().clamp(IVec3::ZERO, self.size - 1)
+    }
+
+    fn index(&self, cell: IVec3) -> usize {
+        ((cell.z * self.size.y + cell.y) * self.size.x + cell.x) as usize
+    }
+
+    /// Calls `visit(index, squared distance)` for every point within `radius`, in a fixed order.
+    pub fn within(&self, centre: Vec3, radius: f32, mut visit: impl FnMut(usize, f32)) {
+        let low = self.cell_of(centre - radius);
+        let high = self.cell_of(centre + radius);
+        for z in low.z..=high.z {
+            for y in low.y..=high.y {
+                // Cells of a row lie side by side.
+                let first = self.starts[self.index(IVec3::new(low.x, y, z))] as usize;
+                let last = self.starts[self.index(IVec3::new(high.x, y, z)) + 1] as usize;
+                for &i in &self.sorted[first..last] {
+                    let squared = self.points[i as usize].distance_squared(centre);
+                    if squared <= radius * radius {
+                        visit(i as usize, squared);
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{RngExt, SeedableRng};
+
+    #[test]
+    fn the_grid_finds_what_a_plain_search_finds() {
+        let mut rng = rand::rngs::StdRng::seed_from_u64(5);
+        let points: Vec<Vec3> = (0..500).map(|_| Vec3::from_array(rng.random::<[f32; 3]>()) * 2.0 - 1.0).collect();
+        for (cell, radius) in [(0.1, 0.1), (0.01, 0.3), (5.0, 0.2), (1e-9, 0.1)] {
+            let grid = PointGrid::new(&points, cell);
+            for &centre in &[points[7], Vec3::splat(0.9), Vec3::splat(-40.0)] {
+                let mut found = Vec::new();
+                grid.within(centre, radius, |i, _| found.push(i));
+                found.sort_unstable();
+                let plain: Vec<usize> = (0..500).filter(|&i| points[i].distance(centre) <= radius).collect();
+                assert_eq!(found, plain, "cell {cell} radius {radius} centre {centre}");
+            }
+        }
+        PointGrid::new(&[], 1.0).within(Vec3::ZERO, 1.0, |_, _| panic!("no points"));
+    }
+}
