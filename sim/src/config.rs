@@ -1,0 +1,167 @@
+//! What to simulate.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use crate::SimError;
+
+/// A simulated capture. The same configuration gives the same bytes on the same graphics adapter.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimConfig {
+    /// Makes the person: body, face, hair, clothes and prints.
+    pub seed: u64,
+    /// Choices about the person that the seed does not make.
+    pub person: PersonConfig,
+    /// How the person moves.
+    pub motion: MotionConfig,
+    /// Where the cameras stand.
+    pub cameras: RingConfig,
+    /// Image width, pixels.
+    pub width: u32,
+    /// Image height, pixels.
+    pub height: u32,
+    /// Frames a second of every camera.
+    pub fps: f64,
+    /// Frames a source gives before its stream ends; none for an endless stream.
+    pub frames: Option<u64>,
+    /// Side of each texture, pixels.
+    pub texture_px: u32,
+}
+
+/// Build of a simulated body.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Build {
+    /// Chosen by the seed.
+    #[default]
+    BySeed,
+    /// A slim woman.
+    SlimWoman,
+    /// A round woman.
+    RoundWoman,
+    /// A slim man.
+    SlimMan,
+    /// A broad, muscular man.
+    BroadMan,
+    /// A heavy man.
+    HeavyMan,
+}
+
+/// Choices about the person.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PersonConfig {
+    /// Body build.
+    pub build: Build,
+}
+
+/// Kind of motion.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MotionKind {
+    /// Turns around on the spot in small steps, shifts weight and moves the arms; needs no file.
+    #[default]
+    Turn,
+    /// A BVH clip.
+    Bvh,
+}
+
+/// How the person moves.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MotionConfig {
+    /// Kind.
+    pub kind: MotionKind,
+    /// Seconds of one full turn.
+    pub turn_secs: f64,
+    /// BVH file; without one, walking subject 01_01 of Debian's `assimp-testmodels`.
+    pub bvh: Option<PathBuf>,
+    /// Seconds of the BVH clip to skip.
+    pub start_secs: f64,
+}
+
+/// Cameras on a ring around the person, all looking at the same point.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RingConfig {
+    /// Cameras, evenly spaced; camera 0 sees the person's front at the start.
+    pub count: usize,
+    /// Distance from the centre, metres.
+    pub radius_m: f64,
+    /// Height of the cameras above the floor, metres.
+    pub height_m: f64,
+    /// Height of the point that all look at, metres.
+    pub target_height_m: f64,
+    /// Focal length as a multiple of the image height.
+    pub focal_heights: f64,
+    /// Radial distortion k1, k2 (OpenCV's).
+    pub radial: [f64; 2],
+}
+
+impl Default for SimConfig {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            person: PersonConfig::default(),
+            motion: MotionConfig::default(),
+            cameras: RingConfig::default(),
+            width: 512,
+            height: 512,
+            fps: 30.0,
+            frames: None,
+            texture_px: 1024,
+        }
+    }
+}
+
+impl Default for MotionConfig {
+    fn default() -> Self {
+        Self { kind: MotionKind::Turn, turn_secs: 10.0, bvh: None, start_secs: 0.0 }
+    }
+}
+
+impl Default for RingConfig {
+    fn default() -> Self {
+        Self {
+            count: 7,
+            radius_m: 3.0,
+            height_m: 1.5,
+            target_height_m: 0.93,
+            focal_heights: 1.36,
+            radial: [-0.12, 0.03],
+        }
+    }
+}
+
+impl SimConfig {
+    /// Checks every number.
+    ///
+    /// # Errors
+    /// [`SimError::Config`] names the setting and its range.
+    pub fn validate(&self) -> Result<(), SimError> {
+        let check = |field, found: f64, low: f64, high: f64, expected| {
+            if (low..=high).contains(&found) {
+                Ok(())
+            } else {
+                Err(SimError::Config { field, found: found.to_string(), expected })
+            }
+        };
+        let (ring, motion) = (&self.cameras, &self.motion);
+        check("width", self.width.into(), 16.0, 4096.0, "16 to 4096 pixels")?;
+        check("height", self.height.into(), 16.0, 4096.0, "16 to 4096 pixels")?;
+        check("fps", self.fps, 0.1, 1000.0, "0.1 to 1000 frames a second")?;
+        check("texture_px", self.texture_px.into(), 64.0, 4096.0, "64 to 4096 pixels")?;
+        check("cameras.count", ring.count as f64, 1.0, 128.0, "1 to 128 cameras")?;
+        check("cameras.radius_m", ring.radius_m, 0.8, 6.0, "0.8 to 6 metres")?;
+        check("cameras.height_m", ring.height_m, 0.1, 3.0, "0.1 to 3 metres")?;
+        check("cameras.target_height_m", ring.target_height_m, 0.0, 3.0, "0 to 3 metres")?;
+        check("cameras.focal_heights", ring.focal_heights, 0.2, 20.0, "0.2 to 20 image heights")?;
+        for k in ring.radial {
+            check("cameras.radial", k, -1.0, 1.0, "coefficients between -1 and 1")?;
+        }
+        check("motion.turn_secs", motion.turn_secs, 1.0, 600.0, "1 to 600 seconds")?;
+        check("motion.start_secs", motion.start_secs, 0.0, 3600.0, "0 to 3600 seconds")
+    }
+}

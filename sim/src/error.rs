@@ -1,0 +1,56 @@
+//! What can go wrong in a simulation.
+
+use std::path::PathBuf;
+
+use flyrig_body::BodyError;
+use flyrig_gpu::GpuError;
+use flyrig_types::{CameraError, ImageError, PoseError};
+
+/// Why there is no simulated frame.
+#[derive(Debug, thiserror::Error)]
+pub enum SimError {
+    /// A setting out of its range.
+    #[error("simulation: {field} is {found}, expected {expected}")]
+    Config {
+        /// Which setting.
+        field: &'static str,
+        /// What was found.
+        found: String,
+        /// What would be right.
+        expected: &'static str,
+    },
+    /// The motion clip is not there.
+    #[error("motion clip {} not found; {mend}", path.display())]
+    NoClip {
+        /// Where it was looked for.
+        path: PathBuf,
+        /// What to do.
+        mend: &'static str,
+    },
+    /// The skeleton lacks a joint that a motion needs.
+    #[error("the body's skeleton has no joint '{0}', which the simulated motion moves")]
+    NoJoint(&'static str),
+    /// No such camera.
+    #[error("the simulated ring has {count} cameras, there is no slot {slot}")]
+    NoSlot {
+        /// The slot asked for.
+        slot: usize,
+        /// Cameras of the ring.
+        count: usize,
+    },
+    /// The body.
+    #[error(transparent)]
+    Body(#[from] BodyError),
+    /// The motion.
+    #[error("simulated motion: {0}")]
+    Pose(#[from] PoseError),
+    /// The cameras.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// The graphics adapter.
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
+    /// A picture.
+    #[error(transparent)]
+    Image(#[from] ImageError),
+}

@@ -1,0 +1,41 @@
+//! What a simulated camera gives, and the truth behind it.
+
+use flyrig_body::Part;
+use flyrig_types::{Image, Mask, Pose};
+use glam::Vec3;
+
+/// One picture with the truth of its instant. Pictures are row by row, one element a pixel; the truth
+/// but for `mask` is taken at pixel centres.
+#[derive(Debug)]
+pub struct SimFrame {
+    /// Time of everything in here.
+    pub nanos: i64,
+    /// Pose of the body.
+    pub pose: Pose,
+    /// sRGB, [`flyrig_types::PixelFormat::Rgb8`].
+    pub color: Image,
+    /// Coverage by the person.
+    pub mask: Mask,
+    /// Camera-space z of the visible clothed surface, metres; 0 on the background.
+    pub depth: Vec<f32>,
+    /// Canonical position (of the template without clothes, metres) of the body point that carries what is
+    /// seen; w is 1 on the person and 0 on the background.
+    pub canonical: Vec<[f32; 4]>,
+    /// Body part of that point.
+    pub part: Vec<Option<Part>>,
+}
+
+/// A surface with the body point that carries each of its vertices.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SurfaceMesh {
+    /// World positions, metres.
+    pub positions: Vec<Vec3>,
+    /// World unit normals.
+    pub normals: Vec<Vec3>,
+    /// Counter-clockwise seen from outside.
+    pub triangles: Vec<[u32; 3]>,
+    /// Per vertex: canonical position of the unclothed body point, metres.
+    pub canonical: Vec<Vec3>,
+    /// Per vertex: its body part.
+    pub parts: Vec<Part>,
+}

@@ -1,0 +1,26 @@
+//! Synthetic people in front of synthetic cameras, with the truth about every pixel.
+//!
+//! A seed makes a person: body shape, skin, face, hair, clothes and prints. The person moves by a clip
+//! or turns around on the spot, stands in a lit room, and is seen by a ring of pinhole cameras with
+//! radial distortion. Pictures are made by an ordinary textured-triangle rasteriser with a z-buffer;
+//! this crate knows nothing of splats, so that no method is judged on its own drawings.
+//!
+//! # Conventions
+//!
+//! - **World**: z up, the floor is z = 0, metres. At the start the person faces -y, towards camera 0.
+//! - **Clock**: nanoseconds from the start of the simulation; frame `i` is taken at exactly
+//!   `i * 1e9 / fps`, rounded down ([`Simulator::frame_nanos`]), by all cameras at once.
+
+mod config;
+mod error;
+mod frame;
+mod ring;
+mod simulator;
+mod source;
+
+pub use config::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig};
+pub use error::SimError;
+pub use frame::{SimFrame, SurfaceMesh};
+pub use ring::camera_ring;
+pub use simulator::Simulator;
+pub use source::{SimSource, sources};
