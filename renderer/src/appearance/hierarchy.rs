@@ -26,6 +26,12 @@ pub struct DiffusionHierarchy {
 }
 
 impl DiffusionHierarchy {
+    /// Damped Jacobi steps a level; even, so that the result ends where it began.
+    pub const RELAX_STEPS: u32 = 8;
+
+    /// How far a Jacobi step goes; below 1, or two nodes that see only each other would swap for ever.
+    pub const DAMPING: f32 = 0.8;
+
     /// Levels of a graph with at least one node. Edges count in both directions, once.
     ///
     /// # Errors

@@ -124,9 +124,9 @@ pub enum AppearanceError {
         /// Count found.
         found: usize,
     },
-    /// A picture beyond what the adapter can hold.
-    #[error("camera {camera}: its {width}x{height} picture is larger than the {limit} pixels a side of this adapter")]
-    PictureTooLarge {
+    /// A picture that the adapter cannot hold.
+    #[error("camera {camera}: its picture is {width}x{height}, this adapter takes 1 to {limit} pixels a side")]
+    PictureSize {
         /// Which camera.
         camera: CameraId,
         /// Pixels.

@@ -1,0 +1,105 @@
+//! The four compute kernels and the constants that Rust and WGSL share.
+
+use bytemuck::{Pod, Zeroable};
+use flyrig_gpu::{CAMERA_WGSL, ComputeKernel, GpuContext};
+
+use super::{AppearanceSettings, DiffusionHierarchy};
+use crate::linear_from_srgb;
+
+/// Threads a workgroup; 256 is the most that every adapter has.
+pub(super) const WORKGROUP: u32 = 256;
+
+/// Closer to the camera's plane nothing is projected, as in [`flyrig_types::Camera::project`].
+const NEAR_M: f32 = 1e-3;
+
+/// Less than half covered by Gaussians, a pixel shows no surface to compare with.
+const MIN_RENDERED_ALPHA: f32 = 0.5;
+
+/// The baseline's small number: far below the weight of a visible view, far above rounding.
+const BASELINE_VIEW_WEIGHT: f32 = 1e-3;
+
+/// Layout of `struct Settings` in the WGSL (std140, 32 bytes).
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(super) struct SettingsUniform {
+    occlusion_per_m: f32,
+    memory_weight_max: f32,
+    min_mask: f32,
+    inpaint_weight: f32,
+    smoothness: f32,
+    view_weight: f32,
+    space: u32,
+    time: u32,
+}
+
+impl From<&AppearanceSettings> for SettingsUniform {
+    fn from(settings: &AppearanceSettings) -> Self {
+        Self {
+            occlusion_per_m: settings.occlusion_per_m,
+            memory_weight_max: settings.memory_weight_max,
+            min_mask: settings.min_mask,
+            inpaint_weight: settings.inpaint_weight,
+            smoothness: settings.smoothness,
+            view_weight: if settings.space { 0.0 } else { BASELINE_VIEW_WEIGHT },
+            space: settings.space.into(),
+            time: settings.time.into(),
+        }
+    }
+}
+
+#[derive(Debug)]
+pub(super) struct Kernels {
+    pub(super) observe: ComputeKernel,
+    pub(super) gather: ComputeKernel,
+    pub(super) diffuse: ComputeKernel,
+    pub(super) paint: ComputeKernel,
+}
+
+impl Kernels {
+    pub(super) fn new(gpu: &GpuContext) -> Self {
+        let [observe, gather, diffuse, paint] =
+            sources().map(|(name, source)| ComputeKernel::new(gpu, name, &[&source], "main"));
+        Self { observe, gather, diffuse, paint }
+    }
+}
+
+/// Name and whole WGSL of each kernel.
+fn sources() -> [(&'static str, String); 4] {
+    let constants = format!(
+        "const WORKGROUP: u32 = {WORKGROUP}u;\nconst NEAR_M: f32 = {NEAR_M:?};\n\
+         const MIN_RENDERED_ALPHA: f32 = {MIN_RENDERED_ALPHA:?};\nconst MID_GREY: f32 = {:?};\n\
+         const RELAX_STEPS: u32 = {}u;\nconst DAMPING: f32 = {:?};\n",
+        linear_from_srgb(0.5),
+        DiffusionHierarchy::RELAX_STEPS,
+        DiffusionHierarchy::DAMPING,
+    );
+    let common = include_str!("common.wgsl");
+    [
+        ("appearance: observe", [&constants, common, CAMERA_WGSL, include_str!("observe.wgsl")].concat()),
+        ("appearance: gather", [&constants, include_str!("gather.wgsl")].concat()),
+        ("appearance: diffuse", [&constants, common, include_str!("diffuse.wgsl")].concat()),
+        ("appearance: paint", [&constants, common, include_str!("paint.wgsl")].concat()),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use naga::valid::{Capabilities, ValidationFlags, Validator};
+
+    use super::*;
+
+    #[test]
+    fn kernels_are_valid_wgsl() {
+        for (name, source) in sources() {
+            let module = naga::front::wgsl::parse_str(&source)
+                .unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(&source)));
+            Validator::new(ValidationFlags::all(), Capabilities::empty())
+                .validate(&module)
+                .unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(&source)));
+            let settings = module.types.iter().find(|(_, ty)| ty.name.as_deref() == Some("Settings"));
+            if let Some((_, ty)) = settings {
+                assert_eq!(ty.inner.size(module.to_ctx()) as usize, size_of::<SettingsUniform>(), "{name}");
+            }
+        }
+    }
+}

@@ -1,0 +1,81 @@
+// One thread a Gaussian, one dispatch a view: adds what this view saw of it (Eq. 5 to 8).
+@group(0) @binding(0) var<uniform> settings: Settings;
+@group(0) @binding(1) var<uniform> camera: Camera;
+@group(0) @binding(2) var picture: texture_2d<f32>;
+// Canonical position times alpha; w: alpha.
+@group(0) @binding(3) var<storage, read> rendered_canonical: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read> center_scale: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read> normals: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read> canonical: array<vec4<f32>>;
+// Sum of weight * linear RGB; w: sum of weights.
+@group(0) @binding(7) var<storage, read_write> seen: array<vec4<f32>>;
+// x: sum of Eq. 6 weights, y: exp(-k d) of the closest view that sees it.
+@group(0) @binding(8) var<storage, read_write> quality: array<vec2<f32>>;
+
+// Eq. 7 in observation space. The sine through the cross product: sqrt(1 - cos^2) loses half the digits
+// exactly where the weight is largest.
+fn angle_weight(normal: vec3<f32>, camera_to_point: vec3<f32>) -> f32 {
+    let lengths = length(normal) * length(camera_to_point);
+    if !(dot(normal, camera_to_point) < 0.0) || !(lengths > 0.0) || !is_finite(lengths) {
+        return 0.0;
+    }
+    return 1.0 - min(length(cross(normal, camera_to_point)) / lengths, 1.0);
+}
+
+@compute @workgroup_size(WORKGROUP)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let i = (group.y * groups.x + group.x) * WORKGROUP + lane;
+    if i >= arrayLength(&seen) {
+        return;
+    }
+    let position = center_scale[i].xyz;
+    let projected = project_point(camera, position, NEAR_M);
+    if !projected.valid {
+        return;
+    }
+    let pixel = projected.pixel;
+    let size = vec2<f32>(camera.size);
+    if !(all(pixel >= vec2(-0.5)) && all(pixel <= size - 0.5)) {
+        return;
+    }
+    // Bilinear by hand: hardware filters know nothing of the mask and pull the background in at silhouettes.
+    let base = floor(pixel);
+    let fraction = pixel - base;
+    var color = vec3(0.0);
+    var coverage = 0.0;
+    var rendered = vec4(0.0);
+    for (var corner = 0u; corner < 4u; corner += 1u) {
+        let offset = vec2<u32>(corner & 1u, corner >> 1u);
+        let texel = vec2<u32>(clamp(vec2<i32>(base) + vec2<i32>(offset), vec2(0), vec2<i32>(camera.size) - 1));
+        let side = select(1.0 - fraction, fraction, offset == vec2(1u));
+        let share = side.x * side.y;
+        let sample = textureLoad(picture, texel, 0);
+        let belief = share * clamp((sample.a - settings.min_mask) / (1.0 - settings.min_mask), 0.0, 1.0);
+        color += belief * sample.rgb;
+        coverage += belief;
+        rendered += share * rendered_canonical[texel.y * camera.size.x + texel.x];
+    }
+    if !(coverage > 0.0) {
+        return;
+    }
+    color /= coverage;
+    var weight = 0.0;
+    if rendered.w >= MIN_RENDERED_ALPHA {
+        // Eq. 8: near the rendered surface in canonical space, so that an arm never paints the belly behind it.
+        let d = distance(canonical[i].xyz, rendered.xyz / rendered.w);
+        let surface = max(1.0 - settings.occlusion_per_m * d, 0.0);
+        weight = angle_weight(normals[i].xyz, position - camera.position.xyz) * surface * coverage;
+        if weight > 0.0 && is_finite(weight) {
+            let before = quality[i];
+            quality[i] = vec2(before.x + weight, max(before.y, exp(-settings.occlusion_per_m * d)));
+        } else {
+            weight = 0.0;
+        }
+    }
+    let total = weight + settings.view_weight * coverage;
+    seen[i] += vec4(color * total, total);
+}
