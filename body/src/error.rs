@@ -70,6 +70,16 @@ pub enum BodyError {
     /// A pose that does not fit the skeleton or is not finite.
     #[error("pose: {0}")]
     Pose(String),
+    /// A GPU buffer of another number of Gaussians.
+    #[error("the buffer of {what} has room for {found} Gaussians, {needed} are needed")]
+    Buffer {
+        /// What it holds.
+        what: &'static str,
+        /// Its length.
+        found: usize,
+        /// Gaussians.
+        needed: usize,
+    },
     /// Key poses that make no track.
     #[error("{what}: {source}")]
     Track {

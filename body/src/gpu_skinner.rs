@@ -1,23 +1,51 @@
 //! Linear blend skinning on the GPU.
 
-use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
+use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer, dispatch_1d};
 use flyrig_types::Pose;
 
 use crate::{BodyError, Skeleton, SurfaceGaussians};
 
-/// Poses surface Gaussians on the GPU.
+const WGSL: &str = include_str!("skin.wgsl");
+/// Default of the kernel's `WORKGROUP_SIZE`.
+const WORKGROUP_SIZE: u32 = 64;
+
+/// Poses surface Gaussians on the GPU: world = LBS(x + t_x), FlyHuman section 3.1. What stays constant is
+/// uploaded once; a frame uploads 48 bytes a joint.
 #[derive(Debug)]
 pub struct GpuSkinner {
+    kernel: ComputeKernel,
     count: usize,
+    joint_rows: StorageBuffer<[f32; 4]>,
+    rest: StorageBuffer<[f32; 4]>,
+    rest_normal: StorageBuffer<[f32; 4]>,
+    skin_joints: StorageBuffer<[u32; 2]>,
+    skin_weights: StorageBuffer<[f32; 4]>,
+    no_displacement: StorageBuffer<[f32; 4]>,
 }
 
 impl GpuSkinner {
-    /// Uploads what stays constant.
+    /// For these Gaussians on a skeleton with as many joints as this one.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
-    pub fn new(_gpu: &GpuContext, gaussians: &SurfaceGaussians, _skeleton: &Skeleton) -> Result<Self, GpuError> {
-        Ok(Self { count: gaussians.positions.len() })
+    pub fn new(gpu: &GpuContext, gaussians: &SurfaceGaussians, skeleton: &Skeleton) -> Result<Self, GpuError> {
+        let rest: Vec<[f32; 4]> =
+            gaussians.positions.iter().zip(&gaussians.scale_m).map(|(p, &scale)| [p.x, p.y, p.z, scale]).collect();
+        let normals: Vec<[f32; 4]> = gaussians.normals.iter().map(|n| [n.x, n.y, n.z, 0.0]).collect();
+        let pack = |a: u16, b: u16| u32::from(a) | u32::from(b) << 16;
+        let joints: Vec<[u32; 2]> =
+            gaussians.skin.iter().map(|s| [pack(s.joints[0], s.joints[1]), pack(s.joints[2], s.joints[3])]).collect();
+        let weights: Vec<[f32; 4]> = gaussians.skin.iter().map(|s| s.weights).collect();
+        Ok(Self {
+            kernel: ComputeKernel::new(gpu, "skinning", &[WGSL], "skin"),
+            count: gaussians.len(),
+            joint_rows: StorageBuffer::zeroed(gpu, "joint matrices", skeleton.joints().len() * 3)?,
+            rest: StorageBuffer::from_slice(gpu, "Gaussian rest positions", &rest)?,
+            rest_normal: StorageBuffer::from_slice(gpu, "Gaussian rest normals", &normals)?,
+            skin_joints: StorageBuffer::from_slice(gpu, "Gaussian joints", &joints)?,
+            skin_weights: StorageBuffer::from_slice(gpu, "Gaussian skin weights", &weights)?,
+            no_displacement: StorageBuffer::zeroed(gpu, "no displacement", 1)?,
+        })
     }
 
     /// Number of Gaussians.
@@ -26,21 +54,75 @@ impl GpuSkinner {
         self.count
     }
 
-    /// Records the kernel. `displacement`: canonical metres per Gaussian.
+    /// Records the kernel: writes world position and scale to `center_scale` and world normals to `normal`, one
+    /// element a Gaussian. `displacement` holds t_x, canonical metres; an element that is not finite counts as
+    /// zero. The pose is uploaded ahead of the next submission, so submit before encoding another one.
     ///
     /// # Errors
-    /// [`BodyError::Pose`].
+    /// [`BodyError::Pose`] when the pose does not fit or is not finite, [`BodyError::Buffer`] when a buffer is too
+    /// short; nothing is recorded then.
     #[allow(clippy::too_many_arguments)]
     pub fn encode(
         &self,
-        _gpu: &GpuContext,
-        _encoder: &mut wgpu::CommandEncoder,
+        gpu: &GpuContext,
+        encoder: &mut wgpu::CommandEncoder,
         skeleton: &Skeleton,
         pose: &Pose,
-        _displacement: Option<&StorageBuffer<[f32; 4]>>,
-        _center_scale: &StorageBuffer<[f32; 4]>,
-        _normal: &StorageBuffer<[f32; 4]>,
+        displacement: Option<&StorageBuffer<[f32; 4]>>,
+        center_scale: &StorageBuffer<[f32; 4]>,
+        normal: &StorageBuffer<[f32; 4]>,
     ) -> Result<(), BodyError> {
-        skeleton.check_pose(pose)
+        skeleton.check_pose(pose)?;
+        let check = |what, buffer: &StorageBuffer<[f32; 4]>| match buffer.len() < self.count {
+            true => Err(BodyError::Buffer { what, found: buffer.len(), needed: self.count }),
+            false => Ok(()),
+        };
+        check("centres", center_scale)?;
+        check("normals", normal)?;
+        if let Some(displacement) = displacement {
+            check("displacements", displacement)?;
+        }
+        let rows = skeleton.joints().len() * 3;
+        if rows != self.joint_rows.len() {
+            let (found, expected) = (rows / 3, self.joint_rows.len() / 3);
+            return Err(BodyError::Pose(format!("a skeleton of {found} joints where the skinner has {expected}")));
+        }
+        let matrices = skeleton.world_from_canonical(pose);
+        let joint_rows: Vec<[f32; 4]> =
+            matrices.iter().flat_map(|matrix| [0, 1, 2].map(|row| matrix.row(row).as_vec4().to_array())).collect();
+        self.joint_rows.write(gpu, &joint_rows);
+        if self.count == 0 {
+            return Ok(());
+        }
+        let buffers = [
+            self.joint_rows.raw(),
+            self.rest.raw(),
+            self.rest_normal.raw(),
+            self.skin_joints.raw(),
+            self.skin_weights.raw(),
+            displacement.unwrap_or(&self.no_displacement).raw(),
+            center_scale.raw(),
+            normal.raw(),
+        ];
+        let bindings = self.kernel.bind(gpu, &buffers.map(wgpu::Buffer::as_entire_binding));
+        let (x, y) = dispatch_1d(self.count as u32, WORKGROUP_SIZE);
+        let mut pass =
+            encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some("skinning"), ..Default::default() });
+        pass.set_pipeline(&self.kernel.pipeline);
+        pass.set_bind_group(0, &bindings, &[]);
+        pass.dispatch_workgroups(x, y, 1);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_shader_is_valid() {
+        let module = naga::front::wgsl::parse_str(WGSL).unwrap();
+        let flags = naga::valid::ValidationFlags::all();
+        naga::valid::Validator::new(flags, naga::valid::Capabilities::default()).validate(&module).unwrap();
     }
 }

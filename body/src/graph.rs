@@ -1,39 +1,207 @@
-//! Deformation graph.
+//! Deformation graph: nodes on the surface, their neighbours, and what hangs on them.
+
+use std::cmp::Ordering;
+use std::collections::BinaryHeap;
 
 use glam::Vec3;
 
+use crate::surface_links::SurfaceLinks;
 use crate::{BodyError, SurfaceGaussians, Template};
 
-/// Nodes of the paper's graph.
+/// Nodes of the graph in FlyHuman, section 4.1.
 pub const DEFAULT_NODE_COUNT: usize = 1620;
 
-/// sigma^2 of Eq. 2, square metres.
+/// sigma^2 of Eq. 2, square metres. The paper's sigma = 0.001 can only be meant so: as a length in metres it
+/// would leave no weight at the nodes' real spacing of about 3.4 cm.
 pub const DEFAULT_SIGMA2_M2: f64 = 0.001;
 
-/// Nodes on the surface and what hangs on them.
-#[derive(Debug, Clone)]
+/// Nodes each Gaussian hangs on, and neighbours of each node.
+const NEAREST: usize = 4;
+
+/// Nodes on the surface with their neighbours, and the nodes that move each Gaussian.
+#[derive(Debug, Clone, PartialEq)]
 pub struct DeformationGraph {
     /// Canonical, metres.
     pub nodes: Vec<Vec3>,
     /// Which Gaussian each node is.
     pub node_gaussian: Vec<u32>,
     /// Neighbours of each node along the surface, nearest first; its own index where it has fewer than 4.
+    /// Not always mutual.
     pub neighbors: Vec<[u32; 4]>,
-    /// Nodes of each Gaussian, nearest first.
+    /// Nodes of each Gaussian, nearest along the surface first; the first one again where it has fewer than 4.
     pub gaussian_nodes: Vec<[u32; 4]>,
-    /// Eq. 2 weights, sum 1; 0 where a Gaussian has fewer than 4 nodes.
+    /// Weights of FlyHuman Eq. 2, divided by their sum; 0 where a Gaussian has fewer than 4 nodes.
     pub gaussian_weights: Vec<[f32; 4]>,
 }
 
-/// Builds the graph.
+/// Spreads `node_count` nodes (at most one a Gaussian) over the surface, each as far as can be from the ones
+/// before it, and hangs every Gaussian on the nearest 4 by Eq. 2 with `sigma2_m2` square metres. Distances are
+/// measured along the surface, so parts that only touch are not linked; Eq. 2 itself takes straight distances.
+/// A part of the surface without any node hangs on the node nearest in space.
 ///
 /// # Errors
-/// [`BodyError::Mesh`].
+/// [`BodyError::Mesh`] when the template is not valid, the Gaussians are none, not finite or not the template's,
+/// `node_count` is 0, or `sigma2_m2` is not positive.
 pub fn build_graph(
-    _template: &Template,
-    _gaussians: &SurfaceGaussians,
-    _node_count: usize,
-    _sigma2_m2: f64,
+    template: &Template,
+    gaussians: &SurfaceGaussians,
+    node_count: usize,
+    sigma2_m2: f64,
 ) -> Result<DeformationGraph, BodyError> {
-    Err(BodyError::Asset("not yet".to_owned()))
+    template.check()?;
+    let fail = |message: String| Err(BodyError::Mesh { name: template.name.clone(), message });
+    let count = gaussians.len();
+    if count == 0 || node_count == 0 {
+        return fail(format!("a graph of {node_count} nodes on {count} Gaussians; both must be at least 1"));
+    }
+    if !(sigma2_m2.is_finite() && sigma2_m2 > 0.0) {
+        return fail(format!("sigma^2 is {sigma2_m2} square metres; it must be positive (the usual is 0.001)"));
+    }
+    let known = gaussians.triangle.iter().all(|&triangle| (triangle as usize) < template.triangles.len());
+    let finite = gaussians.positions.iter().chain(&gaussians.normals).all(|v| v.is_finite());
+    if !known || !finite || gaussians.triangle.len() != count || gaussians.normals.len() != count {
+        return fail("the Gaussians are not finite or not this template's; sample its surface again".to_owned());
+    }
+
+    let links = SurfaceLinks::new(template, gaussians);
+    let node_gaussian = farthest_points(&links, count, node_count.min(count));
+    let nodes: Vec<Vec3> = node_gaussian.iter().map(|&gaussian| gaussians.positions[gaussian as usize]).collect();
+    // One more than needed: the nearest node of a node is itself.
+    let nearest = nearest_nodes(&links, count, &node_gaussian);
+    let neighbors = node_gaussian
+        .iter()
+        .zip(0u32..)
+        .map(|(&gaussian, node)| {
+            let mut others = nearest[gaussian as usize].iter().filter(|&&other| other != node && other != NONE);
+            std::array::from_fn(|_| others.next().copied().unwrap_or(node))
+        })
+        .collect();
+    let (gaussian_nodes, gaussian_weights) =
+        (0..count).map(|i| hang(gaussians.positions[i], &nearest[i], &nodes, sigma2_m2)).unzip();
+    Ok(DeformationGraph { nodes, node_gaussian, neighbors, gaussian_nodes, gaussian_weights })
+}
+
+/// No node.
+const NONE: u32 = u32::MAX;
+
+/// Nodes and Eq. 2 weights of a point. The largest exponent is subtracted from all, which changes no
+/// normalised weight and keeps the sum at 1 or more.
+fn hang(point: Vec3, nearest: &[u32; NEAREST + 1], nodes: &[Vec3], sigma2_m2: f64) -> ([u32; 4], [f32; 4]) {
+    let squared = |node: u32| nodes[node as usize].as_dvec3().distance_squared(point.as_dvec3());
+    let mut found: Vec<u32> = nearest[..NEAREST].iter().copied().filter(|&node| node != NONE).collect();
+    if found.is_empty() {
+        found.extend((0..nodes.len() as u32).min_by(|&a, &b| squared(a).total_cmp(&squared(b))));
+    }
+    let exponents: Vec<f64> = found.iter().map(|&node| -squared(node) / sigma2_m2).collect();
+    let largest = exponents.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let weights: Vec<f64> = exponents.iter().map(|exponent| (exponent - largest).exp()).collect();
+    let sum: f64 = weights.iter().sum();
+    let first = found.first().copied().unwrap_or(0);
+    (
+        std::array::from_fn(|i| found.get(i).copied().unwrap_or(first)),
+        std::array::from_fn(|i| weights.get(i).map_or(0.0, |weight| (weight / sum) as f32)),
+    )
+}
+
+/// A point reached over the surface; the nearest comes first out of a heap.
+struct Reached {
+    distance: f32,
+    gaussian: u32,
+    node: u32,
+}
+
+impl Ord for Reached {
+    fn cmp(&self, other: &Self) -> Ordering {
+        let key = |r: &Self| (r.gaussian, r.node);
+        other.distance.total_cmp(&self.distance).then_with(|| key(other).cmp(&key(self)))
+    }
+}
+
+impl PartialOrd for Reached {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl PartialEq for Reached {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other) == Ordering::Equal
+    }
+}
+
+impl Eq for Reached {}
+
+/// Farthest point sampling along the surface. Each component gets its first node before any gets a second.
+fn farthest_points(links: &SurfaceLinks, count: usize, nodes: usize) -> Vec<u32> {
+    let mut distance = vec![f32::INFINITY; count];
+    // Distances only fall: an entry that is too far goes back where it belongs. Lower indices first.
+    let mut farthest: BinaryHeap<(Far, std::cmp::Reverse<u32>)> =
+        (0..count as u32).map(|i| (Far(f32::INFINITY), std::cmp::Reverse(i))).collect();
+    let mut chosen = Vec::with_capacity(nodes);
+    let mut front = BinaryHeap::new();
+    while chosen.len() < nodes {
+        let Some((Far(told), std::cmp::Reverse(gaussian))) = farthest.pop() else { break };
+        let now = distance[gaussian as usize];
+        if now < told {
+            farthest.push((Far(now), std::cmp::Reverse(gaussian)));
+            continue;
+        }
+        chosen.push(gaussian);
+        distance[gaussian as usize] = 0.0;
+        front.push(Reached { distance: 0.0, gaussian, node: 0 });
+        while let Some(Reached { distance: so_far, gaussian, .. }) = front.pop() {
+            if so_far > distance[gaussian as usize] {
+                continue;
+            }
+            for &(next, step) in links.of(gaussian as usize) {
+                let new = so_far + step;
+                if new < distance[next as usize] {
+                    distance[next as usize] = new;
+                    front.push(Reached { distance: new, gaussian: next, node: 0 });
+                }
+            }
+        }
+    }
+    chosen
+}
+
+#[derive(PartialEq)]
+struct Far(f32);
+
+impl Eq for Far {}
+
+impl PartialOrd for Far {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl Ord for Far {
+    fn cmp(&self, other: &Self) -> Ordering {
+        self.0.total_cmp(&other.0)
+    }
+}
+
+/// The five nearest nodes of every Gaussian along the surface, nearest first, [`NONE`] where there are fewer:
+/// one Dijkstra search from all nodes at once that lets five of them pass each point.
+fn nearest_nodes(links: &SurfaceLinks, count: usize, node_gaussian: &[u32]) -> Vec<[u32; NEAREST + 1]> {
+    let mut nearest = vec![[NONE; NEAREST + 1]; count];
+    let mut front: BinaryHeap<Reached> =
+        node_gaussian.iter().zip(0..).map(|(&gaussian, node)| Reached { distance: 0.0, gaussian, node }).collect();
+    while let Some(Reached { distance, gaussian, node }) = front.pop() {
+        let slots = &mut nearest[gaussian as usize];
+        // Filled from the front; a node that was here came by a shorter way.
+        let Some(free) = slots.iter().position(|&known| known == NONE || known == node) else { continue };
+        if slots[free] == node {
+            continue;
+        }
+        slots[free] = node;
+        for &(next, step) in links.of(gaussian as usize) {
+            let slots = &nearest[next as usize];
+            if slots[NEAREST] == NONE && !slots.contains(&node) {
+                front.push(Reached { distance: distance + step, gaussian: next, node });
+            }
+        }
+    }
+    nearest
 }

@@ -25,9 +25,10 @@ mod shape;
 mod skeleton;
 mod skinning;
 mod surface;
+mod surface_links;
 mod template;
 
-pub use bvh::{BvhClip, BvhJoint, load_bvh, parse_bvh};
+pub use bvh::{BvhChannel, BvhClip, BvhJoint, load_bvh, parse_bvh};
 pub use default_body::{ShapeTarget, default_template, shape_targets};
 pub use error::BodyError;
 pub use gltf_import::{GltfHuman, load_gltf};
