@@ -2,14 +2,14 @@
 
 use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Lens, Rig};
 use foxglove::{
-    messages::{CameraCalibration, FrameTransform, FrameTransforms, Quaternion, Vector3},
     Decode,
+    messages::{CameraCalibration, FrameTransform, FrameTransforms, Quaternion, Vector3},
 };
 use glam::{DQuat, DVec2, DVec3};
 
 use crate::{
-    view::{timestamp, to_bytes},
     TransportError,
+    view::{timestamp, to_bytes},
 };
 
 /// Frames of the transforms message: a level frame (z up) that holds the world, which holds the cameras.
@@ -20,7 +20,7 @@ const WORLD: &str = "world";
 const MAX_CAMERAS: usize = 1024;
 
 /// Largest payload that is looked at, bytes.
-const MAX_BYTES: usize = 1 << 20;
+pub(crate) const MAX_BYTES: usize = 1 << 18;
 
 /// Lens and sensor of a camera as foxglove `CameraCalibration` (protobuf).
 ///
@@ -30,7 +30,9 @@ pub fn encode_calibration(camera: &Camera) -> Result<Vec<u8>, TransportError> {
     camera.validate().map_err(|error| TransportError::config("calibration", error.to_string()))?;
     let i = &camera.intrinsics;
     let (model, d) = match i.lens {
-        Lens::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] } => ("plumb_bob", vec![k1, k2, p1, p2, k3]),
+        Lens::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] } => {
+            ("plumb_bob", vec![k1, k2, p1, p2, k3])
+        }
         Lens::Fisheye { coefficients } => ("kannala_brandt", coefficients.to_vec()),
     };
     let (f, c) = (i.focal_px, i.center_px);
@@ -67,7 +69,10 @@ pub fn decode_calibration(bytes: &[u8]) -> Result<(CameraId, Intrinsics), Transp
         ("kannala_brandt", &[k1, k2, k3, k4]) => Lens::Fisheye { coefficients: [k1, k2, k3, k4] },
         ("", []) => Lens::PINHOLE,
         (model, d) => {
-            let text = format!("distortion {model:?} with {} numbers; known: plumb_bob with 5, kannala_brandt with 4", d.len());
+            let text = format!(
+                "distortion {model:?} with {} numbers; known: plumb_bob with 5, kannala_brandt with 4",
+                d.len()
+            );
             return Err(malformed(text));
         }
     };

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use zenoh::Config;
 
-use crate::{keys, view::MAX_IMAGE_BYTES, TransportError};
+use crate::{TransportError, keys, view::MAX_IMAGE_BYTES};
 
 /// Where a rig is found and how its sessions behave; one structure for both sides.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -102,10 +102,9 @@ impl TransportConfig {
             ("connect/endpoints", list(&self.connect)),
             ("connect/timeout_ms", "-1".to_owned()),
             ("connect/exit_on_failure", "false".to_owned()),
-            (
-                "connect/retry",
-                r#"{"period_init_ms":100,"period_max_ms":1000,"period_increase_factor":2}"#.to_owned(),
-            ),
+            ("connect/retry", r#"{"period_init_ms":100,"period_max_ms":1000,"period_increase_factor":2}"#.to_owned()),
+            // The other side may come much later.
+            ("open/return_conditions/connect_scouted", "false".to_owned()),
             ("scouting/multicast/enabled", self.multicast.to_string()),
             // Gossip would connect the viewers of one rig to each other for nothing.
             ("scouting/gossip/enabled", self.multicast.to_string()),

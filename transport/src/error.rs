@@ -49,7 +49,9 @@ impl TransportError {
         Self::new(
             TransportErrorKind::UnknownVersion,
             topic,
-            format!("speaks schema version {found}, this program knows version {ours}; run the same flyrig on both sides"),
+            format!(
+                "speaks schema version {found}, this program knows version {ours}; run the same flyrig on both sides"
+            ),
         )
     }
 }

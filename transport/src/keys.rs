@@ -1,6 +1,6 @@
 //! The key space.
 
-use crate::{TransportError, SCHEMA_VERSION};
+use crate::{SCHEMA_VERSION, TransportError};
 
 /// Views of this name's beginning belong to one subscriber.
 pub(crate) const VIEWER_PREFIX: &str = "viewer-";
@@ -25,11 +25,11 @@ pub(crate) fn key(rig: &str, rest: &str) -> String {
     format!("flyrig/v{SCHEMA_VERSION}/{rig}/{rest}")
 }
 
-/// Where a view's pictures go.
-pub(crate) fn view(rig: &str, name: &str) -> String {
+/// Last parts of the key where a view's pictures go.
+pub(crate) fn view_label(name: &str) -> String {
     match name.strip_prefix(VIEWER_PREFIX) {
-        Some(subscriber) => key(rig, &format!("viewer/{subscriber}/view")),
-        None => key(rig, &format!("view/{name}")),
+        Some(subscriber) => format!("viewer/{subscriber}/view"),
+        None => format!("view/{name}"),
     }
 }
 
@@ -38,12 +38,14 @@ pub(crate) fn any_version_alive(rig: &str) -> String {
     format!("flyrig/*/{rig}/alive/*")
 }
 
+/// The part of a key behind version and rig.
+pub(crate) fn label_in(key: &str) -> Option<&str> {
+    key.strip_prefix("flyrig/")?.splitn(3, '/').nth(2)
+}
+
 /// The part of a key that `*` stands for in `<before>/*<after>`.
 pub(crate) fn name_in<'a>(key: &'a str, before: &str, after: &str) -> Option<&'a str> {
-    let rest = key.strip_prefix("flyrig/")?;
-    let (_version, rest) = rest.split_once('/')?;
-    let (_rig, rest) = rest.split_once('/')?;
-    let name = rest.strip_prefix(before)?.strip_prefix('/')?.strip_suffix(after)?;
+    let name = label_in(key)?.strip_prefix(before)?.strip_prefix('/')?.strip_suffix(after)?;
     (!name.is_empty() && !name.contains('/')).then_some(name)
 }
 
@@ -58,8 +60,8 @@ mod tests {
 
     #[test]
     fn names_come_back_out_of_keys() {
-        assert_eq!(view("studio", "front"), "flyrig/v1/studio/view/front");
-        assert_eq!(view("studio", "viewer-ab12"), "flyrig/v1/studio/viewer/ab12/view");
+        assert_eq!(key("studio", &view_label("front")), "flyrig/v1/studio/view/front");
+        assert_eq!(key("studio", &view_label("viewer-ab12")), "flyrig/v1/studio/viewer/ab12/view");
         assert_eq!(name_in("flyrig/v1/studio/view/front", "view", ""), Some("front"));
         assert_eq!(name_in("flyrig/v1/studio/viewer/ab12/alive", "viewer", "/alive"), Some("ab12"));
         assert_eq!(name_in("flyrig/v1/studio/viewer/ab12/view", "viewer", "/alive"), None);

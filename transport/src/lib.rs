@@ -26,23 +26,30 @@
 
 mod calibration;
 mod config;
+mod drain;
 mod error;
 mod header;
+mod inbox;
 mod keys;
 mod publisher;
+mod renewal;
+mod report;
 mod splats;
 mod stats;
 mod subscriber;
+mod topic;
 mod view;
 mod viewpoint;
 
-pub use calibration::{decode_calibration, decode_transforms, encode_calibration, encode_transforms, RigTransforms};
+pub use calibration::{RigTransforms, decode_calibration, decode_transforms, encode_calibration, encode_transforms};
 pub use config::TransportConfig;
 pub use error::{TransportError, TransportErrorKind};
-pub use header::{Header, MessageKind, HEADER_BYTES, SCHEMA_VERSION};
-pub use publisher::{PublishOutcome, Publisher, TopicCounts, ViewpointCounts};
-pub use splats::{SplatState, MAX_SPLATS};
+pub use header::{HEADER_BYTES, Header, MessageKind, SCHEMA_VERSION};
+pub use publisher::{Publisher, ViewpointCounts};
+pub use report::{LatencyReport, TopicReport};
+pub use splats::{MAX_SPLATS, SplatState};
 pub use stats::{RigStats, StageTime, ViewRate};
-pub use subscriber::{Interests, LatencyReport, Received, Subscriber, TopicReport, Views};
-pub use view::{ImageFormat, ViewFrame, MAX_IMAGE_BYTES};
-pub use viewpoint::{Viewpoint, ViewpointStatus, MAX_VIEWPOINT_SIDE};
+pub use subscriber::{Interests, Received, Subscriber, Views};
+pub use topic::{PublishOutcome, TopicCounts};
+pub use view::{ImageFormat, MAX_IMAGE_BYTES, ViewFrame};
+pub use viewpoint::{MAX_VIEWPOINT_SIDE, Viewpoint, ViewpointStatus};

@@ -1,40 +1,32 @@
 //! The rig's side.
 
-use std::sync::Arc;
+use std::{
+    net::TcpListener,
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread::JoinHandle,
+    time::{Duration, Instant},
+};
 
 use flyrig_types::Rig;
+use prost::bytes::Bytes;
+use zenoh::{Session, Wait, liveliness::LivelinessToken, query::Query, sample::SampleKind};
 
-use crate::{RigStats, SplatState, TransportConfig, TransportError, ViewFrame, Viewpoint};
+use crate::{
+    Header, MessageKind, RigStats, SplatState, TransportConfig, TransportError, ViewFrame, Viewpoint,
+    calibration::{encode_calibration, encode_transforms},
+    drain::{Drain, Retained, Shared, empty_header},
+    header,
+    keys::{self, VIEWER_PREFIX},
+    stats::{from_json, to_json},
+    topic::{Body, PublishOutcome, Topic, TopicCounts, lock},
+    viewpoint::Leases,
+};
 
-/// What became of a message that was handed in.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum PublishOutcome {
-    /// It waits for the publisher thread.
-    Queued,
-    /// The same, and an older one that still waited is dropped.
-    Replaced,
-    /// Nobody subscribes: dropped at once, nothing encoded.
-    Unwatched,
-}
-
-/// Counts of one topic since the start.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct TopicCounts {
-    /// Handed in.
-    pub offered: u64,
-    /// Handed to zenoh.
-    pub sent: u64,
-    /// Dropped because a newer one came first.
-    pub replaced: u64,
-    /// Dropped because nobody subscribes.
-    pub unwatched: u64,
-    /// Could not be encoded or sent; the log says why.
-    pub failed: u64,
-    /// Payload bytes handed to zenoh.
-    pub bytes: u64,
-    /// Whether somebody subscribes now.
-    pub watched: bool,
-}
+/// Most views of a rig, those of viewers not counted.
+const MAX_VIEWS: usize = 64;
 
 /// Counts of viewpoint requests since the start.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -50,97 +42,286 @@ pub struct ViewpointCounts {
 }
 
 /// Publishes a rig; no method waits for the network once it is open.
-#[derive(Debug)]
-pub struct Publisher {}
+pub struct Publisher {
+    shared: Arc<Shared>,
+    splats: Arc<Topic>,
+    stats: Arc<Topic>,
+    endpoints: Vec<String>,
+    session: Session,
+    thread: Option<JoinHandle<()>>,
+    _alive: LivelinessToken,
+}
+
+impl std::fmt::Debug for Publisher {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Publisher")
+            .field("rig", &self.shared.rig)
+            .field("endpoints", &self.endpoints)
+            .finish_non_exhaustive()
+    }
+}
 
 impl Publisher {
     /// Opens the session and starts the publisher thread.
     ///
     /// # Errors
-    /// `Config` or `Session`.
+    /// `Config`, or `Session` when zenoh cannot listen there.
     pub fn open(config: &TransportConfig) -> Result<Self, TransportError> {
         config.validate()?;
-        Ok(Self {})
+        let rig = &config.rig;
+        let (session, endpoints) = open_session(config)?;
+        let failed = |error: zenoh::Error| TransportError::session(format!("publisher of rig {rig}"), &error);
+
+        let splats = Arc::new(Topic::new("splats".to_owned(), "splats".to_owned(), MessageKind::Splats));
+        let stats = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
+        let (wake, woken) = crossbeam::channel::bounded(1);
+        let shared = Arc::new(Shared {
+            rig: rig.clone(),
+            publisher_id: header::fnv1a(session.zid().to_string().as_bytes()),
+            host_id: header::host_id(),
+            topics: Mutex::new([&splats, &stats].map(|topic| (topic.label.clone(), topic.clone())).into()),
+            calibration: Mutex::new(Arc::new([])),
+            leases: Mutex::new(Leases::new(config.max_viewers, Duration::from_millis(config.viewpoint_lease_millis))),
+            stop: AtomicBool::new(false),
+            wake,
+        });
+
+        let state = shared.clone();
+        session
+            .declare_queryable(keys::key(rig, "viewpoint/*"))
+            .callback(move |query| answer_viewpoint(&state, &query))
+            .background()
+            .wait()
+            .map_err(failed)?;
+        let state = shared.clone();
+        session
+            .liveliness()
+            .declare_subscriber(keys::key(rig, "viewer/*/alive"))
+            .callback(move |sample| {
+                let name = keys::name_in(sample.key_expr().as_str(), "viewer", "/alive");
+                if let (SampleKind::Delete, Some(name)) = (sample.kind(), name) {
+                    lock(&state.leases).drop_subscriber(name);
+                    state.wake();
+                }
+            })
+            .background()
+            .wait()
+            .map_err(failed)?;
+        let alive = keys::key(rig, &format!("alive/{}", session.zid()));
+        let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
+
+        let drain = Drain { shared: shared.clone(), session: session.clone(), express: config.express, woken };
+        let thread = std::thread::Builder::new()
+            .name("flyrig-publish".to_owned())
+            .spawn(move || drain.run())
+            .map_err(|error| TransportError::session("publisher thread", &error))?;
+        Ok(Self { shared, splats, stats, endpoints, session, thread: Some(thread), _alive: alive })
     }
 
     /// Endpoints it listens on, port 0 replaced by the real one.
     #[must_use]
     pub fn endpoints(&self) -> &[String] {
-        &[]
+        &self.endpoints
     }
 
     /// Makes a view known so that subscribers of it are noticed before its first picture.
     ///
     /// # Errors
-    /// `Config` for a bad name or too many views.
+    /// `Config` for a bad name or more than 64 views.
     pub fn add_view(&self, view: &str) -> Result<(), TransportError> {
-        crate::keys::check_name("view", view)
+        self.view_topic(view).map(|_| ())
     }
 
-    /// Whether anybody subscribes to a view that was added or published, or to a requested viewpoint's view.
+    /// Whether anybody subscribes to a view that was added or published, or to a requested viewpoint's
+    /// view; at most some 50 ms old.
     #[must_use]
-    pub fn has_subscribers(&self, _view: &str) -> bool {
-        false
+    pub fn has_subscribers(&self, view: &str) -> bool {
+        lock(&self.shared.topics).get(&keys::view_label(view)).is_some_and(|topic| topic.is_watched())
     }
 
     /// Whether anybody subscribes to the splats.
     #[must_use]
     pub fn has_splat_subscribers(&self) -> bool {
-        false
+        self.splats.is_watched()
     }
 
     /// Hands in a picture.
     ///
     /// # Errors
-    /// `Config` for a bad name, size or too many views.
-    pub fn publish_view(&self, _view: &str, _frame: ViewFrame) -> Result<PublishOutcome, TransportError> {
-        Ok(PublishOutcome::Unwatched)
+    /// `Config` for a bad name, size or more than 64 views.
+    pub fn publish_view(&self, view: &str, frame: ViewFrame) -> Result<PublishOutcome, TransportError> {
+        frame.validate(view)?;
+        let Some(topic) = self.view_topic(view)? else { return Ok(PublishOutcome::Unwatched) };
+        let header = Header {
+            frame: frame.frame,
+            capture_nanos: frame.capture_nanos,
+            width: frame.width,
+            height: frame.height,
+            ..empty_header()
+        };
+        Ok(self.offer(&topic, Body::View(frame), header))
     }
 
     /// Hands in a splat state; it is encoded on the publisher thread.
-    pub fn publish_splats(&self, _state: Arc<SplatState>) -> PublishOutcome {
-        PublishOutcome::Unwatched
+    pub fn publish_splats(&self, state: Arc<SplatState>) -> PublishOutcome {
+        let header = Header { frame: state.frame, capture_nanos: state.capture_nanos, ..empty_header() };
+        self.offer(&self.splats, Body::Splats(state), header)
     }
 
     /// Hands in statistics.
     ///
     /// # Errors
     /// `Config` when a figure is not finite.
-    pub fn publish_stats(&self, _stats: &RigStats) -> Result<PublishOutcome, TransportError> {
-        Ok(PublishOutcome::Unwatched)
+    pub fn publish_stats(&self, stats: &RigStats) -> Result<PublishOutcome, TransportError> {
+        let header = Header { frame: stats.frame, capture_nanos: stats.capture_nanos, ..empty_header() };
+        Ok(self.offer(&self.stats, Body::Bytes(Bytes::from(stats.encode()?)), header))
     }
 
-    /// Sets the calibration; it is sent now, to every new subscriber, and once a second.
+    /// Sets the calibration; it is sent when a first subscriber comes, and then once a second for
+    /// those who come later.
     ///
     /// # Errors
     /// `Config` when the rig is not valid or a camera's name cannot stand in a key.
-    pub fn set_calibration(&self, _rig: &Rig) -> Result<(), TransportError> {
+    pub fn set_calibration(&self, rig: &Rig) -> Result<(), TransportError> {
+        let topic = |label: String, kind| Arc::new(Topic::new(label.clone(), label, kind));
+        let transforms = topic("transforms".to_owned(), MessageKind::Transforms);
+        let mut calibration = vec![Retained { topic: transforms, bytes: Bytes::from(encode_transforms(rig)?) }];
+        for camera in &rig.cameras {
+            keys::check_name("camera", camera.id.as_str())?;
+            let lens = topic(format!("calibration/{}", camera.id), MessageKind::Calibration);
+            calibration.push(Retained { topic: lens, bytes: Bytes::from(encode_calibration(camera)?) });
+        }
+        let mut topics = lock(&self.shared.topics);
+        topics.retain(|_, topic| !matches!(topic.kind, MessageKind::Calibration | MessageKind::Transforms));
+        topics.extend(calibration.iter().map(|Retained { topic, .. }| (topic.label.clone(), topic.clone())));
+        *lock(&self.shared.calibration) = calibration.into();
+        drop(topics);
+        self.shared.wake();
         Ok(())
     }
 
     /// Viewpoints whose lease runs.
     #[must_use]
     pub fn requested_viewpoints(&self) -> Vec<Viewpoint> {
-        vec![]
+        let mut leases = lock(&self.shared.leases);
+        leases.expire(Instant::now());
+        leases.viewpoints()
     }
 
     /// Counts of viewpoint requests.
     #[must_use]
     pub fn viewpoint_counts(&self) -> ViewpointCounts {
-        ViewpointCounts::default()
+        let leases = lock(&self.shared.leases);
+        ViewpointCounts {
+            active: leases.len(),
+            granted: leases.granted,
+            refused: leases.refused,
+            expired: leases.expired,
+        }
     }
 
-    /// Counts a topic: `view/NAME`, `splats`, `stats`, ...
+    /// Counts a topic: `view/NAME`, `viewer/SUBSCRIBER/view`, `splats`, `stats`, `calibration/CAMERA`, `transforms`.
     #[must_use]
     pub fn counts(&self) -> Vec<(String, TopicCounts)> {
-        vec![]
+        lock(&self.shared.topics).iter().map(|(label, topic)| (label.clone(), topic.counts())).collect()
     }
 
     /// Ends the thread and the session; dropping does the same but says nothing.
     ///
     /// # Errors
-    /// `Session` when zenoh fails to close.
-    pub fn close(self) -> Result<(), TransportError> {
-        Ok(())
+    /// `Session` when the thread died or zenoh fails to close.
+    pub fn close(mut self) -> Result<(), TransportError> {
+        self.stop()
+    }
+
+    fn stop(&mut self) -> Result<(), TransportError> {
+        let Some(thread) = self.thread.take() else { return Ok(()) };
+        self.shared.stop.store(true, Ordering::Relaxed);
+        self.shared.wake();
+        let joined = thread.join().map_err(|_| TransportError::session("publisher thread", &"it panicked"));
+        let closed = self.session.close().wait().map_err(|error| TransportError::session("closing", &error));
+        joined.and(closed)
+    }
+
+    fn offer(&self, topic: &Topic, body: Body, header: Header) -> PublishOutcome {
+        let outcome = topic.offer(body, header);
+        if outcome != PublishOutcome::Unwatched {
+            self.shared.wake();
+        }
+        outcome
+    }
+
+    /// `None` for the view of a viewer whose lease has ended.
+    fn view_topic(&self, view: &str) -> Result<Option<Arc<Topic>>, TransportError> {
+        let label = keys::view_label(view);
+        let mut topics = lock(&self.shared.topics);
+        if let Some(topic) = topics.get(&label) {
+            return Ok(Some(topic.clone()));
+        }
+        if view.starts_with(VIEWER_PREFIX) {
+            return Ok(None);
+        }
+        keys::check_name("view", view)?;
+        let views = topics.keys().filter(|label| label.starts_with("view/")).count();
+        if views >= MAX_VIEWS {
+            return Err(TransportError::config(format!("view {view}"), format!("a rig has at most {MAX_VIEWS} views")));
+        }
+        let topic = Arc::new(Topic::new(label.clone(), view.to_owned(), MessageKind::View));
+        topics.insert(label, topic.clone());
+        Ok(Some(topic))
+    }
+}
+
+impl Drop for Publisher {
+    fn drop(&mut self) {
+        if let Err(error) = self.stop() {
+            tracing::warn!(%error, "closing the publisher");
+        }
+    }
+}
+
+/// Opens a session; a port 0 is looked up first because zenoh's stable interface does not tell which it took.
+fn open_session(config: &TransportConfig) -> Result<(Session, Vec<String>), TransportError> {
+    let mut attempts = 5;
+    loop {
+        attempts -= 1;
+        let endpoints: Vec<String> = config.listen.iter().map(|endpoint| with_free_port(endpoint)).collect();
+        match zenoh::open(config.zenoh(&endpoints)?).wait() {
+            Ok(session) => return Ok((session, endpoints)),
+            // Somebody else was faster to take the port.
+            Err(_) if attempts > 0 && endpoints != config.listen => {}
+            Err(error) => {
+                let text = format!("{error}; is another publisher running there? Choose another listen endpoint");
+                return Err(TransportError::session(endpoints.join(", "), &text));
+            }
+        }
+    }
+}
+
+fn with_free_port(endpoint: &str) -> String {
+    let free = || {
+        let host = endpoint.strip_prefix("tcp/")?.strip_suffix(":0")?;
+        let port = TcpListener::bind((host.trim_matches(['[', ']']), 0)).ok()?.local_addr().ok()?.port();
+        Some(format!("tcp/{host}:{port}"))
+    };
+    free().unwrap_or_else(|| endpoint.to_owned())
+}
+
+/// Runs on a zenoh thread: short, no waiting.
+fn answer_viewpoint(shared: &Shared, query: &Query) {
+    let key = query.key_expr().as_str();
+    let Some(subscriber) = keys::name_in(key, "viewpoint", "") else { return };
+    let payload = query.payload().map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
+    let answer = lock(&shared.leases).ask(subscriber, from_json(key, &payload), Instant::now());
+    if !answer.granted {
+        tracing::info!(subscriber, reason = answer.reason, "refused a viewpoint");
+    }
+    shared.sync_viewer_topics();
+    shared.wake();
+    let replied = to_json(key, &answer).and_then(|bytes| {
+        query.reply(query.key_expr(), bytes).wait().map_err(|error| TransportError::session(key, &error))
+    });
+    if let Err(error) = replied {
+        tracing::warn!(%error, "could not answer a viewpoint request");
     }
 }

@@ -12,7 +12,7 @@
 
 use std::sync::LazyLock;
 
-use crate::{header::Reader, TransportError, SCHEMA_VERSION};
+use crate::{SCHEMA_VERSION, TransportError, header::Reader};
 
 /// Most Gaussians in a state.
 pub const MAX_SPLATS: usize = 1 << 22;
@@ -141,7 +141,9 @@ impl SplatState {
         let bounds = Bounds { min: [x0, y0, z0], max: [x1, y1, z1], max_scale, invalid };
         let ordered = bounds.extent().iter().all(|extent| *extent >= 0.0 && extent.is_finite());
         if !numbers.iter().all(|n| n.is_finite()) || !ordered || max_scale < 0.0 || invalid as usize > count {
-            return Err(malformed("bounding box, largest scale or count of invalid Gaussians makes no sense".to_owned()));
+            return Err(malformed(
+                "bounding box, largest scale or count of invalid Gaussians makes no sense".to_owned(),
+            ));
         }
 
         let (positions, rest) = planes.split_at(count * 6);
@@ -158,7 +160,14 @@ impl SplatState {
             .collect();
         let color = colors
             .chunks_exact(4)
-            .map(|c| [SRGB.linear[c[0] as usize], SRGB.linear[c[1] as usize], SRGB.linear[c[2] as usize], f32::from(c[3]) / 255.0])
+            .map(|c| {
+                [
+                    SRGB.linear[c[0] as usize],
+                    SRGB.linear[c[1] as usize],
+                    SRGB.linear[c[2] as usize],
+                    f32::from(c[3]) / 255.0,
+                ]
+            })
             .collect();
         Ok(Self { frame, capture_nanos, center_scale, color, invalid })
     }
@@ -189,9 +198,9 @@ impl Bounds {
                 bounds.invalid += 1;
                 continue;
             }
-            for axis in 0..3 {
-                bounds.min[axis] = bounds.min[axis].min(splat[axis]);
-                bounds.max[axis] = bounds.max[axis].max(splat[axis]);
+            for (axis, value) in splat[..3].iter().enumerate() {
+                bounds.min[axis] = bounds.min[axis].min(*value);
+                bounds.max[axis] = bounds.max[axis].max(*value);
             }
             bounds.max_scale = bounds.max_scale.max(splat[3]);
         }

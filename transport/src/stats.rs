@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{TransportError, SCHEMA_VERSION};
+use crate::{SCHEMA_VERSION, TransportError};
 
 /// Largest JSON payload that is looked at, bytes.
 pub(crate) const MAX_JSON_BYTES: usize = 1 << 18;
@@ -90,8 +90,11 @@ pub(crate) fn from_json<T: serde::de::DeserializeOwned>(topic: &str, bytes: &[u8
 }
 
 impl RigStats {
-    /// JSON; NaN and infinity have no form in it and are refused by the reader, so they are refused here.
-    pub(crate) fn encode(&self) -> Result<Vec<u8>, TransportError> {
+    /// As JSON.
+    ///
+    /// # Errors
+    /// `Config` when a figure is NaN or infinite (JSON has no form for them) or it is over 256 KiB.
+    pub fn encode(&self) -> Result<Vec<u8>, TransportError> {
         let finite = [self.uptime_secs, self.frames_per_second]
             .into_iter()
             .chain(self.stages.iter().flat_map(|stage| [stage.mean_millis, stage.max_millis]))
@@ -103,7 +106,11 @@ impl RigStats {
         to_json("stats", self)
     }
 
-    pub(crate) fn decode(bytes: &[u8]) -> Result<Self, TransportError> {
+    /// Out of JSON.
+    ///
+    /// # Errors
+    /// `UnknownVersion` or `Malformed`.
+    pub fn decode(bytes: &[u8]) -> Result<Self, TransportError> {
         from_json("stats", bytes)
     }
 }

@@ -1,10 +1,18 @@
 //! The watcher's side.
 
-use std::time::Duration;
+use std::{sync::Arc, time::Duration};
 
 use flyrig_types::{Camera, Rig};
+use prost::bytes::Bytes;
+use zenoh::{Session, Wait, liveliness::LivelinessToken, sample::SampleKind};
 
-use crate::{Header, RigStats, SplatState, TransportConfig, TransportError, ViewFrame, ViewpointStatus};
+use crate::{
+    Header, RigStats, SplatState, TopicReport, TransportConfig, TransportError, ViewFrame, ViewpointStatus,
+    inbox::{Inbox, Raw, as_malformed},
+    keys::{self, VIEWER_PREFIX},
+    renewal::Renewal,
+    viewpoint::check_camera,
+};
 
 /// Which views to receive.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -44,94 +52,124 @@ pub struct Received<T> {
     pub body: T,
 }
 
-/// Latencies of the last messages (at most 256).
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LatencyReport {
-    /// Median, milliseconds.
-    pub p50_millis: f64,
-    /// 99 of 100 are below, milliseconds.
-    pub p99_millis: f64,
-    /// Longest, milliseconds.
-    pub max_millis: f64,
-    /// Whether all came from this host; if not, the difference of the hosts' clocks is inside.
-    pub is_exact: bool,
-}
-
-/// What came in on one topic since the start.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct TopicReport {
-    /// Messages.
-    pub received: u64,
-    /// Payload bytes.
-    pub bytes: u64,
-    /// Messages that the publisher handed in but that never came, by gaps of the sequence.
-    pub missed: u64,
-    /// Messages that a newer one replaced before we were asked for them.
-    pub replaced: u64,
-    /// Changes of publisher (restarts).
-    pub restarts: u64,
-    /// Messages a second, over the last ones (at most 256).
-    pub per_second: f64,
-    /// Latency, once something came.
-    pub latency: Option<LatencyReport>,
-}
-
 /// Receives a rig; the newest message of a topic waits for its reader, older ones are replaced and counted.
-#[derive(Debug)]
-pub struct Subscriber {}
+pub struct Subscriber {
+    inbox: Arc<Inbox>,
+    id: String,
+    renewal: Renewal,
+    session: Session,
+    closed: bool,
+    _alive: LivelinessToken,
+}
+
+impl std::fmt::Debug for Subscriber {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Subscriber").field("id", &self.id).finish_non_exhaustive()
+    }
+}
 
 impl Subscriber {
     /// Opens the session; the publisher may come later.
     ///
     /// # Errors
     /// `Config` or `Session`.
-    pub fn open(config: &TransportConfig, _interests: &Interests) -> Result<Self, TransportError> {
+    pub fn open(config: &TransportConfig, interests: &Interests) -> Result<Self, TransportError> {
         config.validate()?;
-        Ok(Self {})
+        let rig = &config.rig;
+        let failed = |error: zenoh::Error| TransportError::session(format!("subscriber of rig {rig}"), &error);
+        let session = zenoh::open(config.zenoh(&config.listen)?).wait().map_err(failed)?;
+        let id = session.zid().to_string();
+        let inbox = Arc::new(Inbox::new(format!("{VIEWER_PREFIX}{id}")));
+
+        let mut labels = vec!["calibration/*".to_owned(), "transforms".to_owned(), format!("viewer/{id}/view")];
+        match &interests.views {
+            Views::None => {}
+            Views::All => labels.push("view/*".to_owned()),
+            Views::Named(names) => {
+                for name in names {
+                    keys::check_name("view", name)?;
+                    labels.push(keys::view_label(name));
+                }
+            }
+        }
+        labels.extend(interests.splats.then(|| "splats".to_owned()));
+        labels.extend(interests.stats.then(|| "stats".to_owned()));
+        for label in labels {
+            let inbox = inbox.clone();
+            session
+                .declare_subscriber(keys::key(rig, &label))
+                .callback(move |sample| inbox.receive(&sample))
+                .background()
+                .wait()
+                .map_err(failed)?;
+        }
+        let watcher = inbox.clone();
+        session
+            .liveliness()
+            .declare_subscriber(keys::any_version_alive(rig))
+            .history(true)
+            .callback(move |sample| {
+                watcher.publisher_alive(sample.key_expr().as_str(), sample.kind() == SampleKind::Put);
+            })
+            .background()
+            .wait()
+            .map_err(failed)?;
+        let alive = keys::key(rig, &format!("viewer/{id}/alive"));
+        let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
+        let key = keys::key(rig, &format!("viewpoint/{id}"));
+        let renewal = Renewal::start(session.clone(), key, format!("{VIEWER_PREFIX}{id}"))?;
+        Ok(Self { inbox, id, renewal, session, closed: false, _alive: alive })
     }
 
     /// Our name towards the publisher.
     #[must_use]
     pub fn id(&self) -> &str {
-        ""
+        &self.id
     }
 
     /// Name of the view that our own viewpoint arrives as.
     #[must_use]
     pub fn viewpoint_view(&self) -> String {
-        String::new()
+        format!("{VIEWER_PREFIX}{}", self.id)
     }
 
     /// The next picture nobody has taken yet, of any view (views take turns); `None` after the timeout.
     ///
     /// # Errors
-    /// `UnknownVersion` or `Malformed`, once for each such message; it is fine to go on.
-    pub fn next_view(&self, _timeout: Duration) -> Result<Option<Received<ViewFrame>>, TransportError> {
-        Ok(None)
+    /// `UnknownVersion` or `Malformed`, once for each such message or publisher, whichever topic it was
+    /// on; it is fine to go on.
+    pub fn next_view(&self, timeout: Duration) -> Result<Option<Received<ViewFrame>>, TransportError> {
+        let Some((label, raw)) = self.inbox.next(timeout, |label| self.inbox.view_name(label).is_some())? else {
+            return Ok(None);
+        };
+        let name = self.inbox.view_name(&label).unwrap_or(&label).to_owned();
+        self.received(name, raw, ViewFrame::decode).map(Some)
     }
 
     /// The newest splat state nobody has taken yet; `None` after the timeout.
     ///
     /// # Errors
     /// As [`Self::next_view`].
-    pub fn next_splats(&self, _timeout: Duration) -> Result<Option<Received<SplatState>>, TransportError> {
-        Ok(None)
+    pub fn next_splats(&self, timeout: Duration) -> Result<Option<Received<SplatState>>, TransportError> {
+        let Some((label, raw)) = self.inbox.next(timeout, |label| label == "splats")? else { return Ok(None) };
+        self.received(label, raw, |_, _, payload| SplatState::decode(&payload)).map(Some)
     }
 
     /// The newest statistics nobody has taken yet; `None` after the timeout.
     ///
     /// # Errors
     /// As [`Self::next_view`].
-    pub fn next_stats(&self, _timeout: Duration) -> Result<Option<Received<RigStats>>, TransportError> {
-        Ok(None)
+    pub fn next_stats(&self, timeout: Duration) -> Result<Option<Received<RigStats>>, TransportError> {
+        let Some((label, raw)) = self.inbox.next(timeout, |label| label == "stats")? else { return Ok(None) };
+        self.received(label, raw, |_, _, payload| RigStats::decode(&payload)).map(Some)
     }
 
     /// The rig's cameras once all of them have come; waits at most `timeout` (may be zero).
     ///
     /// # Errors
     /// As [`Self::next_view`].
-    pub fn rig(&self, _timeout: Duration) -> Result<Option<Rig>, TransportError> {
-        Ok(None)
+    pub fn rig(&self, timeout: Duration) -> Result<Option<Rig>, TransportError> {
+        self.inbox.rig(timeout)
     }
 
     /// Asks for pictures through a camera of our own, or moves it; renewed until given back. The
@@ -139,42 +177,77 @@ impl Subscriber {
     ///
     /// # Errors
     /// `Config` when the camera is not valid, larger than 4096 pixels a side, or `max_fps` is not in 0..=1000.
-    pub fn request_viewpoint(&self, _camera: &Camera, _max_fps: f64) -> Result<(), TransportError> {
+    pub fn request_viewpoint(&self, camera: &Camera, max_fps: f64) -> Result<(), TransportError> {
+        check_camera("our viewpoint", camera, max_fps)?;
+        self.renewal.want(Some((camera.clone(), max_fps)));
         Ok(())
     }
 
     /// Gives our viewpoint back.
-    pub fn release_viewpoint(&self) {}
+    pub fn release_viewpoint(&self) {
+        self.renewal.want(None);
+    }
 
     /// How our viewpoint stands.
     #[must_use]
     pub fn viewpoint_status(&self) -> ViewpointStatus {
-        ViewpointStatus::Idle
+        self.renewal.status()
     }
 
     /// Number of publishers of this rig and our schema version that live now.
     #[must_use]
     pub fn publishers(&self) -> usize {
-        0
+        self.inbox.publishers()
     }
 
-    /// What came in, a topic each (`view/NAME`, `splats`, ...).
+    /// What came in, a topic each (`view/NAME`, `viewer/SUBSCRIBER/view`, `splats`, ...).
     #[must_use]
     pub fn reports(&self) -> Vec<(String, TopicReport)> {
-        vec![]
+        self.inbox.reports()
     }
 
-    /// Messages that could not be read since the start.
+    /// Messages and publishers that could not be read since the start.
     #[must_use]
     pub fn unreadable(&self) -> u64 {
-        0
+        self.inbox.unreadable()
     }
 
-    /// Ends the session; dropping does the same but says nothing.
+    /// Gives the viewpoint back and ends the session; dropping does the same but says nothing.
     ///
     /// # Errors
     /// `Session` when zenoh fails to close.
-    pub fn close(self) -> Result<(), TransportError> {
-        Ok(())
+    pub fn close(mut self) -> Result<(), TransportError> {
+        self.stop()
+    }
+
+    fn stop(&mut self) -> Result<(), TransportError> {
+        if std::mem::replace(&mut self.closed, true) {
+            return Ok(());
+        }
+        let stopped = self.renewal.stop();
+        let closed = self.session.close().wait().map_err(|error| TransportError::session("closing", &error));
+        stopped.and(closed)
+    }
+
+    fn received<T>(
+        &self,
+        topic: String,
+        raw: Raw,
+        decode: impl Fn(&str, &Header, Bytes) -> Result<T, TransportError>,
+    ) -> Result<Received<T>, TransportError> {
+        let Raw { header, payload, latency_nanos, exact } = raw;
+        let body = decode(&topic, &header, payload).map_err(|error| {
+            self.inbox.count_unreadable();
+            as_malformed(error)
+        })?;
+        Ok(Received { topic, header, latency_nanos, latency_is_exact: exact, body })
+    }
+}
+
+impl Drop for Subscriber {
+    fn drop(&mut self) {
+        if let Err(error) = self.stop() {
+            tracing::warn!(%error, "closing the subscriber");
+        }
     }
 }

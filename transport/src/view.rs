@@ -1,8 +1,8 @@
 //! Pictures on the wire: foxglove `CompressedImage`.
 
 use foxglove::{
-    messages::{CompressedImage, Timestamp},
     Decode, Encode,
+    messages::{CompressedImage, Timestamp},
 };
 use prost::bytes::Bytes;
 
@@ -72,12 +72,19 @@ impl ViewFrame {
         let side = 1..=flyrig_types::MAX_IMAGE_SIDE;
         if !side.contains(&self.width) || !side.contains(&self.height) {
             let (width, height) = (self.width, self.height);
-            return Err(TransportError::config(format!("view {view}"), format!("is {width}x{height} pixels; sides are 1 to 16384")));
+            return Err(TransportError::config(
+                format!("view {view}"),
+                format!("is {width}x{height} pixels; sides are 1 to 16384"),
+            ));
         }
         check_len(view, self.bytes.len())
     }
 
-    pub(crate) fn encode(&self, view: &str) -> Result<Vec<u8>, TransportError> {
+    /// As foxglove `CompressedImage`; size and frame number travel in the [`crate::Header`].
+    ///
+    /// # Errors
+    /// `Malformed` when protobuf refuses it.
+    pub fn encode(&self, view: &str) -> Result<Vec<u8>, TransportError> {
         let image = CompressedImage {
             timestamp: Some(timestamp(self.capture_nanos)),
             frame_id: view.to_owned(),
@@ -87,15 +94,19 @@ impl ViewFrame {
         to_bytes(view, &image)
     }
 
-    /// Size, frame and time come from the message's header.
-    pub(crate) fn decode(view: &str, header: &crate::Header, payload: Bytes) -> Result<Self, TransportError> {
+    /// From the wire; size, frame and time come from the message's header.
+    ///
+    /// # Errors
+    /// `Malformed`.
+    pub fn decode(view: &str, header: &crate::Header, payload: Bytes) -> Result<Self, TransportError> {
         if payload.len() > 2 * MAX_IMAGE_BYTES {
             return Err(TransportError::malformed(view, format!("{} bytes are too many for a picture", payload.len())));
         }
         let image = CompressedImage::decode(payload)
             .map_err(|error| TransportError::malformed(view, format!("not a CompressedImage: {error}")))?;
-        let format = ImageFormat::from_name(&image.format)
-            .ok_or_else(|| TransportError::malformed(view, format!("format {:?}, expected jpeg or png", image.format)))?;
+        let format = ImageFormat::from_name(&image.format).ok_or_else(|| {
+            TransportError::malformed(view, format!("format {:?}, expected jpeg or png", image.format))
+        })?;
         let frame = Self {
             width: header.width,
             height: header.height,

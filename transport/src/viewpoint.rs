@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use flyrig_types::Camera;
 use serde::{Deserialize, Serialize};
 
-use crate::{keys, TransportError};
+use crate::{TransportError, keys};
 
 /// Largest side of a picture that a subscriber may ask for, pixels.
 pub const MAX_VIEWPOINT_SIDE: u32 = 4096;
@@ -164,10 +164,6 @@ impl Leases {
 
     pub(crate) fn viewpoints(&self) -> Vec<Viewpoint> {
         self.active.iter().map(|lease| lease.viewpoint.clone()).collect()
-    }
-
-    pub(crate) fn has_view(&self, view: &str) -> bool {
-        self.active.iter().any(|lease| lease.viewpoint.view == view)
     }
 
     pub(crate) fn len(&self) -> usize {

@@ -1,0 +1,189 @@
+//! The publisher thread: watches who subscribes, drains the slots, repeats the calibration, ends leases.
+
+use std::{
+    collections::BTreeMap,
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use crossbeam::channel::{Receiver, Sender};
+use prost::bytes::Bytes;
+use zenoh::{Session, Wait, qos::CongestionControl};
+
+use crate::{
+    Header, MessageKind, TransportError, header,
+    keys::{self, VIEWER_PREFIX},
+    topic::{Body, Pending, Topic, lock},
+    viewpoint::Leases,
+};
+
+/// How often subscriptions and leases are looked at.
+const TICK: Duration = Duration::from_millis(50);
+
+/// How often the calibration is repeated for those who came late.
+const REPEAT: Duration = Duration::from_secs(1);
+
+/// A zenoh publisher that could not be declared is tried again after this.
+const DECLARE_RETRY: Duration = Duration::from_secs(1);
+
+/// A message that is repeated.
+#[derive(Clone)]
+pub(crate) struct Retained {
+    pub topic: Arc<Topic>,
+    pub bytes: Bytes,
+}
+
+/// What the handles, the zenoh callbacks and the publisher thread share.
+pub(crate) struct Shared {
+    pub rig: String,
+    pub publisher_id: u64,
+    pub host_id: u64,
+    pub topics: Mutex<BTreeMap<String, Arc<Topic>>>,
+    pub calibration: Mutex<Arc<[Retained]>>,
+    pub leases: Mutex<Leases>,
+    pub stop: AtomicBool,
+    /// Holds at most one wake-up.
+    pub wake: Sender<()>,
+}
+
+impl Shared {
+    pub(crate) fn wake(&self) {
+        // Full means that it wakes anyway.
+        let _ = self.wake.try_send(());
+    }
+
+    /// Viewers' topics follow the leases, so that days of viewers coming and going leave nothing behind.
+    pub(crate) fn sync_viewer_topics(&self) {
+        let views: Vec<String> = lock(&self.leases).viewpoints().into_iter().map(|viewpoint| viewpoint.view).collect();
+        let mut topics = lock(&self.topics);
+        topics.retain(|_, topic| !topic.name.starts_with(VIEWER_PREFIX) || views.contains(&topic.name));
+        for view in views {
+            if !topics.values().any(|topic| topic.name == view) {
+                let label = keys::view_label(&view);
+                topics.insert(label.clone(), Arc::new(Topic::new(label, view, MessageKind::View)));
+            }
+        }
+    }
+}
+
+/// A topic with its zenoh publisher; `None` until declared.
+struct Lane {
+    topic: Arc<Topic>,
+    publisher: Option<zenoh::pubsub::Publisher<'static>>,
+    declare_at: Instant,
+}
+
+pub(crate) struct Drain {
+    pub shared: Arc<Shared>,
+    pub session: Session,
+    pub express: bool,
+    pub woken: Receiver<()>,
+}
+
+impl Drain {
+    /// Runs until told to stop.
+    pub(crate) fn run(self) {
+        let mut lanes: Vec<Lane> = Vec::new();
+        let mut next_tick = Instant::now();
+        let mut next_repeat = Instant::now();
+        while !self.shared.stop.load(Ordering::Relaxed) {
+            let now = Instant::now();
+            if now >= next_tick {
+                next_tick = now + TICK;
+                lock(&self.shared.leases).expire(now);
+                self.shared.sync_viewer_topics();
+                self.sync_lanes(&mut lanes, now);
+                if update_watched(&lanes) || now >= next_repeat {
+                    next_repeat = now + REPEAT;
+                    let calibration = lock(&self.shared.calibration).clone();
+                    for Retained { topic, bytes } in calibration.iter() {
+                        topic.offer(Body::Bytes(bytes.clone()), empty_header());
+                    }
+                }
+            }
+            for lane in &lanes {
+                if let Some(pending) = lane.topic.take() {
+                    let result = self.send(lane, &pending);
+                    if let Err(error) = &result {
+                        tracing::warn!(%error, "could not publish");
+                    }
+                    lane.topic.count(&result);
+                }
+            }
+            // Whoever offers a message wakes us after it is in its slot, so nothing is overslept.
+            let _ = self.woken.recv_deadline(next_tick);
+        }
+    }
+
+    fn sync_lanes(&self, lanes: &mut Vec<Lane>, now: Instant) {
+        let topics: Vec<Arc<Topic>> = lock(&self.shared.topics).values().cloned().collect();
+        lanes.retain(|lane| topics.iter().any(|topic| Arc::ptr_eq(topic, &lane.topic)));
+        for topic in topics {
+            if !lanes.iter().any(|lane| Arc::ptr_eq(&topic, &lane.topic)) {
+                lanes.push(Lane { topic, publisher: None, declare_at: now });
+            }
+        }
+        for lane in lanes.iter_mut().filter(|lane| lane.publisher.is_none() && lane.declare_at <= now) {
+            let declared = self
+                .session
+                .declare_publisher(keys::key(&self.shared.rig, &lane.topic.label))
+                .congestion_control(CongestionControl::Drop)
+                .priority(lane.topic.priority())
+                .express(self.express)
+                .encoding(lane.topic.encoding())
+                .wait();
+            match declared {
+                Ok(publisher) => lane.publisher = Some(publisher),
+                Err(error) => {
+                    tracing::warn!(topic = lane.topic.label, %error, "could not declare a publisher, trying again");
+                    lane.declare_at = now + DECLARE_RETRY;
+                }
+            }
+        }
+    }
+
+    fn send(&self, lane: &Lane, pending: &Pending) -> Result<usize, TransportError> {
+        let topic = &lane.topic;
+        let publisher = lane
+            .publisher
+            .as_ref()
+            .ok_or_else(|| TransportError::session(topic.label.clone(), &"zenoh has not taken the topic yet"))?;
+        let payload = pending.body.encode(&topic.name)?;
+        let len = payload.len();
+        let header = Header { publisher: self.shared.publisher_id, host: self.shared.host_id, ..pending.header };
+        let put = publisher.put(payload).attachment(header.encode().to_vec());
+        put.wait().map_err(|error| TransportError::session(topic.label.clone(), &error))?;
+        Ok(len)
+    }
+}
+
+/// Asks zenoh who subscribes; true when a topic of the calibration became watched.
+fn update_watched(lanes: &[Lane]) -> bool {
+    let mut calibration_wanted = false;
+    for lane in lanes {
+        let Some(publisher) = &lane.publisher else { continue };
+        let watched = publisher.matching_status().wait().is_ok_and(|status| status.matching());
+        let calibrates = matches!(lane.topic.kind, MessageKind::Calibration | MessageKind::Transforms);
+        calibration_wanted |= calibrates && watched && !lane.topic.is_watched();
+        lane.topic.set_watched(watched);
+    }
+    calibration_wanted
+}
+
+/// A header for [`Topic::offer`] to fill in.
+pub(crate) fn empty_header() -> Header {
+    Header {
+        kind: MessageKind::Stats,
+        sequence: 0,
+        frame: 0,
+        capture_nanos: 0,
+        publish_unix_nanos: header::unix_nanos(),
+        host: 0,
+        publisher: 0,
+        width: 0,
+        height: 0,
+    }
+}

@@ -1,0 +1,151 @@
+//! The subscriber's thread that asks for its viewpoint and renews the lease.
+
+use std::{
+    sync::{Arc, Condvar, Mutex, PoisonError},
+    thread::JoinHandle,
+    time::Duration,
+};
+
+use flyrig_types::Camera;
+use zenoh::{Session, Wait, qos::CongestionControl};
+
+use crate::{
+    TransportError, ViewpointStatus,
+    stats::{from_json, to_json},
+    topic::lock,
+    viewpoint::{ViewpointAnswer, ViewpointRequest},
+};
+
+/// How long an answer may take.
+const ANSWER: Duration = Duration::from_secs(1);
+
+/// When to ask again after no answer or a refusal.
+const RETRY: Duration = Duration::from_millis(500);
+
+#[derive(Debug)]
+struct State {
+    wanted: Option<(Camera, f64)>,
+    changed: bool,
+    stop: bool,
+    status: ViewpointStatus,
+}
+
+#[derive(Debug)]
+struct Shared {
+    state: Mutex<State>,
+    wake: Condvar,
+}
+
+/// Handle of the thread.
+#[derive(Debug)]
+pub(crate) struct Renewal {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Renewal {
+    pub(crate) fn start(session: Session, key: String, view: String) -> Result<Self, TransportError> {
+        let state = State { wanted: None, changed: false, stop: false, status: ViewpointStatus::Idle };
+        let shared = Arc::new(Shared { state: Mutex::new(state), wake: Condvar::new() });
+        let thread = std::thread::Builder::new()
+            .name("flyrig-viewpoint".to_owned())
+            .spawn({
+                let shared = shared.clone();
+                move || run(&shared, &session, &key, &view)
+            })
+            .map_err(|error| TransportError::session("viewpoint thread", &error))?;
+        Ok(Self { shared, thread: Some(thread) })
+    }
+
+    pub(crate) fn want(&self, wanted: Option<(Camera, f64)>) {
+        let mut state = lock(&self.shared.state);
+        match (&wanted, &state.status) {
+            (None, _) => state.status = ViewpointStatus::Idle,
+            // A moved camera keeps its lease.
+            (Some(_), ViewpointStatus::Granted { .. }) => {}
+            (Some(_), _) => state.status = ViewpointStatus::Pending,
+        }
+        state.wanted = wanted;
+        state.changed = true;
+        drop(state);
+        self.shared.wake.notify_all();
+    }
+
+    pub(crate) fn status(&self) -> ViewpointStatus {
+        lock(&self.shared.state).status.clone()
+    }
+
+    pub(crate) fn stop(&mut self) -> Result<(), TransportError> {
+        let Some(thread) = self.thread.take() else { return Ok(()) };
+        lock(&self.shared.state).stop = true;
+        self.shared.wake.notify_all();
+        thread.join().map_err(|_| TransportError::session("viewpoint thread", &"it panicked"))
+    }
+}
+
+fn run(shared: &Shared, session: &Session, key: &str, view: &str) {
+    // Nothing is asked before something is wanted, so nothing is given back either.
+    let mut asked = false;
+    let mut pause: Option<Duration> = None;
+    loop {
+        let mut state = lock(&shared.state);
+        if !state.changed && !state.stop {
+            state = match pause {
+                Some(pause) => shared.wake.wait_timeout(state, pause).unwrap_or_else(PoisonError::into_inner).0,
+                None => shared.wake.wait(state).unwrap_or_else(PoisonError::into_inner),
+            };
+        }
+        let wanted = if state.stop { None } else { state.wanted.clone() };
+        let (stop, _) = (state.stop, std::mem::take(&mut state.changed));
+        drop(state);
+
+        if wanted.is_some() || asked {
+            let answer = ask(session, key, wanted.clone());
+            asked = wanted.is_some();
+            pause = asked.then(|| match &answer {
+                Ok(Some(answer)) if answer.granted => {
+                    Duration::from_millis((answer.lease_millis / 3).clamp(20, 60_000))
+                }
+                _ => RETRY,
+            });
+            let status = match (&wanted, answer) {
+                (None, _) => ViewpointStatus::Idle,
+                (Some(_), Ok(Some(answer))) if answer.granted => ViewpointStatus::Granted { view: view.to_owned() },
+                (Some(_), Ok(Some(answer))) => ViewpointStatus::Refused { reason: answer.reason },
+                (Some(_), Ok(None)) => ViewpointStatus::Pending,
+                (Some(_), Err(error)) => {
+                    tracing::debug!(%error, "asking for a viewpoint");
+                    ViewpointStatus::Pending
+                }
+            };
+            let mut state = lock(&shared.state);
+            // An answer to a question that was changed meanwhile says nothing.
+            if !state.changed {
+                state.status = status;
+            }
+        }
+        if stop {
+            return;
+        }
+    }
+}
+
+/// The answer, `None` when nobody is there.
+fn ask(session: &Session, key: &str, wanted: Option<(Camera, f64)>) -> Result<Option<ViewpointAnswer>, TransportError> {
+    let (camera, max_fps) = wanted.map_or((None, 1.0), |(camera, max_fps)| (Some(camera), max_fps));
+    let question = to_json(key, &ViewpointRequest { camera, max_fps })?;
+    let replies = session
+        .get(key)
+        .payload(question)
+        // The reply inherits it: a stalled subscriber must not block the publisher's session.
+        .congestion_control(CongestionControl::Drop)
+        .timeout(ANSWER)
+        .wait()
+        .map_err(|error| TransportError::session(key, &error))?;
+    while let Ok(reply) = replies.recv() {
+        if let Ok(sample) = reply.result() {
+            return from_json(key, &sample.payload().to_bytes()).map(Some);
+        }
+    }
+    Ok(None)
+}

@@ -1,0 +1,11 @@
+//! What the transport promises, a module for each promise; one binary because every one links zenoh.
+
+#![allow(clippy::unwrap_used, reason = "helpers of tests fail by panicking")]
+
+mod calibration;
+mod malformed;
+mod processes;
+mod sessions;
+mod splats;
+mod support;
+mod viewpoints;

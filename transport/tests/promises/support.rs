@@ -1,0 +1,146 @@
+//! Sessions on loopback, made-up messages, waiting with an end.
+
+use std::{
+    net::TcpListener,
+    time::{Duration, Instant},
+};
+
+use flyrig_transport::{
+    ImageFormat, Interests, Publisher, Received, SplatState, Subscriber, TransportConfig, ViewFrame, Views,
+};
+use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Rig};
+use glam::{DVec2, DVec3};
+
+/// No wait of a test is longer.
+pub const PATIENCE: Duration = Duration::from_secs(40);
+
+/// Asks again until `ready` says something.
+pub fn wait_for<T>(what: &str, mut ready: impl FnMut() -> Option<T>) -> T {
+    let end = Instant::now() + PATIENCE;
+    loop {
+        if let Some(value) = ready() {
+            return value;
+        }
+        assert!(Instant::now() < end, "waited in vain for {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+pub fn wait_until(what: &str, mut ready: impl FnMut() -> bool) {
+    wait_for(what, || ready().then_some(()));
+}
+
+pub fn free_endpoint() -> String {
+    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    format!("tcp/127.0.0.1:{port}")
+}
+
+pub fn open_publisher(change: impl FnOnce(&mut TransportConfig)) -> Publisher {
+    let mut config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".into()], ..TransportConfig::publisher("test") };
+    change(&mut config);
+    Publisher::open(&config).unwrap()
+}
+
+pub fn subscriber_config(endpoints: &[String]) -> TransportConfig {
+    TransportConfig { connect: endpoints.to_vec(), ..TransportConfig::subscriber("test") }
+}
+
+pub fn open_subscriber(publisher: &Publisher, interests: &Interests) -> Subscriber {
+    Subscriber::open(&subscriber_config(publisher.endpoints()), interests).unwrap()
+}
+
+pub fn all_views() -> Interests {
+    Interests { views: Views::All, ..Interests::default() }
+}
+
+pub fn view(frame: u64, len: usize) -> ViewFrame {
+    ViewFrame {
+        width: 64,
+        height: 48,
+        format: ImageFormat::Jpeg,
+        bytes: vec![frame as u8; len].into(),
+        frame,
+        capture_nanos: 1_000_000 * frame as i64,
+    }
+}
+
+pub fn splats(frame: u64, count: usize) -> SplatState {
+    let mut random = Random(frame + 1);
+    let mut vector = |low: f32, high: f32| -> [f32; 4] { std::array::from_fn(|_| low + (high - low) * random.unit()) };
+    let center_scale = (0..count).map(|_| vector(-1.0, 1.0).map(f32::abs)).collect();
+    let color = (0..count).map(|_| vector(0.0, 1.0)).collect();
+    SplatState { frame, capture_nanos: -7, center_scale, color, invalid: 0 }
+}
+
+/// Publishes frames of one view, with growing numbers, until the subscriber has one of them.
+pub fn publish_until_seen(
+    publisher: &Publisher,
+    subscriber: &Subscriber,
+    name: &str,
+    frame: &mut u64,
+) -> Received<ViewFrame> {
+    wait_for(&format!("a picture of {name}"), || {
+        *frame += 1;
+        publisher.publish_view(name, view(*frame, 5000)).unwrap();
+        subscriber.next_view(Duration::from_millis(20)).unwrap().filter(|received| received.topic == name)
+    })
+}
+
+pub fn camera(name: &str, lens: Lens) -> Camera {
+    Camera {
+        id: name.into(),
+        intrinsics: Intrinsics {
+            width: 640,
+            height: 480,
+            focal_px: DVec2::new(500.25, 510.5),
+            center_px: DVec2::new(319.5, 240.125),
+            lens,
+        },
+        camera_from_world: Isometry::look_at(DVec3::new(0.3, -3.0, 1.2), DVec3::new(0.0, 0.1, 1.0), DVec3::Z),
+    }
+}
+
+pub fn rig() -> Rig {
+    let brown = Lens::RadialTangential { radial: [-0.3, 0.1, -0.02], tangential: [0.001, -0.002] };
+    let fisheye = Lens::Fisheye { coefficients: [0.05, -0.01, 0.002, -0.0005] };
+    Rig {
+        cameras: vec![camera("zeta", brown), camera("alpha", fisheye)],
+        world_up: DVec3::new(0.1, -0.9, 0.2).normalize(),
+    }
+}
+
+/// The same cameras in the same order, up to rounding of the matrices' inverse.
+pub fn assert_same_rig(a: &Rig, b: &Rig) {
+    assert!((a.world_up - b.world_up).length() < 1e-12, "{} {}", a.world_up, b.world_up);
+    assert_eq!(a.cameras.len(), b.cameras.len());
+    for (a, b) in a.cameras.iter().zip(&b.cameras) {
+        assert_eq!((&a.id, a.intrinsics), (&b.id, b.intrinsics));
+        let between = a.camera_from_world * b.camera_from_world.inverse();
+        assert!(between.translation.length() < 1e-9 && between.rotation.w.abs() > 1.0 - 1e-12, "{between:?}");
+    }
+}
+
+/// splitmix64: the same numbers on every machine.
+pub struct Random(pub u64);
+
+impl Random {
+    pub fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    pub fn below(&mut self, end: usize) -> usize {
+        (self.next() % end.max(1) as u64) as usize
+    }
+
+    pub fn unit(&mut self) -> f32 {
+        (self.next() >> 40) as f32 / (1u64 << 24) as f32
+    }
+
+    pub fn bytes(&mut self, len: usize) -> Vec<u8> {
+        (0..len).map(|_| self.next() as u8).collect()
+    }
+}
