@@ -1,0 +1,60 @@
+//! Buffers that come back.
+
+use std::sync::Arc;
+
+use crossbeam::queue::ArrayQueue;
+use flyrig_types::{PixelBuffer, Recycle};
+
+/// A bounded pool of byte buffers: a dropped [`PixelBuffer`] comes back and is used again.
+#[derive(Debug)]
+pub struct BufferPool {
+    free: ArrayQueue<Vec<u8>>,
+}
+
+impl BufferPool {
+    /// Keeps at most `capacity` free buffers (at least one); more are let go.
+    #[must_use]
+    pub fn new(capacity: usize) -> Arc<Self> {
+        Arc::new(Self { free: ArrayQueue::new(capacity.max(1)) })
+    }
+
+    /// An empty buffer, with the capacity it had when it was used last.
+    #[must_use]
+    pub fn take(&self) -> Vec<u8> {
+        self.free.pop().unwrap_or_default()
+    }
+
+    /// Bytes that come back to this pool when dropped.
+    #[must_use]
+    pub fn lease(self: &Arc<Self>, bytes: Vec<u8>) -> PixelBuffer {
+        PixelBuffer::leased(bytes, Arc::clone(self) as Arc<dyn Recycle>)
+    }
+}
+
+impl Recycle for BufferPool {
+    fn recycle(&self, mut bytes: Vec<u8>) {
+        bytes.clear();
+        // A full pool lets the buffer go.
+        let _ = self.free.push(bytes);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_dropped_buffer_is_used_again_and_the_pool_stays_small() {
+        let pool = BufferPool::new(2);
+        let mut bytes = pool.take();
+        bytes.resize(1000, 7);
+        let address = bytes.as_ptr();
+        drop(pool.lease(bytes));
+        let again = pool.take();
+        assert_eq!((again.as_ptr(), again.len()), (address, 0));
+        for leased in (0..5).map(|_| pool.lease(vec![0; 10])).collect::<Vec<_>>() {
+            drop(leased);
+        }
+        assert_eq!(pool.free.len(), 2);
+    }
+}

@@ -1,0 +1,260 @@
+//! Every pixel format as 8-bit sRGB.
+//!
+//! YUV is what cameras deliver: ITU-R BT.601 with limited range (Y 16 to 235, U and V 16 to 240),
+//! the chroma of a pair or a 2x2 block used for all of its pixels.
+
+use flyrig_types::{Image, PixelFormat};
+
+use crate::{CaptureError, CaptureErrorKind, picture};
+
+/// The image as `width * height` pixels of 3 bytes, sRGB red green blue. Alpha is left out, grey is
+/// repeated, YUV is BT.601 limited range, Bayer is interpolated bilinearly, JPEG decoded.
+///
+/// # Errors
+/// `Corrupt` for a damaged JPEG or one of another size, `Unsupported` for 4:2:2 of odd width and
+/// Bayer of less than 2x2.
+pub fn to_rgb8(image: &Image) -> Result<Vec<u8>, CaptureError> {
+    let mut rgb = Vec::new();
+    to_rgb8_into(image, &mut rgb)?;
+    Ok(rgb)
+}
+
+/// As [`to_rgb8`], into a buffer that is used again; after an error its content is unspecified.
+///
+/// # Errors
+/// As [`to_rgb8`].
+pub fn to_rgb8_into(image: &Image, rgb: &mut Vec<u8>) -> Result<(), CaptureError> {
+    let (width, height) = (image.width() as usize, image.height() as usize);
+    let bytes = image.bytes();
+    rgb.clear();
+    rgb.reserve(width * height * 3);
+    match image.format() {
+        PixelFormat::Rgb8 => rgb.extend_from_slice(bytes),
+        PixelFormat::Bgr8 => rgb.extend(bytes.chunks_exact(3).flat_map(|p| [p[2], p[1], p[0]])),
+        PixelFormat::Rgba8 => rgb.extend(bytes.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]])),
+        PixelFormat::Gray8 => rgb.extend(bytes.iter().flat_map(|&y| [y, y, y])),
+        format @ (PixelFormat::Yuyv | PixelFormat::Uyvy) => {
+            if width % 2 != 0 {
+                return Err(unsupported(format!("{format:?} needs an even width, not {width}")));
+            }
+            let pairs = bytes.chunks_exact(4).flat_map(|p| {
+                let [y0, u, y1, v] =
+                    if format == PixelFormat::Yuyv { [p[0], p[1], p[2], p[3]] } else { [p[1], p[0], p[3], p[2]] };
+                [rgb_of_yuv(y0, u, v), rgb_of_yuv(y1, u, v)]
+            });
+            rgb.extend(pairs.flatten());
+        }
+        PixelFormat::Nv12 => {
+            let (luma, chroma) = bytes.split_at(width * height);
+            for (y, row) in luma.chunks_exact(width).enumerate() {
+                let chroma_row = &chroma[y / 2 * width.div_ceil(2) * 2..];
+                let pixels = row
+                    .iter()
+                    .enumerate()
+                    .map(|(x, &l)| rgb_of_yuv(l, chroma_row[x / 2 * 2], chroma_row[x / 2 * 2 + 1]));
+                rgb.extend(pixels.flatten());
+            }
+        }
+        PixelFormat::BayerRggb8 => {
+            if width < 2 || height < 2 {
+                return Err(unsupported(format!("a Bayer mosaic needs at least 2x2 pixels, not {width}x{height}")));
+            }
+            demosaic_rggb(bytes, width, height, rgb);
+        }
+        PixelFormat::Mjpeg => {
+            let decoded = picture::decode(bytes)?;
+            if (decoded.width(), decoded.height()) != (image.width(), image.height()) {
+                return Err(CaptureError::general(
+                    CaptureErrorKind::Corrupt,
+                    format!("the JPEG is {}x{}, its frame {width}x{height}", decoded.width(), decoded.height()),
+                ));
+            }
+            *rgb = decoded.into_rgb8().into_raw();
+        }
+    }
+    Ok(())
+}
+
+fn unsupported(message: String) -> CaptureError {
+    CaptureError::general(CaptureErrorKind::Unsupported, message)
+}
+
+/// BT.601 limited range in 16-bit fixed point: `R = 255/219 (Y-16) + 2 (1-Kr) 255/224 (V-128)` and
+/// so on with Kr = 0.299, Kb = 0.114.
+fn rgb_of_yuv(y: u8, u: u8, v: u8) -> [u8; 3] {
+    const ROUND: i32 = 1 << 15;
+    let y = 76_309 * (i32::from(y) - 16) + ROUND;
+    let (u, v) = (i32::from(u) - 128, i32::from(v) - 128);
+    [y + 104_597 * v, y - 25_675 * u - 53_279 * v, y + 132_201 * u].map(|c| (c >> 16).clamp(0, 255) as u8)
+}
+
+/// Bilinear: a colour that a pixel lacks is the mean of its neighbours of that colour; the border
+/// is mirrored about the outermost pixel, which keeps the mosaic's phase.
+fn demosaic_rggb(mosaic: &[u8], width: usize, height: usize, rgb: &mut Vec<u8>) {
+    let mirror = |i: usize, n: usize| [if i == 0 { 1 } else { i - 1 }, if i + 1 == n { n - 2 } else { i + 1 }];
+    for y in 0..height {
+        let [up, down] = mirror(y, height).map(|y| &mosaic[y * width..][..width]);
+        let row = &mosaic[y * width..][..width];
+        for x in 0..width {
+            let [left, right] = mirror(x, width);
+            let own = row[x];
+            let mean2 = |a: u8, b: u8| (u16::from(a) + u16::from(b)).div_ceil(2) as u8;
+            let mean4 =
+                |[a, b, c, d]: [u8; 4]| ((u16::from(a) + u16::from(b) + u16::from(c) + u16::from(d) + 2) / 4) as u8;
+            let cross = || mean4([row[left], row[right], up[x], down[x]]);
+            let corners = || mean4([up[left], up[right], down[left], down[right]]);
+            let (sides, ends) = (mean2(row[left], row[right]), mean2(up[x], down[x]));
+            rgb.extend(match (y % 2, x % 2) {
+                (0, 0) => [own, cross(), corners()],
+                (0, _) => [sides, own, ends],
+                (_, 0) => [ends, own, sides],
+                _ => [corners(), cross(), own],
+            });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Cursor;
+
+    use super::*;
+
+    fn noise(length: usize) -> Vec<u8> {
+        let mut state = 3u64;
+        let step = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 40) as u8
+        };
+        std::iter::repeat_with(step).take(length).collect()
+    }
+
+    fn convert(width: u32, height: u32, format: PixelFormat, bytes: Vec<u8>) -> Result<Vec<u8>, CaptureError> {
+        to_rgb8(&Image::new(width, height, format, bytes).unwrap())
+    }
+
+    /// From the definition of BT.601, not from its usual constants.
+    fn reference(y: u8, u: u8, v: u8) -> [f64; 3] {
+        let (kr, kb) = (0.299, 0.114);
+        let y = (f64::from(y) - 16.0) / 219.0;
+        let (pb, pr) = ((f64::from(u) - 128.0) / 224.0, (f64::from(v) - 128.0) / 224.0);
+        let (r, b) = (y + 2.0 * (1.0 - kr) * pr, y + 2.0 * (1.0 - kb) * pb);
+        [r, (y - kr * r - kb * b) / (1.0 - kr - kb), b].map(|c| 255.0 * c.clamp(0.0, 1.0))
+    }
+
+    fn close(found: &[u8], expected: &[f64]) {
+        assert_eq!(found.len(), expected.len());
+        for (i, (found, expected)) in found.iter().zip(expected).enumerate() {
+            assert!((f64::from(*found) - expected).abs() <= 0.51, "byte {i}: {found} for {expected}");
+        }
+    }
+
+    #[test]
+    fn every_yuv_triple_is_within_half_a_step_of_the_definition() {
+        for y in 0..=255 {
+            for u in (0..=255).step_by(5) {
+                for v in (0..=255).step_by(3) {
+                    close(&rgb_of_yuv(y, u, v), &reference(y, u, v));
+                }
+            }
+        }
+        assert_eq!([rgb_of_yuv(16, 128, 128), rgb_of_yuv(235, 128, 128)], [[0; 3], [255; 3]]);
+        assert_eq!(rgb_of_yuv(81, 90, 240), [254, 0, 0], "a broadcast red bar");
+    }
+
+    #[test]
+    fn packed_yuv_has_its_bytes_in_order() {
+        let bytes = noise(6 * 4 * 2);
+        let expected: Vec<f64> = bytes
+            .chunks(4)
+            .flat_map(|p| [reference(p[0], p[1], p[3]), reference(p[2], p[1], p[3])])
+            .flatten()
+            .collect();
+        close(&convert(6, 4, PixelFormat::Yuyv, bytes.clone()).unwrap(), &expected);
+        let swapped = bytes.chunks(2).flat_map(|p| [p[1], p[0]]).collect();
+        close(&convert(6, 4, PixelFormat::Uyvy, swapped).unwrap(), &expected);
+        assert_eq!(convert(3, 1, PixelFormat::Yuyv, noise(6)).unwrap_err().kind, CaptureErrorKind::Unsupported);
+    }
+
+    #[test]
+    fn nv12_of_even_and_odd_size() {
+        for (width, height) in [(6usize, 4usize), (5, 3), (1, 1)] {
+            let chroma_width = width.div_ceil(2);
+            let bytes = noise(width * height + chroma_width * height.div_ceil(2) * 2);
+            let mut expected = Vec::new();
+            for y in 0..height {
+                for x in 0..width {
+                    let uv = width * height + ((y / 2) * chroma_width + x / 2) * 2;
+                    expected.extend(reference(bytes[y * width + x], bytes[uv], bytes[uv + 1]));
+                }
+            }
+            close(&convert(width as u32, height as u32, PixelFormat::Nv12, bytes).unwrap(), &expected);
+        }
+    }
+
+    #[test]
+    fn bayer_is_the_mean_of_the_neighbours_of_a_colour() {
+        for (width, height) in [(2i64, 2i64), (7, 5), (6, 8)] {
+            let mosaic = noise((width * height) as usize);
+            let mirror = |i: i64, n: i64| {
+                if i < 0 {
+                    -i
+                } else if i >= n {
+                    2 * n - 2 - i
+                } else {
+                    i
+                }
+            };
+            let color = |x: i64, y: i64| [[0, 1], [1, 2]][(y % 2) as usize][(x % 2) as usize];
+            let mut expected = Vec::new();
+            for y in 0..height {
+                for x in 0..width {
+                    for channel in 0..3 {
+                        if color(x, y) == channel {
+                            expected.push(f64::from(mosaic[(y * width + x) as usize]));
+                            continue;
+                        }
+                        let (mut sum, mut count) = (0.0, 0.0);
+                        for (dx, dy) in (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (dx, dy))) {
+                            let (nx, ny) = (mirror(x + dx, width), mirror(y + dy, height));
+                            // Green sits on the cross, the other colour of a corner on the diagonal.
+                            if color(nx, ny) == channel {
+                                sum += f64::from(mosaic[(ny * width + nx) as usize]);
+                                count += 1.0;
+                            }
+                        }
+                        expected.push(sum / count);
+                    }
+                }
+            }
+            close(&convert(width as u32, height as u32, PixelFormat::BayerRggb8, mosaic).unwrap(), &expected);
+        }
+        assert_eq!(convert(1, 4, PixelFormat::BayerRggb8, noise(4)).unwrap_err().kind, CaptureErrorKind::Unsupported);
+    }
+
+    #[test]
+    fn plain_formats_move_bytes() {
+        assert_eq!(convert(2, 1, PixelFormat::Rgb8, vec![1, 2, 3, 4, 5, 6]).unwrap(), [1, 2, 3, 4, 5, 6]);
+        assert_eq!(convert(2, 1, PixelFormat::Bgr8, vec![1, 2, 3, 4, 5, 6]).unwrap(), [3, 2, 1, 6, 5, 4]);
+        assert_eq!(convert(1, 2, PixelFormat::Rgba8, vec![1, 2, 3, 0, 4, 5, 6, 9]).unwrap(), [1, 2, 3, 4, 5, 6]);
+        assert_eq!(convert(1, 2, PixelFormat::Gray8, vec![7, 8]).unwrap(), [7, 7, 7, 8, 8, 8]);
+    }
+
+    #[test]
+    fn mjpeg_is_decoded_or_refused() {
+        let picture = image::RgbImage::from_pixel(16, 8, image::Rgb([200, 40, 90]));
+        let mut jpeg = Cursor::new(Vec::new());
+        picture.write_to(&mut jpeg, image::ImageFormat::Jpeg).unwrap();
+        let jpeg = jpeg.into_inner();
+        let rgb = convert(16, 8, PixelFormat::Mjpeg, jpeg.clone()).unwrap();
+        assert!(rgb.iter().zip(picture.as_raw()).all(|(a, b)| a.abs_diff(*b) <= 6));
+        let error = convert(8, 8, PixelFormat::Mjpeg, jpeg.clone()).unwrap_err();
+        assert_eq!(error.to_string(), "the JPEG is 16x8, its frame 8x8");
+        let cut = convert(16, 8, PixelFormat::Mjpeg, jpeg[..jpeg.len() - 2].to_vec()).unwrap_err();
+        assert_eq!(
+            (cut.kind, cut.to_string().as_str()),
+            (CaptureErrorKind::Corrupt, "is a JPEG picture that is cut off")
+        );
+        assert_eq!(convert(16, 8, PixelFormat::Mjpeg, vec![]).unwrap_err().kind, CaptureErrorKind::Corrupt);
+    }
+}

@@ -1,0 +1,70 @@
+//! Puts the frames of several threads into the order of capture.
+
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+
+/// A merge by time: a thread with a frame waits until no other can have an earlier one. Reading and
+/// decoding go on in parallel. Assumes that each thread's times grow; where they do not, the order
+/// suffers, nothing else.
+#[derive(Debug)]
+pub(crate) struct Turns {
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Debug)]
+struct State {
+    /// Per thread the earliest time that its next frame can have; `None` when it has ended.
+    earliest: Vec<Option<i64>>,
+    closed: bool,
+}
+
+impl Turns {
+    pub fn new(threads: usize) -> Self {
+        Self {
+            state: Mutex::new(State { earliest: vec![Some(i64::MIN); threads], closed: false }),
+            changed: Condvar::new(),
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Waits until the frame at `nanos` is the earliest of all, the lower slot first among equals.
+    /// `false` when closed meanwhile.
+    pub fn wait(&self, slot: usize, nanos: i64) -> bool {
+        let mut state = self.lock();
+        state.earliest[slot] = Some(nanos);
+        self.changed.notify_all();
+        while !state.closed {
+            let is_first = state
+                .earliest
+                .iter()
+                .enumerate()
+                .all(|(other, earliest)| earliest.is_none_or(|earliest| (nanos, slot) <= (earliest, other)));
+            if is_first {
+                return true;
+            }
+            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+        false
+    }
+
+    /// The frame at `nanos` is delivered; the thread's next one is later.
+    pub fn done(&self, slot: usize, nanos: i64) {
+        self.lock().earliest[slot] = Some(nanos.saturating_add(1));
+        self.changed.notify_all();
+    }
+
+    /// The thread gives no more frames.
+    pub fn end(&self, slot: usize) {
+        self.lock().earliest[slot] = None;
+        self.changed.notify_all();
+    }
+
+    /// Frees everyone.
+    pub fn close(&self) {
+        self.lock().closed = true;
+        self.changed.notify_all();
+    }
+}
