@@ -10,12 +10,10 @@ pub struct PoseConfig {
     pub presence_threshold: f64,
     /// Landmarks of lower confidence (the smaller of visibility and presence) are not used, 0..1.
     pub confidence_threshold: f64,
-    /// Distance in pixels up to which views agree on a landmark, for a person `reference_height_px` high.
-    pub inlier_px: f64,
-    /// Height of a person in pixels for which `inlier_px` and `sigma_px` hold; both scale with the person.
-    pub reference_height_px: f64,
-    /// Standard deviation of a landmark in pixels, for a person `reference_height_px` high.
-    pub sigma_px: f64,
+    /// Distance up to which views agree on a landmark, metres at its depth.
+    pub inlier_m: f64,
+    /// Standard deviation of a landmark, metres at its depth.
+    pub sigma_m: f64,
     /// Standard deviation of a joint's turn between sets at 30 sets a second, radians; smaller is smoother.
     pub smooth_rad: f64,
     /// Largest number of solver steps a frame set.
@@ -34,9 +32,8 @@ impl Default for PoseConfig {
         Self {
             presence_threshold: 0.5,
             confidence_threshold: 0.3,
-            inlier_px: 20.0,
-            reference_height_px: 700.0,
-            sigma_px: 5.0,
+            inlier_m: 0.07,
+            sigma_m: 0.015,
             smooth_rad: 0.15,
             max_steps: 12,
             fit_shape: true,

@@ -6,19 +6,34 @@
 //! 1. [`PoseNet`] (BlazePose) finds 33 landmarks and a coarse mask in a turned square crop of each picture;
 //!    the crop follows the person, and is searched over the whole picture after the person was lost.
 //! 2. [`triangulate`] joins the landmarks of the views, leaving out views that disagree.
-//! 3. A damped least-squares fit in pixels turns the template's joints ([`fit_pose`]); the bone lengths are
+//! 3. A damped least-squares fit in pixels turns the template's joints; the bone lengths are
 //!    fitted once, over the first frames ([`PoseEstimator::fit_shape`]).
 //! 4. Masks come from an empty plate ([`mask_from_plate`]) or from the network, sharpened on the picture and
 //!    gated by the fitted body.
 
+mod anatomy;
+mod body_model;
 mod config;
+mod crop;
 mod error;
 mod estimate;
 mod estimator;
+mod fit;
+mod grid;
 mod landmarks;
+mod math;
 mod net;
+mod pixels;
 mod plate;
+mod search;
 mod shape;
+mod silhouette;
+mod single_view;
+mod surface_marks;
+#[cfg(test)]
+mod testing;
+mod triangulate;
+mod view;
 
 pub use config::PoseConfig;
 pub use error::{TrackError, TrackErrorKind};
@@ -27,4 +42,5 @@ pub use estimator::PoseEstimator;
 pub use landmarks::{Keypoint, LANDMARK_BONES, LANDMARK_COUNT, LANDMARK_NAMES, ViewKeypoints};
 pub use net::{CropLandmark, NET_SIDE, NetOutput, PoseNet};
 pub use plate::mask_from_plate;
-pub use shape::ShapeFit;
+pub use shape::{ShapeFit, fit_template_shape};
+pub use triangulate::{WorldPoint, triangulate};

@@ -73,7 +73,7 @@ impl PoseNet {
             )
         };
         let side = NET_SIDE as i64;
-        let model = tract_onnx::onnx()
+        let model = onnx()
             .model_for_read(&mut bytes)
             .and_then(|model| model.with_input_fact(0, f32::fact(tvec!(1, side, side, 3)).into()))
             .and_then(InferenceModelExt::into_optimized)

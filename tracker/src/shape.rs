@@ -1,6 +1,34 @@
-//! Bone lengths of the person.
+//! Bone lengths of the person, and the template with them.
 
 use std::collections::BTreeMap;
+
+use flyrig_body::{Joint, Skeleton, Template};
+use flyrig_types::Rig;
+use glam::{DMat3, DMat4, DVec3};
+
+use crate::body_model::BodyModel;
+use crate::math::median;
+use crate::triangulate::triangulate;
+use crate::{LANDMARK_COUNT, PoseConfig, TrackError, TrackErrorKind, ViewKeypoints};
+
+/// Lengths are pulled towards the template's proportions as if those were this many measurements.
+const PRIOR_COUNT: f64 = 2.0;
+/// Proportions of adults differ from the template's by no more than this.
+const GROUP_RANGE: (f64, f64) = (0.8, 1.25);
+/// Whole-body scale that is believed.
+const SCALE_RANGE: (f64, f64) = (0.4, 1.6);
+
+/// Length groups: name and the pairs of landmarks whose distance measures it.
+const GROUPS: [(&str, &[(usize, usize)]); 8] = [
+    ("trunk", &[(11, 23), (12, 24)]),
+    ("shoulders", &[(11, 12)]),
+    ("hips", &[(23, 24)]),
+    ("upper-arms", &[(11, 13), (12, 14)]),
+    ("forearms", &[(13, 15), (14, 16)]),
+    ("thighs", &[(23, 25), (24, 26)]),
+    ("shanks", &[(25, 27), (26, 28)]),
+    ("feet", &[(29, 31), (30, 32)]),
+];
 
 /// Result of a shape fit.
 #[derive(Debug, Clone, PartialEq)]
@@ -11,8 +39,251 @@ pub struct ShapeFit {
     pub groups: BTreeMap<String, f64>,
     /// Stature of the fitted template in its bind pose, metres.
     pub height_m: f64,
-    /// Median landmark distance after the fit, pixels.
-    pub residual_px: f64,
-    /// Frame sets used.
+    /// Frame sets that gave at least one length.
     pub sets: usize,
+}
+
+/// Scales a template to a person: the whole body, and each group of bones along its own direction, from
+/// the median distances between triangulated landmarks over a few frame sets.
+///
+/// `keypoints[set][slot]` are the landmarks of one person, slots in rig order. Needs two views in at least
+/// one set. Vertices move with the bones that carry them, so flesh keeps its thickness apart from `scale`.
+///
+/// # Errors
+/// Kind `Lost` when too few lengths could be measured or they are not a person's; kind `Template` when the
+/// template lacks joints.
+pub fn fit_template_shape(
+    template: &Template,
+    rig: &Rig,
+    keypoints: &[Vec<Option<ViewKeypoints>>],
+    config: &PoseConfig,
+) -> Result<(Template, ShapeFit), TrackError> {
+    let model = BodyModel::new(template)?;
+    let mut lengths: [Vec<f64>; GROUPS.len()] = std::array::from_fn(|_| Vec::new());
+    let mut sets = 0;
+    for views in keypoints {
+        let points = triangulate(&rig.cameras, views, config.confidence_threshold, config.inlier_m);
+        let mut any = false;
+        for ((_, pairs), lengths) in GROUPS.iter().zip(&mut lengths) {
+            for &(a, b) in *pairs {
+                if let (Some(a), Some(b)) = (&points[a], &points[b]) {
+                    lengths.push((a.position - b.position).length());
+                    any = true;
+                }
+            }
+        }
+        sets += usize::from(any);
+    }
+    let rest = |a: usize, b: usize| (model.marks[a].point - model.marks[b].point).length();
+    // Measured over the template's, with the count of measurements.
+    let ratios: Vec<Option<(f64, f64)>> = GROUPS
+        .iter()
+        .zip(&mut lengths)
+        .map(|((_, pairs), lengths)| {
+            let count = lengths.len() as f64;
+            let template_m = pairs.iter().map(|&(a, b)| rest(a, b)).sum::<f64>() / pairs.len() as f64;
+            median(lengths).map(|measured_m| (measured_m / template_m, count))
+        })
+        .collect();
+    // Long bones tell the stature; widths and feet do not.
+    const STATURE: [(usize, f64); 5] = [(0, 2.0), (3, 1.0), (4, 1.0), (5, 2.0), (6, 2.0)];
+    let (sum, weight) = STATURE
+        .iter()
+        .filter_map(|&(group, weight)| ratios[group].map(|(ratio, _)| (ratio * weight, weight)))
+        .fold((0.0, 0.0), |(s, t), (r, w)| (s + r, t + w));
+    if weight < 4.0 {
+        return Err(TrackError::lost(
+            "the shape fit needs the trunk and the limbs in two views; let the person stand free for a moment",
+        ));
+    }
+    let scale = sum / weight;
+    if !(SCALE_RANGE.0..=SCALE_RANGE.1).contains(&scale) {
+        return Err(TrackError::lost(format!(
+            "the person measures {scale:.2} times the template; check that the calibration is in metres"
+        )));
+    }
+    let groups: BTreeMap<String, f64> = GROUPS
+        .iter()
+        .zip(&ratios)
+        .map(|((name, _), ratio)| {
+            let factor = ratio.map_or(1.0, |(ratio, count)| {
+                (ratio / scale * count + PRIOR_COUNT) / (count + PRIOR_COUNT)
+            });
+            ((*name).to_owned(), factor.clamp(GROUP_RANGE.0, GROUP_RANGE.1))
+        })
+        .collect();
+    let shaped = scale_template(template, &model, scale, &groups)?;
+    let (low, high) = shaped
+        .positions
+        .iter()
+        .fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), p| (low.min(p.y), high.max(p.y)));
+    let fit = ShapeFit { scale, groups, height_m: f64::from(high - low), sets };
+    tracing::info!(scale, height_m = fit.height_m, sets, "fitted the template's bone lengths");
+    Ok((shaped, fit))
+}
+
+/// How each joint's flesh is stretched, canonical axes, before the whole-body scale.
+fn stretches(model: &BodyModel, groups: &BTreeMap<String, f64>) -> Vec<DMat3> {
+    let factor = |name: &str| groups.get(name).copied().unwrap_or(1.0);
+    let mut stretch = vec![DMat3::IDENTITY; model.parents.len()];
+    let roles = &model.roles;
+    let along = |from: usize, to: usize, factor: f64| {
+        let d = (model.origins[to] - model.origins[from]).normalize_or(DVec3::Y);
+        DMat3::IDENTITY + DMat3::from_cols(d * d.x, d * d.y, d * d.z) * (factor - 1.0)
+    };
+    let (shoulders, hips, trunk) = (factor("shoulders"), factor("hips"), factor("trunk"));
+    // Trunk joints: from the root up to where the arms begin, ever less hips and more shoulders.
+    let mut spine = Vec::new();
+    let first_of_arm = roles.clavicle[0].unwrap_or(roles.upper_arm[0]);
+    let mut at = model.parents[first_of_arm];
+    while let Some(joint) = at {
+        spine.push(joint);
+        at = model.parents[joint];
+    }
+    let count = (spine.len().max(2) - 1) as f64;
+    for (i, &joint) in spine.iter().enumerate() {
+        let t = i as f64 / count; // 0 at the chest, 1 at the root
+        stretch[joint] = DMat3::from_diagonal(DVec3::new(shoulders + (hips - shoulders) * t, trunk, 1.0));
+    }
+    for side in 0..2 {
+        if let Some(clavicle) = roles.clavicle[side] {
+            stretch[clavicle] = DMat3::from_diagonal(DVec3::new(shoulders, 1.0, 1.0));
+        }
+        // Helper joints between the root and a thigh carry the width of the hips.
+        let mut at = model.parents[roles.thigh[side]];
+        while let Some(joint) = at {
+            if !spine.contains(&joint) {
+                stretch[joint] = DMat3::from_diagonal(DVec3::new(hips, 1.0, 1.0));
+            }
+            at = model.parents[joint];
+        }
+        stretch[roles.upper_arm[side]] = along(roles.upper_arm[side], roles.forearm[side], factor("upper-arms"));
+        stretch[roles.forearm[side]] = along(roles.forearm[side], roles.hand[side], factor("forearms"));
+        stretch[roles.thigh[side]] = along(roles.thigh[side], roles.shank[side], factor("thighs"));
+        stretch[roles.shank[side]] = along(roles.shank[side], roles.foot[side], factor("shanks"));
+        for joint in 0..stretch.len() {
+            if model.hangs_below(joint, roles.foot[side]) {
+                stretch[joint] = DMat3::from_diagonal(DVec3::new(1.0, 1.0, factor("feet")));
+            }
+        }
+    }
+    stretch
+}
+
+fn scale_template(
+    template: &Template,
+    model: &BodyModel,
+    scale: f64,
+    groups: &BTreeMap<String, f64>,
+) -> Result<Template, TrackError> {
+    let stretch: Vec<DMat3> = stretches(model, groups).into_iter().map(|s| s * scale).collect();
+    let mut origins: Vec<DVec3> = Vec::with_capacity(stretch.len());
+    let mut joints: Vec<Joint> = Vec::with_capacity(stretch.len());
+    for (index, joint) in template.skeleton.joints().iter().enumerate() {
+        let bind = DMat3::from_quat(model.bind_rotation[index]);
+        let (origin, rest_translation) = match joint.parent {
+            None => (model.origins[index] * scale, joint.rest_translation * scale),
+            Some(parent) => {
+                let parent_bind = DMat3::from_quat(model.bind_rotation[parent]);
+                let local = parent_bind.transpose() * stretch[parent] * parent_bind;
+                let origin = origins[parent] + stretch[parent] * (model.origins[index] - model.origins[parent]);
+                (origin, local * joint.rest_translation)
+            }
+        };
+        origins.push(origin);
+        let joint_from_canonical = DMat4::from_mat3(bind.transpose()) * DMat4::from_translation(-origin);
+        joints.push(Joint { rest_translation, joint_from_canonical, ..joint.clone() });
+    }
+    let mut shaped = template.clone();
+    shaped.skeleton = Skeleton::new(joints)
+        .map_err(|error| TrackError::new(TrackErrorKind::Template, format!("the fitted skeleton: {error}")))?;
+    let inverse: Vec<DMat3> = stretch.iter().map(DMat3::inverse).collect();
+    for ((position, normal), skin) in shaped.positions.iter_mut().zip(&mut shaped.normals).zip(&template.skin) {
+        let (old, old_normal) = (position.as_dvec3(), normal.as_dvec3());
+        let (mut moved, mut turned, mut total) = (DVec3::ZERO, DVec3::ZERO, 0.0);
+        for (&joint, &weight) in skin.joints.iter().zip(&skin.weights) {
+            let (joint, weight) = (usize::from(joint), f64::from(weight));
+            if weight > 0.0 {
+                moved += (origins[joint] + stretch[joint] * (old - model.origins[joint])) * weight;
+                turned += inverse[joint] * old_normal * weight;
+                total += weight;
+            }
+        }
+        if total > 0.0 {
+            *position = (moved / total).as_vec3();
+            *normal = turned.normalize_or(old_normal).as_vec3();
+        } else {
+            *position = (old * scale).as_vec3();
+        }
+    }
+    Ok(shaped)
+}
+
+/// Median landmark count that a set needs to be worth a shape fit.
+pub(crate) fn seen_landmarks(views: &[Option<ViewKeypoints>], threshold: f64) -> usize {
+    let seen = |i: usize| {
+        views.iter().flatten().filter(|view| view[i].usable() && view[i].confidence >= threshold).count() >= 2
+    };
+    (0..LANDMARK_COUNT).filter(|&i| seen(i)).count()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{body, keypoints_of, random_turns, ring};
+
+    #[test]
+    fn a_stretched_person_is_measured_back() {
+        let template = body();
+        let model = BodyModel::new(&template).unwrap();
+        let truth: BTreeMap<String, f64> =
+            [("thighs", 1.08), ("forearms", 0.93), ("shoulders", 1.05), ("trunk", 0.96)]
+                .into_iter()
+                .map(|(name, factor)| (name.to_owned(), factor))
+                .collect();
+        let person = BodyModel::new(&scale_template(&template, &model, 1.06, &truth).unwrap()).unwrap();
+        let rig = ring(3);
+        let keypoints: Vec<Vec<_>> = (0..8)
+            .map(|seed| {
+                let marks = person.marks(&random_turns(&person, seed));
+                rig.cameras.iter().map(|camera| Some(keypoints_of(camera, &marks))).collect()
+            })
+            .collect();
+        let (fitted, fit) = fit_template_shape(&template, &rig, &keypoints, &PoseConfig::default()).unwrap();
+        assert_eq!(fit.sets, 8);
+        let fitted = BodyModel::new(&fitted).unwrap();
+        for (a, b) in [(23, 25), (25, 27), (11, 13), (13, 15), (11, 12), (23, 24)] {
+            let length = |m: &BodyModel| (m.marks[a].point - m.marks[b].point).length();
+            let (found, expected) = (length(&fitted), length(&person));
+            assert!((found / expected - 1.0).abs() < 0.02, "{a}-{b}: {found} {expected}");
+        }
+    }
+
+    #[test]
+    fn the_shaped_skeleton_still_carries_its_skin() {
+        let template = body();
+        let model = BodyModel::new(&template).unwrap();
+        let groups = [("thighs".to_owned(), 1.2), ("hips".to_owned(), 0.9)].into_iter().collect();
+        let shaped = scale_template(&template, &model, 0.9, &groups).unwrap();
+        let matrices = shaped.skeleton.world_from_canonical(&shaped.skeleton.rest_pose());
+        // The built-in body rests in its bind pose: the skinning matrices move nothing.
+        for matrix in matrices {
+            assert!((matrix - DMat4::IDENTITY).to_cols_array().iter().all(|v| v.abs() < 1e-6), "{matrix}");
+        }
+        assert!(shaped.positions.iter().chain(&shaped.normals).all(|p| p.is_finite()));
+        assert!(shaped.normals.iter().all(|n| (n.length() - 1.0).abs() < 1e-3));
+    }
+
+    #[test]
+    fn no_views_one_view_and_poison_are_lost_not_nan() {
+        let template = body();
+        let rig = ring(2);
+        let nan = [crate::Keypoint { pixel: glam::DVec2::NAN, confidence: 1.0 }; LANDMARK_COUNT];
+        let points = [DVec3::new(0.0, 0.0, 1.0); LANDMARK_COUNT];
+        let one_point = [0, 1].map(|i| Some(keypoints_of(&rig.cameras[i], &points))).to_vec();
+        for keypoints in [vec![], vec![vec![None, None]], vec![vec![Some(nan), Some(nan)]], vec![one_point]] {
+            let error = fit_template_shape(&template, &rig, &keypoints, &PoseConfig::default()).unwrap_err();
+            assert_eq!(error.kind, TrackErrorKind::Lost);
+        }
+    }
 }

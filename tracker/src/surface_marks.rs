@@ -7,21 +7,16 @@ use crate::anatomy::Roles;
 use crate::landmarks::{LEFT_ANKLE, LEFT_ELBOW, LEFT_HEEL, LEFT_HIP, LEFT_KNEE, LEFT_SHOULDER, LEFT_TOES, LEFT_WRIST, NOSE};
 use crate::{LANDMARK_COUNT, TrackError, TrackErrorKind};
 
-/// A point of the template that moves with a blend of joints: joint, weight, canonical point times weight.
-#[derive(Debug, Clone, PartialEq, Default)]
+/// A canonical point of the template that moves with one joint.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct Mark {
-    pub parts: Vec<(usize, f64, DVec3)>,
+    pub joint: usize,
+    pub point: DVec3,
 }
 
 impl Mark {
-    /// A canonical point that moves with one joint.
     fn on_joint(joint: usize, point: DVec3) -> Self {
-        Self { parts: vec![(joint, 1.0, point)] }
-    }
-
-    /// Canonical position.
-    pub fn canonical(&self) -> DVec3 {
-        self.parts.iter().map(|(_, _, weighted)| *weighted).sum()
+        Self { joint, point }
     }
 }
 
@@ -50,7 +45,7 @@ pub(crate) fn find_marks(
     roles: &Roles,
     origins: &[DVec3],
 ) -> Result<[Mark; LANDMARK_COUNT], TrackError> {
-    let mut marks: [Mark; LANDMARK_COUNT] = std::array::from_fn(|_| Mark::default());
+    let mut marks: [Mark; LANDMARK_COUNT] = [Mark::default(); LANDMARK_COUNT];
     for side in 0..2 {
         for (landmark, joint) in [
             (LEFT_SHOULDER, roles.upper_arm[side]),

@@ -1,0 +1,208 @@
+//! A template's skeleton as the fit sees it: turns away from the bind pose, in canonical axes.
+//!
+//! With `G_j` the rotation that takes joint j's flesh from canonical axes to the world, the parameters are
+//! `A_j = G_parent⁻¹ G_j`: identity in the bind pose for every joint, in axes that mean the same for every
+//! skeleton (x left, y up, z forward).
+
+use flyrig_body::Template;
+use flyrig_types::Pose;
+use glam::{DQuat, DVec3};
+
+use crate::anatomy::{JointRange, Roles, joint_ranges};
+use crate::landmarks::{LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER};
+use crate::surface_marks::{Mark, find_marks};
+use crate::{LANDMARK_COUNT, TrackError, TrackErrorKind};
+
+/// Turns of all joints and the root's place.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Turns {
+    pub root: DVec3,
+    /// `A_j`; for the root `G_root`.
+    pub turns: Vec<DQuat>,
+}
+
+/// World state of a skeleton.
+#[derive(Debug, Clone)]
+pub(crate) struct Posed {
+    /// `G_j`.
+    pub rotation: Vec<DQuat>,
+    /// Joint origins.
+    pub origin: Vec<DVec3>,
+}
+
+/// What the fit needs of a template.
+#[derive(Debug, Clone)]
+pub(crate) struct BodyModel {
+    pub parents: Vec<Option<usize>>,
+    /// Rotation of `canonical_from_joint`.
+    pub bind_rotation: Vec<DQuat>,
+    /// Joint origin in canonical space.
+    pub origins: Vec<DVec3>,
+    /// Joint origin from its parent's, canonical axes.
+    pub offsets: Vec<DVec3>,
+    pub roles: Roles,
+    pub ranges: Vec<Option<JointRange>>,
+    pub marks: [Mark; LANDMARK_COUNT],
+}
+
+impl BodyModel {
+    pub fn new(template: &Template) -> Result<Self, TrackError> {
+        let joints = template.skeleton.joints();
+        let roles = Roles::find(&template.skeleton, &template.name)?;
+        let canonical_from_joint: Vec<_> = joints.iter().map(|joint| joint.joint_from_canonical.inverse()).collect();
+        let bind_rotation: Vec<DQuat> =
+            canonical_from_joint.iter().map(|m| m.to_scale_rotation_translation().1.normalize()).collect();
+        let origins: Vec<DVec3> = canonical_from_joint.iter().map(|m| m.w_axis.truncate()).collect();
+        let parents: Vec<Option<usize>> = joints.iter().map(|joint| joint.parent).collect();
+        let offsets = joints
+            .iter()
+            .map(|joint| joint.parent.map_or(DVec3::ZERO, |parent| bind_rotation[parent] * joint.rest_translation))
+            .collect();
+        let finite = template.positions.iter().all(|p| p.is_finite())
+            && template.skin.len() == template.positions.len()
+            && template.skin.iter().all(|s| s.joints.iter().all(|&j| usize::from(j) < joints.len()))
+            && origins.iter().all(|o| o.is_finite())
+            && bind_rotation.iter().all(|q| q.is_finite());
+        if !finite {
+            return Err(TrackError::new(
+                TrackErrorKind::Template,
+                format!("template '{}' holds numbers that are not finite or skin for joints it has not", template.name),
+            ));
+        }
+        let marks = find_marks(template, &roles, &origins)?;
+        let ranges = joint_ranges(&template.skeleton, &roles, &origins);
+        Ok(Self { parents, bind_rotation, origins, offsets, roles, ranges, marks })
+    }
+
+    /// The bind pose with the root joint at a place.
+    pub fn bind_turns(&self, root: DVec3) -> Turns {
+        Turns { root, turns: vec![DQuat::IDENTITY; self.parents.len()] }
+    }
+
+    /// Forward kinematics.
+    pub fn pose(&self, turns: &Turns) -> Posed {
+        let mut posed = Posed { rotation: Vec::with_capacity(self.parents.len()), origin: Vec::new() };
+        for (joint, parent) in self.parents.iter().enumerate() {
+            let (rotation, origin) = match *parent {
+                None => (turns.turns[joint], turns.root),
+                Some(parent) => (
+                    posed.rotation[parent] * turns.turns[joint],
+                    posed.origin[parent] + posed.rotation[parent] * self.offsets[joint],
+                ),
+            };
+            posed.rotation.push(rotation.normalize());
+            posed.origin.push(origin);
+        }
+        posed
+    }
+
+    /// World position of a mark.
+    pub fn mark(&self, posed: &Posed, landmark: usize) -> DVec3 {
+        let mark = &self.marks[landmark];
+        posed.origin[mark.joint] + posed.rotation[mark.joint] * (mark.point - self.origins[mark.joint])
+    }
+
+    /// World positions of all marks.
+    pub fn marks(&self, turns: &Turns) -> [DVec3; LANDMARK_COUNT] {
+        let posed = self.pose(turns);
+        std::array::from_fn(|i| self.mark(&posed, i))
+    }
+
+    /// As the workspace's pose.
+    pub fn to_pose(&self, turns: &Turns) -> Pose {
+        let rotations = self.parents.iter().enumerate().map(|(joint, parent)| {
+            let bind = self.bind_rotation[joint];
+            match *parent {
+                None => turns.turns[joint] * bind,
+                Some(parent) => self.bind_rotation[parent].inverse() * turns.turns[joint] * bind,
+            }
+            .normalize()
+        });
+        Pose { root_translation: turns.root, joint_rotations: rotations.collect() }
+    }
+
+    /// From the workspace's pose; `None` when it does not fit the skeleton or is not finite.
+    pub fn to_turns(&self, pose: &Pose) -> Option<Turns> {
+        if !pose.is_valid() || pose.joint_rotations.len() != self.parents.len() {
+            return None;
+        }
+        let turns = self.parents.iter().enumerate().map(|(joint, parent)| {
+            let local = pose.joint_rotations[joint];
+            let unbind = self.bind_rotation[joint].inverse();
+            match *parent {
+                None => local * unbind,
+                Some(parent) => self.bind_rotation[parent] * local * unbind,
+            }
+            .normalize()
+        });
+        Some(Turns { root: pose.root_translation, turns: turns.collect() })
+    }
+
+    /// Middle of the hips to middle of the shoulders, metres.
+    pub fn trunk_length(&self) -> f64 {
+        let at = |i: usize| self.marks[i].point;
+        (0.5 * (at(LEFT_SHOULDER) + at(RIGHT_SHOULDER)) - 0.5 * (at(LEFT_HIP) + at(RIGHT_HIP))).length()
+    }
+
+    /// Whether a joint hangs below another or is it.
+    pub fn hangs_below(&self, mut joint: usize, ancestor: usize) -> bool {
+        // Parents come before their children.
+        while joint > ancestor {
+            match self.parents[joint] {
+                Some(parent) => joint = parent,
+                None => return false,
+            }
+        }
+        joint == ancestor
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{body, random_turns};
+
+    #[test]
+    fn our_kinematics_agree_with_the_skeletons() {
+        let template = body();
+        let model = BodyModel::new(&template).unwrap();
+        let turns = random_turns(&model, 3);
+        let pose = model.to_pose(&turns);
+        let world_from_canonical = template.skeleton.world_from_canonical(&pose);
+        for (i, mark) in model.marks(&turns).into_iter().enumerate() {
+            let expected = world_from_canonical[model.marks[i].joint].transform_point3(model.marks[i].point);
+            assert!((mark - expected).length() < 1e-6, "landmark {i}: {mark} {expected}");
+        }
+        let back = model.to_turns(&pose).unwrap();
+        for (a, b) in turns.turns.iter().zip(&back.turns) {
+            assert!(a.dot(*b).abs() > 1.0 - 1e-9);
+        }
+    }
+
+    #[test]
+    fn the_marks_lie_where_a_person_has_them() {
+        let template = body();
+        let model = BodyModel::new(&template).unwrap();
+        let at = |landmark: usize| model.marks[landmark].point;
+        for (left, right) in [(2, 5), (7, 8), (9, 10), (11, 12), (15, 16), (17, 18), (19, 20), (21, 22), (29, 30), (31, 32)] {
+            assert!(at(left).x > 0.005 && at(right).x < -0.005, "{left} {right}");
+            assert!((at(left).x + at(right).x).abs() < 0.02, "{left} {right} are not mirrored");
+        }
+        assert!(at(0).y > at(9).y && at(2).y > at(0).y, "eyes over nose over mouth");
+        assert!(at(0).z > at(7).z + 0.05, "the nose is in front of the ears");
+        assert!(at(31).z > at(29).z + 0.15, "toes are in front of the heels");
+        for (finger, most) in [(17, 0.16), (19, 0.16), (21, 0.13)] {
+            let distance = (at(finger) - at(15)).length();
+            assert!((0.03..most).contains(&distance), "landmark {finger} is {distance} m from the wrist");
+        }
+        assert!((at(17) - at(19)).length() > 0.03, "the hand has a width");
+    }
+
+    #[test]
+    fn a_pose_that_is_not_finite_is_refused() {
+        let model = BodyModel::new(&body()).unwrap();
+        let mut pose = model.to_pose(&model.bind_turns(DVec3::ZERO));
+        pose.joint_rotations[3].x = f64::NAN;
+        assert!(model.to_turns(&pose).is_none());
+    }
+}

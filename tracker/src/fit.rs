@@ -1,0 +1,454 @@
+//! Damped least squares of a body's turns on landmarks.
+//!
+//! The cost is a sum of halves of squared residuals, each divided by its standard deviation: landmark
+//! distances in the pictures and to world points (Cauchy weights), joint ranges, and the change since the
+//! last pose. Levenberg-Marquardt with analytic derivatives; only steps that lower the cost are taken.
+
+use glam::{DMat3, DVec3};
+use nalgebra::{Cholesky, DMatrix, DVector};
+
+use crate::LANDMARK_COUNT;
+use crate::body_model::{BodyModel, Posed, Turns};
+use crate::math::{exp_rotation, log_jacobian, log_rotation};
+use crate::view::{Observation, View};
+
+/// Share of the network's certainty a landmark deserves in the fit: the face's many points are one body,
+/// and the fingers' are vague.
+const LANDMARK_WEIGHT: [f64; LANDMARK_COUNT] = {
+    let mut weight = [1.0; LANDMARK_COUNT];
+    let mut i = 1;
+    while i < 11 {
+        weight[i] = if i == 7 || i == 8 { 0.7 } else { 0.25 };
+        i += 1;
+    }
+    i = 17;
+    while i < 23 {
+        weight[i] = 0.3;
+        i += 1;
+    }
+    weight
+};
+
+/// How sharply a joint's limit is enforced, radians.
+const LIMIT_SIGMA: f64 = 0.05;
+/// How much freer the root turns than a joint, and how far it moves, between sets.
+const ROOT_FREEDOM: f64 = 2.0;
+const ROOT_MOVE_M: f64 = 0.2;
+
+/// One view's part of the data.
+#[derive(Debug, Clone)]
+pub(crate) struct FitView {
+    pub view: View,
+    pub seen: [Option<Observation>; LANDMARK_COUNT],
+    /// Capture time less the pose's time, seconds.
+    pub delay_secs: f64,
+}
+
+/// The pose before, and how far it may have changed.
+#[derive(Debug, Clone)]
+pub(crate) struct Before {
+    pub turns: Turns,
+    /// Standard deviation of a joint's turn since then, radians.
+    pub sigma_rad: f64,
+}
+
+/// What a pose has to explain.
+#[derive(Debug, Clone)]
+pub(crate) struct FitProblem<'a> {
+    pub model: &'a BodyModel,
+    pub views: &'a [FitView],
+    /// World points of landmarks and their standard deviation in metres.
+    pub points: [Option<(DVec3, f64)>; LANDMARK_COUNT],
+    /// Landmark velocities in metres a second, for views that were not taken at the pose's time.
+    pub velocity: [DVec3; LANDMARK_COUNT],
+    pub before: Option<Before>,
+    /// Standard deviation of a landmark, metres at its depth.
+    pub sigma_m: f64,
+    /// Residuals of this many standard deviations lose half their weight.
+    pub robust: f64,
+}
+
+/// Columns of a joint's three parameters.
+fn column(index_of_active: usize) -> usize {
+    3 + 3 * index_of_active
+}
+
+impl FitProblem<'_> {
+    /// Joints that turn: the root and those with a range.
+    fn active(&self) -> Vec<usize> {
+        (0..self.model.parents.len()).filter(|&j| j == 0 || self.model.ranges[j].is_some()).collect()
+    }
+
+    /// Cost of a pose; not finite when nothing can be said.
+    pub fn cost(&self, turns: &Turns) -> f64 {
+        let posed = self.model.pose(turns);
+        let mut cost = 0.0;
+        self.data_terms(&posed, |_, term| cost += term.cost);
+        self.joint_terms(turns, |_, residual, _| cost += 0.5 * residual.length_squared());
+        cost + self.root_move(turns).map_or(0.0, |e| 0.5 * e.length_squared())
+    }
+
+    fn root_move(&self, turns: &Turns) -> Option<DVec3> {
+        let before = self.before.as_ref()?;
+        Some((turns.root - before.turns.root) / self.root_sigma(before))
+    }
+
+    fn root_sigma(&self, before: &Before) -> f64 {
+        // In proportion to the turns' freedom, which already knows the time that passed.
+        ROOT_MOVE_M * before.sigma_rad / 0.15
+    }
+
+    /// Calls `each` with every landmark and its pull in the world.
+    fn data_terms(&self, posed: &Posed, mut each: impl FnMut(usize, DataTerm)) {
+        let robust2 = self.robust * self.robust;
+        for landmark in 0..LANDMARK_COUNT {
+            let mark = self.model.mark(posed, landmark);
+            let mut term = DataTerm::default();
+            let mut any = false;
+            for view in self.views {
+                let Some(seen) = view.seen[landmark] else { continue };
+                let moved = mark + self.velocity[landmark] * view.delay_secs;
+                let Some((pixel, rows)) = view.view.project_with_derivative(moved) else { continue };
+                let Some(px_per_m) = view.view.px_per_m(posed.origin[0]) else { continue };
+                let inverse_sigma = 1.0 / (self.sigma_m * px_per_m);
+                let error = (pixel - seen.ideal_px) * inverse_sigma;
+                let square = error.length_squared();
+                let trust = LANDMARK_WEIGHT[landmark] * seen.confidence * seen.confidence;
+                let weight = trust / (1.0 + square / robust2);
+                term.cost += 0.5 * trust * robust2 * (square / robust2).ln_1p();
+                for (row, e) in rows.into_iter().zip([error.x, error.y]) {
+                    term.add(row * inverse_sigma, e, weight);
+                }
+                any = true;
+            }
+            if let Some((point, sigma)) = self.points[landmark] {
+                let error = (mark - point) / sigma;
+                let square = error.length_squared();
+                let trust = LANDMARK_WEIGHT[landmark];
+                let weight = trust / (1.0 + square / robust2);
+                term.cost += 0.5 * trust * robust2 * (square / robust2).ln_1p();
+                for (axis, e) in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().zip(error.to_array()) {
+                    term.add(axis / sigma, e, weight);
+                }
+                any = true;
+            }
+            if any {
+                each(landmark, term);
+            }
+        }
+    }
+
+    /// Calls `each` with (index among the active joints, residual, derivative by the joint's turn).
+    fn joint_terms(&self, turns: &Turns, mut each: impl FnMut(usize, DVec3, DMat3)) {
+        for (index, joint) in self.active().into_iter().enumerate() {
+            let turn = turns.turns[joint];
+            if let Some(range) = &self.model.ranges[joint] {
+                let v = log_rotation(turn);
+                let components = range.axes.transpose() * v;
+                let derivative = range.axes.transpose() * log_jacobian(v);
+                let scale = |d: DVec3| DMat3::from_diagonal(d);
+                let inverse_sigma = range.sigma.recip();
+                each(index, components * inverse_sigma, scale(inverse_sigma) * derivative);
+                let over = (components - range.high).max(DVec3::ZERO) + (components - range.low).min(DVec3::ZERO);
+                if over != DVec3::ZERO {
+                    let outside = over.to_array().map(|o| if o == 0.0 { 0.0 } else { 1.0 / LIMIT_SIGMA });
+                    each(index, over / LIMIT_SIGMA, scale(DVec3::from(outside)) * derivative);
+                }
+            }
+            if let Some(before) = &self.before {
+                let change = log_rotation(turn * before.turns.turns[joint].inverse());
+                let sigma = before.sigma_rad * if joint == 0 { ROOT_FREEDOM } else { 1.0 };
+                each(index, change / sigma, log_jacobian(change) * (1.0 / sigma));
+            }
+        }
+    }
+
+    /// Normal matrix and gradient at a pose; columns: root place, then three a turning joint.
+    fn linearize(&self, turns: &Turns) -> (DMatrix<f64>, DVector<f64>) {
+        let active = self.active();
+        let size = column(active.len());
+        let mut normal = DMatrix::zeros(size, size);
+        let mut gradient = DVector::zeros(size);
+        let posed = self.model.pose(turns);
+        let mut columns: Vec<(usize, DVec3)> = Vec::new();
+        self.data_terms(&posed, |landmark, term| {
+            let mark = self.model.mark(&posed, landmark);
+            let moving = self.model.marks[landmark].joint;
+            columns.clear();
+            columns.extend([DVec3::X, DVec3::Y, DVec3::Z].into_iter().enumerate());
+            for (index, &joint) in active.iter().enumerate() {
+                if !self.model.hangs_below(moving, joint) {
+                    continue;
+                }
+                let arm = mark - posed.origin[joint];
+                let axes = match self.model.parents[joint] {
+                    Some(parent) => DMat3::from_quat(posed.rotation[parent]),
+                    None => DMat3::IDENTITY,
+                };
+                for k in 0..3 {
+                    columns.push((column(index) + k, axes.col(k).cross(arm)));
+                }
+            }
+            for (a, (row, derivative)) in columns.iter().enumerate() {
+                gradient[*row] += derivative.dot(term.gradient);
+                let weighted = term.normal * *derivative;
+                for (other, other_derivative) in &columns[..=a] {
+                    normal[(*row, *other)] += weighted.dot(*other_derivative);
+                }
+            }
+        });
+        self.joint_terms(turns, |index, residual, derivative| {
+            let at = column(index);
+            let pull = derivative.transpose() * residual;
+            let square = derivative.transpose() * derivative;
+            for r in 0..3 {
+                gradient[at + r] += pull[r];
+                for c in 0..=r {
+                    normal[(at + r, at + c)] += square.col(c)[r];
+                }
+            }
+        });
+        if let (Some(error), Some(before)) = (self.root_move(turns), &self.before) {
+            let inverse_sigma = 1.0 / self.root_sigma(before);
+            for k in 0..3 {
+                gradient[k] += error[k] * inverse_sigma;
+                normal[(k, k)] += inverse_sigma * inverse_sigma;
+            }
+        }
+        normal.fill_upper_triangle_with_lower_triangle();
+        (normal, gradient)
+    }
+
+    fn moved(&self, turns: &Turns, step: &DVector<f64>) -> Turns {
+        let mut moved = turns.clone();
+        moved.root += DVec3::new(step[0], step[1], step[2]);
+        for (index, joint) in self.active().into_iter().enumerate() {
+            let at = column(index);
+            let turn = exp_rotation(DVec3::new(step[at], step[at + 1], step[at + 2]));
+            moved.turns[joint] = (turn * turns.turns[joint]).normalize();
+        }
+        moved
+    }
+
+    /// Minimises from a start; gives the best pose found and the number of steps taken. `None` when even
+    /// the start has no finite cost.
+    pub fn solve(&self, start: &Turns, max_steps: usize) -> Option<(Turns, usize)> {
+        let mut turns = start.clone();
+        let mut cost = self.cost(&turns);
+        if !cost.is_finite() {
+            return None;
+        }
+        let mut damping = 1e-3;
+        let mut steps = 0;
+        'outer: while steps < max_steps {
+            let (normal, gradient) = self.linearize(&turns);
+            loop {
+                steps += 1;
+                let mut damped = normal.clone();
+                for k in 0..damped.nrows() {
+                    damped[(k, k)] += damping * normal[(k, k)] + 1e-9;
+                }
+                let step = Cholesky::new(damped).map(|factor| -factor.solve(&gradient));
+                let step = step.filter(|s| s.iter().all(|v| v.is_finite()));
+                let candidate = step.as_ref().map(|step| self.moved(&turns, step));
+                let candidate_cost = candidate.as_ref().map_or(f64::INFINITY, |c| self.cost(c));
+                if let Some(candidate) = candidate
+                    && candidate_cost < cost
+                {
+                    let gain = (cost - candidate_cost) / cost.max(1e-12);
+                    turns = candidate;
+                    cost = candidate_cost;
+                    damping = (damping * 0.2).max(1e-7);
+                    if gain < 1e-4 {
+                        break 'outer;
+                    }
+                    break;
+                }
+                damping *= 10.0;
+                if damping > 1e6 || steps >= max_steps {
+                    break 'outer;
+                }
+            }
+        }
+        Some((turns, steps))
+    }
+}
+
+/// One landmark's share of the normal equations, in world axes.
+#[derive(Debug, Clone, Copy, Default)]
+struct DataTerm {
+    normal: DMat3,
+    gradient: DVec3,
+    cost: f64,
+}
+
+impl DataTerm {
+    fn add(&mut self, row: DVec3, residual: f64, weight: f64) {
+        self.normal += DMat3::from_cols(row * row.x, row * row.y, row * row.z) * weight;
+        self.gradient += row * (residual * weight);
+    }
+}
+
+/// Turn and place that bring the bind pose's trunk and head onto world points; `None` with fewer than three.
+pub(crate) fn align_trunk(model: &BodyModel, points: &[Option<DVec3>; LANDMARK_COUNT]) -> Option<Turns> {
+    const TRUNK: [usize; 9] = [0, 7, 8, 11, 12, 23, 24, 25, 26];
+    let pairs: Vec<(DVec3, DVec3, f64)> = TRUNK
+        .iter()
+        .filter_map(|&i| {
+            let weight = if (11..=24).contains(&i) { 1.0 } else { 0.1 };
+            points[i].filter(|p| p.is_finite()).map(|p| (model.marks[i].point, p, weight))
+        })
+        .collect();
+    if pairs.len() < 3 {
+        return None;
+    }
+    let total: f64 = pairs.iter().map(|(_, _, w)| w).sum();
+    let from = pairs.iter().map(|(a, _, w)| *a * *w).sum::<DVec3>() / total;
+    let to = pairs.iter().map(|(_, b, w)| *b * *w).sum::<DVec3>() / total;
+    let mut covariance = nalgebra::Matrix3::zeros();
+    for (a, b, w) in &pairs {
+        let (a, b) = (*a - from, *b - to);
+        covariance += nalgebra::Vector3::new(b.x, b.y, b.z) * nalgebra::RowVector3::new(a.x, a.y, a.z) * *w;
+    }
+    let svd = covariance.try_svd(true, true, 1e-12, 100)?;
+    let (u, v_t) = (svd.u?, svd.v_t?);
+    let mut middle = nalgebra::Matrix3::identity();
+    middle[(2, 2)] = (u * v_t).determinant().signum();
+    let rotation = u * middle * v_t;
+    let rotation = DMat3::from_cols_array(&std::array::from_fn(|k| rotation[(k % 3, k / 3)]));
+    let turn = glam::DQuat::from_mat3(&rotation).normalize();
+    let mut turns = model.bind_turns(to + turn * (model.origins[0] - from));
+    turns.turns[0] = turn;
+    (turn.is_finite() && turns.root.is_finite()).then_some(turns)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{body, keypoints_of, noisy_keypoints, random_turns, ring};
+    use crate::view::observe;
+    use rand::{SeedableRng, rngs::StdRng};
+
+    fn views(count: usize, keypoints: impl Fn(&flyrig_types::Camera) -> crate::ViewKeypoints) -> Vec<FitView> {
+        ring(count)
+            .cameras
+            .iter()
+            .map(|camera| {
+                let view = View::new(camera);
+                let seen = observe(camera, &view, &keypoints(camera), 0.3);
+                FitView { view, seen, delay_secs: 0.0 }
+            })
+            .collect()
+    }
+
+    fn problem<'a>(model: &'a BodyModel, views: &'a [FitView]) -> FitProblem<'a> {
+        FitProblem {
+            model,
+            views,
+            points: [None; LANDMARK_COUNT],
+            velocity: [DVec3::ZERO; LANDMARK_COUNT],
+            before: None,
+            sigma_m: 0.012,
+            robust: 2.0,
+        }
+    }
+
+    #[test]
+    fn the_gradient_matches_differences_of_the_cost() {
+        let model = BodyModel::new(&body()).unwrap();
+        let truth = random_turns(&model, 1);
+        let views = views(3, |camera| keypoints_of(camera, &model.marks(&truth)));
+        let mut problem = problem(&model, &views);
+        problem.points[5] = Some((DVec3::new(0.1, 0.2, 1.4), 0.1));
+        problem.velocity = [DVec3::new(1.0, -0.5, 0.2); LANDMARK_COUNT];
+        problem.before = Some(Before { turns: random_turns(&model, 2), sigma_rad: 0.3 });
+        let at = random_turns(&model, 4);
+        let (normal, gradient) = problem.linearize(&at);
+        assert!((&normal - normal.transpose()).amax() < 1e-9 * normal.amax());
+        let mut checked = 0;
+        for k in 0..gradient.len() {
+            const STEP: f64 = 1e-6;
+            let mut step = DVector::zeros(gradient.len());
+            step[k] = STEP;
+            let forward = problem.cost(&problem.moved(&at, &step));
+            step[k] = -STEP;
+            let numeric = (forward - problem.cost(&problem.moved(&at, &step))) / (2.0 * STEP);
+            // Pixels per metre at the root enter as a constant; its derivative by the root's depth is left out.
+            if k >= 3 {
+                assert!((numeric - gradient[k]).abs() < 1e-3 * (1.0 + numeric.abs()), "{k}: {numeric} {}", gradient[k]);
+                checked += 1;
+            }
+        }
+        assert!(checked > 40);
+    }
+
+    #[test]
+    fn exact_landmarks_bring_the_marks_back_from_the_aligned_bind_pose() {
+        let model = BodyModel::new(&body()).unwrap();
+        for seed in 0..4 {
+            let truth = random_turns(&model, seed);
+            let target = model.marks(&truth);
+            let views = views(3, |camera| keypoints_of(camera, &target));
+            let start = align_trunk(&model, &target.map(Some)).unwrap();
+            let (found, _) = problem(&model, &views).solve(&start, 60).unwrap();
+            let mut errors: Vec<f64> =
+                model.marks(&found).iter().zip(target).map(|(a, b)| (*a - b).length()).collect();
+            let median = crate::math::median(&mut errors).unwrap();
+            let largest = errors.iter().copied().fold(0.0, f64::max);
+            assert!(median < 0.004 && largest < 0.03, "seed {seed}: median {median}, largest {largest}");
+        }
+    }
+
+    #[test]
+    fn a_quarter_of_wrong_landmarks_does_not_spoil_the_pose() {
+        let model = BodyModel::new(&body()).unwrap();
+        let truth = random_turns(&model, 7);
+        let target = model.marks(&truth);
+        let mut rng = StdRng::seed_from_u64(5);
+        let rng = std::cell::RefCell::new(&mut rng);
+        let views = views(4, |camera| {
+            let mut keypoints = noisy_keypoints(camera, &target, 2.0, &mut rng.borrow_mut());
+            for keypoint in keypoints.iter_mut().skip(camera.id.as_str().len()).step_by(4) {
+                keypoint.pixel += glam::DVec2::new(90.0, 60.0);
+            }
+            keypoints
+        });
+        let start = align_trunk(&model, &target.map(Some)).unwrap();
+        let (found, _) = problem(&model, &views).solve(&start, 60).unwrap();
+        let mut errors: Vec<f64> = model.marks(&found).iter().zip(target).map(|(a, b)| (*a - b).length()).collect();
+        assert!(crate::math::median(&mut errors).unwrap() < 0.03, "{errors:?}");
+    }
+
+    #[test]
+    fn elbows_and_knees_stay_inside_their_range_whatever_the_landmarks_say() {
+        let model = BodyModel::new(&body()).unwrap();
+        let truth = random_turns(&model, 3);
+        let mut target = model.marks(&truth);
+        // The shanks point forward and up: knees bent the wrong way.
+        for (ankle, knee) in [(27, 25), (28, 26)] {
+            target[ankle] = target[knee] + (target[knee] - target[ankle]);
+        }
+        let views = views(4, |camera| keypoints_of(camera, &target));
+        let (found, _) = problem(&model, &views).solve(&truth, 60).unwrap();
+        for joint in model.roles.shank {
+            let range = model.ranges[joint].as_ref().unwrap();
+            let v = range.axes.transpose() * log_rotation(found.turns[joint]);
+            assert!((v - v.clamp(range.low, range.high)).length() < 0.35, "{v}");
+        }
+    }
+
+    #[test]
+    fn nothing_seen_keeps_the_last_pose_and_poison_gives_none() {
+        let model = BodyModel::new(&body()).unwrap();
+        let last = random_turns(&model, 2);
+        let mut problem = problem(&model, &[]);
+        problem.before = Some(Before { turns: last.clone(), sigma_rad: 0.01 });
+        let (found, _) = problem.solve(&last, 10).unwrap();
+        assert!(model.marks(&found).iter().zip(model.marks(&last)).all(|(a, b)| (*a - b).length() < 0.03));
+        let mut poisoned = last;
+        poisoned.root.x = f64::NAN;
+        assert!(problem.solve(&poisoned, 10).is_none());
+        assert!(align_trunk(&model, &[None; LANDMARK_COUNT]).is_none());
+        assert!(align_trunk(&model, &[Some(DVec3::NAN); LANDMARK_COUNT]).is_none());
+    }
+}

@@ -1,0 +1,312 @@
+//! One-channel float pictures and what masks need of them.
+
+use flyrig_types::Mask;
+use glam::DVec2;
+
+/// A small picture of numbers, row by row.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Grid {
+    pub width: usize,
+    pub height: usize,
+    pub values: Vec<f32>,
+}
+
+impl Grid {
+    pub fn new(width: usize, height: usize, value: f32) -> Self {
+        Self { width, height, values: vec![value; width * height] }
+    }
+
+    /// Sets the pixels whose centre lies in a triangle, and the pixels of its corners, to 1.
+    pub fn fill_triangle(&mut self, a: DVec2, b: DVec2, c: DVec2) {
+        let low = a.min(b).min(c);
+        let high = a.max(b).max(c);
+        let clamp = |v: f64, limit: usize| v.clamp(0.0, limit as f64) as usize;
+        let area = (b - a).perp_dot(c - a);
+        for corner in [a, b, c] {
+            if corner.x >= 0.0 && corner.y >= 0.0 {
+                let (x, y) = (corner.x as usize, corner.y as usize);
+                if x < self.width && y < self.height {
+                    self.values[y * self.width + x] = 1.0;
+                }
+            }
+        }
+        for y in clamp(low.y.ceil(), self.height)..clamp(high.y.floor() + 1.0, self.height) {
+            for x in clamp(low.x.ceil(), self.width)..clamp(high.x.floor() + 1.0, self.width) {
+                let p = DVec2::new(x as f64, y as f64);
+                let sides = [(b - a).perp_dot(p - a), (c - b).perp_dot(p - b), (a - c).perp_dot(p - c)];
+                if sides.iter().all(|s| s * area >= 0.0) {
+                    self.values[y * self.width + x] = 1.0;
+                }
+            }
+        }
+    }
+
+    /// Chamfer distance in pixels (3-4 weights over 3) to the nearest pixel above one half.
+    pub fn distance_to_set(&self) -> Self {
+        let far = (self.width + self.height) as f32 * 2.0;
+        let mut out = self.clone();
+        for value in &mut out.values {
+            *value = if *value > 0.5 { 0.0 } else { far };
+        }
+        const SIDE: f32 = 1.0;
+        const DIAGONAL: f32 = 4.0 / 3.0;
+        let (width, height) = (self.width, self.height);
+        for y in 0..height {
+            for x in 0..width {
+                let at = y * width + x;
+                let mut best = out.values[at];
+                if x > 0 {
+                    best = best.min(out.values[at - 1] + SIDE);
+                }
+                if y > 0 {
+                    best = best.min(out.values[at - width] + SIDE);
+                    if x > 0 {
+                        best = best.min(out.values[at - width - 1] + DIAGONAL);
+                    }
+                    if x + 1 < width {
+                        best = best.min(out.values[at - width + 1] + DIAGONAL);
+                    }
+                }
+                out.values[at] = best;
+            }
+        }
+        for y in (0..height).rev() {
+            for x in (0..width).rev() {
+                let at = y * width + x;
+                let mut best = out.values[at];
+                if x + 1 < width {
+                    best = best.min(out.values[at + 1] + SIDE);
+                }
+                if y + 1 < height {
+                    best = best.min(out.values[at + width] + SIDE);
+                    if x + 1 < width {
+                        best = best.min(out.values[at + width + 1] + DIAGONAL);
+                    }
+                    if x > 0 {
+                        best = best.min(out.values[at + width - 1] + DIAGONAL);
+                    }
+                }
+                out.values[at] = best;
+            }
+        }
+        out
+    }
+
+    /// Mean over a square of `2 radius + 1` pixels, smaller at the border.
+    pub fn box_mean(&self, radius: usize) -> Self {
+        let (width, height) = (self.width, self.height);
+        let mut across = self.clone();
+        for (from, to) in self.values.chunks_exact(width).zip(across.values.chunks_exact_mut(width)) {
+            running_mean(from, to, radius);
+        }
+        let mut out = across.clone();
+        let (mut column, mut mean) = (vec![0.0; height], vec![0.0; height]);
+        for x in 0..width {
+            for (y, value) in column.iter_mut().enumerate() {
+                *value = across.values[y * width + x];
+            }
+            running_mean(&column, &mut mean, radius);
+            for (y, value) in mean.iter().enumerate() {
+                out.values[y * width + x] = *value;
+            }
+        }
+        out
+    }
+
+    /// Guided filter: smooths along the guide's edges.
+    pub fn guided(&self, guide: &Self, radius: usize, epsilon: f32) -> Self {
+        let product = |a: &Self, b: &Self| Self {
+            values: a.values.iter().zip(&b.values).map(|(a, b)| a * b).collect(),
+            ..*a
+        };
+        let mean_guide = guide.box_mean(radius);
+        let mean_self = self.box_mean(radius);
+        let mut slope = product(guide, self).box_mean(radius);
+        let mut offset = product(guide, guide).box_mean(radius);
+        for i in 0..slope.values.len() {
+            let (g, s) = (mean_guide.values[i], mean_self.values[i]);
+            let a = (slope.values[i] - g * s) / ((offset.values[i] - g * g).max(0.0) + epsilon);
+            slope.values[i] = a;
+            offset.values[i] = s - a * g;
+        }
+        let (slope, offset) = (slope.box_mean(radius), offset.box_mean(radius));
+        let values = guide.values.iter().zip(&slope.values).zip(&offset.values).map(|((g, a), b)| a * g + b);
+        Self { values: values.collect(), ..*self }
+    }
+
+    /// As a mask of a larger picture; `None` when no pixel reaches one half.
+    pub fn paste(&self, width: usize, height: usize, x0: usize, y0: usize) -> Option<Mask> {
+        if !self.values.iter().any(|v| *v >= 0.5) {
+            return None;
+        }
+        let mut coverage = vec![0u8; width * height];
+        for (y, row) in self.values.chunks_exact(self.width).enumerate() {
+            let start = (y + y0) * width + x0;
+            for (out, value) in coverage[start..start + self.width].iter_mut().zip(row) {
+                *out = (value.clamp(0.0, 1.0) * 255.0).round() as u8;
+            }
+        }
+        Mask::new(width as u32, height as u32, coverage).ok()
+    }
+}
+
+fn running_mean(from: &[f32], to: &mut [f32], radius: usize) {
+    let mut sum: f64 = from.iter().take(radius).map(|v| f64::from(*v)).sum();
+    for (i, out) in to.iter_mut().enumerate() {
+        if let Some(entering) = from.get(i + radius) {
+            sum += f64::from(*entering);
+        }
+        if i > radius {
+            sum -= f64::from(from[i - radius - 1]);
+        }
+        let count = (i + radius + 1).min(from.len()) - i.saturating_sub(radius);
+        *out = (sum / count as f64) as f32;
+    }
+}
+
+/// Labels connected pixels (4 neighbours) that `keep`; calls `each` with every component's pixels.
+fn components(grid: &Grid, keep: impl Fn(f32) -> bool, mut each: impl FnMut(&[usize])) {
+    let (width, height) = (grid.width, grid.height);
+    let mut done = vec![false; width * height];
+    let mut stack = Vec::new();
+    let mut component = Vec::new();
+    for start in 0..done.len() {
+        if done[start] || !keep(grid.values[start]) {
+            continue;
+        }
+        component.clear();
+        stack.push(start);
+        done[start] = true;
+        while let Some(at) = stack.pop() {
+            component.push(at);
+            let (x, y) = (at % width, at / width);
+            let mut visit = |next: usize| {
+                if !done[next] && keep(grid.values[next]) {
+                    done[next] = true;
+                    stack.push(next);
+                }
+            };
+            if x > 0 {
+                visit(at - 1);
+            }
+            if x + 1 < width {
+                visit(at + 1);
+            }
+            if y > 0 {
+                visit(at - width);
+            }
+            if y + 1 < height {
+                visit(at + width);
+            }
+        }
+        each(&component);
+    }
+}
+
+/// Keeps the largest piece above one half (and pieces at least a fifth as large: an arm cut off by a strap),
+/// and fills holes smaller than a disc of `hole_radius`.
+pub(crate) fn clean(grid: &mut Grid, hole_radius: usize) {
+    let mut sizes = Vec::new();
+    components(grid, |v| v >= 0.5, |pixels| sizes.push(pixels.len()));
+    let largest = sizes.iter().copied().max().unwrap_or(0);
+    let mut drop = Vec::new();
+    components(grid, |v| v >= 0.5, |pixels| {
+        if pixels.len() * 5 < largest {
+            drop.extend_from_slice(pixels);
+        }
+    });
+    for at in drop {
+        grid.values[at] = 0.0;
+    }
+    let small = 3 * hole_radius * hole_radius;
+    let mut fill = Vec::new();
+    let (width, height) = (grid.width, grid.height);
+    components(grid, |v| v < 0.5, |pixels| {
+        let border =
+            pixels.iter().any(|at| at % width == 0 || at % width == width - 1 || *at < width || *at >= width * (height - 1));
+        if pixels.len() <= small && !border {
+            fill.extend_from_slice(pixels);
+        }
+    });
+    for at in fill {
+        grid.values[at] = 1.0;
+    }
+    // What is left of dropped pieces' soft rims: nothing far from a sure pixel.
+    let distance = grid.distance_to_set();
+    for (value, d) in grid.values.iter_mut().zip(&distance.values) {
+        if *d > 2.0 {
+            *value = 0.0;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn square(width: usize, height: usize, x: std::ops::Range<usize>, y: std::ops::Range<usize>) -> Grid {
+        let mut grid = Grid::new(width, height, 0.0);
+        for y in y {
+            for x in x.clone() {
+                grid.values[y * width + x] = 1.0;
+            }
+        }
+        grid
+    }
+
+    #[test]
+    fn box_mean_equals_the_plain_sum() {
+        let grid = Grid { width: 7, height: 5, values: (0..35).map(|i| ((i * 7919) % 13) as f32).collect() };
+        let mean = grid.box_mean(2);
+        for y in 0..5usize {
+            for x in 0..7usize {
+                let (mut sum, mut count) = (0.0, 0.0);
+                for v in y.saturating_sub(2)..(y + 3).min(5) {
+                    for u in x.saturating_sub(2)..(x + 3).min(7) {
+                        sum += grid.values[v * 7 + u];
+                        count += 1.0;
+                    }
+                }
+                assert!((mean.values[y * 7 + x] - sum / count).abs() < 1e-4);
+            }
+        }
+    }
+
+    #[test]
+    fn a_blurred_outline_snaps_to_the_guides_edge() {
+        let guide = square(40, 40, 10..30, 10..30);
+        let blurred = guide.box_mean(4);
+        let snapped = blurred.guided(&guide, 6, 1e-4);
+        let wrong = |grid: &Grid| grid.values.iter().zip(&guide.values).map(|(a, b)| (a - b).abs()).sum::<f32>();
+        assert!(wrong(&snapped) < 0.5 * wrong(&blurred), "{} {}", wrong(&snapped), wrong(&blurred));
+    }
+
+    #[test]
+    fn cleaning_keeps_the_large_piece_and_fills_its_small_hole() {
+        let mut grid = square(60, 60, 5..45, 5..45);
+        grid.values[20 * 60 + 20] = 0.0;
+        for (x, y) in [(55, 55), (56, 55), (55, 56)] {
+            grid.values[y * 60 + x] = 1.0;
+        }
+        clean(&mut grid, 3);
+        assert_eq!(grid, square(60, 60, 5..45, 5..45));
+    }
+
+    #[test]
+    fn a_triangle_and_the_distance_to_it() {
+        let mut grid = Grid::new(20, 20, 0.0);
+        grid.fill_triangle(DVec2::new(2.0, 2.0), DVec2::new(12.0, 2.0), DVec2::new(2.0, 12.0));
+        assert!(grid.values[4 * 20 + 4] > 0.5 && grid.values[11 * 20 + 11] < 0.5);
+        let distance = grid.distance_to_set();
+        assert!((distance.values[2 * 20 + 17] - 5.0).abs() < 0.1);
+        // Nothing set: far, not infinite. Corners outside do not matter.
+        grid.fill_triangle(DVec2::splat(-50.0), DVec2::new(1e9, 3.0), DVec2::NAN);
+        assert!(Grid::new(3, 3, 0.0).distance_to_set().values.iter().all(|d| d.is_finite()));
+    }
+
+    #[test]
+    fn an_empty_grid_is_no_mask() {
+        assert!(Grid::new(4, 4, 0.2).paste(8, 8, 2, 2).is_none());
+        assert_eq!(Grid::new(4, 4, 1.0).paste(8, 8, 2, 2).unwrap().area_px(), 16);
+    }
+}

@@ -1,0 +1,172 @@
+//! Masks without a plate: the network's coarse mask, sharpened on the picture and gated by the fitted body.
+
+use flyrig_types::{Camera, Mask};
+use glam::{DVec2, Vec3};
+
+use crate::grid::{Grid, clean};
+use crate::net::NET_SIDE;
+use crate::pixels::Rgb;
+use crate::search::Sighting;
+
+/// How far clothes and hair may stand off the fitted body, metres.
+const REACH_M: f64 = 0.13;
+/// Bins a colour channel of the colour model.
+const BINS: usize = 16;
+
+/// Where the fitted body may be in a picture.
+#[derive(Debug, Clone)]
+pub(crate) struct BodyGate {
+    /// Box that holds everything allowed: x0, y0, x1, y1 (ends excluded).
+    pub bounds: [usize; 4],
+    /// Distance to the projected body over the reach, 0 on the body, 1 at the reach; the size of the box.
+    pub distance: Grid,
+    /// Pixels that a metre takes at the body.
+    pub px_per_m: f64,
+}
+
+impl BodyGate {
+    /// `None` when nothing of the body is in the picture.
+    pub fn new(camera: &Camera, vertices: &[Vec3], triangles: &[[u32; 3]]) -> Option<Self> {
+        let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
+        let pixels: Vec<Option<DVec2>> = vertices.iter().map(|v| camera.project(v.as_dvec3())).collect();
+        let mut depths: Vec<f64> = vertices
+            .iter()
+            .step_by(37)
+            .map(|v| camera.camera_from_world.transform_point(v.as_dvec3()).z)
+            .filter(|z| *z > 0.1)
+            .collect();
+        let depth = crate::math::median(&mut depths)?;
+        let px_per_m = camera.intrinsics.focal_px.x / depth;
+        let reach = REACH_M * px_per_m;
+        let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+        for pixel in pixels.iter().flatten() {
+            (low, high) = (low.min(*pixel), high.max(*pixel));
+        }
+        let side = |value: f64, limit: usize| value.clamp(0.0, limit as f64) as usize;
+        let bounds = [
+            side(low.x - reach, width),
+            side(low.y - reach, height),
+            side(high.x + reach + 1.0, width),
+            side(high.y + reach + 1.0, height),
+        ];
+        if bounds[2] <= bounds[0] || bounds[3] <= bounds[1] {
+            return None;
+        }
+        let mut body = Grid::new(bounds[2] - bounds[0], bounds[3] - bounds[1], 0.0);
+        let origin = DVec2::new(bounds[0] as f64, bounds[1] as f64);
+        for triangle in triangles {
+            let corner = |k: usize| pixels.get(triangle[k] as usize).copied().flatten().map(|p| p - origin);
+            if let (Some(a), Some(b), Some(c)) = (corner(0), corner(1), corner(2)) {
+                body.fill_triangle(a, b, c);
+            }
+        }
+        let mut distance = body.distance_to_set();
+        for value in &mut distance.values {
+            *value /= reach as f32;
+        }
+        Some(Self { bounds, distance, px_per_m })
+    }
+}
+
+/// Person mask of a picture from the network's coarse one; `None` when nothing is left.
+///
+/// The network's probability is joined with a colour model of person and surroundings (histograms of this
+/// picture's own sure regions) and the distance to the fitted body, then smoothed along the picture's edges
+/// by a guided filter (He et al. 2010), so that the outline snaps to them.
+pub(crate) fn refine(picture: &Rgb, sighting: &Sighting, gate: &BodyGate) -> Option<Mask> {
+    let [x0, y0, x1, y1] = gate.bounds;
+    let (width, height) = (x1 - x0, y1 - y0);
+    // The network's probability, and the luminance that guides it.
+    let mut coarse = Grid::new(width, height, 0.0);
+    for y in 0..height {
+        for x in 0..width {
+            let at = sighting.crop.from_picture(DVec2::new((x + x0) as f64, (y + y0) as f64));
+            coarse.values[y * width + x] = net_probability(&sighting.output.mask, at);
+        }
+    }
+    let bin = |x: usize, y: usize| -> usize {
+        let [r, g, b] = picture.pixel(x + x0, y + y0).map(|c| usize::from(c) * BINS / 256);
+        (r * BINS + g) * BINS + b
+    };
+    let mut inside = vec![0.05f32; BINS * BINS * BINS];
+    let mut outside = inside.clone();
+    let (mut inside_total, mut outside_total) = (0.0f32, 0.0f32);
+    for y in 0..height {
+        for x in 0..width {
+            let at = y * width + x;
+            let (p, d) = (coarse.values[at], gate.distance.values[at]);
+            if p > 0.8 && d < 0.4 {
+                inside[bin(x, y)] += 1.0;
+                inside_total += 1.0;
+            } else if p < 0.2 && d > 0.15 {
+                outside[bin(x, y)] += 1.0;
+                outside_total += 1.0;
+            }
+        }
+    }
+    let mut probability = coarse.clone();
+    for y in 0..height {
+        for x in 0..width {
+            let at = y * width + x;
+            let (p, d) = (coarse.values[at].clamp(0.02, 0.98), gate.distance.values[at]);
+            if d >= 1.0 {
+                probability.values[at] = 0.0;
+                continue;
+            }
+            let color = if inside_total > 50.0 && outside_total > 50.0 {
+                let (i, o) = (smooth(&inside, bin(x, y)) / inside_total, smooth(&outside, bin(x, y)) / outside_total);
+                ((i + 1e-5) / (o + 1e-5)).ln().clamp(-2.5, 2.5)
+            } else {
+                0.0
+            };
+            let near = 1.0 - 4.0 * d.min(1.0);
+            let logit = (p / (1.0 - p)).ln() + 0.6 * color + near;
+            probability.values[at] = 1.0 / (1.0 + (-logit).exp());
+        }
+    }
+    let mut guide = Grid::new(width, height, 0.0);
+    for y in 0..height {
+        for x in 0..width {
+            let [r, g, b] = picture.pixel(x + x0, y + y0).map(f32::from);
+            guide.values[y * width + x] = (0.3 * r + 0.55 * g + 0.15 * b) / 255.0;
+        }
+    }
+    let radius = (1.5 * sighting.crop.scale()).round().clamp(2.0, 12.0) as usize;
+    let mut smoothed = probability.guided(&guide, radius, 1e-3);
+    for (value, d) in smoothed.values.iter_mut().zip(&gate.distance.values) {
+        // A soft step around one half keeps about a pixel of slope.
+        *value = if *d >= 1.0 { 0.0 } else { ((*value - 0.5) * 3.0 + 0.5).clamp(0.0, 1.0) };
+    }
+    clean(&mut smoothed, (0.02 * gate.px_per_m).round() as usize);
+    smoothed.paste(picture.width, picture.height, x0, y0)
+}
+
+/// The bin's own count and a share of its neighbours'.
+fn smooth(histogram: &[f32], bin: usize) -> f32 {
+    let mut sum = histogram[bin];
+    for (step, limit) in [(1, BINS), (BINS, BINS * BINS), (BINS * BINS, BINS * BINS * BINS)] {
+        let place = bin % limit / step;
+        if place > 0 {
+            sum += 0.3 * histogram[bin - step];
+        }
+        if place + 1 < BINS {
+            sum += 0.3 * histogram[bin + step];
+        }
+    }
+    sum
+}
+
+/// Bilinear sample of the network's mask; nobody outside the crop.
+fn net_probability(mask: &[f32], at: DVec2) -> f32 {
+    let limit = NET_SIDE as f64 - 1.0;
+    if !(at.x >= 0.0 && at.y >= 0.0 && at.x <= limit && at.y <= limit) {
+        return 0.0;
+    }
+    let (x, y) = (at.x as usize, at.y as usize);
+    let (x1, y1) = ((x + 1).min(NET_SIDE - 1), (y + 1).min(NET_SIDE - 1));
+    let (fx, fy) = ((at.x - x as f64) as f32, (at.y - y as f64) as f32);
+    let value = |x: usize, y: usize| mask[y * NET_SIDE + x];
+    let top = value(x, y) + (value(x1, y) - value(x, y)) * fx;
+    let bottom = value(x, y1) + (value(x1, y1) - value(x, y1)) * fx;
+    top + (bottom - top) * fy
+}

@@ -1,0 +1,53 @@
+//! A guess at the third dimension from one picture.
+
+use flyrig_types::Camera;
+use glam::{DMat3, DVec2, DVec3};
+
+use crate::LANDMARK_COUNT;
+use crate::search::Sighting;
+use crate::view::{View, observe};
+
+/// World points from one view: the network's hip-centred landmarks (in metres, for a trunk of half a
+/// metre; times `scale`), turned by the crop, moved to where they explain the picture best (linear least squares).
+/// `None` when that place is behind the camera or not finite.
+pub(crate) fn lift(
+    camera: &Camera,
+    sighting: &Sighting,
+    confidence_threshold: f64,
+    scale: f64,
+) -> Option<[Option<DVec3>; LANDMARK_COUNT]> {
+    let view = View::new(camera);
+    let seen = observe(camera, &view, &sighting.keypoints, confidence_threshold);
+    let turn = DVec2::from_angle(sighting.crop.angle);
+    let local: [DVec3; LANDMARK_COUNT] = std::array::from_fn(|i| {
+        let [x, y, z] = sighting.output.landmarks[i].world;
+        (turn.rotate(DVec2::new(x, y)) * scale).extend(z * scale)
+    });
+    // (x + t_x) = u (z + t_z), the same for v.
+    let mut normal = DMat3::ZERO;
+    let mut right = DVec3::ZERO;
+    let mut count = 0;
+    for (local, seen) in local.iter().zip(&seen) {
+        let Some(seen) = seen else { continue };
+        let u = seen.ideal_px / view.focal_px;
+        for (row, value) in [
+            (DVec3::new(1.0, 0.0, -u.x), u.x * local.z - local.x),
+            (DVec3::new(0.0, 1.0, -u.y), u.y * local.z - local.y),
+        ] {
+            normal += DMat3::from_cols(row * row.x, row * row.y, row * row.z) * seen.confidence;
+            right += row * (value * seen.confidence);
+        }
+        count += 1;
+    }
+    if count < 6 || normal.determinant().abs() < 1e-9 {
+        return None;
+    }
+    let translation = normal.inverse() * right;
+    if !translation.is_finite() || translation.z < 0.3 {
+        return None;
+    }
+    let world_from_camera = view.rotation.transpose();
+    Some(std::array::from_fn(|i| {
+        seen[i].map(|_| world_from_camera * (local[i] + translation - view.translation)).filter(|p| p.is_finite())
+    }))
+}
