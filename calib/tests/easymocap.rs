@@ -1,5 +1,7 @@
 //! Calibration files: what is read, what is written, and what is said about broken ones.
 
+#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
+
 use std::{fs, path::Path};
 
 use flyrig_calib::{load_easymocap, save_easymocap};
@@ -116,7 +118,7 @@ fn a_rig_comes_back_as_it_was_written() {
         intrinsics: Intrinsics {
             width: 1088,
             height: 1920,
-            focal_px: DVec2::new(1000.0 / 3.0, 1234.567_890_123_456),
+            focal_px: DVec2::new(1000.0 / 3.0, 1_234.567_890_123),
             center_px: DVec2::new(0.1 + 0.2, 958.5),
             lens: Lens::RadialTangential { radial: [-0.1 / 3.0, 1e-9, 0.7], tangential: [-1e-5, 2e-7] },
         },

@@ -1,5 +1,7 @@
 //! Replay of folders: what comes out, and what is said about broken ones.
 
+#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
+
 use std::{fs, path::Path, time::Duration};
 
 use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, FolderOptions, FolderReplay, folder_picture_size};

@@ -1,5 +1,7 @@
 //! Capture threads: order, back-pressure, counts, and cameras that fail.
 
+#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
+
 use std::{
     collections::VecDeque,
     sync::{
