@@ -12,15 +12,30 @@
 //!   `i * 1e9 / fps`, rounded down ([`Simulator::frame_nanos`]), by all cameras at once.
 
 mod config;
+mod draw;
 mod error;
+mod face;
 mod frame;
+mod garments;
+mod look;
+mod motion;
+mod noise;
+mod person;
+mod prints;
+mod regions;
 mod ring;
+mod room;
+mod sheet;
+mod shoes;
 mod simulator;
 mod source;
+mod texture;
+mod turn;
 
 pub use config::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig};
 pub use error::SimError;
 pub use frame::{SimFrame, SurfaceMesh};
+pub use motion::find_debian_clip;
 pub use ring::camera_ring;
 pub use simulator::Simulator;
 pub use source::{SimSource, sources};

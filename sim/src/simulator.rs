@@ -1,19 +1,34 @@
 //! The simulation itself.
 
-use flyrig_body::Template;
-use flyrig_gpu::GpuContext;
-use flyrig_types::{Image, Mask, Pose, PoseTrack, Rig};
+use std::fmt;
 
-use crate::{SimConfig, SimError, SimFrame, SurfaceMesh};
+use flyrig_body::{Part, Template, skin_mesh};
+use flyrig_gpu::GpuContext;
+use flyrig_types::{Camera, Image, Mask, PixelFormat, Pose, PoseTrack, Rig};
+use glam::Vec3;
+
+use crate::draw::{Drawing, Posed};
+use crate::look::Look;
+use crate::noise::smoothstep;
+use crate::person::Person;
+use crate::room::{LensGrid, Room};
+use crate::{SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring, motion};
 
 /// A person, a motion, a room and cameras.
-#[derive(Debug)]
 pub struct Simulator {
     config: SimConfig,
     rig: Rig,
-    template: Template,
+    person: Person,
     track: PoseTrack,
     plates: Vec<Image>,
+    drawing: Drawing,
+    drawn_nanos: Option<i64>,
+}
+
+impl fmt::Debug for Simulator {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Simulator").field("config", &self.config).finish_non_exhaustive()
+    }
 }
 
 impl Simulator {
@@ -21,11 +36,23 @@ impl Simulator {
     ///
     /// # Errors
     /// [`SimError`] names the setting, the missing file or the adapter's limit.
-    pub fn new(_gpu: &GpuContext, config: &SimConfig) -> Result<Self, SimError> {
-        let rig = crate::camera_ring(config)?;
-        let template = flyrig_body::default_template(&flyrig_body::ShapeParams::default())?;
-        let track = PoseTrack::new(vec![(0, template.skeleton.rest_pose())])?;
-        Ok(Self { config: config.clone(), rig, template, track, plates: Vec::new() })
+    pub fn new(gpu: &GpuContext, config: &SimConfig) -> Result<Self, SimError> {
+        let rig = camera_ring(config)?;
+        let look = Look::new(config);
+        let person = Person::new(&look, config.seed, config.texture_px as usize)?;
+        let track = motion::track(config, &person)?;
+        let room = Room::new(config.seed, config.cameras.radius_m);
+        let mut plates = Vec::with_capacity(rig.cameras.len());
+        if let Some(grid) = rig.cameras.first().and_then(|camera| LensGrid::new(&camera.intrinsics)) {
+            plates.extend(rig.cameras.iter().map(|camera| room.plate(camera, &grid)));
+        }
+        let (width, height) = (config.width, config.height);
+        let drawing = Drawing::new(gpu, &person, [width, height], &plates)?;
+        let plates = plates
+            .into_iter()
+            .map(|plate| Image::new(width, height, PixelFormat::Rgb8, rgb_bytes(&plate.rgba)))
+            .collect::<Result<_, _>>()?;
+        Ok(Self { config: config.clone(), rig, person, track, plates, drawing, drawn_nanos: None })
     }
 
     /// The configuration.
@@ -43,10 +70,10 @@ impl Simulator {
     /// The body without clothes: what a tracker is given.
     #[must_use]
     pub fn template(&self) -> &Template {
-        &self.template
+        &self.person.body
     }
 
-    /// The motion; before its start and after its end the person holds still, but see [`Self::pose`].
+    /// One round of the motion; see [`Self::pose`] for later times.
     #[must_use]
     pub fn track(&self) -> &PoseTrack {
         &self.track
@@ -70,34 +97,93 @@ impl Simulator {
     /// Time of frame `index` of every camera.
     #[must_use]
     pub fn frame_nanos(&self, index: u64) -> i64 {
-        (index as f64 * (1e9 / self.config.fps)) as i64
+        (index as f64 * 1e9 / self.config.fps) as i64
     }
 
     /// Picture and truth of one camera at a time.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
-    pub fn render(&mut self, _nanos: i64, slot: usize) -> Result<SimFrame, SimError> {
-        Err(SimError::NoSlot { slot, count: self.rig.cameras.len() })
+    pub fn render(&mut self, nanos: i64, slot: usize) -> Result<SimFrame, SimError> {
+        let (color, mask) = self.capture(nanos, slot)?;
+        let truth = self.drawing.truth(self.camera(slot)?)?;
+        let parts = truth.part.iter().map(|&part| part_of_index(part)).collect();
+        let mut depth = Vec::with_capacity(truth.canonical_depth.len());
+        let mut canonical = Vec::with_capacity(truth.canonical_depth.len());
+        for (&[x, y, z, camera_z], part) in truth.canonical_depth.iter().zip(&truth.part) {
+            depth.push(camera_z);
+            canonical.push([x, y, z, f32::from(u8::from(*part > 0))]);
+        }
+        Ok(SimFrame { nanos, pose: self.pose(nanos), color, mask, depth, canonical, part: parts })
     }
 
     /// Picture and mask only, at less cost than [`Self::render`].
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
-    pub fn capture(&mut self, _nanos: i64, slot: usize) -> Result<(Image, Mask), SimError> {
-        Err(SimError::NoSlot { slot, count: self.rig.cameras.len() })
+    pub fn capture(&mut self, nanos: i64, slot: usize) -> Result<(Image, Mask), SimError> {
+        self.camera(slot)?;
+        if self.drawn_nanos != Some(nanos) {
+            self.drawing.set_person(&self.posed(nanos));
+            self.drawn_nanos = Some(nanos);
+        }
+        let rgba = self.drawing.picture(self.camera(slot)?, slot)?;
+        let (width, height) = (self.config.width, self.config.height);
+        let color = Image::new(width, height, PixelFormat::Rgb8, rgb_bytes(&rgba))?;
+        let mask = Mask::new(width, height, rgba.iter().map(|pixel| pixel[3]).collect())?;
+        Ok((color, mask))
     }
 
     /// What the cameras see of the person at a time, as a mesh.
     #[must_use]
-    pub fn clothed_surface(&self, _nanos: i64) -> SurfaceMesh {
+    pub fn clothed_surface(&self, nanos: i64) -> SurfaceMesh {
+        let (positions, normals) = skin_mesh(&self.person.clothed, &self.pose(nanos));
         SurfaceMesh {
-            positions: Vec::new(),
-            normals: Vec::new(),
-            triangles: Vec::new(),
-            canonical: Vec::new(),
-            parts: Vec::new(),
+            positions,
+            normals,
+            triangles: self.person.clothed.triangles.clone(),
+            canonical: self.person.carriers.clone(),
+            parts: self.person.clothed.parts.clone(),
         }
     }
+
+    fn camera(&self, slot: usize) -> Result<&Camera, SimError> {
+        self.rig.cameras.get(slot).ok_or(SimError::NoSlot { slot, count: self.rig.cameras.len() })
+    }
+
+    fn posed(&self, nanos: i64) -> Posed {
+        let (positions, normals) = skin_mesh(&self.person.clothed, &self.pose(nanos));
+        let low = positions.iter().copied().fold(Vec3::INFINITY, Vec3::min);
+        let high = positions.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
+        let shoes = self.person.shoe_vertices.clone();
+        let middle = shoes.start + shoes.len() / 2;
+        let feet = [shoes.start..middle, middle..shoes.end].map(|range| {
+            let foot = &positions[range];
+            let lowest = foot.iter().map(|p| p.z).fold(f32::INFINITY, f32::min);
+            let mean = foot.iter().sum::<Vec3>() / foot.len().max(1) as f32;
+            mean.truncate().extend(smoothstep(0.07, 0.0, lowest))
+        });
+        Posed { positions, normals, center: (low + high) * 0.5, feet }
+    }
+}
+
+fn rgb_bytes(rgba: &[[u8; 4]]) -> Vec<u8> {
+    rgba.iter().flat_map(|&[r, g, b, _]| [r, g, b]).collect()
+}
+
+/// Inverse of `part as u32 + 1`.
+fn part_of_index(index: u32) -> Option<Part> {
+    const PARTS: [Part; 10] = [
+        Part::Head,
+        Part::Torso,
+        Part::LeftArm,
+        Part::RightArm,
+        Part::LeftHand,
+        Part::RightHand,
+        Part::LeftLeg,
+        Part::RightLeg,
+        Part::LeftFoot,
+        Part::RightFoot,
+    ];
+    PARTS.into_iter().find(|&part| part as u32 + 1 == index)
 }

@@ -1,0 +1,38 @@
+//! Writes a contact sheet of simulated people: a row a seed, a column a camera, time moving on from row to row.
+//!
+//! `cargo run --release -p flyrig-sim --example contact_sheet -- OUT.png [SEEDS] [CAMERAS] [SIDE_PX]`
+
+use std::error::Error;
+use std::time::Instant;
+
+use flyrig_gpu::{AdapterChoice, GpuContext};
+use flyrig_sim::{SimConfig, Simulator};
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    let out = args.first().map_or("contact_sheet.png", String::as_str);
+    let number = |index: usize, default: u32| args.get(index).map_or(Ok(default), |text| text.parse());
+    let (seeds, cameras, side) = (number(1, 4)?, number(2, 5)?, number(3, 384)?);
+    let gpu = GpuContext::new(&AdapterChoice::Best)?;
+    let mut sheet = image::RgbImage::new(cameras * side, seeds * side);
+    for row in 0..seeds {
+        let mut config = SimConfig { seed: u64::from(row) + 1, width: side, height: side, ..SimConfig::default() };
+        config.cameras.count = cameras as usize;
+        let start = Instant::now();
+        let mut simulator = Simulator::new(&gpu, &config)?;
+        let setup = start.elapsed();
+        let start = Instant::now();
+        for column in 0..cameras {
+            let nanos = simulator.frame_nanos(u64::from(row) * 45);
+            let (picture, _) = simulator.capture(nanos, column as usize)?;
+            for (i, pixel) in (0u32..).zip(picture.bytes().chunks_exact(3)) {
+                let (x, y) = (column * side + i % side, row * side + i / side);
+                sheet.put_pixel(x, y, image::Rgb([pixel[0], pixel[1], pixel[2]]));
+            }
+        }
+        println!("seed {}: set up in {setup:.2?}, {:.2?} a picture", row + 1, start.elapsed() / cameras);
+    }
+    sheet.save(out)?;
+    println!("{out}");
+    Ok(())
+}

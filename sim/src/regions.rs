@@ -1,0 +1,63 @@
+//! Where things are on the average built-in body: canonical metres, y up, facing +z, standing on y = 0.
+
+use glam::Vec3;
+
+use crate::noise::lerp;
+
+/// Centre and radius of the left eyeball (the right one mirrors it).
+pub(crate) const EYE: (Vec3, f32) = (Vec3::new(0.0293, 1.5520, 0.1178), 0.0140);
+pub(crate) const SHOULDER: Vec3 = Vec3::new(0.170, 1.320, 0.019);
+pub(crate) const ELBOW: Vec3 = Vec3::new(0.331, 1.139, 0.020);
+pub(crate) const WRIST: Vec3 = Vec3::new(0.453, 1.015, 0.183);
+/// The body below is inside the shoe.
+pub(crate) const ANKLE_TOP_M: f32 = 0.085;
+
+/// Distance along the arm from the shoulder joint (elbow at 0.242, wrist at 0.482 m), and distance from its axis.
+pub(crate) fn along_arm(p: Vec3) -> (f32, f32) {
+    let p = Vec3::new(p.x.abs(), p.y, p.z);
+    let upper = ELBOW - SHOULDER;
+    let fore = WRIST - ELBOW;
+    let (upper_m, fore_m) = (upper.length(), fore.length());
+    let s = (p - SHOULDER).dot(upper) / upper_m;
+    let f = (p - ELBOW).dot(fore) / fore_m;
+    let near_upper = SHOULDER + upper * (s / upper_m).clamp(-1.0, 1.0);
+    let near_fore = ELBOW + fore * (f / fore_m).clamp(0.0, 1.5);
+    let (du, df) = (p.distance(near_upper), p.distance(near_fore));
+    if du < df { (s.min(upper_m), du) } else { (upper_m + f.max(0.0), df) }
+}
+
+/// How far inside the neck opening's edge a point of a top is, metres.
+pub(crate) fn below_neckline(p: Vec3, v_neck_m: f32) -> f32 {
+    let round = p.distance(Vec3::new(0.0, 1.45, 0.035)) - 0.095;
+    if v_neck_m <= 0.0 || p.z < 0.0 {
+        return round;
+    }
+    // A wedge down the front.
+    let depth = (1.37 - p.y) / v_neck_m;
+    let half_width = 0.055 * (1.0 - depth);
+    round.min(p.x.abs() - half_width)
+}
+
+/// Height of the hairline by direction around the head, metres; positive return: on the scalp.
+pub(crate) fn above_hairline(p: Vec3, recede_m: f32) -> f32 {
+    const LINE: [(f32, f32); 10] = [
+        (0.0, 1.617),
+        (0.45, 1.616),
+        (0.80, 1.601),
+        (1.05, 1.585),
+        (1.22, 1.545),
+        (1.42, 1.530),
+        (1.58, 1.566),
+        (1.85, 1.545),
+        (2.20, 1.497),
+        (3.15, 1.480),
+    ];
+    let around = p.x.abs().atan2(p.z - 0.040);
+    let next = LINE.iter().position(|(angle, _)| *angle >= around).unwrap_or(LINE.len() - 1).max(1);
+    let ((a0, y0), (a1, y1)) = (LINE[next - 1], LINE[next]);
+    let line = lerp(y0, y1, ((around - a0) / (a1 - a0)).clamp(0.0, 1.0));
+    let recede = if around < 1.0 { recede_m * (1.0 - around) } else { 0.0 };
+    let ear = p.x.abs() > 0.0665 && p.y < 1.562 && (0.012..0.075).contains(&p.z);
+    let above = p.y - line - recede;
+    if ear { above.min(-0.002) } else { above }
+}

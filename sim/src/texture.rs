@@ -1,0 +1,127 @@
+//! Painting textures through the mesh's own texture coordinates.
+
+use glam::{Vec2, Vec3};
+use rayon::prelude::*;
+
+use crate::look::Srgb;
+use crate::sheet::Sheet;
+
+/// A square sRGB picture.
+#[derive(Debug, Clone)]
+pub(crate) struct Texture {
+    pub side: usize,
+    pub pixels: Vec<[u8; 4]>,
+}
+
+/// What lies under a texel: index of the triangle plus one (0: nothing) and two of its barycentric coordinates.
+pub(crate) struct UvMap {
+    side: usize,
+    texels: Vec<(u32, Vec2)>,
+}
+
+impl UvMap {
+    /// Draws the sheet's triangles in texture space; texels around the charts take the closest chart's point.
+    pub(crate) fn new(sheet: &Sheet, side: usize) -> Self {
+        let mut texels = vec![(0u32, Vec2::ZERO); side * side];
+        for (triangle, index) in sheet.triangles.iter().zip(1u32..) {
+            let [a, b, c] = triangle.map(|v| sheet.nodes[v as usize].uv * side as f32 - 0.5);
+            let area = (b - a).perp_dot(c - a);
+            if area.abs() < 1e-9 {
+                continue;
+            }
+            let (low, high) = (a.min(b).min(c).floor(), a.max(b).max(c).ceil());
+            let clamp = |v: f32| v.clamp(0.0, side as f32 - 1.0) as usize;
+            for y in clamp(low.y)..=clamp(high.y) {
+                for x in clamp(low.x)..=clamp(high.x) {
+                    let p = Vec2::new(x as f32, y as f32);
+                    let u = (p - a).perp_dot(c - a) / area;
+                    let v = (b - a).perp_dot(p - a) / area;
+                    if u >= -1e-4 && v >= -1e-4 && u + v <= 1.0001 {
+                        texels[y * side + x] = (index, Vec2::new(u, v));
+                    }
+                }
+            }
+        }
+        // Grow the charts, so that filtering finds no unpainted texel at a seam.
+        for _ in 0..(side / 128).clamp(2, 12) {
+            let before = texels.clone();
+            for y in 0..side {
+                for x in 0..side {
+                    if before[y * side + x].0 != 0 {
+                        continue;
+                    }
+                    let around = [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)];
+                    let mut there = around.into_iter().filter(|&(x, y)| x < side && y < side);
+                    if let Some((x2, y2)) = there.find(|&(x, y)| before[y * side + x].0 != 0) {
+                        texels[y * side + x] = before[y2 * side + x2];
+                    }
+                }
+            }
+        }
+        Self { side, texels }
+    }
+
+    /// Colours each texel by what is under it: three corner nodes' indices and the weights of the corners.
+    pub(crate) fn paint(&self, sheet: &Sheet, colour: impl Fn([u32; 3], Vec3) -> Srgb + Sync) -> Texture {
+        let pixels = self
+            .texels
+            .par_iter()
+            .map(|&(index, uv)| match (index as usize).checked_sub(1).and_then(|i| sheet.triangles.get(i)) {
+                Some(&corners) => to_bytes(colour(corners, Vec3::new(1.0 - uv.x - uv.y, uv.x, uv.y))),
+                None => [128, 128, 128, 255],
+            })
+            .collect();
+        Texture { side: self.side, pixels }
+    }
+}
+
+impl Texture {
+    /// A texture from a function of texture coordinates.
+    pub(crate) fn from_fn(side: usize, colour: impl Fn(Vec2) -> Srgb + Sync) -> Self {
+        let pixels = (0..side * side)
+            .into_par_iter()
+            .map(|i| to_bytes(colour((Vec2::new((i % side) as f32, (i / side) as f32) + 0.5) / side as f32)))
+            .collect();
+        Self { side, pixels }
+    }
+
+    /// Half the side, averaged in linear light.
+    pub(crate) fn halved(&self) -> Self {
+        let side = (self.side / 2).max(1);
+        let table: Vec<f32> = (0..=255).map(|v| linear_from_srgb(v as f32 / 255.0)).collect();
+        let at = |x: usize, y: usize| self.pixels[y.min(self.side - 1) * self.side + x.min(self.side - 1)];
+        let pixels = (0..side * side)
+            .into_par_iter()
+            .map(|i| {
+                let (x, y) = (i % side * 2, i / side * 2);
+                let four = [at(x, y), at(x + 1, y), at(x, y + 1), at(x + 1, y + 1)];
+                let mean = |c: usize| four.iter().map(|p| table[usize::from(p[c])]).sum::<f32>() / 4.0;
+                to_bytes([mean(0), mean(1), mean(2)].map(srgb_from_linear))
+            })
+            .collect();
+        Self { side, pixels }
+    }
+}
+
+fn to_bytes(colour: Srgb) -> [u8; 4] {
+    let [r, g, b] = colour.map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8);
+    [r, g, b, 255]
+}
+
+/// IEC 61966-2-1.
+pub(crate) fn linear_from_srgb(c: f32) -> f32 {
+    if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
+}
+
+/// IEC 61966-2-1.
+pub(crate) fn srgb_from_linear(c: f32) -> f32 {
+    if c <= 0.003_130_8 { c * 12.92 } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 }
+}
+
+pub(crate) fn mix3(a: Srgb, b: Srgb, t: f32) -> Srgb {
+    std::array::from_fn(|i| a[i] + (b[i] - a[i]) * t)
+}
+
+pub(crate) fn scale3(a: Srgb, by: f32) -> Srgb {
+    a.map(|c| c * by)
+}
