@@ -1,2 +1,94 @@
-//! The `flyrig` command.
-fn main() {}
+//! The `flyrig` command: wires the stages, reads the configuration, writes the reports.
+//!
+//! A library only so that the end-to-end tests can build the same program; its documentation is `--help`.
+
+mod cli;
+mod config;
+mod dataset;
+mod demo;
+mod engine;
+mod eval;
+mod intake;
+mod outlet;
+mod pipeline;
+mod png;
+mod report;
+mod run;
+mod score;
+mod stats;
+mod stop;
+mod viewpoints;
+mod watch;
+
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::Parser as _;
+use flyrig_gpu::{AdapterChoice, GpuContext};
+use tracing_subscriber::EnvFilter;
+
+use crate::{
+    cli::{Cli, Command, ConfigAction},
+    config::{Config, DEFAULT_TOML},
+};
+
+/// Runs the command line of this process.
+#[must_use]
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    start_log(&cli);
+    match dispatch(&cli) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn dispatch(cli: &Cli) -> Result<()> {
+    match &cli.command {
+        Command::Demo(args) => demo::demo(args, &gpu(cli.adapter.as_deref())?),
+        Command::Run { config } => {
+            let config = Config::load(config)?;
+            let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
+            run::run(&config, &gpu(adapter)?)
+        }
+        Command::Watch(args) => watch::watch(args),
+        Command::Eval(args) => eval::eval(args, &gpu(cli.adapter.as_deref())?),
+        Command::Config { action: ConfigAction::Print } => {
+            print!("{DEFAULT_TOML}");
+            Ok(())
+        }
+        Command::Config { action: ConfigAction::Check { config } } => {
+            Config::load(config)?;
+            println!("{} is right", config.display());
+            Ok(())
+        }
+    }
+}
+
+fn gpu(adapter: Option<&str>) -> Result<GpuContext> {
+    let choice = match adapter {
+        Some(name) if !name.is_empty() => AdapterChoice::Named(name.to_owned()),
+        _ => AdapterChoice::Best,
+    };
+    Ok(GpuContext::new(&choice)?)
+}
+
+fn start_log(cli: &Cli) {
+    let level = match cli.verbose {
+        0 => "warn,flyrig=info",
+        1 => {
+            "info,flyrig=debug,flyrig_capture=debug,flyrig_calib=debug,flyrig_tracker=debug,flyrig_renderer=debug,flyrig_transport=debug,flyrig_gpu=debug"
+        }
+        _ => "debug",
+    };
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    if cli.log_json {
+        builder.json().init();
+    } else {
+        builder.with_target(false).init();
+    }
+}

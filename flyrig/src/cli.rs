@@ -1,0 +1,221 @@
+//! The command line.
+
+use std::{net::SocketAddr, ops::Range, path::PathBuf};
+
+use clap::{Args, Parser, Subcommand};
+
+use crate::config::{AppearanceMode, Origin};
+
+/// Live free-viewpoint video of a person from a few cameras.
+///
+/// Start with `flyrig demo`: it runs a simulated rig, publishes the result, watches it from a second process and
+/// writes a report with pictures. `flyrig eval` does the same honestly on a data set of yours. For a rig that stays
+/// up, print a configuration, edit it and run it:
+///
+///     flyrig config print > rig.toml
+///     flyrig config check rig.toml
+///     flyrig run rig.toml
+///     flyrig watch --view main --out frames
+#[derive(Debug, Parser)]
+#[command(version, verbatim_doc_comment)]
+pub struct Cli {
+    /// Log as one JSON object a line.
+    #[arg(long, global = true)]
+    pub log_json: bool,
+    /// Log more: -v debug, -vv trace. RUST_LOG chooses in detail.
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    pub verbose: u8,
+    /// Part of a graphics adapter's name; the fastest one otherwise.
+    #[arg(long, global = true)]
+    pub adapter: Option<String>,
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Run the simulated rig with a separate viewer process and write a report.
+    Demo(DemoArgs),
+    /// Run a rig from a configuration until Ctrl-C.
+    Run {
+        /// The TOML file; see `flyrig config print`.
+        config: PathBuf,
+    },
+    /// Watch a running rig: print rates and latency, write pictures or a video.
+    Watch(WatchArgs),
+    /// Replay a data set, render its held-out cameras and score them.
+    Eval(EvalArgs),
+    /// Print the commented default configuration, or check one.
+    Config {
+        #[command(subcommand)]
+        action: ConfigAction,
+    },
+}
+
+#[derive(Debug, Subcommand)]
+pub enum ConfigAction {
+    /// Print the default configuration with a comment on every key.
+    Print,
+    /// Read a configuration and say whether it is right.
+    Check {
+        /// The TOML file.
+        config: PathBuf,
+    },
+}
+
+#[derive(Debug, Args)]
+pub struct DemoArgs {
+    /// Folder of the report; created, its old report replaced.
+    #[arg(long, default_value = "out/demo")]
+    pub out: PathBuf,
+    /// Frames of the simulated rig.
+    #[arg(long, default_value_t = 60, conflicts_with = "minutes")]
+    pub frames: usize,
+    /// Run for so long instead, the motion repeating.
+    #[arg(long)]
+    pub minutes: Option<f64>,
+    /// Seed of the person and the room.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// "turn" (turns around fully), "walk" (a captured walk from Debian's assimp-testmodels) or a BVH file.
+    #[arg(long, default_value = "turn")]
+    pub motion: String,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = 115_000)]
+    pub gaussians: usize,
+    /// How Gaussians get their colours.
+    #[arg(long, value_enum, default_value = "direct")]
+    pub appearance: AppearanceMode,
+    /// Also score the modes that `direct` adds to (takes three times as long).
+    #[arg(long)]
+    pub ablation: bool,
+    /// Address of the demo's publisher; port 0 takes a free one.
+    #[arg(long, default_value = "127.0.0.1:0")]
+    pub listen: SocketAddr,
+}
+
+#[derive(Debug, Args)]
+pub struct WatchArgs {
+    /// Name of the rig.
+    #[arg(long, default_value = "flyrig")]
+    pub rig: String,
+    /// Where the rig or a router listens (zenoh endpoint).
+    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
+    pub connect: String,
+    /// A published view; or ask for one of your own with --eye.
+    #[arg(long, default_value = "main")]
+    pub view: String,
+    /// Ask for a viewpoint of your own: camera position x,y,z in metres of the rig's world.
+    #[arg(long, value_parser = parse_vec3, allow_hyphen_values = true)]
+    pub eye: Option<[f64; 3]>,
+    /// Point that the viewpoint of --eye looks at.
+    #[arg(long, value_parser = parse_vec3, allow_hyphen_values = true, default_value = "0,0,1")]
+    pub target: [f64; 3],
+    /// Size of the viewpoint of --eye, WIDTHxHEIGHT.
+    #[arg(long, value_parser = parse_size, default_value = "512x512")]
+    pub size: [u32; 2],
+    /// Vertical field of view of the viewpoint of --eye, degrees.
+    #[arg(long, default_value_t = 40.0)]
+    pub fov_degrees: f64,
+    /// Write every picture as PNG into this folder, or, when the name ends in .mp4 or .avi, a video.
+    #[arg(long)]
+    pub out: Option<PathBuf>,
+    /// Stop after so many pictures.
+    #[arg(long)]
+    pub count: Option<usize>,
+    /// Stop after so many seconds.
+    #[arg(long)]
+    pub seconds: Option<f64>,
+    /// Stop when the rig ends its session.
+    #[arg(long)]
+    pub until_end: bool,
+    /// Write rates and latency as JSON at the end.
+    #[arg(long)]
+    pub stats: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct EvalArgs {
+    /// Folder in EasyMocap layout: intri.yml, extri.yml, images/CAM, optional mask/CAM and a skinned *.glb.
+    pub dataset: PathBuf,
+    /// Cameras that go in, comma separated.
+    #[arg(long, value_delimiter = ',', required = true)]
+    pub inputs: Vec<String>,
+    /// Cameras to render and score, comma separated.
+    #[arg(long, value_delimiter = ',', required = true)]
+    pub holdout: Vec<String>,
+    /// Folder for pictures, surfaces and the report.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Pose from the data set's glTF animation, or from the pictures.
+    #[arg(long, value_enum, default_value = "given")]
+    pub pose: Origin,
+    /// Masks from the data set, or from the pictures.
+    #[arg(long, value_enum, default_value = "given")]
+    pub masks: Origin,
+    /// How Gaussians get their colours.
+    #[arg(long, value_enum, default_value = "direct")]
+    pub appearance: AppearanceMode,
+    /// Frames FIRST..END, END excluded; all of them otherwise.
+    #[arg(long, value_parser = parse_range)]
+    pub frames: Option<Range<u64>>,
+    /// Frame rate of the folder.
+    #[arg(long, default_value_t = 30.0)]
+    pub fps: f64,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = 115_000)]
+    pub gaussians: usize,
+    /// Nodes of the deformation graph.
+    #[arg(long, default_value_t = 1620)]
+    pub nodes: usize,
+}
+
+fn parse_vec3(text: &str) -> Result<[f64; 3], String> {
+    let numbers: Vec<f64> =
+        text.split(',').filter_map(|n| n.trim().parse().ok()).filter(|n: &f64| n.is_finite()).collect();
+    numbers.try_into().ok().filter(|_| text.split(',').count() == 3).ok_or_else(|| format!("'{text}' is not x,y,z"))
+}
+
+fn parse_size(text: &str) -> Result<[u32; 2], String> {
+    let sides: Option<(u32, u32)> = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+    match sides {
+        Some((w, h)) if (16..=4096).contains(&w) && (16..=4096).contains(&h) => Ok([w, h]),
+        _ => Err(format!("'{text}' is not WIDTHxHEIGHT with sides of 16 to 4096 pixels")),
+    }
+}
+
+fn parse_range(text: &str) -> Result<Range<u64>, String> {
+    let ends: Option<(u64, u64)> = text.split_once("..").and_then(|(a, b)| Some((a.parse().ok()?, b.parse().ok()?)));
+    match ends {
+        Some((a, b)) if a < b => Ok(a..b),
+        _ => Err(format!("'{text}' is not a range of frames like 0..60 (the end is excluded)")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn odd_arguments_are_refused() {
+        assert_eq!(parse_vec3("1,-2.5,3"), Ok([1.0, -2.5, 3.0]));
+        for bad in ["", "1,2", "1,2,3,4", "a,b,c", "1,2,nan", "1,,3"] {
+            assert!(parse_vec3(bad).is_err(), "{bad}");
+        }
+        assert_eq!(parse_range("3..7"), Ok(3..7));
+        for bad in ["3", "7..3", "3..3", "-1..4", "a..b"] {
+            assert!(parse_range(bad).is_err(), "{bad}");
+        }
+        assert_eq!(parse_size("640x480"), Ok([640, 480]));
+        for bad in ["0x0", "640", "640x100000", "x"] {
+            assert!(parse_size(bad).is_err(), "{bad}");
+        }
+    }
+}

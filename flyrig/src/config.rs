@@ -1,0 +1,293 @@
+//! The configuration file: one commented default, strict reading, errors that name line and key.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail, ensure};
+use clap::ValueEnum;
+use flyrig_renderer::AppearanceSettings;
+use flyrig_sim::SimConfig;
+use serde::{Deserialize, Serialize};
+
+/// The commented default file, as `flyrig config print` writes it. A test keeps it equal to `Config::default()`.
+pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
+
+/// Everything `flyrig run` can be told; the keys are explained in `assets/default.toml`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    pub rig: RigSection,
+    pub source: SourceSection,
+    pub sim: SimConfig,
+    pub sync: SyncSection,
+    pub body: BodySection,
+    pub appearance: AppearanceSection,
+    pub output: OutputSection,
+    pub transport: TransportSection,
+    pub gpu: GpuSection,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RigSection {
+    pub name: String,
+}
+
+impl Default for RigSection {
+    fn default() -> Self {
+        Self { name: "flyrig".to_owned() }
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SourceKind {
+    Sim,
+    Folder,
+    Video,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SourceSection {
+    pub kind: SourceKind,
+    pub path: PathBuf,
+    pub cameras: Vec<String>,
+    pub fps: f64,
+    pub real_time: bool,
+}
+
+impl Default for SourceSection {
+    fn default() -> Self {
+        Self {
+            kind: SourceKind::Sim,
+            path: PathBuf::new(),
+            cameras: ["00", "03", "05"].map(str::to_owned).to_vec(),
+            fps: 30.0,
+            real_time: true,
+        }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SyncSection {
+    pub window_ms: f64,
+    pub max_wait_ms: f64,
+    pub master: String,
+}
+
+impl Default for SyncSection {
+    fn default() -> Self {
+        Self { window_ms: 8.0, max_wait_ms: 100.0, master: String::new() }
+    }
+}
+
+/// Where a pose or a mask comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Origin {
+    /// From the source or the data set.
+    Given,
+    /// From the pictures.
+    Estimated,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BodySection {
+    pub template: PathBuf,
+    pub pose: Origin,
+    pub masks: Origin,
+    pub gaussians: usize,
+    pub nodes: usize,
+}
+
+impl Default for BodySection {
+    fn default() -> Self {
+        Self { template: PathBuf::new(), pose: Origin::Given, masks: Origin::Given, gaussians: 115_000, nodes: 1620 }
+    }
+}
+
+/// How Gaussians get their colours.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum AppearanceMode {
+    /// Projection, spatial diffusion and temporal memory.
+    Direct,
+    /// Without the temporal memory.
+    DirectNoTime,
+    /// Projection only, as the paper's "w/o ST" baseline.
+    DirectNoSpaceTime,
+}
+
+impl AppearanceMode {
+    /// What the renderer is told.
+    pub fn settings(self) -> AppearanceSettings {
+        let (space, time) = match self {
+            Self::Direct => (true, true),
+            Self::DirectNoTime => (true, false),
+            Self::DirectNoSpaceTime => (false, false),
+        };
+        AppearanceSettings { space, time, ..AppearanceSettings::default() }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AppearanceSection {
+    pub mode: AppearanceMode,
+}
+
+impl Default for AppearanceSection {
+    fn default() -> Self {
+        Self { mode: AppearanceMode::Direct }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct OutputSection {
+    pub views: usize,
+    pub width: u32,
+    pub height: u32,
+    pub jpeg_quality: u8,
+    pub splats: bool,
+}
+
+impl Default for OutputSection {
+    fn default() -> Self {
+        Self { views: 1, width: 512, height: 512, jpeg_quality: 85, splats: true }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TransportSection {
+    pub listen: Vec<String>,
+    pub connect: Vec<String>,
+    pub max_viewers: usize,
+}
+
+impl Default for TransportSection {
+    fn default() -> Self {
+        Self { listen: vec!["tcp/127.0.0.1:7447".to_owned()], connect: Vec::new(), max_viewers: 4 }
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GpuSection {
+    pub adapter: String,
+}
+
+impl Config {
+    /// Reads and checks a file.
+    pub fn load(path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read the configuration {}", path.display()))?;
+        Self::parse(&text).with_context(|| format!("in the configuration {}", path.display()))
+    }
+
+    /// Reads and checks a text.
+    pub fn parse(text: &str) -> Result<Self> {
+        match toml::from_str::<Self>(text) {
+            Ok(config) => {
+                config.check()?;
+                Ok(config)
+            }
+            Err(error) => {
+                let hint = nearest_key(error.message()).map(|key| format!("did you mean `{key}`?")).unwrap_or_default();
+                bail!("{}{hint}", error.to_string().trim_end_matches(' '))
+            }
+        }
+    }
+
+    fn check(&self) -> Result<()> {
+        let range = |key: &str, value: f64, low: f64, high: f64| -> Result<()> {
+            ensure!(
+                value.is_finite() && (low..=high).contains(&value),
+                "{key} is {value}, it must lie between {low} and {high}"
+            );
+            Ok(())
+        };
+        ensure!(
+            !self.rig.name.is_empty() && self.rig.name.chars().all(|c| c.is_ascii_alphanumeric() || "-_".contains(c)),
+            "rig.name is '{}', it must be letters, digits, '-' and '_'",
+            self.rig.name
+        );
+        range("source.fps", self.source.fps, 0.1, 1000.0)?;
+        self.sim.validate().context("in [sim]")?;
+        range("sync.window_ms", self.sync.window_ms, 0.001, 10_000.0)?;
+        range("sync.max_wait_ms", self.sync.max_wait_ms, 0.0, 60_000.0)?;
+        range("body.gaussians", self.body.gaussians as f64, 100.0, 2_000_000.0)?;
+        range("body.nodes", self.body.nodes as f64, 4.0, 100_000.0)?;
+        ensure!(
+            self.body.nodes <= self.body.gaussians,
+            "body.nodes is {}, more than body.gaussians ({}): nodes are chosen among the Gaussians",
+            self.body.nodes,
+            self.body.gaussians
+        );
+        range("output.views", self.output.views as f64, 0.0, 16.0)?;
+        range("output.width", f64::from(self.output.width), 16.0, 4096.0)?;
+        range("output.height", f64::from(self.output.height), 16.0, 4096.0)?;
+        range("output.jpeg_quality", f64::from(self.output.jpeg_quality), 1.0, 100.0)?;
+        range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)?;
+        ensure!(
+            self.source.kind == SourceKind::Sim || !self.source.path.as_os_str().is_empty(),
+            "source.path is empty: name the folder of the data set"
+        );
+        ensure!(
+            self.source.kind == SourceKind::Sim
+                || self.body.pose == Origin::Estimated
+                || !self.body.template.as_os_str().is_empty(),
+            "body.pose is \"given\" but body.template is empty: name a skinned glTF file with an animation, or set body.pose = \"estimated\""
+        );
+        Ok(())
+    }
+}
+
+/// Of a "unknown field `x`, expected one of `a`, `b`" message the listed key closest to `x`.
+fn nearest_key(message: &str) -> Option<String> {
+    let mut quoted = message.split('`').skip(1).step_by(2);
+    let unknown = quoted.next().filter(|_| message.starts_with("unknown"))?;
+    quoted
+        .max_by(|a, b| strsim::jaro_winkler(unknown, a).total_cmp(&strsim::jaro_winkler(unknown, b)))
+        .map(str::to_owned)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_printed_default_is_the_default() {
+        assert_eq!(Config::parse(DEFAULT_TOML).unwrap(), Config::default());
+        assert_eq!(Config::parse("").unwrap(), Config::default());
+    }
+
+    #[test]
+    fn an_unknown_key_names_line_and_nearest_key() {
+        let error = Config::parse("[sync]\nwindow_ms = 4.0\nmax_wait = 5.0\n").unwrap_err().to_string();
+        assert!(error.contains("line 3"), "{error}");
+        assert!(error.contains("unknown field `max_wait`"), "{error}");
+        assert!(error.ends_with("did you mean `max_wait_ms`?"), "{error}");
+        let error = Config::parse("[apearance]\n").unwrap_err().to_string();
+        assert!(error.ends_with("did you mean `appearance`?"), "{error}");
+    }
+
+    #[test]
+    fn values_out_of_range_are_named() {
+        for (text, expected) in [
+            ("[sync]\nwindow_ms = nan\n", "sync.window_ms is NaN"),
+            ("[body]\ngaussians = 3\n", "body.gaussians is 3, it must lie between 100 and 2000000"),
+            ("[body]\ngaussians = 200\nnodes = 1000\n", "body.nodes is 1000, more than body.gaussians"),
+            ("[source]\nkind = \"folder\"\n", "source.path is empty"),
+            ("[source]\nkind = \"folder\"\npath = \"x\"\n", "body.template is empty"),
+            ("[rig]\nname = \"a/b\"\n", "rig.name is 'a/b'"),
+            ("[sim]\nwidth = -4\n", "sim"),
+        ] {
+            let error = format!("{:#}", Config::parse(text).unwrap_err());
+            assert!(error.contains(expected), "{text}: {error}");
+        }
+    }
+}

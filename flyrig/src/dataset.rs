@@ -1,0 +1,69 @@
+//! Finding things in an EasyMocap folder.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use flyrig_types::{Camera, CameraId, Image, PixelFormat, Rig};
+
+/// The named cameras of a rig, in the order of the names; all of them for no names.
+pub fn pick(rig: &Rig, names: &[String], whose: &str) -> Result<Rig> {
+    if names.is_empty() {
+        return Ok(rig.clone());
+    }
+    let cameras = names
+        .iter()
+        .map(|name| {
+            rig.slot(&name.as_str().into()).map(|slot| rig.cameras[slot].clone()).with_context(|| {
+                let known: Vec<_> = rig.cameras.iter().map(|camera| camera.id.as_str()).collect();
+                format!("camera {name} is not in {whose}; it has: {}", known.join(", "))
+            })
+        })
+        .collect::<Result<Vec<Camera>>>()?;
+    let picked = Rig { cameras, world_up: rig.world_up };
+    picked.validate()?;
+    Ok(picked)
+}
+
+/// Size of a camera's first readable picture, or of its video, for calibrations that do not say.
+pub fn image_size(root: &Path, id: &CameraId) -> Option<(u32, u32)> {
+    let folder = root.join("images").join(id.as_str());
+    let mut files: Vec<PathBuf> = std::fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path()).collect();
+    files.sort();
+    files.iter().find_map(|file| image::image_dimensions(file).ok())
+}
+
+/// The empty picture `background/CAM.png` of a camera, where there is one.
+pub fn plate(root: &Path, camera: &Camera) -> Result<Option<Image>> {
+    let path = root.join("background").join(format!("{}.png", camera.id));
+    if !path.exists() {
+        return Ok(None);
+    }
+    let picture = image::open(&path).with_context(|| format!("cannot read {}", path.display()))?.into_rgb8();
+    let (width, height) = picture.dimensions();
+    let expected = (camera.intrinsics.width, camera.intrinsics.height);
+    if (width, height) != expected {
+        bail!("{} is {width}x{height} pixels, the camera's pictures are {}x{}", path.display(), expected.0, expected.1);
+    }
+    Ok(Some(Image::new(width, height, PixelFormat::Rgb8, picture.into_raw())?))
+}
+
+/// The one skinned glTF file of a data set.
+pub fn gltf_file(root: &Path) -> Result<PathBuf> {
+    let is_gltf = |path: &PathBuf| {
+        path.extension().is_some_and(|e| e.eq_ignore_ascii_case("glb") || e.eq_ignore_ascii_case("gltf"))
+    };
+    let files: Vec<PathBuf> = std::fs::read_dir(root)
+        .with_context(|| format!("cannot read the data set {}", root.display()))?
+        .flatten()
+        .map(|entry| entry.path())
+        .filter(is_gltf)
+        .collect();
+    match files.as_slice() {
+        [file] => Ok(file.clone()),
+        _ => bail!(
+            "--pose given needs one skinned glTF file with an animation in {}, found {}; use --pose estimated without",
+            root.display(),
+            files.len()
+        ),
+    }
+}

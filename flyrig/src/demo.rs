@@ -1,0 +1,387 @@
+//! `flyrig demo`: the whole system on a simulated rig, with a viewer in a process of its own and a report.
+
+use std::{
+    path::Path,
+    process::{Child, Command},
+    sync::{Arc, Mutex, MutexGuard},
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context, Result, bail};
+use flyrig_calib::SyncConfig;
+use flyrig_capture::{CameraSource, Pacing};
+use flyrig_gpu::GpuContext;
+use flyrig_sim::{MotionConfig, MotionKind, SimConfig, SimFrame, Simulator};
+use flyrig_transport::{Publisher, TransportConfig};
+use flyrig_types::{Camera, FrameSet};
+use indicatif::ProgressBar;
+use serde::Serialize;
+
+use crate::{
+    cli::DemoArgs,
+    config::{AppearanceMode, Origin},
+    dataset,
+    engine::Engine,
+    eval::progress_bar,
+    intake::Intake,
+    outlet::Outlet,
+    pipeline::{Outcome, Pipeline, PoseSource},
+    png,
+    report::{ContactRow, Curve, Report, write_whole},
+    run::Views,
+    score::{CameraScore, ScoreSheet, contact_pictures, score_view},
+    stats::{StageSummary, resident_mib},
+    stop,
+    watch::WatchStats,
+};
+
+/// Cameras that go in, and cameras that are only rendered and compared.
+const INPUTS: [&str; 3] = ["00", "03", "05"];
+const HELD_OUT: [&str; 4] = ["01", "02", "04", "06"];
+/// Name of the demo's rig on the network.
+const RIG_NAME: &str = "flyrig-demo";
+/// Instants that are scored against the held-out cameras.
+const SCORED: u64 = 20;
+/// Rows of the contact sheet.
+const CONTACT_ROWS: usize = 4;
+/// How often the memory is looked at.
+const MEMORY_EVERY: Duration = Duration::from_secs(5);
+/// The viewer must have connected by then, or the demo goes on without it.
+const VIEWER_DEADLINE: Duration = Duration::from_secs(15);
+/// How long the viewer may take to write its last pictures.
+const VIEWER_END: Duration = Duration::from_secs(15);
+
+/// What one pass over the motion gave.
+#[derive(Debug, Default)]
+struct Pass {
+    sheet: ScoreSheet,
+    stages: Vec<StageSummary>,
+    contact: Vec<ContactRow>,
+    memory: Vec<(f64, f64)>,
+    drops: Vec<(String, u64)>,
+    frames: u64,
+    seconds: f64,
+    /// Of `seconds`, spent on simulating held-out cameras and scoring.
+    scoring_seconds: f64,
+}
+
+/// `metrics.json`.
+#[derive(Debug, Serialize)]
+struct Metrics {
+    adapter: String,
+    seed: u64,
+    gaussians: usize,
+    frames: u64,
+    seconds: f64,
+    frames_per_second: f64,
+    modes: Vec<(AppearanceMode, Vec<CameraScore>, Option<CameraScore>)>,
+    stages: Vec<StageSummary>,
+    drops: Vec<(String, u64)>,
+    memory_mib: Vec<(f64, f64)>,
+    watch: Option<WatchStats>,
+}
+
+/// Runs the command.
+pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    eprintln!("demo: simulated rig on {}", gpu.adapter_name());
+    let simulator = Arc::new(Mutex::new(Simulator::new(gpu, &sim_config(args))?));
+
+    let publisher = Publisher::open(&TransportConfig {
+        listen: vec![format!("tcp/{}", args.listen)],
+        ..TransportConfig::publisher(RIG_NAME)
+    })?;
+    publisher.add_view("main")?;
+    let endpoint = publisher.endpoints().first().context("the publisher listens nowhere")?.clone();
+    let viewer = Viewer::start(&args.out, &endpoint)?;
+    let deadline = Instant::now() + VIEWER_DEADLINE;
+    while !publisher.has_subscribers("main") && Instant::now() < deadline {
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    let mut outlet = Outlet::start(publisher, 85)?;
+
+    let main = pass(args, gpu, &simulator, args.appearance, Some(&mut outlet))?;
+    let mut drops = main.drops.clone();
+    drops.extend(outlet.drops());
+    outlet.finish()?;
+    let watch = viewer.finish();
+    let mut modes = vec![(args.appearance, main.sheet.per_camera(), main.sheet.mean())];
+    if args.ablation {
+        for mode in [AppearanceMode::Direct, AppearanceMode::DirectNoTime, AppearanceMode::DirectNoSpaceTime] {
+            if mode != args.appearance && !stop::requested() {
+                let other = pass(args, gpu, &simulator, mode, None)?;
+                modes.push((mode, other.sheet.per_camera(), other.sheet.mean()));
+            }
+        }
+    }
+
+    let metrics = Metrics {
+        adapter: gpu.adapter_name(),
+        seed: args.seed,
+        gaussians: args.gaussians,
+        frames: main.frames,
+        seconds: main.seconds,
+        frames_per_second: main.frames as f64 / (main.seconds - main.scoring_seconds).max(1e-9),
+        modes,
+        stages: main.stages.clone(),
+        drops,
+        memory_mib: main.memory.clone(),
+        watch,
+    };
+    write_whole(&args.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
+    let summary = summary(&metrics);
+    let path = args.out.join("index.html");
+    report(&metrics, main, &summary).save(&path)?;
+    for (mode, scores, mean) in &metrics.modes {
+        println!("\n{mode:?}: three cameras in, four held out");
+        for s in scores.iter().chain(mean) {
+            println!("  {:<4} PSNR {:.2} dB  SSIM {:.4}  FLIP {:.4}", s.camera, s.psnr_db, s.ssim, s.flip);
+        }
+    }
+    println!();
+    for (name, value) in &summary {
+        println!("{name:<24} {value}");
+    }
+    println!(
+        "\nreport: {} (open it in a browser); the viewer's pictures: {}",
+        path.display(),
+        args.out.join("watched").display()
+    );
+    Ok(())
+}
+
+fn sim_config(args: &DemoArgs) -> SimConfig {
+    let defaults = SimConfig::default();
+    let motion = match args.motion.as_str() {
+        "turn" => MotionConfig::default(),
+        "walk" => MotionConfig { kind: MotionKind::Bvh, ..MotionConfig::default() },
+        file => MotionConfig { kind: MotionKind::Bvh, bvh: Some(file.into()), ..MotionConfig::default() },
+    };
+    // However many frames there are, they show the whole turn.
+    let turn_secs =
+        if args.minutes.is_some() { motion.turn_secs } else { (args.frames as f64 / defaults.fps).clamp(2.0, 60.0) };
+    SimConfig { seed: args.seed, motion: MotionConfig { turn_secs, ..motion }, ..defaults }
+}
+
+fn lock(simulator: &Mutex<Simulator>) -> Result<MutexGuard<'_, Simulator>> {
+    simulator.lock().map_err(|_| anyhow::anyhow!("the simulator's thread failed; see the log above"))
+}
+
+fn pass(
+    args: &DemoArgs,
+    gpu: &GpuContext,
+    simulator: &Arc<Mutex<Simulator>>,
+    mode: AppearanceMode,
+    mut outlet: Option<&mut Outlet>,
+) -> Result<Pass> {
+    let (rig, template, track) = {
+        let simulator = lock(simulator)?;
+        (simulator.rig().clone(), simulator.template().clone(), simulator.track().clone())
+    };
+    let inputs = dataset::pick(&rig, &INPUTS.map(str::to_owned), "the simulated rig")?;
+    let held_out = dataset::pick(&rig, &HELD_OUT.map(str::to_owned), "the simulated rig")?.cameras;
+    let sources: Vec<Box<dyn CameraSource>> = flyrig_sim::sources(simulator)
+        .into_iter()
+        .filter(|source| inputs.slot(source.camera()).is_some())
+        .map(|source| Box::new(source) as Box<dyn CameraSource>)
+        .collect();
+    let engine = Engine::new(
+        gpu.clone(),
+        template,
+        args.gaussians,
+        flyrig_body::DEFAULT_NODE_COUNT,
+        inputs.cameras.len(),
+        mode.settings(),
+    )?;
+    let no_plates = inputs.cameras.iter().map(|_| None).collect();
+    let mut pipeline =
+        Pipeline::new(engine, inputs, PoseSource::Track { track, repeat: true }, Origin::Given, no_plates);
+    if let Some(outlet) = &outlet {
+        outlet.publisher().set_calibration(pipeline.rig())?;
+    }
+    let mut intake = Intake::start(sources, &SyncConfig::default(), Pacing::Lossless)?;
+
+    let limit = args.minutes.map(|minutes| Duration::from_secs_f64(minutes.max(0.0) * 60.0));
+    let total = limit.map_or(args.frames as u64, |limit| limit.as_secs());
+    let bar = progress_bar(total, if limit.is_some() { "seconds" } else { "frames" });
+    let views = Views::new(1, 512, 512);
+    let score_every = if limit.is_some() { 50 } else { (args.frames as u64 / SCORED).max(1) };
+    let started = Instant::now();
+    let mut pass = Pass::default();
+    let mut last_memory: Option<Instant> = None;
+    while !stop::requested() {
+        let done = limit.map_or(pass.frames >= args.frames as u64, |limit| started.elapsed() >= limit);
+        if done {
+            break;
+        }
+        let Some(set) = intake.next_set(Duration::from_secs(10)) else {
+            if intake.ended() {
+                break;
+            }
+            bail!("the simulated cameras gave nothing for 10 s; run with -v to see why");
+        };
+        if let Outcome::Held(reason) = pipeline.process(&set)? {
+            tracing::warn!(set = set.index, %reason, "frame set not used");
+        }
+        if let Some(outlet) = &mut outlet {
+            let turn_time = Duration::from_secs_f64(pass.frames as f64 / 12.0);
+            views.publish(&mut pipeline, outlet, &set, turn_time)?;
+            outlet.publish_stats(&set, pass.frames, &pipeline.stages.summary(), &intake.drops());
+        }
+        if pass.frames % score_every == score_every / 2 {
+            let start = Instant::now();
+            score(&mut pass, &mut pipeline, simulator, &rig.cameras, &held_out, &set, score_every)?;
+            pass.scoring_seconds += start.elapsed().as_secs_f64();
+        }
+        pass.frames += 1;
+        if last_memory.is_none_or(|at| at.elapsed() >= MEMORY_EVERY) {
+            last_memory = Some(Instant::now());
+            pass.memory.extend(resident_mib().map(|mib| (started.elapsed().as_secs_f64(), mib)));
+        }
+        advance(&bar, limit.map_or(pass.frames, |_| started.elapsed().as_secs()), &pass.sheet);
+    }
+    bar.finish_and_clear();
+    pass.memory.extend(resident_mib().map(|mib| (started.elapsed().as_secs_f64(), mib)));
+    pass.seconds = started.elapsed().as_secs_f64();
+    pass.stages = pipeline.stages.summary();
+    pass.drops = intake.drops();
+    Ok(pass)
+}
+
+fn advance(bar: &ProgressBar, position: u64, sheet: &ScoreSheet) {
+    bar.set_position(position);
+    bar.set_message(sheet.progress());
+}
+
+fn score(
+    pass: &mut Pass,
+    pipeline: &mut Pipeline,
+    simulator: &Mutex<Simulator>,
+    all: &[Camera],
+    held_out: &[Camera],
+    set: &FrameSet,
+    score_every: u64,
+) -> Result<()> {
+    let contact_every = score_every * (SCORED / CONTACT_ROWS as u64);
+    let wants_contact = pass.contact.len() < CONTACT_ROWS && pass.frames >= pass.contact.len() as u64 * contact_every;
+    for (i, camera) in held_out.iter().enumerate() {
+        let slot = all.iter().position(|c| c.id == camera.id).context("a held-out camera is not in the rig")?;
+        let truth: SimFrame = lock(simulator)?.render(set.master_nanos, slot)?;
+        let ours = pipeline.render(camera)?;
+        pass.sheet.extend(score_view(&camera.id, set.index, &ours, &truth.color, Some(&truth.mask))?);
+        if wants_contact && i == pass.contact.len() % held_out.len() {
+            let mut pictures = Vec::new();
+            if let Some((_, frame)) = set.present().next() {
+                let image = &frame.image;
+                pictures.push((
+                    format!("input {}", frame.camera),
+                    png::encode_rgb(image.bytes(), image.width(), image.height())?,
+                ));
+            }
+            pictures.extend(contact_pictures(&camera.id, &ours, &truth.color, Some(&truth.mask))?);
+            pass.contact.push(ContactRow { label: format!("frame {}", set.index), pictures });
+        }
+    }
+    Ok(())
+}
+
+/// `flyrig watch` as a child process.
+struct Viewer {
+    child: Child,
+    stats: std::path::PathBuf,
+}
+
+impl Viewer {
+    fn start(out: &Path, endpoint: &str) -> Result<Self> {
+        let stats = out.join("watch.json");
+        let _ = std::fs::remove_file(&stats);
+        let program = std::env::current_exe().context("finding our own program file")?;
+        let child = Command::new(program)
+            .args(["watch", "--until-end", "--rig", RIG_NAME, "--connect", endpoint, "--view", "main", "--out"])
+            .arg(out.join("watched"))
+            .arg("--stats")
+            .arg(&stats)
+            .stderr(std::process::Stdio::null())
+            .spawn()
+            .context("starting the viewer process")?;
+        Ok(Self { child, stats })
+    }
+
+    /// Waits for the viewer to see the end, then reads what it measured.
+    fn finish(mut self) -> Option<WatchStats> {
+        let deadline = Instant::now() + VIEWER_END;
+        while Instant::now() < deadline && matches!(self.child.try_wait(), Ok(None)) {
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        serde_json::from_slice(&std::fs::read(&self.stats).ok()?).ok()
+    }
+}
+
+impl Drop for Viewer {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn summary(metrics: &Metrics) -> Vec<(String, String)> {
+    let mut facts = vec![
+        ("adapter".to_owned(), metrics.adapter.clone()),
+        ("Gaussians".to_owned(), metrics.gaussians.to_string()),
+        (
+            "end to end".to_owned(),
+            format!(
+                "{} frames, {:.2} a second without scoring (simulating the three input cameras included)",
+                metrics.frames, metrics.frames_per_second
+            ),
+        ),
+    ];
+    if let Some(w) = &metrics.watch {
+        let latency = w.latency_p50_ms.map_or_else(String::new, |p50| format!(", latency {p50:.1} ms median"));
+        facts.push(("viewer process".to_owned(), format!("{} pictures, {} missed{latency}", w.received, w.missed)));
+    } else {
+        facts.push(("viewer process".to_owned(), "gave no statistics".to_owned()));
+    }
+    let lost: Vec<String> =
+        metrics.drops.iter().filter(|(_, count)| *count > 0).map(|(place, count)| format!("{count} {place}")).collect();
+    facts.push(("dropped".to_owned(), if lost.is_empty() { "nothing".to_owned() } else { lost.join(", ") }));
+    if let (Some(first), Some(last)) = (metrics.memory_mib.first(), metrics.memory_mib.last()) {
+        facts.push((
+            "memory".to_owned(),
+            format!("{:.0} MiB at the start, {:.0} MiB after {:.0} s", first.1, last.1, last.0),
+        ));
+    }
+    facts
+}
+
+fn report(metrics: &Metrics, main: Pass, summary: &[(String, String)]) -> Report {
+    Report {
+        title: "flyrig demo: three simulated cameras in, a walk-around human out".to_owned(),
+        facts: summary.to_vec(),
+        scores: metrics
+            .modes
+            .iter()
+            .map(|(mode, cameras, mean)| {
+                (format!("Held-out cameras, appearance {mode:?}"), cameras.iter().chain(mean).cloned().collect())
+            })
+            .collect(),
+        stages: metrics.stages.clone(),
+        curves: vec![
+            Curve {
+                title: "PSNR of the held-out cameras".to_owned(),
+                x_label: "frame".to_owned(),
+                y_label: "dB".to_owned(),
+                lines: main.sheet.curves(),
+            },
+            Curve {
+                title: "Memory".to_owned(),
+                x_label: "seconds".to_owned(),
+                y_label: "MiB".to_owned(),
+                lines: vec![("resident".to_owned(), main.memory)],
+            },
+        ],
+        contact: main.contact,
+    }
+}

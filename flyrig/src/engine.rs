@@ -1,0 +1,228 @@
+//! The method on one GPU: pose the Gaussians, see which camera sees what, colour them, draw them.
+
+use std::time::Instant;
+
+use anyhow::{Context, Result, ensure};
+use flyrig_body::{
+    DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, SurfaceGaussians, Template, build_graph, sample_surface, skin_mesh,
+};
+use flyrig_capture::to_rgb8;
+use flyrig_gpu::GpuContext;
+use flyrig_renderer::{
+    AppearanceSettings, DirectAppearance, GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, Splat,
+    ViewInput, read_splats, rgba8_from_target,
+};
+use flyrig_types::{Camera, Image, Mask, Pose};
+
+use crate::stats::StageTimes;
+
+/// Seed of the surface sampling: the same template gives the same Gaussians on every run.
+const SURFACE_SEED: u64 = 1;
+
+/// One input picture with its person mask.
+#[derive(Debug, Clone, Copy)]
+pub struct InputView<'a> {
+    pub camera: &'a Camera,
+    pub image: &'a Image,
+    pub mask: &'a Mask,
+}
+
+/// A rendered view: straight-alpha sRGB.
+#[derive(Debug, Clone)]
+pub struct RenderedView {
+    pub width: u32,
+    pub height: u32,
+    pub rgba: Vec<u8>,
+}
+
+/// The person as Gaussians on the GPU, and everything that keeps them up to date.
+#[derive(Debug)]
+pub struct Engine {
+    gpu: GpuContext,
+    template: Template,
+    skinner: GpuSkinner,
+    gaussians: GaussianBuffers,
+    rasterizer: Rasterizer,
+    appearance: DirectAppearance,
+    settings: AppearanceSettings,
+    /// A target an input view; grows with the rig, remade when a picture's size changes.
+    visibility: Vec<RenderTarget>,
+    rgba: Vec<Vec<u8>>,
+    output: Option<RenderTarget>,
+}
+
+impl Engine {
+    /// Samples the template's surface and prepares the GPU. Takes a few seconds.
+    pub fn new(
+        gpu: GpuContext,
+        template: Template,
+        gaussian_count: usize,
+        node_count: usize,
+        max_views: usize,
+        settings: AppearanceSettings,
+    ) -> Result<Self> {
+        let surface =
+            sample_surface(&template, gaussian_count, SURFACE_SEED).context("sampling the template's surface")?;
+        let graph = build_graph(&template, &surface, node_count, DEFAULT_SIGMA2_M2)
+            .context("building the deformation graph")?;
+        Self::from_parts(gpu, template, &surface, &graph, max_views, settings)
+    }
+
+    fn from_parts(
+        gpu: GpuContext,
+        template: Template,
+        surface: &SurfaceGaussians,
+        graph: &DeformationGraph,
+        max_views: usize,
+        settings: AppearanceSettings,
+    ) -> Result<Self> {
+        let count = surface.positions.len();
+        let gaussians = GaussianBuffers::zeroed(&gpu, count)?;
+        let center_scale: Vec<[f32; 4]> =
+            surface.positions.iter().zip(&surface.scale_m).map(|(p, s)| p.extend(*s).to_array()).collect();
+        gaussians.center_scale.write(&gpu, &center_scale);
+        let canonical: Vec<[f32; 4]> = surface.positions.iter().map(|p| p.extend(1.0).to_array()).collect();
+        gaussians.canonical.write(&gpu, &canonical);
+        gaussians.color.write(&gpu, &vec![[0.5, 0.5, 0.5, 1.0]; count]);
+        Ok(Self {
+            skinner: GpuSkinner::new(&gpu, surface, &template.skeleton)?,
+            rasterizer: Rasterizer::new(&gpu, count)?,
+            appearance: DirectAppearance::new(&gpu, surface, graph, max_views)?,
+            gpu,
+            template,
+            gaussians,
+            settings,
+            visibility: Vec::new(),
+            rgba: Vec::new(),
+            output: None,
+        })
+    }
+
+    /// The template that is being posed.
+    pub fn template(&self) -> &Template {
+        &self.template
+    }
+
+    /// Takes in one instant: pose, then colours from the views. A view whose mask is empty adds nothing.
+    pub fn update(&mut self, pose: &Pose, views: &[InputView<'_>], stages: &mut StageTimes) -> Result<()> {
+        stages.time("convert pictures", || self.fill_rgba(views))?;
+
+        let start = Instant::now();
+        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+        self.skinner.encode(
+            &self.gpu,
+            &mut encoder,
+            &self.template.skeleton,
+            pose,
+            None,
+            &self.gaussians.center_scale,
+            &self.gaussians.normal,
+        )?;
+        self.submit(encoder)?;
+        stages.add("skinning", start.elapsed());
+
+        let start = Instant::now();
+        for (i, view) in views.iter().enumerate() {
+            let (width, height) = (view.image.width(), view.image.height());
+            let fits = self.visibility.get(i).is_some_and(|t| (t.width, t.height) == (width, height));
+            if !fits {
+                let target = RenderTarget::new(&self.gpu, width, height)?;
+                if i < self.visibility.len() {
+                    self.visibility[i] = target;
+                } else {
+                    self.visibility.push(target);
+                }
+            }
+            let settings = RasterSettings {
+                outputs: Outputs { color: false, depth: false, canonical: true },
+                ..RasterSettings::default()
+            };
+            let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+            self.rasterizer.encode(
+                &self.gpu,
+                &mut encoder,
+                &self.gaussians,
+                view.camera,
+                &settings,
+                &self.visibility[i],
+            )?;
+            self.gpu.queue.submit([encoder.finish()]);
+        }
+        self.gpu.wait()?;
+        stages.add("visibility", start.elapsed());
+
+        let start = Instant::now();
+        let inputs: Vec<ViewInput<'_>> = views
+            .iter()
+            .zip(&self.rgba)
+            .zip(&self.visibility)
+            .map(|((view, rgba), target)| ViewInput { camera: view.camera, rgba, canonical: &target.canonical })
+            .collect();
+        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+        self.appearance.update(&self.gpu, &mut encoder, &self.gaussians, &inputs, &self.settings)?;
+        self.submit(encoder)?;
+        stages.add("appearance", start.elapsed());
+        Ok(())
+    }
+
+    /// Draws the person as `camera` would see it now.
+    pub fn render(&mut self, camera: &Camera, stages: &mut StageTimes) -> Result<RenderedView> {
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+        let start = Instant::now();
+        let target = match self.output.take() {
+            Some(target) if (target.width, target.height) == (width, height) => target,
+            _ => RenderTarget::new(&self.gpu, width, height)?,
+        };
+        let settings = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
+        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+        self.rasterizer.encode(&self.gpu, &mut encoder, &self.gaussians, camera, &settings, &target)?;
+        self.submit(encoder)?;
+        stages.add("render a view", start.elapsed());
+        let rgba = stages
+            .time("read a view back", || -> Result<_> { Ok(rgba8_from_target(&target.color.read(&self.gpu)?)) })?;
+        self.output = Some(target);
+        Ok(RenderedView { width, height, rgba })
+    }
+
+    /// The Gaussians of this instant.
+    pub fn splats(&self) -> Result<Vec<Splat>> {
+        Ok(read_splats(&self.gpu, &self.gaussians)?)
+    }
+
+    /// The tracked surface: world positions and normals of the template's vertices.
+    pub fn surface(&self, pose: &Pose) -> (Vec<glam::Vec3>, Vec<glam::Vec3>) {
+        skin_mesh(&self.template, pose)
+    }
+
+    fn submit(&self, encoder: wgpu::CommandEncoder) -> Result<()> {
+        self.gpu.queue.submit([encoder.finish()]);
+        self.gpu.wait()?;
+        Ok(())
+    }
+
+    fn fill_rgba(&mut self, views: &[InputView<'_>]) -> Result<()> {
+        self.rgba.resize_with(self.rgba.len().max(views.len()), Vec::new);
+        for (view, rgba) in views.iter().zip(&mut self.rgba) {
+            let (image, mask) = (view.image, view.mask);
+            ensure!(
+                (mask.width(), mask.height()) == (image.width(), image.height()),
+                "camera {}: the mask is {}x{} pixels, the picture {}x{}",
+                view.camera.id,
+                mask.width(),
+                mask.height(),
+                image.width(),
+                image.height()
+            );
+            let converted;
+            let rgb = if image.format() == flyrig_types::PixelFormat::Rgb8 {
+                image.bytes()
+            } else {
+                converted = to_rgb8(image)?;
+                &converted
+            };
+            rgba.clear();
+            rgba.extend(rgb.chunks_exact(3).zip(mask.coverage()).flat_map(|(c, &a)| [c[0], c[1], c[2], a]));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,7 @@
+//! The `flyrig` command; see the library beside it.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    flyrig::main()
+}

@@ -1,0 +1,173 @@
+//! From a frame set to a coloured person: where pose and masks come from, and what to do when they do not.
+
+use anyhow::Result;
+use flyrig_tracker::{PoseEstimator, mask_from_plate};
+use flyrig_types::{FrameSet, Image, Mask, Pose, PoseTrack, Rig};
+
+use crate::{
+    config::Origin,
+    engine::{Engine, InputView, RenderedView},
+    stats::StageTimes,
+};
+
+/// Where the pose of an instant comes from.
+pub enum PoseSource {
+    /// A known curve in time; the flag repeats it for ever.
+    Track { track: PoseTrack, repeat: bool },
+    /// The pictures.
+    Estimator(Box<PoseEstimator>),
+}
+
+impl PoseSource {
+    /// The pose of a track at a time.
+    fn at(track: &PoseTrack, repeat: bool, nanos: i64) -> Pose {
+        let (first, last) = track.span_nanos();
+        let nanos = if repeat && last > first { first + (nanos - first).rem_euclid(last - first) } else { nanos };
+        track.at(nanos)
+    }
+}
+
+/// What became of a frame set.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Outcome {
+    /// The person was posed and coloured.
+    Updated,
+    /// Nothing changed, because of this.
+    Held(String),
+}
+
+/// What went wrong without stopping the pipeline, counted.
+#[derive(Debug, Clone, Default, PartialEq, Eq, serde::Serialize)]
+pub struct Counts {
+    /// Sets that changed the person.
+    pub updated: u64,
+    /// Sets without a usable pose.
+    pub lost: u64,
+    /// Pictures that had no mask, or an empty one.
+    pub without_mask: u64,
+}
+
+/// The stages after synchronisation.
+pub struct Pipeline {
+    engine: Engine,
+    rig: Rig,
+    pose: PoseSource,
+    masks: Origin,
+    /// Empty pictures by slot, where there are any: masks are then the difference to them.
+    plates: Vec<Option<Image>>,
+    last_pose: Option<Pose>,
+    /// Times of every stage so far.
+    pub stages: StageTimes,
+    /// What happened so far.
+    pub counts: Counts,
+}
+
+impl Pipeline {
+    /// `rig` holds the input cameras in the order of the frame sets.
+    pub fn new(engine: Engine, rig: Rig, pose: PoseSource, masks: Origin, plates: Vec<Option<Image>>) -> Self {
+        Self {
+            engine,
+            rig,
+            pose,
+            masks,
+            plates,
+            last_pose: None,
+            stages: StageTimes::default(),
+            counts: Counts::default(),
+        }
+    }
+
+    /// Takes in one frame set. Errors are those that a later frame cannot mend.
+    pub fn process(&mut self, set: &FrameSet) -> Result<Outcome> {
+        let (pose, masks) = match &mut self.pose {
+            PoseSource::Track { track, repeat } => (PoseSource::at(track, *repeat, set.master_nanos), None),
+            PoseSource::Estimator(estimator) => {
+                match self.stages.time("pose from pictures", || estimator.estimate(set)) {
+                    Ok(estimate) => (estimate.pose, Some(estimate.masks)),
+                    Err(error) => {
+                        self.counts.lost += 1;
+                        return Ok(Outcome::Held(error.to_string()));
+                    }
+                }
+            }
+        };
+        if !pose.is_valid() {
+            self.counts.lost += 1;
+            return Ok(Outcome::Held("the pose holds numbers that are not finite".to_owned()));
+        }
+        let masks = self.masks(set, masks)?;
+        let views: Vec<InputView<'_>> = set
+            .present()
+            .zip(&masks)
+            .filter_map(|((slot, frame), mask)| {
+                let mask = mask.as_ref().map(MaskOf::mask).filter(|mask| mask.area_px() > 0)?;
+                Some(InputView { camera: &self.rig.cameras[slot], image: &frame.image, mask })
+            })
+            .collect();
+        self.counts.without_mask += (set.present().count() - views.len()) as u64;
+        self.engine.update(&pose, &views, &mut self.stages)?;
+        self.last_pose = Some(pose);
+        self.counts.updated += 1;
+        Ok(Outcome::Updated)
+    }
+
+    /// A mask a present frame, in their order.
+    fn masks<'a>(
+        &mut self,
+        set: &'a FrameSet,
+        estimated: Option<Vec<Option<Mask>>>,
+    ) -> Result<Vec<Option<MaskOf<'a>>>> {
+        let mut estimated = estimated.unwrap_or_default();
+        let mut masks = Vec::new();
+        for (slot, frame) in set.present() {
+            masks.push(match self.masks {
+                Origin::Given => frame.mask.as_ref().map(MaskOf::Given),
+                Origin::Estimated => match estimated.get_mut(slot).and_then(Option::take) {
+                    Some(mask) => Some(MaskOf::Made(mask)),
+                    None => match self.plates.get(slot).and_then(Option::as_ref) {
+                        Some(plate) => self
+                            .stages
+                            .time("mask from plate", || mask_from_plate(&frame.image, plate))?
+                            .map(MaskOf::Made),
+                        None => None,
+                    },
+                },
+            });
+        }
+        Ok(masks)
+    }
+
+    /// Draws the person of the last update.
+    pub fn render(&mut self, camera: &flyrig_types::Camera) -> Result<RenderedView> {
+        self.engine.render(camera, &mut self.stages)
+    }
+
+    /// Pose of the last update.
+    pub fn pose(&self) -> Option<&Pose> {
+        self.last_pose.as_ref()
+    }
+
+    /// The engine, for exports.
+    pub fn engine(&self) -> &Engine {
+        &self.engine
+    }
+
+    /// The input cameras.
+    pub fn rig(&self) -> &Rig {
+        &self.rig
+    }
+}
+
+enum MaskOf<'a> {
+    Given(&'a Mask),
+    Made(Mask),
+}
+
+impl MaskOf<'_> {
+    fn mask(&self) -> &Mask {
+        match self {
+            Self::Given(mask) => mask,
+            Self::Made(mask) => mask,
+        }
+    }
+}

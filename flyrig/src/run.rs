@@ -1,0 +1,227 @@
+//! `flyrig run`: a rig that stays up.
+
+use std::{
+    path::Path,
+    time::{Duration, Instant},
+};
+
+use anyhow::{Result, bail, ensure};
+use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
+use flyrig_calib::{SyncConfig, load_easymocap};
+use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, VideoOptions, VideoReplay};
+use flyrig_gpu::GpuContext;
+use flyrig_sim::Simulator;
+use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
+use flyrig_transport::{Publisher, TransportConfig};
+use flyrig_types::{CameraId, FrameSet, Rig};
+
+use crate::{
+    config::{Config, Origin, SourceKind},
+    dataset,
+    engine::Engine,
+    intake::Intake,
+    outlet::Outlet,
+    pipeline::{Outcome, Pipeline, PoseSource},
+    stats::resident_mib,
+    stop, viewpoints,
+};
+
+/// Whole turns a second of the published views, so that a still viewer sees all sides.
+const ORBIT_TURNS_PER_SECOND: f64 = 0.05;
+/// Frame sets that the pose estimator sees before it starts, to learn the person's shape.
+const SHAPE_SETS: usize = 8;
+/// How often a line with rates is printed.
+const PRINT_EVERY: Duration = Duration::from_secs(5);
+
+/// Cameras and what is known about the person.
+struct Scene {
+    sources: Vec<Box<dyn CameraSource>>,
+    rig: Rig,
+    template: Template,
+    track: Option<flyrig_types::PoseTrack>,
+}
+
+/// Runs the command.
+pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
+    let stop = stop::flag();
+    let scene = open(config, gpu)?;
+    let pacing = if config.source.real_time { Pacing::RealTime } else { Pacing::Lossless };
+    let mut intake = Intake::start(scene.sources, &sync_config(config), pacing)?;
+
+    let mut template = scene.template;
+    let pose = match (config.body.pose, scene.track) {
+        (Origin::Given, Some(track)) => PoseSource::Track { track, repeat: config.source.kind == SourceKind::Sim },
+        (Origin::Given, None) => bail!("body.pose is \"given\" but the template holds no animation"),
+        (Origin::Estimated, _) => {
+            let settings = PoseConfig { masks: config.body.masks == Origin::Estimated, ..PoseConfig::default() };
+            let mut estimator = PoseEstimator::new(PoseNet::embedded()?, &template, &scene.rig, settings)?;
+            learn_shape(&mut estimator, &mut intake)?;
+            template = estimator.template().clone();
+            PoseSource::Estimator(Box::new(estimator))
+        }
+    };
+    let engine = Engine::new(
+        gpu.clone(),
+        template,
+        config.body.gaussians,
+        config.body.nodes,
+        scene.rig.cameras.len(),
+        config.appearance.mode.settings(),
+    )?;
+    let plates = vec![None; scene.rig.cameras.len()].into_iter().map(|_: Option<()>| None).collect();
+    let mut pipeline = Pipeline::new(engine, scene.rig, pose, config.body.masks, plates);
+    let publisher = Publisher::open(&TransportConfig {
+        listen: config.transport.listen.clone(),
+        connect: config.transport.connect.clone(),
+        max_viewers: config.transport.max_viewers,
+        ..TransportConfig::publisher(&config.rig.name)
+    })?;
+    publisher.set_calibration(pipeline.rig())?;
+    let mut outlet = Outlet::start(publisher, config.output.jpeg_quality)?;
+    let views = Views::new(config.output.views, config.output.width, config.output.height);
+    eprintln!(
+        "run: rig '{}' on {}, {} cameras, listening on {} (Ctrl-C ends)",
+        config.rig.name,
+        gpu.adapter_name(),
+        pipeline.rig().cameras.len(),
+        outlet.publisher().endpoints().join(", ")
+    );
+
+    let (started, mut last_print, mut frames, mut printed) = (Instant::now(), Instant::now(), 0u64, 0u64);
+    while !stop.load(std::sync::atomic::Ordering::Relaxed) && !intake.ended() {
+        let Some(set) = intake.next_set(Duration::from_millis(200)) else { continue };
+        if let Outcome::Held(reason) = pipeline.process(&set)? {
+            tracing::warn!(set = set.index, %reason, "frame set not used");
+        }
+        frames += 1;
+        views.publish(&mut pipeline, &outlet, &set, started.elapsed())?;
+        if config.output.splats && outlet.publisher().has_splat_subscribers() {
+            outlet.publish_splats(&pipeline.engine().splats()?, &set);
+        }
+        outlet.publish_stats(&set, frames, &pipeline.stages.summary(), &intake.drops());
+        if last_print.elapsed() >= PRINT_EVERY {
+            let rate = (frames - printed) as f64 / last_print.elapsed().as_secs_f64();
+            let memory = resident_mib().map_or_else(String::new, |mib| format!(", {mib:.0} MiB"));
+            eprintln!("run: {frames} sets, {rate:.1} a second, {} lost{memory}", pipeline.counts.lost);
+            (last_print, printed) = (Instant::now(), frames);
+        }
+    }
+    eprintln!("run: {frames} sets in {:.1} s", started.elapsed().as_secs_f64());
+    eprint!("{}", pipeline.stages.table());
+    for (place, count) in intake.drops().into_iter().chain(outlet.drops()).filter(|(_, count)| *count > 0) {
+        eprintln!("dropped: {count} {place}");
+    }
+    outlet.finish()
+}
+
+/// The published views of a rig, and those that viewers ask for.
+pub struct Views {
+    names: Vec<String>,
+    width: u32,
+    height: u32,
+}
+
+impl Views {
+    /// `count` views spread around the person: `main`, `main-1`, ...
+    pub fn new(count: usize, width: u32, height: u32) -> Self {
+        let name = |i: usize| if i == 0 { "main".to_owned() } else { format!("main-{i}") };
+        Self { names: (0..count).map(name).collect(), width, height }
+    }
+
+    /// Renders and publishes what somebody watches; returns how many views that was.
+    pub fn publish(&self, pipeline: &mut Pipeline, outlet: &Outlet, set: &FrameSet, at: Duration) -> Result<usize> {
+        let mut count = 0;
+        if pipeline.pose().is_none() {
+            return Ok(0);
+        }
+        for (i, name) in self.names.iter().enumerate() {
+            outlet.publisher().add_view(name)?;
+            if !outlet.publisher().has_subscribers(name) {
+                continue;
+            }
+            let turn = i as f64 / self.names.len() as f64 + at.as_secs_f64() * ORBIT_TURNS_PER_SECOND;
+            if let Some(camera) = viewpoints::orbit(pipeline.rig(), turn, self.width, self.height, name) {
+                outlet.publish(name, pipeline.render(&camera)?, set);
+                count += 1;
+            }
+        }
+        for viewpoint in outlet.publisher().requested_viewpoints() {
+            outlet.publish(&viewpoint.view, pipeline.render(&viewpoint.camera)?, set);
+            count += 1;
+        }
+        Ok(count)
+    }
+}
+
+/// The synchronizer's settings.
+pub fn sync_config(config: &Config) -> SyncConfig {
+    let nanos = |millis: f64| (millis * 1e6) as u64;
+    SyncConfig {
+        master: (!config.sync.master.is_empty()).then(|| CameraId::from(config.sync.master.as_str())),
+        window_nanos: nanos(config.sync.window_ms),
+        max_wait_nanos: nanos(config.sync.max_wait_ms),
+    }
+}
+
+fn learn_shape(estimator: &mut PoseEstimator, intake: &mut Intake) -> Result<()> {
+    eprintln!("run: learning the person's shape, please stand in view of all cameras");
+    loop {
+        let mut sets = Vec::new();
+        while sets.len() < SHAPE_SETS {
+            ensure!(!stop::requested(), "stopped before a person was seen");
+            match intake.next_set(Duration::from_millis(200)) {
+                Some(set) => sets.push(set),
+                None if intake.ended() => bail!("the cameras ended before a person was seen"),
+                None => {}
+            }
+        }
+        match estimator.fit_shape(&sets) {
+            Ok(fit) => {
+                eprintln!("run: the person is {:.2} m tall, landmarks within {:.1} px", fit.height_m, fit.residual_px);
+                return Ok(());
+            }
+            Err(error) => tracing::warn!(%error, "nobody seen, trying again"),
+        }
+    }
+}
+
+fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
+    let source = &config.source;
+    if source.kind == SourceKind::Sim {
+        let simulator = Simulator::new(gpu, &config.sim)?;
+        let (rig, template, track) = (simulator.rig().clone(), simulator.template().clone(), simulator.track().clone());
+        let simulator = std::sync::Arc::new(std::sync::Mutex::new(simulator));
+        let picked = dataset::pick(&rig, &source.cameras, "the simulated rig")?;
+        let sources = flyrig_sim::sources(&simulator)
+            .into_iter()
+            .filter(|source| picked.slot(source.camera()).is_some())
+            .map(|source| Box::new(source) as Box<dyn CameraSource>)
+            .collect();
+        return Ok(Scene { sources, rig: picked, template, track: Some(track) });
+    }
+    let rig = load_easymocap(&source.path, &|id| dataset::image_size(&source.path, id))?;
+    let rig = dataset::pick(&rig, &source.cameras, "the calibration")?;
+    let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+    let sources: Vec<Box<dyn CameraSource>> = if source.kind == SourceKind::Folder {
+        let options = FolderOptions { fps: source.fps, with_masks: config.body.masks == Origin::Given, frames: None };
+        boxed(FolderReplay::open(&source.path, Some(&ids), &options)?)
+    } else {
+        let open = |id| VideoReplay::open(id, &video_file(&source.path, id), &VideoOptions::default());
+        boxed(ids.iter().map(open).collect::<Result<_, _>>()?)
+    };
+    let (template, track) = if config.body.template.as_os_str().is_empty() {
+        (default_template(&ShapeParams::default())?, None)
+    } else {
+        let human = load_gltf(&config.body.template)?;
+        (human.template, human.track)
+    };
+    Ok(Scene { sources, rig, template, track })
+}
+
+fn boxed<S: CameraSource + 'static>(sources: Vec<S>) -> Vec<Box<dyn CameraSource>> {
+    sources.into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect()
+}
+
+fn video_file(root: &Path, id: &CameraId) -> std::path::PathBuf {
+    root.join("videos").join(format!("{id}.mp4"))
+}

@@ -1,0 +1,239 @@
+//! Scores of rendered views against held-out pictures, and the pictures that show them.
+
+use std::fmt::Write as _;
+
+use anyhow::Result;
+use flyrig_capture::to_rgb8;
+use flyrig_renderer::metrics::{BOX_MARGIN_PX, Picture, flip, mask_iou, person_box, psnr, ssim};
+use flyrig_types::{CameraId, Image, Mask};
+use serde::Serialize;
+
+use crate::{engine::RenderedView, png};
+
+/// Scores of one picture.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FrameScore {
+    pub camera: String,
+    pub frame: u64,
+    pub psnr_db: f64,
+    pub ssim: f64,
+    pub flip: f64,
+    pub iou: Option<f64>,
+}
+
+/// Mean scores of a camera.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CameraScore {
+    pub camera: String,
+    pub frames: usize,
+    pub psnr_db: f64,
+    pub ssim: f64,
+    pub flip: f64,
+    pub iou: Option<f64>,
+}
+
+/// Ours and the truth as they are compared, and the box of the person.
+struct Compared {
+    ours: Picture,
+    truth: Picture,
+    area: [u32; 4],
+}
+
+/// On black where the truth's mask is known; else ours over the held-out picture, inside our own silhouette's box.
+/// `None` when there is nobody to compare.
+fn compare(view: &RenderedView, truth: &Image, mask: Option<&Mask>) -> Result<Option<Compared>> {
+    let (width, height) = (view.width, view.height);
+    let rgb = to_rgb8(truth)?;
+    let silhouette = own_silhouette(view)?;
+    let Some(mask) = mask else {
+        let Ok(area) = person_box(&silhouette, BOX_MARGIN_PX) else { return Ok(None) };
+        let truth = Picture::from_rgb8(truth.width(), truth.height(), &rgb)?;
+        return Ok(Some(Compared { ours: Picture::over(width, height, &view.rgba, &truth)?, truth, area }));
+    };
+    let Ok(area) = person_box(mask, BOX_MARGIN_PX) else { return Ok(None) };
+    let rgba: Vec<u8> = rgb.chunks_exact(3).zip(mask.coverage()).flat_map(|(c, &a)| [c[0], c[1], c[2], a]).collect();
+    Ok(Some(Compared {
+        ours: Picture::on_black(width, height, &view.rgba)?,
+        truth: Picture::on_black(truth.width(), truth.height(), &rgba)?,
+        area,
+    }))
+}
+
+fn own_silhouette(view: &RenderedView) -> Result<Mask> {
+    Ok(Mask::new(view.width, view.height, view.rgba.chunks_exact(4).map(|p| p[3]).collect())?)
+}
+
+/// Scores a rendered view; `None` when there is nobody to compare.
+pub fn score_view(
+    camera: &CameraId,
+    frame: u64,
+    view: &RenderedView,
+    truth: &Image,
+    mask: Option<&Mask>,
+) -> Result<Option<FrameScore>> {
+    let Some(Compared { ours, truth, area }) = compare(view, truth, mask)? else { return Ok(None) };
+    let iou = mask.map(|mask| mask_iou(&own_silhouette(view)?, mask).map_err(anyhow::Error::from)).transpose()?;
+    Ok(Some(FrameScore {
+        camera: camera.to_string(),
+        frame,
+        psnr_db: psnr(&ours, &truth, area)?,
+        ssim: ssim(&ours, &truth, area)?,
+        flip: flip(&truth, &ours, area)?.mean,
+        iou,
+    }))
+}
+
+/// Captioned PNG pictures for a contact sheet: truth, ours, error map, cut to the person.
+pub fn contact_pictures(
+    camera: &CameraId,
+    view: &RenderedView,
+    truth: &Image,
+    mask: Option<&Mask>,
+) -> Result<Vec<(String, Vec<u8>)>> {
+    let Some(Compared { ours, truth, area }) = compare(view, truth, mask)? else { return Ok(Vec::new()) };
+    let map = flip(&truth, &ours, area)?;
+    let (width, height) = (area[2] - area[0], area[3] - area[1]);
+    let cut = |picture: &Picture| -> Vec<u8> {
+        let row = |y: u32| {
+            let start = (y * picture.width() + area[0]) as usize;
+            &picture.pixels()[start..start + width as usize]
+        };
+        (area[1]..area[3]).flat_map(row).flatten().map(|v| (v * 255.0).round() as u8).collect()
+    };
+    Ok(vec![
+        (format!("held-out {camera}"), png::encode_rgb(&cut(&truth), width, height)?),
+        ("ours".to_owned(), png::encode_rgb(&cut(&ours), width, height)?),
+        (format!("FLIP {:.3}", map.mean), png::encode_rgb(&map.to_rgb8(), width, height)?),
+    ])
+}
+
+/// All scores of a run.
+#[derive(Debug, Default)]
+pub struct ScoreSheet {
+    frames: Vec<FrameScore>,
+}
+
+impl ScoreSheet {
+    /// Adds the scores of a frame.
+    pub fn extend(&mut self, scores: impl IntoIterator<Item = FrameScore>) {
+        self.frames.extend(scores);
+    }
+
+    /// One score a picture.
+    pub fn frames(&self) -> &[FrameScore] {
+        &self.frames
+    }
+
+    /// What the pictures were compared with.
+    pub fn reference(&self) -> &'static str {
+        if self.frames.iter().any(|score| score.iou.is_some()) { "mask" } else { "own silhouette" }
+    }
+
+    /// Means a camera, in the order first seen.
+    pub fn per_camera(&self) -> Vec<CameraScore> {
+        let mut names: Vec<&str> = Vec::new();
+        for score in &self.frames {
+            if !names.contains(&score.camera.as_str()) {
+                names.push(&score.camera);
+            }
+        }
+        names
+            .into_iter()
+            .filter_map(|name| mean(name, self.frames.iter().filter(|score| score.camera == name)))
+            .collect()
+    }
+
+    /// Mean over all pictures.
+    pub fn mean(&self) -> Option<CameraScore> {
+        mean("all", self.frames.iter())
+    }
+
+    /// PSNR over frames, a line a camera.
+    pub fn curves(&self) -> Vec<(String, Vec<(f64, f64)>)> {
+        self.per_camera()
+            .into_iter()
+            .map(|camera| {
+                let points = self.frames.iter().filter(|score| score.camera == camera.camera);
+                (camera.camera.clone(), points.map(|score| (score.frame as f64, score.psnr_db)).collect())
+            })
+            .collect()
+    }
+
+    /// For a progress bar.
+    pub fn progress(&self) -> String {
+        self.mean().map(|mean| format!("PSNR {:.2} dB", mean.psnr_db)).unwrap_or_default()
+    }
+
+    /// For the terminal.
+    pub fn table(&self) -> String {
+        let mut text =
+            format!("{:<8} {:>6} {:>9} {:>8} {:>8} {:>9}\n", "camera", "frames", "PSNR dB", "SSIM", "FLIP", "mask IoU");
+        for s in self.per_camera().into_iter().chain(self.mean()) {
+            let iou = s.iou.map_or_else(|| "-".to_owned(), |v| format!("{v:.4}"));
+            let _ = writeln!(
+                text,
+                "{:<8} {:>6} {:>9.2} {:>8.4} {:>8.4} {iou:>9}",
+                s.camera, s.frames, s.psnr_db, s.ssim, s.flip
+            );
+        }
+        text
+    }
+}
+
+fn mean<'a>(name: &str, scores: impl Iterator<Item = &'a FrameScore> + Clone) -> Option<CameraScore> {
+    let frames = scores.clone().count();
+    if frames == 0 {
+        return None;
+    }
+    let over = |pick: fn(&FrameScore) -> f64| scores.clone().map(pick).sum::<f64>() / frames as f64;
+    let ious: Vec<f64> = scores.clone().filter_map(|score| score.iou).collect();
+    Some(CameraScore {
+        camera: name.to_owned(),
+        frames,
+        psnr_db: over(|s| s.psnr_db),
+        ssim: over(|s| s.ssim),
+        flip: over(|s| s.flip),
+        iou: (!ious.is_empty()).then(|| ious.iter().sum::<f64>() / ious.len() as f64),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_types::PixelFormat;
+
+    use super::*;
+
+    fn view(value: u8, alpha: u8) -> RenderedView {
+        RenderedView { width: 32, height: 32, rgba: [value, value, value, alpha].repeat(32 * 32) }
+    }
+
+    #[test]
+    fn a_perfect_view_scores_perfectly_and_a_wrong_one_does_not() {
+        let truth = Image::new(32, 32, PixelFormat::Rgb8, vec![90; 32 * 32 * 3]).unwrap();
+        let mask = Mask::new(32, 32, vec![255; 32 * 32]).unwrap();
+        let id = CameraId::from("01");
+        let perfect = score_view(&id, 0, &view(90, 255), &truth, Some(&mask)).unwrap().unwrap();
+        assert!(perfect.psnr_db > 98.0 && perfect.ssim > 0.999 && perfect.flip < 1e-3 && perfect.iou == Some(1.0));
+        let wrong = score_view(&id, 0, &view(141, 255), &truth, Some(&mask)).unwrap().unwrap();
+        assert!((wrong.psnr_db - 20.0 * 5.0f64.log10()).abs() < 0.01, "a fifth of the range off: {}", wrong.psnr_db);
+    }
+
+    #[test]
+    fn nobody_is_not_a_score() {
+        let truth = Image::new(32, 32, PixelFormat::Rgb8, vec![90; 32 * 32 * 3]).unwrap();
+        let empty = Mask::new(32, 32, vec![0; 32 * 32]).unwrap();
+        let id = CameraId::from("01");
+        assert_eq!(score_view(&id, 0, &view(90, 255), &truth, Some(&empty)).unwrap(), None);
+        assert_eq!(score_view(&id, 0, &view(90, 0), &truth, None).unwrap(), None);
+        assert!(ScoreSheet::default().mean().is_none());
+    }
+
+    #[test]
+    fn without_a_mask_only_our_own_silhouette_counts() {
+        let truth = Image::new(32, 32, PixelFormat::Rgb8, vec![90; 32 * 32 * 3]).unwrap();
+        let id = CameraId::from("01");
+        let score = score_view(&id, 3, &view(90, 255), &truth, None).unwrap().unwrap();
+        assert_eq!((score.iou, score.frame), (None, 3));
+        assert!(score.psnr_db > 98.0);
+    }
+}

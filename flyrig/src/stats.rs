@@ -1,0 +1,126 @@
+//! Where the time and the memory go.
+
+use std::{
+    fmt::Write as _,
+    time::{Duration, Instant},
+};
+
+use serde::Serialize;
+
+/// Times of named stages over many frames; keeps the last [`StageTimes::WINDOW`] of each.
+#[derive(Debug, Default)]
+pub struct StageTimes {
+    stages: Vec<Stage>,
+}
+
+#[derive(Debug)]
+struct Stage {
+    name: &'static str,
+    millis: Vec<f32>,
+    next: usize,
+}
+
+/// Summary of one stage.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct StageSummary {
+    pub name: String,
+    pub frames: usize,
+    pub mean_ms: f32,
+    pub p50_ms: f32,
+    pub p95_ms: f32,
+}
+
+impl StageTimes {
+    /// Samples kept a stage: bounds the memory of a rig that runs for days.
+    const WINDOW: usize = 3600;
+
+    /// Adds one measurement.
+    pub fn add(&mut self, name: &'static str, time: Duration) {
+        let stage = match self.stages.iter_mut().find(|stage| stage.name == name) {
+            Some(stage) => stage,
+            None => {
+                self.stages.push(Stage { name, millis: Vec::new(), next: 0 });
+                let last = self.stages.len() - 1;
+                &mut self.stages[last]
+            }
+        };
+        let millis = time.as_secs_f32() * 1e3;
+        if stage.millis.len() < Self::WINDOW {
+            stage.millis.push(millis);
+        } else {
+            stage.millis[stage.next] = millis;
+        }
+        stage.next = (stage.next + 1) % Self::WINDOW;
+    }
+
+    /// Measures a closure.
+    pub fn time<T>(&mut self, name: &'static str, work: impl FnOnce() -> T) -> T {
+        let start = Instant::now();
+        let result = work();
+        self.add(name, start.elapsed());
+        result
+    }
+
+    /// Stages in the order they were first seen.
+    pub fn summary(&self) -> Vec<StageSummary> {
+        self.stages
+            .iter()
+            .map(|stage| {
+                let mut sorted = stage.millis.clone();
+                sorted.sort_by(f32::total_cmp);
+                let at = |part: f64| sorted[((sorted.len() - 1) as f64 * part).round() as usize];
+                StageSummary {
+                    name: stage.name.to_owned(),
+                    frames: sorted.len(),
+                    mean_ms: sorted.iter().sum::<f32>() / sorted.len() as f32,
+                    p50_ms: at(0.5),
+                    p95_ms: at(0.95),
+                }
+            })
+            .collect()
+    }
+
+    /// As a table for the terminal.
+    pub fn table(&self) -> String {
+        let mut text = format!("{:<28} {:>7} {:>9} {:>9} {:>9}\n", "stage", "frames", "mean ms", "p50 ms", "p95 ms");
+        for s in self.summary() {
+            let _ =
+                writeln!(text, "{:<28} {:>7} {:>9.2} {:>9.2} {:>9.2}", s.name, s.frames, s.mean_ms, s.p50_ms, s.p95_ms);
+        }
+        text
+    }
+}
+
+/// Resident memory of this process in MiB, where the system tells it.
+pub fn resident_mib() -> Option<f64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find(|line| line.starts_with("VmRSS:"))?;
+    let kib: f64 = line.split_whitespace().nth(1)?.parse().ok()?;
+    Some(kib / 1024.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn percentiles_and_bounded_memory() {
+        let mut times = StageTimes::default();
+        for i in 0..StageTimes::WINDOW + 10 {
+            times.add("a", Duration::from_millis(if i < 10 { 1_000_000 } else { 10 }));
+        }
+        times.add("b", Duration::from_millis(3));
+        let summary = times.summary();
+        assert_eq!(summary[0].frames, StageTimes::WINDOW);
+        assert!((summary[0].mean_ms - 10.0).abs() < 0.01, "the oldest fall out: {}", summary[0].mean_ms);
+        assert_eq!((summary[1].name.as_str(), summary[1].frames), ("b", 1));
+        assert_eq!(times.table().lines().count(), 3);
+    }
+
+    #[test]
+    fn memory_is_plausible() {
+        if let Some(mib) = resident_mib() {
+            assert!(mib > 0.5 && mib < 1e6, "{mib}");
+        }
+    }
+}

@@ -1,0 +1,242 @@
+//! `flyrig watch`: a viewer in a process of its own.
+
+use std::{
+    path::{Path, PathBuf},
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context, Result, bail, ensure};
+use flyrig_transport::{
+    ImageFormat, Interests, Received, Subscriber, TransportConfig, ViewFrame, ViewpointStatus, Views,
+};
+use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
+use glam::{DVec2, DVec3};
+use opencv::{
+    core::{Mat, MatTraitConst as _, Size, Vec3b},
+    videoio::{VideoWriter, VideoWriterTrait as _, VideoWriterTraitConst as _},
+};
+use serde::{Deserialize, Serialize};
+
+use crate::{cli::WatchArgs, png, report::write_whole, stop};
+
+/// How often rates are printed.
+const PRINT_EVERY: Duration = Duration::from_secs(1);
+/// Frame rate written into a video: the pictures come as they come, a file needs one number.
+const VIDEO_FPS: f64 = 25.0;
+
+/// `--stats`.
+#[derive(Debug, Default, Serialize, Deserialize)]
+pub struct WatchStats {
+    pub received: u64,
+    pub missed: u64,
+    pub replaced: u64,
+    pub unreadable: u64,
+    pub publisher_restarts: u64,
+    pub seconds: f64,
+    pub pictures_per_second: f64,
+    pub latency_p50_ms: Option<f64>,
+    pub latency_p99_ms: Option<f64>,
+    pub latency_is_exact: Option<bool>,
+}
+
+/// Runs the command.
+pub fn watch(args: &WatchArgs) -> Result<()> {
+    let mut sink = args.out.as_deref().map(Sink::new).transpose()?;
+    let config = TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) };
+    let views = if args.eye.is_some() { Views::None } else { Views::Named(vec![args.view.clone()]) };
+    let subscriber = Subscriber::open(&config, &Interests { views, splats: false, stats: false })?;
+    eprintln!("watch: rig '{}' at {}, waiting for pictures (Ctrl-C ends)", args.rig, args.connect);
+    if let Some(eye) = args.eye {
+        // The rig says which way is up.
+        let rig = loop {
+            if let Some(rig) = subscriber.rig(Duration::from_millis(500))? {
+                break rig;
+            }
+            if stop::requested() {
+                return Ok(());
+            }
+        };
+        subscriber.request_viewpoint(&viewpoint(eye, args, rig.world_up)?, 60.0)?;
+    }
+
+    let stop = stop::flag();
+    let started = Instant::now();
+    let (mut first, mut last_print, mut received) = (None, Instant::now(), 0u64);
+    let mut refused = String::new();
+    while !stop.load(std::sync::atomic::Ordering::Relaxed) {
+        if args.until_end && received > 0 && subscriber.publishers() == 0 {
+            break;
+        }
+        let over_time = args.seconds.is_some_and(|limit| started.elapsed().as_secs_f64() >= limit);
+        if over_time || args.count.is_some_and(|count| received >= count as u64) {
+            break;
+        }
+        match subscriber.next_view(Duration::from_millis(100)) {
+            Ok(Some(picture)) => {
+                received += 1;
+                first.get_or_insert_with(Instant::now);
+                if let Some(sink) = &mut sink {
+                    sink.write(&picture)?;
+                }
+            }
+            Ok(None) => {}
+            Err(error) => eprintln!("watch: {error}"),
+        }
+        if let ViewpointStatus::Refused { reason } = subscriber.viewpoint_status() {
+            if reason != refused {
+                eprintln!("watch: the rig refuses the viewpoint: {reason}");
+                refused = reason;
+            }
+        }
+        if last_print.elapsed() >= PRINT_EVERY {
+            last_print = Instant::now();
+            eprintln!("{}", line(&subscriber));
+        }
+    }
+    if let Some(sink) = sink {
+        sink.finish()?;
+    }
+    let stats = stats(&subscriber, received, first.map_or(0.0, |first| first.elapsed().as_secs_f64()));
+    eprintln!(
+        "watch: {received} pictures, {} missed, {} replaced unseen, {:.1} a second",
+        stats.missed, stats.replaced, stats.pictures_per_second
+    );
+    if let Some(path) = &args.stats {
+        write_whole(path, &serde_json::to_vec_pretty(&stats)?)?;
+    }
+    subscriber.close()?;
+    Ok(())
+}
+
+fn viewpoint(eye: [f64; 3], args: &WatchArgs, world_up: DVec3) -> Result<Camera> {
+    let [width, height] = args.size;
+    let (eye, target) = (DVec3::from(eye), DVec3::from(args.target));
+    ensure!(eye.distance(target) > 1e-3, "--eye and --target are the same point");
+    ensure!(args.fov_degrees > 1.0 && args.fov_degrees < 170.0, "--fov-degrees must lie between 1 and 170");
+    let focal = f64::from(height) / 2.0 / (args.fov_degrees.to_radians() / 2.0).tan();
+    Ok(Camera {
+        id: "watch".into(),
+        intrinsics: Intrinsics {
+            width,
+            height,
+            focal_px: DVec2::splat(focal),
+            center_px: DVec2::new(f64::from(width) - 1.0, f64::from(height) - 1.0) / 2.0,
+            lens: Lens::PINHOLE,
+        },
+        camera_from_world: Isometry::look_at(eye, target, world_up),
+    })
+}
+
+fn line(subscriber: &Subscriber) -> String {
+    let reports: Vec<String> = subscriber
+        .reports()
+        .into_iter()
+        .filter(|(topic, _)| topic.starts_with("view"))
+        .map(|(topic, report)| {
+            let latency = report.latency.as_ref().map_or_else(String::new, |l| {
+                format!(
+                    ", latency {:.1} ms (99 %: {:.1}{})",
+                    l.p50_millis,
+                    l.p99_millis,
+                    if l.is_exact { "" } else { ", clocks differ" }
+                )
+            });
+            format!("{topic}: {:.1}/s, {} missed{latency}", report.per_second, report.missed)
+        })
+        .collect();
+    if reports.is_empty() {
+        format!("watch: {} rig(s) up, no picture yet", subscriber.publishers())
+    } else {
+        format!("watch: {}", reports.join("; "))
+    }
+}
+
+fn stats(subscriber: &Subscriber, received: u64, seconds: f64) -> WatchStats {
+    let mut stats = WatchStats { received, seconds, unreadable: subscriber.unreadable(), ..WatchStats::default() };
+    if seconds > 0.0 {
+        stats.pictures_per_second = received as f64 / seconds;
+    }
+    for (_, report) in subscriber.reports().into_iter().filter(|(topic, _)| topic.starts_with("view")) {
+        stats.missed += report.missed;
+        stats.replaced += report.replaced;
+        stats.publisher_restarts += report.restarts;
+        if let Some(latency) = report.latency {
+            stats.latency_p50_ms = Some(latency.p50_millis);
+            stats.latency_p99_ms = Some(latency.p99_millis);
+            stats.latency_is_exact = Some(latency.is_exact);
+        }
+    }
+    stats
+}
+
+/// Where pictures go.
+enum Sink {
+    Folder(PathBuf),
+    Video { path: PathBuf, writer: Option<(VideoWriter, u32, u32)> },
+}
+
+impl Sink {
+    fn new(path: &Path) -> Result<Self> {
+        let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+        if matches!(extension.as_deref(), Some("mp4" | "avi")) {
+            return Ok(Self::Video { path: path.to_owned(), writer: None });
+        }
+        std::fs::create_dir_all(path).with_context(|| format!("cannot create {}", path.display()))?;
+        Ok(Self::Folder(path.to_owned()))
+    }
+
+    fn write(&mut self, picture: &Received<ViewFrame>) -> Result<()> {
+        let body = &picture.body;
+        let format = match body.format {
+            ImageFormat::Jpeg => image::ImageFormat::Jpeg,
+            ImageFormat::Png => image::ImageFormat::Png,
+        };
+        let rgb = match image::load_from_memory_with_format(&body.bytes, format) {
+            Ok(decoded) => decoded.into_rgb8(),
+            Err(error) => {
+                eprintln!("watch: picture of frame {} cannot be decoded ({error}); skipped", body.frame);
+                return Ok(());
+            }
+        };
+        let (width, height) = rgb.dimensions();
+        match self {
+            Self::Folder(folder) => {
+                let path = folder.join(format!("{:06}.png", body.frame));
+                write_whole(&path, &png::encode_rgb(&rgb, width, height)?)
+            }
+            Self::Video { path, writer } => {
+                if writer.is_none() {
+                    *writer = Some((open_video(path, width, height)?, width, height));
+                }
+                let Some((writer, w, h)) = writer else { return Ok(()) };
+                ensure!(
+                    (*w, *h) == (width, height),
+                    "the view changed its size to {width}x{height} while {} was written",
+                    path.display()
+                );
+                let bgr: Vec<Vec3b> = rgb.pixels().map(|p| Vec3b::from([p.0[2], p.0[1], p.0[0]])).collect();
+                let flat = Mat::from_slice(&bgr).context("handing a picture to the video writer")?;
+                writer.write(&flat.reshape(3, height as i32)?).context("writing a video frame")?;
+                Ok(())
+            }
+        }
+    }
+
+    fn finish(self) -> Result<()> {
+        if let Self::Video { path, writer: Some((mut writer, ..)) } = self {
+            writer.release().with_context(|| format!("closing {}", path.display()))?;
+        }
+        Ok(())
+    }
+}
+
+fn open_video(path: &Path, width: u32, height: u32) -> Result<VideoWriter> {
+    let is_avi = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("avi"));
+    let code = if is_avi { VideoWriter::fourcc('M', 'J', 'P', 'G') } else { VideoWriter::fourcc('m', 'p', '4', 'v') }?;
+    let name = path.to_str().with_context(|| format!("{} is not a readable file name", path.display()))?;
+    let writer = VideoWriter::new(name, code, VIDEO_FPS, Size::new(width as i32, height as i32), true)?;
+    if !writer.is_opened()? {
+        bail!("cannot write a video to {}; does its folder exist?", path.display());
+    }
+    Ok(writer)
+}
