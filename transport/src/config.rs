@@ -20,7 +20,7 @@ pub struct TransportConfig {
     pub multicast: bool,
     /// Pass large payloads through shared memory between processes of one host.
     pub shared_memory: bool,
-    /// Send each message at once instead of waiting for others to fill a batch.
+    /// Send each message at once instead of filling a batch under back-pressure; no gain was measured on loopback.
     pub express: bool,
     /// Publisher: how many subscribers may have a viewpoint of their own.
     pub max_viewers: usize,
@@ -39,7 +39,7 @@ impl Default for TransportConfig {
             connect: vec![],
             multicast: false,
             shared_memory: true,
-            express: true,
+            express: false,
             max_viewers: 4,
             viewpoint_lease_millis: 3000,
         }
@@ -109,6 +109,8 @@ impl TransportConfig {
             // Gossip would connect the viewers of one rig to each other for nothing.
             ("scouting/gossip/enabled", self.multicast.to_string()),
             ("transport/shared_memory/enabled", self.shared_memory.to_string()),
+            // zenoh's 2 batches of 64 KiB overflow when several pictures leave at once; 8 hold two frames of four views.
+            ("transport/link/tx/queue/size/data", "8".to_owned()),
             ("transport/link/rx/max_message_size", largest.to_string()),
         ];
         let mut config = Config::default();

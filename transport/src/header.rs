@@ -163,7 +163,7 @@ mod tests {
             sequence: u64::MAX,
             frame: 7,
             capture_nanos: -5,
-            publish_unix_nanos: unix_nanos(),
+            publish_unix_nanos: 1 << 60,
             host: host_id(),
             publisher: 3,
             width: 640,

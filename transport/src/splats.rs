@@ -8,7 +8,8 @@
 //! skinning once (`splats/canonical`) and then only poses and displacements (`splats/motion`) beside
 //! this one; the `flags` word of the header is 0 today and a reader refuses any other value.
 //!
-//! No general compressor: see the crate's `throughput` example for what was measured.
+//! No general compressor behind it: deflate at its fastest takes 115k Gaussians to 0.87 of the size, to 0.68
+//! when sorted into byte planes, for 24 to 32 ms a state, while encoding takes 3 to 4 ms.
 
 use std::sync::LazyLock;
 
