@@ -95,7 +95,8 @@ fn publish(publisher: &Publisher, frame: &mut u64) {
 
 #[test]
 fn a_killed_watcher_is_forgotten_and_costs_nobody_a_frame() {
-    let publisher = open_publisher(|_| {});
+    // A lease this long: only the watcher's vanished token can end its viewpoint.
+    let publisher = open_publisher(|config| config.viewpoint_lease_millis = 600_000);
     let healthy =
         open_subscriber(&publisher, &Interests { views: Views::Named(vec!["front".into()]), ..Interests::default() });
     let mut watcher = Watcher::start(&publisher);

@@ -38,7 +38,10 @@ fn a_viewpoint_is_granted_moved_seen_and_given_back() {
 
 #[test]
 fn viewers_are_bounded_refusals_answered_and_a_free_place_is_found() {
-    let publisher = open_publisher(|config| config.max_viewers = 1);
+    let publisher = open_publisher(|config| {
+        config.max_viewers = 1;
+        config.viewpoint_lease_millis = 600_000;
+    });
     let (one, two) =
         (open_subscriber(&publisher, &Interests::default()), open_subscriber(&publisher, &Interests::default()));
     let wanted = camera("mine", Lens::PINHOLE);
