@@ -21,16 +21,19 @@ impl<'a> GltfFile<'a> {
         let read = |path: &Path| std::fs::read(path).map_err(|source| BodyError::Io { path: path.into(), source });
         let fail = |message: String| BodyError::Gltf { path: path.into(), message };
         let bytes = read(path)?;
-        // The length stands in the header; the parser would take a cut file's word for it.
+        // The length stands in the header; the parser would take its word for it.
         if let Some(told) = bytes.get(8..12).filter(|_| bytes.starts_with(b"glTF")) {
             let told = u32::from_le_bytes([told[0], told[1], told[2], told[3]]) as usize;
-            if told > bytes.len() {
+            if !(20..=bytes.len()).contains(&told) {
                 let found = bytes.len();
                 return Err(fail(format!("cut off: {found} of {told} bytes; copy the file again")));
             }
         }
-        let gltf::Gltf { document, mut blob } =
-            gltf::Gltf::from_slice(&bytes).map_err(|error| fail(format!("not a valid glTF 2.0 file: {error}")))?;
+        let invalid = |error: gltf::Error| fail(format!("not a valid glTF 2.0 file: {error}"));
+        let gltf::Gltf { document, mut blob } = gltf::Gltf::from_slice_without_validation(&bytes).map_err(invalid)?;
+        let json = document.into_json();
+        check_indices(&json).map_err(fail)?;
+        let document = gltf::Document::from_json(json).map_err(invalid)?;
         let mut buffers = Vec::new();
         for buffer in document.buffers() {
             let index = buffer.index();
@@ -115,6 +118,22 @@ impl<'a> GltfFile<'a> {
             None => Ok(items),
         }
     }
+}
+
+/// The indices that gltf 1.4 follows before or without checking them.
+fn check_indices(json: &gltf::json::Root) -> Result<(), String> {
+    let primitives = json.meshes.iter().flat_map(|mesh| &mesh.primitives);
+    if primitives.flat_map(|primitive| primitive.attributes.values()).any(|index| index.value() >= json.accessors.len())
+    {
+        return Err("a mesh names an accessor that does not exist; the file is damaged".to_owned());
+    }
+    let lost = |animation: &gltf::json::Animation| {
+        animation.channels.iter().any(|channel| channel.sampler.value() >= animation.samplers.len())
+    };
+    if json.animations.iter().any(lost) {
+        return Err("an animation names a sampler that does not exist; the file is damaged".to_owned());
+    }
+    Ok(())
 }
 
 /// One little-endian number; `bytes` has the type's size.

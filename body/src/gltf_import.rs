@@ -52,7 +52,9 @@ pub fn load_gltf(path: &Path) -> Result<GltfHuman, BodyError> {
     }
     let new_from_old = order_joints(&file, &nodes, &mesh.skin, &mut joint_nodes, &mut inverse_binds)?;
     for skin in &mut mesh.skin {
-        skin.joints = skin.joints.map(|joint| new_from_old[usize::from(joint)]);
+        for (joint, weight) in skin.joints.iter_mut().zip(skin.weights) {
+            *joint = if weight > 0.0 { new_from_old[usize::from(*joint)] } else { 0 };
+        }
     }
 
     let rest = placements(&file, &nodes.rest(), &joint_nodes)?;

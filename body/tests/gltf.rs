@@ -1,0 +1,326 @@
+//! glTF import, on files made by hand.
+
+use std::path::PathBuf;
+
+use base64::Engine;
+use flyrig_body::{BodyError, GltfHuman, Part, load_gltf, skin_mesh};
+use glam::{DQuat, DVec3, Vec3};
+use serde_json::{Value, json};
+
+/// A glTF document and its binary buffer.
+#[derive(Clone)]
+struct File {
+    json: Value,
+    bin: Vec<u8>,
+}
+
+impl File {
+    fn new() -> Self {
+        let json = json!({
+            "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
+            "nodes": [], "meshes": [], "skins": [], "bufferViews": [], "accessors": [],
+        });
+        Self { json, bin: Vec::new() }
+    }
+
+    fn accessor(&mut self, bytes: &[u8], component: u32, kind: &str, count: usize) -> usize {
+        self.bin.resize(self.bin.len().next_multiple_of(4), 0);
+        let view = json!({"buffer": 0, "byteOffset": self.bin.len(), "byteLength": bytes.len()});
+        self.bin.extend(bytes);
+        let views = self.json["bufferViews"].as_array_mut().unwrap();
+        views.push(view);
+        let mut accessor =
+            json!({"bufferView": views.len() - 1, "componentType": component, "type": kind, "count": count});
+        if kind == "VEC3" || kind == "SCALAR" {
+            let n = if kind == "VEC3" { 3 } else { 1 };
+            accessor["min"] = json!(vec![0.0; n]);
+            accessor["max"] = json!(vec![0.0; n]);
+        }
+        let accessors = self.json["accessors"].as_array_mut().unwrap();
+        accessors.push(accessor);
+        accessors.len() - 1
+    }
+
+    fn floats(&mut self, kind: &str, numbers: &[f32]) -> usize {
+        let width = [("SCALAR", 1), ("VEC2", 2), ("VEC3", 3), ("VEC4", 4), ("MAT4", 16)]
+            .iter()
+            .find(|k| k.0 == kind)
+            .unwrap()
+            .1;
+        let bytes: Vec<u8> = numbers.iter().flat_map(|x| x.to_le_bytes()).collect();
+        self.accessor(&bytes, 5126, kind, numbers.len() / width)
+    }
+
+    fn shorts(&mut self, kind: &str, numbers: &[u16]) -> usize {
+        let bytes: Vec<u8> = numbers.iter().flat_map(|x| x.to_le_bytes()).collect();
+        self.accessor(&bytes, 5123, kind, numbers.len() / if kind == "SCALAR" { 1 } else { 4 })
+    }
+
+    fn glb(&self) -> Vec<u8> {
+        let mut json = self.json.clone();
+        json["buffers"] = json!([{"byteLength": self.bin.len()}]);
+        let mut text = json.to_string().into_bytes();
+        text.resize(text.len().next_multiple_of(4), b' ');
+        let mut bin = self.bin.clone();
+        bin.resize(bin.len().next_multiple_of(4), 0);
+        let total = 12 + 8 + text.len() + 8 + bin.len();
+        let mut file = Vec::new();
+        file.extend(b"glTF");
+        for number in [2, total as u32, text.len() as u32] {
+            file.extend(number.to_le_bytes());
+        }
+        file.extend(b"JSON");
+        file.extend(text);
+        file.extend((bin.len() as u32).to_le_bytes());
+        file.extend(b"BIN\0");
+        file.extend(bin);
+        file
+    }
+
+    fn load(&self) -> Result<GltfHuman, BodyError> {
+        load_bytes(&self.glb(), "test.glb")
+    }
+
+    fn refused(&self) -> String {
+        self.load().unwrap_err().to_string()
+    }
+}
+
+fn load_bytes(bytes: &[u8], name: &str) -> Result<GltfHuman, BodyError> {
+    let folder = tempfile::tempdir().unwrap();
+    let path: PathBuf = folder.path().join(name);
+    std::fs::write(&path, bytes).unwrap();
+    load_gltf(&path)
+}
+
+/// An armature as Blender writes it: centimetres, turned by -90 degrees about x above the joints, z up in the
+/// mesh. A triangle at 100 cm hangs on the root "Hips", one at 200 cm on "Head"; joints are listed child first.
+fn armature() -> File {
+    let mut file = File::new();
+    let half = std::f32::consts::FRAC_1_SQRT_2;
+    file.json["nodes"] = json!([
+        {"name": "Armature", "rotation": [-half, 0.0, 0.0, half], "scale": [0.01, 0.01, 0.01], "children": [1, 3]},
+        {"name": "Hips", "translation": [0.0, 0.0, 100.0], "children": [2]},
+        {"name": "Head", "translation": [0.0, 0.0, 50.0]},
+        {"name": "Body", "mesh": 0, "skin": 0, "translation": [7.0, 7.0, 7.0]},
+    ]);
+    let positions =
+        file.floats("VEC3", &[0., 0., 100., 10., 0., 100., 0., 0., 110., 0., 0., 200., 10., 0., 200., 0., 0., 210.]);
+    let joints =
+        file.shorts("VEC4", &[1, 0, 0, 0].repeat(3).into_iter().chain([0, 0, 0, 0].repeat(3)).collect::<Vec<u16>>());
+    let weights = file.floats("VEC4", &[1., 0., 0., 0.].repeat(6));
+    let indices = file.shorts("SCALAR", &[0, 1, 2, 3, 4, 5]);
+    let mut head = glam::Mat4::from_translation(Vec3::new(0., 0., -150.)).to_cols_array().to_vec();
+    head.extend(glam::Mat4::from_translation(Vec3::new(0., 0., -100.)).to_cols_array());
+    let binds = file.floats("MAT4", &head);
+    file.json["skins"] = json!([{"joints": [2, 1], "inverseBindMatrices": binds}]);
+    let attributes = json!({"POSITION": positions, "JOINTS_0": joints, "WEIGHTS_0": weights});
+    file.json["meshes"] = json!([{"primitives": [{"attributes": attributes, "indices": indices}]}]);
+    file
+}
+
+fn near(found: Vec3, expected: Vec3) {
+    assert!(found.distance(expected) < 1e-5, "{found} is not {expected}");
+}
+
+#[test]
+fn scale_and_axes_above_the_root_are_folded_in() {
+    let human = armature().load().unwrap();
+    let body = &human.template;
+    body.check().unwrap();
+    let names: Vec<_> = body.skeleton.joints().iter().map(|joint| joint.name.as_str()).collect();
+    assert_eq!(names, ["Hips", "Head"]);
+    assert_eq!(body.parts, [[Part::Torso; 3], [Part::Head; 3]].concat());
+    // z up in centimetres has become y up in metres, in canonical space and in the world.
+    near(body.positions[0], Vec3::new(0.0, 1.0, 0.0));
+    near(body.positions[5], Vec3::new(0.0, 2.1, 0.0));
+    let (positions, normals) = skin_mesh(body, &body.skeleton.rest_pose());
+    for (posed, canonical) in positions.iter().zip(&body.positions) {
+        near(*posed, *canonical);
+    }
+    near(normals[0], Vec3::Z);
+    // Turning the head moves the second triangle about (0, 1.5, 0).
+    let mut pose = body.skeleton.rest_pose();
+    pose.joint_rotations[1] = DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
+    let (positions, _) = skin_mesh(body, &pose);
+    near(positions[0], Vec3::new(0.0, 1.0, 0.0));
+    near(positions[3], Vec3::new(0.0, 1.5, 0.5));
+    assert!(human.track.is_none());
+}
+
+fn animate(file: &mut File, node: usize, path: &str, interpolation: &str, times: &[f32], values: &[f32]) {
+    let input = file.floats("SCALAR", times);
+    let output = file.floats(if path == "rotation" { "VEC4" } else { "VEC3" }, values);
+    if file.json["animations"].is_null() {
+        file.json["animations"] = json!([{"channels": [], "samplers": []}]);
+    }
+    let animation = &mut file.json["animations"][0];
+    let sampler = animation["samplers"].as_array().unwrap().len();
+    animation["samplers"]
+        .as_array_mut()
+        .unwrap()
+        .push(json!({"input": input, "output": output, "interpolation": interpolation}));
+    animation["channels"]
+        .as_array_mut()
+        .unwrap()
+        .push(json!({"sampler": sampler, "target": {"node": node, "path": path}}));
+}
+
+#[test]
+fn linear_step_and_cubic_curves_are_followed() {
+    let quarter = DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2).as_quat().to_array();
+    let mut file = armature();
+    animate(&mut file, 1, "translation", "LINEAR", &[0.0, 2.0], &[0., 0., 100., 0., 0., 300.]);
+    animate(&mut file, 2, "rotation", "STEP", &[0.0, 1.0], &[[0., 0., 0., 1.], quarter].concat());
+    let track = file.load().unwrap().track.unwrap();
+    assert_eq!(track.span_nanos(), (0, 2_000_000_000));
+    for (secs, height, turned) in
+        [(0.0, 1.0, 0.0), (0.5, 1.5, 0.0), (0.999_999_9, 2.0, 0.0), (1.0, 2.0, 1.0), (1.7, 2.7, 1.0)]
+    {
+        let pose = track.at((secs * 1e9) as i64);
+        assert!((pose.root_translation - DVec3::Y * height).length() < 1e-5, "{secs} s: {}", pose.root_translation);
+        let expected = DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2 * turned);
+        assert!(pose.joint_rotations[1].angle_between(expected) < 1e-5, "{secs} s");
+    }
+    // Cubic: from 0 to 1 m in 1 s with tangents 0 is 3 t^2 - 2 t^3; an out-tangent of 300 cm/s adds 3 (t^3 - 2 t^2 + t).
+    for tangent in [0.0f32, 300.0] {
+        let mut file = armature();
+        let values = [0., 0., 0., 0., 0., 0., 0., 0., tangent, 0., 0., 0., 0., 0., 100., 0., 0., 0.];
+        animate(&mut file, 1, "translation", "CUBICSPLINE", &[0.0, 1.0], &values);
+        let track = file.load().unwrap().track.unwrap();
+        for t in [0.0, 0.1, 0.25, 0.5, 0.77, 1.0] {
+            let expected = 3.0 * t * t - 2.0 * t * t * t + f64::from(tangent) / 100.0 * (t * t * t - 2.0 * t * t + t);
+            let found = track.at((t * 1e9) as i64).root_translation.y;
+            assert!((found - expected).abs() < 2e-4, "{t}: {found} {expected}");
+        }
+    }
+}
+
+#[test]
+fn moving_nodes_above_the_root_move_the_root() {
+    let mut file = armature();
+    animate(&mut file, 0, "translation", "LINEAR", &[0.0, 1.0], &[0., 0., 0., 3., 0., 0.]);
+    let track = file.load().unwrap().track.unwrap();
+    assert!((track.at(1_000_000_000).root_translation - DVec3::new(3.0, 1.0, 0.0)).length() < 1e-5);
+    // A leading joint that moves no vertex itself is folded too.
+    let mut file = armature();
+    file.json["skins"][0]["joints"] = json!([2, 1, 0]);
+    let mut binds = vec![0.0; 48];
+    binds[..16].copy_from_slice(&glam::Mat4::from_translation(Vec3::new(0., 0., -150.)).to_cols_array());
+    binds[16..32].copy_from_slice(&glam::Mat4::from_translation(Vec3::new(0., 0., -100.)).to_cols_array());
+    let accessor = file.floats("MAT4", &binds);
+    file.json["skins"][0]["inverseBindMatrices"] = json!(accessor);
+    assert_eq!(file.load().unwrap().template.skeleton.joints()[0].name, "Hips");
+}
+
+#[test]
+fn eight_influences_become_the_strongest_four() {
+    let mut file = armature();
+    let joints = file.shorts("VEC4", &[1, 1, 0, 0].repeat(6));
+    let weights = file.floats("VEC4", &[0.1, 0.2, 0.3, 0.0].repeat(6));
+    let bytes: Vec<u8> = [25, 76, 0, 0].repeat(6);
+    let more = file.accessor(&bytes, 5121, "VEC4", 6);
+    file.json["accessors"][more]["normalized"] = json!(true);
+    let attributes = &mut file.json["meshes"][0]["primitives"][0]["attributes"];
+    attributes["JOINTS_1"] = json!(joints);
+    attributes["WEIGHTS_1"] = json!(more);
+    attributes["JOINTS_0"] = json!(joints);
+    attributes["WEIGHTS_0"] = json!(weights);
+    let body = file.load().unwrap().template;
+    // Listed joint 1 is Hips (0 in order): 0.1 + 0.2 + 101 / 255; listed 0 is Head: 0.3.
+    let hips = 0.3 + 101.0 / 255.0;
+    assert_eq!(body.skin[0].joints[..2], [0, 1]);
+    assert!((body.skin[0].weights[0] - hips / (hips + 0.3)).abs() < 1e-5, "{:?}", body.skin[0]);
+}
+
+#[test]
+fn primitives_and_meshes_are_merged_and_buffers_may_lie_outside() {
+    let mut file = armature();
+    let primitive = file.json["meshes"][0]["primitives"][0].clone();
+    file.json["meshes"][0]["primitives"].as_array_mut().unwrap().push(primitive.clone());
+    file.json["meshes"].as_array_mut().unwrap().push(json!({"primitives": [primitive]}));
+    file.json["nodes"].as_array_mut().unwrap().push(json!({"mesh": 1, "skin": 0}));
+    let merged = file.load().unwrap().template;
+    assert_eq!((merged.positions.len(), merged.triangles.len(), merged.triangles[5]), (18, 6, [15, 16, 17]));
+
+    let mut inside = file.clone();
+    let data = base64::engine::general_purpose::STANDARD.encode(&file.bin);
+    inside.json["buffers"] =
+        json!([{"byteLength": file.bin.len(), "uri": format!("data:application/octet-stream;base64,{data}")}]);
+    assert_eq!(load_bytes(inside.json.to_string().as_bytes(), "test.gltf").unwrap().template, { merged.clone() });
+    let folder = tempfile::tempdir().unwrap();
+    file.json["buffers"] = json!([{"byteLength": file.bin.len(), "uri": "the%20body.bin"}]);
+    std::fs::write(folder.path().join("the body.bin"), &file.bin).unwrap();
+    std::fs::write(folder.path().join("test.gltf"), file.json.to_string()).unwrap();
+    assert_eq!(load_gltf(&folder.path().join("test.gltf")).unwrap().template, merged);
+}
+
+#[test]
+fn odd_files_are_refused_with_a_reason() {
+    let with = |change: &dyn Fn(&mut Value)| {
+        let mut file = armature();
+        change(&mut file.json);
+        file.refused()
+    };
+    let expect = |error: String, words: &str| assert!(error.contains(words), "{error}");
+    expect(
+        with(&|json| {
+            json["skins"] = json!([]);
+            json["nodes"][3] = json!({"mesh": 0});
+        }),
+        "no skin",
+    );
+    expect(with(&|json| json["nodes"][3] = json!({})), "no mesh");
+    expect(with(&|json| json["meshes"][0]["primitives"][0]["mode"] = json!(5)), "export triangles");
+    expect(with(&|json| json["nodes"][0]["scale"] = json!([1.0, 2.0, 1.0])), "apply its scale");
+    expect(with(&|json| json["nodes"][2]["children"] = json!([1])), "two parents");
+    expect(
+        with(&|json| {
+            json["nodes"][0]["children"] = json!([3]);
+            json["nodes"][2]["children"] = json!([1]);
+        }),
+        "circle",
+    );
+    expect(with(&|json| json["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = json!(99)), "accessor");
+    expect(with(&|json| json["accessors"][0]["count"] = json!(60)), "beyond the end");
+    expect(with(&|json| json["accessors"][0]["count"] = json!(3)), "index 3");
+    expect(with(&|json| json["accessors"][0]["byteOffset"] = json!(1u64 << 62)), "beyond the end");
+    expect(with(&|json| json["accessors"][2]["count"] = json!(5)), "5 weight sets for 6 vertices");
+    expect(with(&|json| json["accessors"][0]["type"] = json!("VEC2")), "Vec3");
+    expect(with(&|json| json["skins"][0]["joints"] = json!([2])), "joint");
+    expect(with(&|json| json["meshes"][0]["primitives"][0]["attributes"]["WEIGHTS_0"] = json!(null)), "");
+    for poison in [f32::NAN, f32::INFINITY] {
+        let mut file = armature();
+        file.bin[4..8].copy_from_slice(&poison.to_le_bytes());
+        expect(file.refused(), "item 0 of the positions of primitive 0 of mesh 0 is not a finite number");
+    }
+    let mut file = armature();
+    animate(&mut file, 1, "translation", "LINEAR", &[0.0, 1.0], &[0.0; 6]);
+    file.json["animations"][0]["channels"][0]["sampler"] = json!(7);
+    expect(file.refused(), "sampler");
+    let mut file = armature();
+    animate(&mut file, 1, "translation", "LINEAR", &[1.0, 1.0], &[0.0; 6]);
+    expect(file.refused(), "do not grow");
+    let mut file = armature();
+    animate(&mut file, 1, "translation", "LINEAR", &[0.0, 1.0], &[0.0; 3]);
+    expect(file.refused(), "1 values for 2 keys");
+    assert!(matches!(load_gltf("/nowhere/body.glb".as_ref()), Err(BodyError::Io { .. })));
+}
+
+#[test]
+fn no_cut_of_a_file_panics() {
+    let mut file = armature();
+    animate(&mut file, 1, "translation", "LINEAR", &[0.0, 2.0], &[0., 0., 100., 0., 0., 300.]);
+    let glb = file.glb();
+    assert!(load_bytes(&glb, "test.glb").is_ok());
+    for end in (0..glb.len()).step_by(7) {
+        let error = load_bytes(&glb[..end], "test.glb").unwrap_err();
+        assert!(matches!(error, BodyError::Gltf { .. }), "cut at {end}: {error}");
+    }
+    // Nor does any single damaged byte; most are harmless or refused.
+    for at in (12..glb.len()).step_by(3) {
+        let mut damaged = glb.clone();
+        damaged[at] ^= 0x55;
+        let _ = load_bytes(&damaged, "test.glb");
+    }
+}
