@@ -106,7 +106,8 @@ pub fn read_back<T: Pod>(gpu: &GpuContext, buffer: &Buffer, len: usize) -> Resul
         let _ = sender.try_send(result);
     });
     gpu.wait()?;
-    match receiver.try_recv() {
+    // Another thread's wait may hold our callback and be about to call it.
+    match receiver.recv_timeout(std::time::Duration::from_secs(10)) {
         Ok(Ok(())) => {}
         Ok(Err(error)) => return Err(GpuError::Lost(error.to_string())),
         Err(_) => return Err(GpuError::Lost("a buffer was not mapped after the wait".to_owned())),
