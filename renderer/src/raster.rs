@@ -4,9 +4,9 @@ use flyrig_gpu::{CameraUniform, GpuContext, GpuError, GpuTimer, StorageBuffer, d
 use flyrig_types::Camera;
 use wgpu::{BindingResource, CommandEncoder, ComputePass, ComputePassDescriptor};
 
-use crate::raster_buffers::PictureBuffers;
+use crate::raster_buffers::{Layout, PictureBuffers};
 use crate::raster_kernels::{Frame, RasterKernels, RasterShape};
-use crate::scan::{CHUNK_GROUP, Scan, run};
+use crate::scan::{CHUNK_GROUP, MAX_LOOP, Scan, run};
 use crate::sort::{RadixSort, SortPass};
 use crate::uniforms::{UniformWriter, Uniforms};
 use crate::{GaussianBuffers, RenderTarget};
@@ -80,6 +80,7 @@ pub struct Rasterizer {
     splats: StorageBuffer<[f32; 8]>,
     rects: StorageBuffer<[u32; 2]>,
     chunk_pairs: StorageBuffer<u32>,
+    pairs_before: StorageBuffer<u32>,
     pair_total: StorageBuffer<u32>,
     stats: StorageBuffer<u32>,
     picture: Option<PictureBuffers>,
@@ -95,6 +96,7 @@ impl Rasterizer {
     }
 
     pub(crate) fn with_shape(gpu: &GpuContext, max_gaussians: usize, shape: RasterShape) -> Result<Self, GpuError> {
+        check_count(max_gaussians, shape)?;
         Ok(Self {
             kernels: RasterKernels::new(gpu, shape),
             scan: Scan::new(gpu, shape.sort.chunks)?,
@@ -102,6 +104,7 @@ impl Rasterizer {
             splats: StorageBuffer::zeroed(gpu, "splats", max_gaussians)?,
             rects: StorageBuffer::zeroed(gpu, "splat rectangles", max_gaussians)?,
             chunk_pairs: StorageBuffer::zeroed(gpu, "pairs a chunk", shape.max_bin_chunks as usize)?,
+            pairs_before: StorageBuffer::zeroed(gpu, "pairs before", max_gaussians)?,
             pair_total: StorageBuffer::zeroed(gpu, "pair total", 1)?,
             stats: StorageBuffer::zeroed(gpu, "raster statistics", 3)?,
             picture: None,
@@ -143,20 +146,22 @@ impl Rasterizer {
         }
         self.grow(gpu, gaussians.count(), target)?;
         let Some(picture) = &self.picture else { return Ok(()) };
+        let layout = picture.layout();
         let frame = Frame {
             camera: CameraUniform::from(camera),
             size: [target.width, target.height],
-            tiles: picture.tiles,
+            tiles: layout.tiles,
             gaussians: gaussians.count() as u32,
             cull_backfacing: settings.cull_backfacing.into(),
             with_canonical: settings.outputs.canonical.into(),
-            pair_capacity: picture.pairs.len() as u32,
+            pair_capacity: layout.pair_capacity,
             near_m: settings.near_m,
             filter_variance_px2: settings.filter_variance_px2,
-            bin_chunks: picture.bin_chunks,
+            bin_chunks: layout.bin_chunks,
             unused: 0,
         };
-        let uniforms = self.uniforms(gpu, &frame, picture);
+        let uniforms = self.uniforms(gpu, &frame, layout);
+        encoder.clear_buffer(picture.table.raw(), 0, Some(u64::from(layout.table_len) * 4));
         let blend = self.kernels.blend(gpu, settings.outputs);
         let stages = Stages { gpu, rasterizer: self, gaussians, target, picture, uniforms: &uniforms };
         let mut pass = |name, record: &dyn Fn(&mut ComputePass<'_>)| {
@@ -181,9 +186,11 @@ impl Rasterizer {
     }
 
     fn grow(&mut self, gpu: &GpuContext, count: usize, target: &RenderTarget) -> Result<(), GpuError> {
+        check_count(count, self.kernels.shape)?;
         if count > self.splats.len() {
             self.sort.grow(gpu, count)?;
             self.rects = StorageBuffer::zeroed(gpu, "splat rectangles", count)?;
+            self.pairs_before = StorageBuffer::zeroed(gpu, "pairs before", count)?;
             self.splats = StorageBuffer::zeroed(gpu, "splats", count)?;
         }
         let size = [target.width, target.height];
@@ -197,16 +204,27 @@ impl Rasterizer {
         }
     }
 
-    fn uniforms(&self, gpu: &GpuContext, frame: &Frame, picture: &PictureBuffers) -> Uniforms {
+    fn uniforms(&self, gpu: &GpuContext, frame: &Frame, layout: Layout) -> Uniforms {
         let mut writer = UniformWriter::default();
         writer.push(frame);
         writer.push(&[self.kernels.shape.sort.table_len(), 0, 0, 0]);
-        writer.push(&[picture.table_len(), 0, 0, 0]);
+        writer.push(&[layout.table_len, 0, 0, 0]);
         for index in 0..self.kernels.shape.sort.digit_passes {
             writer.push(&SortPass::new(frame.gaussians, index));
         }
         writer.finish(gpu)
     }
+}
+
+/// Refuses more Gaussians than the invocations of the sort may loop over.
+fn check_count(count: usize, shape: RasterShape) -> Result<(), GpuError> {
+    let limit = u64::from(shape.sort.chunks) * MAX_LOOP;
+    let bytes = size_of::<[u32; 2]>() as u64;
+    if count as u64 > limit {
+        let what = format!("the depth sort of {count} Gaussians");
+        return Err(GpuError::TooLarge { what, needed: count as u64 * bytes, limit: limit * bytes });
+    }
+    Ok(())
 }
 
 /// Places in the [`Uniforms`] of one encoding.
@@ -250,19 +268,21 @@ impl Stages<'_> {
 
     fn tile_lists(&self, pass: &mut ComputePass<'_>) {
         let (r, p) = (self.rasterizer, self.picture);
-        let resources: [BindingResource<'_>; 8] = [
+        let resources: [BindingResource<'_>; 9] = [
             self.uniforms.get(FRAME),
             r.sort.output().raw().as_entire_binding(),
             r.sort.valid().raw().as_entire_binding(),
             r.rects.raw().as_entire_binding(),
             r.chunk_pairs.raw().as_entire_binding(),
+            r.pairs_before.raw().as_entire_binding(),
             p.table.raw().as_entire_binding(),
             p.pairs.raw().as_entire_binding(),
             r.stats.raw().as_entire_binding(),
         ];
-        let groups = (p.bin_chunks.div_ceil(CHUNK_GROUP), 1);
+        let groups = (p.layout().bin_chunks.div_ceil(CHUNK_GROUP), 1);
         run(self.gpu, pass, &r.kernels.count_pairs, &resources[..5], groups);
-        run(self.gpu, pass, &r.kernels.count_tiles, &resources[..6], groups);
+        run(self.gpu, pass, &r.kernels.place_pairs, &resources[..6], groups);
+        run(self.gpu, pass, &r.kernels.count_tiles, &resources[..7], groups);
         r.scan.encode(self.gpu, pass, &self.uniforms.get(TILE_TABLE), &p.table, &r.pair_total);
         run(self.gpu, pass, &r.kernels.list_pairs, &resources, groups);
     }
@@ -280,6 +300,10 @@ impl Stages<'_> {
             t.depth.raw().as_entire_binding(),
             t.canonical.raw().as_entire_binding(),
         ];
-        run(self.gpu, pass, kernel, &resources, (p.tiles[0], p.tiles[1]));
+        run(self.gpu, pass, kernel, &resources, p.layout().tiles.into());
     }
 }
+
+#[cfg(test)]
+#[path = "raster_list_tests.rs"]
+mod tests;

@@ -3,6 +3,7 @@
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 
 use crate::raster_kernels::RasterShape;
+use crate::scan::MAX_LOOP;
 
 /// Room for pairs of a Gaussian and a tile. A body-like surface needs about three a Gaussian; the share
 /// of the tiles is for a few Gaussians that cover the whole picture.
@@ -12,14 +13,24 @@ const MIN_PAIRS: u64 = 1 << 18;
 
 #[derive(Debug)]
 pub(crate) struct PictureBuffers {
+    layout: Layout,
     size: [u32; 2],
     gaussians: usize,
+    pub table: StorageBuffer<u32>,
+    pub pairs: StorageBuffer<u32>,
+}
+
+/// What a picture of some size needs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Layout {
     /// Columns and rows of tiles.
     pub tiles: [u32; 2],
     /// Columns of the tile table.
     pub bin_chunks: u32,
-    pub table: StorageBuffer<u32>,
-    pub pairs: StorageBuffer<u32>,
+    /// Elements of the tile table.
+    pub table_len: u32,
+    /// Pairs of a Gaussian and a tile that can be listed.
+    pub pair_capacity: u32,
 }
 
 impl PictureBuffers {
@@ -29,20 +40,13 @@ impl PictureBuffers {
         size: [u32; 2],
         gaussians: usize,
     ) -> Result<Self, GpuError> {
-        let (tiles, bin_chunks) = layout(shape, size);
-        let count = u64::from(tiles[0]) * u64::from(tiles[1]);
-        let limits = gpu.device.limits();
-        let limit = limits.max_buffer_size.min(u64::from(limits.max_storage_buffer_binding_size)) / 4;
-        // One above the capacity must fit u32 with any one Gaussian's tiles added (see add_pairs).
-        let limit = limit.min(1 << 30);
-        let pairs = (PAIRS_PER_GAUSSIAN * gaussians as u64 + PAIRS_PER_TILE * count).max(MIN_PAIRS).min(limit);
+        let layout = Layout::new(gpu, shape, size, gaussians);
         Ok(Self {
+            layout,
             size,
             gaussians,
-            tiles,
-            bin_chunks,
-            table: StorageBuffer::zeroed(gpu, "tile table", count as usize * bin_chunks as usize)?,
-            pairs: StorageBuffer::zeroed(gpu, "tile lists", pairs as usize)?,
+            table: StorageBuffer::zeroed(gpu, "tile table", layout.table_len as usize)?,
+            pairs: StorageBuffer::zeroed(gpu, "tile lists", layout.pair_capacity as usize)?,
         })
     }
 
@@ -57,24 +61,31 @@ impl PictureBuffers {
         if (self.size, self.gaussians) == (size, gaussians) {
             return Ok(());
         }
-        let (tiles, bin_chunks) = layout(shape, size);
-        let needed = tiles[0] as usize * tiles[1] as usize * bin_chunks as usize;
-        if gaussians > self.gaussians || needed > self.table.len() {
+        let layout = Layout::new(gpu, shape, size, gaussians);
+        if layout.table_len as usize > self.table.len() || layout.pair_capacity as usize > self.pairs.len() {
             *self = Self::new(gpu, shape, size, gaussians)?;
         } else {
-            (self.size, self.tiles, self.bin_chunks) = (size, tiles, bin_chunks);
+            (self.layout, self.size, self.gaussians) = (layout, size, gaussians);
         }
         Ok(())
     }
 
-    /// Elements of the table in use.
-    pub(crate) fn table_len(&self) -> u32 {
-        self.tiles[0] * self.tiles[1] * self.bin_chunks
+    pub(crate) fn layout(&self) -> Layout {
+        self.layout
     }
 }
 
-fn layout(shape: RasterShape, size: [u32; 2]) -> ([u32; 2], u32) {
-    let tiles = size.map(|side| side.div_ceil(shape.tile));
-    let count = tiles[0].saturating_mul(tiles[1]).max(1);
-    (tiles, (shape.max_tile_table / count).clamp(1, shape.max_bin_chunks))
+impl Layout {
+    fn new(gpu: &GpuContext, shape: RasterShape, size: [u32; 2], gaussians: usize) -> Self {
+        let tiles = size.map(|side| side.div_ceil(shape.tile));
+        let count = tiles[0].saturating_mul(tiles[1]).max(1);
+        let bin_chunks = (shape.max_tile_table / count).clamp(1, shape.max_bin_chunks);
+        let limits = gpu.device.limits();
+        let limit = limits.max_buffer_size.min(u64::from(limits.max_storage_buffer_binding_size)) / 4;
+        // Each invocation of the binning walks over its share of the pairs.
+        let limit = limit.min(u64::from(bin_chunks) * MAX_LOOP);
+        let wanted = PAIRS_PER_GAUSSIAN * gaussians as u64 + PAIRS_PER_TILE * u64::from(count);
+        let pair_capacity = wanted.max(MIN_PAIRS).min(limit) as u32;
+        Self { tiles, bin_chunks, table_len: count.saturating_mul(bin_chunks), pair_capacity }
+    }
 }

@@ -102,6 +102,7 @@ pub(crate) struct RasterKernels {
     pub shape: RasterShape,
     pub project: ComputeKernel,
     pub count_pairs: ComputeKernel,
+    pub place_pairs: ComputeKernel,
     pub count_tiles: ComputeKernel,
     pub list_pairs: ComputeKernel,
     blend: Mutex<HashMap<Outputs, Arc<ComputeKernel>>>,
@@ -115,6 +116,7 @@ impl RasterKernels {
             shape,
             project: ComputeKernel::new(gpu, "project", &[&project_wgsl(shape)], "project"),
             count_pairs: bin_kernel("count_pairs"),
+            place_pairs: bin_kernel("place_pairs"),
             count_tiles: bin_kernel("count_tiles"),
             list_pairs: bin_kernel("list_pairs"),
             blend: Mutex::default(),
@@ -128,3 +130,7 @@ impl RasterKernels {
         Arc::clone(kernels.entry(outputs).or_insert_with(compile))
     }
 }
+
+#[cfg(test)]
+#[path = "raster_shader_tests.rs"]
+mod tests;

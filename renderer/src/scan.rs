@@ -6,6 +6,9 @@ use wgpu::{BindingResource, ComputePass};
 pub(crate) const SCAN_WGSL: &str = include_str!("scan.wgsl");
 /// `@workgroup_size` of every kernel whose invocations own chunks; chunk counts are multiples of it.
 pub(crate) const CHUNK_GROUP: u32 = 32;
+/// Iterations that one invocation may spend in loops. Mesa's software adapter ends all loops of an invocation
+/// after 65535 iterations together, without a word.
+pub(crate) const MAX_LOOP: u64 = 60_000;
 
 /// Exclusive prefix sum in place, in two kernels, with one contiguous segment an invocation.
 #[derive(Debug)]

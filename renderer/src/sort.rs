@@ -141,3 +141,7 @@ impl SortShape {
         )
     }
 }
+
+#[cfg(test)]
+#[path = "sort_tests.rs"]
+mod tests;

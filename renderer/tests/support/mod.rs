@@ -1,6 +1,7 @@
 //! Shared by the raster tests and the benchmark.
 #![allow(dead_code)]
 
+pub mod body_scene;
 pub mod reference;
 
 use flyrig_gpu::{GpuContext, GpuError};
