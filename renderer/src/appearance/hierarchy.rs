@@ -27,7 +27,7 @@ pub struct DiffusionHierarchy {
 
 impl DiffusionHierarchy {
     /// Damped Jacobi steps a level; even, so that the result ends where it began.
-    pub const RELAX_STEPS: u32 = 8;
+    pub const RELAX_STEPS: u32 = 16;
 
     /// How far a Jacobi step goes; below 1, or two nodes that see only each other would swap for ever.
     pub const DAMPING: f32 = 0.8;

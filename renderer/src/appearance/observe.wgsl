@@ -1,7 +1,8 @@
 // One thread a Gaussian, one dispatch a view: adds what this view saw of it (Eq. 5 to 8).
 @group(0) @binding(0) var<uniform> settings: Settings;
 @group(0) @binding(1) var<uniform> camera: Camera;
-@group(0) @binding(2) var picture: texture_2d<f32>;
+// sRGB bytes, red lowest; mask coverage highest.
+@group(0) @binding(2) var<storage, read> picture: array<u32>;
 // Canonical position times alpha; w: alpha.
 @group(0) @binding(3) var<storage, read> rendered_canonical: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read> center_scale: array<vec4<f32>>;
@@ -11,6 +12,13 @@
 @group(0) @binding(7) var<storage, read_write> seen: array<vec4<f32>>;
 // x: sum of Eq. 6 weights, y: exp(-k d) of the closest view that sees it.
 @group(0) @binding(8) var<storage, read_write> quality: array<vec2<f32>>;
+// Linear value of each sRGB byte.
+@group(0) @binding(9) var<storage, read> linear_from_srgb: array<f32>;
+
+fn linear_rgb(packed: u32) -> vec3<f32> {
+    let byte = (vec3(packed) >> vec3(0u, 8u, 16u)) & vec3(0xffu);
+    return vec3(linear_from_srgb[byte.x], linear_from_srgb[byte.y], linear_from_srgb[byte.z]);
+}
 
 // Eq. 7 in observation space. The sine through the cross product: sqrt(1 - cos^2) loses half the digits
 // exactly where the weight is largest.
@@ -33,6 +41,10 @@ fn main(
         return;
     }
     let position = center_scale[i].xyz;
+    let angle = angle_weight(normals[i].xyz, position - camera.position.xyz);
+    if settings.view_weight == 0.0 && !(angle > 0.0) {
+        return;
+    }
     let projected = project_point(camera, position, NEAR_M);
     if !projected.valid {
         return;
@@ -42,7 +54,8 @@ fn main(
     if !(all(pixel >= vec2(-0.5)) && all(pixel <= size - 0.5)) {
         return;
     }
-    // Bilinear by hand: hardware filters know nothing of the mask and pull the background in at silhouettes.
+    // Bilinear by hand: hardware filters know nothing of the mask and pull the background in at silhouettes, and
+    // software adapters decode sRGB textures with errors of 1e-3.
     let base = floor(pixel);
     let fraction = pixel - base;
     var color = vec3(0.0);
@@ -53,11 +66,13 @@ fn main(
         let texel = vec2<u32>(clamp(vec2<i32>(base) + vec2<i32>(offset), vec2(0), vec2<i32>(camera.size) - 1));
         let side = select(1.0 - fraction, fraction, offset == vec2(1u));
         let share = side.x * side.y;
-        let sample = textureLoad(picture, texel, 0);
-        let belief = share * clamp((sample.a - settings.min_mask) / (1.0 - settings.min_mask), 0.0, 1.0);
-        color += belief * sample.rgb;
+        let index = texel.y * camera.size.x + texel.x;
+        let packed = picture[index];
+        let mask = f32(packed >> 24u) / 255.0;
+        let belief = share * clamp((mask - settings.min_mask) / (1.0 - settings.min_mask), 0.0, 1.0);
+        color += belief * linear_rgb(packed);
         coverage += belief;
-        rendered += share * rendered_canonical[texel.y * camera.size.x + texel.x];
+        rendered += share * rendered_canonical[index];
     }
     if !(coverage > 0.0) {
         return;
@@ -68,7 +83,7 @@ fn main(
         // Eq. 8: near the rendered surface in canonical space, so that an arm never paints the belly behind it.
         let d = distance(canonical[i].xyz, rendered.xyz / rendered.w);
         let surface = max(1.0 - settings.occlusion_per_m * d, 0.0);
-        weight = angle_weight(normals[i].xyz, position - camera.position.xyz) * surface * coverage;
+        weight = angle * surface * coverage;
         if weight > 0.0 && is_finite(weight) {
             let before = quality[i];
             quality[i] = vec2(before.x + weight, max(before.y, exp(-settings.occlusion_per_m * d)));

@@ -1,7 +1,7 @@
 //! What goes into direct appearance, and what can be wrong with it.
 
 use flyrig_gpu::{GpuError, StorageBuffer};
-use flyrig_types::{Camera, CameraId};
+use flyrig_types::{Camera, CameraId, MAX_IMAGE_SIDE};
 
 /// What one camera saw at this instant.
 #[derive(Debug, Clone, Copy)]
@@ -124,8 +124,8 @@ pub enum AppearanceError {
         /// Count found.
         found: usize,
     },
-    /// A picture that the adapter cannot hold.
-    #[error("camera {camera}: its picture is {width}x{height}, this adapter takes 1 to {limit} pixels a side")]
+    /// A camera without pixels, or with an absurd number of them.
+    #[error("camera {camera}: its picture is {width}x{height}, expected 1 to {MAX_IMAGE_SIDE} pixels a side")]
     PictureSize {
         /// Which camera.
         camera: CameraId,
@@ -133,7 +133,5 @@ pub enum AppearanceError {
         width: u32,
         /// Pixels.
         height: u32,
-        /// Pixels.
-        limit: u32,
     },
 }

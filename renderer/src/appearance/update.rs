@@ -1,17 +1,16 @@
 //! Buffers of direct appearance and the recording of one frame.
 
 use flyrig_body::{DeformationGraph, SurfaceGaussians};
-use flyrig_gpu::{CameraUniform, GpuContext, GpuTimer, StorageBuffer, dispatch_1d};
-use wgpu::{
-    BindingResource, Buffer, BufferUsages, CommandEncoder, ComputePassDescriptor, Extent3d, Texture, TextureView,
-};
+use flyrig_gpu::{CameraUniform, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
+use flyrig_types::MAX_IMAGE_SIDE;
+use wgpu::{Buffer, BufferUsages, CommandEncoder, ComputePassDescriptor};
 
 use super::{
     AppearanceError, AppearanceSettings, ViewInput,
     graph_buffers::GraphBuffers,
     kernels::{Kernels, SettingsUniform, WORKGROUP},
 };
-use crate::GaussianBuffers;
+use crate::{GaussianBuffers, linear_from_srgb};
 
 /// Paints every Gaussian from the pictures of this instant and a memory of earlier ones.
 ///
@@ -21,6 +20,7 @@ pub struct DirectAppearance {
     kernels: Kernels,
     graph: GraphBuffers,
     settings: Buffer,
+    linear_from_srgb: StorageBuffer<f32>,
     views: Vec<ViewSlot>,
     /// Sum of weight times linear RGB, sum of weights.
     seen: StorageBuffer<[f32; 4]>,
@@ -35,7 +35,8 @@ pub struct DirectAppearance {
 #[derive(Debug)]
 struct ViewSlot {
     camera: Buffer,
-    picture: Option<(Texture, TextureView)>,
+    /// A pixel an element.
+    picture: StorageBuffer<u32>,
 }
 
 impl DirectAppearance {
@@ -59,12 +60,17 @@ impl DirectAppearance {
                 mapped_at_creation: false,
             })
         };
-        let view = || ViewSlot { camera: uniform("view camera", size_of::<CameraUniform>()), picture: None };
+        let view = |_| {
+            let picture = StorageBuffer::zeroed(gpu, "view picture", 0)?;
+            Ok(ViewSlot { camera: uniform("view camera", size_of::<CameraUniform>()), picture })
+        };
+        let decoded: Vec<f32> = (0..=255u8).map(|byte| linear_from_srgb(f32::from(byte) / 255.0)).collect();
         Ok(Self {
             kernels: Kernels::new(gpu),
             graph,
             settings: uniform("appearance settings", size_of::<SettingsUniform>()),
-            views: std::iter::repeat_with(view).take(max_views).collect(),
+            linear_from_srgb: StorageBuffer::from_slice(gpu, "linear values of sRGB bytes", &decoded)?,
+            views: (0..max_views).map(view).collect::<Result<_, GpuError>>()?,
             seen: StorageBuffer::zeroed(gpu, "observed colours", count)?,
             quality: StorageBuffer::zeroed(gpu, "observation quality", count)?,
             memory: StorageBuffer::zeroed(gpu, "colour memory", count)?,
@@ -103,7 +109,10 @@ impl DirectAppearance {
         settings: &AppearanceSettings,
         mut timer: Option<&mut GpuTimer>,
     ) -> Result<(), AppearanceError> {
-        self.check(gpu, gaussians, views, settings)?;
+        self.check(gaussians, views, settings)?;
+        for (slot, view) in self.views.iter_mut().zip(views) {
+            slot.upload(gpu, view)?;
+        }
         gpu.queue.write_buffer(&self.settings, 0, bytemuck::bytes_of(&SettingsUniform::from(settings)));
         if std::mem::take(&mut self.forget) {
             encoder.clear_buffer(self.memory.raw(), 0, None);
@@ -121,23 +130,22 @@ impl DirectAppearance {
             }
         };
         let all_gaussians = dispatch_1d(self.seen.len() as u32, WORKGROUP);
-        let binds: Vec<_> = self.views.iter_mut().zip(views).map(|(slot, view)| slot.upload(gpu, view)).collect();
         let observations: Vec<_> = self
             .views
             .iter()
-            .zip(&binds)
             .zip(views)
-            .map(|((slot, picture), view)| {
+            .map(|(slot, view)| {
                 let resources = [
                     self.settings.as_entire_binding(),
                     slot.camera.as_entire_binding(),
-                    BindingResource::TextureView(picture),
+                    slot.picture.raw().as_entire_binding(),
                     view.canonical.raw().as_entire_binding(),
                     gaussians.center_scale.raw().as_entire_binding(),
                     gaussians.normal.raw().as_entire_binding(),
                     gaussians.canonical.raw().as_entire_binding(),
                     self.seen.raw().as_entire_binding(),
                     self.quality.raw().as_entire_binding(),
+                    self.linear_from_srgb.raw().as_entire_binding(),
                 ];
                 self.kernels.observe.bind(gpu, &resources)
             })
@@ -174,7 +182,6 @@ impl DirectAppearance {
 
     fn check(
         &self,
-        gpu: &GpuContext,
         gaussians: &GaussianBuffers,
         views: &[ViewInput<'_>],
         settings: &AppearanceSettings,
@@ -188,13 +195,12 @@ impl DirectAppearance {
         if found > max {
             return Err(AppearanceError::TooManyViews { max, found });
         }
-        let limit = gpu.device.limits().max_texture_dimension_2d;
         for view in views {
             let camera = view.camera.id.clone();
             let (width, height) = (view.camera.intrinsics.width, view.camera.intrinsics.height);
             let pixels = width as usize * height as usize;
-            if width.max(height) > limit || pixels == 0 {
-                return Err(AppearanceError::PictureSize { camera, width, height, limit });
+            if pixels == 0 || width.max(height) > MAX_IMAGE_SIDE {
+                return Err(AppearanceError::PictureSize { camera, width, height });
             }
             let inputs = [
                 ("the picture", "bytes", pixels * 4, view.rgba.len()),
@@ -212,33 +218,14 @@ impl DirectAppearance {
 
 impl ViewSlot {
     /// Queues the upload of camera and picture.
-    fn upload(&mut self, gpu: &GpuContext, view: &ViewInput<'_>) -> TextureView {
-        gpu.queue.write_buffer(&self.camera, 0, bytemuck::bytes_of(&CameraUniform::from(view.camera)));
-        let size = Extent3d {
-            width: view.camera.intrinsics.width,
-            height: view.camera.intrinsics.height,
-            depth_or_array_layers: 1,
-        };
-        if self.picture.as_ref().is_some_and(|(texture, _)| texture.size() != size) {
-            self.picture = None;
+    fn upload(&mut self, gpu: &GpuContext, view: &ViewInput<'_>) -> Result<(), GpuError> {
+        let pixels = view.rgba.len() / 4;
+        if self.picture.len() != pixels {
+            self.picture = StorageBuffer::zeroed(gpu, &format!("the picture of camera {}", view.camera.id), pixels)?;
         }
-        let (texture, picture) = self.picture.get_or_insert_with(|| {
-            let texture = gpu.device.create_texture(&wgpu::TextureDescriptor {
-                label: Some("view picture"),
-                size,
-                mip_level_count: 1,
-                sample_count: 1,
-                dimension: wgpu::TextureDimension::D2,
-                // The texture unit decodes sRGB, so interpolation happens in linear light; alpha stays as it is.
-                format: wgpu::TextureFormat::Rgba8UnormSrgb,
-                usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
-                view_formats: &[],
-            });
-            let picture = texture.create_view(&Default::default());
-            (texture, picture)
-        });
-        let rows = wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(size.width * 4), rows_per_image: None };
-        gpu.queue.write_texture(texture.as_image_copy(), view.rgba, rows, size);
-        picture.clone()
+        gpu.queue.write_buffer(&self.camera, 0, bytemuck::bytes_of(&CameraUniform::from(view.camera)));
+        // Bytes, not words: a picture need not lie on a word's boundary. The GPU reads little-endian words.
+        gpu.queue.write_buffer(self.picture.raw(), 0, view.rgba);
+        Ok(())
     }
 }

@@ -1,0 +1,311 @@
+//! Direct appearance against the f64 reference and against common sense.
+#![allow(clippy::unwrap_used)] // helpers of tests
+
+mod appearance_support;
+
+use appearance_support::{
+    reference::{self, MID_GREY},
+    scene::{self, Frame, Person, View},
+};
+use flyrig_gpu::{AdapterChoice, GpuContext, StorageBuffer};
+use flyrig_renderer::{
+    AppearanceError, AppearanceSettings, DiffusionHierarchy, DirectAppearance, GaussianBuffers, ViewInput,
+    linear_from_srgb,
+};
+use glam::{DVec3, DVec4};
+
+const BACKGROUND: [u8; 3] = [255, 0, 255];
+
+struct Rig {
+    gpu: GpuContext,
+    person: Person,
+    buffers: GaussianBuffers,
+    appearance: DirectAppearance,
+}
+
+impl Rig {
+    fn new(gaussians: usize, nodes: usize) -> Self {
+        let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+        let person = scene::person(gaussians, nodes);
+        let buffers = GaussianBuffers::zeroed(&gpu, gaussians).unwrap();
+        buffers.canonical.write(&gpu, &person.canonical);
+        let appearance = DirectAppearance::new(&gpu, &person.surface, &person.graph, 3).unwrap();
+        Self { gpu, person, buffers, appearance }
+    }
+
+    fn update(&mut self, frame: &Frame, views: &[View], settings: &AppearanceSettings) -> Vec<[f32; 4]> {
+        self.try_update(frame, views, settings).unwrap()
+    }
+
+    fn try_update(
+        &mut self,
+        frame: &Frame,
+        views: &[View],
+        settings: &AppearanceSettings,
+    ) -> Result<Vec<[f32; 4]>, AppearanceError> {
+        self.buffers.center_scale.write(&self.gpu, &frame.center_scale);
+        self.buffers.normal.write(&self.gpu, &frame.normal);
+        let upload = |view: &View| StorageBuffer::from_slice(&self.gpu, "canonical", &view.canonical).unwrap();
+        let maps: Vec<_> = views.iter().map(upload).collect();
+        let inputs: Vec<_> = views
+            .iter()
+            .zip(&maps)
+            .map(|(view, canonical)| ViewInput { camera: &view.camera, rgba: &view.rgba, canonical })
+            .collect();
+        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+        self.appearance.update(&self.gpu, &mut encoder, &self.buffers, &inputs, settings)?;
+        self.gpu.queue.submit([encoder.finish()]);
+        Ok(self.buffers.color.read(&self.gpu)?)
+    }
+
+    fn reference(
+        &self,
+        frame: &Frame,
+        views: &[View],
+        settings: &AppearanceSettings,
+        memory: &mut [DVec4],
+    ) -> Vec<DVec3> {
+        let levels = DiffusionHierarchy::new(&self.person.graph).unwrap().levels;
+        reference::update(&self.person, &levels, frame, views, settings, memory)
+    }
+}
+
+fn ablations() -> [AppearanceSettings; 4] {
+    [(true, true), (true, false), (false, true), (false, false)].map(|(space, time)| AppearanceSettings {
+        space,
+        time,
+        ..Default::default()
+    })
+}
+
+fn views(frame: &Frame, size: u32) -> Vec<View> {
+    scene::ring(size).iter().map(|camera| scene::view(frame, camera, BACKGROUND, scene::pattern)).collect()
+}
+
+/// Largest difference of a colour channel.
+fn difference(ours: &[[f32; 4]], reference: &[DVec3]) -> f64 {
+    assert_eq!(ours.len(), reference.len());
+    let one = |(a, b): (&[f32; 4], &DVec3)| {
+        assert!(a.iter().all(|x| x.is_finite()), "{a:?}");
+        assert_eq!(a[3].to_bits(), 1f32.to_bits(), "opacity");
+        (DVec4::from_array(a.map(f64::from)).truncate() - *b).abs().max_element()
+    };
+    ours.iter().zip(reference).map(one).fold(0.0, f64::max)
+}
+
+/// f32 positions at 2.5 m and pixels at 100 leave about 1e-5 of a pixel; neighbouring texels differ by up to 1.
+const TOLERANCE: f64 = 5e-4;
+/// The baseline also divides by weights of 1e-3 times a sliver of mask coverage.
+const BASELINE_TOLERANCE: f64 = 2e-3;
+
+#[test]
+fn agrees_with_the_reference_over_time_in_every_setting() {
+    let mut rig = Rig::new(4000, 150);
+    let frames: Vec<_> = [0.0, 0.6, 1.2, 1.5].map(|turn| scene::frame(&rig.person, turn)).into();
+    let pictures: Vec<_> = frames.iter().map(|frame| views(frame, 96)).collect();
+    for settings in ablations() {
+        rig.appearance.reset();
+        let mut memory = vec![DVec4::ZERO; 4000];
+        // Cameras come and go.
+        for (frame, seen) in [(0, 0..3), (1, 1..3), (2, 0..0), (3, 2..3)] {
+            let (frame, views) = (&frames[frame], &pictures[frame][seen]);
+            let ours = rig.update(frame, views, &settings);
+            let expected = rig.reference(frame, views, &settings, &mut memory);
+            let worst = difference(&ours, &expected);
+            println!("{settings:?} {} views: {worst:.2e}", views.len());
+            assert!(worst < if settings.space { TOLERANCE } else { BASELINE_TOLERANCE }, "{settings:?}: {worst}");
+        }
+    }
+}
+
+#[test]
+fn the_same_input_gives_the_same_bytes() {
+    let mut rig = Rig::new(4000, 150);
+    let frame = scene::frame(&rig.person, 0.3);
+    let views = views(&frame, 64);
+    let settings = AppearanceSettings::default();
+    let mut run = || {
+        rig.appearance.reset();
+        rig.update(&frame, &views, &settings);
+        rig.update(&frame, &views[1..], &settings)
+    };
+    let (first, second) = (run(), run());
+    assert_eq!(bits(&first), bits(&second));
+}
+
+fn bits(colors: &[[f32; 4]]) -> Vec<u32> {
+    colors.as_flattened().iter().map(|c| c.to_bits()).collect()
+}
+
+#[test]
+fn what_nobody_sees_is_grey_then_remembered_until_reset() {
+    let mut rig = Rig::new(2000, 80);
+    let frame = scene::frame(&rig.person, 0.3);
+    let seen = views(&frame, 64);
+    // No view, an empty mask, and a camera that looks away.
+    let mut masked = seen.clone();
+    masked.iter_mut().for_each(|view| view.rgba.chunks_exact_mut(4).for_each(|p| p[3] = 0));
+    let mut behind = seen.clone();
+    for view in &mut behind {
+        let eye = view.camera.position();
+        view.camera.camera_from_world = flyrig_types::Isometry::look_at(eye, eye * 2.0, DVec3::Y);
+    }
+    let grey = [MID_GREY as f32; 3];
+    for settings in ablations() {
+        rig.appearance.reset();
+        for blind in [&[][..], &masked, &behind] {
+            for color in rig.update(&frame, blind, &settings) {
+                assert!(color[..3].iter().zip(grey).all(|(a, b)| (a - b).abs() < 1e-6), "{settings:?} {color:?}");
+            }
+        }
+        for _ in 0..40 {
+            rig.update(&frame, &seen, &settings);
+        }
+        let known = rig.update(&frame, &seen, &settings);
+        let blind = rig.update(&frame, &[], &settings);
+        let again = rig.update(&frame, &masked, &settings);
+        let same = |a: &[[f32; 4]], b: &[[f32; 4]]| {
+            let near = |a: &[f32; 4], b: &[f32; 4]| a.iter().zip(b).all(|(x, y)| (x - y).abs() < 0.02);
+            a.iter().zip(b).filter(|(a, b)| near(a, b)).count() as f64 / a.len() as f64
+        };
+        assert_eq!(bits(&blind), bits(&again), "zero weight leaves the memory as it was");
+        if settings.time {
+            // The ball hides some of the belly and the head's top is grazed by all; the rest was seen.
+            assert!(same(&known, &blind) > 0.6, "{settings:?} {}", same(&known, &blind));
+        } else {
+            assert!(same(&known, &blind) < 0.1, "{settings:?}");
+        }
+        rig.appearance.reset();
+        let forgotten = rig.update(&frame, &[], &settings);
+        assert!(forgotten.iter().all(|c| (c[0] - grey[0]).abs() < 1e-6), "{settings:?}");
+    }
+}
+
+#[test]
+fn poison_never_reaches_the_memory() {
+    let mut rig = Rig::new(2000, 80);
+    let clean = scene::frame(&rig.person, 0.3);
+    let views = views(&clean, 64);
+    let mut poisoned = clean.clone();
+    let poison = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e38, 0.0];
+    for i in 0..500 {
+        let value = poison[i % poison.len()];
+        if i % 2 == 0 { poisoned.center_scale[i] = [value; 4] } else { poisoned.normal[i] = [value; 4] }
+    }
+    let mut bad_views = views.clone();
+    for view in &mut bad_views {
+        view.canonical.iter_mut().step_by(3).enumerate().for_each(|(i, c)| *c = [poison[i % poison.len()]; 4]);
+    }
+    bad_views[0].camera.camera_from_world.translation.x = f64::NAN;
+    for settings in ablations() {
+        rig.appearance.reset();
+        let known = rig.update(&clean, &views, &settings);
+        for (frame, views) in [(&poisoned, &views), (&clean, &bad_views), (&poisoned, &bad_views)] {
+            let colors = rig.update(frame, views, &settings);
+            assert!(colors.as_flattened().iter().all(|c| c.is_finite() && (0.0..=1.0).contains(c)), "{settings:?}");
+        }
+        let colors = rig.update(&clean, &views, &settings);
+        assert!(colors.as_flattened().iter().all(|c| c.is_finite()), "{settings:?}");
+        if !settings.time {
+            assert_eq!(bits(&colors), bits(&known), "nothing stays");
+        }
+    }
+}
+
+#[test]
+fn neither_background_nor_ball_paints_the_body() {
+    let mut rig = Rig::new(4000, 150);
+    let frame = scene::frame(&rig.person, 0.0);
+    // Green body, blue ball in front of it, magenta behind it.
+    let paint = |p: DVec3| if p.z > 0.3 { [0, 0, 200] } else { [0, 200, 0] };
+    let views: Vec<_> = scene::ring(96).iter().map(|camera| scene::view(&frame, camera, BACKGROUND, paint)).collect();
+    let settings = AppearanceSettings { time: false, ..Default::default() };
+    let colors = rig.update(&frame, &views, &settings);
+    let green = linear_from_srgb(200.0 / 255.0);
+    let mut bled = 0;
+    for color in &colors[..rig.person.body_count] {
+        // The rim's texels are half background: mask coverage 128 of 255 is hardly believed.
+        assert!(color[0] < 0.02, "background: {color:?}");
+        bled += usize::from(color[2] > 0.02 || color[1] < green - 0.05);
+    }
+    // Between the ball's outline and the belly a texel may hold either.
+    assert!(bled < rig.person.body_count / 100, "{bled}");
+    // The baseline projects whatever is in front.
+    let baseline = AppearanceSettings { space: false, ..settings };
+    let colors = rig.update(&frame, &views, &baseline);
+    assert!(colors[..rig.person.body_count].iter().any(|color| color[2] > 0.1));
+}
+
+#[test]
+fn an_unseen_part_takes_the_mean_and_an_unseen_back_its_surroundings() {
+    let mut rig = Rig::new(4000, 150);
+    // From behind, the ball is hidden by the body.
+    let frame = scene::frame(&rig.person, 0.0);
+    let camera = scene::camera("behind", std::f64::consts::PI, 96, flyrig_types::Lens::PINHOLE);
+    let paint = |p: DVec3| if p.y > 1.0 { [200, 0, 0] } else { [0, 200, 0] };
+    let views = [scene::view(&frame, &camera, BACKGROUND, paint)];
+    let settings = AppearanceSettings { time: false, ..Default::default() };
+    let colors = rig.update(&frame, &views, &settings);
+    let bright = linear_from_srgb(200.0 / 255.0);
+    let ball = &colors[rig.person.body_count..];
+    for color in ball {
+        assert!((color[0] + color[1] - bright).abs() < 0.02 && color[2] < 0.02, "{color:?}");
+        assert!(color[0] > 0.3 * bright && color[1] > 0.3 * bright, "about half of each: {color:?}");
+        assert!(color.iter().zip(ball[0]).all(|(a, b)| (a - b).abs() < 1e-5), "one colour: {color:?}");
+    }
+    // The unseen front: red above, green below.
+    for (color, p) in colors.iter().zip(&rig.person.surface.positions).take(rig.person.body_count) {
+        if p.z > 0.1 && (p.y - 1.0).abs() > 0.3 {
+            let (wanted, other) = if p.y > 1.0 { (color[0], color[1]) } else { (color[1], color[0]) };
+            assert!(wanted > 0.7 * bright && other < 0.3 * bright, "{p} {color:?}");
+        }
+    }
+}
+
+#[test]
+fn the_cascade_is_close_to_the_exact_diffusion() {
+    let rig = Rig::new(4000, 600);
+    let frame = scene::frame(&rig.person, 0.3);
+    let camera = scene::camera("one", 0.0, 96, flyrig_types::Lens::PINHOLE);
+    let views = [scene::view(&frame, &camera, BACKGROUND, scene::pattern)];
+    let levels = DiffusionHierarchy::new(&rig.person.graph).unwrap().levels;
+    let settings = AppearanceSettings::default();
+    let exact = reference::exact_diffusion(&rig.person, &levels, &frame, &views, &settings);
+    let ours = reference::cascade_diffusion(&rig.person, &levels, &frame, &views, &settings);
+    let body = rig.person.body_count;
+    let errors: Vec<f64> = ours.iter().zip(&exact).take(body).map(|(a, b)| (*a - *b).abs().max_element()).collect();
+    let mean = errors.iter().sum::<f64>() / body as f64;
+    println!("cascade against exact: mean {mean:.4}, max {:.4}", errors.iter().copied().fold(0.0, f64::max));
+    assert!(mean < 0.03, "{mean}");
+}
+
+#[test]
+fn refusals_name_the_view_and_the_mend() {
+    let mut rig = Rig::new(900, 40);
+    let frame = scene::frame(&rig.person, 0.0);
+    let views = views(&frame, 16);
+    let settings = AppearanceSettings::default();
+    let mut short = views.clone();
+    short[1].rgba.pop();
+    let message = rig.try_update(&frame, &short, &settings).unwrap_err().to_string();
+    assert_eq!(message, "camera radial: the picture has 1023 bytes, its 16x16 picture needs 1024");
+    let mut other = views.clone();
+    other[2].canonical.pop();
+    let message = rig.try_update(&frame, &other, &settings).unwrap_err().to_string();
+    assert!(message.contains("camera fisheye: the canonical map has 255 pixels"), "{message}");
+    let four = [&views[..], &views[..1]].concat();
+    let message = rig.try_update(&frame, &four, &settings).unwrap_err().to_string();
+    assert!(message.contains("made for 3 views but is given 4"), "{message}");
+    for bad in [f32::NAN, -1.0, f32::INFINITY, 0.0] {
+        let settings = AppearanceSettings { memory_weight_max: bad, ..settings };
+        let message = rig.try_update(&frame, &views, &settings).unwrap_err().to_string();
+        assert!(message.contains("memory_weight_max is"), "{message}");
+    }
+    let mut graph = rig.person.graph.clone();
+    graph.gaussian_weights[3] = [f32::NAN; 4];
+    let error = DirectAppearance::new(&rig.gpu, &rig.person.surface, &graph, 1).unwrap_err().to_string();
+    assert!(error.contains("Gaussian 3 has node weights"), "{error}");
+    rig.buffers = GaussianBuffers::zeroed(&rig.gpu, 5).unwrap();
+    let message = rig.try_update(&frame, &views, &settings).unwrap_err().to_string();
+    assert!(message.contains("made for 900 Gaussians but is given 5"), "{message}");
+}
