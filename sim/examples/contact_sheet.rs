@@ -1,6 +1,6 @@
 //! Writes a contact sheet of simulated people: a row a seed, a column a camera, time moving on from row to row.
 //!
-//! `cargo run --release -p flyrig-sim --example contact_sheet -- OUT.png [SEEDS] [CAMERAS] [SIDE_PX]`
+//! `cargo run --release -p flyrig-sim --example contact_sheet -- OUT.png [SEEDS] [CAMERAS] [SIDE_PX] [FOCAL_HEIGHTS [TARGET_HEIGHT_M]]`
 
 use std::error::Error;
 use std::time::Instant;
@@ -18,6 +18,12 @@ fn main() -> Result<(), Box<dyn Error>> {
     for row in 0..seeds {
         let mut config = SimConfig { seed: u64::from(row) + 1, width: side, height: side, ..SimConfig::default() };
         config.cameras.count = cameras as usize;
+        if let Some(focal_heights) = args.get(4) {
+            // A close-up.
+            config.cameras.focal_heights = focal_heights.parse()?;
+            config.cameras.target_height_m = args.get(5).map_or(Ok(1.55), |height| height.parse())?;
+            config.cameras.radial = [0.0; 2];
+        }
         let start = Instant::now();
         let mut simulator = Simulator::new(&gpu, &config)?;
         let setup = start.elapsed();

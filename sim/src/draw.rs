@@ -513,3 +513,23 @@ fn pipeline(
         cache: None,
     })
 }
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn the_shaders_are_valid() {
+        for (name, source) in super::shader_sources() {
+            let module = naga::front::wgsl::parse_str(&source)
+                .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&source)));
+            let mut validator =
+                naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::empty());
+            let info = validator.validate(&module).unwrap_or_else(|e| panic!("{name}: {e:?}"));
+            let _ = info;
+            if let Some((_, view)) = module.types.iter().find(|(_, ty)| ty.name.as_deref() == Some("View"))
+                && let naga::TypeInner::Struct { span, .. } = view.inner
+            {
+                assert_eq!(span as usize, size_of::<super::View>(), "{name}: struct View");
+            }
+        }
+    }
+}

@@ -27,15 +27,15 @@ pub(crate) fn skin_colour(look: &Look, noise: Noise, p: Vec3) -> Srgb {
     colour = red(
         colour,
         front
-            * (0.9 * smoothstep(0.030, 0.006, cheek)
-                + 0.6 * smoothstep(0.018, 0.004, Vec2::new(x, p.y - 1.520).length())),
+            * (0.45 * smoothstep(0.030, 0.006, cheek)
+                + 0.35 * smoothstep(0.018, 0.004, Vec2::new(x, p.y - 1.520).length())),
     );
     // Darker around the eyes.
     let to_eye = Vec2::new((x - 0.030) * 0.75, p.y - 1.553).length();
-    colour = scale3(colour, 1.0 - 0.20 * front * smoothstep(0.021, 0.008, to_eye));
+    colour = scale3(colour, 1.0 - 0.12 * front * smoothstep(0.021, 0.008, to_eye));
     // Lash line and the socket behind the eyeball.
     let lid = EYE.0.distance(Vec3::new(x, p.y, p.z)) / EYE.1;
-    colour = mix3(colour, [0.10, 0.06, 0.05], if p.z > 0.1 { smoothstep(1.20, 1.08, lid) * 0.9 } else { 0.0 });
+    colour = mix3(colour, [0.10, 0.06, 0.05], if p.z > 0.1 { smoothstep(1.17, 1.09, lid) * 0.85 } else { 0.0 });
     // Nostrils.
     let nostril = Vec2::new(x - 0.0085, (p.y - 1.5095) * 1.3).length();
     colour =

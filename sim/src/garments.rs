@@ -1,12 +1,12 @@
 //! Clothes and hair: offset surfaces cut out of the body.
 
 use flyrig_body::Part;
-use glam::Vec3;
+use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
 use crate::look::{HairCut, Look};
 use crate::noise::{Noise, lerp, smoothstep};
-use crate::regions::{ANKLE_TOP_M, above_hairline, along_arm, below_neckline};
+use crate::regions::{ANKLE_TOP_M, above_hairline, along_arm, below_neckline, is_ear};
 use crate::sheet::{Node, Sheet};
 
 /// Hem of a top and waist of trousers, metres above the sole on the average body.
@@ -34,7 +34,7 @@ fn is_hand(part: Part) -> bool {
 /// Metres inside the top's cloth.
 pub(crate) fn inside_top(look: &Look, node: &Node) -> f32 {
     let p = node.average;
-    if node.part == Part::Head && p.y > 1.45 || is_hand(node.part) {
+    if p.y > 1.42 || is_hand(node.part) {
         return -0.05;
     }
     let mut inside = below_neckline(p, look.v_neck_m).min(p.y - TOP_HEM_M);
@@ -106,18 +106,20 @@ impl Tailor {
                     if look.sleeve_m < 0.3 { 0.012 * smoothstep(0.04, 0.15, along) } else { 0.004 * (1.0 - cuff) };
                 let bunch = (along * 95.0 + 2.5 * self.noise.at(p * 9.0)).sin();
                 let near_elbow = smoothstep(0.12, 0.0, (along - 0.25).abs());
-                offset += 0.0045 * bunch * near_elbow * (1.0 - cuff);
+                offset += 0.003 * bunch * near_elbow * (1.0 - cuff);
             } else {
                 // Hangs from the chest, free of the waist.
-                offset += 0.016 * smoothstep(1.22, 1.02, p.y) * smoothstep(0.82, 0.98, p.y)
-                    + 0.006 * smoothstep(1.2, 0.9, p.y);
+                offset +=
+                    if look.female { 0.009 } else { 0.013 } * smoothstep(1.22, 1.02, p.y) * smoothstep(0.82, 0.98, p.y)
+                        + 0.006 * smoothstep(1.2, 0.9, p.y);
             }
             // Folds run along a slanted, wandering direction and are deepest at the waist and under the arms.
             let wander = self.noise.sum(p * 5.0, 2);
-            let slant = p.y * 34.0 + p.x * 26.0 * p.x.signum() + 5.0 * wander;
-            let depth = 0.0055 * smoothstep(1.30, 1.0, p.y) + 0.0015;
+            let slant =
+                p.y * 30.0 + 14.0 * (p.x * 9.0 + 2.0 * self.noise.at(p * 2.5 + 30.0)).sin() * 0.35 + 6.5 * wander;
+            let depth = 0.0038 * smoothstep(1.25, 0.98, p.y) + 0.0008;
             offset += depth * slant.sin() * (0.4 + 0.6 * self.noise.at(p * 7.0 + 11.0).abs());
-            offset += 0.004 * self.noise.sum(p * 16.0, 2);
+            offset += 0.0025 * self.noise.sum(p * 14.0, 2);
             let rim = smoothstep(0.0, 0.03, below_neckline(p, look.v_neck_m));
             self.over(i, node, lerp(0.008, offset.max(0.007), rim))
         });
@@ -137,7 +139,7 @@ impl Tailor {
             let near_knee = smoothstep(0.16, 0.0, (p.y - 0.46).abs());
             let near_hem = smoothstep(0.26, 0.10, p.y);
             let near_crotch = smoothstep(0.12, 0.0, (p.y - 0.80).abs());
-            offset += 0.004 * folds * (near_knee * 0.8 + near_hem * 1.2 + near_crotch * 0.6);
+            offset += 0.0035 * folds * (near_knee * 0.5 + near_hem * 1.2 + near_crotch * 0.6);
             offset += 0.003 * self.noise.sum(p * 13.0 + 7.0, 2);
             self.over(i, node, offset.max(0.005))
         });
@@ -206,7 +208,7 @@ impl Tailor {
                     for row in 0..=ROWS {
                         let t = row as f32 / ROWS as f32;
                         let wave = 0.004 * t * self.noise.at(Vec3::new(around * 16.0, t * 2.5, 3.0));
-                        let flare = out.normalize_or(Vec3::Z) * (0.014 * (t * 3.0).min(1.0) - 0.012 * t * t + wave);
+                        let flare = out.normalize_or(Vec3::Z) * (0.010 * (t * 3.0).min(1.0) - 0.012 * t * t + wave);
                         let position = node.position + flare - Vec3::Y * drop * t;
                         let average = p - Vec3::Y * drop * t;
                         hair.nodes.push(Node { position, average, ..node });
@@ -233,8 +235,19 @@ fn add_bun(hair: &mut Sheet) {
     else {
         return;
     };
-    let centre = near.position + Vec3::new(0.0, 0.008, -0.016);
+    let beside = Vec3::new(0.045, 1.615, 0.0);
+    let by_distance = |a: &&Node, b: &&Node| a.average.distance(beside).total_cmp(&b.average.distance(beside));
+    let patch = hair.nodes.iter().min_by(by_distance).map_or(near.uv, |node| node.uv);
+    let first = hair.nodes.len();
+    let centre = near.position + Vec3::new(0.0, 0.008, -0.014);
     ball(hair, &near, centre, 0.036, centre_average);
+    for node in &mut hair.nodes[first..] {
+        let out = (node.position - centre) / 0.036;
+        // Wound hair: a spiral ridge, and strands from the crown's part of the texture.
+        let ridge = (out.x.atan2(out.y) * 3.0 + out.z * 9.0).sin();
+        node.position += out * 0.0022 * ridge;
+        node.uv = patch + Vec2::new(out.x + out.z, out.y) * 0.012;
+    }
 }
 
 /// Adds a sphere carried by `near`'s body point; its nodes' `average` lies on a sphere around `average`.
@@ -272,5 +285,14 @@ pub(crate) fn visible_skin(body: &Sheet, look: &Look) -> Sheet {
     let covered = |node: &Node| {
         inside_top(look, node) > MARGIN_M || inside_bottom(node) > MARGIN_M || node.average.y < ANKLE_TOP_M
     };
-    body.filtered(|corners| !corners.iter().all(|node| covered(node))).compacted()
+    let mut skin = body.filtered(|corners| !corners.iter().all(|node| covered(node))).compacted();
+    if look.cut == HairCut::Bob {
+        // The hair holds the ears flat.
+        for node in &mut skin.nodes {
+            if is_ear(node.average) {
+                node.position.x -= node.average.x.signum() * (node.average.x.abs() - 0.064).max(0.0);
+            }
+        }
+    }
+    skin
 }

@@ -96,8 +96,8 @@ impl Look {
         let by_seed = builds[(config.seed.wrapping_sub(1) % builds.len() as u64) as usize];
         let build = if config.person.build == Build::BySeed { by_seed } else { config.person.build };
         let [gender, muscle, weight, height, proportions] = match build {
-            Build::SlimWoman => [0.02, 0.50, 0.42, 0.52, 0.85],
-            Build::RoundWoman => [0.05, 0.45, 0.74, 0.40, 0.60],
+            Build::SlimWoman => [0.00, 0.38, 0.40, 0.56, 0.90],
+            Build::RoundWoman => [0.00, 0.40, 0.72, 0.46, 0.70],
             Build::SlimMan => [0.96, 0.50, 0.36, 0.62, 0.75],
             Build::HeavyMan => [1.00, 0.50, 0.84, 0.55, 0.55],
             Build::BroadMan | Build::BySeed => [1.00, 0.78, 0.58, 0.66, 0.85],
@@ -135,7 +135,7 @@ impl Look {
             top: TOPS[pick(TOPS.len())],
             sleeve_m: if long_sleeves { 0.465 } else { 0.16 },
             v_neck_m: if pick(3) == 0 { 0.09 } else { 0.0 },
-            top_offset_m: if long_sleeves { 0.015 } else { 0.013 },
+            top_offset_m: if long_sleeves { 0.011 } else { 0.010 },
             knit: long_sleeves,
             denim,
             bottom: if denim { [0.17, 0.25, 0.41] } else { CHINOS[pick(CHINOS.len())] },

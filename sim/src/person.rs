@@ -1,6 +1,6 @@
 //! A dressed person: all surfaces in one mesh with its textures.
 
-use flyrig_body::{Part, ShapeParams, Template, default_template};
+use flyrig_body::{ShapeParams, Template, default_template};
 use glam::{Vec2, Vec3};
 
 use crate::SimError;
@@ -98,10 +98,9 @@ fn paint(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Texture> {
         let [a, b, c] = corners(v).map(|node| node.average);
         a * w.x + b * w.y + c * w.z
     };
-    let part = |v: [u32; 3], w: Vec3| -> Part { corners(v)[w.max_position()].part };
     let top = map.paint(naked, |v, w| {
         let inside = corners(v).map(|node: &Node| inside_top(look, node));
-        top_colour(look, noise(21), point(v, w), part(v, w), Vec3::from(inside).dot(w))
+        top_colour(look, noise(21), point(v, w), Vec3::from(inside).dot(w))
     });
     let bottom = map.paint(naked, |v, w| {
         let inside = corners(v).map(inside_bottom);
@@ -111,7 +110,7 @@ fn paint(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Texture> {
     let extras = Texture::from_fn(side, |uv: Vec2| match (uv.x < 0.5, uv.y < 0.5) {
         (true, _) => upper_colour(look, noise(24), Vec2::new((uv.x - 0.01) / 0.48, (uv.y - 0.02) / 0.96)),
         (false, true) => sole_colour(look, noise(25), uv),
-        (false, false) => eye_colour(look, (uv - 0.75) / 0.24),
+        (false, false) => eye_colour(look, (uv - 0.75) / 0.12),
     });
     vec![
         map.paint(naked, |v, w| skin_colour(look, noise(20), point(v, w))),

@@ -1,23 +1,18 @@
 //! Colours of cloth, shoes and hair.
 
-use flyrig_body::Part;
 use glam::{Vec2, Vec3};
 
 use crate::look::{Look, Print, Srgb};
 use crate::noise::{Noise, smoothstep};
-use crate::regions::{along_arm, below_neckline};
+use crate::regions::{along_arm, around_arm, below_neckline, on_sleeve};
 use crate::texture::{mix3, scale3};
 
 /// Colour of the top at a point of the average body, `inside` metres from the cloth's edge.
-pub(crate) fn top_colour(look: &Look, noise: Noise, p: Vec3, part: Part, inside: f32) -> Srgb {
-    let arm = matches!(part, Part::LeftArm | Part::RightArm);
+pub(crate) fn top_colour(look: &Look, noise: Noise, p: Vec3, inside: f32) -> Srgb {
+    let arm = on_sleeve(p);
     // Cloth coordinates: across, down. Sleeves have their own piece of cloth.
-    let (across, down) = if arm {
-        let (along, _) = along_arm(p);
-        (p.z * 1.1 + p.y * 0.2, along)
-    } else {
-        (p.x.atan2(if p.z > 0.0 { 0.16 } else { -0.16 }) * 0.15, -p.y)
-    };
+    let (across, down) =
+        if arm { (around_arm(p) * 0.0509, along_arm(p).0) } else { ((p.x / 0.16).atan2(p.z / 0.11) * 0.14, -p.y) };
     let [ground, print] = look.top;
     let blend = |on: f32| mix3(ground, print, on);
     let band = |at: f32, period: f32, share: f32| {
@@ -28,8 +23,8 @@ pub(crate) fn top_colour(look: &Look, noise: Noise, p: Vec3, part: Part, inside:
         Print::Plain => ground,
         Print::Stripes => blend(band(down, 0.058, 0.42)),
         Print::Checks => {
-            let (a, b) = (band(down, 0.075, 0.5), band(across, 0.075, 0.5));
-            let fine = band(down, 0.075, 0.06).max(band(across, 0.075, 0.06));
+            let (a, b) = (band(down, 0.075, 0.5), band(across, 0.0733, 0.5));
+            let fine = band(down, 0.075, 0.06).max(band(across, 0.0733, 0.06));
             mix3(blend(0.48 * (a + b)), [0.95, 0.93, 0.88], fine * 0.5)
         }
         Print::Dots => {

@@ -57,7 +57,26 @@ pub(crate) fn above_hairline(p: Vec3, recede_m: f32) -> f32 {
     let ((a0, y0), (a1, y1)) = (LINE[next - 1], LINE[next]);
     let line = lerp(y0, y1, ((around - a0) / (a1 - a0)).clamp(0.0, 1.0));
     let recede = if around < 1.0 { recede_m * (1.0 - around) } else { 0.0 };
-    let ear = p.x.abs() > 0.0665 && p.y < 1.562 && (0.012..0.075).contains(&p.z);
     let above = p.y - line - recede;
-    if ear { above.min(-0.002) } else { above }
+    if is_ear(p) { above.min(-0.012) } else { above }
+}
+
+/// Whether a point of the average body is on an ear.
+pub(crate) fn is_ear(p: Vec3) -> bool {
+    p.x.abs() > 0.0665 && (1.495..1.562).contains(&p.y) && (0.012..0.075).contains(&p.z)
+}
+
+/// Whether a point of a top belongs to its sleeve.
+pub(crate) fn on_sleeve(p: Vec3) -> bool {
+    let (along, from_axis) = along_arm(p);
+    along > 0.012 && from_axis < 0.078 && p.x.abs() > 0.13
+}
+
+/// Angle around the upper arm's axis, 0 on its outer side.
+pub(crate) fn around_arm(p: Vec3) -> f32 {
+    let p = Vec3::new(p.x.abs(), p.y, p.z);
+    let outward = Vec3::new(SHOULDER.y - ELBOW.y, ELBOW.x - SHOULDER.x, 0.0).normalize_or(Vec3::X);
+    let from_axis = p - SHOULDER;
+    let forward = if p.x > ELBOW.x { (p.x - ELBOW.x) / (WRIST.x - ELBOW.x) * (WRIST.z - ELBOW.z) } else { 0.0 };
+    (from_axis.z - forward).atan2(from_axis.dot(outward))
 }

@@ -177,7 +177,7 @@ impl Room {
             let q = Vec2::new((along - centre).abs(), (z - 1.75).abs()) - size;
             let edge = q.x.max(q.y);
             if edge < 0.05 {
-                let tint = [5, 6, 8].map(|c| 0.45 + 0.25 * self.noise.cell(k, wall as i32, c));
+                let tint = [5, 6, 8].map(|c| 0.52 + 0.11 * self.noise.cell(k, wall as i32, c));
                 let scene = self.noise.sum(Vec3::new(along * 3.0, z * 4.0, 20.0 + wall as f32), 4);
                 let picture = mix3(tint, scale3(tint, 0.5), smoothstep(-0.15, 0.2, scene + 1.6 * (z - 1.75)));
                 colour = if edge < 0.0 { picture } else { [0.22, 0.18, 0.15] };

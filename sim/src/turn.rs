@@ -100,8 +100,11 @@ impl<'a> Puppet<'a> {
         let facing = DQuat::from_rotation_y(yaw);
         let root = facing * DQuat::from_rotation_z(0.030 * shift) * DQuat::from_rotation_x(0.015 * wave(3.0, 0.1));
         let hips = self.origins[0];
-        let sink = 0.022 + 0.006 * (TAU * steps).cos();
-        let root_at = DVec3::new(0.0, hips.y - sink + SOLE, 0.0) + facing * DVec3::new(0.022 * shift, 0.0, -0.01);
+        // Legs all but straight: the hips hang at the height that the leg bones allow.
+        let [hip, knee, ankle] = [self.legs[0].hip, self.legs[0].knee, self.legs[0].ankle].map(|j| self.origins[j]);
+        let leg_m = hip.distance(knee) + knee.distance(ankle);
+        let height = ankle.y + SOLE + 0.988 * leg_m + (hips.y - hip.y) - 0.004 * (1.0 + (TAU * steps).cos());
+        let root_at = DVec3::new(0.0, height, 0.0) + facing * DVec3::new(0.022 * shift, 0.0, -0.01);
 
         // Rotations away from rest, in canonical axes, accumulated from the root.
         let mut delta: Vec<Option<DQuat>> = vec![None; self.origins.len()];
