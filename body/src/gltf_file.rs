@@ -5,6 +5,7 @@ use std::path::Path;
 use base64::Engine;
 use gltf::accessor::{DataType, Dimensions};
 use gltf::buffer::Source;
+use gltf::json::validation::Checked;
 
 use crate::BodyError;
 
@@ -32,7 +33,7 @@ impl<'a> GltfFile<'a> {
         let invalid = |error: gltf::Error| fail(format!("not a valid glTF 2.0 file: {error}"));
         let gltf::Gltf { document, mut blob } = gltf::Gltf::from_slice_without_validation(&bytes).map_err(invalid)?;
         let json = document.into_json();
-        check_indices(&json).map_err(fail)?;
+        check_trusted(&json).map_err(fail)?;
         let document = gltf::Document::from_json(json).map_err(invalid)?;
         let mut buffers = Vec::new();
         for buffer in document.buffers() {
@@ -120,18 +121,17 @@ impl<'a> GltfFile<'a> {
     }
 }
 
-/// The indices that gltf 1.4 follows before or without checking them.
-fn check_indices(json: &gltf::json::Root) -> Result<(), String> {
+/// What gltf 1.4 trusts without checking it first.
+fn check_trusted(json: &gltf::json::Root) -> Result<(), String> {
     let primitives = json.meshes.iter().flat_map(|mesh| &mesh.primitives);
     if primitives.flat_map(|primitive| primitive.attributes.values()).any(|index| index.value() >= json.accessors.len())
     {
         return Err("a mesh names an accessor that does not exist; the file is damaged".to_owned());
     }
-    let lost = |animation: &gltf::json::Animation| {
-        animation.channels.iter().any(|channel| channel.sampler.value() >= animation.samplers.len())
-    };
-    if json.animations.iter().any(lost) {
-        return Err("an animation names a sampler that does not exist; the file is damaged".to_owned());
+    for target in json.animations.iter().flat_map(|animation| &animation.channels).map(|channel| &channel.target) {
+        if target.node.value() >= json.nodes.len() || target.path == Checked::Invalid {
+            return Err("an animation moves a node or a property that does not exist; the file is damaged".to_owned());
+        }
     }
     Ok(())
 }

@@ -73,7 +73,7 @@ pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<Su
         .triangles
         .iter()
         .map(|triangle| {
-            let [a, b, c] = corners(template, triangle).map(|p| p.as_dvec3());
+            let [a, b, c] = corners(template, triangle).map(Vec3::as_dvec3);
             area += 0.5 * (b - a).cross(c - a).length();
             area
         })
