@@ -82,21 +82,24 @@ fn views(frame: &Frame, size: u32) -> Vec<View> {
     scene::ring(size).iter().map(|camera| scene::view(frame, camera, BACKGROUND, scene::pattern)).collect()
 }
 
-/// Largest difference of a colour channel.
-fn difference(ours: &[[f32; 4]], reference: &[DVec3]) -> f64 {
+/// Largest difference of a colour channel, and its mean over the Gaussians.
+fn difference(ours: &[[f32; 4]], reference: &[DVec3]) -> (f64, f64) {
     assert_eq!(ours.len(), reference.len());
     let one = |(a, b): (&[f32; 4], &DVec3)| {
         assert!(a.iter().all(|x| x.is_finite()), "{a:?}");
         assert_eq!(a[3].to_bits(), 1f32.to_bits(), "opacity");
         (DVec4::from_array(a.map(f64::from)).truncate() - *b).abs().max_element()
     };
-    ours.iter().zip(reference).map(one).fold(0.0, f64::max)
+    let each: Vec<f64> = ours.iter().zip(reference).map(one).collect();
+    (each.iter().copied().fold(0.0, f64::max), each.iter().sum::<f64>() / each.len() as f64)
 }
 
 /// f32 positions at 2.5 m and pixels at 100 leave about 1e-5 of a pixel; neighbouring texels differ by up to 1.
 const TOLERANCE: f64 = 5e-4;
-/// The baseline also divides by weights of 1e-3 times a sliver of mask coverage.
-const BASELINE_TOLERANCE: f64 = 2e-3;
+/// The baseline gives the rim its full say, where a sample holds as little as 1% of believed texels: the pixel's
+/// rounding counts a hundredfold there. The mean must not notice.
+const BASELINE_TOLERANCE: f64 = 5e-3;
+const MEAN_TOLERANCE: f64 = 3e-5;
 
 #[test]
 fn agrees_with_the_reference_over_time_in_every_setting() {
@@ -111,8 +114,9 @@ fn agrees_with_the_reference_over_time_in_every_setting() {
             let (frame, views) = (&frames[frame], &pictures[frame][seen]);
             let ours = rig.update(frame, views, &settings);
             let expected = rig.reference(frame, views, &settings, &mut memory);
-            let worst = difference(&ours, &expected);
-            println!("{settings:?} {} views: {worst:.2e}", views.len());
+            let (worst, mean) = difference(&ours, &expected);
+            println!("{settings:?} {} views: max {worst:.2e}, mean {mean:.2e}", views.len());
+            assert!(mean < MEAN_TOLERANCE, "{settings:?}: mean {mean}");
             assert!(worst < if settings.space { TOLERANCE } else { BASELINE_TOLERANCE }, "{settings:?}: {worst}");
         }
     }

@@ -15,6 +15,9 @@ const NEAR_M: f32 = 1e-3;
 /// Less than half covered by Gaussians, a pixel shows no surface to compare with.
 const MIN_RENDERED_ALPHA: f32 = 0.5;
 
+/// A sample with less of the person in it says nothing: its colour would be rounding errors of a sliver.
+const MIN_COVERAGE: f32 = 0.01;
+
 /// The baseline's small number: far below the weight of a visible view, far above rounding.
 const BASELINE_VIEW_WEIGHT: f32 = 1e-3;
 
@@ -67,7 +70,7 @@ impl Kernels {
 fn sources() -> [(&'static str, String); 4] {
     let constants = format!(
         "const WORKGROUP: u32 = {WORKGROUP}u;\nconst NEAR_M: f32 = {NEAR_M:?};\n\
-         const MIN_RENDERED_ALPHA: f32 = {MIN_RENDERED_ALPHA:?};\nconst MID_GREY: f32 = {:?};\n\
+         const MIN_RENDERED_ALPHA: f32 = {MIN_RENDERED_ALPHA:?};\nconst MIN_COVERAGE: f32 = {MIN_COVERAGE:?};\nconst MID_GREY: f32 = {:?};\n\
          const RELAX_STEPS: u32 = {}u;\nconst DAMPING: f32 = {:?};\n",
         linear_from_srgb(0.5),
         DiffusionHierarchy::RELAX_STEPS,

@@ -74,7 +74,7 @@ fn main(
         coverage += belief;
         rendered += share * rendered_canonical[index];
     }
-    if !(coverage > 0.0) {
+    if !(coverage >= MIN_COVERAGE) {
         return;
     }
     color /= coverage;

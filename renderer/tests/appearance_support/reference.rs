@@ -57,7 +57,7 @@ fn observe(person: &Person, frame: &Frame, views: &[View], settings: &Appearance
             coverage += belief;
             rendered += DVec4::from_array(view.canonical[index].map(f64::from)) * share;
         }
-        if coverage <= 0.0 {
+        if coverage < 0.01 {
             continue;
         }
         let mut weight = 0.0;
