@@ -1,4 +1,6 @@
 //! BVH clips: what is read, where errors point, and how the motion arrives on the body.
+// Helpers of tests may stop a test.
+#![allow(clippy::unwrap_used, clippy::panic)]
 
 use std::path::Path;
 

@@ -1,4 +1,6 @@
 //! Linear blend skinning: CPU and GPU against the plain f64 reference.
+// Helpers of tests may stop a test.
+#![allow(clippy::unwrap_used, clippy::panic)]
 
 use flyrig_body::{
     BodyError, GpuSkinner, ShapeParams, SurfaceGaussians, default_template, sample_surface, skin_mesh, skin_normal_f64,
