@@ -284,7 +284,7 @@ mod tests {
             ("[source]\nkind = \"folder\"\n", "source.path is empty"),
             ("[source]\nkind = \"folder\"\npath = \"x\"\n", "body.template is empty"),
             ("[rig]\nname = \"a/b\"\n", "rig.name is 'a/b'"),
-            ("[sim]\nwidth = -4\n", "sim"),
+            ("[sim]\nwidth = -4\n", "invalid value: integer `-4`"),
         ] {
             let error = format!("{:#}", Config::parse(text).unwrap_err());
             assert!(error.contains(expected), "{text}: {error}");

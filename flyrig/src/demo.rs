@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use flyrig_calib::SyncConfig;
 use flyrig_capture::{CameraSource, Pacing};
 use flyrig_gpu::GpuContext;
@@ -241,6 +241,7 @@ fn pass(
         advance(&bar, limit.map_or(pass.frames, |_| started.elapsed().as_secs()), &pass.sheet);
     }
     bar.finish_and_clear();
+    ensure!(pass.frames > 0 || stop::requested(), "the simulated cameras gave no frame; the warnings above say why");
     pass.memory.extend(resident_mib().map(|mib| (started.elapsed().as_secs_f64(), mib)));
     pass.seconds = started.elapsed().as_secs_f64();
     pass.stages = pipeline.stages.summary();

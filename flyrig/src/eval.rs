@@ -91,7 +91,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
                 PoseEstimator::new(PoseNet::embedded()?, &default_template(&ShapeParams::default())?, &rig, config)?;
             set_plates(&mut estimator, &plates)?;
             let fit = estimator.fit_shape(&buffered).context("no person found in the first frames")?;
-            eprintln!("eval: the person is {:.2} m tall, landmarks within {:.1} px", fit.height_m, fit.residual_px);
+            eprintln!("eval: the person is {:.2} m tall", fit.height_m);
             (estimator.template().clone(), PoseSource::Estimator(Box::new(estimator)))
         }
     };

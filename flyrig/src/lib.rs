@@ -78,7 +78,7 @@ fn gpu(adapter: Option<&str>) -> Result<GpuContext> {
 
 fn start_log(cli: &Cli) {
     let level = match cli.verbose {
-        0 => "warn,flyrig=info",
+        0 => "warn,flyrig=info,zenoh=error",
         1 => {
             "info,flyrig=debug,flyrig_capture=debug,flyrig_calib=debug,flyrig_tracker=debug,flyrig_renderer=debug,flyrig_transport=debug,flyrig_gpu=debug"
         }

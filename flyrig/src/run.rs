@@ -177,7 +177,7 @@ fn learn_shape(estimator: &mut PoseEstimator, intake: &mut Intake) -> Result<()>
         }
         match estimator.fit_shape(&sets) {
             Ok(fit) => {
-                eprintln!("run: the person is {:.2} m tall, landmarks within {:.1} px", fit.height_m, fit.residual_px);
+                eprintln!("run: the person is {:.2} m tall", fit.height_m);
                 return Ok(());
             }
             Err(error) => tracing::warn!(%error, "nobody seen, trying again"),

@@ -1,1 +1,9 @@
-//! (skeleton)
+//! What the end-to-end tests share: a small simulated data set on disk, and running the command on it.
+
+mod command;
+mod dataset;
+mod gltf;
+
+pub use command::{Finished, run};
+pub use dataset::{Dataset, FRAMES, SIDE, write_dataset};
+pub use gltf::write_glb;

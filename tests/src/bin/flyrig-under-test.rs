@@ -1,0 +1,7 @@
+//! The `flyrig` command, built by this package so that its tests can start it.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    flyrig::main()
+}

@@ -1,0 +1,113 @@
+//! A damaged data set gives one clear line and a failing exit, or costs the one picture that is damaged.
+
+use flyrig_tests::{Dataset, FRAMES, Finished, run, write_dataset};
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
+
+fn eval(data: &Dataset, extra: &[&str]) -> Finished {
+    let (root, out) = (data.root.to_str().unwrap().to_owned(), data.out().to_str().unwrap().to_owned());
+    let mut args = vec!["eval", &root, "--inputs", "00,02,05", "--holdout", "01", "--out", &out];
+    args.extend(["--gaussians", "4000", "--nodes", "200"]);
+    args.extend(extra);
+    run(PROGRAM, &args, data.root.parent().unwrap()).unwrap()
+}
+
+/// Fails with this text, says nothing else, leaves no results.
+fn assert_refused(data: &Dataset, finished: &Finished, expected: &str) {
+    assert_eq!(finished.code, Some(1), "{finished:?}");
+    assert!(finished.stderr.contains(expected), "expected '{expected}' in: {}", finished.stderr);
+    assert!(!finished.stderr.contains("panicked"), "{}", finished.stderr);
+    assert!(!data.out().join("metrics.json").exists());
+}
+
+#[test]
+fn a_missing_camera_is_named_with_those_there_are() {
+    let data = write_dataset().unwrap();
+    std::fs::remove_dir_all(data.root.join("images/02")).unwrap();
+    let finished = eval(&data, &[]);
+    assert_refused(&data, &finished, "02");
+    assert!(finished.stderr.contains("00"), "lists what there is: {}", finished.stderr);
+
+    let data = write_dataset().unwrap();
+    let root = data.root.to_str().unwrap();
+    let finished = run(
+        PROGRAM,
+        &["eval", root, "--inputs", "00,9", "--holdout", "01", "--out", "out"],
+        data.root.parent().unwrap(),
+    )
+    .unwrap();
+    assert_refused(&data, &finished, "camera 9 is not in the calibration");
+}
+
+#[test]
+fn a_truncated_picture_costs_that_picture() {
+    let data = write_dataset().unwrap();
+    let path = data.picture("02", 1);
+    let bytes = std::fs::read(&path).unwrap();
+    std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+    let finished = eval(&data, &[]);
+    assert_eq!(finished.code, Some(0), "{finished:?}");
+    assert!(finished.stderr.contains("camera 02") && finished.stderr.contains("going on"), "{}", finished.stderr);
+    let metrics: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(data.out().join("metrics.json")).unwrap()).unwrap();
+    assert_eq!(metrics["frames"], FRAMES, "every frame was rendered");
+    assert_eq!(metrics["sync"]["partial"], 1);
+    assert_eq!(metrics["sync"]["broken_pictures"], 1);
+}
+
+#[test]
+fn an_empty_mask_costs_that_view() {
+    let data = write_dataset().unwrap();
+    let black = image::GrayImage::new(flyrig_tests::SIDE, flyrig_tests::SIDE);
+    for frame in 0..FRAMES {
+        black.save(data.mask("05", frame)).unwrap();
+    }
+    let finished = eval(&data, &[]);
+    assert_eq!(finished.code, Some(0), "{finished:?}");
+    let metrics: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(data.out().join("metrics.json")).unwrap()).unwrap();
+    assert_eq!(metrics["counts"]["without_mask"], FRAMES);
+    let psnr = metrics["mean"]["psnr_db"].as_f64().unwrap();
+    assert!(psnr.is_finite() && psnr > 10.0, "{psnr}");
+}
+
+#[test]
+fn a_mask_of_another_size_costs_that_picture_and_names_both_sizes() {
+    let data = write_dataset().unwrap();
+    image::GrayImage::new(30, 20).save(data.mask("00", 0)).unwrap();
+    let finished = eval(&data, &[]);
+    assert_eq!(finished.code, Some(0), "{finished:?}");
+    assert!(finished.stderr.contains("30x20") && finished.stderr.contains("160x160"), "{}", finished.stderr);
+}
+
+#[test]
+fn nan_in_the_calibration_is_refused_by_file_and_camera() {
+    let data = write_dataset().unwrap();
+    let path = data.root.join("intri.yml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    // The first number of the first camera matrix.
+    let start = text.find("K_00").unwrap();
+    let data_at = start
+        + text[start..].find("data:").unwrap()
+        + text[start..][text[start..].find("data:").unwrap()..].find('[').unwrap()
+        + 1;
+    let end = data_at + text[data_at..].find(',').unwrap();
+    std::fs::write(&path, format!("{} .Nan{}", &text[..data_at], &text[end..])).unwrap();
+    let finished = eval(&data, &[]);
+    assert_refused(&data, &finished, "intri.yml");
+    assert!(finished.stderr.contains("00"), "{}", finished.stderr);
+}
+
+#[test]
+fn other_mistakes_are_told_in_one_line() {
+    let data = write_dataset().unwrap();
+    let both = eval(&data, &["--holdout", "02"]);
+    assert_ne!(both.code, Some(0));
+    std::fs::remove_file(data.root.join("subject.glb")).unwrap();
+    let finished = eval(&data, &[]);
+    assert_refused(&data, &finished, "--pose given needs one skinned glTF file");
+    let finished = eval(&data, &["--frames", "5..2"]);
+    assert_eq!(finished.code, Some(2), "clap's own refusal: {}", finished.stderr);
+    std::fs::write(data.root.join("subject.glb"), b"glTF\x02\0\0\0\xff\xff\xff\xff").unwrap();
+    assert_refused(&data, &eval(&data, &[]), "subject.glb");
+}
