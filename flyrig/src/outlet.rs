@@ -152,10 +152,8 @@ impl Outlet {
     /// Sends what waits and ends the thread and the session.
     pub fn finish(mut self) -> Result<()> {
         self.jobs.close();
-        if let Some(encoder) = self.encoder.take() {
-            if encoder.join().is_err() {
-                tracing::error!("the compression thread had ended early");
-            }
+        if self.encoder.take().is_some_and(|encoder| encoder.join().is_err()) {
+            tracing::error!("the compression thread had ended early");
         }
         match Arc::try_unwrap(self.publisher) {
             Ok(publisher) => Ok(publisher.close()?),

@@ -139,13 +139,13 @@ impl ScoreSheet {
         }
         names
             .into_iter()
-            .filter_map(|name| mean(name, self.frames.iter().filter(|score| score.camera == name)))
+            .filter_map(|name| mean(name, &self.frames.iter().filter(|score| score.camera == name)))
             .collect()
     }
 
     /// Mean over all pictures.
     pub fn mean(&self) -> Option<CameraScore> {
-        mean("all", self.frames.iter())
+        mean("all", &self.frames.iter())
     }
 
     /// PSNR over frames, a line a camera.
@@ -180,7 +180,7 @@ impl ScoreSheet {
     }
 }
 
-fn mean<'a>(name: &str, scores: impl Iterator<Item = &'a FrameScore> + Clone) -> Option<CameraScore> {
+fn mean<'a>(name: &str, scores: &(impl Iterator<Item = &'a FrameScore> + Clone)) -> Option<CameraScore> {
     let frames = scores.clone().count();
     if frames == 0 {
         return None;

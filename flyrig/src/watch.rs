@@ -82,11 +82,11 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
             Ok(None) => {}
             Err(error) => eprintln!("watch: {error}"),
         }
-        if let ViewpointStatus::Refused { reason } = subscriber.viewpoint_status() {
-            if reason != refused {
-                eprintln!("watch: the rig refuses the viewpoint: {reason}");
-                refused = reason;
-            }
+        if let ViewpointStatus::Refused { reason } = subscriber.viewpoint_status()
+            && reason != refused
+        {
+            eprintln!("watch: the rig refuses the viewpoint: {reason}");
+            refused = reason;
         }
         if last_print.elapsed() >= PRINT_EVERY {
             last_print = Instant::now();

@@ -28,8 +28,19 @@ fn main() -> Result<(), Box<dyn Error>> {
     println!("times: median of {RUNS} runs, milliseconds; errors: linear colour and alpha over the body's pixels\n");
     println!(
         "{:>9} {:>7} {:>5} {:>6} | {:>6} {:>7} {:>6} {:>6} {:>7} | {:>7} {:>6} | {:>17} | {:>24}",
-        "picture", "count", "cull", "output", "proj.", "sort", "lists", "blend", "total", "visible", "pairs",
-        "own f64 max mean", "full f64 max mean >1/255"
+        "picture",
+        "count",
+        "cull",
+        "output",
+        "proj.",
+        "sort",
+        "lists",
+        "blend",
+        "total",
+        "visible",
+        "pairs",
+        "own f64 max mean",
+        "full f64 max mean >1/255"
     );
     let full_scene = body(115_000)?;
     let scenes = [115_000, 57_000, 29_000].map(|count| (count, body(count)));
@@ -54,7 +65,10 @@ fn main() -> Result<(), Box<dyn Error>> {
                 println!(
                     "{name:>9} {count:>7} {cull:>5} {output:>6} | {project:6.2} {sort:7.2} {lists:6.2} {blend:6.2} {:7.2} | \
                      {:>7} {:>6} | {max:8.1e} {mean:8.1e} | {full_max:8.1e} {full_mean:8.1e} {:5.2}%",
-                    run.total, run.visible, run.pairs, seen * 100.0
+                    run.total,
+                    run.visible,
+                    run.pairs,
+                    seen * 100.0
                 );
                 if let (Some(folder), "all") = (&folder, output) {
                     std::fs::create_dir_all(folder)?;
@@ -100,8 +114,11 @@ fn measure(gpu: &GpuContext, scene: &Scene, camera: &Camera, settings: &RasterSe
         }
     }
     let stats = rasterizer.stats(gpu)?;
-    let pictures =
-        Pictures { color: target.color.read(gpu)?, depth: target.depth.read(gpu)?, canonical: target.canonical.read(gpu)? };
+    let pictures = Pictures {
+        color: target.color.read(gpu)?,
+        depth: target.depth.read(gpu)?,
+        canonical: target.canonical.read(gpu)?,
+    };
     Ok(Run {
         stages: stages.map(median),
         total: median(totals),

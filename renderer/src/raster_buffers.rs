@@ -81,7 +81,7 @@ impl Layout {
         let count = tiles[0].saturating_mul(tiles[1]).max(1);
         let bin_chunks = (shape.max_tile_table / count).clamp(1, shape.max_bin_chunks);
         let limits = gpu.device.limits();
-        let limit = limits.max_buffer_size.min(u64::from(limits.max_storage_buffer_binding_size)) / 4;
+        let limit = limits.max_buffer_size.min(limits.max_storage_buffer_binding_size) / 4;
         // Each invocation of the binning walks over its share of the pairs.
         let limit = limit.min(u64::from(bin_chunks) * MAX_LOOP);
         let wanted = PAIRS_PER_GAUSSIAN * gaussians as u64 + PAIRS_PER_TILE * u64::from(count);

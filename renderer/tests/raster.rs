@@ -1,4 +1,5 @@
 //! The rasteriser against the f64 reference, over random and poisoned scenes.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 mod support;
 
@@ -95,7 +96,13 @@ fn poison(rng: &mut StdRng, scene: &mut Scene) {
     }
 }
 
-fn check(name: &str, rasterizer: &mut Rasterizer, scene: &Scene, camera: &Camera, settings: &RasterSettings) -> Difference {
+fn check(
+    name: &str,
+    rasterizer: &mut Rasterizer,
+    scene: &Scene,
+    camera: &Camera,
+    settings: &RasterSettings,
+) -> Difference {
     let size = (camera.intrinsics.width, camera.intrinsics.height);
     let gaussians = upload(gpu(), scene).unwrap();
     let ours = render(gpu(), rasterizer, &gaussians, camera, settings, size).unwrap();

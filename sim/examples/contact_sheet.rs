@@ -6,7 +6,7 @@ use std::error::Error;
 use std::time::Instant;
 
 use flyrig_gpu::{AdapterChoice, GpuContext};
-use flyrig_sim::{SimConfig, Simulator};
+use flyrig_sim::{MotionKind, SimConfig, Simulator, find_debian_clip};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -23,6 +23,10 @@ fn main() -> Result<(), Box<dyn Error>> {
             config.cameras.focal_heights = focal_heights.parse()?;
             config.cameras.target_height_m = args.get(5).map_or(Ok(1.55), |height| height.parse())?;
             config.cameras.radial = [0.0; 2];
+        }
+        // Every third person moves by a clip where there is one.
+        if row % 3 == 2 && find_debian_clip().is_ok() {
+            config.motion.kind = MotionKind::Bvh;
         }
         let start = Instant::now();
         let mut simulator = Simulator::new(&gpu, &config)?;

@@ -80,6 +80,9 @@ pub struct MotionConfig {
     pub bvh: Option<PathBuf>,
     /// Seconds of the BVH clip to skip.
     pub start_secs: f64,
+    /// Farthest that a BVH clip may walk from the ring's centre, metres; the path of one that goes farther is
+    /// scaled down (its feet then slide), so that the cameras keep seeing the person.
+    pub reach_m: f64,
 }
 
 /// Cameras on a ring around the person, all looking at the same point.
@@ -118,7 +121,7 @@ impl Default for SimConfig {
 
 impl Default for MotionConfig {
     fn default() -> Self {
-        Self { kind: MotionKind::Turn, turn_secs: 10.0, bvh: None, start_secs: 0.0 }
+        Self { kind: MotionKind::Turn, turn_secs: 10.0, bvh: None, start_secs: 0.0, reach_m: 0.5 }
     }
 }
 
@@ -162,6 +165,7 @@ impl SimConfig {
             check("cameras.radial", k, -1.0, 1.0, "coefficients between -1 and 1")?;
         }
         check("motion.turn_secs", motion.turn_secs, 1.0, 600.0, "1 to 600 seconds")?;
+        check("motion.reach_m", motion.reach_m, 0.0, 100.0, "0 to 100 metres")?;
         check("motion.start_secs", motion.start_secs, 0.0, 3600.0, "0 to 3600 seconds")
     }
 }

@@ -7,11 +7,11 @@ use glam::{Mat4, Vec2, Vec3};
 use wgpu::util::DeviceExt;
 use wgpu::{
     BindGroup, BindingResource, Buffer, BufferUsages, Color, CommandEncoder, CompareFunction, LoadOp, Operations,
-    RenderPassColorAttachment, RenderPassDepthStencilAttachment, RenderPipeline, StoreOp, Texture, TextureDescriptor,
-    TextureDimension, TextureFormat, TextureUsages, TextureView, VertexAttribute, VertexBufferLayout, VertexFormat,
-    VertexStepMode,
+    RenderPassColorAttachment, RenderPassDepthStencilAttachment, RenderPipeline, StoreOp, Texture, TextureFormat,
+    TextureUsages, TextureView,
 };
 
+use crate::gpu_parts::{COLOR, DEPTH, bind, pipeline, texture, upload_plate, upload_textures, view_of};
 use crate::person::Person;
 use crate::room::Plate;
 
@@ -21,8 +21,6 @@ const SHADOW_PX: u32 = 1024;
 /// Half the side of the lit box around the person, metres.
 const SHADOW_HALF_M: f32 = 1.35;
 const NEAR_M: f32 = 0.1;
-const COLOR: TextureFormat = TextureFormat::Rgba8UnormSrgb;
-const DEPTH: TextureFormat = TextureFormat::Depth32Float;
 
 /// WGSL of the drawing passes and of the composition.
 pub(crate) fn shader_sources() -> [(&'static str, String); 2] {
@@ -165,8 +163,8 @@ impl Drawing {
             ..Default::default()
         });
         let uniform = view.as_entire_binding();
-        let shadow_bind = bind(gpu, &shadow_pipeline, &[uniform.clone()]);
-        let truth_bind = bind(gpu, &truth_pipeline, &[uniform.clone()]);
+        let shadow_bind = bind(gpu, &shadow_pipeline, std::slice::from_ref(&uniform));
+        let truth_bind = bind(gpu, &truth_pipeline, std::slice::from_ref(&uniform));
         let color_bind = bind(
             gpu,
             &color_pipeline,
@@ -379,139 +377,6 @@ impl Drawing {
 /// Unit vector from the person to the key light: high, in front and to the left of camera 0's view.
 fn to_light() -> Vec3 {
     Vec3::new(-0.50, -0.62, 0.95).normalize()
-}
-
-/// Bind group 0 of a pipeline with derived layout, resources at bindings 0, 1, 2, ...
-fn bind(gpu: &GpuContext, pipeline: &RenderPipeline, resources: &[BindingResource<'_>]) -> BindGroup {
-    let entries: Vec<_> = (0..)
-        .zip(resources)
-        .map(|(binding, resource)| wgpu::BindGroupEntry { binding, resource: resource.clone() })
-        .collect();
-    gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
-        label: None,
-        layout: &pipeline.get_bind_group_layout(0),
-        entries: &entries,
-    })
-}
-
-fn view_of(texture: &Texture) -> TextureView {
-    texture.create_view(&Default::default())
-}
-
-fn texture(
-    gpu: &GpuContext,
-    label: &str,
-    [width, height, layers]: [u32; 3],
-    mips: u32,
-    format: TextureFormat,
-    usage: TextureUsages,
-) -> Texture {
-    gpu.device.create_texture(&TextureDescriptor {
-        label: Some(label),
-        size: wgpu::Extent3d { width, height, depth_or_array_layers: layers },
-        mip_level_count: mips,
-        sample_count: 1,
-        dimension: TextureDimension::D2,
-        format,
-        usage,
-        view_formats: &[],
-    })
-}
-
-fn upload_textures(gpu: &GpuContext, person: &Person) -> TextureView {
-    let side = person.textures.first().map_or(1, |texture| texture.side) as u32;
-    let mips = side.ilog2() + 1;
-    let usage = TextureUsages::TEXTURE_BINDING | TextureUsages::COPY_DST;
-    let array = texture(gpu, "person textures", [side, side, person.textures.len() as u32], mips, COLOR, usage);
-    for (layer, image) in (0..).zip(&person.textures) {
-        let mut image = image.clone();
-        for mip in 0..mips {
-            write_layer(gpu, &array, layer, mip, [side >> mip, side >> mip], &image.pixels);
-            image = image.halved();
-        }
-    }
-    array.create_view(&wgpu::TextureViewDescriptor {
-        dimension: Some(wgpu::TextureViewDimension::D2Array),
-        ..Default::default()
-    })
-}
-
-fn upload_plate(
-    gpu: &GpuContext,
-    plate: &Plate,
-    [width, height]: [u32; 2],
-) -> Result<(TextureView, StorageBuffer<[f32; 2]>), GpuError> {
-    let usage = TextureUsages::TEXTURE_BINDING | TextureUsages::COPY_DST;
-    let image = texture(gpu, "plate", [width, height, 1], 1, COLOR, usage);
-    write_layer(gpu, &image, 0, 0, [width, height], &plate.rgba);
-    Ok((view_of(&image), StorageBuffer::from_slice(gpu, "floor positions", &plate.floor)?))
-}
-
-fn write_layer(gpu: &GpuContext, texture: &Texture, layer: u32, mip: u32, [width, height]: [u32; 2], rgba: &[[u8; 4]]) {
-    let (width, height) = (width.max(1), height.max(1));
-    gpu.queue.write_texture(
-        wgpu::TexelCopyTextureInfo {
-            texture,
-            mip_level: mip,
-            origin: wgpu::Origin3d { x: 0, y: 0, z: layer },
-            aspect: wgpu::TextureAspect::All,
-        },
-        bytemuck::cast_slice(rgba),
-        wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(width * 4), rows_per_image: Some(height) },
-        wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
-    );
-}
-
-fn pipeline(
-    gpu: &GpuContext,
-    module: &wgpu::ShaderModule,
-    vertex: &str,
-    fragment: Option<&str>,
-    formats: &[TextureFormat],
-) -> RenderPipeline {
-    let attribute = |format, shader_location| [VertexAttribute { format, offset: 0, shader_location }];
-    let attributes = [
-        attribute(VertexFormat::Float32x3, 0),
-        attribute(VertexFormat::Float32x3, 1),
-        attribute(VertexFormat::Float32x4, 2),
-        attribute(VertexFormat::Float32x4, 3),
-    ];
-    let buffers = attributes.each_ref().map(|attributes| {
-        Some(VertexBufferLayout {
-            array_stride: attributes[0].format.size(),
-            step_mode: VertexStepMode::Vertex,
-            attributes,
-        })
-    });
-    let targets: Vec<_> = formats.iter().map(|&format| Some(format.into())).collect();
-    gpu.device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
-        label: Some(vertex),
-        layout: None,
-        vertex: wgpu::VertexState {
-            module,
-            entry_point: Some(vertex),
-            compilation_options: Default::default(),
-            buffers: &buffers,
-        },
-        // Hems and hair are seen from inside too.
-        primitive: wgpu::PrimitiveState::default(),
-        depth_stencil: Some(wgpu::DepthStencilState {
-            format: DEPTH,
-            depth_write_enabled: Some(true),
-            depth_compare: Some(CompareFunction::Less),
-            stencil: Default::default(),
-            bias: Default::default(),
-        }),
-        multisample: Default::default(),
-        fragment: fragment.map(|entry| wgpu::FragmentState {
-            module,
-            entry_point: Some(entry),
-            compilation_options: Default::default(),
-            targets: &targets,
-        }),
-        multiview_mask: None,
-        cache: None,
-    })
 }
 
 #[cfg(test)]

@@ -17,6 +17,7 @@ mod error;
 mod face;
 mod frame;
 mod garments;
+mod gpu_parts;
 mod look;
 mod motion;
 mod noise;

@@ -121,7 +121,9 @@ impl Look {
         let denim = pick(3) > 0;
         let cuts = if female { [HairCut::Bob, HairCut::Bun] } else { [HairCut::Short, HairCut::Crop] };
         let cut = cuts[pick(2)];
-        let look = Self {
+        let logo = print == Print::Plain || pick(3) == 0;
+        let v_neck = pick(3) == 0 && !logo;
+        Self {
             shape,
             female,
             skin: SKINS[skin],
@@ -131,17 +133,16 @@ impl Look {
             recede_m: if female { 0.0 } else { 0.008 * pick(3) as f32 },
             stubble: if female { 0.0 } else { 0.4 * pick(3) as f32 },
             print,
-            logo: matches!(print, Print::Plain) || pick(3) == 0,
+            logo,
             top: TOPS[pick(TOPS.len())],
             sleeve_m: if long_sleeves { 0.465 } else { 0.16 },
-            v_neck_m: if pick(3) == 0 { 0.09 } else { 0.0 },
+            v_neck_m: if v_neck { 0.09 } else { 0.0 },
             top_offset_m: if long_sleeves { 0.011 } else { 0.010 },
             knit: long_sleeves,
             denim,
             bottom: if denim { [0.17, 0.25, 0.41] } else { CHINOS[pick(CHINOS.len())] },
             bottom_offset_m: 0.009,
             shoe: SHOES[pick(SHOES.len())],
-        };
-        look
+        }
     }
 }

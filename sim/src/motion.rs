@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use flyrig_body::{Template, load_bvh, skin_mesh};
 use flyrig_types::PoseTrack;
-use glam::DVec3;
+use glam::DVec2;
 
 use crate::person::Person;
 use crate::turn::turn_track;
@@ -40,13 +40,15 @@ pub(crate) fn track(config: &SimConfig, person: &Person) -> Result<PoseTrack, Si
         MotionKind::Bvh => {
             let path = config.motion.bvh.as_deref().map_or_else(find_debian_clip, existing)?;
             let whole = load_bvh(&path)?.retarget(skeleton)?;
-            grounded(&whole, &person.clothed, (config.motion.start_secs * 1e9) as i64)
+            let start_nanos = (config.motion.start_secs * 1e9) as i64;
+            grounded(&whole, &person.clothed, start_nanos, config.motion.reach_m)
         }
     }
 }
 
-/// The track from `start_nanos` on, its middle over the origin and its deepest sole on the floor.
-fn grounded(track: &PoseTrack, clothed: &Template, start_nanos: i64) -> Result<PoseTrack, SimError> {
+/// The track from `start_nanos` on, around the origin and no farther than `reach_m` from it, its deepest sole
+/// on the floor.
+fn grounded(track: &PoseTrack, clothed: &Template, start_nanos: i64, reach_m: f64) -> Result<PoseTrack, SimError> {
     const PROBES: usize = 24;
     let (first, last) = track.span_nanos();
     let start = (first + start_nanos).min(last);
@@ -54,13 +56,18 @@ fn grounded(track: &PoseTrack, clothed: &Template, start_nanos: i64) -> Result<P
     keys.extend(
         track.keys().iter().filter(|(nanos, _)| *nanos > start).map(|(nanos, pose)| (nanos - start, pose.clone())),
     );
-    let middle = keys.iter().map(|(_, pose)| pose.root_translation).sum::<DVec3>() / keys.len() as f64;
+    let path = || keys.iter().map(|(_, pose)| pose.root_translation.truncate());
+    let low = path().fold(DVec2::INFINITY, DVec2::min);
+    let high = path().fold(DVec2::NEG_INFINITY, DVec2::max);
+    let middle = (low + high) * 0.5;
+    let farthest = path().map(|at| at.distance(middle)).fold(0.0, f64::max);
+    let scale = if farthest > reach_m { reach_m / farthest } else { 1.0 };
     let stride = keys.len().div_ceil(PROBES);
     let lowest = |pose| skin_mesh(clothed, pose).0.iter().map(|p| p.z).fold(f32::INFINITY, f32::min);
     let floor = keys.iter().step_by(stride).map(|(_, pose)| lowest(pose)).fold(f32::INFINITY, f32::min);
-    let moved = DVec3::new(middle.x, middle.y, f64::from(floor));
     for (_, pose) in &mut keys {
-        pose.root_translation -= moved;
+        let at = pose.root_translation;
+        pose.root_translation = ((at.truncate() - middle) * scale).extend(at.z - f64::from(floor));
     }
     Ok(PoseTrack::new(keys)?)
 }

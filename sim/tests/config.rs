@@ -1,15 +1,14 @@
 //! Bad settings are refused by name; good ones survive a round trip.
 
-mod common;
+#![allow(clippy::unwrap_used)]
 
 use std::path::PathBuf;
 
-use common::small_config;
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{MotionKind, SimConfig, Simulator, camera_ring};
 
 fn refusal(change: impl Fn(&mut SimConfig)) -> String {
-    let mut config = small_config(1);
+    let mut config = SimConfig::default();
     change(&mut config);
     camera_ring(&config).unwrap_err().to_string()
 }
@@ -41,7 +40,7 @@ fn unknown_keys_are_refused_and_defaults_fill_the_rest() {
 #[test]
 fn a_missing_clip_is_an_error_that_says_what_to_do() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
-    let mut config = small_config(1);
+    let mut config = SimConfig::default();
     config.motion.kind = MotionKind::Bvh;
     config.motion.bvh = Some(PathBuf::from("/nowhere/walk.bvh"));
     let error = Simulator::new(&gpu, &config).unwrap_err().to_string();

@@ -1,5 +1,7 @@
 //! A seed makes a person, and the same seed the same bytes.
 
+#![allow(clippy::unwrap_used)]
+
 mod common;
 
 use common::{simulator, small_config};

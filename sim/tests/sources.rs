@@ -1,5 +1,7 @@
 //! Simulated cameras behind the capture trait.
 
+#![allow(clippy::unwrap_used)]
+
 mod common;
 
 use std::sync::{Arc, Mutex};

@@ -1,5 +1,7 @@
 //! Picture, mask, depth, canonical positions, surface and pose speak of the same person.
 
+#![allow(clippy::unwrap_used)]
+
 mod common;
 
 use common::{simulator, small_config};
@@ -74,9 +76,15 @@ fn quantile(sorted: &[f64], share: f64) -> f64 {
 fn depth_and_canonical_positions_agree_with_the_surface_within_a_millimetre() {
     let mut simulator = simulator(&small_config(3));
     let (depth, canonical) = errors(&mut simulator, 1, 9);
+    println!(
+        "{} pixels, 97 of 100 within {:.3e} m in depth, {:.3e} m in canonical position",
+        depth.len(),
+        quantile(&depth, 0.97),
+        quantile(&canonical, 0.97)
+    );
     assert!(depth.len() > 100, "{} pixels", depth.len());
-    assert!(quantile(&depth, 0.97) < 1e-3, "{:?}", quantile(&depth, 0.97));
-    assert!(quantile(&canonical, 0.97) < 1e-3, "{:?}", quantile(&canonical, 0.97));
+    assert!(quantile(&depth, 0.97) < 2e-5, "{:?}", quantile(&depth, 0.97));
+    assert!(quantile(&canonical, 0.97) < 5e-5, "{:?}", quantile(&canonical, 0.97));
 }
 
 #[test]
@@ -92,7 +100,9 @@ fn strong_distortion_is_drawn_to_a_tenth_of_a_pixel() {
     let footprint_m = 3.0 / (1.05 * 256.0);
     let (_, canonical) = errors(&mut simulator, 0, 37);
     let worst = quantile(&canonical, 0.95) / footprint_m;
-    assert!(worst < 0.1, "{worst} px");
+    println!("95 of 100 pixels within {worst:.4} px");
+    // A tenth of a pixel is promised; the tighter bound notices a lost k2 (0.05 px).
+    assert!(worst < 0.02, "{worst} px");
     // Without the lens the same picture is off by far more.
     let camera = &simulator.rig().cameras[0];
     let mut pinhole = camera.clone();

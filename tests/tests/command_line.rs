@@ -1,4 +1,5 @@
 //! The command explains itself and refuses what it cannot do.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use flyrig_tests::run;
 

@@ -1,4 +1,5 @@
 //! A damaged data set gives one clear line and a failing exit, or costs the one picture that is damaged.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use flyrig_tests::{Dataset, FRAMES, Finished, run, write_dataset};
 

@@ -1,4 +1,5 @@
 //! What we are compared with is not drawn by what is compared: the simulator does not depend on the renderer.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use std::path::Path;
 

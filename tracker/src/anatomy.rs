@@ -55,7 +55,10 @@ impl Roles {
             })
         };
         let both = |what: &str, patterns: &[&str]| -> Result<[usize; 2], TrackError> {
-            Ok([need(&format!("left {what}"), patterns, &SIDES[0])?, need(&format!("right {what}"), patterns, &SIDES[1])?])
+            Ok([
+                need(&format!("left {what}"), patterns, &SIDES[0])?,
+                need(&format!("right {what}"), patterns, &SIDES[1])?,
+            ])
         };
         let forearm = both("forearm", FOREARM)?;
         let upper_arm = both("upper arm", UPPER_ARM).or_else(|error| {

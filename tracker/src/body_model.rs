@@ -184,7 +184,9 @@ mod tests {
         let template = body();
         let model = BodyModel::new(&template).unwrap();
         let at = |landmark: usize| model.marks[landmark].point;
-        for (left, right) in [(2, 5), (7, 8), (9, 10), (11, 12), (15, 16), (17, 18), (19, 20), (21, 22), (29, 30), (31, 32)] {
+        for (left, right) in
+            [(2, 5), (7, 8), (9, 10), (11, 12), (15, 16), (17, 18), (19, 20), (21, 22), (29, 30), (31, 32)]
+        {
             assert!(at(left).x > 0.005 && at(right).x < -0.005, "{left} {right}");
             assert!((at(left).x + at(right).x).abs() < 0.02, "{left} {right} are not mirrored");
         }

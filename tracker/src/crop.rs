@@ -55,7 +55,7 @@ impl Crop {
     }
 
     /// Crop pixel of a picture pixel.
-    pub fn from_picture(self, picture_px: DVec2) -> DVec2 {
+    pub fn crop_from_picture(self, picture_px: DVec2) -> DVec2 {
         let offset = DVec2::from_angle(-self.angle).rotate(picture_px - self.center);
         offset / self.scale() + 0.5 * NET_SIDE as f64 - 0.5
     }
@@ -89,10 +89,7 @@ impl Crop {
     pub fn keypoints(&self, output: &NetOutput) -> ViewKeypoints {
         std::array::from_fn(|i| {
             let landmark = output.landmarks[i];
-            Keypoint {
-                pixel: self.to_picture(DVec2::new(landmark.x, landmark.y)),
-                confidence: landmark.confidence,
-            }
+            Keypoint { pixel: self.to_picture(DVec2::new(landmark.x, landmark.y)), confidence: landmark.confidence }
         })
     }
 }
@@ -132,11 +129,11 @@ mod tests {
         points[LEFT_SHOULDER] = Some(DVec2::new(160.0, 100.0));
         points[RIGHT_SHOULDER] = Some(DVec2::new(160.0, 120.0));
         let crop = Crop::around(&points).unwrap();
-        let at = |i: usize| crop.from_picture(points[i].unwrap());
+        let at = |i: usize| crop.crop_from_picture(points[i].unwrap());
         assert!(at(LEFT_SHOULDER).y < at(LEFT_HIP).y - 40.0);
         assert!((at(LEFT_SHOULDER).x - at(LEFT_HIP).x).abs() < 1e-9);
         let there = DVec2::new(31.0, 77.0);
-        assert!((crop.from_picture(crop.to_picture(there)) - there).length() < 1e-9);
+        assert!((crop.crop_from_picture(crop.to_picture(there)) - there).length() < 1e-9);
         assert!((crop.to_picture(DVec2::splat(127.5)) - crop.center).length() < 1e-9);
     }
 

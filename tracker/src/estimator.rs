@@ -13,7 +13,7 @@ use crate::crop::Crop;
 use crate::fit::{Before, FitProblem, FitView, align_trunk};
 use crate::math::median;
 use crate::pixels::Rgb;
-use crate::plate::foreground;
+use crate::plate::plate_evidence;
 use crate::search::{Sighting, project_all, search};
 use crate::shape::{fit_template_shape, seen_landmarks};
 use crate::silhouette::{BodyGate, refine};
@@ -121,7 +121,7 @@ impl PoseEstimator {
         Ok(fit)
     }
 
-    /// Gives a camera's empty picture; masks of that camera then come from the difference to it.
+    /// Gives a camera's empty picture; masks of that camera then heed the difference to it as well.
     ///
     /// # Errors
     /// Kind `Frames` when there is no such camera, `Image` when the size differs or the format cannot be read.
@@ -177,13 +177,11 @@ impl PoseEstimator {
                     let picture = picture.as_ref().ok_or(NoMask::NoFrame)?;
                     let camera = &self.rig.cameras[slot];
                     let gate = BodyGate::new(camera, &vertices, &self.template.triangles).ok_or(NoMask::OutOfView)?;
-                    if let Some(plate) = &self.plates[slot] {
-                        return foreground(picture, plate, Some(&gate)).ok_or(NoMask::Empty);
-                    }
                     let sighting = fitted.sightings[slot].as_ref();
                     let sighting = sighting.filter(|s| s.output.presence >= self.config.presence_threshold);
                     let sighting = sighting.ok_or(NoMask::NoPerson)?;
-                    refine(picture, sighting, &gate).ok_or(NoMask::Empty)
+                    let evidence = self.plates[slot].as_ref().and_then(|plate| plate_evidence(picture, plate));
+                    refine(picture, sighting, &gate, evidence.as_ref()).ok_or(NoMask::Empty)
                 })
                 .collect();
             for ((mask, view), made) in masks.iter_mut().zip(&mut views).zip(made) {
@@ -261,8 +259,12 @@ impl PoseEstimator {
         let first = self.fit(set, sightings, None, seconds)?;
         // Look again through crops around the fitted body: turned upright, and in the views that chose nobody.
         let marks = self.model.marks(&first.turns);
-        let start =
-            Track { turns: first.turns.clone(), nanos: set.master_nanos, marks, velocity: [DVec3::ZERO; LANDMARK_COUNT] };
+        let start = Track {
+            turns: first.turns.clone(),
+            nanos: set.master_nanos,
+            marks,
+            velocity: [DVec3::ZERO; LANDMARK_COUNT],
+        };
         match self.follow(set, pictures, &start, seconds)? {
             Some(second) if second.relative <= first.relative * 1.5 => Ok(second),
             _ => Ok(first),
@@ -421,8 +423,15 @@ impl PoseEstimator {
         }
         let residual_px = median(&mut all)?;
         let relative = median(&mut all_relative)?;
-        (residual_px.is_finite() && relative.is_finite())
-            .then_some(Fitted { turns, sightings, keypoints, points, views, residual_px, relative })
+        (residual_px.is_finite() && relative.is_finite()).then_some(Fitted {
+            turns,
+            sightings,
+            keypoints,
+            points,
+            views,
+            residual_px,
+            relative,
+        })
     }
 
     fn remember(&mut self, set: &FrameSet, turns: Turns) {

@@ -90,15 +90,16 @@ impl FitProblem<'_> {
 
     fn root_move(&self, turns: &Turns) -> Option<DVec3> {
         let before = self.before.as_ref()?;
-        Some((turns.root - before.turns.root) / self.root_sigma(before))
+        Some((turns.root - before.turns.root) / Self::root_sigma(before))
     }
 
-    fn root_sigma(&self, before: &Before) -> f64 {
+    fn root_sigma(before: &Before) -> f64 {
         // In proportion to the turns' freedom, which already knows the time that passed.
         ROOT_MOVE_M * before.sigma_rad / 0.15
     }
 
     /// Calls `each` with every landmark and its pull in the world.
+    #[allow(clippy::needless_range_loop)] // a landmark indexes the views' arrays and the model alike
     fn data_terms(&self, posed: &Posed, mut each: impl FnMut(usize, DataTerm)) {
         let robust2 = self.robust * self.robust;
         for landmark in 0..LANDMARK_COUNT {
@@ -209,7 +210,7 @@ impl FitProblem<'_> {
             }
         });
         if let (Some(error), Some(before)) = (self.root_move(turns), &self.before) {
-            let inverse_sigma = 1.0 / self.root_sigma(before);
+            let inverse_sigma = 1.0 / Self::root_sigma(before);
             for k in 0..3 {
                 gradient[k] += error[k] * inverse_sigma;
                 normal[(k, k)] += inverse_sigma * inverse_sigma;
@@ -391,8 +392,7 @@ mod tests {
             let views = views(3, |camera| keypoints_of(camera, &target));
             let start = align_trunk(&model, &target.map(Some)).unwrap();
             let (found, _) = problem(&model, &views).solve(&start, 60).unwrap();
-            let mut errors: Vec<f64> =
-                model.marks(&found).iter().zip(target).map(|(a, b)| (*a - b).length()).collect();
+            let mut errors: Vec<f64> = model.marks(&found).iter().zip(target).map(|(a, b)| (*a - b).length()).collect();
             let median = crate::math::median(&mut errors).unwrap();
             let largest = errors.iter().copied().fold(0.0, f64::max);
             assert!(median < 0.004 && largest < 0.03, "seed {seed}: median {median}, largest {largest}");

@@ -96,16 +96,15 @@ impl PoseNet {
         let find = |count: usize| -> Result<Vec<f32>, TrackError> {
             for output in &outputs {
                 if output.len() == count {
-                    let values: Vec<f32> = output
-                        .to_plain_array_view::<f32>()
-                        .map_err(failed)?
-                        .iter()
-                        .copied()
-                        .collect();
+                    let values: Vec<f32> =
+                        output.to_plain_array_view::<f32>().map_err(failed)?.iter().copied().collect();
                     if values.iter().all(|v| v.is_finite()) {
                         return Ok(values);
                     }
-                    return Err(TrackError::new(TrackErrorKind::Net, "the pose network gave a value that is not finite"));
+                    return Err(TrackError::new(
+                        TrackErrorKind::Net,
+                        "the pose network gave a value that is not finite",
+                    ));
                 }
             }
             Err(TrackError::new(
@@ -119,8 +118,7 @@ impl PoseNet {
         let mask = find(NET_SIDE * NET_SIDE)?.into_iter().map(|logit| 1.0 / (1.0 + (-logit).exp())).collect();
         let mut landmarks = [CropLandmark::default(); LANDMARK_COUNT];
         for (i, landmark) in landmarks.iter_mut().enumerate() {
-            let [x, y, _, visible, present] =
-                std::array::from_fn(|k| f64::from(raw[i * LANDMARK_STRIDE + k]));
+            let [x, y, _, visible, present] = std::array::from_fn(|k| f64::from(raw[i * LANDMARK_STRIDE + k]));
             *landmark = CropLandmark {
                 // The network's coordinates have pixel corners at integers.
                 x: x - 0.5,

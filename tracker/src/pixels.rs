@@ -20,10 +20,9 @@ impl<'a> Rgb<'a> {
         let bytes = if image.format() == PixelFormat::Rgb8 {
             Cow::Borrowed(image.bytes())
         } else {
-            return Err(TrackError::new(
-                TrackErrorKind::Image,
-                format!("the tracker reads Rgb8 pictures, not {:?}; convert it first", image.format()),
-            ));
+            Cow::Owned(flyrig_capture::to_rgb8(image).map_err(|error| {
+                TrackError::new(TrackErrorKind::Image, format!("a picture cannot be read: {error}"))
+            })?)
         };
         Ok(Self { width: image.width() as usize, height: image.height() as usize, bytes })
     }

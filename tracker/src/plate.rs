@@ -5,7 +5,6 @@ use flyrig_types::{Image, Mask};
 use crate::grid::{Grid, clean};
 use crate::math::median;
 use crate::pixels::Rgb;
-use crate::silhouette::BodyGate;
 use crate::{TrackError, TrackErrorKind};
 
 /// A shadow darkens the plate to no less than this share, keeping its colour.
@@ -34,11 +33,28 @@ pub fn mask_from_plate(image: &Image, plate: &Image) -> Result<Option<Mask>, Tra
             ),
         ));
     }
-    Ok(foreground(&Rgb::new(image)?, &Rgb::new(plate)?.bytes, None))
+    Ok(foreground(&Rgb::new(image)?, &Rgb::new(plate)?.bytes))
 }
 
-/// The same on plain bytes of equal size, inside the gate if there is one.
-pub(crate) fn foreground(picture: &Rgb, plate: &[u8], gate: Option<&BodyGate>) -> Option<Mask> {
+/// The same on plain bytes of equal size.
+fn foreground(picture: &Rgb, plate: &[u8]) -> Option<Mask> {
+    let (width, height) = (picture.width, picture.height);
+    let evidence = plate_evidence(picture, plate)?;
+    // A vote among neighbours removes specks and closes pinholes.
+    let mut voted = evidence.box_mean(1);
+    for value in &mut voted.values {
+        *value = ((*value - 0.5) * 2.0 + 0.5).clamp(0.0, 1.0);
+    }
+    clean(&mut voted, (width.max(height) / 60).max(2));
+    let least = (width * height / 5000).max(12);
+    if voted.values.iter().filter(|v| **v >= 0.5).count() < least {
+        return None;
+    }
+    voted.paste(width, height, 0, 0)
+}
+
+/// How much each pixel speaks for a foreground, 0..=1 with the border at one half; `None` when the sizes differ.
+pub(crate) fn plate_evidence(picture: &Rgb, plate: &[u8]) -> Option<Grid> {
     let (width, height) = (picture.width, picture.height);
     if plate.len() != picture.bytes.len() {
         return None;
@@ -79,29 +95,7 @@ pub(crate) fn foreground(picture: &Rgb, plate: &[u8], gate: Option<&BodyGate>) -
         };
         *value = color.max(light).min(2.0) * 0.5;
     }
-    if let Some(gate) = gate {
-        let [x0, y0, x1, y1] = gate.bounds;
-        for y in 0..height {
-            for x in 0..width {
-                let inside = (x0..x1).contains(&x) && (y0..y1).contains(&y);
-                let allowed = inside && gate.distance.values[(y - y0.min(y)) * (x1 - x0) + (x - x0.min(x))] < 1.0;
-                if !allowed {
-                    grid.values[y * width + x] = 0.0;
-                }
-            }
-        }
-    }
-    // A vote among neighbours removes specks and closes pinholes.
-    let mut voted = grid.box_mean(1);
-    for value in &mut voted.values {
-        *value = ((*value - 0.5) * 2.0 + 0.5).clamp(0.0, 1.0);
-    }
-    clean(&mut voted, (width.max(height) / 60).max(2));
-    let least = (width * height / 5000).max(12);
-    if voted.values.iter().filter(|v| **v >= 0.5).count() < least {
-        return None;
-    }
-    voted.paste(width, height, 0, 0)
+    Some(grid)
 }
 
 #[cfg(test)]

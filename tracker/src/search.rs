@@ -170,9 +170,6 @@ fn human_size(points: &[Option<WorldPoint>; LANDMARK_COUNT]) -> bool {
 }
 
 /// Where a camera sees world points; `None` where it does not.
-pub(crate) fn project_all(
-    camera: &Camera,
-    points: &[glam::DVec3; LANDMARK_COUNT],
-) -> [Option<DVec2>; LANDMARK_COUNT] {
+pub(crate) fn project_all(camera: &Camera, points: &[glam::DVec3; LANDMARK_COUNT]) -> [Option<DVec2>; LANDMARK_COUNT] {
     points.map(|point| camera.project(point))
 }

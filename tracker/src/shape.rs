@@ -106,9 +106,8 @@ pub fn fit_template_shape(
         .iter()
         .zip(&ratios)
         .map(|((name, _), ratio)| {
-            let factor = ratio.map_or(1.0, |(ratio, count)| {
-                (ratio / scale * count + PRIOR_COUNT) / (count + PRIOR_COUNT)
-            });
+            let factor =
+                ratio.map_or(1.0, |(ratio, count)| (ratio / scale * count + PRIOR_COUNT) / (count + PRIOR_COUNT));
             ((*name).to_owned(), factor.clamp(GROUP_RANGE.0, GROUP_RANGE.1))
         })
         .collect();
@@ -161,9 +160,9 @@ fn stretches(model: &BodyModel, groups: &BTreeMap<String, f64>) -> Vec<DMat3> {
         stretch[roles.forearm[side]] = along(roles.forearm[side], roles.hand[side], factor("forearms"));
         stretch[roles.thigh[side]] = along(roles.thigh[side], roles.shank[side], factor("thighs"));
         stretch[roles.shank[side]] = along(roles.shank[side], roles.foot[side], factor("shanks"));
-        for joint in 0..stretch.len() {
+        for (joint, stretch) in stretch.iter_mut().enumerate() {
             if model.hangs_below(joint, roles.foot[side]) {
-                stretch[joint] = DMat3::from_diagonal(DVec3::new(1.0, 1.0, factor("feet")));
+                *stretch = DMat3::from_diagonal(DVec3::new(1.0, 1.0, factor("feet")));
             }
         }
     }
@@ -236,11 +235,10 @@ mod tests {
     fn a_stretched_person_is_measured_back() {
         let template = body();
         let model = BodyModel::new(&template).unwrap();
-        let truth: BTreeMap<String, f64> =
-            [("thighs", 1.08), ("forearms", 0.93), ("shoulders", 1.05), ("trunk", 0.96)]
-                .into_iter()
-                .map(|(name, factor)| (name.to_owned(), factor))
-                .collect();
+        let truth: BTreeMap<String, f64> = [("thighs", 1.08), ("forearms", 0.93), ("shoulders", 1.05), ("trunk", 0.96)]
+            .into_iter()
+            .map(|(name, factor)| (name.to_owned(), factor))
+            .collect();
         let person = BodyModel::new(&scale_template(&template, &model, 1.06, &truth).unwrap()).unwrap();
         let rig = ring(3);
         let keypoints: Vec<Vec<_>> = (0..8)

@@ -10,6 +10,8 @@ use crate::search::Sighting;
 
 /// How far clothes and hair may stand off the fitted body, metres.
 const REACH_M: f64 = 0.13;
+/// Log-odds between a pixel that surely differs from the plate and one that does not.
+const PLATE_LOGIT: f32 = 6.0;
 /// Bins a colour channel of the colour model.
 const BINS: usize = 16;
 
@@ -73,14 +75,21 @@ impl BodyGate {
 /// The network's probability is joined with a colour model of person and surroundings (histograms of this
 /// picture's own sure regions) and the distance to the fitted body, then smoothed along the picture's edges
 /// by a guided filter (He et al. 2010), so that the outline snaps to them.
-pub(crate) fn refine(picture: &Rgb, sighting: &Sighting, gate: &BodyGate) -> Option<Mask> {
+/// Evidence from an empty plate ([`crate::mask_from_plate`]'s) counts as well where there is one: it sees
+/// thin parts that the coarse mask misses, and the coarse mask sees what has the background's colour.
+pub(crate) fn refine(
+    picture: &Rgb,
+    sighting: &Sighting,
+    gate: &BodyGate,
+    plate_evidence: Option<&Grid>,
+) -> Option<Mask> {
     let [x0, y0, x1, y1] = gate.bounds;
     let (width, height) = (x1 - x0, y1 - y0);
     // The network's probability, and the luminance that guides it.
     let mut coarse = Grid::new(width, height, 0.0);
     for y in 0..height {
         for x in 0..width {
-            let at = sighting.crop.from_picture(DVec2::new((x + x0) as f64, (y + y0) as f64));
+            let at = sighting.crop.crop_from_picture(DVec2::new((x + x0) as f64, (y + y0) as f64));
             coarse.values[y * width + x] = net_probability(&sighting.output.mask, at);
         }
     }
@@ -120,7 +129,8 @@ pub(crate) fn refine(picture: &Rgb, sighting: &Sighting, gate: &BodyGate) -> Opt
                 0.0
             };
             let near = 1.0 - 4.0 * d.min(1.0);
-            let logit = (p / (1.0 - p)).ln() + 0.6 * color + near;
+            let plate = plate_evidence.map_or(0.0, |e| PLATE_LOGIT * (e.values[(y + y0) * e.width + x + x0] - 0.5));
+            let logit = (p / (1.0 - p)).ln() + 0.6 * color + near + plate;
             probability.values[at] = 1.0 / (1.0 + (-logit).exp());
         }
     }

@@ -53,11 +53,7 @@ pub fn triangulate(
 }
 
 /// One landmark, see [`triangulate`].
-pub(crate) fn triangulate_point(
-    views: &[View],
-    seen: &[(usize, Observation)],
-    inlier_m: f64,
-) -> Option<WorldPoint> {
+pub(crate) fn triangulate_point(views: &[View], seen: &[(usize, Observation)], inlier_m: f64) -> Option<WorldPoint> {
     let mut best: Option<(Vec<usize>, f64, DVec3)> = None;
     for a in 0..seen.len() {
         for b in a + 1..seen.len() {
@@ -109,7 +105,7 @@ fn intersect(views: &[View], a: &(usize, Observation), b: &(usize, Observation))
     let (ray_a, ray_b) = (ray(view_a, a.1.ideal_px), ray(view_b, b.1.ideal_px));
     let cosine = ray_a.dot(ray_b);
     let sine2 = 1.0 - cosine * cosine;
-    if !(sine2 > MIN_PARALLAX * MIN_PARALLAX) {
+    if sine2.is_nan() || sine2 <= MIN_PARALLAX * MIN_PARALLAX {
         return None;
     }
     let between = view_b.center() - view_a.center();

@@ -32,7 +32,11 @@ pub fn render(
     let mut encoder = gpu.device.create_command_encoder(&Default::default());
     rasterizer.encode(gpu, &mut encoder, gaussians, camera, settings, &target)?;
     gpu.queue.submit([encoder.finish()]);
-    Ok(Pictures { color: target.color.read(gpu)?, depth: target.depth.read(gpu)?, canonical: target.canonical.read(gpu)? })
+    Ok(Pictures {
+        color: target.color.read(gpu)?,
+        depth: target.depth.read(gpu)?,
+        canonical: target.canonical.read(gpu)?,
+    })
 }
 
 /// A `RenderTarget` on the CPU.
