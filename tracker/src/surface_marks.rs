@@ -5,7 +5,8 @@ use glam::DVec3;
 
 use crate::anatomy::Roles;
 use crate::landmarks::{
-    LEFT_ANKLE, LEFT_ELBOW, LEFT_HEEL, LEFT_HIP, LEFT_KNEE, LEFT_SHOULDER, LEFT_TOES, LEFT_WRIST, NOSE,
+    LEFT_ANKLE, LEFT_ELBOW, LEFT_HEEL, LEFT_HIP, LEFT_INDEX, LEFT_KNEE, LEFT_LITTLE, LEFT_SHOULDER, LEFT_THUMB, LEFT_TOES,
+    LEFT_WRIST, NOSE,
 };
 use crate::{LANDMARK_COUNT, TrackError, TrackErrorKind};
 
