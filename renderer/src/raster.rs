@@ -34,7 +34,7 @@ impl Outputs {
 pub struct RasterSettings {
     /// Gaussians whose centre is closer to the camera's plane are skipped, metres.
     pub near_m: f32,
-    /// Skip Gaussians whose normal points away from the camera.
+    /// Skip Gaussians whose normal points away from the camera ([`crate::BACKFACING_COSINE`]). For closed surfaces.
     pub cull_backfacing: bool,
     /// What to write.
     pub outputs: Outputs,
@@ -65,7 +65,7 @@ pub struct RasterStats {
 /// Draws isotropic Gaussians into pictures: projection through the camera's lens (EWA splatting), stable
 /// sort by depth, lists by tile, and front-to-back blending, all on the GPU without a wait.
 ///
-/// - Depth order is that of the centres, in steps of at most 2^-22 of their range; equal depths keep the
+/// - Depth order is that of the centres, to 24 bits of the range of their depths as floats; equal depths keep the
 ///   order of the buffers. Equal input gives equal bytes on one device.
 /// - `alpha = min(opacity * exp(-r²/2), 0.99)`; below 1/255 a splat does not touch a pixel; a pixel is
 ///   finished when less than 1e-4 of the light behind it would pass.

@@ -21,10 +21,15 @@ pub(crate) const MAX_ALPHA: f64 = 0.99;
 /// Transmittance below which a pixel is finished.
 pub(crate) const OPAQUE: f64 = 1e-4;
 
+/// A Gaussian is back-facing when the cosine between its normal and the line of sight is above this. Not 0: a
+/// Gaussian just behind the rim reaches out beyond it. On the built-in body with a dense front the mean error
+/// falls from 0.015 at 0 to 0.002 at 0.35, for a quarter more Gaussians (tests/raster_culling.rs).
+pub const BACKFACING_COSINE: f64 = 0.35;
+
 /// How the work is cut for an adapter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct RasterShape {
-    /// Side of a tile, pixels.
+    /// Side of a tile, pixels; a multiple of the four rows that one invocation blends.
     pub tile: u32,
     /// Depth sort.
     pub sort: SortShape,
@@ -59,7 +64,7 @@ impl RasterShape {
         let tile = self.tile;
         format!(
             "const TILE: u32 = {tile}u;\nconst INVALID_KEY: u32 = {INVALID_KEY}u;\n\
-             const CUT: f32 = {CUT};\nconst MAX_ALPHA: f32 = {MAX_ALPHA};\nconst OPAQUE: f32 = {OPAQUE};\n"
+             const BACKFACING_COSINE: f32 = {BACKFACING_COSINE};\nconst CUT: f32 = {CUT};\nconst MAX_ALPHA: f32 = {MAX_ALPHA};\nconst OPAQUE: f32 = {OPAQUE};\n"
         )
     }
 }

@@ -1,6 +1,6 @@
 // One invocation a Gaussian: EWA projection (Zwicker et al. 2001) through the lens, low-pass filter,
 // the rectangle of tiles it can reach, and its depth key.
-// Prefix: camera.wgsl, raster_frame.wgsl, const TILE, INVALID_KEY, CUT.
+// Prefix: camera.wgsl, raster_frame.wgsl, const TILE, INVALID_KEY, CUT, BACKFACING_COSINE.
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> center_scale: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> normal: array<vec4<f32>>;
@@ -32,7 +32,8 @@ fn project(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) gro
     }
     if frame.cull_backfacing != 0u {
         let n = normal[i];
-        if !finite(n) || dot(n.xyz, center.xyz - frame.camera.position.xyz) > 0.0 {
+        let sight = center.xyz - frame.camera.position.xyz;
+        if !finite(n) || dot(n.xyz, sight) > BACKFACING_COSINE * length(n.xyz) * length(sight) {
             return;
         }
     }

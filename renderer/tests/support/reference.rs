@@ -1,7 +1,7 @@
 //! Plain slow f64 reference of the rasteriser: sort everything, blend everything, front to back.
 #![allow(dead_code)]
 
-use flyrig_renderer::RasterSettings;
+use flyrig_renderer::{BACKFACING_COSINE, RasterSettings};
 use flyrig_types::Camera;
 use glam::{DVec2, DVec3};
 
@@ -52,7 +52,9 @@ fn splat(scene: &Scene, camera: &Camera, settings: &RasterSettings, index: usize
     let center = vec3(center_scale);
     if settings.cull_backfacing {
         let normal = scene.normal[index];
-        if !finite(&normal) || vec3(normal).dot(center - camera.position()) > 0.0 {
+        let sight = center - camera.position();
+        let limit = BACKFACING_COSINE * vec3(normal).length() * sight.length();
+        if !finite(&normal) || vec3(normal).dot(sight) > limit {
             return None;
         }
     }
