@@ -82,7 +82,7 @@ fn main() -> Result<()> {
     }
     let (mut residuals, mut held_residuals, mut per_camera) =
         (Vec::new(), Vec::new(), vec![Vec::new(); rig.cameras.len()]);
-    let (mut seconds, mut lost, mut overlaps) = ([0.0; 4], 0, Vec::new());
+    let (mut seconds, mut lost, mut overlaps, mut agreement) = ([0.0; 4], 0, Vec::new(), Vec::new());
     for index in first..first + count {
         let frames = set(index, &rig)?;
         let estimate = match estimator.estimate(&frames) {
@@ -97,6 +97,7 @@ fn main() -> Result<()> {
         residuals.push(quality.residual_px);
         for (view, list) in quality.views.iter().zip(&mut per_camera) {
             list.extend(view.residual_px);
+            agreement.extend(view.mask_overlap);
         }
         for (sum, part) in seconds.iter_mut().zip([
             quality.seconds.net,
@@ -178,6 +179,7 @@ fn main() -> Result<()> {
     if !overlaps.is_empty() {
         println!("masks: mean overlap (IoU) {:.3}", overlaps.iter().sum::<f64>() / overlaps.len() as f64);
     }
+    println!("fitted body and mask: median overlap (IoU) {:.3}", median(&mut agreement));
     let [net, triangulate, fit, masks] = seconds.map(|s| s / used * 1e3);
     println!("ms a set: net {net:.1}, triangulate {triangulate:.2}, fit {fit:.1}, masks {masks:.1}");
     Ok(())

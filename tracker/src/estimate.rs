@@ -29,6 +29,9 @@ pub struct ViewQuality {
     pub inliers: usize,
     /// Median distance in pixels between the usable landmarks and the fitted body's; `None` without any.
     pub residual_px: Option<f64>,
+    /// Overlap (intersection over union) of the mask and the fitted body's outline, 0..1; `None` without a mask.
+    /// Clothes and hair keep it below 1; a body off the person shows as a low value.
+    pub mask_overlap: Option<f64>,
     /// Why there is no mask; `None` when there is one.
     pub no_mask: Option<NoMask>,
 }

@@ -170,7 +170,7 @@ impl PoseEstimator {
         let mut masks: Vec<Option<Mask>> = vec![None; pictures.len()];
         if self.config.masks {
             let (vertices, _) = skin_mesh(&self.template, &pose);
-            let made: Vec<Result<Mask, NoMask>> = pictures
+            let made: Vec<Result<(Mask, f64), NoMask>> = pictures
                 .par_iter()
                 .enumerate()
                 .map(|(slot, picture)| {
@@ -181,12 +181,16 @@ impl PoseEstimator {
                     let sighting = sighting.filter(|s| s.output.presence >= self.config.presence_threshold);
                     let sighting = sighting.ok_or(NoMask::NoPerson)?;
                     let evidence = self.plates[slot].as_ref().and_then(|plate| plate_evidence(picture, plate));
-                    refine(picture, sighting, &gate, evidence.as_ref()).ok_or(NoMask::Empty)
+                    let mask = refine(picture, sighting, &gate, evidence.as_ref()).ok_or(NoMask::Empty)?;
+                    let overlap = gate.overlap(&mask);
+                    Ok((mask, overlap))
                 })
                 .collect();
             for ((mask, view), made) in masks.iter_mut().zip(&mut views).zip(made) {
                 match made {
-                    Ok(made) => (*mask, view.no_mask) = (Some(made), None),
+                    Ok((made, overlap)) => {
+                        (*mask, view.mask_overlap, view.no_mask) = (Some(made), Some(overlap), None);
+                    }
                     Err(reason) => view.no_mask = Some(reason),
                 }
             }
@@ -419,7 +423,13 @@ impl PoseEstimator {
                 }
             }
             let no_mask = Some(if self.config.masks { NoMask::NoFrame } else { NoMask::Off });
-            views.push(ViewQuality { presence, inliers, residual_px: median(&mut distances), no_mask });
+            views.push(ViewQuality {
+                presence,
+                inliers,
+                residual_px: median(&mut distances),
+                mask_overlap: None,
+                no_mask,
+            });
         }
         let residual_px = median(&mut all)?;
         let relative = median(&mut all_relative)?;

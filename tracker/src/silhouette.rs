@@ -68,6 +68,20 @@ impl BodyGate {
         }
         Some(Self { bounds, distance, px_per_m })
     }
+
+    /// Intersection over union of a mask of the whole picture and the body's outline.
+    pub fn overlap(&self, mask: &Mask) -> f64 {
+        let [x0, y0, ..] = self.bounds;
+        let (mut both, mut body) = (0usize, 0usize);
+        for (i, distance) in self.distance.values.iter().enumerate() {
+            let (x, y) = (i % self.distance.width + x0, i / self.distance.width + y0);
+            let inside = mask.coverage()[y * mask.width() as usize + x] >= 128;
+            let on_body = *distance <= 0.0;
+            body += usize::from(on_body);
+            both += usize::from(on_body && inside);
+        }
+        both as f64 / (mask.area_px() + body - both).max(1) as f64
+    }
 }
 
 /// Person mask of a picture from the network's coarse one; `None` when nothing is left.
