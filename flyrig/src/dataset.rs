@@ -3,7 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
+use flyrig_capture::{VideoOptions, VideoReplay, folder_picture_size};
+use flyrig_tracker::PoseEstimator;
 use flyrig_types::{Camera, CameraId, Image, PixelFormat, Rig};
+
+use crate::config::Origin;
 
 /// The named cameras of a rig, in the order of the names; all of them for no names.
 pub fn pick(rig: &Rig, names: &[String], whose: &str) -> Result<Rig> {
@@ -24,16 +28,23 @@ pub fn pick(rig: &Rig, names: &[String], whose: &str) -> Result<Rig> {
     Ok(picked)
 }
 
-/// Size of a camera's first readable picture, or of its video, for calibrations that do not say.
-pub fn image_size(root: &Path, id: &CameraId) -> Option<(u32, u32)> {
-    let folder = root.join("images").join(id.as_str());
-    let mut files: Vec<PathBuf> = std::fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path()).collect();
-    files.sort();
-    files.iter().find_map(|file| image::image_dimensions(file).ok())
+/// Size of a camera's first readable picture, or else of its video, for calibrations that do not say.
+pub fn picture_size(root: &Path, id: &CameraId) -> Option<(u32, u32)> {
+    let of_video = || VideoReplay::open(id, &video_file(root, id), &VideoOptions::default()).ok()?.picture_size();
+    folder_picture_size(root, id).ok().or_else(of_video)
 }
 
-/// The empty picture `background/CAM.png` of a camera, where there is one.
-pub fn plate(root: &Path, camera: &Camera) -> Result<Option<Image>> {
+/// Where a camera's video lies.
+pub fn video_file(root: &Path, id: &CameraId) -> PathBuf {
+    root.join("videos").join(format!("{id}.mp4"))
+}
+
+/// The empty pictures `background/CAM.png` by slot, where there are any.
+pub fn plates(root: &Path, rig: &Rig) -> Result<Vec<Option<Image>>> {
+    rig.cameras.iter().map(|camera| plate(root, camera)).collect()
+}
+
+fn plate(root: &Path, camera: &Camera) -> Result<Option<Image>> {
     let path = root.join("background").join(format!("{}.png", camera.id));
     if !path.exists() {
         return Ok(None);
@@ -45,6 +56,27 @@ pub fn plate(root: &Path, camera: &Camera) -> Result<Option<Image>> {
         bail!("{} is {width}x{height} pixels, the camera's pictures are {}x{}", path.display(), expected.0, expected.1);
     }
     Ok(Some(Image::new(width, height, PixelFormat::Rgb8, picture.into_raw())?))
+}
+
+/// Masks that neither lie in the data set nor come with an estimated pose need an empty picture of every camera.
+pub fn require_masks(pose: Origin, masks: Origin, plates: &[Option<Image>]) -> Result<()> {
+    if pose == Origin::Given && masks == Origin::Estimated && plates.iter().any(Option::is_none) {
+        bail!(
+            "a given pose with estimated masks needs an empty picture background/CAM.png of every input camera; add \
+             them, or let the pose be estimated too"
+        );
+    }
+    Ok(())
+}
+
+/// Gives the estimator what is known of the empty scene.
+pub fn set_plates(estimator: &mut PoseEstimator, plates: &[Option<Image>]) -> Result<()> {
+    for (slot, plate) in plates.iter().enumerate() {
+        if let Some(plate) = plate {
+            estimator.set_plate(slot, plate)?;
+        }
+    }
+    Ok(())
 }
 
 /// The one skinned glTF file of a data set.

@@ -42,7 +42,7 @@ const HELD_OUT: [&str; 4] = ["01", "02", "04", "06"];
 const RIG_NAME: &str = "flyrig-demo";
 /// Instants that are scored against the held-out cameras.
 const SCORED: u64 = 20;
-/// Rows of the contact sheet.
+/// Rows of the contact sheet, spread evenly over the run.
 const CONTACT_ROWS: usize = 4;
 /// How often the memory is looked at.
 const MEMORY_EVERY: Duration = Duration::from_secs(5);
@@ -230,7 +230,12 @@ fn pass(
         }
         if pass.frames % score_every == score_every / 2 {
             let start = Instant::now();
-            score(&mut pass, &mut pipeline, simulator, &rig.cameras, &held_out, &set, score_every)?;
+            let done = limit.map_or(pass.frames as f64 / args.frames as f64, |limit| {
+                started.elapsed().as_secs_f64() / limit.as_secs_f64()
+            });
+            let row_due = done * CONTACT_ROWS as f64 >= pass.contact.len() as f64;
+            let wants_row = pass.contact.len() < CONTACT_ROWS && row_due;
+            score(&mut pass, &mut pipeline, simulator, &rig.cameras, &held_out, &set, wants_row)?;
             pass.scoring_seconds += start.elapsed().as_secs_f64();
         }
         pass.frames += 1;
@@ -261,16 +266,15 @@ fn score(
     all: &[Camera],
     held_out: &[Camera],
     set: &FrameSet,
-    score_every: u64,
+    wants_row: bool,
 ) -> Result<()> {
-    let contact_every = score_every * (SCORED / CONTACT_ROWS as u64);
-    let wants_contact = pass.contact.len() < CONTACT_ROWS && pass.frames >= pass.contact.len() as u64 * contact_every;
+    let row = pass.contact.len();
     for (i, camera) in held_out.iter().enumerate() {
         let slot = all.iter().position(|c| c.id == camera.id).context("a held-out camera is not in the rig")?;
         let truth: SimFrame = lock(simulator)?.render(set.master_nanos, slot)?;
         let ours = pipeline.render(camera)?;
         pass.sheet.extend(score_view(&camera.id, set.index, &ours, &truth.color, Some(&truth.mask))?);
-        if wants_contact && i == pass.contact.len() % held_out.len() {
+        if wants_row && i == row % held_out.len() {
             let mut pictures = Vec::new();
             if let Some((_, frame)) = set.present().next() {
                 let image = &frame.image;

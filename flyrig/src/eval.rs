@@ -9,7 +9,7 @@ use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::write_mesh_ply;
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
-use flyrig_types::{Camera, CameraId, Frame, FrameSet, Image, Rig};
+use flyrig_types::{Camera, CameraId, Frame, FrameSet, Rig};
 use indicatif::{ProgressBar, ProgressStyle};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -73,8 +73,8 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
     }
 
-    let plates: Vec<Option<Image>> =
-        rig.cameras.iter().map(|camera| dataset::plate(&args.dataset, camera)).collect::<Result<_>>()?;
+    let plates = dataset::plates(&args.dataset, &rig)?;
+    dataset::require_masks(args.pose, args.masks, &plates)?;
     let mut buffered = Vec::new();
     let (template, pose) = match args.pose {
         Origin::Given => given_pose(&args.dataset)?,
@@ -89,20 +89,12 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
             let config = PoseConfig { masks: args.masks == Origin::Estimated, ..PoseConfig::default() };
             let mut estimator =
                 PoseEstimator::new(PoseNet::embedded()?, &default_template(&ShapeParams::default())?, &rig, config)?;
-            set_plates(&mut estimator, &plates)?;
+            dataset::set_plates(&mut estimator, &plates)?;
             let fit = estimator.fit_shape(&buffered).context("no person found in the first frames")?;
             eprintln!("eval: the person is {:.2} m tall", fit.height_m);
             (estimator.template().clone(), PoseSource::Estimator(Box::new(estimator)))
         }
     };
-    let needs_net_masks =
-        args.pose == Origin::Given && args.masks == Origin::Estimated && plates.iter().any(Option::is_none);
-    if needs_net_masks {
-        bail!(
-            "--pose given with --masks estimated needs an empty picture background/CAM.png of every input camera; \
-             add them, or use --pose estimated"
-        );
-    }
     let engine =
         Engine::new(gpu.clone(), template, args.gaussians, args.nodes, rig.cameras.len(), args.appearance.settings())?;
     let mut pipeline = Pipeline::new(engine, rig, pose, args.masks, plates);
@@ -208,22 +200,13 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
 }
 
 fn load_rigs(args: &EvalArgs) -> Result<(Rig, Vec<Camera>)> {
-    let all = load_easymocap(&args.dataset, &|id| dataset::image_size(&args.dataset, id))?;
+    let all = load_easymocap(&args.dataset, &|id| dataset::picture_size(&args.dataset, id))?;
     let whose = format!("the calibration of {}", args.dataset.display());
     let (rig, holdout) = (dataset::pick(&all, &args.inputs, &whose)?, dataset::pick(&all, &args.holdout, &whose)?);
     if let Some(both) = args.inputs.iter().find(|name| args.holdout.contains(name)) {
         bail!("camera {both} is both an input and held out; scores would flatter");
     }
     Ok((rig, holdout.cameras))
-}
-
-fn set_plates(estimator: &mut PoseEstimator, plates: &[Option<Image>]) -> Result<()> {
-    for (slot, plate) in plates.iter().enumerate() {
-        if let Some(plate) = plate {
-            estimator.set_plate(slot, plate)?;
-        }
-    }
-    Ok(())
 }
 
 /// Template and pose track of the data set's glTF file.

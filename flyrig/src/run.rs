@@ -1,9 +1,6 @@
 //! `flyrig run`: a rig that stays up.
 
-use std::{
-    path::Path,
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail, ensure};
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
@@ -13,7 +10,7 @@ use flyrig_gpu::GpuContext;
 use flyrig_sim::Simulator;
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
 use flyrig_transport::{Publisher, TransportConfig};
-use flyrig_types::{CameraId, FrameSet, Rig};
+use flyrig_types::{CameraId, FrameSet, Image, Rig};
 
 use crate::{
     config::{Config, Origin, SourceKind},
@@ -39,12 +36,15 @@ struct Scene {
     rig: Rig,
     template: Template,
     track: Option<flyrig_types::PoseTrack>,
+    /// Empty pictures by slot, where there are any.
+    plates: Vec<Option<Image>>,
 }
 
 /// Runs the command.
 pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
     let stop = stop::flag();
     let scene = open(config, gpu)?;
+    dataset::require_masks(config.body.pose, config.body.masks, &scene.plates)?;
     let pacing = if config.source.real_time { Pacing::RealTime } else { Pacing::Lossless };
     let mut intake = Intake::start(scene.sources, &sync_config(config), pacing)?;
 
@@ -55,6 +55,7 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         (Origin::Estimated, _) => {
             let settings = PoseConfig { masks: config.body.masks == Origin::Estimated, ..PoseConfig::default() };
             let mut estimator = PoseEstimator::new(PoseNet::embedded()?, &template, &scene.rig, settings)?;
+            dataset::set_plates(&mut estimator, &scene.plates)?;
             learn_shape(&mut estimator, &mut intake)?;
             template = estimator.template().clone();
             PoseSource::Estimator(Box::new(estimator))
@@ -68,8 +69,7 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         scene.rig.cameras.len(),
         config.appearance.mode.settings(),
     )?;
-    let plates = vec![None; scene.rig.cameras.len()].into_iter().map(|_: Option<()>| None).collect();
-    let mut pipeline = Pipeline::new(engine, scene.rig, pose, config.body.masks, plates);
+    let mut pipeline = Pipeline::new(engine, scene.rig, pose, config.body.masks, scene.plates);
     let publisher = Publisher::open(&TransportConfig {
         listen: config.transport.listen.clone(),
         connect: config.transport.connect.clone(),
@@ -190,23 +190,29 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
     if source.kind == SourceKind::Sim {
         let simulator = Simulator::new(gpu, &config.sim)?;
         let (rig, template, track) = (simulator.rig().clone(), simulator.template().clone(), simulator.track().clone());
-        let simulator = std::sync::Arc::new(std::sync::Mutex::new(simulator));
         let picked = dataset::pick(&rig, &source.cameras, "the simulated rig")?;
+        let copy = |slot| -> Result<Image> {
+            let plate = simulator.plate(slot)?;
+            Ok(Image::new(plate.width(), plate.height(), plate.format(), plate.bytes().to_vec())?)
+        };
+        let slots = picked.cameras.iter().filter_map(|camera| rig.slot(&camera.id));
+        let plates = slots.map(|slot| copy(slot).map(Some)).collect::<Result<_>>()?;
+        let simulator = std::sync::Arc::new(std::sync::Mutex::new(simulator));
         let sources = flyrig_sim::sources(&simulator)
             .into_iter()
             .filter(|source| picked.slot(source.camera()).is_some())
             .map(|source| Box::new(source) as Box<dyn CameraSource>)
             .collect();
-        return Ok(Scene { sources, rig: picked, template, track: Some(track) });
+        return Ok(Scene { sources, rig: picked, template, track: Some(track), plates });
     }
-    let rig = load_easymocap(&source.path, &|id| dataset::image_size(&source.path, id))?;
+    let rig = load_easymocap(&source.path, &|id| dataset::picture_size(&source.path, id))?;
     let rig = dataset::pick(&rig, &source.cameras, "the calibration")?;
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     let sources: Vec<Box<dyn CameraSource>> = if source.kind == SourceKind::Folder {
         let options = FolderOptions { fps: source.fps, with_masks: config.body.masks == Origin::Given, frames: None };
         boxed(FolderReplay::open(&source.path, Some(&ids), &options)?)
     } else {
-        let open = |id| VideoReplay::open(id, &video_file(&source.path, id), &VideoOptions::default());
+        let open = |id| VideoReplay::open(id, &dataset::video_file(&source.path, id), &VideoOptions::default());
         boxed(ids.iter().map(open).collect::<Result<_, _>>()?)
     };
     let (template, track) = if config.body.template.as_os_str().is_empty() {
@@ -215,13 +221,10 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
         let human = load_gltf(&config.body.template)?;
         (human.template, human.track)
     };
-    Ok(Scene { sources, rig, template, track })
+    let plates = dataset::plates(&source.path, &rig)?;
+    Ok(Scene { sources, rig, template, track, plates })
 }
 
 fn boxed<S: CameraSource + 'static>(sources: Vec<S>) -> Vec<Box<dyn CameraSource>> {
     sources.into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect()
-}
-
-fn video_file(root: &Path, id: &CameraId) -> std::path::PathBuf {
-    root.join("videos").join(format!("{id}.mp4"))
 }

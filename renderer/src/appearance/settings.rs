@@ -44,7 +44,7 @@ impl Default for AppearanceSettings {
             occlusion_per_m: 20.0,
             memory_weight_max: 8.0,
             min_mask: 0.5,
-            inpaint_weight: 0.05,
+            inpaint_weight: 0.01,
             smoothness: 0.005,
         }
     }
