@@ -10,7 +10,7 @@ pub const CAMERA_WGSL: &str = include_str!("camera.wgsl");
 /// [`Camera`] for the GPU; layout of `struct Camera` in [`CAMERA_WGSL`] (std140, 144 bytes).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-pub struct CameraUniform {
+pub struct CameraConstants {
     /// Columns of the homogeneous matrix.
     pub camera_from_world: [[f32; 4]; 4],
     /// Camera centre in the world, metres; w is unused.
@@ -29,7 +29,7 @@ pub struct CameraUniform {
     pub coefficients: [f32; 8],
 }
 
-impl From<&Camera> for CameraUniform {
+impl From<&Camera> for CameraConstants {
     fn from(camera: &Camera) -> Self {
         let i = &camera.intrinsics;
         let (lens, c) = match i.lens {

@@ -1,6 +1,6 @@
 //! The WGSL camera model against the f64 one, on whichever adapter there is.
 
-use flyrig_gpu::{AdapterChoice, CAMERA_WGSL, CameraUniform, ComputeKernel, GpuContext, StorageBuffer, dispatch_1d};
+use flyrig_gpu::{AdapterChoice, CAMERA_WGSL, CameraConstants, ComputeKernel, GpuContext, StorageBuffer, dispatch_1d};
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
 use glam::{DVec2, DVec3};
 
@@ -63,11 +63,11 @@ fn wgsl_agrees_with_f64_and_poisoned_points_are_invalid() {
     for camera in cameras() {
         let uniform = gpu.device.create_buffer(&wgpu::BufferDescriptor {
             label: None,
-            size: size_of::<CameraUniform>() as u64,
+            size: size_of::<CameraConstants>() as u64,
             usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
-        gpu.queue.write_buffer(&uniform, 0, bytemuck::bytes_of(&CameraUniform::from(&camera)));
+        gpu.queue.write_buffer(&uniform, 0, bytemuck::bytes_of(&CameraConstants::from(&camera)));
         let input = StorageBuffer::from_slice(&gpu, "points", &points).unwrap();
         let pixels = StorageBuffer::<[f32; 4]>::zeroed(&gpu, "pixels", points.len()).unwrap();
         let jacobians = StorageBuffer::<[[f32; 2]; 3]>::zeroed(&gpu, "jacobians", points.len()).unwrap();

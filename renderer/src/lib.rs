@@ -3,6 +3,7 @@
 mod appearance;
 mod buffers;
 mod color;
+mod constants;
 mod export;
 pub mod metrics;
 mod raster;
@@ -10,7 +11,6 @@ mod raster_buffers;
 mod raster_kernels;
 mod scan;
 mod sort;
-mod uniforms;
 
 pub use appearance::{
     AppearanceError, AppearanceSettings, DiffusionHierarchy, DiffusionLevel, DirectAppearance, ViewInput,

@@ -1,14 +1,14 @@
 //! Forward splat rasteriser: what it draws and how it is called.
 
-use flyrig_gpu::{CameraUniform, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
+use flyrig_gpu::{CameraConstants, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
 use flyrig_types::Camera;
 use wgpu::{BindingResource, CommandEncoder, ComputePass, ComputePassDescriptor};
 
+use crate::constants::{ConstantWriter, Constants};
 use crate::raster_buffers::{Layout, PictureBuffers};
 use crate::raster_kernels::{Frame, RasterKernels, RasterShape};
 use crate::scan::{CHUNK_GROUP, MAX_LOOP, Scan, run};
 use crate::sort::{RadixSort, SortPass};
-use crate::uniforms::{UniformWriter, Uniforms};
 use crate::{GaussianBuffers, RenderTarget};
 
 /// Which pictures of a [`RenderTarget`] are written; the others keep their content.
@@ -148,7 +148,7 @@ impl Rasterizer {
         let Some(picture) = &self.picture else { return Ok(()) };
         let layout = picture.layout();
         let frame = Frame {
-            camera: CameraUniform::from(camera),
+            camera: CameraConstants::from(camera),
             size: [target.width, target.height],
             tiles: layout.tiles,
             gaussians: gaussians.count() as u32,
@@ -160,10 +160,10 @@ impl Rasterizer {
             bin_chunks: layout.bin_chunks,
             unused: 0,
         };
-        let uniforms = self.uniforms(gpu, &frame, layout);
+        let constants = self.constants(gpu, &frame, layout);
         encoder.clear_buffer(picture.table.raw(), 0, Some(u64::from(layout.table_len) * 4));
         let blend = self.kernels.blend(gpu, settings.outputs);
-        let stages = Stages { gpu, rasterizer: self, gaussians, target, picture, uniforms: &uniforms };
+        let stages = Stages { gpu, rasterizer: self, gaussians, target, picture, constants: &constants };
         let mut pass = |name, record: &dyn Fn(&mut ComputePass<'_>)| {
             let timestamp_writes = timer.as_mut().and_then(|timer| timer.stage(name));
             record(&mut encoder.begin_compute_pass(&ComputePassDescriptor { label: Some(name), timestamp_writes }));
@@ -204,8 +204,8 @@ impl Rasterizer {
         }
     }
 
-    fn uniforms(&self, gpu: &GpuContext, frame: &Frame, layout: Layout) -> Uniforms {
-        let mut writer = UniformWriter::default();
+    fn constants(&self, gpu: &GpuContext, frame: &Frame, layout: Layout) -> Constants {
+        let mut writer = ConstantWriter::default();
         writer.push(frame);
         writer.push(&[self.kernels.shape.sort.table_len(), 0, 0, 0]);
         writer.push(&[layout.table_len, 0, 0, 0]);
@@ -227,7 +227,7 @@ fn check_count(count: usize, shape: RasterShape) -> Result<(), GpuError> {
     Ok(())
 }
 
-/// Places in the [`Uniforms`] of one encoding.
+/// Places in the [`Constants`] of one encoding.
 const FRAME: usize = 0;
 const SORT_TABLE: usize = 1;
 const TILE_TABLE: usize = 2;
@@ -240,14 +240,14 @@ struct Stages<'a> {
     gaussians: &'a GaussianBuffers,
     target: &'a RenderTarget,
     picture: &'a PictureBuffers,
-    uniforms: &'a Uniforms,
+    constants: &'a Constants,
 }
 
 impl Stages<'_> {
     fn project(&self, pass: &mut ComputePass<'_>) {
         let (r, g) = (self.rasterizer, self.gaussians);
         let resources = [
-            self.uniforms.get(FRAME),
+            self.constants.get(FRAME),
             g.center_scale.raw().as_entire_binding(),
             g.normal.raw().as_entire_binding(),
             g.color.raw().as_entire_binding(),
@@ -262,14 +262,14 @@ impl Stages<'_> {
     fn depth_sort(&self, pass: &mut ComputePass<'_>) {
         let r = self.rasterizer;
         let passes: Vec<_> =
-            (0..r.kernels.shape.sort.digit_passes as usize).map(|i| self.uniforms.get(SORT_PASSES + i)).collect();
-        r.sort.encode(self.gpu, pass, &r.scan, &passes, &self.uniforms.get(SORT_TABLE));
+            (0..r.kernels.shape.sort.digit_passes as usize).map(|i| self.constants.get(SORT_PASSES + i)).collect();
+        r.sort.encode(self.gpu, pass, &r.scan, &passes, &self.constants.get(SORT_TABLE));
     }
 
     fn tile_lists(&self, pass: &mut ComputePass<'_>) {
         let (r, p) = (self.rasterizer, self.picture);
         let resources: [BindingResource<'_>; 9] = [
-            self.uniforms.get(FRAME),
+            self.constants.get(FRAME),
             r.sort.output().raw().as_entire_binding(),
             r.sort.valid().raw().as_entire_binding(),
             r.rects.raw().as_entire_binding(),
@@ -283,14 +283,14 @@ impl Stages<'_> {
         run(self.gpu, pass, &r.kernels.count_pairs, &resources[..5], groups);
         run(self.gpu, pass, &r.kernels.place_pairs, &resources[..6], groups);
         run(self.gpu, pass, &r.kernels.count_tiles, &resources[..7], groups);
-        r.scan.encode(self.gpu, pass, &self.uniforms.get(TILE_TABLE), &p.table, &r.pair_total);
+        r.scan.encode(self.gpu, pass, &self.constants.get(TILE_TABLE), &p.table, &r.pair_total);
         run(self.gpu, pass, &r.kernels.list_pairs, &resources, groups);
     }
 
     fn blend(&self, pass: &mut ComputePass<'_>, kernel: &flyrig_gpu::ComputeKernel) {
         let (r, p, t) = (self.rasterizer, self.picture, self.target);
         let resources = [
-            self.uniforms.get(FRAME),
+            self.constants.get(FRAME),
             r.splats.raw().as_entire_binding(),
             self.gaussians.color.raw().as_entire_binding(),
             self.gaussians.canonical.raw().as_entire_binding(),

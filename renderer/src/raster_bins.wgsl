@@ -3,7 +3,7 @@
 // its own column of the tile table (zeroed before). Sharing by pairs bounds every loop, whatever the
 // footprints: Mesa's software adapter silently ends loops after 65535 iterations of one invocation.
 // Prefix: camera.wgsl, raster_frame.wgsl.
-@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(0) var<storage, read> frame: Frame;
 // (depth key, Gaussian), nearest first
 @group(0) @binding(1) var<storage, read_write> ordered: array<vec2<u32>>;
 @group(0) @binding(2) var<storage, read_write> visible: array<u32>;

@@ -2,7 +2,7 @@
 // Four pixels share the loads of a splat, which is what the time goes into on Mesa's software adapter. No
 // workgroup memory and no barrier, so that every subgroup can leave as soon as its pixels are opaque.
 // Prefix: camera.wgsl, raster_frame.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE, WITH_COLOR, WITH_DEPTH, WITH_CANONICAL.
-@group(0) @binding(0) var<uniform> frame: Frame;
+@group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;
 @group(0) @binding(2) var<storage, read> color: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read> canonical: array<vec4<f32>>;

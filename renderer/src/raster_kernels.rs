@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytemuck::{Pod, Zeroable};
-use flyrig_gpu::{CAMERA_WGSL, CameraUniform, ComputeKernel, GpuContext};
+use flyrig_gpu::{CAMERA_WGSL, CameraConstants, ComputeKernel, GpuContext};
 
 use crate::Outputs;
 use crate::sort::{INVALID_KEY, SortShape};
@@ -69,11 +69,11 @@ impl RasterShape {
     }
 }
 
-/// Uniform of one picture, `struct Frame` in raster_frame.wgsl.
+/// Constants of one picture, `struct Frame` in raster_frame.wgsl.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(crate) struct Frame {
-    pub camera: CameraUniform,
+    pub camera: CameraConstants,
     pub size: [u32; 2],
     pub tiles: [u32; 2],
     pub gaussians: u32,

@@ -7,6 +7,7 @@ use crate::scan::{SCAN_WGSL, scan_prefix};
 use crate::sort::SORT_WGSL;
 
 fn validate(name: &str, source: &str) {
+    assert!(!source.contains("var<uniform>"), "{name}: see constants.rs");
     let module =
         naga::front::wgsl::parse_str(source).unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(source)));
     Validator::new(ValidationFlags::all(), Capabilities::empty())

@@ -32,7 +32,7 @@ impl Scan {
         })
     }
 
-    /// Scans the first elements of `values`, as many as the uniform `length` says (a `vec4<u32>`, x),
+    /// Scans the first elements of `values`, as many as the constants `length` says (a `vec4<u32>`, x),
     /// and writes their sum to `total[0]`.
     pub(crate) fn encode(
         &self,

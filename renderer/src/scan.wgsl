@@ -1,7 +1,7 @@
 // Exclusive prefix sum in place. Each invocation owns one contiguous segment, so that the result is
 // the same on every run and no invocation waits for another.
 // Prefix: const SEGMENTS.
-@group(0) @binding(0) var<uniform> scan_length: vec4<u32>;
+@group(0) @binding(0) var<storage, read> scan_length: vec4<u32>;
 @group(0) @binding(1) var<storage, read_write> values: array<u32>;
 @group(0) @binding(2) var<storage, read_write> segment_sums: array<u32>;
 @group(0) @binding(3) var<storage, read_write> total: array<u32>;

@@ -21,7 +21,7 @@ pub(crate) struct SortShape {
     pub digit_passes: u32,
 }
 
-/// Uniform of one pass.
+/// Constants of one pass.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(crate) struct SortPass {
@@ -97,7 +97,7 @@ impl RadixSort {
         &self.valid
     }
 
-    /// Sorts; `passes` holds one [`SortPass`] uniform a pass, `scan_length` the length of the table.
+    /// Sorts; `passes` holds one [`SortPass`] constants a pass, `scan_length` the length of the table.
     pub(crate) fn encode(
         &self,
         gpu: &GpuContext,
@@ -111,13 +111,13 @@ impl RadixSort {
         let valid = self.valid.raw().as_entire_binding();
         let groups = (self.shape.chunks.div_ceil(CHUNK_GROUP), 1);
         let (mut from, mut to) = (&self.elements, &self.other);
-        for (index, uniform) in passes.iter().enumerate() {
+        for (index, constants) in passes.iter().enumerate() {
             let source = from.raw().as_entire_binding();
             let target = to.raw().as_entire_binding();
             if index == 0 {
-                run(gpu, pass, &self.find_range, &[uniform.clone(), source.clone(), ranges.clone()], groups);
+                run(gpu, pass, &self.find_range, &[constants.clone(), source.clone(), ranges.clone()], groups);
             }
-            let mut resources = vec![uniform.clone(), source, ranges.clone(), table.clone(), valid.clone()];
+            let mut resources = vec![constants.clone(), source, ranges.clone(), table.clone(), valid.clone()];
             run(gpu, pass, &self.count_digits, &resources, groups);
             scan.encode(gpu, pass, scan_length, &self.table, &self.valid);
             resources.push(target);

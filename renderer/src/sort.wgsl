@@ -7,7 +7,7 @@ struct SortPass {
     index: u32,
 }
 
-@group(0) @binding(0) var<uniform> sort_pass: SortPass;
+@group(0) @binding(0) var<storage, read> sort_pass: SortPass;
 // (key, payload)
 @group(0) @binding(1) var<storage, read_write> source: array<vec2<u32>>;
 // Smallest and largest valid key of every chunk.

@@ -6,23 +6,23 @@ use rand::{RngExt, SeedableRng};
 use wgpu::ComputePassDescriptor;
 
 use super::*;
+use crate::constants::ConstantWriter;
 use crate::raster_kernels::RasterShape;
-use crate::uniforms::UniformWriter;
 
 fn sort_on_gpu(gpu: &GpuContext, sort: &mut RadixSort, scan: &Scan, keys: &[u32]) -> Vec<[u32; 2]> {
     sort.grow(gpu, keys.len()).unwrap();
     let elements: Vec<[u32; 2]> = keys.iter().copied().zip(0..).map(|(key, i)| [key, i]).collect();
     sort.input().write(gpu, &elements);
-    let mut writer = UniformWriter::default();
+    let mut writer = ConstantWriter::default();
     writer.push(&[sort.shape.table_len(), 0, 0, 0]);
     for index in 0..sort.shape.digit_passes {
         writer.push(&SortPass::new(keys.len() as u32, index));
     }
-    let uniforms = writer.finish(gpu);
-    let passes: Vec<_> = (1..=sort.shape.digit_passes as usize).map(|i| uniforms.get(i)).collect();
+    let constants = writer.finish(gpu);
+    let passes: Vec<_> = (1..=sort.shape.digit_passes as usize).map(|i| constants.get(i)).collect();
     let mut encoder = gpu.device.create_command_encoder(&Default::default());
     let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
-    sort.encode(gpu, &mut pass, scan, &passes, &uniforms.get(0));
+    sort.encode(gpu, &mut pass, scan, &passes, &constants.get(0));
     drop(pass);
     gpu.queue.submit([encoder.finish()]);
     let valid = sort.valid().read(gpu).unwrap()[0] as usize;
@@ -84,12 +84,12 @@ fn the_scan_is_the_running_sum() {
     for length in [0usize, 1, 63, 64, 65, 10_000, 1_036_800] {
         let content: Vec<u32> = (0..length).map(|_| rng.random_range(0..1000)).collect();
         let values = StorageBuffer::from_slice(&gpu, "values", &content).unwrap();
-        let mut writer = UniformWriter::default();
+        let mut writer = ConstantWriter::default();
         writer.push(&[length as u32, 0, 0, 0]);
-        let uniforms = writer.finish(&gpu);
+        let constants = writer.finish(&gpu);
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
-        scan.encode(&gpu, &mut pass, &uniforms.get(0), &values, &total);
+        scan.encode(&gpu, &mut pass, &constants.get(0), &values, &total);
         drop(pass);
         gpu.queue.submit([encoder.finish()]);
         let mut sum = 0;

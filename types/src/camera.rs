@@ -71,6 +71,9 @@ impl Lens {
                 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4))) > 0.0
             }
         };
+        if self.surely_grows(LIMIT) {
+            return LIMIT;
+        }
         // The derivative may dip below zero and rise again: walk outwards, then bisect the first dip.
         let (mut low, mut r) = (0.0, 0.01);
         while r < LIMIT {
@@ -86,6 +89,32 @@ impl Lens {
             r *= 1.02;
         }
         LIMIT
+    }
+
+    /// Whether a point of the ideal plane may be projected: not beyond [`Self::valid_radius`].
+    #[must_use]
+    pub fn is_valid(&self, ideal: DVec2) -> bool {
+        let radius = ideal.length();
+        self.surely_grows(radius) || radius <= self.valid_radius()
+    }
+
+    /// Quick and on the safe side: counting the negative coefficients alone, the radial part's derivative shrinks
+    /// with the radius, so where it is positive it is so all the way there.
+    fn surely_grows(&self, radius: f64) -> bool {
+        let negative = |c: f64| c.min(0.0);
+        let least = match *self {
+            Self::RadialTangential { radial: [k1, k2, k3], .. } => {
+                let r2 = radius * radius;
+                1.0 + r2 * (3.0 * negative(k1) + r2 * (5.0 * negative(k2) + r2 * 7.0 * negative(k3)))
+            }
+            Self::Fisheye { coefficients: [k1, k2, k3, k4] } => {
+                let t2 = radius.atan().powi(2);
+                1.0 + t2
+                    * (3.0 * negative(k1)
+                        + t2 * (5.0 * negative(k2) + t2 * (7.0 * negative(k3) + t2 * 9.0 * negative(k4))))
+            }
+        };
+        least > 0.0
     }
 
     /// Inverse of [`Self::distort`] by damped fixed-point and Newton steps; `None` when nothing on
@@ -181,7 +210,7 @@ impl Camera {
             return None;
         }
         let ideal = point.truncate() / point.z;
-        if ideal.length() > self.intrinsics.lens.valid_radius() {
+        if !self.intrinsics.lens.is_valid(ideal) {
             return None;
         }
         Some(self.intrinsics.lens.distort(ideal) * self.intrinsics.focal_px + self.intrinsics.center_px)
@@ -333,6 +362,28 @@ mod tests {
         let wide = camera(lens);
         let sideways = wide.position() + wide.camera_from_world.rotation.inverse() * DVec3::new(1.2, 0.0, 1.0);
         assert_eq!(wide.project(sideways), None);
+    }
+
+    #[test]
+    fn the_quick_check_never_lets_a_point_beyond_the_valid_radius_through() {
+        let coefficients = [-0.9, -0.3, -0.01, 0.0, 0.02, 0.4];
+        for (i, k1) in coefficients.into_iter().enumerate() {
+            for (j, k2) in coefficients.into_iter().enumerate() {
+                let k3 = coefficients[(i + 2 * j) % 6];
+                for lens in [
+                    Lens::RadialTangential { radial: [k1, k2, k3], tangential: [0.0; 2] },
+                    Lens::Fisheye { coefficients: [k1, k2, k3, k1] },
+                ] {
+                    let valid = lens.valid_radius();
+                    for share in [0.1, 0.5, 0.9, 0.999, 1.001, 1.1, 2.0, 10.0] {
+                        let radius = share * valid;
+                        let expected = radius <= valid || (valid >= 1e3 && lens.is_valid(DVec2::X * radius));
+                        assert_eq!(lens.is_valid(DVec2::X * radius), expected, "{lens:?} {share}");
+                    }
+                }
+            }
+        }
+        assert!(!Lens::PINHOLE.is_valid(DVec2::new(f64::NAN, 0.0)));
     }
 
     #[test]

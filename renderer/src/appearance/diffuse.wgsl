@@ -1,7 +1,7 @@
 // One workgroup for all: colours go up the hierarchy as visibility-weighted means, come down as first guesses, and
 // a few damped Jacobi steps a level bring each close to the minimum of
 //   sum_i c_i |x_i - seen_i|^2 + smoothness * sum_ij e_ij |x_i - x_j|^2.
-@group(0) @binding(0) var<uniform> settings: Settings;
+@group(0) @binding(0) var<storage, read> settings: Settings;
 // First node and number of nodes, finest level first.
 @group(0) @binding(1) var<storage, read> levels: array<vec4<u32>>;
 // Ranges in `edges` (x..y) and `children` (z..w).

@@ -24,7 +24,7 @@ const BASELINE_VIEW_WEIGHT: f32 = 1e-3;
 /// Layout of `struct Settings` in the WGSL (std140, 32 bytes).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
-pub(super) struct SettingsUniform {
+pub(super) struct SettingsConstants {
     occlusion_per_m: f32,
     memory_weight_max: f32,
     min_mask: f32,
@@ -35,7 +35,7 @@ pub(super) struct SettingsUniform {
     time: u32,
 }
 
-impl From<&AppearanceSettings> for SettingsUniform {
+impl From<&AppearanceSettings> for SettingsConstants {
     fn from(settings: &AppearanceSettings) -> Self {
         Self {
             occlusion_per_m: settings.occlusion_per_m,
@@ -94,6 +94,7 @@ mod tests {
     #[test]
     fn kernels_are_valid_wgsl() {
         for (name, source) in sources() {
+            assert!(!source.contains("var<uniform>"), "{name}: see constants.rs");
             let module = naga::front::wgsl::parse_str(&source)
                 .unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(&source)));
             Validator::new(ValidationFlags::all(), Capabilities::empty())
@@ -101,7 +102,7 @@ mod tests {
                 .unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(&source)));
             let settings = module.types.iter().find(|(_, ty)| ty.name.as_deref() == Some("Settings"));
             if let Some((_, ty)) = settings {
-                assert_eq!(ty.inner.size(module.to_ctx()) as usize, size_of::<SettingsUniform>(), "{name}");
+                assert_eq!(ty.inner.size(module.to_ctx()) as usize, size_of::<SettingsConstants>(), "{name}");
             }
         }
     }

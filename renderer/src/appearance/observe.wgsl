@@ -1,6 +1,6 @@
 // One thread a Gaussian, one dispatch a view: adds what this view saw of it (Eq. 5 to 8).
-@group(0) @binding(0) var<uniform> settings: Settings;
-@group(0) @binding(1) var<uniform> camera: Camera;
+@group(0) @binding(0) var<storage, read> settings: Settings;
+@group(0) @binding(1) var<storage, read> camera: Camera;
 // sRGB bytes, red lowest; mask coverage highest.
 @group(0) @binding(2) var<storage, read> picture: array<u32>;
 // Canonical position times alpha; w: alpha.

@@ -1,5 +1,5 @@
 // One thread a Gaussian: fills what was not seen (Eq. 9), remembers (Eq. 10) and blends with the memory (Eq. 11, 12).
-@group(0) @binding(0) var<uniform> settings: Settings;
+@group(0) @binding(0) var<storage, read> settings: Settings;
 @group(0) @binding(1) var<storage, read> seen: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> quality: array<vec2<f32>>;
 @group(0) @binding(3) var<storage, read> node_color: array<vec4<f32>>;

@@ -1,14 +1,14 @@
 //! Buffers of direct appearance and the recording of one frame.
 
 use flyrig_body::{DeformationGraph, SurfaceGaussians};
-use flyrig_gpu::{CameraUniform, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
+use flyrig_gpu::{CameraConstants, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
 use flyrig_types::MAX_IMAGE_SIDE;
 use wgpu::{Buffer, BufferUsages, CommandEncoder, ComputePassDescriptor};
 
 use super::{
     AppearanceError, AppearanceSettings, ViewInput,
     graph_buffers::GraphBuffers,
-    kernels::{Kernels, SettingsUniform, WORKGROUP},
+    kernels::{Kernels, SettingsConstants, WORKGROUP},
 };
 use crate::{GaussianBuffers, linear_from_srgb};
 
@@ -52,23 +52,23 @@ impl DirectAppearance {
     ) -> Result<Self, AppearanceError> {
         let count = gaussians.positions.len();
         let graph = GraphBuffers::new(gpu, count, graph)?;
-        let uniform = |label, size: usize| {
+        let constants = |label, size: usize| {
             gpu.device.create_buffer(&wgpu::BufferDescriptor {
                 label: Some(label),
                 size: size as u64,
-                usage: BufferUsages::UNIFORM | BufferUsages::COPY_DST,
+                usage: BufferUsages::STORAGE | BufferUsages::COPY_DST,
                 mapped_at_creation: false,
             })
         };
         let view = |_| {
             let picture = StorageBuffer::zeroed(gpu, "view picture", 0)?;
-            Ok(ViewSlot { camera: uniform("view camera", size_of::<CameraUniform>()), picture })
+            Ok(ViewSlot { camera: constants("view camera", size_of::<CameraConstants>()), picture })
         };
         let decoded: Vec<f32> = (0..=255u8).map(|byte| linear_from_srgb(f32::from(byte) / 255.0)).collect();
         Ok(Self {
             kernels: Kernels::new(gpu),
             graph,
-            settings: uniform("appearance settings", size_of::<SettingsUniform>()),
+            settings: constants("appearance settings", size_of::<SettingsConstants>()),
             linear_from_srgb: StorageBuffer::from_slice(gpu, "linear values of sRGB bytes", &decoded)?,
             views: (0..max_views).map(view).collect::<Result<_, GpuError>>()?,
             seen: StorageBuffer::zeroed(gpu, "observed colours", count)?,
@@ -113,7 +113,7 @@ impl DirectAppearance {
         for (slot, view) in self.views.iter_mut().zip(views) {
             slot.upload(gpu, view)?;
         }
-        gpu.queue.write_buffer(&self.settings, 0, bytemuck::bytes_of(&SettingsUniform::from(settings)));
+        gpu.queue.write_buffer(&self.settings, 0, bytemuck::bytes_of(&SettingsConstants::from(settings)));
         if std::mem::take(&mut self.forget) {
             encoder.clear_buffer(self.memory.raw(), 0, None);
         }
@@ -223,7 +223,7 @@ impl ViewSlot {
         if self.picture.len() != pixels {
             self.picture = StorageBuffer::zeroed(gpu, &format!("the picture of camera {}", view.camera.id), pixels)?;
         }
-        gpu.queue.write_buffer(&self.camera, 0, bytemuck::bytes_of(&CameraUniform::from(view.camera)));
+        gpu.queue.write_buffer(&self.camera, 0, bytemuck::bytes_of(&CameraConstants::from(view.camera)));
         // Bytes, not words: a picture need not lie on a word's boundary. The GPU reads little-endian words.
         gpu.queue.write_buffer(self.picture.raw(), 0, view.rgba);
         Ok(())

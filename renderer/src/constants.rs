@@ -1,4 +1,7 @@
-//! Uniforms of one encoding.
+//! Constants of one encoding.
+//!
+//! They lie in a storage buffer on purpose. Mesa's software adapter (22.3) specialises a shader anew for the values of
+//! a uniform buffer at every dispatch and never frees what it made: about 30 to 130 KiB a dispatch, for ever.
 
 use bytemuck::Pod;
 use wgpu::util::{BufferInitDescriptor, DeviceExt};
@@ -6,18 +9,18 @@ use wgpu::{BindingResource, Buffer, BufferBinding, BufferSize, BufferUsages};
 
 use flyrig_gpu::GpuContext;
 
-/// Offsets in a uniform buffer may be any multiple of this on every adapter (WebGPU's default limit).
+/// Offsets in a storage buffer may be any multiple of this on every adapter (WebGPU's default limit).
 const ALIGNMENT: usize = 256;
 
-/// Several uniforms in one buffer. It is made anew for every encoding: a queued write to a shared
+/// Several constants in one buffer. It is made anew for every encoding: a queued write to a shared
 /// buffer would land before all pictures of a submission, not between them.
 #[derive(Debug, Default)]
-pub(crate) struct UniformWriter {
+pub(crate) struct ConstantWriter {
     bytes: Vec<u8>,
     ranges: Vec<(u64, BufferSize)>,
 }
 
-impl UniformWriter {
+impl ConstantWriter {
     pub(crate) fn push<T: Pod>(&mut self, value: &T) {
         let offset = self.bytes.len();
         if let Some(size) = BufferSize::new(size_of::<T>() as u64) {
@@ -27,25 +30,25 @@ impl UniformWriter {
         }
     }
 
-    pub(crate) fn finish(self, gpu: &GpuContext) -> Uniforms {
+    pub(crate) fn finish(self, gpu: &GpuContext) -> Constants {
         let contents = if self.bytes.is_empty() { &[0; ALIGNMENT] } else { self.bytes.as_slice() };
         let buffer = gpu.device.create_buffer_init(&BufferInitDescriptor {
-            label: Some("raster uniforms"),
+            label: Some("raster constants"),
             contents,
-            usage: BufferUsages::UNIFORM,
+            usage: BufferUsages::STORAGE,
         });
-        Uniforms { buffer, ranges: self.ranges }
+        Constants { buffer, ranges: self.ranges }
     }
 }
 
 #[derive(Debug)]
-pub(crate) struct Uniforms {
+pub(crate) struct Constants {
     buffer: Buffer,
     ranges: Vec<(u64, BufferSize)>,
 }
 
-impl Uniforms {
-    /// The uniform pushed as number `index`.
+impl Constants {
+    /// The constant pushed as number `index`.
     pub(crate) fn get(&self, index: usize) -> BindingResource<'_> {
         let (offset, size) = self.ranges.get(index).map_or((0, None), |&(offset, size)| (offset, Some(size)));
         BindingResource::Buffer(BufferBinding { buffer: &self.buffer, offset, size })
