@@ -90,7 +90,7 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
         }
         if last_print.elapsed() >= PRINT_EVERY {
             last_print = Instant::now();
-            eprintln!("{}", line(&subscriber));
+            eprintln!("{}", line(&subscriber, args));
         }
     }
     if let Some(sink) = sink {
@@ -127,7 +127,7 @@ fn viewpoint(eye: [f64; 3], args: &WatchArgs, world_up: DVec3) -> Result<Camera>
     })
 }
 
-fn line(subscriber: &Subscriber) -> String {
+fn line(subscriber: &Subscriber, args: &WatchArgs) -> String {
     let reports: Vec<String> = subscriber
         .reports()
         .into_iter()
@@ -144,10 +144,10 @@ fn line(subscriber: &Subscriber) -> String {
             format!("{topic}: {:.1}/s, {} missed{latency}", report.per_second, report.missed)
         })
         .collect();
-    if reports.is_empty() {
-        format!("watch: {} rig(s) up, no picture yet", subscriber.publishers())
-    } else {
-        format!("watch: {}", reports.join("; "))
+    match (reports.is_empty(), subscriber.publishers()) {
+        (true, 0) => format!("watch: no rig '{}' at {} yet; check --rig and --connect", args.rig, args.connect),
+        (true, _) => format!("watch: rig '{}' is up, no picture of view '{}' yet", args.rig, args.view),
+        (false, _) => format!("watch: {}", reports.join("; ")),
     }
 }
 
