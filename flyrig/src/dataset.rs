@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
+use flyrig_calib::{CalibError, load_easymocap};
 use flyrig_capture::{VideoOptions, VideoReplay, folder_picture_size};
 use flyrig_tracker::PoseEstimator;
 use flyrig_types::{Camera, CameraId, Image, PixelFormat, Rig};
@@ -28,8 +29,21 @@ pub fn pick(rig: &Rig, names: &[String], whose: &str) -> Result<Rig> {
     Ok(picked)
 }
 
+/// The calibrated cameras of a data set. A calibration without picture sizes needs the pictures of every camera; when
+/// one of the `chosen` has none, the error says so.
+pub fn load_rig(root: &Path, chosen: &[CameraId]) -> Result<Rig> {
+    load_easymocap(root, &|id| picture_size(root, id)).or_else(|error| {
+        if matches!(error, CalibError::UnknownSize { .. }) {
+            for camera in chosen.iter().filter(|id| !video_file(root, id).exists()) {
+                folder_picture_size(root, camera)?;
+            }
+        }
+        Err(error.into())
+    })
+}
+
 /// Size of a camera's first readable picture, or else of its video, for calibrations that do not say.
-pub fn picture_size(root: &Path, id: &CameraId) -> Option<(u32, u32)> {
+fn picture_size(root: &Path, id: &CameraId) -> Option<(u32, u32)> {
     let of_video = || VideoReplay::open(id, &video_file(root, id), &VideoOptions::default()).ok()?.picture_size();
     folder_picture_size(root, id).ok().or_else(of_video)
 }

@@ -4,7 +4,7 @@ use std::{path::Path, sync::Arc, time::Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
-use flyrig_calib::{SyncConfig, Synchronizer, load_easymocap};
+use flyrig_calib::{SyncConfig, Synchronizer};
 use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay, to_rgb8};
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::write_mesh_ply;
@@ -200,7 +200,8 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
 }
 
 fn load_rigs(args: &EvalArgs) -> Result<(Rig, Vec<Camera>)> {
-    let all = load_easymocap(&args.dataset, &|id| dataset::picture_size(&args.dataset, id))?;
+    let chosen: Vec<CameraId> = args.inputs.iter().chain(&args.holdout).map(|name| name.as_str().into()).collect();
+    let all = dataset::load_rig(&args.dataset, &chosen)?;
     let whose = format!("the calibration of {}", args.dataset.display());
     let (rig, holdout) = (dataset::pick(&all, &args.inputs, &whose)?, dataset::pick(&all, &args.holdout, &whose)?);
     if let Some(both) = args.inputs.iter().find(|name| args.holdout.contains(name)) {
@@ -254,8 +255,7 @@ impl FrameReader {
                     Ok(None) => ended += 1,
                     Err(error) if error.kind == CaptureErrorKind::Corrupt => {
                         self.broken += 1;
-                        tracing::warn!(%error, "picture skipped");
-                        eprintln!("eval: {error}; going on without it");
+                        tracing::warn!("{error}; going on without it");
                     }
                     Err(error) => return Err(error.into()),
                 }
@@ -308,7 +308,7 @@ impl TruthReader {
                     Ok(Some(frame)) => *current = Some(frame),
                     Ok(None) => break,
                     Err(error) if error.kind == CaptureErrorKind::Corrupt => {
-                        eprintln!("eval: held-out {error}; that frame is not scored");
+                        tracing::warn!("held-out {error}; that frame is not scored");
                     }
                     Err(error) => return Err(error.into()),
                 }

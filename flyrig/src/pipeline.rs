@@ -104,7 +104,16 @@ impl Pipeline {
                 Some(InputView { camera: &self.rig.cameras[slot], image: &frame.image, mask })
             })
             .collect();
-        self.counts.without_mask += (set.present().count() - views.len()) as u64;
+        for ((_, frame), mask) in set.present().zip(&masks) {
+            if mask.as_ref().is_none_or(|mask| mask.mask().area_px() == 0) {
+                self.counts.without_mask += 1;
+                // The 1st, 2nd, 4th ...: a camera that sees nobody all night must not fill the disk.
+                if self.counts.without_mask.is_power_of_two() {
+                    let (camera, count) = (&frame.camera, self.counts.without_mask);
+                    tracing::warn!(set = set.index, %camera, count, "no person in the mask; going on without this view");
+                }
+            }
+        }
         self.engine.update(&pose, &views, &mut self.stages)?;
         self.last_pose = Some(pose);
         self.counts.updated += 1;

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail, ensure};
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
-use flyrig_calib::{SyncConfig, load_easymocap};
+use flyrig_calib::SyncConfig;
 use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, VideoOptions, VideoReplay};
 use flyrig_gpu::GpuContext;
 use flyrig_sim::Simulator;
@@ -205,7 +205,8 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
             .collect();
         return Ok(Scene { sources, rig: picked, template, track: Some(track), plates });
     }
-    let rig = load_easymocap(&source.path, &|id| dataset::picture_size(&source.path, id))?;
+    let chosen: Vec<CameraId> = source.cameras.iter().map(|name| name.as_str().into()).collect();
+    let rig = dataset::load_rig(&source.path, &chosen)?;
     let rig = dataset::pick(&rig, &source.cameras, "the calibration")?;
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     let sources: Vec<Box<dyn CameraSource>> = if source.kind == SourceKind::Folder {

@@ -29,6 +29,13 @@ fn a_missing_camera_is_named_with_those_there_are() {
     assert_refused(&data, &finished, "02");
     assert!(finished.stderr.contains("00"), "lists what there is: {}", finished.stderr);
 
+    // Nor is it put down to the calibration when that says nothing of the pictures' sizes.
+    let intri = data.root.join("intri.yml");
+    let text = std::fs::read_to_string(&intri).unwrap();
+    let sizeless: Vec<&str> = text.lines().filter(|line| !line.starts_with("H_") && !line.starts_with("W_")).collect();
+    std::fs::write(&intri, sizeless.join("\n")).unwrap();
+    assert_refused(&data, &eval(&data, &[]), "camera 02: is not in");
+
     let data = write_dataset().unwrap();
     let root = data.root.to_str().unwrap();
     let finished = run(
@@ -68,6 +75,7 @@ fn an_empty_mask_costs_that_view() {
     let metrics: serde_json::Value =
         serde_json::from_slice(&std::fs::read(data.out().join("metrics.json")).unwrap()).unwrap();
     assert_eq!(metrics["counts"]["without_mask"], FRAMES);
+    assert!(finished.stderr.contains("camera=05") && finished.stderr.contains("no person"), "{}", finished.stderr);
     let psnr = metrics["mean"]["psnr_db"].as_f64().unwrap();
     assert!(psnr.is_finite() && psnr > 10.0, "{psnr}");
 }
