@@ -48,7 +48,7 @@ impl Default for DeformSettings {
             spatial: 1.0,
             temporal: 2.0,
             smoothing: 0.5,
-            damping: 0.01,
+            damping: 0.03,
             max_step_m: 0.02,
             max_translation_m: 0.25,
             attempts: 3,

@@ -10,7 +10,10 @@ use super::{DataTerm, DeformSettings, DeformSolver, PointDerivatives};
 use crate::{TrackError, TrackErrorKind};
 
 /// Damping never falls below or rises above these shares of the mean diagonal.
-const DAMPING_RANGE: (f64, f64) = (1e-6, 1e6);
+const DAMPING_RANGE: (f64, f64) = (1e-3, 1e6);
+/// Shares of the predicted fall of the loss above and below which the damping changes after a step.
+const GOOD_GAIN: f64 = 0.75;
+const POOR_GAIN: f64 = 0.25;
 /// Keeps the matrix regular where neither picture nor neighbour says anything, units of loss a square metre.
 const LEAST_DAMPING: f64 = 1e-6;
 
@@ -213,10 +216,20 @@ impl DeformTracker {
         for _ in 0..self.settings.attempts {
             let damping = self.damping * self.matrix.mean_diagonal() + LEAST_DAMPING;
             let step = self.matrix.solve(self.regularizer.stiffness(), damping, &right);
+            // Of the quadratic model, which the step s solves: (A + damping) s = -g.
+            let share = self.shrink(&step);
+            let along: f64 = right.iter().zip(&step).map(|(r, s)| r.dot(*s)).sum();
+            let squared: f64 = step.iter().map(|s| s.length_squared()).sum();
+            let predicted = share * along - 0.5 * share * share * (along - damping * squared);
             let (translations, displacement) = (self.translations.clone(), self.displacement.clone());
             let new = self.try_step(step, data)?;
             if new < loss {
-                self.damping = (self.damping / 4.0).max(DAMPING_RANGE.0);
+                let gain = (loss - new) / predicted;
+                if gain > GOOD_GAIN {
+                    self.damping = (self.damping / 4.0).max(DAMPING_RANGE.0);
+                } else if gain < POOR_GAIN {
+                    self.damping = (self.damping * 4.0).min(DAMPING_RANGE.1);
+                }
                 report.accepted += 1;
                 report.losses.push(new);
                 return Ok(());
@@ -228,14 +241,19 @@ impl DeformTracker {
         Ok(())
     }
 
+    /// The share of a step that keeps every node within the longest one.
+    fn shrink(&self, step: &[DVec3]) -> f64 {
+        let longest = step.iter().map(|s| s.length()).fold(0.0, f64::max);
+        if longest > self.settings.max_step_m { self.settings.max_step_m / longest } else { 1.0 }
+    }
+
     /// Moves the nodes, within the limits, and tells the loss there. A step or a loss that is not finite is undone,
     /// and so is one that the data term fails at.
     fn try_step<D: DataTerm>(&mut self, step: Vec<DVec3>, data: &mut D) -> Result<f64, D::Error> {
-        let longest = step.iter().map(|s| s.length()).fold(0.0, f64::max);
-        if !step.iter().all(|s| s.is_finite()) || !longest.is_finite() {
+        if !step.iter().all(|s| s.is_finite()) {
             return Ok(f64::NAN);
         }
-        let shrink = if longest > self.settings.max_step_m { self.settings.max_step_m / longest } else { 1.0 };
+        let shrink = self.shrink(&step);
         let limit = self.settings.max_translation_m;
         let moved: Vec<DVec3> =
             self.translations.iter().zip(step).map(|(t, s)| (*t + s * shrink).clamp_length_max(limit)).collect();
