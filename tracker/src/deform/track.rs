@@ -20,7 +20,8 @@ const LEAST_DAMPING: f64 = 1e-6;
 /// What one frame did to the deformation.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DeformReport {
-    /// Total loss (Eq. 3) before the first iteration and after each one that was made.
+    /// Total loss (Eq. 3) before the first iteration and after each one that was made; of [`DeformSolver::Paper`], which
+    /// never looks where it stepped to, before each one.
     pub losses: Vec<f64>,
     /// Steps that were taken.
     pub accepted: usize,
@@ -28,7 +29,7 @@ pub struct DeformReport {
     pub refused: usize,
     /// Gaussians left out because a derivative was not finite.
     pub dropped: usize,
-    /// The loss was not finite: nothing was changed.
+    /// The loss was not finite: all is as it was before the frame.
     pub poisoned: bool,
 }
 
@@ -132,6 +133,7 @@ impl DeformTracker {
         data: &mut D,
     ) -> Result<DeformReport, D::Error> {
         let mut report = DeformReport::default();
+        let start = self.translations.clone();
         for _ in 0..self.settings.iterations(self.frame) {
             let mut gradient = vec![DVec3::ZERO; self.translations.len()];
             let mut derivatives = std::mem::take(&mut self.derivatives);
@@ -140,9 +142,12 @@ impl DeformTracker {
             let loss = data_loss? + self.regularizer.loss(&self.translations, &self.smooth, Some(&mut gradient));
             if !loss.is_finite() {
                 report.poisoned = true;
+                self.translations = start;
+                self.displace();
                 return Ok(report);
             }
-            if report.losses.is_empty() {
+            // Gauss-Newton has told the loss after its step already.
+            if report.losses.len() == report.accepted {
                 report.losses.push(loss);
             }
             report.dropped += self.gather(world_from_canonical, &mut gradient);
@@ -150,7 +155,9 @@ impl DeformTracker {
             match self.settings.solver {
                 DeformSolver::Paper { rate } => {
                     let step = gradient.iter().map(|g| *g * -rate).collect();
-                    self.step_blindly(step, loss, data, &mut report)?;
+                    if self.step(step).is_some() {
+                        report.accepted += 1;
+                    }
                 }
                 DeformSolver::GaussNewton { .. } => self.step_downhill(&gradient, loss, data, &mut report)?,
             }
@@ -181,25 +188,6 @@ impl DeformTracker {
             }
         }
         dropped
-    }
-
-    /// The paper's step: taken whatever it does to the loss, unless that stops being a number.
-    fn step_blindly<D: DataTerm>(
-        &mut self,
-        step: Vec<DVec3>,
-        loss: f64,
-        data: &mut D,
-        report: &mut DeformReport,
-    ) -> Result<(), D::Error> {
-        let new = self.try_step(step, data)?;
-        if new.is_finite() {
-            report.accepted += 1;
-            report.losses.push(new);
-        } else {
-            report.refused += 1;
-            report.losses.push(loss);
-        }
-        Ok(())
     }
 
     fn step_downhill<D: DataTerm>(
@@ -247,11 +235,11 @@ impl DeformTracker {
         if longest > self.settings.max_step_m { self.settings.max_step_m / longest } else { 1.0 }
     }
 
-    /// Moves the nodes, within the limits, and tells the loss there. A step or a loss that is not finite is undone,
-    /// and so is one that the data term fails at.
-    fn try_step<D: DataTerm>(&mut self, step: Vec<DVec3>, data: &mut D) -> Result<f64, D::Error> {
+    /// Moves the nodes, within the limits, and returns where they were; none, and nothing done, when the step is not
+    /// finite.
+    fn step(&mut self, step: Vec<DVec3>) -> Option<Vec<DVec3>> {
         if !step.iter().all(|s| s.is_finite()) {
-            return Ok(f64::NAN);
+            return None;
         }
         let shrink = self.shrink(&step);
         let limit = self.settings.max_translation_m;
@@ -259,6 +247,13 @@ impl DeformTracker {
             self.translations.iter().zip(step).map(|(t, s)| (*t + s * shrink).clamp_length_max(limit)).collect();
         let old = std::mem::replace(&mut self.translations, moved);
         self.displace();
+        Some(old)
+    }
+
+    /// Moves the nodes and tells the loss there. A step or a loss that is not finite is undone, and so is one that the
+    /// data term fails at.
+    fn try_step<D: DataTerm>(&mut self, step: Vec<DVec3>, data: &mut D) -> Result<f64, D::Error> {
+        let Some(old) = self.step(step) else { return Ok(f64::NAN) };
         let loss = data.loss(&self.displacement);
         let total = loss.map(|loss| loss + self.regularizer.loss(&self.translations, &self.smooth, None));
         if !matches!(total, Ok(total) if total.is_finite()) {
