@@ -36,6 +36,6 @@ pub use gpu_skinner::GpuSkinner;
 pub use graph::{DEFAULT_NODE_COUNT, DEFAULT_SIGMA2_M2, DeformationGraph, build_graph};
 pub use shape::ShapeParams;
 pub use skeleton::{Joint, Skeleton};
-pub use skinning::{skin_mesh, skin_normal_f64, skin_point_f64};
+pub use skinning::{skin_jacobian_f64, skin_mesh, skin_normal_f64, skin_point_f64};
 pub use surface::{DEFAULT_GAUSSIAN_COUNT, SurfaceGaussians, sample_surface};
 pub use template::{Part, SkinWeights, Template};

@@ -19,6 +19,13 @@ pub fn skin_normal_f64(matrices: &[DMat4], skin: &SkinWeights, normal: DVec3) ->
     (DMat3::from_mat4(blend_f64(matrices, skin)) * normal).normalize_or_zero()
 }
 
+/// Derivative of the skinned point by the canonical point: the linear part of the blended bone matrices, as
+/// [`skin_point_f64`] takes them.
+#[must_use]
+pub fn skin_jacobian_f64(matrices: &[DMat4], skin: &SkinWeights) -> DMat3 {
+    DMat3::from_mat4(blend_f64(matrices, skin))
+}
+
 fn blend_f64(matrices: &[DMat4], skin: &SkinWeights) -> DMat4 {
     let mut sum = DMat4::ZERO;
     let mut total = 0.0;

@@ -4,7 +4,7 @@ use std::{net::SocketAddr, ops::Range, path::PathBuf};
 
 use clap::{Args, Parser, Subcommand};
 
-use crate::config::{AppearanceMode, Origin};
+use crate::config::{AppearanceMode, Origin, Solver};
 
 /// Live free-viewpoint video of a person from a few cameras.
 ///
@@ -83,6 +83,9 @@ pub struct DemoArgs {
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000)]
     pub gaussians: usize,
+    /// How the body follows the pictures beyond its pose.
+    #[arg(long, value_enum, default_value = "none")]
+    pub solver: Solver,
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
     pub appearance: AppearanceMode,
@@ -153,6 +156,9 @@ pub struct EvalArgs {
     /// Masks from the data set, or from the pictures.
     #[arg(long, value_enum, default_value = "given")]
     pub masks: Origin,
+    /// How the body follows the pictures beyond its pose.
+    #[arg(long, value_enum, default_value = "none")]
+    pub solver: Solver,
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
     pub appearance: AppearanceMode,

@@ -12,8 +12,10 @@ use flyrig_renderer::{
     AppearanceSettings, DirectAppearance, GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, Splat,
     ViewInput, read_splats, rgba8_from_target,
 };
+use flyrig_tracker::DeformSettings;
 use flyrig_types::{Camera, Image, Mask, Pose};
 
+use crate::deformation::{Deformation, Scene, TrackedView};
 use crate::stats::StageTimes;
 
 /// Seed of the surface sampling: the same template gives the same Gaussians on every run.
@@ -49,10 +51,13 @@ pub struct Engine {
     visibility: Vec<RenderTarget>,
     rgba: Vec<Vec<u8>>,
     output: Option<RenderTarget>,
+    deformation: Option<Deformation>,
 }
 
 impl Engine {
-    /// Samples the template's surface and prepares the GPU. Takes a few seconds.
+    /// Samples the template's surface and prepares the GPU. Takes a few seconds. Without `deform` the body is only
+    /// skinned.
+    #[allow(clippy::too_many_arguments)]
     pub fn new(
         gpu: GpuContext,
         template: Template,
@@ -60,12 +65,13 @@ impl Engine {
         node_count: usize,
         max_views: usize,
         settings: AppearanceSettings,
+        deform: Option<DeformSettings>,
     ) -> Result<Self> {
         let surface =
             sample_surface(&template, gaussian_count, SURFACE_SEED).context("sampling the template's surface")?;
         let graph = build_graph(&template, &surface, node_count, DEFAULT_SIGMA2_M2)
             .context("building the deformation graph")?;
-        Self::from_parts(gpu, template, &surface, &graph, max_views, settings)
+        Self::from_parts(gpu, template, &surface, &graph, max_views, settings, deform)
     }
 
     fn from_parts(
@@ -75,6 +81,7 @@ impl Engine {
         graph: &DeformationGraph,
         max_views: usize,
         settings: AppearanceSettings,
+        deform: Option<DeformSettings>,
     ) -> Result<Self> {
         let count = surface.positions.len();
         let gaussians = GaussianBuffers::zeroed(&gpu, count)?;
@@ -84,9 +91,13 @@ impl Engine {
         let canonical: Vec<[f32; 4]> = surface.positions.iter().map(|p| p.extend(1.0).to_array()).collect();
         gaussians.canonical.write(&gpu, &canonical);
         gaussians.color.write(&gpu, &vec![[0.5, 0.5, 0.5, 1.0]; count]);
+        let rasterizer = Rasterizer::new(&gpu, count)?;
         Ok(Self {
             skinner: GpuSkinner::new(&gpu, surface, &template.skeleton)?,
-            rasterizer: Rasterizer::new(&gpu, count)?,
+            deformation: deform
+                .map(|settings| Deformation::new(&gpu, &template, surface, graph, &rasterizer, settings))
+                .transpose()?,
+            rasterizer,
             appearance: DirectAppearance::new(&gpu, surface, graph, max_views)?,
             gpu,
             template,
@@ -107,6 +118,25 @@ impl Engine {
     pub fn update(&mut self, pose: &Pose, views: &[InputView<'_>], stages: &mut StageTimes) -> Result<()> {
         stages.time("convert pictures", || self.fill_rgba(views))?;
 
+        if let Some(deformation) = &mut self.deformation {
+            let start = Instant::now();
+            let tracked: Vec<TrackedView<'_>> = views
+                .iter()
+                .zip(&self.rgba)
+                .map(|(view, rgba)| (view.camera, [view.image.width(), view.image.height()], rgba.as_slice()))
+                .collect();
+            let scene = Scene {
+                gpu: &self.gpu,
+                skinner: &self.skinner,
+                skeleton: &self.template.skeleton,
+                rasterizer: &mut self.rasterizer,
+                gaussians: &self.gaussians,
+            };
+            let report = deformation.track(scene, pose, &tracked)?;
+            tracing::debug!(?report, "deformation");
+            stages.add("deformation", start.elapsed());
+        }
+
         let start = Instant::now();
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         self.skinner.encode(
@@ -114,7 +144,7 @@ impl Engine {
             &mut encoder,
             &self.template.skeleton,
             pose,
-            None,
+            self.deformation.as_ref().map(Deformation::displacement),
             &self.gaussians.center_scale,
             &self.gaussians.normal,
         )?;
@@ -191,7 +221,12 @@ impl Engine {
 
     /// The tracked surface: world positions and normals of the template's vertices.
     pub fn surface(&self, pose: &Pose) -> (Vec<glam::Vec3>, Vec<glam::Vec3>) {
-        skin_mesh(&self.template, pose)
+        let Some(deformation) = &self.deformation else { return skin_mesh(&self.template, pose) };
+        let mut moved = self.template.clone();
+        for (position, by) in moved.positions.iter_mut().zip(deformation.vertex_displacement()) {
+            *position += by;
+        }
+        skin_mesh(&moved, pose)
     }
 
     fn submit(&self, encoder: wgpu::CommandEncoder) -> Result<()> {

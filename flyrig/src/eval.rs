@@ -95,8 +95,15 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
             (estimator.template().clone(), PoseSource::Estimator(Box::new(estimator)))
         }
     };
-    let engine =
-        Engine::new(gpu.clone(), template, args.gaussians, args.nodes, rig.cameras.len(), args.appearance.settings())?;
+    let engine = Engine::new(
+        gpu.clone(),
+        template,
+        args.gaussians,
+        args.nodes,
+        rig.cameras.len(),
+        args.appearance.settings(),
+        args.solver.settings(),
+    )?;
     let mut pipeline = Pipeline::new(engine, rig, pose, args.masks, plates);
 
     let total = frames.count as u64;

@@ -5,6 +5,7 @@
 mod cli;
 mod config;
 mod dataset;
+mod deformation;
 mod demo;
 mod engine;
 mod eval;

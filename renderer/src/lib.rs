@@ -1,4 +1,4 @@
-//! Splats to pictures and back: forward rasteriser, direct appearance, image metrics, splat export.
+//! Splats to pictures and back: forward and backward rasteriser, direct appearance, image metrics, splat export.
 
 mod appearance;
 mod buffers;
@@ -7,6 +7,7 @@ mod constants;
 mod export;
 pub mod metrics;
 mod raster;
+mod raster_backward;
 mod raster_buffers;
 mod raster_kernels;
 mod scan;
@@ -19,4 +20,5 @@ pub use buffers::{GaussianBuffers, RenderTarget};
 pub use color::{composite_over, linear_from_srgb, rgba8_from_target, srgb_from_linear};
 pub use export::{ExportError, Splat, read_splats, write_mesh_ply, write_splat_ply};
 pub use raster::{Outputs, RasterSettings, RasterStats, Rasterizer};
+pub use raster_backward::{BackwardError, BackwardRasterizer, Carry, GaussianGradients, PictureGradients};
 pub use raster_kernels::BACKFACING_COSINE;

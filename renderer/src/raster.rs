@@ -74,16 +74,26 @@ pub struct RasterStats {
 /// - Buffers and pipelines are made once; they grow with the picture and the number of Gaussians.
 #[derive(Debug)]
 pub struct Rasterizer {
-    kernels: RasterKernels,
+    pub(crate) kernels: RasterKernels,
     scan: Scan,
-    sort: RadixSort,
-    splats: StorageBuffer<[f32; 8]>,
-    rects: StorageBuffer<[u32; 2]>,
+    pub(crate) sort: RadixSort,
+    pub(crate) splats: StorageBuffer<[f32; 8]>,
+    pub(crate) rects: StorageBuffer<[u32; 2]>,
     chunk_pairs: StorageBuffer<u32>,
-    pairs_before: StorageBuffer<u32>,
+    pub(crate) pairs_before: StorageBuffer<u32>,
     pair_total: StorageBuffer<u32>,
     stats: StorageBuffer<u32>,
-    picture: Option<PictureBuffers>,
+    pub(crate) picture: Option<PictureBuffers>,
+    pub(crate) latest: Option<Latest>,
+}
+
+/// What the backward pass must know about the picture that was recorded last.
+#[derive(Debug)]
+pub(crate) struct Latest {
+    pub constants: Constants,
+    pub gaussians: usize,
+    pub size: [u32; 2],
+    pub outputs: Outputs,
 }
 
 impl Rasterizer {
@@ -108,6 +118,7 @@ impl Rasterizer {
             pair_total: StorageBuffer::zeroed(gpu, "pair total", 1)?,
             stats: StorageBuffer::zeroed(gpu, "raster statistics", 3)?,
             picture: None,
+            latest: None,
         })
     }
 
@@ -141,6 +152,7 @@ impl Rasterizer {
         target: &RenderTarget,
         mut timer: Option<&mut GpuTimer>,
     ) -> Result<(), GpuError> {
+        self.latest = None;
         if target.width == 0 || target.height == 0 {
             return Ok(());
         }
@@ -172,6 +184,8 @@ impl Rasterizer {
         pass("depth sort", &|pass| stages.depth_sort(pass));
         pass("tile lists", &|pass| stages.tile_lists(pass));
         pass("blend", &|pass| stages.blend(pass, &blend));
+        let (gaussians, size, outputs) = (gaussians.count(), frame.size, settings.outputs);
+        self.latest = Some(Latest { constants, gaussians, size, outputs });
         Ok(())
     }
 
@@ -228,7 +242,7 @@ fn check_count(count: usize, shape: RasterShape) -> Result<(), GpuError> {
 }
 
 /// Places in the [`Constants`] of one encoding.
-const FRAME: usize = 0;
+pub(crate) const FRAME: usize = 0;
 const SORT_TABLE: usize = 1;
 const TILE_TABLE: usize = 2;
 const SORT_PASSES: usize = 3;

@@ -31,6 +31,8 @@ fn blend(@builtin(workgroup_id) tile: vec3<u32>, @builtin(local_invocation_id) l
     let log2_cut = vec4(log2(CUT));
     // One component a pixel.
     var transmittance = vec4(1.0);
+    // Summed, since 1 - transmittance cancels where little is covered.
+    var coverage = vec4(0.0);
     var seen_red = vec4(0.0);
     var seen_green = vec4(0.0);
     var seen_blue = vec4(0.0);
@@ -63,13 +65,13 @@ fn blend(@builtin(workgroup_id) tile: vec3<u32>, @builtin(local_invocation_id) l
                 seen_y += weight * position.y;
                 seen_z += weight * position.z;
             }
+            coverage += weight;
             transmittance *= 1.0 - alpha;
         }
         if all(transmittance < vec4(OPAQUE)) {
             break;
         }
     }
-    let coverage = 1.0 - transmittance;
     for (var row = 0u; row < min(ROWS, frame.size.y - first.y); row++) {
         let at = (first.y + row) * frame.size.x + first.x;
         if WITH_COLOR {

@@ -9,7 +9,7 @@ use flyrig_gpu::{CAMERA_WGSL, CameraConstants, ComputeKernel, GpuContext};
 use crate::Outputs;
 use crate::sort::{INVALID_KEY, SortShape};
 
-const FRAME_WGSL: &str = include_str!("raster_frame.wgsl");
+pub(crate) const FRAME_WGSL: &str = include_str!("raster_frame.wgsl");
 const PROJECT_WGSL: &str = include_str!("raster_project.wgsl");
 const BINS_WGSL: &str = include_str!("raster_bins.wgsl");
 const BLEND_WGSL: &str = include_str!("raster_blend.wgsl");
@@ -60,7 +60,7 @@ impl RasterShape {
         if gpu.is_software() { Self::SOFTWARE } else { Self::HARDWARE }
     }
 
-    fn wgsl(self) -> String {
+    pub(crate) fn wgsl(self) -> String {
         let tile = self.tile;
         format!(
             "const TILE: u32 = {tile}u;\nconst INVALID_KEY: u32 = {INVALID_KEY}u;\n\

@@ -1,4 +1,4 @@
-//! Person masks, keypoints, triangulation and the pose and shape fit of a template.
+//! Person masks, keypoints, triangulation, the pose and shape fit of a template, and its deformation.
 //!
 //! Pictures of several calibrated cameras go in as a [`flyrig_types::FrameSet`]; the pose of a
 //! [`flyrig_body::Template`] and one mask a camera come out:
@@ -10,11 +10,14 @@
 //!    fitted once, over the first frames ([`PoseEstimator::fit_shape`]).
 //! 4. Masks come from an empty plate ([`mask_from_plate`]) or from the network, sharpened on the picture and
 //!    gated by the fitted body.
+//!
+//! [`DeformTracker`] then moves the nodes of a deformation graph so that the posed Gaussians explain the pictures.
 
 mod anatomy;
 mod body_model;
 mod config;
 mod crop;
+mod deform;
 mod error;
 mod estimate;
 mod estimator;
@@ -36,6 +39,7 @@ mod triangulate;
 mod view;
 
 pub use config::PoseConfig;
+pub use deform::{DataTerm, DeformReport, DeformSettings, DeformSolver, DeformTracker, PointDerivatives};
 pub use error::{TrackError, TrackErrorKind};
 pub use estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};
 pub use estimator::PoseEstimator;

@@ -2,7 +2,9 @@
 #![allow(dead_code)]
 
 pub mod body_scene;
+pub mod random_scene;
 pub mod reference;
+pub mod reference_backward;
 
 use flyrig_gpu::{GpuContext, GpuError};
 use flyrig_renderer::{GaussianBuffers, RasterSettings, Rasterizer, RenderTarget};

@@ -22,17 +22,19 @@ pub struct Picture {
     pub canonical: Vec<[f64; 4]>,
 }
 
-struct Splat {
-    index: usize,
-    pixel: DVec2,
-    depth: f64,
-    opacity: f64,
-    xx: f64,
-    xy: f64,
-    yy: f64,
+/// One Gaussian in the picture: place in pixels, camera z, opacity and inverse covariance after the filter.
+#[derive(Debug, Clone, Copy)]
+pub struct Splat {
+    pub index: usize,
+    pub pixel: DVec2,
+    pub depth: f64,
+    pub opacity: f64,
+    pub xx: f64,
+    pub xy: f64,
+    pub yy: f64,
 }
 
-fn vec3(v: [f32; 4]) -> DVec3 {
+pub fn vec3(v: [f32; 4]) -> DVec3 {
     DVec3::new(v[0].into(), v[1].into(), v[2].into())
 }
 
@@ -42,6 +44,17 @@ fn project(camera: &Camera, p: DVec3) -> DVec2 {
 }
 
 fn splat(scene: &Scene, camera: &Camera, settings: &RasterSettings, index: usize) -> Option<Splat> {
+    splat_at(scene, camera, settings, index, vec3(scene.center_scale[index]))
+}
+
+/// The splat of Gaussian `index`, were its centre at `center`; none when it is not drawn.
+pub fn splat_at(
+    scene: &Scene,
+    camera: &Camera,
+    settings: &RasterSettings,
+    index: usize,
+    center: DVec3,
+) -> Option<Splat> {
     let (center_scale, color) = (scene.center_scale[index], scene.color[index]);
     let finite = |v: &[f32; 4]| v.iter().all(|x| x.is_finite());
     let sigma = f64::from(center_scale[3]);
@@ -49,7 +62,6 @@ fn splat(scene: &Scene, camera: &Camera, settings: &RasterSettings, index: usize
     if !finite(&center_scale) || !finite(&color) || sigma <= 0.0 || opacity <= 0.0 {
         return None;
     }
-    let center = vec3(center_scale);
     if settings.cull_backfacing {
         let normal = scene.normal[index];
         let sight = center - camera.position();
@@ -91,11 +103,29 @@ fn splat(scene: &Scene, camera: &Camera, settings: &RasterSettings, index: usize
     })
 }
 
-/// Renders the scene.
-pub fn render(scene: &Scene, camera: &Camera, settings: &RasterSettings, width: u32, height: u32) -> Picture {
+/// All splats, nearest first.
+pub fn sorted_splats(scene: &Scene, camera: &Camera, settings: &RasterSettings) -> Vec<Splat> {
     let mut splats: Vec<Splat> =
         (0..scene.center_scale.len()).filter_map(|i| splat(scene, camera, settings, i)).collect();
     splats.sort_by(|a, b| a.depth.total_cmp(&b.depth));
+    splats
+}
+
+/// Columns and rows (begin, end) outside which alpha is below the cut.
+pub fn footprint(s: &Splat, width: u32, height: u32) -> ([usize; 2], [usize; 2]) {
+    // The widest direction bounds all others.
+    let widest = 1.0 / (0.5 * (s.xx + s.yy) - (0.25 * (s.xx - s.yy).powi(2) + s.xy * s.xy).sqrt()).max(1e-30);
+    let radius = (2.0 * (255.0 * s.opacity).ln() * widest).sqrt() + 1.0;
+    let span = |c: f64, size: u32| {
+        let size = f64::from(size);
+        [(c - radius).clamp(0.0, size) as usize, (c + radius + 1.0).clamp(0.0, size) as usize]
+    };
+    (span(s.pixel.x, width), span(s.pixel.y, height))
+}
+
+/// Renders the scene.
+pub fn render(scene: &Scene, camera: &Camera, settings: &RasterSettings, width: u32, height: u32) -> Picture {
+    let splats = sorted_splats(scene, camera, settings);
     let pixels = width as usize * height as usize;
     let mut picture =
         Picture { color: vec![[0.0; 4]; pixels], depth: vec![0.0; pixels], canonical: vec![[0.0; 4]; pixels] };
@@ -103,15 +133,7 @@ pub fn render(scene: &Scene, camera: &Camera, settings: &RasterSettings, width: 
     for s in &splats {
         let color = scene.color[s.index].map(f64::from);
         let canonical = scene.canonical[s.index].map(f64::from);
-        // Outside this radius alpha is below the cut whatever the direction.
-        let widest = 1.0 / (0.5 * (s.xx + s.yy) - (0.25 * (s.xx - s.yy).powi(2) + s.xy * s.xy).sqrt()).max(1e-30);
-        let radius = (2.0 * (255.0 * s.opacity).ln() * widest).sqrt() + 1.0;
-        let span = |c: f64, size: u32| {
-            let size = f64::from(size);
-            ((c - radius).clamp(0.0, size) as usize, (c + radius + 1.0).clamp(0.0, size) as usize)
-        };
-        let (x0, x1) = span(s.pixel.x, width);
-        let (y0, y1) = span(s.pixel.y, height);
+        let ([x0, x1], [y0, y1]) = footprint(s, width, height);
         for y in y0..y1 {
             for x in x0..x1 {
                 let at = y * width as usize + x;

@@ -1,0 +1,279 @@
+//! Backward splat rasteriser: what a change of the Gaussians does to a loss on the pictures.
+
+use flyrig_gpu::{CAMERA_WGSL, ComputeKernel, GpuContext, GpuError, StorageBuffer, dispatch_1d};
+use wgpu::{CommandEncoder, ComputePassDescriptor};
+
+use crate::constants::ConstantWriter;
+use crate::raster::FRAME;
+use crate::raster_kernels::{FRAME_WGSL, RasterShape};
+use crate::scan::run;
+use crate::{GaussianBuffers, Rasterizer, RenderTarget};
+
+const BACKWARD_FRAME_WGSL: &str = include_str!("raster_backward_frame.wgsl");
+const PLACES_WGSL: &str = include_str!("raster_backward_places.wgsl");
+const BLEND_WGSL: &str = include_str!("raster_backward_blend.wgsl");
+const PROJECT_WGSL: &str = include_str!("raster_backward_project.wgsl");
+
+/// Bytes of `struct PairSum`.
+const PAIR_SUM_BYTES: u64 = 48;
+/// Pairs that one tile's invocations walk over; each costs them about two iterations of [`crate::scan::MAX_LOOP`].
+const MAX_LIST: u32 = 24_576;
+/// Tiles that one Gaussian adds up, for the same reason.
+const MAX_TILES: u32 = 60_000;
+/// Bytes of workgroup memory for partial sums; WebGPU promises 16 KiB.
+const PARTIAL_BYTES: u32 = 12 << 10;
+
+/// Derivatives of a loss L with respect to the pictures of one view, row by row, one element a pixel. A pixel with a
+/// number that is not finite counts as zero; so does one where nothing was drawn.
+#[derive(Debug)]
+pub struct PictureGradients {
+    /// dL/d of the premultiplied linear red, green, blue, and of alpha ([`RenderTarget::color`]).
+    pub color: StorageBuffer<[f32; 4]>,
+    /// x: dL/d [`RenderTarget::depth`], per metre (ignored when the forward pass drew no depth); yzw: three numbers
+    /// that the pixel hands to its Gaussians, see [`Carry`].
+    pub depth_carry: StorageBuffer<[f32; 4]>,
+}
+
+impl PictureGradients {
+    /// For pictures of `width` x `height` pixels, all zero.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn zeroed(gpu: &GpuContext, width: u32, height: u32) -> Result<Self, GpuError> {
+        let pixels = width as usize * height as usize;
+        Ok(Self {
+            color: StorageBuffer::zeroed(gpu, "dL/d colour", pixels)?,
+            depth_carry: StorageBuffer::zeroed(gpu, "dL/d depth", pixels)?,
+        })
+    }
+}
+
+/// What happens to the numbers that a pixel hands to its Gaussians by their blending weights.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Carry {
+    /// They are added up. With dL/d (red, green, blue) as the numbers, the sums are dL/d the Gaussian's colour.
+    Sum,
+    /// They are the entries (xx, xy, yy) of a 2x2 matrix C in the picture, per square pixel; their sum is lifted to
+    /// the world, `J^T C J` with J = d pixel / d centre. With C from the picture's own slopes this is the
+    /// Gauss-Newton matrix of the pixels as if all that is seen in one moved together (Lucas and Kanade 1981).
+    Lift,
+}
+
+/// Derivatives with respect to the Gaussians, summed over the views since [`Self::clear`].
+#[derive(Debug)]
+pub struct GaussianGradients {
+    /// xyz: dL/d world centre, per metre; w: blending weight in the pixels that had a gradient (0: it cannot matter).
+    pub center: StorageBuffer<[f32; 4]>,
+    /// Two elements a Gaussian. [`Carry::Sum`]: the three numbers, the rest 0. [`Carry::Lift`]: entries xx, xy, xz,
+    /// yy | yz, zz, 0, 0 of the symmetric matrix, per square metre.
+    pub carried: StorageBuffer<[f32; 4]>,
+}
+
+impl GaussianGradients {
+    /// For `count` Gaussians, all zero.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn zeroed(gpu: &GpuContext, count: usize) -> Result<Self, GpuError> {
+        Ok(Self {
+            center: StorageBuffer::zeroed(gpu, "dL/d centres", count)?,
+            carried: StorageBuffer::zeroed(gpu, "carried sums", 2 * count)?,
+        })
+    }
+
+    /// Records setting everything to zero.
+    pub fn clear(&self, encoder: &mut CommandEncoder) {
+        encoder.clear_buffer(self.center.raw(), 0, None);
+        encoder.clear_buffer(self.carried.raw(), 0, None);
+    }
+}
+
+/// Why there is no derivative.
+#[derive(Debug, thiserror::Error)]
+pub enum BackwardError {
+    /// Buffers must grow and cannot.
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
+    /// A buffer does not belong to the picture that was drawn last.
+    #[error("{what}: {found} elements where the picture drawn last needs {needed}; make it for that picture")]
+    Buffer {
+        /// Which buffer.
+        what: &'static str,
+        /// Its elements.
+        found: usize,
+        /// Elements needed.
+        needed: usize,
+    },
+}
+
+/// Derivatives of [`Rasterizer`]'s pictures with respect to the centres of the Gaussians (FlyHuman section 3.1).
+///
+/// - Complete where the picture is smooth: place, depth, and the size and shape of the ellipse, through the lens and
+///   the low-pass filter. What jumps passes nothing on: a splat that enters or leaves a pixel at alpha 1/255, a pixel
+///   that is finished, the order by depth, back-face culling; at the clamp (alpha 0.99) alpha itself is constant. On
+///   the built-in body the jumps are 4 to 6 % of the loss's true slope (`bench_backward`).
+/// - No atomics: the sums of a tile go to a slot of their own and are added up row by row. Equal input gives equal
+///   bytes on one device.
+/// - A tile without a gradient costs the look at its pixels; a Gaussian without a pixel that matters costs nothing
+///   but a look at its tiles.
+/// - A Gaussian on more than 60,000 tiles, or behind the first 24,576 of a tile's list, gets nothing there. Sums that
+///   are not finite are left out.
+#[derive(Debug)]
+pub struct BackwardRasterizer {
+    place: ComputeKernel,
+    blend: [ComputeKernel; 2],
+    project: [ComputeKernel; 2],
+    places: StorageBuffer<[u32; 4]>,
+    tile_limits: StorageBuffer<u32>,
+    pair_sums: StorageBuffer<[[f32; 4]; 3]>,
+}
+
+impl BackwardRasterizer {
+    /// Compiles the kernels for pictures drawn by `rasterizer`; buffers grow with the pictures.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn new(gpu: &GpuContext, rasterizer: &Rasterizer) -> Result<Self, GpuError> {
+        let shape = rasterizer.kernels.shape;
+        let kernel = |entry, source: String| ComputeKernel::new(gpu, entry, &[&source], entry);
+        Ok(Self {
+            place: kernel("place_gaussians", places_wgsl()),
+            blend: [false, true].map(|depth| kernel("blend_backward", blend_wgsl(shape, depth))),
+            project: [false, true].map(|lift| kernel("project_backward", project_wgsl(lift))),
+            places: StorageBuffer::zeroed(gpu, "places of sums", 0)?,
+            tile_limits: StorageBuffer::zeroed(gpu, "walked tiles", 0)?,
+            pair_sums: StorageBuffer::zeroed(gpu, "sums of pairs", 0)?,
+        })
+    }
+
+    /// Records the derivatives of the picture that `rasterizer` recorded last, with the same `gaussians` and
+    /// `target`, and adds them to `out`. Views of one submission: encode a view, its loss, its derivative, the next
+    /// view. Without a picture before, or with one without colour, nothing is recorded.
+    ///
+    /// # Errors
+    /// [`BackwardError`]; nothing is recorded then.
+    #[allow(clippy::too_many_arguments)]
+    pub fn encode(
+        &mut self,
+        gpu: &GpuContext,
+        encoder: &mut CommandEncoder,
+        rasterizer: &Rasterizer,
+        gaussians: &GaussianBuffers,
+        target: &RenderTarget,
+        (incoming, carry): (&PictureGradients, Carry),
+        out: &GaussianGradients,
+    ) -> Result<(), BackwardError> {
+        let (Some(picture), Some(latest)) = (&rasterizer.picture, &rasterizer.latest) else { return Ok(()) };
+        if !latest.outputs.color || latest.gaussians == 0 {
+            return Ok(());
+        }
+        let pixels = latest.size[0] as usize * latest.size[1] as usize;
+        check("dL/d colour", incoming.color.len(), pixels)?;
+        check("dL/d depth", incoming.depth_carry.len(), pixels)?;
+        check("the drawn picture", target.color.len().min(target.depth.len()), pixels)?;
+        check("the Gaussians", gaussians.count(), latest.gaussians)?;
+        check("dL/d centres", out.center.len().min(out.carried.len() / 2), latest.gaussians)?;
+        let layout = picture.layout();
+        let tiles = layout.tiles[0] as usize * layout.tiles[1] as usize;
+        self.grow(gpu, latest.gaussians, tiles, layout.pair_capacity)?;
+
+        let mut writer = ConstantWriter::default();
+        writer.push(&[self.pair_sums.len() as u32, 0, 0, 0]);
+        let room = writer.finish(gpu);
+        encoder.clear_buffer(self.places.raw(), 0, None);
+        let mut pass =
+            encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("backward"), ..Default::default() });
+        let by_gaussian = dispatch_1d(latest.gaussians as u32, 64);
+        run(
+            gpu,
+            &mut pass,
+            &self.place,
+            &[
+                latest.constants.get(FRAME),
+                room.get(0),
+                rasterizer.sort.output().raw().as_entire_binding(),
+                rasterizer.sort.valid().raw().as_entire_binding(),
+                rasterizer.rects.raw().as_entire_binding(),
+                rasterizer.pairs_before.raw().as_entire_binding(),
+                self.places.raw().as_entire_binding(),
+            ],
+            by_gaussian,
+        );
+        run(
+            gpu,
+            &mut pass,
+            &self.blend[usize::from(latest.outputs.depth)],
+            &[
+                latest.constants.get(FRAME),
+                rasterizer.splats.raw().as_entire_binding(),
+                gaussians.color.raw().as_entire_binding(),
+                picture.table.raw().as_entire_binding(),
+                picture.pairs.raw().as_entire_binding(),
+                self.places.raw().as_entire_binding(),
+                target.color.raw().as_entire_binding(),
+                target.depth.raw().as_entire_binding(),
+                incoming.color.raw().as_entire_binding(),
+                incoming.depth_carry.raw().as_entire_binding(),
+                self.pair_sums.raw().as_entire_binding(),
+                self.tile_limits.raw().as_entire_binding(),
+            ],
+            layout.tiles.into(),
+        );
+        run(
+            gpu,
+            &mut pass,
+            &self.project[usize::from(carry == Carry::Lift)],
+            &[
+                latest.constants.get(FRAME),
+                gaussians.center_scale.raw().as_entire_binding(),
+                self.places.raw().as_entire_binding(),
+                self.tile_limits.raw().as_entire_binding(),
+                self.pair_sums.raw().as_entire_binding(),
+                out.center.raw().as_entire_binding(),
+                out.carried.raw().as_entire_binding(),
+            ],
+            by_gaussian,
+        );
+        Ok(())
+    }
+
+    fn grow(&mut self, gpu: &GpuContext, gaussians: usize, tiles: usize, pairs: u32) -> Result<(), GpuError> {
+        if self.places.len() < gaussians {
+            self.places = StorageBuffer::zeroed(gpu, "places of sums", gaussians)?;
+        }
+        if self.tile_limits.len() < tiles {
+            self.tile_limits = StorageBuffer::zeroed(gpu, "walked tiles", tiles)?;
+        }
+        let limits = gpu.device.limits();
+        let most = limits.max_buffer_size.min(limits.max_storage_buffer_binding_size) / PAIR_SUM_BYTES;
+        let wanted = u64::from(pairs).min(most) as usize;
+        if self.pair_sums.len() < wanted {
+            self.pair_sums = StorageBuffer::zeroed(gpu, "sums of pairs", wanted)?;
+        }
+        Ok(())
+    }
+}
+
+fn check(what: &'static str, found: usize, needed: usize) -> Result<(), BackwardError> {
+    if found >= needed { Ok(()) } else { Err(BackwardError::Buffer { what, found, needed }) }
+}
+
+pub(crate) fn places_wgsl() -> String {
+    let constants = format!("const MAX_TILES: u32 = {MAX_TILES}u;\n");
+    [&constants, CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, PLACES_WGSL].concat()
+}
+
+pub(crate) fn blend_wgsl(shape: RasterShape, with_depth: bool) -> String {
+    let invocations = shape.tile * shape.tile / 4;
+    let batch = PARTIAL_BYTES / (invocations * PAIR_SUM_BYTES as u32);
+    let constants = format!(
+        "{}const WITH_DEPTH: bool = {with_depth};\nconst BATCH: u32 = {batch}u;\nconst MAX_LIST: u32 = {MAX_LIST}u;\n",
+        shape.wgsl()
+    );
+    [&constants, CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, BLEND_WGSL].concat()
+}
+
+pub(crate) fn project_wgsl(lift: bool) -> String {
+    let constants = format!("const LIFT: bool = {lift};\n");
+    [&constants, CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, PROJECT_WGSL].concat()
+}

@@ -1,0 +1,164 @@
+// Derivative of the projection: one invocation a Gaussian adds up its tiles row by row and carries the sums through
+// the filtered ellipse, the lens and the camera to the world. Adds to the outputs, so that views can follow each other.
+//
+// Complete where the picture is smooth: position in the picture, depth, and the ellipse's size and shape (with the
+// lens's second derivatives). Nothing flows through what jumps: the cut at CUT, the end at OPAQUE, the order by depth,
+// back-face culling.
+// Prefix: camera.wgsl, raster_frame.wgsl, raster_backward_frame.wgsl, const LIFT.
+@group(0) @binding(0) var<storage, read> frame: Frame;
+@group(0) @binding(1) var<storage, read> center_scale: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> places: array<Place>;
+@group(0) @binding(3) var<storage, read> tile_limits: array<u32>;
+@group(0) @binding(4) var<storage, read> pair_sums: array<PairSum>;
+// xyz: dL/d centre; w: blending weight over the pixels that matter.
+@group(0) @binding(5) var<storage, read_write> center_out: array<vec4<f32>>;
+// Two elements a Gaussian: carried numbers (LIFT false), or xx xy xz yy | yz zz of the lifted matrix.
+@group(0) @binding(6) var<storage, read_write> carried_out: array<vec4<f32>>;
+
+// 1 / (2 ln 2): the conics are for exp2.
+const HALF_LOG2_E = 0.72134752;
+
+fn finite(v: vec4<f32>) -> bool {
+    return all((bitcast<vec4<u32>>(v) & vec4(0x7f800000u)) != vec4(0x7f800000u));
+}
+
+// dL/d ideal through the lens's Jacobian, given dL/d Jacobian (columns as those of the Jacobian).
+fn through_lens_jacobian(camera: Camera, ideal: vec2<f32>, d: mat2x2<f32>) -> vec2<f32> {
+    let x = ideal.x;
+    let y = ideal.y;
+    let r2 = dot(ideal, ideal);
+    let k = camera.coefficients_a;
+    // A radial factor s(r): first = s'/r, second = (s'/r)'/r.
+    var first = 0.0;
+    var second = 0.0;
+    var p1 = 0.0;
+    var p2 = 0.0;
+    if camera.lens == 0u {
+        first = 2.0 * (k.x + r2 * (2.0 * k.y + r2 * 3.0 * k.z));
+        second = 8.0 * k.y + 24.0 * k.z * r2;
+        p1 = k.w;
+        p2 = camera.coefficients_b.x;
+    } else if r2 < 1e-4 {
+        // Taylor: s = 1 + (k1 - 1/3) r^2 + O(r^4); the formulas below cancel here.
+        first = 2.0 * (k.x - 1.0 / 3.0);
+    } else {
+        let r = sqrt(r2);
+        let theta = atan(r);
+        let t2 = theta * theta;
+        let n = 1.0 + t2 * (3.0 * k.x + t2 * (5.0 * k.y + t2 * (7.0 * k.z + t2 * 9.0 * k.w)));
+        let dn = theta * (6.0 * k.x + t2 * (20.0 * k.y + t2 * (42.0 * k.z + t2 * 72.0 * k.w)));
+        let s = theta * (1.0 + t2 * (k.x + t2 * (k.y + t2 * (k.z + t2 * k.w)))) / r;
+        let inverse = 1.0 / (1.0 + r2);
+        first = (n * inverse - s) / r2;
+        let bend = (dn - 2.0 * r * n) * inverse * inverse;
+        second = (bend / r - 3.0 * first) / r2;
+    }
+    let u_xx = 3.0 * x * first + x * x * x * second + 6.0 * p2;
+    let u_xy = y * first + x * x * y * second + 2.0 * p1;
+    let u_yy = x * first + x * y * y * second + 2.0 * p2;
+    let v_yy = 3.0 * y * first + y * y * y * second + 6.0 * p1;
+    // v_xx = u_xy and v_xy = u_yy for both lenses.
+    return vec2(
+        d[0].x * u_xx + (d[1].x + d[0].y) * u_xy + d[1].y * u_yy,
+        d[0].x * u_xy + (d[1].x + d[0].y) * u_yy + d[1].y * v_yy,
+    );
+}
+
+@compute @workgroup_size(64)
+fn project_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+                    @builtin(local_invocation_index) local: u32) {
+    let i = (group.y * groups.x + group.x) * 64u + local;
+    if i >= frame.gaussians {
+        return;
+    }
+    let place = places[i];
+    if place.fits == 0u {
+        return;
+    }
+    let width = place_width(place);
+    let tiles = width * place_height(place);
+    var tile = vec2(place.first & 0xffffu, place.first >> 16u);
+    var sums_a = vec4(0.0);
+    var sums_b = vec4(0.0);
+    var carried = vec4(0.0);
+    for (var t = 0u; t < tiles; t++) {
+        if place.offset < tile_limits[tile.y * frame.tiles.x + tile.x] {
+            sums_a += pair_sums[place.offset + t].vectors[0];
+            sums_b += pair_sums[place.offset + t].vectors[1];
+            carried += pair_sums[place.offset + t].vectors[2];
+        }
+        tile.x += 1u;
+        if tile.x > (place.last & 0xffffu) {
+            tile = vec2(place.first & 0xffffu, tile.y + 1u);
+        }
+    }
+    if !(sums_b.w > 0.0) {
+        return;
+    }
+    let center = center_scale[i];
+    let p = (frame.camera.camera_from_world * vec4(center.xyz, 1.0)).xyz;
+    let inverse_z = 1.0 / p.z;
+    let ideal = p.xy * inverse_z;
+    let lens = distort(frame.camera, ideal).jacobian;
+    let f = frame.camera.focal_px * inverse_z;
+    // Columns of d pixel / d camera-space point.
+    let along_x = lens[0] * f;
+    let along_y = lens[1] * f;
+    let along_z = -(ideal.x * along_x + ideal.y * along_y);
+    let row_x = vec3(along_x.x, along_y.x, along_z.x) * center.w;
+    let row_y = vec3(along_x.y, along_y.y, along_z.y) * center.w;
+    let xx = dot(row_x, row_x);
+    let xy = dot(row_x, row_y);
+    let yy = dot(row_y, row_y);
+    let normal_of_rows = cross(row_x, row_y);
+    let det = dot(normal_of_rows, normal_of_rows);
+    let s = frame.filter_variance_px2;
+    let filtered_det = det + s * (xx + yy) + s * s;
+    // Inverse covariances after and before the filter.
+    let filtered_inverse = mat2x2(yy + s, -xy, -xy, xx + s) * (1.0 / filtered_det);
+    let plain_inverse = mat2x2(yy, -xy, -xy, xx) * (1.0 / det);
+    let d_pixel = filtered_inverse * sums_a.yz * (2.0 * HALF_LOG2_E);
+    // dL/d covariance: through the conic, and through the opacity sqrt(det / filtered_det).
+    let moments = mat2x2(sums_b.x, sums_b.y, sums_b.y, sums_b.z);
+    let d_covariance =
+        (filtered_inverse * moments * filtered_inverse + plain_inverse * filtered_inverse * (s * sums_a.x)) * HALF_LOG2_E;
+    // dL/d the columns of the projection's Jacobian, covariance = scale^2 J J^T.
+    let twice = d_covariance * (2.0 * center.w * center.w);
+    let d_along_z = twice * along_z;
+    let d_along_x = twice * along_x - ideal.x * d_along_z;
+    let d_along_y = twice * along_y - ideal.y * d_along_z;
+    let d_lens = mat2x2(d_along_x * f, d_along_y * f);
+    let d_ideal = through_lens_jacobian(frame.camera, ideal, d_lens)
+        - vec2(dot(d_along_z, along_x), dot(d_along_z, along_y));
+    let d_z = sums_a.w - (dot(d_along_x, along_x) + dot(d_along_y, along_y) + dot(ideal, d_ideal)) * inverse_z;
+    let in_camera = vec3(
+        dot(d_pixel, along_x) + d_ideal.x * inverse_z,
+        dot(d_pixel, along_y) + d_ideal.y * inverse_z,
+        dot(d_pixel, along_z) + d_z,
+    );
+    let m = frame.camera.camera_from_world;
+    let rotation = mat3x3(m[0].xyz, m[1].xyz, m[2].xyz);
+    let in_world = vec4(in_camera * rotation, sums_b.w);
+    if finite(in_world) {
+        center_out[i] += in_world;
+    }
+    if LIFT {
+        // J^T C J with C = (xx, xy, yy) of the picture, J = d pixel / d world.
+        let du = vec3(along_x.x, along_y.x, along_z.x) * rotation;
+        let dv = vec3(along_x.y, along_y.y, along_z.y) * rotation;
+        let column_u = carried.x * du + carried.y * dv;
+        let column_v = carried.y * du + carried.z * dv;
+        let first = vec4(dot(vec2(du.x, dv.x), vec2(column_u.x, column_v.x)),
+                         dot(vec2(du.x, dv.x), vec2(column_u.y, column_v.y)),
+                         dot(vec2(du.x, dv.x), vec2(column_u.z, column_v.z)),
+                         dot(vec2(du.y, dv.y), vec2(column_u.y, column_v.y)));
+        let second = vec4(dot(vec2(du.y, dv.y), vec2(column_u.z, column_v.z)),
+                          dot(vec2(du.z, dv.z), vec2(column_u.z, column_v.z)), 0.0, 0.0);
+        if finite(first) && finite(second) {
+            carried_out[2u * i] += first;
+            carried_out[2u * i + 1u] += second;
+        }
+    } else if finite(carried) {
+        carried_out[2u * i] += carried;
+    }
+}

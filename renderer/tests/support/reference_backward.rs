@@ -1,0 +1,197 @@
+//! Plain slow f64 reference of the backward pass. The blending is differentiated from back to front, the projection
+//! by differences: both other ways than the shaders'.
+#![allow(dead_code)]
+
+use flyrig_renderer::RasterSettings;
+use flyrig_types::Camera;
+use glam::{DVec2, DVec3};
+
+use super::reference::{Scene, Splat, footprint, sorted_splats, splat_at, vec3};
+
+const CUT: f64 = 1.0 / 255.0;
+const MAX_ALPHA: f64 = 0.99;
+const OPAQUE: f64 = 1e-4;
+
+/// dL/d the pictures, element for element as in `PictureGradients`.
+#[derive(Debug, Clone)]
+pub struct Incoming {
+    pub color: Vec<[f32; 4]>,
+    pub depth_carry: Vec<[f32; 4]>,
+}
+
+/// dL/d centres, blending weights in pixels with a gradient, carried sums.
+#[derive(Debug, Clone)]
+pub struct Outgoing {
+    pub center: Vec<DVec3>,
+    pub weight: Vec<f64>,
+    pub carried: Vec<[f64; 3]>,
+}
+
+/// A scene's splats and which of them touch each pixel, nearest first.
+pub struct Touched {
+    pub splats: Vec<Splat>,
+    pub lists: Vec<Vec<usize>>,
+    /// Pixels where rounding may decide what touches, what comes first, or what is clamped.
+    pub unclear: Vec<bool>,
+}
+
+fn unclamped_alpha(s: &Splat, x: f64, y: f64) -> f64 {
+    let d = DVec2::new(x, y) - s.pixel;
+    s.opacity * (-0.5 * (s.xx * d.x * d.x + 2.0 * s.xy * d.x * d.y + s.yy * d.y * d.y)).exp()
+}
+
+/// Who touches what.
+pub fn touched(scene: &Scene, camera: &Camera, settings: &RasterSettings, (width, height): (u32, u32)) -> Touched {
+    let splats = sorted_splats(scene, camera, settings);
+    let pixels = width as usize * height as usize;
+    let mut lists: Vec<Vec<usize>> = vec![Vec::new(); pixels];
+    let mut unclear = vec![false; pixels];
+    let mut transmittance = vec![1.0; pixels];
+    let near = |value: f64, limit: f64, share: f64| (value / limit - 1.0).abs() < share;
+    for (k, s) in splats.iter().enumerate() {
+        let ([x0, x1], [y0, y1]) = footprint(s, width, height);
+        for (x, y) in (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y))) {
+            let at = y * width as usize + x;
+            let alpha = unclamped_alpha(s, x as f64, y as f64);
+            if transmittance[at] < OPAQUE {
+                continue;
+            }
+            unclear[at] |= near(alpha, CUT, 2e-3) || near(alpha, MAX_ALPHA, 1e-3);
+            if alpha < CUT {
+                continue;
+            }
+            if let Some(&before) = lists[at].last() {
+                let gap = s.depth - splats[before].depth;
+                unclear[at] |= gap > 0.0 && gap < 1e-5 * s.depth;
+            }
+            transmittance[at] *= 1.0 - alpha.min(MAX_ALPHA);
+            unclear[at] |= near(transmittance[at], OPAQUE, 1e-2);
+            lists[at].push(k);
+        }
+    }
+    Touched { splats, lists, unclear }
+}
+
+fn is_zero_or_poisoned(incoming: &Incoming, at: usize) -> bool {
+    let all = || incoming.color[at].iter().chain(&incoming.depth_carry[at]);
+    all().all(|&v| v == 0.0) || all().any(|v| !v.is_finite())
+}
+
+/// The loss that is linear in the pictures with `incoming` as its derivative, with the lists of `touched` kept while
+/// `splats` may have moved.
+pub fn linear_loss(scene: &Scene, touched: &Touched, splats: &[Splat], incoming: &Incoming, width: u32) -> f64 {
+    let mut loss = 0.0;
+    for (at, list) in touched.lists.iter().enumerate() {
+        if is_zero_or_poisoned(incoming, at) || list.is_empty() {
+            continue;
+        }
+        let (x, y) = ((at % width as usize) as f64, (at / width as usize) as f64);
+        let (mut transmittance, mut color, mut depth) = (1.0, DVec3::ZERO, 0.0);
+        for &k in list {
+            let s = &splats[k];
+            let alpha = unclamped_alpha(s, x, y).min(MAX_ALPHA);
+            color += alpha * transmittance * vec3(scene.color[s.index]);
+            depth += alpha * transmittance * s.depth;
+            transmittance *= 1.0 - alpha;
+        }
+        let alpha = 1.0 - transmittance;
+        loss += vec3(incoming.color[at]).dot(color)
+            + f64::from(incoming.color[at][3]) * alpha
+            + f64::from(incoming.depth_carry[at][0]) * depth / alpha;
+    }
+    loss
+}
+
+/// Derivatives with respect to one splat's numbers.
+#[derive(Clone, Copy, Default)]
+struct SplatGradient {
+    pixel: DVec2,
+    depth: f64,
+    opacity: f64,
+    xx: f64,
+    xy: f64,
+    yy: f64,
+}
+
+/// The backward pass.
+pub fn backward(
+    scene: &Scene,
+    camera: &Camera,
+    settings: &RasterSettings,
+    width: u32,
+    touched: &Touched,
+    incoming: &Incoming,
+) -> Outgoing {
+    let count = scene.center_scale.len();
+    let mut out =
+        Outgoing { center: vec![DVec3::ZERO; count], weight: vec![0.0; count], carried: vec![[0.0; 3]; count] };
+    let splats = &touched.splats;
+    let mut gradients = vec![SplatGradient::default(); splats.len()];
+    for (at, list) in touched.lists.iter().enumerate() {
+        if is_zero_or_poisoned(incoming, at) || list.is_empty() {
+            continue;
+        }
+        let (x, y) = ((at % width as usize) as f64, (at / width as usize) as f64);
+        let mut before = vec![1.0];
+        let mut depth_sum = 0.0;
+        for &k in list {
+            let alpha = unclamped_alpha(&splats[k], x, y).min(MAX_ALPHA);
+            let transmittance = before[before.len() - 1];
+            depth_sum += alpha * transmittance * splats[k].depth;
+            before.push(transmittance * (1.0 - alpha));
+        }
+        let coverage = 1.0 - before[list.len()];
+        let by_depth = f64::from(incoming.depth_carry[at][0]) / coverage;
+        let by_alpha = f64::from(incoming.color[at][3]) - by_depth * depth_sum / coverage;
+        // Value of all that lies behind, per light that reaches it.
+        let mut behind = 0.0;
+        for (place, &k) in list.iter().enumerate().rev() {
+            let s = &splats[k];
+            let unclamped = unclamped_alpha(s, x, y);
+            let alpha = unclamped.min(MAX_ALPHA);
+            let value = vec3(incoming.color[at]).dot(vec3(scene.color[s.index])) + by_depth * s.depth + by_alpha;
+            let weight = alpha * before[place];
+            out.weight[s.index] += weight;
+            for (sum, carry) in out.carried[s.index].iter_mut().zip(&incoming.depth_carry[at][1..]) {
+                *sum += weight * f64::from(*carry);
+            }
+            let g = &mut gradients[k];
+            g.depth += weight * by_depth;
+            if unclamped < MAX_ALPHA {
+                let by_this = before[place] * (value - behind);
+                let d = DVec2::new(x, y) - s.pixel;
+                g.opacity += by_this * alpha / s.opacity;
+                let by_r2 = -0.5 * alpha * by_this;
+                g.xx += by_r2 * d.x * d.x;
+                g.xy += by_r2 * 2.0 * d.x * d.y;
+                g.yy += by_r2 * d.y * d.y;
+                g.pixel -= by_r2 * 2.0 * DVec2::new(s.xx * d.x + s.xy * d.y, s.xy * d.x + s.yy * d.y);
+            }
+            behind = alpha * value + (1.0 - alpha) * behind;
+        }
+    }
+    for (s, g) in splats.iter().zip(&gradients) {
+        let center = vec3(scene.center_scale[s.index]);
+        // Loss were it linear in the splat's numbers. Culling is a jump, and not to be differentiated.
+        let smooth = RasterSettings { cull_backfacing: false, ..*settings };
+        let value = |center: DVec3| {
+            splat_at(scene, camera, &smooth, s.index, center).map(|m| {
+                g.pixel.dot(m.pixel - s.pixel)
+                    + g.depth * (m.depth - s.depth)
+                    + g.opacity * (m.opacity - s.opacity)
+                    + g.xx * (m.xx - s.xx)
+                    + g.xy * (m.xy - s.xy)
+                    + g.yy * (m.yy - s.yy)
+            })
+        };
+        // Fourth order; the reference's own Jacobian is good to 1e-10. A splat that may vanish on the way gets
+        // shorter steps.
+        let slope = |axis: DVec3| {
+            let pair = |h: f64| Some((value(center + axis * h)? - value(center - axis * h)?) / (2.0 * h));
+            let at = |h: f64| Some((4.0 * pair(0.5 * h)? - pair(h)?) / 3.0);
+            [1e-3, 1e-4, 1e-5].iter().find_map(|h| at(h * s.depth)).unwrap_or(0.0)
+        };
+        out.center[s.index] = DVec3::new(slope(DVec3::X), slope(DVec3::Y), slope(DVec3::Z));
+    }
+    out
+}

@@ -1,0 +1,377 @@
+//! The solver on data whose answer is known: world points that each visible Gaussian should reach.
+
+use std::convert::Infallible;
+
+use flyrig_body::{
+    DEFAULT_SIGMA2_M2, DeformationGraph, ShapeParams, SkinWeights, SurfaceGaussians, Template, build_graph,
+    default_template, sample_surface, skin_point_f64,
+};
+use flyrig_types::Pose;
+use glam::{DMat4, DQuat, DVec3, Vec3};
+use nalgebra::{DMatrix, DVector};
+use rand::rngs::StdRng;
+use rand::{RngExt, SeedableRng};
+
+use super::*;
+
+/// Squared distance, times `weight`, of every Gaussian to its goal in the world.
+struct Goals<'a> {
+    positions: &'a [Vec3],
+    skin: &'a [SkinWeights],
+    bones: &'a [DMat4],
+    goals: Vec<DVec3>,
+    weights: Vec<f64>,
+    /// Turns the gradient round, to see whether a step uphill is refused.
+    sign: f32,
+    calls: usize,
+}
+
+impl Goals<'_> {
+    fn off(&self, g: usize, displacement: DVec3) -> DVec3 {
+        skin_point_f64(self.bones, &self.skin[g], self.positions[g].as_dvec3() + displacement) - self.goals[g]
+    }
+}
+
+fn wide(v: [f32; 4]) -> DVec3 {
+    DVec3::new(v[0].into(), v[1].into(), v[2].into())
+}
+
+impl DataTerm for Goals<'_> {
+    type Error = Infallible;
+
+    fn loss(&mut self, displacement: &[[f32; 4]]) -> Result<f64, Infallible> {
+        self.calls += 1;
+        Ok((0..self.goals.len()).map(|g| self.weights[g] * self.off(g, wide(displacement[g])).length_squared()).sum())
+    }
+
+    fn derivatives(&mut self, displacement: &[[f32; 4]], out: &mut PointDerivatives) -> Result<f64, Infallible> {
+        out.gradient.clear();
+        out.curvature.clear();
+        for (g, &moved) in displacement.iter().enumerate() {
+            let weight = self.weights[g] as f32;
+            let slope = 2.0 * weight * self.sign * self.off(g, wide(moved)).as_vec3();
+            out.gradient.push(slope.extend(weight).to_array());
+            out.curvature.push([2.0 * weight, 0.0, 0.0, 2.0 * weight]);
+            out.curvature.push([0.0, 2.0 * weight, 0.0, 0.0]);
+        }
+        self.loss(displacement)
+    }
+}
+
+struct Body {
+    template: Template,
+    surface: SurfaceGaussians,
+    graph: DeformationGraph,
+    bones: Vec<DMat4>,
+}
+
+fn body(gaussians: usize, nodes: usize) -> Body {
+    let template = default_template(&ShapeParams::default()).unwrap();
+    let surface = sample_surface(&template, gaussians, 1).unwrap();
+    let graph = build_graph(&template, &surface, nodes, DEFAULT_SIGMA2_M2).unwrap();
+    let mut rng = StdRng::seed_from_u64(9);
+    let joints = template.skeleton.joints().len();
+    let mut turn = || DQuat::from_scaled_axis(DVec3::from([(); 3].map(|()| rng.random_range(-0.3..0.3))));
+    let pose =
+        Pose { root_translation: DVec3::new(0.2, -0.1, 1.0), joint_rotations: (0..joints).map(|_| turn()).collect() };
+    let bones = template.skeleton.world_from_canonical(&pose);
+    Body { template, surface, graph, bones }
+}
+
+/// What the clothes do: up to 3 cm, smooth.
+fn true_displacement(x: Vec3) -> DVec3 {
+    let x = x.as_dvec3() * 7.0;
+    0.015 * DVec3::new(x.y.sin() + x.z.cos(), (x.x + x.z).sin(), x.y.cos() + (x.x * 1.3).sin())
+}
+
+/// Goals for the Gaussians in front (z > 0), as one camera sees them.
+fn goals(body: &Body) -> Goals<'_> {
+    let Body { surface, bones, .. } = body;
+    let goal = |g: usize| {
+        let x = surface.positions[g];
+        skin_point_f64(bones, &surface.skin[g], x.as_dvec3() + true_displacement(x))
+    };
+    Goals {
+        positions: &surface.positions,
+        skin: &surface.skin,
+        bones,
+        goals: (0..surface.len()).map(goal).collect(),
+        weights: surface.normals.iter().map(|n| if n.z > 0.0 { 100.0 } else { 0.0 }).collect(),
+        sign: 1.0,
+        calls: 0,
+    }
+}
+
+fn tracker(body: &Body, settings: DeformSettings) -> DeformTracker {
+    DeformTracker::new(&body.graph, &body.surface.skin, settings).unwrap()
+}
+
+/// Total loss at these translations, straight from the equations.
+fn total_loss(body: &Body, data: &Goals<'_>, settings: &DeformSettings, t: &[DVec3], smooth: &[DVec3]) -> f64 {
+    let graph = &body.graph;
+    let mut loss = 0.0;
+    for g in 0..body.surface.len() {
+        let moved = (0..4).map(|k| t[graph.gaussian_nodes[g][k] as usize] * f64::from(graph.gaussian_weights[g][k]));
+        loss += data.weights[g] * data.off(g, moved.sum()).length_squared();
+    }
+    for (i, neighbors) in graph.neighbors.iter().enumerate() {
+        for &j in neighbors {
+            let spread = t[i] - t[j as usize];
+            let change = spread - (smooth[i] - smooth[j as usize]);
+            loss += settings.regularization
+                * (settings.spatial * spread.length_squared() + settings.temporal * change.length_squared());
+        }
+    }
+    loss
+}
+
+fn random_translations(rng: &mut StdRng, nodes: usize) -> Vec<DVec3> {
+    (0..nodes).map(|_| DVec3::from([(); 3].map(|()| rng.random_range(-0.02..0.02)))).collect()
+}
+
+#[test]
+fn gradient_and_matrix_match_differences_and_a_dense_solve() {
+    let body = body(600, 14);
+    let mut data = goals(&body);
+    let settings = DeformSettings::default();
+    let mut tracker = tracker(&body, settings);
+    let mut rng = StdRng::seed_from_u64(1);
+    let nodes = body.graph.nodes.len();
+    let (t, smooth) = (random_translations(&mut rng, nodes), random_translations(&mut rng, nodes));
+    (tracker.translations, tracker.smooth) = (t.clone(), smooth.clone());
+    tracker.displace();
+    let mut derivatives = PointDerivatives::default();
+    let displacement = tracker.displacement().to_vec();
+    let data_loss = data.derivatives(&displacement, &mut derivatives).unwrap();
+    tracker.derivatives = derivatives;
+    let mut gradient = vec![DVec3::ZERO; nodes];
+    let loss = data_loss + tracker.regularizer.loss(&t, &smooth, Some(&mut gradient));
+    assert_eq!(tracker.gather(&body.bones, &mut gradient), 0);
+    let direct = total_loss(&body, &data, &settings, &t, &smooth);
+    assert!((loss - direct).abs() < 1e-6 * direct, "{loss} {direct}");
+
+    let at = |steps: &[(usize, f64)]| {
+        let mut moved = t.clone();
+        for &(k, step) in steps {
+            moved[k / 3][k % 3] += step;
+        }
+        total_loss(&body, &data, &settings, &moved, &smooth)
+    };
+    // The loss is quadratic: differences with long steps are exact.
+    let h = 1e-2;
+    let largest = gradient.iter().map(|g| g.length()).fold(0.0, f64::max);
+    let mut dense = DMatrix::zeros(3 * nodes, 3 * nodes);
+    let mut right = DVector::zeros(3 * nodes);
+    for k in 0..3 * nodes {
+        let slope = (at(&[(k, h)]) - at(&[(k, -h)])) / (2.0 * h);
+        right[k] = -gradient[k / 3][k % 3];
+        assert!((slope + right[k]).abs() < 1e-5 * largest, "{k}: {slope} {}", -right[k]);
+        for j in 0..=k {
+            let second = (at(&[(k, h), (j, h)]) - at(&[(k, h)]) - at(&[(j, h)]) + direct) / (h * h);
+            dense[(k, j)] = second;
+            dense[(j, k)] = second;
+        }
+    }
+    let damping = 1e-3 * tracker.matrix.mean_diagonal();
+    for k in 0..3 * nodes {
+        dense[(k, k)] += damping;
+    }
+    let expected = dense.clone().lu().solve(&right).unwrap();
+    let minus: Vec<DVec3> = gradient.iter().map(|g| -*g).collect();
+    let ours = tracker.matrix.solve(tracker.regularizer.stiffness(), damping, &minus);
+    let flat = DVector::from_iterator(3 * nodes, ours.iter().flat_map(DVec3::to_array));
+    let error = (&flat - &expected).norm() / expected.norm();
+    println!("step against a dense f64 solve: {error:.1e}");
+    assert!(error < 1e-3, "{error}");
+}
+
+/// Losses of one frame, the one after its last step included, and its time in milliseconds.
+fn first_frame(body: &Body, settings: DeformSettings) -> (DeformReport, f64) {
+    let mut data = goals(body);
+    let mut tracker = tracker(body, settings);
+    let begin = std::time::Instant::now();
+    let mut report = tracker.track(&body.bones, &mut data).unwrap();
+    let time = begin.elapsed().as_secs_f64() * 1e3;
+    if report.losses.len() == report.accepted {
+        let rest = vec![DVec3::ZERO; tracker.translations.len()];
+        report.losses.push(total_loss(body, &data, &settings, &tracker.translations, &rest));
+    }
+    (report, time)
+}
+
+#[test]
+fn one_gauss_newton_iteration_beats_ten_of_gradient_descent_at_its_best_rate() {
+    let body = body(20_000, 400);
+    // The baseline gets the rate that serves it best.
+    let best = (0..24)
+        .map(|k| 10f64.powf(-8.0 + 0.25 * f64::from(k)))
+        .map(|rate| {
+            let solver = DeformSolver::Paper { rate };
+            (rate, first_frame(&body, DeformSettings { solver, ..Default::default() }))
+        })
+        .min_by(|a, b| a.1.0.losses.last().unwrap().total_cmp(b.1.0.losses.last().unwrap()))
+        .unwrap();
+    let solver = DeformSolver::GaussNewton { first_iterations: 1, iterations: 1 };
+    let (ours, millis) = first_frame(&body, DeformSettings { solver, max_step_m: 1.0, ..Default::default() });
+    let (rate, (paper, paper_millis)) = best;
+    println!("gradient descent, rate {rate:.1e}: {:.4?} in {paper_millis:.1} ms", paper.losses);
+    println!("Gauss-Newton: {:.4?} in {millis:.1} ms", ours.losses);
+    assert!(ours.accepted == 1 && ours.losses[1] < *paper.losses.last().unwrap());
+}
+
+#[test]
+fn frames_follow_each_other_and_unseen_nodes_go_along() {
+    let body = body(6_000, 200);
+    let mut data = goals(&body);
+    let mut tracker = tracker(&body, DeformSettings::default());
+    for _ in 0..15 {
+        let report = tracker.track(&body.bones, &mut data).unwrap();
+        assert!(report.losses.is_sorted_by(|a, b| a >= b), "{report:?}");
+    }
+    let (mut seen, mut count) = (0.0, 0.0);
+    for (g, x) in body.surface.positions.iter().enumerate() {
+        if data.weights[g] > 0.0 {
+            seen += (wide(tracker.displacement()[g]) - true_displacement(*x)).length();
+            count += 1.0;
+        }
+    }
+    println!("mean error of the seen Gaussians {:.2} mm of a displacement of up to 30 mm", seen / count * 1e3);
+    assert!(seen / count < 5e-3);
+    assert!(tracker.translations().iter().all(|t| t.is_finite() && t.length() < 0.1));
+    assert!(tracker.translations().iter().all(|t| t.length() > 1e-5), "no node stays behind");
+    tracker.reset();
+    assert!(tracker.displacement().iter().flatten().all(|d| *d == 0.0));
+}
+
+#[test]
+fn the_same_input_gives_the_same_bytes() {
+    let body = body(5_000, 150);
+    let run = || {
+        let mut tracker = tracker(&body, DeformSettings::default());
+        let mut data = goals(&body);
+        let reports: Vec<_> = (0..4).map(|_| tracker.track(&body.bones, &mut data).unwrap()).collect();
+        (reports, tracker.displacement().to_vec())
+    };
+    assert!(run() == run());
+}
+
+#[test]
+fn a_step_that_does_not_lower_the_loss_is_undone() {
+    let body = body(2_000, 60);
+    let mut data = goals(&body);
+    data.sign = -1.0;
+    let mut tracker = tracker(&body, DeformSettings::default());
+    let report = tracker.track(&body.bones, &mut data).unwrap();
+    assert!(report.accepted == 0 && report.refused == 3, "{report:?}");
+    assert!(tracker.translations().iter().all(|t| *t == DVec3::ZERO));
+    assert!(tracker.displacement().iter().flatten().all(|d| *d == 0.0));
+}
+
+type Spoil = fn(&mut PointDerivatives);
+
+/// Derivatives that went wrong on the way.
+struct Poisoned<'a> {
+    inner: Goals<'a>,
+    loss: Option<f64>,
+    spoil: Spoil,
+}
+
+impl DataTerm for Poisoned<'_> {
+    type Error = Infallible;
+
+    fn loss(&mut self, displacement: &[[f32; 4]]) -> Result<f64, Infallible> {
+        Ok(self.loss.unwrap_or(self.inner.loss(displacement)?))
+    }
+
+    fn derivatives(&mut self, displacement: &[[f32; 4]], out: &mut PointDerivatives) -> Result<f64, Infallible> {
+        let loss = self.inner.derivatives(displacement, out)?;
+        (self.spoil)(out);
+        Ok(self.loss.unwrap_or(loss))
+    }
+}
+
+#[test]
+fn poison_never_reaches_the_state() {
+    let body = body(2_000, 60);
+    let spoilers: [(&str, Spoil); 7] = [
+        ("nothing", |_| {}),
+        ("NaN gradients", |d| d.gradient.iter_mut().step_by(3).for_each(|g| g[1] = f32::NAN)),
+        ("infinite gradients", |d| d.gradient.iter_mut().step_by(5).for_each(|g| g[0] = f32::INFINITY)),
+        ("NaN weights", |d| d.gradient.iter_mut().for_each(|g| g[3] = f32::NAN)),
+        ("NaN matrices", |d| d.curvature.iter_mut().step_by(7).for_each(|h| h[2] = f32::NAN)),
+        ("zero matrices", |d| d.curvature.fill([0.0; 4])),
+        ("no derivatives at all", |d| *d = PointDerivatives::default()),
+    ];
+    let solvers = [DeformSettings::default().solver, DeformSolver::Paper { rate: 1e-4 }];
+    for (name, spoil) in spoilers {
+        for loss in [None, Some(f64::NAN), Some(f64::INFINITY)] {
+            for solver in solvers {
+                let mut tracker = tracker(&body, DeformSettings { solver, ..Default::default() });
+                let mut data = Poisoned { inner: goals(&body), loss, spoil };
+                for _ in 0..3 {
+                    let report = tracker.track(&body.bones, &mut data).unwrap();
+                    assert_eq!(report.poisoned, loss.is_some(), "{name}");
+                }
+                let moved = tracker.translations().iter().any(|t| *t != DVec3::ZERO);
+                assert!(tracker.translations().iter().all(|t| t.is_finite()), "{name}");
+                assert!(tracker.displacement().iter().flatten().all(|d| d.is_finite()), "{name}");
+                assert!(!(moved && loss.is_some()), "{name}: a poisoned frame changes nothing");
+            }
+        }
+    }
+    // Bones that are not finite.
+    let mut tracker = tracker(&body, DeformSettings::default());
+    let broken = vec![DMat4::NAN; body.bones.len()];
+    let report = tracker.track(&broken, &mut goals(&body)).unwrap();
+    assert!(report.dropped > 0 && tracker.translations().iter().all(|t| t.is_finite()));
+}
+
+#[test]
+fn odd_graphs_and_data_without_weight() {
+    // Four nodes; one of them isolated, hanging nothing; one without a visible Gaussian.
+    let mut four = body(500, 4);
+    four.graph.neighbors[0] = [0; 4];
+    four.graph.neighbors.iter_mut().skip(1).flatten().for_each(|n| *n = (*n).max(1));
+    for (nodes, weights) in four.graph.gaussian_nodes.iter_mut().zip(&mut four.graph.gaussian_weights) {
+        for (node, weight) in nodes.iter_mut().zip(weights) {
+            if *node == 0 {
+                *weight = 0.0;
+            }
+        }
+    }
+    for (case, weight) in [("seen", 1.0), ("faint", 1e-30), ("unseen", 0.0), ("strong", 1e12)] {
+        let mut data = goals(&four);
+        data.weights.iter_mut().zip(&four.graph.gaussian_nodes).for_each(|(w, nodes)| {
+            *w *= if nodes[0] == 1 { 0.0 } else { weight };
+        });
+        let mut tracker = tracker(&four, DeformSettings::default());
+        for _ in 0..4 {
+            let report = tracker.track(&four.bones, &mut data).unwrap();
+            assert!(report.losses.iter().all(|l| l.is_finite()), "{case}: {report:?}");
+        }
+        let t = tracker.translations();
+        assert!(t.iter().all(|t| t.is_finite()) && t[0] == DVec3::ZERO, "{case}: {t:?}");
+        assert_eq!(t[2] != DVec3::ZERO, weight >= 1.0, "{case}: {t:?}");
+    }
+    let one = body(50, 1);
+    tracker(&one, DeformSettings::default()).track(&one.bones, &mut goals(&one)).unwrap();
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let body = body(300, 10);
+    let make = |graph: &DeformationGraph, skin: &[SkinWeights], settings| DeformTracker::new(graph, skin, settings);
+    assert!(make(&body.graph, &body.surface.skin[1..], DeformSettings::default()).is_err());
+    let mut graph = body.graph.clone();
+    graph.gaussian_nodes[3][1] = 10;
+    assert!(make(&graph, &body.surface.skin, DeformSettings::default()).is_err());
+    for settings in [
+        DeformSettings { regularization: f64::NAN, ..Default::default() },
+        DeformSettings { smoothing: 1.5, ..Default::default() },
+        DeformSettings { max_step_m: 0.0, ..Default::default() },
+        DeformSettings { solver: DeformSolver::Paper { rate: -1.0 }, ..Default::default() },
+    ] {
+        assert!(make(&body.graph, &body.surface.skin, settings).is_err(), "{settings:?}");
+    }
+    assert!(!body.template.name.is_empty());
+}
