@@ -11,16 +11,26 @@
 //! - **Clock**: nanoseconds from the start of the simulation; frame `i` is taken at exactly
 //!   `i * 1e9 / fps`, rounded down ([`Simulator::frame_nanos`]), by all cameras at once.
 
+mod collars;
 mod config;
+mod cuts;
+mod describe;
 mod draw;
 mod error;
+mod fabric;
 mod face;
 mod frame;
 mod garments;
+mod glyphs;
 mod gpu_parts;
+mod hair;
+mod hanging;
+mod hats;
+mod lift;
 mod look;
 mod motion;
 mod noise;
+mod palette;
 mod person;
 mod prints;
 mod regions;
@@ -32,8 +42,10 @@ mod simulator;
 mod source;
 mod texture;
 mod turn;
+mod wardrobe;
 
 pub use config::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig};
+pub use describe::{describe_person, person_fingerprint};
 pub use error::SimError;
 pub use frame::{SimFrame, SurfaceMesh};
 pub use motion::find_debian_clip;
