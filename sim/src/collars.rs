@@ -50,7 +50,7 @@ pub(crate) fn lapels(cloth: &mut Sheet, outer: &Outer) {
     let wide = outer.collar_m;
     cloth.extrude(
         8,
-        |node| at_neck(node) && node.average.y > 1.30,
+        |node| at_neck(node) && node.average.y > 1.30 && (node.average.z < 0.0 || node.average.x.abs() > 0.014),
         |node, t| {
             let out = outwards(node, centre);
             let front = smoothstep(0.1, 0.8, out.z);

@@ -18,6 +18,8 @@ const HIDDEN_M: f32 = 0.028;
 pub(crate) struct Tailor {
     pub(crate) body: Sheet,
     normals: Vec<Vec3>,
+    /// The body without its smallest forms, which no cloth follows.
+    firm: Vec<Vec3>,
     loose: Vec<Vec3>,
     pub(crate) loose_normals: Vec<Vec3>,
     pub(crate) noise: Noise,
@@ -26,11 +28,11 @@ pub(crate) struct Tailor {
 impl Tailor {
     pub(crate) fn new(body: &Sheet, seed: u64) -> Self {
         let body = body.subdivided();
-        let loose = body.smoothed(26);
+        let (firm, loose) = (body.smoothed(9), body.smoothed(26));
         let positions: Vec<Vec3> = body.nodes.iter().map(|node| node.position).collect();
         let normals = body.normals(&positions);
         let loose_normals = body.normals(&loose);
-        Self { body, normals, loose, loose_normals, noise: Noise::new(seed, 10) }
+        Self { body, normals, firm, loose, loose_normals, noise: Noise::new(seed, 10) }
     }
 
     /// The body twice as fine with each node moved.
@@ -46,10 +48,10 @@ impl Tailor {
     }
 
     /// Loose cloth that bridges hollows and stays `offset` outside of the body.
-    fn over(&self, i: usize, node: &Node, offset: f32) -> Vec3 {
+    fn over(&self, i: usize, offset: f32) -> Vec3 {
         let normal = self.loose_normals[i];
         // Smoothing shrinks limbs: push back out to where the body is.
-        let sunk = (node.body - self.loose[i]).dot(self.normals[i]).max(0.0);
+        let sunk = (self.firm[i] - self.loose[i]).dot(self.loose_normals[i]).max(0.0);
         self.loose[i] + normal * (offset + sunk)
     }
 
@@ -104,7 +106,7 @@ impl Tailor {
     /// T-shirt, shirt, jumper or the upper part of a dress.
     pub(crate) fn top(&self, look: &Look) -> Sheet {
         let top = &look.top;
-        let sheet = self.draped(|i, node| self.over(i, node, self.top_offset(top, look.female, node)));
+        let sheet = self.draped(|i, node| self.over(i, self.top_offset(top, look.female, node)));
         let mut cloth = self.cut(&sheet, |node| inside_top(top, node));
         match top.kind {
             TopKind::Shirt => shirt_collar(&mut cloth),
@@ -139,7 +141,7 @@ impl Tailor {
                 };
                 offset += (0.004 + 0.014 * open) * smoothstep(1.2, 0.85, p.y);
             }
-            self.over(i, node, offset)
+            self.over(i, offset)
         });
         let mut cloth = self.cut(&sheet, |node| inside_outer(outer, node));
         lapels(&mut cloth, outer);
@@ -168,9 +170,11 @@ impl Tailor {
             offset += 0.0035 * folds * (near_knee * 0.5 + near_hem * 1.2 + near_crotch * 0.6);
             offset += 0.003 * self.noise.sum(p * 13.0 + 7.0, 2);
             if look.top.tucked {
-                offset = lerp(offset, 0.015, smoothstep(0.90, 0.96, p.y));
+                // Over the top that it holds in.
+                let over = self.top_offset(&look.top, look.female, node) + 0.008;
+                offset = lerp(offset, over, smoothstep(0.90, 0.96, p.y));
             }
-            self.over(i, node, offset.max(0.005))
+            self.over(i, offset.max(0.005))
         });
         let cloth = self.cut(&sheet, |node| inside_bottom(look, node));
         let mut seen = cloth.filtered(|corners| {

@@ -132,9 +132,9 @@ fn convex_hull(mut points: Vec<Vec2>) -> Vec<Vec2> {
             hull.push(p);
         };
         if turn == 0 {
-            points.iter().for_each(|p| add(*p))
+            points.iter().for_each(|p| add(*p));
         } else {
-            points.iter().rev().for_each(|p| add(*p))
+            points.iter().rev().for_each(|p| add(*p));
         }
         hull.pop();
     }

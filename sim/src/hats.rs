@@ -13,12 +13,11 @@ use crate::wardrobe::{Cloth, Hat};
 const MIDDLE_Z_M: f32 = 0.047;
 /// Half axes of a hat at its rim.
 const HALF_M: Vec2 = Vec2::new(0.0905, 0.1090);
-const APEX_M: f32 = 1.722;
 
 /// Height of a hat's rim in the direction of a point of the average head: lower at the back.
 pub(crate) fn rim_height_m(p: Vec3) -> f32 {
     let around = p.x.abs().atan2(p.z - MIDDLE_Z_M);
-    1.586 + 0.024 * around.cos()
+    1.574 + 0.020 * around.cos()
 }
 
 /// The cloth of a hat.
@@ -36,23 +35,24 @@ pub(crate) fn hat(hat: &Hat, body: &Sheet, noise: Noise) -> Sheet {
     let mut sheet = Sheet::default();
     let Some(carrier) = lift.node(Vec3::new(0.0, 1.66, MIDDLE_Z_M)) else { return sheet };
     let placed = |average: Vec3, uv: Vec2| Node { uv, ..lift.node(average).unwrap_or(carrier) };
+    let crown_m = lift.top_m();
     let (apex, square) = match hat {
         Hat::None => return sheet,
-        Hat::Beanie(_) => (APEX_M + 0.018, 0.62),
-        Hat::Cap(_) => (APEX_M + 0.004, 0.68),
-        Hat::Brimmed(_) => (APEX_M + 0.022, 0.34),
+        Hat::Beanie(_) => (crown_m + 0.014, 0.62),
+        Hat::Cap(_) => (crown_m + 0.008, 0.62),
+        Hat::Brimmed(_) => (crown_m + 0.020, 0.36),
     };
     let crown = |t: f32, angle: f32| {
         let direction = Vec2::new(angle.sin(), angle.cos());
         let polar = t * FRAC_PI_2;
-        let rim = 1.586 + 0.024 * angle.cos();
+        let rim = 1.574 + 0.020 * angle.cos();
         let mut out = polar.cos().max(0.0).powf(square);
         let mut y = rim + (apex - rim) * polar.sin().powf(0.9);
         match hat {
             // The rim is turned up: twice the cloth.
             Hat::Beanie(_) => {
                 out += 0.075 * smoothstep(0.27, 0.24, t)
-                    + 0.03 * noise.sum(Vec3::new(direction.x * 2.0, t * 3.0, direction.y * 2.0), 2)
+                    + 0.03 * noise.sum(Vec3::new(direction.x * 2.0, t * 3.0, direction.y * 2.0), 2);
             }
             // A pinch along the top.
             Hat::Brimmed(_) => y -= 0.020 * smoothstep(0.55, 1.0, t) * smoothstep(0.6, 0.0, direction.x.abs()),

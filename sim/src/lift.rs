@@ -15,6 +15,11 @@ impl<'a> HeadLift<'a> {
         Self { head: body.nodes.iter().filter(|node| node.part == Part::Head && node.average.y > 1.46).collect() }
     }
 
+    /// Height of the average head's crown, metres.
+    pub(crate) fn top_m(&self) -> f32 {
+        self.head.iter().map(|node| node.average.y).fold(0.0, f32::max)
+    }
+
     /// A point near the average head, moved like the head's points around it and carried by the closest one.
     pub(crate) fn node(&self, average: Vec3) -> Option<Node> {
         const REACH_M: f32 = 0.035;

@@ -141,7 +141,7 @@ pub(crate) fn hanging_colour(cloth: &Cloth, noise: Noise, uv: Vec2, high_m: f32,
     let dark = stitch(cloth);
     let hem = line((1.0 - uv.y) * high_m - 0.020, 0.0013);
     let band = if waistband { smoothstep(0.034, 0.032, at.y) } else { 0.0 };
-    let colour = mix3(colour, scale3(cloth.colours[0], 0.72), band);
+    let colour = mix3(colour, scale3(colour, 0.72), band);
     mix3(colour, dark, 0.6 * hem)
 }
 
