@@ -1,8 +1,8 @@
 //! Synthetic people in front of synthetic cameras, with the truth about every pixel.
 //!
-//! A seed makes a person: body shape, skin, face, hair, clothes and prints. The person moves by a clip
+//! A seed makes a person: body, face, hair, hat, layered clothes, cloth and shoes. The person moves by a clip
 //! or turns around on the spot, stands in a lit room, and is seen by a ring of pinhole cameras with
-//! radial distortion. Pictures are made by an ordinary textured-triangle rasteriser with a z-buffer;
+//! radial distortion or fisheye lenses, whose sensors and clocks err as told. Pictures are made by an ordinary textured-triangle rasteriser with a z-buffer;
 //! this crate knows nothing of splats, so that no method is judged on its own drawings.
 //!
 //! # Conventions
@@ -19,6 +19,7 @@ mod draw;
 mod error;
 mod fabric;
 mod face;
+mod faults;
 mod frame;
 mod garments;
 mod glyphs;
@@ -36,6 +37,7 @@ mod prints;
 mod regions;
 mod ring;
 mod room;
+mod sensor;
 mod sheet;
 mod shoes;
 mod simulator;
@@ -47,8 +49,10 @@ mod wardrobe;
 pub use config::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig};
 pub use describe::{describe_person, person_fingerprint};
 pub use error::SimError;
+pub use faults::{Delivery, Fault, FaultKind, FaultScript, FramePlan};
 pub use frame::{SimFrame, SurfaceMesh};
 pub use motion::find_debian_clip;
 pub use ring::camera_ring;
+pub use sensor::SensorConfig;
 pub use simulator::Simulator;
 pub use source::{SimSource, sources};

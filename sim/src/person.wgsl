@@ -32,7 +32,15 @@ fn vs_person(vertex: Vertex) -> Fragment {
     var ideal = camera.xy / max(camera.z, NEAR_M * 0.5);
     let r = min(length(ideal), view.lens.z);
     let r2 = r * r;
-    ideal *= 1.0 + r2 * (view.lens.x + r2 * view.lens.y);
+    if (view.lens.w > 0.5) {
+        let theta = atan(r);
+        let t2 = theta * theta;
+        let k = view.fisheye;
+        let bent = theta * (1.0 + t2 * (k.x + t2 * (k.y + t2 * (k.z + t2 * k.w))));
+        ideal *= bent / max(length(ideal), 1e-9);
+    } else {
+        ideal *= 1.0 + r2 * (view.lens.x + r2 * view.lens.y);
+    }
     let pixel = ideal * view.focal_px + view.center_px;
     let device = (pixel + 0.5) / view.size_px * vec2(2.0, -2.0) + vec2(-1.0, 1.0);
     var out: Fragment;
