@@ -4,7 +4,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use crate::SimError;
+use crate::error::check;
+use crate::{FaultScript, SensorConfig, SimError};
 
 /// A simulated capture. The same configuration gives the same bytes on the same graphics adapter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -18,6 +19,10 @@ pub struct SimConfig {
     pub motion: MotionConfig,
     /// Where the cameras stand.
     pub cameras: RingConfig,
+    /// The cameras' sensors; camera `i` has the sensor of place `i` modulo their number. Without any, pictures are as drawn.
+    pub sensors: Vec<SensorConfig>,
+    /// What goes wrong with the cameras and their clocks.
+    pub faults: FaultScript,
     /// Image width, pixels.
     pub width: u32,
     /// Image height, pixels.
@@ -101,6 +106,8 @@ pub struct RingConfig {
     pub focal_heights: f64,
     /// Radial distortion k1, k2 (OpenCV's).
     pub radial: [f64; 2],
+    /// Coefficients k1 to k4 of an equidistant fisheye lens (OpenCV's), in place of `radial`.
+    pub fisheye: Option<[f64; 4]>,
 }
 
 impl Default for SimConfig {
@@ -110,6 +117,8 @@ impl Default for SimConfig {
             person: PersonConfig::default(),
             motion: MotionConfig::default(),
             cameras: RingConfig::default(),
+            sensors: Vec::new(),
+            faults: FaultScript::default(),
             width: 512,
             height: 512,
             fps: 30.0,
@@ -134,6 +143,7 @@ impl Default for RingConfig {
             target_height_m: 0.93,
             focal_heights: 1.36,
             radial: [-0.12, 0.03],
+            fisheye: None,
         }
     }
 }
@@ -144,13 +154,6 @@ impl SimConfig {
     /// # Errors
     /// [`SimError::Config`] names the setting and its range.
     pub fn validate(&self) -> Result<(), SimError> {
-        let check = |field, found: f64, low: f64, high: f64, expected| {
-            if (low..=high).contains(&found) {
-                Ok(())
-            } else {
-                Err(SimError::Config { field, found: found.to_string(), expected })
-            }
-        };
         let (ring, motion) = (&self.cameras, &self.motion);
         check("width", self.width.into(), 16.0, 4096.0, "16 to 4096 pixels")?;
         check("height", self.height.into(), 16.0, 4096.0, "16 to 4096 pixels")?;
@@ -164,6 +167,11 @@ impl SimConfig {
         for k in ring.radial {
             check("cameras.radial", k, -1.0, 1.0, "coefficients between -1 and 1")?;
         }
+        for k in ring.fisheye.unwrap_or_default() {
+            check("cameras.fisheye", k, -1.0, 1.0, "coefficients between -1 and 1")?;
+        }
+        self.sensors.iter().try_for_each(SensorConfig::validate)?;
+        self.faults.validate()?;
         check("motion.turn_secs", motion.turn_secs, 1.0, 600.0, "1 to 600 seconds")?;
         check("motion.reach_m", motion.reach_m, 0.0, 100.0, "0 to 100 metres")?;
         check("motion.start_secs", motion.start_secs, 0.0, 3600.0, "0 to 3600 seconds")

@@ -43,6 +43,7 @@ struct View {
     size_px: [f32; 2],
     padding: [f32; 2],
     lens: [f32; 4],
+    fisheye: [f32; 4],
     to_light: [f32; 4],
     key: [f32; 4],
     sky: [f32; 4],
@@ -288,9 +289,10 @@ impl Drawing {
 
     fn set_view(&self, camera: &Camera) {
         let i = &camera.intrinsics;
-        let [k1, k2] = match i.lens {
-            Lens::RadialTangential { radial: [k1, k2, _], .. } => [k1, k2],
-            Lens::Fisheye { .. } => [0.0; 2],
+        let valid = i.lens.valid_radius() as f32;
+        let (lens, fisheye) = match i.lens {
+            Lens::RadialTangential { radial: [k1, k2, _], .. } => ([k1 as f32, k2 as f32, valid, 0.0], [0.0; 4]),
+            Lens::Fisheye { coefficients } => ([0.0, 0.0, valid, 1.0], coefficients.map(|k| k as f32)),
         };
         let view = View {
             camera_from_world: camera.camera_from_world.to_matrix().as_mat4().to_cols_array_2d(),
@@ -299,7 +301,8 @@ impl Drawing {
             center_px: i.center_px.as_vec2().to_array(),
             size_px: Vec2::new(i.width as f32, i.height as f32).to_array(),
             padding: [0.0; 2],
-            lens: [k1 as f32, k2 as f32, i.lens.valid_radius() as f32, 0.0],
+            lens,
+            fisheye,
             to_light: to_light().extend(0.0).to_array(),
             key: [0.86, 0.82, 0.76, 0.0],
             sky: [0.42, 0.44, 0.47, 0.0],

@@ -53,4 +53,25 @@ pub enum SimError {
     /// A picture.
     #[error(transparent)]
     Image(#[from] ImageError),
+    /// A picture's JPEG code.
+    #[error("a simulated picture's JPEG code: {0}")]
+    Jpeg(#[from] image::ImageError),
+    /// A fault script.
+    #[error("fault script: {0}")]
+    Script(#[from] toml::de::Error),
+}
+
+/// Checks that a setting lies in its range.
+pub(crate) fn check(
+    field: &'static str,
+    found: f64,
+    low: f64,
+    high: f64,
+    expected: &'static str,
+) -> Result<(), SimError> {
+    if (low..=high).contains(&found) {
+        Ok(())
+    } else {
+        Err(SimError::Config { field, found: found.to_string(), expected })
+    }
 }

@@ -2,10 +2,11 @@
 
 use glam::{Vec2, Vec3};
 
-use crate::look::{HairCut, Look, Srgb};
+use crate::look::Look;
 use crate::noise::{Noise, smoothstep};
 use crate::regions::{EYE, above_hairline};
 use crate::texture::{mix3, scale3};
+use crate::wardrobe::{HairCut, ShoeKind, Srgb};
 
 /// Colour of the skin at a point of the average body.
 pub(crate) fn skin_colour(look: &Look, noise: Noise, p: Vec3) -> Srgb {
@@ -17,6 +18,12 @@ pub(crate) fn skin_colour(look: &Look, noise: Noise, p: Vec3) -> Srgb {
     };
     // Knuckles and fingertips.
     colour = red(colour, 0.5 * smoothstep(0.40, 0.50, p.x.abs()) * smoothstep(0.12, 0.22, p.z));
+    let spots = smoothstep(0.52, 0.75, noise.at(p * 190.0)) * smoothstep(-0.2, 0.3, noise.at(p * 25.0 + 5.0));
+    colour = mix3(colour, scale3(look.skin, 0.70), 0.4 * look.freckles * spots);
+    if p.y < look.shoes.sock_m && look.shoes.kind != ShoeKind::Boots {
+        let rib = 1.0 + 0.05 * ((p.x + p.z) * 900.0).sin();
+        return scale3(look.shoes.sock, rib * (1.0 - 0.15 * smoothstep(0.020, 0.018, look.shoes.sock_m - p.y)));
+    }
     if p.y < 1.42 {
         return colour;
     }
@@ -56,8 +63,7 @@ fn lips(look: &Look, colour: Srgb, p: Vec3, front: f32) -> Srgb {
     let above = p.y - LINE_Y;
     let inside = if above > 0.0 { bow - above } else { fall + above };
     let lip = if look.female { [0.70, 0.26, 0.28] } else { [0.68, 0.38, 0.34] };
-    let lip =
-        mix3(scale3(look.skin, 0.82), scale3(lip, 0.55 + 0.5 * look.skin[0]), if look.female { 0.75 } else { 0.5 });
+    let lip = mix3(scale3(look.skin, 0.82), scale3(lip, 0.55 + 0.5 * look.skin[0]), 0.35 + 0.5 * look.lips);
     let coloured = mix3(colour, lip, front * smoothstep(-0.0008, 0.0012, inside));
     // The line between the lips, and the mouth behind it.
     let line = smoothstep(0.0016, 0.0005, above.abs()) * smoothstep(1.08, 0.9, x);
@@ -88,7 +94,11 @@ fn brows(look: &Look, noise: Noise, colour: Srgb, p: Vec3, front: f32) -> Srgb {
     }
     // Scalp under the hair.
     let scalp = smoothstep(-0.004, 0.008, above_hairline(p, look.recede_m));
-    let under = if look.cut == HairCut::Crop { 0.8 } else { 0.95 };
+    let under = match look.cut {
+        HairCut::Bald => 0.12 + 0.3 * look.stubble,
+        HairCut::Crop => 0.8,
+        _ => 0.95,
+    };
     mix3(colour, scale3(look.hair, 0.85), scalp * under)
 }
 

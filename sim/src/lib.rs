@@ -1,9 +1,9 @@
 //! Synthetic people in front of synthetic cameras, with the truth about every pixel.
 //!
-//! A seed makes a person: body shape, skin, face, hair, clothes and prints. The person moves by a clip
-//! or turns around on the spot, stands in a lit room, and is seen by a ring of pinhole cameras with
-//! radial distortion. Pictures are made by an ordinary textured-triangle rasteriser with a z-buffer;
-//! this crate knows nothing of splats, so that no method is judged on its own drawings.
+//! A seed makes a person: body, face, hair, hat, layered clothes, cloth and shoes. The person moves by a clip
+//! or turns around on the spot, stands in a lit room, and is seen by a ring of cameras with radial distortion or
+//! fisheye lenses, whose sensors and clocks err as told. Pictures are made by an ordinary textured-triangle
+//! rasteriser with a z-buffer; this crate knows nothing of splats, so that no method is judged on its own drawings.
 //!
 //! # Conventions
 //!
@@ -11,32 +11,48 @@
 //! - **Clock**: nanoseconds from the start of the simulation; frame `i` is taken at exactly
 //!   `i * 1e9 / fps`, rounded down ([`Simulator::frame_nanos`]), by all cameras at once.
 
+mod collars;
 mod config;
+mod cuts;
+mod describe;
 mod draw;
 mod error;
+mod fabric;
 mod face;
+mod faults;
 mod frame;
 mod garments;
+mod glyphs;
 mod gpu_parts;
+mod hair;
+mod hanging;
+mod hats;
+mod lift;
 mod look;
 mod motion;
 mod noise;
+mod palette;
 mod person;
 mod prints;
 mod regions;
 mod ring;
 mod room;
+mod sensor;
 mod sheet;
 mod shoes;
 mod simulator;
 mod source;
 mod texture;
 mod turn;
+mod wardrobe;
 
 pub use config::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig};
+pub use describe::{describe_person, person_fingerprint};
 pub use error::SimError;
+pub use faults::{Delivery, Fault, FaultKind, FaultScript, FramePlan};
 pub use frame::{SimFrame, SurfaceMesh};
 pub use motion::find_debian_clip;
 pub use ring::camera_ring;
+pub use sensor::SensorConfig;
 pub use simulator::Simulator;
 pub use source::{SimSource, sources};

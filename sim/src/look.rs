@@ -3,28 +3,9 @@
 use flyrig_body::ShapeParams;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
+use crate::palette::{CHINOS, CLOTHS, DENIMS, HAIRS, IRISES, LEATHERS, SHOES, SKINS};
+use crate::wardrobe::{Beard, Bottom, Cloth, Fabric, HairCut, Hat, Outer, Print, ShoeKind, Shoes, Srgb, Top, TopKind};
 use crate::{Build, SimConfig};
-
-/// sRGB in 0..=1.
-pub(crate) type Srgb = [f32; 3];
-
-/// Print of a top.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Print {
-    Plain,
-    Stripes,
-    Checks,
-    Dots,
-}
-
-/// Cut of the hair.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum HairCut {
-    Crop,
-    Short,
-    Bob,
-    Bun,
-}
 
 /// Everything about the person's looks.
 #[derive(Debug, Clone)]
@@ -32,117 +13,340 @@ pub(crate) struct Look {
     pub shape: ShapeParams,
     pub female: bool,
     pub skin: Srgb,
+    /// Strength of freckles and moles, 0..=1.
+    pub freckles: f32,
+    /// Strength of the lips' colour, 0..=1.
+    pub lips: f32,
     pub hair: Srgb,
     pub iris: Srgb,
     pub cut: HairCut,
     pub recede_m: f32,
     pub stubble: f32,
-    pub print: Print,
-    pub logo: bool,
-    /// Ground and print of the top.
-    pub top: [Srgb; 2],
-    pub sleeve_m: f32,
-    pub v_neck_m: f32,
-    pub top_offset_m: f32,
-    pub knit: bool,
-    pub denim: bool,
-    pub bottom: Srgb,
-    pub bottom_offset_m: f32,
-    pub shoe: [Srgb; 2],
+    pub beard: Beard,
+    pub hat: Hat,
+    pub top: Top,
+    pub bottom: Bottom,
+    pub outer: Option<Outer>,
+    pub shoes: Shoes,
 }
 
-const SKINS: [Srgb; 6] = [
-    [0.90, 0.73, 0.63],
-    [0.87, 0.68, 0.56],
-    [0.80, 0.60, 0.47],
-    [0.70, 0.49, 0.36],
-    [0.53, 0.35, 0.25],
-    [0.40, 0.26, 0.19],
-];
-const HAIRS: [Srgb; 6] = [
-    [0.10, 0.08, 0.07],
-    [0.20, 0.13, 0.09],
-    [0.33, 0.21, 0.13],
-    [0.55, 0.40, 0.24],
-    [0.42, 0.20, 0.10],
-    [0.50, 0.48, 0.46],
-];
-const IRISES: [Srgb; 4] = [[0.30, 0.19, 0.11], [0.25, 0.38, 0.52], [0.30, 0.42, 0.28], [0.18, 0.11, 0.07]];
-const TOPS: [[Srgb; 2]; 8] = [
-    [[0.90, 0.89, 0.86], [0.14, 0.22, 0.42]],
-    [[0.74, 0.16, 0.15], [0.95, 0.90, 0.82]],
-    [[0.13, 0.34, 0.36], [0.93, 0.78, 0.36]],
-    [[0.93, 0.76, 0.27], [0.20, 0.22, 0.28]],
-    [[0.27, 0.45, 0.70], [0.94, 0.94, 0.92]],
-    [[0.45, 0.50, 0.36], [0.88, 0.86, 0.76]],
-    [[0.83, 0.52, 0.47], [0.33, 0.16, 0.23]],
-    [[0.24, 0.24, 0.27], [0.85, 0.42, 0.22]],
-];
-const CHINOS: [Srgb; 5] =
-    [[0.63, 0.55, 0.42], [0.30, 0.32, 0.25], [0.22, 0.23, 0.27], [0.46, 0.34, 0.27], [0.36, 0.38, 0.42]];
-const SHOES: [[Srgb; 2]; 5] = [
-    [[0.88, 0.88, 0.86], [0.20, 0.35, 0.55]],
-    [[0.16, 0.16, 0.18], [0.85, 0.85, 0.83]],
-    [[0.60, 0.20, 0.18], [0.92, 0.90, 0.86]],
-    [[0.40, 0.28, 0.19], [0.24, 0.17, 0.12]],
-    [[0.22, 0.30, 0.46], [0.92, 0.92, 0.90]],
-];
+/// Draws from a seed's numbers.
+struct Dice(StdRng);
+
+impl Dice {
+    fn pick<T: Copy>(&mut self, of: &[T]) -> T {
+        of[self.0.random_range(0..of.len())]
+    }
+
+    fn within(&mut self, low: f32, high: f32) -> f32 {
+        self.0.random_range(low..high)
+    }
+
+    /// Denser in the middle of the range.
+    fn middling(&mut self, low: f32, high: f32) -> f32 {
+        0.5 * (self.within(low, high) + self.within(low, high))
+    }
+
+    fn chance(&mut self, share: f32) -> bool {
+        self.within(0.0, 1.0) < share
+    }
+
+    /// A colour close to one of a palette.
+    fn colour(&mut self, of: &[Srgb]) -> Srgb {
+        let light = self.within(-0.05, 0.05);
+        self.pick(of).map(|c| (c + light + self.within(-0.025, 0.025)).clamp(0.02, 0.97))
+    }
+
+    fn cloth(&mut self, fabric: Fabric, prints: &[Print]) -> Cloth {
+        let ground = self.colour(&CLOTHS);
+        let far = |other: Srgb| (0..3).map(|i| (other[i] - ground[i]).abs()).sum::<f32>();
+        // A print has to be seen: the farthest of four colours.
+        let mut print = self.colour(&CLOTHS);
+        for _ in 0..3 {
+            let other = self.colour(&CLOTHS);
+            if far(other) > far(print) {
+                print = other;
+            }
+        }
+        let print_kind = match self.pick(prints) {
+            Print::Text(_) => Print::Text(self.0.random_range(0..=255)),
+            Print::Logo(_) => Print::Logo(self.0.random_range(0..=255)),
+            other => other,
+        };
+        Cloth {
+            fabric,
+            print: print_kind,
+            colours: [ground, print, self.colour(&CLOTHS)],
+            scale: self.within(0.75, 1.4),
+        }
+    }
+}
 
 impl Look {
     pub(crate) fn new(config: &SimConfig) -> Self {
-        let mut rng = StdRng::seed_from_u64(config.seed);
-        let builds = [Build::SlimWoman, Build::BroadMan, Build::RoundWoman, Build::SlimMan, Build::HeavyMan];
-        // Neighbouring seeds differ in build; the rest is drawn.
-        let by_seed = builds[(config.seed.wrapping_sub(1) % builds.len() as u64) as usize];
-        let build = if config.person.build == Build::BySeed { by_seed } else { config.person.build };
-        let [gender, muscle, weight, height, proportions] = match build {
-            Build::SlimWoman => [0.00, 0.38, 0.40, 0.56, 0.90],
-            Build::RoundWoman => [0.00, 0.40, 0.72, 0.46, 0.70],
-            Build::SlimMan => [0.96, 0.50, 0.36, 0.62, 0.75],
-            Build::HeavyMan => [1.00, 0.50, 0.84, 0.55, 0.55],
-            Build::BroadMan | Build::BySeed => [1.00, 0.78, 0.58, 0.66, 0.85],
-        };
-        let female = gender < 0.5;
-        let mut jitter = |value: f32| (value + rng.random_range(-0.04..0.04f32)).clamp(0.0, 1.0);
-        let shape = ShapeParams::default()
-            .with("gender", jitter(gender))
-            .with("muscle", jitter(muscle))
-            .with("weight", jitter(weight))
-            .with("height", jitter(height))
-            .with("proportions", jitter(proportions))
-            .with("age", jitter(0.56));
-        let mut pick = |count: usize| rng.random_range(0..count);
-        let print = [Print::Stripes, Print::Plain, Print::Checks, Print::Dots][pick(4)];
-        let (skin, mut hair) = (pick(SKINS.len()), pick(HAIRS.len()));
-        if skin >= 3 {
-            hair %= 2;
+        let mut dice = Dice(StdRng::seed_from_u64(config.seed));
+        let (shape, female, age) = body_shape(config, &mut dice);
+        let tone = dice.within(0.0, SKINS.len() as f32 - 1.001);
+        let (low, t) = (tone as usize, tone.fract());
+        let warm = dice.within(-0.015, 0.015);
+        let mut skin: Srgb = std::array::from_fn(|i| SKINS[low][i] + (SKINS[low + 1][i] - SKINS[low][i]) * t);
+        skin[0] += warm;
+        skin[2] -= warm;
+        let dark = tone > 2.4;
+        let mut hair = dice.colour(if dark { &HAIRS[..2] } else { &HAIRS }).map(|c| c.max(0.06));
+        if age > 0.82 {
+            let grey = dice.within(0.5, 0.8);
+            hair = hair.map(|c| c * 0.2 + grey * 0.8);
         }
-        let long_sleeves = pick(2) == 0;
-        let denim = pick(3) > 0;
-        let cuts = if female { [HairCut::Bob, HairCut::Bun] } else { [HairCut::Short, HairCut::Crop] };
-        let cut = cuts[pick(2)];
-        let logo = print == Print::Plain || pick(3) == 0;
-        let v_neck = pick(3) == 0 && !logo;
+        let iris = if dark { dice.pick(&IRISES[..2]) } else { dice.pick(&IRISES) };
+        let cut = hair_cut(&mut dice, female, age);
+        let man = !female && age > 0.35;
+        let beard = if man {
+            let none = Beard::None;
+            dice.pick(&[none, none, none, none, Beard::Moustache, Beard::Goatee, Beard::Full, Beard::Full, Beard::Long])
+        } else {
+            Beard::None
+        };
+        let (top, bottom) = clothes(&mut dice, female);
+        let outer = outer(&mut dice, &bottom);
         Self {
             shape,
             female,
-            skin: SKINS[skin],
-            hair: HAIRS[hair],
-            iris: IRISES[if skin >= 3 { [0, 3][pick(2)] } else { pick(IRISES.len()) }],
+            skin,
+            freckles: if dice.chance(0.3) { dice.within(0.3, 1.0) } else { 0.1 },
+            lips: if female && age > 0.35 { dice.within(0.4, 1.0) } else { dice.within(0.2, 0.5) },
+            hair,
+            iris,
             cut,
-            recede_m: if female { 0.0 } else { 0.008 * pick(3) as f32 },
-            stubble: if female { 0.0 } else { 0.4 * pick(3) as f32 },
-            print,
-            logo,
-            top: TOPS[pick(TOPS.len())],
-            sleeve_m: if long_sleeves { 0.465 } else { 0.16 },
-            v_neck_m: if v_neck { 0.09 } else { 0.0 },
-            top_offset_m: if long_sleeves { 0.011 } else { 0.010 },
-            knit: long_sleeves,
-            denim,
-            bottom: if denim { [0.17, 0.25, 0.41] } else { CHINOS[pick(CHINOS.len())] },
-            bottom_offset_m: 0.009,
-            shoe: SHOES[pick(SHOES.len())],
+            recede_m: if man { dice.pick(&[0.0, 0.0, 0.006, 0.014]) } else { 0.0 },
+            stubble: if man { dice.pick(&[0.0, 0.3, 0.8]) } else { 0.0 },
+            beard,
+            hat: hat(&mut dice, cut),
+            top,
+            bottom,
+            outer,
+            shoes: footwear(&mut dice),
         }
+    }
+}
+
+/// Shape, whether to dress as a woman, and the age axis.
+fn body_shape(config: &SimConfig, dice: &mut Dice) -> (ShapeParams, bool, f32) {
+    let female = dice.chance(0.5);
+    let age = if dice.chance(0.12) {
+        dice.within(0.06, 0.34)
+    } else if dice.chance(0.25) {
+        dice.within(0.78, 1.0)
+    } else {
+        dice.within(0.45, 0.75)
+    };
+    // Gender, muscle, weight, height, proportions, age, and how far each is drawn around that.
+    let (macros, around) = match config.person.build {
+        Build::SlimWoman => ([0.00, 0.38, 0.40, 0.56, 0.90, 0.56], 0.04),
+        Build::RoundWoman => ([0.00, 0.40, 0.72, 0.46, 0.70, 0.56], 0.04),
+        Build::SlimMan => ([0.96, 0.50, 0.36, 0.62, 0.75, 0.56], 0.04),
+        Build::HeavyMan => ([1.00, 0.50, 0.84, 0.55, 0.55, 0.56], 0.04),
+        Build::BroadMan => ([1.00, 0.78, 0.58, 0.66, 0.85, 0.56], 0.04),
+        Build::BySeed => {
+            let gender = if female { dice.within(0.0, 0.25) } else { dice.within(0.75, 1.0) };
+            let (muscle, weight) = (dice.middling(0.25, 0.95), dice.middling(0.22, 0.98));
+            // The average of this axis is small for a man and tall for a woman.
+            let height = if female { dice.middling(0.30, 0.56) } else { dice.middling(0.36, 0.57) };
+            ([gender, muscle, weight, height, dice.within(0.35, 0.95), age], 0.01)
+        }
+    };
+    let mut shape = ShapeParams::default();
+    for (name, value) in ["gender", "muscle", "weight", "height", "proportions", "age"].into_iter().zip(macros) {
+        shape = shape.with(name, (value + dice.within(-around, around)).clamp(0.0, 1.0));
+    }
+    const LOCALS: [(&str, f32); 14] = [
+        ("torso-vshape", 0.4),
+        ("torso-scale-horiz", 0.3),
+        ("hip-scale-horiz", 0.3),
+        ("stomach-tone", 0.5),
+        ("buttocks-volume", 0.4),
+        ("upperleg-scale-vert", 0.3),
+        ("upperarm-fat", 0.4),
+        ("neck-scale-horiz", 0.25),
+        ("head-fat", 0.6),
+        ("head-scale-horiz", 0.35),
+        ("head-scale-vert", 0.3),
+        ("chin-width", 0.7),
+        ("chin-height", 0.5),
+        ("chin-prominent", 0.6),
+    ];
+    for (name, reach) in LOCALS {
+        shape = shape.with(name, dice.within(-reach, reach));
+    }
+    (shape, macros[0] < 0.5, macros[5])
+}
+
+fn hair_cut(dice: &mut Dice, female: bool, age: f32) -> HairCut {
+    use HairCut::{Bald, Bob, Bun, Crop, Curls, Long, Ponytail, Short};
+    if female {
+        dice.pick(&[Bob, Bob, Long, Long, Long, Bun, Bun, Ponytail, Ponytail, Curls, Short])
+    } else if age > 0.7 {
+        dice.pick(&[Bald, Bald, Crop, Short, Short])
+    } else {
+        dice.pick(&[Crop, Short, Short, Short, Curls, Bob, Bun, if age > 0.4 { Bald } else { Short }])
+    }
+}
+
+fn hat(dice: &mut Dice, cut: HairCut) -> Hat {
+    let kind = dice.within(0.0, 1.0);
+    // These do not fit under a hat.
+    if matches!(cut, HairCut::Curls | HairCut::Bun) || kind > 0.3 {
+        return Hat::None;
+    }
+    let knit = [Print::Plain, Print::Plain, Print::Stripes];
+    match kind {
+        k if k < 0.11 => Hat::Beanie(dice.cloth(Fabric::Knit, &knit)),
+        k if k < 0.22 => Hat::Cap(dice.cloth(Fabric::Weave, &[Print::Plain, Print::Plain, Print::Camouflage])),
+        _ => Hat::Brimmed(dice.cloth(Fabric::Weave, &[Print::Plain])),
+    }
+}
+
+fn trousers_cloth(dice: &mut Dice) -> Cloth {
+    let mut cloth = dice.cloth(
+        Fabric::Weave,
+        &[Print::Plain, Print::Plain, Print::Plain, Print::Plain, Print::Pinstripes, Print::Camouflage, Print::Plaid],
+    );
+    if dice.chance(0.45) {
+        let ground = dice.colour(&DENIMS);
+        return Cloth { fabric: Fabric::Denim, print: Print::Plain, colours: [ground; 3], ..cloth };
+    }
+    cloth.colours[0] = dice.colour(&CHINOS);
+    cloth.colours[1] = cloth.colours[0].map(|c| if c > 0.4 { c * 0.7 } else { c * 1.4 + 0.05 });
+    cloth
+}
+
+fn clothes(dice: &mut Dice, female: bool) -> (Top, Bottom) {
+    use Print::{Camouflage, Checks, Dots, Gradient, Logo, Pinstripes, Plaid, Plain, Stripes, Text};
+    let kind = dice.pick(&[
+        TopKind::TShirt,
+        TopKind::TShirt,
+        TopKind::TShirt,
+        TopKind::Shirt,
+        TopKind::Shirt,
+        TopKind::Jumper,
+        TopKind::Jumper,
+        TopKind::Turtleneck,
+        TopKind::Hoodie,
+    ]);
+    let cloth = match kind {
+        TopKind::TShirt => dice.cloth(
+            Fabric::Jersey,
+            &[Plain, Stripes, Stripes, Dots, Camouflage, Gradient, Text(0), Text(0), Logo(0), Logo(0)],
+        ),
+        TopKind::Shirt => dice.cloth(Fabric::Weave, &[Plain, Plain, Checks, Plaid, Plaid, Dots, Pinstripes]),
+        TopKind::Jumper => dice.cloth(Fabric::Knit, &[Plain, Stripes, Stripes, Gradient, Checks]),
+        TopKind::Turtleneck => dice.cloth(Fabric::Knit, &[Plain, Plain, Stripes]),
+        TopKind::Hoodie => dice.cloth(Fabric::Jersey, &[Plain, Text(0), Logo(0), Gradient]),
+    };
+    let sleeve_m = match kind {
+        TopKind::TShirt => dice.within(0.10, 0.20),
+        TopKind::Shirt => dice.pick(&[0.21, 0.30, 0.465, 0.465]),
+        _ => 0.465,
+    };
+    let low_neck = kind == TopKind::TShirt || kind == TopKind::Jumper;
+    let mut top = Top {
+        kind,
+        cloth,
+        sleeve_m,
+        v_neck_m: match kind {
+            TopKind::TShirt | TopKind::Jumper if !matches!(cloth.print, Text(_) | Logo(_)) && dice.chance(0.3) => {
+                dice.within(0.06, 0.10)
+            }
+            // The top button is open.
+            TopKind::Shirt => 0.045,
+            _ => 0.0,
+        },
+        neck_m: if low_neck { dice.within(0.088, 0.100) } else { 0.080 },
+        hem_m: dice.within(0.80, 0.87),
+        offset_m: match kind {
+            TopKind::Jumper | TopKind::Hoodie => dice.within(0.012, 0.018),
+            _ => dice.within(0.008, 0.013),
+        },
+        tucked: false,
+    };
+    let lower = dice.within(0.0, 1.0);
+    let skirt_share = if female { 0.46 } else { 0.0 };
+    if lower < skirt_share {
+        let dress = lower < 0.24;
+        let hem_m = dice.pick(&[0.52, 0.46, 0.40, 0.28, 0.13]);
+        let flare = dice.within(0.04, 0.42);
+        let pleats = dice.pick(&[7, 9, 12, 16]);
+        top.tucked = true;
+        top.hem_m = 0.955;
+        if dress {
+            top.kind = TopKind::TShirt;
+            let prints = [Plain, Plain, Dots, Dots, Stripes, Plaid, Gradient, Checks];
+            top.cloth = dice.cloth(Fabric::Weave, &prints);
+            top.sleeve_m = dice.pick(&[0.06, 0.10, 0.16, 0.465]);
+            top.offset_m = 0.007;
+            top.v_neck_m = dice.pick(&[0.0, 0.08]);
+            return (top, Bottom::Skirt { cloth: top.cloth, hem_m, flare, pleats });
+        }
+        top.offset_m = top.offset_m.min(0.010);
+        let mut cloth = dice.cloth(Fabric::Weave, &[Plain, Plain, Plaid, Dots, Checks, Stripes]);
+        if dice.chance(0.2) {
+            cloth = Cloth { fabric: Fabric::Denim, print: Plain, colours: [dice.colour(&DENIMS); 3], ..cloth };
+        } else if dice.chance(0.15) {
+            cloth = Cloth { fabric: Fabric::Leather, print: Plain, colours: [dice.colour(&LEATHERS); 3], ..cloth };
+        }
+        return (top, Bottom::Skirt { cloth, hem_m, flare, pleats });
+    }
+    let cloth = trousers_cloth(dice);
+    if lower > 0.91 && matches!(top.kind, TopKind::TShirt | TopKind::Jumper | TopKind::Turtleneck) {
+        top.tucked = true;
+        top.offset_m = 0.008;
+        return (top, Bottom::Overalls { cloth, hem_m: dice.pick(&[0.062, 0.062, 0.10, 0.48]) });
+    }
+    let hem_m = if lower > 0.70 { dice.within(0.44, 0.60) } else { dice.pick(&[0.062, 0.062, 0.062, 0.11]) };
+    top.tucked = dice.chance(0.15) && top.kind == TopKind::Shirt;
+    (top, Bottom::Trousers { cloth, hem_m, wide_m: dice.pick(&[0.0, 0.008, 0.016, 0.030]) })
+}
+
+fn outer(dice: &mut Dice, bottom: &Bottom) -> Option<Outer> {
+    if matches!(bottom, Bottom::Overalls { .. }) || !dice.chance(0.32) {
+        return None;
+    }
+    let coat = dice.chance(0.42);
+    let prints = [Print::Plain, Print::Plain, Print::Plain, Print::Plaid, Print::Pinstripes];
+    let mut cloth = dice.cloth(Fabric::Weave, &prints);
+    let kind = dice.within(0.0, 1.0);
+    if kind < 0.35 {
+        let ground = dice.colour(&LEATHERS);
+        cloth = Cloth { fabric: Fabric::Leather, print: Print::Plain, colours: [ground; 3], ..cloth };
+    } else if kind < 0.55 && !coat {
+        cloth = Cloth { fabric: Fabric::Denim, print: Print::Plain, colours: [dice.colour(&DENIMS); 3], ..cloth };
+    } else {
+        cloth.colours[0] = dice.colour(&CHINOS);
+        cloth.colours[1] = cloth.colours[0].map(|c| if c > 0.4 { c * 0.72 } else { c * 1.5 + 0.06 });
+    }
+    Some(Outer {
+        cloth,
+        hem_m: if coat { dice.within(0.34, 0.58) } else { dice.within(0.79, 0.86) },
+        open_m: if dice.chance(0.35) { 0.0 } else { dice.within(0.05, 0.10) },
+        collar_m: dice.within(0.035, 0.060),
+    })
+}
+
+fn footwear(dice: &mut Dice) -> Shoes {
+    let kind =
+        dice.pick(&[ShoeKind::Trainers, ShoeKind::Trainers, ShoeKind::Trainers, ShoeKind::Leather, ShoeKind::Boots]);
+    let colours = match kind {
+        ShoeKind::Trainers => {
+            let [main, accent] = dice.pick(&SHOES);
+            [dice.colour(&[main]), dice.colour(&[accent])]
+        }
+        ShoeKind::Leather | ShoeKind::Boots => [dice.colour(&LEATHERS); 2],
+    };
+    let white = [0.88, 0.87, 0.85];
+    Shoes {
+        kind,
+        colours,
+        sock: if dice.chance(0.4) { white } else { dice.colour(&CLOTHS) },
+        sock_m: dice.pick(&[0.0, 0.14, 0.20, 0.36]),
     }
 }

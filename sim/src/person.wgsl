@@ -32,7 +32,15 @@ fn vs_person(vertex: Vertex) -> Fragment {
     var ideal = camera.xy / max(camera.z, NEAR_M * 0.5);
     let r = min(length(ideal), view.lens.z);
     let r2 = r * r;
-    ideal *= 1.0 + r2 * (view.lens.x + r2 * view.lens.y);
+    if (view.lens.w > 0.5) {
+        let theta = atan(r);
+        let t2 = theta * theta;
+        let k = view.fisheye;
+        let bent = theta * (1.0 + t2 * (k.x + t2 * (k.y + t2 * (k.z + t2 * k.w))));
+        ideal *= bent / max(length(ideal), 1e-9);
+    } else {
+        ideal *= 1.0 + r2 * (view.lens.x + r2 * view.lens.y);
+    }
     let pixel = ideal * view.focal_px + view.center_px;
     let device = (pixel + 0.5) / view.size_px * vec2(2.0, -2.0) + vec2(-1.0, 1.0);
     var out: Fragment;
@@ -68,7 +76,8 @@ fn lit(world: vec3<f32>, spread: f32, bias: f32) -> f32 {
 
 @fragment
 fn fs_color(in: Fragment, @builtin(front_facing) front: bool) -> @location(0) vec4<f32> {
-    let albedo = textureSample(textures, smooth_sampler, in.uv, in.layer_part.x).rgb;
+    let painted = textureSample(textures, smooth_sampler, in.uv, in.layer_part.x);
+    let albedo = painted.rgb;
     var normal = normalize(in.normal);
     if (!front) {
         normal = -normal;
@@ -83,7 +92,15 @@ fn fs_color(in: Fragment, @builtin(front_facing) front: bool) -> @location(0) ve
     let ambient = mix(view.ground.rgb, view.sky.rgb, up) * in.openness;
     let bounce = view.sky.rgb * 0.18 * max(-facing, 0.0);
     let light = view.key.rgb * key * mix(1.0, in.openness, 0.4) + ambient + bounce;
-    return vec4(albedo * light, 1.0);
+    // Gloss: a wide highlight of the key light, and the sky at grazing angles.
+    let gloss = 1.0 - painted.a;
+    let camera = view.camera_from_world;
+    let eye = -(vec3(dot(camera[0].xyz, camera[3].xyz), dot(camera[1].xyz, camera[3].xyz), dot(camera[2].xyz, camera[3].xyz)));
+    let to_eye = normalize(eye - in.world);
+    let middle = max(dot(normal, normalize(to_eye + view.to_light.xyz)), 0.0);
+    let grazing = pow(1.0 - max(dot(normal, to_eye), 0.0), 4.0);
+    let shine = view.key.rgb * min(key * 4.0, 1.0) * pow(middle, 28.0) + view.sky.rgb * grazing * 0.35 * in.openness;
+    return vec4(albedo * light + gloss * 0.8 * shine, 1.0);
 }
 
 struct Truth {

@@ -2,7 +2,8 @@
 
 use glam::Vec3;
 
-use crate::noise::lerp;
+use crate::noise::{lerp, smoothstep};
+use crate::wardrobe::Beard;
 
 /// Centre and radius of the left eyeball (the right one mirrors it).
 pub(crate) const EYE: (Vec3, f32) = (Vec3::new(0.0293, 1.5520, 0.1178), 0.0140);
@@ -27,8 +28,8 @@ pub(crate) fn along_arm(p: Vec3) -> (f32, f32) {
 }
 
 /// How far inside the neck opening's edge a point of a top is, metres.
-pub(crate) fn below_neckline(p: Vec3, v_neck_m: f32) -> f32 {
-    let round = p.distance(Vec3::new(0.0, 1.45, 0.035)) - 0.095;
+pub(crate) fn below_neckline(p: Vec3, v_neck_m: f32, radius_m: f32) -> f32 {
+    let round = p.distance(Vec3::new(0.0, 1.45, 0.035)) - radius_m;
     if v_neck_m <= 0.0 || p.z < 0.0 {
         return round;
     }
@@ -79,4 +80,26 @@ pub(crate) fn around_arm(p: Vec3) -> f32 {
     let from_axis = p - SHOULDER;
     let forward = if p.x > ELBOW.x { (p.x - ELBOW.x) / (WRIST.x - ELBOW.x) * (WRIST.z - ELBOW.z) } else { 0.0 };
     (from_axis.z - forward).atan2(from_axis.dot(outward))
+}
+
+/// How far inside a beard's edge a point of the face is, metres.
+pub(crate) fn inside_beard(p: Vec3, beard: Beard) -> f32 {
+    if is_ear(p) {
+        return -0.01;
+    }
+    let x = p.x.abs();
+    // Free of the lips; below the nose; above the throat; in front of the ears.
+    let lips = (Vec3::new(x / 0.027, (p.y - 1.4845) / 0.0125, 0.0).length() - 1.0) * 0.0125;
+    let nose = if p.z > 0.12 { 1.5065 - p.y } else { 0.02 };
+    let throat = p.y - 1.432 - 0.25 * (0.09 - p.z).max(0.0);
+    let moustache = (0.030 - x).min(p.y - 1.476).min(nose).min(p.z - 0.11).min(lips);
+    match beard {
+        Beard::None => -0.05,
+        Beard::Moustache => moustache.min(p.y - 1.488),
+        Beard::Goatee => moustache.max((0.026 - x).min(1.489 - p.y).min(p.z - 0.09).min(lips).min(throat)),
+        Beard::Full | Beard::Long => {
+            let cheek = lerp(1.502, 1.535, smoothstep(0.085, 0.045, p.z)) - p.y + 0.25 * (0.03 - x).max(0.0);
+            cheek.min(nose).min(throat).min(p.z - 0.052).min(lips)
+        }
+    }
 }

@@ -21,13 +21,16 @@ pub fn camera_ring(config: &SimConfig) -> Result<Rig, SimError> {
         height: config.height,
         focal_px: DVec2::splat(ring.focal_heights * size.y),
         center_px: (size - 1.0) * 0.5,
-        lens: Lens::RadialTangential { radial: [k1, k2, 0.0], tangential: [0.0; 2] },
+        lens: match ring.fisheye {
+            Some(coefficients) => Lens::Fisheye { coefficients },
+            None => Lens::RadialTangential { radial: [k1, k2, 0.0], tangential: [0.0; 2] },
+        },
     };
     let corner = intrinsics.lens.undistort((size * 0.5 + 1.0) / intrinsics.focal_px);
     if corner.is_none() {
         return Err(SimError::Config {
-            field: "cameras.radial",
-            found: format!("{:?}", ring.radial),
+            field: if ring.fisheye.is_some() { "cameras.fisheye" } else { "cameras.radial" },
+            found: ring.fisheye.map_or_else(|| format!("{:?}", ring.radial), |k| format!("{k:?}")),
             expected: "a lens that does not fold over inside the picture (weaker distortion or longer focal length)",
         });
     }

@@ -4,9 +4,9 @@ use flyrig_types::{Camera, Intrinsics};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::look::Srgb;
 use crate::noise::{Noise, smoothstep};
 use crate::texture::{linear_from_srgb, mix3, scale3, srgb_from_linear};
+use crate::wardrobe::Srgb;
 
 /// Ceiling height, metres.
 const HEIGHT_M: f32 = 3.4;

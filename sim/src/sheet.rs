@@ -202,6 +202,68 @@ impl Sheet {
         }
     }
 
+    /// Grows `rows` rows of cloth from the boundary's edges whose ends are both in `keep`; `at` says where a
+    /// boundary node's row lies, 0 at the edge and 1 at the far end.
+    pub(crate) fn extrude(&mut self, rows: u32, keep: impl Fn(&Node) -> bool, at: impl Fn(&Node, f32) -> Vec3) {
+        let mut columns: HashMap<u32, u32> = HashMap::new();
+        for edge in self.boundary() {
+            if edge.iter().any(|&v| !keep(&self.nodes[v as usize])) {
+                continue;
+            }
+            let [a, b] = edge.map(|v| {
+                *columns.entry(v).or_insert_with(|| {
+                    let node = self.nodes[v as usize];
+                    let first = self.nodes.len() as u32;
+                    for row in 0..=rows {
+                        let position = if row == 0 { node.position } else { at(&node, row as f32 / rows as f32) };
+                        self.nodes.push(Node { position, ..node });
+                    }
+                    first
+                })
+            });
+            for row in 0..rows {
+                let (p, q, r, s) = (a + row, b + row, a + row + 1, b + row + 1);
+                self.triangles.extend([[q, p, r], [q, r, s]]);
+            }
+        }
+    }
+
+    /// Turns the cloth in at its boundary by `thick_m` along its normals: the hem of cloth that hangs free.
+    pub(crate) fn add_rim(&mut self, thick_m: f32) {
+        let positions: Vec<Vec3> = self.nodes.iter().map(|node| node.position).collect();
+        let normals = self.normals(&positions);
+        let mut inner: HashMap<u32, u32> = HashMap::new();
+        for edge in self.boundary() {
+            let [a, b] = edge;
+            let [c, d] = edge.map(|v| {
+                *inner.entry(v).or_insert_with(|| {
+                    let node = self.nodes[v as usize];
+                    self.nodes.push(Node { position: node.position - normals[v as usize] * thick_m, ..node });
+                    self.nodes.len() as u32 - 1
+                })
+            });
+            self.triangles.extend([[b, a, c], [b, c, d]]);
+        }
+    }
+
+    /// A grid of `rows` by `columns` cells from nodes row by row; seen from outside, columns run
+    /// counter-clockwise and rows upwards.
+    pub(crate) fn add_grid(&mut self, rows: u32, columns: u32, mut node: impl FnMut(f32, f32) -> Node) {
+        let first = self.nodes.len() as u32;
+        for row in 0..=rows {
+            for column in 0..=columns {
+                self.nodes.push(node(row as f32 / rows as f32, column as f32 / columns as f32));
+            }
+        }
+        for row in 0..rows {
+            for column in 0..columns {
+                let a = first + row * (columns + 1) + column;
+                let (b, c, d) = (a + 1, a + columns + 1, a + columns + 2);
+                self.triangles.extend([[a, b, c], [b, d, c]]);
+            }
+        }
+    }
+
     /// Drops nodes that no triangle uses.
     pub(crate) fn compacted(&self) -> Self {
         let mut compact = Self::default();
@@ -218,7 +280,8 @@ impl Sheet {
     }
 }
 
-fn mix_skin(a: &SkinWeights, b: &SkinWeights, t: f32) -> SkinWeights {
+/// Weights between two, `t` of the way from `a` to `b`.
+pub(crate) fn mix_skin(a: &SkinWeights, b: &SkinWeights, t: f32) -> SkinWeights {
     let mut sums: Vec<(u16, f32)> = Vec::with_capacity(8);
     for (skin, share) in [(a, 1.0 - t), (b, t)] {
         for (&joint, &weight) in skin.joints.iter().zip(&skin.weights) {

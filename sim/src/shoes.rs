@@ -3,7 +3,7 @@
 use flyrig_body::Part;
 use glam::{Vec2, Vec3};
 
-use crate::garments::ball;
+use crate::hair::ball;
 use crate::noise::smoothstep;
 use crate::regions::{ANKLE_TOP_M, EYE};
 use crate::sheet::{Node, Sheet};
@@ -137,8 +137,14 @@ pub(crate) fn eyes(body: &Sheet) -> Sheet {
             body.nodes.iter().filter(|node| node.average.distance(average) < radius * 1.35).collect();
         let Some(&&carrier) = near.first() else { continue };
         let moved = near.iter().map(|node| node.position - node.average).sum::<Vec3>() / near.len() as f32;
+        // As large as the socket around it, child or old man.
+        let spread = |of: fn(&Node) -> Vec3| {
+            let middle = near.iter().map(|node| of(node)).sum::<Vec3>() / near.len() as f32;
+            near.iter().map(|node| of(node).distance(middle)).sum::<f32>()
+        };
+        let scale = spread(|node| node.position) / spread(|node| node.average).max(1e-6);
         let first = eyes.nodes.len();
-        ball(&mut eyes, &carrier, average + moved, radius, average);
+        ball(&mut eyes, &carrier, average + moved, radius * scale, average);
         for node in &mut eyes.nodes[first..] {
             let from_centre = (node.average - average) / radius;
             let front = if from_centre.z > 0.0 {

@@ -12,7 +12,8 @@ use crate::look::Look;
 use crate::noise::smoothstep;
 use crate::person::Person;
 use crate::room::{LensGrid, Room};
-use crate::{SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring, motion};
+use crate::sensor::hash;
+use crate::{SensorConfig, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring, motion};
 
 /// A person, a motion, a room and cameras.
 pub struct Simulator {
@@ -50,8 +51,13 @@ impl Simulator {
         let drawing = Drawing::new(gpu, &person, [width, height], &plates)?;
         let plates = plates
             .into_iter()
-            .map(|plate| Image::new(width, height, PixelFormat::Rgb8, rgb_bytes(&plate.rgba)))
-            .collect::<Result<_, _>>()?;
+            .enumerate()
+            .map(|(slot, plate)| {
+                let drawn = Image::new(width, height, PixelFormat::Rgb8, rgb_bytes(&plate.rgba))?;
+                // An instant that no frame has.
+                develop(config, drawn, i64::MIN, slot, 1.0)
+            })
+            .collect::<Result<_, SimError>>()?;
         Ok(Self { config: config.clone(), rig, person, track, plates, drawing, drawn_nanos: None })
     }
 
@@ -122,6 +128,14 @@ impl Simulator {
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
     pub fn capture(&mut self, nanos: i64, slot: usize) -> Result<(Image, Mask), SimError> {
+        self.capture_exposed(nanos, slot, 1.0)
+    }
+
+    /// [`Self::capture`] with the sensor's exposure multiplied by `exposure`.
+    ///
+    /// # Errors
+    /// [`SimError::NoSlot`], [`SimError::Gpu`].
+    pub fn capture_exposed(&mut self, nanos: i64, slot: usize, exposure: f64) -> Result<(Image, Mask), SimError> {
         self.camera(slot)?;
         if self.drawn_nanos != Some(nanos) {
             self.drawing.set_person(&self.posed(nanos));
@@ -130,6 +144,7 @@ impl Simulator {
         let rgba = self.drawing.picture(self.camera(slot)?, slot)?;
         let (width, height) = (self.config.width, self.config.height);
         let color = Image::new(width, height, PixelFormat::Rgb8, rgb_bytes(&rgba))?;
+        let color = develop(&self.config, color, nanos, slot, exposure)?;
         let mask = Mask::new(width, height, rgba.iter().map(|pixel| pixel[3]).collect())?;
         Ok((color, mask))
     }
@@ -165,6 +180,16 @@ impl Simulator {
         });
         Posed { positions, normals, center: (low + high) * 0.5, feet }
     }
+}
+
+/// What camera `slot`'s sensor makes of a picture drawn for an instant.
+fn develop(config: &SimConfig, drawn: Image, nanos: i64, slot: usize, exposure: f64) -> Result<Image, SimError> {
+    let mut sensor = match config.sensors.len() {
+        0 => SensorConfig::default(),
+        count => config.sensors[slot % count].clone(),
+    };
+    sensor.exposure *= exposure;
+    sensor.develop(drawn, hash(hash(config.seed, slot as u64), nanos as u64))
 }
 
 fn rgb_bytes(rgba: &[[u8; 4]]) -> Vec<u8> {

@@ -3,8 +3,8 @@
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::look::Srgb;
 use crate::sheet::Sheet;
+use crate::wardrobe::Srgb;
 
 /// A square sRGB picture.
 #[derive(Debug, Clone)]
@@ -85,6 +85,15 @@ impl Texture {
         Self { side, pixels }
     }
 
+    /// The same picture of a glossy surface, 0..=1; the gloss is what the fourth channel lacks to full.
+    pub(crate) fn glossy(mut self, gloss: f32) -> Self {
+        let fourth = ((1.0 - gloss.clamp(0.0, 1.0)) * 255.0).round() as u8;
+        for pixel in &mut self.pixels {
+            pixel[3] = fourth;
+        }
+        self
+    }
+
     /// Half the side, averaged in linear light.
     pub(crate) fn halved(&self) -> Self {
         let side = (self.side / 2).max(1);
@@ -96,7 +105,9 @@ impl Texture {
                 let (x, y) = (i % side * 2, i / side * 2);
                 let four = [at(x, y), at(x + 1, y), at(x, y + 1), at(x + 1, y + 1)];
                 let mean = |c: usize| four.iter().map(|p| table[usize::from(p[c])]).sum::<f32>() / 4.0;
-                to_bytes([mean(0), mean(1), mean(2)].map(srgb_from_linear))
+                let [r, g, b, _] = to_bytes([mean(0), mean(1), mean(2)].map(srgb_from_linear));
+                let gloss = four.iter().map(|p| u16::from(p[3])).sum::<u16>() / 4;
+                [r, g, b, gloss as u8]
             })
             .collect();
         Self { side, pixels }

@@ -6,8 +6,10 @@ struct View {
     focal_px: vec2<f32>,
     center_px: vec2<f32>,
     size_px: vec2<f32>,
-    // k1, k2; beyond the radius z the lens is continued linearly.
+    // k1, k2; beyond the radius z the lens is continued linearly; w is 1 for a fisheye.
     lens: vec4<f32>,
+    // k1 to k4 of a fisheye.
+    fisheye: vec4<f32>,
     // Unit vector towards the key light.
     to_light: vec4<f32>,
     key: vec4<f32>,

@@ -114,6 +114,21 @@ fn strong_distortion_is_drawn_to_a_tenth_of_a_pixel() {
 }
 
 #[test]
+fn a_fisheye_is_drawn_to_a_tenth_of_a_pixel() {
+    let mut config = small_config(4);
+    (config.width, config.height) = (256, 256);
+    config.cameras.focal_heights = 0.85;
+    config.cameras.radius_m = 2.2;
+    config.cameras.fisheye = Some([0.05, -0.01, 0.004, -0.001]);
+    let mut simulator = simulator(&config);
+    let footprint_m = 2.2 / (0.85 * 256.0);
+    let (_, canonical) = errors(&mut simulator, 0, 37);
+    let worst = quantile(&canonical, 0.95) / footprint_m;
+    println!("95 of 100 pixels within {worst:.4} px");
+    assert!(worst < 0.05, "{worst} px");
+}
+
+#[test]
 fn the_mask_covers_what_has_depth_and_the_rest_is_the_plate() {
     let mut simulator = simulator(&small_config(5));
     let frame = simulator.render(NANOS, 0).unwrap();

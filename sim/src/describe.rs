@@ -1,0 +1,65 @@
+//! A person in words.
+
+use crate::SimConfig;
+use crate::look::Look;
+use crate::wardrobe::{Beard, Bottom, Cloth, Hat};
+
+/// What the configuration's person looks like, in a line of words; two people of the same words may still
+/// differ in shape and colours. Nothing is drawn.
+#[must_use]
+pub fn describe_person(config: &SimConfig) -> String {
+    let look = Look::new(config);
+    let age = look.shape.0.get("age").copied().unwrap_or(0.5);
+    let who = match (look.female, age) {
+        (true, age) if age < 0.36 => "girl",
+        (false, age) if age < 0.36 => "boy",
+        (true, age) if age > 0.76 => "old woman",
+        (false, age) if age > 0.76 => "old man",
+        (true, _) => "woman",
+        (false, _) => "man",
+    };
+    let mut words = vec![who.to_owned(), format!("{:?} hair", look.cut)];
+    if look.beard != Beard::None {
+        words.push(format!("{:?} beard", look.beard));
+    }
+    match look.hat {
+        Hat::None => {}
+        Hat::Beanie(cloth) => words.push(format!("{} beanie", cloth_words(&cloth))),
+        Hat::Cap(cloth) => words.push(format!("{} cap", cloth_words(&cloth))),
+        Hat::Brimmed(cloth) => words.push(format!("{} brimmed hat", cloth_words(&cloth))),
+    }
+    let top = &look.top;
+    let sleeves = if top.sleeve_m > 0.4 { "long-sleeved" } else { "short-sleeved" };
+    let dress = matches!(look.bottom, Bottom::Skirt { cloth, .. } if cloth == top.cloth);
+    if !dress {
+        words.push(format!("{} {sleeves} {:?}", cloth_words(&top.cloth), top.kind));
+    }
+    words.push(match &look.bottom {
+        Bottom::Trousers { cloth, hem_m, .. } if *hem_m > 0.3 => format!("{} shorts", cloth_words(cloth)),
+        Bottom::Trousers { cloth, .. } => format!("{} trousers", cloth_words(cloth)),
+        Bottom::Overalls { cloth, .. } => format!("{} overalls", cloth_words(cloth)),
+        Bottom::Skirt { cloth, .. } if dress => format!("{} {sleeves} dress", cloth_words(cloth)),
+        Bottom::Skirt { cloth, .. } => format!("{} skirt", cloth_words(cloth)),
+    });
+    if let Some(outer) = look.outer {
+        let kind = if outer.hem_m < 0.7 { "coat" } else { "jacket" };
+        words.push(format!("{} {kind}", cloth_words(&outer.cloth)));
+    }
+    words.push(format!("{:?} shoes", look.shoes.kind));
+    words.join(", ").to_lowercase()
+}
+
+/// A number for everything about the configuration's person, down to the last shade; people of different
+/// numbers differ. Nothing is drawn.
+#[must_use]
+pub fn person_fingerprint(config: &SimConfig) -> u64 {
+    // FNV-1a, which is the same on every machine.
+    let text = format!("{:?}", Look::new(config));
+    text.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
+}
+
+fn cloth_words(cloth: &Cloth) -> String {
+    let print = format!("{:?}", cloth.print);
+    let print = print.split('(').next().unwrap_or_default();
+    format!("{print} {:?}", cloth.fabric)
+}

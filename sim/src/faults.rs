@@ -1,0 +1,214 @@
+//! What goes wrong with cameras and clocks, by a script.
+//!
+//! ```toml
+//! seed = 7
+//!
+//! [[fault]]
+//! kind = "drift"
+//! camera = "01"
+//! ppm = 80.0
+//!
+//! [[fault]]
+//! kind = "drop"
+//! from_frame = 30
+//! frames = 60
+//! probability = 0.1
+//! ```
+
+use flyrig_types::CameraId;
+use serde::{Deserialize, Serialize};
+
+use crate::SimError;
+use crate::error::check;
+use crate::sensor::{gaussian, hash, uniform};
+
+/// Kind of a [`Fault`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FaultKind {
+    /// The camera's clock is `ms` ahead: stamps are later than the instants.
+    Offset,
+    /// The camera's clock runs fast by `ppm`: stamps go ahead of the instants as time goes by.
+    Drift,
+    /// Stamps err by a Gaussian of standard deviation `ms`.
+    Jitter,
+    /// The camera exposes `ms` after the others, and its stamps say so.
+    Lag,
+    /// The frame is lost; the sequence numbers show a gap.
+    Drop,
+    /// The picture of the frame before, under this frame's sequence number and stamp.
+    Duplicate,
+    /// The source times out in place of the frame.
+    Stall,
+    /// The source is disconnected in place of the frame; when it returns, its sequence numbers start at 0.
+    Disconnect,
+    /// The stamp of a single frame is off by `ms`.
+    WrongTimestamp,
+    /// The lower part of the picture, from a random row on, is garbage.
+    Corrupt,
+    /// The frame cannot be decoded: an error in its place.
+    Undecodable,
+    /// The exposure is multiplied by `factor`.
+    ExposureJump,
+}
+
+/// One thing that goes wrong.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Fault {
+    /// What.
+    pub kind: FaultKind,
+    /// Which camera; without it, all.
+    #[serde(default)]
+    pub camera: Option<String>,
+    /// First frame that it can hit.
+    #[serde(default)]
+    pub from_frame: u64,
+    /// Number of frames from there on that it can hit; without it, all.
+    #[serde(default)]
+    pub frames: Option<u64>,
+    /// Share of those frames that it hits, drawn by the seed for each camera and frame.
+    #[serde(default = "always")]
+    pub probability: f64,
+    /// Milliseconds, of offset, jitter, lag and wrong-timestamp.
+    #[serde(default)]
+    pub ms: Option<f64>,
+    /// Parts in a million, of drift.
+    #[serde(default)]
+    pub ppm: Option<f64>,
+    /// Factor of an exposure-jump.
+    #[serde(default)]
+    pub factor: Option<f64>,
+}
+
+fn always() -> f64 {
+    1.0
+}
+
+/// A seeded list of faults. The same script hits the same frames in every run.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FaultScript {
+    /// Draws which frames are hit, and how.
+    pub seed: u64,
+    /// The faults.
+    #[serde(rename = "fault")]
+    pub faults: Vec<Fault>,
+}
+
+/// What a source gives in a frame's turn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Delivery {
+    /// The frame.
+    Frame,
+    /// Nothing; the next frame takes the turn.
+    Dropped,
+    /// A timeout.
+    Stalled,
+    /// A disconnection.
+    Disconnected,
+    /// An error about a frame that cannot be decoded.
+    Undecodable,
+}
+
+/// What the script does to one frame of one camera: the truth about its time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FramePlan {
+    /// What the source gives.
+    pub delivery: Delivery,
+    /// The instant that the picture shows.
+    pub true_nanos: i64,
+    /// The time that the frame claims.
+    pub stamp_nanos: i64,
+    /// On the sensor's exposure.
+    pub exposure: f64,
+    /// Share of the picture's rows above the garbage, where there is some.
+    pub sound_share: Option<f64>,
+}
+
+impl FaultScript {
+    /// Reads and checks a script.
+    ///
+    /// # Errors
+    /// [`SimError::Script`] for what is no script (it names unknown keys), [`SimError::Config`] for numbers out of range.
+    pub fn parse(text: &str) -> Result<Self, SimError> {
+        let script: Self = toml::from_str(text)?;
+        script.validate()?;
+        Ok(script)
+    }
+
+    pub(crate) fn validate(&self) -> Result<(), SimError> {
+        use FaultKind::{Drift, ExposureJump, Jitter, Lag, Offset, WrongTimestamp};
+        for fault in &self.faults {
+            let kind = fault.kind;
+            check("fault.probability", fault.probability, 0.0, 1.0, "a share from 0 to 1")?;
+            let number = |name, value: Option<f64>, belongs: bool, low, high, expected| match (value, belongs) {
+                (Some(value), true) => check(name, value, low, high, expected),
+                (None, false) => Ok(()),
+                (None, true) => Err(SimError::Config { field: name, found: format!("missing for {kind:?}"), expected }),
+                (Some(value), false) => Err(SimError::Config {
+                    field: name,
+                    found: value.to_string(),
+                    expected: "no such number: this kind of fault has no use for it",
+                }),
+            };
+            let timed = matches!(kind, Offset | Jitter | Lag | WrongTimestamp);
+            let low = if matches!(kind, Jitter) { 0.0 } else { -1e5 };
+            number("fault.ms", fault.ms, timed, low, 1e5, "-100000 to 100000 milliseconds (jitter: from 0)")?;
+            number("fault.ppm", fault.ppm, kind == Drift, -1e5, 1e5, "-100000 to 100000 parts in a million")?;
+            number("fault.factor", fault.factor, kind == ExposureJump, 0.0, 64.0, "0 to 64")?;
+        }
+        Ok(())
+    }
+
+    /// What happens to frame `index` of a camera, which all cameras without faults take at `nanos_of(index)`.
+    #[must_use]
+    pub fn plan(&self, camera: &CameraId, index: u64, nanos_of: impl Fn(u64) -> i64) -> FramePlan {
+        let mut shown = index;
+        let (mut lag, mut stamp, mut exposure, mut sound_share) = (0.0, 0.0, 1.0, None);
+        let mut delivery = Delivery::Frame;
+        let name = camera.as_str().bytes().fold(self.seed, |key, byte| hash(key, byte.into()));
+        for (place, fault) in (0u64..).zip(&self.faults) {
+            let key = hash(name, place);
+            let since = index.checked_sub(fault.from_frame);
+            let within = since.is_some_and(|since| fault.frames.is_none_or(|frames| since < frames));
+            let here = fault.camera.as_deref().is_none_or(|name| name == camera.as_str());
+            if !(within && here && uniform(key, index) < fault.probability) {
+                continue;
+            }
+            let nanos = fault.ms.unwrap_or(0.0) * 1e6;
+            match fault.kind {
+                FaultKind::Offset | FaultKind::WrongTimestamp => stamp += nanos,
+                FaultKind::Drift => {
+                    let elapsed = nanos_of(index) - nanos_of(fault.from_frame);
+                    stamp += elapsed as f64 * fault.ppm.unwrap_or(0.0) * 1e-6;
+                }
+                FaultKind::Jitter => stamp += nanos * f64::from(gaussian(hash(key, 1), index)),
+                FaultKind::Lag => lag += nanos,
+                FaultKind::Duplicate => shown = index.saturating_sub(1),
+                FaultKind::Corrupt => sound_share = Some(0.9 * uniform(hash(key, 2), index)),
+                FaultKind::ExposureJump => exposure *= fault.factor.unwrap_or(1.0),
+                FaultKind::Drop => delivery = Delivery::Dropped,
+                FaultKind::Stall => delivery = Delivery::Stalled,
+                FaultKind::Disconnect => delivery = Delivery::Disconnected,
+                FaultKind::Undecodable => delivery = Delivery::Undecodable,
+            }
+        }
+        FramePlan {
+            delivery,
+            true_nanos: nanos_of(shown) + lag as i64,
+            stamp_nanos: nanos_of(index) + (lag + stamp) as i64,
+            exposure,
+            sound_share,
+        }
+    }
+
+    /// Garbage over the rows of an RGB picture below `sound_share` of its height.
+    pub(crate) fn spoil(&self, rgb: &mut [u8], sound_share: f64, index: u64) {
+        let from = (rgb.len() as f64 * sound_share) as usize;
+        let key = hash(hash(self.seed, 3), index);
+        for (place, byte) in (0u64..).zip(rgb.iter_mut().skip(from)) {
+            *byte = hash(key, place / 16) as u8;
+        }
+    }
+}

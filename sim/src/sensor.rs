@@ -1,0 +1,144 @@
+//! What a camera's sensor and its encoder do to light.
+
+use flyrig_types::{Image, PixelFormat};
+use glam::Vec2;
+use image::ImageEncoder as _;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::SimError;
+use crate::error::check;
+use crate::texture::{linear_from_srgb, srgb_from_linear};
+
+/// One camera's sensor; the default changes nothing.
+///
+/// Light (linear, 1 is the brightest sRGB value) is multiplied by `exposure` and falls off towards the corners, is
+/// counted as electrons with their noise, amplified by `gain` and `white_balance`, clipped, and coded as sRGB to the
+/// power of `gamma`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SensorConfig {
+    /// Light gathered, 1 for the drawn picture's.
+    pub exposure: f64,
+    /// Amplification after the noise.
+    pub gain: f64,
+    /// Exponent on the coded value in 0..=1: 1 is sRGB, above it darkens the middle tones.
+    pub gamma: f64,
+    /// Factors of red, green and blue.
+    pub white_balance: [f64; 3],
+    /// Share of the light that is lost in the corners, growing with the fourth power of the distance from the middle.
+    pub vignetting: f64,
+    /// Electrons at light 1: the shot noise's variance, in electrons, is their number (drawn as a Gaussian). Without it
+    /// there is no noise.
+    pub full_well_electrons: Option<f64>,
+    /// Standard deviation of the noise of reading, electrons.
+    pub read_noise_electrons: f64,
+    /// Quality of the JPEG code that the picture goes through, 1 to 100; without it there is none.
+    pub jpeg_quality: Option<u8>,
+}
+
+impl Default for SensorConfig {
+    fn default() -> Self {
+        Self {
+            exposure: 1.0,
+            gain: 1.0,
+            gamma: 1.0,
+            white_balance: [1.0; 3],
+            vignetting: 0.0,
+            full_well_electrons: None,
+            read_noise_electrons: 0.0,
+            jpeg_quality: None,
+        }
+    }
+}
+
+impl SensorConfig {
+    pub(crate) fn validate(&self) -> Result<(), SimError> {
+        check("sensors.exposure", self.exposure, 0.0, 64.0, "0 to 64")?;
+        check("sensors.gain", self.gain, 0.0, 64.0, "0 to 64")?;
+        check("sensors.gamma", self.gamma, 0.1, 10.0, "0.1 to 10")?;
+        for factor in self.white_balance {
+            check("sensors.white_balance", factor, 0.0, 8.0, "factors from 0 to 8")?;
+        }
+        check("sensors.vignetting", self.vignetting, 0.0, 1.0, "a share from 0 to 1")?;
+        if let Some(electrons) = self.full_well_electrons {
+            check("sensors.full_well_electrons", electrons, 10.0, 1e7, "10 to 10000000 electrons")?;
+        } else if self.read_noise_electrons > 0.0 {
+            let expected = "0 without full_well_electrons, which says what an electron is worth";
+            check("sensors.read_noise_electrons", self.read_noise_electrons, 0.0, 0.0, expected)?;
+        }
+        check("sensors.read_noise_electrons", self.read_noise_electrons, 0.0, 1e5, "0 to 100000 electrons")?;
+        check("sensors.jpeg_quality", self.jpeg_quality.unwrap_or(50).into(), 1.0, 100.0, "1 to 100")
+    }
+
+    /// What the sensor makes of a drawn picture (RGB, 8 bits); `key` makes the noise.
+    pub(crate) fn develop(&self, drawn: Image, key: u64) -> Result<Image, SimError> {
+        if *self == Self::default() {
+            return Ok(drawn);
+        }
+        let (width, height) = (drawn.width(), drawn.height());
+        let linear: Vec<f32> = (0..=255).map(|v| linear_from_srgb(v as f32 / 255.0)).collect();
+        let size = Vec2::new(width as f32, height as f32);
+        let row_bytes = width as usize * 3;
+        let mut bytes = vec![0u8; drawn.bytes().len()];
+        bytes.par_chunks_exact_mut(row_bytes).zip(drawn.bytes().par_chunks_exact(row_bytes)).enumerate().for_each(
+            |(y, (to, from))| {
+                for x in 0..width as usize {
+                    let from_middle = (Vec2::new(x as f32, y as f32) + 0.5 - size * 0.5) / (size * 0.5).length();
+                    let fall = 1.0 - self.vignetting as f32 * from_middle.length_squared().powi(2);
+                    for channel in 0..3 {
+                        let i = x * 3 + channel;
+                        let light = linear[usize::from(from[i])] * self.exposure as f32 * fall;
+                        let read = self.read(light, key, (y * row_bytes + i) as u64);
+                        let level = (read * self.gain as f32 * self.white_balance[channel] as f32).clamp(0.0, 1.0);
+                        to[i] = (srgb_from_linear(level).powf(self.gamma as f32) * 255.0).round() as u8;
+                    }
+                }
+            },
+        );
+        let bytes = match self.jpeg_quality {
+            None => bytes,
+            Some(quality) => through_jpeg(&bytes, width, height, quality)?,
+        };
+        Ok(Image::new(width, height, PixelFormat::Rgb8, bytes)?)
+    }
+
+    /// Light as read from the sensor: with noise, and no more than the full well.
+    fn read(&self, light: f32, key: u64, pixel: u64) -> f32 {
+        let Some(full) = self.full_well_electrons else { return light };
+        let full = full as f32;
+        let electrons = (light * full).min(full);
+        let sigma = (electrons + (self.read_noise_electrons as f32).powi(2)).sqrt();
+        (electrons + sigma * gaussian(key, pixel)) / full
+    }
+}
+
+/// Coded and decoded again.
+fn through_jpeg(rgb: &[u8], width: u32, height: u32, quality: u8) -> Result<Vec<u8>, SimError> {
+    let mut code = Vec::new();
+    let encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut code, quality);
+    encoder.write_image(rgb, width, height, image::ExtendedColorType::Rgb8)?;
+    let decoded = image::load_from_memory_with_format(&code, image::ImageFormat::Jpeg)?;
+    Ok(decoded.into_rgb8().into_raw())
+}
+
+/// A hash of two numbers with full avalanche: splitmix64's finisher.
+pub(crate) fn hash(key: u64, index: u64) -> u64 {
+    let mut h = key ^ index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    h = (h ^ (h >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    h = (h ^ (h >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    h ^ (h >> 31)
+}
+
+/// Evenly in 0..1, never 0.
+pub(crate) fn uniform(key: u64, index: u64) -> f64 {
+    ((hash(key, index) >> 11) as f64 + 0.5) / (1u64 << 53) as f64
+}
+
+/// Mean 0, variance 1 (Box and Muller's transform).
+pub(crate) fn gaussian(key: u64, index: u64) -> f32 {
+    let h = hash(key, index);
+    let (a, b) = ((h >> 32) as f32 + 0.5, (h & 0xffff_ffff) as f32);
+    const SPAN: f32 = 4_294_967_296.0;
+    (-2.0 * (a / SPAN).ln()).max(0.0).sqrt() * (b / SPAN * std::f32::consts::TAU).cos()
+}

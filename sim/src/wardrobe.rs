@@ -1,0 +1,149 @@
+//! What people wear: kinds of garments, hair and hats, and the cloth they are made of.
+
+/// sRGB in 0..=1.
+pub(crate) type Srgb = [f32; 3];
+
+/// How a cloth is made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Fabric {
+    /// Smooth cotton jersey.
+    Jersey,
+    /// Plain weave with visible threads.
+    Weave,
+    Denim,
+    Knit,
+    Leather,
+}
+
+/// What is printed or woven into a cloth.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Print {
+    Plain,
+    /// Across the body.
+    Stripes,
+    /// Down the body.
+    Pinstripes,
+    Checks,
+    Plaid,
+    Dots,
+    Camouflage,
+    /// From the first colour above to the second below.
+    Gradient,
+    /// One of the words of [`crate::glyphs`] on the chest.
+    Text(u8),
+    /// One of the marks of [`crate::fabric`] on the chest.
+    Logo(u8),
+}
+
+/// A cloth.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Cloth {
+    pub fabric: Fabric,
+    pub print: Print,
+    /// Ground, print, accent.
+    pub colours: [Srgb; 3],
+    /// Size of the print, 1 for a common one.
+    pub scale: f32,
+}
+
+/// Kind of a top.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum TopKind {
+    TShirt,
+    Shirt,
+    Jumper,
+    Turtleneck,
+    Hoodie,
+}
+
+/// A garment of the upper body; lengths in metres on the average body.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Top {
+    pub kind: TopKind,
+    pub cloth: Cloth,
+    /// Along the arm from the shoulder joint; the wrist is at 0.48.
+    pub sleeve_m: f32,
+    pub v_neck_m: f32,
+    /// Radius of the neck opening.
+    pub neck_m: f32,
+    /// Height of the hem above the sole.
+    pub hem_m: f32,
+    /// Distance from the body.
+    pub offset_m: f32,
+    /// Its hem is under the waistband.
+    pub tucked: bool,
+}
+
+/// A garment of the lower body; lengths in metres on the average body.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Bottom {
+    /// Trousers and shorts. `wide_m` is how much farther from the leg the hem is than the hip.
+    Trousers { cloth: Cloth, hem_m: f32, wide_m: f32 },
+    /// Trousers with a bib and straps.
+    Overalls { cloth: Cloth, hem_m: f32 },
+    /// A skirt of its own, or that of a dress (whose top is of the same cloth). `flare` is metres outwards a
+    /// metre down.
+    Skirt { cloth: Cloth, hem_m: f32, flare: f32, pleats: u8 },
+}
+
+/// A garment over all others.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Outer {
+    pub cloth: Cloth,
+    /// Height of the hem, metres on the average body; below the hip the garment is a coat.
+    pub hem_m: f32,
+    /// Half the width of the opening in front at the hem, metres; 0 for a closed one.
+    pub open_m: f32,
+    pub collar_m: f32,
+}
+
+/// Cut of the hair.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum HairCut {
+    Bald,
+    Crop,
+    Short,
+    Curls,
+    Bob,
+    Long,
+    Bun,
+    Ponytail,
+}
+
+/// Hair on the face.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Beard {
+    None,
+    Moustache,
+    Goatee,
+    Full,
+    Long,
+}
+
+/// What is on the head.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Hat {
+    None,
+    Beanie(Cloth),
+    Cap(Cloth),
+    Brimmed(Cloth),
+}
+
+/// Kind of shoes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum ShoeKind {
+    Trainers,
+    Leather,
+    Boots,
+}
+
+/// Shoes and socks.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Shoes {
+    pub kind: ShoeKind,
+    /// Upper and accents.
+    pub colours: [Srgb; 2],
+    pub sock: Srgb,
+    /// Height of the socks, metres on the average body.
+    pub sock_m: f32,
+}
