@@ -43,14 +43,22 @@ impl Dataset {
     }
 }
 
-/// Simulates a person before seven cameras and writes pictures, masks, plates, calibration and the unclothed body with
+/// [`write_dataset_of`] the first person.
+///
+/// # Errors
+/// See there.
+pub fn write_dataset() -> Result<Dataset> {
+    write_dataset_of(1)
+}
+
+/// Simulates the person of a seed before seven cameras and writes pictures, masks, plates, calibration and the unclothed body with
 /// its motion.
 ///
 /// # Errors
 /// When there is no adapter or the folder cannot be written.
-pub fn write_dataset() -> Result<Dataset> {
+pub fn write_dataset_of(seed: u64) -> Result<Dataset> {
     let gpu = GpuContext::new(&AdapterChoice::Best)?;
-    let mut config = SimConfig { width: SIDE, height: SIDE, texture_px: 256, ..SimConfig::default() };
+    let mut config = SimConfig { seed, width: SIDE, height: SIDE, texture_px: 256, ..SimConfig::default() };
     // A fast turn, so that few frames show all sides.
     config.motion.turn_secs = 2.0;
     let mut simulator = Simulator::new(&gpu, &config)?;
