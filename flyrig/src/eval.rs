@@ -16,7 +16,7 @@ use serde::Serialize;
 
 use crate::{
     cli::EvalArgs,
-    config::Origin,
+    config::{AppearanceMode, Origin, Solver},
     dataset,
     engine::{Engine, RenderedView},
     pipeline::{Counts, Outcome, Pipeline, PoseSource},
@@ -43,7 +43,8 @@ struct Metrics<'a> {
     holdout: &'a [String],
     pose: Origin,
     masks: Origin,
-    appearance: crate::config::AppearanceMode,
+    solver: Solver,
+    appearance: AppearanceMode,
     gaussians: usize,
     nodes: usize,
     adapter: String,
@@ -75,6 +76,10 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
 
     let plates = dataset::plates(&args.dataset, &rig)?;
     dataset::require_masks(args.pose, args.masks, &plates)?;
+    let solver = args.solver.unwrap_or(match args.pose {
+        Origin::Given => Solver::GaussNewton,
+        Origin::Estimated => Solver::None,
+    });
     let mut buffered = Vec::new();
     let (template, pose) = match args.pose {
         Origin::Given => given_pose(&args.dataset)?,
@@ -102,7 +107,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         args.nodes,
         rig.cameras.len(),
         args.appearance.settings(),
-        args.solver.settings(),
+        solver.settings(),
     )?;
     let mut pipeline = Pipeline::new(engine, rig, pose, args.masks, plates);
 
@@ -163,6 +168,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         holdout: &args.holdout,
         pose: args.pose,
         masks: args.masks,
+        solver,
         appearance: args.appearance,
         gaussians: args.gaussians,
         nodes: args.nodes,
@@ -183,7 +189,10 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         facts: vec![
             ("adapter".to_owned(), metrics.adapter.clone()),
             ("inputs, held out".to_owned(), format!("{} → {}", args.inputs.join(" "), args.holdout.join(" "))),
-            ("pose, masks, appearance".to_owned(), format!("{:?}, {:?}, {:?}", args.pose, args.masks, args.appearance)),
+            (
+                "pose, masks, deformation, appearance".to_owned(),
+                format!("{:?}, {:?}, {solver:?}, {:?}", args.pose, args.masks, args.appearance),
+            ),
             ("Gaussians, nodes".to_owned(), format!("{}, {}", args.gaussians, args.nodes)),
             ("frames".to_owned(), format!("{processed} in {seconds:.1} s, writing and scoring included")),
             ("scored against".to_owned(), metrics.reference.to_owned()),
