@@ -1,7 +1,7 @@
 // Averages the samples of each pixel in linear light and puts them before the plate, which the person
 // shades. Prepended: view.wgsl and `SUPERSAMPLES`.
 
-@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(0) var<storage, read> view: View;
 @group(0) @binding(1) var samples: texture_2d<f32>;
 @group(0) @binding(2) var plate: texture_2d<f32>;
 // World x, y of the floor at each pixel; huge where something else is seen.

@@ -1,6 +1,6 @@
 // Draws the clothed person. Prepended: view.wgsl.
 
-@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(0) var<storage, read> view: View;
 @group(0) @binding(1) var textures: texture_2d_array<f32>;
 @group(0) @binding(2) var smooth_sampler: sampler;
 @group(0) @binding(3) var shadow_map: texture_depth_2d;
