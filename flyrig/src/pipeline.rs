@@ -18,15 +18,6 @@ pub enum PoseSource {
     Estimator(Box<PoseEstimator>),
 }
 
-impl PoseSource {
-    /// The pose of a track at a time.
-    fn at(track: &PoseTrack, repeat: bool, nanos: i64) -> Pose {
-        let (first, last) = track.span_nanos();
-        let nanos = if repeat && last > first { first + (nanos - first).rem_euclid(last - first) } else { nanos };
-        track.at(nanos)
-    }
-}
-
 /// What became of a frame set.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Outcome {
@@ -80,7 +71,8 @@ impl Pipeline {
     /// Takes in one frame set. Errors are those that a later frame cannot mend.
     pub fn process(&mut self, set: &FrameSet) -> Result<Outcome> {
         let (pose, masks) = match &mut self.pose {
-            PoseSource::Track { track, repeat } => (PoseSource::at(track, *repeat, set.master_nanos), None),
+            PoseSource::Track { track, repeat: true } => (track.at_repeated(set.master_nanos), None),
+            PoseSource::Track { track, repeat: false } => (track.at(set.master_nanos), None),
             PoseSource::Estimator(estimator) => {
                 match self.stages.time("pose from pictures", || estimator.estimate(set)) {
                     Ok(estimate) => (estimate.pose, Some(estimate.masks)),

@@ -88,8 +88,7 @@ impl Simulator {
     /// Pose at a time; the motion starts over after its end.
     #[must_use]
     pub fn pose(&self, nanos: i64) -> Pose {
-        let (start, end) = self.track.span_nanos();
-        self.track.at(if end > start { start + (nanos - start).rem_euclid(end - start) } else { start })
+        self.track.at_repeated(nanos)
     }
 
     /// The room without the person, as camera `slot` sees it.

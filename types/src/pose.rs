@@ -104,6 +104,16 @@ impl PoseTrack {
         before.interpolate(after, (nanos - t0) as f64 / (t1 - t0) as f64)
     }
 
+    /// Pose at a time of a motion that starts over after its end, and ran before its start too.
+    #[must_use]
+    pub fn at_repeated(&self, nanos: i64) -> Pose {
+        let (first, last) = self.span_nanos();
+        // In i128 no distance between two times overflows.
+        let span = i128::from(last) - i128::from(first);
+        let into = if span > 0 { (i128::from(nanos) - i128::from(first)).rem_euclid(span) } else { 0 };
+        self.at(i64::try_from(i128::from(first) + into).unwrap_or(first))
+    }
+
     /// Time of the first and the last key.
     #[must_use]
     pub fn span_nanos(&self) -> (i64, i64) {
@@ -132,6 +142,21 @@ mod tests {
         assert!(track.at(25).joint_rotations[0].angle_between(DQuat::from_rotation_z(0.25)) < 1e-6);
         assert_eq!(track.at(-5), pose(0.0, 0.0));
         assert_eq!(track.at(500), pose(1.0, 1.0));
+    }
+
+    #[test]
+    fn a_repeated_track_runs_before_its_start_and_after_its_end() {
+        let track = PoseTrack::new(vec![(100, pose(0.0, 0.0)), (200, pose(1.0, 1.0))]).unwrap();
+        let x = |nanos| track.at_repeated(nanos).root_translation.x;
+        for (nanos, expected) in [(100, 0.0), (125, 0.25), (200, 0.0), (325, 0.25), (75, 0.75), (-25, 0.75)] {
+            assert!((x(nanos) - expected).abs() < 1e-12, "{nanos}: {}", x(nanos));
+        }
+        // i64::MAX - 100 is 7 above a multiple of 100, i64::MIN - 100 is 92 above one.
+        assert!((x(i64::MAX) - 0.07).abs() < 1e-12 && (x(i64::MIN) - 0.92).abs() < 1e-12);
+        let single = PoseTrack::new(vec![(100, pose(3.0, 0.0))]).unwrap();
+        assert_eq!(single.at_repeated(i64::MIN), pose(3.0, 0.0));
+        let widest = PoseTrack::new(vec![(i64::MIN, pose(0.0, 0.0)), (i64::MAX, pose(1.0, 0.0))]).unwrap();
+        assert!((widest.at_repeated(0).root_translation.x - 0.5).abs() < 1e-6);
     }
 
     #[test]
