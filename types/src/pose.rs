@@ -101,14 +101,15 @@ impl PoseTrack {
         let next = self.keys.partition_point(|(t, _)| *t <= nanos);
         let Some((t0, before)) = next.checked_sub(1).map(|i| &self.keys[i]) else { return self.keys[0].1.clone() };
         let Some((t1, after)) = self.keys.get(next) else { return before.clone() };
-        before.interpolate(after, (nanos - t0) as f64 / (t1 - t0) as f64)
+        // In i128 no distance between two times overflows.
+        let since = |t: i64| (i128::from(t) - i128::from(*t0)) as f64;
+        before.interpolate(after, since(nanos) / since(*t1))
     }
 
     /// Pose at a time of a motion that starts over after its end, and ran before its start too.
     #[must_use]
     pub fn at_repeated(&self, nanos: i64) -> Pose {
         let (first, last) = self.span_nanos();
-        // In i128 no distance between two times overflows.
         let span = i128::from(last) - i128::from(first);
         let into = if span > 0 { (i128::from(nanos) - i128::from(first)).rem_euclid(span) } else { 0 };
         self.at(i64::try_from(i128::from(first) + into).unwrap_or(first))
