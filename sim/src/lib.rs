@@ -11,6 +11,7 @@
 //! - **Clock**: nanoseconds from the start of the simulation; frame `i` is taken at exactly
 //!   `i * 1e9 / fps`, rounded down ([`Simulator::frame_nanos`]), by all cameras at once.
 
+mod actor;
 mod collars;
 mod config;
 mod cuts;

@@ -2,25 +2,24 @@
 
 use std::fmt;
 
-use flyrig_body::{Part, Template, skin_mesh};
+use flyrig_body::{Part, Template};
 use flyrig_gpu::GpuContext;
 use flyrig_types::{Camera, Image, Mask, PixelFormat, Pose, PoseTrack, Rig};
 use glam::Vec3;
 
+use crate::actor::{Actor, Shape};
 use crate::draw::{Drawing, Posed};
-use crate::look::Look;
 use crate::noise::smoothstep;
 use crate::person::Person;
 use crate::room::{LensGrid, Room};
 use crate::sensor::hash;
-use crate::{SensorConfig, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring, motion};
+use crate::{SensorConfig, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring};
 
 /// A person, a motion, a room and cameras.
 pub struct Simulator {
     config: SimConfig,
     rig: Rig,
-    person: Person,
-    track: PoseTrack,
+    actor: Actor,
     plates: Vec<Image>,
     drawing: Drawing,
     drawn_nanos: Option<i64>,
@@ -39,16 +38,14 @@ impl Simulator {
     /// [`SimError`] names the setting, the missing file or the adapter's limit.
     pub fn new(gpu: &GpuContext, config: &SimConfig) -> Result<Self, SimError> {
         let rig = camera_ring(config)?;
-        let look = Look::new(config);
-        let person = Person::new(&look, config.seed, config.texture_px as usize)?;
-        let track = motion::track(config, &person)?;
+        let actor = Actor::new(config)?;
         let room = Room::new(config.seed, config.cameras.radius_m);
         let mut plates = Vec::with_capacity(rig.cameras.len());
         if let Some(grid) = rig.cameras.first().and_then(|camera| LensGrid::new(&camera.intrinsics)) {
             plates.extend(rig.cameras.iter().map(|camera| room.plate(camera, &grid)));
         }
         let (width, height) = (config.width, config.height);
-        let drawing = Drawing::new(gpu, &person, [width, height], &plates)?;
+        let drawing = Drawing::new(gpu, &actor.person, [width, height], &plates)?;
         let plates = plates
             .into_iter()
             .enumerate()
@@ -58,7 +55,7 @@ impl Simulator {
                 develop(config, drawn, i64::MIN, slot, 1.0)
             })
             .collect::<Result<_, SimError>>()?;
-        Ok(Self { config: config.clone(), rig, person, track, plates, drawing, drawn_nanos: None })
+        Ok(Self { config: config.clone(), rig, actor, plates, drawing, drawn_nanos: None })
     }
 
     /// The configuration.
@@ -76,19 +73,19 @@ impl Simulator {
     /// The body without clothes: what a tracker is given.
     #[must_use]
     pub fn template(&self) -> &Template {
-        &self.person.body
+        &self.actor.person.body
     }
 
     /// One round of the motion; see [`Self::pose`] for later times.
     #[must_use]
     pub fn track(&self) -> &PoseTrack {
-        &self.track
+        &self.actor.track
     }
 
     /// Pose at a time; the motion starts over after its end.
     #[must_use]
     pub fn pose(&self, nanos: i64) -> Pose {
-        self.track.at_repeated(nanos)
+        self.actor.pose(nanos)
     }
 
     /// The room without the person, as camera `slot` sees it.
@@ -137,7 +134,8 @@ impl Simulator {
     pub fn capture_exposed(&mut self, nanos: i64, slot: usize, exposure: f64) -> Result<(Image, Mask), SimError> {
         self.camera(slot)?;
         if self.drawn_nanos != Some(nanos) {
-            self.drawing.set_person(&self.posed(nanos));
+            let posed = self.posed(nanos);
+            self.drawing.set_person(&posed);
             self.drawn_nanos = Some(nanos);
         }
         let rgba = self.drawing.picture(self.camera(slot)?, slot)?;
@@ -149,15 +147,15 @@ impl Simulator {
     }
 
     /// What the cameras see of the person at a time, as a mesh.
-    #[must_use]
-    pub fn clothed_surface(&self, nanos: i64) -> SurfaceMesh {
-        let (positions, normals) = skin_mesh(&self.person.clothed, &self.pose(nanos));
+    pub fn clothed_surface(&mut self, nanos: i64) -> SurfaceMesh {
+        let Shape { positions, normals } = self.actor.shape(nanos);
+        let Person { clothed, carriers, .. } = &self.actor.person;
         SurfaceMesh {
             positions,
             normals,
-            triangles: self.person.clothed.triangles.clone(),
-            canonical: self.person.carriers.clone(),
-            parts: self.person.clothed.parts.clone(),
+            triangles: clothed.triangles.clone(),
+            canonical: carriers.clone(),
+            parts: clothed.parts.clone(),
         }
     }
 
@@ -165,11 +163,11 @@ impl Simulator {
         self.rig.cameras.get(slot).ok_or(SimError::NoSlot { slot, count: self.rig.cameras.len() })
     }
 
-    fn posed(&self, nanos: i64) -> Posed {
-        let (positions, normals) = skin_mesh(&self.person.clothed, &self.pose(nanos));
+    fn posed(&mut self, nanos: i64) -> Posed {
+        let Shape { positions, normals } = self.actor.shape(nanos);
         let low = positions.iter().copied().fold(Vec3::INFINITY, Vec3::min);
         let high = positions.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
-        let shoes = self.person.shoe_vertices.clone();
+        let shoes = self.actor.person.shoe_vertices.clone();
         let middle = shoes.start + shoes.len() / 2;
         let feet = [shoes.start..middle, middle..shoes.end].map(|range| {
             let foot = &positions[range];

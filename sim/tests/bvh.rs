@@ -16,7 +16,7 @@ fn debians_clip_moves_the_person_over_the_floor_or_its_package_is_named() {
     let mut config = small_config(1);
     config.motion.kind = MotionKind::Bvh;
     config.motion.start_secs = 1.0;
-    let simulator = simulator(&config);
+    let mut simulator = simulator(&config);
     let mut lowest = f32::INFINITY;
     let (start, end) = simulator.track().span_nanos();
     assert!(start == 0 && end > 5_000_000_000, "{start} to {end} ns");

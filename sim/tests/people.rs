@@ -85,7 +85,7 @@ fn a_thousand_people_wear_everything_there_is() {
 fn every_garment_stands_on_the_floor_around_the_body_without_stray_points() {
     // Among these are dresses, coats, overalls, hats and children.
     for seed in [5, 7, 13, 16, 22, 31] {
-        let simulator = simulator(&small_config(seed));
+        let mut simulator = simulator(&small_config(seed));
         let mesh = simulator.clothed_surface(0);
         let body = simulator.template();
         let count = mesh.positions.len();

@@ -1,0 +1,41 @@
+//! A person who moves.
+
+use flyrig_body::skin_mesh;
+use flyrig_types::{Pose, PoseTrack};
+use glam::Vec3;
+
+use crate::look::Look;
+use crate::person::Person;
+use crate::{SimConfig, SimError, motion};
+
+/// A dressed person with a motion.
+pub(crate) struct Actor {
+    pub person: Person,
+    pub track: PoseTrack,
+}
+
+/// The surface that the cameras see, world metres, in the order of [`Person::clothed`].
+#[derive(Debug, Clone)]
+pub(crate) struct Shape {
+    pub positions: Vec<Vec3>,
+    pub normals: Vec<Vec3>,
+}
+
+impl Actor {
+    pub(crate) fn new(config: &SimConfig) -> Result<Self, SimError> {
+        let person = Person::new(&Look::new(config), config.seed, config.texture_px as usize)?;
+        let track = motion::track(config, &person)?;
+        Ok(Self { person, track })
+    }
+
+    /// Pose at a time; the motion starts over after its end.
+    pub(crate) fn pose(&self, nanos: i64) -> Pose {
+        self.track.at_repeated(nanos)
+    }
+
+    /// The surface at a time.
+    pub(crate) fn shape(&mut self, nanos: i64) -> Shape {
+        let (positions, normals) = skin_mesh(&self.person.clothed, &self.pose(nanos));
+        Shape { positions, normals }
+    }
+}
