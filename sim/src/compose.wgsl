@@ -105,14 +105,14 @@ fn room_light(same: Same, at: vec2<u32>, row: Row, turn: f32) -> vec3<f32> {
         around *= floor_openness(world.xyz, same.counts.x);
     }
     var sum = plate_light(0u, at) * around + lamp_light(same, 0u, same.lamps[0], row.levels.x, at, world, turn);
-    if (same.counts.z > 1u) {
+    if (LAMPS > 1u) {
         sum += lamp_light(same, 1u, same.lamps[1], row.levels.y, at, world, turn);
     }
-    if (same.counts.z > 2u) {
+    if (LAMPS > 2u) {
         sum += lamp_light(same, 2u, same.lamps[2], row.levels.z, at, world, turn);
     }
     if (same.counts.y > 0u) {
-        sum += plate_light(same.counts.z + 1u, at);
+        sum += plate_light(LAMPS + 1u, at);
     }
     return sum;
 }

@@ -139,6 +139,7 @@ pub(crate) fn shelf(mesh: &mut SceneMesh, plan: &Plan, index: u64, half_m: f32, 
         if level == levels {
             continue;
         }
+        mesh.shading = false;
         let seed = index + 20 + 100 * u64::from(level);
         let mut x = -half_m + 0.02;
         let mut book = 0;
@@ -173,6 +174,7 @@ pub(crate) fn shelf(mesh: &mut SceneMesh, plan: &Plan, index: u64, half_m: f32, 
             }
             book += 7;
         }
+        mesh.shading = true;
     }
 }
 
@@ -187,6 +189,7 @@ pub(crate) fn carton(mesh: &mut SceneMesh, half: Vec3, base_m: f32, tint: f32) {
 
 /// A plant in a pot.
 pub(crate) fn plant(mesh: &mut SceneMesh, plan: &Plan, index: u64, height_m: f32) {
+    mesh.shading = false;
     let pot = Coat::new(Surface::Plain, colour(plan, index)).glossy(0.15);
     mesh.rod(Vec3::ZERO, Vec3::Z * 0.30, [0.13, 0.17], pot);
     mesh.rod(Vec3::Z * 0.285, Vec3::Z * 0.305, [0.155, 0.155], Coat::new(Surface::Carpet, Vec3::new(0.06, 0.04, 0.03)));
@@ -207,6 +210,7 @@ pub(crate) fn plant(mesh: &mut SceneMesh, plan: &Plan, index: u64, height_m: f32
             mesh.leaf(foot.lerp(tip, t), out, length, length * 0.36, 0.5, leaf);
         }
     }
+    mesh.shading = true;
 }
 
 /// A sofa for two.
@@ -316,7 +320,7 @@ pub(crate) fn rug(mesh: &mut SceneMesh, half: [f32; 2]) {
 pub(crate) fn window(mesh: &mut SceneMesh, middle: Vec3, half: [f32; 2], glow: f32, layer: usize) {
     let [x, z] = half;
     let white = Coat::new(Surface::Plain, Vec3::splat(0.75)).glossy(0.1);
-    let pane = Coat::new(Surface::Plain, Vec3::new(0.86, 0.93, 1.0)).glowing(glow, layer);
+    let pane = Coat::new(Surface::Outside, Vec3::ONE).glowing(glow, layer);
     mesh.quad(middle + Vec3::new(-x, 0.0, -z), Vec3::X * 2.0 * x, Vec3::Z * 2.0 * z, pane);
     for side in [-1.0, 1.0] {
         mesh.block(middle + Vec3::new(side * x, 0.0, 0.0), Vec3::new(0.035, 0.03, z + 0.035), white);

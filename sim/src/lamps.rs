@@ -5,7 +5,7 @@ use glam::{Mat4, Vec3};
 use crate::scene_config::LightConfig;
 
 /// Half the angle of a lamp's cone, and where its light begins to fall, degrees.
-const CONE_DEG: [f32; 2] = [66.0, 45.0];
+const CONE_DEG: [f32; 2] = [74.0, 30.0];
 /// Nothing closer to a lamp than this casts a shadow, metres.
 pub(crate) const LAMP_NEAR_M: f32 = 0.3;
 /// What lamps light, unless told otherwise.

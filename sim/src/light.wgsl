@@ -1,4 +1,4 @@
-// The lamps, their shadows, and what people take of the room's light. Prepended: `MAX_LAMPS`, `MAX_CAPSULES`,
+// The lamps, their shadows, and what people take of the room's light. Prepended: `LAMPS`, `MAX_LAMPS`, `MAX_CAPSULES`,
 // `LAMP_NEAR_M`.
 
 struct Lamp {
@@ -34,7 +34,7 @@ struct Light {
     sky: vec4<f32>,
     ground: vec4<f32>,
     people: array<Bound, 2>,
-    // Number of capsules, 1 where something glows by itself, number of lamps, taps of a shadow.
+    // Number of capsules, 1 where something glows by itself, nothing, taps of a shadow.
     counts: vec4<u32>,
     capsules: array<Capsule, MAX_CAPSULES>,
 }

@@ -20,7 +20,7 @@ pub(crate) fn passer_by(config: &SimConfig) -> Result<Actor, SimError> {
     };
     let mut actor = Actor::new(&own)?;
     // Outside of what the person reaches, inside the ring.
-    let line_m = 0.5 * (1.1 + config.cameras.radius_m.max(1.5));
+    let line_m = (0.48 * config.cameras.radius_m).max(1.35);
     actor.track = walk(&actor.track, seed, line_m, 0.75 * config.cameras.radius_m)?;
     Ok(actor)
 }

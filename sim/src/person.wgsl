@@ -99,8 +99,14 @@ fn vs_lit(vertex: Vertex) -> Lit {
     let to_eye = normalize(view.eye.xyz - world);
     let direct = row.levels.xyz * mix(1.0, openness, 0.4);
     let a = beam(lamps[0], world, normal, to_eye, share.x * direct.x);
-    let b = beam(lamps[1], world, normal, to_eye, share.y * direct.y);
-    let c = beam(lamps[2], world, normal, to_eye, share.z * direct.z);
+    var b = Beam(vec4(0.0), vec3(1.0));
+    var c = b;
+    if (LAMPS > 1u) {
+        b = beam(lamps[1], world, normal, to_eye, share.y * direct.y);
+    }
+    if (LAMPS > 2u) {
+        c = beam(lamps[2], world, normal, to_eye, share.z * direct.z);
+    }
     let grazing = pow(1.0 - max(dot(normal, to_eye), 0.0), 4.0);
     let around = row.around.rgb * openness;
     var out: Lit;
@@ -134,10 +140,15 @@ fn fs_lit(in: Lit, @builtin(front_facing) front: bool) -> @location(0) vec4<f32>
     // The inner side of a hem has the light from everywhere alone.
     if (front) {
         let a = in.light_a.rgb * reaching(0u, in.place_a);
-        let b = in.light_b.rgb * reaching(1u, in.place_b);
-        let c = in.light_c.rgb * reaching(2u, in.place_c);
-        sum += painted.rgb * (a + b + c);
-        sum += gloss * (a * in.light_a.a + b * in.light_b.a + c * in.light_c.a);
+        sum += painted.rgb * a + gloss * a * in.light_a.a;
+        if (LAMPS > 1u) {
+            let b = in.light_b.rgb * reaching(1u, in.place_b);
+            sum += painted.rgb * b + gloss * b * in.light_b.a;
+        }
+        if (LAMPS > 2u) {
+            let c = in.light_c.rgb * reaching(2u, in.place_c);
+            sum += painted.rgb * c + gloss * c * in.light_c.a;
+        }
     }
     return vec4(sum, in.paint.w);
 }

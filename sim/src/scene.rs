@@ -77,7 +77,13 @@ impl Scene {
         };
         mesh.find_openness(half_m, HEIGHT_M);
         let side = config.texture_px.clamp(64, if config.height > 700 { 1024 } else { 512 }) as usize;
-        let textures = Surface::ALL.iter().map(|surface| surface.texture(side.next_power_of_two(), seed)).collect();
+        let side = side.next_power_of_two();
+        let used = |surface: Surface| mesh.vertices.iter().any(|vertex| vertex.paint[2] == surface as u32 as f32);
+        let unused = || Texture { side, pixels: vec![[128; 4]; side * side] };
+        let textures = Surface::ALL
+            .iter()
+            .map(|&surface| if used(surface) { surface.texture(side, seed) } else { unused() })
+            .collect();
         Self { mesh, textures, lamps: light.lamps, steady: light.steady, sky: light.sky, ground: light.ground }
     }
 

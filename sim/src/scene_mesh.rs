@@ -4,7 +4,6 @@ use bytemuck::{Pod, Zeroable};
 use glam::{Affine3A, Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::sensor::uniform;
 use crate::surfaces::Surface;
 
 /// A vertex as the room's shader reads it.
@@ -65,6 +64,8 @@ pub(crate) struct SceneMesh {
     pub first_caster: usize,
     solids: Vec<Solid>,
     cell_m: f32,
+    /// Whether things put now keep light from others; too many small ones cost time and change nothing.
+    pub shading: bool,
     /// Where things are put now.
     pub at: Affine3A,
 }
@@ -73,7 +74,7 @@ impl SceneMesh {
     /// `cell_m`: longest side of a cell.
     pub(crate) fn new(cell_m: f32) -> Self {
         let at = Affine3A::IDENTITY;
-        Self { vertices: Vec::new(), triangles: Vec::new(), first_caster: 0, solids: Vec::new(), cell_m, at }
+        Self { vertices: Vec::new(), triangles: Vec::new(), first_caster: 0, solids: Vec::new(), cell_m, shading: true, at }
     }
 
     /// Puts what follows at a place on the floor, turned about the vertical.
@@ -209,6 +210,9 @@ impl SceneMesh {
     }
 
     fn solid(&mut self, middle: Vec3, half: Vec3) {
+        if !self.shading {
+            return;
+        }
         let world_from_unit =
             self.at * Affine3A::from_translation(middle) * Affine3A::from_scale(half.max(Vec3::splat(1e-3)));
         self.solids.push(Solid {
@@ -218,7 +222,7 @@ impl SceneMesh {
         });
     }
 
-    /// Lets every vertex know how much of its surroundings are free of things, within a metre, in a room of this half
+    /// Lets every vertex know how much of its surroundings are free of things, within 0.7 m, in a room of this half
     /// side and height.
     pub(crate) fn find_openness(&mut self, half_m: f32, height_m: f32) {
         let solids = &self.solids;
@@ -242,10 +246,10 @@ impl SceneMesh {
     }
 }
 
-/// Share of a surface's cosine-weighted surroundings that boxes leave free; what is a metre away counts no longer.
+/// Share of a surface's cosine-weighted surroundings that boxes leave free; what is 0.7 m away counts no longer.
 fn openness(solids: &[Solid], p: Vec3, n: Vec3) -> f32 {
-    const RAYS: u64 = 24;
-    const REACH_M: f32 = 1.0;
+    const RAYS: u64 = 16;
+    const REACH_M: f32 = 0.7;
     let start = p + n * 0.012;
     let near: Vec<&Solid> = solids.iter().filter(|s| s.center.distance(p) < s.reach_m + REACH_M).collect();
     if near.is_empty() {
@@ -254,7 +258,7 @@ fn openness(solids: &[Solid], p: Vec3, n: Vec3) -> f32 {
     let (side, other) = n.any_orthonormal_pair();
     let hidden: f32 = (0..RAYS)
         .map(|ray| {
-            let (r2, angle) = ((ray as f32 + 0.5) / RAYS as f32, uniform(11, ray) as f32 * std::f32::consts::TAU);
+            let (r2, angle) = ((ray as f32 + 0.5) / RAYS as f32, ray as f32 * 2.399_963);
             let direction = (side * angle.cos() + other * angle.sin()) * r2.sqrt() + n * (1.0 - r2).sqrt();
             let first = near.iter().filter_map(|s| hit(s, start, direction)).fold(REACH_M, f32::min);
             1.0 - first / REACH_M

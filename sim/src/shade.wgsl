@@ -16,7 +16,6 @@ fn passing(lamp: Lamp, l: u32, world: vec4<f32>, taps: u32) -> f32 {
 @compute @workgroup_size(64)
 fn shade(@builtin(global_invocation_id) id: vec3<u32>) {
     let lamps = light.lamps;
-    let count = light.counts.z;
     let taps = light.counts.w;
     if (id.x >= arrayLength(&shares)) {
         return;
@@ -25,10 +24,10 @@ fn shade(@builtin(global_invocation_id) id: vec3<u32>) {
     let world = vec4(point.place.xyz + point.normal.xyz * 0.01, 1.0);
     var share = vec4(1.0);
     share.x = passing(lamps[0], 0u, world, taps);
-    if (count > 1u) {
+    if (LAMPS > 1u) {
         share.y = passing(lamps[1], 1u, world, taps);
     }
-    if (count > 2u) {
+    if (LAMPS > 2u) {
         share.z = passing(lamps[2], 2u, world, taps);
     }
     shares[id.x] = share;

@@ -30,10 +30,12 @@ pub(crate) enum Surface {
     PosterD,
     ScreenA,
     ScreenB,
+    /// What is seen through a window.
+    Outside,
 }
 
 impl Surface {
-    pub(crate) const ALL: [Self; 16] = [
+    pub(crate) const ALL: [Self; 17] = [
         Self::Plain,
         Self::Planks,
         Self::Plaster,
@@ -50,6 +52,7 @@ impl Surface {
         Self::PosterD,
         Self::ScreenA,
         Self::ScreenB,
+        Self::Outside,
     ];
 
     /// How often the texture comes in a metre; none for pictures that fill what they are on.
@@ -92,6 +95,7 @@ impl Surface {
             Self::PosterD => waves(noise, uv),
             Self::ScreenA => editor(noise, uv),
             Self::ScreenB => charts(noise, uv),
+            Self::Outside => outside(noise, uv),
         })
     }
 }
@@ -213,6 +217,24 @@ fn landscape(noise: Noise, uv: Vec2) -> Srgb {
         colour = mix3(colour, paint, below);
     }
     framed(colour, uv, 0.05)
+}
+
+fn outside(noise: Noise, uv: Vec2) -> Srgb {
+    let cloud = smoothstep(0.0, 0.6, noise.sum(Vec3::new(uv.x * 3.0, uv.y * 6.0, 2.0), 4));
+    let mut colour = mix3(mix3([0.62, 0.76, 0.92], [0.86, 0.91, 0.95], uv.y), [0.97, 0.97, 0.96], cloud);
+    // Roofs, then the tops of trees before them.
+    let house = (uv.x * 5.0).floor();
+    let roof = 0.60 + 0.06 * noise.cell(house as i32, 1, 1) + 0.10 * ((uv.x * 5.0).fract() - 0.5).abs();
+    if uv.y > roof {
+        let brick = mix3([0.66, 0.56, 0.50], [0.56, 0.50, 0.48], 0.5 + 0.5 * noise.cell(house as i32, 2, 1));
+        let pane = ((uv.x * 30.0).fract() - 0.5).abs() < 0.2 && ((uv.y * 16.0).fract() - 0.5).abs() < 0.25;
+        colour = if uv.y < roof + 0.05 { [0.50, 0.36, 0.32] } else if pane { [0.42, 0.47, 0.52] } else { brick };
+    }
+    let tree = 0.80 + 0.12 * noise.sum(Vec3::new(uv.x * 5.0, 7.0, 3.0), 4);
+    if uv.y > tree {
+        colour = mix3([0.33, 0.44, 0.27], [0.22, 0.32, 0.18], 0.5 + 0.5 * noise.sum(Vec3::new(uv.x * 30.0, uv.y * 30.0, 1.0), 3));
+    }
+    colour
 }
 
 fn framed(colour: Srgb, uv: Vec2, margin: f32) -> Srgb {
