@@ -11,7 +11,7 @@ use anyhow::{Context, Result, bail, ensure};
 use flyrig_calib::SyncConfig;
 use flyrig_capture::{CameraSource, Pacing};
 use flyrig_gpu::GpuContext;
-use flyrig_sim::{MotionConfig, MotionKind, SimConfig, SimFrame, Simulator};
+use flyrig_sim::{MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
 use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::{Camera, FrameSet};
 use indicatif::ProgressBar;
@@ -180,7 +180,7 @@ fn pass(
     };
     let inputs = dataset::pick(&rig, &INPUTS.map(str::to_owned), "the simulated rig")?;
     let held_out = dataset::pick(&rig, &HELD_OUT.map(str::to_owned), "the simulated rig")?.cameras;
-    let sources: Vec<Box<dyn CameraSource>> = flyrig_sim::sources(simulator)
+    let sources: Vec<Box<dyn CameraSource>> = flyrig_sim::sources(simulator, SimTime::Exact)
         .into_iter()
         .filter(|source| inputs.slot(source.camera()).is_some())
         .map(|source| Box::new(source) as Box<dyn CameraSource>)

@@ -7,7 +7,7 @@ use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
 use flyrig_calib::SyncConfig;
 use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, VideoOptions, VideoReplay};
 use flyrig_gpu::GpuContext;
-use flyrig_sim::Simulator;
+use flyrig_sim::{SimTime, Simulator};
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
 use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::{CameraId, FrameSet, Image, Rig};
@@ -45,7 +45,12 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
     let stop = stop::flag();
     let scene = open(config, gpu)?;
     dataset::require_masks(config.body.pose, config.body.masks, &scene.plates)?;
-    let pacing = if config.source.real_time { Pacing::RealTime } else { Pacing::Lossless };
+    let pacing = match (config.source.real_time, config.source.kind) {
+        (false, _) => Pacing::Lossless,
+        // Simulated cameras keep the time themselves, whatever their stamps say.
+        (true, SourceKind::Sim) => Pacing::AsDelivered,
+        (true, _) => Pacing::RealTime,
+    };
     let mut intake = Intake::start(scene.sources, &sync_config(config), pacing)?;
 
     let mut template = scene.template;
@@ -199,7 +204,8 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
         let slots = picked.cameras.iter().filter_map(|camera| rig.slot(&camera.id));
         let plates = slots.map(|slot| copy(slot).map(Some)).collect::<Result<_>>()?;
         let simulator = std::sync::Arc::new(std::sync::Mutex::new(simulator));
-        let sources = flyrig_sim::sources(&simulator)
+        let time = if source.real_time { SimTime::Real } else { SimTime::Exact };
+        let sources = flyrig_sim::sources(&simulator, time)
             .into_iter()
             .filter(|source| picked.slot(source.camera()).is_some())
             .map(|source| Box::new(source) as Box<dyn CameraSource>)

@@ -12,6 +12,7 @@
 //!   `i * 1e9 / fps`, rounded down ([`Simulator::frame_nanos`]), by all cameras at once.
 
 mod actor;
+mod clock;
 mod collars;
 mod config;
 mod cuts;
@@ -47,6 +48,7 @@ mod texture;
 mod turn;
 mod wardrobe;
 
+pub use clock::SimTime;
 pub use config::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig};
 pub use describe::{describe_person, person_fingerprint};
 pub use error::SimError;

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use common::{simulator, small_config};
 use flyrig_capture::{CameraSource, CaptureErrorKind};
-use flyrig_sim::{Delivery, FaultScript, SimSource, Simulator, sources};
+use flyrig_sim::{Delivery, FaultScript, SimSource, SimTime, Simulator, sources};
 use flyrig_types::{CameraId, Frame};
 
 const FPS: f64 = 30.0;
@@ -26,7 +26,7 @@ fn rig(script: &str) -> (Vec<SimSource>, Simulator) {
     config.height = 64;
     let plain = simulator(&config);
     config.faults = FaultScript::parse(script).unwrap();
-    (sources(&Arc::new(Mutex::new(simulator(&config)))), plain)
+    (sources(&Arc::new(Mutex::new(simulator(&config))), SimTime::Exact), plain)
 }
 
 fn next(source: &mut SimSource) -> Result<Frame, CaptureErrorKind> {
