@@ -18,7 +18,7 @@ pub use appearance::{
 };
 pub use buffers::{GaussianBuffers, RenderTarget};
 pub use color::{composite_over, linear_from_srgb, rgba8_from_target, srgb_from_linear};
-pub use export::{ExportError, Splat, read_splats, write_mesh_ply, write_splat_ply};
+pub use export::{ExportError, Splat, read_splats, write_splat_ply};
 pub use raster::{Outputs, RasterSettings, RasterStats, Rasterizer};
 pub use raster_backward::{BackwardError, BackwardRasterizer, Carry, GaussianGradients, PictureGradients};
 pub use raster_kernels::BACKFACING_COSINE;

@@ -3,12 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
+use flyrig_body::write_glb;
 use flyrig_calib::save_easymocap;
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{SimConfig, Simulator};
 use tempfile::TempDir;
-
-use crate::write_glb;
 
 /// Side of the pictures, pixels.
 pub const SIDE: u32 = 160;
