@@ -45,11 +45,37 @@ pub enum Command {
     Watch(WatchArgs),
     /// Replay a data set, render its held-out cameras and score them.
     Eval(EvalArgs),
+    /// Use the simulated rig by itself.
+    Sim {
+        #[command(subcommand)]
+        action: SimAction,
+    },
     /// Print the commented default configuration, or check one.
     Config {
         #[command(subcommand)]
         action: ConfigAction,
     },
+}
+
+#[derive(Debug, Subcommand)]
+pub enum SimAction {
+    /// Write a simulated capture as a folder that `flyrig eval` and other tools read (EasyMocap layout), with the truth.
+    Export(SimExportArgs),
+}
+
+#[derive(Debug, Args)]
+pub struct SimExportArgs {
+    /// The TOML file whose [sim] section is simulated; the default configuration without one.
+    pub config: Option<PathBuf>,
+    /// Folder to write; must not be there yet.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Frames of every camera.
+    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub frames: u64,
+    /// Leave out depth, canonical positions, poses, surfaces and true times.
+    #[arg(long)]
+    pub no_truth: bool,
 }
 
 #[derive(Debug, Subcommand)]
@@ -80,6 +106,9 @@ pub struct DemoArgs {
     /// "turn" (turns around fully), "walk" (a captured walk from Debian's assimp-testmodels) or a BVH file.
     #[arg(long, default_value = "turn")]
     pub motion: String,
+    /// TOML file of what goes wrong with cameras and clocks, like sim/assets/faults.toml.
+    #[arg(long)]
+    pub faults: Option<PathBuf>,
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000)]
     pub gaussians: usize,

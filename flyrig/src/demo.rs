@@ -11,7 +11,7 @@ use anyhow::{Context, Result, bail, ensure};
 use flyrig_calib::SyncConfig;
 use flyrig_capture::{CameraSource, Pacing};
 use flyrig_gpu::GpuContext;
-use flyrig_sim::{MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
+use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
 use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::{Camera, FrameSet};
 use indicatif::ProgressBar;
@@ -85,7 +85,7 @@ struct Metrics {
 pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     eprintln!("demo: simulated rig on {}", gpu.adapter_name());
-    let simulator = Arc::new(Mutex::new(Simulator::new(gpu, &sim_config(args))?));
+    let simulator = Arc::new(Mutex::new(Simulator::new(gpu, &sim_config(args)?)?));
 
     let publisher = Publisher::open(&TransportConfig {
         listen: vec![format!("tcp/{}", args.listen)],
@@ -150,7 +150,7 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-fn sim_config(args: &DemoArgs) -> SimConfig {
+fn sim_config(args: &DemoArgs) -> Result<SimConfig> {
     let defaults = SimConfig::default();
     let motion = match args.motion.as_str() {
         "turn" => MotionConfig::default(),
@@ -160,7 +160,15 @@ fn sim_config(args: &DemoArgs) -> SimConfig {
     // However many frames there are, they show the whole turn.
     let turn_secs =
         if args.minutes.is_some() { motion.turn_secs } else { (args.frames as f64 / defaults.fps).clamp(2.0, 60.0) };
-    SimConfig { seed: args.seed, motion: MotionConfig { turn_secs, ..motion }, ..defaults }
+    let faults = match &args.faults {
+        None => FaultScript::default(),
+        Some(path) => {
+            let text = std::fs::read_to_string(path)
+                .with_context(|| format!("cannot read the fault script {}", path.display()))?;
+            FaultScript::parse(&text).with_context(|| format!("in {}", path.display()))?
+        }
+    };
+    Ok(SimConfig { seed: args.seed, motion: MotionConfig { turn_secs, ..motion }, faults, ..defaults })
 }
 
 fn lock(simulator: &Mutex<Simulator>) -> Result<MutexGuard<'_, Simulator>> {

@@ -16,6 +16,7 @@ mod png;
 mod report;
 mod run;
 mod score;
+mod sim_export;
 mod stats;
 mod stop;
 mod viewpoints;
@@ -29,7 +30,7 @@ use flyrig_gpu::{AdapterChoice, GpuContext};
 use tracing_subscriber::EnvFilter;
 
 use crate::{
-    cli::{Cli, Command, ConfigAction},
+    cli::{Cli, Command, ConfigAction, SimAction},
     config::{Config, DEFAULT_TOML},
 };
 
@@ -70,6 +71,11 @@ fn dispatch(cli: &Cli) -> Result<()> {
         }
         Command::Watch(args) => watch::watch(args),
         Command::Eval(args) => eval::eval(args, &gpu(cli.adapter.as_deref())?),
+        Command::Sim { action: SimAction::Export(args) } => {
+            let config = args.config.as_deref().map(Config::load).transpose()?.unwrap_or_default();
+            let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
+            sim_export::sim_export(args, &config.sim, &gpu(adapter)?)
+        }
         Command::Config { action: ConfigAction::Print } => {
             print!("{DEFAULT_TOML}");
             Ok(())

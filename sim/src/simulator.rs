@@ -13,7 +13,7 @@ use crate::noise::smoothstep;
 use crate::person::Person;
 use crate::room::{LensGrid, Room};
 use crate::sensor::hash;
-use crate::{SensorConfig, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring};
+use crate::{FramePlan, SensorConfig, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring};
 
 /// A person, a motion, a room and cameras.
 pub struct Simulator {
@@ -100,6 +100,14 @@ impl Simulator {
     #[must_use]
     pub fn frame_nanos(&self, index: u64) -> i64 {
         (index as f64 * 1e9 / self.config.fps) as i64
+    }
+
+    /// What the fault script does to frame `index` of camera `slot`.
+    ///
+    /// # Errors
+    /// [`SimError::NoSlot`].
+    pub fn plan(&self, slot: usize, index: u64) -> Result<FramePlan, SimError> {
+        Ok(self.config.faults.plan(&self.camera(slot)?.id, index, |index| self.frame_nanos(index)))
     }
 
     /// Picture and truth of one camera at a time.

@@ -6,7 +6,7 @@ use std::{
 };
 
 use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind};
-use flyrig_types::{CameraId, Frame, Image};
+use flyrig_types::{CameraId, Frame, Image, Mask};
 
 use crate::clock::RealClock;
 use crate::{Delivery, FramePlan, SimError, SimTime, Simulator};
@@ -108,7 +108,9 @@ impl SimSource {
             self.next_index += 1;
             let shared = Arc::clone(&self.simulator);
             let mut simulator = shared.lock().unwrap_or_else(PoisonError::into_inner);
-            let plan = simulator.config().faults.plan(&self.camera, index, |index| simulator.frame_nanos(index));
+            let plan = simulator
+                .plan(self.slot, index)
+                .map_err(|error| CaptureError::new(&self.camera, CaptureErrorKind::Unsupported, error.to_string()))?;
             let fault = |kind, message: &str| Err(CaptureError::new(&self.camera, kind, message));
             match plan.delivery {
                 Delivery::Frame => {
@@ -132,13 +134,7 @@ impl SimSource {
     }
 
     fn taken(&self, simulator: &mut Simulator, index: u64, plan: FramePlan) -> Result<Frame, CaptureError> {
-        let taken = simulator.capture_exposed(plan.true_nanos, self.slot, plan.exposure).and_then(|(image, mask)| {
-            let Some(share) = plan.sound_share else { return Ok((image, mask)) };
-            let mut rgb = image.bytes().to_vec();
-            simulator.config().faults.spoil(&mut rgb, share, index);
-            Ok((Image::new(image.width(), image.height(), image.format(), rgb)?, mask))
-        });
-        let (image, mask) = taken.map_err(|error| {
+        let (image, mask) = shoot(simulator, &plan, self.slot, index).map_err(|error| {
             let kind = match error {
                 SimError::Gpu(_) => CaptureErrorKind::Disconnected,
                 _ => CaptureErrorKind::Unsupported,
@@ -154,4 +150,18 @@ impl SimSource {
             mask: Some(mask),
         })
     }
+}
+
+/// The picture that a fault script lets a camera take, and its mask.
+pub(crate) fn shoot(
+    simulator: &mut Simulator,
+    plan: &FramePlan,
+    slot: usize,
+    index: u64,
+) -> Result<(Image, Mask), SimError> {
+    let (image, mask) = simulator.capture_exposed(plan.true_nanos, slot, plan.exposure)?;
+    let Some(share) = plan.sound_share else { return Ok((image, mask)) };
+    let mut rgb = image.bytes().to_vec();
+    simulator.config().faults.spoil(&mut rgb, share, index);
+    Ok((Image::new(image.width(), image.height(), image.format(), rgb)?, mask))
 }

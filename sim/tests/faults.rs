@@ -174,6 +174,15 @@ fn an_exposure_jump_darkens_the_frames_of_its_span() {
 }
 
 #[test]
+fn the_shipped_script_has_every_fault() {
+    let script = FaultScript::parse(include_str!("../assets/faults.toml")).unwrap();
+    let kinds: std::collections::BTreeSet<String> = script.faults.iter().map(|f| format!("{:?}", f.kind)).collect();
+    let known = FaultScript::parse("[[fault]]\nkind = \"none\"\n").unwrap_err().to_string();
+    let listed = known.rsplit("expected one of").next().unwrap().matches('`').count() / 2;
+    assert_eq!(kinds.len(), listed, "{kinds:?} of {known}");
+}
+
+#[test]
 fn what_is_no_fault_is_refused_by_name() {
     let refusal = |text: &str| FaultScript::parse(text).unwrap_err().to_string();
     assert!(refusal("[[fault]]\nkind = \"drop\"\nprobabilty = 0.5\n").contains("probabilty"));
