@@ -12,8 +12,10 @@
 //!   `i * 1e9 / fps`, rounded down ([`Simulator::frame_nanos`]), by all cameras at once.
 
 mod actor;
+mod clips;
 mod collars;
 mod config;
+mod curve;
 mod cuts;
 mod describe;
 mod draw;
@@ -34,7 +36,9 @@ mod motion;
 mod noise;
 mod palette;
 mod person;
+mod posture;
 mod prints;
+mod puppet;
 mod regions;
 mod ring;
 mod room;
@@ -43,8 +47,8 @@ mod sheet;
 mod shoes;
 mod simulator;
 mod source;
+mod steps;
 mod texture;
-mod turn;
 mod wardrobe;
 
 pub use config::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig};

@@ -1,14 +1,17 @@
 //! The pose track of a simulation.
 
+use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 
 use flyrig_body::{Template, load_bvh, skin_mesh};
 use flyrig_types::PoseTrack;
 use glam::DVec2;
+use rand::{RngExt, SeedableRng, rngs::StdRng};
 
+use crate::clips::{clip, passing};
 use crate::person::Person;
-use crate::turn::turn_track;
-use crate::{MotionKind, SimConfig, SimError};
+use crate::puppet::Puppet;
+use crate::{MotionConfig, MotionKind, SimConfig, SimError};
 
 const DEBIAN_CLIP: &str = "/usr/share/assimp/models/BVH/01_01.bvh";
 
@@ -35,15 +38,53 @@ fn existing(path: &Path) -> Result<PathBuf, SimError> {
 /// The configured motion of a person, standing on the floor, around the world's origin.
 pub(crate) fn track(config: &SimConfig, person: &Person) -> Result<PoseTrack, SimError> {
     let skeleton = &person.body.skeleton;
-    match config.motion.kind {
-        MotionKind::Turn => turn_track(skeleton, config.motion.turn_secs),
+    let motion = match config.motion.kind {
+        MotionKind::BySeed => by_seed(config),
+        _ => config.motion.clone(),
+    };
+    match motion.kind {
         MotionKind::Bvh => {
-            let path = config.motion.bvh.as_deref().map_or_else(find_debian_clip, existing)?;
+            let path = motion.bvh.as_deref().map_or_else(find_debian_clip, existing)?;
             let whole = load_bvh(&path)?.retarget(skeleton)?;
-            let start_nanos = (config.motion.start_secs * 1e9) as i64;
-            grounded(&whole, &person.clothed, start_nanos, config.motion.reach_m)
+            let start_nanos = (motion.start_secs * 1e9) as i64;
+            grounded(&whole, &person.clothed, start_nanos, motion.reach_m)
+        }
+        kind => {
+            let puppet = Puppet::new(skeleton, &person.clothed)?;
+            let clip = clip(kind, &puppet, config.seed, motion.turn_secs, motion.speed);
+            if motion.speed > 0.0 && kind != MotionKind::Still {
+                clip.track(&puppet, motion.phase)
+            } else {
+                clip.held(&puppet, motion.phase)
+            }
         }
     }
+}
+
+/// The seed's choice of clip, speed and phase.
+fn by_seed(config: &SimConfig) -> MotionConfig {
+    use MotionKind::{CrossArms, Dance, Jump, Reach, Sit, Squat, Still, Turn, Walk, Wave};
+    const KINDS: [MotionKind; 13] =
+        [Turn, Turn, Walk, Walk, Walk, Dance, Dance, Wave, Squat, Reach, Sit, Jump, CrossArms];
+    let mut dice = StdRng::seed_from_u64(config.seed ^ 0x6d6f_7469_6f6e);
+    let kind = if dice.random_range(0..30) == 0 { Still } else { KINDS[dice.random_range(0..KINDS.len())] };
+    let speed = config.motion.speed * dice.random_range(0.5..1.5);
+    MotionConfig { kind, speed, phase: dice.random_range(0.0..1.0), ..config.motion.clone() }
+}
+
+/// Somebody who walks straight through the room, back on another line 0.8 m farther from the centre, and so on. The
+/// seed chooses the direction, the pace, and whether the line runs 0.7 m or up to 1.2 m beside the centre.
+/// `reach_m` is how far from the centre they turn round.
+///
+/// # Errors
+/// [`SimError::NoJoint`], [`SimError::Pose`].
+#[allow(dead_code)]
+pub(crate) fn pass_by(person: &Person, seed: u64, reach_m: f64) -> Result<PoseTrack, SimError> {
+    let mut dice = StdRng::seed_from_u64(seed ^ 0x7061_7373);
+    let puppet = Puppet::new(&person.body.skeleton, &person.clothed)?;
+    let (near_m, yaw) = (dice.random_range(0.7..1.2), dice.random_range(0.0..TAU));
+    let clip = passing(&puppet, near_m, yaw, reach_m, dice.random_range(0.85..1.5), dice.random_range(0.7..1.2));
+    clip.track(&puppet, dice.random_range(0.0..1.0))
 }
 
 /// The track from `start_nanos` on, around the origin and no farther than `reach_m` from it, its deepest sole
