@@ -33,9 +33,7 @@ pub(crate) fn closed(phase: f64, knots: &[(f64, f64)]) -> f64 {
     };
     let ((t0, v0), (width, rise)) = (knot(at), secant(at));
     let s = (phase - t0) / width;
-    let (m0, m1) = (slope(at) * width, slope(at + 1) * width);
-    let rise = rise * width;
-    v0 + s * (m0 + s * ((3.0 * rise - 2.0 * m0 - m1) + s * (m0 + m1 - 2.0 * rise)))
+    hermite(s, [v0, v0 + rise * width], [slope(at) * width, slope(at + 1) * width])
 }
 
 /// From 0 at `t <= 0` to 1 at `t >= 1`, with no speed at either end.
@@ -44,15 +42,28 @@ pub(crate) fn ease(t: f64) -> f64 {
     t * t * (3.0 - 2.0 * t)
 }
 
+/// The cubic from `values[0]` to `values[1]` over `t` in 0..=1 with these slopes at the ends.
+pub(crate) fn hermite(t: f64, values: [f64; 2], slopes: [f64; 2]) -> f64 {
+    let rise = values[1] - values[0];
+    values[0]
+        + t * (slopes[0] + t * (3.0 * rise - 2.0 * slopes[0] - slopes[1] + t * (slopes[0] + slopes[1] - 2.0 * rise)))
+}
+
 /// A hump: 0 at both ends of 0..=1, 1 in the middle, no speed at the ends.
 pub(crate) fn hump(t: f64) -> f64 {
     (PI * t.clamp(0.0, 1.0)).sin().powi(2)
 }
 
-/// The smaller of two, rounded where they are closer than `round`.
-pub(crate) fn smooth_min(a: f64, b: f64, round: f64) -> f64 {
-    let near = (1.0 - (a - b).abs() / round).max(0.0);
-    a.min(b) - 0.25 * round * near * near
+/// A smooth closed sequence nowhere below the given one: the largest of `2 * radius + 1` neighbours, averaged over as
+/// many with a cosine window.
+pub(crate) fn smooth_above(values: &[f64], radius: usize) -> Vec<f64> {
+    let count = values.len();
+    let around = |i: usize| (0..=2 * radius).map(move |k| (i + count * (radius + 1) + k - radius) % count);
+    let largest: Vec<f64> =
+        (0..count).map(|i| around(i).map(|k| values[k]).fold(f64::NEG_INFINITY, f64::max)).collect();
+    let weights: Vec<f64> = (1..=2 * radius + 1).map(|k| hump(k as f64 / (2 * radius + 2) as f64)).collect();
+    let total: f64 = weights.iter().sum();
+    (0..count).map(|i| around(i).zip(&weights).map(|(k, weight)| largest[k] * weight).sum::<f64>() / total).collect()
 }
 
 #[cfg(test)]
@@ -73,6 +84,10 @@ mod tests {
             assert!((now - 2.0 * before.1 + before.0).abs() < 2e-5, "{i}: {now}");
             before = (before.1, now);
         }
+        let spiky: Vec<f64> = (0..50).map(|i| f64::from(i % 25 == 3)).collect();
+        let smooth = smooth_above(&spiky, 4);
+        assert!(smooth.iter().zip(&spiky).all(|(s, v)| *s >= v - 1e-12 && *s <= 1.0 + 1e-12));
+        assert!(smooth[15].abs() < 1e-12 && (0..50).all(|i| (smooth[(i + 1) % 50] - smooth[i]).abs() < 0.21));
         assert!((closed(0.3, &[(0.0, 4.0)]) - 4.0).abs() < 1e-15 && closed(0.3, &[]).abs() < 1e-15);
     }
 }

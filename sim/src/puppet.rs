@@ -7,7 +7,7 @@ use flyrig_types::Pose;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use crate::SimError;
-use crate::curve::{ease, smooth_min};
+use crate::curve::ease;
 use crate::posture::{Arm, Foot, Posture};
 use crate::shoes::SOLE_M;
 
@@ -53,6 +53,8 @@ pub(crate) struct Puppet<'a> {
     leg_m: f64,
     hang_out: f64,
     chest_m: f64,
+    /// How far the sole reaches behind the ankle, metres.
+    heel_m: f64,
 }
 
 impl<'a> Puppet<'a> {
@@ -88,7 +90,6 @@ impl<'a> Puppet<'a> {
         let hang_out = hanging_angle(&origins, &arms[0], clothed);
         Ok(Self {
             skeleton,
-            legs,
             spine: [find("LowerBack")?, find("Spine")?, find("Spine1")?],
             neck: [find("Neck")?, find("Neck1")?],
             head: find("Head")?,
@@ -96,6 +97,8 @@ impl<'a> Puppet<'a> {
             leg_m,
             hang_out,
             chest_m: chest_depth(&origins, &arms[0], clothed) * AVERAGE_LEG_M / leg_m,
+            heel_m: heel_depth(origins[legs[0].ankle], clothed),
+            legs,
             arms,
             origins,
         })
@@ -134,15 +137,11 @@ impl<'a> Puppet<'a> {
         Arm { upper, fore: (wrist_at - upper * a).normalize_or(upper), hand: [0.0; 2], curl: 0.35 }
     }
 
-    /// The pose; its hips are as high as told or as both legs allow.
-    pub(crate) fn pose(&self, posture: &Posture) -> Pose {
-        let facing = DQuat::from_rotation_y(posture.yaw);
-        let bend = |angles: DVec3| {
-            DQuat::from_rotation_y(angles.z) * DQuat::from_rotation_z(-angles.y) * DQuat::from_rotation_x(angles.x)
-        };
-        let root = facing * bend(posture.pelvis);
+    /// The pose, its hips lowered by `lower_m` (see [`Self::too_high_m`]).
+    pub(crate) fn pose(&self, posture: &Posture, lower_m: f64) -> Pose {
+        let root = root_turn(posture);
         let ankles = [0, 1].map(|i| self.ankle(i, &posture.feet[i]));
-        let root_at = self.root_at(posture, root, &ankles);
+        let root_at = self.root_at(posture) - DVec3::Y * lower_m;
 
         // Rotations away from rest, in canonical axes, accumulated from the root.
         let mut delta: Vec<Option<DQuat>> = vec![None; self.origins.len()];
@@ -180,28 +179,35 @@ impl<'a> Puppet<'a> {
         let (ankle, toe) = (self.origins[leg.ankle], self.origins[leg.toe]);
         let flat = DVec3::new(0.0, ankle.y + SOLE, 0.0);
         let ball = DVec3::new(toe.x - ankle.x, toe.y + SOLE, toe.z - ankle.z);
-        let heel = DVec3::new(0.0, 0.0, -0.055 * self.scale);
+        let heel = DVec3::new(0.0, 0.0, -self.heel_m);
         let pivot = heel.lerp(ball, foot.pivot);
         let rolled = pivot + DQuat::from_rotation_x(foot.roll) * (flat - pivot);
         let at = foot.at * self.scale;
         DVec3::new(at.x, foot.lift * self.scale, at.y) + DQuat::from_rotation_y(foot.yaw) * rolled
     }
 
-    fn root_at(&self, posture: &Posture, root: DQuat, ankles: &[DVec3; 2]) -> DVec3 {
-        let hips = self.origins[0];
-        let flat = DVec2::new(posture.hips.x, posture.hips.z) * self.scale;
-        let ankle_y = self.origins[self.legs[0].ankle].y + SOLE;
-        let hip_y = self.origins[self.legs[0].hip].y - hips.y;
-        let straight = ankle_y + STRETCH * self.leg_m - hip_y;
-        let mut height = straight + posture.hips.y * self.scale;
-        for (leg, ankle) in self.legs.iter().zip(ankles) {
-            let hip = root * (self.origins[leg.hip] - hips);
-            let away = DVec2::new(ankle.x - flat.x - hip.x, ankle.z - flat.y - hip.z).length();
-            let reach = STRETCH * self.leg_m;
-            let above = (reach * reach - away * away).max(0.04 * reach * reach).sqrt();
-            height = smooth_min(height, ankle.y + above - hip.y, 0.02 * self.scale);
-        }
-        DVec3::new(flat.x, height, flat.y)
+    /// How much lower than wanted the hips must be for both feet to be reached, metres.
+    pub(crate) fn too_high_m(&self, posture: &Posture) -> f64 {
+        let root = root_turn(posture);
+        let wanted = self.root_at(posture);
+        let reach = STRETCH * self.leg_m;
+        let limit = |(i, leg): (usize, &Leg)| {
+            let hip = root * (self.origins[leg.hip] - self.origins[0]);
+            let away = self.ankle(i, &posture.feet[i]) - wanted - hip;
+            let flat = DVec2::new(away.x, away.z).length_squared();
+            // A foot too far to be reached at any height lets the hips sink no farther than this.
+            let above = (reach * reach - flat).max(0.04 * reach * reach).sqrt();
+            wanted.y + away.y + above
+        };
+        let limits = self.legs.iter().enumerate().map(limit);
+        (wanted.y - limits.fold(f64::INFINITY, f64::min)).max(0.0)
+    }
+
+    /// Hips where the posture wants them, canonical axes on the ground, metres.
+    fn root_at(&self, posture: &Posture) -> DVec3 {
+        let hip_y = self.origins[self.legs[0].hip].y - self.origins[0].y;
+        let straight = self.origins[self.legs[0].ankle].y + SOLE + STRETCH * self.leg_m - hip_y;
+        posture.hips * self.scale + DVec3::Y * straight
     }
 
     /// The ankle to its place, the knee forward.
@@ -282,6 +288,15 @@ impl<'a> Puppet<'a> {
     }
 }
 
+/// Bent forward, tilted to the left and turned to the left, in this order.
+fn bend(angles: DVec3) -> DQuat {
+    DQuat::from_rotation_y(angles.z) * DQuat::from_rotation_z(-angles.y) * DQuat::from_rotation_x(angles.x)
+}
+
+fn root_turn(posture: &Posture) -> DQuat {
+    DQuat::from_rotation_y(posture.yaw) * bend(posture.pelvis)
+}
+
 /// How far an arm must point to the side to hang free of hips and clothes, radians.
 fn hanging_angle(origins: &[DVec3], arm: &ArmJoints, clothed: &Template) -> f64 {
     use flyrig_body::Part::{LeftLeg, RightLeg, Torso};
@@ -300,6 +315,15 @@ fn hanging_angle(origins: &[DVec3], arm: &ArmJoints, clothed: &Template) -> f64 
     };
     let widest = clothed.positions.iter().zip(&clothed.parts).filter(beside).map(|(p, _)| clear(p));
     widest.fold(0.10, f64::max).min(0.55)
+}
+
+/// How far the sole under the left foot reaches behind the ankle, metres.
+fn heel_depth(ankle: DVec3, clothed: &Template) -> f64 {
+    let behind = |(p, part): (&glam::Vec3, &flyrig_body::Part)| {
+        let here = *part == flyrig_body::Part::LeftFoot && f64::from(p.y) < 0.004 - SOLE;
+        here.then_some(ankle.z - f64::from(p.z))
+    };
+    clothed.positions.iter().zip(&clothed.parts).filter_map(behind).fold(0.03, f64::max).min(0.12)
 }
 
 /// How far the clothed chest reaches in front of the shoulders, metres.

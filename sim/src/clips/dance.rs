@@ -56,7 +56,7 @@ pub(crate) fn dance<'a>(puppet: &'a Puppet<'_>, seed: u64, speed: f64) -> Clip<'
         let known = MOVES.iter().position(|&m| m == moves[bar - 1]).unwrap_or(0);
         moves[bar] = MOVES[(known + step) % MOVES.len()];
     }
-    let spin = dice.random_range(2..BARS);
+    let spin = dice.random_range(2..BARS - 1);
     let feet: [Footwork; BARS] = std::array::from_fn(|bar| match bar {
         bar if bar == spin => Footwork::Spin,
         _ if dice.random_range(0..3) == 0 => Footwork::March,

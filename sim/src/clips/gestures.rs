@@ -119,7 +119,7 @@ pub(crate) fn reach<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
 /// Crosses the arms, waits, looks around and lets go.
 pub(crate) fn cross_arms<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     const SECS: f64 = 7.0;
-    let depth = puppet.chest_m();
+    let depth = puppet.chest_m() - 0.02;
     Clip::new(SECS / speed, move |phase| {
         let cross = closed(phase, &[(0.04, 0.0), (0.10, 0.10), (0.24, 1.0), (0.74, 1.0), (0.90, 0.06), (0.96, 0.0)]);
         // The right arm goes first and lies below.

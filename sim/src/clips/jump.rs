@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use super::Clip;
 use super::gestures::breathe;
-use crate::curve::{closed, ease};
+use crate::curve::{closed, ease, hermite};
 use crate::posture::Arm;
 use crate::puppet::Puppet;
 
@@ -14,22 +14,31 @@ pub(crate) fn jump<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     /// Phases of leaving the floor and of touching it again.
     const OFF: f64 = 0.40;
     const ON: f64 = 0.55;
+    /// Phases of the deepest crouch before, and after the flight; how deep they are, metres.
+    const BENT: f64 = 0.29;
+    const LOW: f64 = 0.64;
+    const DEEP_M: f64 = 0.30;
+    const SOFT_M: f64 = 0.27;
     const GRAVITY: f64 = 9.81;
     let in_air_secs = (ON - OFF) * SECS;
     let apex_m = GRAVITY * in_air_secs * in_air_secs / 8.0;
+    // Hips from standing down, up to the tips of the toes with the speed of the flight, down into a crouch with it.
+    let speed_up = 0.5 * GRAVITY * in_air_secs * SECS;
+    let (tips_m, soles_m) = (0.055, 0.025);
+    let hips = move |phase: f64| match phase {
+        p if p < BENT => -DEEP_M * ease((p - 0.06) / (BENT - 0.06)),
+        p if p < OFF => hermite((p - BENT) / (OFF - BENT), [-DEEP_M, tips_m], [0.0, speed_up * (OFF - BENT)]),
+        p if p < ON => {
+            let flight = (p - OFF) / (ON - OFF);
+            4.0 * apex_m * flight * (1.0 - flight) + tips_m + (soles_m - tips_m) * ease(flight)
+        }
+        p if p < LOW => hermite((p - ON) / (LOW - ON), [soles_m, -SOFT_M], [-speed_up * (LOW - ON), 0.0]),
+        p => -SOFT_M * (1.0 - ease((p - LOW - 0.02) / 0.24)),
+    };
     Clip::new(SECS / speed, move |phase| {
         let crouch = closed(
             phase,
-            &[
-                (0.06, 0.0),
-                (0.28, 1.0),
-                (0.31, 1.0),
-                (OFF - 0.01, 0.0),
-                (ON - 0.02, 0.10),
-                (0.64, 1.05),
-                (0.70, 0.9),
-                (0.90, 0.0),
-            ],
+            &[(0.06, 0.0), (BENT - 0.01, 1.0), (OFF, 0.0), (ON - 0.02, 0.10), (LOW + 0.01, 0.95), (0.90, 0.0)],
         );
         let tiptoe = closed(phase, &[(0.30, 0.0), (OFF, 1.0), (0.47, 1.0), (ON, 0.45), (0.59, 0.0)]);
         let back = closed(
@@ -47,7 +56,7 @@ pub(crate) fn jump<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
             foot.roll = 0.75 * ease(tiptoe);
             foot.lift = height + 0.07 * tucked;
         }
-        posture.hips += DVec3::new(0.0, height - 0.30 * crouch + 0.085 * ease(tiptoe), -0.07 * crouch);
+        posture.hips += DVec3::new(0.0, hips(phase), -0.07 * crouch);
         posture.pelvis.x += 0.42 * crouch;
         posture.trunk.x += 0.40 * crouch - 0.14 * up;
         posture.head.x -= 0.45 * crouch - 0.06 * up;

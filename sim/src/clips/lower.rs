@@ -35,8 +35,8 @@ pub(crate) fn squat<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
         posture.knees_out = 0.16 + 0.10 * down;
         for arm in &mut posture.arms {
             let front = Arm {
-                upper: DVec3::new(0.10, 0.12 + 0.3 * down, 0.95).normalize_or(DVec3::Z),
-                fore: DVec3::new(-0.16, 0.10 + 0.3 * down, 0.95).normalize_or(DVec3::Z),
+                upper: DVec3::new(0.10, 0.12 + 0.75 * down, 0.95).normalize_or(DVec3::Z),
+                fore: DVec3::new(-0.16, 0.10 + 0.75 * down, 0.95).normalize_or(DVec3::Z),
                 hand: [0.0, 0.0],
                 curl: 0.15,
             };

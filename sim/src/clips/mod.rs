@@ -9,6 +9,7 @@ mod walk;
 
 use flyrig_types::PoseTrack;
 
+use crate::curve::smooth_above;
 use crate::posture::Posture;
 use crate::puppet::Puppet;
 use crate::{MotionKind, SimError};
@@ -32,20 +33,24 @@ impl<'a> Clip<'a> {
 
     /// One round as poses, its end equal to its start, from a phase on.
     pub(crate) fn track(&self, puppet: &Puppet<'_>, phase: f64) -> Result<PoseTrack, SimError> {
-        let count = (self.secs * KEYS_A_SECOND).ceil().max(2.0) as i64;
-        let key = |index: i64| {
-            let share = (index % count) as f64 / count as f64 + phase;
-            (
-                (index as f64 / count as f64 * self.secs * 1e9) as i64,
-                puppet.pose(&(self.posture)(share.rem_euclid(1.0))),
-            )
+        /// Hips go down and up again within this many keys around where the legs need it.
+        const SOFT_KEYS: usize = 6;
+        let count = (self.secs * KEYS_A_SECOND).ceil().max(2.0) as usize;
+        let postures: Vec<Posture> =
+            (0..count).map(|key| (self.posture)((key as f64 / count as f64 + phase).rem_euclid(1.0))).collect();
+        let too_high: Vec<f64> = postures.iter().map(|posture| puppet.too_high_m(posture)).collect();
+        let lower = smooth_above(&too_high, SOFT_KEYS);
+        let key = |index: usize| {
+            let nanos = (index as f64 / count as f64 * self.secs * 1e9) as i64;
+            (nanos, puppet.pose(&postures[index % count], lower[index % count]))
         };
         Ok(PoseTrack::new((0..=count).map(key).collect())?)
     }
 
     /// The posture at a phase and no motion.
     pub(crate) fn held(&self, puppet: &Puppet<'_>, phase: f64) -> Result<PoseTrack, SimError> {
-        Ok(PoseTrack::new(vec![(0, puppet.pose(&(self.posture)(phase)))])?)
+        let posture = (self.posture)(phase.rem_euclid(1.0));
+        Ok(PoseTrack::new(vec![(0, puppet.pose(&posture, puppet.too_high_m(&posture)))])?)
     }
 }
 
@@ -66,3 +71,6 @@ pub(crate) fn clip<'a>(kind: MotionKind, puppet: &'a Puppet<'_>, seed: u64, turn
         MotionKind::Still | MotionKind::BySeed | MotionKind::Bvh => gestures::still(puppet),
     }
 }
+
+#[cfg(test)]
+mod tests;
