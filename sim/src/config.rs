@@ -91,6 +91,8 @@ pub enum MotionKind {
     BySeed,
     /// A BVH clip.
     Bvh,
+    /// The first animation of a glTF file.
+    Gltf,
 }
 
 /// How the person moves.
@@ -107,10 +109,13 @@ pub struct MotionConfig {
     pub turn_secs: f64,
     /// BVH file; without one, walking subject 01_01 of Debian's `assimp-testmodels`.
     pub bvh: Option<PathBuf>,
-    /// Seconds of the BVH clip to skip.
+    /// glTF file (`.glb`, `.gltf`) of a skinned human with an animation. Joints are found by the names of the usual rigs
+    /// (Mixamo, VRM, SMPL, Unreal).
+    pub gltf: Option<PathBuf>,
+    /// Seconds of a clip from a file to skip.
     pub start_secs: f64,
-    /// Farthest that a BVH clip may walk from the ring's centre, metres; the path of one that goes farther is
-    /// scaled down (its feet then slide), so that the cameras keep seeing the person.
+    /// Farthest that a clip from a file may walk from the ring's centre, metres; one that goes farther takes shorter
+    /// steps, so that the cameras keep seeing the person.
     pub reach_m: f64,
 }
 
@@ -160,6 +165,7 @@ impl Default for MotionConfig {
             phase: 0.0,
             turn_secs: 10.0,
             bvh: None,
+            gltf: None,
             start_secs: 0.0,
             reach_m: 0.5,
         }

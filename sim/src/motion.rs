@@ -3,14 +3,14 @@
 use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 
-use flyrig_body::{Template, load_bvh, skin_mesh};
-use flyrig_types::PoseTrack;
-use glam::DVec2;
+use flyrig_body::{MotionClip, RetargetOptions, Skeleton, load_bvh, load_gltf};
+use flyrig_types::{Pose, PoseTrack};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use crate::clips::{clip, passing};
 use crate::person::Person;
 use crate::puppet::Puppet;
+use crate::shoes::SOLE_M;
 use crate::{MotionConfig, MotionKind, SimConfig, SimError};
 
 const DEBIAN_CLIP: &str = "/usr/share/assimp/models/BVH/01_01.bvh";
@@ -30,7 +30,7 @@ fn existing(path: &Path) -> Result<PathBuf, SimError> {
     let mend = if path == Path::new(DEBIAN_CLIP) {
         "install it with `apt-get install assimp-testmodels`, name a file of yours in motion.bvh, or set motion.kind = \"turn\""
     } else {
-        "check motion.bvh, or set motion.kind = \"turn\" for a motion that needs no file"
+        "check motion.bvh or motion.gltf, or set motion.kind = \"turn\" for a motion that needs no file"
     };
     Err(SimError::NoClip { path: path.to_owned(), mend })
 }
@@ -45,9 +45,11 @@ pub(crate) fn track(config: &SimConfig, person: &Person) -> Result<PoseTrack, Si
     match motion.kind {
         MotionKind::Bvh => {
             let path = motion.bvh.as_deref().map_or_else(find_debian_clip, existing)?;
-            let whole = load_bvh(&path)?.retarget(skeleton)?;
-            let start_nanos = (motion.start_secs * 1e9) as i64;
-            grounded(&whole, &person.clothed, start_nanos, motion.reach_m)
+            recorded(&load_bvh(&path)?.motion(), skeleton, &motion)
+        }
+        MotionKind::Gltf => {
+            let path = existing(motion.gltf.as_deref().unwrap_or(Path::new("motion.gltf")))?;
+            recorded(&load_gltf(&path)?.motion()?, skeleton, &motion)
         }
         kind => {
             let puppet = Puppet::new(skeleton, &person.clothed)?;
@@ -87,29 +89,16 @@ pub(crate) fn pass_by(person: &Person, seed: u64, reach_m: f64) -> Result<PoseTr
     clip.track(&puppet, dice.random_range(0.0..1.0))
 }
 
-/// The track from `start_nanos` on, around the origin and no farther than `reach_m` from it, its deepest sole
-/// on the floor.
-fn grounded(track: &PoseTrack, clothed: &Template, start_nanos: i64, reach_m: f64) -> Result<PoseTrack, SimError> {
-    const PROBES: usize = 24;
-    let (first, last) = track.span_nanos();
-    let start = (first + start_nanos).min(last);
-    let mut keys: Vec<_> = vec![(0, track.at(start))];
-    keys.extend(
-        track.keys().iter().filter(|(nanos, _)| *nanos > start).map(|(nanos, pose)| (nanos - start, pose.clone())),
-    );
-    let path = || keys.iter().map(|(_, pose)| pose.root_translation.truncate());
-    let low = path().fold(DVec2::INFINITY, DVec2::min);
-    let high = path().fold(DVec2::NEG_INFINITY, DVec2::max);
-    let middle = (low + high) * 0.5;
-    let farthest = path().map(|at| at.distance(middle)).fold(0.0, f64::max);
-    let scale = if farthest > reach_m { reach_m / farthest } else { 1.0 };
-    let stride = keys.len().div_ceil(PROBES);
-    let lowest = |pose| skin_mesh(clothed, pose).0.iter().map(|p| p.z).fold(f32::INFINITY, f32::min);
-    let floor = keys.iter().step_by(stride).map(|(_, pose)| lowest(pose)).fold(f32::INFINITY, f32::min);
-    for (_, pose) in &mut keys {
-        let at = pose.root_translation;
-        pose.root_translation = ((at.truncate() - middle) * scale).extend(at.z - f64::from(floor));
-    }
+/// A recorded motion on a person, around the origin, the shoes' soles on the floor.
+fn recorded(clip: &MotionClip, skeleton: &Skeleton, motion: &MotionConfig) -> Result<PoseTrack, SimError> {
+    let (start_secs, reach_m, sole_m) = (motion.start_secs, Some(motion.reach_m), f64::from(SOLE_M));
+    let options = RetargetOptions { start_secs, reach_m, sole_m };
+    let track = clip.retarget(skeleton, &options)?;
+    // Recorded at one speed, played at another; at none the first pose is held.
+    let paced = |(nanos, pose): &(i64, Pose)| ((*nanos as f64 / motion.speed.max(1e-3)) as i64, pose.clone());
+    let count = if motion.speed > 0.0 { track.keys().len() } else { 1 };
+    let mut keys: Vec<(i64, Pose)> = track.keys().iter().take(count).map(paced).collect();
+    keys.dedup_by_key(|key| key.0);
     Ok(PoseTrack::new(keys)?)
 }
 

@@ -77,11 +77,14 @@ pub(crate) fn dance<'a>(puppet: &'a Puppet<'_>, seed: u64, speed: f64) -> Clip<'
         let mut posture = now.mix(&style(puppet, moves[(index + 1) % BARS], beat, big), into_next);
         posture.feet = [0, 1].map(|side| foot(&plants[side], phase, TAU, gait));
         let [left, right] = posture.feet;
-        let middle = (left.at + right.at) * 0.5;
         posture.yaw = (left.yaw + right.yaw) * 0.5;
-        // Weight on the foot that stands.
-        let share = 0.5 + 9.0 * (right.lift - left.lift).clamp(-0.05, 0.05);
-        let weight = right.at.lerp(left.at, share).lerp(middle, 0.45);
+        // Weight goes to the foot that stands, averaged over a beat: bodies are heavy.
+        let weight_at = |phase: f64| {
+            let [left, right] = [0, 1].map(|side| foot(&plants[side], phase, TAU, gait));
+            let share = 0.5 + 7.0 * (right.lift - left.lift);
+            right.at.lerp(left.at, share).lerp((left.at + right.at) * 0.5, 0.3)
+        };
+        let weight = (-4..=4).map(|i| weight_at(phase + 0.11 * f64::from(i) / beats)).sum::<DVec2>() / 9.0;
         posture.hips += DVec3::new(weight.x, 0.0, weight.y);
         posture
     })

@@ -68,7 +68,7 @@ pub(crate) fn clip<'a>(kind: MotionKind, puppet: &'a Puppet<'_>, seed: u64, turn
         MotionKind::Sit => lower::sit(puppet, speed),
         MotionKind::Jump => jump::jump(puppet, speed),
         MotionKind::Dance => dance::dance(puppet, seed, speed),
-        MotionKind::Still | MotionKind::BySeed | MotionKind::Bvh => gestures::still(puppet),
+        MotionKind::Still | MotionKind::BySeed | MotionKind::Bvh | MotionKind::Gltf => gestures::still(puppet),
     }
 }
 

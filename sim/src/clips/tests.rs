@@ -1,7 +1,7 @@
 //! What all clips keep to.
 
 use flyrig_body::skin_mesh;
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 
 use super::*;
 use crate::look::Look;
@@ -41,6 +41,49 @@ fn soles(person: &Person) -> flyrig_body::Template {
     soles.normals = kept.iter().map(|&v| soles.normals[v]).collect();
     soles.skin = kept.iter().map(|&v| soles.skin[v]).collect();
     soles
+}
+
+/// The farthest that a foot slides over the floor while it rests there flat and slow (from frame to frame by its ball or
+/// its heel, whichever moves less: a foot may turn about either), and the deepest that any point of its sole goes below.
+fn slide_and_depth_of_rests(person: &Person, track: &PoseTrack) -> (f32, f32) {
+    const FPS: f32 = 60.0;
+    let soles = soles(person);
+    let skeleton = &person.body.skeleton;
+    let origins = skeleton.canonical_origins();
+    let ground = soles.positions.iter().map(|p| p.y).fold(f32::INFINITY, f32::min);
+    let end = track.span_nanos().1;
+    let steps = (end as f64 * 1e-9 * f64::from(FPS)).ceil() as i64;
+    let (mut slide, mut depth, mut rests) = (0.0f32, 0.0f32, 0);
+    let mut slid = [0.0f32; 2];
+    let mut before = [[Vec3::ZERO; 2]; 2];
+    for step in 0..=steps {
+        let pose = track.at(end / steps * step);
+        let positions = skin_mesh(&soles, &pose).0;
+        let world = skeleton.world_from_joint(&pose);
+        for (foot, (left, toe)) in [(true, "LeftToeBase"), (false, "RightToeBase")].into_iter().enumerate() {
+            let points = || positions.iter().zip(&soles.positions).filter(|(_, c)| (c.x > 0.0) == left);
+            // On the sole, below the toe joint and behind the ankle, carried by the foot.
+            let ankle = skeleton.joints()[skeleton.joint(toe).unwrap()].parent.unwrap();
+            let toe = origins[skeleton.joint(toe).unwrap()];
+            let matrix = world[ankle] * skeleton.joints()[ankle].joint_from_canonical;
+            let on_sole = |x: f64, z: f64| matrix.transform_point3(DVec3::new(x, f64::from(ground), z)).as_vec3();
+            let ball = on_sole(toe.x, toe.z);
+            let heel = on_sole(origins[ankle].x, origins[ankle].z - 0.55 * (toe.z - origins[ankle].z) - 0.01);
+            depth = points().map(|(p, _)| -p.z).fold(depth, f32::max);
+            let moved = |a: Vec3, b: Vec3| a.truncate().distance(b.truncate());
+            let [was_ball, was_heel] = before[foot];
+            if moved(ball, was_ball) * FPS < 0.12 && points().all(|(p, _)| p.z < 0.03) {
+                rests += 1;
+                slid[foot] += moved(ball, was_ball).min(moved(heel, was_heel));
+                slide = slide.max(slid[foot]);
+            } else {
+                slid[foot] = 0.0;
+            }
+            before[foot] = [ball, heel];
+        }
+    }
+    assert!(rests > 0);
+    (slide, depth)
 }
 
 /// The farthest that a point of the soles moves over the floor while it touches it, and the deepest it goes below.
@@ -119,6 +162,24 @@ fn a_passer_by_walks_in_from_afar_beside_the_centre_and_comes_back() {
         assert!((0.62..1.25).contains(&nearest) && (3.8..4.7).contains(&farthest), "{nearest} to {farthest} m");
         let (slide, depth) = slide_and_depth(&person, &track);
         assert!(slide < 2e-3 && depth < 4e-3, "slides {slide} m, sinks {depth} m");
+    }
+}
+
+#[test]
+fn debians_clip_keeps_its_feet_on_the_floor_when_it_is_installed() {
+    if crate::find_debian_clip().is_err() {
+        return;
+    }
+    for (seed, build) in [(5, Build::BySeed), (7, Build::BySeed), (3, Build::HeavyMan)] {
+        let person = person(seed, build);
+        for reach_m in [0.2, 10.0] {
+            let mut config = SimConfig::default();
+            (config.motion.kind, config.motion.start_secs, config.motion.reach_m) = (MotionKind::Bvh, 1.0, reach_m);
+            let track = crate::motion::track(&config, &person).unwrap();
+            let (slide, depth) = slide_and_depth_of_rests(&person, &track);
+            println!("within {reach_m} m: slides {:.1} mm, sinks {:.1} mm", slide * 1e3, depth * 1e3);
+            assert!(slide < 5e-3 && depth < 5e-3, "slides {slide} m, sinks {depth} m");
+        }
     }
 }
 
