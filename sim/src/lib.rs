@@ -13,8 +13,10 @@
 
 mod actor;
 mod clock;
+mod clips;
 mod collars;
 mod config;
+mod curve;
 mod cuts;
 mod describe;
 mod draw;
@@ -36,7 +38,9 @@ mod motion;
 mod noise;
 mod palette;
 mod person;
+mod posture;
 mod prints;
+mod puppet;
 mod regions;
 mod ring;
 mod room;
@@ -45,6 +49,7 @@ mod sheet;
 mod shoes;
 mod simulator;
 mod source;
+mod steps;
 mod texture;
 mod truth_file;
 mod turn;
