@@ -195,7 +195,8 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
     let source = &config.source;
     if source.kind == SourceKind::Sim {
         let simulator = Simulator::new(gpu, &config.sim)?;
-        let (rig, template, track) = (simulator.rig().clone(), simulator.template().clone(), simulator.track().clone());
+        let (rig, template, track) =
+            (simulator.reported_rig(), simulator.template().clone(), simulator.track().clone());
         let picked = dataset::pick(&rig, &source.cameras, "the simulated rig")?;
         let copy = |slot| -> Result<Image> {
             let plate = simulator.plate(slot)?;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::error::check;
-use crate::{FaultScript, SensorConfig, SimError};
+use crate::{CalibrationError, FaultScript, LightConfig, OpticsConfig, SceneConfig, SensorConfig, SimError};
 
 /// A simulated capture. The same configuration gives the same bytes on the same graphics adapter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -21,6 +21,14 @@ pub struct SimConfig {
     pub cameras: RingConfig,
     /// The cameras' sensors; camera `i` has the sensor of place `i` modulo their number. Without any, pictures are as drawn.
     pub sensors: Vec<SensorConfig>,
+    /// The cameras' shutters and lens openings, given to cameras like `sensors`.
+    pub optics: Vec<OpticsConfig>,
+    /// How wrong the calibration is that [`crate::Simulator::reported_rig`] reports.
+    pub calibration_error: CalibrationError,
+    /// What stands around the person.
+    pub scene: SceneConfig,
+    /// The lamps; without any, the scene has its own.
+    pub lights: Vec<LightConfig>,
     /// What goes wrong with the cameras and their clocks.
     pub faults: FaultScript,
     /// Image width, pixels.
@@ -137,6 +145,14 @@ pub struct RingConfig {
     pub radial: [f64; 2],
     /// Coefficients k1 to k4 of an equidistant fisheye lens (OpenCV's), in place of `radial`.
     pub fisheye: Option<[f64; 4]>,
+    /// Tangential distortion p1, p2 (OpenCV's), beside `radial`.
+    pub tangential: [f64; 2],
+    /// How far each camera stands off its place on the ring, along each axis at most, metres.
+    pub place_jitter_m: f64,
+    /// How far each camera is turned off its aim, about each axis (roll included) at most, degrees.
+    pub aim_jitter_deg: f64,
+    /// How far each camera's focal length is off the ring's, at most, percent.
+    pub focal_jitter_percent: f64,
 }
 
 impl Default for SimConfig {
@@ -147,6 +163,10 @@ impl Default for SimConfig {
             motion: MotionConfig::default(),
             cameras: RingConfig::default(),
             sensors: Vec::new(),
+            optics: Vec::new(),
+            calibration_error: CalibrationError::default(),
+            scene: SceneConfig::default(),
+            lights: Vec::new(),
             faults: FaultScript::default(),
             width: 512,
             height: 512,
@@ -182,6 +202,10 @@ impl Default for RingConfig {
             focal_heights: 1.36,
             radial: [-0.12, 0.03],
             fisheye: None,
+            tangential: [0.0; 2],
+            place_jitter_m: 0.0,
+            aim_jitter_deg: 0.0,
+            focal_jitter_percent: 0.0,
         }
     }
 }
@@ -208,6 +232,16 @@ impl SimConfig {
         for k in ring.fisheye.unwrap_or_default() {
             check("cameras.fisheye", k, -1.0, 1.0, "coefficients between -1 and 1")?;
         }
+        for p in ring.tangential {
+            check("cameras.tangential", p, -0.1, 0.1, "coefficients between -0.1 and 0.1")?;
+        }
+        check("cameras.place_jitter_m", ring.place_jitter_m, 0.0, 0.4, "0 to 0.4 metres")?;
+        check("cameras.aim_jitter_deg", ring.aim_jitter_deg, 0.0, 45.0, "0 to 45 degrees")?;
+        check("cameras.focal_jitter_percent", ring.focal_jitter_percent, 0.0, 50.0, "0 to 50 percent")?;
+        self.optics.iter().try_for_each(OpticsConfig::validate)?;
+        self.calibration_error.validate()?;
+        self.scene.validate(ring.radius_m)?;
+        LightConfig::validate_all(&self.lights)?;
         self.sensors.iter().try_for_each(SensorConfig::validate)?;
         self.faults.validate()?;
         check("motion.turn_secs", motion.turn_secs, 1.0, 600.0, "1 to 600 seconds")?;

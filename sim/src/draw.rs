@@ -1,72 +1,86 @@
-//! The raster pipeline: shadow map, anti-aliased picture, truth at pixel centres.
+//! The drawing of one instant: shadow maps, plates, people before them, truth at pixel centres. All pictures of an
+//! instant are drawn in one submission and read back at once.
 
-use bytemuck::{Pod, Zeroable};
-use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer, read_back};
-use flyrig_types::{Camera, Lens};
-use glam::{Mat4, Vec2, Vec3};
+use bytemuck::Zeroable;
+use flyrig_gpu::{GpuContext, GpuError, StorageBuffer, read_back};
+use flyrig_types::Camera;
+use glam::{Vec2, Vec3};
 use wgpu::util::DeviceExt;
 use wgpu::{
-    BindGroup, BindingResource, Buffer, BufferUsages, Color, CommandEncoder, CompareFunction, LoadOp, Operations,
-    RenderPassColorAttachment, RenderPassDepthStencilAttachment, RenderPipeline, StoreOp, Texture, TextureFormat,
-    TextureUsages, TextureView,
+    BindGroup, BindGroupLayout, BindingResource, Buffer, BufferUsages, Color, CommandEncoder, CompareFunction,
+    ComputePipeline, LoadOp, Operations, RenderPassColorAttachment, RenderPassDepthStencilAttachment, RenderPipeline,
+    Sampler, StoreOp, Texture, TextureUsages, TextureView, VertexFormat,
 };
 
-use crate::gpu_parts::{COLOR, DEPTH, bind, pipeline, texture, upload_plate, upload_textures, view_of};
+use crate::constants::{Blocks, Capsule, LightBlock, ViewHead, shader_sources};
+use crate::figure::{Figure, Figured};
+use crate::gpu_parts::{
+    DEPTH, Drawn, LIGHT, SAMPLES, Slot, TRUTH, array_view, bind, compute, layer_view, layout, pipeline, target,
+    upload_textures, view_of,
+};
+use crate::optics::{OpticsConfig, SubFrame};
 use crate::person::Person;
-use crate::room::Plate;
+use crate::plates::{Plate, Plates};
+use crate::scene::Scene;
 
-/// Colour samples a pixel side.
-pub(crate) const SUPERSAMPLES: u32 = 2;
-const SHADOW_PX: u32 = 1024;
-/// Half the side of the lit box around the person, metres.
-const SHADOW_HALF_M: f32 = 1.35;
-const NEAR_M: f32 = 0.1;
+/// Sides of the lamps' pictures of people and of the room, pixels.
+const PEOPLE_MAP_PX: u32 = 768;
+const ROOM_MAP_PX: u32 = 2048;
 
-/// WGSL of the drawing passes and of the composition.
-pub(crate) fn shader_sources() -> [(&'static str, String); 2] {
-    let constants = format!("const NEAR_M: f32 = {NEAR_M:?};\nconst SUPERSAMPLES: u32 = {SUPERSAMPLES}u;\n");
-    let view = include_str!("view.wgsl");
-    [
-        ("simulated person", [&constants, view, include_str!("person.wgsl")].concat()),
-        ("simulated picture", [&constants, view, include_str!("compose.wgsl")].concat()),
-    ]
+/// The people around an instant.
+#[derive(Debug, Clone)]
+pub(crate) struct Moment {
+    /// First key's seconds from the instant, and keys a second; the keys are evenly spaced.
+    pub first_secs: f64,
+    pub keys_a_second: f64,
+    pub people: Vec<Figured>,
+    /// A ball around everybody at all keys.
+    pub ball: (Vec3, f32),
+    pub capsules: Vec<Capsule>,
 }
 
-/// Layout of `struct View` in view.wgsl.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Pod, Zeroable)]
-struct View {
-    camera_from_world: [[f32; 4]; 4],
-    light_from_world: [[f32; 4]; 4],
-    focal_px: [f32; 2],
-    center_px: [f32; 2],
-    size_px: [f32; 2],
-    padding: [f32; 2],
-    lens: [f32; 4],
-    fisheye: [f32; 4],
-    to_light: [f32; 4],
-    key: [f32; 4],
-    sky: [f32; 4],
-    ground: [f32; 4],
-    feet: [[f32; 4]; 2],
+/// One picture to draw.
+#[derive(Debug, Clone)]
+pub(crate) struct Take {
+    pub nanos: i64,
+    pub camera: Camera,
+    pub optics: OpticsConfig,
+    /// Without people: the plate.
+    pub people: bool,
 }
 
-/// One instant of the person in the world.
-pub(crate) struct Posed {
-    pub positions: Vec<Vec3>,
-    pub normals: Vec<Vec3>,
-    /// Middle of the body, metres.
-    pub center: Vec3,
-    /// x, y of each foot, metres, and its closeness to the floor, 0..=1.
-    pub feet: [Vec3; 2],
-}
+/// Linear light and coverage by the person as halves.
+pub(crate) type Raw = Vec<[u16; 4]>;
 
 /// Truth at pixel centres.
 pub(crate) struct Truth {
     /// Canonical position and camera-space z.
     pub canonical_depth: Vec<[f32; 4]>,
-    /// Part index plus one, 0 on the background.
-    pub part: Vec<u32>,
+    /// World normal; part index plus one, 0 where the person is not seen.
+    pub normal_part: Vec<[f32; 4]>,
+}
+
+/// Layouts of the groups.
+#[derive(Debug)]
+struct Layouts {
+    constants: BindGroupLayout,
+    points: BindGroupLayout,
+    person: BindGroupLayout,
+    room: BindGroupLayout,
+    plate: BindGroupLayout,
+    picture: BindGroupLayout,
+}
+
+#[derive(Debug)]
+struct Pipelines {
+    person_shadow: RenderPipeline,
+    person_color: RenderPipeline,
+    person_truth: RenderPipeline,
+    room_shadow: RenderPipeline,
+    room_layer: RenderPipeline,
+    room_depth: RenderPipeline,
+    plate: ComputePipeline,
+    picture: ComputePipeline,
 }
 
 /// Everything on the GPU.
@@ -74,283 +88,468 @@ pub(crate) struct Truth {
 pub(crate) struct Drawing {
     gpu: GpuContext,
     size: [u32; 2],
-    view: Buffer,
-    positions: Buffer,
-    normals: Buffer,
-    paint: Buffer,
-    truth: Buffer,
-    indices: Buffer,
-    index_count: u32,
-    shadow_pipeline: RenderPipeline,
-    color_pipeline: RenderPipeline,
-    truth_pipeline: RenderPipeline,
-    shadow_bind: BindGroup,
-    color_bind: BindGroup,
-    truth_bind: BindGroup,
-    compose_binds: Vec<BindGroup>,
-    compose: ComputeKernel,
-    shadow_map: TextureView,
-    samples: TextureView,
-    sample_depth: TextureView,
+    scene: Scene,
+    glows: bool,
+    layouts: Layouts,
+    pipelines: Pipelines,
+    people: Vec<(Figure, BindGroup)>,
+    room_vertices: Buffer,
+    room_indices: Buffer,
+    room_bind: BindGroup,
+    people_maps: Texture,
+    compare: Sampler,
+    samples: Texture,
+    depth: Texture,
+    truth_depth: Texture,
     canonical_depth: Texture,
-    part: Texture,
-    truth_depth: TextureView,
-    pixels: StorageBuffer<u32>,
-    light: (Mat4, [[f32; 4]; 2]),
+    normal_part: Texture,
+    pixels: Buffer,
+    sums: Vec<Buffer>,
+    plates: Plates,
+    moment: Moment,
+}
+
+/// Where one pass finds its constants.
+type Offsets = [u32; 2];
+
+/// A step of a batch: one sub-frame of one take.
+struct Step {
+    secs: f64,
+    take: usize,
+    frame: SubFrame,
+    first: bool,
+    last: bool,
 }
 
 impl Drawing {
-    pub(crate) fn new(gpu: &GpuContext, person: &Person, size: [u32; 2], plates: &[Plate]) -> Result<Self, GpuError> {
+    pub(crate) fn new(gpu: &GpuContext, size: [u32; 2], scene: Scene, people: &[&Person]) -> Result<Self, GpuError> {
         let device = &gpu.device;
-        let buffer = |label, content: &[u8], usage| {
-            device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
-                label: Some(label),
-                contents: content,
-                usage,
-            })
+        let layouts = Layouts {
+            constants: layout(gpu, "constants", &[Slot::Constants, Slot::Constants]),
+            points: layout(gpu, "points", &[Slot::Read]),
+            person: layout(
+                gpu,
+                "surface of a person",
+                &[Slot::Textures, Slot::Smooth, Slot::DepthMaps, Slot::DepthMaps, Slot::Compare],
+            ),
+            room: layout(gpu, "surface of the room", &[Slot::Textures, Slot::Smooth, Slot::DepthMaps, Slot::Compare]),
+            plate: layout(gpu, "plate", &[Slot::ManySamples, Slot::Write]),
+            picture: layout(
+                gpu,
+                "picture",
+                &[
+                    Slot::ManySamples,
+                    Slot::ManyDepths,
+                    Slot::Read,
+                    Slot::Read,
+                    Slot::DepthMaps,
+                    Slot::Compare,
+                    Slot::Write,
+                    Slot::Write,
+                ],
+            ),
         };
-        let clothed = &person.clothed;
-        let paint: Vec<[f32; 4]> = clothed
-            .uvs
-            .iter()
-            .zip(&person.layer_and_openness)
-            .map(|(uv, &(layer, open))| [uv.x, uv.y, layer as f32, open])
-            .collect();
-        let truth: Vec<[f32; 4]> = person
-            .carriers
-            .iter()
-            .zip(&clothed.parts)
-            .map(|(p, &part)| p.extend(f32::from(part as u8)).to_array())
-            .collect();
-        let moving = BufferUsages::VERTEX | BufferUsages::COPY_DST;
-        let still: Vec<u8> = bytemuck::cast_slice(&clothed.positions).to_vec();
-        let [person_source, compose_source] = shader_sources();
-        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-            label: Some(person_source.0),
-            source: wgpu::ShaderSource::Wgsl(person_source.1.into()),
-        });
-        let pipeline = |entry, fragment, formats: &[TextureFormat]| pipeline(gpu, &module, entry, fragment, formats);
-        let shadow_pipeline = pipeline("vs_shadow", None, &[]);
-        let color_pipeline = pipeline("vs_person", Some("fs_color"), &[COLOR]);
-        let truth_formats = [TextureFormat::Rgba32Float, TextureFormat::R32Uint];
-        let truth_pipeline = pipeline("vs_person", Some("fs_truth"), &truth_formats);
-        let compose = ComputeKernel::new(gpu, compose_source.0, &[&compose_source.1], "compose");
-
+        let pipelines = Pipelines::new(gpu, &layouts);
         let [width, height] = size;
-        let target = |label, width, height, format, usage| {
-            texture(gpu, label, [width, height, 1], 1, format, TextureUsages::RENDER_ATTACHMENT | usage)
-        };
         let bound = TextureUsages::TEXTURE_BINDING;
-        let (wide, tall) = (width * SUPERSAMPLES, height * SUPERSAMPLES);
-        let shadow_map = view_of(&target("shadow map", SHADOW_PX, SHADOW_PX, DEPTH, bound));
-        let samples = view_of(&target("colour samples", wide, tall, COLOR, bound));
-        let sample_depth = view_of(&target("sample depth", wide, tall, DEPTH, TextureUsages::empty()));
-        let truth_depth = view_of(&target("truth depth", width, height, DEPTH, TextureUsages::empty()));
-        let copied = TextureUsages::COPY_SRC;
-        let canonical_depth = target("canonical and depth", width, height, truth_formats[0], copied);
-        let part = target("parts", width, height, truth_formats[1], copied);
-        // A storage buffer: Mesa's software adapter leaks with uniform ones, see ARCHITECTURE.md.
-        let view = buffer("view", bytemuck::bytes_of(&View::zeroed()), BufferUsages::STORAGE | BufferUsages::COPY_DST);
-        let textures = upload_textures(gpu, person);
-        let smooth = device.create_sampler(&wgpu::SamplerDescriptor {
-            mag_filter: wgpu::FilterMode::Linear,
-            min_filter: wgpu::FilterMode::Linear,
-            mipmap_filter: wgpu::MipmapFilterMode::Linear,
-            ..Default::default()
-        });
+        let lamps = scene.lamps.len().max(1) as u32;
+        let people_maps = target(gpu, "people to lamps", [PEOPLE_MAP_PX, PEOPLE_MAP_PX, lamps], 1, DEPTH, bound);
+        let room_maps = target(gpu, "room to lamps", [ROOM_MAP_PX, ROOM_MAP_PX, lamps], 1, DEPTH, bound);
         let compare = device.create_sampler(&wgpu::SamplerDescriptor {
             mag_filter: wgpu::FilterMode::Linear,
             min_filter: wgpu::FilterMode::Linear,
             compare: Some(CompareFunction::LessEqual),
             ..Default::default()
         });
-        let uniform = view.as_entire_binding();
-        let shadow_bind = bind(gpu, &shadow_pipeline, std::slice::from_ref(&uniform));
-        let truth_bind = bind(gpu, &truth_pipeline, std::slice::from_ref(&uniform));
-        let color_bind = bind(
+        let smooth = |address_mode, anisotropy_clamp| {
+            device.create_sampler(&wgpu::SamplerDescriptor {
+                address_mode_u: address_mode,
+                address_mode_v: address_mode,
+                mag_filter: wgpu::FilterMode::Linear,
+                min_filter: wgpu::FilterMode::Linear,
+                mipmap_filter: wgpu::MipmapFilterMode::Linear,
+                anisotropy_clamp,
+                ..Default::default()
+            })
+        };
+        let (cloth_sampler, room_sampler) =
+            (smooth(wgpu::AddressMode::ClampToEdge, 1), smooth(wgpu::AddressMode::Repeat, 8));
+        let room_textures = upload_textures(gpu, "surfaces of the room", &scene.textures);
+        let mut figures = Vec::with_capacity(people.len());
+        for (index, person) in people.iter().enumerate() {
+            let figure = Figure::new(gpu, &layouts.points, person, index == 0)?;
+            let group = bind(
+                gpu,
+                &layouts.person,
+                &[
+                    BindingResource::TextureView(&figure.textures),
+                    BindingResource::Sampler(&cloth_sampler),
+                    BindingResource::TextureView(&array_view(&people_maps)),
+                    BindingResource::TextureView(&array_view(&room_maps)),
+                    BindingResource::Sampler(&compare),
+                ],
+            );
+            figures.push((figure, group));
+        }
+        let room_bind = bind(
             gpu,
-            &color_pipeline,
+            &layouts.room,
             &[
-                uniform.clone(),
-                BindingResource::TextureView(&textures),
-                BindingResource::Sampler(&smooth),
-                BindingResource::TextureView(&shadow_map),
+                BindingResource::TextureView(&room_textures),
+                BindingResource::Sampler(&room_sampler),
+                BindingResource::TextureView(&array_view(&room_maps)),
                 BindingResource::Sampler(&compare),
             ],
         );
-        let pixels = StorageBuffer::zeroed(gpu, "simulated picture", width as usize * height as usize)?;
-        let mut compose_binds = Vec::with_capacity(plates.len());
-        for plate in plates {
-            let (plate_view, floor) = upload_plate(gpu, plate, size)?;
-            compose_binds.push(compose.bind(
-                gpu,
-                &[
-                    uniform.clone(),
-                    BindingResource::TextureView(&samples),
-                    BindingResource::TextureView(&plate_view),
-                    floor.raw().as_entire_binding(),
-                    BindingResource::TextureView(&shadow_map),
-                    BindingResource::Sampler(&compare),
-                    pixels.raw().as_entire_binding(),
-                ],
-            ));
-        }
-        Ok(Self {
+        let buffer = |label, contents: &[u8], usage| {
+            let label = Some(label);
+            device.create_buffer_init(&wgpu::util::BufferInitDescriptor { label, contents, usage })
+        };
+        let full = [width, height, 1];
+        let none = TextureUsages::empty();
+        let read = TextureUsages::COPY_SRC;
+        let glows = scene.glows();
+        let layers = 1 + scene.lamps.len() + usize::from(glows);
+        let pixels = StorageBuffer::<[u32; 2]>::zeroed(gpu, "simulated picture", width as usize * height as usize)?;
+        let drawing = Self {
             gpu: gpu.clone(),
             size,
-            positions: buffer("person positions", &still, moving),
-            normals: buffer("person normals", &still, moving),
-            paint: buffer("person paint", bytemuck::cast_slice(&paint), BufferUsages::VERTEX),
-            truth: buffer("person truth", bytemuck::cast_slice(&truth), BufferUsages::VERTEX),
-            indices: buffer("person triangles", bytemuck::cast_slice(&clothed.triangles), BufferUsages::INDEX),
-            index_count: clothed.triangles.len() as u32 * 3,
-            view,
-            shadow_pipeline,
-            color_pipeline,
-            truth_pipeline,
-            shadow_bind,
-            color_bind,
-            truth_bind,
-            compose_binds,
-            compose,
-            shadow_map,
-            samples,
-            sample_depth,
-            canonical_depth,
-            part,
-            truth_depth,
-            pixels,
-            light: (Mat4::IDENTITY, [[0.0; 4]; 2]),
+            glows,
+            pipelines,
+            people: figures,
+            room_vertices: buffer("room", bytemuck::cast_slice(&scene.mesh.vertices), BufferUsages::VERTEX),
+            room_indices: buffer(
+                "triangles of the room",
+                bytemuck::cast_slice(&scene.mesh.triangles),
+                BufferUsages::INDEX,
+            ),
+            room_bind,
+            people_maps,
+            compare,
+            samples: target(gpu, "light samples", full, SAMPLES, LIGHT, bound),
+            depth: target(gpu, "sample depth", full, SAMPLES, DEPTH, TextureUsages::COPY_DST),
+            truth_depth: target(gpu, "truth depth", full, 1, DEPTH, TextureUsages::COPY_DST | none),
+            canonical_depth: target(gpu, "canonical and depth", full, 1, TRUTH, read),
+            normal_part: target(gpu, "normal and part", full, 1, TRUTH, read),
+            pixels: pixels.raw().clone(),
+            sums: Vec::new(),
+            plates: Plates::new(size, layers),
+            moment: Moment {
+                first_secs: 0.0,
+                keys_a_second: 0.0,
+                people: Vec::new(),
+                ball: (crate::lamps::STAGE, 1.0),
+                capsules: Vec::new(),
+            },
+            scene,
+            layouts,
+        };
+        drawing.draw_room_maps(&room_maps);
+        Ok(drawing)
+    }
+
+    /// Puts the people around an instant; serves all cameras of that instant.
+    pub(crate) fn set_moment(&mut self, moment: Moment) -> Result<(), GpuError> {
+        for ((figure, _), figured) in self.people.iter_mut().zip(&moment.people) {
+            figure.pose(&self.gpu, &self.layouts.points, figured)?;
+        }
+        self.moment = moment;
+        Ok(())
+    }
+
+    /// Draws pictures of one instant.
+    pub(crate) fn pictures(&mut self, takes: &[Take]) -> Result<Vec<Raw>, GpuError> {
+        let steps = steps(takes);
+        self.plates.next_round();
+        let mut blocks = Blocks::default();
+        let light = self.light_offset(&mut blocks);
+        let mut planned = Vec::with_capacity(steps.len());
+        for step in &steps {
+            let take = &takes[step.take];
+            let focus_m = take.optics.focus_m;
+            let (plate, fresh) = self.plates.find(&self.gpu, &take.camera, focus_m, step.frame.lens_point)?;
+            let mut layers = Vec::new();
+            if fresh {
+                for layer in 0..self.layer_count() {
+                    let mut head = ViewHead::new(&take.camera, focus_m, step.frame);
+                    head.moment[3] = layer as f32;
+                    layers.push([self.view_offset(&mut blocks, head, &[]), light]);
+                }
+            }
+            let view = self.view_offset(&mut blocks, self.head(take, step), &self.levels(take, step.frame));
+            planned.push((plate, layers, [view, light]));
+        }
+        let constants = self.upload(&blocks);
+        let needs_sums = |take: usize| steps.iter().filter(|step| step.take == take).count() > 1;
+        let sums: Vec<Buffer> =
+            (0..takes.len()).map(|take| self.sums_of(take, needs_sums(take))).collect::<Result<_, _>>()?;
+
+        let bytes = u64::from(self.size[0]) * u64::from(self.size[1]) * 8;
+        let staging = self.gpu.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("simulated pictures"),
+            size: bytes * takes.len() as u64,
+            usage: BufferUsages::COPY_DST | BufferUsages::COPY_SRC,
+            mapped_at_creation: false,
+        });
+        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+        let mut shadows_at = None;
+        for (step, (plate, layers, offsets)) in steps.iter().zip(&planned) {
+            let people = takes[step.take].people;
+            if people && shadows_at != Some(step.secs) {
+                self.draw_people_maps(&mut encoder, &constants, *offsets);
+                shadows_at = Some(step.secs);
+            }
+            self.bake(&mut encoder, &constants, plate, layers);
+            self.draw_people(&mut encoder, &constants, plate, *offsets, people);
+            self.compose(&mut encoder, &constants, plate, *offsets, &sums[step.take]);
+            if step.last {
+                encoder.copy_buffer_to_buffer(&self.pixels, 0, &staging, bytes * step.take as u64, bytes);
+            }
+        }
+        self.gpu.queue.submit([encoder.finish()]);
+        let pixels = self.size[0] as usize * self.size[1] as usize;
+        let all: Vec<[u16; 4]> = read_back(&self.gpu, &staging, pixels * takes.len())?;
+        Ok(all.chunks_exact(pixels).map(<[_]>::to_vec).collect())
+    }
+
+    /// Truth of one picture: of the middle of its exposure through the lens's middle, each row at its own time.
+    pub(crate) fn truth(&mut self, take: &Take) -> Result<Truth, GpuError> {
+        let frame = SubFrame { secs: 0.0, lens_point: Vec2::ZERO };
+        let step = Step { secs: 0.0, take: 0, frame, first: true, last: true };
+        let mut blocks = Blocks::default();
+        let light = self.light_offset(&mut blocks);
+        let view = self.view_offset(&mut blocks, self.head(take, &step), &[]);
+        let constants = self.upload(&blocks);
+        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+        let centre = match self.plates.centre_depth(&take.camera) {
+            Some(depth) => depth,
+            None => {
+                let [width, height] = self.size;
+                let usage = TextureUsages::COPY_SRC;
+                let depth = target(&self.gpu, "depth at centres", [width, height, 1], 1, DEPTH, usage);
+                let mut pass = pass(&mut encoder, &[], &view_of(&depth), LoadOp::Clear(1.0));
+                pass.set_pipeline(&self.pipelines.room_depth);
+                pass.set_bind_group(0, &constants, &[view, light]);
+                self.draw_room(&mut pass, 0, 0..1);
+                drop(pass);
+                self.plates.keep_centre_depth(&take.camera, &depth);
+                depth
+            }
+        };
+        encoder.copy_texture_to_texture(
+            centre.as_image_copy(),
+            self.truth_depth.as_image_copy(),
+            self.truth_depth.size(),
+        );
+        let targets = [&view_of(&self.canonical_depth), &view_of(&self.normal_part)];
+        {
+            let mut pass = pass(&mut encoder, &targets, &view_of(&self.truth_depth), LoadOp::Load);
+            pass.set_pipeline(&self.pipelines.person_truth);
+            pass.set_bind_group(0, &constants, &[view, light]);
+            for (figure, surface) in &self.people {
+                pass.set_bind_group(2, surface, &[]);
+                figure.draw(&mut pass, 0..1);
+            }
+        }
+        self.gpu.queue.submit([encoder.finish()]);
+        Ok(Truth {
+            canonical_depth: self.read_truth(&self.canonical_depth)?,
+            normal_part: self.read_truth(&self.normal_part)?,
         })
     }
 
-    /// Puts the person at an instant and draws its shadow map; serves all cameras of that instant.
-    pub(crate) fn set_person(&mut self, posed: &Posed) {
-        let queue = &self.gpu.queue;
-        queue.write_buffer(&self.positions, 0, bytemuck::cast_slice(&posed.positions));
-        queue.write_buffer(&self.normals, 0, bytemuck::cast_slice(&posed.normals));
-        let eye = posed.center + to_light() * 4.0;
-        let light_from_view = Mat4::from_cols_array(&[
-            1.0 / SHADOW_HALF_M,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            1.0 / SHADOW_HALF_M,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            1.0 / 8.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            1.0,
-        ]);
-        let forward = -to_light();
-        let right = forward.cross(Vec3::Z).normalize_or(Vec3::X);
-        let up = right.cross(forward);
-        let axes = glam::Mat3::from_cols(right, up, forward).transpose();
-        let view_from_world = Mat4::from_mat3(axes) * Mat4::from_translation(-eye);
-        let feet = posed.feet.map(|foot| foot.extend(0.0).to_array());
-        self.light = (light_from_view * view_from_world, feet);
-        let view = View { light_from_world: self.light.0.to_cols_array_2d(), ..View::zeroed() };
-        queue.write_buffer(&self.view, 0, bytemuck::bytes_of(&view));
-        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-        self.draw(&mut encoder, &self.shadow_pipeline, &self.shadow_bind, &[], &self.shadow_map);
-        queue.submit([encoder.finish()]);
+    fn layer_count(&self) -> usize {
+        1 + self.scene.lamps.len() + usize::from(self.glows)
     }
 
-    /// Picture of one camera: sRGB and the person's coverage.
-    pub(crate) fn picture(&self, camera: &Camera, slot: usize) -> Result<Vec<[u8; 4]>, GpuError> {
-        self.set_view(camera);
+    fn head(&self, take: &Take, step: &Step) -> ViewHead {
+        let mut head = ViewHead::new(&take.camera, take.optics.focus_m, step.frame);
+        let rows = f64::from(self.size[1]);
+        head.moment[1] = (take.optics.readout_ms * 1e-3 / (rows - 1.0)) as f32;
+        head.moment[2] = (0.5 * (rows - 1.0)) as f32;
+        let keys = self.moment.people.first().map_or(1, |figured| figured.keys.len());
+        head.keys = [self.moment.first_secs as f32, self.moment.keys_a_second as f32, keys as f32, 0.0];
+        let share = 1.0 / take.optics.sub_frames().len() as f32;
+        let flag = |on: bool| f32::from(u8::from(on));
+        head.sum = [share, flag(step.first), flag(step.last), flag(take.people)];
+        head
+    }
+
+    /// Each lamp's level at the time of each row.
+    fn levels(&self, take: &Take, frame: SubFrame) -> Vec<[f32; 4]> {
+        let rows = self.size[1];
+        let row_secs = take.optics.readout_ms * 1e-3 / (f64::from(rows) - 1.0);
+        let middle = take.nanos as f64 * 1e-9 + frame.secs;
+        (0..rows)
+            .map(|row| {
+                let secs = middle + (f64::from(row) - 0.5 * (f64::from(rows) - 1.0)) * row_secs;
+                let mut levels = [0.0; 4];
+                for (level, lamp) in levels.iter_mut().zip(&self.scene.lamps) {
+                    *level = lamp.level(secs);
+                }
+                levels
+            })
+            .collect()
+    }
+
+    fn view_offset(&self, blocks: &mut Blocks, head: ViewHead, levels: &[[f32; 4]]) -> u32 {
+        let mut rows = levels.to_vec();
+        rows.resize(self.size[1] as usize, [0.0; 4]);
+        blocks.push(&[bytemuck::bytes_of(&head), bytemuck::cast_slice(&rows)])
+    }
+
+    fn light_offset(&self, blocks: &mut Blocks) -> u32 {
+        let light = LightBlock::new(&self.scene, self.glows, self.moment.ball, &self.moment.capsules);
+        blocks.push(&[bytemuck::bytes_of(&light)])
+    }
+
+    /// Group 0 over blocks.
+    fn upload(&self, blocks: &Blocks) -> BindGroup {
+        let buffer = self.gpu.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+            label: Some("constants of a batch"),
+            contents: &blocks.bytes,
+            // A storage buffer: Mesa's software adapter leaks with uniform ones, see ARCHITECTURE.md.
+            usage: BufferUsages::STORAGE,
+        });
+        let view_bytes = size_of::<ViewHead>() + 16 * self.size[1] as usize;
+        let block = |bytes: usize| {
+            let size = std::num::NonZeroU64::new(bytes as u64);
+            BindingResource::Buffer(wgpu::BufferBinding { buffer: &buffer, offset: 0, size })
+        };
+        bind(&self.gpu, &self.layouts.constants, &[block(view_bytes), block(size_of::<LightBlock>())])
+    }
+
+    fn sums_of(&mut self, take: usize, needed: bool) -> Result<Buffer, GpuError> {
+        while self.sums.len() <= take {
+            self.sums.push(StorageBuffer::<[f32; 4]>::zeroed(&self.gpu, "no sums", 1)?.raw().clone());
+        }
+        let pixels = self.size[0] as usize * self.size[1] as usize;
+        if needed && self.sums[take].size() < pixels as u64 * 16 {
+            let sums = StorageBuffer::<[f32; 4]>::zeroed(&self.gpu, "sums of sub-frames", pixels)?;
+            self.sums[take] = sums.raw().clone();
+        }
+        Ok(self.sums[take].clone())
+    }
+
+    fn draw_room_maps(&self, maps: &Texture) {
+        let mut blocks = Blocks::default();
+        let light = self.light_offset(&mut blocks);
+        let view = self.view_offset(&mut blocks, ViewHead::zeroed(), &[]);
+        let constants = self.upload(&blocks);
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-        self.draw(&mut encoder, &self.color_pipeline, &self.color_bind, &[&self.samples], &self.sample_depth);
-        {
-            let mut pass = encoder.begin_compute_pass(&Default::default());
-            pass.set_pipeline(&self.compose.pipeline);
-            pass.set_bind_group(0, self.compose_binds.get(slot), &[]);
-            pass.dispatch_workgroups(self.size[0].div_ceil(8), self.size[1].div_ceil(8), 1);
+        for lamp in 0..self.scene.lamps.len() as u32 {
+            let mut pass = pass(&mut encoder, &[], &layer_view(maps, lamp), LoadOp::Clear(1.0));
+            pass.set_pipeline(&self.pipelines.room_shadow);
+            pass.set_bind_group(0, &constants, &[view, light]);
+            self.draw_room(&mut pass, self.scene.mesh.first_caster, lamp..lamp + 1);
         }
         self.gpu.queue.submit([encoder.finish()]);
-        let pixels = self.pixels.read(&self.gpu)?;
-        Ok(pixels.into_iter().map(u32::to_le_bytes).collect())
     }
 
-    /// Truth of one camera.
-    pub(crate) fn truth(&self, camera: &Camera) -> Result<Truth, GpuError> {
-        self.set_view(camera);
-        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-        let targets = [&view_of(&self.canonical_depth), &view_of(&self.part)];
-        self.draw(&mut encoder, &self.truth_pipeline, &self.truth_bind, &targets, &self.truth_depth);
-        self.gpu.queue.submit([encoder.finish()]);
-        Ok(Truth { canonical_depth: self.read_texture(&self.canonical_depth)?, part: self.read_texture(&self.part)? })
+    fn draw_people_maps(&self, encoder: &mut CommandEncoder, constants: &BindGroup, offsets: Offsets) {
+        for lamp in 0..self.scene.lamps.len() as u32 {
+            let mut pass = pass(encoder, &[], &layer_view(&self.people_maps, lamp), LoadOp::Clear(1.0));
+            pass.set_pipeline(&self.pipelines.person_shadow);
+            pass.set_bind_group(0, constants, &offsets);
+            for (figure, _) in &self.people {
+                figure.draw(&mut pass, lamp..lamp + 1);
+            }
+        }
     }
 
-    fn set_view(&self, camera: &Camera) {
-        let i = &camera.intrinsics;
-        let valid = i.lens.valid_radius() as f32;
-        let (lens, fisheye) = match i.lens {
-            Lens::RadialTangential { radial: [k1, k2, _], .. } => ([k1 as f32, k2 as f32, valid, 0.0], [0.0; 4]),
-            Lens::Fisheye { coefficients } => ([0.0, 0.0, valid, 1.0], coefficients.map(|k| k as f32)),
-        };
-        let view = View {
-            camera_from_world: camera.camera_from_world.to_matrix().as_mat4().to_cols_array_2d(),
-            light_from_world: self.light.0.to_cols_array_2d(),
-            focal_px: i.focal_px.as_vec2().to_array(),
-            center_px: i.center_px.as_vec2().to_array(),
-            size_px: Vec2::new(i.width as f32, i.height as f32).to_array(),
-            padding: [0.0; 2],
-            lens,
-            fisheye,
-            to_light: to_light().extend(0.0).to_array(),
-            key: [0.86, 0.82, 0.76, 0.0],
-            sky: [0.42, 0.44, 0.47, 0.0],
-            ground: [0.20, 0.175, 0.15, 0.0],
-            feet: self.light.1,
-        };
-        self.gpu.queue.write_buffer(&self.view, 0, bytemuck::bytes_of(&view));
+    fn bake(&self, encoder: &mut CommandEncoder, constants: &BindGroup, plate: &Plate, layers: &[Offsets]) {
+        let (samples, depth) = (view_of(&self.samples), view_of(&plate.depth));
+        let group = [BindingResource::TextureView(&samples), plate.layers.as_entire_binding()];
+        for (layer, offsets) in layers.iter().enumerate() {
+            let load = if layer == 0 { LoadOp::Clear(1.0) } else { LoadOp::Load };
+            {
+                let mut pass = pass(encoder, &[&samples], &depth, load);
+                pass.set_pipeline(&self.pipelines.room_layer);
+                pass.set_bind_group(0, constants, offsets);
+                pass.set_bind_group(1, &self.room_bind, &[]);
+                self.draw_room(&mut pass, 0, 0..1);
+            }
+            let group = bind(&self.gpu, &self.layouts.plate, &group);
+            self.dispatch(encoder, &self.pipelines.plate, constants, *offsets, &group);
+        }
     }
 
-    fn draw(
+    fn draw_people(
         &self,
         encoder: &mut CommandEncoder,
-        pipeline: &RenderPipeline,
-        group: &BindGroup,
-        targets: &[&TextureView],
-        depth: &TextureView,
+        constants: &BindGroup,
+        plate: &Plate,
+        offsets: Offsets,
+        people: bool,
     ) {
-        let colors: Vec<_> = targets
-            .iter()
-            .map(|&view| {
-                let ops = Operations { load: LoadOp::Clear(Color::TRANSPARENT), store: StoreOp::Store };
-                Some(RenderPassColorAttachment { view, depth_slice: None, resolve_target: None, ops })
-            })
-            .collect();
-        let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
-            label: None,
-            color_attachments: &colors,
-            depth_stencil_attachment: Some(RenderPassDepthStencilAttachment {
-                view: depth,
-                depth_ops: Some(Operations { load: LoadOp::Clear(1.0), store: StoreOp::Store }),
-                stencil_ops: None,
-            }),
-            ..Default::default()
-        });
-        pass.set_pipeline(pipeline);
-        pass.set_bind_group(0, group, &[]);
-        for (slot, buffer) in (0..).zip([&self.positions, &self.normals, &self.paint, &self.truth]) {
-            pass.set_vertex_buffer(slot, buffer.slice(..));
+        encoder.copy_texture_to_texture(plate.depth.as_image_copy(), self.depth.as_image_copy(), self.depth.size());
+        let mut pass = pass(encoder, &[&view_of(&self.samples)], &view_of(&self.depth), LoadOp::Load);
+        if !people {
+            return;
         }
-        pass.set_index_buffer(self.indices.slice(..), wgpu::IndexFormat::Uint32);
-        pass.draw_indexed(0..self.index_count, 0, 0..1);
+        pass.set_pipeline(&self.pipelines.person_color);
+        pass.set_bind_group(0, constants, &offsets);
+        for (figure, surface) in &self.people {
+            pass.set_bind_group(2, surface, &[]);
+            figure.draw(&mut pass, 0..1);
+        }
     }
 
-    /// Pixels of a texture without row padding; `T` is one texel.
-    fn read_texture<T: Pod>(&self, texture: &Texture) -> Result<Vec<T>, GpuError> {
+    fn compose(
+        &self,
+        encoder: &mut CommandEncoder,
+        constants: &BindGroup,
+        plate: &Plate,
+        offsets: Offsets,
+        sums: &Buffer,
+    ) {
+        let group = bind(
+            &self.gpu,
+            &self.layouts.picture,
+            &[
+                BindingResource::TextureView(&view_of(&self.samples)),
+                BindingResource::TextureView(&view_of(&plate.depth)),
+                plate.layers.as_entire_binding(),
+                plate.directions.as_entire_binding(),
+                BindingResource::TextureView(&array_view(&self.people_maps)),
+                BindingResource::Sampler(&self.compare),
+                sums.as_entire_binding(),
+                self.pixels.as_entire_binding(),
+            ],
+        );
+        self.dispatch(encoder, &self.pipelines.picture, constants, offsets, &group);
+    }
+
+    /// Runs a kernel over all pixels.
+    fn dispatch(
+        &self,
+        encoder: &mut CommandEncoder,
+        pipeline: &ComputePipeline,
+        constants: &BindGroup,
+        offsets: Offsets,
+        group: &BindGroup,
+    ) {
+        let mut pass = encoder.begin_compute_pass(&Default::default());
+        pass.set_pipeline(pipeline);
+        pass.set_bind_group(0, constants, &offsets);
+        pass.set_bind_group(1, group, &[]);
+        pass.dispatch_workgroups(self.size[0].div_ceil(8), self.size[1].div_ceil(8), 1);
+    }
+
+    fn draw_room(&self, pass: &mut wgpu::RenderPass<'_>, first_triangle: usize, instances: std::ops::Range<u32>) {
+        let range = first_triangle as u32 * 3..self.scene.mesh.triangles.len() as u32 * 3;
+        if range.is_empty() {
+            return;
+        }
+        pass.set_vertex_buffer(0, self.room_vertices.slice(..));
+        pass.set_index_buffer(self.room_indices.slice(..), wgpu::IndexFormat::Uint32);
+        pass.draw_indexed(range, 0, instances);
+    }
+
+    /// Pixels of a texture without row padding.
+    fn read_truth(&self, texture: &Texture) -> Result<Vec<[f32; 4]>, GpuError> {
         let [width, height] = self.size;
-        let row = width as usize * size_of::<T>();
+        let row = width as usize * 16;
         let padded = row.next_multiple_of(wgpu::COPY_BYTES_PER_ROW_ALIGNMENT as usize);
         let bytes = padded * height as usize;
         let copy = self.gpu.device.create_buffer(&wgpu::BufferDescriptor {
@@ -360,46 +559,102 @@ impl Drawing {
             mapped_at_creation: false,
         });
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+        let layout =
+            wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(padded as u32), rows_per_image: None };
         encoder.copy_texture_to_buffer(
             texture.as_image_copy(),
-            wgpu::TexelCopyBufferInfo {
-                buffer: &copy,
-                layout: wgpu::TexelCopyBufferLayout {
-                    offset: 0,
-                    bytes_per_row: Some(padded as u32),
-                    rows_per_image: None,
-                },
-            },
+            wgpu::TexelCopyBufferInfo { buffer: &copy, layout },
             texture.size(),
         );
         self.gpu.queue.submit([encoder.finish()]);
         let raw: Vec<u8> = read_back(&self.gpu, &copy, bytes)?;
-        Ok(raw.chunks_exact(padded).flat_map(|line| bytemuck::pod_collect_to_vec::<u8, T>(&line[..row])).collect())
+        Ok(raw
+            .chunks_exact(padded)
+            .flat_map(|line| bytemuck::pod_collect_to_vec::<u8, [f32; 4]>(&line[..row]))
+            .collect())
     }
 }
 
-/// Unit vector from the person to the key light: high, in front and to the left of camera 0's view.
-fn to_light() -> Vec3 {
-    Vec3::new(-0.50, -0.62, 0.95).normalize()
-}
-
-#[cfg(test)]
-mod tests {
-    #[test]
-    fn the_shaders_are_valid() {
-        for (name, source) in super::shader_sources() {
-            assert!(!source.contains("var<uniform>"), "{name}: leaks on Mesa's software adapter");
-            let module = naga::front::wgsl::parse_str(&source)
-                .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&source)));
-            let mut validator =
-                naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::empty());
-            let info = validator.validate(&module).unwrap_or_else(|e| panic!("{name}: {e:?}"));
-            let _ = info;
-            if let Some((_, view)) = module.types.iter().find(|(_, ty)| ty.name.as_deref() == Some("View"))
-                && let naga::TypeInner::Struct { span, .. } = view.inner
-            {
-                assert_eq!(span as usize, size_of::<super::View>(), "{name}: struct View");
-            }
+impl Pipelines {
+    fn new(gpu: &GpuContext, layouts: &Layouts) -> Self {
+        let [people, room, plate, picture] = shader_sources().map(|(label, source)| {
+            gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some(label),
+                source: wgpu::ShaderSource::Wgsl(source.into()),
+            })
+        });
+        let Layouts { constants, points, person, room: room_layout, .. } = layouts;
+        let figure = |vertex, fragment, layouts, targets, samples| {
+            let attributes = &[VertexFormat::Float32x4, VertexFormat::Float32x4];
+            let drawn =
+                Drawn { module: &people, layouts, vertex, fragment, attributes, interleaved: false, targets, samples };
+            pipeline(gpu, drawn)
+        };
+        let standing = |vertex, fragment, layouts, targets, samples| {
+            let attributes = &[
+                VertexFormat::Float32x3,
+                VertexFormat::Float32x3,
+                VertexFormat::Float32x4,
+                VertexFormat::Float32x4,
+                VertexFormat::Float32x2,
+            ];
+            let drawn =
+                Drawn { module: &room, layouts, vertex, fragment, attributes, interleaved: true, targets, samples };
+            pipeline(gpu, drawn)
+        };
+        Self {
+            person_shadow: figure("vs_shadow", None, &[constants, points], &[], 1),
+            person_color: figure("vs_person", Some("fs_color"), &[constants, points, person], &[LIGHT], SAMPLES),
+            person_truth: figure("vs_person", Some("fs_truth"), &[constants, points, person], &[TRUTH, TRUTH], 1),
+            room_shadow: standing("vs_room_shadow", None, &[constants], &[], 1),
+            room_layer: standing("vs_room", Some("fs_layer"), &[constants, room_layout], &[LIGHT], SAMPLES),
+            room_depth: standing("vs_room", None, &[constants], &[], 1),
+            plate: compute(gpu, &plate, &[constants, &layouts.plate], "keep"),
+            picture: compute(gpu, &picture, &[constants, &layouts.picture], "compose"),
         }
     }
+}
+
+/// All sub-frames, those of one time together.
+fn steps(takes: &[Take]) -> Vec<Step> {
+    let mut steps: Vec<Step> = Vec::new();
+    for (take, of) in takes.iter().enumerate() {
+        let frames = of.optics.sub_frames();
+        steps.extend(frames.into_iter().map(|frame| Step { secs: frame.secs, take, frame, first: false, last: false }));
+    }
+    steps.sort_by(|a, b| a.secs.total_cmp(&b.secs).then(a.take.cmp(&b.take)));
+    for take in 0..takes.len() {
+        if let Some(step) = steps.iter_mut().find(|step| step.take == take) {
+            step.first = true;
+        }
+        if let Some(step) = steps.iter_mut().rfind(|step| step.take == take) {
+            step.last = true;
+        }
+    }
+    steps
+}
+
+fn pass<'a>(
+    encoder: &'a mut CommandEncoder,
+    targets: &[&TextureView],
+    depth: &TextureView,
+    depth_load: LoadOp<f32>,
+) -> wgpu::RenderPass<'a> {
+    let colors: Vec<_> = targets
+        .iter()
+        .map(|&view| {
+            let ops = Operations { load: LoadOp::Clear(Color::TRANSPARENT), store: StoreOp::Store };
+            Some(RenderPassColorAttachment { view, depth_slice: None, resolve_target: None, ops })
+        })
+        .collect();
+    encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+        label: None,
+        color_attachments: &colors,
+        depth_stencil_attachment: Some(RenderPassDepthStencilAttachment {
+            view: depth,
+            depth_ops: Some(Operations { load: depth_load, store: StoreOp::Store }),
+            stencil_ops: None,
+        }),
+        ..Default::default()
+    })
 }

@@ -10,7 +10,7 @@ use flyrig_types::{CameraId, write_whole};
 use image::{ExtendedColorType, ImageEncoder as _};
 use serde_json::json;
 
-use crate::source::shoot;
+use crate::source::{shot, spoilt};
 use crate::truth_file::write_truth;
 use crate::{Delivery, FramePlan, SimError, Simulator};
 
@@ -37,10 +37,11 @@ pub struct Exported {
 /// - `intri.yml`, `extri.yml`, `images/CAM/000000.png`, `mask/CAM/000000.png`, `background/CAM.png` (EasyMocap layout),
 /// - `subject.glb`: the body without clothes and its motion, z up,
 /// - `simulation.toml`: the configuration that makes the same capture again,
+/// - `truth/intri.yml`, `truth/extri.yml`: the cameras as they are, without the calibration error,
 /// - `truth/frames.csv`: when each frame was taken, what its stamp said, and whether it came,
 /// - `truth/poses.jsonl`: a line a frame with pose and joints,
 /// - `truth/surface/000000.ply`: the clothed surface with canonical positions,
-/// - `truth/CAM/000000.exr`: depth, canonical position and part at each pixel, of the instant that the picture shows.
+/// - `truth/CAM/000000.exr`: depth, normal, canonical position and part at each pixel, as the picture shows them.
 ///
 /// A frame that the fault script loses has no picture. `go_on` is told how many frames are done and ends the export by
 /// returning false. Everything is written beside the folder first: it appears whole or not at all.
@@ -107,7 +108,7 @@ impl Folder {
                 self.folder(&format!("{kind}/{camera}"))?;
             }
         }
-        save_easymocap(&self.root, simulator.rig())?;
+        save_easymocap(&self.root, &simulator.reported_rig())?;
         for (slot, camera) in cameras.iter().enumerate() {
             let plate = simulator.plate(slot)?;
             let size = [plate.width(), plate.height()];
@@ -169,14 +170,18 @@ impl Folder {
         plan: &FramePlan,
         truth: bool,
     ) -> Result<(), SimError> {
-        let (picture, mask) = shoot(simulator, plan, slot, frame)?;
+        let shot = shot(plan, slot);
+        let (picture, mask) = if truth {
+            let seen = simulator.render_with(&shot)?;
+            write_truth(&self.root.join(format!("truth/{camera}/{frame:06}.exr")), &seen)?;
+            (seen.color, seen.mask)
+        } else {
+            simulator.capture_with(&shot)?
+        };
+        let picture = spoilt(simulator, plan, frame, picture)?;
         let size = [picture.width(), picture.height()];
         self.png(&format!("images/{camera}/{frame:06}.png"), picture.bytes(), size, ExtendedColorType::Rgb8)?;
         self.png(&format!("mask/{camera}/{frame:06}.png"), mask.coverage(), size, ExtendedColorType::L8)?;
-        if truth {
-            let seen = simulator.render(plan.true_nanos, slot)?;
-            write_truth(&self.root.join(format!("truth/{camera}/{frame:06}.exr")), &seen)?;
-        }
         Ok(())
     }
 

@@ -91,6 +91,25 @@ pub struct Fault {
     pub deg: Option<f64>,
 }
 
+impl Fault {
+    /// A fault of a kind that hits every frame of every camera, without numbers.
+    #[must_use]
+    pub fn new(kind: FaultKind) -> Self {
+        Self {
+            kind,
+            camera: None,
+            from_frame: 0,
+            frames: None,
+            probability: always(),
+            ms: None,
+            ppm: None,
+            factor: None,
+            mm: None,
+            deg: None,
+        }
+    }
+}
+
 fn always() -> f64 {
     1.0
 }

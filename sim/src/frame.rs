@@ -4,20 +4,24 @@ use flyrig_body::Part;
 use flyrig_types::{Image, Mask, Pose};
 use glam::Vec3;
 
-/// One picture with the truth of its instant. Pictures are row by row, one element a pixel; the truth
-/// but for `mask` is taken at pixel centres.
+/// One picture with the truth of its instant. Pictures are row by row, one element a pixel; the truth but for `mask`
+/// is taken at pixel centres, through the middle of the lens, at the middle of the exposure: of a rolling shutter each
+/// row at the middle of its own. `mask` is blurred like the picture.
 #[derive(Debug)]
 pub struct SimFrame {
-    /// Time of everything in here.
+    /// Middle of the middle row's exposure.
     pub nanos: i64,
     /// Pose of the body.
     pub pose: Pose,
     /// sRGB, [`flyrig_types::PixelFormat::Rgb8`].
     pub color: Image,
-    /// Coverage by the person.
+    /// Share of each pixel in which the person is seen: not behind furniture or somebody else.
     pub mask: Mask,
-    /// Camera-space z of the visible clothed surface, metres; 0 on the background.
+    /// Camera-space z of the visible clothed surface, metres; 0 where something else is seen.
     pub depth: Vec<f32>,
+    /// World unit normal of that surface, interpolated between its vertices, on the side that is seen; 0 where
+    /// something else is seen.
+    pub normal: Vec<[f32; 3]>,
     /// Canonical position (of the template without clothes, metres) of the body point that carries what is
     /// seen; w is 1 on the person and 0 on the background.
     pub canonical: Vec<[f32; 4]>,

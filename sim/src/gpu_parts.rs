@@ -1,155 +1,248 @@
-//! Textures, plates and pipelines in wgpu's words.
+//! Textures, layouts and pipelines in wgpu's words.
 
-use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
+use flyrig_gpu::GpuContext;
 use wgpu::{
-    BindGroup, BindingResource, CompareFunction, RenderPipeline, Texture, TextureDescriptor, TextureDimension,
-    TextureFormat, TextureUsages, TextureView, VertexAttribute, VertexBufferLayout, VertexFormat, VertexStepMode,
+    BindGroup, BindGroupLayout, BindGroupLayoutEntry, BindingResource, BindingType, BufferBindingType, CompareFunction,
+    ComputePipeline, RenderPipeline, SamplerBindingType, ShaderModule, ShaderStages, Texture, TextureDescriptor,
+    TextureDimension, TextureFormat, TextureSampleType, TextureUsages, TextureView, TextureViewDimension,
+    VertexAttribute, VertexBufferLayout, VertexFormat, VertexStepMode,
 };
 
-use crate::person::Person;
-use crate::room::Plate;
+use crate::texture::Texture as Picture;
 
-/// Of colours that are blended and filtered.
-pub(crate) const COLOR: TextureFormat = TextureFormat::Rgba8UnormSrgb;
+/// Of drawn light.
+pub(crate) const LIGHT: TextureFormat = TextureFormat::Rgba16Float;
+/// Of textures.
+pub(crate) const PAINT: TextureFormat = TextureFormat::Rgba8UnormSrgb;
 /// Of depth pictures.
 pub(crate) const DEPTH: TextureFormat = TextureFormat::Depth32Float;
+/// Of truth.
+pub(crate) const TRUTH: TextureFormat = TextureFormat::Rgba32Float;
+/// Samples of a pixel.
+pub(crate) const SAMPLES: u32 = 4;
 
-/// Bind group 0 of a pipeline with derived layout, resources at bindings 0, 1, 2, ...
-pub(crate) fn bind(gpu: &GpuContext, pipeline: &RenderPipeline, resources: &[BindingResource<'_>]) -> BindGroup {
+/// What is bound, in the order of the bindings of a group.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Slot {
+    /// A storage buffer at an offset given when it is set.
+    Constants,
+    Read,
+    Write,
+    Textures,
+    DepthMaps,
+    ManySamples,
+    ManyDepths,
+    Smooth,
+    Compare,
+}
+
+pub(crate) fn layout(gpu: &GpuContext, label: &str, slots: &[Slot]) -> BindGroupLayout {
+    let texture =
+        |sample_type, view_dimension, multisampled| BindingType::Texture { sample_type, view_dimension, multisampled };
+    let buffer = |read_only, has_dynamic_offset| BindingType::Buffer {
+        ty: BufferBindingType::Storage { read_only },
+        has_dynamic_offset,
+        min_binding_size: None,
+    };
+    let entries: Vec<_> = (0..)
+        .zip(slots)
+        .map(|(binding, slot)| BindGroupLayoutEntry {
+            binding,
+            visibility: match slot {
+                Slot::Write => ShaderStages::COMPUTE,
+                _ => ShaderStages::VERTEX_FRAGMENT | ShaderStages::COMPUTE,
+            },
+            ty: match slot {
+                Slot::Constants => buffer(true, true),
+                Slot::Read => buffer(true, false),
+                Slot::Write => buffer(false, false),
+                Slot::Textures => {
+                    texture(TextureSampleType::Float { filterable: true }, TextureViewDimension::D2Array, false)
+                }
+                Slot::DepthMaps => texture(TextureSampleType::Depth, TextureViewDimension::D2Array, false),
+                Slot::ManySamples => {
+                    texture(TextureSampleType::Float { filterable: false }, TextureViewDimension::D2, true)
+                }
+                Slot::ManyDepths => texture(TextureSampleType::Depth, TextureViewDimension::D2, true),
+                Slot::Smooth => BindingType::Sampler(SamplerBindingType::Filtering),
+                Slot::Compare => BindingType::Sampler(SamplerBindingType::Comparison),
+            },
+            count: None,
+        })
+        .collect();
+    gpu.device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(label), entries: &entries })
+}
+
+/// Resources at bindings 0, 1, 2, ...
+pub(crate) fn bind(gpu: &GpuContext, layout: &BindGroupLayout, resources: &[BindingResource<'_>]) -> BindGroup {
     let entries: Vec<_> = (0..)
         .zip(resources)
         .map(|(binding, resource)| wgpu::BindGroupEntry { binding, resource: resource.clone() })
         .collect();
-    gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
-        label: None,
-        layout: &pipeline.get_bind_group_layout(0),
-        entries: &entries,
-    })
+    gpu.device.create_bind_group(&wgpu::BindGroupDescriptor { label: None, layout, entries: &entries })
 }
 
 pub(crate) fn view_of(texture: &Texture) -> TextureView {
     texture.create_view(&Default::default())
 }
 
-pub(crate) fn texture(
+pub(crate) fn array_view(texture: &Texture) -> TextureView {
+    texture.create_view(&wgpu::TextureViewDescriptor {
+        dimension: Some(TextureViewDimension::D2Array),
+        ..Default::default()
+    })
+}
+
+/// One layer of an array, to draw into.
+pub(crate) fn layer_view(texture: &Texture, layer: u32) -> TextureView {
+    texture.create_view(&wgpu::TextureViewDescriptor {
+        dimension: Some(TextureViewDimension::D2),
+        base_array_layer: layer,
+        array_layer_count: Some(1),
+        ..Default::default()
+    })
+}
+
+pub(crate) fn target(
     gpu: &GpuContext,
     label: &str,
     [width, height, layers]: [u32; 3],
-    mips: u32,
+    sample_count: u32,
     format: TextureFormat,
     usage: TextureUsages,
 ) -> Texture {
     gpu.device.create_texture(&TextureDescriptor {
         label: Some(label),
         size: wgpu::Extent3d { width, height, depth_or_array_layers: layers },
-        mip_level_count: mips,
-        sample_count: 1,
+        mip_level_count: 1,
+        sample_count,
         dimension: TextureDimension::D2,
         format,
-        usage,
+        usage: usage | TextureUsages::RENDER_ATTACHMENT,
         view_formats: &[],
     })
 }
 
-pub(crate) fn upload_textures(gpu: &GpuContext, person: &Person) -> TextureView {
-    let side = person.textures.first().map_or(1, |texture| texture.side) as u32;
-    let mips = side.ilog2() + 1;
-    let usage = TextureUsages::TEXTURE_BINDING | TextureUsages::COPY_DST;
-    let array = texture(gpu, "person textures", [side, side, person.textures.len() as u32], mips, COLOR, usage);
-    for (layer, image) in (0..).zip(&person.textures) {
-        let mut image = image.clone();
-        for mip in 0..mips {
-            write_layer(gpu, &array, layer, mip, [side >> mip, side >> mip], &image.pixels);
-            image = image.halved();
+/// All of one side, with their mip levels.
+pub(crate) fn upload_textures(gpu: &GpuContext, label: &str, pictures: &[Picture]) -> TextureView {
+    let side = pictures.first().map_or(1, |picture| picture.side) as u32;
+    let array = gpu.device.create_texture(&TextureDescriptor {
+        label: Some(label),
+        size: wgpu::Extent3d { width: side, height: side, depth_or_array_layers: pictures.len().max(1) as u32 },
+        mip_level_count: side.ilog2() + 1,
+        sample_count: 1,
+        dimension: TextureDimension::D2,
+        format: PAINT,
+        usage: TextureUsages::TEXTURE_BINDING | TextureUsages::COPY_DST,
+        view_formats: &[],
+    });
+    for (layer, picture) in (0..).zip(pictures) {
+        let mut picture = picture.clone();
+        for mip in 0..array.mip_level_count() {
+            let side = (side >> mip).max(1);
+            gpu.queue.write_texture(
+                wgpu::TexelCopyTextureInfo {
+                    texture: &array,
+                    mip_level: mip,
+                    origin: wgpu::Origin3d { x: 0, y: 0, z: layer },
+                    aspect: wgpu::TextureAspect::All,
+                },
+                bytemuck::cast_slice(&picture.pixels),
+                wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(side * 4), rows_per_image: Some(side) },
+                wgpu::Extent3d { width: side, height: side, depth_or_array_layers: 1 },
+            );
+            picture = picture.halved();
         }
     }
-    array.create_view(&wgpu::TextureViewDescriptor {
-        dimension: Some(wgpu::TextureViewDimension::D2Array),
-        ..Default::default()
-    })
+    array_view(&array)
 }
 
-pub(crate) fn upload_plate(
-    gpu: &GpuContext,
-    plate: &Plate,
-    [width, height]: [u32; 2],
-) -> Result<(TextureView, StorageBuffer<[f32; 2]>), GpuError> {
-    let usage = TextureUsages::TEXTURE_BINDING | TextureUsages::COPY_DST;
-    let image = texture(gpu, "plate", [width, height, 1], 1, COLOR, usage);
-    write_layer(gpu, &image, 0, 0, [width, height], &plate.rgba);
-    Ok((view_of(&image), StorageBuffer::from_slice(gpu, "floor positions", &plate.floor)?))
+/// What a render pipeline is made of.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Drawn<'a> {
+    pub module: &'a ShaderModule,
+    pub layouts: &'a [&'a BindGroupLayout],
+    pub vertex: &'a str,
+    pub fragment: Option<&'a str>,
+    /// Vertex attributes and whether each has a buffer of its own.
+    pub attributes: &'a [VertexFormat],
+    pub interleaved: bool,
+    pub targets: &'a [TextureFormat],
+    pub samples: u32,
 }
 
-pub(crate) fn write_layer(
-    gpu: &GpuContext,
-    texture: &Texture,
-    layer: u32,
-    mip: u32,
-    [width, height]: [u32; 2],
-    rgba: &[[u8; 4]],
-) {
-    let (width, height) = (width.max(1), height.max(1));
-    gpu.queue.write_texture(
-        wgpu::TexelCopyTextureInfo {
-            texture,
-            mip_level: mip,
-            origin: wgpu::Origin3d { x: 0, y: 0, z: layer },
-            aspect: wgpu::TextureAspect::All,
-        },
-        bytemuck::cast_slice(rgba),
-        wgpu::TexelCopyBufferLayout { offset: 0, bytes_per_row: Some(width * 4), rows_per_image: Some(height) },
-        wgpu::Extent3d { width, height, depth_or_array_layers: 1 },
-    );
-}
-
-pub(crate) fn pipeline(
-    gpu: &GpuContext,
-    module: &wgpu::ShaderModule,
-    vertex: &str,
-    fragment: Option<&str>,
-    formats: &[TextureFormat],
-) -> RenderPipeline {
-    let attribute = |format, shader_location| [VertexAttribute { format, offset: 0, shader_location }];
-    let attributes = [
-        attribute(VertexFormat::Float32x3, 0),
-        attribute(VertexFormat::Float32x3, 1),
-        attribute(VertexFormat::Float32x4, 2),
-        attribute(VertexFormat::Float32x4, 3),
-    ];
-    let buffers = attributes.each_ref().map(|attributes| {
-        Some(VertexBufferLayout {
-            array_stride: attributes[0].format.size(),
-            step_mode: VertexStepMode::Vertex,
-            attributes,
+pub(crate) fn pipeline(gpu: &GpuContext, drawn: Drawn<'_>) -> RenderPipeline {
+    let mut offset = 0;
+    let attributes: Vec<VertexAttribute> = (0..)
+        .zip(drawn.attributes)
+        .map(|(shader_location, &format)| {
+            let at = if drawn.interleaved { offset } else { 0 };
+            offset += format.size();
+            VertexAttribute { format, offset: at, shader_location }
         })
-    });
-    let targets: Vec<_> = formats.iter().map(|&format| Some(format.into())).collect();
+        .collect();
+    let stride = |attributes: &[VertexAttribute]| attributes.iter().map(|a| a.format.size()).sum();
+    let per_buffer = if drawn.interleaved { attributes.len().max(1) } else { 1 };
+    let buffers: Vec<_> = attributes
+        .chunks(per_buffer)
+        .map(|attributes| {
+            let step_mode = VertexStepMode::Vertex;
+            Some(VertexBufferLayout { array_stride: stride(attributes), step_mode, attributes })
+        })
+        .collect();
+    let targets: Vec<_> = drawn.targets.iter().map(|&format| Some(format.into())).collect();
     gpu.device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
-        label: Some(vertex),
-        layout: None,
+        label: Some(drawn.vertex),
+        layout: Some(&pipeline_layout(gpu, drawn.layouts)),
         vertex: wgpu::VertexState {
-            module,
-            entry_point: Some(vertex),
+            module: drawn.module,
+            entry_point: Some(drawn.vertex),
             compilation_options: Default::default(),
             buffers: &buffers,
         },
-        // Hems and hair are seen from inside too.
+        // Hems, hair and leaves are seen from inside too.
         primitive: wgpu::PrimitiveState::default(),
         depth_stencil: Some(wgpu::DepthStencilState {
             format: DEPTH,
             depth_write_enabled: Some(true),
-            depth_compare: Some(CompareFunction::Less),
+            // The layers of a plate are drawn over the same depth.
+            depth_compare: Some(CompareFunction::LessEqual),
             stencil: Default::default(),
             bias: Default::default(),
         }),
-        multisample: Default::default(),
-        fragment: fragment.map(|entry| wgpu::FragmentState {
-            module,
+        multisample: wgpu::MultisampleState { count: drawn.samples, ..Default::default() },
+        fragment: drawn.fragment.map(|entry| wgpu::FragmentState {
+            module: drawn.module,
             entry_point: Some(entry),
             compilation_options: Default::default(),
             targets: &targets,
         }),
         multiview_mask: None,
         cache: None,
+    })
+}
+
+pub(crate) fn compute(
+    gpu: &GpuContext,
+    module: &ShaderModule,
+    layouts: &[&BindGroupLayout],
+    entry: &str,
+) -> ComputePipeline {
+    gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+        label: Some(entry),
+        layout: Some(&pipeline_layout(gpu, layouts)),
+        module,
+        entry_point: Some(entry),
+        compilation_options: Default::default(),
+        cache: None,
+    })
+}
+
+fn pipeline_layout(gpu: &GpuContext, layouts: &[&BindGroupLayout]) -> wgpu::PipelineLayout {
+    let layouts: Vec<_> = layouts.iter().map(|&layout| Some(layout)).collect();
+    gpu.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+        label: None,
+        bind_group_layouts: &layouts,
+        immediate_size: 0,
     })
 }

@@ -80,7 +80,6 @@ fn by_seed(config: &SimConfig) -> MotionConfig {
 ///
 /// # Errors
 /// [`SimError::NoJoint`], [`SimError::Pose`].
-#[allow(dead_code)]
 pub(crate) fn pass_by(person: &Person, seed: u64, reach_m: f64) -> Result<PoseTrack, SimError> {
     let mut dice = StdRng::seed_from_u64(seed ^ 0x7061_7373);
     let puppet = Puppet::new(&person.body.skeleton, &person.clothed)?;

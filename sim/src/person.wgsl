@@ -1,114 +1,141 @@
-// Draws the clothed person. Prepended: view.wgsl.
+// Draws clothed people. Prepended: constants, view.wgsl and light.wgsl.
+
+// Position and openness, normal.
+struct Point {
+    place: vec4<f32>,
+    normal: vec4<f32>,
+}
 
 @group(0) @binding(0) var<storage, read> view: View;
-@group(0) @binding(1) var textures: texture_2d_array<f32>;
-@group(0) @binding(2) var smooth_sampler: sampler;
-@group(0) @binding(3) var shadow_map: texture_depth_2d;
-@group(0) @binding(4) var shadow_sampler: sampler_comparison;
+@group(0) @binding(1) var<storage, read> light: Light;
+// All points at the first key, at the second, and so on.
+@group(1) @binding(0) var<storage, read> points: array<Point>;
+@group(2) @binding(0) var textures: texture_2d_array<f32>;
+@group(2) @binding(1) var smooth_sampler: sampler;
+@group(2) @binding(2) var people_maps: texture_depth_2d_array;
+@group(2) @binding(3) var room_maps: texture_depth_2d_array;
+@group(2) @binding(4) var compare: sampler_comparison;
 
 struct Vertex {
-    @location(0) position: vec3<f32>,
-    @location(1) normal: vec3<f32>,
-    // uv, layer, openness
-    @location(2) paint: vec4<f32>,
-    // Canonical position of the carrying body point, part index
-    @location(3) truth: vec4<f32>,
+    @builtin(vertex_index) index: u32,
+    // uv, layer, part + 1 (0: somebody else)
+    @location(0) paint: vec4<f32>,
+    // Canonical position of the carrying body point, number of points a key
+    @location(1) truth: vec4<f32>,
 }
 
 struct Fragment {
     @builtin(position) clip: vec4<f32>,
-    @location(0) world: vec3<f32>,
-    @location(1) normal: vec3<f32>,
-    @location(2) uv: vec2<f32>,
-    @location(3) openness: f32,
-    @location(4) canonical: vec3<f32>,
-    @location(5) depth_m: f32,
+    @location(0) @interpolate(perspective, centroid) world: vec3<f32>,
+    @location(1) @interpolate(perspective, centroid) normal: vec3<f32>,
+    @location(2) @interpolate(perspective, centroid) uv: vec2<f32>,
+    @location(3) @interpolate(perspective, centroid) openness: f32,
+    @location(4) @interpolate(perspective, centroid) canonical: vec3<f32>,
+    @location(5) @interpolate(perspective, centroid) depth_m: f32,
     @location(6) @interpolate(flat) layer_part: vec2<u32>,
+}
+
+// A point at a time, on the parabola through the three nearest keys.
+fn point_at(vertex: Vertex, secs: f32) -> Point {
+    let keys = u32(view.keys.z);
+    if (keys < 3u) {
+        return points[vertex.index];
+    }
+    let at = (secs - view.keys.x) * view.keys.y;
+    let middle = clamp(floor(at + 0.5), 1.0, view.keys.z - 2.0);
+    let s = at - middle;
+    let count = u32(vertex.truth.w);
+    let first = (u32(middle) - 1u) * count + vertex.index;
+    let a = points[first];
+    let b = points[first + count];
+    let c = points[first + 2u * count];
+    let wa = 0.5 * s * (s - 1.0);
+    let wb = 1.0 - s * s;
+    let wc = 0.5 * s * (s + 1.0);
+    return Point(a.place * wa + b.place * wb + c.place * wc, a.normal * wa + b.normal * wb + c.normal * wc);
 }
 
 @vertex
 fn vs_person(vertex: Vertex) -> Fragment {
-    let camera = (view.camera_from_world * vec4(vertex.position, 1.0)).xyz;
-    var ideal = camera.xy / max(camera.z, NEAR_M * 0.5);
-    let r = min(length(ideal), view.lens.z);
-    let r2 = r * r;
-    if (view.lens.w > 0.5) {
-        let theta = atan(r);
-        let t2 = theta * theta;
-        let k = view.fisheye;
-        let bent = theta * (1.0 + t2 * (k.x + t2 * (k.y + t2 * (k.z + t2 * k.w))));
-        ideal *= bent / max(length(ideal), 1e-9);
-    } else {
-        ideal *= 1.0 + r2 * (view.lens.x + r2 * view.lens.y);
+    let still = point_at(vertex, view.moment.x);
+    var seen = still;
+    var camera = (view.camera_from_world * vec4(seen.place.xyz, 1.0)).xyz;
+    var pixel = pixel_of(camera);
+    if (view.moment.y != 0.0) {
+        // The row in which the point is seen at that row's own time: a contraction, since nothing crosses the picture
+        // within one readout.
+        for (var i = 0; i < ROW_STEPS; i++) {
+            let row = clamp(pixel.y, -0.5, view.size_px.y - 0.5);
+            seen = point_at(vertex, view.moment.x + (row - view.moment.z) * view.moment.y);
+            camera = (view.camera_from_world * vec4(seen.place.xyz, 1.0)).xyz;
+            pixel = pixel_of(camera);
+        }
     }
-    let pixel = ideal * view.focal_px + view.center_px;
-    let device = (pixel + 0.5) / view.size_px * vec2(2.0, -2.0) + vec2(-1.0, 1.0);
     var out: Fragment;
-    // w = z makes the interpolation perspective-correct; z_device = 1 - near / z.
-    out.clip = vec4(device * camera.z, camera.z - NEAR_M, camera.z);
-    out.world = vertex.position;
-    out.normal = vertex.normal;
+    out.clip = clip_of(pixel, camera.z);
+    // Shadows are those of the middle row's time, and so is the place that they are looked up at.
+    out.world = still.place.xyz;
+    out.normal = seen.normal.xyz;
     out.uv = vertex.paint.xy;
-    out.openness = vertex.paint.w;
+    out.openness = still.place.w;
     out.canonical = vertex.truth.xyz;
     out.depth_m = camera.z;
-    out.layer_part = vec2(u32(vertex.paint.z), u32(vertex.truth.w));
+    out.layer_part = vec2(u32(vertex.paint.z), u32(vertex.paint.w));
     return out;
 }
 
 @vertex
-fn vs_shadow(vertex: Vertex) -> @builtin(position) vec4<f32> {
-    return view.light_from_world * vec4(vertex.position, 1.0);
-}
-
-// Share of the key light that reaches a point, four samples `spread` shadow texels apart.
-fn lit(world: vec3<f32>, spread: f32, bias: f32) -> f32 {
-    let clip = view.light_from_world * vec4(world, 1.0);
-    let at = clip.xy * vec2(0.5, -0.5) + 0.5;
-    let step = spread / vec2<f32>(textureDimensions(shadow_map));
-    var sum = 0.0;
-    for (var i = 0u; i < 4u; i++) {
-        let offset = vec2(f32(i & 1u), f32(i >> 1u)) * 2.0 - 1.0;
-        sum += textureSampleCompareLevel(shadow_map, shadow_sampler, at + offset * step, clip.z - bias);
-    }
-    return sum * 0.25;
+fn vs_shadow(vertex: Vertex, @builtin(instance_index) lamp: u32) -> @builtin(position) vec4<f32> {
+    return light.lamps[lamp].people_from_world * vec4(point_at(vertex, view.moment.x).place.xyz, 1.0);
 }
 
 @fragment
 fn fs_color(in: Fragment, @builtin(front_facing) front: bool) -> @location(0) vec4<f32> {
-    let painted = textureSample(textures, smooth_sampler, in.uv, in.layer_part.x);
-    let albedo = painted.rgb;
+    let painted = textureSampleBias(textures, smooth_sampler, in.uv, in.layer_part.x, -0.5);
+    let levels = view.levels[u32(clamp(in.clip.y, 0.0, view.size_px.y - 1.0))];
     var normal = normalize(in.normal);
     if (!front) {
         normal = -normal;
     }
-    let facing = dot(normal, view.to_light.xyz);
-    var key = max(facing, 0.0);
-    if (key > 0.0) {
-        key *= lit(in.world + normal * 0.006, 0.8, 0.0015);
-    }
-    // Light of the room: brighter from above, some bounce from the floor, more from the walls facing the key.
-    let up = normal.z * 0.5 + 0.5;
-    let ambient = mix(view.ground.rgb, view.sky.rgb, up) * in.openness;
-    let bounce = view.sky.rgb * 0.18 * max(-facing, 0.0);
-    let light = view.key.rgb * key * mix(1.0, in.openness, 0.4) + ambient + bounce;
-    // Gloss: a wide highlight of the key light, and the sky at grazing angles.
-    let gloss = 1.0 - painted.a;
-    let camera = view.camera_from_world;
-    let eye = -(vec3(dot(camera[0].xyz, camera[3].xyz), dot(camera[1].xyz, camera[3].xyz), dot(camera[2].xyz, camera[3].xyz)));
-    let to_eye = normalize(eye - in.world);
-    let middle = max(dot(normal, normalize(to_eye + view.to_light.xyz)), 0.0);
+    let gloss = (1.0 - painted.a) * 0.8;
+    let to_eye = normalize(view.eye.xyz - in.world);
+    let around = surrounding(levels);
+    var sum = around * hemisphere(normal) * in.openness;
     let grazing = pow(1.0 - max(dot(normal, to_eye), 0.0), 4.0);
-    let shine = view.key.rgb * min(key * 4.0, 1.0) * pow(middle, 28.0) + view.sky.rgb * grazing * 0.35 * in.openness;
-    return vec4(albedo * light + gloss * 0.8 * shine, 1.0);
+    var shine = around * light.sky.rgb * grazing * 0.35 * in.openness;
+    for (var l = 0u; l < u32(light.steady.w); l++) {
+        let to_lamp = normalize(light.lamps[l].place.xyz - in.world);
+        let facing = facing_share(l, in.world, dot(normal, to_lamp));
+        let level = level_of(levels, l);
+        if (facing <= 0.0 || level <= 0.0) {
+            continue;
+        }
+        let lifted = vec4(in.world + normal * 0.006, 1.0);
+        var share = quick_share(
+            people_maps, compare, l, light.lamps[l].people_from_world * lifted, 0.004, 0.008, light.lamps[l].tangents.y);
+        if (share > 0.0) {
+            share *= quick_share(
+                room_maps, compare, l, light.lamps[l].room_from_world * lifted, 0.03, 0.02, light.lamps[l].tangents.x);
+        }
+        let got = arriving(l, in.world) * (level * share);
+        sum += got * facing * mix(1.0, in.openness, 0.4);
+        let middle = max(dot(normal, normalize(to_eye + to_lamp)), 0.0);
+        shine += got * min(facing * 4.0, 1.0) * pow(middle, 28.0);
+    }
+    return vec4(painted.rgb * sum + gloss * shine, select(0.5, 1.0, in.layer_part.y > 0u));
 }
 
 struct Truth {
     @location(0) canonical_depth: vec4<f32>,
-    @location(1) part: u32,
+    // World normal towards the camera, part + 1
+    @location(1) normal_part: vec4<f32>,
 }
 
 @fragment
-fn fs_truth(in: Fragment) -> Truth {
-    return Truth(vec4(in.canonical, in.depth_m), in.layer_part.y + 1u);
+fn fs_truth(in: Fragment, @builtin(front_facing) front: bool) -> Truth {
+    if (in.layer_part.y == 0u) {
+        return Truth(vec4(0.0), vec4(0.0));
+    }
+    let normal = normalize(in.normal) * select(-1.0, 1.0, front);
+    return Truth(vec4(in.canonical, in.depth_m), vec4(normal, f32(in.layer_part.y)));
 }

@@ -3,8 +3,9 @@
 use std::f64::consts::TAU;
 
 use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Lens, Rig};
-use glam::{DVec2, DVec3};
+use glam::{DQuat, DVec2, DVec3, EulerRot};
 
+use crate::sensor::{hash, uniform};
 use crate::{SimConfig, SimError};
 
 /// The ring of a configuration: `00`, `01`, ... counter-clockwise seen from above, `00` at -y, z up.
@@ -23,32 +24,50 @@ pub fn camera_ring(config: &SimConfig) -> Result<Rig, SimError> {
         center_px: (size - 1.0) * 0.5,
         lens: match ring.fisheye {
             Some(coefficients) => Lens::Fisheye { coefficients },
-            None => Lens::RadialTangential { radial: [k1, k2, 0.0], tangential: [0.0; 2] },
+            None => Lens::RadialTangential { radial: [k1, k2, 0.0], tangential: ring.tangential },
         },
     };
-    let corner = intrinsics.lens.undistort((size * 0.5 + 1.0) / intrinsics.focal_px);
-    if corner.is_none() {
-        return Err(SimError::Config {
-            field: if ring.fisheye.is_some() { "cameras.fisheye" } else { "cameras.radial" },
-            found: ring.fisheye.map_or_else(|| format!("{:?}", ring.radial), |k| format!("{k:?}")),
-            expected: "a lens that does not fold over inside the picture (weaker distortion or longer focal length)",
-        });
-    }
     let target = DVec3::new(0.0, 0.0, ring.target_height_m);
     let cameras = (0..ring.count)
         .map(|slot| {
+            let key = hash(hash(config.seed, 0x0ca3_e4a5), slot as u64);
+            let draw = |index| 2.0 * uniform(key, index) - 1.0;
+            let three = |first| DVec3::new(draw(first), draw(first + 1), draw(first + 2));
             let angle = TAU * slot as f64 / ring.count as f64 - TAU / 4.0;
-            let eye = DVec3::new(angle.cos() * ring.radius_m, angle.sin() * ring.radius_m, ring.height_m);
-            Camera {
+            let place = DVec3::new(angle.cos() * ring.radius_m, angle.sin() * ring.radius_m, ring.height_m);
+            let eye = (place + three(0) * ring.place_jitter_m).max(DVec3::new(f64::MIN, f64::MIN, 0.05));
+            let turn = three(3) * ring.aim_jitter_deg.to_radians();
+            let turn = Isometry::new(DQuat::from_euler(EulerRot::ZYX, turn.z, turn.y, turn.x), DVec3::ZERO);
+            let mut intrinsics = intrinsics;
+            intrinsics.focal_px *= 1.0 + draw(6) * ring.focal_jitter_percent * 0.01;
+            unfolded(config, &intrinsics)?;
+            Ok(Camera {
                 id: CameraId::from(format!("{slot:02}")),
                 intrinsics,
-                camera_from_world: Isometry::look_at(eye, target, DVec3::Z),
-            }
+                camera_from_world: turn * Isometry::look_at(eye, target, DVec3::Z),
+            })
         })
-        .collect();
+        .collect::<Result<_, SimError>>()?;
     let rig = Rig { cameras, world_up: DVec3::Z };
     rig.validate()?;
     Ok(rig)
+}
+
+/// Refuses a lens that has no direction for a corner of the picture.
+fn unfolded(config: &SimConfig, intrinsics: &Intrinsics) -> Result<(), SimError> {
+    let ring = &config.cameras;
+    let (width, height) = (f64::from(config.width), f64::from(config.height));
+    // A margin of a grid's cell.
+    let corner = |x, y| (DVec2::new(x, y) - intrinsics.center_px) / intrinsics.focal_px;
+    let corners = [(-9.0, -9.0), (width + 8.0, -9.0), (-9.0, height + 8.0), (width + 8.0, height + 8.0)];
+    if corners.iter().all(|&(x, y)| intrinsics.lens.undistort(corner(x, y)).is_some()) {
+        return Ok(());
+    }
+    Err(SimError::Config {
+        field: if ring.fisheye.is_some() { "cameras.fisheye" } else { "cameras.radial" },
+        found: ring.fisheye.map_or_else(|| format!("{:?}", ring.radial), |k| format!("{k:?}")),
+        expected: "a lens that does not fold over inside the picture (weaker distortion or longer focal length)",
+    })
 }
 
 #[cfg(test)]

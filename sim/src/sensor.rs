@@ -1,6 +1,7 @@
 //! What a camera's sensor and its encoder do to light.
 
-use flyrig_types::{Image, PixelFormat};
+use std::sync::OnceLock;
+
 use glam::Vec2;
 use image::ImageEncoder as _;
 use rayon::prelude::*;
@@ -8,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::SimError;
 use crate::error::check;
-use crate::texture::{linear_from_srgb, srgb_from_linear};
+use crate::texture::linear_from_srgb;
 
 /// One camera's sensor; the default changes nothing.
 ///
@@ -71,36 +72,36 @@ impl SensorConfig {
         check("sensors.jpeg_quality", self.jpeg_quality.unwrap_or(50).into(), 1.0, 100.0, "1 to 100")
     }
 
-    /// What the sensor makes of a drawn picture (RGB, 8 bits); `key` makes the noise.
-    pub(crate) fn develop(&self, drawn: Image, key: u64) -> Result<Image, SimError> {
+    /// What the sensor makes of light (halves: linear RGB and something else) as RGB bytes; `key` makes the noise.
+    pub(crate) fn develop(&self, light: &[[u16; 4]], width: u32, height: u32, key: u64) -> Result<Vec<u8>, SimError> {
+        let row = width as usize;
+        let mut bytes = vec![0u8; row * height as usize * 3];
         if *self == Self::default() {
-            return Ok(drawn);
-        }
-        let (width, height) = (drawn.width(), drawn.height());
-        let linear: Vec<f32> = (0..=255).map(|v| linear_from_srgb(v as f32 / 255.0)).collect();
-        let size = Vec2::new(width as f32, height as f32);
-        let row_bytes = width as usize * 3;
-        let mut bytes = vec![0u8; drawn.bytes().len()];
-        bytes.par_chunks_exact_mut(row_bytes).zip(drawn.bytes().par_chunks_exact(row_bytes)).enumerate().for_each(
-            |(y, (to, from))| {
-                for x in 0..width as usize {
-                    let from_middle = (Vec2::new(x as f32, y as f32) + 0.5 - size * 0.5) / (size * 0.5).length();
-                    let fall = 1.0 - self.vignetting as f32 * from_middle.length_squared().powi(2);
-                    for channel in 0..3 {
-                        let i = x * 3 + channel;
-                        let light = linear[usize::from(from[i])] * self.exposure as f32 * fall;
-                        let read = self.read(light, key, (y * row_bytes + i) as u64);
-                        let level = (read * self.gain as f32 * self.white_balance[channel] as f32).clamp(0.0, 1.0);
-                        to[i] = (srgb_from_linear(level).powf(self.gamma as f32) * 255.0).round() as u8;
-                    }
+            let codes = codes_of_halves();
+            bytes.par_chunks_mut(row * 3).zip(light.par_chunks(row)).for_each(|(to, from)| {
+                for (to, from) in to.chunks_exact_mut(3).zip(from) {
+                    to.copy_from_slice(&[from[0], from[1], from[2]].map(|half| codes[usize::from(half)]));
                 }
-            },
-        );
-        let bytes = match self.jpeg_quality {
-            None => bytes,
-            Some(quality) => through_jpeg(&bytes, width, height, quality)?,
-        };
-        Ok(Image::new(width, height, PixelFormat::Rgb8, bytes)?)
+            });
+            return Ok(bytes);
+        }
+        let coder = Coder::new(self.gamma as f32);
+        let size = Vec2::new(width as f32, height as f32);
+        bytes.par_chunks_mut(row * 3).zip(light.par_chunks(row)).enumerate().for_each(|(y, (to, from))| {
+            for (x, (to, from)) in to.chunks_exact_mut(3).zip(from).enumerate() {
+                let from_middle = (Vec2::new(x as f32, y as f32) + 0.5 - size * 0.5) / (size * 0.5).length();
+                let fall = 1.0 - self.vignetting as f32 * from_middle.length_squared().powi(2);
+                for channel in 0..3 {
+                    let light = linear_of_half(from[channel]) * self.exposure as f32 * fall;
+                    let read = self.read(light, key, ((y * row + x) * 3 + channel) as u64);
+                    to[channel] = coder.code(read * self.gain as f32 * self.white_balance[channel] as f32);
+                }
+            }
+        });
+        match self.jpeg_quality {
+            None => Ok(bytes),
+            Some(quality) => through_jpeg(&bytes, width, height, quality),
+        }
     }
 
     /// Light as read from the sensor: with noise, and no more than the full well.
@@ -111,6 +112,60 @@ impl SensorConfig {
         let sigma = (electrons + (self.read_noise_electrons as f32).powi(2)).sqrt();
         (electrons + sigma * gaussian(key, pixel)) / full
     }
+}
+
+/// The nearest byte to sRGB code to the power of a gamma.
+struct Coder {
+    /// Light from which on the next byte is nearer.
+    thresholds: Vec<f32>,
+    /// A byte not above the one of a light in steps of 1 / 1024.
+    starts: Vec<u8>,
+}
+
+impl Coder {
+    fn new(gamma: f32) -> Self {
+        let thresholds: Vec<f32> =
+            (0..255).map(|byte| linear_from_srgb(((byte as f32 + 0.5) / 255.0).powf(1.0 / gamma))).collect();
+        let starts =
+            (0..1024).map(|i| thresholds.partition_point(|&t| t <= i as f32 / 1024.0).min(255) as u8).collect();
+        Self { thresholds, starts }
+    }
+
+    fn code(&self, light: f32) -> u8 {
+        // NaN, which no sensor reads, would become 0.
+        let mut byte = self.starts[((light.clamp(0.0, 1.0) * 1024.0) as usize).min(1023)];
+        while byte < 255 && light >= self.thresholds[usize::from(byte)] {
+            byte += 1;
+        }
+        byte
+    }
+}
+
+/// A half-precision number (IEEE 754 binary16).
+pub(crate) fn linear_of_half(half: u16) -> f32 {
+    static TABLE: OnceLock<Vec<f32>> = OnceLock::new();
+    TABLE.get_or_init(|| {
+        (0..=u16::MAX)
+            .map(|bits| {
+                let (exponent, fraction) = (i32::from(bits >> 10 & 31), f32::from(bits & 1023) / 1024.0);
+                let magnitude = match exponent {
+                    0 => fraction * 2f32.powi(-14),
+                    31 => 65504.0,
+                    _ => (1.0 + fraction) * 2f32.powi(exponent - 15),
+                };
+                if bits >> 15 == 0 { magnitude } else { -magnitude }
+            })
+            .collect()
+    })[usize::from(half)]
+}
+
+/// sRGB bytes of all halves.
+fn codes_of_halves() -> &'static [u8] {
+    static TABLE: OnceLock<Vec<u8>> = OnceLock::new();
+    TABLE.get_or_init(|| {
+        let coder = Coder::new(1.0);
+        (0..=u16::MAX).map(|half| coder.code(linear_of_half(half))).collect()
+    })
 }
 
 /// Coded and decoded again.

@@ -5,24 +5,33 @@ use std::fmt;
 use flyrig_body::{Part, Template};
 use flyrig_gpu::GpuContext;
 use flyrig_types::{Camera, Image, Mask, PixelFormat, Pose, PoseTrack, Rig};
-use glam::Vec3;
 
-use crate::actor::{Actor, Shape};
-use crate::draw::{Drawing, Posed};
-use crate::noise::smoothstep;
+use crate::actor::Shape;
+use crate::cast::Cast;
+use crate::draw::{Drawing, Raw, Take};
 use crate::person::Person;
-use crate::room::{LensGrid, Room};
-use crate::sensor::hash;
-use crate::{FramePlan, SensorConfig, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring};
+use crate::scene::Scene;
+use crate::sensor::{hash, linear_of_half};
+use crate::{FramePlan, OpticsConfig, SensorConfig, Shot, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring};
 
 /// A person, a motion, a room and cameras.
 pub struct Simulator {
     config: SimConfig,
     rig: Rig,
-    actor: Actor,
+    cast: Cast,
     plates: Vec<Image>,
     drawing: Drawing,
-    drawn_nanos: Option<i64>,
+    /// Instant and reach of what the drawing's people do.
+    posed: Option<(i64, f64)>,
+    cameras: Vec<Kept>,
+}
+
+/// What is remembered of a camera.
+#[derive(Debug, Default)]
+struct Kept {
+    /// Instant that was asked for last.
+    asked_nanos: Option<i64>,
+    drawn: Option<(i64, Raw)>,
 }
 
 impl fmt::Debug for Simulator {
@@ -38,24 +47,20 @@ impl Simulator {
     /// [`SimError`] names the setting, the missing file or the adapter's limit.
     pub fn new(gpu: &GpuContext, config: &SimConfig) -> Result<Self, SimError> {
         let rig = camera_ring(config)?;
-        let actor = Actor::new(config)?;
-        let room = Room::new(config.seed, config.cameras.radius_m);
-        let mut plates = Vec::with_capacity(rig.cameras.len());
-        if let Some(grid) = rig.cameras.first().and_then(|camera| LensGrid::new(&camera.intrinsics)) {
-            plates.extend(rig.cameras.iter().map(|camera| room.plate(camera, &grid)));
-        }
-        let (width, height) = (config.width, config.height);
-        let drawing = Drawing::new(gpu, &actor.person, [width, height], &plates)?;
-        let plates = plates
-            .into_iter()
-            .enumerate()
-            .map(|(slot, plate)| {
-                let drawn = Image::new(width, height, PixelFormat::Rgb8, rgb_bytes(&plate.rgba))?;
+        let cast = Cast::new(config)?;
+        let people: Vec<&Person> = cast.actors().map(|actor| &actor.person).collect();
+        let drawing = Drawing::new(gpu, [config.width, config.height], Scene::new(config, &rig), &people)?;
+        let cameras = rig.cameras.iter().map(|_| Kept::default()).collect();
+        let mut new = Self { config: config.clone(), rig, cast, plates: Vec::new(), drawing, posed: None, cameras };
+        for slot in 0..new.rig.cameras.len() {
+            let take = Take { people: false, ..new.take(&Shot::new(0, slot))? };
+            for raw in new.drawing.pictures(&[take])? {
                 // An instant that no frame has.
-                develop(config, drawn, i64::MIN, slot, 1.0)
-            })
-            .collect::<Result<_, SimError>>()?;
-        Ok(Self { config: config.clone(), rig, actor, plates, drawing, drawn_nanos: None })
+                let plate = new.develop(&raw, &Shot::new(i64::MIN, slot))?;
+                new.plates.push(plate);
+            }
+        }
+        Ok(new)
     }
 
     /// The configuration.
@@ -64,31 +69,37 @@ impl Simulator {
         &self.config
     }
 
-    /// The cameras, z up.
+    /// The cameras as they are, z up.
     #[must_use]
     pub fn rig(&self) -> &Rig {
         &self.rig
     }
 
+    /// The cameras as a calibration with the configured error reports them.
+    #[must_use]
+    pub fn reported_rig(&self) -> Rig {
+        self.config.calibration_error.reported(&self.rig, self.config.seed)
+    }
+
     /// The body without clothes: what a tracker is given.
     #[must_use]
     pub fn template(&self) -> &Template {
-        &self.actor.person.body
+        &self.cast.main.person.body
     }
 
     /// One round of the motion; see [`Self::pose`] for later times.
     #[must_use]
     pub fn track(&self) -> &PoseTrack {
-        &self.actor.track
+        &self.cast.main.track
     }
 
     /// Pose at a time; the motion starts over after its end.
     #[must_use]
     pub fn pose(&self, nanos: i64) -> Pose {
-        self.actor.pose(nanos)
+        self.cast.pose(nanos)
     }
 
-    /// The room without the person, as camera `slot` sees it.
+    /// The room without people at time 0, as camera `slot` sees it.
     ///
     /// # Errors
     /// [`SimError::NoSlot`].
@@ -115,24 +126,41 @@ impl Simulator {
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
     pub fn render(&mut self, nanos: i64, slot: usize) -> Result<SimFrame, SimError> {
-        let (color, mask) = self.capture(nanos, slot)?;
-        let truth = self.drawing.truth(self.camera(slot)?)?;
-        let parts = truth.part.iter().map(|&part| part_of_index(part)).collect();
-        let mut depth = Vec::with_capacity(truth.canonical_depth.len());
-        let mut canonical = Vec::with_capacity(truth.canonical_depth.len());
-        for (&[x, y, z, camera_z], part) in truth.canonical_depth.iter().zip(&truth.part) {
-            depth.push(camera_z);
-            canonical.push([x, y, z, f32::from(u8::from(*part > 0))]);
-        }
-        Ok(SimFrame { nanos, pose: self.pose(nanos), color, mask, depth, canonical, part: parts })
+        self.render_with(&Shot::new(nanos, slot))
     }
 
-    /// Picture and mask only, at less cost than [`Self::render`].
+    /// Picture and truth of a shot.
+    ///
+    /// # Errors
+    /// [`SimError::NoSlot`], [`SimError::Config`] for a shot out of range, [`SimError::Gpu`].
+    pub fn render_with(&mut self, shot: &Shot) -> Result<SimFrame, SimError> {
+        let (color, mask) = self.capture_with(shot)?;
+        let take = self.take(shot)?;
+        self.set_moment(shot.nanos, take.optics.reach_secs())?;
+        let truth = self.drawing.truth(&take)?;
+        let mut frame = SimFrame {
+            nanos: shot.nanos,
+            pose: self.pose(shot.nanos),
+            color,
+            mask,
+            depth: truth.canonical_depth.iter().map(|&[.., z]| z).collect(),
+            normal: truth.normal_part.iter().map(|&[x, y, z, _]| [x, y, z]).collect(),
+            canonical: Vec::with_capacity(truth.canonical_depth.len()),
+            part: truth.normal_part.iter().map(|&[.., part]| part_of_index(part as u32)).collect(),
+        };
+        for (&[x, y, z, _], &[.., part]) in truth.canonical_depth.iter().zip(&truth.normal_part) {
+            frame.canonical.push([x, y, z, f32::from(u8::from(part > 0.5))]);
+        }
+        Ok(frame)
+    }
+
+    /// Picture and mask only, at less cost than [`Self::render`]. Cameras that were asked for the same instants before
+    /// are drawn together, when the first of them is asked for.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
     pub fn capture(&mut self, nanos: i64, slot: usize) -> Result<(Image, Mask), SimError> {
-        self.capture_exposed(nanos, slot, 1.0)
+        self.capture_with(&Shot::new(nanos, slot))
     }
 
     /// [`Self::capture`] with the sensor's exposure multiplied by `exposure`.
@@ -140,24 +168,40 @@ impl Simulator {
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
     pub fn capture_exposed(&mut self, nanos: i64, slot: usize, exposure: f64) -> Result<(Image, Mask), SimError> {
-        self.camera(slot)?;
-        if self.drawn_nanos != Some(nanos) {
-            let posed = self.posed(nanos);
-            self.drawing.set_person(&posed);
-            self.drawn_nanos = Some(nanos);
-        }
-        let rgba = self.drawing.picture(self.camera(slot)?, slot)?;
-        let (width, height) = (self.config.width, self.config.height);
-        let color = Image::new(width, height, PixelFormat::Rgb8, rgb_bytes(&rgba))?;
-        let color = develop(&self.config, color, nanos, slot, exposure)?;
-        let mask = Mask::new(width, height, rgba.iter().map(|pixel| pixel[3]).collect())?;
-        Ok((color, mask))
+        self.capture_with(&Shot { exposure, ..Shot::new(nanos, slot) })
+    }
+
+    /// Picture and mask of a shot.
+    ///
+    /// # Errors
+    /// [`SimError::NoSlot`], [`SimError::Config`] for a shot out of range, [`SimError::Gpu`].
+    pub fn capture_with(&mut self, shot: &Shot) -> Result<(Image, Mask), SimError> {
+        let raw = self.raw(shot)?;
+        self.finished(&raw, shot)
+    }
+
+    /// Pictures and masks of several cameras at one time, drawn in one pass.
+    ///
+    /// # Errors
+    /// [`SimError::NoSlot`], [`SimError::Gpu`].
+    pub fn capture_all(&mut self, nanos: i64, slots: &[usize]) -> Result<Vec<(Image, Mask)>, SimError> {
+        self.draw_all(nanos, slots)?;
+        slots.iter().map(|&slot| self.capture(nanos, slot)).collect()
+    }
+
+    /// Linear light on the sensor of a shot, before exposure, noise and code: RGB, 1 is the brightest sRGB value.
+    ///
+    /// # Errors
+    /// As [`Self::capture_with`].
+    pub fn light(&mut self, shot: &Shot) -> Result<Vec<[f32; 3]>, SimError> {
+        let raw = self.raw(shot)?;
+        Ok(raw.iter().map(|&[r, g, b, _]| [r, g, b].map(linear_of_half)).collect())
     }
 
     /// What the cameras see of the person at a time, as a mesh.
     pub fn clothed_surface(&mut self, nanos: i64) -> SurfaceMesh {
-        let Shape { positions, normals } = self.actor.shape(nanos);
-        let Person { clothed, carriers, .. } = &self.actor.person;
+        let Shape { positions, normals } = self.cast.main.shape(nanos);
+        let Person { clothed, carriers, .. } = &self.cast.main.person;
         SurfaceMesh {
             positions,
             normals,
@@ -171,34 +215,94 @@ impl Simulator {
         self.rig.cameras.get(slot).ok_or(SimError::NoSlot { slot, count: self.rig.cameras.len() })
     }
 
-    fn posed(&mut self, nanos: i64) -> Posed {
-        let Shape { positions, normals } = self.actor.shape(nanos);
-        let low = positions.iter().copied().fold(Vec3::INFINITY, Vec3::min);
-        let high = positions.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
-        let shoes = self.actor.person.shoe_vertices.clone();
-        let middle = shoes.start + shoes.len() / 2;
-        let feet = [shoes.start..middle, middle..shoes.end].map(|range| {
-            let foot = &positions[range];
-            let lowest = foot.iter().map(|p| p.z).fold(f32::INFINITY, f32::min);
-            let mean = foot.iter().sum::<Vec3>() / foot.len().max(1) as f32;
-            mean.truncate().extend(smoothstep(0.07, 0.0, lowest))
-        });
-        Posed { positions, normals, center: (low + high) * 0.5, feet }
+    /// Light and coverage of a shot, drawn unless it was.
+    fn raw(&mut self, shot: &Shot) -> Result<Raw, SimError> {
+        shot.validate()?;
+        let take = self.take(shot)?;
+        if shot.camera_shift.is_some() {
+            self.set_moment(shot.nanos, take.optics.reach_secs())?;
+            return Ok(self.drawing.pictures(&[take])?.pop().unwrap_or_default());
+        }
+        let Shot { nanos, slot, .. } = *shot;
+        let before = self.cameras[slot].asked_nanos;
+        if before != Some(nanos) {
+            // Who was asked for the same instant as this camera the last time will be again.
+            let together = |kept: &Kept| before.is_some() && kept.asked_nanos == before;
+            let mut slots: Vec<usize> = (0..self.cameras.len()).filter(|&i| together(&self.cameras[i])).collect();
+            if !slots.contains(&slot) {
+                slots.push(slot);
+            }
+            self.draw_all(nanos, &slots)?;
+            self.cameras[slot].asked_nanos = Some(nanos);
+        } else {
+            self.draw_all(nanos, &[slot])?;
+        }
+        Ok(self.cameras[slot].drawn.as_ref().map(|(_, raw)| raw.clone()).unwrap_or_default())
     }
-}
 
-/// What camera `slot`'s sensor makes of a picture drawn for an instant.
-fn develop(config: &SimConfig, drawn: Image, nanos: i64, slot: usize, exposure: f64) -> Result<Image, SimError> {
-    let mut sensor = match config.sensors.len() {
-        0 => SensorConfig::default(),
-        count => config.sensors[slot % count].clone(),
-    };
-    sensor.exposure *= exposure;
-    sensor.develop(drawn, hash(hash(config.seed, slot as u64), nanos as u64))
-}
+    /// Draws what of an instant is not drawn yet.
+    fn draw_all(&mut self, nanos: i64, slots: &[usize]) -> Result<(), SimError> {
+        /// Bytes that are read back at once.
+        const BATCH_BYTES: usize = 256 << 20;
+        let mut missing: Vec<usize> = Vec::new();
+        for &slot in slots {
+            self.camera(slot)?;
+            let there = self.cameras[slot].drawn.as_ref().is_some_and(|(of, _)| *of == nanos);
+            if !there && !missing.contains(&slot) {
+                missing.push(slot);
+            }
+        }
+        let each = self.config.width as usize * self.config.height as usize * size_of::<[u16; 4]>();
+        for slots in missing.chunks((BATCH_BYTES / each).max(1)) {
+            let takes: Vec<Take> =
+                slots.iter().map(|&slot| self.take(&Shot::new(nanos, slot))).collect::<Result<_, _>>()?;
+            self.set_moment(nanos, takes.iter().map(|take| take.optics.reach_secs()).fold(0.0, f64::max))?;
+            for (&slot, raw) in slots.iter().zip(self.drawing.pictures(&takes)?) {
+                self.cameras[slot].drawn = Some((nanos, raw));
+            }
+        }
+        Ok(())
+    }
 
-fn rgb_bytes(rgba: &[[u8; 4]]) -> Vec<u8> {
-    rgba.iter().flat_map(|&[r, g, b, _]| [r, g, b]).collect()
+    fn set_moment(&mut self, nanos: i64, reach_secs: f64) -> Result<(), SimError> {
+        if self.posed != Some((nanos, reach_secs)) {
+            self.posed = None;
+            let moment = self.cast.moment(nanos, reach_secs);
+            self.drawing.set_moment(moment)?;
+            self.posed = Some((nanos, reach_secs));
+        }
+        Ok(())
+    }
+
+    fn take(&self, shot: &Shot) -> Result<Take, SimError> {
+        let mut camera = self.camera(shot.slot)?.clone();
+        if let Some(shift) = shot.camera_shift {
+            camera.camera_from_world = shift * camera.camera_from_world;
+        }
+        let optics = match self.config.optics.len() {
+            0 => OpticsConfig::default(),
+            count => self.config.optics[shot.slot % count].clone(),
+        };
+        Ok(Take { nanos: shot.nanos, camera, optics, people: true })
+    }
+
+    fn finished(&self, raw: &[[u16; 4]], shot: &Shot) -> Result<(Image, Mask), SimError> {
+        let coverage = raw.iter().map(|&[.., a]| (linear_of_half(a).clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+        Ok((self.develop(raw, shot)?, Mask::new(self.config.width, self.config.height, coverage)?))
+    }
+
+    /// What the camera's sensor makes of light.
+    fn develop(&self, raw: &[[u16; 4]], shot: &Shot) -> Result<Image, SimError> {
+        let mut sensor = match self.config.sensors.len() {
+            0 => SensorConfig::default(),
+            count => self.config.sensors[shot.slot % count].clone(),
+        };
+        sensor.exposure *= shot.exposure;
+        let key = hash(hash(self.config.seed, shot.slot as u64), shot.nanos as u64);
+        let (width, height) = (self.config.width, self.config.height);
+        let bytes = sensor.develop(raw, width, height, key)?;
+        Ok(Image::new(width, height, PixelFormat::Rgb8, bytes)?)
+    }
 }
 
 /// Inverse of `part as u32 + 1`.

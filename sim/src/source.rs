@@ -6,10 +6,10 @@ use std::{
 };
 
 use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind};
-use flyrig_types::{CameraId, Frame, Image, Mask};
+use flyrig_types::{CameraId, Frame, Image};
 
 use crate::clock::RealClock;
-use crate::{Delivery, FramePlan, SimError, SimTime, Simulator};
+use crate::{Delivery, FramePlan, Shot, SimError, SimTime, Simulator};
 
 /// One camera of a [`Simulator`]. All sources of a simulator see the same instants but for what the configured faults
 /// do. Dropping it takes the camera out of the rig.
@@ -134,7 +134,10 @@ impl SimSource {
     }
 
     fn taken(&self, simulator: &mut Simulator, index: u64, plan: FramePlan) -> Result<Frame, CaptureError> {
-        let (image, mask) = shoot(simulator, &plan, self.slot, index).map_err(|error| {
+        let taken = simulator
+            .capture_with(&shot(&plan, self.slot))
+            .and_then(|(image, mask)| Ok((spoilt(simulator, &plan, index, image)?, mask)));
+        let (image, mask) = taken.map_err(|error| {
             let kind = match error {
                 SimError::Gpu(_) => CaptureErrorKind::Disconnected,
                 _ => CaptureErrorKind::Unsupported,
@@ -152,16 +155,15 @@ impl SimSource {
     }
 }
 
-/// The picture that a fault script lets a camera take, and its mask.
-pub(crate) fn shoot(
-    simulator: &mut Simulator,
-    plan: &FramePlan,
-    slot: usize,
-    index: u64,
-) -> Result<(Image, Mask), SimError> {
-    let (image, mask) = simulator.capture_exposed(plan.true_nanos, slot, plan.exposure)?;
-    let Some(share) = plan.sound_share else { return Ok((image, mask)) };
+/// What a fault script makes of a camera's shot.
+pub(crate) fn shot(plan: &FramePlan, slot: usize) -> Shot {
+    Shot { exposure: plan.exposure, camera_shift: plan.bump, ..Shot::new(plan.true_nanos, slot) }
+}
+
+/// Garbage over a picture, where the fault script says so.
+pub(crate) fn spoilt(simulator: &Simulator, plan: &FramePlan, index: u64, image: Image) -> Result<Image, SimError> {
+    let Some(share) = plan.sound_share else { return Ok(image) };
     let mut rgb = image.bytes().to_vec();
     simulator.config().faults.spoil(&mut rgb, share, index);
-    Ok((Image::new(image.width(), image.height(), image.format(), rgb)?, mask))
+    Ok(Image::new(image.width(), image.height(), image.format(), rgb)?)
 }

@@ -8,12 +8,17 @@ use exr::prelude::{
 
 use crate::{SimError, SimFrame};
 
-/// Channels `Z` (camera-space depth, metres), `canonical.X`, `.Y`, `.Z` (metres) and `part` (index + 1; 0 is no person).
+/// Channels `Z` (camera-space depth, metres), `N.X`, `.Y`, `.Z` (world normal), `canonical.X`, `.Y`, `.Z` (metres) and
+/// `part` (index + 1; 0 is no person).
 pub(crate) fn write_truth(path: &Path, frame: &SimFrame) -> Result<(), SimError> {
     let axis = |axis: usize| FlatSamples::F32(frame.canonical.iter().map(|p| p[axis]).collect());
+    let normal = |axis: usize| FlatSamples::F32(frame.normal.iter().map(|n| n[axis]).collect());
     let part = |part: &Option<flyrig_body::Part>| part.map_or(0, |part| part as u32 + 1);
     let channels: SmallVec<[AnyChannel<FlatSamples>; 4]> = [
         AnyChannel::new("Z", FlatSamples::F32(frame.depth.clone())),
+        AnyChannel::new("N.X", normal(0)),
+        AnyChannel::new("N.Y", normal(1)),
+        AnyChannel::new("N.Z", normal(2)),
         AnyChannel::new("canonical.X", axis(0)),
         AnyChannel::new("canonical.Y", axis(1)),
         AnyChannel::new("canonical.Z", axis(2)),

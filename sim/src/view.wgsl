@@ -1,21 +1,62 @@
-// What the passes of one picture share.
+// One sub-frame of one camera, and how it maps points to pixels. Prepended: `NEAR_M`.
 
 struct View {
     camera_from_world: mat4x4<f32>,
-    light_from_world: mat4x4<f32>,
+    // World position of the lens's middle.
+    eye: vec4<f32>,
     focal_px: vec2<f32>,
     center_px: vec2<f32>,
     size_px: vec2<f32>,
-    // k1, k2; beyond the radius z the lens is continued linearly; w is 1 for a fisheye.
-    lens: vec4<f32>,
+    // Columns of the grid of directions, and the side of its cells in pixels.
+    grid: vec2<f32>,
+    // k1, k2, k3; w: beyond this radius the lens is continued linearly.
+    radial: vec4<f32>,
+    // p1, p2; z is 1 for a fisheye.
+    tangential: vec4<f32>,
     // k1 to k4 of a fisheye.
     fisheye: vec4<f32>,
-    // Unit vector towards the key light.
-    to_light: vec4<f32>,
-    key: vec4<f32>,
-    sky: vec4<f32>,
-    ground: vec4<f32>,
-    // World x, y of both feet, and how close to the floor they are (0..1).
-    feet: array<vec4<f32>, 2>,
+    // xy: point on the lens in camera axes, metres; z: 1 / distance of sharpness.
+    lens_point: vec4<f32>,
+    // x: the middle row's seconds from the shot's instant; y: seconds from row to row; z: the middle row;
+    // w: layer of the plate that is being baked.
+    moment: vec4<f32>,
+    // First key's seconds from the shot's instant, keys a second, number of keys.
+    keys: vec4<f32>,
+    // x: share of this sub-frame in its picture; y, z: 1 for the first and for the last sub-frame;
+    // w: 1 where people are there.
+    sum: vec4<f32>,
+    // A row's level of each lamp.
+    levels: array<vec4<f32>>,
 }
 
+// Ideal image plane of a point in camera axes, seen through a point of the lens.
+fn ideal_of(camera: vec3<f32>, view_lens: vec3<f32>) -> vec2<f32> {
+    return (camera.xy - view_lens.xy) / max(camera.z, NEAR_M * 0.5) + view_lens.xy * view_lens.z;
+}
+
+fn pixel_of(camera: vec3<f32>) -> vec2<f32> {
+    let ideal = ideal_of(camera, view.lens_point.xyz);
+    let radius = length(ideal);
+    let r = min(radius, view.radial.w);
+    let r2 = r * r;
+    var bent = ideal;
+    if (view.tangential.z > 0.5) {
+        let theta = atan(r);
+        let t2 = theta * theta;
+        let k = view.fisheye;
+        bent *= theta * (1.0 + t2 * (k.x + t2 * (k.y + t2 * (k.z + t2 * k.w)))) / max(radius, 1e-9);
+    } else {
+        let k = view.radial.xyz;
+        bent *= 1.0 + r2 * (k.x + r2 * (k.y + r2 * k.z));
+        let p = view.tangential.xy;
+        let q = ideal * (r / max(radius, 1e-9));
+        bent += 2.0 * p * q.x * q.y + p.yx * (vec2(r2) + 2.0 * q * q);
+    }
+    return bent * view.focal_px + view.center_px;
+}
+
+// w = z makes the interpolation perspective-correct; the device's depth is 1 - near / z.
+fn clip_of(pixel: vec2<f32>, z: f32) -> vec4<f32> {
+    let device = (pixel + 0.5) / view.size_px * vec2(2.0, -2.0) + vec2(-1.0, 1.0);
+    return vec4(device * z, z - NEAR_M, z);
+}

@@ -1,0 +1,197 @@
+//! What the shaders are told, in their layouts.
+
+use bytemuck::{Pod, Zeroable};
+use flyrig_types::{Camera, Lens};
+use glam::Vec3;
+
+use crate::gpu_parts::SAMPLES;
+use crate::lamps::LAMP_NEAR_M;
+use crate::optics::SubFrame;
+use crate::plates::{GRID_CELL_PX, grid_columns};
+use crate::scene::Scene;
+use crate::scene_config::MAX_LAMPS;
+
+/// Nothing closer to a camera is drawn, metres.
+pub(crate) const NEAR_M: f32 = 0.1;
+/// Capsules that stand for people.
+pub(crate) const MAX_CAPSULES: usize = 64;
+/// Steps to the row in which a moving point is seen.
+const ROW_STEPS: u32 = 5;
+/// Brightest light of a plate's layer.
+const PLATE_WHITE: f32 = 4.0;
+
+/// WGSL of all passes.
+pub(crate) fn shader_sources() -> [(&'static str, String); 4] {
+    let constants = format!(
+        "const NEAR_M: f32 = {NEAR_M:?};\nconst LAMP_NEAR_M: f32 = {LAMP_NEAR_M:?};\nconst SAMPLES: i32 = {SAMPLES};\n\
+         const MAX_LAMPS: u32 = {MAX_LAMPS}u;\nconst MAX_CAPSULES: u32 = {MAX_CAPSULES}u;\nconst ROW_STEPS: i32 = \
+         {ROW_STEPS};\nconst PLATE_WHITE: f32 = {PLATE_WHITE:?};\n"
+    );
+    let (view, light) = (include_str!("view.wgsl"), include_str!("light.wgsl"));
+    [
+        ("simulated people", [&constants, view, light, include_str!("person.wgsl")].concat()),
+        ("simulated room", [&constants, view, light, include_str!("room.wgsl")].concat()),
+        ("simulated plate", [&constants, view, include_str!("plate.wgsl")].concat()),
+        ("simulated picture", [&constants, view, light, include_str!("compose.wgsl")].concat()),
+    ]
+}
+
+/// `struct View` of view.wgsl without its rows.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(crate) struct ViewHead {
+    camera_from_world: [[f32; 4]; 4],
+    eye: [f32; 4],
+    focal_px: [f32; 2],
+    center_px: [f32; 2],
+    size_px: [f32; 2],
+    grid: [f32; 2],
+    radial: [f32; 4],
+    tangential: [f32; 4],
+    fisheye: [f32; 4],
+    lens_point: [f32; 4],
+    pub moment: [f32; 4],
+    pub keys: [f32; 4],
+    pub sum: [f32; 4],
+}
+
+impl ViewHead {
+    pub(crate) fn new(camera: &Camera, focus_m: f64, frame: SubFrame) -> Self {
+        let i = &camera.intrinsics;
+        let valid = i.lens.valid_radius() as f32;
+        let mut view = Self::zeroed();
+        match i.lens {
+            Lens::RadialTangential { radial, tangential: [p1, p2] } => {
+                let [k1, k2, k3] = radial.map(|k| k as f32);
+                view.radial = [k1, k2, k3, valid];
+                view.tangential = [p1 as f32, p2 as f32, 0.0, 0.0];
+            }
+            Lens::Fisheye { coefficients } => {
+                view.radial[3] = valid;
+                view.tangential[2] = 1.0;
+                view.fisheye = coefficients.map(|k| k as f32);
+            }
+        }
+        view.camera_from_world = camera.camera_from_world.to_matrix().as_mat4().to_cols_array_2d();
+        view.eye = camera.position().as_vec3().extend(0.0).to_array();
+        view.focal_px = i.focal_px.as_vec2().to_array();
+        view.center_px = i.center_px.as_vec2().to_array();
+        view.size_px = [i.width as f32, i.height as f32];
+        view.grid = [grid_columns(i.width) as f32, GRID_CELL_PX as f32];
+        view.lens_point = [frame.lens_point.x, frame.lens_point.y, (1.0 / focus_m) as f32, 0.0];
+        view.moment[0] = frame.secs as f32;
+        view
+    }
+}
+
+/// A part of a person that keeps light from its surroundings: a line with a radius, metres.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub(crate) struct Capsule {
+    pub a: [f32; 3],
+    pub radius: f32,
+    pub b: [f32; 3],
+    pub padding: f32,
+}
+
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+struct LampBlock {
+    room_from_world: [[f32; 4]; 4],
+    people_from_world: [[f32; 4]; 4],
+    place: [f32; 4],
+    axis: [f32; 4],
+    color: [f32; 4],
+    tangents: [f32; 4],
+    bounce: [f32; 4],
+}
+
+/// `struct Light` of light.wgsl.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+pub(crate) struct LightBlock {
+    lamps: [LampBlock; MAX_LAMPS],
+    steady: [f32; 4],
+    sky: [f32; 4],
+    ground: [f32; 4],
+    people: [f32; 4],
+    counts: [u32; 4],
+    capsules: [Capsule; MAX_CAPSULES],
+}
+
+impl LightBlock {
+    /// The scene's lamps with people within a ball.
+    pub(crate) fn new(scene: &Scene, glows: bool, (center, radius): (Vec3, f32), capsules: &[Capsule]) -> Self {
+        let mut block = Self::zeroed();
+        for (to, lamp) in block.lamps.iter_mut().zip(&scene.lamps) {
+            let (room, room_tangent) = lamp.room_view();
+            let (people, people_tangent) = lamp.ball_view(center, radius);
+            let [end, begin] = lamp.cone();
+            *to = LampBlock {
+                room_from_world: room.to_cols_array_2d(),
+                people_from_world: people.to_cols_array_2d(),
+                place: lamp.place.extend(lamp.size_m).to_array(),
+                axis: lamp.axis.extend(end).to_array(),
+                color: lamp.power.extend(begin).to_array(),
+                tangents: [room_tangent, people_tangent, 0.0, 0.0],
+                bounce: lamp.bounce.extend(0.0).to_array(),
+            };
+        }
+        block.steady = scene.steady.extend(scene.lamps.len() as f32).to_array();
+        block.sky = scene.sky.extend(0.0).to_array();
+        block.ground = scene.ground.extend(0.0).to_array();
+        block.people = center.extend(radius).to_array();
+        for (to, capsule) in block.capsules.iter_mut().zip(capsules) {
+            *to = *capsule;
+        }
+        block.counts = [capsules.len().min(MAX_CAPSULES) as u32, glows.into(), 0, 0];
+        block
+    }
+}
+
+/// Blocks of constants in one buffer, each at an offset that can be bound.
+#[derive(Debug, Default)]
+pub(crate) struct Blocks {
+    pub bytes: Vec<u8>,
+}
+
+impl Blocks {
+    /// What every adapter allows as an offset.
+    const ALIGNMENT: usize = 256;
+
+    /// Offset of a new block.
+    pub(crate) fn push(&mut self, parts: &[&[u8]]) -> u32 {
+        let offset = self.bytes.len();
+        for part in parts {
+            self.bytes.extend_from_slice(part);
+        }
+        self.bytes.resize(self.bytes.len().next_multiple_of(Self::ALIGNMENT), 0);
+        offset as u32
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_shaders_are_valid_and_their_structures_are_ours() {
+        for (name, source) in shader_sources() {
+            assert!(!source.contains("var<uniform>"), "{name}: leaks on Mesa's software adapter");
+            let module = naga::front::wgsl::parse_str(&source)
+                .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&source)));
+            let capabilities = naga::valid::Capabilities::empty();
+            let mut validator = naga::valid::Validator::new(naga::valid::ValidationFlags::all(), capabilities);
+            validator.validate(&module).unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&source)));
+            let span = |wanted: &str| {
+                module.types.iter().find_map(|(_, ty)| match ty.inner {
+                    naga::TypeInner::Struct { span, .. } if ty.name.as_deref() == Some(wanted) => Some(span as usize),
+                    _ => None,
+                })
+            };
+            // One row.
+            assert_eq!(span("View").unwrap(), size_of::<ViewHead>() + 16, "{name}");
+            assert_eq!(span("Light").unwrap_or(size_of::<LightBlock>()), size_of::<LightBlock>(), "{name}");
+        }
+    }
+}

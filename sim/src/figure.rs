@@ -1,0 +1,94 @@
+//! A person on the graphics adapter.
+
+use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
+use wgpu::util::DeviceExt;
+use wgpu::{BindGroup, BindGroupLayout, Buffer, BufferUsages, RenderPass, TextureView};
+
+use crate::actor::Shape;
+use crate::gpu_parts::{bind, upload_textures};
+use crate::person::Person;
+
+/// A person's surface around an instant.
+#[derive(Debug, Clone)]
+pub(crate) struct Figured {
+    /// At each key.
+    pub keys: Vec<Shape>,
+    /// Per vertex: share of the surroundings that is free, 0..=1.
+    pub openness: Vec<f32>,
+}
+
+#[derive(Debug)]
+pub(crate) struct Figure {
+    points: StorageBuffer<[f32; 8]>,
+    pub points_bind: BindGroup,
+    paint: Buffer,
+    truth: Buffer,
+    indices: Buffer,
+    index_count: u32,
+    vertex_count: usize,
+    pub textures: TextureView,
+}
+
+impl Figure {
+    /// `main`: whether the truth is about this person.
+    pub(crate) fn new(
+        gpu: &GpuContext,
+        layout: &BindGroupLayout,
+        person: &Person,
+        main: bool,
+    ) -> Result<Self, GpuError> {
+        let buffer = |label, contents: &[u8], usage| {
+            let label = Some(label);
+            gpu.device.create_buffer_init(&wgpu::util::BufferInitDescriptor { label, contents, usage })
+        };
+        let clothed = &person.clothed;
+        let vertex_count = clothed.positions.len();
+        let part = |part| if main { part as u8 + 1 } else { 0 };
+        let paint: Vec<[f32; 4]> = (clothed.uvs.iter().zip(&person.layer_and_openness).zip(&clothed.parts))
+            .map(|((uv, &(layer, _)), &of)| [uv.x, uv.y, layer as f32, f32::from(part(of))])
+            .collect();
+        let truth: Vec<[f32; 4]> = person.carriers.iter().map(|p| p.extend(vertex_count as f32).to_array()).collect();
+        let points = StorageBuffer::zeroed(gpu, "points of a person", vertex_count)?;
+        Ok(Self {
+            points_bind: bind(gpu, layout, &[points.raw().as_entire_binding()]),
+            points,
+            paint: buffer("paint of a person", bytemuck::cast_slice(&paint), BufferUsages::VERTEX),
+            truth: buffer("truth of a person", bytemuck::cast_slice(&truth), BufferUsages::VERTEX),
+            indices: buffer("triangles of a person", bytemuck::cast_slice(&clothed.triangles), BufferUsages::INDEX),
+            index_count: clothed.triangles.len() as u32 * 3,
+            vertex_count,
+            textures: upload_textures(gpu, "clothes and skin of a person", &person.textures),
+        })
+    }
+
+    /// Puts the person at the keys of a moment.
+    pub(crate) fn pose(
+        &mut self,
+        gpu: &GpuContext,
+        layout: &BindGroupLayout,
+        figured: &Figured,
+    ) -> Result<(), GpuError> {
+        let needed = self.vertex_count * figured.keys.len();
+        if self.points.len() < needed {
+            self.points = StorageBuffer::zeroed(gpu, "points of a person", needed)?;
+            self.points_bind = bind(gpu, layout, &[self.points.raw().as_entire_binding()]);
+        }
+        let mut points = Vec::with_capacity(needed);
+        for Shape { positions, normals } in &figured.keys {
+            for ((p, n), open) in positions.iter().zip(normals).zip(&figured.openness) {
+                points.push([p.x, p.y, p.z, *open, n.x, n.y, n.z, 0.0]);
+            }
+        }
+        self.points.write(gpu, &points);
+        Ok(())
+    }
+
+    /// Draws `instances`; pipeline and groups but for the points are set.
+    pub(crate) fn draw(&self, pass: &mut RenderPass<'_>, instances: std::ops::Range<u32>) {
+        pass.set_bind_group(1, &self.points_bind, &[]);
+        pass.set_vertex_buffer(0, self.paint.slice(..));
+        pass.set_vertex_buffer(1, self.truth.slice(..));
+        pass.set_index_buffer(self.indices.slice(..), wgpu::IndexFormat::Uint32);
+        pass.draw_indexed(0..self.index_count, 0, instances);
+    }
+}

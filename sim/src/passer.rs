@@ -1,0 +1,21 @@
+//! A second person who walks through.
+
+use crate::actor::Actor;
+use crate::sensor::hash;
+use crate::{MotionConfig, MotionKind, PersonConfig, SimConfig, SimError, motion};
+
+/// Another person than the configuration's, who walks to and fro past the middle.
+pub(crate) fn passer_by(config: &SimConfig) -> Result<Actor, SimError> {
+    let seed = hash(config.seed, 0x9a55_e12b);
+    let own = SimConfig {
+        seed,
+        person: PersonConfig::default(),
+        // Its own track replaces this one.
+        motion: MotionConfig { kind: MotionKind::Still, ..MotionConfig::default() },
+        ..config.clone()
+    };
+    let mut actor = Actor::new(&own)?;
+    // Turns round inside of the ring, lest a camera stands in its way.
+    actor.track = motion::pass_by(&actor.person, seed, 0.75 * config.cameras.radius_m)?;
+    Ok(actor)
+}

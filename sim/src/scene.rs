@@ -1,0 +1,140 @@
+//! The room around the person with its furniture and lamps.
+
+use flyrig_types::Rig;
+use glam::Vec3;
+
+use crate::SimConfig;
+use crate::lamps::Lamp;
+use crate::rooms;
+use crate::scene_config::SceneKind;
+use crate::scene_mesh::{Coat, SceneMesh};
+use crate::sensor::{hash, uniform};
+use crate::surfaces::Surface;
+use crate::texture::Texture;
+
+/// Ceiling height, metres.
+pub(crate) const HEIGHT_M: f32 = 3.6;
+
+/// Everything that stands still.
+#[derive(Debug, Clone)]
+pub(crate) struct Scene {
+    pub mesh: SceneMesh,
+    /// One for each [`Surface`].
+    pub textures: Vec<Texture>,
+    pub lamps: Vec<Lamp>,
+    /// Light from everywhere that no lamp makes.
+    pub steady: Vec3,
+    /// Shares of the light from everywhere that come from above and from below.
+    pub sky: Vec3,
+    pub ground: Vec3,
+}
+
+/// What a room's maker knows.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Plan {
+    key: u64,
+    /// Half the room's side, metres.
+    pub half_m: f32,
+    /// Radius of the ring of cameras, outside of which furniture stands.
+    pub ring_m: f32,
+    /// How many pieces stand between cameras and person.
+    pub occluders: u32,
+}
+
+impl Plan {
+    /// Evenly in `low..high`; one number an index.
+    pub(crate) fn draw(&self, index: u64, low: f32, high: f32) -> f32 {
+        low + (high - low) * uniform(self.key, index) as f32
+    }
+
+    /// One of several; one choice an index.
+    pub(crate) fn pick<T: Copy>(&self, index: u64, of: &[T]) -> Option<T> {
+        of.get((uniform(self.key, index) * of.len() as f64) as usize).copied()
+    }
+}
+
+impl Scene {
+    pub(crate) fn new(config: &SimConfig, rig: &Rig) -> Self {
+        let seed = config.scene.seed.unwrap_or(config.seed);
+        let key = hash(seed, 0x0005_ce4e);
+        let kind = match config.scene.kind {
+            SceneKind::BySeed => {
+                let kinds = [SceneKind::Studio, SceneKind::Office, SceneKind::Cluttered];
+                kinds[(uniform(key, 0) * 2.999) as usize]
+            }
+            kind => kind,
+        };
+        let ring_m = (config.cameras.radius_m + config.cameras.place_jitter_m) as f32;
+        let half_m = ring_m + 1.45;
+        let plan = Plan { key, half_m, ring_m, occluders: config.scene.occluders };
+        let mut mesh = SceneMesh::new(cell_m(rig));
+        let light = match kind {
+            SceneKind::Office => rooms::office(&plan, &mut mesh, &config.lights),
+            SceneKind::Cluttered => rooms::cluttered(&plan, &mut mesh, &config.lights),
+            SceneKind::Studio | SceneKind::BySeed => rooms::studio(&plan, &mut mesh, &config.lights),
+        };
+        mesh.find_openness(half_m, HEIGHT_M);
+        let side = config.texture_px.clamp(64, if config.height > 700 { 1024 } else { 512 }) as usize;
+        let textures = Surface::ALL.iter().map(|surface| surface.texture(side.next_power_of_two(), seed)).collect();
+        Self { mesh, textures, lamps: light.lamps, steady: light.steady, sky: light.sky, ground: light.ground }
+    }
+
+    /// Whether something glows that no lamp makes.
+    pub(crate) fn glows(&self) -> bool {
+        let layer = self.lamps.len() as f32 + 1.0;
+        self.mesh.vertices.iter().any(|vertex| vertex.glow[0] > 0.0 && vertex.glow[1] == layer)
+    }
+}
+
+/// A room's light.
+pub(crate) struct RoomLight {
+    pub lamps: Vec<Lamp>,
+    pub steady: Vec3,
+    pub sky: Vec3,
+    pub ground: Vec3,
+}
+
+/// Longest side of a cell at which straight edges between its corners stay within a twentieth of a pixel of the bent
+/// lens's curves, a metre and a half away.
+fn cell_m(rig: &Rig) -> f32 {
+    const ERROR_PX: f64 = 0.05;
+    const DISTANCE_M: f64 = 1.5;
+    let mut cell = 0.25f64;
+    for camera in &rig.cameras {
+        let i = &camera.intrinsics;
+        let corner = glam::DVec2::new(i.width.into(), i.height.into()) * 0.5 / i.focal_px;
+        let Some(edge) = i.lens.undistort(corner) else { continue };
+        let direction = edge.normalize_or(glam::DVec2::X);
+        let bent = |r: f64| i.lens.distort(direction * r).length();
+        let mut curvature = 0.0f64;
+        for step in 1..16 {
+            let (r, h) = (edge.length() * f64::from(step) / 16.0, edge.length() / 16.0);
+            curvature = curvature.max(((bent(r + h) - 2.0 * bent(r) + bent(r - h)) / (h * h)).abs());
+        }
+        // A chord of length l lies within l² / 8 times the second derivative of its curve.
+        let angle = (8.0 * ERROR_PX / (i.focal_px.max_element() * curvature).max(1e-9)).sqrt();
+        cell = cell.min(angle * DISTANCE_M);
+    }
+    cell.max(0.04) as f32
+}
+
+/// Floor, ceiling and walls; the things that cast no shadow.
+pub(crate) fn shell(plan: &Plan, mesh: &mut SceneMesh, floor: Coat, walls: [Coat; 4], trim: Coat) {
+    let h = plan.half_m;
+    let side = 2.0 * h;
+    mesh.quad(Vec3::new(-h, -h, 0.0), Vec3::X * side, Vec3::Y * side, floor);
+    let white = Coat::new(Surface::Plaster, Vec3::splat(0.78));
+    mesh.quad(Vec3::new(-h, h, HEIGHT_M), Vec3::X * side, -Vec3::Y * side, white);
+    let corners = [Vec3::new(h, h, 0.0), Vec3::new(-h, h, 0.0), Vec3::new(-h, -h, 0.0), Vec3::new(h, -h, 0.0)];
+    for (wall, coat) in walls.into_iter().enumerate() {
+        let from = corners[wall];
+        let along = corners[(wall + 1) % 4] - from;
+        mesh.quad(from, along, Vec3::Z * HEIGHT_M, coat);
+        let inward = Vec3::Z.cross(along).normalize_or(Vec3::X);
+        // The skirting board.
+        let (height, thick) = (0.11, 0.015);
+        mesh.quad(from + inward * thick, along, Vec3::Z * height, trim);
+        mesh.quad(from + inward * thick + Vec3::Z * height, along, -inward * thick, trim);
+    }
+    mesh.first_caster = mesh.triangles.len();
+}

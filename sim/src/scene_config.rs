@@ -1,0 +1,131 @@
+//! What stands around the person, and what lights it.
+
+use serde::{Deserialize, Serialize};
+
+use crate::SimError;
+use crate::error::check;
+
+/// Lamps with shadows that a scene can have.
+pub(crate) const MAX_LAMPS: usize = 3;
+
+/// What kind of room.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum SceneKind {
+    /// A studio with a plank floor, a paper backdrop, stands, cases and soft boxes.
+    #[default]
+    Studio,
+    /// Desks, chairs, screens, shelves of books, plants, panels of light in the ceiling and a window.
+    Office,
+    /// A room full of things: shelves, boxes, a sofa, rugs, posters, plants, lamps.
+    Cluttered,
+    /// One of the others.
+    BySeed,
+}
+
+/// The room and who else is in it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SceneConfig {
+    /// Kind of room.
+    pub kind: SceneKind,
+    /// Makes the room, its colours and its lamps; without it, the simulation's seed does.
+    pub seed: Option<u64>,
+    /// Pieces of furniture (0 to 6) between cameras and the person, who stays free of them within 1.15 m of the middle.
+    pub occluders: u32,
+    /// Whether a second person walks through.
+    pub passer_by: bool,
+}
+
+/// A lamp; the person stands in the middle of the ring, at azimuth -90 degrees is camera 0.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LightConfig {
+    /// Direction from the middle, degrees counter-clockwise from the x axis seen from above.
+    pub azimuth_deg: f64,
+    /// Direction above the horizon, seen from the point that it lights, degrees.
+    pub elevation_deg: f64,
+    /// Distance from the point that it lights (the middle, 0.9 m above the floor), metres.
+    pub distance_m: f64,
+    /// Light on a white surface that faces the lamp in the middle: 1 is the brightest sRGB value at exposure 1.
+    pub intensity: f64,
+    /// Linear colour; the largest part counts as 1.
+    pub colour: [f64; 3],
+    /// Width of the lamp, which makes its shadows soft, metres.
+    pub size_m: f64,
+    /// When its light changes, in order of time.
+    pub switch: Vec<LightSwitch>,
+}
+
+/// A change of a lamp's light that takes no time.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LightSwitch {
+    /// Seconds from the start.
+    pub secs: f64,
+    /// Factor on the intensity from then on; it is 1 before the first switch.
+    pub level: f64,
+}
+
+impl Default for LightConfig {
+    fn default() -> Self {
+        Self {
+            azimuth_deg: -125.0,
+            elevation_deg: 36.0,
+            distance_m: 3.6,
+            intensity: 0.8,
+            colour: [1.0, 0.96, 0.90],
+            size_m: 0.35,
+            switch: Vec::new(),
+        }
+    }
+}
+
+impl SceneConfig {
+    pub(crate) fn validate(&self, ring_radius_m: f64) -> Result<(), SimError> {
+        check("scene.occluders", self.occluders.into(), 0.0, 6.0, "0 to 6 pieces")?;
+        if self.occluders > 0 {
+            let expected = "at least 2.2 metres where scene.occluders have to stand between cameras and person";
+            check("cameras.radius_m", ring_radius_m, 2.2, 6.0, expected)?;
+        }
+        Ok(())
+    }
+}
+
+impl LightConfig {
+    pub(crate) fn validate_all(lights: &[Self]) -> Result<(), SimError> {
+        check("lights", lights.len() as f64, 0.0, MAX_LAMPS as f64, "at most 3 lights (none for the scene's own)")?;
+        lights.iter().try_for_each(Self::validate)
+    }
+
+    fn validate(&self) -> Result<(), SimError> {
+        check("lights.azimuth_deg", self.azimuth_deg, -360.0, 360.0, "-360 to 360 degrees")?;
+        check("lights.elevation_deg", self.elevation_deg, 0.0, 90.0, "0 to 90 degrees")?;
+        check("lights.distance_m", self.distance_m, 1.5, 20.0, "1.5 to 20 metres")?;
+        check("lights.intensity", self.intensity, 0.0, 16.0, "0 to 16")?;
+        for part in self.colour {
+            check("lights.colour", part, 0.0, 1.0, "parts from 0 to 1")?;
+        }
+        if self.colour.iter().all(|&part| part < 0.01) {
+            let found = format!("{:?}", self.colour);
+            return Err(SimError::Config { field: "lights.colour", found, expected: "some colour" });
+        }
+        check("lights.size_m", self.size_m, 0.02, 1.5, "0.02 to 1.5 metres")?;
+        let mut earlier = f64::NEG_INFINITY;
+        for switch in &self.switch {
+            check("lights.switch.secs", switch.secs, -1e6, 1e6, "-1000000 to 1000000 seconds")?;
+            check("lights.switch.level", switch.level, 0.0, 16.0, "0 to 16")?;
+            if switch.secs < earlier {
+                let found = switch.secs.to_string();
+                return Err(SimError::Config { field: "lights.switch.secs", found, expected: "times in order" });
+            }
+            earlier = switch.secs;
+        }
+        Ok(())
+    }
+
+    /// Factor on the intensity at a time.
+    pub(crate) fn level(&self, secs: f64) -> f64 {
+        self.switch.iter().rev().find(|switch| switch.secs <= secs).map_or(1.0, |switch| switch.level)
+    }
+}
