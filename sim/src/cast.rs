@@ -5,6 +5,7 @@ use glam::Vec3;
 
 use crate::actor::{Actor, Shape};
 use crate::capsules::Limbs;
+use crate::constants::Bound;
 use crate::draw::Moment;
 use crate::figure::Figured;
 use crate::passer::passer_by;
@@ -57,6 +58,7 @@ impl Cast {
             keys_a_second: if count > 1 { gap_secs.recip() } else { 0.0 },
             people: Vec::new(),
             ball: (Vec3::ZERO, 0.0),
+            bounds: Vec::new(),
             capsules: Vec::new(),
         };
         let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
@@ -68,10 +70,12 @@ impl Cast {
             // Shade changes little within an exposure: the middle's serves all keys.
             let middle = &keys[count / 2];
             let openness = limbs.openness(&actor.person, &middle.positions, &middle.normals, &capsules);
-            for key in &keys {
-                low = key.positions.iter().copied().fold(low, Vec3::min);
-                high = key.positions.iter().copied().fold(high, Vec3::max);
-            }
+            let points = || keys.iter().flat_map(|key| key.positions.iter().copied());
+            let (own_low, own_high) = (points().fold(Vec3::INFINITY, Vec3::min), points().fold(Vec3::NEG_INFINITY, Vec3::max));
+            let center = ((own_low + own_high) * 0.5).truncate();
+            let radius = points().map(|p| p.truncate().distance_squared(center)).fold(0.0, f32::max).sqrt();
+            moment.bounds.push(Bound { center: center.to_array(), radius, top: own_high.z });
+            (low, high) = (low.min(own_low), high.max(own_high));
             moment.people.push(Figured { keys, openness });
             moment.capsules.extend(capsules);
         }

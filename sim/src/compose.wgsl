@@ -27,26 +27,37 @@ fn depth_m(device: f32) -> f32 {
     return NEAR_M / max(1.0 - device, 1e-6);
 }
 
+// What is the same for all pixels, loaded once before any branch.
+struct Same {
+    camera_from_world: mat4x4<f32>,
+    lens: vec3<f32>,
+    grid: vec2<f32>,
+    size: vec2<u32>,
+    people: array<Bound, 2>,
+    counts: vec4<u32>,
+    lamps: array<Lamp, MAX_LAMPS>,
+    near: bool,
+}
+
 // World position of what the room shows at a pixel.
-fn room_point(at: vec2<u32>, z: f32) -> vec3<f32> {
-    let cell = (vec2<f32>(at) + 0.5) / view.grid.y;
+fn room_point(same: Same, at: vec2<u32>, z: f32) -> vec3<f32> {
+    let cell = (vec2<f32>(at) + 0.5) / same.grid.y;
     let low = floor(cell);
     let t = cell - low;
-    let columns = u32(view.grid.x);
+    let columns = u32(same.grid.x);
     let i = u32(low.y) * columns + u32(low.x);
     let above = mix(directions[i], directions[i + 1u], t.x);
     let below = mix(directions[i + columns], directions[i + columns + 1u], t.x);
-    let lens = view.lens_point.xyz;
-    let camera = vec3((mix(above, below, t.y) - lens.xy * lens.z) * z + lens.xy, z);
-    let m = view.camera_from_world;
+    let camera = vec3((mix(above, below, t.y) - same.lens.xy * same.lens.z) * z + same.lens.xy, z);
+    let m = same.camera_from_world;
     let rotation = mat3x3(m[0].xyz, m[1].xyz, m[2].xyz);
     return transpose(rotation) * (camera - m[3].xyz);
 }
 
 // How much of the sky people leave free over a point of the floor.
-fn floor_openness(world: vec3<f32>) -> f32 {
+fn floor_openness(world: vec3<f32>, count: u32) -> f32 {
     var open = 1.0;
-    for (var i = 0u; i < light.counts.x; i++) {
+    for (var i = 0u; i < count; i++) {
         let a = light.capsules[i].a;
         let b = light.capsules[i].b.xyz;
         let along = b - a.xyz;
@@ -58,29 +69,50 @@ fn floor_openness(world: vec3<f32>) -> f32 {
     return open;
 }
 
-fn room_light(at: vec2<u32>, levels: vec4<f32>, noise: f32) -> vec3<f32> {
-    let lamps = u32(light.steady.w);
-    let world = room_point(at, depth_m(textureLoad(room_depth, at, 0)));
-    let near = view.sum.w > 0.5;
-    var around = surrounding(levels);
-    if (near && world.z < 0.03 && distance(world, light.people.xyz) < light.people.w + 0.8) {
-        around *= floor_openness(world);
+// Whether the light of a lamp to a point may pass through a person's upright cylinder, as wide as the lamp's shadows
+// are soft.
+fn may_hide(bound: Bound, lamp: Lamp, world: vec3<f32>) -> bool {
+    let way = lamp.place.xyz - world;
+    let flat_m = max(length(way.xy), 1e-3);
+    let wide = bound.radius + 0.5 * lamp.place.w;
+    let to_axis = bound.center - world.xy;
+    let along = clamp(dot(to_axis, way.xy) / flat_m, 0.0, flat_m);
+    let off = to_axis - way.xy * (along / flat_m);
+    // Lowest over the cylinder.
+    let low = world.z + way.z * max(along - wide, 0.0) / flat_m;
+    return dot(off, off) < wide * wide && low < bound.top + 0.5 * lamp.place.w;
+}
+
+fn lamp_light(same: Same, l: u32, lamp: Lamp, level: f32, at: vec2<u32>, world: vec4<f32>, turn: f32) -> vec3<f32> {
+    var share = 1.0;
+    let hides = may_hide(same.people[0], lamp, world.xyz) || may_hide(same.people[1], lamp, world.xyz);
+    if (same.near && hides) {
+        let clip = lamp.people_from_world * world;
+        share = soft_share(people_maps, compare, l, clip, 0.02, lamp.place.w, lamp.tangents.y, same.counts.w, turn);
     }
-    var sum = plate_light(0u, at) * around;
-    for (var l = 0u; l < lamps; l++) {
-        let level = level_of(levels, l);
-        if (level <= 0.0) {
-            continue;
-        }
-        var share = 1.0;
-        if (near) {
-            let clip = light.lamps[l].people_from_world * vec4(world, 1.0);
-            share = soft_share(people_maps, compare, l, clip, 0.02, light.lamps[l].tangents.y, 20u, noise * 6.2831853);
-        }
-        sum += plate_light(l + 1u, at) * (level * share);
+    return plate_light(l + 1u, at) * (level * share);
+}
+
+// Whether a point of the floor is close to a person.
+fn under(bound: Bound, at: vec2<f32>) -> bool {
+    return distance(bound.center, at) < bound.radius + 0.35;
+}
+
+fn room_light(same: Same, at: vec2<u32>, row: Row, turn: f32) -> vec3<f32> {
+    let world = vec4(room_point(same, at, depth_m(textureLoad(room_depth, at, 0))), 1.0);
+    var around = row.around.rgb;
+    if (same.near && world.z < 0.03 && (under(same.people[0], world.xy) || under(same.people[1], world.xy))) {
+        around *= floor_openness(world.xyz, same.counts.x);
     }
-    if (light.counts.y > 0u) {
-        sum += plate_light(lamps + 1u, at);
+    var sum = plate_light(0u, at) * around + lamp_light(same, 0u, same.lamps[0], row.levels.x, at, world, turn);
+    if (same.counts.z > 1u) {
+        sum += lamp_light(same, 1u, same.lamps[1], row.levels.y, at, world, turn);
+    }
+    if (same.counts.z > 2u) {
+        sum += lamp_light(same, 2u, same.lamps[2], row.levels.z, at, world, turn);
+    }
+    if (same.counts.y > 0u) {
+        sum += plate_light(same.counts.z + 1u, at);
     }
     return sum;
 }
@@ -88,6 +120,7 @@ fn room_light(at: vec2<u32>, levels: vec4<f32>, noise: f32) -> vec3<f32> {
 // A neighbour that shows nothing but the surface at this depth, or the pixel itself.
 fn like_minded(at: vec2<u32>, device: f32) -> vec2<u32> {
     let size = vec2<i32>(view.size_px);
+    let many = i32(textureNumSamples(room_depth));
     let z = depth_m(device);
     for (var k = 0; k < 9; k++) {
         // The pixel itself first.
@@ -97,7 +130,7 @@ fn like_minded(at: vec2<u32>, device: f32) -> vec2<u32> {
             continue;
         }
         var off = 0.0;
-        for (var i = 0; i < SAMPLES; i++) {
+        for (var i = 0; i < many; i++) {
             off = max(off, abs(depth_m(textureLoad(room_depth, q, i)) - z));
         }
         if (off < 0.03 * z) {
@@ -109,13 +142,23 @@ fn like_minded(at: vec2<u32>, device: f32) -> vec2<u32> {
 
 @compute @workgroup_size(8, 8)
 fn compose(@builtin(global_invocation_id) id: vec3<u32>) {
-    let size = vec2<u32>(view.size_px);
-    if (any(id.xy >= size)) {
+    let same = Same(
+        view.camera_from_world,
+        view.lens_point.xyz,
+        view.grid,
+        vec2<u32>(view.size_px),
+        light.people,
+        light.counts,
+        light.lamps,
+        view.sum.w > 0.5,
+    );
+    let part = view.sum;
+    if (any(id.xy >= same.size)) {
         return;
     }
-    let index = id.y * size.x + id.x;
-    let levels = view.levels[id.y];
-    let noise = pixel_noise(vec2<f32>(id.xy));
+    let index = id.y * same.size.x + id.x;
+    let row = view.rows[id.y];
+    let turn = pixel_noise(vec2<f32>(id.xy)) * 6.2831853;
     var sum = vec4(0.0);
     var free = 0;
     for (var i = 0; i < SAMPLES; i++) {
@@ -126,22 +169,34 @@ fn compose(@builtin(global_invocation_id) id: vec3<u32>) {
             free += 1;
         }
     }
-    if (free == SAMPLES) {
-        sum = vec4(room_light(id.xy, levels, noise) * f32(SAMPLES), 0.0);
-    } else if (free > 0) {
-        // Each free sample shows its own surface: the plate's mean would let what the person hides shine through.
-        for (var i = 0; i < SAMPLES; i++) {
-            if (textureLoad(samples, id.xy, i).a <= 0.25) {
-                let from_pixel = like_minded(id.xy, textureLoad(room_depth, id.xy, i));
-                sum += vec4(room_light(from_pixel, levels, noise), 0.0);
+    // Each free sample shows its own surface: the plate's mean would let what the person hides shine through.
+    var pixel = array(id.xy, id.xy);
+    var count = array(f32(free), 0.0);
+    let looked_at = select(0, i32(textureNumSamples(samples)), free > 0 && free < SAMPLES);
+    for (var i = 0; i < looked_at; i++) {
+        if (textureLoad(samples, id.xy, i).a <= 0.25) {
+            let from_pixel = like_minded(id.xy, textureLoad(room_depth, id.xy, i));
+            if (count[0] == f32(free) && count[1] == 0.0 && any(from_pixel != pixel[0])) {
+                pixel[1] = from_pixel;
+            }
+            if (any(from_pixel != pixel[0])) {
+                count[0] -= 1.0;
+                count[1] += 1.0;
             }
         }
     }
-    sum *= view.sum.x / f32(SAMPLES);
-    if (view.sum.y < 0.5) {
+    var rounds = select(0u, 1u, free > 0);
+    rounds = select(rounds, 2u, count[1] > 0.0);
+    for (var k = 0u; k < rounds; k++) {
+        let second = k > 0u;
+        let light = room_light(same, select(pixel[0], pixel[1], second), row, turn);
+        sum += vec4(light * select(count[0], count[1], second), 0.0);
+    }
+    sum *= part.x / f32(SAMPLES);
+    if (part.y < 0.5) {
         sum += sums[index];
     }
-    if (view.sum.z < 0.5) {
+    if (part.z < 0.5) {
         sums[index] = sum;
         return;
     }

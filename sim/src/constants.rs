@@ -2,8 +2,8 @@
 
 use bytemuck::{Pod, Zeroable};
 use flyrig_types::{Camera, Lens};
-use glam::Vec3;
 
+use crate::draw::Moment;
 use crate::gpu_parts::SAMPLES;
 use crate::lamps::LAMP_NEAR_M;
 use crate::optics::SubFrame;
@@ -17,19 +17,22 @@ pub(crate) const NEAR_M: f32 = 0.1;
 pub(crate) const MAX_CAPSULES: usize = 64;
 /// Steps to the row in which a moving point is seen.
 const ROW_STEPS: u32 = 5;
+/// Taps of a soft shadow.
+const SHADOW_TAPS: u32 = 16;
 /// Brightest light of a plate's layer.
 const PLATE_WHITE: f32 = 4.0;
 
 /// WGSL of all passes.
-pub(crate) fn shader_sources() -> [(&'static str, String); 4] {
+pub(crate) fn shader_sources() -> [(&'static str, String); 5] {
     let constants = format!(
         "const NEAR_M: f32 = {NEAR_M:?};\nconst LAMP_NEAR_M: f32 = {LAMP_NEAR_M:?};\nconst SAMPLES: i32 = {SAMPLES};\n\
          const MAX_LAMPS: u32 = {MAX_LAMPS}u;\nconst MAX_CAPSULES: u32 = {MAX_CAPSULES}u;\nconst ROW_STEPS: i32 = \
          {ROW_STEPS};\nconst PLATE_WHITE: f32 = {PLATE_WHITE:?};\n"
     );
-    let (view, light) = (include_str!("view.wgsl"), include_str!("light.wgsl"));
+    let (view, light, points) = (include_str!("view.wgsl"), include_str!("light.wgsl"), include_str!("points.wgsl"));
     [
-        ("simulated people", [&constants, view, light, include_str!("person.wgsl")].concat()),
+        ("simulated people", [&constants, view, light, points, include_str!("person.wgsl")].concat()),
+        ("shade on simulated people", [&constants, view, light, points, include_str!("shade.wgsl")].concat()),
         ("simulated room", [&constants, view, light, include_str!("room.wgsl")].concat()),
         ("simulated plate", [&constants, view, include_str!("plate.wgsl")].concat()),
         ("simulated picture", [&constants, view, light, include_str!("compose.wgsl")].concat()),
@@ -94,6 +97,17 @@ pub(crate) struct Capsule {
     pub padding: f32,
 }
 
+/// An upright cylinder from the floor around a person, metres.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+pub(crate) struct Bound {
+    pub center: [f32; 2],
+    pub radius: f32,
+    pub top: f32,
+}
+
+const NOBODY: Bound = Bound { center: [0.0; 2], radius: -1e4, top: -1e4 };
+
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct LampBlock {
@@ -103,7 +117,6 @@ struct LampBlock {
     axis: [f32; 4],
     color: [f32; 4],
     tangents: [f32; 4],
-    bounce: [f32; 4],
 }
 
 /// `struct Light` of light.wgsl.
@@ -111,21 +124,21 @@ struct LampBlock {
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(crate) struct LightBlock {
     lamps: [LampBlock; MAX_LAMPS],
-    steady: [f32; 4],
     sky: [f32; 4],
     ground: [f32; 4],
-    people: [f32; 4],
+    people: [Bound; 2],
     counts: [u32; 4],
     capsules: [Capsule; MAX_CAPSULES],
 }
 
 impl LightBlock {
     /// The scene's lamps with people within a ball.
-    pub(crate) fn new(scene: &Scene, glows: bool, (center, radius): (Vec3, f32), capsules: &[Capsule]) -> Self {
+    pub(crate) fn new(scene: &Scene, glows: bool, moment: &Moment) -> Self {
+        let Moment { ball: (center, radius), bounds, capsules, .. } = moment;
         let mut block = Self::zeroed();
         for (to, lamp) in block.lamps.iter_mut().zip(&scene.lamps) {
             let (room, room_tangent) = lamp.room_view();
-            let (people, people_tangent) = lamp.ball_view(center, radius);
+            let (people, people_tangent) = lamp.ball_view(*center, *radius);
             let [end, begin] = lamp.cone();
             *to = LampBlock {
                 room_from_world: room.to_cols_array_2d(),
@@ -134,17 +147,18 @@ impl LightBlock {
                 axis: lamp.axis.extend(end).to_array(),
                 color: lamp.power.extend(begin).to_array(),
                 tangents: [room_tangent, people_tangent, 0.0, 0.0],
-                bounce: lamp.bounce.extend(0.0).to_array(),
             };
         }
-        block.steady = scene.steady.extend(scene.lamps.len() as f32).to_array();
         block.sky = scene.sky.extend(0.0).to_array();
         block.ground = scene.ground.extend(0.0).to_array();
-        block.people = center.extend(radius).to_array();
+        block.people = [NOBODY; 2];
+        for (to, bound) in block.people.iter_mut().zip(bounds) {
+            *to = *bound;
+        }
         for (to, capsule) in block.capsules.iter_mut().zip(capsules) {
             *to = *capsule;
         }
-        block.counts = [capsules.len().min(MAX_CAPSULES) as u32, glows.into(), 0, 0];
+        block.counts = [capsules.len().min(MAX_CAPSULES) as u32, glows.into(), scene.lamps.len() as u32, SHADOW_TAPS];
         block
     }
 }
@@ -180,7 +194,7 @@ mod tests {
             assert!(!source.contains("var<uniform>"), "{name}: leaks on Mesa's software adapter");
             let module = naga::front::wgsl::parse_str(&source)
                 .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&source)));
-            let capabilities = naga::valid::Capabilities::empty();
+            let capabilities = naga::valid::Capabilities::SHADER_FLOAT16_IN_FLOAT32;
             let mut validator = naga::valid::Validator::new(naga::valid::ValidationFlags::all(), capabilities);
             validator.validate(&module).unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&source)));
             let span = |wanted: &str| {
@@ -190,7 +204,7 @@ mod tests {
                 })
             };
             // One row.
-            assert_eq!(span("View").unwrap(), size_of::<ViewHead>() + 16, "{name}");
+            assert_eq!(span("View").unwrap(), size_of::<ViewHead>() + 32, "{name}");
             assert_eq!(span("Light").unwrap_or(size_of::<LightBlock>()), size_of::<LightBlock>(), "{name}");
         }
     }

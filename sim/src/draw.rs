@@ -12,7 +12,8 @@ use wgpu::{
     Sampler, StoreOp, Texture, TextureUsages, TextureView, VertexFormat,
 };
 
-use crate::constants::{Blocks, Capsule, LightBlock, ViewHead, shader_sources};
+use crate::actor::Shape;
+use crate::constants::{Blocks, Bound, Capsule, LightBlock, ViewHead, shader_sources};
 use crate::figure::{Figure, Figured};
 use crate::gpu_parts::{
     DEPTH, Drawn, LIGHT, SAMPLES, Slot, TRUTH, array_view, bind, compute, layer_view, layout, pipeline, target,
@@ -24,7 +25,7 @@ use crate::plates::{Plate, Plates};
 use crate::scene::Scene;
 
 /// Sides of the lamps' pictures of people and of the room, pixels.
-const PEOPLE_MAP_PX: u32 = 768;
+const PEOPLE_MAP_PX: u32 = 512;
 const ROOM_MAP_PX: u32 = 2048;
 
 /// The people around an instant.
@@ -36,6 +37,8 @@ pub(crate) struct Moment {
     pub people: Vec<Figured>,
     /// A ball around everybody at all keys.
     pub ball: (Vec3, f32),
+    /// Around each.
+    pub bounds: Vec<Bound>,
     pub capsules: Vec<Capsule>,
 }
 
@@ -65,6 +68,7 @@ pub(crate) struct Truth {
 struct Layouts {
     constants: BindGroupLayout,
     points: BindGroupLayout,
+    shade: BindGroupLayout,
     person: BindGroupLayout,
     room: BindGroupLayout,
     plate: BindGroupLayout,
@@ -74,11 +78,12 @@ struct Layouts {
 #[derive(Debug)]
 struct Pipelines {
     person_shadow: RenderPipeline,
-    person_color: RenderPipeline,
+    person_lit: RenderPipeline,
     person_truth: RenderPipeline,
     room_shadow: RenderPipeline,
     room_layer: RenderPipeline,
     room_depth: RenderPipeline,
+    shade: ComputePipeline,
     plate: ComputePipeline,
     picture: ComputePipeline,
 }
@@ -97,6 +102,7 @@ pub(crate) struct Drawing {
     room_indices: Buffer,
     room_bind: BindGroup,
     people_maps: Texture,
+    room_maps: Texture,
     compare: Sampler,
     samples: Texture,
     depth: Texture,
@@ -126,11 +132,12 @@ impl Drawing {
         let device = &gpu.device;
         let layouts = Layouts {
             constants: layout(gpu, "constants", &[Slot::Constants, Slot::Constants]),
-            points: layout(gpu, "points", &[Slot::Read]),
+            points: layout(gpu, "points", &[Slot::Read, Slot::Read]),
+            shade: layout(gpu, "shade", &[Slot::Read, Slot::Write, Slot::DepthMaps, Slot::Compare]),
             person: layout(
                 gpu,
                 "surface of a person",
-                &[Slot::Textures, Slot::Smooth, Slot::DepthMaps, Slot::DepthMaps, Slot::Compare],
+                &[Slot::Textures, Slot::Smooth, Slot::DepthMaps, Slot::Compare],
             ),
             room: layout(gpu, "surface of the room", &[Slot::Textures, Slot::Smooth, Slot::DepthMaps, Slot::Compare]),
             plate: layout(gpu, "plate", &[Slot::ManySamples, Slot::Write]),
@@ -185,7 +192,6 @@ impl Drawing {
                     BindingResource::TextureView(&figure.textures),
                     BindingResource::Sampler(&cloth_sampler),
                     BindingResource::TextureView(&array_view(&people_maps)),
-                    BindingResource::TextureView(&array_view(&room_maps)),
                     BindingResource::Sampler(&compare),
                 ],
             );
@@ -225,6 +231,7 @@ impl Drawing {
             ),
             room_bind,
             people_maps,
+            room_maps,
             compare,
             samples: target(gpu, "light samples", full, SAMPLES, LIGHT, bound),
             depth: target(gpu, "sample depth", full, SAMPLES, DEPTH, TextureUsages::COPY_DST),
@@ -239,12 +246,13 @@ impl Drawing {
                 keys_a_second: 0.0,
                 people: Vec::new(),
                 ball: (crate::lamps::STAGE, 1.0),
+                bounds: Vec::new(),
                 capsules: Vec::new(),
             },
             scene,
             layouts,
         };
-        drawing.draw_room_maps(&room_maps);
+        drawing.draw_room_maps();
         Ok(drawing)
     }
 
@@ -254,6 +262,11 @@ impl Drawing {
             figure.pose(&self.gpu, &self.layouts.points, figured)?;
         }
         self.moment = moment;
+        // They are on the adapter now; what is left is their number.
+        for figured in &mut self.moment.people {
+            figured.keys.iter_mut().for_each(|key| *key = Shape { positions: Vec::new(), normals: Vec::new() });
+            figured.openness = Vec::new();
+        }
         Ok(())
     }
 
@@ -276,7 +289,7 @@ impl Drawing {
                     layers.push([self.view_offset(&mut blocks, head, &[]), light]);
                 }
             }
-            let view = self.view_offset(&mut blocks, self.head(take, step), &self.levels(take, step.frame));
+            let view = self.view_offset(&mut blocks, self.head(take, step), &self.rows(take, step.frame));
             planned.push((plate, layers, [view, light]));
         }
         let constants = self.upload(&blocks);
@@ -296,7 +309,7 @@ impl Drawing {
         for (step, (plate, layers, offsets)) in steps.iter().zip(&planned) {
             let people = takes[step.take].people;
             if people && shadows_at != Some(step.secs) {
-                self.draw_people_maps(&mut encoder, &constants, *offsets);
+                self.shade_people(&mut encoder, &constants, *offsets);
                 shadows_at = Some(step.secs);
             }
             self.bake(&mut encoder, &constants, plate, layers);
@@ -375,31 +388,34 @@ impl Drawing {
         head
     }
 
-    /// Each lamp's level at the time of each row.
-    fn levels(&self, take: &Take, frame: SubFrame) -> Vec<[f32; 4]> {
-        let rows = self.size[1];
-        let row_secs = take.optics.readout_ms * 1e-3 / (f64::from(rows) - 1.0);
+    /// Each lamp's level and the light from everywhere at the time of each row.
+    fn rows(&self, take: &Take, frame: SubFrame) -> Vec<[f32; 8]> {
+        let rows = f64::from(self.size[1]);
+        let row_secs = take.optics.readout_ms * 1e-3 / (rows - 1.0);
         let middle = take.nanos as f64 * 1e-9 + frame.secs;
-        (0..rows)
+        (0..self.size[1])
             .map(|row| {
-                let secs = middle + (f64::from(row) - 0.5 * (f64::from(rows) - 1.0)) * row_secs;
+                let secs = middle + (f64::from(row) - 0.5 * (rows - 1.0)) * row_secs;
                 let mut levels = [0.0; 4];
-                for (level, lamp) in levels.iter_mut().zip(&self.scene.lamps) {
-                    *level = lamp.level(secs);
+                let mut around = self.scene.steady;
+                for (to, lamp) in levels.iter_mut().zip(&self.scene.lamps) {
+                    *to = lamp.level(secs);
+                    around += lamp.bounce * *to;
                 }
-                levels
+                let [a, b, c, d] = levels;
+                [a, b, c, d, around.x, around.y, around.z, 0.0]
             })
             .collect()
     }
 
-    fn view_offset(&self, blocks: &mut Blocks, head: ViewHead, levels: &[[f32; 4]]) -> u32 {
-        let mut rows = levels.to_vec();
-        rows.resize(self.size[1] as usize, [0.0; 4]);
+    fn view_offset(&self, blocks: &mut Blocks, head: ViewHead, rows: &[[f32; 8]]) -> u32 {
+        let mut rows = rows.to_vec();
+        rows.resize(self.size[1] as usize, [0.0; 8]);
         blocks.push(&[bytemuck::bytes_of(&head), bytemuck::cast_slice(&rows)])
     }
 
     fn light_offset(&self, blocks: &mut Blocks) -> u32 {
-        let light = LightBlock::new(&self.scene, self.glows, self.moment.ball, &self.moment.capsules);
+        let light = LightBlock::new(&self.scene, self.glows, &self.moment);
         blocks.push(&[bytemuck::bytes_of(&light)])
     }
 
@@ -411,7 +427,7 @@ impl Drawing {
             // A storage buffer: Mesa's software adapter leaks with uniform ones, see ARCHITECTURE.md.
             usage: BufferUsages::STORAGE,
         });
-        let view_bytes = size_of::<ViewHead>() + 16 * self.size[1] as usize;
+        let view_bytes = size_of::<ViewHead>() + 32 * self.size[1] as usize;
         let block = |bytes: usize| {
             let size = std::num::NonZeroU64::new(bytes as u64);
             BindingResource::Buffer(wgpu::BufferBinding { buffer: &buffer, offset: 0, size })
@@ -431,14 +447,14 @@ impl Drawing {
         Ok(self.sums[take].clone())
     }
 
-    fn draw_room_maps(&self, maps: &Texture) {
+    fn draw_room_maps(&self) {
         let mut blocks = Blocks::default();
         let light = self.light_offset(&mut blocks);
         let view = self.view_offset(&mut blocks, ViewHead::zeroed(), &[]);
         let constants = self.upload(&blocks);
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         for lamp in 0..self.scene.lamps.len() as u32 {
-            let mut pass = pass(&mut encoder, &[], &layer_view(maps, lamp), LoadOp::Clear(1.0));
+            let mut pass = pass(&mut encoder, &[], &layer_view(&self.room_maps, lamp), LoadOp::Clear(1.0));
             pass.set_pipeline(&self.pipelines.room_shadow);
             pass.set_bind_group(0, &constants, &[view, light]);
             self.draw_room(&mut pass, self.scene.mesh.first_caster, lamp..lamp + 1);
@@ -446,7 +462,22 @@ impl Drawing {
         self.gpu.queue.submit([encoder.finish()]);
     }
 
-    fn draw_people_maps(&self, encoder: &mut CommandEncoder, constants: &BindGroup, offsets: Offsets) {
+    /// The shadows that people cast at a time, and those of the furniture on them.
+    fn shade_people(&self, encoder: &mut CommandEncoder, constants: &BindGroup, offsets: Offsets) {
+        for (figure, _) in &self.people {
+            let ([points, shares], count) = figure.buffers();
+            let group = [
+                points,
+                shares,
+                BindingResource::TextureView(&array_view(&self.room_maps)),
+                BindingResource::Sampler(&self.compare),
+            ];
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            pass.set_pipeline(&self.pipelines.shade);
+            pass.set_bind_group(0, constants, &offsets);
+            pass.set_bind_group(1, &bind(&self.gpu, &self.layouts.shade, &group), &[]);
+            pass.dispatch_workgroups(count.div_ceil(64), 1, 1);
+        }
         for lamp in 0..self.scene.lamps.len() as u32 {
             let mut pass = pass(encoder, &[], &layer_view(&self.people_maps, lamp), LoadOp::Clear(1.0));
             pass.set_pipeline(&self.pipelines.person_shadow);
@@ -487,7 +518,7 @@ impl Drawing {
         if !people {
             return;
         }
-        pass.set_pipeline(&self.pipelines.person_color);
+        pass.set_pipeline(&self.pipelines.person_lit);
         pass.set_bind_group(0, constants, &offsets);
         for (figure, surface) in &self.people {
             pass.set_bind_group(2, surface, &[]);
@@ -577,7 +608,7 @@ impl Drawing {
 
 impl Pipelines {
     fn new(gpu: &GpuContext, layouts: &Layouts) -> Self {
-        let [people, room, plate, picture] = shader_sources().map(|(label, source)| {
+        let [people, shade, room, plate, picture] = shader_sources().map(|(label, source)| {
             gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
                 label: Some(label),
                 source: wgpu::ShaderSource::Wgsl(source.into()),
@@ -604,11 +635,12 @@ impl Pipelines {
         };
         Self {
             person_shadow: figure("vs_shadow", None, &[constants, points], &[], 1),
-            person_color: figure("vs_person", Some("fs_color"), &[constants, points, person], &[LIGHT], SAMPLES),
-            person_truth: figure("vs_person", Some("fs_truth"), &[constants, points, person], &[TRUTH, TRUTH], 1),
+            person_lit: figure("vs_lit", Some("fs_lit"), &[constants, points, person], &[LIGHT], SAMPLES),
+            person_truth: figure("vs_truth", Some("fs_truth"), &[constants, points, person], &[TRUTH, TRUTH], 1),
             room_shadow: standing("vs_room_shadow", None, &[constants], &[], 1),
             room_layer: standing("vs_room", Some("fs_layer"), &[constants, room_layout], &[LIGHT], SAMPLES),
             room_depth: standing("vs_room", None, &[constants], &[], 1),
+            shade: compute(gpu, &shade, &[constants, &layouts.shade], "shade"),
             plate: compute(gpu, &plate, &[constants, &layouts.plate], "keep"),
             picture: compute(gpu, &picture, &[constants, &layouts.picture], "compose"),
         }

@@ -20,7 +20,9 @@ pub(crate) struct Figured {
 #[derive(Debug)]
 pub(crate) struct Figure {
     points: StorageBuffer<[f32; 8]>,
-    pub points_bind: BindGroup,
+    /// Share of each lamp's light that furniture lets through.
+    shares: StorageBuffer<[f32; 4]>,
+    points_bind: BindGroup,
     paint: Buffer,
     truth: Buffer,
     indices: Buffer,
@@ -47,14 +49,21 @@ impl Figure {
         let paint: Vec<[f32; 4]> = (clothed.uvs.iter().zip(&person.layer_and_openness).zip(&clothed.parts))
             .map(|((uv, &(layer, _)), &of)| [uv.x, uv.y, layer as f32, f32::from(part(of))])
             .collect();
-        let truth: Vec<[f32; 4]> = person.carriers.iter().map(|p| p.extend(vertex_count as f32).to_array()).collect();
+        let truth: Vec<[f32; 4]> =
+            person.carriers.iter().map(|p| p.extend(0.0).to_array()).collect();
         let points = StorageBuffer::zeroed(gpu, "points of a person", vertex_count)?;
+        let shares = StorageBuffer::zeroed(gpu, "shade on a person", vertex_count)?;
         Ok(Self {
-            points_bind: bind(gpu, layout, &[points.raw().as_entire_binding()]),
+            points_bind: bind(gpu, layout, &[points.raw().as_entire_binding(), shares.raw().as_entire_binding()]),
             points,
+            shares,
             paint: buffer("paint of a person", bytemuck::cast_slice(&paint), BufferUsages::VERTEX),
             truth: buffer("truth of a person", bytemuck::cast_slice(&truth), BufferUsages::VERTEX),
-            indices: buffer("triangles of a person", bytemuck::cast_slice(&clothed.triangles), BufferUsages::INDEX),
+            indices: buffer(
+                "triangles of a person",
+                bytemuck::cast_slice(&clothed.triangles),
+                BufferUsages::INDEX,
+            ),
             index_count: clothed.triangles.len() as u32 * 3,
             vertex_count,
             textures: upload_textures(gpu, "clothes and skin of a person", &person.textures),
@@ -71,7 +80,8 @@ impl Figure {
         let needed = self.vertex_count * figured.keys.len();
         if self.points.len() < needed {
             self.points = StorageBuffer::zeroed(gpu, "points of a person", needed)?;
-            self.points_bind = bind(gpu, layout, &[self.points.raw().as_entire_binding()]);
+            let buffers = [self.points.raw().as_entire_binding(), self.shares.raw().as_entire_binding()];
+            self.points_bind = bind(gpu, layout, &buffers);
         }
         let mut points = Vec::with_capacity(needed);
         for Shape { positions, normals } in &figured.keys {
@@ -81,6 +91,11 @@ impl Figure {
         }
         self.points.write(gpu, &points);
         Ok(())
+    }
+
+    /// Points and shares, to compute on; and the number of points.
+    pub(crate) fn buffers(&self) -> ([wgpu::BindingResource<'_>; 2], u32) {
+        ([self.points.raw().as_entire_binding(), self.shares.raw().as_entire_binding()], self.vertex_count as u32)
     }
 
     /// Draws `instances`; pipeline and groups but for the points are set.

@@ -11,9 +11,8 @@ struct Lamp {
     axis: vec4<f32>,
     // Light times squared metres; w: cosine of the angle where its light begins to fall.
     color: vec4<f32>,
-    // Tangents of half the angle of the two pictures; what of it comes back from the room is in `bounce`.
+    // Tangents of half the angle of the two pictures.
     tangents: vec4<f32>,
-    bounce: vec4<f32>,
 }
 
 // Two ends; the first one's w is the radius. Metres.
@@ -22,48 +21,47 @@ struct Capsule {
     b: vec4<f32>,
 }
 
+// An upright cylinder from the floor around a person; without one its radius is far below 0.
+struct Bound {
+    center: vec2<f32>,
+    radius: f32,
+    top: f32,
+}
+
 struct Light {
     lamps: array<Lamp, MAX_LAMPS>,
-    // Light from everywhere at all times; w: number of lamps.
-    steady: vec4<f32>,
-    // Shares of that light and of the bounced light from above and below.
+    // Shares of the light from everywhere that come from above and below.
     sky: vec4<f32>,
     ground: vec4<f32>,
-    // Middle of the people and their distance from it, metres.
-    people: vec4<f32>,
-    // x: number of capsules.
+    people: array<Bound, 2>,
+    // Number of capsules, 1 where something glows by itself, number of lamps, taps of a shadow.
     counts: vec4<u32>,
     capsules: array<Capsule, MAX_CAPSULES>,
 }
 
-fn level_of(levels: vec4<f32>, lamp: u32) -> f32 {
-    return levels[lamp];
-}
+// Written for Mesa's software adapter as well, which gathers what is loaded by a changing index lane by lane (so lamps
+// are handed around by value), and skips nothing of a branch that no lane takes, but leaves loops (so what is seldom
+// needed stands in loops whose number of rounds it cannot know).
 
-// Light from everywhere.
-fn surrounding(levels: vec4<f32>) -> vec3<f32> {
-    var sum = light.steady.rgb;
-    for (var l = 0u; l < u32(light.steady.w); l++) {
-        sum += light.lamps[l].bounce.rgb * level_of(levels, l);
-    }
-    return sum;
-}
-
-fn hemisphere(normal: vec3<f32>) -> vec3<f32> {
-    return mix(light.ground.rgb, light.sky.rgb, normal.z * 0.5 + 0.5);
+fn hemisphere(normal: vec3<f32>, sky: vec3<f32>, ground: vec3<f32>) -> vec3<f32> {
+    return mix(ground, sky, normal.z * 0.5 + 0.5);
 }
 
 // What a surface facing a lamp would get at a point, without shadows.
-fn arriving(l: u32, world: vec3<f32>) -> vec3<f32> {
-    let away = world - light.lamps[l].place.xyz;
+fn arriving(lamp: Lamp, world: vec3<f32>) -> vec3<f32> {
+    let away = world - lamp.place.xyz;
     let d2 = max(dot(away, away), 0.04);
-    let angle = dot(away * inverseSqrt(d2), light.lamps[l].axis.xyz);
-    return light.lamps[l].color.rgb / d2 * smoothstep(light.lamps[l].axis.w, light.lamps[l].color.w, angle);
+    let angle = dot(away * inverseSqrt(d2), lamp.axis.xyz);
+    return lamp.color.rgb / d2 * smoothstep(lamp.axis.w, lamp.color.w, angle);
+}
+
+// How far the light of a wide lamp reaches around a corner.
+fn wrap_of(lamp: Lamp, world: vec3<f32>) -> f32 {
+    return min(0.5 * lamp.place.w / distance(world, lamp.place.xyz), 0.5);
 }
 
 // Share of a wide lamp's light by the cosine of the angle to its middle.
-fn facing_share(l: u32, world: vec3<f32>, cosine: f32) -> f32 {
-    let wrap = min(0.5 * light.lamps[l].place.w / distance(world, light.lamps[l].place.xyz), 0.5);
+fn facing_share(wrap: f32, cosine: f32) -> f32 {
     return max((cosine + wrap) / (1.0 + wrap), 0.0);
 }
 
@@ -71,44 +69,18 @@ fn lamp_depth(z: f32) -> f32 {
     return 1.0 - LAMP_NEAR_M / max(z, LAMP_NEAR_M);
 }
 
-// Point of a disc that fills evenly with growing index.
-fn disc(index: u32, count: u32, turn: f32) -> vec2<f32> {
-    let r = sqrt((f32(index) + 0.5) / f32(count));
-    let angle = f32(index) * 2.3999632 + turn;
-    return r * vec2(cos(angle), sin(angle));
-}
+// Turns by the golden angle, whose multiples fill a circle evenly.
+const GOLDEN = mat2x2<f32>(vec2(-0.7373688, 0.6754903), vec2(-0.6754903, -0.7373688));
 
-// Share of a lamp's light that passes, at a point of its picture; few taps, `spread_m` wide.
-fn quick_share(
-    map: texture_depth_2d_array,
-    compare: sampler_comparison,
-    l: u32,
-    clip: vec4<f32>,
-    spread_m: f32,
-    bias_m: f32,
-    tangent: f32,
-) -> f32 {
-    if (clip.w < LAMP_NEAR_M || any(abs(clip.xy) > vec2(clip.w * 0.995))) {
-        return 1.0;
-    }
-    let at = clip.xy / clip.w * vec2(0.5, -0.5) + 0.5;
-    let step = vec2(spread_m / (2.0 * clip.w * tangent));
-    let depth = lamp_depth(clip.w - bias_m);
-    var sum = 0.0;
-    for (var i = 0u; i < 4u; i++) {
-        let offset = vec2(f32(i & 1u), f32(i >> 1u)) * 2.0 - 1.0;
-        sum += textureSampleCompareLevel(map, compare, at + offset * step, l, depth);
-    }
-    return sum * 0.25;
-}
-
-// The same with a penumbra as wide as the lamp and the distance to what is in its way make it.
+// Share of a lamp's light that passes, at a point of its picture: with a penumbra as wide as the lamp and the distance
+// to what is in its way make it.
 fn soft_share(
     map: texture_depth_2d_array,
     compare: sampler_comparison,
     l: u32,
     clip: vec4<f32>,
     bias_m: f32,
+    size_m: f32,
     tangent: f32,
     taps: u32,
     turn: f32,
@@ -118,30 +90,36 @@ fn soft_share(
         return 1.0;
     }
     let at = clip.xy / z * vec2(0.5, -0.5) + 0.5;
-    let size = light.lamps[l].place.w;
     let pixels = vec2<f32>(textureDimensions(map));
     let depth = lamp_depth(z - bias_m);
     // What lies in the way, on average: looked for as wide as something half-way would be.
-    let search = clamp(0.5 * size / (2.0 * z * tangent), 2.0 / pixels.x, 0.1);
+    let search = clamp(0.5 * size_m / (2.0 * z * tangent), 2.0 / pixels.x, 0.1);
+    let start = vec2(cos(turn), sin(turn));
     var way = 0.0;
     var found = 0.0;
-    for (var i = 0u; i < 12u; i++) {
-        let texel = vec2<i32>(clamp((at + disc(i, 12u, turn) * search) * pixels, vec2(0.0), pixels - 1.0));
+    var direction = start;
+    for (var i = 0u; i < taps; i++) {
+        let offset = direction * (search * sqrt((f32(i) + 0.5) / f32(taps)));
+        let texel = vec2<i32>(clamp((at + offset) * pixels, vec2(0.0), pixels - 1.0));
         let d = textureLoad(map, texel, l, 0);
         if (d < depth) {
             way += LAMP_NEAR_M / (1.0 - d);
             found += 1.0;
         }
+        direction = GOLDEN * direction;
     }
     if (found == 0.0) {
         return 1.0;
     }
     let between = way / found;
-    let half_m = 0.5 * size * max(z - between, 0.0) / between;
+    let half_m = 0.5 * size_m * max(z - between, 0.0) / between;
     let radius = clamp(half_m / (2.0 * z * tangent), 0.75 / pixels.x, search);
     var sum = 0.0;
+    direction = start;
     for (var i = 0u; i < taps; i++) {
-        sum += textureSampleCompareLevel(map, compare, at + disc(i, taps, turn) * radius, l, depth);
+        let offset = direction * (radius * sqrt((f32(i) + 0.5) / f32(taps)));
+        sum += textureSampleCompareLevel(map, compare, at + offset, l, depth);
+        direction = GOLDEN * direction;
     }
     return sum / f32(taps);
 }

@@ -1,128 +1,159 @@
-// Draws clothed people. Prepended: constants, view.wgsl and light.wgsl.
-
-// Position and openness, normal.
-struct Point {
-    place: vec4<f32>,
-    normal: vec4<f32>,
-}
+// Draws clothed people. Prepended: constants, view.wgsl, light.wgsl and points.wgsl.
 
 @group(0) @binding(0) var<storage, read> view: View;
 @group(0) @binding(1) var<storage, read> light: Light;
 // All points at the first key, at the second, and so on.
 @group(1) @binding(0) var<storage, read> points: array<Point>;
+// Share of each lamp's light that furniture lets through, see shade.wgsl.
+@group(1) @binding(1) var<storage, read> shares: array<vec4<f32>>;
 @group(2) @binding(0) var textures: texture_2d_array<f32>;
 @group(2) @binding(1) var smooth_sampler: sampler;
 @group(2) @binding(2) var people_maps: texture_depth_2d_array;
-@group(2) @binding(3) var room_maps: texture_depth_2d_array;
-@group(2) @binding(4) var compare: sampler_comparison;
+@group(2) @binding(3) var compare: sampler_comparison;
 
 struct Vertex {
     @builtin(vertex_index) index: u32,
     // uv, layer, part + 1 (0: somebody else)
     @location(0) paint: vec4<f32>,
-    // Canonical position of the carrying body point, number of points a key
+    // Canonical position of the carrying body point
     @location(1) truth: vec4<f32>,
 }
 
-struct Fragment {
-    @builtin(position) clip: vec4<f32>,
-    @location(0) @interpolate(perspective, centroid) world: vec3<f32>,
-    @location(1) @interpolate(perspective, centroid) normal: vec3<f32>,
-    @location(2) @interpolate(perspective, centroid) uv: vec2<f32>,
-    @location(3) @interpolate(perspective, centroid) openness: f32,
-    @location(4) @interpolate(perspective, centroid) canonical: vec3<f32>,
-    @location(5) @interpolate(perspective, centroid) depth_m: f32,
-    @location(6) @interpolate(flat) layer_part: vec2<u32>,
+// A point as a camera sees it.
+struct Seen {
+    // At the time of the middle row: shadows are those of that time.
+    still: Point,
+    // At the time of the row in which it is seen.
+    point: Point,
+    pixel: vec2<f32>,
+    depth_m: f32,
 }
 
-// A point at a time, on the parabola through the three nearest keys.
-fn point_at(vertex: Vertex, secs: f32) -> Point {
-    let keys = u32(view.keys.z);
-    if (keys < 3u) {
-        return points[vertex.index];
-    }
-    let at = (secs - view.keys.x) * view.keys.y;
-    let middle = clamp(floor(at + 0.5), 1.0, view.keys.z - 2.0);
-    let s = at - middle;
-    let count = u32(vertex.truth.w);
-    let first = (u32(middle) - 1u) * count + vertex.index;
-    let a = points[first];
-    let b = points[first + count];
-    let c = points[first + 2u * count];
-    let wa = 0.5 * s * (s - 1.0);
-    let wb = 1.0 - s * s;
-    let wc = 0.5 * s * (s + 1.0);
-    return Point(a.place * wa + b.place * wb + c.place * wc, a.normal * wa + b.normal * wb + c.normal * wc);
-}
-
-@vertex
-fn vs_person(vertex: Vertex) -> Fragment {
-    let still = point_at(vertex, view.moment.x);
+fn look(index: u32) -> Seen {
+    let count = arrayLength(&shares);
+    let camera_from_world = view.camera_from_world;
+    let still = point_at(index, count, view.moment.x);
     var seen = still;
-    var camera = (view.camera_from_world * vec4(seen.place.xyz, 1.0)).xyz;
+    var camera = (camera_from_world * vec4(seen.place.xyz, 1.0)).xyz;
     var pixel = pixel_of(camera);
-    if (view.moment.y != 0.0) {
-        // The row in which the point is seen at that row's own time: a contraction, since nothing crosses the picture
-        // within one readout.
-        for (var i = 0; i < ROW_STEPS; i++) {
-            let row = clamp(pixel.y, -0.5, view.size_px.y - 0.5);
-            seen = point_at(vertex, view.moment.x + (row - view.moment.z) * view.moment.y);
-            camera = (view.camera_from_world * vec4(seen.place.xyz, 1.0)).xyz;
-            pixel = pixel_of(camera);
-        }
+    // The row in which the point is seen at that row's own time: a contraction, since nothing crosses the picture
+    // within one readout.
+    let steps = select(0, ROW_STEPS, view.moment.y != 0.0);
+    for (var i = 0; i < steps; i++) {
+        let row = clamp(pixel.y, -0.5, view.size_px.y - 0.5);
+        seen = point_at(index, count, view.moment.x + (row - view.moment.z) * view.moment.y);
+        camera = (camera_from_world * vec4(seen.place.xyz, 1.0)).xyz;
+        pixel = pixel_of(camera);
     }
-    var out: Fragment;
-    out.clip = clip_of(pixel, camera.z);
-    // Shadows are those of the middle row's time, and so is the place that they are looked up at.
-    out.world = still.place.xyz;
-    out.normal = seen.normal.xyz;
-    out.uv = vertex.paint.xy;
-    out.openness = still.place.w;
-    out.canonical = vertex.truth.xyz;
-    out.depth_m = camera.z;
-    out.layer_part = vec2(u32(vertex.paint.z), u32(vertex.paint.w));
-    return out;
+    return Seen(still, seen, pixel, camera.z);
 }
 
 @vertex
 fn vs_shadow(vertex: Vertex, @builtin(instance_index) lamp: u32) -> @builtin(position) vec4<f32> {
-    return light.lamps[lamp].people_from_world * vec4(point_at(vertex, view.moment.x).place.xyz, 1.0);
+    let place = point_at(vertex.index, arrayLength(&shares), view.moment.x).place.xyz;
+    return light.lamps[lamp].people_from_world * vec4(place, 1.0);
+}
+
+// Of one lamp: diffuse light with the ratio of gloss to it, and where to look its shadow up (x, y and w).
+struct Beam {
+    light: vec4<f32>,
+    place: vec3<f32>,
+}
+
+fn beam(lamp: Lamp, world: vec3<f32>, normal: vec3<f32>, to_eye: vec3<f32>, share: f32) -> Beam {
+    let clip = lamp.people_from_world * vec4(world + normal * 0.006, 1.0);
+    let to_lamp = normalize(lamp.place.xyz - world);
+    let facing = facing_share(wrap_of(lamp, world), dot(normal, to_lamp));
+    let middle = max(dot(normal, normalize(to_eye + to_lamp)), 0.0);
+    let shine = min(facing * 4.0, 1.0) * pow(middle, 28.0) / max(facing, 1e-3);
+    return Beam(vec4(arriving(lamp, world) * (share * facing), shine), clip.xyw);
+}
+
+// The points lie so close together that their light is good enough for what is between them, and all that a fragment
+// needs comes with it: loads in fragments are slow on Mesa's software adapter.
+struct Lit {
+    @builtin(position) clip: vec4<f32>,
+    // uv, layer, alpha
+    @location(0) @interpolate(perspective, centroid) paint: vec4<f32>,
+    // Light from everywhere, how much of it shines
+    @location(1) @interpolate(perspective, centroid) around: vec4<f32>,
+    @location(2) @interpolate(perspective, centroid) light_a: vec4<f32>,
+    @location(3) @interpolate(perspective, centroid) light_b: vec4<f32>,
+    @location(4) @interpolate(perspective, centroid) light_c: vec4<f32>,
+    @location(5) @interpolate(perspective, centroid) place_a: vec3<f32>,
+    @location(6) @interpolate(perspective, centroid) place_b: vec3<f32>,
+    @location(7) @interpolate(perspective, centroid) place_c: vec3<f32>,
+}
+
+@vertex
+fn vs_lit(vertex: Vertex) -> Lit {
+    let lamps = light.lamps;
+    let sky = light.sky.rgb;
+    let ground = light.ground.rgb;
+    let seen = look(vertex.index);
+    let share = shares[vertex.index];
+    let row = view.rows[u32(clamp(seen.pixel.y + 0.5, 0.0, view.size_px.y - 1.0))];
+    let world = seen.still.place.xyz;
+    let openness = seen.still.place.w;
+    let normal = normalize(seen.still.normal.xyz);
+    let to_eye = normalize(view.eye.xyz - world);
+    let direct = row.levels.xyz * mix(1.0, openness, 0.4);
+    let a = beam(lamps[0], world, normal, to_eye, share.x * direct.x);
+    let b = beam(lamps[1], world, normal, to_eye, share.y * direct.y);
+    let c = beam(lamps[2], world, normal, to_eye, share.z * direct.z);
+    let grazing = pow(1.0 - max(dot(normal, to_eye), 0.0), 4.0);
+    let around = row.around.rgb * openness;
+    var out: Lit;
+    out.clip = clip_of(seen.pixel, seen.depth_m);
+    out.paint = vec4(vertex.paint.xyz, select(0.5, 1.0, vertex.paint.w > 0.5));
+    out.around = vec4(around * hemisphere(normal, sky, ground), grazing * 0.35);
+    out.light_a = a.light;
+    out.light_b = b.light;
+    out.light_c = c.light;
+    out.place_a = a.place;
+    out.place_b = b.place;
+    out.place_c = c.place;
+    return out;
+}
+
+// Share of a lamp's light that reaches a point, with two filtered taps of its picture.
+fn reaching(l: u32, place: vec3<f32>) -> f32 {
+    let at = place.xy / place.z * vec2(0.5, -0.5) + 0.5;
+    let depth = lamp_depth(place.z - 0.008);
+    let step = vec2(0.7, 0.4) / f32(textureDimensions(people_maps).x);
+    return 0.5 * textureSampleCompareLevel(people_maps, compare, at + step, l, depth)
+        + 0.5 * textureSampleCompareLevel(people_maps, compare, at - step, l, depth);
 }
 
 @fragment
-fn fs_color(in: Fragment, @builtin(front_facing) front: bool) -> @location(0) vec4<f32> {
-    let painted = textureSampleBias(textures, smooth_sampler, in.uv, in.layer_part.x, -0.5);
-    let levels = view.levels[u32(clamp(in.clip.y, 0.0, view.size_px.y - 1.0))];
-    var normal = normalize(in.normal);
-    if (!front) {
-        normal = -normal;
-    }
+fn fs_lit(in: Lit, @builtin(front_facing) front: bool) -> @location(0) vec4<f32> {
+    let painted = textureSampleBias(textures, smooth_sampler, in.paint.xy, u32(in.paint.z + 0.5), -0.5);
     let gloss = (1.0 - painted.a) * 0.8;
-    let to_eye = normalize(view.eye.xyz - in.world);
-    let around = surrounding(levels);
-    var sum = around * hemisphere(normal) * in.openness;
-    let grazing = pow(1.0 - max(dot(normal, to_eye), 0.0), 4.0);
-    var shine = around * light.sky.rgb * grazing * 0.35 * in.openness;
-    for (var l = 0u; l < u32(light.steady.w); l++) {
-        let to_lamp = normalize(light.lamps[l].place.xyz - in.world);
-        let facing = facing_share(l, in.world, dot(normal, to_lamp));
-        let level = level_of(levels, l);
-        if (facing <= 0.0 || level <= 0.0) {
-            continue;
-        }
-        let lifted = vec4(in.world + normal * 0.006, 1.0);
-        var share = quick_share(
-            people_maps, compare, l, light.lamps[l].people_from_world * lifted, 0.004, 0.008, light.lamps[l].tangents.y);
-        if (share > 0.0) {
-            share *= quick_share(
-                room_maps, compare, l, light.lamps[l].room_from_world * lifted, 0.03, 0.02, light.lamps[l].tangents.x);
-        }
-        let got = arriving(l, in.world) * (level * share);
-        sum += got * facing * mix(1.0, in.openness, 0.4);
-        let middle = max(dot(normal, normalize(to_eye + to_lamp)), 0.0);
-        shine += got * min(facing * 4.0, 1.0) * pow(middle, 28.0);
+    var sum = in.around.rgb * (painted.rgb + gloss * in.around.a);
+    // The inner side of a hem has the light from everywhere alone.
+    if (front) {
+        let a = in.light_a.rgb * reaching(0u, in.place_a);
+        let b = in.light_b.rgb * reaching(1u, in.place_b);
+        let c = in.light_c.rgb * reaching(2u, in.place_c);
+        sum += painted.rgb * (a + b + c);
+        sum += gloss * (a * in.light_a.a + b * in.light_b.a + c * in.light_c.a);
     }
-    return vec4(painted.rgb * sum + gloss * shine, select(0.5, 1.0, in.layer_part.y > 0u));
+    return vec4(sum, in.paint.w);
+}
+
+struct Told {
+    @builtin(position) clip: vec4<f32>,
+    // Canonical position, depth in metres
+    @location(0) canonical_depth: vec4<f32>,
+    @location(1) normal: vec3<f32>,
+    @location(2) @interpolate(flat) part: f32,
+}
+
+@vertex
+fn vs_truth(vertex: Vertex) -> Told {
+    let seen = look(vertex.index);
+    let clip = clip_of(seen.pixel, seen.depth_m);
+    return Told(clip, vec4(vertex.truth.xyz, seen.depth_m), seen.point.normal.xyz, vertex.paint.w);
 }
 
 struct Truth {
@@ -132,10 +163,9 @@ struct Truth {
 }
 
 @fragment
-fn fs_truth(in: Fragment, @builtin(front_facing) front: bool) -> Truth {
-    if (in.layer_part.y == 0u) {
+fn fs_truth(in: Told, @builtin(front_facing) front: bool) -> Truth {
+    if (in.part < 0.5) {
         return Truth(vec4(0.0), vec4(0.0));
     }
-    let normal = normalize(in.normal) * select(-1.0, 1.0, front);
-    return Truth(vec4(in.canonical, in.depth_m), vec4(normal, f32(in.layer_part.y)));
+    return Truth(in.canonical_depth, vec4(normalize(in.normal) * select(-1.0, 1.0, front), in.part));
 }

@@ -61,16 +61,18 @@ fn fs_layer(in: Fragment, @builtin(front_facing) front: bool) -> @location(0) ve
     let to_eye = normalize(view.eye.xyz - in.world);
     if (layer == 0u) {
         let grazing = pow(1.0 - max(dot(normal, to_eye), 0.0), 4.0);
-        sum += albedo * hemisphere(normal) * openness + gloss * light.sky.rgb * grazing * 0.3 * openness;
-    } else if (layer <= u32(light.steady.w)) {
+        let sky = light.sky.rgb;
+        sum += albedo * hemisphere(normal, sky, light.ground.rgb) * openness + gloss * sky * grazing * 0.3 * openness;
+    } else if (layer <= light.counts.z) {
         let l = layer - 1u;
-        let to_lamp = normalize(light.lamps[l].place.xyz - in.world);
-        let facing = facing_share(l, in.world, dot(normal, to_lamp));
+        let lamp = light.lamps[l];
+        let to_lamp = normalize(lamp.place.xyz - in.world);
+        let facing = facing_share(wrap_of(lamp, in.world), dot(normal, to_lamp));
         if (facing > 0.0) {
-            let at = light.lamps[l].room_from_world * vec4(in.world + normal * 0.012, 1.0);
+            let at = lamp.room_from_world * vec4(in.world + normal * 0.012, 1.0);
             let turn = pixel_noise(in.clip.xy) * 6.2831853;
-            let share = soft_share(room_maps, compare, l, at, 0.015, light.lamps[l].tangents.x, 32u, turn);
-            let got = arriving(l, in.world) * share;
+            let share = soft_share(room_maps, compare, l, at, 0.015, lamp.place.w, lamp.tangents.x, 2u * light.counts.w, turn);
+            let got = arriving(lamp, in.world) * share;
             let middle = max(dot(normal, normalize(to_eye + to_lamp)), 0.0);
             sum += albedo * got * facing * mix(1.0, openness, 0.5);
             sum += gloss * got * min(facing * 4.0, 1.0) * pow(middle, 40.0);

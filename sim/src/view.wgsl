@@ -1,5 +1,11 @@
 // One sub-frame of one camera, and how it maps points to pixels. Prepended: `NEAR_M`.
 
+// The light at a row's time: each lamp's level, and the light from everywhere.
+struct Row {
+    levels: vec4<f32>,
+    around: vec4<f32>,
+}
+
 struct View {
     camera_from_world: mat4x4<f32>,
     // World position of the lens's middle.
@@ -25,8 +31,7 @@ struct View {
     // x: share of this sub-frame in its picture; y, z: 1 for the first and for the last sub-frame;
     // w: 1 where people are there.
     sum: vec4<f32>,
-    // A row's level of each lamp.
-    levels: array<vec4<f32>>,
+    rows: array<Row>,
 }
 
 // Ideal image plane of a point in camera axes, seen through a point of the lens.
