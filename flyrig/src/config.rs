@@ -6,8 +6,10 @@ use anyhow::{Context, Result, bail, ensure};
 use clap::ValueEnum;
 use flyrig_renderer::AppearanceSettings;
 use flyrig_sim::SimConfig;
-use flyrig_tracker::{DeformSettings, DeformSolver};
+use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
 use serde::{Deserialize, Serialize};
+
+use crate::deformation::DeformOptions;
 
 /// The commented default file, as `flyrig config print` writes it. A test keeps it equal to `Config::default()`.
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
@@ -125,17 +127,26 @@ pub enum Solver {
 }
 
 impl Solver {
-    /// What the tracker is told; none when the body is only skinned.
-    pub fn settings(self) -> Option<DeformSettings> {
-        let solver = match self {
-            Self::None => return None,
-            Self::Paper => DeformSolver::Paper { rate: PAPER_RATE },
-            Self::GaussNewton => DeformSettings::default().solver,
-        };
-        Some(DeformSettings { solver, ..DeformSettings::default() })
+    /// What the deformation is told; none when the body is only skinned. An estimated pose is corrected as well.
+    pub fn options(self, pose: Origin) -> Option<DeformOptions> {
+        let default = DeformSettings::default();
+        match self {
+            Self::None => None,
+            Self::Paper => Some(DeformOptions::full(DeformSettings {
+                solver: DeformSolver::Paper { rate: PAPER_RATE },
+                regularization: PAPER_REGULARIZATION,
+                ..default
+            })),
+            Self::GaussNewton => Some(DeformOptions {
+                pose: (pose == Origin::Estimated).then(PoseFreedom::default),
+                ..DeformOptions::coarse(default)
+            }),
+        }
     }
 }
 
+/// λ_reg of the paper's Eq. 3.
+const PAPER_REGULARIZATION: f64 = 200.0;
 /// Rate of the paper's gradient descent, square metres a unit of loss. The paper does not tell its own; of 1e-8 to 1e-5
 /// this one lowered the loss most on a simulated person at 512x512.
 const PAPER_RATE: f64 = 3e-6;

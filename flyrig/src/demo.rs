@@ -192,7 +192,7 @@ fn pass(
         flyrig_body::DEFAULT_NODE_COUNT,
         inputs.cameras.len(),
         mode.settings(),
-        args.solver.settings(),
+        args.solver.options(Origin::Given),
     )?;
     let no_plates = inputs.cameras.iter().map(|_| None).collect();
     let mut pipeline =

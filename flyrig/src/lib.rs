@@ -13,6 +13,7 @@ mod intake;
 mod outlet;
 mod pipeline;
 mod png;
+mod pose_curve;
 mod report;
 mod run;
 mod score;

@@ -68,7 +68,7 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         config.body.nodes,
         scene.rig.cameras.len(),
         config.appearance.mode.settings(),
-        config.tracking.solver.settings(),
+        config.tracking.solver.options(config.body.pose),
     )?;
     let mut pipeline = Pipeline::new(engine, scene.rig, pose, config.body.masks, scene.plates);
     let publisher = Publisher::open(&TransportConfig {
