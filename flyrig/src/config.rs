@@ -117,12 +117,14 @@ impl Default for BodySection {
 #[serde(rename_all = "kebab-case")]
 pub enum Solver {
     /// Skinned only.
-    #[value(alias = "off")]
+    #[value(name = "off", alias = "none")]
+    #[serde(alias = "off")]
     None,
     /// Gradient descent as in the paper.
     Paper,
     /// Damped Gauss-Newton with the graph Laplacian.
-    #[value(alias = "default")]
+    #[value(name = "default", alias = "gauss-newton")]
+    #[serde(alias = "default")]
     GaussNewton,
 }
 

@@ -42,6 +42,7 @@ pub struct Deformation {
     gradients: Vec<GaussianGradients>,
     views: Vec<ViewBuffers>,
     landmarks: Landmarks,
+    report: Option<DeformReport>,
     /// Whether the Gaussians have colours yet.
     painted: bool,
 }
@@ -112,12 +113,13 @@ impl Deformation {
             gradients: Vec::new(),
             views: Vec::new(),
             landmarks,
+            report: None,
             painted: false,
         })
     }
 
     /// Solves one instant. Afterwards [`Self::displacement`] holds its result.
-    pub fn track(&mut self, scene: Scene<'_>, views: &[TrackedView<'_>]) -> Result<(DeformReport, DeformTimes)> {
+    pub fn track(&mut self, scene: Scene<'_>, views: &[TrackedView<'_>]) -> Result<DeformTimes> {
         let start = Instant::now();
         let gpu = scene.gpu;
         let count = self.posed[0].count();
@@ -172,7 +174,14 @@ impl Deformation {
         self.displacement.write(gpu, self.mesh.follow(self.tracker.translations()));
         self.painted |= !views.is_empty();
         let solve = start.elapsed().saturating_sub(prepare + draw + derivatives);
-        Ok((report, DeformTimes { prepare, draw, derivatives, solve }))
+        tracing::debug!(?report, "deformation");
+        self.report = Some(report);
+        Ok(DeformTimes { prepare, draw, derivatives, solve })
+    }
+
+    /// What the last solve did.
+    pub fn report(&self) -> Option<&DeformReport> {
+        self.report.as_ref()
     }
 
     /// What the poses are corrected by.

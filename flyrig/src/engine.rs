@@ -12,6 +12,7 @@ use flyrig_renderer::{
     AppearanceSettings, DirectAppearance, GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, Splat,
     ViewInput, read_splats, rgba8_from_target,
 };
+use flyrig_tracker::DeformReport;
 use flyrig_types::{Camera, Image, Mask, Pose};
 
 use crate::deformation::{DeformOptions, DeformTimes, Deformation, Scene, TrackedView, inset};
@@ -164,9 +165,7 @@ impl Engine {
                 instants: &poses,
                 gaussians: &self.gaussians,
             };
-            let (report, times) = deformation.track(scene, &tracked)?;
-            tracing::debug!(?report, "deformation");
-            let DeformTimes { prepare, draw, derivatives, solve } = times;
+            let DeformTimes { prepare, draw, derivatives, solve } = deformation.track(scene, &tracked)?;
             stages.add("deformation", start.elapsed());
             stages.add("  prepare", prepare);
             stages.add("  draw and compare", draw);
@@ -257,6 +256,11 @@ impl Engine {
             .time("read a view back", || -> Result<_> { Ok(rgba8_from_target(&target.color.read(&self.gpu)?)) })?;
         self.output = Some(target);
         Ok(RenderedView { width, height, rgba })
+    }
+
+    /// What the last solve of the deformation did.
+    pub fn deform_report(&self) -> Option<&DeformReport> {
+        self.deformation.as_ref().and_then(Deformation::report)
     }
 
     /// The Gaussians of this instant.

@@ -2,6 +2,7 @@
 //!
 //! A library only so that the end-to-end tests can build the same program; its documentation is `--help`.
 
+mod bench;
 mod cli;
 mod config;
 mod dataset;
@@ -30,7 +31,7 @@ use flyrig_gpu::{AdapterChoice, GpuContext};
 use tracing_subscriber::EnvFilter;
 
 use crate::{
-    cli::{Cli, Command, ConfigAction},
+    cli::{BenchCommand, Cli, Command, ConfigAction},
     config::{Config, DEFAULT_TOML},
 };
 
@@ -71,6 +72,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         }
         Command::Watch(args) => watch::watch(args),
         Command::Eval(args) => eval::eval(args, &gpu(cli.adapter.as_deref())?),
+        Command::Bench { what: BenchCommand::Track(args) } => bench::track(args, &gpu(cli.adapter.as_deref())?),
         Command::Config { action: ConfigAction::Print } => {
             print!("{DEFAULT_TOML}");
             Ok(())
