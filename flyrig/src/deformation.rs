@@ -43,6 +43,8 @@ pub struct Deformation {
     views: Vec<ViewBuffers>,
     landmarks: Landmarks,
     report: Option<DeformReport>,
+    /// Of the views of the last frame: how much of the person is where the picture shows it, and whether it counted.
+    judged: Vec<(f64, bool)>,
     /// Whether the Gaussians have colours yet.
     painted: bool,
 }
@@ -114,6 +116,7 @@ impl Deformation {
             views: Vec::new(),
             landmarks,
             report: None,
+            judged: Vec::new(),
             painted: false,
         })
     }
@@ -169,7 +172,9 @@ impl Deformation {
             self.painted,
         );
         let prepare = start.elapsed();
+        pictures.distrust(self.tracker.displacement(), self.tracker.correction())?;
         let report = self.tracker.track(&mut pictures)?;
+        self.judged = pictures.judged(self.tracker.displacement(), self.tracker.correction());
         let (draw, derivatives) = pictures.times();
         self.displacement.write(gpu, self.mesh.follow(self.tracker.translations()));
         self.painted |= !views.is_empty();
@@ -177,6 +182,23 @@ impl Deformation {
         tracing::debug!(?report, "deformation");
         self.report = Some(report);
         Ok(DeformTimes { prepare, draw, derivatives, solve })
+    }
+
+    /// Back to rest, for a person who was not there before.
+    pub fn reset(&mut self) {
+        self.tracker.reset();
+        self.painted = false;
+    }
+
+    /// The next frames get the iterations of a start.
+    pub fn restart(&mut self) {
+        self.tracker.restart();
+    }
+
+    /// By view of the last frame: how much of the person is where the picture shows it (1: all; 0: as much is wrong as there
+    /// is), and whether the view counted: one that disagrees with all others does not.
+    pub fn judged(&self) -> &[(f64, bool)] {
+        &self.judged
     }
 
     /// What the last solve did.

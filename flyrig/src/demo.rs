@@ -227,7 +227,7 @@ fn pass(
         if let Some(outlet) = &mut outlet {
             let turn_time = Duration::from_secs_f64(pass.frames as f64 / 12.0);
             views.publish(&mut pipeline, outlet, &set, turn_time)?;
-            outlet.publish_stats(&set, pass.frames, &pipeline.stages.summary(), &intake.drops());
+            outlet.publish_stats(&set, pass.frames, &pipeline.stages.summary(), &intake.drops(), &pipeline.watch);
         }
         if pass.frames % score_every == score_every / 2 {
             let start = Instant::now();

@@ -59,6 +59,8 @@ pub struct Engine {
     rgba: Vec<Vec<u8>>,
     output: Option<RenderTarget>,
     deformation: Option<Deformation>,
+    /// What the deformation thinks of the last update's views.
+    judged: Vec<(f64, bool)>,
 }
 
 impl Engine {
@@ -114,6 +116,7 @@ impl Engine {
             gaussians,
             settings,
             posed: Vec::new(),
+            judged: Vec::new(),
             visibility: Vec::new(),
             rgba: Vec::new(),
             output: None,
@@ -148,6 +151,7 @@ impl Engine {
         let instants: Vec<(&Pose, &GaussianBuffers)> =
             poses.iter().copied().zip(std::iter::once(&self.gaussians).chain(&self.posed)).collect();
 
+        self.judged.clear();
         if let Some(deformation) = self.deformation.as_mut().filter(|_| views.len() >= MIN_DEFORMATION_VIEWS) {
             let start = Instant::now();
             let tracked: Vec<TrackedView<'_>> = views
@@ -166,11 +170,15 @@ impl Engine {
                 gaussians: &self.gaussians,
             };
             let DeformTimes { prepare, draw, derivatives, solve } = deformation.track(scene, &tracked)?;
+            self.judged.extend_from_slice(deformation.judged());
             stages.add("deformation", start.elapsed());
             stages.add("  prepare", prepare);
             stages.add("  draw and compare", draw);
             stages.add("  derivatives", derivatives);
             stages.add("  solve", solve);
+            if deformation.report().is_some_and(|report| report.at_rest) {
+                stages.add("  at rest, no iteration", start.elapsed());
+            }
         }
 
         let start = Instant::now();
@@ -220,11 +228,16 @@ impl Engine {
         stages.add("visibility", start.elapsed());
 
         let start = Instant::now();
+        // A view that is not believed paints nothing.
+        let believed = |i: usize| self.judged.get(i).is_none_or(|(_, trusted)| *trusted);
         let inputs: Vec<ViewInput<'_>> = views
             .iter()
             .zip(&self.rgba)
             .zip(&self.visibility)
             .zip(&instant_of)
+            .enumerate()
+            .filter(|(i, _)| believed(*i))
+            .map(|(_, view)| view)
             .map(|(((view, rgba), target), &instant)| ViewInput {
                 camera: view.camera,
                 rgba,
@@ -256,6 +269,27 @@ impl Engine {
             .time("read a view back", || -> Result<_> { Ok(rgba8_from_target(&target.color.read(&self.gpu)?)) })?;
         self.output = Some(target);
         Ok(RenderedView { width, height, rgba })
+    }
+
+    /// Forgets clothes and colours: another person may come.
+    pub fn forget(&mut self) {
+        if let Some(deformation) = &mut self.deformation {
+            deformation.reset();
+        }
+        self.appearance.reset();
+    }
+
+    /// The next frames get the iterations of a start.
+    pub fn restart(&mut self) {
+        if let Some(deformation) = &mut self.deformation {
+            deformation.restart();
+        }
+    }
+
+    /// By view of the last update: how much of the person is where the picture shows it, 0 to 1. Empty when the body was not
+    /// compared with the pictures.
+    pub fn agreement(&self) -> Vec<f64> {
+        self.judged.iter().map(|(quality, _)| *quality).collect()
     }
 
     /// What the last solve of the deformation did.

@@ -20,6 +20,7 @@ mod run;
 mod score;
 mod stats;
 mod stop;
+mod track_state;
 mod viewpoints;
 mod watch;
 

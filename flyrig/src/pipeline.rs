@@ -9,6 +9,7 @@ use crate::{
     engine::{Engine, InputView, RenderedView},
     pose_curve::PoseCurve,
     stats::StageTimes,
+    track_state::{Remedy, TrackWatch},
 };
 
 /// Where the pose of an instant comes from.
@@ -37,6 +38,8 @@ pub struct Counts {
     pub lost: u64,
     /// Pictures that had no mask, or an empty one.
     pub without_mask: u64,
+    /// Sets whose deformation was dropped because a number was not finite.
+    pub poisoned: u64,
 }
 
 /// The stages after synchronisation.
@@ -50,6 +53,8 @@ pub struct Pipeline {
     last_pose: Option<Pose>,
     /// Times of the last poses that were used, for what lies between and beyond them.
     curve: PoseCurve,
+    /// How well the person is followed.
+    pub watch: TrackWatch,
     /// Whether every picture is explained with the pose of its own capture time, not of the set's.
     pub per_view_time: bool,
     /// Times of every stage so far.
@@ -69,6 +74,7 @@ impl Pipeline {
             plates,
             last_pose: None,
             curve: PoseCurve::default(),
+            watch: TrackWatch::default(),
             per_view_time: true,
             stages: StageTimes::default(),
             counts: Counts::default(),
@@ -85,6 +91,7 @@ impl Pipeline {
                     Ok(estimate) => (estimate.pose, Some(estimate.masks)),
                     Err(error) => {
                         self.counts.lost += 1;
+                        self.watch.away(set.master_nanos);
                         return Ok(Outcome::Held(error.to_string()));
                     }
                 }
@@ -92,6 +99,7 @@ impl Pipeline {
         };
         if !pose.is_valid() {
             self.counts.lost += 1;
+            self.watch.away(set.master_nanos);
             return Ok(Outcome::Held("the pose holds numbers that are not finite".to_owned()));
         }
         let masks = self.masks(set, masks)?;
@@ -117,7 +125,21 @@ impl Pipeline {
                 }
             }
         }
+        if views.is_empty() {
+            self.watch.away(set.master_nanos);
+        } else {
+            match self.watch.arrive(set.master_nanos, &pose) {
+                Remedy::Forget => self.engine.forget(),
+                Remedy::Restart => self.engine.restart(),
+                Remedy::None => {}
+            }
+        }
         self.engine.update(&pose, &views, &mut self.stages)?;
+        if !views.is_empty() {
+            let ids = views.iter().map(|view| view.camera.id.clone());
+            self.watch.judge(ids.zip(self.engine.agreement()));
+        }
+        self.counts.poisoned += u64::from(self.engine.deform_report().is_some_and(|report| report.poisoned));
         self.last_pose = Some(pose);
         self.counts.updated += 1;
         Ok(Outcome::Updated)

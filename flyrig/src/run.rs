@@ -99,7 +99,7 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         if config.output.splats && outlet.publisher().has_splat_subscribers() {
             outlet.publish_splats(&pipeline.engine().splats()?, &set);
         }
-        outlet.publish_stats(&set, frames, &pipeline.stages.summary(), &intake.drops());
+        outlet.publish_stats(&set, frames, &pipeline.stages.summary(), &intake.drops(), &pipeline.watch);
         if last_print.elapsed() >= PRINT_EVERY {
             let rate = (frames - printed) as f64 / last_print.elapsed().as_secs_f64();
             let memory = resident_mib().map_or_else(String::new, |mib| format!(", {mib:.0} MiB"));

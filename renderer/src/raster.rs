@@ -242,8 +242,9 @@ impl Rasterizer {
 fn tile_range(area: Option<[u32; 4]>, tiles: [u32; 2], tile: u32) -> ([u32; 2], [u32; 2]) {
     let Some([left, top, right, bottom]) = area else { return ([0; 2], tiles) };
     let range = |first: u32, end: u32, count: u32| {
+        let tiles = if first < end { end.div_ceil(tile).min(count) } else { 0 };
         let first = (first / tile).min(count);
-        (first, end.div_ceil(tile).min(count).saturating_sub(first))
+        (first, tiles.saturating_sub(first))
     };
     let (x, columns) = range(left, right, tiles[0]);
     let (y, rows) = range(top, bottom, tiles[1]);

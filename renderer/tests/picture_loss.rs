@@ -189,7 +189,7 @@ fn losses_and_slopes_match_the_reference() {
         ("an area that is too large", [96, 80], 0, LossSettings { area: [16, 0, 4000, 4000], ..outline }, None),
         ("nobody", [96, 80], 0, outline, Some(0)),
         ("everywhere", [96, 80], 0, outline, Some(255)),
-        ("one pixel", [1, 1], 2, LossSettings { area: all, ..outline }, Some(200)),
+        ("one pixel", [1, 1], 0, LossSettings { area: all, ..outline }, Some(200)),
         ("one row", [70, 1], 0, LossSettings { area: all, ..outline }, None),
     ] {
         check(&gpu, &mut loss, &case(&mut rng, source, level, settings, coverage), name);
@@ -210,6 +210,7 @@ fn an_empty_area_and_a_buffer_that_does_not_fit_cost_nothing() {
         area: [9, 9, 9, 20],
     };
     let case = case(&mut rng, [32, 32], 0, settings, None);
+    assert_eq!(WantedPicture::zeroed(&gpu, [1, 5], 2).unwrap().size(), [1, 5], "not below a pixel");
     let picture = WantedPicture::zeroed(&gpu, case.source, 0).unwrap();
     let target = RenderTarget::new(&gpu, 32, 32).unwrap();
     let (fits, small) =

@@ -78,7 +78,8 @@ impl Case {
             name += &format!(" {first}/{later} iterations");
         }
         if let Some(compared) = self.compared {
-            name += &if compared == usize::MAX { " all Gaussians".to_owned() } else { format!(" {compared} Gaussians") };
+            name +=
+                &if compared == usize::MAX { " all Gaussians".to_owned() } else { format!(" {compared} Gaussians") };
         }
         if self.full_size {
             name += " full size";

@@ -7,7 +7,7 @@ use flyrig_body::GpuSkinner;
 use flyrig_gpu::{GpuContext, StorageBuffer};
 use flyrig_renderer::{
     BackwardRasterizer, Carry, GaussianBuffers, GaussianGradients, LossSettings, Outputs, PictureGradients,
-    PictureLoss, RasterSettings, Rasterizer, RenderTarget, WantedPicture,
+    PictureLoss, PictureSums, RasterSettings, Rasterizer, RenderTarget, WantedPicture,
 };
 use flyrig_tracker::{DataTerm, PointDerivatives, PoseCorrection};
 use flyrig_types::Camera;
@@ -18,6 +18,9 @@ use super::{DeformOptions, Scene, TrackedView};
 /// λ_color and λ_mask of Eq. 3, over the sum of squared differences (linear light, 0..=1) of all pixels.
 const COLOR_WEIGHT: f32 = 2.0;
 const MASK_WEIGHT: f32 = 2.0;
+/// Where the best view agrees at least so well, one that agrees less than the other is not believed.
+const AGREES: f64 = 0.6;
+const DISAGREES: f64 = 0.25;
 /// How far from the mask's outline its distance still grows, metres at the person.
 const REACH_M: f64 = 0.05;
 
@@ -75,6 +78,11 @@ pub struct Pictures<'a> {
     buffers: &'a mut [ViewBuffers],
     settings: Vec<LossSettings>,
     kernels: Kernels<'a>,
+    /// Views that count.
+    trusted: Vec<bool>,
+    /// Sums of what is drawn now, and of what the last derivatives were made of.
+    sums: Vec<PictureSums>,
+    derived_sums: Vec<PictureSums>,
     /// What is drawn now, and its loss.
     drawn: Option<(Vec<[f32; 4]>, PoseCorrection, f64)>,
     draw_time: Duration,
@@ -111,12 +119,50 @@ impl<'a> Pictures<'a> {
         scene.gpu.queue.submit([encoder.finish()]);
         let cameras = views.iter().zip(plans).map(|(view, plan)| halved(view.camera, plan.level)).collect();
         let (draw_time, derivatives_time) = Default::default();
-        Self { scene, views, cameras, buffers, settings, kernels, drawn: None, draw_time, derivatives_time }
+        Self {
+            scene,
+            views,
+            cameras,
+            buffers,
+            settings,
+            kernels,
+            trusted: vec![true; views.len()],
+            sums: Vec::new(),
+            derived_sums: Vec::new(),
+            drawn: None,
+            draw_time,
+            derivatives_time,
+        }
     }
 
     /// Time spent on drawing and on derivatives.
     pub fn times(&self) -> (Duration, Duration) {
         (self.draw_time, self.derivatives_time)
+    }
+
+    /// Leaves out what disagrees with all others: a camera that is covered, or whose mask shows something else.
+    pub fn distrust(&mut self, displacement: &[[f32; 4]], correction: &PoseCorrection) -> Result<()> {
+        self.draw(displacement, correction)?;
+        let best = self.sums.iter().map(agreement).fold(0.0, f64::max);
+        if best > AGREES {
+            self.trusted = self.sums.iter().map(|sums| agreement(sums) > DISAGREES).collect();
+        }
+        let loss = self.trusted_loss();
+        if let Some((.., drawn_loss)) = &mut self.drawn {
+            *drawn_loss = loss;
+        }
+        Ok(())
+    }
+
+    /// By view how much agrees in this state, which must have been drawn or derived last, and whether it counted.
+    pub fn judged(&self, displacement: &[[f32; 4]], correction: &PoseCorrection) -> Vec<(f64, bool)> {
+        let is_drawn = self.drawn.as_ref().is_some_and(|(d, c, _)| d == displacement && c == correction);
+        let sums = if is_drawn || self.derived_sums.is_empty() { &self.sums } else { &self.derived_sums };
+        sums.iter().map(agreement).zip(self.trusted.iter().copied()).collect()
+    }
+
+    fn trusted_loss(&self) -> f64 {
+        self.sums.iter().zip(&self.trusted).filter(|(_, trusted)| **trusted).map(|(sums, _)| sums.loss).sum()
     }
 
     /// Draws all views, unless that is what is drawn already, and returns the loss.
@@ -157,8 +203,8 @@ impl<'a> Pictures<'a> {
             loss.encode(gpu, &mut encoder, i, target, wanted, settings, incoming);
         }
         gpu.queue.submit([encoder.finish()]);
-        let sums = loss.read(gpu, self.views.len())?;
-        let loss = sums.iter().map(|sums| sums.loss).sum();
+        self.sums = loss.read(gpu, self.views.len())?;
+        let loss = self.trusted_loss();
         self.drawn = Some((displacement.to_vec(), correction.clone(), loss));
         self.draw_time += start.elapsed();
         Ok(loss)
@@ -179,13 +225,15 @@ impl DataTerm for Pictures<'_> {
         out: &mut Vec<PointDerivatives>,
     ) -> Result<f64> {
         let loss = self.draw(displacement, correction)?;
+        self.derived_sums.clone_from(&self.sums);
         let start = Instant::now();
         let Scene { gpu, skeleton, instants, .. } = &self.scene;
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         for gradients in self.kernels.gradients.iter().take(instants.len()) {
             gradients.clear(&mut encoder);
         }
-        for (view, buffers) in self.views.iter().zip(&*self.buffers) {
+        let trusted = self.views.iter().zip(&*self.buffers).zip(&self.trusted).filter(|(_, trusted)| **trusted);
+        for ((view, buffers), _) in trusted {
             let Kernels { posed, gradients, .. } = self.kernels;
             let Some((gaussians, sums)) = posed.get(view.instant).zip(gradients.get(view.instant)) else { continue };
             let ViewBuffers { rasterizer, target, incoming, .. } = buffers;
@@ -206,6 +254,11 @@ impl DataTerm for Pictures<'_> {
         self.derivatives_time += start.elapsed();
         Ok(loss)
     }
+}
+
+/// Share of the person that is where the picture shows it, less what is drawn elsewhere, 0..=1.
+fn agreement(sums: &PictureSums) -> f64 {
+    if sums.wanted > 0.0 && sums.mask.is_finite() { (1.0 - sums.mask / sums.wanted).max(0.0) } else { 0.0 }
 }
 
 /// The same camera with pictures halved so often; pixel centres are at integers.

@@ -38,6 +38,9 @@ pub struct DeformSettings {
     pub max_translation_m: f64,
     /// Attempts with growing damping before an iteration gives up.
     pub attempts: usize,
+    /// After a frame that lowered its loss by less than this share, frames whose loss is no more than this share above get
+    /// no iteration; 0: every frame gets its iterations.
+    pub rest: f64,
 }
 
 impl Default for DeformSettings {
@@ -52,6 +55,7 @@ impl Default for DeformSettings {
             max_step_m: 0.02,
             max_translation_m: 0.25,
             attempts: 3,
+            rest: 0.01,
         }
     }
 }
@@ -94,6 +98,8 @@ impl DeformSettings {
     fn fault_without_solver(&self, weight: fn(f64) -> bool, length: fn(f64) -> bool) -> Option<&'static str> {
         if ![self.regularization, self.spatial, self.temporal, self.damping].into_iter().all(weight) {
             Some("weights and damping must be finite and not negative")
+        } else if !(0.0..1.0).contains(&self.rest) {
+            Some("the share at which there is rest must lie in 0 to 1, 1 excluded")
         } else if !(0.0..=1.0).contains(&self.smoothing) {
             Some("smoothing must lie in 0 to 1")
         } else if !length(self.max_step_m) || !length(self.max_translation_m) {

@@ -7,6 +7,7 @@ use super::carry::to_canonical;
 use super::normal::NormalMatrix;
 use super::pose_fix::{Basis, PoseFix};
 use super::regularizer::Regularizer;
+use super::settings::FIRST_FRAMES;
 use super::{DataTerm, DeformSettings, DeformSolver, PointDerivatives, PoseCorrection, PoseFreedom};
 use crate::{TrackError, TrackErrorKind};
 
@@ -32,6 +33,8 @@ pub struct DeformReport {
     pub dropped: usize,
     /// The loss was not finite: all is as it was before the frame.
     pub poisoned: bool,
+    /// The loss was at its floor: no iteration was made.
+    pub at_rest: bool,
 }
 
 /// Translations of the graph's nodes, tracked over time. State that is not finite never comes in: a frame whose loss is
@@ -51,6 +54,8 @@ pub struct DeformTracker {
     pose: Option<PoseFix>,
     no_correction: PoseCorrection,
     damping: f64,
+    /// Loss below which there is nothing left to gain.
+    floor: Option<f64>,
     frame: u64,
 }
 
@@ -103,6 +108,7 @@ impl DeformTracker {
             derivatives: Vec::new(),
             pose: None,
             no_correction: PoseCorrection::default(),
+            floor: None,
             frame: 0,
         })
     }
@@ -148,6 +154,18 @@ impl DeformTracker {
             pose.reset();
         }
         self.damping = self.settings.damping;
+        self.floor = None;
+        self.frame = 0;
+    }
+
+    /// Keeps what is known of the clothes; the next frame counts as the first again, and the pose is no longer corrected.
+    pub fn restart(&mut self) {
+        self.smooth.clone_from(&self.translations);
+        if let Some(pose) = &mut self.pose {
+            pose.reset();
+        }
+        self.damping = self.settings.damping;
+        self.floor = None;
         self.frame = 0;
     }
 
@@ -172,6 +190,14 @@ impl DeformTracker {
         let start = (self.translations.clone(), self.correction().clone());
         // Before the first frame there is nothing to stay close to.
         self.regularizer.history = self.frame > 0;
+        if let Some(floor) = self.floor.filter(|_| self.frame >= FIRST_FRAMES) {
+            let loss = data.loss(&self.displacement, self.correction())? + self.prior(None);
+            if loss <= floor * (1.0 + self.settings.rest) {
+                report.losses.push(loss);
+                report.at_rest = true;
+                return Ok(report);
+            }
+        }
         for _ in 0..self.settings.iterations(self.frame) {
             let mut gradient = vec![DVec3::ZERO; self.translations.len()];
             let mut derivatives = std::mem::take(&mut self.derivatives);
@@ -206,6 +232,11 @@ impl DeformTracker {
                 break;
             }
         }
+        self.floor = match report.losses[..] {
+            [first, .., last] if self.settings.rest > 0.0 && last >= first * (1.0 - self.settings.rest) => Some(last),
+            [_] if self.settings.rest > 0.0 => report.losses.last().copied(),
+            _ => None,
+        };
         let share = self.settings.smoothing;
         for (smooth, t) in self.smooth.iter_mut().zip(&self.translations) {
             *smooth += (*t - *smooth) * share;
