@@ -67,3 +67,7 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
     }
     cases
 }
+
+#[cfg(test)]
+#[path = "bench/desync_tests.rs"]
+mod desync_tests;

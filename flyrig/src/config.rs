@@ -118,13 +118,13 @@ impl Default for BodySection {
 pub enum Solver {
     /// Skinned only.
     #[value(name = "off", alias = "none")]
-    #[serde(alias = "off")]
+    #[serde(rename = "off", alias = "none")]
     None,
     /// Gradient descent as in the paper.
     Paper,
     /// Damped Gauss-Newton with the graph Laplacian.
     #[value(name = "default", alias = "gauss-newton")]
-    #[serde(alias = "default")]
+    #[serde(rename = "default", alias = "gauss-newton")]
     GaussNewton,
 }
 
@@ -149,6 +149,18 @@ impl Solver {
 
 /// λ_reg of the paper's Eq. 3.
 const PAPER_REGULARIZATION: f64 = 200.0;
+impl TrackingSection {
+    /// What the deformation is told; none when the body is only skinned.
+    pub fn options(&self, pose: Origin) -> Option<DeformOptions> {
+        let mut options = self.solver.options(pose)?;
+        if self.solver == Solver::GaussNewton {
+            options.gaussians = self.gaussians;
+            options.solver.rest = self.rest;
+        }
+        Some(options)
+    }
+}
+
 /// Rate of the paper's gradient descent, square metres a unit of loss. The paper does not tell its own; of 1e-8 to 1e-5
 /// this one lowered the loss most on a simulated person at 512x512.
 const PAPER_RATE: f64 = 3e-6;
@@ -157,11 +169,14 @@ const PAPER_RATE: f64 = 3e-6;
 #[serde(deny_unknown_fields, default)]
 pub struct TrackingSection {
     pub solver: Solver,
+    pub gaussians: usize,
+    pub rest: f64,
+    pub per_view_time: bool,
 }
 
 impl Default for TrackingSection {
     fn default() -> Self {
-        Self { solver: Solver::None }
+        Self { solver: Solver::None, gaussians: 30_000, rest: 0.01, per_view_time: true }
     }
 }
 
@@ -284,6 +299,8 @@ impl Config {
             self.body.nodes,
             self.body.gaussians
         );
+        range("tracking.gaussians", self.tracking.gaussians as f64, 100.0, 2_000_000.0)?;
+        range("tracking.rest", self.tracking.rest, 0.0, 0.5)?;
         range("output.views", self.output.views as f64, 0.0, 16.0)?;
         range("output.width", f64::from(self.output.width), 16.0, 4096.0)?;
         range("output.height", f64::from(self.output.height), 16.0, 4096.0)?;

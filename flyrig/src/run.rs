@@ -68,9 +68,10 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         config.body.nodes,
         scene.rig.cameras.len(),
         config.appearance.mode.settings(),
-        config.tracking.solver.options(config.body.pose),
+        config.tracking.options(config.body.pose),
     )?;
     let mut pipeline = Pipeline::new(engine, scene.rig, pose, config.body.masks, scene.plates);
+    pipeline.per_view_time = config.tracking.per_view_time;
     let publisher = Publisher::open(&TransportConfig {
         listen: config.transport.listen.clone(),
         connect: config.transport.connect.clone(),
