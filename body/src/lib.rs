@@ -10,6 +10,7 @@
 
 mod body_asset;
 mod bvh;
+mod coarse;
 mod default_body;
 mod eliminate;
 mod error;
@@ -34,6 +35,7 @@ mod surface_links;
 mod template;
 
 pub use bvh::{BvhChannel, BvhClip, BvhJoint, load_bvh, parse_bvh};
+pub use coarse::{CoarseSurface, coarsen};
 pub use default_body::{ShapeTarget, default_template, shape_targets};
 pub use error::BodyError;
 pub use gltf_export::write_glb;

@@ -2,7 +2,7 @@
 
 use std::{net::SocketAddr, ops::Range, path::PathBuf};
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, builder::TypedValueParser as _};
 
 use crate::config::{AppearanceMode, Origin, Solver};
 
@@ -50,6 +50,11 @@ pub enum Command {
         #[command(subcommand)]
         action: SimAction,
     },
+    /// Measure run time against error on simulated people.
+    Bench {
+        #[command(subcommand)]
+        what: BenchCommand,
+    },
     /// Print the commented default configuration, or check one.
     Config {
         #[command(subcommand)]
@@ -76,6 +81,34 @@ pub struct SimExportArgs {
     /// Leave out depth, canonical positions, poses, surfaces and true times.
     #[arg(long)]
     pub no_truth: bool,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum BenchCommand {
+    /// Deformation tracking: solvers, iterations, Gaussians, resolution and views; writes CSV, JSON and SVG.
+    Track(BenchTrackArgs),
+}
+
+#[derive(Debug, Args)]
+pub struct BenchTrackArgs {
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-track")]
+    pub out: PathBuf,
+    /// Seed of the person.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Frames of the sequence.
+    #[arg(long, default_value_t = 14, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
+    pub frames: usize,
+    /// Pixels of a picture's side.
+    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
+    /// Only the three solvers.
+    #[arg(long)]
+    pub quick: bool,
 }
 
 #[derive(Debug, Subcommand)]
@@ -113,7 +146,7 @@ pub struct DemoArgs {
     #[arg(long, default_value_t = 115_000)]
     pub gaussians: usize,
     /// How the body follows the pictures beyond its pose.
-    #[arg(long, value_enum, default_value = "none")]
+    #[arg(long, value_enum, default_value = "off")]
     pub solver: Solver,
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]

@@ -200,7 +200,7 @@ fn pass(
         flyrig_body::DEFAULT_NODE_COUNT,
         inputs.cameras.len(),
         mode.settings(),
-        args.solver.settings(),
+        args.solver.options(Origin::Given),
     )?;
     let no_plates = inputs.cameras.iter().map(|_| None).collect();
     let mut pipeline =
@@ -235,7 +235,7 @@ fn pass(
         if let Some(outlet) = &mut outlet {
             let turn_time = Duration::from_secs_f64(pass.frames as f64 / 12.0);
             views.publish(&mut pipeline, outlet, &set, turn_time)?;
-            outlet.publish_stats(&set, pass.frames, &pipeline.stages.summary(), &intake.drops());
+            outlet.publish_stats(&set, pass.frames, &pipeline.stages.summary(), &intake.drops(), &pipeline.watch);
         }
         if pass.frames % score_every == score_every / 2 {
             let start = Instant::now();

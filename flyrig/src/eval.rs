@@ -106,7 +106,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         args.nodes,
         rig.cameras.len(),
         args.appearance.settings(),
-        solver.settings(),
+        solver.options(args.pose),
     )?;
     let mut pipeline = Pipeline::new(engine, rig, pose, args.masks, plates);
 

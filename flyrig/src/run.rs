@@ -73,9 +73,10 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         config.body.nodes,
         scene.rig.cameras.len(),
         config.appearance.mode.settings(),
-        config.tracking.solver.settings(),
+        config.tracking.options(config.body.pose),
     )?;
     let mut pipeline = Pipeline::new(engine, scene.rig, pose, config.body.masks, scene.plates);
+    pipeline.per_view_time = config.tracking.per_view_time;
     let publisher = Publisher::open(&TransportConfig {
         listen: config.transport.listen.clone(),
         connect: config.transport.connect.clone(),
@@ -104,7 +105,7 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         if config.output.splats && outlet.publisher().has_splat_subscribers() {
             outlet.publish_splats(&pipeline.engine().splats()?, &set);
         }
-        outlet.publish_stats(&set, frames, &pipeline.stages.summary(), &intake.drops());
+        outlet.publish_stats(&set, frames, &pipeline.stages.summary(), &intake.drops(), &pipeline.watch);
         if last_print.elapsed() >= PRINT_EVERY {
             let rate = (frames - printed) as f64 / last_print.elapsed().as_secs_f64();
             let memory = resident_mib().map_or_else(String::new, |mib| format!(", {mib:.0} MiB"));
