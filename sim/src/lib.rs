@@ -13,6 +13,7 @@
 
 mod actor;
 mod clips;
+mod cloth;
 mod collars;
 mod config;
 mod curve;
@@ -32,6 +33,7 @@ mod hanging;
 mod hats;
 mod lift;
 mod look;
+mod loose;
 mod motion;
 mod noise;
 mod palette;

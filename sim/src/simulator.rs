@@ -148,7 +148,7 @@ impl Simulator {
 
     /// What the cameras see of the person at a time, as a mesh.
     pub fn clothed_surface(&mut self, nanos: i64) -> SurfaceMesh {
-        let Shape { positions, normals } = self.actor.shape(nanos);
+        let Shape { positions, normals, displacement } = self.actor.shape(nanos);
         let Person { clothed, carriers, .. } = &self.actor.person;
         SurfaceMesh {
             positions,
@@ -156,6 +156,7 @@ impl Simulator {
             triangles: clothed.triangles.clone(),
             canonical: carriers.clone(),
             parts: clothed.parts.clone(),
+            displacement,
         }
     }
 
@@ -164,7 +165,7 @@ impl Simulator {
     }
 
     fn posed(&mut self, nanos: i64) -> Posed {
-        let Shape { positions, normals } = self.actor.shape(nanos);
+        let Shape { positions, normals, .. } = self.actor.shape(nanos);
         let low = positions.iter().copied().fold(Vec3::INFINITY, Vec3::min);
         let high = positions.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
         let shoes = self.actor.person.shoe_vertices.clone();
