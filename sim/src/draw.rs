@@ -264,7 +264,7 @@ impl Drawing {
         self.moment = moment;
         // They are on the adapter now; what is left is their number.
         for figured in &mut self.moment.people {
-            figured.keys.iter_mut().for_each(|key| *key = Shape { positions: Vec::new(), normals: Vec::new() });
+            figured.keys.iter_mut().for_each(|key| *key = Shape::default());
             figured.openness = Vec::new();
         }
         Ok(())

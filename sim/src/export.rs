@@ -40,7 +40,7 @@ pub struct Exported {
 /// - `truth/intri.yml`, `truth/extri.yml`: the cameras as they are, without the calibration error,
 /// - `truth/frames.csv`: when each frame was taken, what its stamp said, and whether it came,
 /// - `truth/poses.jsonl`: a line a frame with pose and joints,
-/// - `truth/surface/000000.ply`: the clothed surface with canonical positions,
+/// - `truth/surface/000000.ply`: the clothed surface with canonical positions and how far the cloth swings (`cloth_*`, metres),
 /// - `truth/CAM/000000.exr`: depth, normal, canonical position and part at each pixel, as the picture shows them.
 ///
 /// A frame that the fault script loses has no picture. `go_on` is told how many frames are done and ends the export by

@@ -84,7 +84,7 @@ impl Figure {
             self.points_bind = bind(gpu, layout, &buffers);
         }
         let mut points = Vec::with_capacity(needed);
-        for Shape { positions, normals } in &figured.keys {
+        for Shape { positions, normals, .. } in &figured.keys {
             for ((p, n), open) in positions.iter().zip(normals).zip(&figured.openness) {
                 points.push([p.x, p.y, p.z, *open, n.x, n.y, n.z, 0.0]);
             }

@@ -200,7 +200,7 @@ impl Simulator {
 
     /// What the cameras see of the person at a time, as a mesh.
     pub fn clothed_surface(&mut self, nanos: i64) -> SurfaceMesh {
-        let Shape { positions, normals } = self.cast.main.shape(nanos);
+        let Shape { positions, normals, displacement } = self.cast.main.shape(nanos);
         let Person { clothed, carriers, .. } = &self.cast.main.person;
         SurfaceMesh {
             positions,
@@ -208,6 +208,7 @@ impl Simulator {
             triangles: clothed.triangles.clone(),
             canonical: carriers.clone(),
             parts: clothed.parts.clone(),
+            displacement,
         }
     }
 
