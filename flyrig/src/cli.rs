@@ -136,7 +136,8 @@ pub struct DemoArgs {
     /// Seed of the person and the room.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// "turn" (turns around fully), "walk" (a captured walk from Debian's assimp-testmodels) or a BVH file.
+    /// "turn", "walk", "wave", "squat", "reach", "sit", "jump", "cross-arms", "dance", "still", "by-seed", "bvh" (a captured
+    /// walk from Debian's assimp-testmodels), or a *.bvh, *.glb or *.gltf file.
     #[arg(long, default_value = "turn")]
     pub motion: String,
     /// TOML file of what goes wrong with cameras and clocks, like sim/assets/faults.toml.

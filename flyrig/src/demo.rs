@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use flyrig_calib::SyncConfig;
 use flyrig_capture::{CameraSource, Pacing};
 use flyrig_gpu::GpuContext;
@@ -15,7 +15,7 @@ use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, Sim
 use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::{Camera, FrameSet};
 use indicatif::ProgressBar;
-use serde::Serialize;
+use serde::{Deserialize as _, Serialize, de::IntoDeserializer as _};
 
 use crate::{
     cli::DemoArgs,
@@ -150,13 +150,26 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
+/// A kind of motion by its name in the configuration, or a file.
+fn motion(name: &str) -> Result<MotionConfig> {
+    let path = Path::new(name);
+    let is = |extensions: &[&str]| {
+        extensions.iter().any(|e| path.extension().is_some_and(|found| found.eq_ignore_ascii_case(e)))
+    };
+    if is(&["bvh"]) {
+        return Ok(MotionConfig { kind: MotionKind::Bvh, bvh: Some(path.into()), ..MotionConfig::default() });
+    }
+    if is(&["glb", "gltf"]) {
+        return Ok(MotionConfig { kind: MotionKind::Gltf, gltf: Some(path.into()), ..MotionConfig::default() });
+    }
+    let named: Result<MotionKind, serde::de::value::Error> = MotionKind::deserialize(name.into_deserializer());
+    let kind = named.map_err(|error| anyhow!("--motion: {error}; or name a file *.bvh, *.glb or *.gltf"))?;
+    Ok(MotionConfig { kind, ..MotionConfig::default() })
+}
+
 fn sim_config(args: &DemoArgs) -> Result<SimConfig> {
     let defaults = SimConfig::default();
-    let motion = match args.motion.as_str() {
-        "turn" => MotionConfig::default(),
-        "walk" => MotionConfig { kind: MotionKind::Bvh, ..MotionConfig::default() },
-        file => MotionConfig { kind: MotionKind::Bvh, bvh: Some(file.into()), ..MotionConfig::default() },
-    };
+    let motion = motion(&args.motion)?;
     // However many frames there are, they show the whole turn.
     let turn_secs =
         if args.minutes.is_some() { motion.turn_secs } else { (args.frames as f64 / defaults.fps).clamp(2.0, 60.0) };

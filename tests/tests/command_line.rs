@@ -38,6 +38,14 @@ fn help_teaches() {
 }
 
 #[test]
+fn an_unknown_motion_is_answered_with_the_known_ones() {
+    let folder = tempfile::tempdir().unwrap();
+    let refused = run(PROGRAM, &["demo", "--out", "no", "--motion", "fly"], folder.path()).unwrap();
+    assert_eq!(refused.code, Some(1));
+    assert!(refused.stderr.contains("`fly`") && refused.stderr.contains("`cross-arms`"), "{}", refused.stderr);
+}
+
+#[test]
 fn a_simulated_capture_is_exported_once() {
     let folder = tempfile::tempdir().unwrap();
     let small = "[sim]\nwidth = 64\nheight = 64\ntexture_px = 64\ncameras.count = 3\n";
