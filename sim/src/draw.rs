@@ -113,6 +113,8 @@ pub(crate) struct Drawing {
     sums: Vec<Buffer>,
     plates: Plates,
     moment: Moment,
+    /// Whether furniture may shade the people of the moment before and of this one.
+    shaded: [bool; 2],
 }
 
 /// Where one pass finds its constants.
@@ -251,6 +253,7 @@ impl Drawing {
             },
             scene,
             layouts,
+            shaded: [false; 2],
         };
         drawing.draw_room_maps();
         Ok(drawing)
@@ -261,6 +264,10 @@ impl Drawing {
         for ((figure, _), figured) in self.people.iter_mut().zip(&moment.people) {
             figure.pose(&self.gpu, &self.layouts.points, figured)?;
         }
+        let (center, radius) = moment.ball;
+        let mesh = &self.scene.mesh;
+        let shaded = self.scene.lamps.iter().any(|lamp| mesh.may_hide(lamp.place, center, radius));
+        self.shaded = [self.shaded[1], shaded];
         self.moment = moment;
         // They are on the adapter now; what is left is their number.
         for figured in &mut self.moment.people {
@@ -464,7 +471,8 @@ impl Drawing {
 
     /// The shadows that people cast at a time, and those of the furniture on them.
     fn shade_people(&self, encoder: &mut CommandEncoder, constants: &BindGroup, offsets: Offsets) {
-        for (figure, _) in &self.people {
+        let shaded = if self.shaded == [false; 2] { &[][..] } else { &self.people };
+        for (figure, _) in shaded {
             let ([points, shares], count) = figure.buffers();
             let group = [
                 points,

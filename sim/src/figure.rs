@@ -52,7 +52,7 @@ impl Figure {
         let truth: Vec<[f32; 4]> =
             person.carriers.iter().map(|p| p.extend(0.0).to_array()).collect();
         let points = StorageBuffer::zeroed(gpu, "points of a person", vertex_count)?;
-        let shares = StorageBuffer::zeroed(gpu, "shade on a person", vertex_count)?;
+        let shares = StorageBuffer::from_slice(gpu, "shade on a person", &vec![[1.0; 4]; vertex_count])?;
         Ok(Self {
             points_bind: bind(gpu, layout, &[points.raw().as_entire_binding(), shares.raw().as_entire_binding()]),
             points,

@@ -32,6 +32,7 @@ mod face;
 mod faults;
 mod figure;
 mod frame;
+mod furniture;
 mod garments;
 mod glyphs;
 mod gpu_parts;

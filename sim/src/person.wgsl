@@ -127,7 +127,8 @@ fn reaching(l: u32, place: vec3<f32>) -> f32 {
 
 @fragment
 fn fs_lit(in: Lit, @builtin(front_facing) front: bool) -> @location(0) vec4<f32> {
-    let painted = textureSampleBias(textures, smooth_sampler, in.paint.xy, u32(in.paint.z + 0.5), -0.5);
+    var painted = textureSampleBias(textures, smooth_sampler, in.paint.xy, u32(in.paint.z + 0.5), -0.5);
+    painted = vec4(painted.rgb * painted.rgb, painted.a);
     let gloss = (1.0 - painted.a) * 0.8;
     var sum = in.around.rgb * (painted.rgb + gloss * in.around.a);
     // The inner side of a hem has the light from everywhere alone.

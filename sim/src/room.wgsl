@@ -51,7 +51,7 @@ fn vs_room_shadow(vertex: Vertex, @builtin(instance_index) lamp: u32) -> @builti
 @fragment
 fn fs_layer(in: Fragment, @builtin(front_facing) front: bool) -> @location(0) vec4<f32> {
     let painted = textureSample(textures, smooth_sampler, in.uv, u32(in.layer_gloss_glow.x));
-    let albedo = painted.rgb * in.tint_openness.rgb;
+    let albedo = painted.rgb * painted.rgb * in.tint_openness.rgb;
     let openness = in.tint_openness.a;
     let layer = u32(view.moment.w);
     let glow = select(0.0, in.layer_gloss_glow.z, u32(in.layer_gloss_glow.w) == layer);

@@ -39,6 +39,8 @@ pub(crate) struct Plan {
     pub ring_m: f32,
     /// How many pieces stand between cameras and person.
     pub occluders: u32,
+    /// Cameras of the ring.
+    pub cameras: usize,
 }
 
 impl Plan {
@@ -66,7 +68,7 @@ impl Scene {
         };
         let ring_m = (config.cameras.radius_m + config.cameras.place_jitter_m) as f32;
         let half_m = ring_m + 1.45;
-        let plan = Plan { key, half_m, ring_m, occluders: config.scene.occluders };
+        let plan = Plan { key, half_m, ring_m, occluders: config.scene.occluders, cameras: config.cameras.count };
         let mut mesh = SceneMesh::new(cell_m(rig));
         let light = match kind {
             SceneKind::Office => rooms::office(&plan, &mut mesh, &config.lights),

@@ -81,12 +81,12 @@ impl SceneMesh {
         self.at = Affine3A::from_translation(at) * Affine3A::from_rotation_z(yaw);
     }
 
-    fn cells(&self, length: f32) -> usize {
+    pub(crate) fn cells(&self, length: f32) -> usize {
         (length / self.cell_m).ceil().clamp(1.0, 400.0) as usize
     }
 
     /// A grid of vertices over 0..=1 squared; seen from outside, the second parameter runs to the left of the first.
-    fn grid(&mut self, [across, up]: [usize; 2], coat: Coat, point: impl Fn(Vec2) -> (Vec3, Vec3, Vec2)) {
+    pub(crate) fn grid(&mut self, [across, up]: [usize; 2], coat: Coat, point: impl Fn(Vec2) -> (Vec3, Vec3, Vec2)) {
         let first = self.vertices.len() as u32;
         for j in 0..=up {
             for i in 0..=across {
@@ -196,6 +196,16 @@ impl SceneMesh {
             let normal = side.cross(along).normalize_or(Vec3::Z) - tilt;
             (spine(t.y) + side * (t.x - 0.5) * wide + fold, normal, t)
         });
+    }
+
+    /// Whether a thing may stand between a lamp and a ball.
+    pub(crate) fn may_hide(&self, lamp: Vec3, center: Vec3, radius: f32) -> bool {
+        let along = center - lamp;
+        self.solids.iter().any(|solid| {
+            let t = ((solid.center - lamp).dot(along) / along.length_squared().max(1e-6)).clamp(0.0, 1.0);
+            // The cone widens towards the ball; penumbrae come on top.
+            (lamp + along * t).distance(solid.center) < solid.reach_m + radius * t + 0.3
+        })
     }
 
     fn solid(&mut self, middle: Vec3, half: Vec3) {
