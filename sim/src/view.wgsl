@@ -36,7 +36,9 @@ struct View {
 
 // Ideal image plane of a point in camera axes, seen through a point of the lens.
 fn ideal_of(camera: vec3<f32>, view_lens: vec3<f32>) -> vec2<f32> {
-    return (camera.xy - view_lens.xy) / max(camera.z, NEAR_M * 0.5) + view_lens.xy * view_lens.z;
+    // Behind the camera the sign stays: times z it is then right for the clipping of triangles that reach behind it.
+    let z = select(camera.z, select(-1e-4, 1e-4, camera.z >= 0.0), abs(camera.z) < 1e-4);
+    return (camera.xy - view_lens.xy) / z + view_lens.xy * view_lens.z;
 }
 
 fn pixel_of(camera: vec3<f32>) -> vec2<f32> {
