@@ -15,6 +15,14 @@ pub enum BodyError {
         /// The system's word.
         source: std::io::Error,
     },
+    /// A file that was not written; the old one, if any, is untouched.
+    #[error("{}: not written, {message}", path.display())]
+    Unwritten {
+        /// Which file.
+        path: PathBuf,
+        /// Why.
+        message: String,
+    },
     /// A glTF file that is damaged or holds no skinned human.
     #[error("{}: {message}", path.display())]
     Gltf {

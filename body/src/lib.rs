@@ -10,14 +10,20 @@
 
 mod body_asset;
 mod bvh;
+mod coarse;
 mod default_body;
 mod eliminate;
 mod error;
+mod foot_contacts;
+mod gltf_export;
 mod gltf_file;
 mod gltf_import;
 mod gltf_nodes;
 mod gpu_skinner;
 mod graph;
+mod joint_names;
+mod mesh_ply;
+mod motion_clip;
 mod part;
 mod point_grid;
 mod retarget;
@@ -29,11 +35,16 @@ mod surface_links;
 mod template;
 
 pub use bvh::{BvhChannel, BvhClip, BvhJoint, load_bvh, parse_bvh};
+pub use coarse::{CoarseSurface, coarsen};
 pub use default_body::{ShapeTarget, default_template, shape_targets};
 pub use error::BodyError;
+pub use gltf_export::write_glb;
 pub use gltf_import::{GltfHuman, load_gltf};
 pub use gpu_skinner::GpuSkinner;
 pub use graph::{DEFAULT_NODE_COUNT, DEFAULT_SIGMA2_M2, DeformationGraph, build_graph};
+pub use mesh_ply::write_mesh_ply;
+pub use motion_clip::MotionClip;
+pub use retarget::RetargetOptions;
 pub use shape::ShapeParams;
 pub use skeleton::{Joint, Skeleton};
 pub use skinning::{skin_jacobian_f64, skin_mesh, skin_normal_f64, skin_point_f64};

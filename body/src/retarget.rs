@@ -1,13 +1,15 @@
-//! Motion of a BVH skeleton on a body.
+//! A recorded motion on a body.
 
 use flyrig_types::{Pose, PoseTrack};
-use glam::{DQuat, DVec3};
+use glam::{DQuat, DVec2, DVec3};
 
-use crate::bvh::BvhLocal;
+use crate::foot_contacts::{FootSource, plant_feet};
+use crate::joint_names::{Named, match_joints};
+use crate::motion_clip::{MotionClip, Moved};
 use crate::part::part_of_joints;
 use crate::{BodyError, BvhClip, Part, Skeleton};
 
-/// BVH is y up, our pose tracks are z up.
+/// Files are y up, our pose tracks are z up.
 const Z_UP_FROM_Y_UP: f64 = std::f64::consts::FRAC_PI_2;
 
 /// Where feet that touch the floor lie among the heights of a clip.
@@ -17,85 +19,148 @@ const FLOOR_QUANTILE: f64 = 0.05;
 const USUAL_TOE_HEIGHT_M: f64 = 0.03;
 
 /// Root, hips and legs: without these there is no scale.
-const LEGS: [[&str; 3]; 2] = [["LeftUpLeg", "LeftLeg", "LeftFoot"], ["RightUpLeg", "RightLeg", "RightFoot"]];
+const LEGS: [[&str; 4]; 2] =
+    [["LeftUpLeg", "LeftLeg", "LeftFoot", "LeftToeBase"], ["RightUpLeg", "RightLeg", "RightFoot", "RightToeBase"]];
+
+/// What part of a motion is taken, and where it happens.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct RetargetOptions {
+    /// Seconds of the motion to skip.
+    pub start_secs: f64,
+    /// The middle of the way is moved to the origin, and a way that leads farther than this from it, metres, is
+    /// shrunk, steps and all: they become shorter, feet do not slide. Without it the motion stays where it is.
+    pub reach_m: Option<f64>,
+    /// How thick the soles under the feet are, metres: they stand on the floor, the feet above them.
+    pub sole_m: f64,
+}
 
 impl BvhClip {
-    /// The clip's motion on another skeleton, by equal joint names (case and a `prefix:` do not matter). World: z
-    /// up, the floor at z = 0, a clip that faces +z of the file faces -y.
-    ///
-    /// A joint turns in the world as the clip's does from its rest. The clip rests in another pose than our bind
-    /// pose, so arms and legs are first turned to the clip's rest directions; hands go along with the arms; the
-    /// trunk and the feet keep their own shape. Joints that the clip does not know stay at rest. The way of the
-    /// hips is scaled by the length of the legs, and lifted such that the feet are on the floor when they are
-    /// lowest (5 % of the frames).
+    /// [`MotionClip::retarget`] of the whole clip, where it is.
     ///
     /// # Errors
-    /// [`BodyError::Skeleton`] when the legs' joints are missing on either side, [`BodyError::Track`].
+    /// As [`MotionClip::retarget`].
     pub fn retarget(&self, skeleton: &Skeleton) -> Result<PoseTrack, BodyError> {
-        let map = Map::new(self, skeleton)?;
-        let mut poses: Vec<Pose> = (0..self.frames.len()).map(|frame| map.pose(&self.locals(frame))).collect();
-        let mut lowest: Vec<f64> = poses.iter().map(|pose| map.lowest_foot(pose)).collect();
-        lowest.sort_by(f64::total_cmp);
-        let floor = lowest.get((lowest.len() as f64 * FLOOR_QUANTILE) as usize).copied().unwrap_or(0.0);
-        let z_up = DQuat::from_rotation_x(Z_UP_FROM_Y_UP);
-        for pose in &mut poses {
-            pose.root_translation.y += map.toe_height - floor;
-            pose.root_translation = z_up * pose.root_translation;
-            pose.joint_rotations[0] = (z_up * pose.joint_rotations[0]).normalize();
-        }
-        let nanos = |frame: usize| (frame as f64 * self.frame_secs * 1e9).round() as i64;
-        let keys = poses.into_iter().enumerate().map(|(frame, pose)| (nanos(frame), pose)).collect();
-        PoseTrack::new(keys).map_err(|source| BodyError::Track { what: self.path.display().to_string(), source })
+        self.motion().retarget(skeleton, &RetargetOptions::default())
     }
 }
 
-/// How a clip's joints drive a skeleton's.
+impl MotionClip {
+    /// The motion on another skeleton, by the joints' names in the usual rigs (case, separators and a `prefix:` do not
+    /// matter). World: z up, the floor at z = 0, a motion that faces +z of the file faces -y.
+    ///
+    /// A joint turns in the world as the source's does from its rest. The source may rest in another pose than our
+    /// bind pose, so arms and legs are first turned to its rest directions; hands go along with the arms; the trunk
+    /// and the feet keep their own shape. Joints that the source does not know stay at rest. The way of the hips is
+    /// scaled by the length of the legs, and lifted such that the feet are on the floor when they are lowest (5 % of
+    /// the frames). Where a foot of the source stands (low and slow), ours is held in place and on the floor by
+    /// two-bone inverse kinematics, and hips too high for that are lowered smoothly.
+    ///
+    /// # Errors
+    /// [`BodyError::Skeleton`] lists the legs' joints that are missing on either side, [`BodyError::Track`].
+    pub fn retarget(&self, skeleton: &Skeleton, options: &RetargetOptions) -> Result<PoseTrack, BodyError> {
+        let map = Map::new(self, skeleton)?;
+        let start_nanos =
+            self.frames.first().map_or(0, |frame| frame.0).saturating_add((options.start_secs * 1e9) as i64);
+        let last = self.frames.len().saturating_sub(1);
+        let start = self.frames.partition_point(|frame| frame.0 < start_nanos).min(last);
+        let mut poses: Vec<Pose> = self.frames.iter().map(|(_, moved)| map.pose(moved)).collect();
+        let mut lowest: Vec<f64> = poses.iter().map(|pose| map.lowest_foot(pose)).collect();
+        lowest.sort_by(f64::total_cmp);
+        let floor = lowest.get((lowest.len() as f64 * FLOOR_QUANTILE) as usize).copied().unwrap_or(0.0);
+        poses.drain(..start);
+        let z_up = DQuat::from_rotation_x(Z_UP_FROM_Y_UP);
+        for pose in &mut poses {
+            pose.root_translation.y += map.toe_height + options.sole_m - floor;
+            pose.root_translation = z_up * pose.root_translation;
+            pose.joint_rotations[0] = (z_up * pose.joint_rotations[0]).normalize();
+        }
+        if let Some(reach_m) = options.reach_m {
+            shrink_way(&mut poses, reach_m);
+        }
+        let nanos: Vec<i64> =
+            self.frames[start.min(self.frames.len())..].iter().map(|frame| frame.0 - self.frames[start].0).collect();
+        let feet = map.legs.map(|leg| {
+            let track = |joint: usize| -> Vec<DVec3> {
+                self.frames[start..].iter().map(|(_, moved)| moved[joint].position * map.scale).collect()
+            };
+            FootSource { ankle: track(leg.theirs[2]), toe: leg.their_toe.map(track) }
+        });
+        plant_feet(skeleton, &map.legs.map(|leg| leg.ours), options.sole_m, &nanos, &feet, &mut poses);
+        let keys = nanos.into_iter().zip(poses).collect();
+        PoseTrack::new(keys).map_err(|source| BodyError::Track { what: self.what.clone(), source })
+    }
+}
+
+/// Moves the middle of the way to the origin and shrinks it to `reach_m`.
+fn shrink_way(poses: &mut [Pose], reach_m: f64) {
+    let way = || poses.iter().map(|pose| pose.root_translation.truncate());
+    let low = way().fold(DVec2::INFINITY, DVec2::min);
+    let high = way().fold(DVec2::NEG_INFINITY, DVec2::max);
+    let middle = (low + high) * 0.5;
+    let farthest = way().map(|at| at.distance(middle)).fold(0.0, f64::max);
+    let scale = if farthest > reach_m { reach_m / farthest } else { 1.0 };
+    for pose in poses {
+        let at = pose.root_translation;
+        pose.root_translation = ((at.truncate() - middle) * scale).extend(at.z);
+    }
+}
+
+/// A leg on both sides: hip, knee, ankle, and our toe joint.
+#[derive(Debug, Clone, Copy)]
+struct LegMap {
+    ours: [usize; 4],
+    theirs: [usize; 3],
+    their_toe: Option<usize>,
+}
+
+/// How a motion's joints drive a skeleton's.
 struct Map<'a> {
-    clip: &'a BvhClip,
     skeleton: &'a Skeleton,
-    /// Clip joint of each of our joints.
+    /// Source joint of each of our joints.
     source: Vec<Option<usize>>,
-    /// Rotation of each of our joints, canonical axes, when the clip is at rest.
-    at_clip_rest: Vec<DQuat>,
-    /// Metres per unit of the clip.
+    /// Rotation of each of our joints, canonical axes, when the source is at rest.
+    at_source_rest: Vec<DQuat>,
+    /// Metres per unit of the source.
     scale: f64,
-    /// Joints at the top of both legs, ours and the clip's.
-    hips: [(usize, usize); 2],
+    legs: [LegMap; 2],
     feet: Vec<usize>,
     /// Height of the lowest foot joint above the floor in the bind pose, metres.
     toe_height: f64,
 }
 
 impl<'a> Map<'a> {
-    fn new(clip: &'a BvhClip, skeleton: &'a Skeleton) -> Result<Self, BodyError> {
+    fn new(clip: &MotionClip, skeleton: &'a Skeleton) -> Result<Self, BodyError> {
         let joints = skeleton.joints();
-        let clip_joint = |name: &str| clip.joints.iter().position(|joint| plain(&joint.name) == plain(name));
-        let our_joint = |name: &str| joints.iter().position(|joint| plain(&joint.name) == plain(name));
-        let source: Vec<Option<usize>> = joints
-            .iter()
-            .enumerate()
-            .map(|(index, joint)| if index == 0 { Some(0) } else { clip_joint(&joint.name) })
-            .collect();
-
+        let named: Vec<Named<'_>> =
+            clip.names.iter().zip(&clip.parents).map(|(name, &parent)| Named { name, parent }).collect();
+        let source = match_joints(skeleton, &named, &clip.what)?;
         let origins = skeleton.canonical_origins();
-        let clip_origins = clip_origins(clip);
-        let (mut ours, mut clips) = (0.0, 0.0);
-        let mut hips = Vec::new();
-        for leg in LEGS {
-            let mut chain = Vec::new();
-            for name in leg {
-                let missing = |place: &str| BodyError::Skeleton(format!("{place} has no joint '{name}'"));
-                let theirs = clip_joint(name).ok_or_else(|| missing(&clip.path.display().to_string()))?;
-                chain.push((our_joint(name).ok_or_else(|| missing("the body"))?, theirs));
+        let (mut ours, mut theirs) = (0.0, 0.0);
+        let mut legs = Vec::new();
+        for names in LEGS {
+            let our = |name: &str| skeleton.joint(name);
+            let [Some(hip), Some(knee), Some(ankle), toe] = names.map(our) else { continue };
+            let [Some(their_hip), Some(their_knee), Some(their_ankle)] = [hip, knee, ankle].map(|joint| source[joint])
+            else {
+                continue;
+            };
+            let leg = LegMap {
+                ours: [hip, knee, ankle, toe.unwrap_or(ankle)],
+                theirs: [their_hip, their_knee, their_ankle],
+                their_toe: toe.and_then(|toe| source[toe]),
+            };
+            for bone in 0..2 {
+                ours += origins[leg.ours[bone + 1]].distance(origins[leg.ours[bone]]);
+                theirs += clip.origins[leg.theirs[bone + 1]].distance(clip.origins[leg.theirs[bone]]);
             }
-            hips.push(chain[0]);
-            for bone in chain.windows(2) {
-                ours += origins[bone[1].0].distance(origins[bone[0].0]);
-                clips += clip_origins[bone[1].1].distance(clip_origins[bone[0].1]);
-            }
+            legs.push(leg);
         }
-        if !(ours > 1e-6 && clips > 1e-6) {
-            return Err(BodyError::Skeleton(format!("{} or the body has legs of no length", clip.path.display())));
+        // `match_joints` has found both legs on both sides.
+        let &[left, right] = legs.as_slice() else {
+            return Err(BodyError::Skeleton(format!("{} has no legs", clip.what)));
+        };
+        if !(ours > 1e-6 && theirs > 1e-6) {
+            return Err(BodyError::Skeleton(format!("{} or the body has legs of no length", clip.what)));
         }
 
         let parts = part_of_joints(skeleton);
@@ -109,7 +174,7 @@ impl<'a> Map<'a> {
                         .find(|&below| joints[below].parent == Some(index) && source[below].is_some());
                     let direction = next.zip(source[index]).and_then(|(next, theirs)| {
                         let ours = (origins[next] - origins[index]).try_normalize()?;
-                        let clips = (clip_origins[source[next]?] - clip_origins[theirs]).try_normalize()?;
+                        let clips = (clip.origins[source[next]?] - clip.origins[theirs]).try_normalize()?;
                         Some(DQuat::from_rotation_arc(ours, clips))
                     });
                     direction.unwrap_or(parent)
@@ -118,41 +183,30 @@ impl<'a> Map<'a> {
                 _ => DQuat::IDENTITY,
             });
         }
-        let at_clip_rest = joints.iter().zip(&turned).map(|(joint, turned)| *turned * bind_rotation(joint)).collect();
+        let at_source_rest = joints.iter().zip(&turned).map(|(joint, turned)| *turned * bind_rotation(joint)).collect();
         let is_foot = |part: &Part| matches!(part, Part::LeftFoot | Part::RightFoot);
         let feet: Vec<usize> = (0..joints.len()).filter(|&index| is_foot(&parts[index])).collect();
         let lowest = feet.iter().map(|&foot| origins[foot].y).fold(f64::INFINITY, f64::min);
         Ok(Self {
-            clip,
             skeleton,
             source,
-            at_clip_rest,
-            scale: ours / clips,
-            hips: [hips[0], hips[1]],
+            at_source_rest,
+            scale: ours / theirs,
+            legs: [left, right],
             feet,
             toe_height: if (0.0..0.15).contains(&lowest) { lowest } else { USUAL_TOE_HEIGHT_M },
         })
     }
 
-    /// One frame, y up, hips where the clip has them.
-    fn pose(&self, locals: &[BvhLocal]) -> Pose {
-        let mut clip_world: Vec<BvhLocal> = Vec::with_capacity(locals.len());
-        for (joint, local) in self.clip.joints.iter().zip(locals) {
-            clip_world.push(match joint.parent.map(|parent| clip_world[parent]) {
-                None => *local,
-                Some(parent) => BvhLocal {
-                    translation: parent.translation + parent.rotation * local.translation,
-                    rotation: (parent.rotation * local.rotation).normalize(),
-                },
-            });
-        }
+    /// One frame, y up, hips where the source has them.
+    fn pose(&self, moved: &[Moved]) -> Pose {
         let joints = self.skeleton.joints();
         let mut world: Vec<DQuat> = Vec::with_capacity(joints.len());
         let mut joint_rotations = Vec::with_capacity(joints.len());
         for (index, joint) in joints.iter().enumerate() {
             let parent = joint.parent.map_or(DQuat::IDENTITY, |parent| world[parent]);
             let local = match self.source[index] {
-                Some(source) => (parent.inverse() * clip_world[source].rotation * self.at_clip_rest[index]).normalize(),
+                Some(source) => (parent.inverse() * moved[source].turned * self.at_source_rest[index]).normalize(),
                 None => joint.rest_rotation,
             };
             joint_rotations.push(local);
@@ -160,11 +214,11 @@ impl<'a> Map<'a> {
         }
         let mut pose = Pose { root_translation: DVec3::ZERO, joint_rotations };
         let ours = self.skeleton.world_from_joint(&pose);
+        let [left, right] = self.legs;
         let between = |a: DVec3, b: DVec3| (a + b) * 0.5;
-        let [(our_left, left), (our_right, right)] = self.hips;
-        let wanted = between(clip_world[left].translation, clip_world[right].translation) * self.scale;
+        let wanted = between(moved[left.theirs[0]].position, moved[right.theirs[0]].position) * self.scale;
         let origin = |joint: usize| ours[joint].w_axis.truncate();
-        pose.root_translation = wanted - between(origin(our_left), origin(our_right));
+        pose.root_translation = wanted - between(origin(left.ours[0]), origin(right.ours[0]));
         pose
     }
 
@@ -174,21 +228,8 @@ impl<'a> Map<'a> {
     }
 }
 
-fn plain(name: &str) -> String {
-    name.rsplit(':').next().unwrap_or(name).to_lowercase()
-}
-
-/// Places of the clip's joints when nothing is turned, the clip's units.
-fn clip_origins(clip: &BvhClip) -> Vec<DVec3> {
-    let mut origins: Vec<DVec3> = Vec::with_capacity(clip.joints.len());
-    for joint in &clip.joints {
-        origins.push(joint.parent.map_or(DVec3::ZERO, |parent| origins[parent] + joint.offset));
-    }
-    origins
-}
-
 /// `canonical_from_joint` rotation in the bind pose.
-fn bind_rotation(joint: &crate::Joint) -> DQuat {
+pub(crate) fn bind_rotation(joint: &crate::Joint) -> DQuat {
     let (_, rotation, _) = joint.joint_from_canonical.inverse().to_scale_rotation_translation();
     rotation.normalize()
 }

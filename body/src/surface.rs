@@ -111,10 +111,7 @@ pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<Su
 
     let positions: Vec<Vec3> = kept.iter().map(|&i| thrown_positions[i]).collect();
     let normals: Vec<Vec3> = kept.iter().map(|&i| thrown_normals[i]).collect();
-    let scale_m = nearest_distances(&positions, &normals, (area / count as f64).sqrt() as f32)
-        .into_iter()
-        .map(|distance| distance * SCALE_OF_NEAREST)
-        .collect();
+    let scale_m = scales(&positions, &normals, (area / count as f64).sqrt() as f32);
     let part_of_joint = part_of_joints(&template.skeleton);
     let skin: Vec<SkinWeights> = kept.iter().map(|&i| blend_skin(template, candidates[i])).collect();
     Ok(SurfaceGaussians {
@@ -134,6 +131,11 @@ pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<Su
         positions,
         normals,
     })
+}
+
+/// Standard deviations of Gaussians about `spacing` apart.
+pub(crate) fn scales(positions: &[Vec3], normals: &[Vec3], spacing: f32) -> Vec<f32> {
+    nearest_distances(positions, normals, spacing).into_iter().map(|distance| distance * SCALE_OF_NEAREST).collect()
 }
 
 fn corners(template: &Template, triangle: &[u32; 3]) -> [Vec3; 3] {

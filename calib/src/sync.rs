@@ -38,13 +38,15 @@ pub struct DropCounts {
     pub duplicate: u64,
     /// Waited, but a nearer frame was taken, or no set came near enough.
     pub superseded: u64,
+    /// Claimed a time far ahead of every camera's, which neither the camera's next frame nor another camera confirmed.
+    pub wild: u64,
 }
 
 impl DropCounts {
     /// All of them.
     #[must_use]
     pub fn total(&self) -> u64 {
-        self.too_old + self.duplicate + self.superseded
+        self.too_old + self.duplicate + self.superseded + self.wild
     }
 }
 
@@ -65,7 +67,8 @@ pub struct SyncCounts {
 ///
 /// A set is emitted as soon as nothing nearer can come (every camera that is not silent has
 /// delivered a frame at or past the set's time) or when it has waited
-/// [`SyncConfig::max_wait_nanos`]. Time is the frames' own: the same frames pushed in the same
+/// [`SyncConfig::max_wait_nanos`]. A frame that claims to be farther than that ahead of all others is set aside until
+/// a second one says so: a single wrong stamp must not move the time of the whole rig. Time is the frames' own: the same frames pushed in the same
 /// order give the same sets. A frame is used once at most, the sets' times grow strictly, and a set
 /// of another clock than the set before lies more than the window after it. All cameras must share
 /// one clock; make a new synchronizer when that clock starts anew.
@@ -88,8 +91,12 @@ struct Camera {
     id: CameraId,
     /// By time.
     pending: BTreeMap<i64, Arc<Frame>>,
+    /// Far ahead of all others, and not believed yet.
+    suspect: Option<Arc<Frame>>,
     /// Time of the frame pushed last. Not the largest: one absurd time must not last.
     latest: Option<i64>,
+    /// From the frame before to that one, nanoseconds.
+    interval: Option<u64>,
     /// Time of the frame that went into a set last.
     used: Option<i64>,
 }
@@ -114,7 +121,14 @@ impl Synchronizer {
         Self {
             cameras: cameras
                 .iter()
-                .map(|id| Camera { id: id.clone(), pending: BTreeMap::new(), latest: None, used: None })
+                .map(|id| Camera {
+                    id: id.clone(),
+                    pending: BTreeMap::new(),
+                    suspect: None,
+                    latest: None,
+                    interval: None,
+                    used: None,
+                })
                 .collect(),
             clock_order,
             window: config.window_nanos,
@@ -133,23 +147,56 @@ impl Synchronizer {
             return Vec::new();
         };
         let nanos = frame.capture_nanos;
+        // A slow camera's next frame is no surprise.
+        let plausible = self.max_wait.max(self.cameras[slot].interval.unwrap_or(0).saturating_mul(4));
+        let far_ahead = self.now().is_some_and(|now| nanos > now && nanos.abs_diff(now) > plausible);
+        let near = |suspect: &Arc<Frame>| suspect.capture_nanos.abs_diff(nanos) <= plausible;
+        let own = self.cameras[slot].suspect.as_ref().is_some_and(|suspect| suspect.capture_nanos < nanos);
+        if !far_ahead {
+            // Its clock tells an ordinary time again.
+            let before = self.cameras[slot].suspect.take();
+            self.counts.dropped_frames[slot].wild += u64::from(before.is_some());
+        } else if own || self.suspects().any(near) {
+            // The rig's time did jump, after a pause of all cameras for example: each gets the usual wait from there on.
+            let start = self.suspects().fold(nanos, |start, suspect| start.min(suspect.capture_nanos));
+            for other in 0..self.cameras.len() {
+                self.cameras[other].latest = self.cameras[other].latest.max(Some(start.saturating_sub(1)));
+                if let Some(suspect) = self.cameras[other].suspect.take() {
+                    self.accept(other, suspect);
+                }
+            }
+        } else {
+            let before = self.cameras[slot].suspect.replace(Arc::new(frame));
+            self.counts.dropped_frames[slot].wild += u64::from(before.is_some());
+            return Vec::new();
+        }
+        self.accept(slot, Arc::new(frame));
+        self.drain(false)
+    }
+
+    fn suspects(&self) -> impl Iterator<Item = &Arc<Frame>> {
+        self.cameras.iter().filter_map(|camera| camera.suspect.as_ref())
+    }
+
+    fn accept(&mut self, slot: usize, frame: Arc<Frame>) {
+        let nanos = frame.capture_nanos;
         self.first_nanos.get_or_insert(nanos);
         let outdated = self.last_set.is_some_and(|(set, _)| nanos < set && nanos.abs_diff(set) >= self.window);
         let camera = &mut self.cameras[slot];
         let dropped = &mut self.counts.dropped_frames[slot];
+        camera.interval = camera.latest.map(|latest| latest.abs_diff(nanos));
         camera.latest = Some(nanos);
         if camera.used == Some(nanos) || camera.pending.contains_key(&nanos) {
             dropped.duplicate += 1;
         } else if outdated || camera.used.is_some_and(|used| nanos < used) {
             dropped.too_old += 1;
         } else {
-            camera.pending.insert(nanos, Arc::new(frame));
+            camera.pending.insert(nanos, frame);
             if camera.pending.len() > MAX_PENDING {
                 camera.pending.pop_first();
                 dropped.superseded += 1;
             }
         }
-        self.drain(false)
     }
 
     /// Gives the sets that were still waiting, at the end of a stream, and drops the frames that
@@ -159,6 +206,7 @@ impl Synchronizer {
         for (camera, dropped) in self.cameras.iter_mut().zip(&mut self.counts.dropped_frames) {
             dropped.superseded += camera.pending.len() as u64;
             camera.pending.clear();
+            dropped.wild += u64::from(camera.suspect.take().is_some());
         }
         sets
     }
@@ -276,6 +324,55 @@ mod tests {
         let config =
             SyncConfig { master: None, window_nanos: window_ms * 1_000_000, max_wait_nanos: max_wait_ms * 1_000_000 };
         Synchronizer::new(&["a".into(), "b".into(), "c".into()], &config)
+    }
+
+    #[test]
+    fn a_single_wrong_stamp_costs_its_own_frame_and_no_other() {
+        let mut sync = synchronizer(8, 100);
+        let mut sets = Vec::new();
+        for i in 0..30 {
+            for camera in ["a", "b", "c"] {
+                let wild = camera == "b" && i == 10;
+                sets.extend(sync.push(frame(camera, (i * 33 + if wild { 800 } else { 0 }) * MS)));
+            }
+        }
+        sets.extend(sync.flush());
+        let expected: Vec<Vec<Option<i64>>> =
+            (0..30).map(|i| vec![Some(i * 33), (i != 10).then_some(i * 33), Some(i * 33)]).collect();
+        assert_eq!(sets.iter().map(times).collect::<Vec<_>>(), expected);
+        let dropped: Vec<u64> = sync.counts().dropped_frames.iter().map(DropCounts::total).collect();
+        assert_eq!((dropped, sync.counts().dropped_frames[1].wild), (vec![0, 1, 0], 1));
+    }
+
+    #[test]
+    fn a_pause_of_all_cameras_costs_nothing() {
+        let mut sync = synchronizer(8, 100);
+        let mut sets = Vec::new();
+        for i in (0..5).chain(100..105) {
+            for camera in ["a", "b", "c"] {
+                sets.extend(sync.push(frame(camera, i * 33 * MS)));
+            }
+        }
+        sets.extend(sync.flush());
+        assert_eq!((sets.len(), sync.counts().complete), (10, 10));
+        // One camera alone goes on too.
+        for i in 200..210 {
+            sets.extend(sync.push(frame("c", i * 33 * MS)));
+        }
+        sets.extend(sync.flush());
+        assert_eq!(sets.len(), 20);
+    }
+
+    #[test]
+    fn a_camera_slower_than_the_wait_is_no_wild_one() {
+        let mut sync = Synchronizer::new(&["a".into()], &SyncConfig { max_wait_nanos: 0, ..SyncConfig::default() });
+        let mut sets = Vec::new();
+        for i in 0..10 {
+            sets.extend(sync.push(frame("a", i * 5000 * MS)));
+            // From the second interval on without delay.
+            assert!(i < 2 || sets.len() as i64 == i + 1, "{} sets after frame {i}", sets.len());
+        }
+        assert_eq!(sync.counts().dropped_frames[0], DropCounts::default());
     }
 
     /// Times in ms of a set's frames.

@@ -19,6 +19,12 @@ pub trait CameraSource: Send {
     /// call goes on: with the next frame after `Corrupt`, with an attempt to reconnect after
     /// `Disconnected` and `Io`. Every other kind is final, `EndOfStream` among them.
     fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError>;
+
+    /// Time by which [`crate::Pacing::Lossless`] puts the frame given last in order with those of other
+    /// cameras, nanoseconds: its capture time, unless the source knows that its stamps are wrong.
+    fn order_nanos(&self, frame: &Frame) -> i64 {
+        frame.capture_nanos
+    }
 }
 
 impl<S: CameraSource + ?Sized> CameraSource for Box<S> {
@@ -28,5 +34,9 @@ impl<S: CameraSource + ?Sized> CameraSource for Box<S> {
 
     fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
         (**self).next_frame(timeout)
+    }
+
+    fn order_nanos(&self, frame: &Frame) -> i64 {
+        (**self).order_nanos(frame)
     }
 }

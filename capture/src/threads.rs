@@ -193,7 +193,8 @@ impl Shared {
             let error = match source.next_frame(POLL) {
                 Ok(frame) => {
                     (pause, failures) = (FIRST_PAUSE, 0);
-                    if self.deliver(slot, frame) {
+                    let order_nanos = source.order_nanos(&frame);
+                    if self.deliver(slot, frame, order_nanos) {
                         continue;
                     }
                     return;
@@ -209,7 +210,9 @@ impl Shared {
                 return;
             }
             failures += 1;
-            if matches!(kind, CaptureErrorKind::Disconnected | CaptureErrorKind::Io) {
+            // What is read without loss does not come back with the wall clock's time.
+            let returns = self.pacing != Pacing::Lossless;
+            if returns && matches!(kind, CaptureErrorKind::Disconnected | CaptureErrorKind::Io) {
                 self.sleep_until(Instant::now() + pause);
                 pause = (pause * 2).min(LAST_PAUSE);
             } else if failures > PATIENCE {
@@ -219,17 +222,16 @@ impl Shared {
     }
 
     /// Whether to go on.
-    fn deliver(&self, slot: usize, frame: Frame) -> bool {
-        let nanos = frame.capture_nanos;
+    fn deliver(&self, slot: usize, frame: Frame, order_nanos: i64) -> bool {
         match self.pacing {
             Pacing::AsDelivered => {}
-            Pacing::RealTime => self.pace(nanos),
+            Pacing::RealTime => self.pace(frame.capture_nanos),
             Pacing::Lossless => {
-                if !self.turns.wait(slot, nanos) || self.queue.push_wait(frame).is_err() {
+                if !self.turns.wait(slot, order_nanos) || self.queue.push_wait(frame).is_err() {
                     return false;
                 }
                 lock(&self.stats)[slot].frames += 1;
-                self.turns.done(slot, nanos);
+                self.turns.done(slot, order_nanos);
                 return true;
             }
         }

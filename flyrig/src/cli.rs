@@ -2,7 +2,7 @@
 
 use std::{net::SocketAddr, ops::Range, path::PathBuf};
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, builder::TypedValueParser as _};
 
 use crate::config::{AppearanceMode, Origin, Solver};
 
@@ -45,11 +45,70 @@ pub enum Command {
     Watch(WatchArgs),
     /// Replay a data set, render its held-out cameras and score them.
     Eval(EvalArgs),
+    /// Use the simulated rig by itself.
+    Sim {
+        #[command(subcommand)]
+        action: SimAction,
+    },
+    /// Measure run time against error on simulated people.
+    Bench {
+        #[command(subcommand)]
+        what: BenchCommand,
+    },
     /// Print the commented default configuration, or check one.
     Config {
         #[command(subcommand)]
         action: ConfigAction,
     },
+}
+
+#[derive(Debug, Subcommand)]
+pub enum SimAction {
+    /// Write a simulated capture as a folder that `flyrig eval` and other tools read (EasyMocap layout), with the truth.
+    Export(SimExportArgs),
+}
+
+#[derive(Debug, Args)]
+pub struct SimExportArgs {
+    /// The TOML file whose [sim] section is simulated; the default configuration without one.
+    pub config: Option<PathBuf>,
+    /// Folder to write; must not be there yet.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Frames of every camera.
+    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub frames: u64,
+    /// Leave out depth, canonical positions, poses, surfaces and true times.
+    #[arg(long)]
+    pub no_truth: bool,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum BenchCommand {
+    /// Deformation tracking: solvers, iterations, Gaussians, resolution and views; writes CSV, JSON and SVG.
+    Track(BenchTrackArgs),
+}
+
+#[derive(Debug, Args)]
+pub struct BenchTrackArgs {
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-track")]
+    pub out: PathBuf,
+    /// Seed of the person.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Frames of the sequence.
+    #[arg(long, default_value_t = 14, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
+    pub frames: usize,
+    /// Pixels of a picture's side.
+    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
+    /// Only the three solvers.
+    #[arg(long)]
+    pub quick: bool,
 }
 
 #[derive(Debug, Subcommand)]
@@ -77,14 +136,18 @@ pub struct DemoArgs {
     /// Seed of the person and the room.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// "turn" (turns around fully), "walk" (a captured walk from Debian's assimp-testmodels) or a BVH file.
+    /// "turn", "walk", "wave", "squat", "reach", "sit", "jump", "cross-arms", "dance", "still", "by-seed", "bvh" (a captured
+    /// walk from Debian's assimp-testmodels), or a *.bvh, *.glb or *.gltf file.
     #[arg(long, default_value = "turn")]
     pub motion: String,
+    /// TOML file of what goes wrong with cameras and clocks, like sim/assets/faults.toml.
+    #[arg(long)]
+    pub faults: Option<PathBuf>,
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000)]
     pub gaussians: usize,
     /// How the body follows the pictures beyond its pose.
-    #[arg(long, value_enum, default_value = "none")]
+    #[arg(long, value_enum, default_value = "off")]
     pub solver: Solver,
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]

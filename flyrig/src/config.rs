@@ -6,8 +6,10 @@ use anyhow::{Context, Result, bail, ensure};
 use clap::ValueEnum;
 use flyrig_renderer::AppearanceSettings;
 use flyrig_sim::SimConfig;
-use flyrig_tracker::{DeformSettings, DeformSolver};
+use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
 use serde::{Deserialize, Serialize};
+
+use crate::deformation::DeformOptions;
 
 /// The commented default file, as `flyrig config print` writes it. A test keeps it equal to `Config::default()`.
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
@@ -115,24 +117,47 @@ impl Default for BodySection {
 #[serde(rename_all = "kebab-case")]
 pub enum Solver {
     /// Skinned only.
-    #[value(alias = "off")]
+    #[value(name = "off", alias = "none")]
+    #[serde(rename = "off", alias = "none")]
     None,
     /// Gradient descent as in the paper.
     Paper,
     /// Damped Gauss-Newton with the graph Laplacian.
-    #[value(alias = "default")]
+    #[value(name = "default", alias = "gauss-newton")]
+    #[serde(rename = "default", alias = "gauss-newton")]
     GaussNewton,
 }
 
 impl Solver {
-    /// What the tracker is told; none when the body is only skinned.
-    pub fn settings(self) -> Option<DeformSettings> {
-        let solver = match self {
-            Self::None => return None,
-            Self::Paper => DeformSolver::Paper { rate: PAPER_RATE },
-            Self::GaussNewton => DeformSettings::default().solver,
-        };
-        Some(DeformSettings { solver, ..DeformSettings::default() })
+    /// What the deformation is told; none when the body is only skinned. An estimated pose is corrected as well.
+    pub fn options(self, pose: Origin) -> Option<DeformOptions> {
+        let default = DeformSettings::default();
+        match self {
+            Self::None => None,
+            Self::Paper => Some(DeformOptions::full(DeformSettings {
+                solver: DeformSolver::Paper { rate: PAPER_RATE },
+                regularization: PAPER_REGULARIZATION,
+                ..default
+            })),
+            Self::GaussNewton => Some(DeformOptions {
+                pose: (pose == Origin::Estimated).then(PoseFreedom::default),
+                ..DeformOptions::coarse(default)
+            }),
+        }
+    }
+}
+
+/// λ_reg of the paper's Eq. 3.
+const PAPER_REGULARIZATION: f64 = 200.0;
+impl TrackingSection {
+    /// What the deformation is told; none when the body is only skinned.
+    pub fn options(&self, pose: Origin) -> Option<DeformOptions> {
+        let mut options = self.solver.options(pose)?;
+        if self.solver == Solver::GaussNewton {
+            options.gaussians = self.gaussians;
+            options.solver.rest = self.rest;
+        }
+        Some(options)
     }
 }
 
@@ -144,11 +169,14 @@ const PAPER_RATE: f64 = 3e-6;
 #[serde(deny_unknown_fields, default)]
 pub struct TrackingSection {
     pub solver: Solver,
+    pub gaussians: usize,
+    pub rest: f64,
+    pub per_view_time: bool,
 }
 
 impl Default for TrackingSection {
     fn default() -> Self {
-        Self { solver: Solver::None }
+        Self { solver: Solver::None, gaussians: 30_000, rest: 0.01, per_view_time: true }
     }
 }
 
@@ -271,6 +299,8 @@ impl Config {
             self.body.nodes,
             self.body.gaussians
         );
+        range("tracking.gaussians", self.tracking.gaussians as f64, 100.0, 2_000_000.0)?;
+        range("tracking.rest", self.tracking.rest, 0.0, 0.5)?;
         range("output.views", self.output.views as f64, 0.0, 16.0)?;
         range("output.width", f64::from(self.output.width), 16.0, 4096.0)?;
         range("output.height", f64::from(self.output.height), 16.0, 4096.0)?;

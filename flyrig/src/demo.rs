@@ -7,15 +7,15 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use flyrig_calib::SyncConfig;
 use flyrig_capture::{CameraSource, Pacing};
 use flyrig_gpu::GpuContext;
-use flyrig_sim::{MotionConfig, MotionKind, SimConfig, SimFrame, Simulator};
+use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
 use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::{Camera, FrameSet};
 use indicatif::ProgressBar;
-use serde::Serialize;
+use serde::{Deserialize as _, Serialize, de::IntoDeserializer as _};
 
 use crate::{
     cli::DemoArgs,
@@ -85,7 +85,7 @@ struct Metrics {
 pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     eprintln!("demo: simulated rig on {}", gpu.adapter_name());
-    let simulator = Arc::new(Mutex::new(Simulator::new(gpu, &sim_config(args))?));
+    let simulator = Arc::new(Mutex::new(Simulator::new(gpu, &sim_config(args)?)?));
 
     let publisher = Publisher::open(&TransportConfig {
         listen: vec![format!("tcp/{}", args.listen)],
@@ -150,17 +150,38 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-fn sim_config(args: &DemoArgs) -> SimConfig {
-    let defaults = SimConfig::default();
-    let motion = match args.motion.as_str() {
-        "turn" => MotionConfig::default(),
-        "walk" => MotionConfig { kind: MotionKind::Bvh, ..MotionConfig::default() },
-        file => MotionConfig { kind: MotionKind::Bvh, bvh: Some(file.into()), ..MotionConfig::default() },
+/// A kind of motion by its name in the configuration, or a file.
+fn motion(name: &str) -> Result<MotionConfig> {
+    let path = Path::new(name);
+    let is = |extensions: &[&str]| {
+        extensions.iter().any(|e| path.extension().is_some_and(|found| found.eq_ignore_ascii_case(e)))
     };
+    if is(&["bvh"]) {
+        return Ok(MotionConfig { kind: MotionKind::Bvh, bvh: Some(path.into()), ..MotionConfig::default() });
+    }
+    if is(&["glb", "gltf"]) {
+        return Ok(MotionConfig { kind: MotionKind::Gltf, gltf: Some(path.into()), ..MotionConfig::default() });
+    }
+    let named: Result<MotionKind, serde::de::value::Error> = MotionKind::deserialize(name.into_deserializer());
+    let kind = named.map_err(|error| anyhow!("--motion: {error}; or name a file *.bvh, *.glb or *.gltf"))?;
+    Ok(MotionConfig { kind, ..MotionConfig::default() })
+}
+
+fn sim_config(args: &DemoArgs) -> Result<SimConfig> {
+    let defaults = SimConfig::default();
+    let motion = motion(&args.motion)?;
     // However many frames there are, they show the whole turn.
     let turn_secs =
         if args.minutes.is_some() { motion.turn_secs } else { (args.frames as f64 / defaults.fps).clamp(2.0, 60.0) };
-    SimConfig { seed: args.seed, motion: MotionConfig { turn_secs, ..motion }, ..defaults }
+    let faults = match &args.faults {
+        None => FaultScript::default(),
+        Some(path) => {
+            let text = std::fs::read_to_string(path)
+                .with_context(|| format!("cannot read the fault script {}", path.display()))?;
+            FaultScript::parse(&text).with_context(|| format!("in {}", path.display()))?
+        }
+    };
+    Ok(SimConfig { seed: args.seed, motion: MotionConfig { turn_secs, ..motion }, faults, ..defaults })
 }
 
 fn lock(simulator: &Mutex<Simulator>) -> Result<MutexGuard<'_, Simulator>> {
@@ -180,7 +201,7 @@ fn pass(
     };
     let inputs = dataset::pick(&rig, &INPUTS.map(str::to_owned), "the simulated rig")?;
     let held_out = dataset::pick(&rig, &HELD_OUT.map(str::to_owned), "the simulated rig")?.cameras;
-    let sources: Vec<Box<dyn CameraSource>> = flyrig_sim::sources(simulator)
+    let sources: Vec<Box<dyn CameraSource>> = flyrig_sim::sources(simulator, SimTime::Exact)
         .into_iter()
         .filter(|source| inputs.slot(source.camera()).is_some())
         .map(|source| Box::new(source) as Box<dyn CameraSource>)
@@ -192,7 +213,7 @@ fn pass(
         flyrig_body::DEFAULT_NODE_COUNT,
         inputs.cameras.len(),
         mode.settings(),
-        args.solver.settings(),
+        args.solver.options(Origin::Given),
     )?;
     let no_plates = inputs.cameras.iter().map(|_| None).collect();
     let mut pipeline =
@@ -227,7 +248,7 @@ fn pass(
         if let Some(outlet) = &mut outlet {
             let turn_time = Duration::from_secs_f64(pass.frames as f64 / 12.0);
             views.publish(&mut pipeline, outlet, &set, turn_time)?;
-            outlet.publish_stats(&set, pass.frames, &pipeline.stages.summary(), &intake.drops());
+            outlet.publish_stats(&set, pass.frames, &pipeline.stages.summary(), &intake.drops(), &pipeline.watch);
         }
         if pass.frames % score_every == score_every / 2 {
             let start = Instant::now();

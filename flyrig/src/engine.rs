@@ -12,10 +12,10 @@ use flyrig_renderer::{
     AppearanceSettings, DirectAppearance, GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, Splat,
     ViewInput, read_splats, rgba8_from_target,
 };
-use flyrig_tracker::DeformSettings;
+use flyrig_tracker::DeformReport;
 use flyrig_types::{Camera, Image, Mask, Pose};
 
-use crate::deformation::{Deformation, Scene, TrackedView};
+use crate::deformation::{DeformOptions, DeformTimes, Deformation, Scene, TrackedView, inset};
 use crate::stats::StageTimes;
 
 /// With fewer views the last deformation stays: a single one cannot tell depth, and what fits it spoils every other side
@@ -30,6 +30,8 @@ pub struct InputView<'a> {
     pub camera: &'a Camera,
     pub image: &'a Image,
     pub mask: &'a Mask,
+    /// Pose at the picture's own time, where that is not the instant's.
+    pub pose: Option<&'a Pose>,
 }
 
 /// A rendered view: straight-alpha sRGB.
@@ -47,6 +49,8 @@ pub struct Engine {
     template: Template,
     skinner: GpuSkinner,
     gaussians: GaussianBuffers,
+    /// The Gaussians as they stood when the second, third ... instant of a set was taken.
+    posed: Vec<GaussianBuffers>,
     rasterizer: Rasterizer,
     appearance: DirectAppearance,
     settings: AppearanceSettings,
@@ -55,6 +59,8 @@ pub struct Engine {
     rgba: Vec<Vec<u8>>,
     output: Option<RenderTarget>,
     deformation: Option<Deformation>,
+    /// What the deformation thinks of the last update's views.
+    judged: Vec<(f64, bool)>,
 }
 
 impl Engine {
@@ -68,7 +74,7 @@ impl Engine {
         node_count: usize,
         max_views: usize,
         settings: AppearanceSettings,
-        deform: Option<DeformSettings>,
+        deform: Option<DeformOptions>,
     ) -> Result<Self> {
         let surface =
             sample_surface(&template, gaussian_count, SURFACE_SEED).context("sampling the template's surface")?;
@@ -84,7 +90,7 @@ impl Engine {
         graph: &DeformationGraph,
         max_views: usize,
         settings: AppearanceSettings,
-        deform: Option<DeformSettings>,
+        deform: Option<DeformOptions>,
     ) -> Result<Self> {
         let count = surface.positions.len();
         let gaussians = GaussianBuffers::zeroed(&gpu, count)?;
@@ -96,9 +102,12 @@ impl Engine {
         gaussians.color.write(&gpu, &vec![[0.5, 0.5, 0.5, 1.0]; count]);
         let rasterizer = Rasterizer::new(&gpu, count)?;
         Ok(Self {
-            skinner: GpuSkinner::new(&gpu, surface, &template.skeleton)?,
+            skinner: match deform {
+                Some(_) => GpuSkinner::new(&gpu, &inset(surface), &template.skeleton)?,
+                None => GpuSkinner::new(&gpu, surface, &template.skeleton)?,
+            },
             deformation: deform
-                .map(|settings| Deformation::new(&gpu, &template, surface, graph, &rasterizer, settings))
+                .map(|options| Deformation::new(&gpu, &template, surface, graph, options))
                 .transpose()?,
             rasterizer,
             appearance: DirectAppearance::new(&gpu, surface, graph, max_views)?,
@@ -106,6 +115,8 @@ impl Engine {
             template,
             gaussians,
             settings,
+            posed: Vec::new(),
+            judged: Vec::new(),
             visibility: Vec::new(),
             rgba: Vec::new(),
             output: None,
@@ -121,37 +132,69 @@ impl Engine {
     pub fn update(&mut self, pose: &Pose, views: &[InputView<'_>], stages: &mut StageTimes) -> Result<()> {
         stages.time("convert pictures", || self.fill_rgba(views))?;
 
+        // The instant itself, and each other one that a picture was taken at.
+        let mut instants = vec![pose];
+        let instant_of: Vec<usize> = views
+            .iter()
+            .map(|view| {
+                let Some(own) = view.pose else { return 0 };
+                instants.iter().position(|known| *known == own).unwrap_or_else(|| {
+                    instants.push(own);
+                    instants.len() - 1
+                })
+            })
+            .collect();
+        while self.posed.len() + 1 < instants.len() {
+            self.posed.push(self.gaussians.posed_again(&self.gpu)?);
+        }
+        let poses = instants;
+        let instants: Vec<(&Pose, &GaussianBuffers)> =
+            poses.iter().copied().zip(std::iter::once(&self.gaussians).chain(&self.posed)).collect();
+
+        self.judged.clear();
         if let Some(deformation) = self.deformation.as_mut().filter(|_| views.len() >= MIN_DEFORMATION_VIEWS) {
             let start = Instant::now();
             let tracked: Vec<TrackedView<'_>> = views
                 .iter()
                 .zip(&self.rgba)
-                .map(|(view, rgba)| (view.camera, [view.image.width(), view.image.height()], rgba.as_slice()))
+                .zip(&instant_of)
+                .map(|((view, rgba), &instant)| {
+                    let size = [view.image.width(), view.image.height()];
+                    TrackedView { camera: view.camera, size, rgba, instant }
+                })
                 .collect();
             let scene = Scene {
                 gpu: &self.gpu,
-                skinner: &self.skinner,
                 skeleton: &self.template.skeleton,
-                rasterizer: &mut self.rasterizer,
+                instants: &poses,
                 gaussians: &self.gaussians,
             };
-            let report = deformation.track(scene, pose, &tracked)?;
-            tracing::debug!(?report, "deformation");
+            let DeformTimes { prepare, draw, derivatives, solve } = deformation.track(scene, &tracked)?;
+            self.judged.extend_from_slice(deformation.judged());
             stages.add("deformation", start.elapsed());
+            stages.add("  prepare", prepare);
+            stages.add("  draw and compare", draw);
+            stages.add("  derivatives", derivatives);
+            stages.add("  solve", solve);
+            if deformation.report().is_some_and(|report| report.at_rest) {
+                stages.add("  at rest, no iteration", start.elapsed());
+            }
         }
 
         let start = Instant::now();
-        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-        self.skinner.encode(
-            &self.gpu,
-            &mut encoder,
-            &self.template.skeleton,
-            pose,
-            self.deformation.as_ref().map(Deformation::displacement),
-            &self.gaussians.center_scale,
-            &self.gaussians.normal,
-        )?;
-        self.submit(encoder)?;
+        let corrected: Vec<Pose> = instants
+            .iter()
+            .map(|(pose, _)| self.deformation.as_ref().map_or_else(|| (*pose).clone(), |d| d.correction().apply(pose)))
+            .collect();
+        let displacement = self.deformation.as_ref().map(Deformation::displacement);
+        for (pose, (_, gaussians)) in corrected.iter().zip(&instants) {
+            let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+            let (centers, normals) = (&gaussians.center_scale, &gaussians.normal);
+            let skeleton = &self.template.skeleton;
+            self.skinner.encode(&self.gpu, &mut encoder, skeleton, pose, displacement, centers, normals)?;
+            self.gpu.queue.submit([encoder.finish()]);
+        }
+        self.gpu.wait()?;
         stages.add("skinning", start.elapsed());
 
         let start = Instant::now();
@@ -174,7 +217,7 @@ impl Engine {
             self.rasterizer.encode(
                 &self.gpu,
                 &mut encoder,
-                &self.gaussians,
+                instants[instant_of[i]].1,
                 view.camera,
                 &settings,
                 &self.visibility[i],
@@ -185,11 +228,22 @@ impl Engine {
         stages.add("visibility", start.elapsed());
 
         let start = Instant::now();
+        // A view that is not believed paints nothing.
+        let believed = |i: usize| self.judged.get(i).is_none_or(|(_, trusted)| *trusted);
         let inputs: Vec<ViewInput<'_>> = views
             .iter()
             .zip(&self.rgba)
             .zip(&self.visibility)
-            .map(|((view, rgba), target)| ViewInput { camera: view.camera, rgba, canonical: &target.canonical })
+            .zip(&instant_of)
+            .enumerate()
+            .filter(|(i, _)| believed(*i))
+            .map(|(_, view)| view)
+            .map(|(((view, rgba), target), &instant)| ViewInput {
+                camera: view.camera,
+                rgba,
+                canonical: &target.canonical,
+                gaussians: (instant > 0).then(|| instants[instant].1),
+            })
             .collect();
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         self.appearance.update(&self.gpu, &mut encoder, &self.gaussians, &inputs, &self.settings)?;
@@ -217,6 +271,32 @@ impl Engine {
         Ok(RenderedView { width, height, rgba })
     }
 
+    /// Forgets clothes and colours: another person may come.
+    pub fn forget(&mut self) {
+        if let Some(deformation) = &mut self.deformation {
+            deformation.reset();
+        }
+        self.appearance.reset();
+    }
+
+    /// The next frames get the iterations of a start.
+    pub fn restart(&mut self) {
+        if let Some(deformation) = &mut self.deformation {
+            deformation.restart();
+        }
+    }
+
+    /// By view of the last update: how much of the person is where the picture shows it, 0 to 1. Empty when the body was not
+    /// compared with the pictures.
+    pub fn agreement(&self) -> Vec<f64> {
+        self.judged.iter().map(|(quality, _)| *quality).collect()
+    }
+
+    /// What the last solve of the deformation did.
+    pub fn deform_report(&self) -> Option<&DeformReport> {
+        self.deformation.as_ref().and_then(Deformation::report)
+    }
+
     /// The Gaussians of this instant.
     pub fn splats(&self) -> Result<Vec<Splat>> {
         Ok(read_splats(&self.gpu, &self.gaussians)?)
@@ -229,7 +309,7 @@ impl Engine {
         for (position, by) in moved.positions.iter_mut().zip(deformation.vertex_displacement()) {
             *position += by;
         }
-        skin_mesh(&moved, pose)
+        skin_mesh(&moved, &deformation.correction().apply(pose))
     }
 
     fn submit(&self, encoder: wgpu::CommandEncoder) -> Result<()> {

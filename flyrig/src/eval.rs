@@ -3,11 +3,10 @@
 use std::{path::Path, sync::Arc, time::Instant};
 
 use anyhow::{Context, Result, bail, ensure};
-use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
+use flyrig_body::{ShapeParams, Template, default_template, load_gltf, write_mesh_ply};
 use flyrig_calib::{SyncConfig, Synchronizer};
 use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay, to_rgb8};
 use flyrig_gpu::GpuContext;
-use flyrig_renderer::write_mesh_ply;
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
 use flyrig_types::{Camera, CameraId, Frame, FrameSet, Rig};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -107,7 +106,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         args.nodes,
         rig.cameras.len(),
         args.appearance.settings(),
-        solver.settings(),
+        solver.options(args.pose),
     )?;
     let mut pipeline = Pipeline::new(engine, rig, pose, args.masks, plates);
 
@@ -135,7 +134,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
             let engine = pipeline.engine();
             let (positions, normals) = engine.surface(pose);
             let path = args.out.join(format!("surface/{number:06}.ply"));
-            write_mesh_ply(&path, &positions, &normals, &engine.template().triangles)?;
+            write_mesh_ply(&path, &positions, &normals, &engine.template().triangles, &[])?;
         }
         let truths = truth.at(set.master_nanos)?;
         let jobs: Vec<_> = holdout.iter().zip(&views).zip(&truths).collect();

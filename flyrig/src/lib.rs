@@ -2,6 +2,7 @@
 //!
 //! A library only so that the end-to-end tests can build the same program; its documentation is `--help`.
 
+mod bench;
 mod cli;
 mod config;
 mod dataset;
@@ -13,11 +14,14 @@ mod intake;
 mod outlet;
 mod pipeline;
 mod png;
+mod pose_curve;
 mod report;
 mod run;
 mod score;
+mod sim_export;
 mod stats;
 mod stop;
+mod track_state;
 mod viewpoints;
 mod watch;
 
@@ -29,7 +33,7 @@ use flyrig_gpu::{AdapterChoice, GpuContext};
 use tracing_subscriber::EnvFilter;
 
 use crate::{
-    cli::{Cli, Command, ConfigAction},
+    cli::{BenchCommand, Cli, Command, ConfigAction, SimAction},
     config::{Config, DEFAULT_TOML},
 };
 
@@ -70,6 +74,12 @@ fn dispatch(cli: &Cli) -> Result<()> {
         }
         Command::Watch(args) => watch::watch(args),
         Command::Eval(args) => eval::eval(args, &gpu(cli.adapter.as_deref())?),
+        Command::Sim { action: SimAction::Export(args) } => {
+            let config = args.config.as_deref().map(Config::load).transpose()?.unwrap_or_default();
+            let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
+            sim_export::sim_export(args, &config.sim, &gpu(adapter)?)
+        }
+        Command::Bench { what: BenchCommand::Track(args) } => bench::track(args, &gpu(cli.adapter.as_deref())?),
         Command::Config { action: ConfigAction::Print } => {
             print!("{DEFAULT_TOML}");
             Ok(())

@@ -12,10 +12,10 @@ use std::{
 use anyhow::{Context, Result};
 use flyrig_capture::{LatestQueue, PopError};
 use flyrig_renderer::{Splat, composite_over};
-use flyrig_transport::{ImageFormat, Publisher, RigStats, SplatState, StageTime, ViewFrame, ViewRate};
+use flyrig_transport::{ImageFormat, Publisher, RigStats, SplatState, StageTime, TrackingStats, ViewFrame, ViewRate};
 use flyrig_types::FrameSet;
 
-use crate::{engine::RenderedView, png, stats::StageSummary};
+use crate::{engine::RenderedView, png, stats::StageSummary, track_state::TrackWatch};
 
 /// Pictures that may wait for compression, over all views.
 const WAITING_PICTURES: usize = 8;
@@ -96,6 +96,7 @@ impl Outlet {
         frames: u64,
         stages: &[StageSummary],
         drops: &[(String, u64)],
+        watch: &TrackWatch,
     ) -> bool {
         let interval = self.last_stats.elapsed();
         if interval < STATS_EVERY {
@@ -132,6 +133,11 @@ impl Outlet {
             dropped: drops.iter().cloned().chain(self.drops()).collect(),
             views,
             viewers: self.publisher.viewpoint_counts().active as u32,
+            tracking: TrackingStats {
+                state: watch.state().name().to_owned(),
+                quality: watch.quality(),
+                cameras: watch.cameras().iter().map(|(id, quality)| (id.to_string(), *quality)).collect(),
+            },
         };
         if let Err(error) = self.publisher.publish_stats(&stats) {
             tracing::warn!(%error, "statistics not published");

@@ -7,7 +7,9 @@ use flyrig_types::{FrameSet, Image, Mask, Pose, PoseTrack, Rig};
 use crate::{
     config::Origin,
     engine::{Engine, InputView, RenderedView},
+    pose_curve::PoseCurve,
     stats::StageTimes,
+    track_state::{Remedy, TrackWatch},
 };
 
 /// Where the pose of an instant comes from.
@@ -36,6 +38,8 @@ pub struct Counts {
     pub lost: u64,
     /// Pictures that had no mask, or an empty one.
     pub without_mask: u64,
+    /// Sets whose deformation was dropped because a number was not finite.
+    pub poisoned: u64,
 }
 
 /// The stages after synchronisation.
@@ -47,6 +51,12 @@ pub struct Pipeline {
     /// Empty pictures by slot, where there are any: masks are then the difference to them.
     plates: Vec<Option<Image>>,
     last_pose: Option<Pose>,
+    /// Times of the last poses that were used, for what lies between and beyond them.
+    curve: PoseCurve,
+    /// How well the person is followed.
+    pub watch: TrackWatch,
+    /// Whether every picture is explained with the pose of its own capture time, not of the set's.
+    pub per_view_time: bool,
     /// Times of every stage so far.
     pub stages: StageTimes,
     /// What happened so far.
@@ -63,6 +73,9 @@ impl Pipeline {
             masks,
             plates,
             last_pose: None,
+            curve: PoseCurve::default(),
+            watch: TrackWatch::default(),
+            per_view_time: true,
             stages: StageTimes::default(),
             counts: Counts::default(),
         }
@@ -78,6 +91,7 @@ impl Pipeline {
                     Ok(estimate) => (estimate.pose, Some(estimate.masks)),
                     Err(error) => {
                         self.counts.lost += 1;
+                        self.watch.away(set.master_nanos);
                         return Ok(Outcome::Held(error.to_string()));
                     }
                 }
@@ -85,15 +99,20 @@ impl Pipeline {
         };
         if !pose.is_valid() {
             self.counts.lost += 1;
+            self.watch.away(set.master_nanos);
             return Ok(Outcome::Held("the pose holds numbers that are not finite".to_owned()));
         }
         let masks = self.masks(set, masks)?;
+        self.curve.push(set.master_nanos, &pose);
+        let poses: Vec<Option<Pose>> =
+            set.present().map(|(_, frame)| self.pose_at(frame.capture_nanos, set.master_nanos)).collect();
         let views: Vec<InputView<'_>> = set
             .present()
             .zip(&masks)
-            .filter_map(|((slot, frame), mask)| {
+            .zip(&poses)
+            .filter_map(|(((slot, frame), mask), pose)| {
                 let mask = mask.as_ref().map(MaskOf::mask).filter(|mask| mask.area_px() > 0)?;
-                Some(InputView { camera: &self.rig.cameras[slot], image: &frame.image, mask })
+                Some(InputView { camera: &self.rig.cameras[slot], image: &frame.image, mask, pose: pose.as_ref() })
             })
             .collect();
         for ((_, frame), mask) in set.present().zip(&masks) {
@@ -106,10 +125,37 @@ impl Pipeline {
                 }
             }
         }
+        if views.is_empty() {
+            self.watch.away(set.master_nanos);
+        } else {
+            match self.watch.arrive(set.master_nanos, &pose) {
+                Remedy::Forget => self.engine.forget(),
+                Remedy::Restart => self.engine.restart(),
+                Remedy::None => {}
+            }
+        }
         self.engine.update(&pose, &views, &mut self.stages)?;
+        if !views.is_empty() {
+            let ids = views.iter().map(|view| view.camera.id.clone());
+            self.watch.judge(ids.zip(self.engine.agreement()));
+        }
+        self.counts.poisoned += u64::from(self.engine.deform_report().is_some_and(|report| report.poisoned));
         self.last_pose = Some(pose);
         self.counts.updated += 1;
         Ok(Outcome::Updated)
+    }
+
+    /// Pose at a picture's own time, where that is another than the set's.
+    fn pose_at(&self, nanos: i64, master_nanos: i64) -> Option<Pose> {
+        if !self.per_view_time || nanos == master_nanos {
+            return None;
+        }
+        let pose = match &self.pose {
+            PoseSource::Track { track, repeat: true } => Some(track.at_repeated(nanos)),
+            PoseSource::Track { track, repeat: false } => Some(track.at(nanos)),
+            PoseSource::Estimator(_) => self.curve.at(nanos),
+        };
+        pose.filter(Pose::is_valid)
     }
 
     /// A mask a present frame, in their order.

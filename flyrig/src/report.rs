@@ -1,6 +1,6 @@
 //! A self-contained HTML page: pictures, scores, times, memory.
 
-use std::{fmt::Write as _, path::Path};
+use std::{fmt::Write as _, io::Write as _, path::Path};
 
 use anyhow::{Context, Result};
 use base64::{Engine as _, prelude::BASE64_STANDARD};
@@ -122,14 +122,10 @@ impl Report {
     }
 }
 
-/// Writes a file through a temporary neighbour, so that nobody sees half of it.
+/// Writes a file whole or not at all.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".part");
-    let part = path.with_file_name(name);
-    std::fs::write(&part, bytes)
-        .and_then(|()| std::fs::rename(&part, path))
-        .with_context(|| format!("cannot write {}", path.display()))
+    flyrig_types::write_whole(path, |out| out.write_all(bytes))
+        .with_context(|| format!("cannot write {}; check that the folder exists and has room", path.display()))
 }
 
 impl Curve {

@@ -7,7 +7,7 @@ use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
 use flyrig_calib::SyncConfig;
 use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, VideoOptions, VideoReplay};
 use flyrig_gpu::GpuContext;
-use flyrig_sim::Simulator;
+use flyrig_sim::{SimTime, Simulator};
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
 use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::{CameraId, FrameSet, Image, Rig};
@@ -45,7 +45,12 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
     let stop = stop::flag();
     let scene = open(config, gpu)?;
     dataset::require_masks(config.body.pose, config.body.masks, &scene.plates)?;
-    let pacing = if config.source.real_time { Pacing::RealTime } else { Pacing::Lossless };
+    let pacing = match (config.source.real_time, config.source.kind) {
+        (false, _) => Pacing::Lossless,
+        // Simulated cameras keep the time themselves, whatever their stamps say.
+        (true, SourceKind::Sim) => Pacing::AsDelivered,
+        (true, _) => Pacing::RealTime,
+    };
     let mut intake = Intake::start(scene.sources, &sync_config(config), pacing)?;
 
     let mut template = scene.template;
@@ -68,9 +73,10 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         config.body.nodes,
         scene.rig.cameras.len(),
         config.appearance.mode.settings(),
-        config.tracking.solver.settings(),
+        config.tracking.options(config.body.pose),
     )?;
     let mut pipeline = Pipeline::new(engine, scene.rig, pose, config.body.masks, scene.plates);
+    pipeline.per_view_time = config.tracking.per_view_time;
     let publisher = Publisher::open(&TransportConfig {
         listen: config.transport.listen.clone(),
         connect: config.transport.connect.clone(),
@@ -99,7 +105,7 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         if config.output.splats && outlet.publisher().has_splat_subscribers() {
             outlet.publish_splats(&pipeline.engine().splats()?, &set);
         }
-        outlet.publish_stats(&set, frames, &pipeline.stages.summary(), &intake.drops());
+        outlet.publish_stats(&set, frames, &pipeline.stages.summary(), &intake.drops(), &pipeline.watch);
         if last_print.elapsed() >= PRINT_EVERY {
             let rate = (frames - printed) as f64 / last_print.elapsed().as_secs_f64();
             let memory = resident_mib().map_or_else(String::new, |mib| format!(", {mib:.0} MiB"));
@@ -190,7 +196,8 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
     let source = &config.source;
     if source.kind == SourceKind::Sim {
         let simulator = Simulator::new(gpu, &config.sim)?;
-        let (rig, template, track) = (simulator.rig().clone(), simulator.template().clone(), simulator.track().clone());
+        let (rig, template, track) =
+            (simulator.reported_rig(), simulator.template().clone(), simulator.track().clone());
         let picked = dataset::pick(&rig, &source.cameras, "the simulated rig")?;
         let copy = |slot| -> Result<Image> {
             let plate = simulator.plate(slot)?;
@@ -199,7 +206,8 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
         let slots = picked.cameras.iter().filter_map(|camera| rig.slot(&camera.id));
         let plates = slots.map(|slot| copy(slot).map(Some)).collect::<Result<_>>()?;
         let simulator = std::sync::Arc::new(std::sync::Mutex::new(simulator));
-        let sources = flyrig_sim::sources(&simulator)
+        let time = if source.real_time { SimTime::Real } else { SimTime::Exact };
+        let sources = flyrig_sim::sources(&simulator, time)
             .into_iter()
             .filter(|source| picked.slot(source.camera()).is_some())
             .map(|source| Box::new(source) as Box<dyn CameraSource>)

@@ -7,8 +7,8 @@ use wgpu::{Buffer, BufferDescriptor, BufferUsages};
 
 use crate::{GpuContext, GpuError};
 
-/// A GPU array of `T`, usable as storage, copy source and copy target.
-#[derive(Debug)]
+/// A GPU array of `T`, usable as storage, copy source and copy target. Clones share the array.
+#[derive(Debug, Clone)]
 pub struct StorageBuffer<T> {
     buffer: Buffer,
     len: usize,

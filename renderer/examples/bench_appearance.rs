@@ -41,7 +41,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let inputs: Vec<_> = views
         .iter()
         .zip(&maps)
-        .map(|(view, canonical)| ViewInput { camera: &view.camera, rgba: &view.rgba, canonical })
+        .map(|(view, canonical)| ViewInput { camera: &view.camera, rgba: &view.rgba, canonical, gaussians: None })
         .collect();
 
     let mut appearance = DirectAppearance::new(&gpu, &person.surface, &person.graph, 3)?;

@@ -29,6 +29,19 @@ impl GaussianBuffers {
         })
     }
 
+    /// Centres and normals of their own, colours and canonical positions shared: the same person in another pose.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn posed_again(&self, gpu: &GpuContext) -> Result<Self, GpuError> {
+        Ok(Self {
+            center_scale: StorageBuffer::zeroed(gpu, "Gaussian centres", self.count())?,
+            normal: StorageBuffer::zeroed(gpu, "Gaussian normals", self.count())?,
+            color: self.color.clone(),
+            canonical: self.canonical.clone(),
+        })
+    }
+
     /// Number of Gaussians.
     #[must_use]
     pub fn count(&self) -> usize {

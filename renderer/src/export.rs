@@ -1,13 +1,12 @@
-//! Splats and meshes as PLY files that other tools open. A file appears whole or not at all.
+//! Splats as PLY files that other tools open. A file appears whole or not at all.
 
 use std::{
-    fs,
-    io::{self, BufWriter, Write},
+    io::{self, Write as _},
     path::{Path, PathBuf},
 };
 
 use flyrig_gpu::{GpuContext, GpuError};
-use glam::Vec3;
+use flyrig_types::write_whole;
 
 use crate::{GaussianBuffers, color::srgb_from_linear};
 
@@ -21,14 +20,6 @@ pub enum ExportError {
         path: PathBuf,
         /// The system's word.
         source: io::Error,
-    },
-    /// The lists do not belong together.
-    #[error("{}: not written, {message}", path.display())]
-    Invalid {
-        /// Which file.
-        path: PathBuf,
-        /// What is wrong with the content.
-        message: String,
     },
 }
 
@@ -117,82 +108,15 @@ pub fn write_splat_ply(path: &Path, splats: &[Splat]) -> Result<usize, ExportErr
             }
         }
         Ok(())
-    })?;
+    })
+    .map_err(|source| ExportError::Io { path: path.to_owned(), source })?;
     Ok(count)
-}
-
-/// Writes a triangle mesh with normals as binary PLY; positions in metres.
-///
-/// # Errors
-/// [`ExportError::Invalid`] when the lists do not fit together or a position is not finite, [`ExportError::Io`]
-/// names the file; the old one, if any, is then untouched.
-pub fn write_mesh_ply(
-    path: &Path,
-    positions: &[Vec3],
-    normals: &[Vec3],
-    triangles: &[[u32; 3]],
-) -> Result<(), ExportError> {
-    let invalid = |message| ExportError::Invalid { path: path.to_owned(), message };
-    let count = positions.len();
-    if normals.len() != count {
-        return Err(invalid(format!("there are {count} positions but {} normals", normals.len())));
-    }
-    // The indices are written as signed 32-bit integers.
-    if let Some(index) = triangles.as_flattened().iter().find(|&&i| i as usize >= count || i32::try_from(i).is_err()) {
-        return Err(invalid(format!("a triangle refers to vertex {index} of {count}")));
-    }
-    if let Some(vertex) = positions.iter().zip(normals).position(|(p, n)| !p.is_finite() || !n.is_finite()) {
-        return Err(invalid(format!("vertex {vertex} is not a finite number")));
-    }
-    write_whole(path, |out| {
-        write!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n")?;
-        for property in ["x", "y", "z", "nx", "ny", "nz"] {
-            writeln!(out, "property float {property}")?;
-        }
-        write!(out, "element face {}\nproperty list uchar int vertex_indices\nend_header\n", triangles.len())?;
-        for (position, normal) in positions.iter().zip(normals) {
-            for value in position.to_array().into_iter().chain(normal.to_array()) {
-                out.write_all(&value.to_le_bytes())?;
-            }
-        }
-        for triangle in triangles {
-            out.write_all(&[3])?;
-            for index in triangle {
-                out.write_all(&index.to_le_bytes())?;
-            }
-        }
-        Ok(())
-    })
-}
-
-/// Writes beside the target, then renames over it, so that a reader never meets half a file.
-fn write_whole(
-    path: &Path,
-    content: impl FnOnce(&mut BufWriter<fs::File>) -> io::Result<()>,
-) -> Result<(), ExportError> {
-    let failed = |source| ExportError::Io { path: path.to_owned(), source };
-    let Some(name) = path.file_name() else {
-        return Err(failed(io::Error::new(io::ErrorKind::InvalidInput, "the path has no file name")));
-    };
-    let mut partial_name = name.to_owned();
-    partial_name.push(format!(".{}.partial", std::process::id()));
-    let partial = path.with_file_name(partial_name);
-    let write = || {
-        let mut out = BufWriter::new(fs::File::create(&partial)?);
-        content(&mut out)?;
-        out.flush()?;
-        drop(out);
-        fs::rename(&partial, path)
-    };
-    write().map_err(|source| {
-        // Nothing more can be done when even that fails; the first error is the one worth telling.
-        let _ = fs::remove_file(&partial);
-        failed(source)
-    })
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     const SPLAT: Splat = Splat {
@@ -231,27 +155,8 @@ mod tests {
     }
 
     #[test]
-    fn a_mesh_has_the_bytes_it_promises() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("m.ply");
-        let positions = [Vec3::ZERO, Vec3::X, Vec3::Y];
-        write_mesh_ply(&path, &positions, &[Vec3::Z; 3], &[[0, 1, 2]]).unwrap();
-        let bytes = fs::read(&path).unwrap();
-        let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
-        assert_eq!(bytes.len(), end + 3 * 24 + 13);
-        assert_eq!(bytes[end + 72..], [3, 0, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0]);
-    }
-
-    #[test]
     fn refusals_name_the_file_and_leave_nothing() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("m.ply");
-        let message = |normals: &[Vec3], triangles: &[[u32; 3]], x: f32| {
-            write_mesh_ply(&path, &[Vec3::splat(x)], normals, triangles).unwrap_err().to_string()
-        };
-        assert!(message(&[], &[], 0.0).contains("m.ply: not written, there are 1 positions but 0 normals"));
-        assert!(message(&[Vec3::Z], &[[0, 0, 1]], 0.0).contains("refers to vertex 1 of 1"));
-        assert!(message(&[Vec3::Z], &[], f32::INFINITY).contains("vertex 0 is not a finite number"));
         let nowhere = folder.path().join("no/such/folder.ply");
         assert!(write_splat_ply(&nowhere, &[SPLAT]).unwrap_err().to_string().contains("no/such/folder.ply"));
         // The target is a folder: the rename fails and the partial file goes.

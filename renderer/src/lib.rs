@@ -3,9 +3,11 @@
 mod appearance;
 mod buffers;
 mod color;
+mod color_means;
 mod constants;
 mod export;
 pub mod metrics;
+mod picture_loss;
 mod raster;
 mod raster_backward;
 mod raster_buffers;
@@ -18,7 +20,9 @@ pub use appearance::{
 };
 pub use buffers::{GaussianBuffers, RenderTarget};
 pub use color::{composite_over, linear_from_srgb, rgba8_from_target, srgb_from_linear};
-pub use export::{ExportError, Splat, read_splats, write_mesh_ply, write_splat_ply};
+pub use color_means::ColorMeans;
+pub use export::{ExportError, Splat, read_splats, write_splat_ply};
+pub use picture_loss::{LossSettings, PictureLoss, PictureSums, WantedPicture};
 pub use raster::{Outputs, RasterSettings, RasterStats, Rasterizer};
 pub use raster_backward::{BackwardError, BackwardRasterizer, Carry, GaussianGradients, PictureGradients};
 pub use raster_kernels::BACKFACING_COSINE;

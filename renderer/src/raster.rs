@@ -42,11 +42,14 @@ pub struct RasterSettings {
     /// The splat's opacity falls so that its integral stays: Mip-Splatting's 2D Mip filter (Yu et al.
     /// 2024, Eq. 10). 0.1 is that paper's value for one pixel.
     pub filter_variance_px2: f32,
+    /// Only the tiles that this part of the picture touches are blended, `[left, top, right, bottom]` in pixels, right
+    /// and bottom excluded; all others keep their content. None: the whole picture.
+    pub area: Option<[u32; 4]>,
 }
 
 impl Default for RasterSettings {
     fn default() -> Self {
-        Self { near_m: 0.05, cull_backfacing: true, outputs: Outputs::ALL, filter_variance_px2: 0.1 }
+        Self { near_m: 0.05, cull_backfacing: true, outputs: Outputs::ALL, filter_variance_px2: 0.1, area: None }
     }
 }
 
@@ -93,6 +96,8 @@ pub(crate) struct Latest {
     pub constants: Constants,
     pub gaussians: usize,
     pub size: [u32; 2],
+    /// Columns and rows of tiles that were blended.
+    pub blended: [u32; 2],
     pub outputs: Outputs,
 }
 
@@ -159,6 +164,7 @@ impl Rasterizer {
         self.grow(gpu, gaussians.count(), target)?;
         let Some(picture) = &self.picture else { return Ok(()) };
         let layout = picture.layout();
+        let (first_tile, blended) = tile_range(settings.area, layout.tiles, self.kernels.shape.tile);
         let frame = Frame {
             camera: CameraConstants::from(camera),
             size: [target.width, target.height],
@@ -171,11 +177,13 @@ impl Rasterizer {
             filter_variance_px2: settings.filter_variance_px2,
             bin_chunks: layout.bin_chunks,
             unused: 0,
+            first_tile,
+            unused_too: [0; 2],
         };
         let constants = self.constants(gpu, &frame, layout);
         encoder.clear_buffer(picture.table.raw(), 0, Some(u64::from(layout.table_len) * 4));
         let blend = self.kernels.blend(gpu, settings.outputs);
-        let stages = Stages { gpu, rasterizer: self, gaussians, target, picture, constants: &constants };
+        let stages = Stages { gpu, rasterizer: self, gaussians, target, picture, constants: &constants, blended };
         let mut pass = |name, record: &dyn Fn(&mut ComputePass<'_>)| {
             let timestamp_writes = timer.as_mut().and_then(|timer| timer.stage(name));
             record(&mut encoder.begin_compute_pass(&ComputePassDescriptor { label: Some(name), timestamp_writes }));
@@ -185,7 +193,7 @@ impl Rasterizer {
         pass("tile lists", &|pass| stages.tile_lists(pass));
         pass("blend", &|pass| stages.blend(pass, &blend));
         let (gaussians, size, outputs) = (gaussians.count(), frame.size, settings.outputs);
-        self.latest = Some(Latest { constants, gaussians, size, outputs });
+        self.latest = Some(Latest { constants, gaussians, size, blended, outputs });
         Ok(())
     }
 
@@ -230,6 +238,19 @@ impl Rasterizer {
     }
 }
 
+/// First tile, and columns and rows of the tiles that an area of pixels touches.
+fn tile_range(area: Option<[u32; 4]>, tiles: [u32; 2], tile: u32) -> ([u32; 2], [u32; 2]) {
+    let Some([left, top, right, bottom]) = area else { return ([0; 2], tiles) };
+    let range = |first: u32, end: u32, count: u32| {
+        let tiles = if first < end { end.div_ceil(tile).min(count) } else { 0 };
+        let first = (first / tile).min(count);
+        (first, tiles.saturating_sub(first))
+    };
+    let (x, columns) = range(left, right, tiles[0]);
+    let (y, rows) = range(top, bottom, tiles[1]);
+    ([x, y], [columns, rows])
+}
+
 /// Refuses more Gaussians than the invocations of the sort may loop over.
 fn check_count(count: usize, shape: RasterShape) -> Result<(), GpuError> {
     let limit = u64::from(shape.sort.chunks) * MAX_LOOP;
@@ -255,6 +276,7 @@ struct Stages<'a> {
     target: &'a RenderTarget,
     picture: &'a PictureBuffers,
     constants: &'a Constants,
+    blended: [u32; 2],
 }
 
 impl Stages<'_> {
@@ -314,7 +336,7 @@ impl Stages<'_> {
             t.depth.raw().as_entire_binding(),
             t.canonical.raw().as_entire_binding(),
         ];
-        run(self.gpu, pass, kernel, &resources, p.layout().tiles.into());
+        run(self.gpu, pass, kernel, &resources, self.blended.into());
     }
 }
 

@@ -181,6 +181,8 @@ impl BackwardRasterizer {
         writer.push(&[self.pair_sums.len() as u32, 0, 0, 0]);
         let room = writer.finish(gpu);
         encoder.clear_buffer(self.places.raw(), 0, None);
+        // Tiles that are not blended have walked nothing.
+        encoder.clear_buffer(self.tile_limits.raw(), 0, None);
         let mut pass =
             encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("backward"), ..Default::default() });
         let by_gaussian = dispatch_1d(latest.gaussians as u32, 64);
@@ -217,7 +219,7 @@ impl BackwardRasterizer {
                 self.pair_sums.raw().as_entire_binding(),
                 self.tile_limits.raw().as_entire_binding(),
             ],
-            layout.tiles.into(),
+            latest.blended.into(),
         );
         run(
             gpu,

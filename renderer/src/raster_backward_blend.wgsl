@@ -51,8 +51,9 @@ fn any_busy(local: u32, mine: bool) -> bool {
 }
 
 @compute @workgroup_size(TILE, TILE / ROWS)
-fn blend_backward(@builtin(workgroup_id) tile: vec3<u32>, @builtin(local_invocation_id) local: vec3<u32>,
+fn blend_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) local: vec3<u32>,
                   @builtin(local_invocation_index) index: u32) {
+    let tile = group.xy + frame.first_tile;
     let first = vec2(tile.x * TILE + local.x, tile.y * TILE + local.y * ROWS);
     let tile_index = tile.y * frame.tiles.x + tile.x;
     // One component a pixel. A pixel that cannot matter starts opaque.

@@ -15,7 +15,8 @@
 const ROWS = 4u;
 
 @compute @workgroup_size(TILE, TILE / ROWS)
-fn blend(@builtin(workgroup_id) tile: vec3<u32>, @builtin(local_invocation_id) local: vec3<u32>) {
+fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) local: vec3<u32>) {
+    let tile = group.xy + frame.first_tile;
     let first = vec2(tile.x * TILE + local.x, tile.y * TILE + local.y * ROWS);
     if any(first >= frame.size) {
         return;

@@ -13,6 +13,9 @@ struct Frame {
     // Invocations that share the binning, each with its own column of the tile table.
     bin_chunks: u32,
     unused: u32,
+    // First of the tiles that are blended; the others keep their content.
+    first_tile: vec2<u32>,
+    unused_too: vec2<u32>,
 }
 
 struct Splat {

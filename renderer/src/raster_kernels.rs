@@ -84,6 +84,8 @@ pub(crate) struct Frame {
     pub filter_variance_px2: f32,
     pub bin_chunks: u32,
     pub unused: u32,
+    pub first_tile: [u32; 2],
+    pub unused_too: [u32; 2],
 }
 
 pub(crate) fn project_wgsl(shape: RasterShape) -> String {

@@ -50,7 +50,7 @@ impl Rig {
         let inputs: Vec<_> = views
             .iter()
             .zip(&maps)
-            .map(|(view, canonical)| ViewInput { camera: &view.camera, rgba: &view.rgba, canonical })
+            .map(|(view, canonical)| ViewInput { camera: &view.camera, rgba: &view.rgba, canonical, gaussians: None })
             .collect();
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         self.appearance.update(&self.gpu, &mut encoder, &self.buffers, &inputs, settings)?;

@@ -4,6 +4,7 @@ use flyrig_body::skin_mesh;
 use flyrig_types::{Pose, PoseTrack};
 use glam::Vec3;
 
+use crate::cloth::Cloth;
 use crate::look::Look;
 use crate::person::Person;
 use crate::{SimConfig, SimError, motion};
@@ -12,20 +13,25 @@ use crate::{SimConfig, SimError, motion};
 pub(crate) struct Actor {
     pub person: Person,
     pub track: PoseTrack,
+    /// None for a person who wears nothing loose.
+    cloth: Option<Cloth>,
 }
 
 /// The surface that the cameras see, world metres, in the order of [`Person::clothed`].
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct Shape {
     pub positions: Vec<Vec3>,
     pub normals: Vec<Vec3>,
+    /// How far each vertex is from where skinning alone would put it, world metres.
+    pub displacement: Vec<Vec3>,
 }
 
 impl Actor {
     pub(crate) fn new(config: &SimConfig) -> Result<Self, SimError> {
         let person = Person::new(&Look::new(config), config.seed, config.texture_px as usize)?;
         let track = motion::track(config, &person)?;
-        Ok(Self { person, track })
+        let cloth = Cloth::new(&person);
+        Ok(Self { person, track, cloth })
     }
 
     /// Pose at a time; the motion starts over after its end.
@@ -35,7 +41,11 @@ impl Actor {
 
     /// The surface at a time.
     pub(crate) fn shape(&mut self, nanos: i64) -> Shape {
-        let (positions, normals) = skin_mesh(&self.person.clothed, &self.pose(nanos));
-        Shape { positions, normals }
+        let (mut positions, mut normals) = skin_mesh(&self.person.clothed, &self.pose(nanos));
+        let displacement = match &mut self.cloth {
+            Some(cloth) => cloth.apply(&self.track, nanos, &mut positions, &mut normals),
+            None => vec![Vec3::ZERO; positions.len()],
+        };
+        Shape { positions, normals, displacement }
     }
 }

@@ -66,9 +66,8 @@ impl Limbs {
         limbs.sort_by(|p, q| q.radius_m.total_cmp(&p.radius_m));
         limbs.truncate(MOST);
         let parent = |j: usize| skeleton.joints()[j].parent;
-        let related = |limb: &Limb, j: usize| {
-            limb.joint == j || parent(limb.joint) == Some(j) || parent(j) == Some(limb.joint)
-        };
+        let related =
+            |limb: &Limb, j: usize| limb.joint == j || parent(limb.joint) == Some(j) || parent(j) == Some(limb.joint);
         let own = (0..joints)
             .map(|j| (0u32..).zip(&limbs).filter(|(_, limb)| related(limb, j)).map(|(i, _)| 1u64 << i).sum())
             .collect();

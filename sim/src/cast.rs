@@ -71,7 +71,8 @@ impl Cast {
             let middle = &keys[count / 2];
             let openness = limbs.openness(&actor.person, &middle.positions, &middle.normals, &capsules);
             let points = || keys.iter().flat_map(|key| key.positions.iter().copied());
-            let (own_low, own_high) = (points().fold(Vec3::INFINITY, Vec3::min), points().fold(Vec3::NEG_INFINITY, Vec3::max));
+            let (own_low, own_high) =
+                (points().fold(Vec3::INFINITY, Vec3::min), points().fold(Vec3::NEG_INFINITY, Vec3::max));
             let center = ((own_low + own_high) * 0.5).truncate();
             let radius = points().map(|p| p.truncate().distance_squared(center)).fold(0.0, f32::max).sqrt();
             moment.bounds.push(Bound { center: center.to_array(), radius, top: own_high.z });

@@ -70,15 +70,37 @@ pub struct PersonConfig {
     pub build: Build,
 }
 
-/// Kind of motion.
+/// Kind of motion. All but the clips from files are made for the body, need no file, and close without a seam.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum MotionKind {
-    /// Turns around on the spot in small steps, shifts weight and moves the arms; needs no file.
+    /// Stands still.
+    Still,
+    /// Turns around on the spot in small steps, shifts weight and moves the arms.
     #[default]
     Turn,
+    /// Walks a circle around the centre, 0.8 m from it.
+    Walk,
+    /// Waves with the right hand.
+    Wave,
+    /// Squats twice.
+    Squat,
+    /// Reaches up high, then down to the floor.
+    Reach,
+    /// Sits down on a chair and gets up.
+    Sit,
+    /// Jumps on the spot.
+    Jump,
+    /// Crosses the arms and lets go.
+    CrossArms,
+    /// Dances a mixture of moves, another one each seed.
+    Dance,
+    /// The seed chooses one of the kinds above, its speed (0.5 to 1.5 times `motion.speed`) and where it starts.
+    BySeed,
     /// A BVH clip.
     Bvh,
+    /// The first animation of a glTF file.
+    Gltf,
 }
 
 /// How the person moves.
@@ -87,14 +109,21 @@ pub enum MotionKind {
 pub struct MotionConfig {
     /// Kind.
     pub kind: MotionKind,
-    /// Seconds of one full turn.
+    /// How fast: 1 as people usually do it, 0 not at all. Walkers also take longer steps.
+    pub speed: f64,
+    /// Share of the clip, 0 to 1, that is over at the start. Not for clips from files, see `start_secs`.
+    pub phase: f64,
+    /// Seconds of one full turn at speed 1.
     pub turn_secs: f64,
     /// BVH file; without one, walking subject 01_01 of Debian's `assimp-testmodels`.
     pub bvh: Option<PathBuf>,
-    /// Seconds of the BVH clip to skip.
+    /// glTF file (`.glb`, `.gltf`) of a skinned human with an animation. Joints are found by the names of the usual rigs
+    /// (Mixamo, VRM, SMPL, Unreal).
+    pub gltf: Option<PathBuf>,
+    /// Seconds of a clip from a file to skip.
     pub start_secs: f64,
-    /// Farthest that a BVH clip may walk from the ring's centre, metres; the path of one that goes farther is
-    /// scaled down (its feet then slide), so that the cameras keep seeing the person.
+    /// Farthest that a clip from a file may walk from the ring's centre, metres; one that goes farther takes shorter
+    /// steps, so that the cameras keep seeing the person.
     pub reach_m: f64,
 }
 
@@ -150,7 +179,16 @@ impl Default for SimConfig {
 
 impl Default for MotionConfig {
     fn default() -> Self {
-        Self { kind: MotionKind::Turn, turn_secs: 10.0, bvh: None, start_secs: 0.0, reach_m: 0.5 }
+        Self {
+            kind: MotionKind::Turn,
+            speed: 1.0,
+            phase: 0.0,
+            turn_secs: 10.0,
+            bvh: None,
+            gltf: None,
+            start_secs: 0.0,
+            reach_m: 0.5,
+        }
     }
 }
 
@@ -207,6 +245,8 @@ impl SimConfig {
         self.sensors.iter().try_for_each(SensorConfig::validate)?;
         self.faults.validate()?;
         check("motion.turn_secs", motion.turn_secs, 1.0, 600.0, "1 to 600 seconds")?;
+        check("motion.speed", motion.speed, 0.0, 3.0, "0 to 3")?;
+        check("motion.phase", motion.phase, 0.0, 1.0, "0 to 1 of the clip")?;
         check("motion.reach_m", motion.reach_m, 0.0, 100.0, "0 to 100 metres")?;
         check("motion.start_secs", motion.start_secs, 0.0, 3600.0, "0 to 3600 seconds")
     }

@@ -17,6 +17,8 @@ const WAIST_M: f32 = 0.925;
 pub(crate) const BOOT_M: f32 = 0.20;
 /// Where the hanging part of skirts and coats begins.
 pub(crate) const COAT_SEAM_M: f32 = 0.90;
+/// How far hems swing up and show what is below.
+const SWING_M: f32 = 0.24;
 /// Radius of a jacket's neck opening.
 const OUTER_NECK_M: f32 = 0.094;
 
@@ -109,7 +111,7 @@ pub(crate) fn under_hanging(look: &Look, node: &Node) -> f32 {
         return OUTSIDE_M;
     }
     if let Bottom::Skirt { hem_m, .. } = look.bottom {
-        return (waist_m(look) - p.y).min(p.y - hem_m - 0.015);
+        return (waist_m(look) - p.y).min(p.y - hem_m - SWING_M);
     }
     OUTSIDE_M
 }
@@ -120,7 +122,7 @@ pub(crate) fn under_tails(look: &Look, node: &Node) -> f32 {
         Some(outer) if outer.hem_m < 0.7 && !is_arm(node.part) && !is_hand(node.part) => {
             let p = node.average;
             let behind = if outer.open_m > 0.0 { 0.02 - p.z } else { 1.0 };
-            (COAT_SEAM_M - p.y).min(p.y - outer.hem_m - 0.04).min(behind)
+            (COAT_SEAM_M - p.y).min(p.y - outer.hem_m - SWING_M).min(behind)
         }
         _ => OUTSIDE_M,
     }

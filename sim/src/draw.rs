@@ -136,11 +136,7 @@ impl Drawing {
             constants: layout(gpu, "constants", &[Slot::Constants, Slot::Constants]),
             points: layout(gpu, "points", &[Slot::Read, Slot::Read]),
             shade: layout(gpu, "shade", &[Slot::Read, Slot::Write, Slot::DepthMaps, Slot::Compare]),
-            person: layout(
-                gpu,
-                "surface of a person",
-                &[Slot::Textures, Slot::Smooth, Slot::DepthMaps, Slot::Compare],
-            ),
+            person: layout(gpu, "surface of a person", &[Slot::Textures, Slot::Smooth, Slot::DepthMaps, Slot::Compare]),
             room: layout(gpu, "surface of the room", &[Slot::Textures, Slot::Smooth, Slot::DepthMaps, Slot::Compare]),
             plate: layout(gpu, "plate", &[Slot::ManySamples, Slot::Write]),
             picture: layout(
@@ -270,7 +266,7 @@ impl Drawing {
         self.moment = moment;
         // They are on the adapter now; what is left is their number.
         for figured in &mut self.moment.people {
-            figured.keys.iter_mut().for_each(|key| *key = Shape { positions: Vec::new(), normals: Vec::new() });
+            figured.keys.iter_mut().for_each(|key| *key = Shape::default());
             figured.openness = Vec::new();
         }
         Ok(())
@@ -606,7 +602,10 @@ impl Drawing {
         );
         self.gpu.queue.submit([encoder.finish()]);
         let raw: Vec<u8> = read_back(&self.gpu, &copy, bytes)?;
-        Ok(raw.chunks_exact(padded).flat_map(|line| bytemuck::pod_collect_to_vec::<u8, [f32; 4]>(&line[..row])).collect())
+        Ok(raw
+            .chunks_exact(padded)
+            .flat_map(|line| bytemuck::pod_collect_to_vec::<u8, [f32; 4]>(&line[..row]))
+            .collect())
     }
 }
 
@@ -656,9 +655,7 @@ fn steps(takes: &[Take]) -> Vec<Step> {
     let mut steps: Vec<Step> = Vec::new();
     for (take, of) in takes.iter().enumerate() {
         let frames = of.optics.sub_frames();
-        steps.extend(
-            frames.into_iter().map(|frame| Step { secs: frame.secs, take, frame, first: false, last: false }),
-        );
+        steps.extend(frames.into_iter().map(|frame| Step { secs: frame.secs, take, frame, first: false, last: false }));
     }
     steps.sort_by(|a, b| a.secs.total_cmp(&b.secs).then(a.take.cmp(&b.take)));
     for take in 0..takes.len() {

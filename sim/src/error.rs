@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use flyrig_body::BodyError;
+use flyrig_calib::CalibError;
 use flyrig_gpu::GpuError;
 use flyrig_types::{CameraError, ImageError, PoseError};
 
@@ -53,9 +54,23 @@ pub enum SimError {
     /// A picture.
     #[error(transparent)]
     Image(#[from] ImageError),
-    /// A picture's JPEG code.
-    #[error("a simulated picture's JPEG code: {0}")]
-    Jpeg(#[from] image::ImageError),
+    /// A picture's JPEG or PNG code.
+    #[error("coding a simulated picture: {0}")]
+    Code(#[from] image::ImageError),
+    /// A folder or a file of an export.
+    #[error("{} {message}", path.display())]
+    Export {
+        /// Which.
+        path: PathBuf,
+        /// What is wrong with it, and the mend.
+        message: String,
+    },
+    /// An export that was told to stop.
+    #[error("stopped; nothing was written")]
+    Stopped,
+    /// A calibration that cannot be written.
+    #[error(transparent)]
+    Calib(#[from] CalibError),
     /// A fault script.
     #[error("fault script: {0}")]
     Script(#[from] toml::de::Error),

@@ -15,7 +15,8 @@
 //! probability = 0.1
 //! ```
 
-use flyrig_types::CameraId;
+use flyrig_types::{CameraId, Isometry};
+use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::SimError;
@@ -50,6 +51,9 @@ pub enum FaultKind {
     Undecodable,
     /// The exposure is multiplied by `factor`.
     ExposureJump,
+    /// The camera was bumped: it stands `mm` aside and is turned by `deg`, both in a direction drawn by the seed, and
+    /// its calibration does not know.
+    Bump,
 }
 
 /// One thing that goes wrong.
@@ -79,6 +83,31 @@ pub struct Fault {
     /// Factor of an exposure-jump.
     #[serde(default)]
     pub factor: Option<f64>,
+    /// Millimetres of a bump.
+    #[serde(default)]
+    pub mm: Option<f64>,
+    /// Degrees of a bump.
+    #[serde(default)]
+    pub deg: Option<f64>,
+}
+
+impl Fault {
+    /// A fault of a kind that hits every frame of every camera, without numbers.
+    #[must_use]
+    pub fn new(kind: FaultKind) -> Self {
+        Self {
+            kind,
+            camera: None,
+            from_frame: 0,
+            frames: None,
+            probability: always(),
+            ms: None,
+            ppm: None,
+            factor: None,
+            mm: None,
+            deg: None,
+        }
+    }
 }
 
 fn always() -> f64 {
@@ -124,6 +153,8 @@ pub struct FramePlan {
     pub exposure: f64,
     /// Share of the picture's rows above the garbage, where there is some.
     pub sound_share: Option<f64>,
+    /// From the axes of the camera where it was set up to those of the camera where it is now.
+    pub bump: Option<Isometry>,
 }
 
 impl FaultScript {
@@ -138,7 +169,7 @@ impl FaultScript {
     }
 
     pub(crate) fn validate(&self) -> Result<(), SimError> {
-        use FaultKind::{Drift, ExposureJump, Jitter, Lag, Offset, WrongTimestamp};
+        use FaultKind::{Bump, Drift, ExposureJump, Jitter, Lag, Offset, WrongTimestamp};
         for fault in &self.faults {
             let kind = fault.kind;
             check("fault.probability", fault.probability, 0.0, 1.0, "a share from 0 to 1")?;
@@ -157,6 +188,8 @@ impl FaultScript {
             number("fault.ms", fault.ms, timed, low, 1e5, "-100000 to 100000 milliseconds (jitter: from 0)")?;
             number("fault.ppm", fault.ppm, kind == Drift, -1e5, 1e5, "-100000 to 100000 parts in a million")?;
             number("fault.factor", fault.factor, kind == ExposureJump, 0.0, 64.0, "0 to 64")?;
+            number("fault.mm", fault.mm, kind == Bump, 0.0, 1000.0, "0 to 1000 millimetres")?;
+            number("fault.deg", fault.deg, kind == Bump, 0.0, 180.0, "0 to 180 degrees")?;
         }
         Ok(())
     }
@@ -166,6 +199,7 @@ impl FaultScript {
     pub fn plan(&self, camera: &CameraId, index: u64, nanos_of: impl Fn(u64) -> i64) -> FramePlan {
         let mut shown = index;
         let (mut lag, mut stamp, mut exposure, mut sound_share) = (0.0, 0.0, 1.0, None);
+        let mut bump: Option<Isometry> = None;
         let mut delivery = Delivery::Frame;
         let name = camera.as_str().bytes().fold(self.seed, |key, byte| hash(key, byte.into()));
         for (place, fault) in (0u64..).zip(&self.faults) {
@@ -188,6 +222,16 @@ impl FaultScript {
                 FaultKind::Duplicate => shown = index.saturating_sub(1),
                 FaultKind::Corrupt => sound_share = Some(0.9 * uniform(hash(key, 2), index)),
                 FaultKind::ExposureJump => exposure *= fault.factor.unwrap_or(1.0),
+                FaultKind::Bump => {
+                    // The same in every frame: the camera stays where it was pushed to.
+                    let direction =
+                        |stream| DVec3::from([0, 1, 2].map(|axis| f64::from(gaussian(hash(key, stream), axis))));
+                    let turn = direction(4).normalize_or(DVec3::X) * fault.deg.unwrap_or(0.0).to_radians();
+                    let push = direction(5).normalize_or(DVec3::X) * fault.mm.unwrap_or(0.0) * 1e-3;
+                    let before = bump.unwrap_or(Isometry::IDENTITY);
+                    let rotation = DQuat::from_scaled_axis(turn);
+                    bump = Some(Isometry::new(rotation * before.rotation, rotation * before.translation + push));
+                }
                 FaultKind::Drop => delivery = Delivery::Dropped,
                 FaultKind::Stall => delivery = Delivery::Stalled,
                 FaultKind::Disconnect => delivery = Delivery::Disconnected,
@@ -200,6 +244,7 @@ impl FaultScript {
             stamp_nanos: nanos_of(index) + (lag + stamp) as i64,
             exposure,
             sound_share,
+            bump,
         }
     }
 

@@ -49,8 +49,7 @@ impl Figure {
         let paint: Vec<[f32; 4]> = (clothed.uvs.iter().zip(&person.layer_and_openness).zip(&clothed.parts))
             .map(|((uv, &(layer, _)), &of)| [uv.x, uv.y, layer as f32, f32::from(part(of))])
             .collect();
-        let truth: Vec<[f32; 4]> =
-            person.carriers.iter().map(|p| p.extend(0.0).to_array()).collect();
+        let truth: Vec<[f32; 4]> = person.carriers.iter().map(|p| p.extend(0.0).to_array()).collect();
         let points = StorageBuffer::zeroed(gpu, "points of a person", vertex_count)?;
         let shares = StorageBuffer::from_slice(gpu, "shade on a person", &vec![[1.0; 4]; vertex_count])?;
         Ok(Self {
@@ -59,11 +58,7 @@ impl Figure {
             shares,
             paint: buffer("paint of a person", bytemuck::cast_slice(&paint), BufferUsages::VERTEX),
             truth: buffer("truth of a person", bytemuck::cast_slice(&truth), BufferUsages::VERTEX),
-            indices: buffer(
-                "triangles of a person",
-                bytemuck::cast_slice(&clothed.triangles),
-                BufferUsages::INDEX,
-            ),
+            indices: buffer("triangles of a person", bytemuck::cast_slice(&clothed.triangles), BufferUsages::INDEX),
             index_count: clothed.triangles.len() as u32 * 3,
             vertex_count,
             textures: upload_textures(gpu, "clothes and skin of a person", &person.textures),
@@ -84,7 +79,7 @@ impl Figure {
             self.points_bind = bind(gpu, layout, &buffers);
         }
         let mut points = Vec::with_capacity(needed);
-        for Shape { positions, normals } in &figured.keys {
+        for Shape { positions, normals, .. } in &figured.keys {
             for ((p, n), open) in positions.iter().zip(normals).zip(&figured.openness) {
                 points.push([p.x, p.y, p.z, *open, n.x, n.y, n.z, 0.0]);
             }

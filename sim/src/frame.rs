@@ -42,4 +42,7 @@ pub struct SurfaceMesh {
     pub canonical: Vec<Vec3>,
     /// Per vertex: its body part.
     pub parts: Vec<Part>,
+    /// Per vertex: how far loose cloth or hair is from where skinning alone would put it, world metres; zero for
+    /// everything that is not loose.
+    pub displacement: Vec<Vec3>,
 }

@@ -96,7 +96,11 @@ pub(crate) fn desk_things(mesh: &mut SceneMesh, at: Vec3, plan: &Plan, index: u6
     mesh.block(at + Vec3::new(0.0, -0.20, 0.009), Vec3::new(0.21, 0.065, 0.009), dark);
     for row in 0..4 {
         let y = -0.245 + 0.028 * row as f32;
-        mesh.block(at + Vec3::new(0.0, y, 0.020), Vec3::new(0.20, 0.010, 0.004), Coat::new(Surface::Plain, Vec3::splat(0.14)));
+        mesh.block(
+            at + Vec3::new(0.0, y, 0.020),
+            Vec3::new(0.20, 0.010, 0.004),
+            Coat::new(Surface::Plain, Vec3::splat(0.14)),
+        );
     }
     mesh.cushion(at + Vec3::new(0.29, -0.20, 0.014), Vec3::new(0.03, 0.052, 0.016), 0.3, dark);
     let mug = Coat::new(Surface::Plain, colour(plan, index)).glossy(0.25);
@@ -104,7 +108,11 @@ pub(crate) fn desk_things(mesh: &mut SceneMesh, at: Vec3, plan: &Plan, index: u6
     for sheet in 0..4 {
         let z = 0.003 + 0.006 * sheet as f32;
         let half = Vec3::new(0.105, 0.148, 0.003);
-        mesh.block(at + Vec3::new(0.48 + 0.01 * (sheet % 2) as f32, -0.08, z), half, Coat::new(Surface::Plain, Vec3::splat(0.8)));
+        mesh.block(
+            at + Vec3::new(0.48 + 0.01 * (sheet % 2) as f32, -0.08, z),
+            half,
+            Coat::new(Surface::Plain, Vec3::splat(0.8)),
+        );
     }
 }
 
@@ -156,15 +164,29 @@ pub(crate) fn shelf(mesh: &mut SceneMesh, plan: &Plan, index: u64, half_m: f32, 
                 }
                 kind if kind < 0.20 && x + 0.14 < half_m => {
                     let coat = Coat::new(Surface::Plain, colour(plan, at + 9)).glossy(0.2);
-                    mesh.rod(Vec3::new(x + 0.07, -0.02, z + 0.011), Vec3::new(x + 0.07, -0.02, z + 0.16), [0.035, 0.055], coat);
-                    mesh.rod(Vec3::new(x + 0.07, -0.02, z + 0.16), Vec3::new(x + 0.07, -0.02, z + 0.21), [0.055, 0.025], coat);
+                    mesh.rod(
+                        Vec3::new(x + 0.07, -0.02, z + 0.011),
+                        Vec3::new(x + 0.07, -0.02, z + 0.16),
+                        [0.035, 0.055],
+                        coat,
+                    );
+                    mesh.rod(
+                        Vec3::new(x + 0.07, -0.02, z + 0.16),
+                        Vec3::new(x + 0.07, -0.02, z + 0.21),
+                        [0.055, 0.025],
+                        coat,
+                    );
                     x += 0.15;
                 }
                 _ => {
                     let coat = Coat::new(Surface::Plain, colour(plan, at + 11)).glossy(0.08);
                     let deep = plan.draw(at + 12, 0.075, 0.11);
                     let half = Vec3::new(thick / 2.0, deep, tall / 2.0);
-                    mesh.block(Vec3::new(x + thick / 2.0, 0.03 - deep / 2.0 + 0.04, z + 0.011 + tall / 2.0), half, coat);
+                    mesh.block(
+                        Vec3::new(x + thick / 2.0, 0.03 - deep / 2.0 + 0.04, z + 0.011 + tall / 2.0),
+                        half,
+                        coat,
+                    );
                     let band = Vec3::new(thick / 2.0 + 0.0006, 0.002, 0.012);
                     let front = 0.03 - deep / 2.0 + 0.04 - deep;
                     let cream = Coat::new(Surface::Plain, Vec3::new(0.6, 0.52, 0.36));
@@ -200,7 +222,8 @@ pub(crate) fn plant(mesh: &mut SceneMesh, plan: &Plan, index: u64, height_m: f32
         let lean = plan.draw(index + 20 + shoot, 0.10, 0.34);
         let (sin, cos) = turn.sin_cos();
         let foot = Vec3::new(cos * 0.05, sin * 0.05, 0.29);
-        let tip = foot + Vec3::new(cos * lean, sin * lean, (height_m - 0.45) * plan.draw(index + 30 + shoot, 0.55, 1.0));
+        let tip =
+            foot + Vec3::new(cos * lean, sin * lean, (height_m - 0.45) * plan.draw(index + 30 + shoot, 0.55, 1.0));
         mesh.rod(foot, tip, [0.010, 0.005], stem);
         for blade in 0..5u64 {
             let t = 0.45 + 0.55 * blade as f32 / 4.0;
@@ -309,7 +332,12 @@ pub(crate) fn poster(mesh: &mut SceneMesh, middle: Vec3, half: [f32; 2], picture
 pub(crate) fn rug(mesh: &mut SceneMesh, half: [f32; 2]) {
     let [x, y] = half;
     let low = Coat::new(Surface::Carpet, Vec3::new(0.35, 0.28, 0.2));
-    mesh.quad(Vec3::new(-x, -y, 0.006), Vec3::X * 2.0 * x, Vec3::Y * 2.0 * y, Coat::new(Surface::Rug, Vec3::splat(0.85)));
+    mesh.quad(
+        Vec3::new(-x, -y, 0.006),
+        Vec3::X * 2.0 * x,
+        Vec3::Y * 2.0 * y,
+        Coat::new(Surface::Rug, Vec3::splat(0.85)),
+    );
     for side in [-1.0, 1.0] {
         mesh.quad(Vec3::new(side * x, -side * y, 0.0), Vec3::Y * side * 2.0 * y, Vec3::Z * 0.006, low);
         mesh.quad(Vec3::new(-side * x, -side * y, 0.0), Vec3::X * side * 2.0 * x, Vec3::Z * 0.006, low);
@@ -341,7 +369,12 @@ pub(crate) fn stool(mesh: &mut SceneMesh, tint: Vec3) {
     mesh.rod(Vec3::Z * 0.62, Vec3::Z * 0.65, [0.17, 0.17], wood(tint));
     for leg in 0..4 {
         let (sin, cos) = (TAU * (leg as f32 + 0.5) / 4.0).sin_cos();
-        mesh.rod(Vec3::new(cos * 0.21, sin * 0.21, 0.0), Vec3::new(cos * 0.12, sin * 0.12, 0.62), [0.014, 0.018], wood(tint));
+        mesh.rod(
+            Vec3::new(cos * 0.21, sin * 0.21, 0.0),
+            Vec3::new(cos * 0.12, sin * 0.12, 0.62),
+            [0.014, 0.018],
+            wood(tint),
+        );
     }
     for side in 0..4 {
         let at = |i: i32| {

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use crate::collars::{hood, lapels, shirt_collar};
 use crate::cuts::{inside_boot, inside_bottom, inside_outer, inside_top, is_arm, under_hanging, under_tails};
 use crate::look::Look;
+use crate::loose::{free_bottom, free_outer, free_top, hang_free};
 use crate::noise::{Noise, lerp, smoothstep};
 use crate::regions::{ANKLE_TOP_M, along_arm, below_neckline, is_ear};
 use crate::sheet::{Node, Sheet};
@@ -108,6 +109,7 @@ impl Tailor {
         let top = &look.top;
         let sheet = self.draped(|i, node| self.over(i, self.top_offset(top, look.female, node)));
         let mut cloth = self.cut(&sheet, |node| inside_top(top, node));
+        hang_free(&mut cloth, |node| free_top(look, node));
         match top.kind {
             TopKind::Shirt => shirt_collar(&mut cloth),
             TopKind::Hoodie => hood(&mut cloth),
@@ -144,6 +146,7 @@ impl Tailor {
             self.over(i, offset)
         });
         let mut cloth = self.cut(&sheet, |node| inside_outer(outer, node));
+        hang_free(&mut cloth, |node| free_outer(outer, node));
         lapels(&mut cloth, outer);
         cloth.add_lip();
         cloth
@@ -176,7 +179,8 @@ impl Tailor {
             }
             self.over(i, offset.max(0.005))
         });
-        let cloth = self.cut(&sheet, |node| inside_bottom(look, node));
+        let mut cloth = self.cut(&sheet, |node| inside_bottom(look, node));
+        hang_free(&mut cloth, |node| free_bottom(look, node));
         let mut seen = cloth.filtered(|corners| {
             !corners.iter().all(|node| {
                 !look.top.tucked && inside_top(&look.top, node) > HIDDEN_M + 0.01

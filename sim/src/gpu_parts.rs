@@ -3,9 +3,9 @@
 use flyrig_gpu::GpuContext;
 use wgpu::{
     BindGroup, BindGroupLayout, BindGroupLayoutEntry, BindingResource, BindingType, BufferBindingType, CompareFunction,
-    ComputePipeline, RenderPipeline, SamplerBindingType, ShaderModule, ShaderStages, Texture,
-    TextureDescriptor, TextureDimension, TextureFormat, TextureSampleType, TextureUsages, TextureView,
-    TextureViewDimension, VertexAttribute, VertexBufferLayout, VertexFormat, VertexStepMode,
+    ComputePipeline, RenderPipeline, SamplerBindingType, ShaderModule, ShaderStages, Texture, TextureDescriptor,
+    TextureDimension, TextureFormat, TextureSampleType, TextureUsages, TextureView, TextureViewDimension,
+    VertexAttribute, VertexBufferLayout, VertexFormat, VertexStepMode,
 };
 
 use crate::texture::{Texture as Picture, linear_from_srgb};
@@ -37,11 +37,8 @@ pub(crate) enum Slot {
 }
 
 pub(crate) fn layout(gpu: &GpuContext, label: &str, slots: &[Slot]) -> BindGroupLayout {
-    let texture = |sample_type, view_dimension, multisampled| BindingType::Texture {
-        sample_type,
-        view_dimension,
-        multisampled,
-    };
+    let texture =
+        |sample_type, view_dimension, multisampled| BindingType::Texture { sample_type, view_dimension, multisampled };
     let buffer = |read_only, has_dynamic_offset| BindingType::Buffer {
         ty: BufferBindingType::Storage { read_only },
         has_dynamic_offset,
@@ -128,8 +125,7 @@ pub(crate) fn target(
 
 /// All of one side, with their mip levels.
 pub(crate) fn upload_textures(gpu: &GpuContext, label: &str, pictures: &[Picture]) -> TextureView {
-    let roots: Vec<u8> =
-        (0..=255).map(|v| (linear_from_srgb(v as f32 / 255.0).sqrt() * 255.0).round() as u8).collect();
+    let roots: Vec<u8> = (0..=255).map(|v| (linear_from_srgb(v as f32 / 255.0).sqrt() * 255.0).round() as u8).collect();
     let side = pictures.first().map_or(1, |picture| picture.side) as u32;
     let array = gpu.device.create_texture(&TextureDescriptor {
         label: Some(label),
@@ -146,7 +142,8 @@ pub(crate) fn upload_textures(gpu: &GpuContext, label: &str, pictures: &[Picture
         for mip in 0..array.mip_level_count() {
             let side = (side >> mip).max(1);
             let root = |byte: u8| roots[usize::from(byte)];
-            let texels: Vec<[u8; 4]> = picture.pixels.iter().map(|&[r, g, b, a]| [root(r), root(g), root(b), a]).collect();
+            let texels: Vec<[u8; 4]> =
+                picture.pixels.iter().map(|&[r, g, b, a]| [root(r), root(g), root(b), a]).collect();
             gpu.queue.write_texture(
                 wgpu::TexelCopyTextureInfo {
                     texture: &array,

@@ -76,6 +76,7 @@ impl Tailor {
         };
         let middle =
             hair.nodes.iter().map(|node| node.position - node.average).sum::<Vec3>() / hair.nodes.len().max(1) as f32;
+        let first = hair.nodes.len();
         hair.extrude(
             rows,
             |node| hangs(node) > 0.0,
@@ -95,6 +96,13 @@ impl Tailor {
                 node.position + flare - Vec3::Z * long - Vec3::Y * fallen
             },
         );
+        // Every column hangs from its first node.
+        for column in hair.nodes[first..].chunks_mut(rows as usize + 1) {
+            let root = column.first().map_or(Vec3::ZERO, |node| node.position);
+            for node in column {
+                node.free_m = 0.8 * node.position.distance(root);
+            }
+        }
     }
 
     /// Hair on the face.
@@ -182,7 +190,9 @@ fn add_tail(hair: &mut Sheet, lift: &HeadLift<'_>, noise: Noise) {
         let up = side.cross(along).normalize_or(Vec3::Z);
         let average = path(t) + (side * angle.cos() - up * angle.sin()) * thick * strand;
         let uv = patch + Vec2::new(angle.cos(), t * 3.0) * 0.010;
-        Node { position: average + moved, average, uv, ..carrier }
+        // Bound at the top.
+        let free_m = 0.27 * (t - 0.12).max(0.0);
+        Node { position: average + moved, average, uv, free_m, ..carrier }
     });
 }
 

@@ -68,7 +68,10 @@ impl Tailor {
                 let sag = 0.006 * wander * t;
                 let position = Vec3::new(direction.x * out, y + sag, centre_z + direction.y * out);
                 if let Some(node) = carried(&band, &carriers, position) {
-                    sheet.nodes.push(Node { position, uv: Vec2::new(0.01 + 0.98 * share, 0.01 + 0.98 * t), ..node });
+                    let uv = Vec2::new(0.01 + 0.98 * share, 0.01 + 0.98 * t);
+                    // Narrow skirts are held by the hips that they lie on.
+                    let free_m = (first_y - y).max(0.0) * (0.35 + 0.65 * smoothstep(0.03, 0.12, cloth.flare));
+                    sheet.nodes.push(Node { position, uv, free_m, ..node });
                 }
             }
             before = Some((first_y, y));

@@ -1,14 +1,17 @@
 //! The pose track of a simulation.
 
+use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 
-use flyrig_body::{Template, load_bvh, skin_mesh};
-use flyrig_types::PoseTrack;
-use glam::DVec2;
+use flyrig_body::{MotionClip, RetargetOptions, Skeleton, load_bvh, load_gltf};
+use flyrig_types::{Pose, PoseTrack};
+use rand::{RngExt, SeedableRng, rngs::StdRng};
 
+use crate::clips::{clip, passing};
 use crate::person::Person;
-use crate::turn::turn_track;
-use crate::{MotionKind, SimConfig, SimError};
+use crate::puppet::Puppet;
+use crate::shoes::SOLE_M;
+use crate::{MotionConfig, MotionKind, SimConfig, SimError};
 
 const DEBIAN_CLIP: &str = "/usr/share/assimp/models/BVH/01_01.bvh";
 
@@ -27,7 +30,7 @@ fn existing(path: &Path) -> Result<PathBuf, SimError> {
     let mend = if path == Path::new(DEBIAN_CLIP) {
         "install it with `apt-get install assimp-testmodels`, name a file of yours in motion.bvh, or set motion.kind = \"turn\""
     } else {
-        "check motion.bvh, or set motion.kind = \"turn\" for a motion that needs no file"
+        "check motion.bvh or motion.gltf, or set motion.kind = \"turn\" for a motion that needs no file"
     };
     Err(SimError::NoClip { path: path.to_owned(), mend })
 }
@@ -35,40 +38,66 @@ fn existing(path: &Path) -> Result<PathBuf, SimError> {
 /// The configured motion of a person, standing on the floor, around the world's origin.
 pub(crate) fn track(config: &SimConfig, person: &Person) -> Result<PoseTrack, SimError> {
     let skeleton = &person.body.skeleton;
-    match config.motion.kind {
-        MotionKind::Turn => turn_track(skeleton, config.motion.turn_secs),
+    let motion = match config.motion.kind {
+        MotionKind::BySeed => by_seed(config),
+        _ => config.motion.clone(),
+    };
+    match motion.kind {
         MotionKind::Bvh => {
-            let path = config.motion.bvh.as_deref().map_or_else(find_debian_clip, existing)?;
-            let whole = load_bvh(&path)?.retarget(skeleton)?;
-            let start_nanos = (config.motion.start_secs * 1e9) as i64;
-            grounded(&whole, &person.clothed, start_nanos, config.motion.reach_m)
+            let path = motion.bvh.as_deref().map_or_else(find_debian_clip, existing)?;
+            recorded(&load_bvh(&path)?.motion(), skeleton, &motion)
+        }
+        MotionKind::Gltf => {
+            let path = existing(motion.gltf.as_deref().unwrap_or(Path::new("motion.gltf")))?;
+            recorded(&load_gltf(&path)?.motion()?, skeleton, &motion)
+        }
+        kind => {
+            let puppet = Puppet::new(skeleton, &person.clothed)?;
+            let clip = clip(kind, &puppet, config.seed, motion.turn_secs, motion.speed);
+            if motion.speed > 0.0 && kind != MotionKind::Still {
+                clip.track(&puppet, motion.phase)
+            } else {
+                clip.held(&puppet, motion.phase)
+            }
         }
     }
 }
 
-/// The track from `start_nanos` on, around the origin and no farther than `reach_m` from it, its deepest sole
-/// on the floor.
-fn grounded(track: &PoseTrack, clothed: &Template, start_nanos: i64, reach_m: f64) -> Result<PoseTrack, SimError> {
-    const PROBES: usize = 24;
-    let (first, last) = track.span_nanos();
-    let start = (first + start_nanos).min(last);
-    let mut keys: Vec<_> = vec![(0, track.at(start))];
-    keys.extend(
-        track.keys().iter().filter(|(nanos, _)| *nanos > start).map(|(nanos, pose)| (nanos - start, pose.clone())),
-    );
-    let path = || keys.iter().map(|(_, pose)| pose.root_translation.truncate());
-    let low = path().fold(DVec2::INFINITY, DVec2::min);
-    let high = path().fold(DVec2::NEG_INFINITY, DVec2::max);
-    let middle = (low + high) * 0.5;
-    let farthest = path().map(|at| at.distance(middle)).fold(0.0, f64::max);
-    let scale = if farthest > reach_m { reach_m / farthest } else { 1.0 };
-    let stride = keys.len().div_ceil(PROBES);
-    let lowest = |pose| skin_mesh(clothed, pose).0.iter().map(|p| p.z).fold(f32::INFINITY, f32::min);
-    let floor = keys.iter().step_by(stride).map(|(_, pose)| lowest(pose)).fold(f32::INFINITY, f32::min);
-    for (_, pose) in &mut keys {
-        let at = pose.root_translation;
-        pose.root_translation = ((at.truncate() - middle) * scale).extend(at.z - f64::from(floor));
-    }
+/// The seed's choice of clip, speed and phase.
+fn by_seed(config: &SimConfig) -> MotionConfig {
+    use MotionKind::{CrossArms, Dance, Jump, Reach, Sit, Squat, Still, Turn, Walk, Wave};
+    const KINDS: [MotionKind; 13] =
+        [Turn, Turn, Walk, Walk, Walk, Dance, Dance, Wave, Squat, Reach, Sit, Jump, CrossArms];
+    let mut dice = StdRng::seed_from_u64(config.seed ^ 0x6d6f_7469_6f6e);
+    let kind = if dice.random_range(0..30) == 0 { Still } else { KINDS[dice.random_range(0..KINDS.len())] };
+    let speed = config.motion.speed * dice.random_range(0.5..1.5);
+    MotionConfig { kind, speed, phase: dice.random_range(0.0..1.0), ..config.motion.clone() }
+}
+
+/// Somebody who walks straight through the room, back on another line 0.8 m farther from the centre, and so on. The
+/// seed chooses the direction, the pace, and whether the line runs 0.7 m or up to 1.2 m beside the centre.
+/// `reach_m` is how far from the centre they turn round.
+///
+/// # Errors
+/// [`SimError::NoJoint`], [`SimError::Pose`].
+pub(crate) fn pass_by(person: &Person, seed: u64, reach_m: f64) -> Result<PoseTrack, SimError> {
+    let mut dice = StdRng::seed_from_u64(seed ^ 0x7061_7373);
+    let puppet = Puppet::new(&person.body.skeleton, &person.clothed)?;
+    let (near_m, yaw) = (dice.random_range(0.7..1.2), dice.random_range(0.0..TAU));
+    let clip = passing(&puppet, near_m, yaw, reach_m, dice.random_range(0.85..1.5), dice.random_range(0.7..1.2));
+    clip.track(&puppet, dice.random_range(0.0..1.0))
+}
+
+/// A recorded motion on a person, around the origin, the shoes' soles on the floor.
+fn recorded(clip: &MotionClip, skeleton: &Skeleton, motion: &MotionConfig) -> Result<PoseTrack, SimError> {
+    let (start_secs, reach_m, sole_m) = (motion.start_secs, Some(motion.reach_m), f64::from(SOLE_M));
+    let options = RetargetOptions { start_secs, reach_m, sole_m };
+    let track = clip.retarget(skeleton, &options)?;
+    // Recorded at one speed, played at another; at none the first pose is held.
+    let paced = |(nanos, pose): &(i64, Pose)| ((*nanos as f64 / motion.speed.max(1e-3)) as i64, pose.clone());
+    let count = if motion.speed > 0.0 { track.keys().len() } else { 1 };
+    let mut keys: Vec<(i64, Pose)> = track.keys().iter().take(count).map(paced).collect();
+    keys.dedup_by_key(|key| key.0);
     Ok(PoseTrack::new(keys)?)
 }
 

@@ -11,6 +11,7 @@ use crate::garments::{Tailor, visible_skin};
 use crate::hanging::Hanging;
 use crate::hats::{hat, hat_cloth};
 use crate::look::Look;
+use crate::loose::stiffness;
 use crate::noise::{Noise, smoothstep};
 use crate::prints::{
     bottom_colour, hair_colour, hanging_colour, hat_colour, outer_colour, sole_colour, top_colour, upper_colour,
@@ -32,14 +33,45 @@ pub(crate) struct Person {
     pub layer_and_openness: Vec<(u32, f32)>,
     /// sRGB, all of one size.
     pub textures: Vec<Texture>,
+    /// Per vertex: how long it hangs free, metres (see [`crate::loose`]).
+    pub free_m: Vec<f32>,
+    /// The sheets that the surface is made of.
+    pub sheets: Vec<SheetRange>,
     /// Vertices of the shoes.
     pub shoe_vertices: std::ops::Range<usize>,
+}
+
+/// A connected garment among a person's surfaces.
+pub(crate) struct SheetRange {
+    pub vertices: std::ops::Range<usize>,
+    pub triangles: std::ops::Range<usize>,
+    /// See [`stiffness`].
+    pub stiff: f32,
+    /// Hangs around the body and is not laid on it.
+    pub hangs: bool,
 }
 
 /// Surfaces that share a texture.
 struct Layer {
     sheets: Vec<Sheet>,
     texture: Texture,
+    stiff: f32,
+    hangs: bool,
+}
+
+impl Layer {
+    /// What lies on the body and does not move of its own.
+    fn held(sheets: Vec<Sheet>, texture: Texture) -> Self {
+        Self { sheets, texture, stiff: 1.0, hangs: false }
+    }
+
+    fn worn(sheets: Vec<Sheet>, texture: Texture, fabric: Fabric) -> Self {
+        Self { sheets, texture: texture.glossy(gloss(fabric)), stiff: stiffness(fabric), hangs: false }
+    }
+
+    fn hanging(sheets: Vec<Sheet>, texture: Texture, stiff: f32) -> Self {
+        Self { sheets, texture, stiff, hangs: true }
+    }
 }
 
 impl Person {
@@ -65,11 +97,11 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
     let depth = |v: [u32; 3], w: Vec3, inside: &dyn Fn(&Node) -> f32| Vec3::from(corners(v).map(inside)).dot(w);
 
     let skin = map.paint(naked, |v, w| skin_colour(look, noise(20), point(v, w)));
-    let mut layers = vec![Layer { sheets: vec![visible_skin(naked, look)], texture: skin.glossy(0.10) }];
+    let mut layers = vec![Layer::held(vec![visible_skin(naked, look)], skin.glossy(0.10))];
     let top = map.paint(naked, |v, w| {
         top_colour(&look.top, noise(21), point(v, w), depth(v, w, &|node| inside_top(&look.top, node)))
     });
-    layers.push(Layer { sheets: vec![tailor.top(look)], texture: top.glossy(gloss(look.top.cloth.fabric)) });
+    layers.push(Layer::worn(vec![tailor.top(look)], top, look.top.cloth.fabric));
     match look.bottom {
         Bottom::Trousers { cloth, .. } | Bottom::Overalls { cloth, .. } => {
             let texture = map.paint(naked, |v, w| {
@@ -77,10 +109,7 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
                 let dark = 1.0 - 0.3 * smoothstep(0.004, 0.0, inside);
                 bottom_colour(look, noise(22), point(v, w), inside).map(|c| c * dark)
             });
-            layers.push(Layer {
-                sheets: tailor.bottom(look).into_iter().collect(),
-                texture: texture.glossy(gloss(cloth.fabric)),
-            });
+            layers.push(Layer::worn(tailor.bottom(look).into_iter().collect(), texture, cloth.fabric));
         }
         Bottom::Skirt { cloth, hem_m, flare, pleats } => {
             let top_m = waist_m(look);
@@ -95,7 +124,8 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
                 open_rad: 0.0,
             };
             let texture = Texture::from_fn(side, |uv| hanging_colour(&cloth, noise(22), uv, top_m - hem_m, true));
-            layers.push(Layer { sheets: vec![tailor.hang(&hanging)], texture: texture.glossy(gloss(cloth.fabric)) });
+            let (texture, stiff) = (texture.glossy(gloss(cloth.fabric)), stiffness(cloth.fabric));
+            layers.push(Layer::hanging(vec![tailor.hang(&hanging)], texture, stiff));
         }
     }
     if let Some(outer) = &look.outer {
@@ -103,7 +133,7 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
         let texture = map.paint(naked, |v, w| {
             outer_colour(outer, noise(26), point(v, w), depth(v, w, &|node| inside_outer(outer, node)))
         });
-        layers.push(Layer { sheets: vec![tailor.outer(look, outer)], texture: texture.glossy(shine) });
+        layers.push(Layer::worn(vec![tailor.outer(look, outer)], texture, outer.cloth.fabric));
         if outer.hem_m < 0.7 {
             let tails = Hanging {
                 top_m: COAT_SEAM_M,
@@ -117,20 +147,18 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
             let texture = Texture::from_fn(side, |uv| {
                 hanging_colour(&outer.cloth, noise(26), uv, tails.top_m - tails.hem_m, false)
             });
-            layers.push(Layer { sheets: vec![tailor.hang(&tails)], texture: texture.glossy(shine) });
+            let stiff = stiffness(outer.cloth.fabric);
+            layers.push(Layer::hanging(vec![tailor.hang(&tails)], texture.glossy(shine), stiff));
         }
     }
     let hairs: Vec<Sheet> = [tailor.hair(look, naked), tailor.beard(look)].into_iter().flatten().collect();
     if !hairs.is_empty() {
         let texture = map.paint(naked, |v, w| hair_colour(look, noise(23), point(v, w)));
-        layers.push(Layer { sheets: hairs, texture: texture.glossy(0.12) });
+        layers.push(Layer::hanging(hairs, texture.glossy(0.12), 1.6));
     }
     if let Some(cloth) = hat_cloth(&look.hat) {
         let texture = Texture::from_fn(side, |uv| hat_colour(cloth, noise(27), uv));
-        layers.push(Layer {
-            sheets: vec![hat(&look.hat, naked, noise(28))],
-            texture: texture.glossy(gloss(cloth.fabric)),
-        });
+        layers.push(Layer::worn(vec![hat(&look.hat, naked, noise(28))], texture, cloth.fabric));
     }
     let leather = if look.shoes.kind == ShoeKind::Trainers { 0.08 } else { gloss(Fabric::Leather) };
     let extras = Texture::from_fn(side, |uv: Vec2| match (uv.x < 0.5, uv.y < 0.5) {
@@ -144,7 +172,7 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
         node.uv = Vec2::new(0.30 + 0.02 * node.uv.x, 0.25 + 0.05 * node.uv.y);
     }
     shafts.extend([eyes(naked), shoes(naked)]);
-    layers.push(Layer { sheets: shafts, texture: extras.glossy(leather) });
+    layers.push(Layer::held(shafts, extras.glossy(leather)));
     layers
 }
 
@@ -160,8 +188,9 @@ fn assemble(body: Template, layers: Vec<Layer>) -> Person {
         skeleton: body.skeleton.clone(),
     };
     let (mut carriers, mut layer_and_openness, mut textures) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut free_m, mut ranges) = (Vec::new(), Vec::new());
     let mut shoe_vertices = 0..0;
-    for (index, Layer { sheets, texture }) in (0u32..).zip(layers) {
+    for (index, Layer { sheets, texture, stiff, hangs }) in (0u32..).zip(layers) {
         textures.push(texture);
         for sheet in &sheets {
             let first = clothed.positions.len();
@@ -176,12 +205,16 @@ fn assemble(body: Template, layers: Vec<Layer>) -> Person {
                 clothed.skin.push(node.skin);
                 clothed.parts.push(node.part);
                 carriers.push(node.body);
+                free_m.push(node.free_m);
             }
             clothed.positions.extend(positions);
             clothed.normals.extend(normals);
+            let first_triangle = clothed.triangles.len();
             clothed.triangles.extend(sheet.triangles.iter().map(|t| t.map(|v| v + first as u32)));
+            let (vertices, triangles) = (first..clothed.positions.len(), first_triangle..clothed.triangles.len());
+            ranges.push(SheetRange { vertices, triangles, stiff, hangs });
             shoe_vertices = first..clothed.positions.len();
         }
     }
-    Person { body, clothed, carriers, layer_and_openness, textures, shoe_vertices }
+    Person { body, clothed, carriers, layer_and_openness, textures, free_m, sheets: ranges, shoe_vertices }
 }

@@ -112,13 +112,7 @@ impl Plates {
         self.centre_depths.push((camera.clone(), depth.clone()));
     }
 
-    fn fresh(
-        &mut self,
-        gpu: &GpuContext,
-        camera: &Camera,
-        focus_m: f64,
-        lens_point: Vec2,
-    ) -> Result<Plate, GpuError> {
+    fn fresh(&mut self, gpu: &GpuContext, camera: &Camera, focus_m: f64, lens_point: Vec2) -> Result<Plate, GpuError> {
         let [width, height] = self.size;
         let pixels = width as usize * height as usize;
         let layers = StorageBuffer::<u32>::zeroed(gpu, "layers of the room's light", pixels * self.layers)?;

@@ -63,7 +63,8 @@ pub(crate) fn studio(plan: &Plan, mesh: &mut SceneMesh, lights: &[LightConfig]) 
     };
     let warm = plan.draw(2, 0.0, 1.0);
     let key = [1.0, 0.97 - 0.05 * warm, 0.92 - 0.14 * warm];
-    let rim = plan.pick(3, &[[0.72, 0.86, 1.0], [1.0, 0.95, 0.88], [0.80, 0.90, 1.0], [1.0, 0.80, 0.62]]).unwrap_or([1.0; 3]);
+    let rim =
+        plan.pick(3, &[[0.72, 0.86, 1.0], [1.0, 0.95, 0.88], [0.80, 0.90, 1.0], [1.0, 0.80, 0.62]]).unwrap_or([1.0; 3]);
     let own = [
         lamp_at(around(-90.0 + side * plan.draw(4, 28.0, 50.0), 2.85), STAGE, plan.draw(5, 0.74, 0.84), key, 0.45),
         lamp_at(around(-90.0 - side * plan.draw(6, 100.0, 135.0), 2.6), STAGE, plan.draw(7, 0.40, 0.60), rim, 0.35),
@@ -151,8 +152,20 @@ pub(crate) fn office(plan: &Plan, mesh: &mut SceneMesh, lights: &[LightConfig]) 
     let panel = |x: f32, y: f32| Vec3::new(x, y, HEIGHT_M - 0.03);
     let own = [
         lamp_at(towards * (h - 0.05) + Vec3::Z * 1.95, STAGE, plan.draw(2, 0.45, 0.75), [0.84, 0.92, 1.0], 0.9),
-        lamp_at(panel(-towards.x * 1.3, -1.4), Vec3::new(-0.3 * towards.x, -0.3, 0.9), plan.draw(3, 0.42, 0.55), white, 0.6),
-        lamp_at(panel(-towards.x * 0.8, 1.6), Vec3::new(-0.2 * towards.x, 0.3, 0.9), plan.draw(3, 0.36, 0.50), white, 0.6),
+        lamp_at(
+            panel(-towards.x * 1.3, -1.4),
+            Vec3::new(-0.3 * towards.x, -0.3, 0.9),
+            plan.draw(3, 0.42, 0.55),
+            white,
+            0.6,
+        ),
+        lamp_at(
+            panel(-towards.x * 0.8, 1.6),
+            Vec3::new(-0.2 * towards.x, 0.3, 0.9),
+            plan.draw(3, 0.36, 0.50),
+            white,
+            0.6,
+        ),
     ];
     let lamps = lamps(lights, &own);
     let always = lamps.len() + 1;
@@ -161,7 +174,8 @@ pub(crate) fn office(plan: &Plan, mesh: &mut SceneMesh, lights: &[LightConfig]) 
         .pick(4, &[[0.19, 0.22, 0.27], [0.30, 0.28, 0.25], [0.17, 0.24, 0.23], [0.33, 0.30, 0.32]])
         .map_or(Vec3::splat(0.3), Vec3::from);
     let paint = |index| {
-        let tones = [[0.66, 0.65, 0.61], [0.56, 0.62, 0.64], [0.66, 0.60, 0.52], [0.50, 0.58, 0.50], [0.62, 0.55, 0.53]];
+        let tones =
+            [[0.66, 0.65, 0.61], [0.56, 0.62, 0.64], [0.66, 0.60, 0.52], [0.50, 0.58, 0.50], [0.62, 0.55, 0.53]];
         Coat::new(Surface::Plaster, plan.pick(index, &tones).map_or(Vec3::splat(0.6), Vec3::from))
     };
     let (plain, accent) = (paint(5), paint(6));
@@ -274,13 +288,20 @@ pub(crate) fn cluttered(plan: &Plan, mesh: &mut SceneMesh, lights: &[LightConfig
         against(mesh, plan, wall, aside, 0.45);
         furniture::plant(mesh, plan, 600 + 90 * wall as u64, plan.draw(610 + wall as u64, 1.1, 1.9));
     }
-    for (wall, aside, z, index) in [(0, 0.35, 1.9, 0), (0, -0.6, 1.75, 1), (2, -0.6, 1.95, 2), (3, -2.3, 1.8, 3), (3, 1.8, 1.9, 0)] {
+    for (wall, aside, z, index) in
+        [(0, 0.35, 1.9, 0), (0, -0.6, 1.75, 1), (2, -0.6, 1.95, 2), (3, -2.3, 1.8, 3), (3, 1.8, 1.9, 0)]
+    {
         against(mesh, plan, wall, aside, 0.04);
         let half = if index % 2 == 0 { [0.30, 0.40] } else { [0.40, 0.30] };
         furniture::poster(mesh, Vec3::Z * z, half, POSTERS[(index + (plan.draw(13, 0.0, 3.99)) as usize) % 4]);
     }
     obstacles(plan, mesh);
-    RoomLight { lamps, steady: Vec3::splat(0.015), sky: Vec3::new(1.0, 0.98, 0.94), ground: Vec3::new(0.50, 0.43, 0.36) }
+    RoomLight {
+        lamps,
+        steady: Vec3::splat(0.015),
+        sky: Vec3::new(1.0, 0.98, 0.94),
+        ground: Vec3::new(0.50, 0.43, 0.36),
+    }
 }
 
 /// What stands between cameras and the person.
@@ -297,7 +318,12 @@ fn obstacles(plan: &Plan, mesh: &mut SceneMesh) {
         let tint = Vec3::splat(plan.draw(index + 2, 0.4, 0.9));
         match (piece + plan.draw(index + 3, 0.0, 1.99) as u32) % 5 {
             0 => {
-                furniture::table(mesh, [0.48, 0.28], Coat::new(Surface::Wood, tint).glossy(0.1), Coat::new(Surface::Plain, tint * 0.4));
+                furniture::table(
+                    mesh,
+                    [0.48, 0.28],
+                    Coat::new(Surface::Wood, tint).glossy(0.1),
+                    Coat::new(Surface::Plain, tint * 0.4),
+                );
                 furniture::desk_things(mesh, Vec3::new(0.0, 0.1, TABLE_M), plan, index + 4);
             }
             1 => furniture::chair(mesh, tint),

@@ -74,7 +74,15 @@ impl SceneMesh {
     /// `cell_m`: longest side of a cell.
     pub(crate) fn new(cell_m: f32) -> Self {
         let at = Affine3A::IDENTITY;
-        Self { vertices: Vec::new(), triangles: Vec::new(), first_caster: 0, solids: Vec::new(), cell_m, shading: true, at }
+        Self {
+            vertices: Vec::new(),
+            triangles: Vec::new(),
+            first_caster: 0,
+            solids: Vec::new(),
+            cell_m,
+            shading: true,
+            at,
+        }
     }
 
     /// Puts what follows at a place on the floor, turned about the vertical.

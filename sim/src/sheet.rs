@@ -17,6 +17,8 @@ pub(crate) struct Node {
     pub uv: Vec2,
     pub skin: SkinWeights,
     pub part: Part,
+    /// How long it hangs free, metres; 0 where it is held (see [`crate::loose`]).
+    pub free_m: f32,
 }
 
 impl Node {
@@ -28,6 +30,7 @@ impl Node {
             uv: self.uv.lerp(other.uv, t),
             skin: mix_skin(&self.skin, &other.skin, t),
             part: if t < 0.5 { self.part } else { other.part },
+            free_m: self.free_m + (other.free_m - self.free_m) * t,
         }
     }
 }
@@ -54,6 +57,7 @@ impl Sheet {
                 uv: template.uvs[i],
                 skin: template.skin[i],
                 part: template.parts[i],
+                free_m: 0.0,
             })
             .collect();
         Self { nodes, triangles: template.triangles.clone() }

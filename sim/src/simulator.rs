@@ -12,7 +12,7 @@ use crate::draw::{Drawing, Raw, Take};
 use crate::person::Person;
 use crate::scene::Scene;
 use crate::sensor::{hash, linear_of_half};
-use crate::{OpticsConfig, SensorConfig, Shot, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring};
+use crate::{FramePlan, OpticsConfig, SensorConfig, Shot, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring};
 
 /// A person, a motion, a room and cameras.
 pub struct Simulator {
@@ -51,8 +51,7 @@ impl Simulator {
         let people: Vec<&Person> = cast.actors().map(|actor| &actor.person).collect();
         let drawing = Drawing::new(gpu, [config.width, config.height], Scene::new(config, &rig), &people)?;
         let cameras = rig.cameras.iter().map(|_| Kept::default()).collect();
-        let mut new =
-            Self { config: config.clone(), rig, cast, plates: Vec::new(), drawing, posed: None, cameras };
+        let mut new = Self { config: config.clone(), rig, cast, plates: Vec::new(), drawing, posed: None, cameras };
         for slot in 0..new.rig.cameras.len() {
             let take = Take { people: false, ..new.take(&Shot::new(0, slot))? };
             for raw in new.drawing.pictures(&[take])? {
@@ -112,6 +111,14 @@ impl Simulator {
     #[must_use]
     pub fn frame_nanos(&self, index: u64) -> i64 {
         (index as f64 * 1e9 / self.config.fps) as i64
+    }
+
+    /// What the fault script does to frame `index` of camera `slot`.
+    ///
+    /// # Errors
+    /// [`SimError::NoSlot`].
+    pub fn plan(&self, slot: usize, index: u64) -> Result<FramePlan, SimError> {
+        Ok(self.config.faults.plan(&self.camera(slot)?.id, index, |index| self.frame_nanos(index)))
     }
 
     /// Picture and truth of one camera at a time.
@@ -193,7 +200,7 @@ impl Simulator {
 
     /// What the cameras see of the person at a time, as a mesh.
     pub fn clothed_surface(&mut self, nanos: i64) -> SurfaceMesh {
-        let Shape { positions, normals } = self.cast.main.shape(nanos);
+        let Shape { positions, normals, displacement } = self.cast.main.shape(nanos);
         let Person { clothed, carriers, .. } = &self.cast.main.person;
         SurfaceMesh {
             positions,
@@ -201,6 +208,7 @@ impl Simulator {
             triangles: clothed.triangles.clone(),
             canonical: carriers.clone(),
             parts: clothed.parts.clone(),
+            displacement,
         }
     }
 

@@ -8,36 +8,48 @@ use std::{
 use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind};
 use flyrig_types::{CameraId, Frame, Image};
 
-use crate::{Delivery, FramePlan, SimError, Simulator};
+use crate::clock::RealClock;
+use crate::{Delivery, FramePlan, Shot, SimError, SimTime, Simulator};
 
-/// One camera of a [`Simulator`]. Simulated time moves by exactly one frame interval a call, whatever the
-/// wall clock does; all sources of a simulator see the same instants but for what the configured faults do.
+/// One camera of a [`Simulator`]. All sources of a simulator see the same instants but for what the configured faults
+/// do. Dropping it takes the camera out of the rig.
 #[derive(Debug)]
 pub struct SimSource {
     simulator: Arc<Mutex<Simulator>>,
+    /// In [`SimTime::Real`].
+    clock: Option<Arc<RealClock>>,
     camera: CameraId,
     slot: usize,
     next_index: u64,
     /// Frame that has the sequence number 0.
     first_index: u64,
+    /// The instant that the frame given last was due at.
+    order_nanos: Option<i64>,
     disconnected: bool,
     frames: Option<u64>,
 }
 
-/// A source for every camera of the rig, in rig order.
+/// A source for every camera of the rig, in rig order. In [`SimTime::Real`] each needs a thread of its own, since all
+/// wait for each other.
 #[must_use]
-pub fn sources(simulator: &Arc<Mutex<Simulator>>) -> Vec<SimSource> {
+pub fn sources(simulator: &Arc<Mutex<Simulator>>, time: SimTime) -> Vec<SimSource> {
     let guard = simulator.lock().unwrap_or_else(PoisonError::into_inner);
     let frames = guard.config().frames;
+    let clock = match time {
+        SimTime::Exact => None,
+        SimTime::Real => Some(Arc::new(RealClock::new(guard.rig().cameras.len(), guard.config().fps))),
+    };
     let camera_ids = guard.rig().cameras.iter().map(|camera| camera.id.clone());
     camera_ids
         .enumerate()
         .map(|(slot, camera)| SimSource {
             simulator: Arc::clone(simulator),
+            clock: clock.clone(),
             camera,
             slot,
             next_index: 0,
             first_index: 0,
+            order_nanos: None,
             disconnected: false,
             frames,
         })
@@ -52,58 +64,79 @@ impl SimSource {
     }
 }
 
+impl Drop for SimSource {
+    fn drop(&mut self) {
+        if let Some(clock) = &self.clock {
+            clock.leave(self.slot);
+        }
+    }
+}
+
 impl CameraSource for SimSource {
     fn camera(&self) -> &CameraId {
         &self.camera
     }
 
-    fn next_frame(&mut self, _timeout: Duration) -> Result<Frame, CaptureError> {
-        let shared = Arc::clone(&self.simulator);
-        let mut simulator = shared.lock().unwrap_or_else(PoisonError::into_inner);
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
+        let result = self.next_delivery(timeout);
+        if let (Err(_), Some(clock)) = (&result, &self.clock) {
+            // Whoever reads this source may pause after an error.
+            clock.leave(self.slot);
+        }
+        result
+    }
+
+    /// The instant that the frame was due at: stamps may be wrong, the order in which frames arrive is not.
+    fn order_nanos(&self, frame: &Frame) -> i64 {
+        self.order_nanos.unwrap_or(frame.capture_nanos)
+    }
+}
+
+impl SimSource {
+    fn next_delivery(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
         loop {
+            if let Some(clock) = &self.clock {
+                self.next_index = clock.next(self.slot, timeout).ok_or_else(|| {
+                    CaptureError::new(&self.camera, CaptureErrorKind::Timeout, "no instant was due in time")
+                })?;
+            }
             let index = self.next_index;
             if self.frames.is_some_and(|frames| index >= frames) {
-                let message = format!("the simulation ends after {index} frames");
+                let message = format!("the simulation ends after {} frames", self.frames.unwrap_or(index));
                 return Err(CaptureError::new(&self.camera, CaptureErrorKind::EndOfStream, message));
             }
-            let plan = simulator.config().faults.plan(&self.camera, index, |index| simulator.frame_nanos(index));
+            self.next_index += 1;
+            let shared = Arc::clone(&self.simulator);
+            let mut simulator = shared.lock().unwrap_or_else(PoisonError::into_inner);
+            let plan = simulator
+                .plan(self.slot, index)
+                .map_err(|error| CaptureError::new(&self.camera, CaptureErrorKind::Unsupported, error.to_string()))?;
             let fault = |kind, message: &str| Err(CaptureError::new(&self.camera, kind, message));
             match plan.delivery {
                 Delivery::Frame => {
                     if self.disconnected {
                         (self.disconnected, self.first_index) = (false, index);
                     }
-                    let frame = self.taken(&mut simulator, index, plan)?;
-                    self.next_index += 1;
-                    return Ok(frame);
+                    self.order_nanos = Some(simulator.frame_nanos(index));
+                    return self.taken(&mut simulator, index, plan);
                 }
-                Delivery::Dropped => self.next_index += 1,
-                Delivery::Stalled => {
-                    self.next_index += 1;
-                    return fault(CaptureErrorKind::Timeout, "stalled by the fault script");
-                }
+                Delivery::Dropped => {}
+                Delivery::Stalled => return fault(CaptureErrorKind::Timeout, "stalled by the fault script"),
                 Delivery::Disconnected => {
-                    self.next_index += 1;
                     self.disconnected = true;
                     return fault(CaptureErrorKind::Disconnected, "disconnected by the fault script");
                 }
                 Delivery::Undecodable => {
-                    self.next_index += 1;
                     return fault(CaptureErrorKind::Corrupt, "frame made undecodable by the fault script");
                 }
             }
         }
     }
-}
 
-impl SimSource {
     fn taken(&self, simulator: &mut Simulator, index: u64, plan: FramePlan) -> Result<Frame, CaptureError> {
-        let taken = simulator.capture_exposed(plan.true_nanos, self.slot, plan.exposure).and_then(|(image, mask)| {
-            let Some(share) = plan.sound_share else { return Ok((image, mask)) };
-            let mut rgb = image.bytes().to_vec();
-            simulator.config().faults.spoil(&mut rgb, share, index);
-            Ok((Image::new(image.width(), image.height(), image.format(), rgb)?, mask))
-        });
+        let taken = simulator
+            .capture_with(&shot(&plan, self.slot))
+            .and_then(|(image, mask)| Ok((spoilt(simulator, &plan, index, image)?, mask)));
         let (image, mask) = taken.map_err(|error| {
             let kind = match error {
                 SimError::Gpu(_) => CaptureErrorKind::Disconnected,
@@ -120,4 +153,17 @@ impl SimSource {
             mask: Some(mask),
         })
     }
+}
+
+/// What a fault script makes of a camera's shot.
+pub(crate) fn shot(plan: &FramePlan, slot: usize) -> Shot {
+    Shot { exposure: plan.exposure, camera_shift: plan.bump, ..Shot::new(plan.true_nanos, slot) }
+}
+
+/// Garbage over a picture, where the fault script says so.
+pub(crate) fn spoilt(simulator: &Simulator, plan: &FramePlan, index: u64, image: Image) -> Result<Image, SimError> {
+    let Some(share) = plan.sound_share else { return Ok(image) };
+    let mut rgb = image.bytes().to_vec();
+    simulator.config().faults.spoil(&mut rgb, share, index);
+    Ok(Image::new(image.width(), image.height(), image.format(), rgb)?)
 }

@@ -202,9 +202,7 @@ fn rug(noise: Noise, uv: Vec2) -> Srgb {
 }
 
 fn landscape(noise: Noise, uv: Vec2) -> Srgb {
-    let ridge = |base: f32, height: f32, seed: f32| {
-        base + height * noise.sum(Vec3::new(uv.x * 3.2, seed, 1.0), 5)
-    };
+    let ridge = |base: f32, height: f32, seed: f32| base + height * noise.sum(Vec3::new(uv.x * 3.2, seed, 1.0), 5);
     let sky = mix3([0.98, 0.80, 0.62], [0.42, 0.58, 0.75], smoothstep(0.65, 0.0, uv.y));
     let sun = smoothstep(0.085, 0.08, uv.distance(Vec2::new(0.66, 0.36)));
     let mut colour = mix3(sky, [1.0, 0.93, 0.80], sun);
@@ -228,11 +226,21 @@ fn outside(noise: Noise, uv: Vec2) -> Srgb {
     if uv.y > roof {
         let brick = mix3([0.66, 0.56, 0.50], [0.56, 0.50, 0.48], 0.5 + 0.5 * noise.cell(house as i32, 2, 1));
         let pane = ((uv.x * 30.0).fract() - 0.5).abs() < 0.2 && ((uv.y * 16.0).fract() - 0.5).abs() < 0.25;
-        colour = if uv.y < roof + 0.05 { [0.50, 0.36, 0.32] } else if pane { [0.42, 0.47, 0.52] } else { brick };
+        colour = if uv.y < roof + 0.05 {
+            [0.50, 0.36, 0.32]
+        } else if pane {
+            [0.42, 0.47, 0.52]
+        } else {
+            brick
+        };
     }
     let tree = 0.80 + 0.12 * noise.sum(Vec3::new(uv.x * 5.0, 7.0, 3.0), 4);
     if uv.y > tree {
-        colour = mix3([0.33, 0.44, 0.27], [0.22, 0.32, 0.18], 0.5 + 0.5 * noise.sum(Vec3::new(uv.x * 30.0, uv.y * 30.0, 1.0), 3));
+        colour = mix3(
+            [0.33, 0.44, 0.27],
+            [0.22, 0.32, 0.18],
+            0.5 + 0.5 * noise.sum(Vec3::new(uv.x * 30.0, uv.y * 30.0, 1.0), 3),
+        );
     }
     colour
 }
@@ -300,7 +308,11 @@ fn editor(noise: Noise, uv: Vec2) -> Srgb {
         let line = (uv.y * 32.0).fract();
         let row = (uv.y * 32.0) as i32;
         let wide = 0.03 + 0.05 * (1.0 + noise.cell(row, 3, 8));
-        return if (0.35..0.65).contains(&line) && uv.x > 0.02 && uv.x < wide { [0.45, 0.47, 0.52] } else { [0.15, 0.16, 0.20] };
+        return if (0.35..0.65).contains(&line) && uv.x > 0.02 && uv.x < wide {
+            [0.45, 0.47, 0.52]
+        } else {
+            [0.15, 0.16, 0.20]
+        };
     }
     let row = (uv.y * 38.0) as i32;
     let line = (uv.y * 38.0).fract();
@@ -329,12 +341,19 @@ fn charts(noise: Noise, uv: Vec2) -> Srgb {
     }
     let q = Vec2::new((local.x - 0.08) / 0.84, 1.0 - (local.y - 0.16) / 0.74);
     let kind = (card.x + 2.0 * card.y) as i32;
-    let ink = [[0.25, 0.52, 0.72], [0.88, 0.50, 0.26], [0.35, 0.62, 0.42], [0.62, 0.36, 0.55]][kind.clamp(0, 3) as usize];
+    let ink =
+        [[0.25, 0.52, 0.72], [0.88, 0.50, 0.26], [0.35, 0.62, 0.42], [0.62, 0.36, 0.55]][kind.clamp(0, 3) as usize];
     if kind % 2 == 0 {
         let bar = (q.x * 9.0).floor();
         let height = 0.25 + 0.6 * (0.5 + 0.5 * noise.cell(bar as i32, kind, 4));
         return if (q.x * 9.0).fract() < 0.7 && q.y < height { ink } else { [1.0; 3] };
     }
     let curve = 0.5 + 0.3 * noise.sum(Vec3::new(q.x * 5.0, kind as f32, 2.0), 3);
-    if (q.y - curve).abs() < 0.02 { ink } else if q.y < curve { mix3([1.0; 3], ink, 0.25) } else { [1.0; 3] }
+    if (q.y - curve).abs() < 0.02 {
+        ink
+    } else if q.y < curve {
+        mix3([1.0; 3], ink, 0.25)
+    } else {
+        [1.0; 3]
+    }
 }

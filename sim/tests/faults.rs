@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use common::{simulator, small_config};
 use flyrig_capture::{CameraSource, CaptureErrorKind};
-use flyrig_sim::{Delivery, FaultScript, SimSource, Simulator, sources};
+use flyrig_sim::{Delivery, FaultScript, Shot, SimSource, SimTime, Simulator, sources};
 use flyrig_types::{CameraId, Frame};
 
 const FPS: f64 = 30.0;
@@ -26,7 +26,7 @@ fn rig(script: &str) -> (Vec<SimSource>, Simulator) {
     config.height = 64;
     let plain = simulator(&config);
     config.faults = FaultScript::parse(script).unwrap();
-    (sources(&Arc::new(Mutex::new(simulator(&config)))), plain)
+    (sources(&Arc::new(Mutex::new(simulator(&config))), SimTime::Exact), plain)
 }
 
 fn next(source: &mut SimSource) -> Result<Frame, CaptureErrorKind> {
@@ -161,8 +161,11 @@ fn a_corrupt_frame_is_garbage_below_a_row_and_an_undecodable_one_an_error() {
 fn an_exposure_jump_darkens_the_frames_of_its_span() {
     let (mut cameras, mut plain) =
         rig("[[fault]]\nkind = \"exposure-jump\"\ncamera = \"00\"\nfrom_frame = 1\nframes = 1\nfactor = 0.4\n");
-    let light =
-        |bytes: &[u8]| bytes.iter().map(|b| (f64::from(*b) / 255.0).powf(2.2)).sum::<f64>() / bytes.len() as f64;
+    let linear = |byte: &u8| match f64::from(*byte) / 255.0 {
+        code if code <= 0.04045 => code / 12.92,
+        code => ((code + 0.055) / 1.055).powf(2.4),
+    };
+    let light = |bytes: &[u8]| bytes.iter().map(linear).sum::<f64>() / bytes.len() as f64;
     let shares: Vec<f64> = (0..3)
         .map(|i| {
             light(next(&mut cameras[0]).unwrap().image.bytes())
@@ -171,6 +174,41 @@ fn an_exposure_jump_darkens_the_frames_of_its_span() {
         .collect();
     println!("light of three frames: {shares:.3?}");
     assert!((shares[0] - 1.0).abs() < 1e-12 && (shares[1] - 0.4).abs() < 0.03 && (shares[2] - 1.0).abs() < 1e-12);
+}
+
+#[test]
+fn a_bumped_camera_stands_where_it_was_pushed_to_and_the_calibration_does_not_know() {
+    let script = "seed = 3\n[[fault]]\nkind = \"bump\"\ncamera = \"00\"\nfrom_frame = 2\nmm = 40.0\ndeg = 2.0\n";
+    let (mut cameras, mut plain) = rig(script);
+    let plan = |index| FaultScript::parse(script).unwrap().plan(&"00".into(), index, nanos_of);
+    assert_eq!(plan(1).bump, None);
+    let push = plan(2).bump.unwrap();
+    assert!((push.translation.length() - 0.04).abs() < 1e-12);
+    assert!((push.rotation.angle_between(glam::DQuat::IDENTITY).to_degrees() - 2.0).abs() < 1e-6);
+    assert_eq!(plan(9).bump, Some(push), "it stays there");
+    for index in 0..4 {
+        let frame = next(&mut cameras[0]).unwrap();
+        let unmoved = plain.capture(nanos_of(index), 0).unwrap().0;
+        if index < 2 {
+            assert_eq!(frame.image.bytes(), unmoved.bytes());
+            continue;
+        }
+        let differ = frame.image.bytes().iter().zip(unmoved.bytes()).filter(|(a, b)| a.abs_diff(**b) > 8).count();
+        assert!(differ * 20 > unmoved.bytes().len(), "{differ} bytes differ");
+        // A camera that is known to stand there sees the same.
+        let shot = Shot { camera_shift: Some(push), ..Shot::new(nanos_of(index), 0) };
+        assert_eq!(plain.capture_with(&shot).unwrap().0.bytes(), frame.image.bytes());
+    }
+    assert_eq!(plain.rig(), &plain.reported_rig());
+}
+
+#[test]
+fn the_shipped_script_has_every_fault() {
+    let script = FaultScript::parse(include_str!("../assets/faults.toml")).unwrap();
+    let kinds: std::collections::BTreeSet<String> = script.faults.iter().map(|f| format!("{:?}", f.kind)).collect();
+    let known = FaultScript::parse("[[fault]]\nkind = \"none\"\n").unwrap_err().to_string();
+    let listed = known.rsplit("expected one of").next().unwrap().matches('`').count() / 2;
+    assert_eq!(kinds.len(), listed, "{kinds:?} of {known}");
 }
 
 #[test]

@@ -1,14 +1,11 @@
 //! A small data set in EasyMocap layout, made by the simulator.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use anyhow::{Context, Result};
-use flyrig_calib::save_easymocap;
+use anyhow::Result;
 use flyrig_gpu::{AdapterChoice, GpuContext};
-use flyrig_sim::{SimConfig, Simulator};
+use flyrig_sim::{ExportOptions, SimConfig, Simulator, export};
 use tempfile::TempDir;
-
-use crate::write_glb;
 
 /// Side of the pictures, pixels.
 pub const SIDE: u32 = 160;
@@ -51,8 +48,7 @@ pub fn write_dataset() -> Result<Dataset> {
     write_dataset_of(1)
 }
 
-/// Simulates the person of a seed before seven cameras and writes pictures, masks, plates, calibration and the unclothed body with
-/// its motion.
+/// Exports a simulated capture of the person of a seed before seven cameras, without the truth.
 ///
 /// # Errors
 /// When there is no adapter or the folder cannot be written.
@@ -64,28 +60,6 @@ pub fn write_dataset_of(seed: u64) -> Result<Dataset> {
     let mut simulator = Simulator::new(&gpu, &config)?;
     let folder = tempfile::tempdir()?;
     let root = folder.path().join("data");
-    for slot in 0..simulator.rig().cameras.len() {
-        let id = simulator.rig().cameras[slot].id.clone();
-        let folders = ["images", "mask"].map(|kind| root.join(kind).join(id.as_str()));
-        for folder in &folders {
-            std::fs::create_dir_all(folder)?;
-        }
-        std::fs::create_dir_all(root.join("background"))?;
-        save_rgb(&root.join(format!("background/{id}.png")), simulator.plate(slot)?.bytes())?;
-        for frame in 0..FRAMES {
-            // Far enough apart that the person turns visibly.
-            let (picture, mask) = simulator.capture(simulator.frame_nanos(frame), slot)?;
-            save_rgb(&folders[0].join(format!("{frame:06}.png")), picture.bytes())?;
-            let mask = image::GrayImage::from_raw(SIDE, SIDE, mask.coverage().to_vec()).context("mask size")?;
-            mask.save(folders[1].join(format!("{frame:06}.png")))?;
-        }
-    }
-    save_easymocap(&root, simulator.rig())?;
-    write_glb(&root.join("subject.glb"), simulator.template(), simulator.track())?;
+    export(&mut simulator, &root, ExportOptions { frames: FRAMES, truth: false }, &mut |_| true)?;
     Ok(Dataset { root, folder })
-}
-
-fn save_rgb(path: &Path, rgb: &[u8]) -> Result<()> {
-    let picture = image::RgbImage::from_raw(SIDE, SIDE, rgb.to_vec()).context("picture size")?;
-    picture.save(path).with_context(|| format!("writing {}", path.display()))
 }

@@ -2,8 +2,6 @@
 
 mod command;
 mod dataset;
-mod gltf;
 
 pub use command::{Finished, run};
 pub use dataset::{Dataset, FRAMES, SIDE, write_dataset, write_dataset_of};
-pub use gltf::write_glb;

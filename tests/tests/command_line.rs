@@ -36,3 +36,56 @@ fn help_teaches() {
     assert_eq!(unknown.code, Some(1));
     assert!(unknown.stderr.contains("no graphics adapter has 'no such card'"), "{}", unknown.stderr);
 }
+
+#[test]
+fn an_unknown_motion_is_answered_with_the_known_ones() {
+    let folder = tempfile::tempdir().unwrap();
+    let refused = run(PROGRAM, &["demo", "--out", "no", "--motion", "fly"], folder.path()).unwrap();
+    assert_eq!(refused.code, Some(1));
+    assert!(refused.stderr.contains("`fly`") && refused.stderr.contains("`cross-arms`"), "{}", refused.stderr);
+}
+
+#[test]
+fn a_simulated_capture_is_exported_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let small = "[sim]\nwidth = 64\nheight = 64\ntexture_px = 64\ncameras.count = 3\n";
+    std::fs::write(folder.path().join("rig.toml"), small).unwrap();
+    let args = ["sim", "export", "rig.toml", "--out", "take", "--frames", "2"];
+    let exported = run(PROGRAM, &args, folder.path()).unwrap();
+    assert_eq!(exported.code, Some(0), "{exported:?}");
+    assert!(exported.stdout.contains("take: 2 frames of 3 cameras, 6 pictures"), "{}", exported.stdout);
+    assert!(exported.stdout.contains("flyrig eval take --inputs 00,02 --holdout 01 --fps 30"), "{}", exported.stdout);
+    for file in ["intri.yml", "images/02/000001.png", "truth/02/000001.exr", "truth/frames.csv", "subject.glb"] {
+        assert!(folder.path().join("take").join(file).exists(), "{file}");
+    }
+    let again = run(PROGRAM, &args, folder.path()).unwrap();
+    assert_eq!(again.code, Some(1));
+    assert!(again.stderr.contains("take is there already"), "{}", again.stderr);
+}
+
+#[test]
+fn a_demo_goes_through_every_fault_of_a_rig() {
+    let folder = tempfile::tempdir().unwrap();
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../sim/assets/faults.toml");
+    let args = ["demo", "--out", "out", "--frames", "56", "--gaussians", "3000", "--faults", script];
+    let finished = run(PROGRAM, &args, folder.path()).unwrap();
+    assert_eq!(finished.code, Some(0), "{finished:?}");
+    let metrics: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(folder.path().join("out/metrics.json")).unwrap()).unwrap();
+    let drops = metrics["drops"].as_array().unwrap();
+    let count = |place: &str| -> u64 {
+        drops
+            .iter()
+            .filter(|drop| drop[0].as_str().unwrap().contains(place))
+            .map(|drop| drop[1].as_u64().unwrap())
+            .sum()
+    };
+    // Camera 05 hangs for 3 frames and is gone for 8; some frames of 00 cannot be decoded.
+    assert!(count("errors of 05") == 11 && count("errors of 00") >= 1, "{drops:?}");
+    assert!(count("sets without a camera") >= 11, "{drops:?}");
+    let wrong = std::fs::write(folder.path().join("bad.toml"), "[[fault]]\nkind = \"drop\"\nmm = 3\n");
+    wrong.unwrap();
+    let refused = run(PROGRAM, &["demo", "--out", "no", "--faults", "bad.toml"], folder.path()).unwrap();
+    assert_eq!(refused.code, Some(1));
+    assert!(refused.stderr.contains("bad.toml") && refused.stderr.contains("fault.mm is 3"), "{}", refused.stderr);
+}

@@ -16,10 +16,12 @@
 mod carry;
 mod data;
 mod normal;
+mod pose_fix;
 mod regularizer;
 mod settings;
 mod track;
 
 pub use data::{DataTerm, PointDerivatives};
+pub use pose_fix::{PoseCorrection, PoseFreedom};
 pub use settings::{DeformSettings, DeformSolver};
 pub use track::{DeformReport, DeformTracker};

@@ -39,7 +39,9 @@ mod triangulate;
 mod view;
 
 pub use config::PoseConfig;
-pub use deform::{DataTerm, DeformReport, DeformSettings, DeformSolver, DeformTracker, PointDerivatives};
+pub use deform::{
+    DataTerm, DeformReport, DeformSettings, DeformSolver, DeformTracker, PointDerivatives, PoseCorrection, PoseFreedom,
+};
 pub use error::{TrackError, TrackErrorKind};
 pub use estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};
 pub use estimator::PoseEstimator;

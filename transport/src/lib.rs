@@ -48,7 +48,7 @@ pub use header::{HEADER_BYTES, Header, MessageKind, SCHEMA_VERSION};
 pub use publisher::{Publisher, ViewpointCounts};
 pub use report::{LatencyReport, TopicReport};
 pub use splats::{MAX_SPLATS, SplatState};
-pub use stats::{RigStats, StageTime, ViewRate};
+pub use stats::{RigStats, StageTime, TrackingStats, ViewRate};
 pub use subscriber::{Interests, Received, Subscriber, Views};
 pub use topic::{PublishOutcome, TopicCounts};
 pub use view::{ImageFormat, MAX_IMAGE_BYTES, ViewFrame};

@@ -31,6 +31,17 @@ pub struct ViewRate {
     pub bytes_per_second: f64,
 }
 
+/// How well the person is followed, at the last frame.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct TrackingStats {
+    /// "searching", "first", "steady", "recovering" or "lost".
+    pub state: String,
+    /// How much of the person is where the pictures show it, 0 to 1; none when nothing was compared.
+    pub quality: Option<f64>,
+    /// The same by camera; one that is covered is near 0.
+    pub cameras: BTreeMap<String, f64>,
+}
+
 /// How the rig is doing over its last interval (about a second).
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RigStats {
@@ -50,6 +61,9 @@ pub struct RigStats {
     pub views: Vec<ViewRate>,
     /// Subscribers with a viewpoint of their own.
     pub viewers: u32,
+    /// How well the person is followed.
+    #[serde(default)]
+    pub tracking: TrackingStats,
 }
 
 /// JSON with the version first, so that a reader can tell before it understands the rest.
@@ -98,6 +112,8 @@ impl RigStats {
         let finite = [self.uptime_secs, self.frames_per_second]
             .into_iter()
             .chain(self.stages.iter().flat_map(|stage| [stage.mean_millis, stage.max_millis]))
+            .chain(self.tracking.quality)
+            .chain(self.tracking.cameras.values().copied())
             .chain(self.views.iter().flat_map(|view| [view.per_second, view.bytes_per_second]))
             .all(f64::is_finite);
         if !finite {

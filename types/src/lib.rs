@@ -17,6 +17,7 @@ mod ids;
 mod image;
 mod isometry;
 mod pose;
+mod whole_file;
 
 pub use camera::{Camera, CameraError, Intrinsics, Lens, MAX_IMAGE_SIDE, Rig};
 pub use frame::{Frame, FrameSet, SetKind};
@@ -24,3 +25,4 @@ pub use ids::CameraId;
 pub use image::{Image, ImageError, Mask, PixelBuffer, PixelFormat, Recycle};
 pub use isometry::Isometry;
 pub use pose::{Pose, PoseError, PoseTrack};
+pub use whole_file::write_whole;

@@ -115,6 +115,25 @@ impl PoseTrack {
         self.at(i64::try_from(i128::from(first) + into).unwrap_or(first))
     }
 
+    /// The motion laid end to end until it covers `until_nanos` too; where its end does not meet its start it jumps
+    /// within a nanosecond, as [`Self::at_repeated`] does.
+    #[must_use]
+    pub fn repeated_until(&self, until_nanos: i64) -> Self {
+        let (first, last) = self.span_nanos();
+        let mut keys = self.keys.clone();
+        let span = last.saturating_sub(first);
+        let mut shift: i64 = 0;
+        while span > 1 && last.saturating_add(shift) < until_nanos {
+            shift = shift.saturating_add(span);
+            // The last key and the first of the next round would have one time.
+            if let Some((end, _)) = keys.last_mut() {
+                *end -= 1;
+            }
+            keys.extend(self.keys.iter().map(|(nanos, pose)| (nanos.saturating_add(shift), pose.clone())));
+        }
+        Self { keys }
+    }
+
     /// Time of the first and the last key.
     #[must_use]
     pub fn span_nanos(&self) -> (i64, i64) {
@@ -158,6 +177,21 @@ mod tests {
         assert_eq!(single.at_repeated(i64::MIN), pose(3.0, 0.0));
         let widest = PoseTrack::new(vec![(i64::MIN, pose(0.0, 0.0)), (i64::MAX, pose(1.0, 0.0))]).unwrap();
         assert!((widest.at_repeated(0).root_translation.x - 0.5).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_motion_laid_end_to_end_is_the_repeated_one() {
+        let keys = vec![(100, pose(0.0, 0.0)), (900, pose(0.5, 0.3)), (2100, pose(2.0, 1.0))];
+        let track = PoseTrack::new(keys).unwrap();
+        let long = track.repeated_until(9000);
+        assert!(long.span_nanos().1 >= 9000 && PoseTrack::new(long.keys().to_vec()).is_ok());
+        for nanos in (100..9000).step_by(37) {
+            let (a, b) = (long.at(nanos), track.at_repeated(nanos));
+            assert!((a.root_translation.x - b.root_translation.x).abs() < 0.002, "{nanos}");
+        }
+        assert_eq!(track.repeated_until(0), track);
+        let single = PoseTrack::new(vec![(100, pose(3.0, 0.0))]).unwrap();
+        assert_eq!(single.repeated_until(9000), single);
     }
 
     #[test]

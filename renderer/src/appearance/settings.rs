@@ -1,5 +1,6 @@
 //! What goes into direct appearance, and what can be wrong with it.
 
+use crate::GaussianBuffers;
 use flyrig_gpu::{GpuError, StorageBuffer};
 use flyrig_types::{Camera, CameraId, MAX_IMAGE_SIDE};
 
@@ -13,6 +14,8 @@ pub struct ViewInput<'a> {
     /// The Gaussians' canonical positions as this camera sees them: [`RenderTarget::canonical`](crate::RenderTarget)
     /// of a rendering with this very camera and the same Gaussians.
     pub canonical: &'a StorageBuffer<[f32; 4]>,
+    /// The Gaussians as they stood when this picture was taken, where that is another instant.
+    pub gaussians: Option<&'a GaussianBuffers>,
 }
 
 /// How colours are gathered.

@@ -1,7 +1,7 @@
 //! From derivatives by world centres to derivatives by canonical displacements.
 
 use flyrig_body::{SkinWeights, skin_jacobian_f64};
-use glam::{DMat3, DMat4, DVec3};
+use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
 use super::PointDerivatives;
@@ -18,18 +18,14 @@ pub(super) struct Carried {
 
 /// With B the blended bone matrix of a Gaussian (d LBS(x + t_x) / d t_x): `B^T g` and `B^T H B`, for the Gaussians that
 /// are seen, in their order; and how many were left out because a number was not finite.
-pub(super) fn to_canonical(
-    derivatives: &PointDerivatives,
-    world_from_canonical: &[DMat4],
-    skin: &[SkinWeights],
-) -> (Vec<Carried>, usize) {
+pub(super) fn to_canonical(derivatives: &PointDerivatives, skin: &[SkinWeights]) -> (Vec<Carried>, usize) {
     let one = |g: usize| -> Option<Result<Carried, ()>> {
         let gradient = derivatives.gradient.get(g)?;
         // NaN counts as seen, and falls below.
         if gradient[3] <= 0.0 {
             return None;
         }
-        let bones = skin_jacobian_f64(world_from_canonical, skin.get(g)?);
+        let bones = skin_jacobian_f64(&derivatives.world_from_canonical, skin.get(g)?);
         let world = DVec3::new(gradient[0].into(), gradient[1].into(), gradient[2].into());
         let zero = [0.0; 4];
         let first = derivatives.curvature.get(2 * g).unwrap_or(&zero).map(f64::from);

@@ -11,24 +11,30 @@ pub(super) struct Regularizer {
     pub spatial: f64,
     /// λ_reg λ_temp.
     pub temporal: f64,
+    /// Whether there were frames before this one; the temporal term is off without.
+    pub history: bool,
 }
 
 impl Regularizer {
     /// Weight of the Laplacian's edges in the second derivative, times the identity.
     pub(super) fn stiffness(&self) -> f64 {
-        2.0 * (self.spatial + self.temporal)
+        2.0 * (self.spatial + self.temporal())
+    }
+
+    fn temporal(&self) -> f64 {
+        if self.history { self.temporal } else { 0.0 }
     }
 
     /// The loss at translations `t` with smoothed translations `smooth`; adds the gradient where asked.
     pub(super) fn loss(&self, t: &[DVec3], smooth: &[DVec3], mut gradient: Option<&mut [DVec3]>) -> f64 {
-        let mut loss = 0.0;
+        let (mut loss, temporal) = (0.0, self.temporal());
         for &(i, j) in &self.edges {
             let (i, j) = (i as usize, j as usize);
             let spread = t[i] - t[j];
             let change = spread - (smooth[i] - smooth[j]);
-            loss += self.spatial * spread.length_squared() + self.temporal * change.length_squared();
+            loss += self.spatial * spread.length_squared() + temporal * change.length_squared();
             if let Some(gradient) = gradient.as_deref_mut() {
-                let pull = 2.0 * (self.spatial * spread + self.temporal * change);
+                let pull = 2.0 * (self.spatial * spread + temporal * change);
                 gradient[i] += pull;
                 gradient[j] -= pull;
             }

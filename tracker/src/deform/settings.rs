@@ -22,7 +22,7 @@ pub enum DeformSolver {
 pub struct DeformSettings {
     /// How to step.
     pub solver: DeformSolver,
-    /// λ_reg of Eq. 3. The paper's 200.
+    /// λ_reg of Eq. 3. The paper's is 200; with a second-order step more of it gives the truer surface.
     pub regularization: f64,
     /// λ_spat of Eq. 4. The paper's 1.
     pub spatial: f64,
@@ -38,13 +38,16 @@ pub struct DeformSettings {
     pub max_translation_m: f64,
     /// Attempts with growing damping before an iteration gives up.
     pub attempts: usize,
+    /// After a frame that lowered its loss by less than this share, frames whose loss is no more than this share above get
+    /// no iteration; 0: every frame gets its iterations.
+    pub rest: f64,
 }
 
 impl Default for DeformSettings {
     fn default() -> Self {
         Self {
             solver: DeformSolver::GaussNewton { first_iterations: 3, iterations: 1 },
-            regularization: 200.0,
+            regularization: 1000.0,
             spatial: 1.0,
             temporal: 2.0,
             smoothing: 0.5,
@@ -52,6 +55,7 @@ impl Default for DeformSettings {
             max_step_m: 0.02,
             max_translation_m: 0.25,
             attempts: 3,
+            rest: 0.01,
         }
     }
 }
@@ -94,6 +98,8 @@ impl DeformSettings {
     fn fault_without_solver(&self, weight: fn(f64) -> bool, length: fn(f64) -> bool) -> Option<&'static str> {
         if ![self.regularization, self.spatial, self.temporal, self.damping].into_iter().all(weight) {
             Some("weights and damping must be finite and not negative")
+        } else if !(0.0..1.0).contains(&self.rest) {
+            Some("the share at which there is rest must lie in 0 to 1, 1 excluded")
         } else if !(0.0..=1.0).contains(&self.smoothing) {
             Some("smoothing must lie in 0 to 1")
         } else if !length(self.max_step_m) || !length(self.max_translation_m) {

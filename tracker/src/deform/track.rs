@@ -1,12 +1,14 @@
 //! The deformation from frame to frame.
 
-use flyrig_body::{DeformationGraph, SkinWeights};
-use glam::{DMat4, DVec3};
+use flyrig_body::{DeformationGraph, Skeleton, SkinWeights};
+use glam::DVec3;
 
 use super::carry::to_canonical;
 use super::normal::NormalMatrix;
+use super::pose_fix::{Basis, PoseFix};
 use super::regularizer::Regularizer;
-use super::{DataTerm, DeformSettings, DeformSolver, PointDerivatives};
+use super::settings::FIRST_FRAMES;
+use super::{DataTerm, DeformSettings, DeformSolver, PointDerivatives, PoseCorrection, PoseFreedom};
 use crate::{TrackError, TrackErrorKind};
 
 /// Damping never falls below or rises above these shares of the mean diagonal.
@@ -31,6 +33,8 @@ pub struct DeformReport {
     pub dropped: usize,
     /// The loss was not finite: all is as it was before the frame.
     pub poisoned: bool,
+    /// The loss was at its floor: no iteration was made.
+    pub at_rest: bool,
 }
 
 /// Translations of the graph's nodes, tracked over time. State that is not finite never comes in: a frame whose loss is
@@ -46,8 +50,12 @@ pub struct DeformTracker {
     translations: Vec<DVec3>,
     smooth: Vec<DVec3>,
     displacement: Vec<[f32; 4]>,
-    derivatives: PointDerivatives,
+    derivatives: Vec<PointDerivatives>,
+    pose: Option<PoseFix>,
+    no_correction: PoseCorrection,
     damping: f64,
+    /// Loss below which there is nothing left to gain.
+    floor: Option<f64>,
     frame: u64,
 }
 
@@ -84,6 +92,7 @@ impl DeformTracker {
             edges,
             spatial: settings.regularization * settings.spatial,
             temporal: settings.regularization * settings.temporal,
+            history: false,
         };
         Ok(Self {
             damping: settings.damping,
@@ -96,9 +105,44 @@ impl DeformTracker {
             translations: vec![DVec3::ZERO; nodes],
             smooth: vec![DVec3::ZERO; nodes],
             displacement: vec![[0.0; 4]; count],
-            derivatives: PointDerivatives::default(),
+            derivatives: Vec::new(),
+            pose: None,
+            no_correction: PoseCorrection::default(),
+            floor: None,
             frame: 0,
         })
+    }
+
+    /// Corrects the pose as well: only what no turn of a joint explains is left to the nodes. `nodes` holds canonical place
+    /// and skin weights of every node. Gradient descent knows nothing of it.
+    ///
+    /// # Errors
+    /// [`TrackErrorKind::Template`] when the nodes are not the graph's or a price is not usable.
+    pub fn with_pose(
+        mut self,
+        skeleton: &Skeleton,
+        nodes: Vec<(DVec3, SkinWeights)>,
+        freedom: PoseFreedom,
+    ) -> Result<Self, TrackError> {
+        let fail = |message: String| Err(TrackError::new(TrackErrorKind::Template, message));
+        if nodes.len() != self.translations.len() {
+            return fail(format!("{} places for {} nodes of the graph", nodes.len(), self.translations.len()));
+        }
+        if ![freedom.turn, freedom.shift].into_iter().all(|v| v.is_finite() && v > 0.0)
+            || !(freedom.hold.is_finite() && freedom.hold >= 0.0)
+        {
+            return fail("the prices of a corrected pose must be finite and above 0".to_owned());
+        }
+        if matches!(self.settings.solver, DeformSolver::GaussNewton { .. }) {
+            self.pose = Some(PoseFix::new(skeleton, nodes, freedom));
+        }
+        Ok(self)
+    }
+
+    /// What the pose is corrected by.
+    #[must_use]
+    pub fn correction(&self) -> &PoseCorrection {
+        self.pose.as_ref().map_or(&self.no_correction, |pose| &pose.now)
     }
 
     /// Back to rest: the next frame counts as the first.
@@ -106,7 +150,22 @@ impl DeformTracker {
         self.translations.fill(DVec3::ZERO);
         self.smooth.fill(DVec3::ZERO);
         self.displacement.fill([0.0; 4]);
+        if let Some(pose) = &mut self.pose {
+            pose.reset();
+        }
         self.damping = self.settings.damping;
+        self.floor = None;
+        self.frame = 0;
+    }
+
+    /// Keeps what is known of the clothes; the next frame counts as the first again, and the pose is no longer corrected.
+    pub fn restart(&mut self) {
+        self.smooth.clone_from(&self.translations);
+        if let Some(pose) = &mut self.pose {
+            pose.reset();
+        }
+        self.damping = self.settings.damping;
+        self.floor = None;
         self.frame = 0;
     }
 
@@ -122,95 +181,134 @@ impl DeformTracker {
         &self.displacement
     }
 
-    /// Takes in one frame, starting from the last one's translations. `world_from_canonical` holds the bone matrices
-    /// of this frame's pose.
+    /// Takes in one frame, starting from the last one's translations.
     ///
     /// # Errors
     /// The data term's; the state is then that of the last accepted step.
-    pub fn track<D: DataTerm>(
-        &mut self,
-        world_from_canonical: &[DMat4],
-        data: &mut D,
-    ) -> Result<DeformReport, D::Error> {
+    pub fn track<D: DataTerm>(&mut self, data: &mut D) -> Result<DeformReport, D::Error> {
         let mut report = DeformReport::default();
-        let start = self.translations.clone();
+        let start = (self.translations.clone(), self.correction().clone());
+        // Before the first frame there is nothing to stay close to.
+        self.regularizer.history = self.frame > 0;
+        if let Some(floor) = self.floor.filter(|_| self.frame >= FIRST_FRAMES) {
+            let loss = data.loss(&self.displacement, self.correction())? + self.prior(None);
+            if loss <= floor * (1.0 + self.settings.rest) {
+                report.losses.push(loss);
+                report.at_rest = true;
+                return Ok(report);
+            }
+        }
         for _ in 0..self.settings.iterations(self.frame) {
             let mut gradient = vec![DVec3::ZERO; self.translations.len()];
             let mut derivatives = std::mem::take(&mut self.derivatives);
-            let data_loss = data.derivatives(&self.displacement, &mut derivatives);
+            let data_loss = data.derivatives(&self.displacement, self.correction(), &mut derivatives);
             self.derivatives = derivatives;
-            let loss = data_loss? + self.regularizer.loss(&self.translations, &self.smooth, Some(&mut gradient));
+            let loss = data_loss? + self.prior(Some(&mut gradient));
             if !loss.is_finite() {
                 report.poisoned = true;
-                self.translations = start;
-                self.displace();
+                self.restore(start);
                 return Ok(report);
             }
             // Gauss-Newton has told the loss after its step already.
             if report.losses.len() == report.accepted {
                 report.losses.push(loss);
             }
-            report.dropped += self.gather(world_from_canonical, &mut gradient);
+            let mut by_data = vec![DVec3::ZERO; gradient.len()];
+            report.dropped += self.gather(&mut by_data);
+            for (sum, by_data) in gradient.iter_mut().zip(&by_data) {
+                *sum += *by_data;
+            }
             let before = report.accepted;
             match self.settings.solver {
                 DeformSolver::Paper { rate } => {
-                    let step = gradient.iter().map(|g| *g * -rate).collect();
-                    if self.step(step).is_some() {
+                    let step: Vec<DVec3> = gradient.iter().map(|g| *g * -rate).collect();
+                    if self.step(&step).is_some() {
                         report.accepted += 1;
                     }
                 }
-                DeformSolver::GaussNewton { .. } => self.step_downhill(&gradient, loss, data, &mut report)?,
+                DeformSolver::GaussNewton { .. } => self.step_downhill(&gradient, &by_data, loss, data, &mut report)?,
             }
             if report.accepted == before {
                 break;
             }
         }
+        self.floor = match report.losses[..] {
+            [first, .., last] if self.settings.rest > 0.0 && last >= first * (1.0 - self.settings.rest) => Some(last),
+            [_] if self.settings.rest > 0.0 => report.losses.last().copied(),
+            _ => None,
+        };
         let share = self.settings.smoothing;
         for (smooth, t) in self.smooth.iter_mut().zip(&self.translations) {
             *smooth += (*t - *smooth) * share;
+        }
+        if let Some(pose) = &mut self.pose {
+            pose.next_frame();
         }
         self.frame += 1;
         Ok(report)
     }
 
     /// Adds the data's gradient and makes its matrix; the number of Gaussians left out.
-    fn gather(&mut self, world_from_canonical: &[DMat4], gradient: &mut [DVec3]) -> usize {
-        let (carried, dropped) = to_canonical(&self.derivatives, world_from_canonical, &self.skin);
+    fn gather(&mut self, gradient: &mut [DVec3]) -> usize {
+        let mut all_dropped = 0;
         let with_matrix = matches!(self.settings.solver, DeformSolver::GaussNewton { .. });
         self.matrix.clear();
-        for one in carried {
-            let (nodes, weights) = (self.gaussian_nodes[one.gaussian], self.gaussian_weights[one.gaussian]);
-            for (&node, weight) in nodes.iter().zip(weights) {
-                gradient[node as usize] += one.gradient * f64::from(weight);
-            }
-            if with_matrix {
-                self.matrix.add_gaussian(one.gaussian, nodes, weights, one.matrix);
+        for derivatives in &self.derivatives {
+            let (carried, dropped) = to_canonical(derivatives, &self.skin);
+            all_dropped += dropped;
+            for one in carried {
+                let (nodes, weights) = (self.gaussian_nodes[one.gaussian], self.gaussian_weights[one.gaussian]);
+                for (&node, weight) in nodes.iter().zip(weights) {
+                    gradient[node as usize] += one.gradient * f64::from(weight);
+                }
+                if with_matrix {
+                    self.matrix.add_gaussian(one.gaussian, nodes, weights, one.matrix);
+                }
             }
         }
-        dropped
+        all_dropped
+    }
+
+    /// All of the loss that the pictures do not tell, and its gradient by the nodes where asked.
+    fn prior(&self, gradient: Option<&mut [DVec3]>) -> f64 {
+        self.regularizer.loss(&self.translations, &self.smooth, gradient)
+            + self.pose.as_ref().map_or(0.0, PoseFix::loss)
+    }
+
+    /// How the pose's unknowns move the nodes, and what they cost.
+    fn pose_basis(&self) -> Option<(Basis, Vec<f64>)> {
+        let (pose, first) = (self.pose.as_ref()?, self.derivatives.first()?);
+        let basis = pose.basis(&first.world_from_canonical, &first.world_from_joint, &self.translations);
+        Some((basis, pose.stiffness()))
     }
 
     fn step_downhill<D: DataTerm>(
         &mut self,
         gradient: &[DVec3],
+        by_data: &[DVec3],
         loss: f64,
         data: &mut D,
         report: &mut DeformReport,
     ) -> Result<(), D::Error> {
-        let right: Vec<DVec3> = gradient.iter().map(|g| -*g).collect();
+        let pose = self.pose_basis();
+        let mut right: Vec<DVec3> = gradient.iter().map(|g| -*g).collect();
+        if let (Some((basis, _)), Some(fix)) = (&pose, &self.pose) {
+            right.extend(basis.gathered(by_data).into_iter().zip(fix.gradient()).map(|(data, own)| -(data + own)));
+        }
         if right.iter().all(|g| *g == DVec3::ZERO) {
             return Ok(());
         }
+        let pose = pose.as_ref().map(|(basis, prices)| (basis, prices.as_slice()));
         for _ in 0..self.settings.attempts {
             let damping = self.damping * self.matrix.mean_diagonal() + LEAST_DAMPING;
-            let step = self.matrix.solve(self.regularizer.stiffness(), damping, &right);
+            let step = self.matrix.solve(self.regularizer.stiffness(), damping, &right, pose);
             // Of the quadratic model, which the step s solves: (A + damping) s = -g.
             let share = self.shrink(&step);
             let along: f64 = right.iter().zip(&step).map(|(r, s)| r.dot(*s)).sum();
-            let squared: f64 = step.iter().map(|s| s.length_squared()).sum();
+            let squared: f64 = step.iter().take(gradient.len()).map(|s| s.length_squared()).sum();
             let predicted = share * along - 0.5 * share * share * (along - damping * squared);
-            let (translations, displacement) = (self.translations.clone(), self.displacement.clone());
-            let new = self.try_step(step, data)?;
+            let state = (self.translations.clone(), self.correction().clone());
+            let new = self.try_step(&step, data)?;
             if new < loss {
                 let gain = (loss - new) / predicted;
                 if gain > GOOD_GAIN {
@@ -222,7 +320,7 @@ impl DeformTracker {
                 report.losses.push(new);
                 return Ok(());
             }
-            (self.translations, self.displacement) = (translations, displacement);
+            self.restore(state);
             self.damping = (self.damping.max(DAMPING_RANGE.0) * 10.0).min(DAMPING_RANGE.1);
             report.refused += 1;
         }
@@ -231,34 +329,48 @@ impl DeformTracker {
 
     /// The share of a step that keeps every node within the longest one.
     fn shrink(&self, step: &[DVec3]) -> f64 {
-        let longest = step.iter().map(|s| s.length()).fold(0.0, f64::max);
+        let nodes = step.iter().take(self.translations.len());
+        let longest = nodes.map(|s| s.length()).fold(0.0, f64::max);
         if longest > self.settings.max_step_m { self.settings.max_step_m / longest } else { 1.0 }
     }
 
-    /// Moves the nodes, within the limits, and returns where they were; none, and nothing done, when the step is not
+    /// Moves the nodes, and the pose where it is free, within the limits; none, and nothing done, when the step is not
     /// finite.
-    fn step(&mut self, step: Vec<DVec3>) -> Option<Vec<DVec3>> {
+    fn step(&mut self, step: &[DVec3]) -> Option<()> {
         if !step.iter().all(|s| s.is_finite()) {
             return None;
         }
-        let shrink = self.shrink(&step);
+        let shrink = self.shrink(step);
         let limit = self.settings.max_translation_m;
-        let moved: Vec<DVec3> =
-            self.translations.iter().zip(step).map(|(t, s)| (*t + s * shrink).clamp_length_max(limit)).collect();
-        let old = std::mem::replace(&mut self.translations, moved);
+        for (t, s) in self.translations.iter_mut().zip(step) {
+            *t = (*t + *s * shrink).clamp_length_max(limit);
+        }
+        if let (Some(pose), Some(unknowns)) = (&mut self.pose, step.get(self.translations.len()..)) {
+            pose.step(unknowns, shrink);
+        }
         self.displace();
-        Some(old)
+        Some(())
+    }
+
+    fn restore(&mut self, (translations, correction): (Vec<DVec3>, PoseCorrection)) {
+        self.translations = translations;
+        if let Some(pose) = &mut self.pose {
+            pose.now = correction;
+        }
+        self.displace();
     }
 
     /// Moves the nodes and tells the loss there. A step or a loss that is not finite is undone, and so is one that the
     /// data term fails at.
-    fn try_step<D: DataTerm>(&mut self, step: Vec<DVec3>, data: &mut D) -> Result<f64, D::Error> {
-        let Some(old) = self.step(step) else { return Ok(f64::NAN) };
-        let loss = data.loss(&self.displacement);
-        let total = loss.map(|loss| loss + self.regularizer.loss(&self.translations, &self.smooth, None));
+    fn try_step<D: DataTerm>(&mut self, step: &[DVec3], data: &mut D) -> Result<f64, D::Error> {
+        let old = (self.translations.clone(), self.correction().clone());
+        if self.step(step).is_none() {
+            return Ok(f64::NAN);
+        }
+        let loss = data.loss(&self.displacement, self.correction());
+        let total = loss.map(|loss| loss + self.prior(None));
         if !matches!(total, Ok(total) if total.is_finite()) {
-            self.translations = old;
-            self.displace();
+            self.restore(old);
         }
         total
     }

@@ -1,11 +1,12 @@
-//! A minimal binary glTF writer: one skinned mesh with one animation.
+//! A template with its motion as binary glTF.
 
+use std::io::Write as _;
 use std::path::Path;
 
-use anyhow::{Context, Result};
-use flyrig_body::Template;
-use flyrig_types::PoseTrack;
+use flyrig_types::{PoseTrack, write_whole};
 use serde_json::{Value, json};
+
+use crate::{BodyError, Template};
 
 /// Collects typed data into one buffer with a view and an accessor each.
 #[derive(Default)]
@@ -40,11 +41,19 @@ impl Buffer {
     }
 }
 
-/// Writes a template with its motion; times are those of the track.
+/// Writes a skinned mesh with one animation, as [`crate::load_gltf`] reads it: times and world axes are those of the
+/// track. The file appears whole or not at all.
 ///
 /// # Errors
-/// When the file cannot be written.
-pub fn write_glb(path: &Path, template: &Template, track: &PoseTrack) -> Result<()> {
+/// [`BodyError::Unwritten`] when the poses do not fit the skeleton, the file would be larger than the format allows,
+/// or the system refuses.
+pub fn write_glb(path: &Path, template: &Template, track: &PoseTrack) -> Result<(), BodyError> {
+    let unwritten = |message| BodyError::Unwritten { path: path.to_owned(), message };
+    let joints = template.skeleton.joints().len();
+    if let Some((_, pose)) = track.keys().iter().find(|(_, pose)| pose.joint_rotations.len() != joints) {
+        let found = pose.joint_rotations.len();
+        return Err(unwritten(format!("a pose of {found} joints does not fit the skeleton's {joints}")));
+    }
     let mut buffer = Buffer::default();
     let low = template.positions.iter().fold(glam::Vec3::INFINITY, |a, b| a.min(*b));
     let high = template.positions.iter().fold(glam::Vec3::NEG_INFINITY, |a, b| a.max(*b));
@@ -115,19 +124,67 @@ pub fn write_glb(path: &Path, template: &Template, track: &PoseTrack) -> Result<
         "bufferViews": buffer.views,
         "accessors": buffer.accessors,
     });
-    let mut text = serde_json::to_vec(&document)?;
+    let mut text = document.to_string().into_bytes();
     text.resize(text.len().next_multiple_of(4), b' ');
     buffer.bytes.resize(buffer.bytes.len().next_multiple_of(4), 0);
-    let total = 12 + 8 + text.len() + 8 + buffer.bytes.len();
-    let mut file = Vec::with_capacity(total);
-    file.extend(b"glTF");
-    file.extend(2u32.to_le_bytes());
-    file.extend((total as u32).to_le_bytes());
-    file.extend((text.len() as u32).to_le_bytes());
-    file.extend(b"JSON");
-    file.extend(&text);
-    file.extend((buffer.bytes.len() as u32).to_le_bytes());
-    file.extend(b"BIN\0");
-    file.extend(&buffer.bytes);
-    std::fs::write(path, file).with_context(|| format!("writing {}", path.display()))
+    let length =
+        |bytes: usize| u32::try_from(bytes).map_err(|_| unwritten("4 GiB are the most it can hold".to_owned()));
+    let total = length(12 + 8 + text.len() + 8 + buffer.bytes.len())?;
+    let [text_length, bytes_length] = [length(text.len())?, length(buffer.bytes.len())?];
+    write_whole(path, |out| {
+        out.write_all(b"glTF")?;
+        for word in [2, total, text_length] {
+            out.write_all(&word.to_le_bytes())?;
+        }
+        out.write_all(b"JSON")?;
+        out.write_all(&text)?;
+        out.write_all(&bytes_length.to_le_bytes())?;
+        out.write_all(b"BIN\0")?;
+        out.write_all(&buffer.bytes)
+    })
+    .map_err(|source| unwritten(source.to_string()))
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_types::{Pose, PoseTrack};
+    use glam::{DQuat, DVec3};
+
+    use super::*;
+    use crate::{ShapeParams, default_template, load_gltf, skin_mesh};
+
+    #[test]
+    fn what_is_written_is_read_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("body.glb");
+        let template = default_template(&ShapeParams::default()).unwrap();
+        let pose = |turn: f64| {
+            let mut pose = template.skeleton.rest_pose();
+            pose.root_translation = DVec3::new(turn, 0.2, 0.9);
+            pose.joint_rotations[3] *= DQuat::from_rotation_x(turn);
+            pose
+        };
+        let track = PoseTrack::new(vec![(0, pose(0.0)), (500_000_000, pose(0.7))]).unwrap();
+        write_glb(&path, &template, &track).unwrap();
+        let human = load_gltf(&path).unwrap();
+        assert_eq!(human.template.triangles, template.triangles);
+        for (a, b) in human.template.positions.iter().zip(&template.positions) {
+            assert!(a.distance(*b) < 1e-6);
+        }
+        let read = human.track.unwrap();
+        assert_eq!(read.span_nanos(), track.span_nanos());
+        for nanos in [0, 200_000_000, 500_000_000] {
+            // The importer may order the joints in its own way; the surface tells.
+            let (a, _) = skin_mesh(&human.template, &read.at(nanos));
+            let (b, _) = skin_mesh(&template, &track.at(nanos));
+            for (a, b) in a.iter().zip(&b) {
+                assert!(a.distance(*b) < 1e-5, "{nanos}: {a} {b}");
+            }
+        }
+        // A pose of another body.
+        let single = Pose { root_translation: DVec3::ZERO, joint_rotations: vec![DQuat::IDENTITY] };
+        let other = PoseTrack::new(vec![(0, single)]).unwrap();
+        let refused = write_glb(&path, &template, &other).unwrap_err().to_string();
+        assert!(refused.contains("a pose of 1 joints does not fit"), "{refused}");
+    }
 }

@@ -1,0 +1,91 @@
+//! A recorded motion of any skeleton, before it is brought onto ours.
+
+use glam::{DQuat, DVec3};
+
+use crate::bvh::BvhLocal;
+use crate::retarget::bind_rotation;
+use crate::{BodyError, BvhClip, GltfHuman};
+
+/// A joint in a frame: place, and rotation away from the rest pose, both in the file's world (y up).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Moved {
+    pub position: DVec3,
+    pub turned: DQuat,
+}
+
+/// A motion with its skeleton, from a BVH clip ([`BvhClip::motion`]) or a glTF file ([`GltfHuman::motion`]); bring it
+/// onto a body with [`MotionClip::retarget`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct MotionClip {
+    /// Where it came from, for messages.
+    pub(crate) what: String,
+    pub(crate) names: Vec<String>,
+    pub(crate) parents: Vec<Option<usize>>,
+    /// Places of the joints at rest, y up, the file's units.
+    pub(crate) origins: Vec<DVec3>,
+    /// Nanoseconds and joints.
+    pub(crate) frames: Vec<(i64, Vec<Moved>)>,
+}
+
+impl BvhClip {
+    /// The clip as a motion to be retargeted.
+    #[must_use]
+    pub fn motion(&self) -> MotionClip {
+        let mut origins: Vec<DVec3> = Vec::with_capacity(self.joints.len());
+        for joint in &self.joints {
+            origins.push(joint.parent.map_or(DVec3::ZERO, |parent| origins[parent] + joint.offset));
+        }
+        let frame = |index: usize| {
+            let mut world: Vec<Moved> = Vec::with_capacity(self.joints.len());
+            for (joint, local) in self.joints.iter().zip(self.locals(index)) {
+                let BvhLocal { translation, rotation } = local;
+                // At rest a BVH joint has the axes of the world.
+                world.push(match joint.parent.map(|parent| world[parent]) {
+                    None => Moved { position: translation, turned: rotation },
+                    Some(parent) => Moved {
+                        position: parent.position + parent.turned * translation,
+                        turned: (parent.turned * rotation).normalize(),
+                    },
+                });
+            }
+            ((index as f64 * self.frame_secs * 1e9).round() as i64, world)
+        };
+        MotionClip {
+            what: self.path.display().to_string(),
+            names: self.joints.iter().map(|joint| joint.name.clone()).collect(),
+            parents: self.joints.iter().map(|joint| joint.parent).collect(),
+            origins,
+            frames: (0..self.frames.len()).map(frame).collect(),
+        }
+    }
+}
+
+impl GltfHuman {
+    /// The file's first animation as a motion to be retargeted; its rest is the bind pose.
+    ///
+    /// # Errors
+    /// [`BodyError::Skeleton`] when the file has no animation.
+    pub fn motion(&self) -> Result<MotionClip, BodyError> {
+        let (template, what) = (&self.template, format!("'{}'", self.template.name));
+        let Some(track) = &self.track else {
+            return Err(BodyError::Skeleton(format!("{what} has no animation; export one with the body")));
+        };
+        let joints = template.skeleton.joints();
+        let rest: Vec<DQuat> = joints.iter().map(|joint| bind_rotation(joint).inverse()).collect();
+        let frame = |(nanos, pose): &(i64, flyrig_types::Pose)| {
+            let world = template.skeleton.world_from_joint(pose);
+            let moved = world.iter().zip(&rest).map(|(world, rest)| Moved {
+                position: world.w_axis.truncate(),
+                turned: (DQuat::from_mat4(world) * *rest).normalize(),
+            });
+            (*nanos, moved.collect())
+        };
+        Ok(MotionClip {
+            what,
+            names: joints.iter().map(|joint| joint.name.clone()).collect(),
+            parents: joints.iter().map(|joint| joint.parent).collect(),
+            origins: template.skeleton.canonical_origins(),
+            frames: track.keys().iter().map(frame).collect(),
+        })
+    }
+}

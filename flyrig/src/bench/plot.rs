@@ -1,0 +1,224 @@
+//! Plain SVG diagrams.
+
+use std::fmt::Write as _;
+
+const WIDTH: f64 = 820.0;
+const HEIGHT: f64 = 440.0;
+const LEFT: f64 = 70.0;
+const RIGHT: f64 = 24.0;
+const TOP: f64 = 44.0;
+const BOTTOM: f64 = 54.0;
+const COLORS: [&str; 4] = ["#c2410c", "#1d4ed8", "#15803d", "#7e22ce"];
+
+/// Points of one kind.
+pub struct Series {
+    pub name: String,
+    /// Place and label.
+    pub points: Vec<(f64, f64, String)>,
+    /// Whether a line runs through them.
+    pub joined: bool,
+}
+
+/// A diagram.
+pub struct Plot {
+    pub title: String,
+    pub x_label: String,
+    pub y_label: String,
+    pub log_x: bool,
+    pub log_y: bool,
+    /// Draws the line of points that no other one beats in both directions (less is better).
+    pub front: bool,
+    pub series: Vec<Series>,
+}
+
+/// From values to pixels along one axis.
+struct Axis {
+    low: f64,
+    high: f64,
+    log: bool,
+    from: f64,
+    to: f64,
+}
+
+impl Axis {
+    fn new(values: impl Iterator<Item = f64>, log: bool, from: f64, to: f64) -> Self {
+        let usable = |v: &f64| v.is_finite() && (!log || *v > 0.0);
+        let (low, high) =
+            values.filter(usable).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
+        let (low, high) = if low <= high { (low, high) } else { (1.0, 2.0) };
+        let (low, high) = if log {
+            (low / 1.25, high * 1.25)
+        } else {
+            let pad = (0.08 * (high - low)).max(1e-9 + 0.02 * high.abs());
+            (low - pad, high + pad)
+        };
+        Self { low, high, log, from, to }
+    }
+
+    fn at(&self, value: f64) -> f64 {
+        let share = if self.log {
+            (value / self.low).ln() / (self.high / self.low).ln()
+        } else {
+            (value - self.low) / (self.high - self.low)
+        };
+        self.from + share * (self.to - self.from)
+    }
+
+    fn ticks(&self) -> Vec<f64> {
+        if self.log {
+            let first = self.low.log10().floor() as i32;
+            let last = self.high.log10().ceil() as i32;
+            let all = (first..=last).flat_map(|e| [1.0, 2.0, 5.0].map(|m| m * 10f64.powi(e)));
+            return all.filter(|v| (self.low..=self.high).contains(v)).collect();
+        }
+        let raw = (self.high - self.low) / 6.0;
+        let power = 10f64.powf(raw.log10().floor());
+        let step = [1.0, 2.0, 5.0, 10.0].into_iter().map(|m| m * power).find(|s| *s >= raw).unwrap_or(raw);
+        let first = (self.low / step).ceil() as i64;
+        let last = (self.high / step).floor() as i64;
+        (first..=last).map(|k| k as f64 * step).collect()
+    }
+}
+
+impl Plot {
+    /// The picture, on white.
+    pub fn svg(&self) -> String {
+        let all = || self.series.iter().flat_map(|s| &s.points).filter(|(x, y, _)| x.is_finite() && y.is_finite());
+        let x = Axis::new(all().map(|p| p.0), self.log_x, LEFT, WIDTH - RIGHT);
+        let y = Axis::new(all().map(|p| p.1), self.log_y, HEIGHT - BOTTOM, TOP);
+        let mut svg = format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" width=\"{WIDTH}\" \
+             height=\"{HEIGHT}\" font-family=\"sans-serif\" font-size=\"12\"><rect width=\"100%\" height=\"100%\" \
+             fill=\"#fff\"/><text x=\"{LEFT}\" y=\"24\" font-size=\"16\" fill=\"#111\">{}</text>",
+            escape(&self.title)
+        );
+        for tick in x.ticks() {
+            let at = x.at(tick);
+            let _ = write!(
+                svg,
+                "<line x1=\"{at:.1}\" x2=\"{at:.1}\" y1=\"{TOP}\" y2=\"{:.1}\" stroke=\"#e5e7eb\"/><text x=\"{at:.1}\" \
+                 y=\"{:.1}\" text-anchor=\"middle\" fill=\"#374151\">{}</text>",
+                HEIGHT - BOTTOM,
+                HEIGHT - BOTTOM + 18.0,
+                short(tick)
+            );
+        }
+        for tick in y.ticks() {
+            let at = y.at(tick);
+            let _ = write!(
+                svg,
+                "<line x1=\"{LEFT}\" x2=\"{:.1}\" y1=\"{at:.1}\" y2=\"{at:.1}\" stroke=\"#e5e7eb\"/><text x=\"{:.1}\" \
+                 y=\"{:.1}\" text-anchor=\"end\" fill=\"#374151\">{}</text>",
+                WIDTH - RIGHT,
+                LEFT - 8.0,
+                at + 4.0,
+                short(tick)
+            );
+        }
+        let _ = write!(
+            svg,
+            "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\" fill=\"#111\">{}</text><text transform=\"rotate(-90)\" \
+             x=\"{:.1}\" y=\"18\" text-anchor=\"middle\" fill=\"#111\">{}</text>",
+            (LEFT + WIDTH - RIGHT) / 2.0,
+            HEIGHT - 14.0,
+            escape(&self.x_label),
+            -(TOP + HEIGHT - BOTTOM) / 2.0,
+            escape(&self.y_label)
+        );
+        if self.front {
+            let points: Vec<(f64, f64)> = all().map(|p| (p.0, p.1)).collect();
+            let line = front(&points);
+            svg += &polyline(&line, &x, &y, "#9ca3af", " stroke-dasharray=\"5 4\"");
+        }
+        for (i, series) in self.series.iter().enumerate() {
+            let color = COLORS[i % COLORS.len()];
+            let points = || series.points.iter().filter(|(x, y, _)| x.is_finite() && y.is_finite());
+            if series.joined {
+                let line: Vec<(f64, f64)> = points().map(|p| (p.0, p.1)).collect();
+                svg += &polyline(&line, &x, &y, color, "");
+            }
+            for (px, py, label) in points() {
+                let (px, py) = (x.at(*px), y.at(*py));
+                let _ = write!(
+                    svg,
+                    "<circle cx=\"{px:.1}\" cy=\"{py:.1}\" r=\"4\" fill=\"{color}\"/><text x=\"{:.1}\" y=\"{:.1}\" \
+                     font-size=\"10\" fill=\"#374151\">{}</text>",
+                    px + 6.0,
+                    py - 5.0,
+                    escape(label)
+                );
+            }
+            let at = WIDTH - RIGHT - 190.0;
+            let row = TOP + 8.0 + 18.0 * i as f64;
+            let _ = write!(
+                svg,
+                "<circle cx=\"{at:.1}\" cy=\"{row:.1}\" r=\"4\" fill=\"{color}\"/><text x=\"{:.1}\" y=\"{:.1}\" \
+                 fill=\"#111\">{}</text>",
+                at + 10.0,
+                row + 4.0,
+                escape(&series.name)
+            );
+        }
+        svg + "</svg>\n"
+    }
+}
+
+/// The points that no other one beats in both directions, from left to right.
+fn front(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
+    let mut sorted = points.to_vec();
+    sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+    let mut best = f64::INFINITY;
+    sorted.retain(|p| {
+        let better = p.1 < best;
+        best = best.min(p.1);
+        better
+    });
+    sorted
+}
+
+fn polyline(points: &[(f64, f64)], x: &Axis, y: &Axis, color: &str, more: &str) -> String {
+    let path: Vec<String> = points.iter().map(|p| format!("{:.1},{:.1}", x.at(p.0), y.at(p.1))).collect();
+    format!("<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"1.6\"{more} points=\"{}\"/>", path.join(" "))
+}
+
+fn short(value: f64) -> String {
+    let text = format!("{value:.3}");
+    text.trim_end_matches('0').trim_end_matches('.').to_owned()
+}
+
+fn escape(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_front_holds_what_nothing_beats() {
+        let points = [(1.0, 9.0), (2.0, 5.0), (3.0, 6.0), (4.0, 1.0), (2.0, 4.0)];
+        assert_eq!(front(&points), [(1.0, 9.0), (2.0, 4.0), (4.0, 1.0)]);
+    }
+
+    #[test]
+    fn a_diagram_of_anything_is_sound() {
+        let plot = |points: Vec<(f64, f64, String)>| Plot {
+            title: "a < b".to_owned(),
+            x_label: "x".to_owned(),
+            y_label: "y".to_owned(),
+            log_x: true,
+            log_y: false,
+            front: true,
+            series: vec![Series { name: "s".to_owned(), points, joined: true }],
+        };
+        for points in [
+            vec![],
+            vec![(5.0, 5.0, "one".to_owned())],
+            vec![(f64::NAN, 1.0, String::new()), (10.0, 0.0, String::new()), (1000.0, 3.0, "z".to_owned())],
+        ] {
+            let svg = plot(points).svg();
+            assert!(svg.starts_with("<svg") && svg.ends_with("</svg>\n"), "{svg}");
+            assert!(!svg.contains("NaN") && !svg.contains("inf") && svg.contains("a &lt; b"), "{svg}");
+        }
+    }
+}

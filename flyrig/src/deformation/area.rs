@@ -1,0 +1,113 @@
+//! Which part of a picture the person can be in, and how fine it is worth looking at.
+
+use flyrig_body::{DeformationGraph, Skeleton, SkinWeights, SurfaceGaussians, skin_point_f64};
+use flyrig_renderer::WantedPicture;
+use flyrig_types::{Camera, Pose};
+use glam::{DMat4, DVec3};
+
+use super::TrackedView;
+
+/// The area ends at multiples of this: the sides of the rasteriser's tiles divide it at every level.
+const GRID_PX: u32 = 16 << WantedPicture::MAX_LEVEL;
+/// What the area reaches beyond mask and body, as a share of its longer side.
+const MARGIN: f64 = 0.06;
+
+/// Pixels a square metre at which the weights of Eq. 3 mean what they mean in the paper: a person 400 pixels high.
+const PAPER_PIXELS_A_M2: f64 = (400.0 / 1.75) * (400.0 / 1.75);
+
+/// How a view is looked at.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ViewPlan {
+    /// Pictures are halved so often.
+    pub level: u32,
+    /// Pixels of the halved picture that count.
+    pub area: [u32; 4],
+    /// Factor of the loss: a square metre counts the same at any resolution.
+    pub weight: f64,
+    /// Pixels of the halved picture a metre, at the person.
+    pub pixels_a_m: f64,
+}
+
+/// Points all over the body.
+#[derive(Debug)]
+pub struct Landmarks {
+    points: Vec<(DVec3, SkinWeights)>,
+}
+
+impl Landmarks {
+    /// The nodes of the graph.
+    pub fn new(surface: &SurfaceGaussians, graph: &DeformationGraph) -> Self {
+        let point = |&g: &u32| Some((surface.positions.get(g as usize)?.as_dvec3(), *surface.skin.get(g as usize)?));
+        Self { points: graph.node_gaussian.iter().filter_map(point).collect() }
+    }
+
+    /// Place and skin weights of every node.
+    pub fn nodes(&self) -> &[(DVec3, SkinWeights)] {
+        &self.points
+    }
+
+    /// One plan a view. Pixels need not be finer than the Gaussians' scale.
+    pub fn plans(
+        &self,
+        skeleton: &Skeleton,
+        instants: &[&Pose],
+        views: &[TrackedView<'_>],
+        scale_m: f64,
+        max_level: u32,
+    ) -> Vec<ViewPlan> {
+        let bones: Vec<_> = instants.iter().map(|pose| skeleton.world_from_canonical(pose)).collect();
+        let plan = |view: &TrackedView<'_>| {
+            let bones = bones.get(view.instant).map_or(&[][..], Vec::as_slice);
+            let center = self.points.iter().map(|(point, skin)| skin_point_f64(bones, skin, *point)).sum::<DVec3>()
+                / self.points.len().max(1) as f64;
+            let depth = view.camera.camera_from_world.transform_point(center).z.max(1e-3);
+            let fine = view.camera.intrinsics.focal_px.element_sum() * 0.5 / depth;
+            let level = (fine * scale_m).log2().round().clamp(0.0, f64::from(max_level.min(WantedPicture::MAX_LEVEL)));
+            let shrink = level.exp2();
+            let pixels_a_m = fine / shrink;
+            let area = self.area(bones, view.camera, view.size, view.rgba);
+            let level = level as u32;
+            ViewPlan {
+                level,
+                area: [area[0] >> level, area[1] >> level, area[2] >> level, area[3] >> level],
+                weight: PAPER_PIXELS_A_M2 / (pixels_a_m * pixels_a_m),
+                pixels_a_m,
+            }
+        };
+        views.iter().map(plan).collect()
+    }
+
+    /// The pixels that mask or posed body may touch, `[left, top, right, bottom]`, right and bottom excluded; the whole
+    /// picture when a part of the body has no place in it.
+    fn area(&self, bones: &[DMat4], camera: &Camera, [width, height]: [u32; 2], rgba: &[u8]) -> [u32; 4] {
+        let mut low = [f64::INFINITY; 2];
+        let mut high = [f64::NEG_INFINITY; 2];
+        let mut include = |x: f64, y: f64| {
+            (low[0], low[1]) = (low[0].min(x), low[1].min(y));
+            (high[0], high[1]) = (high[0].max(x), high[1].max(y));
+        };
+        for (row, pixels) in rgba.chunks_exact(4 * width.max(1) as usize).enumerate() {
+            let covered = |p: &[u8]| p[3] > 0;
+            let first = pixels.chunks_exact(4).position(covered);
+            let last = pixels.chunks_exact(4).rposition(covered);
+            if let (Some(first), Some(last)) = (first, last) {
+                include(first as f64, row as f64);
+                include(last as f64, row as f64);
+            }
+        }
+        for (point, skin) in &self.points {
+            match camera.project(skin_point_f64(bones, skin, *point)) {
+                Some(pixel) if pixel.is_finite() => include(pixel.x, pixel.y),
+                _ => return [0, 0, width, height],
+            }
+        }
+        if low[0] > high[0] {
+            return [0, 0, width, height];
+        }
+        let margin = MARGIN * (high[0] - low[0]).max(high[1] - low[1]);
+        let grid = f64::from(GRID_PX);
+        let first = |v: f64, side: u32| (((v - margin) / grid).floor() * grid).clamp(0.0, f64::from(side)) as u32;
+        let end = |v: f64, side: u32| (((v + margin + 1.0) / grid).ceil() * grid).clamp(0.0, f64::from(side)) as u32;
+        [first(low[0], width), first(low[1], height), end(high[0], width), end(high[1], height)]
+    }
+}

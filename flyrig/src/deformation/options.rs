@@ -1,0 +1,40 @@
+//! How the deformation is tracked.
+
+use flyrig_renderer::WantedPicture;
+use flyrig_tracker::{DeformSettings, PoseFreedom};
+
+/// Everything about the deformation that may be chosen.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DeformOptions {
+    /// Steps, weights and limits.
+    pub solver: DeformSettings,
+    /// Gaussians that are compared with the pictures; the others follow.
+    pub gaussians: usize,
+    /// Pictures are halved at most so often, while a pixel stays finer than the compared Gaussians.
+    pub max_level: u32,
+    /// Whether, and how freely, the pose is corrected as well.
+    pub pose: Option<PoseFreedom>,
+    /// Weight of the silhouette's distance term over that of the mask, a pixel.
+    pub outline: f32,
+    /// Colour difference at which robust weights have fallen to a quarter; infinite: squares.
+    pub robust_color: f32,
+}
+
+impl DeformOptions {
+    /// Compared as they are drawn: every Gaussian, every pixel.
+    pub fn full(solver: DeformSettings) -> Self {
+        Self { gaussians: usize::MAX, max_level: 0, ..Self::coarse(solver) }
+    }
+
+    /// Compared no finer than the result needs: measured in docs/benchmarks/deform.md.
+    pub fn coarse(solver: DeformSettings) -> Self {
+        Self {
+            solver,
+            gaussians: 30_000,
+            max_level: WantedPicture::MAX_LEVEL,
+            pose: None,
+            outline: 0.0,
+            robust_color: f32::INFINITY,
+        }
+    }
+}

@@ -1,0 +1,49 @@
+//! `flyrig sim export`: a simulated capture as a data set.
+
+use std::time::Instant;
+
+use anyhow::Result;
+use flyrig_gpu::GpuContext;
+use flyrig_sim::{ExportOptions, SimConfig, Simulator, export};
+
+use crate::{cli::SimExportArgs, eval::progress_bar, stop};
+
+/// Runs the command.
+pub fn sim_export(args: &SimExportArgs, config: &SimConfig, gpu: &GpuContext) -> Result<()> {
+    stop::flag();
+    let started = Instant::now();
+    let mut simulator = Simulator::new(gpu, config)?;
+    let options = ExportOptions { frames: args.frames, truth: !args.no_truth };
+    let bar = progress_bar(args.frames, "sim export");
+    let exported = export(&mut simulator, &args.out, options, &mut |frames| {
+        bar.set_position(frames);
+        !stop::requested()
+    });
+    bar.finish_and_clear();
+    let exported = exported?;
+    let names: Vec<&str> = simulator.rig().cameras.iter().map(|camera| camera.id.as_str()).collect();
+    println!(
+        "{}: {} frames of {} cameras, {} pictures in {:.1} s on {}",
+        args.out.display(),
+        args.frames,
+        names.len(),
+        exported.pictures,
+        started.elapsed().as_secs_f64(),
+        gpu.adapter_name()
+    );
+    if exported.lost > 0 {
+        println!("{} frames were lost by the fault script; truth/frames.csv says which", exported.lost);
+    }
+    let (inputs, holdout): (Vec<_>, Vec<_>) = names.iter().enumerate().partition(|(i, _)| i % 2 == 0);
+    let list = |cameras: Vec<(usize, &&str)>| cameras.iter().map(|(_, name)| **name).collect::<Vec<_>>().join(",");
+    if !holdout.is_empty() {
+        println!(
+            "score it with: flyrig eval {} --inputs {} --holdout {} --fps {} --out out/eval",
+            args.out.display(),
+            list(inputs),
+            list(holdout),
+            config.fps
+        );
+    }
+    Ok(())
+}

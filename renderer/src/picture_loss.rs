@@ -1,0 +1,319 @@
+//! How a drawn picture differs from the wanted one, and what the backward rasteriser needs to know of it.
+
+use bytemuck::{Pod, Zeroable};
+use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer, read_back};
+use wgpu::{CommandEncoder, ComputePassDescriptor};
+
+use crate::constants::ConstantWriter;
+use crate::scan::run;
+use crate::{PictureGradients, RenderTarget, linear_from_srgb};
+
+const WGSL: &str = include_str!("picture_loss.wgsl");
+/// Pixels of a column that one invocation compares.
+const ROWS: u32 = 4;
+/// Sums a picture that are read back; the CPU adds them up in `f64`.
+const SUMS: u32 = 64;
+
+/// Weights of a picture's loss
+/// `color_weight * ρ(|Δ colour|²) + mask_weight * (Δ alpha)² + outline_weight * d * Δ alpha`, summed over the pixels of
+/// an area: the first two terms are FlyHuman's Eq. 3 over premultiplied linear colour and coverage.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LossSettings {
+    /// λ_color.
+    pub color_weight: f32,
+    /// λ_mask.
+    pub mask_weight: f32,
+    /// Of `d`, how far outside (positive) or inside the mask's outline a pixel lies, less one pixel: what is drawn far
+    /// outside is pulled in, and what is missing far inside pulls, the farther the harder. A pixel's unit.
+    pub outline_weight: f32,
+    /// `d` grows no further beyond so many pixels; at most [`LossSettings::MAX_REACH_PX`].
+    pub reach_px: u32,
+    /// Difference of linear colour κ of the robust `ρ(s) = κ² s / (κ² + s)` (Geman and McClure 1987); infinite:
+    /// plain squares.
+    pub robust_color: f32,
+    /// What counts, `[left, top, right, bottom]` in pixels, right and bottom excluded.
+    pub area: [u32; 4],
+}
+
+impl LossSettings {
+    /// Longest reach of the outline term.
+    pub const MAX_REACH_PX: u32 = 64;
+    /// As good as no robust weights: squares of it stay finite.
+    const NO_LIMIT: f32 = 1e6;
+}
+
+/// Sums of one picture over its area.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct PictureSums {
+    /// The loss.
+    pub loss: f64,
+    /// Squared difference of alpha, pixels.
+    pub mask: f64,
+    /// Squared difference of colour, by how much of the person is wanted in a pixel.
+    pub color: f64,
+    /// How much of the person is wanted, pixels.
+    pub wanted: f64,
+}
+
+/// Constants of one comparison, `struct Loss` in picture_loss.wgsl.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+struct Loss {
+    size: [u32; 2],
+    first: [u32; 2],
+    area: [u32; 2],
+    sums_at: u32,
+    reach: u32,
+    color_weight: f32,
+    mask_weight: f32,
+    outline_weight: f32,
+    robust2: f32,
+    source_width: u32,
+    shrink: u32,
+}
+
+/// A picture that should be drawn, on the GPU.
+#[derive(Debug)]
+pub struct WantedPicture {
+    /// Pixels of the bytes, and how many of them make the side of a pixel.
+    source: [u32; 2],
+    shrink: u32,
+    width: u32,
+    height: u32,
+    bytes: StorageBuffer<u32>,
+    color: StorageBuffer<[f32; 4]>,
+    row_distance: StorageBuffer<f32>,
+    distance: StorageBuffer<f32>,
+    partials: StorageBuffer<[f32; 4]>,
+}
+
+impl WantedPicture {
+    /// The smallest is an 8th as wide and high.
+    pub const MAX_LEVEL: u32 = 3;
+
+    /// For pictures of `source` pixels, compared at `1 / 2^level` of that in each direction (rounded down, at least a
+    /// pixel): colours are means, in linear light and by coverage.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn zeroed(gpu: &GpuContext, source: [u32; 2], level: u32) -> Result<Self, GpuError> {
+        let level = level.min(source[0].min(source[1]).max(1).ilog2()).min(Self::MAX_LEVEL);
+        let [width, height] = source.map(|side| side >> level);
+        let pixels = width as usize * height as usize;
+        let partials = width as usize * height.div_ceil(ROWS) as usize;
+        Ok(Self {
+            source,
+            shrink: 1 << level,
+            width,
+            height,
+            bytes: StorageBuffer::zeroed(gpu, "wanted bytes", source[0] as usize * source[1] as usize)?,
+            color: StorageBuffer::zeroed(gpu, "wanted colour", pixels)?,
+            row_distance: StorageBuffer::zeroed(gpu, "distance along rows", pixels)?,
+            distance: StorageBuffer::zeroed(gpu, "distance to the outline", pixels)?,
+            partials: StorageBuffer::zeroed(gpu, "partial losses", partials)?,
+        })
+    }
+
+    /// Pixels of the picture as it is compared, width and height.
+    #[must_use]
+    pub fn size(&self) -> [u32; 2] {
+        [self.width, self.height]
+    }
+}
+
+/// Compares pictures on the GPU. Sums are made in a fixed order: equal input gives equal bytes on one device.
+#[derive(Debug)]
+pub struct PictureLoss {
+    unpack: ComputeKernel,
+    along: ComputeKernel,
+    across: ComputeKernel,
+    compare: ComputeKernel,
+    add_up: ComputeKernel,
+    linear: StorageBuffer<f32>,
+    sums: StorageBuffer<[f32; 4]>,
+}
+
+impl PictureLoss {
+    /// Compiles the kernels.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn new(gpu: &GpuContext) -> Result<Self, GpuError> {
+        let source = wgsl();
+        let kernel = |entry| ComputeKernel::new(gpu, entry, &[&source], entry);
+        let linear: Vec<f32> = (0..=255u8).map(|byte| linear_from_srgb(f32::from(byte) / 255.0)).collect();
+        Ok(Self {
+            unpack: kernel("unpack_wanted"),
+            along: kernel("distance_along_row"),
+            across: kernel("distance_across_rows"),
+            compare: kernel("compare"),
+            add_up: kernel("add_up"),
+            linear: StorageBuffer::from_slice(gpu, "linear of sRGB", &linear)?,
+            sums: StorageBuffer::zeroed(gpu, "losses", 0)?,
+        })
+    }
+
+    /// Room for the sums of `pictures` pictures.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn reserve(&mut self, gpu: &GpuContext, pictures: usize) -> Result<(), GpuError> {
+        let needed = pictures.saturating_mul(SUMS as usize);
+        if self.sums.len() < needed {
+            self.sums = StorageBuffer::zeroed(gpu, "losses", needed)?;
+        }
+        Ok(())
+    }
+
+    /// Uploads `rgba`, sRGB bytes with coverage row by row (missing pixels keep their content), and records the making of
+    /// what the comparisons within `settings.area` need. Once a picture and area.
+    pub fn prepare(
+        &self,
+        gpu: &GpuContext,
+        encoder: &mut CommandEncoder,
+        wanted: &WantedPicture,
+        rgba: &[u8],
+        settings: &LossSettings,
+    ) {
+        let words: Vec<u32> = rgba.chunks_exact(4).map(|p| u32::from_le_bytes([p[0], p[1], p[2], p[3]])).collect();
+        wanted.bytes.write(gpu, &words);
+        let Some((constants, groups)) = constants(gpu, wanted, 0, settings) else { return };
+        let mut pass =
+            encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("wanted picture"), ..Default::default() });
+        let (bytes, rows) = (wanted.bytes.raw().as_entire_binding(), wanted.row_distance.raw().as_entire_binding());
+        let (linear, color) = (self.linear.raw().as_entire_binding(), wanted.color.raw().as_entire_binding());
+        run(gpu, &mut pass, &self.unpack, &[constants.get(0), bytes, linear, color.clone()], groups);
+        if settings.outline_weight != 0.0 {
+            let distance = wanted.distance.raw().as_entire_binding();
+            run_at(gpu, &mut pass, &self.along, &[(0, constants.get(0)), (3, color), (4, rows.clone())], groups);
+            run_at(gpu, &mut pass, &self.across, &[(0, constants.get(0)), (4, rows), (5, distance)], groups);
+        }
+    }
+
+    /// Records the comparison of a drawn picture as number `index`, and writes its derivatives to `out`, both within
+    /// `settings.area`. Pictures smaller than the wanted one are not compared.
+    #[allow(clippy::too_many_arguments)]
+    pub fn encode(
+        &self,
+        gpu: &GpuContext,
+        encoder: &mut CommandEncoder,
+        index: usize,
+        drawn: &RenderTarget,
+        wanted: &WantedPicture,
+        settings: &LossSettings,
+        out: &PictureGradients,
+    ) {
+        let pixels = wanted.width as usize * wanted.height as usize;
+        let fits = (drawn.width, drawn.height) == (wanted.width, wanted.height)
+            && out.color.len().min(out.depth_carry.len()) >= pixels
+            && self.sums.len() >= (index + 1).saturating_mul(SUMS as usize);
+        let sums_at = index as u64 * u64::from(SUMS) * 16;
+        if fits {
+            encoder.clear_buffer(self.sums.raw(), sums_at, Some(u64::from(SUMS) * 16));
+        }
+        let Some((constants, groups)) = constants(gpu, wanted, index as u32, settings).filter(|_| fits) else { return };
+        let mut pass =
+            encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("picture loss"), ..Default::default() });
+        let partials = wanted.partials.raw().as_entire_binding();
+        let resources = [
+            (0, constants.get(0)),
+            (3, wanted.color.raw().as_entire_binding()),
+            (5, wanted.distance.raw().as_entire_binding()),
+            (6, drawn.color.raw().as_entire_binding()),
+            (7, out.color.raw().as_entire_binding()),
+            (8, out.depth_carry.raw().as_entire_binding()),
+            (9, partials.clone()),
+        ];
+        run_at(gpu, &mut pass, &self.compare, &resources, groups);
+        let resources = [(0, constants.get(0)), (9, partials), (10, self.sums.raw().as_entire_binding())];
+        run_at(gpu, &mut pass, &self.add_up, &resources, (SUMS.div_ceil(64), 1));
+    }
+
+    /// Waits for the GPU and reads the sums of the first `pictures` pictures.
+    ///
+    /// # Errors
+    /// [`GpuError::Lost`].
+    pub fn read(&self, gpu: &GpuContext, pictures: usize) -> Result<Vec<PictureSums>, GpuError> {
+        let len = pictures.saturating_mul(SUMS as usize).min(self.sums.len());
+        let sums: Vec<[f32; 4]> = read_back(gpu, self.sums.raw(), len)?;
+        let total = |one: &[[f32; 4]]| {
+            let [loss, mask, color, wanted] =
+                one.iter().fold([0.0; 4], |sum, s| std::array::from_fn(|i| sum[i] + f64::from(s[i])));
+            PictureSums { loss, mask, color, wanted }
+        };
+        Ok(sums.chunks(SUMS as usize).map(total).collect())
+    }
+}
+
+fn constants(
+    gpu: &GpuContext,
+    wanted: &WantedPicture,
+    index: u32,
+    settings: &LossSettings,
+) -> Option<(crate::constants::Constants, (u32, u32))> {
+    let [left, top, right, bottom] = settings.area;
+    let (right, bottom) = (right.min(wanted.width), bottom.min(wanted.height));
+    if left >= right || top >= bottom {
+        return None;
+    }
+    let area = [right - left, bottom - top];
+    let robust = settings.robust_color.clamp(1e-6, LossSettings::NO_LIMIT);
+    let mut writer = ConstantWriter::default();
+    writer.push(&Loss {
+        size: wanted.size(),
+        first: [left, top],
+        area,
+        sums_at: index * SUMS,
+        reach: settings.reach_px.min(LossSettings::MAX_REACH_PX),
+        color_weight: settings.color_weight,
+        mask_weight: settings.mask_weight,
+        outline_weight: settings.outline_weight,
+        robust2: robust * robust,
+        source_width: wanted.source[0],
+        shrink: wanted.shrink,
+    });
+    Some((writer.finish(gpu), (area[0].div_ceil(64), area[1].div_ceil(ROWS))))
+}
+
+/// As [`run`], with bindings whose numbers do not follow each other.
+fn run_at(
+    gpu: &GpuContext,
+    pass: &mut wgpu::ComputePass<'_>,
+    kernel: &ComputeKernel,
+    resources: &[(u32, wgpu::BindingResource<'_>)],
+    (x, y): (u32, u32),
+) {
+    let entries: Vec<_> = resources
+        .iter()
+        .map(|(binding, resource)| wgpu::BindGroupEntry { binding: *binding, resource: resource.clone() })
+        .collect();
+    let group = gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
+        label: None,
+        layout: &kernel.pipeline.get_bind_group_layout(0),
+        entries: &entries,
+    });
+    pass.set_pipeline(&kernel.pipeline);
+    pass.set_bind_group(0, &group, &[]);
+    pass.dispatch_workgroups(x, y, 1);
+}
+
+fn wgsl() -> String {
+    format!("const ROWS: u32 = {ROWS}u;\nconst SUMS: u32 = {SUMS}u;\n{WGSL}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_kernels_are_valid_and_the_constants_have_their_layout() {
+        let source = wgsl();
+        assert!(!source.contains("var<uniform>"), "see constants.rs");
+        let module = naga::front::wgsl::parse_str(&source).unwrap();
+        let flags = naga::valid::ValidationFlags::all();
+        naga::valid::Validator::new(flags, naga::valid::Capabilities::empty()).validate(&module).unwrap();
+        let loss = module.types.iter().find(|(_, t)| t.name.as_deref() == Some("Loss")).unwrap().1;
+        let naga::TypeInner::Struct { span, .. } = loss.inner else { panic!("Loss is a struct") };
+        assert_eq!(span as usize, size_of::<Loss>());
+    }
+}

@@ -1,0 +1,76 @@
+//! Motions that need no file: each a closed curve of postures.
+
+mod dance;
+mod gestures;
+mod jump;
+mod lower;
+mod turn;
+mod walk;
+
+use flyrig_types::PoseTrack;
+
+use crate::curve::smooth_above;
+use crate::posture::Posture;
+use crate::puppet::Puppet;
+use crate::{MotionKind, SimError};
+
+pub(crate) use walk::passing;
+
+const KEYS_A_SECOND: f64 = 60.0;
+
+/// A motion that repeats.
+pub(crate) struct Clip<'a> {
+    /// Seconds of one round.
+    pub secs: f64,
+    /// Posture at a phase, 0..1 of the round.
+    pub posture: Box<dyn Fn(f64) -> Posture + 'a>,
+}
+
+impl<'a> Clip<'a> {
+    fn new(secs: f64, posture: impl Fn(f64) -> Posture + 'a) -> Self {
+        Self { secs, posture: Box::new(posture) }
+    }
+
+    /// One round as poses, its end equal to its start, from a phase on.
+    pub(crate) fn track(&self, puppet: &Puppet<'_>, phase: f64) -> Result<PoseTrack, SimError> {
+        /// Hips go down and up again within this many keys around where the legs need it.
+        const SOFT_KEYS: usize = 6;
+        let count = (self.secs * KEYS_A_SECOND).ceil().max(2.0) as usize;
+        let postures: Vec<Posture> =
+            (0..count).map(|key| (self.posture)((key as f64 / count as f64 + phase).rem_euclid(1.0))).collect();
+        let too_high: Vec<f64> = postures.iter().map(|posture| puppet.too_high_m(posture)).collect();
+        let lower = smooth_above(&too_high, SOFT_KEYS);
+        let key = |index: usize| {
+            let nanos = (index as f64 / count as f64 * self.secs * 1e9) as i64;
+            (nanos, puppet.pose(&postures[index % count], lower[index % count]))
+        };
+        Ok(PoseTrack::new((0..=count).map(key).collect())?)
+    }
+
+    /// The posture at a phase and no motion.
+    pub(crate) fn held(&self, puppet: &Puppet<'_>, phase: f64) -> Result<PoseTrack, SimError> {
+        let posture = (self.posture)(phase.rem_euclid(1.0));
+        Ok(PoseTrack::new(vec![(0, puppet.pose(&posture, puppet.too_high_m(&posture)))])?)
+    }
+}
+
+/// The clip of a kind; files and the seed's choice are not clips and stand still. `turn_secs` is the time of a full
+/// turn at speed 1.
+pub(crate) fn clip<'a>(kind: MotionKind, puppet: &'a Puppet<'_>, seed: u64, turn_secs: f64, speed: f64) -> Clip<'a> {
+    let speed = speed.max(1e-3);
+    match kind {
+        MotionKind::Turn => turn::turn(puppet, turn_secs / speed),
+        MotionKind::Walk => walk::circle(puppet, speed),
+        MotionKind::Wave => gestures::wave(puppet, speed),
+        MotionKind::Reach => gestures::reach(puppet, speed),
+        MotionKind::CrossArms => gestures::cross_arms(puppet, speed),
+        MotionKind::Squat => lower::squat(puppet, speed),
+        MotionKind::Sit => lower::sit(puppet, speed),
+        MotionKind::Jump => jump::jump(puppet, speed),
+        MotionKind::Dance => dance::dance(puppet, seed, speed),
+        MotionKind::Still | MotionKind::BySeed | MotionKind::Bvh | MotionKind::Gltf => gestures::still(puppet),
+    }
+}
+
+#[cfg(test)]
+mod tests;

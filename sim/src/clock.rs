@@ -1,0 +1,166 @@
+//! Which instant the simulated cameras take next.
+
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+/// How simulated time goes on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SimTime {
+    /// By one frame interval a call of each source, whatever the wall clock does: every instant is simulated.
+    Exact,
+    /// With the wall clock. Where drawing is slower than the frame rate, whole instants are skipped, by all cameras
+    /// alike, as a slower rig would.
+    Real,
+}
+
+/// Gives the sources of one simulator their instants in [`SimTime::Real`].
+#[derive(Debug)]
+pub(crate) struct RealClock {
+    interval: Duration,
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Debug)]
+struct State {
+    /// When the instant 0 was due.
+    origin: Option<Instant>,
+    /// The instant that is being taken; none before the first.
+    index: Option<u64>,
+    cameras: Vec<Progress>,
+    skipped: u64,
+}
+
+#[derive(Debug, Clone, Default)]
+struct Progress {
+    /// The instant it took last.
+    last: Option<u64>,
+    /// Gone for good or for a while: nobody waits for it.
+    away: bool,
+}
+
+impl RealClock {
+    pub(crate) fn new(cameras: usize, fps: f64) -> Self {
+        Self {
+            interval: Duration::from_secs_f64(1.0 / fps),
+            state: Mutex::new(State {
+                origin: None,
+                index: None,
+                cameras: vec![Progress::default(); cameras],
+                skipped: 0,
+            }),
+            changed: Condvar::new(),
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The next instant for the camera in `slot`: the one that the others are taking where it lacks that, else a new
+    /// one as soon as all have the last and it is due. `None` when that is not within `timeout`.
+    pub(crate) fn next(&self, slot: usize, timeout: Duration) -> Option<u64> {
+        let deadline = Instant::now() + timeout;
+        let mut state = self.lock();
+        state.cameras[slot].away = false;
+        loop {
+            if state.index.is_some() && state.cameras[slot].last != state.index {
+                state.cameras[slot].last = state.index;
+                self.changed.notify_all();
+                return state.index;
+            }
+            let now = Instant::now();
+            let mut until = deadline;
+            if state.cameras.iter().all(|camera| camera.away || camera.last == state.index) {
+                let origin = *state.origin.get_or_insert(now);
+                let next = state.index.map_or(0, |index| index + 1);
+                let current = (now.duration_since(origin).as_secs_f64() / self.interval.as_secs_f64()) as u64;
+                if current >= next {
+                    state.begin(current, current - next);
+                    continue;
+                }
+                until = until.min(origin + self.interval.mul_f64(next as f64));
+            }
+            if now >= deadline {
+                return None;
+            }
+            let wait = until.saturating_duration_since(now);
+            state = self.changed.wait_timeout(state, wait).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    /// Nobody waits for the camera until it asks again.
+    pub(crate) fn leave(&self, slot: usize) {
+        self.lock().cameras[slot].away = true;
+        self.changed.notify_all();
+    }
+}
+
+impl State {
+    fn begin(&mut self, index: u64, skipped: u64) {
+        self.index = Some(index);
+        let before = self.skipped;
+        self.skipped += skipped;
+        // The 1st, 2nd, 4th ...: a rig that runs all night must not fill the disk.
+        if before.checked_ilog2() != self.skipped.checked_ilog2() {
+            tracing::warn!(
+                skipped = self.skipped,
+                "this machine cannot draw the simulated cameras at their rate; instants are skipped. Lower sim.fps or the \
+                 pictures' size, or set source.real_time = false to have every instant"
+            );
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NOW: Duration = Duration::ZERO;
+    const LONG: Duration = Duration::from_secs(20);
+
+    /// A clock whose instants are all due.
+    fn late(cameras: usize) -> RealClock {
+        let clock = RealClock::new(cameras, 1000.0);
+        clock.lock().origin = Instant::now().checked_sub(Duration::from_secs(5));
+        clock
+    }
+
+    #[test]
+    fn all_cameras_take_the_same_instants_and_late_ones_are_skipped_together() {
+        let clock = late(3);
+        let first = clock.next(0, NOW).unwrap();
+        assert!(first >= 5000, "5 s late at 1000 a second, but the instant is {first}");
+        // Camera 0 gets no second instant before the others have the first.
+        assert_eq!(clock.next(0, Duration::from_millis(5)), None);
+        assert_eq!(clock.next(2, NOW), Some(first));
+        assert_eq!(clock.next(0, NOW), None);
+        assert_eq!(clock.next(1, NOW), Some(first));
+        let second = clock.next(1, LONG).unwrap();
+        assert!(second > first);
+        assert_eq!((clock.next(0, NOW), clock.next(2, NOW)), (Some(second), Some(second)));
+        assert!(clock.lock().skipped >= 5000);
+    }
+
+    #[test]
+    fn nobody_waits_for_a_camera_that_is_away_and_it_joins_in_when_it_returns() {
+        let clock = late(2);
+        let first = clock.next(0, NOW).unwrap();
+        clock.leave(1);
+        let second = clock.next(0, LONG).unwrap();
+        assert!(second > first);
+        assert_eq!(clock.next(1, NOW), Some(second));
+        // One that leaves with an instant does not get it twice, not even when it is alone.
+        clock.leave(0);
+        clock.leave(1);
+        assert!(clock.next(1, LONG).unwrap() > second);
+    }
+
+    #[test]
+    fn an_instant_is_not_given_before_it_is_due() {
+        let clock = RealClock::new(1, 0.1);
+        assert_eq!(clock.next(0, NOW), Some(0));
+        assert_eq!(clock.next(0, Duration::from_millis(1)), None);
+        assert_eq!(clock.lock().skipped, 0);
+    }
+}

@@ -1,0 +1,172 @@
+//! One step of the particles: extended position-based dynamics with small steps (Macklin, Müller, Chentanez, XPBD:
+//! Position-Based Simulation of Compliant Constrained Dynamics, MIG 2016, Eq. 17 and 18, one iteration a step as in
+//! Macklin et al., Small Steps in Physics Simulation, SCA 2019).
+
+use glam::Vec3;
+
+use super::colliders::Capsule;
+
+/// Steps a second.
+pub(crate) const STEPS_A_SECOND: i64 = 120;
+pub(crate) const STEP_SECS: f32 = 1.0 / STEPS_A_SECOND as f32;
+pub(crate) const GRAVITY: f32 = 9.81;
+/// Rate at which motion against the air dies, 1/s.
+const AIR: f32 = 0.9;
+/// Rate at which motion against the wearer dies, 1/s.
+const RUB: f32 = 1.6;
+/// Inverse stiffness of threads, and of cloth that is pushed together, per unit of mass.
+const STRETCH_COMPLIANCE: f32 = 2e-5;
+const PUSH_COMPLIANCE: f32 = 2e-3;
+/// Share of the sliding along the body that friction takes in a step.
+const FRICTION: f32 = 0.25;
+/// Faster against its wearer than this, metres a second, nothing moves.
+const FASTEST: f32 = 7.0;
+/// A carrier that moves farther than this in a step is not followed but jumped to, metres.
+const TELEPORT_M: f32 = 0.25;
+/// Cloth lies this far above the floor, metres.
+const FLOOR_M: f32 = 0.004;
+
+/// What does not change from step to step.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Particles {
+    pub points: Vec<Particle>,
+    pub links: Vec<Link>,
+}
+
+/// A control particle.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Particle {
+    /// How long it hangs free, metres; 0 for one that is sewn on.
+    pub free_m: f32,
+    /// Stiffness of what it is made of, 1 for plain cloth.
+    pub stiff: f32,
+    /// Distance of the body below along the surface's normal that it keeps, metres; none for what hangs away from it.
+    pub backstop_m: Option<f32>,
+    /// Whether the body's capsules push it; how deep inside them it may be, as it is at rest, metres.
+    pub inside_m: Option<f32>,
+}
+
+/// Two particles and their distance at rest, metres; `soft` multiplies the compliance (bending).
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Link {
+    pub ends: [u32; 2],
+    pub rest_m: f32,
+    pub soft: f32,
+}
+
+/// What skinning says about a particle at a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Carried {
+    /// Its skinned place.
+    pub place: Vec3,
+    /// The direction that was up at rest.
+    pub up: Vec3,
+    /// The surface's normal.
+    pub normal: Vec3,
+}
+
+/// What changes from step to step.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct State {
+    pub places: Vec<Vec3>,
+    pub speeds: Vec<Vec3>,
+    /// Skinned places of the step before.
+    pub carried: Vec<Vec3>,
+}
+
+impl State {
+    /// At rest on the body.
+    pub(crate) fn at_rest(carried: &[Carried]) -> Self {
+        let places: Vec<Vec3> = carried.iter().map(|c| c.place).collect();
+        Self { speeds: vec![Vec3::ZERO; places.len()], carried: places.clone(), places }
+    }
+}
+
+/// Squared angular frequency with which a particle swings about its skinned place, 1/s^2: that of a pendulum of its
+/// length, as gravity at rest is part of its shape.
+pub(crate) fn pull(particle: &Particle) -> f32 {
+    particle.stiff * GRAVITY / particle.free_m.max(1e-3)
+}
+
+/// A step of [`STEP_SECS`].
+pub(crate) fn step(particles: &Particles, carried: &[Carried], capsules: &[Capsule], state: &mut State) {
+    const DT: f32 = STEP_SECS;
+    let before = state.places.clone();
+    for (i, (particle, now)) in particles.points.iter().zip(carried).enumerate() {
+        let was = state.carried[i];
+        if !now.place.is_finite() {
+            continue;
+        }
+        if now.place.distance(was) > TELEPORT_M || !was.is_finite() {
+            // The wearer is somewhere else now: everything goes along.
+            (state.places[i], state.speeds[i]) = (now.place, Vec3::ZERO);
+            continue;
+        }
+        if particle.free_m <= 0.0 {
+            state.places[i] = now.place;
+            continue;
+        }
+        // What gravity does beyond what it does at rest.
+        let fall = (now.up - Vec3::Z) * GRAVITY;
+        let wearer = (now.place - was) / DT;
+        let mut speed = (state.speeds[i] + fall * DT) / (1.0 + AIR * DT);
+        speed = wearer + (speed - wearer) / (1.0 + RUB * DT);
+        let place = state.places[i] + speed * DT;
+        let pull = pull(particle) * DT * DT;
+        state.places[i] = place + (now.place - place) * (pull / (1.0 + pull));
+    }
+    for link in &particles.links {
+        hold(particles, link, &mut state.places);
+    }
+    for (i, (particle, now)) in particles.points.iter().zip(carried).enumerate() {
+        if particle.free_m <= 0.0 || !now.place.is_finite() {
+            state.carried[i] = now.place;
+            continue;
+        }
+        let wearer = now.place - state.carried[i];
+        let wearer = if wearer.length() > TELEPORT_M { Vec3::ZERO } else { wearer };
+        let mut place = state.places[i];
+        if let Some(keep_m) = particle.backstop_m {
+            let above = (place - now.place).dot(now.normal) + keep_m;
+            place -= now.normal * above.min(0.0);
+        }
+        if let Some(inside_m) = particle.inside_m {
+            for capsule in capsules {
+                if let Some((depth, out)) = capsule.depth(place).filter(|(depth, _)| *depth > inside_m) {
+                    place += out * (depth - inside_m);
+                    let slid = place - before[i] - wearer;
+                    place -= (slid - out * slid.dot(out)) * FRICTION;
+                }
+            }
+        }
+        place.z = place.z.max(FLOOR_M);
+        // No thread is longer than it is, whatever happens.
+        place = now.place + (place - now.place).clamp_length_max(1.3 * particle.free_m);
+        let speed = if wearer == Vec3::ZERO && now.place.distance(state.carried[i]) > TELEPORT_M {
+            Vec3::ZERO
+        } else {
+            (place - before[i] - wearer).clamp_length_max(FASTEST * DT) / DT + wearer / DT
+        };
+        let sound = place.is_finite() && speed.is_finite();
+        (state.places[i], state.speeds[i]) = if sound { (place, speed) } else { (now.place, Vec3::ZERO) };
+        state.carried[i] = now.place;
+    }
+}
+
+/// Distance constraint: Eq. 18 of XPBD with the multiplier started at zero each step; all free particles weigh the same.
+fn hold(particles: &Particles, link: &Link, places: &mut [Vec3]) {
+    let [a, b] = link.ends.map(|end| end as usize);
+    let weight = |i: usize| f32::from(u8::from(particles.points[i].free_m > 0.0));
+    let (wa, wb) = (weight(a), weight(b));
+    let apart = places[b] - places[a];
+    let length = apart.length();
+    if wa + wb <= 0.0 || length < 1e-6 {
+        return;
+    }
+    let too_long = length - link.rest_m;
+    let compliance = link.soft * if too_long > 0.0 { STRETCH_COMPLIANCE } else { PUSH_COMPLIANCE };
+    let share = too_long / (wa + wb + compliance / (STEP_SECS * STEP_SECS));
+    let moved = apart * (share / length);
+    places[a] += moved * wa;
+    places[b] -= moved * wb;
+}

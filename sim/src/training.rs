@@ -1,0 +1,205 @@
+//! Endless random captures for training; nothing goes to a disk.
+
+use flyrig_body::Template;
+use flyrig_gpu::GpuContext;
+use flyrig_types::Rig;
+use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
+
+use crate::error::check;
+use crate::sensor::hash;
+use crate::source::shot;
+use crate::{
+    CalibrationError, Delivery, Fault, FaultKind, FaultScript, MotionConfig, MotionKind, OpticsConfig, RingConfig,
+    SceneConfig, SceneKind, SensorConfig, SimConfig, SimError, SimFrame, Simulator,
+};
+
+/// What [`TrainingSamples`] makes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrainingConfig {
+    /// Makes everything.
+    pub seed: u64,
+    /// Cameras of each rig, 1 to 128.
+    pub cameras: usize,
+    /// Size of the pictures, pixels.
+    pub size: [u32; 2],
+    /// Side of each texture, pixels.
+    pub texture_px: u32,
+    /// Consecutive instants of a sample, 1 to 1000.
+    pub instants: usize,
+    /// Samples of one person in one rig (making them costs about as much as a dozen pictures), at least 1.
+    pub samples_a_person: usize,
+}
+
+impl Default for TrainingConfig {
+    fn default() -> Self {
+        Self { seed: 1, cameras: 4, size: [512, 512], texture_px: 512, instants: 1, samples_a_person: 8 }
+    }
+}
+
+/// A few consecutive instants of somebody, seen by all cameras of a rig.
+#[derive(Debug)]
+pub struct TrainingSample {
+    /// What makes it again.
+    pub config: SimConfig,
+    /// The cameras as their calibration reports them: what a method is given.
+    pub reported_rig: Rig,
+    /// The cameras as they are: what a method is compared with.
+    pub rig: Rig,
+    /// The body without clothes.
+    pub template: Template,
+    /// Index of the first instant; instant `i` is due at [`Simulator::frame_nanos`]`(first + i)`.
+    pub first: u64,
+    /// Per instant a frame a camera in rig order. Cameras may lag behind the instant; each frame knows its time.
+    pub instants: Vec<Vec<SimFrame>>,
+}
+
+/// An endless iterator of samples: random people in random clothes move at random before random cameras in random rooms.
+/// The same configuration gives the same samples on the same adapter.
+#[derive(Debug)]
+pub struct TrainingSamples {
+    gpu: GpuContext,
+    config: TrainingConfig,
+    /// Samples given so far.
+    given: u64,
+    simulator: Option<Simulator>,
+}
+
+impl TrainingSamples {
+    /// # Errors
+    /// [`SimError::Config`] names the setting and its range.
+    pub fn new(gpu: &GpuContext, config: TrainingConfig) -> Result<Self, SimError> {
+        check("training.instants", config.instants as f64, 1.0, 1000.0, "1 to 1000 instants")?;
+        check("training.samples_a_person", config.samples_a_person as f64, 1.0, 1e9, "at least 1 sample")?;
+        random_config(&config, 0).validate()?;
+        Ok(Self { gpu: gpu.clone(), config, given: 0, simulator: None })
+    }
+
+    fn sample(&mut self) -> Result<TrainingSample, SimError> {
+        let a_person = self.config.samples_a_person as u64;
+        let (person, place) = (self.given / a_person, self.given % a_person);
+        let mut simulator = match self.simulator.take() {
+            Some(simulator) if place > 0 => simulator,
+            _ => Simulator::new(&self.gpu, &random_config(&self.config, person))?,
+        };
+        // Anywhere in the first minute.
+        let first = hash(hash(simulator.config().seed, 0x7261), place) % 1800;
+        let mut instants = Vec::with_capacity(self.config.instants);
+        for index in first..first + self.config.instants as u64 {
+            let mut frames = Vec::with_capacity(self.config.cameras);
+            for slot in 0..self.config.cameras {
+                let plan = simulator.plan(slot, index)?;
+                debug_assert_eq!(plan.delivery, Delivery::Frame);
+                frames.push(simulator.render_with(&shot(&plan, slot))?);
+            }
+            instants.push(frames);
+        }
+        let sample = TrainingSample {
+            config: simulator.config().clone(),
+            reported_rig: simulator.reported_rig(),
+            rig: simulator.rig().clone(),
+            template: simulator.template().clone(),
+            first,
+            instants,
+        };
+        self.simulator = Some(simulator);
+        Ok(sample)
+    }
+}
+
+impl Iterator for TrainingSamples {
+    type Item = Result<TrainingSample, SimError>;
+
+    /// The next sample. After an error the next call goes on with another person.
+    fn next(&mut self) -> Option<Self::Item> {
+        let sample = self.sample();
+        let a_person = self.config.samples_a_person as u64;
+        self.given = if sample.is_ok() { self.given + 1 } else { (self.given / a_person + 1) * a_person };
+        Some(sample)
+    }
+}
+
+/// The capture of person `person`: everything that a method shall not rely on is random.
+#[must_use]
+pub fn random_config(training: &TrainingConfig, person: u64) -> SimConfig {
+    let seed = hash(training.seed, person);
+    let mut rng = SmallRng::seed_from_u64(hash(seed, 0x7274));
+    let radius_m = rng.random_range(2.2..4.2);
+    let fisheye = rng.random_bool(0.15);
+    let cameras = RingConfig {
+        count: training.cameras,
+        radius_m,
+        height_m: rng.random_range(0.8..2.4),
+        target_height_m: rng.random_range(0.85..1.0),
+        // The person fills more or less of the picture's height.
+        focal_heights: rng.random_range(0.36..0.5) * radius_m,
+        radial: [rng.random_range(-0.18..0.05), rng.random_range(-0.02..0.05)],
+        fisheye: fisheye.then(|| [rng.random_range(-0.05..0.08), rng.random_range(-0.015..0.01), 0.002, 0.0]),
+        tangential: [0.0; 2].map(|_: f64| rng.random_range(-0.001..0.001)),
+        place_jitter_m: rng.random_range(0.0..0.3),
+        aim_jitter_deg: rng.random_range(0.0..4.0),
+        focal_jitter_percent: rng.random_range(0.0..6.0),
+    };
+    let sensors = (0..training.cameras)
+        .map(|_| {
+            let full_well_electrons = rng.random_bool(0.8).then(|| rng.random_range(1500.0..30_000.0));
+            SensorConfig {
+                exposure: rng.random_range(0.6..1.5),
+                gain: rng.random_range(0.8..1.25),
+                gamma: rng.random_range(0.88..1.14),
+                white_balance: [0.0; 3].map(|_: f64| rng.random_range(0.88..1.12)),
+                vignetting: rng.random_range(0.0..0.45),
+                full_well_electrons,
+                read_noise_electrons: full_well_electrons.map_or(0.0, |_| rng.random_range(0.0..12.0)),
+                jpeg_quality: rng.random_bool(0.7).then(|| rng.random_range(45..97)),
+            }
+        })
+        .collect();
+    let optics = OpticsConfig {
+        exposure_ms: if rng.random_bool(0.3) { rng.random_range(1.0..12.0) } else { 0.0 },
+        readout_ms: if rng.random_bool(0.3) { rng.random_range(4.0..28.0) } else { 0.0 },
+        aperture_mm: if rng.random_bool(0.15) { rng.random_range(4.0..25.0) } else { 0.0 },
+        focus_m: radius_m,
+        samples: 4,
+    };
+    let lags = (0..training.cameras).filter_map(|slot| {
+        let lagging = rng.random_bool(0.3);
+        lagging.then(|| Fault {
+            camera: Some(format!("{slot:02}")),
+            ms: Some(rng.random_range(-6.0..6.0)),
+            ..Fault::new(FaultKind::Lag)
+        })
+    });
+    let faults = FaultScript { seed, faults: lags.collect() };
+    let motion = MotionConfig {
+        kind: MotionKind::BySeed,
+        speed: rng.random_range(0.6..1.5),
+        phase: rng.random_range(0.0..1.0),
+        ..MotionConfig::default()
+    };
+    let scene = SceneConfig {
+        kind: SceneKind::BySeed,
+        seed: None,
+        occluders: if rng.random_bool(0.25) { rng.random_range(1..3) } else { 0 },
+        passer_by: rng.random_bool(0.2),
+    };
+    SimConfig {
+        seed,
+        motion,
+        cameras,
+        sensors,
+        optics: vec![optics],
+        calibration_error: CalibrationError {
+            seed: None,
+            rotation_deg: rng.random_range(0.0..0.15),
+            translation_mm: rng.random_range(0.0..4.0),
+            focal_percent: rng.random_range(0.0..0.3),
+            center_px: rng.random_range(0.0..1.0) * f64::from(training.size[0]) / 512.0,
+        },
+        scene,
+        faults,
+        width: training.size[0],
+        height: training.size[1],
+        texture_px: training.texture_px,
+        ..SimConfig::default()
+    }
+}
