@@ -693,3 +693,85 @@ fn pass<'a>(
         ..Default::default()
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use flyrig_gpu::AdapterChoice;
+    use flyrig_types::{CameraId, Intrinsics, Isometry, Lens};
+    use glam::{DVec2, DVec3};
+
+    use super::*;
+    use crate::scene_mesh::{Coat, SceneMesh};
+    use crate::surfaces::Surface;
+    use crate::texture::Texture as Picture;
+
+    /// A glowing square in the dark: the middle of its light against the f64 model's, for each lens model and each
+    /// corner of the picture.
+    #[test]
+    fn furniture_lands_where_each_lens_puts_it() {
+        let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+        let lenses = [
+            (1.3, Lens::PINHOLE),
+            (1.1, Lens::RadialTangential { radial: [-0.25, 0.06, -0.004], tangential: [0.004, -0.003] }),
+            (0.6, Lens::Fisheye { coefficients: [0.05, -0.01, 0.004, -0.001] }),
+        ];
+        for (focal_heights, lens) in lenses {
+            let intrinsics = Intrinsics {
+                width: 200,
+                height: 160,
+                focal_px: DVec2::splat(160.0 * focal_heights),
+                center_px: DVec2::new(101.0, 78.0),
+                lens,
+            };
+            let camera = Camera {
+                id: CameraId::from("00".to_owned()),
+                intrinsics,
+                camera_from_world: Isometry::look_at(DVec3::new(0.3, -3.0, 1.5), DVec3::new(0.0, 0.0, 1.0), DVec3::Z),
+            };
+            for pixel in
+                [DVec2::new(30.0, 25.0), DVec2::new(172.0, 30.0), DVec2::new(96.0, 80.0), DVec2::new(170.0, 130.0)]
+            {
+                let corner = camera.position() + camera.ray(pixel).unwrap() * 2.5;
+                let (u, v) = (DVec3::new(0.30, 0.10, 0.0), DVec3::new(0.0, 0.0, 0.22));
+                let mut mesh = SceneMesh::new(0.05);
+                let glow = Coat::new(Surface::Plain, Vec3::ONE).glowing(1.0, 1);
+                mesh.quad((corner - u * 0.5 - v * 0.5).as_vec3(), u.as_vec3(), v.as_vec3(), glow);
+                let scene = Scene {
+                    mesh,
+                    textures: vec![Picture { side: 1, pixels: vec![[255; 4]] }],
+                    lamps: Vec::new(),
+                    steady: Vec3::ZERO,
+                    sky: Vec3::ZERO,
+                    ground: Vec3::ZERO,
+                };
+                let mut drawing = Drawing::new(&gpu, [200, 160], scene, &[]).unwrap();
+                let take = Take { nanos: 0, camera: camera.clone(), optics: OpticsConfig::default(), people: false };
+                let raw = drawing.pictures(&[take]).unwrap().remove(0);
+                let (mut sum, mut light) = (DVec2::ZERO, 0.0);
+                for (i, pixel) in raw.iter().enumerate() {
+                    let here = f64::from(crate::sensor::linear_of_half(pixel[1]));
+                    sum += DVec2::new((i % 200) as f64, (i / 200) as f64) * here;
+                    light += here;
+                }
+                let (mut expected, mut area) = (DVec2::ZERO, 0.0);
+                const STEPS: usize = 200;
+                for i in 0..STEPS * STEPS {
+                    let t = DVec2::new((i % STEPS) as f64 + 0.5, (i / STEPS) as f64 + 0.5) / STEPS as f64 - 0.5;
+                    let at = |t: DVec2| camera.project(corner + u * t.x + v * t.y).unwrap();
+                    let step = 0.5 / STEPS as f64;
+                    let (dx, dy) = (
+                        at(t + DVec2::X * step) - at(t - DVec2::X * step),
+                        at(t + DVec2::Y * step) - at(t - DVec2::Y * step),
+                    );
+                    let here = dx.perp_dot(dy).abs();
+                    expected += at(t) * here;
+                    area += here;
+                }
+                let off = (sum / light - expected / area).length();
+                println!("{lens:?} at {pixel}: {off:.4} px off, {light:.1} of {area:.1} pixels");
+                assert!(off < 0.1, "{lens:?} at {pixel}: {off} px");
+                assert!((light / area - 1.0).abs() < 0.02, "{light} of {area}");
+            }
+        }
+    }
+}

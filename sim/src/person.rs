@@ -38,6 +38,7 @@ pub(crate) struct Person {
     /// The sheets that the surface is made of.
     pub sheets: Vec<SheetRange>,
     /// Vertices of the shoes.
+    #[cfg_attr(not(test), expect(dead_code, reason = "tests of motions ask where the feet stand"))]
     pub shoe_vertices: std::ops::Range<usize>,
 }
 

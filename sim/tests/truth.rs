@@ -4,36 +4,12 @@
 
 mod common;
 
-use common::{simulator, small_config};
+use common::{cast, simulator, small_config};
 use flyrig_body::{Part, skin_mesh};
-use flyrig_sim::{SimFrame, Simulator, SurfaceMesh};
+use flyrig_sim::{SimFrame, Simulator};
 use glam::{DVec2, DVec3};
 
 const NANOS: i64 = 1_400_000_000;
-
-/// Nearest hit of a ray with the surface, f64: distance along the ray and canonical position.
-fn cast(mesh: &SurfaceMesh, eye: DVec3, ray: DVec3) -> Option<(f64, DVec3)> {
-    let mut nearest: Option<(f64, DVec3)> = None;
-    for triangle in &mesh.triangles {
-        let [a, b, c] = triangle.map(|v| mesh.positions[v as usize].as_dvec3());
-        let (e1, e2) = (b - a, c - a);
-        let h = ray.cross(e2);
-        let det = e1.dot(h);
-        if det.abs() < 1e-15 {
-            continue;
-        }
-        let s = eye - a;
-        let u = s.dot(h) / det;
-        let q = s.cross(e1);
-        let v = ray.dot(q) / det;
-        let t = e2.dot(q) / det;
-        if u >= 0.0 && v >= 0.0 && u + v <= 1.0 && t > 0.0 && nearest.is_none_or(|(best, _)| t < best) {
-            let [p, q, r] = triangle.map(|v| mesh.canonical[v as usize].as_dvec3());
-            nearest = Some((t, p * (1.0 - u - v) + q * u + r * v));
-        }
-    }
-    nearest
-}
 
 fn pixels(frame: &SimFrame) -> impl Iterator<Item = (usize, DVec2)> + '_ {
     let width = frame.color.width() as usize;
