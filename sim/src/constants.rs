@@ -5,7 +5,7 @@ use flyrig_types::{Camera, Lens};
 
 use crate::draw::Moment;
 use crate::gpu_parts::SAMPLES;
-use crate::lamps::LAMP_NEAR_M;
+use crate::lamps::{LAMP_NEAR_M, cone_cosines};
 use crate::optics::SubFrame;
 use crate::plates::{GRID_CELL_PX, grid_columns};
 use crate::scene::Scene;
@@ -139,7 +139,7 @@ impl LightBlock {
         for (to, lamp) in block.lamps.iter_mut().zip(&scene.lamps) {
             let (room, room_tangent) = lamp.room_view();
             let (people, people_tangent) = lamp.ball_view(*center, *radius);
-            let [end, begin] = lamp.cone();
+            let [end, begin] = cone_cosines();
             *to = LampBlock {
                 room_from_world: room.to_cols_array_2d(),
                 people_from_world: people.to_cols_array_2d(),

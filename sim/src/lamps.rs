@@ -49,11 +49,6 @@ impl Lamp {
         self.config.level(secs) as f32
     }
 
-    /// Cosines of the angles where its light ends and where it begins to fall.
-    pub(crate) fn cone(&self) -> [f32; 2] {
-        CONE_DEG.map(|degrees| degrees.to_radians().cos())
-    }
-
     /// The lamp's picture of the room, and the tangent of half its angle.
     pub(crate) fn room_view(&self) -> (Mat4, f32) {
         let tangent = CONE_DEG[0].to_radians().tan();
@@ -67,6 +62,11 @@ impl Lamp {
         let tangent = sine / (1.0 - sine * sine).sqrt();
         (clip_from_world(self.place, towards.normalize_or(self.axis), tangent), tangent)
     }
+}
+
+/// Cosines of the angles where a lamp's light ends and where it begins to fall.
+pub(crate) fn cone_cosines() -> [f32; 2] {
+    CONE_DEG.map(|degrees| degrees.to_radians().cos())
 }
 
 /// Perspective from a place in a direction; the device's depth is 1 - near / z.

@@ -70,7 +70,7 @@ impl Plates {
     ) -> Result<(Plate, bool), GpuError> {
         let same = |plate: &Plate| {
             // Without a way off the lens's middle the focus changes nothing.
-            let focus = plate.focus_m == focus_m || lens_point == Vec2::ZERO;
+            let focus = plate.focus_m.to_bits() == focus_m.to_bits() || lens_point == Vec2::ZERO;
             plate.lens_point == lens_point && focus && plate.camera == *camera
         };
         if let Some(plate) = self.kept.iter_mut().find(|plate| same(plate)) {

@@ -78,7 +78,7 @@ impl Scene {
         mesh.find_openness(half_m, HEIGHT_M);
         let side = config.texture_px.clamp(64, if config.height > 700 { 1024 } else { 512 }) as usize;
         let side = side.next_power_of_two();
-        let used = |surface: Surface| mesh.vertices.iter().any(|vertex| vertex.paint[2] == surface as u32 as f32);
+        let used = |surface: Surface| mesh.vertices.iter().any(|vertex| vertex.paint[2] as u32 == surface as u32);
         let unused = || Texture { side, pixels: vec![[128; 4]; side * side] };
         let textures = Surface::ALL
             .iter()
@@ -89,8 +89,8 @@ impl Scene {
 
     /// Whether something glows that no lamp makes.
     pub(crate) fn glows(&self) -> bool {
-        let layer = self.lamps.len() as f32 + 1.0;
-        self.mesh.vertices.iter().any(|vertex| vertex.glow[0] > 0.0 && vertex.glow[1] == layer)
+        let layer = self.lamps.len() as u32 + 1;
+        self.mesh.vertices.iter().any(|vertex| vertex.glow[0] > 0.0 && vertex.glow[1] as u32 == layer)
     }
 }
 
