@@ -70,7 +70,9 @@ pub(crate) fn inside_outer(outer: &Outer, node: &Node) -> f32 {
     if p.z > 0.0 && !is_arm(node.part) {
         inside = inside.min(p.x.abs() - opening_m(outer, p.y));
     }
-    within_hem_and_sleeve(node, inside, outer.hem_m.max(0.79), 0.468)
+    // A coat goes on as its tails.
+    let hem_m = if outer.hem_m < 0.7 { COAT_SEAM_M - 0.025 } else { outer.hem_m };
+    within_hem_and_sleeve(node, inside, hem_m, 0.468)
 }
 
 /// Half the width of the opening of a jacket at a height.

@@ -138,8 +138,8 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
             let tails = Hanging {
                 top_m: COAT_SEAM_M,
                 hem_m: outer.hem_m,
-                offset_m: [0.030, 0.042],
-                flare: 0.16,
+                offset_m: [0.026, 0.030],
+                flare: 0.13,
                 pleats: 6.0,
                 fold_m: 0.014,
                 open_rad: if outer.open_m > 0.0 { outer.open_m / 0.17 } else { 0.0 },
