@@ -25,7 +25,7 @@ pub(crate) struct Hanging {
 }
 
 /// How much of it hangs from the hips (the root joint) and not from the legs.
-const BY_HIPS: f32 = 0.4;
+const BY_HIPS: f32 = 0.2;
 /// Below this the cloth no longer follows the legs, metres on the average body.
 const FOLLOWS_M: f32 = 0.64;
 
