@@ -91,8 +91,7 @@ pub(crate) fn inside_bottom(look: &Look, node: &Node) -> f32 {
         Bottom::Overalls { hem_m, .. } => {
             let bib =
                 if p.z > 0.02 { (0.118 - p.x.abs()).min(1.225 - p.y) } else { (0.105 - p.x.abs()).min(1.10 - p.y) };
-            let strap = (0.019 - (p.x.abs() - 0.083).abs()).min(p.y - 1.0).min(1.43 - p.y);
-            (waist_m(look) - p.y).max(bib).max(strap).min(p.y - hem_m)
+            (waist_m(look) - p.y).max(bib).min(p.y - hem_m)
         }
         Bottom::Skirt { .. } => OUTSIDE_M,
     }

@@ -24,6 +24,7 @@ mod error;
 mod fabric;
 mod face;
 mod faults;
+mod features;
 mod frame;
 mod garments;
 mod glyphs;
@@ -50,6 +51,7 @@ mod shoes;
 mod simulator;
 mod source;
 mod steps;
+mod straps;
 mod texture;
 mod wardrobe;
 

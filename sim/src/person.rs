@@ -76,8 +76,12 @@ impl Layer {
 
 impl Person {
     pub(crate) fn new(look: &Look, seed: u64, texture_px: usize) -> Result<Self, SimError> {
-        let body = default_template(&look.shape)?;
+        let mut body = default_template(&look.shape)?;
         let average = default_template(&ShapeParams::default())?;
+        for (position, average) in body.positions.iter_mut().zip(&average.positions) {
+            *position += look.features.moved(*average);
+        }
+        body.normals = Sheet::of_body(&body, &average.positions).normals(&body.positions);
         let naked = Sheet::of_body(&body, &average.positions);
         let layers = dress(look, seed, &naked, texture_px);
         Ok(assemble(body, layers))
