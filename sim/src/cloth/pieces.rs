@@ -233,10 +233,12 @@ impl Pieces {
                 .sum::<Vec3>();
             let skinned = positions[vertex];
             let mut place = skinned + moved;
-            // Between particles the body is no flatter than at them.
+            // Between particles the body is no flatter than at them. All go out along the surface's normal, so that
+            // neighbours stay beside each other.
+            let normal = normals[vertex];
             for (capsule, inside_m) in capsules.iter().flat_map(|c| follower.inside_m.map(|inside_m| (c, inside_m))) {
                 if let Some((depth, out)) = capsule.depth(place).filter(|(depth, _)| *depth > inside_m) {
-                    place += out * (depth - inside_m);
+                    place += normal * ((depth - inside_m) * normal.dot(out).max(0.0));
                 }
             }
             displacement[vertex] = place - skinned;
