@@ -19,6 +19,7 @@ mod gltf_import;
 mod gltf_nodes;
 mod gpu_skinner;
 mod graph;
+mod inset;
 mod part;
 mod point_grid;
 mod retarget;
