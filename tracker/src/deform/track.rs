@@ -92,6 +92,7 @@ impl DeformTracker {
             edges,
             spatial: settings.regularization * settings.spatial,
             temporal: settings.regularization * settings.temporal,
+            anchor: settings.anchor,
             history: false,
         };
         Ok(Self {
@@ -301,7 +302,8 @@ impl DeformTracker {
         let pose = pose.as_ref().map(|(basis, prices)| (basis, prices.as_slice()));
         for _ in 0..self.settings.attempts {
             let damping = self.damping * self.matrix.mean_diagonal() + LEAST_DAMPING;
-            let step = self.matrix.solve(self.regularizer.stiffness(), damping, &right, pose);
+            let step =
+                self.matrix.solve(self.regularizer.stiffness(), damping + 2.0 * self.regularizer.anchor, &right, pose);
             // Of the quadratic model, which the step s solves: (A + damping) s = -g.
             let share = self.shrink(&step);
             let along: f64 = right.iter().zip(&step).map(|(r, s)| r.dot(*s)).sum();
@@ -392,3 +394,7 @@ impl DeformTracker {
 #[cfg(test)]
 #[path = "tests.rs"]
 mod tests;
+
+#[cfg(test)]
+#[path = "stability_tests.rs"]
+mod stability_tests;
