@@ -129,9 +129,9 @@ impl DeformTracker {
         if nodes.len() != self.translations.len() {
             return fail(format!("{} places for {} nodes of the graph", nodes.len(), self.translations.len()));
         }
-        if ![freedom.turn, freedom.shift].into_iter().all(|v| v.is_finite() && v > 0.0)
-            || !(freedom.hold.is_finite() && freedom.hold >= 0.0)
-        {
+        let above = [freedom.turn, freedom.shift].into_iter().all(|v| v.is_finite() && v > 0.0);
+        let usable = above && freedom.hold.is_finite() && freedom.hold >= 0.0;
+        if !usable {
             return fail("the prices of a corrected pose must be finite and above 0".to_owned());
         }
         if matches!(self.settings.solver, DeformSolver::GaussNewton { .. }) {
