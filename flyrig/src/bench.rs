@@ -71,3 +71,7 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
 #[cfg(test)]
 #[path = "bench/desync_tests.rs"]
 mod desync_tests;
+
+#[cfg(test)]
+#[path = "bench/state_tests.rs"]
+mod state_tests;

@@ -107,7 +107,7 @@ impl Deformation {
             loss: PictureLoss::new(gpu)?,
             coarse_displacement: StorageBuffer::zeroed(gpu, "displacements", count)?,
             displacement: StorageBuffer::zeroed(gpu, "displacements", surface.len())?,
-            skinner: GpuSkinner::new(gpu, &inset(&coarse.gaussians), &template.skeleton)?,
+            skinner: GpuSkinner::new(gpu, &coarse.gaussians.inset(), &template.skeleton)?,
             colors: ColorMeans::new(gpu, &coarse.first_child, &coarse.children)?,
             posed: vec![GaussianBuffers::zeroed(gpu, count)?],
             spacing_m: mean(&coarse.gaussians.scale_m),
@@ -220,19 +220,6 @@ impl Deformation {
     pub fn vertex_displacement(&self) -> Vec<Vec3> {
         self.mesh.of_vertices()
     }
-}
-
-/// How far inside of the surface a Gaussian's centre lies, as a share of its scale. What is drawn then ends where the
-/// surface does: without, the solver pulls the surface inwards by that much (docs/benchmarks/deform.md).
-const INSET: f32 = 1.7;
-
-/// The same Gaussians, moved inwards.
-pub fn inset(surface: &SurfaceGaussians) -> SurfaceGaussians {
-    let mut surface = surface.clone();
-    for ((position, normal), scale) in surface.positions.iter_mut().zip(&surface.normals).zip(&surface.scale_m) {
-        *position -= *normal * (INSET * scale);
-    }
-    surface
 }
 
 fn mean(values: &[f32]) -> f64 {
