@@ -25,7 +25,7 @@ use self::pictures::{Kernels, Pictures, ViewBuffers};
 /// The tracked deformation and the buffers it is solved with.
 #[derive(Debug)]
 pub struct Deformation {
-    options: DeformOptions,
+    max_level: u32,
     tracker: DeformTracker,
     backward: Option<BackwardRasterizer>,
     loss: PictureLoss,
@@ -101,7 +101,7 @@ impl Deformation {
             tracker = tracker.with_pose(&template.skeleton, landmarks.nodes().to_vec(), freedom)?;
         }
         Ok(Self {
-            options,
+            max_level: options.max_level,
             tracker,
             backward: None,
             loss: PictureLoss::new(gpu)?,
@@ -126,7 +126,7 @@ impl Deformation {
         let start = Instant::now();
         let gpu = scene.gpu;
         let count = self.posed[0].count();
-        let plans = self.landmarks.plans(scene.skeleton, scene.instants, views, self.spacing_m, self.options.max_level);
+        let plans = self.landmarks.plans(scene.skeleton, scene.instants, views, self.spacing_m, self.max_level);
         for (i, (view, plan)) in views.iter().zip(&plans).enumerate() {
             let fits = self.views.get(i).is_some_and(|v| v.fits(view.size, plan.level));
             if !fits {
@@ -168,7 +168,6 @@ impl Deformation {
                 displacement: &self.coarse_displacement,
                 gradients: &self.gradients,
             },
-            &self.options,
             self.painted,
         );
         let prepare = start.elapsed();
