@@ -2,11 +2,12 @@
 CARGO ?= cargo
 OUT ?= out/demo
 
-.PHONY: help setup demo test check
+.PHONY: help setup demo test test-long check
 
 help:
 	@echo "make demo    install what is missing, build, run the simulated rig, show the report (OUT=$(OUT))"
 	@echo "make test    install what is missing, build, run every test"
+	@echo "make test-long  the long stability runs"
 	@echo "make check   format, lints and documentation, as CI runs them"
 	@echo "make setup   only install what is missing"
 
@@ -20,6 +21,9 @@ demo: setup
 
 test: setup
 	$(CARGO) test --release --locked --workspace
+
+test-long: setup
+	$(CARGO) test --release --locked --workspace -- --ignored --nocapture
 
 check: setup
 	$(CARGO) fmt --all -- --check

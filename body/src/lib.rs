@@ -24,6 +24,7 @@ mod graph;
 mod joint_names;
 mod mesh_ply;
 mod motion_clip;
+mod inset;
 mod part;
 mod point_grid;
 mod retarget;

@@ -28,11 +28,12 @@ pub fn track(args: &BenchTrackArgs, gpu: &GpuContext) -> Result<()> {
             None => Sequence::simulate(gpu, config)?,
         };
         rows.push(run_case(gpu, &scene, &case)?);
+        // After every case, so that a run that is stopped leaves what it has.
+        write::all(&args.out, &gpu.adapter_name(), args, &rows)?;
         sequence = Some(scene);
         bar.inc(1);
     }
     bar.finish_and_clear();
-    write::all(&args.out, &gpu.adapter_name(), args, &rows)?;
     print!("{}", write::table(&rows));
     println!("\nwritten to {}: track.csv, track.json, track.svg, energy.svg, views.svg", args.out.display());
     Ok(())
@@ -71,3 +72,7 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
 #[cfg(test)]
 #[path = "bench/desync_tests.rs"]
 mod desync_tests;
+
+#[cfg(test)]
+#[path = "bench/state_tests.rs"]
+mod state_tests;

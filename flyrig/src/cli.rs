@@ -219,8 +219,8 @@ pub struct EvalArgs {
     /// Masks from the data set, or from the pictures.
     #[arg(long, value_enum, default_value = "given")]
     pub masks: Origin,
-    /// How the body follows the pictures beyond its pose. Without this option gauss-newton with a given pose, none with
-    /// an estimated one, whose errors would be taken for cloth.
+    /// How the body follows the pictures beyond its pose. Without this option `default` with a given pose, `off` with an
+    /// estimated one.
     #[arg(long, value_enum)]
     pub solver: Option<Solver>,
     /// How Gaussians get their colours.

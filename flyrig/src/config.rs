@@ -141,11 +141,17 @@ impl Solver {
             })),
             Self::GaussNewton => Some(DeformOptions {
                 pose: (pose == Origin::Estimated).then(PoseFreedom::default),
-                ..DeformOptions::coarse(default)
+                ..DeformOptions::coarse(match pose {
+                    Origin::Given => default,
+                    Origin::Estimated => DeformSettings { anchor: FREE_POSE_ANCHOR, ..default },
+                })
             }),
         }
     }
 }
+
+/// Price of the nodes' distance from the body where the pose is free.
+const FREE_POSE_ANCHOR: f64 = 100.0;
 
 /// λ_reg of the paper's Eq. 3.
 const PAPER_REGULARIZATION: f64 = 200.0;

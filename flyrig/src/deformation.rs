@@ -25,7 +25,7 @@ use self::pictures::{Kernels, Pictures, ViewBuffers};
 /// The tracked deformation and the buffers it is solved with.
 #[derive(Debug)]
 pub struct Deformation {
-    options: DeformOptions,
+    max_level: u32,
     tracker: DeformTracker,
     backward: Option<BackwardRasterizer>,
     loss: PictureLoss,
@@ -101,13 +101,13 @@ impl Deformation {
             tracker = tracker.with_pose(&template.skeleton, landmarks.nodes().to_vec(), freedom)?;
         }
         Ok(Self {
-            options,
+            max_level: options.max_level,
             tracker,
             backward: None,
             loss: PictureLoss::new(gpu)?,
             coarse_displacement: StorageBuffer::zeroed(gpu, "displacements", count)?,
             displacement: StorageBuffer::zeroed(gpu, "displacements", surface.len())?,
-            skinner: GpuSkinner::new(gpu, &inset(&coarse.gaussians), &template.skeleton)?,
+            skinner: GpuSkinner::new(gpu, &coarse.gaussians.inset(), &template.skeleton)?,
             colors: ColorMeans::new(gpu, &coarse.first_child, &coarse.children)?,
             posed: vec![GaussianBuffers::zeroed(gpu, count)?],
             spacing_m: mean(&coarse.gaussians.scale_m),
@@ -126,7 +126,7 @@ impl Deformation {
         let start = Instant::now();
         let gpu = scene.gpu;
         let count = self.posed[0].count();
-        let plans = self.landmarks.plans(scene.skeleton, scene.instants, views, self.spacing_m, self.options.max_level);
+        let plans = self.landmarks.plans(scene.skeleton, scene.instants, views, self.spacing_m, self.max_level);
         for (i, (view, plan)) in views.iter().zip(&plans).enumerate() {
             let fits = self.views.get(i).is_some_and(|v| v.fits(view.size, plan.level));
             if !fits {
@@ -168,7 +168,6 @@ impl Deformation {
                 displacement: &self.coarse_displacement,
                 gradients: &self.gradients,
             },
-            &self.options,
             self.painted,
         );
         let prepare = start.elapsed();
@@ -220,19 +219,6 @@ impl Deformation {
     pub fn vertex_displacement(&self) -> Vec<Vec3> {
         self.mesh.of_vertices()
     }
-}
-
-/// How far inside of the surface a Gaussian's centre lies, as a share of its scale. What is drawn then ends where the
-/// surface does: without, the solver pulls the surface inwards by that much (docs/benchmarks/deform.md).
-const INSET: f32 = 1.7;
-
-/// The same Gaussians, moved inwards.
-pub fn inset(surface: &SurfaceGaussians) -> SurfaceGaussians {
-    let mut surface = surface.clone();
-    for ((position, normal), scale) in surface.positions.iter_mut().zip(&surface.normals).zip(&surface.scale_m) {
-        *position -= *normal * (INSET * scale);
-    }
-    surface
 }
 
 fn mean(values: &[f32]) -> f64 {

@@ -15,7 +15,7 @@ use flyrig_renderer::{
 use flyrig_tracker::DeformReport;
 use flyrig_types::{Camera, Image, Mask, Pose};
 
-use crate::deformation::{DeformOptions, DeformTimes, Deformation, Scene, TrackedView, inset};
+use crate::deformation::{DeformOptions, DeformTimes, Deformation, Scene, TrackedView};
 use crate::stats::StageTimes;
 
 /// With fewer views the last deformation stays: a single one cannot tell depth, and what fits it spoils every other side
@@ -103,7 +103,7 @@ impl Engine {
         let rasterizer = Rasterizer::new(&gpu, count)?;
         Ok(Self {
             skinner: match deform {
-                Some(_) => GpuSkinner::new(&gpu, &inset(surface), &template.skeleton)?,
+                Some(_) => GpuSkinner::new(&gpu, &surface.inset(), &template.skeleton)?,
                 None => GpuSkinner::new(&gpu, surface, &template.skeleton)?,
             },
             deformation: deform

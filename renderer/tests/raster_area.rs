@@ -1,5 +1,7 @@
 //! Drawing, and its derivative, in a part of the picture only.
 
+#![allow(clippy::float_cmp)] // the same bytes are what is promised
+
 mod support;
 
 use flyrig_gpu::{AdapterChoice, GpuContext};

@@ -70,7 +70,9 @@ pub(crate) fn inside_outer(outer: &Outer, node: &Node) -> f32 {
     if p.z > 0.0 && !is_arm(node.part) {
         inside = inside.min(p.x.abs() - opening_m(outer, p.y));
     }
-    within_hem_and_sleeve(node, inside, outer.hem_m.max(0.79), 0.468)
+    // A coat goes on as its tails.
+    let hem_m = if outer.hem_m < 0.7 { COAT_SEAM_M - 0.025 } else { outer.hem_m };
+    within_hem_and_sleeve(node, inside, hem_m, 0.468)
 }
 
 /// Half the width of the opening of a jacket at a height.
@@ -89,8 +91,7 @@ pub(crate) fn inside_bottom(look: &Look, node: &Node) -> f32 {
         Bottom::Overalls { hem_m, .. } => {
             let bib =
                 if p.z > 0.02 { (0.118 - p.x.abs()).min(1.225 - p.y) } else { (0.105 - p.x.abs()).min(1.10 - p.y) };
-            let strap = (0.019 - (p.x.abs() - 0.083).abs()).min(p.y - 1.0).min(1.43 - p.y);
-            (waist_m(look) - p.y).max(bib).max(strap).min(p.y - hem_m)
+            (waist_m(look) - p.y).max(bib).min(p.y - hem_m)
         }
         Bottom::Skirt { .. } => OUTSIDE_M,
     }

@@ -2,6 +2,7 @@
 
 use glam::{Vec2, Vec3};
 
+use crate::features::LIPS_Y;
 use crate::look::Look;
 use crate::noise::{Noise, smoothstep};
 use crate::regions::{EYE, above_hairline};
@@ -53,14 +54,15 @@ pub(crate) fn skin_colour(look: &Look, noise: Noise, p: Vec3) -> Srgb {
 }
 
 fn lips(look: &Look, colour: Srgb, p: Vec3, front: f32) -> Srgb {
-    const LINE_Y: f32 = 1.4858;
+    let face = look.features;
     let x = p.x.abs() / 0.0240;
     if x > 1.15 {
         return colour;
     }
     let bow = 0.0105 * (1.0 - x.powi(2)).max(0.0).sqrt() - 0.0018 * smoothstep(0.35, 0.0, x);
     let fall = 0.0118 * (1.0 - x.powi(2)).max(0.0).powf(0.6);
-    let above = p.y - LINE_Y;
+    // The line bends up at the corners of a friendly mouth.
+    let above = p.y - LIPS_Y - 0.0015 * (0.4 + face.smile).clamp(-0.6, 1.6) * x * x;
     let inside = if above > 0.0 { bow - above } else { fall + above };
     let lip = if look.female { [0.70, 0.26, 0.28] } else { [0.68, 0.38, 0.34] };
     let lip = mix3(scale3(look.skin, 0.82), scale3(lip, 0.55 + 0.5 * look.skin[0]), 0.35 + 0.5 * look.lips);
@@ -85,9 +87,14 @@ fn stubble(look: &Look, noise: Noise, colour: Srgb, p: Vec3) -> Srgb {
 fn brows(look: &Look, noise: Noise, colour: Srgb, p: Vec3, front: f32) -> Srgb {
     let t = (p.x.abs() - 0.011) / 0.038;
     let mut colour = colour;
-    if (0.0..1.0).contains(&t) && (1.55..1.60).contains(&p.y) {
-        let arch = 1.5670 + 0.0062 * (t * 2.5).min(1.0) - 0.0075 * (t - 0.62).max(0.0) / 0.38;
-        let thick = if look.female { 0.0026 } else { 0.0040 } * (1.0 - 0.65 * t.powi(2)) * smoothstep(0.0, 0.12, t);
+    if (0.0..1.0).contains(&t) && (1.55..1.61).contains(&p.y) {
+        let face = look.features;
+        let inner = 1.5672 + 0.0020 * face.brows_open.clamp(-0.8, 1.3);
+        let rise = (1.5732 - inner) + 0.0026 * face.brows_arched;
+        let arch =
+            inner + rise * (t * 2.2).min(1.0) - (0.0075 + 0.0025 * face.brows_arched) * (t - 0.60).max(0.0) / 0.40;
+        let thick = if look.female { 0.0026 } else { 0.0038 } * (1.0 + 0.35 * face.brows_thick);
+        let thick = thick * (1.0 - 0.65 * t.powi(2)) * smoothstep(0.0, 0.12, t);
         let hairs = 0.75 + 0.25 * noise.at(Vec3::new(p.x * 900.0 + p.y * 500.0, p.y * 200.0, 0.0));
         let on = smoothstep(thick, thick * 0.45, (p.y - arch).abs());
         colour = mix3(colour, scale3(look.hair, 0.75), front * on * hairs * 0.92);

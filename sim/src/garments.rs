@@ -130,11 +130,18 @@ impl Tailor {
         let sheet = self.draped(|i, node| {
             let p = node.average;
             let under = self.top_offset(&look.top, look.female, node);
-            let stiff = 0.0035 * self.noise.sum(p * 7.0 + 60.0, 2);
-            let mut offset = under + 0.011 + stiff;
+            let stiff = 0.0025 * self.noise.sum(p * 7.0 + 60.0, 2) + 0.0012 * self.noise.sum(p * 19.0 + 5.0, 2);
+            let mut offset = under + 0.008 + stiff;
             if is_arm(node.part) {
-                offset += 0.003;
+                // Heavy sleeves break into creases at the elbow and above the cuff.
+                let (along, _) = along_arm(p);
+                let crease = (along * 120.0 + 3.0 * self.noise.at(p * 11.0 + 3.0)).sin();
+                let broken =
+                    smoothstep(0.11, 0.0, (along - 0.25).abs()) + 0.7 * smoothstep(0.07, 0.0, (along - 0.42).abs());
+                offset += 0.002 + 0.0040 * crease * broken.min(1.0);
             } else {
+                let crease = (p.y * 75.0 + 9.0 * p.x.abs() + 3.5 * self.noise.at(p * 6.0 + 17.0)).sin();
+                offset += 0.0028 * crease * smoothstep(0.13, 0.03, (p.y - 1.0).abs());
                 // Away from the body towards the hem, more so in front of an open one.
                 let open = if outer.open_m > 0.0 {
                     smoothstep(0.22, 0.05, p.x.abs()) * smoothstep(0.0, 0.05, p.z)
@@ -188,6 +195,11 @@ impl Tailor {
                     || under_tails(look, node) > 0.0
             })
         });
+        if matches!(look.bottom, Bottom::Overalls { .. }) {
+            self.add_straps(&mut seen, |i| {
+                self.over(i, self.top_offset(&look.top, look.female, &self.body.nodes[i]) + 0.011)
+            });
+        }
         seen.add_lip();
         Some(seen.compacted())
     }

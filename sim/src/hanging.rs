@@ -2,7 +2,7 @@
 
 use std::f32::consts::{PI, TAU};
 
-use flyrig_body::Part;
+use flyrig_body::{Part, SkinWeights};
 use glam::{Vec2, Vec3};
 
 use crate::garments::Tailor;
@@ -24,6 +24,8 @@ pub(crate) struct Hanging {
     pub open_rad: f32,
 }
 
+/// How much of it hangs from the hips (the root joint) and not from the legs.
+const BY_HIPS: f32 = 0.2;
 /// Below this the cloth no longer follows the legs, metres on the average body.
 const FOLLOWS_M: f32 = 0.64;
 
@@ -106,7 +108,7 @@ impl Tailor {
     }
 }
 
-/// The closest body point, moved by both legs: in the middle by each of them half.
+/// The closest body point, moved by the hips and both legs: in the middle by each of them half.
 fn carried(band: &[&Node], carriers: &[&Node], position: Vec3) -> Option<Node> {
     let nearest = |nodes: &[&Node], left: bool| {
         let side = nodes.iter().filter(|node| (node.position.x >= 0.0) == left);
@@ -115,7 +117,9 @@ fn carried(band: &[&Node], carriers: &[&Node], position: Vec3) -> Option<Node> {
     };
     let body = nearest(band, position.x >= 0.0).or_else(|| band.first().map(|node| **node))?;
     let (left, right) = (nearest(carriers, true)?, nearest(carriers, false)?);
-    let skin = mix_skin(&right.skin, &left.skin, smoothstep(-0.15, 0.15, position.x));
+    let legs = mix_skin(&right.skin, &left.skin, smoothstep(-0.15, 0.15, position.x));
+    let hips = SkinWeights { joints: [0; 4], weights: [1.0, 0.0, 0.0, 0.0] };
+    let skin = mix_skin(&legs, &hips, BY_HIPS);
     Some(Node { skin, ..body })
 }
 

@@ -3,6 +3,7 @@
 use flyrig_body::ShapeParams;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
+use crate::features::Features;
 use crate::palette::{CHINOS, CLOTHS, DENIMS, HAIRS, IRISES, LEATHERS, SHOES, SKINS};
 use crate::wardrobe::{Beard, Bottom, Cloth, Fabric, HairCut, Hat, Outer, Print, ShoeKind, Shoes, Srgb, Top, TopKind};
 use crate::{Build, SimConfig};
@@ -28,6 +29,7 @@ pub(crate) struct Look {
     pub bottom: Bottom,
     pub outer: Option<Outer>,
     pub shoes: Shoes,
+    pub features: Features,
 }
 
 /// Draws from a seed's numbers.
@@ -126,6 +128,7 @@ impl Look {
             bottom,
             outer,
             shoes: footwear(&mut dice),
+            features: Features::drawn(&mut dice.0),
         }
     }
 }

@@ -77,8 +77,12 @@ impl Layer {
 
 impl Person {
     pub(crate) fn new(look: &Look, seed: u64, texture_px: usize) -> Result<Self, SimError> {
-        let body = default_template(&look.shape)?;
+        let mut body = default_template(&look.shape)?;
         let average = default_template(&ShapeParams::default())?;
+        for (position, average) in body.positions.iter_mut().zip(&average.positions) {
+            *position += look.features.moved(*average);
+        }
+        body.normals = Sheet::of_body(&body, &average.positions).normals(&body.positions);
         let naked = Sheet::of_body(&body, &average.positions);
         let layers = dress(look, seed, &naked, texture_px);
         Ok(assemble(body, layers))
@@ -139,8 +143,8 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
             let tails = Hanging {
                 top_m: COAT_SEAM_M,
                 hem_m: outer.hem_m,
-                offset_m: [0.030, 0.042],
-                flare: 0.16,
+                offset_m: [0.026, 0.030],
+                flare: 0.13,
                 pleats: 6.0,
                 fold_m: 0.014,
                 open_rad: if outer.open_m > 0.0 { outer.open_m / 0.17 } else { 0.0 },

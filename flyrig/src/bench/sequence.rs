@@ -132,7 +132,7 @@ impl Sequence {
     /// Whether one of the first `views` input cameras sees a point of the true surface at the last instant.
     pub fn seen(&self, point: DVec3, views: usize) -> bool {
         self.depths.iter().take(views).any(|(camera, depth)| {
-            let Some(pixel) = camera.project(point).map(|p| p.round()) else { return false };
+            let Some(pixel) = camera.project(point).map(glam::DVec2::round) else { return false };
             let (width, height) = (f64::from(camera.intrinsics.width), f64::from(camera.intrinsics.height));
             if !(pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < width && pixel.y < height) {
                 return false;

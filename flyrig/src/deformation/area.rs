@@ -24,8 +24,6 @@ pub struct ViewPlan {
     pub area: [u32; 4],
     /// Factor of the loss: a square metre counts the same at any resolution.
     pub weight: f64,
-    /// Pixels of the halved picture a metre, at the person.
-    pub pixels_a_m: f64,
 }
 
 /// Points all over the body.
@@ -71,7 +69,6 @@ impl Landmarks {
                 level,
                 area: [area[0] >> level, area[1] >> level, area[2] >> level, area[3] >> level],
                 weight: PAPER_PIXELS_A_M2 / (pixels_a_m * pixels_a_m),
-                pixels_a_m,
             }
         };
         views.iter().map(plan).collect()

@@ -14,10 +14,6 @@ pub struct DeformOptions {
     pub max_level: u32,
     /// Whether, and how freely, the pose is corrected as well.
     pub pose: Option<PoseFreedom>,
-    /// Weight of the silhouette's distance term over that of the mask, a pixel.
-    pub outline: f32,
-    /// Colour difference at which robust weights have fallen to a quarter; infinite: squares.
-    pub robust_color: f32,
 }
 
 impl DeformOptions {
@@ -28,13 +24,6 @@ impl DeformOptions {
 
     /// Compared no finer than the result needs: measured in docs/benchmarks/deform.md.
     pub fn coarse(solver: DeformSettings) -> Self {
-        Self {
-            solver,
-            gaussians: 30_000,
-            max_level: WantedPicture::MAX_LEVEL,
-            pose: None,
-            outline: 0.0,
-            robust_color: f32::INFINITY,
-        }
+        Self { solver, gaussians: 30_000, max_level: WantedPicture::MAX_LEVEL, pose: None }
     }
 }

@@ -13,7 +13,7 @@ use flyrig_tracker::{DataTerm, PointDerivatives, PoseCorrection};
 use flyrig_types::Camera;
 
 use super::area::ViewPlan;
-use super::{DeformOptions, Scene, TrackedView};
+use super::{Scene, TrackedView};
 
 /// λ_color and λ_mask of Eq. 3, over the sum of squared differences (linear light, 0..=1) of all pixels.
 const COLOR_WEIGHT: f32 = 2.0;
@@ -21,8 +21,6 @@ const MASK_WEIGHT: f32 = 2.0;
 /// Where the best view agrees at least so well, one that agrees less than the other is not believed.
 const AGREES: f64 = 0.6;
 const DISAGREES: f64 = 0.25;
-/// How far from the mask's outline its distance still grows, metres at the person.
-const REACH_M: f64 = 0.05;
 
 /// Everything that belongs to one view. Each has a rasteriser of its own: the derivatives walk the lists of the drawing
 /// again, so that no view is drawn twice.
@@ -97,7 +95,6 @@ impl<'a> Pictures<'a> {
         plans: &[ViewPlan],
         buffers: &'a mut [ViewBuffers],
         kernels: Kernels<'a>,
-        options: &DeformOptions,
         painted: bool,
     ) -> Self {
         let settings: Vec<LossSettings> = plans
@@ -106,9 +103,10 @@ impl<'a> Pictures<'a> {
                 // Before the first colours only the masks can tell anything.
                 color_weight: if painted { COLOR_WEIGHT * plan.weight as f32 } else { 0.0 },
                 mask_weight: MASK_WEIGHT * plan.weight as f32,
-                outline_weight: options.outline * MASK_WEIGHT * plan.weight as f32,
-                reach_px: (REACH_M * plan.pixels_a_m).round() as u32,
-                robust_color: options.robust_color,
+                // Neither the distance to the outline nor robust weights gained anything (docs/benchmarks/deform.md).
+                outline_weight: 0.0,
+                reach_px: 0,
+                robust_color: f32::INFINITY,
                 area: plan.area,
             })
             .collect();

@@ -1,10 +1,14 @@
 //! Tapered capsules in the body's limbs and trunk that cloth stays out of.
 
-use flyrig_body::{Part, Template};
-use glam::{DMat4, DVec3, Vec3};
+use flyrig_body::Part;
+use glam::{DMat4, Vec3};
 
-/// Cloth keeps this far from the naked body: what is worn below it.
-const UNDERWEAR_M: f32 = 0.014;
+use crate::person::Person;
+
+/// Cloth keeps this far from what is below it, metres.
+const APART_M: f32 = 0.007;
+/// Capsules a limb, one after the other.
+const PIECES: usize = 2;
 
 /// A capsule between two points with a radius at each, fixed to a joint.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -28,8 +32,13 @@ pub(crate) struct Colliders {
 }
 
 impl Colliders {
-    /// Fitted to a body at rest; bones that it does not have get none.
-    pub(crate) fn fitted(body: &Template) -> Self {
+    /// Fitted to a person's body and what lies on it, at rest; bones that it does not have get none.
+    pub(crate) fn fitted(person: &Person) -> Self {
+        let body = &person.body;
+        let worn = person.sheets.iter().filter(|sheet| !sheet.hangs).flat_map(|sheet| sheet.vertices.clone());
+        let worn = worn.map(|v| (person.clothed.positions[v], person.clothed.parts[v]));
+        let points: Vec<(Vec3, Part)> =
+            body.positions.iter().copied().zip(body.parts.iter().copied()).chain(worn).collect();
         let mut limbs = Vec::new();
         let origins = body.skeleton.canonical_origins();
         for (from, to, parts) in [
@@ -39,11 +48,15 @@ impl Colliders {
             ("RightLeg", "RightFoot", [Part::RightLeg, Part::RightFoot]),
         ] {
             let (Some(joint), Some(end)) = (body.skeleton.joint(from), body.skeleton.joint(to)) else { continue };
-            limbs.extend(fitted_limb(body, joint, origins[joint], origins[end], parts));
+            let (a, b) = (origins[joint].as_vec3(), origins[end].as_vec3());
+            for piece in 0..PIECES {
+                let at = |share: usize| a.lerp(b, share as f32 / PIECES as f32);
+                limbs.extend(fitted_limb(&points, joint, [at(piece), at(piece + 1)], parts));
+            }
         }
         for (name, half_height_m) in [("Hips", 0.05), ("LowerBack", 0.05), ("Spine1", 0.07)] {
             let Some(joint) = body.skeleton.joint(name) else { continue };
-            limbs.extend(fitted_slab(body, joint, origins[joint].y as f32, half_height_m));
+            limbs.extend(fitted_slab(&points, joint, origins[joint].y as f32, half_height_m));
         }
         Self { limbs }
     }
@@ -64,16 +77,14 @@ impl Colliders {
     }
 }
 
-/// A limb's capsule: at both ends as wide as nine of ten points of the skin around there.
-fn fitted_limb(body: &Template, joint: usize, from: DVec3, to: DVec3, parts: [Part; 2]) -> Option<Limb> {
-    let (a, b) = (from.as_vec3(), to.as_vec3());
+/// A piece of a limb: at both ends as wide as 19 of 20 points around there.
+fn fitted_limb(points: &[(Vec3, Part)], joint: usize, ends: [Vec3; 2], parts: [Part; 2]) -> Option<Limb> {
+    let [a, b] = ends;
     let axis = (b - a).try_normalize()?;
     let length = a.distance(b);
     let radius = |low: f32, high: f32| {
-        let mut distances: Vec<f32> = body
-            .positions
+        let mut distances: Vec<f32> = points
             .iter()
-            .zip(&body.parts)
             .filter(|(_, part)| parts.contains(part))
             .filter_map(|(p, _)| {
                 let along = (*p - a).dot(axis) / length;
@@ -81,16 +92,16 @@ fn fitted_limb(body: &Template, joint: usize, from: DVec3, to: DVec3, parts: [Pa
             })
             .collect();
         distances.sort_by(f32::total_cmp);
-        distances.get(distances.len() * 9 / 10).copied()
+        distances.get(distances.len() * 19 / 20).copied()
     };
-    let radii = [radius(0.12, 0.40)?, radius(0.78, 1.0)?];
-    Some(Limb { joint, ends: [a, b], radii: radii.map(|r| r + UNDERWEAR_M) })
+    let radii = [radius(-0.1, 0.3)?, radius(0.7, 1.1)?];
+    Some(Limb { joint, ends, radii: radii.map(|r| r + APART_M) })
 }
 
 /// A lying capsule as wide and deep as the trunk at a height.
-fn fitted_slab(body: &Template, joint: usize, y: f32, half_height_m: f32) -> Option<Limb> {
+fn fitted_slab(points: &[(Vec3, Part)], joint: usize, y: f32, half_height_m: f32) -> Option<Limb> {
     let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
-    for (p, part) in body.positions.iter().zip(&body.parts) {
+    for (p, part) in points {
         if matches!(part, Part::Torso | Part::LeftLeg | Part::RightLeg) && (p.y - y).abs() < half_height_m {
             (low, high) = (low.min(*p), high.max(*p));
         }
@@ -102,7 +113,7 @@ fn fitted_slab(body: &Template, joint: usize, y: f32, half_height_m: f32) -> Opt
     let reach = (0.5 * (high.x - low.x) - radius).max(0.0);
     let middle = Vec3::new(0.0, y, 0.5 * (low.z + high.z));
     let ends = [middle + Vec3::X * reach, middle - Vec3::X * reach];
-    Some(Limb { joint, ends, radii: [radius + 0.5 * UNDERWEAR_M; 2] })
+    Some(Limb { joint, ends, radii: [radius; 2] })
 }
 
 impl Capsule {

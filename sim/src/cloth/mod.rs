@@ -30,7 +30,7 @@ pub(crate) struct Cloth {
 impl Cloth {
     /// `None` for a person who wears nothing loose.
     pub(crate) fn new(person: &Person) -> Option<Self> {
-        let colliders = Colliders::fitted(&person.body);
+        let colliders = Colliders::fitted(person);
         let pieces = Pieces::new(person, &colliders.at_rest())?;
         let replay = Replay::new(person.body.skeleton.clone(), pieces.particles.clone(), colliders);
         Some(Self { pieces, replay })
@@ -46,7 +46,8 @@ impl Cloth {
         normals: &mut [Vec3],
     ) -> Vec<Vec3> {
         let offsets = self.replay.at(track, nanos);
-        self.pieces.apply(&offsets, positions, normals)
+        let capsules = self.replay.capsules(track, nanos);
+        self.pieces.apply(&offsets, &capsules, positions, normals)
     }
 
     /// Control particles.

@@ -17,7 +17,9 @@ const SEWN_M: f32 = 0.008;
 /// Layers are kept this far apart where they lie on the body, metres.
 const KEEP_M: f32 = 0.006;
 /// Bending is this much softer than stretching.
-const BEND_SOFT: f32 = 60.0;
+const BEND_SOFT: f32 = 12.0;
+/// Particles that a vertex follows.
+const FOLLOWED: usize = 10;
 
 /// Particles with what carries them; canonical space.
 #[derive(Debug, Clone, Default)]
@@ -32,8 +34,10 @@ pub(crate) struct Rigging {
 #[derive(Debug, Clone, Copy)]
 struct Follower {
     vertex: u32,
-    particles: [u32; 4],
-    weights: [f32; 4],
+    particles: [u32; FOLLOWED],
+    weights: [f32; FOLLOWED],
+    /// As [`Particle::inside_m`].
+    inside_m: Option<f32>,
     /// 0 keeps the skinned normal, 1 takes the moved surface's.
     turned: f32,
 }
@@ -92,6 +96,10 @@ impl Pieces {
         let position = |v: u32| person.clothed.positions[v as usize];
         let (cell, seeds) =
             sampled(sheet.vertices.start as u32, &weld, &neighbours, &position, |v| person.free_m[v as usize] > SEWN_M);
+        let inside = |v: u32| {
+            let depths = at_rest.iter().filter_map(|c| c.depth(position(v))).map(|(depth, _)| depth);
+            sheet.hangs.then(|| depths.fold(0.0, f32::max))
+        };
         let offset = self.particles.particles.points.len() as u32;
         for &seed in &seeds {
             let v = seed as usize;
@@ -101,9 +109,7 @@ impl Pieces {
                 free_m,
                 stiff: sheet.stiff,
                 backstop_m: (!sheet.hangs).then_some((rests_m - KEEP_M).max(0.0)),
-                inside_m: sheet.hangs.then(|| {
-                    at_rest.iter().filter_map(|c| c.depth(position(seed))).map(|(d, _)| d).fold(0.0, f32::max)
-                }),
+                inside_m: inside(seed),
             });
             self.particles.canonical.push(position(seed));
             self.particles.normals.push(person.clothed.normals[v]);
@@ -124,8 +130,15 @@ impl Pieces {
             if person.free_m[v] <= SEWN_M {
                 continue;
             }
-            let near = std::iter::once(own).chain(joined[own as usize].iter().copied());
-            self.followers.push(self.follower(v as u32, person.clothed.positions[v], near, offset, person.free_m[v]));
+            let mut near = joined[own as usize].clone();
+            near.extend(joined[own as usize].iter().flat_map(|&next| &joined[next as usize]));
+            near.insert(own);
+            self.followers.push(self.follower(
+                (v as u32, person.clothed.positions[v]),
+                near.into_iter(),
+                offset,
+                (person.free_m[v], inside(at(v as u32))),
+            ));
         }
         self.triangles.extend_from_slice(triangles);
         for v in sheet.vertices.clone() {
@@ -155,8 +168,14 @@ impl Pieces {
         self.particles.particles.links.extend(links);
     }
 
-    fn follower(&self, vertex: u32, at: Vec3, near: impl Iterator<Item = u32>, offset: u32, free_m: f32) -> Follower {
-        const REACH_M: f32 = 1.7 * SPACING_M;
+    fn follower(
+        &self,
+        (vertex, at): (u32, Vec3),
+        near: impl Iterator<Item = u32>,
+        offset: u32,
+        (free_m, inside_m): (f32, Option<f32>),
+    ) -> Follower {
+        const REACH_M: f32 = 1.8 * SPACING_M;
         let mut candidates: Vec<(f32, u32)> = near
             .map(|i| {
                 let share = 1.0 - (self.particles.canonical[(i + offset) as usize].distance(at) / REACH_M).powi(2);
@@ -164,17 +183,45 @@ impl Pieces {
             })
             .collect();
         candidates.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-        candidates.truncate(4);
+        candidates.truncate(FOLLOWED);
         let total: f32 = candidates.iter().map(|(weight, _)| weight).sum();
-        let (mut particles, mut weights) = ([0; 4], [0.0; 4]);
+        let (mut particles, mut weights) = ([0; FOLLOWED], [0.0; FOLLOWED]);
         for (slot, (weight, particle)) in candidates.into_iter().enumerate() {
             (particles[slot], weights[slot]) = (particle, weight / total);
         }
-        Follower { vertex, particles, weights, turned: smoothstep(SEWN_M, 4.0 * SEWN_M, free_m) }
+        Follower { vertex, particles, weights, inside_m, turned: smoothstep(SEWN_M, 4.0 * SEWN_M, free_m) }
+    }
+
+    /// Offsets without what neighbours do against each other: cloth makes no folds as small as the distance of particles.
+    fn smoothed(&self, offsets: &[Vec3]) -> Vec<Vec3> {
+        const ROUNDS: usize = 3;
+        let Particles { points, links } = &self.particles.particles;
+        let mut smooth = offsets.to_vec();
+        for _ in 0..ROUNDS {
+            let mut sums = vec![(Vec3::ZERO, 0.0f32); smooth.len()];
+            for link in links.iter().filter(|link| link.soft <= 1.0) {
+                let [a, b] = link.ends.map(|end| end as usize);
+                sums[a] = (sums[a].0 + smooth[b], sums[a].1 + 1.0);
+                sums[b] = (sums[b].0 + smooth[a], sums[b].1 + 1.0);
+            }
+            for ((offset, (sum, count)), point) in smooth.iter_mut().zip(sums).zip(points) {
+                if count > 0.0 && point.free_m > 0.0 {
+                    *offset = offset.lerp(sum / count, 0.5);
+                }
+            }
+        }
+        smooth
     }
 
     /// Moves the followers; gives every vertex's offset.
-    pub(crate) fn apply(&self, offsets: &[Vec3], positions: &mut [Vec3], normals: &mut [Vec3]) -> Vec<Vec3> {
+    pub(crate) fn apply(
+        &self,
+        offsets: &[Vec3],
+        capsules: &[Capsule],
+        positions: &mut [Vec3],
+        normals: &mut [Vec3],
+    ) -> Vec<Vec3> {
+        let offsets = self.smoothed(offsets);
         let mut displacement = vec![Vec3::ZERO; self.welded.len()];
         for follower in &self.followers {
             let vertex = follower.vertex as usize;
@@ -184,8 +231,18 @@ impl Pieces {
                 .zip(follower.weights)
                 .map(|(&particle, weight)| offsets[particle as usize] * weight)
                 .sum::<Vec3>();
-            displacement[vertex] = moved;
-            positions[vertex] += moved;
+            let skinned = positions[vertex];
+            let mut place = skinned + moved;
+            // Between particles the body is no flatter than at them. All go out along the surface's normal, so that
+            // neighbours stay beside each other.
+            let normal = normals[vertex];
+            for (capsule, inside_m) in capsules.iter().flat_map(|c| follower.inside_m.map(|inside_m| (c, inside_m))) {
+                if let Some((depth, out)) = capsule.depth(place).filter(|(depth, _)| *depth > inside_m) {
+                    place += normal * ((depth - inside_m) * normal.dot(out).max(0.0));
+                }
+            }
+            displacement[vertex] = place - skinned;
+            positions[vertex] = place;
         }
         let mut sums = vec![Vec3::ZERO; self.welded.len()];
         for triangle in &self.triangles {

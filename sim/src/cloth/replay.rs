@@ -10,7 +10,7 @@ use flyrig_body::{Skeleton, SkinWeights};
 use flyrig_types::PoseTrack;
 use glam::{Mat3, Mat4, Vec3};
 
-use super::colliders::Colliders;
+use super::colliders::{Capsule, Colliders};
 use super::pieces::Rigging;
 use super::solver::{Carried, STEPS_A_SECOND, State, step};
 
@@ -73,6 +73,11 @@ impl Replay {
         let t = since as f32 / blend as f32;
         let t = t * t * (3.0 - 2.0 * t);
         there.iter().zip(&here).map(|(a, b)| a.lerp(*b, t)).collect()
+    }
+
+    /// The body's capsules at a time of the repeated track.
+    pub(crate) fn capsules(&self, track: &PoseTrack, nanos: i64) -> Vec<Capsule> {
+        self.colliders.placed(&self.skeleton.world_from_canonical(&track.at_repeated(nanos)))
     }
 
     /// Offsets `since` nanoseconds after a window's start, by the run of that window.

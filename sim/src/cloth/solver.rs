@@ -15,8 +15,8 @@ const AIR: f32 = 0.9;
 /// Rate at which motion against the wearer dies, 1/s.
 const RUB: f32 = 1.6;
 /// Inverse stiffness of threads, and of cloth that is pushed together, per unit of mass.
-const STRETCH_COMPLIANCE: f32 = 2e-5;
-const PUSH_COMPLIANCE: f32 = 2e-3;
+const STRETCH_COMPLIANCE: f32 = 1e-5;
+const PUSH_COMPLIANCE: f32 = 4e-4;
 /// Share of the sliding along the body that friction takes in a step.
 const FRICTION: f32 = 0.25;
 /// Faster against its wearer than this, metres a second, nothing moves.
@@ -106,8 +106,8 @@ pub(crate) fn step(particles: &Particles, carried: &[Carried], capsules: &[Capsu
             state.places[i] = now.place;
             continue;
         }
-        // What gravity does beyond what it does at rest.
-        let fall = (now.up - Vec3::Z) * GRAVITY;
+        // What gravity does beyond what threads hold at rest; those that have fallen over hold nothing.
+        let fall = (now.up * now.up.z.max(0.0) - Vec3::Z) * GRAVITY;
         let wearer = (now.place - was) / DT;
         let mut speed = (state.speeds[i] + fall * DT) / (1.0 + AIR * DT);
         speed = wearer + (speed - wearer) / (1.0 + RUB * DT);
@@ -124,7 +124,8 @@ pub(crate) fn step(particles: &Particles, carried: &[Carried], capsules: &[Capsu
             continue;
         }
         let wearer = now.place - state.carried[i];
-        let wearer = if wearer.length() > TELEPORT_M { Vec3::ZERO } else { wearer };
+        let follows = wearer.length() <= TELEPORT_M;
+        let wearer = if follows { wearer } else { Vec3::ZERO };
         let mut place = state.places[i];
         if let Some(keep_m) = particle.backstop_m {
             let above = (place - now.place).dot(now.normal) + keep_m;
@@ -142,10 +143,9 @@ pub(crate) fn step(particles: &Particles, carried: &[Carried], capsules: &[Capsu
         place.z = place.z.max(FLOOR_M);
         // No thread is longer than it is, whatever happens.
         place = now.place + (place - now.place).clamp_length_max(1.3 * particle.free_m);
-        let speed = if wearer == Vec3::ZERO && now.place.distance(state.carried[i]) > TELEPORT_M {
-            Vec3::ZERO
-        } else {
-            (place - before[i] - wearer).clamp_length_max(FASTEST * DT) / DT + wearer / DT
+        let speed = match follows {
+            true => (place - before[i] - wearer).clamp_length_max(FASTEST * DT) / DT + wearer / DT,
+            false => Vec3::ZERO,
         };
         let sound = place.is_finite() && speed.is_finite();
         (state.places[i], state.speeds[i]) = if sound { (place, speed) } else { (now.place, Vec3::ZERO) };

@@ -25,7 +25,7 @@ pub struct PoseFreedom {
 
 impl Default for PoseFreedom {
     fn default() -> Self {
-        Self { turn: 2e3, shift: 2e4, hold: 4.0 }
+        Self { turn: 100.0, shift: 1e4, hold: 1.0 }
     }
 }
 
@@ -249,3 +249,7 @@ pub(super) fn solve_dense(factors: Option<&Cholesky<f64, Dyn>>, r: &[DVec3], sti
         None => r.iter().zip(stiffness).map(|(r, price)| *r / price.max(1e-30)).collect(),
     }
 }
+
+#[cfg(test)]
+#[path = "pose_fix_tests.rs"]
+mod tests;

@@ -11,6 +11,8 @@ pub(super) struct Regularizer {
     pub spatial: f64,
     /// λ_reg λ_temp.
     pub temporal: f64,
+    /// Price of every node's distance from where its pose puts it.
+    pub anchor: f64,
     /// Whether there were frames before this one; the temporal term is off without.
     pub history: bool,
 }
@@ -28,6 +30,12 @@ impl Regularizer {
     /// The loss at translations `t` with smoothed translations `smooth`; adds the gradient where asked.
     pub(super) fn loss(&self, t: &[DVec3], smooth: &[DVec3], mut gradient: Option<&mut [DVec3]>) -> f64 {
         let (mut loss, temporal) = (0.0, self.temporal());
+        if self.anchor > 0.0 {
+            loss += self.anchor * t.iter().map(|t| t.length_squared()).sum::<f64>();
+            for (gradient, t) in gradient.iter_mut().flat_map(|gradient| gradient.iter_mut()).zip(t) {
+                *gradient += 2.0 * self.anchor * *t;
+            }
+        }
         for &(i, j) in &self.edges {
             let (i, j) = (i as usize, j as usize);
             let spread = t[i] - t[j];

@@ -28,6 +28,9 @@ pub struct DeformSettings {
     pub spatial: f64,
     /// λ_temp of Eq. 4. The paper's 2.
     pub temporal: f64,
+    /// Price of a node's distance from where its pose puts it, units of loss a square metre. Without, a shift of all nodes
+    /// together costs nothing, and a free pose has nothing to win.
+    pub anchor: f64,
     /// Share of this frame's translation in the smoothed one of Eq. 4, 0..=1. The paper does not tell its own.
     pub smoothing: f64,
     /// Levenberg damping to begin with, as a share of the mean diagonal of the data's matrix.
@@ -46,10 +49,11 @@ pub struct DeformSettings {
 impl Default for DeformSettings {
     fn default() -> Self {
         Self {
-            solver: DeformSolver::GaussNewton { first_iterations: 3, iterations: 1 },
-            regularization: 1000.0,
+            solver: DeformSolver::GaussNewton { first_iterations: 4, iterations: 1 },
+            regularization: 2000.0,
             spatial: 1.0,
             temporal: 2.0,
+            anchor: 0.0,
             smoothing: 0.5,
             damping: 0.03,
             max_step_m: 0.02,
@@ -96,7 +100,7 @@ impl DeformSettings {
     }
 
     fn fault_without_solver(&self, weight: fn(f64) -> bool, length: fn(f64) -> bool) -> Option<&'static str> {
-        if ![self.regularization, self.spatial, self.temporal, self.damping].into_iter().all(weight) {
+        if ![self.regularization, self.spatial, self.temporal, self.anchor, self.damping].into_iter().all(weight) {
             Some("weights and damping must be finite and not negative")
         } else if !(0.0..1.0).contains(&self.rest) {
             Some("the share at which there is rest must lie in 0 to 1, 1 excluded")

@@ -15,31 +15,31 @@ use rand::{RngExt, SeedableRng};
 use super::*;
 
 /// Squared distance, times `weight`, of every Gaussian to its goal in the world.
-struct Goals<'a> {
-    positions: &'a [Vec3],
-    skin: &'a [SkinWeights],
-    bones: &'a [DMat4],
-    goals: Vec<DVec3>,
-    weights: Vec<f64>,
+pub(super) struct Goals<'a> {
+    pub(super) positions: &'a [Vec3],
+    pub(super) skin: &'a [SkinWeights],
+    pub(super) bones: &'a [DMat4],
+    pub(super) goals: Vec<DVec3>,
+    pub(super) weights: Vec<f64>,
     /// Turns the gradient round, to see whether a step uphill is refused.
-    sign: f32,
-    calls: usize,
+    pub(super) sign: f32,
+    pub(super) calls: usize,
 }
 
 impl Goals<'_> {
-    fn off(&self, g: usize, displacement: DVec3) -> DVec3 {
+    pub(super) fn off(&self, g: usize, displacement: DVec3) -> DVec3 {
         skin_point_f64(self.bones, &self.skin[g], self.positions[g].as_dvec3() + displacement) - self.goals[g]
     }
 }
 
-fn wide(v: [f32; 4]) -> DVec3 {
+pub(super) fn wide(v: [f32; 4]) -> DVec3 {
     DVec3::new(v[0].into(), v[1].into(), v[2].into())
 }
 
 impl DataTerm for Goals<'_> {
     type Error = Infallible;
 
-    fn loss(&mut self, displacement: &[[f32; 4]], correction: &PoseCorrection) -> Result<f64, Infallible> {
+    fn loss(&mut self, displacement: &[[f32; 4]], _: &PoseCorrection) -> Result<f64, Infallible> {
         self.calls += 1;
         Ok((0..self.goals.len()).map(|g| self.weights[g] * self.off(g, wide(displacement[g])).length_squared()).sum())
     }
@@ -64,14 +64,14 @@ impl DataTerm for Goals<'_> {
     }
 }
 
-struct Body {
-    template: Template,
-    surface: SurfaceGaussians,
-    graph: DeformationGraph,
-    bones: Vec<DMat4>,
+pub(super) struct Body {
+    pub(super) template: Template,
+    pub(super) surface: SurfaceGaussians,
+    pub(super) graph: DeformationGraph,
+    pub(super) bones: Vec<DMat4>,
 }
 
-fn body(gaussians: usize, nodes: usize) -> Body {
+pub(super) fn body(gaussians: usize, nodes: usize) -> Body {
     let template = default_template(&ShapeParams::default()).unwrap();
     let surface = sample_surface(&template, gaussians, 1).unwrap();
     let graph = build_graph(&template, &surface, nodes, DEFAULT_SIGMA2_M2).unwrap();
@@ -85,13 +85,13 @@ fn body(gaussians: usize, nodes: usize) -> Body {
 }
 
 /// What the clothes do: up to 3 cm, smooth.
-fn true_displacement(x: Vec3) -> DVec3 {
+pub(super) fn true_displacement(x: Vec3) -> DVec3 {
     let x = x.as_dvec3() * 7.0;
     0.015 * DVec3::new(x.y.sin() + x.z.cos(), (x.x + x.z).sin(), x.y.cos() + (x.x * 1.3).sin())
 }
 
 /// Goals for the Gaussians in front (z > 0), as one camera sees them.
-fn goals(body: &Body) -> Goals<'_> {
+pub(super) fn goals(body: &Body) -> Goals<'_> {
     let Body { surface, bones, .. } = body;
     let goal = |g: usize| {
         let x = surface.positions[g];
@@ -108,7 +108,7 @@ fn goals(body: &Body) -> Goals<'_> {
     }
 }
 
-fn tracker(body: &Body, settings: DeformSettings) -> DeformTracker {
+pub(super) fn tracker(body: &Body, settings: DeformSettings) -> DeformTracker {
     DeformTracker::new(&body.graph, &body.surface.skin, settings).unwrap()
 }
 

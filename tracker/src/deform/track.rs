@@ -92,6 +92,7 @@ impl DeformTracker {
             edges,
             spatial: settings.regularization * settings.spatial,
             temporal: settings.regularization * settings.temporal,
+            anchor: settings.anchor,
             history: false,
         };
         Ok(Self {
@@ -128,9 +129,9 @@ impl DeformTracker {
         if nodes.len() != self.translations.len() {
             return fail(format!("{} places for {} nodes of the graph", nodes.len(), self.translations.len()));
         }
-        if ![freedom.turn, freedom.shift].into_iter().all(|v| v.is_finite() && v > 0.0)
-            || !(freedom.hold.is_finite() && freedom.hold >= 0.0)
-        {
+        let above = [freedom.turn, freedom.shift].into_iter().all(|v| v.is_finite() && v > 0.0);
+        let usable = above && freedom.hold.is_finite() && freedom.hold >= 0.0;
+        if !usable {
             return fail("the prices of a corrected pose must be finite and above 0".to_owned());
         }
         if matches!(self.settings.solver, DeformSolver::GaussNewton { .. }) {
@@ -301,7 +302,8 @@ impl DeformTracker {
         let pose = pose.as_ref().map(|(basis, prices)| (basis, prices.as_slice()));
         for _ in 0..self.settings.attempts {
             let damping = self.damping * self.matrix.mean_diagonal() + LEAST_DAMPING;
-            let step = self.matrix.solve(self.regularizer.stiffness(), damping, &right, pose);
+            let step =
+                self.matrix.solve(self.regularizer.stiffness(), damping + 2.0 * self.regularizer.anchor, &right, pose);
             // Of the quadratic model, which the step s solves: (A + damping) s = -g.
             let share = self.shrink(&step);
             let along: f64 = right.iter().zip(&step).map(|(r, s)| r.dot(*s)).sum();
@@ -392,3 +394,7 @@ impl DeformTracker {
 #[cfg(test)]
 #[path = "tests.rs"]
 mod tests;
+
+#[cfg(test)]
+#[path = "stability_tests.rs"]
+mod stability_tests;

@@ -1,0 +1,67 @@
+//! Gaussians below the surface that they draw.
+
+use rayon::prelude::*;
+
+use crate::SurfaceGaussians;
+use crate::point_grid::PointGrid;
+
+/// What is drawn of a closed surface of Gaussians ends about so many scales outside of their centres (alpha one half).
+const DRAWN_BEYOND: f32 = 1.7;
+/// Thinner parts than this are looked for, metres.
+const THICKEST_M: f32 = 0.05;
+/// No Gaussian's scale falls below this share of its own: it would leave holes.
+const LEAST_SCALE: f32 = 0.6;
+
+impl SurfaceGaussians {
+    /// The same Gaussians, each moved inwards, so that what they draw ends where the surface does. In parts thinner than
+    /// that (fingers, ears) they move to the middle and shrink.
+    #[must_use]
+    pub fn inset(&self) -> Self {
+        let mut moved = self.clone();
+        let grid = PointGrid::new(&self.positions, THICKEST_M / 4.0);
+        let half_thickness = |i: usize| {
+            let (point, normal) = (self.positions[i], self.normals[i]);
+            let mut least = THICKEST_M;
+            grid.within(point, THICKEST_M, |j, _| {
+                // On the other side, and below this point.
+                let depth = (point - self.positions[j]).dot(normal);
+                if depth > 1e-3 && self.normals[j].dot(normal) < -0.5 {
+                    let aside = (point - self.positions[j] - normal * depth).length();
+                    if aside < 0.5 * depth {
+                        least = least.min(depth);
+                    }
+                }
+            });
+            0.5 * least
+        };
+        let halves: Vec<f32> = (0..self.len()).into_par_iter().map(half_thickness).collect();
+        for (i, half) in halves.into_iter().enumerate() {
+            let wanted = DRAWN_BEYOND * self.scale_m[i];
+            let by = wanted.min(0.9 * half);
+            moved.positions[i] = self.positions[i] - self.normals[i] * by;
+            moved.scale_m[i] = self.scale_m[i] * (by / wanted.max(1e-12)).clamp(LEAST_SCALE, 1.0);
+        }
+        moved
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::{ShapeParams, default_template, sample_surface};
+
+    #[test]
+    fn centres_move_inwards_and_not_through_thin_parts() {
+        let template = default_template(&ShapeParams::default()).unwrap();
+        let surface = sample_surface(&template, 20_000, 1).unwrap();
+        let inset = surface.inset();
+        let mut shrunk = 0;
+        for i in 0..surface.len() {
+            let by = (surface.positions[i] - inset.positions[i]).dot(surface.normals[i]);
+            assert!(by > 0.0 && by <= 1.7 * surface.scale_m[i] + 1e-6, "{i}: {by}");
+            assert!(inset.scale_m[i] <= surface.scale_m[i] && inset.scale_m[i] >= 0.59 * surface.scale_m[i]);
+            shrunk += usize::from(inset.scale_m[i] < surface.scale_m[i]);
+        }
+        assert!((200..10_000).contains(&shrunk), "fingers and ears, not the trunk: {shrunk}");
+        assert_eq!((inset.normals, inset.skin), (surface.normals, surface.skin));
+    }
+}

@@ -1,0 +1,131 @@
+//! Long runs and hard matrices. What takes minutes is ignored by default: `make test-long`.
+
+use super::tests::{Goals, body, goals, tracker, true_displacement, wide};
+use super::*;
+use std::convert::Infallible;
+
+/// Mean distance of the seen Gaussians to where the clothes are at a time.
+fn drift(frames: usize) -> (f64, f64) {
+    let body = body(500, 30);
+    let mut data = goals(&body);
+    let mut tracker = tracker(&body, DeformSettings { regularization: 20.0, ..DeformSettings::default() });
+    let still = data.goals.clone();
+    let (mut early, mut late) = (0.0, 0.0);
+    for frame in 0..frames {
+        // Cloth that swings once in 97 frames.
+        let swing = (frame as f64 * std::f64::consts::TAU / 97.0).sin();
+        for (g, goal) in data.goals.iter_mut().enumerate() {
+            *goal = still[g] + true_displacement(body.surface.positions[g]) * (0.5 * swing);
+        }
+        tracker.track(&mut data).unwrap();
+        let seen = (0..body.surface.len()).filter(|&g| data.weights[g] > 0.0);
+        let off = |g: usize| data.off(g, wide(tracker.displacement()[g])).length();
+        let error = seen.clone().map(off).sum::<f64>() / seen.count() as f64;
+        assert!(error.is_finite());
+        if (100..200).contains(&frame) {
+            early += error / 100.0;
+        }
+        if frame + 100 >= frames {
+            late += error / 100.0;
+        }
+    }
+    (early, late)
+}
+
+#[test]
+fn a_thousand_frames_do_not_drift() {
+    let (early, late) = drift(1000);
+    println!("mean error of frames 100 to 200: {:.3} mm, of the last 100 of 1,000: {:.3} mm", early * 1e3, late * 1e3);
+    assert!(late <= 1.1 * early);
+}
+
+#[test]
+#[ignore = "takes a minute: make test-long"]
+fn ten_thousand_frames_do_not_drift() {
+    let (early, late) = drift(10_000);
+    println!("mean error of frames 100 to 200: {:.3} mm, of the last 100 of 10,000: {:.3} mm", early * 1e3, late * 1e3);
+    assert!(late <= 1.1 * early);
+}
+
+/// Matrices that say something along one direction only, or nearly nothing, or far too much.
+struct Flat<'a> {
+    inner: Goals<'a>,
+    keep: [f32; 3],
+}
+
+impl DataTerm for Flat<'_> {
+    type Error = Infallible;
+
+    fn loss(&mut self, displacement: &[[f32; 4]], correction: &PoseCorrection) -> Result<f64, Infallible> {
+        self.inner.loss(displacement, correction)
+    }
+
+    fn derivatives(
+        &mut self,
+        displacement: &[[f32; 4]],
+        correction: &PoseCorrection,
+        out: &mut Vec<PointDerivatives>,
+    ) -> Result<f64, Infallible> {
+        let loss = self.inner.derivatives(displacement, correction, out)?;
+        for h in &mut out[0].curvature.chunks_exact_mut(2) {
+            let [x, y, z] = self.keep;
+            h[0] = [h[0][0] * x, 0.0, 0.0, h[0][3] * y];
+            h[1] = [0.0, h[1][1] * z, 0.0, 0.0];
+        }
+        Ok(loss)
+    }
+}
+
+#[test]
+fn nearly_singular_matrices_give_finite_steps_that_lower_the_loss() {
+    let body = body(2_000, 60);
+    for regularization in [0.0, 1e-9, 200.0, 1e9] {
+        for keep in [[1.0, 0.0, 0.0], [1.0, 1e-7, 1e-14], [1e-30; 3], [1e20; 3], [1e-20, 1.0, 1e15]] {
+            let settings = DeformSettings { regularization, ..DeformSettings::default() };
+            let mut tracker = tracker(&body, settings);
+            let mut data = Flat { inner: goals(&body), keep };
+            for _ in 0..4 {
+                let report = tracker.track(&mut data).unwrap();
+                assert!(report.losses.is_sorted_by(|a, b| a >= b), "{regularization} {keep:?}: {report:?}");
+                assert!(tracker.translations().iter().all(|t| t.is_finite()), "{regularization} {keep:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_frame_without_anything_to_gain_gets_no_iteration_until_something_moves() {
+    let body = body(2_000, 60);
+    let mut data = goals(&body);
+    let mut resting = tracker(&body, DeformSettings::default());
+    let mut rested = 0;
+    for _ in 0..40 {
+        rested += usize::from(resting.track(&mut data).unwrap().at_rest);
+    }
+    assert!(rested > 15, "{rested} of 40 frames of a person who stands still");
+    data.goals.iter_mut().for_each(|goal| goal.x += 0.03);
+    let report = resting.track(&mut data).unwrap();
+    assert!(!report.at_rest && report.accepted > 0, "{report:?}");
+    let mut never = tracker(&body, DeformSettings { rest: 0.0, ..DeformSettings::default() });
+    assert!((0..40).all(|_| !never.track(&mut goals(&body)).unwrap().at_rest), "the switch");
+}
+
+#[test]
+fn far_from_the_origin_the_solution_is_the_same() {
+    let near = body(2_000, 60);
+    let solve = |far: f64| {
+        let mut body = body(2_000, 60);
+        body.bones.iter_mut().for_each(|bone| bone.w_axis.x += far);
+        let mut data = goals(&body);
+        let mut tracker = tracker(&body, DeformSettings::default());
+        for _ in 0..4 {
+            tracker.track(&mut data).unwrap();
+        }
+        tracker.translations().to_vec()
+    };
+    let (here, there) = (solve(0.0), solve(5e3));
+    let worst = here.iter().zip(&there).map(|(a, b)| a.distance(*b)).fold(0.0, f64::max);
+    assert_eq!(near.graph.nodes.len(), here.len());
+    println!("5 km away: nodes within {worst:.1e} m");
+    assert!(worst < 1e-6, "{worst}");
+}
