@@ -37,7 +37,7 @@ const TILES: [Tile; 16] = [
         "motion blur",
         |c| {
             fast(c);
-            c.optics = vec![OpticsConfig { exposure_ms: 40.0, samples: 24, ..OpticsConfig::default() }]
+            c.optics = vec![OpticsConfig { exposure_ms: 40.0, samples: 24, ..OpticsConfig::default() }];
         },
         0.55,
         0,
@@ -46,7 +46,7 @@ const TILES: [Tile; 16] = [
         "rolling shutter",
         |c| {
             fast(c);
-            c.optics = vec![OpticsConfig { readout_ms: 120.0, ..OpticsConfig::default() }]
+            c.optics = vec![OpticsConfig { readout_ms: 120.0, ..OpticsConfig::default() }];
         },
         0.55,
         0,
