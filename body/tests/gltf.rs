@@ -326,3 +326,93 @@ fn no_cut_of_a_file_panics() {
         let _ = load_bytes(&damaged, "test.glb");
     }
 }
+
+/// A skinned human of a rig with prefixes: legs down, arms along x, y up; in one second the left thigh turns by 90
+/// degrees to the front and the hips go 0.2 m along z.
+fn human(prefix: &str) -> File {
+    let mut file = File::new();
+    let name = |joint: &str| format!("{prefix}{joint}");
+    let node = |joint: &str, at: [f64; 3], children: &[usize]| match children {
+        [] => json!({"name": name(joint), "translation": at}),
+        _ => json!({"name": name(joint), "translation": at, "children": children}),
+    };
+    file.json["nodes"] = json!([
+        node("Hips", [0.0, 1.0, 0.0], &[1, 5, 9]),
+        node("LeftUpLeg", [0.1, 0.0, 0.0], &[2]),
+        node("LeftLeg", [0.0, -0.45, 0.0], &[3]),
+        node("LeftFoot", [0.0, -0.45, 0.0], &[4]),
+        node("LeftToeBase", [0.0, -0.08, 0.13], &[]),
+        node("RightUpLeg", [-0.1, 0.0, 0.0], &[6]),
+        node("RightLeg", [0.0, -0.45, 0.0], &[7]),
+        node("RightFoot", [0.0, -0.45, 0.0], &[8]),
+        node("RightToeBase", [0.0, -0.08, 0.13], &[]),
+        node("Spine", [0.0, 0.4, 0.0], &[10]),
+        node("LeftArm", [0.2, 0.1, 0.0], &[11]),
+        node("LeftForeArm", [0.3, 0.0, 0.0], &[]),
+        json!({"name": "Body", "mesh": 0, "skin": 0}),
+    ]);
+    file.json["scenes"] = json!([{"nodes": [0, 12]}]);
+    let positions = file.floats("VEC3", &[0., 1., 0., 0.1, 1., 0., 0., 1.1, 0.]);
+    let joints = file.shorts("VEC4", &[0; 12]);
+    let weights = file.floats("VEC4", &[1., 0., 0., 0.].repeat(3));
+    let indices = file.shorts("SCALAR", &[0, 1, 2]);
+    let places: [[f32; 3]; 12] = [
+        [0.0, 1.0, 0.0],
+        [0.1, 1.0, 0.0],
+        [0.1, 0.55, 0.0],
+        [0.1, 0.1, 0.0],
+        [0.1, 0.02, 0.13],
+        [-0.1, 1.0, 0.0],
+        [-0.1, 0.55, 0.0],
+        [-0.1, 0.1, 0.0],
+        [-0.1, 0.02, 0.13],
+        [0.0, 1.4, 0.0],
+        [0.2, 1.5, 0.0],
+        [0.5, 1.5, 0.0],
+    ];
+    let binds: Vec<f32> =
+        places.iter().flat_map(|p| glam::Mat4::from_translation(-Vec3::from(*p)).to_cols_array()).collect();
+    let binds = file.floats("MAT4", &binds);
+    file.json["skins"] = json!([{"joints": (0..12).collect::<Vec<_>>(), "inverseBindMatrices": binds}]);
+    let attributes = json!({"POSITION": positions, "JOINTS_0": joints, "WEIGHTS_0": weights});
+    file.json["meshes"] = json!([{"primitives": [{"attributes": attributes, "indices": indices}]}]);
+    let times = file.floats("SCALAR", &[0.0, 1.0]);
+    let half = std::f32::consts::FRAC_1_SQRT_2;
+    let turns = file.floats("VEC4", &[0., 0., 0., 1., -half, 0., 0., half]);
+    let ways = file.floats("VEC3", &[0., 1., 0., 0., 1., 0.2]);
+    file.json["animations"] = json!([{
+        "samplers": [{"input": times, "output": turns}, {"input": times, "output": ways}],
+        "channels": [
+            {"sampler": 0, "target": {"node": 1, "path": "rotation"}},
+            {"sampler": 1, "target": {"node": 0, "path": "translation"}},
+        ],
+    }]);
+    file
+}
+
+#[test]
+fn a_rigs_motion_arrives_on_our_body() {
+    let skeleton = flyrig_body::default_template(&flyrig_body::ShapeParams::woman()).unwrap().skeleton;
+    for prefix in ["mixamorig:", "", "MyRig:mixamorig:"] {
+        let motion = human(prefix).load().unwrap().motion().unwrap();
+        let track = motion.retarget(&skeleton, &flyrig_body::RetargetOptions::default()).unwrap();
+        let world = |nanos: i64| skeleton.world_from_joint(&track.at(nanos));
+        let place = |nanos: i64, name: &str| world(nanos)[skeleton.joint(name).unwrap()].w_axis.truncate();
+        let bone = |nanos: i64, from: &str, to: &str| (place(nanos, to) - place(nanos, from)).normalize();
+        let near = |a: DVec3, b: DVec3| assert!((a - b).length() < 0.15, "{prefix}: {a} is not {b}");
+        assert_eq!(track.span_nanos(), (0, 1_000_000_000));
+        near(bone(0, "LeftUpLeg", "LeftLeg"), DVec3::NEG_Z);
+        near(bone(0, "LeftArm", "LeftForeArm"), DVec3::X);
+        // A body that faces +z of the file faces -y.
+        near(bone(1_000_000_000, "LeftUpLeg", "LeftLeg"), DVec3::NEG_Y);
+        near(bone(1_000_000_000, "RightUpLeg", "RightLeg"), DVec3::NEG_Z);
+        let way = place(1_000_000_000, "Hips") - place(0, "Hips");
+        assert!(way.y < -0.1 && way.x.abs() < 0.02, "{way}");
+    }
+    let error = human("bone_").load().unwrap().motion().unwrap();
+    let error = error.retarget(&skeleton, &flyrig_body::RetargetOptions::default()).unwrap_err().to_string();
+    assert!(error.contains("'LeftUpLeg', 'LeftLeg', 'LeftFoot', 'RightUpLeg'"), "{error}");
+    let mut still = human("");
+    still.json.as_object_mut().unwrap().remove("animations");
+    assert!(still.load().unwrap().motion().unwrap_err().to_string().contains("no animation"));
+}

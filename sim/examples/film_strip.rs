@@ -1,10 +1,10 @@
 //! Writes film strips of a simulated person: a row a clip, time moving on from left to right.
 //!
 //! `cargo run --release -p flyrig-sim --example film_strip -- OUT SEED CLIP [CLIP ...] [--columns N] [--height PX]
-//! [--secs A B] [--speed S] [--orbit DEGREES] [--focal HEIGHTS]`
+//! [--secs S] [--speed S] [--orbit DEGREES] [--focal HEIGHTS]`
 //!
-//! CLIP is a `motion.kind`; `SEED:CLIP` takes another person for its row. `--secs` shows the part of the clip between
-//! two times, otherwise one whole round; `--orbit` turns the camera around the person.
+//! CLIP is a `motion.kind`; `SEED:CLIP@FROM` takes another person for its row and starts `FROM` seconds into the clip.
+//! A row shows `--secs` seconds, otherwise one whole round; `--orbit` turns the camera around the person.
 
 use std::error::Error;
 use std::path::Path;
@@ -16,7 +16,7 @@ use flyrig_sim::{SimConfig, Simulator};
 struct Options {
     columns: u32,
     height: u32,
-    secs: Option<[f64; 2]>,
+    secs: Option<f64>,
     speed: f64,
     orbit: f64,
     focal: f64,
@@ -34,7 +34,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         match arg.as_str() {
             "--columns" => options.columns = number()?.max(1.0) as u32,
             "--height" => options.height = number()? as u32,
-            "--secs" => options.secs = Some([number()?, number()?]),
+            "--secs" => options.secs = Some(number()?),
             "--speed" => options.speed = number()?,
             "--orbit" => options.orbit = number()?,
             "--focal" => options.focal = number()?,
@@ -49,6 +49,10 @@ fn main() -> Result<(), Box<dyn Error>> {
             Some((seed, kind)) => (seed.parse()?, kind),
             None => (seed, clip.as_str()),
         };
+        let (kind, from) = match kind.split_once('@') {
+            Some((kind, from)) => (kind, from.parse()?),
+            None => (kind, 0.0),
+        };
         let text =
             format!("seed = {seed}\nwidth = {width}\nheight = {}\n[motion]\nkind = \"{kind}\"\n", options.height);
         let mut config: SimConfig = toml::from_str(&text)?;
@@ -61,9 +65,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         let slot = (options.orbit / 30.0).rem_euclid(12.0) as usize;
         let mut simulator = Simulator::new(&gpu, &config)?;
         let round = simulator.track().span_nanos().1 as f64 * 1e-9;
-        let [from, to] = options.secs.unwrap_or([0.0, round]);
         for column in 0..options.columns {
-            let secs = from + (to - from) * f64::from(column) / f64::from(options.columns);
+            let secs = from + options.secs.unwrap_or(round) * f64::from(column) / f64::from(options.columns);
             let (picture, _) = simulator.capture((secs * 1e9) as i64, slot)?;
             for (i, pixel) in (0u32..).zip(picture.bytes().chunks_exact(3)) {
                 let (x, y) = (column * width + i % width, row * options.height + i / width);
@@ -74,7 +77,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     if Path::new(&out).extension().is_some_and(|ending| ending == "jpg") {
         let mut file = std::io::BufWriter::new(std::fs::File::create(&out)?);
-        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 86).encode_image(&strip)?;
+        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 80).encode_image(&strip)?;
     } else {
         strip.save(&out)?;
     }

@@ -36,7 +36,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     if Path::new(out).extension().is_some_and(|ending| ending == "jpg") {
         let mut file = std::io::BufWriter::new(std::fs::File::create(out)?);
-        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 88).encode_image(&sheet)?;
+        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 78).encode_image(&sheet)?;
     } else {
         sheet.save(out)?;
     }

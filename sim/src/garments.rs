@@ -179,6 +179,10 @@ impl Tailor {
             let near_crotch = smoothstep(0.12, 0.0, (p.y - 0.80).abs());
             offset += 0.0035 * folds * (near_knee * 0.5 + near_hem * 1.2 + near_crotch * 0.6);
             offset += 0.003 * self.noise.sum(p * 13.0 + 7.0, 2);
+            if look.outer.is_some_and(|outer| outer.hem_m < 0.7 && outer.hem_m < hem_m) {
+                // Shorts under a coat.
+                offset = offset.min(0.012);
+            }
             if look.top.tucked {
                 // Over the top that it holds in.
                 let over = self.top_offset(&look.top, look.female, node) + 0.008;

@@ -57,6 +57,10 @@ pub(crate) fn free_outer(outer: &Outer, node: &Node) -> f32 {
 
 /// Wide trouser legs and shorts.
 pub(crate) fn free_bottom(look: &Look, node: &Node) -> f32 {
+    if look.outer.is_some_and(|outer| outer.hem_m < 0.7) {
+        // Under a coat.
+        return 0.0;
+    }
     let (hem_m, wide_m) = match look.bottom {
         Bottom::Trousers { hem_m, wide_m, .. } => (hem_m, wide_m),
         Bottom::Overalls { hem_m, .. } => (hem_m, 0.012),

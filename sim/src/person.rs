@@ -140,10 +140,12 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
         });
         layers.push(Layer::worn(vec![tailor.outer(look, outer)], texture, outer.cloth.fabric));
         if outer.hem_m < 0.7 {
+            let wide_m = if let Bottom::Trousers { wide_m, .. } = look.bottom { wide_m } else { 0.0 };
             let tails = Hanging {
                 top_m: COAT_SEAM_M,
                 hem_m: outer.hem_m,
-                offset_m: [0.026, 0.030],
+                // Over wide trousers.
+                offset_m: [0.026, 0.030 + 0.8 * wide_m],
                 flare: 0.13,
                 pleats: 6.0,
                 fold_m: 0.014,

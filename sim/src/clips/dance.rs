@@ -41,7 +41,7 @@ enum Footwork {
     SideTouch,
     /// On the spot.
     March,
-    /// Around by a full turn.
+    /// Around by half a turn.
     Spin,
 }
 
@@ -56,9 +56,9 @@ pub(crate) fn dance<'a>(puppet: &'a Puppet<'_>, seed: u64, speed: f64) -> Clip<'
         let known = MOVES.iter().position(|&m| m == moves[bar - 1]).unwrap_or(0);
         moves[bar] = MOVES[(known + step) % MOVES.len()];
     }
-    let spin = dice.random_range(2..BARS - 1);
+    let spin = dice.random_range(2..BARS - 2);
     let feet: [Footwork; BARS] = std::array::from_fn(|bar| match bar {
-        bar if bar == spin => Footwork::Spin,
+        bar if bar == spin || bar == spin + 1 => Footwork::Spin,
         _ if dice.random_range(0..3) == 0 => Footwork::March,
         _ => Footwork::SideTouch,
     });
@@ -115,7 +115,7 @@ fn footsteps(bars: &[Footwork; BARS]) -> [Vec<Plant>; 2] {
                     wide = if beat % 2 == 0 { 0.13 } else { 0.09 };
                 }
                 Footwork::March => middle = 0.0,
-                Footwork::Spin => yaw += TAU / BEATS_A_BAR as f64,
+                Footwork::Spin => yaw += TAU / (2 * BEATS_A_BAR) as f64,
             }
             let start = (bar * BEATS_A_BAR + beat) as f64;
             let across = DVec2::new(yaw.cos(), -yaw.sin());

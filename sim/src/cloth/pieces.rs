@@ -16,6 +16,8 @@ const SPACING_M: f32 = 0.030;
 const SEWN_M: f32 = 0.008;
 /// Layers are kept this far apart where they lie on the body, metres.
 const KEEP_M: f32 = 0.006;
+/// What hangs around the body goes in no farther than this: not between the legs for good, metres.
+const INWARDS_M: f32 = 0.09;
 /// Bending is this much softer than stretching.
 const BEND_SOFT: f32 = 12.0;
 /// Particles that a vertex follows.
@@ -108,7 +110,7 @@ impl Pieces {
             self.particles.particles.points.push(Particle {
                 free_m,
                 stiff: sheet.stiff,
-                backstop_m: (!sheet.hangs).then_some((rests_m - KEEP_M).max(0.0)),
+                backstop_m: if sheet.hangs { (0.25 * free_m).min(INWARDS_M) } else { (rests_m - KEEP_M).max(0.0) },
                 inside_m: inside(seed),
             });
             self.particles.canonical.push(position(seed));
@@ -233,12 +235,13 @@ impl Pieces {
                 .sum::<Vec3>();
             let skinned = positions[vertex];
             let mut place = skinned + moved;
-            // Between particles the body is no flatter than at them. All go out along the surface's normal, so that
-            // neighbours stay beside each other.
+            // Between particles the body is no flatter than at them. They go out towards where the surface faces,
+            // so that neighbours stay beside each other.
             let normal = normals[vertex];
             for (capsule, inside_m) in capsules.iter().flat_map(|c| follower.inside_m.map(|inside_m| (c, inside_m))) {
                 if let Some((depth, out)) = capsule.depth(place).filter(|(depth, _)| *depth > inside_m) {
-                    place += normal * ((depth - inside_m) * normal.dot(out).max(0.0));
+                    let way = (out + normal).normalize_or(out);
+                    place += way * ((depth - inside_m) / way.dot(out).max(0.4));
                 }
             }
             displacement[vertex] = place - skinned;

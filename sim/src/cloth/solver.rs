@@ -40,8 +40,8 @@ pub(crate) struct Particle {
     pub free_m: f32,
     /// Stiffness of what it is made of, 1 for plain cloth.
     pub stiff: f32,
-    /// Distance of the body below along the surface's normal that it keeps, metres; none for what hangs away from it.
-    pub backstop_m: Option<f32>,
+    /// How far it may go in against the surface's normal, metres.
+    pub backstop_m: f32,
     /// Whether the body's capsules push it; how deep inside them it may be, as it is at rest, metres.
     pub inside_m: Option<f32>,
 }
@@ -127,10 +127,8 @@ pub(crate) fn step(particles: &Particles, carried: &[Carried], capsules: &[Capsu
         let follows = wearer.length() <= TELEPORT_M;
         let wearer = if follows { wearer } else { Vec3::ZERO };
         let mut place = state.places[i];
-        if let Some(keep_m) = particle.backstop_m {
-            let above = (place - now.place).dot(now.normal) + keep_m;
-            place -= now.normal * above.min(0.0);
-        }
+        let above = (place - now.place).dot(now.normal) + particle.backstop_m;
+        place -= now.normal * above.min(0.0);
         if let Some(inside_m) = particle.inside_m {
             for capsule in capsules {
                 if let Some((depth, out)) = capsule.depth(place).filter(|(depth, _)| *depth > inside_m) {

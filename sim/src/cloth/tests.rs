@@ -158,7 +158,7 @@ fn chain(count: usize) -> (Particles, Vec<Carried>) {
         .map(|i| Particle {
             free_m: free(i),
             stiff: 1.0,
-            backstop_m: (i % 3 == 2).then_some(0.02),
+            backstop_m: if i % 3 == 2 { 0.02 } else { 0.5 },
             inside_m: Some(0.001),
         })
         .collect();
@@ -202,11 +202,10 @@ fn plain_step(particles: &Particles, carried: &[Carried], capsule: &colliders::C
     }
     for i in (0..x.len()).filter(|&i| !held(i)) {
         let (now, wearer) = (d(carried[i].place), d(carried[i].place) - d(state.carried[i]));
-        if let Some(keep) = particles.points[i].backstop_m {
-            let normal = d(carried[i].normal);
-            let above = f64::from(keep) + (x[i] - now).dot(normal);
-            x[i] += normal * (-above).max(0.0);
-        }
+        let keep = f64::from(particles.points[i].backstop_m);
+        let normal = d(carried[i].normal);
+        let above = keep + (x[i] - now).dot(normal);
+        x[i] += normal * (-above).max(0.0);
         let [a, b] = capsule.ends.map(d);
         let t = ((x[i] - a).dot(b - a) / (b - a).length_squared()).clamp(0.0, 1.0);
         let radius = f64::from(capsule.radii[0]) * (1.0 - t) + f64::from(capsule.radii[1]) * t;
