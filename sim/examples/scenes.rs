@@ -57,7 +57,7 @@ const TILES: [Tile; 16] = [
             c.scene.kind = SceneKind::Cluttered;
             c.cameras.focal_heights = 2.6;
             c.cameras.target_height_m = 1.35;
-            c.optics = vec![OpticsConfig { aperture_mm: 45.0, focus_m: 2.9, samples: 48, ..OpticsConfig::default() }];
+            c.optics = vec![OpticsConfig { aperture_mm: 45.0, focus_m: 2.9, samples: 24, ..OpticsConfig::default() }];
             c.sensors = vec![SensorConfig {
                 full_well_electrons: Some(900.0),
                 read_noise_electrons: 8.0,

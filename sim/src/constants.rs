@@ -18,7 +18,7 @@ pub(crate) const MAX_CAPSULES: usize = 64;
 /// Steps to the row in which a moving point is seen.
 const ROW_STEPS: u32 = 5;
 /// Taps of a soft shadow.
-const SHADOW_TAPS: u32 = 16;
+const SHADOW_TAPS: u32 = 12;
 /// Brightest light of a plate's layer.
 const PLATE_WHITE: f32 = 4.0;
 

@@ -88,8 +88,7 @@ fn a_passer_by_hides_and_shades_but_is_never_the_person() {
         for i in 0..free.depth.len() {
             let (before, now) = (free.mask.coverage()[i], with.mask.coverage()[i]);
             assert!(now <= before, "the passer-by is in the mask");
-            let same = with.depth[i].to_bits() == free.depth[i].to_bits();
-            assert!(with.depth[i] == 0.0 || same);
+            assert!(with.depth[i] == 0.0 || (with.depth[i] - free.depth[i]).abs() < 1e-6);
             hidden += usize::from(before == 255 && now == 0);
             let off = (0..3).map(|c| free.color.bytes()[3 * i + c].abs_diff(with.color.bytes()[3 * i + c])).max();
             seen += usize::from(off > Some(25));
@@ -108,7 +107,7 @@ fn normals_are_unit_face_the_camera_and_belong_to_the_surface() {
     for i in 0..frame.depth.len() {
         let normal = DVec3::from_array(frame.normal[i].map(f64::from));
         if frame.depth[i] == 0.0 {
-            assert_eq!(frame.normal[i].map(f32::to_bits), [0; 3]);
+            assert!(normal.length() <= 0.0);
             continue;
         }
         assert!((normal.length() - 1.0).abs() < 1e-4);
