@@ -245,7 +245,7 @@ impl Synchronizer {
         let camera = &self.cameras[slot];
         let since = camera.latest.or(self.first_nanos);
         // Between two frames of a slow camera it is not silent.
-        let usual = camera.interval.unwrap_or(0).saturating_mul(2).min(LONGEST_NANOS);
+        let usual = camera.interval.unwrap_or(0).saturating_mul(4).min(LONGEST_NANOS);
         let patience = self.max_wait.max(usual);
         matches!((self.now(), since), (Some(now), Some(since)) if now.abs_diff(since) > patience)
     }
