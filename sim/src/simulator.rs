@@ -163,14 +163,6 @@ impl Simulator {
         self.capture_with(&Shot::new(nanos, slot))
     }
 
-    /// [`Self::capture`] with the sensor's exposure multiplied by `exposure`.
-    ///
-    /// # Errors
-    /// [`SimError::NoSlot`], [`SimError::Gpu`].
-    pub fn capture_exposed(&mut self, nanos: i64, slot: usize, exposure: f64) -> Result<(Image, Mask), SimError> {
-        self.capture_with(&Shot { exposure, ..Shot::new(nanos, slot) })
-    }
-
     /// Picture and mask of a shot.
     ///
     /// # Errors
