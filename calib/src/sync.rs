@@ -97,7 +97,7 @@ struct Camera {
     latest: Option<i64>,
     /// From the frame before to that one, nanoseconds.
     interval: Option<u64>,
-    /// Frames of each camera since that one.
+    /// Frames of each camera from after that one's instant.
     missed: Vec<u64>,
     /// Time of the frame that went into a set last.
     used: Option<i64>,
@@ -183,7 +183,9 @@ impl Synchronizer {
         let nanos = frame.capture_nanos;
         self.first_nanos.get_or_insert(nanos);
         for other in &mut self.cameras {
-            other.missed[slot] += 1;
+            // Of the same instant, it tells nothing.
+            let later = other.latest.is_none_or(|latest| nanos > latest && nanos.abs_diff(latest) > self.window);
+            other.missed[slot] += u64::from(later);
         }
         self.cameras[slot].missed.fill(0);
         let outdated = self.last_set.is_some_and(|(set, _)| nanos < set && nanos.abs_diff(set) >= self.window);
@@ -376,7 +378,8 @@ mod tests {
         let mut sync = synchronizer(8, 100);
         let mut sets = Vec::new();
         for i in 0..20 {
-            for camera in ["a", "b", "c"] {
+            // Whichever comes first.
+            for camera in ["abc", "bca", "cab"][i as usize % 3].split_terminator("").skip(1) {
                 // Uneven, too.
                 sets.extend(sync.push(frame(camera, (i * 133 + i * i * 20) * MS)));
             }

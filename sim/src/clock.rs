@@ -35,6 +35,8 @@ struct State {
 struct Progress {
     /// The instant it took last.
     last: Option<u64>,
+    /// It has not delivered that one's frame yet.
+    busy: bool,
     /// Gone for good or for a while: nobody waits for it.
     away: bool,
 }
@@ -58,20 +60,23 @@ impl RealClock {
     }
 
     /// The next instant for the camera in `slot`: the one that the others are taking where it lacks that, else a new
-    /// one as soon as all have the last and it is due. `None` when that is not within `timeout`.
+    /// one as soon as all have delivered the last and it is due. `None` when that is not within `timeout`.
     pub(crate) fn next(&self, slot: usize, timeout: Duration) -> Option<u64> {
         let deadline = Instant::now() + timeout;
         let mut state = self.lock();
         state.cameras[slot].away = false;
+        // To have taken it is not enough: a camera that is still waiting for its picture would fall behind the others.
+        state.cameras[slot].busy = false;
+        self.changed.notify_all();
         loop {
             if state.index.is_some() && state.cameras[slot].last != state.index {
-                state.cameras[slot].last = state.index;
-                self.changed.notify_all();
-                return state.index;
+                let index = state.index;
+                state.cameras[slot] = Progress { last: index, busy: true, away: false };
+                return index;
             }
             let now = Instant::now();
             let mut until = deadline;
-            if state.cameras.iter().all(|camera| camera.away || camera.last == state.index) {
+            if state.cameras.iter().all(|camera| camera.away || (!camera.busy && camera.last == state.index)) {
                 let origin = *state.origin.get_or_insert(now);
                 let next = state.index.map_or(0, |index| index + 1);
                 let current = (now.duration_since(origin).as_secs_f64() / self.interval.as_secs_f64()) as u64;
@@ -136,9 +141,10 @@ mod tests {
         assert_eq!(clock.next(2, NOW), Some(first));
         assert_eq!(clock.next(0, NOW), None);
         assert_eq!(clock.next(1, NOW), Some(first));
-        let second = clock.next(1, LONG).unwrap();
+        assert_eq!(clock.next(1, NOW), None, "camera 2 has not delivered the first");
+        let second = clock.next(2, LONG).unwrap();
         assert!(second > first);
-        assert_eq!((clock.next(0, NOW), clock.next(2, NOW)), (Some(second), Some(second)));
+        assert_eq!((clock.next(0, NOW), clock.next(1, NOW)), (Some(second), Some(second)));
         assert!(clock.lock().skipped >= 5000);
     }
 
