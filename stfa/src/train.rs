@@ -1,0 +1,333 @@
+//! Training: pixels of cameras that were not inputs, compared with what the coloured Gaussians would show there.
+//!
+//! A picture is linear in the Gaussians' colours, so a sample carries the shares of the Gaussians in its pixels and no
+//! picture is drawn. The temporal memory is left out, as the paper does. Pixel-aligned sampling stands between two tapes:
+//! the gradient of the sampled features is carried back to the feature maps by hand and handed to the encoder's tape.
+
+use std::{collections::BTreeMap, path::Path};
+
+use burn::tensor::{Device, Tensor, TensorData};
+use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng, seq::SliceRandom as _};
+use safetensors::SafeTensors;
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    NetworkSize, Parameters, StfaError,
+    body_graph::PLACE,
+    inputs::{NODE, STATE},
+    network::{Network, feature_maps, linear_from_srgb, srgb_from_linear},
+    parameters::to_vec,
+    sample::{PATCH, SHARES, Target, TrainingSample},
+    taps::Taps,
+    tensor_file::{TensorFile, array, read},
+    weights::header,
+};
+
+/// Exponential means of Adam (Kingma and Ba 2015).
+const BETAS: [f32; 2] = [0.9, 0.99];
+/// Gradients longer than this are shortened to it.
+const MAX_GRADIENT: f32 = 1.0;
+
+/// How to train.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainSettings {
+    /// Order of samples, starting weights.
+    pub seed: u64,
+    /// Steps in all; the rate falls to zero along half a cosine.
+    pub steps: u64,
+    /// Adam's rate at the start.
+    pub rate: f32,
+    /// Weight of differences between neighbouring pixels against the pixels themselves: the perceptual term.
+    pub edges: f32,
+    /// Share of steps without the graph, so that the same weights serve the ablation.
+    pub without_space: f64,
+}
+
+impl Default for TrainSettings {
+    fn default() -> Self {
+        Self { seed: 1, steps: 10_000, rate: 2e-3, edges: 0.02, without_space: 0.1 }
+    }
+}
+
+/// Loss of one step, and of direct appearance on the same pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Loss {
+    /// Number of the step.
+    pub step: u64,
+    /// Mean squared sRGB difference.
+    pub mse: f64,
+    /// The same of direct appearance.
+    pub direct_mse: f64,
+}
+
+/// The state of a training: everything that the next step depends on.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Trainer {
+    /// What is being trained.
+    pub parameters: Parameters,
+    /// How.
+    pub settings: TrainSettings,
+    /// Steps done.
+    pub step: u64,
+    /// Mean and mean square of each gradient.
+    moments: BTreeMap<String, [Vec<f32>; 2]>,
+}
+
+/// What a forward pass gave.
+struct Forward {
+    loss: Tensor<1>,
+    mse: f64,
+    direct_mse: f64,
+}
+
+impl Trainer {
+    /// Starts anew.
+    #[must_use]
+    pub fn new(size: NetworkSize, settings: TrainSettings) -> Self {
+        let parameters = Parameters::untrained(size, settings.seed);
+        let zeros = |count: usize| [vec![0.0; count], vec![0.0; count]];
+        let moments = parameters.by_name.iter().map(|(name, p)| (name.clone(), zeros(p.values.len()))).collect();
+        Self { parameters, settings, step: 0, moments }
+    }
+
+    /// Place of the sample that the next step wants, out of `count`: every sample once a round, in random order.
+    #[must_use]
+    pub fn next_sample(&self, count: usize) -> usize {
+        if count == 0 {
+            return 0;
+        }
+        let (round, place) = (self.step / count as u64, self.step % count as u64);
+        let mut order: Vec<usize> = (0..count).collect();
+        order.shuffle(&mut SmallRng::seed_from_u64(self.settings.seed.wrapping_mul(0x9e37_79b9).wrapping_add(round)));
+        order[place as usize]
+    }
+
+    /// One step on one sample. A step whose loss or gradient is not finite changes nothing but the count.
+    pub fn step(&mut self, sample: &TrainingSample) -> Option<Loss> {
+        let mut rng = SmallRng::seed_from_u64(self.settings.seed.wrapping_add(self.step.wrapping_mul(0x2545_f491_4f6c)));
+        let step = self.step;
+        self.step += 1;
+        if sample.targets.is_empty() || sample.crops.rgba.is_empty() {
+            return None;
+        }
+        let target = &sample.targets[rng.random_range(0..sample.targets.len())];
+        let mut channels = [0, 1, 2];
+        channels.shuffle(&mut rng);
+        let space = !rng.random_bool(self.settings.without_space.clamp(0.0, 1.0));
+
+        let device = Device::flex().autodiff();
+        let tensors = self.parameters.tensors(&device, true);
+        let network = Network { device, size: self.parameters.size, tensors };
+        let levels = network.encode(planes(&network, sample, channels));
+        let maps = feature_maps(&levels);
+        let feature = network.size.feature();
+        let leaf = |taps: &Taps| network.table(taps.sample(&maps), feature).require_grad();
+        let (visible, nodes) = (leaf(&target.taps), leaf(&sample.node_taps));
+        let forward = forward(&network, sample, target, visible.clone(), nodes.clone(), channels, space, self.settings.edges);
+        if !forward.mse.is_finite() {
+            return None;
+        }
+        let gradients = forward.loss.backward();
+        let mut sums = BTreeMap::new();
+        network.tensors.add_gradients(&gradients, &mut sums);
+
+        let mut map_gradients: Vec<Vec<f32>> = maps.iter().map(|map| vec![0.0; map.values.len()]).collect();
+        for (taps, leaf) in [(&target.taps, &visible), (&sample.node_taps, &nodes)] {
+            let Some(gradient) = leaf.grad(&gradients) else { continue };
+            for (sum, part) in map_gradients.iter_mut().zip(taps.sample_backward(&maps, &to_vec(gradient))) {
+                sum.iter_mut().zip(part).for_each(|(sum, part)| *sum += part);
+            }
+        }
+        let seeds = levels.into_iter().zip(map_gradients).map(|(level, gradient)| {
+            let shape = level.dims();
+            (level * Tensor::<4>::from_data(TensorData::new(gradient, shape), &network.device)).sum()
+        });
+        if let Some(total) = seeds.reduce(|a, b| a + b) {
+            network.tensors.add_gradients(&total.backward(), &mut sums);
+        }
+        self.adam(step, &sums);
+        Some(Loss { step, mse: forward.mse, direct_mse: forward.direct_mse })
+    }
+
+    fn adam(&mut self, step: u64, gradients: &BTreeMap<String, Vec<f32>>) {
+        let length = gradients.values().flatten().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt() as f32;
+        if !length.is_finite() {
+            return;
+        }
+        let shorten = (MAX_GRADIENT / length.max(1e-12)).min(1.0);
+        let progress = (step as f32 / self.settings.steps.max(1) as f32).min(1.0);
+        let rate = self.settings.rate * 0.5 * (1.0 + (std::f32::consts::PI * progress).cos());
+        let count = i32::try_from(step + 1).unwrap_or(i32::MAX);
+        let unbias = BETAS.map(|beta| 1.0 - beta.powi(count));
+        for (name, gradient) in gradients {
+            let (Some(parameter), Some([mean, square])) =
+                (self.parameters.by_name.get_mut(name), self.moments.get_mut(name))
+            else {
+                continue;
+            };
+            for (((value, mean), square), gradient) in parameter.values.iter_mut().zip(mean).zip(square).zip(gradient) {
+                let gradient = gradient * shorten;
+                *mean = BETAS[0] * *mean + (1.0 - BETAS[0]) * gradient;
+                *square = BETAS[1] * *square + (1.0 - BETAS[1]) * gradient * gradient;
+                *value -= rate * (*mean / unbias[0]) / ((*square / unbias[1]).sqrt() + 1e-8);
+            }
+        }
+    }
+
+    /// Writes everything that the next step depends on, whole or not at all.
+    ///
+    /// # Errors
+    /// [`StfaError::File`].
+    pub fn save(&self, path: &Path) -> Result<(), StfaError> {
+        let mut file = TensorFile::default();
+        self.parameters.push_to(&mut file, "");
+        for (name, [mean, square]) in &self.moments {
+            file.push(format!("mean.{name}"), vec![mean.len()], mean);
+            file.push(format!("square.{name}"), vec![square.len()], square);
+        }
+        let card = serde_json::json!({ "step": self.step, "settings": self.settings });
+        file.write(path, self.parameters.metadata(&card))
+    }
+
+    /// Goes on where [`Self::save`] left off.
+    ///
+    /// # Errors
+    /// [`StfaError::File`], [`StfaError::Weights`] for a damaged checkpoint.
+    pub fn load(path: &Path) -> Result<Self, StfaError> {
+        let bytes = read(path)?;
+        let refuse = |what: String| StfaError::Weights { name: path.display().to_string(), what };
+        let file = SafeTensors::deserialize(&bytes).map_err(|error| refuse(format!("not a whole file ({error})")))?;
+        let metadata = header(&bytes).map_err(refuse)?;
+        let parameters = Parameters::read_from(&file, &metadata, "").map_err(refuse)?;
+        #[derive(Deserialize)]
+        struct Card {
+            step: u64,
+            settings: TrainSettings,
+        }
+        let card = metadata.get("card").ok_or_else(|| refuse("it is no checkpoint".to_owned()))?;
+        let Card { step, settings } =
+            serde_json::from_str(card).map_err(|error| refuse(format!("it is no checkpoint ({error})")))?;
+        let mut moments = BTreeMap::new();
+        for (name, parameter) in &parameters.by_name {
+            let shape = [parameter.values.len()];
+            let get = |what: &str| array(&file, &format!("{what}.{name}"), &shape).map_err(refuse);
+            moments.insert(name.clone(), [get("mean")?, get("square")?]);
+        }
+        Ok(Self { parameters, settings, step, moments })
+    }
+}
+
+/// Mean squared sRGB error of the networks and of direct appearance on all targets of a sample.
+#[must_use]
+pub fn evaluate(parameters: &Parameters, sample: &TrainingSample, space: bool) -> Option<[f64; 2]> {
+    if sample.targets.is_empty() || sample.crops.rgba.is_empty() {
+        return None;
+    }
+    let device = Device::flex();
+    let tensors = parameters.tensors(&device, false);
+    let network = Network { device, size: parameters.size, tensors };
+    let channels = [0, 1, 2];
+    let maps = feature_maps(&network.encode(planes(&network, sample, channels)));
+    let table = |taps: &Taps| network.table(taps.sample(&maps), network.size.feature());
+    let (mut sums, mut pixels) = ([0.0; 2], 0.0);
+    for target in &sample.targets {
+        let out = forward(&network, sample, target, table(&target.taps), table(&sample.node_taps), channels, space, 0.0);
+        let count = target.truth.len() as f64;
+        sums[0] += out.mse * count;
+        sums[1] += out.direct_mse * count;
+        pixels += count;
+    }
+    Some(sums.map(|sum| sum / pixels))
+}
+
+/// The input pictures with their colour channels in this order.
+fn planes(network: &Network, sample: &TrainingSample, channels: [usize; 3]) -> Tensor<4> {
+    let crops = &sample.crops;
+    let planes = crops.planes(&flyrig_renderer::AppearanceSettings::default());
+    let pixels = crops.width * crops.height;
+    let mut out = Vec::with_capacity(planes.len());
+    for view in planes.chunks_exact((4 * pixels).max(1)) {
+        for channel in [channels[0], channels[1], channels[2], 3] {
+            out.extend_from_slice(&view[channel * pixels..(channel + 1) * pixels]);
+        }
+    }
+    network.pictures(out, crops.views, crops.height, crops.width)
+}
+
+/// Swaps the colour channels of every triple that starts at one of `at`.
+fn swapped<const N: usize>(row: &[f32; N], at: &[usize], channels: [usize; 3]) -> [f32; N] {
+    let mut out = *row;
+    for &first in at {
+        for c in 0..3 {
+            out[first + c] = row[first + channels[c]];
+        }
+    }
+    out
+}
+
+#[allow(clippy::too_many_arguments)]
+fn forward(
+    network: &Network,
+    sample: &TrainingSample,
+    target: &Target,
+    visible: Tensor<2>,
+    node_feature: Tensor<2>,
+    channels: [usize; 3],
+    space: bool,
+    edge_weight: f32,
+) -> Forward {
+    let count = target.state.len();
+    let mut state: Vec<[f32; STATE]> =
+        target.state.iter().map(|row| swapped(row, &[0, 5, 8, 11, 14], channels)).collect();
+    if !space {
+        state.iter_mut().for_each(|row| row[4..11].fill(0.0));
+    }
+    let weight = network.table(state.iter().map(|row| row[3]).collect(), 1);
+    let current = if space {
+        let inputs: Vec<[f32; NODE]> = sample.nodes.iter().map(|row| swapped(row, &[0, 4], channels)).collect();
+        let place = network.table(sample.place.as_flattened().to_vec(), PLACE);
+        let edges = network.indices(sample.edges.as_flattened().iter().copied());
+        let graph = network.graph(node_feature, network.node_inputs(&inputs), place, &edges);
+        let node = network.size.node;
+        let shares = network.table(target.node_weights.as_flattened().to_vec(), 4).reshape([count, 4, 1]);
+        let gathered = graph.select(0, network.indices(target.nodes.as_flattened().iter().copied()));
+        let around = (gathered.reshape([count, 4, node]) * shares).sum_dim(1).reshape([count, node]);
+        network.fill(visible, weight, around)
+    } else {
+        visible
+    };
+    let base = network.table(state.iter().flat_map(|row| [row[0], row[1], row[2]]).collect(), 3);
+    let rows = Tensor::cat(vec![network.table(state.as_flattened().to_vec(), STATE), current], 1);
+    let color = linear_from_srgb(network.color(rows));
+
+    let pixels = target.truth.len();
+    let shares = network.table(target.shares.as_flattened().to_vec(), SHARES);
+    let alpha = shares.clone().sum_dim(1);
+    let which = network.indices(target.gaussians.as_flattened().iter().copied());
+    let composed = |color: Tensor<2>| -> Tensor<2> {
+        let parts = color.select(0, which.clone()).reshape([pixels, SHARES, 3]) * shares.clone().reshape([pixels, SHARES, 1]);
+        let premultiplied = parts.sum_dim(1).reshape([pixels, 3]);
+        // As the rasteriser's pictures are encoded: straight alpha, the sRGB value times alpha.
+        srgb_from_linear(premultiplied / alpha.clone().clamp_min(1e-3)) * alpha.clone()
+    };
+    let truth = network.table(
+        target.truth.iter().flat_map(|pixel| channels.map(|c| f32::from(pixel[c]) / 255.0)).collect(),
+        3,
+    );
+    let difference = composed(color) - truth.clone();
+    let mse = difference.clone().powf_scalar(2.0).mean();
+    let direct = (composed(base) - truth).powf_scalar(2.0).mean();
+    let number = |tensor: &Tensor<1>| to_vec(tensor.clone()).first().copied().map_or(f64::NAN, f64::from);
+    let (mse_value, direct_mse) = (number(&mse), number(&direct));
+    let mut loss = mse;
+    if edge_weight > 0.0 {
+        let patches = difference.reshape([pixels / (PATCH * PATCH), PATCH, PATCH, 3]);
+        let steps = |dim: usize| {
+            let ahead = patches.clone().narrow(dim, 1, PATCH - 1);
+            (ahead - patches.clone().narrow(dim, 0, PATCH - 1)).abs().mean()
+        };
+        loss = loss + (steps(1) + steps(2)) * edge_weight;
+    }
+    Forward { loss, mse: mse_value, direct_mse }
+}
