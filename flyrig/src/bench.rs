@@ -1,7 +1,8 @@
-//! `flyrig bench track`: how much error is left for how much time, on simulated people whose clothes are known.
+//! `flyrig bench`: how much error is left for how much time, on simulated people whose clothes and looks are known.
 
+mod appearance;
 mod case;
-mod plot;
+pub mod plot;
 mod sequence;
 mod surface;
 mod write;
@@ -9,6 +10,7 @@ mod write;
 use anyhow::{Context, Result};
 use flyrig_gpu::GpuContext;
 
+pub use self::appearance::appearance;
 use self::case::{Case, run_case};
 pub use self::sequence::{Sequence, SequenceConfig};
 use crate::{cli::BenchTrackArgs, config::Solver, eval::progress_bar};

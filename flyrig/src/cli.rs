@@ -50,6 +50,8 @@ pub enum Command {
         #[command(subcommand)]
         action: SimAction,
     },
+    /// Train the networks of learned appearance.
+    Train(TrainArgs),
     /// Measure run time against error on simulated people.
     Bench {
         #[command(subcommand)]
@@ -83,10 +85,93 @@ pub struct SimExportArgs {
     pub no_truth: bool,
 }
 
+#[derive(Debug, Args)]
+pub struct TrainArgs {
+    /// Folder of samples, checkpoint, weights and curves. A folder with a checkpoint is gone on with.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Simulated people to train on.
+    #[arg(long, default_value_t = 60)]
+    pub people: u64,
+    /// Simulated people, of another seed, that only measure progress.
+    #[arg(long, default_value_t = 8)]
+    pub test_people: u64,
+    /// Instants of each simulated person.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
+    pub instants: u64,
+    /// Seed of people, starting weights and order.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Recorded data set (EasyMocap layout, with masks) to train on as well, every camera held out in turn; may be given
+    /// several times.
+    #[arg(long)]
+    pub dataset: Vec<PathBuf>,
+    /// Cameras of --dataset, comma separated; all of them otherwise.
+    #[arg(long, value_delimiter = ',')]
+    pub cameras: Vec<String>,
+    /// Frames of --dataset from one sample to the next.
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    pub every: u64,
+    /// Pose in --dataset: from its glTF animation, or from the pictures.
+    #[arg(long, value_enum, default_value = "given")]
+    pub pose: Origin,
+    /// Frame rate of --dataset.
+    #[arg(long, default_value_t = 30.0)]
+    pub fps: f64,
+    /// Folder of further samples, as an earlier run left them; may be given several times.
+    #[arg(long)]
+    pub extra: Vec<PathBuf>,
+    /// Steps in all.
+    #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
+    pub steps: u64,
+    /// Adam's rate at the start; it falls to zero along half a cosine.
+    #[arg(long, default_value_t = 2e-3)]
+    pub rate: f32,
+    /// Checkpoints (one every 250 steps) from one measurement on the test people to the next.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub test_every: u64,
+    /// Pixels of a simulated picture's side.
+    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
+}
+
 #[derive(Debug, Subcommand)]
 pub enum BenchCommand {
     /// Deformation tracking: solvers, iterations, Gaussians, resolution and views; writes CSV, JSON and SVG.
     Track(BenchTrackArgs),
+    /// Appearance: every mode on simulated people that nobody trained on; writes CSV, JSON and SVG.
+    Appearance(BenchAppearanceArgs),
+}
+
+#[derive(Debug, Args)]
+pub struct BenchAppearanceArgs {
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-appearance")]
+    pub out: PathBuf,
+    /// Seed of the first person; the others follow.
+    #[arg(long, default_value_t = 101)]
+    pub seed: u64,
+    /// How many people.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub people: u64,
+    /// Frames of each sequence; the second half is scored.
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
+    pub frames: usize,
+    /// Numbers of input cameras, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "3,1", value_parser = clap::value_parser!(u8).range(1..=6).map(usize::from))]
+    pub views: Vec<usize>,
+    /// Weights file; the one that comes with the program otherwise.
+    #[arg(long)]
+    pub weights: Option<PathBuf>,
+    /// Pixels of a picture's side.
+    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
 }
 
 #[derive(Debug, Args)]
@@ -226,6 +311,9 @@ pub struct EvalArgs {
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
     pub appearance: AppearanceMode,
+    /// Weights file for the learned modes; the one that comes with the program otherwise.
+    #[arg(long)]
+    pub weights: Option<PathBuf>,
     /// Frames FIRST..END, END excluded; all of them otherwise.
     #[arg(long, value_parser = parse_range)]
     pub frames: Option<Range<u64>>,

@@ -6,6 +6,7 @@ use anyhow::{Context, Result, bail, ensure};
 use clap::ValueEnum;
 use flyrig_renderer::AppearanceSettings;
 use flyrig_sim::SimConfig;
+use flyrig_stfa::Parameters;
 use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
 use serde::{Deserialize, Serialize};
 
@@ -196,17 +197,36 @@ pub enum AppearanceMode {
     DirectNoTime,
     /// Projection only, as the paper's "w/o ST" baseline.
     DirectNoSpaceTime,
+    /// `direct`, and what trained networks add to it.
+    Stfa,
+    /// The same without the temporal memory.
+    StfaNoTime,
+    /// The same without graph and memory.
+    StfaNoSpaceTime,
 }
 
 impl AppearanceMode {
     /// What the renderer is told.
     pub fn settings(self) -> AppearanceSettings {
         let (space, time) = match self {
-            Self::Direct => (true, true),
-            Self::DirectNoTime => (true, false),
-            Self::DirectNoSpaceTime => (false, false),
+            Self::Direct | Self::Stfa => (true, true),
+            Self::DirectNoTime | Self::StfaNoTime => (true, false),
+            Self::DirectNoSpaceTime | Self::StfaNoSpaceTime => (false, false),
         };
         AppearanceSettings { space, time, ..AppearanceSettings::default() }
+    }
+
+    /// Whether networks add to direct appearance.
+    pub fn is_learned(self) -> bool {
+        matches!(self, Self::Stfa | Self::StfaNoTime | Self::StfaNoSpaceTime)
+    }
+
+    /// The networks that add to it: of this file, or those that come with the program. None for the direct modes.
+    pub fn networks(self, weights: Option<&Path>) -> Result<Option<Parameters>> {
+        if !self.is_learned() {
+            return Ok(None);
+        }
+        Ok(Some(weights.map_or_else(Parameters::embedded, Parameters::load)?))
     }
 }
 
@@ -214,11 +234,20 @@ impl AppearanceMode {
 #[serde(deny_unknown_fields, default)]
 pub struct AppearanceSection {
     pub mode: AppearanceMode,
+    /// Weights file of the networks; empty for those that come with the program.
+    pub weights: PathBuf,
+}
+
+impl AppearanceSection {
+    /// What adds to direct appearance.
+    pub fn networks(&self) -> Result<Option<Parameters>> {
+        self.mode.networks(Some(self.weights.as_path()).filter(|path| !path.as_os_str().is_empty()))
+    }
 }
 
 impl Default for AppearanceSection {
     fn default() -> Self {
-        Self { mode: AppearanceMode::Direct }
+        Self { mode: AppearanceMode::Direct, weights: PathBuf::new() }
     }
 }
 

@@ -22,6 +22,7 @@ mod sim_export;
 mod stats;
 mod stop;
 mod track_state;
+mod train;
 mod viewpoints;
 mod watch;
 
@@ -78,6 +79,10 @@ fn dispatch(cli: &Cli) -> Result<()> {
             let config = args.config.as_deref().map(Config::load).transpose()?.unwrap_or_default();
             let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
             sim_export::sim_export(args, &config.sim, &gpu(adapter)?)
+        }
+        Command::Train(args) => train::train(args, &|| gpu(cli.adapter.as_deref())),
+        Command::Bench { what: BenchCommand::Appearance(args) } => {
+            bench::appearance(args, &gpu(cli.adapter.as_deref())?)
         }
         Command::Bench { what: BenchCommand::Track(args) } => bench::track(args, &gpu(cli.adapter.as_deref())?),
         Command::Config { action: ConfigAction::Print } => {

@@ -66,7 +66,7 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
             PoseSource::Estimator(Box::new(estimator))
         }
     };
-    let engine = Engine::new(
+    let mut engine = Engine::new(
         gpu.clone(),
         template,
         config.body.gaussians,
@@ -75,6 +75,9 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         config.appearance.mode.settings(),
         config.tracking.options(config.body.pose),
     )?;
+    if let Some(networks) = config.appearance.networks()? {
+        engine.use_networks(&networks)?;
+    }
     let mut pipeline = Pipeline::new(engine, scene.rig, pose, config.body.masks, scene.plates);
     pipeline.per_view_time = config.tracking.per_view_time;
     let publisher = Publisher::open(&TransportConfig {

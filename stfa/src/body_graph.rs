@@ -161,3 +161,63 @@ fn pooled(graph: &DeformationGraph) -> Vec<[u32; POOLED]> {
         .map(|(list, &own)| std::array::from_fn(|i| list.get(i * list.len() / POOLED).copied().unwrap_or(own)))
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
+
+    use super::*;
+
+    fn body() -> (SurfaceGaussians, DeformationGraph) {
+        let template = default_template(&ShapeParams::default()).unwrap();
+        let surface = sample_surface(&template, 4000, 1).unwrap();
+        let graph = build_graph(&template, &surface, 250, DEFAULT_SIGMA2_M2).unwrap();
+        (surface, graph)
+    }
+
+    #[test]
+    fn nodes_know_their_mirror_image_their_gaussians_and_their_place() {
+        let (surface, graph) = body();
+        let body = BodyGraph::new(&surface, &graph).unwrap();
+        assert_eq!((body.gaussians(), body.nodes()), (4000, 250));
+        for (node, position) in graph.nodes.iter().enumerate() {
+            let image = Vec3::new(-position.x, position.y, position.z);
+            let found = graph.nodes[body.mirror(node)];
+            assert!(found.distance(image) < 0.15, "node {node} at {position}: {found}");
+            for gaussian in body.pooled[node] {
+                let distance = surface.positions[gaussian as usize].distance(*position);
+                assert!(distance < 0.2, "node {node} pools a Gaussian {distance} m away");
+            }
+            let place = &body.place[node];
+            assert!(place.iter().all(|v| v.is_finite() && v.abs() <= 1.01));
+            assert!((place[PLACE - PARTS.len()..].iter().sum::<f32>() - 1.0).abs() < 1e-6, "one part");
+        }
+        // Height does not matter, only the place on the body.
+        let twice = |p: &Vec3| *p * 2.0;
+        let tall = SurfaceGaussians { positions: surface.positions.iter().map(twice).collect(), ..surface.clone() };
+        let wide = DeformationGraph { nodes: graph.nodes.iter().map(twice).collect(), ..graph.clone() };
+        for (a, b) in BodyGraph::new(&tall, &wide).unwrap().place.iter().zip(&body.place) {
+            assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-3));
+        }
+    }
+
+    #[test]
+    fn bodies_that_do_not_fit_are_refused() {
+        let (surface, graph) = body();
+        let refused = |graph: &DeformationGraph| BodyGraph::new(&surface, graph).unwrap_err().to_string();
+        let mut bad = graph.clone();
+        bad.neighbors[3][1] = 250;
+        assert!(refused(&bad).contains("node 250 of 250"));
+        let mut bad = graph.clone();
+        bad.node_gaussian[0] = 4000;
+        assert!(refused(&bad).contains("Gaussian 4000 of 4000"));
+        let mut bad = graph.clone();
+        bad.gaussian_nodes.pop();
+        assert!(refused(&bad).contains("3999 of them"));
+        let mut bad = graph.clone();
+        bad.nodes[7].x = f32::NAN;
+        assert!(refused(&bad).contains("not finite"));
+        let empty = DeformationGraph { nodes: vec![], neighbors: vec![], node_gaussian: vec![], ..graph };
+        assert!(refused(&empty).contains("0 nodes"));
+    }
+}

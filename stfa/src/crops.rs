@@ -59,7 +59,8 @@ impl Crops {
         let side = |of: fn(&[usize; 4]) -> usize| boxes.iter().map(of).max().unwrap_or(0).next_multiple_of(MULTIPLE);
         let (width, height) = (side(|b| b[2] - b[0]), side(|b| b[3] - b[1]));
         let mut rgba = vec![0; pictures.len() * width * height * 4];
-        for ((picture, area), crop) in pictures.iter().zip(&boxes).zip(rgba.chunks_exact_mut((width * height * 4).max(1)))
+        for ((picture, area), crop) in
+            pictures.iter().zip(&boxes).zip(rgba.chunks_exact_mut((width * height * 4).max(1)))
         {
             let stride = picture.width as usize * 4;
             let columns = width.min(picture.width as usize - area[0]) * 4;
@@ -95,10 +96,8 @@ impl Crops {
     pub fn detail(&self, settings: &AppearanceSettings) -> FeatureMaps {
         let pixels = self.width * self.height;
         let mut values = vec![0.0; self.views * pixels * DETAIL];
-        values
-            .par_chunks_mut((pixels * DETAIL).max(1))
-            .zip(self.rgba.par_chunks((pixels * 4).max(1)))
-            .for_each(|(out, crop)| {
+        values.par_chunks_mut((pixels * DETAIL).max(1)).zip(self.rgba.par_chunks((pixels * 4).max(1))).for_each(
+            |(out, crop)| {
                 let sharp: Vec<[f32; 4]> = crop
                     .chunks_exact(4)
                     .map(|pixel| {
@@ -117,7 +116,8 @@ impl Crops {
                         }
                     }
                 }
-            });
+            },
+        );
         FeatureMaps { width: self.width, height: self.height, channels: DETAIL, stride: 1, values }
     }
 }
@@ -194,11 +194,15 @@ mod tests {
 
     #[test]
     fn boxes_hold_the_person_and_keep_their_place() {
-        let one = picture(60, 50, |x, y| ((20..23).contains(&x) && (30..44).contains(&y)).then_some([x as u8, y as u8, 9]));
+        let one =
+            picture(60, 50, |x, y| ((20..23).contains(&x) && (30..44).contains(&y)).then_some([x as u8, y as u8, 9]));
         let nobody = picture(40, 30, |_, _| None);
         let whole = picture(33, 21, |x, y| Some([x as u8, y as u8, 1]));
-        let pictures = [(60, 50, &one), (40, 30, &nobody), (33, 21, &whole)]
-            .map(|(width, height, rgba)| ViewPicture { width, height, rgba });
+        let pictures = [(60, 50, &one), (40, 30, &nobody), (33, 21, &whole)].map(|(width, height, rgba)| ViewPicture {
+            width,
+            height,
+            rgba,
+        });
         let crops = Crops::cut(&pictures).unwrap();
         assert_eq!((crops.width, crops.height), (36, 28));
         assert_eq!(crops.origins, [[12, 22], [0, 0], [0, 0]]);

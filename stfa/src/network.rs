@@ -164,3 +164,7 @@ pub(crate) fn linear_from_srgb<const D: usize>(srgb: Tensor<D>) -> Tensor<D> {
     let curve = ((srgb.clone().clamp_min(0.040_45) + 0.055) / 1.055).powf_scalar(2.4);
     curve.mask_where(dark, srgb / 12.92)
 }
+
+#[cfg(test)]
+#[path = "network_tests.rs"]
+mod tests;

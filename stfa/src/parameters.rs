@@ -110,7 +110,8 @@ impl Parameters {
             .map(|(name, shape, spread)| {
                 let count = shape.iter().product();
                 // Uniform of the wanted standard deviation.
-                let mut draw = || if spread > 0.0 { rng.random_range(-1.0f32..1.0) * spread * 3f32.sqrt() } else { -spread };
+                let mut draw =
+                    || if spread > 0.0 { rng.random_range(-1.0f32..1.0) * spread * 3f32.sqrt() } else { -spread };
                 let values = (0..count).map(|_| draw()).collect();
                 (name, Parameter { shape, values })
             })
@@ -148,7 +149,11 @@ pub(crate) struct Tensors {
 impl Tensors {
     /// The parameter in its shape. Every name comes from [`NetworkSize::parameters`]; another one gives zeros.
     pub(crate) fn get<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
-        match self.by_name.get(name).and_then(|(flat, shape)| Some((flat, <[usize; D]>::try_from(shape.as_slice()).ok()?))) {
+        match self
+            .by_name
+            .get(name)
+            .and_then(|(flat, shape)| Some((flat, <[usize; D]>::try_from(shape.as_slice()).ok()?)))
+        {
             Some((flat, shape)) => flat.clone().reshape(shape),
             None => {
                 debug_assert!(false, "{name}");

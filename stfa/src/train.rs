@@ -105,7 +105,8 @@ impl Trainer {
 
     /// One step on one sample. A step whose loss or gradient is not finite changes nothing but the count.
     pub fn step(&mut self, sample: &TrainingSample) -> Option<Loss> {
-        let mut rng = SmallRng::seed_from_u64(self.settings.seed.wrapping_add(self.step.wrapping_mul(0x2545_f491_4f6c)));
+        let mut rng =
+            SmallRng::seed_from_u64(self.settings.seed.wrapping_add(self.step.wrapping_mul(0x2545_f491_4f6c)));
         let step = self.step;
         self.step += 1;
         if sample.targets.is_empty() || sample.crops.rgba.is_empty() {
@@ -116,6 +117,19 @@ impl Trainer {
         channels.shuffle(&mut rng);
         let space = !rng.random_bool(self.settings.without_space.clamp(0.0, 1.0));
 
+        let (forward, sums, _) = self.gradients(sample, target, channels, space)?;
+        self.adam(step, &sums);
+        Some(Loss { step, mse: forward.mse, direct_mse: forward.direct_mse })
+    }
+
+    /// The forward pass, dL/d parameters, and the loss.
+    fn gradients(
+        &self,
+        sample: &TrainingSample,
+        target: &Target,
+        channels: [usize; 3],
+        space: bool,
+    ) -> Option<(Forward, BTreeMap<String, Vec<f32>>, f64)> {
         let device = Device::flex().autodiff();
         let tensors = self.parameters.tensors(&device, true);
         let network = Network { device, size: self.parameters.size, tensors };
@@ -124,10 +138,12 @@ impl Trainer {
         let feature = network.size.feature();
         let leaf = |taps: &Taps| network.table(taps.sample(&maps), feature).require_grad();
         let (visible, nodes) = (leaf(&target.taps), leaf(&sample.node_taps));
-        let forward = forward(&network, sample, target, visible.clone(), nodes.clone(), channels, space, self.settings.edges);
+        let forward =
+            forward(&network, sample, target, visible.clone(), nodes.clone(), channels, space, self.settings.edges);
         if !forward.mse.is_finite() {
             return None;
         }
+        let loss = to_vec(forward.loss.clone()).first().copied().map_or(f64::NAN, f64::from);
         let gradients = forward.loss.backward();
         let mut sums = BTreeMap::new();
         network.tensors.add_gradients(&gradients, &mut sums);
@@ -146,8 +162,7 @@ impl Trainer {
         if let Some(total) = seeds.reduce(|a, b| a + b) {
             network.tensors.add_gradients(&total.backward(), &mut sums);
         }
-        self.adam(step, &sums);
-        Some(Loss { step, mse: forward.mse, direct_mse: forward.direct_mse })
+        Some((forward, sums, loss))
     }
 
     fn adam(&mut self, step: u64, gradients: &BTreeMap<String, Vec<f32>>) {
@@ -232,7 +247,8 @@ pub fn evaluate(parameters: &Parameters, sample: &TrainingSample, space: bool) -
     let table = |taps: &Taps| network.table(taps.sample(&maps), network.size.feature());
     let (mut sums, mut pixels) = ([0.0; 2], 0.0);
     for target in &sample.targets {
-        let out = forward(&network, sample, target, table(&target.taps), table(&sample.node_taps), channels, space, 0.0);
+        let out =
+            forward(&network, sample, target, table(&target.taps), table(&sample.node_taps), channels, space, 0.0);
         let count = target.truth.len() as f64;
         sums[0] += out.mse * count;
         sums[1] += out.direct_mse * count;
@@ -306,15 +322,14 @@ fn forward(
     let alpha = shares.clone().sum_dim(1);
     let which = network.indices(target.gaussians.as_flattened().iter().copied());
     let composed = |color: Tensor<2>| -> Tensor<2> {
-        let parts = color.select(0, which.clone()).reshape([pixels, SHARES, 3]) * shares.clone().reshape([pixels, SHARES, 1]);
+        let parts =
+            color.select(0, which.clone()).reshape([pixels, SHARES, 3]) * shares.clone().reshape([pixels, SHARES, 1]);
         let premultiplied = parts.sum_dim(1).reshape([pixels, 3]);
         // As the rasteriser's pictures are encoded: straight alpha, the sRGB value times alpha.
         srgb_from_linear(premultiplied / alpha.clone().clamp_min(1e-3)) * alpha.clone()
     };
-    let truth = network.table(
-        target.truth.iter().flat_map(|pixel| channels.map(|c| f32::from(pixel[c]) / 255.0)).collect(),
-        3,
-    );
+    let truth =
+        network.table(target.truth.iter().flat_map(|pixel| channels.map(|c| f32::from(pixel[c]) / 255.0)).collect(), 3);
     let difference = composed(color) - truth.clone();
     let mse = difference.clone().powf_scalar(2.0).mean();
     let direct = (composed(base) - truth).powf_scalar(2.0).mean();
@@ -331,3 +346,7 @@ fn forward(
     }
     Forward { loss, mse: mse_value, direct_mse }
 }
+
+#[cfg(test)]
+#[path = "train_tests.rs"]
+mod tests;
