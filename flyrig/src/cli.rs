@@ -163,7 +163,7 @@ pub struct BenchAppearanceArgs {
     /// Numbers of input cameras, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "3,1", value_parser = clap::value_parser!(u8).range(1..=6).map(usize::from))]
     pub views: Vec<usize>,
-    /// Weights file; the one that comes with the program otherwise.
+    /// Weights file; only the direct modes are measured without one.
     #[arg(long)]
     pub weights: Option<PathBuf>,
     /// Pixels of a picture's side.
@@ -237,6 +237,9 @@ pub struct DemoArgs {
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
     pub appearance: AppearanceMode,
+    /// Weights file of the learned modes.
+    #[arg(long)]
+    pub weights: Option<PathBuf>,
     /// Also score the modes that `direct` adds to (takes three times as long).
     #[arg(long)]
     pub ablation: bool,
@@ -311,7 +314,7 @@ pub struct EvalArgs {
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
     pub appearance: AppearanceMode,
-    /// Weights file for the learned modes; the one that comes with the program otherwise.
+    /// Weights file of the learned modes.
     #[arg(long)]
     pub weights: Option<PathBuf>,
     /// Frames FIRST..END, END excluded; all of them otherwise.

@@ -215,7 +215,7 @@ fn pass(
         mode.settings(),
         args.solver.options(Origin::Given),
     )?;
-    if let Some(networks) = mode.networks(None)? {
+    if let Some(networks) = mode.networks(args.weights.as_deref())? {
         engine.use_networks(&networks)?;
     }
     let no_plates = inputs.cameras.iter().map(|_| None).collect();

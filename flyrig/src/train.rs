@@ -72,7 +72,7 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         bar.inc(1);
         if trainer.step % CHECKPOINT_STEPS == 0 || trainer.step == args.steps {
             if trainer.step % (CHECKPOINT_STEPS * args.test_every) == 0 || trainer.step == args.steps {
-                progress.scores.push(score(&trainer, &test));
+                progress.scores.extend(score(&trainer, &test));
             }
             progress.save(&args.out)?;
             // Last: what a checkpoint tells has been written.
@@ -89,11 +89,10 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     Ok(())
 }
 
-fn score(trainer: &Trainer, test: &[TrainingSample]) -> Scores {
-    let of = |space: bool| -> Vec<[f64; 2]> {
-        test.iter().filter_map(|sample| evaluate(&trainer.parameters, sample, space)).collect()
-    };
-    Scores::new(trainer.step, &of(true))
+/// None without anybody to measure on.
+fn score(trainer: &Trainer, test: &[TrainingSample]) -> Option<Scores> {
+    let errors: Vec<[f64; 2]> = test.iter().filter_map(|sample| evaluate(&trainer.parameters, sample, true)).collect();
+    (!errors.is_empty()).then(|| Scores::new(trainer.step, &errors))
 }
 
 /// Samples of simulated people, out of the folder as far as they lie there.

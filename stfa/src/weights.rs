@@ -83,14 +83,6 @@ impl Parameters {
         }
         Ok(Self { size, by_name })
     }
-
-    /// The weights that come with the program.
-    ///
-    /// # Errors
-    /// [`StfaError::Weights`] when the program was built with a damaged file.
-    pub fn embedded() -> Result<Self, StfaError> {
-        Self::from_bytes("embedded", include_bytes!("../assets/small.safetensors"))
-    }
 }
 
 /// Metadata of a safetensors file.

@@ -43,16 +43,20 @@ struct Row {
 /// Runs the command.
 pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let weights = args.weights.as_deref().map_or_else(Parameters::embedded, Parameters::load)?;
-    let modes = AppearanceMode::value_variants();
+    let weights = args.weights.as_deref().map(Parameters::load).transpose()?;
+    let modes: Vec<AppearanceMode> = AppearanceMode::value_variants()
+        .iter()
+        .copied()
+        .filter(|mode| weights.is_some() || !mode.is_learned())
+        .collect();
     let bar = progress_bar(args.people * (args.views.len() * modes.len()) as u64, "bench appearance");
     let mut rows = Vec::new();
     for person in args.seed..args.seed.saturating_add(args.people) {
         let config = SequenceConfig { seed: person, side: args.side, frames: args.frames, fps: 30.0 };
         let sequence = Sequence::simulate(gpu, config)?;
         for &views in &args.views {
-            for &mode in modes {
-                let row = run(gpu, args, &sequence, person, views, mode, &weights)?;
+            for &mode in &modes {
+                let row = run(gpu, args, &sequence, person, views, mode, weights.as_ref())?;
                 bar.set_message(format!("{} views, {}: {:.2} dB", row.views, row.mode, row.psnr_db));
                 rows.push(row);
                 write(&args.out, &rows)?;
@@ -73,7 +77,7 @@ fn run(
     person: u64,
     views: usize,
     mode: AppearanceMode,
-    weights: &Parameters,
+    weights: Option<&Parameters>,
 ) -> Result<Row> {
     let mut engine = Engine::new(
         gpu.clone(),
@@ -84,7 +88,7 @@ fn run(
         mode.settings(),
         Solver::GaussNewton.options(Origin::Given),
     )?;
-    if mode.is_learned() {
+    if let Some(weights) = weights.filter(|_| mode.is_learned()) {
         engine.use_networks(weights)?;
     }
     let rig = sequence.inputs(views);
