@@ -18,9 +18,6 @@ use flyrig_types::{Camera, Image, Mask, Pose};
 use crate::deformation::{DeformOptions, DeformTimes, Deformation, Scene, TrackedView};
 use crate::stats::StageTimes;
 
-/// With fewer views the last deformation stays: a single one cannot tell depth, and what fits it spoils every other side
-/// (2.6 dB on simulated people).
-const MIN_DEFORMATION_VIEWS: usize = 2;
 /// Seed of the surface sampling: the same template gives the same Gaussians on every run.
 const SURFACE_SEED: u64 = 1;
 
@@ -60,7 +57,7 @@ pub struct Engine {
     output: Option<RenderTarget>,
     deformation: Option<Deformation>,
     /// What the deformation thinks of the last update's views.
-    judged: Vec<(f64, bool)>,
+    judged: Vec<Option<(f64, bool)>>,
 }
 
 impl Engine {
@@ -152,7 +149,7 @@ impl Engine {
             poses.iter().copied().zip(std::iter::once(&self.gaussians).chain(&self.posed)).collect();
 
         self.judged.clear();
-        if let Some(deformation) = self.deformation.as_mut().filter(|_| views.len() >= MIN_DEFORMATION_VIEWS) {
+        if let Some(deformation) = self.deformation.as_mut().filter(|_| !views.is_empty()) {
             let start = Instant::now();
             let tracked: Vec<TrackedView<'_>> = views
                 .iter()
@@ -176,9 +173,13 @@ impl Engine {
             stages.add("  draw and compare", draw);
             stages.add("  derivatives", derivatives);
             stages.add("  solve", solve);
-            if deformation.report().is_some_and(|report| report.at_rest) {
-                stages.add("  at rest, no iteration", start.elapsed());
-            }
+            let at_rest = deformation.report().is_some_and(|report| report.at_rest);
+            stages.count("frames at rest, not solved", u64::from(at_rest));
+            let left_out = deformation.judged().iter().filter(|judged| judged.is_none()).count();
+            stages.count("views not compared", left_out as u64);
+            let distrusted = deformation.judged().iter().flatten().filter(|(_, trusted)| !trusted).count();
+            stages.count("views not believed", distrusted as u64);
+            stages.count("pictures halved", deformation.halved_pictures() as u64);
         }
 
         let start = Instant::now();
@@ -229,7 +230,7 @@ impl Engine {
 
         let start = Instant::now();
         // A view that is not believed paints nothing.
-        let believed = |i: usize| self.judged.get(i).is_none_or(|(_, trusted)| *trusted);
+        let believed = |i: usize| self.judged.get(i).copied().flatten().is_none_or(|(_, trusted)| trusted);
         let inputs: Vec<ViewInput<'_>> = views
             .iter()
             .zip(&self.rgba)
@@ -287,9 +288,9 @@ impl Engine {
     }
 
     /// By view of the last update: how much of the person is where the picture shows it, 0 to 1. Empty when the body was not
-    /// compared with the pictures.
-    pub fn agreement(&self) -> Vec<f64> {
-        self.judged.iter().map(|(quality, _)| *quality).collect()
+    /// compared with the pictures, None for a view that was not.
+    pub fn agreement(&self) -> Vec<Option<f64>> {
+        self.judged.iter().map(|judged| judged.map(|(quality, _)| quality)).collect()
     }
 
     /// What the last solve of the deformation did.

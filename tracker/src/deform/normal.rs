@@ -93,6 +93,11 @@ impl NormalMatrix {
         }
     }
 
+    /// The data's own block of a node.
+    pub(super) fn diagonal_block(&self, node: usize) -> DMat3 {
+        self.diagonal[node]
+    }
+
     /// Mean of the diagonal's entries.
     pub(super) fn mean_diagonal(&self) -> f64 {
         let sum: f64 = self.diagonal.iter().map(|m| m.x_axis.x + m.y_axis.y + m.z_axis.z).sum();
