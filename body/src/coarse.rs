@@ -41,14 +41,7 @@ pub fn coarsen(
         let message = format!("{all} Gaussians do not fit a graph for {}; build both together", lists[0]);
         return Err(BodyError::Mesh { name: template.name.clone(), message });
     }
-    let area: f64 = template
-        .triangles
-        .iter()
-        .filter_map(|t| {
-            let [a, b, c] = t.map(|i| template.positions.get(i as usize).map(|p| p.as_dvec3()));
-            Some(0.5 * (b? - a?).cross(c? - a?).length())
-        })
-        .sum();
+    let area = template.area_m2();
     let kept = eliminate(&surface.positions, &surface.normals, count.clamp(1, all), area);
     let positions: Vec<Vec3> = kept.iter().map(|&i| surface.positions[i]).collect();
     let normals: Vec<Vec3> = kept.iter().map(|&i| surface.normals[i]).collect();

@@ -64,10 +64,14 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
     for gaussians in [8_000, 15_000, 60_000] {
         cases.push(base.but(&format!("{gaussians} Gaussians"), |options| options.gaussians = gaussians));
     }
-    cases.push(base.but(ALL_GAUSSIANS, |options| options.gaussians = usize::MAX));
+    cases.push(base.but(ALL_GAUSSIANS, |options| {
+        (options.gaussians, options.gaussians_a_pixel) = (usize::MAX, f64::INFINITY);
+    }));
     let full = base.but(FULL_SIZE, |options| options.max_level = 0);
     cases.push(full.but("8000 Gaussians", |options| options.gaussians = 8_000));
-    cases.push(full.but(ALL_GAUSSIANS, |options| options.gaussians = usize::MAX));
+    cases.push(full.but(ALL_GAUSSIANS, |options| {
+        (options.gaussians, options.gaussians_a_pixel) = (usize::MAX, f64::INFINITY);
+    }));
     cases.push(full);
     for views in [1, 2, 4, 6] {
         cases.push(case(Solver::None, views, turn));
@@ -78,11 +82,16 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
         let name = format!("{most} compared");
         cases.push(case(Solver::GaussNewton, 6, turn).but(&name, |options| options.views = most));
     }
-    for side in [args.side / 2, args.side * 3 / 2] {
+    for side in [small(args.side), args.side / 2, args.side * 3 / 2] {
         let sequence = SequenceConfig { side, ..turn };
+        let usual = case(Solver::GaussNewton, VIEWS, sequence);
         cases.push(case(Solver::None, VIEWS, sequence));
-        cases.push(case(Solver::GaussNewton, VIEWS, sequence));
-        cases.push(case(Solver::GaussNewton, VIEWS, sequence).but(FULL_SIZE, |options| options.max_level = 0));
+        if side == small(args.side) {
+            cases.push(usual.but(ALL_DETAIL, |options| *options = options.without_level_of_detail()));
+        } else {
+            cases.push(usual.but(FULL_SIZE, |options| options.max_level = 0));
+        }
+        cases.push(usual);
     }
     let still = case(Solver::GaussNewton, VIEWS, SequenceConfig { motion: Motion::Still, ..turn });
     cases.push(still.but(NO_REST, |options| options.solver.rest = 0.0));
@@ -94,10 +103,16 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
     cases
 }
 
+/// Pictures where a pixel covers several of the compared Gaussians.
+fn small(side: u32) -> u32 {
+    (side * 5 / 16).max(16)
+}
+
 /// Input cameras, where nothing else is told.
 const VIEWS: usize = 3;
 const ALL_GAUSSIANS: &str = "all Gaussians";
 const FULL_SIZE: &str = "full size";
+const ALL_DETAIL: &str = "all detail";
 const ALL_VIEWS: &str = "all views";
 const NO_REST: &str = "no rest";
 

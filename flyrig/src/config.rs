@@ -160,7 +160,9 @@ impl TrackingSection {
         if self.solver == Solver::GaussNewton {
             options.gaussians = self.gaussians;
             options.views = self.views;
-            options.max_level = if self.halve { options.max_level } else { 0 };
+            if !self.level_of_detail {
+                options = options.without_level_of_detail();
+            }
             options.solver.rest = self.rest;
         }
         Some(options)
@@ -176,7 +178,7 @@ const PAPER_RATE: f64 = 3e-6;
 pub struct TrackingSection {
     pub solver: Solver,
     pub gaussians: usize,
-    pub halve: bool,
+    pub level_of_detail: bool,
     pub views: usize,
     pub rest: f64,
     pub per_view_time: bool,
@@ -184,7 +186,14 @@ pub struct TrackingSection {
 
 impl Default for TrackingSection {
     fn default() -> Self {
-        Self { solver: Solver::None, gaussians: 30_000, halve: true, views: 0, rest: 0.01, per_view_time: true }
+        Self {
+            solver: Solver::None,
+            gaussians: 30_000,
+            level_of_detail: true,
+            views: 0,
+            rest: 0.01,
+            per_view_time: true,
+        }
     }
 }
 

@@ -92,15 +92,16 @@ pub struct DeformTimes {
 }
 
 impl Deformation {
-    /// At rest, for these Gaussians.
+    /// At rest, for these Gaussians, before cameras whose finest pixel covers `pixel_m` of the person.
     pub fn new(
         gpu: &GpuContext,
         template: &Template,
         surface: &SurfaceGaussians,
         graph: &DeformationGraph,
         options: DeformOptions,
+        pixel_m: f64,
     ) -> Result<Self> {
-        let coarse = coarsen(template, surface, graph, options.gaussians)?;
+        let coarse = coarsen(template, surface, graph, options.compared(template.area_m2(), pixel_m))?;
         let count = coarse.gaussians.len();
         let landmarks = Landmarks::new(surface, graph);
         let mut tracker = DeformTracker::new(&coarse.graph, &coarse.gaussians.skin, options.solver)?;

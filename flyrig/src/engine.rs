@@ -13,10 +13,11 @@ use flyrig_renderer::{
     ViewInput, read_splats, rgba8_from_target,
 };
 use flyrig_tracker::DeformReport;
-use flyrig_types::{Camera, Image, Mask, Pose};
+use flyrig_types::{Camera, Image, Mask, Pose, Rig};
 
 use crate::deformation::{DeformOptions, DeformTimes, Deformation, Scene, TrackedView};
 use crate::stats::StageTimes;
+use crate::viewpoints::center_of_attention;
 
 /// Seed of the surface sampling: the same template gives the same Gaussians on every run.
 const SURFACE_SEED: u64 = 1;
@@ -61,7 +62,7 @@ pub struct Engine {
 }
 
 impl Engine {
-    /// Samples the template's surface and prepares the GPU. Takes a few seconds. Without `deform` the body is only
+    /// Samples the template's surface and prepares the GPU for the input cameras of `rig`. Takes a few seconds. Without `deform` the body is only
     /// skinned.
     #[allow(clippy::too_many_arguments)]
     pub fn new(
@@ -69,7 +70,7 @@ impl Engine {
         template: Template,
         gaussian_count: usize,
         node_count: usize,
-        max_views: usize,
+        rig: &Rig,
         settings: AppearanceSettings,
         deform: Option<DeformOptions>,
     ) -> Result<Self> {
@@ -77,7 +78,7 @@ impl Engine {
             sample_surface(&template, gaussian_count, SURFACE_SEED).context("sampling the template's surface")?;
         let graph = build_graph(&template, &surface, node_count, DEFAULT_SIGMA2_M2)
             .context("building the deformation graph")?;
-        Self::from_parts(gpu, template, &surface, &graph, max_views, settings, deform)
+        Self::from_parts(gpu, template, &surface, &graph, rig, settings, deform)
     }
 
     fn from_parts(
@@ -85,7 +86,7 @@ impl Engine {
         template: Template,
         surface: &SurfaceGaussians,
         graph: &DeformationGraph,
-        max_views: usize,
+        rig: &Rig,
         settings: AppearanceSettings,
         deform: Option<DeformOptions>,
     ) -> Result<Self> {
@@ -104,10 +105,10 @@ impl Engine {
                 None => GpuSkinner::new(&gpu, surface, &template.skeleton)?,
             },
             deformation: deform
-                .map(|options| Deformation::new(&gpu, &template, surface, graph, options))
+                .map(|options| Deformation::new(&gpu, &template, surface, graph, options, finest_pixel_m(rig)))
                 .transpose()?,
             rasterizer,
-            appearance: DirectAppearance::new(&gpu, surface, graph, max_views)?,
+            appearance: DirectAppearance::new(&gpu, surface, graph, rig.cameras.len())?,
             gpu,
             template,
             gaussians,
@@ -344,4 +345,11 @@ impl Engine {
         }
         Ok(())
     }
+}
+
+/// What a pixel of the finest camera covers at the place that all look at, metres.
+fn finest_pixel_m(rig: &Rig) -> f64 {
+    let center = center_of_attention(rig);
+    let pixel = |camera: &Camera| camera.position().distance(center) / (0.5 * camera.intrinsics.focal_px.element_sum());
+    rig.cameras.iter().map(pixel).fold(f64::INFINITY, f64::min)
 }

@@ -100,16 +100,16 @@ impl Case {
 
 /// A pipeline for a case.
 pub fn pipeline(gpu: &GpuContext, sequence: &Sequence, case: &Case) -> Result<Pipeline> {
+    let rig = sequence.inputs(case.views);
     let engine = Engine::new(
         gpu.clone(),
         sequence.template.clone(),
         case.gaussians,
         DEFAULT_NODE_COUNT.min(case.gaussians / 12),
-        case.views,
+        &rig,
         AppearanceMode::Direct.settings(),
         case.options,
     )?;
-    let rig = sequence.inputs(case.views);
     let plates = rig.cameras.iter().map(|_| None).collect();
     let track = PoseSource::Track { track: sequence.track.clone(), repeat: true };
     Ok(Pipeline::new(engine, rig, track, Origin::Given, plates))

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::case::Row;
 use super::sequence::Motion;
-use super::{ALL_GAUSSIANS, ALL_VIEWS, FULL_SIZE, NO_REST, VIEWS};
+use super::{ALL_DETAIL, ALL_GAUSSIANS, ALL_VIEWS, FULL_SIZE, NO_REST, VIEWS, small};
 
 /// Everything, for the terminal.
 pub fn summary(rows: &[Row]) -> String {
@@ -43,18 +43,20 @@ fn find<'a>(rows: &'a [Row], variant: &str, views: usize, side: u32, motion: Mot
 fn skips(rows: &[Row]) -> String {
     let Some(side) = rows.first().map(|r| r.sequence.side) else { return String::new() };
     let but = |what: &str| format!("default, {what}");
-    let of = |variant: &str, views, motion| find(rows, variant, views, side, motion);
+    let low = small(side);
     let pairs = [
-        ("Gaussians: fewer are compared", "default", but(ALL_GAUSSIANS), VIEWS, Motion::Turn),
-        ("pixels: pictures are halved", "default", but(FULL_SIZE), VIEWS, Motion::Turn),
-        ("iterations: none at rest (person stands)", "default", but(NO_REST), VIEWS, Motion::Still),
-        ("views: 4 of 6", "default, 4 compared", but(ALL_VIEWS), 6, Motion::Turn),
-        ("views: 3 of 6", "default, 3 compared", but(ALL_VIEWS), 6, Motion::Turn),
-        ("views: 2 of 6", "default, 2 compared", but(ALL_VIEWS), 6, Motion::Turn),
+        ("Gaussians: fewer are compared", "default", but(ALL_GAUSSIANS), VIEWS, side, Motion::Turn),
+        ("Gaussians: two a pixel (small pictures)", "default", but(ALL_DETAIL), VIEWS, low, Motion::Turn),
+        ("pixels: pictures are halved", "default", but(FULL_SIZE), VIEWS, side, Motion::Turn),
+        ("iterations: none at rest (person stands)", "default", but(NO_REST), VIEWS, side, Motion::Still),
+        ("views: 4 of 6", "default, 4 compared", but(ALL_VIEWS), 6, side, Motion::Turn),
+        ("views: 3 of 6", "default, 3 compared", but(ALL_VIEWS), 6, side, Motion::Turn),
+        ("views: 2 of 6", "default, 2 compared", but(ALL_VIEWS), 6, side, Motion::Turn),
     ];
     let mut text = String::new();
-    for (name, with, without, views, motion) in pairs {
-        let (Some(with), Some(without)) = (of(with, views, motion), of(&without, views, motion)) else { continue };
+    for (name, with, without, views, side, motion) in pairs {
+        let of = |variant: &str| find(rows, variant, views, side, motion);
+        let (Some(with), Some(without)) = (of(with), of(&without)) else { continue };
         if text.is_empty() {
             text = format!(
                 "{:<42} {:>9} {:>9} {:>7} {:>11} {:>9} {:>9}\n",
