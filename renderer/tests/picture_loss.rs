@@ -178,3 +178,42 @@ fn an_empty_area_and_a_buffer_that_does_not_fit_cost_nothing() {
         assert_eq!(loss.read(&gpu, 1).unwrap(), [PictureSums::default()]);
     }
 }
+
+#[test]
+fn a_number_that_is_not_finite_is_told_and_stays_where_it_is() {
+    let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+    let mut loss = PictureLoss::new(&gpu).unwrap();
+    let mut rng = StdRng::seed_from_u64(6);
+    let settings = LossSettings { color_weight: 2.0, mask_weight: 2.0, area: [4, 3, 30, 28] };
+    let case = case(&mut rng, [32, 32], 0, settings, None);
+    let picture = WantedPicture::zeroed(&gpu, case.source, 0).unwrap();
+    let target = RenderTarget::new(&gpu, 32, 32).unwrap();
+    let out = PictureGradients::zeroed(&gpu, 32, 32).unwrap();
+    loss.reserve(&gpu, 1).unwrap();
+    let run = |drawn: &[[f32; 4]]| {
+        target.color.write(&gpu, drawn);
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        loss.prepare(&gpu, &mut encoder, &picture, &case.rgba, &settings);
+        loss.encode(&gpu, &mut encoder, 0, &target, &picture, &settings, &out);
+        gpu.queue.submit([encoder.finish()]);
+        (loss.read(&gpu, 1).unwrap()[0], out.color.read(&gpu).unwrap(), out.depth_carry.read(&gpu).unwrap())
+    };
+    let sound = run(&case.drawn);
+    assert!(sound.0.loss.is_finite());
+    for bad in [f32::NAN, f32::INFINITY, f32::MAX] {
+        for channel in 0..4 {
+            let mut drawn = case.drawn.clone();
+            drawn[10 * 32 + 12][channel] = bad;
+            let (sums, color, carry) = run(&drawn);
+            assert!(!sums.loss.is_finite(), "{bad} in channel {channel}: {sums:?}");
+            for at in 0..32 * 32usize {
+                let far = (at % 32).abs_diff(12) + (at / 32).abs_diff(10) > 1;
+                assert!(!far || (color[at], carry[at]) == (sound.1[at], sound.2[at]), "{bad} at {at}");
+            }
+        }
+        // Outside of the area nobody looks.
+        let mut drawn = case.drawn.clone();
+        drawn[2 * 32 + 12] = [bad; 4];
+        assert!(run(&drawn) == sound);
+    }
+}

@@ -17,7 +17,8 @@ pub enum DeformSolver {
     },
 }
 
-/// Weights and limits.
+/// Weights and limits. In another unit of length everything here that has metres in its unit must be told in that one,
+/// and the solution is the same.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DeformSettings {
     /// How to step.
