@@ -224,3 +224,6 @@ impl Deformation {
 fn mean(values: &[f32]) -> f64 {
     values.iter().map(|v| f64::from(*v)).sum::<f64>() / values.len().max(1) as f64
 }
+
+#[cfg(test)]
+mod stability_tests;
