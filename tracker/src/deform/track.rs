@@ -16,6 +16,9 @@ const DAMPING_RANGE: (f64, f64) = (1e-3, 1e6);
 /// Shares of the predicted fall of the loss above and below which the damping changes after a step.
 const GOOD_GAIN: f64 = 0.75;
 const POOR_GAIN: f64 = 0.25;
+/// A step is not tried when it promises to lower the loss by less than this share: the pictures' sums are `f32`, and what
+/// rounding says of so small a step would decide on the damping of the next frames.
+const LEAST_GAIN: f64 = 1e-5;
 /// Keeps the matrix regular where neither picture nor neighbour says anything, as a share of its mean diagonal: the unit
 /// of length does not matter.
 const LEAST_DAMPING: f64 = 1e-11;
@@ -311,6 +314,9 @@ impl DeformTracker {
             let along: f64 = right.iter().zip(&step).map(|(r, s)| r.dot(*s)).sum();
             let squared: f64 = step.iter().take(gradient.len()).map(|s| s.length_squared()).sum();
             let predicted = share * along - 0.5 * share * share * (along - damping * squared);
+            if predicted < LEAST_GAIN * loss {
+                return Ok(());
+            }
             let state = (self.translations.clone(), self.correction().clone());
             let new = self.try_step(&step, data)?;
             if new < loss {

@@ -202,12 +202,15 @@ impl<'a> Chain<'a> {
                 let limit = self.settings.max_translation_m;
                 let new: Vec<DVec3> =
                     t.iter().zip(&step).map(|(t, s)| (*t + *s * share).clamp_length_max(limit)).collect();
+                let along: f64 = right.iter().zip(&step).map(|(r, s)| r.dot(*s)).sum();
+                let squared: f64 = step.iter().map(|s| s.length_squared()).sum();
+                let predicted = share * along - 0.5 * share * share * (along - self.damping * mean * squared);
+                if predicted < 1e-5 * loss {
+                    break;
+                }
                 let new_loss = total(self, &new);
                 if new_loss < loss {
-                    let along: f64 = right.iter().zip(&step).map(|(r, s)| r.dot(*s)).sum();
-                    let squared: f64 = step.iter().map(|s| s.length_squared()).sum();
-                    let curve = along - self.damping * mean * squared;
-                    let gain = (loss - new_loss) / (share * along - 0.5 * share * share * curve);
+                    let gain = (loss - new_loss) / predicted;
                     if gain > 0.75 {
                         self.damping = (self.damping / 4.0).max(1e-3);
                     } else if gain < 0.25 {
