@@ -79,7 +79,7 @@ fn diverge(frames: usize) -> Vec<Row> {
         assert!(device.deformation.judged().iter().all(|(_, trusted)| *trusted), "every view counts");
         let losses = same.track(&shot);
         exact.track(&shot);
-        if frame % 50 == 0 {
+        if frame.is_multiple_of(50) {
             println!("frame {frame}: losses {:.5?}, in f64 {losses:.5?}", report.losses);
         }
         let ours = device.centers(&scene, &shot.poses[0]);
@@ -207,9 +207,6 @@ fn the_engine_gives_the_same_bytes_again() {
         (engine.splats().unwrap(), losses)
     };
     let first = run();
-    assert!(
-        first.1.len() > 5 && first.0.iter().any(|s| s.color != first.0[0].color),
-        "something was solved and painted"
-    );
+    assert!(first.1.len() > 5 && first.0.iter().any(|s| *s != first.0[0]), "something was solved and painted");
     assert!(first == run());
 }
