@@ -25,8 +25,8 @@ use crate::bench::plot::{Plot, Series};
 use crate::engine::{Engine, InputView};
 use crate::stats::StageTimes;
 
-/// Most that a Gaussian may stand from where f64 puts it: eight times what was measured, and ten units in the last place of
-/// an f32 at the rim of the scene. One step accepted or damped otherwise than in f64 puts millimetres between them.
+/// Most that a Gaussian may stand from where f64 puts it: eight times what was measured, and twenty units in the last place
+/// of a coordinate of 2 m. One step accepted or damped otherwise than in f64 puts millimetres between them.
 const MOST_APART_M: f64 = 5e-6;
 /// And from where it would stand were every step solved exactly, five times what was measured: conjugate gradients that end
 /// at a thousandth of the residual of steps of up to 2 cm.

@@ -1,5 +1,5 @@
 //! The whole chain, plainly and slowly in f64: pictures in, displaced positions out. Written from the equations; it
-//! shares the skinning of points with the product, and nothing else.
+//! shares the skeleton, the f64 skinning and the inset of the surface with the product.
 
 use flyrig_body::{SurfaceGaussians, skin_jacobian_f64, skin_point_f64};
 use flyrig_renderer::{Outputs, RasterSettings, linear_from_srgb};
