@@ -1,7 +1,7 @@
 //! `flyrig bench track`: how much error is left for how much time, on simulated people whose clothes are known.
 
 mod case;
-mod plot;
+pub(crate) mod plot;
 mod sequence;
 mod summary;
 mod surface;

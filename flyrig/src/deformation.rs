@@ -255,3 +255,6 @@ impl Deformation {
         self.mesh.of_vertices()
     }
 }
+
+#[cfg(test)]
+mod stability_tests;

@@ -103,10 +103,6 @@ impl<'a> Pictures<'a> {
                 // Before the first colours only the masks can tell anything.
                 color_weight: if painted { COLOR_WEIGHT * plan.weight as f32 } else { 0.0 },
                 mask_weight: MASK_WEIGHT * plan.weight as f32,
-                // Neither the distance to the outline nor robust weights gained anything (docs/benchmarks/deform.md).
-                outline_weight: 0.0,
-                reach_px: 0,
-                robust_color: f32::INFINITY,
                 area: plan.area,
             })
             .collect();

@@ -4,8 +4,6 @@ use glam::DVec3;
 
 use super::normal::NormalMatrix;
 
-/// Thinnest (a body thinner than its template) and thickest, metres.
-const RANGE_M: (f64, f64) = (-0.02, 0.06);
 /// A part that is seen less than this share of what all parts are together is believed to be like the others.
 const LEAST_SHARE: f64 = 0.01;
 /// Share of a frame in what is known, once something is.
@@ -18,14 +16,16 @@ pub(super) struct Thickness {
     /// Canonical normals of the nodes, and their parts.
     normals: Vec<DVec3>,
     parts: Vec<usize>,
+    /// Thinnest and thickest, metres.
+    range_m: [f64; 2],
     /// Metres a part; none before the first frame.
     known: Option<Vec<f64>>,
 }
 
 impl Thickness {
     /// One normal and one part a node.
-    pub(super) fn new(normals: Vec<DVec3>, parts: Vec<usize>) -> Self {
-        Self { normals, parts, known: None }
+    pub(super) fn new(normals: Vec<DVec3>, parts: Vec<usize>, range_m: [f64; 2]) -> Self {
+        Self { normals, parts, range_m, known: None }
     }
 
     pub(super) fn forget(&mut self) {
@@ -44,7 +44,7 @@ impl Thickness {
         let mut sums = vec![(0.0, 0.0); count];
         for (node, (t, normal)) in translations.iter().zip(&self.normals).enumerate() {
             let weight = normal.dot(matrix.diagonal_block(node) * *normal);
-            let along = t.dot(*normal).clamp(RANGE_M.0, RANGE_M.1);
+            let along = t.dot(*normal).clamp(self.range_m[0], self.range_m[1]);
             if weight.is_finite() && weight > 0.0 && along.is_finite() {
                 let (weights, sum) = &mut sums[self.parts[node]];
                 *weights += weight;

@@ -17,8 +17,12 @@ const DAMPING_RANGE: (f64, f64) = (1e-3, 1e6);
 /// Shares of the predicted fall of the loss above and below which the damping changes after a step.
 const GOOD_GAIN: f64 = 0.75;
 const POOR_GAIN: f64 = 0.25;
-/// Keeps the matrix regular where neither picture nor neighbour says anything, units of loss a square metre.
-const LEAST_DAMPING: f64 = 1e-6;
+/// A step is not tried when it promises to lower the loss by less than this share: the pictures' sums are `f32`, and what
+/// rounding says of so small a step would decide on the damping of the next frames.
+const LEAST_GAIN: f64 = 1e-5;
+/// Keeps the matrix regular where neither picture nor neighbour says anything, as a share of its mean diagonal: the unit
+/// of length does not matter.
+const LEAST_DAMPING: f64 = 1e-11;
 
 /// What one frame did to the deformation.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -155,7 +159,7 @@ impl DeformTracker {
             return Err(TrackError::new(TrackErrorKind::Template, message));
         }
         if matches!(self.settings.solver, DeformSolver::GaussNewton { .. }) {
-            self.thickness = Some(Thickness::new(normals, parts));
+            self.thickness = Some(Thickness::new(normals, parts, self.settings.thickness_m));
         }
         Ok(self)
     }
@@ -327,14 +331,18 @@ impl DeformTracker {
         }
         let pose = pose.as_ref().map(|(basis, prices)| (basis, prices.as_slice()));
         for _ in 0..self.settings.attempts {
-            let damping = self.damping * self.matrix.mean_diagonal() + LEAST_DAMPING;
-            let step =
-                self.matrix.solve(self.regularizer.stiffness(), damping + 2.0 * self.regularizer.anchor, &right, pose);
+            let stiffness = self.regularizer.stiffness();
+            let by_data = self.matrix.mean_diagonal();
+            let damping = self.damping * by_data + LEAST_DAMPING * (by_data + stiffness * self.matrix.mean_edges());
+            let step = self.matrix.solve(stiffness, damping + 2.0 * self.regularizer.anchor, &right, pose);
             // Of the quadratic model, which the step s solves: (A + damping) s = -g.
             let share = self.shrink(&step);
             let along: f64 = right.iter().zip(&step).map(|(r, s)| r.dot(*s)).sum();
             let squared: f64 = step.iter().take(gradient.len()).map(|s| s.length_squared()).sum();
             let predicted = share * along - 0.5 * share * share * (along - damping * squared);
+            if predicted < LEAST_GAIN * loss {
+                return Ok(());
+            }
             let state = (self.translations.clone(), self.correction().clone());
             let new = self.try_step(&step, data)?;
             if new < loss {
