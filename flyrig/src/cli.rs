@@ -109,6 +109,9 @@ pub struct BenchTrackArgs {
     /// Only the three solvers.
     #[arg(long)]
     pub quick: bool,
+    /// Only the cases whose name has this text in it, "2 views" for example.
+    #[arg(long)]
+    pub only: Option<String>,
 }
 
 #[derive(Debug, Subcommand)]

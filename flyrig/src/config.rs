@@ -141,17 +141,15 @@ impl Solver {
             })),
             Self::GaussNewton => Some(DeformOptions {
                 pose: (pose == Origin::Estimated).then(PoseFreedom::default),
-                ..DeformOptions::coarse(match pose {
-                    Origin::Given => default,
-                    Origin::Estimated => DeformSettings { anchor: FREE_POSE_ANCHOR, ..default },
-                })
+                ..DeformOptions::coarse(DeformSettings { anchor: ANCHOR, ..default })
             }),
         }
     }
 }
 
-/// Price of the nodes' distance from the body where the pose is free.
-const FREE_POSE_ANCHOR: f64 = 100.0;
+/// Price of the nodes' distance from where clothes of their part's thickness would be: holds what no view tells, the depth
+/// before a single camera or a shift of all nodes that a corrected pose explains as well.
+const ANCHOR: f64 = 100.0;
 
 /// λ_reg of the paper's Eq. 3.
 const PAPER_REGULARIZATION: f64 = 200.0;
@@ -161,6 +159,10 @@ impl TrackingSection {
         let mut options = self.solver.options(pose)?;
         if self.solver == Solver::GaussNewton {
             options.gaussians = self.gaussians;
+            options.views = self.views;
+            if !self.level_of_detail {
+                options = options.without_level_of_detail();
+            }
             options.solver.rest = self.rest;
         }
         Some(options)
@@ -176,13 +178,22 @@ const PAPER_RATE: f64 = 3e-6;
 pub struct TrackingSection {
     pub solver: Solver,
     pub gaussians: usize,
+    pub level_of_detail: bool,
+    pub views: usize,
     pub rest: f64,
     pub per_view_time: bool,
 }
 
 impl Default for TrackingSection {
     fn default() -> Self {
-        Self { solver: Solver::None, gaussians: 30_000, rest: 0.01, per_view_time: true }
+        Self {
+            solver: Solver::None,
+            gaussians: 30_000,
+            level_of_detail: true,
+            views: 0,
+            rest: 0.01,
+            per_view_time: true,
+        }
     }
 }
 
@@ -306,6 +317,7 @@ impl Config {
             self.body.gaussians
         );
         range("tracking.gaussians", self.tracking.gaussians as f64, 100.0, 2_000_000.0)?;
+        range("tracking.views", self.tracking.views as f64, 0.0, 1000.0)?;
         range("tracking.rest", self.tracking.rest, 0.0, 0.5)?;
         range("output.views", self.output.views as f64, 0.0, 16.0)?;
         range("output.width", f64::from(self.output.width), 16.0, 4096.0)?;

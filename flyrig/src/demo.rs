@@ -211,7 +211,7 @@ fn pass(
         template,
         args.gaussians,
         flyrig_body::DEFAULT_NODE_COUNT,
-        inputs.cameras.len(),
+        &inputs,
         mode.settings(),
         args.solver.options(Origin::Given),
     )?;

@@ -104,7 +104,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         template,
         args.gaussians,
         args.nodes,
-        rig.cameras.len(),
+        &rig,
         args.appearance.settings(),
         solver.options(args.pose),
     )?;

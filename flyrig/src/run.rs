@@ -71,7 +71,7 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         template,
         config.body.gaussians,
         config.body.nodes,
-        scene.rig.cameras.len(),
+        &scene.rig,
         config.appearance.mode.settings(),
         config.tracking.options(config.body.pose),
     )?;

@@ -19,6 +19,7 @@ mod normal;
 mod pose_fix;
 mod regularizer;
 mod settings;
+mod thickness;
 mod track;
 
 pub use data::{DataTerm, PointDerivatives};

@@ -93,6 +93,11 @@ impl NormalMatrix {
         }
     }
 
+    /// The data's own block of a node.
+    pub(super) fn diagonal_block(&self, node: usize) -> DMat3 {
+        self.diagonal[node]
+    }
+
     /// Mean number of edges of a node: the mean diagonal of L.
     pub(super) fn mean_edges(&self) -> f64 {
         self.node_edges.iter().sum::<f64>() / self.node_edges.len().max(1) as f64

@@ -8,6 +8,7 @@ use super::normal::NormalMatrix;
 use super::pose_fix::{Basis, PoseFix};
 use super::regularizer::Regularizer;
 use super::settings::FIRST_FRAMES;
+use super::thickness::Thickness;
 use super::{DataTerm, DeformSettings, DeformSolver, PointDerivatives, PoseCorrection, PoseFreedom};
 use crate::{TrackError, TrackErrorKind};
 
@@ -56,6 +57,7 @@ pub struct DeformTracker {
     displacement: Vec<[f32; 4]>,
     derivatives: Vec<PointDerivatives>,
     pose: Option<PoseFix>,
+    thickness: Option<Thickness>,
     no_correction: PoseCorrection,
     damping: f64,
     /// Loss below which there is nothing left to gain.
@@ -112,6 +114,7 @@ impl DeformTracker {
             displacement: vec![[0.0; 4]; count],
             derivatives: Vec::new(),
             pose: None,
+            thickness: None,
             no_correction: PoseCorrection::default(),
             floor: None,
             frame: 0,
@@ -144,6 +147,23 @@ impl DeformTracker {
         Ok(self)
     }
 
+    /// Learns how thick the clothes of every part are where the pictures tell it, and believes it where they do not. One
+    /// canonical unit normal and one part number a node. Gradient descent knows nothing of it.
+    ///
+    /// # Errors
+    /// [`TrackErrorKind::Template`] when the normals are not finite or not the nodes'.
+    pub fn with_thickness(mut self, normals: Vec<DVec3>, parts: Vec<usize>) -> Result<Self, TrackError> {
+        let nodes = self.translations.len();
+        if normals.len() != nodes || parts.len() != nodes || !normals.iter().all(|n| n.is_finite()) {
+            let message = format!("{} finite normals and {} parts for {nodes} nodes", normals.len(), parts.len());
+            return Err(TrackError::new(TrackErrorKind::Template, message));
+        }
+        if matches!(self.settings.solver, DeformSolver::GaussNewton { .. }) {
+            self.thickness = Some(Thickness::new(normals, parts));
+        }
+        Ok(self)
+    }
+
     /// What the pose is corrected by.
     #[must_use]
     pub fn correction(&self) -> &PoseCorrection {
@@ -157,6 +177,9 @@ impl DeformTracker {
         self.displacement.fill([0.0; 4]);
         if let Some(pose) = &mut self.pose {
             pose.reset();
+        }
+        if let Some(thickness) = &mut self.thickness {
+            thickness.forget();
         }
         self.damping = self.settings.damping;
         self.floor = None;
@@ -249,6 +272,9 @@ impl DeformTracker {
         if let Some(pose) = &mut self.pose {
             pose.next_frame();
         }
+        if let Some(thickness) = &mut self.thickness {
+            thickness.learn(&self.translations, &self.matrix);
+        }
         self.frame += 1;
         Ok(report)
     }
@@ -276,7 +302,7 @@ impl DeformTracker {
 
     /// All of the loss that the pictures do not tell, and its gradient by the nodes where asked.
     fn prior(&self, gradient: Option<&mut [DVec3]>) -> f64 {
-        self.regularizer.loss(&self.translations, &self.smooth, gradient)
+        self.regularizer.loss(&self.translations, &self.smooth, self.thickness.as_ref(), gradient)
             + self.pose.as_ref().map_or(0.0, PoseFix::loss)
     }
 
