@@ -255,6 +255,5 @@ impl Deformation {
         self.mesh.of_vertices()
     }
 }
-
 #[cfg(test)]
 mod stability_tests;

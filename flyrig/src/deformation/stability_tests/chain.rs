@@ -22,6 +22,7 @@ struct View {
     wanted: Vec<[f64; 4]>,
     /// Of colour and mask.
     weights: [f64; 4],
+    raster: RasterSettings,
 }
 
 pub struct Chain<'a> {
@@ -34,6 +35,8 @@ pub struct Chain<'a> {
     edges: Vec<(usize, usize)>,
     pub translations: Vec<DVec3>,
     smooth: Vec<DVec3>,
+    /// How thick the clothes of every part are, metres.
+    thickness: Option<Vec<f64>>,
     damping: f64,
     floor: Option<f64>,
     frame: usize,
@@ -54,6 +57,7 @@ impl<'a> Chain<'a> {
             edges: scene.graph.neighbors.iter().enumerate().flat_map(edges).collect(),
             translations: vec![DVec3::ZERO; nodes],
             smooth: vec![DVec3::ZERO; nodes],
+            thickness: None,
             damping: settings.damping,
             floor: None,
             frame: 0,
@@ -74,7 +78,7 @@ impl<'a> Chain<'a> {
 
     fn views(&self, shot: &Shot) -> Vec<View> {
         let SmallScene { template, surface, graph, cameras, .. } = self.scene;
-        let scale = surface.scale_m.iter().map(|s| f64::from(*s)).sum::<f64>() / surface.len() as f64;
+        let spacing = (template.area_m2() / surface.len() as f64).sqrt();
         let view = |((camera, pose), rgba): ((&Camera, _), &Vec<u8>)| {
             let bones = template.skeleton.world_from_canonical(pose);
             let node =
@@ -82,7 +86,7 @@ impl<'a> Chain<'a> {
             let middle = graph.node_gaussian.iter().map(node).sum::<DVec3>() / graph.node_gaussian.len() as f64;
             let i = &camera.intrinsics;
             let fine = (i.focal_px.x + i.focal_px.y) / 2.0 / camera.camera_from_world.transform_point(middle).z;
-            let level = (fine * scale).log2().round().clamp(0.0, f64::from(self.max_level)) as u32;
+            let level = (fine * spacing).log2().round().clamp(0.0, f64::from(self.max_level)) as u32;
             let share = 0.5f64.powi(level as i32);
             let weight = 2.0 * PAPER_PIXELS_A_M2 / (fine * share).powi(2);
             let color = if self.painted { weight } else { 0.0 };
@@ -91,14 +95,17 @@ impl<'a> Chain<'a> {
             smaller.intrinsics.center_px = (i.center_px + 0.5) * share - 0.5;
             (smaller.intrinsics.width, smaller.intrinsics.height) = (i.width >> level, i.height >> level);
             let wanted = wanted(rgba, i.width as usize, i.height as usize, 1 << level);
-            View { camera: smaller, bones, wanted, weights: [color, color, color, weight] }
+            let plain = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
+            let filter_variance_px2 = plain.filter_variance_px2 * (share * share) as f32;
+            let raster = RasterSettings { filter_variance_px2, ..plain };
+            View { camera: smaller, bones, wanted, weights: [color, color, color, weight], raster }
         };
         cameras.iter().zip(&shot.poses).zip(&shot.rgba).map(view).collect()
     }
 
     fn draw(&self, view: &View, t: &[DVec3]) -> (reference::Scene, Vec<Splat>, Picture) {
         let (scene, centers) = self.scene.posed(&self.rest, &view.bones, |g| self.displacement(t, g));
-        let splats = sorted_splats_at(&scene, &view.camera, &raster(), &centers);
+        let splats = sorted_splats_at(&scene, &view.camera, &view.raster, &centers);
         let picture = blend(&scene, &splats, view.camera.intrinsics.width, view.camera.intrinsics.height);
         (scene, splats, picture)
     }
@@ -119,9 +126,9 @@ impl<'a> Chain<'a> {
             let (width, height) = (view.camera.intrinsics.width, view.camera.intrinsics.height);
             let touched = touched_by(splats, (width, height));
             let incoming = incoming(view, &picture.color);
-            let out = backward(&scene, &view.camera, &raster(), width, &touched, &incoming);
+            let out = backward(&scene, &view.camera, &view.raster, width, &touched, &incoming);
             for s in &touched.splats {
-                let [xx, xy, xz, yy, yz, zz] = lift(&scene, &view.camera, &raster(), s, out.carried[s.index]);
+                let [xx, xy, xz, yy, yz, zz] = lift(&scene, &view.camera, &view.raster, s, out.carried[s.index]);
                 let h = DMat3::from_cols_array(&[xx, xy, xz, xy, yy, yz, xz, yz, zz]);
                 let bones = skin_jacobian_f64(&view.bones, &self.rest.skin[s.index]);
                 let (slope, h) = (bones.transpose() * out.center[s.index], bones.transpose() * h * bones);
@@ -145,13 +152,50 @@ impl<'a> Chain<'a> {
         let (spatial, temporal) = self.prior_weights();
         let (mut loss, mut gradient) = (0.0, vec![DVec3::ZERO; t.len()]);
         for &(i, j) in &self.edges {
-            let spread = t[i] - t[j];
-            let change = spread - (self.smooth[i] - self.smooth[j]);
+            let apart = t[i] - t[j];
+            let change = apart - (self.smooth[i] - self.smooth[j]);
+            let spread = apart - (self.offset(i) - self.offset(j));
             loss += spatial * spread.length_squared() + temporal * change.length_squared();
             gradient[i] += 2.0 * (spatial * spread + temporal * change);
             gradient[j] -= 2.0 * (spatial * spread + temporal * change);
         }
         (loss, gradient)
+    }
+
+    /// Where a node would be, were it clothed like its part.
+    fn offset(&self, node: usize) -> DVec3 {
+        let (normal, part) = self.normal_and_part(node);
+        self.thickness.as_ref().map_or(DVec3::ZERO, |thickness| normal * thickness[part])
+    }
+
+    fn normal_and_part(&self, node: usize) -> (DVec3, usize) {
+        let g = self.scene.graph.node_gaussian[node] as usize;
+        (self.scene.surface.normals[g].as_dvec3(), self.scene.surface.parts[g] as usize)
+    }
+
+    /// Means along the normals by part, weighted by what the data say; a hundredth is everybody's.
+    fn learn(&mut self, blocks: &[DMat3]) {
+        let parts = (0..blocks.len()).map(|n| self.normal_and_part(n).1 + 1).max().unwrap_or(0);
+        let (mut weights, mut sums) = (vec![0.0; parts], vec![0.0; parts]);
+        for (n, block) in blocks.iter().enumerate() {
+            let (normal, part) = self.normal_and_part(n);
+            let weight = normal.dot(*block * normal);
+            if weight > 0.0 {
+                weights[part] += weight;
+                sums[part] += weight
+                    * self.translations[n]
+                        .dot(normal)
+                        .clamp(self.settings.thickness_m[0], self.settings.thickness_m[1]);
+            }
+        }
+        let (weight, sum) = (weights.iter().sum::<f64>(), sums.iter().sum::<f64>());
+        if weight > 0.0 {
+            let now = (0..parts).map(|k| (sums[k] + 0.01 * sum) / (weights[k] + 0.01 * weight));
+            self.thickness = Some(match &self.thickness {
+                None => now.collect(),
+                Some(known) => known.iter().zip(now).map(|(known, now)| 0.5 * (known + now)).collect(),
+            });
+        }
     }
 
     fn prior_weights(&self) -> (f64, f64) {
@@ -171,6 +215,7 @@ impl<'a> Chain<'a> {
         }
         let DeformSolver::GaussNewton { first_iterations, iterations } = self.settings.solver else { return vec![] };
         let mut losses = Vec::new();
+        let mut blocks = Vec::new();
         for _ in 0..if self.frame < 10 { first_iterations } else { iterations } {
             let t = self.translations.clone();
             let (data, by_data, mut matrix) = self.derivatives(&views, &t);
@@ -180,6 +225,7 @@ impl<'a> Chain<'a> {
                 losses.push(loss);
             }
             let right: Vec<DVec3> = by_data.iter().zip(&by_prior).map(|(a, b)| -(*a + *b)).collect();
+            blocks = (0..t.len()).map(|n| matrix[n][n]).collect();
             let trace = |n: usize| matrix[n][n].x_axis.x + matrix[n][n].y_axis.y + matrix[n][n].z_axis.z;
             let mean = (0..t.len()).map(trace).sum::<f64>() / (3 * t.len()) as f64;
             let (spatial, temporal) = self.prior_weights();
@@ -232,14 +278,11 @@ impl<'a> Chain<'a> {
         for (smooth, t) in self.smooth.iter_mut().zip(&self.translations) {
             *smooth += (*t - *smooth) * self.settings.smoothing;
         }
+        self.learn(&blocks);
         self.frame += 1;
         self.painted = true;
         losses
     }
-}
-
-fn raster() -> RasterSettings {
-    RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() }
 }
 
 /// Means of `side` x `side` pixels, in linear light and by coverage.

@@ -145,7 +145,7 @@ impl Device {
         gaussians.color.write(gpu, &scene.colors);
         Self {
             gpu: gpu.clone(),
-            deformation: Deformation::new(gpu, &scene.template, &scene.surface, &scene.graph, options).unwrap(),
+            deformation: Deformation::new(gpu, &scene.template, &scene.surface, &scene.graph, options, 0.01).unwrap(),
             gaussians,
             skinner: GpuSkinner::new(gpu, &scene.surface.inset(), &scene.template.skeleton).unwrap(),
         }
