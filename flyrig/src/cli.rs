@@ -149,8 +149,8 @@ pub struct DemoArgs {
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000)]
     pub gaussians: usize,
-    /// How the body follows the pictures beyond its pose.
-    #[arg(long, value_enum, default_value = "off")]
+    /// How the body follows the pictures beyond its pose; "off" is faster.
+    #[arg(long, value_enum, default_value = "default")]
     pub solver: Solver,
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
