@@ -5,7 +5,7 @@
 
 use flyrig_types::{Image, PixelFormat};
 
-use crate::{CaptureError, CaptureErrorKind, picture};
+use crate::{CaptureError, CaptureErrorKind, mjpeg};
 
 /// The image as `width * height` pixels of 3 bytes, sRGB red green blue. Alpha is left out, grey is
 /// repeated, YUV is BT.601 limited range, Bayer is interpolated bilinearly, JPEG decoded.
@@ -55,21 +55,25 @@ pub fn to_rgb8_into(image: &Image, rgb: &mut Vec<u8>) -> Result<(), CaptureError
                 rgb.extend(pixels.flatten());
             }
         }
-        PixelFormat::BayerRggb8 => {
+        format @ (PixelFormat::BayerRggb8
+        | PixelFormat::BayerGrbg8
+        | PixelFormat::BayerGbrg8
+        | PixelFormat::BayerBggr8) => {
             if width < 2 || height < 2 {
                 return Err(unsupported(format!("a Bayer mosaic needs at least 2x2 pixels, not {width}x{height}")));
             }
-            demosaic_rggb(bytes, width, height, rgb);
+            // Place of the first pixel in a mosaic of rows RG and GB.
+            let phase = match format {
+                PixelFormat::BayerGrbg8 => (1, 0),
+                PixelFormat::BayerGbrg8 => (0, 1),
+                PixelFormat::BayerBggr8 => (1, 1),
+                _ => (0, 0),
+            };
+            demosaic(bytes, width, height, phase, rgb);
         }
         PixelFormat::Mjpeg => {
-            let decoded = picture::decode(bytes)?;
-            if (decoded.width(), decoded.height()) != (image.width(), image.height()) {
-                return Err(CaptureError::general(
-                    CaptureErrorKind::Corrupt,
-                    format!("the JPEG is {}x{}, its frame {width}x{height}", decoded.width(), decoded.height()),
-                ));
-            }
-            *rgb = decoded.into_rgb8().into_raw();
+            rgb.resize(width * height * 3, 0);
+            mjpeg::decode(bytes, width, height, rgb)?;
         }
     }
     Ok(())
@@ -90,7 +94,7 @@ fn rgb_of_yuv(y: u8, u: u8, v: u8) -> [u8; 3] {
 
 /// Bilinear: a colour that a pixel lacks is the mean of its neighbours of that colour; the border
 /// is mirrored about the outermost pixel, which keeps the mosaic's phase.
-fn demosaic_rggb(mosaic: &[u8], width: usize, height: usize, rgb: &mut Vec<u8>) {
+fn demosaic(mosaic: &[u8], width: usize, height: usize, phase: (usize, usize), rgb: &mut Vec<u8>) {
     let mirror = |i: usize, n: usize| [if i == 0 { 1 } else { i - 1 }, if i + 1 == n { n - 2 } else { i + 1 }];
     for y in 0..height {
         let [up, down] = mirror(y, height).map(|y| &mosaic[y * width..][..width]);
@@ -104,7 +108,7 @@ fn demosaic_rggb(mosaic: &[u8], width: usize, height: usize, rgb: &mut Vec<u8>) 
             let cross = || mean4([row[left], row[right], up[x], down[x]]);
             let corners = || mean4([up[left], up[right], down[left], down[right]]);
             let (sides, ends) = (mean2(row[left], row[right]), mean2(up[x], down[x]));
-            rgb.extend(match (y % 2, x % 2) {
+            rgb.extend(match ((y + phase.1) % 2, (x + phase.0) % 2) {
                 (0, 0) => [own, cross(), corners()],
                 (0, _) => [sides, own, ends],
                 (_, 0) => [ends, own, sides],
@@ -194,7 +198,14 @@ mod tests {
 
     #[test]
     fn bayer_is_the_mean_of_the_neighbours_of_a_colour() {
-        for (width, height) in [(2i64, 2i64), (7, 5), (6, 8)] {
+        let phases = [
+            (PixelFormat::BayerRggb8, [[0, 1], [1, 2]]),
+            (PixelFormat::BayerGrbg8, [[1, 0], [2, 1]]),
+            (PixelFormat::BayerGbrg8, [[1, 2], [0, 1]]),
+            (PixelFormat::BayerBggr8, [[2, 1], [1, 0]]),
+        ];
+        let sizes = [(2i64, 2i64), (7, 5), (6, 8)];
+        for ((format, colors), (width, height)) in phases.into_iter().flat_map(|p| sizes.map(|size| (p, size))) {
             let mosaic = noise((width * height) as usize);
             let mirror = |i: i64, n: i64| {
                 if i < 0 {
@@ -205,7 +216,7 @@ mod tests {
                     i
                 }
             };
-            let color = |x: i64, y: i64| [[0, 1], [1, 2]][(y % 2) as usize][(x % 2) as usize];
+            let color = |x: i64, y: i64| colors[(y % 2) as usize][(x % 2) as usize];
             let mut expected = Vec::new();
             for y in 0..height {
                 for x in 0..width {
@@ -227,7 +238,7 @@ mod tests {
                     }
                 }
             }
-            close(&convert(width as u32, height as u32, PixelFormat::BayerRggb8, mosaic).unwrap(), &expected);
+            close(&convert(width as u32, height as u32, format, mosaic).unwrap(), &expected);
         }
         assert_eq!(convert(1, 4, PixelFormat::BayerRggb8, noise(4)).unwrap_err().kind, CaptureErrorKind::Unsupported);
     }
