@@ -12,6 +12,7 @@ use crate::config::{AppearanceMode, Origin, Solver};
 /// writes a report with pictures. `flyrig eval` does the same honestly on a data set of yours. For a rig that stays
 /// up, print a configuration, edit it and run it:
 ///
+///     flyrig doctor
 ///     flyrig config print > rig.toml
 ///     flyrig config check rig.toml
 ///     flyrig run rig.toml
@@ -40,6 +41,22 @@ pub enum Command {
     Run {
         /// The TOML file; see `flyrig config print`.
         config: PathBuf,
+        /// Record the cameras into this MCAP file meanwhile; it must not be there yet.
+        #[arg(long)]
+        record: Option<PathBuf>,
+        /// Show a live table of the cameras in place of a line of rates.
+        #[arg(long)]
+        table: bool,
+    },
+    /// Record the cameras of a configuration into an MCAP file, without tracking.
+    Record(RecordArgs),
+    /// Play a recording through, tell what is in it, and export it where asked to. To run the rig on it, set
+    /// source.kind = "mcap".
+    Replay(ReplayArgs),
+    /// List cameras, what they are named by, their formats and buses, and graphics adapters; say what to mend.
+    Doctor {
+        /// A TOML file whose cameras are looked for and whose buses are planned.
+        config: Option<PathBuf>,
     },
     /// Watch a running rig: print rates and latency, write pictures or a video.
     Watch(WatchArgs),
@@ -60,6 +77,27 @@ pub enum Command {
         #[command(subcommand)]
         action: ConfigAction,
     },
+}
+
+#[derive(Debug, Args)]
+pub struct RecordArgs {
+    /// The TOML file; see `flyrig config print`.
+    pub config: PathBuf,
+    /// The file; must not be there yet. Foxglove and other MCAP readers open it.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Stop after so many seconds.
+    #[arg(long)]
+    pub seconds: Option<f64>,
+}
+
+#[derive(Debug, Args)]
+pub struct ReplayArgs {
+    /// The MCAP file.
+    pub recording: PathBuf,
+    /// Write the synchronised pictures and the calibration into this new folder (EasyMocap layout).
+    #[arg(long)]
+    pub export: Option<PathBuf>,
 }
 
 #[derive(Debug, Subcommand)]
