@@ -31,5 +31,7 @@ pub use rgb::{to_rgb8, to_rgb8_into};
 pub use source::{CameraSource, SourceHealth};
 pub use threads::{CameraStats, CaptureThreads, Pacing, ThreadsConfig};
 #[cfg(target_os = "linux")]
-pub use v4l2::{BusPlan, CameraNode, CameraReport, FormatReport, UsbPlace, V4l2Camera, camera_reports, plan_buses};
+pub use v4l2::{
+    BusPlan, CameraNode, CameraReport, FormatReport, UsbPlace, V4l2Camera, camera_reports, monotonic_nanos, plan_buses,
+};
 pub use video::{VideoOptions, VideoReplay};

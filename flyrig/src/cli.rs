@@ -12,6 +12,7 @@ use crate::config::{AppearanceMode, Origin, Solver};
 /// writes a report with pictures. `flyrig eval` does the same honestly on a data set of yours. For a rig that stays
 /// up, print a configuration, edit it and run it:
 ///
+///     flyrig doctor
 ///     flyrig config print > rig.toml
 ///     flyrig config check rig.toml
 ///     flyrig run rig.toml
@@ -40,6 +41,11 @@ pub enum Command {
     Run {
         /// The TOML file; see `flyrig config print`.
         config: PathBuf,
+    },
+    /// List cameras, what they are named by, their formats and buses, and graphics adapters; say what to mend.
+    Doctor {
+        /// A TOML file whose cameras are looked for and whose buses are planned.
+        config: Option<PathBuf>,
     },
     /// Watch a running rig: print rates and latency, write pictures or a video.
     Watch(WatchArgs),

@@ -9,7 +9,7 @@ use flyrig_sim::SimConfig;
 use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
 use serde::{Deserialize, Serialize};
 
-use crate::deformation::DeformOptions;
+use crate::{cameras::CameraEntry, deformation::DeformOptions};
 
 /// The commented default file, as `flyrig config print` writes it. A test keeps it equal to `Config::default()`.
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
@@ -48,6 +48,7 @@ pub enum SourceKind {
     Sim,
     Folder,
     Video,
+    V4l2,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -55,9 +56,44 @@ pub enum SourceKind {
 pub struct SourceSection {
     pub kind: SourceKind,
     pub path: PathBuf,
-    pub cameras: Vec<String>,
+    pub cameras: Vec<CameraEntry>,
     pub fps: f64,
     pub real_time: bool,
+}
+
+impl SourceSection {
+    /// Names of the chosen cameras; none for all.
+    pub fn names(&self) -> Vec<String> {
+        self.cameras.iter().map(|entry| entry.name().to_owned()).collect()
+    }
+
+    fn check(&self) -> Result<()> {
+        for (i, entry) in self.cameras.iter().enumerate() {
+            let name = entry.name();
+            ensure!(
+                self.cameras[..i].iter().all(|before| before.name() != name),
+                "camera {name} is listed twice in source.cameras"
+            );
+            match entry {
+                CameraEntry::Named(_) if self.kind == SourceKind::V4l2 => {
+                    entry.device()?;
+                }
+                CameraEntry::Named(_) => {}
+                CameraEntry::Device(section) => {
+                    ensure!(
+                        self.kind == SourceKind::V4l2,
+                        "camera {name} of source.cameras is a table, but source.kind is not \"v4l2\""
+                    );
+                    section.check()?;
+                }
+            }
+        }
+        ensure!(
+            self.kind != SourceKind::V4l2 || !self.cameras.is_empty(),
+            "source.kind is \"v4l2\" but there is no table [[source.cameras]]"
+        );
+        Ok(())
+    }
 }
 
 impl Default for SourceSection {
@@ -65,7 +101,7 @@ impl Default for SourceSection {
         Self {
             kind: SourceKind::Sim,
             path: PathBuf::new(),
-            cameras: ["00", "03", "05"].map(str::to_owned).to_vec(),
+            cameras: ["00", "03", "05"].map(|name| CameraEntry::Named(name.to_owned())).to_vec(),
             fps: 30.0,
             real_time: true,
         }
@@ -294,6 +330,7 @@ impl Config {
             self.rig.name
         );
         range("source.fps", self.source.fps, 0.1, 1000.0)?;
+        self.source.check()?;
         self.sim.validate().context("in [sim]")?;
         range("sync.window_ms", self.sync.window_ms, 0.001, 10_000.0)?;
         range("sync.max_wait_ms", self.sync.max_wait_ms, 0.0, 60_000.0)?;
@@ -314,7 +351,7 @@ impl Config {
         range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)?;
         ensure!(
             self.source.kind == SourceKind::Sim || !self.source.path.as_os_str().is_empty(),
-            "source.path is empty: name the folder of the data set"
+            "source.path is empty: name the folder of the data set, or of the calibration for real cameras"
         );
         ensure!(
             self.source.kind == SourceKind::Sim

@@ -3,14 +3,17 @@
 //! A library only so that the end-to-end tests can build the same program; its documentation is `--help`.
 
 mod bench;
+mod cameras;
 mod cli;
 mod config;
 mod dataset;
 mod deformation;
 mod demo;
+mod doctor;
 mod engine;
 mod eval;
 mod intake;
+mod live;
 mod outlet;
 mod pipeline;
 mod png;
@@ -72,6 +75,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
             let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
             run::run(&config, &gpu(adapter)?)
         }
+        Command::Doctor { config } => doctor::doctor(config.as_deref()),
         Command::Watch(args) => watch::watch(args),
         Command::Eval(args) => eval::eval(args, &gpu(cli.adapter.as_deref())?),
         Command::Sim { action: SimAction::Export(args) } => {

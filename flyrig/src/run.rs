@@ -17,6 +17,7 @@ use crate::{
     dataset,
     engine::Engine,
     intake::Intake,
+    live,
     outlet::Outlet,
     pipeline::{Outcome, Pipeline, PoseSource},
     stats::resident_mib,
@@ -46,6 +47,8 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
     let scene = open(config, gpu)?;
     dataset::require_masks(config.body.pose, config.body.masks, &scene.plates)?;
     let pacing = match (config.source.real_time, config.source.kind) {
+        // Nobody can make a real camera wait.
+        (_, SourceKind::V4l2) => Pacing::AsDelivered,
         (false, _) => Pacing::Lossless,
         // Simulated cameras keep the time themselves, whatever their stamps say.
         (true, SourceKind::Sim) => Pacing::AsDelivered,
@@ -198,7 +201,7 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
         let simulator = Simulator::new(gpu, &config.sim)?;
         let (rig, template, track) =
             (simulator.reported_rig(), simulator.template().clone(), simulator.track().clone());
-        let picked = dataset::pick(&rig, &source.cameras, "the simulated rig")?;
+        let picked = dataset::pick(&rig, &source.names(), "the simulated rig")?;
         let copy = |slot| -> Result<Image> {
             let plate = simulator.plate(slot)?;
             Ok(Image::new(plate.width(), plate.height(), plate.format(), plate.bytes().to_vec())?)
@@ -214,16 +217,28 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
             .collect();
         return Ok(Scene { sources, rig: picked, template, track: Some(track), plates });
     }
-    let chosen: Vec<CameraId> = source.cameras.iter().map(|name| name.as_str().into()).collect();
-    let rig = dataset::load_rig(&source.path, &chosen)?;
-    let rig = dataset::pick(&rig, &source.cameras, "the calibration")?;
-    let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
-    let sources: Vec<Box<dyn CameraSource>> = if source.kind == SourceKind::Folder {
-        let options = FolderOptions { fps: source.fps, with_masks: config.body.masks == Origin::Given, frames: None };
-        boxed(FolderReplay::open(&source.path, Some(&ids), &options)?)
+    let chosen: Vec<CameraId> = source.names().into_iter().map(CameraId::from).collect();
+    let rig = if source.kind == SourceKind::V4l2 {
+        live::load_rig(source)?
     } else {
-        let open = |id| VideoReplay::open(id, &dataset::video_file(&source.path, id), &VideoOptions::default());
-        boxed(ids.iter().map(open).collect::<Result<_, _>>()?)
+        dataset::load_rig(&source.path, &chosen)?
+    };
+    let rig = dataset::pick(&rig, &source.names(), "the calibration")?;
+    let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+    let sources: Vec<Box<dyn CameraSource>> = match source.kind {
+        SourceKind::Folder => {
+            let with_masks = config.body.masks == Origin::Given;
+            boxed(FolderReplay::open(
+                &source.path,
+                Some(&ids),
+                &FolderOptions { fps: source.fps, with_masks, frames: None },
+            )?)
+        }
+        SourceKind::V4l2 => live::open(source)?,
+        SourceKind::Video | SourceKind::Sim => {
+            let open = |id| VideoReplay::open(id, &dataset::video_file(&source.path, id), &VideoOptions::default());
+            boxed(ids.iter().map(open).collect::<Result<_, _>>()?)
+        }
     };
     let (template, track) = if config.body.template.as_os_str().is_empty() {
         (default_template(&ShapeParams::default())?, None)

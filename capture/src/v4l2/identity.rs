@@ -272,8 +272,8 @@ pub(crate) mod tests {
         Ok(Capability::test(bus, captures))
     }
 
-    fn found(identity: CameraIdentity, nodes: &[CameraNode]) -> Result<String, CaptureError> {
-        find(&identity, nodes, &answer).map(|node| node.node.file_name().unwrap().to_string_lossy().into_owned())
+    fn found(identity: &CameraIdentity, nodes: &[CameraNode]) -> Result<String, CaptureError> {
+        find(identity, nodes, &answer).map(|node| node.node.file_name().unwrap().to_string_lossy().into_owned())
     }
 
     #[test]
@@ -300,23 +300,23 @@ pub(crate) mod tests {
     fn a_camera_is_found_by_serial_path_and_bus() {
         let (_folder, roots) = fixture();
         let nodes = scan(&roots);
-        assert_eq!(found(CameraIdentity::Serial("B2".into()), &nodes).unwrap(), "video10");
+        assert_eq!(found(&CameraIdentity::Serial("B2".into()), &nodes).unwrap(), "video10");
         for path in ["pci-usb-0:2:1.0-video-index0", "/dev/v4l/by-path/pci-usb-0:2:1.0-video-index0"] {
-            assert_eq!(found(CameraIdentity::Path(path.into()), &nodes).unwrap(), "video0");
+            assert_eq!(found(&CameraIdentity::Path(path.into()), &nodes).unwrap(), "video0");
         }
-        assert_eq!(found(CameraIdentity::Bus("platform:vivid-000".into()), &nodes).unwrap(), "video2");
+        assert_eq!(found(&CameraIdentity::Bus("platform:vivid-000".into()), &nodes).unwrap(), "video2");
     }
 
     #[test]
     fn a_missing_camera_is_told_with_those_there_are() {
         let (_folder, roots) = fixture();
-        let error = found(CameraIdentity::Serial("C3".into()), &scan(&roots)).unwrap_err();
+        let error = found(&CameraIdentity::Serial("C3".into()), &scan(&roots)).unwrap_err();
         assert_eq!(error.kind, CaptureErrorKind::NotFound);
         for part in ["no camera with serial \"C3\"", "serial \"A1\"", "bus \"platform:vivid-000\"", "plug it in"] {
             assert!(error.message.contains(part), "{part}: {error}");
         }
         assert!(!error.message.contains("video1)"), "metadata nodes are no cameras: {error}");
-        let none = found(CameraIdentity::Bus("x".into()), &[]).unwrap_err();
+        let none = found(&CameraIdentity::Bus("x".into()), &[]).unwrap_err();
         assert!(none.message.ends_with("There is: no other camera"), "{none}");
     }
 
@@ -325,7 +325,7 @@ pub(crate) mod tests {
         let (_folder, roots) = fixture();
         let mut nodes = scan(&roots);
         nodes[3].serial = Some("A1".into());
-        let error = found(CameraIdentity::Serial("A1".into()), &nodes).unwrap_err();
+        let error = found(&CameraIdentity::Serial("A1".into()), &nodes).unwrap_err();
         assert_eq!(error.kind, CaptureErrorKind::Unsupported);
         assert!(error.message.contains("usb-0000:00:14.0-2") && error.message.contains("name it by path"), "{error}");
     }

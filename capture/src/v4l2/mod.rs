@@ -28,6 +28,7 @@ use self::{
 pub use self::{
     identity::{CameraNode, UsbPlace},
     report::{BusPlan, CameraReport, FormatReport, camera_reports, plan_buses},
+    sys::monotonic_nanos,
 };
 use crate::{CameraIdentity, CameraOptions, CameraSource, CaptureError, SourceHealth};
 
@@ -81,7 +82,7 @@ impl Host for System {
     }
 
     fn now_nanos(&self) -> i64 {
-        sys::monotonic_nanos()
+        monotonic_nanos()
     }
 }
 

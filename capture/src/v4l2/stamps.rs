@@ -8,8 +8,8 @@ const OLDEST: i64 = 1_000_000_000;
 const NEWEST: i64 = 5_000_000;
 /// Stamps off by the same amount, so many in a row, are of another clock and no accident.
 const CONFIRMATIONS: u32 = 8;
-/// What "the same amount" is, nanoseconds.
-const AGREEMENT: i64 = 20_000_000;
+/// What "the same amount" is, nanoseconds: arrivals on a busy machine are uneven.
+const AGREEMENT: u64 = 150_000_000;
 /// A number that jumps ahead by more is of a driver that counts anew.
 const JUMP: u32 = 100_000;
 
@@ -21,11 +21,20 @@ const JUMP: u32 = 100_000;
 pub(crate) struct Stamps {
     /// Added to the driver's clock.
     offset_nanos: i64,
-    /// The amount that recent stamps were off by, and how many of them.
-    suspect: Option<(i64, u32)>,
+    suspect: Option<Suspect>,
     /// Stamps that were replaced.
     pub replaced: u64,
     last_nanos: Option<i64>,
+}
+
+/// Recent stamps that could not be right.
+#[derive(Debug, Clone, Copy)]
+struct Suspect {
+    /// Least and most that they were off by, nanoseconds.
+    least: i64,
+    most: i64,
+    times: u32,
+    last_stamp: i64,
 }
 
 impl Stamps {
@@ -49,23 +58,30 @@ impl Stamps {
     }
 
     fn believed(&mut self, stamp_nanos: i64, arrival_nanos: i64) -> i64 {
-        let stamp = stamp_nanos.saturating_add(self.offset_nanos);
-        let late = arrival_nanos.saturating_sub(stamp);
-        if (-NEWEST..=OLDEST).contains(&late) {
+        // Modulo 2^64, since drivers' clocks may wrap.
+        let stamp = stamp_nanos.wrapping_add(self.offset_nanos);
+        if (-NEWEST..=OLDEST).contains(&arrival_nanos.wrapping_sub(stamp)) {
             self.suspect = None;
             return stamp;
         }
         self.replaced += 1;
-        let off = arrival_nanos.saturating_sub(stamp_nanos);
-        let (least, times) = match self.suspect {
+        let off = arrival_nanos.wrapping_sub(stamp_nanos);
+        let fresh = Suspect { least: off, most: off, times: 1, last_stamp: stamp_nanos };
+        let suspect = self.suspect.map_or(fresh, |before| {
+            let (least, most) = (off.min(before.least), off.max(before.most));
+            // A stuck clock is off by ever more.
+            let advances = stamp_nanos.wrapping_sub(before.last_stamp) > 0;
+            if advances && most.abs_diff(least) <= AGREEMENT {
+                Suspect { least, most, times: before.times + 1, last_stamp: stamp_nanos }
+            } else {
+                fresh
+            }
+        });
+        self.suspect = Some(suspect);
+        if suspect.times >= CONFIRMATIONS {
             // The least is nearest to the truth: arrivals are only ever late.
-            Some((before, times)) if off.abs_diff(before) <= AGREEMENT as u64 => (off.min(before), times + 1),
-            _ => (off, 1),
-        };
-        self.suspect = Some((least, times));
-        if times >= CONFIRMATIONS {
-            (self.offset_nanos, self.suspect) = (least, None);
-            return stamp_nanos.saturating_add(least);
+            (self.offset_nanos, self.suspect) = (suspect.least, None);
+            return stamp_nanos.wrapping_add(suspect.least);
         }
         arrival_nanos
     }
@@ -147,6 +163,29 @@ mod tests {
             assert!(errors[110..200].iter().all(|&error| error == 8 * MS), "the unknown latency stays, without jitter");
             assert_eq!(stamps.replaced, 2 * u64::from(CONFIRMATIONS));
         }
+    }
+
+    #[test]
+    fn a_clock_that_wraps_and_an_uneven_machine_are_borne() {
+        let mut stamps = Stamps::default();
+        let truth = |n: i64| 1000 * SECOND + n * 33 * MS;
+        let errors: Vec<i64> = (0..300)
+            .map(|n| {
+                let stamp = truth(n).wrapping_add(i64::MAX - truth(150));
+                let late = (3 + 100 * (n % 7) / 7) * MS;
+                stamps.capture_nanos(stamp, StampSource::EndOfFrame, truth(n) + late, 0) - truth(n)
+            })
+            .collect();
+        assert!(errors[8..].iter().all(|&error| error == 3 * MS), "{errors:?}");
+        assert_eq!(stamps.replaced, u64::from(CONFIRMATIONS));
+    }
+
+    #[test]
+    fn a_stuck_clock_is_never_believed() {
+        let mut stamps = Stamps::default();
+        let errors = errors(&mut stamps, 300, |_, _| 5);
+        assert!(errors.iter().all(|&error| error == 8 * MS));
+        assert_eq!(stamps.replaced, 300);
     }
 
     #[test]

@@ -183,7 +183,7 @@ fn kinds(stream: &mut Stream<Bench>, calls: usize) -> Vec<Result<u64, CaptureErr
 
 #[test]
 fn frames_come_with_number_time_and_pixels() {
-    let (stream, log) = open(vec![Ok(webcam(vec![frames(10..12), frames(15..16)].concat()))], &options());
+    let (stream, log) = open(vec![Ok(webcam([frames(10..12), frames(15..16)].concat()))], &options());
     let mut stream = stream.unwrap();
     let first = stream.next_frame(POLL).unwrap();
     assert_eq!((first.sequence, first.image.bytes()), (0, &[10; 16][..]));

@@ -170,8 +170,10 @@ fn invalid(error: &io::Error) -> bool {
     matches!(error.raw_os_error(), Some(libc::EINVAL | libc::ENOTTY | libc::ENODATA))
 }
 
-/// Time of `CLOCK_MONOTONIC`, nanoseconds.
-pub(crate) fn monotonic_nanos() -> i64 {
+/// Time of `CLOCK_MONOTONIC`, nanoseconds: the clock of live frames' capture times.
+#[must_use]
+#[allow(clippy::useless_conversion)] // Narrower on 32-bit systems.
+pub fn monotonic_nanos() -> i64 {
     let mut time = libc::timespec { tv_sec: 0, tv_nsec: 0 };
     // SAFETY: writes one timespec of ours. It cannot fail for this clock.
     unsafe { libc::clock_gettime(libc::CLOCK_MONOTONIC, &raw mut time) };
@@ -424,6 +426,7 @@ impl BufferDevice for Device {
         self.ioctl(vidioc::VIDIOC_QBUF, &mut raw)
     }
 
+    #[allow(clippy::useless_conversion)] // The kernel's times are narrower on 32-bit systems.
     fn dequeue(&mut self) -> io::Result<Delivered> {
         let mut planes = [v4l2_plane::zeroed(); MAX_PLANES];
         let mut raw = self.buffer(0, &mut planes);
@@ -438,12 +441,12 @@ impl BufferDevice for Device {
         }
         let is_monotonic = raw.flags & V4L2_BUF_FLAG_TIMESTAMP_MASK == V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC;
         let starts = raw.flags & V4L2_BUF_FLAG_TSTAMP_SRC_MASK == V4L2_BUF_FLAG_TSTAMP_SRC_SOE;
-        let micros = i64::from(raw.timestamp.tv_usec).saturating_mul(1000);
+        let (secs, micros) = (i64::from(raw.timestamp.tv_sec), i64::from(raw.timestamp.tv_usec));
         Ok(Delivered {
             index: raw.index,
             sequence: raw.sequence,
             is_broken: raw.flags & V4L2_BUF_FLAG_ERROR != 0,
-            stamp_nanos: i64::from(raw.timestamp.tv_sec).saturating_mul(1_000_000_000).saturating_add(micros),
+            stamp_nanos: secs.wrapping_mul(1_000_000_000).wrapping_add(micros.wrapping_mul(1000)),
             stamp_source: match (is_monotonic, starts) {
                 (false, _) => StampSource::Other,
                 (true, true) => StampSource::StartOfExposure,
