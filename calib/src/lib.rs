@@ -3,6 +3,9 @@
 //! Conventions are those of `flyrig_types`: OpenCV camera axes, pixel centres at integers, metres,
 //! nanoseconds.
 
+mod clocks;
+#[cfg(test)]
+mod clocks_tests;
 mod easymocap;
 mod error;
 mod sync;
@@ -10,6 +13,7 @@ mod sync;
 mod sync_properties;
 mod yaml;
 
+pub use clocks::{ClockAligner, ClockKind, ClockState};
 pub use easymocap::{load_easymocap, save_easymocap};
 pub use error::CalibError;
 pub use sync::{DropCounts, SyncConfig, SyncCounts, Synchronizer};

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 use clap::ValueEnum;
+use flyrig_calib::ClockKind;
 use flyrig_renderer::AppearanceSettings;
 use flyrig_sim::SimConfig;
 use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
@@ -114,11 +115,12 @@ pub struct SyncSection {
     pub window_ms: f64,
     pub max_wait_ms: f64,
     pub master: String,
+    pub clocks: ClockKind,
 }
 
 impl Default for SyncSection {
     fn default() -> Self {
-        Self { window_ms: 8.0, max_wait_ms: 100.0, master: String::new() }
+        Self { window_ms: 8.0, max_wait_ms: 100.0, master: String::new(), clocks: ClockKind::Shared }
     }
 }
 

@@ -6,8 +6,8 @@ use std::{
 };
 
 use anyhow::Result;
-use flyrig_calib::{SyncConfig, Synchronizer};
-use flyrig_capture::{CameraSource, CaptureThreads, Pacing, PopError, ThreadsConfig};
+use flyrig_calib::{ClockAligner, ClockKind, SyncConfig, Synchronizer};
+use flyrig_capture::{CameraSource, CaptureErrorKind, CaptureThreads, Pacing, PopError, ThreadsConfig};
 use flyrig_types::{CameraId, FrameSet};
 
 /// Frames a camera that may wait for the pipeline: enough to bridge a slow frame, few enough to stay live.
@@ -16,6 +16,8 @@ const WAITING_FRAMES_A_CAMERA: usize = 4;
 /// Camera threads, their queue and the synchronizer.
 pub struct Intake {
     threads: CaptureThreads,
+    /// Only for cameras with clocks of their own.
+    aligner: Option<ClockAligner>,
     sync: Synchronizer,
     ready: VecDeque<FrameSet>,
     cameras: Vec<CameraId>,
@@ -26,11 +28,17 @@ pub struct Intake {
 
 impl Intake {
     /// Starts a thread a camera. With [`Pacing::Lossless`] every set comes, in order; else the newest one wins.
-    pub fn start(sources: Vec<Box<dyn CameraSource>>, sync: &SyncConfig, pacing: Pacing) -> Result<Self> {
+    pub fn start(
+        sources: Vec<Box<dyn CameraSource>>,
+        sync: &SyncConfig,
+        clocks: ClockKind,
+        pacing: Pacing,
+    ) -> Result<Self> {
         let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
         let queue_capacity = WAITING_FRAMES_A_CAMERA * cameras.len().max(1);
         Ok(Self {
             threads: CaptureThreads::start(sources, ThreadsConfig { queue_capacity, pacing })?,
+            aligner: (clocks == ClockKind::Triggered).then(|| ClockAligner::new(&cameras, sync.master.as_ref())),
             sync: Synchronizer::new(&cameras, sync),
             ready: VecDeque::new(),
             cameras,
@@ -50,6 +58,10 @@ impl Intake {
             while !enough(&self.ready) && !self.ended {
                 match self.threads.queue().pop(wait) {
                     Ok(frame) => {
+                        let frame = match &mut self.aligner {
+                            Some(aligner) => aligner.align(frame),
+                            None => frame,
+                        };
                         self.ready.extend(self.sync.push(frame));
                         wait = Duration::ZERO;
                     }
@@ -91,7 +103,9 @@ impl Intake {
         drops.extend(in_no_set.map(|(camera, dropped)| (format!("frames of {camera} in no set"), dropped.total())));
         for camera in self.threads.stats() {
             drops.push((format!("frames of {} waiting too long", camera.camera), camera.dropped));
-            drops.push((format!("errors of {}", camera.camera), camera.errors.values().sum()));
+            let errors = camera.errors.iter().filter(|(kind, _)| **kind != CaptureErrorKind::Timeout);
+            drops.push((format!("errors of {}", camera.camera), errors.map(|(_, count)| count).sum()));
+            drops.push((format!("frames of {} lost before us", camera.camera), camera.health.lost_by_driver));
         }
         drops
     }

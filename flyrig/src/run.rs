@@ -54,7 +54,7 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         (true, SourceKind::Sim) => Pacing::AsDelivered,
         (true, _) => Pacing::RealTime,
     };
-    let mut intake = Intake::start(scene.sources, &sync_config(config), pacing)?;
+    let mut intake = Intake::start(scene.sources, &sync_config(config), config.sync.clocks, pacing)?;
 
     let mut template = scene.template;
     let pose = match (config.body.pose, scene.track) {
