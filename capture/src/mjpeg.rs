@@ -69,7 +69,7 @@ fn segments(bytes: &[u8]) -> impl Iterator<Item = (usize, u8)> {
 }
 
 /// Size by the frame header.
-fn jpeg_size(bytes: &[u8]) -> Option<(usize, usize)> {
+pub(crate) fn jpeg_size(bytes: &[u8]) -> Option<(usize, usize)> {
     let (at, _) = segments(bytes).find(|(_, marker)| matches!(marker, 0xc0..=0xc2))?;
     let &[h1, h0, w1, w0] = bytes.get(at + 5..at + 9)? else { return None };
     Some((usize::from(u16::from_be_bytes([w1, w0])), usize::from(u16::from_be_bytes([h1, h0]))))

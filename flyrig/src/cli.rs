@@ -41,7 +41,15 @@ pub enum Command {
     Run {
         /// The TOML file; see `flyrig config print`.
         config: PathBuf,
+        /// Record the cameras into this MCAP file meanwhile; it must not be there yet.
+        #[arg(long)]
+        record: Option<PathBuf>,
     },
+    /// Record the cameras of a configuration into an MCAP file, without tracking.
+    Record(RecordArgs),
+    /// Play a recording through, tell what is in it, and export it where asked to. To run the rig on it, set
+    /// source.kind = "mcap".
+    Replay(ReplayArgs),
     /// List cameras, what they are named by, their formats and buses, and graphics adapters; say what to mend.
     Doctor {
         /// A TOML file whose cameras are looked for and whose buses are planned.
@@ -66,6 +74,27 @@ pub enum Command {
         #[command(subcommand)]
         action: ConfigAction,
     },
+}
+
+#[derive(Debug, Args)]
+pub struct RecordArgs {
+    /// The TOML file; see `flyrig config print`.
+    pub config: PathBuf,
+    /// The file; must not be there yet. Foxglove and other MCAP readers open it.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Stop after so many seconds.
+    #[arg(long)]
+    pub seconds: Option<f64>,
+}
+
+#[derive(Debug, Args)]
+pub struct ReplayArgs {
+    /// The MCAP file.
+    pub recording: PathBuf,
+    /// Write the synchronised pictures and the calibration into this new folder (EasyMocap layout).
+    #[arg(long)]
+    pub export: Option<PathBuf>,
 }
 
 #[derive(Debug, Subcommand)]

@@ -50,6 +50,7 @@ pub enum SourceKind {
     Folder,
     Video,
     V4l2,
+    Mcap,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -353,7 +354,7 @@ impl Config {
         range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)?;
         ensure!(
             self.source.kind == SourceKind::Sim || !self.source.path.as_os_str().is_empty(),
-            "source.path is empty: name the folder of the data set, or of the calibration for real cameras"
+            "source.path is empty: name the folder of the data set, the folder of the calibration for real cameras, or the recording"
         );
         ensure!(
             self.source.kind == SourceKind::Sim

@@ -18,6 +18,7 @@ mod outlet;
 mod pipeline;
 mod png;
 mod pose_curve;
+mod record;
 mod report;
 mod run;
 mod score;
@@ -37,7 +38,7 @@ use tracing_subscriber::EnvFilter;
 
 use crate::{
     cli::{BenchCommand, Cli, Command, ConfigAction, SimAction},
-    config::{Config, DEFAULT_TOML},
+    config::{Config, DEFAULT_TOML, SourceKind},
 };
 
 /// An error and its causes, leaving out causes that the text before tells already.
@@ -70,11 +71,18 @@ pub fn main() -> ExitCode {
 fn dispatch(cli: &Cli) -> Result<()> {
     match &cli.command {
         Command::Demo(args) => demo::demo(args, &gpu(cli.adapter.as_deref())?),
-        Command::Run { config } => {
+        Command::Run { config, record } => {
             let config = Config::load(config)?;
             let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
-            run::run(&config, &gpu(adapter)?)
+            run::run(&config, &gpu(adapter)?, record.as_deref())
         }
+        Command::Record(args) => {
+            let config = Config::load(&args.config)?;
+            let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
+            let gpu = (config.source.kind == SourceKind::Sim).then(|| gpu(adapter)).transpose()?;
+            record::record(&config, args, gpu.as_ref())
+        }
+        Command::Replay(args) => record::replay(args),
         Command::Doctor { config } => doctor::doctor(config.as_deref()),
         Command::Watch(args) => watch::watch(args),
         Command::Eval(args) => eval::eval(args, &gpu(cli.adapter.as_deref())?),

@@ -17,16 +17,16 @@ pub fn load_rig(source: &SourceSection) -> Result<Rig> {
     Ok(load_easymocap(&source.path, &size)?)
 }
 
-/// Opens every camera of the configuration.
+/// Opens every camera of the configuration; the pictures come in the cameras' own formats.
 #[cfg(target_os = "linux")]
 pub fn open(source: &SourceSection) -> Result<Vec<Box<dyn CameraSource>>> {
-    use flyrig_capture::{Decoding, V4l2Camera};
+    use flyrig_capture::V4l2Camera;
 
     let mut sources: Vec<Box<dyn CameraSource>> = Vec::new();
     for entry in &source.cameras {
         let camera = V4l2Camera::open(&entry.name().into(), &entry.device()?.options()?)?;
-        eprintln!("run: camera {}: {}", entry.name(), camera.health().mode);
-        sources.push(Box::new(Decoding::new(camera)));
+        eprintln!("camera {}: {}", entry.name(), camera.health().mode);
+        sources.push(Box::new(camera));
     }
     Ok(sources)
 }

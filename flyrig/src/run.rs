@@ -1,11 +1,14 @@
 //! `flyrig run`: a rig that stays up.
 
-use std::time::{Duration, Instant};
+use std::{
+    path::Path,
+    time::{Duration, Instant},
+};
 
-use anyhow::{Result, bail, ensure};
+use anyhow::{Context as _, Result, bail, ensure};
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
 use flyrig_calib::SyncConfig;
-use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, VideoOptions, VideoReplay};
+use flyrig_capture::{CameraSource, Decoding, FolderOptions, FolderReplay, Pacing, VideoOptions, VideoReplay};
 use flyrig_gpu::GpuContext;
 use flyrig_sim::{SimTime, Simulator};
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
@@ -20,6 +23,7 @@ use crate::{
     live,
     outlet::Outlet,
     pipeline::{Outcome, Pipeline, PoseSource},
+    record,
     stats::resident_mib,
     stop, viewpoints,
 };
@@ -32,19 +36,28 @@ const SHAPE_SETS: usize = 8;
 const PRINT_EVERY: Duration = Duration::from_secs(5);
 
 /// Cameras and what is known about the person.
-struct Scene {
-    sources: Vec<Box<dyn CameraSource>>,
-    rig: Rig,
+pub struct Scene {
+    /// In the rig's order, pictures in the cameras' own formats.
+    pub sources: Vec<Box<dyn CameraSource>>,
+    pub rig: Rig,
     template: Template,
     track: Option<flyrig_types::PoseTrack>,
     /// Empty pictures by slot, where there are any.
     plates: Vec<Option<Image>>,
 }
 
-/// Runs the command.
-pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
+/// Runs the command; `recording` names a file that the cameras are recorded to.
+pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>) -> Result<()> {
     let stop = stop::flag();
-    let scene = open(config, gpu)?;
+    let mut scene = open(config, Some(gpu))?;
+    let recorder = recording.map(|path| record::recorder(path, &scene.rig)).transpose()?;
+    if let Some(recorder) = &recorder {
+        scene.sources = record::tap(recorder, scene.sources);
+    }
+    if matches!(config.source.kind, SourceKind::V4l2 | SourceKind::Mcap) {
+        let decoding = |source| Box::new(Decoding::new(source)) as Box<dyn CameraSource>;
+        scene.sources = scene.sources.into_iter().map(decoding).collect();
+    }
     dataset::require_masks(config.body.pose, config.body.masks, &scene.plates)?;
     let pacing = match (config.source.real_time, config.source.kind) {
         // Nobody can make a real camera wait.
@@ -121,6 +134,13 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
     for (place, count) in intake.drops().into_iter().chain(outlet.drops()).filter(|(_, count)| *count > 0) {
         eprintln!("dropped: {count} {place}");
     }
+    drop(intake);
+    if let (Some(recorder), Some(path)) = (recorder, recording) {
+        match record::told(&recorder.finish(), path) {
+            Ok(text) => eprintln!("run: recorded {text}"),
+            Err(error) => eprintln!("run: {error}"),
+        }
+    }
     outlet.finish()
 }
 
@@ -195,9 +215,11 @@ fn learn_shape(estimator: &mut PoseEstimator, intake: &mut Intake) -> Result<()>
     }
 }
 
-fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
+/// Opens the cameras of a configuration; only simulated ones need the graphics adapter.
+pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Scene> {
     let source = &config.source;
     if source.kind == SourceKind::Sim {
+        let gpu = gpu.context("the simulated rig needs a graphics adapter")?;
         let simulator = Simulator::new(gpu, &config.sim)?;
         let (rig, template, track) =
             (simulator.reported_rig(), simulator.template().clone(), simulator.track().clone());
@@ -218,10 +240,10 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
         return Ok(Scene { sources, rig: picked, template, track: Some(track), plates });
     }
     let chosen: Vec<CameraId> = source.names().into_iter().map(CameraId::from).collect();
-    let rig = if source.kind == SourceKind::V4l2 {
-        live::load_rig(source)?
-    } else {
-        dataset::load_rig(&source.path, &chosen)?
+    let rig = match source.kind {
+        SourceKind::V4l2 => live::load_rig(source)?,
+        SourceKind::Mcap => record::recorded_rig(&source.path)?,
+        SourceKind::Folder | SourceKind::Video | SourceKind::Sim => dataset::load_rig(&source.path, &chosen)?,
     };
     let rig = dataset::pick(&rig, &source.names(), "the calibration")?;
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
@@ -235,6 +257,7 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
             )?)
         }
         SourceKind::V4l2 => live::open(source)?,
+        SourceKind::Mcap => record::replay_sources(&source.path, &rig)?,
         SourceKind::Video | SourceKind::Sim => {
             let open = |id| VideoReplay::open(id, &dataset::video_file(&source.path, id), &VideoOptions::default());
             boxed(ids.iter().map(open).collect::<Result<_, _>>()?)
@@ -246,7 +269,10 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
         let human = load_gltf(&config.body.template)?;
         (human.template, human.track)
     };
-    let plates = dataset::plates(&source.path, &rig)?;
+    let plates = match source.kind {
+        SourceKind::Mcap => rig.cameras.iter().map(|_| None).collect(),
+        _ => dataset::plates(&source.path, &rig)?,
+    };
     Ok(Scene { sources, rig, template, track, plates })
 }
 
