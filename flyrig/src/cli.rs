@@ -44,6 +44,9 @@ pub enum Command {
         /// Record the cameras into this MCAP file meanwhile; it must not be there yet.
         #[arg(long)]
         record: Option<PathBuf>,
+        /// Show a live table of the cameras in place of a line of rates.
+        #[arg(long)]
+        table: bool,
     },
     /// Record the cameras of a configuration into an MCAP file, without tracking.
     Record(RecordArgs),

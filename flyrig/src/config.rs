@@ -28,6 +28,7 @@ pub struct Config {
     pub appearance: AppearanceSection,
     pub output: OutputSection,
     pub transport: TransportSection,
+    pub health: HealthSection,
     pub gpu: GpuSection,
 }
 
@@ -295,6 +296,12 @@ impl Default for TransportSection {
 #[serde(deny_unknown_fields, default)]
 pub struct GpuSection {
     pub adapter: String,
+}
+
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct HealthSection {
+    pub listen: String,
 }
 
 impl Config {

@@ -12,8 +12,10 @@ mod demo;
 mod doctor;
 mod engine;
 mod eval;
+mod health;
 mod intake;
 mod live;
+mod notify;
 mod outlet;
 mod pipeline;
 mod png;
@@ -71,10 +73,10 @@ pub fn main() -> ExitCode {
 fn dispatch(cli: &Cli) -> Result<()> {
     match &cli.command {
         Command::Demo(args) => demo::demo(args, &gpu(cli.adapter.as_deref())?),
-        Command::Run { config, record } => {
+        Command::Run { config, record, table } => {
             let config = Config::load(config)?;
             let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
-            run::run(&config, &gpu(adapter)?, record.as_deref())
+            run::run(&config, &gpu(adapter)?, record.as_deref(), *table)
         }
         Command::Record(args) => {
             let config = Config::load(&args.config)?;

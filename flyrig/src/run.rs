@@ -19,8 +19,10 @@ use crate::{
     config::{Config, Origin, SourceKind},
     dataset,
     engine::Engine,
+    health::{Health, MetricsServer},
     intake::Intake,
     live,
+    notify::ServiceManager,
     outlet::Outlet,
     pipeline::{Outcome, Pipeline, PoseSource},
     record,
@@ -35,6 +37,9 @@ const SHAPE_SETS: usize = 8;
 /// How often a line with rates is printed.
 const PRINT_EVERY: Duration = Duration::from_secs(5);
 
+/// How often the health is told.
+const HEALTH_EVERY: Duration = Duration::from_secs(1);
+
 /// Cameras and what is known about the person.
 pub struct Scene {
     /// In the rig's order, pictures in the cameras' own formats.
@@ -46,8 +51,8 @@ pub struct Scene {
     plates: Vec<Option<Image>>,
 }
 
-/// Runs the command; `recording` names a file that the cameras are recorded to.
-pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>) -> Result<()> {
+/// Runs the command; `recording` names a file that the cameras are recorded to, `show_table` draws the cameras' health.
+pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_table: bool) -> Result<()> {
     let stop = stop::flag();
     let mut scene = open(config, Some(gpu))?;
     let recorder = recording.map(|path| record::recorder(path, &scene.rig)).transpose()?;
@@ -68,6 +73,13 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>) -> Resul
         (true, _) => Pacing::RealTime,
     };
     let mut intake = Intake::start(scene.sources, &sync_config(config), config.sync.clocks, pacing)?;
+    if config.source.kind == SourceKind::V4l2 {
+        intake = intake.live();
+    }
+    let metrics = match config.health.listen.as_str() {
+        "" => None,
+        address => Some(MetricsServer::start(address)?),
+    };
 
     let mut template = scene.template;
     let pose = match (config.body.pose, scene.track) {
@@ -110,9 +122,28 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>) -> Resul
         outlet.publisher().endpoints().join(", ")
     );
 
+    if let Some(metrics) = &metrics {
+        eprintln!("run: metrics at http://{}/metrics", metrics.address());
+    }
+    let manager = ServiceManager::from_env();
+    manager.tell("READY=1");
+    let mut last_health: Option<Instant> = None;
     let (started, mut last_print, mut frames, mut printed) = (Instant::now(), Instant::now(), 0u64, 0u64);
     while !stop.load(std::sync::atomic::Ordering::Relaxed) && !intake.ended() {
-        let Some(set) = intake.next_set(Duration::from_millis(200)) else { continue };
+        let set = intake.next_set(Duration::from_millis(200));
+        if last_health.is_none_or(|at| at.elapsed() >= HEALTH_EVERY) {
+            last_health = Some(Instant::now());
+            manager.tell("WATCHDOG=1");
+            let health = Health { stages: pipeline.stages.summary(), resident_mib: resident_mib(), ..intake.health() };
+            if let Some(metrics) = &metrics {
+                metrics.publish(health.prometheus());
+            }
+            if show_table {
+                // Clears the terminal first.
+                eprint!("\x1b[2J\x1b[H{}", health.table());
+            }
+        }
+        let Some(set) = set else { continue };
         if let Outcome::Held(reason) = pipeline.process(&set)? {
             tracing::warn!(set = set.index, %reason, "frame set not used");
         }
@@ -122,7 +153,7 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>) -> Resul
             outlet.publish_splats(&pipeline.engine().splats()?, &set);
         }
         outlet.publish_stats(&set, frames, &pipeline.stages.summary(), &intake.drops(), &pipeline.watch);
-        if last_print.elapsed() >= PRINT_EVERY {
+        if !show_table && last_print.elapsed() >= PRINT_EVERY {
             let rate = (frames - printed) as f64 / last_print.elapsed().as_secs_f64();
             let memory = resident_mib().map_or_else(String::new, |mib| format!(", {mib:.0} MiB"));
             eprintln!("run: {frames} sets, {rate:.1} a second, {} lost{memory}", pipeline.counts.lost);
@@ -134,6 +165,7 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>) -> Resul
     for (place, count) in intake.drops().into_iter().chain(outlet.drops()).filter(|(_, count)| *count > 0) {
         eprintln!("dropped: {count} {place}");
     }
+    manager.tell("STOPPING=1");
     drop(intake);
     if let (Some(recorder), Some(path)) = (recorder, recording) {
         match record::told(&recorder.finish(), path) {

@@ -208,7 +208,8 @@ impl<S> Recording<S> {
         };
         let length = payload.len();
         let too_slow = || {
-            self.shared.stop("the disk is slower than the cameras; record to a faster one, or send MJPEG".to_owned())
+            let text = "the disk is slower than the cameras; record to a faster one, or send MJPEG";
+            self.shared.stop(text.to_owned());
         };
         if self.shared.waiting_bytes.fetch_add(length, Ordering::Relaxed) > WAITING_BYTES {
             return too_slow();

@@ -208,7 +208,7 @@ pub(crate) fn is_denied(error: &io::Error) -> bool {
 pub(crate) fn denied(node: &Path) -> CaptureError {
     let text = format!(
         "{} may not be opened by this user (permission denied); add the user to its group, usually with \
-         `sudo usermod -aG video $USER` and a new login, or install the udev rule of `flyrig doctor`",
+         `sudo usermod -aG video $USER` and a new login, or install packaging/70-flyrig-cameras.rules",
         node.display()
     );
     CaptureError::general(CaptureErrorKind::Io, text)
