@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Runs the V4L2 capture against real drivers without a camera: boots Debian's kernel in an emulated machine (qemu, no
-# hardware virtualisation needed), loads the kernel's camera test driver (vivid) four times, and does to the rig what
-# happens to rigs. Prints a table; fails when a bound is broken. Takes about four minutes on two cores.
+# hardware virtualisation needed), loads the kernel's camera test driver (vivid) four times, plugs four USB cameras into its
+# virtual USB controller, and does to the rig what happens to rigs. Prints a table; fails when a bound is broken. Takes about four minutes on two cores.
 # Usage: scripts/test-v4l2.sh [PROGRAM]   (PROGRAM: the built v4l2-faults; built when left out)
 # Environment: CYCLES (unplugged and replugged so often, 25), WORK (folder for kernel and image)
 set -euo pipefail
@@ -48,20 +48,21 @@ fi
 # The kernel is unpacked into $work and not installed. Cloud kernels lack the media drivers.
 package=$(apt-cache depends linux-image-amd64 | awk '/Depends:/ { print $2; exit }')
 version=${package#linux-image-}
-if [ ! -e "$work/vmlinux-$version" ]; then
+if [ ! -e "$work/ready-$version" ]; then
   say "downloading $package (about 70 MB) into $work, where it is unpacked and not installed"
   (
     cd "$work"
     rm -rf ./*.deb boot lib
     apt-get download -qq "$package"
     drivers="./lib/modules/*/kernel/drivers"
-    dpkg --fsys-tarfile linux-image*.deb | tar x --wildcards "./boot/vmlinuz-*" "$drivers/media/*" './lib/modules/*/modules.*'
+    dpkg --fsys-tarfile linux-image*.deb | tar x --wildcards "./boot/vmlinuz-*" "$drivers/media/*" "$drivers/usb/*" './lib/modules/*/modules.*'
     rm -f ./*.deb
     # The compressed kernel begins at the magic number of xz.
     start=$(grep -abom1 $'\xFD7zXZ' "boot/vmlinuz-$version" | head -1 | cut -d: -f1)
     tail -c "+$((start + 1))" "boot/vmlinuz-$version" | xz -dc --single-stream >vmlinux.part 2>/dev/null || true
     depmod -b . "$version"
     mv vmlinux.part "vmlinux-$version"
+    touch "ready-$version"
   )
 fi
 
@@ -69,7 +70,7 @@ root=$work/root
 rm -rf "$root"
 mkdir -p "$root"/{bin,mod,proc,sys,dev,tmp,usr/bin}
 cp /bin/busybox "$root/bin/"
-modprobe -d "$work" -S "$version" --show-depends vivid | awk '/^insmod/ && !seen[$2]++ { print $2 }' |
+for driver in vivid vhci-hcd uvcvideo; do modprobe -d "$work" -S "$version" --show-depends "$driver"; done | awk '/^insmod/ && !seen[$2]++ { print $2 }' |
   while read -r module; do
     cp "$module" "$root/mod/"
     basename "$module"
@@ -93,6 +94,8 @@ for module in \$(cat /mod/order); do
   options=
   # Plain video capture only; the last device has the multi-planar interface.
   [ \$module = vivid.ko ] && options="n_devs=4 node_types=1,1,1,1 num_inputs=1,1,1,1 input_types=0,0,0,0 multiplanar=1,1,1,2"
+  # Virtual USB devices do not wake up again.
+  [ \$module = usbcore.ko ] && options="autosuspend=-1"
   insmod /mod/\$module \$options
 done
 # The stamps of ends of frames run a frame ahead in this driver.

@@ -8,6 +8,7 @@ mod clocks;
 mod clocks_tests;
 mod easymocap;
 mod error;
+mod lags;
 mod sync;
 #[cfg(test)]
 mod sync_properties;
@@ -16,4 +17,5 @@ mod yaml;
 pub use clocks::{ClockAligner, ClockKind, ClockState};
 pub use easymocap::{load_easymocap, save_easymocap};
 pub use error::CalibError;
+pub use lags::{LagEstimate, MotionSignal, estimate_lags};
 pub use sync::{DropCounts, SyncConfig, SyncCounts, Synchronizer};

@@ -53,6 +53,9 @@ pub enum Command {
     /// Play a recording through, tell what is in it, and export it where asked to. To run the rig on it, set
     /// source.kind = "mcap".
     Replay(ReplayArgs),
+    /// Compare what moves in the pictures of all cameras and tell how much later than the first one's each camera's stamps
+    /// are.
+    SyncCheck(SyncCheckArgs),
     /// List cameras, what they are named by, their formats and buses, and graphics adapters; say what to mend.
     Doctor {
         /// A TOML file whose cameras are looked for and whose buses are planned.
@@ -98,6 +101,22 @@ pub struct ReplayArgs {
     /// Write the synchronised pictures and the calibration into this new folder (EasyMocap layout).
     #[arg(long)]
     pub export: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct SyncCheckArgs {
+    /// A configuration (*.toml), a recording (*.mcap), a folder with images/CAM, or the videos of all cameras.
+    #[arg(required = true)]
+    pub input: Vec<PathBuf>,
+    /// Seconds that are compared.
+    #[arg(long, default_value_t = 20.0)]
+    pub seconds: f64,
+    /// Largest lag that is looked for, milliseconds.
+    #[arg(long, default_value_t = 250.0, value_parser = parse_most_ms)]
+    pub most_ms: f64,
+    /// Frame rate of a folder.
+    #[arg(long, default_value_t = 30.0)]
+    pub fps: f64,
 }
 
 #[derive(Debug, Subcommand)]
@@ -289,6 +308,13 @@ fn parse_size(text: &str) -> Result<[u32; 2], String> {
     match sides {
         Some((w, h)) if (16..=4096).contains(&w) && (16..=4096).contains(&h) => Ok([w, h]),
         _ => Err(format!("'{text}' is not WIDTHxHEIGHT with sides of 16 to 4096 pixels")),
+    }
+}
+
+fn parse_most_ms(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(ms) if (4.0..=10_000.0).contains(&ms) => Ok(ms),
+        _ => Err(format!("'{text}' is not between 4 and 10000 milliseconds")),
     }
 }
 

@@ -27,6 +27,7 @@ mod score;
 mod sim_export;
 mod stats;
 mod stop;
+mod sync_check;
 mod track_state;
 mod viewpoints;
 mod watch;
@@ -85,6 +86,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
             record::record(&config, args, gpu.as_ref())
         }
         Command::Replay(args) => record::replay(args),
+        Command::SyncCheck(args) => sync_check::sync_check(args, &|| gpu(cli.adapter.as_deref())),
         Command::Doctor { config } => doctor::doctor(config.as_deref()),
         Command::Watch(args) => watch::watch(args),
         Command::Eval(args) => eval::eval(args, &gpu(cli.adapter.as_deref())?),

@@ -3,6 +3,8 @@
 mod host;
 mod rig;
 mod table;
+mod usb;
+mod uvc;
 
 use std::{process::ExitCode, time::Duration};
 
@@ -40,6 +42,7 @@ pub fn main() -> ExitCode {
     missing(&mut table);
     refused_start(&mut table);
     replugged(&mut table, cycles);
+    usb::run(&mut table, cycles);
     table.print();
     if table.all_within() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }

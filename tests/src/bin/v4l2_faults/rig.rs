@@ -46,6 +46,8 @@ pub struct Seen {
     /// Frames whose time was not after the one before.
     pub backwards: u64,
     pub health: SourceHealth,
+    /// Of the last frame.
+    pub exposure_nanos: Option<u64>,
     seconds: f64,
     last_frame: Option<Instant>,
     errors: Vec<(CaptureErrorKind, u64)>,
@@ -83,6 +85,7 @@ impl Seen {
             longest_gap_ms: 0.0,
             backwards: 0,
             health: SourceHealth::default(),
+            exposure_nanos: None,
             seconds: 0.0,
             last_frame: None,
             errors: Vec::new(),
@@ -138,12 +141,18 @@ impl Watched {
 }
 
 impl Rig {
-    /// Opens the first so many cameras; a failure ends the program, since then there is nothing to test.
+    /// Opens the first so many cameras of the test driver.
     pub fn start(cameras: usize) -> Self {
+        Self::start_with(&(0..cameras).map(|camera| options(&bus(camera))).collect::<Vec<_>>())
+    }
+
+    /// Opens cameras; a failure ends the program, since then there is nothing to test.
+    pub fn start_with(wanted: &[CameraOptions]) -> Self {
+        let cameras = wanted.len();
         let mut sources: Vec<Box<dyn CameraSource>> = Vec::new();
-        for camera in 0..cameras {
+        for (camera, options) in wanted.iter().enumerate() {
             let name = format!("{camera:02}");
-            match V4l2Camera::open(&name.as_str().into(), &options(&bus(camera))) {
+            match V4l2Camera::open(&name.as_str().into(), options) {
                 Ok(source) => sources.push(Box::new(Decoding::new(source))),
                 Err(error) => {
                     println!("BROKEN: cannot start: {error}");
@@ -223,6 +232,7 @@ impl Rig {
         let slot: usize = frame.camera.as_str().parse().unwrap_or(0);
         let (now, seen) = (Instant::now(), &mut self.seen[slot]);
         seen.frames += 1;
+        seen.exposure_nanos = frame.exposure_nanos;
         seen.last_frame = Some(now);
         if let Some((before, nanos)) = self.last[slot] {
             let gap = now.duration_since(before.max(self.started)).as_secs_f64() * 1e3;
