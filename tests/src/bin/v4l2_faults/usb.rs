@@ -11,7 +11,7 @@ use flyrig_capture::{CameraControls, CameraIdentity, CameraOptions, CaptureError
 
 use super::{
     host::{open_files, threads},
-    rig::{Rig, Share, options},
+    rig::{Rig, Seen, Share, options},
     table::Table,
     uvc::{Knobs, UvcCamera, pictures},
 };
@@ -116,17 +116,20 @@ fn steady(table: &mut Table) {
 fn cut(table: &mut Table, bench: &Bench) {
     let mut rig = Bench::rig();
     rig.watch(Duration::from_secs(2));
-    bench.knobs[0].cut.store(5, Ordering::Relaxed);
-    rig.until(Duration::from_secs(20), |cameras| cameras[0].errors_of(CaptureErrorKind::Corrupt) >= 5);
-    rig.watch(Duration::from_secs(1));
-    let corrupt = rig.now()[0].errors_of(CaptureErrorKind::Corrupt);
+    // A slow machine never sees most of them.
+    bench.knobs[0].cut.store(u64::MAX, Ordering::Relaxed);
+    let refused = |cameras: &[Seen]| cameras[0].errors_of(CaptureErrorKind::Corrupt) >= 5;
+    let in_time = matches!(rig.until(Duration::from_secs(30), refused), Share::After(_));
+    bench.knobs[0].cut.store(0, Ordering::Relaxed);
+    let back = rig.until(Duration::from_secs(10), |cameras| cameras[0].frames > 3);
+    let hit = &rig.now()[0];
     table.row(
         "cut off pictures (USB)",
-        "5 JPEG pictures of one camera end in the middle",
-        &format!("{corrupt} frames refused"),
-        "5, none given on; no restart",
-        &corrupt.to_string(),
-        corrupt == 5 && rig.now()[0].health.reconnects == 0,
+        "JPEG pictures of one camera end in the middle for a while",
+        &format!("{} frames refused, none given on", hit.errors_of(CaptureErrorKind::Corrupt)),
+        "each costs itself; no restart; flowing again",
+        &format!("flowing {:.0} ms after the last one", back.ms()),
+        in_time && matches!(back, Share::After(_)) && hit.health.reconnects == 0,
     );
 }
 
@@ -134,7 +137,8 @@ fn silent(table: &mut Table, bench: &Bench) {
     let mut rig = Bench::rig();
     rig.watch(Duration::from_secs(2));
     bench.knobs[0].silent.store(true, Ordering::Relaxed);
-    rig.until(Duration::from_secs(3), |cameras| cameras[0].health.silences > 0);
+    // A slow machine first empties the driver's buffers.
+    rig.until(Duration::from_secs(15), |cameras| cameras[0].health.silences > 0);
     let noticed = rig.now()[0].silent_ms();
     bench.knobs[0].silent.store(false, Ordering::Relaxed);
     let back = rig.until(Duration::from_secs(10), |cameras| cameras[0].health.reconnects > 0 && cameras[0].frames > 0);
