@@ -53,7 +53,7 @@ if [ ! -e "$work/ready-$version" ]; then
   (
     cd "$work"
     rm -rf ./*.deb boot lib
-    apt-get download -qq "$package"
+    apt-get download -qq -o APT::Sandbox::User=root "$package"
     drivers="./lib/modules/*/kernel/drivers"
     dpkg --fsys-tarfile linux-image*.deb | tar x --wildcards "./boot/vmlinuz-*" "$drivers/media/*" "$drivers/usb/*" './lib/modules/*/modules.*'
     rm -f ./*.deb
@@ -110,6 +110,6 @@ chmod +x "$root/init"
 say "booting $version with four test cameras"
 timeout "${LIMIT:-900}" qemu-system-x86_64 -accel tcg,thread=multi -cpu max -smp 2 -m 768 -nic none -nographic -no-reboot \
   -kernel "$work/vmlinux-$version" -initrd "$work/initrd.cpio" -append "console=ttyS0 quiet panic=-1" </dev/null 2>&1 |
-  tr -d '\r' | tee "$work/log" | { grep -a -v -e '^$' -e '^@@' || true; }
+  stdbuf -oL tr -d '\r' | tee "$work/log" | { grep -a --line-buffered -v -e '^$' -e '^@@' || true; }
 grep -aq '^@@RC 0' "$work/log" || { say "a bound was broken, or the machine did not finish; all it said is in $work/log"; exit 1; }
 say "every bound was kept ($SECONDS s)"

@@ -139,7 +139,6 @@ fn answer(mut requests: UnixStream, shared: &Shared, serial: &str) -> io::Result
             let before = waiting.len();
             waiting.retain(|(other, _)| *other != head[20..24]);
             let found = waiting.len() < before;
-            drop(waiting);
             let mut reply = [0; 48];
             reply[3] = 4;
             reply[4..8].copy_from_slice(&sequence);
@@ -197,9 +196,10 @@ fn send_pictures(shared: &Shared, pictures: &[Vec<u8>]) -> io::Result<()> {
                 waiting = shared.changed.wait_timeout(waiting, PERIOD).unwrap_or_else(PoisonError::into_inner).0;
             }
             let Some((sequence, room)) = waiting.pop_front() else { continue };
-            drop(waiting);
             let (now, later) = rest.split_at(rest.len().min(room));
+            // Under the lock: nobody may say of a transfer that it is over before it is.
             complete(&mut lock(&shared.out), sequence, 0, now.len(), now)?;
+            drop(waiting);
             rest = later;
         }
         if shared.gone.load(Ordering::Relaxed) {
