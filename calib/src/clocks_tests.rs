@@ -2,33 +2,12 @@
 
 use flyrig_types::{CameraId, Frame, FrameSet, Image, PixelFormat};
 
+use crate::random::Random;
 use crate::{ClockAligner, SyncConfig, Synchronizer};
 
 const PERIOD: i64 = 33_333_333;
 const SECOND: i64 = 1_000_000_000;
 const HOUR_FRAMES: i64 = 3600 * 30;
-
-/// SplitMix64.
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    fn chance(&mut self, percent: u64) -> bool {
-        self.next() % 100 < percent
-    }
-
-    /// Between `-most` and `most`.
-    fn jitter(&mut self, most: i64) -> i64 {
-        (self.next() % (2 * most as u64 + 1)) as i64 - most
-    }
-}
 
 /// A frame as it arrives: camera, tick, stamp by the camera's clock.
 type Arrival = (usize, i64, i64);

@@ -209,21 +209,9 @@ fn pair_lag(a: &MotionSignal, b: &MotionSignal, most: i64) -> Option<(f64, f64)>
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::Random;
 
     const PERIOD: i64 = 33_333_333;
-
-    /// SplitMix64 as numbers from 0 to 1.
-    struct Random(u64);
-
-    impl Random {
-        fn unit(&mut self) -> f64 {
-            self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-            let mut z = self.0;
-            z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-            z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-            ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
-        }
-    }
 
     /// Where two hands of a person are: sums of slow swings.
     fn hands(seed: u64) -> impl Fn(f64) -> [f64; 4] {

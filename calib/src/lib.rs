@@ -9,6 +9,8 @@ mod clocks_tests;
 mod easymocap;
 mod error;
 mod lags;
+#[cfg(test)]
+mod random;
 mod sync;
 #[cfg(test)]
 mod sync_properties;

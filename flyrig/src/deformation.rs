@@ -230,6 +230,11 @@ impl Deformation {
         &self.judged
     }
 
+    /// How many Gaussians are compared with the pictures.
+    pub fn compared(&self) -> usize {
+        self.posed[0].count()
+    }
+
     /// Views of the last frame whose pictures were compared at a half of their size or less.
     pub fn halved_pictures(&self) -> usize {
         self.halved

@@ -294,6 +294,11 @@ impl Engine {
         self.judged.iter().map(|judged| judged.map(|(quality, _)| quality)).collect()
     }
 
+    /// How many Gaussians are compared with the pictures; 0 where the body is only skinned.
+    pub fn compared_gaussians(&self) -> usize {
+        self.deformation.as_ref().map_or(0, Deformation::compared)
+    }
+
     /// What the last solve of the deformation did.
     pub fn deform_report(&self) -> Option<&DeformReport> {
         self.deformation.as_ref().and_then(Deformation::report)

@@ -24,5 +24,5 @@ mod track;
 
 pub use data::{DataTerm, PointDerivatives};
 pub use pose_fix::{PoseCorrection, PoseFreedom};
-pub use settings::{DeformSettings, DeformSolver};
+pub use settings::{DeformSettings, DeformSolver, FIRST_FRAMES};
 pub use track::{DeformReport, DeformTracker};

@@ -3,6 +3,7 @@
 use anyhow::{Context, Result};
 use flyrig_body::DEFAULT_NODE_COUNT;
 use flyrig_gpu::GpuContext;
+use flyrig_tracker::FIRST_FRAMES;
 use serde::Serialize;
 
 use super::sequence::{Motion, Sequence, SequenceConfig};
@@ -17,8 +18,6 @@ use crate::{
 
 /// Points on the tracked surface.
 const OUR_POINTS: usize = 20_000;
-/// Frames that get more iterations, of either solver.
-const FIRST_FRAMES: usize = 10;
 
 /// What to run.
 #[derive(Debug, Clone, PartialEq)]
@@ -153,13 +152,13 @@ pub fn run_pipeline(mut pipeline: Pipeline, sequence: &Sequence, case: &Case) ->
     let stages_ms: Vec<(String, f64)> =
         pipeline.stages.summary().into_iter().map(|s| (s.name.trim().to_owned(), f64::from(s.mean_ms))).collect();
     let mean_ms = |times: &[f64]| times.iter().sum::<f64>() / times.len().max(1) as f64;
-    let (first, later) = times_ms.split_at(times_ms.len().min(FIRST_FRAMES));
+    let (first, later) = times_ms.split_at(times_ms.len().min(FIRST_FRAMES as usize));
     Ok(Row {
         name: case.name(),
         variant: case.variant.clone(),
         solver: case.solver,
         gaussians: case.gaussians,
-        compared: case.options.map_or(0, |options| options.gaussians.min(case.gaussians)),
+        compared: pipeline.engine().compared_gaussians(),
         views: case.views,
         sequence: sequence.config(),
         psnr_db: mean.psnr_db,

@@ -69,7 +69,7 @@ impl Default for DeformSettings {
 }
 
 /// Frames that get the first iterations (FlyHuman section 4.1).
-pub(super) const FIRST_FRAMES: u64 = 10;
+pub const FIRST_FRAMES: u64 = 10;
 
 impl DeformSettings {
     /// Iterations of frame number `frame` since the last reset.
