@@ -2,12 +2,13 @@
 CARGO ?= cargo
 OUT ?= out/demo
 
-.PHONY: help setup demo test test-long check
+.PHONY: help setup demo test test-long test-v4l2 check
 
 help:
 	@echo "make demo    install what is missing, build, run the simulated rig, show the report (OUT=$(OUT))"
 	@echo "make test    install what is missing, build, run every test"
 	@echo "make test-long  the long stability runs"
+	@echo "make test-v4l2  camera capture against the kernel's test drivers, in an emulated machine"
 	@echo "make check   format, lints and documentation, as CI runs them"
 	@echo "make setup   only install what is missing"
 
@@ -24,6 +25,9 @@ test: setup
 
 test-long: setup
 	$(CARGO) test --release --locked --workspace -- --ignored --nocapture
+
+test-v4l2: setup
+	@scripts/test-v4l2.sh
 
 check: setup
 	$(CARGO) fmt --all -- --check

@@ -10,7 +10,7 @@ check_only=false
 wanted=(
   "build-essential:C and C++ compilers and make, for crates that build native code"
   "pkg-config:finds installed libraries for the build"
-  "clang:the opencv crate reads OpenCV's headers with it"
+  "clang:the opencv and v4l crates read the headers of OpenCV and of the kernel with it"
   "libclang-dev:the same"
   "libopencv-dev:camera files, video files and image processing"
   "libvulkan1:the Vulkan loader, to reach the graphics adapter"

@@ -14,6 +14,8 @@ use crate::{BodyError, DeformationGraph, SurfaceGaussians, Template};
 pub struct CoarseSurface {
     /// The chosen ones, with the scale that their own spacing asks for.
     pub gaussians: SurfaceGaussians,
+    /// Mean distance of neighbours among them: root of the surface's area a Gaussian, metres.
+    pub spacing_m: f64,
     /// The same nodes; [`DeformationGraph::gaussian_nodes`] and their weights are the chosen ones'.
     /// [`DeformationGraph::node_gaussian`] still counts the fine ones.
     pub graph: DeformationGraph,
@@ -39,23 +41,14 @@ pub fn coarsen(
         let message = format!("{all} Gaussians do not fit a graph for {}; build both together", lists[0]);
         return Err(BodyError::Mesh { name: template.name.clone(), message });
     }
-    let area: f64 = template
-        .triangles
-        .iter()
-        .filter_map(|t| {
-            let [a, b, c] = t.map(|i| template.positions.get(i as usize).map(|p| p.as_dvec3()));
-            Some(0.5 * (b? - a?).cross(c? - a?).length())
-        })
-        .sum();
+    let area = template.area_m2();
     let kept = eliminate(&surface.positions, &surface.normals, count.clamp(1, all), area);
     let positions: Vec<Vec3> = kept.iter().map(|&i| surface.positions[i]).collect();
     let normals: Vec<Vec3> = kept.iter().map(|&i| surface.normals[i]).collect();
-    let scale_m = if kept.len() == all {
-        surface.scale_m.clone()
-    } else {
-        scales(&positions, &normals, (area / kept.len() as f64).sqrt() as f32)
-    };
-    let spacing = ((area / kept.len() as f64).sqrt() as f32).max(1e-6);
+    let spacing_m = (area / kept.len() as f64).sqrt();
+    let scale_m =
+        if kept.len() == all { surface.scale_m.clone() } else { scales(&positions, &normals, spacing_m as f32) };
+    let spacing = (spacing_m as f32).max(1e-6);
     let grid = PointGrid::new(&positions, 2.0 * spacing);
     let parents: Vec<u32> = (0..all)
         .into_par_iter()
@@ -110,7 +103,7 @@ pub fn coarsen(
         gaussian_weights: kept.iter().map(|&i| graph.gaussian_weights[i]).collect(),
         ..graph.clone()
     };
-    Ok(CoarseSurface { gaussians, graph, first_child, children })
+    Ok(CoarseSurface { gaussians, spacing_m, graph, first_child, children })
 }
 
 #[cfg(test)]
@@ -141,6 +134,7 @@ mod tests {
         let mean = |list: &[f32]| list.iter().sum::<f32>() / list.len() as f32;
         let ratio = mean(&coarse.gaussians.scale_m) / mean(&surface.scale_m);
         assert!((1.7..2.3).contains(&ratio), "a quarter as many are twice as large: {ratio}");
+        assert!((0.025..0.035).contains(&coarse.spacing_m), "{}", coarse.spacing_m);
         let same = coarsen(&template, &surface, &graph, 9000).unwrap();
         assert_eq!((same.gaussians, same.graph), (surface.clone(), graph.clone()));
         assert!(coarsen(&template, &surface, &DeformationGraph { gaussian_nodes: Vec::new(), ..graph }, 5).is_err());

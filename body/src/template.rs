@@ -85,6 +85,16 @@ pub struct Template {
 }
 
 impl Template {
+    /// Area of the canonical surface, square metres; triangles whose corners do not exist count nothing.
+    #[must_use]
+    pub fn area_m2(&self) -> f64 {
+        let area = |t: &[u32; 3]| {
+            let [a, b, c] = t.map(|i| self.positions.get(i as usize).map(|p| p.as_dvec3()));
+            Some(0.5 * (b? - a?).cross(c? - a?).length())
+        };
+        self.triangles.iter().filter_map(area).sum()
+    }
+
     /// Whether the lists agree, every index points at something and every number is finite.
     ///
     /// # Errors

@@ -4,28 +4,8 @@ use std::collections::HashMap;
 
 use flyrig_types::{CameraId, Frame, FrameSet, Image, PixelFormat};
 
+use crate::random::Random;
 use crate::{DropCounts, SyncConfig, Synchronizer};
-
-/// SplitMix64: a few lines instead of a dependency.
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    fn below(&mut self, n: u64) -> u64 {
-        self.next() % n
-    }
-
-    fn chance(&mut self, percent: u64) -> bool {
-        self.below(100) < percent
-    }
-}
 
 const PERIOD: i64 = 33_333_333;
 

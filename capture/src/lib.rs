@@ -1,26 +1,39 @@
-//! Frames come from here: one trait for cameras and recordings, the recordings, and the threads
+//! Frames come from here: one trait for cameras and recordings, both of these, and the threads
 //! that read them.
 //!
 //! A [`CameraSource`] gives [`flyrig_types::Frame`]s with capture time, sequence number and camera
 //! name, or a [`CaptureError`] whose kind says what to do. [`CaptureThreads`] reads every source in
 //! a thread of its own into one [`LatestQueue`].
 
+mod camera_options;
+mod decoding;
 mod error;
 mod folder;
+mod mjpeg;
 mod picture;
 mod pool;
 mod queue;
+mod recording;
 mod rgb;
 mod source;
 mod threads;
 mod turns;
+#[cfg(target_os = "linux")]
+mod v4l2;
 mod video;
 
+pub use camera_options::{CameraControls, CameraIdentity, CameraOptions, FormatChoice};
+pub use decoding::Decoding;
 pub use error::{CaptureError, CaptureErrorKind};
 pub use folder::{FolderOptions, FolderReplay, folder_picture_size};
 pub use pool::BufferPool;
 pub use queue::{LatestQueue, PopError};
+pub use recording::{McapReplay, Note, Recorded, Recorder, Recording, recorded_notes};
 pub use rgb::{to_rgb8, to_rgb8_into};
-pub use source::CameraSource;
+pub use source::{CameraSource, SourceHealth};
 pub use threads::{CameraStats, CaptureThreads, Pacing, ThreadsConfig};
+#[cfg(target_os = "linux")]
+pub use v4l2::{
+    BusPlan, CameraNode, CameraReport, FormatReport, UsbPlace, V4l2Camera, camera_reports, monotonic_nanos, plan_buses,
+};
 pub use video::{VideoOptions, VideoReplay};

@@ -37,7 +37,7 @@ pub(crate) fn read(path: &Path) -> Result<DynamicImage, CaptureError> {
 
 /// Whether an end-of-image marker follows the first scan. Segments before it are stepped over,
 /// since a thumbnail in them has an end of its own.
-fn jpeg_has_end(bytes: &[u8]) -> bool {
+pub(crate) fn jpeg_has_end(bytes: &[u8]) -> bool {
     const SCAN: u8 = 0xda;
     let mut at = 2;
     while let Some(&[0xff, marker, high, low]) = bytes.get(at..at + 4) {

@@ -5,7 +5,7 @@
 
 use flyrig_types::{Image, PixelFormat};
 
-use crate::{CaptureError, CaptureErrorKind, picture};
+use crate::{CaptureError, CaptureErrorKind, mjpeg};
 
 /// The image as `width * height` pixels of 3 bytes, sRGB red green blue. Alpha is left out, grey is
 /// repeated, YUV is BT.601 limited range, Bayer is interpolated bilinearly, JPEG decoded.
@@ -26,50 +26,68 @@ pub fn to_rgb8(image: &Image) -> Result<Vec<u8>, CaptureError> {
 pub fn to_rgb8_into(image: &Image, rgb: &mut Vec<u8>) -> Result<(), CaptureError> {
     let (width, height) = (image.width() as usize, image.height() as usize);
     let bytes = image.bytes();
-    rgb.clear();
-    rgb.reserve(width * height * 3);
+    rgb.resize(width * height * 3, 0);
+    let pixels = |bytes_each: usize| bytes.chunks_exact(bytes_each);
     match image.format() {
-        PixelFormat::Rgb8 => rgb.extend_from_slice(bytes),
-        PixelFormat::Bgr8 => rgb.extend(bytes.chunks_exact(3).flat_map(|p| [p[2], p[1], p[0]])),
-        PixelFormat::Rgba8 => rgb.extend(bytes.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]])),
-        PixelFormat::Gray8 => rgb.extend(bytes.iter().flat_map(|&y| [y, y, y])),
+        PixelFormat::Rgb8 => rgb.copy_from_slice(bytes),
+        PixelFormat::Bgr8 => {
+            for (p, out) in pixels(3).zip(rgb.chunks_exact_mut(3)) {
+                out.copy_from_slice(&[p[2], p[1], p[0]]);
+            }
+        }
+        PixelFormat::Rgba8 => {
+            for (p, out) in pixels(4).zip(rgb.chunks_exact_mut(3)) {
+                out.copy_from_slice(&p[..3]);
+            }
+        }
+        PixelFormat::Gray8 => {
+            for (&y, out) in bytes.iter().zip(rgb.chunks_exact_mut(3)) {
+                out.fill(y);
+            }
+        }
         format @ (PixelFormat::Yuyv | PixelFormat::Uyvy) => {
             if width % 2 != 0 {
                 return Err(unsupported(format!("{format:?} needs an even width, not {width}")));
             }
-            let pairs = bytes.chunks_exact(4).flat_map(|p| {
-                let [y0, u, y1, v] =
-                    if format == PixelFormat::Yuyv { [p[0], p[1], p[2], p[3]] } else { [p[1], p[0], p[3], p[2]] };
-                [rgb_of_yuv(y0, u, v), rgb_of_yuv(y1, u, v)]
-            });
-            rgb.extend(pairs.flatten());
+            let pairs = pixels(4).zip(rgb.chunks_exact_mut(6));
+            if format == PixelFormat::Yuyv {
+                pairs.for_each(|(p, out)| pair_of_yuv([p[0], p[2]], p[1], p[3], out));
+            } else {
+                pairs.for_each(|(p, out)| pair_of_yuv([p[1], p[3]], p[0], p[2], out));
+            }
         }
         PixelFormat::Nv12 => {
             let (luma, chroma) = bytes.split_at(width * height);
-            for (y, row) in luma.chunks_exact(width).enumerate() {
-                let chroma_row = &chroma[y / 2 * width.div_ceil(2) * 2..];
-                let pixels = row
-                    .iter()
-                    .enumerate()
-                    .map(|(x, &l)| rgb_of_yuv(l, chroma_row[x / 2 * 2], chroma_row[x / 2 * 2 + 1]));
-                rgb.extend(pixels.flatten());
+            let rows = luma.chunks_exact(width).zip(rgb.chunks_exact_mut(width * 3));
+            for (y, (row, out)) in rows.enumerate() {
+                let uv = chroma[y / 2 * width.div_ceil(2) * 2..].chunks_exact(2);
+                for ((lumas, out), uv) in row.chunks(2).zip(out.chunks_mut(6)).zip(uv) {
+                    let chroma = chroma_of(uv[0], uv[1]);
+                    for (&luma, out) in lumas.iter().zip(out.chunks_exact_mut(3)) {
+                        out.copy_from_slice(&rgb_of(luma, chroma));
+                    }
+                }
             }
         }
-        PixelFormat::BayerRggb8 => {
+        format @ (PixelFormat::BayerRggb8
+        | PixelFormat::BayerGrbg8
+        | PixelFormat::BayerGbrg8
+        | PixelFormat::BayerBggr8) => {
             if width < 2 || height < 2 {
                 return Err(unsupported(format!("a Bayer mosaic needs at least 2x2 pixels, not {width}x{height}")));
             }
-            demosaic_rggb(bytes, width, height, rgb);
+            // Place of the first pixel in a mosaic of rows RG and GB.
+            let phase = match format {
+                PixelFormat::BayerGrbg8 => (1, 0),
+                PixelFormat::BayerGbrg8 => (0, 1),
+                PixelFormat::BayerBggr8 => (1, 1),
+                _ => (0, 0),
+            };
+            rgb.clear();
+            demosaic(bytes, width, height, phase, rgb);
         }
         PixelFormat::Mjpeg => {
-            let decoded = picture::decode(bytes)?;
-            if (decoded.width(), decoded.height()) != (image.width(), image.height()) {
-                return Err(CaptureError::general(
-                    CaptureErrorKind::Corrupt,
-                    format!("the JPEG is {}x{}, its frame {width}x{height}", decoded.width(), decoded.height()),
-                ));
-            }
-            *rgb = decoded.into_rgb8().into_raw();
+            mjpeg::decode(bytes, width, height, rgb)?;
         }
     }
     Ok(())
@@ -81,16 +99,27 @@ fn unsupported(message: String) -> CaptureError {
 
 /// BT.601 limited range in 16-bit fixed point: `R = 255/219 (Y-16) + 2 (1-Kr) 255/224 (V-128)` and
 /// so on with Kr = 0.299, Kb = 0.114.
-fn rgb_of_yuv(y: u8, u: u8, v: u8) -> [u8; 3] {
-    const ROUND: i32 = 1 << 15;
-    let y = 76_309 * (i32::from(y) - 16) + ROUND;
+fn rgb_of(y: u8, chroma: [i32; 3]) -> [u8; 3] {
+    let y = 76_309 * (i32::from(y) - 16) + (1 << 15);
+    chroma.map(|c| ((y + c) >> 16).clamp(0, 255) as u8)
+}
+
+/// What chroma adds to red, green and blue.
+fn chroma_of(u: u8, v: u8) -> [i32; 3] {
     let (u, v) = (i32::from(u) - 128, i32::from(v) - 128);
-    [y + 104_597 * v, y - 25_675 * u - 53_279 * v, y + 132_201 * u].map(|c| (c >> 16).clamp(0, 255) as u8)
+    [104_597 * v, -25_675 * u - 53_279 * v, 132_201 * u]
+}
+
+/// Two pixels with one chroma.
+fn pair_of_yuv(y: [u8; 2], u: u8, v: u8, out: &mut [u8]) {
+    let chroma = chroma_of(u, v);
+    out[..3].copy_from_slice(&rgb_of(y[0], chroma));
+    out[3..6].copy_from_slice(&rgb_of(y[1], chroma));
 }
 
 /// Bilinear: a colour that a pixel lacks is the mean of its neighbours of that colour; the border
 /// is mirrored about the outermost pixel, which keeps the mosaic's phase.
-fn demosaic_rggb(mosaic: &[u8], width: usize, height: usize, rgb: &mut Vec<u8>) {
+fn demosaic(mosaic: &[u8], width: usize, height: usize, phase: (usize, usize), rgb: &mut Vec<u8>) {
     let mirror = |i: usize, n: usize| [if i == 0 { 1 } else { i - 1 }, if i + 1 == n { n - 2 } else { i + 1 }];
     for y in 0..height {
         let [up, down] = mirror(y, height).map(|y| &mosaic[y * width..][..width]);
@@ -104,7 +133,7 @@ fn demosaic_rggb(mosaic: &[u8], width: usize, height: usize, rgb: &mut Vec<u8>) 
             let cross = || mean4([row[left], row[right], up[x], down[x]]);
             let corners = || mean4([up[left], up[right], down[left], down[right]]);
             let (sides, ends) = (mean2(row[left], row[right]), mean2(up[x], down[x]));
-            rgb.extend(match (y % 2, x % 2) {
+            rgb.extend(match ((y + phase.1) % 2, (x + phase.0) % 2) {
                 (0, 0) => [own, cross(), corners()],
                 (0, _) => [sides, own, ends],
                 (_, 0) => [ends, own, sides],
@@ -119,6 +148,10 @@ mod tests {
     use std::io::Cursor;
 
     use super::*;
+
+    fn rgb_of_yuv(y: u8, u: u8, v: u8) -> [u8; 3] {
+        rgb_of(y, chroma_of(u, v))
+    }
 
     fn noise(length: usize) -> Vec<u8> {
         let mut state = 3u64;
@@ -194,7 +227,14 @@ mod tests {
 
     #[test]
     fn bayer_is_the_mean_of_the_neighbours_of_a_colour() {
-        for (width, height) in [(2i64, 2i64), (7, 5), (6, 8)] {
+        let phases = [
+            (PixelFormat::BayerRggb8, [[0, 1], [1, 2]]),
+            (PixelFormat::BayerGrbg8, [[1, 0], [2, 1]]),
+            (PixelFormat::BayerGbrg8, [[1, 2], [0, 1]]),
+            (PixelFormat::BayerBggr8, [[2, 1], [1, 0]]),
+        ];
+        let sizes = [(2i64, 2i64), (7, 5), (6, 8)];
+        for ((format, colors), (width, height)) in phases.into_iter().flat_map(|p| sizes.map(|size| (p, size))) {
             let mosaic = noise((width * height) as usize);
             let mirror = |i: i64, n: i64| {
                 if i < 0 {
@@ -205,7 +245,7 @@ mod tests {
                     i
                 }
             };
-            let color = |x: i64, y: i64| [[0, 1], [1, 2]][(y % 2) as usize][(x % 2) as usize];
+            let color = |x: i64, y: i64| colors[(y % 2) as usize][(x % 2) as usize];
             let mut expected = Vec::new();
             for y in 0..height {
                 for x in 0..width {
@@ -227,7 +267,7 @@ mod tests {
                     }
                 }
             }
-            close(&convert(width as u32, height as u32, PixelFormat::BayerRggb8, mosaic).unwrap(), &expected);
+            close(&convert(width as u32, height as u32, format, mosaic).unwrap(), &expected);
         }
         assert_eq!(convert(1, 4, PixelFormat::BayerRggb8, noise(4)).unwrap_err().kind, CaptureErrorKind::Unsupported);
     }

@@ -6,6 +6,21 @@ use flyrig_types::{CameraId, Frame};
 
 use crate::CaptureError;
 
+/// What a source knows of itself beyond its frames and errors; counts since it was made.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct SourceHealth {
+    /// Frames that the driver numbered and nobody got.
+    pub lost_by_driver: u64,
+    /// Times that the camera came back after it was gone.
+    pub reconnects: u64,
+    /// Times that it went silent without an error.
+    pub silences: u64,
+    /// Time stamps that could not be right and were replaced.
+    pub stamps_replaced: u64,
+    /// Format, size and rate in force, as text; empty where it says nothing.
+    pub mode: String,
+}
+
 /// A camera, real, recorded or simulated, read by one thread.
 pub trait CameraSource: Send {
     /// Name of the camera; never changes.
@@ -25,6 +40,11 @@ pub trait CameraSource: Send {
     fn order_nanos(&self, frame: &Frame) -> i64 {
         frame.capture_nanos
     }
+
+    /// Counts beyond frames and errors.
+    fn health(&self) -> SourceHealth {
+        SourceHealth::default()
+    }
 }
 
 impl<S: CameraSource + ?Sized> CameraSource for Box<S> {
@@ -38,5 +58,9 @@ impl<S: CameraSource + ?Sized> CameraSource for Box<S> {
 
     fn order_nanos(&self, frame: &Frame) -> i64 {
         (**self).order_nanos(frame)
+    }
+
+    fn health(&self) -> SourceHealth {
+        (**self).health()
     }
 }

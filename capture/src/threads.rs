@@ -11,7 +11,7 @@ use std::{
 
 use flyrig_types::{CameraId, Frame};
 
-use crate::{CameraSource, CaptureError, CaptureErrorKind, LatestQueue, turns::Turns};
+use crate::{CameraSource, CaptureError, CaptureErrorKind, LatestQueue, SourceHealth, turns::Turns};
 
 /// How long a source may wait for a frame before its thread looks whether it shall stop.
 const POLL: Duration = Duration::from_millis(200);
@@ -62,6 +62,8 @@ pub struct CameraStats {
     pub errors: BTreeMap<CaptureErrorKind, u64>,
     /// The error that came last.
     pub last_error: Option<CaptureError>,
+    /// What the source says of itself.
+    pub health: SourceHealth,
     /// Whether the thread still reads.
     pub running: bool,
 }
@@ -108,6 +110,7 @@ impl CaptureThreads {
             dropped: 0,
             errors: BTreeMap::new(),
             last_error: None,
+            health: SourceHealth::default(),
             running: true,
         };
         let shared = Arc::new(Shared {
@@ -190,7 +193,9 @@ impl Shared {
     fn read(&self, slot: usize, mut source: Box<dyn CameraSource>) {
         let (mut pause, mut failures) = (FIRST_PAUSE, 0);
         while !*lock(&self.stopped) {
-            let error = match source.next_frame(POLL) {
+            let result = source.next_frame(POLL);
+            lock(&self.stats)[slot].health = source.health();
+            let error = match result {
                 Ok(frame) => {
                     (pause, failures) = (FIRST_PAUSE, 0);
                     let order_nanos = source.order_nanos(&frame);

@@ -12,6 +12,7 @@ use crate::config::{AppearanceMode, Origin, Solver};
 /// writes a report with pictures. `flyrig eval` does the same honestly on a data set of yours. For a rig that stays
 /// up, print a configuration, edit it and run it:
 ///
+///     flyrig doctor
 ///     flyrig config print > rig.toml
 ///     flyrig config check rig.toml
 ///     flyrig run rig.toml
@@ -40,6 +41,25 @@ pub enum Command {
     Run {
         /// The TOML file; see `flyrig config print`.
         config: PathBuf,
+        /// Record the cameras into this MCAP file meanwhile; it must not be there yet.
+        #[arg(long)]
+        record: Option<PathBuf>,
+        /// Show a live table of the cameras in place of a line of rates.
+        #[arg(long)]
+        table: bool,
+    },
+    /// Record the cameras of a configuration into an MCAP file, without tracking.
+    Record(RecordArgs),
+    /// Play a recording through, tell what is in it, and export it where asked to. To run the rig on it, set
+    /// source.kind = "mcap".
+    Replay(ReplayArgs),
+    /// Compare what moves in the pictures of all cameras and tell how much later than the first one's each camera's stamps
+    /// are.
+    SyncCheck(SyncCheckArgs),
+    /// List cameras, what they are named by, their formats and buses, and graphics adapters; say what to mend.
+    Doctor {
+        /// A TOML file whose cameras are looked for and whose buses are planned.
+        config: Option<PathBuf>,
     },
     /// Watch a running rig: print rates and latency, write pictures or a video.
     Watch(WatchArgs),
@@ -62,6 +82,43 @@ pub enum Command {
         #[command(subcommand)]
         action: ConfigAction,
     },
+}
+
+#[derive(Debug, Args)]
+pub struct RecordArgs {
+    /// The TOML file; see `flyrig config print`.
+    pub config: PathBuf,
+    /// The file; must not be there yet. Foxglove and other MCAP readers open it.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Stop after so many seconds.
+    #[arg(long)]
+    pub seconds: Option<f64>,
+}
+
+#[derive(Debug, Args)]
+pub struct ReplayArgs {
+    /// The MCAP file.
+    pub recording: PathBuf,
+    /// Write the synchronised pictures and the calibration into this new folder (EasyMocap layout).
+    #[arg(long)]
+    pub export: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct SyncCheckArgs {
+    /// A configuration (*.toml), a recording (*.mcap), a folder with images/CAM, or the videos of all cameras.
+    #[arg(required = true)]
+    pub input: Vec<PathBuf>,
+    /// Seconds that are compared.
+    #[arg(long, default_value_t = 20.0)]
+    pub seconds: f64,
+    /// Largest lag that is looked for, milliseconds.
+    #[arg(long, default_value_t = 250.0, value_parser = parse_most_ms)]
+    pub most_ms: f64,
+    /// Frame rate of a folder.
+    #[arg(long, default_value_t = 30.0)]
+    pub fps: f64,
 }
 
 #[derive(Debug, Subcommand)]
@@ -194,6 +251,9 @@ pub struct BenchTrackArgs {
     /// Only the three solvers.
     #[arg(long)]
     pub quick: bool,
+    /// Only the cases whose name has this text in it, "2 views" for example.
+    #[arg(long)]
+    pub only: Option<String>,
 }
 
 #[derive(Debug, Subcommand)]
@@ -231,8 +291,8 @@ pub struct DemoArgs {
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000)]
     pub gaussians: usize,
-    /// How the body follows the pictures beyond its pose.
-    #[arg(long, value_enum, default_value = "off")]
+    /// How the body follows the pictures beyond its pose; "off" is faster.
+    #[arg(long, value_enum, default_value = "default")]
     pub solver: Solver,
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
@@ -342,6 +402,13 @@ fn parse_size(text: &str) -> Result<[u32; 2], String> {
     match sides {
         Some((w, h)) if (16..=4096).contains(&w) && (16..=4096).contains(&h) => Ok([w, h]),
         _ => Err(format!("'{text}' is not WIDTHxHEIGHT with sides of 16 to 4096 pixels")),
+    }
+}
+
+fn parse_most_ms(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(ms) if (4.0..=10_000.0).contains(&ms) => Ok(ms),
+        _ => Err(format!("'{text}' is not between 4 and 10000 milliseconds")),
     }
 }
 

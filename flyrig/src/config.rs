@@ -4,13 +4,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 use clap::ValueEnum;
+use flyrig_calib::ClockKind;
 use flyrig_renderer::AppearanceSettings;
 use flyrig_sim::SimConfig;
 use flyrig_stfa::Parameters;
 use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
 use serde::{Deserialize, Serialize};
 
-use crate::deformation::DeformOptions;
+use crate::{cameras::CameraEntry, deformation::DeformOptions};
 
 /// The commented default file, as `flyrig config print` writes it. A test keeps it equal to `Config::default()`.
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
@@ -28,6 +29,7 @@ pub struct Config {
     pub appearance: AppearanceSection,
     pub output: OutputSection,
     pub transport: TransportSection,
+    pub health: HealthSection,
     pub gpu: GpuSection,
 }
 
@@ -49,6 +51,8 @@ pub enum SourceKind {
     Sim,
     Folder,
     Video,
+    V4l2,
+    Mcap,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -56,9 +60,44 @@ pub enum SourceKind {
 pub struct SourceSection {
     pub kind: SourceKind,
     pub path: PathBuf,
-    pub cameras: Vec<String>,
+    pub cameras: Vec<CameraEntry>,
     pub fps: f64,
     pub real_time: bool,
+}
+
+impl SourceSection {
+    /// Names of the chosen cameras; none for all.
+    pub fn names(&self) -> Vec<String> {
+        self.cameras.iter().map(|entry| entry.name().to_owned()).collect()
+    }
+
+    fn check(&self) -> Result<()> {
+        for (i, entry) in self.cameras.iter().enumerate() {
+            let name = entry.name();
+            ensure!(
+                self.cameras[..i].iter().all(|before| before.name() != name),
+                "camera {name} is listed twice in source.cameras"
+            );
+            match entry {
+                CameraEntry::Named(_) if self.kind == SourceKind::V4l2 => {
+                    entry.device()?;
+                }
+                CameraEntry::Named(_) => {}
+                CameraEntry::Device(section) => {
+                    ensure!(
+                        self.kind == SourceKind::V4l2,
+                        "camera {name} of source.cameras is a table, but source.kind is not \"v4l2\""
+                    );
+                    section.check()?;
+                }
+            }
+        }
+        ensure!(
+            self.kind != SourceKind::V4l2 || !self.cameras.is_empty(),
+            "source.kind is \"v4l2\" but there is no table [[source.cameras]]"
+        );
+        Ok(())
+    }
 }
 
 impl Default for SourceSection {
@@ -66,7 +105,7 @@ impl Default for SourceSection {
         Self {
             kind: SourceKind::Sim,
             path: PathBuf::new(),
-            cameras: ["00", "03", "05"].map(str::to_owned).to_vec(),
+            cameras: ["00", "03", "05"].map(|name| CameraEntry::Named(name.to_owned())).to_vec(),
             fps: 30.0,
             real_time: true,
         }
@@ -79,11 +118,12 @@ pub struct SyncSection {
     pub window_ms: f64,
     pub max_wait_ms: f64,
     pub master: String,
+    pub clocks: ClockKind,
 }
 
 impl Default for SyncSection {
     fn default() -> Self {
-        Self { window_ms: 8.0, max_wait_ms: 100.0, master: String::new() }
+        Self { window_ms: 8.0, max_wait_ms: 100.0, master: String::new(), clocks: ClockKind::Shared }
     }
 }
 
@@ -142,17 +182,15 @@ impl Solver {
             })),
             Self::GaussNewton => Some(DeformOptions {
                 pose: (pose == Origin::Estimated).then(PoseFreedom::default),
-                ..DeformOptions::coarse(match pose {
-                    Origin::Given => default,
-                    Origin::Estimated => DeformSettings { anchor: FREE_POSE_ANCHOR, ..default },
-                })
+                ..DeformOptions::coarse(DeformSettings { anchor: ANCHOR, ..default })
             }),
         }
     }
 }
 
-/// Price of the nodes' distance from the body where the pose is free.
-const FREE_POSE_ANCHOR: f64 = 100.0;
+/// Price of the nodes' distance from where clothes of their part's thickness would be: holds what no view tells, the depth
+/// before a single camera or a shift of all nodes that a corrected pose explains as well.
+const ANCHOR: f64 = 100.0;
 
 /// λ_reg of the paper's Eq. 3.
 const PAPER_REGULARIZATION: f64 = 200.0;
@@ -162,6 +200,10 @@ impl TrackingSection {
         let mut options = self.solver.options(pose)?;
         if self.solver == Solver::GaussNewton {
             options.gaussians = self.gaussians;
+            options.views = self.views;
+            if !self.level_of_detail {
+                options = options.without_level_of_detail();
+            }
             options.solver.rest = self.rest;
         }
         Some(options)
@@ -177,13 +219,22 @@ const PAPER_RATE: f64 = 3e-6;
 pub struct TrackingSection {
     pub solver: Solver,
     pub gaussians: usize,
+    pub level_of_detail: bool,
+    pub views: usize,
     pub rest: f64,
     pub per_view_time: bool,
 }
 
 impl Default for TrackingSection {
     fn default() -> Self {
-        Self { solver: Solver::None, gaussians: 30_000, rest: 0.01, per_view_time: true }
+        Self {
+            solver: Solver::None,
+            gaussians: 30_000,
+            level_of_detail: true,
+            views: 0,
+            rest: 0.01,
+            per_view_time: true,
+        }
     }
 }
 
@@ -291,6 +342,12 @@ pub struct GpuSection {
     pub adapter: String,
 }
 
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct HealthSection {
+    pub listen: String,
+}
+
 impl Config {
     /// Reads and checks a file.
     pub fn load(path: &Path) -> Result<Self> {
@@ -327,6 +384,7 @@ impl Config {
             self.rig.name
         );
         range("source.fps", self.source.fps, 0.1, 1000.0)?;
+        self.source.check()?;
         self.sim.validate().context("in [sim]")?;
         range("sync.window_ms", self.sync.window_ms, 0.001, 10_000.0)?;
         range("sync.max_wait_ms", self.sync.max_wait_ms, 0.0, 60_000.0)?;
@@ -339,6 +397,7 @@ impl Config {
             self.body.gaussians
         );
         range("tracking.gaussians", self.tracking.gaussians as f64, 100.0, 2_000_000.0)?;
+        range("tracking.views", self.tracking.views as f64, 0.0, 1000.0)?;
         range("tracking.rest", self.tracking.rest, 0.0, 0.5)?;
         ensure!(
             !self.appearance.mode.is_learned() || !self.appearance.weights.as_os_str().is_empty(),
@@ -351,7 +410,7 @@ impl Config {
         range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)?;
         ensure!(
             self.source.kind == SourceKind::Sim || !self.source.path.as_os_str().is_empty(),
-            "source.path is empty: name the folder of the data set"
+            "source.path is empty: name the folder of the data set, the folder of the calibration for real cameras, or the recording"
         );
         ensure!(
             self.source.kind == SourceKind::Sim

@@ -2,6 +2,7 @@
 //! tells the solver how the pictures differ (FlyHuman Eq. 3).
 
 mod area;
+mod choose;
 mod motion;
 mod options;
 mod pictures;
@@ -15,9 +16,10 @@ use flyrig_gpu::{GpuContext, StorageBuffer};
 use flyrig_renderer::{BackwardRasterizer, ColorMeans, GaussianBuffers, GaussianGradients, PictureLoss};
 use flyrig_tracker::{DeformReport, DeformTracker, PoseCorrection};
 use flyrig_types::{Camera, Pose};
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 
 use self::area::Landmarks;
+use self::choose::Chooser;
 use self::motion::MeshMotion;
 pub use self::options::DeformOptions;
 use self::pictures::{Kernels, Pictures, ViewBuffers};
@@ -26,6 +28,8 @@ use self::pictures::{Kernels, Pictures, ViewBuffers};
 #[derive(Debug)]
 pub struct Deformation {
     max_level: u32,
+    most_views: usize,
+    chooser: Chooser,
     tracker: DeformTracker,
     backward: Option<BackwardRasterizer>,
     loss: PictureLoss,
@@ -43,8 +47,11 @@ pub struct Deformation {
     views: Vec<ViewBuffers>,
     landmarks: Landmarks,
     report: Option<DeformReport>,
-    /// Of the views of the last frame: how much of the person is where the picture shows it, and whether it counted.
-    judged: Vec<(f64, bool)>,
+    /// Of the views of the last frame that were compared: how much of the person is where the picture shows it, and whether
+    /// it counted.
+    judged: Vec<Option<(f64, bool)>>,
+    /// Views of the last frame whose pictures were halved.
+    halved: usize,
     /// Whether the Gaussians have colours yet.
     painted: bool,
 }
@@ -85,23 +92,32 @@ pub struct DeformTimes {
 }
 
 impl Deformation {
-    /// At rest, for these Gaussians.
+    /// At rest, for these Gaussians, before cameras whose finest pixel covers `pixel_m` of the person.
     pub fn new(
         gpu: &GpuContext,
         template: &Template,
         surface: &SurfaceGaussians,
         graph: &DeformationGraph,
         options: DeformOptions,
+        pixel_m: f64,
     ) -> Result<Self> {
-        let coarse = coarsen(template, surface, graph, options.gaussians)?;
+        let coarse = coarsen(template, surface, graph, options.compared(template.area_m2(), pixel_m))?;
         let count = coarse.gaussians.len();
         let landmarks = Landmarks::new(surface, graph);
         let mut tracker = DeformTracker::new(&coarse.graph, &coarse.gaussians.skin, options.solver)?;
+        let of_node = |&g: &u32| {
+            let normal = surface.normals.get(g as usize)?.as_dvec3();
+            Some((normal, *surface.parts.get(g as usize)? as usize))
+        };
+        let (normals, parts) = graph.node_gaussian.iter().filter_map(of_node).unzip();
+        tracker = tracker.with_thickness(normals, parts)?;
         if let Some(freedom) = options.pose {
             tracker = tracker.with_pose(&template.skeleton, landmarks.nodes().to_vec(), freedom)?;
         }
         Ok(Self {
             max_level: options.max_level,
+            most_views: options.views,
+            chooser: Chooser::default(),
             tracker,
             backward: None,
             loss: PictureLoss::new(gpu)?,
@@ -110,23 +126,29 @@ impl Deformation {
             skinner: GpuSkinner::new(gpu, &coarse.gaussians.inset(), &template.skeleton)?,
             colors: ColorMeans::new(gpu, &coarse.first_child, &coarse.children)?,
             posed: vec![GaussianBuffers::zeroed(gpu, count)?],
-            spacing_m: mean(&coarse.gaussians.scale_m),
+            spacing_m: coarse.spacing_m,
             mesh: MeshMotion::new(template, surface, graph),
             gradients: Vec::new(),
             views: Vec::new(),
             landmarks,
             report: None,
             judged: Vec::new(),
+            halved: 0,
             painted: false,
         })
     }
 
     /// Solves one instant. Afterwards [`Self::displacement`] holds its result.
-    pub fn track(&mut self, scene: Scene<'_>, views: &[TrackedView<'_>]) -> Result<DeformTimes> {
+    pub fn track(&mut self, scene: Scene<'_>, all_views: &[TrackedView<'_>]) -> Result<DeformTimes> {
         let start = Instant::now();
         let gpu = scene.gpu;
+        let cameras: Vec<&Camera> = all_views.iter().map(|view| view.camera).collect();
+        let center = scene.instants.first().map_or(DVec3::ZERO, |pose| self.landmarks.center(scene.skeleton, pose));
+        let chosen = self.chooser.choose(&cameras, center, self.most_views);
+        let views: &[TrackedView<'_>] = &chosen.iter().map(|&i| all_views[i]).collect::<Vec<_>>();
         let count = self.posed[0].count();
         let plans = self.landmarks.plans(scene.skeleton, scene.instants, views, self.spacing_m, self.max_level);
+        self.halved = plans.iter().filter(|plan| plan.level > 0).count();
         for (i, (view, plan)) in views.iter().zip(&plans).enumerate() {
             let fits = self.views.get(i).is_some_and(|v| v.fits(view.size, plan.level));
             if !fits {
@@ -173,8 +195,16 @@ impl Deformation {
         let prepare = start.elapsed();
         pictures.distrust(self.tracker.displacement(), self.tracker.correction())?;
         let report = self.tracker.track(&mut pictures)?;
-        self.judged = pictures.judged(self.tracker.displacement(), self.tracker.correction());
+        let judged = pictures.judged(self.tracker.displacement(), self.tracker.correction());
         let (draw, derivatives) = pictures.times();
+        self.judged.clear();
+        self.judged.resize(all_views.len(), None);
+        for (&i, judged) in chosen.iter().zip(judged) {
+            self.judged[i] = Some(judged);
+            if !judged.1 {
+                self.chooser.doubt(&all_views[i].camera.id);
+            }
+        }
         self.displacement.write(gpu, self.mesh.follow(self.tracker.translations()));
         self.painted |= !views.is_empty();
         let solve = start.elapsed().saturating_sub(prepare + draw + derivatives);
@@ -195,9 +225,19 @@ impl Deformation {
     }
 
     /// By view of the last frame: how much of the person is where the picture shows it (1: all; 0: as much is wrong as there
-    /// is), and whether the view counted: one that disagrees with all others does not.
-    pub fn judged(&self) -> &[(f64, bool)] {
+    /// is), and whether the view counted: one that disagrees with all others does not. None for one that was not compared.
+    pub fn judged(&self) -> &[Option<(f64, bool)>] {
         &self.judged
+    }
+
+    /// How many Gaussians are compared with the pictures.
+    pub fn compared(&self) -> usize {
+        self.posed[0].count()
+    }
+
+    /// Views of the last frame whose pictures were compared at a half of their size or less.
+    pub fn halved_pictures(&self) -> usize {
+        self.halved
     }
 
     /// What the last solve did.
@@ -220,7 +260,5 @@ impl Deformation {
         self.mesh.of_vertices()
     }
 }
-
-fn mean(values: &[f32]) -> f64 {
-    values.iter().map(|v| f64::from(*v)).sum::<f64>() / values.len().max(1) as f64
-}
+#[cfg(test)]
+mod stability_tests;

@@ -8,7 +8,7 @@ use std::{
 };
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
-use flyrig_calib::SyncConfig;
+use flyrig_calib::{ClockKind, SyncConfig};
 use flyrig_capture::{CameraSource, Pacing};
 use flyrig_gpu::GpuContext;
 use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
@@ -211,7 +211,7 @@ fn pass(
         template,
         args.gaussians,
         flyrig_body::DEFAULT_NODE_COUNT,
-        inputs.cameras.len(),
+        &inputs,
         mode.settings(),
         args.solver.options(Origin::Given),
     )?;
@@ -224,7 +224,7 @@ fn pass(
     if let Some(outlet) = &outlet {
         outlet.publisher().set_calibration(pipeline.rig())?;
     }
-    let mut intake = Intake::start(sources, &SyncConfig::default(), Pacing::Lossless)?;
+    let mut intake = Intake::start(sources, &SyncConfig::default(), ClockKind::Shared, Pacing::Lossless)?;
 
     let limit = args.minutes.map(|minutes| Duration::from_secs_f64(minutes.max(0.0) * 60.0));
     let total = limit.map_or(args.frames as u64, |limit| limit.as_secs());

@@ -14,14 +14,12 @@ use flyrig_renderer::{
 };
 use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, ViewPicture};
 use flyrig_tracker::DeformReport;
-use flyrig_types::{Camera, Image, Mask, Pose};
+use flyrig_types::{Camera, Image, Mask, Pose, Rig};
 
 use crate::deformation::{DeformOptions, DeformTimes, Deformation, Scene, TrackedView};
 use crate::stats::StageTimes;
+use crate::viewpoints::center_of_attention;
 
-/// With fewer views the last deformation stays: a single one cannot tell depth, and what fits it spoils every other side
-/// (2.6 dB on simulated people).
-const MIN_DEFORMATION_VIEWS: usize = 2;
 /// Seed of the surface sampling: the same template gives the same Gaussians on every run.
 const SURFACE_SEED: u64 = 1;
 
@@ -76,11 +74,11 @@ pub struct Engine {
     output: Option<RenderTarget>,
     deformation: Option<Deformation>,
     /// What the deformation thinks of the last update's views.
-    judged: Vec<(f64, bool)>,
+    judged: Vec<Option<(f64, bool)>>,
 }
 
 impl Engine {
-    /// Samples the template's surface and prepares the GPU. Takes a few seconds. Without `deform` the body is only
+    /// Samples the template's surface and prepares the GPU for the input cameras of `rig`. Takes a few seconds. Without `deform` the body is only
     /// skinned.
     #[allow(clippy::too_many_arguments)]
     pub fn new(
@@ -88,7 +86,7 @@ impl Engine {
         template: Template,
         gaussian_count: usize,
         node_count: usize,
-        max_views: usize,
+        rig: &Rig,
         settings: AppearanceSettings,
         deform: Option<DeformOptions>,
     ) -> Result<Self> {
@@ -96,7 +94,7 @@ impl Engine {
             sample_surface(&template, gaussian_count, SURFACE_SEED).context("sampling the template's surface")?;
         let graph = build_graph(&template, &surface, node_count, DEFAULT_SIGMA2_M2)
             .context("building the deformation graph")?;
-        Self::from_parts(gpu, template, &surface, &graph, max_views, settings, deform)
+        Self::from_parts(gpu, template, &surface, &graph, rig, settings, deform)
     }
 
     fn from_parts(
@@ -104,7 +102,7 @@ impl Engine {
         template: Template,
         surface: &SurfaceGaussians,
         graph: &DeformationGraph,
-        max_views: usize,
+        rig: &Rig,
         settings: AppearanceSettings,
         deform: Option<DeformOptions>,
     ) -> Result<Self> {
@@ -123,10 +121,10 @@ impl Engine {
                 None => GpuSkinner::new(&gpu, surface, &template.skeleton)?,
             },
             deformation: deform
-                .map(|options| Deformation::new(&gpu, &template, surface, graph, options))
+                .map(|options| Deformation::new(&gpu, &template, surface, graph, options, finest_pixel_m(rig)))
                 .transpose()?,
             rasterizer,
-            appearance: DirectAppearance::new(&gpu, surface, graph, max_views)?,
+            appearance: DirectAppearance::new(&gpu, surface, graph, rig.cameras.len())?,
             body: BodyGraph::new(surface, graph)?,
             learned: None,
             painted: Vec::new(),
@@ -202,7 +200,7 @@ impl Engine {
             poses.iter().copied().zip(std::iter::once(&self.gaussians).chain(&self.posed)).collect();
 
         self.judged.clear();
-        if let Some(deformation) = self.deformation.as_mut().filter(|_| views.len() >= MIN_DEFORMATION_VIEWS) {
+        if let Some(deformation) = self.deformation.as_mut().filter(|_| !views.is_empty()) {
             let start = Instant::now();
             let tracked: Vec<TrackedView<'_>> = views
                 .iter()
@@ -226,9 +224,13 @@ impl Engine {
             stages.add("  draw and compare", draw);
             stages.add("  derivatives", derivatives);
             stages.add("  solve", solve);
-            if deformation.report().is_some_and(|report| report.at_rest) {
-                stages.add("  at rest, no iteration", start.elapsed());
-            }
+            let at_rest = deformation.report().is_some_and(|report| report.at_rest);
+            stages.count("frames at rest, not solved", u64::from(at_rest));
+            let left_out = deformation.judged().iter().filter(|judged| judged.is_none()).count();
+            stages.count("views not compared", left_out as u64);
+            let distrusted = deformation.judged().iter().flatten().filter(|(_, trusted)| !trusted).count();
+            stages.count("views not believed", distrusted as u64);
+            stages.count("pictures halved", deformation.halved_pictures() as u64);
         }
 
         let start = Instant::now();
@@ -279,7 +281,7 @@ impl Engine {
 
         let start = Instant::now();
         // A view that is not believed paints nothing.
-        let believed = |i: usize| self.judged.get(i).is_none_or(|(_, trusted)| *trusted);
+        let believed = |i: usize| self.judged.get(i).copied().flatten().is_none_or(|(_, trusted)| trusted);
         self.painted = (0..views.len()).filter(|&i| believed(i)).collect();
         let inputs: Vec<ViewInput<'_>> = self
             .painted
@@ -352,9 +354,14 @@ impl Engine {
     }
 
     /// By view of the last update: how much of the person is where the picture shows it, 0 to 1. Empty when the body was not
-    /// compared with the pictures.
-    pub fn agreement(&self) -> Vec<f64> {
-        self.judged.iter().map(|(quality, _)| *quality).collect()
+    /// compared with the pictures, None for a view that was not.
+    pub fn agreement(&self) -> Vec<Option<f64>> {
+        self.judged.iter().map(|judged| judged.map(|(quality, _)| quality)).collect()
+    }
+
+    /// How many Gaussians are compared with the pictures; 0 where the body is only skinned.
+    pub fn compared_gaussians(&self) -> usize {
+        self.deformation.as_ref().map_or(0, Deformation::compared)
     }
 
     /// What the last solve of the deformation did.
@@ -408,4 +415,11 @@ impl Engine {
         }
         Ok(())
     }
+}
+
+/// What a pixel of the finest camera covers at the place that all look at, metres.
+fn finest_pixel_m(rig: &Rig) -> f64 {
+    let center = center_of_attention(rig);
+    let pixel = |camera: &Camera| camera.position().distance(center) / (0.5 * camera.intrinsics.focal_px.element_sum());
+    rig.cameras.iter().map(pixel).fold(f64::INFINITY, f64::min)
 }

@@ -227,7 +227,7 @@ impl Replay {
             template,
             args.gaussians,
             args.nodes,
-            rig.cameras.len(),
+            &rig,
             args.appearance.settings(),
             solver.options(args.pose),
         )?;

@@ -6,9 +6,11 @@ use std::{
 };
 
 use anyhow::Result;
-use flyrig_calib::{SyncConfig, Synchronizer};
+use flyrig_calib::{ClockAligner, ClockKind, ClockState, DropCounts, SyncConfig, Synchronizer};
 use flyrig_capture::{CameraSource, CaptureThreads, Pacing, PopError, ThreadsConfig};
-use flyrig_types::{CameraId, FrameSet};
+use flyrig_types::{CameraId, Frame, FrameSet};
+
+use crate::health::{CameraHealth, Health};
 
 /// Frames a camera that may wait for the pipeline: enough to bridge a slow frame, few enough to stay live.
 const WAITING_FRAMES_A_CAMERA: usize = 4;
@@ -16,27 +18,68 @@ const WAITING_FRAMES_A_CAMERA: usize = 4;
 /// Camera threads, their queue and the synchronizer.
 pub struct Intake {
     threads: CaptureThreads,
+    /// Only for cameras with clocks of their own.
+    aligner: Option<ClockAligner>,
     sync: Synchronizer,
     ready: VecDeque<FrameSet>,
     cameras: Vec<CameraId>,
     every_set: bool,
     skipped_sets: u64,
     ended: bool,
+    /// By slot.
+    timing: Vec<Timing>,
+    /// Whether capture times are of this computer's clock.
+    is_live: bool,
+}
+
+/// Means over about the last hundred frames of a camera.
+#[derive(Debug, Clone, Copy, Default)]
+struct Timing {
+    last_nanos: Option<i64>,
+    frames: f64,
+    interval_ms: f64,
+    /// Mean square of the distance from the mean interval.
+    variance: f64,
+    lateness_ms: f64,
+}
+
+impl Timing {
+    const MEMORY: f64 = 100.0;
+
+    fn add(&mut self, capture_nanos: i64, now_nanos: i64) {
+        if let Some(last) = self.last_nanos.replace(capture_nanos) {
+            self.frames = (self.frames + 1.0).min(Self::MEMORY);
+            let interval = capture_nanos.saturating_sub(last) as f64 * 1e-6;
+            let off = interval - self.interval_ms;
+            self.interval_ms += off / self.frames;
+            self.variance += (off * off * (1.0 - 1.0 / self.frames) - self.variance) / self.frames;
+            self.lateness_ms +=
+                (now_nanos.saturating_sub(capture_nanos) as f64 * 1e-6 - self.lateness_ms) / self.frames;
+        }
+    }
 }
 
 impl Intake {
     /// Starts a thread a camera. With [`Pacing::Lossless`] every set comes, in order; else the newest one wins.
-    pub fn start(sources: Vec<Box<dyn CameraSource>>, sync: &SyncConfig, pacing: Pacing) -> Result<Self> {
+    pub fn start(
+        sources: Vec<Box<dyn CameraSource>>,
+        sync: &SyncConfig,
+        clocks: ClockKind,
+        pacing: Pacing,
+    ) -> Result<Self> {
         let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
         let queue_capacity = WAITING_FRAMES_A_CAMERA * cameras.len().max(1);
         Ok(Self {
             threads: CaptureThreads::start(sources, ThreadsConfig { queue_capacity, pacing })?,
+            aligner: (clocks == ClockKind::Triggered).then(|| ClockAligner::new(&cameras, sync.master.as_ref())),
             sync: Synchronizer::new(&cameras, sync),
             ready: VecDeque::new(),
             cameras,
             every_set: pacing == Pacing::Lossless,
             skipped_sets: 0,
             ended: false,
+            timing: Vec::new(),
+            is_live: false,
         })
     }
 
@@ -45,11 +88,17 @@ impl Intake {
         let deadline = Instant::now() + timeout;
         loop {
             // A live rig takes all that waits first, so that the newest set is known.
-            let enough = |ready: &VecDeque<FrameSet>| self.every_set && !ready.is_empty();
+            let every_set = self.every_set;
+            let enough = |ready: &VecDeque<FrameSet>| every_set && !ready.is_empty();
             let mut wait = Duration::ZERO;
             while !enough(&self.ready) && !self.ended {
                 match self.threads.queue().pop(wait) {
                     Ok(frame) => {
+                        self.time(&frame);
+                        let frame = match &mut self.aligner {
+                            Some(aligner) => aligner.align(frame),
+                            None => frame,
+                        };
                         self.ready.extend(self.sync.push(frame));
                         wait = Duration::ZERO;
                     }
@@ -75,6 +124,44 @@ impl Intake {
         }
     }
 
+    /// Says that capture times are of this computer's clock, so that lateness can be told.
+    pub fn live(self) -> Self {
+        Self { is_live: true, ..self }
+    }
+
+    fn time(&mut self, frame: &Frame) {
+        self.timing.resize(self.cameras.len(), Timing::default());
+        if let Some(slot) = self.cameras.iter().position(|camera| *camera == frame.camera) {
+            self.timing[slot].add(frame.capture_nanos, now_nanos());
+        }
+    }
+
+    /// How the cameras are; stages and memory are the pipeline's to tell.
+    pub fn health(&self) -> Health {
+        let counts = self.sync.counts();
+        let clocks: Vec<ClockState> =
+            self.aligner.iter().flat_map(|aligner| aligner.clocks().map(|(_, clock)| clock)).collect();
+        let cameras = self.threads.stats().into_iter().enumerate().map(|(slot, stats)| {
+            let timing = self.timing.get(slot).copied().unwrap_or_default();
+            CameraHealth {
+                stats,
+                in_no_set: counts.dropped_frames.get(slot).map_or(0, DropCounts::total),
+                interval_ms: timing.interval_ms,
+                jitter_ms: timing.variance.max(0.0).sqrt(),
+                lateness_ms: self.is_live.then_some(timing.lateness_ms),
+                clock: clocks.get(slot).copied(),
+            }
+        });
+        Health {
+            cameras: cameras.collect(),
+            complete_sets: counts.complete,
+            partial_sets: counts.partial,
+            skipped_sets: self.skipped_sets,
+            stages: Vec::new(),
+            resident_mib: None,
+        }
+    }
+
     /// Whether every camera has ended and every set was taken.
     pub fn ended(&self) -> bool {
         self.ended && self.ready.is_empty()
@@ -92,7 +179,41 @@ impl Intake {
         for camera in self.threads.stats() {
             drops.push((format!("frames of {} waiting too long", camera.camera), camera.dropped));
             drops.push((format!("errors of {}", camera.camera), camera.errors.values().sum()));
+            drops.push((format!("frames of {} lost before us", camera.camera), camera.health.lost_by_driver));
         }
         drops
+    }
+}
+
+/// The clock of live frames.
+#[cfg(target_os = "linux")]
+fn now_nanos() -> i64 {
+    flyrig_capture::monotonic_nanos()
+}
+
+/// No live frames there.
+#[cfg(not(target_os = "linux"))]
+fn now_nanos() -> i64 {
+    0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn intervals_jitter_and_lateness_are_means() {
+        let mut timing = Timing::default();
+        for n in 0..1000i64 {
+            let capture = n * 33_000_000 + if n % 2 == 0 { 1_000_000 } else { 0 };
+            timing.add(capture, capture + 7_000_000);
+        }
+        assert!((timing.interval_ms - 33.0).abs() < 0.1, "{timing:?}");
+        // Intervals are 32 and 34 in turn.
+        assert!((timing.variance.sqrt() - 1.0).abs() < 0.1, "{timing:?}");
+        assert!((timing.lateness_ms - 7.0).abs() < 1e-6, "{timing:?}");
+        timing.add(i64::MIN, i64::MAX);
+        timing.add(i64::MAX, i64::MIN);
+        assert!(timing.variance.is_finite());
     }
 }

@@ -3,24 +3,31 @@
 //! A library only so that the end-to-end tests can build the same program; its documentation is `--help`.
 
 mod bench;
+mod cameras;
 mod cli;
 mod config;
 mod dataset;
 mod deformation;
 mod demo;
+mod doctor;
 mod engine;
 mod eval;
+mod health;
 mod intake;
+mod live;
+mod notify;
 mod outlet;
 mod pipeline;
 mod png;
 mod pose_curve;
+mod record;
 mod report;
 mod run;
 mod score;
 mod sim_export;
 mod stats;
 mod stop;
+mod sync_check;
 mod track_state;
 mod train;
 mod viewpoints;
@@ -35,7 +42,7 @@ use tracing_subscriber::EnvFilter;
 
 use crate::{
     cli::{BenchCommand, Cli, Command, ConfigAction, SimAction},
-    config::{Config, DEFAULT_TOML},
+    config::{Config, DEFAULT_TOML, SourceKind},
 };
 
 /// An error and its causes, leaving out causes that the text before tells already.
@@ -68,11 +75,20 @@ pub fn main() -> ExitCode {
 fn dispatch(cli: &Cli) -> Result<()> {
     match &cli.command {
         Command::Demo(args) => demo::demo(args, &gpu(cli.adapter.as_deref())?),
-        Command::Run { config } => {
+        Command::Run { config, record, table } => {
             let config = Config::load(config)?;
             let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
-            run::run(&config, &gpu(adapter)?)
+            run::run(&config, &gpu(adapter)?, record.as_deref(), *table)
         }
+        Command::Record(args) => {
+            let config = Config::load(&args.config)?;
+            let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
+            let gpu = (config.source.kind == SourceKind::Sim).then(|| gpu(adapter)).transpose()?;
+            record::record(&config, args, gpu.as_ref())
+        }
+        Command::Replay(args) => record::replay(args),
+        Command::SyncCheck(args) => sync_check::sync_check(args, &|| gpu(cli.adapter.as_deref())),
+        Command::Doctor { config } => doctor::doctor(config.as_deref()),
         Command::Watch(args) => watch::watch(args),
         Command::Eval(args) => eval::eval(args, &gpu(cli.adapter.as_deref())?),
         Command::Sim { action: SimAction::Export(args) } => {

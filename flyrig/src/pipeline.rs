@@ -137,7 +137,7 @@ impl Pipeline {
         self.engine.update(&pose, &views, &mut self.stages)?;
         if !views.is_empty() {
             let ids = views.iter().map(|view| view.camera.id.clone());
-            self.watch.judge(ids.zip(self.engine.agreement()));
+            self.watch.judge(ids.zip(self.engine.agreement()).filter_map(|(id, quality)| Some((id, quality?))));
         }
         self.counts.poisoned += u64::from(self.engine.deform_report().is_some_and(|report| report.poisoned));
         self.last_pose = Some(pose);

@@ -1,11 +1,14 @@
 //! `flyrig run`: a rig that stays up.
 
-use std::time::{Duration, Instant};
+use std::{
+    path::Path,
+    time::{Duration, Instant},
+};
 
-use anyhow::{Result, bail, ensure};
+use anyhow::{Context as _, Result, bail, ensure};
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
 use flyrig_calib::SyncConfig;
-use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, VideoOptions, VideoReplay};
+use flyrig_capture::{CameraSource, Decoding, FolderOptions, FolderReplay, Pacing, VideoOptions, VideoReplay};
 use flyrig_gpu::GpuContext;
 use flyrig_sim::{SimTime, Simulator};
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
@@ -16,9 +19,13 @@ use crate::{
     config::{Config, Origin, SourceKind},
     dataset,
     engine::Engine,
+    health::{Health, MetricsServer},
     intake::Intake,
+    live,
+    notify::ServiceManager,
     outlet::Outlet,
     pipeline::{Outcome, Pipeline, PoseSource},
+    record,
     stats::resident_mib,
     stop, viewpoints,
 };
@@ -30,28 +37,49 @@ const SHAPE_SETS: usize = 8;
 /// How often a line with rates is printed.
 const PRINT_EVERY: Duration = Duration::from_secs(5);
 
+/// How often the health is told.
+const HEALTH_EVERY: Duration = Duration::from_secs(1);
+
 /// Cameras and what is known about the person.
-struct Scene {
-    sources: Vec<Box<dyn CameraSource>>,
-    rig: Rig,
+pub struct Scene {
+    /// In the rig's order, pictures in the cameras' own formats.
+    pub sources: Vec<Box<dyn CameraSource>>,
+    pub rig: Rig,
     template: Template,
     track: Option<flyrig_types::PoseTrack>,
     /// Empty pictures by slot, where there are any.
     plates: Vec<Option<Image>>,
 }
 
-/// Runs the command.
-pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
+/// Runs the command; `recording` names a file that the cameras are recorded to, `show_table` draws the cameras' health.
+pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_table: bool) -> Result<()> {
     let stop = stop::flag();
-    let scene = open(config, gpu)?;
+    let mut scene = open(config, Some(gpu))?;
+    let recorder = recording.map(|path| record::recorder(path, &scene.rig)).transpose()?;
+    if let Some(recorder) = &recorder {
+        scene.sources = record::tap(recorder, scene.sources);
+    }
+    if matches!(config.source.kind, SourceKind::V4l2 | SourceKind::Mcap) {
+        let decoding = |source| Box::new(Decoding::new(source)) as Box<dyn CameraSource>;
+        scene.sources = scene.sources.into_iter().map(decoding).collect();
+    }
     dataset::require_masks(config.body.pose, config.body.masks, &scene.plates)?;
     let pacing = match (config.source.real_time, config.source.kind) {
+        // Nobody can make a real camera wait.
+        (_, SourceKind::V4l2) => Pacing::AsDelivered,
         (false, _) => Pacing::Lossless,
         // Simulated cameras keep the time themselves, whatever their stamps say.
         (true, SourceKind::Sim) => Pacing::AsDelivered,
         (true, _) => Pacing::RealTime,
     };
-    let mut intake = Intake::start(scene.sources, &sync_config(config), pacing)?;
+    let mut intake = Intake::start(scene.sources, &sync_config(config), config.sync.clocks, pacing)?;
+    if config.source.kind == SourceKind::V4l2 {
+        intake = intake.live();
+    }
+    let metrics = match config.health.listen.as_str() {
+        "" => None,
+        address => Some(MetricsServer::start(address)?),
+    };
 
     let mut template = scene.template;
     let pose = match (config.body.pose, scene.track) {
@@ -71,7 +99,7 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         template,
         config.body.gaussians,
         config.body.nodes,
-        scene.rig.cameras.len(),
+        &scene.rig,
         config.appearance.mode.settings(),
         config.tracking.options(config.body.pose),
     )?;
@@ -97,9 +125,28 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
         outlet.publisher().endpoints().join(", ")
     );
 
+    if let Some(metrics) = &metrics {
+        eprintln!("run: metrics at http://{}/metrics", metrics.address());
+    }
+    let manager = ServiceManager::from_env();
+    manager.tell("READY=1");
+    let mut last_health: Option<Instant> = None;
     let (started, mut last_print, mut frames, mut printed) = (Instant::now(), Instant::now(), 0u64, 0u64);
     while !stop.load(std::sync::atomic::Ordering::Relaxed) && !intake.ended() {
-        let Some(set) = intake.next_set(Duration::from_millis(200)) else { continue };
+        let set = intake.next_set(Duration::from_millis(200));
+        if last_health.is_none_or(|at| at.elapsed() >= HEALTH_EVERY) {
+            last_health = Some(Instant::now());
+            manager.tell("WATCHDOG=1");
+            let health = Health { stages: pipeline.stages.summary(), resident_mib: resident_mib(), ..intake.health() };
+            if let Some(metrics) = &metrics {
+                metrics.publish(health.prometheus());
+            }
+            if show_table {
+                // Clears the terminal first.
+                eprint!("\x1b[2J\x1b[H{}", health.table());
+            }
+        }
+        let Some(set) = set else { continue };
         if let Outcome::Held(reason) = pipeline.process(&set)? {
             tracing::warn!(set = set.index, %reason, "frame set not used");
         }
@@ -109,7 +156,7 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
             outlet.publish_splats(&pipeline.engine().splats()?, &set);
         }
         outlet.publish_stats(&set, frames, &pipeline.stages.summary(), &intake.drops(), &pipeline.watch);
-        if last_print.elapsed() >= PRINT_EVERY {
+        if !show_table && last_print.elapsed() >= PRINT_EVERY {
             let rate = (frames - printed) as f64 / last_print.elapsed().as_secs_f64();
             let memory = resident_mib().map_or_else(String::new, |mib| format!(", {mib:.0} MiB"));
             eprintln!("run: {frames} sets, {rate:.1} a second, {} lost{memory}", pipeline.counts.lost);
@@ -120,6 +167,14 @@ pub fn run(config: &Config, gpu: &GpuContext) -> Result<()> {
     eprint!("{}", pipeline.stages.table());
     for (place, count) in intake.drops().into_iter().chain(outlet.drops()).filter(|(_, count)| *count > 0) {
         eprintln!("dropped: {count} {place}");
+    }
+    manager.tell("STOPPING=1");
+    drop(intake);
+    if let (Some(recorder), Some(path)) = (recorder, recording) {
+        match record::told(&recorder.finish(), path) {
+            Ok(text) => eprintln!("run: recorded {text}"),
+            Err(error) => eprintln!("run: {error}"),
+        }
     }
     outlet.finish()
 }
@@ -195,13 +250,15 @@ fn learn_shape(estimator: &mut PoseEstimator, intake: &mut Intake) -> Result<()>
     }
 }
 
-fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
+/// Opens the cameras of a configuration; only simulated ones need the graphics adapter.
+pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Scene> {
     let source = &config.source;
     if source.kind == SourceKind::Sim {
+        let gpu = gpu.context("the simulated rig needs a graphics adapter")?;
         let simulator = Simulator::new(gpu, &config.sim)?;
         let (rig, template, track) =
             (simulator.reported_rig(), simulator.template().clone(), simulator.track().clone());
-        let picked = dataset::pick(&rig, &source.cameras, "the simulated rig")?;
+        let picked = dataset::pick(&rig, &source.names(), "the simulated rig")?;
         let copy = |slot| -> Result<Image> {
             let plate = simulator.plate(slot)?;
             Ok(Image::new(plate.width(), plate.height(), plate.format(), plate.bytes().to_vec())?)
@@ -217,16 +274,29 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
             .collect();
         return Ok(Scene { sources, rig: picked, template, track: Some(track), plates });
     }
-    let chosen: Vec<CameraId> = source.cameras.iter().map(|name| name.as_str().into()).collect();
-    let rig = dataset::load_rig(&source.path, &chosen)?;
-    let rig = dataset::pick(&rig, &source.cameras, "the calibration")?;
+    let chosen: Vec<CameraId> = source.names().into_iter().map(CameraId::from).collect();
+    let rig = match source.kind {
+        SourceKind::V4l2 => live::load_rig(source)?,
+        SourceKind::Mcap => record::recorded_rig(&source.path)?,
+        SourceKind::Folder | SourceKind::Video | SourceKind::Sim => dataset::load_rig(&source.path, &chosen)?,
+    };
+    let rig = dataset::pick(&rig, &source.names(), "the calibration")?;
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
-    let sources: Vec<Box<dyn CameraSource>> = if source.kind == SourceKind::Folder {
-        let options = FolderOptions { fps: source.fps, with_masks: config.body.masks == Origin::Given, frames: None };
-        boxed(FolderReplay::open(&source.path, Some(&ids), &options)?)
-    } else {
-        let open = |id| VideoReplay::open(id, &dataset::video_file(&source.path, id), &VideoOptions::default());
-        boxed(ids.iter().map(open).collect::<Result<_, _>>()?)
+    let sources: Vec<Box<dyn CameraSource>> = match source.kind {
+        SourceKind::Folder => {
+            let with_masks = config.body.masks == Origin::Given;
+            boxed(FolderReplay::open(
+                &source.path,
+                Some(&ids),
+                &FolderOptions { fps: source.fps, with_masks, frames: None },
+            )?)
+        }
+        SourceKind::V4l2 => live::open(source)?,
+        SourceKind::Mcap => record::replay_sources(&source.path, &rig)?,
+        SourceKind::Video | SourceKind::Sim => {
+            let open = |id| VideoReplay::open(id, &dataset::video_file(&source.path, id), &VideoOptions::default());
+            boxed(ids.iter().map(open).collect::<Result<_, _>>()?)
+        }
     };
     let (template, track) = if config.body.template.as_os_str().is_empty() {
         (default_template(&ShapeParams::default())?, None)
@@ -234,7 +304,10 @@ fn open(config: &Config, gpu: &GpuContext) -> Result<Scene> {
         let human = load_gltf(&config.body.template)?;
         (human.template, human.track)
     };
-    let plates = dataset::plates(&source.path, &rig)?;
+    let plates = match source.kind {
+        SourceKind::Mcap => rig.cameras.iter().map(|_| None).collect(),
+        _ => dataset::plates(&source.path, &rig)?,
+    };
     Ok(Scene { sources, rig, template, track, plates })
 }
 

@@ -11,6 +11,7 @@ use serde::Serialize;
 #[derive(Debug, Default)]
 pub struct StageTimes {
     stages: Vec<Stage>,
+    counts: Vec<(&'static str, u64)>,
 }
 
 #[derive(Debug)]
@@ -61,6 +62,25 @@ impl StageTimes {
         result
     }
 
+    /// Counts what was left out.
+    pub fn count(&mut self, name: &'static str, by: u64) {
+        match self.counts.iter_mut().find(|(known, _)| *known == name) {
+            Some((_, count)) => *count += by,
+            None => self.counts.push((name, by)),
+        }
+    }
+
+    /// What was left out so far.
+    pub fn counts(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
+        self.counts.iter().copied()
+    }
+
+    /// Milliseconds of all kept samples of a stage together.
+    pub fn total_ms(&self, name: &str) -> f64 {
+        let stage = self.stages.iter().find(|stage| stage.name == name);
+        stage.map_or(0.0, |stage| stage.millis.iter().map(|ms| f64::from(*ms)).sum())
+    }
+
     /// Stages in the order they were first seen.
     pub fn summary(&self) -> Vec<StageSummary> {
         self.stages
@@ -86,6 +106,9 @@ impl StageTimes {
         for s in self.summary() {
             let _ =
                 writeln!(text, "{:<28} {:>7} {:>9.2} {:>9.2} {:>9.2}", s.name, s.frames, s.mean_ms, s.p50_ms, s.p95_ms);
+        }
+        for (name, count) in self.counts() {
+            let _ = writeln!(text, "{name:<28} {count:>7}");
         }
         text
     }
@@ -114,7 +137,11 @@ mod tests {
         assert_eq!(summary[0].frames, StageTimes::WINDOW);
         assert!((summary[0].mean_ms - 10.0).abs() < 0.01, "the oldest fall out: {}", summary[0].mean_ms);
         assert_eq!((summary[1].name.as_str(), summary[1].frames), ("b", 1));
-        assert_eq!(times.table().lines().count(), 3);
+        assert!((times.total_ms("a") - 36_000.0).abs() < 0.5, "{}", times.total_ms("a"));
+        times.count("views left out", 2);
+        times.count("views left out", 3);
+        assert_eq!(times.counts().collect::<Vec<_>>(), [("views left out", 5)]);
+        assert_eq!(times.table().lines().count(), 4);
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use flyrig_tracker::FIRST_FRAMES;
 use flyrig_types::{CameraId, Pose};
 use serde::Serialize;
 
@@ -12,8 +13,6 @@ const BAD_FRAMES: u32 = 5;
 const GOOD_QUALITY: f64 = 0.6;
 /// Away for longer, the person may be another one when somebody returns.
 const LOST_AFTER_NANOS: u64 = 1_000_000_000;
-/// Frames that get the iterations of a start.
-const FIRST_FRAMES: u32 = 10;
 /// Nobody moves faster, metres a second, or farther in one step before it is called a leap, metres.
 const FASTEST_M_A_SEC: f64 = 12.0;
 const LEAST_LEAP_M: f64 = 0.3;
@@ -134,7 +133,7 @@ impl TrackWatch {
         self.since = self.since.saturating_add(1);
         let good = self.quality.is_none_or(|q| q >= GOOD_QUALITY);
         self.bad = if self.quality.is_some_and(|q| q < BAD_QUALITY) { self.bad.saturating_add(1) } else { 0 };
-        if self.since >= FIRST_FRAMES && good && self.state != TrackState::Lost {
+        if u64::from(self.since) >= FIRST_FRAMES && good && self.state != TrackState::Lost {
             self.state = TrackState::Steady;
         } else if self.state == TrackState::Steady && self.bad > 0 {
             self.state = TrackState::Recovering;

@@ -90,15 +90,10 @@ impl GpuContext {
     }
 
     async fn open(choice: &AdapterChoice) -> Result<Self, GpuError> {
-        let instance = Instance::new(InstanceDescriptor {
-            backends: Backends::VULKAN | Backends::METAL | Backends::DX12,
-            ..InstanceDescriptor::new_without_display_handle()
-        });
-        let mut adapters = instance.enumerate_adapters(Backends::all()).await;
+        let mut adapters = adapters().await;
         if adapters.is_empty() {
             return Err(GpuError::NoAdapter);
         }
-        adapters.sort_by_key(|adapter| rank(adapter.get_info().device_type));
         let adapter = match choice {
             AdapterChoice::Best => adapters.swap_remove(0),
             AdapterChoice::Named(wanted) => {
@@ -158,6 +153,28 @@ impl GpuContext {
         self.device.poll(wgpu::PollType::wait_indefinitely()).map_err(|error| GpuError::Lost(error.to_string()))?;
         Ok(())
     }
+}
+
+/// Every adapter, the fastest kind first.
+async fn adapters() -> Vec<Adapter> {
+    let instance = Instance::new(InstanceDescriptor {
+        backends: Backends::VULKAN | Backends::METAL | Backends::DX12,
+        ..InstanceDescriptor::new_without_display_handle()
+    });
+    let mut adapters = instance.enumerate_adapters(Backends::all()).await;
+    adapters.sort_by_key(|adapter| rank(adapter.get_info().device_type));
+    adapters
+}
+
+/// Name, backend, driver and kind of every adapter, in the order of [`AdapterChoice::Best`].
+#[must_use]
+pub fn adapter_names() -> Vec<String> {
+    let name = |adapter: Adapter| {
+        let info = adapter.get_info();
+        let kind = if info.device_type == DeviceType::Cpu { ", software" } else { "" };
+        format!("{} ({}, {}{kind})", info.name, info.backend, info.driver_info)
+    };
+    pollster::block_on(adapters()).into_iter().map(name).collect()
 }
 
 fn rank(kind: DeviceType) -> u8 {

@@ -9,6 +9,6 @@ mod timer;
 
 pub use buffer::{StorageBuffer, read_back};
 pub use camera::{CAMERA_WGSL, CameraConstants};
-pub use context::{AdapterChoice, GpuContext, GpuError};
+pub use context::{AdapterChoice, GpuContext, GpuError, adapter_names};
 pub use shader::{ComputeKernel, MAX_WORKGROUPS_PER_DIMENSION, bind, dispatch_1d};
 pub use timer::{GpuTimer, StageTime};

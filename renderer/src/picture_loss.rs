@@ -15,31 +15,16 @@ const ROWS: u32 = 4;
 const SUMS: u32 = 64;
 
 /// Weights of a picture's loss
-/// `color_weight * ρ(|Δ colour|²) + mask_weight * (Δ alpha)² + outline_weight * d * Δ alpha`, summed over the pixels of
-/// an area: the first two terms are FlyHuman's Eq. 3 over premultiplied linear colour and coverage.
+/// `color_weight * |Δ colour|² + mask_weight * (Δ alpha)²`, summed over the pixels of an area: FlyHuman's Eq. 3 over
+/// premultiplied linear colour and coverage.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LossSettings {
     /// λ_color.
     pub color_weight: f32,
     /// λ_mask.
     pub mask_weight: f32,
-    /// Of `d`, how far outside (positive) or inside the mask's outline a pixel lies, less one pixel: what is drawn far
-    /// outside is pulled in, and what is missing far inside pulls, the farther the harder. A pixel's unit.
-    pub outline_weight: f32,
-    /// `d` grows no further beyond so many pixels; at most [`LossSettings::MAX_REACH_PX`].
-    pub reach_px: u32,
-    /// Difference of linear colour κ of the robust `ρ(s) = κ² s / (κ² + s)` (Geman and McClure 1987); infinite:
-    /// plain squares.
-    pub robust_color: f32,
     /// What counts, `[left, top, right, bottom]` in pixels, right and bottom excluded.
     pub area: [u32; 4],
-}
-
-impl LossSettings {
-    /// Longest reach of the outline term.
-    pub const MAX_REACH_PX: u32 = 64;
-    /// As good as no robust weights: squares of it stay finite.
-    const NO_LIMIT: f32 = 1e6;
 }
 
 /// Sums of one picture over its area.
@@ -63,13 +48,11 @@ struct Loss {
     first: [u32; 2],
     area: [u32; 2],
     sums_at: u32,
-    reach: u32,
     color_weight: f32,
     mask_weight: f32,
-    outline_weight: f32,
-    robust2: f32,
     source_width: u32,
     shrink: u32,
+    unused: u32,
 }
 
 /// A picture that should be drawn, on the GPU.
@@ -82,8 +65,6 @@ pub struct WantedPicture {
     height: u32,
     bytes: StorageBuffer<u32>,
     color: StorageBuffer<[f32; 4]>,
-    row_distance: StorageBuffer<f32>,
-    distance: StorageBuffer<f32>,
     partials: StorageBuffer<[f32; 4]>,
 }
 
@@ -108,8 +89,6 @@ impl WantedPicture {
             height,
             bytes: StorageBuffer::zeroed(gpu, "wanted bytes", source[0] as usize * source[1] as usize)?,
             color: StorageBuffer::zeroed(gpu, "wanted colour", pixels)?,
-            row_distance: StorageBuffer::zeroed(gpu, "distance along rows", pixels)?,
-            distance: StorageBuffer::zeroed(gpu, "distance to the outline", pixels)?,
             partials: StorageBuffer::zeroed(gpu, "partial losses", partials)?,
         })
     }
@@ -125,8 +104,6 @@ impl WantedPicture {
 #[derive(Debug)]
 pub struct PictureLoss {
     unpack: ComputeKernel,
-    along: ComputeKernel,
-    across: ComputeKernel,
     compare: ComputeKernel,
     add_up: ComputeKernel,
     linear: StorageBuffer<f32>,
@@ -144,8 +121,6 @@ impl PictureLoss {
         let linear: Vec<f32> = (0..=255u8).map(|byte| linear_from_srgb(f32::from(byte) / 255.0)).collect();
         Ok(Self {
             unpack: kernel("unpack_wanted"),
-            along: kernel("distance_along_row"),
-            across: kernel("distance_across_rows"),
             compare: kernel("compare"),
             add_up: kernel("add_up"),
             linear: StorageBuffer::from_slice(gpu, "linear of sRGB", &linear)?,
@@ -180,14 +155,13 @@ impl PictureLoss {
         let Some((constants, groups)) = constants(gpu, wanted, 0, settings) else { return };
         let mut pass =
             encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("wanted picture"), ..Default::default() });
-        let (bytes, rows) = (wanted.bytes.raw().as_entire_binding(), wanted.row_distance.raw().as_entire_binding());
-        let (linear, color) = (self.linear.raw().as_entire_binding(), wanted.color.raw().as_entire_binding());
-        run(gpu, &mut pass, &self.unpack, &[constants.get(0), bytes, linear, color.clone()], groups);
-        if settings.outline_weight != 0.0 {
-            let distance = wanted.distance.raw().as_entire_binding();
-            run_at(gpu, &mut pass, &self.along, &[(0, constants.get(0)), (3, color), (4, rows.clone())], groups);
-            run_at(gpu, &mut pass, &self.across, &[(0, constants.get(0)), (4, rows), (5, distance)], groups);
-        }
+        let resources = [
+            constants.get(0),
+            wanted.bytes.raw().as_entire_binding(),
+            self.linear.raw().as_entire_binding(),
+            wanted.color.raw().as_entire_binding(),
+        ];
+        run(gpu, &mut pass, &self.unpack, &resources, groups);
     }
 
     /// Records the comparison of a drawn picture as number `index`, and writes its derivatives to `out`, both within
@@ -218,14 +192,13 @@ impl PictureLoss {
         let resources = [
             (0, constants.get(0)),
             (3, wanted.color.raw().as_entire_binding()),
-            (5, wanted.distance.raw().as_entire_binding()),
-            (6, drawn.color.raw().as_entire_binding()),
-            (7, out.color.raw().as_entire_binding()),
-            (8, out.depth_carry.raw().as_entire_binding()),
-            (9, partials.clone()),
+            (4, drawn.color.raw().as_entire_binding()),
+            (5, out.color.raw().as_entire_binding()),
+            (6, out.depth_carry.raw().as_entire_binding()),
+            (7, partials.clone()),
         ];
         run_at(gpu, &mut pass, &self.compare, &resources, groups);
-        let resources = [(0, constants.get(0)), (9, partials), (10, self.sums.raw().as_entire_binding())];
+        let resources = [(0, constants.get(0)), (7, partials), (8, self.sums.raw().as_entire_binding())];
         run_at(gpu, &mut pass, &self.add_up, &resources, (SUMS.div_ceil(64), 1));
     }
 
@@ -257,20 +230,17 @@ fn constants(
         return None;
     }
     let area = [right - left, bottom - top];
-    let robust = settings.robust_color.clamp(1e-6, LossSettings::NO_LIMIT);
     let mut writer = ConstantWriter::default();
     writer.push(&Loss {
         size: wanted.size(),
         first: [left, top],
         area,
         sums_at: index * SUMS,
-        reach: settings.reach_px.min(LossSettings::MAX_REACH_PX),
         color_weight: settings.color_weight,
         mask_weight: settings.mask_weight,
-        outline_weight: settings.outline_weight,
-        robust2: robust * robust,
         source_width: wanted.source[0],
         shrink: wanted.shrink,
+        unused: 0,
     });
     Some((writer.finish(gpu), (area[0].div_ceil(64), area[1].div_ceil(ROWS))))
 }

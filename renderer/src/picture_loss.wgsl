@@ -9,17 +9,12 @@ struct Loss {
     area: vec2<u32>,
     // Where the sums of this picture begin.
     sums_at: u32,
-    // Pixels beyond which the distance to the outline counts no further.
-    reach: u32,
     color_weight: f32,
     mask_weight: f32,
-    // A pixel.
-    outline_weight: f32,
-    // Squared colour difference at which robust weights have fallen to a quarter.
-    robust2: f32,
     // Pixels of the wanted bytes in a row, and how many of them lie along the side of a pixel here.
     source_width: u32,
     shrink: u32,
+    unused: u32,
 }
 
 struct Sums {
@@ -38,14 +33,11 @@ struct Sums {
 @group(0) @binding(2) var<storage, read> linear: array<f32>;
 // Premultiplied linear colour and coverage.
 @group(0) @binding(3) var<storage, read_write> wanted: array<vec4<f32>>;
-// Pixels to the mask's outline along the row, then in the picture; outside positive.
-@group(0) @binding(4) var<storage, read_write> row_distance: array<f32>;
-@group(0) @binding(5) var<storage, read_write> distance: array<f32>;
-@group(0) @binding(6) var<storage, read> drawn: array<vec4<f32>>;
-@group(0) @binding(7) var<storage, read_write> d_color: array<vec4<f32>>;
-@group(0) @binding(8) var<storage, read_write> d_carry: array<vec4<f32>>;
-@group(0) @binding(9) var<storage, read_write> partials: array<Sums>;
-@group(0) @binding(10) var<storage, read_write> sums: array<Sums>;
+@group(0) @binding(4) var<storage, read> drawn: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read_write> d_color: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read_write> d_carry: array<vec4<f32>>;
+@group(0) @binding(7) var<storage, read_write> partials: array<Sums>;
+@group(0) @binding(8) var<storage, read_write> sums: array<Sums>;
 
 // First pixel of an invocation's column; x beyond the picture where there is none.
 fn column(id: vec3<u32>) -> vec2<u32> {
@@ -79,56 +71,6 @@ fn unpack_wanted(@builtin(global_invocation_id) id: vec3<u32>) {
     }
 }
 
-fn inside(x: u32, y: u32) -> bool {
-    return wanted[y * loss.size.x + x].w >= 0.5;
-}
-
-// Distance along the row to the nearest pixel of the other kind; the area's border is no outline.
-@compute @workgroup_size(64)
-fn distance_along_row(@builtin(global_invocation_id) id: vec3<u32>) {
-    let first = column(id);
-    if first.x == 0xffffffffu {
-        return;
-    }
-    for (var y = first.y; y < min(first.y + ROWS, end_row()); y++) {
-        let own = inside(first.x, y);
-        var step = 1u;
-        for (; step <= loss.reach; step++) {
-            let left = first.x >= loss.first.x + step && inside(first.x - step, y) != own;
-            let right = first.x + step < loss.first.x + loss.area.x && inside(first.x + step, y) != own;
-            if left || right {
-                break;
-            }
-        }
-        row_distance[y * loss.size.x + first.x] = select(1.0, -1.0, own) * f32(step);
-    }
-}
-
-// From the distances along the rows above and below. A pixel of the other kind there is at distance 0 along its row.
-@compute @workgroup_size(64)
-fn distance_across_rows(@builtin(global_invocation_id) id: vec3<u32>) {
-    let first = column(id);
-    if first.x == 0xffffffffu {
-        return;
-    }
-    let reach = i32(loss.reach);
-    for (var y = first.y; y < min(first.y + ROWS, end_row()); y++) {
-        let own = row_distance[y * loss.size.x + first.x];
-        var least = own * own;
-        for (var step = -reach; step <= reach; step++) {
-            let row = i32(y) + step;
-            if row >= i32(loss.first.y) && row < i32(end_row()) {
-                let other = row_distance[u32(row) * loss.size.x + first.x];
-                let across = f32(step * step);
-                least = min(least, across + select(0.0, other * other, (other > 0.0) == (own > 0.0)));
-            }
-        }
-        // Within a pixel of the outline the coverage itself says more.
-        let size = clamp(sqrt(least) - 1.0, 0.0, f32(loss.reach));
-        distance[y * loss.size.x + first.x] = select(-size, size, own > 0.0);
-    }
-}
-
 @compute @workgroup_size(64)
 fn compare(@builtin(global_invocation_id) id: vec3<u32>) {
     let first = column(id);
@@ -143,25 +85,17 @@ fn compare(@builtin(global_invocation_id) id: vec3<u32>) {
         let goal = wanted[at];
         let seen = drawn[at];
         let off = seen - goal;
-        let outline = loss.outline_weight * distance[at];
         let squared = dot(off.rgb, off.rgb);
-        // Geman and McClure 1987.
-        let trust = loss.robust2 / (loss.robust2 + squared);
-        let color_weight = loss.color_weight * trust * trust;
-        sum.loss += loss.color_weight * trust * squared + loss.mask_weight * off.w * off.w + outline * off.w;
+        sum.loss += loss.color_weight * squared + loss.mask_weight * off.w * off.w;
         sum.mask += off.w * off.w;
         sum.color += goal.w * squared;
         sum.wanted += goal.w;
-        d_color[at] = vec4(2.0 * color_weight * off.rgb, 2.0 * loss.mask_weight * off.w + outline);
+        d_color[at] = 2.0 * weights * off;
         var bend = vec3(0.0);
         if first.x > loss.first.x && y > loss.first.y && first.x < last.x && y < last.y {
             let dx = 0.5 * (drawn[at + 1u] - drawn[at - 1u]);
             let dy = 0.5 * (drawn[at + loss.size.x] - drawn[at - loss.size.x]);
-            let steep = sqrt(dx.w * dx.w + dy.w * dy.w);
-            var along = 2.0 * vec4(vec3(color_weight), loss.mask_weight);
-            if outline != 0.0 && steep > 1e-3 {
-                along.w += loss.outline_weight / steep;
-            }
+            let along = 2.0 * weights;
             bend = vec3(dot(along * dx, dx), dot(along * dx, dy), dot(along * dy, dy));
         }
         d_carry[at] = vec4(0.0, bend);

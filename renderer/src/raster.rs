@@ -73,7 +73,7 @@ pub struct RasterStats {
 /// - `alpha = min(opacity * exp(-r²/2), 0.99)`; below 1/255 a splat does not touch a pixel; a pixel is
 ///   finished when less than 1e-4 of the light behind it would pass.
 /// - A Gaussian with any number that is not finite, with scale or opacity not above 0, behind
-///   [`RasterSettings::near_m`], or outside the lens's valid radius is not drawn.
+///   [`RasterSettings::near_m`], beyond 1e9 m, or outside the lens's valid radius is not drawn.
 /// - Buffers and pipelines are made once; they grow with the picture and the number of Gaussians.
 #[derive(Debug)]
 pub struct Rasterizer {

@@ -38,32 +38,10 @@ fn wanted(case: &Case) -> (usize, usize, Vec<[f64; 4]>) {
     (width, height, (0..width * height).map(pixel).collect())
 }
 
-/// Signed distance to the nearest pixel of the other kind within the area, less one, by looking at all of them.
-fn distance(case: &Case, width: usize, goal: &[[f64; 4]], x: usize, y: usize) -> f64 {
-    let [left, top, right, bottom] = case.settings.area.map(|v| v as usize);
-    let (right, bottom) = (right.min(width), bottom.min(goal.len() / width));
-    let inside = goal[y * width + x][3] >= 0.5;
-    let reach = case.settings.reach_px as usize;
-    let mut least = f64::INFINITY;
-    for v in top.max(y.saturating_sub(reach))..bottom.min(y + reach + 1) {
-        for u in left.max(x.saturating_sub(reach))..right.min(x + reach + 1) {
-            if (goal[v * width + u][3] >= 0.5) != inside {
-                least = least.min((u as f64 - x as f64).hypot(v as f64 - y as f64));
-            }
-        }
-    }
-    let size = (least - 1.0).clamp(0.0, reach as f64);
-    if inside { -size } else { size }
-}
-
 /// Loss of one pixel at the drawn value `seen`.
-fn pixel_loss(settings: &LossSettings, goal: [f64; 4], distance: f64, seen: [f64; 4]) -> f64 {
-    let robust2 = f64::from(settings.robust_color).min(1e6).powi(2);
+fn pixel_loss(settings: &LossSettings, goal: [f64; 4], seen: [f64; 4]) -> f64 {
     let squared: f64 = (0..3).map(|c| (seen[c] - goal[c]).powi(2)).sum();
-    let off = seen[3] - goal[3];
-    f64::from(settings.color_weight) * robust2 * squared / (robust2 + squared)
-        + f64::from(settings.mask_weight) * off * off
-        + f64::from(settings.outline_weight) * distance * off
+    f64::from(settings.color_weight) * squared + f64::from(settings.mask_weight) * (seen[3] - goal[3]).powi(2)
 }
 
 fn check(gpu: &GpuContext, loss: &mut PictureLoss, case: &Case, name: &str) {
@@ -93,9 +71,8 @@ fn check(gpu: &GpuContext, loss: &mut PictureLoss, case: &Case, name: &str) {
         for x in left..right {
             let at = y * width + x;
             let (seen, goal_here) = (at_drawn(at), goal[at]);
-            let d = distance(case, width, &goal, x, y);
             let squared: f64 = (0..3).map(|c| (seen[c] - goal_here[c]).powi(2)).sum();
-            expected.loss += pixel_loss(&case.settings, goal_here, d, seen);
+            expected.loss += pixel_loss(&case.settings, goal_here, seen);
             expected.mask += (seen[3] - goal_here[3]).powi(2);
             expected.color += goal_here[3] * squared;
             expected.wanted += goal_here[3];
@@ -103,7 +80,7 @@ fn check(gpu: &GpuContext, loss: &mut PictureLoss, case: &Case, name: &str) {
                 let moved = |by: f64| {
                     let mut seen = seen;
                     seen[c] += by;
-                    pixel_loss(&case.settings, goal_here, d, seen)
+                    pixel_loss(&case.settings, goal_here, seen)
                 };
                 let slope = (moved(1e-5) - moved(-1e-5)) / 2e-5;
                 worst[0] = worst[0].max((slope - f64::from(color[at][c])).abs() / (1.0 + slope.abs()));
@@ -111,20 +88,12 @@ fn check(gpu: &GpuContext, loss: &mut PictureLoss, case: &Case, name: &str) {
             let inner = x > left && y > top && x + 1 < right && y + 1 < bottom;
             let mut bend = [0.0; 3];
             if inner {
-                let robust2 = f64::from(case.settings.robust_color).min(1e6).powi(2);
-                let trust = (robust2 / (robust2 + squared)).powi(2);
                 let slopes = |step: usize| -> [f64; 4] {
                     std::array::from_fn(|c| 0.5 * (at_drawn(at + step)[c] - at_drawn(at - step)[c]))
                 };
                 let (dx, dy) = (slopes(1), slopes(width));
-                let steep = dx[3].hypot(dy[3]);
                 for c in 0..4 {
-                    let mut weight = 2.0 * f64::from(case.settings.mask_weight);
-                    if c < 3 {
-                        weight = 2.0 * f64::from(case.settings.color_weight) * trust;
-                    } else if case.settings.outline_weight * d as f32 != 0.0 && steep > 1e-3 {
-                        weight += f64::from(case.settings.outline_weight) / steep;
-                    }
+                    let weight = 2.0 * f64::from([case.settings.color_weight, case.settings.mask_weight][c / 3]);
                     for (bend, product) in bend.iter_mut().zip([dx[c] * dx[c], dx[c] * dy[c], dy[c] * dy[c]]) {
                         *bend += weight * product;
                     }
@@ -170,27 +139,18 @@ fn losses_and_slopes_match_the_reference() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     let mut loss = PictureLoss::new(&gpu).unwrap();
     let mut rng = StdRng::seed_from_u64(4);
-    let plain = LossSettings {
-        color_weight: 2.0,
-        mask_weight: 3.0,
-        outline_weight: 0.0,
-        reach_px: 0,
-        robust_color: f32::INFINITY,
-        area: [0, 0, 96, 80],
-    };
-    let outline = LossSettings { outline_weight: 0.7, reach_px: 9, robust_color: 0.3, ..plain };
-    let all = outline.area;
+    let both = LossSettings { color_weight: 2.0, mask_weight: 3.0, area: [0, 0, 96, 80] };
     for (name, source, level, settings, coverage) in [
-        ("squares", [96, 80], 0, plain, None),
-        ("everything", [96, 80], 0, outline, None),
-        ("halved", [193, 161], 1, outline, None),
-        ("an eighth", [768, 640], 3, outline, None),
-        ("an area", [96, 80], 0, LossSettings { area: [7, 5, 61, 78], ..outline }, None),
-        ("an area that is too large", [96, 80], 0, LossSettings { area: [16, 0, 4000, 4000], ..outline }, None),
-        ("nobody", [96, 80], 0, outline, Some(0)),
-        ("everywhere", [96, 80], 0, outline, Some(255)),
-        ("one pixel", [1, 1], 0, LossSettings { area: all, ..outline }, Some(200)),
-        ("one row", [70, 1], 0, LossSettings { area: all, ..outline }, None),
+        ("everything", [96, 80], 0, both, None),
+        ("masks only", [96, 80], 0, LossSettings { color_weight: 0.0, ..both }, None),
+        ("halved", [193, 161], 1, both, None),
+        ("an eighth", [768, 640], 3, both, None),
+        ("an area", [96, 80], 0, LossSettings { area: [7, 5, 61, 78], ..both }, None),
+        ("an area that is too large", [96, 80], 0, LossSettings { area: [16, 0, 4000, 4000], ..both }, None),
+        ("nobody", [96, 80], 0, both, Some(0)),
+        ("everywhere", [96, 80], 0, both, Some(255)),
+        ("one pixel", [1, 1], 0, both, Some(200)),
+        ("one row", [70, 1], 0, both, None),
     ] {
         check(&gpu, &mut loss, &case(&mut rng, source, level, settings, coverage), name);
     }
@@ -201,14 +161,7 @@ fn an_empty_area_and_a_buffer_that_does_not_fit_cost_nothing() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     let mut loss = PictureLoss::new(&gpu).unwrap();
     let mut rng = StdRng::seed_from_u64(5);
-    let settings = LossSettings {
-        color_weight: 1.0,
-        mask_weight: 1.0,
-        outline_weight: 1.0,
-        reach_px: 4,
-        robust_color: 1.0,
-        area: [9, 9, 9, 20],
-    };
+    let settings = LossSettings { color_weight: 1.0, mask_weight: 1.0, area: [9, 9, 9, 20] };
     let case = case(&mut rng, [32, 32], 0, settings, None);
     assert_eq!(WantedPicture::zeroed(&gpu, [1, 5], 2).unwrap().size(), [1, 5], "not below a pixel");
     let picture = WantedPicture::zeroed(&gpu, case.source, 0).unwrap();
@@ -223,5 +176,44 @@ fn an_empty_area_and_a_buffer_that_does_not_fit_cost_nothing() {
         loss.encode(&gpu, &mut encoder, 0, &target, &picture, &settings, out);
         gpu.queue.submit([encoder.finish()]);
         assert_eq!(loss.read(&gpu, 1).unwrap(), [PictureSums::default()]);
+    }
+}
+
+#[test]
+fn a_number_that_is_not_finite_is_told_and_stays_where_it_is() {
+    let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+    let mut loss = PictureLoss::new(&gpu).unwrap();
+    let mut rng = StdRng::seed_from_u64(6);
+    let settings = LossSettings { color_weight: 2.0, mask_weight: 2.0, area: [4, 3, 30, 28] };
+    let case = case(&mut rng, [32, 32], 0, settings, None);
+    let picture = WantedPicture::zeroed(&gpu, case.source, 0).unwrap();
+    let target = RenderTarget::new(&gpu, 32, 32).unwrap();
+    let out = PictureGradients::zeroed(&gpu, 32, 32).unwrap();
+    loss.reserve(&gpu, 1).unwrap();
+    let run = |drawn: &[[f32; 4]]| {
+        target.color.write(&gpu, drawn);
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        loss.prepare(&gpu, &mut encoder, &picture, &case.rgba, &settings);
+        loss.encode(&gpu, &mut encoder, 0, &target, &picture, &settings, &out);
+        gpu.queue.submit([encoder.finish()]);
+        (loss.read(&gpu, 1).unwrap()[0], out.color.read(&gpu).unwrap(), out.depth_carry.read(&gpu).unwrap())
+    };
+    let sound = run(&case.drawn);
+    assert!(sound.0.loss.is_finite());
+    for bad in [f32::NAN, f32::INFINITY, f32::MAX] {
+        for channel in 0..4 {
+            let mut drawn = case.drawn.clone();
+            drawn[10 * 32 + 12][channel] = bad;
+            let (sums, color, carry) = run(&drawn);
+            assert!(!sums.loss.is_finite(), "{bad} in channel {channel}: {sums:?}");
+            for at in 0..32 * 32usize {
+                let far = (at % 32).abs_diff(12) + (at / 32).abs_diff(10) > 1;
+                assert!(!far || (color[at], carry[at]) == (sound.1[at], sound.2[at]), "{bad} at {at}");
+            }
+        }
+        // Outside of the area nobody looks.
+        let mut drawn = case.drawn.clone();
+        drawn[2 * 32 + 12] = [bad; 4];
+        assert!(run(&drawn) == sound);
     }
 }

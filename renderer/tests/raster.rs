@@ -10,7 +10,7 @@ use flyrig_renderer::{Outputs, RasterSettings, Rasterizer, RenderTarget};
 use flyrig_types::{Camera, Lens};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use support::random_scene::{LENSES, poison, random_camera, random_scene, straight};
+use support::random_scene::{LENSES, poison, random_camera, random_scene, scaled, straight};
 use support::reference::{self, Scene};
 use support::{Difference, render, upload};
 
@@ -103,6 +103,15 @@ fn hard_cases_agree_with_the_reference() {
     check("all opaque", &opaque, &camera);
     opaque.color.iter_mut().for_each(|c| c[3] = 0.0);
     check("all transparent", &opaque, &camera);
+    opaque.color.iter_mut().zip(0..).for_each(|(c, i)| c[3] = [0.985, 0.99, 0.995, 1.0][i % 4]);
+    opaque.center_scale.iter_mut().for_each(|c| c[3] = 0.15);
+    check("opacities about the clamp", &opaque, &camera);
+
+    let mut one_place = scene.clone();
+    one_place.center_scale.iter_mut().for_each(|c| *c = [0.1, -0.05, 0.3, 0.08]);
+    check("coincident", &one_place, &camera);
+    one_place.center_scale.iter_mut().for_each(|c| c[3] = 0.0);
+    check("zero scale", &one_place, &camera);
 
     let mut plane = scene.clone();
     for (i, c) in plane.center_scale.iter_mut().enumerate() {
@@ -116,6 +125,40 @@ fn hard_cases_agree_with_the_reference() {
     check("a Gaussian 1e4 px wide", &wide, &camera);
     wide.center_scale.iter_mut().for_each(|c| c[3] = 300.0);
     check("every Gaussian 1e4 px wide", &wide, &camera);
+}
+
+#[test]
+fn from_millimetres_to_kilometres_the_pictures_agree_with_the_reference() {
+    let mut rasterizer = Rasterizer::new(gpu(), 300).unwrap();
+    for unit in [1e-6, 1e-3, 1.0, 1e3, 1e6] {
+        let mut rng = StdRng::seed_from_u64(6);
+        let mut worst = Difference::default();
+        for lens in LENSES {
+            let camera = random_camera(&mut rng, lens, 64, 48);
+            let (scene, camera, settings) = scaled(&random_scene(&mut rng, 300), &camera, unit);
+            let gaussians = upload(gpu(), &scene).unwrap();
+            let ours = render(gpu(), &mut rasterizer, &gaussians, &camera, &settings, (64, 48)).unwrap();
+            let expected = reference::render(&scene, &camera, &settings, 64, 48);
+            assert!(ours.color.iter().any(|c| c[3] > 0.5), "something is seen");
+            let d = Difference::between(&ours, &expected);
+            worst.color_max = worst.color_max.max(d.color_max);
+            worst.color_mean = worst.color_mean.max(d.color_mean);
+            worst.depth_mean = worst.depth_mean.max(d.depth_mean / unit);
+            worst.canonical_mean = worst.canonical_mean.max(d.canonical_mean);
+        }
+        println!(
+            "unit {unit:.0e} m: colour max {:.1e} mean {:.1e}, depth mean {:.1e} units, canonical mean {:.1e}",
+            worst.color_max, worst.color_mean, worst.depth_mean, worst.canonical_mean
+        );
+        assert!(worst.color_max < MAX_ERROR && worst.color_mean < MEAN_ERROR, "{unit}: {worst:?}");
+        assert!(worst.depth_mean < 4.0 * MEAN_ERROR && worst.canonical_mean < MEAN_ERROR, "{unit}: {worst:?}");
+    }
+    // The edge: what is farther than 1e9 m is not drawn.
+    let camera = straight(Lens::PINHOLE, 64, 48);
+    let (scene, camera, settings) = scaled(&random_scene(&mut StdRng::seed_from_u64(6), 300), &camera, 2e9);
+    let gaussians = upload(gpu(), &scene).unwrap();
+    let ours = render(gpu(), &mut rasterizer, &gaussians, &camera, &settings, (64, 48)).unwrap();
+    assert!(ours.color.as_flattened().iter().all(|v| *v == 0.0));
 }
 
 #[test]

@@ -13,9 +13,9 @@ use flyrig_types::{Camera, Lens};
 use glam::DVec3;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use support::random_scene::{LENSES, poison, random_camera, random_scene, straight};
+use support::random_scene::{LENSES, poison, random_camera, random_scene, scaled, straight};
 use support::reference::{Scene, splat_at, vec3};
-use support::reference_backward::{Incoming, Outgoing, backward, linear_loss, touched};
+use support::reference_backward::{Incoming, Outgoing, backward, lift, linear_loss, touched};
 use support::upload;
 
 fn gpu() -> &'static GpuContext {
@@ -230,6 +230,54 @@ fn hard_cases_agree_with_the_reference_and_stay_finite() {
     other.center_scale[7] = [0.0, 0.0, 0.0, 300.0];
     other.color[7][3] = 0.5;
     check("a Gaussian 1e4 px wide", &other, &camera, false);
+    other.center_scale.iter_mut().for_each(|c| c[3] = 300.0);
+    check("every Gaussian 1e4 px wide", &other, &camera, false);
+    // The nearest is opaque: clamped in every pixel. The next one ends it.
+    for (i, (c, color)) in other.center_scale.iter_mut().zip(&mut other.color).enumerate() {
+        c[2] = 0.002 * i as f32;
+        color[3] = [1.0, 0.995][i % 2];
+    }
+    other.color[1][3] = 0.6;
+    check("every Gaussian wide and clamped", &other, &camera, false);
+    let mut other = scene.clone();
+    other.color.iter_mut().zip(0..).for_each(|(c, i)| c[3] = [0.985, 0.99, 0.995, 1.0][i % 4]);
+    other.center_scale.iter_mut().for_each(|c| c[3] = 0.15);
+    check("opacities about the clamp", &other, &camera, false);
+}
+
+#[test]
+fn from_millimetres_to_kilometres_slopes_and_matrices_agree_with_the_reference() {
+    let mut device = Gpu::new();
+    for unit in [1e-6, 1e-3, 1.0, 1e3, 1e6] {
+        let mut rng = StdRng::seed_from_u64(8);
+        let mut worst = [0.0f64; 3];
+        for round in 0..8 {
+            let camera = random_camera(&mut rng, LENSES[round % 4], 31, 23);
+            let (scene, camera, settings) = scaled(&random_scene(&mut rng, 60), &camera, unit);
+            let lists = touched(&scene, &camera, &settings, (31, 23));
+            let mut incoming = random_incoming(&mut rng, 31 * 23);
+            // The loss's slope by depth belongs to the unit as well.
+            incoming.depth_carry.iter_mut().for_each(|d| d[0] /= unit as f32);
+            only_clear(&mut incoming, &lists.unclear);
+            let expected = backward(&scene, &camera, &settings, 31, &lists, &incoming);
+            let (center, carried) =
+                errors(&device.run(&scene, &[(&camera, &incoming)], &settings, Carry::Sum), &expected);
+            let (_, lifted) = device.run(&scene, &[(&camera, &incoming)], &settings, Carry::Lift);
+            let (mut off, mut all) = (0.0, 0.0);
+            for s in &lists.splats {
+                let want = lift(&scene, &camera, &settings, s, expected.carried[s.index]);
+                for (ours, want) in lifted[2 * s.index..2 * s.index + 2].as_flattened().iter().zip(want) {
+                    off += (f64::from(*ours) - want).powi(2);
+                    all += want * want;
+                }
+            }
+            assert!(lists.splats.len() > 10 && all > 0.0, "something is seen");
+            let errors = [center, carried, (off / all).sqrt()];
+            worst.iter_mut().zip(errors).for_each(|(worst, error)| *worst = worst.max(error));
+        }
+        println!("unit {unit:.0e} m: centres {:.1e}, colours {:.1e}, matrices {:.1e}", worst[0], worst[1], worst[2]);
+        assert!(worst.iter().all(|error| *error < 1e-4), "{unit}: {worst:?}");
+    }
 }
 
 #[test]
@@ -286,19 +334,7 @@ fn lifted_matrices_are_those_of_the_projection() {
     let expected = backward(&scene, &camera, &settings, 30, &lists, &incoming);
     let (_, lifted) = Gpu::new().run(&scene, &[(&camera, &incoming)], &settings, Carry::Lift);
     for s in &lists.splats {
-        let center = vec3(scene.center_scale[s.index]);
-        let h = 1e-5;
-        let column = |axis: DVec3| {
-            let at = |h: f64| splat_at(&scene, &camera, &settings, s.index, center + axis * h).unwrap().pixel;
-            (at(h) - at(-h)) / (2.0 * h)
-        };
-        let columns = [column(DVec3::X), column(DVec3::Y), column(DVec3::Z)];
-        let [xx, xy, yy] = expected.carried[s.index];
-        let entry = |i: usize, j: usize| {
-            let (a, b): (glam::DVec2, glam::DVec2) = (columns[i], columns[j]);
-            xx * a.x * b.x + xy * (a.x * b.y + a.y * b.x) + yy * a.y * b.y
-        };
-        let want = [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)];
+        let want = lift(&scene, &camera, &settings, s, expected.carried[s.index]);
         let ours = lifted[2 * s.index..2 * s.index + 2].as_flattened();
         let size = want.iter().map(|v| v.abs()).fold(1e-3, f64::max);
         for (ours, want) in ours.iter().zip(want) {

@@ -19,9 +19,10 @@ mod normal;
 mod pose_fix;
 mod regularizer;
 mod settings;
+mod thickness;
 mod track;
 
 pub use data::{DataTerm, PointDerivatives};
 pub use pose_fix::{PoseCorrection, PoseFreedom};
-pub use settings::{DeformSettings, DeformSolver};
+pub use settings::{DeformSettings, DeformSolver, FIRST_FRAMES};
 pub use track::{DeformReport, DeformTracker};

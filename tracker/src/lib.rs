@@ -40,7 +40,8 @@ mod view;
 
 pub use config::PoseConfig;
 pub use deform::{
-    DataTerm, DeformReport, DeformSettings, DeformSolver, DeformTracker, PointDerivatives, PoseCorrection, PoseFreedom,
+    DataTerm, DeformReport, DeformSettings, DeformSolver, DeformTracker, FIRST_FRAMES, PointDerivatives,
+    PoseCorrection, PoseFreedom,
 };
 pub use error::{TrackError, TrackErrorKind};
 pub use estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};

@@ -23,6 +23,12 @@ pub enum PixelFormat {
     Nv12,
     /// Bayer mosaic of 8 bits, rows RG and GB.
     BayerRggb8,
+    /// Bayer mosaic of 8 bits, rows GR and BG.
+    BayerGrbg8,
+    /// Bayer mosaic of 8 bits, rows GB and RG.
+    BayerGbrg8,
+    /// Bayer mosaic of 8 bits, rows BG and GR.
+    BayerBggr8,
     /// One JPEG picture, any length up to the raw size.
     Mjpeg,
 }
@@ -35,7 +41,7 @@ impl PixelFormat {
         match self {
             Self::Rgb8 | Self::Bgr8 => Some(pixels * 3),
             Self::Rgba8 => Some(pixels * 4),
-            Self::Gray8 | Self::BayerRggb8 => Some(pixels),
+            Self::Gray8 | Self::BayerRggb8 | Self::BayerGrbg8 | Self::BayerGbrg8 | Self::BayerBggr8 => Some(pixels),
             Self::Yuyv | Self::Uyvy => Some(pixels * 2),
             Self::Nv12 => Some(pixels + (width as usize).div_ceil(2) * (height as usize).div_ceil(2) * 2),
             Self::Mjpeg => None,

@@ -12,7 +12,7 @@ use serde::Serialize;
 
 use super::{
     plot::{Plot, Series},
-    sequence::{Sequence, SequenceConfig},
+    sequence::{Motion, Sequence, SequenceConfig},
 };
 use crate::{
     cli::BenchAppearanceArgs,
@@ -52,7 +52,7 @@ pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
     let bar = progress_bar(args.people * (args.views.len() * modes.len()) as u64, "bench appearance");
     let mut rows = Vec::new();
     for person in args.seed..args.seed.saturating_add(args.people) {
-        let config = SequenceConfig { seed: person, side: args.side, frames: args.frames, fps: 30.0 };
+        let config = SequenceConfig { motion: Motion::Turn, seed: person, side: args.side, frames: args.frames, fps: 30.0 };
         let sequence = Sequence::simulate(gpu, config)?;
         for &views in &args.views {
             for &mode in &modes {
@@ -79,19 +79,19 @@ fn run(
     mode: AppearanceMode,
     weights: Option<&Parameters>,
 ) -> Result<Row> {
+    let rig = sequence.inputs(views);
     let mut engine = Engine::new(
         gpu.clone(),
         sequence.template.clone(),
         args.gaussians,
         DEFAULT_NODE_COUNT.min(args.gaussians / 12),
-        views,
+        &rig,
         mode.settings(),
         Solver::GaussNewton.options(Origin::Given),
     )?;
     if let Some(weights) = weights.filter(|_| mode.is_learned()) {
         engine.use_networks(weights)?;
     }
-    let rig = sequence.inputs(views);
     let plates = rig.cameras.iter().map(|_| None).collect();
     let track = PoseSource::Track { track: sequence.track.clone(), repeat: true };
     let mut pipeline = Pipeline::new(engine, rig, track, Origin::Given, plates);

@@ -3,11 +3,10 @@
 use anyhow::{Context, Result};
 use flyrig_body::DEFAULT_NODE_COUNT;
 use flyrig_gpu::GpuContext;
-use flyrig_renderer::WantedPicture;
-use flyrig_tracker::DeformSolver;
+use flyrig_tracker::FIRST_FRAMES;
 use serde::Serialize;
 
-use super::sequence::Sequence;
+use super::sequence::{Motion, Sequence, SequenceConfig};
 use super::surface::Points;
 use crate::{
     config::{AppearanceMode, Origin, Solver},
@@ -21,102 +20,95 @@ use crate::{
 const OUR_POINTS: usize = 20_000;
 
 /// What to run.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Case {
+    /// What is special about it: a solver's name, or that and what differs from its defaults.
+    pub variant: String,
     pub solver: Solver,
-    /// Of the first frames and of later ones, where not the default.
-    pub iterations: Option<[usize; 2]>,
+    /// None: skinned only.
+    pub options: Option<DeformOptions>,
     /// Gaussians that are drawn.
     pub gaussians: usize,
-    /// Gaussians that are compared, where not the default.
-    pub compared: Option<usize>,
-    /// Pictures are not halved.
-    pub full_size: bool,
+    /// Input cameras.
     pub views: usize,
-    pub side: u32,
+    pub sequence: SequenceConfig,
 }
 
 /// What came out.
 #[derive(Debug, Clone, Serialize)]
 pub struct Row {
     pub name: String,
+    pub variant: String,
     pub solver: Solver,
-    pub iterations: Option<[usize; 2]>,
     pub gaussians: usize,
-    pub compared: Option<usize>,
-    pub full_size: bool,
+    /// Gaussians that were compared with the pictures.
+    pub compared: usize,
     pub views: usize,
-    pub side: u32,
-    pub frames: usize,
+    pub sequence: SequenceConfig,
     /// Over the second half of the sequence.
     pub psnr_db: f64,
     pub ssim: f64,
     pub iou: f64,
     /// Mean distance of our surface to the true one, of the true one to ours, and of what the cameras see of it, at the last
-    /// instant; their mean is the Chamfer distance.
+    /// instant; the mean of the first two is the Chamfer distance.
     pub accuracy_mm: f64,
     pub completeness_mm: f64,
     pub seen_mm: f64,
     pub chamfer_mm: f64,
     /// Mean milliseconds a frame of every stage.
     pub stages_ms: Vec<(String, f64)>,
+    /// Mean milliseconds of the deformation, over all frames, the first ten, and those after them.
     pub deformation_ms: f64,
+    pub first_ms: f64,
+    pub later_ms: f64,
+    /// What was left out, counted over all frames.
+    pub skipped: Vec<(String, u64)>,
     /// Total loss of the first frame's iterations, and of the last frame's.
     pub first_energy: Vec<f64>,
     pub last_energy: Vec<f64>,
 }
 
 impl Case {
-    /// For tables.
-    pub fn name(&self) -> String {
-        let mut name = match self.solver {
-            Solver::None => "off".to_owned(),
-            Solver::Paper => "paper".to_owned(),
-            Solver::GaussNewton => "default".to_owned(),
+    /// A solver as it is by default.
+    pub fn new(solver: Solver, gaussians: usize, views: usize, sequence: SequenceConfig) -> Self {
+        let variant = match solver {
+            Solver::None => "off",
+            Solver::Paper => "paper",
+            Solver::GaussNewton => "default",
         };
-        if let Some([first, later]) = self.iterations {
-            name += &format!(" {first}/{later} iterations");
-        }
-        if let Some(compared) = self.compared {
-            name +=
-                &if compared == usize::MAX { " all Gaussians".to_owned() } else { format!(" {compared} Gaussians") };
-        }
-        if self.full_size {
-            name += " full size";
-        }
-        format!("{name}, {} views, {}²", self.views, self.side)
+        Self { variant: variant.to_owned(), solver, options: solver.options(Origin::Given), gaussians, views, sequence }
     }
 
-    fn options(&self) -> Option<DeformOptions> {
-        let mut options = self.solver.options(Origin::Given)?;
-        if let (Some([first_iterations, iterations]), DeformSolver::GaussNewton { .. }) =
-            (self.iterations, options.solver.solver)
-        {
-            options.solver.solver = DeformSolver::GaussNewton { first_iterations, iterations };
+    /// The same but for one thing.
+    pub fn but(&self, what: &str, change: impl FnOnce(&mut DeformOptions)) -> Self {
+        let mut case = self.clone();
+        case.variant = format!("{}, {what}", case.variant);
+        if let Some(options) = &mut case.options {
+            change(options);
         }
-        if let Some(compared) = self.compared {
-            options.gaussians = compared;
-        }
-        if self.full_size {
-            options.max_level = 0;
-        }
-        options.max_level = options.max_level.min(WantedPicture::MAX_LEVEL);
-        Some(options)
+        case
+    }
+
+    /// For tables.
+    pub fn name(&self) -> String {
+        let SequenceConfig { seed, side, motion, .. } = self.sequence;
+        let still = if motion == Motion::Still { ", still" } else { "" };
+        format!("{}; {} views, {side}², seed {seed}{still}", self.variant, self.views)
     }
 }
 
 /// A pipeline for a case.
 pub fn pipeline(gpu: &GpuContext, sequence: &Sequence, case: &Case) -> Result<Pipeline> {
+    let rig = sequence.inputs(case.views);
     let engine = Engine::new(
         gpu.clone(),
         sequence.template.clone(),
         case.gaussians,
         DEFAULT_NODE_COUNT.min(case.gaussians / 12),
-        case.views,
+        &rig,
         AppearanceMode::Direct.settings(),
-        case.options(),
+        case.options,
     )?;
-    let rig = sequence.inputs(case.views);
     let plates = rig.cameras.iter().map(|_| None).collect();
     let track = PoseSource::Track { track: sequence.track.clone(), repeat: true };
     Ok(Pipeline::new(engine, rig, track, Origin::Given, plates))
@@ -131,9 +123,12 @@ pub fn run_case(gpu: &GpuContext, sequence: &Sequence, case: &Case) -> Result<Ro
 pub fn run_pipeline(mut pipeline: Pipeline, sequence: &Sequence, case: &Case) -> Result<Row> {
     let mut sheet = ScoreSheet::default();
     let (mut first_energy, mut last_energy) = (Vec::new(), Vec::new());
+    let mut times_ms = Vec::new();
     let frames = sequence.config().frames;
     for set in sequence.sets(case.views) {
+        let before = pipeline.stages.total_ms("deformation");
         pipeline.process(&set)?;
+        times_ms.push(pipeline.stages.total_ms("deformation") - before);
         if let Some(report) = pipeline.engine().deform_report() {
             last_energy.clone_from(&report.losses);
             if first_energy.is_empty() {
@@ -156,17 +151,16 @@ pub fn run_pipeline(mut pipeline: Pipeline, sequence: &Sequence, case: &Case) ->
     let seen_mm = ours.mean_distance(&sequence.truth.filter(|p| sequence.seen(p, case.views))) * 1e3;
     let stages_ms: Vec<(String, f64)> =
         pipeline.stages.summary().into_iter().map(|s| (s.name.trim().to_owned(), f64::from(s.mean_ms))).collect();
-    let deformation_ms = stages_ms.iter().find(|(name, _)| name == "deformation").map_or(0.0, |(_, ms)| *ms);
+    let mean_ms = |times: &[f64]| times.iter().sum::<f64>() / times.len().max(1) as f64;
+    let (first, later) = times_ms.split_at(times_ms.len().min(FIRST_FRAMES as usize));
     Ok(Row {
         name: case.name(),
+        variant: case.variant.clone(),
         solver: case.solver,
-        iterations: case.iterations,
         gaussians: case.gaussians,
-        compared: case.compared.filter(|&n| n < usize::MAX),
-        full_size: case.full_size,
+        compared: pipeline.engine().compared_gaussians(),
         views: case.views,
-        side: case.side,
-        frames,
+        sequence: sequence.config(),
         psnr_db: mean.psnr_db,
         ssim: mean.ssim,
         iou: mean.iou.unwrap_or(0.0),
@@ -175,7 +169,10 @@ pub fn run_pipeline(mut pipeline: Pipeline, sequence: &Sequence, case: &Case) ->
         seen_mm,
         chamfer_mm: 0.5 * (accuracy_mm + completeness_mm),
         stages_ms,
-        deformation_ms,
+        deformation_ms: mean_ms(&times_ms),
+        first_ms: mean_ms(first),
+        later_ms: mean_ms(later),
+        skipped: pipeline.stages.counts().map(|(name, count)| (name.to_owned(), count)).collect(),
         first_energy,
         last_energy,
     })

@@ -9,15 +9,7 @@ const SIDE: u32 = 160;
 
 /// Scores of the second half of a fast turn.
 fn scores(gpu: &GpuContext, sequence: &Sequence, per_view_time: bool, solver: Solver) -> Row {
-    let case = Case {
-        solver,
-        iterations: None,
-        gaussians: 9_000,
-        compared: Some(9_000),
-        full_size: true,
-        views: 3,
-        side: SIDE,
-    };
+    let case = Case::new(solver, 9_000, 3, sequence.config());
     let mut pipeline = pipeline(gpu, sequence, &case).unwrap();
     pipeline.per_view_time = per_view_time;
     run_pipeline(pipeline, sequence, &case).unwrap()
@@ -27,7 +19,7 @@ fn scores(gpu: &GpuContext, sequence: &Sequence, per_view_time: bool, solver: So
 #[test]
 fn a_rig_without_genlock_loses_little_with_the_time_of_each_view() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
-    let config = SequenceConfig { seed: 1, side: SIDE, frames: 10, fps: 30.0 };
+    let config = SequenceConfig { motion: Motion::Turn, seed: 1, side: SIDE, frames: 10, fps: 30.0 };
     let genlocked = Sequence::simulate(&gpu, config).unwrap();
     let shifted = Sequence::simulate_shifted(&gpu, config, &[4_100_000, 29_300_000, 17_600_000]).unwrap();
     for solver in [Solver::None, Solver::GaussNewton] {

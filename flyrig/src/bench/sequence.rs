@@ -5,9 +5,10 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use flyrig_body::Template;
 use flyrig_gpu::GpuContext;
-use flyrig_sim::{MotionConfig, RingConfig, SimConfig, Simulator, SurfaceMesh};
+use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, Simulator, SurfaceMesh};
 use flyrig_types::{Camera, Frame, FrameSet, PoseTrack, Rig};
 use glam::DVec3;
+use serde::Serialize;
 
 use super::surface::Points;
 
@@ -16,9 +17,20 @@ const TRUE_POINTS: usize = 20_000;
 /// A point is seen where the simulator's depth is not nearer than it by more, metres.
 const DEPTH_TOLERANCE_M: f64 = 0.01;
 
+/// What the person does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Motion {
+    /// Turns around.
+    Turn,
+    /// Stands.
+    Still,
+}
+
 /// What is simulated.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct SequenceConfig {
+    pub motion: Motion,
     /// Of the person.
     pub seed: u64,
     /// Pixels of a picture's side.
@@ -61,7 +73,10 @@ impl Sequence {
             gpu,
             &SimConfig {
                 seed: config.seed,
-                motion: MotionConfig { turn_secs, ..MotionConfig::default() },
+                motion: match config.motion {
+                    Motion::Turn => MotionConfig { turn_secs, ..MotionConfig::default() },
+                    Motion::Still => MotionConfig { kind: MotionKind::Still, ..MotionConfig::default() },
+                },
                 cameras: RingConfig { count: 12, ..RingConfig::default() },
                 width: config.side,
                 height: config.side,

@@ -20,15 +20,7 @@ struct Stage {
 
 impl Stage {
     fn new(gpu: &GpuContext, sequence: &Sequence) -> Self {
-        let case = Case {
-            solver: Solver::GaussNewton,
-            iterations: None,
-            gaussians: 3_000,
-            compared: Some(3_000),
-            full_size: true,
-            views: 3,
-            side: SIDE,
-        };
+        let case = Case::new(Solver::GaussNewton, 3_000, 3, sequence.config());
         Self { sets: sequence.sets(3).collect(), pipeline: pipeline(gpu, sequence, &case).unwrap() }
     }
 
@@ -82,7 +74,7 @@ fn filled(value: u8) -> Mask {
 #[test]
 fn the_tracking_degrades_and_comes_back_by_itself() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
-    let config = SequenceConfig { seed: 2, side: SIDE, frames: 34, fps: 30.0 };
+    let config = SequenceConfig { motion: Motion::Turn, seed: 2, side: SIDE, frames: 34, fps: 30.0 };
     let sequence = Sequence::simulate(&gpu, config).unwrap();
     let mut calm = Stage::new(&gpu, &sequence);
     calm.play(0..34, 0, as_is);

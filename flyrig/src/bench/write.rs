@@ -1,13 +1,15 @@
-//! CSV, JSON and pictures of a benchmark.
+//! CSV, JSON, tables and pictures of a benchmark.
 
 use std::{fmt::Write as _, path::Path};
 
 use anyhow::Result;
 use serde::Serialize;
 
+use super::ALL_VIEWS;
 use super::case::Row;
 use super::plot::{Plot, Series};
-use crate::{cli::BenchTrackArgs, config::Solver, report::write_whole};
+use super::summary::summary;
+use crate::{config::Solver, report::write_whole};
 
 #[derive(Serialize)]
 struct Document<'a> {
@@ -17,16 +19,11 @@ struct Document<'a> {
 }
 
 /// Writes everything into a folder.
-pub fn all(out: &Path, adapter: &str, args: &BenchTrackArgs, rows: &[Row]) -> Result<()> {
-    let command = format!(
-        "flyrig bench track --seed {} --frames {} --side {} --gaussians {}{}",
-        args.seed,
-        args.frames,
-        args.side,
-        args.gaussians,
-        if args.quick { " --quick" } else { "" }
-    );
+pub fn all(out: &Path, adapter: &str, rows: &[Row]) -> Result<()> {
+    // Without the program's own place.
+    let command = std::iter::once("flyrig".to_owned()).chain(std::env::args().skip(1)).collect::<Vec<_>>().join(" ");
     write_whole(&out.join("track.csv"), csv(rows).as_bytes())?;
+    write_whole(&out.join("track.txt"), summary(rows).as_bytes())?;
     write_whole(&out.join("track.json"), &serde_json::to_vec_pretty(&Document { adapter, command, rows })?)?;
     write_whole(&out.join("track.svg"), pareto(rows).svg().as_bytes())?;
     write_whole(&out.join("energy.svg"), energy(rows).svg().as_bytes())?;
@@ -35,17 +32,17 @@ pub fn all(out: &Path, adapter: &str, args: &BenchTrackArgs, rows: &[Row]) -> Re
 
 fn csv(rows: &[Row]) -> String {
     let mut text = "case,views,side,frames,psnr_db,ssim,iou,chamfer_mm,accuracy_mm,completeness_mm,seen_mm,\
-                    deformation_ms,prepare_ms,draw_ms,derivatives_ms,solve_ms\n"
+                    deformation_ms,first_ms,later_ms,prepare_ms,draw_ms,derivatives_ms,solve_ms\n"
         .to_owned();
     for r in rows {
         let stage = |name: &str| r.stages_ms.iter().find(|(known, _)| known == name).map_or(0.0, |(_, ms)| *ms);
         let _ = writeln!(
             text,
-            "\"{}\",{},{},{},{:.3},{:.4},{:.4},{:.3},{:.3},{:.3},{:.3},{:.2},{:.2},{:.2},{:.2},{:.2}",
+            "\"{}\",{},{},{},{:.3},{:.4},{:.4},{:.3},{:.3},{:.3},{:.3},{:.2},{:.2},{:.2},{:.2},{:.2},{:.2},{:.2}",
             r.name,
             r.views,
-            r.side,
-            r.frames,
+            r.sequence.side,
+            r.sequence.frames,
             r.psnr_db,
             r.ssim,
             r.iou,
@@ -54,6 +51,8 @@ fn csv(rows: &[Row]) -> String {
             r.completeness_mm,
             r.seen_mm,
             r.deformation_ms,
+            r.first_ms,
+            r.later_ms,
             stage("prepare"),
             stage("draw and compare"),
             stage("derivatives"),
@@ -63,33 +62,19 @@ fn csv(rows: &[Row]) -> String {
     text
 }
 
-/// For the terminal.
-pub fn table(rows: &[Row]) -> String {
-    let mut text = format!(
-        "{:<44} {:>8} {:>7} {:>7} {:>11} {:>8} {:>12}\n",
-        "case", "PSNR dB", "SSIM", "IoU", "chamfer mm", "seen mm", "ms a frame"
-    );
-    for r in rows {
-        let _ = writeln!(
-            text,
-            "{:<44} {:>8.2} {:>7.4} {:>7.4} {:>11.2} {:>8.2} {:>12.1}",
-            r.name, r.psnr_db, r.ssim, r.iou, r.chamfer_mm, r.seen_mm, r.deformation_ms
-        );
-    }
-    text
-}
-
-/// Error over time, of the cases that deform three views at the usual size.
+/// Error over time, of the cases that deform the first person before the usual views at the usual size.
 fn pareto(rows: &[Row]) -> Plot {
-    let (side, views) = rows.first().map_or((0, 0), |r| (r.side, r.views));
-    let same = |r: &&Row| r.side == side && r.views == views && r.deformation_ms > 0.0;
-    let group = |name: &str, keep: &dyn Fn(&Row) -> bool| Series {
+    let same = |r: &&Row| {
+        rows.first().is_some_and(|first| (r.sequence, r.views) == (first.sequence, first.views))
+            && r.solver != Solver::None
+    };
+    let group = |name: &str, solver: Solver| Series {
         name: name.to_owned(),
         points: rows
             .iter()
             .filter(same)
-            .filter(|r| keep(r))
-            .map(|r| (r.deformation_ms, r.chamfer_mm, r.name.split(',').next().unwrap_or_default().to_owned()))
+            .filter(|r| r.solver == solver)
+            .map(|r| (r.deformation_ms, r.chamfer_mm, r.variant.trim_start_matches("default, ").to_owned()))
             .collect(),
         joined: false,
     };
@@ -100,28 +85,26 @@ fn pareto(rows: &[Row]) -> Plot {
         log_x: true,
         log_y: false,
         front: true,
-        series: vec![
-            group("paper", &|r| r.solver == Solver::Paper),
-            group("Gauss-Newton", &|r| r.solver == Solver::GaussNewton),
-        ],
+        series: vec![group("paper", Solver::Paper), group("Gauss-Newton", Solver::GaussNewton)],
     }
 }
 
 /// Energy of the first frame over iterations, each as a share of where it began: the solvers weigh differently.
 fn energy(rows: &[Row]) -> Plot {
     let line = |r: &Row| Series {
-        name: r.name.split(',').next().unwrap_or_default().to_owned(),
+        name: r.variant.clone(),
         points: (0u32..)
             .zip(&r.first_energy)
             .map(|(i, e)| (f64::from(i), e / r.first_energy[0].max(1e-12), String::new()))
             .collect(),
         joined: true,
     };
-    let deforms = |r: &&Row| r.solver == Solver::Paper || r.iterations == Some([10, 4]);
-    let mut chosen: Vec<&Row> = rows.iter().filter(deforms).collect();
+    let mut chosen: Vec<&Row> =
+        rows.iter().filter(|r| r.solver == Solver::Paper || r.variant.contains("10/4 iterations")).collect();
     if chosen.len() < 2 {
-        chosen = rows.iter().filter(|r| r.deformation_ms > 0.0).collect();
+        chosen = rows.iter().filter(|r| r.solver != Solver::None).collect();
     }
+    chosen.truncate(4);
     Plot {
         title: "Energy of the first frame".to_owned(),
         x_label: "iteration".to_owned(),
@@ -135,13 +118,10 @@ fn energy(rows: &[Row]) -> Plot {
 
 /// Error over the number of views.
 fn views(rows: &[Row]) -> Plot {
-    let side = rows.first().map_or(0, |r| r.side);
-    let line = |name: &str, solver: Solver| {
-        let plain = |r: &&Row| {
-            r.solver == solver && r.side == side && r.iterations.is_none() && r.compared.is_none() && !r.full_size
-        };
+    let line = |name: &str, variant: &str| {
+        let same = |r: &&Row| rows.first().is_some_and(|first| r.sequence == first.sequence) && r.variant == variant;
         let mut points: Vec<_> =
-            rows.iter().filter(plain).map(|r| (r.views as f64, r.chamfer_mm, String::new())).collect();
+            rows.iter().filter(same).map(|r| (r.views as f64, r.chamfer_mm, format!("{:.1} dB", r.psnr_db))).collect();
         points.sort_by(|a, b| a.0.total_cmp(&b.0));
         Series { name: name.to_owned(), points, joined: true }
     };
@@ -152,6 +132,6 @@ fn views(rows: &[Row]) -> Plot {
         log_x: false,
         log_y: false,
         front: false,
-        series: vec![line("skinned only", Solver::None), line("default solver", Solver::GaussNewton)],
+        series: vec![line("skinned only", "off"), line("default solver", &format!("default, {ALL_VIEWS}"))],
     }
 }

@@ -44,23 +44,32 @@ impl Landmarks {
         &self.points
     }
 
-    /// One plan a view. Pixels need not be finer than the Gaussians' scale.
+    /// Middle of the body, world metres.
+    pub fn center(&self, skeleton: &Skeleton, pose: &Pose) -> DVec3 {
+        self.posed_center(&skeleton.world_from_canonical(pose))
+    }
+
+    fn posed_center(&self, bones: &[DMat4]) -> DVec3 {
+        self.points.iter().map(|(point, skin)| skin_point_f64(bones, skin, *point)).sum::<DVec3>()
+            / self.points.len().max(1) as f64
+    }
+
+    /// One plan a view. Pixels need not be finer than the Gaussians' spacing.
     pub fn plans(
         &self,
         skeleton: &Skeleton,
         instants: &[&Pose],
         views: &[TrackedView<'_>],
-        scale_m: f64,
+        spacing_m: f64,
         max_level: u32,
     ) -> Vec<ViewPlan> {
         let bones: Vec<_> = instants.iter().map(|pose| skeleton.world_from_canonical(pose)).collect();
         let plan = |view: &TrackedView<'_>| {
             let bones = bones.get(view.instant).map_or(&[][..], Vec::as_slice);
-            let center = self.points.iter().map(|(point, skin)| skin_point_f64(bones, skin, *point)).sum::<DVec3>()
-                / self.points.len().max(1) as f64;
-            let depth = view.camera.camera_from_world.transform_point(center).z.max(1e-3);
+            let depth = view.camera.camera_from_world.transform_point(self.posed_center(bones)).z.max(1e-3);
             let fine = view.camera.intrinsics.focal_px.element_sum() * 0.5 / depth;
-            let level = (fine * scale_m).log2().round().clamp(0.0, f64::from(max_level.min(WantedPicture::MAX_LEVEL)));
+            let level =
+                (fine * spacing_m).log2().round().clamp(0.0, f64::from(max_level.min(WantedPicture::MAX_LEVEL)));
             let shrink = level.exp2();
             let pixels_a_m = fine / shrink;
             let area = self.area(bones, view.camera, view.size, view.rgba);

@@ -3,6 +3,9 @@
 use flyrig_renderer::WantedPicture;
 use flyrig_tracker::{DeformSettings, PoseFreedom};
 
+/// So many are compared even where the person is a few pixels high.
+const LEAST_GAUSSIANS: f64 = 2000.0;
+
 /// Everything about the deformation that may be chosen.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DeformOptions {
@@ -10,8 +13,12 @@ pub struct DeformOptions {
     pub solver: DeformSettings,
     /// Gaussians that are compared with the pictures; the others follow.
     pub gaussians: usize,
-    /// Pictures are halved at most so often, while a pixel stays finer than the compared Gaussians.
+    /// Gaussians that are compared at most for every pixel that the person's whole surface would take in the finest view.
+    pub gaussians_a_pixel: f64,
+    /// Pictures are halved at most so often, while a pixel stays finer than the compared Gaussians' spacing.
     pub max_level: u32,
+    /// Views that are compared at most, those from the most different directions; 0: all.
+    pub views: usize,
     /// Whether, and how freely, the pose is corrected as well.
     pub pose: Option<PoseFreedom>,
 }
@@ -19,11 +26,48 @@ pub struct DeformOptions {
 impl DeformOptions {
     /// Compared as they are drawn: every Gaussian, every pixel.
     pub fn full(solver: DeformSettings) -> Self {
-        Self { gaussians: usize::MAX, max_level: 0, ..Self::coarse(solver) }
+        Self { gaussians: usize::MAX, gaussians_a_pixel: f64::INFINITY, max_level: 0, views: 0, ..Self::coarse(solver) }
+    }
+
+    /// Everything is compared, however little more it tells.
+    #[must_use]
+    pub fn without_level_of_detail(self) -> Self {
+        Self { gaussians_a_pixel: f64::INFINITY, max_level: 0, ..self }
+    }
+
+    /// How many of a surface's Gaussians are compared, where a pixel of the finest view covers `pixel_m` of the person.
+    pub fn compared(&self, area_m2: f64, pixel_m: f64) -> usize {
+        let useful = (self.gaussians_a_pixel * area_m2 / (pixel_m * pixel_m)).max(LEAST_GAUSSIANS);
+        if useful < self.gaussians as f64 { useful as usize } else { self.gaussians }
     }
 
     /// Compared no finer than the result needs: measured in docs/benchmarks/deform.md.
     pub fn coarse(solver: DeformSettings) -> Self {
-        Self { solver, gaussians: 30_000, max_level: WantedPicture::MAX_LEVEL, pose: None }
+        Self {
+            solver,
+            gaussians: 30_000,
+            gaussians_a_pixel: 2.0,
+            max_level: WantedPicture::MAX_LEVEL,
+            views: 0,
+            pose: None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_more_gaussians_than_pixels_can_tell_apart() {
+        let coarse = DeformOptions::coarse(DeformSettings::default());
+        assert_eq!(coarse.compared(1.8, 0.002), 30_000);
+        assert_eq!(coarse.compared(1.8, 0.015), 16_000);
+        assert_eq!(coarse.compared(1.8, 10.0), 2000);
+        assert_eq!(DeformOptions { gaussians: 500, ..coarse }.compared(1.8, 10.0), 500);
+        assert_eq!(coarse.without_level_of_detail().compared(1.8, 10.0), 30_000);
+        for nothing in [f64::NAN, 0.0, f64::INFINITY] {
+            assert!((2000..=30_000).contains(&coarse.compared(1.8, nothing)));
+        }
     }
 }

@@ -103,10 +103,6 @@ impl<'a> Pictures<'a> {
                 // Before the first colours only the masks can tell anything.
                 color_weight: if painted { COLOR_WEIGHT * plan.weight as f32 } else { 0.0 },
                 mask_weight: MASK_WEIGHT * plan.weight as f32,
-                // Neither the distance to the outline nor robust weights gained anything (docs/benchmarks/deform.md).
-                outline_weight: 0.0,
-                reach_px: 0,
-                robust_color: f32::INFINITY,
                 area: plan.area,
             })
             .collect();
@@ -194,9 +190,15 @@ impl<'a> Pictures<'a> {
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         for (i, (view, settings)) in self.views.iter().zip(&self.settings).enumerate() {
             let Some(gaussians) = posed.get(view.instant) else { continue };
+            let plain = RasterSettings::default();
+            let raster = RasterSettings {
+                outputs: Outputs::COLOR,
+                area: Some(settings.area),
+                // As wide as in the whole picture: a wider filter draws a wider person, and the solver makes it thinner.
+                filter_variance_px2: plain.filter_variance_px2 * 0.25f32.powi(self.buffers[i].level as i32),
+                ..plain
+            };
             let ViewBuffers { rasterizer, target, wanted, incoming, .. } = &mut self.buffers[i];
-            let raster =
-                RasterSettings { outputs: Outputs::COLOR, area: Some(settings.area), ..RasterSettings::default() };
             rasterizer.encode(gpu, &mut encoder, gaussians, &self.cameras[i], &raster, target)?;
             loss.encode(gpu, &mut encoder, i, target, wanted, settings, incoming);
         }

@@ -76,7 +76,7 @@ impl People {
             template,
             self.gaussians,
             DEFAULT_NODE_COUNT.min(self.gaussians / 12),
-            CAMERAS,
+            &rig,
             settings,
             Solver::GaussNewton.options(Origin::Given),
         )?;

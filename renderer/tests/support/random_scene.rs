@@ -1,6 +1,7 @@
 //! Random and poisoned scenes.
 #![allow(dead_code)]
 
+use flyrig_renderer::RasterSettings;
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
 use glam::{DQuat, DVec2, DVec3, Vec3};
 use rand::RngExt;
@@ -65,6 +66,15 @@ pub fn random_scene(rng: &mut StdRng, count: usize) -> Scene {
         scene.canonical.push(canonical.extend(0.0).to_array());
     }
     scene
+}
+
+/// The same scene, camera and near plane with all lengths of the world times `unit`, nothing culled.
+pub fn scaled(scene: &Scene, camera: &Camera, unit: f64) -> (Scene, Camera, RasterSettings) {
+    let (mut scene, mut camera) = (scene.clone(), camera.clone());
+    scene.center_scale.as_flattened_mut().iter_mut().for_each(|v| *v *= unit as f32);
+    camera.camera_from_world.translation *= unit;
+    let plain = RasterSettings::default();
+    (scene, camera, RasterSettings { near_m: plain.near_m * unit as f32, cull_backfacing: false, ..plain })
 }
 
 /// Replaces every third Gaussian's numbers by poison.

@@ -22,10 +22,12 @@ pub struct Picture {
     pub canonical: Vec<[f64; 4]>,
 }
 
-/// One Gaussian in the picture: place in pixels, camera z, opacity and inverse covariance after the filter.
+/// One Gaussian in the picture: place in the world and in pixels, camera z, opacity and inverse covariance after the
+/// filter.
 #[derive(Debug, Clone, Copy)]
 pub struct Splat {
     pub index: usize,
+    pub center: DVec3,
     pub pixel: DVec2,
     pub depth: f64,
     pub opacity: f64,
@@ -41,10 +43,6 @@ pub fn vec3(v: [f32; 4]) -> DVec3 {
 fn project(camera: &Camera, p: DVec3) -> DVec2 {
     let i = &camera.intrinsics;
     i.lens.distort(p.truncate() / p.z) * i.focal_px + i.center_px
-}
-
-fn splat(scene: &Scene, camera: &Camera, settings: &RasterSettings, index: usize) -> Option<Splat> {
-    splat_at(scene, camera, settings, index, vec3(scene.center_scale[index]))
 }
 
 /// The splat of Gaussian `index`, were its centre at `center`; none when it is not drawn.
@@ -94,6 +92,7 @@ pub fn splat_at(
     let overflows = filtered_det > f64::from(f32::MAX);
     (opacity > 1.0 / 255.0 && !overflows).then(|| Splat {
         index,
+        center,
         pixel: project(camera, p),
         depth: p.z,
         opacity,
@@ -105,8 +104,14 @@ pub fn splat_at(
 
 /// All splats, nearest first.
 pub fn sorted_splats(scene: &Scene, camera: &Camera, settings: &RasterSettings) -> Vec<Splat> {
+    let centers: Vec<DVec3> = scene.center_scale.iter().map(|c| vec3(*c)).collect();
+    sorted_splats_at(scene, camera, settings, &centers)
+}
+
+/// [`sorted_splats`], were the centres at `centers`.
+pub fn sorted_splats_at(scene: &Scene, camera: &Camera, settings: &RasterSettings, centers: &[DVec3]) -> Vec<Splat> {
     let mut splats: Vec<Splat> =
-        (0..scene.center_scale.len()).filter_map(|i| splat(scene, camera, settings, i)).collect();
+        (0..centers.len()).filter_map(|i| splat_at(scene, camera, settings, i, centers[i])).collect();
     splats.sort_by(|a, b| a.depth.total_cmp(&b.depth));
     splats
 }
@@ -125,12 +130,16 @@ pub fn footprint(s: &Splat, width: u32, height: u32) -> ([usize; 2], [usize; 2])
 
 /// Renders the scene.
 pub fn render(scene: &Scene, camera: &Camera, settings: &RasterSettings, width: u32, height: u32) -> Picture {
-    let splats = sorted_splats(scene, camera, settings);
+    blend(scene, &sorted_splats(scene, camera, settings), width, height)
+}
+
+/// Blends splats that are sorted by depth.
+pub fn blend(scene: &Scene, splats: &[Splat], width: u32, height: u32) -> Picture {
     let pixels = width as usize * height as usize;
     let mut picture =
         Picture { color: vec![[0.0; 4]; pixels], depth: vec![0.0; pixels], canonical: vec![[0.0; 4]; pixels] };
     let mut transmittance = vec![1.0; pixels];
-    for s in &splats {
+    for s in splats {
         let color = scene.color[s.index].map(f64::from);
         let canonical = scene.canonical[s.index].map(f64::from);
         let ([x0, x1], [y0, y1]) = footprint(s, width, height);

@@ -14,9 +14,9 @@ const OPAQUE: f64 = 1e-4;
 
 /// dL/d the pictures, element for element as in `PictureGradients`.
 #[derive(Debug, Clone)]
-pub struct Incoming {
-    pub color: Vec<[f32; 4]>,
-    pub depth_carry: Vec<[f32; 4]>,
+pub struct Incoming<T = f32> {
+    pub color: Vec<[T; 4]>,
+    pub depth_carry: Vec<[T; 4]>,
 }
 
 /// dL/d centres, blending weights in pixels with a gradient, carried sums.
@@ -41,8 +41,12 @@ fn unclamped_alpha(s: &Splat, x: f64, y: f64) -> f64 {
 }
 
 /// Who touches what.
-pub fn touched(scene: &Scene, camera: &Camera, settings: &RasterSettings, (width, height): (u32, u32)) -> Touched {
-    let splats = sorted_splats(scene, camera, settings);
+pub fn touched(scene: &Scene, camera: &Camera, settings: &RasterSettings, size: (u32, u32)) -> Touched {
+    touched_by(sorted_splats(scene, camera, settings), size)
+}
+
+/// Who touches what, of splats that are sorted by depth.
+pub fn touched_by(splats: Vec<Splat>, (width, height): (u32, u32)) -> Touched {
     let pixels = width as usize * height as usize;
     let mut lists: Vec<Vec<usize>> = vec![Vec::new(); pixels];
     let mut unclear = vec![false; pixels];
@@ -72,9 +76,15 @@ pub fn touched(scene: &Scene, camera: &Camera, settings: &RasterSettings, (width
     Touched { splats, lists, unclear }
 }
 
-fn is_zero_or_poisoned(incoming: &Incoming, at: usize) -> bool {
-    let all = || incoming.color[at].iter().chain(&incoming.depth_carry[at]);
-    all().all(|&v| v == 0.0) || all().any(|v| !v.is_finite())
+/// Colour and alpha, then depth and carried numbers of a pixel; none where all are zero or one is not finite.
+fn pixel<T: Copy + Into<f64>>(incoming: &Incoming<T>, at: usize) -> Option<([f64; 4], [f64; 4])> {
+    let (color, depth_carry) = (incoming.color[at].map(Into::into), incoming.depth_carry[at].map(Into::into));
+    let all = || color.iter().chain(&depth_carry);
+    (all().any(|&v| v != 0.0) && all().all(|v| v.is_finite())).then_some((color, depth_carry))
+}
+
+fn rgb(color: [f64; 4]) -> DVec3 {
+    DVec3::new(color[0], color[1], color[2])
 }
 
 /// The loss that is linear in the pictures with `incoming` as its derivative, with the lists of `touched` kept while
@@ -82,9 +92,7 @@ fn is_zero_or_poisoned(incoming: &Incoming, at: usize) -> bool {
 pub fn linear_loss(scene: &Scene, touched: &Touched, splats: &[Splat], incoming: &Incoming, width: u32) -> f64 {
     let mut loss = 0.0;
     for (at, list) in touched.lists.iter().enumerate() {
-        if is_zero_or_poisoned(incoming, at) || list.is_empty() {
-            continue;
-        }
+        let Some((by_color, by_depth)) = pixel(incoming, at).filter(|_| !list.is_empty()) else { continue };
         let (x, y) = ((at % width as usize) as f64, (at / width as usize) as f64);
         let (mut transmittance, mut color, mut depth) = (1.0, DVec3::ZERO, 0.0);
         for &k in list {
@@ -95,9 +103,7 @@ pub fn linear_loss(scene: &Scene, touched: &Touched, splats: &[Splat], incoming:
             transmittance *= 1.0 - alpha;
         }
         let alpha = 1.0 - transmittance;
-        loss += vec3(incoming.color[at]).dot(color)
-            + f64::from(incoming.color[at][3]) * alpha
-            + f64::from(incoming.depth_carry[at][0]) * depth / alpha;
+        loss += rgb(by_color).dot(color) + by_color[3] * alpha + by_depth[0] * depth / alpha;
     }
     loss
 }
@@ -114,13 +120,13 @@ struct SplatGradient {
 }
 
 /// The backward pass.
-pub fn backward(
+pub fn backward<T: Copy + Into<f64>>(
     scene: &Scene,
     camera: &Camera,
     settings: &RasterSettings,
     width: u32,
     touched: &Touched,
-    incoming: &Incoming,
+    incoming: &Incoming<T>,
 ) -> Outgoing {
     let count = scene.center_scale.len();
     let mut out =
@@ -128,9 +134,7 @@ pub fn backward(
     let splats = &touched.splats;
     let mut gradients = vec![SplatGradient::default(); splats.len()];
     for (at, list) in touched.lists.iter().enumerate() {
-        if is_zero_or_poisoned(incoming, at) || list.is_empty() {
-            continue;
-        }
+        let Some((by_color, depth_carry)) = pixel(incoming, at).filter(|_| !list.is_empty()) else { continue };
         let (x, y) = ((at % width as usize) as f64, (at / width as usize) as f64);
         let mut before = vec![1.0];
         let mut depth_sum = 0.0;
@@ -141,19 +145,19 @@ pub fn backward(
             before.push(transmittance * (1.0 - alpha));
         }
         let coverage = 1.0 - before[list.len()];
-        let by_depth = f64::from(incoming.depth_carry[at][0]) / coverage;
-        let by_alpha = f64::from(incoming.color[at][3]) - by_depth * depth_sum / coverage;
+        let by_depth = depth_carry[0] / coverage;
+        let by_alpha = by_color[3] - by_depth * depth_sum / coverage;
         // Value of all that lies behind, per light that reaches it.
         let mut behind = 0.0;
         for (place, &k) in list.iter().enumerate().rev() {
             let s = &splats[k];
             let unclamped = unclamped_alpha(s, x, y);
             let alpha = unclamped.min(MAX_ALPHA);
-            let value = vec3(incoming.color[at]).dot(vec3(scene.color[s.index])) + by_depth * s.depth + by_alpha;
+            let value = rgb(by_color).dot(vec3(scene.color[s.index])) + by_depth * s.depth + by_alpha;
             let weight = alpha * before[place];
             out.weight[s.index] += weight;
-            for (sum, carry) in out.carried[s.index].iter_mut().zip(&incoming.depth_carry[at][1..]) {
-                *sum += weight * f64::from(*carry);
+            for (sum, carry) in out.carried[s.index].iter_mut().zip(&depth_carry[1..]) {
+                *sum += weight * carry;
             }
             let g = &mut gradients[k];
             g.depth += weight * by_depth;
@@ -171,7 +175,6 @@ pub fn backward(
         }
     }
     for (s, g) in splats.iter().zip(&gradients) {
-        let center = vec3(scene.center_scale[s.index]);
         // Loss were it linear in the splat's numbers. Culling is a jump, and not to be differentiated.
         let smooth = RasterSettings { cull_backfacing: false, ..*settings };
         let value = |center: DVec3| {
@@ -187,11 +190,33 @@ pub fn backward(
         // Fourth order; the reference's own Jacobian is good to 1e-10. A splat that may vanish on the way gets
         // shorter steps.
         let slope = |axis: DVec3| {
-            let pair = |h: f64| Some((value(center + axis * h)? - value(center - axis * h)?) / (2.0 * h));
+            let pair = |h: f64| Some((value(s.center + axis * h)? - value(s.center - axis * h)?) / (2.0 * h));
             let at = |h: f64| Some((4.0 * pair(0.5 * h)? - pair(h)?) / 3.0);
             [1e-3, 1e-4, 1e-5].iter().find_map(|h| at(h * s.depth)).unwrap_or(0.0)
         };
         out.center[s.index] = DVec3::new(slope(DVec3::X), slope(DVec3::Y), slope(DVec3::Z));
     }
     out
+}
+
+/// Entries xx, xy, xz, yy, yz, zz of `J^T C J`, with C = (xx, xy, yy) of the picture and J = d pixel / d centre of a
+/// splat by differences.
+pub fn lift(
+    scene: &Scene,
+    camera: &Camera,
+    settings: &RasterSettings,
+    splat: &Splat,
+    [xx, xy, yy]: [f64; 3],
+) -> [f64; 6] {
+    let smooth = RasterSettings { cull_backfacing: false, ..*settings };
+    let h = 1e-5 * splat.depth;
+    let column = |axis: DVec3| {
+        let at = |h: f64| splat_at(scene, camera, &smooth, splat.index, splat.center + axis * h).map(|s| s.pixel);
+        Some((at(h)? - at(-h)?) / (2.0 * h))
+    };
+    let columns = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| column(axis).unwrap_or(DVec2::ZERO));
+    [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)].map(|(i, j)| {
+        let (a, b) = (columns[i], columns[j]);
+        xx * a.x * b.x + xy * (a.x * b.y + a.y * b.x) + yy * a.y * b.y
+    })
 }

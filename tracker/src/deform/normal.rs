@@ -93,7 +93,17 @@ impl NormalMatrix {
         }
     }
 
-    /// Mean of the diagonal's entries.
+    /// The data's own block of a node.
+    pub(super) fn diagonal_block(&self, node: usize) -> DMat3 {
+        self.diagonal[node]
+    }
+
+    /// Mean number of edges of a node: the mean diagonal of L.
+    pub(super) fn mean_edges(&self) -> f64 {
+        self.node_edges.iter().sum::<f64>() / self.node_edges.len().max(1) as f64
+    }
+
+    /// Mean of the diagonal's entries, those of H alone.
     pub(super) fn mean_diagonal(&self) -> f64 {
         let sum: f64 = self.diagonal.iter().map(|m| m.x_axis.x + m.y_axis.y + m.z_axis.z).sum();
         sum / (3 * self.diagonal.len().max(1)) as f64
@@ -209,3 +219,7 @@ fn inverse(m: DMat3) -> DMat3 {
         DMat3::from_diagonal(DVec3::splat(1.0 / mean.max(1e-30)))
     }
 }
+
+#[cfg(test)]
+#[path = "normal_tests.rs"]
+mod tests;

@@ -12,7 +12,8 @@ const MAX_TURN: f64 = 0.35;
 const MAX_SHIFT_M: f64 = 0.15;
 
 /// How freely the pose may be corrected: `(turn |ω|² + hold |ω - ω_before|²)` a joint and the same for the root's shift
-/// are added to the loss.
+/// are added to the loss. No joint is turned by more than 0.35 radians, and the root not shifted by more than 0.15 metres:
+/// unlike the nodes' limits these are a person's, in metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseFreedom {
     /// Price of a joint's turn, units of loss a square radian.

@@ -2,6 +2,8 @@
 
 use glam::DVec3;
 
+use super::thickness::Thickness;
+
 /// Eq. 4 over the directed edges of the graph, times λ_reg.
 #[derive(Debug)]
 pub(super) struct Regularizer {
@@ -27,19 +29,30 @@ impl Regularizer {
         if self.history { self.temporal } else { 0.0 }
     }
 
-    /// The loss at translations `t` with smoothed translations `smooth`; adds the gradient where asked.
-    pub(super) fn loss(&self, t: &[DVec3], smooth: &[DVec3], mut gradient: Option<&mut [DVec3]>) -> f64 {
+    /// The loss at translations `t` with smoothed translations `smooth`; adds the gradient where asked. Spatial smoothness
+    /// and the anchor count from `thickness`.
+    pub(super) fn loss(
+        &self,
+        t: &[DVec3],
+        smooth: &[DVec3],
+        thickness: Option<&Thickness>,
+        mut gradient: Option<&mut [DVec3]>,
+    ) -> f64 {
+        let offset = |node: usize| thickness.map_or(DVec3::ZERO, |thickness| thickness.offset(node));
         let (mut loss, temporal) = (0.0, self.temporal());
         if self.anchor > 0.0 {
-            loss += self.anchor * t.iter().map(|t| t.length_squared()).sum::<f64>();
-            for (gradient, t) in gradient.iter_mut().flat_map(|gradient| gradient.iter_mut()).zip(t) {
-                *gradient += 2.0 * self.anchor * *t;
+            let off = |(node, t): (usize, &DVec3)| *t - offset(node);
+            loss += self.anchor * t.iter().enumerate().map(|at| off(at).length_squared()).sum::<f64>();
+            for (gradient, at) in gradient.iter_mut().flat_map(|gradient| gradient.iter_mut()).zip(t.iter().enumerate())
+            {
+                *gradient += 2.0 * self.anchor * off(at);
             }
         }
         for &(i, j) in &self.edges {
             let (i, j) = (i as usize, j as usize);
-            let spread = t[i] - t[j];
-            let change = spread - (smooth[i] - smooth[j]);
+            let apart = t[i] - t[j];
+            let change = apart - (smooth[i] - smooth[j]);
+            let spread = apart - (offset(i) - offset(j));
             loss += self.spatial * spread.length_squared() + temporal * change.length_squared();
             if let Some(gradient) = gradient.as_deref_mut() {
                 let pull = 2.0 * (self.spatial * spread + temporal * change);

@@ -17,7 +17,8 @@ pub enum DeformSolver {
     },
 }
 
-/// Weights and limits.
+/// Weights and limits. In another unit of length everything here that has metres in its unit must be told in that one,
+/// and the solution is the same.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DeformSettings {
     /// How to step.
@@ -39,6 +40,8 @@ pub struct DeformSettings {
     pub max_step_m: f64,
     /// No node is farther than this from where its pose puts it, metres.
     pub max_translation_m: f64,
+    /// Thinnest (a body thinner than its template) and thickest clothes that are believed where nobody looks, metres.
+    pub thickness_m: [f64; 2],
     /// Attempts with growing damping before an iteration gives up.
     pub attempts: usize,
     /// After a frame that lowered its loss by less than this share, frames whose loss is no more than this share above get
@@ -58,6 +61,7 @@ impl Default for DeformSettings {
             damping: 0.03,
             max_step_m: 0.02,
             max_translation_m: 0.25,
+            thickness_m: [-0.02, 0.06],
             attempts: 3,
             rest: 0.01,
         }
@@ -65,7 +69,7 @@ impl Default for DeformSettings {
 }
 
 /// Frames that get the first iterations (FlyHuman section 4.1).
-pub(super) const FIRST_FRAMES: u64 = 10;
+pub const FIRST_FRAMES: u64 = 10;
 
 impl DeformSettings {
     /// Iterations of frame number `frame` since the last reset.
@@ -108,6 +112,8 @@ impl DeformSettings {
             Some("smoothing must lie in 0 to 1")
         } else if !length(self.max_step_m) || !length(self.max_translation_m) {
             Some("the longest step and translation must be above 0")
+        } else if !(self.thickness_m[0] <= self.thickness_m[1] && self.thickness_m.iter().all(|v| v.is_finite())) {
+            Some("the clothes' thinnest and thickest must be finite and in this order")
         } else {
             None
         }

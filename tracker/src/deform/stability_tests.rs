@@ -2,6 +2,7 @@
 
 use super::tests::{Goals, body, goals, tracker, true_displacement, wide};
 use super::*;
+use glam::{DMat3, DQuat};
 use std::convert::Infallible;
 
 /// Mean distance of the seen Gaussians to where the clothes are at a time.
@@ -50,7 +51,9 @@ fn ten_thousand_frames_do_not_drift() {
 /// Matrices that say something along one direction only, or nearly nothing, or far too much.
 struct Flat<'a> {
     inner: Goals<'a>,
-    keep: [f32; 3],
+    keep: [f64; 3],
+    /// Of the directions, by Gaussian.
+    turn: f64,
 }
 
 impl DataTerm for Flat<'_> {
@@ -67,10 +70,12 @@ impl DataTerm for Flat<'_> {
         out: &mut Vec<PointDerivatives>,
     ) -> Result<f64, Infallible> {
         let loss = self.inner.derivatives(displacement, correction, out)?;
-        for h in &mut out[0].curvature.chunks_exact_mut(2) {
-            let [x, y, z] = self.keep;
-            h[0] = [h[0][0] * x, 0.0, 0.0, h[0][3] * y];
-            h[1] = [0.0, h[1][1] * z, 0.0, 0.0];
+        for (g, h) in out[0].curvature.chunks_exact_mut(2).enumerate() {
+            let turn = DMat3::from_quat(DQuat::from_scaled_axis(DVec3::new(0.3, 1.0, -0.7) * self.turn * g as f64));
+            let m = turn * DMat3::from_diagonal(DVec3::from(self.keep) * f64::from(h[0][0])) * turn.transpose();
+            let entry = |r: usize, c: usize| m.col(c)[r] as f32;
+            h[0] = [entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1)];
+            h[1] = [entry(1, 2), entry(2, 2), 0.0, 0.0];
         }
         Ok(loss)
     }
@@ -79,18 +84,30 @@ impl DataTerm for Flat<'_> {
 #[test]
 fn nearly_singular_matrices_give_finite_steps_that_lower_the_loss() {
     let body = body(2_000, 60);
+    let mut moved = 0;
     for regularization in [0.0, 1e-9, 200.0, 1e9] {
-        for keep in [[1.0, 0.0, 0.0], [1.0, 1e-7, 1e-14], [1e-30; 3], [1e20; 3], [1e-20, 1.0, 1e15]] {
-            let settings = DeformSettings { regularization, ..DeformSettings::default() };
-            let mut tracker = tracker(&body, settings);
-            let mut data = Flat { inner: goals(&body), keep };
-            for _ in 0..4 {
-                let report = tracker.track(&mut data).unwrap();
-                assert!(report.losses.is_sorted_by(|a, b| a >= b), "{regularization} {keep:?}: {report:?}");
-                assert!(tracker.translations().iter().all(|t| t.is_finite()), "{regularization} {keep:?}");
+        for keep in [[1.0, 0.0, 0.0], [1.0, 1e-6, 1e-12], [0.0; 3], [1e-30; 3], [1e20; 3], [1e-20, 1.0, 1e15]] {
+            for turn in [0.0, 0.1] {
+                let settings = DeformSettings { regularization, ..DeformSettings::default() };
+                let mut tracker = tracker(&body, settings);
+                let mut data = Flat { inner: goals(&body), keep, turn };
+                let told = format!("{regularization} {keep:?} {turn}");
+                let mut before = f64::INFINITY;
+                for _ in 0..4 {
+                    let report = tracker.track(&mut data).unwrap();
+                    assert!(report.losses.is_sorted_by(|a, b| a >= b), "{told}: {report:?}");
+                    assert!(tracker.translations().iter().all(|t| t.is_finite()), "{told}");
+                    moved += report.accepted;
+                    // The first frame has no history yet, which the second one adds to the loss.
+                    let after = data.loss(tracker.displacement(), &PoseCorrection::default()).unwrap();
+                    assert!(after <= before || regularization > 0.0, "{told}: {before} {after}");
+                    before = after;
+                }
             }
         }
     }
+    println!("{moved} steps taken");
+    assert!(moved > 100, "{moved}");
 }
 
 #[test]
@@ -108,6 +125,56 @@ fn a_frame_without_anything_to_gain_gets_no_iteration_until_something_moves() {
     assert!(!report.at_rest && report.accepted > 0, "{report:?}");
     let mut never = tracker(&body, DeformSettings { rest: 0.0, ..DeformSettings::default() });
     assert!((0..40).all(|_| !never.track(&mut goals(&body)).unwrap().at_rest), "the switch");
+}
+
+/// The person, the cameras and all that has a unit of length times `unit`; weights are units of loss a square metre.
+fn solved_in(unit: f64) -> (Vec<DVec3>, Vec<f64>) {
+    let mut body = body(2_000, 60);
+    body.surface.positions.iter_mut().for_each(|x| *x *= unit as f32);
+    body.graph.nodes.iter_mut().for_each(|x| *x *= unit as f32);
+    body.bones.iter_mut().for_each(|bone| bone.w_axis = (bone.w_axis.truncate() * unit).extend(1.0));
+    let surface = &body.surface;
+    let goal = |g: usize| {
+        let x = (surface.positions[g].as_dvec3() / unit).as_vec3();
+        let moved = surface.positions[g].as_dvec3() + true_displacement(x) * unit;
+        flyrig_body::skin_point_f64(&body.bones, &surface.skin[g], moved)
+    };
+    let mut data = goals(&body);
+    data.goals = (0..surface.len()).map(goal).collect();
+    data.weights.iter_mut().for_each(|w| *w /= unit * unit);
+    let plain = DeformSettings::default();
+    let settings = DeformSettings {
+        regularization: plain.regularization / (unit * unit),
+        max_step_m: plain.max_step_m * unit,
+        max_translation_m: plain.max_translation_m * unit,
+        thickness_m: plain.thickness_m.map(|v| v * unit),
+        rest: 0.0,
+        ..plain
+    };
+    let mut tracker = tracker(&body, settings);
+    let mut losses = Vec::new();
+    for _ in 0..15 {
+        let report = tracker.track(&mut data).unwrap();
+        assert!(report.losses.is_sorted_by(|a, b| a >= b), "{unit}: {report:?}");
+        losses.extend(report.losses.last().copied());
+    }
+    (tracker.translations().iter().map(|t| *t / unit).collect(), losses)
+}
+
+#[test]
+fn from_millimetres_to_kilometres_the_solution_is_the_same() {
+    let (metres, losses) = solved_in(1.0);
+    let longest = metres.iter().map(|t| t.length()).fold(0.0, f64::max);
+    // Powers of two round nothing: what were left would know of metres.
+    for (unit, most) in
+        [(0.5f64.powi(10), 0.0), (2f64.powi(10), 0.0), (1e-6, 1e-5), (1e-3, 1e-5), (1e3, 1e-5), (1e6, 1e-5)]
+    {
+        let (moved, its_losses) = solved_in(unit);
+        let off = metres.iter().zip(&moved).map(|(a, b)| a.distance(*b)).fold(0.0, f64::max) / longest;
+        let by_loss = losses.iter().zip(&its_losses).map(|(a, b)| (a / b - 1.0).abs()).fold(0.0, f64::max);
+        println!("unit {unit:.0e} m: nodes within {off:.1e} of the longest translation, losses within {by_loss:.1e}");
+        assert!(off <= most && by_loss <= most, "{unit}: {off} {by_loss}");
+    }
 }
 
 #[test]

@@ -112,18 +112,39 @@ pub(super) fn tracker(body: &Body, settings: DeformSettings) -> DeformTracker {
     DeformTracker::new(&body.graph, &body.surface.skin, settings).unwrap()
 }
 
+/// Knows normals and parts, too.
+fn clothed(body: &Body, settings: DeformSettings) -> DeformTracker {
+    let surface = &body.surface;
+    let of_node = |&g: &u32| (surface.normals[g as usize].as_dvec3(), surface.parts[g as usize] as usize);
+    let (normals, parts) = body.graph.node_gaussian.iter().map(of_node).unzip();
+    tracker(body, settings).with_thickness(normals, parts).unwrap()
+}
+
 /// Total loss at these translations, straight from the equations.
 fn total_loss(body: &Body, data: &Goals<'_>, settings: &DeformSettings, t: &[DVec3], smooth: &[DVec3]) -> f64 {
+    clothed_loss(body, data, settings, t, smooth, &vec![DVec3::ZERO; t.len()])
+}
+
+/// The same, with smoothness and anchor that count from `offsets`.
+fn clothed_loss(
+    body: &Body,
+    data: &Goals<'_>,
+    settings: &DeformSettings,
+    t: &[DVec3],
+    smooth: &[DVec3],
+    offsets: &[DVec3],
+) -> f64 {
     let graph = &body.graph;
-    let mut loss = 0.0;
+    let mut loss = settings.anchor * t.iter().zip(offsets).map(|(t, o)| (*t - *o).length_squared()).sum::<f64>();
     for g in 0..body.surface.len() {
         let moved = (0..4).map(|k| t[graph.gaussian_nodes[g][k] as usize] * f64::from(graph.gaussian_weights[g][k]));
         loss += data.weights[g] * data.off(g, moved.sum()).length_squared();
     }
     for (i, neighbors) in graph.neighbors.iter().enumerate() {
         for &j in neighbors {
-            let spread = t[i] - t[j as usize];
-            let change = spread - (smooth[i] - smooth[j as usize]);
+            let apart = t[i] - t[j as usize];
+            let spread = apart - (offsets[i] - offsets[j as usize]);
+            let change = apart - (smooth[i] - smooth[j as usize]);
             loss += settings.regularization
                 * (settings.spatial * spread.length_squared() + settings.temporal * change.length_squared());
         }
@@ -139,8 +160,16 @@ fn random_translations(rng: &mut StdRng, nodes: usize) -> Vec<DVec3> {
 fn gradient_and_matrix_match_differences_and_a_dense_solve() {
     let body = body(600, 14);
     let mut data = goals(&body);
-    let settings = DeformSettings::default();
-    let mut tracker = tracker(&body, settings);
+    let settings = DeformSettings { anchor: 300.0, ..DeformSettings::default() };
+    let mut tracker = clothed(&body, settings);
+    // Learns some thickness from a frame.
+    tracker.track(&mut data).unwrap();
+    let offsets = tracker.thickness.as_ref().unwrap();
+    let offsets: Vec<DVec3> = (0..body.graph.nodes.len()).map(|node| offsets.offset(node)).collect();
+    assert!(offsets.iter().any(|o| o.length() > 1e-4));
+    let total_loss = |body: &Body, data: &Goals<'_>, settings: &DeformSettings, t: &[DVec3], smooth: &[DVec3]| {
+        clothed_loss(body, data, settings, t, smooth, &offsets)
+    };
     let mut rng = StdRng::seed_from_u64(1);
     let nodes = body.graph.nodes.len();
     let (t, smooth) = (random_translations(&mut rng, nodes), random_translations(&mut rng, nodes));
@@ -152,7 +181,7 @@ fn gradient_and_matrix_match_differences_and_a_dense_solve() {
     let data_loss = data.derivatives(&displacement, &PoseCorrection::default(), &mut derivatives).unwrap();
     tracker.derivatives = derivatives;
     let mut gradient = vec![DVec3::ZERO; nodes];
-    let loss = data_loss + tracker.regularizer.loss(&t, &smooth, Some(&mut gradient));
+    let loss = data_loss + tracker.regularizer.loss(&t, &smooth, tracker.thickness.as_ref(), Some(&mut gradient));
     assert_eq!(tracker.gather(&mut gradient), 0);
     let direct = total_loss(&body, &data, &settings, &t, &smooth);
     assert!((loss - direct).abs() < 1e-6 * direct, "{loss} {direct}");
@@ -180,12 +209,14 @@ fn gradient_and_matrix_match_differences_and_a_dense_solve() {
         }
     }
     let damping = 1e-3 * tracker.matrix.mean_diagonal();
+    // The differences hold the anchor already.
+    let own_damping = damping + 2.0 * settings.anchor;
     for k in 0..3 * nodes {
         dense[(k, k)] += damping;
     }
     let expected = dense.clone().lu().solve(&right).unwrap();
     let minus: Vec<DVec3> = gradient.iter().map(|g| -*g).collect();
-    let ours = tracker.matrix.solve(tracker.regularizer.stiffness(), damping, &minus, None);
+    let ours = tracker.matrix.solve(tracker.regularizer.stiffness(), own_damping, &minus, None);
     let flat = DVector::from_iterator(3 * nodes, ours.iter().flat_map(DVec3::to_array));
     let error = (&flat - &expected).norm() / expected.norm();
     println!("step against a dense f64 solve: {error:.1e}");
@@ -387,4 +418,40 @@ fn what_does_not_fit_is_refused() {
         assert!(make(&body.graph, &body.surface.skin, settings).is_err(), "{settings:?}");
     }
     assert!(!body.template.name.is_empty());
+}
+
+#[test]
+fn where_nobody_looks_clothes_are_as_thick_as_where_somebody_does() {
+    let body = body(8000, 800);
+    let mut data = goals(&body);
+    // Two centimetres of clothes all over.
+    for (g, goal) in data.goals.iter_mut().enumerate() {
+        let clothed = body.surface.positions[g].as_dvec3() + 0.02 * body.surface.normals[g].as_dvec3();
+        *goal = skin_point_f64(&body.bones, &body.surface.skin[g], clothed);
+    }
+    let settings = DeformSettings { anchor: 5.0, regularization: 20.0, rest: 0.0, ..DeformSettings::default() };
+    let unseen = |tracker: &mut DeformTracker, data: &mut Goals<'_>| {
+        for _ in 0..40 {
+            tracker.track(data).unwrap();
+        }
+        let hidden = (0..body.surface.len()).filter(|&g| data.weights[g] == 0.0);
+        let off: Vec<f64> = hidden.map(|g| data.off(g, wide(tracker.displacement()[g])).length()).collect();
+        off.iter().sum::<f64>() / off.len() as f64
+    };
+    let without = unseen(&mut tracker(&body, settings), &mut data);
+    let mut with_thickness = clothed(&body, settings);
+    let with = unseen(&mut with_thickness, &mut data);
+    println!("unseen side: {:.1} mm without, {:.1} mm with thickness", without * 1e3, with * 1e3);
+    assert!(with < 0.5 * without, "{with} {without}");
+    // Another person: forgotten.
+    with_thickness.reset();
+    assert_eq!(with_thickness.thickness.as_ref().unwrap().offset(0), DVec3::ZERO);
+    // A frame nobody sees teaches nothing, and lists that do not fit are told.
+    data.weights.fill(0.0);
+    with_thickness.track(&mut data).unwrap();
+    assert_eq!(with_thickness.thickness.as_ref().unwrap().offset(0), DVec3::ZERO);
+    for (normals, parts) in [(vec![], vec![]), (vec![DVec3::NAN; 800], vec![0; 800])] {
+        let error = tracker(&body, settings).with_thickness(normals, parts).unwrap_err();
+        assert!(error.to_string().contains("800 nodes"), "{error}");
+    }
 }

@@ -8,6 +8,7 @@ use super::normal::NormalMatrix;
 use super::pose_fix::{Basis, PoseFix};
 use super::regularizer::Regularizer;
 use super::settings::FIRST_FRAMES;
+use super::thickness::Thickness;
 use super::{DataTerm, DeformSettings, DeformSolver, PointDerivatives, PoseCorrection, PoseFreedom};
 use crate::{TrackError, TrackErrorKind};
 
@@ -16,8 +17,12 @@ const DAMPING_RANGE: (f64, f64) = (1e-3, 1e6);
 /// Shares of the predicted fall of the loss above and below which the damping changes after a step.
 const GOOD_GAIN: f64 = 0.75;
 const POOR_GAIN: f64 = 0.25;
-/// Keeps the matrix regular where neither picture nor neighbour says anything, units of loss a square metre.
-const LEAST_DAMPING: f64 = 1e-6;
+/// A step is not tried when it promises to lower the loss by less than this share: the pictures' sums are `f32`, and what
+/// rounding says of so small a step would decide on the damping of the next frames.
+const LEAST_GAIN: f64 = 1e-5;
+/// Keeps the matrix regular where neither picture nor neighbour says anything, as a share of its mean diagonal: the unit
+/// of length does not matter.
+const LEAST_DAMPING: f64 = 1e-11;
 
 /// What one frame did to the deformation.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -52,6 +57,7 @@ pub struct DeformTracker {
     displacement: Vec<[f32; 4]>,
     derivatives: Vec<PointDerivatives>,
     pose: Option<PoseFix>,
+    thickness: Option<Thickness>,
     no_correction: PoseCorrection,
     damping: f64,
     /// Loss below which there is nothing left to gain.
@@ -108,6 +114,7 @@ impl DeformTracker {
             displacement: vec![[0.0; 4]; count],
             derivatives: Vec::new(),
             pose: None,
+            thickness: None,
             no_correction: PoseCorrection::default(),
             floor: None,
             frame: 0,
@@ -140,6 +147,23 @@ impl DeformTracker {
         Ok(self)
     }
 
+    /// Learns how thick the clothes of every part are where the pictures tell it, and believes it where they do not. One
+    /// canonical unit normal and one part number a node. Gradient descent knows nothing of it.
+    ///
+    /// # Errors
+    /// [`TrackErrorKind::Template`] when the normals are not finite or not the nodes'.
+    pub fn with_thickness(mut self, normals: Vec<DVec3>, parts: Vec<usize>) -> Result<Self, TrackError> {
+        let nodes = self.translations.len();
+        if normals.len() != nodes || parts.len() != nodes || !normals.iter().all(|n| n.is_finite()) {
+            let message = format!("{} finite normals and {} parts for {nodes} nodes", normals.len(), parts.len());
+            return Err(TrackError::new(TrackErrorKind::Template, message));
+        }
+        if matches!(self.settings.solver, DeformSolver::GaussNewton { .. }) {
+            self.thickness = Some(Thickness::new(normals, parts, self.settings.thickness_m));
+        }
+        Ok(self)
+    }
+
     /// What the pose is corrected by.
     #[must_use]
     pub fn correction(&self) -> &PoseCorrection {
@@ -153,6 +177,9 @@ impl DeformTracker {
         self.displacement.fill([0.0; 4]);
         if let Some(pose) = &mut self.pose {
             pose.reset();
+        }
+        if let Some(thickness) = &mut self.thickness {
+            thickness.forget();
         }
         self.damping = self.settings.damping;
         self.floor = None;
@@ -245,6 +272,9 @@ impl DeformTracker {
         if let Some(pose) = &mut self.pose {
             pose.next_frame();
         }
+        if let Some(thickness) = &mut self.thickness {
+            thickness.learn(&self.translations, &self.matrix);
+        }
         self.frame += 1;
         Ok(report)
     }
@@ -272,7 +302,7 @@ impl DeformTracker {
 
     /// All of the loss that the pictures do not tell, and its gradient by the nodes where asked.
     fn prior(&self, gradient: Option<&mut [DVec3]>) -> f64 {
-        self.regularizer.loss(&self.translations, &self.smooth, gradient)
+        self.regularizer.loss(&self.translations, &self.smooth, self.thickness.as_ref(), gradient)
             + self.pose.as_ref().map_or(0.0, PoseFix::loss)
     }
 
@@ -301,14 +331,18 @@ impl DeformTracker {
         }
         let pose = pose.as_ref().map(|(basis, prices)| (basis, prices.as_slice()));
         for _ in 0..self.settings.attempts {
-            let damping = self.damping * self.matrix.mean_diagonal() + LEAST_DAMPING;
-            let step =
-                self.matrix.solve(self.regularizer.stiffness(), damping + 2.0 * self.regularizer.anchor, &right, pose);
+            let stiffness = self.regularizer.stiffness();
+            let by_data = self.matrix.mean_diagonal();
+            let damping = self.damping * by_data + LEAST_DAMPING * (by_data + stiffness * self.matrix.mean_edges());
+            let step = self.matrix.solve(stiffness, damping + 2.0 * self.regularizer.anchor, &right, pose);
             // Of the quadratic model, which the step s solves: (A + damping) s = -g.
             let share = self.shrink(&step);
             let along: f64 = right.iter().zip(&step).map(|(r, s)| r.dot(*s)).sum();
             let squared: f64 = step.iter().take(gradient.len()).map(|s| s.length_squared()).sum();
             let predicted = share * along - 0.5 * share * share * (along - damping * squared);
+            if predicted < LEAST_GAIN * loss {
+                return Ok(());
+            }
             let state = (self.translations.clone(), self.correction().clone());
             let new = self.try_step(&step, data)?;
             if new < loss {

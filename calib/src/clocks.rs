@@ -1,0 +1,357 @@
+//! Cameras that are exposed together but stamp with clocks of their own: from each clock to the master's.
+
+use std::collections::VecDeque;
+
+use flyrig_types::{CameraId, Frame};
+use serde::{Deserialize, Serialize};
+
+/// What the stamps of different cameras have to do with each other.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ClockKind {
+    /// One clock stamps all frames (cameras of one computer, recordings). Nothing is corrected, since a frame that lies
+    /// between two others was really taken there.
+    #[default]
+    Shared,
+    /// A trigger exposes all cameras at once, and each stamps with a clock of its own. Offset and drift of every clock
+    /// against the master's are estimated and taken off.
+    Triggered,
+}
+
+/// A stamp farther than this from the newest frame of the master was not taken now, nanoseconds.
+const PLAUSIBLE: i64 = 500_000_000;
+/// Stamps that agree on another offset, in a row, before it is believed.
+const CONFIRMATIONS: usize = 3;
+/// Frames from which the first offset is taken.
+const ACQUISITION: usize = 15;
+/// A pair of stamps enters the fit at most so often, nanoseconds; the fit spans [`PAIRS`] of them.
+const PAIR_EVERY: i64 = 100_000_000;
+const PAIRS: usize = 300;
+/// Pairs with which the drift is first believed: fewer see more jitter than drift.
+const FIRST_FIT: usize = 50;
+/// Intervals whose median is a camera's period.
+const INTERVALS: usize = 15;
+/// Clocks of cameras are within this, parts per million; a steeper fit is of wrong pairs.
+const MOST_DRIFT_PPM: f64 = 500.0;
+/// Instants of the master that are remembered.
+const INSTANTS: usize = 64;
+
+/// How a camera's clock differs from the master's.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct ClockState {
+    /// Added to the camera's stamp of now, nanoseconds.
+    pub offset_nanos: i64,
+    /// How much faster the master's clock runs, parts per million.
+    pub drift_ppm: f64,
+    /// Root mean square of what the fit leaves, nanoseconds.
+    pub residual_nanos: f64,
+    /// Steps of the clock that were taken off.
+    pub steps: u64,
+    /// Frames whose stamp could not be right and was replaced by what the sequence number tells.
+    pub replaced: u64,
+}
+
+/// Puts the capture times of all cameras onto the master's clock, for [`ClockKind::Triggered`].
+///
+/// Each camera has an offset and a drift, fitted by least squares without outliers to the pairs of its stamps and the
+/// master's of the last half minute. A stamp that departs from that and from the trigger's beat is replaced by what the
+/// frame's sequence number tells; when three of them agree, the clock has made a step, and the offset follows. (A step by
+/// whole periods of less than half a second passes for frames that the camera did not take.)
+/// The trigger's beat leaves the offset open by whole periods: clocks that differ by more than half a period at the start
+/// are matched by the order in which frames arrive, which the cameras' latencies can make wrong by a frame.
+#[derive(Debug)]
+pub struct ClockAligner {
+    cameras: Vec<(CameraId, Clock)>,
+    master: usize,
+    /// Corrected times of the master's last frames.
+    instants: VecDeque<i64>,
+}
+
+#[derive(Debug, Default)]
+struct Clock {
+    state: ClockState,
+    /// The fit is `master = stamp + offset + drift * (stamp - anchor)`, whole nanoseconds kept apart from the small rest.
+    anchor: i64,
+    offset: i64,
+    drift: f64,
+    /// Stamp and the master's corrected time.
+    pairs: VecDeque<(i64, i64)>,
+    /// First differences to the master's newest frame.
+    acquisition: Vec<i64>,
+    is_locked: bool,
+    /// Amounts that recent stamps were off by.
+    suspects: Vec<i64>,
+    /// Stamp, sequence number and corrected time of the last frame.
+    last: Option<(i64, u64, i64)>,
+    intervals: VecDeque<i64>,
+    /// Waits for a master's frame at or after it.
+    unpaired: VecDeque<i64>,
+}
+
+impl Clock {
+    fn corrected(&self, stamp: i64) -> i64 {
+        let drifted = self.drift * stamp.wrapping_sub(self.anchor) as f64;
+        stamp.wrapping_add(self.offset).saturating_add(drifted.round() as i64)
+    }
+
+    fn period(&self) -> Option<i64> {
+        let mut sorted: Vec<i64> = self.intervals.iter().copied().collect();
+        sorted.sort_unstable();
+        sorted.get(sorted.len() / 2).copied()
+    }
+
+    /// What the sequence number says, by the camera's own period.
+    fn expected(&self, sequence: u64) -> Option<i64> {
+        let (_, before, time) = self.last?;
+        let steps = i64::try_from(sequence.checked_sub(before)?).ok().filter(|steps| (1..1000).contains(steps))?;
+        Some(time.saturating_add(self.period()?.saturating_mul(steps)))
+    }
+
+    fn note(&mut self, stamp: i64, sequence: u64, corrected: i64) {
+        if let Some((before, number, _)) = self.last
+            && let Some(steps) = sequence.checked_sub(number).and_then(|steps| i64::try_from(steps).ok())
+            && steps > 0
+        {
+            let interval = stamp.wrapping_sub(before) / steps;
+            if (100_000..10_000_000_000).contains(&interval) {
+                self.intervals.push_back(interval);
+                if self.intervals.len() > INTERVALS {
+                    self.intervals.pop_front();
+                }
+            }
+        }
+        self.last = Some((stamp, sequence, corrected));
+    }
+
+    fn step(&mut self, by: i64) {
+        self.offset = self.offset.wrapping_add(by);
+        // The pairs keep their worth: their stamps are as if they were of the stepped clock.
+        for (stamp, _) in &mut self.pairs {
+            *stamp = stamp.wrapping_sub(by);
+        }
+        self.anchor = self.anchor.wrapping_sub(by);
+        self.suspects.clear();
+        self.unpaired.clear();
+    }
+
+    /// Least squares over the pairs, twice: the second time without what the first one found far off.
+    fn fit(&mut self) {
+        let Some(&(anchor, _)) = self.pairs.back() else { return };
+        // Small numbers: seconds before the newest pair, and nanoseconds off the offset in force.
+        let points: Vec<(f64, f64)> = self
+            .pairs
+            .iter()
+            .map(|&(stamp, master)| {
+                let off = master.wrapping_sub(stamp).wrapping_sub(self.offset);
+                (stamp.wrapping_sub(anchor) as f64 * 1e-9, off as f64)
+            })
+            .collect();
+        let mut kept = points.clone();
+        let mut line = (0.0, 0.0);
+        for _ in 0..2 {
+            line = least_squares(&kept, kept.len() >= FIRST_FIT);
+            let mut off: Vec<f64> = points.iter().map(|(x, y)| (y - line.0 - line.1 * x).abs()).collect();
+            off.sort_by(f64::total_cmp);
+            // Four standard deviations, by the median of the distances.
+            let gate = (off[off.len() / 2] * 1.4826 * 4.0).max(100_000.0);
+            kept = points.iter().copied().filter(|(x, y)| (y - line.0 - line.1 * x).abs() <= gate).collect();
+        }
+        let drift = line.1 * 1e-9;
+        if !line.0.is_finite() || drift.abs() > MOST_DRIFT_PPM * 1e-6 {
+            return;
+        }
+        let squares: f64 = kept.iter().map(|(x, y)| (y - line.0 - line.1 * x).powi(2)).sum();
+        self.offset = self.offset.wrapping_add(line.0.round() as i64);
+        (self.anchor, self.drift) = (anchor, drift);
+        self.state.residual_nanos = (squares / kept.len().max(1) as f64).sqrt();
+    }
+}
+
+/// Intercept and slope; a slope only where asked for.
+fn least_squares(points: &[(f64, f64)], with_slope: bool) -> (f64, f64) {
+    let n = points.len().max(1) as f64;
+    let (mx, my) = points.iter().fold((0.0, 0.0), |(x, y), p| (x + p.0 / n, y + p.1 / n));
+    let (sxx, sxy) =
+        points.iter().fold((0.0, 0.0), |(xx, xy), p| (xx + (p.0 - mx).powi(2), xy + (p.0 - mx) * (p.1 - my)));
+    let slope = if with_slope && sxx > 0.0 { sxy / sxx } else { 0.0 };
+    (my - slope * mx, slope)
+}
+
+/// `value` moved by whole periods to the one nearest to zero.
+fn phase(value: i64, period: i64) -> i64 {
+    let rest = value.rem_euclid(period);
+    if rest > period / 2 { rest - period } else { rest }
+}
+
+impl ClockAligner {
+    /// For the cameras of a rig; `master` is the name of one, or the first leads.
+    #[must_use]
+    pub fn new(cameras: &[CameraId], master: Option<&CameraId>) -> Self {
+        let slot = master.and_then(|master| cameras.iter().position(|id| id == master));
+        Self {
+            cameras: cameras.iter().map(|id| (id.clone(), Clock::default())).collect(),
+            master: slot.unwrap_or(0),
+            instants: VecDeque::with_capacity(INSTANTS),
+        }
+    }
+
+    /// The same frame with its capture time on the master's clock.
+    #[must_use]
+    pub fn align(&mut self, frame: Frame) -> Frame {
+        let Some(slot) = self.cameras.iter().position(|(id, _)| *id == frame.camera) else { return frame };
+        let capture_nanos = self.time(slot, frame.capture_nanos, frame.sequence);
+        Frame { capture_nanos, ..frame }
+    }
+
+    /// Every camera's clock, in rig order.
+    pub fn clocks(&self) -> impl Iterator<Item = (&CameraId, ClockState)> {
+        self.cameras.iter().map(|(id, clock)| {
+            let drift_ppm = clock.drift * 1e6;
+            let now = clock.last.map_or(clock.offset, |(stamp, ..)| clock.corrected(stamp).wrapping_sub(stamp));
+            (id, ClockState { offset_nanos: now, drift_ppm, ..clock.state })
+        })
+    }
+
+    fn time(&mut self, slot: usize, stamp: i64, sequence: u64) -> i64 {
+        let period = self.beat(slot);
+        // The newest instant that is known without this camera.
+        let now = if slot == self.master { self.others_now() } else { self.instants.back().copied() };
+        let instants = &self.instants;
+        let is_master = slot == self.master;
+        let Some((_, clock)) = self.cameras.get_mut(slot) else { return stamp };
+        let (Some(now), false) = (now, is_master && clock.last.is_none()) else {
+            // Nothing to compare with yet.
+            let time = clock.corrected(stamp);
+            clock.note(stamp, sequence, time);
+            if is_master {
+                self.instant(time);
+            }
+            return time;
+        };
+        if !is_master && !clock.is_locked {
+            acquire(clock, stamp, now, period, instants);
+        }
+        let mut time = clock.corrected(stamp);
+        let near = |time: i64| {
+            time.saturating_sub(now).saturating_abs() <= PLAUSIBLE.max(period.unwrap_or(0).saturating_mul(4))
+        };
+        let in_beat = |time: i64| {
+            let gate = |period: i64| (period / 8).max(3_000_000);
+            // Without jitter of the trigger the beat goes on from the newest instant.
+            is_master || period.is_none_or(|period| phase(time.saturating_sub(now), period).abs() <= gate(period))
+        };
+        if clock.is_locked || is_master {
+            if near(time) && in_beat(time) {
+                clock.suspects.clear();
+            } else {
+                let told = clock.expected(sequence).filter(|told| near(*told)).unwrap_or(now);
+                let off = told.saturating_sub(time);
+                let agree = |before: &i64| before.abs_diff(off) <= period.unwrap_or(20_000_000).unsigned_abs() / 4;
+                if !clock.suspects.last().is_none_or(agree) {
+                    clock.suspects.clear();
+                }
+                clock.suspects.push(off);
+                clock.state.replaced += 1;
+                if clock.suspects.len() >= CONFIRMATIONS {
+                    clock.state.steps += 1;
+                    clock.step(off);
+                    tracing::warn!("the clock stepped by {:.3} s, which is taken off", -(off as f64) * 1e-9);
+                }
+                time = told;
+            }
+        }
+        clock.note(stamp, sequence, time);
+        if is_master {
+            self.instant(time);
+        } else if clock.suspects.is_empty() {
+            clock.unpaired.push_back(stamp);
+            self.pair(slot);
+        }
+        time
+    }
+
+    /// The period that the trigger beats with, as far as a camera and the master show it.
+    fn beat(&self, slot: usize) -> Option<i64> {
+        let period = |slot: usize| self.cameras.get(slot).and_then(|(_, clock)| clock.period());
+        match (period(slot), period(self.master)) {
+            (Some(own), Some(master)) => Some(own.min(master)),
+            (own, master) => own.or(master),
+        }
+    }
+
+    /// Median of the other cameras' newest times: one of them may be wrong.
+    fn others_now(&self) -> Option<i64> {
+        let others = self.cameras.iter().enumerate().filter(|(slot, _)| *slot != self.master);
+        let mut times: Vec<i64> =
+            others.filter_map(|(_, (_, clock))| clock.is_locked.then_some(clock.last?.2)).collect();
+        times.sort_unstable();
+        times.get(times.len() / 2).copied()
+    }
+
+    /// A frame of the master came.
+    fn instant(&mut self, time: i64) {
+        self.instants.push_back(time);
+        if self.instants.len() > INSTANTS {
+            self.instants.pop_front();
+        }
+        for slot in 0..self.cameras.len() {
+            if slot != self.master {
+                self.pair(slot);
+            }
+        }
+    }
+
+    /// Pairs what lies before the master's newest instant with the nearest one.
+    fn pair(&mut self, slot: usize) {
+        let Some(period) = self.beat(slot) else { return };
+        let Some(&newest) = self.instants.back() else { return };
+        let Some((_, clock)) = self.cameras.get_mut(slot) else { return };
+        let mut fresh = false;
+        while let Some(&stamp) = clock.unpaired.front() {
+            let time = clock.corrected(stamp);
+            if time.saturating_sub(newest) > period / 4 && clock.unpaired.len() < INSTANTS {
+                break;
+            }
+            clock.unpaired.pop_front();
+            let nearest = self.instants.iter().min_by_key(|instant| instant.abs_diff(time)).copied();
+            let Some(instant) = nearest.filter(|instant| instant.abs_diff(time) <= period.unsigned_abs() / 4) else {
+                continue;
+            };
+            if clock.pairs.back().is_none_or(|(before, _)| stamp.wrapping_sub(*before).abs() >= PAIR_EVERY) {
+                clock.pairs.push_back((stamp, instant));
+                if clock.pairs.len() > PAIRS {
+                    clock.pairs.pop_front();
+                }
+                fresh = true;
+            }
+        }
+        if fresh && clock.is_locked {
+            clock.fit();
+        }
+    }
+}
+
+/// Learns the first offset: whole periods by the order of arrival where the clocks have nothing in common, the rest by the
+/// beat.
+fn acquire(clock: &mut Clock, stamp: i64, now: i64, period: Option<i64>, instants: &VecDeque<i64>) {
+    clock.acquisition.push(now.wrapping_sub(stamp));
+    if clock.acquisition.len() == 1 && now.wrapping_sub(stamp).saturating_abs() > PLAUSIBLE {
+        clock.offset = now.wrapping_sub(stamp);
+    }
+    let (true, Some(period)) = (clock.acquisition.len() >= ACQUISITION, period) else { return };
+    let median = |values: &mut Vec<i64>| {
+        values.sort_unstable();
+        values.get(values.len() / 2).copied().unwrap_or(0)
+    };
+    let rough = median(&mut clock.acquisition);
+    if rough.saturating_abs() > PLAUSIBLE {
+        clock.offset = rough;
+    }
+    let time = stamp.wrapping_add(clock.offset);
+    let mut phases: Vec<i64> = instants.iter().map(|instant| phase(instant.wrapping_sub(time), period)).collect();
+    clock.offset = clock.offset.wrapping_add(median(&mut phases));
+    clock.anchor = stamp;
+    clock.acquisition.clear();
+    clock.unpaired.clear();
+    clock.is_locked = true;
+}

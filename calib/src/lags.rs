@@ -1,0 +1,301 @@
+//! Constant lags between cameras out of what moves in their pictures, for stamps that cannot be trusted.
+
+use flyrig_types::CameraId;
+
+/// Signals are compared every so many nanoseconds.
+const STEP: i64 = 4_000_000;
+/// What is slower than this is light and background, not motion, nanoseconds.
+const TREND: i64 = 1_000_000_000;
+/// Bands of a picture whose changes are measured: fine enough for a hand, coarse enough for noise.
+const BANDS: usize = 64;
+/// Samples that two signals must have in common, besides the lags that are tried: in less than four seconds, different
+/// movements are too easily alike.
+const LEAST_COMMON: usize = 1000;
+/// Correlation below which two cameras tell nothing about each other.
+const LEAST_CORRELATION: f64 = 0.3;
+
+/// How much moves up and down in the pictures of one camera over time.
+#[derive(Debug, Clone)]
+pub struct MotionSignal {
+    camera: CameraId,
+    last: Option<(i64, Vec<f32>)>,
+    /// Time in the middle between two pictures, and how much changed a second.
+    samples: Vec<(i64, f64)>,
+}
+
+impl MotionSignal {
+    /// Of a camera, still empty.
+    #[must_use]
+    pub fn new(camera: CameraId) -> Self {
+        Self { camera, last: None, samples: Vec::new() }
+    }
+
+    /// Adds a picture of `width * height` pixels of 3 bytes. Pictures of no size, of another size than the bytes', and out
+    /// of order are left out.
+    pub fn add(&mut self, capture_nanos: i64, rgb: &[u8], width: usize, height: usize) {
+        if width == 0 || height == 0 || rgb.len() != width * height * 3 {
+            return;
+        }
+        let bands = bands(rgb, width, height);
+        if let Some((before, old)) = &self.last {
+            let dt = capture_nanos.saturating_sub(*before);
+            if dt <= 0 {
+                return;
+            }
+            if old.len() == bands.len() {
+                let changed: f64 = old.iter().zip(&bands).map(|(a, b)| f64::from((a - b).abs())).sum();
+                self.samples.push((before.saturating_add(dt / 2), changed / bands.len() as f64 / (dt as f64 * 1e-9)));
+            }
+        }
+        self.last = Some((capture_nanos, bands));
+    }
+
+    /// Pictures that were compared.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.samples.len()
+    }
+
+    /// Whether nothing was compared yet.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.samples.is_empty()
+    }
+
+    /// Every [`STEP`] from `start` on, without what is slower than [`TREND`].
+    fn sampled(&self, start: i64, count: usize) -> Vec<f64> {
+        let mut at = 0;
+        let raw: Vec<f64> = (0..count as i64)
+            .map(|i| {
+                let time = start.saturating_add(i * STEP);
+                while at + 2 < self.samples.len() && self.samples[at + 1].0 < time {
+                    at += 1;
+                }
+                let ((t0, v0), (t1, v1)) = (self.samples[at], self.samples[at + 1]);
+                let share = (time.saturating_sub(t0) as f64 / (t1.saturating_sub(t0).max(1)) as f64).clamp(0.0, 1.0);
+                v0 + (v1 - v0) * share
+            })
+            .collect();
+        let half = (TREND / STEP / 2) as usize;
+        let mut sums = vec![0.0; count + 1];
+        for (i, value) in raw.iter().enumerate() {
+            sums[i + 1] = sums[i] + value;
+        }
+        let mean = |i: usize| {
+            let (from, to) = (i.saturating_sub(half), (i + half + 1).min(count));
+            (sums[to] - sums[from]) / (to - from) as f64
+        };
+        raw.iter().enumerate().map(|(i, value)| value - mean(i)).collect()
+    }
+
+    fn span(&self) -> Option<(i64, i64)> {
+        Some((self.samples.first()?.0, self.samples.last()?.0)).filter(|_| self.samples.len() > 1)
+    }
+}
+
+/// Mean of the green channel in each of [`BANDS`] bands from top to bottom. What moves sideways stays in its band: that looks
+/// different from every side, while up and down are the same for all cameras that stand upright.
+fn bands(rgb: &[u8], width: usize, height: usize) -> Vec<f32> {
+    let count = BANDS.min(height);
+    let mut sums = vec![(0u64, 0u64); count];
+    for (y, row) in rgb.chunks_exact(width * 3).enumerate() {
+        let (sum, pixels) = &mut sums[y * count / height];
+        *sum += row.iter().skip(1).step_by(3).map(|&green| u64::from(green)).sum::<u64>();
+        *pixels += width as u64;
+    }
+    sums.into_iter().map(|(sum, pixels)| (sum as f64 / pixels.max(1) as f64) as f32).collect()
+}
+
+/// How much later than the first camera's a camera's stamps are.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LagEstimate {
+    /// Which camera.
+    pub camera: CameraId,
+    /// To be taken off its stamps, nanoseconds; none when its motion is like no other camera's.
+    pub lag_nanos: Option<i64>,
+    /// Best correlation of its motion with another camera's, 0 to 1.
+    pub correlation: f64,
+    /// Root mean square of what the pairs of cameras disagree by, nanoseconds.
+    pub disagreement_nanos: f64,
+}
+
+/// Lags of all cameras against the first one, each at most `most_nanos`. What moves is seen by all, from other sides: the
+/// lag of a pair is where their changes correlate best, and the lags of all follow from the pairs by weighted least
+/// squares.
+#[must_use]
+pub fn estimate_lags(signals: &[MotionSignal], most_nanos: i64) -> Vec<LagEstimate> {
+    let count = signals.len();
+    let mut pairs = Vec::new();
+    for i in 0..count {
+        for j in i + 1..count {
+            if let Some((lag, correlation)) = pair_lag(&signals[i], &signals[j], most_nanos.clamp(STEP, 10_000_000_000))
+            {
+                pairs.push((i, j, lag, correlation));
+            }
+        }
+    }
+    let known: Vec<_> = pairs.iter().copied().filter(|pair| pair.3 >= LEAST_CORRELATION).collect();
+    // Gauss-Seidel: each camera where its partners want it. The first one stays at 0.
+    let mut lags = vec![0.0; count];
+    let mut reached = vec![false; count];
+    if let Some(first) = reached.first_mut() {
+        *first = true;
+    }
+    for _ in 0..200 {
+        for slot in 1..count {
+            let (mut sum, mut weights) = (0.0, 0.0);
+            for &(i, j, lag, correlation) in &known {
+                let wish = match (i == slot, j == slot) {
+                    (true, false) if reached[j] => lags[j] - lag,
+                    (false, true) if reached[i] => lags[i] + lag,
+                    _ => continue,
+                };
+                let weight = correlation.powi(4);
+                (sum, weights) = (sum + weight * wish, weights + weight);
+            }
+            if weights > 0.0 {
+                (lags[slot], reached[slot]) = (sum / weights, true);
+            }
+        }
+    }
+    let of = |slot: usize| pairs.iter().filter(move |(i, j, ..)| *i == slot || *j == slot);
+    (0..count)
+        .map(|slot| {
+            let squares: Vec<f64> = known
+                .iter()
+                .filter(|(i, j, ..)| *i == slot || *j == slot)
+                .map(|&(i, j, lag, _)| (lags[j] - lags[i] - lag).powi(2))
+                .collect();
+            LagEstimate {
+                camera: signals[slot].camera.clone(),
+                lag_nanos: reached[slot].then_some(lags[slot].round() as i64),
+                correlation: of(slot).map(|pair| pair.3).fold(0.0, f64::max),
+                disagreement_nanos: (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt(),
+            }
+        })
+        .collect()
+}
+
+/// How much later `b`'s motion is than `a`'s, nanoseconds, and the correlation there.
+fn pair_lag(a: &MotionSignal, b: &MotionSignal, most: i64) -> Option<(f64, f64)> {
+    let ((a0, a1), (b0, b1)) = (a.span()?, b.span()?);
+    let (start, end) = (a0.max(b0), a1.min(b1));
+    let count = usize::try_from(end.saturating_sub(start) / STEP).ok()?.min(200_000);
+    let shifts = usize::try_from(most / STEP).ok()?;
+    if count < LEAST_COMMON + 2 * shifts {
+        return None;
+    }
+    let (a, b) = (a.sampled(start, count), b.sampled(start, count));
+    let inner = &a[shifts..count - shifts];
+    let score = |shift: usize| {
+        let other = &b[shift..shift + inner.len()];
+        let (mut ab, mut aa, mut bb) = (0.0, 0.0, 0.0);
+        for (x, y) in inner.iter().zip(other) {
+            ab += x * y;
+            aa += x * x;
+            bb += y * y;
+        }
+        if aa > 0.0 && bb > 0.0 { ab / (aa * bb).sqrt() } else { 0.0 }
+    };
+    let scores: Vec<f64> = (0..=2 * shifts).map(score).collect();
+    let best = (0..scores.len()).max_by(|x, y| scores[*x].total_cmp(&scores[*y]))?;
+    // A peak at the edge is a slope that goes on beyond.
+    let (&before, &after) = (scores.get(best.checked_sub(1)?)?, scores.get(best + 1)?);
+    let curve = before - 2.0 * scores[best] + after;
+    let fine = if curve < 0.0 { (0.5 * (before - after) / curve).clamp(-0.5, 0.5) } else { 0.0 };
+    Some(((best as f64 + fine - shifts as f64) * STEP as f64, scores[best].clamp(0.0, 1.0)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::Random;
+
+    const PERIOD: i64 = 33_333_333;
+
+    /// Where two hands of a person are: sums of slow swings.
+    fn hands(seed: u64) -> impl Fn(f64) -> [f64; 4] {
+        let mut random = Random(seed);
+        let swings: Vec<[f64; 3]> =
+            (0..24).map(|_| [0.3 + 1.5 * random.unit(), 6.3 * random.unit(), 3.0 + 3.0 * random.unit()]).collect();
+        move |t| {
+            std::array::from_fn(|hand| {
+                swings.iter().skip(hand * 6).take(6).map(|[f, p, size]| size * (6.3 * f * t + p).sin()).sum()
+            })
+        }
+    }
+
+    /// A camera's pictures: two blobs where it sees the hands from its side, and noise.
+    fn signal(seed: u64, camera: usize, lag: i64, seconds: i64) -> MotionSignal {
+        let (hands, mut random) = (hands(seed), Random(seed * 100 + camera as u64));
+        let mut signal = MotionSignal::new(format!("cam{camera}").into());
+        let (side, angle) = (96usize, camera as f64 * 0.8);
+        let phase = (random.unit() * PERIOD as f64) as i64;
+        for n in 0..seconds * 30 {
+            let truth = n * PERIOD + phase;
+            let [x0, y0, x1, y1] = hands(truth as f64 * 1e-9);
+            let see = |x: f64, y: f64| [48.0 + x * angle.cos() + y * angle.sin(), 48.0 + y * 0.9];
+            let blobs = [see(x0, y0), see(x1, y1)];
+            let rgb: Vec<u8> = (0..side * side)
+                .flat_map(|i| {
+                    let (x, y) = ((i % side) as f64, (i / side) as f64);
+                    let light: f64 = blobs
+                        .iter()
+                        .map(|[bx, by]| 150.0 * (-((x - bx).powi(2) + (y - by).powi(2)) / 40.0).exp())
+                        .sum();
+                    [(60.0 + light + 6.0 * random.unit()).min(255.0) as u8; 3]
+                })
+                .collect();
+            signal.add(truth + lag, &rgb, side, side);
+        }
+        signal
+    }
+
+    #[test]
+    fn random_lags_are_found_within_a_few_milliseconds() {
+        let mut random = Random(9);
+        let mut worst = 0.0f64;
+        for seed in 1..4 {
+            let lags: Vec<i64> =
+                (0..4).map(|i| if i == 0 { 0 } else { ((random.unit() - 0.5) * 240e6) as i64 }).collect();
+            let signals: Vec<MotionSignal> =
+                lags.iter().enumerate().map(|(camera, lag)| signal(seed, camera, *lag, 12)).collect();
+            for (estimate, lag) in estimate_lags(&signals, 300_000_000).iter().zip(&lags) {
+                let off = (estimate.lag_nanos.unwrap() - lag) as f64 * 1e-6;
+                println!("seed {seed} {}: {:.1} ms, off by {off:.2} ms", estimate.camera, *lag as f64 * 1e-6);
+                worst = worst.max(off.abs());
+            }
+        }
+        assert!(worst <= 3.0, "{worst} ms");
+    }
+
+    #[test]
+    fn a_camera_that_sees_nothing_of_it_is_told() {
+        let mut signals: Vec<MotionSignal> = (0..2).map(|camera| signal(5, camera, 0, 12)).collect();
+        let mut still = MotionSignal::new("wall".into());
+        for n in 0..360 {
+            still.add(n * PERIOD, &[90; 48 * 48 * 3], 48, 48);
+        }
+        signals.push(still);
+        let estimates = estimate_lags(&signals, 300_000_000);
+        assert!(estimates[1].lag_nanos.is_some());
+        assert_eq!((estimates[2].lag_nanos, estimates[2].correlation), (None, 0.0));
+    }
+
+    #[test]
+    fn too_little_and_senseless_input_is_borne() {
+        assert!(estimate_lags(&[], 1).is_empty());
+        let mut odd = MotionSignal::new("odd".into());
+        odd.add(0, &[1, 2, 3], 0, 5);
+        odd.add(0, &[1, 2, 3], 1, 1);
+        odd.add(i64::MAX, &[1, 2, 9], 1, 1);
+        odd.add(i64::MIN, &[1, 2, 3], 1, 1);
+        odd.add(i64::MAX, &[0; 12], 2, 2);
+        assert_eq!(odd.len(), 1);
+        let estimates = estimate_lags(&[odd.clone(), odd.clone(), MotionSignal::new("none".into())], i64::MAX);
+        assert_eq!(estimates[2].lag_nanos, None);
+        assert_eq!(estimates[0].lag_nanos, Some(0));
+        let short: Vec<MotionSignal> = (0..2).map(|camera| signal(6, camera, 0, 3)).collect();
+        assert_eq!(estimate_lags(&short, 100_000_000)[1].lag_nanos, None, "three seconds tell nothing");
+    }
+}

@@ -1,0 +1,122 @@
+//! Playing a recording.
+
+use std::{
+    fs::File,
+    io::BufReader,
+    path::{Path, PathBuf},
+    time::Duration,
+};
+
+use flyrig_types::{CameraId, Frame};
+use mcap::io::MessageReader;
+
+use super::message::{self, TOPIC};
+use crate::{CameraSource, CaptureError, CaptureErrorKind};
+
+/// Bytes read at once.
+const BUFFER: usize = 1 << 20;
+
+/// One camera of a recording. Frames come as they were recorded, in the order of the file; one that breaks off, as after
+/// a crash, ends there with a warning.
+pub struct McapReplay {
+    camera: CameraId,
+    path: PathBuf,
+    topic: String,
+    messages: MessageReader<BufReader<File>>,
+    /// Number of the last frame in the file, of 32 bits, and in all.
+    last: Option<(u32, u64)>,
+    is_over: bool,
+}
+
+fn open(path: &Path) -> Result<MessageReader<BufReader<File>>, CaptureError> {
+    let file = File::open(path).map_err(|error| {
+        CaptureError::general(CaptureErrorKind::NotFound, format!("{} cannot be opened: {error}", path.display()))
+    })?;
+    Ok(MessageReader::new(BufReader::with_capacity(BUFFER, file)))
+}
+
+/// Topic and content of everything before the first frame of a recording.
+///
+/// # Errors
+/// `NotFound` without the file, `Corrupt` when it is no MCAP file.
+pub fn recorded_notes(path: &Path) -> Result<Vec<(String, Vec<u8>)>, CaptureError> {
+    let mut notes = Vec::new();
+    for message in open(path)? {
+        match message {
+            Ok(message) if message.channel.topic.starts_with(TOPIC) => break,
+            Ok(message) => notes.push((message.channel.topic.clone(), message.data.into_owned())),
+            Err(error) if notes.is_empty() => {
+                let text = format!("{} is no recording: {error}", path.display());
+                return Err(CaptureError::general(CaptureErrorKind::Corrupt, text));
+            }
+            // Cut off: what came before counts.
+            Err(_) => break,
+        }
+    }
+    Ok(notes)
+}
+
+impl McapReplay {
+    /// Opens a file for one camera; each camera reads the file by itself.
+    ///
+    /// # Errors
+    /// `NotFound` without the file. A camera that is not in it ends at once.
+    pub fn open(camera: &CameraId, path: &Path) -> Result<Self, CaptureError> {
+        Ok(Self {
+            camera: camera.clone(),
+            path: path.to_owned(),
+            topic: format!("{TOPIC}{camera}"),
+            messages: open(path).map_err(|error| error.of(camera))?,
+            last: None,
+            is_over: false,
+        })
+    }
+
+    fn end(&mut self) -> CaptureError {
+        self.is_over = true;
+        CaptureError::new(&self.camera, CaptureErrorKind::EndOfStream, "the recording is over")
+    }
+}
+
+impl CameraSource for McapReplay {
+    fn camera(&self) -> &CameraId {
+        &self.camera
+    }
+
+    fn next_frame(&mut self, _timeout: Duration) -> Result<Frame, CaptureError> {
+        while !self.is_over {
+            let message = match self.messages.next() {
+                Some(Ok(message)) => message,
+                Some(Err(error)) => {
+                    tracing::warn!("camera {}: {} breaks off: {error}", self.camera, self.path.display());
+                    return Err(self.end());
+                }
+                None => break,
+            };
+            if message.channel.topic != self.topic {
+                continue;
+            }
+            let sequence = self.last.map_or(u64::from(message.sequence), |(before, counted)| {
+                counted.wrapping_add(u64::from(message.sequence.wrapping_sub(before)))
+            });
+            self.last = Some((message.sequence, sequence));
+            let schema = message.channel.schema.as_ref().map_or("", |schema| schema.name.as_str());
+            let image = message::decode(&self.camera, schema, message.data.into_owned())?;
+            return Ok(Frame {
+                camera: self.camera.clone(),
+                sequence,
+                capture_nanos: i64::try_from(message.log_time).unwrap_or(i64::MAX),
+                exposure_nanos: message::exposure_nanos(&message.channel.metadata),
+                image,
+                mask: None,
+            });
+        }
+        Err(self.end())
+    }
+}
+
+impl std::fmt::Debug for McapReplay {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("McapReplay").field("camera", &self.camera).field("path", &self.path).finish_non_exhaustive()
+    }
+}

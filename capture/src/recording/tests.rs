@@ -1,0 +1,207 @@
+//! What is recorded comes back, whatever ends the recording.
+
+use std::{
+    fs,
+    io::{self, Cursor, Seek, SeekFrom, Write},
+    path::Path,
+    time::Duration,
+};
+
+use flyrig_types::{CameraId, Frame, Image, PixelFormat};
+
+use super::{McapReplay, Note, Recorder, recorded_notes};
+use crate::{CameraSource, CaptureError, CaptureErrorKind};
+
+struct Script(CameraId, u64, u64);
+
+fn jpeg() -> Vec<u8> {
+    let mut bytes = Cursor::new(Vec::new());
+    image::RgbImage::from_pixel(16, 8, image::Rgb([9, 80, 200]))
+        .write_to(&mut bytes, image::ImageFormat::Jpeg)
+        .unwrap();
+    bytes.into_inner()
+}
+
+/// Frame `n` of a camera: raw pictures of camera "a", JPEG pictures of every other.
+fn frame(camera: &CameraId, n: u64) -> Frame {
+    let image = if camera.as_str() == "a" {
+        Image::new(4, 2, PixelFormat::Yuyv, vec![n as u8; 16])
+    } else {
+        Image::new(16, 8, PixelFormat::Mjpeg, jpeg())
+    };
+    let exposure_nanos = (camera.as_str() == "a").then_some(8_000_000);
+    let (camera, sequence) = (camera.clone(), n * 2);
+    Frame { camera, sequence, capture_nanos: n as i64 * 33_000_000, exposure_nanos, image: image.unwrap(), mask: None }
+}
+
+impl CameraSource for Script {
+    fn camera(&self) -> &CameraId {
+        &self.0
+    }
+
+    fn next_frame(&mut self, _timeout: Duration) -> Result<Frame, CaptureError> {
+        if self.1 == self.2 {
+            return Err(CaptureError::new(&self.0, CaptureErrorKind::EndOfStream, "over"));
+        }
+        self.1 += 1;
+        Ok(frame(&self.0, self.1 - 1))
+    }
+}
+
+fn note() -> Note {
+    let schema = ("flyrig.Test".to_owned(), "protobuf".to_owned(), vec![1]);
+    Note { topic: "calibration/a".to_owned(), schema, payload: vec![1, 2, 3] }
+}
+
+fn pass(source: &mut impl CameraSource) -> u64 {
+    (0..).take_while(|_| source.next_frame(Duration::ZERO).is_ok()).count() as u64
+}
+
+fn record(path: &Path, frames: u64) {
+    let recorder = Recorder::create(path, &[note()]).unwrap();
+    let mut taps = ["a", "b"].map(|name| recorder.tap(Script(name.into(), 0, frames)));
+    for tap in &mut taps {
+        assert_eq!(pass(tap), frames);
+    }
+    drop(taps);
+    let state = recorder.finish();
+    assert_eq!((state.frames, state.problem), (2 * frames, None));
+}
+
+fn replayed(path: &Path, camera: &str) -> Vec<Frame> {
+    let mut replay = McapReplay::open(&camera.into(), path).unwrap();
+    std::iter::from_fn(|| replay.next_frame(Duration::ZERO).ok()).collect()
+}
+
+fn same(found: &Frame, wanted: &Frame) {
+    let all = |f: &Frame| (f.camera.clone(), f.sequence, f.capture_nanos, f.exposure_nanos, f.image.format());
+    assert_eq!(all(found), all(wanted));
+    assert_eq!((found.image.width(), found.image.height()), (wanted.image.width(), wanted.image.height()));
+    assert_eq!(found.image.bytes(), wanted.image.bytes());
+}
+
+#[test]
+fn a_replay_gives_the_very_frames() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("take.mcap");
+    record(&path, 30);
+    for camera in ["a", "b"] {
+        let frames = replayed(&path, camera);
+        assert_eq!(frames.len(), 30);
+        for (found, n) in frames.iter().zip(0..) {
+            same(found, &frame(&camera.into(), n));
+        }
+    }
+    assert_eq!(recorded_notes(&path).unwrap(), [("calibration/a".to_owned(), vec![1, 2, 3])]);
+    assert!(replayed(&path, "nobody").is_empty());
+}
+
+#[test]
+fn the_file_has_an_index_that_other_readers_use() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("take.mcap");
+    record(&path, 30);
+    let bytes = fs::read(&path).unwrap();
+    let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
+    let statistics = summary.stats.unwrap();
+    assert_eq!((statistics.message_count, statistics.channel_count), (61, 3));
+    assert!(!summary.chunk_indexes.is_empty());
+    let schemas: Vec<&str> = summary.schemas.values().map(|schema| schema.name.as_str()).collect();
+    for name in ["foxglove.CompressedImage", "foxglove.RawImage"] {
+        assert!(schemas.contains(&name), "{schemas:?}");
+    }
+}
+
+#[test]
+fn a_file_is_never_written_over() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("take.mcap");
+    fs::write(&path, "precious").unwrap();
+    let error = Recorder::create(&path, &[]).unwrap_err();
+    assert!(error.message.contains("take.mcap cannot be recorded to"), "{error}");
+    assert_eq!(fs::read(&path).unwrap(), b"precious");
+}
+
+/// As a killed process leaves it: cut anywhere, a prefix of the frames comes back, at most a chunk is lost.
+#[test]
+fn every_cut_of_a_recording_gives_the_frames_before_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, cut) = (folder.path().join("take.mcap"), folder.path().join("cut.mcap"));
+    let recorder = Recorder::create(&path, &[note()]).unwrap();
+    let mut sizes = Vec::new();
+    for round in 0..4u64 {
+        let mut tap = recorder.tap(Script("a".into(), round * 10, round * 10 + 10));
+        assert_eq!(pass(&mut tap), 10);
+        drop(tap);
+        // Until the chunk is on the disk: half a second after its first frame.
+        let before = sizes.last().copied().unwrap_or(0);
+        while recorder.state().frames < (round + 1) * 10 || fs::metadata(&path).unwrap().len() <= before + 1000 {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        sizes.push(fs::metadata(&path).unwrap().len());
+    }
+    // Killed here: the file on the disk has no end.
+    let on_disk = fs::read(&path).unwrap();
+    for length in (0..=on_disk.len()).step_by(97).chain(sizes.iter().map(|size| *size as usize)) {
+        fs::write(&cut, &on_disk[..length]).unwrap();
+        let frames = replayed(&cut, "a");
+        for (found, n) in frames.iter().zip(0..) {
+            same(found, &frame(&"a".into(), n));
+        }
+        let whole_chunks = sizes.iter().filter(|size| **size as usize <= length).count();
+        assert!(frames.len() >= whole_chunks * 10, "{length}: {} frames of {whole_chunks} chunks", frames.len());
+    }
+    assert_eq!(recorder.finish().frames, 40);
+}
+
+/// A disk with so much room.
+struct Small(Cursor<Vec<u8>>, usize);
+
+impl Write for Small {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.0.get_ref().len() + bytes.len() > self.1 {
+            return Err(io::Error::from(io::ErrorKind::StorageFull));
+        }
+        self.0.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Seek for Small {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        self.0.seek(to)
+    }
+}
+
+#[test]
+fn a_full_disk_stops_the_recording_and_not_the_cameras() {
+    let recorder = Recorder::start(Small(Cursor::new(Vec::new()), 3000), &[]).unwrap();
+    let mut tap = recorder.tap(Script("a".into(), 0, 100_000));
+    let mut passed = 0;
+    while recorder.state().problem.is_none() {
+        assert!(tap.next_frame(Duration::ZERO).is_ok(), "the camera was held up after {passed} frames");
+        passed += 1;
+        std::thread::yield_now();
+        if passed == 100_000 {
+            break;
+        }
+    }
+    let mut more = recorder.tap(Script("b".into(), 0, 50));
+    assert_eq!(pass(&mut more), 50, "cameras go on");
+    drop((tap, more));
+    let problem = recorder.finish().problem.unwrap();
+    assert!(problem.contains("free space on the disk") || problem.contains("slower than the cameras"), "{problem}");
+}
+
+#[test]
+fn what_is_no_recording_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.mcap");
+    assert_eq!(McapReplay::open(&"a".into(), &path).unwrap_err().kind, CaptureErrorKind::NotFound);
+    fs::write(&path, b"not an mcap file at all").unwrap();
+    assert_eq!(recorded_notes(&path).unwrap_err().kind, CaptureErrorKind::Corrupt);
+    assert!(replayed(&path, "a").is_empty());
+}

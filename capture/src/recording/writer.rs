@@ -1,0 +1,245 @@
+//! Writing a recording beside a running rig.
+
+use std::{
+    fs::OpenOptions,
+    io::{BufWriter, Seek, Write},
+    path::Path,
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicUsize, Ordering},
+    },
+    thread::{Builder, JoinHandle},
+    time::{Duration, Instant},
+};
+
+use crossbeam::channel::{Receiver, RecvTimeoutError, Sender, TrySendError, bounded};
+use flyrig_types::{CameraId, Frame};
+use mcap::{WriteOptions, Writer, records::MessageHeader};
+
+use super::message::{self, Channel};
+use crate::{CameraSource, CaptureError, CaptureErrorKind, SourceHealth};
+
+/// A chunk ends after so many bytes or so long: what a killed process loses at most.
+const CHUNK_BYTES: u64 = 8 << 20;
+const CHUNK_TIME: Duration = Duration::from_millis(500);
+/// Frames and bytes that may wait for the disk.
+const WAITING_FRAMES: usize = 512;
+const WAITING_BYTES: usize = 512 << 20;
+
+/// Something to find in the file before the first frame, like a calibration.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Note {
+    /// Topic of the message.
+    pub topic: String,
+    /// Name, encoding and content of the message's schema.
+    pub schema: (String, String, Vec<u8>),
+    /// The message, protobuf.
+    pub payload: Vec<u8>,
+}
+
+/// How a recording stands.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Recorded {
+    /// Frames written.
+    pub frames: u64,
+    /// Their bytes.
+    pub bytes: u64,
+    /// Why it has stopped, if it has. What was written before is readable.
+    pub problem: Option<String>,
+}
+
+#[derive(Debug)]
+struct Item {
+    channel: Arc<Channel>,
+    nanos: i64,
+    sequence: u64,
+    payload: Vec<u8>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    waiting_bytes: AtomicUsize,
+    state: Mutex<Recorded>,
+}
+
+/// Writes frames to a file in a thread of its own. It never drops a frame silently: when the disk is full, gone or too
+/// slow, the recording stops and says so, and the rig goes on.
+#[derive(Debug)]
+pub struct Recorder {
+    sender: Sender<Item>,
+    shared: Arc<Shared>,
+    thread: JoinHandle<()>,
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, Recorded> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn stop(&self, problem: String) {
+        let mut state = self.lock();
+        if state.problem.is_none() {
+            tracing::error!("the recording has stopped after {} frames: {problem}", state.frames);
+            state.problem = Some(problem);
+        }
+    }
+}
+
+impl Recorder {
+    /// Makes a file, which must not be there yet, and writes the notes into it.
+    ///
+    /// # Errors
+    /// `Io` says what the system refused.
+    pub fn create(path: &Path, notes: &[Note]) -> Result<Self, CaptureError> {
+        let io = |error: &dyn std::fmt::Display| {
+            CaptureError::general(CaptureErrorKind::Io, format!("{} cannot be recorded to: {error}", path.display()))
+        };
+        let file = OpenOptions::new().write(true).create_new(true).open(path).map_err(|error| io(&error))?;
+        Self::start(BufWriter::with_capacity(1 << 20, file), notes).map_err(|error| io(&error))
+    }
+
+    pub(super) fn start<W: Write + Seek + Send + 'static>(target: W, notes: &[Note]) -> mcap::McapResult<Self> {
+        // Chunks are made in memory and written whole: a killed process leaves no half of one behind.
+        let options = WriteOptions::new().compression(None).chunk_size(None).disable_seeking(true);
+        let mut writer = Writer::with_options(target, options.library(concat!("flyrig ", env!("CARGO_PKG_VERSION"))))?;
+        for (sequence, note) in (0..).zip(notes) {
+            let (name, encoding, data) = &note.schema;
+            let schema = writer.add_schema(name, encoding, data)?;
+            let channel_id = writer.add_channel(schema, &note.topic, "protobuf", &Default::default())?;
+            let header = MessageHeader { channel_id, sequence, log_time: 0, publish_time: 0 };
+            writer.write_to_known_channel(&header, &note.payload)?;
+        }
+        writer.flush()?;
+        let (sender, receiver) = bounded(WAITING_FRAMES);
+        let shared = Arc::new(Shared { waiting_bytes: AtomicUsize::new(0), state: Mutex::default() });
+        let of_thread = Arc::clone(&shared);
+        let thread = Builder::new().name("recorder".to_owned()).spawn(move || {
+            if let Err(error) = write(writer, &receiver, &of_thread) {
+                of_thread.stop(format!("{error}; free space on the disk and record into a new file"));
+            }
+        });
+        Ok(Self { sender, shared, thread: thread.map_err(mcap::McapError::Io)? })
+    }
+
+    /// How it stands.
+    #[must_use]
+    pub fn state(&self) -> Recorded {
+        self.shared.lock().clone()
+    }
+
+    /// Records what a source gives, on its way.
+    #[must_use]
+    pub fn tap<S: CameraSource>(&self, source: S) -> Recording<S> {
+        Recording { source, sender: Some(self.sender.clone()), shared: Arc::clone(&self.shared), channel: None }
+    }
+
+    /// Waits until everything is on the disk and closes the file with its index. Every [`Recording`] must be gone.
+    #[must_use]
+    pub fn finish(self) -> Recorded {
+        drop(self.sender);
+        if self.thread.join().is_err() {
+            self.shared.stop("it failed inside".to_owned());
+        }
+        self.shared.lock().clone()
+    }
+}
+
+fn write<W: Write + Seek>(mut writer: Writer<W>, items: &Receiver<Item>, shared: &Shared) -> mcap::McapResult<()> {
+    let (mut flushed, mut unflushed) = (Instant::now(), 0u64);
+    loop {
+        match items.recv_timeout(CHUNK_TIME) {
+            Ok(item) => {
+                let (name, encoding, data) = &item.channel.schema;
+                let schema = writer.add_schema(name, encoding, data)?;
+                let channel_id = writer.add_channel(schema, &item.channel.topic, "protobuf", &item.channel.metadata)?;
+                let log_time = u64::try_from(item.nanos).unwrap_or(0);
+                let sequence = item.sequence as u32;
+                let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
+                writer.write_to_known_channel(&header, &item.payload)?;
+                shared.waiting_bytes.fetch_sub(item.payload.len(), Ordering::Relaxed);
+                unflushed += item.payload.len() as u64;
+                let mut state = shared.lock();
+                state.frames += 1;
+                state.bytes += item.payload.len() as u64;
+                // A frame that could not wait has ended it.
+                if state.problem.is_some() {
+                    break;
+                }
+            }
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => break,
+        }
+        if unflushed >= CHUNK_BYTES || (unflushed > 0 && flushed.elapsed() >= CHUNK_TIME) {
+            writer.flush()?;
+            (flushed, unflushed) = (Instant::now(), 0);
+        }
+    }
+    writer.finish()?;
+    writer.into_inner().flush()?;
+    Ok(())
+}
+
+/// A source whose frames are recorded as they pass, in the form in which they pass.
+#[derive(Debug)]
+pub struct Recording<S> {
+    source: S,
+    /// None once the recording has stopped.
+    sender: Option<Sender<Item>>,
+    shared: Arc<Shared>,
+    channel: Option<Arc<Channel>>,
+}
+
+impl<S> Recording<S> {
+    fn record(&mut self, frame: &Frame) {
+        let Some(sender) = &self.sender else { return };
+        if self.shared.lock().problem.is_some() {
+            self.sender = None;
+            return;
+        }
+        let channel = Channel::of(frame);
+        let channel = match &self.channel {
+            Some(before) if **before == channel => Arc::clone(before),
+            _ => Arc::new(channel),
+        };
+        self.channel = Some(Arc::clone(&channel));
+        let payload = match message::encode(frame) {
+            Ok(payload) => payload,
+            Err(error) => return self.shared.stop(error.to_string()),
+        };
+        let length = payload.len();
+        let too_slow = || {
+            let text = "the disk is slower than the cameras; record to a faster one, or send MJPEG";
+            self.shared.stop(text.to_owned());
+        };
+        if self.shared.waiting_bytes.fetch_add(length, Ordering::Relaxed) > WAITING_BYTES {
+            return too_slow();
+        }
+        let item = Item { channel, nanos: frame.capture_nanos, sequence: frame.sequence, payload };
+        match sender.try_send(item) {
+            Ok(()) => {}
+            Err(TrySendError::Full(_)) => too_slow(),
+            // The thread has told why it ended.
+            Err(TrySendError::Disconnected(_)) => self.sender = None,
+        }
+    }
+}
+
+impl<S: CameraSource> CameraSource for Recording<S> {
+    fn camera(&self) -> &CameraId {
+        self.source.camera()
+    }
+
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
+        let frame = self.source.next_frame(timeout)?;
+        self.record(&frame);
+        Ok(frame)
+    }
+
+    fn order_nanos(&self, frame: &Frame) -> i64 {
+        self.source.order_nanos(frame)
+    }
+
+    fn health(&self) -> SourceHealth {
+        self.source.health()
+    }
+}

@@ -1,0 +1,372 @@
+//! One camera's stream: connecting, watching over it, and connecting again.
+
+use std::{
+    fs, io,
+    path::{Path, PathBuf},
+    sync::Arc,
+    time::Duration,
+};
+
+use flyrig_types::{CameraId, Frame, Image};
+
+use super::{
+    controls::{self, ControlDevice, ControlError},
+    format::{fourcc_text, pack},
+    identity,
+    modes::{self, Mode, Offer, SAME_RATE},
+    queue::{BufferDevice, BufferQueue},
+    stamps::{Sequence, Stamps},
+    sys::{ActiveFormat, SizeRange},
+};
+use crate::{BufferPool, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, SourceHealth};
+
+/// A camera that has sent frames is silent after so many periods without one, but not before [`SILENT_AFTER`].
+const SILENT_PERIODS: f64 = 5.0;
+const SILENT_AFTER: Duration = Duration::from_millis(500);
+/// A camera that has just been started may take so long until its first frame.
+const FIRST_FRAME: Duration = Duration::from_secs(5);
+/// Frames older than this when the first one is asked for piled up while other cameras were opened.
+const STALE: Duration = Duration::from_millis(200);
+/// Free buffers that are kept for frames to come.
+const POOLED_FRAMES: usize = 16;
+
+/// A device that can be set up and streamed from.
+pub(crate) trait CameraDevice: BufferDevice + ControlDevice {
+    fn formats(&self) -> io::Result<Vec<[u8; 4]>>;
+    fn sizes(&self, fourcc: [u8; 4]) -> io::Result<Vec<SizeRange>>;
+    fn rates(&self, fourcc: [u8; 4], width: u32, height: u32) -> io::Result<Vec<f64>>;
+    fn set_format(&mut self, fourcc: [u8; 4], width: u32, height: u32) -> io::Result<ActiveFormat>;
+    fn set_rate(&mut self, fps: f64) -> io::Result<Option<f64>>;
+}
+
+/// The world around a stream: finds the device and tells the time; scripted in tests.
+pub(crate) trait Host: Send {
+    type Device: CameraDevice + Send;
+    /// The device, its node, and the speed of its USB link where it has one.
+    fn open(&mut self, identity: &CameraIdentity) -> Result<(Self::Device, PathBuf, Option<u32>), CaptureError>;
+    /// `CLOCK_MONOTONIC`.
+    fn now_nanos(&self) -> i64;
+}
+
+/// A camera as a source of frames in its own pixel format.
+#[derive(Debug)]
+pub(crate) struct Stream<H: Host> {
+    camera: CameraId,
+    options: CameraOptions,
+    host: H,
+    session: Option<Session<H::Device>>,
+    /// Steps down that were needed so far; they stay when the camera comes back.
+    rung: usize,
+    stamps: Stamps,
+    sequence: Sequence,
+    health: SourceHealth,
+    pool: Arc<BufferPool>,
+}
+
+/// From one STREAMON to its end.
+#[derive(Debug)]
+struct Session<D: BufferDevice> {
+    queue: BufferQueue<D>,
+    active: ActiveFormat,
+    fps: f64,
+    exposure_nanos: Option<u64>,
+    /// Arrival of the last frame, or the start of the stream.
+    last_nanos: i64,
+    is_flowing: bool,
+    was_asked: bool,
+}
+
+impl<H: Host> Stream<H> {
+    /// Connects at once, so that what is wrong is told at the start.
+    pub fn open(camera: &CameraId, options: &CameraOptions, host: H) -> Result<Self, CaptureError> {
+        let mut stream = Self {
+            camera: camera.clone(),
+            options: options.clone(),
+            host,
+            session: None,
+            rung: 0,
+            stamps: Stamps::default(),
+            sequence: Sequence::default(),
+            health: SourceHealth::default(),
+            pool: BufferPool::new(POOLED_FRAMES),
+        };
+        let session = stream.connect().map_err(|error| error.of(camera))?;
+        stream.session = Some(session);
+        Ok(stream)
+    }
+
+    #[cfg(test)]
+    pub fn device(&mut self) -> Option<&mut H::Device> {
+        self.session.as_mut().map(|session| session.queue.device())
+    }
+
+    #[cfg(test)]
+    pub fn host(&self) -> &H {
+        &self.host
+    }
+
+    fn connect(&mut self) -> Result<Session<H::Device>, CaptureError> {
+        let unsupported = |text: String| CaptureError::general(CaptureErrorKind::Unsupported, text);
+        let (device, node, usb_speed) = self.host.open(&self.options.identity)?;
+        let (width, height) = (self.options.width, self.options.height);
+        let offers = offers(&device, width, height)
+            .map_err(|error| explain(&error, "cannot be asked for its formats", &node))?;
+        let camera_bytes = usb_speed.map(|speed| modes::usb_capacity(speed).1);
+        let ladder = modes::ladder(self.options.format, self.options.fps, (width, height), &offers, camera_bytes)
+            .map_err(|text| unsupported(format!("{text} ({})", node.display())))?;
+        let mut queue = BufferQueue::new(device);
+        let rung = self.rung.min(ladder.len().saturating_sub(1));
+        for (step, mode) in ladder.iter().enumerate().skip(rung) {
+            let active = queue
+                .device()
+                .set_format(mode.fourcc, width, height)
+                .map_err(|error| explain(&error, "does not take its format", &node))?;
+            if (active.fourcc, active.width, active.height) != (mode.fourcc, width, height) {
+                return Err(unsupported(format!(
+                    "sends {} {}x{} instead of {} {width}x{height}; set width and height to a size that it has",
+                    fourcc_text(active.fourcc),
+                    active.width,
+                    active.height,
+                    fourcc_text(mode.fourcc)
+                )));
+            }
+            let rate = queue.device().set_rate(mode.fps);
+            let fps = rate.map_err(|error| explain(&error, "does not take its frame rate", &node))?.unwrap_or(mode.fps);
+            if (fps / mode.fps - 1.0).abs() > SAME_RATE {
+                tracing::warn!(
+                    "camera {}: {:.2} frames a second were asked for, it runs at {fps:.2}",
+                    self.camera,
+                    mode.fps
+                );
+            }
+            match queue.start(self.options.buffers) {
+                Ok(()) => {
+                    self.rung = step;
+                    return self.set_up(queue, active, fps, mode, &node);
+                }
+                Err(error) if error.raw_os_error() == Some(libc::ENOSPC) => {
+                    let next = ladder.get(step + 1);
+                    let next = next.map_or_else(
+                        || "nothing is left to try".to_owned(),
+                        |next| format!("trying {}", describe(next)),
+                    );
+                    tracing::warn!("camera {}: its bus has no room for {}; {next}", self.camera, describe(mode));
+                }
+                Err(error) => return Err(explain(&error, "cannot be started", &node)),
+            }
+        }
+        Err(CaptureError::general(
+            CaptureErrorKind::Io,
+            format!(
+                "its USB bus has no room for it, even as {}; plug it into a port of another controller (`flyrig doctor` shows \
+                 who shares a bus)",
+                ladder.last().map(describe).unwrap_or_default()
+            ),
+        ))
+    }
+
+    fn set_up(
+        &mut self,
+        mut queue: BufferQueue<H::Device>,
+        active: ActiveFormat,
+        fps: f64,
+        mode: &Mode,
+        node: &Path,
+    ) -> Result<Session<H::Device>, CaptureError> {
+        // Some cameras forget their settings when a stream starts.
+        let (exposure_nanos, warnings) =
+            controls::apply(&self.options.controls, queue.device()).map_err(|error| match error {
+                ControlError::Refused(text) => CaptureError::general(CaptureErrorKind::Unsupported, text),
+                ControlError::Io(error) => explain(&error, "does not take its settings", node),
+            })?;
+        for warning in warnings {
+            tracing::warn!("camera {}: {warning}", self.camera);
+        }
+        self.health.mode = format!("{} {}x{} at {fps:.2}", fourcc_text(mode.fourcc), active.width, active.height);
+        self.sequence.restart();
+        tracing::debug!("camera {}: {} as {}", self.camera, node.display(), self.health.mode);
+        Ok(Session {
+            queue,
+            active,
+            fps,
+            exposure_nanos,
+            last_nanos: self.host.now_nanos(),
+            is_flowing: false,
+            was_asked: false,
+        })
+    }
+
+    fn read(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
+        if self.session.is_none() {
+            let session = self.connect().map_err(|error| match error.kind {
+                // It was there once and may come back, changed settings of another program included.
+                CaptureErrorKind::NotFound | CaptureErrorKind::Unsupported => {
+                    CaptureError { kind: CaptureErrorKind::Disconnected, ..error }
+                }
+                _ => error,
+            })?;
+            self.session = Some(session);
+            self.health.reconnects += 1;
+            tracing::info!("camera {}: is back as {}", self.camera, self.health.mode);
+        }
+        let Some(session) = &mut self.session else {
+            return Err(CaptureError::general(CaptureErrorKind::Disconnected, "is not connected"));
+        };
+        let now = self.host.now_nanos();
+        let nanos = |time: Duration| i64::try_from(time.as_nanos()).unwrap_or(i64::MAX);
+        if !std::mem::replace(&mut session.was_asked, true) && now.saturating_sub(session.last_nanos) > nanos(STALE) {
+            session.discard(self.options.buffers).map_err(|error| lost(&error))?;
+        }
+        // It must not take longer to notice silence than the caller waits.
+        let silent_after = session.silent_after();
+        let patience = nanos(silent_after).saturating_sub(now.saturating_sub(session.last_nanos));
+        let patience = Duration::from_nanos(u64::try_from(patience).unwrap_or(0));
+        let lease = session.queue.next(timeout.min(patience)).map_err(|error| lost(&error))?;
+        let arrival = self.host.now_nanos();
+        let Some(lease) = lease else {
+            if patience > timeout {
+                return Err(CaptureError::general(CaptureErrorKind::Timeout, "no frame yet"));
+            }
+            self.health.silences += 1;
+            let text = format!("gave no frame for {} ms; starting it again", silent_after.as_millis());
+            return Err(CaptureError::general(CaptureErrorKind::Disconnected, text));
+        };
+        session.last_nanos = arrival;
+        session.is_flowing = true;
+        let number = self.sequence.count(lease.buffer.sequence);
+        self.health.lost_by_driver = self.sequence.lost;
+        let corrupt =
+            |text: String| CaptureError::general(CaptureErrorKind::Corrupt, format!("frame {number}: {text}"));
+        if lease.buffer.is_broken {
+            return Err(corrupt("the driver says that it is damaged".to_owned()));
+        }
+        let mut bytes = self.pool.take();
+        let packed = pack(&session.active, |plane| lease.plane(plane), &mut bytes);
+        let (stamp, source) = (lease.buffer.stamp_nanos, lease.buffer.stamp_source);
+        drop(lease);
+        let format = packed.map_err(corrupt)?;
+        let (width, height) = (session.active.width, session.active.height);
+        let image = Image::new(width, height, format, self.pool.lease(bytes));
+        let exposure = session.exposure_nanos;
+        let whole = exposure.unwrap_or(0) as f64 + self.options.readout_secs * 1e9;
+        let capture = self.stamps.capture_nanos(stamp, source, arrival, (whole / 2.0) as i64);
+        self.health.stamps_replaced = self.stamps.replaced;
+        Ok(Frame {
+            camera: self.camera.clone(),
+            sequence: number,
+            capture_nanos: capture.saturating_sub((self.options.lag_secs * 1e9) as i64),
+            exposure_nanos: exposure,
+            image: image.map_err(|error| corrupt(error.to_string()))?,
+            mask: None,
+        })
+    }
+}
+
+impl<D: BufferDevice> Session<D> {
+    fn silent_after(&self) -> Duration {
+        if self.is_flowing {
+            SILENT_AFTER.max(Duration::from_secs_f64(SILENT_PERIODS / self.fps.clamp(0.1, 1e6)))
+        } else {
+            FIRST_FRAME
+        }
+    }
+
+    /// Gives back what has waited since before anybody asked.
+    fn discard(&mut self, buffers: u32) -> io::Result<()> {
+        for _ in 0..buffers {
+            if self.queue.next(Duration::ZERO)?.is_none() {
+                break;
+            }
+        }
+        Ok(())
+    }
+}
+
+impl<H: Host> CameraSource for Stream<H> {
+    fn camera(&self) -> &CameraId {
+        &self.camera
+    }
+
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
+        let result = self.read(timeout);
+        if matches!(&result, Err(error) if matches!(error.kind, CaptureErrorKind::Disconnected | CaptureErrorKind::Io))
+        {
+            self.session = None;
+        }
+        result.map_err(|error| error.of(&self.camera))
+    }
+
+    fn health(&self) -> SourceHealth {
+        self.health.clone()
+    }
+}
+
+fn describe(mode: &Mode) -> String {
+    format!("{} at {:.2} frames a second", fourcc_text(mode.fourcc), mode.fps)
+}
+
+/// The formats that a device has at a size.
+pub(crate) fn offers(device: &impl CameraDevice, width: u32, height: u32) -> io::Result<Vec<Offer>> {
+    let mut offers = Vec::new();
+    for fourcc in device.formats()? {
+        let sizes = device.sizes(fourcc)?;
+        let on = |[low, high, step]: [u32; 3], side: u32| {
+            (low..=high).contains(&side) && (step < 2 || (side - low).is_multiple_of(step))
+        };
+        let has = |size: &SizeRange| match *size {
+            SizeRange::One(w, h) => (w, h) == (width, height),
+            SizeRange::Steps(w, h) => on(w, width) && on(h, height),
+        };
+        if sizes.is_empty() || sizes.iter().any(has) {
+            offers.push(Offer { fourcc, rates: device.rates(fourcc, width, height)? });
+        }
+    }
+    Ok(offers)
+}
+
+/// A stream that broke.
+fn lost(error: &io::Error) -> CaptureError {
+    let text = match error.raw_os_error() {
+        Some(libc::ENODEV | libc::ENXIO) => {
+            "was unplugged or its driver let go of it; waiting for it to come back".to_owned()
+        }
+        Some(libc::EIO) => "its driver reports a failed transfer; starting it again".to_owned(),
+        _ => format!("its stream broke ({error}); starting it again"),
+    };
+    CaptureError::general(CaptureErrorKind::Disconnected, text)
+}
+
+/// Why a camera cannot be set up, with the mend.
+pub(crate) fn explain(error: &io::Error, what: &str, node: &Path) -> CaptureError {
+    let place = node.display();
+    match error.raw_os_error() {
+        Some(libc::EACCES | libc::EPERM) => identity::denied(node),
+        Some(libc::EBUSY) => {
+            let holders = holders(node);
+            let who = if holders.is_empty() { "another program".to_owned() } else { holders.join(", ") };
+            let text = format!("{what}: {place} is in use by {who}; end that first");
+            CaptureError::general(CaptureErrorKind::Io, text)
+        }
+        Some(libc::ENODEV | libc::ENXIO | libc::ENOENT) => CaptureError::general(
+            CaptureErrorKind::Disconnected,
+            format!("{what}: {place} is gone; plug the camera in again"),
+        ),
+        _ => CaptureError::general(CaptureErrorKind::Io, format!("{what}: {place}: {error}")),
+    }
+}
+
+/// Other processes that have a node open, as far as this user may see them.
+fn holders(node: &Path) -> Vec<String> {
+    let own = std::process::id();
+    let numbers = fs::read_dir("/proc").into_iter().flatten().flatten();
+    let pids = numbers.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok()).filter(|pid| *pid != own);
+    pids.filter(|pid| {
+        let mut links = fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
+        links.any(|link| fs::read_link(link.path()).is_ok_and(|target| target == node))
+    })
+    .map(|pid| {
+        let name = fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
+        format!("{} (process {pid})", name.trim())
+    })
+    .collect()
+}

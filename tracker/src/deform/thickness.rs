@@ -1,0 +1,65 @@
+//! How thick the clothes are, part by part: where nobody looks, they are as thick as where somebody does.
+
+use glam::DVec3;
+
+use super::normal::NormalMatrix;
+
+/// A part that is seen less than this share of what all parts are together is believed to be like the others.
+const LEAST_SHARE: f64 = 0.01;
+/// Share of a frame in what is known, once something is.
+const RATE: f64 = 0.5;
+
+/// The mean displacement of each part along its normals, where the pictures tell it. Smoothness (Eq. 4) then counts from
+/// there, so that the unseen side of a sleeve is not dragged along by the seen one but follows it outwards.
+#[derive(Debug)]
+pub(super) struct Thickness {
+    /// Canonical normals of the nodes, and their parts.
+    normals: Vec<DVec3>,
+    parts: Vec<usize>,
+    /// Thinnest and thickest, metres.
+    range_m: [f64; 2],
+    /// Metres a part; none before the first frame.
+    known: Option<Vec<f64>>,
+}
+
+impl Thickness {
+    /// One normal and one part a node.
+    pub(super) fn new(normals: Vec<DVec3>, parts: Vec<usize>, range_m: [f64; 2]) -> Self {
+        Self { normals, parts, range_m, known: None }
+    }
+
+    pub(super) fn forget(&mut self) {
+        self.known = None;
+    }
+
+    /// Where the node would be if it were clothed like its part, canonical metres.
+    pub(super) fn offset(&self, node: usize) -> DVec3 {
+        let Some(known) = &self.known else { return DVec3::ZERO };
+        self.normals[node] * known[self.parts[node]]
+    }
+
+    /// Learns from a frame's result: what the pictures say along the normals, `n^T H n`, is a node's weight.
+    pub(super) fn learn(&mut self, translations: &[DVec3], matrix: &NormalMatrix) {
+        let count = self.parts.iter().max().map_or(0, |most| most + 1);
+        let mut sums = vec![(0.0, 0.0); count];
+        for (node, (t, normal)) in translations.iter().zip(&self.normals).enumerate() {
+            let weight = normal.dot(matrix.diagonal_block(node) * *normal);
+            let along = t.dot(*normal).clamp(self.range_m[0], self.range_m[1]);
+            if weight.is_finite() && weight > 0.0 && along.is_finite() {
+                let (weights, sum) = &mut sums[self.parts[node]];
+                *weights += weight;
+                *sum += weight * along;
+            }
+        }
+        let (all_weights, all) = sums.iter().fold((0.0, 0.0), |(w, s), part| (w + part.0, s + part.1));
+        if all_weights <= 0.0 {
+            return;
+        }
+        let least = LEAST_SHARE * all_weights;
+        let now = sums.iter().map(|(weights, sum)| (sum + least * all / all_weights) / (weights + least));
+        self.known = Some(match self.known.take() {
+            None => now.collect(),
+            Some(known) => known.into_iter().zip(now).map(|(known, now)| known + (now - known) * RATE).collect(),
+        });
+    }
+}
