@@ -223,6 +223,9 @@ pub struct BenchAppearanceArgs {
     /// Weights file; only the direct modes are measured without one.
     #[arg(long)]
     pub weights: Option<PathBuf>,
+    /// What the networks keep from frame to frame: see `reuse` in the configuration.
+    #[arg(long, default_value_t = 0.0)]
+    pub reuse: f32,
     /// Pixels of a picture's side.
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
     pub side: u32,
@@ -377,6 +380,9 @@ pub struct EvalArgs {
     /// Weights file of the learned modes.
     #[arg(long)]
     pub weights: Option<PathBuf>,
+    /// What the networks keep from frame to frame: see `reuse` in the configuration.
+    #[arg(long, default_value_t = 0.0)]
+    pub reuse: f32,
     /// Frames FIRST..END, END excluded; all of them otherwise.
     #[arg(long, value_parser = parse_range)]
     pub frames: Option<Range<u64>>,

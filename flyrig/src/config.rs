@@ -291,6 +291,8 @@ pub struct AppearanceSection {
     pub mode: AppearanceMode,
     /// Weights file of the networks; needed by the learned modes.
     pub weights: PathBuf,
+    /// Inputs of a Gaussian that changed by no more than this leave what the networks add to its colour as it was.
+    pub reuse: f32,
 }
 
 impl AppearanceSection {
@@ -302,7 +304,7 @@ impl AppearanceSection {
 
 impl Default for AppearanceSection {
     fn default() -> Self {
-        Self { mode: AppearanceMode::Direct, weights: PathBuf::new() }
+        Self { mode: AppearanceMode::Direct, weights: PathBuf::new(), reuse: 0.0 }
     }
 }
 
@@ -403,6 +405,7 @@ impl Config {
             !self.appearance.mode.is_learned() || !self.appearance.weights.as_os_str().is_empty(),
             "appearance.weights is empty, a learned appearance.mode needs the file that `flyrig train` made"
         );
+        range("appearance.reuse", f64::from(self.appearance.reuse), 0.0, 1.0)?;
         range("output.views", self.output.views as f64, 0.0, 16.0)?;
         range("output.width", f64::from(self.output.width), 16.0, 4096.0)?;
         range("output.height", f64::from(self.output.height), 16.0, 4096.0)?;

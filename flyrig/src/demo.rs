@@ -216,7 +216,7 @@ fn pass(
         args.solver.options(Origin::Given),
     )?;
     if let Some(networks) = mode.networks(args.weights.as_deref())? {
-        engine.use_networks(&networks)?;
+        engine.use_networks(&networks, 0.0)?;
     }
     let no_plates = inputs.cameras.iter().map(|_| None).collect();
     let mut pipeline =

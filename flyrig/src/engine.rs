@@ -145,10 +145,12 @@ impl Engine {
         &self.template
     }
 
-    /// From now on these networks add to direct appearance.
-    pub fn use_networks(&mut self, parameters: &Parameters) -> Result<()> {
+    /// From now on these networks add to direct appearance; see [`LearnedAppearance::reuse`].
+    pub fn use_networks(&mut self, parameters: &Parameters, reuse: f32) -> Result<()> {
         self.appearance.keep_observations(&self.gpu)?;
-        self.learned = Some(LearnedAppearance::new(parameters, self.body.clone()));
+        let mut learned = LearnedAppearance::new(parameters, self.body.clone());
+        learned.reuse = reuse;
+        self.learned = Some(learned);
         Ok(())
     }
 
@@ -310,9 +312,14 @@ impl Engine {
             ViewPicture { width, height, rgba: &self.rgba[i] }
         };
         let pictures: Vec<_> = self.painted.iter().map(picture).collect();
+        let before = learned.counts;
         let colors = learned.paint(&observed, &pictures, &self.settings)?;
         self.gaussians.color.write(&self.gpu, &colors);
         stages.add("networks", start.elapsed());
+        let counts = learned.counts;
+        stages.count("views not encoded", counts.views_kept - before.views_kept);
+        stages.count("Gaussians not corrected anew", counts.colors_kept - before.colors_kept);
+        stages.count("corrections that were no numbers", counts.poisoned - before.poisoned);
         Ok(())
     }
 

@@ -232,7 +232,7 @@ impl Replay {
             solver.options(args.pose),
         )?;
         if let Some(networks) = args.appearance.networks(args.weights.as_deref())? {
-            engine.use_networks(&networks)?;
+            engine.use_networks(&networks, args.reuse)?;
         }
         let pipeline = Pipeline::new(engine, rig, pose, args.masks, plates);
         Ok(Self { pipeline, frames, buffered, holdout, truth, solver })

@@ -104,7 +104,7 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
         config.tracking.options(config.body.pose),
     )?;
     if let Some(networks) = config.appearance.networks()? {
-        engine.use_networks(&networks)?;
+        engine.use_networks(&networks, config.appearance.reuse)?;
     }
     let mut pipeline = Pipeline::new(engine, scene.rig, pose, config.body.masks, scene.plates);
     pipeline.per_view_time = config.tracking.per_view_time;

@@ -15,7 +15,7 @@ use std::{
 
 use anyhow::{Context, Result, ensure};
 use flyrig_gpu::GpuContext;
-use flyrig_stfa::{NetworkSize, TrainSettings, Trainer, TrainingSample, evaluate};
+use flyrig_stfa::{NetworkSize, SampleErrors, TrainSettings, Trainer, TrainingSample, evaluate};
 
 pub use self::people::People;
 use self::report::{Progress, Scores};
@@ -91,7 +91,8 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
 
 /// None without anybody to measure on.
 fn score(trainer: &Trainer, test: &[TrainingSample]) -> Option<Scores> {
-    let errors: Vec<[f64; 2]> = test.iter().filter_map(|sample| evaluate(&trainer.parameters, sample, true)).collect();
+    let errors: Vec<SampleErrors> =
+        test.iter().filter_map(|sample| evaluate(&trainer.parameters, sample, true)).collect();
     (!errors.is_empty()).then(|| Scores::new(trainer.step, &errors))
 }
 

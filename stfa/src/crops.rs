@@ -91,6 +91,13 @@ impl Crops {
         out
     }
 
+    /// sRGB values times belief, and belief.
+    #[must_use]
+    pub fn colors(&self, settings: &AppearanceSettings) -> FeatureMaps {
+        let values = self.rgba.par_chunks_exact(4).flat_map_iter(|pixel| believed(pixel, settings)).collect();
+        FeatureMaps { width: self.width, height: self.height, channels: 4, stride: 1, values }
+    }
+
     /// What two blurs take away from the sRGB values, the background left out.
     #[must_use]
     pub fn detail(&self, settings: &AppearanceSettings) -> FeatureMaps {
@@ -98,14 +105,7 @@ impl Crops {
         let mut values = vec![0.0; self.views * pixels * DETAIL];
         values.par_chunks_mut((pixels * DETAIL).max(1)).zip(self.rgba.par_chunks((pixels * 4).max(1))).for_each(
             |(out, crop)| {
-                let sharp: Vec<[f32; 4]> = crop
-                    .chunks_exact(4)
-                    .map(|pixel| {
-                        let belief = belief(pixel[3], settings);
-                        let color = |c: usize| belief * f32::from(pixel[c]) / 255.0;
-                        [color(0), color(1), color(2), belief]
-                    })
-                    .collect();
+                let sharp: Vec<[f32; 4]> = crop.chunks_exact(4).map(|pixel| believed(pixel, settings)).collect();
                 let [fine, coarse] = BLURS_PX.map(|sigma| blurred(&sharp, self.width, sigma));
                 let mean = |p: [f32; 4], c: usize| if p[3] > 1e-3 { p[c] / p[3] } else { 0.0 };
                 for (i, out) in out.chunks_exact_mut(DETAIL).enumerate() {
@@ -125,6 +125,13 @@ impl Crops {
 /// As direct appearance believes a pixel of this coverage.
 fn belief(coverage: u8, settings: &AppearanceSettings) -> f32 {
     ((f32::from(coverage) / 255.0 - settings.min_mask) / (1.0 - settings.min_mask)).clamp(0.0, 1.0)
+}
+
+/// sRGB 0..1 times belief, and belief.
+fn believed(pixel: &[u8], settings: &AppearanceSettings) -> [f32; 4] {
+    let belief = belief(pixel[3], settings);
+    let color = |c: usize| belief * f32::from(pixel[c]) / 255.0;
+    [color(0), color(1), color(2), belief]
 }
 
 /// Left, top, right, bottom (excluded) of what is covered, with a margin; empty without a person.

@@ -10,14 +10,18 @@ use crate::{
     taps::{Tap, Taps},
 };
 
-/// Colours that a Gaussian's could move towards: around it, on the other side of the body, and two bands of detail.
-pub const CANDIDATES: usize = 4;
+/// Colours that a Gaussian's could move towards: around it, on the other side of the body, two bands of detail, and what
+/// the view saw that sees it best (how far views differ tells how well they are aligned).
+pub const CANDIDATES: usize = 5;
 /// Numbers of a Gaussian that pass through the memory beside its features: linear colour, visibility of itself and of its
 /// mirror image, candidates as differences of sRGB values.
 pub const STATE: usize = 5 + 3 * CANDIDATES;
 /// Numbers that a node knows beside its image feature: sRGB of the diffused colour around it, visibility, the same of its
 /// mirror image.
 pub const NODE: usize = 8;
+
+/// Where the best view's candidate stands.
+const BEST: usize = STATE - 3;
 
 /// Sum of weights that halves the belief in a mean.
 const SMALL_WEIGHT: f32 = 0.02;
@@ -92,13 +96,18 @@ pub fn frame_inputs(
         taps.end_row();
     }
     let detail = taps.sample(&[crops.detail(settings)]);
+    let colors = crops.colors(settings);
+    let [mean, best] = [taps.sample(std::slice::from_ref(&colors)), taps.heaviest().sample(&[colors])];
     let states: Vec<([f32; STATE], [f32; 2])> = which
         .par_iter()
         .zip(detail.par_chunks_exact(DETAIL))
+        .zip(mean.par_chunks_exact(4).zip(best.par_chunks_exact(4)))
         .enumerate()
-        .map(|(row, (&index, detail))| {
+        .map(|(row, ((&index, detail), (mean, best)))| {
             let weight: f32 = taps.row(row).iter().map(|tap| tap.weight).sum();
-            gaussian_state(body, observed, settings, index as usize, detail, weight)
+            let (mut state, seen) = gaussian_state(body, observed, settings, index as usize, detail, weight);
+            state[BEST..].copy_from_slice(&difference(best, mean));
+            (state, seen)
         })
         .collect();
     let (state, seen) = states.into_iter().unzip();
@@ -119,6 +128,11 @@ pub fn frame_inputs(
         node_values.push([a, b, c, d, e, f, g, h]);
     }
     Ok(FrameInputs { taps, state, seen, node_taps, nodes: node_values })
+}
+
+/// Difference of two colours that were sampled with belief as their fourth number; zero where one of them was not seen.
+fn difference(a: &[f32], b: &[f32]) -> [f32; 3] {
+    if a[3] > 1e-3 && b[3] > 1e-3 { std::array::from_fn(|c| tame(a[c] / a[3] - b[c] / b[3])) } else { [0.0; 3] }
 }
 
 fn rgb(color: [f32; 4]) -> [f32; 3] {
@@ -191,7 +205,7 @@ fn gaussian_state(
             state[8 + c] = mirrored[c] - encoded[c];
         }
     }
-    for (to, from) in state[11..].iter_mut().zip(detail) {
+    for (to, from) in state[11..BEST].iter_mut().zip(detail) {
         *to = from / (tap_weight + SMALL_WEIGHT);
     }
     let share = visible + (1.0 - visible) * own;

@@ -1,7 +1,7 @@
 //! The networks: encoder, graph transformer, filling (Eq. 9), colour. Written on burn's tensors, for training and painting
 //! alike.
 
-use burn::tensor::{Device, Int, Tensor, TensorData, activation, module, ops::ConvOptions};
+use burn_tensor::{Device, Int, Tensor, TensorData, activation, module, ops::ConvOptions};
 
 use crate::{
     BodyGraph, NetworkSize,

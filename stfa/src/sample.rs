@@ -21,7 +21,7 @@ pub const PATCH: usize = 16;
 /// Gaussians of a pixel, at most; what the others would add goes to these.
 pub const SHARES: usize = 12;
 
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 /// A patch with less of the person or of the drawing in it teaches nothing.
 const MIN_PATCH_COVERAGE: f32 = 0.15;
 /// Places tried for a patch.

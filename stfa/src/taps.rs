@@ -44,6 +44,11 @@ pub struct FeatureMaps {
 }
 
 impl FeatureMaps {
+    /// A map of the same form without numbers.
+    pub(crate) fn without_values(&self) -> Self {
+        Self { values: Vec::new(), ..*self }
+    }
+
     /// Numbers in one map.
     fn map_len(&self) -> usize {
         self.width * self.height * self.channels
@@ -96,6 +101,30 @@ impl Taps {
             && self.starts.windows(2).all(|pair| pair[0] <= pair[1])
             && self.starts.last().is_some_and(|&end| end as usize == self.taps.len())
             && self.taps.iter().all(|tap| (tap.view as usize) < views)
+    }
+
+    /// Of every row the tap that weighs most, with weight 1; the first of several.
+    #[must_use]
+    pub fn heaviest(&self) -> Self {
+        let mut out = Self::default();
+        for row in 0..self.rows() {
+            let heavier = |best: Option<Tap>, tap: &Tap| match best {
+                Some(best) if best.weight >= tap.weight => Some(best),
+                _ => Some(*tap),
+            };
+            let best = self.row(row).iter().fold(None, heavier);
+            out.taps.extend(best.map(|tap| Tap { weight: 1.0, ..tap }));
+            out.end_row();
+        }
+        out
+    }
+
+    /// The same looks at pictures of `width` pixels that were turned left to right.
+    #[must_use]
+    pub fn flipped(&self, width: usize) -> Self {
+        let last = width.saturating_sub(1) as f32;
+        let turn = |tap: &Tap| Tap { pixel: [last - tap.pixel[0], tap.pixel[1]], ..*tap };
+        Self { starts: self.starts.clone(), taps: self.taps.iter().map(turn).collect() }
     }
 
     /// Row by row the features of all scales one after another. Taps must fit the maps' number of views.

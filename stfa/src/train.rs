@@ -6,7 +6,7 @@
 
 use std::{collections::BTreeMap, path::Path};
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn_tensor::{Device, Tensor, TensorData};
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng, seq::SliceRandom as _};
 use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use crate::{
     NetworkSize, Parameters, StfaError,
     body_graph::PLACE,
-    inputs::{NODE, STATE},
+    inputs::{CANDIDATES, NODE, STATE},
     network::{Network, feature_maps, linear_from_srgb, srgb_from_linear},
     parameters::to_vec,
     sample::{PATCH, SHARES, Target, TrainingSample},
@@ -25,6 +25,10 @@ use crate::{
 
 /// Exponential means of Adam (Kingma and Ba 2015).
 const BETAS: [f32; 2] = [0.9, 0.99];
+/// A sample's loss counts as if direct appearance's were this: well tracked people teach as much as badly tracked ones.
+const USUAL_MSE: f64 = 0.01;
+/// Added to direct appearance's loss before that.
+const SMALL_MSE: f64 = 5e-4;
 /// Gradients longer than this are shortened to it.
 const MAX_GRADIENT: f32 = 1.0;
 
@@ -42,11 +46,15 @@ pub struct TrainSettings {
     pub edges: f32,
     /// Share of steps without the graph, so that the same weights serve the ablation.
     pub without_space: f64,
+    /// Decay of the weights, relative to the rate (Loshchilov and Hutter 2019).
+    pub decay: f32,
+    /// Whether a sample comes in another variation each time: colour channels swapped and darkened, left and right turned.
+    pub vary: bool,
 }
 
 impl Default for TrainSettings {
     fn default() -> Self {
-        Self { seed: 1, steps: 10_000, rate: 2e-3, edges: 0.02, without_space: 0.1 }
+        Self { seed: 1, steps: 10_000, rate: 2e-3, edges: 0.02, without_space: 0.1, decay: 0.05, vary: true }
     }
 }
 
@@ -77,9 +85,86 @@ pub struct Trainer {
 /// What a forward pass gave.
 struct Forward {
     loss: Tensor<1>,
-    mse: f64,
-    direct_mse: f64,
+    errors: SampleErrors,
 }
+
+/// Mean squared sRGB errors of a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct SampleErrors {
+    /// Pixels on black: shape and colour.
+    pub mse: f64,
+    /// The same of direct appearance.
+    pub direct_mse: f64,
+    /// As far as drawing and truth both cover a pixel: colour only.
+    pub color_mse: f64,
+    /// The same of direct appearance.
+    pub direct_color_mse: f64,
+}
+
+/// How a sample is shown to the networks.
+#[derive(Debug, Clone, Copy)]
+struct Variation {
+    channels: [usize; 3],
+    /// Factor on the sRGB values of each channel, at most 1.
+    gain: [f32; 3],
+    flip: bool,
+    space: bool,
+}
+
+impl Variation {
+    fn plain(space: bool) -> Self {
+        Self { channels: [0, 1, 2], gain: [1.0; 3], flip: false, space }
+    }
+
+    fn draw(settings: &TrainSettings, rng: &mut SmallRng) -> Self {
+        let mut out = Self::plain(!rng.random_bool(settings.without_space.clamp(0.0, 1.0)));
+        if settings.vary {
+            out.channels.shuffle(rng);
+            out.flip = rng.random_bool(0.5);
+            if rng.random_bool(0.7) {
+                let all: f32 = rng.random_range(0.55..1.0);
+                out.gain = std::array::from_fn(|_| all * rng.random_range(0.85..1.0));
+            }
+        }
+        out
+    }
+
+    /// Swaps and darkens every sRGB triple that starts at one of `at`.
+    fn row<const N: usize>(&self, row: &[f32; N], at: &[usize]) -> [f32; N] {
+        let mut out = *row;
+        for &first in at {
+            for c in 0..3 {
+                out[first + c] = row[first + self.channels[c]] * self.gain[c];
+            }
+        }
+        out
+    }
+
+    /// The same of a Gaussian's state, whose first triple is linear.
+    fn state(&self, row: &[f32; STATE]) -> [f32; STATE] {
+        let mut out = self.row(row, &CANDIDATE_PLACES);
+        for c in 0..3 {
+            let encoded = flyrig_renderer::srgb_from_linear(row[self.channels[c]]);
+            out[c] = flyrig_renderer::linear_from_srgb(encoded * self.gain[c]);
+        }
+        out
+    }
+
+    fn taps(&self, taps: &Taps, width: usize) -> Taps {
+        if self.flip { taps.flipped(width) } else { taps.clone() }
+    }
+}
+
+/// Where the candidates stand in a state.
+const CANDIDATE_PLACES: [usize; CANDIDATES] = {
+    let mut places = [0; CANDIDATES];
+    let mut i = 0;
+    while i < CANDIDATES {
+        places[i] = STATE - 3 * (CANDIDATES - i);
+        i += 1;
+    }
+    places
+};
 
 impl Trainer {
     /// Starts anew.
@@ -113,13 +198,10 @@ impl Trainer {
             return None;
         }
         let target = &sample.targets[rng.random_range(0..sample.targets.len())];
-        let mut channels = [0, 1, 2];
-        channels.shuffle(&mut rng);
-        let space = !rng.random_bool(self.settings.without_space.clamp(0.0, 1.0));
-
-        let (forward, sums, _) = self.gradients(sample, target, channels, space)?;
+        let variation = Variation::draw(&self.settings, &mut rng);
+        let (forward, sums, _) = self.gradients(sample, target, variation)?;
         self.adam(step, &sums);
-        Some(Loss { step, mse: forward.mse, direct_mse: forward.direct_mse })
+        Some(Loss { step, mse: forward.errors.mse, direct_mse: forward.errors.direct_mse })
     }
 
     /// The forward pass, dL/d parameters, and the loss.
@@ -127,20 +209,20 @@ impl Trainer {
         &self,
         sample: &TrainingSample,
         target: &Target,
-        channels: [usize; 3],
-        space: bool,
+        variation: Variation,
     ) -> Option<(Forward, BTreeMap<String, Vec<f32>>, f64)> {
         let device = Device::flex().autodiff();
         let tensors = self.parameters.tensors(&device, true);
         let network = Network { device, size: self.parameters.size, tensors };
-        let levels = network.encode(planes(&network, sample, channels));
+        let levels = network.encode(planes(&network, sample, variation));
         let maps = feature_maps(&levels);
         let feature = network.size.feature();
         let leaf = |taps: &Taps| network.table(taps.sample(&maps), feature).require_grad();
-        let (visible, nodes) = (leaf(&target.taps), leaf(&sample.node_taps));
+        let taps = [&target.taps, &sample.node_taps].map(|taps| variation.taps(taps, sample.crops.width));
+        let (visible, nodes) = (leaf(&taps[0]), leaf(&taps[1]));
         let forward =
-            forward(&network, sample, target, visible.clone(), nodes.clone(), channels, space, self.settings.edges);
-        if !forward.mse.is_finite() {
+            forward(&network, sample, target, [visible.clone(), nodes.clone()], variation, self.settings.edges);
+        if !forward.errors.mse.is_finite() {
             return None;
         }
         let loss = to_vec(forward.loss.clone()).first().copied().map_or(f64::NAN, f64::from);
@@ -149,7 +231,7 @@ impl Trainer {
         network.tensors.add_gradients(&gradients, &mut sums);
 
         let mut map_gradients: Vec<Vec<f32>> = maps.iter().map(|map| vec![0.0; map.values.len()]).collect();
-        for (taps, leaf) in [(&target.taps, &visible), (&sample.node_taps, &nodes)] {
+        for (taps, leaf) in taps.iter().zip([&visible, &nodes]) {
             let Some(gradient) = leaf.grad(&gradients) else { continue };
             for (sum, part) in map_gradients.iter_mut().zip(taps.sample_backward(&maps, &to_vec(gradient))) {
                 sum.iter_mut().zip(part).for_each(|(sum, part)| *sum += part);
@@ -181,11 +263,13 @@ impl Trainer {
             else {
                 continue;
             };
+            // Biases and scales have one dimension.
+            let decay = if parameter.shape.len() > 1 { rate * self.settings.decay } else { 0.0 };
             for (((value, mean), square), gradient) in parameter.values.iter_mut().zip(mean).zip(square).zip(gradient) {
                 let gradient = gradient * shorten;
                 *mean = BETAS[0] * *mean + (1.0 - BETAS[0]) * gradient;
                 *square = BETAS[1] * *square + (1.0 - BETAS[1]) * gradient * gradient;
-                *value -= rate * (*mean / unbias[0]) / ((*square / unbias[1]).sqrt() + 1e-8);
+                *value -= decay * *value + rate * (*mean / unbias[0]) / ((*square / unbias[1]).sqrt() + 1e-8);
             }
         }
     }
@@ -233,75 +317,76 @@ impl Trainer {
     }
 }
 
-/// Mean squared sRGB error of the networks and of direct appearance on all targets of a sample.
+/// Errors of the networks and of direct appearance on all targets of a sample.
 #[must_use]
-pub fn evaluate(parameters: &Parameters, sample: &TrainingSample, space: bool) -> Option<[f64; 2]> {
+pub fn evaluate(parameters: &Parameters, sample: &TrainingSample, space: bool) -> Option<SampleErrors> {
     if sample.targets.is_empty() || sample.crops.rgba.is_empty() {
         return None;
     }
     let device = Device::flex();
     let tensors = parameters.tensors(&device, false);
     let network = Network { device, size: parameters.size, tensors };
-    let channels = [0, 1, 2];
-    let maps = feature_maps(&network.encode(planes(&network, sample, channels)));
+    let variation = Variation::plain(space);
+    let maps = feature_maps(&network.encode(planes(&network, sample, variation)));
     let table = |taps: &Taps| network.table(taps.sample(&maps), network.size.feature());
-    let (mut sums, mut pixels) = ([0.0; 2], 0.0);
+    let (mut sum, mut pixels) = (SampleErrors::default(), 0.0);
     for target in &sample.targets {
-        let out =
-            forward(&network, sample, target, table(&target.taps), table(&sample.node_taps), channels, space, 0.0);
+        let tables = [table(&target.taps), table(&sample.node_taps)];
+        let SampleErrors { mse, direct_mse, color_mse, direct_color_mse } =
+            forward(&network, sample, target, tables, variation, 0.0).errors;
         let count = target.truth.len() as f64;
-        sums[0] += out.mse * count;
-        sums[1] += out.direct_mse * count;
+        sum.mse += mse * count;
+        sum.direct_mse += direct_mse * count;
+        sum.color_mse += color_mse * count;
+        sum.direct_color_mse += direct_color_mse * count;
         pixels += count;
     }
-    Some(sums.map(|sum| sum / pixels))
+    Some(SampleErrors {
+        mse: sum.mse / pixels,
+        direct_mse: sum.direct_mse / pixels,
+        color_mse: sum.color_mse / pixels,
+        direct_color_mse: sum.direct_color_mse / pixels,
+    })
 }
 
-/// The input pictures with their colour channels in this order.
-fn planes(network: &Network, sample: &TrainingSample, channels: [usize; 3]) -> Tensor<4> {
+/// The input pictures in this variation.
+fn planes(network: &Network, sample: &TrainingSample, variation: Variation) -> Tensor<4> {
     let crops = &sample.crops;
     let planes = crops.planes(&flyrig_renderer::AppearanceSettings::default());
     let pixels = crops.width * crops.height;
     let mut out = Vec::with_capacity(planes.len());
     for view in planes.chunks_exact((4 * pixels).max(1)) {
-        for channel in [channels[0], channels[1], channels[2], 3] {
-            out.extend_from_slice(&view[channel * pixels..(channel + 1) * pixels]);
+        let [a, b, c] = variation.channels;
+        let [e, f, g] = variation.gain;
+        for (channel, gain) in [(a, e), (b, f), (c, g), (3, 1.0)] {
+            for row in view[channel * pixels..(channel + 1) * pixels].chunks_exact(crops.width) {
+                if variation.flip {
+                    out.extend(row.iter().rev().map(|v| v * gain));
+                } else {
+                    out.extend(row.iter().map(|v| v * gain));
+                }
+            }
         }
     }
     network.pictures(out, crops.views, crops.height, crops.width)
 }
 
-/// Swaps the colour channels of every triple that starts at one of `at`.
-fn swapped<const N: usize>(row: &[f32; N], at: &[usize], channels: [usize; 3]) -> [f32; N] {
-    let mut out = *row;
-    for &first in at {
-        for c in 0..3 {
-            out[first + c] = row[first + channels[c]];
-        }
-    }
-    out
-}
-
-#[allow(clippy::too_many_arguments)]
 fn forward(
     network: &Network,
     sample: &TrainingSample,
     target: &Target,
-    visible: Tensor<2>,
-    node_feature: Tensor<2>,
-    channels: [usize; 3],
-    space: bool,
+    [visible, node_feature]: [Tensor<2>; 2],
+    variation: Variation,
     edge_weight: f32,
 ) -> Forward {
     let count = target.state.len();
-    let mut state: Vec<[f32; STATE]> =
-        target.state.iter().map(|row| swapped(row, &[0, 5, 8, 11, 14], channels)).collect();
-    if !space {
+    let mut state: Vec<[f32; STATE]> = target.state.iter().map(|row| variation.state(row)).collect();
+    if !variation.space {
         state.iter_mut().for_each(|row| row[4..11].fill(0.0));
     }
     let weight = network.table(state.iter().map(|row| row[3]).collect(), 1);
-    let current = if space {
-        let inputs: Vec<[f32; NODE]> = sample.nodes.iter().map(|row| swapped(row, &[0, 4], channels)).collect();
+    let current = if variation.space {
+        let inputs: Vec<[f32; NODE]> = sample.nodes.iter().map(|row| variation.row(row, &[0, 4])).collect();
         let place = network.table(sample.place.as_flattened().to_vec(), PLACE);
         let edges = network.indices(sample.edges.as_flattened().iter().copied());
         let graph = network.graph(node_feature, network.node_inputs(&inputs), place, &edges);
@@ -328,23 +413,37 @@ fn forward(
         // As the rasteriser's pictures are encoded: straight alpha, the sRGB value times alpha.
         srgb_from_linear(premultiplied / alpha.clone().clamp_min(1e-3)) * alpha.clone()
     };
-    let truth =
-        network.table(target.truth.iter().flat_map(|pixel| channels.map(|c| f32::from(pixel[c]) / 255.0)).collect(), 3);
-    let difference = composed(color) - truth.clone();
-    let mse = difference.clone().powf_scalar(2.0).mean();
-    let direct = (composed(base) - truth).powf_scalar(2.0).mean();
-    let number = |tensor: &Tensor<1>| to_vec(tensor.clone()).first().copied().map_or(f64::NAN, f64::from);
-    let (mse_value, direct_mse) = (number(&mse), number(&direct));
-    let mut loss = mse;
+    let truth = target.truth.iter().flat_map(|pixel| {
+        let varied = |c: usize| variation.gain[c] * f32::from(pixel[variation.channels[c]]) / 255.0;
+        [varied(0), varied(1), varied(2)]
+    });
+    let truth = network.table(truth.collect(), 3);
+    // Only colours can be learned here. Where drawing and truth do not cover the same pixels, black against cloth would
+    // teach dark seams: the difference counts as far as both cover a pixel.
+    let covered = network.table(target.truth.iter().map(|pixel| f32::from(pixel[3]) / 255.0).collect(), 1);
+    let (ours, direct) = (composed(color), composed(base));
+    let difference = |of: Tensor<2>| of * covered.clone() - truth.clone() * alpha.clone();
+    let mean = |difference: Tensor<2>| difference.powf_scalar(2.0).mean();
+    let number = |tensor: Tensor<1>| to_vec(tensor).first().copied().map_or(f64::NAN, f64::from);
+    let color_difference = difference(ours.clone());
+    let color_mse = mean(color_difference.clone());
+    let errors = SampleErrors {
+        mse: number(mean(ours - truth.clone())),
+        direct_mse: number(mean(direct.clone() - truth.clone())),
+        color_mse: number(color_mse.clone()),
+        direct_color_mse: number(mean(difference(direct))),
+    };
+    let mut loss = color_mse;
     if edge_weight > 0.0 {
-        let patches = difference.reshape([pixels / (PATCH * PATCH), PATCH, PATCH, 3]);
+        let patches = color_difference.reshape([pixels / (PATCH * PATCH), PATCH, PATCH, 3]);
         let steps = |dim: usize| {
             let ahead = patches.clone().narrow(dim, 1, PATCH - 1);
             (ahead - patches.clone().narrow(dim, 0, PATCH - 1)).abs().mean()
         };
         loss = loss + (steps(1) + steps(2)) * edge_weight;
     }
-    Forward { loss, mse: mse_value, direct_mse }
+    let importance = USUAL_MSE / (errors.direct_color_mse + SMALL_MSE);
+    Forward { loss: loss * importance, errors }
 }
 
 #[cfg(test)]

@@ -58,7 +58,7 @@ fn sample(seed: u64) -> TrainingSample {
 }
 
 fn settings(steps: u64) -> TrainSettings {
-    TrainSettings { steps, rate: 1e-2, without_space: 0.0, ..TrainSettings::default() }
+    TrainSettings { steps, rate: 1e-2, without_space: 0.0, decay: 0.0, vary: false, ..TrainSettings::default() }
 }
 
 #[test]
@@ -69,10 +69,10 @@ fn both_tapes_together_give_the_true_gradient() {
     for parameter in trainer.parameters.by_name.values_mut() {
         parameter.values.iter_mut().for_each(|value| *value += rng.random_range(-0.2..0.2));
     }
-    let gradients = trainer.gradients(&sample, &sample.targets[0], [0, 1, 2], true).unwrap().1;
+    let gradients = trainer.gradients(&sample, &sample.targets[0], Variation::plain(true)).unwrap().1;
     let loss = |parameters: &Parameters| -> f64 {
         let copy = Trainer { parameters: parameters.clone(), ..trainer.clone() };
-        copy.gradients(&sample, &sample.targets[0], [0, 1, 2], true).unwrap().2
+        copy.gradients(&sample, &sample.targets[0], Variation::plain(true)).unwrap().2
     };
     let mut checked = 0;
     for (name, gradient) in &gradients {
@@ -100,15 +100,17 @@ fn both_tapes_together_give_the_true_gradient() {
 fn an_untrained_network_is_direct_appearance_and_training_beats_it() {
     let samples = [sample(1), sample(3)];
     let mut trainer = Trainer::new(SIZE, settings(200));
-    let [before, direct] = evaluate(&trainer.parameters, &samples[0], true).unwrap();
-    assert!((before - direct).abs() < 1e-9, "{before} against {direct}");
+    let SampleErrors { mse, direct_mse, color_mse, direct_color_mse } =
+        evaluate(&trainer.parameters, &samples[0], true).unwrap();
+    assert!((mse - direct_mse).abs() < 1e-9, "{mse} against {direct_mse}");
+    assert!((color_mse - direct_color_mse).abs() < 1e-9, "{color_mse} against {direct_color_mse}");
     while trainer.step < 200 {
         let next = trainer.next_sample(samples.len());
         trainer.step(&samples[next]).unwrap();
     }
     for sample in &samples {
-        let [after, direct] = evaluate(&trainer.parameters, sample, true).unwrap();
-        assert!(after < 0.5 * direct, "{after} against {direct}");
+        let SampleErrors { mse, direct_mse, .. } = evaluate(&trainer.parameters, sample, true).unwrap();
+        assert!(mse < 0.5 * direct_mse, "{mse} against {direct_mse}");
     }
 }
 

@@ -131,7 +131,7 @@ fn untrained_networks_paint_direct_appearance_over_time() {
                 ours.as_flattened().iter().zip(direct.as_flattened()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(worst < 2e-3, "space {space}, time {time}, frame {frame}: off by {worst}");
         }
-        assert_eq!(learned.poisoned, 0);
+        assert_eq!(learned.counts.poisoned, 0);
     }
 }
 

@@ -52,7 +52,8 @@ pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
     let bar = progress_bar(args.people * (args.views.len() * modes.len()) as u64, "bench appearance");
     let mut rows = Vec::new();
     for person in args.seed..args.seed.saturating_add(args.people) {
-        let config = SequenceConfig { motion: Motion::Turn, seed: person, side: args.side, frames: args.frames, fps: 30.0 };
+        let config =
+            SequenceConfig { motion: Motion::Turn, seed: person, side: args.side, frames: args.frames, fps: 30.0 };
         let sequence = Sequence::simulate(gpu, config)?;
         for &views in &args.views {
             for &mode in &modes {
@@ -90,7 +91,7 @@ fn run(
         Solver::GaussNewton.options(Origin::Given),
     )?;
     if let Some(weights) = weights.filter(|_| mode.is_learned()) {
-        engine.use_networks(weights)?;
+        engine.use_networks(weights, args.reuse)?;
     }
     let plates = rig.cameras.iter().map(|_| None).collect();
     let track = PoseSource::Track { track: sequence.track.clone(), repeat: true };

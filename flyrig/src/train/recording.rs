@@ -57,6 +57,7 @@ fn leave_out(
         solver: None,
         appearance: AppearanceMode::DirectNoTime,
         weights: None,
+        reuse: 0.0,
         frames: None,
         fps: args.fps,
         gaussians: args.gaussians,

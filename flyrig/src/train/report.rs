@@ -3,7 +3,7 @@
 use std::{fmt, path::Path};
 
 use anyhow::{Context, Result};
-use flyrig_stfa::Loss;
+use flyrig_stfa::{Loss, SampleErrors};
 use serde::{Deserialize, Serialize};
 
 use crate::{
@@ -24,17 +24,24 @@ pub struct Scores {
     pub psnr_db: f64,
     /// Of direct appearance on the same pixels.
     pub direct_db: f64,
+    /// As far as drawing and truth both cover a pixel, dB: gain of the networks over direct appearance in colour alone.
+    pub color_gain_db: f64,
     /// Share of the samples on which the networks are better.
     pub better: f64,
 }
 
 impl Scores {
     /// From mean squared errors of the networks and of direct appearance.
-    pub fn new(step: u64, errors: &[[f64; 2]]) -> Self {
+    pub fn new(step: u64, errors: &[SampleErrors]) -> Self {
         let count = errors.len().max(1) as f64;
-        let mean = |which: usize| errors.iter().map(|e| psnr(e[which])).sum::<f64>() / count;
-        let better = errors.iter().filter(|[ours, direct]| ours < direct).count() as f64 / count;
-        Self { step, psnr_db: mean(0), direct_db: mean(1), better }
+        let mean = |of: fn(&SampleErrors) -> f64| errors.iter().map(|e| psnr(of(e))).sum::<f64>() / count;
+        Self {
+            step,
+            psnr_db: mean(|e| e.mse),
+            direct_db: mean(|e| e.direct_mse),
+            color_gain_db: mean(|e| e.color_mse) - mean(|e| e.direct_color_mse),
+            better: errors.iter().filter(|e| e.mse < e.direct_mse).count() as f64 / count,
+        }
     }
 }
 
@@ -42,10 +49,11 @@ impl fmt::Display for Scores {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             f,
-            "people never seen: {:.2} dB, direct appearance {:.2} dB, better on {:.0} % of the samples",
+            "people never seen: {:.2} dB, direct appearance {:.2} dB, better on {:.0} % of the samples, {:+.2} dB in colour",
             self.psnr_db,
             self.direct_db,
-            self.better * 100.0
+            self.better * 100.0,
+            self.color_gain_db
         )
     }
 }
