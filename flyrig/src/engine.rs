@@ -73,6 +73,10 @@ pub struct Engine {
     rgba: Vec<Vec<u8>>,
     output: Option<RenderTarget>,
     deformation: Option<Deformation>,
+    /// Whether the body keeps its shape for the time being.
+    pub shape_held: bool,
+    /// What direct appearance painted last, while the Gaussians show what the networks made of it.
+    direct_colors: Vec<[f32; 4]>,
     /// What the deformation thinks of the last update's views.
     judged: Vec<Option<(f64, bool)>>,
 }
@@ -120,6 +124,8 @@ impl Engine {
                 Some(_) => GpuSkinner::new(&gpu, &surface.inset(), &template.skeleton)?,
                 None => GpuSkinner::new(&gpu, surface, &template.skeleton)?,
             },
+            shape_held: false,
+            direct_colors: Vec::new(),
             deformation: deform
                 .map(|options| Deformation::new(&gpu, &template, surface, graph, options, finest_pixel_m(rig)))
                 .transpose()?,
@@ -202,7 +208,7 @@ impl Engine {
             poses.iter().copied().zip(std::iter::once(&self.gaussians).chain(&self.posed)).collect();
 
         self.judged.clear();
-        if let Some(deformation) = self.deformation.as_mut().filter(|_| !views.is_empty()) {
+        if let Some(deformation) = self.deformation.as_mut().filter(|_| !views.is_empty() && !self.shape_held) {
             let start = Instant::now();
             let tracked: Vec<TrackedView<'_>> = views
                 .iter()
@@ -251,6 +257,10 @@ impl Engine {
         self.gpu.wait()?;
         stages.add("skinning", start.elapsed());
 
+        if !self.direct_colors.is_empty() {
+            // Direct appearance goes on from its own colours.
+            self.gaussians.color.write(&self.gpu, &self.direct_colors);
+        }
         let start = Instant::now();
         for (i, view) in views.iter().enumerate() {
             let (width, height) = (view.image.width(), view.image.height());
@@ -264,7 +274,7 @@ impl Engine {
                 }
             }
             let settings = RasterSettings {
-                outputs: Outputs { color: false, depth: false, canonical: true },
+                outputs: Outputs { color: true, depth: false, canonical: true },
                 ..RasterSettings::default()
             };
             let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
@@ -292,6 +302,7 @@ impl Engine {
                 camera: views[i].camera,
                 rgba: &self.rgba[i],
                 canonical: &self.visibility[i].canonical,
+                drawn: &self.visibility[i].color,
                 gaussians: (instant_of[i] > 0).then(|| instants[instant_of[i]].1),
             })
             .collect();
@@ -312,6 +323,7 @@ impl Engine {
             ViewPicture { width, height, rgba: &self.rgba[i] }
         };
         let pictures: Vec<_> = self.painted.iter().map(picture).collect();
+        self.direct_colors = self.gaussians.color.read(&self.gpu)?;
         let before = learned.counts;
         let colors = learned.paint(&observed, &pictures, &self.settings)?;
         self.gaussians.color.write(&self.gpu, &colors);

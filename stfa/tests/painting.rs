@@ -99,7 +99,13 @@ impl Stage {
             .iter()
             .zip(pictures)
             .zip(&targets)
-            .map(|((camera, rgba), target)| ViewInput { camera, rgba, canonical: &target.canonical, gaussians: None })
+            .map(|((camera, rgba), target)| ViewInput {
+                camera,
+                rgba,
+                canonical: &target.canonical,
+                drawn: &target.color,
+                gaussians: None,
+            })
             .collect();
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         self.appearance.update(&self.gpu, &mut encoder, &self.buffers, &views, settings).unwrap();

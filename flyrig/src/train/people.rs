@@ -24,7 +24,11 @@ const CAMERAS: usize = 7;
 /// Pictures that are compared an instant.
 const TARGETS: usize = 3;
 /// Instants before the first sample, in which the deformation finds the clothes.
-const WARM_UP: u64 = 2;
+const WARM_UP: u64 = 3;
+/// Instants before each other one.
+const RUN_IN: u64 = 1;
+/// Further looks at a sample's instant, in which the sharpening of the colours settles.
+const LOOKS: usize = 6;
 /// Share of the people who are filmed in a furnished room.
 const FURNISHED: f64 = 0.15;
 /// Frames, a minute of them, that instants are taken from.
@@ -83,7 +87,8 @@ impl People {
         let mut rng = SmallRng::seed_from_u64(seed ^ 0x7069_636b);
         let (rig, reported) = (simulator.rig().clone(), simulator.reported_rig());
         let template = simulator.template().clone();
-        let settings = AppearanceMode::DirectNoTime.settings();
+        // With time: sharpening goes on from the last colours. What the networks are given is of this instant alone.
+        let settings = AppearanceMode::Direct.settings();
         let mut engine = Engine::new(
             gpu.clone(),
             template,
@@ -102,11 +107,18 @@ impl People {
         for instant in 0..self.instants {
             let first: u64 = rng.random_range(0..SPAN_FRAMES);
             let (inputs, targets) = choose(&mut rng);
-            let warm_up = if instant == 0 { WARM_UP } else { 0 };
+            let warm_up = if instant == 0 { WARM_UP } else { RUN_IN };
             for step in 0..=warm_up {
                 let set = frame_set(&mut simulator, &rig, first + step, index, &inputs)?;
                 index += 1;
                 pipeline.process(&set)?;
+                if step == warm_up {
+                    pipeline.engine_mut().shape_held = true;
+                    for _ in 0..LOOKS {
+                        pipeline.process(&set)?;
+                    }
+                    pipeline.engine_mut().shape_held = false;
+                }
             }
             let nanos = simulator.frame_nanos(first + warm_up);
             let pictures = simulator.capture_all(nanos, &targets)?;

@@ -55,7 +55,7 @@ fn leave_out(
         pose: args.pose,
         masks: Origin::Given,
         solver: None,
-        appearance: AppearanceMode::DirectNoTime,
+        appearance: AppearanceMode::Direct,
         weights: None,
         reuse: 0.0,
         frames: None,
