@@ -198,6 +198,10 @@ impl Trainer {
             return None;
         }
         let target = &sample.targets[rng.random_range(0..sample.targets.len())];
+        let numbers = target.state.as_flattened().iter().chain(sample.nodes.as_flattened());
+        if !numbers.copied().all(f32::is_finite) {
+            return None;
+        }
         let variation = Variation::draw(&self.settings, &mut rng);
         let (forward, sums, _) = self.gradients(sample, target, variation)?;
         self.adam(step, &sums);
