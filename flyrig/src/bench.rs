@@ -15,7 +15,7 @@ use flyrig_tracker::DeformSolver;
 pub use self::appearance::appearance;
 use self::case::{Case, run_case};
 pub use self::sequence::{Motion, Sequence, SequenceConfig};
-use crate::{cli::BenchTrackArgs, config::Solver, eval::progress_bar};
+use crate::{cli::BenchTrackArgs, config::Solver, deformation::PAPER_COLOR_WEIGHT, eval::progress_bar};
 
 /// Runs the command.
 pub fn track(args: &BenchTrackArgs, gpu: &GpuContext) -> Result<()> {
@@ -69,6 +69,9 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
     cases.push(base.but(ALL_GAUSSIANS, |options| {
         (options.gaussians, options.gaussians_a_pixel) = (usize::MAX, f64::INFINITY);
     }));
+    for weight in [PAPER_COLOR_WEIGHT, 0.1] {
+        cases.push(base.but(&format!("colour weight {weight}"), |options| options.color_weight = weight));
+    }
     let full = base.but(FULL_SIZE, |options| options.max_level = 0);
     cases.push(full.but("8000 Gaussians", |options| options.gaussians = 8_000));
     cases.push(full.but(ALL_GAUSSIANS, |options| {
@@ -97,6 +100,9 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
     }
     let still = case(Solver::GaussNewton, VIEWS, SequenceConfig { motion: Motion::Still, ..turn });
     cases.push(still.but(NO_REST, |options| options.solver.rest = 0.0));
+    cases.push(still.but("no rest, colour weight 2", |options| {
+        (options.solver.rest, options.color_weight) = (0.0, PAPER_COLOR_WEIGHT);
+    }));
     cases.push(still);
     for seed in (1..=4).filter(|seed| *seed != args.seed) {
         let sequence = SequenceConfig { seed, ..turn };

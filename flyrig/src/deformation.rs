@@ -21,13 +21,14 @@ use glam::{DVec3, Vec3};
 use self::area::Landmarks;
 use self::choose::Chooser;
 use self::motion::MeshMotion;
-pub use self::options::DeformOptions;
+pub use self::options::{DeformOptions, PAPER_COLOR_WEIGHT};
 use self::pictures::{Kernels, Pictures, ViewBuffers};
 
 /// The tracked deformation and the buffers it is solved with.
 #[derive(Debug)]
 pub struct Deformation {
     max_level: u32,
+    color_weight: f32,
     most_views: usize,
     chooser: Chooser,
     tracker: DeformTracker,
@@ -116,6 +117,7 @@ impl Deformation {
         }
         Ok(Self {
             max_level: options.max_level,
+            color_weight: options.color_weight,
             most_views: options.views,
             chooser: Chooser::default(),
             tracker,
@@ -190,7 +192,7 @@ impl Deformation {
                 displacement: &self.coarse_displacement,
                 gradients: &self.gradients,
             },
-            self.painted,
+            if self.painted { self.color_weight } else { 0.0 },
         );
         let prepare = start.elapsed();
         pictures.distrust(self.tracker.displacement(), self.tracker.correction())?;

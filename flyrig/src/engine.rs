@@ -17,11 +17,14 @@ use flyrig_tracker::DeformReport;
 use flyrig_types::{Camera, Image, Mask, Pose, Rig};
 
 use crate::deformation::{DeformOptions, DeformTimes, Deformation, Scene, TrackedView};
-use crate::stats::StageTimes;
+use crate::stats::{StageTimes, processor_time};
 use crate::viewpoints::center_of_attention;
 
 /// Seed of the surface sampling: the same template gives the same Gaussians on every run.
 const SURFACE_SEED: u64 = 1;
+
+/// Stage that tells how much of the deformation's time the processor worked for this program.
+pub const PROCESSOR_STAGE: &str = "  processor";
 
 /// One input picture with its person mask.
 #[derive(Debug, Clone, Copy)]
@@ -146,6 +149,11 @@ impl Engine {
         })
     }
 
+    /// The device that everything runs on.
+    pub fn gpu(&self) -> &GpuContext {
+        &self.gpu
+    }
+
     /// The template that is being posed.
     pub fn template(&self) -> &Template {
         &self.template
@@ -209,7 +217,7 @@ impl Engine {
 
         self.judged.clear();
         if let Some(deformation) = self.deformation.as_mut().filter(|_| !views.is_empty() && !self.shape_held) {
-            let start = Instant::now();
+            let (start, processor) = (Instant::now(), processor_time());
             let tracked: Vec<TrackedView<'_>> = views
                 .iter()
                 .zip(&self.rgba)
@@ -232,6 +240,7 @@ impl Engine {
             stages.add("  draw and compare", draw);
             stages.add("  derivatives", derivatives);
             stages.add("  solve", solve);
+            stages.add(PROCESSOR_STAGE, processor_time().saturating_sub(processor));
             let at_rest = deformation.report().is_some_and(|report| report.at_rest);
             stages.count("frames at rest, not solved", u64::from(at_rest));
             let left_out = deformation.judged().iter().filter(|judged| judged.is_none()).count();

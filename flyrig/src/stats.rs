@@ -114,6 +114,13 @@ impl StageTimes {
     }
 }
 
+/// Time that all threads of this process together have spent on the processor: where the graphics adapter is software, what
+/// drawing costs, whoever else is running.
+pub fn processor_time() -> Duration {
+    let spent = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+    Duration::new(spent.tv_sec.unsigned_abs(), spent.tv_nsec.unsigned_abs().min(999_999_999) as u32)
+}
+
 /// Resident memory of this process in MiB, where the system tells it.
 pub fn resident_mib() -> Option<f64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;

@@ -5,6 +5,8 @@ use flyrig_tracker::{DeformSettings, PoseFreedom};
 
 /// So many are compared even where the person is a few pixels high.
 const LEAST_GAUSSIANS: f64 = 2000.0;
+/// λ_color of the paper's Eq. 3.
+pub const PAPER_COLOR_WEIGHT: f32 = 2.0;
 
 /// Everything about the deformation that may be chosen.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -15,6 +17,8 @@ pub struct DeformOptions {
     pub gaussians: usize,
     /// Gaussians that are compared at most for every pixel that the person's whole surface would take in the finest view.
     pub gaussians_a_pixel: f64,
+    /// λ_color of Eq. 3, over the sum of squared differences (linear light, 0..=1) of all pixels.
+    pub color_weight: f32,
     /// Pictures are halved at most so often, while a pixel stays finer than the compared Gaussians' spacing.
     pub max_level: u32,
     /// Views that are compared at most, those from the most different directions; 0: all.
@@ -26,7 +30,14 @@ pub struct DeformOptions {
 impl DeformOptions {
     /// Compared as they are drawn: every Gaussian, every pixel.
     pub fn full(solver: DeformSettings) -> Self {
-        Self { gaussians: usize::MAX, gaussians_a_pixel: f64::INFINITY, max_level: 0, views: 0, ..Self::coarse(solver) }
+        Self {
+            gaussians: usize::MAX,
+            gaussians_a_pixel: f64::INFINITY,
+            color_weight: PAPER_COLOR_WEIGHT,
+            max_level: 0,
+            views: 0,
+            ..Self::coarse(solver)
+        }
     }
 
     /// Everything is compared, however little more it tells.
@@ -47,6 +58,8 @@ impl DeformOptions {
             solver,
             gaussians: 30_000,
             gaussians_a_pixel: 2.0,
+            // With more the colours, which are painted anew every frame, push the surface along itself for ever.
+            color_weight: 0.25 * PAPER_COLOR_WEIGHT,
             max_level: WantedPicture::MAX_LEVEL,
             views: 0,
             pose: None,

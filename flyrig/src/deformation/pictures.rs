@@ -15,8 +15,7 @@ use flyrig_types::Camera;
 use super::area::ViewPlan;
 use super::{Scene, TrackedView};
 
-/// λ_color and λ_mask of Eq. 3, over the sum of squared differences (linear light, 0..=1) of all pixels.
-const COLOR_WEIGHT: f32 = 2.0;
+/// λ_mask of Eq. 3, over the sum of squared differences of all pixels.
 const MASK_WEIGHT: f32 = 2.0;
 /// Where the best view agrees at least so well, one that agrees less than the other is not believed.
 const AGREES: f64 = 0.6;
@@ -95,13 +94,13 @@ impl<'a> Pictures<'a> {
         plans: &[ViewPlan],
         buffers: &'a mut [ViewBuffers],
         kernels: Kernels<'a>,
-        painted: bool,
+        // Of the colours, 0 before there are any: then only the masks can tell anything.
+        color_weight: f32,
     ) -> Self {
         let settings: Vec<LossSettings> = plans
             .iter()
             .map(|plan| LossSettings {
-                // Before the first colours only the masks can tell anything.
-                color_weight: if painted { COLOR_WEIGHT * plan.weight as f32 } else { 0.0 },
+                color_weight: color_weight * plan.weight as f32,
                 mask_weight: MASK_WEIGHT * plan.weight as f32,
                 area: plan.area,
             })

@@ -39,7 +39,7 @@ fn gpu() -> &'static GpuContext {
 }
 
 fn options() -> DeformOptions {
-    DeformOptions { max_level: 1, ..DeformOptions::full(DeformSettings::default()) }
+    DeformOptions { max_level: 1, color_weight: 0.5, ..DeformOptions::full(DeformSettings::default()) }
 }
 
 /// Distances between two chains' Gaussians after a frame, metres.
