@@ -48,6 +48,12 @@ pub enum Command {
         #[arg(long)]
         table: bool,
     },
+    /// Send the cameras of this computer to a rig that runs on another one (source.kind = "network" there) until Ctrl-C. Of
+    /// the configuration [rig], [source], [capture], [transport] and [health] count; it needs no calibration.
+    Capture {
+        /// The TOML file; see `flyrig config print`.
+        config: PathBuf,
+    },
     /// Record the cameras of a configuration into an MCAP file, without tracking.
     Record(RecordArgs),
     /// Play a recording through, tell what is in it, and export it where asked to. To run the rig on it, set

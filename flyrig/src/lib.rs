@@ -4,6 +4,7 @@
 
 mod bench;
 mod cameras;
+mod capture;
 mod cli;
 mod config;
 mod dataset;
@@ -15,6 +16,7 @@ mod eval;
 mod health;
 mod intake;
 mod live;
+mod network;
 mod notify;
 mod outlet;
 mod pipeline;
@@ -84,6 +86,12 @@ fn dispatch(cli: &Cli) -> Result<()> {
             let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
             let gpu = (config.source.kind == SourceKind::Sim).then(|| gpu(adapter)).transpose()?;
             record::record(&config, args, gpu.as_ref())
+        }
+        Command::Capture { config } => {
+            let config = Config::load_for_capture(config)?;
+            let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
+            let gpu = (config.source.kind == SourceKind::Sim).then(|| gpu(adapter)).transpose()?;
+            capture::capture(&config, gpu.as_ref())
         }
         Command::Replay(args) => record::replay(args),
         Command::SyncCheck(args) => sync_check::sync_check(args, &|| gpu(cli.adapter.as_deref())),

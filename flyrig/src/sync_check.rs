@@ -86,7 +86,7 @@ fn open(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(S
         [path] if has_ending(path, "toml") => {
             let config = Config::load(path)?;
             let gpu = (config.source.kind == SourceKind::Sim).then(gpu).transpose()?;
-            Ok((run::open(&config, gpu.as_ref())?.sources, config.source.kind == SourceKind::V4l2))
+            Ok((run::open(&config, gpu.as_ref())?.sources, config.source.kind.is_live()))
         }
         [path] if has_ending(path, "mcap") => Ok((record::replay_sources(path, &record::recorded_rig(path)?)?, false)),
         [folder] if folder.is_dir() => {
