@@ -59,6 +59,14 @@ fn one_line(error: &anyhow::Error) -> String {
     line
 }
 
+/// Reads and checks a configuration; the error is what `flyrig config check` says.
+///
+/// # Errors
+/// Names the key, what was found, and what is expected.
+pub fn check_config(text: &str) -> Result<(), String> {
+    Config::parse(text).map(|_| ()).map_err(|error| one_line(&error))
+}
+
 /// Runs the command line of this process.
 #[must_use]
 pub fn main() -> ExitCode {
@@ -103,6 +111,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
             let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
             sim_export::sim_export(args, &config.sim, &gpu(adapter)?)
         }
+        Command::Bench { what: BenchCommand::Capture(args) } => bench::soak::capture(args),
         Command::Bench { what: BenchCommand::Track(args) } => bench::track(args, &gpu(cli.adapter.as_deref())?),
         Command::Config { action: ConfigAction::Print } => {
             print!("{DEFAULT_TOML}");
