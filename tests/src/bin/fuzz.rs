@@ -16,6 +16,7 @@ use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
     process::ExitCode,
+    sync::{Mutex, PoisonError},
     time::{Duration, Instant},
 };
 
@@ -26,6 +27,8 @@ use fuzz::{
 
 /// Longest that one input may take: a machine that is busy included.
 const SLOW: Duration = Duration::from_secs(10);
+/// The input in work, for whoever finds that it does not end.
+static CURRENT: Mutex<Option<(&str, Instant, Vec<u8>)>> = Mutex::new(None);
 /// Memory that no input may take, MiB.
 const MOST_MIB: f64 = 3000.0;
 /// Inputs that are kept beside the seeds, and their longest.
@@ -46,6 +49,7 @@ fn main() -> ExitCode {
     let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus");
     // Panics are caught and told once.
     std::panic::set_hook(Box::new(|_| {}));
+    std::thread::spawn(watch);
     let mut clean = true;
     for target in TARGETS.iter().filter(|target| wanted.is_empty() || wanted.iter().any(|name| *name == target.name)) {
         match run(target, &corpus.join(target.name), Duration::from_secs_f64(minutes * 60.0), seed) {
@@ -73,6 +77,7 @@ fn run(target: &Target, corpus: &Path, time: Duration, seed: u64) -> Result<Stri
             _ => random.child(&inputs, LONGEST),
         };
         let begin = Instant::now();
+        *CURRENT.lock().unwrap_or_else(PoisonError::into_inner) = Some((target.name, begin, input.clone()));
         let outcome = catch_unwind(AssertUnwindSafe(|| (target.run)(&input)));
         let took = begin.elapsed();
         tried += 1;
@@ -96,6 +101,7 @@ fn run(target: &Target, corpus: &Path, time: Duration, seed: u64) -> Result<Stri
             inputs.push(input);
         }
     }
+    *CURRENT.lock().unwrap_or_else(PoisonError::into_inner) = None;
     Ok(format!(
         "{tried} inputs in {:.0} s from {seeds} seeds, {taken} read, {} different outcomes, slowest {:.0} ms, peak {:.0} MiB",
         started.elapsed().as_secs_f64(),
@@ -103,6 +109,20 @@ fn run(target: &Target, corpus: &Path, time: Duration, seed: u64) -> Result<Stri
         slowest.as_secs_f64() * 1e3,
         peak_mib()
     ))
+}
+
+/// Ends the program when an input does not end.
+fn watch() {
+    loop {
+        std::thread::sleep(Duration::from_secs(1));
+        let current = CURRENT.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((target, since, input)) = &*current
+            && since.elapsed() > 3 * SLOW
+        {
+            println!("fuzz {target}: FAILED: an input does not end; {}", keep(target, input));
+            std::process::exit(1);
+        }
+    }
 }
 
 fn seeds(corpus: &Path) -> Result<Vec<Vec<u8>>, String> {
