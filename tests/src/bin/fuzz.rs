@@ -49,7 +49,9 @@ fn main() -> ExitCode {
     let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus");
     // Panics are caught and told once.
     std::panic::set_hook(Box::new(|_| {}));
-    std::thread::spawn(watch);
+    if let Err(error) = std::thread::Builder::new().name("watch".to_owned()).spawn(watch) {
+        println!("fuzz: nobody watches for inputs that do not end: {error}");
+    }
     let mut clean = true;
     for target in TARGETS.iter().filter(|target| wanted.is_empty() || wanted.iter().any(|name| *name == target.name)) {
         match run(target, &corpus.join(target.name), Duration::from_secs_f64(minutes * 60.0), seed) {
