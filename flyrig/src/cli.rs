@@ -123,6 +123,10 @@ pub struct SyncCheckArgs {
     /// Frame rate of a folder.
     #[arg(long, default_value_t = 30.0)]
     pub fps: f64,
+    /// Folder with intri.yml and extri.yml: compare where the joints of a person are in place of what moves. Needs three
+    /// cameras that see one person; a second and a half is enough.
+    #[arg(long)]
+    pub calibration: Option<PathBuf>,
 }
 
 #[derive(Debug, Subcommand)]
