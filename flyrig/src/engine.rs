@@ -212,7 +212,7 @@ impl Engine {
                 }
             }
             let settings = RasterSettings {
-                outputs: Outputs { color: false, depth: false, canonical: true },
+                outputs: Outputs { color: true, depth: false, canonical: true },
                 ..RasterSettings::default()
             };
             let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
@@ -244,6 +244,7 @@ impl Engine {
                 camera: view.camera,
                 rgba,
                 canonical: &target.canonical,
+                drawn: &target.color,
                 gaussians: (instant > 0).then(|| instants[instant].1),
             })
             .collect();

@@ -36,12 +36,21 @@ fn main() -> Result<(), Box<dyn Error>> {
         .collect();
     let maps = views
         .iter()
-        .map(|view| StorageBuffer::from_slice(&gpu, "canonical", &view.canonical))
-        .collect::<Result<Vec<_>, _>>()?;
+        .map(|view| {
+            let upload = |map: &[[f32; 4]]| StorageBuffer::from_slice(&gpu, "map", map);
+            Ok((upload(&view.canonical)?, upload(&view.drawn)?))
+        })
+        .collect::<Result<Vec<_>, flyrig_gpu::GpuError>>()?;
     let inputs: Vec<_> = views
         .iter()
         .zip(&maps)
-        .map(|(view, canonical)| ViewInput { camera: &view.camera, rgba: &view.rgba, canonical, gaussians: None })
+        .map(|(view, (canonical, drawn))| ViewInput {
+            camera: &view.camera,
+            rgba: &view.rgba,
+            canonical,
+            drawn,
+            gaussians: None,
+        })
         .collect();
 
     let mut appearance = DirectAppearance::new(&gpu, &person.surface, &person.graph, 3)?;
@@ -59,8 +68,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         };
         update(&mut timer)?;
         let ours = buffers.color.read(&gpu)?;
-        let mut memory = vec![DVec4::ZERO; gaussians];
-        let expected = reference::update(&person, &levels, &frame, &views, &settings, &mut memory);
+        let mut state = reference::State { memory: vec![DVec4::ZERO; gaussians], last: None };
+        let expected = reference::update(&person, &levels, &frame, &views, &settings, &mut state);
         let errors: Vec<f64> = ours
             .iter()
             .zip(&expected)

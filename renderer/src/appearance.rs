@@ -23,6 +23,11 @@
 //!   We lengthen the best view's d by `-ln(s) / k`, s being the share of the current colour that was really
 //!   seen: 0 for a point seen well (the equation as printed), infinite for an unseen one (the memory rules).
 //!   So `w = (w_acc / w_max) (1 - s exp(-k d))`. Best view: the smallest d among those with a positive weight.
+//! - **Sharpness.** Every Gaussian is drawn over its neighbours, so that colours taken from a picture draw a blurred one. What
+//!   a view tells is raised by what drawing takes away: W + g (c - D c), with W the picture, c the colours of the last frame
+//!   and D c their drawing, both at the Gaussian. Repeated, that solves (1 - g + g D) c = W: for g towards 1 the drawing is
+//!   the picture, for less noise that drawing cannot show stays bounded. It costs no drawing of its own: the visibility needs
+//!   one anyway.
 //! - **No spatial aggregation**: the paper's baseline. A camera that has the point inside picture and mask gets a
 //!   small extra weight, visible or not; the weights are normalised. Points inside no picture are grey.
 

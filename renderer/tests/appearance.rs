@@ -9,8 +9,8 @@ use appearance_support::{
 };
 use flyrig_gpu::{AdapterChoice, GpuContext, StorageBuffer};
 use flyrig_renderer::{
-    AppearanceError, AppearanceSettings, DiffusionHierarchy, DirectAppearance, GaussianBuffers, ViewInput,
-    linear_from_srgb,
+    AppearanceError, AppearanceSettings, DiffusionHierarchy, DirectAppearance, GaussianBuffers, Outputs,
+    RasterSettings, Rasterizer, RenderTarget, ViewInput, linear_from_srgb,
 };
 use glam::{DVec3, DVec4};
 
@@ -45,12 +45,18 @@ impl Rig {
     ) -> Result<Vec<[f32; 4]>, AppearanceError> {
         self.buffers.center_scale.write(&self.gpu, &frame.center_scale);
         self.buffers.normal.write(&self.gpu, &frame.normal);
-        let upload = |view: &View| StorageBuffer::from_slice(&self.gpu, "canonical", &view.canonical).unwrap();
-        let maps: Vec<_> = views.iter().map(upload).collect();
+        let upload = |map: &[[f32; 4]]| StorageBuffer::from_slice(&self.gpu, "map", map).unwrap();
+        let maps: Vec<_> = views.iter().map(|view| (upload(&view.canonical), upload(&view.drawn))).collect();
         let inputs: Vec<_> = views
             .iter()
             .zip(&maps)
-            .map(|(view, canonical)| ViewInput { camera: &view.camera, rgba: &view.rgba, canonical, gaussians: None })
+            .map(|(view, (canonical, drawn))| ViewInput {
+                camera: &view.camera,
+                rgba: &view.rgba,
+                canonical,
+                drawn,
+                gaussians: None,
+            })
             .collect();
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         self.appearance.update(&self.gpu, &mut encoder, &self.buffers, &inputs, settings)?;
@@ -63,10 +69,10 @@ impl Rig {
         frame: &Frame,
         views: &[View],
         settings: &AppearanceSettings,
-        memory: &mut [DVec4],
+        state: &mut reference::State,
     ) -> Vec<DVec3> {
         let levels = DiffusionHierarchy::new(&self.person.graph).unwrap().levels;
-        reference::update(&self.person, &levels, frame, views, settings, memory)
+        reference::update(&self.person, &levels, frame, views, settings, state)
     }
 }
 
@@ -108,12 +114,12 @@ fn agrees_with_the_reference_over_time_in_every_setting() {
     let pictures: Vec<_> = frames.iter().map(|frame| views(frame, 96)).collect();
     for settings in ablations() {
         rig.appearance.reset();
-        let mut memory = vec![DVec4::ZERO; 4000];
+        let mut state = reference::State { memory: vec![DVec4::ZERO; 4000], last: None };
         // Cameras come and go.
         for (frame, seen) in [(0, 0..3), (1, 1..3), (2, 0..0), (3, 2..3)] {
             let (frame, views) = (&frames[frame], &pictures[frame][seen]);
             let ours = rig.update(frame, views, &settings);
-            let expected = rig.reference(frame, views, &settings, &mut memory);
+            let expected = rig.reference(frame, views, &settings, &mut state);
             let (worst, mean) = difference(&ours, &expected);
             println!("{settings:?} {} views: max {worst:.2e}, mean {mean:.2e}", views.len());
             assert!(mean < MEAN_TOLERANCE, "{settings:?}: mean {mean}");
@@ -155,7 +161,8 @@ fn what_nobody_sees_is_grey_then_remembered_until_reset() {
         view.camera.camera_from_world = flyrig_types::Isometry::look_at(eye, eye * 2.0, DVec3::Y);
     }
     let grey = [MID_GREY as f32; 3];
-    for settings in ablations() {
+    // These views were not drawn with the last colours.
+    for settings in ablations().map(|settings| AppearanceSettings { sharpness: 0.0, ..settings }) {
         rig.appearance.reset();
         for blind in [&[][..], &masked, &behind] {
             for color in rig.update(&frame, blind, &settings) {
@@ -199,6 +206,7 @@ fn poison_never_reaches_the_memory() {
     let mut bad_views = views.clone();
     for view in &mut bad_views {
         view.canonical.iter_mut().step_by(3).enumerate().for_each(|(i, c)| *c = [poison[i % poison.len()]; 4]);
+        view.drawn.iter_mut().step_by(2).enumerate().for_each(|(i, c)| *c = [poison[i % poison.len()]; 4]);
     }
     bad_views[0].camera.camera_from_world.translation.x = f64::NAN;
     for settings in ablations() {
@@ -214,6 +222,46 @@ fn poison_never_reaches_the_memory() {
             assert_eq!(bits(&colors), bits(&known), "nothing stays");
         }
     }
+}
+
+#[test]
+fn what_is_painted_draws_the_picture_again() {
+    let gaussians = 6000;
+    let mut rig = Rig::new(gaussians, 300);
+    let mut frame = scene::frame(&rig.person, 0.3);
+    // As wide as they are apart.
+    frame.center_scale.iter_mut().for_each(|c| c[3] = 0.012);
+    let mut rasterizer = Rasterizer::new(&rig.gpu, gaussians).unwrap();
+    let target = RenderTarget::new(&rig.gpu, 128, 128).unwrap();
+    let mut error_after = |sharpness: f32, frames: usize| {
+        let settings = AppearanceSettings { sharpness, ..Default::default() };
+        let mut views = views(&frame, 128);
+        rig.appearance.reset();
+        let mut errors = (0.0, 0.0);
+        for _ in 0..frames {
+            rig.update(&frame, &views, &settings);
+            errors = (0.0, 0.0);
+            for view in &mut views {
+                let mut encoder = rig.gpu.device.create_command_encoder(&Default::default());
+                let color = RasterSettings { outputs: Outputs::COLOR, ..Default::default() };
+                rasterizer.encode(&rig.gpu, &mut encoder, &rig.buffers, &view.camera, &color, &target).unwrap();
+                rig.gpu.queue.submit([encoder.finish()]);
+                view.drawn = target.color.read(&rig.gpu).unwrap();
+                for (drawn, wanted) in view.drawn.iter().zip(view.rgba.chunks_exact(4)) {
+                    if wanted[3] == 255 && drawn[3] > 0.9 {
+                        let off = |c: usize| drawn[c] / drawn[3] - linear_from_srgb(f32::from(wanted[c]) / 255.0);
+                        errors.0 += (0..3).map(|c| off(c) * off(c)).sum::<f32>();
+                        errors.1 += 3.0;
+                    }
+                }
+            }
+        }
+        (errors.0 / errors.1).sqrt()
+    };
+    let [plain, once, sharp] = [(0.0, 12), (0.8, 1), (0.8, 12)].map(|(share, frames)| error_after(share, frames));
+    println!("RMS of the drawn pictures, linear light: plain {plain:.4}, sharpened {sharp:.4}");
+    assert!((once - plain).abs() < 0.02 * plain, "nothing is known in the first frame: {once}, {plain}");
+    assert!(sharp < 0.8 * plain, "{sharp} {plain}");
 }
 
 #[test]
@@ -297,6 +345,10 @@ fn refusals_name_the_view_and_the_mend() {
     other[2].canonical.pop();
     let message = rig.try_update(&frame, &other, &settings).unwrap_err().to_string();
     assert!(message.contains("camera fisheye: the canonical map has 255 pixels"), "{message}");
+    let mut no_drawing = views.clone();
+    no_drawing[0].drawn.clear();
+    let message = rig.try_update(&frame, &no_drawing, &settings).unwrap_err().to_string();
+    assert!(message.contains("the drawn picture has 0 pixels"), "{message}");
     let four = [&views[..], &views[..1]].concat();
     let message = rig.try_update(&frame, &four, &settings).unwrap_err().to_string();
     assert!(message.contains("made for 3 views but is given 4"), "{message}");
@@ -304,6 +356,11 @@ fn refusals_name_the_view_and_the_mend() {
         let settings = AppearanceSettings { memory_weight_max: bad, ..settings };
         let message = rig.try_update(&frame, &views, &settings).unwrap_err().to_string();
         assert!(message.contains("memory_weight_max is"), "{message}");
+    }
+    for bad in [f32::NAN, -0.1, 0.96, 1e9] {
+        let settings = AppearanceSettings { sharpness: bad, ..settings };
+        let message = rig.try_update(&frame, &views, &settings).unwrap_err().to_string();
+        assert!(message.contains("sharpness is"), "{message}");
     }
     let mut graph = rig.person.graph.clone();
     graph.gaussian_weights[3] = [f32::NAN; 4];

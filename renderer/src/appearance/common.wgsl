@@ -9,6 +9,8 @@ struct Settings {
     view_weight: f32,
     space: u32,
     time: u32,
+    // 0 where there are no last colours.
+    sharpness: f32,
 }
 
 // By its bits: compilers may assume that no NaN exists and drop `x != x`.

@@ -21,7 +21,7 @@ const MIN_COVERAGE: f32 = 0.01;
 /// The baseline's small number: far below the weight of a visible view, far above rounding.
 const BASELINE_VIEW_WEIGHT: f32 = 1e-3;
 
-/// Layout of `struct Settings` in the WGSL (std140, 32 bytes).
+/// Layout of `struct Settings` in the WGSL (std430, 36 bytes).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(super) struct SettingsConstants {
@@ -33,10 +33,12 @@ pub(super) struct SettingsConstants {
     view_weight: f32,
     space: u32,
     time: u32,
+    sharpness: f32,
 }
 
-impl From<&AppearanceSettings> for SettingsConstants {
-    fn from(settings: &AppearanceSettings) -> Self {
+impl SettingsConstants {
+    /// `painted`: whether there are colours of an earlier frame.
+    pub(super) fn new(settings: &AppearanceSettings, painted: bool) -> Self {
         Self {
             occlusion_per_m: settings.occlusion_per_m,
             memory_weight_max: settings.memory_weight_max,
@@ -46,6 +48,7 @@ impl From<&AppearanceSettings> for SettingsConstants {
             view_weight: if settings.space { 0.0 } else { BASELINE_VIEW_WEIGHT },
             space: settings.space.into(),
             time: settings.time.into(),
+            sharpness: if painted && settings.time { settings.sharpness } else { 0.0 },
         }
     }
 }

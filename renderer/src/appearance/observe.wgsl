@@ -14,6 +14,9 @@
 @group(0) @binding(8) var<storage, read_write> quality: array<vec2<f32>>;
 // Linear value of each sRGB byte.
 @group(0) @binding(9) var<storage, read> linear_from_srgb: array<f32>;
+// The last colours as this view shows them, times alpha; w: alpha.
+@group(0) @binding(10) var<storage, read> drawn: array<vec4<f32>>;
+@group(0) @binding(11) var<storage, read> last: array<vec4<f32>>;
 
 fn linear_rgb(packed: u32) -> vec3<f32> {
     let byte = (vec3(packed) >> vec3(0u, 8u, 16u)) & vec3(0xffu);
@@ -28,6 +31,18 @@ fn angle_weight(normal: vec3<f32>, camera_to_point: vec3<f32>) -> f32 {
         return 0.0;
     }
     return 1.0 - min(length(cross(normal, camera_to_point)) / lengths, 1.0);
+}
+
+// Adds what drawing takes away: a Gaussian's picture is its colour mixed with its neighbours'.
+fn sharpened(color: vec3<f32>, last: vec3<f32>, shown: vec4<f32>) -> vec3<f32> {
+    if !(settings.sharpness > 0.0 && shown.w >= MIN_RENDERED_ALPHA) {
+        return color;
+    }
+    let sharper = color + settings.sharpness * (last - shown.rgb / shown.w);
+    if !all_finite(vec4(sharper, 0.0)) {
+        return color;
+    }
+    return clamp(sharper, vec3(0.0), vec3(1.0));
 }
 
 @compute @workgroup_size(WORKGROUP)
@@ -61,6 +76,7 @@ fn main(
     var color = vec3(0.0);
     var coverage = 0.0;
     var rendered = vec4(0.0);
+    var shown = vec4(0.0);
     for (var corner = 0u; corner < 4u; corner += 1u) {
         let offset = vec2<u32>(corner & 1u, corner >> 1u);
         let texel = vec2<u32>(clamp(vec2<i32>(base) + vec2<i32>(offset), vec2(0), vec2<i32>(camera.size) - 1));
@@ -73,6 +89,7 @@ fn main(
         color += belief * linear_rgb(packed);
         coverage += belief;
         rendered += share * rendered_canonical[index];
+        shown += share * drawn[index];
     }
     if !(coverage >= MIN_COVERAGE) {
         return;
@@ -87,6 +104,7 @@ fn main(
         if weight > 0.0 && is_finite(weight) {
             let before = quality[i];
             quality[i] = vec2(before.x + weight, max(before.y, exp(-settings.occlusion_per_m * d)));
+            color = sharpened(color, last[i].rgb, shown);
         } else {
             weight = 0.0;
         }

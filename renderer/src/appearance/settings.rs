@@ -14,6 +14,9 @@ pub struct ViewInput<'a> {
     /// The Gaussians' canonical positions as this camera sees them: [`RenderTarget::canonical`](crate::RenderTarget)
     /// of a rendering with this very camera and the same Gaussians.
     pub canonical: &'a StorageBuffer<[f32; 4]>,
+    /// The Gaussians with the colours of the last update as this camera sees them: [`RenderTarget::color`](crate::RenderTarget)
+    /// of the same rendering.
+    pub drawn: &'a StorageBuffer<[f32; 4]>,
     /// The Gaussians as they stood when this picture was taken, where that is another instant.
     pub gaussians: Option<&'a GaussianBuffers>,
 }
@@ -24,7 +27,7 @@ pub struct AppearanceSettings {
     /// Fill what no camera sees from its surroundings on the surface. Off: the paper's baseline, every camera that
     /// has the point inside its picture gets a small extra weight, visible or not.
     pub space: bool,
-    /// Remember earlier frames. Off: the memory is neither read nor written.
+    /// Remember earlier frames. Off: neither the memory nor the last colours are read.
     pub time: bool,
     /// k of Eq. 8 and 11, per metre: beyond 1 / k a point counts as hidden.
     pub occlusion_per_m: f32,
@@ -37,6 +40,9 @@ pub struct AppearanceSettings {
     pub inpaint_weight: f32,
     /// Weight of the likeness of neighbouring graph nodes against a node's own observation (0..=1).
     pub smoothness: f32,
+    /// How much of what drawing blurs is put back into the colours, 0 to 0.95; detail that drawing wipes out wholly is
+    /// raised `1 / (1 - sharpness)` times.
+    pub sharpness: f32,
 }
 
 impl Default for AppearanceSettings {
@@ -49,6 +55,7 @@ impl Default for AppearanceSettings {
             min_mask: 0.5,
             inpaint_weight: 0.01,
             smoothness: 0.005,
+            sharpness: 0.8,
         }
     }
 }
@@ -70,7 +77,8 @@ impl AppearanceSettings {
         check("min_mask", self.min_mask, (0.0..1.0).contains(&self.min_mask), "0 up to but not including 1")?;
         let inpaint = self.inpaint_weight;
         check("inpaint_weight", inpaint, positive(inpaint), "a positive number")?;
-        check("smoothness", self.smoothness, positive(self.smoothness), "a positive number")
+        check("smoothness", self.smoothness, positive(self.smoothness), "a positive number")?;
+        check("sharpness", self.sharpness, (0.0..=0.95).contains(&self.sharpness), "0 to 0.95")
     }
 }
 

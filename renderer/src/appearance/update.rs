@@ -113,7 +113,8 @@ impl DirectAppearance {
         for (slot, view) in self.views.iter_mut().zip(views) {
             slot.upload(gpu, view)?;
         }
-        gpu.queue.write_buffer(&self.settings, 0, bytemuck::bytes_of(&SettingsConstants::from(settings)));
+        let constants = SettingsConstants::new(settings, !self.forget);
+        gpu.queue.write_buffer(&self.settings, 0, bytemuck::bytes_of(&constants));
         if std::mem::take(&mut self.forget) {
             encoder.clear_buffer(self.memory.raw(), 0, None);
         }
@@ -146,6 +147,8 @@ impl DirectAppearance {
                     self.seen.raw().as_entire_binding(),
                     self.quality.raw().as_entire_binding(),
                     self.linear_from_srgb.raw().as_entire_binding(),
+                    view.drawn.raw().as_entire_binding(),
+                    gaussians.color.raw().as_entire_binding(),
                 ];
                 self.kernels.observe.bind(gpu, &resources)
             })
@@ -205,6 +208,7 @@ impl DirectAppearance {
             let inputs = [
                 ("the picture", "bytes", pixels * 4, view.rgba.len()),
                 ("the canonical map", "pixels", pixels, view.canonical.len()),
+                ("the drawn picture", "pixels", pixels, view.drawn.len()),
             ];
             for (what, unit, needed, found) in inputs {
                 if needed != found {

@@ -18,21 +18,41 @@ struct Seen {
     closeness: f64,
 }
 
-/// One frame; `memory` (colour, weight) goes on from frame to frame. Returns the colours.
+/// What goes on from frame to frame.
+pub struct State {
+    /// Colour, weight.
+    pub memory: Vec<DVec4>,
+    /// Colours of the last frame.
+    pub last: Option<Vec<DVec3>>,
+}
+
+/// One frame. Returns the colours.
 pub fn update(
     person: &Person,
     levels: &[DiffusionLevel],
     frame: &Frame,
     views: &[View],
     settings: &AppearanceSettings,
-    memory: &mut [DVec4],
+    state: &mut State,
 ) -> Vec<DVec3> {
-    let seen: Vec<Seen> = (0..person.canonical.len()).map(|i| observe(person, frame, views, settings, i)).collect();
+    let last = |i: usize| state.last.as_ref().filter(|_| settings.time).map(|last| last[i]);
+    let seen: Vec<Seen> =
+        (0..person.canonical.len()).map(|i| observe(person, frame, views, settings, i, last(i))).collect();
     let nodes = diffuse(levels, &gather(person, &seen), f64::from(settings.smoothness));
-    seen.iter().enumerate().map(|(i, seen)| paint(person, settings, &nodes, i, seen, &mut memory[i])).collect()
+    let one = |(i, seen)| paint(person, settings, &nodes, i, seen, &mut state.memory[i]);
+    let colors: Vec<DVec3> = seen.iter().enumerate().map(one).collect();
+    state.last = Some(colors.clone());
+    colors
 }
 
-fn observe(person: &Person, frame: &Frame, views: &[View], settings: &AppearanceSettings, i: usize) -> Seen {
+fn observe(
+    person: &Person,
+    frame: &Frame,
+    views: &[View],
+    settings: &AppearanceSettings,
+    i: usize,
+    past: Option<DVec3>,
+) -> Seen {
     let mut seen = Seen::default();
     let [k, min_mask] = [settings.occlusion_per_m, settings.min_mask].map(f64::from);
     let extra = if settings.space { 0.0 } else { 1e-3 };
@@ -44,7 +64,7 @@ fn observe(person: &Person, frame: &Frame, views: &[View], settings: &Appearance
         if pixel.min_element() < -0.5 || pixel.x > last.x || pixel.y > last.y {
             continue;
         }
-        let (mut color, mut coverage, mut rendered) = (DVec3::ZERO, 0.0, DVec4::ZERO);
+        let (mut color, mut coverage, mut rendered, mut drawn) = (DVec3::ZERO, 0.0, DVec4::ZERO, DVec4::ZERO);
         for (dx, dy) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
             let corner = pixel.floor() + DVec2::new(dx, dy);
             let share = (1.0 - (pixel.x - corner.x).abs()) * (1.0 - (pixel.y - corner.y).abs());
@@ -56,10 +76,12 @@ fn observe(person: &Person, frame: &Frame, views: &[View], settings: &Appearance
             color += DVec3::new(linear(texel[0]), linear(texel[1]), linear(texel[2])) * belief;
             coverage += belief;
             rendered += DVec4::from_array(view.canonical[index].map(f64::from)) * share;
+            drawn += DVec4::from_array(view.drawn[index].map(f64::from)) * share;
         }
         if coverage < 0.01 {
             continue;
         }
+        color /= coverage;
         let mut weight = 0.0;
         if rendered.w >= 0.5 {
             let normal = xyz(frame.normal[i]).normalize();
@@ -71,12 +93,16 @@ fn observe(person: &Person, frame: &Frame, views: &[View], settings: &Appearance
             if weight > 0.0 {
                 seen.visible += weight;
                 seen.closeness = seen.closeness.max((-k * d).exp());
+                if let Some(last) = past.filter(|_| drawn.w >= 0.5) {
+                    let lacking = last - drawn.truncate() / drawn.w;
+                    color = (color + lacking * f64::from(settings.sharpness)).clamp(DVec3::ZERO, DVec3::ONE);
+                }
             } else {
                 weight = 0.0;
             }
         }
         let total = weight + extra * coverage;
-        seen.color += color / coverage * total;
+        seen.color += color * total;
         seen.weight += total;
     }
     seen
@@ -142,7 +168,8 @@ pub fn exact_diffusion(
     views: &[View],
     settings: &AppearanceSettings,
 ) -> Vec<DVec3> {
-    let seen: Vec<Seen> = (0..person.canonical.len()).map(|i| observe(person, frame, views, settings, i)).collect();
+    let seen: Vec<Seen> =
+        (0..person.canonical.len()).map(|i| observe(person, frame, views, settings, i, None)).collect();
     let nodes = gather(person, &seen);
     let mut colors = diffuse(levels, &nodes, f64::from(settings.smoothness));
     for _ in 0..20_000 {
@@ -159,7 +186,8 @@ pub fn cascade_diffusion(
     views: &[View],
     settings: &AppearanceSettings,
 ) -> Vec<DVec3> {
-    let seen: Vec<Seen> = (0..person.canonical.len()).map(|i| observe(person, frame, views, settings, i)).collect();
+    let seen: Vec<Seen> =
+        (0..person.canonical.len()).map(|i| observe(person, frame, views, settings, i, None)).collect();
     let colors = diffuse(levels, &gather(person, &seen), f64::from(settings.smoothness));
     upsample_all(person, &colors)
 }

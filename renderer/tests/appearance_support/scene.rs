@@ -32,6 +32,8 @@ pub struct View {
     pub camera: Camera,
     pub rgba: Vec<u8>,
     pub canonical: Vec<[f32; 4]>,
+    /// What the last frame's Gaussians are drawn like: paler than the picture.
+    pub drawn: Vec<[f32; 4]>,
 }
 
 /// Evenly spread Gaussians and nodes, a ninth of them on the ball.
@@ -162,12 +164,13 @@ pub fn view(frame: &Frame, camera: &Camera, background: [u8; 3], paint: impl Fn(
         };
         PARTS.into_iter().filter_map(along).min_by(f64::total_cmp).map(|t| eye + direction * t)
     };
-    let (mut rgba, mut canonical) = (Vec::new(), Vec::new());
+    let (mut rgba, mut canonical, mut drawn) = (Vec::new(), Vec::new(), Vec::new());
     for y in 0..height as i64 {
         for x in 0..width as i64 {
             let Some(point) = hit(x, y) else {
                 rgba.extend([background[0], background[1], background[2], 0]);
                 canonical.push([0.0; 4]);
+                drawn.push([0.0; 4]);
                 continue;
             };
             let inner = [(1, 0), (-1, 0), (0, 1), (0, -1)].iter().all(|(dx, dy)| hit(x + dx, y + dy).is_some());
@@ -177,8 +180,12 @@ pub fn view(frame: &Frame, camera: &Camera, background: [u8; 3], paint: impl Fn(
             }
             rgba.push(if inner { 255 } else { 128 });
             let alpha = if inner { 1.0 } else { 0.75 };
+            drawn.push(
+                [color[0], color[1], color[2], 255].map(|c| (alpha * (0.5 * f64::from(c) / 255.0 + 0.5 * 0.3)) as f32),
+            );
+            drawn[canonical.len()][3] = alpha as f32;
             canonical.push((point * alpha).as_vec3().extend(alpha as f32).to_array());
         }
     }
-    View { camera: camera.clone(), rgba, canonical }
+    View { camera: camera.clone(), rgba, canonical, drawn }
 }
