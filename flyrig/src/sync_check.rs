@@ -7,15 +7,13 @@ use std::{
 
 use anyhow::{Result, bail, ensure};
 use flyrig_body::{ShapeParams, default_template};
-use flyrig_calib::{
-    ClockKind, LagEstimate, MotionSignal, PointTrack, SyncConfig, estimate_lags, estimate_point_lags, load_easymocap,
-};
+use flyrig_calib::{ClockKind, LagEstimate, MotionSignal, PointTrack, SyncConfig, estimate_lags, estimate_point_lags};
 use flyrig_capture::{
     CameraSource, CaptureThreads, FolderOptions, FolderReplay, Pacing, PopError, ThreadsConfig, VideoOptions,
     VideoReplay, to_rgb8_into,
 };
 use flyrig_gpu::GpuContext;
-use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
+use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet, TrackErrorKind};
 use flyrig_types::CameraId;
 
 use crate::{
@@ -92,7 +90,7 @@ fn print(estimates: &[LagEstimate], frames: &[usize]) {
 /// By where the joints of a person are: for takes too short for motion alone.
 fn by_person(args: &SyncCheckArgs, folder: &Path, sources: Sources, cameras: &[CameraId]) -> Result<()> {
     ensure!(cameras.len() > 2, "two cameras cannot tell which point they see; name at least three");
-    let rig = dataset::pick(&load_easymocap(folder, &|_| None)?, &cameras_named(cameras), "the calibration")?;
+    let rig = dataset::pick(&dataset::load_rig(folder, cameras)?, &cameras_named(cameras), "the calibration")?;
     let mut estimator = PoseEstimator::new(
         PoseNet::embedded()?,
         &default_template(&ShapeParams::default())?,
@@ -121,7 +119,8 @@ fn by_person(args: &SyncCheckArgs, folder: &Path, sources: Sources, cameras: &[C
                     frames[slot] += 1;
                 }
             }
-            Err(_) => unseen += 1,
+            Err(error) if error.kind == TrackErrorKind::Lost => unseen += 1,
+            Err(error) => return Err(error.into()),
         }
     }
     let estimates = estimate_point_lags(&tracks, (args.most_ms * 1e6) as i64);
