@@ -310,7 +310,7 @@ mod tests {
     fn a_second_and_a_half_of_walking_is_enough() {
         let mut random = Random(4);
         let mut worst = 0.0f64;
-        for _ in 0..3 {
+        for _ in 0..2 {
             let lags: Vec<i64> =
                 (0..4).map(|i| if i == 0 { 0 } else { ((random.unit() - 0.5) * 160e6) as i64 }).collect();
             let tracks: Vec<PointTrack> =

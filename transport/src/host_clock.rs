@@ -10,10 +10,8 @@ use std::{collections::VecDeque, fmt, sync::Arc};
 const BLOCK: usize = 8;
 /// Quickest ones that the line goes through, about two minutes.
 const BLOCKS: usize = 64;
-/// A quickest one this much slower than the best says too little.
-const SLOWEST: f64 = 3.0;
-/// The line may lean once its ends are so far apart, nanoseconds: over less, the wire's jitter looks like drift.
-const FIRST_LEAN: i64 = 5_000_000_000;
+/// How far clocks of computers usually drift apart, parts per million: what few or slow exchanges say beyond is their noise.
+const USUAL_DRIFT_PPM: f64 = 100.0;
 /// Exchanges before the first answer.
 const FIRST_ANSWER: usize = 3;
 /// Clocks of computers run within this of each other, parts per million.
@@ -144,23 +142,13 @@ impl ClockFit {
         let Some(quickest) = all().min_by_key(|exchange| exchange.round_trip).copied() else { return };
         self.round_trip = quickest.round_trip;
         let flat = Line { anchor: quickest.local, offset: quickest.offset, drift: 0.0 };
-        let worth = |exchange: &Exchange| {
-            let ratio = (exchange.round_trip.max(1) as f64) / (quickest.round_trip.max(1) as f64);
-            if ratio <= SLOWEST { 1.0 / (ratio * ratio) } else { 0.0 }
-        };
-        let useful = || all().filter(|exchange| worth(exchange) > 0.0);
-        let ends = (useful().map(|exchange| exchange.local).min(), useful().map(|exchange| exchange.local).max());
-        let (Some(first), Some(last)) = ends else { return };
-        if last.saturating_sub(first) < FIRST_LEAN {
-            // Until then the slope stays what it was.
-            let drift = self.line.map_or(0.0, |line| line.drift);
-            self.line = Some(Line { drift, ..flat });
-            return;
-        }
-        // Least squares around the quickest exchange, so that the numbers stay small.
-        let [mut w, mut x, mut y, mut xx, mut xy] = [0.0; 5];
-        for exchange in useful() {
-            let weight = worth(exchange);
+        // Least squares around the quickest exchange, so that the numbers stay small; each is known to half of its round
+        // trip, the drift to what is usual.
+        let known = |round_trip: i64| round_trip.max(1000) as f64 / 2.0;
+        let prior = (known(quickest.round_trip) / (USUAL_DRIFT_PPM * 1e-6)).powi(2);
+        let [mut w, mut x, mut y, mut xx, mut xy] = [0.0, 0.0, 0.0, prior, 0.0];
+        for exchange in all() {
+            let weight = (known(quickest.round_trip) / known(exchange.round_trip)).powi(2);
             let dx = exchange.local.saturating_sub(flat.anchor) as f64;
             let dy = exchange.offset.saturating_sub(flat.offset) as f64;
             w += weight;
@@ -169,8 +157,8 @@ impl ClockFit {
             xx += weight * dx * dx;
             xy += weight * dx * dy;
         }
-        let spread = w * xx - x * x;
-        let drift = if spread > 0.0 { (w * xy - x * y) / spread } else { 0.0 };
+        let drift = (w * xy - x * y) / (w * xx - x * x);
+        let drift = if drift.is_finite() { drift } else { 0.0 };
         let drift = drift.clamp(-MOST_DRIFT_PPM * 1e-6, MOST_DRIFT_PPM * 1e-6);
         let shift = (y - drift * x) / w;
         self.line = Some(Line { offset: flat.offset.saturating_add(shift as i64), drift, ..flat });
