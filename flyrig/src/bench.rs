@@ -3,6 +3,7 @@
 mod case;
 pub(crate) mod plot;
 mod sequence;
+pub mod soak;
 mod summary;
 mod surface;
 mod write;
