@@ -1,14 +1,17 @@
 # Two commands set everything up: `make demo` and `make test`. `make help` lists the rest.
 CARGO ?= cargo
 OUT ?= out/demo
+MINUTES ?= 30
 
-.PHONY: help setup demo test test-long test-v4l2 check
+.PHONY: help setup demo test test-long test-v4l2 soak fuzz check
 
 help:
 	@echo "make demo    install what is missing, build, run the simulated rig, show the report (OUT=$(OUT))"
 	@echo "make test    install what is missing, build, run every test"
 	@echo "make test-long  the long stability runs"
 	@echo "make test-v4l2  camera capture against the kernel's test drivers, in an emulated machine"
+	@echo "make soak    four plain cameras for MINUTES (30): memory, latency, processor time"
+	@echo "make fuzz    damaged input for everything that reads foreign bytes, MINUTES (30) for each"
 	@echo "make check   format, lints and documentation, as CI runs them"
 	@echo "make setup   only install what is missing"
 
@@ -28,6 +31,12 @@ test-long: setup
 
 test-v4l2: setup
 	@scripts/test-v4l2.sh
+
+soak: setup
+	$(CARGO) run --release --locked -q -p flyrig -- bench capture --minutes $(MINUTES)
+
+fuzz: setup
+	$(CARGO) run --release --locked -q -p flyrig-tests --bin fuzz -- --minutes $(MINUTES)
 
 check: setup
 	$(CARGO) fmt --all -- --check

@@ -227,8 +227,8 @@ fn rotation_of(entry: &Entry<'_>, matrix: DMat3) -> Result<DQuat, CalibError> {
 /// [`CalibError`] when a camera is bad or a fisheye, or the folder cannot be written.
 pub fn save_easymocap(dir: &Path, rig: &Rig) -> Result<(), CalibError> {
     validate(rig, dir)?;
-    let mut intri = YamlWriter::new(dir.join(INTRINSICS))?;
-    let mut extri = YamlWriter::new(dir.join(EXTRINSICS))?;
+    let mut intri = YamlWriter::new(dir.join(INTRINSICS));
+    let mut extri = YamlWriter::new(dir.join(EXTRINSICS));
     for file in [&mut intri, &mut extri] {
         file.strings("names", rig.cameras.iter().map(|camera| camera.id.as_str()))?;
     }
@@ -241,14 +241,14 @@ pub fn save_easymocap(dir: &Path, rig: &Rig) -> Result<(), CalibError> {
             &format!("K_{id}"),
             3,
             &[i.focal_px.x, 0.0, i.center_px.x, 0.0, i.focal_px.y, i.center_px.y, 0.0, 0.0, 1.0],
-        )?;
-        intri.matrix(&format!("dist_{id}"), 5, &[k1, k2, p1, p2, k3])?;
-        intri.integer(&format!("H_{id}"), i.height)?;
-        intri.integer(&format!("W_{id}"), i.width)?;
+        );
+        intri.matrix(&format!("dist_{id}"), 5, &[k1, k2, p1, p2, k3]);
+        intri.integer(&format!("H_{id}"), i.height);
+        intri.integer(&format!("W_{id}"), i.width);
         let rotation = camera.camera_from_world.rotation;
-        extri.matrix(&format!("R_{id}"), 1, &rotation.to_scaled_axis().to_array())?;
-        extri.matrix(&format!("Rot_{id}"), 3, &DMat3::from_quat(rotation).transpose().to_cols_array())?;
-        extri.matrix(&format!("T_{id}"), 1, &camera.camera_from_world.translation.to_array())?;
+        extri.matrix(&format!("R_{id}"), 1, &rotation.to_scaled_axis().to_array());
+        extri.matrix(&format!("Rot_{id}"), 3, &DMat3::from_quat(rotation).transpose().to_cols_array());
+        extri.matrix(&format!("T_{id}"), 1, &camera.camera_from_world.translation.to_array());
     }
     intri.finish()?;
     extri.finish()

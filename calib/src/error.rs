@@ -28,7 +28,7 @@ pub enum CalibError {
     Parse {
         /// Which file.
         path: PathBuf,
-        /// What OpenCV said.
+        /// What is wrong with it.
         reason: String,
     },
     /// No camera in it.

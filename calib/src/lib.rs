@@ -9,6 +9,7 @@ mod clocks_tests;
 mod easymocap;
 mod error;
 mod lags;
+mod point_lags;
 #[cfg(test)]
 mod random;
 mod sync;
@@ -20,4 +21,5 @@ pub use clocks::{ClockAligner, ClockKind, ClockState};
 pub use easymocap::{load_easymocap, save_easymocap};
 pub use error::CalibError;
 pub use lags::{LagEstimate, MotionSignal, estimate_lags};
+pub use point_lags::{PointTrack, estimate_point_lags};
 pub use sync::{DropCounts, SyncConfig, SyncCounts, Synchronizer};

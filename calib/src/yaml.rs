@@ -1,17 +1,18 @@
-//! OpenCV's FileStorage with errors that name the file, and without OpenCV's own words on stderr.
+//! The YAML that OpenCV's FileStorage writes, and nothing more of YAML: keys, scalars, lists, matrices.
+//!
+//! OpenCV's own reader stands still for ever before some damaged files, so this is read here.
 
-use std::path::{Path, PathBuf};
-
-use flyrig_types::CameraId;
-use opencv::{
-    core::{
-        CV_64F, FileNodeTraitConst, FileStorage, FileStorage_MEMORY, FileStorage_READ, FileStorage_WRITE,
-        FileStorageTrait, FileStorageTraitConst, LogLevel, Mat, MatTraitConst, Vector, set_log_level,
-    },
-    prelude::MatTraitConstManual,
+use std::{
+    fmt::Write as _,
+    path::{Path, PathBuf},
 };
 
+use flyrig_types::CameraId;
+
 use crate::CalibError;
+
+/// Calibrations are small; larger files are something else.
+const MAX_BYTES: usize = 16 << 20;
 
 /// A matrix of a file, row by row.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,81 +22,95 @@ pub(crate) struct Matrix {
     pub values: Vec<f64>,
 }
 
+#[derive(Debug, Clone, PartialEq)]
+enum Value {
+    /// As it stands; whether it was quoted.
+    Scalar(String, bool),
+    List(Vec<Value>),
+    Map(Vec<(String, Value)>),
+}
+
+impl Value {
+    fn number(&self) -> Option<f64> {
+        let Self::Scalar(text, false) = self else { return None };
+        match text.as_str() {
+            ".Inf" | ".inf" | "+.Inf" => Some(f64::INFINITY),
+            "-.Inf" | "-.inf" => Some(f64::NEG_INFINITY),
+            ".NaN" | ".Nan" | ".nan" => Some(f64::NAN),
+            // Rust reads words like "inf" and "nan" too, YAML does not.
+            text if text.starts_with(|c: char| c.is_ascii_digit() || "+-.".contains(c)) => text.parse().ok(),
+            _ => None,
+        }
+    }
+
+    fn get(&self, key: &str) -> Option<&Self> {
+        let Self::Map(entries) = self else { return None };
+        entries.iter().find(|(name, _)| name == key).map(|(_, value)| value)
+    }
+}
+
 /// A parsed file.
 pub(crate) struct YamlFile {
     path: PathBuf,
-    storage: FileStorage,
-}
-
-/// OpenCV prints what it also returns; the user shall see one error.
-fn silence_opencv() {
-    // Fails only without the logger, and then there is nothing to silence.
-    let _ = set_log_level(LogLevel::LOG_LEVEL_SILENT);
-}
-
-fn reason(error: &opencv::Error) -> String {
-    // "OpenCV(4.6.0) file:line: error: (-49:Unknown error code -49) text in function 'f'": the text.
-    let text = error.message.rsplit_once(") ").map_or(error.message.as_str(), |(_, text)| text);
-    text.split(" in function").next().unwrap_or(text).trim().to_owned()
+    entries: Vec<(String, Value)>,
 }
 
 impl YamlFile {
     pub fn open(path: PathBuf) -> Result<Self, CalibError> {
-        silence_opencv();
         let bytes = match std::fs::read(&path) {
             Ok(bytes) => bytes,
             Err(source) => return Err(CalibError::Read { path, source }),
         };
-        let parse = |path: &Path, reason: String| CalibError::Parse { path: path.to_owned(), reason };
-        let Ok(text) = String::from_utf8(bytes) else { return Err(parse(&path, "it is not text".to_owned())) };
-        if text.contains('\0') {
-            return Err(parse(&path, "it is not text".to_owned()));
+        match Self::parse(&bytes) {
+            Ok(entries) => Ok(Self { path, entries }),
+            Err(reason) => Err(CalibError::Parse { path, reason }),
         }
+    }
+
+    fn parse(bytes: &[u8]) -> Result<Vec<(String, Value)>, String> {
+        if bytes.len() > MAX_BYTES {
+            return Err(format!("it has {} bytes, at most {MAX_BYTES}", bytes.len()));
+        }
+        let text = std::str::from_utf8(bytes).ok().filter(|text| !text.contains('\0')).ok_or("it is not text")?;
+        let text = text.trim_start_matches('\u{feff}');
         if !text.trim_start().starts_with("%YAML") {
-            return Err(parse(&path, "it does not begin with %YAML".to_owned()));
+            return Err("it does not begin with %YAML".to_owned());
         }
-        match FileStorage::new_def(&text, FileStorage_READ | FileStorage_MEMORY) {
-            Ok(storage) if storage.is_opened().unwrap_or(false) => Ok(Self { path, storage }),
-            Ok(_) => Err(parse(&path, "nothing in it".to_owned())),
-            Err(error) => Err(parse(&path, reason(&error))),
-        }
+        Lines::new(text).map()
     }
 
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    fn parse_error(&self, error: &opencv::Error) -> CalibError {
-        CalibError::Parse { path: self.path.clone(), reason: reason(error) }
+    fn get(&self, key: &str) -> Option<&Value> {
+        self.entries.iter().find(|(name, _)| name == key).map(|(_, value)| value)
     }
 
     /// Every key of the top level.
     pub fn keys(&self) -> Result<Vec<String>, CalibError> {
-        let root = self.storage.root_def().map_err(|error| self.parse_error(&error))?;
-        if !root.is_map().unwrap_or(false) {
+        if self.entries.is_empty() {
             return Err(CalibError::Parse { path: self.path.clone(), reason: "no keys in it".to_owned() });
         }
-        Ok(root.keys().map_err(|error| self.parse_error(&error))?.iter().collect())
+        Ok(self.entries.iter().map(|(key, _)| key.clone()).collect())
     }
 
     /// A list of strings; `None` when it is missing or holds anything else (YAML reads a bare 00 as
     /// the number 0).
     pub fn strings(&self, key: &str) -> Option<Vec<String>> {
-        let node = self.storage.get(key).ok()?;
-        let count = node.is_seq().ok()?.then(|| node.size().ok())??;
-        (0..i32::try_from(count).ok()?)
-            .map(|i| {
-                let entry = node.at(i).ok()?;
-                entry.is_string().ok()?.then(|| entry.string().ok())?
+        let Some(Value::List(values)) = self.get(key) else { return None };
+        values
+            .iter()
+            .map(|value| match value {
+                Value::Scalar(text, quoted) if *quoted || value.number().is_none() => Some(text.clone()),
+                _ => None,
             })
             .collect()
     }
 
     /// A number; `None` when it is missing or no number.
     pub fn number(&self, key: &str) -> Option<f64> {
-        let node = self.storage.get(key).ok()?;
-        let is_number = node.is_int().ok()? || node.is_real().ok()?;
-        is_number.then(|| node.real().ok())?
+        self.get(key)?.number()
     }
 
     /// A matrix of finite numbers, `None` when the key is missing.
@@ -107,70 +122,239 @@ impl YamlFile {
             problem,
             mend: "export or redo the calibration of this camera",
         };
-        let node = self.storage.get(key).map_err(|error| self.parse_error(&error))?;
-        if node.is_none().unwrap_or(true) {
-            return Ok(None);
-        }
-        if !node.is_map().unwrap_or(false) {
+        let Some(value) = self.get(key) else { return Ok(None) };
+        if !matches!(value, Value::Map(_)) {
             return Err(broken("is not a matrix".to_owned()));
         }
-        let read = || -> opencv::Result<Matrix> {
-            let stored = node.mat()?;
-            let mut mat = Mat::default();
-            stored.convert_to_def(&mut mat, CV_64F)?;
-            let values = if mat.empty() { Vec::new() } else { mat.data_typed::<f64>()?.to_vec() };
-            Ok(Matrix { rows: mat.rows().max(0) as usize, cols: mat.cols().max(0) as usize, values })
+        let size = |name: &str| {
+            let number = value.get(name)?.number().filter(|n| n.fract() == 0.0 && (0.0..=1e6).contains(n))?;
+            Some(number as usize)
         };
-        let matrix = read().map_err(|error| broken(format!("cannot be read as a matrix ({})", reason(&error))))?;
-        match matrix.values.iter().find(|value| !value.is_finite()) {
+        let read = || -> Option<(usize, usize, Vec<f64>)> {
+            let Some(Value::List(data)) = value.get("data") else { return None };
+            Some((size("rows")?, size("cols")?, data.iter().map(Value::number).collect::<Option<_>>()?))
+        };
+        let (rows, cols, values) =
+            read().ok_or_else(|| broken("cannot be read as a matrix (rows, cols or data is no number)".to_owned()))?;
+        if rows.checked_mul(cols) != Some(values.len()) {
+            let count = values.len();
+            return Err(broken(format!("cannot be read as a matrix ({count} numbers for {rows}x{cols})")));
+        }
+        match values.iter().find(|value| !value.is_finite()) {
             Some(value) => Err(broken(format!("holds {value}, not a finite number"))),
-            None => Ok(Some(matrix)),
+            None => Ok(Some(Matrix { rows, cols, values })),
         }
     }
+}
+
+/// The lines that hold something, with their number and indentation.
+struct Lines<'a> {
+    lines: Vec<(usize, usize, &'a str)>,
+    at: usize,
+}
+
+impl<'a> Lines<'a> {
+    fn new(text: &'a str) -> Self {
+        let line = |(number, line): (usize, &'a str)| {
+            let body = line.trim();
+            let is_content = !body.is_empty() && !body.starts_with(['%', '#']) && body != "---" && body != "...";
+            is_content.then_some((number + 1, line.len() - line.trim_start().len(), body))
+        };
+        Self { lines: text.lines().enumerate().filter_map(line).collect(), at: 0 }
+    }
+
+    /// The top level.
+    fn map(mut self) -> Result<Vec<(String, Value)>, String> {
+        let entries = self.entries(0, true)?;
+        match self.lines.get(self.at) {
+            Some((number, ..)) => Err(format!("line {number} is indented, but belongs to nothing")),
+            None => Ok(entries),
+        }
+    }
+
+    /// Keys at one indentation. Only those of the top level may hold keys themselves: nothing lies deeper in these files.
+    fn entries(&mut self, indent: usize, is_top: bool) -> Result<Vec<(String, Value)>, String> {
+        let mut entries: Vec<(String, Value)> = Vec::new();
+        while let Some(&(number, found, body)) = self.lines.get(self.at).filter(|line| line.1 == indent) {
+            let Some((key, rest)) = key(body) else {
+                return Err(format!("line {number}: expected a key, found {:?}", shortened(body)));
+            };
+            self.at += 1;
+            // A tag says what the keys below are; they say it themselves.
+            let rest = match rest.strip_prefix("!!") {
+                Some(tag) => tag.split_once(char::is_whitespace).map_or("", |(_, rest)| rest).trim(),
+                None => rest,
+            };
+            let value = if rest.is_empty() {
+                self.below(found, is_top)?
+            } else if rest.starts_with('[') {
+                self.flow(number, rest)?
+            } else {
+                scalar(rest)
+            };
+            entries.push((key, value));
+        }
+        Ok(entries)
+    }
+
+    /// What follows a key without a value.
+    fn below(&mut self, indent: usize, is_top: bool) -> Result<Value, String> {
+        let Some(&(number, inner, body)) = self.lines.get(self.at) else {
+            return Ok(Value::Scalar(String::new(), false));
+        };
+        let is_item = |body: &str| body == "-" || body.starts_with("- ");
+        if is_item(body) && inner >= indent {
+            let mut items = Vec::new();
+            while let Some((_, _, body)) = self.lines.get(self.at).filter(|line| line.1 == inner && is_item(line.2)) {
+                items.push(scalar(body[1..].trim()));
+                self.at += 1;
+            }
+            return Ok(Value::List(items));
+        }
+        if inner <= indent {
+            return Ok(Value::Scalar(String::new(), false));
+        }
+        if !is_top {
+            return Err(format!("line {number} lies deeper than a calibration goes"));
+        }
+        Ok(Value::Map(self.entries(inner, false)?))
+    }
+
+    /// `[ a, b, c ]`, over as many lines as it takes.
+    fn flow(&mut self, number: usize, first: &str) -> Result<Value, String> {
+        let mut items = Vec::new();
+        let mut rest = &first[1..];
+        loop {
+            let (inside, is_end) = rest.split_once(']').map_or((rest, false), |(inside, _)| (inside, true));
+            if inside.contains(['[', '{']) {
+                return Err(format!("line {number}: a list inside of a list"));
+            }
+            items.extend(inside.split(',').map(str::trim).filter(|item| !item.is_empty()).map(scalar));
+            if is_end {
+                return Ok(Value::List(items));
+            }
+            let Some((_, _, body)) = self.lines.get(self.at) else {
+                return Err(format!("line {number}: a list without its end"));
+            };
+            rest = body;
+            self.at += 1;
+        }
+    }
+}
+
+/// `key: rest`; the key may stand in quotes.
+fn key(body: &str) -> Option<(String, &str)> {
+    let (key, rest) = match body.strip_prefix('"') {
+        Some(quoted) => {
+            let (key, rest) = quoted.split_once('"')?;
+            (key, rest.trim_start().strip_prefix(':')?)
+        }
+        None => body.split_once(": ").or_else(|| Some((body.strip_suffix(':')?, "")))?,
+    };
+    let key = key.trim();
+    (!key.is_empty()).then(|| (key.to_owned(), rest.trim()))
+}
+
+fn scalar(text: &str) -> Value {
+    for quote in ['"', '\''] {
+        if let Some(inner) = text.strip_prefix(quote).and_then(|text| text.split_once(quote)) {
+            return Value::Scalar(inner.0.to_owned(), true);
+        }
+    }
+    let text = text.split(" #").next().unwrap_or_default().trim();
+    Value::Scalar(text.to_owned(), false)
+}
+
+fn shortened(text: &str) -> String {
+    text.chars().take(40).collect()
 }
 
 /// A file in the making.
 pub(crate) struct YamlWriter {
     path: PathBuf,
-    storage: FileStorage,
+    text: String,
 }
 
 impl YamlWriter {
-    pub fn new(path: PathBuf) -> Result<Self, CalibError> {
-        silence_opencv();
-        match FileStorage::new_def("rig.yml", FileStorage_WRITE | FileStorage_MEMORY) {
-            Ok(storage) => Ok(Self { path, storage }),
-            Err(error) => Err(CalibError::Write { path, reason: reason(&error) }),
-        }
-    }
-
-    fn checked<T>(&self, result: opencv::Result<T>) -> Result<T, CalibError> {
-        result.map_err(|error| CalibError::Write { path: self.path.clone(), reason: reason(&error) })
+    pub fn new(path: PathBuf) -> Self {
+        Self { path, text: "%YAML:1.0\n---\n".to_owned() }
     }
 
     pub fn strings<'a>(&mut self, key: &str, values: impl Iterator<Item = &'a str>) -> Result<(), CalibError> {
-        let written = self.storage.write_str_vec(key, &Vector::<String>::from_iter(values));
-        self.checked(written)
+        let _ = writeln!(self.text, "{key}:");
+        for value in values {
+            if value.contains('"') || value.contains(char::is_control) {
+                let reason = format!("the name {value:?} cannot stand in it");
+                return Err(CalibError::Write { path: self.path.clone(), reason });
+            }
+            let _ = writeln!(self.text, "   - \"{value}\"");
+        }
+        Ok(())
     }
 
-    pub fn integer(&mut self, key: &str, value: u32) -> Result<(), CalibError> {
-        let written = i32::try_from(value)
-            .map_err(|_| opencv::Error::new(0, format!("{key} is too large")))
-            .and_then(|value| self.storage.write_i32(key, value));
-        self.checked(written)
+    pub fn integer(&mut self, key: &str, value: u32) {
+        let _ = writeln!(self.text, "{key}: {value}");
     }
 
-    pub fn matrix(&mut self, key: &str, cols: usize, values: &[f64]) -> Result<(), CalibError> {
+    pub fn matrix(&mut self, key: &str, cols: usize, values: &[f64]) {
         let rows = values.len() / cols.max(1);
-        let written = Mat::new_rows_cols_with_data(rows as i32, cols as i32, values)
-            .and_then(|mat| self.storage.write_mat(key, &mat));
-        self.checked(written)
+        // The shortest digits that read back as the same number.
+        let data: Vec<String> = values.iter().map(|value| format!("{value:?}")).collect();
+        let data = data.join(", ");
+        let _ = writeln!(
+            self.text,
+            "{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {data} ]"
+        );
     }
 
-    pub fn finish(mut self) -> Result<(), CalibError> {
-        let text = self.storage.release_and_get_string();
-        let text = self.checked(text)?;
-        std::fs::write(&self.path, text)
-            .map_err(|error| CalibError::Write { path: self.path.clone(), reason: error.to_string() })
+    pub fn finish(self) -> Result<(), CalibError> {
+        std::fs::write(&self.path, self.text)
+            .map_err(|error| CalibError::Write { path: self.path, reason: error.to_string() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(text: &str) -> Result<YamlFile, String> {
+        let entries = YamlFile::parse(format!("%YAML:1.0\n---\n{text}").as_bytes())?;
+        Ok(YamlFile { path: "x.yml".into(), entries })
+    }
+
+    #[test]
+    fn the_ways_in_which_opencv_and_people_write() {
+        let text = "# by hand\nnames: [ \"a\", 'b', c ]\nflat:\n- \"01\"\n- x # told\n\"quoted\": 7.5\nK: !!opencv-matrix\n   rows: 2\n   cols: 2\n   dt: d\n   \
+                    data: [ 1., -2.5e-3,\n       +3, .5 ]\nempty:\nlast: !!str yes\n";
+        let file = parse(text).unwrap();
+        assert_eq!(file.keys().unwrap(), ["names", "flat", "quoted", "K", "empty", "last"]);
+        assert_eq!(file.strings("names").unwrap(), ["a", "b", "c"]);
+        assert_eq!(file.strings("flat").unwrap(), ["01", "x"]);
+        assert_eq!((file.number("quoted"), file.number("names"), file.number("last")), (Some(7.5), None, None));
+        let matrix = file.matrix(&"a".into(), "K").unwrap().unwrap();
+        assert_eq!(matrix, Matrix { rows: 2, cols: 2, values: vec![1.0, -0.0025, 3.0, 0.5] });
+        assert_eq!(parse("names:\n   - 00\n   - 01\n").unwrap().strings("names"), None, "numbers, to YAML");
+    }
+
+    #[test]
+    fn damage_is_named_with_its_line() {
+        for (text, expected) in [
+            ("K\n", "line 3: expected a key, found \"K\""),
+            ("a: 1\n  b: 2\n", "line 4 is indented, but belongs to nothing"),
+            ("a: [ 1,\n 2\n", "line 3: a list without its end"),
+            ("a: [ 1, [ 2 ] ]\n", "line 3: a list inside of a list"),
+            ("a:\n  b:\n    c:\n      d: 1\n", "line 5 lies deeper than a calibration goes"),
+            ("- 1\n", "line 3: expected a key"),
+        ] {
+            let found = parse(text).err().unwrap();
+            assert!(found.starts_with(expected), "{text}: {found}");
+        }
+        let file = parse(
+            "K: !!opencv-matrix\n  rows: 1e300\n  cols: 3\n  data: [ 1 ]\nL:\n  rows: 2\n  cols: 3\n  data: [ inf ]\n",
+        )
+        .unwrap();
+        for key in ["K", "L"] {
+            assert!(file.matrix(&"a".into(), key).unwrap_err().to_string().contains("cannot be read as a matrix"));
+        }
     }
 }

@@ -3,10 +3,12 @@
 //!
 //! A [`CameraSource`] gives [`flyrig_types::Frame`]s with capture time, sequence number and camera
 //! name, or a [`CaptureError`] whose kind says what to do. [`CaptureThreads`] reads every source in
-//! a thread of its own into one [`LatestQueue`].
+//! a thread of its own into one [`LatestQueue`], with a [`FrameStage`] (decoding, compressing) in a
+//! second thread between them where one is asked for.
 
 mod camera_options;
 mod decoding;
+mod encoding;
 mod error;
 mod folder;
 mod mjpeg;
@@ -16,6 +18,7 @@ mod queue;
 mod recording;
 mod rgb;
 mod source;
+mod stage;
 mod threads;
 mod turns;
 #[cfg(target_os = "linux")]
@@ -24,13 +27,15 @@ mod video;
 
 pub use camera_options::{CameraControls, CameraIdentity, CameraOptions, FormatChoice};
 pub use decoding::Decoding;
+pub use encoding::JpegEncoding;
 pub use error::{CaptureError, CaptureErrorKind};
 pub use folder::{FolderOptions, FolderReplay, folder_picture_size};
 pub use pool::BufferPool;
 pub use queue::{LatestQueue, PopError};
 pub use recording::{McapReplay, Note, Recorded, Recorder, Recording, recorded_notes};
 pub use rgb::{to_rgb8, to_rgb8_into};
-pub use source::{CameraSource, SourceHealth};
+pub use source::{CameraSource, NetworkHealth, SourceHealth};
+pub use stage::FrameStage;
 pub use threads::{CameraStats, CaptureThreads, Pacing, ThreadsConfig};
 #[cfg(target_os = "linux")]
 pub use v4l2::{

@@ -12,7 +12,13 @@ use crate::{CaptureError, CaptureErrorKind, picture};
 ///
 /// # Errors
 /// `Corrupt`, whatever is wrong with the bytes.
-pub(crate) fn decode(bytes: &[u8], width: usize, height: usize, rgb: &mut [u8]) -> Result<(), CaptureError> {
+pub(crate) fn decode(
+    bytes: &[u8],
+    width: usize,
+    height: usize,
+    rgb: &mut [u8],
+    scratch: &mut JpegScratch,
+) -> Result<(), CaptureError> {
     let corrupt = |text: String| CaptureError::general(CaptureErrorKind::Corrupt, text);
     if !bytes.starts_with(&[0xff, 0xd8]) {
         return Err(corrupt("is not a JPEG picture".to_owned()));
@@ -21,13 +27,13 @@ pub(crate) fn decode(bytes: &[u8], width: usize, height: usize, rgb: &mut [u8]) 
         return Err(corrupt("is a JPEG picture that is cut off".to_owned()));
     }
     let damaged = |error: &dyn std::fmt::Display| corrupt(format!("is a damaged JPEG picture ({error})"));
-    let completed = with_huffman_tables(bytes);
+    let whole = if scratch.complete(bytes) { &scratch.0 } else { bytes };
     let options = DecoderOptions::default()
         .set_strict_mode(true)
         .set_max_width(width)
         .set_max_height(height)
         .jpeg_set_out_colorspace(ColorSpace::RGB);
-    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(completed.as_deref().unwrap_or(bytes)), options);
+    let mut decoder = JpegDecoder::new_with_options(ZCursor::new(whole), options);
     if let Err(error) = decoder.decode_headers() {
         return match jpeg_size(bytes) {
             Some(size) if size != (width, height) => Err(other_size(size, width, height)),
@@ -75,33 +81,41 @@ pub(crate) fn jpeg_size(bytes: &[u8]) -> Option<(usize, usize)> {
     Some((usize::from(u16::from_be_bytes([w1, w0])), usize::from(u16::from_be_bytes([h1, h0]))))
 }
 
-/// The picture with the standard's tables put before its scan, when it has none of its own: USB cameras leave them out.
-fn with_huffman_tables(bytes: &[u8]) -> Option<Vec<u8>> {
-    let mut scan = None;
-    for (at, marker) in segments(bytes) {
-        match marker {
-            0xc4 => return None,
-            0xda => scan = Some(at),
-            _ => {}
+/// Memory that is used again from picture to picture.
+#[derive(Debug, Default)]
+pub(crate) struct JpegScratch(Vec<u8>);
+
+impl JpegScratch {
+    /// Puts the standard's tables before the scan of a picture that has none of its own: USB cameras leave them out. False
+    /// where nothing is missing.
+    fn complete(&mut self, bytes: &[u8]) -> bool {
+        let mut scan = None;
+        for (at, marker) in segments(bytes) {
+            match marker {
+                0xc4 => return false,
+                0xda => scan = Some(at),
+                _ => {}
+            }
         }
+        let Some(scan) = scan else { return false };
+        let completed = &mut self.0;
+        completed.clear();
+        completed.extend_from_slice(&bytes[..scan]);
+        for (class, counts, values) in [
+            (0x00, DC_LUMA_COUNTS, &DC_VALUES[..]),
+            (0x10, AC_LUMA_COUNTS, &AC_LUMA_VALUES[..]),
+            (0x01, DC_CHROMA_COUNTS, &DC_VALUES[..]),
+            (0x11, AC_CHROMA_COUNTS, &AC_CHROMA_VALUES[..]),
+        ] {
+            completed.extend([0xff, 0xc4]);
+            completed.extend((2 + 1 + 16 + values.len() as u16).to_be_bytes());
+            completed.push(class);
+            completed.extend(counts);
+            completed.extend(values);
+        }
+        completed.extend_from_slice(&bytes[scan..]);
+        true
     }
-    let scan = scan?;
-    let mut completed = Vec::with_capacity(bytes.len() + 420);
-    completed.extend_from_slice(&bytes[..scan]);
-    for (class, counts, values) in [
-        (0x00, DC_LUMA_COUNTS, &DC_VALUES[..]),
-        (0x10, AC_LUMA_COUNTS, &AC_LUMA_VALUES[..]),
-        (0x01, DC_CHROMA_COUNTS, &DC_VALUES[..]),
-        (0x11, AC_CHROMA_COUNTS, &AC_CHROMA_VALUES[..]),
-    ] {
-        completed.extend([0xff, 0xc4]);
-        completed.extend((2 + 1 + 16 + values.len() as u16).to_be_bytes());
-        completed.push(class);
-        completed.extend(counts);
-        completed.extend(values);
-    }
-    completed.extend_from_slice(&bytes[scan..]);
-    Some(completed)
 }
 
 // ITU-T T.81, tables K.3 to K.6: number of codes of each length, and the values in the order of their codes.
@@ -151,7 +165,7 @@ mod tests {
 
     fn decoded(bytes: &[u8], width: usize, height: usize) -> Result<Vec<u8>, CaptureError> {
         let mut rgb = vec![0; width * height * 3];
-        decode(bytes, width, height, &mut rgb).map(|()| rgb)
+        decode(bytes, width, height, &mut rgb, &mut JpegScratch::default()).map(|()| rgb)
     }
 
     fn without_tables(jpeg: &[u8]) -> Vec<u8> {
@@ -193,6 +207,7 @@ mod tests {
         };
         let mut rgb = vec![0; 48 * 32 * 3];
         let (mut refused, mut taken) = (0, 0);
+        let mut scratch = JpegScratch::default();
         for round in 0..rounds {
             let mut bytes = sources[round % 2].clone();
             match random(5) {
@@ -213,7 +228,7 @@ mod tests {
                 }
             }
             let is_cut = !picture::jpeg_has_end(&bytes);
-            let result = catch_unwind(std::panic::AssertUnwindSafe(|| decode(&bytes, 48, 32, &mut rgb)));
+            let result = catch_unwind(std::panic::AssertUnwindSafe(|| decode(&bytes, 48, 32, &mut rgb, &mut scratch)));
             match result.expect("a damaged picture made the decoder panic") {
                 Ok(()) => {
                     assert!(!is_cut, "a picture without its end came through");

@@ -5,7 +5,10 @@
 
 use flyrig_types::{Image, PixelFormat};
 
-use crate::{CaptureError, CaptureErrorKind, mjpeg};
+use crate::{
+    CaptureError, CaptureErrorKind,
+    mjpeg::{self, JpegScratch},
+};
 
 /// The image as `width * height` pixels of 3 bytes, sRGB red green blue. Alpha is left out, grey is
 /// repeated, YUV is BT.601 limited range, Bayer is interpolated bilinearly, JPEG decoded.
@@ -24,6 +27,11 @@ pub fn to_rgb8(image: &Image) -> Result<Vec<u8>, CaptureError> {
 /// # Errors
 /// As [`to_rgb8`].
 pub fn to_rgb8_into(image: &Image, rgb: &mut Vec<u8>) -> Result<(), CaptureError> {
+    convert(image, rgb, &mut JpegScratch::default())
+}
+
+/// As [`to_rgb8_into`], with the JPEG decoder's memory.
+pub(crate) fn convert(image: &Image, rgb: &mut Vec<u8>, scratch: &mut JpegScratch) -> Result<(), CaptureError> {
     let (width, height) = (image.width() as usize, image.height() as usize);
     let bytes = image.bytes();
     rgb.resize(width * height * 3, 0);
@@ -87,7 +95,7 @@ pub fn to_rgb8_into(image: &Image, rgb: &mut Vec<u8>) -> Result<(), CaptureError
             demosaic(bytes, width, height, phase, rgb);
         }
         PixelFormat::Mjpeg => {
-            mjpeg::decode(bytes, width, height, rgb)?;
+            mjpeg::decode(bytes, width, height, rgb, scratch)?;
         }
     }
     Ok(())

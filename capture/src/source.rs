@@ -1,6 +1,6 @@
 //! The one trait behind which every camera stands.
 
-use std::time::Duration;
+use std::{sync::Arc, time::Duration};
 
 use flyrig_types::{CameraId, Frame};
 
@@ -18,7 +18,30 @@ pub struct SourceHealth {
     /// Time stamps that could not be right and were replaced.
     pub stamps_replaced: u64,
     /// Format, size and rate in force, as text; empty where it says nothing.
-    pub mode: String,
+    pub mode: Arc<str>,
+    /// Of a camera on another computer.
+    pub network: Option<NetworkHealth>,
+}
+
+/// What happens to a camera's frames between its computer and this one; counts since this one listens.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct NetworkHealth {
+    /// Frames that newer ones overtook before they left the camera's computer.
+    pub overtaken_before: u64,
+    /// Frames that left and never came.
+    pub lost_on_the_way: u64,
+    /// Frames that came and were overtaken before they were read.
+    pub overtaken_here: u64,
+    /// Messages that could not be used: damaged, hostile, of another publisher, with a stamp that cannot be right.
+    pub refused: u64,
+    /// Frames that came before the other computer's clock was known.
+    pub before_clock: u64,
+    /// Clock of the camera's computer minus ours, nanoseconds; none as long as it is not known.
+    pub clock_offset_nanos: Option<i64>,
+    /// How much faster that clock runs than ours, parts in 10^9.
+    pub clock_drift_ppb: i64,
+    /// Shortest round trip of late: half of it bounds the error of the offset, nanoseconds.
+    pub round_trip_nanos: u64,
 }
 
 /// A camera, real, recorded or simulated, read by one thread.

@@ -11,7 +11,9 @@ use std::{
 
 use flyrig_types::{CameraId, Frame};
 
-use crate::{CameraSource, CaptureError, CaptureErrorKind, LatestQueue, SourceHealth, turns::Turns};
+use crate::{
+    CameraSource, CaptureError, CaptureErrorKind, FrameStage, LatestQueue, SourceHealth, stage::Hand, turns::Turns,
+};
 
 /// How long a source may wait for a frame before its thread looks whether it shall stop.
 const POLL: Duration = Duration::from_millis(200);
@@ -58,6 +60,8 @@ pub struct CameraStats {
     pub frames: u64,
     /// Frames of this camera that were dropped out of the full queue.
     pub dropped: u64,
+    /// Frames that newer ones overtook before the camera's stage (see [`FrameStage`]) came to them.
+    pub overtaken: u64,
     /// Errors by kind; the end of a recording is none.
     pub errors: BTreeMap<CaptureErrorKind, u64>,
     /// The error that came last.
@@ -73,6 +77,9 @@ pub struct CameraStats {
 /// A thread goes on after errors that may pass, with growing pauses while a camera is gone; a panic
 /// inside a source ends that camera alone, as `Disconnected`. The queue closes when all threads
 /// have ended. Dropping this stops the threads and waits for them.
+///
+/// With a [`FrameStage`] each camera has a second thread for it, so that a slow or damaged picture holds up neither the
+/// driver's buffers nor another camera.
 #[derive(Debug)]
 pub struct CaptureThreads {
     shared: Arc<Shared>,
@@ -80,8 +87,10 @@ pub struct CaptureThreads {
 }
 
 #[derive(Debug)]
-struct Shared {
+pub(crate) struct Shared {
     queue: Arc<LatestQueue<Frame>>,
+    /// By slot, between a camera's thread and its stage's; empty without stages.
+    hands: Vec<Hand>,
     pacing: Pacing,
     turns: Turns,
     stats: Mutex<Vec<CameraStats>>,
@@ -97,6 +106,27 @@ impl CaptureThreads {
     /// # Errors
     /// `Unsupported` when two sources have one name, `Io` when the system gives no thread.
     pub fn start(sources: Vec<Box<dyn CameraSource>>, config: ThreadsConfig) -> Result<Self, CaptureError> {
+        Self::start_all(sources, Vec::new(), config)
+    }
+
+    /// The same, with a stage behind every source; each runs in a thread of its own.
+    ///
+    /// # Errors
+    /// As [`Self::start`].
+    pub fn start_staged(
+        sources: Vec<Box<dyn CameraSource>>,
+        stage: impl Fn(&CameraId) -> Box<dyn FrameStage>,
+        config: ThreadsConfig,
+    ) -> Result<Self, CaptureError> {
+        let stages = sources.iter().map(|source| stage(source.camera())).collect();
+        Self::start_all(sources, stages, config)
+    }
+
+    fn start_all(
+        sources: Vec<Box<dyn CameraSource>>,
+        stages: Vec<Box<dyn FrameStage>>,
+        config: ThreadsConfig,
+    ) -> Result<Self, CaptureError> {
         let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
         for (i, camera) in cameras.iter().enumerate() {
             if cameras[..i].contains(camera) {
@@ -108,6 +138,7 @@ impl CaptureThreads {
             camera: camera.clone(),
             frames: 0,
             dropped: 0,
+            overtaken: 0,
             errors: BTreeMap::new(),
             last_error: None,
             health: SourceHealth::default(),
@@ -115,6 +146,7 @@ impl CaptureThreads {
         };
         let shared = Arc::new(Shared {
             queue: Arc::new(LatestQueue::new(config.queue_capacity)),
+            hands: stages.iter().map(|_| Hand::new()).collect(),
             pacing: config.pacing,
             turns: Turns::new(cameras.len()),
             stats: Mutex::new(cameras.iter().map(stats).collect()),
@@ -126,16 +158,30 @@ impl CaptureThreads {
             shared.queue.close();
         }
         // From here on an early return drops this and stops what has started.
-        let mut this = Self { shared, threads: Vec::with_capacity(cameras.len()) };
-        for ((slot, source), camera) in sources.into_iter().enumerate().zip(&cameras) {
+        let mut this = Self { shared, threads: Vec::with_capacity(2 * cameras.len()) };
+        for (slot, stage) in stages.into_iter().enumerate() {
             let shared = Arc::clone(&this.shared);
-            let thread = Builder::new()
-                .name(format!("camera {camera}"))
-                .spawn(move || shared.run(slot, source))
-                .map_err(|error| CaptureError::new(camera, CaptureErrorKind::Io, format!("no thread: {error}")))?;
-            this.threads.push(thread);
+            this.spawn("stage", &cameras[slot], move || shared.run_stage(slot, stage))?;
+        }
+        for (slot, source) in sources.into_iter().enumerate() {
+            let shared = Arc::clone(&this.shared);
+            this.spawn("camera", &cameras[slot], move || shared.run(slot, source))?;
         }
         Ok(this)
+    }
+
+    fn spawn(
+        &mut self,
+        what: &str,
+        camera: &CameraId,
+        work: impl FnOnce() + Send + 'static,
+    ) -> Result<(), CaptureError> {
+        let thread = Builder::new()
+            .name(format!("{what} {camera}"))
+            .spawn(work)
+            .map_err(|error| CaptureError::new(camera, CaptureErrorKind::Io, format!("no thread: {error}")))?;
+        self.threads.push(thread);
+        Ok(())
     }
 
     /// Where the frames are; closed and empty after the last one.
@@ -156,6 +202,7 @@ impl Drop for CaptureThreads {
         *lock(&self.shared.stopped) = true;
         self.shared.stop.notify_all();
         self.shared.queue.close();
+        self.shared.hands.iter().for_each(Hand::close);
         self.shared.turns.close();
         for thread in self.threads.drain(..) {
             // A panic was caught and counted inside the thread.
@@ -174,20 +221,38 @@ fn panic_text(panic: &(dyn Any + Send)) -> &str {
 }
 
 impl Shared {
+    /// The hand-over to a camera's stage.
+    pub(crate) fn hand(&self, slot: usize) -> Option<&Hand> {
+        self.hands.get(slot)
+    }
+
     fn run(&self, slot: usize, source: Box<dyn CameraSource>) {
         // The source moves in, so that a panic in its Drop is caught too; it is never used again.
         let read = AssertUnwindSafe(move || self.read(slot, source));
         if let Err(panic) = catch_unwind(read) {
-            let camera = lock(&self.stats)[slot].camera.clone();
+            let camera = self.camera(slot);
             let message = format!("its source failed inside: {}; restart to use it again", panic_text(&*panic));
             self.count(slot, CaptureError::new(&camera, CaptureErrorKind::Disconnected, message));
         }
+        // What its stage still has to do comes first.
+        match self.hands.get(slot) {
+            Some(hand) => hand.close(),
+            None => self.end(slot),
+        }
+    }
+
+    /// The last frame of a camera is delivered.
+    pub(crate) fn end(&self, slot: usize) {
         self.turns.end(slot);
         let mut stats = lock(&self.stats);
         stats[slot].running = false;
         if stats.iter().all(|stats| !stats.running) {
             self.queue.close();
         }
+    }
+
+    pub(crate) fn camera(&self, slot: usize) -> CameraId {
+        lock(&self.stats)[slot].camera.clone()
     }
 
     fn read(&self, slot: usize, mut source: Box<dyn CameraSource>) {
@@ -199,7 +264,11 @@ impl Shared {
                 Ok(frame) => {
                     (pause, failures) = (FIRST_PAUSE, 0);
                     let order_nanos = source.order_nanos(&frame);
-                    if self.deliver(slot, frame, order_nanos) {
+                    let is_open = match self.hands.get(slot) {
+                        Some(hand) => self.hand_over(slot, hand, frame, order_nanos),
+                        None => self.deliver(slot, frame, order_nanos),
+                    };
+                    if is_open {
                         continue;
                     }
                     return;
@@ -226,8 +295,20 @@ impl Shared {
         }
     }
 
+    /// To the camera's stage; whether to go on.
+    fn hand_over(&self, slot: usize, hand: &Hand, frame: Frame, order_nanos: i64) -> bool {
+        if self.pacing == Pacing::Lossless {
+            return hand.0.push_wait((frame, order_nanos)).is_ok();
+        }
+        let Ok(overtaken) = hand.0.push((frame, order_nanos)) else { return false };
+        if overtaken.is_some() {
+            lock(&self.stats)[slot].overtaken += 1;
+        }
+        true
+    }
+
     /// Whether to go on.
-    fn deliver(&self, slot: usize, frame: Frame, order_nanos: i64) -> bool {
+    pub(crate) fn deliver(&self, slot: usize, frame: Frame, order_nanos: i64) -> bool {
         match self.pacing {
             Pacing::AsDelivered => {}
             Pacing::RealTime => self.pace(frame.capture_nanos),
@@ -273,7 +354,7 @@ impl Shared {
         }
     }
 
-    fn count(&self, slot: usize, error: CaptureError) {
+    pub(crate) fn count(&self, slot: usize, error: CaptureError) {
         let mut stats = lock(&self.stats);
         let count = stats[slot].errors.entry(error.kind).or_default();
         *count += 1;

@@ -4,6 +4,7 @@ mod appearance;
 mod case;
 pub(crate) mod plot;
 mod sequence;
+pub mod soak;
 mod summary;
 mod surface;
 mod write;

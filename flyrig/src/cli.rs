@@ -48,6 +48,12 @@ pub enum Command {
         #[arg(long)]
         table: bool,
     },
+    /// Send the cameras of this computer to a rig that runs on another one (source.kind = "network" there) until Ctrl-C. Of
+    /// the configuration [rig], [source], [capture], [transport] and [health] count; it needs no calibration.
+    Capture {
+        /// The TOML file; see `flyrig config print`.
+        config: PathBuf,
+    },
     /// Record the cameras of a configuration into an MCAP file, without tracking.
     Record(RecordArgs),
     /// Play a recording through, tell what is in it, and export it where asked to. To run the rig on it, set
@@ -119,6 +125,10 @@ pub struct SyncCheckArgs {
     /// Frame rate of a folder.
     #[arg(long, default_value_t = 30.0)]
     pub fps: f64,
+    /// Folder with intri.yml and extri.yml: compare where the joints of a person are in place of what moves. Needs three
+    /// cameras that see one person; a second and a half is enough.
+    #[arg(long)]
+    pub calibration: Option<PathBuf>,
 }
 
 #[derive(Debug, Subcommand)]
@@ -201,6 +211,8 @@ pub enum BenchCommand {
     Track(BenchTrackArgs),
     /// Appearance: every mode on simulated people that nobody trained on; writes CSV, JSON and SVG.
     Appearance(BenchAppearanceArgs),
+    /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to whole sets.
+    Capture(BenchCaptureArgs),
 }
 
 #[derive(Debug, Args)]
@@ -232,6 +244,22 @@ pub struct BenchAppearanceArgs {
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
     pub gaussians: usize,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchCaptureArgs {
+    /// How long.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_minutes)]
+    pub minutes: f64,
+    /// Cameras; every second one sends JPEG.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=32))]
+    pub cameras: u32,
+    /// Frames a second.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// Size of the pictures, WIDTHxHEIGHT.
+    #[arg(long, value_parser = parse_size, default_value = "640x360")]
+    pub size: [u32; 2],
 }
 
 #[derive(Debug, Args)]
@@ -415,6 +443,20 @@ fn parse_most_ms(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(ms) if (4.0..=10_000.0).contains(&ms) => Ok(ms),
         _ => Err(format!("'{text}' is not between 4 and 10000 milliseconds")),
+    }
+}
+
+fn parse_minutes(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(minutes) if (0.01..=10_000.0).contains(&minutes) => Ok(minutes),
+        _ => Err(format!("'{text}' is not between 0.01 and 10000 minutes")),
+    }
+}
+
+fn parse_fps(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(fps) if (0.1..=1000.0).contains(&fps) => Ok(fps),
+        _ => Err(format!("'{text}' is not between 0.1 and 1000 frames a second")),
     }
 }
 

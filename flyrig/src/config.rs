@@ -28,6 +28,7 @@ pub struct Config {
     pub tracking: TrackingSection,
     pub appearance: AppearanceSection,
     pub output: OutputSection,
+    pub capture: CaptureSection,
     pub transport: TransportSection,
     pub health: HealthSection,
     pub gpu: GpuSection,
@@ -52,7 +53,15 @@ pub enum SourceKind {
     Folder,
     Video,
     V4l2,
+    Network,
     Mcap,
+}
+
+impl SourceKind {
+    /// Whether frames come when they are taken, with the time of this computer.
+    pub fn is_live(self) -> bool {
+        matches!(self, Self::V4l2 | Self::Network)
+    }
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -92,6 +101,10 @@ impl SourceSection {
                 }
             }
         }
+        ensure!(
+            self.kind != SourceKind::Network || !self.cameras.is_empty(),
+            "source.kind is \"network\" but source.cameras names no camera"
+        );
         ensure!(
             self.kind != SourceKind::V4l2 || !self.cameras.is_empty(),
             "source.kind is \"v4l2\" but there is no table [[source.cameras]]"
@@ -324,6 +337,19 @@ impl Default for OutputSection {
     }
 }
 
+/// What `flyrig capture` sends.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CaptureSection {
+    pub jpeg_quality: u8,
+}
+
+impl Default for CaptureSection {
+    fn default() -> Self {
+        Self { jpeg_quality: 90 }
+    }
+}
+
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TransportSection {
@@ -360,9 +386,27 @@ impl Config {
 
     /// Reads and checks a text.
     pub fn parse(text: &str) -> Result<Self> {
+        let config = Self::parse_values(text)?;
+        config.check_scene()?;
+        Ok(config)
+    }
+
+    /// Reads a file for `flyrig capture`, which needs neither a calibration nor a person.
+    pub fn load_for_capture(path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read the configuration {}", path.display()))?;
+        let in_file = || format!("in the configuration {}", path.display());
+        let config = Self::parse_values(&text).with_context(in_file)?;
+        if config.source.kind != SourceKind::V4l2 {
+            config.check_scene().with_context(in_file)?;
+        }
+        Ok(config)
+    }
+
+    fn parse_values(text: &str) -> Result<Self> {
         match toml::from_str::<Self>(text) {
             Ok(config) => {
-                config.check()?;
+                config.check_values()?;
                 Ok(config)
             }
             Err(error) => {
@@ -372,7 +416,7 @@ impl Config {
         }
     }
 
-    fn check(&self) -> Result<()> {
+    fn check_values(&self) -> Result<()> {
         let range = |key: &str, value: f64, low: f64, high: f64| -> Result<()> {
             ensure!(
                 value.is_finite() && (low..=high).contains(&value),
@@ -410,7 +454,12 @@ impl Config {
         range("output.width", f64::from(self.output.width), 16.0, 4096.0)?;
         range("output.height", f64::from(self.output.height), 16.0, 4096.0)?;
         range("output.jpeg_quality", f64::from(self.output.jpeg_quality), 1.0, 100.0)?;
-        range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)?;
+        range("capture.jpeg_quality", f64::from(self.capture.jpeg_quality), 0.0, 100.0)?;
+        range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)
+    }
+
+    /// What tracking needs beyond values in their ranges.
+    fn check_scene(&self) -> Result<()> {
         ensure!(
             self.source.kind == SourceKind::Sim || !self.source.path.as_os_str().is_empty(),
             "source.path is empty: name the folder of the data set, the folder of the calibration for real cameras, or the recording"

@@ -224,7 +224,7 @@ fn pass(
     if let Some(outlet) = &outlet {
         outlet.publisher().set_calibration(pipeline.rig())?;
     }
-    let mut intake = Intake::start(sources, &SyncConfig::default(), ClockKind::Shared, Pacing::Lossless)?;
+    let mut intake = Intake::start(sources, false, &SyncConfig::default(), ClockKind::Shared, Pacing::Lossless)?;
 
     let limit = args.minutes.map(|minutes| Duration::from_secs_f64(minutes.max(0.0) * 60.0));
     let total = limit.map_or(args.frames as u64, |limit| limit.as_secs());

@@ -64,7 +64,7 @@ impl Health {
         };
         let label = |camera: &CameraHealth| format!("{{camera=\"{}\"}}", escaped(camera.stats.camera.as_str()));
         type Field<'a> = &'a dyn Fn(&CameraHealth) -> Option<f64>;
-        let per_camera: [(&str, &str, &str, Field<'_>); 12] = [
+        let per_camera: [(&str, &str, &str, Field<'_>); 20] = [
             ("frames_total", "counter", "Frames that came.", &|c| Some(c.stats.frames as f64)),
             ("frames_lost_before_us_total", "counter", "Frames that the driver numbered and nobody got.", &|c| {
                 Some(c.stats.health.lost_by_driver as f64)
@@ -92,6 +92,32 @@ impl Health {
             ("lateness_seconds", "gauge", "From capture to synchronizer.", &|c| c.lateness_ms.map(|ms| ms / 1e3)),
             ("clock_drift_ppm", "gauge", "Drift against the master's clock.", &|c| {
                 c.clock.map(|clock| clock.drift_ppm)
+            }),
+            ("frames_overtaken_total", "counter", "Frames overtaken before they were decoded.", &|c| {
+                Some(c.stats.overtaken as f64)
+            }),
+            ("network_overtaken_before_total", "counter", "Frames overtaken on the camera's computer.", &|c| {
+                c.stats.health.network.map(|n| n.overtaken_before as f64)
+            }),
+            ("network_lost_total", "counter", "Frames that left the camera's computer and never came.", &|c| {
+                c.stats.health.network.map(|n| n.lost_on_the_way as f64)
+            }),
+            ("network_overtaken_here_total", "counter", "Frames overtaken after they had come.", &|c| {
+                c.stats.health.network.map(|n| n.overtaken_here as f64)
+            }),
+            ("network_refused_total", "counter", "Messages that could not be used.", &|c| {
+                c.stats.health.network.map(|n| (n.refused + n.before_clock) as f64)
+            }),
+            ("host_clock_offset_seconds", "gauge", "Clock of the camera's computer minus ours.", &|c| {
+                Some(c.stats.health.network?.clock_offset_nanos? as f64 * 1e-9)
+            }),
+            ("host_clock_drift_ppm", "gauge", "How much faster that clock runs.", &|c| {
+                let network = c.stats.health.network?;
+                network.clock_offset_nanos.map(|_| network.clock_drift_ppb as f64 * 1e-3)
+            }),
+            ("host_round_trip_seconds", "gauge", "Shortest round trip to that computer.", &|c| {
+                let network = c.stats.health.network?;
+                network.clock_offset_nanos.map(|_| network.round_trip_nanos as f64 * 1e-9)
             }),
         ];
         for (name, kind, help, field) in per_camera {
@@ -127,7 +153,16 @@ impl Health {
         for camera in &self.cameras {
             let stats = &camera.stats;
             let late = camera.lateness_ms.map_or_else(|| "-".to_owned(), |ms| format!("{ms:.1}"));
-            let mode = if stats.running { stats.health.mode.as_str() } else { "ended" };
+            let mut mode = if stats.running { stats.health.mode.to_string() } else { "ended".to_owned() };
+            if let Some(network) = stats.health.network {
+                let offset = network.clock_offset_nanos.map(|nanos| nanos as f64 * 1e-9);
+                let drift = network.clock_drift_ppb as f64 * 1e-3;
+                let clock = offset.map_or_else(
+                    || "clock not known yet".to_owned(),
+                    |secs| format!("clock {secs:+.4} s {drift:+.1} ppm"),
+                );
+                let _ = write!(mode, "  network: {} lost, {clock}", network.lost_on_the_way);
+            }
             let _ = writeln!(
                 text,
                 "{:<14} {:>9} {:>7} {:>7} {:>7} {:>7} {:>7} {:>9.2} {:>9}  {mode}",
@@ -254,11 +289,18 @@ mod tests {
             camera: "le\"ft".into(),
             frames: 900,
             dropped: 3,
+            overtaken: 6,
             errors: BTreeMap::from([(CaptureErrorKind::Corrupt, 2)]),
             last_error: None,
             health: SourceHealth {
                 lost_by_driver: 7,
                 reconnects: 1,
+                network: Some(flyrig_capture::NetworkHealth {
+                    lost_on_the_way: 8,
+                    clock_offset_nanos: Some(-1_500_000_000),
+                    clock_drift_ppb: 2500,
+                    ..Default::default()
+                }),
                 mode: "YUYV 640x360 at 30.00".into(),
                 ..Default::default()
             },
@@ -284,6 +326,10 @@ mod tests {
             "flyrig_clock_drift_ppm{camera=\"le\\\"ft\"} -12.5",
             "flyrig_stage_seconds{stage=\"draw\",quantile=\"0.95\"} 0.004",
             "flyrig_resident_bytes 2097152",
+            "flyrig_frames_overtaken_total{camera=\"le\\\"ft\"} 6",
+            "flyrig_network_lost_total{camera=\"le\\\"ft\"} 8",
+            "flyrig_host_clock_offset_seconds{camera=\"le\\\"ft\"} -1.5",
+            "flyrig_host_clock_drift_ppm{camera=\"le\\\"ft\"} 2.5",
         ] {
             assert!(text.lines().any(|found| found == line), "{line} in\n{text}");
         }
@@ -301,7 +347,7 @@ mod tests {
         let row = table.lines().nth(1).unwrap();
         let cells: Vec<&str> = row.split_whitespace().collect();
         assert_eq!(cells[..9], ["le\"ft", "900", "7", "3", "5", "2", "1", "0.40", "12.0"]);
-        assert!(row.ends_with("YUYV 640x360 at 30.00"));
+        assert!(row.ends_with("  YUYV 640x360 at 30.00  network: 8 lost, clock -1.5000 s +2.5 ppm"), "{row}");
         assert_eq!(table.lines().last(), Some("sets: 800 complete, 10 partial, 4 skipped"));
     }
 

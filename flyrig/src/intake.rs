@@ -7,7 +7,7 @@ use std::{
 
 use anyhow::Result;
 use flyrig_calib::{ClockAligner, ClockKind, ClockState, DropCounts, SyncConfig, Synchronizer};
-use flyrig_capture::{CameraSource, CaptureThreads, Pacing, PopError, ThreadsConfig};
+use flyrig_capture::{CameraSource, CaptureThreads, Decoding, FrameStage, Pacing, PopError, ThreadsConfig};
 use flyrig_types::{CameraId, Frame, FrameSet};
 
 use crate::health::{CameraHealth, Health};
@@ -60,17 +60,26 @@ impl Timing {
 }
 
 impl Intake {
-    /// Starts a thread a camera. With [`Pacing::Lossless`] every set comes, in order; else the newest one wins.
+    /// Starts a thread a camera, and where `decode` says so another one that makes RGB of its pictures. With
+    /// [`Pacing::Lossless`] every set comes, in order; else the newest one wins.
     pub fn start(
         sources: Vec<Box<dyn CameraSource>>,
+        decode: bool,
         sync: &SyncConfig,
         clocks: ClockKind,
         pacing: Pacing,
     ) -> Result<Self> {
         let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
         let queue_capacity = WAITING_FRAMES_A_CAMERA * cameras.len().max(1);
+        let config = ThreadsConfig { queue_capacity, pacing };
+        let decoding = |_: &CameraId| Box::new(Decoding::default()) as Box<dyn FrameStage>;
+        let threads = if decode {
+            CaptureThreads::start_staged(sources, decoding, config)?
+        } else {
+            CaptureThreads::start(sources, config)?
+        };
         Ok(Self {
-            threads: CaptureThreads::start(sources, ThreadsConfig { queue_capacity, pacing })?,
+            threads,
             aligner: (clocks == ClockKind::Triggered).then(|| ClockAligner::new(&cameras, sync.master.as_ref())),
             sync: Synchronizer::new(&cameras, sync),
             ready: VecDeque::new(),
@@ -178,6 +187,18 @@ impl Intake {
         drops.extend(in_no_set.map(|(camera, dropped)| (format!("frames of {camera} in no set"), dropped.total())));
         for camera in self.threads.stats() {
             drops.push((format!("frames of {} waiting too long", camera.camera), camera.dropped));
+            drops.push((format!("frames of {} overtaken before their decoding", camera.camera), camera.overtaken));
+            if let Some(network) = camera.health.network {
+                for (place, count) in [
+                    ("overtaken on the camera's computer", network.overtaken_before),
+                    ("lost on the way", network.lost_on_the_way),
+                    ("overtaken when they had come", network.overtaken_here),
+                    ("refused", network.refused),
+                    ("before its clock was known", network.before_clock),
+                ] {
+                    drops.push((format!("frames of {} {place}", camera.camera), count));
+                }
+            }
             drops.push((format!("errors of {}", camera.camera), camera.errors.values().sum()));
             drops.push((format!("frames of {} lost before us", camera.camera), camera.health.lost_by_driver));
         }

@@ -4,6 +4,7 @@
 
 mod bench;
 mod cameras;
+mod capture;
 mod cli;
 mod config;
 mod dataset;
@@ -15,6 +16,7 @@ mod eval;
 mod health;
 mod intake;
 mod live;
+mod network;
 mod notify;
 mod outlet;
 mod pipeline;
@@ -58,6 +60,14 @@ fn one_line(error: &anyhow::Error) -> String {
     line
 }
 
+/// Reads and checks a configuration; the error is what `flyrig config check` says.
+///
+/// # Errors
+/// Names the key, what was found, and what is expected.
+pub fn check_config(text: &str) -> Result<(), String> {
+    Config::parse(text).map(|_| ()).map_err(|error| one_line(&error))
+}
+
 /// Runs the command line of this process.
 #[must_use]
 pub fn main() -> ExitCode {
@@ -86,6 +96,12 @@ fn dispatch(cli: &Cli) -> Result<()> {
             let gpu = (config.source.kind == SourceKind::Sim).then(|| gpu(adapter)).transpose()?;
             record::record(&config, args, gpu.as_ref())
         }
+        Command::Capture { config } => {
+            let config = Config::load_for_capture(config)?;
+            let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
+            let gpu = (config.source.kind == SourceKind::Sim).then(|| gpu(adapter)).transpose()?;
+            capture::capture(&config, gpu.as_ref())
+        }
         Command::Replay(args) => record::replay(args),
         Command::SyncCheck(args) => sync_check::sync_check(args, &|| gpu(cli.adapter.as_deref())),
         Command::Doctor { config } => doctor::doctor(config.as_deref()),
@@ -100,6 +116,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         Command::Bench { what: BenchCommand::Appearance(args) } => {
             bench::appearance(args, &gpu(cli.adapter.as_deref())?)
         }
+        Command::Bench { what: BenchCommand::Capture(args) } => bench::soak::capture(args),
         Command::Bench { what: BenchCommand::Track(args) } => bench::track(args, &gpu(cli.adapter.as_deref())?),
         Command::Config { action: ConfigAction::Print } => {
             print!("{DEFAULT_TOML}");

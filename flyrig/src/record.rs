@@ -22,7 +22,7 @@ use foxglove::{
 
 use crate::{
     cli::{RecordArgs, ReplayArgs},
-    config::{Config, SourceKind},
+    config::Config,
     png,
     run::{self, Scene},
     stop,
@@ -94,7 +94,7 @@ pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> R
     let Scene { rig, sources, .. } = run::open(config, gpu)?;
     let recorder = recorder(&args.out, &rig)?;
     let tapped = tap(&recorder, sources);
-    let pacing = if config.source.kind == SourceKind::V4l2 { Pacing::AsDelivered } else { Pacing::Lossless };
+    let pacing = if config.source.kind.is_live() { Pacing::AsDelivered } else { Pacing::Lossless };
     let threads = CaptureThreads::start(tapped, ThreadsConfig { pacing, ..ThreadsConfig::default() })?;
     eprintln!("record: {} cameras to {} (Ctrl-C ends)", rig.cameras.len(), args.out.display());
     let (started, mut printed) = (Instant::now(), Instant::now());

@@ -8,7 +8,7 @@ use std::{
 use anyhow::{Context as _, Result, bail, ensure};
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
 use flyrig_calib::SyncConfig;
-use flyrig_capture::{CameraSource, Decoding, FolderOptions, FolderReplay, Pacing, VideoOptions, VideoReplay};
+use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, VideoOptions, VideoReplay};
 use flyrig_gpu::GpuContext;
 use flyrig_sim::{SimTime, Simulator};
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
@@ -21,7 +21,7 @@ use crate::{
     engine::Engine,
     health::{Health, MetricsServer},
     intake::Intake,
-    live,
+    live, network,
     notify::ServiceManager,
     outlet::Outlet,
     pipeline::{Outcome, Pipeline, PoseSource},
@@ -59,21 +59,18 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
     if let Some(recorder) = &recorder {
         scene.sources = record::tap(recorder, scene.sources);
     }
-    if matches!(config.source.kind, SourceKind::V4l2 | SourceKind::Mcap) {
-        let decoding = |source| Box::new(Decoding::new(source)) as Box<dyn CameraSource>;
-        scene.sources = scene.sources.into_iter().map(decoding).collect();
-    }
+    let decode = matches!(config.source.kind, SourceKind::V4l2 | SourceKind::Network | SourceKind::Mcap);
     dataset::require_masks(config.body.pose, config.body.masks, &scene.plates)?;
     let pacing = match (config.source.real_time, config.source.kind) {
         // Nobody can make a real camera wait.
-        (_, SourceKind::V4l2) => Pacing::AsDelivered,
+        (_, SourceKind::V4l2 | SourceKind::Network) => Pacing::AsDelivered,
         (false, _) => Pacing::Lossless,
         // Simulated cameras keep the time themselves, whatever their stamps say.
         (true, SourceKind::Sim) => Pacing::AsDelivered,
         (true, _) => Pacing::RealTime,
     };
-    let mut intake = Intake::start(scene.sources, &sync_config(config), config.sync.clocks, pacing)?;
-    if config.source.kind == SourceKind::V4l2 {
+    let mut intake = Intake::start(scene.sources, decode, &sync_config(config), config.sync.clocks, pacing)?;
+    if config.source.kind.is_live() {
         intake = intake.live();
     }
     let metrics = match config.health.listen.as_str() {
@@ -276,7 +273,7 @@ pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Scene> {
     }
     let chosen: Vec<CameraId> = source.names().into_iter().map(CameraId::from).collect();
     let rig = match source.kind {
-        SourceKind::V4l2 => live::load_rig(source)?,
+        SourceKind::V4l2 | SourceKind::Network => live::load_rig(source)?,
         SourceKind::Mcap => record::recorded_rig(&source.path)?,
         SourceKind::Folder | SourceKind::Video | SourceKind::Sim => dataset::load_rig(&source.path, &chosen)?,
     };
@@ -292,6 +289,7 @@ pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Scene> {
             )?)
         }
         SourceKind::V4l2 => live::open(source)?,
+        SourceKind::Network => network::open(config, &rig)?,
         SourceKind::Mcap => record::replay_sources(&source.path, &rig)?,
         SourceKind::Video | SourceKind::Sim => {
             let open = |id| VideoReplay::open(id, &dataset::video_file(&source.path, id), &VideoOptions::default());

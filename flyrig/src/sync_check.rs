@@ -6,17 +6,21 @@ use std::{
 };
 
 use anyhow::{Result, bail, ensure};
-use flyrig_calib::{MotionSignal, estimate_lags};
+use flyrig_body::{ShapeParams, default_template};
+use flyrig_calib::{ClockKind, LagEstimate, MotionSignal, PointTrack, SyncConfig, estimate_lags, estimate_point_lags};
 use flyrig_capture::{
     CameraSource, CaptureThreads, FolderOptions, FolderReplay, Pacing, PopError, ThreadsConfig, VideoOptions,
     VideoReplay, to_rgb8_into,
 };
 use flyrig_gpu::GpuContext;
+use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet, TrackErrorKind};
 use flyrig_types::CameraId;
 
 use crate::{
     cli::SyncCheckArgs,
     config::{Config, SourceKind},
+    dataset,
+    intake::Intake,
     record, run, stop,
 };
 
@@ -26,6 +30,9 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     let (sources, is_live) = open(args, gpu)?;
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(cameras.len() > 1, "one camera alone has no lag; name at least two");
+    if let Some(folder) = &args.calibration {
+        return by_person(args, folder, sources, &cameras);
+    }
     let mut signals: Vec<MotionSignal> = cameras.iter().cloned().map(MotionSignal::new).collect();
     let pacing = if is_live { Pacing::AsDelivered } else { Pacing::Lossless };
     let threads = CaptureThreads::start(sources, ThreadsConfig { queue_capacity: 8 * cameras.len(), pacing })?;
@@ -53,20 +60,11 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     }
     drop(threads);
     let estimates = estimate_lags(&signals, (args.most_ms * 1e6) as i64);
-    println!("{:<14} {:>7} {:>9} {:>12} {:>13}", "camera", "frames", "lag ms", "correlation", "disagree ms");
-    for (estimate, signal) in estimates.iter().zip(&signals) {
-        let lag = estimate.lag_nanos.map_or_else(|| "?".to_owned(), |nanos| format!("{:.1}", nanos as f64 * 1e-6));
-        println!(
-            "{:<14} {:>7} {lag:>9} {:>12.2} {:>13.1}",
-            estimate.camera,
-            signal.len(),
-            estimate.correlation,
-            estimate.disagreement_nanos * 1e-6
-        );
-    }
+    print(&estimates, &signals.iter().map(MotionSignal::len).collect::<Vec<_>>());
     if estimates.iter().any(|estimate| estimate.lag_nanos.is_none()) {
         println!(
-            "?: nothing moves there as elsewhere, or not for long enough (five seconds); move up and down before all cameras"
+            "?: nothing moves there as elsewhere, or not for long enough (five seconds); move up and down before all cameras, \
+             or name the --calibration"
         );
     } else {
         println!(
@@ -74,6 +72,73 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
         );
     }
     Ok(())
+}
+
+fn print(estimates: &[LagEstimate], frames: &[usize]) {
+    println!("{:<14} {:>7} {:>9} {:>12} {:>13}", "camera", "frames", "lag ms", "correlation", "disagree ms");
+    for (estimate, frames) in estimates.iter().zip(frames) {
+        let lag = estimate.lag_nanos.map_or_else(|| "?".to_owned(), |nanos| format!("{:.1}", nanos as f64 * 1e-6));
+        println!(
+            "{:<14} {frames:>7} {lag:>9} {:>12.2} {:>13.1}",
+            estimate.camera,
+            estimate.correlation,
+            estimate.disagreement_nanos * 1e-6
+        );
+    }
+}
+
+/// By where the joints of a person are: for takes too short for motion alone.
+fn by_person(args: &SyncCheckArgs, folder: &Path, sources: Sources, cameras: &[CameraId]) -> Result<()> {
+    ensure!(cameras.len() > 2, "two cameras cannot tell which point they see; name at least three");
+    let rig = dataset::pick(&dataset::load_rig(folder, cameras)?, &cameras_named(cameras), "the calibration")?;
+    let mut estimator = PoseEstimator::new(
+        PoseNet::embedded()?,
+        &default_template(&ShapeParams::default())?,
+        &rig,
+        PoseConfig::default(),
+    )?;
+    let mut tracks: Vec<PointTrack> = rig.cameras.iter().map(PointTrack::new).collect();
+    let mut frames = vec![0; tracks.len()];
+    let mut intake = Intake::start(sources, true, &SyncConfig::default(), ClockKind::Shared, Pacing::Lossless)?;
+    let (mut first, mut unseen) = (None, 0);
+    while !intake.ended() && !stop::requested() {
+        let Some(set) = intake.next_set(Duration::from_millis(200)) else { continue };
+        let from = *first.get_or_insert(set.master_nanos);
+        if set.master_nanos.saturating_sub(from) as f64 * 1e-9 > args.seconds {
+            break;
+        }
+        match estimator.estimate(&set) {
+            Ok(estimate) => {
+                for (slot, frame) in set.present() {
+                    let Some(Some(keypoints)) = estimate.keypoints.get(slot) else { continue };
+                    let pixels: Vec<_> = keypoints
+                        .iter()
+                        .map(|keypoint| (keypoint.usable() && keypoint.confidence > 0.5).then_some(keypoint.pixel))
+                        .collect();
+                    tracks[slot].add(frame.capture_nanos, &pixels);
+                    frames[slot] += 1;
+                }
+            }
+            Err(error) if error.kind == TrackErrorKind::Lost => unseen += 1,
+            Err(error) => return Err(error.into()),
+        }
+    }
+    let estimates = estimate_point_lags(&tracks, (args.most_ms * 1e6) as i64);
+    print(&estimates, &frames);
+    println!(
+        "correlation: how much better the lag explains the joints than others do; disagreement: of halves of the joints"
+    );
+    if unseen > 0 {
+        println!("in {unseen} sets nobody was seen");
+    }
+    if estimates.iter().any(|estimate| estimate.lag_nanos.is_none()) {
+        println!("?: the joints do not tell; let one person walk through the view of all cameras");
+    }
+    Ok(())
+}
+
+fn cameras_named(cameras: &[CameraId]) -> Vec<String> {
+    cameras.iter().map(CameraId::to_string).collect()
 }
 
 type Sources = Vec<Box<dyn CameraSource>>;
@@ -86,7 +151,7 @@ fn open(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(S
         [path] if has_ending(path, "toml") => {
             let config = Config::load(path)?;
             let gpu = (config.source.kind == SourceKind::Sim).then(gpu).transpose()?;
-            Ok((run::open(&config, gpu.as_ref())?.sources, config.source.kind == SourceKind::V4l2))
+            Ok((run::open(&config, gpu.as_ref())?.sources, config.source.kind.is_live()))
         }
         [path] if has_ending(path, "mcap") => Ok((record::replay_sources(path, &record::recorded_rig(path)?)?, false)),
         [folder] if folder.is_dir() => {

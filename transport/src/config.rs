@@ -95,7 +95,7 @@ impl TransportConfig {
     pub(crate) fn zenoh(&self, listen: &[String]) -> Result<Config, TransportError> {
         let list = |endpoints: &[String]| serde_json::json!(endpoints).to_string();
         // Twice the largest picture is room for every message that we make.
-        let largest = (2 * MAX_IMAGE_BYTES).max(crate::splats::MAX_BYTES);
+        let largest = (2 * MAX_IMAGE_BYTES).max(crate::splats::MAX_BYTES).max(crate::MAX_FRAME_BYTES + (1 << 20));
         let settings = [
             ("mode", "\"peer\"".to_owned()),
             ("listen/endpoints", list(listen)),

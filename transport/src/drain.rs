@@ -6,6 +6,7 @@ use std::{
         Arc, Mutex,
         atomic::{AtomicBool, Ordering},
     },
+    thread::JoinHandle,
     time::{Duration, Instant},
 };
 
@@ -50,6 +51,27 @@ pub(crate) struct Shared {
 }
 
 impl Shared {
+    /// Of a session that publishes these topics; the other end of its wake-ups.
+    pub(crate) fn new(
+        rig: &str,
+        session: &Session,
+        topics: &[Arc<Topic>],
+        leases: Leases,
+    ) -> (Arc<Self>, Receiver<()>) {
+        let (wake, woken) = crossbeam::channel::bounded(1);
+        let shared = Self {
+            rig: rig.to_owned(),
+            publisher_id: header::fnv1a(session.zid().to_string().as_bytes()),
+            host_id: header::host_id(),
+            topics: Mutex::new(topics.iter().map(|topic| (topic.label.clone(), topic.clone())).collect()),
+            calibration: Mutex::new(Arc::new([])),
+            leases: Mutex::new(leases),
+            stop: AtomicBool::new(false),
+            wake,
+        };
+        (Arc::new(shared), woken)
+    }
+
     pub(crate) fn wake(&self) {
         // Full means that it wakes anyway.
         let _ = self.wake.try_send(());
@@ -83,9 +105,45 @@ pub(crate) struct Drain {
     pub woken: Receiver<()>,
 }
 
+/// The thread with its session, ended together.
+pub(crate) struct DrainThread {
+    shared: Arc<Shared>,
+    session: Session,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl DrainThread {
+    pub(crate) fn start(drain: Drain) -> Result<Self, TransportError> {
+        let (shared, session) = (drain.shared.clone(), drain.session.clone());
+        let thread = std::thread::Builder::new()
+            .name("flyrig-publish".to_owned())
+            .spawn(move || drain.run())
+            .map_err(|error| TransportError::session("publisher thread", &error))?;
+        Ok(Self { shared, session, thread: Some(thread) })
+    }
+
+    /// Ends both; the second time nothing.
+    pub(crate) fn stop(&mut self) -> Result<(), TransportError> {
+        let Some(thread) = self.thread.take() else { return Ok(()) };
+        self.shared.stop.store(true, Ordering::Relaxed);
+        self.shared.wake();
+        let joined = thread.join().map_err(|_| TransportError::session("publisher thread", &"it panicked"));
+        let closed = self.session.close().wait().map_err(|error| TransportError::session("closing", &error));
+        joined.and(closed)
+    }
+}
+
+impl Drop for DrainThread {
+    fn drop(&mut self) {
+        if let Err(error) = self.stop() {
+            tracing::warn!(%error, "closing the publisher");
+        }
+    }
+}
+
 impl Drain {
     /// Runs until told to stop.
-    pub(crate) fn run(self) {
+    fn run(self) {
         let mut lanes: Vec<Lane> = Vec::new();
         let mut next_tick = Instant::now();
         let mut next_repeat = Instant::now();
@@ -154,7 +212,7 @@ impl Drain {
         let payload = pending.body.encode(&topic.name)?;
         let len = payload.len();
         let header = Header { publisher: self.shared.publisher_id, host: self.shared.host_id, ..pending.header };
-        let put = publisher.put(payload).attachment(header.encode().to_vec());
+        let put = publisher.put(payload).attachment(pending.attachment(header));
         put.wait().map_err(|error| TransportError::session(topic.label.clone(), &error))?;
         Ok(len)
     }

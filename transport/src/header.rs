@@ -25,10 +25,15 @@ pub enum MessageKind {
     Transforms,
     /// [`crate::RigStats`].
     Stats,
+    /// A camera's picture, see [`crate::FrameHeader`].
+    Frame,
+    /// [`crate::CameraStatus`].
+    CameraStatus,
 }
 
 impl MessageKind {
-    const ALL: [Self; 5] = [Self::View, Self::Splats, Self::Calibration, Self::Transforms, Self::Stats];
+    const ALL: [Self; 7] =
+        [Self::View, Self::Splats, Self::Calibration, Self::Transforms, Self::Stats, Self::Frame, Self::CameraStatus];
 
     fn code(self) -> u8 {
         match self {
@@ -37,6 +42,8 @@ impl MessageKind {
             Self::Calibration => 3,
             Self::Transforms => 4,
             Self::Stats => 5,
+            Self::Frame => 6,
+            Self::CameraStatus => 7,
         }
     }
 }

@@ -124,7 +124,11 @@ impl Inbox {
                 }
             }
             MessageKind::Transforms => state.places = Some((header.publisher, decode_transforms(&payload)?)),
-            MessageKind::View | MessageKind::Splats | MessageKind::Stats => {}
+            MessageKind::View
+            | MessageKind::Splats
+            | MessageKind::Stats
+            | MessageKind::Frame
+            | MessageKind::CameraStatus => {}
         }
         if state.slots.len() >= MAX_TOPICS && !state.slots.contains_key(label) {
             return Err(TransportError::malformed(key, format!("more than {MAX_TOPICS} topics")));

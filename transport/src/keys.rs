@@ -1,5 +1,7 @@
 //! The key space.
 
+use flyrig_types::CameraId;
+
 use crate::{SCHEMA_VERSION, TransportError};
 
 /// Views of this name's beginning belong to one subscriber.
@@ -36,6 +38,27 @@ pub(crate) fn view_label(name: &str) -> String {
 /// Liveliness of publishers of any schema version.
 pub(crate) fn any_version_alive(rig: &str) -> String {
     format!("flyrig/*/{rig}/alive/*")
+}
+
+/// Labels of a camera's status begin so.
+pub(crate) const STATUS: &str = "camera-status/";
+
+/// Last parts of the key where a camera's pictures go.
+pub(crate) fn frames_label(camera: &CameraId) -> String {
+    format!("camera/{camera}")
+}
+
+/// Last parts of the key where a camera's status goes.
+pub(crate) fn status_label(camera: &CameraId) -> String {
+    format!("{STATUS}{camera}")
+}
+
+/// Liveliness of computers with cameras, of any rig and schema version.
+pub(crate) const ANY_HOST: &str = "flyrig/*/*/host/*";
+
+/// The rig that a key names.
+pub(crate) fn rig_in(key: &str) -> Option<&str> {
+    key.strip_prefix("flyrig/")?.split('/').nth(1)
 }
 
 /// The part of a key behind version and rig.

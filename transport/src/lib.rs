@@ -13,7 +13,10 @@
 //! | `transforms` | foxglove `FrameTransforms`: `world_from_camera` of every camera and the world's up |
 //! | `stats` | [`RigStats`], JSON |
 //! | `viewpoint/<subscriber>` | query and reply: JSON, the request and the answer |
-//! | `alive/<publisher>`, `viewer/<subscriber>/alive` | liveliness tokens |
+//! | `camera/<camera>` | a camera's picture as it came, [`FrameHeader`] as the attachment |
+//! | `camera-status/<camera>` | [`CameraStatus`], JSON |
+//! | `clock/<host>` | query and reply: that computer's `CLOCK_MONOTONIC`, nanoseconds, i64 little-endian |
+//! | `alive/<publisher>`, `viewer/<subscriber>/alive`, `host/<host>` | liveliness tokens |
 //!
 //! Every message carries a [`Header`] as its zenoh attachment: schema version, sequence, times.
 //!
@@ -25,10 +28,16 @@
 //! - A subscriber may start before the publisher, stall, die, come back; a publisher may restart.
 
 mod calibration;
+mod camera_inbox;
+mod camera_publisher;
+mod camera_subscriber;
+mod clock_exchange;
 mod config;
 mod drain;
 mod error;
+mod frame;
 mod header;
+mod host_clock;
 mod inbox;
 mod keys;
 mod publisher;
@@ -42,9 +51,13 @@ mod view;
 mod viewpoint;
 
 pub use calibration::{RigTransforms, decode_calibration, decode_transforms, encode_calibration, encode_transforms};
+pub use camera_publisher::CameraPublisher;
+pub use camera_subscriber::{CameraLink, CameraSubscriber};
 pub use config::TransportConfig;
 pub use error::{TransportError, TransportErrorKind};
+pub use frame::{CameraStatus, FRAME_HEADER_BYTES, FrameHeader, MAX_FRAME_BYTES};
 pub use header::{HEADER_BYTES, Header, MessageKind, SCHEMA_VERSION};
+pub use host_clock::{ClockEstimate, HostClock};
 pub use publisher::{Publisher, ViewpointCounts};
 pub use report::{LatencyReport, TopicReport};
 pub use splats::{MAX_SPLATS, SplatState};

@@ -2,11 +2,7 @@
 
 use std::{
     net::TcpListener,
-    sync::{
-        Arc, Mutex,
-        atomic::{AtomicBool, Ordering},
-    },
-    thread::JoinHandle,
+    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -17,8 +13,7 @@ use zenoh::{Session, Wait, liveliness::LivelinessToken, query::Query, sample::Sa
 use crate::{
     Header, MessageKind, RigStats, SplatState, TransportConfig, TransportError, ViewFrame, Viewpoint,
     calibration::{encode_calibration, encode_transforms},
-    drain::{Drain, Retained, Shared, empty_header},
-    header,
+    drain::{Drain, DrainThread, Retained, Shared, empty_header},
     keys::{self, VIEWER_PREFIX},
     stats::{from_json, to_json},
     topic::{Body, PublishOutcome, Topic, TopicCounts, lock},
@@ -47,8 +42,7 @@ pub struct Publisher {
     splats: Arc<Topic>,
     stats: Arc<Topic>,
     endpoints: Vec<String>,
-    session: Session,
-    thread: Option<JoinHandle<()>>,
+    drain: DrainThread,
     _alive: LivelinessToken,
 }
 
@@ -74,17 +68,8 @@ impl Publisher {
 
         let splats = Arc::new(Topic::new("splats".to_owned(), "splats".to_owned(), MessageKind::Splats));
         let stats = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
-        let (wake, woken) = crossbeam::channel::bounded(1);
-        let shared = Arc::new(Shared {
-            rig: rig.clone(),
-            publisher_id: header::fnv1a(session.zid().to_string().as_bytes()),
-            host_id: header::host_id(),
-            topics: Mutex::new([&splats, &stats].map(|topic| (topic.label.clone(), topic.clone())).into()),
-            calibration: Mutex::new(Arc::new([])),
-            leases: Mutex::new(Leases::new(config.max_viewers, Duration::from_millis(config.viewpoint_lease_millis))),
-            stop: AtomicBool::new(false),
-            wake,
-        });
+        let leases = Leases::new(config.max_viewers, Duration::from_millis(config.viewpoint_lease_millis));
+        let (shared, woken) = Shared::new(rig, &session, &[splats.clone(), stats.clone()], leases);
 
         let state = shared.clone();
         session
@@ -110,12 +95,8 @@ impl Publisher {
         let alive = keys::key(rig, &format!("alive/{}", session.zid()));
         let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
 
-        let drain = Drain { shared: shared.clone(), session: session.clone(), express: config.express, woken };
-        let thread = std::thread::Builder::new()
-            .name("flyrig-publish".to_owned())
-            .spawn(move || drain.run())
-            .map_err(|error| TransportError::session("publisher thread", &error))?;
-        Ok(Self { shared, splats, stats, endpoints, session, thread: Some(thread), _alive: alive })
+        let drain = DrainThread::start(Drain { shared: shared.clone(), session, express: config.express, woken })?;
+        Ok(Self { shared, splats, stats, endpoints, drain, _alive: alive })
     }
 
     /// Endpoints it listens on, port 0 replaced by the real one.
@@ -231,16 +212,7 @@ impl Publisher {
     /// # Errors
     /// `Session` when the thread died or zenoh fails to close.
     pub fn close(mut self) -> Result<(), TransportError> {
-        self.stop()
-    }
-
-    fn stop(&mut self) -> Result<(), TransportError> {
-        let Some(thread) = self.thread.take() else { return Ok(()) };
-        self.shared.stop.store(true, Ordering::Relaxed);
-        self.shared.wake();
-        let joined = thread.join().map_err(|_| TransportError::session("publisher thread", &"it panicked"));
-        let closed = self.session.close().wait().map_err(|error| TransportError::session("closing", &error));
-        joined.and(closed)
+        self.drain.stop()
     }
 
     fn offer(&self, topic: &Topic, body: Body, header: Header) -> PublishOutcome {
@@ -272,16 +244,8 @@ impl Publisher {
     }
 }
 
-impl Drop for Publisher {
-    fn drop(&mut self) {
-        if let Err(error) = self.stop() {
-            tracing::warn!(%error, "closing the publisher");
-        }
-    }
-}
-
 /// Opens a session; a port 0 is looked up first because zenoh's stable interface does not tell which it took.
-fn open_session(config: &TransportConfig) -> Result<(Session, Vec<String>), TransportError> {
+pub(crate) fn open_session(config: &TransportConfig) -> Result<(Session, Vec<String>), TransportError> {
     let mut attempts = 5;
     loop {
         attempts -= 1;

@@ -5,10 +5,11 @@ use std::sync::{
     atomic::{AtomicBool, Ordering},
 };
 
+use flyrig_types::Frame;
 use prost::bytes::Bytes;
 use zenoh::{bytes::Encoding, qos::Priority};
 
-use crate::{Header, MessageKind, SplatState, TransportError, ViewFrame, header};
+use crate::{FrameHeader, Header, MessageKind, SplatState, TransportError, ViewFrame, header};
 
 /// What became of a message that was handed in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,6 +46,7 @@ pub struct TopicCounts {
 pub(crate) enum Body {
     View(ViewFrame),
     Splats(Arc<SplatState>),
+    Frame(Arc<Frame>),
     Bytes(Bytes),
 }
 
@@ -53,6 +55,8 @@ pub(crate) struct Pending {
     pub body: Body,
     /// Its `publisher` and `host` are filled in when it is sent.
     pub header: Header,
+    /// Messages of the topic before this one that did not leave.
+    pub withheld: u64,
 }
 
 #[derive(Debug, Default)]
@@ -103,11 +107,11 @@ impl Topic {
             state.counts.unwatched += 1;
             return PublishOutcome::Unwatched;
         }
-        if state.pending.replace(Pending { body, header }).is_some() {
-            state.counts.replaced += 1;
-            return PublishOutcome::Replaced;
-        }
-        PublishOutcome::Queued
+        let is_replaced = state.pending.take().is_some();
+        state.counts.replaced += u64::from(is_replaced);
+        let withheld = state.counts.replaced + state.counts.unwatched + state.counts.failed;
+        state.pending = Some(Pending { body, header, withheld });
+        if is_replaced { PublishOutcome::Replaced } else { PublishOutcome::Queued }
     }
 
     pub(crate) fn take(&self) -> Option<Pending> {
@@ -132,8 +136,10 @@ impl Topic {
     /// Small messages travel in a queue of their own, so that pictures never hold them up.
     pub(crate) fn priority(&self) -> Priority {
         match self.kind {
-            MessageKind::View | MessageKind::Splats => Priority::Data,
-            MessageKind::Calibration | MessageKind::Transforms | MessageKind::Stats => Priority::InteractiveLow,
+            MessageKind::View | MessageKind::Splats | MessageKind::Frame => Priority::Data,
+            MessageKind::Calibration | MessageKind::Transforms | MessageKind::Stats | MessageKind::CameraStatus => {
+                Priority::InteractiveLow
+            }
         }
     }
 
@@ -144,6 +150,21 @@ impl Topic {
             MessageKind::Transforms => Encoding::APPLICATION_PROTOBUF.with_schema("foxglove.FrameTransforms"),
             MessageKind::Splats => Encoding::APPLICATION_OCTET_STREAM.with_schema("flyrig.SplatState"),
             MessageKind::Stats => Encoding::APPLICATION_JSON.with_schema("flyrig.RigStats"),
+            MessageKind::Frame => Encoding::APPLICATION_OCTET_STREAM.with_schema("flyrig.Frame"),
+            MessageKind::CameraStatus => Encoding::APPLICATION_JSON.with_schema("flyrig.CameraStatus"),
+        }
+    }
+}
+
+impl Pending {
+    /// What travels beside the payload.
+    pub(crate) fn attachment(&self, header: Header) -> Vec<u8> {
+        match &self.body {
+            Body::Frame(frame) => {
+                let (exposure_nanos, format) = (frame.exposure_nanos, frame.image.format());
+                FrameHeader { header, exposure_nanos, withheld: self.withheld, format }.encode().to_vec()
+            }
+            Body::View(_) | Body::Splats(_) | Body::Bytes(_) => header.encode().to_vec(),
         }
     }
 }
@@ -153,6 +174,7 @@ impl Body {
         match self {
             Self::View(frame) => frame.encode(name),
             Self::Splats(state) => state.encode(),
+            Self::Frame(frame) => Ok(frame.image.bytes().to_vec()),
             Self::Bytes(bytes) => Ok(bytes.to_vec()),
         }
     }

@@ -8,7 +8,7 @@ use std::{
 };
 
 use flyrig_types::{CameraId, Frame};
-use mcap::io::MessageReader;
+use mcap::{io::MessageReader, sans_io::LinearReaderOptions};
 
 use super::message::{self, TOPIC};
 use crate::{CameraSource, CaptureError, CaptureErrorKind};
@@ -29,10 +29,14 @@ pub struct McapReplay {
 }
 
 fn open(path: &Path) -> Result<MessageReader<BufReader<File>>, CaptureError> {
-    let file = File::open(path).map_err(|error| {
+    let cannot = |error: std::io::Error| {
         CaptureError::general(CaptureErrorKind::NotFound, format!("{} cannot be opened: {error}", path.display()))
-    })?;
-    Ok(MessageReader::new(BufReader::with_capacity(BUFFER, file)))
+    };
+    let file = File::open(path).map_err(cannot)?;
+    // A damaged length must not ask for more memory than the file has bytes.
+    let length = usize::try_from(file.metadata().map_err(cannot)?.len()).unwrap_or(usize::MAX);
+    let options = LinearReaderOptions::default().with_record_length_limit(length);
+    Ok(MessageReader::new_with_options(BufReader::with_capacity(BUFFER, file), options))
 }
 
 /// Topic and content of everything before the first frame of a recording.

@@ -196,6 +196,22 @@ fn a_full_disk_stops_the_recording_and_not_the_cameras() {
     assert!(problem.contains("free space on the disk") || problem.contains("slower than the cameras"), "{problem}");
 }
 
+/// A length of eight bytes that says more than there is memory ended the process once.
+#[test]
+fn a_damaged_length_ends_the_recording_and_nothing_else() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, broken) = (folder.path().join("take.mcap"), folder.path().join("broken.mcap"));
+    record(&path, 3);
+    let whole = fs::read(&path).unwrap();
+    for at in (8..whole.len().min(1500)).step_by(3) {
+        let mut bytes = whole.clone();
+        let end = (at + 8).min(bytes.len());
+        bytes[at..end].copy_from_slice(&(i64::MAX - 5).to_le_bytes()[..end - at]);
+        fs::write(&broken, &bytes).unwrap();
+        assert!(replayed(&broken, "a").len() <= 3);
+    }
+}
+
 #[test]
 fn what_is_no_recording_is_refused() {
     let folder = tempfile::tempdir().unwrap();

@@ -182,7 +182,8 @@ impl<H: Host> Stream<H> {
         for warning in warnings {
             tracing::warn!("camera {}: {warning}", self.camera);
         }
-        self.health.mode = format!("{} {}x{} at {fps:.2}", fourcc_text(mode.fourcc), active.width, active.height);
+        self.health.mode =
+            format!("{} {}x{} at {fps:.2}", fourcc_text(mode.fourcc), active.width, active.height).into();
         self.sequence.restart();
         tracing::debug!("camera {}: {} as {}", self.camera, node.display(), self.health.mode);
         Ok(Session {

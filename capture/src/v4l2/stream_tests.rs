@@ -191,7 +191,7 @@ fn frames_come_with_number_time_and_pixels() {
     assert_eq!(first.capture_nanos, 1_000_000 * MS + (33 - 4 - 5) * MS);
     assert_eq!(kinds(&mut stream, 2), [Ok(1), Ok(5)]);
     assert_eq!((stream.health().lost_by_driver, stream.health().reconnects), (3, 0));
-    assert_eq!(stream.health().mode, "YUYV 4x2 at 30.00");
+    assert_eq!(&*stream.health().mode, "YUYV 4x2 at 30.00");
     assert_eq!(*log.lock().unwrap(), ["format YUYV", "rate 30", &format!("set {V4L2_CID_GAIN} 9")]);
 }
 
@@ -268,7 +268,7 @@ fn a_full_bus_is_answered_by_stepping_down() {
     };
     let (stream, log) = open(vec![Ok(full(1)), Ok(full(0))], &options());
     let mut stream = stream.unwrap();
-    assert_eq!(stream.health().mode, "MJPG 4x2 at 30.00");
+    assert_eq!(&*stream.health().mode, "MJPG 4x2 at 30.00");
     assert!(kinds(&mut stream, 3)[2].is_ok());
     let formats: Vec<String> = log.lock().unwrap().iter().filter(|l| l.starts_with("format")).cloned().collect();
     assert_eq!(formats, ["format YUYV", "format MJPG", "format MJPG"], "the step stays when it comes back");

@@ -39,7 +39,9 @@ fn gpu() -> &'static GpuContext {
 }
 
 fn options() -> DeformOptions {
-    DeformOptions { max_level: 1, color_weight: 0.5, ..DeformOptions::full(DeformSettings::default()) }
+    let solver = DeformSettings::default();
+    let color_weight = DeformOptions::coarse(solver).color_weight;
+    DeformOptions { max_level: 1, color_weight, ..DeformOptions::full(solver) }
 }
 
 /// Distances between two chains' Gaussians after a frame, metres.

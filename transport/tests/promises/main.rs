@@ -3,6 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "helpers of tests fail by panicking")]
 
 mod calibration;
+mod cameras;
+mod clocks;
 mod malformed;
 mod processes;
 mod sessions;

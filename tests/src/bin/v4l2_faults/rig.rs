@@ -153,7 +153,7 @@ impl Rig {
         for (camera, options) in wanted.iter().enumerate() {
             let name = format!("{camera:02}");
             match V4l2Camera::open(&name.as_str().into(), options) {
-                Ok(source) => sources.push(Box::new(Decoding::new(source))),
+                Ok(source) => sources.push(Box::new(source)),
                 Err(error) => {
                     println!("BROKEN: cannot start: {error}");
                     std::process::exit(1);
@@ -162,7 +162,7 @@ impl Rig {
         }
         let ids: Vec<_> = sources.iter().map(|source| source.camera().clone()).collect();
         let config = ThreadsConfig { queue_capacity: 4 * cameras, ..ThreadsConfig::default() };
-        let threads = match CaptureThreads::start(sources, config) {
+        let threads = match CaptureThreads::start_staged(sources, |_| Box::new(Decoding::default()), config) {
             Ok(threads) => threads,
             Err(error) => {
                 println!("BROKEN: cannot start: {error}");
@@ -259,6 +259,7 @@ impl Rig {
                 silences: now.health.silences - first.health.silences,
                 stamps_replaced: now.health.stamps_replaced - first.health.stamps_replaced,
                 mode: now.health.mode.clone(),
+                network: None,
             };
             // The gap that is still open counts too.
             let open_gap = last.map_or(0.0, |(at, _)| at.max(self.started).elapsed().as_secs_f64() * 1e3);

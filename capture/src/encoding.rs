@@ -1,0 +1,80 @@
+//! Uncompressed pictures made JPEG, for the network and the disk.
+
+use flyrig_types::{Frame, Image, PixelFormat};
+use opencv::{
+    core::{Mat, MatTraitConst as _, Vector, VectorToVec as _},
+    imgcodecs::{IMWRITE_JPEG_QUALITY, imencode},
+    imgproc::{COLOR_RGB2BGR, cvt_color_def},
+};
+
+use crate::{CaptureError, CaptureErrorKind, FrameStage, mjpeg::JpegScratch, rgb};
+
+/// Compresses a camera's frames; frames that are JPEG already pass as they came.
+#[derive(Debug)]
+pub struct JpegEncoding {
+    quality: i32,
+    rgb: Vec<u8>,
+    bgr: Mat,
+    jpeg: Vector<u8>,
+    scratch: JpegScratch,
+}
+
+impl JpegEncoding {
+    /// Of a quality from 1 to 100 (libjpeg's scale).
+    #[must_use]
+    pub fn new(quality: u8) -> Self {
+        let quality = i32::from(quality.clamp(1, 100));
+        Self { quality, rgb: Vec::new(), bgr: Mat::default(), jpeg: Vector::new(), scratch: JpegScratch::default() }
+    }
+
+    fn encode(&mut self, height: u32) -> opencv::Result<Vec<u8>> {
+        let flat = Mat::from_slice(&self.rgb)?;
+        cvt_color_def(&flat.reshape(3, height as i32)?, &mut self.bgr, COLOR_RGB2BGR)?;
+        let quality = Vector::from_slice(&[IMWRITE_JPEG_QUALITY, self.quality]);
+        imencode(".jpg", &self.bgr, &mut self.jpeg, &quality)?;
+        Ok(self.jpeg.to_vec())
+    }
+}
+
+impl FrameStage for JpegEncoding {
+    fn process(&mut self, frame: Frame) -> Result<Frame, CaptureError> {
+        if frame.image.format() == PixelFormat::Mjpeg {
+            return Ok(frame);
+        }
+        let corrupt = |text: String| CaptureError::general(CaptureErrorKind::Corrupt, text);
+        rgb::convert(&frame.image, &mut self.rgb, &mut self.scratch)?;
+        let (width, height) = (frame.image.width(), frame.image.height());
+        let jpeg = self.encode(height).map_err(|error| corrupt(format!("cannot be compressed: {error}")))?;
+        let image = Image::new(width, height, PixelFormat::Mjpeg, jpeg).map_err(|error| corrupt(error.to_string()))?;
+        Ok(Frame { image, ..frame })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::to_rgb8;
+
+    fn frame(format: PixelFormat, bytes: Vec<u8>) -> Frame {
+        let image = Image::new(48, 32, format, bytes).unwrap();
+        Frame { camera: "a".into(), sequence: 4, capture_nanos: 9, exposure_nanos: Some(7), image, mask: None }
+    }
+
+    #[test]
+    fn a_picture_survives_but_for_what_jpeg_takes() {
+        let rgb: Vec<u8> =
+            (0..32u32).flat_map(|y| (0..48u32).flat_map(move |x| [x as u8 * 5, y as u8 * 7, 90])).collect();
+        let mut stage = JpegEncoding::new(95);
+        let made = stage.process(frame(PixelFormat::Rgb8, rgb.clone())).unwrap();
+        assert_eq!((made.image.format(), made.sequence, made.exposure_nanos), (PixelFormat::Mjpeg, 4, Some(7)));
+        assert!(made.image.bytes().len() < rgb.len() / 2);
+        let found = to_rgb8(&made.image).unwrap();
+        let mean = found.iter().zip(&rgb).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>() / rgb.len() as f64;
+        assert!(mean < 3.0, "red for blue? {mean}");
+        // As it came, so it passes.
+        let bytes = made.image.bytes().to_vec();
+        assert_eq!(stage.process(made).unwrap().image.bytes(), bytes);
+        let yuyv = stage.process(frame(PixelFormat::Yuyv, vec![128; 48 * 32 * 2])).unwrap();
+        assert!(to_rgb8(&yuyv.image).unwrap().iter().all(|c| c.abs_diff(130) <= 2));
+    }
+}

@@ -1,0 +1,237 @@
+//! What is fed, each with the words of its language. A target says what became of the input, for people and for the choice
+//! of what to keep.
+
+use std::{cell::RefCell, fs, path::Path, time::Duration};
+
+use flyrig_body::{load_gltf, parse_bvh};
+use flyrig_calib::load_easymocap;
+use flyrig_capture::{CameraSource as _, FolderOptions, FolderReplay, McapReplay, recorded_notes, to_rgb8};
+use flyrig_transport::{
+    CameraStatus, FRAME_HEADER_BYTES, FrameHeader, HEADER_BYTES, Header, RigStats, SplatState, ViewFrame,
+    decode_calibration, decode_transforms,
+};
+use flyrig_types::{Image, PixelFormat};
+
+/// A reader of foreign bytes.
+pub struct Target {
+    pub name: &'static str,
+    pub words: &'static [&'static str],
+    pub run: fn(&[u8]) -> Result<String, String>,
+}
+
+pub const TARGETS: [Target; 10] = [
+    Target { name: "pixels", words: &[], run: pixels },
+    Target { name: "jpeg", words: &["\u{fffd}\u{fffd}", "JFIF", "Exif", "Adobe"], run: jpeg },
+    Target { name: "picture", words: &["IHDR", "IDAT", "IEND", "PLTE", "tRNS"], run: picture },
+    Target { name: "mcap", words: &["foxglove.RawImage", "camera/a", "protobuf", "\u{89}MCAP0\r\n"], run: mcap },
+    Target { name: "calibration", words: CALIBRATION_WORDS, run: calibration },
+    Target { name: "config", words: CONFIG_WORDS, run: config },
+    Target { name: "wire", words: &["schema_version", "FLYR", "null", "{", "[", "1e999"], run: wire },
+    Target { name: "network-frame", words: &["FLYR"], run: network_frame },
+    Target { name: "splats", words: &[], run: splats },
+    Target {
+        name: "motion",
+        words: &["JOINT", "OFFSET", "CHANNELS", "End Site", "MOTION", "Frames:", "{", "}"],
+        run: motion,
+    },
+];
+
+const CALIBRATION_WORDS: &[&str] = &[
+    "%YAML:1.0\n---\n",
+    "!!opencv-matrix",
+    "rows: ",
+    "cols: ",
+    "dt: d",
+    "data: [",
+    "names:",
+    "K_a",
+    "R_a",
+    "T_a",
+    "dist_a",
+    "H_a",
+];
+const CONFIG_WORDS: &[&str] = &[
+    "[[source.cameras]]\n",
+    "[source]\n",
+    "kind = ",
+    "\"v4l2\"",
+    "\"network\"",
+    "size = [",
+    "fps = ",
+    "[sim]\n",
+    "[sync]\n",
+    "= true",
+    "= [",
+    "{ ",
+    "'''",
+    "[sim.faults]\n",
+    "0x",
+    "1979-05-27T07:32:00Z",
+];
+
+fn told<T, E: std::fmt::Display>(result: Result<T, E>, ok: &str) -> Result<String, String> {
+    result.map(|_| ok.to_owned()).map_err(|error| error.to_string())
+}
+
+const FORMATS: [PixelFormat; 12] = [
+    PixelFormat::Rgb8,
+    PixelFormat::Bgr8,
+    PixelFormat::Rgba8,
+    PixelFormat::Gray8,
+    PixelFormat::Yuyv,
+    PixelFormat::Uyvy,
+    PixelFormat::Nv12,
+    PixelFormat::BayerRggb8,
+    PixelFormat::BayerGrbg8,
+    PixelFormat::BayerGbrg8,
+    PixelFormat::BayerBggr8,
+    PixelFormat::Mjpeg,
+];
+
+/// Format, width and height of a byte each, then pixels; as many as needed or as there are.
+fn pixels(input: &[u8]) -> Result<String, String> {
+    let [format, width, height, exact, bytes @ ..] = input else { return Err("short".into()) };
+    let format = FORMATS[usize::from(*format) % FORMATS.len()];
+    let (width, height) = (u32::from(*width) % 70, u32::from(*height) % 70);
+    let mut bytes = bytes.to_vec();
+    if let Some(needed) = format.byte_len(width, height).filter(|_| exact % 4 != 0) {
+        bytes.resize(needed, 77);
+    }
+    let image = Image::new(width, height, format, bytes).map_err(|error| error.to_string())?;
+    let rgb = to_rgb8(&image).map_err(|error| format!("{format:?} {error}"))?;
+    assert_eq!(rgb.len(), width as usize * height as usize * 3, "pixels went missing");
+    Ok(format!("{format:?}"))
+}
+
+fn jpeg(input: &[u8]) -> Result<String, String> {
+    let image = Image::new(48, 32, PixelFormat::Mjpeg, input.to_vec()).map_err(|error| error.to_string())?;
+    let rgb = to_rgb8(&image).map_err(|error| error.to_string())?;
+    assert_eq!(rgb.len(), 48 * 32 * 3, "pixels went missing");
+    Ok("a picture".into())
+}
+
+thread_local! {
+    static FOLDER: RefCell<Option<tempfile::TempDir>> = const { RefCell::new(None) };
+}
+
+/// Writes files into a folder that is used again, and reads them by its path.
+fn with_files<T>(files: &[(&str, &[u8])], read: impl FnOnce(&Path) -> T) -> Result<T, String> {
+    FOLDER.with(|folder| {
+        let mut folder = folder.borrow_mut();
+        if folder.is_none() {
+            // Memory rather than a disk, where there is one.
+            let memory = Path::new("/dev/shm");
+            let made = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
+            *folder = Some(made.map_err(|error| error.to_string())?);
+        }
+        let Some(folder) = folder.as_ref() else { return Err("no folder".to_owned()) };
+        for (name, bytes) in files {
+            let path = folder.path().join(name);
+            let write = || -> std::io::Result<()> {
+                if let Some(parent) = path.parent() {
+                    fs::create_dir_all(parent)?;
+                }
+                fs::write(&path, bytes)
+            };
+            write().map_err(|error| error.to_string())?;
+        }
+        Ok(read(folder.path()))
+    })
+}
+
+fn picture(input: &[u8]) -> Result<String, String> {
+    let name = if input.starts_with(&[0x89]) { "images/a/000000.png" } else { "images/b/000000.jpg" };
+    let camera = if name.contains("/a/") { "a" } else { "b" };
+    with_files(&[(name, input)], |root| {
+        let sources = FolderReplay::open(root, Some(&[camera.into()]), &FolderOptions::default());
+        let mut sources = sources.map_err(|error| error.to_string())?;
+        let source = sources.first_mut().ok_or("no source")?;
+        told(source.next_frame(Duration::ZERO), "a frame")
+    })?
+}
+
+fn mcap(input: &[u8]) -> Result<String, String> {
+    with_files(&[("take.mcap", input)], |root| {
+        let path = root.join("take.mcap");
+        let notes = recorded_notes(&path).map_err(|error| error.to_string())?;
+        for (_, note) in &notes {
+            let _ = (decode_calibration(note), decode_transforms(note));
+        }
+        let mut frames = 0;
+        for camera in ["a", "b"] {
+            let mut replay = McapReplay::open(&camera.into(), &path).map_err(|error| error.to_string())?;
+            // A recording of a few kilobytes has no more.
+            for _ in 0..10_000 {
+                match replay.next_frame(Duration::ZERO) {
+                    Ok(frame) => {
+                        let _ = to_rgb8(&frame.image);
+                        frames += 1;
+                    }
+                    Err(error) if error.kind.is_recoverable() => {}
+                    Err(_) => break,
+                }
+            }
+        }
+        Ok(format!("frames {}", if frames > 0 { "some" } else { "none" }))
+    })?
+}
+
+/// Both files, the second after a NUL.
+fn calibration(input: &[u8]) -> Result<String, String> {
+    let cut = input.iter().position(|b| *b == 0).unwrap_or(input.len());
+    let (intri, extri) = (&input[..cut], input.get(cut + 1..).unwrap_or_default());
+    with_files(&[("intri.yml", intri), ("extri.yml", extri)], |root| {
+        let rig = load_easymocap(root, &|_| Some((640, 480)))
+            .map_err(|error| error.to_string().replace(&root.display().to_string(), ""))?;
+        assert!(rig.validate().is_ok(), "a rig came in that is none");
+        Ok("a rig".to_owned())
+    })?
+}
+
+fn config(input: &[u8]) -> Result<String, String> {
+    let text = String::from_utf8_lossy(input);
+    told(flyrig::check_config(&text), "a configuration")
+}
+
+/// The first byte chooses the message.
+fn wire(input: &[u8]) -> Result<String, String> {
+    let (choice, bytes) = input.split_first().ok_or("short")?;
+    match choice % 6 {
+        0 => told(Header::decode("x", bytes), "header"),
+        1 => told(CameraStatus::decode(bytes), "status"),
+        2 => told(RigStats::decode(bytes), "stats"),
+        3 => told(decode_calibration(bytes), "calibration"),
+        4 => told(decode_transforms(bytes), "transforms"),
+        _ => {
+            let (head, payload) = bytes.split_at(bytes.len().min(HEADER_BYTES));
+            let header = Header::decode("x", head).map_err(|error| error.to_string())?;
+            told(ViewFrame::decode("x", &header, payload.to_vec().into()), "view")
+        }
+    }
+}
+
+fn network_frame(input: &[u8]) -> Result<String, String> {
+    let (head, payload) = input.split_at(input.len().min(FRAME_HEADER_BYTES));
+    let header = FrameHeader::decode("x", head).map_err(|error| error.to_string())?;
+    let frame = header.frame("x", &"a".into(), payload.to_vec()).map_err(|error| error.to_string())?;
+    // A JPEG of a few bytes may claim any size; the rig knows its cameras' sizes before it decodes.
+    if frame.image.width() > 4096 || frame.image.height() > 4096 {
+        return Err("large".into());
+    }
+    told(to_rgb8(&frame.image), &format!("{:?}", frame.image.format()))
+}
+
+fn splats(input: &[u8]) -> Result<String, String> {
+    let state = SplatState::decode(input).map_err(|error| error.to_string())?;
+    assert!(state.center_scale.iter().flatten().all(|value| value.is_finite()), "a number that is none came through");
+    Ok("splats".into())
+}
+
+/// BVH text, or a binary glTF file.
+fn motion(input: &[u8]) -> Result<String, String> {
+    if input.starts_with(b"glTF") {
+        return with_files(&[("body.glb", input)], |root| told(load_gltf(&root.join("body.glb")), "a body"))?;
+    }
+    let text = String::from_utf8_lossy(input);
+    told(parse_bvh(&text, Path::new("x.bvh")), "a clip")
+}

@@ -1,0 +1,73 @@
+//! Cameras of another computer: `flyrig capture` on one side, the rig on the other.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
+
+use std::{
+    net::TcpListener,
+    process::{Child, Command, Stdio},
+};
+
+use flyrig_tests::run;
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
+
+/// Ends the process when the test ends, however it does.
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+fn cameras_of_another_process_are_recorded_in_whole_sets() {
+    let folder = tempfile::tempdir().unwrap();
+    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let write = |name: &str, text: String| std::fs::write(folder.path().join(name), text).unwrap();
+    let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    write(
+        "cameras.toml",
+        format!(
+            "[rig]\nname = \"stage\"\n[source]\nkind = \"sim\"\ncameras = [\"00\", \"01\"]\n\
+             [sim]\nwidth = 64\nheight = 64\ntexture_px = 64\nfps = 10.0\ncameras.count = 2\n\
+             [transport]\nlisten = [\"tcp/127.0.0.1:{port}\"]\n"
+        ),
+    );
+    let exported = command(&["sim", "export", "cameras.toml", "--out", "calibration", "--frames", "1", "--no-truth"]);
+    assert_eq!(exported.code, Some(0), "{exported:?}");
+    let rig = |name: &str| {
+        format!(
+            "[rig]\nname = \"{name}\"\n[source]\nkind = \"network\"\npath = \"calibration\"\n\
+             cameras = [\"00\", \"01\"]\n[body]\npose = \"estimated\"\nmasks = \"estimated\"\n\
+             [transport]\nconnect = [\"tcp/127.0.0.1:{port}\"]\n"
+        )
+    };
+    write("rig.toml", rig("stage"));
+    write("wrong.toml", rig("stagee"));
+    let mut cameras = Command::new(PROGRAM);
+    cameras.args(["capture", "cameras.toml"]).current_dir(folder.path()).stderr(Stdio::null());
+    let _cameras = Running(cameras.spawn().unwrap());
+    let record =
+        |config: &str, out: &str, seconds: &str| command(&["record", config, "--out", out, "--seconds", seconds]);
+
+    // The other side takes its time to start; what is recorded then is whole.
+    let replayed = (0..8)
+        .find_map(|take| {
+            let file = format!("take{take}.mcap");
+            let recorded = record("rig.toml", &file, "4");
+            assert_eq!(recorded.code, Some(0), "{recorded:?}");
+            let replayed = command(&["replay", &file]);
+            replayed.stdout.contains("frames of Mjpeg 64x64").then_some(replayed)
+        })
+        .unwrap_or_else(|| panic!("no frame came"));
+    let sets = replayed.stdout.lines().find_map(|line| line.strip_prefix("sets: ")).unwrap();
+    let complete: usize = sets.split(' ').next().unwrap().parse().unwrap();
+    assert!(complete > 3, "{}", replayed.stdout);
+
+    let lost = record("wrong.toml", "none.mcap", "2");
+    assert!(lost.stderr.contains("no computer of rig 'stagee' is there, but of 'stage'"), "{}", lost.stderr);
+    let twice = command(&["capture", "rig.toml"]);
+    assert_eq!(twice.code, Some(1));
+    assert!(twice.stderr.contains("these cameras are on the network already"), "{}", twice.stderr);
+}

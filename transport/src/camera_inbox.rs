@@ -1,0 +1,279 @@
+//! What has come of other computers' cameras: frames that wait, clocks, and who is there.
+
+use std::{
+    collections::{BTreeMap, BTreeSet, VecDeque},
+    time::{Duration, Instant},
+};
+
+use flyrig_types::{CameraId, Frame};
+
+use crate::{
+    CameraLink, CameraStatus, FRAME_HEADER_BYTES, FrameHeader, Header, MessageKind, SCHEMA_VERSION, TransportError,
+    clock_exchange::Question, header, host_clock::ClockFit, keys,
+};
+
+/// Longest attachment that is looked at.
+pub(crate) const MAX_ATTACHMENT: usize = 4 * FRAME_HEADER_BYTES;
+/// Frames of a camera that may wait for their reader.
+const WAITING: usize = 4;
+/// A publisher of a camera that was silent for so long may be followed by another.
+const SUCCESSION: Duration = Duration::from_secs(1);
+/// The same trouble is told again after this.
+const AGAIN: Duration = Duration::from_secs(10);
+/// Frames are younger than this, and not of the future but for the clock's error; nanoseconds.
+const OLDEST: i64 = 10_000_000_000;
+const EARLIEST: i64 = 500_000_000;
+/// Computers and names that are remembered.
+const MAX_HOSTS: usize = 256;
+
+#[derive(Debug)]
+pub(crate) struct CameraInbox {
+    rig: String,
+    slots: Vec<Slot>,
+    /// By publisher.
+    hosts: BTreeMap<u64, Host>,
+    /// Keys of computers that we cannot use: of other rigs, of other versions.
+    others: BTreeSet<String>,
+}
+
+#[derive(Debug)]
+struct Host {
+    clock_key: String,
+    fit: ClockFit,
+}
+
+#[derive(Debug)]
+struct Slot {
+    camera: CameraId,
+    waiting: VecDeque<Frame>,
+    link: CameraLink,
+    publisher: Option<u64>,
+    arrived: Option<Instant>,
+    /// Sequence and withheld count of the message before.
+    last: Option<(u64, u64)>,
+    trouble: Option<TransportError>,
+    told: Option<(String, Instant)>,
+}
+
+impl CameraInbox {
+    pub fn new(rig: &str, cameras: &[CameraId]) -> Self {
+        let slot = |camera: &CameraId| Slot {
+            camera: camera.clone(),
+            waiting: VecDeque::with_capacity(WAITING),
+            link: CameraLink::default(),
+            publisher: None,
+            arrived: None,
+            last: None,
+            trouble: None,
+            told: None,
+        };
+        Self {
+            rig: rig.to_owned(),
+            slots: cameras.iter().map(slot).collect(),
+            hosts: BTreeMap::new(),
+            others: BTreeSet::new(),
+        }
+    }
+
+    /// A computer with cameras appeared or is gone.
+    pub fn host(&mut self, key: &str, is_alive: bool) {
+        let ours = (Some(self.rig.as_str()), Some(format!("v{SCHEMA_VERSION}")));
+        if (keys::rig_in(key), keys::version_in(key).map(str::to_owned)) != ours {
+            if !is_alive {
+                self.others.remove(key);
+            } else if self.others.len() < MAX_HOSTS {
+                self.others.insert(key.to_owned());
+            }
+            return;
+        }
+        let Some(name) = keys::name_in(key, "host", "") else { return };
+        let id = header::fnv1a(name.as_bytes());
+        if !is_alive {
+            self.hosts.remove(&id);
+        } else if self.hosts.len() < MAX_HOSTS {
+            let clock_key = keys::key(&self.rig, &format!("clock/{name}"));
+            self.hosts.entry(id).or_insert_with(|| Host { clock_key, fit: ClockFit::default() });
+        }
+    }
+
+    /// Whose clock to ask for.
+    pub fn questions(&self) -> Vec<Question> {
+        let question = |(host, state): (&u64, &Host)| Question {
+            key: state.clock_key.clone(),
+            host: *host,
+            is_urgent: state.fit.is_young(),
+        };
+        self.hosts.iter().map(question).collect()
+    }
+
+    pub fn clock(&mut self, host: u64, asked: i64, answer: i64, answered: i64) {
+        if let Some(host) = self.hosts.get_mut(&host) {
+            host.fit.add(asked, answer, answered);
+        }
+    }
+
+    pub fn status(
+        &mut self,
+        camera: &CameraId,
+        key: &str,
+        attachment: &[u8],
+        payload: Result<Vec<u8>, TransportError>,
+    ) {
+        let status = payload.and_then(|payload| {
+            let header = Header::decode(key, attachment)?;
+            if header.kind != MessageKind::CameraStatus {
+                return Err(TransportError::malformed(key, format!("holds {:?}, not a status", header.kind)));
+            }
+            CameraStatus::decode(&payload)
+        });
+        let Some(slot) = self.slots.iter_mut().find(|slot| slot.camera == *camera) else { return };
+        match status {
+            Ok(status) => slot.link.status = Some(status),
+            Err(error) => slot.refuse(error),
+        }
+    }
+
+    pub fn frame(
+        &mut self,
+        camera: &CameraId,
+        key: &str,
+        attachment: &[u8],
+        payload: Result<Vec<u8>, TransportError>,
+        now_nanos: i64,
+    ) {
+        let Some(slot) = self.slots.iter_mut().find(|slot| slot.camera == *camera) else { return };
+        let header = match FrameHeader::decode(key, attachment) {
+            Ok(header) => header,
+            Err(error) => return slot.refuse(error),
+        };
+        if let Err(error) = slot.follow(&header, &self.hosts) {
+            return slot.refuse(error);
+        }
+        let frame = match payload.and_then(|bytes| header.frame(key, camera, bytes)) {
+            Ok(frame) => frame,
+            Err(error) => return slot.refuse(error),
+        };
+        let host = self.hosts.get(&header.header.publisher);
+        let Some(capture_nanos) = host.and_then(|host| host.fit.to_local(frame.capture_nanos)) else {
+            slot.link.before_clock += 1;
+            return;
+        };
+        let age = now_nanos.saturating_sub(capture_nanos);
+        if !(-EARLIEST..=OLDEST).contains(&age) {
+            let secs = age as f64 * 1e-9;
+            let text = format!("its stamp is {secs:.1} s before now, which cannot be; restart `flyrig capture` there");
+            return slot.refuse(TransportError::malformed(key, text));
+        }
+        slot.link.frames += 1;
+        if slot.waiting.len() == WAITING {
+            slot.waiting.pop_front();
+            slot.link.overtaken += 1;
+        }
+        slot.waiting.push_back(Frame { capture_nanos, ..frame });
+    }
+
+    /// The oldest frame that waits, or what is to be told first.
+    pub fn take(&mut self, camera: &CameraId) -> Result<Option<Result<Frame, TransportError>>, TransportError> {
+        let slot = self.slots.iter_mut().find(|slot| slot.camera == *camera);
+        let slot = slot.ok_or_else(|| TransportError::config(format!("camera {camera}"), "was not asked for"))?;
+        if let Some(trouble) = slot.trouble.take() {
+            return Ok(Some(Err(trouble)));
+        }
+        Ok(slot.waiting.pop_front().map(Ok))
+    }
+
+    pub fn link(&self, camera: &CameraId, now_nanos: i64) -> CameraLink {
+        let Some(slot) = self.slots.iter().find(|slot| slot.camera == *camera) else { return CameraLink::default() };
+        let host = slot.publisher.and_then(|publisher| self.hosts.get(&publisher));
+        CameraLink { clock: host.and_then(|host| host.fit.estimate(now_nanos)), ..slot.link.clone() }
+    }
+
+    pub fn absence(&self, camera: &CameraId, connect: &[String]) -> String {
+        let Some(slot) = self.slots.iter().find(|slot| slot.camera == *camera) else {
+            return "was not asked for".into();
+        };
+        let rig = &self.rig;
+        let status = slot.link.status.as_ref();
+        let host = status.map(|status| status.host.as_str()).filter(|host| !host.is_empty());
+        let computer = host.map_or_else(|| "its computer".to_owned(), |host| format!("its computer '{host}'"));
+        let is_there = slot.publisher.map(|publisher| self.hosts.contains_key(&publisher));
+        if is_there == Some(false) {
+            return format!(
+                "{computer} is gone from the network; start `flyrig capture` there again, or mend the cable"
+            );
+        }
+        let problem = status.map(|status| status.problem.as_str()).filter(|problem| !problem.is_empty());
+        if let Some(problem) = problem.filter(|_| !self.hosts.is_empty()) {
+            return format!("{computer} says: {problem}");
+        }
+        if is_there.is_some() {
+            return format!("{computer} is there and sends nothing; look at the network between");
+        }
+        if !self.hosts.is_empty() {
+            return format!(
+                "no computer of rig '{rig}' sends a camera of this name; compare source.cameras there and here"
+            );
+        }
+        let quoted =
+            |names: BTreeSet<&str>| names.iter().map(|name| format!("'{name}'")).collect::<Vec<_>>().join(", ");
+        let is_ours = |key: &&String| keys::rig_in(key) == Some(rig.as_str());
+        let versions: BTreeSet<&str> =
+            self.others.iter().filter(is_ours).filter_map(|key| keys::version_in(key)).collect();
+        if !versions.is_empty() {
+            return format!(
+                "its computer speaks schema version {}, this program knows v{SCHEMA_VERSION}; run the same flyrig on both",
+                quoted(versions)
+            );
+        }
+        let rigs: BTreeSet<&str> = self.others.iter().filter_map(|key| keys::rig_in(key)).collect();
+        if !rigs.is_empty() {
+            return format!(
+                "no computer of rig '{rig}' is there, but of {}; set rig.name alike on both sides",
+                quoted(rigs)
+            );
+        }
+        format!(
+            "no computer of rig '{rig}' is there; run `flyrig capture` on it, and let transport.connect ({}) name its \
+             transport.listen",
+            connect.join(", ")
+        )
+    }
+}
+
+impl Slot {
+    /// Counts what is missing before this message. A camera has one publisher at a time.
+    fn follow(&mut self, header: &FrameHeader, hosts: &BTreeMap<u64, Host>) -> Result<(), TransportError> {
+        let FrameHeader { header: Header { publisher, sequence, .. }, withheld, .. } = *header;
+        if let Some(before) = self.publisher.filter(|before| *before != publisher) {
+            let is_fresh = self.arrived.is_some_and(|at| at.elapsed() < SUCCESSION);
+            if is_fresh && hosts.contains_key(&before) {
+                return Err(TransportError::malformed(
+                    format!("camera {}", self.camera),
+                    "two computers publish a camera of this name; give each its own in source.cameras",
+                ));
+            }
+            self.link.restarts += 1;
+            self.last = None;
+        }
+        if let Some((last, withheld_before)) = self.last {
+            let gap = sequence.saturating_sub(last).saturating_sub(1);
+            let not_sent = withheld.saturating_sub(withheld_before).min(gap);
+            self.link.withheld = self.link.withheld.saturating_add(not_sent);
+            self.link.lost = self.link.lost.saturating_add(gap - not_sent);
+        }
+        self.publisher = Some(publisher);
+        self.arrived = Some(Instant::now());
+        self.last = Some((sequence, withheld));
+        Ok(())
+    }
+
+    fn refuse(&mut self, error: TransportError) {
+        self.link.refused += 1;
+        let text = error.to_string();
+        let is_known = self.told.as_ref().is_some_and(|(told, at)| *told == text && at.elapsed() < AGAIN);
+        if !is_known {
+            self.told = Some((text, Instant::now()));
+            self.trouble = Some(error);
+        }
+    }
+}

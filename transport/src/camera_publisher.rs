@@ -1,0 +1,146 @@
+//! The side of a computer with cameras.
+
+use std::{sync::Arc, time::Duration};
+
+use flyrig_types::{CameraId, Frame};
+use prost::bytes::Bytes;
+use zenoh::{Wait, liveliness::LivelinessToken};
+
+use crate::{
+    CameraStatus, Header, HostClock, MessageKind, PublishOutcome, TopicCounts, TransportConfig, TransportError,
+    clock_exchange,
+    drain::{Drain, DrainThread, Shared, empty_header},
+    frame::MAX_FRAME_BYTES,
+    keys,
+    publisher::open_session,
+    topic::{Body, Topic},
+    viewpoint::Leases,
+};
+
+/// Publishes the frames of cameras, each to a topic with one slot: the newest wins, nothing waits for the network. Answers
+/// questions for its clock.
+pub struct CameraPublisher {
+    shared: Arc<Shared>,
+    cameras: Vec<Lane>,
+    endpoints: Vec<String>,
+    drain: DrainThread,
+    _alive: LivelinessToken,
+}
+
+struct Lane {
+    camera: CameraId,
+    frames: Arc<Topic>,
+    status: Arc<Topic>,
+}
+
+impl std::fmt::Debug for CameraPublisher {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("CameraPublisher")
+            .field("rig", &self.shared.rig)
+            .field("endpoints", &self.endpoints)
+            .finish_non_exhaustive()
+    }
+}
+
+impl CameraPublisher {
+    /// Opens the session and starts its thread. `clock` is the one that stamps the frames.
+    ///
+    /// # Errors
+    /// `Config` for names that cannot stand in a key, or `Session` when zenoh cannot listen there.
+    pub fn open(config: &TransportConfig, cameras: &[CameraId], clock: HostClock) -> Result<Self, TransportError> {
+        config.validate()?;
+        let rig = &config.rig;
+        let lane = |camera: &CameraId| {
+            keys::check_name("camera", camera.as_str())?;
+            let topic = |label: String, kind| Arc::new(Topic::new(label.clone(), label, kind));
+            Ok(Lane {
+                camera: camera.clone(),
+                frames: topic(keys::frames_label(camera), MessageKind::Frame),
+                status: topic(keys::status_label(camera), MessageKind::CameraStatus),
+            })
+        };
+        let cameras: Vec<Lane> = cameras.iter().map(lane).collect::<Result<_, TransportError>>()?;
+        let (session, endpoints) = open_session(config)?;
+        let failed = |error: zenoh::Error| TransportError::session(format!("cameras of rig {rig}"), &error);
+        let topics: Vec<_> = cameras.iter().flat_map(|lane| [lane.frames.clone(), lane.status.clone()]).collect();
+        let (shared, woken) = Shared::new(rig, &session, &topics, Leases::new(0, Duration::ZERO));
+        let host = session.zid().to_string();
+        clock_exchange::answer(&session, keys::key(rig, &format!("clock/{host}")), clock).map_err(failed)?;
+        let alive = keys::key(rig, &format!("host/{host}"));
+        let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
+        let drain = DrainThread::start(Drain { shared: shared.clone(), session, express: config.express, woken })?;
+        Ok(Self { shared, cameras, endpoints, drain, _alive: alive })
+    }
+
+    /// Endpoints it listens on, port 0 replaced by the real one.
+    #[must_use]
+    pub fn endpoints(&self) -> &[String] {
+        &self.endpoints
+    }
+
+    /// Whether anybody wants a camera's frames; at most some 50 ms old.
+    #[must_use]
+    pub fn is_watched(&self, camera: &CameraId) -> bool {
+        self.cameras.iter().any(|lane| lane.camera == *camera && lane.frames.is_watched())
+    }
+
+    /// Hands in a frame.
+    ///
+    /// # Errors
+    /// `Config` for a camera that was not named at the start and a picture of more than [`MAX_FRAME_BYTES`].
+    pub fn publish(&self, frame: Frame) -> Result<PublishOutcome, TransportError> {
+        let lane = self.lane(&frame.camera)?;
+        let length = frame.image.bytes().len();
+        if length > MAX_FRAME_BYTES {
+            let text = format!("picture of {length} bytes, at most {MAX_FRAME_BYTES}; choose a smaller size");
+            return Err(TransportError::config(format!("camera {}", frame.camera), text));
+        }
+        let header = Header {
+            frame: frame.sequence,
+            capture_nanos: frame.capture_nanos,
+            width: frame.image.width(),
+            height: frame.image.height(),
+            ..empty_header()
+        };
+        Ok(self.offer(&lane.frames, Body::Frame(Arc::new(frame)), header))
+    }
+
+    /// Hands in how a camera is; what was overtaken here is added.
+    ///
+    /// # Errors
+    /// `Config` for a camera that was not named at the start.
+    pub fn publish_status(&self, camera: &CameraId, status: &CameraStatus) -> Result<PublishOutcome, TransportError> {
+        let lane = self.lane(camera)?;
+        let overtaken = status.overtaken.saturating_add(lane.frames.counts().replaced);
+        let bytes = CameraStatus { overtaken, ..status.clone() }.encode()?;
+        Ok(self.offer(&lane.status, Body::Bytes(Bytes::from(bytes)), empty_header()))
+    }
+
+    /// Counts of the cameras' frames.
+    #[must_use]
+    pub fn counts(&self) -> Vec<(CameraId, TopicCounts)> {
+        self.cameras.iter().map(|lane| (lane.camera.clone(), lane.frames.counts())).collect()
+    }
+
+    /// Ends the thread and the session; dropping does the same but says nothing.
+    ///
+    /// # Errors
+    /// `Session` when the thread died or zenoh fails to close.
+    pub fn close(mut self) -> Result<(), TransportError> {
+        self.drain.stop()
+    }
+
+    fn lane(&self, camera: &CameraId) -> Result<&Lane, TransportError> {
+        self.cameras.iter().find(|lane| lane.camera == *camera).ok_or_else(|| {
+            TransportError::config(format!("camera {camera}"), "is not one of those that this publisher was opened for")
+        })
+    }
+
+    fn offer(&self, topic: &Topic, body: Body, header: Header) -> PublishOutcome {
+        let outcome = topic.offer(body, header);
+        if outcome != PublishOutcome::Unwatched {
+            self.shared.wake();
+        }
+        outcome
+    }
+}

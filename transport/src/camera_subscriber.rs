@@ -1,0 +1,201 @@
+//! The side that uses cameras of other computers.
+
+use std::{
+    sync::{Arc, Condvar, Mutex, PoisonError},
+    time::{Duration, Instant},
+};
+
+use flyrig_types::{CameraId, Frame};
+use zenoh::{Session, Wait, sample::Sample, sample::SampleKind};
+
+use crate::{
+    CameraStatus, ClockEstimate, HostClock, TransportConfig, TransportError,
+    camera_inbox::{CameraInbox, MAX_ATTACHMENT},
+    clock_exchange::{Asker, Question},
+    frame::MAX_FRAME_BYTES,
+    keys,
+    publisher::open_session,
+    stats::MAX_JSON_BYTES,
+    topic::lock,
+};
+
+/// What became of a camera's frames on their way; counts since this side was opened.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct CameraLink {
+    /// Frames that came and could be used.
+    pub frames: u64,
+    /// Frames overtaken before they left the camera's computer, or not sent because nobody listened.
+    pub withheld: u64,
+    /// Frames that left and never came.
+    pub lost: u64,
+    /// Frames that newer ones overtook here before they were read.
+    pub overtaken: u64,
+    /// Messages that could not be used; the errors tell why.
+    pub refused: u64,
+    /// Frames that came before their computer's clock was known.
+    pub before_clock: u64,
+    /// Times that another program began to publish the camera: a restart, or another computer.
+    pub restarts: u64,
+    /// The clock of the camera's computer.
+    pub clock: Option<ClockEstimate>,
+    /// What that computer says of the camera.
+    pub status: Option<CameraStatus>,
+}
+
+/// Receives the frames of cameras of other computers, with capture times on this computer's clock.
+///
+/// A few frames a camera wait for their reader, the newest win. Computers may come later, vanish and return.
+pub struct CameraSubscriber {
+    shared: Arc<Shared>,
+    asker: Asker,
+    session: Session,
+    connect: Vec<String>,
+    closed: bool,
+}
+
+struct Shared {
+    rig: String,
+    inbox: Mutex<CameraInbox>,
+    changed: Condvar,
+    clock: HostClock,
+}
+
+impl std::fmt::Debug for CameraSubscriber {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("CameraSubscriber").field("rig", &self.shared.rig).finish_non_exhaustive()
+    }
+}
+
+impl CameraSubscriber {
+    /// Opens the session; the cameras' computers may come later. `clock` is this computer's.
+    ///
+    /// # Errors
+    /// `Config` for names that cannot stand in a key, or `Session`.
+    pub fn open(config: &TransportConfig, cameras: &[CameraId], clock: HostClock) -> Result<Self, TransportError> {
+        config.validate()?;
+        let rig = &config.rig;
+        for camera in cameras {
+            keys::check_name("camera", camera.as_str())?;
+        }
+        let (session, _) = open_session(config)?;
+        let failed = |error: zenoh::Error| TransportError::session(format!("cameras of rig {rig}"), &error);
+        let shared = Arc::new(Shared {
+            rig: rig.clone(),
+            inbox: Mutex::new(CameraInbox::new(rig, cameras)),
+            changed: Condvar::new(),
+            clock: clock.clone(),
+        });
+        for camera in cameras {
+            for label in [keys::frames_label(camera), keys::status_label(camera)] {
+                let (shared, camera) = (shared.clone(), camera.clone());
+                session
+                    .declare_subscriber(keys::key(rig, &label))
+                    .callback(move |sample| shared.receive(&camera, &sample))
+                    .background()
+                    .wait()
+                    .map_err(failed)?;
+            }
+        }
+        let watcher = shared.clone();
+        session
+            .liveliness()
+            .declare_subscriber(keys::ANY_HOST)
+            .history(true)
+            .callback(move |sample| {
+                let is_alive = sample.kind() == SampleKind::Put;
+                lock(&watcher.inbox).host(sample.key_expr().as_str(), is_alive);
+                watcher.changed.notify_all();
+            })
+            .background()
+            .wait()
+            .map_err(failed)?;
+        let (asking, taking) = (shared.clone(), shared.clone());
+        let hosts = move || -> Vec<Question> { lock(&asking.inbox).questions() };
+        let take = move |host, asked, answer, answered| {
+            lock(&taking.inbox).clock(host, asked, answer, answered);
+        };
+        let asker = Asker::start(session.clone(), clock, hosts, take)?;
+        Ok(Self { shared, asker, session, connect: config.connect.clone(), closed: false })
+    }
+
+    /// The oldest frame of a camera that waits; `None` after the timeout.
+    ///
+    /// # Errors
+    /// `UnknownVersion` or `Malformed` for a message that could not be used, the same text once in ten seconds; it is fine
+    /// to go on. `Config` for a camera that was not named at the start.
+    pub fn next_frame(&self, camera: &CameraId, timeout: Duration) -> Result<Option<Frame>, TransportError> {
+        let deadline = Instant::now() + timeout;
+        let mut inbox = lock(&self.shared.inbox);
+        loop {
+            if let Some(result) = inbox.take(camera)? {
+                return result.map(Some);
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Ok(None);
+            }
+            inbox = self.shared.changed.wait_timeout(inbox, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    /// How a camera's way here is; all zero for one that was not named at the start.
+    #[must_use]
+    pub fn link(&self, camera: &CameraId) -> CameraLink {
+        lock(&self.shared.inbox).link(camera, self.shared.clock.now_nanos())
+    }
+
+    /// Why nothing comes of a camera, and the mend.
+    #[must_use]
+    pub fn absence(&self, camera: &CameraId) -> String {
+        lock(&self.shared.inbox).absence(camera, &self.connect)
+    }
+
+    /// Ends the session; dropping does the same but says nothing.
+    ///
+    /// # Errors
+    /// `Session` when zenoh fails to close.
+    pub fn close(mut self) -> Result<(), TransportError> {
+        self.stop()
+    }
+
+    fn stop(&mut self) -> Result<(), TransportError> {
+        if std::mem::replace(&mut self.closed, true) {
+            return Ok(());
+        }
+        self.asker.stop();
+        self.session.close().wait().map_err(|error| TransportError::session("closing", &error))
+    }
+}
+
+impl Drop for CameraSubscriber {
+    fn drop(&mut self) {
+        if let Err(error) = self.stop() {
+            tracing::warn!(%error, "closing the subscriber of cameras");
+        }
+    }
+}
+
+impl Shared {
+    /// Takes a sample in; runs on a zenoh thread.
+    fn receive(&self, camera: &CameraId, sample: &Sample) {
+        let key = sample.key_expr().as_str();
+        let is_status = keys::label_in(key).is_some_and(|label| label.starts_with(keys::STATUS));
+        let attachment = sample.attachment().filter(|bytes| bytes.len() <= MAX_ATTACHMENT);
+        let attachment = attachment.map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
+        // What is too long is not even copied.
+        let limit = if is_status { MAX_JSON_BYTES } else { MAX_FRAME_BYTES };
+        let length = sample.payload().len();
+        let payload = (length <= limit)
+            .then(|| sample.payload().to_bytes().into_owned())
+            .ok_or_else(|| TransportError::malformed(key, format!("{length} bytes, at most {limit}")));
+        let now_nanos = self.clock.now_nanos();
+        let mut inbox = lock(&self.inbox);
+        if is_status {
+            inbox.status(camera, key, &attachment, payload);
+        } else {
+            inbox.frame(camera, key, &attachment, payload, now_nanos);
+        }
+        drop(inbox);
+        self.changed.notify_all();
+    }
+}

@@ -1,0 +1,284 @@
+//! Clocks of two computers: how far the other one is from ours, from round trips.
+//!
+//! A question leaves at `t1` and its answer is here at `t4` (our clock), and says the other clock's `t` between. Half of the
+//! round trip bounds the error of `t - (t1 + t4) / 2`, so the quickest exchanges are worth most: of every few only the
+//! quickest counts (the minimum filter of NTP, RFC 5905, section 10), and a line through those is offset and drift.
+
+use std::{collections::VecDeque, fmt, sync::Arc};
+
+/// Exchanges of which only the quickest counts.
+const BLOCK: usize = 8;
+/// Quickest ones that the line goes through, about two minutes.
+const BLOCKS: usize = 64;
+/// How far clocks of computers usually drift apart, parts per million: what few or slow exchanges say beyond is their noise.
+const USUAL_DRIFT_PPM: f64 = 100.0;
+/// Exchanges before the first answer.
+const FIRST_ANSWER: usize = 3;
+/// Clocks of computers run within this of each other, parts per million.
+const MOST_DRIFT_PPM: f64 = 500.0;
+/// How far an exchange may lie from the line beyond its own bound, nanoseconds, and how many in a row that do make a step.
+const SLACK: f64 = 2e6;
+const CONFIRMATIONS: usize = 4;
+
+/// The clock that stamps this computer's frames: `CLOCK_MONOTONIC`, nanoseconds.
+#[derive(Clone)]
+pub struct HostClock(Arc<dyn Fn() -> i64 + Send + Sync>);
+
+impl HostClock {
+    /// Around a function that reads it; called from several threads.
+    #[must_use]
+    pub fn new(now_nanos: impl Fn() -> i64 + Send + Sync + 'static) -> Self {
+        Self(Arc::new(now_nanos))
+    }
+
+    /// Its time.
+    #[must_use]
+    pub fn now_nanos(&self) -> i64 {
+        (self.0)()
+    }
+}
+
+impl fmt::Debug for HostClock {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("HostClock")
+    }
+}
+
+/// What is known of another computer's clock.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ClockEstimate {
+    /// That clock minus ours, now, nanoseconds.
+    pub offset_nanos: i64,
+    /// How much faster it runs than ours, parts per million.
+    pub drift_ppm: f64,
+    /// Shortest round trip of late, nanoseconds: half of it bounds the offset's error.
+    pub round_trip_nanos: i64,
+    /// Steps of that clock so far.
+    pub steps: u64,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Exchange {
+    /// Middle of the question's and the answer's time, our clock.
+    local: i64,
+    /// The other clock minus `local`.
+    offset: i64,
+    round_trip: i64,
+}
+
+/// `offset(local) = offset + drift (local - anchor)`.
+#[derive(Debug, Clone, Copy)]
+struct Line {
+    anchor: i64,
+    offset: i64,
+    drift: f64,
+}
+
+impl Line {
+    fn at(&self, local: i64) -> i64 {
+        self.offset.saturating_add((self.drift * local.saturating_sub(self.anchor) as f64) as i64)
+    }
+}
+
+/// Estimates one clock.
+#[derive(Debug, Default)]
+pub(crate) struct ClockFit {
+    block: Vec<Exchange>,
+    best: VecDeque<Exchange>,
+    outliers: Vec<Exchange>,
+    line: Option<Line>,
+    round_trip: i64,
+    steps: u64,
+}
+
+impl ClockFit {
+    /// Takes an exchange in: our time of the question, the answer, our time of the answer.
+    pub fn add(&mut self, asked: i64, answer: i64, answered: i64) {
+        let round_trip = answered.saturating_sub(asked);
+        if round_trip < 0 {
+            return;
+        }
+        let local = asked.saturating_add(round_trip / 2);
+        let Some(offset) = answer.checked_sub(local) else { return };
+        let exchange = Exchange { local, offset, round_trip };
+        if let Some(line) = &self.line {
+            let off = offset.saturating_sub(line.at(local)) as f64;
+            if off.abs() > round_trip as f64 / 2.0 + SLACK {
+                // Only those that agree with each other tell of another clock.
+                self.outliers.retain(|other| {
+                    let apart = other.offset.saturating_sub(offset).unsigned_abs() as f64;
+                    apart <= (other.round_trip.saturating_add(round_trip)) as f64 / 2.0 + SLACK
+                });
+                self.outliers.push(exchange);
+                if self.outliers.len() < CONFIRMATIONS {
+                    return;
+                }
+                // The clock was set, or its computer slept: what was learned is of another clock.
+                self.best.clear();
+                self.block = std::mem::take(&mut self.outliers);
+                self.steps += 1;
+                self.line = None;
+            } else {
+                self.outliers.clear();
+                self.block.push(exchange);
+            }
+        } else {
+            self.block.push(exchange);
+        }
+        if self.block.len() >= BLOCK {
+            self.best.extend(self.block.drain(..).min_by_key(|exchange| exchange.round_trip));
+            if self.best.len() > BLOCKS {
+                self.best.pop_front();
+            }
+        }
+        if self.best.len() * BLOCK + self.block.len() >= FIRST_ANSWER {
+            self.fit();
+        }
+    }
+
+    fn fit(&mut self) {
+        let current = self.block.iter().min_by_key(|exchange| exchange.round_trip);
+        let all = || self.best.iter().chain(current);
+        let Some(quickest) = all().min_by_key(|exchange| exchange.round_trip).copied() else { return };
+        self.round_trip = quickest.round_trip;
+        let flat = Line { anchor: quickest.local, offset: quickest.offset, drift: 0.0 };
+        // Least squares around the quickest exchange, so that the numbers stay small; each is known to half of its round
+        // trip, the drift to what is usual.
+        let known = |round_trip: i64| round_trip.max(1000) as f64 / 2.0;
+        let prior = (known(quickest.round_trip) / (USUAL_DRIFT_PPM * 1e-6)).powi(2);
+        let [mut w, mut x, mut y, mut xx, mut xy] = [0.0, 0.0, 0.0, prior, 0.0];
+        for exchange in all() {
+            let weight = (known(quickest.round_trip) / known(exchange.round_trip)).powi(2);
+            let dx = exchange.local.saturating_sub(flat.anchor) as f64;
+            let dy = exchange.offset.saturating_sub(flat.offset) as f64;
+            w += weight;
+            x += weight * dx;
+            y += weight * dy;
+            xx += weight * dx * dx;
+            xy += weight * dx * dy;
+        }
+        let drift = (w * xy - x * y) / (w * xx - x * x);
+        let drift = if drift.is_finite() { drift } else { 0.0 };
+        let drift = drift.clamp(-MOST_DRIFT_PPM * 1e-6, MOST_DRIFT_PPM * 1e-6);
+        let shift = (y - drift * x) / w;
+        self.line = Some(Line { offset: flat.offset.saturating_add(shift as i64), drift, ..flat });
+    }
+
+    /// What is known at our time; none before a few exchanges.
+    pub fn estimate(&self, local_nanos: i64) -> Option<ClockEstimate> {
+        let line = self.line?;
+        Some(ClockEstimate {
+            offset_nanos: line.at(local_nanos),
+            drift_ppm: line.drift * 1e6,
+            round_trip_nanos: self.round_trip,
+            steps: self.steps,
+        })
+    }
+
+    /// Our time of a time of the other clock.
+    pub fn to_local(&self, remote_nanos: i64) -> Option<i64> {
+        let line = self.line?;
+        // The line takes our time; the difference of one more turn is the drift squared.
+        let local = remote_nanos.saturating_sub(line.offset);
+        Some(remote_nanos.saturating_sub(line.at(local)))
+    }
+
+    /// Whether questions should come quickly.
+    pub fn is_young(&self) -> bool {
+        self.best.len() < 2
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The same numbers on every machine; 0 to 1.
+    struct Random(u64);
+
+    impl Random {
+        fn unit(&mut self) -> f64 {
+            self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (self.0 >> 11) as f64 / (1u64 << 53) as f64
+        }
+    }
+
+    struct Truth {
+        offset: i64,
+        drift: f64,
+    }
+
+    impl Truth {
+        fn remote(&self, local: i64) -> i64 {
+            local + self.offset + (self.drift * local as f64) as i64
+        }
+    }
+
+    /// A wire of 200 us each way; every third exchange waits up to 20 ms more behind pictures, on one way only.
+    fn exchange(fit: &mut ClockFit, truth: &Truth, local: i64, random: &mut Random) {
+        let mut way = || 200_000 + (random.unit() * 30_000.0) as i64;
+        let (mut there, mut back) = (way(), way());
+        if random.unit() < 0.33 {
+            let late = (random.unit() * 20e6) as i64;
+            if random.unit() < 0.8 { there += late } else { back += late }
+        }
+        fit.add(local, truth.remote(local + there), local + there + back);
+    }
+
+    #[test]
+    fn offset_and_drift_come_out_of_a_crowded_wire() {
+        for (offset, ppm) in [(0, 0.0), (7_200_000_000_123, 80.0), (-3_600_000_000_000, -100.0)] {
+            let truth = Truth { offset, drift: ppm * 1e-6 };
+            let (mut fit, mut random) = (ClockFit::default(), Random(5));
+            let mut worst = 0;
+            for n in 0..600i64 {
+                let local = 1_000_000_000_000 + n * 250_000_000;
+                exchange(&mut fit, &truth, local, &mut random);
+                if let Some(found) = fit.to_local(truth.remote(local)) {
+                    let bound = if n > 60 { 60_000 } else { 2_000_000 };
+                    let error = (found - local).abs();
+                    assert!(error < bound, "exchange {n}: {error} ns");
+                    worst = worst.max(if n > 60 { error } else { 0 });
+                }
+            }
+            let estimate = fit.estimate(1_150_000_000_000).unwrap();
+            assert!((estimate.drift_ppm - ppm).abs() < 0.5, "{estimate:?}");
+            let true_offset = truth.remote(1_150_000_000_000) - 1_150_000_000_000;
+            assert!((estimate.offset_nanos - true_offset).abs() < 60_000, "{estimate:?}");
+            assert!((400_000..460_000).contains(&estimate.round_trip_nanos), "{estimate:?}");
+            println!("offset {offset} ns, {ppm} ppm: within {} us, drift {:.2} ppm", worst / 1000, estimate.drift_ppm);
+        }
+    }
+
+    #[test]
+    fn a_clock_that_steps_is_followed_and_a_late_answer_is_not() {
+        let (mut fit, mut random) = (ClockFit::default(), Random(9));
+        let mut truth = Truth { offset: 5_000_000, drift: 20e-6 };
+        for n in 0..100i64 {
+            exchange(&mut fit, &truth, n * 250_000_000, &mut random);
+        }
+        // One liar between honest ones.
+        fit.add(25_000_000_000, -1 << 60, 25_000_400_000);
+        let before = fit.estimate(25_000_000_000).unwrap();
+        assert!((before.offset_nanos - 5_500_000).abs() < 60_000 && before.steps == 0, "{before:?}");
+        truth.offset = -90_000_000_000;
+        for n in 100..120i64 {
+            exchange(&mut fit, &truth, n * 250_000_000, &mut random);
+        }
+        let after = fit.estimate(30_000_000_000).unwrap();
+        assert!((after.offset_nanos + 90_000_000_000 - 600_000).abs() < 120_000 && after.steps == 1, "{after:?}");
+    }
+
+    #[test]
+    fn absurd_answers_do_no_harm() {
+        let mut fit = ClockFit::default();
+        for (asked, answer, answered) in
+            [(i64::MAX, 0, i64::MIN), (i64::MIN, i64::MAX, i64::MAX), (0, i64::MIN, 0), (5, i64::MAX, 5), (9, 1, 3)]
+        {
+            for _ in 0..20 {
+                fit.add(asked, answer, answered);
+                let _ = (fit.to_local(i64::MAX), fit.to_local(i64::MIN), fit.estimate(i64::MIN), fit.is_young());
+            }
+        }
+    }
+}
