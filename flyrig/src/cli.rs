@@ -2,7 +2,8 @@
 
 use std::{net::SocketAddr, ops::Range, path::PathBuf};
 
-use clap::{Args, Parser, Subcommand, builder::TypedValueParser as _};
+use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
+use flyrig_stfa::NetworkSize;
 
 use crate::config::{AppearanceMode, Origin, Solver};
 
@@ -194,6 +195,12 @@ pub struct TrainArgs {
     /// Adam's rate at the start; it falls to zero along half a cosine.
     #[arg(long, default_value_t = 2e-3)]
     pub rate: f32,
+    /// Weight of structural similarity beside the mean squared difference.
+    #[arg(long, default_value_t = 0.02)]
+    pub structure: f32,
+    /// How large the networks are.
+    #[arg(long, value_enum, default_value = "small")]
+    pub size: SizeName,
     /// Checkpoints (one every 250 steps) from one measurement on the test people to the next.
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub test_every: u64,
@@ -203,6 +210,24 @@ pub struct TrainArgs {
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
     pub gaussians: usize,
+}
+
+/// Sizes of the networks of learned appearance.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum SizeName {
+    Tiny,
+    Small,
+    Medium,
+}
+
+impl SizeName {
+    pub fn size(self) -> NetworkSize {
+        match self {
+            Self::Tiny => NetworkSize::TINY,
+            Self::Small => NetworkSize::SMALL,
+            Self::Medium => NetworkSize::MEDIUM,
+        }
+    }
 }
 
 #[derive(Debug, Subcommand)]

@@ -15,7 +15,7 @@ use std::{
 
 use anyhow::{Context, Result, ensure};
 use flyrig_gpu::GpuContext;
-use flyrig_stfa::{NetworkSize, SampleErrors, TrainSettings, Trainer, TrainingSample, evaluate};
+use flyrig_stfa::{SampleErrors, TrainSettings, Trainer, TrainingSample, evaluate};
 
 pub use self::people::People;
 use self::report::{Progress, Scores};
@@ -46,18 +46,19 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     ensure!(!samples.is_empty(), "there is nothing to train on; ask for at least one person or data set");
 
     let checkpoint = args.out.join("checkpoint.safetensors");
-    let settings = TrainSettings { seed: args.seed, steps: args.steps, rate: args.rate, ..TrainSettings::default() };
+    let settings = TrainSettings { seed: args.seed, steps: args.steps, rate: args.rate, structure: args.structure, ..TrainSettings::default() };
     let mut trainer = if checkpoint.exists() {
         let trainer = Trainer::load(&checkpoint)?;
         ensure!(
-            trainer.settings == settings,
-            "{} was begun with other settings ({:?}); give the same ones, or another --out",
+            trainer.settings == settings && trainer.parameters.size == args.size.size(),
+            "{} was begun with other settings ({:?}, {:?}); give the same ones, or another --out",
             checkpoint.display(),
+            trainer.parameters.size,
             trainer.settings
         );
         trainer
     } else {
-        Trainer::new(NetworkSize::SMALL, settings)
+        Trainer::new(args.size.size(), settings)
     };
     let mut progress = Progress::open(&args.out, trainer.step)?;
     let bar = progress_bar(args.steps, "train");

@@ -25,9 +25,11 @@ mod network;
 mod paint;
 mod parameters;
 mod sample;
+mod structure;
 mod taps;
 mod tensor_file;
 mod train;
+mod variation;
 mod weights;
 
 pub use body_graph::{BodyGraph, EDGES, PLACE, POOLED};

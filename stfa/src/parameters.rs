@@ -31,6 +31,11 @@ impl NetworkSize {
     /// Small enough for two CPU cores.
     pub const SMALL: Self = Self { channels: [8, 16, 24], node: 32, heads: 2, layers: 3, hidden: [48, 32] };
 
+    /// Half as wide.
+    pub const TINY: Self = Self { channels: [4, 8, 12], node: 16, heads: 2, layers: 2, hidden: [24, 16] };
+    /// Twice as wide.
+    pub const MEDIUM: Self = Self { channels: [16, 32, 48], node: 64, heads: 4, layers: 4, hidden: [96, 64] };
+
     /// Numbers of an image feature.
     #[must_use]
     pub fn feature(&self) -> usize {

@@ -14,12 +14,14 @@ use serde::{Deserialize, Serialize};
 use crate::{
     NetworkSize, Parameters, StfaError,
     body_graph::PLACE,
-    inputs::{CANDIDATES, NODE, STATE},
+    inputs::{NODE, STATE},
     network::{Network, feature_maps, linear_from_srgb, srgb_from_linear},
     parameters::to_vec,
-    sample::{PATCH, SHARES, Target, TrainingSample},
+    sample::{SHARES, Target, TrainingSample},
+    structure::structural_similarity,
     taps::Taps,
     tensor_file::{TensorFile, array, read},
+    variation::Variation,
     weights::header,
 };
 
@@ -42,8 +44,9 @@ pub struct TrainSettings {
     pub steps: u64,
     /// Adam's rate at the start.
     pub rate: f32,
-    /// Weight of differences between neighbouring pixels against the pixels themselves: the perceptual term.
-    pub edges: f32,
+    /// Weight of what SSIM misses of 1 against the mean squared difference: the perceptual term, which keeps contrast
+    /// where the mean squared difference alone would rather blur.
+    pub structure: f32,
     /// Share of steps without the graph, so that the same weights serve the ablation.
     pub without_space: f64,
     /// Decay of the weights, relative to the rate (Loshchilov and Hutter 2019).
@@ -54,7 +57,7 @@ pub struct TrainSettings {
 
 impl Default for TrainSettings {
     fn default() -> Self {
-        Self { seed: 1, steps: 10_000, rate: 2e-3, edges: 0.02, without_space: 0.1, decay: 0.05, vary: true }
+        Self { seed: 1, steps: 10_000, rate: 2e-3, structure: 0.02, without_space: 0.1, decay: 0.05, vary: true }
     }
 }
 
@@ -99,72 +102,11 @@ pub struct SampleErrors {
     pub color_mse: f64,
     /// The same of direct appearance.
     pub direct_color_mse: f64,
+    /// Mean structural similarity of the patches, of colour only.
+    pub ssim: f64,
+    /// The same of direct appearance.
+    pub direct_ssim: f64,
 }
-
-/// How a sample is shown to the networks.
-#[derive(Debug, Clone, Copy)]
-struct Variation {
-    channels: [usize; 3],
-    /// Factor on the sRGB values of each channel, at most 1.
-    gain: [f32; 3],
-    flip: bool,
-    space: bool,
-}
-
-impl Variation {
-    fn plain(space: bool) -> Self {
-        Self { channels: [0, 1, 2], gain: [1.0; 3], flip: false, space }
-    }
-
-    fn draw(settings: &TrainSettings, rng: &mut SmallRng) -> Self {
-        let mut out = Self::plain(!rng.random_bool(settings.without_space.clamp(0.0, 1.0)));
-        if settings.vary {
-            out.channels.shuffle(rng);
-            out.flip = rng.random_bool(0.5);
-            if rng.random_bool(0.7) {
-                let all: f32 = rng.random_range(0.55..1.0);
-                out.gain = std::array::from_fn(|_| all * rng.random_range(0.85..1.0));
-            }
-        }
-        out
-    }
-
-    /// Swaps and darkens every sRGB triple that starts at one of `at`.
-    fn row<const N: usize>(&self, row: &[f32; N], at: &[usize]) -> [f32; N] {
-        let mut out = *row;
-        for &first in at {
-            for c in 0..3 {
-                out[first + c] = row[first + self.channels[c]] * self.gain[c];
-            }
-        }
-        out
-    }
-
-    /// The same of a Gaussian's state, whose first triple is linear.
-    fn state(&self, row: &[f32; STATE]) -> [f32; STATE] {
-        let mut out = self.row(row, &CANDIDATE_PLACES);
-        for c in 0..3 {
-            let encoded = flyrig_renderer::srgb_from_linear(row[self.channels[c]]);
-            out[c] = flyrig_renderer::linear_from_srgb(encoded * self.gain[c]);
-        }
-        out
-    }
-
-    fn taps(&self, taps: &Taps, width: usize) -> Taps {
-        if self.flip { taps.flipped(width) } else { taps.clone() }
-    }
-}
-
-/// Where the candidates stand in a state.
-const CANDIDATE_PLACES: [usize; CANDIDATES] = {
-    let mut places = [0; CANDIDATES];
-    let mut i = 0;
-    while i < CANDIDATES {
-        places[i] = STATE - 3 * (CANDIDATES - i);
-        i += 1;
-    }
-    places
-};
 
 impl Trainer {
     /// Starts anew.
@@ -225,7 +167,7 @@ impl Trainer {
         let taps = [&target.taps, &sample.node_taps].map(|taps| variation.taps(taps, sample.crops.width));
         let (visible, nodes) = (leaf(&taps[0]), leaf(&taps[1]));
         let forward =
-            forward(&network, sample, target, [visible.clone(), nodes.clone()], variation, self.settings.edges);
+            forward(&network, sample, target, [visible.clone(), nodes.clone()], variation, self.settings.structure);
         if !forward.errors.mse.is_finite() {
             return None;
         }
@@ -336,13 +278,15 @@ pub fn evaluate(parameters: &Parameters, sample: &TrainingSample, space: bool) -
     let (mut sum, mut pixels) = (SampleErrors::default(), 0.0);
     for target in &sample.targets {
         let tables = [table(&target.taps), table(&sample.node_taps)];
-        let SampleErrors { mse, direct_mse, color_mse, direct_color_mse } =
+        let SampleErrors { mse, direct_mse, color_mse, direct_color_mse, ssim, direct_ssim } =
             forward(&network, sample, target, tables, variation, 0.0).errors;
         let count = target.truth.len() as f64;
         sum.mse += mse * count;
         sum.direct_mse += direct_mse * count;
         sum.color_mse += color_mse * count;
         sum.direct_color_mse += direct_color_mse * count;
+        sum.ssim += ssim * count;
+        sum.direct_ssim += direct_ssim * count;
         pixels += count;
     }
     Some(SampleErrors {
@@ -350,6 +294,8 @@ pub fn evaluate(parameters: &Parameters, sample: &TrainingSample, space: bool) -
         direct_mse: sum.direct_mse / pixels,
         color_mse: sum.color_mse / pixels,
         direct_color_mse: sum.direct_color_mse / pixels,
+        ssim: sum.ssim / pixels,
+        direct_ssim: sum.direct_ssim / pixels,
     })
 }
 
@@ -381,7 +327,7 @@ fn forward(
     target: &Target,
     [visible, node_feature]: [Tensor<2>; 2],
     variation: Variation,
-    edge_weight: f32,
+    structure_weight: f32,
 ) -> Forward {
     let count = target.state.len();
     let mut state: Vec<[f32; STATE]> = target.state.iter().map(|row| variation.state(row)).collect();
@@ -429,25 +375,25 @@ fn forward(
     let difference = |of: Tensor<2>| of * covered.clone() - truth.clone() * alpha.clone();
     let mean = |difference: Tensor<2>| difference.powf_scalar(2.0).mean();
     let number = |tensor: Tensor<1>| to_vec(tensor).first().copied().map_or(f64::NAN, f64::from);
-    let color_difference = difference(ours.clone());
-    let color_mse = mean(color_difference.clone());
+    let color_mse = mean(difference(ours.clone()));
     let errors = SampleErrors {
-        mse: number(mean(ours - truth.clone())),
+        mse: number(mean(ours.clone() - truth.clone())),
         direct_mse: number(mean(direct.clone() - truth.clone())),
         color_mse: number(color_mse.clone()),
-        direct_color_mse: number(mean(difference(direct))),
+        direct_color_mse: number(mean(difference(direct.clone()))),
+        ..SampleErrors::default()
     };
-    let mut loss = color_mse;
-    if edge_weight > 0.0 {
-        let patches = color_difference.reshape([pixels / (PATCH * PATCH), PATCH, PATCH, 3]);
-        let steps = |dim: usize| {
-            let ahead = patches.clone().narrow(dim, 1, PATCH - 1);
-            (ahead - patches.clone().narrow(dim, 0, PATCH - 1)).abs().mean()
-        };
-        loss = loss + (steps(1) + steps(2)) * edge_weight;
-    }
+    let [ours, direct] = [ours, direct].map(|of| of * covered.clone());
+    let truth = truth * alpha;
+    let similarity = structural_similarity(ours, truth.clone());
+    let errors = SampleErrors {
+        ssim: number(similarity.clone()),
+        direct_ssim: number(structural_similarity(direct, truth)),
+        ..errors
+    };
     let importance = USUAL_MSE / (errors.direct_color_mse + SMALL_MSE);
-    Forward { loss: loss * importance, errors }
+    let loss = color_mse * importance + (1.0 - similarity) * structure_weight;
+    Forward { loss, errors }
 }
 
 #[cfg(test)]

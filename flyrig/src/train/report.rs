@@ -26,6 +26,8 @@ pub struct Scores {
     pub direct_db: f64,
     /// As far as drawing and truth both cover a pixel, dB: gain of the networks over direct appearance in colour alone.
     pub color_gain_db: f64,
+    /// Mean structural similarity of the patches, colour alone: gain over direct appearance.
+    pub ssim_gain: f64,
     /// Share of the samples on which the networks are better.
     pub better: f64,
 }
@@ -40,6 +42,7 @@ impl Scores {
             psnr_db: mean(|e| e.mse),
             direct_db: mean(|e| e.direct_mse),
             color_gain_db: mean(|e| e.color_mse) - mean(|e| e.direct_color_mse),
+            ssim_gain: errors.iter().map(|e| e.ssim - e.direct_ssim).sum::<f64>() / count,
             better: errors.iter().filter(|e| e.mse < e.direct_mse).count() as f64 / count,
         }
     }
@@ -49,11 +52,12 @@ impl fmt::Display for Scores {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             f,
-            "people never seen: {:.2} dB, direct appearance {:.2} dB, better on {:.0} % of the samples, {:+.2} dB in colour",
+            "people never seen: {:.2} dB, direct appearance {:.2} dB, better on {:.0} % of the samples, {:+.2} dB and SSIM {:+.4} in colour",
             self.psnr_db,
             self.direct_db,
             self.better * 100.0,
-            self.color_gain_db
+            self.color_gain_db,
+            self.ssim_gain
         )
     }
 }
