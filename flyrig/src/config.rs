@@ -190,6 +190,8 @@ impl Solver {
             Self::Paper => Some(DeformOptions::full(DeformSettings {
                 solver: DeformSolver::Paper { rate: PAPER_RATE },
                 regularization: PAPER_REGULARIZATION,
+                // The paper iterates on every frame.
+                rest: 0.0,
                 ..default
             })),
             Self::GaussNewton => Some(DeformOptions {
@@ -446,11 +448,21 @@ fn nearest_key(message: &str) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::deformation::PAPER_COLOR_WEIGHT;
 
     #[test]
     fn the_printed_default_is_the_default() {
         assert_eq!(Config::parse(DEFAULT_TOML).unwrap(), Config::default());
         assert_eq!(Config::parse("").unwrap(), Config::default());
+    }
+
+    #[test]
+    fn the_papers_solver_is_measured_as_the_paper_tells() {
+        let options = Solver::Paper.options(Origin::Given).unwrap();
+        assert_eq!(options.color_weight, PAPER_COLOR_WEIGHT);
+        assert_eq!(options.solver.regularization, 200.0);
+        assert_eq!(options.solver.rest, 0.0, "every frame has its iterations");
+        assert_eq!((options.gaussians, options.max_level), (usize::MAX, 0));
     }
 
     #[test]
