@@ -9,7 +9,7 @@ use crate::config::Config;
 
 /// Runs the command. Prints everything it can find out; fails only when the configuration cannot be read.
 pub fn doctor(config: Option<&Path>) -> Result<()> {
-    let config = config.map(Config::load).transpose()?;
+    let config = config.map(Config::load_for_capture).transpose()?;
     let mut mends = Vec::new();
     print!("{}", cameras(config.as_ref(), &mut mends));
     println!("graphics adapters");
