@@ -257,9 +257,9 @@ pub struct BenchAppearanceArgs {
     /// Numbers of input cameras, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "3,1", value_parser = clap::value_parser!(u8).range(1..=6).map(usize::from))]
     pub views: Vec<usize>,
-    /// Weights file; only the direct modes are measured without one.
+    /// Weights files of the learned modes, in place of the networks that come with flyrig; may be given several times.
     #[arg(long)]
-    pub weights: Option<PathBuf>,
+    pub weights: Vec<PathBuf>,
     /// What the networks keep from frame to frame: see `reuse` in the configuration.
     #[arg(long, default_value_t = 0.0)]
     pub reuse: f32,
@@ -353,7 +353,7 @@ pub struct DemoArgs {
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
     pub appearance: AppearanceMode,
-    /// Weights file of the learned modes.
+    /// Weights file of the learned modes, in place of the networks that come with flyrig.
     #[arg(long)]
     pub weights: Option<PathBuf>,
     /// Also score the modes that `direct` adds to (takes three times as long).
@@ -430,7 +430,7 @@ pub struct EvalArgs {
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
     pub appearance: AppearanceMode,
-    /// Weights file of the learned modes.
+    /// Weights file of the learned modes, in place of the networks that come with flyrig.
     #[arg(long)]
     pub weights: Option<PathBuf>,
     /// What the networks keep from frame to frame: see `reuse` in the configuration.

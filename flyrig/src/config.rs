@@ -287,16 +287,12 @@ impl AppearanceMode {
         matches!(self, Self::Stfa | Self::StfaNoTime | Self::StfaNoSpaceTime)
     }
 
-    /// The networks that add to it, from this file. None for the direct modes.
+    /// The networks that add to it, from this file or those that come with the program. None for the direct modes.
     pub fn networks(self, weights: Option<&Path>) -> Result<Option<Parameters>> {
         if !self.is_learned() {
             return Ok(None);
         }
-        let weights = weights.context(
-            "a learned appearance needs a weights file, as `flyrig train` makes it; name it with --weights, or as \
-             `weights` in [appearance]",
-        )?;
-        Ok(Some(Parameters::load(weights)?))
+        Ok(Some(weights.map_or_else(Parameters::embedded, Parameters::load)?))
     }
 }
 
@@ -304,7 +300,7 @@ impl AppearanceMode {
 #[serde(deny_unknown_fields, default)]
 pub struct AppearanceSection {
     pub mode: AppearanceMode,
-    /// Weights file of the networks; needed by the learned modes.
+    /// Weights file of the learned modes; empty: the networks that come with the program.
     pub weights: PathBuf,
     /// Inputs of a Gaussian that changed by no more than this leave what the networks add to its colour as it was.
     pub reuse: f32,
@@ -447,10 +443,6 @@ impl Config {
         range("tracking.gaussians", self.tracking.gaussians as f64, 100.0, 2_000_000.0)?;
         range("tracking.views", self.tracking.views as f64, 0.0, 1000.0)?;
         range("tracking.rest", self.tracking.rest, 0.0, 0.5)?;
-        ensure!(
-            !self.appearance.mode.is_learned() || !self.appearance.weights.as_os_str().is_empty(),
-            "appearance.weights is empty, a learned appearance.mode needs the file that `flyrig train` made"
-        );
         range("appearance.reuse", f64::from(self.appearance.reuse), 0.0, 1.0)?;
         range("output.views", self.output.views as f64, 0.0, 16.0)?;
         range("output.width", f64::from(self.output.width), 16.0, 4096.0)?;

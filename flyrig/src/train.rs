@@ -46,7 +46,13 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     ensure!(!samples.is_empty(), "there is nothing to train on; ask for at least one person or data set");
 
     let checkpoint = args.out.join("checkpoint.safetensors");
-    let settings = TrainSettings { seed: args.seed, steps: args.steps, rate: args.rate, structure: args.structure, ..TrainSettings::default() };
+    let settings = TrainSettings {
+        seed: args.seed,
+        steps: args.steps,
+        rate: args.rate,
+        structure: args.structure,
+        ..TrainSettings::default()
+    };
     let mut trainer = if checkpoint.exists() {
         let trainer = Trainer::load(&checkpoint)?;
         ensure!(

@@ -34,7 +34,8 @@ mod tests {
     use super::*;
 
     fn measured(a: &[f32], b: &[f32]) -> f64 {
-        let rows = |of: &[f32]| Tensor::<2>::from_data(TensorData::new(of.to_vec(), [of.len() / 3, 3]), &Device::flex());
+        let rows =
+            |of: &[f32]| Tensor::<2>::from_data(TensorData::new(of.to_vec(), [of.len() / 3, 3]), &Device::flex());
         f64::from(crate::parameters::to_vec(structural_similarity(rows(a), rows(b)))[0])
     }
 
@@ -42,9 +43,10 @@ mod tests {
     fn reference(a: &[f32], b: &[f32]) -> f64 {
         let (mut sum, mut count) = (0.0, 0.0);
         for patch in 0..a.len() / (3 * PATCH * PATCH) {
-            for (y0, x0) in (0..=PATCH - WINDOW).step_by(STRIDE).flat_map(|y| {
-                (0..=PATCH - WINDOW).step_by(STRIDE).map(move |x| (y, x))
-            }) {
+            for (y0, x0) in (0..=PATCH - WINDOW)
+                .step_by(STRIDE)
+                .flat_map(|y| (0..=PATCH - WINDOW).step_by(STRIDE).map(move |x| (y, x)))
+            {
                 for c in 0..3 {
                     let places = (0..WINDOW * WINDOW).map(|i| {
                         let (y, x) = (y0 + i / WINDOW, x0 + i % WINDOW);

@@ -4,7 +4,7 @@ use flyrig_renderer::AppearanceSettings;
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
 use super::*;
-use crate::{body_graph::EDGES, crops::Crops, taps::Tap};
+use crate::{PATCH, body_graph::EDGES, crops::Crops, taps::Tap};
 
 const SIZE: NetworkSize = NetworkSize { channels: [3, 4, 5], node: 6, heads: 2, layers: 1, hidden: [8, 6] };
 
@@ -14,7 +14,7 @@ fn sample(seed: u64) -> TrainingSample {
     let (views, width, height, nodes, gaussians) = (2, 16, 12, 12, 60);
     let rgba = (0..views * width * height).flat_map(|_| [rng.random(), rng.random(), rng.random(), 255]).collect();
     let crops = Crops { views, width, height, origins: vec![[0, 0]; views], rgba };
-    let mut row = |taps: &mut Taps, rng: &mut SmallRng| {
+    let row = |taps: &mut Taps, rng: &mut SmallRng| {
         for view in 0..views as u32 {
             let pixel = [rng.random_range(0.0..15.0), rng.random_range(0.0..11.0)];
             taps.taps.push(Tap { view, pixel, weight: rng.random_range(0.0..0.5) });

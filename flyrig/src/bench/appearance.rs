@@ -1,6 +1,9 @@
 //! `flyrig bench appearance`: how well every way of colouring paints people that nobody trained on, and what it takes.
 
-use std::{fmt::Write as _, path::Path};
+use std::{
+    fmt::Write as _,
+    path::{Path, PathBuf},
+};
 
 use anyhow::{Context, Result};
 use clap::ValueEnum as _;
@@ -43,11 +46,14 @@ struct Row {
 /// Runs the command.
 pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let weights = args.weights.as_deref().map(Parameters::load).transpose()?;
-    let modes: Vec<AppearanceMode> = AppearanceMode::value_variants()
+    let networks = networks(&args.weights)?;
+    let modes: Vec<Mode<'_>> = AppearanceMode::value_variants()
         .iter()
-        .copied()
-        .filter(|mode| weights.is_some() || !mode.is_learned())
+        .flat_map(|&mode| {
+            let learned = networks.iter().map(move |(name, networks)| Mode { mode, networks: Some((name, networks)) });
+            let direct = (!mode.is_learned()).then_some(Mode { mode, networks: None });
+            direct.into_iter().chain(learned.filter(move |_| mode.is_learned()))
+        })
         .collect();
     let bar = progress_bar(args.people * (args.views.len() * modes.len()) as u64, "bench appearance");
     let mut rows = Vec::new();
@@ -56,8 +62,8 @@ pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
             SequenceConfig { motion: Motion::Turn, seed: person, side: args.side, frames: args.frames, fps: 30.0 };
         let sequence = Sequence::simulate(gpu, config)?;
         for &views in &args.views {
-            for &mode in &modes {
-                let row = run(gpu, args, &sequence, person, views, mode, weights.as_ref())?;
+            for mode in &modes {
+                let row = run(gpu, args, &sequence, person, views, mode)?;
                 bar.set_message(format!("{} views, {}: {:.2} dB", row.views, row.mode, row.psnr_db));
                 rows.push(row);
                 write(&args.out, &rows)?;
@@ -77,8 +83,7 @@ fn run(
     sequence: &Sequence,
     person: u64,
     views: usize,
-    mode: AppearanceMode,
-    weights: Option<&Parameters>,
+    mode: &Mode<'_>,
 ) -> Result<Row> {
     let rig = sequence.inputs(views);
     let mut engine = Engine::new(
@@ -87,11 +92,11 @@ fn run(
         args.gaussians,
         DEFAULT_NODE_COUNT.min(args.gaussians / 12),
         &rig,
-        mode.settings(),
+        mode.mode.settings(),
         Solver::GaussNewton.options(Origin::Given),
     )?;
-    if let Some(weights) = weights.filter(|_| mode.is_learned()) {
-        engine.use_networks(weights, args.reuse)?;
+    if let Some((_, networks)) = mode.networks {
+        engine.use_networks(networks, args.reuse)?;
     }
     let plates = rig.cameras.iter().map(|_| None).collect();
     let track = PoseSource::Track { track: sequence.track.clone(), repeat: true };
@@ -125,7 +130,7 @@ fn run(
     Ok(Row {
         person,
         views,
-        mode: name(mode),
+        mode: mode.name(),
         psnr_db: mean.psnr_db,
         ssim: mean.ssim,
         flip: mean.flip,
@@ -135,8 +140,34 @@ fn run(
     })
 }
 
-fn name(mode: AppearanceMode) -> String {
-    mode.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned())
+/// A way of colouring, and the networks of the learned ones with their name.
+#[derive(Clone, Copy)]
+struct Mode<'a> {
+    mode: AppearanceMode,
+    networks: Option<(&'a str, &'a Parameters)>,
+}
+
+impl Mode<'_> {
+    fn name(&self) -> String {
+        let mode = self.mode.to_possible_value();
+        let mode = mode.as_ref().map_or("", |value| value.get_name());
+        match self.networks {
+            Some((name, _)) if !name.is_empty() => format!("{mode} {name}"),
+            _ => mode.to_owned(),
+        }
+    }
+}
+
+/// The networks of these files, or those that come with the program; named where there are several.
+fn networks(files: &[PathBuf]) -> Result<Vec<(String, Parameters)>> {
+    if files.is_empty() {
+        return Ok(vec![(String::new(), Parameters::embedded()?)]);
+    }
+    let named = |path: &PathBuf| -> Result<(String, Parameters)> {
+        let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).filter(|_| files.len() > 1);
+        Ok((stem.unwrap_or_default(), Parameters::load(path)?))
+    };
+    files.iter().map(named).collect()
 }
 
 /// Means over people, in the order of the first row of each kind.
