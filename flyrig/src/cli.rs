@@ -196,8 +196,11 @@ pub struct TrainArgs {
     #[arg(long, default_value_t = 2e-3)]
     pub rate: f32,
     /// Weight of structural similarity beside the mean squared difference.
-    #[arg(long, default_value_t = 0.02)]
+    #[arg(long, default_value_t = 0.2)]
     pub structure: f32,
+    /// Weight of fine contrast beside it, which keeps prints from fading.
+    #[arg(long, default_value_t = 1.0)]
+    pub contrast: f32,
     /// How large the networks are.
     #[arg(long, value_enum, default_value = "small")]
     pub size: SizeName,

@@ -51,6 +51,7 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         steps: args.steps,
         rate: args.rate,
         structure: args.structure,
+        contrast: args.contrast,
         ..TrainSettings::default()
     };
     let mut trainer = if checkpoint.exists() {

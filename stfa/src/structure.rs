@@ -1,4 +1,4 @@
-//! Structural similarity (Wang et al. 2004) of patches, with box windows.
+//! Structural similarity (Wang et al. 2004) of patches, with box windows, and how much fine contrast they have.
 
 use burn_tensor::{Tensor, module, ops::AvgPoolOptions};
 
@@ -10,10 +10,28 @@ const STRIDE: usize = 4;
 /// What keeps flat, dark windows calm, for values from 0 to 1.
 const SMALL: [f32; 2] = [1e-4, 9e-4];
 
+/// Side of a window of fine contrast and distance of two windows, pixels.
+const FINE: usize = 4;
+const FINE_STRIDE: usize = 2;
+/// Added to a variance, so that its root has a slope everywhere.
+const SMALL_VARIANCE: f32 = 1e-4;
+
+/// Patches as planes, from rows (pixel, 3): patch by patch, row by row.
+fn planes(of: Tensor<2>) -> Tensor<4> {
+    let patches = of.dims()[0] / (PATCH * PATCH);
+    of.reshape([patches, PATCH, PATCH, 3]).permute([0, 3, 1, 2])
+}
+
+/// Standard deviation of every small window.
+pub(crate) fn fine_contrast(of: Tensor<2>) -> Tensor<4> {
+    let mean = |of: Tensor<4>| module::avg_pool2d(of, AvgPoolOptions::new([FINE; 2]).with_stride([FINE_STRIDE; 2]));
+    let of = planes(of);
+    let variance = mean(of.clone().powf_scalar(2.0)) - mean(of).powf_scalar(2.0);
+    (variance.clamp_min(0.0) + SMALL_VARIANCE).sqrt()
+}
+
 /// Mean SSIM over windows and channels of rows (pixel, 3): patch by patch, row by row.
 pub(crate) fn structural_similarity(ours: Tensor<2>, truth: Tensor<2>) -> Tensor<1> {
-    let patches = ours.dims()[0] / (PATCH * PATCH);
-    let planes = |of: Tensor<2>| -> Tensor<4> { of.reshape([patches, PATCH, PATCH, 3]).permute([0, 3, 1, 2]) };
     let mean = |of: Tensor<4>| module::avg_pool2d(of, AvgPoolOptions::new([WINDOW; 2]).with_stride([STRIDE; 2]));
     let (a, b) = (planes(ours), planes(truth));
     let (mean_a, mean_b) = (mean(a.clone()), mean(b.clone()));
@@ -65,6 +83,28 @@ mod tests {
             }
         }
         sum / count
+    }
+
+    #[test]
+    fn fine_contrast_is_the_deviation_of_every_small_window() {
+        let mut rng = SmallRng::seed_from_u64(9);
+        let size = 2 * PATCH * PATCH * 3;
+        let a: Vec<f32> = (0..size).map(|_| rng.random_range(0.0..1.0)).collect();
+        let rows = Tensor::<2>::from_data(TensorData::new(a.clone(), [size / 3, 3]), &Device::flex());
+        let found = fine_contrast(rows);
+        let side = (PATCH - FINE) / FINE_STRIDE + 1;
+        assert_eq!(found.dims(), [2, 3, side, side]);
+        let found = crate::parameters::to_vec(found);
+        for (i, found) in found.iter().enumerate() {
+            let (x, y, c, patch) = (i % side, i / side % side, i / (side * side) % 3, i / (3 * side * side));
+            let values: Vec<f64> = (0..FINE * FINE)
+                .map(|k| (patch * PATCH + y * FINE_STRIDE + k / FINE) * PATCH + x * FINE_STRIDE + k % FINE)
+                .map(|pixel| f64::from(a[pixel * 3 + c]))
+                .collect();
+            let mean = values.iter().sum::<f64>() / 16.0;
+            let expected = (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 16.0 + 1e-4).sqrt();
+            assert!((f64::from(*found) - expected).abs() < 1e-5, "window {i}: {found} against {expected}");
+        }
     }
 
     #[test]

@@ -100,7 +100,7 @@ fn both_tapes_together_give_the_true_gradient() {
 fn an_untrained_network_is_direct_appearance_and_training_beats_it() {
     let samples = [sample(1), sample(3)];
     let mut trainer = Trainer::new(SIZE, settings(200));
-    let SampleErrors { mse, direct_mse, color_mse, direct_color_mse, ssim, direct_ssim } =
+    let SampleErrors { mse, direct_mse, color_mse, direct_color_mse, ssim, direct_ssim, .. } =
         evaluate(&trainer.parameters, &samples[0], true).unwrap();
     assert!((mse - direct_mse).abs() < 1e-9, "{mse} against {direct_mse}");
     assert!((color_mse - direct_color_mse).abs() < 1e-9, "{color_mse} against {direct_color_mse}");

@@ -28,6 +28,8 @@ pub struct Scores {
     pub color_gain_db: f64,
     /// Mean structural similarity of the patches, colour alone: gain over direct appearance.
     pub ssim_gain: f64,
+    /// Fine contrast over the truth's, of the networks and of direct appearance.
+    pub contrast: [f64; 2],
     /// Share of the samples on which the networks are better.
     pub better: f64,
 }
@@ -43,6 +45,8 @@ impl Scores {
             direct_db: mean(|e| e.direct_mse),
             color_gain_db: mean(|e| e.color_mse) - mean(|e| e.direct_color_mse),
             ssim_gain: errors.iter().map(|e| e.ssim - e.direct_ssim).sum::<f64>() / count,
+            contrast: [|e: &SampleErrors| e.contrast, |e: &SampleErrors| e.direct_contrast]
+                .map(|of| errors.iter().map(of).sum::<f64>() / count),
             better: errors.iter().filter(|e| e.mse < e.direct_mse).count() as f64 / count,
         }
     }
@@ -52,12 +56,14 @@ impl fmt::Display for Scores {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             f,
-            "people never seen: {:.2} dB, direct appearance {:.2} dB, better on {:.0} % of the samples, {:+.2} dB and SSIM {:+.4} in colour",
+            "people never seen: {:.2} dB, direct appearance {:.2} dB, better on {:.0} % of the samples, {:+.2} dB and SSIM {:+.4} in colour, fine contrast {:.2} (direct {:.2})",
             self.psnr_db,
             self.direct_db,
             self.better * 100.0,
             self.color_gain_db,
-            self.ssim_gain
+            self.ssim_gain,
+            self.contrast[0],
+            self.contrast[1]
         )
     }
 }
