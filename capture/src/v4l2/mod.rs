@@ -9,7 +9,7 @@ mod identity;
 mod modes;
 mod queue;
 mod report;
-mod stamps;
+mod sequence;
 mod stream;
 #[cfg(test)]
 mod stream_tests;

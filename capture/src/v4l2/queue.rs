@@ -6,20 +6,10 @@ use std::{
 };
 
 use super::sys::MAX_PLANES;
+use crate::stamps::StampSource;
 
 /// Fewest buffers in the driver's hands with which a stream flows; a driver without a free buffer drops frames.
 const MIN_QUEUED: usize = 2;
-
-/// What the stamp of a buffer tells the time of.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum StampSource {
-    /// `CLOCK_MONOTONIC` when the exposure began (for USB cameras: when the first packet came).
-    StartOfExposure,
-    /// `CLOCK_MONOTONIC` when the last pixel had come.
-    EndOfFrame,
-    /// Another clock, or none.
-    Other,
-}
 
 /// A buffer that the driver has given.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -15,10 +15,13 @@ use super::{
     identity,
     modes::{self, Mode, Offer, SAME_RATE},
     queue::{BufferDevice, BufferQueue},
-    stamps::{Sequence, Stamps},
+    sequence::Sequence,
     sys::{ActiveFormat, SizeRange},
 };
-use crate::{BufferPool, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, SourceHealth};
+use crate::{
+    BufferPool, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, SourceHealth,
+    stamps::Stamps,
+};
 
 /// A camera that has sent frames is silent after so many periods without one, but not before [`SILENT_AFTER`].
 const SILENT_PERIODS: f64 = 5.0;

@@ -33,7 +33,8 @@ use v4l::{
     v4l2::{self, vidioc},
 };
 
-use super::queue::{BufferDevice, Delivered, StampSource};
+use super::queue::{BufferDevice, Delivered};
+use crate::stamps::StampSource;
 
 /// Most memory planes of a buffer (`VIDEO_MAX_PLANES`).
 pub(crate) const MAX_PLANES: usize = 8;
