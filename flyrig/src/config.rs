@@ -51,7 +51,8 @@ pub enum SourceKind {
     Sim,
     Folder,
     Video,
-    V4l2,
+    #[serde(alias = "v4l2")]
+    Cameras,
     Network,
     Mcap,
 }
@@ -59,7 +60,7 @@ pub enum SourceKind {
 impl SourceKind {
     /// Whether frames come when they are taken, with the time of this computer.
     pub fn is_live(self) -> bool {
-        matches!(self, Self::V4l2 | Self::Network)
+        matches!(self, Self::Cameras | Self::Network)
     }
 }
 
@@ -87,14 +88,14 @@ impl SourceSection {
                 "camera {name} is listed twice in source.cameras"
             );
             match entry {
-                CameraEntry::Named(_) if self.kind == SourceKind::V4l2 => {
+                CameraEntry::Named(_) if self.kind == SourceKind::Cameras => {
                     entry.device()?;
                 }
                 CameraEntry::Named(_) => {}
                 CameraEntry::Device(section) => {
                     ensure!(
-                        self.kind == SourceKind::V4l2,
-                        "camera {name} of source.cameras is a table, but source.kind is not \"v4l2\""
+                        self.kind == SourceKind::Cameras,
+                        "camera {name} of source.cameras is a table, but source.kind is not \"cameras\""
                     );
                     section.check()?;
                 }
@@ -105,8 +106,8 @@ impl SourceSection {
             "source.kind is \"network\" but source.cameras names no camera"
         );
         ensure!(
-            self.kind != SourceKind::V4l2 || !self.cameras.is_empty(),
-            "source.kind is \"v4l2\" but there is no table [[source.cameras]]"
+            self.kind != SourceKind::Cameras || !self.cameras.is_empty(),
+            "source.kind is \"cameras\" but there is no table [[source.cameras]]"
         );
         Ok(())
     }
@@ -362,7 +363,7 @@ impl Config {
             .with_context(|| format!("cannot read the configuration {}", path.display()))?;
         let in_file = || format!("in the configuration {}", path.display());
         let config = Self::parse_values(&text).with_context(in_file)?;
-        if config.source.kind != SourceKind::V4l2 {
+        if config.source.kind != SourceKind::Cameras {
             config.check_scene().with_context(in_file)?;
         }
         Ok(config)

@@ -59,11 +59,11 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
     if let Some(recorder) = &recorder {
         scene.sources = record::tap(recorder, scene.sources);
     }
-    let decode = matches!(config.source.kind, SourceKind::V4l2 | SourceKind::Network | SourceKind::Mcap);
+    let decode = matches!(config.source.kind, SourceKind::Cameras | SourceKind::Network | SourceKind::Mcap);
     dataset::require_masks(config.body.pose, config.body.masks, &scene.plates)?;
     let pacing = match (config.source.real_time, config.source.kind) {
         // Nobody can make a real camera wait.
-        (_, SourceKind::V4l2 | SourceKind::Network) => Pacing::AsDelivered,
+        (_, SourceKind::Cameras | SourceKind::Network) => Pacing::AsDelivered,
         (false, _) => Pacing::Lossless,
         // Simulated cameras keep the time themselves, whatever their stamps say.
         (true, SourceKind::Sim) => Pacing::AsDelivered,
@@ -270,7 +270,7 @@ pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Scene> {
     }
     let chosen: Vec<CameraId> = source.names().into_iter().map(CameraId::from).collect();
     let rig = match source.kind {
-        SourceKind::V4l2 | SourceKind::Network => live::load_rig(source)?,
+        SourceKind::Cameras | SourceKind::Network => live::load_rig(source)?,
         SourceKind::Mcap => record::recorded_rig(&source.path)?,
         SourceKind::Folder | SourceKind::Video | SourceKind::Sim => dataset::load_rig(&source.path, &chosen)?,
     };
@@ -285,7 +285,7 @@ pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Scene> {
                 &FolderOptions { fps: source.fps, with_masks, frames: None },
             )?)
         }
-        SourceKind::V4l2 => live::open(source)?,
+        SourceKind::Cameras => live::open(source)?,
         SourceKind::Network => network::open(config, &rig)?,
         SourceKind::Mcap => record::replay_sources(&source.path, &rig)?,
         SourceKind::Video | SourceKind::Sim => {
