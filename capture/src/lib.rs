@@ -38,7 +38,9 @@ pub use folder::{FolderOptions, FolderReplay, folder_picture_size};
 pub use nokhwa_camera::{NokhwaCamera, NokhwaDevice, NokhwaOptions, nokhwa_cameras};
 pub use pool::BufferPool;
 pub use queue::{LatestQueue, PopError};
-pub use recording::{McapReplay, Note, Recorded, Recorder, Recording, recorded_notes};
+pub use recording::{
+    Compression, McapReplay, MessageTap, Note, Recorded, Recorder, Recording, recorded_messages, recorded_notes,
+};
 pub use rgb::{to_rgb8, to_rgb8_into};
 pub use source::{CameraSource, NetworkHealth, SourceHealth};
 pub use stage::FrameStage;

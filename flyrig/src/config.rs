@@ -28,6 +28,7 @@ pub struct Config {
     pub appearance: AppearanceSection,
     pub output: OutputSection,
     pub capture: CaptureSection,
+    pub record: RecordSection,
     pub transport: TransportSection,
     pub health: HealthSection,
     pub gpu: GpuSection,
@@ -316,6 +317,19 @@ impl Default for CaptureSection {
     }
 }
 
+/// What recordings hold.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RecordSection {
+    pub jpeg_quality: u8,
+}
+
+impl Default for RecordSection {
+    fn default() -> Self {
+        Self { jpeg_quality: 95 }
+    }
+}
+
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TransportSection {
@@ -416,6 +430,7 @@ impl Config {
         range("output.height", f64::from(self.output.height), 16.0, 4096.0)?;
         range("output.jpeg_quality", f64::from(self.output.jpeg_quality), 1.0, 100.0)?;
         range("capture.jpeg_quality", f64::from(self.capture.jpeg_quality), 0.0, 100.0)?;
+        range("record.jpeg_quality", f64::from(self.record.jpeg_quality), 0.0, 100.0)?;
         range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)
     }
 

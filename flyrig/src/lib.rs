@@ -22,6 +22,7 @@ mod outlet;
 mod pipeline;
 mod png;
 mod pose_curve;
+mod pose_recording;
 mod record;
 mod report;
 mod run;

@@ -25,6 +25,7 @@ use crate::{
     notify::ServiceManager,
     outlet::Outlet,
     pipeline::{Outcome, Pipeline, PoseSource},
+    pose_recording::PoseRecording,
     record,
     stats::resident_mib,
     stop, viewpoints,
@@ -55,10 +56,6 @@ pub struct Scene {
 pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_table: bool) -> Result<()> {
     let stop = stop::flag();
     let mut scene = open(config, Some(gpu))?;
-    let recorder = recording.map(|path| record::recorder(path, &scene.rig)).transpose()?;
-    if let Some(recorder) = &recorder {
-        scene.sources = record::tap(recorder, scene.sources);
-    }
     let decode = matches!(config.source.kind, SourceKind::Cameras | SourceKind::Network | SourceKind::Mcap);
     dataset::require_masks(config.body.pose, config.body.masks, &scene.plates)?;
     let pacing = match (config.source.real_time, config.source.kind) {
@@ -69,6 +66,12 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
         (true, SourceKind::Sim) => Pacing::AsDelivered,
         (true, _) => Pacing::RealTime,
     };
+    let quality = config.record.jpeg_quality;
+    let recorder = recording.map(|path| record::recorder(path, &scene.rig, quality, pacing)).transpose()?;
+    if let Some(recorder) = &recorder {
+        scene.sources = record::tap(recorder, scene.sources)?;
+    }
+    let mut poses = recorder.as_ref().map(PoseRecording::new);
     let mut intake = Intake::start(scene.sources, decode, &sync_config(config), config.sync.clocks, pacing)?;
     if config.source.kind.is_live() {
         intake = intake.live();
@@ -141,8 +144,9 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
             }
         }
         let Some(set) = set else { continue };
-        if let Outcome::Held(reason) = pipeline.process(&set)? {
-            tracing::warn!(set = set.index, %reason, "frame set not used");
+        match pipeline.process(&set)? {
+            Outcome::Held(reason) => tracing::warn!(set = set.index, %reason, "frame set not used"),
+            Outcome::Updated => record_pose(poses.as_mut(), &pipeline, set.master_nanos),
         }
         frames += 1;
         views.publish(&mut pipeline, &outlet, &set, started.elapsed())?;
@@ -163,7 +167,7 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
         eprintln!("dropped: {count} {place}");
     }
     manager.tell("STOPPING=1");
-    drop(intake);
+    drop((intake, poses));
     if let (Some(recorder), Some(path)) = (recorder, recording) {
         match record::told(&recorder.finish(), path) {
             Ok(text) => eprintln!("run: recorded {text}"),
@@ -171,6 +175,12 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
         }
     }
     outlet.finish()
+}
+
+fn record_pose(poses: Option<&mut PoseRecording>, pipeline: &Pipeline, nanos: i64) {
+    if let (Some(poses), Some(pose)) = (poses, pipeline.drawn_pose()) {
+        poses.record(&pipeline.engine().template().skeleton, &pose, nanos);
+    }
 }
 
 /// The published views of a rig, and those that viewers ask for.
