@@ -113,6 +113,9 @@ fn dispatch(cli: &Cli) -> Result<()> {
             sim_export::sim_export(args, &config.sim, &gpu(adapter)?)
         }
         Command::Bench { what: BenchCommand::Capture(args) } => bench::soak::capture(args),
+        Command::Bench { what: BenchCommand::Record(args) } => {
+            bench::recording::record(args, &gpu(cli.adapter.as_deref())?)
+        }
         Command::Bench { what: BenchCommand::Track(args) } => bench::track(args, &gpu(cli.adapter.as_deref())?),
         Command::Config { action: ConfigAction::Print } => {
             print!("{DEFAULT_TOML}");
