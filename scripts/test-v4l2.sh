@@ -90,6 +90,7 @@ cat >"$root/init" <<INIT
 /bin/busybox --install -s /bin
 export PATH=/bin:/usr/bin
 mount -t proc proc /proc; mount -t sysfs sys /sys; mount -t devtmpfs dev /dev; mount -t tmpfs tmp /tmp
+mkdir -p /small; mount -t tmpfs -o size=8m small /small
 for module in \$(cat /mod/order); do
   options=
   # Plain video capture only; the last device has the multi-planar interface.
