@@ -94,7 +94,7 @@ fn describe(reports: &[flyrig_capture::CameraReport], mends: &mut Vec<String>) -
         if let Some(usb) = &node.usb {
             let _ = writeln!(text, "    USB bus {}, port {}, {} Mbit/s, {}", usb.bus, usb.port, usb.speed_mbit, usb.id);
         }
-        for format in &report.formats {
+        for format in report.formats.iter().filter(|format| format.choice.is_some()) {
             let modes: Vec<String> = format
                 .modes
                 .iter()
@@ -103,8 +103,12 @@ fn describe(reports: &[flyrig_capture::CameraReport], mends: &mut Vec<String>) -
                     format!("{width}x{height}{}", fastest.trim_end_matches('0').trim_end_matches('.'))
                 })
                 .collect();
-            let unread = if format.choice.is_none() { " (not read by flyrig)" } else { "" };
-            let _ = writeln!(text, "    {}{unread}: {}", format.code, modes.join(", "));
+            let _ = writeln!(text, "    {}: {}", format.code, modes.join(", "));
+        }
+        let unread = report.formats.iter().filter(|format| format.choice.is_none());
+        let unread: Vec<&str> = unread.map(|format| format.code.as_str()).collect();
+        if !unread.is_empty() {
+            let _ = writeln!(text, "    not read by flyrig: {}", unread.join(", "));
         }
         if let Some(problem) = &report.problem {
             mends.push(problem.to_string());
@@ -204,7 +208,7 @@ mod tests {
             "Webcam (/dev/video2): serial \"B\", path \"pci-usb-0:2:1.0-video-index0\", bus \"usb-0000:00:14.0-2\"",
             "USB bus 1, port 1-2, 480 Mbit/s, 046d:082d",
             "YUYV: 640x360 at 30, 1280x720 at 7.5",
-            "H264 (not read by flyrig)",
+            "not read by flyrig: H264\n",
         ] {
             assert!(text.contains(part), "{part}: {text}");
         }

@@ -14,7 +14,7 @@ use std::{
 
 use crossbeam::channel::{Receiver, RecvTimeoutError, Sender, TrySendError, bounded};
 use flyrig_types::Frame;
-use mcap::{WriteOptions, Writer, records::MessageHeader};
+use mcap::{McapError, WriteOptions, Writer, records::MessageHeader};
 
 use super::{
     compress::Compression,
@@ -115,7 +115,7 @@ impl Recorder {
             CaptureError::general(CaptureErrorKind::Io, format!("{} cannot be recorded to: {error}", path.display()))
         };
         let file = OpenOptions::new().write(true).create_new(true).open(path).map_err(|error| io(&error))?;
-        Self::start(BufWriter::with_capacity(1 << 20, file), notes, compression).map_err(|error| io(&error))
+        Self::start(BufWriter::with_capacity(1 << 20, file), notes, compression).map_err(|error| io(&cause(error)))
     }
 
     pub(super) fn start<W: Write + Seek + Send + 'static>(
@@ -139,11 +139,11 @@ impl Recorder {
         let of_thread = Arc::clone(&shared);
         let thread = Builder::new().name("recorder".to_owned()).spawn(move || {
             if let Err(error) = write(writer, &receiver, &of_thread) {
-                of_thread.stop(format!("{error}; free space on the disk and record into a new file"));
+                of_thread.stop(format!("{}; free space on the disk and record into a new file", cause(error)));
             }
         });
         let outlet = Outlet { sender: Some(sender), shared };
-        Ok(Self { outlet, compression, thread: thread.map_err(mcap::McapError::Io)? })
+        Ok(Self { outlet, compression, thread: thread.map_err(McapError::Io)? })
     }
 
     /// How it stands.
@@ -229,6 +229,14 @@ impl Outlet {
             }
             Err(error) => self.shared.stop(error.to_string()),
         }
+    }
+}
+
+/// The library's own text says nothing of what the system said.
+fn cause(error: McapError) -> String {
+    match error {
+        McapError::Io(error) => error.to_string(),
+        other => other.to_string(),
     }
 }
 
