@@ -44,7 +44,7 @@ pub struct Note {
 /// How a recording stands.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Recorded {
-    /// Frames written.
+    /// Frames in the file.
     pub frames: u64,
     /// Their bytes in the file.
     pub bytes: u64,
@@ -93,6 +93,14 @@ pub(super) struct Outlet {
 impl Shared {
     pub fn lock(&self) -> MutexGuard<'_, Recorded> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Frames that are in the file now.
+    fn add(&self, fresh: &Recorded) {
+        let mut state = self.lock();
+        state.frames += fresh.frames;
+        state.bytes += fresh.bytes;
+        state.bytes_sent += fresh.bytes_sent;
     }
 
     pub fn stop(&self, problem: String) {
@@ -242,6 +250,8 @@ fn cause(error: McapError) -> String {
 
 fn write<W: Write + Seek>(mut writer: Writer<W>, items: &Receiver<Item>, shared: &Shared) -> mcap::McapResult<()> {
     let (mut flushed, mut unflushed) = (Instant::now(), 0u64);
+    // Of frames that are in the chunk in memory: they count once it is in the file.
+    let mut fresh = Recorded::default();
     loop {
         match items.recv_timeout(CHUNK_TIME) {
             Ok(item) => {
@@ -254,14 +264,13 @@ fn write<W: Write + Seek>(mut writer: Writer<W>, items: &Receiver<Item>, shared:
                 writer.write_to_known_channel(&header, &item.payload)?;
                 shared.waiting_bytes.fetch_sub(item.payload.len(), Ordering::Relaxed);
                 unflushed += item.payload.len() as u64;
-                let mut state = shared.lock();
                 if let Some(bytes_sent) = item.bytes_sent {
-                    state.frames += 1;
-                    state.bytes += item.payload.len() as u64;
-                    state.bytes_sent += bytes_sent as u64;
+                    fresh.frames += 1;
+                    fresh.bytes += item.payload.len() as u64;
+                    fresh.bytes_sent += bytes_sent as u64;
                 }
                 // A frame that could not wait has ended it.
-                if state.problem.is_some() {
+                if shared.lock().problem.is_some() {
                     break;
                 }
             }
@@ -270,10 +279,12 @@ fn write<W: Write + Seek>(mut writer: Writer<W>, items: &Receiver<Item>, shared:
         }
         if unflushed >= CHUNK_BYTES || (unflushed > 0 && flushed.elapsed() >= CHUNK_TIME) {
             writer.flush()?;
+            shared.add(&std::mem::take(&mut fresh));
             (flushed, unflushed) = (Instant::now(), 0);
         }
     }
     writer.finish()?;
     writer.into_inner().flush()?;
+    shared.add(&fresh);
     Ok(())
 }
