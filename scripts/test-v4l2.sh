@@ -148,6 +148,7 @@ CYCLES=${CYCLES:-25} v4l2-faults
 result=\$?
 if [ -e /rig.toml ]; then
   ifconfig lo up
+  mkdir -p /dev/shm; mount -t tmpfs shm /dev/shm
   flyrig doctor /rig.toml
   timeout -s INT ${RUN_SECONDS:-240} flyrig run /rig.toml --record /tmp/take.mcap || result=1
   flyrig replay /tmp/take.mcap || result=1

@@ -37,7 +37,7 @@ const ASKING: Duration = Duration::from_secs(4);
 /// How a camera is told from the others.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum NokhwaDevice {
-    /// Its number in the system's list; on Linux that of `/dev/video`.
+    /// Its number in the system's list; on Linux that of `/dev/video`. It may be another after a replug: prefer the name.
     Index(u32),
     /// Its name; the first one of several with that name.
     Name(String),

@@ -105,10 +105,13 @@ fn run(args: &BenchRecordArgs, quality: u8, path: &Path, pictures: &Arc<Vec<Vec<
         anyhow::bail!("{}: {problem}", path.display());
     }
     let shares = cpu_share(&before, &after, seconds);
-    let of = |name: &str| shares.iter().filter(|(thread, _)| thread.starts_with(name)).map(|(_, share)| share).sum();
-    let compressing: f64 = of("jpeg ");
+    let of = |name: &str| {
+        let threads = shares.iter().filter(|(thread, _)| thread.starts_with(name));
+        // The sum of none is minus zero.
+        threads.fold(0.0, |sum, (_, share)| sum + share)
+    };
+    let compressing = of("jpeg ") / f64::from(args.cameras);
     let psnr_db = psnr_db(path, args.size, pictures)?;
-    let compressing = compressing / f64::from(args.cameras);
     Ok(Row { quality, recorded, seconds, compressing, writing: of("recorder"), psnr_db })
 }
 

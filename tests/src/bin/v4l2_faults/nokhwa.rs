@@ -17,10 +17,9 @@ use super::{
 const CYCLES: usize = 5;
 
 fn open(table: &mut Table) -> Option<NokhwaCamera> {
-    let node =
-        camera_reports().into_iter().find(|report| report.bus_info.as_deref() == Some(bus(0).as_str()))?.node.node;
-    let index = node.display().to_string().trim_start_matches("/dev/video").parse().ok()?;
-    let (device, format) = (NokhwaDevice::Index(index), FormatChoice::Auto);
+    // By its name: a node that is still open when its camera comes back has its number taken.
+    let report = camera_reports().into_iter().find(|report| report.bus_info.as_deref() == Some(bus(0).as_str()))?;
+    let (device, format) = (NokhwaDevice::Name(report.node.name), FormatChoice::Auto);
     let wanted = NokhwaOptions { device, width: 640, height: 360, fps: super::FPS, format, lag_secs: 0.0 };
     match NokhwaCamera::open(&"00".into(), &wanted) {
         Ok(camera) => Some(camera),
@@ -109,7 +108,7 @@ fn lost(table: &mut Table, camera: NokhwaCamera) {
     }
     table.row(
         "unplugged, replugged (nokhwa)",
-        &format!("{CYCLES} times"),
+        &format!("{CYCLES} times, by its name"),
         &format!("{failures} times not back"),
         "always back within 10 s",
         &format!("slowest {slowest:.0} ms"),
