@@ -2,8 +2,11 @@
 
 mod case;
 pub(crate) mod plot;
+mod processor;
+pub mod recording;
 mod sequence;
 pub mod soak;
+mod steady;
 mod summary;
 mod surface;
 mod write;

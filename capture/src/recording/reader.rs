@@ -60,6 +60,16 @@ pub fn recorded_notes(path: &Path) -> Result<Vec<(String, Vec<u8>)>, CaptureErro
     Ok(notes)
 }
 
+/// Time, nanoseconds, and content of every message of a topic, in the order of the file, until it breaks off.
+///
+/// # Errors
+/// `NotFound` without the file.
+pub fn recorded_messages(path: &Path, topic: &str) -> Result<impl Iterator<Item = (i64, Vec<u8>)>, CaptureError> {
+    let topic = topic.to_owned();
+    let messages = open(path)?.map_while(Result::ok).filter(move |message| message.channel.topic == topic);
+    Ok(messages.map(|message| (i64::try_from(message.log_time).unwrap_or(i64::MAX), message.data.into_owned())))
+}
+
 impl McapReplay {
     /// Opens a file for one camera; each camera reads the file by itself.
     ///
