@@ -97,6 +97,21 @@ fn a_replay_gives_the_very_frames() {
 }
 
 #[test]
+fn a_recorder_that_is_dropped_beside_a_running_camera_leaves_a_whole_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.mcap");
+    let recorder = Recorder::create(&path, &[note()], None).unwrap();
+    let mut tap = recorder.tap(Script("a".into(), 0, 8)).unwrap();
+    assert_eq!((0..5).filter(|_| tap.next_frame(Duration::ZERO).is_ok()).count(), 5);
+    drop(recorder);
+    assert_eq!(pass(&mut tap), 3, "the camera goes on");
+    assert_eq!(replayed(&path, "a").len(), 5);
+    let bytes = std::fs::read(&path).unwrap();
+    let summary = mcap::Summary::read(&bytes).unwrap().expect("an index");
+    assert_eq!(summary.stats.unwrap().message_count, 6, "five frames and the note");
+}
+
+#[test]
 fn the_file_has_an_index_that_other_readers_use() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("take.mcap");

@@ -6,7 +6,7 @@ use std::{
     path::Path,
     sync::{
         Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicUsize, Ordering},
+        atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     thread::{Builder, JoinHandle},
     time::{Duration, Instant},
@@ -67,10 +67,12 @@ struct Item {
     bytes_sent: Option<usize>,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Shared {
     waiting_bytes: AtomicUsize,
     state: Mutex<Recorded>,
+    /// The file ends with what waits now.
+    is_ending: AtomicBool,
 }
 
 /// Writes frames to a file in a thread of its own. It never drops a frame silently: when the disk is full, gone or too
@@ -79,7 +81,7 @@ pub(super) struct Shared {
 pub struct Recorder {
     outlet: Outlet,
     compression: Option<Compression>,
-    thread: JoinHandle<()>,
+    thread: Option<JoinHandle<()>>,
 }
 
 /// A way into the file.
@@ -143,7 +145,7 @@ impl Recorder {
         }
         writer.flush()?;
         let (sender, receiver) = bounded(WAITING_FRAMES);
-        let shared = Arc::new(Shared { waiting_bytes: AtomicUsize::new(0), state: Mutex::default() });
+        let shared = Arc::new(Shared::default());
         let of_thread = Arc::clone(&shared);
         let thread = Builder::new().name("recorder".to_owned()).spawn(move || {
             if let Err(error) = write(writer, &receiver, &of_thread) {
@@ -151,7 +153,7 @@ impl Recorder {
             }
         });
         let outlet = Outlet { sender: Some(sender), shared };
-        Ok(Self { outlet, compression, thread: thread.map_err(McapError::Io)? })
+        Ok(Self { outlet, compression, thread: Some(thread.map_err(McapError::Io)?) })
     }
 
     /// How it stands.
@@ -174,16 +176,29 @@ impl Recorder {
         MessageTap::new(self.outlet.clone(), topic, schema)
     }
 
-    /// Waits until everything is on the disk and closes the file with its index. Every [`Recording`] and [`MessageTap`] must
-    /// be gone.
+    /// Waits until everything is on the disk and closes the file with its index. What a [`Recording`] or [`MessageTap`] gives
+    /// after that is not recorded.
     #[must_use]
-    pub fn finish(self) -> Recorded {
-        let shared = Arc::clone(&self.outlet.shared);
-        drop(self.outlet);
-        if self.thread.join().is_err() {
-            shared.stop("it failed inside".to_owned());
+    pub fn finish(mut self) -> Recorded {
+        self.end();
+        self.state()
+    }
+
+    fn end(&mut self) {
+        self.outlet.sender = None;
+        self.outlet.shared.is_ending.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take()
+            && thread.join().is_err()
+        {
+            self.outlet.shared.stop("it failed inside".to_owned());
         }
-        shared.lock().clone()
+    }
+}
+
+impl Drop for Recorder {
+    /// A rig that ends with an error leaves a whole file too.
+    fn drop(&mut self) {
+        self.end();
     }
 }
 
@@ -227,7 +242,8 @@ impl Outlet {
         }
         let fresh = Channel::of(frame);
         let channel = match channel {
-            Some(before) if **before == fresh => Arc::clone(before),
+            // The exposure is that of the camera's first frame: automatic ones would make channels without end.
+            Some(before) if before.topic == fresh.topic && before.schema == fresh.schema => Arc::clone(before),
             _ => Arc::clone(channel.insert(Arc::new(fresh))),
         };
         match message::encode(frame) {
@@ -276,6 +292,9 @@ fn write<W: Write + Seek>(mut writer: Writer<W>, items: &Receiver<Item>, shared:
             }
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => break,
+        }
+        if shared.is_ending.load(Ordering::Relaxed) && items.is_empty() {
+            break;
         }
         if unflushed >= CHUNK_BYTES || (unflushed > 0 && flushed.elapsed() >= CHUNK_TIME) {
             writer.flush()?;

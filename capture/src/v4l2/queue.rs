@@ -70,7 +70,11 @@ impl<D: BufferDevice> BufferQueue<D> {
         self.stop();
         let started = self.try_start(count);
         if started.is_err() {
+            let is_freed = !self.queued.is_empty();
             self.stop();
+            if !is_freed {
+                let _ = self.device.allocate(0);
+            }
         }
         started
     }

@@ -189,4 +189,5 @@ fn a_failed_start_leaves_nothing_behind() {
     assert_eq!(queue.device.log, ["allocate 4", "allocate 0", "allocate 4", "start", "stop", "allocate 0"]);
     queue.device.allocates = Some(1);
     assert_eq!(queue.start(4).unwrap_err().kind(), io::ErrorKind::OutOfMemory);
+    assert_eq!(queue.device.log.last().map(String::as_str), Some("allocate 0"), "too few buffers are given back");
 }
