@@ -3,7 +3,8 @@
 # hardware virtualisation needed), loads the kernel's camera test driver (vivid) four times, plugs four USB cameras into its
 # virtual USB controller, and does to the rig what happens to rigs. Prints a table; fails when a bound is broken. Takes about four minutes on two cores.
 # Usage: scripts/test-v4l2.sh [PROGRAM]   (PROGRAM: the built v4l2-faults; built when left out)
-# Environment: CYCLES (unplugged and replugged so often, 25), WORK (folder for kernel and image)
+# Environment: CYCLES (unplugged and replugged so often, 25), WORK (folder for kernel and image), FLYRIG (a built flyrig: its
+# doctor and run are tried inside too, which needs 4 GB and some minutes more)
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -68,7 +69,9 @@ fi
 
 root=$work/root
 rm -rf "$root"
-mkdir -p "$root"/{bin,mod,proc,sys,dev,tmp,usr/bin}
+mkdir -p "$root"/{bin,lib,mod,proc,sys,dev,tmp,usr/bin}
+# Libraries are asked for under both names.
+ln -s ../lib "$root/usr/lib"
 cp /bin/busybox "$root/bin/"
 for driver in vivid vhci-hcd uvcvideo; do modprobe -d "$work" -S "$version" --show-depends "$driver"; done | awk '/^insmod/ && !seen[$2]++ { print $2 }' |
   while read -r module; do
@@ -76,7 +79,7 @@ for driver in vivid vhci-hcd uvcvideo; do modprobe -d "$work" -S "$version" --sh
     basename "$module"
   done >"$root/mod/order"
 copy_program() {
-  cp -L "$1" "$root/usr/bin/"
+  cp -L "$1" "$root/usr/bin/${2:-}"
   { ldd "$1" 2>/dev/null || true; } | { grep -oE '/[^ ]+\.so[^ ]*' || true; } | while read -r library; do
     mkdir -p "$root$(dirname "$library")"
     cp -Lu "$library" "$root$library"
@@ -84,12 +87,53 @@ copy_program() {
 }
 copy_program /usr/bin/v4l2-ctl
 copy_program "$program"
+memory=768
+if [ -n "${FLYRIG:-}" ]; then
+  say "simulating a calibration and a person for flyrig run"
+  memory=4096
+  # The adapter in software is found at run time.
+  for library in libvulkan.so.1 libvulkan_lvp.so; do
+    path=$(ldconfig -p | awk -v name="$library" '$1 == name && !found { print $NF; found = 1 }')
+    path=${path:-/usr/lib/x86_64-linux-gnu/$library}
+    copy_program "$path"
+    mkdir -p "$root$(dirname "$path")"
+    mv "$root/usr/bin/$library" "$root$path"
+  done
+  mkdir -p "$root/usr/share/vulkan/icd.d"
+  cp /usr/share/vulkan/icd.d/lvp_icd*.json "$root/usr/share/vulkan/icd.d/"
+  rm -rf "$work/rig"
+  printf '[sim]\nwidth = 320\nheight = 180\ntexture_px = 64\ncameras.count = 2\nmotion.kind = "still"\n' >"$work/sim.toml"
+  "$FLYRIG" sim export "$work/sim.toml" --out "$work/rig" --frames 2 --no-truth
+  cp -r "$work/rig" "$root/rig"
+  copy_program "$FLYRIG" flyrig
+  cat >"$root/rig.toml" <<RIG
+[source]
+kind = "cameras"
+path = "/rig"
+[[source.cameras]]
+name = "00"
+bus = "platform:vivid-000"
+size = [320, 180]
+fps = 10
+[[source.cameras]]
+name = "01"
+nokhwa = "1"
+size = [320, 180]
+fps = 10
+[body]
+template = "/rig/subject.glb"
+masks = "estimated"
+gaussians = 2000
+nodes = 50
+RIG
+fi
 
 cat >"$root/init" <<INIT
 #!/bin/busybox sh
 /bin/busybox --install -s /bin
 export PATH=/bin:/usr/bin
 mount -t proc proc /proc; mount -t sysfs sys /sys; mount -t devtmpfs dev /dev; mount -t tmpfs tmp /tmp
+mkdir -p /small; mount -t tmpfs -o size=8m small /small
 for module in \$(cat /mod/order); do
   options=
   # Plain video capture only; the last device has the multi-planar interface.
@@ -101,14 +145,22 @@ done
 # The stamps of ends of frames run a frame ahead in this driver.
 for node in /dev/video*; do chmod 660 \$node; v4l2-ctl -d \$node -c timestamp_source=1; done
 CYCLES=${CYCLES:-25} v4l2-faults
-echo "@@RC \$?"
+result=\$?
+if [ -e /rig.toml ]; then
+  ifconfig lo up
+  mkdir -p /dev/shm; mount -t tmpfs shm /dev/shm
+  flyrig doctor /rig.toml
+  timeout -s INT ${RUN_SECONDS:-240} flyrig run /rig.toml --record /tmp/take.mcap || result=1
+  flyrig replay /tmp/take.mcap || result=1
+fi
+echo "@@RC \$result"
 poweroff -f
 INIT
 chmod +x "$root/init"
 (cd "$root" && find . | cpio -o -H newc --quiet) >"$work/initrd.cpio"
 
 say "booting $version with four test cameras"
-timeout "${LIMIT:-900}" qemu-system-x86_64 -accel tcg,thread=multi -cpu max -smp 2 -m 768 -nic none -nographic -no-reboot \
+timeout "${LIMIT:-900}" qemu-system-x86_64 -accel tcg,thread=multi -cpu max -smp 2 -m $memory -nic none -nographic -no-reboot \
   -kernel "$work/vmlinux-$version" -initrd "$work/initrd.cpio" -append "console=ttyS0 quiet panic=-1" </dev/null 2>&1 |
   stdbuf -oL tr -d '\r' | tee "$work/log" | { grep -a --line-buffered -v -e '^$' -e '^@@' || true; }
 grep -aq '^@@RC 0' "$work/log" || { say "a bound was broken, or the machine did not finish; all it said is in $work/log"; exit 1; }

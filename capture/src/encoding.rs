@@ -27,7 +27,18 @@ impl JpegEncoding {
         Self { quality, rgb: Vec::new(), bgr: Mat::default(), jpeg: Vector::new(), scratch: JpegScratch::default() }
     }
 
-    fn encode(&mut self, height: u32) -> opencv::Result<Vec<u8>> {
+    /// A JPEG picture of a picture.
+    ///
+    /// # Errors
+    /// `Unsupported` and `Corrupt` for what cannot be made RGB first.
+    pub fn encode(&mut self, image: &Image) -> Result<Image, CaptureError> {
+        let corrupt = |text: String| CaptureError::general(CaptureErrorKind::Corrupt, text);
+        rgb::convert(image, &mut self.rgb, &mut self.scratch)?;
+        let jpeg = self.jpeg(image.height()).map_err(|error| corrupt(format!("cannot be compressed: {error}")))?;
+        Image::new(image.width(), image.height(), PixelFormat::Mjpeg, jpeg).map_err(|error| corrupt(error.to_string()))
+    }
+
+    fn jpeg(&mut self, height: u32) -> opencv::Result<Vec<u8>> {
         let flat = Mat::from_slice(&self.rgb)?;
         cvt_color_def(&flat.reshape(3, height as i32)?, &mut self.bgr, COLOR_RGB2BGR)?;
         let quality = Vector::from_slice(&[IMWRITE_JPEG_QUALITY, self.quality]);
@@ -41,11 +52,7 @@ impl FrameStage for JpegEncoding {
         if frame.image.format() == PixelFormat::Mjpeg {
             return Ok(frame);
         }
-        let corrupt = |text: String| CaptureError::general(CaptureErrorKind::Corrupt, text);
-        rgb::convert(&frame.image, &mut self.rgb, &mut self.scratch)?;
-        let (width, height) = (frame.image.width(), frame.image.height());
-        let jpeg = self.encode(height).map_err(|error| corrupt(format!("cannot be compressed: {error}")))?;
-        let image = Image::new(width, height, PixelFormat::Mjpeg, jpeg).map_err(|error| corrupt(error.to_string()))?;
+        let image = self.encode(&frame.image)?;
         Ok(Frame { image, ..frame })
     }
 }

@@ -6,12 +6,15 @@
 //! a thread of its own into one [`LatestQueue`], with a [`FrameStage`] (decoding, compressing) in a
 //! second thread between them where one is asked for.
 
+mod blocking;
 mod camera_options;
+mod clock;
 mod decoding;
 mod encoding;
 mod error;
 mod folder;
 mod mjpeg;
+mod nokhwa_camera;
 mod picture;
 mod pool;
 mod queue;
@@ -19,6 +22,7 @@ mod recording;
 mod rgb;
 mod source;
 mod stage;
+mod stamps;
 mod threads;
 mod turns;
 #[cfg(target_os = "linux")]
@@ -26,19 +30,21 @@ mod v4l2;
 mod video;
 
 pub use camera_options::{CameraControls, CameraIdentity, CameraOptions, FormatChoice};
+pub use clock::monotonic_nanos;
 pub use decoding::Decoding;
 pub use encoding::JpegEncoding;
 pub use error::{CaptureError, CaptureErrorKind};
 pub use folder::{FolderOptions, FolderReplay, folder_picture_size};
+pub use nokhwa_camera::{NokhwaCamera, NokhwaDevice, NokhwaOptions, nokhwa_cameras};
 pub use pool::BufferPool;
 pub use queue::{LatestQueue, PopError};
-pub use recording::{McapReplay, Note, Recorded, Recorder, Recording, recorded_notes};
+pub use recording::{
+    Compression, McapReplay, MessageTap, Note, Recorded, Recorder, Recording, recorded_messages, recorded_notes,
+};
 pub use rgb::{to_rgb8, to_rgb8_into};
 pub use source::{CameraSource, NetworkHealth, SourceHealth};
 pub use stage::FrameStage;
 pub use threads::{CameraStats, CaptureThreads, Pacing, ThreadsConfig};
 #[cfg(target_os = "linux")]
-pub use v4l2::{
-    BusPlan, CameraNode, CameraReport, FormatReport, UsbPlace, V4l2Camera, camera_reports, monotonic_nanos, plan_buses,
-};
+pub use v4l2::{BusPlan, CameraNode, CameraReport, FormatReport, UsbPlace, V4l2Camera, camera_reports, plan_buses};
 pub use video::{VideoOptions, VideoReplay};

@@ -35,9 +35,14 @@ pub(crate) fn read(path: &Path) -> Result<DynamicImage, CaptureError> {
     decode(&bytes).map_err(|error| CaptureError { message: format!("{} {}", path.display(), error.message), ..error })
 }
 
-/// Whether an end-of-image marker follows the first scan. Segments before it are stepped over,
-/// since a thumbnail in them has an end of its own.
+/// Whether an end-of-image marker follows the first scan.
 pub(crate) fn jpeg_has_end(bytes: &[u8]) -> bool {
+    jpeg_length(bytes).is_some()
+}
+
+/// Bytes up to and with the end-of-image marker after the first scan. Segments before it are stepped over, since a thumbnail
+/// in them has an end of its own.
+pub(crate) fn jpeg_length(bytes: &[u8]) -> Option<usize> {
     const SCAN: u8 = 0xda;
     let mut at = 2;
     while let Some(&[0xff, marker, high, low]) = bytes.get(at..at + 4) {
@@ -47,10 +52,10 @@ pub(crate) fn jpeg_has_end(bytes: &[u8]) -> bool {
         }
         at += 2 + usize::from(u16::from_be_bytes([high, low]));
         if marker == SCAN {
-            return bytes.get(at..).is_some_and(|rest| rest.windows(2).any(|pair| pair == [0xff, 0xd9]));
+            return bytes.get(at..)?.windows(2).position(|pair| pair == [0xff, 0xd9]).map(|end| at + end + 2);
         }
     }
-    false
+    None
 }
 
 #[cfg(test)]
@@ -78,6 +83,7 @@ mod tests {
         let mut padded = encoded(ImageFormat::Jpeg);
         padded.extend([0; 100]);
         assert!(decode(&padded).is_ok(), "cameras pad JPEG pictures");
+        assert_eq!(jpeg_length(&padded), Some(padded.len() - 100));
     }
 
     #[test]

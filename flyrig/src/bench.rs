@@ -3,8 +3,11 @@
 mod appearance;
 mod case;
 pub(crate) mod plot;
+mod processor;
+pub mod recording;
 mod sequence;
 pub mod soak;
+mod steady;
 mod summary;
 mod surface;
 mod write;

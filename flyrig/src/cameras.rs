@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-use anyhow::{Context as _, Result, ensure};
-use flyrig_capture::{CameraControls, CameraIdentity, CameraOptions, FormatChoice};
+use anyhow::{Result, ensure};
+use flyrig_capture::{CameraControls, CameraIdentity, CameraOptions, FormatChoice, NokhwaDevice, NokhwaOptions};
 use serde::{
     Deserialize, Deserializer, Serialize,
     de::{MapAccess, Visitor, value::MapAccessDeserializer},
@@ -17,6 +17,13 @@ pub enum CameraEntry {
     Device(Box<CameraSection>),
 }
 
+/// How a real camera is opened.
+#[derive(Debug, Clone, PartialEq)]
+pub enum DeviceOptions {
+    V4l2(CameraOptions),
+    Nokhwa(NokhwaOptions),
+}
+
 /// A real camera.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -28,6 +35,8 @@ pub struct CameraSection {
     pub path: String,
     #[serde(default)]
     pub bus: String,
+    #[serde(default)]
+    pub nokhwa: String,
     pub size: [u32; 2],
     #[serde(default = "default_fps")]
     pub fps: f64,
@@ -98,8 +107,8 @@ impl CameraEntry {
         match self {
             Self::Device(section) => Ok(section),
             Self::Named(name) => anyhow::bail!(
-                "source.kind is \"v4l2\", but camera {name} of source.cameras is only a name; write a table \
-                 [[source.cameras]] with name, size, and one of serial, path and bus (`flyrig doctor` lists them)"
+                "source.kind is \"cameras\", but camera {name} of source.cameras is only a name; write a table \
+                 [[source.cameras]] with name, size, and one of serial, path, bus and nokhwa (`flyrig doctor` lists them)"
             ),
         }
     }
@@ -117,7 +126,7 @@ impl CameraSection {
             Ok(())
         };
         ensure!(!self.name.is_empty(), "a table [[source.cameras]] has an empty name");
-        self.identity()?;
+        self.options()?;
         range("size[0]", f64::from(self.size[0]), 16.0, 16_384.0)?;
         range("size[1]", f64::from(self.size[1]), 16.0, 16_384.0)?;
         range("fps", self.fps, 0.1, 1000.0)?;
@@ -128,25 +137,30 @@ impl CameraSection {
         range("buffers", self.buffers.into(), 3.0, 32.0)
     }
 
-    fn identity(&self) -> Result<CameraIdentity> {
-        let given = [
-            (&self.serial, CameraIdentity::Serial as fn(String) -> CameraIdentity),
-            (&self.path, CameraIdentity::Path),
-            (&self.bus, CameraIdentity::Bus),
-        ];
-        let mut given = given.into_iter().filter(|(text, _)| !text.is_empty());
-        let (first, second) = (given.next(), given.next());
-        ensure!(second.is_none(), "camera {}: name it by one of serial, path and bus, not by several", self.name);
-        let (text, make) = first.with_context(|| {
-            format!("camera {}: serial, path and bus are all empty; set one (`flyrig doctor` lists them)", self.name)
-        })?;
-        Ok(make(text.clone()))
-    }
-
     /// What the camera is opened as.
-    pub fn options(&self) -> Result<CameraOptions> {
-        Ok(CameraOptions {
-            identity: self.identity()?,
+    ///
+    /// # Errors
+    /// When it is named in no way or in several, and when nokhwa cannot do what is asked for.
+    pub fn options(&self) -> Result<DeviceOptions> {
+        let name = &self.name;
+        let given = [&self.serial, &self.path, &self.bus, &self.nokhwa];
+        let count = given.iter().filter(|text| !text.is_empty()).count();
+        ensure!(count < 2, "camera {name}: name it by one of serial, path, bus and nokhwa, not by several");
+        let identity = if !self.serial.is_empty() {
+            CameraIdentity::Serial(self.serial.clone())
+        } else if !self.path.is_empty() {
+            CameraIdentity::Path(self.path.clone())
+        } else if !self.bus.is_empty() {
+            CameraIdentity::Bus(self.bus.clone())
+        } else {
+            ensure!(
+                count > 0,
+                "camera {name}: serial, path, bus and nokhwa are all empty; set one (`flyrig doctor` lists them)"
+            );
+            return Ok(DeviceOptions::Nokhwa(self.nokhwa_options()?));
+        };
+        Ok(DeviceOptions::V4l2(CameraOptions {
+            identity,
             width: self.size[0],
             height: self.size[1],
             fps: self.fps,
@@ -160,6 +174,39 @@ impl CameraSection {
             readout_secs: self.readout_ms / 1e3,
             lag_secs: self.lag_ms / 1e3,
             buffers: self.buffers,
+        }))
+    }
+
+    fn nokhwa_options(&self) -> Result<NokhwaOptions> {
+        let set = [
+            ("exposure_ms", self.exposure_ms.is_some()),
+            ("gain", self.gain.is_some()),
+            ("white_balance_kelvin", self.white_balance_kelvin.is_some()),
+            ("focus", self.focus.is_some()),
+            ("readout_ms", self.readout_ms > 0.0),
+            ("buffers", self.buffers != default_buffers()),
+        ];
+        if let Some((key, _)) = set.into_iter().find(|(_, is_set)| *is_set) {
+            anyhow::bail!(
+                "camera {}: {key} cannot be set through nokhwa; leave it out, or name the camera by serial, path or bus",
+                self.name
+            );
+        }
+        for (format, text) in [(FormatChoice::Uyvy, "uyvy"), (FormatChoice::Bayer8, "bayer8")] {
+            ensure!(
+                self.format != format,
+                "camera {}: format \"{text}\" cannot be had through nokhwa; set another, or name the camera by serial, \
+                 path or bus",
+                self.name
+            );
+        }
+        Ok(NokhwaOptions {
+            device: NokhwaDevice::from(self.nokhwa.as_str()),
+            width: self.size[0],
+            height: self.size[1],
+            fps: self.fps,
+            format: self.format,
+            lag_secs: self.lag_ms / 1e3,
         })
     }
 }
@@ -182,12 +229,19 @@ mod tests {
         let table = "[[source.cameras]]\nname = \"left\"\nserial = \"A1\"\nsize = [1280, 720]\nfps = 60\nformat = \"mjpeg\"\n\
                      exposure_ms = 8\ngain = 3\nlag_ms = 2.5\n";
         let config = parse(table).unwrap();
-        let options = config.source.cameras[0].device().unwrap().options().unwrap();
+        let DeviceOptions::V4l2(options) = config.source.cameras[0].device().unwrap().options().unwrap() else {
+            panic!()
+        };
         assert_eq!(options.identity, CameraIdentity::Serial("A1".into()));
         assert_eq!((options.width, options.height, options.fps), (1280, 720, 60.0));
         assert_eq!((options.format, options.buffers), (FormatChoice::Mjpeg, 6));
         assert_eq!((options.controls.exposure_secs, options.controls.gain), (Some(0.008), Some(3)));
         assert!((options.lag_secs - 0.0025).abs() < 1e-12);
+        let table = "[[source.cameras]]\nname = \"left\"\nnokhwa = \"FaceTime HD Camera\"\nsize = [1280, 720]\n";
+        let nokhwa = parse(table).unwrap().source.cameras[0].device().unwrap().options().unwrap();
+        let DeviceOptions::Nokhwa(nokhwa) = nokhwa else { panic!() };
+        assert_eq!(nokhwa.device, NokhwaDevice::Name("FaceTime HD Camera".into()));
+        assert_eq!((nokhwa.width, nokhwa.height, nokhwa.fps), (1280, 720, 30.0));
         // As written, so read.
         let again = Config::parse(&toml::to_string(&config).unwrap()).unwrap();
         assert_eq!(again, config);
@@ -199,8 +253,10 @@ mod tests {
             parse(&format!("[[source.cameras]]\nname = \"left\"\nsize = [640, 360]\n{keys}\n")).unwrap_err()
         };
         for (keys, expected) in [
-            ("", "camera left: serial, path and bus are all empty; set one"),
-            ("serial = \"a\"\nbus = \"b\"", "by one of serial, path and bus, not by several"),
+            ("", "camera left: serial, path, bus and nokhwa are all empty; set one"),
+            ("serial = \"a\"\nbus = \"b\"", "by one of serial, path, bus and nokhwa, not by several"),
+            ("nokhwa = \"0\"\ngain = 3", "camera left: gain cannot be set through nokhwa; leave it out"),
+            ("nokhwa = \"0\"\nformat = \"uyvy\"", "format \"uyvy\" cannot be had through nokhwa"),
             ("serial = \"a\"\nfps = 0", "camera left: fps is 0, it must lie between 0.1 and 1000"),
             ("serial = \"a\"\nexposure_ms = nan", "camera left: exposure_ms is NaN"),
             ("serial = \"a\"\nbuffers = 1", "camera left: buffers is 1, it must lie between 3 and 32"),
@@ -219,6 +275,6 @@ mod tests {
         assert!(parse(&twice).unwrap_err().contains("camera a is listed twice"));
         assert!(parse("").unwrap_err().contains("is only a name"), "the default names are those of the simulated rig");
         let error = Config::parse("[[source.cameras]]\nname = \"a\"\nsize = [64, 64]\nbus = \"x\"\n").unwrap_err();
-        assert!(error.to_string().contains("source.kind is not \"v4l2\""), "{error}");
+        assert!(error.to_string().contains("source.kind is not \"cameras\""), "{error}");
     }
 }

@@ -38,7 +38,8 @@ pub fn capture(config: &Config, gpu: Option<&GpuContext>) -> Result<()> {
     let stop = stop::flag();
     let kind = config.source.kind;
     ensure!(kind != SourceKind::Network, "source.kind is \"network\": these cameras are on the network already");
-    let sources = if kind == SourceKind::V4l2 { live::open(&config.source)? } else { run::open(config, gpu)?.sources };
+    let sources =
+        if kind == SourceKind::Cameras { live::open(&config.source)? } else { run::open(config, gpu)?.sources };
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
     let threads = start(config, sources)?;
     let clock = network::host_clock();
@@ -57,7 +58,7 @@ pub fn capture(config: &Config, gpu: Option<&GpuContext>) -> Result<()> {
     manager.tell("READY=1");
     let host = host_name();
     // Stamps of what was recorded or simulated are of another time; played now, it is taken now.
-    let mut shift = (kind == SourceKind::V4l2).then_some(0i64);
+    let mut shift = (kind == SourceKind::Cameras).then_some(0i64);
     let mut last_frame: Vec<Option<Instant>> = vec![None; cameras.len()];
     let (mut told, mut printed): (Option<Instant>, _) = (None, Instant::now());
     while !stop.load(Ordering::Relaxed) {
@@ -109,7 +110,7 @@ pub fn capture(config: &Config, gpu: Option<&GpuContext>) -> Result<()> {
 
 fn start(config: &Config, sources: Vec<Box<dyn CameraSource>>) -> Result<CaptureThreads> {
     let pacing = match config.source.kind {
-        SourceKind::V4l2 | SourceKind::Sim => Pacing::AsDelivered,
+        SourceKind::Cameras | SourceKind::Sim => Pacing::AsDelivered,
         _ => Pacing::RealTime,
     };
     let threads = ThreadsConfig { queue_capacity: 4 * sources.len().max(1), pacing };

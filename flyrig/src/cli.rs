@@ -241,6 +241,8 @@ pub enum BenchCommand {
     Appearance(BenchAppearanceArgs),
     /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to whole sets.
     Capture(BenchCaptureArgs),
+    /// Recording uncompressed cameras: bytes, processor time and loss of each JPEG quality against pictures as they come.
+    Record(BenchRecordArgs),
 }
 
 #[derive(Debug, Args)]
@@ -288,6 +290,28 @@ pub struct BenchCaptureArgs {
     /// Size of the pictures, WIDTHxHEIGHT.
     #[arg(long, value_parser = parse_size, default_value = "640x360")]
     pub size: [u32; 2],
+}
+
+#[derive(Debug, Args)]
+pub struct BenchRecordArgs {
+    /// Seconds for each quality.
+    #[arg(long, default_value_t = 5.0, value_parser = parse_seconds)]
+    pub seconds: f64,
+    /// Cameras, all YUYV.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=32))]
+    pub cameras: u32,
+    /// Frames a second.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// Size of the pictures, WIDTHxHEIGHT.
+    #[arg(long, value_parser = parse_size, default_value = "640x360")]
+    pub size: [u32; 2],
+    /// JPEG qualities, comma separated; 0 records pictures as they come.
+    #[arg(long, value_delimiter = ',', default_values_t = [0, 80, 90, 95, 98], value_parser = clap::value_parser!(u8).range(0..=100))]
+    pub qualities: Vec<u8>,
+    /// Folder for the recordings, which are removed again; the system's for temporary files otherwise.
+    #[arg(long)]
+    pub folder: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]

@@ -29,6 +29,7 @@ pub struct Config {
     pub appearance: AppearanceSection,
     pub output: OutputSection,
     pub capture: CaptureSection,
+    pub record: RecordSection,
     pub transport: TransportSection,
     pub health: HealthSection,
     pub gpu: GpuSection,
@@ -52,7 +53,8 @@ pub enum SourceKind {
     Sim,
     Folder,
     Video,
-    V4l2,
+    #[serde(alias = "v4l2")]
+    Cameras,
     Network,
     Mcap,
 }
@@ -60,7 +62,7 @@ pub enum SourceKind {
 impl SourceKind {
     /// Whether frames come when they are taken, with the time of this computer.
     pub fn is_live(self) -> bool {
-        matches!(self, Self::V4l2 | Self::Network)
+        matches!(self, Self::Cameras | Self::Network)
     }
 }
 
@@ -88,14 +90,14 @@ impl SourceSection {
                 "camera {name} is listed twice in source.cameras"
             );
             match entry {
-                CameraEntry::Named(_) if self.kind == SourceKind::V4l2 => {
+                CameraEntry::Named(_) if self.kind == SourceKind::Cameras => {
                     entry.device()?;
                 }
                 CameraEntry::Named(_) => {}
                 CameraEntry::Device(section) => {
                     ensure!(
-                        self.kind == SourceKind::V4l2,
-                        "camera {name} of source.cameras is a table, but source.kind is not \"v4l2\""
+                        self.kind == SourceKind::Cameras,
+                        "camera {name} of source.cameras is a table, but source.kind is not \"cameras\""
                     );
                     section.check()?;
                 }
@@ -106,8 +108,8 @@ impl SourceSection {
             "source.kind is \"network\" but source.cameras names no camera"
         );
         ensure!(
-            self.kind != SourceKind::V4l2 || !self.cameras.is_empty(),
-            "source.kind is \"v4l2\" but there is no table [[source.cameras]]"
+            self.kind != SourceKind::Cameras || !self.cameras.is_empty(),
+            "source.kind is \"cameras\" but there is no table [[source.cameras]]"
         );
         Ok(())
     }
@@ -348,6 +350,19 @@ impl Default for CaptureSection {
     }
 }
 
+/// What recordings hold.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RecordSection {
+    pub jpeg_quality: u8,
+}
+
+impl Default for RecordSection {
+    fn default() -> Self {
+        Self { jpeg_quality: 95 }
+    }
+}
+
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TransportSection {
@@ -395,7 +410,7 @@ impl Config {
             .with_context(|| format!("cannot read the configuration {}", path.display()))?;
         let in_file = || format!("in the configuration {}", path.display());
         let config = Self::parse_values(&text).with_context(in_file)?;
-        if config.source.kind != SourceKind::V4l2 {
+        if config.source.kind != SourceKind::Cameras {
             config.check_scene().with_context(in_file)?;
         }
         Ok(config)
@@ -449,6 +464,7 @@ impl Config {
         range("output.height", f64::from(self.output.height), 16.0, 4096.0)?;
         range("output.jpeg_quality", f64::from(self.output.jpeg_quality), 1.0, 100.0)?;
         range("capture.jpeg_quality", f64::from(self.capture.jpeg_quality), 0.0, 100.0)?;
+        range("record.jpeg_quality", f64::from(self.record.jpeg_quality), 0.0, 100.0)?;
         range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)?;
         network::transport(self).validate().context("in [rig] or [transport]")
     }

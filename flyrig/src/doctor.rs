@@ -3,9 +3,12 @@
 use std::{fmt::Write as _, path::Path};
 
 use anyhow::Result;
+use flyrig_capture::NokhwaDevice;
 use flyrig_gpu::adapter_names;
 
 use crate::config::Config;
+
+const NO_CAMERA: &str = "no camera: plug one in, or simulate a rig with source.kind = \"sim\"";
 
 /// Runs the command. Prints everything it can find out; fails only when the configuration cannot be read.
 pub fn doctor(config: Option<&Path>) -> Result<()> {
@@ -39,12 +42,43 @@ pub fn doctor(config: Option<&Path>) -> Result<()> {
 fn cameras(config: Option<&Config>, mends: &mut Vec<String>) -> String {
     let reports = flyrig_capture::camera_reports();
     let text = describe(&reports, mends);
+    missing_through_nokhwa(config, mends);
     format!("{text}{}", plan(&reports, config, mends))
 }
 
 #[cfg(not(target_os = "linux"))]
-fn cameras(_config: Option<&Config>, _mends: &mut Vec<String>) -> String {
-    "cameras\n  only those of Linux can be listed\n".to_owned()
+fn cameras(config: Option<&Config>, mends: &mut Vec<String>) -> String {
+    let mut text = "cameras\n".to_owned();
+    match flyrig_capture::nokhwa_cameras() {
+        Ok(cameras) => {
+            for (device, name) in &cameras {
+                let _ = writeln!(text, "  {name}: nokhwa = \"{name}\", or by its {device}");
+            }
+            if cameras.is_empty() {
+                text.push_str("  none\n");
+                mends.push(NO_CAMERA.to_owned());
+            }
+        }
+        Err(error) => mends.push(error.to_string()),
+    }
+    missing_through_nokhwa(config, mends);
+    text
+}
+
+/// Cameras of a configuration that are opened through nokhwa and are not there.
+fn missing_through_nokhwa(config: Option<&Config>, mends: &mut Vec<String>) {
+    let sections = config.iter().flat_map(|config| &config.source.cameras).filter_map(|entry| entry.device().ok());
+    let wanted: Vec<_> = sections.filter(|section| !section.nokhwa.is_empty()).collect();
+    if wanted.is_empty() {
+        return;
+    }
+    let there = flyrig_capture::nokhwa_cameras().unwrap_or_default();
+    for section in wanted {
+        let device = NokhwaDevice::from(section.nokhwa.as_str());
+        if !there.iter().any(|(number, name)| *number == device || NokhwaDevice::Name(name.clone()) == device) {
+            mends.push(format!("camera {} of the configuration ({device}) is not plugged in", section.name));
+        }
+    }
 }
 
 #[cfg(target_os = "linux")]
@@ -52,7 +86,7 @@ fn describe(reports: &[flyrig_capture::CameraReport], mends: &mut Vec<String>) -
     let mut text = "cameras\n".to_owned();
     if reports.is_empty() {
         text.push_str("  none\n");
-        mends.push("no camera: plug one in, or simulate a rig with source.kind = \"sim\"".to_owned());
+        mends.push(NO_CAMERA.to_owned());
     }
     for report in reports {
         let node = &report.node;
@@ -60,7 +94,7 @@ fn describe(reports: &[flyrig_capture::CameraReport], mends: &mut Vec<String>) -
         if let Some(usb) = &node.usb {
             let _ = writeln!(text, "    USB bus {}, port {}, {} Mbit/s, {}", usb.bus, usb.port, usb.speed_mbit, usb.id);
         }
-        for format in &report.formats {
+        for format in report.formats.iter().filter(|format| format.choice.is_some()) {
             let modes: Vec<String> = format
                 .modes
                 .iter()
@@ -69,8 +103,12 @@ fn describe(reports: &[flyrig_capture::CameraReport], mends: &mut Vec<String>) -
                     format!("{width}x{height}{}", fastest.trim_end_matches('0').trim_end_matches('.'))
                 })
                 .collect();
-            let unread = if format.choice.is_none() { " (not read by flyrig)" } else { "" };
-            let _ = writeln!(text, "    {}{unread}: {}", format.code, modes.join(", "));
+            let _ = writeln!(text, "    {}: {}", format.code, modes.join(", "));
+        }
+        let unread = report.formats.iter().filter(|format| format.choice.is_none());
+        let unread: Vec<&str> = unread.map(|format| format.code.as_str()).collect();
+        if !unread.is_empty() {
+            let _ = writeln!(text, "    not read by flyrig: {}", unread.join(", "));
         }
         if let Some(problem) = &report.problem {
             mends.push(problem.to_string());
@@ -90,7 +128,8 @@ fn describe(reports: &[flyrig_capture::CameraReport], mends: &mut Vec<String>) -
 fn plan(reports: &[flyrig_capture::CameraReport], config: Option<&Config>, mends: &mut Vec<String>) -> String {
     let Some(config) = config else { return String::new() };
     let mut demands = Vec::new();
-    for section in config.source.cameras.iter().filter_map(|entry| entry.device().ok()) {
+    let sections = config.source.cameras.iter().filter_map(|entry| entry.device().ok());
+    for section in sections.filter(|section| section.nokhwa.is_empty()) {
         let found = reports.iter().find(|report| {
             let node = &report.node;
             let link = section.path.rsplit('/').next().unwrap_or_default();
@@ -169,7 +208,7 @@ mod tests {
             "Webcam (/dev/video2): serial \"B\", path \"pci-usb-0:2:1.0-video-index0\", bus \"usb-0000:00:14.0-2\"",
             "USB bus 1, port 1-2, 480 Mbit/s, 046d:082d",
             "YUYV: 640x360 at 30, 1280x720 at 7.5",
-            "H264 (not read by flyrig)",
+            "not read by flyrig: H264\n",
         ] {
             assert!(text.contains(part), "{part}: {text}");
         }
@@ -188,12 +227,15 @@ mod tests {
             )
         };
         let tables: String = [("a", "A"), ("b", "B"), ("c", "C"), ("d", "D")].map(|(n, s)| camera(n, s)).concat();
-        let text = format!("[source]\nkind = \"v4l2\"\npath = \"x\"\n{tables}[body]\npose = \"estimated\"\n");
+        let tables = format!("{tables}[[source.cameras]]\nname = \"e\"\nnokhwa = \"No Such Cam\"\nsize = [640, 480]\n");
+        let text = format!("[source]\nkind = \"cameras\"\npath = \"x\"\n{tables}[body]\npose = \"estimated\"\n");
         let config = Config::parse(&text).unwrap();
         let mut mends = Vec::new();
         let text = plan(&[report(0, "A"), report(2, "B"), report(4, "C")], Some(&config), &mut mends);
         assert_eq!(text, "USB bus 1 (480 Mbit/s): 55.3 of 48 MB/s: a 18.4, b 18.4, c 18.4\n");
         assert_eq!(mends[0], "camera d of the configuration is not plugged in");
         assert!(mends[1].starts_with("USB bus 1 is asked for 55.3 MB/s and carries 48: set format"), "{mends:?}");
+        missing_through_nokhwa(Some(&config), &mut mends);
+        assert_eq!(mends[2], "camera e of the configuration (name \"No Such Cam\") is not plugged in");
     }
 }

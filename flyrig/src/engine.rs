@@ -251,10 +251,7 @@ impl Engine {
         }
 
         let start = Instant::now();
-        let corrected: Vec<Pose> = instants
-            .iter()
-            .map(|(pose, _)| self.deformation.as_ref().map_or_else(|| (*pose).clone(), |d| d.correction().apply(pose)))
-            .collect();
+        let corrected: Vec<Pose> = instants.iter().map(|(pose, _)| self.corrected(pose)).collect();
         let displacement = self.deformation.as_ref().map(Deformation::displacement);
         for (pose, (_, gaussians)) in corrected.iter().zip(&instants) {
             let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
@@ -400,6 +397,11 @@ impl Engine {
     /// The Gaussians of this instant.
     pub fn splats(&self) -> Result<Vec<Splat>> {
         Ok(read_splats(&self.gpu, &self.gaussians)?)
+    }
+
+    /// A pose with what the deformation's solver corrected last.
+    pub fn corrected(&self, pose: &Pose) -> Pose {
+        self.deformation.as_ref().map_or_else(|| pose.clone(), |deformation| deformation.correction().apply(pose))
     }
 
     /// The tracked surface: world positions and normals of the template's vertices.

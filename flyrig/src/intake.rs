@@ -7,7 +7,9 @@ use std::{
 
 use anyhow::Result;
 use flyrig_calib::{ClockAligner, ClockKind, ClockState, DropCounts, SyncConfig, Synchronizer};
-use flyrig_capture::{CameraSource, CaptureThreads, Decoding, FrameStage, Pacing, PopError, ThreadsConfig};
+use flyrig_capture::{
+    CameraSource, CaptureThreads, Decoding, FrameStage, Pacing, PopError, ThreadsConfig, monotonic_nanos,
+};
 use flyrig_types::{CameraId, Frame, FrameSet};
 
 use crate::health::{CameraHealth, Health};
@@ -143,7 +145,7 @@ impl Intake {
     fn time(&mut self, frame: &Frame) {
         self.timing.resize(self.cameras.len(), Timing::default());
         if let Some(slot) = self.cameras.iter().position(|camera| *camera == frame.camera) {
-            self.timing[slot].add(frame.capture_nanos, now_nanos());
+            self.timing[slot].add(frame.capture_nanos, monotonic_nanos());
         }
     }
 
@@ -207,18 +209,6 @@ impl Intake {
         }
         drops
     }
-}
-
-/// The clock of live frames.
-#[cfg(target_os = "linux")]
-fn now_nanos() -> i64 {
-    flyrig_capture::monotonic_nanos()
-}
-
-/// No live frames there.
-#[cfg(not(target_os = "linux"))]
-fn now_nanos() -> i64 {
-    0
 }
 
 #[cfg(test)]

@@ -23,6 +23,7 @@ mod outlet;
 mod pipeline;
 mod png;
 mod pose_curve;
+mod pose_recording;
 mod record;
 mod report;
 mod run;
@@ -118,6 +119,9 @@ fn dispatch(cli: &Cli) -> Result<()> {
             bench::appearance(args, &gpu(cli.adapter.as_deref())?)
         }
         Command::Bench { what: BenchCommand::Capture(args) } => bench::soak::capture(args),
+        Command::Bench { what: BenchCommand::Record(args) } => {
+            bench::recording::record(args, &gpu(cli.adapter.as_deref())?)
+        }
         Command::Bench { what: BenchCommand::Track(args) } => bench::track(args, &gpu(cli.adapter.as_deref())?),
         Command::Config { action: ConfigAction::Print } => {
             print!("{DEFAULT_TOML}");

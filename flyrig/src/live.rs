@@ -2,15 +2,15 @@
 
 use anyhow::Result;
 use flyrig_calib::load_easymocap;
-use flyrig_capture::CameraSource;
-use flyrig_types::Rig;
+use flyrig_capture::{CameraOptions, CameraSource, NokhwaCamera};
+use flyrig_types::{CameraId, Rig};
 
-use crate::config::SourceSection;
+use crate::{cameras::DeviceOptions, config::SourceSection};
 
 /// The calibration; where its files do not say how large the pictures are, the configuration does, and where both do,
 /// they must agree.
 pub fn load_rig(source: &SourceSection) -> Result<Rig> {
-    let size = |id: &flyrig_types::CameraId| {
+    let size = |id: &CameraId| {
         let entry = source.cameras.iter().find(|entry| entry.name() == id.as_str())?;
         entry.device().ok().map(|section| (section.size[0], section.size[1]))
     };
@@ -18,21 +18,27 @@ pub fn load_rig(source: &SourceSection) -> Result<Rig> {
 }
 
 /// Opens every camera of the configuration; the pictures come in the cameras' own formats.
-#[cfg(target_os = "linux")]
 pub fn open(source: &SourceSection) -> Result<Vec<Box<dyn CameraSource>>> {
-    use flyrig_capture::V4l2Camera;
-
     let mut sources: Vec<Box<dyn CameraSource>> = Vec::new();
     for entry in &source.cameras {
-        let camera = V4l2Camera::open(&entry.name().into(), &entry.device()?.options()?)?;
+        let id = entry.name().into();
+        let camera = match entry.device()?.options()? {
+            DeviceOptions::V4l2(options) => open_v4l2(&id, &options)?,
+            DeviceOptions::Nokhwa(options) => Box::new(NokhwaCamera::open(&id, &options)?),
+        };
         eprintln!("camera {}: {}", entry.name(), camera.health().mode);
-        sources.push(Box::new(camera));
+        sources.push(camera);
     }
     Ok(sources)
 }
 
+#[cfg(target_os = "linux")]
+fn open_v4l2(camera: &CameraId, options: &CameraOptions) -> Result<Box<dyn CameraSource>> {
+    Ok(Box::new(flyrig_capture::V4l2Camera::open(camera, options)?))
+}
+
 /// Only Linux has V4L2.
 #[cfg(not(target_os = "linux"))]
-pub fn open(_source: &SourceSection) -> Result<Vec<Box<dyn CameraSource>>> {
-    anyhow::bail!("source.kind \"v4l2\" needs Linux")
+fn open_v4l2(camera: &CameraId, options: &CameraOptions) -> Result<Box<dyn CameraSource>> {
+    anyhow::bail!("camera {camera}: {} needs Linux; name it by its name or number in the key nokhwa", options.identity)
 }

@@ -21,13 +21,7 @@ const HEALTH_EVERY: Duration = Duration::from_millis(250);
 
 /// This computer's clock.
 pub fn host_clock() -> HostClock {
-    #[cfg(target_os = "linux")]
-    return HostClock::new(flyrig_capture::monotonic_nanos);
-    #[cfg(not(target_os = "linux"))]
-    {
-        let start = Instant::now();
-        HostClock::new(move || i64::try_from(start.elapsed().as_nanos()).unwrap_or(i64::MAX))
-    }
+    HostClock::new(flyrig_capture::monotonic_nanos)
 }
 
 /// The session's settings, without what is not used.

@@ -194,6 +194,11 @@ impl Pipeline {
         self.last_pose.as_ref()
     }
 
+    /// Pose in which the last update drew the person: an estimated one with what the solver corrected.
+    pub fn drawn_pose(&self) -> Option<Pose> {
+        self.last_pose.as_ref().map(|pose| self.engine.corrected(pose))
+    }
+
     /// The engine, for exports.
     pub fn engine(&self) -> &Engine {
         &self.engine

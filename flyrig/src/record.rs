@@ -9,7 +9,7 @@ use std::{
 use anyhow::{Context as _, Result, bail, ensure};
 use flyrig_calib::{SyncConfig, Synchronizer, save_easymocap};
 use flyrig_capture::{
-    CameraSource, CaptureThreads, McapReplay, Note, Pacing, PopError, Recorded, Recorder, ThreadsConfig,
+    CameraSource, CaptureThreads, Compression, McapReplay, Note, Pacing, PopError, Recorded, Recorder, ThreadsConfig,
     recorded_notes, to_rgb8,
 };
 use flyrig_gpu::GpuContext;
@@ -23,7 +23,7 @@ use foxglove::{
 use crate::{
     cli::{RecordArgs, ReplayArgs},
     config::Config,
-    png,
+    png, pose_recording,
     report::write_whole,
     run::{self, Scene},
     stop,
@@ -35,22 +35,28 @@ const TRANSFORMS: &str = "transforms";
 /// How often a line with counts is printed.
 const PRINT_EVERY: Duration = Duration::from_secs(5);
 
-/// Opens a recording file and writes the rig into it.
-pub fn recorder(path: &Path, rig: &Rig) -> Result<Recorder> {
+/// Name, encoding and content of a message's schema.
+pub fn schema<M: Encode>() -> (String, String, Vec<u8>) {
+    M::get_schema().map(|schema| (schema.name, schema.encoding, schema.data.into_owned())).unwrap_or_default()
+}
+
+/// Opens a recording file and writes the rig into it. Sources that are read without loss are recorded without loss.
+pub fn recorder(path: &Path, rig: &Rig, jpeg_quality: u8, pacing: Pacing) -> Result<Recorder> {
     fn note<M: Encode>(topic: String, payload: Vec<u8>) -> Note {
-        let schema = M::get_schema().map(|schema| (schema.name, schema.encoding, schema.data.into_owned()));
-        Note { topic, schema: schema.unwrap_or_default(), payload }
+        Note { topic, schema: schema::<M>(), payload }
     }
+    let keep_all = pacing == Pacing::Lossless;
+    let compression = (jpeg_quality > 0).then_some(Compression { quality: jpeg_quality, keep_all });
     let mut notes = vec![note::<FrameTransforms>(TRANSFORMS.to_owned(), encode_transforms(rig)?)];
     for camera in &rig.cameras {
         notes.push(note::<CameraCalibration>(format!("{CALIBRATION}{}", camera.id), encode_calibration(camera)?));
     }
-    Ok(Recorder::create(path, &notes)?)
+    Ok(Recorder::create(path, &notes, compression)?)
 }
 
 /// The same sources, recorded as they are read.
-pub fn tap(recorder: &Recorder, sources: Vec<Box<dyn CameraSource>>) -> Vec<Box<dyn CameraSource>> {
-    sources.into_iter().map(|source| Box::new(recorder.tap(source)) as Box<dyn CameraSource>).collect()
+pub fn tap(recorder: &Recorder, sources: Vec<Box<dyn CameraSource>>) -> Result<Vec<Box<dyn CameraSource>>> {
+    sources.into_iter().map(|source| Ok(Box::new(recorder.tap(source)?) as Box<dyn CameraSource>)).collect()
 }
 
 /// The rig that a recording was made with.
@@ -82,7 +88,14 @@ pub fn replay_sources(path: &Path, rig: &Rig) -> Result<Vec<Box<dyn CameraSource
 
 /// What a finished recording says, as one line; an error when it broke off.
 pub fn told(recorded: &Recorded, path: &Path) -> Result<String> {
-    let text = format!("{} frames, {:.1} MB in {}", recorded.frames, recorded.bytes as f64 / 1e6, path.display());
+    let mut text = format!("{} frames, {:.1} MB in {}", recorded.frames, recorded.bytes as f64 / 1e6, path.display());
+    // Messages are a little longer than their pictures.
+    if recorded.bytes_sent > recorded.bytes {
+        text += &format!(", as JPEG; {:.1} MB as the cameras sent them", recorded.bytes_sent as f64 / 1e6);
+    }
+    if recorded.dropped > 0 {
+        text += &format!("; {} more were dropped because compressing them took too long", recorded.dropped);
+    }
     match &recorded.problem {
         Some(problem) => bail!("the recording broke off after {text}: {problem}"),
         None => Ok(text),
@@ -93,9 +106,9 @@ pub fn told(recorded: &Recorded, path: &Path) -> Result<String> {
 pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> Result<()> {
     let stop = stop::flag();
     let Scene { rig, sources, .. } = run::open(config, gpu)?;
-    let recorder = recorder(&args.out, &rig)?;
-    let tapped = tap(&recorder, sources);
     let pacing = if config.source.kind.is_live() { Pacing::AsDelivered } else { Pacing::Lossless };
+    let recorder = recorder(&args.out, &rig, config.record.jpeg_quality, pacing)?;
+    let tapped = tap(&recorder, sources)?;
     let threads = CaptureThreads::start(tapped, ThreadsConfig { pacing, ..ThreadsConfig::default() })?;
     eprintln!("record: {} cameras to {} (Ctrl-C ends)", rig.cameras.len(), args.out.display());
     let (started, mut printed) = (Instant::now(), Instant::now());
@@ -160,6 +173,9 @@ pub fn replay(args: &ReplayArgs) -> Result<()> {
     export(sync.flush())?;
     for (id, tally) in ids.iter().zip(&tallies) {
         println!("camera {id}: {}", tally.line());
+    }
+    if let Some(poses) = pose_recording::told(&args.recording)? {
+        println!("poses: {poses}");
     }
     let counts = sync.counts();
     println!("sets: {} complete, {} partial", counts.complete, counts.partial);

@@ -27,6 +27,7 @@ use crate::{
     notify::ServiceManager,
     outlet::Outlet,
     pipeline::{Outcome, Pipeline, PoseSource},
+    pose_recording::PoseRecording,
     record,
     stats::resident_mib,
     stop, viewpoints,
@@ -57,20 +58,22 @@ pub struct Scene {
 pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_table: bool) -> Result<()> {
     let stop = stop::flag();
     let mut scene = open(config, Some(gpu))?;
-    let recorder = recording.map(|path| record::recorder(path, &scene.rig)).transpose()?;
-    if let Some(recorder) = &recorder {
-        scene.sources = record::tap(recorder, scene.sources);
-    }
-    let decode = matches!(config.source.kind, SourceKind::V4l2 | SourceKind::Network | SourceKind::Mcap);
+    let decode = matches!(config.source.kind, SourceKind::Cameras | SourceKind::Network | SourceKind::Mcap);
     dataset::require_masks(config.body.pose, config.body.masks, &scene.plates)?;
     let pacing = match (config.source.real_time, config.source.kind) {
         // Nobody can make a real camera wait.
-        (_, SourceKind::V4l2 | SourceKind::Network) => Pacing::AsDelivered,
+        (_, SourceKind::Cameras | SourceKind::Network) => Pacing::AsDelivered,
         (false, _) => Pacing::Lossless,
         // Simulated cameras keep the time themselves, whatever their stamps say.
         (true, SourceKind::Sim) => Pacing::AsDelivered,
         (true, _) => Pacing::RealTime,
     };
+    let quality = config.record.jpeg_quality;
+    let recorder = recording.map(|path| record::recorder(path, &scene.rig, quality, pacing)).transpose()?;
+    if let Some(recorder) = &recorder {
+        scene.sources = record::tap(recorder, scene.sources)?;
+    }
+    let mut poses = recorder.as_ref().map(PoseRecording::new);
     let mut intake = Intake::start(scene.sources, decode, &sync_config(config), config.sync.clocks, pacing)?;
     if config.source.kind.is_live() {
         intake = intake.live();
@@ -142,12 +145,15 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
             }
         }
         let Some(set) = set else { continue };
-        if let Outcome::Held(reason) = pipeline.process(&set)? {
-            held += 1;
-            // The 1st, 2nd, 4th ...: a room that is empty all night must not fill the disk.
-            if held.is_power_of_two() {
-                tracing::warn!(set = set.index, held, %reason, "frame set not used");
+        match pipeline.process(&set)? {
+            Outcome::Held(reason) => {
+                held += 1;
+                // The 1st, 2nd, 4th ...: a room that is empty all night must not fill the disk.
+                if held.is_power_of_two() {
+                    tracing::warn!(set = set.index, held, %reason, "frame set not used");
+                }
             }
+            Outcome::Updated => record_pose(poses.as_mut(), &pipeline, set.master_nanos),
         }
         frames += 1;
         views.publish(&mut pipeline, &outlet, &set, started.elapsed())?;
@@ -168,7 +174,7 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
         eprintln!("dropped: {count} {place}");
     }
     manager.tell("STOPPING=1");
-    drop(intake);
+    drop((intake, poses));
     if let (Some(recorder), Some(path)) = (recorder, recording) {
         match record::told(&recorder.finish(), path) {
             Ok(text) => eprintln!("run: recorded {text}"),
@@ -176,6 +182,12 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
         }
     }
     outlet.finish()
+}
+
+fn record_pose(poses: Option<&mut PoseRecording>, pipeline: &Pipeline, nanos: i64) {
+    if let (Some(poses), Some(pose)) = (poses, pipeline.drawn_pose()) {
+        poses.record(&pipeline.engine().template().skeleton, &pose, nanos);
+    }
 }
 
 /// The published views of a rig, and those that viewers ask for.
@@ -281,7 +293,7 @@ pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Scene> {
     }
     let chosen: Vec<CameraId> = source.names().into_iter().map(CameraId::from).collect();
     let rig = match source.kind {
-        SourceKind::V4l2 | SourceKind::Network => live::load_rig(source)?,
+        SourceKind::Cameras | SourceKind::Network => live::load_rig(source)?,
         SourceKind::Mcap => record::recorded_rig(&source.path)?,
         SourceKind::Folder | SourceKind::Video | SourceKind::Sim => dataset::load_rig(&source.path, &chosen)?,
     };
@@ -296,7 +308,7 @@ pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Scene> {
                 &FolderOptions { fps: source.fps, with_masks, frames: None },
             )?)
         }
-        SourceKind::V4l2 => live::open(source)?,
+        SourceKind::Cameras => live::open(source)?,
         SourceKind::Network => network::open(config, &rig)?,
         SourceKind::Mcap => record::replay_sources(&source.path, &rig)?,
         SourceKind::Video | SourceKind::Sim => {

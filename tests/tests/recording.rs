@@ -6,7 +6,7 @@ use flyrig_tests::run;
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
 const RIG: &str = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = [\"00\", \"01\"]\n\
-    [sim]\nwidth = 64\nheight = 64\ntexture_px = 64\nframes = 6\ncameras.count = 2\n";
+    [record]\njpeg_quality = 0\n[sim]\nwidth = 64\nheight = 64\ntexture_px = 64\nframes = 6\ncameras.count = 2\n";
 
 #[test]
 fn a_recording_is_replayed_to_the_bit_and_exported() {
@@ -40,6 +40,27 @@ fn a_recording_is_replayed_to_the_bit_and_exported() {
     let nothing = command(&["replay", "rig.toml"]);
     assert_eq!(nothing.code, Some(1));
     assert!(nothing.stderr.contains("rig.toml is no recording"), "{}", nothing.stderr);
+}
+
+#[test]
+fn pictures_are_recorded_as_jpeg_unless_told_otherwise_and_poses_beside_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let rig = RIG.replace("jpeg_quality = 0", "jpeg_quality = 95");
+    std::fs::write(
+        folder.path().join("rig.toml"),
+        format!("{rig}[body]\ngaussians = 2000\nnodes = 50\n[transport]\nlisten = [\"tcp/127.0.0.1:0\"]\n"),
+    )
+    .unwrap();
+    let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    let recorded = command(&["run", "rig.toml", "--record", "take.mcap"]);
+    assert_eq!(recorded.code, Some(0), "{recorded:?}");
+    assert!(recorded.stderr.contains("run: recorded 12 frames"), "{}", recorded.stderr);
+    assert!(recorded.stderr.contains("MB as the cameras sent them"), "{}", recorded.stderr);
+    let replayed = command(&["replay", "take.mcap", "--export", "take"]);
+    assert_eq!(replayed.code, Some(0), "{replayed:?}");
+    assert!(replayed.stdout.contains("camera 01: 6 frames of Mjpeg 64x64"), "{}", replayed.stdout);
+    assert!(replayed.stdout.contains("poses: 6 of 31 joints in 0.17 s"), "{}", replayed.stdout);
+    assert!(folder.path().join("take/images/01/000005.jpg").exists());
 }
 
 #[test]

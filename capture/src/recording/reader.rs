@@ -15,6 +15,9 @@ use crate::{CameraSource, CaptureError, CaptureErrorKind};
 
 /// Bytes read at once.
 const BUFFER: usize = 1 << 20;
+/// Most messages and bytes before the first frame: other people's recordings may have no frame at all.
+const MOST_NOTES: usize = 4096;
+const MOST_NOTE_BYTES: usize = 64 << 20;
 
 /// One camera of a recording. Frames come as they were recorded, in the order of the file; one that breaks off, as after
 /// a crash, ends there with a warning.
@@ -44,11 +47,17 @@ fn open(path: &Path) -> Result<MessageReader<BufReader<File>>, CaptureError> {
 /// # Errors
 /// `NotFound` without the file, `Corrupt` when it is no MCAP file.
 pub fn recorded_notes(path: &Path) -> Result<Vec<(String, Vec<u8>)>, CaptureError> {
-    let mut notes = Vec::new();
+    let (mut notes, mut bytes) = (Vec::new(), 0usize);
     for message in open(path)? {
+        if notes.len() >= MOST_NOTES || bytes >= MOST_NOTE_BYTES {
+            break;
+        }
         match message {
             Ok(message) if message.channel.topic.starts_with(TOPIC) => break,
-            Ok(message) => notes.push((message.channel.topic.clone(), message.data.into_owned())),
+            Ok(message) => {
+                bytes = bytes.saturating_add(message.data.len());
+                notes.push((message.channel.topic.clone(), message.data.into_owned()));
+            }
             Err(error) if notes.is_empty() => {
                 let text = format!("{} is no recording: {error}", path.display());
                 return Err(CaptureError::general(CaptureErrorKind::Corrupt, text));
@@ -58,6 +67,16 @@ pub fn recorded_notes(path: &Path) -> Result<Vec<(String, Vec<u8>)>, CaptureErro
         }
     }
     Ok(notes)
+}
+
+/// Time, nanoseconds, and content of every message of a topic, in the order of the file, until it breaks off.
+///
+/// # Errors
+/// `NotFound` without the file.
+pub fn recorded_messages(path: &Path, topic: &str) -> Result<impl Iterator<Item = (i64, Vec<u8>)>, CaptureError> {
+    let topic = topic.to_owned();
+    let messages = open(path)?.map_while(Result::ok).filter(move |message| message.channel.topic == topic);
+    Ok(messages.map(|message| (i64::try_from(message.log_time).unwrap_or(i64::MAX), message.data.into_owned())))
 }
 
 impl McapReplay {

@@ -3,13 +3,14 @@
 //! The crate's own streams wait for ever on a silent camera, cannot be used after a timeout, know single-planar formats
 //! only and panic when dropped after an unplug; see [`queue`] for ours.
 
+mod causes;
 mod controls;
 mod format;
 mod identity;
 mod modes;
 mod queue;
 mod report;
-mod stamps;
+mod sequence;
 mod stream;
 #[cfg(test)]
 mod stream_tests;
@@ -77,7 +78,7 @@ impl Host for System {
     fn open(&mut self, identity: &CameraIdentity) -> Result<(Device, PathBuf, Option<u32>), CaptureError> {
         let found = identity::find(identity, &identity::scan(&Roots::default()), &identity::probe)?;
         let device =
-            Device::open(&found.node).map_err(|error| stream::explain(&error, "cannot be opened", &found.node))?;
+            Device::open(&found.node).map_err(|error| causes::explain(&error, "cannot be opened", &found.node))?;
         Ok((device, found.node, found.usb.map(|usb| usb.speed_mbit)))
     }
 

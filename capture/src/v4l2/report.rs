@@ -49,7 +49,7 @@ pub fn camera_reports() -> Vec<CameraReport> {
 fn report(node: CameraNode) -> Option<CameraReport> {
     let path = node.node.clone();
     let mut report = CameraReport { node, bus_info: None, driver: None, formats: Vec::new(), problem: None };
-    let failed = |error: std::io::Error| super::stream::explain(&error, "cannot be asked", &path);
+    let failed = |error: std::io::Error| super::causes::explain(&error, "cannot be asked", &path);
     let device = match Device::open(&path) {
         Ok(device) => device,
         Err(error) => {

@@ -1,7 +1,7 @@
 //! One camera's stream: connecting, watching over it, and connecting again.
 
 use std::{
-    fs, io,
+    io,
     path::{Path, PathBuf},
     sync::Arc,
     time::Duration,
@@ -10,15 +10,18 @@ use std::{
 use flyrig_types::{CameraId, Frame, Image};
 
 use super::{
+    causes::{explain, lost},
     controls::{self, ControlDevice, ControlError},
     format::{fourcc_text, pack},
-    identity,
     modes::{self, Mode, Offer, SAME_RATE},
     queue::{BufferDevice, BufferQueue},
-    stamps::{Sequence, Stamps},
+    sequence::Sequence,
     sys::{ActiveFormat, SizeRange},
 };
-use crate::{BufferPool, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, SourceHealth};
+use crate::{
+    BufferPool, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, SourceHealth,
+    stamps::Stamps,
+};
 
 /// A camera that has sent frames is silent after so many periods without one, but not before [`SILENT_AFTER`].
 const SILENT_PERIODS: f64 = 5.0;
@@ -323,51 +326,4 @@ pub(crate) fn offers(device: &impl CameraDevice, width: u32, height: u32) -> io:
         }
     }
     Ok(offers)
-}
-
-/// A stream that broke.
-fn lost(error: &io::Error) -> CaptureError {
-    let text = match error.raw_os_error() {
-        Some(libc::ENODEV | libc::ENXIO) => {
-            "was unplugged or its driver let go of it; waiting for it to come back".to_owned()
-        }
-        Some(libc::EIO) => "its driver reports a failed transfer; starting it again".to_owned(),
-        _ => format!("its stream broke ({error}); starting it again"),
-    };
-    CaptureError::general(CaptureErrorKind::Disconnected, text)
-}
-
-/// Why a camera cannot be set up, with the mend.
-pub(crate) fn explain(error: &io::Error, what: &str, node: &Path) -> CaptureError {
-    let place = node.display();
-    match error.raw_os_error() {
-        Some(libc::EACCES | libc::EPERM) => identity::denied(node),
-        Some(libc::EBUSY) => {
-            let holders = holders(node);
-            let who = if holders.is_empty() { "another program".to_owned() } else { holders.join(", ") };
-            let text = format!("{what}: {place} is in use by {who}; end that first");
-            CaptureError::general(CaptureErrorKind::Io, text)
-        }
-        Some(libc::ENODEV | libc::ENXIO | libc::ENOENT) => CaptureError::general(
-            CaptureErrorKind::Disconnected,
-            format!("{what}: {place} is gone; plug the camera in again"),
-        ),
-        _ => CaptureError::general(CaptureErrorKind::Io, format!("{what}: {place}: {error}")),
-    }
-}
-
-/// Other processes that have a node open, as far as this user may see them.
-fn holders(node: &Path) -> Vec<String> {
-    let own = std::process::id();
-    let numbers = fs::read_dir("/proc").into_iter().flatten().flatten();
-    let pids = numbers.filter_map(|entry| entry.file_name().to_str()?.parse::<u32>().ok()).filter(|pid| *pid != own);
-    pids.filter(|pid| {
-        let mut links = fs::read_dir(format!("/proc/{pid}/fd")).into_iter().flatten().flatten();
-        links.any(|link| fs::read_link(link.path()).is_ok_and(|target| target == node))
-    })
-    .map(|pid| {
-        let name = fs::read_to_string(format!("/proc/{pid}/comm")).unwrap_or_default();
-        format!("{} (process {pid})", name.trim())
-    })
-    .collect()
 }

@@ -131,7 +131,7 @@ impl Host for Bench {
                 Ok((device, node, Some(480)))
             }
             Some(Err(errno)) => {
-                Err(super::stream::explain(&io::Error::from_raw_os_error(errno), "cannot be opened", &node))
+                Err(super::causes::explain(&io::Error::from_raw_os_error(errno), "cannot be opened", &node))
             }
             None => {
                 Err(CaptureError::general(CaptureErrorKind::NotFound, format!("there is no camera with {identity}")))

@@ -6,19 +6,19 @@
 use std::{
     collections::BTreeMap,
     fmt::Write as _,
-    fs,
     sync::Arc,
     time::{Duration, Instant},
 };
 
 use anyhow::{Result, ensure};
 use flyrig_calib::{ClockKind, SyncConfig};
-use flyrig_capture::{
-    BufferPool, CameraSource, CaptureError, CaptureErrorKind, FrameStage as _, JpegEncoding, Pacing, SourceHealth,
-};
-use flyrig_transport::HostClock;
-use flyrig_types::{CameraId, Frame, Image, PixelFormat};
+use flyrig_capture::{CameraSource, CaptureErrorKind, FrameStage as _, JpegEncoding, Pacing};
+use flyrig_types::{Frame, Image, PixelFormat};
 
+use super::{
+    processor::{cpu_share, cpu_ticks},
+    steady::Steady,
+};
 use crate::{cli::BenchCaptureArgs, intake::Intake, network, stats::resident_mib, stop};
 
 /// Share of the run after which memory counts: buffers and pools have grown by then.
@@ -26,55 +26,6 @@ const WARM_UP: f64 = 0.1;
 /// Memory and the processor are looked at so often in a run.
 const LOOKS: u32 = 180;
 const CELLS: u32 = 40;
-
-/// A camera that gives one picture at a fixed rate, as a driver does: late readers lose frames, by number.
-struct Steady {
-    camera: CameraId,
-    clock: HostClock,
-    format: PixelFormat,
-    size: [u32; 2],
-    picture: Vec<u8>,
-    pool: Arc<BufferPool>,
-    period_nanos: i64,
-    start_nanos: i64,
-    next: i64,
-    health: SourceHealth,
-}
-
-impl CameraSource for Steady {
-    fn camera(&self) -> &CameraId {
-        &self.camera
-    }
-
-    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
-        let now = self.clock.now_nanos();
-        // A driver keeps a few buffers; what is older is gone.
-        let oldest = (now - self.start_nanos) / self.period_nanos - 4;
-        if oldest > self.next {
-            self.health.lost_by_driver += (oldest - self.next).unsigned_abs();
-            self.next = oldest;
-        }
-        let due = self.start_nanos + self.next * self.period_nanos;
-        let wait = Duration::from_nanos(u64::try_from(due - now).unwrap_or(0));
-        std::thread::sleep(wait.min(timeout));
-        if wait > timeout {
-            return Err(CaptureError::new(&self.camera, CaptureErrorKind::Timeout, "no frame yet"));
-        }
-        let mut bytes = self.pool.take();
-        bytes.extend_from_slice(&self.picture);
-        let [width, height] = self.size;
-        let image = Image::new(width, height, self.format, self.pool.lease(bytes))
-            .map_err(|error| CaptureError::new(&self.camera, CaptureErrorKind::Corrupt, error.to_string()))?;
-        let sequence = self.next.unsigned_abs();
-        self.next += 1;
-        let camera = self.camera.clone();
-        Ok(Frame { camera, sequence, capture_nanos: due, exposure_nanos: None, image, mask: None })
-    }
-
-    fn health(&self) -> SourceHealth {
-        self.health.clone()
-    }
-}
 
 /// Every second camera sends JPEG.
 fn cameras(args: &BenchCaptureArgs) -> Result<Vec<Box<dyn CameraSource>>> {
@@ -92,23 +43,12 @@ fn cameras(args: &BenchCaptureArgs) -> Result<Vec<Box<dyn CameraSource>>> {
         mask: None,
     };
     let jpeg = JpegEncoding::new(90).process(plain)?;
-    let start_nanos = clock.now_nanos() + 200_000_000;
+    let (jpeg, yuyv) = (Arc::new(vec![jpeg.image.bytes().to_vec()]), Arc::new(vec![yuyv]));
     let camera = |slot: u32| {
         let is_jpeg = slot % 2 == 1;
-        let (format, picture) =
-            if is_jpeg { (PixelFormat::Mjpeg, jpeg.image.bytes().to_vec()) } else { (PixelFormat::Yuyv, yuyv.clone()) };
-        Box::new(Steady {
-            camera: format!("{slot:02}").into(),
-            clock: clock.clone(),
-            format,
-            size: args.size,
-            picture,
-            pool: BufferPool::new(16),
-            period_nanos: (1e9 / args.fps) as i64,
-            start_nanos,
-            next: 0,
-            health: SourceHealth { mode: format!("{format:?} {width}x{height}").into(), ..SourceHealth::default() },
-        }) as Box<dyn CameraSource>
+        let (format, pictures) = if is_jpeg { (PixelFormat::Mjpeg, &jpeg) } else { (PixelFormat::Yuyv, &yuyv) };
+        let (id, pictures) = (format!("{slot:02}").into(), Arc::clone(pictures));
+        Box::new(Steady::new(id, &clock, format, args.size, pictures, args.fps)) as Box<dyn CameraSource>
     };
     Ok((0..args.cameras).map(camera).collect())
 }
@@ -220,29 +160,6 @@ fn slope(points: &[(f64, f64)]) -> f64 {
 fn sparkline(memory: &[(f64, f64)]) -> String {
     let step = memory.len().div_ceil(CELLS as usize).max(1);
     memory.iter().step_by(step).map(|(_, mib)| format!("{mib:.1}")).collect::<Vec<_>>().join(" ")
-}
-
-/// Processor time of this process' threads by name, in ticks of 10 ms, where the system tells it.
-fn cpu_ticks() -> BTreeMap<String, u64> {
-    let mut ticks = BTreeMap::new();
-    for task in fs::read_dir("/proc/self/task").into_iter().flatten().flatten() {
-        let Ok(stat) = fs::read_to_string(task.path().join("stat")) else { continue };
-        // The name is in parentheses and may hold anything, spaces too.
-        let Some((head, tail)) = stat.rsplit_once(')') else { continue };
-        let name = head.split_once('(').map_or("", |(_, name)| name);
-        let mut fields = tail.split_whitespace().skip(11).filter_map(|field| field.parse::<u64>().ok());
-        let used = fields.next().unwrap_or(0) + fields.next().unwrap_or(0);
-        *ticks.entry(name.to_owned()).or_insert(0) += used;
-    }
-    ticks
-}
-
-fn cpu_share(before: &BTreeMap<String, u64>, after: &BTreeMap<String, u64>, seconds: f64) -> BTreeMap<String, f64> {
-    let used = |(name, ticks): (&String, &u64)| {
-        let ticks = ticks.saturating_sub(before.get(name).copied().unwrap_or(0));
-        (name.clone(), ticks as f64 / 100.0 / seconds.max(1e-9))
-    };
-    after.iter().map(used).collect()
 }
 
 #[cfg(test)]

@@ -1,6 +1,8 @@
 //! The faults, one function each.
 
+mod disk;
 mod host;
+mod nokhwa;
 mod rig;
 mod table;
 mod usb;
@@ -42,6 +44,8 @@ pub fn main() -> ExitCode {
     missing(&mut table);
     refused_start(&mut table);
     replugged(&mut table, cycles);
+    nokhwa::run(&mut table);
+    disk::full(&mut table);
     usb::run(&mut table, cycles);
     table.print();
     if table.all_within() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
@@ -73,9 +77,15 @@ fn steady(table: &mut Table) {
         "none",
         "4 x 640x360 YUYV at 30 a second, 12 s",
         &format!("{} frames, {lost} missing in the drivers' numbers, {} errors", seen.frames(), seen.errors()),
-        "frames + missing within 15 % of 30 a second; no errors",
+        if is_fast {
+            "within 15 % of 30 a second; no errors"
+        } else {
+            "no errors; this machine is too slow for four cameras"
+        },
         &format!("{} a second", rates.join(", ")),
-        seen.errors() == 0 && seen.cameras.iter().all(|camera| (camera.rate_numbered() / FPS - 1.0).abs() < 0.15),
+        seen.errors() == 0
+            && seen.cameras.iter().all(|camera| camera.frames > 10)
+            && (!is_fast || seen.cameras.iter().all(|camera| (camera.rate() / FPS - 1.0).abs() < 0.15)),
     );
     table.row(
         "none",
@@ -155,9 +165,9 @@ fn fatal(table: &mut Table) {
         "stream breaks",
         "fatal streaming error of one camera",
         &format!("{} reconnect, back after {:.0} ms", hit.health.reconnects, hit.longest_gap_ms),
-        "back within 1 s; the other camera unharmed",
+        "back within 600 ms; the other camera unharmed",
         &format!("{:.0} ms; the other's longest gap {:.0} ms", hit.longest_gap_ms, seen.cameras[1].longest_gap_ms),
-        hit.health.reconnects == 1 && hit.longest_gap_ms < 1000.0 && seen.cameras[1].is_sound(),
+        hit.health.reconnects == 1 && hit.longest_gap_ms < 600.0 && seen.cameras[1].is_sound(),
     );
 }
 
@@ -174,9 +184,9 @@ fn silent(table: &mut Table) {
         "silent camera",
         "one camera sends nothing for a while",
         &format!("noticed {noticed:.0} ms after its last frame, back {:.0} ms after it spoke again", back.ms()),
-        "500 ms, and what a busy machine takes to look (200); the other unharmed",
+        "500 ms, and what a busy machine takes to look (200); back within 2 s; the other unharmed",
         &format!("{noticed:.0} ms"),
-        noticed < 700.0 && back.ms() < 8000.0 && other.cameras[1].is_sound(),
+        noticed < 700.0 && back.ms() < 2000.0 && other.cameras[1].is_sound(),
     );
 }
 
@@ -300,8 +310,8 @@ fn replugged(table: &mut Table, cycles: usize) {
         "unplugged, replugged",
         &format!("4 cameras, {cycles} times, under {} numbers", numbers.len()),
         &format!("{failures} times not all back; slowest {slowest:.0} ms after the replug"),
-        "always back within 6 s; file descriptors and threads as before",
+        "always back within 2 s; file descriptors and threads as before",
         &format!("file descriptors {files} to {files_after}, threads {running} to {running_after}"),
-        failures == 0 && slowest < 6000.0 && files == files_after && running == running_after,
+        failures == 0 && slowest < 2000.0 && files == files_after && running == running_after,
     );
 }

@@ -97,11 +97,6 @@ impl Seen {
         self.frames as f64 / self.seconds.max(1e-9)
     }
 
-    /// Frames a second that the driver made.
-    pub fn rate_numbered(&self) -> f64 {
-        (self.frames + self.lost) as f64 / self.seconds.max(1e-9)
-    }
-
     /// Without errors and long gaps. A slow machine loses single frames; that is counted and no harm.
     pub fn is_sound(&self) -> bool {
         self.errors.is_empty() && self.longest_gap_ms < 500.0 && self.frames > 0
@@ -148,7 +143,6 @@ impl Rig {
 
     /// Opens cameras; a failure ends the program, since then there is nothing to test.
     pub fn start_with(wanted: &[CameraOptions]) -> Self {
-        let cameras = wanted.len();
         let mut sources: Vec<Box<dyn CameraSource>> = Vec::new();
         for (camera, options) in wanted.iter().enumerate() {
             let name = format!("{camera:02}");
@@ -160,6 +154,12 @@ impl Rig {
                 }
             }
         }
+        Self::of(sources)
+    }
+
+    /// Of cameras that are open, called 00, 01 and so on.
+    pub fn of(sources: Vec<Box<dyn CameraSource>>) -> Self {
+        let cameras = sources.len();
         let ids: Vec<_> = sources.iter().map(|source| source.camera().clone()).collect();
         let config = ThreadsConfig { queue_capacity: 4 * cameras, ..ThreadsConfig::default() };
         let threads = match CaptureThreads::start_staged(sources, |_| Box::new(Decoding::default()), config) {

@@ -1,6 +1,16 @@
 //! From a driver's stamps to the middle of the exposure on `CLOCK_MONOTONIC`, whatever the stamps do.
 
-use super::queue::StampSource;
+/// What the stamp of a frame tells the time of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum StampSource {
+    /// `CLOCK_MONOTONIC` when the exposure began (for USB cameras: when the first packet came).
+    #[cfg_attr(not(target_os = "linux"), expect(dead_code))]
+    StartOfExposure,
+    /// `CLOCK_MONOTONIC` when the last pixel had come.
+    EndOfFrame,
+    /// Another clock, or none.
+    Other,
+}
 
 /// A believable stamp lies at most so long and an exposure before its frame's arrival, nanoseconds.
 const OLDEST: i64 = 1_000_000_000;
@@ -10,8 +20,6 @@ const NEWEST: i64 = 5_000_000;
 const CONFIRMATIONS: u32 = 8;
 /// What "the same amount" is, nanoseconds: arrivals on a busy machine are uneven.
 const AGREEMENT: u64 = 150_000_000;
-/// A number that jumps ahead by more is of a driver that counts anew.
-const JUMP: u32 = 100_000;
 
 /// Turns stamps into capture times.
 ///
@@ -86,32 +94,6 @@ impl Stamps {
             return stamp_nanos.wrapping_add(suspect.least);
         }
         arrival_nanos
-    }
-}
-
-/// Makes the driver's 32-bit numbers count on, over wraps and reconnects.
-#[derive(Debug, Default)]
-pub(crate) struct Sequence {
-    last: Option<u32>,
-    counted: u64,
-    /// Frames that the driver numbered and we never got.
-    pub lost: u64,
-}
-
-impl Sequence {
-    /// The number of a frame.
-    pub fn count(&mut self, number: u32) -> u64 {
-        let ahead = self.last.map_or(1, |last| number.wrapping_sub(last));
-        self.last = Some(number);
-        let step = if (1..=JUMP).contains(&ahead) { u64::from(ahead) } else { 1 };
-        self.lost += step - 1;
-        self.counted += step;
-        self.counted - 1
-    }
-
-    /// The driver counts anew from the next frame on.
-    pub fn restart(&mut self) {
-        self.last = None;
     }
 }
 
@@ -201,16 +183,5 @@ mod tests {
         }
         stamps.capture_nanos(0, StampSource::StartOfExposure, i64::MAX, i64::MAX);
         stamps.capture_nanos(0, StampSource::EndOfFrame, i64::MIN, i64::MAX);
-    }
-
-    #[test]
-    fn numbers_count_on_over_wraps_and_restarts() {
-        let mut sequence = Sequence::default();
-        let numbers = [u32::MAX - 1, u32::MAX, 0, 1, 4, 5].map(|n| sequence.count(n));
-        assert_eq!((numbers, sequence.lost), ([0, 1, 2, 3, 6, 7], 2));
-        sequence.restart();
-        assert_eq!((sequence.count(0), sequence.count(1)), (8, 9));
-        assert_eq!((sequence.count(1), sequence.count(0), sequence.count(3_000_000_000)), (10, 11, 12));
-        assert_eq!(sequence.lost, 2, "a driver that counts anew has lost nothing that we know of");
     }
 }

@@ -1,0 +1,296 @@
+//! Cameras whose reading waits for ever: each is read in a thread that a watchdog looks after and, if need be, abandons.
+
+#[cfg(test)]
+mod tests;
+mod worker;
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use flyrig_types::{CameraId, Frame, Image, PixelBuffer, PixelFormat};
+
+use self::worker::{Event, Line};
+use crate::{
+    BufferPool, CameraSource, CaptureError, CaptureErrorKind, PopError, SourceHealth,
+    stamps::{StampSource, Stamps},
+};
+
+/// A camera that has sent frames is silent after so many periods without one, but not before [`SILENT_AFTER`].
+const SILENT_PERIODS: f64 = 5.0;
+const SILENT_AFTER: Duration = Duration::from_millis(500);
+/// A camera may take so long to be opened, and so long again until its first frame.
+const FIRST_FRAME: Duration = Duration::from_secs(5);
+/// Threads of one camera that may be left behind in calls that do not return. There is one more at most, which is not left.
+const MOST_ABANDONED: usize = 1;
+/// How long an orderly end waits for the camera to be closed.
+const CLOSING: Duration = Duration::from_secs(1);
+/// Free buffers that are kept for frames to come.
+const POOLED_FRAMES: usize = 16;
+
+/// A camera that is open. It lives and dies in one thread.
+pub(crate) trait BlockingCamera {
+    /// Format, size and rate, for people.
+    fn mode(&self) -> String;
+
+    /// Waits for the next picture as long as it takes, and puts its bytes into `bytes`, which are empty.
+    ///
+    /// # Errors
+    /// `Corrupt` costs the picture; after every other kind the camera is closed.
+    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<Shot, CaptureError>;
+}
+
+/// What a camera is opened with: once at first and again whenever it was lost, each time in a new thread.
+pub(crate) trait Opener: Send + Sync + 'static {
+    type Camera: BlockingCamera;
+
+    /// Takes as long as it takes.
+    fn open(&self) -> Result<Self::Camera, CaptureError>;
+}
+
+/// A picture without its bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Shot {
+    pub size: (u32, u32),
+    pub format: PixelFormat,
+    /// When the system says that it was taken.
+    pub stamp_nanos: Option<i64>,
+    /// When the call returned.
+    pub arrival_nanos: i64,
+}
+
+/// What is expected of a camera.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Expected {
+    pub size: (u32, u32),
+    /// Frames a second.
+    pub fps: f64,
+    /// How much later than the truth its stamps are, seconds; taken off.
+    pub lag_secs: f64,
+}
+
+/// Such a camera as a source.
+///
+/// A read or an opening that takes too long is left alone in its thread, which ends as soon as its call returns, and the
+/// camera is opened again in a new one. When that hangs as well it is kept: a camera never has more than two threads in
+/// its driver, however often it fails.
+#[derive(Debug)]
+pub(crate) struct Watched<O: Opener> {
+    camera: CameraId,
+    expected: Expected,
+    opener: Arc<O>,
+    session: Option<Session>,
+    /// Threads that were left behind and have not come back yet.
+    abandoned: Vec<Arc<Line>>,
+    stamps: Stamps,
+    frames: u64,
+    health: SourceHealth,
+    pool: Arc<BufferPool>,
+}
+
+/// From one opening to its end.
+#[derive(Debug)]
+struct Session {
+    line: Arc<Line>,
+    /// When something came last, or when it was started.
+    heard: Instant,
+    is_flowing: bool,
+    /// Whether its first frame is that of a camera that has come back.
+    is_back: bool,
+    was_asked: bool,
+    /// Whether it hangs and may not be left behind.
+    is_stuck: bool,
+    /// Frames that newer ones overtook, as counted so far.
+    overtaken: u64,
+}
+
+impl Session {
+    fn silent_after(&self, fps: f64) -> Duration {
+        if self.is_flowing {
+            SILENT_AFTER.max(Duration::from_secs_f64(SILENT_PERIODS / fps.clamp(0.1, 1e6)))
+        } else {
+            FIRST_FRAME
+        }
+    }
+}
+
+impl<O: Opener> Watched<O> {
+    /// Opens at once, so that what is wrong is told at the start.
+    pub fn open(camera: &CameraId, expected: Expected, opener: O) -> Result<Self, CaptureError> {
+        let mut watched = Self {
+            camera: camera.clone(),
+            expected,
+            opener: Arc::new(opener),
+            session: None,
+            abandoned: Vec::new(),
+            stamps: Stamps::default(),
+            frames: 0,
+            health: SourceHealth::default(),
+            pool: BufferPool::new(POOLED_FRAMES),
+        };
+        let of_camera = |error: CaptureError| error.of(camera);
+        let session = watched.start().map_err(of_camera)?;
+        let opened = session.line.events.pop(FIRST_FRAME);
+        let line = Arc::clone(&session.line);
+        watched.session = Some(session);
+        match opened {
+            Ok(_) => watched.tell_mode(&line, ""),
+            Err(PopError::Closed) => return Err(of_camera(line.end())),
+            Err(PopError::Timeout) => {
+                let text = format!(
+                    "was not opened within {} s: its driver hangs; unplug it and plug it in again",
+                    FIRST_FRAME.as_secs()
+                );
+                return Err(CaptureError::new(camera, CaptureErrorKind::Io, text));
+            }
+        }
+        Ok(watched)
+    }
+
+    fn start(&self) -> Result<Session, CaptureError> {
+        let line = worker::start(&self.camera, &self.opener, &self.pool)?;
+        let (heard, overtaken) = (Instant::now(), 0);
+        let is_back = self.frames > 0;
+        Ok(Session { line, heard, is_flowing: false, is_back, was_asked: false, is_stuck: false, overtaken })
+    }
+
+    fn tell_mode(&mut self, line: &Line, stamps: &str) {
+        let mode = format!("{}{stamps}", line.mode.get().map_or("", String::as_str));
+        if *self.health.mode != *mode {
+            self.health.mode = mode.into();
+        }
+    }
+
+    fn read(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
+        let deadline = Instant::now() + timeout.min(Duration::from_secs(3600));
+        if self.session.is_none() {
+            self.session = Some(self.start()?);
+        }
+        loop {
+            let Some(session) = &mut self.session else {
+                return Err(CaptureError::general(CaptureErrorKind::Disconnected, "is not open"));
+            };
+            if !std::mem::replace(&mut session.was_asked, true) {
+                // What was overtaken before anybody asked is no loss.
+                session.overtaken = session.line.events.dropped();
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            let silent_after = session.silent_after(self.expected.fps);
+            // It must not take longer to notice silence than the caller waits.
+            let patience = silent_after.saturating_sub(session.heard.elapsed());
+            let event = match session.line.events.pop(left.min(patience)) {
+                Ok(event) => event,
+                Err(PopError::Closed) => {
+                    let error = session.line.end();
+                    self.session = None;
+                    return Err(error);
+                }
+                Err(PopError::Timeout) if patience > left => {
+                    return Err(CaptureError::general(CaptureErrorKind::Timeout, "no frame yet"));
+                }
+                Err(PopError::Timeout) => return Err(self.silent(silent_after)),
+            };
+            session.heard = Instant::now();
+            let overtaken = session.line.events.dropped();
+            self.health.lost_by_driver += overtaken - std::mem::replace(&mut session.overtaken, overtaken);
+            match event {
+                Event::Opened => {}
+                Event::Damaged(error) => return Err(error),
+                Event::Shot(shot, bytes) => {
+                    (session.is_flowing, session.is_stuck) = (true, false);
+                    let line = Arc::clone(&session.line);
+                    if std::mem::take(&mut session.is_back) {
+                        self.health.reconnects += 1;
+                        tracing::info!("camera {}: is back", self.camera);
+                    }
+                    return self.frame(&line, shot, bytes);
+                }
+            }
+        }
+    }
+
+    fn frame(&mut self, line: &Line, shot: Shot, bytes: PixelBuffer) -> Result<Frame, CaptureError> {
+        let number = self.frames + self.health.lost_by_driver;
+        self.frames += 1;
+        let corrupt =
+            |text: String| CaptureError::general(CaptureErrorKind::Corrupt, format!("frame {number}: {text}"));
+        let (width, height) = shot.size;
+        if shot.size != self.expected.size {
+            let (wanted_width, wanted_height) = self.expected.size;
+            let text = format!("it is {width}x{height} and not {wanted_width}x{wanted_height} as asked for");
+            return Err(corrupt(text));
+        }
+        let image = Image::new(width, height, shot.format, bytes).map_err(|error| corrupt(error.to_string()))?;
+        let half_period = (0.5e9 / self.expected.fps.clamp(0.1, 1e6)) as i64;
+        let (stamp, source, told) = match shot.stamp_nanos {
+            Some(stamp) => (stamp, StampSource::EndOfFrame, ", stamped by the system"),
+            None => (0, StampSource::Other, ", stamped at arrival less half a period"),
+        };
+        let half = if source == StampSource::Other { half_period } else { 0 };
+        let capture = self.stamps.capture_nanos(stamp, source, shot.arrival_nanos, half);
+        self.health.stamps_replaced = self.stamps.replaced;
+        self.tell_mode(line, told);
+        Ok(Frame {
+            camera: self.camera.clone(),
+            sequence: number,
+            capture_nanos: capture.saturating_sub((self.expected.lag_secs * 1e9) as i64),
+            exposure_nanos: None,
+            image,
+            mask: None,
+        })
+    }
+
+    /// The camera says nothing: it is left behind, if that is allowed.
+    fn silent(&mut self, silent_after: Duration) -> CaptureError {
+        let disconnected = |text: String| CaptureError::general(CaptureErrorKind::Disconnected, text);
+        let Some(session) = &mut self.session else { return disconnected("is not open".to_owned()) };
+        self.health.silences += u64::from(!session.is_stuck);
+        self.abandoned.retain(|line| !line.events.is_closed());
+        if self.abandoned.len() < MOST_ABANDONED {
+            session.line.abandon();
+            self.abandoned.push(Arc::clone(&session.line));
+            self.session = None;
+            return disconnected(format!("gave no frame for {} ms; opening it again", silent_after.as_millis()));
+        }
+        // Asked again after a while, and told again.
+        (session.is_stuck, session.is_flowing, session.heard) = (true, false, Instant::now());
+        disconnected(
+            "hangs in its driver, and so does the attempt to open it again; no other is made until one of them returns: \
+             unplug it and plug it in again, or restart flyrig"
+                .to_owned(),
+        )
+    }
+}
+
+impl<O: Opener> CameraSource for Watched<O> {
+    fn camera(&self) -> &CameraId {
+        &self.camera
+    }
+
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
+        self.read(timeout).map_err(|error| match error.kind {
+            // It was there once and may come back, changed settings of another program included.
+            CaptureErrorKind::NotFound | CaptureErrorKind::Unsupported => {
+                CaptureError { kind: CaptureErrorKind::Disconnected, ..error }.of(&self.camera)
+            }
+            _ => error.of(&self.camera),
+        })
+    }
+
+    fn health(&self) -> SourceHealth {
+        self.health.clone()
+    }
+}
+
+impl<O: Opener> Drop for Watched<O> {
+    /// The camera is closed with its next frame; one that hangs stays in its thread until the process ends.
+    fn drop(&mut self) {
+        let Some(session) = self.session.take() else { return };
+        session.line.abandon();
+        let deadline = Instant::now() + CLOSING;
+        if !session.is_stuck {
+            while session.line.events.pop(deadline.saturating_duration_since(Instant::now())).is_ok() {}
+        }
+    }
+}

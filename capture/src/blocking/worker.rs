@@ -1,0 +1,118 @@
+//! The thread that waits inside of a camera's driver.
+
+use std::{
+    panic::{AssertUnwindSafe, catch_unwind},
+    sync::{
+        Arc, Mutex, OnceLock, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread::Builder,
+};
+
+use flyrig_types::{CameraId, PixelBuffer};
+
+use super::{BlockingCamera, Opener, Shot};
+use crate::{BufferPool, CaptureError, CaptureErrorKind, LatestQueue, threads::panic_text};
+
+/// Frames that may wait for the camera's own thread: one to take next, one for jitter.
+const WAITING: usize = 2;
+
+/// What comes out of the thread.
+#[derive(Debug)]
+pub(super) enum Event {
+    /// The camera is open and has a mode.
+    Opened,
+    Shot(Shot, PixelBuffer),
+    /// A picture is lost.
+    Damaged(CaptureError),
+}
+
+/// What the thread and its watchdog share.
+#[derive(Debug)]
+pub(super) struct Line {
+    /// Closed when the thread has ended.
+    pub events: LatestQueue<Event>,
+    /// Mode of the open camera, for people.
+    pub mode: OnceLock<String>,
+    is_abandoned: AtomicBool,
+    /// Why it has ended.
+    end: Mutex<Option<CaptureError>>,
+}
+
+impl Line {
+    /// The thread ends as soon as its call returns.
+    pub fn abandon(&self) {
+        self.is_abandoned.store(true, Ordering::Relaxed);
+    }
+
+    /// Why the thread has ended.
+    pub fn end(&self) -> CaptureError {
+        let end = self.end.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        end.unwrap_or_else(|| CaptureError::general(CaptureErrorKind::Disconnected, "was closed"))
+    }
+}
+
+/// Starts a thread that opens the camera and reads it.
+///
+/// # Errors
+/// `Io` when the system gives no thread.
+pub(super) fn start<O: Opener>(
+    camera: &CameraId,
+    opener: &Arc<O>,
+    pool: &Arc<BufferPool>,
+) -> Result<Arc<Line>, CaptureError> {
+    let line = Arc::new(Line {
+        events: LatestQueue::new(WAITING),
+        mode: OnceLock::new(),
+        is_abandoned: AtomicBool::new(false),
+        end: Mutex::new(None),
+    });
+    let (of_thread, opener, pool) = (Arc::clone(&line), Arc::clone(opener), Arc::clone(pool));
+    let work = move || {
+        let end = work(&*opener, &pool, &of_thread);
+        *of_thread.end.lock().unwrap_or_else(PoisonError::into_inner) = end.err();
+        of_thread.events.close();
+    };
+    Builder::new()
+        .name(format!("driver {camera}"))
+        .spawn(work)
+        .map_err(|error| CaptureError::general(CaptureErrorKind::Io, format!("no thread: {error}")))?;
+    Ok(line)
+}
+
+/// Every call by itself: a camera that is dropped while its own panic unwinds may panic again, which ends the process.
+fn guarded<T>(call: impl FnOnce() -> Result<T, CaptureError>) -> Result<T, CaptureError> {
+    catch_unwind(AssertUnwindSafe(call)).unwrap_or_else(|panic| {
+        let text = format!("its driver library failed inside: {}; opening it again", panic_text(&*panic));
+        // What the panic carries is somebody else's code too.
+        let _ = catch_unwind(AssertUnwindSafe(|| drop(panic)));
+        Err(CaptureError::general(CaptureErrorKind::Disconnected, text))
+    })
+}
+
+fn work<O: Opener>(opener: &O, pool: &Arc<BufferPool>, line: &Line) -> Result<(), CaptureError> {
+    let mut camera = guarded(|| opener.open())?;
+    let result = read(&mut camera, pool, line);
+    let closed = guarded(|| {
+        drop(camera);
+        Ok(())
+    });
+    result.and(closed)
+}
+
+fn read(camera: &mut impl BlockingCamera, pool: &Arc<BufferPool>, line: &Line) -> Result<(), CaptureError> {
+    let mode = guarded(|| Ok(camera.mode()))?;
+    line.mode.get_or_init(|| mode);
+    let mut event = Event::Opened;
+    loop {
+        if line.is_abandoned.load(Ordering::Relaxed) || line.events.push(event).is_err() {
+            return Ok(());
+        }
+        let mut bytes = pool.take();
+        event = match guarded(|| camera.read(&mut bytes)) {
+            Ok(shot) => Event::Shot(shot, pool.lease(bytes)),
+            Err(error) if error.kind == CaptureErrorKind::Corrupt => Event::Damaged(error),
+            Err(error) => return Err(error),
+        };
+    }
+}

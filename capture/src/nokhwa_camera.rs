@@ -1,0 +1,348 @@
+//! Cameras through the `nokhwa` crate: those of macOS and Windows, and devices of Linux that V4L2 alone does not serve.
+
+use std::{
+    fmt,
+    time::{Duration, SystemTime},
+};
+
+use crossbeam::channel::bounded;
+use flyrig_types::{CameraId, Frame, PixelFormat};
+use nokhwa::{
+    Camera, NokhwaError, nokhwa_check, nokhwa_initialize, query,
+    utils::{
+        ApiBackend, CameraFormat, CameraIndex, CameraInfo, FrameFormat, RequestedFormat, RequestedFormatType,
+        Resolution,
+    },
+};
+
+use crate::{
+    CameraSource, CaptureError, CaptureErrorKind, FormatChoice, SourceHealth,
+    blocking::{BlockingCamera, Expected, Opener, Shot, Watched},
+    clock::monotonic_nanos,
+    mjpeg, picture,
+};
+
+/// Formats that the crate knows and what we call them, in the order in which [`FormatChoice::Auto`] takes them.
+const FORMATS: [(FrameFormat, FormatChoice, PixelFormat); 6] = [
+    (FrameFormat::YUYV, FormatChoice::Yuyv, PixelFormat::Yuyv),
+    (FrameFormat::NV12, FormatChoice::Nv12, PixelFormat::Nv12),
+    (FrameFormat::RAWRGB, FormatChoice::Rgb24, PixelFormat::Rgb8),
+    (FrameFormat::RAWBGR, FormatChoice::Rgb24, PixelFormat::Bgr8),
+    (FrameFormat::MJPEG, FormatChoice::Mjpeg, PixelFormat::Mjpeg),
+    (FrameFormat::GRAY, FormatChoice::Grey, PixelFormat::Gray8),
+];
+/// How long the system may take to ask its user whether cameras may be used.
+const ASKING: Duration = Duration::from_secs(4);
+
+/// How a camera is told from the others.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum NokhwaDevice {
+    /// Its number in the system's list; on Linux that of `/dev/video`. It may be another after a replug: prefer the name.
+    Index(u32),
+    /// Its name; the first one of several with that name.
+    Name(String),
+}
+
+impl From<&str> for NokhwaDevice {
+    /// A number is an index.
+    fn from(text: &str) -> Self {
+        text.parse().map_or_else(|_| Self::Name(text.to_owned()), Self::Index)
+    }
+}
+
+impl fmt::Display for NokhwaDevice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Index(index) => write!(f, "number {index}"),
+            Self::Name(name) => write!(f, "name \"{name}\""),
+        }
+    }
+}
+
+/// What a camera is opened as.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NokhwaOptions {
+    /// Which camera.
+    pub device: NokhwaDevice,
+    /// Pixels; the calibration belongs to this size, so nothing else is taken.
+    pub width: u32,
+    /// Pixels.
+    pub height: u32,
+    /// Frames a second, rounded: the crate knows whole rates only.
+    pub fps: f64,
+    /// Pixel format; UYVY and Bayer mosaics are not to be had.
+    pub format: FormatChoice,
+    /// How much later than the truth this camera's stamps are, seconds; taken off.
+    pub lag_secs: f64,
+}
+
+/// A camera of this computer, read through `nokhwa`. Frames come in the camera's own pixel format.
+///
+/// The crate's reads wait for ever, so they have a thread of their own. A camera that gives no frame for five periods (but
+/// not less than 500 ms) is given up and opened again; a thread that hangs in the driver is left behind, at most one of
+/// them a camera, so that a camera never has more than two threads.
+///
+/// The capture time is what the system stamps where it does, else the arrival less half a period, which is good to about
+/// half a frame; [`SourceHealth::mode`] says which. Nobody tells what the system's stamp stands for: it may be off by the
+/// exposure and the readout, which `lag_secs` corrects. The crate has no sequence numbers: frames are counted as they
+/// come, so that what the driver loses is not seen. Exposure and the like stay as the camera has them. Rows with padding
+/// cannot be told from others and look sheared.
+#[derive(Debug)]
+pub struct NokhwaCamera(Watched<System>);
+
+impl NokhwaCamera {
+    /// Finds the camera, sets it up and starts its stream.
+    ///
+    /// # Errors
+    /// `NotFound` when no such camera is there, `Unsupported` for what it cannot do, `Io` when it is in use, may not be
+    /// opened or hangs. Every text names the camera, the cause and the mend.
+    pub fn open(camera: &CameraId, options: &NokhwaOptions) -> Result<Self, CaptureError> {
+        let (size, lag_secs) = ((options.width, options.height), options.lag_secs);
+        let expected = Expected { size, fps: options.fps, lag_secs };
+        Watched::open(camera, expected, System(options.clone())).map(Self)
+    }
+}
+
+impl CameraSource for NokhwaCamera {
+    fn camera(&self) -> &CameraId {
+        self.0.camera()
+    }
+
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
+        self.0.next_frame(timeout)
+    }
+
+    fn health(&self) -> SourceHealth {
+        self.0.health()
+    }
+}
+
+/// Number and name of every camera that `nokhwa` sees.
+///
+/// # Errors
+/// `Io` when the system cannot be asked.
+pub fn nokhwa_cameras() -> Result<Vec<(NokhwaDevice, String)>, CaptureError> {
+    let infos = list()?;
+    Ok(infos.iter().map(|info| (NokhwaDevice::from(info.index().as_string().as_str()), info.human_name())).collect())
+}
+
+fn list() -> Result<Vec<CameraInfo>, CaptureError> {
+    if !nokhwa_check() {
+        let (sender, receiver) = bounded(1);
+        nokhwa_initialize(move |granted| {
+            // Nobody waits any more for an answer that comes late.
+            let _ = sender.try_send(granted);
+        });
+        if !receiver.recv_timeout(ASKING).unwrap_or(false) {
+            let text =
+                "the system does not let this program use cameras; allow it in the privacy settings and start again";
+            return Err(CaptureError::general(CaptureErrorKind::Io, text));
+        }
+    }
+    query(ApiBackend::Auto).map_err(|error| explain(&error))
+}
+
+fn find(infos: &[CameraInfo], device: &NokhwaDevice) -> Result<CameraIndex, CaptureError> {
+    let is_it = |info: &&CameraInfo| match device {
+        NokhwaDevice::Index(index) => info.index().as_string() == index.to_string(),
+        NokhwaDevice::Name(name) => info.human_name() == *name,
+    };
+    let order = |info: &&CameraInfo| info.index().as_index().unwrap_or(u32::MAX);
+    if let Some(info) = infos.iter().filter(is_it).min_by_key(order) {
+        return Ok(info.index().clone());
+    }
+    let there: Vec<String> =
+        infos.iter().map(|info| format!("{} \"{}\"", info.index().as_string(), info.human_name())).collect();
+    let there = if there.is_empty() { "none".to_owned() } else { there.join(", ") };
+    let text = format!("no camera with {device} is there; plug it in, or set nokhwa to one of these: {there}");
+    Err(CaptureError::general(CaptureErrorKind::NotFound, text))
+}
+
+/// The crate's errors are texts; the system's number is at their end.
+fn explain(error: &NokhwaError) -> CaptureError {
+    let text = error.to_string();
+    let has = |number: u8| text.contains(&format!("(os error {number})"));
+    let general = |kind, mend: &str| CaptureError::general(kind, format!("{text}; {mend}"));
+    if has(2) || has(6) || has(19) {
+        general(CaptureErrorKind::Disconnected, "it is gone: plug the camera in again")
+    } else if has(13) {
+        general(CaptureErrorKind::Io, "add the user to the group video (sudo usermod -aG video $USER) and log in again")
+    } else if has(16) {
+        general(CaptureErrorKind::Io, "another program uses it: close that")
+    } else {
+        general(CaptureErrorKind::Io, "plug it in again, or see whether another program can use it")
+    }
+}
+
+/// This computer.
+#[derive(Debug)]
+struct System(NokhwaOptions);
+
+impl System {
+    fn size(&self) -> Resolution {
+        Resolution::new(self.0.width, self.0.height)
+    }
+
+    /// What the camera has, for an error that helps.
+    fn lacks(&self, index: CameraIndex, error: &NokhwaError) -> CaptureError {
+        let all = FORMATS.map(|(format, ..)| format);
+        let opened = Camera::new(index, RequestedFormat::with_formats(RequestedFormatType::None, &all));
+        let formats = opened.and_then(|mut camera| camera.compatible_camera_formats()).unwrap_or_default();
+        let of_size = formats.iter().filter(|format| format.resolution() == self.size());
+        let mut list: Vec<String> = of_size.map(|f| format!("{} at {}", f.format(), f.frame_rate())).collect();
+        list.sort();
+        list.dedup();
+        let list = if list.is_empty() { "none that nokhwa knows".to_owned() } else { list.join(", ") };
+        let NokhwaOptions { width, height, fps, format, .. } = &self.0;
+        let text = format!(
+            "gives no {format:?} pictures of {width}x{height} at {fps} frames a second ({error}); what it has at that \
+             size: {list}"
+        );
+        CaptureError::general(CaptureErrorKind::Unsupported, text)
+    }
+}
+
+impl Opener for System {
+    type Camera = OpenCamera;
+
+    fn open(&self) -> Result<OpenCamera, CaptureError> {
+        let index = find(&list()?, &self.0.device)?;
+        let rate = self.0.fps.round().clamp(1.0, 10_000.0) as u32;
+        let choice = self.0.format;
+        let mut refused = NokhwaError::NotImplementedError(format!("{choice:?}"));
+        for (format, ..) in FORMATS.iter().filter(|(_, of, _)| choice == FormatChoice::Auto || choice == *of) {
+            let wanted = CameraFormat::new(self.size(), *format, rate);
+            let formats = [*format];
+            let exact = RequestedFormat::with_formats(RequestedFormatType::Exact(wanted), &formats);
+            match Camera::new(index.clone(), exact) {
+                Ok(mut camera) => {
+                    camera.open_stream().map_err(|error| explain(&error))?;
+                    return Ok(OpenCamera(camera));
+                }
+                Err(error)
+                    if matches!(error, NokhwaError::OpenDeviceError(..)) || error.to_string().contains("(os error") =>
+                {
+                    return Err(explain(&error));
+                }
+                Err(error) => refused = error,
+            }
+        }
+        Err(self.lacks(index, &refused))
+    }
+}
+
+struct OpenCamera(Camera);
+
+impl BlockingCamera for OpenCamera {
+    fn mode(&self) -> String {
+        let format = self.0.camera_format();
+        format!("{} {} at {} through nokhwa", format.format(), format.resolution(), format.frame_rate())
+    }
+
+    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<Shot, CaptureError> {
+        let buffer = self.0.frame().map_err(|error| explain(&error))?;
+        let arrival_nanos = monotonic_nanos();
+        let stamp_nanos = buffer.capture_timestamp().and_then(|taken| {
+            let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).ok()?;
+            let age = i128::try_from(now.as_nanos()).ok()? - i128::try_from(taken.as_nanos()).ok()?;
+            i64::try_from(i128::from(arrival_nanos) - age).ok()
+        });
+        let resolution = buffer.resolution();
+        let format = buffer.source_frame_format();
+        let Some((.., format)) = FORMATS.iter().find(|(of, ..)| *of == format) else {
+            return Err(CaptureError::general(CaptureErrorKind::Corrupt, format!("{format} cannot be read")));
+        };
+        let size = cut(*format, (resolution.width(), resolution.height()), buffer.buffer(), bytes)?;
+        Ok(Shot { size, format: *format, stamp_nanos, arrival_nanos })
+    }
+}
+
+/// Copies the picture alone: the crate may give the driver's whole buffer. Gives its size.
+fn cut(
+    format: PixelFormat,
+    (width, height): (u32, u32),
+    given: &[u8],
+    bytes: &mut Vec<u8>,
+) -> Result<(u32, u32), CaptureError> {
+    let corrupt = |text: String| CaptureError::general(CaptureErrorKind::Corrupt, text);
+    let (length, size) = if format == PixelFormat::Mjpeg {
+        let found = picture::jpeg_length(given).zip(mjpeg::jpeg_size(given));
+        let (length, size) = found.ok_or_else(|| corrupt("a picture is no whole JPEG".to_owned()))?;
+        (length, (size.0 as u32, size.1 as u32))
+    } else {
+        (format.byte_len(width, height).unwrap_or(usize::MAX), (width, height))
+    };
+    let given = given.get(..length);
+    bytes.extend_from_slice(given.ok_or_else(|| corrupt(format!("a picture is cut off: it has no {length} bytes")))?);
+    Ok(size)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn options(device: &str) -> NokhwaOptions {
+        let (width, height, fps) = (640, 360, 30.0);
+        NokhwaOptions { device: device.into(), width, height, fps, format: FormatChoice::Auto, lag_secs: 0.0 }
+    }
+
+    #[test]
+    fn a_camera_that_is_not_there_is_one_clear_error() {
+        for (device, named) in [("97", "no camera with number 97"), ("Best Cam", "no camera with name \"Best Cam\"")] {
+            let error = NokhwaCamera::open(&"front".into(), &options(device)).unwrap_err();
+            assert_eq!(error.kind, CaptureErrorKind::NotFound);
+            let text = error.to_string();
+            assert!(
+                text.starts_with(&format!("camera front: {named} is there; plug it in, or set nokhwa to")),
+                "{text}"
+            );
+        }
+    }
+
+    #[test]
+    fn cameras_are_found_by_number_and_name() {
+        let info = |name: &str, index| CameraInfo::new(name, "", "", CameraIndex::Index(index));
+        let infos = [info("B", 3), info("A", 2), info("B", 1)];
+        let found = |device: &str| find(&infos, &device.into()).map(|index| index.as_string());
+        assert_eq!([found("2"), found("B")], [Ok("2".into()), Ok("1".into())]);
+        let error = found("0").unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "no camera with number 0 is there; plug it in, or set nokhwa to one of these: 3 \"B\", 2 \"A\", 1 \"B\""
+        );
+    }
+
+    #[test]
+    fn errors_of_the_system_say_what_to_do() {
+        let open = |text: &str| explain(&NokhwaError::OpenDeviceError("0".into(), text.into()));
+        for (text, kind, mend) in [
+            ("Permission denied (os error 13)", CaptureErrorKind::Io, "usermod -aG video"),
+            ("Device or resource busy (os error 16)", CaptureErrorKind::Io, "another program uses it"),
+            ("No such device (os error 19)", CaptureErrorKind::Disconnected, "plug the camera in again"),
+            ("whatever", CaptureErrorKind::Io, "another program can use it"),
+        ] {
+            let error = open(text);
+            assert_eq!(error.kind, kind, "{error}");
+            assert!(error.message.contains(text) && error.message.contains(mend), "{error}");
+        }
+    }
+
+    #[test]
+    fn what_lies_behind_a_picture_is_left_out() {
+        let mut bytes = Vec::new();
+        let given: Vec<u8> = (0..100).collect();
+        assert_eq!(cut(PixelFormat::Yuyv, (4, 2), &given, &mut bytes), Ok((4, 2)));
+        assert_eq!(bytes, given[..16]);
+        assert!(cut(PixelFormat::Nv12, (64, 64), &given, &mut bytes).unwrap_err().message.contains("cut off"));
+        let mut jpeg = std::io::Cursor::new(Vec::new());
+        image::RgbImage::new(16, 8).write_to(&mut jpeg, image::ImageFormat::Jpeg).unwrap();
+        let whole = jpeg.into_inner();
+        // As the driver's buffer looks: the rest of a longer picture before it.
+        let padded: Vec<u8> = whole.iter().copied().chain([7; 3000]).chain([0xff, 0xd9]).collect();
+        bytes.clear();
+        assert_eq!(cut(PixelFormat::Mjpeg, (640, 360), &padded, &mut bytes), Ok((16, 8)));
+        assert_eq!(bytes, whole);
+        assert!(cut(PixelFormat::Mjpeg, (16, 8), &whole[..whole.len() - 2], &mut bytes).is_err());
+        assert!(cut(PixelFormat::Mjpeg, (16, 8), b"no picture", &mut bytes).is_err());
+    }
+}

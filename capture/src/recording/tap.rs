@@ -1,0 +1,86 @@
+//! What is recorded as it passes: a camera's frames, and messages of other kinds.
+
+use std::{collections::BTreeMap, sync::Arc, time::Duration};
+
+use flyrig_types::{CameraId, Frame, PixelFormat};
+
+use super::{
+    compress::{Compression, Compressor},
+    message::Channel,
+    writer::Outlet,
+};
+use crate::{CameraSource, CaptureError, SourceHealth};
+
+/// A source whose frames are recorded as they pass: JPEG pictures as they came, others compressed where the recorder was
+/// told so. The frames themselves go on as they are.
+#[derive(Debug)]
+pub struct Recording<S> {
+    source: S,
+    outlet: Outlet,
+    channel: Option<Arc<Channel>>,
+    compressor: Option<Compressor>,
+}
+
+impl<S: CameraSource> Recording<S> {
+    pub(super) fn new(source: S, outlet: Outlet, compression: Option<Compression>) -> Result<Self, CaptureError> {
+        let start = |compression| Compressor::start(source.camera(), compression, outlet.clone());
+        let compressor = compression.map(start).transpose()?;
+        Ok(Self { source, outlet, channel: None, compressor })
+    }
+}
+
+impl<S> Recording<S> {
+    fn record(&mut self, frame: &Frame) {
+        if !self.outlet.is_open() {
+            return;
+        }
+        match &self.compressor {
+            Some(compressor) if frame.image.format() != PixelFormat::Mjpeg => compressor.record(frame),
+            _ => self.outlet.frame(&mut self.channel, frame, frame.image.bytes().len()),
+        }
+    }
+}
+
+impl<S: CameraSource> CameraSource for Recording<S> {
+    fn camera(&self) -> &CameraId {
+        self.source.camera()
+    }
+
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
+        let frame = self.source.next_frame(timeout)?;
+        self.record(&frame);
+        Ok(frame)
+    }
+
+    fn order_nanos(&self, frame: &Frame) -> i64 {
+        self.source.order_nanos(frame)
+    }
+
+    fn health(&self) -> SourceHealth {
+        self.source.health()
+    }
+}
+
+/// A channel of other messages than frames, like poses. It must be gone before the recording is finished.
+#[derive(Debug)]
+pub struct MessageTap {
+    outlet: Outlet,
+    channel: Arc<Channel>,
+    sequence: u64,
+}
+
+impl MessageTap {
+    pub(super) fn new(outlet: Outlet, topic: &str, schema: (String, String, Vec<u8>)) -> Self {
+        let channel = Channel { topic: topic.to_owned(), schema, metadata: BTreeMap::new() };
+        Self { outlet, channel: Arc::new(channel), sequence: 0 }
+    }
+
+    /// Records a message (protobuf) of an instant, nanoseconds on the clock of the frames. It never waits; once the recording
+    /// has stopped, nothing happens.
+    pub fn record(&mut self, nanos: i64, payload: Vec<u8>) {
+        if self.outlet.is_open() {
+            self.outlet.message(&self.channel, nanos, self.sequence, payload);
+            self.sequence += 1;
+        }
+    }
+}
