@@ -35,6 +35,8 @@ const INTERVALS: usize = 15;
 const MOST_DRIFT_PPM: f64 = 500.0;
 /// Instants of the master that are remembered.
 const INSTANTS: usize = 64;
+/// A camera without a frame while all together gave this many times their number tells no longer what time it is.
+const SILENT_ROUNDS: u64 = 2;
 
 /// How a camera's clock differs from the master's.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
@@ -65,6 +67,8 @@ pub struct ClockAligner {
     master: usize,
     /// Corrected times of the master's last frames.
     instants: VecDeque<i64>,
+    /// Frames of all cameras.
+    arrivals: u64,
 }
 
 #[derive(Debug, Default)]
@@ -86,6 +90,8 @@ struct Clock {
     intervals: VecDeque<i64>,
     /// Waits for a master's frame at or after it.
     unpaired: VecDeque<i64>,
+    /// Frames of all cameras when this one's last frame came.
+    heard: u64,
 }
 
 impl Clock {
@@ -192,6 +198,7 @@ impl ClockAligner {
             cameras: cameras.iter().map(|id| (id.clone(), Clock::default())).collect(),
             master: slot.unwrap_or(0),
             instants: VecDeque::with_capacity(INSTANTS),
+            arrivals: 0,
         }
     }
 
@@ -213,13 +220,17 @@ impl ClockAligner {
     }
 
     fn time(&mut self, slot: usize, stamp: i64, sequence: u64) -> i64 {
+        self.arrivals += 1;
         let period = self.beat(slot);
-        // The newest instant that is known without this camera.
-        let now = if slot == self.master { self.others_now() } else { self.instants.back().copied() };
-        let instants = &self.instants;
         let is_master = slot == self.master;
-        let Some((_, clock)) = self.cameras.get_mut(slot) else { return stamp };
-        let (Some(now), false) = (now, is_master && clock.last.is_none()) else {
+        // The newest instant that is known without this camera. A master that is silent holds nobody back.
+        let of_master = self.instants.back().copied().filter(|_| !is_master && !self.is_silent(self.master));
+        let now = of_master.or_else(|| self.others_now(slot));
+        let (arrivals, instants) = (self.arrivals, &self.instants);
+        let Some((id, clock)) = self.cameras.get_mut(slot) else { return stamp };
+        clock.heard = arrivals;
+        let is_told = if is_master { clock.last.is_some() } else { clock.is_locked || of_master.is_some() };
+        let (Some(now), true) = (now, is_told) else {
             // Nothing to compare with yet.
             let time = clock.corrected(stamp);
             clock.note(stamp, sequence, time);
@@ -233,7 +244,7 @@ impl ClockAligner {
         }
         let mut time = clock.corrected(stamp);
         let near = |time: i64| {
-            time.saturating_sub(now).saturating_abs() <= PLAUSIBLE.max(period.unwrap_or(0).saturating_mul(4))
+            time.saturating_sub(now).saturating_abs() <= PLAUSIBLE.max(period.unwrap_or(0).saturating_mul(6))
         };
         let in_beat = |time: i64| {
             let gate = |period: i64| (period / 8).max(3_000_000);
@@ -255,7 +266,7 @@ impl ClockAligner {
                 if clock.suspects.len() >= CONFIRMATIONS {
                     clock.state.steps += 1;
                     clock.step(off);
-                    tracing::warn!("the clock stepped by {:.3} s, which is taken off", -(off as f64) * 1e-9);
+                    tracing::warn!(camera = %id, "the clock stepped by {:.3} s, which is taken off", -(off as f64) * 1e-9);
                 }
                 time = told;
             }
@@ -279,9 +290,16 @@ impl ClockAligner {
         }
     }
 
-    /// Median of the other cameras' newest times: one of them may be wrong.
-    fn others_now(&self) -> Option<i64> {
-        let others = self.cameras.iter().enumerate().filter(|(slot, _)| *slot != self.master);
+    /// Whether the others went on without this camera.
+    fn is_silent(&self, slot: usize) -> bool {
+        let heard = self.cameras.get(slot).map_or(0, |(_, clock)| clock.heard);
+        self.arrivals.saturating_sub(heard) > SILENT_ROUNDS * self.cameras.len() as u64
+    }
+
+    /// Median of the newest times of the cameras that go on, but for this one and the master: one of them may be wrong.
+    fn others_now(&self, own: usize) -> Option<i64> {
+        let others = self.cameras.iter().enumerate();
+        let others = others.filter(|(slot, _)| *slot != self.master && *slot != own && !self.is_silent(*slot));
         let mut times: Vec<i64> =
             others.filter_map(|(_, (_, clock))| clock.is_locked.then_some(clock.last?.2)).collect();
         times.sort_unstable();
@@ -317,7 +335,11 @@ impl ClockAligner {
             let Some(instant) = nearest.filter(|instant| instant.abs_diff(time) <= period.unsigned_abs() / 4) else {
                 continue;
             };
-            if clock.pairs.back().is_none_or(|(before, _)| stamp.wrapping_sub(*before).abs() >= PAIR_EVERY) {
+            if clock
+                .pairs
+                .back()
+                .is_none_or(|(before, _)| stamp.wrapping_sub(*before).unsigned_abs() >= PAIR_EVERY.unsigned_abs())
+            {
                 clock.pairs.push_back((stamp, instant));
                 if clock.pairs.len() > PAIRS {
                     clock.pairs.pop_front();

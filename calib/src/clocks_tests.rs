@@ -152,6 +152,24 @@ fn stamps_that_jump_or_wrap_for_a_moment_are_replaced() {
 }
 
 #[test]
+fn the_others_go_on_while_the_master_is_away() {
+    for cameras in 2..=4 {
+        let mut random = Random(9);
+        // The master is away for half a minute.
+        let frames = arrivals(&mut random, cameras, 1800, |random, camera, tick, truth| {
+            let away = camera == 0 && (300..1200).contains(&tick);
+            (!away).then(|| truth + 3_000_000 * camera as i64 + random.jitter(100_000))
+        });
+        let run = run(cameras, &frames);
+        let worst = worst(&run, 60, |tick| tick * PERIOD);
+        assert!(worst <= 1_000_000, "{cameras} cameras: {worst} ns off");
+        for (id, state) in run.aligner.clocks() {
+            assert_eq!((state.steps, state.replaced), (0, 0), "{cameras} cameras: {id}");
+        }
+    }
+}
+
+#[test]
 fn a_clock_that_wraps_goes_on() {
     let mut random = Random(5);
     let frames = arrivals(&mut random, 2, 1500, |random, camera, _, truth| {

@@ -4,6 +4,7 @@
 
 use std::{
     fmt::Write as _,
+    io::Write as _,
     path::{Path, PathBuf},
 };
 
@@ -308,7 +309,7 @@ impl YamlWriter {
     }
 
     pub fn finish(self) -> Result<(), CalibError> {
-        std::fs::write(&self.path, self.text)
+        flyrig_types::write_whole(&self.path, |out| out.write_all(self.text.as_bytes()))
             .map_err(|error| CalibError::Write { path: self.path, reason: error.to_string() })
     }
 }

@@ -12,7 +12,7 @@ pub(crate) enum StampSource {
     Other,
 }
 
-/// A believable stamp lies at most so long before its frame's arrival, nanoseconds.
+/// A believable stamp lies at most so long and an exposure before its frame's arrival, nanoseconds.
 const OLDEST: i64 = 1_000_000_000;
 /// And at most so long after it: clocks are read one after the other.
 const NEWEST: i64 = 5_000_000;
@@ -51,7 +51,9 @@ impl Stamps {
         let capture = match source {
             StampSource::Other => arrival_nanos.saturating_sub(half),
             source => {
-                let stamp = self.believed(stamp_nanos, arrival_nanos);
+                // A stamp of the start lies a whole exposure before the arrival.
+                let oldest = OLDEST.saturating_add(half.saturating_mul(2));
+                let stamp = self.believed(stamp_nanos, arrival_nanos, oldest);
                 if source == StampSource::StartOfExposure {
                     stamp.saturating_add(half)
                 } else {
@@ -65,10 +67,10 @@ impl Stamps {
         capture
     }
 
-    fn believed(&mut self, stamp_nanos: i64, arrival_nanos: i64) -> i64 {
+    fn believed(&mut self, stamp_nanos: i64, arrival_nanos: i64, oldest: i64) -> i64 {
         // Modulo 2^64, since drivers' clocks may wrap.
         let stamp = stamp_nanos.wrapping_add(self.offset_nanos);
-        if (-NEWEST..=OLDEST).contains(&arrival_nanos.wrapping_sub(stamp)) {
+        if (-NEWEST..=oldest).contains(&arrival_nanos.wrapping_sub(stamp)) {
             self.suspect = None;
             return stamp;
         }

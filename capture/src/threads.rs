@@ -264,6 +264,10 @@ impl Shared {
                 Ok(frame) => {
                     (pause, failures) = (FIRST_PAUSE, 0);
                     let order_nanos = source.order_nanos(&frame);
+                    // Before its stage: a reader that runs ahead would overtake all frames but the last.
+                    if self.pacing == Pacing::RealTime {
+                        self.pace(frame.capture_nanos);
+                    }
                     let is_open = match self.hands.get(slot) {
                         Some(hand) => self.hand_over(slot, hand, frame, order_nanos),
                         None => self.deliver(slot, frame, order_nanos),
@@ -279,7 +283,10 @@ impl Shared {
             if kind == CaptureErrorKind::EndOfStream {
                 return;
             }
-            self.count(slot, error);
+            // No frame yet is no error: who watches for silence looks at when the last frame came.
+            if kind != CaptureErrorKind::Timeout {
+                self.count(slot, error);
+            }
             if !kind.is_recoverable() {
                 return;
             }
@@ -309,17 +316,13 @@ impl Shared {
 
     /// Whether to go on.
     pub(crate) fn deliver(&self, slot: usize, frame: Frame, order_nanos: i64) -> bool {
-        match self.pacing {
-            Pacing::AsDelivered => {}
-            Pacing::RealTime => self.pace(frame.capture_nanos),
-            Pacing::Lossless => {
-                if !self.turns.wait(slot, order_nanos) || self.queue.push_wait(frame).is_err() {
-                    return false;
-                }
-                lock(&self.stats)[slot].frames += 1;
-                self.turns.done(slot, order_nanos);
-                return true;
+        if self.pacing == Pacing::Lossless {
+            if !self.turns.wait(slot, order_nanos) || self.queue.push_wait(frame).is_err() {
+                return false;
             }
+            lock(&self.stats)[slot].frames += 1;
+            self.turns.done(slot, order_nanos);
+            return true;
         }
         let Ok(oldest) = self.queue.push(frame) else { return false };
         let mut stats = lock(&self.stats);

@@ -133,6 +133,30 @@ fn a_stuck_decoder_holds_up_neither_its_camera_nor_another() {
     assert!(slow.ends_with(&[48, 49]), "the newest are kept: {slow:?}");
 }
 
+/// A recording: capture times lie a tenth of a second apart.
+struct Tenths(Box<dyn CameraSource>);
+
+impl CameraSource for Tenths {
+    fn camera(&self) -> &CameraId {
+        self.0.camera()
+    }
+
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
+        let frame = self.0.next_frame(timeout)?;
+        Ok(Frame { capture_nanos: frame.sequence as i64 * 100_000_000, ..frame })
+    }
+}
+
+#[test]
+fn a_recording_played_as_live_does_not_overtake_itself() {
+    let sources = vec![Box::new(Tenths(Fast::boxed("a", 12, &Arc::default(), grey))) as Box<dyn CameraSource>];
+    let config = ThreadsConfig { queue_capacity: 12, pacing: Pacing::RealTime };
+    let threads = CaptureThreads::start_staged(sources, |_| Box::new(Decoding::default()), config).unwrap();
+    let frames = drain(&threads).len();
+    // A stage that the machine stops for a tenth of a second may lose one.
+    assert!(frames >= 9, "{frames} of 12 frames are left");
+}
+
 #[test]
 fn a_damaged_picture_costs_its_own_frame() {
     let taken = Arc::default();

@@ -8,8 +8,7 @@ use std::{
 
 use anyhow::{Result, ensure};
 use flyrig_capture::{
-    CameraSource, CameraStats, CaptureErrorKind, CaptureThreads, FrameStage, JpegEncoding, Pacing, PopError,
-    ThreadsConfig,
+    CameraSource, CameraStats, CaptureThreads, FrameStage, JpegEncoding, Pacing, PopError, ThreadsConfig,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_transport::{CameraPublisher, CameraStatus};
@@ -17,8 +16,10 @@ use flyrig_types::{CameraId, Frame};
 
 use crate::{
     config::{Config, SourceKind},
-    health::{CameraHealth, Health, MetricsServer},
-    live, network,
+    health::{CameraHealth, Health},
+    live,
+    metrics_server::MetricsServer,
+    network,
     notify::ServiceManager,
     run,
     stats::resident_mib,
@@ -82,7 +83,7 @@ pub fn capture(config: &Config, gpu: Option<&GpuContext>) -> Result<()> {
                 publisher.publish_status(&camera.camera, &status(&host, camera, is_silent))?;
             }
             if let Some(metrics) = &metrics {
-                metrics.publish(health(stats).prometheus());
+                metrics.publish(health(stats, &last_frame).prometheus());
             }
         }
         if printed.elapsed() >= PRINT_EVERY {
@@ -123,7 +124,7 @@ fn start(config: &Config, sources: Vec<Box<dyn CameraSource>>) -> Result<Capture
 
 fn status(host: &str, stats: &CameraStats, is_silent: bool) -> CameraStatus {
     let problem = match &stats.last_error {
-        Some(error) if is_silent && error.kind != CaptureErrorKind::Timeout => error.message.clone(),
+        Some(error) if is_silent => error.message.clone(),
         _ if is_silent => "no frame for a second".to_owned(),
         _ => String::new(),
     };
@@ -143,11 +144,18 @@ fn status(host: &str, stats: &CameraStats, is_silent: bool) -> CameraStatus {
 }
 
 /// There are no sets here.
-fn health(stats: Vec<CameraStats>) -> Health {
-    let camera =
-        |stats| CameraHealth { stats, in_no_set: 0, interval_ms: 0.0, jitter_ms: 0.0, lateness_ms: None, clock: None };
+fn health(stats: Vec<CameraStats>, last_frame: &[Option<Instant>]) -> Health {
+    let camera = |(stats, last): (CameraStats, &Option<Instant>)| CameraHealth {
+        stats,
+        in_no_set: 0,
+        interval_ms: 0.0,
+        jitter_ms: 0.0,
+        lateness_ms: None,
+        quiet_s: last.map(|at| at.elapsed().as_secs_f64()),
+        clock: None,
+    };
     Health {
-        cameras: stats.into_iter().map(camera).collect(),
+        cameras: stats.into_iter().zip(last_frame).map(camera).collect(),
         complete_sets: 0,
         partial_sets: 0,
         skipped_sets: 0,

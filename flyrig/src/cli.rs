@@ -96,7 +96,7 @@ pub struct RecordArgs {
     #[arg(long)]
     pub out: PathBuf,
     /// Stop after so many seconds.
-    #[arg(long)]
+    #[arg(long, value_parser = parse_seconds)]
     pub seconds: Option<f64>,
 }
 
@@ -115,13 +115,13 @@ pub struct SyncCheckArgs {
     #[arg(required = true)]
     pub input: Vec<PathBuf>,
     /// Seconds that are compared.
-    #[arg(long, default_value_t = 20.0)]
+    #[arg(long, default_value_t = 20.0, value_parser = parse_seconds)]
     pub seconds: f64,
     /// Largest lag that is looked for, milliseconds.
     #[arg(long, default_value_t = 250.0, value_parser = parse_most_ms)]
     pub most_ms: f64,
     /// Frame rate of a folder.
-    #[arg(long, default_value_t = 30.0)]
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
     /// Folder with intri.yml and extri.yml: compare where the joints of a person are in place of what moves. Needs three
     /// cameras that see one person; a second and a half is enough.
@@ -243,7 +243,7 @@ pub struct DemoArgs {
     #[arg(long, default_value_t = 60, conflicts_with = "minutes")]
     pub frames: usize,
     /// Run for so long instead, the motion repeating.
-    #[arg(long)]
+    #[arg(long, value_parser = parse_minutes)]
     pub minutes: Option<f64>,
     /// Seed of the person and the room.
     #[arg(long, default_value_t = 1)]
@@ -302,7 +302,7 @@ pub struct WatchArgs {
     #[arg(long)]
     pub count: Option<usize>,
     /// Stop after so many seconds.
-    #[arg(long)]
+    #[arg(long, value_parser = parse_seconds)]
     pub seconds: Option<f64>,
     /// Stop when the rig ends its session.
     #[arg(long)]
@@ -342,7 +342,7 @@ pub struct EvalArgs {
     #[arg(long, value_parser = parse_range)]
     pub frames: Option<Range<u64>>,
     /// Frame rate of the folder.
-    #[arg(long, default_value_t = 30.0)]
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000)]
@@ -382,8 +382,8 @@ fn parse_minutes(text: &str) -> Result<f64, String> {
 
 fn parse_seconds(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
-        Ok(seconds) if (0.1..=100_000.0).contains(&seconds) => Ok(seconds),
-        _ => Err(format!("'{text}' is not between 0.1 and 100000 seconds")),
+        Ok(seconds) if (0.1..=1e6).contains(&seconds) => Ok(seconds),
+        _ => Err(format!("'{text}' is not between 0.1 and 1000000 seconds")),
     }
 }
 

@@ -10,7 +10,7 @@ use flyrig_sim::SimConfig;
 use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
 use serde::{Deserialize, Serialize};
 
-use crate::{cameras::CameraEntry, deformation::DeformOptions};
+use crate::{cameras::CameraEntry, deformation::DeformOptions, network};
 
 /// The commented default file, as `flyrig config print` writes it. A test keeps it equal to `Config::default()`.
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
@@ -192,6 +192,8 @@ impl Solver {
             Self::Paper => Some(DeformOptions::full(DeformSettings {
                 solver: DeformSolver::Paper { rate: PAPER_RATE },
                 regularization: PAPER_REGULARIZATION,
+                // The paper iterates on every frame.
+                rest: 0.0,
                 ..default
             })),
             Self::GaussNewton => Some(DeformOptions {
@@ -431,14 +433,20 @@ impl Config {
         range("output.jpeg_quality", f64::from(self.output.jpeg_quality), 1.0, 100.0)?;
         range("capture.jpeg_quality", f64::from(self.capture.jpeg_quality), 0.0, 100.0)?;
         range("record.jpeg_quality", f64::from(self.record.jpeg_quality), 0.0, 100.0)?;
-        range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)
+        range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)?;
+        network::transport(self).validate().context("in [rig] or [transport]")
     }
 
     /// What tracking needs beyond values in their ranges.
-    fn check_scene(&self) -> Result<()> {
+    pub fn check_scene(&self) -> Result<()> {
         ensure!(
             self.source.kind == SourceKind::Sim || !self.source.path.as_os_str().is_empty(),
             "source.path is empty: name the folder of the data set, the folder of the calibration for real cameras, or the recording"
+        );
+        ensure!(
+            self.source.kind != SourceKind::Network || !self.transport.connect.is_empty(),
+            "source.kind is \"network\" but transport.connect is empty: name the computers with cameras, such as \
+             tcp/10.0.0.2:7447"
         );
         ensure!(
             self.source.kind == SourceKind::Sim
@@ -462,11 +470,21 @@ fn nearest_key(message: &str) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::deformation::PAPER_COLOR_WEIGHT;
 
     #[test]
     fn the_printed_default_is_the_default() {
         assert_eq!(Config::parse(DEFAULT_TOML).unwrap(), Config::default());
         assert_eq!(Config::parse("").unwrap(), Config::default());
+    }
+
+    #[test]
+    fn the_papers_solver_is_measured_as_the_paper_tells() {
+        let options = Solver::Paper.options(Origin::Given).unwrap();
+        assert!((options.color_weight - PAPER_COLOR_WEIGHT).abs() < 1e-6);
+        assert!((options.solver.regularization - 200.0).abs() < 1e-9);
+        assert!(options.solver.rest <= 0.0, "every frame has its iterations");
+        assert_eq!((options.gaussians, options.max_level), (usize::MAX, 0));
     }
 
     #[test]

@@ -12,7 +12,7 @@ const NO_CAMERA: &str = "no camera: plug one in, or simulate a rig with source.k
 
 /// Runs the command. Prints everything it can find out; fails only when the configuration cannot be read.
 pub fn doctor(config: Option<&Path>) -> Result<()> {
-    let config = config.map(Config::load).transpose()?;
+    let config = config.map(Config::load_for_capture).transpose()?;
     let mut mends = Vec::new();
     print!("{}", cameras(config.as_ref(), &mut mends));
     println!("graphics adapters");

@@ -1,29 +1,14 @@
 //! How the rig is: one snapshot for the terminal and for Prometheus.
 
-use std::{
-    fmt::Write as _,
-    io::{Read as _, Write as _},
-    net::{SocketAddr, TcpListener, TcpStream},
-    sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, Ordering},
-    },
-    thread::{Builder, JoinHandle},
-    time::Duration,
-};
+use std::fmt::Write as _;
 
-use anyhow::{Context as _, Result};
 use flyrig_calib::ClockState;
 use flyrig_capture::CameraStats;
 
 use crate::stats::StageSummary;
 
-/// Longest that a client may take to ask or to read.
-const PATIENCE: Duration = Duration::from_secs(1);
-/// Longest request that is read.
-const REQUEST_BYTES: usize = 8192;
-/// How often the server looks whether it shall stop.
-const LOOK: Duration = Duration::from_millis(100);
+/// A camera whose last frame is older than this, or than five intervals, is down, seconds.
+const UP_WITHIN_S: f64 = 5.0;
 
 /// One camera.
 #[derive(Debug, Clone)]
@@ -36,8 +21,17 @@ pub struct CameraHealth {
     pub jitter_ms: f64,
     /// From the capture to the synchronizer, milliseconds; known for cameras of this computer.
     pub lateness_ms: Option<f64>,
+    /// Since the last frame, seconds; none before the first.
+    pub quiet_s: Option<f64>,
     /// For cameras with clocks of their own.
     pub clock: Option<ClockState>,
+}
+
+impl CameraHealth {
+    /// Whether frames come.
+    fn is_up(&self) -> bool {
+        self.stats.running && self.quiet_s.is_some_and(|quiet| quiet < (5e-3 * self.interval_ms).max(UP_WITHIN_S))
+    }
 }
 
 /// The rig.
@@ -64,7 +58,7 @@ impl Health {
         };
         let label = |camera: &CameraHealth| format!("{{camera=\"{}\"}}", escaped(camera.stats.camera.as_str()));
         type Field<'a> = &'a dyn Fn(&CameraHealth) -> Option<f64>;
-        let per_camera: [(&str, &str, &str, Field<'_>); 20] = [
+        let per_camera: [(&str, &str, &str, Field<'_>); 21] = [
             ("frames_total", "counter", "Frames that came.", &|c| Some(c.stats.frames as f64)),
             ("frames_lost_before_us_total", "counter", "Frames that the driver numbered and nobody got.", &|c| {
                 Some(c.stats.health.lost_by_driver as f64)
@@ -80,16 +74,20 @@ impl Health {
                 Some(c.stats.health.silences as f64)
             }),
             ("stamps_replaced_total", "counter", "Time stamps that could not be right.", &|c| {
-                Some((c.stats.health.stamps_replaced + c.clock.map_or(0, |clock| clock.replaced)) as f64)
+                let of_clock = c.clock.map_or(0, |clock| clock.replaced);
+                Some(c.stats.health.stamps_replaced.saturating_add(of_clock) as f64)
             }),
-            ("camera_up", "gauge", "Whether the camera's thread reads.", &|c| {
-                Some(f64::from(u8::from(c.stats.running)))
+            ("camera_up", "gauge", "Whether frames come.", &|c| Some(f64::from(u8::from(c.is_up())))),
+            ("quiet_seconds", "gauge", "Since the last frame.", &|c| c.quiet_s),
+            ("interval_seconds", "gauge", "Mean time between captures.", &|c| {
+                (c.is_up() && c.interval_ms > 0.0).then_some(c.interval_ms / 1e3)
             }),
-            ("interval_seconds", "gauge", "Mean time between captures.", &|c| Some(c.interval_ms / 1e3)),
             ("jitter_seconds", "gauge", "Standard deviation of the time between captures.", &|c| {
-                Some(c.jitter_ms / 1e3)
+                (c.is_up() && c.interval_ms > 0.0).then_some(c.jitter_ms / 1e3)
             }),
-            ("lateness_seconds", "gauge", "From capture to synchronizer.", &|c| c.lateness_ms.map(|ms| ms / 1e3)),
+            ("lateness_seconds", "gauge", "From capture to synchronizer.", &|c| {
+                c.lateness_ms.filter(|_| c.is_up()).map(|ms| ms / 1e3)
+            }),
             ("clock_drift_ppm", "gauge", "Drift against the master's clock.", &|c| {
                 c.clock.map(|clock| clock.drift_ppm)
             }),
@@ -106,7 +104,7 @@ impl Health {
                 c.stats.health.network.map(|n| n.overtaken_here as f64)
             }),
             ("network_refused_total", "counter", "Messages that could not be used.", &|c| {
-                c.stats.health.network.map(|n| (n.refused + n.before_clock) as f64)
+                c.stats.health.network.map(|n| n.refused.saturating_add(n.before_clock) as f64)
             }),
             ("host_clock_offset_seconds", "gauge", "Clock of the camera's computer minus ours.", &|c| {
                 Some(c.stats.health.network?.clock_offset_nanos? as f64 * 1e-9)
@@ -191,91 +189,6 @@ fn escaped(text: &str) -> String {
     text.replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n")
 }
 
-/// Answers every HTTP request with the text published last, one client at a time.
-pub struct MetricsServer {
-    text: Arc<Mutex<String>>,
-    stop: Arc<AtomicBool>,
-    address: SocketAddr,
-    thread: Option<JoinHandle<()>>,
-}
-
-impl MetricsServer {
-    /// Listens on an address; port 0 takes a free one.
-    ///
-    /// # Errors
-    /// Names the address when it is taken.
-    pub fn start(address: &str) -> Result<Self> {
-        let listener =
-            TcpListener::bind(address).with_context(|| format!("health.listen: cannot listen on {address}"))?;
-        listener.set_nonblocking(true)?;
-        let (text, stop) = (Arc::new(Mutex::new(String::new())), Arc::new(AtomicBool::new(false)));
-        let address = listener.local_addr()?;
-        let (of_thread, stopped) = (Arc::clone(&text), Arc::clone(&stop));
-        let serve = move || {
-            while !stopped.load(Ordering::Relaxed) {
-                match listener.accept() {
-                    Ok((client, _)) => {
-                        let text = lock(&of_thread).clone();
-                        // A client that asks badly is its own loss.
-                        let _ = answer(client, &text);
-                    }
-                    Err(_) => std::thread::sleep(LOOK),
-                }
-            }
-        };
-        let thread = Some(Builder::new().name("metrics".to_owned()).spawn(serve)?);
-        Ok(Self { text, stop, address, thread })
-    }
-
-    /// Where it listens.
-    pub fn address(&self) -> SocketAddr {
-        self.address
-    }
-
-    /// What is answered from now on.
-    pub fn publish(&self, text: String) {
-        *lock(&self.text) = text;
-    }
-}
-
-impl Drop for MetricsServer {
-    fn drop(&mut self) {
-        self.stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
-    }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-fn answer(mut client: TcpStream, text: &str) -> std::io::Result<()> {
-    client.set_nonblocking(false)?;
-    client.set_read_timeout(Some(PATIENCE))?;
-    client.set_write_timeout(Some(PATIENCE))?;
-    let mut request = Vec::new();
-    let mut piece = [0; 512];
-    while !request.windows(4).any(|window| window == b"\r\n\r\n") && request.len() < REQUEST_BYTES {
-        match client.read(&mut piece)? {
-            0 => break,
-            read => request.extend_from_slice(&piece[..read]),
-        }
-    }
-    let (status, body) = if request.starts_with(b"GET /metrics ") || request.starts_with(b"GET / ") {
-        ("200 OK", text)
-    } else {
-        ("404 Not Found", "the metrics are at /metrics\n")
-    };
-    write!(
-        client,
-        "HTTP/1.1 {status}\r\nContent-Type: text/plain; version=0.0.4; charset=utf-8\r\nContent-Length: {}\r\n\
-         Connection: close\r\n\r\n{body}",
-        body.len()
-    )
-}
-
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;
@@ -307,8 +220,8 @@ mod tests {
             running: true,
         };
         let clock = Some(ClockState { drift_ppm: -12.5, ..ClockState::default() });
-        let (interval_ms, jitter_ms, lateness_ms) = (33.3, 0.4, Some(12.0));
-        let camera = CameraHealth { stats, in_no_set: 5, interval_ms, jitter_ms, lateness_ms, clock };
+        let (interval_ms, jitter_ms, lateness_ms, quiet_s) = (33.3, 0.4, Some(12.0), Some(0.1));
+        let camera = CameraHealth { stats, in_no_set: 5, interval_ms, jitter_ms, lateness_ms, quiet_s, clock };
         let stage = StageSummary { name: "draw".into(), frames: 1, mean_ms: 2.0, p50_ms: 2.0, p95_ms: 4.0 };
         let (complete_sets, partial_sets, skipped_sets) = (800, 10, 4);
         let resident_mib = Some(2.0);
@@ -342,6 +255,22 @@ mod tests {
     }
 
     #[test]
+    fn a_camera_without_frames_is_down_and_tells_nothing_old() {
+        let mut health = health();
+        let has = |health: &Health, start: &str| health.prometheus().lines().any(|line| line.starts_with(start));
+        assert!(has(&health, "flyrig_camera_up{camera=\"le\\\"ft\"} 1"));
+        for quiet_s in [Some(60.0), None] {
+            health.cameras[0].quiet_s = quiet_s;
+            assert!(has(&health, "flyrig_camera_up{camera=\"le\\\"ft\"} 0"));
+            assert!(!has(&health, "flyrig_lateness_seconds{") && !has(&health, "flyrig_interval_seconds{"));
+        }
+        // A status of another computer may hold any number.
+        health.cameras[0].stats.health.stamps_replaced = u64::MAX;
+        health.cameras[0].clock = Some(ClockState { replaced: 7, ..ClockState::default() });
+        assert!(has(&health, "flyrig_stamps_replaced_total{"));
+    }
+
+    #[test]
     fn the_table_has_a_row_a_camera() {
         let table = health().table();
         let row = table.lines().nth(1).unwrap();
@@ -349,31 +278,5 @@ mod tests {
         assert_eq!(cells[..9], ["le\"ft", "900", "7", "3", "5", "2", "1", "0.40", "12.0"]);
         assert!(row.ends_with("  YUYV 640x360 at 30.00  network: 8 lost, clock -1.5000 s +2.5 ppm"), "{row}");
         assert_eq!(table.lines().last(), Some("sets: 800 complete, 10 partial, 4 skipped"));
-    }
-
-    fn ask(server: &MetricsServer, request: &str) -> String {
-        let mut client = TcpStream::connect(server.address()).unwrap();
-        client.write_all(request.as_bytes()).unwrap();
-        let mut answer = String::new();
-        client.read_to_string(&mut answer).unwrap();
-        answer
-    }
-
-    #[test]
-    fn clients_get_the_newest_text_and_bad_ones_do_no_harm() {
-        let server = MetricsServer::start("127.0.0.1:0").unwrap();
-        server.publish("flyrig_frames_total 1\n".to_owned());
-        // Gone before the answer.
-        drop(TcpStream::connect(server.address()).unwrap());
-        let answer = ask(&server, "GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n");
-        assert!(
-            answer.starts_with("HTTP/1.1 200 OK\r\n") && answer.ends_with("\r\n\r\nflyrig_frames_total 1\n"),
-            "{answer}"
-        );
-        assert!(ask(&server, "GET /secrets HTTP/1.1\r\n\r\n").starts_with("HTTP/1.1 404"));
-        server.publish("flyrig_frames_total 2\n".to_owned());
-        assert!(ask(&server, "GET / HTTP/1.0\r\n\r\n").ends_with("flyrig_frames_total 2\n"));
-        let taken = MetricsServer::start(&server.address().to_string()).err().unwrap();
-        assert!(format!("{taken:#}").contains("health.listen: cannot listen on 127.0.0.1"), "{taken:#}");
     }
 }

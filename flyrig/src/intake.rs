@@ -43,12 +43,14 @@ struct Timing {
     /// Mean square of the distance from the mean interval.
     variance: f64,
     lateness_ms: f64,
+    arrived: Option<Instant>,
 }
 
 impl Timing {
     const MEMORY: f64 = 100.0;
 
     fn add(&mut self, capture_nanos: i64, now_nanos: i64) {
+        self.arrived = Some(Instant::now());
         if let Some(last) = self.last_nanos.replace(capture_nanos) {
             self.frames = (self.frames + 1.0).min(Self::MEMORY);
             let interval = capture_nanos.saturating_sub(last) as f64 * 1e-6;
@@ -160,6 +162,7 @@ impl Intake {
                 interval_ms: timing.interval_ms,
                 jitter_ms: timing.variance.max(0.0).sqrt(),
                 lateness_ms: self.is_live.then_some(timing.lateness_ms),
+                quiet_s: timing.arrived.map(|at| at.elapsed().as_secs_f64()),
                 clock: clocks.get(slot).copied(),
             }
         });

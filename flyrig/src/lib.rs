@@ -16,6 +16,7 @@ mod eval;
 mod health;
 mod intake;
 mod live;
+mod metrics_server;
 mod network;
 mod notify;
 mod outlet;
@@ -122,8 +123,13 @@ fn dispatch(cli: &Cli) -> Result<()> {
             Ok(())
         }
         Command::Config { action: ConfigAction::Check { config } } => {
-            Config::load(config)?;
-            println!("{} is right", config.display());
+            let loaded = Config::load_for_capture(config)?;
+            match loaded.check_scene() {
+                Ok(()) => println!("{} is right", config.display()),
+                Err(error) => {
+                    println!("{} is right for `flyrig capture` and `flyrig doctor` alone: {error}", config.display());
+                }
+            }
             Ok(())
         }
     }

@@ -24,6 +24,7 @@ use crate::{
     cli::{RecordArgs, ReplayArgs},
     config::Config,
     png, pose_recording,
+    report::write_whole,
     run::{self, Scene},
     stop,
 };
@@ -191,10 +192,10 @@ fn write_set(folder: &Path, set: &FrameSet) -> Result<()> {
         let (image, stem) = (&frame.image, format!("{:06}", set.index));
         let path = folder.join("images").join(frame.camera.as_str());
         match image.format() {
-            PixelFormat::Mjpeg => fs::write(path.join(stem + ".jpg"), image.bytes())?,
+            PixelFormat::Mjpeg => write_whole(&path.join(stem + ".jpg"), image.bytes())?,
             _ => {
                 let encoded = png::encode_rgb(&to_rgb8(image)?, image.width(), image.height())?;
-                fs::write(path.join(stem + ".png"), encoded)?;
+                write_whole(&path.join(stem + ".png"), &encoded)?;
             }
         }
     }

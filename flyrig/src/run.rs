@@ -12,16 +12,18 @@ use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, VideoOpt
 use flyrig_gpu::GpuContext;
 use flyrig_sim::{SimTime, Simulator};
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
-use flyrig_transport::{Publisher, TransportConfig};
+use flyrig_transport::Publisher;
 use flyrig_types::{CameraId, FrameSet, Image, Rig};
 
 use crate::{
     config::{Config, Origin, SourceKind},
     dataset,
     engine::Engine,
-    health::{Health, MetricsServer},
+    health::Health,
     intake::Intake,
-    live, network,
+    live,
+    metrics_server::MetricsServer,
+    network,
     notify::ServiceManager,
     outlet::Outlet,
     pipeline::{Outcome, Pipeline, PoseSource},
@@ -105,12 +107,7 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
     )?;
     let mut pipeline = Pipeline::new(engine, scene.rig, pose, config.body.masks, scene.plates);
     pipeline.per_view_time = config.tracking.per_view_time;
-    let publisher = Publisher::open(&TransportConfig {
-        listen: config.transport.listen.clone(),
-        connect: config.transport.connect.clone(),
-        max_viewers: config.transport.max_viewers,
-        ..TransportConfig::publisher(&config.rig.name)
-    })?;
+    let publisher = Publisher::open(&network::transport(config))?;
     publisher.set_calibration(pipeline.rig())?;
     let mut outlet = Outlet::start(publisher, config.output.jpeg_quality)?;
     let views = Views::new(config.output.views, config.output.width, config.output.height);
@@ -128,7 +125,8 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
     let manager = ServiceManager::from_env();
     manager.tell("READY=1");
     let mut last_health: Option<Instant> = None;
-    let (started, mut last_print, mut frames, mut printed) = (Instant::now(), Instant::now(), 0u64, 0u64);
+    let (started, mut last_print) = (Instant::now(), Instant::now());
+    let (mut frames, mut printed, mut held) = (0u64, 0u64, 0u64);
     while !stop.load(std::sync::atomic::Ordering::Relaxed) && !intake.ended() {
         let set = intake.next_set(Duration::from_millis(200));
         if last_health.is_none_or(|at| at.elapsed() >= HEALTH_EVERY) {
@@ -145,7 +143,13 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
         }
         let Some(set) = set else { continue };
         match pipeline.process(&set)? {
-            Outcome::Held(reason) => tracing::warn!(set = set.index, %reason, "frame set not used"),
+            Outcome::Held(reason) => {
+                held += 1;
+                // The 1st, 2nd, 4th ...: a room that is empty all night must not fill the disk.
+                if held.is_power_of_two() {
+                    tracing::warn!(set = set.index, held, %reason, "frame set not used");
+                }
+            }
             Outcome::Updated => record_pose(poses.as_mut(), &pipeline, set.master_nanos),
         }
         frames += 1;
@@ -234,6 +238,7 @@ pub fn sync_config(config: &Config) -> SyncConfig {
 
 fn learn_shape(estimator: &mut PoseEstimator, intake: &mut Intake) -> Result<()> {
     eprintln!("run: learning the person's shape, please stand in view of all cameras");
+    let mut tries = 0u64;
     loop {
         let mut sets = Vec::new();
         while sets.len() < SHAPE_SETS {
@@ -249,7 +254,12 @@ fn learn_shape(estimator: &mut PoseEstimator, intake: &mut Intake) -> Result<()>
                 eprintln!("run: the person is {:.2} m tall", fit.height_m);
                 return Ok(());
             }
-            Err(error) => tracing::warn!(%error, "nobody seen, trying again"),
+            Err(error) => {
+                tries += 1;
+                if tries.is_power_of_two() {
+                    tracing::warn!(%error, tries, "nobody seen, trying again");
+                }
+            }
         }
     }
 }

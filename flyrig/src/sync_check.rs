@@ -31,6 +31,11 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(cameras.len() > 1, "one camera alone has no lag; name at least two");
     if let Some(folder) = &args.calibration {
+        ensure!(
+            !is_live,
+            "--calibration looks at every frame, which takes longer than live cameras wait; record them first (flyrig \
+             record) and give the recording"
+        );
         return by_person(args, folder, sources, &cameras);
     }
     let mut signals: Vec<MotionSignal> = cameras.iter().cloned().map(MotionSignal::new).collect();
@@ -68,7 +73,8 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
         );
     } else {
         println!(
-            "lag ms is how much later than the first camera's a camera's stamps are: lag_ms of its [[source.cameras]]"
+            "lag ms is how much later than the first camera's a camera's stamps are: add it to the lag_ms that its \
+             [[source.cameras]] has (0 without one)"
         );
     }
     Ok(())

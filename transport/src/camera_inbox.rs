@@ -25,6 +25,8 @@ const OLDEST: i64 = 10_000_000_000;
 const EARLIEST: i64 = 500_000_000;
 /// Computers and names that are remembered.
 const MAX_HOSTS: usize = 256;
+/// So often a computer without answers is asked in quick succession.
+const EAGER_QUESTIONS: u32 = 100;
 
 #[derive(Debug)]
 pub(crate) struct CameraInbox {
@@ -40,6 +42,14 @@ pub(crate) struct CameraInbox {
 struct Host {
     clock_key: String,
     fit: ClockFit,
+    asked: u32,
+}
+
+impl Host {
+    /// Whether it was asked often and never told its time.
+    fn is_mute(&self) -> bool {
+        self.asked >= EAGER_QUESTIONS && self.fit.is_young()
+    }
 }
 
 #[derive(Debug)]
@@ -90,20 +100,25 @@ impl CameraInbox {
         let id = header::fnv1a(name.as_bytes());
         if !is_alive {
             self.hosts.remove(&id);
-        } else if self.hosts.len() < MAX_HOSTS {
+            return;
+        }
+        if self.hosts.len() >= MAX_HOSTS {
+            // Names that nobody answers to must not keep a real computer out.
+            self.hosts.retain(|_, host| !host.is_mute());
+        }
+        if self.hosts.len() < MAX_HOSTS {
             let clock_key = keys::key(&self.rig, &format!("clock/{name}"));
-            self.hosts.entry(id).or_insert_with(|| Host { clock_key, fit: ClockFit::default() });
+            self.hosts.entry(id).or_insert_with(|| Host { clock_key, fit: ClockFit::default(), asked: 0 });
         }
     }
 
     /// Whose clock to ask for.
-    pub fn questions(&self) -> Vec<Question> {
-        let question = |(host, state): (&u64, &Host)| Question {
-            key: state.clock_key.clone(),
-            host: *host,
-            is_urgent: state.fit.is_young(),
+    pub fn questions(&mut self) -> Vec<Question> {
+        let question = |(host, state): (&u64, &mut Host)| {
+            state.asked = state.asked.saturating_add(1);
+            Question { key: state.clock_key.clone(), host: *host, is_urgent: state.fit.is_young() && !state.is_mute() }
         };
-        self.hosts.iter().map(question).collect()
+        self.hosts.iter_mut().map(question).collect()
     }
 
     pub fn clock(&mut self, host: u64, asked: i64, answer: i64, answered: i64) {

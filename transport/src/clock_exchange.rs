@@ -12,7 +12,7 @@ use std::{
 use zenoh::{
     Session, Wait,
     qos::{CongestionControl, Priority},
-    query::Query,
+    query::{ConsolidationMode, Query},
 };
 
 use crate::{HostClock, TransportError};
@@ -101,6 +101,8 @@ where
     let asked = clock.now_nanos();
     let sent = session
         .get(&question.key)
+        // Else the answer is held back until the question is closed, which would count as its way.
+        .consolidation(ConsolidationMode::None)
         .congestion_control(CongestionControl::Drop)
         .priority(Priority::RealTime)
         .express(true)

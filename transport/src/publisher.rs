@@ -278,7 +278,7 @@ fn answer_viewpoint(shared: &Shared, query: &Query) {
     let payload = query.payload().map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
     let answer = lock(&shared.leases).ask(subscriber, from_json(key, &payload), Instant::now());
     if !answer.granted {
-        tracing::info!(subscriber, reason = answer.reason, "refused a viewpoint");
+        tracing::debug!(subscriber, reason = answer.reason, "refused a viewpoint");
     }
     shared.sync_viewer_topics();
     shared.wake();
