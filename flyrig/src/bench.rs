@@ -1,5 +1,6 @@
-//! `flyrig bench track`: how much error is left for how much time, on simulated people whose clothes are known.
+//! `flyrig bench`: how much error is left for how much time, on simulated people whose clothes and looks are known.
 
+mod appearance;
 mod case;
 pub(crate) mod plot;
 mod processor;
@@ -15,6 +16,7 @@ use anyhow::{Context, Result, ensure};
 use flyrig_gpu::GpuContext;
 use flyrig_tracker::DeformSolver;
 
+pub use self::appearance::appearance;
 use self::case::{Case, run_case};
 pub use self::sequence::{Motion, Sequence, SequenceConfig};
 use crate::{cli::BenchTrackArgs, config::Solver, deformation::PAPER_COLOR_WEIGHT, eval::progress_bar};

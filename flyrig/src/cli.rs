@@ -2,7 +2,8 @@
 
 use std::{net::SocketAddr, ops::Range, path::PathBuf};
 
-use clap::{Args, Parser, Subcommand, builder::TypedValueParser as _};
+use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
+use flyrig_stfa::NetworkSize;
 
 use crate::config::{AppearanceMode, Origin, Solver};
 
@@ -76,6 +77,8 @@ pub enum Command {
         #[command(subcommand)]
         action: SimAction,
     },
+    /// Train the networks of learned appearance.
+    Train(TrainArgs),
     /// Measure run time against error on simulated people.
     Bench {
         #[command(subcommand)]
@@ -150,14 +153,127 @@ pub struct SimExportArgs {
     pub no_truth: bool,
 }
 
+#[derive(Debug, Args)]
+pub struct TrainArgs {
+    /// Folder of samples, checkpoint, weights and curves. A folder with a checkpoint is gone on with.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Simulated people to train on.
+    #[arg(long, default_value_t = 60)]
+    pub people: u64,
+    /// Simulated people, of another seed, that only measure progress.
+    #[arg(long, default_value_t = 8)]
+    pub test_people: u64,
+    /// Instants of each simulated person.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
+    pub instants: u64,
+    /// Seed of people, starting weights and order.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Recorded data set (EasyMocap layout, with masks) to train on as well, every camera held out in turn; may be given
+    /// several times.
+    #[arg(long)]
+    pub dataset: Vec<PathBuf>,
+    /// Cameras of --dataset, comma separated; all of them otherwise.
+    #[arg(long, value_delimiter = ',')]
+    pub cameras: Vec<String>,
+    /// Frames of --dataset from one sample to the next.
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=100_000))]
+    pub every: u64,
+    /// Pose in --dataset: from its glTF animation, or from the pictures.
+    #[arg(long, value_enum, default_value = "given")]
+    pub pose: Origin,
+    /// Frame rate of --dataset.
+    #[arg(long, default_value_t = 30.0)]
+    pub fps: f64,
+    /// Folder of further samples, as an earlier run left them; may be given several times.
+    #[arg(long)]
+    pub extra: Vec<PathBuf>,
+    /// Steps in all.
+    #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
+    pub steps: u64,
+    /// Adam's rate at the start; it falls to zero along half a cosine.
+    #[arg(long, default_value_t = 2e-3)]
+    pub rate: f32,
+    /// Weight of structural similarity beside the mean squared difference.
+    #[arg(long, default_value_t = 0.2)]
+    pub structure: f32,
+    /// Weight of fine contrast beside it, which keeps prints from fading.
+    #[arg(long, default_value_t = 1.0)]
+    pub contrast: f32,
+    /// How large the networks are.
+    #[arg(long, value_enum, default_value = "small")]
+    pub size: SizeName,
+    /// Checkpoints (one every 250 steps) from one measurement on the test people to the next.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub test_every: u64,
+    /// Pixels of a simulated picture's side.
+    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
+}
+
+/// Sizes of the networks of learned appearance.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum SizeName {
+    Tiny,
+    Small,
+    Medium,
+}
+
+impl SizeName {
+    pub fn size(self) -> NetworkSize {
+        match self {
+            Self::Tiny => NetworkSize::TINY,
+            Self::Small => NetworkSize::SMALL,
+            Self::Medium => NetworkSize::MEDIUM,
+        }
+    }
+}
+
 #[derive(Debug, Subcommand)]
 pub enum BenchCommand {
     /// Deformation tracking: solvers, iterations, Gaussians, resolution and views; writes CSV, JSON and SVG.
     Track(BenchTrackArgs),
+    /// Appearance: every mode on simulated people that nobody trained on; writes CSV, JSON and SVG.
+    Appearance(BenchAppearanceArgs),
     /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to whole sets.
     Capture(BenchCaptureArgs),
     /// Recording uncompressed cameras: bytes, processor time and loss of each JPEG quality against pictures as they come.
     Record(BenchRecordArgs),
+}
+
+#[derive(Debug, Args)]
+pub struct BenchAppearanceArgs {
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-appearance")]
+    pub out: PathBuf,
+    /// Seed of the first person; the others follow.
+    #[arg(long, default_value_t = 101)]
+    pub seed: u64,
+    /// How many people.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub people: u64,
+    /// Frames of each sequence; the second half is scored.
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
+    pub frames: usize,
+    /// Numbers of input cameras, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "3,1", value_parser = clap::value_parser!(u8).range(1..=6).map(usize::from))]
+    pub views: Vec<usize>,
+    /// Weights files of the learned modes, in place of the networks that come with flyrig; may be given several times.
+    #[arg(long)]
+    pub weights: Vec<PathBuf>,
+    /// What the networks keep from frame to frame: see `reuse` in the configuration.
+    #[arg(long, default_value_t = 0.0)]
+    pub reuse: f32,
+    /// Pixels of a picture's side.
+    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
 }
 
 #[derive(Debug, Args)]
@@ -264,6 +380,9 @@ pub struct DemoArgs {
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
     pub appearance: AppearanceMode,
+    /// Weights file of the learned modes, in place of the networks that come with flyrig.
+    #[arg(long)]
+    pub weights: Option<PathBuf>,
     /// Also score the modes that `direct` adds to (takes three times as long).
     #[arg(long)]
     pub ablation: bool,
@@ -338,6 +457,12 @@ pub struct EvalArgs {
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
     pub appearance: AppearanceMode,
+    /// Weights file of the learned modes, in place of the networks that come with flyrig.
+    #[arg(long)]
+    pub weights: Option<PathBuf>,
+    /// What the networks keep from frame to frame: see `reuse` in the configuration.
+    #[arg(long, default_value_t = 0.0)]
+    pub reuse: f32,
     /// Frames FIRST..END, END excluded; all of them otherwise.
     #[arg(long, value_parser = parse_range)]
     pub frames: Option<Range<u64>>,

@@ -7,6 +7,7 @@ use clap::ValueEnum;
 use flyrig_calib::ClockKind;
 use flyrig_renderer::AppearanceSettings;
 use flyrig_sim::SimConfig;
+use flyrig_stfa::Parameters;
 use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
 use serde::{Deserialize, Serialize};
 
@@ -264,17 +265,36 @@ pub enum AppearanceMode {
     DirectNoTime,
     /// Projection only, as the paper's "w/o ST" baseline.
     DirectNoSpaceTime,
+    /// `direct`, and what trained networks add to it.
+    Stfa,
+    /// The same without the temporal memory.
+    StfaNoTime,
+    /// The same without graph and memory.
+    StfaNoSpaceTime,
 }
 
 impl AppearanceMode {
     /// What the renderer is told.
     pub fn settings(self) -> AppearanceSettings {
         let (space, time) = match self {
-            Self::Direct => (true, true),
-            Self::DirectNoTime => (true, false),
-            Self::DirectNoSpaceTime => (false, false),
+            Self::Direct | Self::Stfa => (true, true),
+            Self::DirectNoTime | Self::StfaNoTime => (true, false),
+            Self::DirectNoSpaceTime | Self::StfaNoSpaceTime => (false, false),
         };
         AppearanceSettings { space, time, ..AppearanceSettings::default() }
+    }
+
+    /// Whether networks add to direct appearance.
+    pub fn is_learned(self) -> bool {
+        matches!(self, Self::Stfa | Self::StfaNoTime | Self::StfaNoSpaceTime)
+    }
+
+    /// The networks that add to it, from this file or those that come with the program. None for the direct modes.
+    pub fn networks(self, weights: Option<&Path>) -> Result<Option<Parameters>> {
+        if !self.is_learned() {
+            return Ok(None);
+        }
+        Ok(Some(weights.map_or_else(Parameters::embedded, Parameters::load)?))
     }
 }
 
@@ -282,11 +302,22 @@ impl AppearanceMode {
 #[serde(deny_unknown_fields, default)]
 pub struct AppearanceSection {
     pub mode: AppearanceMode,
+    /// Weights file of the learned modes; empty: the networks that come with the program.
+    pub weights: PathBuf,
+    /// Inputs of a Gaussian that changed by no more than this leave what the networks add to its colour as it was.
+    pub reuse: f32,
+}
+
+impl AppearanceSection {
+    /// What adds to direct appearance.
+    pub fn networks(&self) -> Result<Option<Parameters>> {
+        self.mode.networks(Some(self.weights.as_path()).filter(|path| !path.as_os_str().is_empty()))
+    }
 }
 
 impl Default for AppearanceSection {
     fn default() -> Self {
-        Self { mode: AppearanceMode::Direct }
+        Self { mode: AppearanceMode::Direct, weights: PathBuf::new(), reuse: 0.0 }
     }
 }
 
@@ -427,6 +458,7 @@ impl Config {
         range("tracking.gaussians", self.tracking.gaussians as f64, 100.0, 2_000_000.0)?;
         range("tracking.views", self.tracking.views as f64, 0.0, 1000.0)?;
         range("tracking.rest", self.tracking.rest, 0.0, 0.5)?;
+        range("appearance.reuse", f64::from(self.appearance.reuse), 0.0, 1.0)?;
         range("output.views", self.output.views as f64, 0.0, 16.0)?;
         range("output.width", f64::from(self.output.width), 16.0, 4096.0)?;
         range("output.height", f64::from(self.output.height), 16.0, 4096.0)?;

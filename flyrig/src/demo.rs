@@ -206,7 +206,7 @@ fn pass(
         .filter(|source| inputs.slot(source.camera()).is_some())
         .map(|source| Box::new(source) as Box<dyn CameraSource>)
         .collect();
-    let engine = Engine::new(
+    let mut engine = Engine::new(
         gpu.clone(),
         template,
         args.gaussians,
@@ -215,6 +215,9 @@ fn pass(
         mode.settings(),
         args.solver.options(Origin::Given),
     )?;
+    if let Some(networks) = mode.networks(args.weights.as_deref())? {
+        engine.use_networks(&networks, 0.0)?;
+    }
     let no_plates = inputs.cameras.iter().map(|_| None).collect();
     let mut pipeline =
         Pipeline::new(engine, inputs, PoseSource::Track { track, repeat: true }, Origin::Given, no_plates);

@@ -9,9 +9,10 @@ use flyrig_body::{
 use flyrig_capture::to_rgb8;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::{
-    AppearanceSettings, DirectAppearance, GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, Splat,
-    ViewInput, read_splats, rgba8_from_target,
+    AppearanceSettings, DirectAppearance, GaussianBuffers, Observations, Outputs, RasterSettings, Rasterizer,
+    RenderTarget, Splat, ViewInput, read_splats, rgba8_from_target,
 };
+use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, ViewPicture};
 use flyrig_tracker::DeformReport;
 use flyrig_types::{Camera, Image, Mask, Pose, Rig};
 
@@ -43,6 +44,16 @@ pub struct RenderedView {
     pub rgba: Vec<u8>,
 }
 
+/// What the last update saw, and where the Gaussians stood.
+#[derive(Debug)]
+pub struct Observed {
+    pub observations: Observations,
+    /// The observing views: size and pixels with mask.
+    pub pictures: Vec<(u32, u32, Vec<u8>)>,
+    pub center_scale: Vec<[f32; 4]>,
+    pub normal: Vec<[f32; 4]>,
+}
+
 /// The person as Gaussians on the GPU, and everything that keeps them up to date.
 #[derive(Debug)]
 pub struct Engine {
@@ -55,11 +66,20 @@ pub struct Engine {
     rasterizer: Rasterizer,
     appearance: DirectAppearance,
     settings: AppearanceSettings,
+    body: BodyGraph,
+    /// What adds to direct appearance.
+    learned: Option<LearnedAppearance>,
+    /// Views that painted in the last update.
+    painted: Vec<usize>,
     /// A target an input view; grows with the rig, remade when a picture's size changes.
     visibility: Vec<RenderTarget>,
     rgba: Vec<Vec<u8>>,
     output: Option<RenderTarget>,
     deformation: Option<Deformation>,
+    /// Whether the body keeps its shape for the time being.
+    pub shape_held: bool,
+    /// What direct appearance painted last, while the Gaussians show what the networks made of it.
+    direct_colors: Vec<[f32; 4]>,
     /// What the deformation thinks of the last update's views.
     judged: Vec<Option<(f64, bool)>>,
 }
@@ -107,11 +127,16 @@ impl Engine {
                 Some(_) => GpuSkinner::new(&gpu, &surface.inset(), &template.skeleton)?,
                 None => GpuSkinner::new(&gpu, surface, &template.skeleton)?,
             },
+            shape_held: false,
+            direct_colors: Vec::new(),
             deformation: deform
                 .map(|options| Deformation::new(&gpu, &template, surface, graph, options, finest_pixel_m(rig)))
                 .transpose()?,
             rasterizer,
             appearance: DirectAppearance::new(&gpu, surface, graph, rig.cameras.len())?,
+            body: BodyGraph::new(surface, graph)?,
+            learned: None,
+            painted: Vec::new(),
             gpu,
             template,
             gaussians,
@@ -132,6 +157,39 @@ impl Engine {
     /// The template that is being posed.
     pub fn template(&self) -> &Template {
         &self.template
+    }
+
+    /// From now on these networks add to direct appearance; see [`LearnedAppearance::reuse`].
+    pub fn use_networks(&mut self, parameters: &Parameters, reuse: f32) -> Result<()> {
+        self.appearance.keep_observations(&self.gpu)?;
+        let mut learned = LearnedAppearance::new(parameters, self.body.clone());
+        learned.reuse = reuse;
+        self.learned = Some(learned);
+        Ok(())
+    }
+
+    /// From now on [`Self::observed`] tells what each view saw.
+    pub fn keep_observations(&mut self) -> Result<()> {
+        Ok(self.appearance.keep_observations(&self.gpu)?)
+    }
+
+    /// The graph as the networks see it.
+    pub fn body_graph(&self) -> &BodyGraph {
+        &self.body
+    }
+
+    /// What the last update saw.
+    pub fn observed(&self) -> Result<Observed> {
+        Ok(Observed {
+            observations: self.appearance.observations(&self.gpu, self.painted.len())?,
+            pictures: self
+                .painted
+                .iter()
+                .map(|&i| (self.visibility[i].width, self.visibility[i].height, self.rgba[i].clone()))
+                .collect(),
+            center_scale: self.gaussians.center_scale.read(&self.gpu)?,
+            normal: self.gaussians.normal.read(&self.gpu)?,
+        })
     }
 
     /// Takes in one instant: pose, then colours from the views. A view whose mask is empty adds nothing.
@@ -158,7 +216,7 @@ impl Engine {
             poses.iter().copied().zip(std::iter::once(&self.gaussians).chain(&self.posed)).collect();
 
         self.judged.clear();
-        if let Some(deformation) = self.deformation.as_mut().filter(|_| !views.is_empty()) {
+        if let Some(deformation) = self.deformation.as_mut().filter(|_| !views.is_empty() && !self.shape_held) {
             let (start, processor) = (Instant::now(), processor_time());
             let tracked: Vec<TrackedView<'_>> = views
                 .iter()
@@ -205,6 +263,10 @@ impl Engine {
         self.gpu.wait()?;
         stages.add("skinning", start.elapsed());
 
+        if !self.direct_colors.is_empty() {
+            // Direct appearance goes on from its own colours.
+            self.gaussians.color.write(&self.gpu, &self.direct_colors);
+        }
         let start = Instant::now();
         for (i, view) in views.iter().enumerate() {
             let (width, height) = (view.image.width(), view.image.height());
@@ -238,26 +300,44 @@ impl Engine {
         let start = Instant::now();
         // A view that is not believed paints nothing.
         let believed = |i: usize| self.judged.get(i).copied().flatten().is_none_or(|(_, trusted)| trusted);
-        let inputs: Vec<ViewInput<'_>> = views
+        self.painted = (0..views.len()).filter(|&i| believed(i)).collect();
+        let inputs: Vec<ViewInput<'_>> = self
+            .painted
             .iter()
-            .zip(&self.rgba)
-            .zip(&self.visibility)
-            .zip(&instant_of)
-            .enumerate()
-            .filter(|(i, _)| believed(*i))
-            .map(|(_, view)| view)
-            .map(|(((view, rgba), target), &instant)| ViewInput {
-                camera: view.camera,
-                rgba,
-                canonical: &target.canonical,
-                drawn: &target.color,
-                gaussians: (instant > 0).then(|| instants[instant].1),
+            .map(|&i| ViewInput {
+                camera: views[i].camera,
+                rgba: &self.rgba[i],
+                canonical: &self.visibility[i].canonical,
+                drawn: &self.visibility[i].color,
+                gaussians: (instant_of[i] > 0).then(|| instants[instant_of[i]].1),
             })
             .collect();
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         self.appearance.update(&self.gpu, &mut encoder, &self.gaussians, &inputs, &self.settings)?;
         self.submit(encoder)?;
         stages.add("appearance", start.elapsed());
+        self.paint_learned(views, stages)
+    }
+
+    /// Lets the networks add to what direct appearance painted.
+    fn paint_learned(&mut self, views: &[InputView<'_>], stages: &mut StageTimes) -> Result<()> {
+        let Some(learned) = &mut self.learned else { return Ok(()) };
+        let start = Instant::now();
+        let observed = self.appearance.observations(&self.gpu, self.painted.len())?;
+        let picture = |&i: &usize| {
+            let (width, height) = (views[i].image.width(), views[i].image.height());
+            ViewPicture { width, height, rgba: &self.rgba[i] }
+        };
+        let pictures: Vec<_> = self.painted.iter().map(picture).collect();
+        self.direct_colors = self.gaussians.color.read(&self.gpu)?;
+        let before = learned.counts;
+        let colors = learned.paint(&observed, &pictures, &self.settings)?;
+        self.gaussians.color.write(&self.gpu, &colors);
+        stages.add("networks", start.elapsed());
+        let counts = learned.counts;
+        stages.count("views not encoded", counts.views_kept - before.views_kept);
+        stages.count("Gaussians not corrected anew", counts.colors_kept - before.colors_kept);
+        stages.count("corrections that were no numbers", counts.poisoned - before.poisoned);
         Ok(())
     }
 
@@ -286,6 +366,9 @@ impl Engine {
             deformation.reset();
         }
         self.appearance.reset();
+        if let Some(learned) = &mut self.learned {
+            learned.reset();
+        }
     }
 
     /// The next frames get the iterations of a start.

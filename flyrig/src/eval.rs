@@ -63,52 +63,13 @@ struct Metrics<'a> {
 /// Runs the command.
 pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let started = Instant::now();
-    let (rig, holdout) = load_rigs(args)?;
-    let mut frames = FrameReader::open(args, &rig)?;
-    let mut truth = TruthReader::open(args, &holdout)?;
+    let Replay { mut pipeline, mut frames, buffered, holdout, mut truth, solver } = Replay::open(args, gpu)?;
     std::fs::create_dir_all(args.out.join("surface"))
         .with_context(|| format!("cannot create {}", args.out.display()))?;
     for camera in &holdout {
         let folder = args.out.join(camera.id.as_str());
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
     }
-
-    let plates = dataset::plates(&args.dataset, &rig)?;
-    dataset::require_masks(args.pose, args.masks, &plates)?;
-    let solver = args.solver.unwrap_or(match args.pose {
-        Origin::Given => Solver::GaussNewton,
-        Origin::Estimated => Solver::None,
-    });
-    let mut buffered = Vec::new();
-    let (template, pose) = match args.pose {
-        Origin::Given => given_pose(&args.dataset)?,
-        Origin::Estimated => {
-            eprintln!("eval: learning the person's shape from the first {SHAPE_SETS} frames");
-            while buffered.len() < SHAPE_SETS {
-                match frames.next_set()? {
-                    Some(set) => buffered.push(set),
-                    None => break,
-                }
-            }
-            let config = PoseConfig { masks: args.masks == Origin::Estimated, ..PoseConfig::default() };
-            let mut estimator =
-                PoseEstimator::new(PoseNet::embedded()?, &default_template(&ShapeParams::default())?, &rig, config)?;
-            dataset::set_plates(&mut estimator, &plates)?;
-            let fit = estimator.fit_shape(&buffered).context("no person found in the first frames")?;
-            eprintln!("eval: the person is {:.2} m tall", fit.height_m);
-            (estimator.template().clone(), PoseSource::Estimator(Box::new(estimator)))
-        }
-    };
-    let engine = Engine::new(
-        gpu.clone(),
-        template,
-        args.gaussians,
-        args.nodes,
-        &rig,
-        args.appearance.settings(),
-        solver.options(args.pose),
-    )?;
-    let mut pipeline = Pipeline::new(engine, rig, pose, args.masks, plates);
 
     let total = frames.count as u64;
     let bar = progress_bar(total, "eval");
@@ -214,6 +175,70 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
+/// A data set about to be replayed.
+pub struct Replay {
+    pub pipeline: Pipeline,
+    pub frames: FrameReader,
+    /// Sets that were read already, to learn the person's shape.
+    pub buffered: Vec<FrameSet>,
+    pub holdout: Vec<Camera>,
+    pub truth: TruthReader,
+    pub solver: Solver,
+}
+
+impl Replay {
+    /// Opens the cameras and makes the pipeline.
+    pub fn open(args: &EvalArgs, gpu: &GpuContext) -> Result<Self> {
+        let (rig, holdout) = load_rigs(args)?;
+        let mut frames = FrameReader::open(args, &rig)?;
+        let truth = TruthReader::open(args, &holdout)?;
+        let plates = dataset::plates(&args.dataset, &rig)?;
+        dataset::require_masks(args.pose, args.masks, &plates)?;
+        let solver = args.solver.unwrap_or(match args.pose {
+            Origin::Given => Solver::GaussNewton,
+            Origin::Estimated => Solver::None,
+        });
+        let mut buffered = Vec::new();
+        let (template, pose) = match args.pose {
+            Origin::Given => given_pose(&args.dataset)?,
+            Origin::Estimated => {
+                eprintln!("eval: learning the person's shape from the first {SHAPE_SETS} frames");
+                while buffered.len() < SHAPE_SETS {
+                    match frames.next_set()? {
+                        Some(set) => buffered.push(set),
+                        None => break,
+                    }
+                }
+                let config = PoseConfig { masks: args.masks == Origin::Estimated, ..PoseConfig::default() };
+                let mut estimator = PoseEstimator::new(
+                    PoseNet::embedded()?,
+                    &default_template(&ShapeParams::default())?,
+                    &rig,
+                    config,
+                )?;
+                dataset::set_plates(&mut estimator, &plates)?;
+                let fit = estimator.fit_shape(&buffered).context("no person found in the first frames")?;
+                eprintln!("eval: the person is {:.2} m tall", fit.height_m);
+                (estimator.template().clone(), PoseSource::Estimator(Box::new(estimator)))
+            }
+        };
+        let mut engine = Engine::new(
+            gpu.clone(),
+            template,
+            args.gaussians,
+            args.nodes,
+            &rig,
+            args.appearance.settings(),
+            solver.options(args.pose),
+        )?;
+        if let Some(networks) = args.appearance.networks(args.weights.as_deref())? {
+            engine.use_networks(&networks, args.reuse)?;
+        }
+        let pipeline = Pipeline::new(engine, rig, pose, args.masks, plates);
+        Ok(Self { pipeline, frames, buffered, holdout, truth, solver })
+    }
+}
+
 fn load_rigs(args: &EvalArgs) -> Result<(Rig, Vec<Camera>)> {
     let chosen: Vec<CameraId> = args.inputs.iter().chain(&args.holdout).map(|name| name.as_str().into()).collect();
     let all = dataset::load_rig(&args.dataset, &chosen)?;
@@ -234,12 +259,12 @@ fn given_pose(root: &Path) -> Result<(Template, PoseSource)> {
 }
 
 /// Reads the input cameras frame by frame and forms sets; a broken picture is missing from its set.
-struct FrameReader {
+pub struct FrameReader {
     sources: Vec<FolderReplay>,
     sync: Synchronizer,
     ready: std::collections::VecDeque<FrameSet>,
     done: bool,
-    count: usize,
+    pub count: usize,
     broken: u64,
 }
 
@@ -261,7 +286,7 @@ impl FrameReader {
         })
     }
 
-    fn next_set(&mut self) -> Result<Option<FrameSet>> {
+    pub fn next_set(&mut self) -> Result<Option<FrameSet>> {
         while self.ready.is_empty() && !self.done {
             let mut ended = 0;
             for source in &mut self.sources {
@@ -299,7 +324,7 @@ fn next_frame(source: &mut FolderReplay) -> Result<Option<Frame>, flyrig_capture
 }
 
 /// Reads the held-out cameras alongside, never ahead of what is scored.
-struct TruthReader {
+pub struct TruthReader {
     sources: Vec<(FolderReplay, Option<Frame>)>,
 }
 
@@ -313,7 +338,7 @@ impl TruthReader {
     }
 
     /// Per held-out camera the frame nearest in time, within half the synchronisation window.
-    fn at(&mut self, nanos: i64) -> Result<Vec<Option<&Frame>>> {
+    pub fn at(&mut self, nanos: i64) -> Result<Vec<Option<&Frame>>> {
         for (source, current) in &mut self.sources {
             while current
                 .as_ref()

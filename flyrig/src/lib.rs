@@ -33,6 +33,7 @@ mod stats;
 mod stop;
 mod sync_check;
 mod track_state;
+mod train;
 mod viewpoints;
 mod watch;
 
@@ -112,6 +113,10 @@ fn dispatch(cli: &Cli) -> Result<()> {
             let config = args.config.as_deref().map(Config::load).transpose()?.unwrap_or_default();
             let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
             sim_export::sim_export(args, &config.sim, &gpu(adapter)?)
+        }
+        Command::Train(args) => train::train(args, &|| gpu(cli.adapter.as_deref())),
+        Command::Bench { what: BenchCommand::Appearance(args) } => {
+            bench::appearance(args, &gpu(cli.adapter.as_deref())?)
         }
         Command::Bench { what: BenchCommand::Capture(args) } => bench::soak::capture(args),
         Command::Bench { what: BenchCommand::Record(args) } => {

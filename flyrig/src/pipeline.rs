@@ -204,6 +204,11 @@ impl Pipeline {
         &self.engine
     }
 
+    /// The engine, to be told more.
+    pub fn engine_mut(&mut self) -> &mut Engine {
+        &mut self.engine
+    }
+
     /// The input cameras.
     pub fn rig(&self) -> &Rig {
         &self.rig

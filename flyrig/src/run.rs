@@ -96,7 +96,7 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
             PoseSource::Estimator(Box::new(estimator))
         }
     };
-    let engine = Engine::new(
+    let mut engine = Engine::new(
         gpu.clone(),
         template,
         config.body.gaussians,
@@ -105,6 +105,9 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
         config.appearance.mode.settings(),
         config.tracking.options(config.body.pose),
     )?;
+    if let Some(networks) = config.appearance.networks()? {
+        engine.use_networks(&networks, config.appearance.reuse)?;
+    }
     let mut pipeline = Pipeline::new(engine, scene.rig, pose, config.body.masks, scene.plates);
     pipeline.per_view_time = config.tracking.per_view_time;
     let publisher = Publisher::open(&network::transport(config))?;

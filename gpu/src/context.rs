@@ -117,7 +117,7 @@ impl GpuContext {
                 Err(GpuError::Limit { adapter: info.name.clone(), limit, found, needed })
             }
         };
-        check("max_storage_buffers_per_shader_stage", limits.max_storage_buffers_per_shader_stage.into(), 12)?;
+        check("max_storage_buffers_per_shader_stage", limits.max_storage_buffers_per_shader_stage.into(), 13)?;
         check("max_compute_invocations_per_workgroup", limits.max_compute_invocations_per_workgroup.into(), 256)?;
         let wanted = Features::TIMESTAMP_QUERY;
         let (device, queue) = adapter

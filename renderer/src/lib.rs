@@ -14,9 +14,10 @@ mod raster_buffers;
 mod raster_kernels;
 mod scan;
 mod sort;
+mod splat_rows;
 
 pub use appearance::{
-    AppearanceError, AppearanceSettings, DiffusionHierarchy, DiffusionLevel, DirectAppearance, ViewInput,
+    AppearanceError, AppearanceSettings, DiffusionHierarchy, DiffusionLevel, DirectAppearance, Observations, ViewInput,
 };
 pub use buffers::{GaussianBuffers, RenderTarget};
 pub use color::{composite_over, linear_from_srgb, rgba8_from_target, srgb_from_linear};
@@ -26,3 +27,4 @@ pub use picture_loss::{LossSettings, PictureLoss, PictureSums, WantedPicture};
 pub use raster::{Outputs, RasterSettings, RasterStats, Rasterizer};
 pub use raster_backward::{BackwardError, BackwardRasterizer, Carry, GaussianGradients, PictureGradients};
 pub use raster_kernels::BACKFACING_COSINE;
+pub use splat_rows::{PixelShares, PosedGaussians, pixel_shares};

@@ -25,7 +25,7 @@ pub(super) struct GraphBuffers {
     edges: StorageBuffer<[u32; 2]>,
     children: StorageBuffer<u32>,
     /// What was seen around each node.
-    node_seen: StorageBuffer<[f32; 4]>,
+    pub(super) node_seen: StorageBuffer<[f32; 4]>,
     /// Two copies of the diffused colours; the first holds the result.
     pub(super) node_color: StorageBuffer<[f32; 4]>,
 }

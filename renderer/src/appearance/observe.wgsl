@@ -17,6 +17,8 @@
 // The last colours as this view shows them, times alpha; w: alpha.
 @group(0) @binding(10) var<storage, read> drawn: array<vec4<f32>>;
 @group(0) @binding(11) var<storage, read> last: array<vec4<f32>>;
+// Pixel, weight and exp(-k d) of this view alone; shorter than the Gaussians where nobody asked for it.
+@group(0) @binding(12) var<storage, read_write> kept: array<vec4<f32>>;
 
 fn linear_rgb(packed: u32) -> vec3<f32> {
     let byte = (vec3(packed) >> vec3(0u, 8u, 16u)) & vec3(0xffu);
@@ -96,6 +98,7 @@ fn main(
     }
     color /= coverage;
     var weight = 0.0;
+    var nearness = 0.0;
     if rendered.w >= MIN_RENDERED_ALPHA {
         // Eq. 8: near the rendered surface in canonical space, so that an arm never paints the belly behind it.
         let d = distance(canonical[i].xyz, rendered.xyz / rendered.w);
@@ -103,7 +106,8 @@ fn main(
         weight = angle * surface * coverage;
         if weight > 0.0 && is_finite(weight) {
             let before = quality[i];
-            quality[i] = vec2(before.x + weight, max(before.y, exp(-settings.occlusion_per_m * d)));
+            nearness = exp(-settings.occlusion_per_m * d);
+            quality[i] = vec2(before.x + weight, max(before.y, nearness));
             color = sharpened(color, last[i].rgb, shown);
         } else {
             weight = 0.0;
@@ -111,4 +115,7 @@ fn main(
     }
     let total = weight + settings.view_weight * coverage;
     seen[i] += vec4(color * total, total);
+    if i < arrayLength(&kept) {
+        kept[i] = vec4(pixel, total, nearness);
+    }
 }

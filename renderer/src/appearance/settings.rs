@@ -21,6 +21,22 @@ pub struct ViewInput<'a> {
     pub gaussians: Option<&'a GaussianBuffers>,
 }
 
+/// What direct appearance found out in one update, read back: the input of learned appearance.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Observations {
+    /// By view, by Gaussian: pixel x and y, weight of Eq. 6 (with the baseline's small number where nothing is filled
+    /// in), exp(-k d). All zero where the view has nothing to say.
+    pub views: Vec<Vec<[f32; 4]>>,
+    /// By Gaussian: sum of weight times linear RGB; sum of weights.
+    pub seen: Vec<[f32; 4]>,
+    /// By Gaussian: sum of the Eq. 6 weights, exp(-k d) of the best view.
+    pub quality: Vec<[f32; 2]>,
+    /// By graph node: mean linear RGB seen around it; mean visibility, 0 to 1.
+    pub node_seen: Vec<[f32; 4]>,
+    /// By graph node: linear RGB diffused over the surface (old where nothing is filled in); w unused.
+    pub node_color: Vec<[f32; 4]>,
+}
+
 /// How colours are gathered.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AppearanceSettings {

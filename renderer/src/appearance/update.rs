@@ -1,12 +1,12 @@
 //! Buffers of direct appearance and the recording of one frame.
 
 use flyrig_body::{DeformationGraph, SurfaceGaussians};
-use flyrig_gpu::{CameraConstants, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
+use flyrig_gpu::{CameraConstants, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d, read_back};
 use flyrig_types::MAX_IMAGE_SIDE;
 use wgpu::{Buffer, BufferUsages, CommandEncoder, ComputePassDescriptor};
 
 use super::{
-    AppearanceError, AppearanceSettings, ViewInput,
+    AppearanceError, AppearanceSettings, Observations, ViewInput,
     graph_buffers::GraphBuffers,
     kernels::{Kernels, SettingsConstants, WORKGROUP},
 };
@@ -37,6 +37,8 @@ struct ViewSlot {
     camera: Buffer,
     /// A pixel an element.
     picture: StorageBuffer<u32>,
+    /// What this view alone saw; empty unless observations are kept.
+    kept: StorageBuffer<[f32; 4]>,
 }
 
 impl DirectAppearance {
@@ -62,7 +64,8 @@ impl DirectAppearance {
         };
         let view = |_| {
             let picture = StorageBuffer::zeroed(gpu, "view picture", 0)?;
-            Ok(ViewSlot { camera: constants("view camera", size_of::<CameraConstants>()), picture })
+            let camera = constants("view camera", size_of::<CameraConstants>());
+            Ok(ViewSlot { camera, picture, kept: StorageBuffer::zeroed(gpu, "observations of a view", 0)? })
         };
         let decoded: Vec<f32> = (0..=255u8).map(|byte| linear_from_srgb(f32::from(byte) / 255.0)).collect();
         Ok(Self {
@@ -120,6 +123,9 @@ impl DirectAppearance {
         }
         encoder.clear_buffer(self.seen.raw(), 0, None);
         encoder.clear_buffer(self.quality.raw(), 0, None);
+        for slot in self.views.iter().filter(|slot| !slot.kept.is_empty()) {
+            encoder.clear_buffer(slot.kept.raw(), 0, None);
+        }
         let mut stage = |encoder: &mut CommandEncoder, name, kernel: &wgpu::ComputePipeline, binds: &[_], groups| {
             let timestamp_writes = timer.as_deref_mut().and_then(|timer| timer.stage(name));
             let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor { label: Some(name), timestamp_writes });
@@ -149,6 +155,7 @@ impl DirectAppearance {
                     self.linear_from_srgb.raw().as_entire_binding(),
                     view.drawn.raw().as_entire_binding(),
                     gaussians.color.raw().as_entire_binding(),
+                    slot.kept.raw().as_entire_binding(),
                 ];
                 self.kernels.observe.bind(gpu, &resources)
             })
@@ -176,6 +183,33 @@ impl DirectAppearance {
         );
         stage(encoder, "paint", &self.kernels.paint.pipeline, &[bind], all_gaussians);
         Ok(())
+    }
+
+    /// From the next update on keeps what each view saw, for [`Self::observations`].
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn keep_observations(&mut self, gpu: &GpuContext) -> Result<(), GpuError> {
+        for slot in &mut self.views {
+            slot.kept = StorageBuffer::zeroed(gpu, "observations of a view", self.seen.len())?;
+        }
+        Ok(())
+    }
+
+    /// What the last update, which must have been submitted, found out. `views` is the number of views it was given;
+    /// their lists are empty without [`Self::keep_observations`].
+    ///
+    /// # Errors
+    /// [`GpuError::Lost`].
+    pub fn observations(&self, gpu: &GpuContext, views: usize) -> Result<Observations, GpuError> {
+        let nodes = self.graph.node_count as usize;
+        Ok(Observations {
+            views: self.views.iter().take(views).map(|slot| slot.kept.read(gpu)).collect::<Result<_, _>>()?,
+            seen: self.seen.read(gpu)?,
+            quality: self.quality.read(gpu)?,
+            node_seen: read_back(gpu, self.graph.node_seen.raw(), nodes)?,
+            node_color: read_back(gpu, self.graph.node_color.raw(), nodes)?,
+        })
     }
 
     /// Forgets all earlier frames, from the next update on.

@@ -1,0 +1,191 @@
+//! `flyrig train`: networks for learned appearance, from simulated people and recorded rigs.
+//!
+//! Everything lies in one folder and survives being killed at any time: samples are made once and kept as files, the
+//! state of the training is written whole every few hundred steps.
+
+mod gather;
+mod people;
+mod recording;
+mod report;
+
+use std::{
+    path::{Path, PathBuf},
+    time::Instant,
+};
+
+use anyhow::{Context, Result, ensure};
+use flyrig_gpu::GpuContext;
+use flyrig_stfa::{SampleErrors, TrainSettings, Trainer, TrainingSample, evaluate};
+
+pub use self::people::People;
+use self::report::{Progress, Scores};
+use crate::{cli::TrainArgs, eval::progress_bar, stop};
+
+/// Added to the seed of the people that only measure progress.
+const HELD_OUT_SEED: u64 = 1 << 40;
+/// Steps between two checkpoints.
+const CHECKPOINT_STEPS: u64 = 250;
+
+/// Runs the command.
+pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
+    stop::flag();
+    let started = Instant::now();
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    let people = People { seed: args.seed, instants: args.instants, side: args.side, gaussians: args.gaussians };
+    let held_out = People { seed: args.seed.wrapping_add(HELD_OUT_SEED), ..people.clone() };
+    let mut samples = simulated(args, &people, args.people, "samples", gpu)?;
+    let mut folders = args.extra.clone();
+    for dataset in &args.dataset {
+        folders.push(recording::record(args, dataset, &args.out, &gpu()?)?);
+    }
+    samples.extend(read_extra(&folders)?);
+    let test = simulated(args, &held_out, args.test_people, "test", gpu)?;
+    if stop::requested() {
+        return Ok(());
+    }
+    ensure!(!samples.is_empty(), "there is nothing to train on; ask for at least one person or data set");
+
+    let checkpoint = args.out.join("checkpoint.safetensors");
+    let settings = TrainSettings {
+        seed: args.seed,
+        steps: args.steps,
+        rate: args.rate,
+        structure: args.structure,
+        contrast: args.contrast,
+        ..TrainSettings::default()
+    };
+    let mut trainer = if checkpoint.exists() {
+        let trainer = Trainer::load(&checkpoint)?;
+        ensure!(
+            trainer.settings == settings && trainer.parameters.size == args.size.size(),
+            "{} was begun with other settings ({:?}, {:?}); give the same ones, or another --out",
+            checkpoint.display(),
+            trainer.parameters.size,
+            trainer.settings
+        );
+        trainer
+    } else {
+        Trainer::new(args.size.size(), settings)
+    };
+    let mut progress = Progress::open(&args.out, trainer.step)?;
+    let bar = progress_bar(args.steps, "train");
+    bar.set_position(trainer.step);
+    bar.reset_eta();
+    while trainer.step < args.steps && !stop::requested() {
+        let sample = &samples[trainer.next_sample(samples.len())];
+        if let Some(loss) = trainer.step(sample) {
+            progress.losses.push(loss);
+            bar.set_message(progress.message());
+        }
+        bar.inc(1);
+        if trainer.step % CHECKPOINT_STEPS == 0 || trainer.step == args.steps {
+            if trainer.step % (CHECKPOINT_STEPS * args.test_every) == 0 || trainer.step == args.steps {
+                progress.scores.extend(score(&trainer, &test));
+            }
+            progress.save(&args.out)?;
+            // Last: what a checkpoint tells has been written.
+            trainer.save(&checkpoint)?;
+            save_weights(args, &trainer, &progress, &people, samples.len(), started)?;
+        }
+    }
+    bar.finish_and_clear();
+    println!("{} of {} steps; {}", trainer.step, args.steps, progress.message());
+    if let Some(scores) = progress.scores.last() {
+        println!("{scores}");
+    }
+    println!("weights.safetensors, weights.json, loss.csv, loss.svg in {}", args.out.display());
+    Ok(())
+}
+
+/// None without anybody to measure on.
+fn score(trainer: &Trainer, test: &[TrainingSample]) -> Option<Scores> {
+    let errors: Vec<SampleErrors> =
+        test.iter().filter_map(|sample| evaluate(&trainer.parameters, sample, true)).collect();
+    (!errors.is_empty()).then(|| Scores::new(trainer.step, &errors))
+}
+
+/// Samples of simulated people, out of the folder as far as they lie there.
+fn simulated(
+    args: &TrainArgs,
+    people: &People,
+    count: u64,
+    folder: &str,
+    gpu: &dyn Fn() -> Result<GpuContext>,
+) -> Result<Vec<TrainingSample>> {
+    let folder = args.out.join(folder);
+    std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
+    let path = |person: u64, instant: u64| folder.join(format!("{person:05}-{instant:02}.safetensors"));
+    let missing: Vec<u64> =
+        (0..count).filter(|&person| (0..people.instants).any(|i| !path(person, i).exists())).collect();
+    if !missing.is_empty() {
+        let gpu = gpu()?;
+        let bar = progress_bar(missing.len() as u64, "people");
+        for person in missing {
+            if stop::requested() {
+                break;
+            }
+            for (instant, sample) in people.samples(&gpu, person)?.into_iter().enumerate() {
+                sample.save(&path(person, instant as u64))?;
+            }
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+    }
+    let mut samples = Vec::new();
+    for person in 0..count {
+        for instant in 0..people.instants {
+            let path = path(person, instant);
+            if path.exists() {
+                samples.push(TrainingSample::load(&path)?);
+            }
+        }
+    }
+    Ok(samples)
+}
+
+/// All samples of these folders.
+fn read_extra(folders: &[PathBuf]) -> Result<Vec<TrainingSample>> {
+    let mut samples = Vec::new();
+    for folder in folders {
+        let entries = std::fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?;
+        let mut paths: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).collect();
+        paths.sort();
+        for path in paths.iter().filter(|path| path.extension().is_some_and(|e| e == "safetensors")) {
+            samples.push(TrainingSample::load(path)?);
+        }
+    }
+    Ok(samples)
+}
+
+fn save_weights(
+    args: &TrainArgs,
+    trainer: &Trainer,
+    progress: &Progress,
+    people: &People,
+    samples: usize,
+    started: Instant,
+) -> Result<()> {
+    let card = serde_json::json!({
+        "flyrig": env!("CARGO_PKG_VERSION"),
+        "command": command_line(),
+        "size": trainer.parameters.size,
+        "parameters": trainer.parameters.count(),
+        "settings": trainer.settings,
+        "step": trainer.step,
+        "people": { "train": people, "count": args.people, "held_out_seed": people.seed.wrapping_add(HELD_OUT_SEED) },
+        "samples": samples,
+        "scores": progress.scores,
+        "seconds_of_this_run": started.elapsed().as_secs(),
+        "machine": format!("{} threads", rayon::current_num_threads()),
+    });
+    trainer.parameters.save(&args.out.join("weights.safetensors"), &card)?;
+    let json = serde_json::to_vec_pretty(&card)?;
+    crate::report::write_whole(&args.out.join("weights.json"), &json)
+}
+
+/// The command as it was typed, folders shortened to their names.
+fn command_line() -> String {
+    let short =
+        |word: String| Path::new(&word).file_name().map_or(word.clone(), |name| name.to_string_lossy().into_owned());
+    std::env::args().map(short).collect::<Vec<_>>().join(" ")
+}

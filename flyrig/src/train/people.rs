@@ -1,0 +1,176 @@
+//! Training samples of simulated people.
+
+use std::sync::Arc;
+
+use anyhow::{Context, Result};
+use flyrig_body::DEFAULT_NODE_COUNT;
+use flyrig_gpu::GpuContext;
+use flyrig_renderer::AppearanceSettings;
+use flyrig_sim::{OpticsConfig, SceneKind, SimConfig, Simulator, TrainingConfig, random_config};
+use flyrig_stfa::TrainingSample;
+use flyrig_types::{Camera, Frame, FrameSet, Image, Mask, Rig};
+use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng, seq::SliceRandom as _};
+use serde::{Deserialize, Serialize};
+
+use super::gather::{HeldOut, gather};
+use crate::{
+    config::{AppearanceMode, Origin, Solver},
+    engine::Engine,
+    pipeline::{Pipeline, PoseSource},
+};
+
+/// Cameras around each person.
+const CAMERAS: usize = 7;
+/// Pictures that are compared an instant.
+const TARGETS: usize = 3;
+/// Instants before the first sample, in which the deformation finds the clothes.
+const WARM_UP: u64 = 3;
+/// Instants before each other one.
+const RUN_IN: u64 = 1;
+/// Further looks at a sample's instant, in which the sharpening of the colours settles.
+const LOOKS: usize = 6;
+/// Share of the people who are filmed in a furnished room.
+const FURNISHED: f64 = 0.15;
+/// Frames, a minute of them, that instants are taken from.
+const SPAN_FRAMES: u64 = 1800;
+
+/// Which people.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct People {
+    /// Makes them all; another seed gives other people.
+    pub seed: u64,
+    /// Instants of each person, each with cameras, lens and pose of its own.
+    pub instants: u64,
+    /// Pixels of a picture's side, from 0.85 to 1.3 times as many for each person.
+    pub side: u32,
+    /// Gaussians on the person's surface.
+    pub gaussians: usize,
+}
+
+impl People {
+    /// The capture of one person: the simulator's random people, motion, rooms, lights, lenses and calibration errors.
+    /// What only costs time stays away: lens openings and rolling shutters (which draw the room several times), most of
+    /// the furnished rooms. Sensors differ less than at worst, since a rig's colours are matched, and the held-out
+    /// pictures would only teach their own casts.
+    pub fn capture(&self, person: u64) -> SimConfig {
+        let training =
+            TrainingConfig { seed: self.seed, cameras: CAMERAS, size: [self.side; 2], ..TrainingConfig::default() };
+        let mut config = random_config(&training, person);
+        let mut rng = SmallRng::seed_from_u64(config.seed ^ 0x636f_6c6f_7572);
+        let exposure = rng.random_range(0.8..1.25);
+        for sensor in &mut config.sensors {
+            sensor.exposure = exposure * rng.random_range(0.96..1.04);
+            sensor.gain = 1.0;
+            sensor.gamma = rng.random_range(0.98..1.02);
+            sensor.white_balance = [0.0; 3].map(|_: f64| rng.random_range(0.98..1.02));
+            sensor.vignetting = rng.random_range(0.0..0.1);
+        }
+        config.faults = Default::default();
+        config.scene.occluders = 0;
+        config.scene.passer_by = false;
+        if !rng.random_bool(FURNISHED) {
+            config.scene.kind = SceneKind::Studio;
+        }
+        let exposure_ms = if rng.random_bool(0.2) { rng.random_range(2.0..10.0) } else { 0.0 };
+        config.optics = vec![OpticsConfig { exposure_ms, samples: 3, ..OpticsConfig::default() }];
+        // A person's pixels may be finer or coarser than the Gaussians' usual ones.
+        let scale = rng.random_range(0.85..1.3);
+        let side = ((f64::from(self.side) * scale / 16.0).round() as u32).max(4) * 16;
+        (config.width, config.height) = (side, side);
+        config
+    }
+
+    /// Samples of one person. The same configuration gives the same samples on the same adapter.
+    pub fn samples(&self, gpu: &GpuContext, person: u64) -> Result<Vec<TrainingSample>> {
+        let mut simulator = Simulator::new(gpu, &self.capture(person))?;
+        let seed = simulator.config().seed;
+        let mut rng = SmallRng::seed_from_u64(seed ^ 0x7069_636b);
+        let (rig, reported) = (simulator.rig().clone(), simulator.reported_rig());
+        let template = simulator.template().clone();
+        // With time: sharpening goes on from the last colours. What the networks are given is of this instant alone.
+        let settings = AppearanceMode::Direct.settings();
+        let mut engine = Engine::new(
+            gpu.clone(),
+            template,
+            self.gaussians,
+            DEFAULT_NODE_COUNT.min(self.gaussians / 12),
+            &rig,
+            settings,
+            Solver::GaussNewton.options(Origin::Given),
+        )?;
+        engine.keep_observations()?;
+        let track = PoseSource::Track { track: simulator.track().clone(), repeat: true };
+        let plates = (0..CAMERAS).map(|_| None).collect();
+        let mut pipeline = Pipeline::new(engine, reported, track, Origin::Given, plates);
+        let mut samples = Vec::new();
+        let mut index = 0;
+        for instant in 0..self.instants {
+            let first: u64 = rng.random_range(0..SPAN_FRAMES);
+            let (inputs, targets) = choose(&mut rng);
+            let warm_up = if instant == 0 { WARM_UP } else { RUN_IN };
+            for step in 0..=warm_up {
+                let set = frame_set(&mut simulator, &rig, first + step, index, &inputs)?;
+                index += 1;
+                pipeline.process(&set)?;
+                if step == warm_up {
+                    pipeline.engine_mut().shape_held = true;
+                    for _ in 0..LOOKS {
+                        pipeline.process(&set)?;
+                    }
+                    pipeline.engine_mut().shape_held = false;
+                }
+            }
+            let nanos = simulator.frame_nanos(first + warm_up);
+            let pictures = simulator.capture_all(nanos, &targets)?;
+            let held_out: Vec<HeldOut<'_>> = targets
+                .iter()
+                .zip(&pictures)
+                .map(|(&slot, (image, mask))| HeldOut { camera: &rig.cameras[slot], image, mask })
+                .collect();
+            samples.push(sample_of(&pipeline, &held_out, &settings, seed ^ instant)?);
+        }
+        Ok(samples)
+    }
+}
+
+fn sample_of(
+    pipeline: &Pipeline,
+    held_out: &[HeldOut<'_>],
+    settings: &AppearanceSettings,
+    seed: u64,
+) -> Result<TrainingSample> {
+    gather(pipeline.engine(), held_out, settings, seed).context("gathering a training sample")
+}
+
+/// Inputs and held-out cameras by slot: mostly three inputs that lie apart, sometimes two, or one.
+fn choose(rng: &mut SmallRng) -> (Vec<usize>, Vec<usize>) {
+    let start = rng.random_range(0..CAMERAS);
+    let places = [0, if rng.random_bool(0.5) { 2 } else { 3 }, 5];
+    let count = [1, 1, 2, 2, 3, 3, 3, 3, 3, 3][rng.random_range(0..10)];
+    let inputs: Vec<usize> = places.iter().take(count).map(|place| (start + place) % CAMERAS).collect();
+    let mut others: Vec<usize> = (0..CAMERAS).filter(|slot| !inputs.contains(slot)).collect();
+    others.shuffle(rng);
+    others.truncate(TARGETS);
+    (inputs, others)
+}
+
+/// What the input cameras give at an instant; the other slots are empty.
+fn frame_set(simulator: &mut Simulator, rig: &Rig, instant: u64, index: u64, inputs: &[usize]) -> Result<FrameSet> {
+    let nanos = simulator.frame_nanos(instant);
+    let mut frames: Vec<Option<Arc<Frame>>> = vec![None; rig.cameras.len()];
+    for (&slot, (image, mask)) in inputs.iter().zip(simulator.capture_all(nanos, inputs)?) {
+        frames[slot] = Some(Arc::new(frame(&rig.cameras[slot], nanos, image, mask)));
+    }
+    Ok(FrameSet { index, master_nanos: nanos, frames })
+}
+
+fn frame(camera: &Camera, nanos: i64, image: Image, mask: Mask) -> Frame {
+    Frame {
+        camera: camera.id.clone(),
+        sequence: 0,
+        capture_nanos: nanos,
+        exposure_nanos: None,
+        image,
+        mask: Some(mask),
+    }
+}

@@ -1,0 +1,139 @@
+//! How a training goes: curve, table, picture.
+
+use std::{fmt, path::Path};
+
+use anyhow::{Context, Result};
+use flyrig_stfa::{Loss, SampleErrors};
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    bench::plot::{Plot, Series},
+    report::write_whole,
+};
+
+/// Points of the curve.
+const CURVE_POINTS: usize = 120;
+/// Steps that the progress bar's message is the mean of.
+const RECENT: usize = 200;
+
+/// How well people that were never trained on are painted.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Scores {
+    pub step: u64,
+    /// Mean over samples, dB.
+    pub psnr_db: f64,
+    /// Of direct appearance on the same pixels.
+    pub direct_db: f64,
+    /// As far as drawing and truth both cover a pixel, dB: gain of the networks over direct appearance in colour alone.
+    pub color_gain_db: f64,
+    /// Mean structural similarity of the patches, colour alone: gain over direct appearance.
+    pub ssim_gain: f64,
+    /// Fine contrast over the truth's, of the networks and of direct appearance.
+    pub contrast: [f64; 2],
+    /// Share of the samples on which the networks are better.
+    pub better: f64,
+}
+
+impl Scores {
+    /// From mean squared errors of the networks and of direct appearance.
+    pub fn new(step: u64, errors: &[SampleErrors]) -> Self {
+        let count = errors.len().max(1) as f64;
+        let mean = |of: fn(&SampleErrors) -> f64| errors.iter().map(|e| psnr(of(e))).sum::<f64>() / count;
+        Self {
+            step,
+            psnr_db: mean(|e| e.mse),
+            direct_db: mean(|e| e.direct_mse),
+            color_gain_db: mean(|e| e.color_mse) - mean(|e| e.direct_color_mse),
+            ssim_gain: errors.iter().map(|e| e.ssim - e.direct_ssim).sum::<f64>() / count,
+            contrast: [|e: &SampleErrors| e.contrast, |e: &SampleErrors| e.direct_contrast]
+                .map(|of| errors.iter().map(of).sum::<f64>() / count),
+            better: errors.iter().filter(|e| e.mse < e.direct_mse).count() as f64 / count,
+        }
+    }
+}
+
+impl fmt::Display for Scores {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "people never seen: {:.2} dB, direct appearance {:.2} dB, better on {:.0} % of the samples, {:+.2} dB and SSIM {:+.4} in colour, fine contrast {:.2} (direct {:.2})",
+            self.psnr_db,
+            self.direct_db,
+            self.better * 100.0,
+            self.color_gain_db,
+            self.ssim_gain,
+            self.contrast[0],
+            self.contrast[1]
+        )
+    }
+}
+
+fn psnr(mse: f64) -> f64 {
+    -10.0 * mse.max(1e-10).log10()
+}
+
+/// Everything that is plotted.
+#[derive(Debug, Default)]
+pub struct Progress {
+    pub losses: Vec<Loss>,
+    pub scores: Vec<Scores>,
+}
+
+impl Progress {
+    /// Reads what an earlier run left, up to the step that it is resumed at.
+    pub fn open(folder: &Path, step: u64) -> Result<Self> {
+        let path = folder.join("progress.json");
+        if step == 0 || !path.exists() {
+            return Ok(Self::default());
+        }
+        let text = std::fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        let (mut losses, mut scores): (Vec<Loss>, Vec<Scores>) =
+            serde_json::from_str(&text).with_context(|| format!("{} is damaged; delete it", path.display()))?;
+        losses.retain(|loss| loss.step < step);
+        scores.retain(|score| score.step <= step);
+        Ok(Self { losses, scores })
+    }
+
+    /// Recent gain over direct appearance on what is trained on.
+    pub fn message(&self) -> String {
+        let recent = &self.losses[self.losses.len().saturating_sub(RECENT)..];
+        let count = recent.len().max(1) as f64;
+        let mean = |of: fn(&Loss) -> f64| recent.iter().map(|loss| psnr(of(loss))).sum::<f64>() / count;
+        let (ours, direct) = (mean(|loss| loss.mse), mean(|loss| loss.direct_mse));
+        let held_out =
+            self.scores.last().map_or(String::new(), |s| format!(", held out {:+.2}", s.psnr_db - s.direct_db));
+        format!("{ours:.2} dB, {:+.2} over direct{held_out}", ours - direct)
+    }
+
+    /// Writes table, picture and what a resumed run needs.
+    pub fn save(&self, folder: &Path) -> Result<()> {
+        write_whole(&folder.join("progress.json"), &serde_json::to_vec(&(&self.losses, &self.scores))?)?;
+        let rows: Vec<String> =
+            self.losses.iter().map(|l| format!("{},{:.6},{:.6}\n", l.step, l.mse, l.direct_mse)).collect();
+        write_whole(&folder.join("loss.csv"), format!("step,mse,direct_mse\n{}", rows.concat()).as_bytes())?;
+        write_whole(&folder.join("loss.svg"), self.plot().svg().as_bytes())
+    }
+
+    fn plot(&self) -> Plot {
+        let gain = |losses: &[Loss]| {
+            let sum: f64 = losses.iter().map(|loss| psnr(loss.mse) - psnr(loss.direct_mse)).sum();
+            sum / losses.len().max(1) as f64
+        };
+        let width = self.losses.len().div_ceil(CURVE_POINTS).max(1);
+        let trained =
+            self.losses.chunks(width).filter_map(|chunk| Some((chunk.last()?.step as f64, gain(chunk), String::new())));
+        let held_out = self.scores.iter().map(|s| (s.step as f64, s.psnr_db - s.direct_db, String::new()));
+        Plot {
+            title: "Gain over direct appearance".to_owned(),
+            x_label: "step".to_owned(),
+            y_label: "PSNR gain, dB".to_owned(),
+            log_x: false,
+            log_y: false,
+            front: false,
+            series: vec![
+                Series { name: "people trained on".to_owned(), points: trained.collect(), joined: true },
+                Series { name: "people never seen".to_owned(), points: held_out.collect(), joined: true },
+            ],
+        }
+    }
+}

@@ -1,0 +1,244 @@
+//! The person's box of every input picture, and its fine detail.
+
+use flyrig_renderer::AppearanceSettings;
+use rayon::prelude::*;
+
+use crate::{StfaError, taps::FeatureMaps};
+
+/// Colours of fine and of coarse detail.
+pub const DETAIL: usize = 6;
+
+/// Pixels around the person that the networks see as well.
+const MARGIN_PX: usize = 8;
+/// Sides are multiples of this: the encoder halves twice.
+const MULTIPLE: usize = 4;
+/// Detail is what these blurs take away, standard deviations in pixels.
+const BLURS_PX: [f32; 2] = [1.0, 3.0];
+
+/// A picture as the engine holds it.
+#[derive(Debug, Clone, Copy)]
+pub struct ViewPicture<'a> {
+    /// Pixels.
+    pub width: u32,
+    /// Pixels.
+    pub height: u32,
+    /// sRGB rows without padding; a: mask coverage, 255 on the person.
+    pub rgba: &'a [u8],
+}
+
+/// The person's boxes, all of one size.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Crops {
+    /// Number of pictures.
+    pub views: usize,
+    /// Pixels, a multiple of four.
+    pub width: usize,
+    /// Pixels, a multiple of four.
+    pub height: usize,
+    /// Pixel of each picture that lies on the crop's first one.
+    pub origins: Vec<[u32; 2]>,
+    /// View by view, row by row: sRGB and mask coverage.
+    pub rgba: Vec<u8>,
+}
+
+impl Crops {
+    /// Cuts the masks' boxes out, grown to a common size. A picture without a person gives an empty crop.
+    ///
+    /// # Errors
+    /// [`StfaError::Frame`] when a picture's bytes do not fit its size.
+    pub fn cut(pictures: &[ViewPicture<'_>]) -> Result<Self, StfaError> {
+        let mut boxes = Vec::with_capacity(pictures.len());
+        for (view, picture) in pictures.iter().enumerate() {
+            let (width, height) = (picture.width as usize, picture.height as usize);
+            if width == 0 || picture.rgba.len() != width * height * 4 {
+                let bytes = picture.rgba.len();
+                return Err(StfaError::Frame(format!("view {view}: {bytes} bytes for {width}x{height} pixels")));
+            }
+            boxes.push(person_box(picture.rgba, width, height));
+        }
+        let side = |of: fn(&[usize; 4]) -> usize| boxes.iter().map(of).max().unwrap_or(0).next_multiple_of(MULTIPLE);
+        let (width, height) = (side(|b| b[2] - b[0]), side(|b| b[3] - b[1]));
+        let mut rgba = vec![0; pictures.len() * width * height * 4];
+        for ((picture, area), crop) in
+            pictures.iter().zip(&boxes).zip(rgba.chunks_exact_mut((width * height * 4).max(1)))
+        {
+            let stride = picture.width as usize * 4;
+            let columns = width.min(picture.width as usize - area[0]) * 4;
+            let rows = picture.rgba.chunks_exact(stride).skip(area[1]);
+            for (to, from) in crop.chunks_exact_mut(width * 4).zip(rows) {
+                to[..columns].copy_from_slice(&from[area[0] * 4..area[0] * 4 + columns]);
+            }
+        }
+        let origins = boxes.iter().map(|area| [area[0] as u32, area[1] as u32]).collect();
+        Ok(Self { views: pictures.len(), width, height, origins, rgba })
+    }
+
+    /// What the encoder sees, channels first: sRGB 0..1 on the person, black elsewhere, and how far a pixel is the
+    /// person's.
+    #[must_use]
+    pub fn planes(&self, settings: &AppearanceSettings) -> Vec<f32> {
+        let pixels = self.width * self.height;
+        let mut out = vec![0.0; self.views * 4 * pixels];
+        for (crop, out) in self.rgba.chunks_exact((pixels * 4).max(1)).zip(out.chunks_exact_mut((pixels * 4).max(1))) {
+            for (i, pixel) in crop.chunks_exact(4).enumerate() {
+                let belief = belief(pixel[3], settings);
+                for c in 0..3 {
+                    out[c * pixels + i] = belief * f32::from(pixel[c]) / 255.0;
+                }
+                out[3 * pixels + i] = belief;
+            }
+        }
+        out
+    }
+
+    /// sRGB values times belief, and belief.
+    #[must_use]
+    pub fn colors(&self, settings: &AppearanceSettings) -> FeatureMaps {
+        let values = self.rgba.par_chunks_exact(4).flat_map_iter(|pixel| believed(pixel, settings)).collect();
+        FeatureMaps { width: self.width, height: self.height, channels: 4, stride: 1, values }
+    }
+
+    /// What two blurs take away from the sRGB values, the background left out.
+    #[must_use]
+    pub fn detail(&self, settings: &AppearanceSettings) -> FeatureMaps {
+        let pixels = self.width * self.height;
+        let mut values = vec![0.0; self.views * pixels * DETAIL];
+        values.par_chunks_mut((pixels * DETAIL).max(1)).zip(self.rgba.par_chunks((pixels * 4).max(1))).for_each(
+            |(out, crop)| {
+                let sharp: Vec<[f32; 4]> = crop.chunks_exact(4).map(|pixel| believed(pixel, settings)).collect();
+                let [fine, coarse] = BLURS_PX.map(|sigma| blurred(&sharp, self.width, sigma));
+                let mean = |p: [f32; 4], c: usize| if p[3] > 1e-3 { p[c] / p[3] } else { 0.0 };
+                for (i, out) in out.chunks_exact_mut(DETAIL).enumerate() {
+                    if sharp[i][3] > 0.0 {
+                        for c in 0..3 {
+                            out[c] = mean(sharp[i], c) - mean(fine[i], c);
+                            out[3 + c] = mean(fine[i], c) - mean(coarse[i], c);
+                        }
+                    }
+                }
+            },
+        );
+        FeatureMaps { width: self.width, height: self.height, channels: DETAIL, stride: 1, values }
+    }
+}
+
+/// As direct appearance believes a pixel of this coverage.
+fn belief(coverage: u8, settings: &AppearanceSettings) -> f32 {
+    ((f32::from(coverage) / 255.0 - settings.min_mask) / (1.0 - settings.min_mask)).clamp(0.0, 1.0)
+}
+
+/// sRGB 0..1 times belief, and belief.
+fn believed(pixel: &[u8], settings: &AppearanceSettings) -> [f32; 4] {
+    let belief = belief(pixel[3], settings);
+    let color = |c: usize| belief * f32::from(pixel[c]) / 255.0;
+    [color(0), color(1), color(2), belief]
+}
+
+/// Left, top, right, bottom (excluded) of what is covered, with a margin; empty without a person.
+fn person_box(rgba: &[u8], width: usize, height: usize) -> [usize; 4] {
+    let (mut left, mut top, mut right, mut bottom) = (width, height, 0, 0);
+    for (y, row) in rgba.chunks_exact(width * 4).enumerate() {
+        let covered = |pixel: &&[u8]| pixel[3] > 0;
+        let mut pixels = row.chunks_exact(4);
+        if let Some(first) = pixels.position(|pixel| covered(&pixel)) {
+            let last = row.chunks_exact(4).rposition(|pixel| covered(&pixel)).unwrap_or(first);
+            (left, right) = (left.min(first), right.max(last + 1));
+            (top, bottom) = (top.min(y), y + 1);
+        }
+    }
+    if left >= right {
+        return [0; 4];
+    }
+    [
+        left.saturating_sub(MARGIN_PX),
+        top.saturating_sub(MARGIN_PX),
+        (right + MARGIN_PX).min(width),
+        (bottom + MARGIN_PX).min(height),
+    ]
+}
+
+/// Separable Gaussian blur, zero outside.
+fn blurred(pixels: &[[f32; 4]], width: usize, sigma: f32) -> Vec<[f32; 4]> {
+    let radius = (2.5 * sigma).ceil() as i64;
+    let kernel: Vec<f32> = (-radius..=radius).map(|d| (-0.5 * (d as f32 / sigma).powi(2)).exp()).collect();
+    let total: f32 = kernel.iter().sum();
+    let height = pixels.len() / width.max(1);
+    let pass = |from: &[[f32; 4]], step: [i64; 2]| -> Vec<[f32; 4]> {
+        let mut out = vec![[0.0; 4]; from.len()];
+        for y in 0..height as i64 {
+            for x in 0..width as i64 {
+                let mut sum = [0.0; 4];
+                for (k, weight) in kernel.iter().enumerate() {
+                    let d = k as i64 - radius;
+                    let (sx, sy) = (x + d * step[0], y + d * step[1]);
+                    if (0..width as i64).contains(&sx) && (0..height as i64).contains(&sy) {
+                        let source = from[sy as usize * width + sx as usize];
+                        for c in 0..4 {
+                            sum[c] += weight * source[c];
+                        }
+                    }
+                }
+                out[y as usize * width + x as usize] = sum.map(|v| v / total);
+            }
+        }
+        out
+    };
+    pass(&pass(pixels, [1, 0]), [0, 1])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn picture(width: u32, height: u32, person: impl Fn(u32, u32) -> Option<[u8; 3]>) -> Vec<u8> {
+        (0..width * height)
+            .flat_map(|i| match person(i % width, i / width) {
+                Some([r, g, b]) => [r, g, b, 255],
+                None => [255, 0, 255, 0],
+            })
+            .collect()
+    }
+
+    #[test]
+    fn boxes_hold_the_person_and_keep_their_place() {
+        let one =
+            picture(60, 50, |x, y| ((20..23).contains(&x) && (30..44).contains(&y)).then_some([x as u8, y as u8, 9]));
+        let nobody = picture(40, 30, |_, _| None);
+        let whole = picture(33, 21, |x, y| Some([x as u8, y as u8, 1]));
+        let pictures = [(60, 50, &one), (40, 30, &nobody), (33, 21, &whole)].map(|(width, height, rgba)| ViewPicture {
+            width,
+            height,
+            rgba,
+        });
+        let crops = Crops::cut(&pictures).unwrap();
+        assert_eq!((crops.width, crops.height), (36, 28));
+        assert_eq!(crops.origins, [[12, 22], [0, 0], [0, 0]]);
+        let at = |view: usize, x: usize, y: usize| &crops.rgba[((view * 28 + y) * 36 + x) * 4..][..4];
+        assert_eq!(at(0, 20 - 12, 30 - 22), [20, 30, 9, 255]);
+        assert_eq!(at(2, 32, 20), [32, 20, 1, 255]);
+        assert_eq!(at(2, 33, 20), [0; 4]);
+        assert!(crops.planes(&AppearanceSettings::default())[4 * 36 * 28..8 * 36 * 28].iter().all(|v| *v == 0.0));
+        let error = Crops::cut(&[ViewPicture { width: 4, height: 4, rgba: &one }]).unwrap_err().to_string();
+        assert!(error.contains("view 0") && error.contains("4x4"), "{error}");
+    }
+
+    #[test]
+    fn detail_is_zero_on_flat_cloth_and_never_sees_the_background() {
+        let flat = picture(40, 40, |x, _| (x > 10).then_some([200, 100, 50]));
+        let crops = Crops::cut(&[ViewPicture { width: 40, height: 40, rgba: &flat }]).unwrap();
+        let detail = crops.detail(&AppearanceSettings::default());
+        assert!(detail.values.iter().all(|v| v.abs() < 1e-5), "flat cloth");
+        let stripes = picture(40, 40, |x, _| Some(if x % 2 == 0 { [255; 3] } else { [0; 3] }));
+        let crops = Crops::cut(&[ViewPicture { width: 40, height: 40, rgba: &stripes }]).unwrap();
+        let detail = crops.detail(&AppearanceSettings::default());
+        let middle = &detail.values[(20 * crops.width + 20) * DETAIL..][..DETAIL];
+        assert!(middle[0] > 0.4 && middle[3].abs() < 0.02, "stripes of a pixel are fine detail: {middle:?}");
+    }
+
+    #[test]
+    fn no_picture_at_all_gives_empty_crops() {
+        let crops = Crops::cut(&[]).unwrap();
+        assert_eq!(crops, Crops::default());
+        assert!(crops.detail(&AppearanceSettings::default()).values.is_empty());
+    }
+}

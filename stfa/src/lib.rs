@@ -1,0 +1,45 @@
+//! Learned appearance: networks of spatial-temporal feature aggregation (FlyHuman, section 3.2), trained on simulated
+//! people, that add to direct appearance.
+//!
+//! A crate of its own because of the build time of `burn`, which only this one needs.
+//!
+//! # What goes through
+//!
+//! 1. **Encoder**: three scales of feature maps over the person's box of every picture.
+//! 2. **Aggregation** (Eq. 5 to 8): bilinear samples at the projected Gaussians, with the weights that direct appearance
+//!    found ([`Observations`](flyrig_renderer::Observations)).
+//! 3. **Graph**: graph-transformer layers over the deformation graph's nodes, which know their place on the body, what was
+//!    seen around them and how well; each node has an edge to its mirror image. Eq. 9 fills in what was not seen.
+//! 4. **Memory** (Eq. 10 to 12): of whole feature vectors.
+//! 5. **Colour**: a small network that moves direct appearance's colour towards candidates (the colour around, the colour
+//!    of the other side, sharper detail) and adds a residual.
+//!
+//! The last layer starts at zero: an untrained network paints what direct appearance paints.
+
+mod body_graph;
+mod crops;
+mod error;
+mod inputs;
+mod memory;
+mod network;
+mod paint;
+mod parameters;
+mod sample;
+mod structure;
+mod taps;
+mod tensor_file;
+mod train;
+mod variation;
+mod weights;
+
+pub use body_graph::{BodyGraph, EDGES, PLACE, POOLED};
+pub use crops::{Crops, DETAIL, ViewPicture};
+pub use error::StfaError;
+pub use inputs::{CANDIDATES, FrameInputs, NODE, STATE, frame_inputs};
+pub use memory::FeatureMemory;
+pub use paint::{LearnedAppearance, PaintCounts};
+pub use parameters::{NetworkSize, Parameters};
+pub use sample::{PATCH, SHARES, Target, TargetPicture, TrainingSample, training_sample};
+pub use taps::{FeatureMaps, Tap, Taps};
+pub use train::{Loss, SampleErrors, TrainSettings, Trainer, evaluate};
+pub use weights::WEIGHTS_VERSION;

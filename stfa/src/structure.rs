@@ -1,0 +1,126 @@
+//! Structural similarity (Wang et al. 2004) of patches, with box windows, and how much fine contrast they have.
+
+use burn_tensor::{Tensor, module, ops::AvgPoolOptions};
+
+use crate::sample::PATCH;
+
+/// Side of a window and distance of two windows, pixels.
+const WINDOW: usize = 8;
+const STRIDE: usize = 4;
+/// What keeps flat, dark windows calm, for values from 0 to 1.
+const SMALL: [f32; 2] = [1e-4, 9e-4];
+
+/// Side of a window of fine contrast and distance of two windows, pixels.
+const FINE: usize = 4;
+const FINE_STRIDE: usize = 2;
+/// Added to a variance, so that its root has a slope everywhere.
+const SMALL_VARIANCE: f32 = 1e-4;
+
+/// Patches as planes, from rows (pixel, 3): patch by patch, row by row.
+fn planes(of: Tensor<2>) -> Tensor<4> {
+    let patches = of.dims()[0] / (PATCH * PATCH);
+    of.reshape([patches, PATCH, PATCH, 3]).permute([0, 3, 1, 2])
+}
+
+/// Standard deviation of every small window.
+pub(crate) fn fine_contrast(of: Tensor<2>) -> Tensor<4> {
+    let mean = |of: Tensor<4>| module::avg_pool2d(of, AvgPoolOptions::new([FINE; 2]).with_stride([FINE_STRIDE; 2]));
+    let of = planes(of);
+    let variance = mean(of.clone().powf_scalar(2.0)) - mean(of).powf_scalar(2.0);
+    (variance.clamp_min(0.0) + SMALL_VARIANCE).sqrt()
+}
+
+/// Mean SSIM over windows and channels of rows (pixel, 3): patch by patch, row by row.
+pub(crate) fn structural_similarity(ours: Tensor<2>, truth: Tensor<2>) -> Tensor<1> {
+    let mean = |of: Tensor<4>| module::avg_pool2d(of, AvgPoolOptions::new([WINDOW; 2]).with_stride([STRIDE; 2]));
+    let (a, b) = (planes(ours), planes(truth));
+    let (mean_a, mean_b) = (mean(a.clone()), mean(b.clone()));
+    let products = mean_a.clone() * mean_b.clone();
+    let squares = mean_a.powf_scalar(2.0) + mean_b.powf_scalar(2.0);
+    let covariance = mean(a.clone() * b.clone()) - products.clone();
+    let variances = mean(a.powf_scalar(2.0) + b.powf_scalar(2.0)) - squares.clone();
+    let light = (products * 2.0 + SMALL[0]) / (squares + SMALL[0]);
+    let shape = (covariance * 2.0 + SMALL[1]) / (variances + SMALL[1]);
+    (light * shape).mean()
+}
+
+#[cfg(test)]
+mod tests {
+    use burn_tensor::{Device, TensorData};
+    use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
+
+    use super::*;
+
+    fn measured(a: &[f32], b: &[f32]) -> f64 {
+        let rows =
+            |of: &[f32]| Tensor::<2>::from_data(TensorData::new(of.to_vec(), [of.len() / 3, 3]), &Device::flex());
+        f64::from(crate::parameters::to_vec(structural_similarity(rows(a), rows(b)))[0])
+    }
+
+    /// Window by window, from differences to the mean.
+    fn reference(a: &[f32], b: &[f32]) -> f64 {
+        let (mut sum, mut count) = (0.0, 0.0);
+        for patch in 0..a.len() / (3 * PATCH * PATCH) {
+            for (y0, x0) in (0..=PATCH - WINDOW)
+                .step_by(STRIDE)
+                .flat_map(|y| (0..=PATCH - WINDOW).step_by(STRIDE).map(move |x| (y, x)))
+            {
+                for c in 0..3 {
+                    let places = (0..WINDOW * WINDOW).map(|i| {
+                        let (y, x) = (y0 + i / WINDOW, x0 + i % WINDOW);
+                        ((patch * PATCH + y) * PATCH + x) * 3 + c
+                    });
+                    let n = (WINDOW * WINDOW) as f64;
+                    let mean = |of: &[f32]| places.clone().map(|i| f64::from(of[i])).sum::<f64>() / n;
+                    let (ma, mb) = (mean(a), mean(b));
+                    let moment = |f: &dyn Fn(f64, f64) -> f64| {
+                        places.clone().map(|i| f(f64::from(a[i]) - ma, f64::from(b[i]) - mb)).sum::<f64>() / n
+                    };
+                    let (va, vb, cov) = (moment(&|a, _| a * a), moment(&|_, b| b * b), moment(&|a, b| a * b));
+                    sum += (2.0 * ma * mb + 1e-4) / (ma * ma + mb * mb + 1e-4) * (2.0 * cov + 9e-4) / (va + vb + 9e-4);
+                    count += 1.0;
+                }
+            }
+        }
+        sum / count
+    }
+
+    #[test]
+    fn fine_contrast_is_the_deviation_of_every_small_window() {
+        let mut rng = SmallRng::seed_from_u64(9);
+        let size = 2 * PATCH * PATCH * 3;
+        let a: Vec<f32> = (0..size).map(|_| rng.random_range(0.0..1.0)).collect();
+        let rows = Tensor::<2>::from_data(TensorData::new(a.clone(), [size / 3, 3]), &Device::flex());
+        let found = fine_contrast(rows);
+        let side = (PATCH - FINE) / FINE_STRIDE + 1;
+        assert_eq!(found.dims(), [2, 3, side, side]);
+        let found = crate::parameters::to_vec(found);
+        for (i, found) in found.iter().enumerate() {
+            let (x, y, c, patch) = (i % side, i / side % side, i / (side * side) % 3, i / (3 * side * side));
+            let values: Vec<f64> = (0..FINE * FINE)
+                .map(|k| (patch * PATCH + y * FINE_STRIDE + k / FINE) * PATCH + x * FINE_STRIDE + k % FINE)
+                .map(|pixel| f64::from(a[pixel * 3 + c]))
+                .collect();
+            let mean = values.iter().sum::<f64>() / 16.0;
+            let expected = (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 16.0 + 1e-4).sqrt();
+            assert!((f64::from(*found) - expected).abs() < 1e-5, "window {i}: {found} against {expected}");
+        }
+    }
+
+    #[test]
+    fn windows_equal_the_definition() {
+        let mut rng = SmallRng::seed_from_u64(8);
+        let size = 2 * PATCH * PATCH * 3;
+        let a: Vec<f32> = (0..size).map(|_| rng.random_range(0.0..1.0)).collect();
+        for blend in [0.0, 0.2, 0.9, 1.0] {
+            let b: Vec<f32> = a.iter().map(|v| v + blend * (rng.random_range(0.0..1.0) - v)).collect();
+            let (ours, expected) = (measured(&a, &b), reference(&a, &b));
+            assert!((ours - expected).abs() < 2e-5, "{blend}: {ours} against {expected}");
+        }
+        let (black, white) = (vec![0.0; size], vec![1.0; size]);
+        assert!((measured(&white, &white) - 1.0).abs() < 1e-4);
+        assert!((measured(&black, &white) - reference(&black, &white)).abs() < 2e-5);
+        let flat: Vec<f32> = (0..size).map(|_| 0.5).collect();
+        assert!(measured(&a, &flat) < 0.1, "contrast that is lost counts");
+    }
+}

@@ -1,0 +1,109 @@
+//! Weights files: safetensors with a card that tells where they come from.
+
+use std::{collections::HashMap, path::Path};
+
+use safetensors::SafeTensors;
+
+use crate::{
+    NetworkSize, Parameters, StfaError,
+    parameters::Parameter,
+    tensor_file::{TensorFile, array, read},
+};
+
+/// Version of the networks: a file of another one cannot be used.
+pub const WEIGHTS_VERSION: u32 = 1;
+
+/// Largest sensible number of channels, heads, layers: what a damaged file may not exceed.
+const MAX_SIZE: usize = 4096;
+
+impl Parameters {
+    /// Writes the weights; `card` is JSON of the user's choice (data, seeds, command, scores).
+    ///
+    /// # Errors
+    /// [`StfaError::File`].
+    pub fn save(&self, path: &Path, card: &serde_json::Value) -> Result<(), StfaError> {
+        let mut file = TensorFile::default();
+        self.push_to(&mut file, "");
+        file.write(path, self.metadata(card))
+    }
+
+    pub(crate) fn push_to(&self, file: &mut TensorFile, prefix: &str) {
+        for (name, parameter) in &self.by_name {
+            file.push(format!("{prefix}{name}"), parameter.shape.clone(), &parameter.values);
+        }
+    }
+
+    pub(crate) fn metadata(&self, card: &serde_json::Value) -> HashMap<String, String> {
+        // A struct of numbers always has a JSON form.
+        let size = serde_json::to_string(&self.size).unwrap_or_default();
+        HashMap::from([
+            ("flyrig-stfa".to_owned(), WEIGHTS_VERSION.to_string()),
+            ("size".to_owned(), size),
+            ("card".to_owned(), card.to_string()),
+        ])
+    }
+
+    /// The weights that come with this version (`stfa/weights/small.safetensors`; `small.json` tells how they were made).
+    ///
+    /// # Errors
+    /// [`StfaError::Weights`], never for a program that was built whole.
+    pub fn embedded() -> Result<Self, StfaError> {
+        Self::from_bytes("embedded", include_bytes!("../weights/small.safetensors"))
+    }
+
+    /// Reads weights from a file.
+    ///
+    /// # Errors
+    /// [`StfaError::File`]; [`StfaError::Weights`] for a file that is cut short, of another version or another network.
+    pub fn load(path: &Path) -> Result<Self, StfaError> {
+        Self::from_bytes(&path.display().to_string(), &read(path)?)
+    }
+
+    /// Reads weights from a file's bytes; `name` is for errors.
+    ///
+    /// # Errors
+    /// [`StfaError::Weights`].
+    pub fn from_bytes(name: &str, bytes: &[u8]) -> Result<Self, StfaError> {
+        let refuse = |what: String| StfaError::Weights { name: name.to_owned(), what };
+        let file = SafeTensors::deserialize(bytes).map_err(|error| refuse(format!("not a whole file ({error})")))?;
+        Self::read_from(&file, &header(bytes).map_err(refuse)?, "").map_err(refuse)
+    }
+
+    pub(crate) fn read_from(
+        file: &SafeTensors<'_>,
+        metadata: &HashMap<String, String>,
+        prefix: &str,
+    ) -> Result<Self, String> {
+        let version = metadata.get("flyrig-stfa").ok_or("it holds no flyrig networks")?;
+        if *version != WEIGHTS_VERSION.to_string() {
+            return Err(format!("version {version}, expected {WEIGHTS_VERSION}"));
+        }
+        let size = metadata.get("size").ok_or("the networks' size is missing")?;
+        let size: NetworkSize = serde_json::from_str(size).map_err(|error| format!("the networks' size: {error}"))?;
+        check_size(&size)?;
+        let mut by_name = std::collections::BTreeMap::new();
+        for (name, shape, _) in size.parameters() {
+            let values: Vec<f32> = array(file, &format!("{prefix}{name}"), &shape)?;
+            if !values.iter().all(|v| v.is_finite()) {
+                return Err(format!("{name} holds numbers that are not finite"));
+            }
+            by_name.insert(name, Parameter { shape, values });
+        }
+        Ok(Self { size, by_name })
+    }
+}
+
+/// Metadata of a safetensors file.
+pub(crate) fn header(bytes: &[u8]) -> Result<HashMap<String, String>, String> {
+    let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| error.to_string())?;
+    Ok(metadata.metadata().clone().unwrap_or_default())
+}
+
+fn check_size(size: &NetworkSize) -> Result<(), String> {
+    let NetworkSize { channels: [a, b, c], node, heads, layers, hidden: [d, e] } = *size;
+    let sizes = [a, b, c, node, heads, layers, d, e];
+    if sizes.iter().any(|&s| s == 0 || s > MAX_SIZE) || node % heads != 0 {
+        return Err(format!("a network of size {size:?} cannot be"));
+    }
+    Ok(())
+}
