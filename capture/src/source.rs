@@ -26,7 +26,7 @@ pub struct SourceHealth {
 /// What happens to a camera's frames between its computer and this one; counts since this one listens.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct NetworkHealth {
-    /// Frames that newer ones overtook before they left the camera's computer.
+    /// Frames that stayed on the camera's computer: newer ones overtook them, nobody listened, or sending failed.
     pub overtaken_before: u64,
     /// Frames that left and never came.
     pub lost_on_the_way: u64,

@@ -50,7 +50,7 @@ pub enum Command {
         table: bool,
     },
     /// Send the cameras of this computer to a rig that runs on another one (source.kind = "network" there) until Ctrl-C. Of
-    /// the configuration [rig], [source], [capture], [transport] and [health] count; it needs no calibration.
+    /// the configuration [rig], [source], [capture], [transport] and [health] count; V4L2 cameras need no calibration.
     Capture {
         /// The TOML file; see `flyrig config print`.
         config: PathBuf,

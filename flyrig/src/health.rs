@@ -94,7 +94,7 @@ impl Health {
             ("frames_overtaken_total", "counter", "Frames overtaken before they were decoded.", &|c| {
                 Some(c.stats.overtaken as f64)
             }),
-            ("network_overtaken_before_total", "counter", "Frames overtaken on the camera's computer.", &|c| {
+            ("network_overtaken_before_total", "counter", "Frames that stayed on the camera's computer.", &|c| {
                 c.stats.health.network.map(|n| n.overtaken_before as f64)
             }),
             ("network_lost_total", "counter", "Frames that left the camera's computer and never came.", &|c| {

@@ -195,7 +195,7 @@ impl Intake {
             drops.push((format!("frames of {} overtaken before their decoding", camera.camera), camera.overtaken));
             if let Some(network) = camera.health.network {
                 for (place, count) in [
-                    ("overtaken on the camera's computer", network.overtaken_before),
+                    ("left on the camera's computer", network.overtaken_before),
                     ("lost on the way", network.lost_on_the_way),
                     ("overtaken when they had come", network.overtaken_here),
                     ("refused", network.refused),

@@ -18,7 +18,7 @@
 //! | `clock/<host>` | query and reply: that computer's `CLOCK_MONOTONIC`, nanoseconds, i64 little-endian |
 //! | `alive/<publisher>`, `viewer/<subscriber>/alive`, `host/<host>` | liveliness tokens |
 //!
-//! Every message carries a [`Header`] as its zenoh attachment: schema version, sequence, times.
+//! Every published message carries a [`Header`] as its zenoh attachment: schema version, sequence, times.
 //!
 //! # Promises
 //!
