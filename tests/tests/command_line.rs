@@ -80,8 +80,8 @@ fn a_demo_goes_through_every_fault_of_a_rig() {
             .map(|drop| drop[1].as_u64().unwrap())
             .sum()
     };
-    // Camera 05 hangs for 3 frames and is gone for 8; some frames of 00 cannot be decoded.
-    assert!(count("errors of 05") == 11 && count("errors of 00") >= 1, "{drops:?}");
+    // Camera 05 hangs for 3 frames, which is no error yet, and is gone for 8; some frames of 00 cannot be decoded.
+    assert!(count("errors of 05") == 8 && count("errors of 00") >= 1, "{drops:?}");
     assert!(count("sets without a camera") >= 11, "{drops:?}");
     let wrong = std::fs::write(folder.path().join("bad.toml"), "[[fault]]\nkind = \"drop\"\nmm = 3\n");
     wrong.unwrap();
