@@ -106,7 +106,7 @@ fn a_recorder_that_is_dropped_beside_a_running_camera_leaves_a_whole_file() {
     drop(recorder);
     assert_eq!(pass(&mut tap), 3, "the camera goes on");
     assert_eq!(replayed(&path, "a").len(), 5);
-    let bytes = std::fs::read(&path).unwrap();
+    let bytes = fs::read(&path).unwrap();
     let summary = mcap::Summary::read(&bytes).unwrap().expect("an index");
     assert_eq!(summary.stats.unwrap().message_count, 6, "five frames and the note");
 }
