@@ -107,6 +107,61 @@ mod tests {
         }
     }
 
+    /// Largest difference of the slopes by autodiff from finite differences of the f64 references, over the largest slope.
+    fn slope_error(size: usize, value: impl Fn(Tensor<2>) -> Tensor<1>, reference: impl Fn(&[f32]) -> f64) -> f64 {
+        let mut rng = SmallRng::seed_from_u64(10);
+        let a: Vec<f32> = (0..size).map(|_| rng.random_range(0.2..0.8)).collect();
+        let leaf = Tensor::<2>::from_data(TensorData::new(a.clone(), [size / 3, 3]), &Device::flex().autodiff());
+        let leaf = leaf.require_grad();
+        let gradients = value(leaf.clone()).backward();
+        let found = crate::parameters::to_vec(leaf.grad(&gradients).unwrap());
+        let largest = found.iter().fold(0.0f32, |m, v| m.max(v.abs()));
+        let step = 1e-3;
+        (0..size).step_by(17).fold(0.0, |worst: f64, at| {
+            let moved = |by: f32| {
+                let mut a = a.clone();
+                a[at] += by;
+                reference(&a)
+            };
+            let expected = (moved(step) - moved(-step)) / (2.0 * f64::from(step));
+            worst.max((f64::from(found[at]) - expected).abs() / f64::from(largest))
+        })
+    }
+
+    #[test]
+    fn slopes_equal_finite_differences() {
+        let mut rng = SmallRng::seed_from_u64(11);
+        let size = PATCH * PATCH * 3;
+        let b: Vec<f32> = (0..size).map(|_| rng.random_range(0.2..0.8)).collect();
+        let truth = b.clone();
+        let similarity = move |of: Tensor<2>| {
+            let device = of.device();
+            structural_similarity(of, Tensor::from_data(TensorData::new(truth.clone(), [size / 3, 3]), &device))
+        };
+        let error = slope_error(size, similarity, |a| reference(a, &b));
+        assert!(error < 1e-2, "similarity: {error}");
+        let error = slope_error(size, |of| fine_contrast(of).mean(), fine_reference);
+        assert!(error < 1e-2, "contrast: {error}");
+    }
+
+    /// Mean fine contrast, window by window.
+    fn fine_reference(a: &[f32]) -> f64 {
+        let (mut sum, mut count) = (0.0, 0.0);
+        for y in (0..=PATCH - FINE).step_by(FINE_STRIDE) {
+            for x in (0..=PATCH - FINE).step_by(FINE_STRIDE) {
+                for c in 0..3 {
+                    let values: Vec<f64> = (0..FINE * FINE)
+                        .map(|k| f64::from(a[((y + k / FINE) * PATCH + x + k % FINE) * 3 + c]))
+                        .collect();
+                    let mean = values.iter().sum::<f64>() / 16.0;
+                    sum += (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 16.0 + 1e-4).sqrt();
+                    count += 1.0;
+                }
+            }
+        }
+        sum / count
+    }
+
     #[test]
     fn windows_equal_the_definition() {
         let mut rng = SmallRng::seed_from_u64(8);

@@ -57,8 +57,18 @@ fn sample(seed: u64) -> TrainingSample {
     }
 }
 
+/// The contrast term has kinks, where differences tell nothing; its slopes have a test of their own (`structure.rs`).
 fn settings(steps: u64) -> TrainSettings {
-    TrainSettings { steps, rate: 1e-2, without_space: 0.0, decay: 0.0, vary: false, ..TrainSettings::default() }
+    TrainSettings {
+        steps,
+        structure: 0.02,
+        contrast: 0.0,
+        rate: 1e-2,
+        without_space: 0.0,
+        decay: 0.0,
+        vary: false,
+        ..TrainSettings::default()
+    }
 }
 
 #[test]
