@@ -283,8 +283,14 @@ impl Shared {
             if kind == CaptureErrorKind::EndOfStream {
                 return;
             }
-            // No frame yet is no error: who watches for silence looks at when the last frame came.
-            if kind != CaptureErrorKind::Timeout {
+            // No frame yet is no error: who watches for silence looks at when the last frame came. But a camera that never
+            // gave one says what it waits for.
+            if kind == CaptureErrorKind::Timeout {
+                let mut stats = lock(&self.stats);
+                if stats[slot].frames == 0 {
+                    stats[slot].last_error = Some(error);
+                }
+            } else {
                 self.count(slot, error);
             }
             if !kind.is_recoverable() {
