@@ -19,9 +19,9 @@ setup:
 	@scripts/setup.sh
 
 demo: setup
-	@echo "demo: building flyrig (the first build takes 10 to 20 minutes on two cores, later ones seconds)"
-	$(CARGO) build --release --locked -p flyrig
-	$(CARGO) run --release --locked -q -p flyrig -- demo --out $(OUT)
+	@echo "demo: building flyrig (the first build takes 20 to 30 minutes on two cores, later ones seconds)"
+	$(CARGO) build --release --locked --workspace --bin flyrig
+	$(CARGO) run --release --locked -q --bin flyrig -- demo --out $(OUT)
 
 test: setup
 	$(CARGO) test --release --locked --workspace
@@ -33,10 +33,10 @@ test-v4l2: setup
 	@scripts/test-v4l2.sh
 
 soak: setup
-	$(CARGO) run --release --locked -q -p flyrig -- bench capture --minutes $(MINUTES)
+	$(CARGO) run --release --locked -q --bin flyrig -- bench capture --minutes $(MINUTES)
 
 fuzz: setup
-	$(CARGO) run --release --locked -q -p flyrig-tests --bin fuzz -- --minutes $(MINUTES)
+	$(CARGO) run --release --locked -q --bin fuzz -- --minutes $(MINUTES)
 
 check: setup
 	$(CARGO) fmt --all -- --check

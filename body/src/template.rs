@@ -62,6 +62,22 @@ pub enum Part {
     RightFoot,
 }
 
+impl Part {
+    /// Every part, in the order that shipped networks know them in.
+    pub const ALL: [Self; 10] = [
+        Self::Head,
+        Self::Torso,
+        Self::LeftArm,
+        Self::RightArm,
+        Self::LeftHand,
+        Self::RightHand,
+        Self::LeftLeg,
+        Self::RightLeg,
+        Self::LeftFoot,
+        Self::RightFoot,
+    ];
+}
+
 /// A skinned human at rest. All vertex lists have the same length; vertices may be split at UV seams
 /// (see [`Template::welded`]).
 #[derive(Debug, Clone, PartialEq)]

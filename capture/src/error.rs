@@ -24,23 +24,6 @@ pub enum CaptureErrorKind {
 }
 
 impl CaptureErrorKind {
-    /// Every kind, in the order of [`Self::index`].
-    pub const ALL: [Self; 7] = [
-        Self::Timeout,
-        Self::EndOfStream,
-        Self::Disconnected,
-        Self::Corrupt,
-        Self::Unsupported,
-        Self::NotFound,
-        Self::Io,
-    ];
-
-    /// Position in [`Self::ALL`].
-    #[must_use]
-    pub fn index(self) -> usize {
-        self as usize
-    }
-
     /// Whether asking the same source again can help.
     #[must_use]
     pub fn is_recoverable(self) -> bool {

@@ -300,17 +300,5 @@ impl Simulator {
 
 /// Inverse of `part as u32 + 1`.
 fn part_of_index(index: u32) -> Option<Part> {
-    const PARTS: [Part; 10] = [
-        Part::Head,
-        Part::Torso,
-        Part::LeftArm,
-        Part::RightArm,
-        Part::LeftHand,
-        Part::RightHand,
-        Part::LeftLeg,
-        Part::RightLeg,
-        Part::LeftFoot,
-        Part::RightFoot,
-    ];
-    PARTS.into_iter().find(|&part| part as u32 + 1 == index)
+    Part::ALL.into_iter().find(|&part| part as u32 + 1 == index)
 }

@@ -10,21 +10,9 @@ pub const POOLED: usize = 8;
 /// Edges of a node: four along the surface, and one to its mirror image.
 pub const EDGES: usize = 5;
 /// Numbers that describe a node's place on the body: position with three octaves of sine and cosine, normal, part.
-pub const PLACE: usize = 3 + 3 * 2 * OCTAVES + 3 + PARTS.len();
+pub const PLACE: usize = 3 + 3 * 2 * OCTAVES + 3 + Part::ALL.len();
 
 const OCTAVES: usize = 3;
-const PARTS: [Part; 10] = [
-    Part::Head,
-    Part::Torso,
-    Part::LeftArm,
-    Part::RightArm,
-    Part::LeftHand,
-    Part::RightHand,
-    Part::LeftLeg,
-    Part::RightLeg,
-    Part::LeftFoot,
-    Part::RightFoot,
-];
 /// Nodes of a Gaussian that weigh less do not count it among theirs.
 const MIN_POOL_WEIGHT: f32 = 0.25;
 
@@ -139,7 +127,7 @@ fn encode_place(position: Vec3, normal: Vec3, part: Part) -> [f32; PLACE] {
     let rest = 3 + 6 * OCTAVES;
     let normal = if normal.is_finite() { normal.normalize_or_zero() } else { Vec3::ZERO };
     out[rest..rest + 3].copy_from_slice(&normal.to_array());
-    if let Some(index) = PARTS.iter().position(|known| *known == part) {
+    if let Some(index) = Part::ALL.iter().position(|known| *known == part) {
         out[rest + 3 + index] = 1.0;
     }
     out
@@ -190,7 +178,7 @@ mod tests {
             }
             let place = &body.place[node];
             assert!(place.iter().all(|v| v.is_finite() && v.abs() <= 1.01));
-            assert!((place[PLACE - PARTS.len()..].iter().sum::<f32>() - 1.0).abs() < 1e-6, "one part");
+            assert!((place[PLACE - Part::ALL.len()..].iter().sum::<f32>() - 1.0).abs() < 1e-6, "one part");
         }
         // Height does not matter, only the place on the body.
         let twice = |p: &Vec3| *p * 2.0;

@@ -17,6 +17,7 @@
 //! The last layer starts at zero: an untrained network paints what direct appearance paints.
 
 mod body_graph;
+mod comparison;
 mod crops;
 mod error;
 mod inputs;
@@ -33,6 +34,7 @@ mod variation;
 mod weights;
 
 pub use body_graph::{BodyGraph, EDGES, PLACE, POOLED};
+pub use comparison::{Errors, SampleErrors, evaluate};
 pub use crops::{Crops, DETAIL, ViewPicture};
 pub use error::StfaError;
 pub use inputs::{CANDIDATES, FrameInputs, NODE, STATE, frame_inputs};
@@ -41,5 +43,5 @@ pub use paint::{LearnedAppearance, PaintCounts};
 pub use parameters::{NetworkSize, Parameters};
 pub use sample::{PATCH, SHARES, Target, TargetPicture, TrainingSample, training_sample};
 pub use taps::{FeatureMaps, Tap, Taps};
-pub use train::{Loss, SampleErrors, TrainSettings, Trainer, evaluate};
+pub use train::{Loss, TrainSettings, Trainer};
 pub use weights::WEIGHTS_VERSION;

@@ -32,17 +32,17 @@ pub struct PaintCounts {
     pub poisoned: u64,
 }
 
-/// Features of one picture.
-#[derive(Debug)]
-struct EncodedView {
-    width: usize,
-    rgba: Vec<u8>,
+/// Feature maps of all pictures, and the pictures themselves where features are to be reused.
+#[derive(Debug, Default)]
+struct Encoded {
+    crops: Crops,
     levels: Vec<FeatureMaps>,
 }
 
-/// What was added to each Gaussian's colour the last time, and what the colour network saw then.
+/// What was added to each Gaussian's colour the last time.
 #[derive(Debug, Default)]
 struct Corrections {
+    /// What the colour network saw then; empty where nothing is to be reused.
     rows: Vec<f32>,
     /// sRGB.
     added: Vec<[f32; 3]>,
@@ -56,7 +56,7 @@ pub struct LearnedAppearance {
     place: Tensor<2>,
     edges: Tensor<1, Int>,
     memory: FeatureMemory,
-    encoded: Vec<EncodedView>,
+    encoded: Encoded,
     corrections: Corrections,
     /// What is kept from frame to frame: features of pictures that did not change at all, and what the networks add to a
     /// Gaussian none of whose inputs changed by more than this. 0: nothing is kept.
@@ -79,7 +79,7 @@ impl LearnedAppearance {
             place,
             edges,
             memory: FeatureMemory::default(),
-            encoded: Vec::new(),
+            encoded: Encoded::default(),
             corrections: Corrections::default(),
             reuse: 0.0,
             counts: PaintCounts::default(),
@@ -107,10 +107,10 @@ impl LearnedAppearance {
         let inputs = frame_inputs(&self.body, observed, &crops, settings, None)?;
         let size = self.network.size;
         let (feature, node) = (size.feature(), size.node);
-        let levels = self.encode(&crops, settings);
-        let network = &self.network;
+        self.encode(crops, settings);
+        let (network, levels) = (&self.network, &self.encoded.levels);
         let sample = |taps: &Taps| {
-            if levels.is_empty() { vec![0.0; taps.rows() * feature] } else { taps.sample(&levels) }
+            if levels.is_empty() { vec![0.0; taps.rows() * feature] } else { taps.sample(levels) }
         };
         let visible = sample(&inputs.taps);
         let graph = if settings.space {
@@ -166,66 +166,70 @@ impl LearnedAppearance {
             .collect())
     }
 
-    /// Feature maps of all views; those of unchanged pictures are taken from the frame before.
-    fn encode(&mut self, crops: &Crops, settings: &AppearanceSettings) -> Vec<FeatureMaps> {
-        let bytes = crops.width * crops.height * 4;
-        if bytes == 0 {
-            return Vec::new();
+    /// Brings the feature maps up to date; those of unchanged pictures are kept.
+    fn encode(&mut self, crops: Crops, settings: &AppearanceSettings) {
+        if crops.rgba.is_empty() {
+            self.encoded = Encoded::default();
+            return;
         }
-        let planes = crops.planes(settings);
-        let mut before = std::mem::take(&mut self.encoded);
-        for (rgba, planes) in crops.rgba.chunks_exact(bytes).zip(planes.chunks_exact(bytes)) {
-            let same = |view: &EncodedView| view.width == crops.width && view.rgba == rgba;
-            let kept = if self.reuse > 0.0 { before.iter().position(same) } else { None };
-            self.encoded.push(if let Some(index) = kept {
+        let before = std::mem::take(&mut self.encoded.crops);
+        let comparable = self.reuse > 0.0 && before.rgba.len() == crops.rgba.len() && before.width == crops.width;
+        if !comparable {
+            self.encoded.levels.clear();
+        }
+        for view in 0..crops.views {
+            if comparable && before.view(view) == crops.view(view) {
                 self.counts.views_kept += 1;
-                before.swap_remove(index)
-            } else {
-                self.counts.views_encoded += 1;
-                let picture = self.network.pictures(planes.to_vec(), 1, crops.height, crops.width);
-                let levels = feature_maps(&self.network.encode(picture));
-                EncodedView { width: crops.width, rgba: rgba.to_vec(), levels }
-            });
+                continue;
+            }
+            self.counts.views_encoded += 1;
+            let picture = self.network.pictures(crops.planes(view, settings), 1, crops.height, crops.width);
+            for (level, map) in feature_maps(&self.network.encode(picture)).into_iter().enumerate() {
+                let size = map.values.len();
+                if self.encoded.levels.len() <= level {
+                    let values = vec![0.0; size * crops.views];
+                    self.encoded.levels.push(FeatureMaps { values, ..map.without_values() });
+                }
+                self.encoded.levels[level].values[view * size..(view + 1) * size].copy_from_slice(&map.values);
+            }
         }
-        let level = |index: usize| {
-            let of = |view: &EncodedView| view.levels[index].values.clone();
-            let values = self.encoded.iter().flat_map(of).collect();
-            Some(FeatureMaps { values, ..self.encoded.first()?.levels.get(index)?.without_values() })
-        };
-        (0..3).filter_map(level).collect()
+        if self.reuse > 0.0 {
+            self.encoded.crops = crops;
+        }
     }
 
     /// Brings what is added to each Gaussian's colour up to date with its row.
     fn add_corrections(&mut self, rows: &[f32]) {
-        let row = self.network.size.row();
+        let (row, reuse) = (self.network.size.row(), self.reuse);
+        let of = |gaussian: u32| gaussian as usize * row..(gaussian as usize + 1) * row;
         let Corrections { rows: before, added } = &mut self.corrections;
-        let fresh = before.len() != rows.len() || self.reuse <= 0.0;
-        if fresh {
-            *before = rows.to_vec();
-            *added = vec![[0.0; 3]; rows.len() / row];
-        }
-        let reuse = self.reuse;
-        let changed: Vec<u32> = (0..added.len() as u32)
+        let count = rows.len() / row;
+        let fresh = reuse <= 0.0 || before.len() != rows.len();
+        added.resize(count, [0.0; 3]);
+        let near = |(a, b): (&f32, &f32)| (a - b).abs() <= reuse;
+        let changed: Vec<u32> = (0..count as u32)
             .into_par_iter()
-            .filter(|&gaussian| {
-                let range = gaussian as usize * row..(gaussian as usize + 1) * row;
-                let near = |(a, b): (&f32, &f32)| (a - b).abs() <= reuse;
-                fresh || !rows[range.clone()].iter().zip(&before[range]).all(near)
-            })
+            .filter(|&gaussian| fresh || !rows[of(gaussian)].iter().zip(&before[of(gaussian)]).all(near))
             .collect();
         self.counts.colors_computed += changed.len() as u64;
-        self.counts.colors_kept += (added.len() - changed.len()) as u64;
+        self.counts.colors_kept += (count - changed.len()) as u64;
+        if reuse <= 0.0 {
+            before.clear();
+        } else if fresh {
+            *before = rows.to_vec();
+        }
         for which in changed.chunks(CHUNK) {
-            let of = |gaussian: u32| gaussian as usize * row..(gaussian as usize + 1) * row;
-            let inputs: Vec<f32> = which.iter().flat_map(|&g| rows[of(g)].iter().copied()).collect();
-            let colors = to_vec(self.network.color(self.network.table(inputs.clone(), row)));
-            for ((&gaussian, color), inputs) in which.iter().zip(colors.chunks_exact(3)).zip(inputs.chunks_exact(row)) {
-                let base = [inputs[0], inputs[1], inputs[2]].map(srgb_from_linear);
-                let add: [f32; 3] = std::array::from_fn(|c| color[c] - base[c]);
+            let inputs: Vec<f32> = which.iter().flat_map(|&gaussian| &rows[of(gaussian)]).copied().collect();
+            let colors = to_vec(self.network.color(self.network.table(inputs, row)));
+            for (&gaussian, color) in which.iter().zip(colors.chunks_exact(3)) {
+                let input = &rows[of(gaussian)];
+                let add: [f32; 3] = std::array::from_fn(|c| color[c] - srgb_from_linear(input[c]));
                 let finite = add.iter().all(|v| v.is_finite());
                 self.counts.poisoned += u64::from(!finite);
                 added[gaussian as usize] = if finite { add } else { [0.0; 3] };
-                before[of(gaussian)].copy_from_slice(inputs);
+                if reuse > 0.0 && !fresh {
+                    before[of(gaussian)].copy_from_slice(input);
+                }
             }
         }
     }

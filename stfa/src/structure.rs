@@ -97,12 +97,7 @@ mod tests {
         let found = crate::parameters::to_vec(found);
         for (i, found) in found.iter().enumerate() {
             let (x, y, c, patch) = (i % side, i / side % side, i / (side * side) % 3, i / (3 * side * side));
-            let values: Vec<f64> = (0..FINE * FINE)
-                .map(|k| (patch * PATCH + y * FINE_STRIDE + k / FINE) * PATCH + x * FINE_STRIDE + k % FINE)
-                .map(|pixel| f64::from(a[pixel * 3 + c]))
-                .collect();
-            let mean = values.iter().sum::<f64>() / 16.0;
-            let expected = (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 16.0 + 1e-4).sqrt();
+            let expected = window_contrast(&a, patch * PATCH + y * FINE_STRIDE, x * FINE_STRIDE, c);
             assert!((f64::from(*found) - expected).abs() < 1e-5, "window {i}: {found} against {expected}");
         }
     }
@@ -144,17 +139,21 @@ mod tests {
         assert!(error < 1e-2, "contrast: {error}");
     }
 
+    /// Deviation of the window whose first pixel is this one, by definition.
+    fn window_contrast(a: &[f32], y: usize, x: usize, c: usize) -> f64 {
+        let values: Vec<f64> =
+            (0..FINE * FINE).map(|k| f64::from(a[((y + k / FINE) * PATCH + x + k % FINE) * 3 + c])).collect();
+        let mean = values.iter().sum::<f64>() / 16.0;
+        (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 16.0 + 1e-4).sqrt()
+    }
+
     /// Mean fine contrast, window by window.
     fn fine_reference(a: &[f32]) -> f64 {
         let (mut sum, mut count) = (0.0, 0.0);
         for y in (0..=PATCH - FINE).step_by(FINE_STRIDE) {
             for x in (0..=PATCH - FINE).step_by(FINE_STRIDE) {
                 for c in 0..3 {
-                    let values: Vec<f64> = (0..FINE * FINE)
-                        .map(|k| f64::from(a[((y + k / FINE) * PATCH + x + k % FINE) * 3 + c]))
-                        .collect();
-                    let mean = values.iter().sum::<f64>() / 16.0;
-                    sum += (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 16.0 + 1e-4).sqrt();
+                    sum += window_contrast(a, y, x, c);
                     count += 1.0;
                 }
             }

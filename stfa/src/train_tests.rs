@@ -4,7 +4,14 @@ use flyrig_renderer::AppearanceSettings;
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
 use super::*;
-use crate::{PATCH, body_graph::EDGES, crops::Crops, taps::Tap};
+use crate::{
+    PATCH, SHARES, SampleErrors,
+    body_graph::EDGES,
+    comparison::{evaluate, number},
+    crops::Crops,
+    inputs::STATE,
+    taps::Tap,
+};
 
 const SIZE: NetworkSize = NetworkSize { channels: [3, 4, 5], node: 6, heads: 2, layers: 1, hidden: [8, 6] };
 
@@ -82,7 +89,7 @@ fn both_tapes_together_give_the_true_gradient() {
     let gradients = trainer.gradients(&sample, &sample.targets[0], Variation::plain(true)).unwrap().1;
     let loss = |parameters: &Parameters| -> f64 {
         let copy = Trainer { parameters: parameters.clone(), ..trainer.clone() };
-        copy.gradients(&sample, &sample.targets[0], Variation::plain(true)).unwrap().2
+        number(copy.gradients(&sample, &sample.targets[0], Variation::plain(true)).unwrap().0.total)
     };
     let mut checked = 0;
     for (name, gradient) in &gradients {
@@ -110,18 +117,18 @@ fn both_tapes_together_give_the_true_gradient() {
 fn an_untrained_network_is_direct_appearance_and_training_beats_it() {
     let samples = [sample(1), sample(3)];
     let mut trainer = Trainer::new(SIZE, settings(200));
-    let SampleErrors { mse, direct_mse, color_mse, direct_color_mse, ssim, direct_ssim, .. } =
-        evaluate(&trainer.parameters, &samples[0], true).unwrap();
-    assert!((mse - direct_mse).abs() < 1e-9, "{mse} against {direct_mse}");
-    assert!((color_mse - direct_color_mse).abs() < 1e-9, "{color_mse} against {direct_color_mse}");
-    assert!((ssim - direct_ssim).abs() < 1e-6, "{ssim} against {direct_ssim}");
+    let SampleErrors { learned, direct } = evaluate(&trainer.parameters, &samples[0], true).unwrap();
+    assert!((learned.mse - direct.mse).abs() < 1e-9, "{learned:?} against {direct:?}");
+    assert!((learned.color_mse - direct.color_mse).abs() < 1e-9, "{learned:?} against {direct:?}");
+    assert!((learned.ssim - direct.ssim).abs() < 1e-6, "{learned:?} against {direct:?}");
+    assert!((learned.contrast - direct.contrast).abs() < 1e-6, "{learned:?} against {direct:?}");
     while trainer.step < 200 {
         let next = trainer.next_sample(samples.len());
         trainer.step(&samples[next]).unwrap();
     }
     for sample in &samples {
-        let SampleErrors { mse, direct_mse, .. } = evaluate(&trainer.parameters, sample, true).unwrap();
-        assert!(mse < 0.5 * direct_mse, "{mse} against {direct_mse}");
+        let SampleErrors { learned, direct } = evaluate(&trainer.parameters, sample, true).unwrap();
+        assert!(learned.mse < 0.5 * direct.mse, "{learned:?} against {direct:?}");
     }
 }
 

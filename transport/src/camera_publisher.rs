@@ -78,12 +78,6 @@ impl CameraPublisher {
         &self.endpoints
     }
 
-    /// Whether anybody wants a camera's frames; at most some 50 ms old.
-    #[must_use]
-    pub fn is_watched(&self, camera: &CameraId) -> bool {
-        self.cameras.iter().any(|lane| lane.camera == *camera && lane.frames.is_watched())
-    }
-
     /// Hands in a frame.
     ///
     /// # Errors

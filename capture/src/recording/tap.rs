@@ -61,7 +61,7 @@ impl<S: CameraSource> CameraSource for Recording<S> {
     }
 }
 
-/// A channel of other messages than frames, like poses. It must be gone before the recording is finished.
+/// A channel of other messages than frames, like poses. What comes after the recording's end is lost.
 #[derive(Debug)]
 pub struct MessageTap {
     outlet: Outlet,

@@ -105,13 +105,7 @@ pub(crate) mod tests {
 
     impl ControlDevice for FakeControls {
         fn range(&self, id: u32) -> io::Result<Option<ControlRange>> {
-            Ok(self.0.get(&id).map(|&(minimum, maximum, default)| ControlRange {
-                minimum,
-                maximum,
-                step: 1,
-                default,
-                flags: 0,
-            }))
+            Ok(self.0.get(&id).map(|&(minimum, maximum, _)| ControlRange { minimum, maximum, flags: 0 }))
         }
 
         fn get(&self, id: u32) -> io::Result<i32> {

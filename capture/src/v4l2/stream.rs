@@ -144,17 +144,14 @@ impl<H: Host> Stream<H> {
             }
             match queue.start(self.options.buffers) {
                 Ok(()) => {
+                    if step > rung {
+                        let (wanted, got) = (describe(&ladder[rung]), describe(mode));
+                        tracing::warn!("camera {}: its bus has no room for {wanted}; it sends {got}", self.camera);
+                    }
                     self.rung = step;
                     return self.set_up(queue, active, fps, mode, &node);
                 }
-                Err(error) if error.raw_os_error() == Some(libc::ENOSPC) => {
-                    let next = ladder.get(step + 1);
-                    let next = next.map_or_else(
-                        || "nothing is left to try".to_owned(),
-                        |next| format!("trying {}", describe(next)),
-                    );
-                    tracing::warn!("camera {}: its bus has no room for {}; {next}", self.camera, describe(mode));
-                }
+                Err(error) if error.raw_os_error() == Some(libc::ENOSPC) => {}
                 Err(error) => return Err(explain(&error, "cannot be started", &node)),
             }
         }

@@ -12,7 +12,7 @@ use std::{
 
 use anyhow::{Result, ensure};
 use flyrig_calib::{ClockKind, SyncConfig};
-use flyrig_capture::{CameraSource, CaptureErrorKind, FrameStage as _, JpegEncoding, Pacing};
+use flyrig_capture::{CameraSource, FrameStage as _, JpegEncoding, Pacing};
 use flyrig_types::{Frame, Image, PixelFormat};
 
 use super::{
@@ -129,8 +129,7 @@ fn report(
     }
     for camera in &health.cameras {
         let stats = &camera.stats;
-        let errors: u64 =
-            stats.errors.iter().filter(|(kind, _)| **kind != CaptureErrorKind::Timeout).map(|e| e.1).sum();
+        let errors: u64 = stats.errors.values().sum();
         let _ = writeln!(
             text,
             "camera {}: {}, {} frames, {} lost before us, {} overtaken, {} waited too long, {} in no set, {errors} errors",

@@ -38,16 +38,15 @@ impl Scores {
     /// From mean squared errors of the networks and of direct appearance.
     pub fn new(step: u64, errors: &[SampleErrors]) -> Self {
         let count = errors.len().max(1) as f64;
-        let mean = |of: fn(&SampleErrors) -> f64| errors.iter().map(|e| psnr(of(e))).sum::<f64>() / count;
+        let mean = |of: fn(&SampleErrors) -> f64| errors.iter().map(of).sum::<f64>() / count;
         Self {
             step,
-            psnr_db: mean(|e| e.mse),
-            direct_db: mean(|e| e.direct_mse),
-            color_gain_db: mean(|e| e.color_mse) - mean(|e| e.direct_color_mse),
-            ssim_gain: errors.iter().map(|e| e.ssim - e.direct_ssim).sum::<f64>() / count,
-            contrast: [|e: &SampleErrors| e.contrast, |e: &SampleErrors| e.direct_contrast]
-                .map(|of| errors.iter().map(of).sum::<f64>() / count),
-            better: errors.iter().filter(|e| e.mse < e.direct_mse).count() as f64 / count,
+            psnr_db: mean(|e| psnr(e.learned.mse)),
+            direct_db: mean(|e| psnr(e.direct.mse)),
+            color_gain_db: mean(|e| psnr(e.learned.color_mse) - psnr(e.direct.color_mse)),
+            ssim_gain: mean(|e| e.learned.ssim - e.direct.ssim),
+            contrast: [mean(|e| e.learned.contrast), mean(|e| e.direct.contrast)],
+            better: mean(|e| f64::from(u8::from(e.learned.mse < e.direct.mse))),
         }
     }
 }

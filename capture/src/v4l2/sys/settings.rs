@@ -51,8 +51,6 @@ pub(crate) struct ActiveFormat {
 pub(crate) struct ControlRange {
     pub minimum: i32,
     pub maximum: i32,
-    pub step: i32,
-    pub default: i32,
     /// `V4L2_CTRL_FLAG_*`.
     pub flags: u32,
 }
@@ -202,13 +200,7 @@ impl Device {
     pub fn control_range(&self, id: u32) -> io::Result<Option<ControlRange>> {
         let mut raw = v4l2_queryctrl { id, ..Plain::zeroed() };
         let (exists, r) = (self.listed(vidioc::VIDIOC_QUERYCTRL, &mut raw)?, raw);
-        Ok(exists.then_some(ControlRange {
-            minimum: r.minimum,
-            maximum: r.maximum,
-            step: r.step,
-            default: r.default_value,
-            flags: r.flags,
-        }))
+        Ok(exists.then_some(ControlRange { minimum: r.minimum, maximum: r.maximum, flags: r.flags }))
     }
 
     pub fn control(&self, id: u32) -> io::Result<i32> {

@@ -251,7 +251,7 @@ impl Rig {
         rows.map(|(((seen, now), first), last)| {
             let errors = now.errors.iter().filter_map(|(&kind, &count)| {
                 let fresh = count - first.errors.get(&kind).copied().unwrap_or(0);
-                (fresh > 0 && kind != CaptureErrorKind::Timeout).then_some((kind, fresh))
+                (fresh > 0).then_some((kind, fresh))
             });
             let health = SourceHealth {
                 lost_by_driver: now.health.lost_by_driver - first.health.lost_by_driver,
