@@ -2,6 +2,7 @@
 
 mod appearance;
 mod case;
+mod endure;
 pub(crate) mod plot;
 mod processor;
 pub mod recording;
@@ -18,6 +19,7 @@ use flyrig_tracker::DeformSolver;
 
 pub use self::appearance::appearance;
 use self::case::{Case, run_case};
+pub use self::endure::endure;
 pub use self::sequence::{Motion, Sequence, SequenceConfig};
 use crate::{cli::BenchTrackArgs, config::Solver, deformation::PAPER_COLOR_WEIGHT, eval::progress_bar};
 

@@ -237,6 +237,8 @@ impl SizeName {
 pub enum BenchCommand {
     /// Deformation tracking: solvers, iterations, Gaussians, resolution and views; writes CSV, JSON and SVG.
     Track(BenchTrackArgs),
+    /// Thousands of frames of one movement there and back: error and memory over time; writes CSV and SVG.
+    Endure(BenchEndureArgs),
     /// Appearance: every mode on simulated people that nobody trained on; writes CSV, JSON and SVG.
     Appearance(BenchAppearanceArgs),
     /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to whole sets.
@@ -273,6 +275,25 @@ pub struct BenchAppearanceArgs {
     pub side: u32,
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchEndureArgs {
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-endure")]
+    pub out: PathBuf,
+    /// Seed of the person.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Frames in all.
+    #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u64).range(300..=10_000_000))]
+    pub frames: u64,
+    /// Pixels of a picture's side.
+    #[arg(long, default_value_t = 160, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = 12_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
     pub gaussians: usize,
 }
 

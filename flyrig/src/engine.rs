@@ -178,6 +178,11 @@ impl Engine {
         &self.body
     }
 
+    /// RGB and mask of an input view of the last update.
+    pub fn input(&self, view: usize) -> &[u8] {
+        self.rgba.get(view).map_or(&[], Vec::as_slice)
+    }
+
     /// What the last update saw.
     pub fn observed(&self) -> Result<Observed> {
         Ok(Observed {

@@ -1,11 +1,11 @@
 //! `flyrig eval`: replay a data set in order, as live, render the cameras that were held out, score them.
 
-use std::{path::Path, sync::Arc, time::Instant};
+use std::{path::Path, time::Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf, write_mesh_ply};
 use flyrig_calib::{SyncConfig, Synchronizer};
-use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay, to_rgb8};
+use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay};
 use flyrig_gpu::GpuContext;
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
 use flyrig_types::{Camera, CameraId, Frame, FrameSet, Rig};
@@ -18,6 +18,7 @@ use crate::{
     config::{AppearanceMode, Origin, Solver},
     dataset,
     engine::{Engine, RenderedView},
+    outlines::outlined_inputs,
     pipeline::{Counts, Outcome, Pipeline, PoseSource},
     png,
     report::{ContactRow, Curve, Report, write_whole},
@@ -110,8 +111,10 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
             })
             .collect::<Result<_>>()?;
         sheet.extend(scores.into_iter().flatten());
-        if processed % contact_every == contact_every / 2 && contact.len() < CONTACT_ROWS {
-            contact.push(contact_row(number, &set, &holdout, &views, &truths)?);
+        if processed % contact_every == contact_every / 2 && contact.len() < 2 * CONTACT_ROWS {
+            contact.push(contact_row(number, &holdout, &views, &truths)?);
+            let pictures = outlined_inputs(&mut pipeline)?;
+            contact.push(ContactRow { label: format!("frame {number}, inputs"), pictures });
         }
         processed += 1;
         bar.set_message(sheet.progress());
@@ -144,6 +147,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         stages: pipeline.stages.summary(),
     };
     write_whole(&args.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
+    contact.retain(|row| !row.pictures.is_empty());
     let report = Report {
         title: format!("flyrig eval: {}", metrics.dataset),
         facts: vec![
@@ -367,20 +371,12 @@ fn frame_number(set: &FrameSet) -> u64 {
 
 fn contact_row(
     number: u64,
-    set: &FrameSet,
     holdout: &[Camera],
     views: &[RenderedView],
     truths: &[Option<&Frame>],
 ) -> Result<ContactRow> {
-    let input = set.present().next().map(|(_, frame)| Arc::clone(frame));
     let best = truths.iter().position(Option::is_some).unwrap_or(0);
     let mut pictures = Vec::new();
-    if let Some(frame) = input {
-        pictures.push((
-            format!("input {}", frame.camera),
-            png::encode_rgb(&to_rgb8(&frame.image)?, frame.image.width(), frame.image.height())?,
-        ));
-    }
     let shown = if truths.is_empty() { 0 } else { (best + number as usize) % truths.len() };
     if let (Some(view), Some(Some(truth))) = (views.get(shown), truths.get(shown)) {
         pictures.extend(contact_pictures(&holdout[shown].id, view, &truth.image, truth.mask.as_ref())?);

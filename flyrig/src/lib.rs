@@ -20,6 +20,7 @@ mod metrics_server;
 mod network;
 mod notify;
 mod outlet;
+mod outlines;
 mod pipeline;
 mod png;
 mod pose_curve;
@@ -118,6 +119,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         Command::Bench { what: BenchCommand::Appearance(args) } => {
             bench::appearance(args, &gpu(cli.adapter.as_deref())?)
         }
+        Command::Bench { what: BenchCommand::Endure(args) } => bench::endure(args, &gpu(cli.adapter.as_deref())?),
         Command::Bench { what: BenchCommand::Capture(args) } => bench::soak::capture(args),
         Command::Bench { what: BenchCommand::Record(args) } => {
             bench::recording::record(args, &gpu(cli.adapter.as_deref())?)

@@ -2,7 +2,7 @@
 
 use anyhow::Result;
 use flyrig_tracker::{PoseEstimator, mask_from_plate};
-use flyrig_types::{FrameSet, Image, Mask, Pose, PoseTrack, Rig};
+use flyrig_types::{Camera, FrameSet, Image, Mask, Pose, PoseTrack, Rig};
 
 use crate::{
     config::Origin,
@@ -51,6 +51,8 @@ pub struct Pipeline {
     /// Empty pictures by slot, where there are any: masks are then the difference to them.
     plates: Vec<Option<Image>>,
     last_pose: Option<Pose>,
+    /// Slots of the views that the last update took in.
+    viewed: Vec<usize>,
     /// Times of the last poses that were used, for what lies between and beyond them.
     curve: PoseCurve,
     /// How well the person is followed.
@@ -73,12 +75,18 @@ impl Pipeline {
             masks,
             plates,
             last_pose: None,
+            viewed: Vec::new(),
             curve: PoseCurve::default(),
             watch: TrackWatch::default(),
             per_view_time: true,
             stages: StageTimes::default(),
             counts: Counts::default(),
         }
+    }
+
+    /// Poses come from here from now on.
+    pub fn follow(&mut self, pose: PoseSource) {
+        self.pose = pose;
     }
 
     /// Takes in one frame set. Errors are those that a later frame cannot mend.
@@ -106,15 +114,16 @@ impl Pipeline {
         self.curve.push(set.master_nanos, &pose);
         let poses: Vec<Option<Pose>> =
             set.present().map(|(_, frame)| self.pose_at(frame.capture_nanos, set.master_nanos)).collect();
-        let views: Vec<InputView<'_>> = set
+        let (slots, views): (Vec<usize>, Vec<InputView<'_>>) = set
             .present()
             .zip(&masks)
             .zip(&poses)
             .filter_map(|(((slot, frame), mask), pose)| {
                 let mask = mask.as_ref().map(MaskOf::mask).filter(|mask| mask.area_px() > 0)?;
-                Some(InputView { camera: &self.rig.cameras[slot], image: &frame.image, mask, pose: pose.as_ref() })
+                let camera = &self.rig.cameras[slot];
+                Some((slot, InputView { camera, image: &frame.image, mask, pose: pose.as_ref() }))
             })
-            .collect();
+            .unzip();
         for ((_, frame), mask) in set.present().zip(&masks) {
             if mask.as_ref().is_none_or(|mask| mask.mask().area_px() == 0) {
                 self.counts.without_mask += 1;
@@ -134,6 +143,7 @@ impl Pipeline {
                 Remedy::None => {}
             }
         }
+        self.viewed = slots;
         self.engine.update(&pose, &views, &mut self.stages)?;
         if !views.is_empty() {
             let ids = views.iter().map(|view| view.camera.id.clone());
@@ -185,8 +195,13 @@ impl Pipeline {
     }
 
     /// Draws the person of the last update.
-    pub fn render(&mut self, camera: &flyrig_types::Camera) -> Result<RenderedView> {
+    pub fn render(&mut self, camera: &Camera) -> Result<RenderedView> {
         self.engine.render(camera, &mut self.stages)
+    }
+
+    /// Cameras whose pictures the last update took in, in the order of [`Engine::input`].
+    pub fn viewed(&self) -> Vec<Camera> {
+        self.viewed.iter().map(|&slot| self.rig.cameras[slot].clone()).collect()
     }
 
     /// Pose of the last update.

@@ -115,6 +115,24 @@ pub fn pipeline(gpu: &GpuContext, sequence: &Sequence, case: &Case) -> Result<Pi
     Ok(Pipeline::new(engine, rig, track, Origin::Given, plates))
 }
 
+/// Points on the surface of the last update.
+fn tracked_surface(pipeline: &Pipeline) -> Result<Points> {
+    let pose = pipeline.pose().context("no frame was used")?;
+    let (positions, _) = pipeline.engine().surface(pose);
+    Ok(Points::on(&positions, &pipeline.engine().template().triangles, OUR_POINTS))
+}
+
+/// Mean distance of our surface to the true one at the last instant, and of the true one to ours, millimetres.
+fn distances_mm(ours: &Points, sequence: &Sequence) -> [f64; 2] {
+    let to_truth = sequence.truth.mean_distance(&ours.points);
+    [to_truth, ours.mean_distance(&sequence.truth.points)].map(|metres| metres * 1e3)
+}
+
+/// Chamfer distance of the last update's surface, to the truth of the last instant.
+pub fn chamfer_mm(pipeline: &Pipeline, sequence: &Sequence) -> Result<f64> {
+    Ok(0.5 * distances_mm(&tracked_surface(pipeline)?, sequence).iter().sum::<f64>())
+}
+
 /// Tracks the whole sequence.
 pub fn run_case(gpu: &GpuContext, sequence: &Sequence, case: &Case) -> Result<Row> {
     run_pipeline(pipeline(gpu, sequence, case)?, sequence, case)
@@ -145,11 +163,8 @@ pub fn run_pipeline(mut pipeline: Pipeline, sequence: &Sequence, case: &Case) ->
         }
     }
     let mean = sheet.mean().context("nothing to compare")?;
-    let pose = pipeline.pose().cloned().context("no frame was used")?;
-    let (positions, _) = pipeline.engine().surface(&pose);
-    let ours = Points::on(&positions, &pipeline.engine().template().triangles, OUR_POINTS);
-    let accuracy_mm = sequence.truth.mean_distance(&ours.points) * 1e3;
-    let completeness_mm = ours.mean_distance(&sequence.truth.points) * 1e3;
+    let ours = tracked_surface(&pipeline)?;
+    let [accuracy_mm, completeness_mm] = distances_mm(&ours, sequence);
     let seen_mm = ours.mean_distance(&sequence.truth.filter(|p| sequence.seen(p, case.views))) * 1e3;
     let stages_ms: Vec<(String, f64)> =
         pipeline.stages.summary().into_iter().map(|s| (s.name.trim().to_owned(), f64::from(s.mean_ms))).collect();
