@@ -78,6 +78,7 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
     for weight in [PAPER_COLOR_WEIGHT, 0.1] {
         cases.push(base.but(&format!("colour weight {weight}"), |options| options.color_weight = weight));
     }
+    cases.push(base.but("no stiff parts", |options| options.stiff_parts = false));
     let full = base.but(FULL_SIZE, |options| options.max_level = 0);
     cases.push(full.but("8000 Gaussians", |options| options.gaussians = 8_000));
     cases.push(full.but(ALL_GAUSSIANS, |options| {

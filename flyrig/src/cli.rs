@@ -471,10 +471,9 @@ pub struct EvalArgs {
     /// Masks from the data set, or from the pictures.
     #[arg(long, value_enum, default_value = "given")]
     pub masks: Origin,
-    /// How the body follows the pictures beyond its pose. Without this option `default` with a given pose, `off` with an
-    /// estimated one.
-    #[arg(long, value_enum)]
-    pub solver: Option<Solver>,
+    /// How the body follows the pictures beyond its pose; "off" is faster.
+    #[arg(long, value_enum, default_value = "default")]
+    pub solver: Solver,
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
     pub appearance: AppearanceMode,

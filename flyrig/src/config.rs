@@ -245,7 +245,7 @@ pub struct TrackingSection {
 impl Default for TrackingSection {
     fn default() -> Self {
         Self {
-            solver: Solver::None,
+            solver: Solver::GaussNewton,
             gaussians: 30_000,
             level_of_detail: true,
             views: 0,

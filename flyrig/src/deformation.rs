@@ -11,7 +11,7 @@ mod vertex_means;
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use flyrig_body::{DeformationGraph, GpuSkinner, Skeleton, SurfaceGaussians, Template, coarsen};
+use flyrig_body::{DeformationGraph, GpuSkinner, Part, Skeleton, SurfaceGaussians, Template, coarsen};
 use flyrig_gpu::{GpuContext, StorageBuffer};
 use flyrig_renderer::{BackwardRasterizer, ColorMeans, GaussianBuffers, GaussianGradients, PictureLoss};
 use flyrig_tracker::{DeformReport, DeformTracker, PoseCorrection};
@@ -108,10 +108,12 @@ impl Deformation {
         let mut tracker = DeformTracker::new(&coarse.graph, &coarse.gaussians.skin, options.solver)?;
         let of_node = |&g: &u32| {
             let normal = surface.normals.get(g as usize)?.as_dvec3();
-            Some((normal, *surface.parts.get(g as usize)? as usize))
+            Some((normal, *surface.parts.get(g as usize)?))
         };
-        let (normals, parts) = graph.node_gaussian.iter().filter_map(of_node).unzip();
-        tracker = tracker.with_thickness(normals, parts)?;
+        let (normals, parts): (Vec<DVec3>, Vec<Part>) = graph.node_gaussian.iter().filter_map(of_node).unzip();
+        let stiffness: Vec<f64> = parts.iter().map(|&part| options.stiffness(part)).collect();
+        tracker = tracker.with_stiffness(&stiffness)?;
+        tracker = tracker.with_thickness(normals, parts.iter().map(|&part| part as usize).collect())?;
         if let Some(freedom) = options.pose {
             tracker = tracker.with_pose(&template.skeleton, landmarks.nodes().to_vec(), freedom)?;
         }

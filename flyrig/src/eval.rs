@@ -64,7 +64,7 @@ struct Metrics<'a> {
 /// Runs the command.
 pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let started = Instant::now();
-    let Replay { mut pipeline, mut frames, buffered, holdout, mut truth, solver } = Replay::open(args, gpu)?;
+    let Replay { mut pipeline, mut frames, buffered, holdout, mut truth } = Replay::open(args, gpu)?;
     std::fs::create_dir_all(args.out.join("surface"))
         .with_context(|| format!("cannot create {}", args.out.display()))?;
     for camera in &holdout {
@@ -131,7 +131,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         holdout: &args.holdout,
         pose: args.pose,
         masks: args.masks,
-        solver,
+        solver: args.solver,
         appearance: args.appearance,
         gaussians: args.gaussians,
         nodes: args.nodes,
@@ -155,7 +155,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
             ("inputs, held out".to_owned(), format!("{} → {}", args.inputs.join(" "), args.holdout.join(" "))),
             (
                 "pose, masks, deformation, appearance".to_owned(),
-                format!("{:?}, {:?}, {solver:?}, {:?}", args.pose, args.masks, args.appearance),
+                format!("{:?}, {:?}, {:?}, {:?}", args.pose, args.masks, args.solver, args.appearance),
             ),
             ("Gaussians, nodes".to_owned(), format!("{}, {}", args.gaussians, args.nodes)),
             ("frames".to_owned(), format!("{processed} in {seconds:.1} s, writing and scoring included")),
@@ -187,7 +187,6 @@ pub struct Replay {
     pub buffered: Vec<FrameSet>,
     pub holdout: Vec<Camera>,
     pub truth: TruthReader,
-    pub solver: Solver,
 }
 
 impl Replay {
@@ -198,10 +197,6 @@ impl Replay {
         let truth = TruthReader::open(args, &holdout)?;
         let plates = dataset::plates(&args.dataset, &rig)?;
         dataset::require_masks(args.pose, args.masks, &plates)?;
-        let solver = args.solver.unwrap_or(match args.pose {
-            Origin::Given => Solver::GaussNewton,
-            Origin::Estimated => Solver::None,
-        });
         let mut buffered = Vec::new();
         let (template, pose) = match args.pose {
             Origin::Given => given_pose(&args.dataset)?,
@@ -233,13 +228,13 @@ impl Replay {
             args.nodes,
             &rig,
             args.appearance.settings(),
-            solver.options(args.pose),
+            args.solver.options(args.pose),
         )?;
         if let Some(networks) = args.appearance.networks(args.weights.as_deref())? {
             engine.use_networks(&networks, args.reuse)?;
         }
         let pipeline = Pipeline::new(engine, rig, pose, args.masks, plates);
-        Ok(Self { pipeline, frames, buffered, holdout, truth, solver })
+        Ok(Self { pipeline, frames, buffered, holdout, truth })
     }
 }
 

@@ -1,5 +1,6 @@
 //! How the deformation is tracked.
 
+use flyrig_body::Part;
 use flyrig_renderer::WantedPicture;
 use flyrig_tracker::{DeformSettings, PoseFreedom};
 
@@ -23,6 +24,8 @@ pub struct DeformOptions {
     pub max_level: u32,
     /// Views that are compared at most, those from the most different directions; 0: all.
     pub views: usize,
+    /// Whether head, hands and feet are stiffer than the rest.
+    pub stiff_parts: bool,
     /// Whether, and how freely, the pose is corrected as well.
     pub pose: Option<PoseFreedom>,
 }
@@ -36,6 +39,7 @@ impl DeformOptions {
             color_weight: PAPER_COLOR_WEIGHT,
             max_level: 0,
             views: 0,
+            stiff_parts: false,
             ..Self::coarse(solver)
         }
     }
@@ -44,6 +48,16 @@ impl DeformOptions {
     #[must_use]
     pub fn without_level_of_detail(self) -> Self {
         Self { gaussians_a_pixel: f64::INFINITY, max_level: 0, ..self }
+    }
+
+    /// How many times stiffer than clothes a part is. Three outlines leave a skull or a heel much freedom: where they err,
+    /// it grew horns.
+    pub fn stiffness(&self, part: Part) -> f64 {
+        match part {
+            Part::Head if self.stiff_parts => 30.0,
+            Part::LeftHand | Part::RightHand | Part::LeftFoot | Part::RightFoot if self.stiff_parts => 10.0,
+            _ => 1.0,
+        }
     }
 
     /// How many of a surface's Gaussians are compared, where a pixel of the finest view covers `pixel_m` of the person.
@@ -62,6 +76,7 @@ impl DeformOptions {
             color_weight: 0.25 * PAPER_COLOR_WEIGHT,
             max_level: WantedPicture::MAX_LEVEL,
             views: 0,
+            stiff_parts: true,
             pose: None,
         }
     }

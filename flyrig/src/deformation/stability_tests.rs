@@ -41,7 +41,7 @@ fn gpu() -> &'static GpuContext {
 fn options() -> DeformOptions {
     let solver = DeformSettings::default();
     let color_weight = DeformOptions::coarse(solver).color_weight;
-    DeformOptions { max_level: 1, color_weight, ..DeformOptions::full(solver) }
+    DeformOptions { max_level: 1, color_weight, stiff_parts: true, ..DeformOptions::full(solver) }
 }
 
 /// Distances between two chains' Gaussians after a frame, metres.

@@ -9,7 +9,7 @@ use flyrig_types::CameraId;
 use super::gather::{HeldOut, gather};
 use crate::{
     cli::{EvalArgs, TrainArgs},
-    config::{AppearanceMode, Origin},
+    config::{AppearanceMode, Origin, Solver},
     dataset,
     eval::{Replay, progress_bar},
     stop,
@@ -54,7 +54,7 @@ fn leave_out(
         out: folder.to_owned(),
         pose: args.pose,
         masks: Origin::Given,
-        solver: None,
+        solver: Solver::GaussNewton,
         appearance: AppearanceMode::Direct,
         weights: None,
         reuse: 0.0,
@@ -64,7 +64,7 @@ fn leave_out(
         nodes: flyrig_body::DEFAULT_NODE_COUNT,
     };
     let settings = replay.appearance.settings();
-    let Replay { mut pipeline, mut frames, buffered, holdout, mut truth, .. } = Replay::open(&replay, gpu)?;
+    let Replay { mut pipeline, mut frames, buffered, holdout, mut truth } = Replay::open(&replay, gpu)?;
     pipeline.engine_mut().keep_observations()?;
     let bar = progress_bar(frames.count as u64, "recorded");
     let mut buffered = buffered.into_iter();

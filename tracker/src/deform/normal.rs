@@ -23,7 +23,7 @@ pub(super) struct NormalMatrix {
     /// Row by row: the other node and the pair's number; `rows[n]..rows[n + 1]` is node n's.
     rows: Vec<usize>,
     others: Vec<(u32, u32)>,
-    /// Edges a pair, and edges a node.
+    /// Stiffness of the edges a pair, and a node.
     pair_edges: Vec<f64>,
     node_edges: Vec<f64>,
     diagonal: Vec<DMat3>,
@@ -33,14 +33,19 @@ pub(super) struct NormalMatrix {
 const CORNERS: [(usize, usize); 6] = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)];
 
 impl NormalMatrix {
-    pub(super) fn new(nodes: usize, gaussian_nodes: &[[u32; 4]], weights: &[[f32; 4]], edges: &[(u32, u32)]) -> Self {
+    pub(super) fn new(
+        nodes: usize,
+        gaussian_nodes: &[[u32; 4]],
+        weights: &[[f32; 4]],
+        edges: &[(u32, u32, f64)],
+    ) -> Self {
         let ordered = |a: u32, b: u32| (a.min(b), a.max(b));
         let of_gaussian = |g: usize, (a, b): (usize, usize)| {
             let (n, m) = (gaussian_nodes[g][a], gaussian_nodes[g][b]);
             (n != m && weights[g][a] > 0.0 && weights[g][b] > 0.0).then(|| ordered(n, m))
         };
         // Two different nodes each, the smaller first, ascending.
-        let mut pairs: Vec<(u32, u32)> = edges.iter().map(|&(a, b)| ordered(a, b)).collect();
+        let mut pairs: Vec<(u32, u32)> = edges.iter().map(|&(a, b, _)| ordered(a, b)).collect();
         pairs.extend((0..gaussian_nodes.len()).flat_map(|g| CORNERS.iter().filter_map(move |&c| of_gaussian(g, c))));
         pairs.sort_unstable();
         pairs.dedup();
@@ -50,12 +55,12 @@ impl NormalMatrix {
             .collect();
         let mut pair_edges = vec![0.0; pairs.len()];
         let mut node_edges = vec![0.0; nodes];
-        for &(a, b) in edges {
-            if let Some(count) = pair_edges.get_mut(find(ordered(a, b)) as usize) {
-                *count += 1.0;
+        for &(a, b, stiff) in edges {
+            if let Some(sum) = pair_edges.get_mut(find(ordered(a, b)) as usize) {
+                *sum += stiff;
             }
-            node_edges[a as usize] += 1.0;
-            node_edges[b as usize] += 1.0;
+            node_edges[a as usize] += stiff;
+            node_edges[b as usize] += stiff;
         }
         let mut by_row: Vec<Vec<(u32, u32)>> = vec![Vec::new(); nodes];
         for (k, &(a, b)) in (0u32..).zip(&pairs) {
@@ -98,7 +103,7 @@ impl NormalMatrix {
         self.diagonal[node]
     }
 
-    /// Mean number of edges of a node: the mean diagonal of L.
+    /// Mean stiffness of a node's edges: the mean diagonal of L.
     pub(super) fn mean_edges(&self) -> f64 {
         self.node_edges.iter().sum::<f64>() / self.node_edges.len().max(1) as f64
     }

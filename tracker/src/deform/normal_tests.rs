@@ -13,7 +13,7 @@ const NODES: usize = 14;
 struct Case {
     nodes: Vec<[u32; 4]>,
     weights: Vec<[f32; 4]>,
-    edges: Vec<(u32, u32)>,
+    edges: Vec<(u32, u32, f64)>,
     matrices: Vec<DMat3>,
     stiffness: f64,
     damping: f64,
@@ -28,7 +28,8 @@ impl Case {
             raw.map(|w| w / raw.iter().sum::<f32>())
         };
         let weights = nodes.iter().map(weight).collect();
-        let edges = (0..row).flat_map(|n| [(n, (n + 1) % row), ((n + 1) % row, n)]).collect();
+        let edges =
+            (0..row).flat_map(|n| [(n, (n + 1) % row, 1.0 + f64::from(n % 3)), ((n + 1) % row, n, 0.5)]).collect();
         let matrices: Vec<DMat3> = nodes.iter().map(|_| matrix(rng)).collect();
         Self { nodes, weights, edges, matrices, stiffness, damping: 0.0 }
     }
@@ -51,9 +52,9 @@ impl Case {
             let at = |v: &[DVec3]| (0..4).map(|k| v[nodes[k] as usize] * f64::from(weights[k])).sum::<DVec3>();
             sum += at(&moved_x).dot(*matrix * at(&moved_y));
         }
-        for &(i, j) in &self.edges {
+        for &(i, j, stiff) in &self.edges {
             let (i, j) = (i as usize, j as usize);
-            sum += self.stiffness * (x[i] - x[j]).dot(y[i] - y[j]);
+            sum += self.stiffness * stiff * (x[i] - x[j]).dot(y[i] - y[j]);
         }
         sum += (0..NODES).map(|n| self.damping * x[n].dot(y[n])).sum::<f64>();
         let prices = pose.map_or(&[][..], |(_, prices)| prices);

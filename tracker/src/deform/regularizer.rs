@@ -7,8 +7,8 @@ use super::thickness::Thickness;
 /// Eq. 4 over the directed edges of the graph, times λ_reg.
 #[derive(Debug)]
 pub(super) struct Regularizer {
-    /// Directed edges (node, neighbour); a node without neighbours has none.
-    pub edges: Vec<(u32, u32)>,
+    /// Directed edges (node, neighbour) and how stiff each is; a node without neighbours has none.
+    pub edges: Vec<(u32, u32, f64)>,
     /// λ_reg λ_spat.
     pub spatial: f64,
     /// λ_reg λ_temp.
@@ -48,14 +48,14 @@ impl Regularizer {
                 *gradient += 2.0 * self.anchor * off(at);
             }
         }
-        for &(i, j) in &self.edges {
+        for &(i, j, stiff) in &self.edges {
             let (i, j) = (i as usize, j as usize);
             let apart = t[i] - t[j];
             let change = apart - (smooth[i] - smooth[j]);
             let spread = apart - (offset(i) - offset(j));
-            loss += self.spatial * spread.length_squared() + temporal * change.length_squared();
+            loss += stiff * (self.spatial * spread.length_squared() + temporal * change.length_squared());
             if let Some(gradient) = gradient.as_deref_mut() {
-                let pull = 2.0 * (self.spatial * spread + temporal * change);
+                let pull = 2.0 * stiff * (self.spatial * spread + temporal * change);
                 gradient[i] += pull;
                 gradient[j] -= pull;
             }

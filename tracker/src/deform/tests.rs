@@ -122,30 +122,32 @@ fn clothed(body: &Body, settings: DeformSettings) -> DeformTracker {
 
 /// Total loss at these translations, straight from the equations.
 fn total_loss(body: &Body, data: &Goals<'_>, settings: &DeformSettings, t: &[DVec3], smooth: &[DVec3]) -> f64 {
-    clothed_loss(body, data, settings, t, smooth, &vec![DVec3::ZERO; t.len()])
+    clothed_loss(body, data, settings, t, smooth, &vec![(DVec3::ZERO, 1.0); t.len()])
 }
 
-/// The same, with smoothness and anchor that count from `offsets`.
+/// The same, with smoothness and anchor that count from each node's offset, and its stiffness.
 fn clothed_loss(
     body: &Body,
     data: &Goals<'_>,
     settings: &DeformSettings,
     t: &[DVec3],
     smooth: &[DVec3],
-    offsets: &[DVec3],
+    nodes: &[(DVec3, f64)],
 ) -> f64 {
     let graph = &body.graph;
-    let mut loss = settings.anchor * t.iter().zip(offsets).map(|(t, o)| (*t - *o).length_squared()).sum::<f64>();
+    let mut loss = settings.anchor * t.iter().zip(nodes).map(|(t, (o, _))| (*t - *o).length_squared()).sum::<f64>();
     for g in 0..body.surface.len() {
         let moved = (0..4).map(|k| t[graph.gaussian_nodes[g][k] as usize] * f64::from(graph.gaussian_weights[g][k]));
         loss += data.weights[g] * data.off(g, moved.sum()).length_squared();
     }
     for (i, neighbors) in graph.neighbors.iter().enumerate() {
         for &j in neighbors {
+            let (here, there) = (nodes[i], nodes[j as usize]);
             let apart = t[i] - t[j as usize];
-            let spread = apart - (offsets[i] - offsets[j as usize]);
+            let spread = apart - (here.0 - there.0);
             let change = apart - (smooth[i] - smooth[j as usize]);
             loss += settings.regularization
+                * (here.1 * there.1).sqrt()
                 * (settings.spatial * spread.length_squared() + settings.temporal * change.length_squared());
         }
     }
@@ -161,14 +163,16 @@ fn gradient_and_matrix_match_differences_and_a_dense_solve() {
     let body = body(600, 14);
     let mut data = goals(&body);
     let settings = DeformSettings { anchor: 300.0, ..DeformSettings::default() };
-    let mut tracker = clothed(&body, settings);
+    let stiffness: Vec<f64> = (0..body.graph.nodes.len()).map(|node| [1.0, 30.0, 0.5][node % 3]).collect();
+    let mut tracker = clothed(&body, settings).with_stiffness(&stiffness).unwrap();
     // Learns some thickness from a frame.
     tracker.track(&mut data).unwrap();
     let offsets = tracker.thickness.as_ref().unwrap();
     let offsets: Vec<DVec3> = (0..body.graph.nodes.len()).map(|node| offsets.offset(node)).collect();
     assert!(offsets.iter().any(|o| o.length() > 1e-4));
+    let of_nodes: Vec<(DVec3, f64)> = offsets.into_iter().zip(stiffness).collect();
     let total_loss = |body: &Body, data: &Goals<'_>, settings: &DeformSettings, t: &[DVec3], smooth: &[DVec3]| {
-        clothed_loss(body, data, settings, t, smooth, &offsets)
+        clothed_loss(body, data, settings, t, smooth, &of_nodes)
     };
     let mut rng = StdRng::seed_from_u64(1);
     let nodes = body.graph.nodes.len();
@@ -452,6 +456,10 @@ fn where_nobody_looks_clothes_are_as_thick_as_where_somebody_does() {
     assert_eq!(with_thickness.thickness.as_ref().unwrap().offset(0), DVec3::ZERO);
     for (normals, parts) in [(vec![], vec![]), (vec![DVec3::NAN; 800], vec![0; 800])] {
         let error = tracker(&body, settings).with_thickness(normals, parts).unwrap_err();
+        assert!(error.to_string().contains("800 nodes"), "{error}");
+    }
+    for stiffness in [vec![1.0; 799], vec![0.0; 800], vec![f64::NAN; 800]] {
+        let error = tracker(&body, settings).with_stiffness(&stiffness).unwrap_err();
         assert!(error.to_string().contains("800 nodes"), "{error}");
     }
 }

@@ -89,9 +89,9 @@ impl DeformTracker {
                 skin.len()
             ));
         }
-        let edges: Vec<(u32, u32)> = (0u32..)
+        let edges: Vec<(u32, u32, f64)> = (0u32..)
             .zip(&graph.neighbors)
-            .flat_map(|(node, others)| others.iter().filter(move |&&other| other != node).map(move |&o| (node, o)))
+            .flat_map(|(node, others)| others.iter().filter(move |&&other| other != node).map(move |&o| (node, o, 1.0)))
             .collect();
         let matrix = NormalMatrix::new(nodes, &graph.gaussian_nodes, &graph.gaussian_weights, &edges);
         let regularizer = Regularizer {
@@ -143,6 +143,27 @@ impl DeformTracker {
         }
         if matches!(self.settings.solver, DeformSolver::GaussNewton { .. }) {
             self.pose = Some(PoseFix::new(skeleton, nodes, freedom));
+        }
+        Ok(self)
+    }
+
+    /// Makes parts of the body stiffer: an edge's share of Eq. 4 counts as many times as the geometric mean of its two
+    /// nodes' numbers. Gradient descent knows nothing of it.
+    ///
+    /// # Errors
+    /// [`TrackErrorKind::Template`] when the numbers are not above 0, finite, or the nodes'.
+    pub fn with_stiffness(mut self, of_node: &[f64]) -> Result<Self, TrackError> {
+        let nodes = self.translations.len();
+        if of_node.len() != nodes || !of_node.iter().all(|s| s.is_finite() && *s > 0.0) {
+            let message = format!("{} numbers above 0 for the stiffness of {nodes} nodes", of_node.len());
+            return Err(TrackError::new(TrackErrorKind::Template, message));
+        }
+        if matches!(self.settings.solver, DeformSolver::GaussNewton { .. }) {
+            for (i, j, stiff) in &mut self.regularizer.edges {
+                *stiff = (of_node[*i as usize] * of_node[*j as usize]).sqrt();
+            }
+            let edges = &self.regularizer.edges;
+            self.matrix = NormalMatrix::new(nodes, &self.gaussian_nodes, &self.gaussian_weights, edges);
         }
         Ok(self)
     }

@@ -7,6 +7,7 @@ use flyrig_tracker::{DeformSettings, DeformSolver};
 use flyrig_types::Camera;
 use glam::{DMat3, DMat4, DVec3};
 
+use super::super::DeformOptions;
 use super::reference::{self, Picture, Splat, blend, sorted_splats_at};
 use super::reference_backward::{Incoming, backward, lift, touched_by};
 use super::small_scene::{Shot, SmallScene};
@@ -32,7 +33,8 @@ pub struct Chain<'a> {
     /// Conjugate gradients end at this share of the first residual.
     tolerance: f64,
     rest: SurfaceGaussians,
-    edges: Vec<(usize, usize)>,
+    /// Nodes and stiffness.
+    edges: Vec<(usize, usize, f64)>,
     pub translations: Vec<DVec3>,
     smooth: Vec<DVec3>,
     /// How thick the clothes of every part are, metres.
@@ -46,8 +48,12 @@ pub struct Chain<'a> {
 impl<'a> Chain<'a> {
     pub fn new(scene: &'a SmallScene, settings: DeformSettings, max_level: u32, tolerance: f64) -> Self {
         let nodes = scene.graph.nodes.len();
-        let edges =
-            |(i, others): (usize, &[u32; 4])| others.map(|j| (i, j as usize)).into_iter().filter(|(i, j)| i != j);
+        let options = DeformOptions::coarse(settings);
+        let part = |node: usize| scene.surface.parts[scene.graph.node_gaussian[node] as usize];
+        let stiff = |i, j| (options.stiffness(part(i)) * options.stiffness(part(j))).sqrt();
+        let edges = |(i, others): (usize, &[u32; 4])| {
+            others.map(|j| (i, j as usize, stiff(i, j as usize))).into_iter().filter(|(i, j, _)| i != j)
+        };
         Self {
             scene,
             settings,
@@ -151,13 +157,13 @@ impl<'a> Chain<'a> {
     fn prior(&self, t: &[DVec3]) -> (f64, Vec<DVec3>) {
         let (spatial, temporal) = self.prior_weights();
         let (mut loss, mut gradient) = (0.0, vec![DVec3::ZERO; t.len()]);
-        for &(i, j) in &self.edges {
+        for &(i, j, stiff) in &self.edges {
             let apart = t[i] - t[j];
             let change = apart - (self.smooth[i] - self.smooth[j]);
             let spread = apart - (self.offset(i) - self.offset(j));
-            loss += spatial * spread.length_squared() + temporal * change.length_squared();
-            gradient[i] += 2.0 * (spatial * spread + temporal * change);
-            gradient[j] -= 2.0 * (spatial * spread + temporal * change);
+            loss += stiff * (spatial * spread.length_squared() + temporal * change.length_squared());
+            gradient[i] += 2.0 * stiff * (spatial * spread + temporal * change);
+            gradient[j] -= 2.0 * stiff * (spatial * spread + temporal * change);
         }
         (loss, gradient)
     }
@@ -230,7 +236,8 @@ impl<'a> Chain<'a> {
             let mean = (0..t.len()).map(trace).sum::<f64>() / (3 * t.len()) as f64;
             let (spatial, temporal) = self.prior_weights();
             let stiffness = DMat3::from_diagonal(DVec3::splat(2.0 * (spatial + temporal)));
-            for &(i, j) in &self.edges {
+            for &(i, j, stiff) in &self.edges {
+                let stiffness = stiffness * stiff;
                 matrix[i][i] += stiffness;
                 matrix[j][j] += stiffness;
                 matrix[i][j] -= stiffness;
