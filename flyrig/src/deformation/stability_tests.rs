@@ -25,10 +25,10 @@ use crate::bench::plot::{Plot, Series};
 use crate::engine::{Engine, InputView};
 use crate::stats::StageTimes;
 
-/// Most that a Gaussian may stand from where f64 puts it, in all frames but one in fifty: eight times what rounding was
-/// measured to do, and twenty units in the last place of a coordinate of 2 m.
+/// Most that a Gaussian may stand from where f64 puts it: eight times what rounding was measured to do, and twenty units in
+/// the last place of a coordinate of 2 m. Once in fifty frames it may be more, until that has faded: a body at rest keeps it.
 const MOST_APART_M: f64 = 5e-6;
-/// In those few, where a pixel or a Gaussian lies so near to a limit (alpha 1/255, back-facing, order by depth) that rounding
+/// Then, where a pixel or a Gaussian lies so near to a limit (alpha 1/255, back-facing, order by depth) that rounding
 /// decides; and always from where it would stand were every step solved exactly, for conjugate gradients end at a
 /// thousandth of the residual of steps of up to 2 cm. One step that only f64 accepts puts millimetres between them.
 const MOST_AT_A_JUMP_M: f64 = 2e-4;
@@ -126,9 +126,15 @@ fn check(rows: &[Row]) {
         skinned * 1e3
     );
     assert!(truth < 0.8 * skinned, "the chain does follow the clothes");
-    let jumps = rows.iter().filter(|row| row.same.max > MOST_APART_M).count();
-    println!("{jumps} frames in which rounding decided");
-    assert!(50 * jumps <= rows.len() && same < MOST_AT_A_JUMP_M, "{jumps}: {same}");
+    let beyond: Vec<bool> = rows.iter().map(|row| row.same.max > MOST_APART_M).collect();
+    let jumps = (0..beyond.len()).filter(|&i| beyond[i] && (i == 0 || !beyond[i - 1])).count();
+    let usual = rows.iter().map(|row| row.same.max).filter(|max| *max <= MOST_APART_M).fold(0.0, f64::max);
+    println!(
+        "rounding decided {jumps} times, to be seen in {} frames; {:.2} um in all others",
+        beyond.iter().filter(|beyond| **beyond).count(),
+        usual * 1e6
+    );
+    assert!(jumps <= rows.len().div_ceil(50) && same < MOST_AT_A_JUMP_M, "{jumps}: {same}");
     assert!(exact < MOST_AT_A_JUMP_M, "{exact}");
 }
 
@@ -139,7 +145,7 @@ fn the_chain_in_f32_stays_with_the_chain_in_f64() {
 
 /// Writes `divergence.csv` and `divergence.svg` into the folder `DIVERGENCE_OUT`, where there is one.
 #[test]
-#[ignore = "takes a minute: make test-long"]
+#[ignore = "takes seconds to a minute: make test-long"]
 fn the_chain_in_f32_stays_with_the_chain_in_f64_for_200_frames() {
     let rows = diverge(200);
     if let Ok(out) = std::env::var("DIVERGENCE_OUT") {
