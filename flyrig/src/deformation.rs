@@ -24,6 +24,10 @@ use self::motion::MeshMotion;
 pub use self::options::{DeformOptions, PAPER_COLOR_WEIGHT};
 use self::pictures::{Kernels, Pictures, ViewBuffers};
 
+/// Share of the last instant's colours in those that are compared. Painting follows the surface wherever it slides; colours
+/// that remember where cloth was hold it there.
+const COLOR_RATE: f32 = 0.03;
+
 /// The tracked deformation and the buffers it is solved with.
 #[derive(Debug)]
 pub struct Deformation {
@@ -55,6 +59,8 @@ pub struct Deformation {
     halved: usize,
     /// Whether the Gaussians have colours yet.
     painted: bool,
+    /// Whether the coarse ones had colours in the last frame.
+    colored: bool,
 }
 
 /// What one frame is compared with.
@@ -139,6 +145,7 @@ impl Deformation {
             judged: Vec::new(),
             halved: 0,
             painted: false,
+            colored: false,
         })
     }
 
@@ -179,7 +186,9 @@ impl Deformation {
             },
         };
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        self.colors.encode(gpu, &mut encoder, &scene.gaussians.color, &self.posed[0].color);
+        let rate = if self.colored { COLOR_RATE } else { 1.0 };
+        self.colored = self.painted;
+        self.colors.encode(gpu, &mut encoder, &scene.gaussians.color, &self.posed[0].color, rate);
         gpu.queue.submit([encoder.finish()]);
         let mut pictures = Pictures::new(
             scene,

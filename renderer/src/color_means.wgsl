@@ -1,8 +1,10 @@
-// Colours of coarse Gaussians: means over the fine ones that each stands for.
+// Colours of coarse Gaussians: means over the fine ones that each stands for, taken over little by little.
 @group(0) @binding(0) var<storage, read> first_child: array<u32>;
 @group(0) @binding(1) var<storage, read> children: array<u32>;
 @group(0) @binding(2) var<storage, read> fine: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read_write> coarse: array<vec4<f32>>;
+// Share of the means in the colours; the rest stays as it was.
+@group(0) @binding(4) var<storage, read> rate: array<f32>;
 
 @compute @workgroup_size(64)
 fn mean_colors(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
@@ -18,5 +20,11 @@ fn mean_colors(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups)
     for (var k = begin; k < end; k++) {
         sum += fine[children[k]];
     }
-    coarse[i] = sum / f32(max(end - begin, 1u));
+    let mean = sum / f32(max(end - begin, 1u));
+    // Not mix(): what was there may be no number when all of it goes.
+    if rate[0] < 1.0 {
+        coarse[i] += rate[0] * (mean - coarse[i]);
+    } else {
+        coarse[i] = mean;
+    }
 }

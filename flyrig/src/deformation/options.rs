@@ -72,8 +72,8 @@ impl DeformOptions {
             solver,
             gaussians: 30_000,
             gaussians_a_pixel: 2.0,
-            // With more the colours, which are painted anew every frame, push the surface along itself for ever.
-            color_weight: 0.25 * PAPER_COLOR_WEIGHT,
+            // With more the colours, which are painted anew every frame, push the surface along itself.
+            color_weight: 0.1 * PAPER_COLOR_WEIGHT,
             max_level: WantedPicture::MAX_LEVEL,
             views: 0,
             stiff_parts: true,
