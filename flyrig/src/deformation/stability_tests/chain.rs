@@ -95,7 +95,7 @@ impl<'a> Chain<'a> {
             let level = (fine * spacing).log2().round().clamp(0.0, f64::from(self.max_level)) as u32;
             let share = 0.5f64.powi(level as i32);
             let weight = 2.0 * PAPER_PIXELS_A_M2 / (fine * share).powi(2);
-            let color = if self.painted { 0.25 * weight } else { 0.0 };
+            let color = if self.painted { 0.1 * weight } else { 0.0 };
             let mut smaller = camera.clone();
             smaller.intrinsics.focal_px *= share;
             smaller.intrinsics.center_px = (i.center_px + 0.5) * share - 0.5;
