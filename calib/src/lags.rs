@@ -18,6 +18,11 @@ const MOST_OFFSET: usize = 4;
 const LEAST_COMMON: usize = 1000;
 /// Correlation below which two cameras tell nothing about each other.
 const LEAST_CORRELATION: f64 = 0.3;
+/// What pairs of cameras may disagree by before a camera's lag is not believed, nanoseconds: slow movements look alike over
+/// many frames, and from every side a little different.
+const MOST_DISAGREEMENT: f64 = 3e6;
+/// Correlation that is asked for where no third camera can disagree.
+const LONE_CORRELATION: f64 = 0.75;
 
 /// How much moves up and down in the pictures of one camera over time.
 #[derive(Debug, Clone)]
@@ -124,7 +129,8 @@ fn bands(rgb: &[u8], width: usize, height: usize) -> Vec<f32> {
 pub struct LagEstimate {
     /// Which camera.
     pub camera: CameraId,
-    /// To be taken off its stamps, nanoseconds; none when its motion is like no other camera's.
+    /// To be taken off its stamps, nanoseconds; none when its motion is like no other camera's, or the pairs of cameras
+    /// disagree.
     pub lag_nanos: Option<i64>,
     /// Best correlation of its motion with another camera's, 0 to 1.
     pub correlation: f64,
@@ -179,11 +185,16 @@ pub fn estimate_lags(signals: &[MotionSignal], most_nanos: i64) -> Vec<LagEstima
                 .filter(|(i, j, ..)| *i == slot || *j == slot)
                 .map(|&(i, j, lag, _)| (lags[j] - lags[i] - lag).powi(2))
                 .collect();
+            let correlation = of(slot).map(|pair| pair.3).fold(0.0, f64::max);
+            let disagreement_nanos = (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt();
+            let is_alone = squares.len() < 2;
+            let is_sure =
+                if is_alone { correlation >= LONE_CORRELATION } else { disagreement_nanos <= MOST_DISAGREEMENT };
             LagEstimate {
                 camera: signals[slot].camera.clone(),
-                lag_nanos: reached[slot].then_some(lags[slot].round() as i64),
-                correlation: of(slot).map(|pair| pair.3).fold(0.0, f64::max),
-                disagreement_nanos: (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt(),
+                lag_nanos: (reached[slot] && (is_sure || slot == 0)).then_some(lags[slot].round() as i64),
+                correlation,
+                disagreement_nanos,
             }
         })
         .collect()

@@ -11,21 +11,36 @@ const POOLED_FRAMES: usize = 16;
 
 /// Makes `Rgb8` frames of a camera's frames, in buffers that are used again; frames that are RGB already pass.
 ///
-/// A picture that cannot be decoded is a `Corrupt` error and costs its own frame alone.
+/// A picture that cannot be decoded is a `Corrupt` error, one of another size than expected an `Unsupported` one; each
+/// costs its own frame alone.
 #[derive(Debug)]
 pub struct Decoding {
+    /// Width and height, where they are known.
+    size: Option<[u32; 2]>,
     pool: Arc<BufferPool>,
     scratch: JpegScratch,
 }
 
-impl Default for Decoding {
-    fn default() -> Self {
-        Self { pool: BufferPool::new(POOLED_FRAMES), scratch: JpegScratch::default() }
+impl Decoding {
+    /// For pictures of this width and height in pixels; of any without it. With it, a header that lies cannot ask for more
+    /// memory than the camera's pictures need.
+    #[must_use]
+    pub fn new(size: Option<[u32; 2]>) -> Self {
+        Self { size, pool: BufferPool::new(POOLED_FRAMES), scratch: JpegScratch::default() }
     }
 }
 
 impl FrameStage for Decoding {
     fn process(&mut self, frame: Frame) -> Result<Frame, CaptureError> {
+        let (width, height) = (frame.image.width(), frame.image.height());
+        if let Some(size) = self.size.filter(|size| *size != [width, height]) {
+            let message = format!(
+                "is {width}x{height} pixels, the calibration is for {}x{}; let the camera send that size, or calibrate it \
+                 at the size that it sends",
+                size[0], size[1]
+            );
+            return Err(CaptureError::general(CaptureErrorKind::Unsupported, message));
+        }
         if frame.image.format() == PixelFormat::Rgb8 {
             return Ok(frame);
         }
@@ -34,9 +49,30 @@ impl FrameStage for Decoding {
         // Back to the pool, whether it is a picture or not.
         let bytes = self.pool.lease(bytes);
         decoded?;
-        let (width, height) = (frame.image.width(), frame.image.height());
         let image = Image::new(width, height, PixelFormat::Rgb8, bytes)
             .map_err(|error| CaptureError::general(CaptureErrorKind::Corrupt, error.to_string()))?;
         Ok(Frame { image, ..frame })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_picture_that_claims_to_be_huge_gets_no_memory() {
+        let frame = Frame {
+            camera: "a".into(),
+            sequence: 3,
+            capture_nanos: 0,
+            exposure_nanos: None,
+            image: Image::new(16_384, 16_384, PixelFormat::Mjpeg, vec![0xff, 0xd8, 0xff, 0xd9]).unwrap(),
+            mask: None,
+        };
+        let mut decoding = Decoding::new(Some([640, 360]));
+        let error = decoding.process(frame).unwrap_err();
+        assert_eq!(error.kind, CaptureErrorKind::Unsupported);
+        assert!(error.message.contains("is 16384x16384 pixels, the calibration is for 640x360"), "{error}");
+        assert_eq!(decoding.pool.take().capacity(), 0);
     }
 }

@@ -103,7 +103,7 @@ fn steady(formats: &[PixelFormat], frames: u64, pacing: Pacing) -> (u64, i64) {
         }) as Box<dyn CameraSource>
     });
     let config = ThreadsConfig { queue_capacity: 8, pacing };
-    let threads = CaptureThreads::start_staged(sources.collect(), |_| Box::new(Decoding::default()), config).unwrap();
+    let threads = CaptureThreads::start_staged(sources.collect(), |_| Box::new(Decoding::new(None)), config).unwrap();
     let pass = || {
         for _ in 0..frames * formats.len() as u64 {
             drop(threads.queue().pop(Duration::from_secs(60)).unwrap());

@@ -151,7 +151,7 @@ impl CameraSource for Tenths {
 fn a_recording_played_as_live_does_not_overtake_itself() {
     let sources = vec![Box::new(Tenths(Fast::boxed("a", 12, &Arc::default(), grey))) as Box<dyn CameraSource>];
     let config = ThreadsConfig { queue_capacity: 12, pacing: Pacing::RealTime };
-    let threads = CaptureThreads::start_staged(sources, |_| Box::new(Decoding::default()), config).unwrap();
+    let threads = CaptureThreads::start_staged(sources, |_| Box::new(Decoding::new(None)), config).unwrap();
     let frames = drain(&threads).len();
     // A stage that the machine stops for a tenth of a second may lose one.
     assert!(frames >= 9, "{frames} of 12 frames are left");
@@ -162,7 +162,7 @@ fn a_damaged_picture_costs_its_own_frame() {
     let taken = Arc::default();
     let sources = vec![Fast::boxed("a", 9, &taken, sometimes_damaged)];
     let config = ThreadsConfig { queue_capacity: 1, pacing: Pacing::Lossless };
-    let threads = CaptureThreads::start_staged(sources, |_| Box::new(Decoding::default()), config).unwrap();
+    let threads = CaptureThreads::start_staged(sources, |_| Box::new(Decoding::new(None)), config).unwrap();
     let frames = drain(&threads);
     assert_eq!(frames.iter().map(|frame| frame.sequence).collect::<Vec<_>>(), [0, 2, 3, 5, 6, 8]);
     for frame in &frames {
@@ -191,7 +191,7 @@ fn stages_keep_the_order_of_capture_where_nothing_may_be_lost() {
         let (a, b) = (Arc::default(), Arc::default());
         let sources = vec![Fast::boxed("a", 100, &a, grey), Fast::boxed("b", 100, &b, grey)];
         let config = ThreadsConfig { queue_capacity: capacity, pacing: Pacing::Lossless };
-        let threads = CaptureThreads::start_staged(sources, |_| Box::new(Decoding::default()), config).unwrap();
+        let threads = CaptureThreads::start_staged(sources, |_| Box::new(Decoding::new(None)), config).unwrap();
         let frames = drain(&threads);
         assert_eq!(frames.len(), 200);
         assert!(frames.is_sorted_by_key(|frame| (frame.capture_nanos, frame.camera.clone())));
@@ -204,7 +204,7 @@ fn dropping_frees_stages_that_wait() {
     let taken = Arc::new(AtomicUsize::new(0));
     let config = ThreadsConfig { queue_capacity: 1, pacing: Pacing::Lossless };
     let sources = vec![Fast::boxed("a", 1000, &taken, grey)];
-    let threads = CaptureThreads::start_staged(sources, |_| Box::new(Decoding::default()), config).unwrap();
+    let threads = CaptureThreads::start_staged(sources, |_| Box::new(Decoding::new(None)), config).unwrap();
     assert!(threads.queue().pop(LONG).is_ok());
     // Source, stage and queue are all full now or soon; nobody takes anything any more.
     drop(threads);

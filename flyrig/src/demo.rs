@@ -18,12 +18,12 @@ use indicatif::ProgressBar;
 use serde::{Deserialize as _, Serialize, de::IntoDeserializer as _};
 
 use crate::{
-    cli::DemoArgs,
+    cli::{DemoArgs, NetworkUse},
     config::{AppearanceMode, Origin},
     dataset,
     engine::Engine,
     eval::progress_bar,
-    intake::Intake,
+    intake::{Intake, Pictures},
     outlet::Outlet,
     pipeline::{Outcome, Pipeline, PoseSource},
     png,
@@ -216,7 +216,7 @@ fn pass(
         args.solver.options(Origin::Given),
     )?;
     if let Some(networks) = mode.networks(args.weights.as_deref())? {
-        engine.use_networks(&networks, 0.0)?;
+        engine.use_networks(&networks, NetworkUse::default())?;
     }
     let no_plates = inputs.cameras.iter().map(|_| None).collect();
     let mut pipeline =
@@ -224,7 +224,8 @@ fn pass(
     if let Some(outlet) = &outlet {
         outlet.publisher().set_calibration(pipeline.rig())?;
     }
-    let mut intake = Intake::start(sources, false, &SyncConfig::default(), ClockKind::Shared, Pacing::Lossless)?;
+    let mut intake =
+        Intake::start(sources, Pictures::Rgb, &SyncConfig::default(), ClockKind::Shared, Pacing::Lossless)?;
 
     let limit = args.minutes.map(|minutes| Duration::from_secs_f64(minutes.max(0.0) * 60.0));
     let total = limit.map_or(args.frames as u64, |limit| limit.as_secs());

@@ -10,12 +10,23 @@ use flyrig_calib::{ClockAligner, ClockKind, ClockState, DropCounts, SyncConfig, 
 use flyrig_capture::{
     CameraSource, CaptureThreads, Decoding, FrameStage, Pacing, PopError, ThreadsConfig, monotonic_nanos,
 };
-use flyrig_types::{CameraId, Frame, FrameSet};
+use flyrig_types::{Camera, CameraId, Frame, FrameSet, Rig};
 
 use crate::health::{CameraHealth, Health};
 
 /// Frames a camera that may wait for the pipeline: enough to bridge a slow frame, few enough to stay live.
 const WAITING_FRAMES_A_CAMERA: usize = 4;
+
+/// What cameras send.
+#[derive(Debug, Clone, Copy)]
+pub enum Pictures<'a> {
+    /// RGB: there is nothing to decode.
+    Rgb,
+    /// To be decoded; those of other sizes than the calibration's are refused.
+    OfRig(&'a Rig),
+    /// To be decoded, of any size.
+    OfAnySize,
+}
 
 /// Camera threads, their queue and the synchronizer.
 pub struct Intake {
@@ -64,11 +75,11 @@ impl Timing {
 }
 
 impl Intake {
-    /// Starts a thread a camera, and where `decode` says so another one that makes RGB of its pictures. With
+    /// Starts a thread a camera, and another one each that makes RGB of its pictures where they are not. With
     /// [`Pacing::Lossless`] every set comes, in order; else the newest one wins.
     pub fn start(
         sources: Vec<Box<dyn CameraSource>>,
-        decode: bool,
+        pictures: Pictures<'_>,
         sync: &SyncConfig,
         clocks: ClockKind,
         pacing: Pacing,
@@ -76,11 +87,14 @@ impl Intake {
         let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
         let queue_capacity = WAITING_FRAMES_A_CAMERA * cameras.len().max(1);
         let config = ThreadsConfig { queue_capacity, pacing };
-        let decoding = |_: &CameraId| Box::new(Decoding::default()) as Box<dyn FrameStage>;
-        let threads = if decode {
-            CaptureThreads::start_staged(sources, decoding, config)?
-        } else {
-            CaptureThreads::start(sources, config)?
+        let size = |camera: &CameraId| match pictures {
+            Pictures::OfRig(rig) => rig.cameras.iter().find(|known| known.id == *camera).map(Camera::size),
+            Pictures::OfAnySize | Pictures::Rgb => None,
+        };
+        let decoding = |camera: &CameraId| Box::new(Decoding::new(size(camera))) as Box<dyn FrameStage>;
+        let threads = match pictures {
+            Pictures::Rgb => CaptureThreads::start(sources, config)?,
+            _ => CaptureThreads::start_staged(sources, decoding, config)?,
         };
         Ok(Self {
             threads,

@@ -20,7 +20,7 @@ use crate::{
     dataset,
     engine::Engine,
     health::Health,
-    intake::Intake,
+    intake::{Intake, Pictures},
     live,
     metrics_server::MetricsServer,
     network,
@@ -58,7 +58,6 @@ pub struct Scene {
 pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_table: bool) -> Result<()> {
     let stop = stop::flag();
     let mut scene = open(config, Some(gpu))?;
-    let decode = matches!(config.source.kind, SourceKind::Cameras | SourceKind::Network | SourceKind::Mcap);
     dataset::require_masks(config.body.pose, config.body.masks, &scene.plates)?;
     let pacing = match (config.source.real_time, config.source.kind) {
         // Nobody can make a real camera wait.
@@ -74,7 +73,11 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
         scene.sources = record::tap(recorder, scene.sources)?;
     }
     let mut poses = recorder.as_ref().map(PoseRecording::new);
-    let mut intake = Intake::start(scene.sources, decode, &sync_config(config), config.sync.clocks, pacing)?;
+    let pictures = match config.source.kind {
+        SourceKind::Cameras | SourceKind::Network | SourceKind::Mcap => Pictures::OfRig(&scene.rig),
+        SourceKind::Folder | SourceKind::Video | SourceKind::Sim => Pictures::Rgb,
+    };
+    let mut intake = Intake::start(scene.sources, pictures, &sync_config(config), config.sync.clocks, pacing)?;
     if config.source.kind.is_live() {
         intake = intake.live();
     }
@@ -106,7 +109,7 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
         config.tracking.options(config.body.pose),
     )?;
     if let Some(networks) = config.appearance.networks()? {
-        engine.use_networks(&networks, config.appearance.reuse)?;
+        engine.use_networks(&networks, config.appearance.network_use())?;
     }
     let mut pipeline = Pipeline::new(engine, scene.rig, pose, config.body.masks, scene.plates);
     pipeline.per_view_time = config.tracking.per_view_time;

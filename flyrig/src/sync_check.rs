@@ -20,7 +20,7 @@ use crate::{
     cli::SyncCheckArgs,
     config::{Config, SourceKind},
     dataset,
-    intake::Intake,
+    intake::{Intake, Pictures},
     record, run, stop,
 };
 
@@ -38,12 +38,35 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
         );
         return by_person(args, folder, sources, &cameras);
     }
+    if is_live {
+        eprintln!("sync-check: jump and wave both arms before all cameras for {} s, please", args.seconds);
+    }
+    let (estimates, frames) = by_motion(args, sources, &cameras, is_live)?;
+    print(&estimates, &frames);
+    if estimates.iter().any(|estimate| estimate.lag_nanos.is_none()) {
+        println!(
+            "?: nothing moves there as elsewhere, too slowly, or not for long enough (five seconds): jump and wave both arms \
+             before all cameras, or name the --calibration"
+        );
+    } else {
+        println!(
+            "lag ms is how much later than the first camera's a camera's stamps are: add it to the lag_ms that its \
+             [[source.cameras]] has (0 without one)"
+        );
+    }
+    Ok(())
+}
+
+/// The lags by what moves in the pictures, and how many pictures of each camera were compared.
+fn by_motion(
+    args: &SyncCheckArgs,
+    sources: Sources,
+    cameras: &[CameraId],
+    is_live: bool,
+) -> Result<(Vec<LagEstimate>, Vec<usize>)> {
     let mut signals: Vec<MotionSignal> = cameras.iter().cloned().map(MotionSignal::new).collect();
     let pacing = if is_live { Pacing::AsDelivered } else { Pacing::Lossless };
     let threads = CaptureThreads::start(sources, ThreadsConfig { queue_capacity: 8 * cameras.len(), pacing })?;
-    if is_live {
-        eprintln!("sync-check: move up and down before all cameras for {} s, please", args.seconds);
-    }
     let (started, mut rgb, mut first) = (Instant::now(), Vec::new(), None);
     while !stop::requested() {
         let frame = match threads.queue().pop(Duration::from_millis(200)) {
@@ -65,19 +88,7 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     }
     drop(threads);
     let estimates = estimate_lags(&signals, (args.most_ms * 1e6) as i64);
-    print(&estimates, &signals.iter().map(MotionSignal::len).collect::<Vec<_>>());
-    if estimates.iter().any(|estimate| estimate.lag_nanos.is_none()) {
-        println!(
-            "?: nothing moves there as elsewhere, or not for long enough (five seconds); move up and down before all cameras, \
-             or name the --calibration"
-        );
-    } else {
-        println!(
-            "lag ms is how much later than the first camera's a camera's stamps are: add it to the lag_ms that its \
-             [[source.cameras]] has (0 without one)"
-        );
-    }
-    Ok(())
+    Ok((estimates, signals.iter().map(MotionSignal::len).collect()))
 }
 
 fn print(estimates: &[LagEstimate], frames: &[usize]) {
@@ -105,7 +116,8 @@ fn by_person(args: &SyncCheckArgs, folder: &Path, sources: Sources, cameras: &[C
     )?;
     let mut tracks: Vec<PointTrack> = rig.cameras.iter().map(PointTrack::new).collect();
     let mut frames = vec![0; tracks.len()];
-    let mut intake = Intake::start(sources, true, &SyncConfig::default(), ClockKind::Shared, Pacing::Lossless)?;
+    let mut intake =
+        Intake::start(sources, Pictures::OfRig(&rig), &SyncConfig::default(), ClockKind::Shared, Pacing::Lossless)?;
     let (mut first, mut unseen) = (None, 0);
     while !intake.ended() && !stop::requested() {
         let Some(set) = intake.next_set(Duration::from_millis(200)) else { continue };
@@ -174,6 +186,81 @@ fn open(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(S
                 Ok(boxed(VideoReplay::open(&name.into(), path, &VideoOptions::default())?))
             };
             Ok((videos.iter().map(video).collect::<Result<_>>()?, false))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_gpu::AdapterChoice;
+    use flyrig_sim::{Fault, FaultKind, FaultScript, MotionConfig, MotionKind, SimConfig, SimTime, Simulator};
+    use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
+
+    use super::*;
+
+    const NAMES: [&str; 4] = ["00", "02", "03", "05"];
+
+    /// Lags that were simulated and lags that were found, milliseconds after the first camera.
+    fn simulated(gpu: &GpuContext, seed: u64, kind: MotionKind) -> Vec<(f64, LagEstimate)> {
+        let mut rng = SmallRng::seed_from_u64(seed);
+        let lags_ms = NAMES.map(|_| rng.random_range(-100.0f64..100.0));
+        let offset = |(name, ms): (&str, f64)| Fault {
+            camera: Some(name.to_owned()),
+            ms: Some(ms),
+            ..Fault::new(FaultKind::Offset)
+        };
+        let config = SimConfig {
+            seed,
+            motion: MotionConfig { kind, ..MotionConfig::default() },
+            faults: FaultScript { seed, faults: NAMES.into_iter().zip(lags_ms).map(offset).collect() },
+            width: 128,
+            height: 128,
+            frames: Some(240),
+            ..SimConfig::default()
+        };
+        let simulator = std::sync::Arc::new(std::sync::Mutex::new(Simulator::new(gpu, &config).unwrap()));
+        let sources: Sources = flyrig_sim::sources(&simulator, SimTime::Exact)
+            .into_iter()
+            .filter(|source| NAMES.contains(&source.camera().as_str()))
+            .map(|source| Box::new(source) as Box<dyn CameraSource>)
+            .collect();
+        let args = SyncCheckArgs { input: Vec::new(), seconds: 20.0, most_ms: 250.0, fps: 30.0, calibration: None };
+        let (estimates, _) = by_motion(&args, sources, &NAMES.map(CameraId::from), false).unwrap();
+        lags_ms.map(|lag| lag - lags_ms[0]).into_iter().zip(estimates).collect()
+    }
+
+    fn assert_found(gpu: &GpuContext, seed: u64) {
+        for (lag_ms, estimate) in simulated(gpu, seed, MotionKind::Wave) {
+            let found = estimate.lag_nanos.unwrap() as f64 * 1e-6;
+            let off = found - lag_ms;
+            println!("seed {seed} {}: {found:.1} ms, off by {off:.2} ms", estimate.camera);
+            assert!(off.abs() <= 2.0, "seed {seed} {}: off by {off} ms", estimate.camera);
+        }
+    }
+
+    #[test]
+    fn random_lags_of_a_person_who_waves_are_found() {
+        assert_found(&GpuContext::new(&AdapterChoice::Best).unwrap(), 1);
+    }
+
+    #[test]
+    #[ignore = "minutes: run by make test-long"]
+    fn lags_are_found_or_not_told() {
+        let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+        for seed in 2..5 {
+            assert_found(&gpu, seed);
+        }
+        // Slow, and different from every side: no answer is better than a wrong one.
+        for (kind, seed) in [(MotionKind::Squat, 5), (MotionKind::Turn, 6)] {
+            for (lag_ms, estimate) in simulated(&gpu, seed, kind) {
+                let off = estimate.lag_nanos.map(|found| found as f64 * 1e-6 - lag_ms);
+                println!(
+                    "{kind:?} {}: off by {off:?} ms, disagreement {:.1} ms",
+                    estimate.camera,
+                    estimate.disagreement_nanos * 1e-6
+                );
+                assert!(off.is_none_or(|off| off.abs() <= 5.0), "{kind:?} {}: off by {off:?} ms", estimate.camera);
+            }
         }
     }
 }

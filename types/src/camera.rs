@@ -201,6 +201,12 @@ pub struct Camera {
 }
 
 impl Camera {
+    /// Width and height of its pictures, pixels.
+    #[must_use]
+    pub fn size(&self) -> [u32; 2] {
+        [self.intrinsics.width, self.intrinsics.height]
+    }
+
     /// Pixel of a world point; `None` behind the camera, closer than 1 mm to its plane, or beyond
     /// the lens model's valid radius.
     #[must_use]

@@ -19,7 +19,13 @@ use super::{
     processor::{cpu_share, cpu_ticks},
     steady::Steady,
 };
-use crate::{cli::BenchCaptureArgs, intake::Intake, network, stats::resident_mib, stop};
+use crate::{
+    cli::BenchCaptureArgs,
+    intake::{Intake, Pictures},
+    network,
+    stats::resident_mib,
+    stop,
+};
 
 /// Share of the run after which memory counts: buffers and pools have grown by then.
 const WARM_UP: f64 = 0.1;
@@ -57,8 +63,14 @@ fn cameras(args: &BenchCaptureArgs) -> Result<Vec<Box<dyn CameraSource>>> {
 pub fn capture(args: &BenchCaptureArgs) -> Result<()> {
     let stop = stop::flag();
     let clock = network::host_clock();
-    let mut intake =
-        Intake::start(cameras(args)?, true, &SyncConfig::default(), ClockKind::Shared, Pacing::AsDelivered)?.live();
+    let mut intake = Intake::start(
+        cameras(args)?,
+        Pictures::OfAnySize,
+        &SyncConfig::default(),
+        ClockKind::Shared,
+        Pacing::AsDelivered,
+    )?
+    .live();
     let run = Duration::from_secs_f64(args.minutes * 60.0);
     let sets = (run.as_secs_f64() * args.fps * 1.1) as usize;
     // All of its memory is taken before the measurement.
@@ -177,7 +189,7 @@ mod tests {
         let args = BenchCaptureArgs { minutes: 0.05, cameras: 2, fps: 30.0, size: [64, 48] };
         let mut intake = Intake::start(
             cameras(&args).unwrap(),
-            true,
+            Pictures::OfAnySize,
             &SyncConfig::default(),
             ClockKind::Shared,
             Pacing::AsDelivered,

@@ -162,7 +162,7 @@ impl Rig {
         let cameras = sources.len();
         let ids: Vec<_> = sources.iter().map(|source| source.camera().clone()).collect();
         let config = ThreadsConfig { queue_capacity: 4 * cameras, ..ThreadsConfig::default() };
-        let threads = match CaptureThreads::start_staged(sources, |_| Box::new(Decoding::default()), config) {
+        let threads = match CaptureThreads::start_staged(sources, |_| Box::new(Decoding::new(None)), config) {
             Ok(threads) => threads,
             Err(error) => {
                 println!("BROKEN: cannot start: {error}");
