@@ -2,10 +2,11 @@
 
 use std::{net::SocketAddr, ops::Range, path::PathBuf};
 
+use anyhow::{Result, ensure};
 use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
 use flyrig_stfa::NetworkSize;
 
-use crate::config::{AppearanceMode, Origin, Solver};
+use crate::config::{AppearanceMode, NetworksOn, Origin, Solver};
 
 /// Live free-viewpoint video of a person from a few cameras.
 ///
@@ -204,6 +205,9 @@ pub struct TrainArgs {
     /// How large the networks are.
     #[arg(long, value_enum, default_value = "small")]
     pub size: SizeName,
+    /// Where the networks are trained; "adapter" needs a flyrig that was built with the feature gpu-networks.
+    #[arg(long, value_enum, default_value = "processor")]
+    pub networks_on: NetworksOn,
     /// Checkpoints (one every 250 steps) from one measurement on the test people to the next.
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub test_every: u64,
@@ -213,6 +217,28 @@ pub struct TrainArgs {
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
     pub gaussians: usize,
+}
+
+/// How the networks of learned appearance are used.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Args)]
+pub struct NetworkUse {
+    /// What the networks keep from frame to frame: see `reuse` in the configuration.
+    #[arg(long, default_value_t = 0.0)]
+    pub reuse: f32,
+    /// Where the networks run; "adapter" needs a flyrig that was built with the feature gpu-networks.
+    #[arg(long, value_enum, default_value = "processor")]
+    pub networks_on: NetworksOn,
+}
+
+impl NetworkUse {
+    /// Checks that the two go together.
+    pub fn check(self) -> Result<()> {
+        ensure!(
+            self.reuse == 0.0 || self.networks_on == NetworksOn::Processor,
+            "networks on the adapter keep nothing from frame to frame: set reuse to 0, or let them run on the processor"
+        );
+        Ok(())
+    }
 }
 
 /// Sizes of the networks of learned appearance.
@@ -267,9 +293,8 @@ pub struct BenchAppearanceArgs {
     /// Weights files of the learned modes, in place of the networks that come with flyrig; may be given several times.
     #[arg(long)]
     pub weights: Vec<PathBuf>,
-    /// What the networks keep from frame to frame: see `reuse` in the configuration.
-    #[arg(long, default_value_t = 0.0)]
-    pub reuse: f32,
+    #[command(flatten)]
+    pub networks: NetworkUse,
     /// Pixels of a picture's side.
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
     pub side: u32,
@@ -480,9 +505,8 @@ pub struct EvalArgs {
     /// Weights file of the learned modes, in place of the networks that come with flyrig.
     #[arg(long)]
     pub weights: Option<PathBuf>,
-    /// What the networks keep from frame to frame: see `reuse` in the configuration.
-    #[arg(long, default_value_t = 0.0)]
-    pub reuse: f32,
+    #[command(flatten)]
+    pub networks: NetworkUse,
     /// Frames FIRST..END, END excluded; all of them otherwise.
     #[arg(long, value_parser = parse_range)]
     pub frames: Option<Range<u64>>,

@@ -11,7 +11,7 @@ use flyrig_stfa::Parameters;
 use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
 use serde::{Deserialize, Serialize};
 
-use crate::{cameras::CameraEntry, deformation::DeformOptions, network};
+use crate::{cameras::CameraEntry, cli::NetworkUse, deformation::DeformOptions, network};
 
 /// The commented default file, as `flyrig config print` writes it. A test keeps it equal to `Config::default()`.
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
@@ -306,9 +306,26 @@ pub struct AppearanceSection {
     pub weights: PathBuf,
     /// Inputs of a Gaussian that changed by no more than this leave what the networks add to its colour as it was.
     pub reuse: f32,
+    pub networks_on: NetworksOn,
+}
+
+/// Where networks run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum NetworksOn {
+    /// All cores.
+    #[default]
+    Processor,
+    /// The graphics adapter that draws.
+    Adapter,
 }
 
 impl AppearanceSection {
+    /// How they are used.
+    pub fn network_use(&self) -> NetworkUse {
+        NetworkUse { reuse: self.reuse, networks_on: self.networks_on }
+    }
+
     /// What adds to direct appearance.
     pub fn networks(&self) -> Result<Option<Parameters>> {
         self.mode.networks(Some(self.weights.as_path()).filter(|path| !path.as_os_str().is_empty()))
@@ -317,7 +334,7 @@ impl AppearanceSection {
 
 impl Default for AppearanceSection {
     fn default() -> Self {
-        Self { mode: AppearanceMode::Direct, weights: PathBuf::new(), reuse: 0.0 }
+        Self { mode: AppearanceMode::Direct, weights: PathBuf::new(), reuse: 0.0, networks_on: NetworksOn::default() }
     }
 }
 
@@ -459,6 +476,7 @@ impl Config {
         range("tracking.views", self.tracking.views as f64, 0.0, 1000.0)?;
         range("tracking.rest", self.tracking.rest, 0.0, 0.5)?;
         range("appearance.reuse", f64::from(self.appearance.reuse), 0.0, 1.0)?;
+        self.appearance.network_use().check()?;
         range("output.views", self.output.views as f64, 0.0, 16.0)?;
         range("output.width", f64::from(self.output.width), 16.0, 4096.0)?;
         range("output.height", f64::from(self.output.height), 16.0, 4096.0)?;

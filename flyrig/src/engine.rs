@@ -7,15 +7,17 @@ use flyrig_body::{
     DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, SurfaceGaussians, Template, build_graph, sample_surface, skin_mesh,
 };
 use flyrig_capture::to_rgb8;
-use flyrig_gpu::GpuContext;
+use flyrig_gpu::{GpuContext, StorageBuffer};
 use flyrig_renderer::{
     AppearanceSettings, DirectAppearance, GaussianBuffers, Observations, Outputs, RasterSettings, Rasterizer,
     RenderTarget, Splat, ViewInput, read_splats, rgba8_from_target,
 };
-use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, ViewPicture};
+use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, SharedAppearance, ViewPicture};
 use flyrig_tracker::DeformReport;
 use flyrig_types::{Camera, Image, Mask, Pose, Rig};
 
+use crate::cli::NetworkUse;
+use crate::config::NetworksOn;
 use crate::deformation::{DeformOptions, DeformTimes, Deformation, Scene, TrackedView};
 use crate::stats::{StageTimes, processor_time};
 use crate::viewpoints::center_of_attention;
@@ -54,6 +56,13 @@ pub struct Observed {
     pub normal: Vec<[f32; 4]>,
 }
 
+/// Networks, where they run.
+#[derive(Debug)]
+enum Learned {
+    Processor(Box<LearnedAppearance>),
+    Adapter(SharedAppearance),
+}
+
 /// The person as Gaussians on the GPU, and everything that keeps them up to date.
 #[derive(Debug)]
 pub struct Engine {
@@ -68,7 +77,7 @@ pub struct Engine {
     settings: AppearanceSettings,
     body: BodyGraph,
     /// What adds to direct appearance.
-    learned: Option<LearnedAppearance>,
+    learned: Option<Learned>,
     /// Views that painted in the last update.
     painted: Vec<usize>,
     /// A target an input view; grows with the rig, remade when a picture's size changes.
@@ -79,7 +88,7 @@ pub struct Engine {
     /// Whether the body keeps its shape for the time being.
     pub shape_held: bool,
     /// What direct appearance painted last, while the Gaussians show what the networks made of it.
-    direct_colors: Vec<[f32; 4]>,
+    direct_colors: Option<StorageBuffer<[f32; 4]>>,
     /// What the deformation thinks of the last update's views.
     judged: Vec<Option<(f64, bool)>>,
 }
@@ -128,7 +137,7 @@ impl Engine {
                 None => GpuSkinner::new(&gpu, surface, &template.skeleton)?,
             },
             shape_held: false,
-            direct_colors: Vec::new(),
+            direct_colors: None,
             deformation: deform
                 .map(|options| Deformation::new(&gpu, &template, surface, graph, options, finest_pixel_m(rig)))
                 .transpose()?,
@@ -160,11 +169,19 @@ impl Engine {
     }
 
     /// From now on these networks add to direct appearance; see [`LearnedAppearance::reuse`].
-    pub fn use_networks(&mut self, parameters: &Parameters, reuse: f32) -> Result<()> {
+    pub fn use_networks(&mut self, parameters: &Parameters, how: NetworkUse) -> Result<()> {
+        how.check()?;
         self.appearance.keep_observations(&self.gpu)?;
-        let mut learned = LearnedAppearance::new(parameters, self.body.clone());
-        learned.reuse = reuse;
-        self.learned = Some(learned);
+        self.learned = Some(match how.networks_on {
+            NetworksOn::Processor => {
+                let mut learned = LearnedAppearance::new(parameters, self.body.clone());
+                learned.reuse = how.reuse;
+                Learned::Processor(Box::new(learned))
+            }
+            NetworksOn::Adapter => Learned::Adapter(SharedAppearance::new(&self.gpu, parameters, &self.body)?),
+        });
+        self.direct_colors =
+            Some(StorageBuffer::from_slice(&self.gpu, "direct colours", &self.gaussians.color.read(&self.gpu)?)?);
         Ok(())
     }
 
@@ -268,9 +285,9 @@ impl Engine {
         self.gpu.wait()?;
         stages.add("skinning", start.elapsed());
 
-        if !self.direct_colors.is_empty() {
+        if let Some(direct) = &self.direct_colors {
             // Direct appearance goes on from its own colours.
-            self.gaussians.color.write(&self.gpu, &self.direct_colors);
+            direct.copy_to(&self.gpu, &self.gaussians.color);
         }
         let start = Instant::now();
         for (i, view) in views.iter().enumerate() {
@@ -328,13 +345,24 @@ impl Engine {
     fn paint_learned(&mut self, views: &[InputView<'_>], stages: &mut StageTimes) -> Result<()> {
         let Some(learned) = &mut self.learned else { return Ok(()) };
         let start = Instant::now();
-        let observed = self.appearance.observations(&self.gpu, self.painted.len())?;
+        if let Some(direct) = &self.direct_colors {
+            self.gaussians.color.copy_to(&self.gpu, direct);
+        }
         let picture = |&i: &usize| {
             let (width, height) = (views[i].image.width(), views[i].image.height());
             ViewPicture { width, height, rgba: &self.rgba[i] }
         };
         let pictures: Vec<_> = self.painted.iter().map(picture).collect();
-        self.direct_colors = self.gaussians.color.read(&self.gpu)?;
+        let learned = match learned {
+            Learned::Processor(learned) => learned,
+            Learned::Adapter(learned) => {
+                learned.paint(&self.gpu, &self.appearance, &self.gaussians, &pictures, &self.settings)?;
+                self.gpu.wait()?;
+                stages.add("networks", start.elapsed());
+                return Ok(());
+            }
+        };
+        let observed = self.appearance.observations(&self.gpu, self.painted.len())?;
         let before = learned.counts;
         let colors = learned.paint(&observed, &pictures, &self.settings)?;
         self.gaussians.color.write(&self.gpu, &colors);
@@ -371,8 +399,10 @@ impl Engine {
             deformation.reset();
         }
         self.appearance.reset();
-        if let Some(learned) = &mut self.learned {
-            learned.reset();
+        match &mut self.learned {
+            Some(Learned::Processor(learned)) => learned.reset(),
+            Some(Learned::Adapter(learned)) => learned.reset(),
+            None => {}
         }
     }
 

@@ -231,7 +231,7 @@ impl Replay {
             args.solver.options(args.pose),
         )?;
         if let Some(networks) = args.appearance.networks(args.weights.as_deref())? {
-            engine.use_networks(&networks, args.reuse)?;
+            engine.use_networks(&networks, args.networks)?;
         }
         let pipeline = Pipeline::new(engine, rig, pose, args.masks, plates);
         Ok(Self { pipeline, frames, buffered, holdout, truth })

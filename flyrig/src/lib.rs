@@ -12,6 +12,7 @@ mod deformation;
 mod demo;
 mod doctor;
 mod engine;
+mod error_parts;
 mod eval;
 mod health;
 mod intake;

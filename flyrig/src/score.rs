@@ -8,7 +8,7 @@ use flyrig_renderer::metrics::{BOX_MARGIN_PX, Picture, flip, mask_iou, person_bo
 use flyrig_types::{CameraId, Image, Mask};
 use serde::Serialize;
 
-use crate::{engine::RenderedView, png};
+use crate::{engine::RenderedView, error_parts::ErrorParts, png};
 
 /// Scores of one picture.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -19,6 +19,8 @@ pub struct FrameScore {
     pub ssim: f64,
     pub flip: f64,
     pub iou: Option<f64>,
+    /// Where the error lies; only against a mask.
+    pub parts: Option<ErrorParts>,
 }
 
 /// Mean scores of a camera.
@@ -30,6 +32,8 @@ pub struct CameraScore {
     pub ssim: f64,
     pub flip: f64,
     pub iou: Option<f64>,
+    /// Where the error lies; only against a mask.
+    pub parts: Option<ErrorParts>,
 }
 
 /// Ours and the truth as they are compared, and the box of the person.
@@ -72,7 +76,8 @@ pub fn score_view(
     mask: Option<&Mask>,
 ) -> Result<Option<FrameScore>> {
     let Some(Compared { ours, truth, area }) = compare(view, truth, mask)? else { return Ok(None) };
-    let iou = mask.map(|mask| mask_iou(&own_silhouette(view)?, mask).map_err(anyhow::Error::from)).transpose()?;
+    let drawn = own_silhouette(view)?;
+    let iou = mask.map(|mask| mask_iou(&drawn, mask)).transpose()?;
     Ok(Some(FrameScore {
         camera: camera.to_string(),
         frame,
@@ -80,6 +85,7 @@ pub fn score_view(
         ssim: ssim(&ours, &truth, area)?,
         flip: flip(&truth, &ours, area)?.mean,
         iou,
+        parts: mask.map(|mask| ErrorParts::new(&ours, &truth, &drawn, mask, area)),
     }))
 }
 
@@ -176,6 +182,9 @@ impl ScoreSheet {
                 s.camera, s.frames, s.psnr_db, s.ssim, s.flip
             );
         }
+        if let Some(parts) = self.mean().and_then(|mean| mean.parts) {
+            let _ = writeln!(text, "{parts}");
+        }
         text
     }
 }
@@ -187,6 +196,7 @@ fn mean<'a>(name: &str, scores: &(impl Iterator<Item = &'a FrameScore> + Clone))
     }
     let over = |pick: fn(&FrameScore) -> f64| scores.clone().map(pick).sum::<f64>() / frames as f64;
     let ious: Vec<f64> = scores.clone().filter_map(|score| score.iou).collect();
+    let parts: Vec<ErrorParts> = scores.clone().filter_map(|score| score.parts).collect();
     Some(CameraScore {
         camera: name.to_owned(),
         frames,
@@ -194,6 +204,7 @@ fn mean<'a>(name: &str, scores: &(impl Iterator<Item = &'a FrameScore> + Clone))
         ssim: over(|s| s.ssim),
         flip: over(|s| s.flip),
         iou: (!ious.is_empty()).then(|| ious.iter().sum::<f64>() / ious.len() as f64),
+        parts: ErrorParts::mean(&parts),
     })
 }
 

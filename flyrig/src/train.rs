@@ -15,11 +15,11 @@ use std::{
 
 use anyhow::{Context, Result, ensure};
 use flyrig_gpu::GpuContext;
-use flyrig_stfa::{SampleErrors, TrainSettings, Trainer, TrainingSample, evaluate};
+use flyrig_stfa::{NetworkDevice, SampleErrors, TrainSettings, Trainer, TrainingSample, evaluate};
 
 pub use self::people::People;
 use self::report::{Progress, Scores};
-use crate::{cli::TrainArgs, eval::progress_bar, stop};
+use crate::{cli::TrainArgs, config::NetworksOn, eval::progress_bar, stop};
 
 /// Added to the seed of the people that only measure progress.
 const HELD_OUT_SEED: u64 = 1 << 40;
@@ -67,6 +67,9 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     } else {
         Trainer::new(args.size.size(), settings)
     };
+    if args.networks_on == NetworksOn::Adapter {
+        trainer.device = NetworkDevice::adapter(&gpu()?)?;
+    }
     let mut progress = Progress::open(&args.out, trainer.step)?;
     let bar = progress_bar(args.steps, "train");
     bar.set_position(trainer.step);

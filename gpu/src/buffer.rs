@@ -55,6 +55,14 @@ impl<T: Pod> StorageBuffer<T> {
         }
     }
 
+    /// Queues a copy of the elements that both have room for.
+    pub fn copy_to(&self, gpu: &GpuContext, other: &Self) {
+        let bytes = self.len.min(other.len) as u64 * size_of::<T>() as u64;
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        encoder.copy_buffer_to_buffer(&self.buffer, 0, &other.buffer, 0, bytes);
+        gpu.queue.submit([encoder.finish()]);
+    }
+
     /// Elements.
     #[must_use]
     pub fn len(&self) -> usize {

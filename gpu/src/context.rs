@@ -77,7 +77,9 @@ pub struct GpuContext {
     pub device: Device,
     /// wgpu's queue.
     pub queue: Queue,
-    adapter: AdapterInfo,
+    instance: Instance,
+    adapter: Adapter,
+    info: AdapterInfo,
 }
 
 impl GpuContext {
@@ -90,7 +92,7 @@ impl GpuContext {
     }
 
     async fn open(choice: &AdapterChoice) -> Result<Self, GpuError> {
-        let mut adapters = adapters().await;
+        let (instance, mut adapters) = adapters().await;
         if adapters.is_empty() {
             return Err(GpuError::NoAdapter);
         }
@@ -119,7 +121,13 @@ impl GpuContext {
         };
         check("max_storage_buffers_per_shader_stage", limits.max_storage_buffers_per_shader_stage.into(), 13)?;
         check("max_compute_invocations_per_workgroup", limits.max_compute_invocations_per_workgroup.into(), 256)?;
-        let wanted = Features::TIMESTAMP_QUERY;
+        // The networks' library takes for granted that of these, whatever the adapter can is switched on.
+        let networks = Features::SUBGROUP
+            | Features::SHADER_F16
+            | Features::SHADER_F64
+            | Features::SHADER_INT64
+            | Features::SHADER_FLOAT32_ATOMIC;
+        let wanted = Features::TIMESTAMP_QUERY | networks;
         let (device, queue) = adapter
             .request_device(&wgpu::DeviceDescriptor {
                 label: Some("flyrig"),
@@ -130,19 +138,25 @@ impl GpuContext {
             .await
             .map_err(|source| GpuError::Open { adapter: info.name.clone(), source })?;
         tracing::debug!(adapter = %info.name, backend = %info.backend, driver = %info.driver_info, "graphics adapter");
-        Ok(Self { device, queue, adapter: info })
+        Ok(Self { device, queue, instance, adapter, info })
     }
 
     /// Name, backend and driver of the adapter, for reports.
     #[must_use]
     pub fn adapter_name(&self) -> String {
-        format!("{} ({}, {})", self.adapter.name, self.adapter.backend, self.adapter.driver_info)
+        format!("{} ({}, {})", self.info.name, self.info.backend, self.info.driver_info)
+    }
+
+    /// What the device was opened on, for libraries that share it.
+    #[must_use]
+    pub fn handles(&self) -> (&Instance, &Adapter) {
+        (&self.instance, &self.adapter)
     }
 
     /// Whether the adapter is a CPU in disguise.
     #[must_use]
     pub fn is_software(&self) -> bool {
-        self.adapter.device_type == DeviceType::Cpu
+        self.info.device_type == DeviceType::Cpu
     }
 
     /// Waits until all submitted work is done.
@@ -156,14 +170,14 @@ impl GpuContext {
 }
 
 /// Every adapter, the fastest kind first.
-async fn adapters() -> Vec<Adapter> {
+async fn adapters() -> (Instance, Vec<Adapter>) {
     let instance = Instance::new(InstanceDescriptor {
         backends: Backends::VULKAN | Backends::METAL | Backends::DX12,
         ..InstanceDescriptor::new_without_display_handle()
     });
     let mut adapters = instance.enumerate_adapters(Backends::all()).await;
     adapters.sort_by_key(|adapter| rank(adapter.get_info().device_type));
-    adapters
+    (instance, adapters)
 }
 
 /// Name, backend, driver and kind of every adapter, in the order of [`AdapterChoice::Best`].
@@ -174,7 +188,7 @@ pub fn adapter_names() -> Vec<String> {
         let kind = if info.device_type == DeviceType::Cpu { ", software" } else { "" };
         format!("{} ({}, {}{kind})", info.name, info.backend, info.driver_info)
     };
-    pollster::block_on(adapters()).into_iter().map(name).collect()
+    pollster::block_on(adapters()).1.into_iter().map(name).collect()
 }
 
 fn rank(kind: DeviceType) -> u8 {

@@ -38,5 +38,5 @@ mod settings;
 mod update;
 
 pub use hierarchy::{DiffusionHierarchy, DiffusionLevel};
-pub use settings::{AppearanceError, AppearanceSettings, Observations, ViewInput};
+pub use settings::{AppearanceError, AppearanceSettings, ObservationBuffers, Observations, ViewInput};
 pub use update::DirectAppearance;

@@ -17,7 +17,8 @@ mod sort;
 mod splat_rows;
 
 pub use appearance::{
-    AppearanceError, AppearanceSettings, DiffusionHierarchy, DiffusionLevel, DirectAppearance, Observations, ViewInput,
+    AppearanceError, AppearanceSettings, DiffusionHierarchy, DiffusionLevel, DirectAppearance, ObservationBuffers,
+    Observations, ViewInput,
 };
 pub use buffers::{GaussianBuffers, RenderTarget};
 pub use color::{composite_over, linear_from_srgb, rgba8_from_target, srgb_from_linear};

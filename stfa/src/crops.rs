@@ -13,7 +13,7 @@ const MARGIN_PX: usize = 8;
 /// Sides are multiples of this: the encoder halves twice.
 const MULTIPLE: usize = 4;
 /// Detail is what these blurs take away, standard deviations in pixels.
-const BLURS_PX: [f32; 2] = [1.0, 3.0];
+pub(crate) const BLURS_PX: [f32; 2] = [1.0, 3.0];
 
 /// A picture as the engine holds it.
 #[derive(Debug, Clone, Copy)]
@@ -160,17 +160,24 @@ fn person_box(rgba: &[u8], width: usize, height: usize) -> [usize; 4] {
     ]
 }
 
-/// Separable Gaussian blur, zero outside.
-fn blurred(pixels: &[[f32; 4]], width: usize, sigma: f32) -> Vec<[f32; 4]> {
+/// Shares of a pixel's neighbours in a row or column, an odd number of them; they sum to 1.
+pub(crate) fn blur_kernel(sigma: f32) -> Vec<f32> {
     let radius = (2.5 * sigma).ceil() as isize;
     let kernel: Vec<f32> = (-radius..=radius).map(|d| (-0.5 * (d as f32 / sigma).powi(2)).exp()).collect();
     let total: f32 = kernel.iter().sum();
+    kernel.into_iter().map(|weight| weight / total).collect()
+}
+
+/// Separable Gaussian blur, zero outside.
+fn blurred(pixels: &[[f32; 4]], width: usize, sigma: f32) -> Vec<[f32; 4]> {
+    let kernel = blur_kernel(sigma);
+    let radius = (kernel.len() / 2) as isize;
     let add = |to: &mut [[f32; 4]], from: &[[f32; 4]], weight: f32| {
         for (to, from) in to.as_flattened_mut().iter_mut().zip(from.as_flattened()) {
             *to += weight * from;
         }
     };
-    let shares = |d: isize| kernel[(d + radius) as usize] / total;
+    let shares = |d: isize| kernel[(d + radius) as usize];
     let width = width.max(1);
     let mut rows = vec![[0.0; 4]; pixels.len()];
     for (to, from) in rows.chunks_exact_mut(width).zip(pixels.chunks_exact(width)) {

@@ -24,7 +24,7 @@ pub const NODE: usize = 8;
 const BEST: usize = STATE - 3;
 
 /// Sum of weights that halves the belief in a mean.
-const SMALL_WEIGHT: f32 = 0.02;
+pub(crate) const SMALL_WEIGHT: f32 = 0.02;
 
 /// A frame as the networks take it in, for all Gaussians or some of them.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -140,7 +140,7 @@ fn rgb(color: [f32; 4]) -> [f32; 3] {
 }
 
 fn sum_weight(observed: &Observations, gaussian: usize) -> f32 {
-    observed.views.iter().map(|view| tame(view[gaussian][2])).sum()
+    observed.views.iter().filter_map(|view| look(view[gaussian])).map(|[_, _, weight]| weight).sum()
 }
 
 /// Eq. 5: the weights count as they are until they sum to more than 1. The baseline without filling always normalises.
@@ -149,10 +149,14 @@ fn row_weight(observed: &Observations, settings: &AppearanceSettings, gaussian: 
     if settings.space { sum.max(1.0) } else { sum.max(1e-6) }
 }
 
+/// Pixel and weight, where a view has something to say.
+fn look([x, y, weight, _]: [f32; 4]) -> Option<[f32; 3]> {
+    (weight > 0.0 && [x, y, weight].iter().all(|v| v.is_finite())).then_some([x, y, weight])
+}
+
 fn push_taps(taps: &mut Taps, observed: &Observations, crops: &Crops, gaussian: usize, factor: f32) {
     for (view, (kept, origin)) in observed.views.iter().zip(&crops.origins).enumerate() {
-        let [x, y, weight, _] = kept[gaussian];
-        if weight > 0.0 && weight.is_finite() && x.is_finite() && y.is_finite() {
+        if let Some([x, y, weight]) = look(kept[gaussian]) {
             let pixel = [x - origin[0] as f32, y - origin[1] as f32];
             taps.taps.push(Tap { view: view as u32, pixel, weight: weight * factor });
         }

@@ -19,13 +19,18 @@
 mod body_graph;
 mod comparison;
 mod crops;
+#[cfg(any(test, feature = "wgpu"))]
+mod device_paint;
 mod error;
 mod inputs;
 mod memory;
 mod network;
+mod network_device;
 mod paint;
 mod parameters;
 mod sample;
+#[cfg_attr(not(feature = "wgpu"), path = "shared_missing.rs")]
+mod shared;
 mod structure;
 mod taps;
 mod tensor_file;
@@ -39,9 +44,11 @@ pub use crops::{Crops, DETAIL, ViewPicture};
 pub use error::StfaError;
 pub use inputs::{CANDIDATES, FrameInputs, NODE, STATE, frame_inputs};
 pub use memory::FeatureMemory;
+pub use network_device::NetworkDevice;
 pub use paint::{LearnedAppearance, PaintCounts};
 pub use parameters::{NetworkSize, Parameters};
 pub use sample::{PATCH, SHARES, Target, TargetPicture, TrainingSample, training_sample};
+pub use shared::SharedAppearance;
 pub use taps::{FeatureMaps, Tap, Taps};
 pub use train::{Loss, TrainSettings, Trainer};
 pub use weights::WEIGHTS_VERSION;

@@ -96,7 +96,7 @@ fn run(
         Solver::GaussNewton.options(Origin::Given),
     )?;
     if let Some((_, networks)) = mode.networks {
-        engine.use_networks(networks, args.reuse)?;
+        engine.use_networks(networks, args.networks)?;
     }
     let plates = rig.cameras.iter().map(|_| None).collect();
     let track = PoseSource::Track { track: sequence.track.clone(), repeat: true };

@@ -8,7 +8,7 @@ use flyrig_types::CameraId;
 
 use super::gather::{HeldOut, gather};
 use crate::{
-    cli::{EvalArgs, TrainArgs},
+    cli::{EvalArgs, NetworkUse, TrainArgs},
     config::{AppearanceMode, Origin, Solver},
     dataset,
     eval::{Replay, progress_bar},
@@ -57,7 +57,7 @@ fn leave_out(
         solver: Solver::GaussNewton,
         appearance: AppearanceMode::Direct,
         weights: None,
-        reuse: 0.0,
+        networks: NetworkUse::default(),
         frames: None,
         fps: args.fps,
         gaussians: args.gaussians,

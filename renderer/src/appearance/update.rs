@@ -6,7 +6,7 @@ use flyrig_types::MAX_IMAGE_SIDE;
 use wgpu::{Buffer, BufferUsages, CommandEncoder, ComputePassDescriptor};
 
 use super::{
-    AppearanceError, AppearanceSettings, Observations, ViewInput,
+    AppearanceError, AppearanceSettings, ObservationBuffers, Observations, ViewInput,
     graph_buffers::GraphBuffers,
     kernels::{Kernels, SettingsConstants, WORKGROUP},
 };
@@ -210,6 +210,19 @@ impl DirectAppearance {
             node_seen: read_back(gpu, self.graph.node_seen.raw(), nodes)?,
             node_color: read_back(gpu, self.graph.node_color.raw(), nodes)?,
         })
+    }
+
+    /// The same where it lies on the GPU.
+    #[must_use]
+    pub fn observation_buffers(&self) -> ObservationBuffers<'_> {
+        ObservationBuffers {
+            views: self.views.iter().map(|slot| &slot.kept).collect(),
+            seen: &self.seen,
+            quality: &self.quality,
+            nodes: self.graph.node_count as usize,
+            node_seen: &self.graph.node_seen,
+            node_color: &self.graph.node_color,
+        }
     }
 
     /// Forgets all earlier frames, from the next update on.
