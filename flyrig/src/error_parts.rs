@@ -139,7 +139,7 @@ mod tests {
         let whole = mask(|_, _| true);
         let parts =
             ErrorParts::new(&picture(|x, _| 100 + 40 * (x / 2 % 2) as u8), &picture(|_, _| 120), &whole, &whole, ALL);
-        assert!(parts.smooth_db.iter().all(|db| *db < 0.2), "{parts:?}");
+        assert!(parts.smooth_db.iter().all(|db| *db < 0.3), "{parts:?}"); // the borders are lopsided
         assert!(parts.colors_db > 98.0, "{parts:?}");
     }
 

@@ -14,7 +14,7 @@ use flyrig_stfa::Parameters;
 use serde::Serialize;
 
 use super::{
-    plot::{Plot, Series},
+    plot::{Line, Plot, Series},
     sequence::{Motion, Sequence, SequenceConfig},
 };
 use crate::{
@@ -227,7 +227,7 @@ fn write(folder: &Path, rows: &[Row]) -> Result<()> {
     let series = views.into_iter().map(|views| {
         let point = |row: &&Row| (row.direct_ms + row.networks_ms, -row.psnr_db, row.mode.clone());
         let points = means.iter().filter(|row| row.views == views).collect::<Vec<_>>();
-        Series { name: format!("{views} views"), points: points.iter().map(point).collect(), joined: false }
+        Series { name: format!("{views} views"), points: points.iter().map(point).collect(), line: Line::Front }
     });
     let plot = Plot {
         title: "Run time against error, people never trained on".to_owned(),
@@ -235,7 +235,6 @@ fn write(folder: &Path, rows: &[Row]) -> Result<()> {
         y_label: "-PSNR, dB".to_owned(),
         log_x: true,
         log_y: false,
-        front: false,
         series: series.collect(),
     };
     write_whole(&folder.join("appearance.svg"), plot.svg().as_bytes())

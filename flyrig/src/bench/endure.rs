@@ -10,7 +10,7 @@ use serde::Serialize;
 use super::{
     VIEWS,
     case::{Case, chamfer_mm, pipeline},
-    plot::{Plot, Series},
+    plot::{Line, Plot, Series},
     sequence::{Motion, Sequence, SequenceConfig},
 };
 use crate::{
@@ -131,8 +131,7 @@ fn plot(points: &[Point], title: &str, of: fn(&Point) -> f64) -> Plot {
         y_label: title.to_owned(),
         log_x: false,
         log_y: false,
-        front: false,
-        series: vec![Series { name: "default".to_owned(), points, joined: true }],
+        series: vec![Series { name: "default".to_owned(), points, line: Line::Through }],
     }
 }
 

@@ -15,8 +15,16 @@ pub struct Series {
     pub name: String,
     /// Place and label.
     pub points: Vec<(f64, f64, String)>,
-    /// Whether a line runs through them.
-    pub joined: bool,
+    pub line: Line,
+}
+
+/// The line of a series.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Line {
+    /// From point to point.
+    Through,
+    /// Along those that no other one of the series beats in both directions (less is better).
+    Front,
 }
 
 /// A diagram.
@@ -26,8 +34,6 @@ pub struct Plot {
     pub y_label: String,
     pub log_x: bool,
     pub log_y: bool,
-    /// Draws the line of points that no other one beats in both directions (less is better).
-    pub front: bool,
     pub series: Vec<Series>,
 }
 
@@ -125,18 +131,14 @@ impl Plot {
             -(TOP + HEIGHT - BOTTOM) / 2.0,
             escape(&self.y_label)
         );
-        if self.front {
-            let points: Vec<(f64, f64)> = all().map(|p| (p.0, p.1)).collect();
-            let line = front(&points);
-            svg += &polyline(&line, &x, &y, "#9ca3af", " stroke-dasharray=\"5 4\"");
-        }
         for (i, series) in self.series.iter().enumerate() {
             let color = COLORS[i % COLORS.len()];
             let points = || series.points.iter().filter(|(x, y, _)| x.is_finite() && y.is_finite());
-            if series.joined {
-                let line: Vec<(f64, f64)> = points().map(|p| (p.0, p.1)).collect();
-                svg += &polyline(&line, &x, &y, color, "");
-            }
+            let line: Vec<(f64, f64)> = points().map(|p| (p.0, p.1)).collect();
+            svg += &match series.line {
+                Line::Through => polyline(&line, &x, &y, color, ""),
+                Line::Front => polyline(&front(&line), &x, &y, color, " stroke-dasharray=\"5 4\""),
+            };
             for (px, py, label) in points() {
                 let (px, py) = (x.at(*px), y.at(*py));
                 let _ = write!(
@@ -208,8 +210,7 @@ mod tests {
             y_label: "y".to_owned(),
             log_x: true,
             log_y: false,
-            front: true,
-            series: vec![Series { name: "s".to_owned(), points, joined: true }],
+            series: vec![Series { name: "s".to_owned(), points, line: Line::Through }],
         };
         for points in [
             vec![],

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::ALL_VIEWS;
 use super::case::Row;
-use super::plot::{Plot, Series};
+use super::plot::{Line, Plot, Series};
 use super::summary::summary;
 use crate::{config::Solver, report::write_whole};
 
@@ -76,7 +76,7 @@ fn pareto(rows: &[Row]) -> Plot {
             .filter(|r| r.solver == solver)
             .map(|r| (r.deformation_ms, r.chamfer_mm, r.variant.trim_start_matches("default, ").to_owned()))
             .collect(),
-        joined: false,
+        line: Line::Front,
     };
     Plot {
         title: "Tracking: error over time".to_owned(),
@@ -84,7 +84,6 @@ fn pareto(rows: &[Row]) -> Plot {
         y_label: "Chamfer distance to the clothed surface, mm".to_owned(),
         log_x: true,
         log_y: false,
-        front: true,
         series: vec![group("paper", Solver::Paper), group("Gauss-Newton", Solver::GaussNewton)],
     }
 }
@@ -97,7 +96,7 @@ fn energy(rows: &[Row]) -> Plot {
             .zip(&r.first_energy)
             .map(|(i, e)| (f64::from(i), e / r.first_energy[0].max(1e-12), String::new()))
             .collect(),
-        joined: true,
+        line: Line::Through,
     };
     let mut chosen: Vec<&Row> =
         rows.iter().filter(|r| r.solver == Solver::Paper || r.variant.contains("10/4 iterations")).collect();
@@ -111,7 +110,6 @@ fn energy(rows: &[Row]) -> Plot {
         y_label: "share of the energy at the start".to_owned(),
         log_x: false,
         log_y: false,
-        front: false,
         series: chosen.into_iter().map(line).collect(),
     }
 }
@@ -123,7 +121,7 @@ fn views(rows: &[Row]) -> Plot {
         let mut points: Vec<_> =
             rows.iter().filter(same).map(|r| (r.views as f64, r.chamfer_mm, format!("{:.1} dB", r.psnr_db))).collect();
         points.sort_by(|a, b| a.0.total_cmp(&b.0));
-        Series { name: name.to_owned(), points, joined: true }
+        Series { name: name.to_owned(), points, line: Line::Through }
     };
     Plot {
         title: "Error over the number of views".to_owned(),
@@ -131,7 +129,6 @@ fn views(rows: &[Row]) -> Plot {
         y_label: "Chamfer distance to the clothed surface, mm".to_owned(),
         log_x: false,
         log_y: false,
-        front: false,
         series: vec![line("skinned only", "off"), line("default solver", &format!("default, {ALL_VIEWS}"))],
     }
 }

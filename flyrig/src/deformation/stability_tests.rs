@@ -21,7 +21,7 @@ use glam::DVec3;
 use self::chain::Chain;
 use self::small_scene::{Device, Shot, SmallScene};
 use super::*;
-use crate::bench::plot::{Plot, Series};
+use crate::bench::plot::{Line, Plot, Series};
 use crate::engine::{Engine, InputView};
 use crate::stats::StageTimes;
 
@@ -159,7 +159,7 @@ fn the_chain_in_f32_stays_with_the_chain_in_f64_for_200_frames() {
         let line = |name: &str, of: fn(&Row) -> f64| Series {
             name: name.to_owned(),
             points: rows.iter().enumerate().map(|(frame, r)| (frame as f64, of(r) * 1e6, String::new())).collect(),
-            joined: true,
+            line: Line::Through,
         };
         let plot = Plot {
             title: "Positions: f32 on the adapter from f64 on the CPU".to_owned(),
@@ -167,7 +167,6 @@ fn the_chain_in_f32_stays_with_the_chain_in_f64_for_200_frames() {
             y_label: "distance, micrometres".to_owned(),
             log_x: false,
             log_y: true,
-            front: false,
             series: vec![
                 line("farthest Gaussian", |r| r.same.max),
                 line("mean", |r| r.same.mean),

@@ -7,7 +7,7 @@ use flyrig_stfa::{Loss, SampleErrors};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    bench::plot::{Plot, Series},
+    bench::plot::{Line, Plot, Series},
     report::write_whole,
 };
 
@@ -128,10 +128,9 @@ impl Progress {
             y_label: "PSNR gain, dB".to_owned(),
             log_x: false,
             log_y: false,
-            front: false,
             series: vec![
-                Series { name: "people trained on".to_owned(), points: trained.collect(), joined: true },
-                Series { name: "people never seen".to_owned(), points: held_out.collect(), joined: true },
+                Series { name: "people trained on".to_owned(), points: trained.collect(), line: Line::Through },
+                Series { name: "people never seen".to_owned(), points: held_out.collect(), line: Line::Through },
             ],
         }
     }
