@@ -3,13 +3,14 @@ CARGO ?= cargo
 OUT ?= out/demo
 MINUTES ?= 30
 
-.PHONY: help setup demo test test-long test-v4l2 soak fuzz check
+.PHONY: help setup demo test test-long test-v4l2 test-gpu-networks soak fuzz check
 
 help:
 	@echo "make demo    install what is missing, build, run the simulated rig, show the report (OUT=$(OUT))"
 	@echo "make test    install what is missing, build, run every test"
 	@echo "make test-long  the long stability runs"
 	@echo "make test-v4l2  camera capture against the kernel's test drivers, in an emulated machine"
+	@echo "make test-gpu-networks  networks on the graphics adapter (about twenty processor minutes more to build)"
 	@echo "make soak    four plain cameras for MINUTES (30): memory, latency, processor time"
 	@echo "make fuzz    damaged input for everything that reads foreign bytes, MINUTES (30) for each"
 	@echo "make check   format, lints and documentation, as CI runs them"
@@ -31,6 +32,9 @@ test-long: setup
 
 test-v4l2: setup
 	@scripts/test-v4l2.sh
+
+test-gpu-networks: setup
+	$(CARGO) test --release --locked -p flyrig-stfa --features wgpu
 
 soak: setup
 	$(CARGO) run --release --locked -q --bin flyrig -- bench capture --minutes $(MINUTES)
