@@ -23,6 +23,9 @@ pub const NODE: usize = 8;
 /// Where the best view's candidate stands.
 const BEST: usize = STATE - 3;
 
+/// Gaussians that are gathered together.
+const CHUNK: usize = 8192;
+
 /// Sum of weights that halves the belief in a mean.
 pub(crate) const SMALL_WEIGHT: f32 = 0.02;
 
@@ -89,12 +92,16 @@ pub fn frame_inputs(
             &all
         }
     };
-    let mut taps = Taps::default();
-    for &index in which {
-        let denominator = row_weight(observed, settings, index as usize);
-        push_taps(&mut taps, observed, crops, index as usize, 1.0 / denominator);
-        taps.end_row();
-    }
+    let part = |which: &[u32]| {
+        let mut taps = Taps::default();
+        for &index in which {
+            let denominator = row_weight(observed, settings, index as usize);
+            push_taps(&mut taps, observed, crops, index as usize, 1.0 / denominator);
+            taps.end_row();
+        }
+        taps
+    };
+    let taps = Taps::joined(which.par_chunks(CHUNK).map(part).collect());
     let detail = taps.sample(&[crops.detail(settings)]);
     let colors = crops.colors(settings);
     let [mean, best] = [taps.sample(std::slice::from_ref(&colors)), taps.heaviest().sample(&[colors])];

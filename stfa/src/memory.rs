@@ -20,26 +20,31 @@ impl FeatureMemory {
         self.features.clear();
     }
 
-    /// Takes in the rows of this instant, `width` numbers a Gaussian, and blends the past into them. `visible` is w_vis a
-    /// Gaussian, `seen` the share of it that was seen and exp(-k d) of the best view. A row with a number that is not
-    /// finite, or without weight, leaves the memory as it was.
+    /// Makes room for so many Gaussians of `width` numbers each; forgets everything where that changes.
+    pub fn fit(&mut self, gaussians: usize, width: usize) {
+        if self.width != width || self.weights.len() != gaussians {
+            self.width = width;
+            self.weights = vec![0.0; gaussians];
+            self.features = vec![0.0; gaussians * width];
+        }
+    }
+
+    /// Takes in the rows of this instant of the Gaussians from `first` on, and blends the past into them. `visible` is w_vis
+    /// a Gaussian, `seen` the share of it that was seen and exp(-k d) of the best view. A row with a number that is not
+    /// finite, or without weight, leaves the memory as it was; rows that [`Self::fit`] made no room for stay as they are.
     pub fn fuse(
         &mut self,
+        first: usize,
         rows: &mut [f32],
-        width: usize,
         visible: &[f32],
         seen: &[[f32; 2]],
         settings: &AppearanceSettings,
     ) {
-        if self.width != width || self.weights.len() != visible.len() || self.features.len() != rows.len() {
-            self.width = width;
-            self.weights = vec![0.0; visible.len()];
-            self.features = vec![0.0; rows.len()];
-        }
+        let width = self.width;
         let max = settings.memory_weight_max;
         rows.par_chunks_exact_mut(width.max(1))
-            .zip(self.features.par_chunks_exact_mut(width.max(1)))
-            .zip(&mut self.weights)
+            .zip(self.features.par_chunks_exact_mut(width.max(1)).skip(first))
+            .zip(self.weights.par_iter_mut().skip(first))
             .zip(visible.par_iter().zip(seen))
             .for_each(|(((row, past), past_weight), (&visible, &[share, nearness]))| {
                 if visible > 0.0 && visible.is_finite() && row.iter().all(|v| v.is_finite()) {
@@ -69,6 +74,7 @@ mod tests {
     fn fusion_follows_the_equations() {
         let settings = AppearanceSettings::default();
         let mut memory = FeatureMemory::default();
+        memory.fit(1, 2);
         let (mut acc, mut weight) = ([0.0f64; 2], 0.0f64);
         for frame in 0..40 {
             let t = f64::from(frame);
@@ -76,7 +82,7 @@ mod tests {
             let visible = f64::from((frame * 7) % 5) / 4.0;
             let (share, nearness) = (0.6 + 0.4 * visible, 0.5);
             let mut row = now.map(|v| v as f32);
-            memory.fuse(&mut row, 2, &[visible as f32], &[[share as f32, nearness as f32]], &settings);
+            memory.fuse(0, &mut row, &[visible as f32], &[[share as f32, nearness as f32]], &settings);
             if visible > 0.0 {
                 for (acc, now) in acc.iter_mut().zip(now) {
                     *acc = (weight * *acc + visible * now) / (weight + visible);
@@ -95,17 +101,19 @@ mod tests {
     fn poison_and_blindness_leave_the_memory() {
         let settings = AppearanceSettings::default();
         let mut memory = FeatureMemory::default();
-        memory.fuse(&mut [1.0, 2.0], 2, &[0.5], &[[1.0, 1.0]], &settings);
+        memory.fit(1, 2);
+        memory.fuse(0, &mut [1.0, 2.0], &[0.5], &[[1.0, 1.0]], &settings);
         let before = memory.clone();
         let mut poisoned = [f32::NAN, 5.0];
-        memory.fuse(&mut poisoned, 2, &[1.0], &[[0.0, 0.0]], &settings);
-        memory.fuse(&mut [7.0, 8.0], 2, &[0.0], &[[0.0, 0.0]], &settings);
-        memory.fuse(&mut [7.0, 8.0], 2, &[f32::NAN], &[[0.0, 0.0]], &settings);
+        memory.fuse(0, &mut poisoned, &[1.0], &[[0.0, 0.0]], &settings);
+        memory.fuse(0, &mut [7.0, 8.0], &[0.0], &[[0.0, 0.0]], &settings);
+        memory.fuse(0, &mut [7.0, 8.0], &[f32::NAN], &[[0.0, 0.0]], &settings);
         assert_eq!(memory, before);
         assert!(poisoned.iter().all(|v| v.is_finite()), "the past stands in: {poisoned:?}");
         memory.clear();
+        memory.fit(1, 2);
         let mut fresh = [3.0, 4.0];
-        memory.fuse(&mut fresh, 2, &[0.0], &[[0.0, 0.0]], &settings);
+        memory.fuse(0, &mut fresh, &[0.0], &[[0.0, 0.0]], &settings);
         assert!((fresh[0] - 3.0f32).abs() < 1e-6 && (fresh[1] - 4.0f32).abs() < 1e-6);
     }
 }

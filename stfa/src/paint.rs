@@ -1,5 +1,7 @@
 //! One frame through the networks.
 
+use std::ops::Range;
+
 use burn_tensor::{Device, Int, Tensor};
 use flyrig_renderer::{AppearanceSettings, Observations, linear_from_srgb, srgb_from_linear};
 use rayon::prelude::*;
@@ -7,7 +9,7 @@ use rayon::prelude::*;
 use crate::{
     BodyGraph, Parameters, StfaError,
     crops::{Crops, ViewPicture},
-    inputs::{STATE, frame_inputs},
+    inputs::{FrameInputs, STATE, frame_inputs},
     memory::FeatureMemory,
     network::{Network, feature_maps},
     parameters::to_vec,
@@ -46,6 +48,8 @@ struct Corrections {
     rows: Vec<f32>,
     /// sRGB.
     added: Vec<[f32; 3]>,
+    /// Whether this frame is the first that is kept.
+    fresh: bool,
 }
 
 /// Paints every Gaussian: direct appearance and what the networks add to it.
@@ -106,27 +110,57 @@ impl LearnedAppearance {
         let crops = Crops::cut(pictures)?;
         let inputs = frame_inputs(&self.body, observed, &crops, settings, None)?;
         let size = self.network.size;
-        let (feature, node) = (size.feature(), size.node);
+        let feature = size.feature();
         self.encode(crops, settings);
         let (network, levels) = (&self.network, &self.encoded.levels);
-        let sample = |taps: &Taps| {
-            if levels.is_empty() { vec![0.0; taps.rows() * feature] } else { taps.sample(levels) }
-        };
-        let visible = sample(&inputs.taps);
         let graph = if settings.space {
-            let node_feature = network.table(sample(&inputs.node_taps), feature);
+            let sampled =
+                |taps: &Taps| if levels.is_empty() { vec![0.0; taps.rows() * feature] } else { taps.sample(levels) };
+            let node_feature = network.table(sampled(&inputs.node_taps), feature);
             let nodes = network.node_inputs(&inputs.nodes);
             to_vec(network.graph(node_feature, nodes, self.place.clone(), &self.edges))
         } else {
-            vec![0.0; self.body.nodes() * node]
+            Vec::new()
         };
 
-        let row = size.row();
-        let mut rows = vec![0.0; self.body.gaussians() * row];
-        for (chunk, rows) in rows.chunks_mut(CHUNK * row).enumerate() {
-            let first = chunk * CHUNK;
-            let range = first..first + rows.len() / row;
-            let part = &visible[range.start * feature..range.end * feature];
+        let (row, count) = (size.row(), self.body.gaussians());
+        self.memory.fit(count, row);
+        self.corrections.fit(count, row, self.reuse);
+        let mut colors = Vec::with_capacity(count);
+        // A chunk's rows stay in the cache from sampling to colour.
+        for first in (0..count).step_by(CHUNK) {
+            let range = first..(first + CHUNK).min(count);
+            let mut rows = self.rows(&inputs, range.clone(), &graph, settings);
+            if settings.time {
+                let weights: Vec<f32> = inputs.state[range.clone()].iter().map(|state| state[3]).collect();
+                self.memory.fuse(first, &mut rows, &weights, &inputs.seen[range.clone()], settings);
+            }
+            self.add_corrections(first, &rows);
+            colors.par_extend(rows.par_chunks_exact(row).zip(&self.corrections.added[range]).map(|(row, added)| {
+                let color = |c: usize| linear_from_srgb((srgb_from_linear(row[c]) + added[c]).clamp(0.0, 1.0));
+                let color = [color(0), color(1), color(2), 1.0];
+                if color.iter().all(|v| v.is_finite()) { color } else { [0.2, 0.2, 0.2, 1.0] }
+            }));
+        }
+        Ok(colors)
+    }
+
+    /// What the colour network sees of some Gaussians, before the memory. Without `graph` nothing is filled in.
+    fn rows(
+        &self,
+        inputs: &FrameInputs,
+        range: Range<usize>,
+        graph: &[f32],
+        settings: &AppearanceSettings,
+    ) -> Vec<f32> {
+        let (network, size) = (&self.network, self.network.size);
+        let (feature, node, row) = (size.feature(), size.node, size.row());
+        let visible = if self.encoded.levels.is_empty() {
+            vec![0.0; range.len() * feature]
+        } else {
+            inputs.taps.sample_rows(&self.encoded.levels, range.clone())
+        };
+        let filled = if settings.space {
             let mut around = vec![0.0; range.len() * node];
             around.par_chunks_mut(node).zip(range.clone().into_par_iter()).for_each(|(out, gaussian)| {
                 let nodes = self.body.gaussian_nodes[gaussian].iter().zip(&self.body.gaussian_weights[gaussian]);
@@ -137,33 +171,19 @@ impl LearnedAppearance {
                 }
             });
             let weights = inputs.state[range.clone()].iter().map(|state| state[3]).collect();
-            let filled = if settings.space {
-                let around = network.table(around, node);
-                to_vec(network.fill(network.table(part.to_vec(), feature), network.table(weights, 1), around))
-            } else {
-                part.to_vec()
-            };
-            rows.par_chunks_mut(row).zip(filled.par_chunks(feature)).zip(&inputs.state[range]).for_each(
-                |((row, filled), state)| {
-                    row[..STATE].copy_from_slice(state);
-                    row[STATE..].copy_from_slice(filled);
-                },
-            );
-        }
-        if settings.time {
-            let weights: Vec<f32> = inputs.state.iter().map(|state| state[3]).collect();
-            self.memory.fuse(&mut rows, row, &weights, &inputs.seen, settings);
-        }
-        self.add_corrections(&rows);
-        Ok(rows
-            .chunks_exact(row)
-            .zip(&self.corrections.added)
-            .map(|(row, added)| {
-                let color = |c: usize| linear_from_srgb((srgb_from_linear(row[c]) + added[c]).clamp(0.0, 1.0));
-                let color = [color(0), color(1), color(2), 1.0];
-                if color.iter().all(|v| v.is_finite()) { color } else { [0.2, 0.2, 0.2, 1.0] }
-            })
-            .collect())
+            let around = network.table(around, node);
+            to_vec(network.fill(network.table(visible, feature), network.table(weights, 1), around))
+        } else {
+            visible
+        };
+        let mut rows = vec![0.0; range.len() * row];
+        rows.par_chunks_mut(row).zip(filled.par_chunks(feature)).zip(&inputs.state[range]).for_each(
+            |((row, filled), state)| {
+                row[..STATE].copy_from_slice(state);
+                row[STATE..].copy_from_slice(filled);
+            },
+        );
+        rows
     }
 
     /// Brings the feature maps up to date; those of unchanged pictures are kept.
@@ -198,39 +218,51 @@ impl LearnedAppearance {
         }
     }
 
-    /// Brings what is added to each Gaussian's colour up to date with its row.
-    fn add_corrections(&mut self, rows: &[f32]) {
+    /// Brings what is added to the colours of the Gaussians from `first` on up to date with their rows.
+    fn add_corrections(&mut self, first: usize, rows: &[f32]) {
         let (row, reuse) = (self.network.size.row(), self.reuse);
-        let of = |gaussian: u32| gaussian as usize * row..(gaussian as usize + 1) * row;
-        let Corrections { rows: before, added } = &mut self.corrections;
+        let of = |place: u32| place as usize * row..(place as usize + 1) * row;
         let count = rows.len() / row;
-        let fresh = reuse <= 0.0 || before.len() != rows.len();
-        added.resize(count, [0.0; 3]);
+        let Corrections { rows: before, added, fresh } = &mut self.corrections;
+        let added = &mut added[first..first + count];
+        let mut kept = before.get_mut(first * row..(first + count) * row);
         let near = |(a, b): (&f32, &f32)| (a - b).abs() <= reuse;
-        let changed: Vec<u32> = (0..count as u32)
-            .into_par_iter()
-            .filter(|&gaussian| fresh || !rows[of(gaussian)].iter().zip(&before[of(gaussian)]).all(near))
-            .collect();
+        let differs = |place: u32| {
+            let known = kept.as_deref().filter(|_| !*fresh);
+            known.is_none_or(|known| !rows[of(place)].iter().zip(&known[of(place)]).all(near))
+        };
+        let changed: Vec<u32> = (0..count as u32).into_par_iter().filter(|&place| differs(place)).collect();
         self.counts.colors_computed += changed.len() as u64;
         self.counts.colors_kept += (count - changed.len()) as u64;
-        if reuse <= 0.0 {
-            before.clear();
-        } else if fresh {
-            *before = rows.to_vec();
+        let mut inputs = Vec::with_capacity(changed.len() * row);
+        changed.iter().for_each(|&place| inputs.extend_from_slice(&rows[of(place)]));
+        if inputs.is_empty() {
+            return;
         }
-        for which in changed.chunks(CHUNK) {
-            let inputs: Vec<f32> = which.iter().flat_map(|&gaussian| &rows[of(gaussian)]).copied().collect();
-            let colors = to_vec(self.network.color(self.network.table(inputs, row)));
-            for (&gaussian, color) in which.iter().zip(colors.chunks_exact(3)) {
-                let input = &rows[of(gaussian)];
-                let add: [f32; 3] = std::array::from_fn(|c| color[c] - srgb_from_linear(input[c]));
-                let finite = add.iter().all(|v| v.is_finite());
-                self.counts.poisoned += u64::from(!finite);
-                added[gaussian as usize] = if finite { add } else { [0.0; 3] };
-                if reuse > 0.0 && !fresh {
-                    before[of(gaussian)].copy_from_slice(input);
-                }
+        let colors = to_vec(self.network.color(self.network.table(inputs, row)));
+        let additions: Vec<[f32; 3]> = (changed.par_iter().zip(colors.par_chunks_exact(3)))
+            .map(|(&place, color)| {
+                let input = &rows[of(place)];
+                std::array::from_fn(|c| color[c] - srgb_from_linear(input[c]))
+            })
+            .collect();
+        for (&place, add) in changed.iter().zip(additions) {
+            let finite = add.iter().all(|v| v.is_finite());
+            self.counts.poisoned += u64::from(!finite);
+            added[place as usize] = if finite { add } else { [0.0; 3] };
+            if let Some(kept) = &mut kept {
+                kept[of(place)].copy_from_slice(&rows[of(place)]);
             }
         }
+    }
+}
+
+impl Corrections {
+    /// Makes room; what is of another form, or not to be reused, is forgotten.
+    fn fit(&mut self, count: usize, row: usize, reuse: f32) {
+        let wanted = if reuse > 0.0 { count * row } else { 0 };
+        self.fresh = wanted == 0 || self.rows.len() != wanted;
+        self.rows.resize(wanted, 0.0);
+        self.added.resize(count, [0.0; 3]);
     }
 }

@@ -1,5 +1,7 @@
 //! Pixel-aligned features (FlyHuman, Eq. 5): weighted bilinear samples of feature maps, and the way back for training.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 /// One look of a row at one view.
@@ -82,6 +84,19 @@ impl Taps {
         self.starts.push(self.taps.len() as u32);
     }
 
+    /// The rows of several one after another.
+    #[must_use]
+    pub(crate) fn joined(parts: Vec<Self>) -> Self {
+        let mut out = Self::default();
+        out.taps.reserve(parts.iter().map(|part| part.taps.len()).sum());
+        for part in parts {
+            let first = out.taps.len() as u32;
+            out.starts.extend(part.starts.iter().skip(1).map(|start| first + start));
+            out.taps.extend(part.taps);
+        }
+        out
+    }
+
     /// Number of rows.
     #[must_use]
     pub fn rows(&self) -> usize {
@@ -107,6 +122,7 @@ impl Taps {
     #[must_use]
     pub fn heaviest(&self) -> Self {
         let mut out = Self::default();
+        out.starts.reserve(self.rows());
         for row in 0..self.rows() {
             let heavier = |best: Option<Tap>, tap: &Tap| match best {
                 Some(best) if best.weight >= tap.weight => Some(best),
@@ -130,9 +146,15 @@ impl Taps {
     /// Row by row the features of all scales one after another. Taps must fit the maps' number of views.
     #[must_use]
     pub fn sample(&self, levels: &[FeatureMaps]) -> Vec<f32> {
+        self.sample_rows(levels, 0..self.rows())
+    }
+
+    /// The same of some rows.
+    #[must_use]
+    pub fn sample_rows(&self, levels: &[FeatureMaps], rows: Range<usize>) -> Vec<f32> {
         let channels: usize = levels.iter().map(|level| level.channels).sum();
-        let mut out = vec![0.0; self.rows() * channels];
-        out.par_chunks_mut(channels.max(1)).enumerate().for_each(|(row, out)| {
+        let mut out = vec![0.0; rows.len() * channels];
+        out.par_chunks_mut(channels.max(1)).zip(rows).for_each(|(out, row)| {
             for tap in self.row(row).iter().filter(|tap| tap.weight != 0.0) {
                 let mut first = 0;
                 for level in levels {
