@@ -203,8 +203,11 @@ pub struct TrainArgs {
     #[arg(long, default_value_t = 1.0)]
     pub contrast: f32,
     /// How large the networks are.
-    #[arg(long, value_enum, default_value = "small")]
+    #[arg(long, value_enum, default_value = "small", conflicts_with = "from")]
     pub size: SizeName,
+    /// Weights file to start from in place of random weights; "shipped" for the networks that come with flyrig.
+    #[arg(long)]
+    pub from: Option<PathBuf>,
     /// Where the networks are trained; "adapter" needs a flyrig that was built with the feature gpu-networks.
     #[arg(long, value_enum, default_value = "processor")]
     pub networks_on: NetworksOn,

@@ -15,7 +15,7 @@ use std::{
 
 use anyhow::{Context, Result, ensure};
 use flyrig_gpu::GpuContext;
-use flyrig_stfa::{NetworkDevice, SampleErrors, TrainSettings, Trainer, TrainingSample, evaluate};
+use flyrig_stfa::{NetworkDevice, Parameters, SampleErrors, TrainSettings, Trainer, TrainingSample, evaluate};
 
 pub use self::people::People;
 use self::report::{Progress, Scores};
@@ -54,10 +54,11 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         contrast: args.contrast,
         ..TrainSettings::default()
     };
+    let begin = begin(args)?;
     let mut trainer = if checkpoint.exists() {
         let trainer = Trainer::load(&checkpoint)?;
         ensure!(
-            trainer.settings == settings && trainer.parameters.size == args.size.size(),
+            trainer.settings == settings && trainer.parameters.size == begin.size,
             "{} was begun with other settings ({:?}, {:?}); give the same ones, or another --out",
             checkpoint.display(),
             trainer.parameters.size,
@@ -65,7 +66,7 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         );
         trainer
     } else {
-        Trainer::new(args.size.size(), settings)
+        Trainer::new(begin, settings)
     };
     if args.networks_on == NetworksOn::Adapter {
         trainer.device = NetworkDevice::adapter(&gpu()?)?;
@@ -93,11 +94,24 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     }
     bar.finish_and_clear();
     println!("{} of {} steps; {}", trainer.step, args.steps, progress.message());
-    if let Some(scores) = progress.scores.last() {
-        println!("{scores}");
+    match progress.scores.last() {
+        Some(scores) => println!("{scores}"),
+        None => println!(
+            "that is of the samples it learned from; measure with `flyrig eval --weights` on a camera that took no part, since \
+             a short take is easily learned by heart"
+        ),
     }
     println!("weights.safetensors, weights.json, loss.csv, loss.svg in {}", args.out.display());
     Ok(())
+}
+
+/// What a training that is new starts from.
+fn begin(args: &TrainArgs) -> Result<Parameters> {
+    Ok(match &args.from {
+        None => Parameters::untrained(args.size.size(), args.seed),
+        Some(path) if path.as_os_str() == "shipped" => Parameters::embedded()?,
+        Some(path) => Parameters::load(path)?,
+    })
 }
 
 /// None without anybody to measure on.

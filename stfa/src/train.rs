@@ -12,7 +12,7 @@ use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    NetworkDevice, NetworkSize, Parameters, StfaError,
+    NetworkDevice, Parameters, StfaError,
     comparison::{Comparison, PixelLoss, planes},
     network::{Network, feature_maps},
     parameters::to_vec,
@@ -94,10 +94,9 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// Starts anew.
+    /// Starts from these weights.
     #[must_use]
-    pub fn new(size: NetworkSize, settings: TrainSettings) -> Self {
-        let parameters = Parameters::untrained(size, settings.seed);
+    pub fn new(parameters: Parameters, settings: TrainSettings) -> Self {
         let zeros = |count: usize| [vec![0.0; count], vec![0.0; count]];
         let moments = parameters.by_name.iter().map(|(name, p)| (name.clone(), zeros(p.values.len()))).collect();
         Self { parameters, settings, step: 0, device: NetworkDevice::processor(), moments }

@@ -5,7 +5,7 @@ use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
 use super::*;
 use crate::{
-    PATCH, SHARES, SampleErrors,
+    NetworkSize, PATCH, SHARES, SampleErrors,
     body_graph::EDGES,
     comparison::{evaluate, number},
     crops::Crops,
@@ -81,7 +81,7 @@ fn settings(steps: u64) -> TrainSettings {
 #[test]
 fn both_tapes_together_give_the_true_gradient() {
     let sample = sample(1);
-    let mut trainer = Trainer::new(SIZE, settings(10));
+    let mut trainer = Trainer::new(Parameters::untrained(SIZE, 1), settings(10));
     let mut rng = SmallRng::seed_from_u64(2);
     for parameter in trainer.parameters.by_name.values_mut() {
         parameter.values.iter_mut().for_each(|value| *value += rng.random_range(-0.2..0.2));
@@ -116,7 +116,7 @@ fn both_tapes_together_give_the_true_gradient() {
 #[test]
 fn an_untrained_network_is_direct_appearance_and_training_beats_it() {
     let samples = [sample(1), sample(3)];
-    let mut trainer = Trainer::new(SIZE, settings(200));
+    let mut trainer = Trainer::new(Parameters::untrained(SIZE, 1), settings(200));
     let SampleErrors { learned, direct } = evaluate(&trainer.parameters, &samples[0], true).unwrap();
     assert!((learned.mse - direct.mse).abs() < 1e-9, "{learned:?} against {direct:?}");
     assert!((learned.color_mse - direct.color_mse).abs() < 1e-9, "{learned:?} against {direct:?}");
@@ -142,9 +142,9 @@ fn a_resumed_training_is_the_same_training() {
             trainer.step(&samples[trainer.next_sample(samples.len())]);
         }
     };
-    let mut straight = Trainer::new(SIZE, settings(12));
+    let mut straight = Trainer::new(Parameters::untrained(SIZE, 1), settings(12));
     go(&mut straight, 12);
-    let mut first = Trainer::new(SIZE, settings(12));
+    let mut first = Trainer::new(Parameters::untrained(SIZE, 1), settings(12));
     go(&mut first, 5);
     first.save(&path).unwrap();
     let mut second = Trainer::load(&path).unwrap();
@@ -157,7 +157,7 @@ fn a_resumed_training_is_the_same_training() {
 
 #[test]
 fn every_sample_has_its_turn() {
-    let mut trainer = Trainer::new(SIZE, settings(100));
+    let mut trainer = Trainer::new(Parameters::untrained(SIZE, 1), settings(100));
     let mut seen: Vec<usize> = (0..7)
         .map(|step| {
             trainer.step = step;
@@ -171,7 +171,7 @@ fn every_sample_has_its_turn() {
 
 #[test]
 fn poisoned_samples_leave_the_weights_alone() {
-    let mut trainer = Trainer::new(SIZE, settings(10));
+    let mut trainer = Trainer::new(Parameters::untrained(SIZE, 1), settings(10));
     let before = trainer.parameters.clone();
     let mut poisoned = sample(1);
     poisoned.targets[0].state[3][1] = f32::NAN;
