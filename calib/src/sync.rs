@@ -15,7 +15,8 @@ pub struct SyncConfig {
     /// The camera whose frames set the times of the sets; the rig's first when `None`.
     pub master: Option<CameraId>,
     /// Largest distance of a frame from its set's time. Up to half the master's frame period the
-    /// nearest set of a frame is unambiguous.
+    /// nearest set of a frame is unambiguous. A camera that goes on at the distance it had in the set before may be
+    /// half as far again: one that runs half a period beside the master would fall out of every other set.
     pub window_nanos: u64,
     /// Longest time, by the frames' own clock, that a set waits for a camera. A camera silent for
     /// longer is waited for no more, and when it is the master, the next camera's clock takes over.
@@ -101,6 +102,17 @@ struct Camera {
     missed: Vec<u64>,
     /// Time of the frame that went into a set last.
     used: Option<i64>,
+    /// How much later than the set's time that was, and whose clock the set followed.
+    offset: Option<(usize, i64)>,
+}
+
+impl Camera {
+    /// The waiting frame nearest to a time.
+    fn nearest(&self, nanos: i64) -> Option<i64> {
+        let before = self.pending.range(..=nanos).next_back().map(|(time, _)| *time);
+        let after = self.pending.range(nanos..).next().map(|(time, _)| *time);
+        before.into_iter().chain(after).min_by_key(|time| time.abs_diff(nanos))
+    }
 }
 
 impl Synchronizer {
@@ -131,6 +143,7 @@ impl Synchronizer {
                     interval: None,
                     missed: vec![0; cameras.len()],
                     used: None,
+                    offset: None,
                 })
                 .collect(),
             clock_order,
@@ -282,16 +295,17 @@ impl Synchronizer {
         let window = self.window;
         let mut frames = Vec::with_capacity(self.cameras.len());
         for (slot, camera) in self.cameras.iter_mut().enumerate() {
-            let before = camera.pending.range(..=nanos).next_back().map(|(time, _)| *time);
-            let after = camera.pending.range(nanos..).next().map(|(time, _)| *time);
-            let nearest = before
-                .into_iter()
-                .chain(after)
-                .min_by_key(|time| time.abs_diff(nanos))
-                .filter(|time| slot == clock || time.abs_diff(nanos) <= window);
+            let expected = camera.offset.filter(|(by, _)| *by == clock).map(|(_, offset)| nanos.saturating_add(offset));
+            let steady = expected.and_then(|expected| camera.nearest(expected)).filter(|time| {
+                let near = |to: i64, most: u64| time.abs_diff(to) <= most;
+                near(nanos, window.saturating_add(window / 2)) && expected.is_some_and(|at| near(at, window / 2))
+            });
+            let nearest = steady.or_else(|| camera.nearest(nanos).filter(|time| time.abs_diff(nanos) <= window));
+            let nearest = if slot == clock { Some(nanos) } else { nearest };
             frames.push(nearest.and_then(|time| camera.pending.remove(&time)));
-            if nearest.is_some() {
+            if let Some(time) = nearest {
                 camera.used = nearest;
+                camera.offset = Some((clock, time.saturating_sub(nanos)));
             }
             // What no later set can use: frames before the used one, and frames a window behind.
             let before_purge = camera.pending.len();

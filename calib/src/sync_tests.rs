@@ -118,6 +118,54 @@ fn the_nearest_frames_are_taken_and_keep_their_own_time() {
     assert_eq!(sets[1].master_nanos, 33 * MS);
 }
 
+/// Free-running cameras, `offsets` beside the master, each stamp up to `jitter` off; `keep` says which frames there are.
+fn free_running(
+    ticks: i64,
+    offsets: [i64; 3],
+    ppm: [i64; 3],
+    jitter: u64,
+    keep: impl Fn(usize, i64) -> bool,
+) -> (Vec<FrameSet>, SyncCounts) {
+    let mut random = crate::random::Random(9);
+    let mut frames = Vec::new();
+    for tick in 0..ticks {
+        for (slot, name) in ["a", "b", "c"].into_iter().enumerate().filter(|&(slot, _)| keep(slot, tick)) {
+            let time = tick * 33_333_333 + offsets[slot];
+            let off = random.below(2 * jitter + 1) as i64 - jitter as i64;
+            frames.push((time + time / 1_000_000 * ppm[slot] + off, name));
+        }
+    }
+    frames.sort_unstable();
+    let mut sync = Synchronizer::new(&["a".into(), "b".into(), "c".into()], &SyncConfig::default());
+    let mut sets: Vec<FrameSet> = frames.iter().flat_map(|(time, name)| sync.push(frame(name, *time))).collect();
+    sets.extend(sync.flush());
+    (sets, sync.counts().clone())
+}
+
+#[test]
+fn cameras_half_a_period_beside_the_master_stay_in_its_sets() {
+    let half = 16_666_667;
+    let (_, counts) = free_running(900, [0, half, -half], [0; 3], 3_000_000, |_, _| true);
+    assert!(counts.complete >= 890, "{counts:?}");
+    // Clocks that drift carry a camera across a whole period in less than three minutes.
+    let (_, counts) = free_running(18_000, [0, 0, half], [0, 200, -150], 1_000_000, |_, _| true);
+    assert!(counts.complete >= 17_950, "{counts:?}");
+}
+
+#[test]
+fn a_lost_frame_is_not_made_up_for_by_the_next_one() {
+    let offsets = [0, -10_000_000, 12_000_000];
+    let (sets, counts) =
+        free_running(300, offsets, [0; 3], 500_000, |slot, tick| slot == 0 || tick % 10 != slot as i64);
+    assert!(counts.partial >= 59 && counts.partial <= 61, "{counts:?}");
+    for set in &sets {
+        for (slot, frame) in set.present() {
+            let off = frame.capture_nanos - set.master_nanos - offsets[slot];
+            assert!(off.abs() <= 1_000_000, "camera {slot} is {off} ns off its place");
+        }
+    }
+}
+
 #[test]
 fn a_frame_outside_the_window_leaves_its_slot_empty() {
     let mut sync = synchronizer(10, 100);
