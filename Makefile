@@ -34,6 +34,7 @@ test-v4l2: setup
 	@scripts/test-v4l2.sh
 
 test-gpu-networks: setup
+	$(CARGO) clippy --release --locked -p flyrig-stfa --features wgpu --all-targets -- -D warnings
 	$(CARGO) test --release --locked -p flyrig-stfa --features wgpu
 
 soak: setup

@@ -21,7 +21,7 @@ const LEAST_CORRELATION: f64 = 0.3;
 /// What pairs of cameras may disagree by before a camera's lag is not believed, nanoseconds: slow movements look alike over
 /// many frames, and from every side a little different.
 const MOST_DISAGREEMENT: f64 = 3e6;
-/// Correlation that is asked for where no third camera can disagree.
+/// Correlation that is asked of a pair that no third camera can contradict.
 const LONE_CORRELATION: f64 = 0.75;
 
 /// How much moves up and down in the pictures of one camera over time.
@@ -129,8 +129,8 @@ fn bands(rgb: &[u8], width: usize, height: usize) -> Vec<f32> {
 pub struct LagEstimate {
     /// Which camera.
     pub camera: CameraId,
-    /// To be taken off its stamps, nanoseconds; none when its motion is like no other camera's, or the pairs of cameras
-    /// disagree.
+    /// To be taken off its stamps, nanoseconds; none when its motion is like no other camera's, when the pairs of cameras
+    /// disagree, or when nothing but a weak pair tells of it. The first camera's is 0.
     pub lag_nanos: Option<i64>,
     /// Best correlation of its motion with another camera's, 0 to 1.
     pub correlation: f64,
@@ -153,7 +153,32 @@ pub fn estimate_lags(signals: &[MotionSignal], most_nanos: i64) -> Vec<LagEstima
             }
         }
     }
-    let known: Vec<_> = pairs.iter().copied().filter(|pair| pair.3 >= LEAST_CORRELATION).collect();
+    settled(count, &pairs)
+        .into_iter()
+        .zip(signals)
+        .enumerate()
+        .map(|(slot, ((lag, disagreement_nanos), signal))| LagEstimate {
+            camera: signal.camera.clone(),
+            lag_nanos: lag.map(|lag| lag.round() as i64),
+            correlation: (pairs.iter().filter(|(i, j, ..)| *i == slot || *j == slot)).map(|p| p.3).fold(0.0, f64::max),
+            disagreement_nanos,
+        })
+        .collect()
+}
+
+/// Of every camera the lag after the first one that its pairs agree on, and what they disagree by. A pair is two cameras, how
+/// much later the second is, and the correlation there.
+fn settled(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>, f64)> {
+    let linked = |a: usize, b: usize| {
+        pairs.iter().any(|pair| (pair.0, pair.1) == (a.min(b), a.max(b)) && pair.3 >= LEAST_CORRELATION)
+    };
+    // Only pairs that close a loop can contradict each other.
+    let checked = |i: usize, j: usize| (0..count).any(|k| k != i && k != j && linked(i, k) && linked(j, k));
+    let known: Vec<_> = pairs
+        .iter()
+        .copied()
+        .filter(|pair| pair.3 >= LONE_CORRELATION || (pair.3 >= LEAST_CORRELATION && checked(pair.0, pair.1)))
+        .collect();
     // Gauss-Seidel: each camera where its partners want it. The first one stays at 0.
     let mut lags = vec![0.0; count];
     let mut reached = vec![false; count];
@@ -177,25 +202,13 @@ pub fn estimate_lags(signals: &[MotionSignal], most_nanos: i64) -> Vec<LagEstima
             }
         }
     }
-    let of = |slot: usize| pairs.iter().filter(move |(i, j, ..)| *i == slot || *j == slot);
     (0..count)
         .map(|slot| {
-            let squares: Vec<f64> = known
-                .iter()
-                .filter(|(i, j, ..)| *i == slot || *j == slot)
-                .map(|&(i, j, lag, _)| (lags[j] - lags[i] - lag).powi(2))
-                .collect();
-            let correlation = of(slot).map(|pair| pair.3).fold(0.0, f64::max);
-            let disagreement_nanos = (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt();
-            let is_alone = squares.len() < 2;
-            let is_sure =
-                if is_alone { correlation >= LONE_CORRELATION } else { disagreement_nanos <= MOST_DISAGREEMENT };
-            LagEstimate {
-                camera: signals[slot].camera.clone(),
-                lag_nanos: (reached[slot] && (is_sure || slot == 0)).then_some(lags[slot].round() as i64),
-                correlation,
-                disagreement_nanos,
-            }
+            let of_slot = known.iter().filter(|(i, j, ..)| *i == slot || *j == slot);
+            let squares: Vec<f64> = of_slot.map(|&(i, j, lag, _)| (lags[j] - lags[i] - lag).powi(2)).collect();
+            let disagreement = (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt();
+            let is_sure = slot == 0 || disagreement <= MOST_DISAGREEMENT;
+            ((reached[slot] && is_sure).then_some(lags[slot]), disagreement)
         })
         .collect()
 }
@@ -257,6 +270,26 @@ mod tests {
     }
 
     /// A camera's pictures: two blobs where it sees the hands from its side, and noise.
+    fn lags(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<Option<f64>> {
+        settled(count, pairs).into_iter().map(|(lag, _)| lag.map(f64::round)).collect()
+    }
+
+    #[test]
+    fn lags_are_told_only_where_something_vouches_for_them() {
+        let known = |ms: f64| Some(ms * 1e6);
+        // A loop of weak pairs that agree, and one that does not.
+        let loop_of = |third: f64| [(0, 1, 5e6, 0.5), (1, 2, 7e6, 0.5), (0, 2, third, 0.5)];
+        assert_eq!(lags(3, &loop_of(12e6)), [known(0.0), known(5.0), known(12.0)]);
+        assert_eq!(lags(3, &loop_of(40e6)), [known(0.0), None, None]);
+        // A chain of weak pairs: nothing could contradict them.
+        assert_eq!(lags(3, &[(0, 1, 5e6, 0.5), (1, 2, 7e6, 0.5)]), [known(0.0), None, None]);
+        // Strong pairs need nobody.
+        assert_eq!(lags(3, &[(0, 1, 5e6, 0.9), (1, 2, 7e6, 0.8)]), [known(0.0), known(5.0), known(12.0)]);
+        // A strong pair that hangs on a weak one.
+        assert_eq!(lags(3, &[(0, 1, 5e6, 0.5), (1, 2, 7e6, 0.9)]), [known(0.0), None, None]);
+        assert_eq!((lags(1, &[]), lags(0, &[])), (vec![known(0.0)], vec![]));
+    }
+
     fn signal(seed: u64, camera: usize, lag: i64, seconds: i64) -> MotionSignal {
         let (hands, mut random) = (hands(seed), Random(seed * 100 + camera as u64));
         let mut signal = MotionSignal::new(format!("cam{camera}").into());

@@ -526,6 +526,19 @@ mod tests {
     fn the_printed_default_is_the_default() {
         assert_eq!(Config::parse(DEFAULT_TOML).unwrap(), Config::default());
         assert_eq!(Config::parse("").unwrap(), Config::default());
+        // Every key is in it, so that nobody has to guess.
+        fn missing(all: &toml::Table, printed: &toml::Table, path: &str) -> Vec<String> {
+            let of = |(key, value): (&String, &toml::Value)| match (value, printed.get(key)) {
+                (_, None) => vec![format!("{path}{key}")],
+                (toml::Value::Table(all), Some(toml::Value::Table(printed))) => {
+                    missing(all, printed, &format!("{path}{key}."))
+                }
+                _ => Vec::new(),
+            };
+            all.iter().flat_map(of).collect()
+        }
+        let all = toml::Table::try_from(Config::default()).unwrap();
+        assert_eq!(missing(&all, &DEFAULT_TOML.parse().unwrap(), ""), Vec::<String>::new());
     }
 
     #[test]

@@ -168,7 +168,7 @@ impl Engine {
         &self.template
     }
 
-    /// From now on these networks add to direct appearance; see [`LearnedAppearance::reuse`].
+    /// From now on these networks add to direct appearance.
     pub fn use_networks(&mut self, parameters: &Parameters, how: NetworkUse) -> Result<()> {
         how.check()?;
         self.appearance.keep_observations(&self.gpu)?;
@@ -180,8 +180,9 @@ impl Engine {
             }
             NetworksOn::Adapter => Learned::Adapter(SharedAppearance::new(&self.gpu, parameters, &self.body)?),
         });
-        self.direct_colors =
-            Some(StorageBuffer::from_slice(&self.gpu, "direct colours", &self.gaussians.color.read(&self.gpu)?)?);
+        let direct = StorageBuffer::zeroed(&self.gpu, "direct colours", self.gaussians.count())?;
+        self.gaussians.color.copy_to(&self.gpu, &direct);
+        self.direct_colors = Some(direct);
         Ok(())
     }
 

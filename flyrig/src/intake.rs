@@ -8,7 +8,7 @@ use std::{
 use anyhow::Result;
 use flyrig_calib::{ClockAligner, ClockKind, ClockState, DropCounts, SyncConfig, Synchronizer};
 use flyrig_capture::{
-    CameraSource, CaptureThreads, Decoding, FrameStage, Pacing, PopError, ThreadsConfig, monotonic_nanos,
+    CameraSource, CaptureError, CaptureThreads, Decoding, FrameStage, Pacing, PopError, ThreadsConfig, monotonic_nanos,
 };
 use flyrig_types::{Camera, CameraId, Frame, FrameSet, Rig};
 
@@ -161,6 +161,11 @@ impl Intake {
         if let Some(slot) = self.cameras.iter().position(|camera| *camera == frame.camera) {
             self.timing[slot].add(frame.capture_nanos, monotonic_nanos());
         }
+    }
+
+    /// What went wrong last with a camera.
+    pub fn last_error(&self, slot: usize) -> Option<CaptureError> {
+        self.threads.stats().into_iter().nth(slot).and_then(|stats| stats.last_error)
     }
 
     /// How the cameras are; stages and memory are the pipeline's to tell.

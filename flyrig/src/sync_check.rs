@@ -141,6 +141,11 @@ fn by_person(args: &SyncCheckArgs, folder: &Path, sources: Sources, cameras: &[C
             Err(error) => return Err(error.into()),
         }
     }
+    if let Some((slot, error)) =
+        (0..frames.len()).filter(|&slot| frames[slot] == 0).find_map(|slot| Some((slot, intake.last_error(slot)?)))
+    {
+        bail!("no picture of camera {} could be used; the last: {error}", cameras[slot]);
+    }
     let estimates = estimate_point_lags(&tracks, (args.most_ms * 1e6) as i64);
     print(&estimates, &frames);
     println!(

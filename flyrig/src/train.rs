@@ -30,6 +30,12 @@ const CHECKPOINT_STEPS: u64 = 250;
 pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     let started = Instant::now();
+    // What is asked for in vain is told before hours of simulation.
+    let begin = begin(args)?;
+    let device = match args.networks_on {
+        NetworksOn::Processor => NetworkDevice::processor(),
+        NetworksOn::Adapter => NetworkDevice::adapter(&gpu()?)?,
+    };
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     let people = People { seed: args.seed, instants: args.instants, side: args.side, gaussians: args.gaussians };
     let held_out = People { seed: args.seed.wrapping_add(HELD_OUT_SEED), ..people.clone() };
@@ -54,7 +60,6 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         contrast: args.contrast,
         ..TrainSettings::default()
     };
-    let begin = begin(args)?;
     let mut trainer = if checkpoint.exists() {
         let trainer = Trainer::load(&checkpoint)?;
         ensure!(
@@ -64,13 +69,14 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
             trainer.parameters.size,
             trainer.settings
         );
+        if args.from.is_some() {
+            eprintln!("train: going on with {}; --from is for a training that begins", checkpoint.display());
+        }
         trainer
     } else {
         Trainer::new(begin, settings)
     };
-    if args.networks_on == NetworksOn::Adapter {
-        trainer.device = NetworkDevice::adapter(&gpu()?)?;
-    }
+    trainer.device = device;
     let mut progress = Progress::open(&args.out, trainer.step)?;
     let bar = progress_bar(args.steps, "train");
     bar.set_position(trainer.step);

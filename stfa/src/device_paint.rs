@@ -96,6 +96,18 @@ impl DevicePainter {
         Self { network, body, gaussians, memory: None }
     }
 
+    /// Of the body.
+    #[cfg(feature = "wgpu")]
+    pub(crate) fn gaussians(&self) -> usize {
+        self.gaussians
+    }
+
+    /// Of the body's graph.
+    #[cfg(feature = "wgpu")]
+    pub(crate) fn nodes(&self) -> usize {
+        self.body.mirror.dims()[0]
+    }
+
     /// Forgets all earlier frames.
     pub(crate) fn reset(&mut self) {
         self.memory = None;
@@ -133,9 +145,9 @@ impl DevicePainter {
         }
         let base = srgb_from_linear(rows.clone().narrow(1, 0, 3));
         let painted = self.network.color(rows);
-        let sound = painted.clone().is_finite();
-        let color = linear_from_srgb(base.mask_where(sound, painted));
-        let color = color.clone().mask_fill(color.is_finite().bool_not(), 0.2);
+        // As on the processor: a colour that is none in one channel is direct appearance's in all.
+        let sound = painted.clone().is_finite().float().sum_dim(1).greater_elem(2.5).expand([self.gaussians, 3]);
+        let color = tame(linear_from_srgb(base.mask_where(sound, painted)));
         Ok(Tensor::cat(vec![color, Tensor::ones([self.gaussians, 1], &self.network.device)], 1))
     }
 
@@ -303,8 +315,7 @@ impl Place {
         let ([y0, y1], fy) = axis(&self.y, height);
         let (left, top) = (rest(&fx), rest(&fy));
         let corner = |x: &Tensor<2>, y: &Tensor<2>, share: Tensor<2>| {
-            // Whole numbers up to 2^24 are exact in f32: pictures of up to 4096x4096.
-            let index = (y.clone() * width as f32 + x.clone()).int();
+            let index = y.clone().int() * width as i32 + x.clone().int();
             map.clone().select(0, index.squeeze_dim(1)) * share
         };
         corner(&x0, &y0, left.clone() * top.clone())

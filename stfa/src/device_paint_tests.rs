@@ -92,13 +92,12 @@ fn compare(device: &Device, size: NetworkSize, settings: &AppearanceSettings, bo
         if frame == 3 {
             seen = poisoned(seen);
         }
-        let views = if frame == 4 { 0 } else { SIZES.len() };
-        seen.views.truncate(views);
-        let views: Vec<ViewPicture<'_>> = (pictures.iter().zip(&SIZES).take(views))
-            .map(|(rgba, &[width, height])| ViewPicture { width, height, rgba })
-            .collect();
-        let expected = plain.paint(&seen, &views, settings).unwrap();
-        let crops = Crops::cut(&views).unwrap();
+        let count = if frame == 4 { 0 } else { SIZES.len() };
+        seen.views.truncate(count);
+        let pictures = views(&pictures);
+        let views = &pictures[..count];
+        let expected = plain.paint(&seen, views, settings).unwrap();
+        let crops = Crops::cut(views).unwrap();
         let found = to_vec(painter.paint(&ObservedTensors::upload(&seen, device), &crops, settings).unwrap());
         assert!(found.iter().all(|v| (0.0..=1.0).contains(v)), "frame {frame}");
         let worst = expected.as_flattened().iter().zip(&found).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
@@ -118,6 +117,40 @@ fn tensors_paint_what_the_processor_paints() {
     for (space, time) in [(true, false), (false, false), (false, true)] {
         compare(&device, NetworkSize::TINY, &AppearanceSettings { space, time, ..settings }, 2e-5);
     }
+}
+
+fn views(pictures: &[Vec<u8>]) -> Vec<ViewPicture<'_>> {
+    pictures.iter().zip(&SIZES).map(|(rgba, &[width, height])| ViewPicture { width, height, rgba }).collect()
+}
+
+#[test]
+fn what_did_not_change_is_kept() {
+    let (body, mut rng) = (body(), SmallRng::seed_from_u64(6));
+    let settings = AppearanceSettings { time: false, ..AppearanceSettings::default() };
+    let (mut pictures, seen) = (pictures(&mut rng), observed(&body, &mut rng));
+    let mut kept = LearnedAppearance::new(&networks(NetworkSize::TINY), body.clone());
+    kept.reuse = 1e-6;
+    let first = kept.paint(&seen, &views(&pictures), &settings).unwrap();
+    assert_eq!((kept.counts.views_kept, kept.counts.colors_kept), (0, 0));
+    assert_eq!(kept.paint(&seen, &views(&pictures), &settings).unwrap(), first);
+    assert_eq!((kept.counts.views_kept, kept.counts.colors_kept), (3, body.gaussians() as u64));
+    // Another picture: its features are made anew, and the colours of all who see it.
+    let middle = pictures[1].len() / 2;
+    pictures[1][middle - 2000..middle + 2000].iter_mut().for_each(|value| *value = 255 - *value / 2);
+    let changed = kept.paint(&seen, &views(&pictures), &settings).unwrap();
+    assert_eq!(kept.counts.views_kept, 5);
+    let mut fresh = LearnedAppearance::new(&networks(NetworkSize::TINY), body.clone());
+    let expected = fresh.paint(&seen, &views(&pictures), &settings).unwrap();
+    let worst = |a: &[[f32; 4]], b: &[[f32; 4]]| {
+        a.as_flattened().iter().zip(b.as_flattened()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+    };
+    assert!(worst(&changed, &expected) < 1e-4 && worst(&changed, &first) > 1e-3);
+    // One picture fewer, and masks that are believed otherwise: nothing of before may be used.
+    let mut fewer = seen.clone();
+    fewer.views.truncate(2);
+    kept.paint(&fewer, &views(&pictures)[..2], &settings).unwrap();
+    kept.paint(&fewer, &views(&pictures)[..2], &AppearanceSettings { min_mask: 0.2, ..settings }).unwrap();
+    assert_eq!(kept.counts.views_kept, 5);
 }
 
 #[test]

@@ -24,7 +24,7 @@ pub const NODE: usize = 8;
 const BEST: usize = STATE - 3;
 
 /// Gaussians that are gathered together.
-const CHUNK: usize = 8192;
+const CHUNK: usize = if cfg!(test) { 700 } else { 8192 };
 
 /// Sum of weights that halves the belief in a mean.
 pub(crate) const SMALL_WEIGHT: f32 = 0.02;

@@ -16,8 +16,8 @@ use crate::{
     taps::{FeatureMaps, Taps},
 };
 
-/// Gaussians that go through the colour network together.
-const CHUNK: usize = 16_384;
+/// Gaussians that go through the networks together.
+const CHUNK: usize = if cfg!(test) { 1000 } else { 16_384 };
 
 /// What was done and what was left out since the start.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -39,6 +39,8 @@ pub struct PaintCounts {
 struct Encoded {
     crops: Crops,
     levels: Vec<FeatureMaps>,
+    /// What the pictures' masks were believed by.
+    min_mask: Option<f32>,
 }
 
 /// What was added to each Gaussian's colour the last time.
@@ -124,7 +126,9 @@ impl LearnedAppearance {
         };
 
         let (row, count) = (size.row(), self.body.gaussians());
-        self.memory.fit(count, row);
+        if settings.time {
+            self.memory.fit(count, row);
+        }
         self.corrections.fit(count, row, self.reuse);
         let mut colors = Vec::with_capacity(count);
         // A chunk's rows stay in the cache from sampling to colour.
@@ -138,8 +142,7 @@ impl LearnedAppearance {
             self.add_corrections(first, &rows);
             colors.par_extend(rows.par_chunks_exact(row).zip(&self.corrections.added[range]).map(|(row, added)| {
                 let color = |c: usize| linear_from_srgb((srgb_from_linear(row[c]) + added[c]).clamp(0.0, 1.0));
-                let color = [color(0), color(1), color(2), 1.0];
-                if color.iter().all(|v| v.is_finite()) { color } else { [0.2, 0.2, 0.2, 1.0] }
+                [color(0), color(1), color(2), 1.0]
             }));
         }
         Ok(colors)
@@ -193,7 +196,10 @@ impl LearnedAppearance {
             return;
         }
         let before = std::mem::take(&mut self.encoded.crops);
-        let comparable = self.reuse > 0.0 && before.rgba.len() == crops.rgba.len() && before.width == crops.width;
+        let form = |crops: &Crops| (crops.views, crops.width, crops.height);
+        let comparable =
+            self.reuse > 0.0 && form(&before) == form(&crops) && self.encoded.min_mask == Some(settings.min_mask);
+        self.encoded.min_mask = Some(settings.min_mask);
         if !comparable {
             self.encoded.levels.clear();
         }

@@ -1,7 +1,7 @@
 //! Networks on the device that also draws (feature `wgpu`): what direct appearance found out goes to them, and the colours
 //! back, without the processor.
 
-use std::sync::Mutex;
+use std::{any::Any, sync::Mutex};
 
 use burn_cubecl::{
     CubeBackend,
@@ -20,8 +20,8 @@ use crate::{
 /// The drawing device as burn knows it, and which one it is: burn does not notice a second registration.
 static REGISTERED: Mutex<Vec<(wgpu::Device, Device)>> = Mutex::new(Vec::new());
 
-/// [`LearnedAppearance`](crate::LearnedAppearance) on the drawing device. It keeps no features or colours from frame to frame
-/// but those of the memory.
+/// [`LearnedAppearance`](crate::LearnedAppearance) on the drawing device. It keeps nothing from frame to frame but the memory,
+/// and counts nothing.
 #[derive(Debug)]
 pub struct SharedAppearance {
     painter: DevicePainter,
@@ -59,8 +59,14 @@ impl SharedAppearance {
         let crops = Crops::cut(pictures)?;
         let mut copies = Copies::new(gpu, &self.device);
         let buffers = direct.observation_buffers();
-        if buffers.views.len() < pictures.len() {
-            return Err(StfaError::Frame(format!("{} views, {} pictures", buffers.views.len(), pictures.len())));
+        for (what, found, expected) in [
+            ("Gaussians", gaussians.count(), self.painter.gaussians()),
+            ("nodes", buffers.nodes, self.painter.nodes()),
+            ("pictures", pictures.len(), pictures.len().min(buffers.views.len())),
+        ] {
+            if found != expected {
+                return Err(StfaError::Frame(format!("{found} {what}, expected {expected}")));
+            }
         }
         let observed = ObservedTensors {
             views: (buffers.views.iter().take(pictures.len()))
@@ -102,11 +108,13 @@ struct Copies<'a> {
     gpu: &'a GpuContext,
     device: &'a Device,
     encoder: wgpu::CommandEncoder,
+    /// Burn's tables that what was recorded names by their address: while these are held, they stay where they are.
+    held: Vec<Box<dyn Any>>,
 }
 
 impl<'a> Copies<'a> {
     fn new(gpu: &'a GpuContext, device: &'a Device) -> Self {
-        Self { gpu, device, encoder: gpu.device.create_command_encoder(&Default::default()) }
+        Self { gpu, device, encoder: gpu.device.create_command_encoder(&Default::default()), held: Vec::new() }
     }
 
     /// Records the copy of a buffer of `rows` rows into a new tensor.
@@ -115,6 +123,9 @@ impl<'a> Copies<'a> {
         buffer: &StorageBuffer<[f32; C]>,
         rows: usize,
     ) -> Result<Tensor<2>, StfaError> {
+        if buffer.len() < rows {
+            return Err(StfaError::Frame(format!("{} rows of observations, expected {rows}", buffer.len())));
+        }
         let tensor = Tensor::empty([rows, C], self.device);
         let bytes = (rows * C * size_of::<f32>()) as u64;
         self.record(tensor.clone(), |encoder, theirs, offset| {
@@ -123,7 +134,7 @@ impl<'a> Copies<'a> {
         Ok(tensor)
     }
 
-    /// Copies a tensor out into a buffer of the same form, and waits for it to be there before anything later on the queue.
+    /// Copies a tensor out into a buffer of the same form, before anything later on the queue.
     fn write<const C: usize>(mut self, tensor: Tensor<2>, buffer: &StorageBuffer<[f32; C]>) -> Result<(), StfaError> {
         let bytes = (buffer.len() * C * size_of::<f32>()) as u64;
         if tensor.dims() != [buffer.len(), C] {
@@ -153,6 +164,7 @@ impl<'a> Copies<'a> {
         tensor.client.flush().map_err(|error| refuse(error.to_string()))?;
         let resource = managed.resource();
         copy(&mut self.encoder, &resource.buffer, resource.offset);
+        self.held.push(Box::new(managed));
         Ok(())
     }
 
@@ -160,5 +172,6 @@ impl<'a> Copies<'a> {
     fn submit(&mut self) {
         let encoder = std::mem::replace(&mut self.encoder, self.gpu.device.create_command_encoder(&Default::default()));
         self.gpu.queue.submit([encoder.finish()]);
+        self.held.clear();
     }
 }

@@ -204,22 +204,24 @@ mod tests {
 
     #[test]
     fn a_diagram_of_anything_is_sound() {
-        let plot = |points: Vec<(f64, f64, String)>| Plot {
+        let plot = |points: Vec<(f64, f64, String)>, line| Plot {
             title: "a < b".to_owned(),
             x_label: "x".to_owned(),
             y_label: "y".to_owned(),
             log_x: true,
             log_y: false,
-            series: vec![Series { name: "s".to_owned(), points, line: Line::Through }],
+            series: vec![Series { name: "s".to_owned(), points, line }],
         };
         for points in [
             vec![],
             vec![(5.0, 5.0, "one".to_owned())],
             vec![(f64::NAN, 1.0, String::new()), (10.0, 0.0, String::new()), (1000.0, 3.0, "z".to_owned())],
         ] {
-            let svg = plot(points).svg();
-            assert!(svg.starts_with("<svg") && svg.ends_with("</svg>\n"), "{svg}");
-            assert!(!svg.contains("NaN") && !svg.contains("inf") && svg.contains("a &lt; b"), "{svg}");
+            for line in [Line::Through, Line::Front] {
+                let svg = plot(points.clone(), line).svg();
+                assert!(svg.starts_with("<svg") && svg.ends_with("</svg>\n"), "{svg}");
+                assert!(!svg.contains("NaN") && !svg.contains("inf") && svg.contains("a &lt; b"), "{svg}");
+            }
         }
     }
 }
