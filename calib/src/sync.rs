@@ -1,6 +1,9 @@
 //! Sets of frames of one instant out of cameras that run on their own.
 
-use std::{collections::BTreeMap, sync::Arc};
+use std::{
+    collections::{BTreeMap, VecDeque},
+    sync::Arc,
+};
 
 use flyrig_types::{CameraId, Frame, FrameSet, SetKind};
 use serde::{Deserialize, Serialize};
@@ -8,25 +11,30 @@ use serde::{Deserialize, Serialize};
 /// Most frames that wait for a set, per camera: a clock gone wild must not eat the memory.
 const MAX_PENDING: usize = 64;
 
+/// The window before the master's period is known: half a frame of 30 a second.
+const FIRST_WINDOW: u64 = 16_666_667;
+/// Periods of the master whose median counts.
+const PERIODS: usize = 9;
+
 /// How sets are made.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SyncConfig {
     /// The camera whose frames set the times of the sets; the rig's first when `None`.
     pub master: Option<CameraId>,
-    /// Largest distance of a frame from its set's time. Up to half the master's frame period the
-    /// nearest set of a frame is unambiguous. A camera that goes on at the distance it had in the set before may be
+    /// Largest distance of a frame from its set's time; half of the master's frame period, as it is at the time, when `None`.
+    /// Up to that the nearest set of a frame is unambiguous. A camera that goes on at the distance it had in the set before may be
     /// half as far again: one that runs half a period beside the master would fall out of every other set.
-    pub window_nanos: u64,
+    pub window_nanos: Option<u64>,
     /// Longest time, by the frames' own clock, that a set waits for a camera. A camera silent for
     /// longer is waited for no more, and when it is the master, the next camera's clock takes over.
     pub max_wait_nanos: u64,
 }
 
 impl Default for SyncConfig {
-    /// For 30 frames a second: a window of half a frame, waits for three frames.
+    /// A window of half a frame; waits for three frames of 30 a second.
     fn default() -> Self {
-        Self { master: None, window_nanos: 16_666_667, max_wait_nanos: 100_000_000 }
+        Self { master: None, window_nanos: None, max_wait_nanos: 100_000_000 }
     }
 }
 
@@ -79,6 +87,8 @@ pub struct Synchronizer {
     /// Slots in the order in which their clocks lead: the master, then the rig's order.
     clock_order: Vec<usize>,
     window: u64,
+    /// The last times from set to set of one clock, where the window follows them.
+    periods: Option<VecDeque<u64>>,
     max_wait: u64,
     /// Time of the first frame ever: cameras not seen yet are silent since then.
     first_nanos: Option<i64>,
@@ -147,7 +157,8 @@ impl Synchronizer {
                 })
                 .collect(),
             clock_order,
-            window: config.window_nanos,
+            window: config.window_nanos.unwrap_or(FIRST_WINDOW),
+            periods: config.window_nanos.is_none().then(VecDeque::new),
             max_wait: config.max_wait_nanos,
             first_nanos: None,
             last_set: None,
@@ -313,6 +324,18 @@ impl Synchronizer {
                 nearest.is_none_or(|used| *time > used) && (*time >= nanos || time.abs_diff(nanos) < window)
             });
             self.counts.dropped_frames[slot].superseded += (before_purge - camera.pending.len()) as u64;
+        }
+        if let (Some(periods), Some((last, by))) = (&mut self.periods, self.last_set)
+            && by == clock
+        {
+            periods.push_back(nanos.abs_diff(last));
+            if periods.len() > PERIODS {
+                periods.pop_front();
+            }
+            // The median: a lost frame makes two periods of one.
+            let mut sorted: Vec<u64> = periods.iter().copied().collect();
+            sorted.sort_unstable();
+            self.window = sorted[sorted.len() / 2] / 2;
         }
         let set = FrameSet { index: self.sets, master_nanos: nanos, frames };
         match set.kind() {

@@ -57,7 +57,7 @@ fn random_rigs_keep_every_promise() {
         let ids: Vec<CameraId> = (0..1 + random.below(6)).map(|i| format!("cam{i}").into()).collect();
         let config = SyncConfig {
             master: random.chance(50).then(|| ids[random.below(ids.len() as u64) as usize].clone()),
-            window_nanos: random.below(40_000_000),
+            window_nanos: Some(random.below(40_000_000)),
             max_wait_nanos: random.below(200_000_000),
         };
         let arrivals = arrivals(&mut random, ids.len());
@@ -72,7 +72,7 @@ fn random_rigs_keep_every_promise() {
             for (slot, frame) in set.present() {
                 assert_eq!(frame.camera, ids[slot]);
                 let distance = frame.capture_nanos.abs_diff(set.master_nanos);
-                let most = config.window_nanos + config.window_nanos / 2;
+                let most = config.window_nanos.map(|window| window + window / 2).unwrap();
                 assert!(distance <= most, "seed {seed}: {distance} ns off");
                 assert_eq!(seen.insert(frame.sequence, set.index), None, "seed {seed}: a frame in two sets");
             }
@@ -116,7 +116,8 @@ fn a_sound_rig_gets_the_nearest_frame_of_every_camera() {
         frames.sort_unstable();
         let arrivals: Vec<(usize, i64, u64)> =
             frames.into_iter().zip(0..).map(|((nanos, camera), serial)| (camera, nanos, serial)).collect();
-        let config = SyncConfig { master: None, window_nanos: PERIOD as u64 / 2, max_wait_nanos: 4 * PERIOD as u64 };
+        let config =
+            SyncConfig { master: None, window_nanos: Some(PERIOD as u64 / 2), max_wait_nanos: 4 * PERIOD as u64 };
         let (sets, sync) = run(&ids, &config, &arrivals);
         assert_eq!((sync.counts().complete, sync.counts().partial), (60, 0), "seed {seed}");
         for set in &sets {

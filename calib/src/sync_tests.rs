@@ -19,7 +19,7 @@ pub(crate) fn frame(camera: &str, capture_nanos: i64) -> Frame {
 
 fn synchronizer(window_ms: u64, max_wait_ms: u64) -> Synchronizer {
     let config =
-        SyncConfig { master: None, window_nanos: window_ms * 1_000_000, max_wait_nanos: max_wait_ms * 1_000_000 };
+        SyncConfig { master: None, window_nanos: Some(window_ms * 1_000_000), max_wait_nanos: max_wait_ms * 1_000_000 };
     Synchronizer::new(&["a".into(), "b".into(), "c".into()], &config)
 }
 
@@ -118,8 +118,11 @@ fn the_nearest_frames_are_taken_and_keep_their_own_time() {
     assert_eq!(sets[1].master_nanos, 33 * MS);
 }
 
+const PERIOD: i64 = 33_333_333;
+
 /// Free-running cameras, `offsets` beside the master, each stamp up to `jitter` off; `keep` says which frames there are.
 fn free_running(
+    period: i64,
     ticks: i64,
     offsets: [i64; 3],
     ppm: [i64; 3],
@@ -130,7 +133,7 @@ fn free_running(
     let mut frames = Vec::new();
     for tick in 0..ticks {
         for (slot, name) in ["a", "b", "c"].into_iter().enumerate().filter(|&(slot, _)| keep(slot, tick)) {
-            let time = tick * 33_333_333 + offsets[slot];
+            let time = tick * period + offsets[slot];
             let off = random.below(2 * jitter + 1) as i64 - jitter as i64;
             frames.push((time + time / 1_000_000 * ppm[slot] + off, name));
         }
@@ -145,18 +148,34 @@ fn free_running(
 #[test]
 fn cameras_half_a_period_beside_the_master_stay_in_its_sets() {
     let half = 16_666_667;
-    let (_, counts) = free_running(900, [0, half, -half], [0; 3], 3_000_000, |_, _| true);
+    let (_, counts) = free_running(PERIOD, 900, [0, half, -half], [0; 3], 3_000_000, |_, _| true);
     assert!(counts.complete >= 890, "{counts:?}");
     // Clocks that drift carry a camera across a whole period in less than three minutes.
-    let (_, counts) = free_running(18_000, [0, 0, half], [0, 200, -150], 1_000_000, |_, _| true);
+    let (_, counts) = free_running(PERIOD, 18_000, [0, 0, half], [0, 200, -150], 1_000_000, |_, _| true);
     assert!(counts.complete >= 17_950, "{counts:?}");
+}
+
+#[test]
+fn the_window_follows_the_masters_period() {
+    // Ten a second, and a hundred and twenty of which the master loses every seventh.
+    for (period, loss) in [(100_000_000, i64::MAX), (8_333_333, 7)] {
+        let keep = |slot: usize, tick: i64| slot != 0 || tick % loss != 5;
+        let offsets = [0, period * 45 / 100, -period * 4 / 10];
+        let (sets, counts) = free_running(period, 300, offsets, [0; 3], 500_000, keep);
+        assert!(counts.complete >= 250, "period {period}: {counts:?}");
+        for set in &sets {
+            let far = |(_, frame): (usize, &Arc<Frame>)| frame.capture_nanos.abs_diff(set.master_nanos);
+            let most = set.present().map(far).max().unwrap();
+            assert!(most < period as u64 * 7 / 10 || set.index < 5, "period {period}: {most} ns beside the master");
+        }
+    }
 }
 
 #[test]
 fn a_lost_frame_is_not_made_up_for_by_the_next_one() {
     let offsets = [0, -10_000_000, 12_000_000];
     let (sets, counts) =
-        free_running(300, offsets, [0; 3], 500_000, |slot, tick| slot == 0 || tick % 10 != slot as i64);
+        free_running(PERIOD, 300, offsets, [0; 3], 500_000, |slot, tick| slot == 0 || tick % 10 != slot as i64);
     assert!(counts.partial >= 59 && counts.partial <= 61, "{counts:?}");
     for set in &sets {
         for (slot, frame) in set.present() {
@@ -249,6 +268,7 @@ fn the_ends_of_time_do_not_overflow() {
     let growing = [i64::MIN, i64::MIN + 1, -1, 0, i64::MAX - 1, i64::MAX];
     for (window_nanos, max_wait_nanos) in [(0, 0), (u64::MAX, u64::MAX), (5, 0), (0, 5)] {
         for times in [wild, growing] {
+            let window_nanos = Some(window_nanos);
             let config = SyncConfig { master: Some("b".into()), window_nanos, max_wait_nanos };
             let mut sync = Synchronizer::new(&["a".into(), "b".into()], &config);
             let mut sets = Vec::new();

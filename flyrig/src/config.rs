@@ -138,7 +138,7 @@ pub struct SyncSection {
 
 impl Default for SyncSection {
     fn default() -> Self {
-        Self { window_ms: 8.0, max_wait_ms: 100.0, master: String::new(), clocks: ClockKind::Shared }
+        Self { window_ms: 0.0, max_wait_ms: 100.0, master: String::new(), clocks: ClockKind::Shared }
     }
 }
 
@@ -462,7 +462,7 @@ impl Config {
         range("source.fps", self.source.fps, 0.1, 1000.0)?;
         self.source.check()?;
         self.sim.validate().context("in [sim]")?;
-        range("sync.window_ms", self.sync.window_ms, 0.001, 10_000.0)?;
+        range("sync.window_ms", self.sync.window_ms, 0.0, 10_000.0)?;
         range("sync.max_wait_ms", self.sync.max_wait_ms, 0.0, 60_000.0)?;
         range("body.gaussians", self.body.gaussians as f64, 100.0, 2_000_000.0)?;
         range("body.nodes", self.body.nodes as f64, 4.0, 100_000.0)?;

@@ -274,7 +274,7 @@ impl FrameReader {
             FolderOptions { fps: args.fps, frames: args.frames.clone(), with_masks: args.masks == Origin::Given };
         let sources = FolderReplay::open(&args.dataset, Some(&ids), &options)?;
         let count = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);
-        let config = SyncConfig { window_nanos: SYNC_WINDOW_NANOS, ..SyncConfig::default() };
+        let config = SyncConfig { window_nanos: Some(SYNC_WINDOW_NANOS), ..SyncConfig::default() };
         Ok(Self {
             sources,
             sync: Synchronizer::new(&ids, &config),

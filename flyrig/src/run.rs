@@ -237,7 +237,7 @@ pub fn sync_config(config: &Config) -> SyncConfig {
     let nanos = |millis: f64| (millis * 1e6) as u64;
     SyncConfig {
         master: (!config.sync.master.is_empty()).then(|| CameraId::from(config.sync.master.as_str())),
-        window_nanos: nanos(config.sync.window_ms),
+        window_nanos: (config.sync.window_ms > 0.0).then(|| nanos(config.sync.window_ms)),
         max_wait_nanos: nanos(config.sync.max_wait_ms),
     }
 }
