@@ -86,7 +86,7 @@ copy_program() {
   done
 }
 copy_program /usr/bin/v4l2-ctl
-copy_program "$program"
+copy_program "$program" v4l2-faults
 memory=768
 if [ -n "${FLYRIG:-}" ]; then
   say "simulating a calibration and a person for flyrig run"
