@@ -13,8 +13,8 @@ const MAX_PENDING: usize = 64;
 
 /// The window before the master's period is known: half a frame of 30 a second.
 const FIRST_WINDOW: u64 = 16_666_667;
-/// Periods of the master whose median counts.
-const PERIODS: usize = 9;
+/// Intervals of a camera whose median is its period.
+const INTERVALS: usize = 9;
 
 /// How sets are made.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -22,7 +22,8 @@ const PERIODS: usize = 9;
 pub struct SyncConfig {
     /// The camera whose frames set the times of the sets; the rig's first when `None`.
     pub master: Option<CameraId>,
-    /// Largest distance of a frame from its set's time; half of the master's frame period, as it is at the time, when `None`.
+    /// Largest distance of a frame from its set's time; half of the master's frame period, as it is at the time, when `None`
+    /// (or, where a camera is faster than the master, three fifths of its own).
     /// Up to that the nearest set of a frame is unambiguous. A camera that goes on at the distance it had in the set before may be
     /// half as far again: one that runs half a period beside the master would fall out of every other set.
     pub window_nanos: Option<u64>,
@@ -87,8 +88,8 @@ pub struct Synchronizer {
     /// Slots in the order in which their clocks lead: the master, then the rig's order.
     clock_order: Vec<usize>,
     window: u64,
-    /// The last times from set to set of one clock, where the window follows them.
-    periods: Option<VecDeque<u64>>,
+    /// Whether the window is half of the master's period.
+    follows_period: bool,
     max_wait: u64,
     /// Time of the first frame ever: cameras not seen yet are silent since then.
     first_nanos: Option<i64>,
@@ -108,6 +109,8 @@ struct Camera {
     latest: Option<i64>,
     /// From the frame before to that one, nanoseconds.
     interval: Option<u64>,
+    /// The last of those, newest last.
+    intervals: VecDeque<u64>,
     /// Frames of each camera from after that one's instant.
     missed: Vec<u64>,
     /// Time of the frame that went into a set last.
@@ -117,6 +120,15 @@ struct Camera {
 }
 
 impl Camera {
+    /// From frame to frame, as a rule: the median of the last intervals, as a lost frame makes one of two.
+    fn period(&self) -> Option<u64> {
+        let mut sorted = [0; INTERVALS];
+        let sorted = &mut sorted[..self.intervals.len()];
+        sorted.iter_mut().zip(&self.intervals).for_each(|(to, from)| *to = *from);
+        sorted.sort_unstable();
+        sorted.get(sorted.len() / 2).copied()
+    }
+
     /// The waiting frame nearest to a time.
     fn nearest(&self, nanos: i64) -> Option<i64> {
         let before = self.pending.range(..=nanos).next_back().map(|(time, _)| *time);
@@ -151,6 +163,7 @@ impl Synchronizer {
                     suspect: None,
                     latest: None,
                     interval: None,
+                    intervals: VecDeque::with_capacity(INTERVALS + 1),
                     missed: vec![0; cameras.len()],
                     used: None,
                     offset: None,
@@ -158,7 +171,7 @@ impl Synchronizer {
                 .collect(),
             clock_order,
             window: config.window_nanos.unwrap_or(FIRST_WINDOW),
-            periods: config.window_nanos.is_none().then(VecDeque::new),
+            follows_period: config.window_nanos.is_none(),
             max_wait: config.max_wait_nanos,
             first_nanos: None,
             last_set: None,
@@ -217,6 +230,12 @@ impl Synchronizer {
         let dropped = &mut self.counts.dropped_frames[slot];
         camera.interval = camera.latest.map(|latest| latest.abs_diff(nanos));
         camera.latest = Some(nanos);
+        camera.intervals.extend(camera.interval.filter(|interval| *interval > 0));
+        if camera.intervals.len() > INTERVALS {
+            camera.intervals.pop_front();
+        }
+        let period = camera.period().filter(|_| self.follows_period && self.clock_order.first() == Some(&slot));
+        self.window = period.map_or(self.window, |period| period / 2);
         if camera.used == Some(nanos) || camera.pending.contains_key(&nanos) {
             dropped.duplicate += 1;
         } else if outdated || camera.used.is_some_and(|used| nanos < used) {
@@ -303,9 +322,11 @@ impl Synchronizer {
     }
 
     fn emit(&mut self, clock: usize, nanos: i64) -> FrameSet {
-        let window = self.window;
         let mut frames = Vec::with_capacity(self.cameras.len());
         for (slot, camera) in self.cameras.iter_mut().enumerate() {
+            // Beside a slow master, a lost frame of a fast camera must not be made up for by the next one.
+            let own = camera.period().filter(|_| self.follows_period);
+            let window = self.window.min(own.map_or(u64::MAX, |period| period / 5 * 3));
             let expected = camera.offset.filter(|(by, _)| *by == clock).map(|(_, offset)| nanos.saturating_add(offset));
             let steady = expected.and_then(|expected| camera.nearest(expected)).filter(|time| {
                 let near = |to: i64, most: u64| time.abs_diff(to) <= most;
@@ -324,18 +345,6 @@ impl Synchronizer {
                 nearest.is_none_or(|used| *time > used) && (*time >= nanos || time.abs_diff(nanos) < window)
             });
             self.counts.dropped_frames[slot].superseded += (before_purge - camera.pending.len()) as u64;
-        }
-        if let (Some(periods), Some((last, by))) = (&mut self.periods, self.last_set)
-            && by == clock
-        {
-            periods.push_back(nanos.abs_diff(last));
-            if periods.len() > PERIODS {
-                periods.pop_front();
-            }
-            // The median: a lost frame makes two periods of one.
-            let mut sorted: Vec<u64> = periods.iter().copied().collect();
-            sorted.sort_unstable();
-            self.window = sorted[sorted.len() / 2] / 2;
         }
         let set = FrameSet { index: self.sets, master_nanos: nanos, frames };
         match set.kind() {

@@ -172,6 +172,27 @@ fn the_window_follows_the_masters_period() {
 }
 
 #[test]
+fn beside_a_slow_master_a_lost_frame_stays_lost() {
+    let mut sync = Synchronizer::new(&["a".into(), "b".into()], &SyncConfig::default());
+    let mut sets = Vec::new();
+    for tick in 0..400 {
+        let time = tick * PERIOD;
+        // Every fourth frame of b is lost, which is every second one that the master asks for.
+        if tick % 4 != 0 {
+            sets.extend(sync.push(frame("b", time + 2 * MS)));
+        }
+        if tick % 2 == 0 {
+            sets.extend(sync.push(frame("a", time)));
+        }
+    }
+    sets.extend(sync.flush());
+    let far =
+        |set: &FrameSet| set.present().any(|(_, frame)| frame.capture_nanos.abs_diff(set.master_nanos) > 3_000_000);
+    assert!(sets.len() >= 199 && !sets.iter().skip(5).any(far), "{:?}", sync.counts());
+    assert!(sync.counts().complete >= 99, "{:?}", sync.counts());
+}
+
+#[test]
 fn a_lost_frame_is_not_made_up_for_by_the_next_one() {
     let offsets = [0, -10_000_000, 12_000_000];
     let (sets, counts) =
