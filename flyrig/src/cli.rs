@@ -203,7 +203,7 @@ pub struct TrainArgs {
     #[arg(long, default_value_t = 1.0)]
     pub contrast: f32,
     /// How large the networks are.
-    #[arg(long, value_enum, default_value = "small", conflicts_with = "from")]
+    #[arg(long, value_enum, default_value = "tiny", conflicts_with = "from")]
     pub size: SizeName,
     /// Weights file to start from in place of random weights; "shipped" for the networks that come with flyrig.
     #[arg(long)]

@@ -43,12 +43,12 @@ impl Parameters {
         ])
     }
 
-    /// The weights that come with this version (`stfa/weights/small.safetensors`; `small.json` tells how they were made).
+    /// The weights that come with this version (`stfa/weights/tiny.safetensors`; `tiny.json` tells how they were made).
     ///
     /// # Errors
     /// [`StfaError::Weights`], never for a program that was built whole.
     pub fn embedded() -> Result<Self, StfaError> {
-        Self::from_bytes("embedded", include_bytes!("../weights/small.safetensors"))
+        Self::from_bytes("embedded", include_bytes!("../weights/tiny.safetensors"))
     }
 
     /// Reads weights from a file.
