@@ -205,7 +205,7 @@ pub struct TrainArgs {
     /// How large the networks are.
     #[arg(long, value_enum, default_value = "tiny", conflicts_with = "from")]
     pub size: SizeName,
-    /// Weights file to start from in place of random weights; "shipped" for the networks that come with flyrig.
+    /// Weights file to start from in place of random weights; "small" or "tiny" for the networks that come with flyrig.
     #[arg(long)]
     pub from: Option<PathBuf>,
     /// Where the networks are trained; "adapter" needs a flyrig that was built with the feature gpu-networks.
@@ -293,7 +293,7 @@ pub struct BenchAppearanceArgs {
     /// Numbers of input cameras, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "3,1", value_parser = clap::value_parser!(u8).range(1..=6).map(usize::from))]
     pub views: Vec<usize>,
-    /// Weights files of the learned modes, in place of the networks that come with flyrig; may be given several times.
+    /// Weights files of the learned modes, in place of all networks that come with flyrig; may be given several times.
     #[arg(long)]
     pub weights: Vec<PathBuf>,
     #[command(flatten)]
@@ -429,7 +429,7 @@ pub struct DemoArgs {
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
     pub appearance: AppearanceMode,
-    /// Weights file of the learned modes, in place of the networks that come with flyrig.
+    /// Weights file of the learned modes; "small" or "tiny" for the networks that come with flyrig [default: small].
     #[arg(long)]
     pub weights: Option<PathBuf>,
     /// Also score the modes that `direct` adds to (takes three times as long).
@@ -505,7 +505,7 @@ pub struct EvalArgs {
     /// How Gaussians get their colours.
     #[arg(long, value_enum, default_value = "direct")]
     pub appearance: AppearanceMode,
-    /// Weights file of the learned modes, in place of the networks that come with flyrig.
+    /// Weights file of the learned modes; "small" or "tiny" for the networks that come with flyrig [default: small].
     #[arg(long)]
     pub weights: Option<PathBuf>,
     #[command(flatten)]

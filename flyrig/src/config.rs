@@ -7,7 +7,7 @@ use clap::ValueEnum;
 use flyrig_calib::ClockKind;
 use flyrig_renderer::AppearanceSettings;
 use flyrig_sim::SimConfig;
-use flyrig_stfa::Parameters;
+use flyrig_stfa::{EMBEDDED, Parameters};
 use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
 use serde::{Deserialize, Serialize};
 
@@ -289,12 +289,12 @@ impl AppearanceMode {
         matches!(self, Self::Stfa | Self::StfaNoTime | Self::StfaNoSpaceTime)
     }
 
-    /// The networks that add to it, from this file or those that come with the program. None for the direct modes.
+    /// The networks that add to it, from this file or those of this name that come with the program. None for the direct modes.
     pub fn networks(self, weights: Option<&Path>) -> Result<Option<Parameters>> {
         if !self.is_learned() {
             return Ok(None);
         }
-        Ok(Some(weights.map_or_else(Parameters::embedded, Parameters::load)?))
+        Ok(Some(Parameters::named(weights.unwrap_or(Path::new(EMBEDDED[0].0)))?))
     }
 }
 
@@ -302,7 +302,7 @@ impl AppearanceMode {
 #[serde(deny_unknown_fields, default)]
 pub struct AppearanceSection {
     pub mode: AppearanceMode,
-    /// Weights file of the learned modes; empty: the networks that come with the program.
+    /// Weights file of the learned modes, or the name of networks that come with the program; empty: the first of those.
     pub weights: PathBuf,
     /// Inputs of a Gaussian that changed by no more than this leave what the networks add to its colour as it was.
     pub reuse: f32,

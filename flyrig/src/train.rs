@@ -115,8 +115,7 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
 fn begin(args: &TrainArgs) -> Result<Parameters> {
     Ok(match &args.from {
         None => Parameters::untrained(args.size.size(), args.seed),
-        Some(path) if path.as_os_str() == "shipped" => Parameters::embedded()?,
-        Some(path) => Parameters::load(path)?,
+        Some(weights) => Parameters::named(weights)?,
     })
 }
 

@@ -51,4 +51,4 @@ pub use sample::{PATCH, SHARES, Target, TargetPicture, TrainingSample, training_
 pub use shared::SharedAppearance;
 pub use taps::{FeatureMaps, Tap, Taps};
 pub use train::{Loss, TrainSettings, Trainer};
-pub use weights::WEIGHTS_VERSION;
+pub use weights::{EMBEDDED, WEIGHTS_VERSION};

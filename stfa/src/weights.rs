@@ -13,6 +13,12 @@ use crate::{
 /// Version of the networks: a file of another one cannot be used.
 pub const WEIGHTS_VERSION: u32 = 1;
 
+/// Weights that come along, by name: the first are used where nothing else is asked for.
+pub const EMBEDDED: [(&str, &[u8]); 2] = [
+    ("small", include_bytes!("../weights/small.safetensors")),
+    ("tiny", include_bytes!("../weights/tiny.safetensors")),
+];
+
 /// Largest sensible number of channels, heads, layers: what a damaged file may not exceed.
 const MAX_SIZE: usize = 4096;
 
@@ -43,12 +49,16 @@ impl Parameters {
         ])
     }
 
-    /// The weights that come with this version (`stfa/weights/tiny.safetensors`; `tiny.json` tells how they were made).
+    /// The weights that come with this version, by the name of one of [`EMBEDDED`] (`stfa/weights` has cards that tell how they
+    /// were made), or those of a file.
     ///
     /// # Errors
-    /// [`StfaError::Weights`], never for a program that was built whole.
-    pub fn embedded() -> Result<Self, StfaError> {
-        Self::from_bytes("embedded", include_bytes!("../weights/tiny.safetensors"))
+    /// [`StfaError::File`]; [`StfaError::Weights`] for a file that is cut short, of another version or another network.
+    pub fn named(name_or_file: &Path) -> Result<Self, StfaError> {
+        match EMBEDDED.iter().find(|(name, _)| name_or_file.as_os_str() == *name) {
+            Some((name, bytes)) => Self::from_bytes(name, bytes),
+            None => Self::load(name_or_file),
+        }
     }
 
     /// Reads weights from a file.
@@ -106,4 +116,17 @@ fn check_size(size: &NetworkSize) -> Result<(), String> {
         return Err(format!("a network of size {size:?} cannot be"));
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn weights_that_come_along_are_whole_and_others_are_files() {
+        let counts = EMBEDDED.map(|(name, _)| Parameters::named(Path::new(name)).unwrap().count());
+        assert_eq!(counts, [35_920, 8_860]);
+        let error = Parameters::named(Path::new("no-such-weights")).unwrap_err().to_string();
+        assert!(error.contains("no-such-weights"), "{error}");
+    }
 }

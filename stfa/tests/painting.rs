@@ -246,7 +246,7 @@ fn networks_on_the_adapter_are_refused_in_words_where_they_were_left_out() {
 fn networks_on_the_adapter_paint_what_those_on_the_processor_paint() {
     let mut stage = Stage::new();
     let settings = AppearanceSettings::default();
-    let parameters = Parameters::embedded().unwrap();
+    let parameters = Parameters::named("small".as_ref()).unwrap();
     let mut plain = LearnedAppearance::new(&parameters, stage.body());
     let mut shared = flyrig_stfa::SharedAppearance::new(&stage.gpu, &parameters, &stage.body()).unwrap();
     for frame in 0..4 {

@@ -10,7 +10,7 @@ use clap::ValueEnum as _;
 use flyrig_body::DEFAULT_NODE_COUNT;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::srgb_from_linear;
-use flyrig_stfa::Parameters;
+use flyrig_stfa::{EMBEDDED, Parameters};
 use serde::Serialize;
 
 use super::{
@@ -158,10 +158,11 @@ impl Mode<'_> {
     }
 }
 
-/// The networks of these files, or those that come with the program; named where there are several.
+/// The networks of these files, or all that come with the program; named where there are several.
 fn networks(files: &[PathBuf]) -> Result<Vec<(String, Parameters)>> {
     if files.is_empty() {
-        return Ok(vec![(String::new(), Parameters::embedded()?)]);
+        let shipped = |(name, _): &(&str, _)| Ok((name.to_string(), Parameters::named(name.as_ref())?));
+        return EMBEDDED.iter().map(shipped).collect();
     }
     let named = |path: &PathBuf| -> Result<(String, Parameters)> {
         let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).filter(|_| files.len() > 1);
@@ -227,7 +228,11 @@ fn write(folder: &Path, rows: &[Row]) -> Result<()> {
     let series = views.into_iter().map(|views| {
         let point = |row: &&Row| (row.direct_ms + row.networks_ms, -row.psnr_db, row.mode.clone());
         let points = means.iter().filter(|row| row.views == views).collect::<Vec<_>>();
-        Series { name: format!("{views} views"), points: points.iter().map(point).collect(), line: Line::Front }
+        Series {
+            name: if views == 1 { "1 view".to_owned() } else { format!("{views} views") },
+            points: points.iter().map(point).collect(),
+            line: Line::Front,
+        }
     });
     let plot = Plot {
         title: "Run time against error, people never trained on".to_owned(),

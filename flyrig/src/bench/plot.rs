@@ -131,6 +131,9 @@ impl Plot {
             -(TOP + HEIGHT - BOTTOM) / 2.0,
             escape(&self.y_label)
         );
+        // Legend first: labels make way for it.
+        let rows = self.series.len() as f64;
+        let mut taken = vec![[WIDTH - RIGHT - 200.0, TOP - 4.0, WIDTH, TOP + 18.0 * rows]];
         for (i, series) in self.series.iter().enumerate() {
             let color = COLORS[i % COLORS.len()];
             let points = || series.points.iter().filter(|(x, y, _)| x.is_finite() && y.is_finite());
@@ -141,12 +144,11 @@ impl Plot {
             };
             for (px, py, label) in points() {
                 let (px, py) = (x.at(*px), y.at(*py));
+                let [tx, ty] = free_place(&mut taken, [px, py], label);
                 let _ = write!(
                     svg,
-                    "<circle cx=\"{px:.1}\" cy=\"{py:.1}\" r=\"4\" fill=\"{color}\"/><text x=\"{:.1}\" y=\"{:.1}\" \
+                    "<circle cx=\"{px:.1}\" cy=\"{py:.1}\" r=\"4\" fill=\"{color}\"/><text x=\"{tx:.1}\" y=\"{ty:.1}\" \
                      font-size=\"10\" fill=\"#374151\">{}</text>",
-                    px + 6.0,
-                    py - 5.0,
                     escape(label)
                 );
             }
@@ -163,6 +165,28 @@ impl Plot {
         }
         svg + "</svg>\n"
     }
+}
+
+/// Where a point's label starts: beside it, inside of the picture, and not on another one in `taken`.
+fn free_place(taken: &mut Vec<[f64; 4]>, [px, py]: [f64; 2], label: &str) -> [f64; 2] {
+    let (width, height) = (6.0 * label.chars().count() as f64, 11.0);
+    let left = (px + 6.0).min(WIDTH - 4.0 - width);
+    // Above the point, below it, farther above, farther below ...
+    let steps = (0..24).map(|i| f64::from(i / 2) * height * if i % 2 == 0 { -1.0 } else { 1.0 });
+    let boxes = steps.map(|step| [left, py - 5.0 + step - height, left + width, py - 5.0 + step]);
+    let meets = |a: &[f64; 4], b: &[f64; 4]| a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
+    let inside = |place: &[f64; 4]| place[1] > 0.0 && place[3] < HEIGHT;
+    let mut all = boxes.filter(inside);
+    let first = all.next().unwrap_or([left, py - 5.0 - height, left + width, py - 5.0]);
+    let place = if label.is_empty() || !taken.iter().any(|other| meets(other, &first)) {
+        first
+    } else {
+        all.find(|place| !taken.iter().any(|other| meets(other, place))).unwrap_or(first)
+    };
+    if !label.is_empty() {
+        taken.push(place);
+    }
+    [place[0], place[3]]
 }
 
 /// The points that no other one beats in both directions, from left to right.
