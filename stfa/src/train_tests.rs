@@ -247,7 +247,7 @@ fn steps_on_the_graphics_device_are_those_of_the_processor() {
     let samples = [sample(1), sample(3)];
     let mut plain = Trainer::new(Parameters::untrained(SIZE, 1), settings(10));
     let mut other = plain.clone();
-    other.device = crate::NetworkDevice::adapter(&gpu).unwrap();
+    other.device = NetworkDevice::adapter(&gpu).unwrap();
     for step in 0..3 {
         let [a, b] = [&mut plain, &mut other].map(|trainer| trainer.step(&samples[step % 2]).unwrap());
         assert!((a.mse - b.mse).abs() < 1e-3 * a.mse, "step {step}: {a:?} against {b:?}");
