@@ -20,7 +20,7 @@ const LEAST_COMMON: usize = 1000;
 const LEAST_CORRELATION: f64 = 0.3;
 /// What pairs of cameras may disagree by before a camera's lag is not believed, nanoseconds: slow movements look alike over
 /// many frames, and from every side a little different.
-const MOST_DISAGREEMENT: f64 = 3e6;
+const MOST_DISAGREEMENT: f64 = 2e6;
 /// Correlation that is asked of a pair that no third camera can contradict.
 const LONE_CORRELATION: f64 = 0.75;
 
@@ -202,15 +202,17 @@ fn settled(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>
             }
         }
     }
-    (0..count)
+    let disagreements: Vec<f64> = (0..count)
         .map(|slot| {
             let of_slot = known.iter().filter(|(i, j, ..)| *i == slot || *j == slot);
             let squares: Vec<f64> = of_slot.map(|&(i, j, lag, _)| (lags[j] - lags[i] - lag).powi(2)).collect();
-            let disagreement = (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt();
-            let is_sure = slot == 0 || disagreement <= MOST_DISAGREEMENT;
-            ((reached[slot] && is_sure).then_some(lags[slot]), disagreement)
+            (squares.iter().sum::<f64>() / squares.len().max(1) as f64).abs().sqrt()
         })
-        .collect()
+        .collect();
+    // All lags are counted from the first camera: what it disagrees on is in each of them.
+    let of_first = disagreements.first().copied().unwrap_or(0.0);
+    let sure = |slot: usize| slot == 0 || disagreements[slot].max(of_first) <= MOST_DISAGREEMENT;
+    (0..count).map(|slot| ((reached[slot] && sure(slot)).then_some(lags[slot]), disagreements[slot])).collect()
 }
 
 /// How much later `b`'s motion is than `a`'s, nanoseconds, and the correlation there. Cameras that see the person higher or
@@ -281,6 +283,9 @@ mod tests {
         let loop_of = |third: f64| [(0, 1, 5e6, 0.5), (1, 2, 7e6, 0.5), (0, 2, third, 0.5)];
         assert_eq!(lags(3, &loop_of(12e6)), [known(0.0), known(5.0), known(12.0)]);
         assert_eq!(lags(3, &loop_of(40e6)), [known(0.0), None, None]);
+        // The first camera disagrees with two that agree with each other: all are counted from it.
+        let beside = [(0, 1, 5e6, 0.8), (0, 2, 14e6, 0.8), (1, 2, 0.0, 0.99), (1, 3, 0.0, 0.99), (2, 3, 0.0, 0.99)];
+        assert_eq!(lags(4, &beside), [known(0.0), None, None, None]);
         // A chain of weak pairs: nothing could contradict them.
         assert_eq!(lags(3, &[(0, 1, 5e6, 0.5), (1, 2, 7e6, 0.5)]), [known(0.0), None, None]);
         // Strong pairs need nobody.

@@ -250,21 +250,20 @@ mod tests {
 
     #[test]
     #[ignore = "minutes: run by make test-long"]
-    fn lags_are_found_or_not_told() {
+    fn lags_are_right_or_not_told() {
         let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
-        for seed in 2..5 {
-            assert_found(&gpu, seed);
-        }
-        // Slow, and different from every side: no answer is better than a wrong one.
-        for (kind, seed) in [(MotionKind::Squat, 5), (MotionKind::Turn, 6)] {
+        // Slow movements look different from every side: no answer is better than a wrong one.
+        let waving = (2..6).map(|seed| (MotionKind::Wave, seed));
+        for (kind, seed) in waving.chain([(MotionKind::Squat, 6), (MotionKind::Turn, 7)]) {
             for (lag_ms, estimate) in simulated(&gpu, seed, kind) {
                 let off = estimate.lag_nanos.map(|found| found as f64 * 1e-6 - lag_ms);
-                println!(
-                    "{kind:?} {}: off by {off:?} ms, disagreement {:.1} ms",
-                    estimate.camera,
-                    estimate.disagreement_nanos * 1e-6
+                let disagreement = estimate.disagreement_nanos * 1e-6;
+                println!("{kind:?} {seed} {}: off by {off:?} ms, disagreement {disagreement:.1} ms", estimate.camera);
+                assert!(
+                    off.is_none_or(|off| off.abs() <= 3.0),
+                    "{kind:?} {seed} {}: off by {off:?} ms",
+                    estimate.camera
                 );
-                assert!(off.is_none_or(|off| off.abs() <= 5.0), "{kind:?} {}: off by {off:?} ms", estimate.camera);
             }
         }
     }
