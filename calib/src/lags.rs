@@ -206,7 +206,7 @@ fn settled(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>
         .map(|slot| {
             let of_slot = known.iter().filter(|(i, j, ..)| *i == slot || *j == slot);
             let squares: Vec<f64> = of_slot.map(|&(i, j, lag, _)| (lags[j] - lags[i] - lag).powi(2)).collect();
-            (squares.iter().sum::<f64>() / squares.len().max(1) as f64).abs().sqrt()
+            (squares.iter().fold(0.0, |sum, square| sum + square) / squares.len().max(1) as f64).sqrt()
         })
         .collect();
     // All lags are counted from the first camera: what it disagrees on is in each of them.

@@ -22,7 +22,7 @@ use crate::{
     pipeline::{Counts, Outcome, Pipeline, PoseSource},
     png,
     report::{ContactRow, Curve, Report, write_whole},
-    score::{CameraScore, FrameScore, ScoreSheet, contact_pictures, score_view},
+    score::{CameraScore, FrameScore, ScoreSheet, contact_pictures, error_parts, score_view},
     stats::StageSummary,
 };
 
@@ -105,7 +105,13 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
             .map(|((camera, view), truth)| {
                 png::write_view(&args.out.join(camera.id.as_str()).join(format!("{number:06}.png")), view)?;
                 match truth {
-                    Some(truth) => score_view(&camera.id, number, view, &truth.image, truth.mask.as_ref()),
+                    Some(truth) => {
+                        let mut score = score_view(&camera.id, number, view, &truth.image, truth.mask.as_ref())?;
+                        if let (Some(score), Some(mask)) = (&mut score, &truth.mask) {
+                            score.parts = error_parts(view, &truth.image, mask)?;
+                        }
+                        Ok(score)
+                    }
                     None => Ok(None),
                 }
             })

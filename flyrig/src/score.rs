@@ -19,7 +19,7 @@ pub struct FrameScore {
     pub ssim: f64,
     pub flip: f64,
     pub iou: Option<f64>,
-    /// Where the error lies; only against a mask.
+    /// Where the error lies; only where somebody asked for [`error_parts`].
     pub parts: Option<ErrorParts>,
 }
 
@@ -76,8 +76,7 @@ pub fn score_view(
     mask: Option<&Mask>,
 ) -> Result<Option<FrameScore>> {
     let Some(Compared { ours, truth, area }) = compare(view, truth, mask)? else { return Ok(None) };
-    let drawn = own_silhouette(view)?;
-    let iou = mask.map(|mask| mask_iou(&drawn, mask)).transpose()?;
+    let iou = mask.map(|mask| mask_iou(&own_silhouette(view)?, mask).map_err(anyhow::Error::from)).transpose()?;
     Ok(Some(FrameScore {
         camera: camera.to_string(),
         frame,
@@ -85,8 +84,14 @@ pub fn score_view(
         ssim: ssim(&ours, &truth, area)?,
         flip: flip(&truth, &ours, area)?.mean,
         iou,
-        parts: mask.map(|mask| ErrorParts::new(&ours, &truth, &drawn, mask, area)),
+        parts: None,
     }))
+}
+
+/// Where the error of a rendered view lies; `None` when there is nobody to compare.
+pub fn error_parts(view: &RenderedView, truth: &Image, mask: &Mask) -> Result<Option<ErrorParts>> {
+    let Some(Compared { ours, truth, area }) = compare(view, truth, Some(mask))? else { return Ok(None) };
+    Ok(Some(ErrorParts::new(&ours, &truth, &own_silhouette(view)?, mask, area)))
 }
 
 /// Captioned PNG pictures for a contact sheet: truth, ours, error map, cut to the person.
