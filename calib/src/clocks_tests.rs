@@ -63,7 +63,8 @@ fn run(cameras: usize, arrivals: &[Arrival]) -> Run {
 fn run_waiting(cameras: usize, arrivals: &[Arrival], max_wait_nanos: u64) -> Run {
     let ids = ids(cameras);
     let mut aligner = ClockAligner::new(&ids, None);
-    let mut sync = Synchronizer::new(&ids, &SyncConfig { master: None, window_nanos: Some(8_000_000), max_wait_nanos });
+    let mut sync =
+        Synchronizer::new(&ids, &SyncConfig { window_nanos: Some(8_000_000), max_wait_nanos, ..SyncConfig::default() });
     let (mut sets, mut times) = (Vec::new(), Vec::new());
     for &(camera, tick, stamp) in arrivals {
         let aligned = aligner.align(frame(&ids[camera], tick as u64, stamp));

@@ -166,19 +166,21 @@ pub fn estimate_lags(signals: &[MotionSignal], most_nanos: i64) -> Vec<LagEstima
         .collect()
 }
 
-/// Of every camera the lag after the first one that its pairs agree on, and what they disagree by. A pair is two cameras, how
-/// much later the second is, and the correlation there.
-fn settled(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>, f64)> {
-    let linked = |a: usize, b: usize| {
-        pairs.iter().any(|pair| (pair.0, pair.1) == (a.min(b), a.max(b)) && pair.3 >= LEAST_CORRELATION)
-    };
-    // Only pairs that close a loop can contradict each other.
-    let checked = |i: usize, j: usize| (0..count).any(|k| k != i && k != j && linked(i, k) && linked(j, k));
-    let known: Vec<_> = pairs
-        .iter()
-        .copied()
-        .filter(|pair| pair.3 >= LONE_CORRELATION || (pair.3 >= LEAST_CORRELATION && checked(pair.0, pair.1)))
-        .collect();
+/// What two cameras tell of each other.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct PairLag {
+    /// Slots of the cameras.
+    pub first: usize,
+    pub second: usize,
+    /// How much later the second one's stamps are, nanoseconds.
+    pub lag: f64,
+    /// How much it is believed.
+    pub weight: f64,
+}
+
+/// Of every camera the lag after the first one that its pairs agree on best (weighted least squares), where pairs reach it, and
+/// the root mean square of what they disagree by.
+pub(crate) fn balanced(count: usize, pairs: &[PairLag]) -> Vec<(Option<f64>, f64)> {
     // Gauss-Seidel: each camera where its partners want it. The first one stays at 0.
     let mut lags = vec![0.0; count];
     let mut reached = vec![false; count];
@@ -188,31 +190,48 @@ fn settled(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>
     for _ in 0..200 {
         for slot in 1..count {
             let (mut sum, mut weights) = (0.0, 0.0);
-            for &(i, j, lag, correlation) in &known {
-                let wish = match (i == slot, j == slot) {
-                    (true, false) if reached[j] => lags[j] - lag,
-                    (false, true) if reached[i] => lags[i] + lag,
+            for pair in pairs {
+                let wish = match (pair.first == slot, pair.second == slot) {
+                    (true, false) if reached[pair.second] => lags[pair.second] - pair.lag,
+                    (false, true) if reached[pair.first] => lags[pair.first] + pair.lag,
                     _ => continue,
                 };
-                let weight = correlation.powi(4);
-                (sum, weights) = (sum + weight * wish, weights + weight);
+                (sum, weights) = (sum + pair.weight * wish, weights + pair.weight);
             }
             if weights > 0.0 {
                 (lags[slot], reached[slot]) = (sum / weights, true);
             }
         }
     }
-    let disagreements: Vec<f64> = (0..count)
-        .map(|slot| {
-            let of_slot = known.iter().filter(|(i, j, ..)| *i == slot || *j == slot);
-            let squares: Vec<f64> = of_slot.map(|&(i, j, lag, _)| (lags[j] - lags[i] - lag).powi(2)).collect();
-            (squares.iter().fold(0.0, |sum, square| sum + square) / squares.len().max(1) as f64).sqrt()
-        })
+    let disagreement = |slot: usize| {
+        let of_slot = pairs.iter().filter(|pair| pair.first == slot || pair.second == slot);
+        let squares: Vec<f64> = of_slot.map(|pair| (lags[pair.second] - lags[pair.first] - pair.lag).powi(2)).collect();
+        (squares.iter().fold(0.0, |sum, square| sum + square) / squares.len().max(1) as f64).sqrt()
+    };
+    (0..count).map(|slot| (reached[slot].then_some(lags[slot]), disagreement(slot))).collect()
+}
+
+/// Of every camera the lag after the first one that its pairs agree on, and what they disagree by. A pair is two cameras, how
+/// much later the second is, and the correlation there.
+fn settled(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>, f64)> {
+    let linked = |a: usize, b: usize| {
+        pairs.iter().any(|pair| (pair.0, pair.1) == (a.min(b), a.max(b)) && pair.3 >= LEAST_CORRELATION)
+    };
+    // Only pairs that close a loop can contradict each other.
+    let checked = |i: usize, j: usize| (0..count).any(|k| k != i && k != j && linked(i, k) && linked(j, k));
+    let known: Vec<PairLag> = pairs
+        .iter()
+        .filter(|pair| pair.3 >= LONE_CORRELATION || (pair.3 >= LEAST_CORRELATION && checked(pair.0, pair.1)))
+        .map(|&(first, second, lag, correlation)| PairLag { first, second, lag, weight: correlation.powi(4) })
         .collect();
+    let lags = balanced(count, &known);
     // All lags are counted from the first camera: what it disagrees on is in each of them.
-    let of_first = disagreements.first().copied().unwrap_or(0.0);
-    let sure = |slot: usize| slot == 0 || disagreements[slot].max(of_first) <= MOST_DISAGREEMENT;
-    (0..count).map(|slot| ((reached[slot] && sure(slot)).then_some(lags[slot]), disagreements[slot])).collect()
+    let of_first = lags.first().map_or(0.0, |first| first.1);
+    let sure = |slot: usize, disagreement: f64| slot == 0 || disagreement.max(of_first) <= MOST_DISAGREEMENT;
+    lags.into_iter()
+        .enumerate()
+        .map(|(slot, (lag, disagreement))| (lag.filter(|_| sure(slot, disagreement)), disagreement))
+        .collect()
 }
 
 /// How much later `b`'s motion is than `a`'s, nanoseconds, and the correlation there. Cameras that see the person higher or

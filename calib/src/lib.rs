@@ -9,9 +9,9 @@ mod clocks_tests;
 mod easymocap;
 mod error;
 mod lags;
-mod point_lags;
 #[cfg(test)]
 mod random;
+mod silhouette_lags;
 mod sync;
 #[cfg(test)]
 mod sync_properties;
@@ -21,5 +21,5 @@ pub use clocks::{ClockAligner, ClockKind, ClockState};
 pub use easymocap::{load_easymocap, save_easymocap};
 pub use error::CalibError;
 pub use lags::{LagEstimate, MotionSignal, estimate_lags};
-pub use point_lags::{PointTrack, estimate_point_lags};
+pub use silhouette_lags::{SilhouetteTrack, estimate_silhouette_lags};
 pub use sync::{DropCounts, SyncConfig, SyncCounts, Synchronizer};

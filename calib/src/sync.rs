@@ -30,12 +30,14 @@ pub struct SyncConfig {
     /// Longest time, by the frames' own clock, that a set waits for a camera. A camera silent for
     /// longer is waited for no more, and when it is the master, the next camera's clock takes over.
     pub max_wait_nanos: u64,
+    /// By camera how much later its stamps are than those of the others; taken off before anything else.
+    pub lags_nanos: BTreeMap<CameraId, i64>,
 }
 
 impl Default for SyncConfig {
     /// A window of half a frame; waits for three frames of 30 a second.
     fn default() -> Self {
-        Self { master: None, window_nanos: None, max_wait_nanos: 100_000_000 }
+        Self { master: None, window_nanos: None, max_wait_nanos: 100_000_000, lags_nanos: BTreeMap::new() }
     }
 }
 
@@ -101,6 +103,8 @@ pub struct Synchronizer {
 #[derive(Debug)]
 struct Camera {
     id: CameraId,
+    /// Taken off its stamps, nanoseconds.
+    lag: i64,
     /// By time.
     pending: BTreeMap<i64, Arc<Frame>>,
     /// Far ahead of all others, and not believed yet.
@@ -159,6 +163,7 @@ impl Synchronizer {
                 .iter()
                 .map(|id| Camera {
                     id: id.clone(),
+                    lag: config.lags_nanos.get(id).copied().unwrap_or_default(),
                     pending: BTreeMap::new(),
                     suspect: None,
                     latest: None,
@@ -186,7 +191,8 @@ impl Synchronizer {
             self.counts.unknown_camera += 1;
             return Vec::new();
         };
-        let nanos = frame.capture_nanos;
+        let nanos = frame.capture_nanos.saturating_sub(self.cameras[slot].lag);
+        let frame = Frame { capture_nanos: nanos, ..frame };
         // A slow camera's next frame is no surprise.
         let plausible = self.max_wait.max(self.cameras[slot].interval.unwrap_or(0).saturating_mul(4));
         let far_ahead = self.now().is_some_and(|now| nanos > now && nanos.abs_diff(now) > plausible);

@@ -59,6 +59,7 @@ fn random_rigs_keep_every_promise() {
             master: random.chance(50).then(|| ids[random.below(ids.len() as u64) as usize].clone()),
             window_nanos: Some(random.below(40_000_000)),
             max_wait_nanos: random.below(200_000_000),
+            ..SyncConfig::default()
         };
         let arrivals = arrivals(&mut random, ids.len());
         let (sets, sync) = run(&ids, &config, &arrivals);
@@ -116,8 +117,11 @@ fn a_sound_rig_gets_the_nearest_frame_of_every_camera() {
         frames.sort_unstable();
         let arrivals: Vec<(usize, i64, u64)> =
             frames.into_iter().zip(0..).map(|((nanos, camera), serial)| (camera, nanos, serial)).collect();
-        let config =
-            SyncConfig { master: None, window_nanos: Some(PERIOD as u64 / 2), max_wait_nanos: 4 * PERIOD as u64 };
+        let config = SyncConfig {
+            window_nanos: Some(PERIOD as u64 / 2),
+            max_wait_nanos: 4 * PERIOD as u64,
+            ..SyncConfig::default()
+        };
         let (sets, sync) = run(&ids, &config, &arrivals);
         assert_eq!((sync.counts().complete, sync.counts().partial), (60, 0), "seed {seed}");
         for set in &sets {

@@ -18,8 +18,11 @@ pub(crate) fn frame(camera: &str, capture_nanos: i64) -> Frame {
 }
 
 fn synchronizer(window_ms: u64, max_wait_ms: u64) -> Synchronizer {
-    let config =
-        SyncConfig { master: None, window_nanos: Some(window_ms * 1_000_000), max_wait_nanos: max_wait_ms * 1_000_000 };
+    let config = SyncConfig {
+        window_nanos: Some(window_ms * 1_000_000),
+        max_wait_nanos: max_wait_ms * 1_000_000,
+        ..SyncConfig::default()
+    };
     Synchronizer::new(&["a".into(), "b".into(), "c".into()], &config)
 }
 
@@ -290,7 +293,7 @@ fn the_ends_of_time_do_not_overflow() {
     for (window_nanos, max_wait_nanos) in [(0, 0), (u64::MAX, u64::MAX), (5, 0), (0, 5)] {
         for times in [wild, growing] {
             let window_nanos = Some(window_nanos);
-            let config = SyncConfig { master: Some("b".into()), window_nanos, max_wait_nanos };
+            let config = SyncConfig { master: Some("b".into()), window_nanos, max_wait_nanos, ..SyncConfig::default() };
             let mut sync = Synchronizer::new(&["a".into(), "b".into()], &config);
             let mut sets = Vec::new();
             for nanos in times {
@@ -316,4 +319,22 @@ fn an_empty_rig_and_an_unknown_master_do_no_harm() {
     let config = SyncConfig { master: Some("zz".into()), ..SyncConfig::default() };
     let mut sync = Synchronizer::new(&["a".into()], &config);
     assert_eq!(sync.push(frame("a", 0)).len(), 1);
+}
+
+#[test]
+fn a_lag_that_is_known_is_taken_off() {
+    let config = SyncConfig { lags_nanos: [("b".into(), -52_000_000)].into(), ..SyncConfig::default() };
+    let ids = ["a".into(), "b".into()];
+    let mut sync = Synchronizer::new(&ids, &config);
+    let mut sets = Vec::new();
+    for n in 0..30 {
+        let nanos = n * 33_333_333;
+        sets.extend(sync.push(frame("a", nanos)));
+        sets.extend(sync.push(frame("b", nanos - 52_000_000)));
+    }
+    assert!(sets.len() > 25);
+    for set in sets {
+        let times: Vec<i64> = set.present().map(|(_, frame)| frame.capture_nanos).collect();
+        assert_eq!(times, [set.master_nanos; 2]);
+    }
 }

@@ -61,8 +61,8 @@ pub enum Command {
     /// Play a recording through, tell what is in it, and export it where asked to. To run the rig on it, set
     /// source.kind = "mcap".
     Replay(ReplayArgs),
-    /// Compare what moves in the pictures of all cameras and tell how much later than the first one's each camera's stamps
-    /// are.
+    /// Tell how much later than the first one's each camera's stamps are: by the silhouettes of a person where the cameras'
+    /// places are known (recordings, folders), by what moves else (live cameras).
     SyncCheck(SyncCheckArgs),
     /// List cameras, what they are named by, their formats and buses, and graphics adapters; say what to mend.
     Doctor {
@@ -127,8 +127,8 @@ pub struct SyncCheckArgs {
     /// Frame rate of a folder.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
-    /// Folder with intri.yml and extri.yml: compare where the joints of a person are in place of what moves. Needs three
-    /// cameras that see one person; a second and a half is enough.
+    /// Folder with intri.yml and extri.yml, where the input does not tell where the cameras are: with that, silhouettes of one
+    /// person are compared, which is surer than what moves. It replaces the input's own.
     #[arg(long)]
     pub calibration: Option<PathBuf>,
 }
@@ -516,6 +516,10 @@ pub struct EvalArgs {
     /// Frame rate of the folder.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
+    /// How much later than the others' a camera's stamps are, milliseconds, as CAM=MS; may be given again. `flyrig sync-check`
+    /// tells it.
+    #[arg(long = "lag", value_name = "CAM=MS", value_parser = parse_lag, allow_hyphen_values = true)]
+    pub lags: Vec<(String, f64)>,
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000)]
     pub gaussians: usize,
@@ -563,6 +567,14 @@ fn parse_fps(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(fps) if (0.1..=1000.0).contains(&fps) => Ok(fps),
         _ => Err(format!("'{text}' is not between 0.1 and 1000 frames a second")),
+    }
+}
+
+fn parse_lag(text: &str) -> Result<(String, f64), String> {
+    let parts = text.split_once('=').and_then(|(camera, lag)| Some((camera.to_owned(), lag.parse::<f64>().ok()?)));
+    match parts {
+        Some((camera, lag)) if !camera.is_empty() && lag.abs() <= 10_000.0 => Ok((camera, lag)),
+        _ => Err(format!("'{text}' is no camera with its lag in milliseconds like 03=-50.2 (at most 10000)")),
     }
 }
 

@@ -1,6 +1,9 @@
 //! The configuration file: one commented default, strict reading, errors that name line and key.
 
-use std::path::{Path, PathBuf};
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
 
 use anyhow::{Context, Result, bail, ensure};
 use clap::ValueEnum;
@@ -131,6 +134,7 @@ impl Default for SourceSection {
 #[serde(deny_unknown_fields, default)]
 pub struct SyncSection {
     pub window_ms: f64,
+    pub lags_ms: BTreeMap<String, f64>,
     pub max_wait_ms: f64,
     pub master: String,
     pub clocks: ClockKind,
@@ -138,7 +142,13 @@ pub struct SyncSection {
 
 impl Default for SyncSection {
     fn default() -> Self {
-        Self { window_ms: 0.0, max_wait_ms: 100.0, master: String::new(), clocks: ClockKind::Shared }
+        Self {
+            window_ms: 0.0,
+            lags_ms: BTreeMap::new(),
+            max_wait_ms: 100.0,
+            master: String::new(),
+            clocks: ClockKind::Shared,
+        }
     }
 }
 
@@ -463,6 +473,9 @@ impl Config {
         self.source.check()?;
         self.sim.validate().context("in [sim]")?;
         range("sync.window_ms", self.sync.window_ms, 0.0, 10_000.0)?;
+        for (camera, lag) in &self.sync.lags_ms {
+            range(&format!("sync.lags_ms of {camera}"), *lag, -10_000.0, 10_000.0)?;
+        }
         range("sync.max_wait_ms", self.sync.max_wait_ms, 0.0, 60_000.0)?;
         range("body.gaussians", self.body.gaussians as f64, 100.0, 2_000_000.0)?;
         range("body.nodes", self.body.nodes as f64, 4.0, 100_000.0)?;

@@ -1,6 +1,6 @@
 //! `flyrig eval`: replay a data set in order, as live, render the cameras that were held out, score them.
 
-use std::{path::Path, time::Instant};
+use std::{collections::BTreeMap, path::Path, time::Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf, write_mesh_ply};
@@ -22,6 +22,7 @@ use crate::{
     pipeline::{Counts, Outcome, Pipeline, PoseSource},
     png,
     report::{ContactRow, Curve, Report, write_whole},
+    run,
     score::{CameraScore, FrameScore, ScoreSheet, contact_pictures, error_parts, score_view},
     stats::StageSummary,
 };
@@ -32,8 +33,6 @@ const SURFACE_EVERY: u64 = 10;
 const SHAPE_SETS: usize = 8;
 /// Rows of the report's contact sheet.
 const CONTACT_ROWS: usize = 4;
-/// How far apart two cameras' frames of one set may be.
-const SYNC_WINDOW_NANOS: u64 = 8_000_000;
 
 /// `metrics.json`.
 #[derive(Debug, Serialize)]
@@ -164,6 +163,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
                 format!("{:?}, {:?}, {:?}, {:?}", args.pose, args.masks, args.solver, args.appearance),
             ),
             ("Gaussians, nodes".to_owned(), format!("{}, {}", args.gaussians, args.nodes)),
+            ("lags taken off, ms".to_owned(), listed(&args.lags)),
             ("frames".to_owned(), format!("{processed} in {seconds:.1} s, writing and scoring included")),
             ("scored against".to_owned(), metrics.reference.to_owned()),
         ],
@@ -249,6 +249,8 @@ fn load_rigs(args: &EvalArgs) -> Result<(Rig, Vec<Camera>)> {
     let all = dataset::load_rig(&args.dataset, &chosen)?;
     let whose = format!("the calibration of {}", args.dataset.display());
     let (rig, holdout) = (dataset::pick(&all, &args.inputs, &whose)?, dataset::pick(&all, &args.holdout, &whose)?);
+    let lagging: Vec<String> = args.lags.iter().map(|(camera, _)| camera.clone()).collect();
+    dataset::pick(&all, &lagging, &format!("{whose}, but in --lag"))?;
     if let Some(both) = args.inputs.iter().find(|name| args.holdout.contains(name)) {
         bail!("camera {both} is both an input and held out; scores would flatter");
     }
@@ -280,7 +282,11 @@ impl FrameReader {
             FolderOptions { fps: args.fps, frames: args.frames.clone(), with_masks: args.masks == Origin::Given };
         let sources = FolderReplay::open(&args.dataset, Some(&ids), &options)?;
         let count = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);
-        let config = SyncConfig { window_nanos: Some(SYNC_WINDOW_NANOS), ..SyncConfig::default() };
+        let config = SyncConfig {
+            window_nanos: Some(half_period_nanos(args)),
+            lags_nanos: lags_nanos(args),
+            ..SyncConfig::default()
+        };
         Ok(Self {
             sources,
             sync: Synchronizer::new(&ids, &config),
@@ -330,7 +336,9 @@ fn next_frame(source: &mut FolderReplay) -> Result<Option<Frame>, flyrig_capture
 
 /// Reads the held-out cameras alongside, never ahead of what is scored.
 pub struct TruthReader {
-    sources: Vec<(FolderReplay, Option<Frame>)>,
+    /// With what is taken off the stamps, nanoseconds, and the frame of the last time.
+    sources: Vec<(FolderReplay, i64, Option<Frame>)>,
+    window_nanos: u64,
 }
 
 impl TruthReader {
@@ -339,18 +347,21 @@ impl TruthReader {
         let with_masks = ids.iter().all(|id| args.dataset.join("mask").join(id.as_str()).is_dir());
         let options = FolderOptions { fps: args.fps, frames: args.frames.clone(), with_masks };
         let sources = FolderReplay::open(&args.dataset, Some(&ids), &options)?;
-        Ok(Self { sources: sources.into_iter().map(|source| (source, None)).collect() })
+        let lags = lags_nanos(args);
+        let lag = |id: &CameraId| lags.get(id).copied().unwrap_or_default();
+        let sources = sources.into_iter().zip(&ids).map(|(source, id)| (source, lag(id), None)).collect();
+        Ok(Self { sources, window_nanos: half_period_nanos(args) })
     }
 
-    /// Per held-out camera the frame nearest in time, within half the synchronisation window.
+    /// Per held-out camera the frame nearest in time, within half a frame period.
     pub fn at(&mut self, nanos: i64) -> Result<Vec<Option<&Frame>>> {
-        for (source, current) in &mut self.sources {
-            while current
-                .as_ref()
-                .is_none_or(|frame| frame.capture_nanos < nanos.saturating_sub_unsigned(SYNC_WINDOW_NANOS))
-            {
+        for (source, lag, current) in &mut self.sources {
+            let earliest = nanos.saturating_sub_unsigned(self.window_nanos);
+            while current.as_ref().is_none_or(|frame| frame.capture_nanos < earliest) {
                 match next_frame(source) {
-                    Ok(Some(frame)) => *current = Some(frame),
+                    Ok(Some(frame)) => {
+                        *current = Some(Frame { capture_nanos: frame.capture_nanos.saturating_sub(*lag), ..frame });
+                    }
                     Ok(None) => break,
                     Err(error) if error.kind == CaptureErrorKind::Corrupt => {
                         tracing::warn!("held-out {error}; that frame is not scored");
@@ -359,9 +370,25 @@ impl TruthReader {
                 }
             }
         }
-        let near = |frame: &&Frame| frame.capture_nanos.abs_diff(nanos) <= SYNC_WINDOW_NANOS;
-        Ok(self.sources.iter().map(|(_, frame)| frame.as_ref().filter(near)).collect())
+        let near = |frame: &&Frame| frame.capture_nanos.abs_diff(nanos) <= self.window_nanos;
+        Ok(self.sources.iter().map(|(_, _, frame)| frame.as_ref().filter(near)).collect())
     }
+}
+
+/// Cameras and their lags for the report.
+fn listed(lags: &[(String, f64)]) -> String {
+    let each: Vec<String> = lags.iter().map(|(camera, lag)| format!("{camera} {lag}")).collect();
+    if each.is_empty() { "none".to_owned() } else { each.join(", ") }
+}
+
+/// Half of the time from frame to frame: nearer than that a frame's set is unambiguous.
+fn half_period_nanos(args: &EvalArgs) -> u64 {
+    (0.5e9 / args.fps).ceil() as u64
+}
+
+/// What is taken off the stamps, by camera.
+fn lags_nanos(args: &EvalArgs) -> BTreeMap<CameraId, i64> {
+    run::lags_nanos(args.lags.iter().map(|(camera, lag)| (camera, lag)))
 }
 
 /// Number of a set's frames in the data set's file names.

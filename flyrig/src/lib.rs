@@ -30,6 +30,7 @@ mod record;
 mod report;
 mod run;
 mod score;
+mod silhouettes;
 mod sim_export;
 mod stats;
 mod stop;

@@ -1,6 +1,7 @@
 //! `flyrig run`: a rig that stays up.
 
 use std::{
+    collections::BTreeMap,
     path::Path,
     time::{Duration, Instant},
 };
@@ -51,7 +52,7 @@ pub struct Scene {
     template: Template,
     track: Option<flyrig_types::PoseTrack>,
     /// Empty pictures by slot, where there are any.
-    plates: Vec<Option<Image>>,
+    pub plates: Vec<Option<Image>>,
 }
 
 /// Runs the command; `recording` names a file that the cameras are recorded to, `show_table` draws the cameras' health.
@@ -239,7 +240,13 @@ pub fn sync_config(config: &Config) -> SyncConfig {
         master: (!config.sync.master.is_empty()).then(|| CameraId::from(config.sync.master.as_str())),
         window_nanos: (config.sync.window_ms > 0.0).then(|| nanos(config.sync.window_ms)),
         max_wait_nanos: nanos(config.sync.max_wait_ms),
+        lags_nanos: lags_nanos(&config.sync.lags_ms),
     }
+}
+
+/// Nanoseconds of the lags by camera.
+pub fn lags_nanos<'a>(lags_ms: impl IntoIterator<Item = (&'a String, &'a f64)>) -> BTreeMap<CameraId, i64> {
+    lags_ms.into_iter().map(|(camera, lag)| (camera.as_str().into(), (lag * 1e6).round() as i64)).collect()
 }
 
 fn learn_shape(estimator: &mut PoseEstimator, intake: &mut Intake) -> Result<()> {
@@ -272,6 +279,16 @@ fn learn_shape(estimator: &mut PoseEstimator, intake: &mut Intake) -> Result<()>
 
 /// Opens the cameras of a configuration; only simulated ones need the graphics adapter.
 pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Scene> {
+    let scene = open_source(config, gpu)?;
+    dataset::pick(
+        &scene.rig,
+        &config.sync.lags_ms.keys().cloned().collect::<Vec<_>>(),
+        "the rig, but in sync.lags_ms",
+    )?;
+    Ok(scene)
+}
+
+fn open_source(config: &Config, gpu: Option<&GpuContext>) -> Result<Scene> {
     let source = &config.source;
     if source.kind == SourceKind::Sim {
         let gpu = gpu.context("the simulated rig needs a graphics adapter")?;
@@ -332,6 +349,7 @@ pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Scene> {
     Ok(Scene { sources, rig, template, track, plates })
 }
 
-fn boxed<S: CameraSource + 'static>(sources: Vec<S>) -> Vec<Box<dyn CameraSource>> {
+/// Sources of one kind as the capture threads take them.
+pub fn boxed<S: CameraSource + 'static>(sources: Vec<S>) -> Vec<Box<dyn CameraSource>> {
     sources.into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect()
 }

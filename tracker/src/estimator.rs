@@ -137,6 +137,15 @@ impl PoseEstimator {
         Ok(())
     }
 
+    /// Looks for the person where a pose puts him at a time; false for a pose that does not fit the template.
+    pub fn start_from(&mut self, pose: &flyrig_types::Pose, nanos: i64) -> bool {
+        let Some(turns) = self.model.to_turns(pose) else { return false };
+        let marks = self.model.marks(&turns);
+        self.track = Some(Track { turns, nanos, marks, velocity: [DVec3::ZERO; LANDMARK_COUNT] });
+        self.lost = 0;
+        true
+    }
+
     /// Forgets the last pose: the next set is searched from nothing.
     pub fn reset(&mut self) {
         self.track = None;

@@ -48,6 +48,7 @@ fn leave_out(
     let mask = root.join("mask").join(CameraId::from(left_out.as_str()).as_str());
     ensure!(mask.is_dir(), "there are no masks of it; write them to {}", mask.display());
     let replay = EvalArgs {
+        lags: Vec::new(),
         dataset: root.to_owned(),
         inputs: cameras.iter().filter(|camera| *camera != left_out).cloned().collect(),
         holdout: vec![left_out.clone()],

@@ -1,0 +1,447 @@
+//! Constant lags between calibrated cameras out of the silhouettes of whoever moves before them.
+//!
+//! Planes through the centres of two cameras that touch a body touch its silhouettes in both pictures (epipolar tangency, e.g.
+//! Wong and Cipolla 2001; used for synchronisation by Sinha and Pollefeys 2004). How far the two outermost planes are turned
+//! is therefore the same for both cameras at one instant, whatever side they see: two curves over time for every pair of
+//! cameras that differ by nothing but the lag.
+
+use flyrig_types::{Camera, Mask};
+use glam::{DVec2, DVec3};
+
+use crate::LagEstimate;
+use crate::lags::{PairLag, balanced};
+
+/// Curves are compared every so many nanoseconds.
+const STEP: i64 = 4_000_000;
+/// Smallest sine of the angle between the line through two cameras and what they see: nearer to that line, planes through it
+/// tell little.
+const LEAST_APART: f64 = 0.35;
+/// A silhouette that is wider than this, radians around the line through both cameras, surrounds that line.
+const MOST_SPAN: f64 = 2.0;
+/// Samples that two curves must have in common, besides the lags that are tried: three quarters of a second.
+const LEAST_COMMON: usize = 187;
+/// Alternating stretches of time whose lags must agree, samples.
+const STRETCH: usize = 125;
+/// How much better than the mean of all lags a pair's best one must fit, 0 to 1.
+const LEAST_CONTRAST: f64 = 0.2;
+/// What a mask is believed to lean by where somebody moves, pixels.
+const LEANING_PX: f64 = 0.1;
+/// Standard error beyond which a lag is not told, nanoseconds.
+const MOST_ERROR: f64 = 5e6;
+/// Distance in robust standard deviations from which two curves are more likely to show different things.
+const SCALE: f64 = 1.5;
+/// Coverage of a pixel that is half covered.
+const HALF: f64 = 127.5;
+/// Lags looked for, at most, nanoseconds.
+const MOST: i64 = 1_000_000_000;
+
+/// A corner of the convex hull of a silhouette.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Corner {
+    /// Direction in the world.
+    ray: DVec3,
+    /// Whether the picture ends there, so that the silhouette may go on.
+    is_cut: bool,
+}
+
+/// Silhouettes of one camera over time.
+#[derive(Debug, Clone)]
+pub struct SilhouetteTrack {
+    camera: Camera,
+    /// Time, and the convex hull of the silhouette.
+    samples: Vec<(i64, Vec<Corner>)>,
+}
+
+impl SilhouetteTrack {
+    /// Of a camera, still empty.
+    #[must_use]
+    pub fn new(camera: &Camera) -> Self {
+        Self { camera: camera.clone(), samples: Vec::new() }
+    }
+
+    /// Adds the mask of a picture. Masks out of order, of another size than the camera's pictures, and empty ones are left
+    /// out.
+    pub fn add(&mut self, capture_nanos: i64, mask: &Mask) {
+        let is_late = self.samples.last().is_none_or(|(before, _)| *before < capture_nanos);
+        if is_late && [mask.width(), mask.height()] == self.camera.size() {
+            let hull = self.hull(mask);
+            if hull.len() > 2 {
+                self.samples.push((capture_nanos, hull));
+            }
+        }
+    }
+
+    /// Masks that were added.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.samples.len()
+    }
+
+    /// Whether no mask was added yet.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.samples.is_empty()
+    }
+
+    /// The convex hull of where coverage crosses one half, without the lens: lines that touch a silhouette touch its hull.
+    fn hull(&self, mask: &Mask) -> Vec<Corner> {
+        let rotation = self.camera.camera_from_world.rotation;
+        let mut points: Vec<(DVec2, bool)> = outline(mask)
+            .into_iter()
+            .filter_map(|(pixel, is_cut)| {
+                let ray = rotation * self.camera.ray(pixel)?;
+                (ray.z > 1e-3).then(|| (ray.truncate() / ray.z, is_cut))
+            })
+            .collect();
+        points.sort_by(|(a, _), (b, _)| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
+        let mut hull = half_hull(points.iter());
+        hull.extend(half_hull(points.iter().rev()));
+        let in_world = |(point, is_cut): (DVec2, bool)| Corner {
+            ray: (rotation.inverse() * point.extend(1.0)).normalize(),
+            is_cut,
+        };
+        hull.into_iter().map(in_world).collect()
+    }
+
+    /// Half of the median time between two masks, nanoseconds.
+    fn half_interval(&self) -> f64 {
+        let mut gaps: Vec<i64> = self.samples.windows(2).map(|pair| pair[1].0.saturating_sub(pair[0].0)).collect();
+        gaps.sort_unstable();
+        gaps.get(gaps.len() / 2).map_or(STEP as f64, |gap| *gap as f64 / 2.0)
+    }
+
+    fn span(&self) -> Option<(i64, i64)> {
+        Some((self.samples.first()?.0, self.samples.last()?.0))
+    }
+}
+
+/// Where coverage crosses one half between neighbouring pixels, and covered pixels on the picture's border; true where the
+/// silhouette may go on beyond that border.
+fn outline(mask: &Mask) -> Vec<(DVec2, bool)> {
+    let (width, height) = (mask.width() as usize, mask.height() as usize);
+    let at = |x: usize, y: usize| f64::from(mask.coverage()[y * width + x]);
+    let mut points = Vec::new();
+    for y in 0..height {
+        for x in 0..width {
+            let (here, place) = (at(x, y), DVec2::new(x as f64, y as f64));
+            let (on_side, on_end) = (x == 0 || x + 1 == width, y == 0 || y + 1 == height);
+            let mut crossing = |there: f64, to: DVec2, is_cut: bool| {
+                if (here < HALF) != (there < HALF) {
+                    points.push((place + to * ((HALF - here) / (there - here)), is_cut));
+                }
+            };
+            if x + 1 < width {
+                crossing(at(x + 1, y), DVec2::X, on_end);
+            }
+            if y + 1 < height {
+                crossing(at(x, y + 1), DVec2::Y, on_side);
+            }
+            if here >= HALF && (on_side || on_end) {
+                points.push((place, true));
+            }
+        }
+    }
+    points
+}
+
+/// Half of the convex hull of sorted points, without its last one (Andrew 1979).
+fn half_hull<'a>(points: impl Iterator<Item = &'a (DVec2, bool)>) -> Vec<(DVec2, bool)> {
+    let mut hull: Vec<(DVec2, bool)> = Vec::new();
+    for point in points {
+        while let [.., (a, _), (b, _)] = hull.as_slice()
+            && (*b - *a).perp_dot(point.0 - *b) <= 0.0
+        {
+            hull.pop();
+        }
+        hull.push(*point);
+    }
+    hull.pop();
+    hull
+}
+
+/// Lags of all cameras against the first one, each at most `most_nanos`; two cameras are enough. The correlation of an estimate
+/// is how much better than the mean of all lags the best one fits, 0 to 1; its disagreement the standard error, by the noise
+/// of the curves, by what pairs of cameras disagree on, and by what alternating half seconds disagree on. Nothing is told of a
+/// camera where that is more than 5 ms, or that has nothing in common with the first one (error infinite).
+#[must_use]
+pub fn estimate_silhouette_lags(tracks: &[SilhouetteTrack], most_nanos: i64) -> Vec<LagEstimate> {
+    let count = tracks.len();
+    let most = most_nanos.clamp(STEP, MOST);
+    let mut pairs: [Vec<PairLag>; 3] = Default::default();
+    let mut contrasts = vec![0.0f64; count];
+    for first in 0..count {
+        for second in first + 1..count {
+            for fit in fits(&tracks[first], &tracks[second], most) {
+                for (pairs, lag) in pairs.iter_mut().zip(fit.lags) {
+                    pairs.extend(lag.map(|lag| PairLag { first, second, lag, weight: fit.weight }));
+                }
+                for slot in [first, second] {
+                    contrasts[slot] = contrasts[slot].max(fit.contrast);
+                }
+            }
+        }
+    }
+    let [whole, even, odd] = pairs.each_ref().map(|pairs| balanced(count, pairs));
+    let errors = standard_errors(&whole, &pairs[0]);
+    (0..count)
+        .map(|slot| {
+            let of_times = match (even[slot].0, odd[slot].0) {
+                (Some(even), Some(odd)) => (even - odd).abs() / 2.0,
+                _ => 0.0,
+            };
+            let error = errors[slot].max(of_times);
+            LagEstimate {
+                camera: tracks[slot].camera.id.clone(),
+                lag_nanos: whole[slot].0.filter(|_| error <= MOST_ERROR).map(|lag| lag.round() as i64),
+                correlation: contrasts[slot],
+                disagreement_nanos: error,
+            }
+        })
+        .collect()
+}
+
+/// Standard errors of balanced lags: what the weights (inverse variances) promise, or more where the pairs disagree by more.
+fn standard_errors(lags: &[(Option<f64>, f64)], pairs: &[PairLag]) -> Vec<f64> {
+    // The first camera is at 0; one that nothing reaches is left out.
+    let unknown: Vec<usize> = (1..lags.len()).filter(|slot| lags[*slot].0.is_some()).collect();
+    let row = |slot: usize| unknown.iter().position(|known| *known == slot);
+    let mut normal = vec![vec![0.0; unknown.len()]; unknown.len()];
+    let mut chi_square = 0.0;
+    let mut used = 0;
+    for pair in pairs {
+        let (Some(first), Some(second)) = (lags[pair.first].0, lags[pair.second].0) else { continue };
+        used += 1;
+        chi_square += pair.weight * (second - first - pair.lag).powi(2);
+        let ends = [(row(pair.first), -1.0), (row(pair.second), 1.0)];
+        for (i, x) in ends {
+            for (j, y) in ends {
+                if let (Some(i), Some(j)) = (i, j) {
+                    normal[i][j] += pair.weight * x * y;
+                }
+            }
+        }
+    }
+    let spare = used - unknown.len().min(used);
+    let excess = if spare > 0 { (chi_square / spare as f64).max(1.0) } else { 1.0 };
+    let mut errors = vec![f64::INFINITY; lags.len()];
+    if let Some(first) = errors.first_mut() {
+        *first = 0.0;
+    }
+    for (i, slot) in unknown.iter().enumerate() {
+        errors[*slot] = variance(normal.clone(), i).map_or(f64::INFINITY, |variance| (variance * excess).sqrt());
+    }
+    errors
+}
+
+/// Entry of the inverse's diagonal (Gauss elimination); none where the matrix does not tell.
+fn variance(mut rows: Vec<Vec<f64>>, entry: usize) -> Option<f64> {
+    let n = rows.len();
+    for (i, row) in rows.iter_mut().enumerate() {
+        row.push(f64::from(u8::from(i == entry)));
+    }
+    for i in 0..n {
+        let pivot = (i..n).max_by(|a, b| rows[*a][i].abs().total_cmp(&rows[*b][i].abs()))?;
+        rows.swap(i, pivot);
+        let top = rows[i].clone();
+        for (_, row) in rows.iter_mut().enumerate().filter(|(j, _)| *j != i) {
+            let factor = row[i] / top[i];
+            row.iter_mut().zip(&top).for_each(|(value, top)| *value -= factor * top);
+        }
+    }
+    Some(rows[entry][n] / rows[entry][entry]).filter(|variance| *variance > 0.0 && variance.is_finite())
+}
+
+/// What one of the two curves of a pair of cameras tells.
+#[derive(Debug)]
+struct Fit {
+    /// How much later the second camera's stamps are, nanoseconds: by all of the time, by the even and by the odd stretches.
+    lags: [Option<f64>; 3],
+    /// How much better that lag fits than the mean of all.
+    contrast: f64,
+    /// Inverse variance of the lag, 1/ns².
+    weight: f64,
+}
+
+/// What the lowest and the highest tangents of two cameras tell, as far as they do.
+fn fits(a: &SilhouetteTrack, b: &SilhouetteTrack, most: i64) -> Vec<Fit> {
+    let (Some(pencil), Some((a0, a1)), Some((b0, b1))) = (Pencil::new(a, b), a.span(), b.span()) else {
+        return Vec::new();
+    };
+    let start = a0.max(b0);
+    let count = usize::try_from(a1.min(b1).saturating_sub(start) / STEP).unwrap_or(0).min(200_000);
+    let shifts = usize::try_from(most / STEP).unwrap_or(0);
+    if count < LEAST_COMMON + 2 * shifts {
+        return Vec::new();
+    }
+    let trust = Trust {
+        leaning: LEANING_PX * (1.0 / a.camera.intrinsics.focal_px.y + 1.0 / b.camera.intrinsics.focal_px.y) / 2.0,
+        apart_nanos: a.half_interval() + b.half_interval(),
+    };
+    let sides = pencil.tangents(a).into_iter().zip(pencil.tangents(b));
+    sides
+        .filter_map(|(a_side, b_side)| {
+            let a_curve = smoothed(&a_side, a.half_interval(), start, count);
+            let b_curve = smoothed(&b_side, b.half_interval(), start, count);
+            fit(&a_curve[shifts..count - shifts], &b_curve, &trust)
+        })
+        .collect()
+}
+
+/// How far curves are believed.
+struct Trust {
+    /// What masks lean by as somebody moves, radians.
+    leaning: f64,
+    /// Time from one independent sample to the next, nanoseconds.
+    apart_nanos: f64,
+}
+
+/// The lag between two curves that differ by noise and a constant, which calibration and masks are granted: where the mean
+/// robust (Geman-McClure) square of the difference is lowest. `b` goes on beyond `a` by equally many samples on both sides.
+fn fit(a: &[f64], b: &[f64], trust: &Trust) -> Option<Fit> {
+    let tries = b.len() - a.len() + 1;
+    let differences = |shift: usize| a.iter().zip(&b[shift..]).map(|(x, y)| y - x);
+    // What no lag can explain is noise.
+    let mut least = f64::INFINITY;
+    let mut centers = Vec::with_capacity(tries);
+    for shift in 0..tries {
+        let mut known: Vec<f64> = differences(shift).filter(|d| d.is_finite()).collect();
+        if known.len() * 2 < a.len() {
+            return None;
+        }
+        let center = median(&mut known)?;
+        known.iter_mut().for_each(|d| *d = (*d - center).abs());
+        least = least.min(median(&mut known)?);
+        centers.push(center);
+    }
+    let noise = (1.4826 * least).max(1e-7);
+    let square = |d: f64, center: f64| ((d - center) / (SCALE * noise)).powi(2);
+    let mut costs = [vec![0.0; tries], vec![0.0; tries]];
+    for (shift, center) in centers.iter().enumerate() {
+        let (mut sums, mut counts) = ([0.0; 2], [0usize; 2]);
+        for (i, d) in differences(shift).enumerate().filter(|(_, d)| d.is_finite()) {
+            let square = square(d, *center);
+            sums[i / STRETCH % 2] += square / (1.0 + square);
+            counts[i / STRETCH % 2] += 1;
+        }
+        for ((costs, sum), count) in costs.iter_mut().zip(sums).zip(counts) {
+            costs[shift] = sum / count.max(1) as f64;
+        }
+    }
+    let all: Vec<f64> = costs[0].iter().zip(&costs[1]).map(|(even, odd)| even + odd).collect();
+    let best = (0..tries).min_by(|x, y| all[*x].total_cmp(&all[*y]))?;
+    let contrast = 1.0 - all[best] / (all.iter().sum::<f64>() / tries as f64);
+    if contrast.is_nan() || contrast < LEAST_CONTRAST {
+        return None;
+    }
+    // Squared slopes of the samples that fit.
+    let steep: Vec<f64> = differences(best)
+        .zip(a.windows(3))
+        .filter(|(d, around)| d.is_finite() && around.iter().all(|value| value.is_finite()))
+        .map(|(d, around)| {
+            let slope = (around[2] - around[0]) / (2 * STEP) as f64;
+            slope * slope / (1.0 + square(d, centers[best])).powi(2)
+        })
+        .collect();
+    let sum: f64 = steep.iter().sum();
+    // Fisher information of a shift in white noise; masks lean while something moves, however long that is.
+    let of_noise = noise * noise / (sum * STEP as f64 / trust.apart_nanos);
+    let of_leaning = trust.leaning * trust.leaning * sum / steep.iter().map(|steep| steep * steep).sum::<f64>();
+    let variance = of_noise + of_leaning;
+    let lags = [lowest(&all), lowest(&costs[0]), lowest(&costs[1])];
+    (variance > 0.0 && variance.is_finite() && lags[0].is_some()).then_some(Fit {
+        lags,
+        contrast,
+        weight: 1.0 / variance,
+    })
+}
+
+/// Lag of the lowest cost, nanoseconds; none at the edge, which is a slope that goes on beyond.
+fn lowest(costs: &[f64]) -> Option<f64> {
+    let best = (0..costs.len()).min_by(|x, y| costs[*x].total_cmp(&costs[*y]))?;
+    let (before, after) = (costs.get(best.checked_sub(1)?)?, costs.get(best + 1)?);
+    let curve = before - 2.0 * costs[best] + after;
+    let fine = if curve > 0.0 { (0.5 * (before - after) / curve).clamp(-0.5, 0.5) } else { 0.0 };
+    Some((best as f64 + fine - (costs.len() / 2) as f64) * STEP as f64)
+}
+
+fn median(values: &mut [f64]) -> Option<f64> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// The planes through the centres of two cameras, by their angle.
+struct Pencil {
+    /// Angle 0 and a right angle, of length 1 and across the line through both cameras.
+    axes: [DVec3; 2],
+}
+
+impl Pencil {
+    /// None for cameras at one place, and for cameras that look at each other.
+    fn new(a: &SilhouetteTrack, b: &SilhouetteTrack) -> Option<Self> {
+        let line = (b.camera.position() - a.camera.position()).try_normalize()?;
+        let mean = |track: &SilhouetteTrack| {
+            track.samples.iter().flat_map(|(_, hull)| hull).map(|corner| corner.ray).sum::<DVec3>().try_normalize()
+        };
+        let ahead = ((mean(a)? + mean(b)?) / 2.0).reject_from_normalized(line);
+        let front = ahead.try_normalize().filter(|_| ahead.length() >= LEAST_APART)?;
+        Some(Self { axes: [front, line.cross(front)] })
+    }
+
+    /// Angles of the two outermost planes that touch the silhouettes, with their times.
+    fn tangents(&self, track: &SilhouetteTrack) -> [Vec<(i64, f64)>; 2] {
+        let mut sides: [Vec<(i64, f64)>; 2] = Default::default();
+        for (nanos, hull) in &track.samples {
+            let angles = hull
+                .iter()
+                .map(|corner| (corner.ray.dot(self.axes[1]).atan2(corner.ray.dot(self.axes[0])), corner.is_cut));
+            let lowest = angles.clone().min_by(|x, y| x.0.total_cmp(&y.0));
+            let highest = angles.max_by(|x, y| x.0.total_cmp(&y.0));
+            if let (Some(lowest), Some(highest)) = (lowest, highest)
+                && highest.0 - lowest.0 < MOST_SPAN
+            {
+                for (side, (angle, is_cut)) in sides.iter_mut().zip([lowest, highest]) {
+                    if !is_cut {
+                        side.push((*nanos, angle));
+                    }
+                }
+            }
+        }
+        sides
+    }
+}
+
+/// A curve every [`STEP`] from `start` on: lines fitted to what is near, so that between two samples there is no less noise than
+/// at them (which would draw the lags to the middle between two pictures). NaN where there are no samples on both sides.
+fn smoothed(samples: &[(i64, f64)], sigma: f64, start: i64, count: usize) -> Vec<f64> {
+    let reach = 3.0 * sigma;
+    let mut from = 0;
+    (0..count as i64)
+        .map(|i| {
+            let time = start.saturating_add(i * STEP);
+            let distance = |sample: &(i64, f64)| sample.0.saturating_sub(time) as f64;
+            while samples.get(from).is_some_and(|sample| distance(sample) < -reach) {
+                from += 1;
+            }
+            let near = samples[from..].iter().take_while(|sample| distance(sample) <= reach);
+            // Sums of the weighted least squares of value over distance.
+            let [mut w, mut d, mut dd, mut v, mut dv] = [0.0; 5];
+            let (mut before, mut after) = (false, false);
+            for sample in near {
+                let x = distance(sample) / sigma;
+                let weight = (-0.5 * x * x).exp();
+                (before, after) = (before || x <= 0.0, after || x >= 0.0);
+                w += weight;
+                d += weight * x;
+                dd += weight * x * x;
+                v += weight * sample.1;
+                dv += weight * x * sample.1;
+            }
+            let det = w * dd - d * d;
+            if before && after && det > 1e-9 { (dd * v - d * dv) / det } else { f64::NAN }
+        })
+        .collect()
+}
+
+#[cfg(test)]
+#[path = "silhouette_lags_tests.rs"]
+mod tests;
