@@ -57,10 +57,10 @@ struct Run {
 
 /// The sequence number of a frame is its tick.
 fn run(cameras: usize, arrivals: &[Arrival]) -> Run {
-    run_waiting(cameras, arrivals, SyncConfig::default().max_wait_nanos)
+    run_waiting(cameras, arrivals, None)
 }
 
-fn run_waiting(cameras: usize, arrivals: &[Arrival], max_wait_nanos: u64) -> Run {
+fn run_waiting(cameras: usize, arrivals: &[Arrival], max_wait_nanos: Option<u64>) -> Run {
     let ids = ids(cameras);
     let mut aligner = ClockAligner::new(&ids, None);
     let mut sync =
@@ -205,7 +205,7 @@ fn ten_percent_loss_is_counted_frame_by_frame() {
         Some(truth + truth / 1_000_000 * [0, 80, -80, 40][camera] + random.jitter(100_000))
     });
     // Longer than any camera loses frames in a row: one that is given up for silent may miss a set more.
-    let run = run_waiting(4, &frames, 300_000_000);
+    let run = run_waiting(4, &frames, Some(300_000_000));
     let missing: Vec<u64> =
         (1..4).map(|slot| run.sets.iter().filter(|set| set.frames[slot].is_none()).count() as u64).collect();
     assert_eq!(missing, lost[1..], "sets without a camera are the frames that it lost");

@@ -13,6 +13,10 @@ const MAX_PENDING: usize = 64;
 
 /// The window before the master's period is known: half a frame of 30 a second.
 const FIRST_WINDOW: u64 = 16_666_667;
+/// The least that a set waits for a camera whose delay is not told, nanoseconds: three frames of 30 a second.
+const LEAST_WAIT: u64 = 100_000_000;
+/// The most: one odd interval of a camera that has just started must not hold the rig up.
+const MOST_WAIT: u64 = 1_000_000_000;
 /// Intervals of a camera whose median is its period.
 const INTERVALS: usize = 9;
 
@@ -27,17 +31,18 @@ pub struct SyncConfig {
     /// Up to that the nearest set of a frame is unambiguous. A camera that goes on at the distance it had in the set before may be
     /// half as far again: one that runs half a period beside the master would fall out of every other set.
     pub window_nanos: Option<u64>,
-    /// Longest time, by the frames' own clock, that a set waits for a camera. A camera silent for
+    /// Longest time, by the frames' own clock, that a set waits for a camera; three of the master's periods, but 100 ms to
+    /// 1 s, when `None`. A camera silent for
     /// longer is waited for no more, and when it is the master, the next camera's clock takes over.
-    pub max_wait_nanos: u64,
+    pub max_wait_nanos: Option<u64>,
     /// By camera how much later its stamps are than those of the others; taken off before anything else.
     pub lags_nanos: BTreeMap<CameraId, i64>,
 }
 
 impl Default for SyncConfig {
-    /// A window of half a frame; waits for three frames of 30 a second.
+    /// A window of half a frame; waits for three frames.
     fn default() -> Self {
-        Self { master: None, window_nanos: None, max_wait_nanos: 100_000_000, lags_nanos: BTreeMap::new() }
+        Self { master: None, window_nanos: None, max_wait_nanos: None, lags_nanos: BTreeMap::new() }
     }
 }
 
@@ -93,6 +98,8 @@ pub struct Synchronizer {
     /// Whether the window is half of the master's period.
     follows_period: bool,
     max_wait: u64,
+    /// Whether [`Self::max_wait`] is of the master's period.
+    waits_periods: bool,
     /// Time of the first frame ever: cameras not seen yet are silent since then.
     first_nanos: Option<i64>,
     last_set: Option<(i64, usize)>,
@@ -177,7 +184,8 @@ impl Synchronizer {
             clock_order,
             window: config.window_nanos.unwrap_or(FIRST_WINDOW),
             follows_period: config.window_nanos.is_none(),
-            max_wait: config.max_wait_nanos,
+            max_wait: config.max_wait_nanos.unwrap_or(LEAST_WAIT),
+            waits_periods: config.max_wait_nanos.is_none(),
             first_nanos: None,
             last_set: None,
             sets: 0,
@@ -240,8 +248,14 @@ impl Synchronizer {
         if camera.intervals.len() > INTERVALS {
             camera.intervals.pop_front();
         }
-        let period = camera.period().filter(|_| self.follows_period && self.clock_order.first() == Some(&slot));
-        self.window = period.map_or(self.window, |period| period / 2);
+        if let Some(period) = camera.period().filter(|_| self.clock_order.first() == Some(&slot)) {
+            if self.follows_period {
+                self.window = period / 2;
+            }
+            if self.waits_periods {
+                self.max_wait = period.saturating_mul(3).clamp(LEAST_WAIT, MOST_WAIT);
+            }
+        }
         if camera.used == Some(nanos) || camera.pending.contains_key(&nanos) {
             dropped.duplicate += 1;
         } else if outdated || camera.used.is_some_and(|used| nanos < used) {

@@ -20,7 +20,7 @@ pub(crate) fn frame(camera: &str, capture_nanos: i64) -> Frame {
 fn synchronizer(window_ms: u64, max_wait_ms: u64) -> Synchronizer {
     let config = SyncConfig {
         window_nanos: Some(window_ms * 1_000_000),
-        max_wait_nanos: max_wait_ms * 1_000_000,
+        max_wait_nanos: Some(max_wait_ms * 1_000_000),
         ..SyncConfig::default()
     };
     Synchronizer::new(&["a".into(), "b".into(), "c".into()], &config)
@@ -80,7 +80,7 @@ fn cameras_slower_than_the_wait_still_make_complete_sets() {
 
 #[test]
 fn a_camera_slower_than_the_wait_is_no_wild_one() {
-    let mut sync = Synchronizer::new(&["a".into()], &SyncConfig { max_wait_nanos: 0, ..SyncConfig::default() });
+    let mut sync = Synchronizer::new(&["a".into()], &SyncConfig { max_wait_nanos: Some(0), ..SyncConfig::default() });
     let mut sets = Vec::new();
     for i in 0..10 {
         sets.extend(sync.push(frame("a", i * 5000 * MS)));
@@ -293,7 +293,12 @@ fn the_ends_of_time_do_not_overflow() {
     for (window_nanos, max_wait_nanos) in [(0, 0), (u64::MAX, u64::MAX), (5, 0), (0, 5)] {
         for times in [wild, growing] {
             let window_nanos = Some(window_nanos);
-            let config = SyncConfig { master: Some("b".into()), window_nanos, max_wait_nanos, ..SyncConfig::default() };
+            let config = SyncConfig {
+                master: Some("b".into()),
+                window_nanos,
+                max_wait_nanos: Some(max_wait_nanos),
+                ..SyncConfig::default()
+            };
             let mut sync = Synchronizer::new(&["a".into(), "b".into()], &config);
             let mut sets = Vec::new();
             for nanos in times {
@@ -337,4 +342,22 @@ fn a_lag_that_is_known_is_taken_off() {
         let times: Vec<i64> = set.present().map(|(_, frame)| frame.capture_nanos).collect();
         assert_eq!(times, [set.master_nanos; 2]);
     }
+}
+
+#[test]
+fn a_slow_master_that_loses_a_frame_stays_master() {
+    // Ten frames a second, 30 beside: 200 ms without the master are one lost frame, not silence.
+    let ids = ["slow".into(), "fast".into()];
+    let mut sync = Synchronizer::new(&ids, &SyncConfig::default());
+    let mut sets = Vec::new();
+    for n in 0..120i64 {
+        let nanos = n * 33_333_333;
+        sets.extend(sync.push(frame("fast", nanos)));
+        if n % 3 == 0 && n != 60 {
+            sets.extend(sync.push(frame("slow", nanos)));
+        }
+    }
+    sets.extend(sync.flush());
+    assert_eq!(sets.len(), 39, "the fast camera led");
+    assert!(sets.iter().all(|set| set.kind() == SetKind::Complete));
 }

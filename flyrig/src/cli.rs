@@ -111,6 +111,10 @@ pub struct ReplayArgs {
     /// Write the synchronised pictures and the calibration into this new folder (EasyMocap layout).
     #[arg(long)]
     pub export: Option<PathBuf>,
+    /// How much later than the others' a camera's stamps are, milliseconds, as CAM=MS; may be given again. `flyrig sync-check`
+    /// tells it.
+    #[arg(long = "lag", value_name = "CAM=MS", value_parser = parse_lag)]
+    pub lags: Vec<(String, f64)>,
 }
 
 #[derive(Debug, Args)]
@@ -452,10 +456,10 @@ pub struct WatchArgs {
     #[arg(long, default_value = "main")]
     pub view: String,
     /// Ask for a viewpoint of your own: camera position x,y,z in metres of the rig's world.
-    #[arg(long, value_parser = parse_vec3, allow_hyphen_values = true)]
+    #[arg(long, value_parser = parse_vec3)]
     pub eye: Option<[f64; 3]>,
     /// Point that the viewpoint of --eye looks at.
-    #[arg(long, value_parser = parse_vec3, allow_hyphen_values = true, default_value = "0,0,1")]
+    #[arg(long, value_parser = parse_vec3, default_value = "0,0,1")]
     pub target: [f64; 3],
     /// Size of the viewpoint of --eye, WIDTHxHEIGHT.
     #[arg(long, value_parser = parse_size, default_value = "512x512")]
@@ -518,7 +522,7 @@ pub struct EvalArgs {
     pub fps: f64,
     /// How much later than the others' a camera's stamps are, milliseconds, as CAM=MS; may be given again. `flyrig sync-check`
     /// tells it.
-    #[arg(long = "lag", value_name = "CAM=MS", value_parser = parse_lag, allow_hyphen_values = true)]
+    #[arg(long = "lag", value_name = "CAM=MS", value_parser = parse_lag)]
     pub lags: Vec<(String, f64)>,
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000)]

@@ -145,7 +145,7 @@ impl Default for SyncSection {
         Self {
             window_ms: 0.0,
             lags_ms: BTreeMap::new(),
-            max_wait_ms: 100.0,
+            max_wait_ms: 0.0,
             master: String::new(),
             clocks: ClockKind::Shared,
         }

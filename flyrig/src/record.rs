@@ -23,7 +23,7 @@ use foxglove::{
 use crate::{
     cli::{RecordArgs, ReplayArgs},
     config::Config,
-    png, pose_recording,
+    dataset, png, pose_recording,
     report::write_whole,
     run::{self, Scene},
     stop,
@@ -142,7 +142,10 @@ pub fn replay(args: &ReplayArgs) -> Result<()> {
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     let threads_config = ThreadsConfig { queue_capacity: 4 * ids.len().max(1), pacing: Pacing::Lossless };
     let threads = CaptureThreads::start(replay_sources(&args.recording, &rig)?, threads_config)?;
-    let mut sync = Synchronizer::new(&ids, &SyncConfig::default());
+    let named: Vec<String> = args.lags.iter().map(|(camera, _)| camera.clone()).collect();
+    dataset::pick(&rig, &named, "the recording, but in --lag")?;
+    let lags_nanos = run::lags_nanos(args.lags.iter().map(|(camera, lag)| (camera, lag)));
+    let mut sync = Synchronizer::new(&ids, &SyncConfig { lags_nanos, ..SyncConfig::default() });
     if let Some(folder) = &args.export {
         ensure!(!folder.exists(), "{} is there already; name a new folder", folder.display());
         for id in &ids {

@@ -239,7 +239,7 @@ pub fn sync_config(config: &Config) -> SyncConfig {
     SyncConfig {
         master: (!config.sync.master.is_empty()).then(|| CameraId::from(config.sync.master.as_str())),
         window_nanos: (config.sync.window_ms > 0.0).then(|| nanos(config.sync.window_ms)),
-        max_wait_nanos: nanos(config.sync.max_wait_ms),
+        max_wait_nanos: (config.sync.max_wait_ms > 0.0).then(|| nanos(config.sync.max_wait_ms)),
         lags_nanos: lags_nanos(&config.sync.lags_ms),
     }
 }

@@ -139,7 +139,8 @@ fn by_silhouettes(
     let mut silhouettes = Silhouettes::new(rig, plates, given_masks)?;
     // One camera may be ahead by as much as another is behind.
     let most_nanos = (args.most_ms * 1e6) as u64;
-    let sync = &SyncConfig { max_wait_nanos: sync.max_wait_nanos + 2 * most_nanos, ..sync.clone() };
+    let max_wait_nanos = Some(sync.max_wait_nanos.unwrap_or(100_000_000) + 2 * most_nanos);
+    let sync = &SyncConfig { max_wait_nanos, ..sync.clone() };
     let mut intake = Intake::start(sources, Pictures::OfRig(rig), sync, ClockKind::Shared, Pacing::Lossless)?;
     let bar = progress_bar((args.seconds * 1e3) as u64, "silhouettes, ms of the take");
     let mut first = None;
