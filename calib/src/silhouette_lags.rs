@@ -22,8 +22,8 @@ const MOST_SPAN: f64 = 2.0;
 const LEAST_COMMON: usize = 187;
 /// Alternating stretches of time whose lags must agree, samples.
 const STRETCH: usize = 125;
-/// How much better than the mean of all lags a pair's best one must fit, 0 to 1.
-const LEAST_CONTRAST: f64 = 0.2;
+/// How much better than the mean of all lags a pair's best one must fit, 0 to 1: below, masks of too small pictures lead astray.
+const LEAST_CONTRAST: f64 = 0.3;
 /// What a mask is believed to lean by where somebody moves, pixels.
 const LEANING_PX: f64 = 0.1;
 /// Standard error beyond which a lag is not told, nanoseconds.

@@ -1,0 +1,64 @@
+//! A camera's lag is found, and taken off where it is told.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
+
+use flyrig_tests::run;
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
+
+const RIG: &str = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = []\n\
+    [sim]\nwidth = 112\nheight = 112\ntexture_px = 64\nframes = 75\ncameras.count = 3\nmotion.kind = \"jump\"\n\
+    [[sim.faults.fault]]\nkind = \"offset\"\ncamera = \"02\"\nms = 45.0\n";
+
+/// Lags in milliseconds by camera as a report tells them.
+fn lags(report: &str) -> Vec<(String, f64)> {
+    let line = |line: &str| {
+        let mut words = line.split_whitespace();
+        let (camera, _frames, lag) = (words.next()?, words.next()?.parse::<u32>().ok()?, words.next()?);
+        Some((camera.to_owned(), lag.parse().unwrap_or(f64::NAN)))
+    };
+    report.lines().filter_map(line).collect()
+}
+
+#[test]
+fn a_lag_is_found_and_taken_off() {
+    let folder = tempfile::tempdir().unwrap();
+    let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    let check = |tail: &str, truth: [f64; 3]| {
+        std::fs::write(folder.path().join("rig.toml"), format!("{RIG}{tail}")).unwrap();
+        let checked = command(&["sync-check", "rig.toml", "--most-ms", "150"]);
+        assert_eq!(checked.code, Some(0), "{checked:?}");
+        assert!(checked.stdout.contains("by silhouettes"), "{}", checked.stdout);
+        let found = lags(&checked.stdout);
+        assert_eq!(found.len(), 3, "{}", checked.stdout);
+        for ((camera, lag), truth) in found.iter().zip(truth) {
+            assert!((lag - truth).abs() <= 2.0, "{camera}: {lag} ms in place of {truth}\n{}", checked.stdout);
+        }
+    };
+    check("", [0.0, 0.0, 45.0]);
+    check("[sync]\nlags_ms = { \"02\" = 45.0 }\n", [0.0; 3]);
+
+    std::fs::write(folder.path().join("rig.toml"), format!("{RIG}[sync]\nlags_ms = {{ side = 45.0 }}\n")).unwrap();
+    let unknown = command(&["sync-check", "rig.toml"]);
+    assert_eq!(unknown.code, Some(1), "{unknown:?}");
+    assert!(unknown.stderr.contains("camera side is not in the rig, but in sync.lags_ms"), "{}", unknown.stderr);
+}
+
+#[test]
+fn what_cannot_be_checked_is_refused_in_words() {
+    let folder = tempfile::tempdir().unwrap();
+    let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    let refused = |args: &[&str], text: &str| {
+        let refused = command(args);
+        assert_ne!(refused.code, Some(0), "{refused:?}");
+        assert!(refused.stderr.contains(text), "{args:?}: {}", refused.stderr);
+    };
+    refused(&["sync-check", "nowhere"], "nowhere is no configuration, recording or folder");
+    refused(&["sync-check", "nowhere.mcap"], "nowhere.mcap");
+    std::fs::create_dir_all(folder.path().join("one/images/00")).unwrap();
+    refused(&["sync-check", "one"], "00");
+    refused(&["replay", "take.mcap", "--lag", "02"], "is no camera with its lag in milliseconds");
+    refused(
+        &["eval", "one", "--inputs", "0", "--holdout", "1", "--out", "o", "--lag", "02=nan"],
+        "is no camera with its lag",
+    );
+}
