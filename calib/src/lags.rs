@@ -178,37 +178,79 @@ pub(crate) struct PairLag {
     pub weight: f64,
 }
 
-/// Of every camera the lag after the first one that its pairs agree on best (weighted least squares), where pairs reach it, and
-/// the root mean square of what they disagree by.
-pub(crate) fn balanced(count: usize, pairs: &[PairLag]) -> Vec<(Option<f64>, f64)> {
-    // Gauss-Seidel: each camera where its partners want it. The first one stays at 0.
-    let mut lags = vec![0.0; count];
+/// What the pairs tell of one camera.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Balance {
+    /// Nanoseconds after the first camera; none where no pairs reach it.
+    pub lag: Option<f64>,
+    /// The lag's variance if the weights are inverse variances.
+    pub variance: f64,
+    /// Root mean square of what its pairs disagree by, nanoseconds.
+    pub disagreement: f64,
+}
+
+/// The lags that the pairs agree on best: weighted least squares with the first camera at 0.
+pub(crate) fn balanced(count: usize, pairs: &[PairLag]) -> Vec<Balance> {
     let mut reached = vec![false; count];
     if let Some(first) = reached.first_mut() {
         *first = true;
     }
-    for _ in 0..200 {
-        for slot in 1..count {
-            let (mut sum, mut weights) = (0.0, 0.0);
-            for pair in pairs {
-                let wish = match (pair.first == slot, pair.second == slot) {
-                    (true, false) if reached[pair.second] => lags[pair.second] - pair.lag,
-                    (false, true) if reached[pair.first] => lags[pair.first] + pair.lag,
-                    _ => continue,
-                };
-                (sum, weights) = (sum + pair.weight * wish, weights + pair.weight);
-            }
-            if weights > 0.0 {
-                (lags[slot], reached[slot]) = (sum / weights, true);
+    for _ in 0..count {
+        for pair in pairs {
+            let either = reached[pair.first] || reached[pair.second];
+            (reached[pair.first], reached[pair.second]) = (either, either);
+        }
+    }
+    let unknown: Vec<usize> = (1..count).filter(|slot| reached[*slot]).collect();
+    let row = |slot: usize| unknown.iter().position(|known| *known == slot);
+    // The normal equations, their right side, and the unit matrix that becomes their inverse.
+    let n = unknown.len();
+    let mut rows = vec![vec![0.0; 2 * n + 1]; n];
+    for (i, row) in rows.iter_mut().enumerate() {
+        row[n + 1 + i] = 1.0;
+    }
+    for pair in pairs {
+        let ends = [(row(pair.first), -1.0), (row(pair.second), 1.0)];
+        for (i, x) in ends.iter().filter_map(|(i, x)| Some(((*i)?, x))) {
+            rows[i][n] += pair.weight * x * pair.lag;
+            for (j, y) in ends.iter().filter_map(|(j, y)| Some(((*j)?, y))) {
+                rows[i][j] += pair.weight * x * y;
             }
         }
     }
-    let disagreement = |slot: usize| {
+    eliminate(&mut rows);
+    let mut out = vec![Balance::default(); count];
+    if let Some(first) = out.first_mut() {
+        first.lag = Some(0.0);
+    }
+    for (i, slot) in unknown.into_iter().enumerate() {
+        let (lag, variance) = (rows[i][n], rows[i][n + 1 + i]);
+        out[slot].lag = Some(lag).filter(|_| lag.is_finite() && variance > 0.0 && variance.is_finite());
+        out[slot].variance = variance;
+    }
+    for slot in 0..count {
         let of_slot = pairs.iter().filter(|pair| pair.first == slot || pair.second == slot);
-        let squares: Vec<f64> = of_slot.map(|pair| (lags[pair.second] - lags[pair.first] - pair.lag).powi(2)).collect();
-        (squares.iter().fold(0.0, |sum, square| sum + square) / squares.len().max(1) as f64).sqrt()
-    };
-    (0..count).map(|slot| (reached[slot].then_some(lags[slot]), disagreement(slot))).collect()
+        let squares: Vec<f64> = of_slot
+            .filter_map(|pair| Some((out[pair.second].lag? - out[pair.first].lag? - pair.lag).powi(2)))
+            .collect();
+        out[slot].disagreement = (squares.iter().fold(0.0, |sum, x| sum + x) / squares.len().max(1) as f64).sqrt();
+    }
+    out
+}
+
+/// Gauss-Jordan: the left square becomes the unit matrix, as far as it tells.
+fn eliminate(rows: &mut [Vec<f64>]) {
+    for i in 0..rows.len() {
+        let pivot = (i..rows.len()).max_by(|a, b| rows[*a][i].abs().total_cmp(&rows[*b][i].abs())).unwrap_or(i);
+        rows.swap(i, pivot);
+        let scale = rows[i][i];
+        rows[i].iter_mut().for_each(|value| *value /= scale);
+        let top = rows[i].clone();
+        for (_, row) in rows.iter_mut().enumerate().filter(|(j, _)| *j != i) {
+            let factor = row[i];
+            row.iter_mut().zip(&top).for_each(|(value, top)| *value -= factor * top);
+        }
+    }
 }
 
 /// Of every camera the lag after the first one that its pairs agree on, and what they disagree by. A pair is two cameras, how
@@ -226,11 +268,11 @@ fn settled(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>
         .collect();
     let lags = balanced(count, &known);
     // All lags are counted from the first camera: what it disagrees on is in each of them.
-    let of_first = lags.first().map_or(0.0, |first| first.1);
+    let of_first = lags.first().map_or(0.0, |first| first.disagreement);
     let sure = |slot: usize, disagreement: f64| slot == 0 || disagreement.max(of_first) <= MOST_DISAGREEMENT;
     lags.into_iter()
         .enumerate()
-        .map(|(slot, (lag, disagreement))| (lag.filter(|_| sure(slot, disagreement)), disagreement))
+        .map(|(slot, Balance { lag, disagreement, .. })| (lag.filter(|_| sure(slot, disagreement)), disagreement))
         .collect()
 }
 

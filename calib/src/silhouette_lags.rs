@@ -9,7 +9,7 @@ use flyrig_types::{Camera, Mask};
 use glam::{DVec2, DVec3};
 
 use crate::LagEstimate;
-use crate::lags::{PairLag, balanced};
+use crate::lags::{Balance, PairLag, balanced};
 
 /// Curves are compared every so many nanoseconds.
 const STEP: i64 = 4_000_000;
@@ -28,6 +28,10 @@ const LEAST_CONTRAST: f64 = 0.3;
 const LEANING_PX: f64 = 0.1;
 /// Standard error beyond which a lag is not told, nanoseconds.
 const MOST_ERROR: f64 = 5e6;
+/// Samples of a kind of stretches below which their lag is not asked for.
+const LEAST_STRETCH: usize = 30;
+/// How near to the best fit, of what the mean lag lacks, another lag makes it doubtful.
+const AMBIGUOUS: f64 = 0.25;
 /// Distance in robust standard deviations from which two curves are more likely to show different things.
 const SCALE: f64 = 1.5;
 /// Coverage of a pixel that is half covered.
@@ -159,7 +163,7 @@ fn half_hull<'a>(points: impl Iterator<Item = &'a (DVec2, bool)>) -> Vec<(DVec2,
     hull
 }
 
-/// Lags of all cameras against the first one, each at most `most_nanos`; two cameras are enough. The correlation of an estimate
+/// Lags of all cameras against the first one, of two cameras at most `most_nanos` (at most 1 s); two cameras are enough. The correlation of an estimate
 /// is how much better than the mean of all lags the best one fits, 0 to 1; its disagreement the standard error, by the noise
 /// of the curves, by what pairs of cameras disagree on, and by what alternating half seconds disagree on. Nothing is told of a
 /// camera where that is more than 5 ms, or that has nothing in common with the first one (error infinite).
@@ -185,14 +189,15 @@ pub fn estimate_silhouette_lags(tracks: &[SilhouetteTrack], most_nanos: i64) -> 
     let errors = standard_errors(&whole, &pairs[0]);
     (0..count)
         .map(|slot| {
-            let of_times = match (even[slot].0, odd[slot].0) {
+            let of_times = match (even[slot].lag, odd[slot].lag) {
                 (Some(even), Some(odd)) => (even - odd).abs() / 2.0,
-                _ => 0.0,
+                // Half of the time tells nothing, or of a lag beyond those that are tried.
+                _ => f64::INFINITY,
             };
             let error = errors[slot].max(of_times);
             LagEstimate {
                 camera: tracks[slot].camera.id.clone(),
-                lag_nanos: whole[slot].0.filter(|_| error <= MOST_ERROR).map(|lag| lag.round() as i64),
+                lag_nanos: whole[slot].lag.filter(|_| error <= MOST_ERROR).map(|lag| lag.round() as i64),
                 correlation: contrasts[slot],
                 disagreement_nanos: error,
             }
@@ -201,54 +206,15 @@ pub fn estimate_silhouette_lags(tracks: &[SilhouetteTrack], most_nanos: i64) -> 
 }
 
 /// Standard errors of balanced lags: what the weights (inverse variances) promise, or more where the pairs disagree by more.
-fn standard_errors(lags: &[(Option<f64>, f64)], pairs: &[PairLag]) -> Vec<f64> {
-    // The first camera is at 0; one that nothing reaches is left out.
-    let unknown: Vec<usize> = (1..lags.len()).filter(|slot| lags[*slot].0.is_some()).collect();
-    let row = |slot: usize| unknown.iter().position(|known| *known == slot);
-    let mut normal = vec![vec![0.0; unknown.len()]; unknown.len()];
-    let mut chi_square = 0.0;
-    let mut used = 0;
-    for pair in pairs {
-        let (Some(first), Some(second)) = (lags[pair.first].0, lags[pair.second].0) else { continue };
-        used += 1;
-        chi_square += pair.weight * (second - first - pair.lag).powi(2);
-        let ends = [(row(pair.first), -1.0), (row(pair.second), 1.0)];
-        for (i, x) in ends {
-            for (j, y) in ends {
-                if let (Some(i), Some(j)) = (i, j) {
-                    normal[i][j] += pair.weight * x * y;
-                }
-            }
-        }
-    }
-    let spare = used - unknown.len().min(used);
-    let excess = if spare > 0 { (chi_square / spare as f64).max(1.0) } else { 1.0 };
-    let mut errors = vec![f64::INFINITY; lags.len()];
-    if let Some(first) = errors.first_mut() {
-        *first = 0.0;
-    }
-    for (i, slot) in unknown.iter().enumerate() {
-        errors[*slot] = variance(normal.clone(), i).map_or(f64::INFINITY, |variance| (variance * excess).sqrt());
-    }
-    errors
-}
-
-/// Entry of the inverse's diagonal (Gauss elimination); none where the matrix does not tell.
-fn variance(mut rows: Vec<Vec<f64>>, entry: usize) -> Option<f64> {
-    let n = rows.len();
-    for (i, row) in rows.iter_mut().enumerate() {
-        row.push(f64::from(u8::from(i == entry)));
-    }
-    for i in 0..n {
-        let pivot = (i..n).max_by(|a, b| rows[*a][i].abs().total_cmp(&rows[*b][i].abs()))?;
-        rows.swap(i, pivot);
-        let top = rows[i].clone();
-        for (_, row) in rows.iter_mut().enumerate().filter(|(j, _)| *j != i) {
-            let factor = row[i] / top[i];
-            row.iter_mut().zip(&top).for_each(|(value, top)| *value -= factor * top);
-        }
-    }
-    Some(rows[entry][n] / rows[entry][entry]).filter(|variance| *variance > 0.0 && variance.is_finite())
+fn standard_errors(lags: &[Balance], pairs: &[PairLag]) -> Vec<f64> {
+    let squares: Vec<f64> = pairs
+        .iter()
+        .filter_map(|pair| Some(pair.weight * (lags[pair.second].lag? - lags[pair.first].lag? - pair.lag).powi(2)))
+        .collect();
+    let unknown = lags.iter().skip(1).filter(|lag| lag.lag.is_some()).count();
+    let spare = squares.len().saturating_sub(unknown);
+    let excess = if spare > 0 { (squares.iter().sum::<f64>() / spare as f64).max(1.0) } else { 1.0 };
+    lags.iter().map(|lag| lag.lag.map_or(f64::INFINITY, |_| (lag.variance * excess).sqrt())).collect()
 }
 
 /// What one of the two curves of a pair of cameras tells.
@@ -275,7 +241,8 @@ fn fits(a: &SilhouetteTrack, b: &SilhouetteTrack, most: i64) -> Vec<Fit> {
     }
     let trust = Trust {
         leaning: LEANING_PX * (1.0 / a.camera.intrinsics.focal_px.y + 1.0 / b.camera.intrinsics.focal_px.y) / 2.0,
-        apart_nanos: a.half_interval() + b.half_interval(),
+        // Smoothing by a Gaussian of half an interval leaves white noise as alike as samples so far apart.
+        apart_nanos: std::f64::consts::PI.sqrt() * (a.half_interval() + b.half_interval()),
     };
     let sides = pencil.tangents(a).into_iter().zip(pencil.tangents(b));
     sides
@@ -316,6 +283,7 @@ fn fit(a: &[f64], b: &[f64], trust: &Trust) -> Option<Fit> {
     let noise = (1.4826 * least).max(1e-7);
     let square = |d: f64, center: f64| ((d - center) / (SCALE * noise)).powi(2);
     let mut costs = [vec![0.0; tries], vec![0.0; tries]];
+    let mut all = vec![0.0; tries];
     for (shift, center) in centers.iter().enumerate() {
         let (mut sums, mut counts) = ([0.0; 2], [0usize; 2]);
         for (i, d) in differences(shift).enumerate().filter(|(_, d)| d.is_finite()) {
@@ -324,13 +292,14 @@ fn fit(a: &[f64], b: &[f64], trust: &Trust) -> Option<Fit> {
             counts[i / STRETCH % 2] += 1;
         }
         for ((costs, sum), count) in costs.iter_mut().zip(sums).zip(counts) {
-            costs[shift] = sum / count.max(1) as f64;
+            // Few samples fit anything.
+            costs[shift] = if count < LEAST_STRETCH { f64::NAN } else { sum / count as f64 };
         }
+        all[shift] = (sums[0] + sums[1]) / (counts[0] + counts[1]).max(1) as f64;
     }
-    let all: Vec<f64> = costs[0].iter().zip(&costs[1]).map(|(even, odd)| even + odd).collect();
     let best = (0..tries).min_by(|x, y| all[*x].total_cmp(&all[*y]))?;
     let contrast = 1.0 - all[best] / (all.iter().sum::<f64>() / tries as f64);
-    if contrast.is_nan() || contrast < LEAST_CONTRAST {
+    if contrast.is_nan() || contrast < LEAST_CONTRAST || is_ambiguous(&all, best) {
         return None;
     }
     // Squared slopes of the samples that fit.
@@ -355,8 +324,21 @@ fn fit(a: &[f64], b: &[f64], trust: &Trust) -> Option<Fit> {
     })
 }
 
-/// Lag of the lowest cost, nanoseconds; none at the edge, which is a slope that goes on beyond.
+/// Whether another lag fits nearly as well, as when somebody moves regularly: `AMBIGUOUS` of the way from the best to the mean.
+fn is_ambiguous(costs: &[f64], best: usize) -> bool {
+    let mean = costs.iter().sum::<f64>() / costs.len() as f64;
+    let nearly = costs[best] + AMBIGUOUS * (mean - costs[best]);
+    // Out of the valley of the best, and down again.
+    let falls_again =
+        |costs: &mut dyn Iterator<Item = &f64>| costs.skip_while(|cost| **cost <= nearly).any(|cost| *cost <= nearly);
+    falls_again(&mut costs[best..].iter()) || falls_again(&mut costs[..=best].iter().rev())
+}
+
+/// Lag of the lowest cost, nanoseconds; none at the edge, which is a slope that goes on beyond, and where a cost is not known.
 fn lowest(costs: &[f64]) -> Option<f64> {
+    if costs.iter().any(|cost| cost.is_nan()) {
+        return None;
+    }
     let best = (0..costs.len()).min_by(|x, y| costs[*x].total_cmp(&costs[*y]))?;
     let (before, after) = (costs.get(best.checked_sub(1)?)?, costs.get(best + 1)?);
     let curve = before - 2.0 * costs[best] + after;

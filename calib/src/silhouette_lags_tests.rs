@@ -209,3 +209,42 @@ fn too_little_and_senseless_input_is_borne() {
     let lags: Vec<_> = estimate_silhouette_lags(&twice, i64::MAX).into_iter().map(|e| e.lag_nanos).collect();
     assert_eq!(lags, [Some(0), None, None, None]);
 }
+
+#[test]
+fn regular_movement_has_more_than_one_lag_and_none_is_told() {
+    let cameras = ring(2);
+    let rays: Vec<Vec<DVec3>> = cameras.iter().map(rays).collect();
+    let told = |rate: f64| {
+        let tracks: Vec<SilhouetteTrack> = (cameras.iter().zip(&rays))
+            .map(|(camera, rays)| {
+                let mut track = SilhouetteTrack::new(camera);
+                for n in 0..240 {
+                    let height = 1.0 + 0.2 * (rate * (n * PERIOD) as f64 * 1e-9).sin();
+                    track.add(n * PERIOD, &mask(camera, rays, &[(DVec3::new(0.0, 0.0, height), 0.4)]));
+                }
+                track
+            })
+            .collect();
+        estimate_silhouette_lags(&tracks, 250_000_000)[1].lag_nanos
+    };
+    // Five times a second, and once in two seconds, of which half a second either way shows no second one.
+    assert_eq!(told(31.4), None);
+    assert!(told(3.0).is_some_and(|lag| lag.abs() < 2_000_000));
+}
+
+#[test]
+fn pairs_are_joined_by_their_weights() {
+    // Four cameras that know each other well, and the first one badly: the mean of what it says counts.
+    let mut pairs: Vec<PairLag> = [10.0, -6.0, -5.0, -7.0]
+        .into_iter()
+        .enumerate()
+        .map(|(i, lag)| PairLag { first: 0, second: i + 1, lag, weight: 1.0 })
+        .collect();
+    for first in 1..5 {
+        pairs.extend((first + 1..5).map(|second| PairLag { first, second, lag: 0.0, weight: 700.0 }));
+    }
+    let lags = balanced(6, &pairs);
+    assert!((1..5).all(|slot| lags[slot].lag.is_some_and(|lag| (lag + 2.0).abs() < 0.1)), "{lags:?}");
+    assert!((1..5).all(|slot| (lags[slot].variance - 0.25).abs() < 0.01), "{lags:?}");
+    assert!(lags[5].lag.is_none() && lags[0].lag == Some(0.0));
+}

@@ -10,6 +10,8 @@ use serde::{Deserialize, Serialize};
 
 /// Most frames that wait for a set, per camera: a clock gone wild must not eat the memory.
 const MAX_PENDING: usize = 64;
+/// One more for so much that lags differ by, nanoseconds: a period of 120 frames a second.
+const PENDING_STEP: u64 = 8_000_000;
 
 /// The window before the master's period is known: half a frame of 30 a second.
 const FIRST_WINDOW: u64 = 16_666_667;
@@ -32,10 +34,11 @@ pub struct SyncConfig {
     /// half as far again: one that runs half a period beside the master would fall out of every other set.
     pub window_nanos: Option<u64>,
     /// Longest time, by the frames' own clock, that a set waits for a camera; three of the master's periods, but 100 ms to
-    /// 1 s, when `None`. A camera silent for
-    /// longer is waited for no more, and when it is the master, the next camera's clock takes over.
+    /// 1 s, when `None`. A camera silent for longer is waited for no more, and when it is the master, the next camera's
+    /// clock takes over.
     pub max_wait_nanos: Option<u64>,
-    /// By camera how much later its stamps are than those of the others; taken off before anything else.
+    /// By camera how much later its stamps are than those of the others; taken off before anything else. Sets wait longer
+    /// by what the lags differ by.
     pub lags_nanos: BTreeMap<CameraId, i64>,
 }
 
@@ -85,8 +88,8 @@ pub struct SyncCounts {
 /// A set is emitted as soon as nothing nearer can come (every camera that is not silent has
 /// delivered a frame at or past the set's time) or when it has waited
 /// [`SyncConfig::max_wait_nanos`]. A frame that claims to be farther than that ahead of all others is set aside until
-/// a second one says so: a single wrong stamp must not move the time of the whole rig. Time is the frames' own: the same frames pushed in the same
-/// order give the same sets. A frame is used once at most, the sets' times grow strictly, and a set
+/// a second one says so: a single wrong stamp must not move the time of the whole rig. Time is the frames' own: the same
+/// frames pushed in the same order give the same sets. A frame is used once at most, the sets' times grow strictly, and a set
 /// of another clock than the set before lies more than the window after it. All cameras must share
 /// one clock; make a new synchronizer when that clock starts anew.
 #[derive(Debug)]
@@ -98,6 +101,8 @@ pub struct Synchronizer {
     /// Whether the window is half of the master's period.
     follows_period: bool,
     max_wait: u64,
+    /// What the known lags differ by: so much later the frames of one instant come, nanoseconds.
+    spread: u64,
     /// Whether [`Self::max_wait`] is of the master's period.
     waits_periods: bool,
     /// Time of the first frame ever: cameras not seen yet are silent since then.
@@ -165,12 +170,17 @@ impl Synchronizer {
             clock_order.retain(|&slot| slot != master);
             clock_order.insert(0, master);
         }
+        let lag = |id: &CameraId| config.lags_nanos.get(id).copied().unwrap_or_default();
+        let spread = match (cameras.iter().map(lag).max(), cameras.iter().map(lag).min()) {
+            (Some(most), Some(least)) => most.abs_diff(least),
+            _ => 0,
+        };
         Self {
             cameras: cameras
                 .iter()
                 .map(|id| Camera {
                     id: id.clone(),
-                    lag: config.lags_nanos.get(id).copied().unwrap_or_default(),
+                    lag: lag(id),
                     pending: BTreeMap::new(),
                     suspect: None,
                     latest: None,
@@ -184,7 +194,8 @@ impl Synchronizer {
             clock_order,
             window: config.window_nanos.unwrap_or(FIRST_WINDOW),
             follows_period: config.window_nanos.is_none(),
-            max_wait: config.max_wait_nanos.unwrap_or(LEAST_WAIT),
+            max_wait: config.max_wait_nanos.unwrap_or(LEAST_WAIT).saturating_add(spread),
+            spread,
             waits_periods: config.max_wait_nanos.is_none(),
             first_nanos: None,
             last_set: None,
@@ -253,7 +264,7 @@ impl Synchronizer {
                 self.window = period / 2;
             }
             if self.waits_periods {
-                self.max_wait = period.saturating_mul(3).clamp(LEAST_WAIT, MOST_WAIT);
+                self.max_wait = period.saturating_mul(3).clamp(LEAST_WAIT, MOST_WAIT).saturating_add(self.spread);
             }
         }
         if camera.used == Some(nanos) || camera.pending.contains_key(&nanos) {
@@ -262,7 +273,7 @@ impl Synchronizer {
             dropped.too_old += 1;
         } else {
             camera.pending.insert(nanos, frame);
-            if camera.pending.len() > MAX_PENDING {
+            if camera.pending.len() as u64 > MAX_PENDING as u64 + self.spread / PENDING_STEP {
                 camera.pending.pop_first();
                 dropped.superseded += 1;
             }

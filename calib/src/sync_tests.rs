@@ -328,19 +328,24 @@ fn an_empty_rig_and_an_unknown_master_do_no_harm() {
 
 #[test]
 fn a_lag_that_is_known_is_taken_off() {
-    let config = SyncConfig { lags_nanos: [("b".into(), -52_000_000)].into(), ..SyncConfig::default() };
-    let ids = ["a".into(), "b".into()];
-    let mut sync = Synchronizer::new(&ids, &config);
-    let mut sets = Vec::new();
-    for n in 0..30 {
-        let nanos = n * 33_333_333;
-        sets.extend(sync.push(frame("a", nanos)));
-        sets.extend(sync.push(frame("b", nanos - 52_000_000)));
-    }
-    assert!(sets.len() > 25);
-    for set in sets {
-        let times: Vec<i64> = set.present().map(|(_, frame)| frame.capture_nanos).collect();
-        assert_eq!(times, [set.master_nanos; 2]);
+    let ids = ["a".into(), "b".into(), "c".into()];
+    for lag_ms in [-1000, -150, -52, 0, 52, 150, 1000] {
+        let lag = lag_ms * MS;
+        let config = SyncConfig { lags_nanos: [("b".into(), lag)].into(), ..SyncConfig::default() };
+        let mut sync = Synchronizer::new(&ids, &config);
+        let mut sets = Vec::new();
+        // Frames come when they are taken: those of the late camera at the same time as the others', with later stamps.
+        for n in 0..90 {
+            let nanos = n * 33_333_333;
+            sets.extend(["a", "b", "c"].into_iter().flat_map(|camera| sync.push(frame(camera, nanos))));
+        }
+        sets.extend(sync.flush());
+        let whole = sets.iter().filter(|set| set.kind() == SetKind::Complete).count();
+        assert!(whole >= 88 - lag_ms.unsigned_abs() as usize * 30 / 1000, "{lag_ms} ms: {whole} of {}", sets.len());
+        for set in sets {
+            let near = |frame: &Arc<Frame>| frame.capture_nanos.abs_diff(set.master_nanos) <= 16_666_667;
+            assert!(set.present().all(|(_, frame)| near(frame)), "{lag_ms} ms");
+        }
     }
 }
 

@@ -456,10 +456,10 @@ pub struct WatchArgs {
     #[arg(long, default_value = "main")]
     pub view: String,
     /// Ask for a viewpoint of your own: camera position x,y,z in metres of the rig's world.
-    #[arg(long, value_parser = parse_vec3)]
+    #[arg(long, value_parser = parse_vec3, allow_hyphen_values = true)]
     pub eye: Option<[f64; 3]>,
     /// Point that the viewpoint of --eye looks at.
-    #[arg(long, value_parser = parse_vec3, default_value = "0,0,1")]
+    #[arg(long, value_parser = parse_vec3, allow_hyphen_values = true, default_value = "0,0,1")]
     pub target: [f64; 3],
     /// Size of the viewpoint of --eye, WIDTHxHEIGHT.
     #[arg(long, value_parser = parse_size, default_value = "512x512")]
@@ -548,8 +548,8 @@ fn parse_size(text: &str) -> Result<[u32; 2], String> {
 
 fn parse_most_ms(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
-        Ok(ms) if (4.0..=10_000.0).contains(&ms) => Ok(ms),
-        _ => Err(format!("'{text}' is not between 4 and 10000 milliseconds")),
+        Ok(ms) if (4.0..=1000.0).contains(&ms) => Ok(ms),
+        _ => Err(format!("'{text}' is not between 4 and 1000 milliseconds")),
     }
 }
 
@@ -577,8 +577,8 @@ fn parse_fps(text: &str) -> Result<f64, String> {
 fn parse_lag(text: &str) -> Result<(String, f64), String> {
     let parts = text.split_once('=').and_then(|(camera, lag)| Some((camera.to_owned(), lag.parse::<f64>().ok()?)));
     match parts {
-        Some((camera, lag)) if !camera.is_empty() && lag.abs() <= 10_000.0 => Ok((camera, lag)),
-        _ => Err(format!("'{text}' is no camera with its lag in milliseconds like 03=-50.2 (at most 10000)")),
+        Some((camera, lag)) if !camera.is_empty() && lag.abs() <= 1000.0 => Ok((camera, lag)),
+        _ => Err(format!("'{text}' is no camera with its lag in milliseconds like 03=-50.2 (at most 1000)")),
     }
 }
 
@@ -612,6 +612,10 @@ mod tests {
             assert!(parse_range(bad).is_err(), "{bad}");
         }
         assert_eq!(parse_size("640x480"), Ok([640, 480]));
+        let lag = |text: &str| parse_lag(text).ok();
+        assert_eq!(lag("03=-50.2"), Some(("03".to_owned(), -50.2)));
+        assert!(["", "03", "03=", "=3", "03=nan", "03=2000", "03:3"].into_iter().all(|bad| lag(bad).is_none()));
+        assert!(Cli::try_parse_from(["flyrig", "watch", "--eye", "-1,2,3", "--target", "-1,0,1"]).is_ok());
         for bad in ["0x0", "640", "640x100000", "x"] {
             assert!(parse_size(bad).is_err(), "{bad}");
         }

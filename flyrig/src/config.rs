@@ -474,7 +474,7 @@ impl Config {
         self.sim.validate().context("in [sim]")?;
         range("sync.window_ms", self.sync.window_ms, 0.0, 10_000.0)?;
         for (camera, lag) in &self.sync.lags_ms {
-            range(&format!("sync.lags_ms of {camera}"), *lag, -10_000.0, 10_000.0)?;
+            range(&format!("sync.lags_ms of {camera}"), *lag, -1000.0, 1000.0)?;
         }
         range("sync.max_wait_ms", self.sync.max_wait_ms, 0.0, 60_000.0)?;
         range("body.gaussians", self.body.gaussians as f64, 100.0, 2_000_000.0)?;

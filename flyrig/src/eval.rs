@@ -250,7 +250,8 @@ fn load_rigs(args: &EvalArgs) -> Result<(Rig, Vec<Camera>)> {
     let whose = format!("the calibration of {}", args.dataset.display());
     let (rig, holdout) = (dataset::pick(&all, &args.inputs, &whose)?, dataset::pick(&all, &args.holdout, &whose)?);
     let lagging: Vec<String> = args.lags.iter().map(|(camera, _)| camera.clone()).collect();
-    dataset::pick(&all, &lagging, &format!("{whose}, but in --lag"))?;
+    let used = Rig { cameras: rig.cameras.iter().chain(&holdout.cameras).cloned().collect(), world_up: all.world_up };
+    dataset::pick(&used, &lagging, "--inputs or --holdout, but in --lag")?;
     if let Some(both) = args.inputs.iter().find(|name| args.holdout.contains(name)) {
         bail!("camera {both} is both an input and held out; scores would flatter");
     }

@@ -1,4 +1,4 @@
-//! Silhouettes of one person in the pictures of every camera by itself, whatever the stamps say.
+//! Silhouettes of one person in the pictures of every camera by itself; stamps only help to find whom a camera misses.
 
 use std::sync::Arc;
 
