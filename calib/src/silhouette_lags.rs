@@ -66,8 +66,8 @@ impl SilhouetteTrack {
     /// Adds the mask of a picture. Masks out of order, of another size than the camera's pictures, and empty ones are left
     /// out.
     pub fn add(&mut self, capture_nanos: i64, mask: &Mask) {
-        let is_late = self.samples.last().is_none_or(|(before, _)| *before < capture_nanos);
-        if is_late && [mask.width(), mask.height()] == self.camera.size() {
+        let is_newer = self.samples.last().is_none_or(|(before, _)| *before < capture_nanos);
+        if is_newer && [mask.width(), mask.height()] == self.camera.size() {
             let hull = self.hull(mask);
             if hull.len() > 2 {
                 self.samples.push((capture_nanos, hull));
@@ -163,10 +163,11 @@ fn half_hull<'a>(points: impl Iterator<Item = &'a (DVec2, bool)>) -> Vec<(DVec2,
     hull
 }
 
-/// Lags of all cameras against the first one, of two cameras at most `most_nanos` (at most 1 s); two cameras are enough. The correlation of an estimate
-/// is how much better than the mean of all lags the best one fits, 0 to 1; its disagreement the standard error, by the noise
-/// of the curves, by what pairs of cameras disagree on, and by what alternating half seconds disagree on. Nothing is told of a
-/// camera where that is more than 5 ms, or that has nothing in common with the first one (error infinite).
+/// Lags of all cameras against the first one, of two cameras at most `most_nanos` (at most 1 s); two cameras are enough. The
+/// correlation of an estimate is how much better than the mean of all lags the best one fits, 0 to 1; its disagreement the
+/// standard error, by the noise of the curves, by what pairs of cameras disagree on, and by what alternating half seconds
+/// disagree on. Nothing is told of a camera where that is more than 5 ms, or that has nothing in common with the first one
+/// (error infinite).
 #[must_use]
 pub fn estimate_silhouette_lags(tracks: &[SilhouetteTrack], most_nanos: i64) -> Vec<LagEstimate> {
     let count = tracks.len();
@@ -304,6 +305,7 @@ fn fit(a: &[f64], b: &[f64], trust: &Trust) -> Option<Fit> {
     }
     // Squared slopes of the samples that fit.
     let steep: Vec<f64> = differences(best)
+        .skip(1)
         .zip(a.windows(3))
         .filter(|(d, around)| d.is_finite() && around.iter().all(|value| value.is_finite()))
         .map(|(d, around)| {

@@ -1,12 +1,16 @@
 //! The command line.
 
-use std::{net::SocketAddr, ops::Range, path::PathBuf};
+use std::{collections::BTreeMap, net::SocketAddr, ops::Range, path::PathBuf};
 
 use anyhow::{Result, ensure};
 use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
 use flyrig_stfa::NetworkSize;
+use flyrig_types::CameraId;
 
-use crate::config::{AppearanceMode, NetworksOn, Origin, Solver};
+use crate::{
+    config::{AppearanceMode, NetworksOn, Origin, Solver},
+    run,
+};
 
 /// Live free-viewpoint video of a person from a few cameras.
 ///
@@ -104,6 +108,26 @@ pub struct RecordArgs {
     pub seconds: Option<f64>,
 }
 
+#[derive(Debug, Default, Args)]
+pub struct LagArgs {
+    /// How much later than the others' a camera's stamps are, milliseconds, as CAM=MS; may be given again. `flyrig sync-check`
+    /// tells it.
+    #[arg(long = "lag", value_name = "CAM=MS", value_parser = parse_lag)]
+    pub by_camera: Vec<(String, f64)>,
+}
+
+impl LagArgs {
+    /// The cameras that have one.
+    pub fn cameras(&self) -> Vec<String> {
+        self.by_camera.iter().map(|(camera, _)| camera.clone()).collect()
+    }
+
+    /// What is taken off the stamps, nanoseconds.
+    pub fn nanos(&self) -> BTreeMap<CameraId, i64> {
+        run::lags_nanos(self.by_camera.iter().map(|(camera, lag)| (camera, lag)))
+    }
+}
+
 #[derive(Debug, Args)]
 pub struct ReplayArgs {
     /// The MCAP file.
@@ -111,10 +135,8 @@ pub struct ReplayArgs {
     /// Write the synchronised pictures and the calibration into this new folder (EasyMocap layout).
     #[arg(long)]
     pub export: Option<PathBuf>,
-    /// How much later than the others' a camera's stamps are, milliseconds, as CAM=MS; may be given again. `flyrig sync-check`
-    /// tells it.
-    #[arg(long = "lag", value_name = "CAM=MS", value_parser = parse_lag)]
-    pub lags: Vec<(String, f64)>,
+    #[command(flatten)]
+    pub lags: LagArgs,
 }
 
 #[derive(Debug, Args)]
@@ -520,10 +542,8 @@ pub struct EvalArgs {
     /// Frame rate of the folder.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
-    /// How much later than the others' a camera's stamps are, milliseconds, as CAM=MS; may be given again. `flyrig sync-check`
-    /// tells it.
-    #[arg(long = "lag", value_name = "CAM=MS", value_parser = parse_lag)]
-    pub lags: Vec<(String, f64)>,
+    #[command(flatten)]
+    pub lags: LagArgs,
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = 115_000)]
     pub gaussians: usize,

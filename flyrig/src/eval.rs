@@ -1,6 +1,6 @@
 //! `flyrig eval`: replay a data set in order, as live, render the cameras that were held out, score them.
 
-use std::{collections::BTreeMap, path::Path, time::Instant};
+use std::{path::Path, time::Instant};
 
 use anyhow::{Context, Result, bail, ensure};
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf, write_mesh_ply};
@@ -22,7 +22,6 @@ use crate::{
     pipeline::{Counts, Outcome, Pipeline, PoseSource},
     png,
     report::{ContactRow, Curve, Report, write_whole},
-    run,
     score::{CameraScore, FrameScore, ScoreSheet, contact_pictures, error_parts, score_view},
     stats::StageSummary,
 };
@@ -163,7 +162,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
                 format!("{:?}, {:?}, {:?}, {:?}", args.pose, args.masks, args.solver, args.appearance),
             ),
             ("Gaussians, nodes".to_owned(), format!("{}, {}", args.gaussians, args.nodes)),
-            ("lags taken off, ms".to_owned(), listed(&args.lags)),
+            ("lags taken off, ms".to_owned(), listed(&args.lags.by_camera)),
             ("frames".to_owned(), format!("{processed} in {seconds:.1} s, writing and scoring included")),
             ("scored against".to_owned(), metrics.reference.to_owned()),
         ],
@@ -249,9 +248,8 @@ fn load_rigs(args: &EvalArgs) -> Result<(Rig, Vec<Camera>)> {
     let all = dataset::load_rig(&args.dataset, &chosen)?;
     let whose = format!("the calibration of {}", args.dataset.display());
     let (rig, holdout) = (dataset::pick(&all, &args.inputs, &whose)?, dataset::pick(&all, &args.holdout, &whose)?);
-    let lagging: Vec<String> = args.lags.iter().map(|(camera, _)| camera.clone()).collect();
     let used = Rig { cameras: rig.cameras.iter().chain(&holdout.cameras).cloned().collect(), world_up: all.world_up };
-    dataset::pick(&used, &lagging, "--inputs or --holdout, but in --lag")?;
+    dataset::pick(&used, &args.lags.cameras(), "--inputs or --holdout, but in --lag")?;
     if let Some(both) = args.inputs.iter().find(|name| args.holdout.contains(name)) {
         bail!("camera {both} is both an input and held out; scores would flatter");
     }
@@ -285,7 +283,7 @@ impl FrameReader {
         let count = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);
         let config = SyncConfig {
             window_nanos: Some(half_period_nanos(args)),
-            lags_nanos: lags_nanos(args),
+            lags_nanos: args.lags.nanos(),
             ..SyncConfig::default()
         };
         Ok(Self {
@@ -348,7 +346,7 @@ impl TruthReader {
         let with_masks = ids.iter().all(|id| args.dataset.join("mask").join(id.as_str()).is_dir());
         let options = FolderOptions { fps: args.fps, frames: args.frames.clone(), with_masks };
         let sources = FolderReplay::open(&args.dataset, Some(&ids), &options)?;
-        let lags = lags_nanos(args);
+        let lags = args.lags.nanos();
         let lag = |id: &CameraId| lags.get(id).copied().unwrap_or_default();
         let sources = sources.into_iter().zip(&ids).map(|(source, id)| (source, lag(id), None)).collect();
         Ok(Self { sources, window_nanos: half_period_nanos(args) })
@@ -385,11 +383,6 @@ fn listed(lags: &[(String, f64)]) -> String {
 /// Half of the time from frame to frame: nearer than that a frame's set is unambiguous.
 fn half_period_nanos(args: &EvalArgs) -> u64 {
     (0.5e9 / args.fps).ceil() as u64
-}
-
-/// What is taken off the stamps, by camera.
-fn lags_nanos(args: &EvalArgs) -> BTreeMap<CameraId, i64> {
-    run::lags_nanos(args.lags.iter().map(|(camera, lag)| (camera, lag)))
 }
 
 /// Number of a set's frames in the data set's file names.

@@ -139,13 +139,11 @@ pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> R
 pub fn replay(args: &ReplayArgs) -> Result<()> {
     let stop = stop::flag();
     let rig = recorded_rig(&args.recording)?;
-    let named: Vec<String> = args.lags.iter().map(|(camera, _)| camera.clone()).collect();
-    dataset::pick(&rig, &named, "the recording, but in --lag")?;
+    dataset::pick(&rig, &args.lags.cameras(), "the recording, but in --lag")?;
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     let threads_config = ThreadsConfig { queue_capacity: 4 * ids.len().max(1), pacing: Pacing::Lossless };
     let threads = CaptureThreads::start(replay_sources(&args.recording, &rig)?, threads_config)?;
-    let lags_nanos = run::lags_nanos(args.lags.iter().map(|(camera, lag)| (camera, lag)));
-    let mut sync = Synchronizer::new(&ids, &SyncConfig { lags_nanos, ..SyncConfig::default() });
+    let mut sync = Synchronizer::new(&ids, &SyncConfig { lags_nanos: args.lags.nanos(), ..SyncConfig::default() });
     if let Some(folder) = &args.export {
         ensure!(!folder.exists(), "{} is there already; name a new folder", folder.display());
         for id in &ids {

@@ -8,7 +8,7 @@ use flyrig_types::CameraId;
 
 use super::gather::{HeldOut, gather};
 use crate::{
-    cli::{EvalArgs, NetworkUse, TrainArgs},
+    cli::{EvalArgs, LagArgs, NetworkUse, TrainArgs},
     config::{AppearanceMode, Origin, Solver},
     dataset,
     eval::{Replay, progress_bar},
@@ -48,7 +48,7 @@ fn leave_out(
     let mask = root.join("mask").join(CameraId::from(left_out.as_str()).as_str());
     ensure!(mask.is_dir(), "there are no masks of it; write them to {}", mask.display());
     let replay = EvalArgs {
-        lags: Vec::new(),
+        lags: LagArgs::default(),
         dataset: root.to_owned(),
         inputs: cameras.iter().filter(|camera| *camera != left_out).cloned().collect(),
         holdout: vec![left_out.clone()],
