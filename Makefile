@@ -38,7 +38,7 @@ test-gpu-networks: setup
 	$(CARGO) test --release --locked -p flyrig-stfa --features wgpu
 
 soak: setup
-	$(CARGO) run --release --locked -q --bin flyrig -- bench capture --minutes $(MINUTES)
+	$(CARGO) run --release --locked -q --bin flyrig-bench -- capture --minutes $(MINUTES)
 
 fuzz: setup
 	$(CARGO) run --release --locked -q --bin fuzz -- --minutes $(MINUTES)

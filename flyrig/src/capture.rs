@@ -10,20 +10,19 @@ use anyhow::{Result, ensure};
 use flyrig_capture::{
     CameraSource, CameraStats, CaptureThreads, FrameStage, JpegEncoding, Pacing, PopError, ThreadsConfig,
 };
+use flyrig_fusion::{CameraHealth, Health, resident_mib};
 use flyrig_gpu::GpuContext;
+use flyrig_report::stop;
 use flyrig_transport::{CameraPublisher, CameraStatus};
 use flyrig_types::{CameraId, Frame};
 
 use crate::{
     config::{Config, SourceKind},
-    health::{CameraHealth, Health},
-    live,
+    health, live,
     metrics_server::MetricsServer,
     network,
     notify::ServiceManager,
-    run,
-    stats::resident_mib,
-    stop,
+    source,
 };
 
 /// How often cameras tell how they are.
@@ -39,11 +38,11 @@ pub fn capture(config: &Config, gpu: Option<&GpuContext>) -> Result<()> {
     let kind = config.source.kind;
     ensure!(kind != SourceKind::Network, "source.kind is \"network\": these cameras are on the network already");
     let sources =
-        if kind == SourceKind::Cameras { live::open(&config.source)? } else { run::open(config, gpu)?.sources };
+        if kind == SourceKind::Cameras { live::open(&config.source)? } else { source::open(config, gpu)?.cameras };
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
     let threads = start(config, sources)?;
     let clock = network::host_clock();
-    let publisher = CameraPublisher::open(&network::transport(config), &cameras, clock.clone())?;
+    let publisher = CameraPublisher::open(&config.transport(), &cameras, clock.clone())?;
     let metrics = match config.health.listen.as_str() {
         "" => None,
         address => Some(MetricsServer::start(address)?),
@@ -83,7 +82,7 @@ pub fn capture(config: &Config, gpu: Option<&GpuContext>) -> Result<()> {
                 publisher.publish_status(&camera.camera, &status(&host, camera, is_silent))?;
             }
             if let Some(metrics) = &metrics {
-                metrics.publish(health(stats, &last_frame).prometheus());
+                metrics.publish(health::prometheus(&snapshot(stats, &last_frame)));
             }
         }
         if printed.elapsed() >= PRINT_EVERY {
@@ -144,7 +143,7 @@ fn status(host: &str, stats: &CameraStats, is_silent: bool) -> CameraStatus {
 }
 
 /// There are no sets here.
-fn health(stats: Vec<CameraStats>, last_frame: &[Option<Instant>]) -> Health {
+fn snapshot(stats: Vec<CameraStats>, last_frame: &[Option<Instant>]) -> Health {
     let camera = |(stats, last): (CameraStats, &Option<Instant>)| CameraHealth {
         stats,
         in_no_set: 0,
@@ -156,11 +155,8 @@ fn health(stats: Vec<CameraStats>, last_frame: &[Option<Instant>]) -> Health {
     };
     Health {
         cameras: stats.into_iter().zip(last_frame).map(camera).collect(),
-        complete_sets: 0,
-        partial_sets: 0,
-        skipped_sets: 0,
-        stages: Vec::new(),
         resident_mib: resident_mib(),
+        ..Health::default()
     }
 }
 

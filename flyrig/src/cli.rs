@@ -2,15 +2,12 @@
 
 use std::{collections::BTreeMap, net::SocketAddr, ops::Range, path::PathBuf};
 
-use anyhow::{Result, ensure};
 use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
+use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
+use flyrig_fusion::{AppearanceOptions, BodySettings, NetworksOn, Origin, TrackingSettings};
+use flyrig_report::arguments::{parse_fps, parse_minutes, parse_seconds, parse_size};
 use flyrig_stfa::NetworkSize;
 use flyrig_types::CameraId;
-
-use crate::{
-    config::{AppearanceMode, NetworksOn, Origin, Solver},
-    run,
-};
 
 /// Live free-viewpoint video of a person from a few cameras.
 ///
@@ -84,11 +81,6 @@ pub enum Command {
     },
     /// Train the networks of learned appearance.
     Train(TrainArgs),
-    /// Measure run time against error on simulated people.
-    Bench {
-        #[command(subcommand)]
-        what: BenchCommand,
-    },
     /// Print the commented default configuration, or check one.
     Config {
         #[command(subcommand)]
@@ -124,7 +116,7 @@ impl LagArgs {
 
     /// What is taken off the stamps, nanoseconds.
     pub fn nanos(&self) -> BTreeMap<CameraId, i64> {
-        run::lags_nanos(self.by_camera.iter().map(|(camera, lag)| (camera, lag)))
+        self.by_camera.iter().map(|(camera, ms)| (camera.as_str().into(), (ms * 1e6).round() as i64)).collect()
     }
 }
 
@@ -244,30 +236,8 @@ pub struct TrainArgs {
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
     pub side: u32,
     /// Gaussians on the person's surface.
-    #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
     pub gaussians: usize,
-}
-
-/// How the networks of learned appearance are used.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Args)]
-pub struct NetworkUse {
-    /// What the networks keep from frame to frame: see `reuse` in the configuration.
-    #[arg(long, default_value_t = 0.0)]
-    pub reuse: f32,
-    /// Where the networks run; "adapter" needs a flyrig that was built with the feature gpu-networks.
-    #[arg(long, value_enum, default_value = "processor")]
-    pub networks_on: NetworksOn,
-}
-
-impl NetworkUse {
-    /// Checks that the two go together.
-    pub fn check(self) -> Result<()> {
-        ensure!(
-            self.reuse == 0.0 || self.networks_on == NetworksOn::Processor,
-            "networks on the adapter keep nothing from frame to frame: set reuse to 0, or let them run on the processor"
-        );
-        Ok(())
-    }
 }
 
 /// Sizes of the networks of learned appearance.
@@ -286,132 +256,6 @@ impl SizeName {
             Self::Medium => NetworkSize::MEDIUM,
         }
     }
-}
-
-#[derive(Debug, Subcommand)]
-pub enum BenchCommand {
-    /// Deformation tracking: solvers, iterations, Gaussians, resolution and views; writes CSV, JSON and SVG.
-    Track(BenchTrackArgs),
-    /// Thousands of frames of one movement there and back: error and memory over time; writes CSV and SVG.
-    Endure(BenchEndureArgs),
-    /// Appearance: every mode on simulated people that nobody trained on; writes CSV, JSON and SVG.
-    Appearance(BenchAppearanceArgs),
-    /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to whole sets.
-    Capture(BenchCaptureArgs),
-    /// Recording uncompressed cameras: bytes, processor time and loss of each JPEG quality against pictures as they come.
-    Record(BenchRecordArgs),
-}
-
-#[derive(Debug, Args)]
-pub struct BenchAppearanceArgs {
-    /// Folder of the results.
-    #[arg(long, default_value = "out/bench-appearance")]
-    pub out: PathBuf,
-    /// Seed of the first person; the others follow.
-    #[arg(long, default_value_t = 101)]
-    pub seed: u64,
-    /// How many people.
-    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
-    pub people: u64,
-    /// Frames of each sequence; the second half is scored.
-    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
-    pub frames: usize,
-    /// Numbers of input cameras, comma separated.
-    #[arg(long, value_delimiter = ',', default_value = "3,1", value_parser = clap::value_parser!(u8).range(1..=6).map(usize::from))]
-    pub views: Vec<usize>,
-    /// Weights files of the learned modes, in place of all networks that come with flyrig; may be given several times.
-    #[arg(long)]
-    pub weights: Vec<PathBuf>,
-    #[command(flatten)]
-    pub networks: NetworkUse,
-    /// Pixels of a picture's side.
-    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
-    pub side: u32,
-    /// Gaussians on the person's surface.
-    #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
-    pub gaussians: usize,
-}
-
-#[derive(Debug, Args)]
-pub struct BenchEndureArgs {
-    /// Folder of the results.
-    #[arg(long, default_value = "out/bench-endure")]
-    pub out: PathBuf,
-    /// Seed of the person.
-    #[arg(long, default_value_t = 1)]
-    pub seed: u64,
-    /// Frames in all.
-    #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u64).range(300..=10_000_000))]
-    pub frames: u64,
-    /// Pixels of a picture's side.
-    #[arg(long, default_value_t = 160, value_parser = clap::value_parser!(u32).range(64..=2048))]
-    pub side: u32,
-    /// Gaussians on the person's surface.
-    #[arg(long, default_value_t = 12_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
-    pub gaussians: usize,
-}
-
-#[derive(Debug, Args)]
-pub struct BenchCaptureArgs {
-    /// How long.
-    #[arg(long, default_value_t = 30.0, value_parser = parse_minutes)]
-    pub minutes: f64,
-    /// Cameras; every second one sends JPEG.
-    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=32))]
-    pub cameras: u32,
-    /// Frames a second.
-    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
-    pub fps: f64,
-    /// Size of the pictures, WIDTHxHEIGHT.
-    #[arg(long, value_parser = parse_size, default_value = "640x360")]
-    pub size: [u32; 2],
-}
-
-#[derive(Debug, Args)]
-pub struct BenchRecordArgs {
-    /// Seconds for each quality.
-    #[arg(long, default_value_t = 5.0, value_parser = parse_seconds)]
-    pub seconds: f64,
-    /// Cameras, all YUYV.
-    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=32))]
-    pub cameras: u32,
-    /// Frames a second.
-    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
-    pub fps: f64,
-    /// Size of the pictures, WIDTHxHEIGHT.
-    #[arg(long, value_parser = parse_size, default_value = "640x360")]
-    pub size: [u32; 2],
-    /// JPEG qualities, comma separated; 0 records pictures as they come.
-    #[arg(long, value_delimiter = ',', default_values_t = [0, 80, 90, 95, 98], value_parser = clap::value_parser!(u8).range(0..=100))]
-    pub qualities: Vec<u8>,
-    /// Folder for the recordings, which are removed again; the system's for temporary files otherwise.
-    #[arg(long)]
-    pub folder: Option<PathBuf>,
-}
-
-#[derive(Debug, Args)]
-pub struct BenchTrackArgs {
-    /// Folder of the results.
-    #[arg(long, default_value = "out/bench-track")]
-    pub out: PathBuf,
-    /// Seed of the person.
-    #[arg(long, default_value_t = 1)]
-    pub seed: u64,
-    /// Frames of the sequence.
-    #[arg(long, default_value_t = 14, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
-    pub frames: usize,
-    /// Pixels of a picture's side.
-    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
-    pub side: u32,
-    /// Gaussians on the person's surface.
-    #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
-    pub gaussians: usize,
-    /// Only the three solvers.
-    #[arg(long)]
-    pub quick: bool,
-    /// Only the cases whose name has this text in it, "2 views" for example.
-    #[arg(long)]
-    pub only: Option<String>,
 }
 
 #[derive(Debug, Subcommand)]
@@ -447,17 +291,12 @@ pub struct DemoArgs {
     #[arg(long)]
     pub faults: Option<PathBuf>,
     /// Gaussians on the person's surface.
-    #[arg(long, default_value_t = 115_000)]
+    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT)]
     pub gaussians: usize,
-    /// How the body follows the pictures beyond its pose; "off" is faster.
-    #[arg(long, value_enum, default_value = "default")]
-    pub solver: Solver,
-    /// How Gaussians get their colours.
-    #[arg(long, value_enum, default_value = "direct")]
-    pub appearance: AppearanceMode,
-    /// Weights file of the learned modes; "small" or "tiny" for the networks that come with flyrig [default: small].
-    #[arg(long)]
-    pub weights: Option<PathBuf>,
+    #[command(flatten)]
+    pub tracking: TrackingSettings,
+    #[command(flatten)]
+    pub appearance: AppearanceOptions,
     /// Also score the modes that `direct` adds to (takes three times as long).
     #[arg(long)]
     pub ablation: bool,
@@ -519,23 +358,12 @@ pub struct EvalArgs {
     /// Folder for pictures, surfaces and the report.
     #[arg(long)]
     pub out: PathBuf,
-    /// Pose from the data set's glTF animation, or from the pictures.
-    #[arg(long, value_enum, default_value = "given")]
-    pub pose: Origin,
-    /// Masks from the data set, or from the pictures.
-    #[arg(long, value_enum, default_value = "given")]
-    pub masks: Origin,
-    /// How the body follows the pictures beyond its pose; "off" is faster.
-    #[arg(long, value_enum, default_value = "default")]
-    pub solver: Solver,
-    /// How Gaussians get their colours.
-    #[arg(long, value_enum, default_value = "direct")]
-    pub appearance: AppearanceMode,
-    /// Weights file of the learned modes; "small" or "tiny" for the networks that come with flyrig [default: small].
-    #[arg(long)]
-    pub weights: Option<PathBuf>,
     #[command(flatten)]
-    pub networks: NetworkUse,
+    pub body: BodySettings,
+    #[command(flatten)]
+    pub tracking: TrackingSettings,
+    #[command(flatten)]
+    pub appearance: AppearanceOptions,
     /// Frames FIRST..END, END excluded; all of them otherwise.
     #[arg(long, value_parser = parse_range)]
     pub frames: Option<Range<u64>>,
@@ -544,12 +372,6 @@ pub struct EvalArgs {
     pub fps: f64,
     #[command(flatten)]
     pub lags: LagArgs,
-    /// Gaussians on the person's surface.
-    #[arg(long, default_value_t = 115_000)]
-    pub gaussians: usize,
-    /// Nodes of the deformation graph.
-    #[arg(long, default_value_t = 1620)]
-    pub nodes: usize,
 }
 
 fn parse_vec3(text: &str) -> Result<[f64; 3], String> {
@@ -558,39 +380,10 @@ fn parse_vec3(text: &str) -> Result<[f64; 3], String> {
     numbers.try_into().ok().filter(|_| text.split(',').count() == 3).ok_or_else(|| format!("'{text}' is not x,y,z"))
 }
 
-fn parse_size(text: &str) -> Result<[u32; 2], String> {
-    let sides: Option<(u32, u32)> = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
-    match sides {
-        Some((w, h)) if (16..=4096).contains(&w) && (16..=4096).contains(&h) => Ok([w, h]),
-        _ => Err(format!("'{text}' is not WIDTHxHEIGHT with sides of 16 to 4096 pixels")),
-    }
-}
-
 fn parse_most_ms(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(ms) if (4.0..=1000.0).contains(&ms) => Ok(ms),
         _ => Err(format!("'{text}' is not between 4 and 1000 milliseconds")),
-    }
-}
-
-fn parse_minutes(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(minutes) if (0.01..=10_000.0).contains(&minutes) => Ok(minutes),
-        _ => Err(format!("'{text}' is not between 0.01 and 10000 minutes")),
-    }
-}
-
-fn parse_seconds(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(seconds) if (0.1..=1e6).contains(&seconds) => Ok(seconds),
-        _ => Err(format!("'{text}' is not between 0.1 and 1000000 seconds")),
-    }
-}
-
-fn parse_fps(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(fps) if (0.1..=1000.0).contains(&fps) => Ok(fps),
-        _ => Err(format!("'{text}' is not between 0.1 and 1000 frames a second")),
     }
 }
 

@@ -1,20 +1,15 @@
 //! The configuration file: one commented default, strict reading, errors that name line and key.
 
-use std::{
-    collections::BTreeMap,
-    path::{Path, PathBuf},
-};
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
-use clap::ValueEnum;
-use flyrig_calib::ClockKind;
-use flyrig_renderer::AppearanceSettings;
+use flyrig_fusion::{AppearanceOptions, BodySettings, Origin, OutputSettings, SessionSettings, TrackingSettings};
 use flyrig_sim::SimConfig;
-use flyrig_stfa::{EMBEDDED, Parameters};
-use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
+use flyrig_sync::SyncSettings;
+use flyrig_transport::TransportConfig;
 use serde::{Deserialize, Serialize};
 
-use crate::{cameras::CameraEntry, cli::NetworkUse, deformation::DeformOptions, network};
+use crate::cameras::CameraEntry;
 
 /// The commented default file, as `flyrig config print` writes it. A test keeps it equal to `Config::default()`.
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
@@ -26,11 +21,11 @@ pub struct Config {
     pub rig: RigSection,
     pub source: SourceSection,
     pub sim: SimConfig,
-    pub sync: SyncSection,
-    pub body: BodySection,
-    pub tracking: TrackingSection,
-    pub appearance: AppearanceSection,
-    pub output: OutputSection,
+    pub sync: SyncSettings,
+    pub body: BodySettings,
+    pub tracking: TrackingSettings,
+    pub appearance: AppearanceOptions,
+    pub output: OutputSettings,
     pub capture: CaptureSection,
     pub record: RecordSection,
     pub transport: TransportSection,
@@ -127,240 +122,6 @@ impl Default for SourceSection {
             fps: 30.0,
             real_time: true,
         }
-    }
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct SyncSection {
-    pub window_ms: f64,
-    pub lags_ms: BTreeMap<String, f64>,
-    pub max_wait_ms: f64,
-    pub master: String,
-    pub clocks: ClockKind,
-}
-
-impl Default for SyncSection {
-    fn default() -> Self {
-        Self {
-            window_ms: 0.0,
-            lags_ms: BTreeMap::new(),
-            max_wait_ms: 0.0,
-            master: String::new(),
-            clocks: ClockKind::Shared,
-        }
-    }
-}
-
-/// Where a pose or a mask comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum Origin {
-    /// From the source or the data set.
-    Given,
-    /// From the pictures.
-    Estimated,
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct BodySection {
-    pub template: PathBuf,
-    pub pose: Origin,
-    pub masks: Origin,
-    pub gaussians: usize,
-    pub nodes: usize,
-}
-
-impl Default for BodySection {
-    fn default() -> Self {
-        Self { template: PathBuf::new(), pose: Origin::Given, masks: Origin::Given, gaussians: 115_000, nodes: 1620 }
-    }
-}
-
-/// How the body is deformed beyond its pose.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub enum Solver {
-    /// Skinned only.
-    #[value(name = "off", alias = "none")]
-    #[serde(rename = "off", alias = "none")]
-    None,
-    /// Gradient descent as in the paper.
-    Paper,
-    /// Damped Gauss-Newton with the graph Laplacian.
-    #[value(name = "default", alias = "gauss-newton")]
-    #[serde(rename = "default", alias = "gauss-newton")]
-    GaussNewton,
-}
-
-impl Solver {
-    /// What the deformation is told; none when the body is only skinned. An estimated pose is corrected as well.
-    pub fn options(self, pose: Origin) -> Option<DeformOptions> {
-        let default = DeformSettings::default();
-        match self {
-            Self::None => None,
-            Self::Paper => Some(DeformOptions::full(DeformSettings {
-                solver: DeformSolver::Paper { rate: PAPER_RATE },
-                regularization: PAPER_REGULARIZATION,
-                // The paper iterates on every frame.
-                rest: 0.0,
-                ..default
-            })),
-            Self::GaussNewton => Some(DeformOptions {
-                pose: (pose == Origin::Estimated).then(PoseFreedom::default),
-                ..DeformOptions::coarse(DeformSettings { anchor: ANCHOR, ..default })
-            }),
-        }
-    }
-}
-
-/// Price of the nodes' distance from where clothes of their part's thickness would be: holds what no view tells, the depth
-/// before a single camera or a shift of all nodes that a corrected pose explains as well.
-const ANCHOR: f64 = 100.0;
-
-/// λ_reg of the paper's Eq. 3.
-const PAPER_REGULARIZATION: f64 = 200.0;
-impl TrackingSection {
-    /// What the deformation is told; none when the body is only skinned.
-    pub fn options(&self, pose: Origin) -> Option<DeformOptions> {
-        let mut options = self.solver.options(pose)?;
-        if self.solver == Solver::GaussNewton {
-            options.gaussians = self.gaussians;
-            options.views = self.views;
-            if !self.level_of_detail {
-                options = options.without_level_of_detail();
-            }
-            options.solver.rest = self.rest;
-        }
-        Some(options)
-    }
-}
-
-/// Rate of the paper's gradient descent, square metres a unit of loss. The paper does not tell its own; of 1e-8 to 1e-5
-/// this one lowered the loss most on a simulated person at 512x512.
-const PAPER_RATE: f64 = 3e-6;
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct TrackingSection {
-    pub solver: Solver,
-    pub gaussians: usize,
-    pub level_of_detail: bool,
-    pub views: usize,
-    pub rest: f64,
-    pub per_view_time: bool,
-}
-
-impl Default for TrackingSection {
-    fn default() -> Self {
-        Self {
-            solver: Solver::GaussNewton,
-            gaussians: 30_000,
-            level_of_detail: true,
-            views: 0,
-            rest: 0.01,
-            per_view_time: true,
-        }
-    }
-}
-
-/// How Gaussians get their colours.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub enum AppearanceMode {
-    /// Projection, spatial diffusion and temporal memory.
-    Direct,
-    /// Without the temporal memory.
-    DirectNoTime,
-    /// Projection only, as the paper's "w/o ST" baseline.
-    DirectNoSpaceTime,
-    /// `direct`, and what trained networks add to it.
-    Stfa,
-    /// The same without the temporal memory.
-    StfaNoTime,
-    /// The same without graph and memory.
-    StfaNoSpaceTime,
-}
-
-impl AppearanceMode {
-    /// What the renderer is told.
-    pub fn settings(self) -> AppearanceSettings {
-        let (space, time) = match self {
-            Self::Direct | Self::Stfa => (true, true),
-            Self::DirectNoTime | Self::StfaNoTime => (true, false),
-            Self::DirectNoSpaceTime | Self::StfaNoSpaceTime => (false, false),
-        };
-        AppearanceSettings { space, time, ..AppearanceSettings::default() }
-    }
-
-    /// Whether networks add to direct appearance.
-    pub fn is_learned(self) -> bool {
-        matches!(self, Self::Stfa | Self::StfaNoTime | Self::StfaNoSpaceTime)
-    }
-
-    /// The networks that add to it, from this file or those of this name that come with the program. None for the direct modes.
-    pub fn networks(self, weights: Option<&Path>) -> Result<Option<Parameters>> {
-        if !self.is_learned() {
-            return Ok(None);
-        }
-        Ok(Some(Parameters::named(weights.unwrap_or(Path::new(EMBEDDED[0].0)))?))
-    }
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct AppearanceSection {
-    pub mode: AppearanceMode,
-    /// Weights file of the learned modes, or the name of networks that come with the program; empty: the first of those.
-    pub weights: PathBuf,
-    /// Inputs of a Gaussian that changed by no more than this leave what the networks add to its colour as it was.
-    pub reuse: f32,
-    pub networks_on: NetworksOn,
-}
-
-/// Where networks run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub enum NetworksOn {
-    /// All cores.
-    #[default]
-    Processor,
-    /// The graphics adapter that draws.
-    Adapter,
-}
-
-impl AppearanceSection {
-    /// How they are used.
-    pub fn network_use(&self) -> NetworkUse {
-        NetworkUse { reuse: self.reuse, networks_on: self.networks_on }
-    }
-
-    /// What adds to direct appearance.
-    pub fn networks(&self) -> Result<Option<Parameters>> {
-        self.mode.networks(Some(self.weights.as_path()).filter(|path| !path.as_os_str().is_empty()))
-    }
-}
-
-impl Default for AppearanceSection {
-    fn default() -> Self {
-        Self { mode: AppearanceMode::Direct, weights: PathBuf::new(), reuse: 0.0, networks_on: NetworksOn::default() }
-    }
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct OutputSection {
-    pub views: usize,
-    pub width: u32,
-    pub height: u32,
-    pub jpeg_quality: u8,
-    pub splats: bool,
-}
-
-impl Default for OutputSection {
-    fn default() -> Self {
-        Self { views: 1, width: 512, height: 512, jpeg_quality: 85, splats: true }
     }
 }
 
@@ -472,32 +233,31 @@ impl Config {
         range("source.fps", self.source.fps, 0.1, 1000.0)?;
         self.source.check()?;
         self.sim.validate().context("in [sim]")?;
-        range("sync.window_ms", self.sync.window_ms, 0.0, 10_000.0)?;
-        for (camera, lag) in &self.sync.lags_ms {
-            range(&format!("sync.lags_ms of {camera}"), *lag, -1000.0, 1000.0)?;
-        }
-        range("sync.max_wait_ms", self.sync.max_wait_ms, 0.0, 60_000.0)?;
-        range("body.gaussians", self.body.gaussians as f64, 100.0, 2_000_000.0)?;
-        range("body.nodes", self.body.nodes as f64, 4.0, 100_000.0)?;
-        ensure!(
-            self.body.nodes <= self.body.gaussians,
-            "body.nodes is {}, more than body.gaussians ({}): nodes are chosen among the Gaussians",
-            self.body.nodes,
-            self.body.gaussians
-        );
-        range("tracking.gaussians", self.tracking.gaussians as f64, 100.0, 2_000_000.0)?;
-        range("tracking.views", self.tracking.views as f64, 0.0, 1000.0)?;
-        range("tracking.rest", self.tracking.rest, 0.0, 0.5)?;
-        range("appearance.reuse", f64::from(self.appearance.reuse), 0.0, 1.0)?;
-        self.appearance.network_use().check()?;
-        range("output.views", self.output.views as f64, 0.0, 16.0)?;
-        range("output.width", f64::from(self.output.width), 16.0, 4096.0)?;
-        range("output.height", f64::from(self.output.height), 16.0, 4096.0)?;
-        range("output.jpeg_quality", f64::from(self.output.jpeg_quality), 1.0, 100.0)?;
+        self.session().validate()?;
+        self.output.validate()?;
         range("capture.jpeg_quality", f64::from(self.capture.jpeg_quality), 0.0, 100.0)?;
         range("record.jpeg_quality", f64::from(self.record.jpeg_quality), 0.0, 100.0)?;
         range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)?;
-        network::transport(self).validate().context("in [rig] or [transport]")
+        self.transport().validate().context("in [rig] or [transport]")
+    }
+
+    /// The settings of a session.
+    pub fn session(&self) -> SessionSettings {
+        SessionSettings {
+            body: self.body.clone(),
+            tracking: self.tracking.clone(),
+            appearance: self.appearance.clone(),
+        }
+    }
+
+    /// The settings of the transport session.
+    pub fn transport(&self) -> TransportConfig {
+        TransportConfig {
+            listen: self.transport.listen.clone(),
+            connect: self.transport.connect.clone(),
+            max_viewers: self.transport.max_viewers,
+            ..TransportConfig::publisher(&self.rig.name)
+        }
     }
 
     /// What tracking needs beyond values in their ranges.
@@ -533,7 +293,6 @@ fn nearest_key(message: &str) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::deformation::PAPER_COLOR_WEIGHT;
 
     #[test]
     fn the_printed_default_is_the_default() {
@@ -554,15 +313,6 @@ mod tests {
         }
         let all = toml::Table::try_from(Config::default()).unwrap();
         assert_eq!(missing(&all, &DEFAULT_TOML.parse().unwrap(), ""), Vec::<String>::new());
-    }
-
-    #[test]
-    fn the_papers_solver_is_measured_as_the_paper_tells() {
-        let options = Solver::Paper.options(Origin::Given).unwrap();
-        assert!((options.color_weight - PAPER_COLOR_WEIGHT).abs() < 1e-6);
-        assert!((options.solver.regularization - 200.0).abs() < 1e-9);
-        assert!(options.solver.rest <= 0.0, "every frame has its iterations");
-        assert_eq!((options.gaussians, options.max_level), (usize::MAX, 0));
     }
 
     #[test]

@@ -5,10 +5,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use flyrig_calib::{CalibError, load_easymocap};
 use flyrig_capture::{VideoOptions, VideoReplay, folder_picture_size};
-use flyrig_tracker::PoseEstimator;
+use flyrig_fusion::Origin;
 use flyrig_types::{Camera, CameraId, Image, PixelFormat, Rig};
-
-use crate::config::Origin;
 
 /// The named cameras of a rig, in the order of the names; all of them for no names.
 pub fn pick(rig: &Rig, names: &[String], whose: &str) -> Result<Rig> {
@@ -79,16 +77,6 @@ pub fn require_masks(pose: Origin, masks: Origin, plates: &[Option<Image>]) -> R
             "a given pose with estimated masks needs an empty picture background/CAM.png of every input camera; add \
              them, or let the pose be estimated too"
         );
-    }
-    Ok(())
-}
-
-/// Gives the estimator what is known of the empty scene.
-pub fn set_plates(estimator: &mut PoseEstimator, plates: &[Option<Image>]) -> Result<()> {
-    for (slot, plate) in plates.iter().enumerate() {
-        if let Some(plate) = plate {
-            estimator.set_plate(slot, plate)?;
-        }
     }
     Ok(())
 }

@@ -8,32 +8,22 @@ use std::{
 };
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
-use flyrig_calib::{ClockKind, SyncConfig};
 use flyrig_capture::{CameraSource, Pacing};
+use flyrig_fusion::{
+    AppearanceMode, AppearanceOptions, BodySettings, GivenPerception, InputFormat, Intake, LivePublisher, LiveRig,
+    LiveViews, OutputSettings, Session, SessionBuilder, SessionSettings, StageSummary, resident_mib,
+};
 use flyrig_gpu::GpuContext;
+use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
+use flyrig_report::{ContactRow, Curve, Report, contact_pictures, png, progress_bar, stop, write_whole};
 use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
+use flyrig_sync::SyncSettings;
 use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::{Camera, FrameSet};
 use indicatif::ProgressBar;
 use serde::{Deserialize as _, Serialize, de::IntoDeserializer as _};
 
-use crate::{
-    cli::{DemoArgs, NetworkUse},
-    config::{AppearanceMode, Origin},
-    dataset,
-    engine::Engine,
-    eval::progress_bar,
-    intake::{Intake, Pictures},
-    outlet::Outlet,
-    pipeline::{Outcome, Pipeline, PoseSource},
-    png,
-    report::{ContactRow, Curve, Report, write_whole},
-    run::Views,
-    score::{CameraScore, ScoreSheet, contact_pictures, score_view},
-    stats::{StageSummary, resident_mib},
-    stop,
-    watch::WatchStats,
-};
+use crate::{cli::DemoArgs, dataset, watch::WatchStats};
 
 /// Cameras that go in, and cameras that are only rendered and compared.
 const INPUTS: [&str; 3] = ["00", "03", "05"];
@@ -98,18 +88,16 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     while !publisher.has_subscribers("main") && Instant::now() < deadline {
         std::thread::sleep(Duration::from_millis(50));
     }
-    let mut outlet = Outlet::start(publisher, 85)?;
+    let publisher = LivePublisher::start(publisher, OutputSettings::default().jpeg_quality)?;
 
-    let main = pass(args, gpu, &simulator, args.appearance, Some(&mut outlet))?;
-    let mut drops = main.drops.clone();
-    drops.extend(outlet.drops());
-    outlet.finish()?;
+    let main = pass(args, gpu, &simulator, &args.appearance, Some(publisher))?;
     let watch = viewer.finish();
-    let mut modes = vec![(args.appearance, main.sheet.per_camera(), main.sheet.mean())];
+    let main_mode = args.appearance.mode;
+    let mut modes = vec![(main_mode, main.sheet.per_camera(), main.sheet.mean())];
     if args.ablation {
         for mode in [AppearanceMode::Direct, AppearanceMode::DirectNoTime, AppearanceMode::DirectNoSpaceTime] {
-            if mode != args.appearance && !stop::requested() {
-                let other = pass(args, gpu, &simulator, mode, None)?;
+            if mode != main_mode && !stop::requested() {
+                let other = pass(args, gpu, &simulator, &AppearanceOptions::of_mode(mode), None)?;
                 modes.push((mode, other.sheet.per_camera(), other.sheet.mean()));
             }
         }
@@ -124,7 +112,7 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
         frames_per_second: main.frames as f64 / (main.seconds - main.scoring_seconds).max(1e-9),
         modes,
         stages: main.stages.clone(),
-        drops,
+        drops: main.drops.clone(),
         memory_mib: main.memory.clone(),
         watch,
     };
@@ -192,8 +180,8 @@ fn pass(
     args: &DemoArgs,
     gpu: &GpuContext,
     simulator: &Arc<Mutex<Simulator>>,
-    mode: AppearanceMode,
-    mut outlet: Option<&mut Outlet>,
+    appearance: &AppearanceOptions,
+    publisher: Option<LivePublisher>,
 ) -> Result<Pass> {
     let (rig, template, track) = {
         let simulator = lock(simulator)?;
@@ -206,31 +194,23 @@ fn pass(
         .filter(|source| inputs.slot(source.camera()).is_some())
         .map(|source| Box::new(source) as Box<dyn CameraSource>)
         .collect();
-    let mut engine = Engine::new(
-        gpu.clone(),
-        template,
-        args.gaussians,
-        flyrig_body::DEFAULT_NODE_COUNT,
-        &inputs,
-        mode.settings(),
-        args.solver.options(Origin::Given),
-    )?;
-    if let Some(networks) = mode.networks(args.weights.as_deref())? {
-        engine.use_networks(&networks, NetworkUse::default())?;
+    let settings = SessionSettings {
+        body: BodySettings { gaussians: args.gaussians, ..BodySettings::default() },
+        tracking: args.tracking.clone(),
+        appearance: appearance.clone(),
+    };
+    let perception = GivenPerception::repeating(&inputs, template, track);
+    let session = SessionBuilder::new(gpu.clone(), inputs).settings(settings).perception(perception).build()?;
+    if let Some(publisher) = &publisher {
+        publisher.publisher().set_calibration(session.rig())?;
     }
-    let no_plates = inputs.cameras.iter().map(|_| None).collect();
-    let mut pipeline =
-        Pipeline::new(engine, inputs, PoseSource::Track { track, repeat: true }, Origin::Given, no_plates);
-    if let Some(outlet) = &outlet {
-        outlet.publisher().set_calibration(pipeline.rig())?;
-    }
-    let mut intake =
-        Intake::start(sources, Pictures::Rgb, &SyncConfig::default(), ClockKind::Shared, Pacing::Lossless)?;
+    let intake = Intake::start(sources, InputFormat::Rgb, &SyncSettings::default(), Pacing::Lossless)?;
+    let views = LiveViews::new(&OutputSettings::default());
+    let mut live = LiveRig::new(session, intake, views, publisher).with_splats(false);
 
     let limit = args.minutes.map(|minutes| Duration::from_secs_f64(minutes.max(0.0) * 60.0));
     let total = limit.map_or(args.frames as u64, |limit| limit.as_secs());
     let bar = progress_bar(total, if limit.is_some() { "seconds" } else { "frames" });
-    let views = Views::new(1, 512, 512);
     let score_every = if limit.is_some() { 50 } else { (args.frames as u64 / SCORED).max(1) };
     let started = Instant::now();
     let mut pass = Pass::default();
@@ -240,20 +220,14 @@ fn pass(
         if done {
             break;
         }
-        let Some(set) = intake.next_set(Duration::from_secs(10)) else {
-            if intake.ended() {
+        let turn_time = Duration::from_secs_f64(pass.frames as f64 / 12.0);
+        let Some(step) = live.step(Duration::from_secs(10), Some(turn_time))? else {
+            if live.intake.ended() {
                 break;
             }
             bail!("the simulated cameras gave nothing for 10 s; run with -v to see why");
         };
-        if let Outcome::Held(reason) = pipeline.process(&set)? {
-            tracing::warn!(set = set.index, %reason, "frame set not used");
-        }
-        if let Some(outlet) = &mut outlet {
-            let turn_time = Duration::from_secs_f64(pass.frames as f64 / 12.0);
-            views.publish(&mut pipeline, outlet, &set, turn_time)?;
-            outlet.publish_stats(&set, pass.frames, &pipeline.stages.summary(), &intake.drops(), &pipeline.watch);
-        }
+        let set = step.set;
         if pass.frames % score_every == score_every / 2 {
             let start = Instant::now();
             let done = limit.map_or(pass.frames as f64 / args.frames as f64, |limit| {
@@ -261,7 +235,7 @@ fn pass(
             });
             let row_due = done * CONTACT_ROWS as f64 >= pass.contact.len() as f64;
             let wants_row = pass.contact.len() < CONTACT_ROWS && row_due;
-            score(&mut pass, &mut pipeline, simulator, &rig.cameras, &held_out, &set, wants_row)?;
+            score(&mut pass, &mut live.session, simulator, &rig.cameras, &held_out, &set, wants_row)?;
             pass.scoring_seconds += start.elapsed().as_secs_f64();
         }
         pass.frames += 1;
@@ -275,8 +249,9 @@ fn pass(
     ensure!(pass.frames > 0 || stop::requested(), "the simulated cameras gave no frame; the warnings above say why");
     pass.memory.extend(resident_mib().map(|mib| (started.elapsed().as_secs_f64(), mib)));
     pass.seconds = started.elapsed().as_secs_f64();
-    pass.stages = pipeline.stages.summary();
-    pass.drops = intake.drops();
+    pass.stages = live.session.stages.summary();
+    pass.drops = live.drops();
+    live.finish()?;
     Ok(pass)
 }
 
@@ -287,7 +262,7 @@ fn advance(bar: &ProgressBar, position: u64, sheet: &ScoreSheet) {
 
 fn score(
     pass: &mut Pass,
-    pipeline: &mut Pipeline,
+    session: &mut Session,
     simulator: &Mutex<Simulator>,
     all: &[Camera],
     held_out: &[Camera],
@@ -298,7 +273,7 @@ fn score(
     for (i, camera) in held_out.iter().enumerate() {
         let slot = all.iter().position(|c| c.id == camera.id).context("a held-out camera is not in the rig")?;
         let truth: SimFrame = lock(simulator)?.render(set.master_nanos, slot)?;
-        let ours = pipeline.render(camera)?;
+        let ours = session.render(camera)?;
         pass.sheet.extend(score_view(&camera.id, set.index, &ours, &truth.color, Some(&truth.mask))?);
         if wants_row && i == row % held_out.len() {
             let mut pictures = Vec::new();

@@ -1,35 +1,31 @@
 //! `flyrig eval`: replay a data set in order, as live, render the cameras that were held out, score them.
 
-use std::{path::Path, time::Instant};
+use std::{
+    collections::{BTreeMap, VecDeque},
+    ops::Range,
+    path::{Path, PathBuf},
+    time::Instant,
+};
 
 use anyhow::{Context, Result, bail, ensure};
-use flyrig_body::{ShapeParams, Template, default_template, load_gltf, write_mesh_ply};
-use flyrig_calib::{SyncConfig, Synchronizer};
-use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay};
+use flyrig_body::{ShapeParams, default_template, load_gltf, write_mesh_ply};
+use flyrig_capture::{CaptureErrorKind, FolderOptions, FolderReplay};
+use flyrig_fusion::{
+    AppearanceMode, Counts, EstimatedPerception, GivenPerception, GivenPerson, Origin, Outcome, PersonId, SHAPE_SETS,
+    Session, SessionBuilder, SessionSettings, SetReader, Solver, StageSummary, next_frame,
+};
 use flyrig_gpu::GpuContext;
-use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
-use flyrig_types::{Camera, CameraId, Frame, FrameSet, Rig};
-use indicatif::{ProgressBar, ProgressStyle};
+use flyrig_metrics::{CameraScore, FrameScore, ScoreSheet, error_parts, score_view};
+use flyrig_report::{ContactRow, Curve, Report, contact_pictures, outlined_inputs, png, progress_bar, write_whole};
+use flyrig_sync::SyncSettings;
+use flyrig_types::{Camera, CameraId, Frame, FrameSet, RenderedView, Rig};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::{
-    cli::EvalArgs,
-    config::{AppearanceMode, Origin, Solver},
-    dataset,
-    engine::{Engine, RenderedView},
-    outlines::outlined_inputs,
-    pipeline::{Counts, Outcome, Pipeline, PoseSource},
-    png,
-    report::{ContactRow, Curve, Report, write_whole},
-    score::{CameraScore, FrameScore, ScoreSheet, contact_pictures, error_parts, score_view},
-    stats::StageSummary,
-};
+use crate::{cli::EvalArgs, dataset, source};
 
 /// Every so many frames the tracked surface is written.
 const SURFACE_EVERY: u64 = 10;
-/// Frame sets that the pose estimator sees before the first is processed, to learn the person's shape.
-const SHAPE_SETS: usize = 8;
 /// Rows of the report's contact sheet.
 const CONTACT_ROWS: usize = 4;
 
@@ -62,7 +58,21 @@ struct Metrics<'a> {
 /// Runs the command.
 pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let started = Instant::now();
-    let Replay { mut pipeline, mut frames, buffered, holdout, mut truth } = Replay::open(args, gpu)?;
+    let settings = ReplaySettings {
+        dataset: args.dataset.clone(),
+        inputs: args.inputs.clone(),
+        holdout: args.holdout.clone(),
+        session: SessionSettings {
+            body: args.body.clone(),
+            tracking: args.tracking.clone(),
+            appearance: args.appearance.clone(),
+        },
+        fps: args.fps,
+        frames: args.frames.clone(),
+        lags_nanos: args.lags.nanos(),
+    };
+    let mut replay = Replay::open(&settings, gpu)?;
+    let holdout = replay.holdout.clone();
     std::fs::create_dir_all(args.out.join("surface"))
         .with_context(|| format!("cannot create {}", args.out.display()))?;
     for camera in &holdout {
@@ -70,33 +80,35 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
     }
 
-    let total = frames.count as u64;
+    let total = replay.count as u64;
     let bar = progress_bar(total, "eval");
     let mut sheet = ScoreSheet::default();
     let mut contact = Vec::new();
     let contact_every = (total / CONTACT_ROWS as u64).max(1);
     let mut processed = 0u64;
-    let mut buffered = buffered.into_iter();
-    while let Some(set) = buffered.next().map_or_else(|| frames.next_set(), |set| Ok(Some(set)))? {
+    let person = PersonId::default();
+    while let Some(set) = replay.next_set()? {
         let number = frame_number(&set);
-        match pipeline.process(&set)? {
+        match replay.session.process(&set)? {
             Outcome::Updated => {}
             Outcome::Held(reason) => {
                 tracing::warn!(frame = number, %reason, "frame not used");
-                if pipeline.pose().is_none() {
+                if !replay.session.has_people() {
                     bar.inc(1);
                     continue;
                 }
             }
         }
-        let views: Vec<RenderedView> = holdout.iter().map(|camera| pipeline.render(camera)).collect::<Result<_>>()?;
-        if let (Some(pose), 0) = (pipeline.pose(), number % SURFACE_EVERY) {
-            let engine = pipeline.engine();
-            let (positions, normals) = engine.surface(pose);
+        let views: Vec<RenderedView> =
+            holdout.iter().map(|camera| replay.session.render(camera)).collect::<Result<_, _>>()?;
+        if let (Some(subject), 0) = (replay.session.subject(person), number % SURFACE_EVERY)
+            && let Some(pose) = subject.pose()
+        {
+            let (positions, normals) = subject.surface(pose);
             let path = args.out.join(format!("surface/{number:06}.ply"));
-            write_mesh_ply(&path, &positions, &normals, &engine.template().triangles, &[])?;
+            write_mesh_ply(&path, &positions, &normals, &subject.template().triangles, &[])?;
         }
-        let truths = truth.at(set.master_nanos)?;
+        let truths = replay.truth.at(set.master_nanos)?;
         let jobs: Vec<_> = holdout.iter().zip(&views).zip(&truths).collect();
         let scores: Vec<Option<FrameScore>> = jobs
             .into_par_iter()
@@ -117,7 +129,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         sheet.extend(scores.into_iter().flatten());
         if processed % contact_every == contact_every / 2 && contact.len() < 2 * CONTACT_ROWS {
             contact.push(contact_row(number, &holdout, &views, &truths)?);
-            let pictures = outlined_inputs(&mut pipeline)?;
+            let pictures = outlined_inputs(&mut replay.session, person)?;
             contact.push(ContactRow { label: format!("frame {number}, inputs"), pictures });
         }
         processed += 1;
@@ -133,12 +145,12 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         dataset: args.dataset.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned()),
         inputs: &args.inputs,
         holdout: &args.holdout,
-        pose: args.pose,
-        masks: args.masks,
-        solver: args.solver,
-        appearance: args.appearance,
-        gaussians: args.gaussians,
-        nodes: args.nodes,
+        pose: args.body.pose,
+        masks: args.body.masks,
+        solver: args.tracking.solver,
+        appearance: args.appearance.mode,
+        gaussians: args.body.gaussians,
+        nodes: args.body.nodes,
         adapter: gpu.adapter_name(),
         frames: processed as usize,
         seconds,
@@ -146,9 +158,9 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         mean: sheet.mean(),
         cameras: cameras.clone(),
         per_frame: sheet.frames(),
-        counts: pipeline.counts.clone(),
-        sync: frames.sync_summary(),
-        stages: pipeline.stages.summary(),
+        counts: replay.session.counts.clone(),
+        sync: replay.sync_summary(),
+        stages: replay.session.stages.summary(),
     };
     write_whole(&args.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
     contact.retain(|row| !row.pictures.is_empty());
@@ -159,9 +171,9 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
             ("inputs, held out".to_owned(), format!("{} → {}", args.inputs.join(" "), args.holdout.join(" "))),
             (
                 "pose, masks, deformation, appearance".to_owned(),
-                format!("{:?}, {:?}, {:?}, {:?}", args.pose, args.masks, args.solver, args.appearance),
+                format!("{:?}, {:?}, {:?}, {:?}", metrics.pose, metrics.masks, metrics.solver, metrics.appearance),
             ),
-            ("Gaussians, nodes".to_owned(), format!("{}, {}", args.gaussians, args.nodes)),
+            ("Gaussians, nodes".to_owned(), format!("{}, {}", metrics.gaussians, metrics.nodes)),
             ("lags taken off, ms".to_owned(), listed(&args.lags.by_camera)),
             ("frames".to_owned(), format!("{processed} in {seconds:.1} s, writing and scoring included")),
             ("scored against".to_owned(), metrics.reference.to_owned()),
@@ -179,158 +191,124 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     report.save(&args.out.join("index.html"))?;
     print!("{}", sheet.table());
     println!();
-    print!("{}", pipeline.stages.table());
+    print!("{}", replay.session.stages.table());
     println!("\n{processed} frames in {seconds:.1} s; pictures and report in {}", args.out.display());
     Ok(())
 }
 
-/// A data set about to be replayed.
+/// Settings of a replayed data set.
+#[derive(Debug, Clone)]
+pub struct ReplaySettings {
+    pub dataset: PathBuf,
+    pub inputs: Vec<String>,
+    pub holdout: Vec<String>,
+    pub session: SessionSettings,
+    /// Frame rate of the folder.
+    pub fps: f64,
+    /// All frames where `None`.
+    pub frames: Option<Range<u64>>,
+    /// Time offsets that are subtracted from the timestamps, nanoseconds.
+    pub lags_nanos: BTreeMap<CameraId, i64>,
+}
+
+/// A data set that is replayed into a session.
 pub struct Replay {
-    pub pipeline: Pipeline,
-    pub frames: FrameReader,
+    pub session: Session,
+    sets: SetReader,
+    /// Number of frames.
+    pub count: usize,
     /// Sets that were read already, to learn the person's shape.
-    pub buffered: Vec<FrameSet>,
+    buffered: VecDeque<FrameSet>,
     pub holdout: Vec<Camera>,
     pub truth: TruthReader,
 }
 
 impl Replay {
-    /// Opens the cameras and makes the pipeline.
-    pub fn open(args: &EvalArgs, gpu: &GpuContext) -> Result<Self> {
-        let (rig, holdout) = load_rigs(args)?;
-        let mut frames = FrameReader::open(args, &rig)?;
-        let truth = TruthReader::open(args, &holdout)?;
-        let plates = dataset::plates(&args.dataset, &rig)?;
-        dataset::require_masks(args.pose, args.masks, &plates)?;
-        let mut buffered = Vec::new();
-        let (template, pose) = match args.pose {
-            Origin::Given => given_pose(&args.dataset)?,
+    /// Opens the cameras and builds the session.
+    pub fn open(settings: &ReplaySettings, gpu: &GpuContext) -> Result<Self> {
+        let (rig, holdout) = load_rigs(settings)?;
+        let (mut sets, count) = open_inputs(settings, &rig)?;
+        let truth = TruthReader::open(settings, &holdout)?;
+        let body = &settings.session.body;
+        let plates = dataset::plates(&settings.dataset, &rig)?;
+        dataset::require_masks(body.pose, body.masks, &plates)?;
+        let builder = SessionBuilder::new(gpu.clone(), rig.clone()).settings(settings.session.clone());
+        let mut buffered = VecDeque::new();
+        let session = match body.pose {
+            Origin::Given => {
+                let person = given_person(&settings.dataset)?;
+                builder.perception(GivenPerception::new(&rig, vec![person]).with_masks(body.masks, plates))
+            }
             Origin::Estimated => {
                 eprintln!("eval: learning the person's shape from the first {SHAPE_SETS} frames");
                 while buffered.len() < SHAPE_SETS {
-                    match frames.next_set()? {
-                        Some(set) => buffered.push(set),
+                    match sets.next_set()? {
+                        Some(set) => buffered.push_back(set),
                         None => break,
                     }
                 }
-                let config = PoseConfig { masks: args.masks == Origin::Estimated, ..PoseConfig::default() };
-                let mut estimator = PoseEstimator::new(
-                    PoseNet::embedded()?,
-                    &default_template(&ShapeParams::default())?,
-                    &rig,
-                    config,
-                )?;
-                dataset::set_plates(&mut estimator, &plates)?;
-                let fit = estimator.fit_shape(&buffered).context("no person found in the first frames")?;
+                let template = default_template(&ShapeParams::default())?;
+                let mut perception = EstimatedPerception::new(&rig, &template, body.masks, plates)?;
+                let fit = perception
+                    .learn_shape(buffered.make_contiguous())
+                    .context("no person found in the first frames")?;
                 eprintln!("eval: the person is {:.2} m tall", fit.height_m);
-                (estimator.template().clone(), PoseSource::Estimator(Box::new(estimator)))
+                builder.perception(perception)
             }
         };
-        let mut engine = Engine::new(
-            gpu.clone(),
-            template,
-            args.gaussians,
-            args.nodes,
-            &rig,
-            args.appearance.settings(),
-            args.solver.options(args.pose),
-        )?;
-        if let Some(networks) = args.appearance.networks(args.weights.as_deref())? {
-            engine.use_networks(&networks, args.networks)?;
+        Ok(Self { session: session.build()?, sets, count, buffered, holdout, truth })
+    }
+
+    /// Returns the next set; `None` at the end.
+    pub fn next_set(&mut self) -> Result<Option<FrameSet>> {
+        match self.buffered.pop_front() {
+            Some(set) => Ok(Some(set)),
+            None => Ok(self.sets.next_set()?),
         }
-        let pipeline = Pipeline::new(engine, rig, pose, args.masks, plates);
-        Ok(Self { pipeline, frames, buffered, holdout, truth })
+    }
+
+    fn sync_summary(&self) -> serde_json::Value {
+        let counts = self.sets.counts();
+        let damaged = self.sets.damaged();
+        serde_json::json!({ "complete": counts.complete, "partial": counts.partial, "broken_pictures": damaged })
     }
 }
 
-fn load_rigs(args: &EvalArgs) -> Result<(Rig, Vec<Camera>)> {
+fn load_rigs(args: &ReplaySettings) -> Result<(Rig, Vec<Camera>)> {
     let chosen: Vec<CameraId> = args.inputs.iter().chain(&args.holdout).map(|name| name.as_str().into()).collect();
     let all = dataset::load_rig(&args.dataset, &chosen)?;
     let whose = format!("the calibration of {}", args.dataset.display());
     let (rig, holdout) = (dataset::pick(&all, &args.inputs, &whose)?, dataset::pick(&all, &args.holdout, &whose)?);
     let used = Rig { cameras: rig.cameras.iter().chain(&holdout.cameras).cloned().collect(), world_up: all.world_up };
-    dataset::pick(&used, &args.lags.cameras(), "--inputs or --holdout, but in --lag")?;
+    let with_lags: Vec<String> = args.lags_nanos.keys().map(CameraId::to_string).collect();
+    dataset::pick(&used, &with_lags, "--inputs or --holdout, but in --lag")?;
     if let Some(both) = args.inputs.iter().find(|name| args.holdout.contains(name)) {
         bail!("camera {both} is both an input and held out; scores would flatter");
     }
     Ok((rig, holdout.cameras))
 }
 
-/// Template and pose track of the data set's glTF file.
-fn given_pose(root: &Path) -> Result<(Template, PoseSource)> {
+/// The person of the data set's glTF file.
+fn given_person(root: &Path) -> Result<GivenPerson> {
     let file = dataset::gltf_file(root)?;
     let human = load_gltf(&file)?;
     let track = human.track.with_context(|| format!("{} holds no animation; use --pose estimated", file.display()))?;
-    Ok((human.template, PoseSource::Track { track, repeat: false }))
+    Ok(GivenPerson { person: PersonId::default(), template: human.template, track, repeat: false })
 }
 
-/// Reads the input cameras frame by frame and forms sets; a broken picture is missing from its set.
-pub struct FrameReader {
-    sources: Vec<FolderReplay>,
-    sync: Synchronizer,
-    ready: std::collections::VecDeque<FrameSet>,
-    done: bool,
-    pub count: usize,
-    broken: u64,
-}
-
-impl FrameReader {
-    fn open(args: &EvalArgs, rig: &Rig) -> Result<Self> {
-        let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
-        let options =
-            FolderOptions { fps: args.fps, frames: args.frames.clone(), with_masks: args.masks == Origin::Given };
-        let sources = FolderReplay::open(&args.dataset, Some(&ids), &options)?;
-        let count = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);
-        let config = SyncConfig {
-            window_nanos: Some(half_period_nanos(args)),
-            lags_nanos: args.lags.nanos(),
-            ..SyncConfig::default()
-        };
-        Ok(Self {
-            sources,
-            sync: Synchronizer::new(&ids, &config),
-            ready: Default::default(),
-            done: false,
-            count,
-            broken: 0,
-        })
-    }
-
-    pub fn next_set(&mut self) -> Result<Option<FrameSet>> {
-        while self.ready.is_empty() && !self.done {
-            let mut ended = 0;
-            for source in &mut self.sources {
-                match next_frame(source) {
-                    Ok(Some(frame)) => self.ready.extend(self.sync.push(frame)),
-                    Ok(None) => ended += 1,
-                    Err(error) if error.kind == CaptureErrorKind::Corrupt => {
-                        self.broken += 1;
-                        tracing::warn!("{error}; going on without it");
-                    }
-                    Err(error) => return Err(error.into()),
-                }
-            }
-            if ended == self.sources.len() {
-                self.done = true;
-                self.ready.extend(self.sync.flush());
-            }
-        }
-        Ok(self.ready.pop_front())
-    }
-
-    fn sync_summary(&self) -> serde_json::Value {
-        let counts = self.sync.counts();
-        serde_json::json!({ "complete": counts.complete, "partial": counts.partial, "broken_pictures": self.broken })
-    }
-}
-
-/// The next frame of a folder; `None` at its end.
-fn next_frame(source: &mut FolderReplay) -> Result<Option<Frame>, flyrig_capture::CaptureError> {
-    match source.next_frame(std::time::Duration::ZERO) {
-        Ok(frame) => Ok(Some(frame)),
-        Err(error) if error.kind == CaptureErrorKind::EndOfStream => Ok(None),
-        Err(error) => Err(error),
-    }
+/// Opens the input cameras; returns their number of frames as well.
+fn open_inputs(settings: &ReplaySettings, rig: &Rig) -> Result<(SetReader, usize)> {
+    let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+    let with_masks = settings.session.body.masks == Origin::Given;
+    let options = FolderOptions { fps: settings.fps, frames: settings.frames.clone(), with_masks };
+    let sources = FolderReplay::open(&settings.dataset, Some(&ids), &options)?;
+    let count = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);
+    let sync = SyncSettings {
+        window_nanos: Some(half_period_nanos(settings.fps)),
+        lags_nanos: settings.lags_nanos.clone(),
+        ..SyncSettings::default()
+    };
+    Ok((SetReader::new(source::boxed(sources), &sync), count))
 }
 
 /// Reads the held-out cameras alongside, never ahead of what is scored.
@@ -341,15 +319,14 @@ pub struct TruthReader {
 }
 
 impl TruthReader {
-    fn open(args: &EvalArgs, holdout: &[Camera]) -> Result<Self> {
+    fn open(args: &ReplaySettings, holdout: &[Camera]) -> Result<Self> {
         let ids: Vec<CameraId> = holdout.iter().map(|camera| camera.id.clone()).collect();
         let with_masks = ids.iter().all(|id| args.dataset.join("mask").join(id.as_str()).is_dir());
         let options = FolderOptions { fps: args.fps, frames: args.frames.clone(), with_masks };
         let sources = FolderReplay::open(&args.dataset, Some(&ids), &options)?;
-        let lags = args.lags.nanos();
-        let lag = |id: &CameraId| lags.get(id).copied().unwrap_or_default();
+        let lag = |id: &CameraId| args.lags_nanos.get(id).copied().unwrap_or_default();
         let sources = sources.into_iter().zip(&ids).map(|(source, id)| (source, lag(id), None)).collect();
-        Ok(Self { sources, window_nanos: half_period_nanos(args) })
+        Ok(Self { sources, window_nanos: half_period_nanos(args.fps) })
     }
 
     /// Per held-out camera the frame nearest in time, within half a frame period.
@@ -357,7 +334,7 @@ impl TruthReader {
         for (source, lag, current) in &mut self.sources {
             let earliest = nanos.saturating_sub_unsigned(self.window_nanos);
             while current.as_ref().is_none_or(|frame| frame.capture_nanos < earliest) {
-                match next_frame(source) {
+                match next_frame(&mut *source) {
                     Ok(Some(frame)) => {
                         *current = Some(Frame { capture_nanos: frame.capture_nanos.saturating_sub(*lag), ..frame });
                     }
@@ -381,8 +358,8 @@ fn listed(lags: &[(String, f64)]) -> String {
 }
 
 /// Half of the time from frame to frame: nearer than that a frame's set is unambiguous.
-fn half_period_nanos(args: &EvalArgs) -> u64 {
-    (0.5e9 / args.fps).ceil() as u64
+fn half_period_nanos(fps: f64) -> u64 {
+    (0.5e9 / fps).ceil() as u64
 }
 
 /// Number of a set's frames in the data set's file names.
@@ -404,11 +381,4 @@ fn contact_row(
         pictures.extend(contact_pictures(&holdout[shown].id, view, &truth.image, truth.mask.as_ref())?);
     }
     Ok(ContactRow { label: format!("frame {number}"), pictures })
-}
-
-/// A bar with rate, time left and a message.
-pub fn progress_bar(total: u64, what: &'static str) -> ProgressBar {
-    let style = ProgressStyle::with_template("{prefix} {bar:32} {pos}/{len} {per_sec} {eta} left {msg}")
-        .unwrap_or_else(|_| ProgressStyle::default_bar());
-    ProgressBar::new(total).with_style(style).with_prefix(what)
 }

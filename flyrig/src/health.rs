@@ -1,187 +1,139 @@
-//! How the rig is: one snapshot for the terminal and for Prometheus.
+//! Health of a rig for the terminal and for Prometheus.
 
 use std::fmt::Write as _;
 
-use flyrig_calib::ClockState;
-use flyrig_capture::CameraStats;
+use flyrig_fusion::{CameraHealth, Health};
 
-use crate::stats::StageSummary;
-
-/// A camera whose last frame is older than this, or than five intervals, is down, seconds.
-const UP_WITHIN_S: f64 = 5.0;
-
-/// One camera.
-#[derive(Debug, Clone)]
-pub struct CameraHealth {
-    pub stats: CameraStats,
-    /// Frames that came into no set.
-    pub in_no_set: u64,
-    /// Capture times: mean interval and its standard deviation, milliseconds.
-    pub interval_ms: f64,
-    pub jitter_ms: f64,
-    /// From the capture to the synchronizer, milliseconds; known for cameras of this computer.
-    pub lateness_ms: Option<f64>,
-    /// Since the last frame, seconds; none before the first.
-    pub quiet_s: Option<f64>,
-    /// For cameras with clocks of their own.
-    pub clock: Option<ClockState>,
-}
-
-impl CameraHealth {
-    /// Whether frames come.
-    fn is_up(&self) -> bool {
-        self.stats.running && self.quiet_s.is_some_and(|quiet| quiet < (5e-3 * self.interval_ms).max(UP_WITHIN_S))
-    }
-}
-
-/// The rig.
-#[derive(Debug, Clone)]
-pub struct Health {
-    pub cameras: Vec<CameraHealth>,
-    pub complete_sets: u64,
-    pub partial_sets: u64,
-    /// Sets that were older than the newest when the pipeline could take one.
-    pub skipped_sets: u64,
-    pub stages: Vec<StageSummary>,
-    pub resident_mib: Option<f64>,
-}
-
-impl Health {
-    /// In Prometheus' text format 0.0.4.
-    pub fn prometheus(&self) -> String {
-        let mut text = String::new();
-        let mut family = |name: &str, kind: &str, help: &str, samples: &mut dyn Iterator<Item = (String, f64)>| {
-            let _ = writeln!(text, "# HELP flyrig_{name} {help}\n# TYPE flyrig_{name} {kind}");
-            for (labels, value) in samples {
-                let _ = writeln!(text, "flyrig_{name}{labels} {value}");
-            }
-        };
-        let label = |camera: &CameraHealth| format!("{{camera=\"{}\"}}", escaped(camera.stats.camera.as_str()));
-        type Field<'a> = &'a dyn Fn(&CameraHealth) -> Option<f64>;
-        let per_camera: [(&str, &str, &str, Field<'_>); 21] = [
-            ("frames_total", "counter", "Frames that came.", &|c| Some(c.stats.frames as f64)),
-            ("frames_lost_before_us_total", "counter", "Frames that the driver numbered and nobody got.", &|c| {
-                Some(c.stats.health.lost_by_driver as f64)
-            }),
-            ("frames_waited_too_long_total", "counter", "Frames dropped because the rig was busy.", &|c| {
-                Some(c.stats.dropped as f64)
-            }),
-            ("frames_in_no_set_total", "counter", "Frames that fitted into no set.", &|c| Some(c.in_no_set as f64)),
-            ("reconnects_total", "counter", "Times that the camera came back.", &|c| {
-                Some(c.stats.health.reconnects as f64)
-            }),
-            ("silences_total", "counter", "Times that the camera stopped without an error.", &|c| {
-                Some(c.stats.health.silences as f64)
-            }),
-            ("stamps_replaced_total", "counter", "Time stamps that could not be right.", &|c| {
-                let of_clock = c.clock.map_or(0, |clock| clock.replaced);
-                Some(c.stats.health.stamps_replaced.saturating_add(of_clock) as f64)
-            }),
-            ("camera_up", "gauge", "Whether frames come.", &|c| Some(f64::from(u8::from(c.is_up())))),
-            ("quiet_seconds", "gauge", "Since the last frame.", &|c| c.quiet_s),
-            ("interval_seconds", "gauge", "Mean time between captures.", &|c| {
-                (c.is_up() && c.interval_ms > 0.0).then_some(c.interval_ms / 1e3)
-            }),
-            ("jitter_seconds", "gauge", "Standard deviation of the time between captures.", &|c| {
-                (c.is_up() && c.interval_ms > 0.0).then_some(c.jitter_ms / 1e3)
-            }),
-            ("lateness_seconds", "gauge", "From capture to synchronizer.", &|c| {
-                c.lateness_ms.filter(|_| c.is_up()).map(|ms| ms / 1e3)
-            }),
-            ("clock_drift_ppm", "gauge", "Drift against the master's clock.", &|c| {
-                c.clock.map(|clock| clock.drift_ppm)
-            }),
-            ("frames_overtaken_total", "counter", "Frames overtaken before they were decoded.", &|c| {
-                Some(c.stats.overtaken as f64)
-            }),
-            ("network_overtaken_before_total", "counter", "Frames that stayed on the camera's computer.", &|c| {
-                c.stats.health.network.map(|n| n.overtaken_before as f64)
-            }),
-            ("network_lost_total", "counter", "Frames that left the camera's computer and never came.", &|c| {
-                c.stats.health.network.map(|n| n.lost_on_the_way as f64)
-            }),
-            ("network_overtaken_here_total", "counter", "Frames overtaken after they had come.", &|c| {
-                c.stats.health.network.map(|n| n.overtaken_here as f64)
-            }),
-            ("network_refused_total", "counter", "Messages that could not be used.", &|c| {
-                c.stats.health.network.map(|n| n.refused.saturating_add(n.before_clock) as f64)
-            }),
-            ("host_clock_offset_seconds", "gauge", "Clock of the camera's computer minus ours.", &|c| {
-                Some(c.stats.health.network?.clock_offset_nanos? as f64 * 1e-9)
-            }),
-            ("host_clock_drift_ppm", "gauge", "How much faster that clock runs.", &|c| {
-                let network = c.stats.health.network?;
-                network.clock_offset_nanos.map(|_| network.clock_drift_ppb as f64 * 1e-3)
-            }),
-            ("host_round_trip_seconds", "gauge", "Shortest round trip to that computer.", &|c| {
-                let network = c.stats.health.network?;
-                network.clock_offset_nanos.map(|_| network.round_trip_nanos as f64 * 1e-9)
-            }),
-        ];
-        for (name, kind, help, field) in per_camera {
-            let mut samples = self.cameras.iter().filter_map(|camera| Some((label(camera), field(camera)?)));
-            family(name, kind, help, &mut samples);
+/// Formats a snapshot in Prometheus' text format 0.0.4.
+pub fn prometheus(health: &Health) -> String {
+    let mut text = String::new();
+    let mut family = |name: &str, kind: &str, help: &str, samples: &mut dyn Iterator<Item = (String, f64)>| {
+        let _ = writeln!(text, "# HELP flyrig_{name} {help}\n# TYPE flyrig_{name} {kind}");
+        for (labels, value) in samples {
+            let _ = writeln!(text, "flyrig_{name}{labels} {value}");
         }
-        let mut errors = self.cameras.iter().flat_map(|camera| {
-            let name = escaped(camera.stats.camera.as_str());
-            let labels = move |kind| format!("{{camera=\"{name}\",kind=\"{kind:?}\"}}");
-            camera.stats.errors.iter().map(move |(kind, count)| (labels(kind), *count as f64))
-        });
-        family("camera_errors_total", "counter", "Errors of cameras by kind.", &mut errors);
-        let sets = [("complete", self.complete_sets), ("partial", self.partial_sets), ("skipped", self.skipped_sets)];
-        let mut sets = sets.into_iter().map(|(kind, count)| (format!("{{kind=\"{kind}\"}}"), count as f64));
-        family("sets_total", "counter", "Sets of frames.", &mut sets);
-        let mut stages = self.stages.iter().flat_map(|stage| {
-            let name = escaped(&stage.name);
-            [("0.5", stage.p50_ms), ("0.95", stage.p95_ms)]
-                .map(|(quantile, ms)| (format!("{{stage=\"{name}\",quantile=\"{quantile}\"}}"), f64::from(ms) / 1e3))
-        });
-        family("stage_seconds", "gauge", "Time of a stage of the pipeline.", &mut stages);
-        let mut memory = self.resident_mib.into_iter().map(|mib| (String::new(), mib * 1024.0 * 1024.0));
-        family("resident_bytes", "gauge", "Resident memory.", &mut memory);
-        text
+    };
+    let label = |camera: &CameraHealth| format!("{{camera=\"{}\"}}", escaped(camera.stats.camera.as_str()));
+    type Field<'a> = &'a dyn Fn(&CameraHealth) -> Option<f64>;
+    let per_camera: [(&str, &str, &str, Field<'_>); 21] = [
+        ("frames_total", "counter", "Frames that came.", &|c| Some(c.stats.frames as f64)),
+        ("frames_lost_before_us_total", "counter", "Frames that the driver numbered and nobody got.", &|c| {
+            Some(c.stats.health.lost_by_driver as f64)
+        }),
+        ("frames_waited_too_long_total", "counter", "Frames dropped because the rig was busy.", &|c| {
+            Some(c.stats.dropped as f64)
+        }),
+        ("frames_in_no_set_total", "counter", "Frames that fitted into no set.", &|c| Some(c.in_no_set as f64)),
+        ("reconnects_total", "counter", "Times that the camera came back.", &|c| {
+            Some(c.stats.health.reconnects as f64)
+        }),
+        ("silences_total", "counter", "Times that the camera stopped without an error.", &|c| {
+            Some(c.stats.health.silences as f64)
+        }),
+        ("stamps_replaced_total", "counter", "Time stamps that could not be right.", &|c| {
+            let of_clock = c.clock.map_or(0, |clock| clock.replaced);
+            Some(c.stats.health.stamps_replaced.saturating_add(of_clock) as f64)
+        }),
+        ("camera_up", "gauge", "Whether frames come.", &|c| Some(f64::from(u8::from(c.is_up())))),
+        ("quiet_seconds", "gauge", "Since the last frame.", &|c| c.quiet_s),
+        ("interval_seconds", "gauge", "Mean time between captures.", &|c| {
+            (c.is_up() && c.interval_ms > 0.0).then_some(c.interval_ms / 1e3)
+        }),
+        ("jitter_seconds", "gauge", "Standard deviation of the time between captures.", &|c| {
+            (c.is_up() && c.interval_ms > 0.0).then_some(c.jitter_ms / 1e3)
+        }),
+        ("lateness_seconds", "gauge", "From capture to synchronizer.", &|c| {
+            c.lateness_ms.filter(|_| c.is_up()).map(|ms| ms / 1e3)
+        }),
+        ("clock_drift_ppm", "gauge", "Drift against the master's clock.", &|c| c.clock.map(|clock| clock.drift_ppm)),
+        ("frames_overtaken_total", "counter", "Frames overtaken before they were decoded.", &|c| {
+            Some(c.stats.overtaken as f64)
+        }),
+        ("network_overtaken_before_total", "counter", "Frames that stayed on the camera's computer.", &|c| {
+            c.stats.health.network.map(|n| n.overtaken_before as f64)
+        }),
+        ("network_lost_total", "counter", "Frames that left the camera's computer and never came.", &|c| {
+            c.stats.health.network.map(|n| n.lost_on_the_way as f64)
+        }),
+        ("network_overtaken_here_total", "counter", "Frames overtaken after they had come.", &|c| {
+            c.stats.health.network.map(|n| n.overtaken_here as f64)
+        }),
+        ("network_refused_total", "counter", "Messages that could not be used.", &|c| {
+            c.stats.health.network.map(|n| n.refused.saturating_add(n.before_clock) as f64)
+        }),
+        ("host_clock_offset_seconds", "gauge", "Clock of the camera's computer minus ours.", &|c| {
+            Some(c.stats.health.network?.clock_offset_nanos? as f64 * 1e-9)
+        }),
+        ("host_clock_drift_ppm", "gauge", "How much faster that clock runs.", &|c| {
+            let network = c.stats.health.network?;
+            network.clock_offset_nanos.map(|_| network.clock_drift_ppb as f64 * 1e-3)
+        }),
+        ("host_round_trip_seconds", "gauge", "Shortest round trip to that computer.", &|c| {
+            let network = c.stats.health.network?;
+            network.clock_offset_nanos.map(|_| network.round_trip_nanos as f64 * 1e-9)
+        }),
+    ];
+    for (name, kind, help, field) in per_camera {
+        let mut samples = health.cameras.iter().filter_map(|camera| Some((label(camera), field(camera)?)));
+        family(name, kind, help, &mut samples);
     }
+    let mut errors = health.cameras.iter().flat_map(|camera| {
+        let name = escaped(camera.stats.camera.as_str());
+        let labels = move |kind| format!("{{camera=\"{name}\",kind=\"{kind:?}\"}}");
+        camera.stats.errors.iter().map(move |(kind, count)| (labels(kind), *count as f64))
+    });
+    family("camera_errors_total", "counter", "Errors of cameras by kind.", &mut errors);
+    let sets = [("complete", health.complete_sets), ("partial", health.partial_sets), ("skipped", health.skipped_sets)];
+    let mut sets = sets.into_iter().map(|(kind, count)| (format!("{{kind=\"{kind}\"}}"), count as f64));
+    family("sets_total", "counter", "Sets of frames.", &mut sets);
+    let mut stages = health.stages.iter().flat_map(|stage| {
+        let name = escaped(&stage.name);
+        [("0.5", stage.p50_ms), ("0.95", stage.p95_ms)]
+            .map(|(quantile, ms)| (format!("{{stage=\"{name}\",quantile=\"{quantile}\"}}"), f64::from(ms) / 1e3))
+    });
+    family("stage_seconds", "gauge", "Time of a stage of the pipeline.", &mut stages);
+    let mut memory = health.resident_mib.into_iter().map(|mib| (String::new(), mib * 1024.0 * 1024.0));
+    family("resident_bytes", "gauge", "Resident memory.", &mut memory);
+    text
+}
 
-    /// As a table for the terminal.
-    pub fn table(&self) -> String {
-        let mut text = format!(
-            "{:<14} {:>9} {:>7} {:>7} {:>7} {:>7} {:>7} {:>9} {:>9}  {}\n",
-            "camera", "frames", "lost", "late", "no set", "errors", "back", "jitter ms", "late ms", "mode"
-        );
-        for camera in &self.cameras {
-            let stats = &camera.stats;
-            let late = camera.lateness_ms.map_or_else(|| "-".to_owned(), |ms| format!("{ms:.1}"));
-            let mut mode = if stats.running { stats.health.mode.to_string() } else { "ended".to_owned() };
-            if let Some(network) = stats.health.network {
-                let offset = network.clock_offset_nanos.map(|nanos| nanos as f64 * 1e-9);
-                let drift = network.clock_drift_ppb as f64 * 1e-3;
-                let clock = offset.map_or_else(
-                    || "clock not known yet".to_owned(),
-                    |secs| format!("clock {secs:+.4} s {drift:+.1} ppm"),
-                );
-                let _ = write!(mode, "  network: {} lost, {clock}", network.lost_on_the_way);
-            }
-            let _ = writeln!(
-                text,
-                "{:<14} {:>9} {:>7} {:>7} {:>7} {:>7} {:>7} {:>9.2} {:>9}  {mode}",
-                stats.camera,
-                stats.frames,
-                stats.health.lost_by_driver,
-                stats.dropped,
-                camera.in_no_set,
-                stats.errors.values().sum::<u64>(),
-                stats.health.reconnects,
-                camera.jitter_ms,
-                late
-            );
+/// Formats a snapshot as a table for the terminal.
+pub fn table(health: &Health) -> String {
+    let mut text = format!(
+        "{:<14} {:>9} {:>7} {:>7} {:>7} {:>7} {:>7} {:>9} {:>9}  {}\n",
+        "camera", "frames", "lost", "late", "no set", "errors", "back", "jitter ms", "late ms", "mode"
+    );
+    for camera in &health.cameras {
+        let stats = &camera.stats;
+        let late = camera.lateness_ms.map_or_else(|| "-".to_owned(), |ms| format!("{ms:.1}"));
+        let mut mode = if stats.running { stats.health.mode.to_string() } else { "ended".to_owned() };
+        if let Some(network) = stats.health.network {
+            let offset = network.clock_offset_nanos.map(|nanos| nanos as f64 * 1e-9);
+            let drift = network.clock_drift_ppb as f64 * 1e-3;
+            let clock = offset
+                .map_or_else(|| "clock not known yet".to_owned(), |secs| format!("clock {secs:+.4} s {drift:+.1} ppm"));
+            let _ = write!(mode, "  network: {} lost, {clock}", network.lost_on_the_way);
         }
         let _ = writeln!(
             text,
-            "sets: {} complete, {} partial, {} skipped",
-            self.complete_sets, self.partial_sets, self.skipped_sets
+            "{:<14} {:>9} {:>7} {:>7} {:>7} {:>7} {:>7} {:>9.2} {:>9}  {mode}",
+            stats.camera,
+            stats.frames,
+            stats.health.lost_by_driver,
+            stats.dropped,
+            camera.in_no_set,
+            stats.errors.values().sum::<u64>(),
+            stats.health.reconnects,
+            camera.jitter_ms,
+            late
         );
-        text
     }
+    let _ = writeln!(
+        text,
+        "sets: {} complete, {} partial, {} skipped",
+        health.complete_sets, health.partial_sets, health.skipped_sets
+    );
+    text
 }
 
 /// A label's value may hold anything but these.
@@ -193,7 +145,9 @@ fn escaped(text: &str) -> String {
 mod tests {
     use std::collections::BTreeMap;
 
-    use flyrig_capture::{CaptureErrorKind, SourceHealth};
+    use flyrig_capture::{CameraStats, CaptureErrorKind, SourceHealth};
+    use flyrig_fusion::StageSummary;
+    use flyrig_sync::ClockState;
 
     use super::*;
 
@@ -225,12 +179,20 @@ mod tests {
         let stage = StageSummary { name: "draw".into(), frames: 1, mean_ms: 2.0, p50_ms: 2.0, p95_ms: 4.0 };
         let (complete_sets, partial_sets, skipped_sets) = (800, 10, 4);
         let resident_mib = Some(2.0);
-        Health { cameras: vec![camera], complete_sets, partial_sets, skipped_sets, stages: vec![stage], resident_mib }
+        Health {
+            cameras: vec![camera],
+            complete_sets,
+            partial_sets,
+            skipped_sets,
+            stages: vec![stage],
+            device_faults: 0,
+            resident_mib,
+        }
     }
 
     #[test]
     fn every_line_of_the_metrics_is_well_formed() {
-        let text = health().prometheus();
+        let text = prometheus(&health());
         for line in [
             "flyrig_frames_total{camera=\"le\\\"ft\"} 900",
             "flyrig_camera_errors_total{camera=\"le\\\"ft\",kind=\"Corrupt\"} 2",
@@ -257,7 +219,7 @@ mod tests {
     #[test]
     fn a_camera_without_frames_is_down_and_tells_nothing_old() {
         let mut health = health();
-        let has = |health: &Health, start: &str| health.prometheus().lines().any(|line| line.starts_with(start));
+        let has = |health: &Health, start: &str| prometheus(health).lines().any(|line| line.starts_with(start));
         assert!(has(&health, "flyrig_camera_up{camera=\"le\\\"ft\"} 1"));
         for quiet_s in [Some(60.0), None] {
             health.cameras[0].quiet_s = quiet_s;
@@ -272,7 +234,7 @@ mod tests {
 
     #[test]
     fn the_table_has_a_row_a_camera() {
-        let table = health().table();
+        let table = table(&health());
         let row = table.lines().nth(1).unwrap();
         let cells: Vec<&str> = row.split_whitespace().collect();
         assert_eq!(cells[..9], ["le\"ft", "900", "7", "3", "5", "2", "1", "0.40", "12.0"]);

@@ -10,8 +10,6 @@ use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, NetworkHealth
 use flyrig_transport::{CameraSubscriber, HostClock, TransportConfig, TransportErrorKind};
 use flyrig_types::{CameraId, Frame, Rig};
 
-use crate::config::Config;
-
 /// A camera that was there is silent after this.
 const SILENT: Duration = Duration::from_millis(700);
 /// A camera that was not there yet is missed after this.
@@ -24,21 +22,11 @@ pub fn host_clock() -> HostClock {
     HostClock::new(flyrig_capture::monotonic_nanos)
 }
 
-/// The session's settings, without what is not used.
-pub fn transport(config: &Config) -> TransportConfig {
-    TransportConfig {
-        listen: config.transport.listen.clone(),
-        connect: config.transport.connect.clone(),
-        max_viewers: config.transport.max_viewers,
-        ..TransportConfig::publisher(&config.rig.name)
-    }
-}
-
 /// A source for every camera of the rig, all in one session.
-pub fn open(config: &Config, rig: &Rig) -> Result<Vec<Box<dyn CameraSource>>> {
+pub fn open(transport: &TransportConfig, rig: &Rig) -> Result<Vec<Box<dyn CameraSource>>> {
     let cameras: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     // It listens nowhere: that address is the results'.
-    let transport = TransportConfig { listen: Vec::new(), ..transport(config) };
+    let transport = TransportConfig { listen: Vec::new(), ..transport.clone() };
     let subscriber = CameraSubscriber::open(&transport, &cameras, host_clock())
         .context("source.kind is \"network\": transport.connect must name the computers with cameras or a router")?;
     let subscriber = Arc::new(subscriber);

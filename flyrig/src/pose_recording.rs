@@ -16,7 +16,7 @@ use foxglove::{
 };
 use glam::{DQuat, DVec3};
 
-use crate::record;
+use crate::recording;
 
 /// Where poses are in a recording.
 const TOPIC: &str = "pose";
@@ -33,7 +33,7 @@ pub struct PoseRecording(MessageTap);
 impl PoseRecording {
     /// A channel of its own in the file.
     pub fn new(recorder: &Recorder) -> Self {
-        Self(recorder.messages(TOPIC, record::schema::<FrameTransforms>()))
+        Self(recorder.messages(TOPIC, recording::schema::<FrameTransforms>()))
     }
 
     /// Records a pose of an instant, nanoseconds on the clock of the frames.

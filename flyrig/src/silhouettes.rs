@@ -4,13 +4,11 @@ use std::sync::Arc;
 
 use anyhow::Result;
 use flyrig_body::{ShapeParams, default_template};
-use flyrig_calib::SilhouetteTrack;
+use flyrig_sync::SilhouetteTrack;
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet, TrackErrorKind};
 use flyrig_types::{Camera, Frame, FrameSet, Image, Pose, Rig};
 use glam::DVec3;
 use rayon::prelude::*;
-
-use crate::dataset;
 
 /// Finds silhouettes.
 pub struct Silhouettes {
@@ -74,7 +72,9 @@ impl Viewer {
     fn new(camera: &Camera, world_up: DVec3, plate: Option<Image>, given_masks: bool) -> Result<Self> {
         let alone = Rig { cameras: vec![camera.clone()], world_up };
         let mut estimator = estimator(&alone, PoseConfig::default())?;
-        dataset::set_plates(&mut estimator, &[plate])?;
+        if let Some(plate) = &plate {
+            estimator.set_plate(0, plate)?;
+        }
         Ok(Self { estimator, track: SilhouetteTrack::new(camera), given_masks, sets: 0 })
     }
 

@@ -4,9 +4,10 @@ use std::time::Instant;
 
 use anyhow::Result;
 use flyrig_gpu::GpuContext;
+use flyrig_report::{progress_bar, stop};
 use flyrig_sim::{ExportOptions, SimConfig, Simulator, export};
 
-use crate::{cli::SimExportArgs, eval::progress_bar, stop};
+use crate::cli::SimExportArgs;
 
 /// Runs the command.
 pub fn sim_export(args: &SimExportArgs, config: &SimConfig, gpu: &GpuContext) -> Result<()> {

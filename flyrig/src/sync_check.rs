@@ -6,25 +6,24 @@ use std::{
 };
 
 use anyhow::{Result, bail, ensure};
-use flyrig_calib::{
-    ClockKind, LagEstimate, MotionSignal, SilhouetteTrack, SyncConfig, estimate_lags, estimate_silhouette_lags,
-};
 use flyrig_capture::{
     CameraSource, CaptureThreads, FolderOptions, FolderReplay, Pacing, PopError, ThreadsConfig, VideoOptions,
     VideoReplay, to_rgb8_into,
 };
+use flyrig_fusion::{InputFormat, Intake, Origin};
 use flyrig_gpu::GpuContext;
+use flyrig_report::{progress_bar, stop};
+use flyrig_sync::{
+    ClockKind, LagEstimate, MotionSignal, SilhouetteTrack, SyncSettings, estimate_lags, estimate_silhouette_lags,
+};
 use flyrig_types::{CameraId, Image, Rig};
 
 use crate::{
     cli::SyncCheckArgs,
-    config::{Config, Origin, SourceKind},
-    dataset,
-    eval::progress_bar,
-    intake::{Intake, Pictures},
-    record, run,
+    config::{Config, SourceKind},
+    dataset, recording,
     silhouettes::Silhouettes,
-    stop,
+    source,
 };
 
 type Sources = Vec<Box<dyn CameraSource>>;
@@ -38,8 +37,7 @@ struct Take {
     /// Whether masks that come with the pictures are used.
     given_masks: bool,
     /// What is taken off the stamps already.
-    sync: SyncConfig,
-    clocks: ClockKind,
+    sync: SyncSettings,
     /// Where lags are told to flyrig.
     advice: &'static str,
 }
@@ -47,8 +45,7 @@ struct Take {
 impl Take {
     /// Of a recording, folder or videos by themselves.
     fn replayed(sources: Sources, calibration: Option<(Rig, Vec<Option<Image>>)>, given_masks: bool) -> Self {
-        let (sync, clocks) = (SyncConfig::default(), ClockKind::Shared);
-        Self { sources, is_live: false, calibration, given_masks, sync, clocks, advice: TELL }
+        Self { sources, is_live: false, calibration, given_masks, sync: SyncSettings::default(), advice: TELL }
     }
 }
 
@@ -74,7 +71,7 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
         }
         _ => {
             ensure!(
-                take.clocks == ClockKind::Shared,
+                take.sync.clocks == ClockKind::Shared,
                 "sync.clocks is \"triggered\": every camera has a clock of its own, and without the rig's clocks in step what moves \
                  tells no lag; record the take and check the recording"
             );
@@ -104,7 +101,7 @@ fn by_motion(
     args: &SyncCheckArgs,
     sources: Sources,
     cameras: &[CameraId],
-    sync: &SyncConfig,
+    sync: &SyncSettings,
     is_live: bool,
 ) -> Result<(Vec<LagEstimate>, Vec<usize>)> {
     let mut signals: Vec<MotionSignal> = cameras.iter().cloned().map(MotionSignal::new).collect();
@@ -156,8 +153,8 @@ fn by_silhouettes(
     let mut silhouettes = Silhouettes::new(rig, plates, take.given_masks)?;
     // One camera may be ahead by as much as another is behind, and nothing is lost by waiting.
     let max_wait_nanos = Some(take.sync.max_wait_nanos.unwrap_or(1_000_000_000) + (args.most_ms * 2e6) as u64);
-    let sync = SyncConfig { max_wait_nanos, ..take.sync };
-    let mut intake = Intake::start(take.sources, Pictures::OfRig(rig), &sync, take.clocks, Pacing::Lossless)?;
+    let sync = SyncSettings { max_wait_nanos, ..take.sync };
+    let mut intake = Intake::start(take.sources, InputFormat::OfRig(rig), &sync, Pacing::Lossless)?;
     let bar = progress_bar((args.seconds * 1e3) as u64, "silhouettes, ms of the take");
     let (mut first, mut pictures) = (None, vec![0usize; rig.cameras.len()]);
     while !intake.ended() && !stop::requested() {
@@ -193,30 +190,28 @@ fn open(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Ta
             config.source.real_time &= !is_sim;
             let gpu = is_sim.then(gpu).transpose()?;
             let is_live = config.source.kind.is_live();
-            let scene = run::open(&config, gpu.as_ref())?;
+            let source = source::open(&config, gpu.as_ref())?;
             let given_masks = config.body.masks == Origin::Given;
-            let sync = run::sync_config(&config);
             Take {
-                sources: scene.sources,
+                sources: source.cameras,
                 is_live,
-                calibration: Some((scene.rig, scene.plates)),
+                calibration: Some((source.rig, source.plates)),
                 given_masks,
-                sync,
-                clocks: config.sync.clocks,
+                sync: config.sync,
                 advice: if is_live { ADD_TO_CAMERA } else { ADD_TO_SYNC },
             }
         }
         [path] if has_ending(path, "mcap") => {
-            let rig = record::recorded_rig(path)?;
+            let rig = recording::recorded_rig(path)?;
             let plates = rig.cameras.iter().map(|_| None).collect();
-            let sources = record::replay_sources(path, &rig)?;
+            let sources = recording::replay_sources(path, &rig)?;
             Take::replayed(sources, Some((rig, plates)), false)
         }
         [folder] if folder.is_dir() => {
             let is_calibrated = ["intri.yml", "extri.yml"].iter().all(|file| folder.join(file).exists());
             let replay = |with_masks| -> Result<Sources> {
                 let options = FolderOptions { fps: args.fps, with_masks, ..FolderOptions::default() };
-                Ok(run::boxed(FolderReplay::open(folder, None, &options)?))
+                Ok(source::boxed(FolderReplay::open(folder, None, &options)?))
             };
             let mut sources = replay(false)?;
             let masks = folder.join("mask");
@@ -236,7 +231,7 @@ fn open(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Ta
                 let name = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
                 Ok(VideoReplay::open(&name.into(), path, &VideoOptions::default())?)
             };
-            let sources = run::boxed(videos.iter().map(video).collect::<Result<_>>()?);
+            let sources = source::boxed(videos.iter().map(video).collect::<Result<_>>()?);
             Take::replayed(sources, None, false)
         }
     };
@@ -303,7 +298,7 @@ mod tests {
             let simulator = Arc::new(Mutex::new(simulator));
             let sources = flyrig_sim::sources(&simulator, SimTime::Exact);
             let chosen = sources.into_iter().filter(|source| NAMES.contains(&source.camera().as_str())).collect();
-            Self { lags_ms: lags_ms.map(|lag| lag - lags_ms[0]), rig, sources: run::boxed(chosen) }
+            Self { lags_ms: lags_ms.map(|lag| lag - lags_ms[0]), rig, sources: source::boxed(chosen) }
         }
 
         /// By what was found, off by how many milliseconds, if anything was found; the standard error or disagreement.
@@ -319,7 +314,7 @@ mod tests {
         fn by_motion(mut self) -> Vec<(Option<f64>, f64)> {
             let sources = std::mem::take(&mut self.sources);
             let (estimates, _) =
-                by_motion(&args(), sources, &NAMES.map(CameraId::from), &SyncConfig::default(), false).unwrap();
+                by_motion(&args(), sources, &NAMES.map(CameraId::from), &SyncSettings::default(), false).unwrap();
             self.off(&estimates)
         }
 

@@ -14,12 +14,14 @@ use std::{
 };
 
 use anyhow::{Context, Result, ensure};
+use flyrig_fusion::NetworksOn;
 use flyrig_gpu::GpuContext;
+use flyrig_report::{progress_bar, stop, write_whole};
 use flyrig_stfa::{NetworkDevice, Parameters, SampleErrors, TrainSettings, Trainer, TrainingSample, evaluate};
 
-pub use self::people::People;
+use self::people::People;
 use self::report::{Progress, Scores};
-use crate::{cli::TrainArgs, config::NetworksOn, eval::progress_bar, stop};
+use crate::cli::TrainArgs;
 
 /// Added to the seed of the people that only measure progress.
 const HELD_OUT_SEED: u64 = 1 << 40;
@@ -202,7 +204,7 @@ fn save_weights(
     });
     trainer.parameters.save(&args.out.join("weights.safetensors"), &card)?;
     let json = serde_json::to_vec_pretty(&card)?;
-    crate::report::write_whole(&args.out.join("weights.json"), &json)
+    write_whole(&args.out.join("weights.json"), &json)
 }
 
 /// The command as it was typed, folders shortened to their names.

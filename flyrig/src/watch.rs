@@ -6,6 +6,7 @@ use std::{
 };
 
 use anyhow::{Context, Result, bail, ensure};
+use flyrig_report::{png, stop, write_whole};
 use flyrig_transport::{
     ImageFormat, Interests, Received, Subscriber, TransportConfig, ViewFrame, ViewpointStatus, Views,
 };
@@ -17,7 +18,7 @@ use opencv::{
 };
 use serde::{Deserialize, Serialize};
 
-use crate::{cli::WatchArgs, png, report::write_whole, stop};
+use crate::cli::WatchArgs;
 
 /// How often rates are printed.
 const PRINT_EVERY: Duration = Duration::from_secs(1);

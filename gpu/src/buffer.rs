@@ -1,6 +1,6 @@
 //! Typed storage buffers.
 
-use std::marker::PhantomData;
+use std::{marker::PhantomData, sync::atomic::Ordering};
 
 use bytemuck::Pod;
 use wgpu::{Buffer, BufferDescriptor, BufferUsages};
@@ -28,6 +28,7 @@ impl<T: Pod> StorageBuffer<T> {
             return Err(GpuError::TooLarge { what: label.to_owned(), needed, limit });
         }
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST | BufferUsages::INDIRECT;
+        gpu.shared.storage_buffers_made.fetch_add(1, Ordering::Relaxed);
         let buffer = gpu.device.create_buffer(&BufferDescriptor {
             label: Some(label),
             size: needed,
@@ -52,6 +53,15 @@ impl<T: Pod> StorageBuffer<T> {
         let count = content.len().min(self.len);
         if count > 0 {
             gpu.queue.write_buffer(&self.buffer, 0, bytemuck::cast_slice(&content[..count]));
+        }
+    }
+
+    /// Queues a copy of little-endian bytes to the start of the buffer (extra ones are ignored). The bytes need no
+    /// alignment, their number must be a multiple of 4.
+    pub fn write_bytes(&self, gpu: &GpuContext, bytes: &[u8]) {
+        let count = bytes.len().min(self.len * size_of::<T>()) & !3;
+        if count > 0 {
+            gpu.queue.write_buffer(&self.buffer, 0, &bytes[..count]);
         }
     }
 
@@ -90,6 +100,18 @@ impl<T: Pod> StorageBuffer<T> {
     }
 }
 
+impl StorageBuffer<u32> {
+    /// A buffer of little-endian words; up to three bytes at the end that fill none are left out.
+    ///
+    /// # Errors
+    /// As [`Self::zeroed`].
+    pub fn from_bytes(gpu: &GpuContext, label: &str, bytes: &[u8]) -> Result<Self, GpuError> {
+        let buffer = Self::zeroed(gpu, label, bytes.len() / size_of::<u32>())?;
+        buffer.write_bytes(gpu, bytes);
+        Ok(buffer)
+    }
+}
+
 /// Waits for the GPU and copies the first `len` elements of `buffer` (needs `COPY_SRC`).
 ///
 /// # Errors
@@ -100,12 +122,7 @@ pub fn read_back<T: Pod>(gpu: &GpuContext, buffer: &Buffer, len: usize) -> Resul
     }
     let bytes = len as u64 * size_of::<T>() as u64;
     let size = bytes.next_multiple_of(wgpu::COPY_BUFFER_ALIGNMENT);
-    let staging = gpu.device.create_buffer(&BufferDescriptor {
-        label: Some("read back"),
-        size,
-        usage: BufferUsages::MAP_READ | BufferUsages::COPY_DST,
-        mapped_at_creation: false,
-    });
+    let staging = gpu.shared.take_read_back(&gpu.device, size);
     let mut encoder = gpu.device.create_command_encoder(&Default::default());
     encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, size);
     gpu.queue.submit([encoder.finish()]);
@@ -120,6 +137,11 @@ pub fn read_back<T: Pod>(gpu: &GpuContext, buffer: &Buffer, len: usize) -> Resul
         Ok(Err(error)) => return Err(GpuError::Lost(error.to_string())),
         Err(_) => return Err(GpuError::Lost("a buffer was not mapped after the wait".to_owned())),
     }
-    let view = staging.get_mapped_range(..bytes).map_err(|error| GpuError::Lost(error.to_string()))?;
-    Ok(bytemuck::pod_collect_to_vec(&view[..]))
+    let content = {
+        let view = staging.get_mapped_range(..bytes).map_err(|error| GpuError::Lost(error.to_string()))?;
+        bytemuck::pod_collect_to_vec(&view[..])
+    };
+    staging.unmap();
+    gpu.shared.give_read_back(staging);
+    Ok(content)
 }

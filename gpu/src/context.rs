@@ -1,6 +1,10 @@
 //! Finding an adapter and opening a device.
 
+use std::sync::Arc;
+
 use wgpu::{Adapter, AdapterInfo, Backends, Device, DeviceType, Features, Instance, InstanceDescriptor, Queue};
+
+use crate::shared::{GpuObjects, Shared};
 
 /// Which adapter to open.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -13,7 +17,7 @@ pub enum AdapterChoice {
 }
 
 /// Why there is no GPU to work with, or what it refused.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, Clone, thiserror::Error)]
 pub enum GpuError {
     /// No adapter at all.
     #[error(
@@ -64,10 +68,24 @@ pub enum GpuError {
         limit: u64,
     },
     /// Device lost or a wait failed.
-    #[error(
-        "the graphics device stopped answering ({0}); restart flyrig, and check the driver's log when it happens again"
-    )]
+    #[error("the graphics device is lost ({0}); check the driver's log when it happens again")]
     Lost(String),
+    /// The device's memory is full.
+    #[error(
+        "the graphics device is out of memory; end other programs that use it, or use fewer Gaussians, views or people"
+    )]
+    OutOfMemory,
+    /// The device rejected a command: a mistake of ours or of the driver.
+    #[error("the graphics device rejected a command ({0}); please report it with the adapter's name")]
+    Rejected(String),
+}
+
+impl GpuError {
+    /// Whether the device can no longer be relied on, so that everything on it must be built anew.
+    #[must_use]
+    pub fn is_device_fault(&self) -> bool {
+        matches!(self, Self::Lost(_) | Self::OutOfMemory | Self::Rejected(_))
+    }
 }
 
 /// An open device with its queue. Clones share both.
@@ -80,6 +98,8 @@ pub struct GpuContext {
     instance: Instance,
     adapter: Adapter,
     info: AdapterInfo,
+    choice: AdapterChoice,
+    pub(crate) shared: Arc<Shared>,
 }
 
 impl GpuContext {
@@ -138,7 +158,36 @@ impl GpuContext {
             .await
             .map_err(|source| GpuError::Open { adapter: info.name.clone(), source })?;
         tracing::debug!(adapter = %info.name, backend = %info.backend, driver = %info.driver_info, "graphics adapter");
-        Ok(Self { device, queue, instance, adapter, info })
+        let shared = Arc::new(Shared::default());
+        shared.fault.watch(&device);
+        Ok(Self { device, queue, instance, adapter, info, choice: choice.clone(), shared })
+    }
+
+    /// Opens the same choice of adapter once more, for a device that is lost. Nothing is shared with this one.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn reopen(&self) -> Result<Self, GpuError> {
+        Self::new(&self.choice)
+    }
+
+    /// Fails when the device was lost, ran out of memory or rejected a command.
+    ///
+    /// # Errors
+    /// The first fault since the device was opened.
+    pub fn check(&self) -> Result<(), GpuError> {
+        self.shared.fault.check()
+    }
+
+    /// Destroys the device, as a driver's reset would. For tests of what follows.
+    pub fn simulate_loss(&self) {
+        self.device.destroy();
+    }
+
+    /// Counts the GPU objects created so far.
+    #[must_use]
+    pub fn objects(&self) -> GpuObjects {
+        self.shared.objects()
     }
 
     /// Name, backend and driver of the adapter, for reports.
@@ -162,10 +211,11 @@ impl GpuContext {
     /// Waits until all submitted work is done.
     ///
     /// # Errors
-    /// [`GpuError::Lost`].
+    /// [`GpuError::Lost`], or the device's first fault.
     pub fn wait(&self) -> Result<(), GpuError> {
-        self.device.poll(wgpu::PollType::wait_indefinitely()).map_err(|error| GpuError::Lost(error.to_string()))?;
-        Ok(())
+        let waited = self.device.poll(wgpu::PollType::wait_indefinitely());
+        self.check()?;
+        waited.map(|_| ()).map_err(|error| GpuError::Lost(error.to_string()))
     }
 }
 

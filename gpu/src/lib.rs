@@ -5,10 +5,12 @@ mod buffer;
 mod camera;
 mod context;
 mod shader;
+mod shared;
 mod timer;
 
 pub use buffer::{StorageBuffer, read_back};
 pub use camera::{CAMERA_WGSL, CameraConstants};
 pub use context::{AdapterChoice, GpuContext, GpuError, adapter_names};
 pub use shader::{ComputeKernel, MAX_WORKGROUPS_PER_DIMENSION, bind, dispatch_1d};
+pub use shared::GpuObjects;
 pub use timer::{GpuTimer, StageTime};

@@ -15,23 +15,27 @@ pub struct ComputeKernel {
 }
 
 impl ComputeKernel {
-    /// Compiles `entry` of the concatenated `sources`. A mistake in our own WGSL reaches wgpu's
-    /// error handler; the naga test of each crate catches it before.
+    /// Compiles `entry` of the concatenated `sources`, or returns the pipeline that this device has compiled from them
+    /// before. A mistake in our own WGSL reaches wgpu's error handler; the naga test of each crate catches it before.
     #[must_use]
     pub fn new(gpu: &GpuContext, label: &str, sources: &[&str], entry: &str) -> Self {
+        let compile = |source: &str| Self::compile(gpu, label, source, entry);
+        Self { pipeline: gpu.shared.pipeline(sources.concat(), entry, compile) }
+    }
+
+    fn compile(gpu: &GpuContext, label: &str, source: &str, entry: &str) -> ComputePipeline {
         let module = gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(label),
-            source: wgpu::ShaderSource::Wgsl(sources.concat().into()),
+            source: wgpu::ShaderSource::Wgsl(source.into()),
         });
-        let pipeline = gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+        gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some(label),
             layout: None,
             module: &module,
             entry_point: Some(entry),
             compilation_options: Default::default(),
             cache: None,
-        });
-        Self { pipeline }
+        })
     }
 
     /// Bind group 0 with the resources at bindings 0, 1, 2, ...

@@ -38,15 +38,16 @@ fn main() -> Result<(), Box<dyn Error>> {
         .iter()
         .map(|view| {
             let upload = |map: &[[f32; 4]]| StorageBuffer::from_slice(&gpu, "map", map);
-            Ok((upload(&view.canonical)?, upload(&view.drawn)?))
+            let image = StorageBuffer::from_bytes(&gpu, "image", &view.rgba)?;
+            Ok((image, upload(&view.canonical)?, upload(&view.drawn)?))
         })
         .collect::<Result<Vec<_>, flyrig_gpu::GpuError>>()?;
     let inputs: Vec<_> = views
         .iter()
         .zip(&maps)
-        .map(|(view, (canonical, drawn))| ViewInput {
+        .map(|(view, (picture, canonical, drawn))| ViewInput {
             camera: &view.camera,
-            rgba: &view.rgba,
+            picture,
             canonical,
             drawn,
             gaussians: None,

@@ -42,6 +42,20 @@ impl GaussianBuffers {
         })
     }
 
+    /// Records the copy of all Gaussians into `other`, from its element `first` on; what has no room there is left out.
+    pub fn encode_copy(&self, encoder: &mut wgpu::CommandEncoder, other: &Self, first: usize) {
+        let count = self.count().min(other.count().saturating_sub(first));
+        let element = size_of::<[f32; 4]>() as u64;
+        for (from, to) in [
+            (&self.center_scale, &other.center_scale),
+            (&self.normal, &other.normal),
+            (&self.color, &other.color),
+            (&self.canonical, &other.canonical),
+        ] {
+            encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), first as u64 * element, count as u64 * element);
+        }
+    }
+
     /// Number of Gaussians.
     #[must_use]
     pub fn count(&self) -> usize {
@@ -71,12 +85,26 @@ impl RenderTarget {
     /// [`GpuError::TooLarge`].
     pub fn new(gpu: &GpuContext, width: u32, height: u32) -> Result<Self, GpuError> {
         let pixels = width as usize * height as usize;
+        Self::with_room(gpu, [width, height], pixels)
+    }
+
+    /// A target of colour alone: its depth and canonical positions are empty, and must not be among the
+    /// [`Outputs`](crate::Outputs).
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn of_color(gpu: &GpuContext, width: u32, height: u32) -> Result<Self, GpuError> {
+        Self::with_room(gpu, [width, height], 0)
+    }
+
+    fn with_room(gpu: &GpuContext, [width, height]: [u32; 2], others: usize) -> Result<Self, GpuError> {
+        let pixels = width as usize * height as usize;
         Ok(Self {
             width,
             height,
             color: StorageBuffer::zeroed(gpu, "rendered colour", pixels)?,
-            depth: StorageBuffer::zeroed(gpu, "rendered depth", pixels)?,
-            canonical: StorageBuffer::zeroed(gpu, "rendered canonical positions", pixels)?,
+            depth: StorageBuffer::zeroed(gpu, "rendered depth", others)?,
+            canonical: StorageBuffer::zeroed(gpu, "rendered canonical positions", others)?,
         })
     }
 }

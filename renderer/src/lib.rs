@@ -1,4 +1,4 @@
-//! Splats to pictures and back: forward and backward rasteriser, direct appearance, image metrics, splat export.
+//! Splats to pictures and back: forward and backward rasteriser, direct appearance, splat export.
 
 mod appearance;
 mod buffers;
@@ -6,7 +6,6 @@ mod color;
 mod color_means;
 mod constants;
 mod export;
-pub mod metrics;
 mod picture_loss;
 mod raster;
 mod raster_backward;
@@ -24,7 +23,7 @@ pub use buffers::{GaussianBuffers, RenderTarget};
 pub use color::{composite_over, linear_from_srgb, rgba8_from_target, srgb_from_linear};
 pub use color_means::ColorMeans;
 pub use export::{ExportError, Splat, read_splats, write_splat_ply};
-pub use picture_loss::{LossSettings, PictureLoss, PictureSums, WantedPicture};
+pub use picture_loss::{LossSettings, PictureLoss, PictureSums, UNKNOWN_RGBA, WantedPicture};
 pub use raster::{Outputs, RasterSettings, RasterStats, Rasterizer};
 pub use raster_backward::{BackwardError, BackwardRasterizer, Carry, GaussianGradients, PictureGradients};
 pub use raster_kernels::BACKFACING_COSINE;

@@ -25,7 +25,14 @@ pub struct LossSettings {
     pub mask_weight: f32,
     /// What counts, `[left, top, right, bottom]` in pixels, right and bottom excluded.
     pub area: [u32; 4],
+    /// Whether pixels of the image that are [`UNKNOWN_RGBA`] say nothing: a compared pixel with more than half of them
+    /// counts neither in the loss nor in its derivatives.
+    pub with_unknown: bool,
 }
+
+/// Marks a pixel that says nothing about the person: no coverage, and a colour next to black. Other people's pixels, for
+/// example.
+pub const UNKNOWN_RGBA: [u8; 4] = [0, 0, 1, 0];
 
 /// Sums of one picture over its area.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -52,7 +59,7 @@ struct Loss {
     mask_weight: f32,
     source_width: u32,
     shrink: u32,
-    unused: u32,
+    with_unknown: u32,
 }
 
 /// A picture that should be drawn, on the GPU.
@@ -63,7 +70,6 @@ pub struct WantedPicture {
     shrink: u32,
     width: u32,
     height: u32,
-    bytes: StorageBuffer<u32>,
     color: StorageBuffer<[f32; 4]>,
     partials: StorageBuffer<[f32; 4]>,
 }
@@ -87,7 +93,6 @@ impl WantedPicture {
             shrink: 1 << level,
             width,
             height,
-            bytes: StorageBuffer::zeroed(gpu, "wanted bytes", source[0] as usize * source[1] as usize)?,
             color: StorageBuffer::zeroed(gpu, "wanted colour", pixels)?,
             partials: StorageBuffer::zeroed(gpu, "partial losses", partials)?,
         })
@@ -140,24 +145,23 @@ impl PictureLoss {
         Ok(())
     }
 
-    /// Uploads `rgba`, sRGB bytes with coverage row by row (missing pixels keep their content), and records the making of
-    /// what the comparisons within `settings.area` need. Once a picture and area.
+    /// Records the conversion of `image` (sRGB bytes with coverage, a pixel an element, row by row) to linear light at the
+    /// compared size, within `settings.area`. Once an image and area. An image of too few pixels is not converted.
     pub fn prepare(
         &self,
         gpu: &GpuContext,
         encoder: &mut CommandEncoder,
         wanted: &WantedPicture,
-        rgba: &[u8],
+        image: &StorageBuffer<u32>,
         settings: &LossSettings,
     ) {
-        let words: Vec<u32> = rgba.chunks_exact(4).map(|p| u32::from_le_bytes([p[0], p[1], p[2], p[3]])).collect();
-        wanted.bytes.write(gpu, &words);
-        let Some((constants, groups)) = constants(gpu, wanted, 0, settings) else { return };
+        let enough = image.len() >= wanted.source[0] as usize * wanted.source[1] as usize;
+        let Some((constants, groups)) = constants(gpu, wanted, 0, settings).filter(|_| enough) else { return };
         let mut pass =
             encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("wanted picture"), ..Default::default() });
         let resources = [
             constants.get(0),
-            wanted.bytes.raw().as_entire_binding(),
+            image.raw().as_entire_binding(),
             self.linear.raw().as_entire_binding(),
             wanted.color.raw().as_entire_binding(),
         ];
@@ -240,7 +244,7 @@ fn constants(
         mask_weight: settings.mask_weight,
         source_width: wanted.source[0],
         shrink: wanted.shrink,
-        unused: 0,
+        with_unknown: settings.with_unknown.into(),
     });
     Some((writer.finish(gpu), (area[0].div_ceil(64), area[1].div_ceil(ROWS))))
 }
@@ -268,7 +272,8 @@ fn run_at(
 }
 
 fn wgsl() -> String {
-    format!("const ROWS: u32 = {ROWS}u;\nconst SUMS: u32 = {SUMS}u;\n{WGSL}")
+    let unknown = u32::from_le_bytes(UNKNOWN_RGBA);
+    format!("const ROWS: u32 = {ROWS}u;\nconst SUMS: u32 = {SUMS}u;\nconst UNKNOWN: u32 = {unknown}u;\n{WGSL}")
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 // How a drawn picture differs from a wanted one (FlyHuman Eq. 3), and its derivatives for the backward rasteriser.
 // One invocation for four pixels of a column; sums in a fixed order.
-// Prefix: const ROWS, SUMS.
+// Prefix: const ROWS, SUMS, UNKNOWN.
 struct Loss {
     // Pixels of the picture.
     size: vec2<u32>,
@@ -14,7 +14,8 @@ struct Loss {
     // Pixels of the wanted bytes in a row, and how many of them lie along the side of a pixel here.
     source_width: u32,
     shrink: u32,
-    unused: u32,
+    // Whether pixels that are UNKNOWN say nothing.
+    with_unknown: u32,
 }
 
 struct Sums {
@@ -31,7 +32,7 @@ struct Sums {
 @group(0) @binding(1) var<storage, read> bytes: array<u32>;
 // Linear value of each sRGB byte.
 @group(0) @binding(2) var<storage, read> linear: array<f32>;
-// Premultiplied linear colour and coverage.
+// Premultiplied linear colour and coverage; negative where nothing is known.
 @group(0) @binding(3) var<storage, read_write> wanted: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read> drawn: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> d_color: array<vec4<f32>>;
@@ -59,13 +60,18 @@ fn unpack_wanted(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     for (var y = first.y; y < min(first.y + ROWS, end_row()); y++) {
         var sum = vec4(0.0);
+        var unknown = 0u;
         for (var v = 0u; v < loss.shrink; v++) {
             for (var u = 0u; u < loss.shrink; u++) {
                 let word = bytes[(y * loss.shrink + v) * loss.source_width + first.x * loss.shrink + u];
+                unknown += select(0u, 1u, word == UNKNOWN);
                 let mask = f32(word >> 24u) / 255.0;
                 sum += vec4(linear[word & 0xffu], linear[(word >> 8u) & 0xffu], linear[(word >> 16u) & 0xffu], 1.0)
                     * mask;
             }
+        }
+        if loss.with_unknown != 0u && 2u * unknown > loss.shrink * loss.shrink {
+            sum = vec4(-1.0);
         }
         wanted[y * loss.size.x + first.x] = sum / f32(loss.shrink * loss.shrink);
     }
@@ -83,6 +89,11 @@ fn compare(@builtin(global_invocation_id) id: vec3<u32>) {
     for (var y = first.y; y < min(first.y + ROWS, end_row()); y++) {
         let at = y * loss.size.x + first.x;
         let goal = wanted[at];
+        if goal.w < 0.0 {
+            d_color[at] = vec4(0.0);
+            d_carry[at] = vec4(0.0);
+            continue;
+        }
         let seen = drawn[at];
         let off = seen - goal;
         let squared = dot(off.rgb, off.rgb);

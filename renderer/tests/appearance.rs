@@ -46,13 +46,15 @@ impl Rig {
         self.buffers.center_scale.write(&self.gpu, &frame.center_scale);
         self.buffers.normal.write(&self.gpu, &frame.normal);
         let upload = |map: &[[f32; 4]]| StorageBuffer::from_slice(&self.gpu, "map", map).unwrap();
-        let maps: Vec<_> = views.iter().map(|view| (upload(&view.canonical), upload(&view.drawn))).collect();
+        let image = |rgba: &[u8]| StorageBuffer::from_bytes(&self.gpu, "image", rgba).unwrap();
+        let maps: Vec<_> =
+            views.iter().map(|view| (image(&view.rgba), upload(&view.canonical), upload(&view.drawn))).collect();
         let inputs: Vec<_> = views
             .iter()
             .zip(&maps)
-            .map(|(view, (canonical, drawn))| ViewInput {
+            .map(|(view, (picture, canonical, drawn))| ViewInput {
                 camera: &view.camera,
-                rgba: &view.rgba,
+                picture,
                 canonical,
                 drawn,
                 gaussians: None,

@@ -1,7 +1,7 @@
 //! The picture loss against a plain f64 reference, its derivatives against differences of that reference.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
-use flyrig_gpu::{AdapterChoice, GpuContext};
+use flyrig_gpu::{AdapterChoice, GpuContext, StorageBuffer};
 use flyrig_renderer::{
     LossSettings, PictureGradients, PictureLoss, PictureSums, RenderTarget, WantedPicture, linear_from_srgb,
 };
@@ -49,12 +49,13 @@ fn check(gpu: &GpuContext, loss: &mut PictureLoss, case: &Case, name: &str) {
     let target = RenderTarget::new(gpu, width as u32, height as u32).unwrap();
     target.color.write(gpu, &case.drawn);
     let picture = WantedPicture::zeroed(gpu, case.source, case.level).unwrap();
+    let image = StorageBuffer::from_bytes(gpu, "image", &case.rgba).unwrap();
     assert_eq!(picture.size(), [width as u32, height as u32]);
     let out = PictureGradients::zeroed(gpu, width as u32, height as u32).unwrap();
     loss.reserve(gpu, 2).unwrap();
     let run = || {
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        loss.prepare(gpu, &mut encoder, &picture, &case.rgba, &case.settings);
+        loss.prepare(gpu, &mut encoder, &picture, &image, &case.settings);
         loss.encode(gpu, &mut encoder, 1, &target, &picture, &case.settings, &out);
         gpu.queue.submit([encoder.finish()]);
         (loss.read(gpu, 2).unwrap()[1], out.color.read(gpu).unwrap(), out.depth_carry.read(gpu).unwrap())
@@ -139,7 +140,7 @@ fn losses_and_slopes_match_the_reference() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     let mut loss = PictureLoss::new(&gpu).unwrap();
     let mut rng = StdRng::seed_from_u64(4);
-    let both = LossSettings { color_weight: 2.0, mask_weight: 3.0, area: [0, 0, 96, 80] };
+    let both = LossSettings { color_weight: 2.0, mask_weight: 3.0, area: [0, 0, 96, 80], with_unknown: false };
     for (name, source, level, settings, coverage) in [
         ("everything", [96, 80], 0, both, None),
         ("masks only", [96, 80], 0, LossSettings { color_weight: 0.0, ..both }, None),
@@ -161,10 +162,11 @@ fn an_empty_area_and_a_buffer_that_does_not_fit_cost_nothing() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     let mut loss = PictureLoss::new(&gpu).unwrap();
     let mut rng = StdRng::seed_from_u64(5);
-    let settings = LossSettings { color_weight: 1.0, mask_weight: 1.0, area: [9, 9, 9, 20] };
+    let settings = LossSettings { color_weight: 1.0, mask_weight: 1.0, area: [9, 9, 9, 20], with_unknown: false };
     let case = case(&mut rng, [32, 32], 0, settings, None);
     assert_eq!(WantedPicture::zeroed(&gpu, [1, 5], 2).unwrap().size(), [1, 5], "not below a pixel");
     let picture = WantedPicture::zeroed(&gpu, case.source, 0).unwrap();
+    let image = StorageBuffer::from_bytes(&gpu, "image", &case.rgba).unwrap();
     let target = RenderTarget::new(&gpu, 32, 32).unwrap();
     let (fits, small) =
         (PictureGradients::zeroed(&gpu, 32, 32).unwrap(), PictureGradients::zeroed(&gpu, 8, 8).unwrap());
@@ -172,7 +174,7 @@ fn an_empty_area_and_a_buffer_that_does_not_fit_cost_nothing() {
     for (area, out) in [([9, 9, 9, 20], &fits), ([0, 0, 32, 32], &small), ([40, 0, 50, 9], &fits)] {
         let settings = LossSettings { area, ..settings };
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        loss.prepare(&gpu, &mut encoder, &picture, &case.rgba, &settings);
+        loss.prepare(&gpu, &mut encoder, &picture, &image, &settings);
         loss.encode(&gpu, &mut encoder, 0, &target, &picture, &settings, out);
         gpu.queue.submit([encoder.finish()]);
         assert_eq!(loss.read(&gpu, 1).unwrap(), [PictureSums::default()]);
@@ -184,16 +186,17 @@ fn a_number_that_is_not_finite_is_told_and_stays_where_it_is() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     let mut loss = PictureLoss::new(&gpu).unwrap();
     let mut rng = StdRng::seed_from_u64(6);
-    let settings = LossSettings { color_weight: 2.0, mask_weight: 2.0, area: [4, 3, 30, 28] };
+    let settings = LossSettings { color_weight: 2.0, mask_weight: 2.0, area: [4, 3, 30, 28], with_unknown: false };
     let case = case(&mut rng, [32, 32], 0, settings, None);
     let picture = WantedPicture::zeroed(&gpu, case.source, 0).unwrap();
+    let image = StorageBuffer::from_bytes(&gpu, "image", &case.rgba).unwrap();
     let target = RenderTarget::new(&gpu, 32, 32).unwrap();
     let out = PictureGradients::zeroed(&gpu, 32, 32).unwrap();
     loss.reserve(&gpu, 1).unwrap();
     let run = |drawn: &[[f32; 4]]| {
         target.color.write(&gpu, drawn);
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        loss.prepare(&gpu, &mut encoder, &picture, &case.rgba, &settings);
+        loss.prepare(&gpu, &mut encoder, &picture, &image, &settings);
         loss.encode(&gpu, &mut encoder, 0, &target, &picture, &settings, &out);
         gpu.queue.submit([encoder.finish()]);
         (loss.read(&gpu, 1).unwrap()[0], out.color.read(&gpu).unwrap(), out.depth_carry.read(&gpu).unwrap())

@@ -4,7 +4,7 @@
 use flyrig_body::{
     DEFAULT_SIGMA2_M2, DeformationGraph, ShapeParams, SurfaceGaussians, build_graph, default_template, sample_surface,
 };
-use flyrig_gpu::{AdapterChoice, GpuContext};
+use flyrig_gpu::{AdapterChoice, GpuContext, StorageBuffer};
 use flyrig_renderer::{
     AppearanceSettings, DirectAppearance, GaussianBuffers, Observations, Outputs, RasterSettings, Rasterizer,
     RenderTarget, ViewInput, rgba8_from_target,
@@ -95,13 +95,15 @@ impl Stage {
         settings: &AppearanceSettings,
     ) -> (Vec<[f32; 4]>, Observations) {
         let targets: Vec<RenderTarget> = cameras.iter().map(|camera| self.draw(camera)).collect();
+        let images: Vec<_> =
+            pictures.iter().map(|rgba| StorageBuffer::from_bytes(&self.gpu, "image", rgba).unwrap()).collect();
         let views: Vec<ViewInput<'_>> = cameras
             .iter()
-            .zip(pictures)
+            .zip(&images)
             .zip(&targets)
-            .map(|((camera, rgba), target)| ViewInput {
+            .map(|((camera, picture), target)| ViewInput {
                 camera,
-                rgba,
+                picture,
                 canonical: &target.canonical,
                 drawn: &target.color,
                 gaussians: None,

@@ -16,7 +16,9 @@ mod frame;
 mod ids;
 mod image;
 mod isometry;
+mod person;
 mod pose;
+mod rendered_view;
 mod whole_file;
 
 pub use camera::{Camera, CameraError, Intrinsics, Lens, MAX_IMAGE_SIDE, Rig};
@@ -24,5 +26,7 @@ pub use frame::{Frame, FrameSet, SetKind};
 pub use ids::CameraId;
 pub use image::{Image, ImageError, Mask, PixelBuffer, PixelFormat, Recycle};
 pub use isometry::Isometry;
+pub use person::PersonId;
 pub use pose::{Pose, PoseError, PoseTrack};
+pub use rendered_view::RenderedView;
 pub use whole_file::write_whole;

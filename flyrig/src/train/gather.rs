@@ -1,12 +1,11 @@
 //! From an engine's last update and held-out pictures to a training sample.
 
-use anyhow::{Result, ensure};
+use anyhow::{Context as _, Result, ensure};
 use flyrig_capture::to_rgb8;
+use flyrig_fusion::{Observed, PersonId, Session};
 use flyrig_renderer::{AppearanceSettings, PosedGaussians};
 use flyrig_stfa::{TargetPicture, TrainingSample, ViewPicture, training_sample};
 use flyrig_types::{Camera, Image, Mask};
-
-use crate::engine::{Engine, Observed};
 
 /// Squares of pixels a held-out picture.
 const PATCHES: usize = 16;
@@ -21,12 +20,14 @@ pub struct HeldOut<'a> {
 
 /// A sample of the last update.
 pub fn gather(
-    engine: &Engine,
+    session: &Session,
     held_out: &[HeldOut<'_>],
     settings: &AppearanceSettings,
     seed: u64,
 ) -> Result<TrainingSample> {
-    let Observed { observations, pictures, center_scale, normal } = engine.observed()?;
+    let person = PersonId::default();
+    let subject = session.subject(person).context("nobody was simulated")?;
+    let Observed { observations, pictures, center_scale, normal } = session.observed(person)?;
     let pictures: Vec<ViewPicture<'_>> =
         pictures.iter().map(|(width, height, rgba)| ViewPicture { width: *width, height: *height, rgba }).collect();
     let rgba: Vec<Vec<u8>> = held_out.iter().map(rgba).collect::<Result<_>>()?;
@@ -39,7 +40,7 @@ pub fn gather(
         })
         .collect();
     let posed = PosedGaussians { center_scale: &center_scale, normal: &normal };
-    Ok(training_sample(engine.body_graph(), &observations, &pictures, settings, posed, &targets, PATCHES, seed)?)
+    Ok(training_sample(subject.body_graph(), &observations, &pictures, settings, posed, &targets, PATCHES, seed)?)
 }
 
 fn rgba(of: &HeldOut<'_>) -> Result<Vec<u8>> {

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use anyhow::{Context, Result};
-use flyrig_body::DEFAULT_NODE_COUNT;
+use flyrig_fusion::{AppearanceMode, BodySettings, GivenPerception, Session, SessionBuilder, SessionSettings};
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::AppearanceSettings;
 use flyrig_sim::{OpticsConfig, SceneKind, SimConfig, Simulator, TrainingConfig, random_config};
@@ -13,12 +13,6 @@ use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng, seq::SliceRandom as _}
 use serde::{Deserialize, Serialize};
 
 use super::gather::{HeldOut, gather};
-use crate::{
-    config::{AppearanceMode, Origin, Solver},
-    engine::Engine,
-    pipeline::{Pipeline, PoseSource},
-};
-
 /// Cameras around each person.
 const CAMERAS: usize = 7;
 /// Pictures that are compared an instant.
@@ -89,19 +83,13 @@ impl People {
         let template = simulator.template().clone();
         // With time: sharpening goes on from the last colours. What the networks are given is of this instant alone.
         let settings = AppearanceMode::Direct.settings();
-        let mut engine = Engine::new(
-            gpu.clone(),
-            template,
-            self.gaussians,
-            DEFAULT_NODE_COUNT.min(self.gaussians / 12),
-            &rig,
-            settings,
-            Solver::GaussNewton.options(Origin::Given),
-        )?;
-        engine.keep_observations()?;
-        let track = PoseSource::Track { track: simulator.track().clone(), repeat: true };
-        let plates = (0..CAMERAS).map(|_| None).collect();
-        let mut pipeline = Pipeline::new(engine, reported, track, Origin::Given, plates);
+        let body = BodySettings::with_gaussians(self.gaussians);
+        let perception = GivenPerception::repeating(&reported, template, simulator.track().clone());
+        let mut session = SessionBuilder::new(gpu.clone(), reported)
+            .settings(SessionSettings { body, ..SessionSettings::default() })
+            .perception(perception)
+            .build()?;
+        session.keep_observations()?;
         let mut samples = Vec::new();
         let mut index = 0;
         for instant in 0..self.instants {
@@ -111,13 +99,13 @@ impl People {
             for step in 0..=warm_up {
                 let set = frame_set(&mut simulator, &rig, first + step, index, &inputs)?;
                 index += 1;
-                pipeline.process(&set)?;
+                session.process(&set)?;
                 if step == warm_up {
-                    pipeline.engine_mut().shape_held = true;
+                    session.hold_shape(true);
                     for _ in 0..LOOKS {
-                        pipeline.process(&set)?;
+                        session.process(&set)?;
                     }
-                    pipeline.engine_mut().shape_held = false;
+                    session.hold_shape(false);
                 }
             }
             let nanos = simulator.frame_nanos(first + warm_up);
@@ -127,19 +115,19 @@ impl People {
                 .zip(&pictures)
                 .map(|(&slot, (image, mask))| HeldOut { camera: &rig.cameras[slot], image, mask })
                 .collect();
-            samples.push(sample_of(&pipeline, &held_out, &settings, seed ^ instant)?);
+            samples.push(sample_of(&session, &held_out, &settings, seed ^ instant)?);
         }
         Ok(samples)
     }
 }
 
 fn sample_of(
-    pipeline: &Pipeline,
+    session: &Session,
     held_out: &[HeldOut<'_>],
     settings: &AppearanceSettings,
     seed: u64,
 ) -> Result<TrainingSample> {
-    gather(pipeline.engine(), held_out, settings, seed).context("gathering a training sample")
+    gather(session, held_out, settings, seed).context("gathering a training sample")
 }
 
 /// Inputs and held-out cameras by slot: mostly three inputs that lie apart, sometimes two, or one.

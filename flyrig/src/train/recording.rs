@@ -1,18 +1,21 @@
 //! Training samples of a recorded rig: every camera is held out in turn, the others are the inputs.
 
-use std::path::{Path, PathBuf};
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
 
 use anyhow::{Context, Result, ensure};
+use flyrig_fusion::{BodySettings, SessionSettings};
 use flyrig_gpu::GpuContext;
+use flyrig_report::{progress_bar, stop, write_whole};
 use flyrig_types::CameraId;
 
 use super::gather::{HeldOut, gather};
 use crate::{
-    cli::{EvalArgs, LagArgs, NetworkUse, TrainArgs},
-    config::{AppearanceMode, Origin, Solver},
+    cli::TrainArgs,
     dataset,
-    eval::{Replay, progress_bar},
-    stop,
+    eval::{Replay, ReplaySettings},
 };
 
 /// Writes what is missing of a data set's samples into a folder below `out`, and tells which one.
@@ -47,41 +50,36 @@ fn leave_out(
     }
     let mask = root.join("mask").join(CameraId::from(left_out.as_str()).as_str());
     ensure!(mask.is_dir(), "there are no masks of it; write them to {}", mask.display());
-    let replay = EvalArgs {
-        lags: LagArgs::default(),
+    let settings = ReplaySettings {
         dataset: root.to_owned(),
         inputs: cameras.iter().filter(|camera| *camera != left_out).cloned().collect(),
         holdout: vec![left_out.clone()],
-        out: folder.to_owned(),
-        pose: args.pose,
-        masks: Origin::Given,
-        solver: Solver::GaussNewton,
-        appearance: AppearanceMode::Direct,
-        weights: None,
-        networks: NetworkUse::default(),
-        frames: None,
+        session: SessionSettings {
+            body: BodySettings { pose: args.pose, gaussians: args.gaussians, ..BodySettings::default() },
+            ..SessionSettings::default()
+        },
         fps: args.fps,
-        gaussians: args.gaussians,
-        nodes: flyrig_body::DEFAULT_NODE_COUNT,
+        frames: None,
+        lags_nanos: BTreeMap::new(),
     };
-    let settings = replay.appearance.settings();
-    let Replay { mut pipeline, mut frames, buffered, holdout, mut truth } = Replay::open(&replay, gpu)?;
-    pipeline.engine_mut().keep_observations()?;
-    let bar = progress_bar(frames.count as u64, "recorded");
-    let mut buffered = buffered.into_iter();
+    let appearance = settings.session.appearance.mode.settings();
+    let mut replay = Replay::open(&settings, gpu)?;
+    replay.session.keep_observations()?;
+    let bar = progress_bar(replay.count as u64, "recorded");
     let mut index = 0;
-    while let Some(set) = buffered.next().map_or_else(|| frames.next_set(), |set| Ok(Some(set)))? {
+    while let Some(set) = replay.next_set()? {
         if stop::requested() {
             return Ok(());
         }
-        pipeline.process(&set)?;
+        replay.session.process(&set)?;
         bar.inc(1);
         index += 1;
-        if index % args.every != 0 || pipeline.pose().is_none() {
+        if index % args.every != 0 || !replay.session.has_people() {
             continue;
         }
-        let frames = truth.at(set.master_nanos)?;
-        let held_out: Vec<HeldOut<'_>> = holdout
+        let frames = replay.truth.at(set.master_nanos)?;
+        let held_out: Vec<HeldOut<'_>> = replay
+            .holdout
             .iter()
             .zip(&frames)
             .filter_map(|(camera, frame)| {
@@ -89,9 +87,9 @@ fn leave_out(
                 Some(HeldOut { camera, image: &frame.image, mask: frame.mask.as_ref()? })
             })
             .collect();
-        let sample = gather(pipeline.engine(), &held_out, &settings, args.seed ^ index)?;
+        let sample = gather(&replay.session, &held_out, &appearance, args.seed ^ index)?;
         sample.save(&folder.join(format!("{left_out}-{index:06}.safetensors")))?;
     }
     bar.finish_and_clear();
-    crate::report::write_whole(&done, b"")
+    write_whole(&done, b"")
 }

@@ -3,13 +3,12 @@
 use std::{fmt, path::Path};
 
 use anyhow::{Context, Result};
+use flyrig_report::{
+    plot::{Line, Plot, Series},
+    write_whole,
+};
 use flyrig_stfa::{Loss, SampleErrors};
 use serde::{Deserialize, Serialize};
-
-use crate::{
-    bench::plot::{Line, Plot, Series},
-    report::write_whole,
-};
 
 /// Points of the curve.
 const CURVE_POINTS: usize = 120;

@@ -9,8 +9,9 @@ use flyrig_types::{Camera, CameraId, MAX_IMAGE_SIDE};
 pub struct ViewInput<'a> {
     /// The camera that took the picture, at the picture's size.
     pub camera: &'a Camera,
-    /// sRGB rows without padding; a: mask coverage, 255 on the person. The colour is not multiplied by it.
-    pub rgba: &'a [u8],
+    /// sRGB bytes, a pixel an element (red in the lowest byte), rows without padding; a: mask coverage, 255 on the person.
+    /// The colour is not multiplied by it.
+    pub picture: &'a StorageBuffer<u32>,
     /// The Gaussians' canonical positions as this camera sees them: [`RenderTarget::canonical`](crate::RenderTarget)
     /// of a rendering with this very camera and the same Gaussians.
     pub canonical: &'a StorageBuffer<[f32; 4]>,

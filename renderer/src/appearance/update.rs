@@ -14,7 +14,7 @@ use crate::{GaussianBuffers, linear_from_srgb};
 
 /// Paints every Gaussian from the pictures of this instant and a memory of earlier ones.
 ///
-/// Buffers and pipelines are made once, pictures when a view's size changes.
+/// Buffers and pipelines are made once.
 #[derive(Debug)]
 pub struct DirectAppearance {
     kernels: Kernels,
@@ -35,8 +35,6 @@ pub struct DirectAppearance {
 #[derive(Debug)]
 struct ViewSlot {
     camera: Buffer,
-    /// A pixel an element.
-    picture: StorageBuffer<u32>,
     /// What this view alone saw; empty unless observations are kept.
     kept: StorageBuffer<[f32; 4]>,
 }
@@ -63,9 +61,8 @@ impl DirectAppearance {
             })
         };
         let view = |_| {
-            let picture = StorageBuffer::zeroed(gpu, "view picture", 0)?;
             let camera = constants("view camera", size_of::<CameraConstants>());
-            Ok(ViewSlot { camera, picture, kept: StorageBuffer::zeroed(gpu, "observations of a view", 0)? })
+            Ok(ViewSlot { camera, kept: StorageBuffer::zeroed(gpu, "observations of a view", 0)? })
         };
         let decoded: Vec<f32> = (0..=255u8).map(|byte| linear_from_srgb(f32::from(byte) / 255.0)).collect();
         Ok(Self {
@@ -81,7 +78,7 @@ impl DirectAppearance {
         })
     }
 
-    /// Records the painting of [`GaussianBuffers::color`] (opacity 1) and uploads the pictures. Any number of views
+    /// Records the painting of [`GaussianBuffers::color`] (opacity 1) and uploads the cameras. Any number of views
     /// up to the maximum will do; a camera that gave no picture is left out of `views`.
     ///
     /// Submit the encoder before the next update: uploads take effect at the submission.
@@ -113,8 +110,8 @@ impl DirectAppearance {
         mut timer: Option<&mut GpuTimer>,
     ) -> Result<(), AppearanceError> {
         self.check(gaussians, views, settings)?;
-        for (slot, view) in self.views.iter_mut().zip(views) {
-            slot.upload(gpu, view)?;
+        for (slot, view) in self.views.iter().zip(views) {
+            gpu.queue.write_buffer(&slot.camera, 0, bytemuck::bytes_of(&CameraConstants::from(view.camera)));
         }
         let constants = SettingsConstants::new(settings, !self.forget);
         gpu.queue.write_buffer(&self.settings, 0, bytemuck::bytes_of(&constants));
@@ -145,7 +142,7 @@ impl DirectAppearance {
                 let resources = [
                     self.settings.as_entire_binding(),
                     slot.camera.as_entire_binding(),
-                    slot.picture.raw().as_entire_binding(),
+                    view.picture.raw().as_entire_binding(),
                     view.canonical.raw().as_entire_binding(),
                     view.gaussians.unwrap_or(gaussians).center_scale.raw().as_entire_binding(),
                     view.gaussians.unwrap_or(gaussians).normal.raw().as_entire_binding(),
@@ -225,6 +222,28 @@ impl DirectAppearance {
         }
     }
 
+    /// Reads the colour memory back: accumulated linear RGB of each Gaussian and its weight.
+    ///
+    /// # Errors
+    /// [`GpuError::Lost`].
+    pub fn memory(&self, gpu: &GpuContext) -> Result<Vec<[f32; 4]>, GpuError> {
+        self.memory.read(gpu)
+    }
+
+    /// Resumes from the colour memory of an earlier appearance of the same Gaussians.
+    ///
+    /// # Errors
+    /// [`AppearanceError::GaussianCount`] when it is of another number of Gaussians.
+    pub fn resume(&mut self, gpu: &GpuContext, memory: &[[f32; 4]]) -> Result<(), AppearanceError> {
+        let (expected, found) = (self.seen.len(), memory.len());
+        if found != expected {
+            return Err(AppearanceError::GaussianCount { expected, found });
+        }
+        self.memory.write(gpu, memory);
+        self.forget = false;
+        Ok(())
+    }
+
     /// Forgets all earlier frames, from the next update on.
     pub fn reset(&mut self) {
         self.forget = true;
@@ -253,7 +272,7 @@ impl DirectAppearance {
                 return Err(AppearanceError::PictureSize { camera, width, height });
             }
             let inputs = [
-                ("the picture", "bytes", pixels * 4, view.rgba.len()),
+                ("the picture", "pixels", pixels, view.picture.len()),
                 ("the canonical map", "pixels", pixels, view.canonical.len()),
                 ("the drawn picture", "pixels", pixels, view.drawn.len()),
             ];
@@ -263,20 +282,6 @@ impl DirectAppearance {
                 }
             }
         }
-        Ok(())
-    }
-}
-
-impl ViewSlot {
-    /// Queues the upload of camera and picture.
-    fn upload(&mut self, gpu: &GpuContext, view: &ViewInput<'_>) -> Result<(), GpuError> {
-        let pixels = view.rgba.len() / 4;
-        if self.picture.len() != pixels {
-            self.picture = StorageBuffer::zeroed(gpu, &format!("the picture of camera {}", view.camera.id), pixels)?;
-        }
-        gpu.queue.write_buffer(&self.camera, 0, bytemuck::bytes_of(&CameraConstants::from(view.camera)));
-        // Bytes, not words: a picture need not lie on a word's boundary. The GPU reads little-endian words.
-        gpu.queue.write_buffer(self.picture.raw(), 0, view.rgba);
         Ok(())
     }
 }

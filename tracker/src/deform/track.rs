@@ -218,6 +218,22 @@ impl DeformTracker {
         self.frame = 0;
     }
 
+    /// Resumes from translations of an earlier tracker of the same graph, canonical metres; the next frame counts as the first.
+    ///
+    /// # Errors
+    /// [`TrackErrorKind::Template`] when they are not the graph's nodes', or not finite.
+    pub fn resume(&mut self, translations: &[DVec3]) -> Result<(), TrackError> {
+        let nodes = self.translations.len();
+        if translations.len() != nodes || !translations.iter().all(|t| t.is_finite()) {
+            let message = format!("{} finite translations for {nodes} nodes of the graph", translations.len());
+            return Err(TrackError::new(TrackErrorKind::Template, message));
+        }
+        self.reset();
+        self.restore((translations.to_vec(), self.correction().clone()));
+        self.smooth.clone_from(&self.translations);
+        Ok(())
+    }
+
     /// Canonical translations of the nodes, metres.
     #[must_use]
     pub fn translations(&self) -> &[DVec3] {

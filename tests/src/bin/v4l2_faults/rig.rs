@@ -2,11 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use flyrig_calib::{SyncConfig, Synchronizer};
 use flyrig_capture::{
     CameraControls, CameraIdentity, CameraOptions, CameraSource, CameraStats, CaptureErrorKind, CaptureThreads,
     Decoding, FormatChoice, PopError, SourceHealth, ThreadsConfig, V4l2Camera, monotonic_nanos,
 };
+use flyrig_sync::{SyncSettings, Synchronizer};
 use flyrig_types::SetKind;
 
 use super::{bus, host::cpu_secs};
@@ -173,7 +173,7 @@ impl Rig {
         Self {
             cameras,
             threads,
-            sync: Synchronizer::new(&ids, &SyncConfig::default()),
+            sync: Synchronizer::new(&ids, &SyncSettings::default()),
             seen: vec![Seen::new(); cameras],
             last: vec![None; cameras],
             started: Instant::now(),

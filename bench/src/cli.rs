@@ -1,0 +1,164 @@
+//! The command line of `flyrig-bench`.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, builder::TypedValueParser as _};
+use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
+use flyrig_fusion::NetworksOn;
+use flyrig_report::arguments::{parse_fps, parse_minutes, parse_seconds, parse_size};
+
+/// Measure run time against error on simulated people.
+#[derive(Debug, Parser)]
+#[command(name = "flyrig-bench", version)]
+pub struct Cli {
+    /// Log more: -v debug, -vv trace. RUST_LOG chooses in detail.
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    pub verbose: u8,
+    /// Part of a graphics adapter's name; the fastest one otherwise.
+    #[arg(long, global = true)]
+    pub adapter: Option<String>,
+    #[command(subcommand)]
+    pub command: BenchCommand,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum BenchCommand {
+    /// Deformation tracking: solvers, iterations, Gaussians, resolution and views; writes CSV, JSON and SVG.
+    Track(BenchTrackArgs),
+    /// Thousands of frames of one movement there and back: error and memory over time; writes CSV and SVG.
+    Endure(BenchEndureArgs),
+    /// Appearance: every mode on simulated people that nobody trained on; writes CSV, JSON and SVG.
+    Appearance(BenchAppearanceArgs),
+    /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to whole sets.
+    Capture(BenchCaptureArgs),
+    /// Recording uncompressed cameras: bytes, processor time and loss of each JPEG quality against pictures as they come.
+    Record(BenchRecordArgs),
+}
+
+#[derive(Debug, Args)]
+pub struct BenchAppearanceArgs {
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-appearance")]
+    pub out: PathBuf,
+    /// Seed of the first person; the others follow.
+    #[arg(long, default_value_t = 101)]
+    pub seed: u64,
+    /// How many people.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub people: u64,
+    /// Frames of each sequence; the second half is scored.
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
+    pub frames: usize,
+    /// Numbers of input cameras, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "3,1", value_parser = clap::value_parser!(u8).range(1..=6).map(usize::from))]
+    pub views: Vec<usize>,
+    /// Weights files of the learned modes, in place of all networks that come with flyrig; may be given several times.
+    #[arg(long)]
+    pub weights: Vec<PathBuf>,
+    /// What the networks keep from frame to frame: see `reuse` in the configuration.
+    #[arg(long, default_value_t = 0.0)]
+    pub reuse: f32,
+    /// Where the networks run; "adapter" needs a program that was built with the feature gpu-networks.
+    #[arg(long, value_enum, default_value = "processor")]
+    pub networks_on: NetworksOn,
+    /// Pixels of a picture's side.
+    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchEndureArgs {
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-endure")]
+    pub out: PathBuf,
+    /// Seed of the person.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Frames in all.
+    #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u64).range(300..=10_000_000))]
+    pub frames: u64,
+    /// Pixels of a picture's side.
+    #[arg(long, default_value_t = 160, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = 12_000, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchCaptureArgs {
+    /// How long.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_minutes)]
+    pub minutes: f64,
+    /// Cameras; every second one sends JPEG.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=32))]
+    pub cameras: u32,
+    /// Frames a second.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// Size of the pictures, WIDTHxHEIGHT.
+    #[arg(long, value_parser = parse_size, default_value = "640x360")]
+    pub size: [u32; 2],
+}
+
+#[derive(Debug, Args)]
+pub struct BenchRecordArgs {
+    /// Seconds for each quality.
+    #[arg(long, default_value_t = 5.0, value_parser = parse_seconds)]
+    pub seconds: f64,
+    /// Cameras, all YUYV.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=32))]
+    pub cameras: u32,
+    /// Frames a second.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// Size of the pictures, WIDTHxHEIGHT.
+    #[arg(long, value_parser = parse_size, default_value = "640x360")]
+    pub size: [u32; 2],
+    /// JPEG qualities, comma separated; 0 records pictures as they come.
+    #[arg(long, value_delimiter = ',', default_values_t = [0, 80, 90, 95, 98], value_parser = clap::value_parser!(u8).range(0..=100))]
+    pub qualities: Vec<u8>,
+    /// Folder for the recordings, which are removed again; the system's for temporary files otherwise.
+    #[arg(long)]
+    pub folder: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchTrackArgs {
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-track")]
+    pub out: PathBuf,
+    /// Seed of the person.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Frames of the sequence.
+    #[arg(long, default_value_t = 14, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
+    pub frames: usize,
+    /// Pixels of a picture's side.
+    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
+    /// Only the three solvers.
+    #[arg(long)]
+    pub quick: bool,
+    /// Only the cases whose name has this text in it, "2 views" for example.
+    #[arg(long)]
+    pub only: Option<String>,
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+}

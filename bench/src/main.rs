@@ -1,0 +1,45 @@
+//! `flyrig-bench`: benchmarks that print run time beside error.
+
+mod appearance;
+mod capture;
+mod case;
+mod cli;
+mod endure;
+mod processor;
+mod recording;
+mod sequence;
+mod steady;
+mod summary;
+mod surface;
+mod track;
+mod write;
+
+#[cfg(test)]
+mod desync_tests;
+#[cfg(test)]
+mod state_tests;
+
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::Parser as _;
+use flyrig_report::program::{self, open_gpu};
+
+use crate::cli::{BenchCommand, Cli};
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    program::start_log(cli.verbose, false);
+    program::exit_code(dispatch(&cli))
+}
+
+fn dispatch(cli: &Cli) -> Result<()> {
+    let gpu = || open_gpu(cli.adapter.as_deref());
+    match &cli.command {
+        BenchCommand::Track(args) => track::track(args, &gpu()?),
+        BenchCommand::Endure(args) => endure::endure(args, &gpu()?),
+        BenchCommand::Appearance(args) => appearance::appearance(args, &gpu()?),
+        BenchCommand::Capture(args) => capture::capture(args),
+        BenchCommand::Record(args) => recording::record(args, &gpu()?),
+    }
+}

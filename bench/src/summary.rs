@@ -1,0 +1,165 @@
+//! What a benchmark's rows say together: tables, growth, what skipping saves and costs.
+
+use std::fmt::Write as _;
+
+use crate::{
+    case::Row,
+    sequence::Motion,
+    track::{ALL_DETAIL, ALL_GAUSSIANS, ALL_VIEWS, FULL_SIZE, NO_REST, VIEWS, small},
+};
+
+/// Everything, for the terminal.
+pub fn summary(rows: &[Row]) -> String {
+    let parts = [table(rows), skips(rows), growth(rows), people(rows)];
+    parts.into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join("\n")
+}
+
+fn table(rows: &[Row]) -> String {
+    let mut text = format!(
+        "{:<52} {:>7} {:>6} {:>6} {:>10} {:>7} {:>9} {:>9}\n",
+        "case", "PSNR dB", "SSIM", "IoU", "chamfer mm", "seen mm", "first ms", "later ms"
+    );
+    for r in rows {
+        let _ = writeln!(
+            text,
+            "{:<52} {:>7.2} {:>6.4} {:>6.4} {:>10.2} {:>7.2} {:>9.0} {:>9.0}",
+            r.name, r.psnr_db, r.ssim, r.iou, r.chamfer_mm, r.seen_mm, r.first_ms, r.later_ms
+        );
+        for (what, count) in &r.skipped {
+            let _ = writeln!(text, "    {what}: {count}");
+        }
+    }
+    text
+}
+
+/// The row of this variant, person of the first row.
+fn find<'a>(rows: &'a [Row], variant: &str, views: usize, side: u32, motion: Motion) -> Option<&'a Row> {
+    let seed = rows.first()?.sequence.seed;
+    rows.iter().find(|r| {
+        let s = r.sequence;
+        r.variant == variant && r.views == views && (s.side, s.motion, s.seed) == (side, motion, seed)
+    })
+}
+
+/// What each way of leaving things out saves, and what it costs in error.
+fn skips(rows: &[Row]) -> String {
+    let Some(side) = rows.first().map(|r| r.sequence.side) else { return String::new() };
+    let but = |what: &str| format!("default, {what}");
+    let low = small(side);
+    let pairs = [
+        ("Gaussians: fewer are compared", "default", but(ALL_GAUSSIANS), VIEWS, side, Motion::Turn),
+        ("Gaussians: two a pixel (small pictures)", "default", but(ALL_DETAIL), VIEWS, low, Motion::Turn),
+        ("pixels: pictures are halved", "default", but(FULL_SIZE), VIEWS, side, Motion::Turn),
+        ("iterations: none at rest (person stands)", "default", but(NO_REST), VIEWS, side, Motion::Still),
+        ("views: 4 of 6", "default, 4 compared", but(ALL_VIEWS), 6, side, Motion::Turn),
+        ("views: 3 of 6", "default, 3 compared", but(ALL_VIEWS), 6, side, Motion::Turn),
+        ("views: 2 of 6", "default, 2 compared", but(ALL_VIEWS), 6, side, Motion::Turn),
+    ];
+    let mut text = String::new();
+    for (name, with, without, views, side, motion) in pairs {
+        let of = |variant: &str| find(rows, variant, views, side, motion);
+        let (Some(with), Some(without)) = (of(with), of(&without)) else { continue };
+        if text.is_empty() {
+            text = format!(
+                "{:<42} {:>9} {:>9} {:>7} {:>11} {:>9} {:>9}\n",
+                "left out", "ms with", "without", "saved", "chamfer mm", "PSNR dB", "IoU"
+            );
+        }
+        let _ = writeln!(
+            text,
+            "{name:<42} {:>9.0} {:>9.0} {:>6.0}% {:>+11.2} {:>+9.2} {:>+9.4}",
+            with.deformation_ms,
+            without.deformation_ms,
+            100.0 * (1.0 - with.deformation_ms / without.deformation_ms),
+            with.chamfer_mm - without.chamfer_mm,
+            with.psnr_db - without.psnr_db,
+            with.iou - without.iou
+        );
+    }
+    text
+}
+
+/// How the time grows.
+fn growth(rows: &[Row]) -> String {
+    let Some(first) = rows.first() else { return String::new() };
+    let side = first.sequence.side;
+    let full = |what: &str| {
+        if what.is_empty() { format!("default, {FULL_SIZE}") } else { format!("default, {FULL_SIZE}, {what}") }
+    };
+    let of = |variant: &str, views, side| find(rows, variant, views, side, Motion::Turn);
+    let gaussians: Vec<(f64, f64)> = ["8000 Gaussians", "", ALL_GAUSSIANS]
+        .iter()
+        .filter_map(|what| of(&full(what), VIEWS, side))
+        .map(|r| (r.compared as f64, r.deformation_ms))
+        .collect();
+    let pixels: Vec<(f64, f64)> = [side / 2, side, side * 3 / 2]
+        .iter()
+        .filter_map(|&side| of(&full(""), VIEWS, side))
+        .map(|r| (f64::from(r.sequence.side).powi(2), r.deformation_ms))
+        .collect();
+    let views: Vec<(f64, f64)> = [2, 3, 4, 6]
+        .iter()
+        .filter_map(|&views| of(&format!("default, {ALL_VIEWS}"), views, side))
+        .map(|r| (r.views as f64, r.deformation_ms))
+        .collect();
+    let mut text = String::new();
+    for (name, points) in [("Gaussians", gaussians), ("pixels", pixels), ("views", views)] {
+        if let Some(exponent) = exponent(&points) {
+            let _ = writeln!(text, "time of the deformation grows with the {exponent:.2}th power of the {name}");
+        }
+    }
+    text
+}
+
+/// Slope of the line through the logarithms, by least squares; none of fewer than two places.
+fn exponent(points: &[(f64, f64)]) -> Option<f64> {
+    let logs: Vec<(f64, f64)> =
+        points.iter().filter(|p| p.0 > 0.0 && p.1 > 0.0).map(|p| (p.0.ln(), p.1.ln())).collect();
+    let n = logs.len() as f64;
+    let (mx, my) = (logs.iter().map(|p| p.0).sum::<f64>() / n, logs.iter().map(|p| p.1).sum::<f64>() / n);
+    let spread: f64 = logs.iter().map(|p| (p.0 - mx).powi(2)).sum();
+    let along: f64 = logs.iter().map(|p| (p.0 - mx) * (p.1 - my)).sum();
+    (spread > 1e-9).then(|| along / spread)
+}
+
+/// Means over the people, skinned only and tracked.
+fn people(rows: &[Row]) -> String {
+    let Some(first) = rows.first() else { return String::new() };
+    let usual = |r: &&Row| {
+        let s = r.sequence;
+        r.views == VIEWS && s.side == first.sequence.side && s.motion == Motion::Turn
+    };
+    let mut text = String::new();
+    for variant in ["off", "default"] {
+        let of: Vec<&Row> = rows.iter().filter(usual).filter(|r| r.variant == variant).collect();
+        if of.len() < 2 {
+            continue;
+        }
+        let mean = |value: &dyn Fn(&Row) -> f64| of.iter().map(|r| value(r)).sum::<f64>() / of.len() as f64;
+        let _ = writeln!(
+            text,
+            "mean of {} people, {variant}: {:.2} dB, SSIM {:.4}, IoU {:.4}, chamfer {:.2} mm, {:.2} mm of what is seen",
+            of.len(),
+            mean(&|r| r.psnr_db),
+            mean(&|r| r.ssim),
+            mean(&|r| r.iou),
+            mean(&|r| r.chamfer_mm),
+            mean(&|r| r.seen_mm)
+        );
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exponents_are_those_of_powers() {
+        let cubes: Vec<(f64, f64)> = [1.0, 2.0, 5.0].map(|x: f64| (x, 7.0 * x.powi(3))).to_vec();
+        assert!(exponent(&cubes).is_some_and(|e| (e - 3.0).abs() < 1e-9));
+        for few in [vec![], vec![(1.0, 2.0)], vec![(2.0, 2.0), (2.0, 3.0)], vec![(0.0, 1.0), (1.0, f64::NAN)]] {
+            assert_eq!(exponent(&few), None);
+        }
+    }
+}

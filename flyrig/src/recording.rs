@@ -1,0 +1,260 @@
+//! `flyrig record` and `flyrig replay`: cameras into a file and out of it.
+
+use std::{
+    fs,
+    path::Path,
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context as _, Result, bail, ensure};
+use flyrig_calib::save_easymocap;
+use flyrig_capture::{
+    CameraSource, CaptureThreads, Compression, McapReplay, Note, Pacing, PopError, Recorded, Recorder, ThreadsConfig,
+    recorded_notes, to_rgb8,
+};
+use flyrig_gpu::GpuContext;
+use flyrig_report::{png, stop, write_whole};
+use flyrig_sync::{SyncSettings, Synchronizer};
+use flyrig_transport::{decode_calibration, decode_transforms, encode_calibration, encode_transforms};
+use flyrig_types::{Camera, CameraId, Frame, FrameSet, PixelFormat, Rig};
+use foxglove::{
+    Encode,
+    messages::{CameraCalibration, FrameTransforms},
+};
+
+use crate::{
+    cli::{RecordArgs, ReplayArgs},
+    config::Config,
+    dataset, pose_recording,
+    source::{self, Source},
+};
+
+/// Topics of the calibration in a recording, as on the network.
+const CALIBRATION: &str = "calibration/";
+const TRANSFORMS: &str = "transforms";
+/// How often a line with counts is printed.
+const PRINT_EVERY: Duration = Duration::from_secs(5);
+
+/// Name, encoding and content of a message's schema.
+pub fn schema<M: Encode>() -> (String, String, Vec<u8>) {
+    M::get_schema().map(|schema| (schema.name, schema.encoding, schema.data.into_owned())).unwrap_or_default()
+}
+
+/// Opens a recording file and writes the rig into it. Sources that are read without loss are recorded without loss.
+pub fn recorder(path: &Path, rig: &Rig, jpeg_quality: u8, pacing: Pacing) -> Result<Recorder> {
+    fn note<M: Encode>(topic: String, payload: Vec<u8>) -> Note {
+        Note { topic, schema: schema::<M>(), payload }
+    }
+    let keep_all = pacing == Pacing::Lossless;
+    let compression = (jpeg_quality > 0).then_some(Compression { quality: jpeg_quality, keep_all });
+    let mut notes = vec![note::<FrameTransforms>(TRANSFORMS.to_owned(), encode_transforms(rig)?)];
+    for camera in &rig.cameras {
+        notes.push(note::<CameraCalibration>(format!("{CALIBRATION}{}", camera.id), encode_calibration(camera)?));
+    }
+    Ok(Recorder::create(path, &notes, compression)?)
+}
+
+/// The same sources, recorded as they are read.
+pub fn tap(recorder: &Recorder, sources: Vec<Box<dyn CameraSource>>) -> Result<Vec<Box<dyn CameraSource>>> {
+    sources.into_iter().map(|source| Ok(Box::new(recorder.tap(source)?) as Box<dyn CameraSource>)).collect()
+}
+
+/// The rig that a recording was made with.
+pub fn recorded_rig(path: &Path) -> Result<Rig> {
+    let notes = recorded_notes(path)?;
+    let named = |text: &str| format!("{}: {text}", path.display());
+    let transforms = notes.iter().find(|(topic, _)| topic == TRANSFORMS);
+    let (_, bytes) = transforms.with_context(|| named("holds no calibration; it is no recording of flyrig's"))?;
+    let transforms = decode_transforms(bytes)?;
+    let mut cameras = Vec::new();
+    for (_, bytes) in notes.iter().filter(|(topic, _)| topic.starts_with(CALIBRATION)) {
+        let (id, intrinsics) = decode_calibration(bytes)?;
+        let place = transforms.camera_from_world.iter().find(|(camera, _)| *camera == id);
+        let (_, camera_from_world) = place.with_context(|| named(&format!("camera {id} has no place")))?;
+        cameras.push(Camera { id, intrinsics, camera_from_world: *camera_from_world });
+    }
+    let rig = Rig { cameras, world_up: transforms.world_up };
+    rig.validate()?;
+    Ok(rig)
+}
+
+/// One source a camera of the rig.
+pub fn replay_sources(path: &Path, rig: &Rig) -> Result<Vec<Box<dyn CameraSource>>> {
+    rig.cameras
+        .iter()
+        .map(|camera| Ok(Box::new(McapReplay::open(&camera.id, path)?) as Box<dyn CameraSource>))
+        .collect()
+}
+
+/// Summarises a finished recording in one line.
+///
+/// # Errors
+/// When it broke off.
+pub fn summary(recorded: &Recorded, path: &Path) -> Result<String> {
+    let mut text = format!("{} frames, {:.1} MB in {}", recorded.frames, recorded.bytes as f64 / 1e6, path.display());
+    // Messages are a little longer than their pictures.
+    if recorded.bytes_sent > recorded.bytes {
+        text += &format!(", as JPEG; {:.1} MB as the cameras sent them", recorded.bytes_sent as f64 / 1e6);
+    }
+    if recorded.dropped > 0 {
+        text += &format!("; {} more were dropped because compressing them took too long", recorded.dropped);
+    }
+    match &recorded.problem {
+        Some(problem) => bail!("the recording broke off after {text}: {problem}"),
+        None => Ok(text),
+    }
+}
+
+/// Runs `flyrig record`.
+pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> Result<()> {
+    let stop = stop::flag();
+    let Source { rig, cameras, .. } = source::open(config, gpu)?;
+    let pacing = if config.source.kind.is_live() { Pacing::AsDelivered } else { Pacing::Lossless };
+    let recorder = recorder(&args.out, &rig, config.record.jpeg_quality, pacing)?;
+    let tapped = tap(&recorder, cameras)?;
+    let threads = CaptureThreads::start(tapped, ThreadsConfig { pacing, ..ThreadsConfig::default() })?;
+    eprintln!("record: {} cameras to {} (Ctrl-C ends)", rig.cameras.len(), args.out.display());
+    let (started, mut printed) = (Instant::now(), Instant::now());
+    let is_over = || args.seconds.is_some_and(|seconds| started.elapsed().as_secs_f64() >= seconds);
+    while !stop.load(std::sync::atomic::Ordering::Relaxed) && !is_over() && recorder.state().problem.is_none() {
+        // The frames are recorded on their way; here they are only taken out.
+        if matches!(threads.queue().pop(Duration::from_millis(100)), Err(PopError::Closed)) {
+            break;
+        }
+        if printed.elapsed() >= PRINT_EVERY {
+            let state = recorder.state();
+            eprintln!("record: {} frames, {:.1} MB", state.frames, state.bytes as f64 / 1e6);
+            printed = Instant::now();
+        }
+    }
+    let stats = threads.stats();
+    drop(threads);
+    for camera in stats {
+        let lost = camera.health.lost_by_driver;
+        let error = camera.last_error.map_or_else(String::new, |error| format!("; last error: {error}"));
+        eprintln!("record: camera {}: {} frames, {lost} lost before us{error}", camera.camera, camera.frames);
+    }
+    println!("record: {}", summary(&recorder.finish(), &args.out)?);
+    Ok(())
+}
+
+/// Runs `flyrig replay`: plays a recording through, tells what is in it, and exports it where asked to.
+pub fn replay(args: &ReplayArgs) -> Result<()> {
+    let stop = stop::flag();
+    let rig = recorded_rig(&args.recording)?;
+    dataset::pick(&rig, &args.lags.cameras(), "the recording, but in --lag")?;
+    let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+    let threads_config = ThreadsConfig { queue_capacity: 4 * ids.len().max(1), pacing: Pacing::Lossless };
+    let threads = CaptureThreads::start(replay_sources(&args.recording, &rig)?, threads_config)?;
+    let mut sync = Synchronizer::new(&ids, &SyncSettings { lags_nanos: args.lags.nanos(), ..SyncSettings::default() });
+    if let Some(folder) = &args.export {
+        ensure!(!folder.exists(), "{} is there already; name a new folder", folder.display());
+        for id in &ids {
+            fs::create_dir_all(folder.join("images").join(id.as_str()))?;
+        }
+        save_easymocap(folder, &rig)?;
+    }
+    let mut tallies = vec![Tally::default(); ids.len()];
+    let mut digest = Digest::default();
+    let export = |sets: Vec<FrameSet>| -> Result<()> {
+        let Some(folder) = &args.export else { return Ok(()) };
+        sets.iter().try_for_each(|set| write_set(folder, set))
+    };
+    loop {
+        ensure!(!stop.load(std::sync::atomic::Ordering::Relaxed), "stopped before the end");
+        match threads.queue().pop(Duration::from_millis(200)) {
+            Ok(frame) => {
+                if let Some(slot) = rig.slot(&frame.camera) {
+                    tallies[slot].add(&frame);
+                }
+                digest.add(&frame);
+                export(sync.push(frame))?;
+            }
+            Err(PopError::Timeout) => {}
+            Err(PopError::Closed) => break,
+        }
+    }
+    export(sync.flush())?;
+    for (id, tally) in ids.iter().zip(&tallies) {
+        println!("camera {id}: {}", tally.line());
+    }
+    if let Some(poses) = pose_recording::told(&args.recording)? {
+        println!("poses: {poses}");
+    }
+    let counts = sync.counts();
+    println!("sets: {} complete, {} partial", counts.complete, counts.partial);
+    println!("digest of all frames in their order: {:016x}", digest.0);
+    if let Some(folder) = &args.export {
+        println!("exported to {}", folder.display());
+    }
+    Ok(())
+}
+
+/// JPEG pictures as they are, every other as PNG.
+fn write_set(folder: &Path, set: &FrameSet) -> Result<()> {
+    for (_, frame) in set.present() {
+        let (image, stem) = (&frame.image, format!("{:06}", set.index));
+        let path = folder.join("images").join(frame.camera.as_str());
+        match image.format() {
+            PixelFormat::Mjpeg => write_whole(&path.join(stem + ".jpg"), image.bytes())?,
+            _ => {
+                let encoded = png::encode_rgb(&to_rgb8(image)?, image.width(), image.height())?;
+                write_whole(&path.join(stem + ".png"), &encoded)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+#[derive(Debug, Clone, Default)]
+struct Tally {
+    frames: u64,
+    missing: u64,
+    first_nanos: i64,
+    last: Option<(i64, u64)>,
+    look: String,
+}
+
+impl Tally {
+    fn add(&mut self, frame: &Frame) {
+        match self.last {
+            Some((_, sequence)) => self.missing += frame.sequence.saturating_sub(sequence).saturating_sub(1),
+            None => {
+                self.first_nanos = frame.capture_nanos;
+                let image = &frame.image;
+                self.look = format!("{:?} {}x{}", image.format(), image.width(), image.height());
+            }
+        }
+        self.frames += 1;
+        self.last = Some((frame.capture_nanos, frame.sequence));
+    }
+
+    fn line(&self) -> String {
+        let Some((last, _)) = self.last else { return "no frame".to_owned() };
+        let seconds = last.saturating_sub(self.first_nanos) as f64 * 1e-9;
+        let rate = if seconds > 0.0 { (self.frames - 1) as f64 / seconds } else { 0.0 };
+        format!(
+            "{} frames of {} in {seconds:.2} s ({rate:.2} a second), {} missing",
+            self.frames, self.look, self.missing
+        )
+    }
+}
+
+/// FNV-1a over everything about the frames: two replays of one recording must agree.
+struct Digest(u64);
+
+impl Default for Digest {
+    fn default() -> Self {
+        Self(0xcbf2_9ce4_8422_2325)
+    }
+}
+
+impl Digest {
+    fn add(&mut self, frame: &Frame) {
+        let numbers = [frame.sequence.to_le_bytes(), frame.capture_nanos.to_le_bytes()];
+        let name = frame.camera.as_str().as_bytes();
+        for byte in name.iter().chain(numbers.iter().flatten()).chain(frame.image.bytes()) {
+            self.0 = (self.0 ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3);
+        }
+    }
+}

@@ -1,0 +1,147 @@
+//! Cameras of a configuration, and what it says about the person.
+
+use anyhow::{Context as _, Result, bail};
+use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
+use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, VideoOptions, VideoReplay};
+use flyrig_fusion::{EstimatedPerception, GivenPerception, GivenPerson, InputFormat, Origin, PersonId};
+use flyrig_gpu::GpuContext;
+use flyrig_sim::{SimTime, Simulator};
+use flyrig_types::{CameraId, Image, PoseTrack, Rig};
+
+use crate::{
+    config::{Config, SourceKind},
+    dataset, live, network, recording,
+};
+
+/// Cameras, and what is known about the person.
+pub struct Source {
+    /// In the rig's order, images in the cameras' own formats.
+    pub cameras: Vec<Box<dyn CameraSource>>,
+    pub rig: Rig,
+    pub template: Template,
+    pub track: Option<PoseTrack>,
+    /// Images of the empty scene by slot, where there are any.
+    pub plates: Vec<Option<Image>>,
+}
+
+/// A person found by the configuration's means.
+pub enum FoundBy {
+    Given(GivenPerception),
+    /// Its shape is still to be learnt.
+    Estimated(EstimatedPerception),
+}
+
+impl Source {
+    /// How people are found: from the source's pose track, or from the images.
+    pub fn perception(&mut self, config: &Config) -> Result<FoundBy> {
+        let (masks, plates) = (config.body.masks, std::mem::take(&mut self.plates));
+        match (config.body.pose, self.track.take()) {
+            (Origin::Given, Some(track)) => {
+                let (person, repeat) = (PersonId::default(), config.source.kind == SourceKind::Sim);
+                let given = GivenPerson { person, template: self.template.clone(), track, repeat };
+                Ok(FoundBy::Given(GivenPerception::new(&self.rig, vec![given]).with_masks(masks, plates)))
+            }
+            (Origin::Given, None) => bail!("body.pose is \"given\" but the template holds no animation"),
+            (Origin::Estimated, _) => {
+                Ok(FoundBy::Estimated(EstimatedPerception::new(&self.rig, &self.template, masks, plates)?))
+            }
+        }
+    }
+}
+
+/// Pace at which the frames of a configuration's cameras are delivered.
+pub fn pacing(config: &Config) -> Pacing {
+    match (config.source.real_time, config.source.kind) {
+        // Nobody can make a real camera wait.
+        (_, SourceKind::Cameras | SourceKind::Network) => Pacing::AsDelivered,
+        (false, _) => Pacing::Lossless,
+        // Simulated cameras keep the time themselves, whatever their timestamps say.
+        (true, SourceKind::Sim) => Pacing::AsDelivered,
+        (true, _) => Pacing::RealTime,
+    }
+}
+
+/// Images that a configuration's cameras send.
+pub fn input_format<'a>(kind: SourceKind, rig: &'a Rig) -> InputFormat<'a> {
+    match kind {
+        SourceKind::Cameras | SourceKind::Network | SourceKind::Mcap => InputFormat::OfRig(rig),
+        SourceKind::Folder | SourceKind::Video | SourceKind::Sim => InputFormat::Rgb,
+    }
+}
+
+/// Opens the cameras of a configuration; only simulated ones need a graphics adapter.
+pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
+    let source = open_cameras(config, gpu)?;
+    dataset::pick(
+        &source.rig,
+        &config.sync.lags_nanos.keys().map(CameraId::to_string).collect::<Vec<_>>(),
+        "the rig, but in sync.lags_ms",
+    )?;
+    Ok(source)
+}
+
+fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
+    let source = &config.source;
+    if source.kind == SourceKind::Sim {
+        let gpu = gpu.context("the simulated rig needs a graphics adapter")?;
+        let simulator = Simulator::new(gpu, &config.sim)?;
+        let (rig, template, track) =
+            (simulator.reported_rig(), simulator.template().clone(), simulator.track().clone());
+        let picked = dataset::pick(&rig, &source.names(), "the simulated rig")?;
+        let copy = |slot| -> Result<Image> {
+            let plate = simulator.plate(slot)?;
+            Ok(Image::new(plate.width(), plate.height(), plate.format(), plate.bytes().to_vec())?)
+        };
+        let slots = picked.cameras.iter().filter_map(|camera| rig.slot(&camera.id));
+        let plates = slots.map(|slot| copy(slot).map(Some)).collect::<Result<_>>()?;
+        let simulator = std::sync::Arc::new(std::sync::Mutex::new(simulator));
+        let time = if source.real_time { SimTime::Real } else { SimTime::Exact };
+        let sources = flyrig_sim::sources(&simulator, time)
+            .into_iter()
+            .filter(|source| picked.slot(source.camera()).is_some())
+            .map(|source| Box::new(source) as Box<dyn CameraSource>)
+            .collect();
+        return Ok(Source { cameras: sources, rig: picked, template, track: Some(track), plates });
+    }
+    let chosen: Vec<CameraId> = source.names().into_iter().map(CameraId::from).collect();
+    let rig = match source.kind {
+        SourceKind::Cameras | SourceKind::Network => live::load_rig(source)?,
+        SourceKind::Mcap => recording::recorded_rig(&source.path)?,
+        SourceKind::Folder | SourceKind::Video | SourceKind::Sim => dataset::load_rig(&source.path, &chosen)?,
+    };
+    let rig = dataset::pick(&rig, &source.names(), "the calibration")?;
+    let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+    let sources: Vec<Box<dyn CameraSource>> = match source.kind {
+        SourceKind::Folder => {
+            let with_masks = config.body.masks == Origin::Given;
+            boxed(FolderReplay::open(
+                &source.path,
+                Some(&ids),
+                &FolderOptions { fps: source.fps, with_masks, frames: None },
+            )?)
+        }
+        SourceKind::Cameras => live::open(source)?,
+        SourceKind::Network => network::open(&config.transport(), &rig)?,
+        SourceKind::Mcap => recording::replay_sources(&source.path, &rig)?,
+        SourceKind::Video | SourceKind::Sim => {
+            let open = |id| VideoReplay::open(id, &dataset::video_file(&source.path, id), &VideoOptions::default());
+            boxed(ids.iter().map(open).collect::<Result<_, _>>()?)
+        }
+    };
+    let (template, track) = if config.body.template.as_os_str().is_empty() {
+        (default_template(&ShapeParams::default())?, None)
+    } else {
+        let human = load_gltf(&config.body.template)?;
+        (human.template, human.track)
+    };
+    let plates = match source.kind {
+        SourceKind::Mcap => rig.cameras.iter().map(|_| None).collect(),
+        _ => dataset::plates(&source.path, &rig)?,
+    };
+    Ok(Source { cameras: sources, rig, template, track, plates })
+}
+
+/// Sources of one kind as the capture threads take them.
+pub fn boxed<S: CameraSource + 'static>(sources: Vec<S>) -> Vec<Box<dyn CameraSource>> {
+    sources.into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect()
+}

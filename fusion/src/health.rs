@@ -1,0 +1,55 @@
+//! Health of a rig, as a snapshot.
+
+use flyrig_capture::CameraStats;
+use flyrig_sync::ClockState;
+
+use crate::StageSummary;
+
+/// A camera whose last frame is older than this, or than five intervals, is down, seconds.
+const UP_WITHIN_S: f64 = 5.0;
+
+/// Health of one camera.
+#[derive(Debug, Clone)]
+pub struct CameraHealth {
+    /// Counts of its threads and source.
+    pub stats: CameraStats,
+    /// Frames that came into no set.
+    pub in_no_set: u64,
+    /// Mean interval between capture times, milliseconds.
+    pub interval_ms: f64,
+    /// Standard deviation of that interval, milliseconds.
+    pub jitter_ms: f64,
+    /// Latency from capture to synchroniser, milliseconds; known for cameras of this computer.
+    pub lateness_ms: Option<f64>,
+    /// Time since the last frame, seconds; `None` before the first.
+    pub quiet_s: Option<f64>,
+    /// State of the camera's own clock, where it has one.
+    pub clock: Option<ClockState>,
+}
+
+impl CameraHealth {
+    /// Whether frames come.
+    #[must_use]
+    pub fn is_up(&self) -> bool {
+        self.stats.running && self.quiet_s.is_some_and(|quiet| quiet < (5e-3 * self.interval_ms).max(UP_WITHIN_S))
+    }
+}
+
+/// Health of a rig.
+#[derive(Debug, Clone, Default)]
+pub struct Health {
+    /// One element a camera.
+    pub cameras: Vec<CameraHealth>,
+    /// Sets with a frame of every camera.
+    pub complete_sets: u64,
+    /// Sets without at least one camera.
+    pub partial_sets: u64,
+    /// Sets that were older than the newest when the pipeline could take one.
+    pub skipped_sets: u64,
+    /// Run times of the session's stages.
+    pub stages: Vec<StageSummary>,
+    /// How often the graphics device was opened again after a fault.
+    pub device_faults: u64,
+    /// Resident memory of the process, MiB.
+    pub resident_mib: Option<f64>,
+}

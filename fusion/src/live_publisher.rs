@@ -1,0 +1,219 @@
+//! From rendered views to the network: compression and publishing off the session's thread.
+
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+    thread::JoinHandle,
+    time::{Duration, Instant},
+};
+
+use flyrig_capture::{LatestQueue, PopError};
+use flyrig_renderer::{Splat, composite_over};
+use flyrig_transport::{ImageFormat, Publisher, RigStats, SplatState, StageTime, TrackingStats, ViewFrame, ViewRate};
+use flyrig_types::{FrameSet, RenderedView};
+use image::{ExtendedColorType, ImageEncoder as _, codecs::jpeg::JpegEncoder};
+
+use crate::{FusionError, Session};
+
+/// Views that may wait for compression, all together.
+const WAITING_PICTURES: usize = 8;
+/// Grey behind the people in published views, sRGB.
+const BACKDROP: u8 = 30;
+/// How often statistics are published.
+const STATS_EVERY: Duration = Duration::from_secs(1);
+
+struct Job {
+    view: String,
+    picture: RenderedView,
+    frame: u64,
+    capture_nanos: i64,
+}
+
+/// Compresses and publishes views, Gaussians and statistics without ever making the session wait.
+pub struct LivePublisher {
+    publisher: Arc<Publisher>,
+    jobs: Arc<LatestQueue<Job>>,
+    encoder: Option<JoinHandle<()>>,
+    failures: Arc<AtomicU64>,
+    started: Instant,
+    last_stats: Instant,
+    frames_at_last_stats: u64,
+}
+
+impl LivePublisher {
+    /// Starts the compression thread.
+    ///
+    /// # Errors
+    /// [`FusionError::Thread`] when the system starts none.
+    pub fn start(publisher: Publisher, jpeg_quality: u8) -> Result<Self, FusionError> {
+        let publisher = Arc::new(publisher);
+        let jobs = Arc::new(LatestQueue::new(WAITING_PICTURES));
+        let failures = Arc::new(AtomicU64::new(0));
+        let encoder = {
+            let (publisher, jobs, failures) = (Arc::clone(&publisher), Arc::clone(&jobs), Arc::clone(&failures));
+            std::thread::Builder::new()
+                .name("encode".to_owned())
+                .spawn(move || encode_all(&publisher, &jobs, jpeg_quality, &failures))
+                .map_err(|source| FusionError::Thread { name: "encode", source })?
+        };
+        Ok(Self {
+            publisher,
+            jobs,
+            encoder: Some(encoder),
+            failures,
+            started: Instant::now(),
+            last_stats: Instant::now(),
+            frames_at_last_stats: 0,
+        })
+    }
+
+    /// The publisher, to ask who watches.
+    #[must_use]
+    pub fn publisher(&self) -> &Publisher {
+        &self.publisher
+    }
+
+    /// Hands a rendered view over; when the compressor is behind, the oldest waiting view is dropped and counted.
+    pub fn publish(&self, view: &str, picture: RenderedView, set: &FrameSet) {
+        let job = Job { view: view.to_owned(), picture, frame: set.index, capture_nanos: set.master_nanos };
+        drop(self.jobs.push(job));
+    }
+
+    /// Reads everybody's Gaussians back and hands them over.
+    ///
+    /// # Errors
+    /// [`FusionError::Gpu`].
+    pub fn publish_splats(&self, session: &Session, set: &FrameSet) -> Result<(), FusionError> {
+        let mut state = SplatState {
+            frame: set.index,
+            capture_nanos: set.master_nanos,
+            center_scale: Vec::new(),
+            color: Vec::new(),
+            invalid: 0,
+        };
+        for subject in session.subjects() {
+            for Splat { position: [x, y, z], scale_m, color: [r, g, b], opacity, .. } in session.splats(subject.id())? {
+                state.center_scale.push([x, y, z, scale_m[0]]);
+                state.color.push([r, g, b, opacity]);
+            }
+        }
+        self.publisher.publish_splats(Arc::new(state));
+        Ok(())
+    }
+
+    /// Publishes statistics once a second; returns whether it did.
+    pub fn publish_stats(&mut self, session: &Session, set: &FrameSet, frames: u64, drops: &[(String, u64)]) -> bool {
+        let interval = self.last_stats.elapsed();
+        if interval < STATS_EVERY {
+            return false;
+        }
+        let frames_per_second = (frames - self.frames_at_last_stats.min(frames)) as f64 / interval.as_secs_f64();
+        self.last_stats = Instant::now();
+        self.frames_at_last_stats = frames;
+        let uptime_secs = self.started.elapsed().as_secs_f64();
+        let counts = self.publisher.counts();
+        let views = counts
+            .iter()
+            .filter_map(|(topic, counts)| {
+                Some(ViewRate {
+                    view: topic.strip_prefix("view/")?.to_owned(),
+                    per_second: counts.sent as f64 / uptime_secs,
+                    bytes_per_second: counts.bytes as f64 / uptime_secs,
+                })
+            })
+            .collect();
+        let stats = RigStats {
+            frame: set.index,
+            capture_nanos: set.master_nanos,
+            uptime_secs,
+            frames_per_second,
+            stages: session
+                .stages
+                .summary()
+                .iter()
+                .map(|s| StageTime {
+                    stage: s.name.clone(),
+                    mean_millis: f64::from(s.mean_ms),
+                    max_millis: f64::from(s.p95_ms),
+                })
+                .collect(),
+            dropped: drops.iter().cloned().chain(self.drops()).collect(),
+            views,
+            viewers: self.publisher.viewpoint_counts().active as u32,
+            tracking: session.subjects().first().map_or_else(TrackingStats::default, |subject| {
+                let watch = subject.watch();
+                TrackingStats {
+                    state: watch.state().name().to_owned(),
+                    quality: watch.quality(),
+                    cameras: watch.cameras().iter().map(|(id, quality)| (id.to_string(), *quality)).collect(),
+                }
+            }),
+        };
+        if let Err(error) = self.publisher.publish_stats(&stats) {
+            tracing::warn!(%error, "statistics not published");
+        }
+        true
+    }
+
+    /// Counts the views lost on the way out, by place.
+    #[must_use]
+    pub fn drops(&self) -> Vec<(String, u64)> {
+        let mut drops = vec![
+            ("pictures waiting for compression".to_owned(), self.jobs.dropped()),
+            ("pictures that failed".to_owned(), self.failures.load(Ordering::Relaxed)),
+        ];
+        drops.extend(self.publisher.counts().into_iter().map(|(topic, c)| (format!("published {topic}"), c.replaced)));
+        drops
+    }
+
+    /// Sends what waits and ends the thread and the transport session.
+    ///
+    /// # Errors
+    /// [`FusionError::Transport`].
+    pub fn finish(mut self) -> Result<(), FusionError> {
+        self.jobs.close();
+        if self.encoder.take().is_some_and(|encoder| encoder.join().is_err()) {
+            tracing::error!("the compression thread had ended early");
+        }
+        match Arc::try_unwrap(self.publisher) {
+            Ok(publisher) => Ok(publisher.close()?),
+            Err(_) => Ok(()),
+        }
+    }
+}
+
+fn encode_all(publisher: &Publisher, jobs: &LatestQueue<Job>, quality: u8, failures: &AtomicU64) {
+    loop {
+        let job = match jobs.pop(Duration::from_millis(200)) {
+            Ok(job) => job,
+            Err(PopError::Timeout) => continue,
+            Err(PopError::Closed) => return,
+        };
+        if let Err(error) = encode_one(publisher, &job, quality) {
+            failures.fetch_add(1, Ordering::Relaxed);
+            tracing::warn!(view = job.view, %error, "view not published");
+        }
+    }
+}
+
+fn encode_one(publisher: &Publisher, job: &Job, quality: u8) -> Result<(), Box<dyn std::error::Error>> {
+    let RenderedView { width, height, rgba } = &job.picture;
+    let backdrop = vec![BACKDROP; *width as usize * *height as usize * 3];
+    let mut jpeg = Vec::new();
+    let rgb = composite_over(rgba, &backdrop);
+    JpegEncoder::new_with_quality(&mut jpeg, quality).write_image(&rgb, *width, *height, ExtendedColorType::Rgb8)?;
+    publisher.publish_view(
+        &job.view,
+        ViewFrame {
+            width: *width,
+            height: *height,
+            format: ImageFormat::Jpeg,
+            bytes: jpeg.into(),
+            frame: job.frame,
+            capture_nanos: job.capture_nanos,
+        },
+    )?;
+    Ok(())
+}

@@ -1,0 +1,207 @@
+//! A live rig: cameras, session and publisher, step by step, going on after faults.
+
+use std::{
+    collections::{BTreeMap, VecDeque},
+    time::{Duration, Instant},
+};
+
+use flyrig_types::{FrameSet, PersonId};
+
+use crate::{FusionError, Health, Intake, LivePublisher, LiveViews, Outcome, PersonMemory, Session, resident_mib};
+
+/// How often what was learnt about the people is read back, to survive the loss of the graphics device.
+const SNAPSHOT_EVERY: Duration = Duration::from_secs(10);
+/// More device faults within [`FAULT_WINDOW`] end the rig: rebuilding does not help.
+const MOST_FAULTS: usize = 5;
+const FAULT_WINDOW: Duration = Duration::from_secs(60);
+/// Pauses between attempts to open the device again, doubling from the first; after as many attempts the rig ends.
+const FIRST_PAUSE: Duration = Duration::from_millis(100);
+const ATTEMPTS: u32 = 5;
+
+/// A set that was taken in.
+#[derive(Debug)]
+pub struct LiveStep {
+    /// The set.
+    pub set: FrameSet,
+    /// Its result.
+    pub outcome: Outcome,
+}
+
+/// Cameras in, people out, for as long as the cameras give frames.
+pub struct LiveRig {
+    /// The people.
+    pub session: Session,
+    /// The cameras.
+    pub intake: Intake,
+    publisher: Option<LivePublisher>,
+    views: LiveViews,
+    splats: bool,
+    started: Instant,
+    frames: u64,
+    held: u64,
+    recovery: Recovery,
+}
+
+/// What the rig needs to go on after the loss of its device.
+#[derive(Debug, Default)]
+struct Recovery {
+    memories: BTreeMap<PersonId, PersonMemory>,
+    taken: Option<Instant>,
+    /// Times of the last faults.
+    faults: VecDeque<Instant>,
+    rebuilt: u64,
+}
+
+impl LiveRig {
+    /// Joins cameras, session and views; nothing is published without a publisher.
+    #[must_use]
+    pub fn new(session: Session, intake: Intake, views: LiveViews, publisher: Option<LivePublisher>) -> Self {
+        let (frames, held, recovery) = Default::default();
+        Self { session, intake, publisher, views, splats: true, started: Instant::now(), frames, held, recovery }
+    }
+
+    /// Chooses whether the Gaussians are published as well.
+    #[must_use]
+    pub fn with_splats(self, splats: bool) -> Self {
+        Self { splats, ..self }
+    }
+
+    /// Waits for a set, takes it in and publishes the views that are watched. Returns `None` when no set came in time. The
+    /// rig's own views turn with `turn_time`, or with the time since the start.
+    ///
+    /// A graphics device that is lost, out of memory or rejects a command is opened again, and the people are resumed from
+    /// the last snapshot.
+    ///
+    /// # Errors
+    /// Faults that going on does not mend: the rig must end.
+    pub fn step(&mut self, timeout: Duration, turn_time: Option<Duration>) -> Result<Option<LiveStep>, FusionError> {
+        let Some(set) = self.intake.next_set(timeout) else { return Ok(None) };
+        match self.take_in(&set, turn_time) {
+            Ok(outcome) => Ok(Some(LiveStep { set, outcome })),
+            Err(fault) if fault.is_device_fault() => {
+                self.recover(fault)?;
+                let outcome = Outcome::Held("the graphics device was opened again".to_owned());
+                Ok(Some(LiveStep { set, outcome }))
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    fn take_in(&mut self, set: &FrameSet, turn_time: Option<Duration>) -> Result<Outcome, FusionError> {
+        self.frames += 1;
+        let outcome = self.session.process(set)?;
+        if let Outcome::Held(reason) = &outcome {
+            self.held += 1;
+            // The 1st, 2nd, 4th ...: a room that is empty all night must not fill the disk.
+            if self.held.is_power_of_two() {
+                tracing::warn!(set = set.index, held = self.held, %reason, "frame set not used");
+            }
+        }
+        if let Some(publisher) = &mut self.publisher {
+            let turn_time = turn_time.unwrap_or_else(|| self.started.elapsed());
+            self.views.publish(&mut self.session, publisher, set, turn_time)?;
+            if self.splats && publisher.publisher().has_splat_subscribers() {
+                publisher.publish_splats(&self.session, set)?;
+            }
+            publisher.publish_stats(&self.session, set, self.frames, &self.intake.drops());
+        }
+        if self.recovery.taken.is_none_or(|at| at.elapsed() >= SNAPSHOT_EVERY) && self.session.has_people() {
+            self.snapshot()?;
+        }
+        Ok(outcome)
+    }
+
+    /// Reads back what was learnt about everybody.
+    ///
+    /// # Errors
+    /// [`FusionError::Gpu`].
+    pub fn snapshot(&mut self) -> Result<&BTreeMap<PersonId, PersonMemory>, FusionError> {
+        for subject in self.session.subjects().iter().filter(|subject| subject.pose().is_some()) {
+            self.recovery.memories.insert(subject.id(), self.session.memory(subject.id())?);
+        }
+        self.recovery.taken = Some(Instant::now());
+        Ok(&self.recovery.memories)
+    }
+
+    /// Opens the graphics device again and resumes the people.
+    fn recover(&mut self, fault: FusionError) -> Result<(), FusionError> {
+        let now = Instant::now();
+        let faults = &mut self.recovery.faults;
+        faults.push_back(now);
+        faults.retain(|at| now.duration_since(*at) < FAULT_WINDOW);
+        if faults.len() > MOST_FAULTS {
+            tracing::error!("{} faults of the graphics device within a minute; giving up", faults.len());
+            return Err(fault);
+        }
+        tracing::error!("{fault}; opening the graphics device again");
+        let mut pause = FIRST_PAUSE;
+        for attempt in 1..=ATTEMPTS {
+            let gpu = self.session.gpu().reopen();
+            let rebuilt =
+                gpu.map_err(FusionError::from).and_then(|gpu| self.session.rebuild(gpu, &self.recovery.memories));
+            match rebuilt {
+                Ok(()) => {
+                    self.recovery.rebuilt += 1;
+                    tracing::warn!("the graphics device works again after {:.1} s", now.elapsed().as_secs_f64());
+                    return Ok(());
+                }
+                Err(error) if attempt < ATTEMPTS => {
+                    tracing::warn!("{error}; attempt {} of {ATTEMPTS} follows", attempt + 1);
+                    std::thread::sleep(pause);
+                    pause *= 2;
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        Err(fault)
+    }
+
+    /// The publisher, where there is one.
+    #[must_use]
+    pub fn publisher(&self) -> Option<&LivePublisher> {
+        self.publisher.as_ref()
+    }
+
+    /// Sets that were taken in.
+    #[must_use]
+    pub fn frames(&self) -> u64 {
+        self.frames
+    }
+
+    /// How often the graphics device was opened again.
+    #[must_use]
+    pub fn rebuilt(&self) -> u64 {
+        self.recovery.rebuilt
+    }
+
+    /// Reports the health of cameras, sets, stages and memory.
+    #[must_use]
+    pub fn health(&self) -> Health {
+        Health {
+            stages: self.session.stages.summary(),
+            resident_mib: resident_mib(),
+            device_faults: self.recovery.rebuilt,
+            ..self.intake.health()
+        }
+    }
+
+    /// Counts everything that was lost, by place.
+    #[must_use]
+    pub fn drops(&self) -> Vec<(String, u64)> {
+        let mut drops = self.intake.drops();
+        drops.extend(self.publisher.iter().flat_map(LivePublisher::drops));
+        drops
+    }
+
+    /// Stops the cameras, sends what waits and ends the transport session; returns the session.
+    ///
+    /// # Errors
+    /// [`FusionError::Transport`].
+    pub fn finish(self) -> Result<Session, FusionError> {
+        drop(self.intake);
+        if let Some(publisher) = self.publisher {
+            publisher.finish()?;
+        }
+        Ok(self.session)
+    }
+}

@@ -1,0 +1,96 @@
+//! The views that a live rig publishes: its own, and those that viewers ask for.
+
+use std::time::Duration;
+
+use flyrig_types::FrameSet;
+use serde::{Deserialize, Serialize};
+
+use crate::{FusionError, LivePublisher, Session, orbit, settings::check};
+
+/// Turns a second of the rig's own views, so that a viewer who stands still sees all sides.
+const ORBIT_TURNS_PER_SECOND: f64 = 0.05;
+
+/// The table `[output]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct OutputSettings {
+    /// Views on a circle around the people.
+    pub views: usize,
+    /// Pixels.
+    pub width: u32,
+    /// Pixels.
+    pub height: u32,
+    /// Quality of the published JPEG images, 1 to 100.
+    pub jpeg_quality: u8,
+    /// Whether the Gaussians are published as well.
+    pub splats: bool,
+}
+
+impl Default for OutputSettings {
+    fn default() -> Self {
+        Self { views: 1, width: 512, height: 512, jpeg_quality: 85, splats: true }
+    }
+}
+
+impl OutputSettings {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`FusionError::Setting`] names the key and the range.
+    pub fn validate(&self) -> Result<(), FusionError> {
+        check("output.views", self.views as f64, 0.0, 16.0)?;
+        check("output.width", f64::from(self.width), 16.0, 4096.0)?;
+        check("output.height", f64::from(self.height), 16.0, 4096.0)?;
+        check("output.jpeg_quality", f64::from(self.jpeg_quality), 1.0, 100.0)
+    }
+}
+
+/// Draws and publishes views. Nothing is drawn without a recipient.
+#[derive(Debug)]
+pub struct LiveViews {
+    names: Vec<String>,
+    width: u32,
+    height: u32,
+}
+
+impl LiveViews {
+    /// The rig's own views: `main`, `main-1`, ... spread around the people.
+    #[must_use]
+    pub fn new(settings: &OutputSettings) -> Self {
+        let name = |i: usize| if i == 0 { "main".to_owned() } else { format!("main-{i}") };
+        Self { names: (0..settings.views).map(name).collect(), width: settings.width, height: settings.height }
+    }
+
+    /// Draws the watched views and hands them to the publisher. `at` turns the rig's own views. Returns how many were drawn.
+    ///
+    /// # Errors
+    /// Faults of the graphics device and of the transport session; a viewer's view that cannot be drawn is not one.
+    pub fn publish(
+        &self,
+        session: &mut Session,
+        publisher: &LivePublisher,
+        set: &FrameSet,
+        at: Duration,
+    ) -> Result<usize, FusionError> {
+        let mut count = 0;
+        if !session.has_people() {
+            return Ok(0);
+        }
+        for (i, name) in self.names.iter().enumerate() {
+            publisher.publisher().add_view(name)?;
+            if !publisher.publisher().has_subscribers(name) {
+                continue;
+            }
+            let turn = i as f64 / self.names.len() as f64 + at.as_secs_f64() * ORBIT_TURNS_PER_SECOND;
+            if let Some(camera) = orbit(session.rig(), turn, self.width, self.height, name) {
+                publisher.publish(name, session.render(&camera)?, set);
+                count += 1;
+            }
+        }
+        for viewpoint in publisher.publisher().requested_viewpoints() {
+            publisher.publish(&viewpoint.view, session.render(&viewpoint.camera)?, set);
+            count += 1;
+        }
+        Ok(count)
+    }
+}

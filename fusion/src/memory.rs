@@ -1,0 +1,262 @@
+//! What was learnt about a person: shape, deformation and colours. A session resumes from it after a restart of the program or
+//! the loss of the graphics device.
+
+use std::{collections::HashMap, io::Write as _, path::Path};
+
+use flyrig_body::{Joint, Skeleton, Template};
+use glam::{DMat4, DQuat, DVec3, Vec3};
+use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+
+use crate::FusionError;
+
+/// Version of the file; a file of another one is refused.
+const VERSION: &str = "1";
+/// Key of the version in the file's metadata.
+const VERSION_KEY: &str = "flyrig-person";
+/// Key of the joints' names, one a line.
+const JOINTS_KEY: &str = "joints";
+/// A larger file is no saved person, bytes.
+const MOST_BYTES: u64 = 1 << 30;
+
+/// What a session has learnt about one person.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PersonMemory {
+    /// Canonical positions and normals of the template's vertices, metres.
+    positions: Vec<Vec3>,
+    normals: Vec<Vec3>,
+    joints: Vec<Joint>,
+    /// Canonical translation of each node of the deformation graph, metres; empty where the body is only skinned.
+    pub(crate) translations: Vec<DVec3>,
+    /// Accumulated linear RGB of each Gaussian, and its weight.
+    pub(crate) memory: Vec<[f32; 4]>,
+    /// Linear RGB of each Gaussian, and its opacity.
+    pub(crate) colors: Vec<[f32; 4]>,
+}
+
+impl PersonMemory {
+    /// Collects what is known; the shape is the template's.
+    pub(crate) fn new(
+        template: &Template,
+        translations: Vec<DVec3>,
+        memory: Vec<[f32; 4]>,
+        colors: Vec<[f32; 4]>,
+    ) -> Self {
+        let joints = template.skeleton.joints().to_vec();
+        let (positions, normals) = (template.positions.clone(), template.normals.clone());
+        Self { positions, normals, joints, translations, memory, colors }
+    }
+
+    /// Returns the person's template: `base` with the learnt shape.
+    ///
+    /// # Errors
+    /// [`FusionError::SavedPerson`] when it was learnt with a template of other vertices or joints.
+    pub fn template(&self, base: &Template) -> Result<Template, FusionError> {
+        let names = |joints: &[Joint]| joints.iter().map(|joint| joint.name.clone()).collect::<Vec<_>>();
+        if self.positions.len() != base.positions.len() || names(&self.joints) != names(base.skeleton.joints()) {
+            return Err(fault(
+                &base.name,
+                format!(
+                    "it has {} vertices and {} joints, the template {} and {}; use the body that it was saved with, or \
+                     delete it",
+                    self.positions.len(),
+                    self.joints.len(),
+                    base.positions.len(),
+                    base.skeleton.joints().len()
+                ),
+            ));
+        }
+        let template = Template {
+            positions: self.positions.clone(),
+            normals: self.normals.clone(),
+            skeleton: Skeleton::new(self.joints.clone())?,
+            ..base.clone()
+        };
+        template.check()?;
+        Ok(template)
+    }
+
+    /// Writes a file, whole or not at all.
+    ///
+    /// # Errors
+    /// [`FusionError::SavedPerson`] with the system's reason.
+    pub fn save(&self, path: &Path) -> Result<(), FusionError> {
+        let fail = |problem: String| fault(&path.display().to_string(), problem);
+        let vec3 = |points: &[Vec3]| bytes(points.iter().flat_map(|p| p.to_array()).map(f32::to_le_bytes));
+        let vec4 = |points: &[[f32; 4]]| bytes(points.as_flattened().iter().map(|v| v.to_le_bytes()));
+        let joints =
+            |numbers: fn(&Joint) -> Vec<f64>| bytes(self.joints.iter().flat_map(numbers).map(f64::to_le_bytes));
+        let translations = bytes(self.translations.iter().flat_map(|t| t.to_array()).map(f64::to_le_bytes));
+        let count = self.joints.len();
+        let tensors = [
+            ("positions", Dtype::F32, vec![self.positions.len(), 3], vec3(&self.positions)),
+            ("normals", Dtype::F32, vec![self.normals.len(), 3], vec3(&self.normals)),
+            ("parents", Dtype::F64, vec![count, 1], joints(|j| vec![j.parent.map_or(-1.0, |p| p as f64)])),
+            ("rest_translations", Dtype::F64, vec![count, 3], joints(|j| j.rest_translation.to_array().to_vec())),
+            ("rest_rotations", Dtype::F64, vec![count, 4], joints(|j| j.rest_rotation.to_array().to_vec())),
+            ("binds", Dtype::F64, vec![count, 16], joints(|j| j.joint_from_canonical.to_cols_array().to_vec())),
+            ("translations", Dtype::F64, vec![self.translations.len(), 3], translations),
+            ("memory", Dtype::F32, vec![self.memory.len(), 4], vec4(&self.memory)),
+            ("colors", Dtype::F32, vec![self.colors.len(), 4], vec4(&self.colors)),
+        ];
+        let views: Vec<(&str, TensorView<'_>)> = tensors
+            .iter()
+            .map(|(name, dtype, shape, data)| Ok((*name, TensorView::new(*dtype, shape.clone(), data)?)))
+            .collect::<Result<_, safetensors::SafeTensorError>>()
+            .map_err(|error| fail(error.to_string()))?;
+        let names: Vec<&str> = self.joints.iter().map(|joint| joint.name.as_str()).collect();
+        let metadata =
+            HashMap::from([(VERSION_KEY.to_owned(), VERSION.to_owned()), (JOINTS_KEY.to_owned(), names.join("\n"))]);
+        let file = safetensors::serialize(views, Some(metadata)).map_err(|error| fail(error.to_string()))?;
+        flyrig_types::write_whole(path, |out| out.write_all(&file))
+            .map_err(|error| fail(format!("cannot be written ({error}); check that the folder exists and has room")))
+    }
+
+    /// Reads a file of [`Self::save`].
+    ///
+    /// # Errors
+    /// [`FusionError::SavedPerson`] when it cannot be read, is cut short, is of another version or holds numbers that are
+    /// not finite.
+    pub fn load(path: &Path) -> Result<Self, FusionError> {
+        let name = path.display().to_string();
+        let read = |error: std::io::Error| fault(&name, format!("cannot be read ({error})"));
+        let length = std::fs::metadata(path).map_err(read)?.len();
+        if length > MOST_BYTES {
+            return Err(fault(
+                &name,
+                format!("has {length} bytes, too many for a person; name a file that flyrig saved"),
+            ));
+        }
+        Self::decode(&name, &std::fs::read(path).map_err(read)?)
+    }
+
+    fn decode(name: &str, file: &[u8]) -> Result<Self, FusionError> {
+        let damaged = |what: &str| fault(name, format!("{what}; delete it, it is learnt again"));
+        let (_, header) = SafeTensors::read_metadata(file).map_err(|error| damaged(&error.to_string()))?;
+        let metadata = header.metadata().clone().unwrap_or_default();
+        match metadata.get(VERSION_KEY).map(String::as_str) {
+            Some(VERSION) => {}
+            Some(other) => return Err(damaged(&format!("is of version {other}, this flyrig reads {VERSION}"))),
+            None => return Err(fault(name, "is no saved person; name a file that flyrig saved".to_owned())),
+        }
+        let tensors = SafeTensors::deserialize(file).map_err(|error| damaged(&error.to_string()))?;
+        let rows = |tensor: &str, dtype: Dtype, columns: usize| -> Result<Vec<f64>, FusionError> {
+            let view = tensors.tensor(tensor).map_err(|_| damaged(&format!("lacks {tensor}")))?;
+            if view.dtype() != dtype || view.shape().len() != 2 || view.shape().get(1) != Some(&columns) {
+                return Err(damaged(&format!("{tensor} has another shape or type")));
+            }
+            let four = |b: &[u8]| f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+            let eight = |b: &[u8]| f64::from_le_bytes([b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7]]);
+            let numbers: Vec<f64> = match dtype {
+                Dtype::F32 => view.data().chunks_exact(4).map(four).collect(),
+                _ => view.data().chunks_exact(8).map(eight).collect(),
+            };
+            if numbers.iter().all(|v| v.is_finite()) {
+                Ok(numbers)
+            } else {
+                Err(damaged(&format!("{tensor} holds a number that is not finite")))
+            }
+        };
+        let vec3 = |tensor| -> Result<Vec<Vec3>, FusionError> {
+            let numbers = rows(tensor, Dtype::F32, 3)?;
+            Ok(numbers.chunks_exact(3).map(|p| DVec3::from_slice(p).as_vec3()).collect())
+        };
+        let vec4 = |tensor| -> Result<Vec<[f32; 4]>, FusionError> {
+            let numbers = rows(tensor, Dtype::F32, 4)?;
+            Ok(numbers.chunks_exact(4).map(|p| [p[0] as f32, p[1] as f32, p[2] as f32, p[3] as f32]).collect())
+        };
+        let names: Vec<&str> = metadata.get(JOINTS_KEY).map_or_else(Vec::new, |names| names.lines().collect());
+        let of_joints = |tensor, columns| -> Result<Vec<f64>, FusionError> {
+            let numbers = rows(tensor, Dtype::F64, columns)?;
+            if numbers.len() == names.len() * columns {
+                Ok(numbers)
+            } else {
+                Err(damaged(&format!("{tensor} is of another number of joints than their names")))
+            }
+        };
+        let (parents, rests) = (of_joints("parents", 1)?, of_joints("rest_translations", 3)?);
+        let (turns, binds) = (of_joints("rest_rotations", 4)?, of_joints("binds", 16)?);
+        let joint = |(i, name): (usize, &&str)| Joint {
+            name: (*name).to_owned(),
+            parent: (parents[i] >= 0.0).then_some(parents[i] as usize),
+            rest_translation: DVec3::from_slice(&rests[3 * i..]),
+            rest_rotation: DQuat::from_slice(&turns[4 * i..]),
+            joint_from_canonical: DMat4::from_cols_slice(&binds[16 * i..]),
+        };
+        let translations = rows("translations", Dtype::F64, 3)?.chunks_exact(3).map(DVec3::from_slice).collect();
+        Ok(Self {
+            positions: vec3("positions")?,
+            normals: vec3("normals")?,
+            joints: names.iter().enumerate().map(joint).collect(),
+            translations,
+            memory: vec4("memory")?,
+            colors: vec4("colors")?,
+        })
+    }
+}
+
+fn bytes<const N: usize>(numbers: impl Iterator<Item = [u8; N]>) -> Vec<u8> {
+    numbers.flatten().collect()
+}
+
+fn fault(name: &str, problem: String) -> FusionError {
+    FusionError::SavedPerson { name: name.to_owned(), problem }
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_body::{ShapeParams, default_template};
+
+    use super::*;
+
+    fn memory() -> (Template, PersonMemory) {
+        let mut template = default_template(&ShapeParams::default()).unwrap();
+        template.positions[7] += Vec3::new(0.01, 0.0, -0.02);
+        let translations = vec![DVec3::new(0.001, -0.002, 0.003); 5];
+        let memory = PersonMemory::new(&template, translations, vec![[0.1, 0.2, 0.3, 8.0]; 9], vec![[0.5; 4]; 9]);
+        (template, memory)
+    }
+
+    #[test]
+    fn a_saved_person_comes_back_bit_for_bit() {
+        let (template, memory) = memory();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("person.safetensors");
+        memory.save(&path).unwrap();
+        let loaded = PersonMemory::load(&path).unwrap();
+        assert_eq!(loaded, memory);
+        let base = default_template(&ShapeParams::default()).unwrap();
+        assert_eq!(loaded.template(&base).unwrap(), template);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "written whole");
+        let error = memory.save(&folder.path().join("none/person")).unwrap_err().to_string();
+        assert!(error.contains("cannot be written"), "{error}");
+    }
+
+    #[test]
+    fn what_is_no_saved_person_is_refused_in_words() {
+        let (_, memory) = memory();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("person.safetensors");
+        memory.save(&path).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        for cut in [0, 4, 8, 100, whole.len() / 2, whole.len() - 1] {
+            let error = PersonMemory::decode("p", &whole[..cut]).unwrap_err().to_string();
+            assert!(error.starts_with("saved person p: "), "{error}");
+        }
+        let mut poisoned = memory.clone();
+        poisoned.memory[3][1] = f32::NAN;
+        poisoned.save(&path).unwrap();
+        let error = PersonMemory::load(&path).unwrap_err().to_string();
+        assert!(error.contains("memory holds a number that is not finite"), "{error}");
+        let other = safetensors::serialize(Vec::<(&str, TensorView<'_>)>::new(), None).unwrap();
+        assert!(PersonMemory::decode("p", &other).unwrap_err().to_string().contains("is no saved person"));
+        assert!(PersonMemory::load(&folder.path().join("none")).unwrap_err().to_string().contains("cannot be read"));
+    }
+
+    #[test]
+    fn a_person_of_another_body_is_refused() {
+        let (_, memory) = memory();
+        let mut base = default_template(&ShapeParams::default()).unwrap();
+        base.positions.pop();
+        assert!(memory.template(&base).unwrap_err().to_string().contains("vertices"));
+    }
+}

@@ -1,0 +1,84 @@
+//! Who is in front of the cameras: from a frame set to observations of people.
+
+mod estimated;
+mod given;
+mod split_mask;
+
+use std::borrow::Cow;
+
+use flyrig_body::Template;
+use flyrig_tracker::ViewKeypoints;
+use flyrig_types::{FrameSet, Mask, PersonId, Pose};
+
+pub use self::estimated::{EstimatedPerception, SHAPE_SETS};
+pub use self::given::{GivenPerception, GivenPerson};
+use crate::{FusionError, StageTimes};
+
+/// Finds people in frame sets. Sets come in the order of their times.
+pub trait Perception: Send {
+    /// The people known so far, each with a template of their shape in its bind pose. People may be added while the session
+    /// runs; the template of a known person does not change.
+    fn people(&self) -> Vec<(PersonId, &Template)>;
+
+    /// Observes every known person in one set: one element a person, in the order of [`Self::people`].
+    ///
+    /// # Errors
+    /// Only those that a later set cannot mend; a person who is not found is [`Observation::Lost`].
+    fn observe<'a>(&mut self, set: &'a FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation<'a>>, FusionError>;
+
+    /// Returns a person's pose at a time near the last set's, where it is known exactly. `None` lets the session interpolate
+    /// the observed poses.
+    fn pose_at(&self, person: PersonId, nanos: i64) -> Option<Pose> {
+        let _ = (person, nanos);
+        None
+    }
+}
+
+/// What a set says about one person.
+#[derive(Debug, Clone)]
+pub enum Observation<'a> {
+    /// The person was found.
+    Seen(SeenPerson<'a>),
+    /// The person was not found.
+    Lost {
+        /// Who.
+        person: PersonId,
+        /// Why, for the log.
+        reason: String,
+    },
+}
+
+/// A person found in a set.
+#[derive(Debug, Clone)]
+pub struct SeenPerson<'a> {
+    /// Who.
+    pub person: PersonId,
+    /// Pose at the set's time, for the person's template.
+    pub pose: Pose,
+    /// Confidence in the pose, 0..=1; 1 for a given one.
+    pub confidence: f64,
+    /// One element a present frame, in their order.
+    pub views: Vec<ViewObservation<'a>>,
+}
+
+/// A person in one image.
+#[derive(Debug, Clone, Default)]
+pub struct ViewObservation<'a> {
+    /// Coverage by the person; `None` when it is not known.
+    pub mask: Option<Cow<'a, Mask>>,
+    /// Confidence in the mask, 0..=1; 1 for a given one.
+    pub mask_confidence: f64,
+    /// Coverage by other people, whose pixels say nothing about this person. `None` without others.
+    pub others: Option<Mask>,
+    /// Landmarks with their own confidences; `None` for given poses.
+    pub landmarks: Option<ViewKeypoints>,
+}
+
+impl<'a> ViewObservation<'a> {
+    /// Returns an observation of a mask alone; its confidence is 0 without one.
+    #[must_use]
+    pub fn of_mask(mask: Option<Cow<'a, Mask>>, confidence: f64) -> Self {
+        let mask_confidence = if mask.is_some() { confidence } else { 0.0 };
+        Self { mask, mask_confidence, others: None, landmarks: None }
+    }
+}

@@ -1,0 +1,160 @@
+//! Divides a mask of everybody among people whose posed bodies are known.
+
+use std::collections::VecDeque;
+
+use flyrig_types::{Camera, Mask};
+use glam::{DVec2, Vec3};
+
+/// A body where it stands, world metres.
+pub(super) struct PosedMesh<'a> {
+    pub vertices: Vec<Vec3>,
+    pub triangles: &'a [[u32; 3]],
+}
+
+/// No body is at this pixel.
+const NOBODY: u32 = u32::MAX;
+/// Corners nearer to the camera's plane are not drawn, metres.
+const NEAR_M: f64 = 0.05;
+
+/// Returns, for each body, its own part of the mask and the part of all others. A pixel belongs to the nearest body drawn
+/// there, else (clothes, hair) to the body of the closest pixel that has one.
+pub(super) fn split_mask(camera: &Camera, mask: &Mask, bodies: &[PosedMesh<'_>]) -> Vec<(Mask, Mask)> {
+    let (width, height) = (mask.width() as usize, mask.height() as usize);
+    let mut labels = vec![NOBODY; width * height];
+    let mut depths = vec![f64::INFINITY; width * height];
+    for (label, body) in (0u32..).zip(bodies) {
+        let corners: Vec<Option<(DVec2, f64)>> = body
+            .vertices
+            .iter()
+            .map(|vertex| {
+                let point = vertex.as_dvec3();
+                let depth = camera.camera_from_world.transform_point(point).z;
+                let pixel = camera.project(point).filter(|pixel| pixel.is_finite())?;
+                (depth > NEAR_M).then_some((pixel, depth))
+            })
+            .collect();
+        for triangle in body.triangles {
+            let corner = |k: usize| corners.get(triangle[k] as usize).copied().flatten();
+            if let (Some(a), Some(b), Some(c)) = (corner(0), corner(1), corner(2)) {
+                let depth = (a.1 + b.1 + c.1) / 3.0;
+                draw([a.0, b.0, c.0], [width, height], |at| {
+                    if depth < depths[at] {
+                        (depths[at], labels[at]) = (depth, label);
+                    }
+                });
+            }
+        }
+    }
+    spread(&mut labels, width, height);
+    let part = |keep: &dyn Fn(u32) -> bool| {
+        let coverage = mask.coverage().iter().zip(&labels).map(|(&c, &label)| if keep(label) { c } else { 0 });
+        let coverage: Vec<u8> = coverage.collect();
+        // Of the mask's own size, so it is never refused.
+        Mask::new(mask.width(), mask.height(), coverage).unwrap_or_else(|_| mask.clone())
+    };
+    (0..bodies.len() as u32)
+        .map(|own| (part(&|label| label == own), part(&|label| label != own && label != NOBODY)))
+        .collect()
+}
+
+/// Visits the pixels whose centres lie in a triangle.
+fn draw([a, b, c]: [DVec2; 3], [width, height]: [usize; 2], mut visit: impl FnMut(usize)) {
+    let (low, high) = (a.min(b).min(c), a.max(b).max(c));
+    let first = |value: f64, side: usize| value.ceil().clamp(0.0, side as f64) as usize;
+    let end = |value: f64, side: usize| (value.floor() + 1.0).clamp(0.0, side as f64) as usize;
+    let edge = |p: DVec2, q: DVec2, at: DVec2| (q - p).perp_dot(at - p);
+    for y in first(low.y, height)..end(high.y, height) {
+        for x in first(low.x, width)..end(high.x, width) {
+            let at = DVec2::new(x as f64, y as f64);
+            let sides = [edge(a, b, at), edge(b, c, at), edge(c, a, at)];
+            if sides.iter().all(|s| *s >= 0.0) || sides.iter().all(|s| *s <= 0.0) {
+                visit(y * width + x);
+            }
+        }
+    }
+}
+
+/// Gives every pixel the label of the closest labelled one (by steps between neighbours).
+fn spread(labels: &mut [u32], width: usize, height: usize) {
+    let mut queue: VecDeque<usize> = (0..labels.len()).filter(|&at| labels[at] != NOBODY).collect();
+    while let Some(at) = queue.pop_front() {
+        let (x, y, label) = (at % width, at / width, labels[at]);
+        let neighbours = [
+            (x > 0).then(|| at - 1),
+            (x + 1 < width).then(|| at + 1),
+            (y > 0).then(|| at - width),
+            (y + 1 < height).then(|| at + width),
+        ];
+        for next in neighbours.into_iter().flatten() {
+            if labels[next] == NOBODY {
+                labels[next] = label;
+                queue.push_back(next);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_types::{Intrinsics, Isometry, Lens};
+    use glam::DVec3;
+
+    use super::*;
+
+    fn camera() -> Camera {
+        Camera {
+            id: "a".into(),
+            intrinsics: Intrinsics {
+                width: 40,
+                height: 20,
+                focal_px: DVec2::splat(20.0),
+                center_px: DVec2::new(19.5, 9.5),
+                lens: Lens::PINHOLE,
+            },
+            camera_from_world: Isometry::look_at(DVec3::new(0.0, -2.0, 0.0), DVec3::ZERO, DVec3::Z),
+        }
+    }
+
+    /// A square that faces the camera, `x` to its right, `y` behind the origin.
+    fn square(x: f32, y: f32, half: f32) -> PosedMesh<'static> {
+        let corner = |sx: f32, sz: f32| Vec3::new(x + sx * half, y, sz * half);
+        let vertices = vec![corner(-1.0, -1.0), corner(1.0, -1.0), corner(1.0, 1.0), corner(-1.0, 1.0)];
+        PosedMesh { vertices, triangles: &[[0, 1, 2], [0, 2, 3]] }
+    }
+
+    fn count(mask: &Mask, columns: std::ops::Range<usize>) -> usize {
+        let width = mask.width() as usize;
+        mask.coverage().iter().enumerate().filter(|(i, c)| **c > 0 && columns.contains(&(i % width))).count()
+    }
+
+    #[test]
+    fn each_pixel_goes_to_the_nearest_body_and_all_pixels_go_to_somebody() {
+        let mask = Mask::new(40, 20, vec![200; 800]).unwrap();
+        let parts = split_mask(&camera(), &mask, &[square(-0.5, 0.0, 0.3), square(0.5, 0.0, 0.3)]);
+        let [(left, of_right), (right, of_left)] = parts.as_slice() else { panic!("two bodies") };
+        assert_eq!((count(left, 0..20), count(left, 20..40)), (400, 0));
+        assert_eq!((count(right, 0..20), count(right, 20..40)), (0, 400));
+        assert_eq!((of_right, of_left), (right, left), "the others' part is the other's own");
+        assert!(left.coverage().iter().all(|c| [0, 200].contains(c)), "coverage is kept");
+    }
+
+    #[test]
+    fn a_body_in_front_hides_the_one_behind() {
+        let mask = Mask::new(40, 20, vec![255; 800]).unwrap();
+        let parts = split_mask(&camera(), &mask, &[square(0.0, 0.5, 0.9), square(0.0, -0.5, 0.2)]);
+        let centre = 10 * 40 + 20;
+        assert_eq!((parts[0].0.coverage()[centre], parts[1].0.coverage()[centre]), (0, 255));
+        assert_eq!(parts[0].1.coverage()[centre], 255, "the front body's pixels say nothing about the other");
+    }
+
+    #[test]
+    fn bodies_that_cannot_be_drawn_own_nothing() {
+        let mask = Mask::new(40, 20, vec![255; 800]).unwrap();
+        let behind = square(0.0, -5.0, 0.3);
+        let broken = PosedMesh { vertices: vec![Vec3::NAN; 4], triangles: &[[0, 1, 2], [7, 8, 9]] };
+        let parts = split_mask(&camera(), &mask, &[behind, broken, square(0.0, 0.0, 0.3)]);
+        assert_eq!(parts.iter().map(|part| part.0.area_px()).collect::<Vec<_>>(), [0, 0, 800]);
+        let nobody = split_mask(&camera(), &mask, &[square(0.0, -5.0, 0.3)]);
+        assert_eq!((nobody[0].0.area_px(), nobody[0].1.area_px()), (0, 0));
+    }
+}

@@ -1,0 +1,361 @@
+//! A session: frame sets in, people as Gaussians and views out.
+
+use std::collections::BTreeMap;
+
+use flyrig_gpu::GpuContext;
+use flyrig_renderer::{GaussianBuffers, Splat};
+use flyrig_types::{Camera, FrameSet, PersonId, Pose, RenderedView, Rig};
+
+use crate::{
+    FusionError, Observation, Perception, PersonMemory, Remedy, SeenPerson, SessionSettings, StageTimes, Subject,
+    drawing::Drawing,
+    subject::{InputView, Observed},
+};
+
+/// Result of one frame set.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Outcome {
+    /// At least one person was posed and coloured.
+    Updated,
+    /// Nobody was updated, for this reason.
+    Held(String),
+}
+
+/// Counts of the faults that a session went on after, over all people.
+#[derive(Debug, Clone, Default, PartialEq, Eq, serde::Serialize)]
+pub struct Counts {
+    /// Updates of people.
+    pub updated: u64,
+    /// People without a usable pose in a set.
+    pub lost: u64,
+    /// Images without a mask of a person, or with an empty one.
+    pub without_mask: u64,
+    /// Updates whose deformation was dropped because a number was not finite.
+    pub poisoned: u64,
+}
+
+/// Builds a [`Session`].
+pub struct SessionBuilder {
+    gpu: GpuContext,
+    rig: Rig,
+    settings: SessionSettings,
+    perception: Option<Box<dyn Perception>>,
+    saved: BTreeMap<PersonId, PersonMemory>,
+}
+
+impl SessionBuilder {
+    /// Starts from a device and the input cameras, in the order of the frame sets' slots.
+    #[must_use]
+    pub fn new(gpu: GpuContext, rig: Rig) -> Self {
+        Self { gpu, rig, settings: SessionSettings::default(), perception: None, saved: BTreeMap::new() }
+    }
+
+    /// Chooses the settings; the defaults otherwise.
+    #[must_use]
+    pub fn settings(self, settings: SessionSettings) -> Self {
+        Self { settings, ..self }
+    }
+
+    /// Chooses how people are found. Without, nobody ever is.
+    #[must_use]
+    pub fn perception(self, perception: impl Perception + 'static) -> Self {
+        Self { perception: Some(Box::new(perception)), ..self }
+    }
+
+    /// Resumes a person from what an earlier session has learnt.
+    #[must_use]
+    pub fn person(mut self, id: PersonId, memory: PersonMemory) -> Self {
+        self.saved.insert(id, memory);
+        self
+    }
+
+    /// Samples the surfaces of the people known so far and prepares the GPU. Takes a few seconds.
+    ///
+    /// # Errors
+    /// [`FusionError`] names the setting, template or saved person that cannot be used, or what the GPU refuses.
+    pub fn build(self) -> Result<Session, FusionError> {
+        self.settings.validate()?;
+        let mut session = Session {
+            drawing: Drawing::new(&self.gpu, self.settings.body.gaussians)?,
+            gpu: self.gpu,
+            rig: self.rig,
+            settings: self.settings,
+            perception: self.perception.unwrap_or_else(|| Box::new(Nobody)),
+            subjects: Vec::new(),
+            saved: self.saved,
+            keep_observations: false,
+            shape_held: false,
+            stages: StageTimes::default(),
+            counts: Counts::default(),
+        };
+        session.add_people()?;
+        Ok(session)
+    }
+}
+
+/// Finds nobody.
+struct Nobody;
+
+impl Perception for Nobody {
+    fn people(&self) -> Vec<(PersonId, &flyrig_body::Template)> {
+        Vec::new()
+    }
+
+    fn observe<'a>(&mut self, _: &'a FrameSet, _: &mut StageTimes) -> Result<Vec<Observation<'a>>, FusionError> {
+        Ok(Vec::new())
+    }
+}
+
+/// The live reconstruction of any number of people from one rig.
+pub struct Session {
+    gpu: GpuContext,
+    rig: Rig,
+    settings: SessionSettings,
+    perception: Box<dyn Perception>,
+    subjects: Vec<Subject>,
+    drawing: Drawing,
+    /// Of people who are not subjects yet.
+    saved: BTreeMap<PersonId, PersonMemory>,
+    keep_observations: bool,
+    shape_held: bool,
+    /// Run times of every stage so far.
+    pub stages: StageTimes,
+    /// Counts so far.
+    pub counts: Counts,
+}
+
+impl Session {
+    /// The input cameras.
+    #[must_use]
+    pub fn rig(&self) -> &Rig {
+        &self.rig
+    }
+
+    /// The device that everything runs on.
+    #[must_use]
+    pub fn gpu(&self) -> &GpuContext {
+        &self.gpu
+    }
+
+    /// The people, in the order in which they were first known.
+    #[must_use]
+    pub fn subjects(&self) -> &[Subject] {
+        &self.subjects
+    }
+
+    /// One person.
+    #[must_use]
+    pub fn subject(&self, person: PersonId) -> Option<&Subject> {
+        self.subjects.iter().find(|subject| subject.id() == person)
+    }
+
+    /// Whether anybody has been posed yet.
+    #[must_use]
+    pub fn has_people(&self) -> bool {
+        self.subjects.iter().any(|subject| subject.last_pose.is_some())
+    }
+
+    /// Finds people in another way from now on.
+    pub fn set_perception(&mut self, perception: impl Perception + 'static) {
+        self.perception = Box::new(perception);
+    }
+
+    /// Keeps the observations of each view from the next set on, for [`Self::observed`].
+    ///
+    /// # Errors
+    /// [`FusionError::Gpu`] when the adapter has no room for them.
+    pub fn keep_observations(&mut self) -> Result<(), FusionError> {
+        self.keep_observations = true;
+        self.subjects.iter_mut().try_for_each(|subject| subject.keep_observations(&self.gpu))
+    }
+
+    /// Suspends the deformation: colours go on settling on the surface as it is.
+    pub fn hold_shape(&mut self, hold: bool) {
+        self.shape_held = hold;
+        self.subjects.iter_mut().for_each(|subject| subject.shape_held = hold);
+    }
+
+    /// Explains every image with the pose of its own capture time, or of its set's.
+    pub fn set_per_view_time(&mut self, per_view_time: bool) {
+        self.settings.tracking.per_view_time = per_view_time;
+    }
+
+    /// Takes in one frame set. A person who is not found keeps the last state.
+    ///
+    /// # Errors
+    /// Only those that a later set cannot mend. After one that [is a device fault](FusionError::is_device_fault), call
+    /// [`Self::rebuild`].
+    pub fn process(&mut self, set: &FrameSet) -> Result<Outcome, FusionError> {
+        let observations = self.perception.observe(set, &mut self.stages)?;
+        self.add_people()?;
+        let mut outcome = Outcome::Held("nobody is known".to_owned());
+        for observation in observations {
+            match observation {
+                Observation::Lost { person, reason } => {
+                    self.counts.lost += 1;
+                    if let Some(subject) = self.subjects.iter_mut().find(|subject| subject.id() == person) {
+                        subject.watch.away(set.master_nanos);
+                    }
+                    if outcome != Outcome::Updated {
+                        outcome = Outcome::Held(reason);
+                    }
+                }
+                Observation::Seen(seen) => {
+                    self.update(set, &seen)?;
+                    outcome = Outcome::Updated;
+                }
+            }
+        }
+        Ok(outcome)
+    }
+
+    /// Makes a subject of everybody whom perception knows and who is none yet.
+    fn add_people(&mut self) -> Result<(), FusionError> {
+        for (id, template) in self.perception.people() {
+            if self.subjects.iter().any(|subject| subject.id() == id) {
+                continue;
+            }
+            let mut subject = Subject::new(&self.gpu, id, template.clone(), &self.rig, &self.settings)?;
+            if self.keep_observations {
+                subject.keep_observations(&self.gpu)?;
+            }
+            subject.shape_held = self.shape_held;
+            if let Some(memory) = self.saved.remove(&id) {
+                subject.restore(&self.gpu, &memory)?;
+            }
+            self.subjects.push(subject);
+        }
+        Ok(())
+    }
+
+    /// Takes in one person of a set.
+    fn update(&mut self, set: &FrameSet, seen: &SeenPerson<'_>) -> Result<(), FusionError> {
+        let Some(subject) = self.subjects.iter_mut().find(|subject| subject.id() == seen.person) else {
+            return Err(FusionError::NoSuchPerson(seen.person));
+        };
+        let pose = &seen.pose;
+        subject.curve.push(set.master_nanos, pose);
+        let pose_at = |nanos: i64| {
+            if !self.settings.tracking.per_view_time || nanos == set.master_nanos {
+                return None;
+            }
+            let exact = self.perception.pose_at(seen.person, nanos);
+            exact.or_else(|| subject.curve.at(nanos)).filter(Pose::is_valid)
+        };
+        let poses: Vec<Option<Pose>> = set.present().map(|(_, frame)| pose_at(frame.capture_nanos)).collect();
+        let (mut slots, mut views) = (Vec::new(), Vec::new());
+        for (((slot, frame), view), pose) in set.present().zip(&seen.views).zip(&poses) {
+            let mask = view.mask.as_deref().filter(|mask| mask.area_px() > 0);
+            if let Some((mask, camera)) = mask.zip(self.rig.cameras.get(slot)) {
+                slots.push(slot);
+                let others = view.others.as_ref();
+                views.push(InputView { camera, image: &frame.image, mask, others, pose: pose.as_ref() });
+                continue;
+            }
+            self.counts.without_mask += 1;
+            // The 1st, 2nd, 4th ...: a camera that sees nobody all night must not fill the disk.
+            if self.counts.without_mask.is_power_of_two() {
+                let (camera, count) = (&frame.camera, self.counts.without_mask);
+                tracing::warn!(set = set.index, %camera, count, "no person in the mask; going on without this view");
+            }
+        }
+        if views.is_empty() {
+            subject.watch.away(set.master_nanos);
+        } else {
+            match subject.watch.arrive(set.master_nanos, pose) {
+                Remedy::Forget => subject.forget(),
+                Remedy::Restart => subject.restart(),
+                Remedy::None => {}
+            }
+        }
+        subject.viewed = slots;
+        subject.confidence = seen.confidence;
+        self.drawing.people_changed();
+        subject.update(&self.gpu, &mut self.drawing.rasterizer, pose, &views, &mut self.stages)?;
+        if !views.is_empty() {
+            let ids = views.iter().map(|view| view.camera.id.clone());
+            let judged = ids.zip(subject.agreement()).filter_map(|(id, quality)| Some((id, quality?)));
+            subject.watch.judge(judged);
+        }
+        self.counts.poisoned += u64::from(subject.deform_report().is_some_and(|report| report.poisoned));
+        subject.last_pose = Some(seen.pose.clone());
+        self.counts.updated += 1;
+        Ok(())
+    }
+
+    /// Draws everybody as `camera` would see them now.
+    ///
+    /// # Errors
+    /// [`FusionError::Gpu`]; a view that is too large for the adapter leaves the session as it was.
+    pub fn render(&mut self, camera: &Camera) -> Result<RenderedView, FusionError> {
+        let posed = |subject: &&Subject| subject.last_pose.is_some();
+        let mut people: Vec<&GaussianBuffers> = self.subjects.iter().filter(posed).map(Subject::gaussians).collect();
+        if people.is_empty() {
+            // Before the first pose: as the surfaces were made.
+            people = self.subjects.iter().map(Subject::gaussians).collect();
+        }
+        if people.is_empty() {
+            let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+            return Ok(RenderedView { width, height, rgba: vec![0; 4 * width as usize * height as usize] });
+        }
+        self.drawing.render(&self.gpu, &people, camera, &mut self.stages)
+    }
+
+    /// Reads a person's Gaussians back, as they were drawn last.
+    ///
+    /// # Errors
+    /// [`FusionError::NoSuchPerson`], [`FusionError::Gpu`].
+    pub fn splats(&self, person: PersonId) -> Result<Vec<Splat>, FusionError> {
+        self.known(person)?.splats(&self.gpu)
+    }
+
+    /// Reads back what a person's last update observed. Needs [`Self::keep_observations`].
+    ///
+    /// # Errors
+    /// [`FusionError::NoSuchPerson`], [`FusionError::Gpu`].
+    pub fn observed(&self, person: PersonId) -> Result<Observed, FusionError> {
+        self.known(person)?.observed(&self.gpu)
+    }
+
+    /// Cameras whose images a person's last update took in, in the order of [`Subject::input`].
+    #[must_use]
+    pub fn viewed(&self, person: PersonId) -> Vec<Camera> {
+        let slots = self.subject(person).map_or(&[][..], |subject| &subject.viewed);
+        slots.iter().filter_map(|&slot| self.rig.cameras.get(slot).cloned()).collect()
+    }
+
+    /// Reads back what was learnt about a person, to resume from it in another session.
+    ///
+    /// # Errors
+    /// [`FusionError::NoSuchPerson`], [`FusionError::Gpu`].
+    pub fn memory(&self, person: PersonId) -> Result<PersonMemory, FusionError> {
+        self.known(person)?.memory(&self.gpu)
+    }
+
+    /// Builds everything anew on another device and resumes the people from `memories`; those without one start afresh.
+    /// Poses, quality, counts and run times are kept. After an error the session is as it was.
+    ///
+    /// # Errors
+    /// [`FusionError`] when the new device fails as well.
+    pub fn rebuild(&mut self, gpu: GpuContext, memories: &BTreeMap<PersonId, PersonMemory>) -> Result<(), FusionError> {
+        let drawing = Drawing::new(&gpu, self.settings.body.gaussians)?;
+        let mut subjects = Vec::new();
+        for old in &self.subjects {
+            let mut subject = Subject::new(&gpu, old.id(), old.template().clone(), &self.rig, &self.settings)?;
+            if self.keep_observations {
+                subject.keep_observations(&gpu)?;
+            }
+            if let Some(memory) = memories.get(&old.id()) {
+                subject.restore(&gpu, memory)?;
+            }
+            subject.take_over(old);
+            subjects.push(subject);
+        }
+        (self.gpu, self.drawing, self.subjects) = (gpu, drawing, subjects);
+        Ok(())
+    }
+
+    fn known(&self, person: PersonId) -> Result<&Subject, FusionError> {
+        self.subject(person).ok_or(FusionError::NoSuchPerson(person))
+    }
+}

@@ -1,0 +1,42 @@
+//! Settings of a session. Each struct is a table of a configuration (serde) and a group of command-line options (clap).
+
+mod appearance;
+mod body;
+mod tracking;
+
+pub use appearance::{AppearanceMode, AppearanceOptions, NetworksOn};
+pub use body::{BodySettings, Origin};
+pub use tracking::{Solver, TrackingSettings};
+
+use crate::FusionError;
+
+/// Everything that may be chosen about a session.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SessionSettings {
+    /// The person's surface, and where poses and masks come from.
+    pub body: BodySettings,
+    /// How the surface follows the images.
+    pub tracking: TrackingSettings,
+    /// How Gaussians get their colours.
+    pub appearance: AppearanceOptions,
+}
+
+impl SessionSettings {
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`FusionError::Setting`] names the key and the range.
+    pub fn validate(&self) -> Result<(), FusionError> {
+        self.body.validate()?;
+        self.tracking.validate()?;
+        self.appearance.validate()
+    }
+}
+
+/// Checks that a value lies in a range.
+pub(crate) fn check(key: &str, value: f64, low: f64, high: f64) -> Result<(), FusionError> {
+    if (low..=high).contains(&value) {
+        return Ok(());
+    }
+    Err(FusionError::Setting(format!("{key} is {value}, it must lie between {low} and {high}")))
+}

@@ -1,0 +1,128 @@
+//! The table `[appearance]`.
+
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use flyrig_renderer::AppearanceSettings;
+use flyrig_stfa::{EMBEDDED, Parameters};
+use serde::{Deserialize, Serialize};
+
+use super::check;
+use crate::FusionError;
+
+/// How Gaussians get their colours.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum AppearanceMode {
+    /// Projection, spatial diffusion and temporal memory.
+    #[default]
+    Direct,
+    /// Without the temporal memory.
+    DirectNoTime,
+    /// Projection only, as the paper's "w/o ST" baseline.
+    DirectNoSpaceTime,
+    /// `direct`, and the corrections of trained networks.
+    Stfa,
+    /// The same without the temporal memory.
+    StfaNoTime,
+    /// The same without graph and memory.
+    StfaNoSpaceTime,
+}
+
+impl AppearanceMode {
+    /// Returns the renderer's settings.
+    #[must_use]
+    pub fn settings(self) -> AppearanceSettings {
+        let (space, time) = match self {
+            Self::Direct | Self::Stfa => (true, true),
+            Self::DirectNoTime | Self::StfaNoTime => (true, false),
+            Self::DirectNoSpaceTime | Self::StfaNoSpaceTime => (false, false),
+        };
+        AppearanceSettings { space, time, ..AppearanceSettings::default() }
+    }
+
+    /// Whether networks correct direct appearance.
+    #[must_use]
+    pub fn is_learned(self) -> bool {
+        matches!(self, Self::Stfa | Self::StfaNoTime | Self::StfaNoSpaceTime)
+    }
+}
+
+/// Device of the networks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum NetworksOn {
+    /// All cores of the processor.
+    #[default]
+    Processor,
+    /// The graphics adapter that draws; needs the feature `gpu-networks`.
+    Adapter,
+}
+
+/// Which appearance, and with which networks.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, Args)]
+#[serde(deny_unknown_fields, default)]
+pub struct AppearanceOptions {
+    /// How Gaussians get their colours.
+    #[arg(long = "appearance", value_enum, default_value = "direct")]
+    pub mode: AppearanceMode,
+    /// Weights file of the learned modes; "small" or "tiny" for the networks that come with flyrig [default: small].
+    #[arg(long)]
+    #[serde(with = "path_or_empty")]
+    pub weights: Option<PathBuf>,
+    /// What the networks keep from frame to frame, 0 to 1: features of images that did not change at all, and the corrections of
+    /// Gaussians none of whose inputs changed by more than this. 0 computes everything anew.
+    #[arg(long, default_value_t = 0.0)]
+    pub reuse: f32,
+    /// Where the networks run; "adapter" needs a flyrig that was built with the feature gpu-networks.
+    #[arg(long, value_enum, default_value = "processor")]
+    pub networks_on: NetworksOn,
+}
+
+impl AppearanceOptions {
+    /// Returns the defaults with another mode.
+    #[must_use]
+    pub fn of_mode(mode: AppearanceMode) -> Self {
+        Self { mode, ..Self::default() }
+    }
+
+    /// Loads the networks that correct direct appearance; `None` for the direct modes.
+    ///
+    /// # Errors
+    /// [`FusionError::Networks`] when the weights cannot be read.
+    pub fn load_networks(&self) -> Result<Option<Parameters>, FusionError> {
+        if !self.mode.is_learned() {
+            return Ok(None);
+        }
+        Ok(Some(Parameters::named(self.weights.as_deref().unwrap_or(Path::new(EMBEDDED[0].0)))?))
+    }
+
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`FusionError::Setting`] names the key and the range.
+    pub fn validate(&self) -> Result<(), FusionError> {
+        check("appearance.reuse", f64::from(self.reuse), 0.0, 1.0)?;
+        if self.reuse != 0.0 && self.networks_on == NetworksOn::Adapter {
+            let text = "networks on the adapter keep nothing from frame to frame: set appearance.reuse to 0, or \
+                        appearance.networks_on to \"processor\"";
+            return Err(FusionError::Setting(text.to_owned()));
+        }
+        Ok(())
+    }
+}
+
+/// A path, empty for `None`.
+mod path_or_empty {
+    use std::path::PathBuf;
+
+    use serde::{Deserialize as _, Deserializer, Serialize as _, Serializer};
+
+    pub fn serialize<S: Serializer>(path: &Option<PathBuf>, to: S) -> Result<S::Ok, S::Error> {
+        path.clone().unwrap_or_default().serialize(to)
+    }
+
+    pub fn deserialize<'de, D: Deserializer<'de>>(from: D) -> Result<Option<PathBuf>, D::Error> {
+        Ok(Some(PathBuf::deserialize(from)?).filter(|path| !path.as_os_str().is_empty()))
+    }
+}

@@ -1,0 +1,81 @@
+//! The table `[body]`.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+use flyrig_body::{DEFAULT_GAUSSIAN_COUNT, DEFAULT_NODE_COUNT};
+use serde::{Deserialize, Serialize};
+
+use super::check;
+use crate::FusionError;
+
+/// Fewest Gaussians for each node of a small deformation graph.
+const GAUSSIANS_A_NODE: usize = 12;
+
+/// Source of a pose or a mask.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Origin {
+    /// From the source or the data set.
+    #[default]
+    Given,
+    /// From the images.
+    Estimated,
+}
+
+/// The person's surface, and where poses and masks come from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Args)]
+#[serde(deny_unknown_fields, default)]
+pub struct BodySettings {
+    /// A skinned glTF file; empty: the built-in body.
+    #[arg(skip)]
+    pub template: PathBuf,
+    /// Pose from the data set's glTF animation, or from the images.
+    #[arg(long, value_enum, default_value = "given")]
+    pub pose: Origin,
+    /// Masks from the data set, or from the images.
+    #[arg(long, value_enum, default_value = "given")]
+    pub masks: Origin,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT)]
+    pub gaussians: usize,
+    /// Nodes of the deformation graph.
+    #[arg(long, default_value_t = DEFAULT_NODE_COUNT)]
+    pub nodes: usize,
+}
+
+impl Default for BodySettings {
+    fn default() -> Self {
+        Self {
+            template: PathBuf::new(),
+            pose: Origin::Given,
+            masks: Origin::Given,
+            gaussians: DEFAULT_GAUSSIAN_COUNT,
+            nodes: DEFAULT_NODE_COUNT,
+        }
+    }
+}
+
+impl BodySettings {
+    /// Returns the defaults with another number of Gaussians, and a graph that is not too fine for them.
+    #[must_use]
+    pub fn with_gaussians(gaussians: usize) -> Self {
+        Self { gaussians, nodes: DEFAULT_NODE_COUNT.min(gaussians / GAUSSIANS_A_NODE), ..Self::default() }
+    }
+
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`FusionError::Setting`] names the key and the range.
+    pub fn validate(&self) -> Result<(), FusionError> {
+        check("body.gaussians", self.gaussians as f64, 100.0, 2_000_000.0)?;
+        check("body.nodes", self.nodes as f64, 4.0, 100_000.0)?;
+        if self.nodes > self.gaussians {
+            return Err(FusionError::Setting(format!(
+                "body.nodes is {}, more than body.gaussians ({}): nodes are chosen among the Gaussians",
+                self.nodes, self.gaussians
+            )));
+        }
+        Ok(())
+    }
+}

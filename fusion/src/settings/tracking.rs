@@ -1,0 +1,150 @@
+//! The table `[tracking]`.
+
+use clap::{Args, ValueEnum};
+use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
+use serde::{Deserialize, Serialize};
+
+use super::{Origin, check};
+use crate::{FusionError, deformation::DeformOptions};
+
+/// Weight of the nodes' distance from where clothes of their part's thickness would be: it holds what no view constrains, the
+/// depth before a single camera or a shift of all nodes that a corrected pose explains as well.
+const ANCHOR: f64 = 100.0;
+/// λ_reg of the paper's Eq. 3.
+const PAPER_REGULARIZATION: f64 = 200.0;
+/// Rate of the paper's gradient descent, square metres a unit of loss. The paper does not state its own; of 1e-8 to 1e-5
+/// this one lowered the loss most on a simulated person at 512x512.
+const PAPER_RATE: f64 = 3e-6;
+
+/// How the body is deformed beyond its pose.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum Solver {
+    /// Skinned only.
+    #[value(name = "off", alias = "none")]
+    #[serde(rename = "off", alias = "none")]
+    None,
+    /// Gradient descent as in the paper.
+    Paper,
+    /// Damped Gauss-Newton with the graph Laplacian.
+    #[default]
+    #[value(name = "default", alias = "gauss-newton")]
+    #[serde(rename = "default", alias = "gauss-newton")]
+    GaussNewton,
+}
+
+impl Solver {
+    /// Returns the options of the deformation, `None` when the body is only skinned. An estimated pose is corrected as well.
+    #[must_use]
+    pub fn options(self, pose: Origin) -> Option<DeformOptions> {
+        let default = DeformSettings::default();
+        match self {
+            Self::None => None,
+            Self::Paper => Some(DeformOptions::full(DeformSettings {
+                solver: DeformSolver::Paper { rate: PAPER_RATE },
+                regularization: PAPER_REGULARIZATION,
+                // The paper iterates on every frame.
+                rest: 0.0,
+                ..default
+            })),
+            Self::GaussNewton => Some(DeformOptions {
+                pose: (pose == Origin::Estimated).then(PoseFreedom::default),
+                ..DeformOptions::coarse(DeformSettings { anchor: ANCHOR, ..default })
+            }),
+        }
+    }
+}
+
+/// How the surface follows the images.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Args)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrackingSettings {
+    /// How the body follows the images beyond its pose; "off" is faster.
+    #[arg(long, value_enum, default_value = "default")]
+    pub solver: Solver,
+    /// Gaussians that the default solver compares with the images; the others follow.
+    #[arg(skip = Self::default().gaussians)]
+    pub gaussians: usize,
+    /// Compare no finer than the images resolve.
+    #[arg(skip = Self::default().level_of_detail)]
+    pub level_of_detail: bool,
+    /// Views that are compared at most; 0: all.
+    #[arg(skip = Self::default().views)]
+    pub views: usize,
+    /// Relative growth of the loss up to which a frame gets no iteration, once the solver has converged.
+    #[arg(skip = Self::default().rest)]
+    pub rest: f64,
+    /// Explain every image with the pose of its own capture time.
+    #[arg(skip = Self::default().per_view_time)]
+    pub per_view_time: bool,
+    /// Options of the deformation in place of those that the settings above imply, for measurements.
+    #[arg(skip)]
+    #[serde(skip)]
+    pub replaced: Option<DeformOptions>,
+}
+
+impl Default for TrackingSettings {
+    fn default() -> Self {
+        Self {
+            solver: Solver::GaussNewton,
+            gaussians: 30_000,
+            level_of_detail: true,
+            views: 0,
+            rest: 0.01,
+            per_view_time: true,
+            replaced: None,
+        }
+    }
+}
+
+impl TrackingSettings {
+    /// Returns the options of the deformation, `None` when the body is only skinned.
+    #[must_use]
+    pub fn options(&self, pose: Origin) -> Option<DeformOptions> {
+        let mut options = self.solver.options(pose)?;
+        if let Some(replaced) = self.replaced {
+            return Some(replaced);
+        }
+        if self.solver == Solver::GaussNewton {
+            options.gaussians = self.gaussians;
+            options.views = self.views;
+            if !self.level_of_detail {
+                options = options.without_level_of_detail();
+            }
+            options.solver.rest = self.rest;
+        }
+        Some(options)
+    }
+
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`FusionError::Setting`] names the key and the range.
+    pub fn validate(&self) -> Result<(), FusionError> {
+        check("tracking.gaussians", self.gaussians as f64, 100.0, 2_000_000.0)?;
+        check("tracking.views", self.views as f64, 0.0, 1000.0)?;
+        check("tracking.rest", self.rest, 0.0, 0.5)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::deformation::PAPER_COLOR_WEIGHT;
+
+    #[test]
+    fn the_papers_solver_has_the_papers_weights() {
+        let options = Solver::Paper.options(Origin::Given).unwrap();
+        assert!((options.color_weight - PAPER_COLOR_WEIGHT).abs() < 1e-6);
+        assert!((options.solver.regularization - 200.0).abs() < 1e-9);
+        assert!(options.solver.rest <= 0.0, "every frame has its iterations");
+        assert_eq!((options.gaussians, options.max_level), (usize::MAX, 0));
+    }
+
+    #[test]
+    fn the_default_settings_change_nothing_about_the_default_solver() {
+        for pose in [Origin::Given, Origin::Estimated] {
+            assert_eq!(TrackingSettings::default().options(pose), Solver::GaussNewton.options(pose));
+        }
+    }
+}

@@ -1,0 +1,592 @@
+//! One person: the template, its Gaussians on the GPU, deformation, colours, and how well the person is tracked.
+
+use std::time::Instant;
+
+use flyrig_body::{
+    DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, SurfaceGaussians, Template, build_graph, sample_surface, skin_mesh,
+};
+use flyrig_capture::to_rgb8;
+use flyrig_gpu::{GpuContext, StorageBuffer};
+use flyrig_renderer::{
+    AppearanceSettings, DirectAppearance, GaussianBuffers, Observations, Outputs, RasterSettings, Rasterizer,
+    RenderTarget, Splat, UNKNOWN_RGBA, ViewInput, read_splats,
+};
+use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, SharedAppearance, ViewPicture};
+use flyrig_tracker::DeformReport;
+use flyrig_types::{Camera, Image, Mask, PersonId, Pose, Rig};
+
+use crate::{
+    FusionError, NetworksOn, PersonMemory, SessionSettings, StageTimes, TrackWatch,
+    deformation::{DeformTimes, Deformation, Instants, TrackedView},
+    pose_curve::PoseCurve,
+    stage_times::processor_time,
+    viewpoints::center_of_attention,
+};
+
+/// Seed of the surface sampling: the same template gives the same Gaussians on every run.
+const SURFACE_SEED: u64 = 1;
+/// Stage of the processor time that the deformation took, over all threads of the process.
+pub const PROCESSOR_STAGE: &str = "  processor";
+/// Coverage by other people from which a pixel says nothing about this person.
+const OTHERS_COVER: u8 = 128;
+
+/// One image of a set with one person's mask.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct InputView<'a> {
+    pub camera: &'a Camera,
+    pub image: &'a Image,
+    pub mask: &'a Mask,
+    /// Coverage by other people.
+    pub others: Option<&'a Mask>,
+    /// Pose at the image's own time, where that is not the set's.
+    pub pose: Option<&'a Pose>,
+}
+
+/// An image as the kernels read it.
+#[derive(Debug)]
+struct InputImage {
+    size: [u32; 2],
+    /// sRGB with the person's coverage, row by row.
+    rgba: Vec<u8>,
+    /// The same on the GPU, a pixel an element.
+    words: StorageBuffer<u32>,
+}
+
+/// The inputs and results of a person's last update, read back: the raw material of training samples.
+#[derive(Debug)]
+pub struct Observed {
+    /// Of direct appearance, by observing view.
+    pub observations: Observations,
+    /// The observing views: width, height, and pixels with the mask as alpha.
+    pub pictures: Vec<(u32, u32, Vec<u8>)>,
+    /// World centre, metres; w: scale.
+    pub center_scale: Vec<[f32; 4]>,
+    /// World normal; w unused.
+    pub normal: Vec<[f32; 4]>,
+}
+
+/// The networks, by device.
+#[derive(Debug)]
+enum Networks {
+    Processor(Box<LearnedAppearance>),
+    Adapter(SharedAppearance),
+}
+
+/// One person as Gaussians on the GPU, with everything that belongs to the person: shape, pose track, deformation, colour
+/// memory and tracking quality.
+#[derive(Debug)]
+pub struct Subject {
+    id: PersonId,
+    template: Template,
+    skinner: GpuSkinner,
+    gaussians: GaussianBuffers,
+    /// The Gaussians as they stood at the second, third ... instant of a set.
+    posed: Vec<GaussianBuffers>,
+    appearance: DirectAppearance,
+    settings: AppearanceSettings,
+    body: BodyGraph,
+    networks: Option<Networks>,
+    /// Views that painted in the last update.
+    painted: Vec<usize>,
+    /// A target an input view; grows with the rig, remade when an image's size changes.
+    visibility: Vec<RenderTarget>,
+    inputs: Vec<InputImage>,
+    deformation: Option<Deformation>,
+    /// Whether the deformation is suspended.
+    pub(crate) shape_held: bool,
+    /// Colours of direct appearance, while the Gaussians show those of the networks.
+    direct_colors: Option<StorageBuffer<[f32; 4]>>,
+    /// Agreement of the deformation with the last update's views.
+    judged: Vec<Option<(f64, bool)>>,
+    /// Times of the last poses that were used, for what lies between and beyond them.
+    pub(crate) curve: PoseCurve,
+    pub(crate) watch: TrackWatch,
+    pub(crate) last_pose: Option<Pose>,
+    /// Confidence in the last pose, 0..=1.
+    pub(crate) confidence: f64,
+    /// Slots of the views that the last update took in.
+    pub(crate) viewed: Vec<usize>,
+}
+
+impl Subject {
+    /// Samples the template's surface and prepares the GPU for the input cameras of `rig`. Takes a few seconds.
+    pub(crate) fn new(
+        gpu: &GpuContext,
+        id: PersonId,
+        template: Template,
+        rig: &Rig,
+        settings: &SessionSettings,
+    ) -> Result<Self, FusionError> {
+        let body = &settings.body;
+        let surface = sample_surface(&template, body.gaussians, SURFACE_SEED)?;
+        let graph = build_graph(&template, &surface, body.nodes, DEFAULT_SIGMA2_M2)?;
+        let mut subject = Self::from_parts(gpu, id, template, &surface, &graph, rig, settings)?;
+        if let Some(networks) = settings.appearance.load_networks()? {
+            subject.use_networks(gpu, &networks, settings)?;
+        }
+        Ok(subject)
+    }
+
+    fn from_parts(
+        gpu: &GpuContext,
+        id: PersonId,
+        template: Template,
+        surface: &SurfaceGaussians,
+        graph: &DeformationGraph,
+        rig: &Rig,
+        settings: &SessionSettings,
+    ) -> Result<Self, FusionError> {
+        let count = surface.positions.len();
+        let gaussians = GaussianBuffers::zeroed(gpu, count)?;
+        let center_scale: Vec<[f32; 4]> =
+            surface.positions.iter().zip(&surface.scale_m).map(|(p, s)| p.extend(*s).to_array()).collect();
+        gaussians.center_scale.write(gpu, &center_scale);
+        let canonical: Vec<[f32; 4]> = surface.positions.iter().map(|p| p.extend(1.0).to_array()).collect();
+        gaussians.canonical.write(gpu, &canonical);
+        gaussians.color.write(gpu, &vec![[0.5, 0.5, 0.5, 1.0]; count]);
+        let deform = settings.tracking.options(settings.body.pose);
+        Ok(Self {
+            id,
+            skinner: match deform {
+                Some(_) => GpuSkinner::new(gpu, &surface.inset(), &template.skeleton)?,
+                None => GpuSkinner::new(gpu, surface, &template.skeleton)?,
+            },
+            shape_held: false,
+            direct_colors: None,
+            deformation: deform
+                .map(|options| Deformation::new(gpu, &template, surface, graph, options, finest_pixel_m(rig)))
+                .transpose()?,
+            appearance: DirectAppearance::new(gpu, surface, graph, rig.cameras.len())?,
+            body: BodyGraph::new(surface, graph)?,
+            networks: None,
+            painted: Vec::new(),
+            template,
+            gaussians,
+            settings: settings.appearance.mode.settings(),
+            posed: Vec::new(),
+            judged: Vec::new(),
+            visibility: Vec::new(),
+            inputs: Vec::new(),
+            curve: PoseCurve::default(),
+            watch: TrackWatch::default(),
+            last_pose: None,
+            confidence: 0.0,
+            viewed: Vec::new(),
+        })
+    }
+
+    /// Which person this is.
+    #[must_use]
+    pub fn id(&self) -> PersonId {
+        self.id
+    }
+
+    /// The template that is posed.
+    #[must_use]
+    pub fn template(&self) -> &Template {
+        &self.template
+    }
+
+    /// How well the person is tracked.
+    #[must_use]
+    pub fn watch(&self) -> &TrackWatch {
+        &self.watch
+    }
+
+    /// Pose of the last update, as it was observed.
+    #[must_use]
+    pub fn pose(&self) -> Option<&Pose> {
+        self.last_pose.as_ref()
+    }
+
+    /// Confidence in the last observed pose, 0..=1.
+    #[must_use]
+    pub fn confidence(&self) -> f64 {
+        self.confidence
+    }
+
+    /// Pose in which the last update drew the person: an estimated one with the solver's correction.
+    #[must_use]
+    pub fn drawn_pose(&self) -> Option<Pose> {
+        self.last_pose.as_ref().map(|pose| self.corrected(pose))
+    }
+
+    /// The Gaussians as they are drawn.
+    pub(crate) fn gaussians(&self) -> &GaussianBuffers {
+        &self.gaussians
+    }
+
+    fn use_networks(
+        &mut self,
+        gpu: &GpuContext,
+        parameters: &Parameters,
+        settings: &SessionSettings,
+    ) -> Result<(), FusionError> {
+        self.appearance.keep_observations(gpu)?;
+        self.networks = Some(match settings.appearance.networks_on {
+            NetworksOn::Processor => {
+                let mut learned = LearnedAppearance::new(parameters, self.body.clone());
+                learned.reuse = settings.appearance.reuse;
+                Networks::Processor(Box::new(learned))
+            }
+            NetworksOn::Adapter => Networks::Adapter(SharedAppearance::new(gpu, parameters, &self.body)?),
+        });
+        let direct = StorageBuffer::zeroed(gpu, "direct colours", self.gaussians.count())?;
+        self.gaussians.color.copy_to(gpu, &direct);
+        self.direct_colors = Some(direct);
+        Ok(())
+    }
+
+    /// Keeps what each view saw from the next update on, for [`Self::observed`].
+    pub(crate) fn keep_observations(&mut self, gpu: &GpuContext) -> Result<(), FusionError> {
+        Ok(self.appearance.keep_observations(gpu)?)
+    }
+
+    /// The deformation graph as the networks see it.
+    #[must_use]
+    pub fn body_graph(&self) -> &BodyGraph {
+        &self.body
+    }
+
+    /// sRGB of an input view of the last update with the person's mask as alpha, in the order of
+    /// [`crate::Session::viewed`].
+    #[must_use]
+    pub fn input(&self, view: usize) -> &[u8] {
+        self.inputs.get(view).map_or(&[], |input| &input.rgba)
+    }
+
+    pub(crate) fn observed(&self, gpu: &GpuContext) -> Result<Observed, FusionError> {
+        let picture = |&i: &usize| {
+            let InputImage { size: [width, height], rgba, .. } = &self.inputs[i];
+            (*width, *height, rgba.clone())
+        };
+        Ok(Observed {
+            observations: self.appearance.observations(gpu, self.painted.len())?,
+            pictures: self.painted.iter().map(picture).collect(),
+            center_scale: self.gaussians.center_scale.read(gpu)?,
+            normal: self.gaussians.normal.read(gpu)?,
+        })
+    }
+
+    /// Takes in one instant: pose, then colours from the views. A view whose mask is empty adds nothing.
+    pub(crate) fn update(
+        &mut self,
+        gpu: &GpuContext,
+        rasterizer: &mut Rasterizer,
+        pose: &Pose,
+        views: &[InputView<'_>],
+        stages: &mut StageTimes,
+    ) -> Result<(), FusionError> {
+        stages.time("convert pictures", || self.take_images(gpu, views))?;
+
+        // The instant itself, and each other one that a picture was taken at.
+        let mut instants = vec![pose];
+        let instant_of: Vec<usize> = views
+            .iter()
+            .map(|view| {
+                let Some(own) = view.pose else { return 0 };
+                instants.iter().position(|known| *known == own).unwrap_or_else(|| {
+                    instants.push(own);
+                    instants.len() - 1
+                })
+            })
+            .collect();
+        while self.posed.len() + 1 < instants.len() {
+            self.posed.push(self.gaussians.posed_again(gpu)?);
+        }
+        let poses = instants;
+        let instants: Vec<(&Pose, &GaussianBuffers)> =
+            poses.iter().copied().zip(std::iter::once(&self.gaussians).chain(&self.posed)).collect();
+
+        self.judged.clear();
+        if let Some(deformation) = self.deformation.as_mut().filter(|_| !views.is_empty() && !self.shape_held) {
+            let (start, processor) = (Instant::now(), processor_time());
+            let tracked: Vec<TrackedView<'_>> = views
+                .iter()
+                .zip(&self.inputs)
+                .zip(&instant_of)
+                .map(|((view, input), &instant)| TrackedView {
+                    camera: view.camera,
+                    size: input.size,
+                    rgba: &input.rgba,
+                    words: &input.words,
+                    with_unknown: view.others.is_some(),
+                    instant,
+                })
+                .collect();
+            let scene = Instants { gpu, skeleton: &self.template.skeleton, poses: &poses, gaussians: &self.gaussians };
+            let DeformTimes { prepare, draw, derivatives, solve } = deformation.track(scene, &tracked)?;
+            self.judged.extend_from_slice(deformation.judged());
+            stages.add("deformation", start.elapsed());
+            stages.add("  prepare", prepare);
+            stages.add("  draw and compare", draw);
+            stages.add("  derivatives", derivatives);
+            stages.add("  solve", solve);
+            stages.add(PROCESSOR_STAGE, processor_time().saturating_sub(processor));
+            let at_rest = deformation.report().is_some_and(|report| report.at_rest);
+            stages.count("frames at rest, not solved", u64::from(at_rest));
+            let left_out = deformation.judged().iter().filter(|judged| judged.is_none()).count();
+            stages.count("views not compared", left_out as u64);
+            let distrusted = deformation.judged().iter().flatten().filter(|(_, trusted)| !trusted).count();
+            stages.count("views not believed", distrusted as u64);
+            stages.count("pictures halved", deformation.halved_pictures() as u64);
+        }
+
+        let start = Instant::now();
+        let corrected: Vec<Pose> = instants.iter().map(|(pose, _)| self.corrected(pose)).collect();
+        let displacement = self.deformation.as_ref().map(Deformation::displacement);
+        for (pose, (_, gaussians)) in corrected.iter().zip(&instants) {
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            let (centers, normals) = (&gaussians.center_scale, &gaussians.normal);
+            let skeleton = &self.template.skeleton;
+            self.skinner.encode(gpu, &mut encoder, skeleton, pose, displacement, centers, normals)?;
+            gpu.queue.submit([encoder.finish()]);
+        }
+        gpu.wait()?;
+        stages.add("skinning", start.elapsed());
+
+        if let Some(direct) = &self.direct_colors {
+            // Direct appearance goes on from its own colours.
+            direct.copy_to(gpu, &self.gaussians.color);
+        }
+        let start = Instant::now();
+        for (i, view) in views.iter().enumerate() {
+            let (width, height) = (view.image.width(), view.image.height());
+            let fits = self.visibility.get(i).is_some_and(|t| (t.width, t.height) == (width, height));
+            if !fits {
+                let target = RenderTarget::new(gpu, width, height)?;
+                if i < self.visibility.len() {
+                    self.visibility[i] = target;
+                } else {
+                    self.visibility.push(target);
+                }
+            }
+            let settings = RasterSettings {
+                outputs: Outputs { color: true, depth: false, canonical: true },
+                ..RasterSettings::default()
+            };
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            rasterizer.encode(
+                gpu,
+                &mut encoder,
+                instants[instant_of[i]].1,
+                view.camera,
+                &settings,
+                &self.visibility[i],
+            )?;
+            gpu.queue.submit([encoder.finish()]);
+        }
+        gpu.wait()?;
+        stages.add("visibility", start.elapsed());
+
+        let start = Instant::now();
+        // A view that is not believed paints nothing.
+        let believed = |i: usize| self.judged.get(i).copied().flatten().is_none_or(|(_, trusted)| trusted);
+        self.painted = (0..views.len()).filter(|&i| believed(i)).collect();
+        let inputs: Vec<ViewInput<'_>> = self
+            .painted
+            .iter()
+            .map(|&i| ViewInput {
+                camera: views[i].camera,
+                picture: &self.inputs[i].words,
+                canonical: &self.visibility[i].canonical,
+                drawn: &self.visibility[i].color,
+                gaussians: (instant_of[i] > 0).then(|| instants[instant_of[i]].1),
+            })
+            .collect();
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        self.appearance.update(gpu, &mut encoder, &self.gaussians, &inputs, &self.settings)?;
+        gpu.queue.submit([encoder.finish()]);
+        gpu.wait()?;
+        stages.add("appearance", start.elapsed());
+        self.paint_learned(gpu, stages)
+    }
+
+    /// Lets the networks add to what direct appearance painted.
+    fn paint_learned(&mut self, gpu: &GpuContext, stages: &mut StageTimes) -> Result<(), FusionError> {
+        let Some(networks) = &mut self.networks else { return Ok(()) };
+        let start = Instant::now();
+        if let Some(direct) = &self.direct_colors {
+            self.gaussians.color.copy_to(gpu, direct);
+        }
+        let picture = |&i: &usize| {
+            let InputImage { size: [width, height], rgba, .. } = &self.inputs[i];
+            ViewPicture { width: *width, height: *height, rgba }
+        };
+        let pictures: Vec<_> = self.painted.iter().map(picture).collect();
+        let learned = match networks {
+            Networks::Processor(learned) => learned,
+            Networks::Adapter(learned) => {
+                learned.paint(gpu, &self.appearance, &self.gaussians, &pictures, &self.settings)?;
+                gpu.wait()?;
+                stages.add("networks", start.elapsed());
+                return Ok(());
+            }
+        };
+        let observed = self.appearance.observations(gpu, self.painted.len())?;
+        let before = learned.counts;
+        let colors = learned.paint(&observed, &pictures, &self.settings)?;
+        self.gaussians.color.write(gpu, &colors);
+        stages.add("networks", start.elapsed());
+        let counts = learned.counts;
+        stages.count("views not encoded", counts.views_kept - before.views_kept);
+        stages.count("Gaussians not corrected anew", counts.colors_kept - before.colors_kept);
+        stages.count("corrections that were no numbers", counts.poisoned - before.poisoned);
+        Ok(())
+    }
+
+    /// Forgets clothes and colours: another person may come.
+    pub(crate) fn forget(&mut self) {
+        if let Some(deformation) = &mut self.deformation {
+            deformation.reset();
+        }
+        self.appearance.reset();
+        match &mut self.networks {
+            Some(Networks::Processor(learned)) => learned.reset(),
+            Some(Networks::Adapter(learned)) => learned.reset(),
+            None => {}
+        }
+    }
+
+    /// Reads back what was learnt about the person.
+    pub(crate) fn memory(&self, gpu: &GpuContext) -> Result<PersonMemory, FusionError> {
+        let translations = self.deformation.as_ref().map_or_else(Vec::new, |known| known.translations().to_vec());
+        let colors = self.direct_colors.as_ref().unwrap_or(&self.gaussians.color);
+        Ok(PersonMemory::new(&self.template, translations, self.appearance.memory(gpu)?, colors.read(gpu)?))
+    }
+
+    /// Resumes from what an earlier session has learnt about the same person.
+    pub(crate) fn restore(&mut self, gpu: &GpuContext, memory: &PersonMemory) -> Result<(), FusionError> {
+        let count = self.gaussians.count();
+        if memory.colors.len() != count {
+            return Err(FusionError::SavedPerson {
+                name: self.id.to_string(),
+                problem: format!(
+                    "it has {} Gaussians, the session {count}; set body.gaussians to {0}, or delete it",
+                    memory.colors.len()
+                ),
+            });
+        }
+        if let Some(deformation) = self.deformation.as_mut().filter(|_| !memory.translations.is_empty()) {
+            deformation.resume(gpu, &memory.translations)?;
+        }
+        self.appearance.resume(gpu, &memory.memory)?;
+        self.gaussians.color.write(gpu, &memory.colors);
+        if let Some(direct) = &self.direct_colors {
+            direct.write(gpu, &memory.colors);
+        }
+        self.watch.resume();
+        Ok(())
+    }
+
+    /// Takes over what belongs to no device: poses and tracking quality. For the same person on another device.
+    pub(crate) fn take_over(&mut self, old: &Self) {
+        let resumed = self.watch.is_resumed();
+        self.curve.clone_from(&old.curve);
+        self.last_pose.clone_from(&old.last_pose);
+        self.viewed.clone_from(&old.viewed);
+        (self.confidence, self.shape_held) = (old.confidence, old.shape_held);
+        if resumed {
+            self.watch.clone_from(&old.watch);
+        }
+    }
+
+    /// The next frames get the iterations of a start.
+    pub(crate) fn restart(&mut self) {
+        if let Some(deformation) = &mut self.deformation {
+            deformation.restart();
+        }
+    }
+
+    /// By view of the last update: how much of the person is where the picture shows it, 0 to 1. Empty when the body was not
+    /// compared with the pictures, None for a view that was not.
+    pub(crate) fn agreement(&self) -> Vec<Option<f64>> {
+        self.judged.iter().map(|judged| judged.map(|(quality, _)| quality)).collect()
+    }
+
+    /// How many Gaussians are compared with the pictures; 0 where the body is only skinned.
+    pub fn compared_gaussians(&self) -> usize {
+        self.deformation.as_ref().map_or(0, Deformation::compared)
+    }
+
+    /// What the last solve of the deformation did.
+    pub fn deform_report(&self) -> Option<&DeformReport> {
+        self.deformation.as_ref().and_then(Deformation::report)
+    }
+
+    /// The Gaussians of this instant.
+    pub(crate) fn splats(&self, gpu: &GpuContext) -> Result<Vec<Splat>, FusionError> {
+        Ok(read_splats(gpu, &self.gaussians)?)
+    }
+
+    /// A pose with what the deformation's solver corrected last.
+    pub(crate) fn corrected(&self, pose: &Pose) -> Pose {
+        self.deformation.as_ref().map_or_else(|| pose.clone(), |deformation| deformation.correction().apply(pose))
+    }
+
+    /// The tracked surface: world positions and normals of the template's vertices.
+    pub fn surface(&self, pose: &Pose) -> (Vec<glam::Vec3>, Vec<glam::Vec3>) {
+        let Some(deformation) = &self.deformation else { return skin_mesh(&self.template, pose) };
+        let mut moved = self.template.clone();
+        for (position, by) in moved.positions.iter_mut().zip(deformation.vertex_displacement()) {
+            *position += by;
+        }
+        skin_mesh(&moved, &deformation.correction().apply(pose))
+    }
+
+    /// Converts the images to RGB with the mask as alpha, and uploads each once.
+    fn take_images(&mut self, gpu: &GpuContext, views: &[InputView<'_>]) -> Result<(), FusionError> {
+        for (i, view) in views.iter().enumerate() {
+            let (image, mask) = (view.image, view.mask);
+            let size = [image.width(), image.height()];
+            for mask in std::iter::once(mask).chain(view.others) {
+                if [mask.width(), mask.height()] != size {
+                    return Err(FusionError::MaskSize {
+                        camera: view.camera.id.clone(),
+                        mask: (mask.width(), mask.height()),
+                        image: (image.width(), image.height()),
+                    });
+                }
+            }
+            if self.inputs.get(i).is_none_or(|input| input.size != size) {
+                let words = StorageBuffer::zeroed(
+                    gpu,
+                    &format!("the image of camera {}", view.camera.id),
+                    size[0] as usize * size[1] as usize,
+                )?;
+                let input = InputImage { size, rgba: Vec::new(), words };
+                if i < self.inputs.len() {
+                    self.inputs[i] = input;
+                } else {
+                    self.inputs.push(input);
+                }
+            }
+            let converted;
+            let rgb = if image.format() == flyrig_types::PixelFormat::Rgb8 {
+                image.bytes()
+            } else {
+                converted = to_rgb8(image)?;
+                &converted
+            };
+            let InputImage { rgba, words, .. } = &mut self.inputs[i];
+            rgba.clear();
+            rgba.extend(rgb.chunks_exact(3).zip(mask.coverage()).flat_map(|(c, &a)| [c[0], c[1], c[2], a]));
+            if let Some(others) = view.others {
+                for (pixel, others) in rgba.chunks_exact_mut(4).zip(others.coverage()) {
+                    if *others >= OTHERS_COVER {
+                        pixel.copy_from_slice(&UNKNOWN_RGBA);
+                    }
+                }
+            }
+            words.write_bytes(gpu, rgba);
+        }
+        Ok(())
+    }
+}
+
+/// Width on the person of a pixel of the finest camera, at the point that all cameras look at, metres.
+fn finest_pixel_m(rig: &Rig) -> f64 {
+    let center = center_of_attention(rig);
+    let pixel = |camera: &Camera| camera.position().distance(center) / (0.5 * camera.intrinsics.focal_px.element_sum());
+    rig.cameras.iter().map(pixel).fold(f64::INFINITY, f64::min)
+}

@@ -1,0 +1,143 @@
+//! What all clones of a [`crate::GpuContext`] share: compiled pipelines, read-back buffers, and the device's first fault.
+
+use std::{
+    collections::HashMap,
+    sync::{
+        Arc, Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicU64, Ordering},
+    },
+};
+
+use wgpu::{Buffer, BufferDescriptor, BufferUsages, ComputePipeline, Device};
+
+use crate::GpuError;
+
+/// Read-back buffers kept for later reads; a frame uses a few sizes.
+const IDLE_READ_BACKS: usize = 24;
+
+/// Numbers of GPU objects that were created since the device was opened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct GpuObjects {
+    /// Compiled compute pipelines.
+    pub pipelines: u64,
+    /// Storage buffers.
+    pub storage_buffers: u64,
+    /// Staging buffers of read-backs.
+    pub read_backs: u64,
+}
+
+/// The device's first fault, written by wgpu's callbacks. It holds no wgpu object, which would keep the device alive.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct FaultSlot(Arc<Mutex<Option<GpuError>>>);
+
+impl FaultSlot {
+    fn set(&self, fault: GpuError) {
+        let mut slot = lock(&self.0);
+        if slot.is_none() {
+            tracing::error!("graphics device: {fault}");
+            *slot = Some(fault);
+        }
+    }
+
+    /// Registers the callbacks. Without them wgpu panics on the first error that nobody asked for.
+    pub fn watch(&self, device: &Device) {
+        let slot = self.clone();
+        device.set_device_lost_callback(move |reason, message| {
+            slot.set(GpuError::Lost(format!("{reason:?}: {}", first_line(&message))));
+        });
+        let slot = self.clone();
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
+            slot.set(match error {
+                wgpu::Error::OutOfMemory { .. } => GpuError::OutOfMemory,
+                wgpu::Error::Validation { description, .. } | wgpu::Error::Internal { description, .. } => {
+                    GpuError::Rejected(first_line(&description))
+                }
+            });
+        }));
+    }
+
+    /// The first fault, if there was one.
+    pub fn check(&self) -> Result<(), GpuError> {
+        lock(&self.0).clone().map_or(Ok(()), Err)
+    }
+}
+
+/// Longer messages of drivers end here, characters.
+const LONGEST: usize = 300;
+
+fn first_line(message: &str) -> String {
+    let words: Vec<&str> = message.split_whitespace().collect();
+    words.join(" ").chars().take(LONGEST).collect()
+}
+
+/// Caches and counters of one device.
+#[derive(Debug, Default)]
+pub(crate) struct Shared {
+    pub fault: FaultSlot,
+    /// By WGSL and entry point.
+    pipelines: Mutex<HashMap<(String, String), ComputePipeline>>,
+    /// Not mapped, of any size.
+    read_backs: Mutex<Vec<Buffer>>,
+    pipelines_made: AtomicU64,
+    read_backs_made: AtomicU64,
+    pub storage_buffers_made: AtomicU64,
+}
+
+impl Shared {
+    /// Returns the pipeline of a source and entry point, compiled on first use.
+    pub fn pipeline(
+        &self,
+        source: String,
+        entry: &str,
+        compile: impl FnOnce(&str) -> ComputePipeline,
+    ) -> ComputePipeline {
+        let key = (source, entry.to_owned());
+        // Compiled outside of the lock: another thread may need a pipeline that is there.
+        if let Some(known) = lock(&self.pipelines).get(&key) {
+            return known.clone();
+        }
+        let pipeline = compile(&key.0);
+        self.pipelines_made.fetch_add(1, Ordering::Relaxed);
+        lock(&self.pipelines).entry(key).or_insert(pipeline).clone()
+    }
+
+    /// Takes a buffer to read `size` bytes back with, an idle one of that size where there is one.
+    pub fn take_read_back(&self, device: &Device, size: u64) -> Buffer {
+        let idle = {
+            let mut idle = lock(&self.read_backs);
+            let found = idle.iter().position(|buffer| buffer.size() == size);
+            found.map(|index| idle.remove(index))
+        };
+        idle.unwrap_or_else(|| {
+            self.read_backs_made.fetch_add(1, Ordering::Relaxed);
+            device.create_buffer(&BufferDescriptor {
+                label: Some("read back"),
+                size,
+                usage: BufferUsages::MAP_READ | BufferUsages::COPY_DST,
+                mapped_at_creation: false,
+            })
+        })
+    }
+
+    /// Gives an unmapped buffer back; the one that waited longest makes room.
+    pub fn give_read_back(&self, buffer: Buffer) {
+        let mut idle = lock(&self.read_backs);
+        if idle.len() >= IDLE_READ_BACKS {
+            idle.remove(0);
+        }
+        idle.push(buffer);
+    }
+
+    pub fn objects(&self) -> GpuObjects {
+        GpuObjects {
+            pipelines: self.pipelines_made.load(Ordering::Relaxed),
+            storage_buffers: self.storage_buffers_made.load(Ordering::Relaxed),
+            read_backs: self.read_backs_made.load(Ordering::Relaxed),
+        }
+    }
+}
+
+/// What is behind these locks is whole at every step.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,252 @@
+//! A self-contained HTML page: pictures, scores, times, memory.
+
+use std::{fmt::Write as _, io::Write as _, path::Path};
+
+use anyhow::{Context, Result};
+use base64::{Engine as _, prelude::BASE64_STANDARD};
+use flyrig_fusion::StageSummary;
+use flyrig_metrics::CameraScore;
+
+/// Contents of a report; empty parts are left out.
+#[derive(Debug, Default)]
+pub struct Report {
+    /// Heading of the page.
+    pub title: String,
+    /// Name and value pairs: adapter, commit, frame rate, counts.
+    pub facts: Vec<(String, String)>,
+    /// Heading and rows of each table of scores.
+    pub scores: Vec<(String, Vec<CameraScore>)>,
+    /// Run time of each stage.
+    pub stages: Vec<StageSummary>,
+    /// Values over frames or seconds.
+    pub curves: Vec<Curve>,
+    /// Rows of images.
+    pub contact: Vec<ContactRow>,
+}
+
+/// A line plot.
+#[derive(Debug)]
+pub struct Curve {
+    /// Heading.
+    pub title: String,
+    /// Quantity and unit along x.
+    pub x_label: String,
+    /// Quantity and unit along y.
+    pub y_label: String,
+    /// Name and points of each line.
+    pub lines: Vec<(String, Vec<(f64, f64)>)>,
+}
+
+/// A row of the contact sheet.
+#[derive(Debug)]
+pub struct ContactRow {
+    /// Caption of the row.
+    pub label: String,
+    /// Caption and PNG bytes of each image.
+    pub pictures: Vec<(String, Vec<u8>)>,
+}
+
+const STYLE: &str = "body{font:15px/1.45 system-ui,sans-serif;margin:2rem auto;max-width:1240px;padding:0 1rem;color:#1c2430;background:#fafbfc}\
+h1{font-size:1.6rem}h2{font-size:1.15rem;margin-top:2rem}table{border-collapse:collapse;background:#fff}\
+td,th{padding:.3rem .8rem;border-bottom:1px solid #dde3ea;text-align:right}td:first-child,th:first-child{text-align:left}\
+.row{display:flex;gap:6px;margin:.2rem 0 1rem}.row figure{margin:0;flex:1}.row img{width:100%;display:block;background:#000}\
+figcaption{font-size:.8rem;color:#5a6675}svg{background:#fff;border:1px solid #dde3ea}svg text{font-size:11px;fill:#5a6675}";
+
+impl Report {
+    /// Formats the page.
+    #[must_use]
+    pub fn html(&self) -> String {
+        let mut page = String::new();
+        let title = escape(&self.title);
+        let _ = write!(
+            page,
+            "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content=\"width=device-width\"><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
+        );
+        if !self.facts.is_empty() {
+            page.push_str("<table>");
+            for (name, value) in &self.facts {
+                let _ = write!(page, "<tr><td>{}<td style=\"text-align:left\">{}", escape(name), escape(value));
+            }
+            page.push_str("</table>");
+        }
+        for (name, scores) in &self.scores {
+            let _ = write!(
+                page,
+                "<h2>{}</h2><table><tr><th>camera<th>frames<th>PSNR dB<th>SSIM<th>FLIP<th>mask IoU",
+                escape(name)
+            );
+            for s in scores {
+                let iou = s.iou.map_or_else(|| "-".to_owned(), |v| format!("{v:.4}"));
+                let _ = write!(
+                    page,
+                    "<tr><td>{}<td>{}<td>{:.2}<td>{:.4}<td>{:.4}<td>{iou}",
+                    escape(&s.camera),
+                    s.frames,
+                    s.psnr_db,
+                    s.ssim,
+                    s.flip
+                );
+            }
+            page.push_str("</table>");
+        }
+        if !self.contact.is_empty() {
+            page.push_str("<h2>Pictures</h2>");
+        }
+        for row in &self.contact {
+            let _ = write!(page, "<figcaption>{}</figcaption><div class=row>", escape(&row.label));
+            for (caption, png) in &row.pictures {
+                let data = BASE64_STANDARD.encode(png);
+                let caption = escape(caption);
+                let _ = write!(
+                    page,
+                    "<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{data}\"><figcaption>{caption}</figcaption></figure>"
+                );
+            }
+            page.push_str("</div>");
+        }
+        if !self.stages.is_empty() {
+            page.push_str("<h2>Time per stage</h2><table><tr><th>stage<th>frames<th>mean ms<th>median ms<th>95 % ms");
+            for s in &self.stages {
+                let _ = write!(
+                    page,
+                    "<tr><td>{}<td>{}<td>{:.2}<td>{:.2}<td>{:.2}",
+                    escape(&s.name),
+                    s.frames,
+                    s.mean_ms,
+                    s.p50_ms,
+                    s.p95_ms
+                );
+            }
+            page.push_str("</table>");
+        }
+        for curve in &self.curves {
+            let _ = write!(page, "<h2>{}</h2>{}", escape(&curve.title), curve.svg());
+        }
+        page.push_str("</html>\n");
+        page
+    }
+
+    /// Writes the page, whole or not at all.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        write_whole(path, self.html().as_bytes())
+    }
+}
+
+/// Writes a file whole or not at all.
+///
+/// # Errors
+/// Names the file and the fix.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
+    flyrig_types::write_whole(path, |out| out.write_all(bytes))
+        .with_context(|| format!("cannot write {}; check that the folder exists and has room", path.display()))
+}
+
+impl Curve {
+    fn svg(&self) -> String {
+        const W: f64 = 720.0;
+        const H: f64 = 240.0;
+        const PAD: f64 = 48.0;
+        const COLORS: [&str; 6] = ["#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf"];
+        let finite: Vec<(f64, f64)> =
+            self.lines.iter().flat_map(|(_, p)| p).copied().filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
+        let bounds = |pick: fn(&(f64, f64)) -> f64| {
+            let low = finite.iter().map(pick).fold(f64::INFINITY, f64::min);
+            let high = finite.iter().map(pick).fold(f64::NEG_INFINITY, f64::max);
+            if low < high { (low, high) } else { (low - 0.5, low + 0.5) }
+        };
+        if finite.is_empty() {
+            return "<p>no values</p>".to_owned();
+        }
+        let ((x0, x1), (y0, y1)) = (bounds(|p| p.0), bounds(|p| p.1));
+        let px = |x: f64| PAD + (x - x0) / (x1 - x0) * (W - 1.5 * PAD);
+        let py = |y: f64| H - PAD * 0.8 - (y - y0) / (y1 - y0) * (H - 1.4 * PAD);
+        let mut svg = format!("<svg viewBox=\"0 0 {W} {H}\" width=\"{W}\" height=\"{H}\">");
+        for step in 0..=4 {
+            let (x, y) = (x0 + (x1 - x0) * f64::from(step) / 4.0, y0 + (y1 - y0) * f64::from(step) / 4.0);
+            let _ = write!(
+                svg,
+                "<line x1=\"{PAD}\" x2=\"{:.1}\" y1=\"{:.1}\" y2=\"{:.1}\" stroke=\"#e6ebf0\"/><text x=\"4\" y=\"{:.1}\">{y:.4}</text><text x=\"{:.1}\" y=\"{:.1}\">{x:.4}</text>",
+                W - PAD / 2.0,
+                py(y),
+                py(y),
+                py(y) + 4.0,
+                px(x) - 12.0,
+                H - 22.0
+            );
+        }
+        for (i, (name, points)) in self.lines.iter().enumerate() {
+            let color = COLORS[i % COLORS.len()];
+            let path: String = points.iter().filter(|(x, y)| x.is_finite() && y.is_finite()).fold(
+                String::new(),
+                |mut text, &(x, y)| {
+                    let _ = write!(text, "{:.1},{:.1} ", px(x), py(y));
+                    text
+                },
+            );
+            let _ = write!(
+                svg,
+                "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"1.6\" points=\"{path}\"/><text x=\"{:.1}\" y=\"14\" style=\"fill:{color}\">{}</text>",
+                PAD + 110.0 * i as f64,
+                escape(name)
+            );
+        }
+        let _ = write!(
+            svg,
+            "<text x=\"{:.1}\" y=\"{:.1}\">{}</text><text x=\"4\" y=\"14\">{}</text></svg>",
+            W / 2.0,
+            H - 6.0,
+            escape(&self.x_label),
+            escape(&self.y_label)
+        );
+        svg
+    }
+}
+
+fn escape(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_page_holds_what_it_was_given_and_nothing_unescaped() {
+        let report = Report {
+            title: "a <b>".to_owned(),
+            facts: vec![("adapter".to_owned(), "x & y".to_owned())],
+            curves: vec![Curve {
+                title: "memory".to_owned(),
+                x_label: "s".to_owned(),
+                y_label: "MiB".to_owned(),
+                lines: vec![
+                    ("rss".to_owned(), vec![(0.0, 1.0), (1.0, f64::NAN), (2.0, 3.0)]),
+                    ("none".to_owned(), vec![]),
+                ],
+            }],
+            contact: vec![ContactRow {
+                label: "frame 1".to_owned(),
+                pictures: vec![("input".to_owned(), vec![1, 2, 3])],
+            }],
+            ..Report::default()
+        };
+        let html = report.html();
+        assert!(html.contains("a &lt;b&gt;") && html.contains("x &amp; y"));
+        assert!(html.contains("data:image/png;base64,AQID"));
+        assert!(html.contains("<polyline") && !html.contains("NaN"));
+    }
+
+    #[test]
+    fn a_report_is_written_whole_or_not_at_all() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("index.html");
+        Report::default().save(&path).unwrap();
+        assert!(path.exists());
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+        let error = Report::default().save(&folder.path().join("none/index.html")).unwrap_err();
+        assert!(error.to_string().contains("cannot write"), "{error}");
+    }
+}

@@ -1,0 +1,16 @@
+//! What the programs share: HTML reports, plots, images, progress bars, logging, arguments, and Ctrl-C as a flag.
+
+pub mod arguments;
+mod contact;
+mod html;
+mod outlines;
+pub mod plot;
+pub mod png;
+pub mod program;
+mod progress;
+pub mod stop;
+
+pub use contact::contact_pictures;
+pub use html::{ContactRow, Curve, Report, write_whole};
+pub use outlines::outlined_inputs;
+pub use progress::progress_bar;

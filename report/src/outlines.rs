@@ -1,0 +1,69 @@
+//! Input pictures with the outlines of mask and drawn person: shows whether masks, pose and calibration fit.
+
+use anyhow::Result;
+use flyrig_fusion::{PersonId, Session};
+
+use crate::png;
+
+/// Colour of the mask's outline.
+const MASK: [u8; 3] = [0, 255, 80];
+/// Colour of the drawn person's outline.
+const DRAWN: [u8; 3] = [255, 0, 200];
+
+/// Encodes every input view of a person's last update as a captioned PNG image.
+///
+/// # Errors
+/// When a view cannot be drawn.
+pub fn outlined_inputs(session: &mut Session, person: PersonId) -> Result<Vec<(String, Vec<u8>)>> {
+    let mut out = Vec::new();
+    for (view, camera) in session.viewed(person).into_iter().enumerate() {
+        let drawn = session.render(&camera)?;
+        let (width, height) = (drawn.width as usize, drawn.height as usize);
+        let seen = session.subject(person).map_or(&[][..], |subject| subject.input(view));
+        if seen.len() != drawn.rgba.len() {
+            continue;
+        }
+        let mut rgb: Vec<u8> = seen.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect();
+        paint_outline(&mut rgb, seen, width, height, MASK);
+        paint_outline(&mut rgb, &drawn.rgba, width, height, DRAWN);
+        let caption = format!("input {}: mask green, ours magenta", camera.id);
+        out.push((caption, png::encode_rgb(&rgb, drawn.width, drawn.height)?));
+    }
+    Ok(out)
+}
+
+/// Paints the pixels of `rgb` that are covered by half or more in `rgba` and have a neighbour that is not.
+fn paint_outline(rgb: &mut [u8], rgba: &[u8], width: usize, height: usize, color: [u8; 3]) {
+    let covered = |x: usize, y: usize| rgba[(y * width + x) * 4 + 3] >= 128;
+    for y in 0..height {
+        for x in 0..width {
+            let inner = x > 0 && y > 0 && x + 1 < width && y + 1 < height;
+            let surrounded = inner && covered(x - 1, y) && covered(x + 1, y) && covered(x, y - 1) && covered(x, y + 1);
+            if covered(x, y) && !surrounded {
+                rgb[(y * width + x) * 3..][..3].copy_from_slice(&color);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_rim_is_painted() {
+        let (width, height) = (6, 5);
+        let inside = |i: usize| (1..5).contains(&(i % width)) && (1..4).contains(&(i / width));
+        let rgba: Vec<u8> = (0..width * height).flat_map(|i| [0, 0, 0, if inside(i) { 200 } else { 90 }]).collect();
+        let mut rgb = vec![7; width * height * 3];
+        paint_outline(&mut rgb, &rgba, width, height, MASK);
+        for i in 0..width * height {
+            let rim = inside(i) && !((2..4).contains(&(i % width)) && i / width == 2);
+            assert_eq!(rgb[i * 3..][..3] == MASK, rim, "pixel {i}");
+        }
+        let whole = vec![255; 4];
+        let mut one = vec![0; 3];
+        paint_outline(&mut one, &whole, 1, 1, DRAWN);
+        assert_eq!(one, DRAWN);
+    }
+}

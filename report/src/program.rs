@@ -1,0 +1,67 @@
+//! What every program does first and last: logging, the graphics adapter, the exit code.
+
+use std::{io::IsTerminal as _, process::ExitCode};
+
+use anyhow::Result;
+use flyrig_gpu::{AdapterChoice, GpuContext};
+use tracing_subscriber::EnvFilter;
+
+/// Opens the adapter with this text in its name, or the fastest one.
+///
+/// # Errors
+/// Says what is missing and what to install.
+pub fn open_gpu(adapter: Option<&str>) -> Result<GpuContext> {
+    let choice = match adapter {
+        Some(name) if !name.is_empty() => AdapterChoice::Named(name.to_owned()),
+        _ => AdapterChoice::Best,
+    };
+    Ok(GpuContext::new(&choice)?)
+}
+
+/// Starts logging to standard error, more with each level of `verbose`; as one JSON object a line where asked to.
+pub fn start_log(verbose: u8, json: bool) {
+    let level = match verbose {
+        0 => "warn,flyrig=info,flyrig_fusion=info,zenoh=error",
+        1 => {
+            "info,flyrig=debug,flyrig_fusion=debug,flyrig_capture=debug,flyrig_sync=debug,flyrig_calib=debug,\
+             flyrig_tracker=debug,flyrig_renderer=debug,flyrig_transport=debug,flyrig_gpu=debug"
+        }
+        _ => "debug",
+    };
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(level));
+    let builder = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_ansi(std::io::stderr().is_terminal())
+        .with_writer(std::io::stderr);
+    if json {
+        builder.json().init();
+    } else {
+        builder.with_target(false).init();
+    }
+}
+
+/// Prints an error as one line and returns the exit code.
+#[must_use]
+pub fn exit_code(result: Result<()>) -> ExitCode {
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {}", one_line(&error));
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Joins an error and its causes, without causes that the text before contains already.
+#[must_use]
+pub fn one_line(error: &anyhow::Error) -> String {
+    let mut line = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if line.is_empty() {
+            line = cause;
+        } else if !line.contains(&cause) {
+            line = format!("{line}: {cause}");
+        }
+    }
+    line
+}
