@@ -80,6 +80,7 @@ impl Outlet {
     /// Hands the Gaussians over.
     pub fn publish_splats(&self, splats: &[Splat], set: &FrameSet) {
         let state = SplatState {
+            person: 0,
             frame: set.index,
             capture_nanos: set.master_nanos,
             center_scale: splats.iter().map(|s| [s.position[0], s.position[1], s.position[2], s.scale_m[0]]).collect(),
@@ -127,7 +128,7 @@ impl Outlet {
                 .map(|s| StageTime {
                     stage: s.name.clone(),
                     mean_millis: f64::from(s.mean_ms),
-                    max_millis: f64::from(s.p95_ms),
+                    p95_millis: f64::from(s.p95_ms),
                 })
                 .collect(),
             dropped: drops.iter().cloned().chain(self.drops()).collect(),
@@ -138,6 +139,7 @@ impl Outlet {
                 quality: watch.quality(),
                 cameras: watch.cameras().iter().map(|(id, quality)| (id.to_string(), *quality)).collect(),
             },
+            subjects: Vec::new(),
         };
         if let Err(error) = self.publisher.publish_stats(&stats) {
             tracing::warn!(%error, "statistics not published");
