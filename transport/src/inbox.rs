@@ -347,6 +347,8 @@ pub(crate) fn as_malformed(error: TransportError) -> TransportError {
 
 #[cfg(test)]
 mod tests {
+    use flyrig_types::{Isometry, Lens};
+
     use super::*;
     use crate::drain::empty_header;
 
@@ -427,6 +429,28 @@ mod tests {
         }
         assert_eq!(next().unwrap().unwrap().0, "view/a");
         assert!(next().is_err());
+    }
+
+    #[test]
+    fn a_rig_that_cannot_be_is_reported_once() {
+        let inbox = Inbox::new("viewer-me".to_owned(), QUOTA);
+        let places = RigTransforms {
+            camera_from_world: vec![("twice".into(), Isometry::IDENTITY); 2],
+            world_up: glam::DVec3::Z,
+        };
+        let lens = Intrinsics {
+            width: 64,
+            height: 48,
+            focal_px: glam::DVec2::splat(50.0),
+            center_px: glam::DVec2::splat(20.0),
+            lens: Lens::PINHOLE,
+        };
+        let mut state = lock(&inbox.state);
+        state.places = Some((1, places));
+        state.lenses.insert("twice".into(), (1, lens));
+        drop(state);
+        assert_eq!(inbox.rig(Duration::ZERO).unwrap_err().kind, TransportErrorKind::Malformed);
+        assert_eq!((inbox.rig(Duration::ZERO), inbox.unreadable()), (Ok(None), 1));
     }
 
     #[test]
