@@ -1,13 +1,14 @@
 //! glTF files as bytes: buffers and accessors, every length checked.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use base64::Engine;
 use gltf::accessor::{DataType, Dimensions};
 use gltf::buffer::Source;
 use gltf::json::validation::Checked;
 
-use crate::BodyError;
+use crate::gltf_limits::{MAX_FILE_BYTES, MAX_JSON_ENTRIES};
+use crate::{BodyError, gltf_uri};
 
 /// A parsed file with its buffers.
 pub(crate) struct GltfFile<'a> {
@@ -17,11 +18,10 @@ pub(crate) struct GltfFile<'a> {
 }
 
 impl<'a> GltfFile<'a> {
-    /// Reads a `.glb`, or a `.gltf` with its buffers in files beside it or as data URIs.
+    /// Reads a `.glb`, or a `.gltf` with its buffers as data URIs or in files of its folder.
     pub fn open(path: &'a Path) -> Result<Self, BodyError> {
-        let read = |path: &Path| std::fs::read(path).map_err(|source| BodyError::Io { path: path.into(), source });
         let fail = |message: String| BodyError::Gltf { path: path.into(), message };
-        let bytes = read(path)?;
+        let bytes = gltf_uri::read(path, MAX_FILE_BYTES)?;
         // The length stands in the header; the parser would take its word for it.
         if let Some(told) = bytes.get(8..12).filter(|_| bytes.starts_with(b"glTF")) {
             let told = u32::from_le_bytes([told[0], told[1], told[2], told[3]]) as usize;
@@ -30,22 +30,25 @@ impl<'a> GltfFile<'a> {
                 return Err(fail(format!("cut off: {found} of {told} bytes; copy the file again")));
             }
         }
+        let entries = json_entries(json_part(&bytes));
+        if entries > MAX_JSON_ENTRIES {
+            return Err(fail(too_many("entries of the JSON part", entries, MAX_JSON_ENTRIES)));
+        }
         let invalid = |error: gltf::Error| fail(format!("not a valid glTF 2.0 file: {error}"));
         let gltf::Gltf { document, mut blob } = gltf::Gltf::from_slice_without_validation(&bytes).map_err(invalid)?;
         let json = document.into_json();
         check_trusted(&json).map_err(fail)?;
         let document = gltf::Document::from_json(json).map_err(invalid)?;
+        let beside = external_buffers(path, &document)?;
         let mut buffers = Vec::new();
-        for buffer in document.buffers() {
+        for (buffer, beside) in document.buffers().zip(beside) {
             let index = buffer.index();
-            let data = match buffer.source() {
-                Source::Bin => blob.take().ok_or_else(|| fail("the binary chunk is missing".to_owned()))?,
-                Source::Uri(uri) => match uri.strip_prefix("data:").and_then(|data| data.split_once("base64,")) {
-                    Some((_, data)) => base64::engine::general_purpose::STANDARD
-                        .decode(data)
-                        .map_err(|error| fail(format!("buffer {index}: {error}")))?,
-                    None => read(&path.with_file_name(uri.replace("%20", " ")))?,
-                },
+            let data = match (buffer.source(), beside) {
+                (Source::Bin, _) => blob.take().ok_or_else(|| fail("the binary chunk is missing".to_owned()))?,
+                (Source::Uri(_), Some(beside)) => gltf_uri::read(&beside, MAX_FILE_BYTES)?,
+                (Source::Uri(uri), None) => base64::engine::general_purpose::STANDARD
+                    .decode(embedded(uri).unwrap_or_default())
+                    .map_err(|error| fail(format!("buffer {index}: {error}")))?,
             };
             let (found, told) = (data.len(), buffer.length());
             if found < told {
@@ -61,11 +64,17 @@ impl<'a> GltfFile<'a> {
         BodyError::Gltf { path: self.path.into(), message: message.into() }
     }
 
-    /// Items of `N` numbers; normalised integers become fractions, other numbers keep their value.
+    /// An error unless `found` is at most `limit`.
+    pub fn check_count(&self, what: &str, found: usize, limit: usize) -> Result<(), BodyError> {
+        if found > limit { Err(self.fail(too_many(what, found, limit))) } else { Ok(()) }
+    }
+
+    /// At most `limit` items of `N` numbers; normalised integers become fractions, other numbers keep their value.
     pub fn numbers<const N: usize>(
         &self,
         accessor: &gltf::Accessor<'_>,
         what: &str,
+        limit: usize,
     ) -> Result<Vec<[f64; N]>, BodyError> {
         let wanted = match N {
             1 => Dimensions::Scalar,
@@ -82,6 +91,7 @@ impl<'a> GltfFile<'a> {
             return Err(self.fail(format!("{what} is stored sparsely; export the file without sparse accessors")));
         }
         let count = accessor.count();
+        self.check_count(&format!("items of {what}"), count, limit)?;
         let Some(view) = accessor.view() else { return Err(self.fail(format!("{what} has no data"))) };
         let data_type = accessor.data_type();
         let size = data_type.size() * N;
@@ -112,13 +122,71 @@ impl<'a> GltfFile<'a> {
         &self,
         accessor: &gltf::Accessor<'_>,
         what: &str,
+        limit: usize,
     ) -> Result<Vec<[f64; N]>, BodyError> {
-        let items = self.numbers::<N>(accessor, what)?;
+        let items = self.numbers::<N>(accessor, what, limit)?;
         match items.iter().position(|item| item.iter().any(|x| !x.is_finite())) {
             Some(index) => Err(self.fail(format!("item {index} of {what} is not a finite number"))),
             None => Ok(items),
         }
     }
+}
+
+/// The base64 part of a data URI.
+fn embedded(uri: &str) -> Option<&str> {
+    uri.strip_prefix("data:")?.split_once("base64,").map(|(_, data)| data)
+}
+
+/// Path of each buffer that lies in a file of its own. Checks the sum of their sizes before any is read: many buffers may
+/// name one file.
+fn external_buffers(path: &Path, document: &gltf::Document) -> Result<Vec<Option<PathBuf>>, BodyError> {
+    let mut total = 0u64;
+    let beside = document.buffers().map(|buffer| {
+        let Source::Uri(uri) = buffer.source() else { return Ok(None) };
+        if embedded(uri).is_some() {
+            return Ok(None);
+        }
+        let beside = gltf_uri::resolve(path, uri)?;
+        let meta = std::fs::metadata(&beside).map_err(|source| BodyError::Io { path: beside.clone(), source })?;
+        total = total.saturating_add(meta.len());
+        if total > MAX_FILE_BYTES {
+            let message =
+                too_many(&format!("bytes of all buffers up to buffer {}", buffer.index()), total, MAX_FILE_BYTES);
+            return Err(BodyError::Gltf { path: path.into(), message });
+        }
+        Ok(Some(beside))
+    });
+    beside.collect()
+}
+
+fn too_many(what: &str, found: impl std::fmt::Display, limit: impl std::fmt::Display) -> String {
+    format!("{what}: {found}, at most {limit} are allowed; export the body alone, with a shorter animation")
+}
+
+/// The JSON of either form of a file; the parser refuses what is cut off.
+fn json_part(bytes: &[u8]) -> &[u8] {
+    match (bytes.starts_with(b"glTF"), bytes.get(12..20)) {
+        (true, Some(&[a, b, c, d, ..])) => {
+            let rest = &bytes[20..];
+            &rest[..rest.len().min(u32::from_le_bytes([a, b, c, d]) as usize)]
+        }
+        _ => bytes,
+    }
+}
+
+/// Upper bound of the objects, arrays and their entries in JSON text, without parsing it.
+fn json_entries(text: &[u8]) -> usize {
+    let (mut entries, mut is_string, mut is_escaped) = (0, false, false);
+    for byte in text {
+        match (byte, is_string) {
+            _ if is_escaped => is_escaped = false,
+            (b'\\', true) => is_escaped = true,
+            (b'"', _) => is_string = !is_string,
+            (b'{' | b'[' | b',', false) => entries += 1,
+            _ => {}
+        }
+    }
+    entries
 }
 
 /// What gltf 1.4 trusts without checking it first.

@@ -6,6 +6,7 @@ use flyrig_types::{Pose, PoseTrack};
 use glam::{DMat3, DMat4, DVec3, Vec2, Vec3};
 
 use crate::gltf_file::GltfFile;
+use crate::gltf_limits::{MAX_INDICES, MAX_JOINT_SETS, MAX_JOINTS, MAX_VERTICES};
 use crate::gltf_nodes::{Nodes, Placement};
 use crate::part::part_of_joints;
 use crate::{BodyError, Joint, Skeleton, SkinWeights, Template};
@@ -25,17 +26,21 @@ pub struct GltfHuman {
 /// Up to eight influences a vertex are reduced to the strongest four. Transforms above the root joint, even
 /// scale included, are folded into the root; a leading joint that moves nothing but its only child is folded
 /// too. Joints keep their rest distance from their parents: animated translations of other joints than the
-/// root, and animated scale, are not followed. Morph targets are ignored.
+/// root, and animated scale, are not followed. Morph targets are ignored, and so is what is animated elsewhere.
+///
+/// External buffers must lie in the folder of the file or below it. Memory is bounded by the limits in `gltf_limits.rs`,
+/// whatever the file claims.
 ///
 /// # Errors
 /// [`BodyError::Io`]; [`BodyError::Gltf`] for a damaged file, one without skin or mesh, numbers that are not
-/// finite, and uneven scale.
+/// finite, uneven scale, a buffer outside the folder, and sizes over a limit.
 pub fn load_gltf(path: &Path) -> Result<GltfHuman, BodyError> {
     let file = GltfFile::open(path)?;
     let nodes = Nodes::new(&file)?;
     let Some(skin) = file.document.skins().next() else {
         return Err(file.fail("no skin; export the body with its armature"));
     };
+    file.check_count("joints of the skin", skin.joints().count(), MAX_JOINTS)?;
     let mut mesh = read_meshes(&file, &skin)?;
     let mut joint_nodes: Vec<usize> = skin.joints().map(|node| node.index()).collect();
     if let Some(joint) = mesh.skin.iter().flat_map(|s| s.joints).find(|&joint| usize::from(joint) >= joint_nodes.len())
@@ -44,7 +49,7 @@ pub fn load_gltf(path: &Path) -> Result<GltfHuman, BodyError> {
     }
     let mut inverse_binds = vec![DMat4::IDENTITY; joint_nodes.len()];
     if let Some(accessor) = skin.inverse_bind_matrices() {
-        let matrices = file.finite::<16>(&accessor, "the inverse bind matrices")?;
+        let matrices = file.finite::<16>(&accessor, "the inverse bind matrices", MAX_JOINTS)?;
         if matrices.len() < joint_nodes.len() {
             return Err(file.fail("there are fewer inverse bind matrices than joints"));
         }
@@ -82,9 +87,10 @@ pub fn load_gltf(path: &Path) -> Result<GltfHuman, BodyError> {
     let skeleton = Skeleton::new(joints.collect()).map_err(|error| file.fail(error.to_string()))?;
 
     let mut keys = Vec::new();
-    for (nanos, world) in nodes.animated(&file)? {
-        keys.push((nanos, pose_of(&placements(&file, &world, &joint_nodes)?, &parents)));
-    }
+    nodes.animate(&file, &joint_nodes, |nanos, world| {
+        keys.push((nanos, pose_of(&placements(&file, world, &joint_nodes)?, &parents)));
+        Ok(())
+    })?;
     let track = match keys.is_empty() {
         true => None,
         false => Some(PoseTrack::new(keys).map_err(|error| file.fail(error.to_string()))?),
@@ -115,17 +121,21 @@ fn order_joints(
             used[usize::from(*joint)] |= weight > 0.0;
         }
     }
-    let rank = |old: usize| nodes.order.iter().position(|&node| node == joint_nodes[old]).unwrap_or(usize::MAX);
+    let mut ranks = vec![0; nodes.order.len()];
+    for (rank, &node) in nodes.order.iter().enumerate() {
+        ranks[node] = rank;
+    }
     let mut old_from_new: Vec<usize> = (0..joint_nodes.len()).collect();
-    old_from_new.sort_by_key(|&old| rank(old));
+    old_from_new.sort_by_key(|&old| ranks[joint_nodes[old]]);
     loop {
         let ordered: Vec<usize> = old_from_new.iter().map(|&old| joint_nodes[old]).collect();
         let parents = joint_parents(nodes, &ordered);
         let roots: Vec<usize> = (0..ordered.len()).filter(|&i| parents[i].is_none()).collect();
-        let idle = |i: &usize| {
-            let children = parents.iter().filter(|&&parent| parent == Some(*i)).count();
-            !used[old_from_new[*i]] && (children == 0 && roots.len() > 1 || children == 1)
-        };
+        let mut children = vec![0; ordered.len()];
+        for &parent in parents.iter().flatten() {
+            children[parent] += 1;
+        }
+        let idle = |i: &usize| !used[old_from_new[*i]] && (children[*i] == 0 && roots.len() > 1 || children[*i] == 1);
         if let Some(root) = roots.iter().copied().find(idle) {
             old_from_new.remove(root);
             continue;
@@ -150,10 +160,16 @@ fn order_joints(
 
 /// Nearest ancestor of each joint that is a joint too.
 fn joint_parents(nodes: &Nodes, joint_nodes: &[usize]) -> Vec<Option<usize>> {
-    let joint_at = |node: usize| joint_nodes.iter().position(|&joint| joint == node);
-    let parent_of =
-        |&node: &usize| std::iter::successors(nodes.parents[node], |&n| nodes.parents[n]).find_map(joint_at);
-    joint_nodes.iter().map(parent_of).collect()
+    let mut joint_at = vec![None; nodes.parents.len()];
+    for (joint, &node) in joint_nodes.iter().enumerate().rev() {
+        joint_at[node] = Some(joint);
+    }
+    // One pass from the roots: a chain of nodes may be as long as the file allows.
+    let mut nearest: Vec<Option<usize>> = vec![None; joint_at.len()];
+    for &node in &nodes.order {
+        nearest[node] = joint_at[node].or_else(|| nodes.parents[node].and_then(|parent| nearest[parent]));
+    }
+    joint_nodes.iter().map(|&node| nodes.parents[node].and_then(|parent| nearest[parent])).collect()
 }
 
 fn placements(file: &GltfFile<'_>, world: &[DMat4], joint_nodes: &[usize]) -> Result<Vec<Placement>, BodyError> {
@@ -224,6 +240,7 @@ fn read_meshes(file: &GltfFile<'_>, skin: &gltf::Skin<'_>) -> Result<Mesh, BodyE
     if others > 0 {
         tracing::warn!(path = %file.path.display(), others, "meshes without the first skin are left out");
     }
+    check_sizes(file, file.document.nodes().filter(uses))?;
     for node in file.document.nodes().filter(uses) {
         let Some(source) = node.mesh() else { continue };
         for primitive in source.primitives() {
@@ -240,6 +257,23 @@ fn read_meshes(file: &GltfFile<'_>, skin: &gltf::Skin<'_>) -> Result<Mesh, BodyE
     Ok(mesh)
 }
 
+/// Checks the sums over all meshes before anything is read: primitives may share their data, and nodes their mesh.
+fn check_sizes<'a>(file: &GltfFile<'_>, nodes: impl Iterator<Item = gltf::Node<'a>>) -> Result<(), BodyError> {
+    let (mut vertices, mut corners) = (0usize, 0usize);
+    for mesh in nodes.filter_map(|node| node.mesh()) {
+        for primitive in mesh.primitives() {
+            let what = |items: &str| format!("{items} up to primitive {} of mesh {}", primitive.index(), mesh.index());
+            let count = primitive.get(&gltf::Semantic::Positions).map_or(0, |accessor| accessor.count());
+            // An empty primitive counts too, so that this loop is bounded.
+            vertices = vertices.saturating_add(count.max(1));
+            corners = corners.saturating_add(primitive.indices().map_or(count, |accessor| accessor.count()));
+            file.check_count(&what("vertices"), vertices, MAX_VERTICES)?;
+            file.check_count(&what("triangle corners"), corners, MAX_INDICES)?;
+        }
+    }
+    Ok(())
+}
+
 fn read_primitive(
     file: &GltfFile<'_>,
     primitive: &gltf::Primitive<'_>,
@@ -254,13 +288,14 @@ fn read_primitive(
         false => Err(file.fail(format!("{what} has {found} {name} for {expected} vertices"))),
     };
     let positions = primitive.get(&Positions).ok_or_else(|| missing("positions"))?;
-    let positions = file.finite::<3>(&positions, &format!("the positions of {what}"))?;
+    let positions = file.finite::<3>(&positions, &format!("the positions of {what}"), MAX_VERTICES)?;
     let count = positions.len();
     mesh.positions.extend(positions.iter().map(|&p| DVec3::from_array(p).as_vec3()));
 
     let indices: Vec<usize> = match primitive.indices() {
         Some(accessor) => {
-            file.numbers::<1>(&accessor, &format!("the indices of {what}"))?.iter().map(|[i]| *i as usize).collect()
+            let indices = file.numbers::<1>(&accessor, &format!("the indices of {what}"), MAX_INDICES)?;
+            indices.iter().map(|[i]| *i as usize).collect()
         }
         None => (0..count).collect(),
     };
@@ -272,7 +307,7 @@ fn read_primitive(
 
     match primitive.get(&Normals) {
         Some(accessor) => {
-            let normals = file.finite::<3>(&accessor, &format!("the normals of {what}"))?;
+            let normals = file.finite::<3>(&accessor, &format!("the normals of {what}"), MAX_VERTICES)?;
             check(normals.len(), count, "normals")?;
             mesh.normals.extend(normals.iter().map(|&n| DVec3::from_array(n).as_vec3()));
         }
@@ -289,7 +324,7 @@ fn read_primitive(
     }
     match primitive.get(&TexCoords(0)) {
         Some(accessor) => {
-            let uvs = file.finite::<2>(&accessor, &format!("the texture coordinates of {what}"))?;
+            let uvs = file.finite::<2>(&accessor, &format!("the texture coordinates of {what}"), MAX_VERTICES)?;
             check(uvs.len(), count, "texture coordinates")?;
             mesh.uvs.extend(uvs.iter().map(|&[u, v]| Vec2::new(u as f32, v as f32)));
         }
@@ -299,8 +334,9 @@ fn read_primitive(
     let mut influences = vec![Vec::new(); count];
     for set in 0.. {
         let (Some(joints), Some(weights)) = (primitive.get(&Joints(set)), primitive.get(&Weights(set))) else { break };
-        let joints = file.finite::<4>(&joints, &format!("the joints of {what}"))?;
-        let weights = file.finite::<4>(&weights, &format!("the weights of {what}"))?;
+        file.check_count(&format!("sets of joints of {what}"), set as usize + 1, MAX_JOINT_SETS as usize)?;
+        let joints = file.finite::<4>(&joints, &format!("the joints of {what}"), MAX_VERTICES)?;
+        let weights = file.finite::<4>(&weights, &format!("the weights of {what}"), MAX_VERTICES)?;
         check(joints.len(), count, "joint sets")?;
         check(weights.len(), count, "weight sets")?;
         for ((list, joints), weights) in influences.iter_mut().zip(&joints).zip(&weights) {

@@ -5,6 +5,7 @@ use gltf::animation::{Interpolation, Property};
 
 use crate::BodyError;
 use crate::gltf_file::GltfFile;
+use crate::gltf_limits::{MAX_ANIMATION_KEYS, MAX_KEY_SECS, MAX_NODES, MAX_POSED_NODES};
 
 /// Between two keys of a cubic curve poses are taken this often.
 const CUBIC_STEP_NANOS: i64 = 1_000_000_000 / 120;
@@ -36,6 +37,7 @@ pub(crate) struct Placement {
 impl Nodes {
     pub fn new(file: &GltfFile<'_>) -> Result<Self, BodyError> {
         let count = file.document.nodes().count();
+        file.check_count("nodes", count, MAX_NODES)?;
         let mut parents = vec![None; count];
         let mut locals = Vec::with_capacity(count);
         for node in file.document.nodes() {
@@ -74,53 +76,46 @@ impl Nodes {
 
     /// `world_from_node` of every node at rest.
     pub fn rest(&self) -> Vec<DMat4> {
-        self.world(&self.locals)
+        let mut world = vec![DMat4::IDENTITY; self.locals.len()];
+        self.update_world(&self.order, &self.locals, &mut world);
+        world
     }
 
-    fn world(&self, locals: &[Local]) -> Vec<DMat4> {
-        let mut world = vec![DMat4::IDENTITY; locals.len()];
-        for &node in &self.order {
+    /// Computes `world_from_node` of some nodes; the parent of each stands before it in `order`.
+    fn update_world(&self, order: &[usize], locals: &[Local], world: &mut [DMat4]) {
+        for &node in order {
             let Local { translation, rotation, scale } = locals[node];
             let parent_from_node = DMat4::from_scale_rotation_translation(scale, rotation, translation);
             world[node] = self.parents[node].map_or(DMat4::IDENTITY, |parent| world[parent]) * parent_from_node;
         }
-        world
     }
 
-    /// Time in nanoseconds and `world_from_node` of every node at each key of the first animation.
-    /// Empty when there is no animation or it moves no node.
-    pub fn animated(&self, file: &GltfFile<'_>) -> Result<Vec<(i64, Vec<DMat4>)>, BodyError> {
-        let Some(animation) = file.document.animations().next() else { return Ok(Vec::new()) };
-        let mut curves = Vec::new();
-        for channel in animation.channels() {
-            let what = format!("animation channel {}", channel.index());
-            let property = channel.target().property();
-            let output = channel.sampler().output();
-            let values: Vec<[f64; 4]> = match property {
-                Property::Rotation => file.finite::<4>(&output, &what)?,
-                Property::Translation | Property::Scale => {
-                    file.finite::<3>(&output, &what)?.into_iter().map(|[x, y, z]| [x, y, z, 0.0]).collect()
-                }
-                Property::MorphTargetWeights => continue,
-            };
-            let times = file.finite::<1>(&channel.sampler().input(), &what)?;
-            let nanos: Vec<i64> = times.iter().map(|[secs]| (secs * 1e9).round() as i64).collect();
-            if nanos.is_empty() || nanos.windows(2).any(|pair| pair[0] >= pair[1]) {
-                return Err(file.fail(format!("the key times of {what} do not grow")));
+    /// The joints and the nodes above them, parents before children.
+    fn moving(&self, joint_nodes: &[usize]) -> Vec<usize> {
+        let mut moves = vec![false; self.parents.len()];
+        for &joint in joint_nodes {
+            let mut next = Some(joint);
+            while let Some(node) = next.filter(|&node| !moves[node]) {
+                moves[node] = true;
+                next = self.parents[node];
             }
-            let interpolation = channel.sampler().interpolation();
-            let values_per_key = if interpolation == Interpolation::CubicSpline { 3 } else { 1 };
-            if values.len() != nanos.len() * values_per_key {
-                let (values, keys) = (values.len(), nanos.len());
-                return Err(file.fail(format!("{what} has {values} values for {keys} keys")));
-            }
-            curves.push(Curve { node: channel.target().node().index(), property, nanos, values, interpolation });
         }
-        let mut nanos: Vec<i64> = curves.iter().flat_map(Curve::times_needed).collect();
-        nanos.sort_unstable();
-        nanos.dedup();
-        let pose = |at: i64| {
-            let mut locals = self.locals.clone();
+        self.order.iter().copied().filter(|&node| moves[node]).collect()
+    }
+
+    /// Calls `pose` with the time in nanoseconds and `world_from_node` of the joints and the nodes above them, for each
+    /// key of the first animation in the order of time. Never when there is no animation or it moves no joint. Other
+    /// nodes' matrices hold no meaning.
+    pub fn animate(
+        &self,
+        file: &GltfFile<'_>,
+        joint_nodes: &[usize],
+        mut pose: impl FnMut(i64, &[DMat4]) -> Result<(), BodyError>,
+    ) -> Result<(), BodyError> {
+        let moving = self.moving(joint_nodes);
+        let curves = self.curves(file, &moving)?;
+        let (mut locals, mut world) = (self.locals.clone(), vec![DMat4::IDENTITY; self.locals.len()]);
+        for at in pose_times(file, &curves, moving.len())? {
             for curve in &curves {
                 let value = curve.at(at);
                 let xyz = DVec3::new(value[0], value[1], value[2]);
@@ -130,10 +125,81 @@ impl Nodes {
                     _ => locals[curve.node].translation = xyz,
                 }
             }
-            (at, self.world(&locals))
-        };
-        Ok(nanos.into_iter().map(pose).collect())
+            self.update_world(&moving, &locals, &mut world);
+            pose(at, &world)?;
+        }
+        Ok(())
     }
+
+    /// The channels of the first animation that move one of these nodes.
+    fn curves(&self, file: &GltfFile<'_>, moving: &[usize]) -> Result<Vec<Curve>, BodyError> {
+        let Some(animation) = file.document.animations().next() else { return Ok(Vec::new()) };
+        let mut is_free: Vec<Option<[bool; 3]>> = vec![None; self.parents.len()];
+        for &node in moving {
+            is_free[node] = Some([true; 3]);
+        }
+        // Everything is counted before it is read.
+        let mut channels = Vec::new();
+        let mut keys = 0usize;
+        for channel in animation.channels() {
+            let what = format!("animation channel {}", channel.index());
+            let node = channel.target().node().index();
+            let slot = match channel.target().property() {
+                Property::Translation => 0,
+                Property::Rotation => 1,
+                Property::Scale => 2,
+                Property::MorphTargetWeights => continue,
+            };
+            let Some(is_free) = &mut is_free[node] else { continue };
+            // Without this, channels that share their data would multiply it.
+            if !std::mem::take(&mut is_free[slot]) {
+                return Err(file.fail(format!("{what} moves the same property of node {node} as another one")));
+            }
+            keys = keys.saturating_add(channel.sampler().input().count());
+            file.check_count(&format!("keys up to {what}"), keys, MAX_ANIMATION_KEYS)?;
+            channels.push((channel, node, what));
+        }
+        let curve = |(channel, node, what): (gltf::animation::Channel<'_>, usize, String)| {
+            let (property, interpolation) = (channel.target().property(), channel.sampler().interpolation());
+            let (input, output) = (channel.sampler().input(), channel.sampler().output());
+            let values_per_key = if interpolation == Interpolation::CubicSpline { 3 } else { 1 };
+            let (keys, values) = (input.count(), output.count());
+            if values != keys * values_per_key {
+                return Err(file.fail(format!("{what} has {values} values for {keys} keys")));
+            }
+            let values: Vec<[f64; 4]> = match property {
+                Property::Rotation => file.finite::<4>(&output, &what, values)?,
+                _ => file.finite::<3>(&output, &what, values)?.into_iter().map(|[x, y, z]| [x, y, z, 0.0]).collect(),
+            };
+            let times = file.finite::<1>(&input, &what, keys)?;
+            if let Some([secs]) = times.iter().find(|[secs]| secs.abs() > MAX_KEY_SECS) {
+                return Err(file.fail(format!("{what} has a key at {secs} s, at most {MAX_KEY_SECS} s are allowed")));
+            }
+            let nanos: Vec<i64> = times.iter().map(|[secs]| (secs * 1e9).round() as i64).collect();
+            if nanos.is_empty() || nanos.windows(2).any(|pair| pair[0] >= pair[1]) {
+                return Err(file.fail(format!("the key times of {what} do not grow")));
+            }
+            Ok(Curve { node, property, nanos, values, interpolation })
+        };
+        channels.into_iter().map(curve).collect()
+    }
+}
+
+/// Times of the track's poses, growing: each curve is followed by straight pieces between them.
+fn pose_times(file: &GltfFile<'_>, curves: &[Curve], moving: usize) -> Result<Vec<i64>, BodyError> {
+    let limit = MAX_POSED_NODES / moving.max(1);
+    let what = format!("poses of an animation of {moving} nodes");
+    let mut nanos = Vec::new();
+    for curve in curves {
+        // Counted before they are made: a cubic curve has up to a thousand a key.
+        file.check_count(&what, curve.count_needed(), limit)?;
+        nanos.extend(curve.times_needed());
+        // Merges the sorted runs.
+        nanos.sort();
+        nanos.dedup();
+        file.check_count(&what, nanos.len(), limit)?;
+    }
+    Ok(nanos)
 }
 
 impl Placement {
@@ -162,6 +228,22 @@ struct Curve {
 }
 
 impl Curve {
+    /// Straight pieces that follow the curve between two keys.
+    fn pieces(pair: &[i64]) -> i64 {
+        // A gap of minutes between two keys does not need thousands of poses.
+        ((pair[1] - pair[0]) / CUBIC_STEP_NANOS + 1).min(1000)
+    }
+
+    /// Length of [`Self::times_needed`].
+    fn count_needed(&self) -> usize {
+        let between = match self.interpolation {
+            Interpolation::Linear => 0,
+            Interpolation::Step => self.nanos.len() - 1,
+            Interpolation::CubicSpline => self.nanos.windows(2).map(|pair| (Self::pieces(pair) - 1) as usize).sum(),
+        };
+        self.nanos.len() + between
+    }
+
     /// Where a track with straight pieces has to have keys to follow this curve.
     fn times_needed(&self) -> Vec<i64> {
         let mut times = self.nanos.clone();
@@ -170,9 +252,7 @@ impl Curve {
                 Interpolation::Linear => {}
                 Interpolation::Step => times.push((pair[1] - 1).max(pair[0])),
                 Interpolation::CubicSpline => {
-                    let pieces = (pair[1] - pair[0]) / CUBIC_STEP_NANOS + 1;
-                    // A gap of minutes between two keys does not need thousands of poses.
-                    let pieces = pieces.min(1000);
+                    let pieces = Self::pieces(pair);
                     times.extend((1..pieces).map(|i| pair[0] + (pair[1] - pair[0]) * i / pieces));
                 }
             }

@@ -328,6 +328,9 @@ pub struct WatchArgs {
     /// Vertical field of view of the viewpoint of --eye, degrees.
     #[arg(long, default_value_t = 40.0)]
     pub fov_degrees: f64,
+    /// Most pictures a second of the viewpoint of --eye; viewers share the rig's budget of pixels a second.
+    #[arg(long, default_value_t = 30.0)]
+    pub max_fps: f64,
     /// Write every picture as PNG into this folder, or, when the name ends in .mp4 or .avi, a video.
     #[arg(long)]
     pub out: Option<PathBuf>,

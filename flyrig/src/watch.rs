@@ -1,6 +1,8 @@
 //! `flyrig watch`: a viewer in a process of its own.
 
 use std::{
+    collections::BTreeMap,
+    io::Cursor,
     path::{Path, PathBuf},
     time::{Duration, Instant},
 };
@@ -8,7 +10,8 @@ use std::{
 use anyhow::{Context, Result, bail, ensure};
 use flyrig_report::{png, stop, write_whole};
 use flyrig_transport::{
-    ImageFormat, Interests, Received, Subscriber, TransportConfig, ViewFrame, ViewpointStatus, Views,
+    ImageFormat, Interests, Received, Subscriber, TransportConfig, TransportError, TransportErrorKind, ViewFrame,
+    ViewpointStatus, Views, printable,
 };
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
 use glam::{DVec2, DVec3};
@@ -40,24 +43,55 @@ pub struct WatchStats {
     pub latency_is_exact: Option<bool>,
 }
 
+/// What other programs sent and nobody can use: counted by kind, reported the 1st, 2nd, 4th time. It never ends the command.
+#[derive(Debug, Default)]
+struct Complaints(BTreeMap<&'static str, u64>);
+
+impl Complaints {
+    /// Counts one more; the line to print, if it is time.
+    fn count(&mut self, kind: &'static str, text: impl std::fmt::Display) -> Option<String> {
+        let count = self.0.entry(kind).or_default();
+        *count += 1;
+        count.is_power_of_two().then(|| format!("watch: {text} ({kind}, {count} so far)"))
+    }
+
+    fn add(&mut self, kind: &'static str, text: impl std::fmt::Display) {
+        if let Some(line) = self.count(kind, text) {
+            eprintln!("{line}");
+        }
+    }
+
+    fn add_error(&mut self, error: &TransportError) {
+        let kind = match error.kind {
+            TransportErrorKind::UnknownVersion => "messages of other versions",
+            TransportErrorKind::Malformed => "malformed messages",
+            TransportErrorKind::Config | TransportErrorKind::Session | TransportErrorKind::Closed => "errors",
+        };
+        self.add(kind, error);
+    }
+}
+
 /// Runs the command.
 pub fn watch(args: &WatchArgs) -> Result<()> {
     let mut sink = args.out.as_deref().map(Sink::new).transpose()?;
     let config = TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) };
     let views = if args.eye.is_some() { Views::None } else { Views::Named(vec![args.view.clone()]) };
     let subscriber = Subscriber::open(&config, &Interests { views, splats: false, stats: false })?;
+    let mut complaints = Complaints::default();
     eprintln!("watch: rig '{}' at {}, waiting for pictures (Ctrl-C ends)", args.rig, args.connect);
     if let Some(eye) = args.eye {
         // The rig says which way is up.
         let rig = loop {
-            if let Some(rig) = subscriber.rig(Duration::from_millis(500))? {
-                break rig;
+            match subscriber.rig(Duration::from_millis(500)) {
+                Ok(Some(rig)) => break rig,
+                Ok(None) => {}
+                Err(error) => complaints.add_error(&error),
             }
             if stop::requested() {
                 return Ok(());
             }
         };
-        subscriber.request_viewpoint(&viewpoint(eye, args, rig.world_up)?, 60.0)?;
+        subscriber.request_viewpoint(&viewpoint(eye, args, rig.world_up)?, args.max_fps)?;
     }
 
     let stop = stop::flag();
@@ -77,11 +111,11 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
                 received += 1;
                 first.get_or_insert_with(Instant::now);
                 if let Some(sink) = &mut sink {
-                    sink.write(&picture)?;
+                    sink.write(&picture, &mut complaints)?;
                 }
             }
             Ok(None) => {}
-            Err(error) => eprintln!("watch: {error}"),
+            Err(error) => complaints.add_error(&error),
         }
         if let ViewpointStatus::Refused { reason } = subscriber.viewpoint_status()
             && reason != refused
@@ -186,16 +220,14 @@ impl Sink {
         Ok(Self::Folder(path.to_owned()))
     }
 
-    fn write(&mut self, picture: &Received<ViewFrame>) -> Result<()> {
+    /// Writes a picture; one that cannot be used is skipped. Errors are those of the disk and of the encoder.
+    fn write(&mut self, picture: &Received<ViewFrame>, complaints: &mut Complaints) -> Result<()> {
         let body = &picture.body;
-        let format = match body.format {
-            ImageFormat::Jpeg => image::ImageFormat::Jpeg,
-            ImageFormat::Png => image::ImageFormat::Png,
-        };
-        let rgb = match image::load_from_memory_with_format(&body.bytes, format) {
-            Ok(decoded) => decoded.into_rgb8(),
+        let rgb = match decode(body) {
+            Ok(rgb) => rgb,
             Err(error) => {
-                eprintln!("watch: picture of frame {} cannot be decoded ({error}); skipped", body.frame);
+                let text = format!("picture of frame {} cannot be decoded ({error}); skipped", body.frame);
+                complaints.add("damaged pictures", printable(&text));
                 return Ok(());
             }
         };
@@ -210,11 +242,11 @@ impl Sink {
                     *writer = Some((open_video(path, width, height)?, width, height));
                 }
                 let Some((writer, w, h)) = writer else { return Ok(()) };
-                ensure!(
-                    (*w, *h) == (width, height),
-                    "the view changed its size to {width}x{height} while {} was written",
-                    path.display()
-                );
+                if (*w, *h) != (width, height) {
+                    let text = format!("a picture of {width}x{height} is left out of {}, of {w}x{h}", path.display());
+                    complaints.add("pictures of another size", text);
+                    return Ok(());
+                }
                 let bgr: Vec<Vec3b> = rgb.pixels().map(|p| Vec3b::from([p.0[2], p.0[1], p.0[0]])).collect();
                 let flat = Mat::from_slice(&bgr).context("handing a picture to the video writer")?;
                 writer.write(&flat.reshape(3, height as i32)?).context("writing a video frame")?;
@@ -231,6 +263,22 @@ impl Sink {
     }
 }
 
+/// Decodes a picture of the size that its message states, within that size's memory.
+fn decode(frame: &ViewFrame) -> Result<image::RgbImage> {
+    let format = match frame.format {
+        ImageFormat::Jpeg => image::ImageFormat::Jpeg,
+        ImageFormat::Png => image::ImageFormat::Png,
+    };
+    let mut reader = image::ImageReader::with_format(Cursor::new(&frame.bytes), format);
+    let mut limits = image::Limits::default();
+    (limits.max_image_width, limits.max_image_height) = (Some(frame.width), Some(frame.height));
+    reader.limits(limits);
+    let rgb = reader.decode()?.into_rgb8();
+    let (found, stated) = (rgb.dimensions(), (frame.width, frame.height));
+    ensure!(found == stated, "it is {}x{}, not {}x{}", found.0, found.1, stated.0, stated.1);
+    Ok(rgb)
+}
+
 fn open_video(path: &Path, width: u32, height: u32) -> Result<VideoWriter> {
     let is_avi = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("avi"));
     let code = if is_avi { VideoWriter::fourcc('M', 'J', 'P', 'G') } else { VideoWriter::fourcc('m', 'p', '4', 'v') }?;
@@ -240,4 +288,65 @@ fn open_video(path: &Path, width: u32, height: u32) -> Result<VideoWriter> {
         bail!("cannot write a video to {}; does its folder exist?", path.display());
     }
     Ok(writer)
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_transport::Header;
+
+    use super::*;
+
+    fn picture(bytes: Vec<u8>, width: u32, height: u32) -> Received<ViewFrame> {
+        let header = Header {
+            kind: flyrig_transport::MessageKind::View,
+            sequence: 0,
+            frame: 7,
+            capture_nanos: 0,
+            publish_unix_nanos: 0,
+            host: 0,
+            publisher: 0,
+            width,
+            height,
+        };
+        let format = ImageFormat::Png;
+        let body = ViewFrame { width, height, format, bytes: bytes.into(), frame: 7, capture_nanos: 0 };
+        Received { topic: "main".into(), header, latency_nanos: 0, latency_is_exact: false, body }
+    }
+
+    fn png(width: u32, height: u32) -> Vec<u8> {
+        png::encode_rgb(&vec![90; (width * height * 3) as usize], width, height).unwrap()
+    }
+
+    #[test]
+    fn no_picture_ends_a_recording() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut complaints = Complaints::default();
+        for name in ["pictures", "video.avi"] {
+            let mut sink = Sink::new(&folder.path().join(name)).unwrap();
+            let mut write = |bytes: Vec<u8>, width, height| {
+                sink.write(&picture(bytes, width, height), &mut complaints).unwrap();
+            };
+            write(png(64, 48), 64, 48);
+            for _ in 0..5 {
+                write(b"noise".to_vec(), 64, 48);
+                // Larger than stated, and smaller.
+                write(png(64, 48), 32, 48);
+                write(png(64, 48), 128, 96);
+                write(png(32, 48), 32, 48);
+            }
+            write(png(64, 48), 64, 48);
+            sink.finish().unwrap();
+        }
+        assert!(folder.path().join("pictures/000007.png").exists());
+        assert_eq!(complaints.0["damaged pictures"], 30);
+        assert_eq!(complaints.0["pictures of another size"], 5);
+    }
+
+    #[test]
+    fn complaints_are_reported_the_1st_2nd_and_4th_time() {
+        let mut complaints = Complaints::default();
+        let lines: Vec<String> = (0..100).filter_map(|_| complaints.count("malformed messages", "x: y")).collect();
+        assert_eq!(lines.len(), 7);
+        assert_eq!(lines[6], "watch: x: y (malformed messages, 64 so far)");
+    }
 }

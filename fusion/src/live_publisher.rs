@@ -10,12 +10,14 @@ use std::{
 };
 
 use flyrig_capture::{LatestQueue, PopError};
-use flyrig_renderer::{Splat, composite_over};
-use flyrig_transport::{ImageFormat, Publisher, RigStats, SplatState, StageTime, TrackingStats, ViewFrame, ViewRate};
+use flyrig_renderer::composite_over;
+use flyrig_transport::{
+    ImageFormat, Publisher, RigStats, SplatState, StageTime, SubjectStats, TrackingStats, ViewFrame, ViewRate,
+};
 use flyrig_types::{FrameSet, RenderedView};
 use image::{ExtendedColorType, ImageEncoder as _, codecs::jpeg::JpegEncoder};
 
-use crate::{FusionError, Session};
+use crate::{FusionError, Session, Subject};
 
 /// Views that may wait for compression, all together.
 const WAITING_PICTURES: usize = 8;
@@ -86,20 +88,21 @@ impl LivePublisher {
     /// # Errors
     /// [`FusionError::Gpu`].
     pub fn publish_splats(&self, session: &Session, set: &FrameSet) -> Result<(), FusionError> {
-        let mut state = SplatState {
-            frame: set.index,
-            capture_nanos: set.master_nanos,
-            center_scale: Vec::new(),
-            color: Vec::new(),
-            invalid: 0,
-        };
         for subject in session.subjects() {
-            for Splat { position: [x, y, z], scale_m, color: [r, g, b], opacity, .. } in session.splats(subject.id())? {
-                state.center_scale.push([x, y, z, scale_m[0]]);
-                state.color.push([r, g, b, opacity]);
-            }
+            let splats = session.splats(subject.id())?;
+            let state = SplatState {
+                person: subject.id().0,
+                frame: set.index,
+                capture_nanos: set.master_nanos,
+                center_scale: splats
+                    .iter()
+                    .map(|s| [s.position[0], s.position[1], s.position[2], s.scale_m[0]])
+                    .collect(),
+                color: splats.iter().map(|s| [s.color[0], s.color[1], s.color[2], s.opacity]).collect(),
+                invalid: 0,
+            };
+            self.publisher.publish_splats(Arc::new(state));
         }
-        self.publisher.publish_splats(Arc::new(state));
         Ok(())
     }
 
@@ -136,20 +139,14 @@ impl LivePublisher {
                 .map(|s| StageTime {
                     stage: s.name.clone(),
                     mean_millis: f64::from(s.mean_ms),
-                    max_millis: f64::from(s.p95_ms),
+                    p95_millis: f64::from(s.p95_ms),
                 })
                 .collect(),
             dropped: drops.iter().cloned().chain(self.drops()).collect(),
             views,
             viewers: self.publisher.viewpoint_counts().active as u32,
-            tracking: session.subjects().first().map_or_else(TrackingStats::default, |subject| {
-                let watch = subject.watch();
-                TrackingStats {
-                    state: watch.state().name().to_owned(),
-                    quality: watch.quality(),
-                    cameras: watch.cameras().iter().map(|(id, quality)| (id.to_string(), *quality)).collect(),
-                }
-            }),
+            tracking: TrackingStats::default(),
+            subjects: session.subjects().iter().map(stats_of).collect(),
         };
         if let Err(error) = self.publisher.publish_stats(&stats) {
             tracing::warn!(%error, "statistics not published");
@@ -181,6 +178,16 @@ impl LivePublisher {
             Ok(publisher) => Ok(publisher.close()?),
             Err(_) => Ok(()),
         }
+    }
+}
+
+fn stats_of(subject: &Subject) -> SubjectStats {
+    let watch = subject.watch();
+    SubjectStats {
+        person: subject.id().0,
+        state: watch.state().name().to_owned(),
+        quality: watch.quality(),
+        cameras: watch.cameras().iter().map(|(id, quality)| (id.to_string(), *quality)).collect(),
     }
 }
 

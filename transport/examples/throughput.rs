@@ -62,7 +62,7 @@ fn state(frame: u64) -> SplatState {
         })
         .collect::<Vec<_>>();
     let color = center_scale.iter().map(|c| [0.5 + c[0], 0.4 + c[1], 0.2 + 0.3 * c[2], 1.0]).collect();
-    SplatState { frame, capture_nanos: 0, center_scale, color, invalid: 0 }
+    SplatState { person: 0, frame, capture_nanos: 0, center_scale, color, invalid: 0 }
 }
 
 fn codec() -> Result<(), TransportError> {

@@ -8,12 +8,10 @@ use std::{
 use flyrig_types::{CameraId, Frame};
 
 use crate::{
-    CameraLink, CameraStatus, FRAME_HEADER_BYTES, FrameHeader, Header, MessageKind, SCHEMA_VERSION, TransportError,
-    clock_exchange::Question, header, host_clock::ClockFit, keys,
+    CameraLink, CameraStatus, FrameHeader, Header, MessageKind, SCHEMA_VERSION, TransportError,
+    clock_exchange::Question, header, host_clock::ClockFit, keys, printable,
 };
 
-/// Longest attachment that is looked at.
-pub(crate) const MAX_ATTACHMENT: usize = 4 * FRAME_HEADER_BYTES;
 /// Frames of a camera that may wait for their reader.
 const WAITING: usize = 4;
 /// A publisher of a camera that was silent for so long may be followed by another.
@@ -25,6 +23,8 @@ const OLDEST: i64 = 10_000_000_000;
 const EARLIEST: i64 = 500_000_000;
 /// Computers and names that are remembered.
 const MAX_HOSTS: usize = 256;
+/// Names of others that an error repeats.
+const SHOWN_NAMES: usize = 8;
 /// So often a computer without answers is asked in quick succession.
 const EAGER_QUESTIONS: u32 = 100;
 
@@ -32,6 +32,8 @@ const EAGER_QUESTIONS: u32 = 100;
 pub(crate) struct CameraInbox {
     rig: String,
     slots: Vec<Slot>,
+    /// Most bytes of pictures that wait, over all cameras.
+    quota: u64,
     /// By publisher.
     hosts: BTreeMap<u64, Host>,
     /// Keys of computers that we cannot use: of other rigs, of other versions.
@@ -66,7 +68,7 @@ struct Slot {
 }
 
 impl CameraInbox {
-    pub fn new(rig: &str, cameras: &[CameraId]) -> Self {
+    pub fn new(rig: &str, cameras: &[CameraId], quota: u64) -> Self {
         let slot = |camera: &CameraId| Slot {
             camera: camera.clone(),
             waiting: VecDeque::with_capacity(WAITING),
@@ -80,6 +82,7 @@ impl CameraInbox {
         Self {
             rig: rig.to_owned(),
             slots: cameras.iter().map(slot).collect(),
+            quota,
             hosts: BTreeMap::new(),
             others: BTreeSet::new(),
         }
@@ -185,6 +188,17 @@ impl CameraInbox {
             slot.link.overtaken += 1;
         }
         slot.waiting.push_back(Frame { capture_nanos, ..frame });
+        self.fit();
+    }
+
+    /// Drops the oldest frames of the camera with the most bytes waiting until the quota holds: a camera of huge pictures
+    /// loses its own.
+    fn fit(&mut self) {
+        while self.slots.iter().map(Slot::waiting_bytes).sum::<u64>() > self.quota {
+            let Some(slot) = self.slots.iter_mut().max_by_key(|slot| slot.waiting_bytes()) else { return };
+            slot.waiting.pop_front();
+            slot.link.overtaken += 1;
+        }
     }
 
     /// The oldest frame that waits, or what is to be told first.
@@ -204,6 +218,10 @@ impl CameraInbox {
     }
 
     pub fn absence(&self, camera: &CameraId, connect: &[String]) -> String {
+        printable(&self.absence_of(camera, connect)).into_owned()
+    }
+
+    fn absence_of(&self, camera: &CameraId, connect: &[String]) -> String {
         let Some(slot) = self.slots.iter().find(|slot| slot.camera == *camera) else {
             return "was not asked for".into();
         };
@@ -229,8 +247,13 @@ impl CameraInbox {
                 "no computer of rig '{rig}' sends a camera of this name; compare source.cameras there and here"
             );
         }
-        let quoted =
-            |names: BTreeSet<&str>| names.iter().map(|name| format!("'{name}'")).collect::<Vec<_>>().join(", ");
+        let quoted = |names: BTreeSet<&str>| {
+            let more = if names.len() > SHOWN_NAMES { ", ..." } else { "" };
+            // Whoever is on the network chooses these.
+            let short = |name: &str| name.chars().take(32).collect::<String>();
+            let names: Vec<String> = names.into_iter().take(SHOWN_NAMES).map(|n| format!("'{}'", short(n))).collect();
+            names.join(", ") + more
+        };
         let is_ours = |key: &&String| keys::rig_in(key) == Some(rig.as_str());
         let versions: BTreeSet<&str> =
             self.others.iter().filter(is_ours).filter_map(|key| keys::version_in(key)).collect();
@@ -256,6 +279,10 @@ impl CameraInbox {
 }
 
 impl Slot {
+    fn waiting_bytes(&self) -> u64 {
+        self.waiting.iter().map(|frame| frame.image.bytes().len() as u64).sum()
+    }
+
     /// Counts what is missing before this message. A camera has one publisher at a time.
     fn follow(&mut self, header: &FrameHeader, hosts: &BTreeMap<u64, Host>) -> Result<(), TransportError> {
         let FrameHeader { header: Header { publisher, sequence, .. }, withheld, .. } = *header;

@@ -9,6 +9,7 @@ use zenoh::{Wait, liveliness::LivelinessToken};
 use crate::{
     CameraStatus, Header, HostClock, MessageKind, PublishOutcome, TopicCounts, TransportConfig, TransportError,
     clock_exchange,
+    config::LARGEST_QUESTION,
     drain::{Drain, DrainThread, Shared, empty_header},
     frame::MAX_FRAME_BYTES,
     keys,
@@ -60,10 +61,10 @@ impl CameraPublisher {
             })
         };
         let cameras: Vec<Lane> = cameras.iter().map(lane).collect::<Result<_, TransportError>>()?;
-        let (session, endpoints) = open_session(config)?;
+        let (session, endpoints) = open_session(config, LARGEST_QUESTION)?;
         let failed = |error: zenoh::Error| TransportError::session(format!("cameras of rig {rig}"), &error);
         let topics: Vec<_> = cameras.iter().flat_map(|lane| [lane.frames.clone(), lane.status.clone()]).collect();
-        let (shared, woken) = Shared::new(rig, &session, &topics, Leases::new(0, Duration::ZERO));
+        let (shared, woken) = Shared::new(rig, &session, &topics, Leases::new(0, Duration::ZERO, 0));
         let host = session.zid().to_string();
         clock_exchange::answer(&session, keys::key(rig, &format!("clock/{host}")), clock).map_err(failed)?;
         let alive = keys::key(rig, &format!("host/{host}"));

@@ -10,9 +10,11 @@ use zenoh::{Session, Wait, sample::Sample, sample::SampleKind};
 
 use crate::{
     CameraStatus, ClockEstimate, HostClock, TransportConfig, TransportError,
-    camera_inbox::{CameraInbox, MAX_ATTACHMENT},
+    camera_inbox::CameraInbox,
     clock_exchange::{Asker, Question},
+    config::LARGEST_QUESTION,
     frame::MAX_FRAME_BYTES,
+    header::MAX_ATTACHMENT,
     keys,
     publisher::open_session,
     stats::MAX_JSON_BYTES,
@@ -28,7 +30,8 @@ pub struct CameraLink {
     pub withheld: u64,
     /// Frames that left and never came.
     pub lost: u64,
-    /// Frames that newer ones overtook here before they were read.
+    /// Frames that newer ones overtook here before they were read, or that were dropped because too many bytes waited over
+    /// all cameras.
     pub overtaken: u64,
     /// Messages that could not be used; the errors tell why.
     pub refused: u64,
@@ -58,6 +61,7 @@ struct Shared {
     inbox: Mutex<CameraInbox>,
     changed: Condvar,
     clock: HostClock,
+    inbox_bytes: u64,
 }
 
 impl std::fmt::Debug for CameraSubscriber {
@@ -77,13 +81,14 @@ impl CameraSubscriber {
         for camera in cameras {
             keys::check_name("camera", camera.as_str())?;
         }
-        let (session, _) = open_session(config)?;
+        let (session, _) = open_session(config, MAX_FRAME_BYTES + LARGEST_QUESTION)?;
         let failed = |error: zenoh::Error| TransportError::session(format!("cameras of rig {rig}"), &error);
         let shared = Arc::new(Shared {
             rig: rig.clone(),
-            inbox: Mutex::new(CameraInbox::new(rig, cameras)),
+            inbox: Mutex::new(CameraInbox::new(rig, cameras, config.inbox_bytes)),
             changed: Condvar::new(),
             clock: clock.clone(),
+            inbox_bytes: config.inbox_bytes,
         });
         for camera in cameras {
             for label in [keys::frames_label(camera), keys::status_label(camera)] {
@@ -183,11 +188,16 @@ impl Shared {
         let attachment = sample.attachment().filter(|bytes| bytes.len() <= MAX_ATTACHMENT);
         let attachment = attachment.map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
         // What is too long is not even copied.
-        let limit = if is_status { MAX_JSON_BYTES } else { MAX_FRAME_BYTES };
         let length = sample.payload().len();
-        let payload = (length <= limit)
-            .then(|| sample.payload().to_bytes().into_owned())
-            .ok_or_else(|| TransportError::malformed(key, format!("{length} bytes, at most {limit}")));
+        let limit = match is_status {
+            true => MAX_JSON_BYTES,
+            false => MAX_FRAME_BYTES.min(usize::try_from(self.inbox_bytes).unwrap_or(usize::MAX)),
+        };
+        let too_long = || {
+            let mend = if !is_status && limit < MAX_FRAME_BYTES { "; raise inbox-bytes" } else { "" };
+            TransportError::malformed(key, format!("{length} bytes, at most {limit}{mend}"))
+        };
+        let payload = (length <= limit).then(|| sample.payload().to_bytes().into_owned()).ok_or_else(too_long);
         let now_nanos = self.clock.now_nanos();
         let mut inbox = lock(&self.inbox);
         if is_status {

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use zenoh::Config;
 
-use crate::{TransportError, keys, view::MAX_IMAGE_BYTES};
+use crate::{TransportError, keys};
 
 /// Where a rig is found and how its sessions behave; one structure for both sides.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -26,7 +26,19 @@ pub struct TransportConfig {
     pub max_viewers: usize,
     /// Publisher: how long a viewpoint lives without being renewed, milliseconds.
     pub viewpoint_lease_millis: u64,
+    /// Publisher: pixels a second that all viewpoints may ask for together, width * height * frame rate each; more is
+    /// refused. The default is four viewers with 512x512 pixels at 30 a second.
+    pub viewpoint_pixels_per_second: u64,
+    /// Receiving side: bytes of payload that may wait for their reader, over all topics or cameras. Beyond it the largest
+    /// waiting payloads are dropped and counted; a single message over it is refused. 64 KiB to 4 GiB.
+    pub inbox_bytes: u64,
 }
+
+/// What other programs may send to a publisher: questions for viewpoints and clocks, a message each.
+pub(crate) const LARGEST_QUESTION: usize = 1 << 20;
+
+/// Range of [`TransportConfig::inbox_bytes`].
+const INBOX_BYTES: std::ops::RangeInclusive<u64> = 1 << 16..=1 << 32;
 
 /// Endpoint where a publisher listens unless told otherwise.
 const DEFAULT_ENDPOINT: &str = "tcp/127.0.0.1:7447";
@@ -42,6 +54,9 @@ impl Default for TransportConfig {
             express: false,
             max_viewers: 4,
             viewpoint_lease_millis: 3000,
+            viewpoint_pixels_per_second: 512 * 512 * 30 * 4,
+            // Four waiting pictures of 1280x720 YUYV from each of 16 cameras are 118 MB.
+            inbox_bytes: 256 << 20,
         }
     }
 }
@@ -85,17 +100,23 @@ impl TransportConfig {
                 format!("is {}, expected 100 to 600000", self.viewpoint_lease_millis),
             ));
         }
+        if !INBOX_BYTES.contains(&self.inbox_bytes) {
+            let (min, max) = (INBOX_BYTES.start(), INBOX_BYTES.end());
+            return Err(TransportError::config(
+                "inbox-bytes",
+                format!("is {}, expected {min} to {max}", self.inbox_bytes),
+            ));
+        }
         if self.max_viewers > 64 {
             return Err(TransportError::config("max-viewers", format!("is {}, at most 64", self.max_viewers)));
         }
         Ok(())
     }
 
-    /// The zenoh configuration that this means.
-    pub(crate) fn zenoh(&self, listen: &[String]) -> Result<Config, TransportError> {
+    /// The zenoh configuration that this means. `largest` is the size of the largest message that anybody may send to
+    /// this session, bytes: a connection with a larger one is ended by zenoh before the message is assembled.
+    pub(crate) fn zenoh(&self, listen: &[String], largest: usize) -> Result<Config, TransportError> {
         let list = |endpoints: &[String]| serde_json::json!(endpoints).to_string();
-        // Twice the largest picture is room for every message that we make.
-        let largest = (2 * MAX_IMAGE_BYTES).max(crate::splats::MAX_BYTES).max(crate::MAX_FRAME_BYTES + (1 << 20));
         let settings = [
             ("mode", "\"peer\"".to_owned()),
             ("listen/endpoints", list(listen)),
@@ -129,7 +150,7 @@ mod tests {
     fn every_setting_is_known_to_zenoh() {
         for config in [TransportConfig::publisher("a"), TransportConfig::subscriber("a")] {
             config.validate().unwrap();
-            config.zenoh(&config.listen).unwrap();
+            config.zenoh(&config.listen, LARGEST_QUESTION).unwrap();
         }
     }
 
@@ -142,6 +163,9 @@ mod tests {
         assert!(refused(TransportConfig { listen: vec!["udp/1.2.3.4:5".into()], ..good.clone() }).contains("udp/"));
         assert!(refused(TransportConfig::default()).contains("meets nobody"));
         assert!(refused(TransportConfig { viewpoint_lease_millis: 0, ..good.clone() }).contains("lease"));
+        for inbox_bytes in [0, 1000, u64::MAX] {
+            assert!(refused(TransportConfig { inbox_bytes, ..good.clone() }).contains("inbox-bytes"));
+        }
         assert!(refused(TransportConfig { max_viewers: 1000, ..good }).contains("max-viewers"));
     }
 }

@@ -1,5 +1,7 @@
 //! What can go wrong on the wire.
 
+use crate::printable;
+
 /// Sort of a [`TransportError`], for those who decide what to do next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TransportErrorKind {
@@ -15,7 +17,7 @@ pub enum TransportErrorKind {
     Closed,
 }
 
-/// An error that names the thing and the mend.
+/// An error that names the thing and the mend. Both texts are [`printable`]: either may repeat what another program sent.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{topic}: {message}")]
 pub struct TransportError {
@@ -29,7 +31,8 @@ pub struct TransportError {
 
 impl TransportError {
     pub(crate) fn new(kind: TransportErrorKind, topic: impl Into<String>, message: impl Into<String>) -> Self {
-        Self { kind, topic: topic.into(), message: message.into() }
+        let (topic, message) = (topic.into(), message.into());
+        Self { kind, topic: printable(&topic).into_owned(), message: printable(&message).into_owned() }
     }
 
     pub(crate) fn config(topic: impl Into<String>, message: impl Into<String>) -> Self {

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::{
     HEADER_BYTES, Header, MessageKind, TransportError,
     header::Reader,
+    printable::clean,
     stats::{from_json, to_json},
 };
 
@@ -140,9 +141,6 @@ pub struct CameraStatus {
     pub overtaken: u64,
 }
 
-/// Longest text of a status that is kept.
-const MAX_TEXT: usize = 500;
-
 impl CameraStatus {
     /// As JSON.
     ///
@@ -152,15 +150,14 @@ impl CameraStatus {
         to_json("camera status", self)
     }
 
-    /// Out of JSON.
+    /// Out of JSON; the texts are [`crate::printable`].
     ///
     /// # Errors
     /// `UnknownVersion` or `Malformed`.
     pub fn decode(bytes: &[u8]) -> Result<Self, TransportError> {
         let mut status: Self = from_json("camera status", bytes)?;
-        // It goes to terminals and logs.
         for text in [&mut status.host, &mut status.mode, &mut status.problem] {
-            *text = text.chars().filter(|c| !c.is_control()).take(MAX_TEXT).collect();
+            clean(text);
         }
         Ok(status)
     }
@@ -229,10 +226,11 @@ mod tests {
 
     #[test]
     fn a_status_comes_back_without_what_harms_terminals() {
-        let status =
-            CameraStatus { host: "pi\x1b[2J".into(), problem: "x".repeat(5000), frames: 3, ..Default::default() };
+        let (host, mode) = ("pi\x1b[2J".into(), "\u{202e}GPJM\n".into());
+        let status = CameraStatus { host, mode, problem: "x".repeat(5000), frames: 3, ..Default::default() };
         let found = CameraStatus::decode(&status.encode().unwrap()).unwrap();
-        assert_eq!((found.host.as_str(), found.problem.len(), found.frames), ("pi[2J", 500, 3));
+        assert_eq!((found.host.as_str(), found.problem.len(), found.frames), ("pi\\u{1b}[2J", 500, 3));
+        assert_eq!(found.mode, "\\u{202e}GPJM\\n");
         assert!(CameraStatus::decode(b"{\"schema_version\":1}").is_err());
     }
 }

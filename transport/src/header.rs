@@ -10,6 +10,9 @@ pub const SCHEMA_VERSION: u16 = 1;
 /// Bytes of an encoded [`Header`].
 pub const HEADER_BYTES: usize = 64;
 
+/// Longest attachment that is looked at, bytes.
+pub(crate) const MAX_ATTACHMENT: usize = 4 * HEADER_BYTES;
+
 const MAGIC: [u8; 4] = *b"FLYR";
 
 /// Which payload a message has.

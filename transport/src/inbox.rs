@@ -1,4 +1,4 @@
-//! What has come in and waits for its reader: one slot a topic, the newest wins.
+//! What has come in and waits for its reader: one slot a topic, the newest wins, bounded in bytes over all topics.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -16,9 +16,9 @@ use crate::{
     calibration::{RigTransforms, decode_calibration, decode_transforms},
     header, keys,
     report::{Tally, TopicReport},
-    splats,
+    splats::{self, MAX_PERSON_TOPICS},
     topic::lock,
-    view::MAX_IMAGE_BYTES,
+    view,
 };
 
 /// Most topics that a subscriber keeps slots for.
@@ -39,15 +39,23 @@ pub(crate) struct Raw {
 #[derive(Debug, Default)]
 struct Slot {
     raw: Option<Raw>,
+    /// Number of the message that came last, over all topics.
+    arrival: u64,
     tally: Tally,
 }
 
 #[derive(Debug, Default)]
 struct State {
     slots: BTreeMap<String, Slot>,
+    /// Messages that came, over all topics.
+    arrivals: u64,
+    /// Payload bytes in all slots.
+    waiting: u64,
     /// Label that was served last, for turns.
     served: String,
     errors: VecDeque<TransportError>,
+    /// Whether the reader got an error last: then a message goes first, so that errors never hold messages up.
+    erred: bool,
     unreadable: u64,
     /// With the publisher it came from: calibrations of two publishers are never mixed.
     lenses: BTreeMap<CameraId, (u64, Intrinsics)>,
@@ -61,14 +69,51 @@ pub(crate) struct Inbox {
     state: Mutex<State>,
     changed: Condvar,
     host: u64,
+    /// Most payload bytes in all slots.
+    quota: u64,
     /// Label and name of our own viewpoint's view.
     own_view: (String, String),
 }
 
+impl State {
+    /// Takes the payload out of a slot.
+    fn take(&mut self, label: &str) -> Option<Raw> {
+        let raw = self.slots.get_mut(label)?.raw.take()?;
+        self.waiting -= raw.payload.len() as u64;
+        Some(raw)
+    }
+
+    /// Drops payloads of other topics than `label` until `bytes` more fit: the largest first, so that a topic of huge
+    /// messages loses its own.
+    fn make_room(&mut self, label: &str, bytes: u64, quota: u64) {
+        while self.waiting.saturating_add(bytes) > quota {
+            let size = |slot: &Slot| slot.raw.as_ref().map(|raw| (raw.payload.len(), u64::MAX - slot.arrival));
+            let largest = self.slots.iter().filter(|(other, _)| *other != label).max_by_key(|(_, slot)| size(slot));
+            let Some(other) = largest.filter(|(_, slot)| slot.raw.is_some()).map(|(other, _)| other.clone()) else {
+                return;
+            };
+            self.take(&other);
+            if let Some(slot) = self.slots.get_mut(&other) {
+                slot.tally.totals.dropped += 1;
+            }
+        }
+    }
+
+    /// Forgets the person whose splats came longest ago when there are as many as are kept: persons come and go for days.
+    fn forget_person(&mut self) {
+        let persons = self.slots.iter().filter(|(label, _)| label.starts_with(keys::PERSON_SPLATS));
+        let oldest = persons.clone().min_by_key(|(_, slot)| slot.arrival).map(|(label, _)| label.clone());
+        if let Some(oldest) = oldest.filter(|_| persons.count() >= MAX_PERSON_TOPICS) {
+            self.take(&oldest);
+            self.slots.remove(&oldest);
+        }
+    }
+}
+
 impl Inbox {
-    pub(crate) fn new(own_view_name: String) -> Self {
+    pub(crate) fn new(own_view_name: String, quota: u64) -> Self {
         let own_view = (keys::view_label(&own_view_name), own_view_name);
-        Self { state: Mutex::default(), changed: Condvar::new(), host: header::host_id(), own_view }
+        Self { state: Mutex::default(), changed: Condvar::new(), host: header::host_id(), quota, own_view }
     }
 
     /// Name of a view for its reader; `None` for other topics.
@@ -80,14 +125,11 @@ impl Inbox {
     pub(crate) fn receive(&self, sample: &Sample) {
         let (now, unix_nanos) = (Instant::now(), header::unix_nanos());
         let key = sample.key_expr().as_str();
-        let attachment = sample.attachment().map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
+        let attachment = sample.attachment().filter(|bytes| bytes.len() <= header::MAX_ATTACHMENT);
+        let attachment = attachment.map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
         // The payload may lie in memory that the publisher takes back when we stall: copy it now.
-        let payload = |limit: usize| {
-            let len = sample.payload().len();
-            let too_long = || TransportError::malformed(key, format!("{len} bytes, at most {limit}"));
-            if len > limit { Err(too_long()) } else { Ok(Bytes::from(sample.payload().to_bytes().into_owned())) }
-        };
-        if let Err(error) = self.accept(key, &attachment, payload, now, unix_nanos) {
+        let (len, payload) = (sample.payload().len(), || Bytes::from(sample.payload().to_bytes().into_owned()));
+        if let Err(error) = self.accept(key, &attachment, len, payload, now, unix_nanos) {
             self.refuse(error);
         }
     }
@@ -96,24 +138,45 @@ impl Inbox {
         &self,
         key: &str,
         attachment: &[u8],
-        payload: impl Fn(usize) -> Result<Bytes, TransportError>,
+        len: usize,
+        payload: impl Fn() -> Bytes,
         now: Instant,
         unix_nanos: i64,
     ) -> Result<(), TransportError> {
         let header = Header::decode(key, attachment)?;
         let label = keys::label_in(key).unwrap_or_default();
+        let malformed = |message: String| TransportError::malformed(key, message);
+        // Names reach the reader, and a slot keeps its name.
+        for (prefix, what) in [("view/", "view"), ("calibration/", "camera")] {
+            if let Some(name) = label.strip_prefix(prefix) {
+                keys::check_name(what, name).map_err(|error| malformed(error.to_string()))?;
+            }
+        }
+        if let Some(person) = label.strip_prefix(keys::PERSON_SPLATS)
+            && person.parse().map(keys::splats_label).as_deref() != Ok(label)
+        {
+            return Err(malformed("names no person; expected a number".to_owned()));
+        }
         let (expected, limit) = match label {
             "splats" => (MessageKind::Splats, splats::MAX_BYTES),
             "stats" => (MessageKind::Stats, crate::stats::MAX_JSON_BYTES),
             "transforms" => (MessageKind::Transforms, crate::calibration::MAX_BYTES),
+            _ if label.starts_with(keys::PERSON_SPLATS) => (MessageKind::Splats, splats::MAX_BYTES),
             _ if label.starts_with("calibration/") => (MessageKind::Calibration, crate::calibration::MAX_BYTES),
-            _ => (MessageKind::View, 2 * MAX_IMAGE_BYTES),
+            _ => (MessageKind::View, view::MAX_MESSAGE_BYTES),
         };
         if header.kind != expected {
             let found = header.kind;
-            return Err(TransportError::malformed(key, format!("holds {found:?}, expected {expected:?}")));
+            return Err(malformed(format!("holds {found:?}, expected {expected:?}")));
         }
-        let payload = payload(limit)?;
+        if len > limit {
+            return Err(malformed(format!("{len} bytes, at most {limit}")));
+        }
+        if len as u64 > self.quota {
+            let quota = self.quota;
+            return Err(malformed(format!("{len} bytes, over the inbox of {quota} bytes; raise inbox-bytes")));
+        }
+        let payload = payload();
         let mut state = lock(&self.state);
         match header.kind {
             MessageKind::Calibration => {
@@ -131,17 +194,26 @@ impl Inbox {
             | MessageKind::CameraStatus => {}
         }
         if state.slots.len() >= MAX_TOPICS && !state.slots.contains_key(label) {
-            return Err(TransportError::malformed(key, format!("more than {MAX_TOPICS} topics")));
+            return Err(malformed(format!("more than {MAX_TOPICS} topics")));
         }
+        if label.starts_with(keys::PERSON_SPLATS) && !state.slots.contains_key(label) {
+            state.forget_person();
+        }
+        let waits = !matches!(expected, MessageKind::Calibration | MessageKind::Transforms);
+        let is_replaced = waits && state.take(label).is_some();
+        if waits {
+            state.make_room(label, payload.len() as u64, self.quota);
+            state.waiting += payload.len() as u64;
+        }
+        state.arrivals += 1;
+        let arrival = state.arrivals;
         let slot = state.slots.entry(label.to_owned()).or_default();
+        slot.arrival = arrival;
         let exact = self.host != 0 && header.host == self.host;
         let latency_nanos = unix_nanos.saturating_sub(header.publish_unix_nanos);
         slot.tally.add(&header, payload.len(), now, latency_nanos, exact);
-        if !matches!(expected, MessageKind::Calibration | MessageKind::Transforms)
-            && slot.raw.replace(Raw { header, payload, latency_nanos, exact }).is_some()
-        {
-            slot.tally.totals.replaced += 1;
-        }
+        slot.tally.totals.replaced += u64::from(is_replaced);
+        slot.raw = waits.then_some(Raw { header, payload, latency_nanos, exact });
         drop(state);
         self.changed.notify_all();
         Ok(())
@@ -191,15 +263,15 @@ impl Inbox {
             let after = (Bound::Excluded(state.served.as_str()), Bound::Unbounded);
             let label =
                 state.slots.range::<str, _>(after).find_map(ready).or_else(|| state.slots.iter().find_map(ready))?;
-            let raw = state.slots.get_mut(&label)?.raw.take()?;
+            let raw = state.take(&label)?;
             state.served.clone_from(&label);
             Some((label, raw))
         })
     }
 
-    /// The whole rig once its parts have come.
+    /// The whole rig once its parts have come. Parts that make no valid rig are forgotten, so that they are reported once.
     pub(crate) fn rig(&self, timeout: Duration) -> Result<Option<Rig>, TransportError> {
-        let rig = self.wait(timeout, |state| {
+        let rig = |state: &State| {
             let (publisher, places) = state.places.as_ref()?;
             let cameras = places.camera_from_world.iter().map(|(id, camera_from_world)| {
                 let (from, intrinsics) = state.lenses.get(id)?;
@@ -207,11 +279,19 @@ impl Inbox {
                 (from == publisher).then_some(camera)
             });
             Some(Rig { cameras: cameras.collect::<Option<_>>()?, world_up: places.world_up })
+        };
+        let checked = self.wait(timeout, |state| {
+            let rig = rig(state)?;
+            Some(match rig.validate() {
+                Ok(()) => Ok(rig),
+                Err(error) => {
+                    state.places = None;
+                    state.unreadable += 1;
+                    Err(TransportError::malformed("calibration", error.to_string()))
+                }
+            })
         })?;
-        if let Some(rig) = &rig {
-            rig.validate().map_err(|error| TransportError::malformed("calibration", error.to_string()))?;
-        }
-        Ok(rig)
+        checked.transpose()
     }
 
     fn wait<T>(
@@ -222,11 +302,19 @@ impl Inbox {
         let deadline = Instant::now() + timeout;
         let mut state: MutexGuard<'_, State> = lock(&self.state);
         loop {
-            if let Some(error) = state.errors.pop_front() {
+            if !state.erred
+                && let Some(error) = state.errors.pop_front()
+            {
+                state.erred = true;
                 return Err(error);
             }
+            state.erred = false;
             if let Some(value) = ready(&mut state) {
                 return Ok(Some(value));
+            }
+            if let Some(error) = state.errors.pop_front() {
+                state.erred = true;
+                return Err(error);
             }
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
@@ -259,17 +347,115 @@ pub(crate) fn as_malformed(error: TransportError) -> TransportError {
 
 #[cfg(test)]
 mod tests {
+    use flyrig_types::{Isometry, Lens};
+
     use super::*;
     use crate::drain::empty_header;
 
+    const QUOTA: u64 = 1 << 20;
+
+    fn put_bytes(inbox: &Inbox, key: &str, kind: MessageKind, len: usize) -> Result<(), TransportError> {
+        let header = Header { kind, ..empty_header() };
+        inbox.accept(key, &header.encode(), len, || vec![7; len].into(), Instant::now(), 0)
+    }
+
     fn put(inbox: &Inbox, key: &str, header: &Header) -> Result<(), TransportError> {
-        let payload = |_| Ok(Bytes::from_static(b"x"));
-        inbox.accept(key, &header.encode(), payload, Instant::now(), 0)
+        inbox.accept(key, &header.encode(), 1, || Bytes::from_static(b"x"), Instant::now(), 0)
+    }
+
+    fn report(inbox: &Inbox, label: &str) -> TopicReport {
+        inbox.reports().into_iter().find(|(other, _)| other == label).unwrap().1
+    }
+
+    #[test]
+    fn bytes_are_bounded_over_all_topics_and_the_largest_are_dropped() {
+        let inbox = Inbox::new("viewer-me".to_owned(), 1000);
+        let view = |name: &str, len| put_bytes(&inbox, &format!("flyrig/v1/r/view/{name}"), MessageKind::View, len);
+        view("small", 100).unwrap();
+        for n in 0..50 {
+            view(&format!("huge{}", n % 5), 450).unwrap();
+            assert!(lock(&inbox.state).waiting <= 1000);
+        }
+        let dropped = |label: &str| report(&inbox, label).dropped;
+        assert_eq!(dropped("view/small"), 0, "the small one made room for the large ones");
+        // 50 came: two wait, the others were dropped or replaced.
+        let gone: u64 = (0..5).map(|n| report(&inbox, &format!("view/huge{n}"))).map(|r| r.dropped + r.replaced).sum();
+        assert_eq!(gone, 48);
+        // One that fills the inbox by itself is let in; one byte more is refused by name.
+        view("whole", 1000).unwrap();
+        assert_eq!(dropped("view/small"), 1);
+        let error = view("more", 1001).unwrap_err();
+        assert!(error.to_string().contains("view/more: 1001 bytes, over the inbox of 1000 bytes"), "{error}");
+        let (label, raw) = inbox.next(Duration::ZERO, |_| true).unwrap().unwrap();
+        assert_eq!((label.as_str(), raw.payload.len()), ("view/whole", 1000));
+        assert!(inbox.next(Duration::ZERO, |_| true).unwrap().is_none());
+        assert_eq!(lock(&inbox.state).waiting, 0);
+        // Replacing the own message needs no room of others.
+        view("small", 600).unwrap();
+        view("other", 400).unwrap();
+        view("small", 600).unwrap();
+        assert_eq!((dropped("view/other"), report(&inbox, "view/small").replaced), (0, 1));
+    }
+
+    #[test]
+    fn persons_come_and_go_without_end() {
+        let inbox = Inbox::new("viewer-me".to_owned(), QUOTA);
+        for person in 1..1000 {
+            let key = format!("flyrig/v1/r/{}", keys::splats_label(person));
+            put_bytes(&inbox, &key, MessageKind::Splats, 100).unwrap();
+            assert!(inbox.reports().len() <= MAX_PERSON_TOPICS && lock(&inbox.state).waiting <= 1600);
+        }
+        let labels: Vec<String> = inbox.reports().into_iter().map(|(label, _)| label).collect();
+        assert!(labels.contains(&"splats/999".to_owned()) && labels.contains(&"splats/984".to_owned()), "{labels:?}");
+        for bad in ["splats/", "splats/-1", "splats/01", "splats/+1", "splats/0", "splats/4294967296", "splats/x"] {
+            let error = put_bytes(&inbox, &format!("flyrig/v1/r/{bad}"), MessageKind::Splats, 1).unwrap_err();
+            assert!(error.to_string().contains("names no person"), "{error}");
+        }
+    }
+
+    #[test]
+    fn names_that_harm_terminals_are_refused_and_errors_hold_no_message_up() {
+        let inbox = Inbox::new("viewer-me".to_owned(), QUOTA);
+        for name in ["\u{1b}[2J", "a b", &"x".repeat(65)] {
+            let error = put_bytes(&inbox, &format!("flyrig/v1/r/view/{name}"), MessageKind::View, 1).unwrap_err();
+            assert!(error.to_string().contains("view name") && !error.to_string().contains('\u{1b}'), "{error}");
+        }
+        put_bytes(&inbox, "flyrig/v1/r/view/a", MessageKind::View, 1).unwrap();
+        let next = || inbox.next(Duration::ZERO, |_| true);
+        inbox.refuse(TransportError::malformed("x", "first"));
+        assert!(next().is_err());
+        for n in 0..3 {
+            inbox.refuse(TransportError::malformed("x", format!("flood {n}")));
+        }
+        assert_eq!(next().unwrap().unwrap().0, "view/a");
+        assert!(next().is_err());
+    }
+
+    #[test]
+    fn a_rig_that_cannot_be_is_reported_once() {
+        let inbox = Inbox::new("viewer-me".to_owned(), QUOTA);
+        let places = RigTransforms {
+            camera_from_world: vec![("twice".into(), Isometry::IDENTITY); 2],
+            world_up: glam::DVec3::Z,
+        };
+        let lens = Intrinsics {
+            width: 64,
+            height: 48,
+            focal_px: glam::DVec2::splat(50.0),
+            center_px: glam::DVec2::splat(20.0),
+            lens: Lens::PINHOLE,
+        };
+        let mut state = lock(&inbox.state);
+        state.places = Some((1, places));
+        state.lenses.insert("twice".into(), (1, lens));
+        drop(state);
+        assert_eq!(inbox.rig(Duration::ZERO).unwrap_err().kind, TransportErrorKind::Malformed);
+        assert_eq!((inbox.rig(Duration::ZERO), inbox.unreadable()), (Ok(None), 1));
     }
 
     #[test]
     fn views_take_turns_and_the_newest_wins() {
-        let inbox = Inbox::new("viewer-me".to_owned());
+        let inbox = Inbox::new("viewer-me".to_owned(), QUOTA);
         for sequence in 0..3 {
             for view in ["a", "b"] {
                 let header = Header { kind: MessageKind::View, sequence, ..empty_header() };
@@ -288,7 +474,7 @@ mod tests {
 
     #[test]
     fn topics_kinds_and_errors_are_bounded() {
-        let inbox = Inbox::new("viewer-me".to_owned());
+        let inbox = Inbox::new("viewer-me".to_owned(), QUOTA);
         let header = Header { kind: MessageKind::View, ..empty_header() };
         for i in 0..MAX_TOPICS {
             put(&inbox, &format!("flyrig/v1/r/view/{i}"), &header).unwrap();

@@ -35,6 +35,19 @@ pub(crate) fn view_label(name: &str) -> String {
     }
 }
 
+/// Labels of the splats of others than the first person begin so.
+pub(crate) const PERSON_SPLATS: &str = "splats/";
+
+/// Last parts of the key where a person's splats go; the first person's are where a rig of one person has them.
+pub(crate) fn splats_label(person: u32) -> String {
+    if person == 0 { "splats".to_owned() } else { format!("{PERSON_SPLATS}{person}") }
+}
+
+/// Whether a label is that of splats.
+pub(crate) fn is_splats(label: &str) -> bool {
+    label == "splats" || label.starts_with(PERSON_SPLATS)
+}
+
 /// Liveliness of publishers of any schema version.
 pub(crate) fn any_version_alive(rig: &str) -> String {
     format!("flyrig/*/{rig}/alive/*")

@@ -8,7 +8,7 @@
 //! |---|---|
 //! | `view/<name>` | foxglove `CompressedImage`, protobuf |
 //! | `viewer/<subscriber>/view` | the same, a subscriber's own viewpoint |
-//! | `splats` | [`SplatState`], own binary layout |
+//! | `splats`, `splats/<person>` | [`SplatState`] of the first person and of the others, own binary layout |
 //! | `calibration/<camera>` | foxglove `CameraCalibration`, protobuf |
 //! | `transforms` | foxglove `FrameTransforms`: `world_from_camera` of every camera and the world's up |
 //! | `stats` | [`RigStats`], JSON |
@@ -24,7 +24,9 @@
 //!
 //! - Publishing never waits for the network: each topic has one slot, the newest message wins, the
 //!   rest are counted, one named thread drains the slots.
-//! - Nothing that arrives makes a decoder panic or allocate more than its payload's size allows.
+//! - Nothing that arrives makes a decoder panic or allocate more than its payload's size allows. What waits for a reader
+//!   is bounded in bytes ([`TransportConfig::inbox_bytes`]).
+//! - Text of other programs reaches the caller [`printable`].
 //! - A subscriber may start before the publisher, stall, die, come back; a publisher may restart.
 
 mod calibration;
@@ -40,6 +42,7 @@ mod header;
 mod host_clock;
 mod inbox;
 mod keys;
+mod printable;
 mod publisher;
 mod renewal;
 mod report;
@@ -58,10 +61,11 @@ pub use error::{TransportError, TransportErrorKind};
 pub use frame::{CameraStatus, FRAME_HEADER_BYTES, FrameHeader, MAX_FRAME_BYTES};
 pub use header::{HEADER_BYTES, Header, MessageKind, SCHEMA_VERSION};
 pub use host_clock::{ClockEstimate, HostClock};
+pub use printable::{MAX_PRINTABLE, printable};
 pub use publisher::{Publisher, ViewpointCounts};
 pub use report::{LatencyReport, TopicReport};
-pub use splats::{MAX_SPLATS, SplatState};
-pub use stats::{RigStats, StageTime, TrackingStats, ViewRate};
+pub use splats::{MAX_PERSON_TOPICS, MAX_SPLATS, SplatState};
+pub use stats::{RigStats, StageTime, SubjectStats, TrackingStats, ViewRate};
 pub use subscriber::{Interests, Received, Subscriber, Views};
 pub use topic::{PublishOutcome, TopicCounts};
 pub use view::{ImageFormat, MAX_IMAGE_BYTES, ViewFrame};

@@ -1,8 +1,9 @@
 //! The rig's side.
 
 use std::{
+    collections::BTreeSet,
     net::TcpListener,
-    sync::Arc,
+    sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
@@ -13,9 +14,12 @@ use zenoh::{Session, Wait, liveliness::LivelinessToken, query::Query, sample::Sa
 use crate::{
     Header, MessageKind, RigStats, SplatState, TransportConfig, TransportError, ViewFrame, Viewpoint,
     calibration::{encode_calibration, encode_transforms},
+    config::LARGEST_QUESTION,
     drain::{Drain, DrainThread, Retained, Shared, empty_header},
     keys::{self, VIEWER_PREFIX},
-    stats::{from_json, to_json},
+    printable,
+    splats::MAX_PERSON_TOPICS,
+    stats::{MAX_JSON_BYTES, from_json, to_json},
     topic::{Body, PublishOutcome, Topic, TopicCounts, lock},
     viewpoint::Leases,
 };
@@ -32,7 +36,7 @@ pub struct ViewpointCounts {
     pub granted: u64,
     /// Requests refused.
     pub refused: u64,
-    /// Ended by their lease or because the subscriber went away.
+    /// Ended by their lease, because the subscriber went away, or because they could not be drawn.
     pub expired: u64,
 }
 
@@ -40,6 +44,8 @@ pub struct ViewpointCounts {
 pub struct Publisher {
     shared: Arc<Shared>,
     splats: Arc<Topic>,
+    /// Splats of other persons than the first, the one that was published last at the end.
+    persons: Mutex<Vec<(u32, Arc<Topic>)>>,
     stats: Arc<Topic>,
     endpoints: Vec<String>,
     drain: DrainThread,
@@ -63,12 +69,13 @@ impl Publisher {
     pub fn open(config: &TransportConfig) -> Result<Self, TransportError> {
         config.validate()?;
         let rig = &config.rig;
-        let (session, endpoints) = open_session(config)?;
+        let (session, endpoints) = open_session(config, LARGEST_QUESTION)?;
         let failed = |error: zenoh::Error| TransportError::session(format!("publisher of rig {rig}"), &error);
 
         let splats = Arc::new(Topic::new("splats".to_owned(), "splats".to_owned(), MessageKind::Splats));
         let stats = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
-        let leases = Leases::new(config.max_viewers, Duration::from_millis(config.viewpoint_lease_millis));
+        let lease = Duration::from_millis(config.viewpoint_lease_millis);
+        let leases = Leases::new(config.max_viewers, lease, config.viewpoint_pixels_per_second);
         let (shared, woken) = Shared::new(rig, &session, &[splats.clone(), stats.clone()], leases);
 
         let state = shared.clone();
@@ -96,7 +103,8 @@ impl Publisher {
         let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
 
         let drain = DrainThread::start(Drain { shared: shared.clone(), session, express: config.express, woken })?;
-        Ok(Self { shared, splats, stats, endpoints, drain, _alive: alive })
+        let persons = Mutex::default();
+        Ok(Self { shared, splats, persons, stats, endpoints, drain, _alive: alive })
     }
 
     /// Endpoints it listens on, port 0 replaced by the real one.
@@ -120,7 +128,7 @@ impl Publisher {
         lock(&self.shared.topics).get(&keys::view_label(view)).is_some_and(|topic| topic.is_watched())
     }
 
-    /// Whether anybody subscribes to the splats.
+    /// Whether anybody subscribes to the splats (of the first person; a [`crate::Subscriber`] takes those of all).
     #[must_use]
     pub fn has_splat_subscribers(&self) -> bool {
         self.splats.is_watched()
@@ -143,10 +151,33 @@ impl Publisher {
         Ok(self.offer(&topic, Body::View(frame), header))
     }
 
-    /// Hands in a splat state; it is encoded on the publisher thread.
+    /// Hands in a person's splat state; it is encoded on the publisher thread. Each person has a slot of its own; the first
+    /// state of a new one is [`PublishOutcome::Unwatched`], since nobody could subscribe yet.
     pub fn publish_splats(&self, state: Arc<SplatState>) -> PublishOutcome {
         let header = Header { frame: state.frame, capture_nanos: state.capture_nanos, ..empty_header() };
-        self.offer(&self.splats, Body::Splats(state), header)
+        let topic = match state.person {
+            0 => self.splats.clone(),
+            person => self.person_topic(person),
+        };
+        self.offer(&topic, Body::Splats(state), header)
+    }
+
+    fn person_topic(&self, person: u32) -> Arc<Topic> {
+        let mut persons = lock(&self.persons);
+        if let Some(at) = persons.iter().position(|(other, _)| *other == person) {
+            persons[at..].rotate_left(1);
+            return persons[persons.len() - 1].1.clone();
+        }
+        let label = keys::splats_label(person);
+        let topic = Arc::new(Topic::new(label.clone(), label.clone(), MessageKind::Splats));
+        let mut topics = lock(&self.shared.topics);
+        if persons.len() >= MAX_PERSON_TOPICS {
+            let (oldest, _) = persons.remove(0);
+            topics.remove(&keys::splats_label(oldest));
+        }
+        topics.insert(label, topic.clone());
+        persons.push((person, topic.clone()));
+        topic
     }
 
     /// Hands in statistics.
@@ -189,6 +220,30 @@ impl Publisher {
         leases.viewpoints()
     }
 
+    /// Viewpoints to draw for the frame set at `now`: those that are watched and whose last picture is a period of their
+    /// `max_fps` old. Each is taken: its next picture is due a period later, so call this once a frame set.
+    #[must_use]
+    pub fn due_viewpoints(&self, now: Instant) -> Vec<Viewpoint> {
+        let watched = |topic: &&Arc<Topic>| topic.is_watched() && topic.name.starts_with(VIEWER_PREFIX);
+        let watched: BTreeSet<String> =
+            lock(&self.shared.topics).values().filter(watched).map(|topic| topic.name.clone()).collect();
+        lock(&self.shared.leases).take_due(now, |view| watched.contains(view))
+    }
+
+    /// Sets the pixels of the largest viewpoint that the rig can draw; larger ones end, and are refused in words. No limit
+    /// at first.
+    pub fn set_max_view_pixels(&self, pixels: u64) {
+        lock(&self.shared.leases).set_max_view_pixels(pixels);
+        self.shared.sync_viewer_topics();
+    }
+
+    /// Ends the viewpoint of a subscriber that could not be drawn. The same request is refused for a minute with this
+    /// reason; another camera or rate is tried again.
+    pub fn refuse_viewpoint(&self, subscriber: &str, reason: &str) {
+        lock(&self.shared.leases).refuse(subscriber, reason, Instant::now());
+        self.shared.sync_viewer_topics();
+    }
+
     /// Counts of viewpoint requests.
     #[must_use]
     pub fn viewpoint_counts(&self) -> ViewpointCounts {
@@ -201,7 +256,7 @@ impl Publisher {
         }
     }
 
-    /// Counts a topic: `view/NAME`, `viewer/SUBSCRIBER/view`, `splats`, `stats`, `calibration/CAMERA`, `transforms`.
+    /// Counts a topic: `view/NAME`, `viewer/SUBSCRIBER/view`, `splats`, `splats/PERSON`, `stats`, `calibration/CAMERA`, `transforms`.
     #[must_use]
     pub fn counts(&self) -> Vec<(String, TopicCounts)> {
         lock(&self.shared.topics).iter().map(|(label, topic)| (label.clone(), topic.counts())).collect()
@@ -245,12 +300,13 @@ impl Publisher {
 }
 
 /// Opens a session; a port 0 is looked up first because zenoh's stable interface does not tell which it took.
-pub(crate) fn open_session(config: &TransportConfig) -> Result<(Session, Vec<String>), TransportError> {
+/// `largest` bytes are the most that a message to this session may have.
+pub(crate) fn open_session(config: &TransportConfig, largest: usize) -> Result<(Session, Vec<String>), TransportError> {
     let mut attempts = 5;
     loop {
         attempts -= 1;
         let endpoints: Vec<String> = config.listen.iter().map(|endpoint| with_free_port(endpoint)).collect();
-        match zenoh::open(config.zenoh(&endpoints)?).wait() {
+        match zenoh::open(config.zenoh(&endpoints, largest)?).wait() {
             Ok(session) => return Ok((session, endpoints)),
             // Somebody else was faster to take the port.
             Err(_) if attempts > 0 && endpoints != config.listen => {}
@@ -275,10 +331,12 @@ fn with_free_port(endpoint: &str) -> String {
 fn answer_viewpoint(shared: &Shared, query: &Query) {
     let key = query.key_expr().as_str();
     let Some(subscriber) = keys::name_in(key, "viewpoint", "") else { return };
-    let payload = query.payload().map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
+    // What is too long is not even copied, and refused as empty.
+    let payload = query.payload().filter(|payload| payload.len() <= MAX_JSON_BYTES);
+    let payload = payload.map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
     let answer = lock(&shared.leases).ask(subscriber, from_json(key, &payload), Instant::now());
     if !answer.granted {
-        tracing::debug!(subscriber, reason = answer.reason, "refused a viewpoint");
+        tracing::debug!(subscriber = %printable(subscriber), reason = answer.reason, "refused a viewpoint");
     }
     shared.sync_viewer_topics();
     shared.wake();

@@ -11,7 +11,7 @@ use zenoh::{Session, Wait, qos::CongestionControl};
 
 use crate::{
     TransportError, ViewpointStatus,
-    stats::{from_json, to_json},
+    stats::{MAX_JSON_BYTES, to_json},
     topic::lock,
     viewpoint::{ViewpointAnswer, ViewpointRequest},
 };
@@ -130,7 +130,7 @@ fn run(shared: &Shared, session: &Session, key: &str, view: &str) {
     }
 }
 
-/// The answer, `None` when nobody is there.
+/// The first answer that can be read, `None` when nobody is there.
 fn ask(session: &Session, key: &str, wanted: Option<(Camera, f64)>) -> Result<Option<ViewpointAnswer>, TransportError> {
     let (camera, max_fps) = wanted.map_or((None, 1.0), |(camera, max_fps)| (Some(camera), max_fps));
     let question = to_json(key, &ViewpointRequest { camera, max_fps })?;
@@ -142,10 +142,18 @@ fn ask(session: &Session, key: &str, wanted: Option<(Camera, f64)>) -> Result<Op
         .timeout(ANSWER)
         .wait()
         .map_err(|error| TransportError::session(key, &error))?;
+    let mut unreadable = None;
     while let Ok(reply) = replies.recv() {
-        if let Ok(sample) = reply.result() {
-            return from_json(key, &sample.payload().to_bytes()).map(Some);
+        let Ok(sample) = reply.result() else { continue };
+        let payload = sample.payload();
+        let answer = match payload.len() {
+            0..=MAX_JSON_BYTES => ViewpointAnswer::decode(key, &payload.to_bytes()),
+            len => Err(TransportError::malformed(key, format!("answer of {len} bytes, at most {MAX_JSON_BYTES}"))),
+        };
+        match answer {
+            Ok(answer) => return Ok(Some(answer)),
+            Err(error) => unreadable = Some(error),
         }
     }
-    Ok(None)
+    unreadable.map_or(Ok(None), Err)
 }

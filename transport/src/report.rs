@@ -31,6 +31,8 @@ pub struct TopicReport {
     pub missed: u64,
     /// Messages that a newer one replaced before we were asked for them.
     pub replaced: u64,
+    /// Messages that were dropped before we were asked for them because too many bytes waited over all topics.
+    pub dropped: u64,
     /// How often the sequence began anew: the publisher restarted, or set the topic up again.
     pub restarts: u64,
     /// Messages a second, over the last ones (at most 256).

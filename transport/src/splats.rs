@@ -5,8 +5,10 @@
 //! green, blue, opacity; 4 x u8).
 //!
 //! Seam: a Gaussian keeps its index over time. A later stream can send canonical positions and
-//! skinning once (`splats/canonical`) and then only poses and displacements (`splats/motion`) beside
-//! this one; the `flags` word of the header is 0 today and a reader refuses any other value.
+//! skinning once and then only poses and displacements beside this one.
+//!
+//! The `flags` word of the header is 0 for the first person. Bit 1 says that the header's last four bytes hold the number
+//! of another person; a reader refuses other bits, and one older than that bit refuses other persons.
 //!
 //! No general compressor behind it: deflate at its fastest takes 115k Gaussians to 0.87 of the size, to 0.68
 //! when sorted into byte planes, for 24 to 32 ms a state, while encoding takes 3 to 4 ms.
@@ -18,9 +20,15 @@ use crate::{SCHEMA_VERSION, TransportError, header::Reader};
 /// Most Gaussians in a state.
 pub const MAX_SPLATS: usize = 1 << 22;
 
+/// Persons, the first one aside, whose splats have a topic at a time; beyond it the one that was published longest ago
+/// loses its topic.
+pub const MAX_PERSON_TOPICS: usize = 16;
+
 const MAGIC: [u8; 4] = *b"FLSP";
 const HEADER: usize = 64;
 const PER_SPLAT: usize = 12;
+/// Flag: the header names a person.
+const HAS_PERSON: u16 = 2;
 
 /// Largest encoded state, bytes.
 pub(crate) const MAX_BYTES: usize = HEADER + MAX_SPLATS * PER_SPLAT;
@@ -28,6 +36,8 @@ pub(crate) const MAX_BYTES: usize = HEADER + MAX_SPLATS * PER_SPLAT;
 /// Gaussians as the renderer keeps them; both vectors have one element a Gaussian.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct SplatState {
+    /// Which person, 0 for the first; the same number is the same person as long as it is followed.
+    pub person: u32,
     /// The rig's frame number.
     pub frame: u64,
     /// Capture time of the frame set, `CLOCK_MONOTONIC` of the capturing host.
@@ -69,7 +79,8 @@ impl SplatState {
         let mut bytes = Vec::with_capacity(HEADER + count * PER_SPLAT);
         bytes.extend_from_slice(&MAGIC);
         bytes.extend_from_slice(&SCHEMA_VERSION.to_le_bytes());
-        bytes.extend_from_slice(&[0; 2]);
+        let flags = if self.person == 0 { 0 } else { HAS_PERSON };
+        bytes.extend_from_slice(&flags.to_le_bytes());
         bytes.extend_from_slice(&self.frame.to_le_bytes());
         bytes.extend_from_slice(&self.capture_nanos.to_le_bytes());
         bytes.extend_from_slice(&(count as u32).to_le_bytes());
@@ -77,6 +88,7 @@ impl SplatState {
         for value in bounds.min.into_iter().chain(bounds.max).chain([bounds.max_scale]) {
             bytes.extend_from_slice(&value.to_le_bytes());
         }
+        bytes.extend_from_slice(&self.person.to_le_bytes());
         bytes.resize(HEADER + count * PER_SPLAT, 0);
 
         let per_metre = bounds.extent().map(|extent| if extent > 0.0 { LEVELS / extent } else { 0.0 });
@@ -118,7 +130,7 @@ impl SplatState {
             return Err(TransportError::version("splats", version));
         }
         let flags = reader.take().map(u16::from_le_bytes).ok_or_else(short)?;
-        if flags != 0 {
+        if flags & !HAS_PERSON != 0 {
             return Err(malformed(format!("flags {flags:#x} are not known to this version")));
         }
         let frame = u64::from_le_bytes(reader.take().ok_or_else(short)?);
@@ -129,7 +141,9 @@ impl SplatState {
         for number in &mut numbers {
             *number = f32::from_le_bytes(reader.take().ok_or_else(short)?);
         }
-        let _reserved: [u8; HEADER - 60] = reader.take().ok_or_else(short)?;
+        let person = u32::from_le_bytes(reader.take().ok_or_else(short)?);
+        // Without the flag these bytes mean nothing.
+        let person = if flags == HAS_PERSON { person } else { 0 };
         if count > MAX_SPLATS {
             return Err(malformed(format!("claims {count} Gaussians, at most {MAX_SPLATS}")));
         }
@@ -170,7 +184,7 @@ impl SplatState {
                 ]
             })
             .collect();
-        Ok(Self { frame, capture_nanos, center_scale, color, invalid })
+        Ok(Self { person, frame, capture_nanos, center_scale, color, invalid })
     }
 }
 
@@ -268,6 +282,24 @@ mod tests {
             assert!((code - srgb * 255.0).abs() < 0.5 + 1e-3, "{linear}: {code} {}", srgb * 255.0);
         }
         assert_eq!((SRGB.encode(-1.0), SRGB.encode(7.0), SRGB.encode(f32::NAN)), (0, 255, 0));
+    }
+
+    #[test]
+    fn a_person_travels_and_the_first_one_changes_no_byte() {
+        let state = SplatState { center_scale: vec![[1.0; 4]], color: vec![[0.5; 4]], ..SplatState::default() };
+        let first = state.encode().unwrap();
+        assert_eq!((&first[6..8], &first[60..64]), (&[0; 2][..], &[0; 4][..]));
+        for person in [1, u32::MAX] {
+            let mut bytes = SplatState { person, ..state.clone() }.encode().unwrap();
+            assert_eq!(SplatState::decode(&bytes).unwrap().person, person);
+            // Older readers refuse the flag in words.
+            assert_eq!(bytes[6..8], [2, 0]);
+            (bytes[6], bytes[60], bytes[61], bytes[62], bytes[63]) = (0, 0, 0, 0, 0);
+            assert_eq!(bytes, first);
+        }
+        let mut unknown = first;
+        unknown[6] = 6;
+        assert!(SplatState::decode(&unknown).unwrap_err().to_string().contains("flags 0x6 are not known"));
     }
 
     #[test]

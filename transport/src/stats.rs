@@ -4,20 +4,45 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{SCHEMA_VERSION, TransportError};
+use crate::{SCHEMA_VERSION, TransportError, printable, printable::clean};
 
 /// Largest JSON payload that is looked at, bytes.
 pub(crate) const MAX_JSON_BYTES: usize = 1 << 18;
 
 /// Time a stage of the pipeline takes.
+///
+/// On the wire the percentile also stands as `max_millis`, its name before, so that older and newer programs read each
+/// other.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(from = "WireStageTime", into = "WireStageTime")]
 pub struct StageTime {
     /// Name of the stage.
     pub stage: String,
     /// Mean over the interval, milliseconds.
     pub mean_millis: f64,
-    /// Longest of the interval, milliseconds.
-    pub max_millis: f64,
+    /// 95th percentile over the interval, milliseconds.
+    pub p95_millis: f64,
+}
+
+#[derive(Serialize, Deserialize)]
+struct WireStageTime {
+    stage: String,
+    mean_millis: f64,
+    max_millis: f64,
+    p95_millis: Option<f64>,
+}
+
+impl From<WireStageTime> for StageTime {
+    fn from(wire: WireStageTime) -> Self {
+        let WireStageTime { stage, mean_millis, max_millis, p95_millis } = wire;
+        Self { stage, mean_millis, p95_millis: p95_millis.unwrap_or(max_millis) }
+    }
+}
+
+impl From<StageTime> for WireStageTime {
+    fn from(StageTime { stage, mean_millis, p95_millis }: StageTime) -> Self {
+        Self { stage, mean_millis, max_millis: p95_millis, p95_millis: Some(p95_millis) }
+    }
 }
 
 /// What a view costs.
@@ -42,6 +67,19 @@ pub struct TrackingStats {
     pub cameras: BTreeMap<String, f64>,
 }
 
+/// How well one person is followed, at the last frame.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct SubjectStats {
+    /// Which person, as in [`crate::SplatState::person`]; 0 is the first.
+    pub person: u32,
+    /// As [`TrackingStats::state`].
+    pub state: String,
+    /// As [`TrackingStats::quality`].
+    pub quality: Option<f64>,
+    /// As [`TrackingStats::cameras`].
+    pub cameras: BTreeMap<String, f64>,
+}
+
 /// How the rig is doing over its last interval (about a second).
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RigStats {
@@ -61,9 +99,13 @@ pub struct RigStats {
     pub views: Vec<ViewRate>,
     /// Subscribers with a viewpoint of their own.
     pub viewers: u32,
-    /// How well the person is followed.
+    /// The first of `subjects`, for programs that know one person. [`Self::encode`] fills it in from `subjects`, or
+    /// `subjects` from it where that is empty; so does [`Self::decode`] with what an older program sent.
     #[serde(default)]
     pub tracking: TrackingStats,
+    /// How well each person is followed.
+    #[serde(default)]
+    pub subjects: Vec<SubjectStats>,
 }
 
 /// JSON with the version first, so that a reader can tell before it understands the rest.
@@ -109,24 +151,123 @@ impl RigStats {
     /// # Errors
     /// `Config` when a figure is NaN or infinite (JSON has no form for them) or it is over 256 KiB.
     pub fn encode(&self) -> Result<Vec<u8>, TransportError> {
+        let stats = self.clone().with_subjects();
+        let figures_of = |subject: &SubjectStats| {
+            subject.quality.into_iter().chain(subject.cameras.values().copied()).all(f64::is_finite)
+        };
         let finite = [self.uptime_secs, self.frames_per_second]
             .into_iter()
-            .chain(self.stages.iter().flat_map(|stage| [stage.mean_millis, stage.max_millis]))
-            .chain(self.tracking.quality)
-            .chain(self.tracking.cameras.values().copied())
+            .chain(self.stages.iter().flat_map(|stage| [stage.mean_millis, stage.p95_millis]))
             .chain(self.views.iter().flat_map(|view| [view.per_second, view.bytes_per_second]))
             .all(f64::is_finite);
-        if !finite {
+        if !finite || !stats.subjects.iter().all(figures_of) {
             return Err(TransportError::config("stats", "a figure is NaN or infinite; leave it out or send 0"));
         }
-        to_json("stats", self)
+        to_json("stats", &stats)
     }
 
-    /// Out of JSON.
+    /// Out of JSON; all names are [`printable`].
     ///
     /// # Errors
     /// `UnknownVersion` or `Malformed`.
     pub fn decode(bytes: &[u8]) -> Result<Self, TransportError> {
-        from_json("stats", bytes)
+        let mut stats: Self = from_json("stats", bytes)?;
+        stats.stages.iter_mut().for_each(|stage| clean(&mut stage.stage));
+        stats.views.iter_mut().for_each(|view| clean(&mut view.view));
+        clean_keys(&mut stats.dropped);
+        clean(&mut stats.tracking.state);
+        clean_keys(&mut stats.tracking.cameras);
+        for subject in &mut stats.subjects {
+            clean(&mut subject.state);
+            clean_keys(&mut subject.cameras);
+        }
+        Ok(stats.with_subjects())
+    }
+
+    /// Lets `tracking` and the first subject say the same.
+    fn with_subjects(mut self) -> Self {
+        match self.subjects.first().cloned() {
+            Some(SubjectStats { state, quality, cameras, .. }) => {
+                self.tracking = TrackingStats { state, quality, cameras };
+            }
+            None if self.tracking != TrackingStats::default() => {
+                let TrackingStats { state, quality, cameras } = self.tracking.clone();
+                self.subjects = vec![SubjectStats { person: 0, state, quality, cameras }];
+            }
+            None => {}
+        }
+        self
+    }
+}
+
+/// Makes the names in a map printable.
+fn clean_keys<T>(map: &mut BTreeMap<String, T>) {
+    *map = std::mem::take(map).into_iter().map(|(name, value)| (printable(&name).into_owned(), value)).collect();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// As a program without `subjects` and `p95_millis` reads it.
+    #[derive(Deserialize)]
+    struct OldStats {
+        stages: Vec<OldStage>,
+        #[serde(default)]
+        tracking: TrackingStats,
+    }
+
+    #[derive(Deserialize)]
+    struct OldStage {
+        mean_millis: f64,
+        max_millis: f64,
+    }
+
+    fn subject(person: u32) -> SubjectStats {
+        let cameras = [("left".to_owned(), 0.5)].into();
+        SubjectStats { person, state: "steady".to_owned(), quality: Some(0.75), cameras }
+    }
+
+    #[test]
+    fn older_and_newer_programs_read_each_other() {
+        let stages = vec![StageTime { stage: "draw".to_owned(), mean_millis: 2.0, p95_millis: 4.0 }];
+        let sent = RigStats { stages, subjects: vec![subject(3), subject(7)], ..RigStats::default() };
+        let bytes = sent.encode().unwrap();
+        let found = RigStats::decode(&bytes).unwrap();
+        assert_eq!((&found.stages, &found.subjects), (&sent.stages, &sent.subjects));
+        let old: OldStats = serde_json::from_slice(&bytes).unwrap();
+        assert_eq!((old.stages[0].mean_millis, old.stages[0].max_millis), (2.0, 4.0));
+        assert_eq!((old.tracking.state.as_str(), old.tracking.quality), ("steady", Some(0.75)));
+
+        let old = br#"{"schema_version":1,"frame":5,"capture_nanos":1,"uptime_secs":1,"frames_per_second":30,
+            "stages":[{"stage":"draw","mean_millis":2,"max_millis":4}],"dropped":{},"views":[],"viewers":0,
+            "tracking":{"state":"steady","quality":0.75,"cameras":{"left":0.5}}}"#;
+        let found = RigStats::decode(old).unwrap();
+        assert_eq!((&found.stages, found.subjects), (&sent.stages, vec![subject(0)]));
+        // A rig of one person may fill in either.
+        let TrackingStats { state, quality, cameras } = found.tracking;
+        let one = RigStats { tracking: TrackingStats { state, quality, cameras }, ..RigStats::default() };
+        assert_eq!(RigStats::decode(&one.encode().unwrap()).unwrap().subjects, [subject(0)]);
+        assert!(RigStats::decode(&RigStats::default().encode().unwrap()).unwrap().subjects.is_empty());
+
+        let mut poisoned = sent;
+        poisoned.subjects[1].cameras.insert("right".to_owned(), f64::NAN);
+        assert!(poisoned.encode().unwrap_err().to_string().contains("NaN"));
+    }
+
+    #[test]
+    fn names_come_out_printable() {
+        let bad = || "\u{1b}[2J\u{202e}".to_owned();
+        let stats = RigStats {
+            stages: vec![StageTime { stage: bad(), mean_millis: 1.0, p95_millis: 1.0 }],
+            dropped: [(bad(), 1)].into(),
+            views: vec![ViewRate { view: bad(), per_second: 1.0, bytes_per_second: 1.0 }],
+            subjects: vec![SubjectStats { person: 1, state: bad(), quality: None, cameras: [(bad(), 1.0)].into() }],
+            ..RigStats::default()
+        };
+        let found = format!("{:#?}", RigStats::decode(&stats.encode().unwrap()).unwrap());
+        // Debug escapes a backslash once more, and a raw control character only once.
+        assert_eq!(found.matches("\\\\u{1b}[2J\\\\u{202e}").count(), 7, "{found}");
+        assert!(!found.contains("\"\\u{1b}"), "{found}");
     }
 }

@@ -8,9 +8,12 @@ use zenoh::{Session, Wait, liveliness::LivelinessToken, sample::SampleKind};
 
 use crate::{
     Header, RigStats, SplatState, TopicReport, TransportConfig, TransportError, ViewFrame, ViewpointStatus,
+    config::LARGEST_QUESTION,
     inbox::{Inbox, Raw, as_malformed},
     keys::{self, VIEWER_PREFIX},
     renewal::Renewal,
+    splats,
+    view::MAX_MESSAGE_BYTES,
     viewpoint::check_camera,
 };
 
@@ -77,9 +80,10 @@ impl Subscriber {
         config.validate()?;
         let rig = &config.rig;
         let failed = |error: zenoh::Error| TransportError::session(format!("subscriber of rig {rig}"), &error);
-        let session = zenoh::open(config.zenoh(&config.listen)?).wait().map_err(failed)?;
+        let largest = MAX_MESSAGE_BYTES.max(splats::MAX_BYTES) + LARGEST_QUESTION;
+        let session = zenoh::open(config.zenoh(&config.listen, largest)?).wait().map_err(failed)?;
         let id = session.zid().to_string();
-        let inbox = Arc::new(Inbox::new(format!("{VIEWER_PREFIX}{id}")));
+        let inbox = Arc::new(Inbox::new(format!("{VIEWER_PREFIX}{id}"), config.inbox_bytes));
 
         let mut labels = vec!["calibration/*".to_owned(), "transforms".to_owned(), format!("viewer/{id}/view")];
         match &interests.views {
@@ -92,7 +96,9 @@ impl Subscriber {
                 }
             }
         }
-        labels.extend(interests.splats.then(|| "splats".to_owned()));
+        if interests.splats {
+            labels.extend(["splats".to_owned(), format!("{}*", keys::PERSON_SPLATS)]);
+        }
         labels.extend(interests.stats.then(|| "stats".to_owned()));
         for label in labels {
             let inbox = inbox.clone();
@@ -137,7 +143,7 @@ impl Subscriber {
     ///
     /// # Errors
     /// `UnknownVersion` or `Malformed`, once for each such message or publisher, whichever topic it was
-    /// on; it is fine to go on.
+    /// on; it is fine to go on. After an error a message that waits comes first, so errors hold no message up.
     pub fn next_view(&self, timeout: Duration) -> Result<Option<Received<ViewFrame>>, TransportError> {
         let Some((label, raw)) = self.inbox.next(timeout, |label| self.inbox.view_name(label).is_some())? else {
             return Ok(None);
@@ -146,12 +152,13 @@ impl Subscriber {
         self.received(name, raw, ViewFrame::decode).map(Some)
     }
 
-    /// The newest splat state nobody has taken yet; `None` after the timeout.
+    /// The newest splat state nobody has taken yet, of any person (persons take turns, see [`SplatState::person`]); `None`
+    /// after the timeout.
     ///
     /// # Errors
     /// As [`Self::next_view`].
     pub fn next_splats(&self, timeout: Duration) -> Result<Option<Received<SplatState>>, TransportError> {
-        let Some((label, raw)) = self.inbox.next(timeout, |label| label == "splats")? else { return Ok(None) };
+        let Some((label, raw)) = self.inbox.next(timeout, keys::is_splats)? else { return Ok(None) };
         self.received(label, raw, |_, _, payload| SplatState::decode(&payload)).map(Some)
     }
 

@@ -11,6 +11,9 @@ use crate::TransportError;
 /// Largest compressed picture, bytes.
 pub const MAX_IMAGE_BYTES: usize = 32 << 20;
 
+/// Largest message of a view: the picture and the few fields around it, bytes.
+pub(crate) const MAX_MESSAGE_BYTES: usize = MAX_IMAGE_BYTES + (4 << 10);
+
 /// How a picture is compressed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ImageFormat {
@@ -99,7 +102,7 @@ impl ViewFrame {
     /// # Errors
     /// `Malformed`.
     pub fn decode(view: &str, header: &crate::Header, payload: Bytes) -> Result<Self, TransportError> {
-        if payload.len() > 2 * MAX_IMAGE_BYTES {
+        if payload.len() > MAX_MESSAGE_BYTES {
             return Err(TransportError::malformed(view, format!("{} bytes are too many for a picture", payload.len())));
         }
         let image = CompressedImage::decode(payload)

@@ -320,3 +320,43 @@ fn a_computer_whose_clock_does_not_answer_gives_no_frames() {
     assert!(there.next_frame(&"a".into(), Duration::ZERO).unwrap().is_none());
     assert_eq!(there.link(&"a".into()).frames, 0);
 }
+
+#[test]
+fn the_camera_of_huge_pictures_loses_its_own_where_bytes_are_short() {
+    let host = host("test", &["small", "huge"], "tcp/127.0.0.1:0");
+    let (small, huge) = (CameraId::from("small"), CameraId::from("huge"));
+    let config = TransportConfig {
+        connect: host.endpoints().to_vec(),
+        inbox_bytes: 100_000,
+        ..TransportConfig::subscriber("test")
+    };
+    let there = CameraSubscriber::open(&config, &[small.clone(), huge.clone()], our_clock()).unwrap();
+    let mut sequence = 0;
+    publish_until_seen(&host, &there, "small", &mut sequence);
+    let picture = |bytes: usize, sequence: u64| Frame {
+        image: Image::new(640, 480, PixelFormat::Mjpeg, vec![1; bytes]).unwrap(),
+        ..frame("huge", sequence)
+    };
+    // Two of four that may wait fit.
+    wait_until("four huge pictures", || {
+        sequence += 1;
+        host.publish(picture(45_000, sequence)).unwrap();
+        host.publish(frame("small", sequence | 1)).unwrap();
+        std::thread::sleep(Duration::from_millis(2));
+        there.link(&huge).frames >= 6 && there.link(&small).frames >= 6
+    });
+    let drain = |camera: &CameraId| {
+        std::iter::from_fn(|| there.next_frame(camera, Duration::ZERO).unwrap())
+            .map(|f| f.image.bytes().len())
+            .collect()
+    };
+    let (of_small, of_huge): (Vec<usize>, Vec<usize>) = (drain(&small), drain(&huge));
+    assert!(of_small.len() >= 3 && (1..=2).contains(&of_huge.len()), "{of_small:?} {of_huge:?}");
+    assert!(there.link(&huge).overtaken >= 2);
+    let error = wait_for("the refusal", || {
+        sequence += 1;
+        host.publish(picture(100_001, sequence)).unwrap();
+        there.next_frame(&huge, Duration::from_millis(20)).err()
+    });
+    assert!(error.to_string().contains("camera/huge: 100001 bytes, at most 100000; raise inbox-bytes"), "{error}");
+}

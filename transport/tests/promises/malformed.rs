@@ -3,9 +3,11 @@
 use std::{sync::Arc, time::Duration};
 
 use flyrig_transport::{
-    HEADER_BYTES, Header, Interests, MessageKind, RigStats, SplatState, Subscriber, TransportErrorKind, ViewFrame,
-    Views, decode_calibration, decode_transforms, encode_calibration, encode_transforms,
+    HEADER_BYTES, Header, Interests, MessageKind, RigStats, SplatState, Subscriber, TransportConfig, TransportError,
+    TransportErrorKind, ViewFrame, ViewpointStatus, Views, decode_calibration, decode_transforms, encode_calibration,
+    encode_transforms,
 };
+use flyrig_types::Lens;
 use foxglove::{
     Decode, Encode,
     messages::{CameraCalibration, CompressedImage, FrameTransforms},
@@ -35,7 +37,7 @@ fn bytes_of<M: Encode>(message: &M) -> Vec<u8> {
 }
 
 /// The error's text; its kind must be `Malformed`.
-fn refused<T: std::fmt::Debug>(result: Result<T, flyrig_transport::TransportError>) -> String {
+fn refused<T: std::fmt::Debug>(result: Result<T, TransportError>) -> String {
     let error = result.unwrap_err();
     assert_eq!(error.kind, TransportErrorKind::Malformed, "{error}");
     error.to_string()
@@ -164,6 +166,17 @@ fn seeded_noise_never_panics() {
     assert!(good > 1000 && bad > 1000, "{good} {bad}");
 }
 
+/// A session that says what it likes, and where it listens.
+fn stranger() -> (zenoh::Session, String) {
+    let mut config = zenoh::Config::default();
+    for (key, value) in [("mode", "\"peer\""), ("scouting/multicast/enabled", "false"), ("connect/endpoints", "[]")] {
+        config.insert_json5(key, value).unwrap();
+    }
+    let endpoint = free_endpoint();
+    config.insert_json5("listen/endpoints", &format!("[{endpoint:?}]")).unwrap();
+    (zenoh::open(config).wait().unwrap(), endpoint)
+}
+
 #[test]
 fn foreign_messages_on_our_keys_are_told_counted_and_survived() {
     let publisher = open_publisher(|_| {});
@@ -171,13 +184,7 @@ fn foreign_messages_on_our_keys_are_told_counted_and_survived() {
     let subscriber = open_subscriber(&publisher, &interests);
     publish_until_seen(&publisher, &subscriber, "front", &mut 0);
 
-    let mut config = zenoh::Config::default();
-    for (key, value) in [("mode", "\"peer\""), ("scouting/multicast/enabled", "false"), ("connect/endpoints", "[]")] {
-        config.insert_json5(key, value).unwrap();
-    }
-    let endpoint = free_endpoint();
-    config.insert_json5("listen/endpoints", &format!("[{endpoint:?}]")).unwrap();
-    let stranger = zenoh::open(config).wait().unwrap();
+    let (stranger, endpoint) = stranger();
     let mut both = subscriber_config(publisher.endpoints());
     both.connect.push(endpoint);
     let subscriber = Subscriber::open(&both, &interests).unwrap();
@@ -216,4 +223,123 @@ fn foreign_messages_on_our_keys_are_told_counted_and_survived() {
         subscriber.next_splats(Duration::from_millis(20)).ok().flatten()
     });
     stranger.close().wait().unwrap();
+}
+
+#[test]
+fn a_hostile_publisher_ends_no_watcher_and_holds_no_message_up() {
+    let publisher = open_publisher(|_| {});
+    publisher.set_calibration(&rig()).unwrap();
+    let (stranger, endpoint) = stranger();
+    let mut both = subscriber_config(publisher.endpoints());
+    both.connect.push(endpoint);
+    let subscriber = Subscriber::open(&both, &Interests { views: Views::All, splats: true, stats: true }).unwrap();
+    // Answers to the viewpoint's question: nonsense, and no end of it.
+    let noise = ["{", r#"{"schema_version":1,"granted":7}"#, &"x".repeat(300_000)].map(String::from);
+    stranger
+        .declare_queryable("flyrig/v1/test/viewpoint/*")
+        .callback(move |query| {
+            for answer in &noise {
+                let _ = query.reply(query.key_expr(), answer.as_str()).wait();
+            }
+        })
+        .background()
+        .wait()
+        .unwrap();
+    let esc = "\u{1b}[2J\u{202e}";
+    let flood = || {
+        let put = |label: &str, kind: Option<MessageKind>, payload: &[u8]| {
+            let attachment = kind.map_or(vec![7; 64], |kind| header(kind).encode().to_vec());
+            stranger.put(format!("flyrig/v1/test/{label}"), payload).attachment(attachment).wait().unwrap();
+        };
+        let calibration = CameraCalibration { frame_id: esc.into(), ..Default::default() };
+        put("calibration/zeta", Some(MessageKind::Calibration), &bytes_of(&calibration));
+        put("calibration/alpha", Some(MessageKind::Calibration), b"noise");
+        put("transforms", Some(MessageKind::Transforms), b"noise");
+        put("transforms", None, b"noise");
+        put("view/front", Some(MessageKind::View), b"noise");
+        put("view/front", None, &[0; 5000]);
+        put(&format!("view/{esc}"), Some(MessageKind::View), b"noise");
+        put("splats", Some(MessageKind::Splats), esc.as_bytes());
+        put("splats/x", Some(MessageKind::Splats), b"noise");
+        put("stats", Some(MessageKind::Stats), br#"{"schema_version":1,"frame":"\u001b[2J"}"#);
+    };
+    let mut errors = Vec::new();
+    let mut note = |error: TransportError| {
+        assert!(!error.to_string().chars().any(|c| c.is_control() || c == '\u{202e}'), "{error:?}");
+        assert!(error.to_string().len() < 2000);
+        errors.push(error);
+    };
+    // Each in the midst of the flood, as a watcher asks.
+    let found = wait_for("the rig", || {
+        flood();
+        subscriber.rig(Duration::from_millis(20)).unwrap_or_else(|error| {
+            note(error);
+            None
+        })
+    });
+    assert_same_rig(&found, &rig());
+    subscriber.request_viewpoint(&camera("mine", Lens::PINHOLE), 30.0).unwrap();
+    wait_until("the viewpoint", || {
+        flood();
+        matches!(subscriber.viewpoint_status(), ViewpointStatus::Granted { .. })
+    });
+    let mut frame = 0;
+    for name in ["front".to_owned(), subscriber.viewpoint_view()] {
+        wait_until("a picture", || {
+            flood();
+            frame += 1;
+            publisher.publish_view(&name, view(frame, 5000)).unwrap();
+            match subscriber.next_view(Duration::from_millis(20)) {
+                Ok(picture) => picture.is_some_and(|picture| picture.topic == name),
+                Err(error) => {
+                    note(error);
+                    false
+                }
+            }
+        });
+    }
+    wait_until("splats", || {
+        flood();
+        publisher.publish_splats(Arc::new(splats(2, 50)));
+        matches!(subscriber.next_splats(Duration::from_millis(20)).map_err(&mut note), Ok(Some(_)))
+    });
+    wait_until("statistics", || {
+        flood();
+        publisher.publish_stats(&RigStats::default()).unwrap();
+        matches!(subscriber.next_stats(Duration::from_millis(20)).map_err(&mut note), Ok(Some(_)))
+    });
+    assert!(subscriber.unreadable() > 10 && !errors.is_empty());
+    println!("{} unreadable messages, {} errors", subscriber.unreadable(), errors.len());
+    stranger.close().wait().unwrap();
+}
+
+#[test]
+fn an_inbox_over_its_bytes_drops_the_largest_and_refuses_by_name() {
+    let publisher = open_publisher(|_| {});
+    let config = TransportConfig { inbox_bytes: 100_000, ..subscriber_config(publisher.endpoints()) };
+    let subscriber = Subscriber::open(&config, &all_views()).unwrap();
+    let dropped = || subscriber.reports().iter().map(|(_, report)| report.dropped).sum::<u64>();
+    let mut frame = 0;
+    wait_until("a full inbox", || {
+        frame += 1;
+        for (name, bytes) in [("small", 5_000), ("a", 60_000), ("b", 60_000)] {
+            publisher.publish_view(name, view(frame, bytes)).unwrap();
+        }
+        std::thread::sleep(Duration::from_millis(5));
+        dropped() > 3
+    });
+    let of = |name: &str| subscriber.reports().into_iter().find(|(label, _)| label == name).unwrap().1;
+    assert_eq!(of("view/small").dropped, 0);
+    let mut waiting = Vec::new();
+    while let Some(received) = subscriber.next_view(Duration::ZERO).unwrap() {
+        waiting.push(received.body.bytes.len());
+    }
+    assert!(waiting.iter().sum::<usize>() <= 100_000, "{waiting:?}");
+    let error = wait_for("the refusal", || {
+        publisher.publish_view("huge", view(1, 100_000)).unwrap();
+        subscriber.next_view(Duration::from_millis(20)).err()
+    });
+    assert_eq!(error.kind, TransportErrorKind::Malformed);
+    assert!(error.to_string().contains("view/huge: 1000"), "{error}");
+    assert!(error.to_string().contains("over the inbox of 100000 bytes; raise inbox-bytes"), "{error}");
 }

@@ -57,7 +57,7 @@ fn splats_and_statistics_come_out_as_they_went_in() {
         frame: 9,
         capture_nanos: -1,
         frames_per_second: 29.97,
-        stages: vec![StageTime { stage: "render".into(), mean_millis: 4.5, max_millis: 9.25 }],
+        stages: vec![StageTime { stage: "render".into(), mean_millis: 4.5, p95_millis: 9.25 }],
         dropped: [("sync".to_owned(), 3)].into(),
         ..RigStats::default()
     };

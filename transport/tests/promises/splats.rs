@@ -1,6 +1,8 @@
 //! The splat codec: error bounds, poisoned Gaussians, an end to what it accepts.
 
-use flyrig_transport::{MAX_SPLATS, SplatState, TransportErrorKind};
+use std::{collections::BTreeSet, sync::Arc, time::Duration};
+
+use flyrig_transport::{Interests, MAX_PERSON_TOPICS, MAX_SPLATS, PublishOutcome, SplatState, TransportErrorKind};
 
 use crate::support::*;
 
@@ -97,4 +99,36 @@ fn the_edges_none_one_flat_and_too_many() {
     assert_eq!(many.encode().unwrap_err().kind, TransportErrorKind::Config);
     let uneven = SplatState { color: vec![], ..one };
     assert!(uneven.encode().unwrap_err().to_string().contains("1 positions but 0 colours"));
+}
+
+#[test]
+fn persons_of_one_frame_do_not_replace_each_other() {
+    let publisher = open_publisher(|_| {});
+    let subscriber = open_subscriber(&publisher, &Interests { splats: true, ..Interests::default() });
+    let mut seen = BTreeSet::new();
+    wait_until("all three persons", || {
+        for person in [0, 3, 7] {
+            publisher.publish_splats(Arc::new(SplatState { person, ..splats(1, 50) }));
+        }
+        while let Some(received) = subscriber.next_splats(Duration::from_millis(20)).unwrap() {
+            let topic =
+                if received.body.person == 0 { "splats".into() } else { format!("splats/{}", received.body.person) };
+            assert_eq!(received.topic, topic);
+            seen.insert(received.body.person);
+        }
+        seen == [0, 3, 7].into()
+    });
+    // Persons come and go for days: topics are bounded, and the first person keeps its own.
+    for person in 100..200 {
+        assert_eq!(
+            publisher.publish_splats(Arc::new(SplatState { person, ..splats(1, 5) })),
+            PublishOutcome::Unwatched
+        );
+    }
+    let counts = publisher.counts();
+    let labels: Vec<&str> =
+        counts.iter().map(|(label, _)| label.as_str()).filter(|l| l.starts_with("splats")).collect();
+    assert_eq!(labels.len(), MAX_PERSON_TOPICS + 1, "{labels:?}");
+    assert!(labels.contains(&"splats") && labels.contains(&"splats/199") && labels.contains(&"splats/184"));
+    assert!(subscriber.next_splats(Duration::ZERO).is_ok());
 }

@@ -69,7 +69,7 @@ pub fn splats(frame: u64, count: usize) -> SplatState {
     let mut vector = |low: f32, high: f32| -> [f32; 4] { std::array::from_fn(|_| low + (high - low) * random.unit()) };
     let center_scale = (0..count).map(|_| vector(-1.0, 1.0).map(f32::abs)).collect();
     let color = (0..count).map(|_| vector(0.0, 1.0)).collect();
-    SplatState { frame, capture_nanos: -7, center_scale, color, invalid: 0 }
+    SplatState { person: 0, frame, capture_nanos: -7, center_scale, color, invalid: 0 }
 }
 
 /// Publishes frames of one view, with growing numbers, until the subscriber has one of them.

@@ -1,11 +1,22 @@
 //! Viewpoints of subscribers: granted, renewed, bounded, ended.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use flyrig_transport::{Interests, MAX_VIEWPOINT_SIDE, ViewpointStatus};
+use flyrig_transport::{Interests, MAX_VIEWPOINT_SIDE, Subscriber, Viewpoint, ViewpointStatus};
 use flyrig_types::Lens;
+use zenoh::Wait;
 
 use crate::support::*;
+
+/// A session of no flyrig program.
+fn client(endpoints: &[String]) -> zenoh::Session {
+    let mut config = zenoh::Config::default();
+    for (key, value) in [("mode", "\"client\""), ("scouting/multicast/enabled", "false")] {
+        config.insert_json5(key, value).unwrap();
+    }
+    config.insert_json5("connect/endpoints", &format!("{endpoints:?}")).unwrap();
+    zenoh::open(config).wait().unwrap()
+}
 
 #[test]
 fn a_viewpoint_is_granted_moved_seen_and_given_back() {
@@ -72,13 +83,7 @@ fn a_lease_outlives_its_length_only_by_renewal() {
     wait_until("the renewed lease", || !publisher.requested_viewpoints().is_empty());
 
     // A question by hand is not renewed: it ends by itself, while its session lives on.
-    let mut config = zenoh::Config::default();
-    for (key, value) in [("mode", "\"client\""), ("scouting/multicast/enabled", "false")] {
-        config.insert_json5(key, value).unwrap();
-    }
-    config.insert_json5("connect/endpoints", &format!("{:?}", publisher.endpoints())).unwrap();
-    use zenoh::Wait;
-    let session = zenoh::open(config).wait().unwrap();
+    let session = client(publisher.endpoints());
     let ask = |payload: String| {
         let replies = session.get("flyrig/v1/test/viewpoint/by-hand").payload(payload).wait().unwrap();
         let reply = replies.recv().unwrap();
@@ -117,4 +122,77 @@ fn a_viewpoint_that_cannot_be_is_refused_before_it_is_sent() {
         assert!(subscriber.request_viewpoint(&good, fps).is_err(), "{fps}");
     }
     assert_eq!(subscriber.viewpoint_status(), ViewpointStatus::Idle);
+}
+
+/// The reason once the rig refuses.
+fn refusal(subscriber: &Subscriber) -> Option<String> {
+    match subscriber.viewpoint_status() {
+        ViewpointStatus::Refused { reason } => Some(reason),
+        _ => None,
+    }
+}
+
+fn is_granted(subscriber: &Subscriber) -> bool {
+    matches!(subscriber.viewpoint_status(), ViewpointStatus::Granted { .. })
+}
+
+#[test]
+fn viewers_share_the_pixels_and_a_failure_reaches_only_its_viewer() {
+    let publisher = open_publisher(|config| config.viewpoint_pixels_per_second = 640 * 480 * 60);
+    let [one, two, three] = std::array::from_fn(|_| open_subscriber(&publisher, &Interests::default()));
+    let wanted = camera("mine", Lens::PINHOLE);
+    for subscriber in [&one, &two] {
+        subscriber.request_viewpoint(&wanted, 30.0).unwrap();
+        wait_until("the grant", || is_granted(subscriber));
+    }
+    three.request_viewpoint(&wanted, 30.0).unwrap();
+    let reason = wait_for("the refusal", || refusal(&three));
+    assert!(reason.contains("640x480 at 30 a second is 9.2 Mpx/s; 0.0 of the rig's 18.4 Mpx/s are left"), "{reason}");
+    one.release_viewpoint();
+    wait_until("the third", || is_granted(&three));
+
+    // What cannot be drawn ends for its viewer alone, in the rig's words, also when it asks again.
+    publisher.refuse_viewpoint(three.id(), "the adapter is out of memory \u{1b}[2J");
+    assert!(publisher.requested_viewpoints().iter().all(|viewpoint| viewpoint.subscriber != three.id()));
+    let reason = wait_for("the reason", || refusal(&three));
+    assert!(reason.contains("the adapter is out of memory \\u{1b}[2J"), "{reason}");
+    three.request_viewpoint(&wanted, 30.0).unwrap();
+    assert!(wait_for("the same answer", || refusal(&three)).contains("out of memory"));
+    assert!(is_granted(&two));
+    let mut smaller = wanted.clone();
+    smaller.intrinsics.width = 320;
+    three.request_viewpoint(&smaller, 30.0).unwrap();
+    wait_until("another request", || is_granted(&three));
+
+    publisher.set_max_view_pixels(320 * 480);
+    assert_eq!(publisher.requested_viewpoints().len(), 1);
+    let reason = wait_for("the limit", || refusal(&two));
+    assert!(reason.contains("640x480 is 0.3 Mpx, the rig draws at most 0.2 Mpx; ask for 452x339"), "{reason}");
+    assert!(is_granted(&three));
+}
+
+#[test]
+fn due_viewpoints_are_watched_ones_at_their_own_rate() {
+    let publisher = open_publisher(|config| config.viewpoint_lease_millis = 600_000);
+    let subscriber = open_subscriber(&publisher, &Interests::default());
+    subscriber.request_viewpoint(&camera("mine", Lens::PINHOLE), 10.0).unwrap();
+    let viewpoint = wait_for("the request", || publisher.requested_viewpoints().pop());
+    wait_until("somebody to watch it", || publisher.has_subscribers(&viewpoint.view));
+    // Two seconds of a rig at 30 a second, without waiting for them.
+    let start = Instant::now();
+    let due = |set: u32| publisher.due_viewpoints(start + Duration::from_secs(1) * set / 30);
+    let taken: Vec<u32> = (0..60).filter(|set| due(*set) == [viewpoint.clone()]).collect();
+    assert_eq!(taken, (0..20).map(|n| 3 * n).collect::<Vec<_>>());
+
+    // A request by hand that nobody watches is granted and never drawn.
+    let session = client(publisher.endpoints());
+    let camera = serde_json::to_string(&camera("\u{1b}[2J", Lens::PINHOLE)).unwrap();
+    let question = format!(r#"{{"schema_version":1,"max_fps":5.0,"camera":{camera}}}"#);
+    let replies = session.get("flyrig/v1/test/viewpoint/by-hand").payload(question).wait().unwrap();
+    assert!(replies.recv().unwrap().result().is_ok());
+    let by_hand = |viewpoint: &Viewpoint| viewpoint.subscriber == "by-hand";
+    let asked = publisher.requested_viewpoints().into_iter().find(by_hand).unwrap();
+    assert_eq!(asked.camera.id.as_str(), "\\u{1b}[2J");
+    assert!(!publisher.due_viewpoints(start + Duration::from_secs(60)).iter().any(by_hand));
+    session.close().wait().unwrap();
 }
