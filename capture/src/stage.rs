@@ -16,7 +16,8 @@ pub trait FrameStage: Send {
     /// Makes another frame of a frame.
     ///
     /// # Errors
-    /// Costs this frame alone and is counted; so is a panic, as `Corrupt`.
+    /// Costs this frame alone and is counted; so is a panic, as `Corrupt`, after which the next frames go to a new stage
+    /// where one can be made ([`crate::CaptureThreads::start_opening_staged`]).
     fn process(&mut self, frame: Frame) -> Result<Frame, CaptureError>;
 }
 

@@ -202,7 +202,7 @@ fn an_opening_that_hangs_holds_up_neither_the_others_nor_the_end() {
     assert!(late.running && !late.opened, "{late:?}");
     let text = late.last_error.unwrap().to_string();
     assert!(text.starts_with("camera hangs: was not opened within 5 s"), "{text}");
-    assert_eq!(threads.stuck(Duration::from_secs(2)), ["open hangs"]);
+    assert_eq!(threads.stuck(Duration::from_secs(4)), ["open hangs"]);
     flows(&threads, "good");
     dropped(threads);
     assert_eq!(calls.load(Ordering::SeqCst), 1, "no second thread went into the driver");
