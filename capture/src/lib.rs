@@ -4,7 +4,7 @@
 //! A [`CameraSource`] gives [`flyrig_types::Frame`]s with capture time, sequence number and camera
 //! name, or a [`CaptureError`] whose kind says what to do. [`CaptureThreads`] reads every source in
 //! a thread of its own into one [`LatestQueue`], with a [`FrameStage`] (decoding, compressing) in a
-//! second thread between them where one is asked for.
+//! second thread between them where one is asked for. A [`SourceOpener`] is a camera that may come later.
 
 mod blocking;
 mod camera_options;
@@ -15,6 +15,7 @@ mod error;
 mod folder;
 mod mjpeg;
 mod nokhwa_camera;
+mod panics;
 mod picture;
 mod pool;
 mod queue;
@@ -39,12 +40,13 @@ pub use nokhwa_camera::{NokhwaCamera, NokhwaDevice, NokhwaOptions, nokhwa_camera
 pub use pool::BufferPool;
 pub use queue::{LatestQueue, PopError};
 pub use recording::{
-    Compression, McapReplay, MessageTap, Note, Recorded, Recorder, Recording, recorded_messages, recorded_notes,
+    Compression, McapReplay, MessageTap, Note, RESERVE_BYTES, Recorded, Recorder, RecorderConfig, Recording, Rotation,
+    RotationError, SourceTap, recorded_messages, recorded_notes,
 };
 pub use rgb::{to_rgb8, to_rgb8_into};
 pub use source::{CameraSource, NetworkHealth, SourceHealth};
 pub use stage::FrameStage;
-pub use threads::{CameraStats, CaptureThreads, Pacing, ThreadsConfig};
+pub use threads::{CameraStats, CaptureThreads, Pacing, SourceOpener, ThreadsConfig};
 #[cfg(target_os = "linux")]
 pub use v4l2::{BusPlan, CameraNode, CameraReport, FormatReport, UsbPlace, V4l2Camera, camera_reports, plan_buses};
 pub use video::{VideoOptions, VideoReplay};

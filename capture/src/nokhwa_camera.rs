@@ -205,6 +205,10 @@ impl System {
 impl Opener for System {
     type Camera = OpenCamera;
 
+    fn device(&self) -> String {
+        format!("{:?}", self.0.device)
+    }
+
     fn open(&self) -> Result<OpenCamera, CaptureError> {
         let index = find(&list()?, &self.0.device)?;
         let rate = self.0.fps.round().clamp(1.0, 10_000.0) as u32;

@@ -55,7 +55,7 @@ pub trait CameraSource: Send {
     /// # Errors
     /// After an error of a recoverable kind ([`crate::CaptureErrorKind::is_recoverable`]) the next
     /// call goes on: with the next frame after `Corrupt`, with an attempt to reconnect after
-    /// `Disconnected` and `Io`. Every other kind is final, `EndOfStream` among them.
+    /// `Disconnected` and `Io`. Every other kind is final for this source, `EndOfStream` for its camera.
     fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError>;
 
     /// Time by which [`crate::Pacing::Lossless`] puts the frame given last in order with those of other

@@ -1,23 +1,23 @@
 //! Work on frames between a camera's thread and the common queue, in a thread of its own.
 
-use std::{
-    panic::{AssertUnwindSafe, catch_unwind},
-    time::Duration,
-};
+use std::{sync::Arc, time::Duration};
 
-use flyrig_types::Frame;
+use flyrig_types::{CameraId, Frame};
 
-use crate::{CaptureError, CaptureErrorKind, LatestQueue, threads::Shared};
+use crate::{CaptureError, CaptureErrorKind, LatestQueue, PopError, panics::caught, threads::Shared};
 
 /// Frames that may wait for a stage: one to work on next, one for jitter. More would only be older.
 const WAITING: usize = 2;
+/// A stage without frames shows that it lives so often.
+const TURN: Duration = Duration::from_millis(500);
 
 /// Work on every frame of a camera that shall not hold up the camera's own thread: decoding, compressing.
 pub trait FrameStage: Send {
     /// Makes another frame of a frame.
     ///
     /// # Errors
-    /// Costs this frame alone and is counted; so is a panic, as `Corrupt`.
+    /// Costs this frame alone and is counted; so is a panic, as `Corrupt`, after which the next frames go to a new stage
+    /// where one can be made ([`crate::CaptureThreads::start_opening_staged`]).
     fn process(&mut self, frame: Frame) -> Result<Frame, CaptureError>;
 }
 
@@ -35,20 +35,51 @@ impl Hand {
     }
 }
 
+/// Makes a camera's stage.
+pub(crate) type StageMaker = Arc<dyn Fn(&CameraId) -> Box<dyn FrameStage> + Send + Sync>;
+
+/// A stage, and how to make another when it has panicked; without that it is used on.
+pub(crate) struct Stage {
+    pub stage: Box<dyn FrameStage>,
+    pub maker: Option<StageMaker>,
+}
+
+impl Stage {
+    /// Replaces the stage, if another can be made.
+    fn renew(&mut self, camera: &CameraId) -> bool {
+        let Some(maker) = &self.maker else { return false };
+        let Ok(fresh) = caught(|| maker(camera)) else { return false };
+        let broken = std::mem::replace(&mut self.stage, fresh);
+        let _ = caught(move || drop(broken));
+        true
+    }
+}
+
 impl Shared {
     /// The body of a stage's thread.
-    pub(crate) fn run_stage(&self, slot: usize, mut stage: Box<dyn FrameStage>) {
+    pub(crate) fn run_stage(&self, slot: usize, mut stage: Stage) {
         let Some(hand) = self.hand(slot) else { return };
-        let camera = self.camera(slot);
+        let (camera, pulse) = (self.camera(slot), &self.pulses(slot).stage);
         // Ends when the camera's thread has closed the queue, and all that was in it is done.
-        while let Ok((frame, order_nanos)) = hand.0.pop(Duration::MAX) {
+        loop {
+            pulse.beat();
+            let (frame, order_nanos) = match hand.0.pop(TURN) {
+                Ok(next) => next,
+                Err(PopError::Timeout) => continue,
+                Err(PopError::Closed) => break,
+            };
+            pulse.beat();
             let sequence = frame.sequence;
-            let done = catch_unwind(AssertUnwindSafe(|| stage.process(frame))).unwrap_or_else(|_| {
-                Err(CaptureError::general(CaptureErrorKind::Corrupt, "made the decoder fail inside"))
+            let done = caught(|| stage.stage.process(frame)).unwrap_or_else(|text| {
+                if stage.renew(&camera) {
+                    self.count_stage_restart(slot);
+                }
+                let message = format!("made the decoder fail inside: {text}");
+                Err(CaptureError::general(CaptureErrorKind::Corrupt, message))
             });
             match done {
                 Ok(frame) => {
-                    if !self.deliver(slot, frame, order_nanos) {
+                    if !self.deliver(slot, pulse, frame, order_nanos) {
                         hand.close();
                         break;
                     }
@@ -59,6 +90,8 @@ impl Shared {
                 }
             }
         }
+        let _ = caught(move || drop(stage));
+        pulse.rest();
         self.end(slot);
     }
 }

@@ -1,5 +1,6 @@
 //! Cameras whose reading waits for ever: each is read in a thread that a watchdog looks after and, if need be, abandons.
 
+mod left;
 #[cfg(test)]
 mod tests;
 mod worker;
@@ -45,6 +46,9 @@ pub(crate) trait BlockingCamera {
 pub(crate) trait Opener: Send + Sync + 'static {
     type Camera: BlockingCamera;
 
+    /// Names what is opened, the same at every attempt.
+    fn device(&self) -> String;
+
     /// Takes as long as it takes.
     fn open(&self) -> Result<Self::Camera, CaptureError>;
 }
@@ -74,7 +78,7 @@ pub(crate) struct Expected {
 ///
 /// A read or an opening that takes too long is left alone in its thread, which ends as soon as its call returns, and the
 /// camera is opened again in a new one. When that hangs as well it is kept: a camera never has more than two threads in
-/// its driver, however often it fails.
+/// its driver, however often it fails and is opened again.
 #[derive(Debug)]
 pub(crate) struct Watched<O: Opener> {
     camera: CameraId,
@@ -118,18 +122,24 @@ impl Session {
 impl<O: Opener> Watched<O> {
     /// Opens at once, so that what is wrong is told at the start.
     pub fn open(camera: &CameraId, expected: Expected, opener: O) -> Result<Self, CaptureError> {
+        let abandoned = left::take(&opener.device());
         let mut watched = Self {
             camera: camera.clone(),
             expected,
             opener: Arc::new(opener),
             session: None,
-            abandoned: Vec::new(),
+            abandoned,
             stamps: Stamps::default(),
             frames: 0,
             health: SourceHealth::default(),
             pool: BufferPool::new(POOLED_FRAMES),
         };
         let of_camera = |error: CaptureError| error.of(camera);
+        if watched.abandoned.len() > MOST_ABANDONED {
+            let text =
+                "hangs in its driver since it was opened before; unplug it and plug it in again, or restart flyrig";
+            return Err(CaptureError::new(camera, CaptureErrorKind::Io, text));
+        }
         let session = watched.start().map_err(of_camera)?;
         let opened = session.line.events.pop(FIRST_FRAME);
         let line = Arc::clone(&session.line);
@@ -284,13 +294,17 @@ impl<O: Opener> CameraSource for Watched<O> {
 }
 
 impl<O: Opener> Drop for Watched<O> {
-    /// The camera is closed with its next frame; one that hangs stays in its thread until the process ends.
+    /// The camera is closed with its next frame; one that hangs stays in its thread until the process ends, and counts
+    /// when its device is opened again.
     fn drop(&mut self) {
-        let Some(session) = self.session.take() else { return };
-        session.line.abandon();
-        let deadline = Instant::now() + CLOSING;
-        if !session.is_stuck {
-            while session.line.events.pop(deadline.saturating_duration_since(Instant::now())).is_ok() {}
+        if let Some(session) = self.session.take() {
+            session.line.abandon();
+            let deadline = Instant::now() + CLOSING;
+            if !session.is_stuck {
+                while session.line.events.pop(deadline.saturating_duration_since(Instant::now())).is_ok() {}
+            }
+            self.abandoned.push(session.line);
         }
+        left::leave(&self.opener.device(), self.abandoned.drain(..));
     }
 }

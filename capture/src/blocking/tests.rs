@@ -128,6 +128,10 @@ impl BlockingCamera for Fake {
 impl Opener for Arc<Script> {
     type Camera = Fake;
 
+    fn device(&self) -> String {
+        format!("{:p}", Arc::as_ptr(self))
+    }
+
     fn open(&self) -> Result<Fake, CaptureError> {
         self.tried.fetch_add(1, Ordering::SeqCst);
         let inside = self.enter();
@@ -267,6 +271,24 @@ fn threads_do_not_pile_up_whatever_hangs() {
     until("it came back", || script.open.load(Ordering::SeqCst) == 0);
     while next(&mut camera).is_err() {}
     assert_eq!((camera.health().reconnects, script.most_open.load(Ordering::SeqCst)), (1, 2));
+}
+
+#[test]
+fn openings_that_hang_do_not_pile_up_over_attempts() {
+    let script = script(&[Open::Hangs, Open::Hangs, Open::Camera(frames(30))]);
+    let texts: Vec<String> = (0..4).map(|_| open(&script).unwrap_err().to_string()).collect();
+    assert!(texts[..2].iter().all(|text| text.contains("was not opened within 5 s")), "{texts:?}");
+    assert!(texts[2..].iter().all(|text| text.contains("hangs in its driver since it was opened before")), "{texts:?}");
+    assert_eq!((script.tried.load(Ordering::SeqCst), script.most_open.load(Ordering::SeqCst)), (2, 2));
+    script.release(2);
+    until("both return", || script.open.load(Ordering::SeqCst) == 0);
+    let mut camera = loop {
+        // The last of a thread is its word that it has ended.
+        if let Ok(camera) = open(&script) {
+            break camera;
+        }
+    };
+    assert!(next(&mut camera).is_ok());
 }
 
 #[test]

@@ -1,7 +1,6 @@
 //! The thread that waits inside of a camera's driver.
 
 use std::{
-    panic::{AssertUnwindSafe, catch_unwind},
     sync::{
         Arc, Mutex, OnceLock, PoisonError,
         atomic::{AtomicBool, Ordering},
@@ -12,7 +11,7 @@ use std::{
 use flyrig_types::{CameraId, PixelBuffer};
 
 use super::{BlockingCamera, Opener, Shot};
-use crate::{BufferPool, CaptureError, CaptureErrorKind, LatestQueue, threads::panic_text};
+use crate::{BufferPool, CaptureError, CaptureErrorKind, LatestQueue, panics::caught};
 
 /// Frames that may wait for the camera's own thread: one to take next, one for jitter.
 const WAITING: usize = 2;
@@ -82,10 +81,8 @@ pub(super) fn start<O: Opener>(
 
 /// Every call by itself: a camera that is dropped while its own panic unwinds may panic again, which ends the process.
 fn guarded<T>(call: impl FnOnce() -> Result<T, CaptureError>) -> Result<T, CaptureError> {
-    catch_unwind(AssertUnwindSafe(call)).unwrap_or_else(|panic| {
-        let text = format!("its driver library failed inside: {}; opening it again", panic_text(&*panic));
-        // What the panic carries is somebody else's code too.
-        let _ = catch_unwind(AssertUnwindSafe(|| drop(panic)));
+    caught(call).unwrap_or_else(|text| {
+        let text = format!("its driver library failed inside: {text}; opening it again");
         Err(CaptureError::general(CaptureErrorKind::Disconnected, text))
     })
 }

@@ -1,7 +1,6 @@
 //! Uncompressed pictures made JPEG before they are recorded, in a thread of their own.
 
 use std::{
-    panic::{AssertUnwindSafe, catch_unwind},
     sync::Arc,
     thread::{Builder, JoinHandle},
     time::Duration,
@@ -10,7 +9,7 @@ use std::{
 use flyrig_types::{CameraId, Frame, Image};
 
 use super::writer::Outlet;
-use crate::{BufferPool, CaptureError, CaptureErrorKind, JpegEncoding, LatestQueue};
+use crate::{BufferPool, CaptureError, CaptureErrorKind, JpegEncoding, LatestQueue, panics::caught};
 
 /// Pictures of a camera that may wait for their compression: a quarter of a second of 30 frames a second.
 const WAITING: usize = 8;
@@ -41,8 +40,7 @@ impl Compressor {
         let queue = Arc::new(LatestQueue::new(WAITING));
         let (of_thread, mut out) = (Arc::clone(&queue), outlet.clone());
         let work = move || {
-            let run = AssertUnwindSafe(|| compress(&of_thread, compression.quality, &mut out));
-            if catch_unwind(run).is_err() {
+            if caught(|| compress(&of_thread, compression.quality, &mut out)).is_err() {
                 out.shared.stop("compressing failed inside; record without it (record.jpeg_quality = 0)".to_owned());
             }
             // Nobody waits for a thread that has ended.

@@ -3,10 +3,17 @@
 //! `camera/<name>` holds foxglove `CompressedImage` (JPEG pictures as the camera sent them, and what a [`Compression`] made
 //! of others) or `RawImage` (every other format, bytes as they came), protobuf, logged at capture time. A replay gives the
 //! very frames that are in the file. What else a program wants to find (calibrations) stands before the first frame.
+//! A [`Rotation`] divides a long recording into files that are complete each by itself.
 
 mod compress;
+mod disk;
 mod message;
+mod part;
+mod parts;
 mod reader;
+mod rotation;
+#[cfg(test)]
+mod rotation_tests;
 mod tap;
 #[cfg(test)]
 mod tests;
@@ -15,6 +22,7 @@ mod writer;
 pub use self::{
     compress::Compression,
     reader::{McapReplay, recorded_messages, recorded_notes},
-    tap::{MessageTap, Recording},
-    writer::{Note, Recorded, Recorder},
+    rotation::{Rotation, RotationError},
+    tap::{MessageTap, Recording, SourceTap},
+    writer::{Note, RESERVE_BYTES, Recorded, Recorder, RecorderConfig},
 };

@@ -1,54 +1,42 @@
 //! Playing a recording.
 
 use std::{
-    fs::File,
-    io::BufReader,
     path::{Path, PathBuf},
     time::Duration,
 };
 
 use flyrig_types::{CameraId, Frame};
-use mcap::{io::MessageReader, sans_io::LinearReaderOptions};
 
-use super::message::{self, TOPIC};
+use super::{
+    message::{self, TOPIC},
+    parts::Parts,
+};
 use crate::{CameraSource, CaptureError, CaptureErrorKind};
 
-/// Bytes read at once.
-const BUFFER: usize = 1 << 20;
 /// Most messages and bytes before the first frame: other people's recordings may have no frame at all.
 const MOST_NOTES: usize = 4096;
 const MOST_NOTE_BYTES: usize = 64 << 20;
 
 /// One camera of a recording. Frames come as they were recorded, in the order of the file; one that breaks off, as after
-/// a crash, ends there with a warning.
+/// a crash, ends there with a warning. The first file of a rotated recording ([`crate::Rotation`]) gives the frames of all
+/// its files, up to the first that is missing; any other file gives its own.
 pub struct McapReplay {
     camera: CameraId,
     path: PathBuf,
     topic: String,
-    messages: MessageReader<BufReader<File>>,
+    messages: Parts,
     /// Number of the last frame in the file, of 32 bits, and in all.
     last: Option<(u32, u64)>,
     is_over: bool,
 }
 
-fn open(path: &Path) -> Result<MessageReader<BufReader<File>>, CaptureError> {
-    let cannot = |error: std::io::Error| {
-        CaptureError::general(CaptureErrorKind::NotFound, format!("{} cannot be opened: {error}", path.display()))
-    };
-    let file = File::open(path).map_err(cannot)?;
-    // A damaged length must not ask for more memory than the file has bytes.
-    let length = usize::try_from(file.metadata().map_err(cannot)?.len()).unwrap_or(usize::MAX);
-    let options = LinearReaderOptions::default().with_record_length_limit(length);
-    Ok(MessageReader::new_with_options(BufReader::with_capacity(BUFFER, file), options))
-}
-
-/// Topic and content of everything before the first frame of a recording.
+/// Topic and content of everything before the first frame of a recording. Every file of a rotated one holds them.
 ///
 /// # Errors
 /// `NotFound` without the file, `Corrupt` when it is no MCAP file.
 pub fn recorded_notes(path: &Path) -> Result<Vec<(String, Vec<u8>)>, CaptureError> {
     let (mut notes, mut bytes) = (Vec::new(), 0usize);
-    for message in open(path)? {
+    for message in Parts::open(path)? {
         if notes.len() >= MOST_NOTES || bytes >= MOST_NOTE_BYTES {
             break;
         }
@@ -69,13 +57,14 @@ pub fn recorded_notes(path: &Path) -> Result<Vec<(String, Vec<u8>)>, CaptureErro
     Ok(notes)
 }
 
-/// Time, nanoseconds, and content of every message of a topic, in the order of the file, until it breaks off.
+/// Time, nanoseconds, and content of every message of a topic, in the order of the file, until it breaks off; of a
+/// rotated recording, over all its files.
 ///
 /// # Errors
 /// `NotFound` without the file.
 pub fn recorded_messages(path: &Path, topic: &str) -> Result<impl Iterator<Item = (i64, Vec<u8>)>, CaptureError> {
     let topic = topic.to_owned();
-    let messages = open(path)?.map_while(Result::ok).filter(move |message| message.channel.topic == topic);
+    let messages = Parts::open(path)?.map_while(Result::ok).filter(move |message| message.channel.topic == topic);
     Ok(messages.map(|message| (i64::try_from(message.log_time).unwrap_or(i64::MAX), message.data.into_owned())))
 }
 
@@ -89,7 +78,7 @@ impl McapReplay {
             camera: camera.clone(),
             path: path.to_owned(),
             topic: format!("{TOPIC}{camera}"),
-            messages: open(path).map_err(|error| error.of(camera))?,
+            messages: Parts::open(path).map_err(|error| error.of(camera))?,
             last: None,
             is_over: false,
         })
@@ -120,7 +109,11 @@ impl CameraSource for McapReplay {
                 continue;
             }
             let sequence = self.last.map_or(u64::from(message.sequence), |(before, counted)| {
-                counted.wrapping_add(u64::from(message.sequence.wrapping_sub(before)))
+                match message.sequence.wrapping_sub(before) {
+                    step if step <= u32::MAX / 2 => counted.wrapping_add(u64::from(step)),
+                    // Back: the camera was opened anew and counts from its start.
+                    _ => counted.wrapping_add(1),
+                }
             });
             self.last = Some((message.sequence, sequence));
             let schema = message.channel.schema.as_ref().map_or("", |schema| schema.name.as_str());

@@ -11,6 +11,23 @@ use super::{
 };
 use crate::{CameraSource, CaptureError, SourceHealth};
 
+/// Makes sources record, wherever they are opened: cheap to clone, and it does not keep the recording from ending.
+#[derive(Debug, Clone)]
+pub struct SourceTap {
+    pub(super) outlet: Outlet,
+    pub(super) compression: Option<Compression>,
+}
+
+impl SourceTap {
+    /// Records what a source gives, on its way.
+    ///
+    /// # Errors
+    /// `Io` when the system gives no thread for the compression.
+    pub fn tap<S: CameraSource>(&self, source: S) -> Result<Recording<S>, CaptureError> {
+        Recording::new(source, self.outlet.clone(), self.compression)
+    }
+}
+
 /// A source whose frames are recorded as they pass: JPEG pictures as they came, others compressed where the recorder was
 /// told so. The frames themselves go on as they are.
 #[derive(Debug)]

@@ -3,16 +3,16 @@
 use std::{
     fs,
     io::{self, Cursor, Seek, SeekFrom, Write},
-    path::Path,
+    path::{Path, PathBuf},
     time::Duration,
 };
 
 use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
-use super::{Compression, McapReplay, Note, Recorder, recorded_notes};
+use super::{Compression, McapReplay, Note, Recorder, RecorderConfig, disk::Disk, recorded_notes};
 use crate::{CameraSource, CaptureError, CaptureErrorKind, to_rgb8};
 
-struct Script(CameraId, u64, u64);
+pub(super) struct Script(pub CameraId, pub u64, pub u64);
 
 fn jpeg() -> Vec<u8> {
     let mut bytes = Cursor::new(Vec::new());
@@ -23,7 +23,7 @@ fn jpeg() -> Vec<u8> {
 }
 
 /// Frame `n` of a camera: raw pictures of camera "a", JPEG pictures of every other.
-fn frame(camera: &CameraId, n: u64) -> Frame {
+pub(super) fn frame(camera: &CameraId, n: u64) -> Frame {
     let image = if camera.as_str() == "a" {
         Image::new(4, 2, PixelFormat::Yuyv, vec![n as u8; 16])
     } else {
@@ -48,12 +48,12 @@ impl CameraSource for Script {
     }
 }
 
-fn note() -> Note {
+pub(super) fn note() -> Note {
     let schema = ("flyrig.Test".to_owned(), "protobuf".to_owned(), vec![1]);
     Note { topic: "calibration/a".to_owned(), schema, payload: vec![1, 2, 3] }
 }
 
-fn pass(source: &mut impl CameraSource) -> u64 {
+pub(super) fn pass(source: &mut impl CameraSource) -> u64 {
     (0..).take_while(|_| source.next_frame(Duration::ZERO).is_ok()).count() as u64
 }
 
@@ -68,12 +68,12 @@ fn record(path: &Path, frames: u64) {
     assert_eq!((state.frames, state.problem), (2 * frames, None));
 }
 
-fn replayed(path: &Path, camera: &str) -> Vec<Frame> {
+pub(super) fn replayed(path: &Path, camera: &str) -> Vec<Frame> {
     let mut replay = McapReplay::open(&camera.into(), path).unwrap();
     std::iter::from_fn(|| replay.next_frame(Duration::ZERO).ok()).collect()
 }
 
-fn same(found: &Frame, wanted: &Frame) {
+pub(super) fn same(found: &Frame, wanted: &Frame) {
     let all = |f: &Frame| (f.camera.clone(), f.sequence, f.capture_nanos, f.exposure_nanos, f.image.format());
     assert_eq!(all(found), all(wanted));
     assert_eq!((found.image.width(), found.image.height()), (wanted.image.width(), wanted.image.height()));
@@ -169,8 +169,29 @@ fn every_cut_of_a_recording_gives_the_frames_before_it() {
     assert_eq!(recorder.finish().frames, 40);
 }
 
-/// A disk with so much room.
+/// A disk with so much room, and a file on it.
+struct SmallDisk(usize);
 struct Small(Cursor<Vec<u8>>, usize);
+
+impl Disk for SmallDisk {
+    type File = Small;
+
+    fn path(&self, _part: u32) -> PathBuf {
+        "take.mcap".into()
+    }
+
+    fn create(&mut self, _part: u32) -> io::Result<Small> {
+        Ok(Small(Cursor::new(Vec::new()), self.0))
+    }
+
+    fn sync(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+
+    fn free_bytes(&self) -> Option<u64> {
+        None
+    }
+}
 
 impl Write for Small {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
@@ -193,7 +214,7 @@ impl Seek for Small {
 
 #[test]
 fn a_full_disk_stops_the_recording_and_not_the_cameras() {
-    let recorder = Recorder::start(Small(Cursor::new(Vec::new()), 3000), &[], None).unwrap();
+    let recorder = Recorder::start(SmallDisk(3000), &[], &RecorderConfig::default()).unwrap();
     let mut tap = recorder.tap(Script("a".into(), 0, 100_000)).unwrap();
     let mut passed = 0;
     while recorder.state().problem.is_none() {

@@ -1,33 +1,41 @@
 //! Writing a recording beside a running rig.
 
 use std::{
-    fs::OpenOptions,
-    io::{BufWriter, Seek, Write},
-    path::Path,
+    io,
+    path::{Path, PathBuf},
     sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
+        Arc, Mutex, MutexGuard, OnceLock, PoisonError,
         atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     thread::{Builder, JoinHandle},
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
 };
 
 use crossbeam::channel::{Receiver, RecvTimeoutError, Sender, TrySendError, bounded};
 use flyrig_types::Frame;
-use mcap::{McapError, WriteOptions, Writer, records::MessageHeader};
+use mcap::{McapError, McapResult};
 
 use super::{
     compress::Compression,
+    disk::{Disk, Folder},
     message::{self, Channel},
-    tap::{MessageTap, Recording},
+    part::{Link, Part},
+    rotation::Rotation,
+    tap::{MessageTap, Recording, SourceTap},
 };
-use crate::{CameraSource, CaptureError, CaptureErrorKind};
+use crate::{CameraSource, CaptureError, CaptureErrorKind, panics::caught};
+
+/// Free space that a recording leaves on its file system unless it is told otherwise, bytes: room for its index, and for
+/// whatever else the machine writes.
+pub const RESERVE_BYTES: u64 = 1 << 30;
 
 /// A chunk ends after so many bytes or so long: what a killed process loses at most.
 const CHUNK_BYTES: u64 = 8 << 20;
 const CHUNK_TIME: Duration = Duration::from_millis(500);
-/// Frames and bytes that may wait for the disk.
-const WAITING_FRAMES: usize = 512;
+/// What is written is made durable so often: what a power cut loses at most, beside a chunk.
+const SYNC_TIME: Duration = Duration::from_secs(2);
+/// Frames and bytes that may wait for the disk, which stands still while it makes bytes durable.
+const WAITING_FRAMES: usize = 4096;
 const WAITING_BYTES: usize = 512 << 20;
 
 /// Something to find in the file before the first frame, like a calibration.
@@ -41,36 +49,64 @@ pub struct Note {
     pub payload: Vec<u8>,
 }
 
-/// How a recording stands.
+/// Settings of a [`Recorder`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RecorderConfig {
+    /// Without it every picture is recorded as it came.
+    pub compression: Option<Compression>,
+    /// When a new file is begun.
+    pub rotation: Rotation,
+    /// Free space that is left on the file system, bytes: without it no recording starts, and a running one stops there.
+    pub reserve_bytes: u64,
+}
+
+impl Default for RecorderConfig {
+    fn default() -> Self {
+        Self { compression: None, rotation: Rotation::default(), reserve_bytes: RESERVE_BYTES }
+    }
+}
+
+/// State of a recording; counts are over all of its files.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Recorded {
-    /// Frames in the file.
+    /// The newest file.
+    pub file: PathBuf,
+    /// Files begun.
+    pub files: u32,
+    /// Frames in the files.
     pub frames: u64,
-    /// Their bytes in the file.
+    /// Their bytes in the files.
     pub bytes: u64,
     /// Their bytes as the cameras sent them.
     pub bytes_sent: u64,
     /// Frames that were not recorded because compressing them took too long.
     pub dropped: u64,
+    /// Time since the start; of a recording that has ended, until then.
+    pub elapsed: Duration,
+    /// Free space of the file system when it was last looked at, bytes; `None` where that is unknown.
+    pub free_bytes: Option<u64>,
     /// Why it has stopped, if it has. What was written before is readable.
     pub problem: Option<String>,
 }
 
 /// A message on its way to the file.
 #[derive(Debug)]
-struct Item {
-    channel: Arc<Channel>,
-    nanos: i64,
-    sequence: u64,
-    payload: Vec<u8>,
+pub(super) struct Item {
+    pub channel: Arc<Channel>,
+    pub nanos: i64,
+    pub sequence: u64,
+    pub payload: Vec<u8>,
     /// Bytes of the frame as its camera sent it; none for what is no frame.
     bytes_sent: Option<usize>,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Shared {
     waiting_bytes: AtomicUsize,
     state: Mutex<Recorded>,
+    started: Instant,
+    /// How long it took, once it has ended.
+    took: OnceLock<Duration>,
     /// The file ends with what waits now.
     is_ending: AtomicBool,
 }
@@ -112,54 +148,99 @@ impl Shared {
             state.problem = Some(problem);
         }
     }
+
+    fn begin_file(&self, file: PathBuf) {
+        let mut state = self.lock();
+        state.file = file;
+        state.files += 1;
+    }
 }
 
 impl Recorder {
-    /// Makes a file, which must not be there yet, and writes the notes into it. Without compression every picture is
-    /// recorded as it came.
+    /// Starts a recording with default settings but for the compression; see [`Self::create_with`].
     ///
     /// # Errors
-    /// `Io` says what the system refused.
+    /// As [`Self::create_with`].
     pub fn create(path: &Path, notes: &[Note], compression: Option<Compression>) -> Result<Self, CaptureError> {
+        Self::create_with(path, notes, &RecorderConfig { compression, ..RecorderConfig::default() })
+    }
+
+    /// Creates a file, which must not exist yet, and writes the notes into it. With a [`Rotation`] it goes on in
+    /// `take-0001.mcap`, `take-0002.mcap` ... beside `take.mcap`, each of them complete by itself.
+    ///
+    /// # Errors
+    /// `Io` names what the system refused, a file that is in the way, or the space that is missing.
+    pub fn create_with(path: &Path, notes: &[Note], config: &RecorderConfig) -> Result<Self, CaptureError> {
         let io = |error: &dyn std::fmt::Display| {
             CaptureError::general(CaptureErrorKind::Io, format!("{} cannot be recorded to: {error}", path.display()))
         };
-        let file = OpenOptions::new().write(true).create_new(true).open(path).map_err(|error| io(&error))?;
-        Self::start(BufWriter::with_capacity(1 << 20, file), notes, compression).map_err(|error| io(&cause(error)))
+        let folder = Folder::new(path);
+        let second = folder.path(1);
+        // Found now rather than in the middle of the recording.
+        if config.rotation.is_on() && second.exists() {
+            return Err(io(&format!("{} is there already; name another file", second.display())));
+        }
+        Self::start(folder, notes, config).map_err(|error| io(&cause(error)))
     }
 
-    pub(super) fn start<W: Write + Seek + Send + 'static>(
-        target: W,
-        notes: &[Note],
-        compression: Option<Compression>,
-    ) -> mcap::McapResult<Self> {
-        // Chunks are made in memory and written whole: a killed process leaves no half of one behind.
-        let options = WriteOptions::new().compression(None).chunk_size(None).disable_seeking(true);
-        let mut writer = Writer::with_options(target, options.library(concat!("flyrig ", env!("CARGO_PKG_VERSION"))))?;
-        for (sequence, note) in (0..).zip(notes) {
-            let (name, encoding, data) = &note.schema;
-            let schema = writer.add_schema(name, encoding, data)?;
-            let channel_id = writer.add_channel(schema, &note.topic, "protobuf", &Default::default())?;
-            let header = MessageHeader { channel_id, sequence, log_time: 0, publish_time: 0 };
-            writer.write_to_known_channel(&header, &note.payload)?;
+    pub(super) fn start<D: Disk>(mut disk: D, notes: &[Note], config: &RecorderConfig) -> McapResult<Self> {
+        let free_bytes = disk.free_bytes();
+        if let Some(shortage) = shortage(free_bytes, config.reserve_bytes) {
+            return Err(McapError::Io(io::Error::new(io::ErrorKind::StorageFull, shortage)));
         }
-        writer.flush()?;
+        let link = config.rotation.is_on().then(|| Link { recording: new_id(), part: 0 });
+        let part = Part::create(&mut disk, 0, notes, link.clone())?;
         let (sender, receiver) = bounded(WAITING_FRAMES);
-        let shared = Arc::new(Shared::default());
+        let shared = Arc::new(Shared {
+            waiting_bytes: AtomicUsize::new(0),
+            state: Mutex::new(Recorded { free_bytes, ..Recorded::default() }),
+            started: Instant::now(),
+            took: OnceLock::new(),
+            is_ending: AtomicBool::new(false),
+        });
+        shared.begin_file(disk.path(0));
         let of_thread = Arc::clone(&shared);
+        let mut writing = Writing {
+            disk,
+            notes: notes.to_vec(),
+            rotation: config.rotation,
+            reserve_bytes: config.reserve_bytes,
+            link,
+            shared: Arc::clone(&shared),
+            fresh: Recorded::default(),
+            unflushed: 0,
+            flushed: Instant::now(),
+            is_dirty: false,
+            synced: Instant::now(),
+        };
         let thread = Builder::new().name("recorder".to_owned()).spawn(move || {
-            if let Err(error) = write(writer, &receiver, &of_thread) {
-                of_thread.stop(format!("{}; free space on the disk and record into a new file", cause(error)));
+            match caught(move || writing.run(part, &receiver)) {
+                Ok(Ok(())) => {}
+                Ok(Err(error)) => {
+                    let is_full = matches!(&error, McapError::Io(error) if error.kind() == io::ErrorKind::StorageFull);
+                    let advice = if is_full { "free space on the disk and record" } else { "record" };
+                    of_thread.stop(format!("{}; {advice} into a new file", cause(error)));
+                }
+                Err(text) => of_thread.stop(format!("writing failed inside: {text}; record into a new file")),
             }
+            of_thread.took.get_or_init(|| of_thread.started.elapsed());
         });
         let outlet = Outlet { sender: Some(sender), shared };
-        Ok(Self { outlet, compression, thread: Some(thread.map_err(McapError::Io)?) })
+        Ok(Self { outlet, compression: config.compression, thread: Some(thread.map_err(McapError::Io)?) })
     }
 
-    /// How it stands.
+    /// Returns the state as of now.
     #[must_use]
     pub fn state(&self) -> Recorded {
-        self.outlet.shared.lock().clone()
+        let shared = &self.outlet.shared;
+        let elapsed = shared.took.get().copied().unwrap_or_else(|| shared.started.elapsed());
+        Recorded { elapsed, ..shared.lock().clone() }
+    }
+
+    /// Returns a way to record sources that are opened elsewhere or later.
+    #[must_use]
+    pub fn source_tap(&self) -> SourceTap {
+        SourceTap { outlet: self.outlet.clone(), compression: self.compression }
     }
 
     /// Records what a source gives, on its way.
@@ -167,7 +248,7 @@ impl Recorder {
     /// # Errors
     /// `Io` when the system gives no thread for the compression.
     pub fn tap<S: CameraSource>(&self, source: S) -> Result<Recording<S>, CaptureError> {
-        Recording::new(source, self.outlet.clone(), self.compression)
+        self.source_tap().tap(source)
     }
 
     /// Records messages of one kind beside the frames: topic, and name, encoding and content of their schema.
@@ -264,46 +345,136 @@ fn cause(error: McapError) -> String {
     }
 }
 
-fn write<W: Write + Seek>(mut writer: Writer<W>, items: &Receiver<Item>, shared: &Shared) -> mcap::McapResult<()> {
-    let (mut flushed, mut unflushed) = (Instant::now(), 0u64);
-    // Of frames that are in the chunk in memory: they count once it is in the file.
-    let mut fresh = Recorded::default();
-    loop {
-        match items.recv_timeout(CHUNK_TIME) {
-            Ok(item) => {
-                let (name, encoding, data) = &item.channel.schema;
-                let schema = writer.add_schema(name, encoding, data)?;
-                let channel_id = writer.add_channel(schema, &item.channel.topic, "protobuf", &item.channel.metadata)?;
-                let log_time = u64::try_from(item.nanos).unwrap_or(0);
-                let sequence = item.sequence as u32;
-                let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
-                writer.write_to_known_channel(&header, &item.payload)?;
-                shared.waiting_bytes.fetch_sub(item.payload.len(), Ordering::Relaxed);
-                unflushed += item.payload.len() as u64;
-                if let Some(bytes_sent) = item.bytes_sent {
-                    fresh.frames += 1;
-                    fresh.bytes += item.payload.len() as u64;
-                    fresh.bytes_sent += bytes_sent as u64;
+/// Describes what is missing when less than the reserve is free.
+fn shortage(free_bytes: Option<u64>, reserve_bytes: u64) -> Option<String> {
+    let free_bytes = free_bytes.filter(|free| *free < reserve_bytes)?;
+    let mb = |bytes: u64| bytes / 1_000_000;
+    Some(format!(
+        "only {} MB are free on its file system, and a recording leaves {} MB; free space or record to another disk",
+        mb(free_bytes),
+        mb(reserve_bytes)
+    ))
+}
+
+/// Returns a name that no other recording of this machine has.
+fn new_id() -> String {
+    let time = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    format!("{:x}-{:x}", time.as_nanos(), std::process::id())
+}
+
+/// The recorder's thread.
+struct Writing<D: Disk> {
+    disk: D,
+    notes: Vec<Note>,
+    rotation: Rotation,
+    reserve_bytes: u64,
+    /// Of the current part.
+    link: Option<Link>,
+    shared: Arc<Shared>,
+    /// Frames of the chunk in memory: they count once they are in the file.
+    fresh: Recorded,
+    /// Bytes of that chunk.
+    unflushed: u64,
+    flushed: Instant,
+    /// Whether the file has bytes that are not durable yet.
+    is_dirty: bool,
+    synced: Instant,
+}
+
+impl<D: Disk> Writing<D> {
+    fn run(&mut self, mut part: Part<D>, items: &Receiver<Item>) -> McapResult<()> {
+        loop {
+            match items.recv_timeout(CHUNK_TIME) {
+                Ok(item) => {
+                    let is_due = |(bytes, begun): (u64, Instant)| self.rotation.is_due(bytes, begun.elapsed());
+                    if part.with(&item).is_some_and(is_due) {
+                        self.finish(part)?;
+                        part = match self.next()? {
+                            Some(next) => next,
+                            None => return Ok(()),
+                        };
+                    }
+                    part.write(&item)?;
+                    self.count(&item);
                 }
-                // A frame that could not wait has ended it.
-                if shared.lock().problem.is_some() {
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+            // A frame that could not wait has ended it, or all that waited is written.
+            let is_ending = self.shared.is_ending.load(Ordering::Relaxed);
+            if self.shared.lock().problem.is_some() || (is_ending && items.is_empty()) {
+                break;
+            }
+            if self.unflushed >= CHUNK_BYTES || (self.unflushed > 0 && self.flushed.elapsed() >= CHUNK_TIME) {
+                part.flush()?;
+                self.is_dirty = true;
+                self.now_in_file();
+                if !self.has_space() {
                     break;
                 }
             }
-            Err(RecvTimeoutError::Timeout) => {}
-            Err(RecvTimeoutError::Disconnected) => break,
+            if self.is_dirty && self.synced.elapsed() >= SYNC_TIME {
+                self.disk.sync()?;
+                (self.is_dirty, self.synced) = (false, Instant::now());
+            }
         }
-        if shared.is_ending.load(Ordering::Relaxed) && items.is_empty() {
-            break;
-        }
-        if unflushed >= CHUNK_BYTES || (unflushed > 0 && flushed.elapsed() >= CHUNK_TIME) {
-            writer.flush()?;
-            shared.add(&std::mem::take(&mut fresh));
-            (flushed, unflushed) = (Instant::now(), 0);
+        self.finish(part)
+    }
+
+    fn count(&mut self, item: &Item) {
+        let length = item.payload.len();
+        self.shared.waiting_bytes.fetch_sub(length, Ordering::Relaxed);
+        self.unflushed += length as u64;
+        if let Some(bytes_sent) = item.bytes_sent {
+            self.fresh.frames += 1;
+            self.fresh.bytes += length as u64;
+            self.fresh.bytes_sent += bytes_sent as u64;
         }
     }
-    writer.finish()?;
-    writer.into_inner().flush()?;
-    shared.add(&fresh);
-    Ok(())
+
+    fn now_in_file(&mut self) {
+        self.shared.add(&std::mem::take(&mut self.fresh));
+        (self.flushed, self.unflushed) = (Instant::now(), 0);
+    }
+
+    /// Whether the reserve is still free; stops the recording where it is not.
+    fn has_space(&self) -> bool {
+        let free_bytes = self.disk.free_bytes();
+        self.shared.lock().free_bytes = free_bytes;
+        let shortage = shortage(free_bytes, self.reserve_bytes);
+        let has_space = shortage.is_none();
+        if let Some(shortage) = shortage {
+            self.shared.stop(shortage);
+        }
+        has_space
+    }
+
+    fn finish(&mut self, part: Part<D>) -> McapResult<()> {
+        part.finish(&mut self.disk)?;
+        self.now_in_file();
+        (self.is_dirty, self.synced) = (false, Instant::now());
+        Ok(())
+    }
+
+    /// Begins the next file; none when there is no space for it.
+    fn next(&mut self) -> McapResult<Option<Part<D>>> {
+        if !self.has_space() {
+            return Ok(None);
+        }
+        let number = self.link.as_ref().map_or(0, |link| link.part).saturating_add(1);
+        if let Some(link) = &mut self.link {
+            link.part = number;
+        }
+        let path = self.disk.path(number);
+        let part =
+            Part::create(&mut self.disk, number, &self.notes, self.link.clone()).map_err(|error| match error {
+                McapError::Io(error) => {
+                    let text = format!("{} cannot be created: {error}", path.display());
+                    McapError::Io(io::Error::new(error.kind(), text))
+                }
+                other => other,
+            })?;
+        self.shared.begin_file(path);
+        Ok(Some(part))
+    }
 }

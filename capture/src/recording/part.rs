@@ -1,0 +1,123 @@
+//! One file of a recording while it is written.
+
+use std::{collections::BTreeMap, sync::Arc, time::Instant};
+
+use mcap::{McapResult, WriteOptions, Writer, records::MessageHeader};
+
+use super::{
+    disk::Disk,
+    message::Channel,
+    writer::{Item, Note},
+};
+
+/// A message's record and its entry in the index, bytes.
+const MESSAGE_BYTES: u64 = 64;
+/// Keys of the channels of a rotated recording: what joins its parts.
+const RECORDING: &str = "recording";
+const PART: &str = "part";
+
+/// Joins the parts of a rotated recording.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Link {
+    /// The same in all parts, and in no other recording.
+    pub recording: String,
+    /// Counted from 0.
+    pub part: u32,
+}
+
+impl Link {
+    pub fn read(metadata: &BTreeMap<String, String>) -> Option<Self> {
+        Some(Self { recording: metadata.get(RECORDING)?.clone(), part: metadata.get(PART)?.parse().ok()? })
+    }
+
+    fn put(&self, metadata: &mut BTreeMap<String, String>) {
+        metadata.insert(RECORDING.to_owned(), self.recording.clone());
+        metadata.insert(PART.to_owned(), self.part.to_string());
+    }
+}
+
+/// A file that is complete by itself: notes, schemas and channels stand in each.
+pub(super) struct Part<D: Disk> {
+    writer: Writer<D::File>,
+    link: Option<Link>,
+    channels: Vec<(Arc<Channel>, u16)>,
+    /// When the first message came that is no note.
+    begun: Option<Instant>,
+    /// About the length of the file.
+    bytes: u64,
+}
+
+impl<D: Disk> Part<D> {
+    /// Creates the file and writes the notes.
+    pub fn create(disk: &mut D, number: u32, notes: &[Note], link: Option<Link>) -> McapResult<Self> {
+        let target = disk.create(number)?;
+        // Chunks are made in memory and written whole: a killed process leaves no half of one behind.
+        let options = WriteOptions::new().compression(None).chunk_size(None).disable_seeking(true);
+        let writer = Writer::with_options(target, options.library(concat!("flyrig ", env!("CARGO_PKG_VERSION"))))?;
+        let mut part = Self { writer, link, channels: Vec::new(), begun: None, bytes: 0 };
+        for (sequence, note) in (0..).zip(notes) {
+            let channel_id = part.add(&note.schema, &note.topic, &BTreeMap::new())?;
+            part.put(&MessageHeader { channel_id, sequence, log_time: 0, publish_time: 0 }, &note.payload)?;
+        }
+        part.flush()?;
+        disk.sync()?;
+        Ok(part)
+    }
+
+    fn add(
+        &mut self,
+        (name, encoding, data): &(String, String, Vec<u8>),
+        topic: &str,
+        metadata: &BTreeMap<String, String>,
+    ) -> McapResult<u16> {
+        let schema = self.writer.add_schema(name, encoding, data)?;
+        let mut metadata = metadata.clone();
+        if let Some(link) = &self.link {
+            link.put(&mut metadata);
+        }
+        // Once in the data and once in the index.
+        self.bytes += 2 * (data.len() + topic.len()) as u64 + 2 * MESSAGE_BYTES;
+        self.writer.add_channel(schema, topic, "protobuf", &metadata)
+    }
+
+    fn put(&mut self, header: &MessageHeader, payload: &[u8]) -> McapResult<()> {
+        self.bytes += payload.len() as u64 + MESSAGE_BYTES;
+        self.writer.write_to_known_channel(header, payload)
+    }
+
+    /// Returns the length of the file with another message, bytes, and when its first message came; `None` as long as it
+    /// holds notes alone.
+    pub fn with(&self, item: &Item) -> Option<(u64, Instant)> {
+        self.begun.map(|begun| (self.bytes + item.payload.len() as u64 + MESSAGE_BYTES, begun))
+    }
+
+    pub fn write(&mut self, item: &Item) -> McapResult<()> {
+        self.begun.get_or_insert_with(Instant::now);
+        let known = self.channels.iter().find(|(known, _)| Arc::ptr_eq(known, &item.channel) || *known == item.channel);
+        let channel_id = match known {
+            Some((_, id)) => *id,
+            None => {
+                let channel = Arc::clone(&item.channel);
+                let id = self.add(&channel.schema, &channel.topic, &channel.metadata)?;
+                self.channels.push((channel, id));
+                id
+            }
+        };
+        let log_time = u64::try_from(item.nanos).unwrap_or(0);
+        let header = MessageHeader { channel_id, sequence: item.sequence as u32, log_time, publish_time: log_time };
+        self.put(&header, &item.payload)
+    }
+
+    /// Hands everything to the system.
+    pub fn flush(&mut self) -> McapResult<()> {
+        self.writer.flush()
+    }
+
+    /// Writes the index and makes the file durable.
+    pub fn finish(mut self, disk: &mut D) -> McapResult<()> {
+        use std::io::Write as _;
+        self.writer.finish()?;
+        self.writer.into_inner().flush()?;
+        Ok(disk.sync()?)
+    }
+}

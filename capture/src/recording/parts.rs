@@ -1,0 +1,96 @@
+//! Messages of a recording, over all of its files.
+
+use std::{
+    fs::File,
+    io::BufReader,
+    path::{Path, PathBuf},
+};
+
+use mcap::{McapResult, Message, io::MessageReader, sans_io::LinearReaderOptions};
+
+use super::{disk::part_path, part::Link};
+use crate::{CaptureError, CaptureErrorKind};
+
+/// Bytes read at once.
+const BUFFER: usize = 1 << 20;
+
+/// Reads the messages of a file and, when it is the first of a rotated recording, those of the files after it.
+pub(super) struct Parts {
+    first: PathBuf,
+    messages: MessageReader<BufReader<File>>,
+    /// The first message of a file that was just opened.
+    held: Option<Message<'static>>,
+    /// Whether the first message was read.
+    has_begun: bool,
+    /// Of the file that is read, if others may follow it.
+    link: Option<Link>,
+}
+
+fn messages(path: &Path) -> std::io::Result<MessageReader<BufReader<File>>> {
+    let file = File::open(path)?;
+    // A damaged length must not ask for more memory than the file has bytes.
+    let length = usize::try_from(file.metadata()?.len()).unwrap_or(usize::MAX);
+    let options = LinearReaderOptions::default().with_record_length_limit(length);
+    Ok(MessageReader::new_with_options(BufReader::with_capacity(BUFFER, file), options))
+}
+
+impl Parts {
+    /// Opens the first file.
+    ///
+    /// # Errors
+    /// `NotFound` without it.
+    pub fn open(path: &Path) -> Result<Self, CaptureError> {
+        let messages = messages(path).map_err(|error| {
+            CaptureError::general(CaptureErrorKind::NotFound, format!("{} cannot be opened: {error}", path.display()))
+        })?;
+        Ok(Self { first: path.to_owned(), messages, held: None, has_begun: false, link: None })
+    }
+
+    /// Goes on to the next file, if it is there and of this recording.
+    fn advance(&mut self) -> bool {
+        let Some(link) = &mut self.link else { return false };
+        let Some(part) = link.part.checked_add(1) else { return false };
+        let path = part_path(&self.first, part);
+        let Ok(mut next) = messages(&path) else { return false };
+        // Without a message it broke off before it began.
+        let Some(Ok(message)) = next.next() else { return false };
+        let wanted = Link { recording: link.recording.clone(), part };
+        if Link::read(&message.channel.metadata).as_ref() != Some(&wanted) {
+            tracing::warn!("{} is not a part of {} and is left out", path.display(), self.first.display());
+            self.link = None;
+            return false;
+        }
+        *link = wanted;
+        (self.messages, self.held) = (next, Some(message));
+        true
+    }
+}
+
+impl Iterator for Parts {
+    type Item = McapResult<Message<'static>>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        loop {
+            if let Some(message) = self.held.take() {
+                return Some(Ok(message));
+            }
+            let end = match self.messages.next() {
+                Some(Ok(message)) => {
+                    if !std::mem::replace(&mut self.has_begun, true) {
+                        // A later part stands by itself.
+                        self.link = Link::read(&message.channel.metadata).filter(|link| link.part == 0);
+                    }
+                    return Some(Ok(message));
+                }
+                end => end,
+            };
+            let part = self.link.as_ref().map_or(0, |link| link.part);
+            if !self.advance() {
+                return end;
+            }
+            if let Some(Err(error)) = end {
+                tracing::warn!("{} breaks off: {error}; going on", part_path(&self.first, part).display());
+            }
+        }
+    }
+}

@@ -1,0 +1,284 @@
+//! One thread a camera, all into one queue.
+
+mod course;
+mod opener;
+mod pulse;
+mod restarts;
+mod shared;
+
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, Condvar, Mutex},
+    thread::{Builder, JoinHandle},
+    time::{Duration, Instant},
+};
+
+use flyrig_types::{CameraId, Frame};
+
+pub use self::opener::SourceOpener;
+pub(crate) use self::shared::Shared;
+use self::{
+    opener::{How, Opening},
+    pulse::Pulse,
+    shared::{Pulses, Supply, lock},
+};
+use crate::{
+    CameraSource, CaptureError, CaptureErrorKind, FrameStage, LatestQueue, SourceHealth,
+    stage::{Hand, Stage, StageMaker},
+    turns::Turns,
+};
+
+/// Dropping waits so long for threads inside of somebody else's code before it leaves them behind.
+const CLOSING: Duration = Duration::from_secs(15);
+/// How often it looks.
+const LOOK: Duration = Duration::from_millis(2);
+
+/// When frames go into the queue, and what happens when it is full.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Pacing {
+    /// As the sources give them; the oldest is dropped. For live cameras.
+    #[default]
+    AsDelivered,
+    /// At the pace of their capture times; the oldest is dropped. For a recording played as live.
+    RealTime,
+    /// As fast as they are taken out, nothing is dropped, and in the order of capture over all
+    /// cameras, so that every run is the same. For evaluation.
+    Lossless,
+}
+
+/// Settings of [`CaptureThreads`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ThreadsConfig {
+    /// Frames of all cameras together that wait in the queue.
+    pub queue_capacity: usize,
+    /// See [`Pacing`].
+    pub pacing: Pacing,
+}
+
+impl Default for ThreadsConfig {
+    fn default() -> Self {
+        Self { queue_capacity: 16, pacing: Pacing::default() }
+    }
+}
+
+/// What one camera's thread has done.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CameraStats {
+    /// Which camera.
+    pub camera: CameraId,
+    /// Frames put into the queue.
+    pub frames: u64,
+    /// Frames of this camera that were dropped out of the full queue.
+    pub dropped: u64,
+    /// Frames that newer ones overtook before the camera's stage (see [`FrameStage`]) came to them.
+    pub overtaken: u64,
+    /// Errors by kind; the end of a recording is none.
+    pub errors: BTreeMap<CaptureErrorKind, u64>,
+    /// The error that came last.
+    pub last_error: Option<CaptureError>,
+    /// What the source says of itself; counts are over all sources of the camera.
+    pub health: SourceHealth,
+    /// Times that the camera was opened anew because its source had failed for good or panicked.
+    pub restarts: u64,
+    /// Times that its stage was made anew because it had panicked.
+    pub stage_restarts: u64,
+    /// Whether the camera has a source now. Without one it is being opened, or, when not `running`, has ended.
+    pub opened: bool,
+    /// Whether the thread still reads.
+    pub running: bool,
+}
+
+/// Reads every source in a thread of its own, named after its camera, into one queue.
+///
+/// A thread goes on after errors that may pass, with growing pauses while a camera is gone. A source that fails for good or
+/// panics (`Disconnected`) ends that camera alone; where it came from a [`SourceOpener`] with a function, it is opened anew:
+/// five times at once, then once a minute. The queue closes when all threads have ended. Dropping this stops the threads
+/// and waits for them; one that does not come out of a source's or a stage's call within 15 seconds is left behind.
+///
+/// With a [`FrameStage`] each camera has a second thread for it, so that a slow or damaged picture holds up neither the
+/// driver's buffers nor another camera.
+#[derive(Debug)]
+pub struct CaptureThreads {
+    shared: Arc<Shared>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl CaptureThreads {
+    /// Starts the threads.
+    ///
+    /// # Errors
+    /// `Unsupported` when two sources have one name, `Io` when the system gives no thread.
+    pub fn start(sources: Vec<Box<dyn CameraSource>>, config: ThreadsConfig) -> Result<Self, CaptureError> {
+        Self::start_all(sources.into_iter().map(SourceOpener::ready).collect(), Vec::new(), config)
+    }
+
+    /// The same, with a stage behind every source; each runs in a thread of its own.
+    ///
+    /// # Errors
+    /// As [`Self::start`].
+    pub fn start_staged(
+        sources: Vec<Box<dyn CameraSource>>,
+        stage: impl Fn(&CameraId) -> Box<dyn FrameStage>,
+        config: ThreadsConfig,
+    ) -> Result<Self, CaptureError> {
+        let stages = sources.iter().map(|source| Stage { stage: stage(source.camera()), maker: None }).collect();
+        Self::start_all(sources.into_iter().map(SourceOpener::ready).collect(), stages, config)
+    }
+
+    /// Starts the threads before the cameras are open. Each is opened in a thread of its own (`open NAME`), again with pauses
+    /// of up to 5 s as long as that fails, and joins when it comes; meanwhile its [`CameraStats`] hold the last error.
+    ///
+    /// Only live cameras are waited for: with another pacing than [`Pacing::AsDelivered`] all sources are opened first, one
+    /// after the other, and none is opened anew, since a recording would begin again.
+    ///
+    /// # Errors
+    /// As [`Self::start`]; and, where the sources are opened first, the first error of these.
+    pub fn start_opening(openers: Vec<SourceOpener>, config: ThreadsConfig) -> Result<Self, CaptureError> {
+        Self::start_all(openers, Vec::new(), config)
+    }
+
+    /// The same, with a stage behind every source; one that panics is made anew.
+    ///
+    /// # Errors
+    /// As [`Self::start_opening`].
+    pub fn start_opening_staged(
+        openers: Vec<SourceOpener>,
+        stage: impl Fn(&CameraId) -> Box<dyn FrameStage> + Send + Sync + 'static,
+        config: ThreadsConfig,
+    ) -> Result<Self, CaptureError> {
+        let maker: StageMaker = Arc::new(stage);
+        let made = |opener: &SourceOpener| Stage { stage: maker(opener.camera()), maker: Some(Arc::clone(&maker)) };
+        let stages = openers.iter().map(made).collect();
+        Self::start_all(openers, stages, config)
+    }
+
+    fn start_all(openers: Vec<SourceOpener>, stages: Vec<Stage>, config: ThreadsConfig) -> Result<Self, CaptureError> {
+        let cameras: Vec<CameraId> = openers.iter().map(|opener| opener.camera().clone()).collect();
+        for (i, camera) in cameras.iter().enumerate() {
+            if cameras[..i].contains(camera) {
+                let message = "is given twice; every source needs a name of its own";
+                return Err(CaptureError::new(camera, CaptureErrorKind::Unsupported, message));
+            }
+        }
+        let openers = if config.pacing == Pacing::AsDelivered {
+            openers
+        } else {
+            let now = |opener: SourceOpener| opener.open_now().map(SourceOpener::ready);
+            openers.into_iter().map(now).collect::<Result<_, _>>()?
+        };
+        let stats = |camera: &CameraId| CameraStats {
+            camera: camera.clone(),
+            frames: 0,
+            dropped: 0,
+            overtaken: 0,
+            errors: BTreeMap::new(),
+            last_error: None,
+            health: SourceHealth::default(),
+            restarts: 0,
+            stage_restarts: 0,
+            opened: false,
+            running: true,
+        };
+        let shared = Arc::new(Shared {
+            queue: Arc::new(LatestQueue::new(config.queue_capacity)),
+            hands: stages.iter().map(|_| Hand::new()).collect(),
+            pacing: config.pacing,
+            turns: Turns::new(cameras.len()),
+            stats: Mutex::new(cameras.iter().map(stats).collect()),
+            pulses: cameras.iter().map(Pulses::new).collect(),
+            origin: Mutex::new(None),
+            stopped: Mutex::new(false),
+            stop: Condvar::new(),
+        });
+        if cameras.is_empty() {
+            shared.queue.close();
+        }
+        // From here on an early return drops this and stops what has started.
+        let mut this = Self { shared, threads: Vec::with_capacity(2 * cameras.len()) };
+        for (slot, stage) in stages.into_iter().enumerate() {
+            let shared = Arc::clone(&this.shared);
+            this.spawn("stage", &cameras[slot], move || shared.run_stage(slot, stage))?;
+        }
+        for (slot, opener) in openers.into_iter().enumerate() {
+            let shared = Arc::clone(&this.shared);
+            let supply = match opener.how {
+                How::Ready(source) => Supply::Once(Some(source)),
+                How::Factory(open) => {
+                    Supply::Again(Opening::start(&cameras[slot], open, Arc::clone(&shared.pulses[slot].open))?)
+                }
+            };
+            this.spawn("camera", &cameras[slot], move || shared.run(slot, supply))?;
+        }
+        Ok(this)
+    }
+
+    fn spawn(
+        &mut self,
+        what: &str,
+        camera: &CameraId,
+        work: impl FnOnce() + Send + 'static,
+    ) -> Result<(), CaptureError> {
+        let thread = Builder::new()
+            .name(format!("{what} {camera}"))
+            .spawn(work)
+            .map_err(|error| CaptureError::new(camera, CaptureErrorKind::Io, format!("no thread: {error}")))?;
+        self.threads.push(thread);
+        Ok(())
+    }
+
+    /// Where the frames are; closed and empty after the last one.
+    #[must_use]
+    pub fn queue(&self) -> &Arc<LatestQueue<Frame>> {
+        &self.shared.queue
+    }
+
+    /// A copy of the counts, in the order of the sources.
+    #[must_use]
+    pub fn stats(&self) -> Vec<CameraStats> {
+        lock(&self.shared.stats).clone()
+    }
+
+    /// Returns the threads that work now, by name (`camera NAME`, `stage NAME`, `open NAME`), and the time since each began
+    /// its last turn. A turn is a call of a source, a stage or an opener; threads that have ended, or wait for whoever
+    /// takes the frames without loss, are left out.
+    #[must_use]
+    pub fn activity(&self) -> Vec<(String, Duration)> {
+        self.quiet().map(|(pulse, quiet)| (pulse.name().to_owned(), quiet)).collect()
+    }
+
+    /// Returns the names of threads that made no turn for longer than this. A healthy camera's and stage's thread makes
+    /// several a second, also while the camera is gone; opening may take seconds.
+    #[must_use]
+    pub fn stuck(&self, longer_than: Duration) -> Vec<String> {
+        let stuck = self.quiet().filter(|(_, quiet)| *quiet > longer_than);
+        stuck.map(|(pulse, _)| pulse.name().to_owned()).collect()
+    }
+
+    fn quiet(&self) -> impl Iterator<Item = (&Pulse, Duration)> {
+        let pulses = self.shared.pulses.iter().flat_map(|of| [&*of.camera, &*of.stage, &*of.open]);
+        pulses.filter_map(|pulse| pulse.quiet().map(|quiet| (pulse, quiet)))
+    }
+}
+
+impl Drop for CaptureThreads {
+    fn drop(&mut self) {
+        *lock(&self.shared.stopped) = true;
+        self.shared.stop.notify_all();
+        self.shared.queue.close();
+        self.shared.hands.iter().for_each(Hand::close);
+        self.shared.turns.close();
+        let deadline = Instant::now() + CLOSING;
+        for thread in self.threads.drain(..) {
+            while !thread.is_finished() && Instant::now() < deadline {
+                std::thread::sleep(LOOK);
+            }
+            if thread.is_finished() {
+                // A panic was caught and counted inside the thread.
+                let _ = thread.join();
+            } else {
+                let name = thread.thread().name().unwrap_or_default().to_owned();
+                tracing::error!("thread {name:?} hangs in its driver and is left behind; unplug its camera");
+            }
+        }
+    }
+}

@@ -1,0 +1,107 @@
+//! Opening a camera where nobody waits for it.
+
+use std::{fmt, sync::Arc, thread::Builder};
+
+use crossbeam::channel::{Receiver, Sender, bounded};
+use flyrig_types::CameraId;
+
+use super::pulse::Pulse;
+use crate::{CameraSource, CaptureError, CaptureErrorKind, panics::caught};
+
+type Source = Box<dyn CameraSource>;
+type Open = Box<dyn FnMut() -> Result<Source, CaptureError> + Send>;
+
+/// A camera that may not be there yet: opens its source, again whenever it was lost.
+pub struct SourceOpener {
+    pub(super) camera: CameraId,
+    pub(super) how: How,
+}
+
+pub(super) enum How {
+    Ready(Source),
+    Factory(Open),
+}
+
+impl SourceOpener {
+    /// Opens the camera with a function, which may take long, fail and panic. It has to give a source of this camera.
+    #[must_use]
+    pub fn new(camera: &CameraId, open: impl FnMut() -> Result<Source, CaptureError> + Send + 'static) -> Self {
+        Self { camera: camera.clone(), how: How::Factory(Box::new(open)) }
+    }
+
+    /// Gives a source that is open already. When it fails for good its camera ends.
+    #[must_use]
+    pub fn ready(source: Source) -> Self {
+        Self { camera: source.camera().clone(), how: How::Ready(source) }
+    }
+
+    /// Returns the name of the camera.
+    #[must_use]
+    pub fn camera(&self) -> &CameraId {
+        &self.camera
+    }
+
+    /// Opens the source, waiting for it.
+    pub(super) fn open_now(self) -> Result<Source, CaptureError> {
+        match self.how {
+            How::Ready(source) => Ok(source),
+            How::Factory(mut open) => call(&self.camera, &mut open),
+        }
+    }
+}
+
+impl fmt::Debug for SourceOpener {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("SourceOpener").field("camera", &self.camera).finish_non_exhaustive()
+    }
+}
+
+fn call(camera: &CameraId, open: &mut Open) -> Result<Source, CaptureError> {
+    let source = caught(open).unwrap_or_else(|text| {
+        let message = format!("opening it failed inside: {text}");
+        Err(CaptureError::general(CaptureErrorKind::Disconnected, message))
+    });
+    let source = source.map_err(|error| error.of(camera))?;
+    if source.camera() == camera {
+        return Ok(source);
+    }
+    let message = format!("its opener gave a source of camera {}; give that of this camera", source.camera());
+    let _ = caught(move || drop(source));
+    Err(CaptureError::new(camera, CaptureErrorKind::Unsupported, message))
+}
+
+/// A thread that opens one camera as often as it is asked to. It ends after the call in which its owner has gone.
+#[derive(Debug)]
+pub(super) struct Opening {
+    pub requests: Sender<()>,
+    pub results: Receiver<Result<Source, CaptureError>>,
+}
+
+impl Opening {
+    /// Starts the thread.
+    ///
+    /// # Errors
+    /// `Io` when the system gives no thread.
+    pub fn start(camera: &CameraId, mut open: Open, pulse: Arc<Pulse>) -> Result<Self, CaptureError> {
+        let (requests, to_do) = bounded(1);
+        let (done, results) = bounded(1);
+        let of_thread = camera.clone();
+        let work = move || {
+            for () in &to_do {
+                pulse.beat();
+                let result = call(&of_thread, &mut open);
+                pulse.rest();
+                if let Err(unwanted) = done.send(result) {
+                    let _ = caught(move || drop(unwanted));
+                    break;
+                }
+            }
+            let _ = caught(move || drop(open));
+        };
+        Builder::new()
+            .name(format!("open {camera}"))
+            .spawn(work)
+            .map_err(|error| CaptureError::new(camera, CaptureErrorKind::Io, format!("no thread: {error}")))?;
+        Ok(Self { requests, results })
+    }
+}

@@ -1,0 +1,54 @@
+//! How often a source is opened anew.
+
+use std::time::{Duration, Instant};
+
+/// So many restarts follow each other at once, each of a source that worked for less than [`WINDOW`].
+const AT_ONCE: u32 = 5;
+/// After these one restart is made in so long.
+const WINDOW: Duration = Duration::from_secs(60);
+/// A restart is never earlier after the failure.
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// Spaces the restarts of one source out: one that fails for ever must not keep a core and a bus busy.
+#[derive(Debug, Default)]
+pub(super) struct Restarts {
+    last: Option<Instant>,
+    in_a_row: u32,
+}
+
+impl Restarts {
+    /// Returns when a source that has failed `now` may be opened anew, and counts that restart.
+    pub fn after_failure(&mut self, now: Instant) -> Instant {
+        if self.last.is_some_and(|last| now.saturating_duration_since(last) >= WINDOW) {
+            self.in_a_row = 0;
+        }
+        self.in_a_row = self.in_a_row.saturating_add(1);
+        let due = match self.last {
+            Some(last) if self.in_a_row > AT_ONCE => (last + WINDOW).max(now + PAUSE),
+            _ => now + PAUSE,
+        };
+        self.last = Some(due);
+        due
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_source_that_fails_at_once_gets_five_restarts_and_then_one_a_minute() {
+        let (start, mut restarts) = (Instant::now(), Restarts::default());
+        let mut now = start;
+        let mut times = Vec::new();
+        for _ in 0..8 {
+            now = restarts.after_failure(now);
+            times.push((now - start).as_millis());
+        }
+        assert_eq!(times, [100, 200, 300, 400, 500, 60_500, 120_500, 180_500]);
+        // One that has worked for a minute starts over.
+        now = restarts.after_failure(now + WINDOW);
+        assert_eq!((now - start).as_millis(), 240_600);
+        assert_eq!(restarts.after_failure(now) - now, PAUSE);
+    }
+}

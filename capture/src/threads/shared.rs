@@ -1,0 +1,322 @@
+//! What the threads of a rig share, and the body of a camera's thread.
+
+use std::{
+    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+use crossbeam::channel::RecvTimeoutError;
+use flyrig_types::{CameraId, Frame};
+
+use super::{CameraStats, Pacing, course::Course, opener::Opening, pulse::Pulse, restarts::Restarts};
+use crate::{CameraSource, CaptureError, CaptureErrorKind, LatestQueue, panics::caught, stage::Hand, turns::Turns};
+
+/// How long a source may wait for a frame before its thread looks whether it shall stop.
+const POLL: Duration = Duration::from_millis(200);
+/// Pauses before a camera that is gone is asked again: doubling from the first to the last.
+const FIRST_PAUSE: Duration = Duration::from_millis(100);
+const LAST_PAUSE: Duration = Duration::from_secs(2);
+/// The last pause before a camera that could not be opened is tried again.
+const LAST_OPEN_PAUSE: Duration = Duration::from_secs(5);
+/// An opening that takes longer is reported, and once more whenever it has taken so long again.
+const OPENING: Duration = Duration::from_secs(5);
+/// A thread that waits for something of ours shows itself so often.
+const TURN: Duration = Duration::from_millis(500);
+/// Errors in a row after which a source that fails at once is slowed, lest it takes a core.
+const PATIENCE: u32 = 1000;
+
+#[derive(Debug)]
+pub(crate) struct Shared {
+    pub(super) queue: Arc<LatestQueue<Frame>>,
+    /// By slot, between a camera's thread and its stage's; empty without stages.
+    pub(super) hands: Vec<Hand>,
+    pub(super) pacing: Pacing,
+    pub(super) turns: Turns,
+    pub(super) stats: Mutex<Vec<CameraStats>>,
+    /// By slot.
+    pub(super) pulses: Vec<Pulses>,
+    /// Wall time and capture time of the first frame of all, for pacing.
+    pub(super) origin: Mutex<Option<(Instant, i64)>>,
+    pub(super) stopped: Mutex<bool>,
+    pub(super) stop: Condvar,
+}
+
+/// Of the threads of one camera.
+#[derive(Debug)]
+pub(crate) struct Pulses {
+    pub camera: Arc<Pulse>,
+    pub stage: Arc<Pulse>,
+    pub open: Arc<Pulse>,
+}
+
+impl Pulses {
+    pub fn new(camera: &CameraId) -> Self {
+        let pulse = |what: &str| Arc::new(Pulse::new(format!("{what} {camera}")));
+        Self { camera: pulse("camera"), stage: pulse("stage"), open: pulse("open") }
+    }
+}
+
+/// Where a camera's thread has its sources from.
+pub(super) enum Supply {
+    /// One source, until it fails for good.
+    Once(Option<Box<dyn CameraSource>>),
+    /// As many as it takes.
+    Again(Opening),
+}
+
+/// Why a source is not read any more.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum End {
+    /// There are no more frames, or nobody wants them.
+    Over,
+    Failed,
+}
+
+/// What is behind our locks is whole at every step.
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Shared {
+    /// The hand-over to a camera's stage.
+    pub(crate) fn hand(&self, slot: usize) -> Option<&Hand> {
+        self.hands.get(slot)
+    }
+
+    pub(crate) fn pulses(&self, slot: usize) -> &Pulses {
+        &self.pulses[slot]
+    }
+
+    /// The body of a camera's thread.
+    pub(super) fn run(&self, slot: usize, mut supply: Supply) {
+        let (mut course, mut restarts) = (Course::default(), Restarts::default());
+        loop {
+            let source = match &mut supply {
+                Supply::Once(source) => source.take(),
+                Supply::Again(opening) => self.open(slot, opening),
+            };
+            let Some(mut source) = source else { break };
+            lock(&self.stats)[slot].opened = true;
+            let end = caught(|| self.read(slot, &mut *source, &mut course));
+            lock(&self.stats)[slot].opened = false;
+            // By itself: a source that is dropped while its own panic unwinds may panic again, which ends the process.
+            let closed = caught(move || drop(source));
+            if let Some(text) = end.as_ref().err().or(closed.as_ref().err()) {
+                let camera = self.camera(slot);
+                let then =
+                    if matches!(supply, Supply::Once(_)) { "restart to use it again" } else { "opening it again" };
+                let message = format!("its source failed inside: {text}; {then}");
+                self.count(slot, CaptureError::new(&camera, CaptureErrorKind::Disconnected, message));
+            }
+            if end == Ok(End::Over) || matches!(supply, Supply::Once(_)) || self.is_stopped() {
+                break;
+            }
+            course.restart(lock(&self.stats)[slot].health.clone());
+            self.sleep_until(slot, restarts.after_failure(Instant::now()));
+            if self.is_stopped() {
+                break;
+            }
+            lock(&self.stats)[slot].restarts += 1;
+        }
+        self.pulses[slot].camera.rest();
+        // What its stage still has to do comes first.
+        match self.hands.get(slot) {
+            Some(hand) => hand.close(),
+            None => self.end(slot),
+        }
+    }
+
+    /// Opens a camera, as often as it takes. `None` when it has ended, or everything has.
+    fn open(&self, slot: usize, opening: &Opening) -> Option<Box<dyn CameraSource>> {
+        let mut pause = FIRST_PAUSE;
+        while !self.is_stopped() {
+            opening.requests.send(()).ok()?;
+            match self.opened(slot, opening)? {
+                Ok(source) => return Some(source),
+                Err(error) => {
+                    let is_over = error.kind == CaptureErrorKind::EndOfStream;
+                    self.count(slot, error);
+                    if is_over {
+                        return None;
+                    }
+                }
+            }
+            self.sleep_until(slot, Instant::now() + pause);
+            pause = (pause * 2).min(LAST_OPEN_PAUSE);
+        }
+        None
+    }
+
+    /// Waits for the camera's opener, but not through a stop. One that hangs is reported and waited for: a second call would
+    /// hang as well.
+    fn opened(&self, slot: usize, opening: &Opening) -> Option<Result<Box<dyn CameraSource>, CaptureError>> {
+        let mut late = Instant::now() + OPENING;
+        loop {
+            self.pulses[slot].camera.beat();
+            match opening.results.recv_timeout(POLL) {
+                Ok(result) => return Some(result),
+                Err(RecvTimeoutError::Disconnected) => return None,
+                Err(RecvTimeoutError::Timeout) if self.is_stopped() => return None,
+                Err(RecvTimeoutError::Timeout) => {}
+            }
+            if Instant::now() >= late {
+                let message = format!(
+                    "was not opened within {} s and is waited for: its driver hangs; unplug it and plug it in again",
+                    OPENING.as_secs()
+                );
+                self.count(slot, CaptureError::new(&self.camera(slot), CaptureErrorKind::Io, message));
+                late += OPENING;
+            }
+        }
+    }
+
+    /// The last frame of a camera is delivered.
+    pub(crate) fn end(&self, slot: usize) {
+        self.turns.end(slot);
+        let mut stats = lock(&self.stats);
+        stats[slot].running = false;
+        if stats.iter().all(|stats| !stats.running) {
+            self.queue.close();
+        }
+    }
+
+    pub(crate) fn camera(&self, slot: usize) -> CameraId {
+        lock(&self.stats)[slot].camera.clone()
+    }
+
+    fn is_stopped(&self) -> bool {
+        *lock(&self.stopped)
+    }
+
+    fn read(&self, slot: usize, source: &mut dyn CameraSource, course: &mut Course) -> End {
+        let pulse = &self.pulses[slot].camera;
+        let (mut pause, mut failures) = (FIRST_PAUSE, 0);
+        while !self.is_stopped() {
+            pulse.beat();
+            let result = source.next_frame(POLL);
+            let health = course.health(source.health());
+            lock(&self.stats)[slot].health = health;
+            let error = match result {
+                Ok(mut frame) => {
+                    (pause, failures) = (FIRST_PAUSE, 0);
+                    let order_nanos = source.order_nanos(&frame);
+                    course.number(&mut frame);
+                    // Before its stage: a reader that runs ahead would overtake all frames but the last.
+                    if self.pacing == Pacing::RealTime {
+                        self.pace(slot, frame.capture_nanos);
+                    }
+                    let is_open = match self.hands.get(slot) {
+                        Some(hand) => self.hand_over(slot, hand, frame, order_nanos),
+                        None => self.deliver(slot, pulse, frame, order_nanos),
+                    };
+                    if is_open {
+                        continue;
+                    }
+                    return End::Over;
+                }
+                Err(error) => error,
+            };
+            let kind = error.kind;
+            if kind == CaptureErrorKind::EndOfStream {
+                return End::Over;
+            }
+            // No frame yet is no error: who watches for silence looks at when the last frame came. But a camera that never
+            // gave one says what it waits for.
+            if kind == CaptureErrorKind::Timeout {
+                let mut stats = lock(&self.stats);
+                if stats[slot].frames == 0 {
+                    stats[slot].last_error = Some(error);
+                }
+            } else {
+                self.count(slot, error);
+            }
+            if !kind.is_recoverable() {
+                return End::Failed;
+            }
+            failures += 1;
+            // What is read without loss does not come back with the wall clock's time.
+            let returns = self.pacing != Pacing::Lossless;
+            if returns && matches!(kind, CaptureErrorKind::Disconnected | CaptureErrorKind::Io) {
+                self.sleep_until(slot, Instant::now() + pause);
+                pause = (pause * 2).min(LAST_PAUSE);
+            } else if failures > PATIENCE {
+                self.sleep_until(slot, Instant::now() + FIRST_PAUSE);
+            }
+        }
+        End::Over
+    }
+
+    /// To the camera's stage; whether to go on.
+    fn hand_over(&self, slot: usize, hand: &Hand, frame: Frame, order_nanos: i64) -> bool {
+        if self.pacing == Pacing::Lossless {
+            // Whoever takes the frames may take any time.
+            self.pulses[slot].camera.rest();
+            return hand.0.push_wait((frame, order_nanos)).is_ok();
+        }
+        let Ok(overtaken) = hand.0.push((frame, order_nanos)) else { return false };
+        if overtaken.is_some() {
+            lock(&self.stats)[slot].overtaken += 1;
+        }
+        true
+    }
+
+    /// Whether to go on. The pulse is that of the calling thread.
+    pub(crate) fn deliver(&self, slot: usize, pulse: &Pulse, frame: Frame, order_nanos: i64) -> bool {
+        if self.pacing == Pacing::Lossless {
+            pulse.rest();
+            if !self.turns.wait(slot, order_nanos) || self.queue.push_wait(frame).is_err() {
+                return false;
+            }
+            lock(&self.stats)[slot].frames += 1;
+            self.turns.done(slot, order_nanos);
+            return true;
+        }
+        let Ok(oldest) = self.queue.push(frame) else { return false };
+        let mut stats = lock(&self.stats);
+        stats[slot].frames += 1;
+        if let Some(oldest) = oldest
+            && let Some(stats) = stats.iter_mut().find(|stats| stats.camera == oldest.camera)
+        {
+            stats.dropped += 1;
+        }
+        true
+    }
+
+    /// Sleeps until a frame is due; the first frame of all is due at once, earlier ones too.
+    fn pace(&self, slot: usize, nanos: i64) {
+        let (start, first) = *lock(&self.origin).get_or_insert_with(|| (Instant::now(), nanos));
+        if nanos > first
+            && let Some(due) = start.checked_add(Duration::from_nanos(nanos.abs_diff(first)))
+        {
+            self.sleep_until(slot, due);
+        }
+    }
+
+    /// Lets a camera's thread sleep, but not through a stop.
+    fn sleep_until(&self, slot: usize, due: Instant) {
+        let mut stopped = lock(&self.stopped);
+        while !*stopped {
+            self.pulses[slot].camera.beat();
+            let left = due.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return;
+            }
+            stopped = self.stop.wait_timeout(stopped, left.min(TURN)).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    pub(crate) fn count_stage_restart(&self, slot: usize) {
+        lock(&self.stats)[slot].stage_restarts += 1;
+    }
+
+    pub(crate) fn count(&self, slot: usize, error: CaptureError) {
+        let mut stats = lock(&self.stats);
+        let count = stats[slot].errors.entry(error.kind).or_default();
+        *count += 1;
+        // The 1st, 2nd, 4th ... of a kind: a camera that is gone all night must not fill the disk.
+        if count.is_power_of_two() {
+            tracing::warn!(kind = ?error.kind, count = *count, "{error}");
+        }
+        stats[slot].last_error = Some(error);
+    }
+}
