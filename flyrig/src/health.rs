@@ -172,6 +172,9 @@ mod tests {
                 ..Default::default()
             },
             running: true,
+            restarts: 0,
+            stage_restarts: 0,
+            opened: true,
         };
         let clock = Some(ClockState { drift_ppm: -12.5, ..ClockState::default() });
         let (interval_ms, jitter_ms, lateness_ms, quiet_s) = (33.3, 0.4, Some(12.0), Some(0.1));

@@ -56,6 +56,9 @@ impl LiveRig {
     /// Joins cameras, session and views; nothing is published without a publisher.
     #[must_use]
     pub fn new(session: Session, intake: Intake, views: LiveViews, publisher: Option<LivePublisher>) -> Self {
+        if let Some(publisher) = &publisher {
+            publisher.publisher().set_max_view_pixels(session.max_view_pixels());
+        }
         let (frames, held, recovery) = Default::default();
         Self { session, intake, publisher, views, splats: true, started: Instant::now(), frames, held, recovery }
     }

@@ -1,6 +1,6 @@
 //! The views that a live rig publishes: its own, and those that viewers ask for.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use flyrig_types::FrameSet;
 use serde::{Deserialize, Serialize};
@@ -87,9 +87,21 @@ impl LiveViews {
                 count += 1;
             }
         }
-        for viewpoint in publisher.publisher().requested_viewpoints() {
-            publisher.publish(&viewpoint.view, session.render(&viewpoint.camera)?, set);
-            count += 1;
+        for viewpoint in publisher.publisher().due_viewpoints(Instant::now()) {
+            match session.render(&viewpoint.camera) {
+                Ok(view) => {
+                    publisher.publish(&viewpoint.view, view, set);
+                    count += 1;
+                }
+                Err(error) => {
+                    // The request is to blame, whatever it did to the device: nobody else loses anything by it.
+                    publisher.publisher().refuse_viewpoint(&viewpoint.subscriber, &error.to_string());
+                    tracing::warn!(viewer = viewpoint.subscriber, %error, "viewpoint refused");
+                    if error.is_device_fault() {
+                        return Err(error);
+                    }
+                }
+            }
         }
         Ok(count)
     }

@@ -301,6 +301,12 @@ impl Session {
         self.drawing.render(&self.gpu, &people, camera, &mut self.stages)
     }
 
+    /// Largest view that the adapter can hold, pixels.
+    #[must_use]
+    pub fn max_view_pixels(&self) -> u64 {
+        flyrig_renderer::RenderTarget::max_pixels(&self.gpu)
+    }
+
     /// Reads a person's Gaussians back, as they were drawn last.
     ///
     /// # Errors

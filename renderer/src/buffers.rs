@@ -97,6 +97,13 @@ impl RenderTarget {
         Self::with_room(gpu, [width, height], 0)
     }
 
+    /// Pixels of the largest target that the adapter can bind.
+    #[must_use]
+    pub fn max_pixels(gpu: &GpuContext) -> u64 {
+        let limits = gpu.device.limits();
+        limits.max_buffer_size.min(limits.max_storage_buffer_binding_size) / size_of::<[f32; 4]>() as u64
+    }
+
     fn with_room(gpu: &GpuContext, [width, height]: [u32; 2], others: usize) -> Result<Self, GpuError> {
         let pixels = width as usize * height as usize;
         Ok(Self {

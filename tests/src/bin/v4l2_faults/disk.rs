@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_capture::{CameraSource, McapReplay, Recorder, V4l2Camera};
+use flyrig_capture::{CameraSource, McapReplay, Recorder, RecorderConfig, V4l2Camera};
 
 use super::{
     bus,
@@ -20,10 +20,11 @@ const DISK: &str = "/small";
 pub fn full(table: &mut Table) {
     let path = Path::new(DISK).join("take.mcap");
     let mut sources: Vec<Box<dyn CameraSource>> = Vec::new();
-    let recorder = match Recorder::create(&path, &[], None) {
-        Ok(recorder) => recorder,
-        Err(error) => return table.row("full disk", "recording", &error.to_string(), "it starts", "no", false),
-    };
+    let recorder =
+        match Recorder::create_with(&path, &[], &RecorderConfig { reserve_bytes: 0, ..RecorderConfig::default() }) {
+            Ok(recorder) => recorder,
+            Err(error) => return table.row("full disk", "recording", &error.to_string(), "it starts", "no", false),
+        };
     for (camera, name) in ["00", "01"].into_iter().enumerate() {
         let tapped = V4l2Camera::open(&name.into(), &options(&bus(camera))).and_then(|source| recorder.tap(source));
         match tapped {
