@@ -1,0 +1,75 @@
+//! Embeds flyrig in another program: images with timestamps in, Gaussians and a view out; no network, files or command line.
+//!
+//!     cargo run --release -p flyrig-fusion --example embed
+
+use std::error::Error;
+
+use flyrig_body::{ShapeParams, default_template};
+use flyrig_fusion::{BodySettings, GivenPerception, PersonId, SessionBuilder, SessionSettings};
+use flyrig_gpu::{AdapterChoice, GpuContext};
+use flyrig_renderer::Splat;
+use flyrig_sync::{SyncSettings, Synchronizer};
+use flyrig_types::{
+    Camera, CameraId, Frame, Image, Intrinsics, Isometry, Lens, Mask, PixelFormat, PoseTrack, RenderedView, Rig,
+};
+use glam::{DVec2, DVec3};
+
+const SIZE: u32 = 160;
+
+/// A calibrated camera on a circle of 3 m around the person; the world is y up here.
+fn camera(name: &str, degrees: f64) -> Camera {
+    let (sin, cos) = degrees.to_radians().sin_cos();
+    let middle = DVec3::new(0.0, 0.85, 0.0);
+    let (focal_px, center_px) = (DVec2::splat(210.0), DVec2::splat(0.5 * f64::from(SIZE) - 0.5));
+    Camera {
+        id: name.into(),
+        intrinsics: Intrinsics { width: SIZE, height: SIZE, focal_px, center_px, lens: Lens::PINHOLE },
+        camera_from_world: Isometry::look_at(middle + DVec3::new(sin, 0.2, cos) * 3.0, middle, DVec3::Y),
+    }
+}
+
+/// Three images of a person in, the person's Gaussians and a view from a fourth side out.
+pub fn run() -> Result<(Vec<Splat>, RenderedView), Box<dyn Error>> {
+    let rig = Rig { cameras: vec![camera("a", 0.0), camera("b", 120.0), camera("c", 240.0)], world_up: DVec3::Y };
+    let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+
+    // Here the pose is known: the built-in body stands still. `EstimatedPerception` finds pose and masks in the images.
+    let template = default_template(&ShapeParams::default())?;
+    let track =
+        PoseTrack::new(vec![(0, template.skeleton.rest_pose()), (1_000_000_000, template.skeleton.rest_pose())])?;
+    let settings = SessionSettings { body: BodySettings::with_gaussians(12_000), ..SessionSettings::default() };
+    let mut session = SessionBuilder::new(GpuContext::new(&AdapterChoice::Best)?, rig.clone())
+        .settings(settings)
+        .perception(GivenPerception::repeating(&rig, template, track))
+        .build()?;
+
+    let mut sync = Synchronizer::new(&ids, &SyncSettings::default());
+    for number in 0..4u64 {
+        for camera in &rig.cameras {
+            // In place of a camera's driver: the silhouette of the untouched body, the image red on the left.
+            let silhouette = session.render(camera)?.rgba.chunks_exact(4).map(|p| p[3]).collect();
+            let red_left = |i: u32| if i % SIZE < SIZE / 2 { [200, 40, 40] } else { [40, 60, 180] };
+            let rgb: Vec<u8> = (0..SIZE * SIZE).flat_map(red_left).collect();
+            let frame = Frame {
+                camera: camera.id.clone(),
+                sequence: number,
+                capture_nanos: number as i64 * 33_333_333,
+                exposure_nanos: None,
+                image: Image::new(SIZE, SIZE, PixelFormat::Rgb8, rgb)?,
+                mask: Some(Mask::new(SIZE, SIZE, silhouette)?),
+            };
+            // Frames of one instant come out as a set, in whatever order the cameras deliver.
+            for set in sync.push(frame) {
+                println!("set {}: {:?}", set.index, session.process(&set)?);
+            }
+        }
+    }
+    Ok((session.splats(PersonId::default())?, session.render(&camera("mine", 30.0))?))
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let (splats, view) = run()?;
+    let covered = view.rgba.chunks_exact(4).filter(|p| p[3] > 127).count();
+    println!("{} Gaussians; {covered} of {} pixels of the view show the person", splats.len(), SIZE * SIZE);
+    Ok(())
+}
