@@ -31,6 +31,8 @@ pub enum BenchCommand {
     Appearance(BenchAppearanceArgs),
     /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to whole sets.
     Capture(BenchCaptureArgs),
+    /// Two people in one scene: views, and the cost beside one person; writes a table and PNG images.
+    Subjects(BenchSubjectsArgs),
     /// Recording uncompressed cameras: bytes, processor time and loss of each JPEG quality against pictures as they come.
     Record(BenchRecordArgs),
 }
@@ -124,6 +126,25 @@ pub struct BenchRecordArgs {
     /// Folder for the recordings, which are removed again; the system's for temporary files otherwise.
     #[arg(long)]
     pub folder: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchSubjectsArgs {
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-subjects")]
+    pub out: PathBuf,
+    /// Seed of the first person; the next one makes the second.
+    #[arg(long, default_value_t = 3)]
+    pub seed: u64,
+    /// Frames of the sequence; the second half is scored.
+    #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
+    pub frames: usize,
+    /// Pixels of an image's side.
+    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
+    /// Gaussians on each person's surface.
+    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
 }
 
 #[derive(Debug, Args)]

@@ -9,6 +9,7 @@ mod processor;
 mod recording;
 mod sequence;
 mod steady;
+mod subjects;
 mod summary;
 mod surface;
 mod track;
@@ -40,6 +41,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         BenchCommand::Endure(args) => endure::endure(args, &gpu()?),
         BenchCommand::Appearance(args) => appearance::appearance(args, &gpu()?),
         BenchCommand::Capture(args) => capture::capture(args),
+        BenchCommand::Subjects(args) => subjects::subjects(args, &gpu()?),
         BenchCommand::Record(args) => recording::record(args, &gpu()?),
     }
 }

@@ -125,6 +125,8 @@ pub struct MotionConfig {
     /// Farthest that a clip from a file may walk from the ring's centre, metres; one that goes farther takes shorter
     /// steps, so that the cameras keep seeing the person.
     pub reach_m: f64,
+    /// Where the person stands or the motion is centred, from the ring's centre (x, y), metres.
+    pub at_m: [f64; 2],
 }
 
 /// Cameras on a ring around the person, all looking at the same point.
@@ -188,6 +190,7 @@ impl Default for MotionConfig {
             gltf: None,
             start_secs: 0.0,
             reach_m: 0.5,
+            at_m: [0.0; 2],
         }
     }
 }
@@ -248,6 +251,9 @@ impl SimConfig {
         check("motion.speed", motion.speed, 0.0, 3.0, "0 to 3")?;
         check("motion.phase", motion.phase, 0.0, 1.0, "0 to 1 of the clip")?;
         check("motion.reach_m", motion.reach_m, 0.0, 100.0, "0 to 100 metres")?;
+        for at_m in motion.at_m {
+            check("motion.at_m", at_m, -20.0, 20.0, "-20 to 20 metres")?;
+        }
         check("motion.start_secs", motion.start_secs, 0.0, 3600.0, "0 to 3600 seconds")
     }
 }

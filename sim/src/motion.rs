@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use flyrig_body::{MotionClip, RetargetOptions, Skeleton, load_bvh, load_gltf};
 use flyrig_types::{Pose, PoseTrack};
+use glam::DVec3;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use crate::clips::{clip, passing};
@@ -35,8 +36,21 @@ fn existing(path: &Path) -> Result<PathBuf, SimError> {
     Err(SimError::NoClip { path: path.to_owned(), mend })
 }
 
-/// The configured motion of a person, standing on the floor, around the world's origin.
+/// The configured motion of a person, standing on the floor, around the configured place.
 pub(crate) fn track(config: &SimConfig, person: &Person) -> Result<PoseTrack, SimError> {
+    let track = track_around_origin(config, person)?;
+    let [x, y] = config.motion.at_m;
+    if x == 0.0 && y == 0.0 {
+        return Ok(track);
+    }
+    let moved = |(nanos, pose): &(i64, Pose)| {
+        let root_translation = pose.root_translation + DVec3::new(x, y, 0.0);
+        (*nanos, Pose { root_translation, ..pose.clone() })
+    };
+    Ok(PoseTrack::new(track.keys().iter().map(moved).collect())?)
+}
+
+fn track_around_origin(config: &SimConfig, person: &Person) -> Result<PoseTrack, SimError> {
     let skeleton = &person.body.skeleton;
     let motion = match config.motion.kind {
         MotionKind::BySeed => by_seed(config),

@@ -1,0 +1,199 @@
+//! `flyrig-bench subjects`: two people in one scene, with the views and the cost beside those of one person.
+//!
+//! Two simulated people of one rig are composited by depth, so that they hide each other as they would in one room.
+
+use std::{path::Path, sync::Arc, time::Instant};
+
+use anyhow::{Context, Result};
+use flyrig_fusion::{
+    BodySettings, GivenPerception, GivenPerson, PersonId, Session, SessionBuilder, SessionSettings, Subject,
+};
+use flyrig_gpu::GpuContext;
+use flyrig_metrics::{ScoreSheet, score_view};
+use flyrig_report::{png, progress_bar, write_whole};
+use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, SimFrame, Simulator};
+use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat, Rig};
+
+use crate::cli::BenchSubjectsArgs;
+
+/// Half of the distance between the two people, metres.
+const APART_M: f64 = 0.45;
+/// Input and held-out cameras.
+const INPUTS: [usize; 4] = [0, 2, 4, 6];
+const HELD_OUT: [usize; 3] = [1, 3, 5];
+
+/// One way of tracking.
+struct Row {
+    name: &'static str,
+    psnr_db: f64,
+    iou: f64,
+    /// Milliseconds a set, and of one drawn view.
+    set_ms: f64,
+    view_ms: f64,
+}
+
+/// Runs the command.
+pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    let mut people = [-APART_M, APART_M]
+        .into_iter()
+        .zip(args.seed..)
+        .map(|(x, seed)| simulator(gpu, args, seed, x))
+        .collect::<Result<Vec<_>>>()?;
+    let rig = people[0].rig().clone();
+    let bar = progress_bar(args.frames as u64 * 3, "bench subjects");
+    let mut rows = Vec::new();
+    for (name, chosen) in [("first alone", &[0usize][..]), ("second alone", &[1]), ("both", &[0, 1])] {
+        rows.push(run(args, gpu, &rig, &mut people, name, chosen, &bar)?);
+    }
+    bar.finish_and_clear();
+    let mut table = String::from("| people | PSNR dB | mask IoU | ms a set | ms a view |\n|---|---|---|---|---|\n");
+    for row in &rows {
+        table += &format!(
+            "| {} | {:.2} | {:.4} | {:.0} | {:.1} |\n",
+            row.name, row.psnr_db, row.iou, row.set_ms, row.view_ms
+        );
+    }
+    if let [first, second, both] = rows.as_slice() {
+        let alone = (first.set_ms + second.set_ms) / 2.0;
+        table += &format!("\nboth take {:.2} times as long as one person\n", both.set_ms / alone);
+    }
+    write_whole(&args.out.join("subjects.md"), table.as_bytes())?;
+    print!("{table}");
+    println!("{}; subjects.md and views in {}", gpu.adapter_name(), args.out.display());
+    Ok(())
+}
+
+fn simulator(gpu: &GpuContext, args: &BenchSubjectsArgs, seed: u64, x: f64) -> Result<Simulator> {
+    let motion = MotionConfig {
+        kind: if x < 0.0 { MotionKind::Wave } else { MotionKind::Turn },
+        at_m: [x, 0.0],
+        ..MotionConfig::default()
+    };
+    let mut config = SimConfig {
+        seed,
+        motion,
+        cameras: RingConfig { count: 7, radius_m: 3.4, ..RingConfig::default() },
+        width: args.side,
+        height: args.side,
+        ..SimConfig::default()
+    };
+    // One room for both.
+    config.scene.seed = Some(args.seed);
+    Ok(Simulator::new(gpu, &config)?)
+}
+
+/// Image and mask of the chosen people as one camera sees them, the nearer one in front.
+fn composite(frames: &[SimFrame]) -> Result<(Image, Mask)> {
+    let first = frames.first().context("nobody was chosen")?;
+    let (width, height) = (first.color.width(), first.color.height());
+    let mut rgb = first.color.bytes().to_vec();
+    let mut coverage = first.mask.coverage().to_vec();
+    let mut depth = first.depth.clone();
+    for frame in &frames[1..] {
+        for i in 0..depth.len() {
+            let (own, cover) = (frame.depth[i], u32::from(frame.mask.coverage()[i]));
+            let in_front = own > 0.0 && (depth[i] <= 0.0 || own < depth[i]);
+            if cover == 0 || !(in_front || depth[i] <= 0.0) {
+                continue;
+            }
+            for c in 0..3 {
+                let (over, under) = (u32::from(frame.color.bytes()[3 * i + c]), u32::from(rgb[3 * i + c]));
+                rgb[3 * i + c] = ((over * cover + under * (255 - cover) + 127) / 255) as u8;
+            }
+            coverage[i] = coverage[i].max(frame.mask.coverage()[i]);
+            if in_front {
+                depth[i] = own;
+            }
+        }
+    }
+    Ok((Image::new(width, height, PixelFormat::Rgb8, rgb)?, Mask::new(width, height, coverage)?))
+}
+
+fn capture(people: &mut [Simulator], chosen: &[usize], nanos: i64, slot: usize) -> Result<(Image, Mask)> {
+    let frames = chosen.iter().map(|&who| Ok(people[who].render(nanos, slot)?)).collect::<Result<Vec<_>>>()?;
+    composite(&frames)
+}
+
+fn run(
+    args: &BenchSubjectsArgs,
+    gpu: &GpuContext,
+    rig: &Rig,
+    people: &mut [Simulator],
+    name: &'static str,
+    chosen: &[usize],
+    bar: &indicatif::ProgressBar,
+) -> Result<Row> {
+    let inputs = Rig { cameras: INPUTS.map(|slot| rig.cameras[slot].clone()).into(), world_up: rig.world_up };
+    let given = |&who: &usize| GivenPerson {
+        person: PersonId(who as u32),
+        template: people[who].template().clone(),
+        track: people[who].track().clone(),
+        repeat: true,
+    };
+    let perception = GivenPerception::new(&inputs, chosen.iter().map(given).collect());
+    let settings = SessionSettings { body: BodySettings::with_gaussians(args.gaussians), ..SessionSettings::default() };
+    let mut session = SessionBuilder::new(gpu.clone(), inputs).settings(settings).perception(perception).build()?;
+    let mut sheet = ScoreSheet::default();
+    let (mut set_secs, mut view_secs, mut views) = (0.0, 0.0, 0u32);
+    for index in 0..args.frames as u64 {
+        let nanos = people[0].frame_nanos(index);
+        let set = frame_set(people, chosen, rig, index, nanos)?;
+        let start = Instant::now();
+        session.process(&set)?;
+        // The first set compiles and starts from nothing.
+        set_secs += if index > 0 { start.elapsed().as_secs_f64() } else { 0.0 };
+        if index as usize >= args.frames / 2 {
+            for slot in HELD_OUT {
+                let camera = &rig.cameras[slot];
+                let (image, mask) = capture(people, chosen, nanos, slot)?;
+                let start = Instant::now();
+                let view = session.render(camera)?;
+                view_secs += start.elapsed().as_secs_f64();
+                views += 1;
+                sheet.extend(score_view(&camera.id, index, &view, &image, Some(&mask))?);
+                if index as usize + 1 == args.frames {
+                    let file = format!("{}-{}", name.replace(' ', "-"), camera.id);
+                    png::write_view(&args.out.join(format!("{file}.png")), &view)?;
+                    let truth = png::encode_rgb(image.bytes(), image.width(), image.height())?;
+                    write_whole(&args.out.join(format!("{file}-truth.png")), &truth)?;
+                }
+            }
+        }
+        bar.inc(1);
+    }
+    write_subjects(&args.out, name, &session)?;
+    let mean = sheet.mean().context("nothing to compare")?;
+    Ok(Row {
+        name,
+        psnr_db: mean.psnr_db,
+        iou: mean.iou.unwrap_or(0.0),
+        set_ms: set_secs * 1e3 / (args.frames - 1).max(1) as f64,
+        view_ms: view_secs * 1e3 / f64::from(views.max(1)),
+    })
+}
+
+fn frame_set(people: &mut [Simulator], chosen: &[usize], rig: &Rig, index: u64, nanos: i64) -> Result<FrameSet> {
+    let frame = |slot: usize| -> Result<Option<Arc<Frame>>> {
+        let (image, mask) = capture(people, chosen, nanos, slot)?;
+        Ok(Some(Arc::new(Frame {
+            camera: rig.cameras[slot].id.clone(),
+            sequence: index,
+            capture_nanos: nanos,
+            exposure_nanos: None,
+            image,
+            mask: Some(mask),
+        })))
+    };
+    Ok(FrameSet { index, master_nanos: nanos, frames: INPUTS.into_iter().map(frame).collect::<Result<_>>()? })
+}
+
+/// State and quality of everybody, for the log.
+fn write_subjects(out: &Path, name: &str, session: &Session) -> Result<()> {
+    let line = |subject: &Subject| {
+        let watch = subject.watch();
+        format!("person {}: {}, quality {:?}\n", subject.id(), watch.state().name(), watch.quality())
+    };
+    let lines: String = session.subjects().iter().map(line).collect();
+    write_whole(&out.join(format!("{}.txt", name.replace(' ', "-"))), lines.as_bytes())
+}
