@@ -186,6 +186,7 @@ impl Session {
     /// Only those that a later set cannot mend. After one that [is a device fault](FusionError::is_device_fault), call
     /// [`Self::rebuild`].
     pub fn process(&mut self, set: &FrameSet) -> Result<Outcome, FusionError> {
+        self.gpu.check()?;
         let observations = self.perception.observe(set, &mut self.stages)?;
         self.add_people()?;
         let mut outcome = Outcome::Held("nobody is known".to_owned());

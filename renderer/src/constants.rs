@@ -4,8 +4,7 @@
 //! a uniform buffer at every dispatch and never frees what it made: about 30 to 130 KiB a dispatch, for ever.
 
 use bytemuck::Pod;
-use wgpu::util::{BufferInitDescriptor, DeviceExt};
-use wgpu::{BindingResource, Buffer, BufferBinding, BufferSize, BufferUsages};
+use wgpu::{BindingResource, Buffer, BufferBinding, BufferDescriptor, BufferSize, BufferUsages};
 
 use flyrig_gpu::GpuContext;
 
@@ -32,11 +31,14 @@ impl ConstantWriter {
 
     pub(crate) fn finish(self, gpu: &GpuContext) -> Constants {
         let contents = if self.bytes.is_empty() { &[0; ALIGNMENT] } else { self.bytes.as_slice() };
-        let buffer = gpu.device.create_buffer_init(&BufferInitDescriptor {
+        // Not mapped at creation, which panics on a device that is lost.
+        let buffer = gpu.device.create_buffer(&BufferDescriptor {
             label: Some("raster constants"),
-            contents,
-            usage: BufferUsages::STORAGE,
+            size: contents.len() as u64,
+            usage: BufferUsages::STORAGE | BufferUsages::COPY_DST,
+            mapped_at_creation: false,
         });
+        gpu.queue.write_buffer(&buffer, 0, contents);
         Constants { buffer, ranges: self.ranges }
     }
 }

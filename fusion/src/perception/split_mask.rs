@@ -13,11 +13,14 @@ pub(super) struct PosedMesh<'a> {
 
 /// No body is at this pixel.
 const NOBODY: u32 = u32::MAX;
+/// This pixel is at the border of two bodies.
+const MIXED: u32 = u32::MAX - 1;
 /// Corners nearer to the camera's plane are not drawn, metres.
 const NEAR_M: f64 = 0.05;
 
-/// Returns, for each body, its own part of the mask and the part of all others. A pixel belongs to the nearest body drawn
-/// there, else (clothes, hair) to the body of the closest pixel that has one.
+/// Returns, for each body, its own part of the mask and the part that says nothing about it. A pixel belongs to the nearest
+/// body drawn there, else (clothes, hair) to the body of the closest pixel that has one. Pixels beside another body's mix
+/// both colours: they are nobody's own.
 pub(super) fn split_mask(camera: &Camera, mask: &Mask, bodies: &[PosedMesh<'_>]) -> Vec<(Mask, Mask)> {
     let (width, height) = (mask.width() as usize, mask.height() as usize);
     let mut labels = vec![NOBODY; width * height];
@@ -46,6 +49,14 @@ pub(super) fn split_mask(camera: &Camera, mask: &Mask, bodies: &[PosedMesh<'_>])
         }
     }
     spread(&mut labels, width, height);
+    let mixed = |at: usize| {
+        let (x, y) = (at % width, at / width);
+        let near = |v: usize, side: usize| v.saturating_sub(1)..(v + 2).min(side);
+        near(y, height).any(|v| near(x, width).any(|u| labels[v * width + u] != labels[at]))
+    };
+    let labels: Vec<u32> = (0..labels.len())
+        .map(|at| if mask.coverage()[at] > 0 && labels[at] != NOBODY && mixed(at) { MIXED } else { labels[at] })
+        .collect();
     let part = |keep: &dyn Fn(u32) -> bool| {
         let coverage = mask.coverage().iter().zip(&labels).map(|(&c, &label)| if keep(label) { c } else { 0 });
         let coverage: Vec<u8> = coverage.collect();
@@ -132,9 +143,9 @@ mod tests {
         let mask = Mask::new(40, 20, vec![200; 800]).unwrap();
         let parts = split_mask(&camera(), &mask, &[square(-0.5, 0.0, 0.3), square(0.5, 0.0, 0.3)]);
         let [(left, of_right), (right, of_left)] = parts.as_slice() else { panic!("two bodies") };
-        assert_eq!((count(left, 0..20), count(left, 20..40)), (400, 0));
-        assert_eq!((count(right, 0..20), count(right, 20..40)), (0, 400));
-        assert_eq!((of_right, of_left), (right, left), "the others' part is the other's own");
+        assert_eq!((count(left, 0..20), count(left, 20..40)), (380, 0), "a column at the border is nobody's");
+        assert_eq!((count(right, 0..20), count(right, 20..40)), (0, 380));
+        assert_eq!((count(of_right, 0..40), count(of_left, 0..40)), (420, 420), "and says nothing about either");
         assert!(left.coverage().iter().all(|c| [0, 200].contains(c)), "coverage is kept");
     }
 
