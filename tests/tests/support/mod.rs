@@ -1,0 +1,69 @@
+//! Rigs and viewers as processes.
+#![allow(dead_code, clippy::unwrap_used, clippy::panic)] // each test uses a part; a test may fail by panicking
+
+use std::{
+    path::Path,
+    process::{Child, Command, Stdio},
+    time::{Duration, Instant},
+};
+
+/// Far longer than anything here takes: a hang fails instead of hanging.
+pub const PATIENCE: Duration = Duration::from_secs(90);
+
+/// A process that does not outlive its test.
+pub struct Process(pub Child);
+
+impl Process {
+    /// Starts `program`; its standard error goes to a file named after `log` in the folder.
+    pub fn start(program: &str, args: &[&str], folder: &Path, log: &str) -> Self {
+        let child = Command::new(program)
+            .args(args)
+            .current_dir(folder)
+            .stdout(Stdio::null())
+            .stderr(std::fs::File::create(folder.join(format!("{log}.log"))).unwrap())
+            .spawn()
+            .unwrap();
+        Self(child)
+    }
+
+    /// Sends a signal by its name, without SIG.
+    pub fn signal(&self, name: &str) {
+        let status = Command::new("kill").args([&format!("-{name}"), &self.0.id().to_string()]).status().unwrap();
+        assert!(status.success());
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Number of PNG files in a folder.
+pub fn pictures(folder: &Path) -> usize {
+    std::fs::read_dir(folder)
+        .map_or(0, |entries| entries.flatten().filter(|e| e.path().extension().is_some_and(|e| e == "png")).count())
+}
+
+/// Waits until something is done; panics when it takes too long.
+pub fn wait_until(what: &str, mut done: impl FnMut() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !done() {
+        assert!(Instant::now() < deadline, "waited in vain for {what}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// Writes `rig.toml` of a small simulated rig with this name and returns the endpoint that it listens on. `more` is appended.
+pub fn small_rig(name: &str, folder: &Path, more: &str) -> String {
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let endpoint = format!("tcp/127.0.0.1:{port}");
+    let config = format!(
+        "[rig]\nname = \"{name}\"\n[source]\ncameras = [\"00\", \"03\"]\n[sim]\nwidth = 96\nheight = 96\n\
+         texture_px = 128\n[body]\ngaussians = 3000\nnodes = 100\n[output]\nwidth = 96\nheight = 96\n[transport]\n\
+         listen = [\"{endpoint}\"]\n{more}"
+    );
+    std::fs::write(folder.join("rig.toml"), config).unwrap();
+    endpoint
+}
