@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 
+use flyrig_solve::{ClockLine, LineGate, LineOptions, LineSample, fit_line};
 use flyrig_types::{CameraId, Frame};
 use serde::{Deserialize, Serialize};
 
@@ -74,10 +75,8 @@ pub struct ClockAligner {
 #[derive(Debug, Default)]
 struct Clock {
     state: ClockState,
-    /// The fit is `master = stamp + offset + drift * (stamp - anchor)`, whole nanoseconds kept apart from the small rest.
-    anchor: i64,
-    offset: i64,
-    drift: f64,
+    /// Master minus stamp.
+    line: ClockLine,
     /// Stamp and the master's corrected time.
     pairs: VecDeque<(i64, i64)>,
     /// First differences to the master's newest frame.
@@ -96,8 +95,7 @@ struct Clock {
 
 impl Clock {
     fn corrected(&self, stamp: i64) -> i64 {
-        let drifted = self.drift * stamp.wrapping_sub(self.anchor) as f64;
-        stamp.wrapping_add(self.offset).saturating_add(drifted.round() as i64)
+        stamp.wrapping_add(self.line.offset_nanos).saturating_add(self.line.drifted_nanos(stamp))
     }
 
     fn period(&self) -> Option<i64> {
@@ -130,57 +128,37 @@ impl Clock {
     }
 
     fn step(&mut self, by: i64) {
-        self.offset = self.offset.wrapping_add(by);
+        self.line.offset_nanos = self.line.offset_nanos.wrapping_add(by);
         // The pairs keep their worth: their stamps are as if they were of the stepped clock.
         for (stamp, _) in &mut self.pairs {
             *stamp = stamp.wrapping_sub(by);
         }
-        self.anchor = self.anchor.wrapping_sub(by);
+        self.line.anchor_nanos = self.line.anchor_nanos.wrapping_sub(by);
         self.suspects.clear();
         self.unpaired.clear();
     }
 
-    /// Least squares over the pairs, twice: the second time without what the first one found far off.
+    /// Fits the line to the pairs, the second time without outliers.
     fn fit(&mut self) {
+        const OPTIONS: LineOptions = LineOptions {
+            least_drift_samples: FIRST_FIT,
+            drift_prior_secs: 0.0,
+            max_drift: f64::INFINITY,
+            gate: Some(LineGate { rounds: 2, sigmas: 4.0, least_nanos: 100_000.0 }),
+        };
         let Some(&(anchor, _)) = self.pairs.back() else { return };
-        // Small numbers: seconds before the newest pair, and nanoseconds off the offset in force.
-        let points: Vec<(f64, f64)> = self
-            .pairs
-            .iter()
-            .map(|&(stamp, master)| {
-                let off = master.wrapping_sub(stamp).wrapping_sub(self.offset);
-                (stamp.wrapping_sub(anchor) as f64 * 1e-9, off as f64)
-            })
-            .collect();
-        let mut kept = points.clone();
-        let mut line = (0.0, 0.0);
-        for _ in 0..2 {
-            line = least_squares(&kept, kept.len() >= FIRST_FIT);
-            let mut off: Vec<f64> = points.iter().map(|(x, y)| (y - line.0 - line.1 * x).abs()).collect();
-            off.sort_by(f64::total_cmp);
-            // Four standard deviations, by the median of the distances.
-            let gate = (off[off.len() / 2] * 1.4826 * 4.0).max(100_000.0);
-            kept = points.iter().copied().filter(|(x, y)| (y - line.0 - line.1 * x).abs() <= gate).collect();
+        let sample = |&(stamp, master): &(i64, i64)| LineSample {
+            time_nanos: stamp,
+            offset_nanos: master.wrapping_sub(stamp),
+            weight: 1.0,
+        };
+        let samples: Vec<LineSample> = self.pairs.iter().map(sample).collect();
+        let fit = fit_line(&samples, anchor, self.line.offset_nanos, &OPTIONS);
+        if let Some(fit) = fit.filter(|fit| fit.line.drift.abs() <= MOST_DRIFT_PPM * 1e-6) {
+            self.line = fit.line;
+            self.state.residual_nanos = fit.residual_nanos;
         }
-        let drift = line.1 * 1e-9;
-        if !line.0.is_finite() || drift.abs() > MOST_DRIFT_PPM * 1e-6 {
-            return;
-        }
-        let squares: f64 = kept.iter().map(|(x, y)| (y - line.0 - line.1 * x).powi(2)).sum();
-        self.offset = self.offset.wrapping_add(line.0.round() as i64);
-        (self.anchor, self.drift) = (anchor, drift);
-        self.state.residual_nanos = (squares / kept.len().max(1) as f64).sqrt();
     }
-}
-
-/// Intercept and slope; a slope only where asked for.
-fn least_squares(points: &[(f64, f64)], with_slope: bool) -> (f64, f64) {
-    let n = points.len().max(1) as f64;
-    let (mx, my) = points.iter().fold((0.0, 0.0), |(x, y), p| (x + p.0 / n, y + p.1 / n));
-    let (sxx, sxy) =
-        points.iter().fold((0.0, 0.0), |(xx, xy), p| (xx + (p.0 - mx).powi(2), xy + (p.0 - mx) * (p.1 - my)));
-    let slope = if with_slope && sxx > 0.0 { sxy / sxx } else { 0.0 };
-    (my - slope * mx, slope)
 }
 
 /// `value` moved by whole periods to the one nearest to zero.
@@ -213,8 +191,9 @@ impl ClockAligner {
     /// Every camera's clock, in rig order.
     pub fn clocks(&self) -> impl Iterator<Item = (&CameraId, ClockState)> {
         self.cameras.iter().map(|(id, clock)| {
-            let drift_ppm = clock.drift * 1e6;
-            let now = clock.last.map_or(clock.offset, |(stamp, ..)| clock.corrected(stamp).wrapping_sub(stamp));
+            let drift_ppm = clock.line.drift * 1e6;
+            let now =
+                clock.last.map_or(clock.line.offset_nanos, |(stamp, ..)| clock.corrected(stamp).wrapping_sub(stamp));
             (id, ClockState { offset_nanos: now, drift_ppm, ..clock.state })
         })
     }
@@ -358,7 +337,7 @@ impl ClockAligner {
 fn acquire(clock: &mut Clock, stamp: i64, now: i64, period: Option<i64>, instants: &VecDeque<i64>) {
     clock.acquisition.push(now.wrapping_sub(stamp));
     if clock.acquisition.len() == 1 && now.wrapping_sub(stamp).saturating_abs() > PLAUSIBLE {
-        clock.offset = now.wrapping_sub(stamp);
+        clock.line.offset_nanos = now.wrapping_sub(stamp);
     }
     let (true, Some(period)) = (clock.acquisition.len() >= ACQUISITION, period) else { return };
     let median = |values: &mut Vec<i64>| {
@@ -367,12 +346,12 @@ fn acquire(clock: &mut Clock, stamp: i64, now: i64, period: Option<i64>, instant
     };
     let rough = median(&mut clock.acquisition);
     if rough.saturating_abs() > PLAUSIBLE {
-        clock.offset = rough;
+        clock.line.offset_nanos = rough;
     }
-    let time = stamp.wrapping_add(clock.offset);
+    let time = stamp.wrapping_add(clock.line.offset_nanos);
     let mut phases: Vec<i64> = instants.iter().map(|instant| phase(instant.wrapping_sub(time), period)).collect();
-    clock.offset = clock.offset.wrapping_add(median(&mut phases));
-    clock.anchor = stamp;
+    clock.line.offset_nanos = clock.line.offset_nanos.wrapping_add(median(&mut phases));
+    clock.line.anchor_nanos = stamp;
     clock.acquisition.clear();
     clock.unpaired.clear();
     clock.is_locked = true;

@@ -1,5 +1,6 @@
 //! Constant lags between cameras out of what moves in their pictures, for stamps that cannot be trusted.
 
+use flyrig_solve::DenseNormal;
 use flyrig_types::CameraId;
 
 /// Signals are compared every so many nanoseconds.
@@ -203,30 +204,26 @@ pub(crate) fn balanced(count: usize, pairs: &[PairLag]) -> Vec<Balance> {
     }
     let unknown: Vec<usize> = (1..count).filter(|slot| reached[*slot]).collect();
     let row = |slot: usize| unknown.iter().position(|known| *known == slot);
-    // The normal equations, their right side, and the unit matrix that becomes their inverse.
-    let n = unknown.len();
-    let mut rows = vec![vec![0.0; 2 * n + 1]; n];
-    for (i, row) in rows.iter_mut().enumerate() {
-        row[n + 1 + i] = 1.0;
-    }
+    let mut normal = DenseNormal::zeros(unknown.len());
     for pair in pairs {
         let ends = [(row(pair.first), -1.0), (row(pair.second), 1.0)];
         for (i, x) in ends.iter().filter_map(|(i, x)| Some(((*i)?, x))) {
-            rows[i][n] += pair.weight * x * pair.lag;
+            normal.gradient[i] -= pair.weight * x * pair.lag;
             for (j, y) in ends.iter().filter_map(|(j, y)| Some(((*j)?, y))) {
-                rows[i][j] += pair.weight * x * y;
+                normal.matrix[(i, j)] += pair.weight * x * y;
             }
         }
     }
-    eliminate(&mut rows);
+    let solution = normal.minimum();
     let mut out = vec![Balance::default(); count];
     if let Some(first) = out.first_mut() {
         first.lag = Some(0.0);
     }
-    for (i, slot) in unknown.into_iter().enumerate() {
-        let (lag, variance) = (rows[i][n], rows[i][n + 1 + i]);
-        out[slot].lag = Some(lag).filter(|_| lag.is_finite() && variance > 0.0 && variance.is_finite());
-        out[slot].variance = variance;
+    if let Some((lags, covariance)) = solution {
+        for (i, slot) in unknown.into_iter().enumerate() {
+            out[slot].lag = Some(lags[i]).filter(|lag| lag.is_finite());
+            out[slot].variance = covariance[(i, i)];
+        }
     }
     for slot in 0..count {
         let of_slot = pairs.iter().filter(|pair| pair.first == slot || pair.second == slot);
@@ -236,21 +233,6 @@ pub(crate) fn balanced(count: usize, pairs: &[PairLag]) -> Vec<Balance> {
         out[slot].disagreement = (squares.iter().fold(0.0, |sum, x| sum + x) / squares.len().max(1) as f64).sqrt();
     }
     out
-}
-
-/// Gauss-Jordan: the left square becomes the unit matrix, as far as it tells.
-fn eliminate(rows: &mut [Vec<f64>]) {
-    for i in 0..rows.len() {
-        let pivot = (i..rows.len()).max_by(|a, b| rows[*a][i].abs().total_cmp(&rows[*b][i].abs())).unwrap_or(i);
-        rows.swap(i, pivot);
-        let scale = rows[i][i];
-        rows[i].iter_mut().for_each(|value| *value /= scale);
-        let top = rows[i].clone();
-        for (_, row) in rows.iter_mut().enumerate().filter(|(j, _)| *j != i) {
-            let factor = row[i];
-            row.iter_mut().zip(&top).for_each(|(value, top)| *value -= factor * top);
-        }
-    }
 }
 
 /// Of every camera the lag after the first one that its pairs agree on, and what they disagree by. A pair is two cameras, how

@@ -5,6 +5,7 @@
 //! is therefore the same for both cameras at one instant, whatever side they see: two curves over time for every pair of
 //! cameras that differ by nothing but the lag.
 
+use flyrig_solve::median;
 use flyrig_types::{Camera, Mask};
 use glam::{DVec2, DVec3};
 
@@ -346,11 +347,6 @@ fn lowest(costs: &[f64]) -> Option<f64> {
     let curve = before - 2.0 * costs[best] + after;
     let fine = if curve > 0.0 { (0.5 * (before - after) / curve).clamp(-0.5, 0.5) } else { 0.0 };
     Some((best as f64 + fine - (costs.len() / 2) as f64) * STEP as f64)
-}
-
-fn median(values: &mut [f64]) -> Option<f64> {
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 /// The planes through the centres of two cameras, by their angle.

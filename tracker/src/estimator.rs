@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use flyrig_body::{Template, skin_mesh};
+use flyrig_solve::median;
 use flyrig_types::{Frame, FrameSet, Image, Mask, Rig};
 use glam::DVec3;
 use rayon::prelude::*;
@@ -11,7 +12,6 @@ use rayon::prelude::*;
 use crate::body_model::{BodyModel, Turns};
 use crate::crop::Crop;
 use crate::fit::{Before, FitProblem, FitView, align_trunk};
-use crate::math::median;
 use crate::pixels::Rgb;
 use crate::plate::plate_evidence;
 use crate::search::{Sighting, project_all, search};

@@ -4,12 +4,15 @@
 //! distances in the pictures and to world points (Cauchy weights), joint ranges, and the change since the
 //! last pose. Levenberg-Marquardt with analytic derivatives; only steps that lower the cost are taken.
 
+use flyrig_solve::{
+    Convergence, DenseNormal, Kernel, PointPair, Problem, align_rigid, exp_rotation, left_jacobian_inverse,
+    log_rotation, minimize,
+};
 use glam::{DMat3, DVec3};
-use nalgebra::{Cholesky, DMatrix, DVector};
+use nalgebra::DVector;
 
 use crate::LANDMARK_COUNT;
 use crate::body_model::{BodyModel, Posed, Turns};
-use crate::math::{exp_rotation, log_jacobian, log_rotation};
 use crate::view::{Observation, View};
 
 /// Share of the network's certainty a landmark deserves in the fit: the face's many points are one body,
@@ -79,15 +82,6 @@ impl FitProblem<'_> {
         (0..self.model.parents.len()).filter(|&j| j == 0 || self.model.ranges[j].is_some()).collect()
     }
 
-    /// Cost of a pose; not finite when nothing can be said.
-    pub fn cost(&self, turns: &Turns) -> f64 {
-        let posed = self.model.pose(turns);
-        let mut cost = 0.0;
-        self.data_terms(&posed, |_, term| cost += term.cost);
-        self.joint_terms(turns, |_, residual, _| cost += 0.5 * residual.length_squared());
-        cost + self.root_move(turns).map_or(0.0, |e| 0.5 * e.length_squared())
-    }
-
     fn root_move(&self, turns: &Turns) -> Option<DVec3> {
         let before = self.before.as_ref()?;
         Some((turns.root - before.turns.root) / Self::root_sigma(before))
@@ -101,7 +95,7 @@ impl FitProblem<'_> {
     /// Calls `each` with every landmark and its pull in the world.
     #[allow(clippy::needless_range_loop)] // a landmark indexes the views' arrays and the model alike
     fn data_terms(&self, posed: &Posed, mut each: impl FnMut(usize, DataTerm)) {
-        let robust2 = self.robust * self.robust;
+        let kernel = Kernel::Cauchy(self.robust);
         for landmark in 0..LANDMARK_COUNT {
             let mark = self.model.mark(posed, landmark);
             let mut term = DataTerm::default();
@@ -113,10 +107,9 @@ impl FitProblem<'_> {
                 let Some(px_per_m) = view.view.px_per_m(posed.origin[0]) else { continue };
                 let inverse_sigma = 1.0 / (self.sigma_m * px_per_m);
                 let error = (pixel - seen.ideal_px) * inverse_sigma;
-                let square = error.length_squared();
                 let trust = LANDMARK_WEIGHT[landmark] * seen.confidence * seen.confidence;
-                let weight = trust / (1.0 + square / robust2);
-                term.cost += 0.5 * trust * robust2 * (square / robust2).ln_1p();
+                let (cost, weight) = kernel.weigh(error.length_squared(), trust);
+                term.cost += cost;
                 for (row, e) in rows.into_iter().zip([error.x, error.y]) {
                     term.add(row * inverse_sigma, e, weight);
                 }
@@ -124,10 +117,8 @@ impl FitProblem<'_> {
             }
             if let Some((point, sigma)) = self.points[landmark] {
                 let error = (mark - point) / sigma;
-                let square = error.length_squared();
-                let trust = LANDMARK_WEIGHT[landmark];
-                let weight = trust / (1.0 + square / robust2);
-                term.cost += 0.5 * trust * robust2 * (square / robust2).ln_1p();
+                let (cost, weight) = kernel.weigh(error.length_squared(), LANDMARK_WEIGHT[landmark]);
+                term.cost += cost;
                 for (axis, e) in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().zip(error.to_array()) {
                     term.add(axis / sigma, e, weight);
                 }
@@ -146,7 +137,7 @@ impl FitProblem<'_> {
             if let Some(range) = &self.model.ranges[joint] {
                 let v = log_rotation(turn);
                 let components = range.axes.transpose() * v;
-                let derivative = range.axes.transpose() * log_jacobian(v);
+                let derivative = range.axes.transpose() * left_jacobian_inverse(v);
                 let scale = |d: DVec3| DMat3::from_diagonal(d);
                 let inverse_sigma = range.sigma.recip();
                 each(index, components * inverse_sigma, scale(inverse_sigma) * derivative);
@@ -159,17 +150,37 @@ impl FitProblem<'_> {
             if let Some(before) = &self.before {
                 let change = log_rotation(turn * before.turns.turns[joint].inverse());
                 let sigma = before.sigma_rad * if joint == 0 { ROOT_FREEDOM } else { 1.0 };
-                each(index, change / sigma, log_jacobian(change) * (1.0 / sigma));
+                each(index, change / sigma, left_jacobian_inverse(change) * (1.0 / sigma));
             }
         }
     }
 
+    /// Minimises from a start; gives the best pose found and the number of steps taken. `None` when even
+    /// the start has no finite cost.
+    pub fn solve(&self, start: &Turns, max_steps: usize) -> Option<(Turns, usize)> {
+        let options = Convergence { max_steps, min_gain: 1e-4, ..Convergence::default() };
+        minimize(self, start, &options).map(|solution| (solution.unknowns, solution.steps))
+    }
+}
+
+impl Problem for FitProblem<'_> {
+    type Unknowns = Turns;
+    type Normal = DenseNormal;
+
+    /// Cost of a pose; not finite when nothing can be said.
+    fn cost(&self, turns: &Turns) -> f64 {
+        let posed = self.model.pose(turns);
+        let mut cost = 0.0;
+        self.data_terms(&posed, |_, term| cost += term.cost);
+        self.joint_terms(turns, |_, residual, _| cost += 0.5 * residual.length_squared());
+        cost + self.root_move(turns).map_or(0.0, |e| 0.5 * e.length_squared())
+    }
+
     /// Normal matrix and gradient at a pose; columns: root place, then three a turning joint.
-    fn linearize(&self, turns: &Turns) -> (DMatrix<f64>, DVector<f64>) {
+    fn linearize(&self, turns: &Turns) -> Option<DenseNormal> {
         let active = self.active();
         let size = column(active.len());
-        let mut normal = DMatrix::zeros(size, size);
-        let mut gradient = DVector::zeros(size);
+        let DenseNormal { matrix: mut normal, mut gradient } = DenseNormal::zeros(size);
         let posed = self.model.pose(turns);
         let mut columns: Vec<(usize, DVec3)> = Vec::new();
         self.data_terms(&posed, |landmark, term| {
@@ -217,7 +228,7 @@ impl FitProblem<'_> {
             }
         }
         normal.fill_upper_triangle_with_lower_triangle();
-        (normal, gradient)
+        Some(DenseNormal { matrix: normal, gradient })
     }
 
     fn moved(&self, turns: &Turns, step: &DVector<f64>) -> Turns {
@@ -229,49 +240,6 @@ impl FitProblem<'_> {
             moved.turns[joint] = (turn * turns.turns[joint]).normalize();
         }
         moved
-    }
-
-    /// Minimises from a start; gives the best pose found and the number of steps taken. `None` when even
-    /// the start has no finite cost.
-    pub fn solve(&self, start: &Turns, max_steps: usize) -> Option<(Turns, usize)> {
-        let mut turns = start.clone();
-        let mut cost = self.cost(&turns);
-        if !cost.is_finite() {
-            return None;
-        }
-        let mut damping = 1e-3;
-        let mut steps = 0;
-        'outer: while steps < max_steps {
-            let (normal, gradient) = self.linearize(&turns);
-            loop {
-                steps += 1;
-                let mut damped = normal.clone();
-                for k in 0..damped.nrows() {
-                    damped[(k, k)] += damping * normal[(k, k)] + 1e-9;
-                }
-                let step = Cholesky::new(damped).map(|factor| -factor.solve(&gradient));
-                let step = step.filter(|s| s.iter().all(|v| v.is_finite()));
-                let candidate = step.as_ref().map(|step| self.moved(&turns, step));
-                let candidate_cost = candidate.as_ref().map_or(f64::INFINITY, |c| self.cost(c));
-                if let Some(candidate) = candidate
-                    && candidate_cost < cost
-                {
-                    let gain = (cost - candidate_cost) / cost.max(1e-12);
-                    turns = candidate;
-                    cost = candidate_cost;
-                    damping = (damping * 0.2).max(1e-7);
-                    if gain < 1e-4 {
-                        break 'outer;
-                    }
-                    break;
-                }
-                damping *= 10.0;
-                if damping > 1e6 || steps >= max_steps {
-                    break 'outer;
-                }
-            }
-        }
-        Some((turns, steps))
     }
 }
 
@@ -290,37 +258,21 @@ impl DataTerm {
     }
 }
 
-/// Turn and place that bring the bind pose's trunk and head onto world points; `None` with fewer than three.
+/// Turn and place that bring the bind pose's trunk and head onto world points; `None` with fewer than three, or where those
+/// lie on a line.
 pub(crate) fn align_trunk(model: &BodyModel, points: &[Option<DVec3>; LANDMARK_COUNT]) -> Option<Turns> {
     const TRUNK: [usize; 9] = [0, 7, 8, 11, 12, 23, 24, 25, 26];
-    let pairs: Vec<(DVec3, DVec3, f64)> = TRUNK
+    let pairs: Vec<PointPair> = TRUNK
         .iter()
         .filter_map(|&i| {
             let weight = if (11..=24).contains(&i) { 1.0 } else { 0.1 };
-            points[i].filter(|p| p.is_finite()).map(|p| (model.marks[i].point, p, weight))
+            points[i].filter(|p| p.is_finite()).map(|to| PointPair { from: model.marks[i].point, to, weight })
         })
         .collect();
-    if pairs.len() < 3 {
-        return None;
-    }
-    let total: f64 = pairs.iter().map(|(_, _, w)| w).sum();
-    let from = pairs.iter().map(|(a, _, w)| *a * *w).sum::<DVec3>() / total;
-    let to = pairs.iter().map(|(_, b, w)| *b * *w).sum::<DVec3>() / total;
-    let mut covariance = nalgebra::Matrix3::zeros();
-    for (a, b, w) in &pairs {
-        let (a, b) = (*a - from, *b - to);
-        covariance += nalgebra::Vector3::new(b.x, b.y, b.z) * nalgebra::RowVector3::new(a.x, a.y, a.z) * *w;
-    }
-    let svd = covariance.try_svd(true, true, 1e-12, 100)?;
-    let (u, v_t) = (svd.u?, svd.v_t?);
-    let mut middle = nalgebra::Matrix3::identity();
-    middle[(2, 2)] = (u * v_t).determinant().signum();
-    let rotation = u * middle * v_t;
-    let rotation = DMat3::from_cols_array(&std::array::from_fn(|k| rotation[(k % 3, k / 3)]));
-    let turn = glam::DQuat::from_mat3(&rotation).normalize();
-    let mut turns = model.bind_turns(to + turn * (model.origins[0] - from));
-    turns.turns[0] = turn;
-    (turn.is_finite() && turns.root.is_finite()).then_some(turns)
+    let alignment = align_rigid(&pairs)?;
+    let mut turns = model.bind_turns(alignment.apply(model.origins[0]));
+    turns.turns[0] = alignment.rotation;
+    turns.root.is_finite().then_some(turns)
 }
 
 #[cfg(test)]
@@ -364,7 +316,7 @@ mod tests {
         problem.velocity = [DVec3::new(1.0, -0.5, 0.2); LANDMARK_COUNT];
         problem.before = Some(Before { turns: random_turns(&model, 2), sigma_rad: 0.3 });
         let at = random_turns(&model, 4);
-        let (normal, gradient) = problem.linearize(&at);
+        let DenseNormal { matrix: normal, gradient } = problem.linearize(&at).unwrap();
         assert!((&normal - normal.transpose()).amax() < 1e-9 * normal.amax());
         let mut checked = 0;
         for k in 0..gradient.len() {
@@ -393,7 +345,7 @@ mod tests {
             let start = align_trunk(&model, &target.map(Some)).unwrap();
             let (found, _) = problem(&model, &views).solve(&start, 60).unwrap();
             let mut errors: Vec<f64> = model.marks(&found).iter().zip(target).map(|(a, b)| (*a - b).length()).collect();
-            let median = crate::math::median(&mut errors).unwrap();
+            let median = flyrig_solve::median(&mut errors).unwrap();
             let largest = errors.iter().copied().fold(0.0, f64::max);
             assert!(median < 0.004 && largest < 0.03, "seed {seed}: median {median}, largest {largest}");
         }
@@ -416,7 +368,7 @@ mod tests {
         let start = align_trunk(&model, &target.map(Some)).unwrap();
         let (found, _) = problem(&model, &views).solve(&start, 60).unwrap();
         let mut errors: Vec<f64> = model.marks(&found).iter().zip(target).map(|(a, b)| (*a - b).length()).collect();
-        assert!(crate::math::median(&mut errors).unwrap() < 0.03, "{errors:?}");
+        assert!(flyrig_solve::median(&mut errors).unwrap() < 0.03, "{errors:?}");
     }
 
     #[test]

@@ -24,7 +24,6 @@ mod estimator;
 mod fit;
 mod grid;
 mod landmarks;
-mod math;
 mod net;
 mod pixels;
 mod plate;

@@ -1,9 +1,9 @@
 //! Masks from an empty plate.
 
+use flyrig_solve::median;
 use flyrig_types::{Image, Mask};
 
 use crate::grid::{Grid, clean};
-use crate::math::median;
 use crate::pixels::Rgb;
 use crate::{TrackError, TrackErrorKind};
 

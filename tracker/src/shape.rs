@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 
 use flyrig_body::{Joint, Skeleton, Template};
+use flyrig_solve::median;
 use flyrig_types::Rig;
 use glam::{DMat3, DMat4, DVec3};
 
 use crate::body_model::BodyModel;
-use crate::math::median;
 use crate::triangulate::triangulate;
 use crate::{LANDMARK_COUNT, PoseConfig, TrackError, TrackErrorKind, ViewKeypoints};
 

@@ -37,7 +37,7 @@ impl BodyGate {
             .map(|v| camera.camera_from_world.transform_point(v.as_dvec3()).z)
             .filter(|z| *z > 0.1)
             .collect();
-        let depth = crate::math::median(&mut depths)?;
+        let depth = flyrig_solve::median(&mut depths)?;
         let px_per_m = camera.intrinsics.focal_px.x / depth;
         let reach = REACH_M * px_per_m;
         let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);

@@ -1,12 +1,12 @@
 //! Synthetic rigs, bodies and landmarks for the tests.
 
 use flyrig_body::{ShapeParams, Template, default_template};
+use flyrig_solve::exp_rotation;
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Rig};
 use glam::{DQuat, DVec2, DVec3};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use crate::body_model::{BodyModel, Turns};
-use crate::math::exp_rotation;
 use crate::{Keypoint, LANDMARK_COUNT, ViewKeypoints};
 
 pub(crate) fn body() -> Template {

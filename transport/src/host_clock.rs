@@ -6,6 +6,8 @@
 
 use std::{collections::VecDeque, fmt, sync::Arc};
 
+use flyrig_solve::{ClockLine, LineOptions, LineSample, fit_line};
+
 /// Exchanges of which only the quickest counts.
 const BLOCK: usize = 8;
 /// Quickest ones that the line goes through, about two minutes.
@@ -66,27 +68,14 @@ struct Exchange {
     round_trip: i64,
 }
 
-/// `offset(local) = offset + drift (local - anchor)`.
-#[derive(Debug, Clone, Copy)]
-struct Line {
-    anchor: i64,
-    offset: i64,
-    drift: f64,
-}
-
-impl Line {
-    fn at(&self, local: i64) -> i64 {
-        self.offset.saturating_add((self.drift * local.saturating_sub(self.anchor) as f64) as i64)
-    }
-}
-
 /// Estimates one clock.
 #[derive(Debug, Default)]
 pub(crate) struct ClockFit {
     block: Vec<Exchange>,
     best: VecDeque<Exchange>,
     outliers: Vec<Exchange>,
-    line: Option<Line>,
+    /// The other clock minus ours.
+    line: Option<ClockLine>,
     round_trip: i64,
     steps: u64,
 }
@@ -102,7 +91,7 @@ impl ClockFit {
         let Some(offset) = answer.checked_sub(local) else { return };
         let exchange = Exchange { local, offset, round_trip };
         if let Some(line) = &self.line {
-            let off = offset.saturating_sub(line.at(local)) as f64;
+            let off = offset.saturating_sub(line.offset_at(local)) as f64;
             if off.abs() > round_trip as f64 / 2.0 + SLACK {
                 // Only those that agree with each other tell of another clock.
                 self.outliers.retain(|other| {
@@ -141,34 +130,29 @@ impl ClockFit {
         let all = || self.best.iter().chain(current);
         let Some(quickest) = all().min_by_key(|exchange| exchange.round_trip).copied() else { return };
         self.round_trip = quickest.round_trip;
-        let flat = Line { anchor: quickest.local, offset: quickest.offset, drift: 0.0 };
-        // Least squares around the quickest exchange, so that the numbers stay small; each is known to half of its round
-        // trip, the drift to what is usual.
-        let known = |round_trip: i64| round_trip.max(1000) as f64 / 2.0;
-        let prior = (known(quickest.round_trip) / (USUAL_DRIFT_PPM * 1e-6)).powi(2);
-        let [mut w, mut x, mut y, mut xx, mut xy] = [0.0, 0.0, 0.0, prior, 0.0];
-        for exchange in all() {
-            let weight = (known(quickest.round_trip) / known(exchange.round_trip)).powi(2);
-            let dx = exchange.local.saturating_sub(flat.anchor) as f64;
-            let dy = exchange.offset.saturating_sub(flat.offset) as f64;
-            w += weight;
-            x += weight * dx;
-            y += weight * dy;
-            xx += weight * dx * dx;
-            xy += weight * dx * dy;
-        }
-        let drift = (w * xy - x * y) / (w * xx - x * x);
-        let drift = if drift.is_finite() { drift } else { 0.0 };
-        let drift = drift.clamp(-MOST_DRIFT_PPM * 1e-6, MOST_DRIFT_PPM * 1e-6);
-        let shift = (y - drift * x) / w;
-        self.line = Some(Line { offset: flat.offset.saturating_add(shift as i64), drift, ..flat });
+        // Around the quickest exchange; each is known to half of its round trip, the drift to what is usual.
+        let known = |exchange: &Exchange| exchange.round_trip.max(1000) as f64 / 2.0;
+        let sample = |exchange: &Exchange| LineSample {
+            time_nanos: exchange.local,
+            offset_nanos: exchange.offset,
+            weight: (known(&quickest) / known(exchange)).powi(2),
+        };
+        let samples: Vec<LineSample> = all().map(sample).collect();
+        let options = LineOptions {
+            drift_prior_secs: known(&quickest) * 1e-9 / (USUAL_DRIFT_PPM * 1e-6),
+            max_drift: MOST_DRIFT_PPM * 1e-6,
+            ..LineOptions::default()
+        };
+        let flat = ClockLine { anchor_nanos: quickest.local, offset_nanos: quickest.offset, drift: 0.0 };
+        let fit = fit_line(&samples, flat.anchor_nanos, flat.offset_nanos, &options);
+        self.line = Some(fit.map_or(flat, |fit| fit.line));
     }
 
     /// What is known at our time; none before a few exchanges.
     pub fn estimate(&self, local_nanos: i64) -> Option<ClockEstimate> {
         let line = self.line?;
         Some(ClockEstimate {
-            offset_nanos: line.at(local_nanos),
+            offset_nanos: line.offset_at(local_nanos),
             drift_ppm: line.drift * 1e6,
             round_trip_nanos: self.round_trip,
             steps: self.steps,
@@ -179,8 +163,8 @@ impl ClockFit {
     pub fn to_local(&self, remote_nanos: i64) -> Option<i64> {
         let line = self.line?;
         // The line takes our time; the difference of one more turn is the drift squared.
-        let local = remote_nanos.saturating_sub(line.offset);
-        Some(remote_nanos.saturating_sub(line.at(local)))
+        let local = remote_nanos.saturating_sub(line.offset_nanos);
+        Some(remote_nanos.saturating_sub(line.offset_at(local)))
     }
 
     /// Whether questions should come quickly.
