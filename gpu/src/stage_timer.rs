@@ -121,17 +121,19 @@ impl StageTimer {
         }
     }
 
-    /// Records that the frame's timestamps are read back when `encoder` has been executed. Drop that encoder only together
-    /// with the timer: the frame would never come back.
+    /// Records that the frame's timestamps are read back when `encoder` has been executed. A frame whose encoder is dropped
+    /// is not measured.
     pub fn finish(&mut self, encoder: &mut CommandEncoder) {
         let Some(frame) = self.recorded.take().and_then(|index| self.frames.get_mut(index)) else { return };
         let count = frame.names.len() as u32 + 1;
         encoder.resolve_query_set(&frame.queries, 0..count, &frame.resolved, 0);
         encoder.copy_buffer_to_buffer(&frame.resolved, 0, &frame.read_back, 0, u64::from(count) * 8);
         frame.state.store(UNDER_WAY, Ordering::Release);
-        let state = Arc::clone(&frame.state);
+        let arrival = Arrival(Arc::clone(&frame.state));
         encoder.map_buffer_on_submit(&frame.read_back, MapMode::Read, .., move |mapped| {
-            state.store(if mapped.is_ok() { MAPPED } else { IDLE }, Ordering::Release);
+            if mapped.is_ok() {
+                arrival.0.store(MAPPED, Ordering::Release);
+            }
         });
     }
 
@@ -155,6 +157,16 @@ impl StageTimer {
             frame.state.store(IDLE, Ordering::Release);
         }
         stages
+    }
+}
+
+/// The callback of a frame under way. Dropped without success, it makes the frame idle.
+#[derive(Debug)]
+struct Arrival(Arc<AtomicU8>);
+
+impl Drop for Arrival {
+    fn drop(&mut self) {
+        let _ = self.0.compare_exchange(UNDER_WAY, IDLE, Ordering::AcqRel, Ordering::Acquire);
     }
 }
 

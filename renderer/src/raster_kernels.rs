@@ -7,6 +7,7 @@ use bytemuck::{Pod, Zeroable};
 use flyrig_gpu::{CAMERA_WGSL, CameraConstants, ComputeKernel, GpuContext};
 
 use crate::Outputs;
+use crate::schema::bindings_wgsl;
 use crate::sort::{INVALID_KEY, SortShape};
 
 pub(crate) const FRAME_WGSL: &str = include_str!("raster_frame.wgsl");
@@ -89,7 +90,7 @@ pub(crate) struct Frame {
 }
 
 pub(crate) fn project_wgsl(shape: RasterShape) -> String {
-    [&shape.wgsl(), CAMERA_WGSL, FRAME_WGSL, PROJECT_WGSL].concat()
+    [&shape.wgsl(), CAMERA_WGSL, FRAME_WGSL, &bindings_wgsl(1), PROJECT_WGSL].concat()
 }
 
 pub(crate) fn bins_wgsl() -> String {
