@@ -90,8 +90,8 @@ impl Scene {
             rasterizer.encode(gpu, &mut encoder, &gaussians, camera, &settings, &target).unwrap();
             gpu.queue.submit([encoder.finish()]);
             let rgba = rgba8_from_target(&target.color.read(gpu).unwrap());
-            let rgb = rgba.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect();
-            let coverage = rgba.chunks_exact(4).map(|p| p[3]).collect();
+            let rgb: Vec<u8> = rgba.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect();
+            let coverage: Vec<u8> = rgba.chunks_exact(4).map(|p| p[3]).collect();
             Some(Arc::new(Frame {
                 camera: camera.id.clone(),
                 sequence: frame as u64,
