@@ -88,11 +88,10 @@ fn main() -> Result<(), Box<dyn Error>> {
             gpu.queue.submit([encoder.finish()]);
         }
         ended(1)?;
-        let view = |(camera, target)| {
-            let RenderTarget { canonical, color, .. } = target;
-            ViewInput { camera, picture: &picture, canonical, drawn: color, gaussians: None }
-        };
-        let inputs: Vec<ViewInput<'_>> = cameras.iter().zip(&targets).map(view).collect();
+        let mut inputs = Vec::new();
+        for (camera, RenderTarget { canonical, color, .. }) in cameras.iter().zip(&targets) {
+            inputs.push(ViewInput { camera, picture: &picture, canonical, drawn: color, gaussians: None });
+        }
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         appearance.update(&gpu, &mut encoder, &gaussians, &inputs, &AppearanceSettings::default())?;
         timer.mark(&mut encoder, STAGES[2]);
@@ -107,7 +106,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut times = [Vec::new(), Vec::new()];
     for run in 0..RUNS + 3 {
         // Alternating, so that whatever else the machine does meets both.
-        for (waits, times) in [(true, 0), (false, 1)].map(|(waits, index)| (waits, &mut times[index])).into_iter() {
+        for (waits, times) in [true, false].into_iter().zip(&mut times) {
             let time = frame(waits, &mut timer)?;
             let stages = timer.collect();
             if run >= 3 {
