@@ -240,7 +240,7 @@ impl Rasterizer {
         let lengths = [[sort.table_len(), 0, 0, 0], [layout.table_len, 0, 0, 0]];
         let passes: Vec<SortPass> = (0..sort.digit_passes).map(|index| SortPass::new(frame.gaussians, index)).collect();
         let mut values = vec![bytes_of(frame)];
-        values.extend(lengths.iter().map(|length| bytes_of(length)));
+        values.extend(lengths.iter().map(bytes_of));
         values.extend(passes.iter().map(bytes_of));
         self.constants.encode(gpu, encoder, &values);
     }
