@@ -56,7 +56,7 @@ impl GpuSkinner {
 
     /// Records the kernel: writes world position and scale to `center_scale` and world normals to `normal`, one
     /// element a Gaussian. `displacement` holds t_x, canonical metres; an element that is not finite counts as
-    /// zero. The pose is uploaded ahead of the next submission, so submit before encoding another one.
+    /// zero. The pose is uploaded among the encoder's commands: several poses may go into one encoder.
     ///
     /// # Errors
     /// [`BodyError::Pose`] when the pose does not fit or is not finite, [`BodyError::Buffer`] when a buffer is too
@@ -90,10 +90,10 @@ impl GpuSkinner {
         let matrices = skeleton.world_from_canonical(pose);
         let joint_rows: Vec<[f32; 4]> =
             matrices.iter().flat_map(|matrix| [0, 1, 2].map(|row| matrix.row(row).as_vec4().to_array())).collect();
-        self.joint_rows.write(gpu, &joint_rows);
         if self.count == 0 {
             return Ok(());
         }
+        self.joint_rows.encode_write(gpu, encoder, &joint_rows);
         let buffers = [
             self.joint_rows.raw(),
             self.rest.raw(),

@@ -36,7 +36,7 @@ pub struct Deformation {
     most_views: usize,
     chooser: Chooser,
     tracker: DeformTracker,
-    backward: Option<BackwardRasterizer>,
+    backward: BackwardRasterizer,
     loss: PictureLoss,
     /// Of the coarse Gaussians that are compared, and of all of them.
     coarse_displacement: StorageBuffer<[f32; 4]>,
@@ -133,7 +133,7 @@ impl Deformation {
             most_views: options.views,
             chooser: Chooser::default(),
             tracker,
-            backward: None,
+            backward: BackwardRasterizer::for_device(gpu)?,
             loss: PictureLoss::new(gpu)?,
             coarse_displacement: StorageBuffer::zeroed(gpu, "displacements", count)?,
             displacement: StorageBuffer::zeroed(gpu, "displacements", surface.len())?,
@@ -182,13 +182,9 @@ impl Deformation {
             self.gradients.push(GaussianGradients::zeroed(gpu, count)?);
         }
         self.loss.reserve(gpu, views.len())?;
-        let backward = match &mut self.backward {
-            Some(backward) => backward,
-            none => match self.views.first() {
-                Some(view) => none.insert(BackwardRasterizer::new(gpu, view.rasterizer())?),
-                None => return Ok(Default::default()),
-            },
-        };
+        if self.views.is_empty() {
+            return Ok(Default::default());
+        }
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         let rate = if self.colored { COLOR_RATE } else { 1.0 };
         self.colored = self.painted;
@@ -203,7 +199,7 @@ impl Deformation {
                 skinner: &self.skinner,
                 posed: &self.posed,
                 loss: &self.loss,
-                backward,
+                backward: &mut self.backward,
                 displacement: &self.coarse_displacement,
                 gradients: &self.gradients,
             },

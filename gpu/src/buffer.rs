@@ -1,18 +1,36 @@
 //! Typed storage buffers.
 
-use std::{marker::PhantomData, sync::atomic::Ordering};
+use std::{
+    marker::PhantomData,
+    sync::{Arc, Weak, atomic::Ordering},
+};
 
 use bytemuck::Pod;
-use wgpu::{Buffer, BufferDescriptor, BufferUsages};
+use wgpu::{Buffer, BufferDescriptor, BufferUsages, CommandEncoder};
 
-use crate::{GpuContext, GpuError};
+use crate::{GpuContext, GpuError, shared::Shared};
 
 /// A GPU array of `T`, usable as storage, copy source and copy target. Clones share the array.
 #[derive(Debug, Clone)]
 pub struct StorageBuffer<T> {
-    buffer: Buffer,
+    owner: Arc<Owner>,
     len: usize,
     element: PhantomData<T>,
+}
+
+/// The buffer of all clones. The last one takes the bind groups along.
+#[derive(Debug)]
+struct Owner {
+    buffer: Buffer,
+    shared: Weak<Shared>,
+}
+
+impl Drop for Owner {
+    fn drop(&mut self) {
+        if let Some(shared) = self.shared.upgrade() {
+            shared.bind_groups.forget(&self.buffer);
+        }
+    }
 }
 
 impl<T: Pod> StorageBuffer<T> {
@@ -28,14 +46,15 @@ impl<T: Pod> StorageBuffer<T> {
             return Err(GpuError::TooLarge { what: label.to_owned(), needed, limit });
         }
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST | BufferUsages::INDIRECT;
-        gpu.shared.storage_buffers_made.fetch_add(1, Ordering::Relaxed);
+        gpu.shared.counters.storage_buffers.fetch_add(1, Ordering::Relaxed);
         let buffer = gpu.device.create_buffer(&BufferDescriptor {
             label: Some(label),
             size: needed,
             usage,
             mapped_at_creation: false,
         });
-        Ok(Self { buffer, len, element: PhantomData })
+        let owner = Arc::new(Owner { buffer, shared: Arc::downgrade(&gpu.shared) });
+        Ok(Self { owner, len, element: PhantomData })
     }
 
     /// A buffer with the given content.
@@ -52,7 +71,17 @@ impl<T: Pod> StorageBuffer<T> {
     pub fn write(&self, gpu: &GpuContext, content: &[T]) {
         let count = content.len().min(self.len);
         if count > 0 {
-            gpu.queue.write_buffer(&self.buffer, 0, bytemuck::cast_slice(&content[..count]));
+            gpu.queue.write_buffer(self.raw(), 0, bytemuck::cast_slice(&content[..count]));
+        }
+    }
+
+    /// Records a copy of the first elements (extra ones are ignored): the commands recorded before see the old content,
+    /// those after it the new one. Creates no buffer in the long run. Elements of a multiple of 4 bytes only.
+    pub fn encode_write(&self, gpu: &GpuContext, encoder: &mut CommandEncoder, content: &[T]) {
+        let count = content.len().min(self.len);
+        if count > 0 {
+            let bytes = bytemuck::cast_slice(&content[..count]);
+            gpu.shared.uploads.record(&gpu.device, &gpu.shared.counters, encoder, bytes, (self.raw(), 0));
         }
     }
 
@@ -61,7 +90,7 @@ impl<T: Pod> StorageBuffer<T> {
     pub fn write_bytes(&self, gpu: &GpuContext, bytes: &[u8]) {
         let count = bytes.len().min(self.len * size_of::<T>()) & !3;
         if count > 0 {
-            gpu.queue.write_buffer(&self.buffer, 0, &bytes[..count]);
+            gpu.queue.write_buffer(self.raw(), 0, &bytes[..count]);
         }
     }
 
@@ -69,7 +98,7 @@ impl<T: Pod> StorageBuffer<T> {
     pub fn copy_to(&self, gpu: &GpuContext, other: &Self) {
         let bytes = self.len.min(other.len) as u64 * size_of::<T>() as u64;
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        encoder.copy_buffer_to_buffer(&self.buffer, 0, &other.buffer, 0, bytes);
+        encoder.copy_buffer_to_buffer(self.raw(), 0, other.raw(), 0, bytes);
         gpu.queue.submit([encoder.finish()]);
     }
 
@@ -88,7 +117,7 @@ impl<T: Pod> StorageBuffer<T> {
     /// wgpu's buffer.
     #[must_use]
     pub fn raw(&self) -> &Buffer {
-        &self.buffer
+        &self.owner.buffer
     }
 
     /// Waits for the GPU and copies the elements out. For tests, exports and published pictures.
@@ -96,7 +125,7 @@ impl<T: Pod> StorageBuffer<T> {
     /// # Errors
     /// [`GpuError::Lost`].
     pub fn read(&self, gpu: &GpuContext) -> Result<Vec<T>, GpuError> {
-        read_back(gpu, &self.buffer, self.len)
+        read_back(gpu, self.raw(), self.len)
     }
 }
 

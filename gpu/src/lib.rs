@@ -1,16 +1,20 @@
 //! The GPU as flyrig sees it: one device and queue, errors with advice, typed buffers, the camera
 //! model in WGSL and stage timers. Any wgpu adapter will do, Mesa's software rasteriser included.
 
+mod bind_groups;
 mod buffer;
 mod camera;
 mod context;
 mod shader;
 mod shared;
+mod stage_timer;
 mod timer;
+mod uploads;
 
 pub use buffer::{StorageBuffer, read_back};
 pub use camera::{CAMERA_WGSL, CameraConstants};
 pub use context::{AdapterChoice, GpuContext, GpuError, adapter_names};
 pub use shader::{ComputeKernel, MAX_WORKGROUPS_PER_DIMENSION, bind, dispatch_1d};
 pub use shared::GpuObjects;
+pub use stage_timer::StageTimer;
 pub use timer::{GpuTimer, StageTime};

@@ -1,6 +1,6 @@
 //! Compute kernels with fewer words.
 
-use wgpu::{BindGroup, BindGroupEntry, BindingResource, ComputePipeline};
+use wgpu::{BindGroup, BindingResource, ComputePipeline};
 
 use crate::GpuContext;
 
@@ -38,26 +38,25 @@ impl ComputeKernel {
         })
     }
 
-    /// Bind group 0 with the resources at bindings 0, 1, 2, ...
+    /// Returns bind group 0 with the resources at bindings 0, 1, 2, ...; the one of an earlier call with the same resources
+    /// where there is one.
     #[must_use]
     pub fn bind(&self, gpu: &GpuContext, resources: &[BindingResource<'_>]) -> BindGroup {
         bind(gpu, &self.pipeline, resources)
     }
+
+    /// As [`Self::bind`], with the number of each binding. A kernel's layout has only the bindings that its entry point uses.
+    #[must_use]
+    pub fn bind_at(&self, gpu: &GpuContext, resources: &[(u32, BindingResource<'_>)]) -> BindGroup {
+        gpu.shared.bind_groups.get(&gpu.device, &gpu.shared.counters, &self.pipeline, resources)
+    }
 }
 
-/// Bind group 0 of a pipeline with derived layout, resources at bindings 0, 1, 2, ...
+/// As [`ComputeKernel::bind`], for any pipeline with derived layout.
 #[must_use]
 pub fn bind(gpu: &GpuContext, pipeline: &ComputePipeline, resources: &[BindingResource<'_>]) -> BindGroup {
-    let entries: Vec<_> = resources
-        .iter()
-        .zip(0..)
-        .map(|(resource, binding)| BindGroupEntry { binding, resource: resource.clone() })
-        .collect();
-    gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
-        label: None,
-        layout: &pipeline.get_bind_group_layout(0),
-        entries: &entries,
-    })
+    let numbered: Vec<_> = (0..).zip(resources.iter().cloned()).collect();
+    gpu.shared.bind_groups.get(&gpu.device, &gpu.shared.counters, pipeline, &numbered)
 }
 
 /// Workgroup counts (x, y) for `items` at `group_size` a workgroup. The kernel's linear workgroup index is

@@ -1,4 +1,5 @@
-//! What all clones of a [`crate::GpuContext`] share: compiled pipelines, read-back buffers, and the device's first fault.
+//! What all clones of a [`crate::GpuContext`] share: compiled pipelines, bind groups, staging buffers, and the device's first
+//! fault.
 
 use std::{
     collections::HashMap,
@@ -10,7 +11,7 @@ use std::{
 
 use wgpu::{Buffer, BufferDescriptor, BufferUsages, ComputePipeline, Device};
 
-use crate::GpuError;
+use crate::{GpuError, bind_groups::BindGroups, uploads::Uploads};
 
 /// Read-back buffers kept for later reads; a frame uses a few sizes.
 const IDLE_READ_BACKS: usize = 24;
@@ -24,6 +25,20 @@ pub struct GpuObjects {
     pub storage_buffers: u64,
     /// Staging buffers of read-backs.
     pub read_backs: u64,
+    /// Staging buffers of constants.
+    pub uploads: u64,
+    /// Bind groups of compute kernels.
+    pub bind_groups: u64,
+}
+
+/// [`GpuObjects`] while they are counted.
+#[derive(Debug, Default)]
+pub(crate) struct Counters {
+    pub pipelines: AtomicU64,
+    pub storage_buffers: AtomicU64,
+    pub read_backs: AtomicU64,
+    pub uploads: AtomicU64,
+    pub bind_groups: AtomicU64,
 }
 
 /// The device's first fault, written by wgpu's callbacks. It holds no wgpu object, which would keep the device alive.
@@ -78,9 +93,9 @@ pub(crate) struct Shared {
     pipelines: Mutex<HashMap<(String, String), ComputePipeline>>,
     /// Not mapped, of any size.
     read_backs: Mutex<Vec<Buffer>>,
-    pipelines_made: AtomicU64,
-    read_backs_made: AtomicU64,
-    pub storage_buffers_made: AtomicU64,
+    pub uploads: Uploads,
+    pub bind_groups: BindGroups,
+    pub counters: Counters,
 }
 
 impl Shared {
@@ -97,7 +112,7 @@ impl Shared {
             return known.clone();
         }
         let pipeline = compile(&key.0);
-        self.pipelines_made.fetch_add(1, Ordering::Relaxed);
+        self.counters.pipelines.fetch_add(1, Ordering::Relaxed);
         lock(&self.pipelines).entry(key).or_insert(pipeline).clone()
     }
 
@@ -109,7 +124,7 @@ impl Shared {
             found.map(|index| idle.remove(index))
         };
         idle.unwrap_or_else(|| {
-            self.read_backs_made.fetch_add(1, Ordering::Relaxed);
+            self.counters.read_backs.fetch_add(1, Ordering::Relaxed);
             device.create_buffer(&BufferDescriptor {
                 label: Some("read back"),
                 size,
@@ -129,15 +144,19 @@ impl Shared {
     }
 
     pub fn objects(&self) -> GpuObjects {
+        let get = |count: &AtomicU64| count.load(Ordering::Relaxed);
+        let Counters { pipelines, storage_buffers, read_backs, uploads, bind_groups } = &self.counters;
         GpuObjects {
-            pipelines: self.pipelines_made.load(Ordering::Relaxed),
-            storage_buffers: self.storage_buffers_made.load(Ordering::Relaxed),
-            read_backs: self.read_backs_made.load(Ordering::Relaxed),
+            pipelines: get(pipelines),
+            storage_buffers: get(storage_buffers),
+            read_backs: get(read_backs),
+            uploads: get(uploads),
+            bind_groups: get(bind_groups),
         }
     }
 }
 
 /// What is behind these locks is whole at every step.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

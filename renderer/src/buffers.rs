@@ -2,17 +2,20 @@
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 
-/// The posed, coloured Gaussians of one instant; one element a Gaussian in every buffer.
+use crate::schema::{self, GaussianElement};
+
+/// The posed, coloured Gaussians of one instant; one element a Gaussian in every buffer, a buffer for each of
+/// [`GAUSSIAN_ATTRIBUTES`](crate::GAUSSIAN_ATTRIBUTES).
 #[derive(Debug)]
 pub struct GaussianBuffers {
     /// World position, metres; w: standard deviation of the isotropic Gaussian, metres.
-    pub center_scale: StorageBuffer<[f32; 4]>,
+    pub center_scale: StorageBuffer<GaussianElement>,
     /// World unit normal of the surface; w unused.
-    pub normal: StorageBuffer<[f32; 4]>,
+    pub normal: StorageBuffer<GaussianElement>,
     /// Linear RGB; w: opacity in 0..=1.
-    pub color: StorageBuffer<[f32; 4]>,
+    pub color: StorageBuffer<GaussianElement>,
     /// Canonical position, metres; w unused. Constant over time.
-    pub canonical: StorageBuffer<[f32; 4]>,
+    pub canonical: StorageBuffer<GaussianElement>,
 }
 
 impl GaussianBuffers {
@@ -22,10 +25,10 @@ impl GaussianBuffers {
     /// [`GpuError::TooLarge`].
     pub fn zeroed(gpu: &GpuContext, count: usize) -> Result<Self, GpuError> {
         Ok(Self {
-            center_scale: StorageBuffer::zeroed(gpu, "Gaussian centres", count)?,
-            normal: StorageBuffer::zeroed(gpu, "Gaussian normals", count)?,
-            color: StorageBuffer::zeroed(gpu, "Gaussian colours", count)?,
-            canonical: StorageBuffer::zeroed(gpu, "Gaussian canonical positions", count)?,
+            center_scale: schema::CENTER_SCALE.zeroed(gpu, count)?,
+            normal: schema::NORMAL.zeroed(gpu, count)?,
+            color: schema::COLOR.zeroed(gpu, count)?,
+            canonical: schema::CANONICAL.zeroed(gpu, count)?,
         })
     }
 
@@ -35,8 +38,8 @@ impl GaussianBuffers {
     /// [`GpuError::TooLarge`].
     pub fn posed_again(&self, gpu: &GpuContext) -> Result<Self, GpuError> {
         Ok(Self {
-            center_scale: StorageBuffer::zeroed(gpu, "Gaussian centres", self.count())?,
-            normal: StorageBuffer::zeroed(gpu, "Gaussian normals", self.count())?,
+            center_scale: schema::CENTER_SCALE.zeroed(gpu, self.count())?,
+            normal: schema::NORMAL.zeroed(gpu, self.count())?,
             color: self.color.clone(),
             canonical: self.canonical.clone(),
         })
@@ -45,15 +48,16 @@ impl GaussianBuffers {
     /// Records the copy of all Gaussians into `other`, from its element `first` on; what has no room there is left out.
     pub fn encode_copy(&self, encoder: &mut wgpu::CommandEncoder, other: &Self, first: usize) {
         let count = self.count().min(other.count().saturating_sub(first));
-        let element = size_of::<[f32; 4]>() as u64;
-        for (from, to) in [
-            (&self.center_scale, &other.center_scale),
-            (&self.normal, &other.normal),
-            (&self.color, &other.color),
-            (&self.canonical, &other.canonical),
-        ] {
+        let element = size_of::<GaussianElement>() as u64;
+        for (from, to) in self.attributes().into_iter().zip(other.attributes()) {
             encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), first as u64 * element, count as u64 * element);
         }
+    }
+
+    /// The buffers in the order of [`GAUSSIAN_ATTRIBUTES`](crate::GAUSSIAN_ATTRIBUTES).
+    #[must_use]
+    pub fn attributes(&self) -> [&StorageBuffer<GaussianElement>; 4] {
+        [&self.center_scale, &self.normal, &self.color, &self.canonical]
     }
 
     /// Number of Gaussians.

@@ -40,7 +40,7 @@ impl ColorMeans {
         coarse: &StorageBuffer<[f32; 4]>,
         rate: f32,
     ) {
-        self.rate.write(gpu, &[rate]);
+        self.rate.encode_write(gpu, encoder, &[rate]);
         let mut pass =
             encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("mean colours"), ..Default::default() });
         let resources = [self.first_child.raw(), self.children.raw(), fine.raw(), coarse.raw(), self.rate.raw()];

@@ -8,7 +8,7 @@ use std::{
 use flyrig_gpu::{GpuContext, GpuError};
 use flyrig_types::write_whole;
 
-use crate::{GaussianBuffers, color::srgb_from_linear};
+use crate::{GaussianBuffers, PLY_PROPERTIES, color::srgb_from_linear};
 
 /// Why an export failed.
 #[derive(Debug, thiserror::Error)]
@@ -82,14 +82,10 @@ pub fn write_splat_ply(path: &Path, splats: &[Splat]) -> Result<usize, ExportErr
     /// Opacity 1 has an infinite logit.
     const OPACITY_MARGIN: f32 = 1e-4;
     const SMALLEST_SCALE_M: f32 = 1e-9;
-    const PROPERTIES: [&str; 17] = [
-        "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
-        "rot_0", "rot_1", "rot_2", "rot_3",
-    ];
     let count = splats.iter().filter(|splat| splat.is_finite()).count();
     write_whole(path, |out| {
         write!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n")?;
-        for property in PROPERTIES {
+        for property in PLY_PROPERTIES {
             writeln!(out, "property float {property}")?;
         }
         writeln!(out, "end_header")?;

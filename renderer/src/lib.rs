@@ -12,6 +12,7 @@ mod raster_backward;
 mod raster_buffers;
 mod raster_kernels;
 mod scan;
+mod schema;
 mod sort;
 mod splat_rows;
 
@@ -27,4 +28,5 @@ pub use picture_loss::{LossSettings, PictureLoss, PictureSums, UNKNOWN_RGBA, Wan
 pub use raster::{Outputs, RasterSettings, RasterStats, Rasterizer};
 pub use raster_backward::{BackwardError, BackwardRasterizer, Carry, GaussianGradients, PictureGradients};
 pub use raster_kernels::BACKFACING_COSINE;
+pub use schema::{GAUSSIAN_ATTRIBUTES, GaussianAttribute, GaussianElement, PLY_PROPERTIES};
 pub use splat_rows::{PixelShares, PosedGaussians, pixel_shares};

@@ -1,11 +1,11 @@
 //! How a drawn picture differs from the wanted one, and what the backward rasteriser needs to know of it.
 
-use bytemuck::{Pod, Zeroable};
+use bytemuck::{Pod, Zeroable, bytes_of};
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer, read_back};
 use wgpu::{CommandEncoder, ComputePassDescriptor};
 
-use crate::constants::ConstantWriter;
-use crate::scan::run;
+use crate::constants::Constants;
+use crate::scan::{run, run_at};
 use crate::{PictureGradients, RenderTarget, linear_from_srgb};
 
 const WGSL: &str = include_str!("picture_loss.wgsl");
@@ -72,6 +72,7 @@ pub struct WantedPicture {
     height: u32,
     color: StorageBuffer<[f32; 4]>,
     partials: StorageBuffer<[f32; 4]>,
+    constants: Constants,
 }
 
 impl WantedPicture {
@@ -95,6 +96,7 @@ impl WantedPicture {
             height,
             color: StorageBuffer::zeroed(gpu, "wanted colour", pixels)?,
             partials: StorageBuffer::zeroed(gpu, "partial losses", partials)?,
+            constants: Constants::new(gpu, &[size_of::<Loss>()])?,
         })
     }
 
@@ -156,11 +158,12 @@ impl PictureLoss {
         settings: &LossSettings,
     ) {
         let enough = image.len() >= wanted.source[0] as usize * wanted.source[1] as usize;
-        let Some((constants, groups)) = constants(gpu, wanted, 0, settings).filter(|_| enough) else { return };
+        let Some((constants, groups)) = constants(wanted, 0, settings).filter(|_| enough) else { return };
+        wanted.constants.encode(gpu, encoder, &[bytes_of(&constants)]);
         let mut pass =
             encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("wanted picture"), ..Default::default() });
         let resources = [
-            constants.get(0),
+            wanted.constants.get(0),
             image.raw().as_entire_binding(),
             self.linear.raw().as_entire_binding(),
             wanted.color.raw().as_entire_binding(),
@@ -189,12 +192,13 @@ impl PictureLoss {
         if fits {
             encoder.clear_buffer(self.sums.raw(), sums_at, Some(u64::from(SUMS) * 16));
         }
-        let Some((constants, groups)) = constants(gpu, wanted, index as u32, settings).filter(|_| fits) else { return };
+        let Some((constants, groups)) = constants(wanted, index as u32, settings).filter(|_| fits) else { return };
+        wanted.constants.encode(gpu, encoder, &[bytes_of(&constants)]);
         let mut pass =
             encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("picture loss"), ..Default::default() });
         let partials = wanted.partials.raw().as_entire_binding();
         let resources = [
-            (0, constants.get(0)),
+            (0, wanted.constants.get(0)),
             (3, wanted.color.raw().as_entire_binding()),
             (4, drawn.color.raw().as_entire_binding()),
             (5, out.color.raw().as_entire_binding()),
@@ -202,7 +206,7 @@ impl PictureLoss {
             (7, partials.clone()),
         ];
         run_at(gpu, &mut pass, &self.compare, &resources, groups);
-        let resources = [(0, constants.get(0)), (7, partials), (8, self.sums.raw().as_entire_binding())];
+        let resources = [(0, wanted.constants.get(0)), (7, partials), (8, self.sums.raw().as_entire_binding())];
         run_at(gpu, &mut pass, &self.add_up, &resources, (SUMS.div_ceil(64), 1));
     }
 
@@ -222,20 +226,15 @@ impl PictureLoss {
     }
 }
 
-fn constants(
-    gpu: &GpuContext,
-    wanted: &WantedPicture,
-    index: u32,
-    settings: &LossSettings,
-) -> Option<(crate::constants::Constants, (u32, u32))> {
+/// Constants of a comparison and its workgroups; None where there is no area.
+fn constants(wanted: &WantedPicture, index: u32, settings: &LossSettings) -> Option<(Loss, (u32, u32))> {
     let [left, top, right, bottom] = settings.area;
     let (right, bottom) = (right.min(wanted.width), bottom.min(wanted.height));
     if left >= right || top >= bottom {
         return None;
     }
     let area = [right - left, bottom - top];
-    let mut writer = ConstantWriter::default();
-    writer.push(&Loss {
+    let constants = Loss {
         size: wanted.size(),
         first: [left, top],
         area,
@@ -245,30 +244,8 @@ fn constants(
         source_width: wanted.source[0],
         shrink: wanted.shrink,
         with_unknown: settings.with_unknown.into(),
-    });
-    Some((writer.finish(gpu), (area[0].div_ceil(64), area[1].div_ceil(ROWS))))
-}
-
-/// As [`run`], with bindings whose numbers do not follow each other.
-fn run_at(
-    gpu: &GpuContext,
-    pass: &mut wgpu::ComputePass<'_>,
-    kernel: &ComputeKernel,
-    resources: &[(u32, wgpu::BindingResource<'_>)],
-    (x, y): (u32, u32),
-) {
-    let entries: Vec<_> = resources
-        .iter()
-        .map(|(binding, resource)| wgpu::BindGroupEntry { binding: *binding, resource: resource.clone() })
-        .collect();
-    let group = gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
-        label: None,
-        layout: &kernel.pipeline.get_bind_group_layout(0),
-        entries: &entries,
-    });
-    pass.set_pipeline(&kernel.pipeline);
-    pass.set_bind_group(0, &group, &[]);
-    pass.dispatch_workgroups(x, y, 1);
+    };
+    Some((constants, (area[0].div_ceil(64), area[1].div_ceil(ROWS))))
 }
 
 fn wgsl() -> String {

@@ -1,13 +1,16 @@
 //! Forward splat rasteriser: what it draws and how it is called.
 
-use flyrig_gpu::{CameraConstants, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
+use std::sync::Arc;
+
+use bytemuck::bytes_of;
+use flyrig_gpu::{CameraConstants, ComputeKernel, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
 use flyrig_types::Camera;
 use wgpu::{BindingResource, CommandEncoder, ComputePass, ComputePassDescriptor};
 
-use crate::constants::{ConstantWriter, Constants};
+use crate::constants::Constants;
 use crate::raster_buffers::{Layout, PictureBuffers};
 use crate::raster_kernels::{Frame, RasterKernels, RasterShape};
-use crate::scan::{CHUNK_GROUP, MAX_LOOP, Scan, run};
+use crate::scan::{CHUNK_GROUP, MAX_LOOP, Scan, run, run_at};
 use crate::sort::{RadixSort, SortPass};
 use crate::{GaussianBuffers, RenderTarget};
 
@@ -27,6 +30,8 @@ impl Outputs {
     pub const ALL: Self = Self { color: true, depth: true, canonical: true };
     /// Colour and alpha only.
     pub const COLOR: Self = Self { color: true, depth: false, canonical: false };
+    /// Colour, alpha and canonical positions: the inputs of direct appearance.
+    pub const SURFACE: Self = Self { color: true, depth: false, canonical: true };
 }
 
 /// How to render.
@@ -86,6 +91,8 @@ pub struct Rasterizer {
     pub(crate) pairs_before: StorageBuffer<u32>,
     pair_total: StorageBuffer<u32>,
     stats: StorageBuffer<u32>,
+    /// Of the picture recorded last.
+    pub(crate) constants: Constants,
     pub(crate) picture: Option<PictureBuffers>,
     pub(crate) latest: Option<Latest>,
 }
@@ -93,7 +100,6 @@ pub struct Rasterizer {
 /// What the backward pass must know about the picture that was recorded last.
 #[derive(Debug)]
 pub(crate) struct Latest {
-    pub constants: Constants,
     pub gaussians: usize,
     pub size: [u32; 2],
     /// Columns and rows of tiles that were blended.
@@ -112,7 +118,10 @@ impl Rasterizer {
 
     pub(crate) fn with_shape(gpu: &GpuContext, max_gaussians: usize, shape: RasterShape) -> Result<Self, GpuError> {
         check_count(max_gaussians, shape)?;
+        let mut constants = vec![size_of::<Frame>(), size_of::<[u32; 4]>(), size_of::<[u32; 4]>()];
+        constants.resize(SORT_PASSES + shape.sort.digit_passes as usize, size_of::<SortPass>());
         Ok(Self {
+            constants: Constants::new(gpu, &constants)?,
             kernels: RasterKernels::new(gpu, shape),
             scan: Scan::new(gpu, shape.sort.chunks)?,
             sort: RadixSort::new(gpu, max_gaussians, shape.sort)?,
@@ -180,10 +189,10 @@ impl Rasterizer {
             first_tile,
             unused_too: [0; 2],
         };
-        let constants = self.constants(gpu, &frame, layout);
+        self.encode_constants(gpu, encoder, &frame, layout);
         encoder.clear_buffer(picture.table.raw(), 0, Some(u64::from(layout.table_len) * 4));
         let blend = self.kernels.blend(gpu, settings.outputs);
-        let stages = Stages { gpu, rasterizer: self, gaussians, target, picture, constants: &constants, blended };
+        let stages = Stages { gpu, rasterizer: self, gaussians, target, picture, blended };
         let mut pass = |name, record: &dyn Fn(&mut ComputePass<'_>)| {
             let timestamp_writes = timer.as_mut().and_then(|timer| timer.stage(name));
             record(&mut encoder.begin_compute_pass(&ComputePassDescriptor { label: Some(name), timestamp_writes }));
@@ -193,7 +202,7 @@ impl Rasterizer {
         pass("tile lists", &|pass| stages.tile_lists(pass));
         pass("blend", &|pass| stages.blend(pass, &blend));
         let (gaussians, size, outputs) = (gaussians.count(), frame.size, settings.outputs);
-        self.latest = Some(Latest { constants, gaussians, size, blended, outputs });
+        self.latest = Some(Latest { gaussians, size, blended, outputs });
         Ok(())
     }
 
@@ -226,15 +235,14 @@ impl Rasterizer {
         }
     }
 
-    fn constants(&self, gpu: &GpuContext, frame: &Frame, layout: Layout) -> Constants {
-        let mut writer = ConstantWriter::default();
-        writer.push(frame);
-        writer.push(&[self.kernels.shape.sort.table_len(), 0, 0, 0]);
-        writer.push(&[layout.table_len, 0, 0, 0]);
-        for index in 0..self.kernels.shape.sort.digit_passes {
-            writer.push(&SortPass::new(frame.gaussians, index));
-        }
-        writer.finish(gpu)
+    fn encode_constants(&self, gpu: &GpuContext, encoder: &mut CommandEncoder, frame: &Frame, layout: Layout) {
+        let sort = self.kernels.shape.sort;
+        let lengths = [[sort.table_len(), 0, 0, 0], [layout.table_len, 0, 0, 0]];
+        let passes: Vec<SortPass> = (0..sort.digit_passes).map(|index| SortPass::new(frame.gaussians, index)).collect();
+        let mut values = vec![bytes_of(frame)];
+        values.extend(lengths.iter().map(bytes_of));
+        values.extend(passes.iter().map(bytes_of));
+        self.constants.encode(gpu, encoder, &values);
     }
 }
 
@@ -275,7 +283,6 @@ struct Stages<'a> {
     gaussians: &'a GaussianBuffers,
     target: &'a RenderTarget,
     picture: &'a PictureBuffers,
-    constants: &'a Constants,
     blended: [u32; 2],
 }
 
@@ -283,7 +290,7 @@ impl Stages<'_> {
     fn project(&self, pass: &mut ComputePass<'_>) {
         let (r, g) = (self.rasterizer, self.gaussians);
         let resources = [
-            self.constants.get(FRAME),
+            self.rasterizer.constants.get(FRAME),
             g.center_scale.raw().as_entire_binding(),
             g.normal.raw().as_entire_binding(),
             g.color.raw().as_entire_binding(),
@@ -297,15 +304,16 @@ impl Stages<'_> {
 
     fn depth_sort(&self, pass: &mut ComputePass<'_>) {
         let r = self.rasterizer;
-        let passes: Vec<_> =
-            (0..r.kernels.shape.sort.digit_passes as usize).map(|i| self.constants.get(SORT_PASSES + i)).collect();
-        r.sort.encode(self.gpu, pass, &r.scan, &passes, &self.constants.get(SORT_TABLE));
+        let passes: Vec<_> = (0..r.kernels.shape.sort.digit_passes as usize)
+            .map(|i| self.rasterizer.constants.get(SORT_PASSES + i))
+            .collect();
+        r.sort.encode(self.gpu, pass, &r.scan, &passes, &self.rasterizer.constants.get(SORT_TABLE));
     }
 
     fn tile_lists(&self, pass: &mut ComputePass<'_>) {
         let (r, p) = (self.rasterizer, self.picture);
         let resources: [BindingResource<'_>; 9] = [
-            self.constants.get(FRAME),
+            r.constants.get(FRAME),
             r.sort.output().raw().as_entire_binding(),
             r.sort.valid().raw().as_entire_binding(),
             r.rects.raw().as_entire_binding(),
@@ -318,15 +326,15 @@ impl Stages<'_> {
         let groups = (p.layout().bin_chunks.div_ceil(CHUNK_GROUP), 1);
         run(self.gpu, pass, &r.kernels.count_pairs, &resources[..5], groups);
         run(self.gpu, pass, &r.kernels.place_pairs, &resources[..6], groups);
-        run(self.gpu, pass, &r.kernels.count_tiles, &resources[..7], groups);
-        r.scan.encode(self.gpu, pass, &self.constants.get(TILE_TABLE), &p.table, &r.pair_total);
-        run(self.gpu, pass, &r.kernels.list_pairs, &resources, groups);
+        run_at(self.gpu, pass, &r.kernels.count_tiles, &numbered(&resources, &[0, 1, 2, 3, 4, 5, 6, 8]), groups);
+        r.scan.encode(self.gpu, pass, &self.rasterizer.constants.get(TILE_TABLE), &p.table, &r.pair_total);
+        run(self.gpu, pass, &r.kernels.list_pairs, &resources[..8], groups);
     }
 
-    fn blend(&self, pass: &mut ComputePass<'_>, kernel: &flyrig_gpu::ComputeKernel) {
+    fn blend(&self, pass: &mut ComputePass<'_>, kernels: &[(Outputs, Arc<ComputeKernel>)]) {
         let (r, p, t) = (self.rasterizer, self.picture, self.target);
         let resources = [
-            self.constants.get(FRAME),
+            r.constants.get(FRAME),
             r.splats.raw().as_entire_binding(),
             self.gaussians.color.raw().as_entire_binding(),
             self.gaussians.canonical.raw().as_entire_binding(),
@@ -336,8 +344,19 @@ impl Stages<'_> {
             t.depth.raw().as_entire_binding(),
             t.canonical.raw().as_entire_binding(),
         ];
-        run(self.gpu, pass, kernel, &resources, self.blended.into());
+        for (outputs, kernel) in kernels {
+            let mut used = vec![0, 1, 4, 5];
+            used.extend(if outputs.color { &[2, 6][..] } else { &[] });
+            used.extend(if outputs.depth { &[7][..] } else { &[] });
+            used.extend(if outputs.canonical { &[3, 8][..] } else { &[] });
+            run_at(self.gpu, pass, kernel, &numbered(&resources, &used), self.blended.into());
+        }
     }
+}
+
+/// The resources that a kernel uses, with the numbers of their bindings.
+fn numbered<'a>(resources: &[BindingResource<'a>], used: &[u32]) -> Vec<(u32, BindingResource<'a>)> {
+    used.iter().filter_map(|&binding| Some((binding, resources.get(binding as usize)?.clone()))).collect()
 }
 
 #[cfg(test)]

@@ -3,7 +3,6 @@
 use flyrig_gpu::{CAMERA_WGSL, ComputeKernel, GpuContext, GpuError, StorageBuffer, dispatch_1d};
 use wgpu::{CommandEncoder, ComputePassDescriptor};
 
-use crate::constants::ConstantWriter;
 use crate::raster::FRAME;
 use crate::raster_kernels::{FRAME_WGSL, RasterShape};
 use crate::scan::run;
@@ -126,6 +125,8 @@ pub struct BackwardRasterizer {
     places: StorageBuffer<[u32; 4]>,
     tile_limits: StorageBuffer<u32>,
     pair_sums: StorageBuffer<[[f32; 4]; 3]>,
+    /// Elements of `pair_sums`, in x; made anew with it.
+    room: StorageBuffer<[u32; 4]>,
 }
 
 impl BackwardRasterizer {
@@ -134,7 +135,18 @@ impl BackwardRasterizer {
     /// # Errors
     /// [`GpuError::TooLarge`].
     pub fn new(gpu: &GpuContext, rasterizer: &Rasterizer) -> Result<Self, GpuError> {
-        let shape = rasterizer.kernels.shape;
+        Self::with_shape(gpu, rasterizer.kernels.shape)
+    }
+
+    /// As [`Self::new`], for pictures of any [`Rasterizer::new`] on this device.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn for_device(gpu: &GpuContext) -> Result<Self, GpuError> {
+        Self::with_shape(gpu, RasterShape::for_adapter(gpu))
+    }
+
+    fn with_shape(gpu: &GpuContext, shape: RasterShape) -> Result<Self, GpuError> {
         let kernel = |entry, source: String| ComputeKernel::new(gpu, entry, &[&source], entry);
         Ok(Self {
             place: kernel("place_gaussians", places_wgsl()),
@@ -143,6 +155,7 @@ impl BackwardRasterizer {
             places: StorageBuffer::zeroed(gpu, "places of sums", 0)?,
             tile_limits: StorageBuffer::zeroed(gpu, "walked tiles", 0)?,
             pair_sums: StorageBuffer::zeroed(gpu, "sums of pairs", 0)?,
+            room: StorageBuffer::zeroed(gpu, "room for sums of pairs", 1)?,
         })
     }
 
@@ -177,9 +190,6 @@ impl BackwardRasterizer {
         let tiles = layout.tiles[0] as usize * layout.tiles[1] as usize;
         self.grow(gpu, latest.gaussians, tiles, layout.pair_capacity)?;
 
-        let mut writer = ConstantWriter::default();
-        writer.push(&[self.pair_sums.len() as u32, 0, 0, 0]);
-        let room = writer.finish(gpu);
         encoder.clear_buffer(self.places.raw(), 0, None);
         // Tiles that are not blended have walked nothing.
         encoder.clear_buffer(self.tile_limits.raw(), 0, None);
@@ -191,8 +201,8 @@ impl BackwardRasterizer {
             &mut pass,
             &self.place,
             &[
-                latest.constants.get(FRAME),
-                room.get(0),
+                rasterizer.constants.get(FRAME),
+                self.room.raw().as_entire_binding(),
                 rasterizer.sort.output().raw().as_entire_binding(),
                 rasterizer.sort.valid().raw().as_entire_binding(),
                 rasterizer.rects.raw().as_entire_binding(),
@@ -206,7 +216,7 @@ impl BackwardRasterizer {
             &mut pass,
             &self.blend[usize::from(latest.outputs.depth)],
             &[
-                latest.constants.get(FRAME),
+                rasterizer.constants.get(FRAME),
                 rasterizer.splats.raw().as_entire_binding(),
                 gaussians.color.raw().as_entire_binding(),
                 picture.table.raw().as_entire_binding(),
@@ -226,7 +236,7 @@ impl BackwardRasterizer {
             &mut pass,
             &self.project[usize::from(carry == Carry::Lift)],
             &[
-                latest.constants.get(FRAME),
+                rasterizer.constants.get(FRAME),
                 gaussians.center_scale.raw().as_entire_binding(),
                 self.places.raw().as_entire_binding(),
                 self.tile_limits.raw().as_entire_binding(),
@@ -251,6 +261,7 @@ impl BackwardRasterizer {
         let wanted = u64::from(pairs).min(most) as usize;
         if self.pair_sums.len() < wanted {
             self.pair_sums = StorageBuffer::zeroed(gpu, "sums of pairs", wanted)?;
+            self.room = StorageBuffer::from_slice(gpu, "room for sums of pairs", &[[wanted as u32, 0, 0, 0]])?;
         }
         Ok(())
     }

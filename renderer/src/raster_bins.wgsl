@@ -2,6 +2,7 @@
 // (Gaussian, tile), where each invocation owns an equal share of the pairs, contiguous in depth order, and
 // its own column of the tile table (zeroed before). Sharing by pairs bounds every loop, whatever the
 // footprints: Mesa's software adapter silently ends loops after 65535 iterations of one invocation.
+// No kernel uses more than 8 of the bindings: all that browsers promise (raster_shader_tests.rs).
 // Prefix: camera.wgsl, raster_frame.wgsl.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 // (depth key, Gaussian), nearest first
@@ -139,6 +140,14 @@ fn cell(tile: vec2<u32>, index: u32) -> u32 {
 
 @compute @workgroup_size(32)
 fn count_tiles(@builtin(global_invocation_id) id: vec3<u32>) {
+    if id.x == 0u {
+        let wanted = pairs_of_chunks(frame.bin_chunks);
+        stats[0] = visible[0];
+        stats[1] = wanted;
+        if wanted > frame.pair_capacity {
+            stats[2] += 1u;
+        }
+    }
     let range = share(kept_pairs(), id.x);
     if id.x >= frame.bin_chunks || range.x >= range.y {
         return;
@@ -153,14 +162,6 @@ fn count_tiles(@builtin(global_invocation_id) id: vec3<u32>) {
 // After this kernel table[i] is the end of list i, which is the start of list i + 1.
 @compute @workgroup_size(32)
 fn list_pairs(@builtin(global_invocation_id) id: vec3<u32>) {
-    if id.x == 0u {
-        let wanted = pairs_of_chunks(frame.bin_chunks);
-        stats[0] = visible[0];
-        stats[1] = wanted;
-        if wanted > frame.pair_capacity {
-            stats[2] += 1u;
-        }
-    }
     let range = share(kept_pairs(), id.x);
     if id.x >= frame.bin_chunks || range.x >= range.y {
         return;

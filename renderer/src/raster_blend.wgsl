@@ -1,16 +1,28 @@
 // One workgroup a tile, one invocation for four pixels of a column: blends the tile's list front to back.
 // Four pixels share the loads of a splat, which is what the time goes into on Mesa's software adapter. No
 // workgroup memory and no barrier, so that every subgroup can leave as soon as its pixels are opaque.
-// Prefix: camera.wgsl, raster_frame.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE, WITH_COLOR, WITH_DEPTH, WITH_CANONICAL.
+// Lines between "// only NAME" and "// end" are left out of kernels that do not write that picture: a binding counts
+// against the adapter's limit wherever it is declared and named, reached or not.
+// Prefix: camera.wgsl, raster_frame.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;
+// only color
 @group(0) @binding(2) var<storage, read> color: array<vec4<f32>>;
+// end
+// only canonical
 @group(0) @binding(3) var<storage, read> canonical: array<vec4<f32>>;
+// end
 @group(0) @binding(4) var<storage, read> table: array<u32>;
 @group(0) @binding(5) var<storage, read> pairs: array<u32>;
+// only color
 @group(0) @binding(6) var<storage, read_write> color_out: array<vec4<f32>>;
+// end
+// only depth
 @group(0) @binding(7) var<storage, read_write> depth_out: array<f32>;
+// end
+// only canonical
 @group(0) @binding(8) var<storage, read_write> canonical_out: array<vec4<f32>>;
+// end
 
 const ROWS = 4u;
 
@@ -51,21 +63,21 @@ fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) 
         if any(touched) {
             let alpha = select(vec4(0.0), min(exp2(exponent), vec4(MAX_ALPHA)), touched);
             let weight = alpha * transmittance;
-            if WITH_COLOR {
-                let paint = color[g];
-                seen_red += weight * paint.r;
-                seen_green += weight * paint.g;
-                seen_blue += weight * paint.b;
-            }
-            if WITH_DEPTH {
-                seen_depth += weight * splat.depth;
-            }
-            if WITH_CANONICAL {
-                let position = canonical[g];
-                seen_x += weight * position.x;
-                seen_y += weight * position.y;
-                seen_z += weight * position.z;
-            }
+            // only color
+            let paint = color[g];
+            seen_red += weight * paint.r;
+            seen_green += weight * paint.g;
+            seen_blue += weight * paint.b;
+            // end
+            // only depth
+            seen_depth += weight * splat.depth;
+            // end
+            // only canonical
+            let position = canonical[g];
+            seen_x += weight * position.x;
+            seen_y += weight * position.y;
+            seen_z += weight * position.z;
+            // end
             coverage += weight;
             transmittance *= 1.0 - alpha;
         }
@@ -75,15 +87,15 @@ fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) 
     }
     for (var row = 0u; row < min(ROWS, frame.size.y - first.y); row++) {
         let at = (first.y + row) * frame.size.x + first.x;
-        if WITH_COLOR {
-            color_out[at] = vec4(seen_red[row], seen_green[row], seen_blue[row], coverage[row]);
-        }
-        if WITH_DEPTH {
-            // Coverage is 0 or at least CUT.
-            depth_out[at] = seen_depth[row] / max(coverage[row], 1e-6);
-        }
-        if WITH_CANONICAL {
-            canonical_out[at] = vec4(seen_x[row], seen_y[row], seen_z[row], coverage[row]);
-        }
+        // only color
+        color_out[at] = vec4(seen_red[row], seen_green[row], seen_blue[row], coverage[row]);
+        // end
+        // only depth
+        // Coverage is 0 or at least CUT.
+        depth_out[at] = seen_depth[row] / max(coverage[row], 1e-6);
+        // end
+        // only canonical
+        canonical_out[at] = vec4(seen_x[row], seen_y[row], seen_z[row], coverage[row]);
+        // end
     }
 }

@@ -7,6 +7,7 @@ use bytemuck::{Pod, Zeroable};
 use flyrig_gpu::{CAMERA_WGSL, CameraConstants, ComputeKernel, GpuContext};
 
 use crate::Outputs;
+use crate::schema::bindings_wgsl;
 use crate::sort::{INVALID_KEY, SortShape};
 
 pub(crate) const FRAME_WGSL: &str = include_str!("raster_frame.wgsl");
@@ -89,19 +90,36 @@ pub(crate) struct Frame {
 }
 
 pub(crate) fn project_wgsl(shape: RasterShape) -> String {
-    [&shape.wgsl(), CAMERA_WGSL, FRAME_WGSL, PROJECT_WGSL].concat()
+    [&shape.wgsl(), CAMERA_WGSL, FRAME_WGSL, &bindings_wgsl(1), PROJECT_WGSL].concat()
 }
 
 pub(crate) fn bins_wgsl() -> String {
     [CAMERA_WGSL, FRAME_WGSL, BINS_WGSL].concat()
 }
 
+/// The kernel that writes these outputs; at most two of them fit the bindings of one.
 pub(crate) fn blend_wgsl(shape: RasterShape, outputs: Outputs) -> String {
     let Outputs { color, depth, canonical } = outputs;
-    let switches = format!(
-        "const WITH_COLOR: bool = {color};\nconst WITH_DEPTH: bool = {depth};\nconst WITH_CANONICAL: bool = {canonical};\n"
-    );
-    [&shape.wgsl(), &switches, CAMERA_WGSL, FRAME_WGSL, BLEND_WGSL].concat()
+    let mut kept = String::new();
+    let mut keep = true;
+    for line in BLEND_WGSL.lines() {
+        match line.trim() {
+            "// only color" => keep = color,
+            "// only depth" => keep = depth,
+            "// only canonical" => keep = canonical,
+            "// end" => keep = true,
+            _ if keep => kept.extend([line, "\n"]),
+            _ => {}
+        }
+    }
+    [&shape.wgsl(), CAMERA_WGSL, FRAME_WGSL, &kept].concat()
+}
+
+/// The outputs of each kernel that draws `outputs`, so that none binds more than 8 buffers.
+pub(crate) fn blend_passes(outputs: Outputs) -> ([Outputs; 2], usize) {
+    let surface = Outputs { depth: false, ..outputs };
+    let depth = Outputs { color: false, canonical: false, ..outputs };
+    if outputs == Outputs::ALL { ([surface, depth], 2) } else { ([outputs; 2], 1) }
 }
 
 #[derive(Debug)]
@@ -119,7 +137,7 @@ impl RasterKernels {
     pub(crate) fn new(gpu: &GpuContext, shape: RasterShape) -> Self {
         let bins = bins_wgsl();
         let bin_kernel = |entry| ComputeKernel::new(gpu, entry, &[&bins], entry);
-        Self {
+        let kernels = Self {
             shape,
             project: ComputeKernel::new(gpu, "project", &[&project_wgsl(shape)], "project"),
             count_pairs: bin_kernel("count_pairs"),
@@ -127,14 +145,23 @@ impl RasterKernels {
             count_tiles: bin_kernel("count_tiles"),
             list_pairs: bin_kernel("list_pairs"),
             blend: Mutex::default(),
+        };
+        // What a live session draws; anything else is compiled with the first picture that asks for it.
+        for outputs in [Outputs::COLOR, Outputs::SURFACE] {
+            kernels.blend(gpu, outputs);
         }
+        kernels
     }
 
-    /// The blending kernel that writes these outputs, compiled on first use.
-    pub(crate) fn blend(&self, gpu: &GpuContext, outputs: Outputs) -> Arc<ComputeKernel> {
+    /// The blending kernels that write these outputs, and what each of them writes; compiled on first use.
+    pub(crate) fn blend(&self, gpu: &GpuContext, outputs: Outputs) -> Vec<(Outputs, Arc<ComputeKernel>)> {
+        let (passes, count) = blend_passes(outputs);
         let mut kernels = self.blend.lock().unwrap_or_else(PoisonError::into_inner);
-        let compile = || Arc::new(ComputeKernel::new(gpu, "blend", &[&blend_wgsl(self.shape, outputs)], "blend"));
-        Arc::clone(kernels.entry(outputs).or_insert_with(compile))
+        let compile =
+            |outputs| Arc::new(ComputeKernel::new(gpu, "blend", &[&blend_wgsl(self.shape, outputs)], "blend"));
+        let kernel =
+            |&outputs: &Outputs| (outputs, Arc::clone(kernels.entry(outputs).or_insert_with(|| compile(outputs))));
+        passes[..count].iter().map(kernel).collect()
     }
 }
 

@@ -1,11 +1,8 @@
 // One invocation a Gaussian: EWA projection (Zwicker et al. 2001) through the lens, low-pass filter,
 // the rectangle of tiles it can reach, and its depth key.
-// Prefix: camera.wgsl, raster_frame.wgsl, const TILE, INVALID_KEY, CUT, BACKFACING_COSINE.
+// Prefix: camera.wgsl, raster_frame.wgsl, the attributes' bindings, const TILE, INVALID_KEY, CUT, BACKFACING_COSINE.
 @group(0) @binding(0) var<storage, read> frame: Frame;
-@group(0) @binding(1) var<storage, read> center_scale: array<vec4<f32>>;
-@group(0) @binding(2) var<storage, read> normal: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read> color: array<vec4<f32>>;
-@group(0) @binding(4) var<storage, read> canonical: array<vec4<f32>>;
+// Bindings 1 to 4: the attributes of the Gaussians (schema.rs).
 @group(0) @binding(5) var<storage, read_write> splats: array<Splat>;
 // First and last tile, each x | y << 16.
 @group(0) @binding(6) var<storage, read_write> rects: array<vec2<u32>>;

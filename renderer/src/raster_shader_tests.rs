@@ -1,6 +1,6 @@
 //! Every kernel is parsed and validated without a GPU.
 
-use naga::valid::{Capabilities, ValidationFlags, Validator};
+use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 
 use super::*;
 use crate::raster_backward;
@@ -37,4 +37,47 @@ fn every_kernel_is_valid_wgsl_and_the_uniform_has_its_layout() {
     let frame = module.types.iter().find(|(_, t)| t.name.as_deref() == Some("Frame")).unwrap().1;
     let naga::TypeInner::Struct { span, .. } = frame.inner else { panic!("Frame is a struct") };
     assert_eq!(span as usize, size_of::<Frame>());
+}
+
+/// Storage buffers that a browser's adapter offers a shader stage at least (WebGPU's default limit).
+const BROWSER_STORAGE_BUFFERS: usize = 8;
+
+/// Number of storage buffers in the derived layout of each entry point.
+fn storage_buffers(source: &str) -> Vec<(String, usize)> {
+    let module = naga::front::wgsl::parse_str(source).unwrap();
+    let info: ModuleInfo = Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&module).unwrap();
+    let count = |(index, entry): (usize, &naga::EntryPoint)| {
+        let uses = info.get_entry_point(index);
+        let bound = module.global_variables.iter().filter(|(handle, variable)| {
+            matches!(variable.space, naga::AddressSpace::Storage { .. }) && !uses[*handle].is_empty()
+        });
+        (entry.name.clone(), bound.count())
+    };
+    module.entry_points.iter().enumerate().map(count).collect()
+}
+
+#[test]
+fn drawing_needs_no_more_storage_buffers_than_browsers_promise() {
+    let shape = RasterShape::HARDWARE;
+    let mut sources = vec![
+        project_wgsl(shape),
+        bins_wgsl(),
+        [&scan_prefix(shape.sort.chunks), SCAN_WGSL].concat(),
+        [&shape.sort.wgsl(), SORT_WGSL].concat(),
+    ];
+    for bits in 0..8 {
+        let outputs = Outputs { color: bits & 1 != 0, depth: bits & 2 != 0, canonical: bits & 4 != 0 };
+        let (passes, count) = blend_passes(outputs);
+        let written = passes[..count]
+            .iter()
+            .fold([false; 3], |[c, d, k], pass| [c | pass.color, d | pass.depth, k | pass.canonical]);
+        assert_eq!(written, [outputs.color, outputs.depth, outputs.canonical]);
+        sources.extend(passes[..count].iter().map(|&pass| blend_wgsl(shape, pass)));
+    }
+    let counts: Vec<_> = sources.iter().flat_map(|source| storage_buffers(source)).collect();
+    println!("{counts:?}");
+    assert_eq!(counts.iter().filter(|(name, _)| name == "blend").count(), 9);
+    for (name, count) in counts {
+        assert!(count <= BROWSER_STORAGE_BUFFERS, "{name} binds {count} storage buffers");
+    }
 }

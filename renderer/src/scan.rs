@@ -1,7 +1,7 @@
 //! Prefix sums on the GPU.
 
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer};
-use wgpu::{BindingResource, ComputePass};
+use wgpu::{BindGroup, BindingResource, ComputePass};
 
 pub(crate) const SCAN_WGSL: &str = include_str!("scan.wgsl");
 /// `@workgroup_size` of every kernel whose invocations own chunks; chunk counts are multiples of it.
@@ -61,10 +61,24 @@ pub(crate) fn run(
     pass: &mut ComputePass<'_>,
     kernel: &ComputeKernel,
     resources: &[BindingResource<'_>],
-    (x, y): (u32, u32),
+    groups: (u32, u32),
 ) {
-    let group = kernel.bind(gpu, resources);
+    dispatch(pass, kernel, &kernel.bind(gpu, resources), groups);
+}
+
+/// As [`run`], with bindings whose numbers do not follow each other.
+pub(crate) fn run_at(
+    gpu: &GpuContext,
+    pass: &mut ComputePass<'_>,
+    kernel: &ComputeKernel,
+    resources: &[(u32, BindingResource<'_>)],
+    groups: (u32, u32),
+) {
+    dispatch(pass, kernel, &kernel.bind_at(gpu, resources), groups);
+}
+
+fn dispatch(pass: &mut ComputePass<'_>, kernel: &ComputeKernel, group: &BindGroup, (x, y): (u32, u32)) {
     pass.set_pipeline(&kernel.pipeline);
-    pass.set_bind_group(0, &group, &[]);
+    pass.set_bind_group(0, group, &[]);
     pass.dispatch_workgroups(x, y, 1);
 }

@@ -1,26 +1,28 @@
 //! The sort and the scan against the standard library's, on this machine's adapter.
 
+use bytemuck::bytes_of;
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
 use wgpu::ComputePassDescriptor;
 
 use super::*;
-use crate::constants::ConstantWriter;
+use crate::constants::Constants;
 use crate::raster_kernels::RasterShape;
 
 fn sort_on_gpu(gpu: &GpuContext, sort: &mut RadixSort, scan: &Scan, keys: &[u32]) -> Vec<[u32; 2]> {
     sort.grow(gpu, keys.len()).unwrap();
     let elements: Vec<[u32; 2]> = keys.iter().copied().zip(0..).map(|(key, i)| [key, i]).collect();
     sort.input().write(gpu, &elements);
-    let mut writer = ConstantWriter::default();
-    writer.push(&[sort.shape.table_len(), 0, 0, 0]);
-    for index in 0..sort.shape.digit_passes {
-        writer.push(&SortPass::new(keys.len() as u32, index));
-    }
-    let constants = writer.finish(gpu);
+    let table = [sort.shape.table_len(), 0, 0, 0];
+    let of_passes: Vec<SortPass> =
+        (0..sort.shape.digit_passes).map(|index| SortPass::new(keys.len() as u32, index)).collect();
+    let mut values = vec![bytes_of(&table)];
+    values.extend(of_passes.iter().map(bytes_of));
+    let constants = Constants::new(gpu, &values.iter().map(|value| value.len()).collect::<Vec<_>>()).unwrap();
     let passes: Vec<_> = (1..=sort.shape.digit_passes as usize).map(|i| constants.get(i)).collect();
     let mut encoder = gpu.device.create_command_encoder(&Default::default());
+    constants.encode(gpu, &mut encoder, &values);
     let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
     sort.encode(gpu, &mut pass, scan, &passes, &constants.get(0));
     drop(pass);
@@ -84,10 +86,9 @@ fn the_scan_is_the_running_sum() {
     for length in [0usize, 1, 63, 64, 65, 10_000, 1_036_800] {
         let content: Vec<u32> = (0..length).map(|_| rng.random_range(0..1000)).collect();
         let values = StorageBuffer::from_slice(&gpu, "values", &content).unwrap();
-        let mut writer = ConstantWriter::default();
-        writer.push(&[length as u32, 0, 0, 0]);
-        let constants = writer.finish(&gpu);
+        let constants = Constants::new(&gpu, &[size_of::<[u32; 4]>()]).unwrap();
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        constants.encode(&gpu, &mut encoder, &[bytes_of(&[length as u32, 0, 0, 0])]);
         let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
         scan.encode(&gpu, &mut pass, &constants.get(0), &values, &total);
         drop(pass);

@@ -342,7 +342,7 @@ fn refusals_name_the_view_and_the_mend() {
     let mut short = views.clone();
     short[1].rgba.pop();
     let message = rig.try_update(&frame, &short, &settings).unwrap_err().to_string();
-    assert_eq!(message, "camera radial: the picture has 1023 bytes, its 16x16 picture needs 1024");
+    assert_eq!(message, "camera radial: the picture has 255 pixels, its 16x16 picture needs 256");
     let mut other = views.clone();
     other[2].canonical.pop();
     let message = rig.try_update(&frame, &other, &settings).unwrap_err().to_string();

@@ -52,10 +52,6 @@ impl ViewBuffers {
     pub fn fits(&self, source: [u32; 2], level: u32) -> bool {
         (self.source, self.level) == (source, level)
     }
-
-    pub fn rasterizer(&self) -> &Rasterizer {
-        &self.rasterizer
-    }
 }
 
 /// What the deformation lends: kernels and buffers that belong to no view.
@@ -175,9 +171,8 @@ impl<'a> Pictures<'a> {
         let Instants { gpu, skeleton, poses: instants, .. } = &self.scene;
         let Kernels { skinner, posed, loss, .. } = &self.kernels;
         self.kernels.displacement.write(gpu, displacement);
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
         for (pose, gaussians) in instants.iter().zip(*posed) {
-            // A submission each: the pose's upload takes effect at the next one.
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
             let (centers, normals) = (&gaussians.center_scale, &gaussians.normal);
             skinner.encode(
                 gpu,
@@ -188,9 +183,7 @@ impl<'a> Pictures<'a> {
                 centers,
                 normals,
             )?;
-            gpu.queue.submit([encoder.finish()]);
         }
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
         for (i, (view, settings)) in self.views.iter().zip(&self.settings).enumerate() {
             let Some(gaussians) = posed.get(view.instant) else { continue };
             let plain = RasterSettings::default();
