@@ -263,6 +263,7 @@ fn calibration(folder: &Path, sources: &Sources) -> Result<(Rig, Vec<Option<Imag
 
 #[cfg(test)]
 mod tests {
+    use flyrig_capture::CameraSource as _;
     use flyrig_gpu::AdapterChoice;
     use flyrig_sim::{Fault, FaultKind, FaultScript, MotionConfig, MotionKind, SimConfig, SimTime, Simulator};
     use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
