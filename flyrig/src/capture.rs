@@ -47,7 +47,7 @@ pub fn capture(config: &Config, gpu: Option<&GpuContext>) -> Result<()> {
         config.rig.name,
         publisher.endpoints().join(", ")
     );
-    monitor.ready();
+    Monitor::ready();
     let host = host_name();
     // Stamps of what was recorded or simulated are of another time; played now, it is taken now.
     let mut shift = (kind == SourceKind::Cameras).then_some(0i64);

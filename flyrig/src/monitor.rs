@@ -43,7 +43,7 @@ impl Monitor {
     }
 
     /// Reports that the service is up: the watchdog is in force from here on.
-    pub fn ready(&self) {
+    pub fn ready() {
         notify("READY=1");
     }
 

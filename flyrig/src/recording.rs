@@ -121,7 +121,7 @@ pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> R
     let mut arrivals = Arrivals::new(&ids);
     let threads = CaptureThreads::start_opening(tapped, ThreadsConfig { pacing, ..ThreadsConfig::default() })?;
     eprintln!("record: {} cameras to {} (Ctrl-C ends)", rig.cameras.len(), args.out.display());
-    monitor.ready();
+    Monitor::ready();
     let (started, mut printed, mut has_ended) = (Instant::now(), Instant::now(), false);
     let is_over = || args.seconds.is_some_and(|seconds| started.elapsed().as_secs_f64() >= seconds);
     while !stop.load(std::sync::atomic::Ordering::Relaxed) && !is_over() && recorder.state().problem.is_none() {

@@ -66,7 +66,7 @@ fn capture_people(
     if config.source.kind.is_live() {
         intake = intake.live();
     }
-    monitor.ready();
+    Monitor::ready();
     let builder = SessionBuilder::new(gpu.clone(), source.rig.clone()).settings(config.session());
     let session = match source.perception(config)? {
         FoundBy::Given(perception) => builder.perception(perception).build()?,
@@ -74,7 +74,7 @@ fn capture_people(
             if !learn_shape(&mut perception, &mut intake, recorder, monitor)? {
                 return Ok(());
             }
-            builder.perception(perception).build()?
+            builder.perception(*perception).build()?
         }
     };
     let publisher = Publisher::open(&config.transport())?;

@@ -28,7 +28,7 @@ pub struct Source {
 pub enum FoundBy {
     Given(GivenPerception),
     /// Its shape is still to be learnt.
-    Estimated(EstimatedPerception),
+    Estimated(Box<EstimatedPerception>),
 }
 
 impl Source {
@@ -43,7 +43,8 @@ impl Source {
             }
             (Origin::Given, None) => bail!("body.pose is \"given\" but the template holds no animation"),
             (Origin::Estimated, _) => {
-                Ok(FoundBy::Estimated(EstimatedPerception::new(&self.rig, &self.template, masks, plates)?))
+                let estimated = EstimatedPerception::new(&self.rig, &self.template, masks, plates)?;
+                Ok(FoundBy::Estimated(Box::new(estimated)))
             }
         }
     }
