@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
+use flyrig_capture::Rotation;
 use flyrig_fusion::{AppearanceOptions, BodySettings, Origin, OutputSettings, SessionSettings, TrackingSettings};
 use flyrig_sim::SimConfig;
 use flyrig_sync::SyncSettings;
@@ -143,11 +144,12 @@ impl Default for CaptureSection {
 #[serde(deny_unknown_fields, default)]
 pub struct RecordSection {
     pub jpeg_quality: u8,
+    pub rotate: Rotation,
 }
 
 impl Default for RecordSection {
     fn default() -> Self {
-        Self { jpeg_quality: 95 }
+        Self { jpeg_quality: 95, rotate: Rotation::default() }
     }
 }
 
@@ -157,11 +159,20 @@ pub struct TransportSection {
     pub listen: Vec<String>,
     pub connect: Vec<String>,
     pub max_viewers: usize,
+    pub viewpoint_pixels_per_second: u64,
+    pub inbox_bytes: u64,
 }
 
 impl Default for TransportSection {
     fn default() -> Self {
-        Self { listen: vec!["tcp/127.0.0.1:7447".to_owned()], connect: Vec::new(), max_viewers: 4 }
+        let TransportConfig { viewpoint_pixels_per_second, inbox_bytes, .. } = TransportConfig::default();
+        Self {
+            listen: vec!["tcp/127.0.0.1:7447".to_owned()],
+            connect: Vec::new(),
+            max_viewers: 4,
+            viewpoint_pixels_per_second,
+            inbox_bytes,
+        }
     }
 }
 
@@ -238,6 +249,9 @@ impl Config {
         range("capture.jpeg_quality", f64::from(self.capture.jpeg_quality), 0.0, 100.0)?;
         range("record.jpeg_quality", f64::from(self.record.jpeg_quality), 0.0, 100.0)?;
         range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)?;
+        let pixels = self.transport.viewpoint_pixels_per_second as f64;
+        range("transport.viewpoint_pixels_per_second", pixels, 0.0, 1e11)?;
+        range("transport.inbox_bytes", self.transport.inbox_bytes as f64, 65_536.0, 4_294_967_296.0)?;
         self.transport().validate().context("in [rig] or [transport]")
     }
 
@@ -256,6 +270,8 @@ impl Config {
             listen: self.transport.listen.clone(),
             connect: self.transport.connect.clone(),
             max_viewers: self.transport.max_viewers,
+            viewpoint_pixels_per_second: self.transport.viewpoint_pixels_per_second,
+            inbox_bytes: self.transport.inbox_bytes,
             ..TransportConfig::publisher(&self.rig.name)
         }
     }
@@ -334,6 +350,12 @@ mod tests {
             ("[source]\nkind = \"folder\"\n", "source.path is empty"),
             ("[source]\nkind = \"folder\"\npath = \"x\"\n", "body.template is empty"),
             ("[rig]\nname = \"a/b\"\n", "rig.name is 'a/b'"),
+            ("[transport]\ninbox_bytes = 1000\n", "transport.inbox_bytes is 1000, it must lie between 65536 and"),
+            (
+                "[transport]\nviewpoint_pixels_per_second = 1000000000000\n",
+                "viewpoint_pixels_per_second is 1000000000000",
+            ),
+            ("[record]\nrotate = \"4\"\n", "without a unit"),
             ("[sim]\nwidth = -4\n", "invalid value: integer `-4`"),
         ] {
             let error = format!("{:#}", Config::parse(text).unwrap_err());

@@ -9,7 +9,7 @@ use std::{
 
 use anyhow::{Context, Result, bail, ensure};
 use flyrig_body::{ShapeParams, default_template, load_gltf, write_mesh_ply};
-use flyrig_capture::{CaptureErrorKind, FolderOptions, FolderReplay};
+use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay};
 use flyrig_fusion::{
     AppearanceMode, Counts, EstimatedPerception, GivenPerception, GivenPerson, Origin, Outcome, PersonId, SHAPE_SETS,
     Session, SessionBuilder, SessionSettings, SetReader, Solver, StageSummary, next_frame,
@@ -22,7 +22,7 @@ use flyrig_types::{Camera, CameraId, Frame, FrameSet, RenderedView, Rig};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::{cli::EvalArgs, dataset, source};
+use crate::{cli::EvalArgs, dataset};
 
 /// Every so many frames the tracked surface is written.
 const SURFACE_EVERY: u64 = 10;
@@ -308,7 +308,8 @@ fn open_inputs(settings: &ReplaySettings, rig: &Rig) -> Result<(SetReader, usize
         lags_nanos: settings.lags_nanos.clone(),
         ..SyncSettings::default()
     };
-    Ok((SetReader::new(source::boxed(sources), &sync), count))
+    let sources = sources.into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect();
+    Ok((SetReader::new(sources, &sync), count))
 }
 
 /// Reads the held-out cameras alongside, never ahead of what is scored.

@@ -2,10 +2,11 @@
 
 use std::fmt::Write as _;
 
+use flyrig_capture::Recorded;
 use flyrig_fusion::{CameraHealth, Health};
 
-/// Formats a snapshot in Prometheus' text format 0.0.4.
-pub fn prometheus(health: &Health) -> String {
+/// Formats a snapshot, and the state of a recording where there is one, in Prometheus' text format 0.0.4.
+pub fn prometheus(health: &Health, recorded: Option<&Recorded>) -> String {
     let mut text = String::new();
     let mut family = |name: &str, kind: &str, help: &str, samples: &mut dyn Iterator<Item = (String, f64)>| {
         let _ = writeln!(text, "# HELP flyrig_{name} {help}\n# TYPE flyrig_{name} {kind}");
@@ -83,6 +84,14 @@ pub fn prometheus(health: &Health) -> String {
         camera.stats.errors.iter().map(move |(kind, count)| (labels(kind), *count as f64))
     });
     family("camera_errors_total", "counter", "Errors of cameras by kind.", &mut errors);
+    let labels = |thread: &str| format!("{{thread=\"{}\"}}", escaped(thread));
+    let mut restarts = thread_restarts(health).into_iter().map(|(thread, count)| (labels(&thread), count as f64));
+    family("thread_restarts_total", "counter", "Times that a thread's work was begun anew.", &mut restarts);
+    let mut stuck = threads(health).into_iter().map(|thread| {
+        let is_stuck = health.stuck.contains(&thread);
+        (labels(&thread), f64::from(u8::from(is_stuck)))
+    });
+    family("thread_stuck", "gauge", "Whether a thread hangs.", &mut stuck);
     let sets = [("complete", health.complete_sets), ("partial", health.partial_sets), ("skipped", health.skipped_sets)];
     let mut sets = sets.into_iter().map(|(kind, count)| (format!("{{kind=\"{kind}\"}}"), count as f64));
     family("sets_total", "counter", "Sets of frames.", &mut sets);
@@ -94,11 +103,40 @@ pub fn prometheus(health: &Health) -> String {
     family("stage_seconds", "gauge", "Time of a stage of the pipeline.", &mut stages);
     let mut memory = health.resident_mib.into_iter().map(|mib| (String::new(), mib * 1024.0 * 1024.0));
     family("resident_bytes", "gauge", "Resident memory.", &mut memory);
+    if let Some(recorded) = recorded {
+        let broken = f64::from(u8::from(recorded.problem.is_some()));
+        for (name, kind, help, value) in [
+            ("recording_frames_total", "counter", "Frames in the recording.", Some(recorded.frames as f64)),
+            ("recording_bytes_total", "counter", "Their bytes.", Some(recorded.bytes as f64)),
+            ("recording_files_total", "counter", "Files begun.", Some(f64::from(recorded.files))),
+            ("recording_dropped_total", "counter", "Frames that were not recorded.", Some(recorded.dropped as f64)),
+            ("recording_free_bytes", "gauge", "Free space of its disk.", recorded.free_bytes.map(|free| free as f64)),
+            ("recording_broken", "gauge", "Whether the recording broke off.", Some(broken)),
+        ] {
+            family(name, kind, help, &mut value.into_iter().map(|value| (String::new(), value)));
+        }
+    }
     text
 }
 
+/// Returns the names of a rig's camera threads.
+fn threads(health: &Health) -> Vec<String> {
+    let of = |camera: &CameraHealth| ["camera", "stage", "open"].map(|what| format!("{what} {}", camera.stats.camera));
+    health.cameras.iter().flat_map(of).collect()
+}
+
+/// Returns how often the work of each camera's threads was begun anew, by thread.
+pub fn thread_restarts(health: &Health) -> Vec<(String, u64)> {
+    let of = |camera: &CameraHealth| {
+        let stats = &camera.stats;
+        [("camera", stats.restarts), ("stage", stats.stage_restarts)]
+            .map(|(what, count)| (format!("{what} {}", stats.camera), count))
+    };
+    health.cameras.iter().flat_map(of).collect()
+}
+
 /// Formats a snapshot as a table for the terminal.
-pub fn table(health: &Health) -> String {
+pub fn table(health: &Health, recorded: Option<&Recorded>) -> String {
     let mut text = format!(
         "{:<14} {:>9} {:>7} {:>7} {:>7} {:>7} {:>7} {:>9} {:>9}  {}\n",
         "camera", "frames", "lost", "late", "no set", "errors", "back", "jitter ms", "late ms", "mode"
@@ -106,7 +144,12 @@ pub fn table(health: &Health) -> String {
     for camera in &health.cameras {
         let stats = &camera.stats;
         let late = camera.lateness_ms.map_or_else(|| "-".to_owned(), |ms| format!("{ms:.1}"));
-        let mut mode = if stats.running { stats.health.mode.to_string() } else { "ended".to_owned() };
+        let mut mode = match (&stats.last_error, stats.running, stats.opened) {
+            (_, false, _) => "ended".to_owned(),
+            (Some(error), true, false) => format!("not there: {}", error.message),
+            (None, true, false) => "is being opened".to_owned(),
+            (_, true, true) => stats.health.mode.to_string(),
+        };
         if let Some(network) = stats.health.network {
             let offset = network.clock_offset_nanos.map(|nanos| nanos as f64 * 1e-9);
             let drift = network.clock_drift_ppb as f64 * 1e-3;
@@ -133,6 +176,21 @@ pub fn table(health: &Health) -> String {
         "sets: {} complete, {} partial, {} skipped",
         health.complete_sets, health.partial_sets, health.skipped_sets
     );
+    for (thread, count) in thread_restarts(health).into_iter().filter(|(_, count)| *count > 0) {
+        let _ = writeln!(text, "thread '{thread}': restarted {count} times");
+    }
+    for thread in &health.stuck {
+        let _ = writeln!(text, "thread '{thread}': stuck");
+    }
+    if let Some(recorded) = recorded {
+        let free = recorded.free_bytes.map_or_else(String::new, |free| format!(", {:.1} GB free", free as f64 / 1e9));
+        let (frames, mb) = (recorded.frames, recorded.bytes as f64 / 1e6);
+        let file = recorded.file.display();
+        let _ = writeln!(text, "recording: {frames} frames, {mb:.1} MB, {} files, now {file}{free}", recorded.files);
+        if let Some(problem) = &recorded.problem {
+            let _ = writeln!(text, "the recording broke off: {problem}");
+        }
+    }
     text
 }
 
@@ -142,7 +200,7 @@ fn escaped(text: &str) -> String {
 }
 
 #[cfg(test)]
-mod tests {
+pub mod tests {
     use std::collections::BTreeMap;
 
     use flyrig_capture::{CameraStats, CaptureErrorKind, SourceHealth};
@@ -151,7 +209,7 @@ mod tests {
 
     use super::*;
 
-    fn health() -> Health {
+    pub fn health() -> Health {
         let stats = CameraStats {
             camera: "le\"ft".into(),
             frames: 900,
@@ -184,6 +242,7 @@ mod tests {
         let resident_mib = Some(2.0);
         Health {
             cameras: vec![camera],
+            stuck: Vec::new(),
             complete_sets,
             partial_sets,
             skipped_sets,
@@ -195,7 +254,7 @@ mod tests {
 
     #[test]
     fn every_line_of_the_metrics_is_well_formed() {
-        let text = prometheus(&health());
+        let text = prometheus(&health(), None);
         for line in [
             "flyrig_frames_total{camera=\"le\\\"ft\"} 900",
             "flyrig_camera_errors_total{camera=\"le\\\"ft\",kind=\"Corrupt\"} 2",
@@ -220,9 +279,38 @@ mod tests {
     }
 
     #[test]
+    fn threads_and_recordings_are_named() {
+        let mut health = health();
+        (health.cameras[0].stats.restarts, health.stuck) = (2, vec!["stage le\"ft".to_owned()]);
+        let problem = Some("disk full".to_owned());
+        let recorded =
+            Recorded { frames: 7, bytes: 2_000_000, files: 2, free_bytes: Some(9), problem, ..Recorded::default() };
+        let text = prometheus(&health, Some(&recorded));
+        for line in [
+            "flyrig_thread_restarts_total{thread=\"camera le\\\"ft\"} 2",
+            "flyrig_thread_restarts_total{thread=\"stage le\\\"ft\"} 0",
+            "flyrig_thread_stuck{thread=\"stage le\\\"ft\"} 1",
+            "flyrig_thread_stuck{thread=\"camera le\\\"ft\"} 0",
+            "flyrig_recording_frames_total 7",
+            "flyrig_recording_bytes_total 2000000",
+            "flyrig_recording_files_total 2",
+            "flyrig_recording_free_bytes 9",
+            "flyrig_recording_broken 1",
+        ] {
+            assert!(text.lines().any(|found| found == line), "{line} in\n{text}");
+        }
+        let text = table(&health, Some(&recorded));
+        for part in
+            ["'camera le\"ft': restarted 2 times", "'stage le\"ft': stuck", "7 frames, 2.0 MB, 2 files", "disk full"]
+        {
+            assert!(text.contains(part), "{part} in\n{text}");
+        }
+    }
+
+    #[test]
     fn a_camera_without_frames_is_down_and_tells_nothing_old() {
         let mut health = health();
-        let has = |health: &Health, start: &str| prometheus(health).lines().any(|line| line.starts_with(start));
+        let has = |health: &Health, start: &str| prometheus(health, None).lines().any(|line| line.starts_with(start));
         assert!(has(&health, "flyrig_camera_up{camera=\"le\\\"ft\"} 1"));
         for quiet_s in [Some(60.0), None] {
             health.cameras[0].quiet_s = quiet_s;
@@ -237,7 +325,7 @@ mod tests {
 
     #[test]
     fn the_table_has_a_row_a_camera() {
-        let table = table(&health());
+        let table = table(&health(), None);
         let row = table.lines().nth(1).unwrap();
         let cells: Vec<&str> = row.split_whitespace().collect();
         assert_eq!(cells[..9], ["le\"ft", "900", "7", "3", "5", "2", "1", "0.40", "12.0"]);

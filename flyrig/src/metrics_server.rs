@@ -17,15 +17,18 @@ use anyhow::{Context as _, Result};
 const PATIENCE: Duration = Duration::from_secs(1);
 /// Longest request that is read.
 const REQUEST_BYTES: usize = 8192;
-/// How often the server looks whether it shall stop.
+/// How often a thread looks whether it shall stop.
 const LOOK: Duration = Duration::from_millis(100);
+/// Clients that are served at the same time; each takes one thread for at most about two seconds, the others wait.
+const THREADS: usize = 8;
 
-/// Answers every HTTP request with the text published last, one client at a time.
+/// Answers HTTP requests with the text published last. Own code rather than a crate's: the small servers that there are
+/// have no time-outs for clients that dawdle, or bring an executor along.
 pub struct MetricsServer {
     text: Arc<Mutex<String>>,
     stop: Arc<AtomicBool>,
     address: SocketAddr,
-    thread: Option<JoinHandle<()>>,
+    threads: Vec<JoinHandle<()>>,
 }
 
 impl MetricsServer {
@@ -39,21 +42,25 @@ impl MetricsServer {
         listener.set_nonblocking(true)?;
         let (text, stop) = (Arc::new(Mutex::new(String::new())), Arc::new(AtomicBool::new(false)));
         let address = listener.local_addr()?;
-        let (of_thread, stopped) = (Arc::clone(&text), Arc::clone(&stop));
-        let serve = move || {
-            while !stopped.load(Ordering::Relaxed) {
-                match listener.accept() {
-                    Ok((client, _)) => {
-                        let text = lock(&of_thread).clone();
-                        // A client that asks badly is its own loss.
-                        let _ = answer(client, &text, &stopped);
+        // From here on an early return drops this and stops what has started.
+        let mut this = Self { text, stop, address, threads: Vec::with_capacity(THREADS) };
+        for _ in 0..THREADS {
+            let (listener, text, stopped) = (listener.try_clone()?, Arc::clone(&this.text), Arc::clone(&this.stop));
+            let serve = move || {
+                while !stopped.load(Ordering::Relaxed) {
+                    match listener.accept() {
+                        Ok((client, _)) => {
+                            let text = lock(&text).clone();
+                            // A client that asks badly is its own loss.
+                            let _ = answer(client, &text, &stopped);
+                        }
+                        Err(_) => std::thread::sleep(LOOK),
                     }
-                    Err(_) => std::thread::sleep(LOOK),
                 }
-            }
-        };
-        let thread = Some(Builder::new().name("metrics".to_owned()).spawn(serve)?);
-        Ok(Self { text, stop, address, thread })
+            };
+            this.threads.push(Builder::new().name("metrics".to_owned()).spawn(serve)?);
+        }
+        Ok(this)
     }
 
     /// Where it listens.
@@ -70,7 +77,7 @@ impl MetricsServer {
 impl Drop for MetricsServer {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
+        for thread in self.threads.drain(..) {
             let _ = thread.join();
         }
     }
@@ -159,5 +166,26 @@ mod tests {
         let writer = writer.unwrap();
         assert!(ask(&server, "GET /metrics HTTP/1.1\r\n\r\n").ends_with("flyrig_frames_total 1\n"));
         assert!(writer.join().unwrap(), "the server hung up");
+    }
+
+    #[test]
+    fn clients_are_answered_while_others_keep_their_connection_open() {
+        let server = MetricsServer::start("127.0.0.1:0").unwrap();
+        server.publish("flyrig_frames_total 1\n".to_owned());
+        let connect = || TcpStream::connect(server.address()).unwrap();
+        let silent: Vec<TcpStream> = (1..THREADS).map(|_| connect()).collect();
+        // They are all being served.
+        std::thread::sleep(2 * LOOK);
+        let answer = ask(&server, "GET /metrics HTTP/1.1\r\n\r\n");
+        assert!(answer.ends_with("flyrig_frames_total 1\n"), "{answer}");
+        for client in &silent {
+            client.set_nonblocking(true).unwrap();
+            let error = (&*client).read(&mut [0]).map_err(|error| error.kind());
+            assert_eq!(
+                error,
+                Err(ErrorKind::WouldBlock),
+                "it was answered before the server gave up on the silent ones"
+            );
+        }
     }
 }

@@ -6,7 +6,7 @@ use std::{
 };
 
 use anyhow::{Context as _, Result};
-use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, NetworkHealth, SourceHealth};
+use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, NetworkHealth, SourceHealth, SourceOpener};
 use flyrig_transport::{CameraSubscriber, HostClock, TransportConfig, TransportErrorKind};
 use flyrig_types::{CameraId, Frame, Rig};
 
@@ -22,19 +22,25 @@ pub fn host_clock() -> HostClock {
     HostClock::new(flyrig_capture::monotonic_nanos)
 }
 
-/// A source for every camera of the rig, all in one session.
-pub fn open(transport: &TransportConfig, rig: &Rig) -> Result<Vec<Box<dyn CameraSource>>> {
+/// Returns an opener for every camera of the rig, all in one session.
+///
+/// # Errors
+/// Names settings of the session that are wrong.
+pub fn openers(transport: &TransportConfig, rig: &Rig) -> Result<Vec<SourceOpener>> {
     let cameras: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     // It listens nowhere: that address is the results'.
     let transport = TransportConfig { listen: Vec::new(), ..transport.clone() };
     let subscriber = CameraSubscriber::open(&transport, &cameras, host_clock())
         .context("source.kind is \"network\": transport.connect must name the computers with cameras or a router")?;
     let subscriber = Arc::new(subscriber);
-    let source = |camera: &flyrig_types::Camera| {
+    let opener = |camera: &flyrig_types::Camera| {
         let size = (camera.intrinsics.width, camera.intrinsics.height);
-        Box::new(NetworkCamera::new(camera.id.clone(), size, Arc::clone(&subscriber))) as Box<dyn CameraSource>
+        let (id, subscriber) = (camera.id.clone(), Arc::clone(&subscriber));
+        SourceOpener::new(&camera.id, move || {
+            Ok(Box::new(NetworkCamera::new(id.clone(), size, Arc::clone(&subscriber))) as Box<dyn CameraSource>)
+        })
     };
-    Ok(rig.cameras.iter().map(source).collect())
+    Ok(rig.cameras.iter().map(opener).collect())
 }
 
 /// A camera of another computer, with capture times on this computer's clock.

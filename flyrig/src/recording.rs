@@ -9,8 +9,8 @@ use std::{
 use anyhow::{Context as _, Result, bail, ensure};
 use flyrig_calib::save_easymocap;
 use flyrig_capture::{
-    CameraSource, CaptureThreads, Compression, McapReplay, Note, Pacing, PopError, Recorded, Recorder, ThreadsConfig,
-    recorded_notes, to_rgb8,
+    CameraSource, CaptureThreads, Compression, McapReplay, Note, Pacing, PopError, Recorded, Recorder, RecorderConfig,
+    SourceOpener, ThreadsConfig, recorded_notes, to_rgb8,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{png, stop, write_whole};
@@ -24,8 +24,10 @@ use foxglove::{
 
 use crate::{
     cli::{RecordArgs, ReplayArgs},
-    config::Config,
-    dataset, pose_recording,
+    config::{Config, RecordSection},
+    dataset,
+    monitor::{Arrivals, Monitor, ended_by_itself},
+    pose_recording,
     source::{self, Source},
 };
 
@@ -41,22 +43,24 @@ pub fn schema<M: Encode>() -> (String, String, Vec<u8>) {
 }
 
 /// Opens a recording file and writes the rig into it. Sources that are read without loss are recorded without loss.
-pub fn recorder(path: &Path, rig: &Rig, jpeg_quality: u8, pacing: Pacing) -> Result<Recorder> {
+pub fn recorder(path: &Path, rig: &Rig, settings: &RecordSection, pacing: Pacing) -> Result<Recorder> {
     fn note<M: Encode>(topic: String, payload: Vec<u8>) -> Note {
         Note { topic, schema: schema::<M>(), payload }
     }
     let keep_all = pacing == Pacing::Lossless;
-    let compression = (jpeg_quality > 0).then_some(Compression { quality: jpeg_quality, keep_all });
+    let quality = settings.jpeg_quality;
+    let compression = (quality > 0).then_some(Compression { quality, keep_all });
     let mut notes = vec![note::<FrameTransforms>(TRANSFORMS.to_owned(), encode_transforms(rig)?)];
     for camera in &rig.cameras {
         notes.push(note::<CameraCalibration>(format!("{CALIBRATION}{}", camera.id), encode_calibration(camera)?));
     }
-    Ok(Recorder::create(path, &notes, compression)?)
+    let settings = RecorderConfig { compression, rotation: settings.rotate, ..RecorderConfig::default() };
+    Ok(Recorder::create_with(path, &notes, &settings)?)
 }
 
-/// The same sources, recorded as they are read.
-pub fn tap(recorder: &Recorder, sources: Vec<Box<dyn CameraSource>>) -> Result<Vec<Box<dyn CameraSource>>> {
-    sources.into_iter().map(|source| Ok(Box::new(recorder.tap(source)?) as Box<dyn CameraSource>)).collect()
+/// Returns the same cameras, recorded as they are read, whenever they are opened.
+pub fn tap(recorder: &Recorder, cameras: Vec<SourceOpener>) -> Result<Vec<SourceOpener>> {
+    cameras.into_iter().map(|camera| Ok(camera.recorded(recorder.source_tap())?)).collect()
 }
 
 /// The rig that a recording was made with.
@@ -108,19 +112,32 @@ pub fn summary(recorded: &Recorded, path: &Path) -> Result<String> {
 /// Runs `flyrig record`.
 pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> Result<()> {
     let stop = stop::flag();
+    let mut monitor = Monitor::start(&config.health.listen, false)?;
     let Source { rig, cameras, .. } = source::open(config, gpu)?;
     let pacing = if config.source.kind.is_live() { Pacing::AsDelivered } else { Pacing::Lossless };
-    let recorder = recorder(&args.out, &rig, config.record.jpeg_quality, pacing)?;
+    let recorder = recorder(&args.out, &rig, &config.record, pacing)?;
     let tapped = tap(&recorder, cameras)?;
-    let threads = CaptureThreads::start(tapped, ThreadsConfig { pacing, ..ThreadsConfig::default() })?;
+    let ids: Vec<CameraId> = tapped.iter().map(|camera| camera.camera().clone()).collect();
+    let mut arrivals = Arrivals::new(&ids);
+    let threads = CaptureThreads::start_opening(tapped, ThreadsConfig { pacing, ..ThreadsConfig::default() })?;
     eprintln!("record: {} cameras to {} (Ctrl-C ends)", rig.cameras.len(), args.out.display());
-    let (started, mut printed) = (Instant::now(), Instant::now());
+    Monitor::ready();
+    let (started, mut printed, mut has_ended) = (Instant::now(), Instant::now(), false);
     let is_over = || args.seconds.is_some_and(|seconds| started.elapsed().as_secs_f64() >= seconds);
     while !stop.load(std::sync::atomic::Ordering::Relaxed) && !is_over() && recorder.state().problem.is_none() {
         // The frames are recorded on their way; here they are only taken out.
-        if matches!(threads.queue().pop(Duration::from_millis(100)), Err(PopError::Closed)) {
-            break;
+        match threads.queue().pop(Duration::from_millis(100)) {
+            Ok(frame) => {
+                arrivals.add(&frame.camera);
+                monitor.stepped();
+            }
+            Err(PopError::Timeout) => {}
+            Err(PopError::Closed) => {
+                has_ended = true;
+                break;
+            }
         }
+        monitor.look(|| (arrivals.health(&threads), Some(recorder.state())));
         if printed.elapsed() >= PRINT_EVERY {
             let state = recorder.state();
             eprintln!("record: {} frames, {:.1} MB", state.frames, state.bytes as f64 / 1e6);
@@ -129,12 +146,13 @@ pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> R
     }
     let stats = threads.stats();
     drop(threads);
-    for camera in stats {
+    for camera in &stats {
         let lost = camera.health.lost_by_driver;
-        let error = camera.last_error.map_or_else(String::new, |error| format!("; last error: {error}"));
+        let error = camera.last_error.as_ref().map_or_else(String::new, |error| format!("; last error: {error}"));
         eprintln!("record: camera {}: {} frames, {lost} lost before us{error}", camera.camera, camera.frames);
     }
     println!("record: {}", summary(&recorder.finish(), &args.out)?);
+    ensure!(!has_ended || !config.source.kind.is_live(), ended_by_itself(&stats));
     Ok(())
 }
 

@@ -2,13 +2,13 @@
 
 use std::{
     path::Path,
-    sync::atomic::Ordering,
     time::{Duration, Instant},
 };
 
-use anyhow::{Result, bail, ensure};
+use anyhow::{Result, bail};
+use flyrig_capture::{CameraStats, Recorder};
 use flyrig_fusion::{
-    EstimatedPerception, Intake, LivePublisher, LiveRig, LiveViews, Outcome, PersonId, SHAPE_SETS, Session,
+    EstimatedPerception, Health, Intake, LivePublisher, LiveRig, LiveViews, Outcome, PersonId, SHAPE_SETS, Session,
     SessionBuilder, resident_mib,
 };
 use flyrig_gpu::GpuContext;
@@ -17,49 +17,64 @@ use flyrig_transport::Publisher;
 
 use crate::{
     config::Config,
-    dataset, health,
-    metrics_server::MetricsServer,
-    notify::ServiceManager,
+    dataset,
+    monitor::{Monitor, ended_by_itself},
     pose_recording::PoseRecording,
     recording,
-    source::{self, FoundBy},
+    source::{self, FoundBy, Source},
 };
 
 /// How long a step waits for a set before health and Ctrl-C are looked at.
 const STEP: Duration = Duration::from_millis(200);
 /// How often a line with rates is printed.
 const PRINT_EVERY: Duration = Duration::from_secs(5);
-/// How often the health is reported.
-const HEALTH_EVERY: Duration = Duration::from_secs(1);
 
 /// Runs the command; `recording` names a file that the cameras are recorded to, `show_table` draws the cameras' health.
 pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_table: bool) -> Result<()> {
-    let stop = stop::flag();
-    let mut source = source::open(config, Some(gpu))?;
+    stop::flag();
+    let mut monitor = Monitor::start(&config.health.listen, show_table)?;
+    let source = source::open(config, Some(gpu))?;
     dataset::require_masks(config.body.pose, config.body.masks, &source.plates)?;
     let pacing = source::pacing(config);
-    let quality = config.record.jpeg_quality;
-    let recorder = recording.map(|path| recording::recorder(path, &source.rig, quality, pacing)).transpose()?;
+    let recorder = recording.map(|path| recording::recorder(path, &source.rig, &config.record, pacing)).transpose()?;
+    let ended = capture_people(config, gpu, source, recorder.as_ref(), &mut monitor, show_table);
+    let recorded = match (recorder, recording) {
+        (Some(recorder), Some(path)) => recording::summary(&recorder.finish(), path)
+            .map(|text| eprintln!("run: recorded {text}"))
+            .inspect_err(|error| eprintln!("run: {error}")),
+        _ => Ok(()),
+    };
+    ended.and(recorded)
+}
+
+/// Runs the rig until its cameras end or it is asked to stop.
+fn capture_people(
+    config: &Config,
+    gpu: &GpuContext,
+    mut source: Source,
+    recorder: Option<&Recorder>,
+    monitor: &mut Monitor,
+    show_table: bool,
+) -> Result<()> {
     let mut cameras = std::mem::take(&mut source.cameras);
-    if let Some(recorder) = &recorder {
+    if let Some(recorder) = recorder {
         cameras = recording::tap(recorder, cameras)?;
     }
-    let mut poses = recorder.as_ref().map(PoseRecording::new);
+    let mut poses = recorder.map(PoseRecording::new);
     let format = source::input_format(config.source.kind, &source.rig);
-    let mut intake = Intake::start(cameras, format, &config.sync, pacing)?;
+    let mut intake = Intake::start_opening(cameras, format, &config.sync, source::pacing(config))?;
     if config.source.kind.is_live() {
         intake = intake.live();
     }
-    let metrics = match config.health.listen.as_str() {
-        "" => None,
-        address => Some(MetricsServer::start(address)?),
-    };
+    Monitor::ready();
     let builder = SessionBuilder::new(gpu.clone(), source.rig.clone()).settings(config.session());
     let session = match source.perception(config)? {
         FoundBy::Given(perception) => builder.perception(perception).build()?,
         FoundBy::Estimated(mut perception) => {
-            learn_shape(&mut perception, &mut intake)?;
-            builder.perception(perception).build()?
+            if !learn_shape(&mut perception, &mut intake, recorder, monitor)? {
+                return Ok(());
+            }
+            builder.perception(*perception).build()?
         }
     };
     let publisher = Publisher::open(&config.transport())?;
@@ -74,27 +89,13 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
     let publisher = LivePublisher::start(publisher, config.output.jpeg_quality)?;
     let mut rig = LiveRig::new(session, intake, LiveViews::new(&config.output), Some(publisher))
         .with_splats(config.output.splats);
-    if let Some(metrics) = &metrics {
-        eprintln!("run: metrics at http://{}/metrics", metrics.address());
-    }
-    let manager = ServiceManager::from_env();
-    manager.tell("READY=1");
-    let mut last_health: Option<Instant> = None;
     let (started, mut last_print, mut printed) = (Instant::now(), Instant::now(), 0u64);
-    while !stop.load(Ordering::Relaxed) && !rig.intake.ended() {
+    while !stop::requested() && !rig.intake.ended() {
         let step = rig.step(STEP, None)?;
-        if last_health.is_none_or(|at| at.elapsed() >= HEALTH_EVERY) {
-            last_health = Some(Instant::now());
-            manager.tell("WATCHDOG=1");
-            let snapshot = rig.health();
-            if let Some(metrics) = &metrics {
-                metrics.publish(health::prometheus(&snapshot));
-            }
-            if show_table {
-                // Clears the terminal first.
-                eprint!("\x1b[2J\x1b[H{}", health::table(&snapshot));
-            }
+        if step.is_some() {
+            monitor.stepped();
         }
+        monitor.look(|| (rig.health(), recorder.map(Recorder::state)));
         let Some(step) = step else { continue };
         if step.outcome == Outcome::Updated {
             record_pose(poses.as_mut(), &rig.session, step.set.master_nanos);
@@ -112,17 +113,17 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
     for (place, count) in rig.drops().into_iter().filter(|(_, count)| *count > 0) {
         eprintln!("dropped: {count} {place}");
     }
-    manager.tell("STOPPING=1");
-    drop(poses);
-    let finished = rig.finish();
-    if let (Some(recorder), Some(path)) = (recorder, recording) {
-        match recording::summary(&recorder.finish(), path) {
-            Ok(text) => eprintln!("run: recorded {text}"),
-            Err(error) => eprintln!("run: {error}"),
-        }
+    let stats = camera_stats(rig.health());
+    rig.finish()?;
+    // A recording ends; live cameras do not.
+    if config.source.kind.is_live() && !stop::requested() {
+        return Err(ended_by_itself(&stats));
     }
-    finished?;
     Ok(())
+}
+
+fn camera_stats(health: Health) -> Vec<CameraStats> {
+    health.cameras.into_iter().map(|camera| camera.stats).collect()
 }
 
 fn record_pose(poses: Option<&mut PoseRecording>, session: &Session, nanos: i64) {
@@ -134,23 +135,35 @@ fn record_pose(poses: Option<&mut PoseRecording>, session: &Session, nanos: i64)
     }
 }
 
-fn learn_shape(perception: &mut EstimatedPerception, intake: &mut Intake) -> Result<()> {
+/// Waits for a person and learns its shape. Returns false when the command was asked to stop before.
+fn learn_shape(
+    perception: &mut EstimatedPerception,
+    intake: &mut Intake,
+    recorder: Option<&Recorder>,
+    monitor: &mut Monitor,
+) -> Result<bool> {
     eprintln!("run: learning the person's shape, please stand in view of all cameras");
-    let mut tries = 0u64;
-    loop {
-        let mut sets = Vec::new();
-        while sets.len() < SHAPE_SETS {
-            ensure!(!stop::requested(), "stopped before a person was seen");
-            match intake.next_set(STEP) {
-                Some(set) => sets.push(set),
-                None if intake.ended() => bail!("the cameras ended before a person was seen"),
-                None => {}
+    let (mut tries, mut sets) = (0u64, Vec::new());
+    while !stop::requested() {
+        monitor.look(|| (Health { resident_mib: resident_mib(), ..intake.health() }, recorder.map(Recorder::state)));
+        match intake.next_set(STEP) {
+            Some(set) => {
+                sets.push(set);
+                monitor.stepped();
             }
+            None if intake.ended() => {
+                let ended = ended_by_itself(&camera_stats(intake.health()));
+                bail!("nobody was seen, and {ended}");
+            }
+            None => {}
+        }
+        if sets.len() < SHAPE_SETS {
+            continue;
         }
         match perception.learn_shape(&sets) {
             Ok(fit) => {
                 eprintln!("run: the person is {:.2} m tall", fit.height_m);
-                return Ok(());
+                return Ok(true);
             }
             Err(error) => {
                 tries += 1;
@@ -159,5 +172,7 @@ fn learn_shape(perception: &mut EstimatedPerception, intake: &mut Intake) -> Res
                 }
             }
         }
+        sets.clear();
     }
+    Ok(false)
 }

@@ -72,8 +72,8 @@ impl Viewer {
     fn new(camera: &Camera, world_up: DVec3, plate: Option<Image>, given_masks: bool) -> Result<Self> {
         let alone = Rig { cameras: vec![camera.clone()], world_up };
         let mut estimator = estimator(&alone, PoseConfig::default())?;
-        if let Some(plate) = &plate {
-            estimator.set_plate(0, plate)?;
+        if let Some(plate) = plate {
+            estimator.set_plate(0, &plate)?;
         }
         Ok(Self { estimator, track: SilhouetteTrack::new(camera), given_masks, sets: 0 })
     }

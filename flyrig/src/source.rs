@@ -2,7 +2,7 @@
 
 use anyhow::{Context as _, Result, bail};
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
-use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, VideoOptions, VideoReplay};
+use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, SourceOpener, VideoOptions, VideoReplay};
 use flyrig_fusion::{EstimatedPerception, GivenPerception, GivenPerson, InputFormat, Origin, PersonId};
 use flyrig_gpu::GpuContext;
 use flyrig_sim::{SimTime, Simulator};
@@ -15,8 +15,8 @@ use crate::{
 
 /// Cameras, and what is known about the person.
 pub struct Source {
-    /// In the rig's order, images in the cameras' own formats.
-    pub cameras: Vec<Box<dyn CameraSource>>,
+    /// In the rig's order, images in the cameras' own formats. Only live ones may be opened later.
+    pub cameras: Vec<SourceOpener>,
     pub rig: Rig,
     pub template: Template,
     pub track: Option<PoseTrack>,
@@ -28,7 +28,7 @@ pub struct Source {
 pub enum FoundBy {
     Given(GivenPerception),
     /// Its shape is still to be learnt.
-    Estimated(EstimatedPerception),
+    Estimated(Box<EstimatedPerception>),
 }
 
 impl Source {
@@ -43,7 +43,8 @@ impl Source {
             }
             (Origin::Given, None) => bail!("body.pose is \"given\" but the template holds no animation"),
             (Origin::Estimated, _) => {
-                Ok(FoundBy::Estimated(EstimatedPerception::new(&self.rig, &self.template, masks, plates)?))
+                let estimated = EstimatedPerception::new(&self.rig, &self.template, masks, plates)?;
+                Ok(FoundBy::Estimated(Box::new(estimated)))
             }
         }
     }
@@ -99,8 +100,8 @@ fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
         let sources = flyrig_sim::sources(&simulator, time)
             .into_iter()
             .filter(|source| picked.slot(source.camera()).is_some())
-            .map(|source| Box::new(source) as Box<dyn CameraSource>)
             .collect();
+        let sources = ready(sources);
         return Ok(Source { cameras: sources, rig: picked, template, track: Some(track), plates });
     }
     let chosen: Vec<CameraId> = source.names().into_iter().map(CameraId::from).collect();
@@ -111,21 +112,21 @@ fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
     };
     let rig = dataset::pick(&rig, &source.names(), "the calibration")?;
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
-    let sources: Vec<Box<dyn CameraSource>> = match source.kind {
+    let sources: Vec<SourceOpener> = match source.kind {
         SourceKind::Folder => {
             let with_masks = config.body.masks == Origin::Given;
-            boxed(FolderReplay::open(
+            ready(FolderReplay::open(
                 &source.path,
                 Some(&ids),
                 &FolderOptions { fps: source.fps, with_masks, frames: None },
             )?)
         }
-        SourceKind::Cameras => live::open(source)?,
-        SourceKind::Network => network::open(&config.transport(), &rig)?,
-        SourceKind::Mcap => recording::replay_sources(&source.path, &rig)?,
+        SourceKind::Cameras => live::openers(source)?,
+        SourceKind::Network => network::openers(&config.transport(), &rig)?,
+        SourceKind::Mcap => ready(recording::replay_sources(&source.path, &rig)?),
         SourceKind::Video | SourceKind::Sim => {
             let open = |id| VideoReplay::open(id, &dataset::video_file(&source.path, id), &VideoOptions::default());
-            boxed(ids.iter().map(open).collect::<Result<_, _>>()?)
+            ready(ids.iter().map(open).collect::<Result<_, _>>()?)
         }
     };
     let (template, track) = if config.body.template.as_os_str().is_empty() {
@@ -141,7 +142,7 @@ fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
     Ok(Source { cameras: sources, rig, template, track, plates })
 }
 
-/// Sources of one kind as the capture threads take them.
-pub fn boxed<S: CameraSource + 'static>(sources: Vec<S>) -> Vec<Box<dyn CameraSource>> {
-    sources.into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect()
+/// Returns sources that are open already as the capture threads take them.
+pub fn ready<S: CameraSource + 'static>(sources: Vec<S>) -> Vec<SourceOpener> {
+    sources.into_iter().map(|source| SourceOpener::ready(Box::new(source))).collect()
 }

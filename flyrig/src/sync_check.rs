@@ -7,7 +7,7 @@ use std::{
 
 use anyhow::{Result, bail, ensure};
 use flyrig_capture::{
-    CameraSource, CaptureThreads, FolderOptions, FolderReplay, Pacing, PopError, ThreadsConfig, VideoOptions,
+    CaptureThreads, FolderOptions, FolderReplay, Pacing, PopError, SourceOpener, ThreadsConfig, VideoOptions,
     VideoReplay, to_rgb8_into,
 };
 use flyrig_fusion::{InputFormat, Intake, Origin};
@@ -26,7 +26,7 @@ use crate::{
     source,
 };
 
-type Sources = Vec<Box<dyn CameraSource>>;
+type Sources = Vec<SourceOpener>;
 
 /// What is looked at.
 struct Take {
@@ -106,7 +106,7 @@ fn by_motion(
 ) -> Result<(Vec<LagEstimate>, Vec<usize>)> {
     let mut signals: Vec<MotionSignal> = cameras.iter().cloned().map(MotionSignal::new).collect();
     let pacing = if is_live { Pacing::AsDelivered } else { Pacing::Lossless };
-    let threads = CaptureThreads::start(sources, ThreadsConfig { queue_capacity: 8 * cameras.len(), pacing })?;
+    let threads = CaptureThreads::start_opening(sources, ThreadsConfig { queue_capacity: 8 * cameras.len(), pacing })?;
     let (started, mut rgb, mut first) = (Instant::now(), Vec::new(), None);
     while !stop::requested() {
         let frame = match threads.queue().pop(Duration::from_millis(200)) {
@@ -127,6 +127,12 @@ fn by_motion(
             let nanos = frame.capture_nanos.saturating_sub(lag);
             signals[slot].add(nanos, &rgb, image.width() as usize, image.height() as usize);
         }
+    }
+    if let Some(stats) = threads.stats().into_iter().find(|stats| stats.frames == 0)
+        && let Some(error) = stats.last_error
+        && is_live
+    {
+        bail!("no picture of camera {} came; the last: {error}", stats.camera);
     }
     drop(threads);
     let estimates = estimate_lags(&signals, (args.most_ms * 1e6) as i64);
@@ -154,7 +160,7 @@ fn by_silhouettes(
     // One camera may be ahead by as much as another is behind, and nothing is lost by waiting.
     let max_wait_nanos = Some(take.sync.max_wait_nanos.unwrap_or(1_000_000_000) + (args.most_ms * 2e6) as u64);
     let sync = SyncSettings { max_wait_nanos, ..take.sync };
-    let mut intake = Intake::start(take.sources, InputFormat::OfRig(rig), &sync, Pacing::Lossless)?;
+    let mut intake = Intake::start_opening(take.sources, InputFormat::OfRig(rig), &sync, Pacing::Lossless)?;
     let bar = progress_bar((args.seconds * 1e3) as u64, "silhouettes, ms of the take");
     let (mut first, mut pictures) = (None, vec![0usize; rig.cameras.len()]);
     while !intake.ended() && !stop::requested() {
@@ -204,14 +210,14 @@ fn open(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Ta
         [path] if has_ending(path, "mcap") => {
             let rig = recording::recorded_rig(path)?;
             let plates = rig.cameras.iter().map(|_| None).collect();
-            let sources = recording::replay_sources(path, &rig)?;
+            let sources = source::ready(recording::replay_sources(path, &rig)?);
             Take::replayed(sources, Some((rig, plates)), false)
         }
         [folder] if folder.is_dir() => {
             let is_calibrated = ["intri.yml", "extri.yml"].iter().all(|file| folder.join(file).exists());
             let replay = |with_masks| -> Result<Sources> {
                 let options = FolderOptions { fps: args.fps, with_masks, ..FolderOptions::default() };
-                Ok(source::boxed(FolderReplay::open(folder, None, &options)?))
+                Ok(source::ready(FolderReplay::open(folder, None, &options)?))
             };
             let mut sources = replay(false)?;
             let masks = folder.join("mask");
@@ -231,7 +237,7 @@ fn open(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Ta
                 let name = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
                 Ok(VideoReplay::open(&name.into(), path, &VideoOptions::default())?)
             };
-            let sources = source::boxed(videos.iter().map(video).collect::<Result<_>>()?);
+            let sources = source::ready(videos.iter().map(video).collect::<Result<_>>()?);
             Take::replayed(sources, None, false)
         }
     };
@@ -257,6 +263,7 @@ fn calibration(folder: &Path, sources: &Sources) -> Result<(Rig, Vec<Option<Imag
 
 #[cfg(test)]
 mod tests {
+    use flyrig_capture::CameraSource as _;
     use flyrig_gpu::AdapterChoice;
     use flyrig_sim::{Fault, FaultKind, FaultScript, MotionConfig, MotionKind, SimConfig, SimTime, Simulator};
     use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
@@ -298,7 +305,7 @@ mod tests {
             let simulator = Arc::new(Mutex::new(simulator));
             let sources = flyrig_sim::sources(&simulator, SimTime::Exact);
             let chosen = sources.into_iter().filter(|source| NAMES.contains(&source.camera().as_str())).collect();
-            Self { lags_ms: lags_ms.map(|lag| lag - lags_ms[0]), rig, sources: source::boxed(chosen) }
+            Self { lags_ms: lags_ms.map(|lag| lag - lags_ms[0]), rig, sources: source::ready(chosen) }
         }
 
         /// By what was found, off by how many milliseconds, if anything was found; the standard error or disagreement.

@@ -1,5 +1,7 @@
 //! Health of a rig, as a snapshot.
 
+use std::time::Duration;
+
 use flyrig_capture::CameraStats;
 use flyrig_sync::ClockState;
 
@@ -7,6 +9,8 @@ use crate::StageSummary;
 
 /// A camera whose last frame is older than this, or than five intervals, is down, seconds.
 const UP_WITHIN_S: f64 = 5.0;
+/// A thread of a camera without a turn for so long is stuck.
+pub const STUCK_AFTER: Duration = Duration::from_secs(10);
 
 /// Health of one camera.
 #[derive(Debug, Clone)]
@@ -40,6 +44,8 @@ impl CameraHealth {
 pub struct Health {
     /// One element a camera.
     pub cameras: Vec<CameraHealth>,
+    /// Names of camera threads (`camera NAME`, `stage NAME`, `open NAME`) that hang in somebody else's code.
+    pub stuck: Vec<String>,
     /// Sets with a frame of every camera.
     pub complete_sets: u64,
     /// Sets without at least one camera.

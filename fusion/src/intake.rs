@@ -1,17 +1,18 @@
 //! Live frame sets: camera threads, their queue and the synchroniser.
 
 use std::{
-    collections::VecDeque,
+    collections::{HashMap, VecDeque},
     time::{Duration, Instant},
 };
 
 use flyrig_capture::{
-    CameraSource, CaptureError, CaptureThreads, Decoding, FrameStage, Pacing, PopError, ThreadsConfig, monotonic_nanos,
+    CameraSource, CaptureError, CaptureThreads, Decoding, FrameStage, Pacing, PopError, SourceOpener, ThreadsConfig,
+    monotonic_nanos,
 };
 use flyrig_sync::{ClockAligner, ClockKind, ClockState, DropCounts, SyncSettings, Synchronizer};
-use flyrig_types::{Camera, CameraId, Frame, FrameSet, Rig};
+use flyrig_types::{CameraId, Frame, FrameSet, Rig};
 
-use crate::{CameraHealth, FusionError, Health};
+use crate::{CameraHealth, FusionError, Health, health::STUCK_AFTER};
 
 /// Frames a camera that may wait for the pipeline: enough to bridge a slow frame, few enough to stay live.
 const WAITING_FRAMES_A_CAMERA: usize = 4;
@@ -75,25 +76,46 @@ impl Timing {
 }
 
 impl Intake {
-    /// Starts a thread a camera, and another one each that makes RGB of its pictures where they are not. With
-    /// [`Pacing::Lossless`] every set comes, in order; else the newest one wins.
+    /// Starts the threads of sources that are open already; see [`Self::start_opening`].
+    ///
+    /// # Errors
+    /// As [`Self::start_opening`].
     pub fn start(
         sources: Vec<Box<dyn CameraSource>>,
         format: InputFormat<'_>,
         sync: &SyncSettings,
         pacing: Pacing,
     ) -> Result<Self, FusionError> {
-        let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
+        Self::start_opening(sources.into_iter().map(SourceOpener::ready).collect(), format, sync, pacing)
+    }
+
+    /// Starts a thread a camera, and another one each that makes RGB of its pictures where they are not. With
+    /// [`Pacing::Lossless`] every set comes, in order; else the newest one wins. A live camera that cannot be opened yet
+    /// joins later; meanwhile sets come without it.
+    ///
+    /// # Errors
+    /// [`FusionError::Capture`] when two cameras have one name or the system gives no thread; with another pacing than
+    /// [`Pacing::AsDelivered`] also when a source cannot be opened.
+    pub fn start_opening(
+        openers: Vec<SourceOpener>,
+        format: InputFormat<'_>,
+        sync: &SyncSettings,
+        pacing: Pacing,
+    ) -> Result<Self, FusionError> {
+        let cameras: Vec<CameraId> = openers.iter().map(|opener| opener.camera().clone()).collect();
         let queue_capacity = WAITING_FRAMES_A_CAMERA * cameras.len().max(1);
         let config = ThreadsConfig { queue_capacity, pacing };
-        let size = |camera: &CameraId| match format {
-            InputFormat::OfRig(rig) => rig.cameras.iter().find(|known| known.id == *camera).map(Camera::size),
-            InputFormat::AnySize | InputFormat::Rgb => None,
+        let sizes: HashMap<CameraId, _> = match format {
+            InputFormat::OfRig(rig) => rig.cameras.iter().map(|known| (known.id.clone(), known.size())).collect(),
+            InputFormat::AnySize | InputFormat::Rgb => HashMap::new(),
         };
-        let decoding = |camera: &CameraId| Box::new(Decoding::new(size(camera))) as Box<dyn FrameStage>;
+        let decoding =
+            move |camera: &CameraId| Box::new(Decoding::new(sizes.get(camera).copied())) as Box<dyn FrameStage>;
         let threads = match format {
-            InputFormat::Rgb => CaptureThreads::start(sources, config)?,
-            _ => CaptureThreads::start_staged(sources, decoding, config)?,
+            InputFormat::Rgb => CaptureThreads::start_opening(openers, config)?,
+            InputFormat::OfRig(_) | InputFormat::AnySize => {
+                CaptureThreads::start_opening_staged(openers, decoding, config)?
+            }
         };
         Ok(Self {
             threads,
@@ -189,6 +211,7 @@ impl Intake {
         });
         Health {
             cameras: cameras.collect(),
+            stuck: self.threads.stuck(STUCK_AFTER),
             complete_sets: counts.complete,
             partial_sets: counts.partial,
             skipped_sets: self.skipped_sets,

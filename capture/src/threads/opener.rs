@@ -6,7 +6,7 @@ use crossbeam::channel::{Receiver, Sender, bounded};
 use flyrig_types::CameraId;
 
 use super::pulse::Pulse;
-use crate::{CameraSource, CaptureError, CaptureErrorKind, panics::caught};
+use crate::{CameraSource, CaptureError, CaptureErrorKind, SourceTap, panics::caught};
 
 type Source = Box<dyn CameraSource>;
 type Open = Box<dyn FnMut() -> Result<Source, CaptureError> + Send>;
@@ -33,6 +33,19 @@ impl SourceOpener {
     #[must_use]
     pub fn ready(source: Source) -> Self {
         Self { camera: source.camera().clone(), how: How::Ready(source) }
+    }
+
+    /// Records what the camera gives, whenever it is opened.
+    ///
+    /// # Errors
+    /// As [`SourceTap::tap`], for a source that is open already.
+    pub fn recorded(self, tap: SourceTap) -> Result<Self, CaptureError> {
+        let tapped = move |source: Source| Ok(Box::new(tap.tap(source)?) as Source);
+        let how = match self.how {
+            How::Ready(source) => How::Ready(tapped(source)?),
+            How::Factory(mut open) => How::Factory(Box::new(move || tapped(open()?))),
+        };
+        Ok(Self { how, ..self })
     }
 
     /// Returns the name of the camera.

@@ -1,0 +1,245 @@
+//! The health of a running command: once a second to the metrics page, the terminal's table and the service manager.
+
+use std::{
+    collections::BTreeMap,
+    time::{Duration, Instant},
+};
+
+use anyhow::{Result, anyhow};
+use flyrig_capture::{CameraStats, CaptureThreads, Recorded};
+use flyrig_fusion::{CameraHealth, Health, STUCK_AFTER, resident_mib};
+use flyrig_types::CameraId;
+
+use crate::{health, metrics_server::MetricsServer};
+
+/// How often the health is reported.
+const EVERY: Duration = Duration::from_secs(1);
+
+/// Reports the health of a command from its first second to its last. Every loop of the command calls [`Self::look`].
+pub struct Monitor {
+    metrics: Option<MetricsServer>,
+    show_table: bool,
+    looked: Option<Instant>,
+    watchdog: Watchdog,
+    /// Restarts of threads, and whether they are stuck, as logged last.
+    logged: BTreeMap<String, (u64, bool)>,
+    status: String,
+}
+
+impl Monitor {
+    /// Starts the metrics page where there is an address for it, and publishes the state of a command that is starting.
+    ///
+    /// # Errors
+    /// Names the address when it cannot be listened on.
+    pub fn start(listen: &str, show_table: bool) -> Result<Self> {
+        let metrics = if listen.is_empty() { None } else { Some(MetricsServer::start(listen)?) };
+        if let Some(metrics) = &metrics {
+            eprintln!("metrics at http://{}/metrics", metrics.address());
+            let health = Health { resident_mib: resident_mib(), ..Health::default() };
+            metrics.publish(health::prometheus(&health, None));
+        }
+        let (looked, watchdog, logged) = Default::default();
+        Ok(Self { metrics, show_table, looked, watchdog, logged, status: String::new() })
+    }
+
+    /// Reports that the service is up: the watchdog is in force from here on.
+    pub fn ready() {
+        notify("READY=1");
+    }
+
+    /// Reports that the pipeline made a step: a set of frames was processed.
+    pub fn stepped(&mut self) {
+        self.watchdog.stepped = true;
+    }
+
+    /// Reports the health, at most once a second; `snapshot` returns it and the state of a recording, if there is one.
+    pub fn look(&mut self, snapshot: impl FnOnce() -> (Health, Option<Recorded>)) {
+        if self.looked.is_some_and(|at| at.elapsed() < EVERY) {
+            return;
+        }
+        self.looked = Some(Instant::now());
+        let (health, recorded) = snapshot();
+        self.log(&health);
+        let (feeds, status) = self.watchdog.judge(&health);
+        if feeds {
+            notify("WATCHDOG=1");
+        }
+        if status != self.status {
+            notify(&format!("STATUS={status}"));
+            self.status = status;
+        }
+        if let Some(metrics) = &self.metrics {
+            metrics.publish(health::prometheus(&health, recorded.as_ref()));
+        }
+        if self.show_table {
+            // Clears the terminal first.
+            eprint!("\x1b[2J\x1b[H{}", health::table(&health, recorded.as_ref()));
+        }
+    }
+
+    fn log(&mut self, health: &Health) {
+        for (thread, restarts) in health::thread_restarts(health) {
+            let logged = self.logged.entry(thread.clone()).or_default();
+            if restarts > logged.0 {
+                tracing::warn!("thread '{thread}' was restarted, {restarts} times so far");
+            }
+            logged.0 = restarts;
+        }
+        let seconds = STUCK_AFTER.as_secs();
+        for thread in &health.stuck {
+            if !std::mem::replace(&mut self.logged.entry(thread.clone()).or_default().1, true) {
+                tracing::error!(
+                    "thread '{thread}' made no turn for {seconds} s; unplug its camera and plug it in again"
+                );
+            }
+        }
+        for (thread, (_, is_stuck)) in &mut self.logged {
+            if *is_stuck && !health.stuck.contains(thread) {
+                tracing::info!("thread '{thread}' works again");
+                *is_stuck = false;
+            }
+        }
+    }
+}
+
+impl Drop for Monitor {
+    fn drop(&mut self) {
+        notify("STOPPING=1");
+    }
+}
+
+/// Decides whether the service manager's watchdog is fed: by progress, not by time.
+#[derive(Debug, Default)]
+struct Watchdog {
+    /// Whether the pipeline made a step since the watchdog was fed last.
+    stepped: bool,
+}
+
+impl Watchdog {
+    /// Returns whether to feed the watchdog now, and the state in words.
+    fn judge(&mut self, health: &Health) -> (bool, String) {
+        let ours = |thread: &&String| !thread.starts_with("open ");
+        let stuck: Vec<&str> = health.stuck.iter().filter(ours).map(String::as_str).collect();
+        if !stuck.is_empty() {
+            return (false, format!("stuck: {}", stuck.join(", ")));
+        }
+        let up = health.cameras.iter().filter(|camera| camera.is_up()).count();
+        if up == 0 {
+            let stats: Vec<&CameraStats> = health.cameras.iter().map(|camera| &camera.stats).collect();
+            return (true, format!("no camera delivers frames{}", last_errors(&stats)));
+        }
+        let status = format!("{up} of {} cameras deliver frames", health.cameras.len());
+        (std::mem::take(&mut self.stepped), status)
+    }
+}
+
+/// Sends a state to the service manager, where there is one. One that does not listen must not hold the rig up.
+#[cfg(target_os = "linux")]
+fn notify(state: &str) {
+    if let Err(error) = sd_notify::notify(&[sd_notify::NotifyState::Custom(&state.replace('\n', " "))]) {
+        tracing::debug!("{state} did not reach the service manager: {error}");
+    }
+}
+
+/// Only Linux has systemd.
+#[cfg(not(target_os = "linux"))]
+fn notify(_state: &str) {}
+
+/// Returns why a live rig ended without a request.
+pub fn ended_by_itself(cameras: &[CameraStats]) -> anyhow::Error {
+    let all: Vec<&CameraStats> = cameras.iter().collect();
+    anyhow!("all cameras have ended{}", last_errors(&all))
+}
+
+fn last_errors(cameras: &[&CameraStats]) -> String {
+    let errors: Vec<String> =
+        cameras.iter().filter_map(|camera| camera.last_error.as_ref()).map(ToString::to_string).collect();
+    if errors.is_empty() { String::new() } else { format!(": {}", errors.join("; ")) }
+}
+
+/// When frames of each camera came last, where no [`flyrig_fusion::Intake`] keeps account.
+pub struct Arrivals(Vec<(CameraId, Option<Instant>)>);
+
+impl Arrivals {
+    /// No frame has come yet.
+    pub fn new(cameras: &[CameraId]) -> Self {
+        Self(cameras.iter().map(|camera| (camera.clone(), None)).collect())
+    }
+
+    /// Notes a frame of a camera.
+    pub fn add(&mut self, camera: &CameraId) {
+        if let Some((_, at)) = self.0.iter_mut().find(|(known, _)| known == camera) {
+            *at = Some(Instant::now());
+        }
+    }
+
+    /// Returns whether a camera gave no frame for so long.
+    pub fn is_silent(&self, camera: &CameraId, longer_than: Duration) -> bool {
+        let at = self.0.iter().find(|(known, _)| known == camera).and_then(|(_, at)| *at);
+        at.is_none_or(|at| at.elapsed() >= longer_than)
+    }
+
+    /// Returns the health of cameras of which no sets are made.
+    pub fn health(&self, threads: &CaptureThreads) -> Health {
+        let camera = |(stats, (_, last)): (CameraStats, &(CameraId, Option<Instant>))| CameraHealth {
+            stats,
+            in_no_set: 0,
+            interval_ms: 0.0,
+            jitter_ms: 0.0,
+            lateness_ms: None,
+            quiet_s: last.map(|at| at.elapsed().as_secs_f64()),
+            clock: None,
+        };
+        Health {
+            cameras: threads.stats().into_iter().zip(&self.0).map(camera).collect(),
+            stuck: threads.stuck(STUCK_AFTER),
+            resident_mib: resident_mib(),
+            ..Health::default()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_capture::{CaptureError, CaptureErrorKind};
+
+    use super::*;
+    use crate::health::tests::health;
+
+    #[test]
+    fn the_watchdog_is_fed_by_steps_alone_while_cameras_deliver() {
+        let (mut watchdog, mut health) = (Watchdog::default(), health());
+        assert!(!watchdog.judge(&health).0, "frames come and nothing is made of them");
+        watchdog.stepped = true;
+        assert_eq!(watchdog.judge(&health), (true, "1 of 1 cameras deliver frames".to_owned()));
+        assert!(!watchdog.judge(&health).0, "one step feeds once");
+        watchdog.stepped = true;
+        health.stuck = vec!["open left".to_owned()];
+        assert!(watchdog.judge(&health).0, "opening a camera may take any time");
+        watchdog.stepped = true;
+        health.stuck.push("stage left".to_owned());
+        assert_eq!(watchdog.judge(&health), (false, "stuck: stage left".to_owned()));
+    }
+
+    #[test]
+    fn a_rig_without_any_camera_is_alive_and_says_so() {
+        let (mut watchdog, mut health) = (Watchdog::default(), health());
+        health.cameras[0].quiet_s = None;
+        let error = CaptureError::new(&"left".into(), CaptureErrorKind::NotFound, "is not plugged in");
+        health.cameras[0].stats.last_error = Some(error);
+        let expected = "no camera delivers frames: camera left: is not plugged in";
+        assert_eq!(watchdog.judge(&health), (true, expected.to_owned()));
+        let ended = ended_by_itself(&[health.cameras[0].stats.clone()]).to_string();
+        assert_eq!(ended, "all cameras have ended: camera left: is not plugged in");
+    }
+
+    #[test]
+    fn the_service_file_starts_what_there_is() {
+        use clap::Parser as _;
+        let service = include_str!("../../packaging/flyrig.service");
+        let start = service.lines().find_map(|line| line.strip_prefix("ExecStart=")).unwrap();
+        let cli = crate::cli::Cli::try_parse_from(start.split_whitespace()).unwrap();
+        assert!(matches!(cli.command, crate::cli::Command::Run { .. }));
+        assert!(service.contains("Type=notify") && service.contains("WatchdogSec="));
+    }
+}
