@@ -102,6 +102,8 @@ pub fn prometheus(health: &Health, recorded: Option<&Recorded>) -> String {
     });
     family("stage_seconds", "gauge", "Time of a stage of the pipeline.", &mut stages);
     let mut memory = health.resident_mib.into_iter().map(|mib| (String::new(), mib * 1024.0 * 1024.0));
+    let mut faults = std::iter::once((String::new(), health.device_faults as f64));
+    family("device_faults_total", "counter", "Times that the graphics device was opened again.", &mut faults);
     family("resident_bytes", "gauge", "Resident memory.", &mut memory);
     if let Some(recorded) = recorded {
         let broken = f64::from(u8::from(recorded.problem.is_some()));
@@ -263,6 +265,7 @@ pub mod tests {
             "flyrig_clock_drift_ppm{camera=\"le\\\"ft\"} -12.5",
             "flyrig_stage_seconds{stage=\"draw\",quantile=\"0.95\"} 0.004",
             "flyrig_resident_bytes 2097152",
+            "flyrig_device_faults_total 0",
             "flyrig_frames_overtaken_total{camera=\"le\\\"ft\"} 6",
             "flyrig_network_lost_total{camera=\"le\\\"ft\"} 8",
             "flyrig_host_clock_offset_seconds{camera=\"le\\\"ft\"} -1.5",

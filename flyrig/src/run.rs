@@ -8,8 +8,8 @@ use std::{
 use anyhow::{Result, bail};
 use flyrig_capture::{CameraStats, Recorder};
 use flyrig_fusion::{
-    EstimatedPerception, Health, Intake, LivePublisher, LiveRig, LiveViews, Outcome, PersonId, SHAPE_SETS, Session,
-    SessionBuilder, resident_mib,
+    EstimatedPerception, Health, Intake, LivePublisher, LiveRig, LiveViews, Outcome, PersonId, PersonMemory,
+    SHAPE_SETS, Session, SessionBuilder, resident_mib,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::stop;
@@ -28,6 +28,8 @@ use crate::{
 const STEP: Duration = Duration::from_millis(200);
 /// How often a line with rates is printed.
 const PRINT_EVERY: Duration = Duration::from_secs(5);
+/// How often what was learnt about the person is saved.
+const SAVE_EVERY: Duration = Duration::from_secs(60);
 
 /// Runs the command; `recording` names a file that the cameras are recorded to, `show_table` draws the cameras' health.
 pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_table: bool) -> Result<()> {
@@ -67,9 +69,17 @@ fn capture_people(
         intake = intake.live();
     }
     Monitor::ready();
-    let builder = SessionBuilder::new(gpu.clone(), source.rig.clone()).settings(config.session());
+    let mut builder = SessionBuilder::new(gpu.clone(), source.rig.clone()).settings(config.session());
+    let saved = config.body.person_file().filter(|path| path.exists()).map(PersonMemory::load).transpose()?;
+    let is_known = saved.is_some();
+    if let Some(memory) = saved {
+        source.template = memory.template(&source.template)?;
+        builder = builder.person(PersonId::default(), memory);
+        eprintln!("run: the person is resumed from {}", config.body.person.display());
+    }
     let session = match source.perception(config)? {
         FoundBy::Given(perception) => builder.perception(perception).build()?,
+        FoundBy::Estimated(perception) if is_known => builder.perception(*perception).build()?,
         FoundBy::Estimated(mut perception) => {
             if !learn_shape(&mut perception, &mut intake, recorder, monitor)? {
                 return Ok(());
@@ -90,6 +100,7 @@ fn capture_people(
     let mut rig = LiveRig::new(session, intake, LiveViews::new(&config.output), Some(publisher))
         .with_splats(config.output.splats);
     let (started, mut last_print, mut printed) = (Instant::now(), Instant::now(), 0u64);
+    let mut last_save = Instant::now();
     while !stop::requested() && !rig.intake.ended() {
         let step = rig.step(STEP, None)?;
         if step.is_some() {
@@ -99,6 +110,10 @@ fn capture_people(
         let Some(step) = step else { continue };
         if step.outcome == Outcome::Updated {
             record_pose(poses.as_mut(), &rig.session, step.set.master_nanos);
+        }
+        if last_save.elapsed() >= SAVE_EVERY {
+            save_person(&mut rig, config)?;
+            last_save = Instant::now();
         }
         if !show_table && last_print.elapsed() >= PRINT_EVERY {
             let rate = (rig.frames() - printed) as f64 / last_print.elapsed().as_secs_f64();
@@ -114,10 +129,21 @@ fn capture_people(
         eprintln!("dropped: {count} {place}");
     }
     let stats = camera_stats(rig.health());
+    let saved = save_person(&mut rig, config);
     rig.finish()?;
+    saved?;
     // A recording ends; live cameras do not.
     if config.source.kind.is_live() && !stop::requested() {
         return Err(ended_by_itself(&stats));
+    }
+    Ok(())
+}
+
+/// Saves what was learnt about the person, where the configuration names a file.
+fn save_person(rig: &mut LiveRig, config: &Config) -> Result<()> {
+    let Some(path) = config.body.person_file() else { return Ok(()) };
+    if let Some(memory) = rig.snapshot()?.get(&PersonId::default()) {
+        memory.save(path)?;
     }
     Ok(())
 }

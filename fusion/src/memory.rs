@@ -81,11 +81,11 @@ impl PersonMemory {
     /// [`FusionError::SavedPerson`] with the system's reason.
     pub fn save(&self, path: &Path) -> Result<(), FusionError> {
         let fail = |problem: String| fault(&path.display().to_string(), problem);
-        let vec3 = |points: &[Vec3]| bytes(points.iter().flat_map(|p| p.to_array()).map(f32::to_le_bytes));
+        let vec3 = |points: &[Vec3]| bytes(points.iter().flat_map(Vec3::to_array).map(f32::to_le_bytes));
         let vec4 = |points: &[[f32; 4]]| bytes(points.as_flattened().iter().map(|v| v.to_le_bytes()));
         let joints =
             |numbers: fn(&Joint) -> Vec<f64>| bytes(self.joints.iter().flat_map(numbers).map(f64::to_le_bytes));
-        let translations = bytes(self.translations.iter().flat_map(|t| t.to_array()).map(f64::to_le_bytes));
+        let translations = bytes(self.translations.iter().flat_map(DVec3::to_array).map(f64::to_le_bytes));
         let count = self.joints.len();
         let tensors = [
             ("positions", Dtype::F32, vec![self.positions.len(), 3], vec3(&self.positions)),

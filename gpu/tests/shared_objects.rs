@@ -1,4 +1,5 @@
 //! Constants that are uploaded within encoders, and bind groups that are used again.
+#![allow(clippy::unwrap_used)] // a test may fail by panicking, in its helpers too
 
 use flyrig_gpu::{AdapterChoice, ComputeKernel, GpuContext, StorageBuffer};
 use wgpu::{Buffer, CommandEncoder};

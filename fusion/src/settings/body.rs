@@ -1,6 +1,6 @@
 //! The table `[body]`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use flyrig_body::{DEFAULT_GAUSSIAN_COUNT, DEFAULT_NODE_COUNT};
@@ -42,6 +42,9 @@ pub struct BodySettings {
     /// Nodes of the deformation graph.
     #[arg(long, default_value_t = DEFAULT_NODE_COUNT)]
     pub nodes: usize,
+    /// File of what was learnt about the person; empty: none.
+    #[arg(skip)]
+    pub person: PathBuf,
 }
 
 impl Default for BodySettings {
@@ -52,6 +55,7 @@ impl Default for BodySettings {
             masks: Origin::Given,
             gaussians: DEFAULT_GAUSSIAN_COUNT,
             nodes: DEFAULT_NODE_COUNT,
+            person: PathBuf::new(),
         }
     }
 }
@@ -61,6 +65,12 @@ impl BodySettings {
     #[must_use]
     pub fn with_gaussians(gaussians: usize) -> Self {
         Self { gaussians, nodes: DEFAULT_NODE_COUNT.min(gaussians / GAUSSIANS_A_NODE), ..Self::default() }
+    }
+
+    /// The file of what was learnt about the person, where one is named.
+    #[must_use]
+    pub fn person_file(&self) -> Option<&Path> {
+        Some(self.person.as_path()).filter(|path| !path.as_os_str().is_empty())
     }
 
     /// Checks every value.
