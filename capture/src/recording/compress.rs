@@ -8,7 +8,7 @@ use std::{
 
 use flyrig_types::{CameraId, Frame, Image};
 
-use super::writer::Outlet;
+use super::outlet::Outlet;
 use crate::{BufferPool, CaptureError, CaptureErrorKind, JpegEncoding, LatestQueue, panics::caught};
 
 /// Pictures of a camera that may wait for their compression: a quarter of a second of 30 frames a second.

@@ -8,6 +8,7 @@
 mod compress;
 mod disk;
 mod message;
+mod outlet;
 mod part;
 mod parts;
 mod reader;
@@ -21,8 +22,9 @@ mod writer;
 
 pub use self::{
     compress::Compression,
+    outlet::{Note, Recorded},
     reader::{McapReplay, recorded_messages, recorded_notes},
     rotation::{Rotation, RotationError},
     tap::{MessageTap, Recording, SourceTap},
-    writer::{Note, RESERVE_BYTES, Recorded, Recorder, RecorderConfig},
+    writer::{RESERVE_BYTES, Recorder, RecorderConfig},
 };

@@ -7,7 +7,7 @@ use mcap::{McapResult, WriteOptions, Writer, records::MessageHeader};
 use super::{
     disk::Disk,
     message::Channel,
-    writer::{Item, Note},
+    outlet::{Item, Note},
 };
 
 /// A message's record and its entry in the index, bytes.

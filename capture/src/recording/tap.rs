@@ -7,7 +7,7 @@ use flyrig_types::{CameraId, Frame, PixelFormat};
 use super::{
     compress::{Compression, Compressor},
     message::Channel,
-    writer::Outlet,
+    outlet::Outlet,
 };
 use crate::{CameraSource, CaptureError, SourceHealth};
 
