@@ -59,13 +59,13 @@ pub enum Command {
     },
     /// Record the cameras of a configuration into an MCAP file, without tracking.
     Record(RecordArgs),
-    /// Play a recording through, tell what is in it, and export it where asked to. To run the rig on it, set
+    /// Play a recording through, summarise its contents, and export it where asked to. To run the rig on it, set
     /// source.kind = "mcap".
     Replay(ReplayArgs),
-    /// Tell how much later than the first one's each camera's stamps are: by the silhouettes of a person where the cameras'
-    /// places are known (recordings, folders), by what moves else (live cameras).
+    /// Estimate each camera's time offset from the first camera: from the silhouettes of a person where the calibration is
+    /// known (recordings, folders), else from motion in the images (live cameras).
     SyncCheck(SyncCheckArgs),
-    /// List cameras, what they are named by, their formats and buses, and graphics adapters; say what to mend.
+    /// List cameras with their identifiers, formats and buses, and graphics adapters; suggest fixes.
     Doctor {
         /// A TOML file whose cameras are looked for and whose buses are planned.
         config: Option<PathBuf>,
@@ -102,8 +102,8 @@ pub struct RecordArgs {
 
 #[derive(Debug, Default, Args)]
 pub struct LagArgs {
-    /// How much later than the others' a camera's stamps are, milliseconds, as CAM=MS; may be given again. `flyrig sync-check`
-    /// tells it.
+    /// Time offset of a camera's timestamps against the other cameras', milliseconds, as CAM=MS; may be repeated. `flyrig
+    /// sync-check` estimates it.
     #[arg(long = "lag", value_name = "CAM=MS", value_parser = parse_lag)]
     pub by_camera: Vec<(String, f64)>,
 }
@@ -114,7 +114,7 @@ impl LagArgs {
         self.by_camera.iter().map(|(camera, _)| camera.clone()).collect()
     }
 
-    /// What is taken off the stamps, nanoseconds.
+    /// Offsets that are subtracted from the timestamps, nanoseconds.
     pub fn nanos(&self) -> BTreeMap<CameraId, i64> {
         self.by_camera.iter().map(|(camera, ms)| (camera.as_str().into(), (ms * 1e6).round() as i64)).collect()
     }
@@ -139,14 +139,14 @@ pub struct SyncCheckArgs {
     /// Seconds that are compared.
     #[arg(long, default_value_t = 20.0, value_parser = parse_seconds)]
     pub seconds: f64,
-    /// Largest lag that is looked for, milliseconds.
+    /// Largest time offset that is searched for, milliseconds.
     #[arg(long, default_value_t = 250.0, value_parser = parse_most_ms)]
     pub most_ms: f64,
     /// Frame rate of a folder.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
-    /// Folder with intri.yml and extri.yml, where the input does not tell where the cameras are: with that, silhouettes of one
-    /// person are compared, which is surer than what moves. It replaces the input's own.
+    /// Folder with intri.yml and extri.yml, for an input without a calibration: silhouettes of one person are then compared,
+    /// which is more reliable than motion. It replaces the input's own calibration.
     #[arg(long)]
     pub calibration: Option<PathBuf>,
 }
@@ -287,7 +287,7 @@ pub struct DemoArgs {
     /// walk from Debian's assimp-testmodels), or a *.bvh, *.glb or *.gltf file.
     #[arg(long, default_value = "turn")]
     pub motion: String,
-    /// TOML file of what goes wrong with cameras and clocks, like sim/assets/faults.toml.
+    /// TOML file with faults of cameras and clocks, like sim/assets/faults.toml.
     #[arg(long)]
     pub faults: Option<PathBuf>,
     /// Gaussians on the person's surface.
