@@ -57,7 +57,7 @@ pub struct BenchAppearanceArgs {
     /// Weights files of the learned modes, in place of all networks that come with flyrig; may be given several times.
     #[arg(long)]
     pub weights: Vec<PathBuf>,
-    /// What the networks keep from frame to frame: see `reuse` in the configuration.
+    /// Reuse of the networks' results from frame to frame: see `reuse` in the configuration.
     #[arg(long, default_value_t = 0.0)]
     pub reuse: f32,
     /// Where the networks run; "adapter" needs a program that was built with the feature gpu-networks.

@@ -43,7 +43,7 @@ pub struct WatchStats {
     pub latency_is_exact: Option<bool>,
 }
 
-/// What other programs sent and nobody can use: counted by kind, reported the 1st, 2nd, 4th time. It never ends the command.
+/// Unusable messages of other programs: counted by kind, reported the 1st, 2nd, 4th time. It never ends the command.
 #[derive(Debug, Default)]
 struct Complaints(BTreeMap<&'static str, u64>);
 

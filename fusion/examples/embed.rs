@@ -31,7 +31,7 @@ fn camera(name: &str, degrees: f64) -> Camera {
 /// Three images of a person in, the person's Gaussians and a view from a fourth side out.
 ///
 /// # Errors
-/// What the adapter, the calibration or an image lacks.
+/// When the adapter, the calibration or an image cannot be used.
 pub fn run() -> Result<(Vec<Splat>, RenderedView), Box<dyn Error>> {
     let rig = Rig { cameras: vec![camera("a", 0.0), camera("b", 120.0), camera("c", 240.0)], world_up: DVec3::Y };
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();

@@ -42,7 +42,7 @@ pub struct LiveRig {
     recovery: Recovery,
 }
 
-/// What the rig needs to go on after the loss of its device.
+/// State that survives the loss of the device.
 #[derive(Debug, Default)]
 struct Recovery {
     memories: BTreeMap<PersonId, PersonMemory>,

@@ -1,4 +1,4 @@
-//! What was learnt about a person: shape, deformation and colours. A session resumes from it after a restart of the program or
+//! Learnt shape, deformation and colours of a person. A session resumes from it after a restart of the program or
 //! the loss of the graphics device.
 
 use std::{collections::HashMap, io::Write as _, path::Path};
@@ -18,7 +18,7 @@ const JOINTS_KEY: &str = "joints";
 /// A larger file is no saved person, bytes.
 const MOST_BYTES: u64 = 1 << 30;
 
-/// What a session has learnt about one person.
+/// Learnt shape, deformation and colours of one person.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PersonMemory {
     /// Canonical positions and normals of the template's vertices, metres.

@@ -34,7 +34,7 @@ pub trait Perception: Send {
     }
 }
 
-/// What a set says about one person.
+/// Observation of one person in a set.
 #[derive(Debug, Clone)]
 pub enum Observation<'a> {
     /// The person was found.

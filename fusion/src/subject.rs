@@ -509,7 +509,7 @@ impl Subject {
         self.deformation.as_ref().map_or(0, Deformation::compared)
     }
 
-    /// What the last solve of the deformation did.
+    /// Report of the deformation's last solve.
     pub fn deform_report(&self) -> Option<&DeformReport> {
         self.deformation.as_ref().and_then(Deformation::report)
     }

@@ -1,4 +1,4 @@
-//! What was learnt about a person outlives the program.
+//! The learnt person outlives the program.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
 
 mod support;

@@ -1,4 +1,4 @@
-//! What all clones of a [`crate::GpuContext`] share: compiled pipelines, bind groups, staging buffers, and the device's first
+//! Shared by all clones of a [`crate::GpuContext`]: compiled pipelines, bind groups, staging buffers, and the device's first
 //! fault.
 
 use std::{
@@ -156,7 +156,7 @@ impl Shared {
     }
 }
 
-/// What is behind these locks is whole at every step.
+/// Locks a mutex, even a poisoned one: the values behind these locks are consistent at every step.
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -1,4 +1,4 @@
-//! What the programs share: HTML reports, plots, images, progress bars, logging, arguments, and Ctrl-C as a flag.
+//! Shared by the programs: HTML reports, plots, images, progress bars, logging, arguments, and Ctrl-C as a flag.
 
 pub mod arguments;
 mod contact;

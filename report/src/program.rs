@@ -1,4 +1,4 @@
-//! What every program does first and last: logging, the graphics adapter, the exit code.
+//! First and last steps of every program: logging, the graphics adapter, the exit code.
 
 use std::{io::IsTerminal as _, process::ExitCode};
 

@@ -6,7 +6,7 @@ use nalgebra::{Cholesky, DMatrix, DVector, DVectorView, Dyn};
 /// given those before it.
 const LEAST_PIVOT: f64 = 1e-12;
 
-/// What a Levenberg-Marquardt step needs of a linearized problem.
+/// Operations of a Levenberg-Marquardt step on a linearized problem.
 pub trait NormalEquations {
     /// Largest absolute element of the gradient.
     fn gradient_max(&self) -> f64;

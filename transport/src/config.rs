@@ -34,7 +34,7 @@ pub struct TransportConfig {
     pub inbox_bytes: u64,
 }
 
-/// What other programs may send to a publisher: questions for viewpoints and clocks, a message each.
+/// Largest request to a publisher (for a viewpoint or a clock), bytes.
 pub(crate) const LARGEST_QUESTION: usize = 1 << 20;
 
 /// Range of [`TransportConfig::inbox_bytes`].

@@ -1,4 +1,4 @@
-//! What has come in and waits for its reader: one slot a topic, the newest wins, bounded in bytes over all topics.
+//! Received messages that wait for their reader: one slot a topic, the newest wins, bounded in bytes over all topics.
 
 use std::{
     collections::{BTreeMap, VecDeque},

@@ -376,7 +376,7 @@ mod tests {
             full.contains("512x512 at 30 a second is 7.9 Mpx/s; 0.0 of the rig's 31.5 Mpx/s are left; wait"),
             "{full}"
         );
-        // One that leaves makes room; a larger one is told what fits, and both ways do.
+        // One that leaves makes room; a larger one learns which sizes fit, and both of them do.
         leases.drop_subscriber("d");
         let large = ask(&mut leases, "e", (1024, 1024), 30.0, now);
         assert!(large.contains("1024x1024 at 30 a second is 31.5 Mpx/s; 7.9 of the rig's 31.5 Mpx/s"), "{large}");

@@ -24,14 +24,14 @@ use super::{
 };
 use crate::{CameraSource, CaptureError, CaptureErrorKind, panics::caught};
 
-/// Free space that a recording leaves on its file system unless it is told otherwise, bytes: room for its index, and for
+/// Free space that a recording leaves on its file system by default, bytes: room for its index, and for
 /// whatever else the machine writes.
 pub const RESERVE_BYTES: u64 = 1 << 30;
 
 /// A chunk ends after so many bytes or so long: what a killed process loses at most.
 const CHUNK_BYTES: u64 = 8 << 20;
 const CHUNK_TIME: Duration = Duration::from_millis(500);
-/// What is written is made durable so often: what a power cut loses at most, beside a chunk.
+/// Interval between syncs to the disk: the most that a power cut loses, besides a chunk.
 const SYNC_TIME: Duration = Duration::from_secs(2);
 
 /// Settings of a [`Recorder`].

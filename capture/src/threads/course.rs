@@ -1,4 +1,4 @@
-//! What stays the same while a camera's source is opened anew.
+//! State that is kept while a camera's source is opened anew.
 
 use flyrig_types::Frame;
 

@@ -61,7 +61,7 @@ impl Default for ThreadsConfig {
     }
 }
 
-/// What one camera's thread has done.
+/// Counts of one camera's thread.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CameraStats {
     /// Which camera.
@@ -76,7 +76,7 @@ pub struct CameraStats {
     pub errors: BTreeMap<CaptureErrorKind, u64>,
     /// The error that came last.
     pub last_error: Option<CaptureError>,
-    /// What the source says of itself; counts are over all sources of the camera.
+    /// Health as the source reports it; counts are over all sources of the camera.
     pub health: SourceHealth,
     /// Times that the camera was opened anew because its source had failed for good or panicked.
     pub restarts: u64,

@@ -1,4 +1,4 @@
-//! What the threads of a rig share, and the body of a camera's thread.
+//! State shared by the threads of a rig, and the body of a camera's thread.
 
 use std::{
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
@@ -72,7 +72,7 @@ enum End {
     Failed,
 }
 
-/// What is behind our locks is whole at every step.
+/// Locks a mutex, even a poisoned one: the values behind these locks are consistent at every step.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -70,7 +70,7 @@ pub struct AppearanceOptions {
     #[arg(long)]
     #[serde(with = "path_or_empty")]
     pub weights: Option<PathBuf>,
-    /// What the networks keep from frame to frame, 0 to 1: features of images that did not change at all, and the corrections of
+    /// Reuse of the networks' results from frame to frame, 0 to 1: features of images that did not change at all, and the corrections of
     /// Gaussians none of whose inputs changed by more than this. 0 computes everything anew.
     #[arg(long, default_value_t = 0.0)]
     pub reuse: f32,
