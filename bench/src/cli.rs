@@ -1,11 +1,11 @@
 //! The command line of `flyrig-bench`.
 
-use std::path::PathBuf;
+use std::{ops::Range, path::PathBuf};
 
 use clap::{Args, Parser, Subcommand, builder::TypedValueParser as _};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
 use flyrig_fusion::NetworksOn;
-use flyrig_report::arguments::{parse_fps, parse_minutes, parse_seconds, parse_size};
+use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size};
 
 /// Measure run time against error on simulated people.
 #[derive(Debug, Parser)]
@@ -31,6 +31,10 @@ pub enum BenchCommand {
     Appearance(BenchAppearanceArgs),
     /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to whole sets.
     Capture(BenchCaptureArgs),
+    /// Bias and spread of the landmark network on people whose pose is known.
+    Landmarks(BenchLandmarksArgs),
+    /// Pose, shape and masks from images: errors, and what each of them costs in the views; writes a table and JSON.
+    Perception(BenchPerceptionArgs),
     /// Two people in one scene: views, and the cost beside one person; writes a table and PNG images.
     Subjects(BenchSubjectsArgs),
     /// Recording uncompressed cameras: bytes, processor time and loss of each JPEG quality against pictures as they come.
@@ -126,6 +130,50 @@ pub struct BenchRecordArgs {
     /// Folder for the recordings, which are removed again; the system's for temporary files otherwise.
     #[arg(long)]
     pub folder: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchLandmarksArgs {
+    /// Data sets with an animated glTF body, as `flyrig sim export` writes them; all of their cameras are used.
+    #[arg(required = true)]
+    pub datasets: Vec<PathBuf>,
+    /// Only every so many frames.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    pub every: u64,
+    /// Frames a second of the data sets.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchPerceptionArgs {
+    /// Data sets with true masks and an animated glTF body, as `flyrig sim export` writes them.
+    #[arg(required = true)]
+    pub datasets: Vec<PathBuf>,
+    /// Input cameras, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "00,03,05")]
+    pub inputs: Vec<String>,
+    /// Cameras that the views are compared with, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "01,02,04,06")]
+    pub holdout: Vec<String>,
+    /// Frames FIRST..END, END excluded; all of them otherwise.
+    #[arg(long, value_parser = parse_range)]
+    pub frames: Option<Range<u64>>,
+    /// Frames a second of the data sets.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// Only these rows: letters of pose, shape and masks, g for given and e for estimated, comma separated.
+    #[arg(long, value_delimiter = ',')]
+    pub only: Vec<String>,
+    /// Leaves out the deformation and the views: poses, shapes and masks alone, in a fraction of the time.
+    #[arg(long)]
+    pub no_views: bool,
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-perception")]
+    pub out: PathBuf,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
 }
 
 #[derive(Debug, Args)]

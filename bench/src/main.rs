@@ -5,6 +5,9 @@ mod capture;
 mod case;
 mod cli;
 mod endure;
+mod landmarks;
+mod mask_errors;
+mod perception;
 mod processor;
 mod recording;
 mod sequence;
@@ -41,6 +44,8 @@ fn dispatch(cli: &Cli) -> Result<()> {
         BenchCommand::Endure(args) => endure::endure(args, &gpu()?),
         BenchCommand::Appearance(args) => appearance::appearance(args, &gpu()?),
         BenchCommand::Capture(args) => capture::capture(args),
+        BenchCommand::Landmarks(args) => landmarks::landmarks(args),
+        BenchCommand::Perception(args) => perception::perception(args, &gpu()?),
         BenchCommand::Subjects(args) => subjects::subjects(args, &gpu()?),
         BenchCommand::Record(args) => recording::record(args, &gpu()?),
     }

@@ -6,6 +6,17 @@ use crate::body_asset::{BodyAsset, TargetKind, body_asset};
 use crate::part::part_of_joints;
 use crate::{BodyError, Joint, ShapeParams, Skeleton, SkinWeights, Template};
 
+/// Name of the built-in body's templates.
+const BUILT_IN: &str = "built-in body";
+
+impl Template {
+    /// Whether this is the built-in body, in any shape: [`default_template`] makes others of its kind.
+    #[must_use]
+    pub fn is_built_in(&self) -> bool {
+        self.name == BUILT_IN && body_asset().is_ok_and(|asset| asset.corner_vertex.len() == self.positions.len())
+    }
+}
+
 /// A knob of the built-in body's shape.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ShapeTarget {
@@ -63,7 +74,7 @@ pub fn default_template(shape: &ShapeParams) -> Result<Template, BodyError> {
         })
         .collect();
     Ok(Template {
-        name: "built-in body".to_owned(),
+        name: BUILT_IN.to_owned(),
         positions: corners().map(|v| vertices[v]).collect(),
         normals: corners().map(|v| body_normals[v]).collect(),
         // glTF's v runs down.

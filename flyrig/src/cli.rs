@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, net::SocketAddr, ops::Range, path::PathBuf};
 use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
 use flyrig_fusion::{AppearanceOptions, BodySettings, NetworksOn, Origin, TrackingSettings};
-use flyrig_report::arguments::{parse_fps, parse_minutes, parse_seconds, parse_size};
+use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size};
 use flyrig_stfa::NetworkSize;
 use flyrig_types::CameraId;
 
@@ -395,14 +395,6 @@ fn parse_lag(text: &str) -> Result<(String, f64), String> {
     match parts {
         Some((camera, lag)) if !camera.is_empty() && lag.abs() <= 1000.0 => Ok((camera, lag)),
         _ => Err(format!("'{text}' is no camera with its lag in milliseconds like 03=-50.2 (at most 1000)")),
-    }
-}
-
-fn parse_range(text: &str) -> Result<Range<u64>, String> {
-    let ends: Option<(u64, u64)> = text.split_once("..").and_then(|(a, b)| Some((a.parse().ok()?, b.parse().ok()?)));
-    match ends {
-        Some((a, b)) if a < b => Ok(a..b),
-        _ => Err(format!("'{text}' is not a range of frames like 0..60 (the end is excluded)")),
     }
 }
 

@@ -15,7 +15,7 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
-use flyrig_report::{ContactRow, Curve, Report, contact_pictures, png, progress_bar, stop, write_whole};
+use flyrig_report::{ContactRow, Curve, Report, contact_pictures, dataset, png, progress_bar, stop, write_whole};
 use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
 use flyrig_sync::SyncSettings;
 use flyrig_transport::{Publisher, TransportConfig};
@@ -23,7 +23,7 @@ use flyrig_types::{Camera, FrameSet};
 use indicatif::ProgressBar;
 use serde::{Deserialize as _, Serialize, de::IntoDeserializer as _};
 
-use crate::{cli::DemoArgs, dataset, watch::WatchStats};
+use crate::{cli::DemoArgs, watch::WatchStats};
 
 /// Cameras that go in, and cameras that are only rendered and compared.
 const INPUTS: [&str; 3] = ["00", "03", "05"];

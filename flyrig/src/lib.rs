@@ -6,7 +6,6 @@ mod cameras;
 mod capture;
 mod cli;
 mod config;
-mod dataset;
 mod demo;
 mod doctor;
 mod eval;

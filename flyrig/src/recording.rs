@@ -13,7 +13,7 @@ use flyrig_capture::{
     SourceOpener, ThreadsConfig, recorded_notes, to_rgb8,
 };
 use flyrig_gpu::GpuContext;
-use flyrig_report::{png, stop, write_whole};
+use flyrig_report::{dataset, png, stop, write_whole};
 use flyrig_sync::{SyncSettings, Synchronizer};
 use flyrig_transport::{decode_calibration, decode_transforms, encode_calibration, encode_transforms};
 use flyrig_types::{Camera, CameraId, Frame, FrameSet, PixelFormat, Rig};
@@ -25,7 +25,6 @@ use foxglove::{
 use crate::{
     cli::{RecordArgs, ReplayArgs},
     config::{Config, RecordSection},
-    dataset,
     monitor::{Arrivals, Monitor, ended_by_itself},
     pose_recording,
     source::{self, Source},

@@ -12,12 +12,11 @@ use flyrig_fusion::{
     SHAPE_SETS, Session, SessionBuilder, resident_mib,
 };
 use flyrig_gpu::GpuContext;
-use flyrig_report::stop;
+use flyrig_report::{dataset, stop};
 use flyrig_transport::Publisher;
 
 use crate::{
     config::Config,
-    dataset,
     monitor::{Monitor, ended_by_itself},
     pose_recording::PoseRecording,
     recording,

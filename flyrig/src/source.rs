@@ -6,11 +6,12 @@ use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, SourceOp
 use flyrig_fusion::{EstimatedPerception, GivenPerception, GivenPerson, InputFormat, Origin, PersonId};
 use flyrig_gpu::GpuContext;
 use flyrig_sim::{SimTime, Simulator};
+use flyrig_report::dataset;
 use flyrig_types::{CameraId, Image, PoseTrack, Rig};
 
 use crate::{
     config::{Config, SourceKind},
-    dataset, live, network, recording,
+    live, network, recording,
 };
 
 /// Cameras, and what is known about the person.

@@ -12,7 +12,7 @@ use flyrig_capture::{
 };
 use flyrig_fusion::{InputFormat, Intake, Origin};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{progress_bar, stop};
+use flyrig_report::{dataset, progress_bar, stop};
 use flyrig_sync::{
     ClockKind, LagEstimate, MotionSignal, SilhouetteTrack, SyncSettings, estimate_lags, estimate_silhouette_lags,
 };
@@ -21,7 +21,7 @@ use flyrig_types::{CameraId, Image, Rig};
 use crate::{
     cli::SyncCheckArgs,
     config::{Config, SourceKind},
-    dataset, recording,
+    recording,
     silhouettes::Silhouettes,
     source,
 };

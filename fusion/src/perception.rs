@@ -10,7 +10,7 @@ use flyrig_body::Template;
 use flyrig_tracker::ViewKeypoints;
 use flyrig_types::{FrameSet, Mask, PersonId, Pose};
 
-pub use self::estimated::{EstimatedPerception, SHAPE_SETS};
+pub use self::estimated::{EstimatedPerception, SHAPE_SECS, SHAPE_SETS};
 pub use self::given::{GivenPerception, GivenPerson};
 use crate::{FusionError, StageTimes};
 

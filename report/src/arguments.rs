@@ -1,5 +1,7 @@
 //! Parsers of command-line arguments that the programs share.
 
+use std::ops::Range;
+
 /// Parses WIDTHxHEIGHT, 16 to 4096 pixels a side.
 ///
 /// # Errors
@@ -42,5 +44,17 @@ pub fn parse_fps(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(fps) if (0.1..=1000.0).contains(&fps) => Ok(fps),
         _ => Err(format!("'{text}' is not between 0.1 and 1000 frames a second")),
+    }
+}
+
+/// Parses a range of frames, FIRST..END with END excluded.
+///
+/// # Errors
+/// Says what was expected.
+pub fn parse_range(text: &str) -> Result<Range<u64>, String> {
+    let ends: Option<(u64, u64)> = text.split_once("..").and_then(|(a, b)| Some((a.parse().ok()?, b.parse().ok()?)));
+    match ends {
+        Some((a, b)) if a < b => Ok(a..b),
+        _ => Err(format!("'{text}' is not a range of frames like 0..60 (the end is excluded)")),
     }
 }

@@ -2,15 +2,18 @@
 
 pub mod arguments;
 mod contact;
+pub mod dataset;
 mod html;
 mod outlines;
 pub mod plot;
 pub mod png;
 pub mod program;
 mod progress;
+mod replay;
 pub mod stop;
 
 pub use contact::contact_pictures;
 pub use html::{ContactRow, Curve, Report, write_whole};
 pub use outlines::outlined_inputs;
 pub use progress::progress_bar;
+pub use replay::{Replay, ReplaySettings, TruthReader, frame_number};

@@ -10,6 +10,7 @@ use glam::{DQuat, DVec3};
 
 use crate::anatomy::{JointRange, Roles, joint_ranges};
 use crate::landmarks::{LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER};
+use crate::habits::add_habits;
 use crate::surface_marks::{Mark, find_marks};
 use crate::{LANDMARK_COUNT, TrackError, TrackErrorKind};
 
@@ -19,6 +20,22 @@ pub(crate) struct Turns {
     pub root: DVec3,
     /// `A_j`; for the root `G_root`.
     pub turns: Vec<DQuat>,
+}
+
+impl Turns {
+    /// Continues the motion from `before` to here by a share of it.
+    pub fn advanced(&self, before: &Self, share: f64) -> Self {
+        let turn = |(now, before): (&DQuat, &DQuat)| {
+            let change = (*now * before.inverse()).normalize();
+            // The shorter way round.
+            let change = if change.w < 0.0 { -change } else { change };
+            (DQuat::from_scaled_axis(change.to_scaled_axis() * share) * *now).normalize()
+        };
+        Self {
+            root: self.root + (self.root - before.root) * share,
+            turns: self.turns.iter().zip(&before.turns).map(turn).collect(),
+        }
+    }
 }
 
 /// World state of a skeleton.
@@ -46,7 +63,15 @@ pub(crate) struct BodyModel {
 }
 
 impl BodyModel {
+    /// With the landmarks where the network points.
     pub fn new(template: &Template) -> Result<Self, TrackError> {
+        let mut model = Self::without_habits(template)?;
+        add_habits(template, &mut model.marks);
+        Ok(model)
+    }
+
+    /// With the landmarks at their anatomical places.
+    pub fn without_habits(template: &Template) -> Result<Self, TrackError> {
         let joints = template.skeleton.joints();
         let roles = Roles::find(&template.skeleton, &template.name)?;
         let canonical_from_joint: Vec<_> = joints.iter().map(|joint| joint.joint_from_canonical.inverse()).collect();

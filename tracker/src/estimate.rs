@@ -47,6 +47,8 @@ pub struct StageSeconds {
     pub fit: f64,
     /// Masks.
     pub masks: f64,
+    /// Pose fit to the outlines of the masks.
+    pub outline: f64,
 }
 
 /// How far an estimate may be trusted.

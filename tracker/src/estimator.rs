@@ -6,16 +6,19 @@ use std::time::Instant;
 use flyrig_body::{Template, skin_mesh};
 use flyrig_solve::median;
 use flyrig_types::{Frame, FrameSet, Image, Mask, Rig};
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use crate::body_model::{BodyModel, Turns};
+use crate::body_shape::ShapeSpace;
 use crate::crop::Crop;
 use crate::fit::{Before, FitProblem, FitView, align_trunk};
+use crate::outline::{OutlinePoint, SeenBody};
 use crate::pixels::Rgb;
 use crate::plate::plate_evidence;
 use crate::search::{Sighting, project_all, search};
 use crate::shape::{fit_template_shape, seen_landmarks};
+use crate::shape_solve::{ShapeAndPoses, ShapeProblem, ShapeSet};
 use crate::silhouette::{BodyGate, refine};
 use crate::single_view::lift;
 use crate::triangulate::{WorldPoint, triangulate};
@@ -33,6 +36,14 @@ const OFF_TRACK: f64 = 1.5;
 const MAX_DELAY_SECS: f64 = 0.1;
 /// Nobody's landmarks move faster, metres a second.
 const MAX_SPEED: f64 = 12.0;
+/// Cameras that expose nearer to the set's time see the body where it is then, seconds.
+const MIN_DELAY_SECS: f64 = 5e-4;
+/// Farthest that the outline of a body near its place lies from the mask's, metres.
+const OUTLINE_REACH_M: f64 = 0.05;
+/// Rounds of matching when the shape is fitted.
+const SHAPE_ROUNDS: usize = 3;
+/// Steps of the solver in each round of matching.
+const OUTLINE_STEPS: usize = 4;
 /// After a loss the whole picture is searched in every set, and ever more rarely up to every so many sets.
 const RAREST_SEARCH: u32 = 8;
 
@@ -49,6 +60,9 @@ struct Track {
 #[derive(Debug)]
 pub struct PoseEstimator {
     net: PoseNet,
+    /// As it was given.
+    base: Template,
+    /// In the person's shape.
     template: Template,
     model: BodyModel,
     rig: Rig,
@@ -69,6 +83,40 @@ struct Fitted {
     residual_px: f64,
     /// Residual in inlier distances.
     relative: f64,
+    evidence: Evidence,
+}
+
+/// What a pose was fitted to.
+#[derive(Debug, Clone)]
+struct Evidence {
+    /// An element a frame.
+    views: Vec<FitView>,
+    points: [Option<(DVec3, f64)>; LANDMARK_COUNT],
+    velocity: [DVec3; LANDMARK_COUNT],
+    before: Option<Before>,
+}
+
+impl Fitted {
+    /// Time of a slot's frame less the set's, seconds.
+    fn delay_secs(&self, slot: usize) -> f64 {
+        self.evidence.views.iter().find(|view| view.slot == slot).map_or(0.0, |view| view.delay_secs)
+    }
+}
+
+impl Evidence {
+    fn problem<'a>(&'a self, model: &'a BodyModel, config: &PoseConfig) -> FitProblem<'a> {
+        FitProblem {
+            model,
+            views: &self.views,
+            outline: &[],
+            outline_sigma_m: config.outline_sigma_m,
+            points: self.points,
+            velocity: self.velocity,
+            before: self.before.clone(),
+            sigma_m: config.sigma_m,
+            robust: 2.0,
+        }
+    }
 }
 
 impl PoseEstimator {
@@ -83,7 +131,7 @@ impl PoseEstimator {
         }
         let model = BodyModel::new(template)?;
         let plates = vec![None; rig.cameras.len()];
-        Ok(Self { net, template: template.clone(), model, rig: rig.clone(), config, plates, track: None, lost: 0 })
+        Ok(Self { net, base: template.clone(), template: template.clone(), model, rig: rig.clone(), config, plates, track: None, lost: 0 })
     }
 
     /// The template, with the person's bone lengths once [`Self::fit_shape`] has run.
@@ -114,11 +162,57 @@ impl PoseEstimator {
             }
         }
         self.reset();
-        let (template, fit) =
-            fit_template_shape(&self.template, &self.rig, &keypoints, &self.config).map_err(|e| last.unwrap_or(e))?;
+        let (template, mut fit) =
+            fit_template_shape(&self.base, &self.rig, &keypoints, &self.config).map_err(|e| last.unwrap_or(e))?;
         self.model = BodyModel::new(&template)?;
         self.template = template;
+        if self.config.outline_rounds > 0 {
+            self.fit_shape_to_outlines(sets, &mut fit)?;
+        }
+        self.reset();
         Ok(fit)
+    }
+
+    /// Solves for shape and poses of all sets together, from landmarks and the outlines of masks.
+    fn fit_shape_to_outlines(&mut self, sets: &[FrameSet], fit: &mut ShapeFit) -> Result<(), TrackError> {
+        let mut found = Vec::new();
+        for set in sets {
+            let Ok(pictures) = self.check(set) else { continue };
+            let Ok(mut fitted) = self.follow_or_search(set, &pictures) else { continue };
+            let masks = self.masks(set, &pictures, &mut fitted);
+            fitted.evidence.before = None;
+            self.remember(set, fitted.turns.clone());
+            found.push((set, fitted, masks));
+        }
+        let space = ShapeSpace::new(&self.base);
+        let mut shape: Vec<f64> = space.prior().iter().map(|(name, mean, _)| fit.factor(name).unwrap_or(*mean)).collect();
+        for _ in 0..SHAPE_ROUNDS {
+            let given = |set: &FrameSet, masks: &[Option<Mask>], slot: usize| -> Option<Mask> {
+                let own = masks.get(slot).cloned().flatten();
+                own.or_else(|| set.frames.get(slot)?.as_ref()?.mask.clone().filter(|_| !self.config.masks))
+            };
+            let problems: Vec<ShapeSet<'_>> = found
+                .iter()
+                .map(|(set, fitted, masks)| {
+                    let masks: Vec<Option<Mask>> = (0..masks.len()).map(|slot| given(set, masks, slot)).collect();
+                    let masks: Vec<Option<&Mask>> = masks.iter().map(Option::as_ref).collect();
+                    let outline = self.outline_points(set, fitted, &fitted.turns, &masks, 2.0 * OUTLINE_REACH_M);
+                    ShapeSet { problem: fitted.evidence.problem(&self.model, &self.config), outline }
+                })
+                .collect();
+            let start = ShapeAndPoses { shape: shape.clone(), poses: found.iter().map(|(_, f, _)| f.turns.clone()).collect() };
+            let Some((solved, sigma)) = (ShapeProblem { space: &space, sets: &problems }).solve(&start) else { break };
+            drop(problems);
+            for ((_, fitted, _), pose) in found.iter_mut().zip(solved.poses) {
+                fitted.turns = pose;
+            }
+            shape = solved.shape;
+            self.template = space.template(&shape)?;
+            self.model = BodyModel::new(&self.template)?;
+            fit.set(&space, &shape, &sigma, &self.template);
+        }
+        tracing::info!(?fit, "fitted the body to landmarks and outlines");
+        Ok(())
     }
 
     /// Gives a camera's empty picture; masks of that camera then heed the difference to it as well.
@@ -160,7 +254,7 @@ impl PoseEstimator {
     pub fn estimate(&mut self, set: &FrameSet) -> Result<PoseEstimate, TrackError> {
         let pictures = self.check(set)?;
         let mut seconds = StageSeconds::default();
-        let fitted = match self.follow_or_search_timed(set, &pictures, &mut seconds) {
+        let mut fitted = match self.follow_or_search_timed(set, &pictures, &mut seconds) {
             Ok(fitted) => fitted,
             Err(error) => {
                 if error.kind == TrackErrorKind::Lost {
@@ -172,39 +266,25 @@ impl PoseEstimator {
                 return Err(error);
             }
         };
+        let start = Instant::now();
+        let mut masks = self.masks(set, &pictures, &mut fitted);
+        seconds.masks = start.elapsed().as_secs_f64();
+        if self.config.outline_rounds > 0 {
+            let start = Instant::now();
+            let given: Vec<Option<&Mask>> = if self.config.masks {
+                masks.iter().map(Option::as_ref).collect()
+            } else {
+                set.frames.iter().map(|frame| frame.as_ref().and_then(|frame| frame.mask.as_ref())).collect()
+            };
+            fitted.turns = self.fit_outline(set, &fitted, &given);
+            seconds.outline = start.elapsed().as_secs_f64();
+        }
+        if !self.config.masks {
+            masks.fill(None);
+        }
         self.remember(set, fitted.turns.clone());
         let pose = self.model.to_pose(&fitted.turns);
-        let start = Instant::now();
-        let mut views = fitted.views;
-        let mut masks: Vec<Option<Mask>> = vec![None; pictures.len()];
-        if self.config.masks {
-            let (vertices, _) = skin_mesh(&self.template, &pose);
-            let made: Vec<Result<(Mask, f64), NoMask>> = pictures
-                .par_iter()
-                .enumerate()
-                .map(|(slot, picture)| {
-                    let picture = picture.as_ref().ok_or(NoMask::NoFrame)?;
-                    let camera = &self.rig.cameras[slot];
-                    let gate = BodyGate::new(camera, &vertices, &self.template.triangles).ok_or(NoMask::OutOfView)?;
-                    let sighting = fitted.sightings[slot].as_ref();
-                    let sighting = sighting.filter(|s| s.output.presence >= self.config.presence_threshold);
-                    let sighting = sighting.ok_or(NoMask::NoPerson)?;
-                    let evidence = self.plates[slot].as_ref().and_then(|plate| plate_evidence(picture, plate));
-                    let mask = refine(picture, sighting, &gate, evidence.as_ref()).ok_or(NoMask::Empty)?;
-                    let overlap = gate.overlap(&mask);
-                    Ok((mask, overlap))
-                })
-                .collect();
-            for ((mask, view), made) in masks.iter_mut().zip(&mut views).zip(made) {
-                match made {
-                    Ok((made, overlap)) => {
-                        (*mask, view.mask_overlap, view.no_mask) = (Some(made), Some(overlap), None);
-                    }
-                    Err(reason) => view.no_mask = Some(reason),
-                }
-            }
-        }
-        seconds.masks = start.elapsed().as_secs_f64();
+        let views = fitted.views;
         let triangulated = fitted.points.iter().flatten().count();
         Ok(PoseEstimate {
             pose,
@@ -213,6 +293,104 @@ impl PoseEstimator {
             points: fitted.points.map(|point| point.map(|p| p.position)),
             quality: PoseQuality { views, residual_px: fitted.residual_px, triangulated, seconds },
         })
+    }
+
+    /// Vertices and normals of a pose at a time after it, as the body has moved since the last set.
+    fn skinned(&self, turns: &Turns, set: &FrameSet, delay_secs: f64) -> (Vec<Vec3>, Vec<Vec3>) {
+        let moved = self.track.as_ref().filter(|_| delay_secs.abs() > MIN_DELAY_SECS).and_then(|track| {
+            let since = secs(set.master_nanos.saturating_sub(track.nanos));
+            (since > 1e-3).then(|| turns.advanced(&track.turns, (delay_secs / since).clamp(-1.0, 1.0)))
+        });
+        skin_mesh(&self.template, &self.model.to_pose(moved.as_ref().unwrap_or(turns)))
+    }
+
+    /// Masks by slot; why there is none goes into the views' quality.
+    fn masks(&self, set: &FrameSet, pictures: &[Option<Rgb<'_>>], fitted: &mut Fitted) -> Vec<Option<Mask>> {
+        if !self.config.masks {
+            return vec![None; pictures.len()];
+        }
+        let made: Vec<Result<(Mask, f64), NoMask>> = pictures
+            .par_iter()
+            .enumerate()
+            .map(|(slot, picture)| {
+                let picture = picture.as_ref().ok_or(NoMask::NoFrame)?;
+                let camera = &self.rig.cameras[slot];
+                let (vertices, _) = self.skinned(&fitted.turns, set, fitted.delay_secs(slot));
+                let gate = BodyGate::new(camera, &vertices, &self.template.triangles).ok_or(NoMask::OutOfView)?;
+                let sighting = fitted.sightings[slot].as_ref();
+                let sighting = sighting.filter(|s| s.output.presence >= self.config.presence_threshold);
+                let sighting = sighting.ok_or(NoMask::NoPerson)?;
+                let evidence = self.plates[slot].as_ref().and_then(|plate| plate_evidence(picture, plate));
+                let mask = refine(picture, sighting, &gate, evidence.as_ref()).ok_or(NoMask::Empty)?;
+                let overlap = gate.overlap(&mask);
+                Ok((mask, overlap))
+            })
+            .collect();
+        let mut masks = Vec::with_capacity(made.len());
+        for (view, made) in fitted.views.iter_mut().zip(made) {
+            masks.push(match made {
+                Ok((made, overlap)) => {
+                    (view.mask_overlap, view.no_mask) = (Some(overlap), None);
+                    Some(made)
+                }
+                Err(reason) => {
+                    view.no_mask = Some(reason);
+                    None
+                }
+            });
+        }
+        masks
+    }
+
+    /// Moves a pose so that the body's outline lies on that of the masks.
+    fn fit_outline(&self, set: &FrameSet, fitted: &Fitted, masks: &[Option<&Mask>]) -> Turns {
+        let mut turns = fitted.turns.clone();
+        for round in 0..self.config.outline_rounds {
+            // Far first, then only what is near.
+            let widen = if round + 1 < self.config.outline_rounds { 2.0 } else { 1.0 };
+            let points = self.outline_points(set, fitted, &turns, masks, widen * crate::config::env("RE", OUTLINE_REACH_M));
+            if points.is_empty() {
+                break;
+            }
+            let mut problem = fitted.evidence.problem(&self.model, &self.config);
+            problem.outline = &points;
+            problem.outline_sigma_m *= widen;
+            let Some((better, _)) = problem.solve(&turns, crate::config::env("ST", OUTLINE_STEPS as f64) as usize).filter(|(turns, _)| finite(turns)) else {
+                break;
+            };
+            turns = better;
+        }
+        turns
+    }
+
+    /// The outline of the body in a pose, matched with the masks of all views.
+    fn outline_points(
+        &self,
+        set: &FrameSet,
+        fitted: &Fitted,
+        turns: &Turns,
+        masks: &[Option<&Mask>],
+        reach_m: f64,
+    ) -> Vec<OutlinePoint> {
+        let (now, _) = self.skinned(turns, set, 0.0);
+        let of_view = |(index, view): (usize, &FitView)| {
+            let Some(mask) = masks.get(view.slot).copied().flatten() else { return Vec::new() };
+            let (vertices, normals) = self.skinned(turns, set, view.delay_secs);
+            let seen = SeenBody {
+                camera: &self.rig.cameras[view.slot],
+                view: &view.view,
+                template: &self.template,
+                model: &self.model,
+                vertices: &vertices,
+                normals: &normals,
+            };
+            let mut points = seen.match_mask(mask, index, reach_m);
+            for point in &mut points {
+                point.shift = (vertices[point.vertex] - now[point.vertex]).as_dvec3();
+            }
+            points
+        };
+        fitted.evidence.views.par_iter().enumerate().flat_map_iter(of_view).collect()
     }
 
     /// World positions of the landmarks on the template in a pose, metres; `None` for a pose that does not
@@ -331,26 +509,23 @@ impl PoseEstimator {
         seconds.triangulate += start.elapsed().as_secs_f64();
         let start = Instant::now();
         let mut views = Vec::new();
-        for (slot, keypoints) in keypoints.iter().enumerate() {
-            let (Some(keypoints), camera) = (keypoints, &self.rig.cameras[slot]) else { continue };
+        for (slot, frame) in set.present() {
+            let camera = &self.rig.cameras[slot];
             let view = View::new(camera);
-            let seen = observe(camera, &view, keypoints, config.confidence_threshold);
-            let nanos = set.frames[slot].as_ref().map_or(set.master_nanos, |frame| frame.capture_nanos);
-            let delay_secs = secs(nanos.saturating_sub(set.master_nanos)).clamp(-MAX_DELAY_SECS, MAX_DELAY_SECS);
-            views.push(FitView { view, seen, delay_secs });
+            let observed = |keypoints| observe(camera, &view, keypoints, config.confidence_threshold);
+            let seen = keypoints[slot].as_ref().map_or([None; LANDMARK_COUNT], observed);
+            let delay = secs(frame.capture_nanos.saturating_sub(set.master_nanos));
+            views.push(FitView { slot, view, seen, delay_secs: delay.clamp(-MAX_DELAY_SECS, MAX_DELAY_SECS) });
         }
         let most = views.iter().map(|v| v.seen.iter().flatten().count()).max().unwrap_or(0);
         if most < MIN_LANDMARKS {
             return Err(lost("no view shows enough of a person"));
         }
-        let mut problem = FitProblem {
-            model: &self.model,
-            views: &views,
+        let mut evidence = Evidence {
+            views,
             points: [None; LANDMARK_COUNT],
             velocity: [DVec3::ZERO; LANDMARK_COUNT],
             before: None,
-            sigma_m: config.sigma_m,
-            robust: 2.0,
         };
         // One view alone says nothing of depth: the network's own guess at the third dimension stands in.
         let triangulated = points.iter().flatten().count();
@@ -364,20 +539,21 @@ impl PoseEstimator {
             let lifted = surest.and_then(|(s, camera)| lift(camera, s, config.confidence_threshold, scale));
             if let Some(lifted) = lifted {
                 world = lifted;
-                problem.points = lifted.map(|point| point.map(|p| (p, 0.1)));
+                evidence.points = lifted.map(|point| point.map(|p| (p, 0.1)));
             }
         }
         let turns = match track {
             Some(track) => {
-                problem.velocity = track.velocity;
+                evidence.velocity = track.velocity;
                 let dt = secs(set.master_nanos.saturating_sub(track.nanos));
                 let sigma_rad = config.smooth_rad * (dt * 30.0).clamp(0.1, 30.0).sqrt();
-                problem.before = Some(Before { turns: track.turns.clone(), sigma_rad });
-                problem.solve(&track.turns, config.max_steps)
+                evidence.before = Some(Before { turns: track.turns.clone(), sigma_rad });
+                evidence.problem(&self.model, config).solve(&track.turns, config.max_steps)
             }
             None => {
                 let aligned = align_trunk(&self.model, &world)
                     .ok_or_else(|| lost("the views do not agree on a person's trunk"))?;
+                let problem = evidence.problem(&self.model, config);
                 // World points first: their cost has no far minima behind the cameras.
                 let near = FitProblem {
                     points: world.map(|point| point.map(|p| (p, 0.03))),
@@ -391,7 +567,7 @@ impl PoseEstimator {
         };
         seconds.fit += start.elapsed().as_secs_f64();
         let (turns, _) = turns.filter(|(turns, _)| finite(turns)).ok_or_else(|| lost("the fit has no finite cost"))?;
-        self.judge(turns, sightings, keypoints, points, &problem).ok_or_else(|| lost("no landmark agrees with the fit"))
+        self.judge(turns, sightings, keypoints, points, evidence).ok_or_else(|| lost("no landmark agrees with the fit"))
     }
 
     /// Distances of the landmarks from the fitted body.
@@ -401,21 +577,20 @@ impl PoseEstimator {
         sightings: Vec<Option<Sighting>>,
         keypoints: Vec<Option<ViewKeypoints>>,
         points: [Option<WorldPoint>; LANDMARK_COUNT],
-        problem: &FitProblem<'_>,
+        evidence: Evidence,
     ) -> Option<Fitted> {
         let marks = self.model.marks(&turns);
         let mut all = Vec::new();
         let mut all_relative = Vec::new();
-        let mut used = problem.views.iter();
         let mut views = Vec::with_capacity(keypoints.len());
         for (slot, camera) in self.rig.cameras.iter().enumerate() {
             let presence = sightings[slot].as_ref().map_or(0.0, |s| s.output.presence);
             let mut distances = Vec::new();
             let mut inliers = 0;
-            let fit_view = keypoints[slot].and_then(|_| used.next());
+            let fit_view = evidence.views.iter().find(|view| view.slot == slot);
             if let (Some(keypoints), Some(fit_view)) = (&keypoints[slot], fit_view) {
                 for (i, keypoint) in keypoints.iter().enumerate() {
-                    let moved = marks[i] + problem.velocity[i] * fit_view.delay_secs;
+                    let moved = marks[i] + evidence.velocity[i] * fit_view.delay_secs;
                     let (Some(pixel), Some(px_per_m)) = (camera.project(moved), fit_view.view.px_per_m(marks[i]))
                     else {
                         continue;
@@ -450,6 +625,7 @@ impl PoseEstimator {
             views,
             residual_px,
             relative,
+            evidence,
         })
     }
 

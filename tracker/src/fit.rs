@@ -1,8 +1,8 @@
 //! Damped least squares of a body's turns on landmarks.
 //!
 //! The cost is a sum of halves of squared residuals, each divided by its standard deviation: landmark
-//! distances in the pictures and to world points (Cauchy weights), joint ranges, and the change since the
-//! last pose. Levenberg-Marquardt with analytic derivatives; only steps that lower the cost are taken.
+//! distances in the pictures and to world points (Cauchy weights), distances of the body's outline from the
+//! masks' (Geman-McClure weights), joint ranges, and the change since the last pose. Levenberg-Marquardt with analytic derivatives; only steps that lower the cost are taken.
 
 use flyrig_solve::{
     Convergence, DenseNormal, Kernel, PointPair, Problem, align_rigid, exp_rotation, left_jacobian_inverse,
@@ -13,6 +13,8 @@ use nalgebra::DVector;
 
 use crate::LANDMARK_COUNT;
 use crate::body_model::{BodyModel, Posed, Turns};
+use crate::habits::spread_m;
+use crate::outline::OutlinePoint;
 use crate::view::{Observation, View};
 
 /// Share of the network's certainty a landmark deserves in the fit: the face's many points are one body,
@@ -34,6 +36,11 @@ const LANDMARK_WEIGHT: [f64; LANDMARK_COUNT] = {
 
 /// How sharply a joint's limit is enforced, radians.
 const LIMIT_SIGMA: f64 = 0.05;
+/// Outline points in a view that count as many measurements; more of them share their weight, for neighbours err alike.
+const OUTLINE_COUNT: f64 = 80.0;
+/// Outline distances of this many standard deviations lose three quarters of their weight: they belong to another edge.
+const OUTLINE_ROBUST: f64 = 3.0;
+
 /// How much freer the root turns than a joint, and how far it moves, between sets.
 const ROOT_FREEDOM: f64 = 2.0;
 const ROOT_MOVE_M: f64 = 0.2;
@@ -41,6 +48,8 @@ const ROOT_MOVE_M: f64 = 0.2;
 /// One view's part of the data.
 #[derive(Debug, Clone)]
 pub(crate) struct FitView {
+    /// The camera's place in the rig.
+    pub slot: usize,
     pub view: View,
     pub seen: [Option<Observation>; LANDMARK_COUNT],
     /// Capture time less the pose's time, seconds.
@@ -60,6 +69,10 @@ pub(crate) struct Before {
 pub(crate) struct FitProblem<'a> {
     pub model: &'a BodyModel,
     pub views: &'a [FitView],
+    /// Points of the body's outline with the lines they belong on.
+    pub outline: &'a [OutlinePoint],
+    /// Standard deviation of an outline, metres.
+    pub outline_sigma_m: f64,
     /// World points of landmarks and their standard deviation in metres.
     pub points: [Option<(DVec3, f64)>; LANDMARK_COUNT],
     /// Landmark velocities in metres a second, for views that were not taken at the pose's time.
@@ -105,7 +118,7 @@ impl FitProblem<'_> {
                 let moved = mark + self.velocity[landmark] * view.delay_secs;
                 let Some((pixel, rows)) = view.view.project_with_derivative(moved) else { continue };
                 let Some(px_per_m) = view.view.px_per_m(posed.origin[0]) else { continue };
-                let inverse_sigma = 1.0 / (self.sigma_m * px_per_m);
+                let inverse_sigma = 1.0 / (self.sigma_m * (spread_m(landmark) / 0.015).powf(crate::config::env("SP", 1.0)) * px_per_m);
                 let error = (pixel - seen.ideal_px) * inverse_sigma;
                 let trust = LANDMARK_WEIGHT[landmark] * seen.confidence * seen.confidence;
                 let (cost, weight) = kernel.weigh(error.length_squared(), trust);
@@ -127,6 +140,30 @@ impl FitProblem<'_> {
             if any {
                 each(landmark, term);
             }
+        }
+    }
+
+    /// Calls `each` with every outline point, its place in the world, the derivative of its residual by that place, the
+    /// residual and the weight.
+    fn outline_terms(&self, posed: &Posed, mut each: impl FnMut(&OutlinePoint, DVec3, f64, f64, f64)) {
+        let mut counts = vec![0.0f64; self.views.len()];
+        for point in self.outline {
+            counts[point.view] += 1.0;
+        }
+        let kernel = Kernel::GemanMcClure(OUTLINE_ROBUST);
+        for point in self.outline {
+            let view = &self.views[point.view].view;
+            let mut at = point.shift;
+            for (joint, weight, local) in &point.bones {
+                at += (posed.origin[*joint] + posed.rotation[*joint] * *local) * *weight;
+            }
+            let Some((pixel, [du, dv])) = view.project_with_derivative(at) else { continue };
+            let inverse_sigma = 1.0 / (self.outline_sigma_m * point.px_per_m);
+            let error = (pixel.dot(point.normal) - point.offset) * inverse_sigma;
+            let row = (du * point.normal.x + dv * point.normal.y) * inverse_sigma;
+            let importance = (crate::config::env("OC", OUTLINE_COUNT) / counts[point.view]).min(1.0);
+            let (cost, weight) = kernel.weigh(error * error, importance);
+            each(point, row, error, weight, cost);
         }
     }
 
@@ -172,40 +209,97 @@ impl Problem for FitProblem<'_> {
         let posed = self.model.pose(turns);
         let mut cost = 0.0;
         self.data_terms(&posed, |_, term| cost += term.cost);
+        self.outline_terms(&posed, |_, _, _, _, term| cost += term);
         self.joint_terms(turns, |_, residual, _| cost += 0.5 * residual.length_squared());
         cost + self.root_move(turns).map_or(0.0, |e| 0.5 * e.length_squared())
     }
 
     /// Normal matrix and gradient at a pose; columns: root place, then three a turning joint.
     fn linearize(&self, turns: &Turns) -> Option<DenseNormal> {
+        Some(self.linearize_with(turns, None))
+    }
+
+    fn moved(&self, turns: &Turns, step: &DVector<f64>) -> Turns {
+        let mut moved = turns.clone();
+        moved.root += DVec3::new(step[0], step[1], step[2]);
+        for (index, joint) in self.active().into_iter().enumerate() {
+            let at = column(index);
+            let turn = exp_rotation(DVec3::new(step[at], step[at + 1], step[at + 2]));
+            moved.turns[joint] = (turn * turns.turns[joint]).normalize();
+        }
+        moved
+    }
+}
+
+impl FitProblem<'_> {
+    /// As [`Problem::linearize`], with the parameters of the shape in the last columns.
+    pub fn linearize_with(&self, turns: &Turns, shape: Option<&ShapeDerivatives>) -> DenseNormal {
         let active = self.active();
-        let size = column(active.len());
+        let pose_size = column(active.len());
+        let size = pose_size + shape.map_or(0, |shape| shape.count);
         let DenseNormal { matrix: mut normal, mut gradient } = DenseNormal::zeros(size);
         let posed = self.model.pose(turns);
+        let moves = shape.map(|shape| shape.of_origins(self.model, &posed));
+        let axes: Vec<DMat3> = active
+            .iter()
+            .map(|&joint| match self.model.parents[joint] {
+                Some(parent) => DMat3::from_quat(posed.rotation[parent]),
+                None => DMat3::IDENTITY,
+            })
+            .collect();
+        let below: Vec<Vec<bool>> = active
+            .iter()
+            .map(|&joint| (0..self.model.parents.len()).map(|other| self.model.hangs_below(other, joint)).collect())
+            .collect();
         let mut columns: Vec<(usize, DVec3)> = Vec::new();
         self.data_terms(&posed, |landmark, term| {
             let mark = self.model.mark(&posed, landmark);
             let moving = self.model.marks[landmark].joint;
             columns.clear();
             columns.extend([DVec3::X, DVec3::Y, DVec3::Z].into_iter().enumerate());
-            for (index, &joint) in active.iter().enumerate() {
-                if !self.model.hangs_below(moving, joint) {
-                    continue;
-                }
+            for (index, &joint) in active.iter().enumerate().filter(|(index, _)| below[*index][moving]) {
                 let arm = mark - posed.origin[joint];
-                let axes = match self.model.parents[joint] {
-                    Some(parent) => DMat3::from_quat(posed.rotation[parent]),
-                    None => DMat3::IDENTITY,
-                };
-                for k in 0..3 {
-                    columns.push((column(index) + k, axes.col(k).cross(arm)));
-                }
+                columns.extend((0..3).map(|k| (column(index) + k, axes[index].col(k).cross(arm))));
+            }
+            if let (Some(shape), Some(moves)) = (shape, &moves) {
+                let local = |k: usize| posed.rotation[moving] * shape.marks[k][landmark];
+                columns.extend((0..shape.count).map(|k| (pose_size + k, moves[k][moving] + local(k))));
             }
             for (a, (row, derivative)) in columns.iter().enumerate() {
                 gradient[*row] += derivative.dot(term.gradient);
                 let weighted = term.normal * *derivative;
                 for (other, other_derivative) in &columns[..=a] {
                     normal[(*row, *other)] += weighted.dot(*other_derivative);
+                }
+            }
+        });
+        let mut scalars: Vec<(usize, f64)> = Vec::new();
+        self.outline_terms(&posed, |point, slope, error, weight, _| {
+            scalars.clear();
+            scalars.extend(slope.to_array().into_iter().enumerate());
+            for (index, &joint) in active.iter().enumerate() {
+                let mut arm = DVec3::ZERO;
+                for (bone, share, local) in point.bones.iter().filter(|(bone, ..)| below[index][*bone]) {
+                    arm += (posed.origin[*bone] + posed.rotation[*bone] * *local - posed.origin[joint]) * *share;
+                }
+                if arm != DVec3::ZERO {
+                    scalars.extend((0..3).map(|k| (column(index) + k, slope.dot(axes[index].col(k).cross(arm)))));
+                }
+            }
+            if let (Some(shape), Some(moves)) = (shape, &moves) {
+                scalars.extend((0..shape.count).map(|k| {
+                    let mut moved = DVec3::ZERO;
+                    for (bone, share, _) in &point.bones {
+                        let local = shape.positions[k][point.vertex] - shape.origins[k][*bone];
+                        moved += (moves[k][*bone] + posed.rotation[*bone] * local) * *share;
+                    }
+                    (pose_size + k, slope.dot(moved))
+                }));
+            }
+            for (a, (row, derivative)) in scalars.iter().enumerate() {
+                gradient[*row] += derivative * error * weight;
+                for (other, other_derivative) in &scalars[..=a] {
+                    normal[(*row, *other)] += derivative * other_derivative * weight;
                 }
             }
         });
@@ -228,18 +322,43 @@ impl Problem for FitProblem<'_> {
             }
         }
         normal.fill_upper_triangle_with_lower_triangle();
-        Some(DenseNormal { matrix: normal, gradient })
+        DenseNormal { matrix: normal, gradient }
     }
 
-    fn moved(&self, turns: &Turns, step: &DVector<f64>) -> Turns {
-        let mut moved = turns.clone();
-        moved.root += DVec3::new(step[0], step[1], step[2]);
-        for (index, joint) in self.active().into_iter().enumerate() {
-            let at = column(index);
-            let turn = exp_rotation(DVec3::new(step[at], step[at + 1], step[at + 2]));
-            moved.turns[joint] = (turn * turns.turns[joint]).normalize();
-        }
-        moved
+    /// Number of a pose's parameters.
+    pub fn pose_size(&self) -> usize {
+        column(self.active().len())
+    }
+}
+
+/// Derivatives of a model by the parameters of its shape, canonical metres: by parameter, then by joint, landmark or vertex.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct ShapeDerivatives {
+    pub count: usize,
+    /// Of the joints' origins.
+    pub origins: Vec<Vec<DVec3>>,
+    /// Of the offsets from the parents' origins.
+    pub offsets: Vec<Vec<DVec3>>,
+    /// Of the landmarks' places from the origins of their joints.
+    pub marks: Vec<[DVec3; LANDMARK_COUNT]>,
+    /// Of the vertices.
+    pub positions: Vec<Vec<DVec3>>,
+}
+
+impl ShapeDerivatives {
+    /// Derivatives of the joints' world origins in a pose.
+    fn of_origins(&self, model: &BodyModel, posed: &Posed) -> Vec<Vec<DVec3>> {
+        self.offsets
+            .iter()
+            .map(|offsets| {
+                let mut moves: Vec<DVec3> = Vec::with_capacity(offsets.len());
+                for (joint, parent) in model.parents.iter().enumerate() {
+                    let of_parent = |parent: usize| moves[parent] + posed.rotation[parent] * offsets[joint];
+                    moves.push(parent.map_or(DVec3::ZERO, of_parent));
+                }
+                moves
+            })
+            .collect()
     }
 }
 
@@ -289,7 +408,7 @@ mod tests {
             .map(|camera| {
                 let view = View::new(camera);
                 let seen = observe(camera, &view, &keypoints(camera), 0.3);
-                FitView { view, seen, delay_secs: 0.0 }
+                FitView { slot: 0, view, seen, delay_secs: 0.0 }
             })
             .collect()
     }
@@ -298,6 +417,8 @@ mod tests {
         FitProblem {
             model,
             views,
+            outline: &[],
+            outline_sigma_m: 0.01,
             points: [None; LANDMARK_COUNT],
             velocity: [DVec3::ZERO; LANDMARK_COUNT],
             before: None,

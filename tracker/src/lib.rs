@@ -15,6 +15,7 @@
 
 mod anatomy;
 mod body_model;
+mod body_shape;
 mod config;
 mod crop;
 mod deform;
@@ -23,12 +24,15 @@ mod estimate;
 mod estimator;
 mod fit;
 mod grid;
+mod habits;
 mod landmarks;
 mod net;
+mod outline;
 mod pixels;
 mod plate;
 mod search;
 mod shape;
+mod shape_solve;
 mod silhouette;
 mod single_view;
 mod surface_marks;
@@ -45,6 +49,7 @@ pub use deform::{
 pub use error::{TrackError, TrackErrorKind};
 pub use estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};
 pub use estimator::PoseEstimator;
+pub use habits::{Habit, LandmarkStudy};
 pub use landmarks::{Keypoint, LANDMARK_BONES, LANDMARK_COUNT, LANDMARK_NAMES, ViewKeypoints};
 pub use net::{CropLandmark, NET_SIDE, NetOutput, PoseNet};
 pub use plate::mask_from_plate;

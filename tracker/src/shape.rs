@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use flyrig_body::{Joint, Skeleton, Template};
+use flyrig_body::Template;
 use flyrig_solve::median;
 use flyrig_types::Rig;
-use glam::{DMat3, DMat4, DVec3};
 
 use crate::body_model::BodyModel;
+use crate::body_shape::{ShapeSpace, scale_template};
 use crate::triangulate::triangulate;
 use crate::{LANDMARK_COUNT, PoseConfig, TrackError, TrackErrorKind, ViewKeypoints};
 
@@ -37,10 +37,32 @@ pub struct ShapeFit {
     pub scale: f64,
     /// Length factor of each group of bones on top of `scale`, by name.
     pub groups: BTreeMap<String, f64>,
+    /// Standard deviation of `scale` and of each factor, by name; empty where only distances between landmarks were used.
+    pub sigma: BTreeMap<String, f64>,
     /// Stature of the fitted template in its bind pose, metres.
     pub height_m: f64,
     /// Frame sets that gave at least one length.
     pub sets: usize,
+}
+
+impl ShapeFit {
+    /// A factor by name, `scale` included.
+    pub(crate) fn factor(&self, name: &str) -> Option<f64> {
+        if name == "scale" { Some(self.scale) } else { self.groups.get(name).copied() }
+    }
+
+    /// Takes over a solution.
+    pub(crate) fn set(&mut self, space: &ShapeSpace, values: &[f64], sigma: &[f64], template: &Template) {
+        for (((name, ..), value), sigma) in space.prior().iter().zip(values).zip(sigma) {
+            if *name == "scale" {
+                self.scale = *value;
+            } else {
+                self.groups.insert((*name).to_owned(), *value);
+            }
+            self.sigma.insert((*name).to_owned(), *sigma);
+        }
+        self.height_m = height_m(template);
+    }
 }
 
 /// Scales a template to a person: the whole body, and each group of bones along its own direction, from
@@ -111,111 +133,19 @@ pub fn fit_template_shape(
             ((*name).to_owned(), factor.clamp(GROUP_RANGE.0, GROUP_RANGE.1))
         })
         .collect();
-    let shaped = scale_template(template, &model, scale, &groups)?;
-    let (low, high) = shaped
-        .positions
-        .iter()
-        .fold((f32::INFINITY, f32::NEG_INFINITY), |(low, high), p| (low.min(p.y), high.max(p.y)));
-    let fit = ShapeFit { scale, groups, height_m: f64::from(high - low), sets };
+    let mut factors = groups.clone();
+    factors.insert("scale".to_owned(), scale);
+    let shaped = scale_template(template, &model, &factors)?;
+    let fit = ShapeFit { scale, groups, sigma: BTreeMap::new(), height_m: height_m(&shaped), sets };
     tracing::info!(scale, height_m = fit.height_m, sets, "fitted the template's bone lengths");
     Ok((shaped, fit))
 }
 
-/// How each joint's flesh is stretched, canonical axes, before the whole-body scale.
-fn stretches(model: &BodyModel, groups: &BTreeMap<String, f64>) -> Vec<DMat3> {
-    let factor = |name: &str| groups.get(name).copied().unwrap_or(1.0);
-    let mut stretch = vec![DMat3::IDENTITY; model.parents.len()];
-    let roles = &model.roles;
-    let along = |from: usize, to: usize, factor: f64| {
-        let d = (model.origins[to] - model.origins[from]).normalize_or(DVec3::Y);
-        DMat3::IDENTITY + DMat3::from_cols(d * d.x, d * d.y, d * d.z) * (factor - 1.0)
-    };
-    let (shoulders, hips, trunk) = (factor("shoulders"), factor("hips"), factor("trunk"));
-    // Trunk joints: from the root up to where the arms begin, ever less hips and more shoulders.
-    let mut spine = Vec::new();
-    let first_of_arm = roles.clavicle[0].unwrap_or(roles.upper_arm[0]);
-    let mut at = model.parents[first_of_arm];
-    while let Some(joint) = at {
-        spine.push(joint);
-        at = model.parents[joint];
-    }
-    let count = (spine.len().max(2) - 1) as f64;
-    for (i, &joint) in spine.iter().enumerate() {
-        let t = i as f64 / count; // 0 at the chest, 1 at the root
-        stretch[joint] = DMat3::from_diagonal(DVec3::new(shoulders + (hips - shoulders) * t, trunk, 1.0));
-    }
-    for side in 0..2 {
-        if let Some(clavicle) = roles.clavicle[side] {
-            stretch[clavicle] = DMat3::from_diagonal(DVec3::new(shoulders, 1.0, 1.0));
-        }
-        // Helper joints between the root and a thigh carry the width of the hips.
-        let mut at = model.parents[roles.thigh[side]];
-        while let Some(joint) = at {
-            if !spine.contains(&joint) {
-                stretch[joint] = DMat3::from_diagonal(DVec3::new(hips, 1.0, 1.0));
-            }
-            at = model.parents[joint];
-        }
-        stretch[roles.upper_arm[side]] = along(roles.upper_arm[side], roles.forearm[side], factor("upper-arms"));
-        stretch[roles.forearm[side]] = along(roles.forearm[side], roles.hand[side], factor("forearms"));
-        stretch[roles.thigh[side]] = along(roles.thigh[side], roles.shank[side], factor("thighs"));
-        stretch[roles.shank[side]] = along(roles.shank[side], roles.foot[side], factor("shanks"));
-        for (joint, stretch) in stretch.iter_mut().enumerate() {
-            if model.hangs_below(joint, roles.foot[side]) {
-                *stretch = DMat3::from_diagonal(DVec3::new(1.0, 1.0, factor("feet")));
-            }
-        }
-    }
-    stretch
-}
-
-fn scale_template(
-    template: &Template,
-    model: &BodyModel,
-    scale: f64,
-    groups: &BTreeMap<String, f64>,
-) -> Result<Template, TrackError> {
-    let stretch: Vec<DMat3> = stretches(model, groups).into_iter().map(|s| s * scale).collect();
-    let mut origins: Vec<DVec3> = Vec::with_capacity(stretch.len());
-    let mut joints: Vec<Joint> = Vec::with_capacity(stretch.len());
-    for (index, joint) in template.skeleton.joints().iter().enumerate() {
-        let bind = DMat3::from_quat(model.bind_rotation[index]);
-        let (origin, rest_translation) = match joint.parent {
-            None => (model.origins[index] * scale, joint.rest_translation * scale),
-            Some(parent) => {
-                let parent_bind = DMat3::from_quat(model.bind_rotation[parent]);
-                let local = parent_bind.transpose() * stretch[parent] * parent_bind;
-                let origin = origins[parent] + stretch[parent] * (model.origins[index] - model.origins[parent]);
-                (origin, local * joint.rest_translation)
-            }
-        };
-        origins.push(origin);
-        let joint_from_canonical = DMat4::from_mat3(bind.transpose()) * DMat4::from_translation(-origin);
-        joints.push(Joint { rest_translation, joint_from_canonical, ..joint.clone() });
-    }
-    let mut shaped = template.clone();
-    shaped.skeleton = Skeleton::new(joints)
-        .map_err(|error| TrackError::new(TrackErrorKind::Template, format!("the fitted skeleton: {error}")))?;
-    let inverse: Vec<DMat3> = stretch.iter().map(DMat3::inverse).collect();
-    for ((position, normal), skin) in shaped.positions.iter_mut().zip(&mut shaped.normals).zip(&template.skin) {
-        let (old, old_normal) = (position.as_dvec3(), normal.as_dvec3());
-        let (mut moved, mut turned, mut total) = (DVec3::ZERO, DVec3::ZERO, 0.0);
-        for (&joint, &weight) in skin.joints.iter().zip(&skin.weights) {
-            let (joint, weight) = (usize::from(joint), f64::from(weight));
-            if weight > 0.0 {
-                moved += (origins[joint] + stretch[joint] * (old - model.origins[joint])) * weight;
-                turned += inverse[joint] * old_normal * weight;
-                total += weight;
-            }
-        }
-        if total > 0.0 {
-            *position = (moved / total).as_vec3();
-            *normal = turned.normalize_or(old_normal).as_vec3();
-        } else {
-            *position = (old * scale).as_vec3();
-        }
-    }
-    Ok(shaped)
+/// Height of a template in its bind pose, metres.
+fn height_m(template: &Template) -> f64 {
+    let heights = template.positions.iter().map(|p| f64::from(p.y));
+    let (low, high) = heights.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), y| (low.min(y), high.max(y)));
+    high - low
 }
 
 /// Median landmark count that a set needs to be worth a shape fit.
@@ -228,6 +158,8 @@ pub(crate) fn seen_landmarks(views: &[Option<ViewKeypoints>], threshold: f64) ->
 
 #[cfg(test)]
 mod tests {
+    use glam::{DMat4, DVec3};
+
     use super::*;
     use crate::testing::{body, keypoints_of, random_turns, ring};
 
@@ -239,7 +171,7 @@ mod tests {
             .into_iter()
             .map(|(name, factor)| (name.to_owned(), factor))
             .collect();
-        let person = BodyModel::new(&scale_template(&template, &model, 1.06, &truth).unwrap()).unwrap();
+        let person = BodyModel::new(&scale_template(&template, &model, &truth).unwrap()).unwrap();
         let rig = ring(3);
         let keypoints: Vec<Vec<_>> = (0..8)
             .map(|seed| {
@@ -261,8 +193,8 @@ mod tests {
     fn the_shaped_skeleton_still_carries_its_skin() {
         let template = body();
         let model = BodyModel::new(&template).unwrap();
-        let groups = [("thighs".to_owned(), 1.2), ("hips".to_owned(), 0.9)].into_iter().collect();
-        let shaped = scale_template(&template, &model, 0.9, &groups).unwrap();
+        let groups = [("scale".to_owned(), 0.9), ("thighs".to_owned(), 1.2), ("hips".to_owned(), 0.9)].into_iter().collect();
+        let shaped = scale_template(&template, &model, &groups).unwrap();
         let matrices = shaped.skeleton.world_from_canonical(&shaped.skeleton.rest_pose());
         // The built-in body rests in its bind pose: the skinning matrices move nothing.
         for matrix in matrices {

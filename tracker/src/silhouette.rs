@@ -29,8 +29,6 @@ pub(crate) struct BodyGate {
 impl BodyGate {
     /// `None` when nothing of the body is in the picture.
     pub fn new(camera: &Camera, vertices: &[Vec3], triangles: &[[u32; 3]]) -> Option<Self> {
-        let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
-        let pixels: Vec<Option<DVec2>> = vertices.iter().map(|v| camera.project(v.as_dvec3())).collect();
         let mut depths: Vec<f64> = vertices
             .iter()
             .step_by(37)
@@ -40,28 +38,7 @@ impl BodyGate {
         let depth = flyrig_solve::median(&mut depths)?;
         let px_per_m = camera.intrinsics.focal_px.x / depth;
         let reach = REACH_M * px_per_m;
-        let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
-        for pixel in pixels.iter().flatten() {
-            (low, high) = (low.min(*pixel), high.max(*pixel));
-        }
-        let side = |value: f64, limit: usize| value.clamp(0.0, limit as f64) as usize;
-        let bounds = [
-            side(low.x - reach, width),
-            side(low.y - reach, height),
-            side(high.x + reach + 1.0, width),
-            side(high.y + reach + 1.0, height),
-        ];
-        if bounds[2] <= bounds[0] || bounds[3] <= bounds[1] {
-            return None;
-        }
-        let mut body = Grid::new(bounds[2] - bounds[0], bounds[3] - bounds[1], 0.0);
-        let origin = DVec2::new(bounds[0] as f64, bounds[1] as f64);
-        for triangle in triangles {
-            let corner = |k: usize| pixels.get(triangle[k] as usize).copied().flatten().map(|p| p - origin);
-            if let (Some(a), Some(b), Some(c)) = (corner(0), corner(1), corner(2)) {
-                body.fill_triangle(a, b, c);
-            }
-        }
+        let (bounds, body) = drawn_body(camera, vertices, triangles, reach)?;
         let mut distance = body.distance_to_set();
         for value in &mut distance.values {
             *value /= reach as f32;
@@ -82,6 +59,41 @@ impl BodyGate {
         }
         both as f64 / (mask.area_px() + body - both).max(1) as f64
     }
+}
+
+/// Draws a posed body: the box around it with a margin in pixels (x0, y0, x1, y1, ends excluded), and 1 on the body inside
+/// that box. `None` when nothing of it is in the image.
+pub(crate) fn drawn_body(
+    camera: &Camera,
+    vertices: &[Vec3],
+    triangles: &[[u32; 3]],
+    margin_px: f64,
+) -> Option<([usize; 4], Grid)> {
+    let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
+    let pixels: Vec<Option<DVec2>> = vertices.iter().map(|v| camera.project(v.as_dvec3())).collect();
+    let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+    for pixel in pixels.iter().flatten() {
+        (low, high) = (low.min(*pixel), high.max(*pixel));
+    }
+    let side = |value: f64, limit: usize| value.clamp(0.0, limit as f64) as usize;
+    let bounds = [
+        side(low.x - margin_px, width),
+        side(low.y - margin_px, height),
+        side(high.x + margin_px + 1.0, width),
+        side(high.y + margin_px + 1.0, height),
+    ];
+    if bounds[2] <= bounds[0] || bounds[3] <= bounds[1] {
+        return None;
+    }
+    let mut body = Grid::new(bounds[2] - bounds[0], bounds[3] - bounds[1], 0.0);
+    let origin = DVec2::new(bounds[0] as f64, bounds[1] as f64);
+    for triangle in triangles {
+        let corner = |k: usize| pixels.get(triangle[k] as usize).copied().flatten().map(|p| p - origin);
+        if let (Some(a), Some(b), Some(c)) = (corner(0), corner(1), corner(2)) {
+            body.fill_triangle(a, b, c);
+        }
+    }
+    Some((bounds, body))
 }
 
 /// Person mask of a picture from the network's coarse one; `None` when nothing is left.

@@ -39,30 +39,6 @@ fn vertices_below(template: &Template, joints: &[usize]) -> Vec<usize> {
     (0..template.positions.len()).filter(|&v| below(strongest(&template.skin[v]))).collect()
 }
 
-/// Where the network really points, from the anatomical place: left side, canonical axes, millimetres on a
-/// body of 1.7 m; the right side is its mirror image.
-///
-/// Measured once on a rendered person of known pose seen by seven cameras (medians over 30 frames, mean of
-/// both sides), shrunk by a fifth. Its signs are anatomy: the network's hips lie at the outer hip bone, below the joint,
-/// its shoulders on top of the joint. Without it a fitted trunk is too long and the thighs too short.
-const HABITS_MM: [(usize, [f64; 3]); 15] = [
-    (NOSE, [0.0, 14.0, -7.0]),
-    (1, [-2.0, 8.0, -6.0]),
-    (2, [-4.0, 8.0, -10.0]),
-    (3, [-7.0, 7.0, -11.0]),
-    (7, [-24.0, -9.0, 24.0]),
-    (9, [-6.0, 12.0, -3.0]),
-    (LEFT_SHOULDER, [-14.0, 21.0, -10.0]),
-    (LEFT_ELBOW, [-1.0, 26.0, 29.0]),
-    (LEFT_WRIST, [5.0, 4.0, 18.0]),
-    (LEFT_LITTLE, [0.0, 44.0, 0.0]),
-    (LEFT_INDEX, [12.0, 12.0, 12.0]),
-    (LEFT_HIP, [-5.0, -46.0, 26.0]),
-    (LEFT_KNEE, [-1.0, -9.0, -24.0]),
-    (LEFT_ANKLE, [-11.0, 6.0, 10.0]),
-    (LEFT_HEEL, [1.0, -17.0, 14.0]),
-];
-
 /// The landmarks' places on the template.
 ///
 /// Joints for shoulders, elbows, wrists, hips, knees, ankles; for the face, the hands and the feet places on
@@ -91,18 +67,6 @@ pub(crate) fn find_marks(
     for side in 0..2 {
         foot_marks(template, roles, origins, side, &mut marks)?;
         hand_marks(template, roles, origins, side, &mut marks)?;
-    }
-    let heights = template.positions.iter().map(|p| f64::from(p.y));
-    let (low, high) = heights.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), y| (low.min(y), high.max(y)));
-    let metres = 1e-3 * (high - low) / 1.7;
-    for (landmark, [x, y, z]) in HABITS_MM {
-        marks[landmark].point += DVec3::new(x, y, z) * metres;
-        let right = match landmark {
-            NOSE => continue,
-            1..=3 => landmark + 3,
-            _ => landmark + 1,
-        };
-        marks[right].point += DVec3::new(-x, y, z) * metres;
     }
     Ok(marks)
 }

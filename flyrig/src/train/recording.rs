@@ -8,15 +8,11 @@ use std::{
 use anyhow::{Context, Result, ensure};
 use flyrig_fusion::{BodySettings, SessionSettings};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{progress_bar, stop, write_whole};
+use flyrig_report::{Replay, ReplaySettings, dataset, progress_bar, stop, write_whole};
 use flyrig_types::CameraId;
 
 use super::gather::{HeldOut, gather};
-use crate::{
-    cli::TrainArgs,
-    dataset,
-    eval::{Replay, ReplaySettings},
-};
+use crate::cli::TrainArgs;
 
 /// Writes what is missing of a data set's samples into a folder below `out`, and tells which one.
 pub fn record(args: &TrainArgs, root: &Path, out: &Path, gpu: &GpuContext) -> Result<PathBuf> {
@@ -61,6 +57,7 @@ fn leave_out(
         fps: args.fps,
         frames: None,
         lags_nanos: BTreeMap::new(),
+        true_masks: false,
     };
     let appearance = settings.session.appearance.mode.settings();
     let mut replay = Replay::open(&settings, gpu)?;

@@ -9,8 +9,10 @@ use flyrig_types::{FrameSet, Image, PersonId, Rig};
 use super::{Observation, Perception, SeenPerson, ViewObservation};
 use crate::{FusionError, Origin, StageTimes};
 
-/// Frame sets that the bone lengths are fitted to before the first pose.
+/// Frame sets that the shape is fitted to before the first pose.
 pub const SHAPE_SETS: usize = 8;
+/// Time that they are spread over, seconds: a person who moves is seen in several poses.
+pub const SHAPE_SECS: f64 = 1.5;
 /// Median residual at which a pose is half believed, pixels.
 const HALF_BELIEVED_PX: f64 = 12.0;
 
@@ -39,7 +41,7 @@ impl EstimatedPerception {
         Ok(Self { estimator, masks, plates })
     }
 
-    /// Fits the template's bone lengths to the person in a few sets ([`SHAPE_SETS`]). Call it before the session is built.
+    /// Fits the template's shape to the person in a few sets ([`SHAPE_SETS`], over [`SHAPE_SECS`]). Call it before the session is built.
     ///
     /// # Errors
     /// [`FusionError::Track`] when too few of the sets show a person; the shape stays as it was.

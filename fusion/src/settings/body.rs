@@ -36,6 +36,9 @@ pub struct BodySettings {
     /// Masks from the data set, or from the images.
     #[arg(long, value_enum, default_value = "given")]
     pub masks: Origin,
+    /// Shape of the body from the data set's glTF file, or from the images; by default from where the pose comes.
+    #[arg(long, value_enum)]
+    pub shape: Option<Origin>,
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT)]
     pub gaussians: usize,
@@ -53,6 +56,7 @@ impl Default for BodySettings {
             template: PathBuf::new(),
             pose: Origin::Given,
             masks: Origin::Given,
+            shape: None,
             gaussians: DEFAULT_GAUSSIAN_COUNT,
             nodes: DEFAULT_NODE_COUNT,
             person: PathBuf::new(),

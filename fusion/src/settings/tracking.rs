@@ -48,8 +48,12 @@ impl Solver {
                 ..default
             })),
             Self::GaussNewton => Some(DeformOptions {
-                pose: (pose == Origin::Estimated).then(PoseFreedom::default),
-                ..DeformOptions::coarse(DeformSettings { anchor: ANCHOR, ..default })
+                pose: (env("FX", 0.0) > 0.5).then(|| PoseFreedom {
+                    turn: env("PT", 100.0),
+                    shift: env("PS", 1e4),
+                    hold: env("PH", 1.0),
+                }),
+                ..DeformOptions::coarse(DeformSettings { anchor: env("AN", ANCHOR), regularization: env("RG", default.regularization), temporal: env("TE", default.temporal), solver: DeformSolver::GaussNewton { first_iterations: env("FI", 4.0) as usize, iterations: env("IT", 1.0) as usize }, ..default })
             }),
         }
     }
@@ -147,4 +151,8 @@ mod tests {
             assert_eq!(TrackingSettings::default().options(pose), Solver::GaussNewton.options(pose));
         }
     }
+}
+
+fn env(name: &str, default: f64) -> f64 {
+    std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(default)
 }

@@ -9,6 +9,9 @@ use flyrig_fusion::Origin;
 use flyrig_types::{Camera, CameraId, Image, PixelFormat, Rig};
 
 /// The named cameras of a rig, in the order of the names; all of them for no names.
+///
+/// # Errors
+/// Names what is missing or wrong.
 pub fn pick(rig: &Rig, names: &[String], whose: &str) -> Result<Rig> {
     if names.is_empty() {
         return Ok(rig.clone());
@@ -29,6 +32,9 @@ pub fn pick(rig: &Rig, names: &[String], whose: &str) -> Result<Rig> {
 
 /// The calibrated cameras of a data set. A calibration without picture sizes needs the pictures of every camera; when
 /// one of the `chosen` has none, the error says so.
+///
+/// # Errors
+/// Names what is missing or wrong.
 pub fn load_rig(root: &Path, chosen: &[CameraId]) -> Result<Rig> {
     load_easymocap(root, &|id| picture_size(root, id)).or_else(|error| {
         if matches!(error, CalibError::UnknownSize { .. }) {
@@ -47,11 +53,15 @@ fn picture_size(root: &Path, id: &CameraId) -> Option<(u32, u32)> {
 }
 
 /// Where a camera's video lies.
+#[must_use]
 pub fn video_file(root: &Path, id: &CameraId) -> PathBuf {
     root.join("videos").join(format!("{id}.mp4"))
 }
 
 /// The empty pictures `background/CAM.png` by slot, where there are any.
+///
+/// # Errors
+/// Names what is missing or wrong.
 pub fn plates(root: &Path, rig: &Rig) -> Result<Vec<Option<Image>>> {
     rig.cameras.iter().map(|camera| plate(root, camera)).collect()
 }
@@ -71,6 +81,9 @@ fn plate(root: &Path, camera: &Camera) -> Result<Option<Image>> {
 }
 
 /// Masks that neither lie in the data set nor come with an estimated pose need an empty picture of every camera.
+///
+/// # Errors
+/// Names what is missing or wrong.
 pub fn require_masks(pose: Origin, masks: Origin, plates: &[Option<Image>]) -> Result<()> {
     if pose == Origin::Given && masks == Origin::Estimated && plates.iter().any(Option::is_none) {
         bail!(
@@ -82,6 +95,9 @@ pub fn require_masks(pose: Origin, masks: Origin, plates: &[Option<Image>]) -> R
 }
 
 /// The one skinned glTF file of a data set.
+///
+/// # Errors
+/// Names what is missing or wrong.
 pub fn gltf_file(root: &Path) -> Result<PathBuf> {
     let is_gltf = |path: &PathBuf| {
         path.extension().is_some_and(|e| e.eq_ignore_ascii_case("glb") || e.eq_ignore_ascii_case("gltf"))

@@ -1,0 +1,45 @@
+//! `flyrig-bench landmarks`: bias and spread of the landmark network on people whose pose is known.
+//!
+//! The result is the table in `tracker/src/habits.rs`.
+
+use anyhow::{Context, Result};
+use flyrig_body::load_gltf;
+use flyrig_capture::{FolderOptions, FolderReplay};
+use flyrig_fusion::next_frame;
+use flyrig_report::{dataset, progress_bar};
+use flyrig_tracker::{LANDMARK_NAMES, LandmarkStudy, PoseNet};
+
+use crate::cli::BenchLandmarksArgs;
+
+/// Runs the command.
+pub fn landmarks(args: &BenchLandmarksArgs) -> Result<()> {
+    let mut study = LandmarkStudy::new(PoseNet::embedded()?);
+    for folder in &args.datasets {
+        let name = folder.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
+        let human = load_gltf(&dataset::gltf_file(folder)?)?;
+        let track = human.track.with_context(|| format!("the glTF file of {name} holds no animation"))?;
+        let rig = dataset::load_rig(folder, &[])?;
+        let options = FolderOptions { fps: args.fps, frames: None, with_masks: false };
+        let bar = progress_bar(rig.cameras.len() as u64, format!("{name} cameras"));
+        for camera in &rig.cameras {
+            for mut source in FolderReplay::open(folder, Some(std::slice::from_ref(&camera.id)), &options)? {
+                let mut number = 0;
+                while let Some(frame) = next_frame(&mut source)? {
+                    if number % args.every == 0 {
+                        study.add(camera, &frame.image, &human.template, &track.at(frame.capture_nanos))?;
+                    }
+                    number += 1;
+                }
+            }
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+    }
+    println!("{:>3} {:<20} {:>7} {:>7} {:>7} {:>8} {:>6}", "", "landmark", "x mm", "y mm", "z mm", "spread", "seen");
+    for habit in study.habits() {
+        let [x, y, z] = (habit.bias_m * 1e3).to_array();
+        let (name, spread) = (LANDMARK_NAMES[habit.landmark], habit.spread_m * 1e3);
+        println!("{:>3} {name:<20} {x:>7.1} {y:>7.1} {z:>7.1} {spread:>8.1} {:>6}", habit.landmark, habit.count);
+    }
+    Ok(())
+}

@@ -1,0 +1,215 @@
+//! A data set that is replayed into a session: for `flyrig eval`, training and benchmarks.
+
+use std::{
+    collections::BTreeMap,
+    ops::Range,
+    path::{Path, PathBuf},
+};
+
+use anyhow::{Context, Result, bail};
+use flyrig_body::{ShapeParams, default_template, load_gltf};
+use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay};
+use flyrig_fusion::{
+    EstimatedPerception, GivenPerception, GivenPerson, Origin, PersonId, SHAPE_SECS, SHAPE_SETS, Session, SessionBuilder,
+    SessionSettings, SetReader, next_frame,
+};
+use flyrig_gpu::GpuContext;
+use flyrig_sync::SyncSettings;
+use flyrig_types::{Camera, CameraId, Frame, FrameSet, Rig};
+
+use crate::dataset;
+
+/// Settings of a replayed data set.
+#[derive(Debug, Clone)]
+pub struct ReplaySettings {
+    /// Folder in EasyMocap's layout.
+    pub dataset: PathBuf,
+    /// Input cameras.
+    pub inputs: Vec<String>,
+    /// Cameras that are scored; may be none.
+    pub holdout: Vec<String>,
+    /// Settings of the session; its origins decide what is read from the data set.
+    pub session: SessionSettings,
+    /// Frame rate of the folder.
+    pub fps: f64,
+    /// All frames where `None`.
+    pub frames: Option<Range<u64>>,
+    /// Time offsets that are subtracted from the timestamps, nanoseconds.
+    pub lags_nanos: BTreeMap<CameraId, i64>,
+    /// Whether frames carry their true masks even where masks are estimated, for scores.
+    pub true_masks: bool,
+}
+
+/// A data set that is replayed into a session.
+pub struct Replay {
+    /// The session.
+    pub session: Session,
+    sets: SetReader,
+    /// Number of frames.
+    pub count: usize,
+    /// The held-out cameras.
+    pub holdout: Vec<Camera>,
+    /// Frames of the held-out cameras.
+    pub truth: TruthReader,
+}
+
+impl Replay {
+    /// Opens the cameras and builds the session.
+    ///
+    /// # Errors
+    /// Names the missing file, camera or person.
+    pub fn open(settings: &ReplaySettings, gpu: &GpuContext) -> Result<Self> {
+        let (rig, holdout) = load_rigs(settings)?;
+        let (sets, count) = open_inputs(settings, &rig)?;
+        let truth = TruthReader::open(settings, &holdout)?;
+        let body = &settings.session.body;
+        let plates = dataset::plates(&settings.dataset, &rig)?;
+        dataset::require_masks(body.pose, body.masks, &plates)?;
+        let builder = SessionBuilder::new(gpu.clone(), rig.clone()).settings(settings.session.clone());
+        let session = match body.pose {
+            Origin::Given => {
+                let person = given_person(&settings.dataset)?;
+                builder.perception(GivenPerception::new(&rig, vec![person]).with_masks(body.masks, plates))
+            }
+            Origin::Estimated => {
+                if body.shape == Some(Origin::Given) {
+                    let template = given_person(&settings.dataset)?.template;
+                    builder.perception(EstimatedPerception::new(&rig, &template, body.masks, plates)?)
+                } else {
+                    let template = default_template(&ShapeParams::default())?;
+                    let mut perception = EstimatedPerception::new(&rig, &template, body.masks, plates)?;
+                    eprintln!("learning the person's shape from {SHAPE_SETS} frames of the first {SHAPE_SECS} seconds");
+                    let first = first_sets(settings, &rig)?;
+                    let fit = perception.learn_shape(&first).context("no person found in the first frames")?;
+                    eprintln!("the person is {:.2} m tall", fit.height_m);
+                    builder.perception(perception)
+                }
+            }
+        };
+        Ok(Self { session: session.build()?, sets, count, holdout, truth })
+    }
+
+    /// Returns the next set; `None` at the end.
+    ///
+    /// # Errors
+    /// Names the image that cannot be read.
+    pub fn next_set(&mut self) -> Result<Option<FrameSet>> {
+        Ok(self.sets.next_set()?)
+    }
+
+    /// Counts of complete and partial sets and of broken images.
+    #[must_use]
+    pub fn sync_summary(&self) -> serde_json::Value {
+        let counts = self.sets.counts();
+        let damaged = self.sets.damaged();
+        serde_json::json!({ "complete": counts.complete, "partial": counts.partial, "broken_pictures": damaged })
+    }
+}
+
+fn load_rigs(args: &ReplaySettings) -> Result<(Rig, Vec<Camera>)> {
+    let chosen: Vec<CameraId> = args.inputs.iter().chain(&args.holdout).map(|name| name.as_str().into()).collect();
+    let all = dataset::load_rig(&args.dataset, &chosen)?;
+    let whose = format!("the calibration of {}", args.dataset.display());
+    let (rig, holdout) = (dataset::pick(&all, &args.inputs, &whose)?, dataset::pick(&all, &args.holdout, &whose)?);
+    let used = Rig { cameras: rig.cameras.iter().chain(&holdout.cameras).cloned().collect(), world_up: all.world_up };
+    let with_lags: Vec<String> = args.lags_nanos.keys().map(CameraId::to_string).collect();
+    dataset::pick(&used, &with_lags, "--inputs or --holdout, but in --lag")?;
+    if let Some(both) = args.inputs.iter().find(|name| args.holdout.contains(name)) {
+        bail!("camera {both} is both an input and held out; scores would flatter");
+    }
+    Ok((rig, holdout.cameras))
+}
+
+/// Sets spread over the first seconds, in which the person is seen in several poses.
+fn first_sets(settings: &ReplaySettings, rig: &Rig) -> Result<Vec<FrameSet>> {
+    let (mut reader, count) = open_inputs(settings, rig)?;
+    let span = ((SHAPE_SECS * settings.fps) as usize).min(count);
+    let every = span.div_ceil(SHAPE_SETS).max(1);
+    let mut sets = Vec::new();
+    for index in 0..span {
+        let Some(set) = reader.next_set()? else { break };
+        if index % every == 0 {
+            sets.push(set);
+        }
+    }
+    Ok(sets)
+}
+
+/// The person of the data set's glTF file.
+fn given_person(root: &Path) -> Result<GivenPerson> {
+    let file = dataset::gltf_file(root)?;
+    let human = load_gltf(&file)?;
+    let track = human.track.with_context(|| format!("{} holds no animation; use --pose estimated", file.display()))?;
+    Ok(GivenPerson { person: PersonId::default(), template: human.template, track, repeat: false })
+}
+
+/// Opens the input cameras; returns their number of frames as well.
+fn open_inputs(settings: &ReplaySettings, rig: &Rig) -> Result<(SetReader, usize)> {
+    let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+    let with_masks = settings.true_masks || settings.session.body.masks == Origin::Given;
+    let options = FolderOptions { fps: settings.fps, frames: settings.frames.clone(), with_masks };
+    let sources = FolderReplay::open(&settings.dataset, Some(&ids), &options)?;
+    let count = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);
+    let sync = SyncSettings {
+        window_nanos: Some(half_period_nanos(settings.fps)),
+        lags_nanos: settings.lags_nanos.clone(),
+        ..SyncSettings::default()
+    };
+    let sources = sources.into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect();
+    Ok((SetReader::new(sources, &sync), count))
+}
+
+/// Reads the held-out cameras alongside, never ahead of what is scored.
+pub struct TruthReader {
+    /// With what is taken off the stamps, nanoseconds, and the frame of the last time.
+    sources: Vec<(FolderReplay, i64, Option<Frame>)>,
+    window_nanos: u64,
+}
+
+impl TruthReader {
+    fn open(args: &ReplaySettings, holdout: &[Camera]) -> Result<Self> {
+        let ids: Vec<CameraId> = holdout.iter().map(|camera| camera.id.clone()).collect();
+        let with_masks = ids.iter().all(|id| args.dataset.join("mask").join(id.as_str()).is_dir());
+        let options = FolderOptions { fps: args.fps, frames: args.frames.clone(), with_masks };
+        let sources = FolderReplay::open(&args.dataset, Some(&ids), &options)?;
+        let lag = |id: &CameraId| args.lags_nanos.get(id).copied().unwrap_or_default();
+        let sources = sources.into_iter().zip(&ids).map(|(source, id)| (source, lag(id), None)).collect();
+        Ok(Self { sources, window_nanos: half_period_nanos(args.fps) })
+    }
+
+    /// Per held-out camera the frame nearest in time, within half a frame period.
+    ///
+    /// # Errors
+    /// Names the image that cannot be read; one that is broken is left out.
+    pub fn at(&mut self, nanos: i64) -> Result<Vec<Option<&Frame>>> {
+        for (source, lag, current) in &mut self.sources {
+            let earliest = nanos.saturating_sub_unsigned(self.window_nanos);
+            while current.as_ref().is_none_or(|frame| frame.capture_nanos < earliest) {
+                match next_frame(&mut *source) {
+                    Ok(Some(frame)) => {
+                        *current = Some(Frame { capture_nanos: frame.capture_nanos.saturating_sub(*lag), ..frame });
+                    }
+                    Ok(None) => break,
+                    Err(error) if error.kind == CaptureErrorKind::Corrupt => {
+                        tracing::warn!("held-out {error}; that frame is not scored");
+                    }
+                    Err(error) => return Err(error.into()),
+                }
+            }
+        }
+        let near = |frame: &&Frame| frame.capture_nanos.abs_diff(nanos) <= self.window_nanos;
+        Ok(self.sources.iter().map(|(_, _, frame)| frame.as_ref().filter(near)).collect())
+    }
+}
+
+/// Half of the time from frame to frame: nearer than that a frame's set is unambiguous.
+fn half_period_nanos(fps: f64) -> u64 {
+    (0.5e9 / fps).ceil() as u64
+}
+
+/// Number of a set's frames in the data set's file names.
+#[must_use]
+pub fn frame_number(set: &FrameSet) -> u64 {
+    let at_master = set.present().min_by_key(|(_, frame)| frame.capture_nanos.abs_diff(set.master_nanos));
+    at_master.map_or(set.index, |(_, frame)| frame.sequence)
+}

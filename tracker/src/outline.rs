@@ -1,0 +1,163 @@
+//! Where the outline of the posed body has to move to lie on the outline of a mask.
+
+use flyrig_body::Template;
+use flyrig_types::{Camera, Mask};
+use glam::{DVec2, DVec3, Vec3};
+
+use crate::body_model::BodyModel;
+use crate::silhouette::drawn_body;
+use crate::view::View;
+
+/// A vertex is on the rim where the angle between its normal and the image plane has a smaller sine.
+const RIM_SINE: f64 = 0.4;
+/// Distance between the chosen rim points, metres at the body.
+const SPACING_M: f64 = 0.025;
+/// The body must have ended this many pixels outside of a rim point.
+const CLEAR_PX: [f64; 2] = [2.5, 5.0];
+
+/// A point of the body's outline in a view, and the line in the image that it belongs on.
+#[derive(Debug, Clone)]
+pub(crate) struct OutlinePoint {
+    /// Vertex of the template.
+    pub vertex: usize,
+    /// Index of the view in the fit.
+    pub view: usize,
+    /// Normal of the line, undistorted pixels.
+    pub normal: DVec2,
+    /// Place of the line along its normal, undistorted pixels from the principal point.
+    pub offset: f64,
+    /// Pixels that a metre takes at the point.
+    pub px_per_m: f64,
+    /// Joints that carry the vertex, their weights (sum 1) and the vertex from the joint's origin, canonical metres.
+    pub bones: Vec<(usize, f64, DVec3)>,
+    /// Motion from the pose's time to the image's, world metres.
+    pub shift: DVec3,
+}
+
+impl OutlinePoint {
+    /// Hangs the point on the bones of a model of the template's shape.
+    pub fn hang(&mut self, model: &BodyModel, template: &Template) {
+        self.bones = bones(model, template, self.vertex);
+    }
+}
+
+/// Returns joints, weights and places on the bones of a vertex.
+pub(crate) fn bones(model: &BodyModel, template: &Template, vertex: usize) -> Vec<(usize, f64, DVec3)> {
+    let (point, skin) = (template.positions[vertex].as_dvec3(), &template.skin[vertex]);
+    let total: f64 = skin.weights.iter().filter(|w| **w > 0.0).map(|w| f64::from(*w)).sum();
+    let carrying = skin.joints.iter().zip(&skin.weights).filter(|(_, w)| **w > 0.0);
+    carrying
+        .map(|(&joint, &weight)| {
+            let joint = usize::from(joint);
+            (joint, f64::from(weight) / total, point - model.origins[joint])
+        })
+        .collect()
+}
+
+/// A posed body and the camera that sees it.
+pub(crate) struct SeenBody<'a> {
+    pub camera: &'a Camera,
+    pub view: &'a View,
+    pub template: &'a Template,
+    pub model: &'a BodyModel,
+    /// World positions and normals of the template's vertices at the image's time.
+    pub vertices: &'a [Vec3],
+    pub normals: &'a [Vec3],
+}
+
+impl SeenBody<'_> {
+    /// Returns points on the body's outline for which the mask ends within `reach_m` along the outline's normal. Ends of
+    /// the mask at the image's border are no outline.
+    pub fn match_mask(&self, mask: &Mask, view: usize, reach_m: f64) -> Vec<OutlinePoint> {
+        let Some((bounds, body)) = drawn_body(self.camera, self.vertices, &self.template.triangles, 8.0) else {
+            return Vec::new();
+        };
+        let eye = self.view.center();
+        let drawn = |at: DVec2| {
+            let (x, y) = (at.x.round() - bounds[0] as f64, at.y.round() - bounds[1] as f64);
+            let inside = x >= 0.0 && y >= 0.0 && (x as usize) < body.width && (y as usize) < body.height;
+            inside && body.values[y as usize * body.width + x as usize] > 0.5
+        };
+        // One point a cell, so that dense parts of the mesh (face, hands) do not outvote the others.
+        let mut cells: std::collections::BTreeMap<(i64, i64), (f64, usize, DVec2, DVec2)> = Default::default();
+        let (width, height) = (f64::from(mask.width()), f64::from(mask.height()));
+        for (vertex, (position, normal)) in self.vertices.iter().zip(self.normals).enumerate() {
+            let (position, normal) = (position.as_dvec3(), normal.as_dvec3());
+            let sine = normal.dot((position - eye).normalize_or_zero()).abs();
+            if sine.is_nan() || sine >= RIM_SINE {
+                continue;
+            }
+            let Some(px_per_m) = self.view.px_per_m(position) else { continue };
+            let (Some(at), Some(out)) = (self.camera.project(position), self.camera.project(position + normal * 0.01))
+            else {
+                continue;
+            };
+            let direction = (out - at).normalize_or_zero();
+            let in_image = at.x >= 1.0 && at.y >= 1.0 && at.x < width - 2.0 && at.y < height - 2.0;
+            if direction == DVec2::ZERO || !in_image || CLEAR_PX.iter().any(|step| drawn(at + direction * *step)) {
+                continue;
+            }
+            let cell = (at / (SPACING_M * px_per_m).max(3.0)).floor();
+            let best = cells.entry((cell.x as i64, cell.y as i64)).or_insert((f64::INFINITY, vertex, at, direction));
+            if sine < best.0 {
+                *best = (sine, vertex, at, direction);
+            }
+        }
+        let point = |(_, vertex, at, direction): (f64, usize, DVec2, DVec2)| {
+            let px_per_m = self.view.px_per_m(self.vertices[vertex].as_dvec3())?;
+            let end = mask_end(mask, at, direction, reach_m * px_per_m)?;
+            let (on, beyond) = (self.ideal(end)?, self.ideal(end + direction)?);
+            let normal = (beyond - on).normalize_or_zero();
+            let bones = bones(self.model, self.template, vertex);
+            (normal != DVec2::ZERO && !bones.is_empty()).then(|| OutlinePoint {
+                vertex,
+                view,
+                normal,
+                offset: normal.dot(on),
+                px_per_m,
+                bones,
+                shift: DVec3::ZERO,
+            })
+        };
+        cells.into_values().filter_map(point).collect()
+    }
+
+    /// Undistorted pixel offset from the principal point.
+    fn ideal(&self, pixel: DVec2) -> Option<DVec2> {
+        let intrinsics = &self.camera.intrinsics;
+        let distorted = (pixel - intrinsics.center_px) / intrinsics.focal_px;
+        Some(intrinsics.lens.undistort(distorted)? * self.view.focal_px)
+    }
+}
+
+/// Returns the place nearest to `at` along a direction, within `reach` pixels, where the mask ends.
+fn mask_end(mask: &Mask, at: DVec2, direction: DVec2, reach: f64) -> Option<DVec2> {
+    let value = |t: f64| coverage(mask, at + direction * t);
+    let ends = |t: f64| -> Option<f64> {
+        let (inner, outer) = (value(t)?, value(t + 1.0)?);
+        (inner >= 0.5 && outer < 0.5).then(|| t + (inner - 0.5) / (inner - outer))
+    };
+    let mut t = 0.0;
+    while t <= reach {
+        let (outward, inward) = (ends(t), ends(-t - 1.0));
+        if let Some(t) = outward.or(inward) {
+            return Some(at + direction * t);
+        }
+        t += 1.0;
+    }
+    None
+}
+
+/// Bilinear coverage, 0..=1; `None` outside of the mask.
+fn coverage(mask: &Mask, at: DVec2) -> Option<f64> {
+    let (width, height) = (mask.width() as usize, mask.height() as usize);
+    if !(at.x >= 0.0 && at.y >= 0.0 && at.x < width as f64 - 1.0 && at.y < height as f64 - 1.0) {
+        return None;
+    }
+    let (x, y) = (at.x as usize, at.y as usize);
+    let (fx, fy) = (at.x - x as f64, at.y - y as f64);
+    let value = |x: usize, y: usize| f64::from(mask.coverage()[y * width + x]) / 255.0;
+    let top = value(x, y) + (value(x + 1, y) - value(x, y)) * fx;
+    let bottom = value(x, y + 1) + (value(x + 1, y + 1) - value(x, y + 1)) * fx;
+    Some(top + (bottom - top) * fy)
+}
