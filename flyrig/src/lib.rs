@@ -12,6 +12,7 @@ mod eval;
 mod health;
 mod live;
 mod metrics_server;
+mod metrics_text;
 mod monitor;
 mod network;
 mod pose_recording;

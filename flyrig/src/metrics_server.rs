@@ -1,34 +1,47 @@
-//! A page of metrics for Prometheus.
+//! The HTTP server of the metrics page.
 
 use std::{
-    io::{ErrorKind, Read as _, Write as _},
-    net::{SocketAddr, TcpListener, TcpStream},
-    sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, Ordering},
-    },
+    convert::Infallible,
+    net::{SocketAddr, TcpListener},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
     thread::{Builder, JoinHandle},
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use anyhow::{Context as _, Result};
+use hyper::{
+    Method, Request, Response, StatusCode,
+    body::Incoming,
+    header::{CONTENT_TYPE, HeaderValue},
+    server::conn::http1,
+    service::service_fn,
+};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use tokio::{
+    net::TcpStream,
+    runtime,
+    sync::{Semaphore, oneshot},
+    time::{sleep, timeout},
+};
 
-/// Longest that a client may take to ask, and longest that a piece of the answer may take.
+/// Time that a client has to ask.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// Longest request that is read.
+/// Time from the connection to the end of the answer.
+const LONGEST: Duration = Duration::from_secs(2);
+/// Longest request that is read, the smallest bound that hyper takes.
 const REQUEST_BYTES: usize = 8192;
-/// How often a thread looks whether it shall stop.
-const LOOK: Duration = Duration::from_millis(100);
-/// Clients that are served at the same time; each takes one thread for at most about two seconds, the others wait.
-const THREADS: usize = 8;
+/// Clients that are served at the same time; the others wait in the system's queue.
+const CONNECTIONS: usize = 32;
+/// Pause after a connection could not be accepted: with no file descriptor left, trying at once only costs time.
+const PAUSE: Duration = Duration::from_millis(100);
 
-/// Answers HTTP requests with the text published last. Own code rather than a crate's: the small servers that there are
-/// have no time-outs for clients that dawdle, or bring an executor along.
+/// Answers HTTP requests with the text published last, in one thread.
 pub struct MetricsServer {
     text: Arc<Mutex<String>>,
-    stop: Arc<AtomicBool>,
     address: SocketAddr,
-    threads: Vec<JoinHandle<()>>,
+    /// Dropping it ends the thread.
+    stop: Option<oneshot::Sender<()>>,
+    thread: Option<JoinHandle<()>>,
 }
 
 impl MetricsServer {
@@ -40,35 +53,32 @@ impl MetricsServer {
         let listener =
             TcpListener::bind(address).with_context(|| format!("health.listen: cannot listen on {address}"))?;
         listener.set_nonblocking(true)?;
-        let (text, stop) = (Arc::new(Mutex::new(String::new())), Arc::new(AtomicBool::new(false)));
         let address = listener.local_addr()?;
-        // From here on an early return drops this and stops what has started.
-        let mut this = Self { text, stop, address, threads: Vec::with_capacity(THREADS) };
-        for _ in 0..THREADS {
-            let (listener, text, stopped) = (listener.try_clone()?, Arc::clone(&this.text), Arc::clone(&this.stop));
-            let serve = move || {
-                while !stopped.load(Ordering::Relaxed) {
-                    match listener.accept() {
-                        Ok((client, _)) => {
-                            let text = lock(&text).clone();
-                            // A client that asks badly is its own loss.
-                            let _ = answer(client, &text, &stopped);
-                        }
-                        Err(_) => std::thread::sleep(LOOK),
+        let runtime = runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
+        let text = Arc::new(Mutex::new(String::new()));
+        let (stop, stopped) = oneshot::channel();
+        let of_thread = Arc::clone(&text);
+        let work = move || {
+            // Open connections end with the runtime.
+            runtime.block_on(async {
+                tokio::select! {
+                    _ = stopped => {}
+                    ended = serve(listener, &of_thread) => if let Err(error) = ended {
+                        tracing::error!("the metrics page has ended: {error}");
                     }
                 }
-            };
-            this.threads.push(Builder::new().name("metrics".to_owned()).spawn(serve)?);
-        }
-        Ok(this)
+            });
+        };
+        let thread = Builder::new().name("metrics".to_owned()).spawn(work)?;
+        Ok(Self { text, address, stop: Some(stop), thread: Some(thread) })
     }
 
-    /// Where it listens.
+    /// Returns the address that is listened on.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// What is answered from now on.
+    /// Sets the text of all answers from now on.
     pub fn publish(&self, text: String) {
         *lock(&self.text) = text;
     }
@@ -76,8 +86,8 @@ impl MetricsServer {
 
 impl Drop for MetricsServer {
     fn drop(&mut self) {
-        self.stop.store(true, Ordering::Relaxed);
-        for thread in self.threads.drain(..) {
+        drop(self.stop.take());
+        if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
     }
@@ -87,39 +97,57 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn answer(mut client: TcpStream, text: &str, stopped: &AtomicBool) -> std::io::Result<()> {
-    client.set_nonblocking(false)?;
-    client.set_read_timeout(Some(LOOK))?;
-    client.set_write_timeout(Some(PATIENCE))?;
-    let deadline = Instant::now() + PATIENCE;
-    let mut request = Vec::new();
-    let mut piece = [0; 512];
-    while !request.windows(4).any(|window| window == b"\r\n\r\n") && request.len() < REQUEST_BYTES {
-        if Instant::now() >= deadline || stopped.load(Ordering::Relaxed) {
-            return Ok(());
-        }
-        match client.read(&mut piece) {
-            Ok(0) => break,
-            Ok(read) => request.extend_from_slice(&piece[..read]),
-            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {}
-            Err(error) => return Err(error),
+/// Accepts clients, no more than [`CONNECTIONS`] at a time, and answers each in a task.
+async fn serve(listener: TcpListener, text: &Arc<Mutex<String>>) -> std::io::Result<()> {
+    let listener = tokio::net::TcpListener::from_std(listener)?;
+    let places = Arc::new(Semaphore::new(CONNECTIONS));
+    while let Ok(place) = Arc::clone(&places).acquire_owned().await {
+        match listener.accept().await {
+            Ok((client, _)) => {
+                let text = Arc::clone(text);
+                tokio::spawn(async move {
+                    let _place = place;
+                    // A client that asks badly or reads slowly is its own loss.
+                    let _ = timeout(LONGEST, answer(client, &text)).await;
+                });
+            }
+            Err(_) => sleep(PAUSE).await,
         }
     }
-    let (status, body) = if request.starts_with(b"GET /metrics ") || request.starts_with(b"GET / ") {
-        ("200 OK", text)
-    } else {
-        ("404 Not Found", "the metrics are at /metrics\n")
-    };
-    write!(
-        client,
-        "HTTP/1.1 {status}\r\nContent-Type: text/plain; version=0.0.4; charset=utf-8\r\nContent-Length: {}\r\n\
-         Connection: close\r\n\r\n{body}",
-        body.len()
-    )
+    Ok(())
+}
+
+/// Answers one request.
+async fn answer(client: TcpStream, text: &Mutex<String>) -> hyper::Result<()> {
+    let service = service_fn(async |request| Ok::<_, Infallible>(page(&request, text)));
+    http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(PATIENCE)
+        .max_buf_size(REQUEST_BYTES)
+        .keep_alive(false)
+        .serve_connection(TokioIo::new(client), service)
+        .await
+}
+
+fn page(request: &Request<Incoming>, text: &Mutex<String>) -> Response<String> {
+    if request.method() == Method::GET && matches!(request.uri().path(), "/metrics" | "/") {
+        let mut response = Response::new(lock(text).clone());
+        let kind = HeaderValue::from_static("application/openmetrics-text; version=1.0.0; charset=utf-8");
+        response.headers_mut().insert(CONTENT_TYPE, kind);
+        return response;
+    }
+    let mut response = Response::new("the metrics are at /metrics\n".to_owned());
+    *response.status_mut() = StatusCode::NOT_FOUND;
+    response
 }
 
 #[cfg(test)]
 mod tests {
+    use std::{
+        io::{ErrorKind, Read as _, Write as _},
+        net::TcpStream,
+    };
+
     use super::*;
 
     fn ask(server: &MetricsServer, request: &str) -> String {
@@ -173,9 +201,9 @@ mod tests {
         let server = MetricsServer::start("127.0.0.1:0").unwrap();
         server.publish("flyrig_frames_total 1\n".to_owned());
         let connect = || TcpStream::connect(server.address()).unwrap();
-        let silent: Vec<TcpStream> = (1..THREADS).map(|_| connect()).collect();
+        let silent: Vec<TcpStream> = (1..CONNECTIONS).map(|_| connect()).collect();
         // They are all being served.
-        std::thread::sleep(2 * LOOK);
+        std::thread::sleep(2 * PAUSE);
         let answer = ask(&server, "GET /metrics HTTP/1.1\r\n\r\n");
         assert!(answer.ends_with("flyrig_frames_total 1\n"), "{answer}");
         for client in &silent {
@@ -187,5 +215,38 @@ mod tests {
                 "it was answered before the server gave up on the silent ones"
             );
         }
+    }
+
+    #[test]
+    fn a_client_that_does_not_read_is_hung_up_on() {
+        let server = MetricsServer::start("127.0.0.1:0").unwrap();
+        // More than the buffers of both ends hold.
+        let text = "flyrig_frames_total 1\n".repeat(2_000_000);
+        server.publish(text.clone());
+        let mut deaf = TcpStream::connect(server.address()).unwrap();
+        deaf.write_all(b"GET /metrics HTTP/1.1\r\n\r\n").unwrap();
+        std::thread::sleep(LONGEST + PATIENCE);
+        let mut answer = Vec::new();
+        let _ = deaf.read_to_end(&mut answer);
+        assert!(answer.len() < text.len(), "the rest was never sent");
+    }
+
+    #[test]
+    fn a_request_without_end_is_refused() {
+        let server = MetricsServer::start("127.0.0.1:0").unwrap();
+        let mut endless = TcpStream::connect(server.address()).unwrap();
+        let (mut sent, most) = (0, 64 << 20);
+        while sent < most && endless.write_all(&[b'G'; 4096]).is_ok() {
+            sent += 4096;
+        }
+        assert!(sent < most, "{sent} bytes were taken");
+    }
+
+    #[test]
+    fn the_server_ends_with_its_owner() {
+        let server = MetricsServer::start("127.0.0.1:0").unwrap();
+        let (address, _silent) = (server.address(), TcpStream::connect(server.address()).unwrap());
+        drop(server);
+        assert!(TcpStream::connect(address).is_err());
     }
 }

@@ -10,7 +10,7 @@ use flyrig_capture::{CameraStats, CaptureThreads, Recorded};
 use flyrig_fusion::{CameraHealth, Health, STUCK_AFTER, resident_mib};
 use flyrig_types::CameraId;
 
-use crate::{health, metrics_server::MetricsServer};
+use crate::{health, metrics_server::MetricsServer, metrics_text};
 
 /// How often the health is reported.
 const EVERY: Duration = Duration::from_secs(1);
@@ -36,7 +36,7 @@ impl Monitor {
         if let Some(metrics) = &metrics {
             eprintln!("metrics at http://{}/metrics", metrics.address());
             let health = Health { resident_mib: resident_mib(), ..Health::default() };
-            metrics.publish(health::prometheus(&health, None));
+            metrics.publish(metrics_text::prometheus(&health, None));
         }
         let (looked, watchdog, logged) = Default::default();
         Ok(Self { metrics, show_table, looked, watchdog, logged, status: String::new() })
@@ -69,7 +69,7 @@ impl Monitor {
             self.status = status;
         }
         if let Some(metrics) = &self.metrics {
-            metrics.publish(health::prometheus(&health, recorded.as_ref()));
+            metrics.publish(metrics_text::prometheus(&health, recorded.as_ref()));
         }
         if self.show_table {
             // Clears the terminal first.
