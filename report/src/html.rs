@@ -7,6 +7,8 @@ use base64::{Engine as _, prelude::BASE64_STANDARD};
 use flyrig_fusion::StageSummary;
 use flyrig_metrics::CameraScore;
 
+use crate::plot::{Line, Plot, Series};
+
 /// Contents of a report; empty parts are left out.
 #[derive(Debug, Default)]
 pub struct Report {
@@ -50,7 +52,7 @@ const STYLE: &str = "body{font:15px/1.45 system-ui,sans-serif;margin:2rem auto;m
 h1{font-size:1.6rem}h2{font-size:1.15rem;margin-top:2rem}table{border-collapse:collapse;background:#fff}\
 td,th{padding:.3rem .8rem;border-bottom:1px solid #dde3ea;text-align:right}td:first-child,th:first-child{text-align:left}\
 .row{display:flex;gap:6px;margin:.2rem 0 1rem}.row figure{margin:0;flex:1}.row img{width:100%;display:block;background:#000}\
-figcaption{font-size:.8rem;color:#5a6675}svg{background:#fff;border:1px solid #dde3ea}svg text{font-size:11px;fill:#5a6675}";
+figcaption{font-size:.8rem;color:#5a6675}svg{background:#fff;border:1px solid #dde3ea}";
 
 impl Report {
     /// Formats the page.
@@ -146,62 +148,24 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
 
 impl Curve {
     fn svg(&self) -> String {
-        const W: f64 = 720.0;
-        const H: f64 = 240.0;
-        const PAD: f64 = 48.0;
-        const COLORS: [&str; 6] = ["#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf"];
-        let finite: Vec<(f64, f64)> =
-            self.lines.iter().flat_map(|(_, p)| p).copied().filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
-        let bounds = |pick: fn(&(f64, f64)) -> f64| {
-            let low = finite.iter().map(pick).fold(f64::INFINITY, f64::min);
-            let high = finite.iter().map(pick).fold(f64::NEG_INFINITY, f64::max);
-            if low < high { (low, high) } else { (low - 0.5, low + 0.5) }
+        let series = |(name, points): &(String, Vec<(f64, f64)>)| Series {
+            name: name.clone(),
+            points: points.iter().map(|&(x, y)| (x, y, String::new())).collect(),
+            line: Line::Through,
         };
-        if finite.is_empty() {
+        let plot = Plot {
+            title: self.title.clone(),
+            x_label: self.x_label.clone(),
+            y_label: self.y_label.clone(),
+            log_x: false,
+            log_y: false,
+            series: self.lines.iter().map(series).collect(),
+        };
+        if plot.is_empty() {
             return "<p>no values</p>".to_owned();
         }
-        let ((x0, x1), (y0, y1)) = (bounds(|p| p.0), bounds(|p| p.1));
-        let px = |x: f64| PAD + (x - x0) / (x1 - x0) * (W - 1.5 * PAD);
-        let py = |y: f64| H - PAD * 0.8 - (y - y0) / (y1 - y0) * (H - 1.4 * PAD);
-        let mut svg = format!("<svg viewBox=\"0 0 {W} {H}\" width=\"{W}\" height=\"{H}\">");
-        for step in 0..=4 {
-            let (x, y) = (x0 + (x1 - x0) * f64::from(step) / 4.0, y0 + (y1 - y0) * f64::from(step) / 4.0);
-            let _ = write!(
-                svg,
-                "<line x1=\"{PAD}\" x2=\"{:.1}\" y1=\"{:.1}\" y2=\"{:.1}\" stroke=\"#e6ebf0\"/><text x=\"4\" y=\"{:.1}\">{y:.4}</text><text x=\"{:.1}\" y=\"{:.1}\">{x:.4}</text>",
-                W - PAD / 2.0,
-                py(y),
-                py(y),
-                py(y) + 4.0,
-                px(x) - 12.0,
-                H - 22.0
-            );
-        }
-        for (i, (name, points)) in self.lines.iter().enumerate() {
-            let color = COLORS[i % COLORS.len()];
-            let path: String = points.iter().filter(|(x, y)| x.is_finite() && y.is_finite()).fold(
-                String::new(),
-                |mut text, &(x, y)| {
-                    let _ = write!(text, "{:.1},{:.1} ", px(x), py(y));
-                    text
-                },
-            );
-            let _ = write!(
-                svg,
-                "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"1.6\" points=\"{path}\"/><text x=\"{:.1}\" y=\"14\" style=\"fill:{color}\">{}</text>",
-                PAD + 110.0 * i as f64,
-                escape(name)
-            );
-        }
-        let _ = write!(
-            svg,
-            "<text x=\"{:.1}\" y=\"{:.1}\">{}</text><text x=\"4\" y=\"14\">{}</text></svg>",
-            W / 2.0,
-            H - 6.0,
-            escape(&self.x_label),
-            escape(&self.y_label)
-        );
-        svg
+        // Inside of a page the namespace goes without saying.
+        plot.strip().replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1)
     }
 }
 
@@ -237,6 +201,7 @@ mod tests {
         assert!(html.contains("a &lt;b&gt;") && html.contains("x &amp; y"));
         assert!(html.contains("data:image/png;base64,AQID"));
         assert!(html.contains("<polyline") && !html.contains("NaN"));
+        assert!(!html.contains("http"), "self-contained");
     }
 
     #[test]

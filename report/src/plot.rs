@@ -1,14 +1,44 @@
-//! Plain SVG diagrams.
+//! Diagrams as SVG, drawn by plotters.
 
-use std::fmt::Write as _;
+use std::{io, ops::Range};
 
-const WIDTH: f64 = 820.0;
-const HEIGHT: f64 = 440.0;
-const LEFT: f64 = 70.0;
-const RIGHT: f64 = 24.0;
-const TOP: f64 = 44.0;
-const BOTTOM: f64 = 54.0;
-const COLORS: [&str; 4] = ["#c2410c", "#1d4ed8", "#15803d", "#7e22ce"];
+use plotters::{
+    coord::{
+        Shift,
+        ranged1d::{AsRangedCoord, ValueFormatter},
+    },
+    prelude::*,
+    style::text_anchor::{HPos, Pos, VPos},
+};
+
+const COLORS: [RGBColor; 6] = [
+    RGBColor(0xc2, 0x41, 0x0c),
+    RGBColor(0x1d, 0x4e, 0xd8),
+    RGBColor(0x15, 0x80, 0x3d),
+    RGBColor(0x7e, 0x22, 0xce),
+    RGBColor(0x0e, 0x74, 0x90),
+    RGBColor(0xa1, 0x62, 0x07),
+];
+const TEXT: RGBColor = RGBColor(0x11, 0x11, 0x11);
+const FAINT_TEXT: RGBColor = RGBColor(0x37, 0x41, 0x51);
+const GRID: RGBColor = RGBColor(0xe5, 0xe7, 0xeb);
+/// Plotters rounds to whole pixels, which shows as steps in a flat line: it draws on so many to each pixel of the SVG.
+const FINE: u32 = 4;
+/// Sizes of text in pixels of the SVG.
+const TITLE_SIZE: f64 = 16.0;
+const TEXT_SIZE: f64 = 12.0;
+const LABEL_SIZE: f64 = 10.0;
+/// Distance of the legend's rows in pixels of the SVG.
+const ROW: f64 = 19.0;
+/// Plotters shrinks text by this.
+const SHRINK: f64 = 1.24;
+/// Series of more points are drawn without dots, which would hide their lines.
+const MOST_DOTS: usize = 100;
+/// Values beyond it are left out, so that no range of an axis overflows.
+const LARGEST: f64 = 1e100;
+
+type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+type Failure = DrawingAreaErrorKind<io::Error>;
 
 /// Points of one kind.
 pub struct Series {
@@ -45,148 +75,178 @@ pub struct Plot {
     pub series: Vec<Series>,
 }
 
-/// From values to pixels along one axis.
-struct Axis {
-    low: f64,
-    high: f64,
-    log: bool,
-    from: f64,
-    to: f64,
-}
-
-impl Axis {
-    fn new(values: impl Iterator<Item = f64>, log: bool, from: f64, to: f64) -> Self {
-        let usable = |v: &f64| v.is_finite() && (!log || *v > 0.0);
-        let (low, high) =
-            values.filter(usable).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
-        let (low, high) = if low <= high { (low, high) } else { (1.0, 2.0) };
-        let (low, high) = if log {
-            (low / 1.25, high * 1.25)
-        } else {
-            let pad = (0.08 * (high - low)).max(1e-9 + 0.02 * high.abs());
-            (low - pad, high + pad)
-        };
-        Self { low, high, log, from, to }
-    }
-
-    fn at(&self, value: f64) -> f64 {
-        let share = if self.log {
-            (value / self.low).ln() / (self.high / self.low).ln()
-        } else {
-            (value - self.low) / (self.high - self.low)
-        };
-        self.from + share * (self.to - self.from)
-    }
-
-    fn ticks(&self) -> Vec<f64> {
-        if self.log {
-            let first = self.low.log10().floor() as i32;
-            let last = self.high.log10().ceil() as i32;
-            let all = (first..=last).flat_map(|e| [1.0, 2.0, 5.0].map(|m| m * 10f64.powi(e)));
-            return all.filter(|v| (self.low..=self.high).contains(v)).collect();
-        }
-        let raw = (self.high - self.low) / 6.0;
-        let power = 10f64.powf(raw.log10().floor());
-        let step = [1.0, 2.0, 5.0, 10.0].into_iter().map(|m| m * power).find(|s| *s >= raw).unwrap_or(raw);
-        let first = (self.low / step).ceil() as i64;
-        let last = (self.high / step).floor() as i64;
-        (first..=last).map(|k| k as f64 * step).collect()
-    }
-}
-
 impl Plot {
     /// Draws the diagram as SVG, on white.
     #[must_use]
     pub fn svg(&self) -> String {
-        let all = || self.series.iter().flat_map(|s| &s.points).filter(|(x, y, _)| x.is_finite() && y.is_finite());
-        let x = Axis::new(all().map(|p| p.0), self.log_x, LEFT, WIDTH - RIGHT);
-        let y = Axis::new(all().map(|p| p.1), self.log_y, HEIGHT - BOTTOM, TOP);
-        let mut svg = format!(
-            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" width=\"{WIDTH}\" \
-             height=\"{HEIGHT}\" font-family=\"sans-serif\" font-size=\"12\"><rect width=\"100%\" height=\"100%\" \
-             fill=\"#fff\"/><text x=\"{LEFT}\" y=\"24\" font-size=\"16\" fill=\"#111\">{}</text>",
-            escape(&self.title)
-        );
-        for tick in x.ticks() {
-            let at = x.at(tick);
-            let _ = write!(
-                svg,
-                "<line x1=\"{at:.1}\" x2=\"{at:.1}\" y1=\"{TOP}\" y2=\"{:.1}\" stroke=\"#e5e7eb\"/><text x=\"{at:.1}\" \
-                 y=\"{:.1}\" text-anchor=\"middle\" fill=\"#374151\">{}</text>",
-                HEIGHT - BOTTOM,
-                HEIGHT - BOTTOM + 18.0,
-                short(tick)
-            );
-        }
-        for tick in y.ticks() {
-            let at = y.at(tick);
-            let _ = write!(
-                svg,
-                "<line x1=\"{LEFT}\" x2=\"{:.1}\" y1=\"{at:.1}\" y2=\"{at:.1}\" stroke=\"#e5e7eb\"/><text x=\"{:.1}\" \
-                 y=\"{:.1}\" text-anchor=\"end\" fill=\"#374151\">{}</text>",
-                WIDTH - RIGHT,
-                LEFT - 8.0,
-                at + 4.0,
-                short(tick)
-            );
-        }
-        let _ = write!(
-            svg,
-            "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\" fill=\"#111\">{}</text><text transform=\"rotate(-90)\" \
-             x=\"{:.1}\" y=\"18\" text-anchor=\"middle\" fill=\"#111\">{}</text>",
-            (LEFT + WIDTH - RIGHT) / 2.0,
-            HEIGHT - 14.0,
-            escape(&self.x_label),
-            -(TOP + HEIGHT - BOTTOM) / 2.0,
-            escape(&self.y_label)
-        );
-        // Legend first: labels make way for it.
-        let rows = self.series.len() as f64;
-        let mut taken = vec![[WIDTH - RIGHT - 200.0, TOP - 4.0, WIDTH, TOP + 18.0 * rows]];
-        for (i, series) in self.series.iter().enumerate() {
-            let color = COLORS[i % COLORS.len()];
-            let points = || series.points.iter().filter(|(x, y, _)| x.is_finite() && y.is_finite());
-            let line: Vec<(f64, f64)> = points().map(|p| (p.0, p.1)).collect();
-            svg += &match series.line {
-                Line::Through => polyline(&line, &x, &y, color, ""),
-                Line::Front => polyline(&front(&line), &x, &y, color, " stroke-dasharray=\"5 4\""),
+        self.drawn((820, 440), true)
+    }
+
+    /// Draws the lines alone, low and wide, for a page that has its own heading.
+    #[must_use]
+    pub(crate) fn strip(&self) -> String {
+        self.drawn((820, 260), false)
+    }
+
+    /// Returns whether no point can be drawn.
+    #[must_use]
+    pub(crate) fn is_empty(&self) -> bool {
+        self.points().next().is_none()
+    }
+
+    fn drawn(&self, size: (u32, u32), is_alone: bool) -> String {
+        self.draw(size, is_alone).unwrap_or_else(|error| {
+            // Text in memory is always written; a diagram is not worth a report.
+            tracing::error!("the diagram '{}' was not drawn: {error}", self.title);
+            "<svg xmlns=\"http://www.w3.org/2000/svg\"></svg>\n".to_owned()
+        })
+    }
+
+    /// Draws at a size in pixels. A diagram that stands alone has its title, dots and labels.
+    fn draw(&self, (width, height): (u32, u32), is_alone: bool) -> Result<String, Failure> {
+        let (fine_width, fine_height) = (FINE * width, FINE * height);
+        let mut svg = String::new();
+        {
+            let area = SVGBackend::with_string(&mut svg, (fine_width, fine_height)).into_drawing_area();
+            area.fill(&WHITE)?;
+            let x = range(self.points().map(|p| p.0), self.log_x);
+            let y = range(self.points().map(|p| p.1), self.log_y);
+            let log = |range: Range<f64>| {
+                let ticks = log_ticks(&range);
+                range.log_scale().with_key_points(ticks)
             };
-            for (px, py, label) in points() {
-                let (px, py) = (x.at(*px), y.at(*py));
-                let [tx, ty] = free_place(&mut taken, [px, py], label);
-                let _ = write!(
-                    svg,
-                    "<circle cx=\"{px:.1}\" cy=\"{py:.1}\" r=\"4\" fill=\"{color}\"/><text x=\"{tx:.1}\" y=\"{ty:.1}\" \
-                     font-size=\"10\" fill=\"#374151\">{}</text>",
-                    escape(label)
-                );
+            match (self.log_x, self.log_y) {
+                (false, false) => self.chart(&area, x, y, is_alone)?,
+                (false, true) => self.chart(&area, x, log(y), is_alone)?,
+                (true, false) => self.chart(&area, log(x), y, is_alone)?,
+                (true, true) => self.chart(&area, log(x), log(y), is_alone)?,
             }
-            let at = WIDTH - RIGHT - 190.0;
-            let row = TOP + 8.0 + 18.0 * i as f64;
-            let _ = write!(
-                svg,
-                "<circle cx=\"{at:.1}\" cy=\"{row:.1}\" r=\"4\" fill=\"{color}\"/><text x=\"{:.1}\" y=\"{:.1}\" \
-                 fill=\"#111\">{}</text>",
-                at + 10.0,
-                row + 4.0,
-                escape(&series.name)
-            );
+            area.present()?;
         }
-        svg + "</svg>\n"
+        let fine = format!("width=\"{fine_width}\" height=\"{fine_height}\" ");
+        Ok(svg.replacen(&fine, &format!("width=\"{width}\" height=\"{height}\" "), 1))
+    }
+
+    /// Returns the points that can be drawn.
+    fn points(&self) -> impl Iterator<Item = &(f64, f64, String)> {
+        self.series.iter().flat_map(|series| self.points_of(series))
+    }
+
+    fn points_of<'a>(&self, series: &'a Series) -> impl Iterator<Item = &'a (f64, f64, String)> + Clone + use<'a> {
+        let (log_x, log_y) = (self.log_x, self.log_y);
+        let usable = |v: f64, log: bool| v.abs() < LARGEST && (!log || v > 1.0 / LARGEST);
+        series.points.iter().filter(move |(x, y, _)| usable(*x, log_x) && usable(*y, log_y))
+    }
+
+    fn chart<X, Y>(&self, area: &Area<'_>, x: X, y: Y, is_alone: bool) -> Result<(), Failure>
+    where
+        X: AsRangedCoord<Value = f64, CoordDescType: ValueFormatter<f64>>,
+        Y: AsRangedCoord<Value = f64, CoordDescType: ValueFormatter<f64>>,
+    {
+        let font =
+            |size: f64, color: &RGBColor| ("sans-serif", f64::from(FINE) * SHRINK * size).into_font().color(color);
+        let letters = self.series.iter().map(|series| series.name.chars().count()).max().unwrap_or(0);
+        let legend_width = 40 + 7 * u32::try_from(letters.min(40)).unwrap_or(0);
+        let right = if is_alone { 24 } else { legend_width };
+        let mut builder = ChartBuilder::on(area);
+        builder.margin(10 * FINE).margin_right(right * FINE).x_label_area_size(46 * FINE).y_label_area_size(64 * FINE);
+        if is_alone {
+            builder.caption(&self.title, font(TITLE_SIZE, &TEXT));
+        }
+        let mut chart = builder.build_cartesian_2d(x, y)?;
+        let format = |value: &f64| short(*value);
+        let grid = GRID.stroke_width(FINE);
+        chart
+            .configure_mesh()
+            .max_light_lines(0)
+            .bold_line_style(grid)
+            .axis_style(grid)
+            .set_all_tick_mark_size(4 * FINE)
+            .label_style(font(TEXT_SIZE, &FAINT_TEXT))
+            .axis_desc_style(font(TEXT_SIZE, &TEXT))
+            .x_label_formatter(&format)
+            .y_label_formatter(&format)
+            .x_desc(&self.x_label)
+            .y_desc(&self.y_label)
+            .draw()?;
+        let mut dots = Vec::new();
+        for (series, color) in self.series.iter().zip(COLORS.into_iter().cycle()) {
+            let line: Vec<(f64, f64)> = self.points_of(series).map(|p| (p.0, p.1)).collect();
+            if is_alone && line.len() <= MOST_DOTS {
+                let dot = |(x, y, label): &(f64, f64, String)| (chart.backend_coord(&(*x, *y)), label.clone(), color);
+                dots.extend(self.points_of(series).map(dot));
+            }
+            let thick = color.stroke_width(8 * FINE / 5);
+            match series.line {
+                Line::Through => chart.draw_series(LineSeries::new(line, thick))?,
+                Line::Front => chart.draw_series(DashedLineSeries::new(front(&line), 5 * FINE, 4 * FINE, thick))?,
+            };
+        }
+        let (width, height) = area.dim_in_pixel();
+        let [width, height] = [width, height].map(|fine| f64::from(fine) / f64::from(FINE));
+        // Labels make way for the legend.
+        let legend_left = width - f64::from(legend_width) - if is_alone { 24.0 } else { 0.0 };
+        let top = if is_alone { 32.0 } else { 12.0 };
+        let legend = [legend_left, top, legend_left + f64::from(legend_width), top + ROW * self.series.len() as f64];
+        let mut taken = vec![legend];
+        for ((x, y), label, color) in dots {
+            area.draw(&Circle::new((x, y), 4 * FINE as i32, color.filled()))?;
+            let at = [x, y].map(|fine| f64::from(fine) / f64::from(FINE));
+            let place = free_place(&mut taken, at, &label, [width, height]);
+            let [x, y] = place.map(|at| (at * f64::from(FINE)).round() as i32);
+            let style = font(LABEL_SIZE, &FAINT_TEXT).pos(Pos::new(HPos::Left, VPos::Bottom));
+            area.draw(&Text::new(label, (x, y), style))?;
+        }
+        let px = |at: f64| (at * f64::from(FINE)).round() as i32;
+        area.draw(&Rectangle::new(
+            [(px(legend[0]), px(legend[1])), (px(legend[2]), px(legend[3]))],
+            WHITE.mix(0.85).filled(),
+        ))?;
+        for (row, (series, color)) in self.series.iter().zip(COLORS.into_iter().cycle()).enumerate() {
+            let (x, y) = (legend[0] + 8.0, legend[1] + ROW * (row as f64 + 0.5));
+            let mark = [(px(x), px(y - 1.0)), (px(x + 12.0), px(y + 1.0))];
+            area.draw(&Rectangle::new(mark, color.filled()))?;
+            let style = font(TEXT_SIZE, &TEXT).pos(Pos::new(HPos::Left, VPos::Center));
+            area.draw(&Text::new(series.name.as_str(), (px(x + 17.0), px(y)), style))?;
+        }
+        Ok(())
     }
 }
 
-/// Where a point's label starts: beside it, inside of the picture, and not on another one in `taken`.
-fn free_place(taken: &mut Vec<[f64; 4]>, [px, py]: [f64; 2], label: &str) -> [f64; 2] {
-    let (width, height) = (6.0 * label.chars().count() as f64, 11.0);
-    let left = (px + 6.0).min(WIDTH - 4.0 - width);
+/// Returns the range of an axis, with a margin around the values.
+fn range(values: impl Iterator<Item = f64>, log: bool) -> Range<f64> {
+    let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
+    let (low, high) = if low <= high { (low, high) } else { (1.0, 2.0) };
+    if log {
+        return low / 1.25..high * 1.25;
+    }
+    let pad = (0.08 * (high - low)).max(1e-9 + 0.02 * high.abs());
+    low - pad..high + pad
+}
+
+/// Returns 1, 2 and 5 times the powers of ten in a range: plotters marks powers of ten alone, of which a short axis has none.
+fn log_ticks(range: &Range<f64>) -> Vec<f64> {
+    let (first, last) = (range.start.log10().floor() as i32, range.end.log10().ceil() as i32);
+    let factors: &[f64] = match last - first {
+        ..=4 => &[1.0, 2.0, 5.0],
+        _ => &[1.0],
+    };
+    let step = usize::try_from((last - first) / 10 + 1).unwrap_or(1);
+    let all = (first..=last).step_by(step).flat_map(|power| factors.iter().map(move |m| m * 10f64.powi(power)));
+    all.filter(|value| range.contains(value)).collect()
+}
+
+/// Returns the lower left corner of a point's label: beside it, inside of the picture, and not on a box in `taken`.
+fn free_place(taken: &mut Vec<[f64; 4]>, [px, py]: [f64; 2], label: &str, [width, height]: [f64; 2]) -> [f64; 2] {
+    let (long, tall) = (6.0 * label.chars().count() as f64, 11.0);
+    let left = (px + 6.0).min(width - 4.0 - long);
     // Above the point, below it, farther above, farther below ...
-    let steps = (0..24).map(|i| f64::from(i / 2) * height * if i % 2 == 0 { -1.0 } else { 1.0 });
-    let boxes = steps.map(|step| [left, py - 5.0 + step - height, left + width, py - 5.0 + step]);
+    let steps = (0..24).map(|i| f64::from(i / 2) * tall * if i % 2 == 0 { -1.0 } else { 1.0 });
+    let boxes = steps.map(|step| [left, py - 5.0 + step - tall, left + long, py - 5.0 + step]);
     let meets = |a: &[f64; 4], b: &[f64; 4]| a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
-    let inside = |place: &[f64; 4]| place[1] > 0.0 && place[3] < HEIGHT;
+    let inside = |place: &[f64; 4]| place[1] > 0.0 && place[3] < height;
     let mut all = boxes.filter(inside);
-    let first = all.next().unwrap_or([left, py - 5.0 - height, left + width, py - 5.0]);
+    let first = all.next().unwrap_or([left, py - 5.0 - tall, left + long, py - 5.0]);
     let place = if label.is_empty() || !taken.iter().any(|other| meets(other, &first)) {
         first
     } else {
@@ -211,18 +271,16 @@ fn front(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     sorted
 }
 
-fn polyline(points: &[(f64, f64)], x: &Axis, y: &Axis, color: &str, more: &str) -> String {
-    let path: Vec<String> = points.iter().map(|p| format!("{:.1},{:.1}", x.at(p.0), y.at(p.1))).collect();
-    format!("<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"1.6\"{more} points=\"{}\"/>", path.join(" "))
-}
-
 fn short(value: f64) -> String {
+    // Ticks are summed up by plotters, which leaves a trace of rounding at 0.
+    if value.abs() < 1e-12 {
+        return "0".to_owned();
+    }
+    if !(1e-3..1e7).contains(&value.abs()) {
+        return format!("{value:.1e}");
+    }
     let text = format!("{value:.3}");
     text.trim_end_matches('0').trim_end_matches('.').to_owned()
-}
-
-fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
 }
 
 #[cfg(test)]
@@ -249,12 +307,31 @@ mod tests {
             vec![],
             vec![(5.0, 5.0, "one".to_owned())],
             vec![(f64::NAN, 1.0, String::new()), (10.0, 0.0, String::new()), (1000.0, 3.0, "z".to_owned())],
+            vec![(1e-300, f64::MAX, "small".to_owned()), (1e300, f64::MIN, "large".to_owned())],
+            vec![(-1.0, f64::INFINITY, "none".to_owned()), (0.0, -0.0, "<&>".to_owned())],
+            vec![(1e-90, 1e90, "far".to_owned()), (1e90, -1e90, "off".to_owned())],
+            vec![(1e9, 1e9, "close".to_owned()), (1e9 + 1e-6, 1e9 + 1e-6, "by".to_owned())],
         ] {
             for line in [Line::Through, Line::Front] {
-                let svg = plot(points.clone(), line).svg();
-                assert!(svg.starts_with("<svg") && svg.ends_with("</svg>\n"), "{svg}");
-                assert!(!svg.contains("NaN") && !svg.contains("inf") && svg.contains("a &lt; b"), "{svg}");
+                for (log_x, log_y) in [(true, false), (false, false), (false, true), (true, true)] {
+                    let svg = Plot { log_x, log_y, ..plot(points.clone(), line) }.svg();
+                    assert!(svg.starts_with("<svg") && svg.ends_with("</svg>\n"), "{svg}");
+                    assert!(!svg.contains("NaN") && !svg.contains("inf") && svg.contains("a &lt; b"), "{svg}");
+                }
             }
         }
+    }
+
+    #[test]
+    fn a_short_logarithmic_axis_has_ticks() {
+        assert_eq!(log_ticks(&(12.0..80.0)), [20.0, 50.0]);
+        assert_eq!(log_ticks(&(0.9..11.0)), [1.0, 2.0, 5.0, 10.0]);
+        assert_eq!(log_ticks(&(0.9e-90..1e90)).len(), 9, "not hundreds");
+    }
+
+    #[test]
+    fn ticks_are_short() {
+        let values = [0.0, -0.0, 5.6e-17, 0.2, -1.5, 1000.0, 0.000_25, 2e8];
+        assert_eq!(values.map(short), ["0", "0", "0", "0.2", "-1.5", "1000", "2.5e-4", "2.0e8"]);
     }
 }
