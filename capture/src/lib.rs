@@ -15,7 +15,6 @@ mod error;
 mod folder;
 mod mjpeg;
 mod nokhwa_camera;
-mod panics;
 mod picture;
 mod pool;
 mod queue;

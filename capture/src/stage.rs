@@ -2,9 +2,9 @@
 
 use std::{sync::Arc, time::Duration};
 
-use flyrig_types::{CameraId, Frame};
+use flyrig_types::{CameraId, Frame, caught};
 
-use crate::{CaptureError, CaptureErrorKind, LatestQueue, PopError, panics::caught, threads::Shared};
+use crate::{CaptureError, CaptureErrorKind, LatestQueue, PopError, threads::Shared};
 
 /// Frames that may wait for a stage: one to work on next, one for jitter. More would only be older.
 const WAITING: usize = 2;

@@ -10,6 +10,7 @@ use anyhow::{Result, ensure};
 use flyrig_capture::{
     CameraStats, CaptureThreads, FrameStage, JpegEncoding, Pacing, PopError, SourceOpener, ThreadsConfig,
 };
+use flyrig_fusion::{Health, check_threads};
 use flyrig_gpu::GpuContext;
 use flyrig_report::stop;
 use flyrig_transport::{CameraPublisher, CameraStatus};
@@ -69,7 +70,9 @@ pub fn capture(config: &Config, gpu: Option<&GpuContext>) -> Result<()> {
                 break;
             }
         }
-        monitor.look(|| (arrivals.health(&threads), None));
+        let publishing = publisher.thread();
+        check_threads([publishing.clone()])?;
+        monitor.look(|| (Health { threads: vec![publishing], ..arrivals.health(&threads) }, None));
         if sent.is_none_or(|at| at.elapsed() >= STATUS_EVERY) {
             sent = Some(Instant::now());
             for camera in threads.stats() {

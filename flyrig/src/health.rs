@@ -11,14 +11,15 @@ pub fn threads(health: &Health) -> Vec<String> {
     health.cameras.iter().flat_map(of).collect()
 }
 
-/// Returns how often the work of each camera's threads was begun anew, by thread.
+/// Returns how often the work of each thread was begun anew, by thread.
 pub fn thread_restarts(health: &Health) -> Vec<(String, u64)> {
     let of = |camera: &CameraHealth| {
         let stats = &camera.stats;
         [("camera", stats.restarts), ("stage", stats.stage_restarts)]
             .map(|(what, count)| (format!("{what} {}", stats.camera), count))
     };
-    health.cameras.iter().flat_map(of).collect()
+    let others = health.threads.iter().map(|thread| (thread.name.clone(), thread.restarts));
+    health.cameras.iter().flat_map(of).chain(others).collect()
 }
 
 /// Formats a snapshot as a table for the terminal.
@@ -124,6 +125,7 @@ pub mod tests {
         Health {
             cameras: vec![camera],
             stuck: Vec::new(),
+            threads: Vec::new(),
             complete_sets,
             partial_sets,
             skipped_sets,

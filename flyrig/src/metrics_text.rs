@@ -180,6 +180,7 @@ impl Page<'_> {
 #[cfg(test)]
 mod tests {
     use flyrig_sync::ClockState;
+    use flyrig_types::ThreadHealth;
 
     use super::*;
     use crate::health::tests::health;
@@ -220,6 +221,7 @@ mod tests {
     fn threads_and_recordings_are_named() {
         let mut health = health();
         (health.cameras[0].stats.restarts, health.stuck) = (2, vec!["stage le\"ft".to_owned()]);
+        health.threads = vec![ThreadHealth { name: "encode".to_owned(), restarts: 3, ..ThreadHealth::default() }];
         let problem = Some("disk full".to_owned());
         let recorded =
             Recorded { frames: 7, bytes: 2_000_000, files: 2, free_bytes: Some(9), problem, ..Recorded::default() };
@@ -227,6 +229,7 @@ mod tests {
         for line in [
             "flyrig_thread_restarts_total{thread=\"camera le\\\"ft\"} 2",
             "flyrig_thread_restarts_total{thread=\"stage le\\\"ft\"} 0",
+            "flyrig_thread_restarts_total{thread=\"encode\"} 3",
             "flyrig_thread_stuck{thread=\"stage le\\\"ft\"} 1",
             "flyrig_thread_stuck{thread=\"camera le\\\"ft\"} 0",
             "flyrig_recording_frames_total 7",

@@ -2,12 +2,15 @@
 
 use std::{
     collections::BTreeMap,
+    sync::mpsc::{RecvTimeoutError, sync_channel},
+    thread::Builder,
     time::{Duration, Instant},
 };
 
 use anyhow::{Result, anyhow};
 use flyrig_capture::{CameraStats, CaptureThreads, Recorded};
 use flyrig_fusion::{CameraHealth, Health, STUCK_AFTER, resident_mib};
+use flyrig_gpu::GpuContext;
 use flyrig_types::CameraId;
 
 use crate::{health, metrics_server::MetricsServer, metrics_text};
@@ -50,6 +53,14 @@ impl Monitor {
     /// Reports that the pipeline made a step: a set of frames was processed.
     pub fn stepped(&mut self) {
         self.watchdog.stepped = true;
+    }
+
+    /// Does work that makes no steps, such as building a session, and feeds the watchdog whenever the graphics device was given
+    /// something new to hold. Work that hangs is not fed for.
+    pub fn during<T>(&mut self, gpu: &GpuContext, work: impl FnOnce() -> T) -> T {
+        let done = during(EVERY, || gpu.objects(), || notify("WATCHDOG=1"), work);
+        self.stepped();
+        done
     }
 
     /// Reports the health, at most once a second; `snapshot` returns it and the state of a recording, if there is one.
@@ -131,6 +142,33 @@ impl Watchdog {
         let status = format!("{up} of {} cameras deliver frames", health.cameras.len());
         (std::mem::take(&mut self.stepped), status)
     }
+}
+
+/// Does some work, and meanwhile looks at its progress again and again; `feed` is called whenever it has changed.
+fn during<P: PartialEq + Send, T>(
+    every: Duration,
+    progress: impl Fn() -> P + Send,
+    feed: impl Fn() + Send,
+    work: impl FnOnce() -> T,
+) -> T {
+    std::thread::scope(|scope| {
+        // Dropped at the end of the work, or by its panic.
+        let (_working, is_over) = sync_channel::<()>(0);
+        let mut last = progress();
+        let watch = move || {
+            while is_over.recv_timeout(every) == Err(RecvTimeoutError::Timeout) {
+                let now = progress();
+                if now != last {
+                    feed();
+                    last = now;
+                }
+            }
+        };
+        if let Err(error) = Builder::new().name("progress".to_owned()).spawn_scoped(scope, watch) {
+            tracing::warn!("nobody feeds the watchdog for a while, since the system gives no thread: {error}");
+        }
+        work()
+    })
 }
 
 /// Sends a state to the service manager, where there is one. One that does not listen must not hold the rig up.
@@ -231,6 +269,34 @@ mod tests {
         assert_eq!(watchdog.judge(&health), (true, expected.to_owned()));
         let ended = ended_by_itself(&[health.cameras[0].stats.clone()]).to_string();
         assert_eq!(ended, "all cameras have ended: camera left: is not plugged in");
+    }
+
+    #[test]
+    fn work_that_goes_on_is_fed_for_and_work_that_hangs_is_not() {
+        use std::sync::atomic::{AtomicU64, Ordering::SeqCst};
+        let (progress, fed, every) = (AtomicU64::new(0), AtomicU64::new(0), Duration::from_millis(5));
+        let feed = || {
+            fed.fetch_add(1, SeqCst);
+        };
+        let wait = |count| {
+            while fed.load(SeqCst) < count {
+                std::thread::sleep(every);
+            }
+        };
+        let done = during(
+            every,
+            || progress.load(SeqCst),
+            feed,
+            || {
+                for step in 1..=3 {
+                    progress.store(step, SeqCst);
+                    wait(step);
+                }
+                std::thread::sleep(20 * every);
+                "done"
+            },
+        );
+        assert_eq!((done, fed.load(SeqCst)), ("done", 3), "once for each step, and not while it hung");
     }
 
     #[test]

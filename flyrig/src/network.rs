@@ -8,7 +8,7 @@ use std::{
 use anyhow::{Context as _, Result};
 use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, NetworkHealth, SourceHealth, SourceOpener};
 use flyrig_transport::{CameraSubscriber, HostClock, TransportConfig, TransportErrorKind};
-use flyrig_types::{CameraId, Frame, Rig};
+use flyrig_types::{CameraId, Frame, Rig, ThreadWatch};
 
 /// A camera that was there is silent after this.
 const SILENT: Duration = Duration::from_millis(700);
@@ -22,16 +22,17 @@ pub fn host_clock() -> HostClock {
     HostClock::new(flyrig_capture::monotonic_nanos)
 }
 
-/// Returns an opener for every camera of the rig, all in one session.
+/// Returns an opener for every camera of the rig, all in one session, and the thread that compares their clocks.
 ///
 /// # Errors
 /// Names settings of the session that are wrong.
-pub fn openers(transport: &TransportConfig, rig: &Rig) -> Result<Vec<SourceOpener>> {
+pub fn openers(transport: &TransportConfig, rig: &Rig) -> Result<(Vec<SourceOpener>, ThreadWatch)> {
     let cameras: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     // It listens nowhere: that address is the results'.
     let transport = TransportConfig { listen: Vec::new(), ..transport.clone() };
     let subscriber = CameraSubscriber::open(&transport, &cameras, host_clock())
         .context("source.kind is \"network\": transport.connect must name the computers with cameras or a router")?;
+    let clocks = subscriber.clock_thread();
     let subscriber = Arc::new(subscriber);
     let opener = |camera: &flyrig_types::Camera| {
         let size = (camera.intrinsics.width, camera.intrinsics.height);
@@ -40,7 +41,7 @@ pub fn openers(transport: &TransportConfig, rig: &Rig) -> Result<Vec<SourceOpene
             Ok(Box::new(NetworkCamera::new(id.clone(), size, Arc::clone(&subscriber))) as Box<dyn CameraSource>)
         })
     };
-    Ok(rig.cameras.iter().map(opener).collect())
+    Ok((rig.cameras.iter().map(opener).collect(), clocks))
 }
 
 /// A camera of another computer, with capture times on this computer's clock.

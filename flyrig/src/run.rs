@@ -9,11 +9,12 @@ use anyhow::{Result, bail};
 use flyrig_capture::{CameraStats, Recorder};
 use flyrig_fusion::{
     EstimatedPerception, Health, Intake, LivePublisher, LiveRig, LiveViews, Outcome, PersonId, PersonMemory,
-    SHAPE_SETS, Session, SessionBuilder, resident_mib,
+    SHAPE_SETS, Session, SessionBuilder, check_threads, resident_mib,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{dataset, stop};
 use flyrig_transport::Publisher;
+use flyrig_types::{ThreadHealth, ThreadWatch};
 
 use crate::{
     config::Config,
@@ -76,16 +77,18 @@ fn capture_people(
         builder = builder.person(PersonId::default(), memory);
         eprintln!("run: the person is resumed from {}", config.body.person.display());
     }
-    let session = match source.perception(config)? {
-        FoundBy::Given(perception) => builder.perception(perception).build()?,
-        FoundBy::Estimated(perception) if is_known => builder.perception(*perception).build()?,
+    let threads = std::mem::take(&mut source.threads);
+    builder = match source.perception(config)? {
+        FoundBy::Given(perception) => builder.perception(perception),
+        FoundBy::Estimated(perception) if is_known => builder.perception(*perception),
         FoundBy::Estimated(mut perception) => {
-            if !learn_shape(&mut perception, &mut intake, recorder, monitor)? {
+            if !learn_shape(&mut perception, &mut intake, &threads, recorder, monitor)? {
                 return Ok(());
             }
-            builder.perception(*perception).build()?
+            builder.perception(*perception)
         }
     };
+    let session = monitor.during(gpu, || builder.build())?;
     let publisher = Publisher::open(&config.transport())?;
     publisher.set_calibration(session.rig())?;
     eprintln!(
@@ -97,7 +100,8 @@ fn capture_people(
     );
     let publisher = LivePublisher::start(publisher, config.output.jpeg_quality)?;
     let mut rig = LiveRig::new(session, intake, LiveViews::new(&config.output), Some(publisher))
-        .with_splats(config.output.splats);
+        .with_splats(config.output.splats)
+        .with_threads(threads);
     let (started, mut last_print, mut printed) = (Instant::now(), Instant::now(), 0u64);
     let mut last_save = Instant::now();
     while !stop::requested() && !rig.intake.ended() {
@@ -164,13 +168,18 @@ fn record_pose(poses: Option<&mut PoseRecording>, session: &Session, nanos: i64)
 fn learn_shape(
     perception: &mut EstimatedPerception,
     intake: &mut Intake,
+    threads: &[ThreadWatch],
     recorder: Option<&Recorder>,
     monitor: &mut Monitor,
 ) -> Result<bool> {
     eprintln!("run: learning the person's shape, please stand in view of all cameras");
     let (mut tries, mut sets) = (0u64, Vec::new());
     while !stop::requested() {
-        monitor.look(|| (Health { resident_mib: resident_mib(), ..intake.health() }, recorder.map(Recorder::state)));
+        let threads: Vec<ThreadHealth> = threads.iter().map(ThreadWatch::health).collect();
+        check_threads(threads.iter().cloned())?;
+        monitor.look(|| {
+            (Health { threads, resident_mib: resident_mib(), ..intake.health() }, recorder.map(Recorder::state))
+        });
         match intake.next_set(STEP) {
             Some(set) => {
                 sets.push(set);
@@ -185,7 +194,9 @@ fn learn_shape(
         if sets.len() < SHAPE_SETS {
             continue;
         }
-        match perception.learn_shape(&sets) {
+        let learnt = perception.learn_shape(&sets);
+        monitor.stepped();
+        match learnt {
             Ok(fit) => {
                 eprintln!("run: the person is {:.2} m tall", fit.height_m);
                 return Ok(true);

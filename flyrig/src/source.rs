@@ -7,7 +7,7 @@ use flyrig_fusion::{EstimatedPerception, GivenPerception, GivenPerson, InputForm
 use flyrig_gpu::GpuContext;
 use flyrig_sim::{SimTime, Simulator};
 use flyrig_report::dataset;
-use flyrig_types::{CameraId, Image, PoseTrack, Rig};
+use flyrig_types::{CameraId, Image, PoseTrack, Rig, ThreadWatch};
 
 use crate::{
     config::{Config, SourceKind},
@@ -23,6 +23,8 @@ pub struct Source {
     pub track: Option<PoseTrack>,
     /// Images of the empty scene by slot, where there are any.
     pub plates: Vec<Option<Image>>,
+    /// Threads that the cameras need.
+    pub threads: Vec<ThreadWatch>,
 }
 
 /// A person found by the configuration's means.
@@ -103,7 +105,8 @@ fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
             .filter(|source| picked.slot(source.camera()).is_some())
             .collect();
         let sources = ready(sources);
-        return Ok(Source { cameras: sources, rig: picked, template, track: Some(track), plates });
+        let threads = Vec::new();
+        return Ok(Source { cameras: sources, rig: picked, template, track: Some(track), plates, threads });
     }
     let chosen: Vec<CameraId> = source.names().into_iter().map(CameraId::from).collect();
     let rig = match source.kind {
@@ -113,6 +116,7 @@ fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
     };
     let rig = dataset::pick(&rig, &source.names(), "the calibration")?;
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+    let mut threads = Vec::new();
     let sources: Vec<SourceOpener> = match source.kind {
         SourceKind::Folder => {
             let with_masks = config.body.masks == Origin::Given;
@@ -123,7 +127,11 @@ fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
             )?)
         }
         SourceKind::Cameras => live::openers(source)?,
-        SourceKind::Network => network::openers(&config.transport(), &rig)?,
+        SourceKind::Network => {
+            let (openers, clocks) = network::openers(&config.transport(), &rig)?;
+            threads.push(clocks);
+            openers
+        }
         SourceKind::Mcap => ready(recording::replay_sources(&source.path, &rig)?),
         SourceKind::Video | SourceKind::Sim => {
             let open = |id| VideoReplay::open(id, &dataset::video_file(&source.path, id), &VideoOptions::default());
@@ -140,7 +148,7 @@ fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
         SourceKind::Mcap => rig.cameras.iter().map(|_| None).collect(),
         _ => dataset::plates(&source.path, &rig)?,
     };
-    Ok(Source { cameras: sources, rig, template, track, plates })
+    Ok(Source { cameras: sources, rig, template, track, plates, threads })
 }
 
 /// Returns sources that are open already as the capture threads take them.

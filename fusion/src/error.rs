@@ -73,6 +73,16 @@ pub enum FusionError {
         /// The system's error.
         source: std::io::Error,
     },
+    /// A thread that panicked too often to be restarted once more.
+    #[error(
+        "the thread '{name}' panicked again and again: {panic}; this is a fault of flyrig, please report it with the log"
+    )]
+    ThreadFailed {
+        /// Name of the thread.
+        name: String,
+        /// Text of its last panic.
+        panic: String,
+    },
 }
 
 impl FusionError {

@@ -4,8 +4,9 @@ use std::time::Duration;
 
 use flyrig_capture::CameraStats;
 use flyrig_sync::ClockState;
+use flyrig_types::ThreadHealth;
 
-use crate::StageSummary;
+use crate::{FusionError, StageSummary};
 
 /// A camera whose last frame is older than this, or than five intervals, is down, seconds.
 const UP_WITHIN_S: f64 = 5.0;
@@ -46,6 +47,8 @@ pub struct Health {
     pub cameras: Vec<CameraHealth>,
     /// Names of camera threads (`camera NAME`, `stage NAME`, `open NAME`) that hang in somebody else's code.
     pub stuck: Vec<String>,
+    /// Threads that are restarted after a panic: `pipeline` and those that publish or compare clocks.
+    pub threads: Vec<ThreadHealth>,
     /// Sets with a frame of every camera.
     pub complete_sets: u64,
     /// Sets without at least one camera.
@@ -58,4 +61,17 @@ pub struct Health {
     pub device_faults: u64,
     /// Resident memory of the process, MiB.
     pub resident_mib: Option<f64>,
+}
+
+/// Checks that every thread still does its work.
+///
+/// # Errors
+/// [`FusionError::ThreadFailed`] for the first one that panicked too often.
+pub fn check_threads(threads: impl IntoIterator<Item = ThreadHealth>) -> Result<(), FusionError> {
+    match threads.into_iter().find(|thread| thread.has_failed) {
+        Some(ThreadHealth { name, panic, .. }) => {
+            Err(FusionError::ThreadFailed { name, panic: panic.unwrap_or_else(|| "?".to_owned()) })
+        }
+        None => Ok(()),
+    }
 }

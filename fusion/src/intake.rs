@@ -212,6 +212,7 @@ impl Intake {
         Health {
             cameras: cameras.collect(),
             stuck: self.threads.stuck(STUCK_AFTER),
+            threads: Vec::new(),
             complete_sets: counts.complete,
             partial_sets: counts.partial,
             skipped_sets: self.skipped_sets,

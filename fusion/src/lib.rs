@@ -29,7 +29,7 @@ mod viewpoints;
 
 pub use deformation::{DeformOptions, PAPER_COLOR_WEIGHT};
 pub use error::FusionError;
-pub use health::{CameraHealth, Health, STUCK_AFTER};
+pub use health::{CameraHealth, Health, STUCK_AFTER, check_threads};
 pub use intake::{InputFormat, Intake};
 pub use live_publisher::LivePublisher;
 pub use live_rig::{LiveRig, LiveStep};

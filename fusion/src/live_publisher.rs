@@ -1,11 +1,11 @@
 //! From rendered views to the network: compression and publishing off the session's thread.
 
 use std::{
+    error::Error,
     sync::{
         Arc,
         atomic::{AtomicU64, Ordering},
     },
-    thread::JoinHandle,
     time::{Duration, Instant},
 };
 
@@ -14,7 +14,7 @@ use flyrig_renderer::composite_over;
 use flyrig_transport::{
     ImageFormat, Publisher, RigStats, SplatState, StageTime, SubjectStats, TrackingStats, ViewFrame, ViewRate,
 };
-use flyrig_types::{FrameSet, RenderedView};
+use flyrig_types::{FrameSet, RenderedView, SupervisedThread, ThreadHealth};
 use image::{ExtendedColorType, ImageEncoder as _, codecs::jpeg::JpegEncoder};
 
 use crate::{FusionError, Session, Subject};
@@ -37,7 +37,7 @@ struct Job {
 pub struct LivePublisher {
     publisher: Arc<Publisher>,
     jobs: Arc<LatestQueue<Job>>,
-    encoder: Option<JoinHandle<()>>,
+    encoder: SupervisedThread,
     failures: Arc<AtomicU64>,
     started: Instant,
     last_stats: Instant,
@@ -50,20 +50,32 @@ impl LivePublisher {
     /// # Errors
     /// [`FusionError::Thread`] when the system starts none.
     pub fn start(publisher: Publisher, jpeg_quality: u8) -> Result<Self, FusionError> {
+        Self::start_with(publisher, move |publisher, job| encode_one(publisher, job, jpeg_quality))
+    }
+
+    fn start_with(
+        publisher: Publisher,
+        encode: impl Fn(&Publisher, &Job) -> Result<(), Box<dyn Error>> + Send + 'static,
+    ) -> Result<Self, FusionError> {
         let publisher = Arc::new(publisher);
         let jobs = Arc::new(LatestQueue::new(WAITING_PICTURES));
         let failures = Arc::new(AtomicU64::new(0));
         let encoder = {
             let (publisher, jobs, failures) = (Arc::clone(&publisher), Arc::clone(&jobs), Arc::clone(&failures));
-            std::thread::Builder::new()
-                .name("encode".to_owned())
-                .spawn(move || encode_all(&publisher, &jobs, jpeg_quality, &failures))
-                .map_err(|source| FusionError::Thread { name: "encode", source })?
+            let mut has_begun = false;
+            let work = move || {
+                // Begun anew: the view that it panicked at is lost.
+                if std::mem::replace(&mut has_begun, true) {
+                    failures.fetch_add(1, Ordering::Relaxed);
+                }
+                encode_all(&jobs, &failures, |job| encode(&publisher, job));
+            };
+            SupervisedThread::start("encode", work).map_err(|source| FusionError::Thread { name: "encode", source })?
         };
         Ok(Self {
             publisher,
             jobs,
-            encoder: Some(encoder),
+            encoder,
             failures,
             started: Instant::now(),
             last_stats: Instant::now(),
@@ -154,6 +166,12 @@ impl LivePublisher {
         true
     }
 
+    /// Returns the health of the threads that compress and publish.
+    #[must_use]
+    pub fn threads(&self) -> [ThreadHealth; 2] {
+        [self.encoder.health(), self.publisher.thread()]
+    }
+
     /// Counts the views lost on the way out, by place.
     #[must_use]
     pub fn drops(&self) -> Vec<(String, u64)> {
@@ -171,9 +189,7 @@ impl LivePublisher {
     /// [`FusionError::Transport`].
     pub fn finish(mut self) -> Result<(), FusionError> {
         self.jobs.close();
-        if self.encoder.take().is_some_and(|encoder| encoder.join().is_err()) {
-            tracing::error!("the compression thread had ended early");
-        }
+        self.encoder.join();
         match Arc::try_unwrap(self.publisher) {
             Ok(publisher) => Ok(publisher.close()?),
             Err(_) => Ok(()),
@@ -191,21 +207,21 @@ fn stats_of(subject: &Subject) -> SubjectStats {
     }
 }
 
-fn encode_all(publisher: &Publisher, jobs: &LatestQueue<Job>, quality: u8, failures: &AtomicU64) {
+fn encode_all(jobs: &LatestQueue<Job>, failures: &AtomicU64, encode: impl Fn(&Job) -> Result<(), Box<dyn Error>>) {
     loop {
         let job = match jobs.pop(Duration::from_millis(200)) {
             Ok(job) => job,
             Err(PopError::Timeout) => continue,
             Err(PopError::Closed) => return,
         };
-        if let Err(error) = encode_one(publisher, &job, quality) {
+        if let Err(error) = encode(&job) {
             failures.fetch_add(1, Ordering::Relaxed);
             tracing::warn!(view = job.view, %error, "view not published");
         }
     }
 }
 
-fn encode_one(publisher: &Publisher, job: &Job, quality: u8) -> Result<(), Box<dyn std::error::Error>> {
+fn encode_one(publisher: &Publisher, job: &Job, quality: u8) -> Result<(), Box<dyn Error>> {
     let RenderedView { width, height, rgba } = &job.picture;
     let backdrop = vec![BACKDROP; *width as usize * *height as usize * 3];
     let mut jpeg = Vec::new();
@@ -223,4 +239,58 @@ fn encode_one(publisher: &Publisher, job: &Job, quality: u8) -> Result<(), Box<d
         },
     )?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_transport::TransportConfig;
+
+    use super::*;
+
+    /// Publishes a view a turn, encoded by `encode`, until the threads are as wanted.
+    fn publish_until(
+        encode: impl Fn(u64) + Send + 'static,
+        is_wanted: impl Fn(&ThreadHealth) -> bool,
+    ) -> (LivePublisher, ThreadHealth) {
+        let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
+        let publisher = Publisher::open(&config).unwrap();
+        let publisher = LivePublisher::start_with(publisher, move |_, job| {
+            encode(job.frame);
+            Ok(())
+        })
+        .unwrap();
+        for index in 0..1000 {
+            let set = FrameSet { index, master_nanos: 0, frames: Vec::new() };
+            publisher.publish("main", RenderedView { width: 1, height: 1, rgba: vec![0; 4] }, &set);
+            let [encoder, _] = publisher.threads();
+            if is_wanted(&encoder) {
+                return (publisher, encoder);
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        panic!("{:?}", publisher.threads());
+    }
+
+    #[test]
+    fn views_are_compressed_again_after_a_panic() {
+        let last = Arc::new(AtomicU64::new(0));
+        let of_thread = Arc::clone(&last);
+        let encode = move |frame| {
+            assert!(frame != 1, "frame {frame}");
+            of_thread.store(frame, Ordering::Relaxed);
+        };
+        let (publisher, encoder) = publish_until(encode, |_| last.load(Ordering::Relaxed) > 5);
+        let panic = Some("frame 1".to_owned());
+        assert_eq!(encoder, ThreadHealth { name: "encode".to_owned(), restarts: 1, panic, has_failed: false });
+        assert_eq!(publisher.drops()[1], ("pictures that failed".to_owned(), 1));
+        publisher.finish().unwrap();
+    }
+
+    #[test]
+    fn a_compressor_that_panics_again_and_again_fails_for_good_and_by_name() {
+        let (publisher, encoder) = publish_until(|frame| panic!("frame {frame}"), |encoder| encoder.has_failed);
+        assert_eq!(encoder.restarts, 5);
+        let error = crate::check_threads(publisher.threads()).unwrap_err().to_string();
+        assert!(error.contains("the thread 'encode' panicked again and again: frame "), "{error}");
+    }
 }

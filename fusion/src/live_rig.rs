@@ -5,9 +5,14 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_types::{FrameSet, PersonId};
+use flyrig_types::{FrameSet, PersonId, Restarts, ThreadHealth, ThreadWatch, caught};
 
-use crate::{FusionError, Health, Intake, LivePublisher, LiveViews, Outcome, PersonMemory, Session, resident_mib};
+use crate::{
+    FusionError, Health, Intake, LivePublisher, LiveViews, Outcome, PersonMemory, Session, check_threads, resident_mib,
+};
+
+/// Name of the thread that calls [`LiveRig::step`], in health and errors.
+const PIPELINE: &str = "pipeline";
 
 /// How often what was learnt about the people is read back, to survive the loss of the graphics device.
 const SNAPSHOT_EVERY: Duration = Duration::from_secs(10);
@@ -40,6 +45,10 @@ pub struct LiveRig {
     frames: u64,
     held: u64,
     recovery: Recovery,
+    /// Threads of others that are checked in every step.
+    watched: Vec<ThreadWatch>,
+    pipeline: ThreadHealth,
+    restarts: Restarts,
 }
 
 /// State that survives the loss of the device.
@@ -59,8 +68,27 @@ impl LiveRig {
         if let Some(publisher) = &publisher {
             publisher.publisher().set_max_view_pixels(session.max_view_pixels());
         }
-        let (frames, held, recovery) = Default::default();
-        Self { session, intake, publisher, views, splats: true, started: Instant::now(), frames, held, recovery }
+        let (frames, held, recovery, watched, restarts) = Default::default();
+        Self {
+            session,
+            intake,
+            publisher,
+            views,
+            splats: true,
+            started: Instant::now(),
+            frames,
+            held,
+            recovery,
+            watched,
+            pipeline: ThreadHealth { name: PIPELINE.to_owned(), ..ThreadHealth::default() },
+            restarts,
+        }
+    }
+
+    /// Adds threads of the cameras' side to those whose restarts are reported and whose failure ends the rig.
+    #[must_use]
+    pub fn with_threads(self, watched: Vec<ThreadWatch>) -> Self {
+        Self { watched, ..self }
     }
 
     /// Chooses whether the Gaussians are published as well.
@@ -73,20 +101,31 @@ impl LiveRig {
     /// rig's own views turn with `turn_time`, or with the time since the start.
     ///
     /// A graphics device that is lost, out of memory or rejects a command is opened again, and the people are resumed from
-    /// the last snapshot.
+    /// the last snapshot. After a panic everything is built anew in the same way, as often as [`Restarts`] lets it at once.
     ///
     /// # Errors
-    /// Faults that going on does not mend: the rig must end.
+    /// Faults that going on does not mend: the rig must end. [`FusionError::ThreadFailed`] for a thread that panicked too
+    /// often.
     pub fn step(&mut self, timeout: Duration, turn_time: Option<Duration>) -> Result<Option<LiveStep>, FusionError> {
-        let Some(set) = self.intake.next_set(timeout) else { return Ok(None) };
-        match self.take_in(&set, turn_time) {
-            Ok(outcome) => Ok(Some(LiveStep { set, outcome })),
-            Err(fault) if fault.is_device_fault() => {
+        check_threads(self.other_threads())?;
+        let set = match caught(|| self.intake.next_set(timeout)) {
+            Ok(Some(set)) => set,
+            Ok(None) => return Ok(None),
+            Err(panic) => return self.restart(panic).map(|()| None),
+        };
+        match caught(|| self.take_in(&set, turn_time)) {
+            Ok(Ok(outcome)) => Ok(Some(LiveStep { set, outcome })),
+            Ok(Err(fault)) if fault.is_device_fault() => {
                 self.recover(fault)?;
                 let outcome = Outcome::Held("the graphics device was opened again".to_owned());
                 Ok(Some(LiveStep { set, outcome }))
             }
-            Err(error) => Err(error),
+            Ok(Err(error)) => Err(error),
+            Err(panic) => {
+                let outcome = Outcome::Held(format!("the pipeline was restarted after a panic: {panic}"));
+                self.restart(panic)?;
+                Ok(Some(LiveStep { set, outcome }))
+            }
         }
     }
 
@@ -159,6 +198,32 @@ impl LiveRig {
         Err(fault)
     }
 
+    /// Builds the session anew after a panic: what it left behind may be anything.
+    fn restart(&mut self, panic: String) -> Result<(), FusionError> {
+        tracing::error!("the pipeline panicked: {panic}");
+        let failed = |panic: String| FusionError::ThreadFailed { name: PIPELINE.to_owned(), panic };
+        let due = self.restarts.after_failure(Instant::now());
+        self.pipeline.panic = Some(panic.clone());
+        self.pipeline.has_failed = self.restarts.are_exhausted();
+        if self.pipeline.has_failed {
+            return Err(failed(panic));
+        }
+        std::thread::sleep(due.saturating_duration_since(Instant::now()));
+        let rebuilt = caught(|| {
+            let gpu = self.session.gpu().reopen()?;
+            self.session.rebuild(gpu, &self.recovery.memories)
+        });
+        rebuilt.map_err(failed)??;
+        self.pipeline.restarts += 1;
+        Ok(())
+    }
+
+    /// Returns the health of all threads but the one that calls [`Self::step`].
+    fn other_threads(&self) -> impl Iterator<Item = ThreadHealth> {
+        let publishing = self.publisher.iter().flat_map(LivePublisher::threads);
+        publishing.chain(self.watched.iter().map(ThreadWatch::health))
+    }
+
     /// The publisher, where there is one.
     #[must_use]
     pub fn publisher(&self) -> Option<&LivePublisher> {
@@ -184,6 +249,7 @@ impl LiveRig {
             stages: self.session.stages.summary(),
             resident_mib: resident_mib(),
             device_faults: self.recovery.rebuilt,
+            threads: std::iter::once(self.pipeline.clone()).chain(self.other_threads()).collect(),
             ..self.intake.health()
         }
     }

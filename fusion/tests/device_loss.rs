@@ -5,12 +5,12 @@ mod support;
 
 use std::{collections::BTreeMap, time::Duration};
 
-use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, Pacing};
+use flyrig_capture::Pacing;
 use flyrig_fusion::{InputFormat, Intake, LiveRig, LiveViews, Outcome, OutputSettings, Session, resident_mib};
 use flyrig_sync::SyncSettings;
-use flyrig_types::{CameraId, Frame, FrameSet, Image, Mask, PersonId};
+use flyrig_types::{FrameSet, PersonId};
 
-use support::{frame_set, gpu, images, session};
+use support::{frame_set, gpu, images, played, session};
 
 const RED: [u8; 3] = [220, 40, 30];
 const ME: PersonId = PersonId(0);
@@ -56,44 +56,6 @@ fn a_session_without_a_snapshot_starts_afresh_on_another_device() {
     session.rebuild(reopened, &BTreeMap::new()).unwrap();
     assert_eq!(session.process(&frame_set(2, &images)).unwrap(), Outcome::Updated);
     assert!(colors(&session).iter().filter(|c| c[0] > 4.0 * c[2]).count() > 1000);
-}
-
-/// Plays the frames of one slot.
-struct Played {
-    camera: CameraId,
-    frames: std::vec::IntoIter<Frame>,
-}
-
-impl CameraSource for Played {
-    fn camera(&self) -> &CameraId {
-        &self.camera
-    }
-
-    fn next_frame(&mut self, _: Duration) -> Result<Frame, CaptureError> {
-        let end = || CaptureError::new(&self.camera, CaptureErrorKind::EndOfStream, "played through");
-        self.frames.next().ok_or_else(end)
-    }
-}
-
-fn played(sets: &[FrameSet]) -> Vec<Box<dyn CameraSource>> {
-    let source = |slot: usize| {
-        let copy = |set: &FrameSet| {
-            let frame = set.frames[slot].as_ref().unwrap();
-            let (image, mask) = (&frame.image, frame.mask.as_ref().unwrap());
-            let (width, height) = (image.width(), image.height());
-            Frame {
-                camera: frame.camera.clone(),
-                sequence: frame.sequence,
-                capture_nanos: frame.capture_nanos,
-                exposure_nanos: None,
-                image: Image::new(width, height, image.format(), image.bytes().to_vec()).unwrap(),
-                mask: Some(Mask::new(width, height, mask.coverage().to_vec()).unwrap()),
-            }
-        };
-        let frames: Vec<Frame> = sets.iter().map(copy).collect();
-        Box::new(Played { camera: frames[0].camera.clone(), frames: frames.into_iter() }) as Box<dyn CameraSource>
-    };
-    (0..4).map(source).collect()
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use std::{sync::Arc, time::Duration};
 
-use flyrig_types::{CameraId, Frame};
+use flyrig_types::{CameraId, Frame, ThreadHealth};
 use prost::bytes::Bytes;
 use zenoh::{Wait, liveliness::LivelinessToken};
 
@@ -115,6 +115,12 @@ impl CameraPublisher {
     #[must_use]
     pub fn counts(&self) -> Vec<(CameraId, TopicCounts)> {
         self.cameras.iter().map(|lane| (lane.camera.clone(), lane.frames.counts())).collect()
+    }
+
+    /// Returns the health of the thread that sends.
+    #[must_use]
+    pub fn thread(&self) -> ThreadHealth {
+        self.drain.health()
     }
 
     /// Ends the thread and the session; dropping does the same but says nothing.

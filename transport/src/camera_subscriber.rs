@@ -5,7 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_types::{CameraId, Frame};
+use flyrig_types::{CameraId, Frame, ThreadWatch};
 use zenoh::{Session, Wait, sample::Sample, sample::SampleKind};
 
 use crate::{
@@ -121,6 +121,12 @@ impl CameraSubscriber {
         };
         let asker = Asker::start(session.clone(), clock, hosts, take)?;
         Ok(Self { shared, asker, session, connect: config.connect.clone(), closed: false })
+    }
+
+    /// Returns a view of the thread that compares the clocks.
+    #[must_use]
+    pub fn clock_thread(&self) -> ThreadWatch {
+        self.asker.watch().clone()
     }
 
     /// The oldest frame of a camera that waits; `None` after the timeout.

@@ -5,10 +5,10 @@ use std::{
         Arc,
         atomic::{AtomicBool, Ordering},
     },
-    thread::JoinHandle,
     time::{Duration, Instant},
 };
 
+use flyrig_types::{SupervisedThread, ThreadWatch};
 use zenoh::{
     Session, Wait,
     qos::{CongestionControl, Priority},
@@ -48,7 +48,7 @@ pub(crate) struct Question {
 /// Asks every host again and again, in a thread.
 pub(crate) struct Asker {
     stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<()>>,
+    thread: SupervisedThread,
 }
 
 impl Asker {
@@ -75,20 +75,21 @@ impl Asker {
                 std::thread::park_timeout(EAGER);
             }
         };
-        let thread = std::thread::Builder::new()
-            .name("flyrig-clocks".to_owned())
-            .spawn(work)
-            .map_err(|error| TransportError::session("clock thread", &error))?;
-        Ok(Self { stop, thread: Some(thread) })
+        let thread =
+            SupervisedThread::start("clocks", work).map_err(|error| TransportError::session("clock thread", &error))?;
+        Ok(Self { stop, thread })
+    }
+
+    pub(crate) fn watch(&self) -> &ThreadWatch {
+        self.thread.watch()
     }
 
     pub(crate) fn stop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            thread.thread().unpark();
-            // A panic there has nothing to tell that its absence does not.
-            let _ = thread.join();
+        if let Some(thread) = self.thread.thread() {
+            thread.unpark();
         }
+        self.thread.join();
     }
 }
 
@@ -118,5 +119,49 @@ where
         .wait();
     if let Err(error) = sent {
         tracing::debug!(%error, "a clock could not be asked");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::AtomicU64;
+
+    use super::*;
+    use crate::{TransportConfig, publisher::open_session};
+
+    fn asker(hosts: impl Fn() -> Vec<Question> + Send + 'static) -> Asker {
+        let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
+        let (session, _) = open_session(&config, 1 << 16).unwrap();
+        Asker::start(session, HostClock::new(|| 0), hosts, |_, _, _, _| {}).unwrap()
+    }
+
+    fn wait_until(what: &str, is_true: impl Fn() -> bool) {
+        let deadline = Instant::now() + Duration::from_secs(20);
+        while !is_true() {
+            assert!(Instant::now() < deadline, "{what} did not happen");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    #[test]
+    fn clocks_are_asked_again_after_a_panic() {
+        let asked = Arc::new(AtomicU64::new(0));
+        let of_thread = asked.clone();
+        let mut asker = asker(move || {
+            let turn = of_thread.fetch_add(1, Ordering::Relaxed);
+            assert!(turn != 2, "turn {turn}");
+            Vec::new()
+        });
+        wait_until("more turns", || asked.load(Ordering::Relaxed) > 5);
+        let health = asker.watch().health();
+        assert_eq!((health.name.as_str(), health.restarts, health.panic.as_deref()), ("clocks", 1, Some("turn 2")));
+        asker.stop();
+    }
+
+    #[test]
+    fn an_asker_that_panics_again_and_again_fails_for_good() {
+        let mut asker = asker(|| panic!("no turn works"));
+        wait_until("the end", || asker.watch().health().has_failed);
+        asker.stop();
     }
 }

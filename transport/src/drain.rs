@@ -6,11 +6,11 @@ use std::{
         Arc, Mutex,
         atomic::{AtomicBool, Ordering},
     },
-    thread::JoinHandle,
     time::{Duration, Instant},
 };
 
 use crossbeam::channel::{Receiver, Sender};
+use flyrig_types::{SupervisedThread, ThreadHealth};
 use prost::bytes::Bytes;
 use zenoh::{Session, Wait, qos::CongestionControl};
 
@@ -109,25 +109,41 @@ pub(crate) struct Drain {
 pub(crate) struct DrainThread {
     shared: Arc<Shared>,
     session: Session,
-    thread: Option<JoinHandle<()>>,
+    thread: SupervisedThread,
+    is_stopped: bool,
 }
 
 impl DrainThread {
     pub(crate) fn start(drain: Drain) -> Result<Self, TransportError> {
+        Self::start_with(drain, || {})
+    }
+
+    /// Calls `each_turn` in every turn of the thread: for tests, which let it panic.
+    fn start_with(drain: Drain, each_turn: impl Fn() + Send + 'static) -> Result<Self, TransportError> {
         let (shared, session) = (drain.shared.clone(), drain.session.clone());
-        let thread = std::thread::Builder::new()
-            .name("flyrig-publish".to_owned())
-            .spawn(move || drain.run())
+        let thread = SupervisedThread::start("publish", move || drain.run(&each_turn))
             .map_err(|error| TransportError::session("publisher thread", &error))?;
-        Ok(Self { shared, session, thread: Some(thread) })
+        Ok(Self { shared, session, thread, is_stopped: false })
+    }
+
+    pub(crate) fn health(&self) -> ThreadHealth {
+        self.thread.health()
     }
 
     /// Ends both; the second time nothing.
     pub(crate) fn stop(&mut self) -> Result<(), TransportError> {
-        let Some(thread) = self.thread.take() else { return Ok(()) };
+        if std::mem::replace(&mut self.is_stopped, true) {
+            return Ok(());
+        }
         self.shared.stop.store(true, Ordering::Relaxed);
         self.shared.wake();
-        let joined = thread.join().map_err(|_| TransportError::session("publisher thread", &"it panicked"));
+        self.thread.join();
+        let joined = match self.thread.health() {
+            ThreadHealth { panic: Some(text), has_failed: true, .. } => {
+                Err(TransportError::session("publisher thread", &format!("it panicked again and again: {text}")))
+            }
+            _ => Ok(()),
+        };
         let closed = self.session.close().wait().map_err(|error| TransportError::session("closing", &error));
         joined.and(closed)
     }
@@ -142,12 +158,13 @@ impl Drop for DrainThread {
 }
 
 impl Drain {
-    /// Runs until told to stop.
-    fn run(self) {
+    /// Runs until it is stopped. After a panic it can be called again: it declares its publishers anew.
+    fn run(&self, each_turn: &impl Fn()) {
         let mut lanes: Vec<Lane> = Vec::new();
         let mut next_tick = Instant::now();
         let mut next_repeat = Instant::now();
         while !self.shared.stop.load(Ordering::Relaxed) {
+            each_turn();
             let now = Instant::now();
             if now >= next_tick {
                 next_tick = now + TICK;
@@ -243,5 +260,68 @@ pub(crate) fn empty_header() -> Header {
         publisher: 0,
         width: 0,
         height: 0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::AtomicU64;
+
+    use super::*;
+    use crate::{TransportConfig, publisher::open_session};
+
+    /// A drain of one topic, and how it is offered a message.
+    fn drain() -> (Drain, Arc<Topic>) {
+        let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
+        let (session, _) = open_session(&config, 1 << 16).unwrap();
+        let topic = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
+        let leases = Leases::new(0, Duration::ZERO, 0);
+        let (shared, woken) = Shared::new("drill", &session, std::slice::from_ref(&topic), leases);
+        (Drain { shared, session, express: false, woken }, topic)
+    }
+
+    fn wait_until(what: &str, is_true: impl Fn() -> bool) {
+        let deadline = Instant::now() + Duration::from_secs(20);
+        while !is_true() {
+            assert!(Instant::now() < deadline, "{what} did not happen");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    #[test]
+    fn publishing_goes_on_after_a_panic() {
+        let (drain, topic) = drain();
+        let heard = Arc::new(AtomicU64::new(0));
+        let of_callback = heard.clone();
+        let subscriber = drain.session.declare_subscriber(keys::key("drill", "stats"));
+        let _subscriber = subscriber
+            .callback(move |_| {
+                of_callback.fetch_add(1, Ordering::Relaxed);
+            })
+            .wait()
+            .unwrap();
+        let turns = AtomicU64::new(0);
+        let mut thread = DrainThread::start_with(drain, move || {
+            let turn = turns.fetch_add(1, Ordering::Relaxed);
+            assert!(turn != 1 && turn != 3, "turn {turn}");
+        })
+        .unwrap();
+        wait_until("two restarts", || thread.health().restarts == 2);
+        wait_until("a message", || {
+            topic.offer(Body::Bytes(Bytes::from_static(b"{}")), empty_header());
+            heard.load(Ordering::Relaxed) > 0
+        });
+        let health = thread.health();
+        assert_eq!((health.name.as_str(), health.panic.as_deref()), ("publish", Some("turn 3")));
+        thread.stop().unwrap();
+    }
+
+    #[test]
+    fn a_publisher_that_panics_again_and_again_says_so_at_its_end() {
+        let (drain, _) = drain();
+        let mut thread = DrainThread::start_with(drain, || panic!("no turn works")).unwrap();
+        wait_until("the end", || thread.health().has_failed);
+        let error = thread.stop().unwrap_err().to_string();
+        assert!(error.contains("it panicked again and again: no turn works"), "{error}");
     }
 }

@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_types::Rig;
+use flyrig_types::{Rig, ThreadHealth};
 use prost::bytes::Bytes;
 use zenoh::{Session, Wait, liveliness::LivelinessToken, query::Query, sample::SampleKind};
 
@@ -260,6 +260,12 @@ impl Publisher {
     #[must_use]
     pub fn counts(&self) -> Vec<(String, TopicCounts)> {
         lock(&self.shared.topics).iter().map(|(label, topic)| (label.clone(), topic.counts())).collect()
+    }
+
+    /// Returns the health of the thread that sends.
+    #[must_use]
+    pub fn thread(&self) -> ThreadHealth {
+        self.drain.health()
     }
 
     /// Ends the thread and the session; dropping does the same but says nothing.

@@ -8,10 +8,10 @@ use std::{
     thread::Builder,
 };
 
-use flyrig_types::{CameraId, PixelBuffer};
+use flyrig_types::{CameraId, PixelBuffer, caught};
 
 use super::{BlockingCamera, Opener, Shot};
-use crate::{BufferPool, CaptureError, CaptureErrorKind, LatestQueue, panics::caught};
+use crate::{BufferPool, CaptureError, CaptureErrorKind, LatestQueue};
 
 /// Frames that may wait for the camera's own thread: one to take next, one for jitter.
 const WAITING: usize = 2;

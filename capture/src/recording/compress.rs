@@ -6,10 +6,10 @@ use std::{
     time::Duration,
 };
 
-use flyrig_types::{CameraId, Frame, Image};
+use flyrig_types::{CameraId, Frame, Image, caught};
 
 use super::outlet::Outlet;
-use crate::{BufferPool, CaptureError, CaptureErrorKind, JpegEncoding, LatestQueue, panics::caught};
+use crate::{BufferPool, CaptureError, CaptureErrorKind, JpegEncoding, LatestQueue};
 
 /// Pictures of a camera that may wait for their compression: a quarter of a second of 30 frames a second.
 const WAITING: usize = 8;

@@ -12,6 +12,7 @@ use std::{
 };
 
 use crossbeam::channel::{Receiver, RecvTimeoutError, bounded};
+use flyrig_types::caught;
 use mcap::{McapError, McapResult};
 
 use super::{
@@ -22,7 +23,7 @@ use super::{
     rotation::Rotation,
     tap::{MessageTap, Recording, SourceTap},
 };
-use crate::{CameraSource, CaptureError, CaptureErrorKind, panics::caught};
+use crate::{CameraSource, CaptureError, CaptureErrorKind};
 
 /// Free space that a recording leaves on its file system by default, bytes: room for its index, and for
 /// whatever else the machine writes.

@@ -3,7 +3,6 @@
 mod course;
 mod opener;
 mod pulse;
-mod restarts;
 mod shared;
 
 use std::{

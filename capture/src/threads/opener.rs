@@ -3,10 +3,10 @@
 use std::{fmt, sync::Arc, thread::Builder};
 
 use crossbeam::channel::{Receiver, Sender, bounded};
-use flyrig_types::CameraId;
+use flyrig_types::{CameraId, caught};
 
 use super::pulse::Pulse;
-use crate::{CameraSource, CaptureError, CaptureErrorKind, SourceTap, panics::caught};
+use crate::{CameraSource, CaptureError, CaptureErrorKind, SourceTap};
 
 type Source = Box<dyn CameraSource>;
 type Open = Box<dyn FnMut() -> Result<Source, CaptureError> + Send>;

@@ -6,10 +6,10 @@ use std::{
 };
 
 use crossbeam::channel::RecvTimeoutError;
-use flyrig_types::{CameraId, Frame};
+use flyrig_types::{CameraId, Frame, Restarts, caught};
 
-use super::{CameraStats, Pacing, course::Course, opener::Opening, pulse::Pulse, restarts::Restarts};
-use crate::{CameraSource, CaptureError, CaptureErrorKind, LatestQueue, panics::caught, stage::Hand, turns::Turns};
+use super::{CameraStats, Pacing, course::Course, opener::Opening, pulse::Pulse};
+use crate::{CameraSource, CaptureError, CaptureErrorKind, LatestQueue, stage::Hand, turns::Turns};
 
 /// How long a source may wait for a frame before its thread looks whether it shall stop.
 const POLL: Duration = Duration::from_millis(200);

@@ -1,13 +1,18 @@
 //! A small scene for sessions: cameras on a circle, people of the built-in body who stand still, painted silhouettes.
 #![allow(dead_code, clippy::unwrap_used)] // each test uses a part; a test may fail by panicking
 
-use std::sync::{Arc, OnceLock};
+use std::{
+    sync::{Arc, OnceLock},
+    time::Duration,
+};
 
 use flyrig_body::{ShapeParams, Template, default_template};
+use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind};
 use flyrig_fusion::{BodySettings, GivenPerception, GivenPerson, Session, SessionBuilder, SessionSettings};
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_types::{
-    Camera, Frame, FrameSet, Image, Intrinsics, Isometry, Lens, Mask, PersonId, PixelFormat, Pose, PoseTrack, Rig,
+    Camera, CameraId, Frame, FrameSet, Image, Intrinsics, Isometry, Lens, Mask, PersonId, PixelFormat, Pose, PoseTrack,
+    Rig,
 };
 use glam::{DVec2, DVec3};
 
@@ -115,4 +120,43 @@ pub fn images(people: &[(f64, [u8; 3])]) -> Vec<(Vec<u8>, Vec<u8>)> {
         (rgb, mask)
     };
     rig().cameras.iter().enumerate().map(of).collect()
+}
+
+/// Plays the frames of one slot.
+struct Played {
+    camera: CameraId,
+    frames: std::vec::IntoIter<Frame>,
+}
+
+impl CameraSource for Played {
+    fn camera(&self) -> &CameraId {
+        &self.camera
+    }
+
+    fn next_frame(&mut self, _: Duration) -> Result<Frame, CaptureError> {
+        let end = || CaptureError::new(&self.camera, CaptureErrorKind::EndOfStream, "played through");
+        self.frames.next().ok_or_else(end)
+    }
+}
+
+/// Cameras that play sets through.
+pub fn played(sets: &[FrameSet]) -> Vec<Box<dyn CameraSource>> {
+    let source = |slot: usize| {
+        let copy = |set: &FrameSet| {
+            let frame = set.frames[slot].as_ref().unwrap();
+            let (image, mask) = (&frame.image, frame.mask.as_ref().unwrap());
+            let (width, height) = (image.width(), image.height());
+            Frame {
+                camera: frame.camera.clone(),
+                sequence: frame.sequence,
+                capture_nanos: frame.capture_nanos,
+                exposure_nanos: None,
+                image: Image::new(width, height, image.format(), image.bytes().to_vec()).unwrap(),
+                mask: Some(Mask::new(width, height, mask.coverage().to_vec()).unwrap()),
+            }
+        };
+        let frames: Vec<Frame> = sets.iter().map(copy).collect();
+        Box::new(Played { camera: frames[0].camera.clone(), frames: frames.into_iter() }) as Box<dyn CameraSource>
+    };
+    (0..4).map(source).collect()
 }

@@ -1,23 +1,24 @@
-//! How often a source is opened anew.
+//! How often work that failed is begun anew.
 
 use std::time::{Duration, Instant};
 
-/// So many restarts follow each other at once, each of a source that worked for less than [`WINDOW`].
+/// So many restarts follow each other at once, each of work that lasted for less than [`WINDOW`].
 const AT_ONCE: u32 = 5;
 /// After these one restart is made in so long.
 const WINDOW: Duration = Duration::from_secs(60);
 /// A restart is never earlier after the failure.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// Spaces the restarts of one source out: one that fails for ever must not keep a core and a bus busy.
+/// Spaces the restarts of one source or thread out: one that fails for ever must not keep a core and a bus busy. Five follow
+/// each other at once, then one a minute; whoever cannot wait so long gives up when they are [exhausted](Self::are_exhausted).
 #[derive(Debug, Default)]
-pub(super) struct Restarts {
+pub struct Restarts {
     last: Option<Instant>,
     in_a_row: u32,
 }
 
 impl Restarts {
-    /// Returns when a source that has failed `now` may be opened anew, and counts that restart.
+    /// Returns when work that has failed `now` may be begun anew, and counts that restart.
     pub fn after_failure(&mut self, now: Instant) -> Instant {
         if self.last.is_some_and(|last| now.saturating_duration_since(last) >= WINDOW) {
             self.in_a_row = 0;
@@ -30,6 +31,12 @@ impl Restarts {
         self.last = Some(due);
         due
     }
+
+    /// Returns whether the restart counted last is beyond those that may follow each other at once.
+    #[must_use]
+    pub fn are_exhausted(&self) -> bool {
+        self.in_a_row > AT_ONCE
+    }
 }
 
 #[cfg(test)]
@@ -37,18 +44,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_source_that_fails_at_once_gets_five_restarts_and_then_one_a_minute() {
+    fn what_fails_at_once_gets_five_restarts_and_then_one_a_minute() {
         let (start, mut restarts) = (Instant::now(), Restarts::default());
         let mut now = start;
         let mut times = Vec::new();
-        for _ in 0..8 {
+        for count in 1..=8 {
             now = restarts.after_failure(now);
             times.push((now - start).as_millis());
+            assert_eq!(restarts.are_exhausted(), count > 5);
         }
         assert_eq!(times, [100, 200, 300, 400, 500, 60_500, 120_500, 180_500]);
         // One that has worked for a minute starts over.
         now = restarts.after_failure(now + WINDOW);
         assert_eq!((now - start).as_millis(), 240_600);
+        assert!(!restarts.are_exhausted());
         assert_eq!(restarts.after_failure(now) - now, PAUSE);
     }
 }

@@ -1,4 +1,4 @@
-//! Panics in code of others.
+//! Panics, caught.
 
 use std::{
     any::Any,
@@ -10,8 +10,11 @@ fn panic_text(panic: &(dyn Any + Send)) -> &str {
     panic.downcast_ref::<&str>().copied().or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("?")
 }
 
-/// Runs a call, or returns the text of its panic. What the call has touched must be whole afterwards, or dropped.
-pub(crate) fn caught<T>(call: impl FnOnce() -> T) -> Result<T, String> {
+/// Runs a call. Everything that the call has touched must be whole after a panic, or dropped.
+///
+/// # Errors
+/// The text of its panic.
+pub fn caught<T>(call: impl FnOnce() -> T) -> Result<T, String> {
     catch_unwind(AssertUnwindSafe(call)).map_err(|panic| {
         let text = panic_text(&*panic).to_owned();
         // What the panic carries is somebody else's code too.
