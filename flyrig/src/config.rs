@@ -328,7 +328,23 @@ mod tests {
             all.iter().flat_map(of).collect()
         }
         let all = toml::Table::try_from(Config::default()).unwrap();
-        assert_eq!(missing(&all, &DEFAULT_TOML.parse().unwrap(), ""), Vec::<String>::new());
+        // It stands there as a comment, since it would exclude tables of real cameras.
+        let names = "# cameras = [\"00\", \"03\", \"05\"]\n";
+        assert_eq!(missing(&all, &DEFAULT_TOML.parse().unwrap(), ""), ["source.cameras"]);
+        let uncommented = DEFAULT_TOML.replace(names, &names[2..]);
+        assert_ne!(uncommented, DEFAULT_TOML);
+        assert_eq!(Config::parse(&uncommented).unwrap(), Config::default());
+        assert_eq!(missing(&all, &uncommented.parse().unwrap(), ""), Vec::<String>::new());
+    }
+
+    #[test]
+    fn real_cameras_can_be_added_to_the_printed_default() {
+        let tables = "\n[[source.cameras]]\nname = \"left\"\nserial = \"A1\"\nsize = [1280, 720]\n";
+        let text = format!("{}{tables}", DEFAULT_TOML.replace("kind = \"sim\"", "kind = \"cameras\""));
+        let text = text.replacen("path = \"\"", "path = \"calibration\"", 1);
+        let text = text.replace("pose = \"given\"", "pose = \"estimated\"");
+        let config = Config::parse(&text).unwrap();
+        assert_eq!(config.source.names(), ["left"]);
     }
 
     #[test]

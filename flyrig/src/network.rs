@@ -7,7 +7,7 @@ use std::{
 
 use anyhow::{Context as _, Result};
 use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, NetworkHealth, SourceHealth, SourceOpener};
-use flyrig_transport::{CameraSubscriber, HostClock, TransportConfig, TransportErrorKind};
+use flyrig_transport::{CameraLink, CameraStatus, CameraSubscriber, HostClock, TransportConfig, TransportErrorKind};
 use flyrig_types::{CameraId, Frame, Rig, ThreadWatch};
 
 /// A camera that was there is silent after this.
@@ -56,16 +56,21 @@ struct NetworkCamera {
     is_missed: bool,
     returns: u64,
     silences: u64,
+    /// The link when this was opened. It goes on counting while a camera is opened anew, and the counts of earlier sources
+    /// are kept elsewhere.
+    opened: CameraLink,
     health: SourceHealth,
     health_at: Option<Instant>,
 }
 
 impl NetworkCamera {
     fn new(camera: CameraId, size: (u32, u32), subscriber: Arc<CameraSubscriber>) -> Self {
+        let opened = subscriber.link(&camera);
         Self {
             camera,
             size,
             subscriber,
+            opened,
             heard: Instant::now(),
             has_come: false,
             is_missed: false,
@@ -97,24 +102,38 @@ impl NetworkCamera {
         }
         self.health_at = Some(Instant::now());
         let link = self.subscriber.link(&self.camera);
-        let status = link.status.unwrap_or_default();
-        if *self.health.mode != *status.mode {
-            self.health.mode = status.mode.as_str().into();
+        let mut health = health_since(&link, &self.opened);
+        health.reconnects = health.reconnects.saturating_add(self.returns);
+        health.silences = health.silences.saturating_add(self.silences);
+        if health.mode == self.health.mode {
+            health.mode = Arc::clone(&self.health.mode);
         }
-        self.health.lost_by_driver = status.lost_by_driver;
-        self.health.stamps_replaced = status.stamps_replaced;
-        self.health.reconnects = status.reconnects.saturating_add(self.returns);
-        self.health.silences = status.silences.saturating_add(self.silences);
-        self.health.network = Some(NetworkHealth {
-            overtaken_before: link.withheld,
-            lost_on_the_way: link.lost,
-            overtaken_here: link.overtaken,
-            refused: link.refused,
-            before_clock: link.before_clock,
+        self.health = health;
+    }
+}
+
+/// Returns the health of a link, counted since it was as in `opened`.
+fn health_since(link: &CameraLink, opened: &CameraLink) -> SourceHealth {
+    // A camera's computer that starts anew counts from 0.
+    let since = |now: u64, then: u64| now.checked_sub(then).unwrap_or(now);
+    let (no_status, none) = (CameraStatus::default(), CameraStatus::default());
+    let (status, then) = (link.status.as_ref().unwrap_or(&no_status), opened.status.as_ref().unwrap_or(&none));
+    SourceHealth {
+        lost_by_driver: since(status.lost_by_driver, then.lost_by_driver),
+        reconnects: since(status.reconnects, then.reconnects),
+        silences: since(status.silences, then.silences),
+        stamps_replaced: since(status.stamps_replaced, then.stamps_replaced),
+        mode: status.mode.as_str().into(),
+        network: Some(NetworkHealth {
+            overtaken_before: since(link.withheld, opened.withheld),
+            lost_on_the_way: since(link.lost, opened.lost),
+            overtaken_here: since(link.overtaken, opened.overtaken),
+            refused: since(link.refused, opened.refused),
+            before_clock: since(link.before_clock, opened.before_clock),
             clock_offset_nanos: link.clock.map(|clock| clock.offset_nanos),
             clock_drift_ppb: link.clock.map_or(0, |clock| (clock.drift_ppm * 1e3) as i64),
             round_trip_nanos: link.clock.map_or(0, |clock| clock.round_trip_nanos.unsigned_abs()),
-        });
+        }),
     }
 }
 
@@ -153,5 +172,29 @@ impl CameraSource for NetworkCamera {
 
     fn health(&self) -> SourceHealth {
         self.health.clone()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_camera_that_is_opened_anew_counts_nothing_twice() {
+        let link = |lost, reconnects| CameraLink {
+            lost,
+            status: Some(CameraStatus { reconnects, mode: "YUYV".to_owned(), ..CameraStatus::default() }),
+            ..CameraLink::default()
+        };
+        let counts = |now: &CameraLink, opened: &CameraLink| {
+            let health = health_since(now, opened);
+            (health.network.unwrap().lost_on_the_way, health.reconnects)
+        };
+        assert_eq!(counts(&link(5, 2), &CameraLink::default()), (5, 2));
+        let opened = link(5, 2);
+        assert_eq!(counts(&opened, &opened), (0, 0), "these belong to the source before");
+        assert_eq!(counts(&link(8, 3), &opened), (3, 1));
+        assert_eq!(counts(&link(8, 1), &opened), (3, 1), "its computer has counted anew");
+        assert_eq!(&*health_since(&link(8, 1), &opened).mode, "YUYV");
     }
 }

@@ -55,12 +55,8 @@ impl Drawing {
         let gaussians = match people {
             [one] => one,
             people => {
-                self.join(gpu, &mut encoder, people)?;
-                match &self.joined {
-                    Some(joined) => joined,
-                    // Not reached: joining makes it.
-                    None => return Ok(RenderedView { width, height, rgba: Vec::new() }),
-                }
+                let is_current = std::mem::replace(&mut self.is_current, true);
+                join(gpu, &mut encoder, people, &mut self.joined, is_current)?
             }
         };
         let settings = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
@@ -74,31 +70,29 @@ impl Drawing {
         self.targets.push(target);
         Ok(RenderedView { width, height, rgba })
     }
+}
 
-    /// Copies the people's Gaussians into one set of buffers, unless they are there already.
-    fn join(
-        &mut self,
-        gpu: &GpuContext,
-        encoder: &mut wgpu::CommandEncoder,
-        people: &[&GaussianBuffers],
-    ) -> Result<(), FusionError> {
-        let count = people.iter().map(|gaussians| gaussians.count()).sum();
-        let joined = match self.joined.take().filter(|joined| joined.count() == count) {
-            Some(joined) => joined,
-            None => {
-                self.is_current = false;
-                GaussianBuffers::zeroed(gpu, count)?
-            }
-        };
-        if !self.is_current {
-            let mut first = 0;
-            for gaussians in people {
-                gaussians.encode_copy(encoder, &joined, first);
-                first += gaussians.count();
-            }
-            self.is_current = true;
+/// Returns the people's Gaussians in one set of buffers; those of `joined` are kept if they are current.
+fn join<'a>(
+    gpu: &GpuContext,
+    encoder: &mut wgpu::CommandEncoder,
+    people: &[&GaussianBuffers],
+    joined: &'a mut Option<GaussianBuffers>,
+    is_current: bool,
+) -> Result<&'a GaussianBuffers, FusionError> {
+    let count = people.iter().map(|gaussians| gaussians.count()).sum();
+    let known = joined.take().filter(|known| known.count() == count);
+    let is_current = is_current && known.is_some();
+    let buffers = match known {
+        Some(known) => known,
+        None => GaussianBuffers::zeroed(gpu, count)?,
+    };
+    if !is_current {
+        let mut first = 0;
+        for gaussians in people {
+            gaussians.encode_copy(encoder, &buffers, first);
+            first += gaussians.count();
         }
-        self.joined = Some(joined);
-        Ok(())
     }
+    Ok(joined.insert(buffers))
 }
