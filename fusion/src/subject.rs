@@ -6,7 +6,7 @@ use flyrig_body::{
     DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, SurfaceGaussians, Template, build_graph, sample_surface, skin_mesh,
 };
 use flyrig_capture::to_rgb8;
-use flyrig_gpu::{GpuContext, StorageBuffer};
+use flyrig_gpu::{GpuContext, StageTimer, StorageBuffer};
 use flyrig_renderer::{
     AppearanceSettings, DirectAppearance, GaussianBuffers, Observations, Outputs, RasterSettings, Rasterizer,
     RenderTarget, Splat, UNKNOWN_RGBA, ViewInput, read_splats,
@@ -27,6 +27,8 @@ use crate::{
 const SURFACE_SEED: u64 = 1;
 /// Stage of the processor time that the deformation took, over all threads of the process.
 pub const PROCESSOR_STAGE: &str = "  processor";
+/// Stages of an update that the adapter times.
+const TIMED_STAGES: [&str; 3] = ["skinning", "visibility", "appearance"];
 /// Coverage by other people from which a pixel says nothing about this person.
 const OTHERS_COVER: u8 = 128;
 
@@ -86,6 +88,8 @@ pub struct Subject {
     settings: AppearanceSettings,
     body: BodyGraph,
     networks: Option<Networks>,
+    /// Of [`TIMED_STAGES`].
+    timer: StageTimer,
     /// Views that painted in the last update.
     painted: Vec<usize>,
     /// A target an input view; grows with the rig, remade when an image's size changes.
@@ -159,6 +163,7 @@ impl Subject {
             appearance: DirectAppearance::new(gpu, surface, graph, rig.cameras.len())?,
             body: BodyGraph::new(surface, graph)?,
             networks: None,
+            timer: StageTimer::new(gpu, TIMED_STAGES.len() as u32),
             painted: Vec::new(),
             template,
             gaussians,
@@ -278,6 +283,9 @@ impl Subject {
         stages: &mut StageTimes,
     ) -> Result<(), FusionError> {
         stages.time("convert pictures", || self.take_images(gpu, views))?;
+        // One update at a time is under way, and none while the processor's time is measured.
+        gpu.wait()?;
+        self.collect_times(stages);
 
         // The instant itself, and each other one that a picture was taken at.
         let mut instants = vec![pose];
@@ -335,15 +343,25 @@ impl Subject {
         let start = Instant::now();
         let corrected: Vec<Pose> = instants.iter().map(|(pose, _)| self.corrected(pose)).collect();
         let displacement = self.deformation.as_ref().map(Deformation::displacement);
-        for (pose, (_, gaussians)) in corrected.iter().zip(&instants) {
+        for (i, (pose, (_, gaussians))) in corrected.iter().zip(&instants).enumerate() {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            if i == 0 {
+                self.timer.begin(&mut encoder);
+            }
             let (centers, normals) = (&gaussians.center_scale, &gaussians.normal);
             let skeleton = &self.template.skeleton;
             self.skinner.encode(gpu, &mut encoder, skeleton, pose, displacement, centers, normals)?;
+            if i + 1 == instants.len() {
+                self.timer.mark(&mut encoder, TIMED_STAGES[0]);
+            }
             gpu.queue.submit([encoder.finish()]);
         }
-        gpu.wait()?;
-        stages.add("skinning", start.elapsed());
+        // Waits that only a clock on this side needs.
+        let has_timer = self.timer.is_supported();
+        if !has_timer {
+            gpu.wait()?;
+            stages.add(TIMED_STAGES[0], start.elapsed());
+        }
 
         if let Some(direct) = &self.direct_colors {
             // Direct appearance goes on from its own colours.
@@ -374,10 +392,15 @@ impl Subject {
                 &settings,
                 &self.visibility[i],
             )?;
+            if i + 1 == views.len() {
+                self.timer.mark(&mut encoder, TIMED_STAGES[1]);
+            }
             gpu.queue.submit([encoder.finish()]);
         }
-        gpu.wait()?;
-        stages.add("visibility", start.elapsed());
+        if !has_timer {
+            gpu.wait()?;
+            stages.add(TIMED_STAGES[1], start.elapsed());
+        }
 
         let start = Instant::now();
         // A view that is not believed paints nothing.
@@ -395,11 +418,27 @@ impl Subject {
             })
             .collect();
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        if views.is_empty() {
+            self.timer.mark(&mut encoder, TIMED_STAGES[1]);
+        }
         self.appearance.update(gpu, &mut encoder, &self.gaussians, &inputs, &self.settings)?;
+        self.timer.mark(&mut encoder, TIMED_STAGES[2]);
+        self.timer.finish(&mut encoder);
         gpu.queue.submit([encoder.finish()]);
-        gpu.wait()?;
-        stages.add("appearance", start.elapsed());
+        if !has_timer || self.networks.is_some() {
+            gpu.wait()?;
+        }
+        if !has_timer {
+            stages.add(TIMED_STAGES[2], start.elapsed());
+        }
         self.paint_learned(gpu, stages)
+    }
+
+    /// Adds the adapter's times of updates that were waited for.
+    pub(crate) fn collect_times(&mut self, stages: &mut StageTimes) {
+        for stage in self.timer.collect() {
+            stages.add(stage.name, stage.time);
+        }
     }
 
     /// Lets the networks add to what direct appearance painted.
