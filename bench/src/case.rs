@@ -2,8 +2,8 @@
 
 use anyhow::{Context, Result};
 use flyrig_fusion::{
-    BodySettings, DeformOptions, GivenPerception, Origin, PROCESSOR_STAGE, PersonId, Session, SessionBuilder,
-    SessionSettings, Solver, Subject, TrackingSettings,
+    BodySettings, DeformOptions, GivenPerception, PROCESSOR_STAGE, PersonId, Session, SessionBuilder, SessionSettings,
+    Solver, Subject, TrackingSettings,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
@@ -76,7 +76,7 @@ impl Case {
             Solver::Paper => "paper",
             Solver::GaussNewton => "default",
         };
-        Self { variant: variant.to_owned(), solver, options: solver.options(Origin::Given), gaussians, views, sequence }
+        Self { variant: variant.to_owned(), solver, options: solver.options(), gaussians, views, sequence }
     }
 
     /// The same but for one thing.

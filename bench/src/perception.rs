@@ -19,8 +19,20 @@ use crate::{cli::BenchPerceptionArgs, mask_errors::MaskErrors};
 
 /// Joints that are compared, by the names of the CMU skeleton.
 const JOINTS: [&str; 14] = [
-    "Hips", "Head", "LeftArm", "RightArm", "LeftForeArm", "RightForeArm", "LeftHand", "RightHand", "LeftUpLeg",
-    "RightUpLeg", "LeftLeg", "RightLeg", "LeftFoot", "RightFoot",
+    "Hips",
+    "Head",
+    "LeftArm",
+    "RightArm",
+    "LeftForeArm",
+    "RightForeArm",
+    "LeftHand",
+    "RightHand",
+    "LeftUpLeg",
+    "RightUpLeg",
+    "LeftLeg",
+    "RightLeg",
+    "LeftFoot",
+    "RightFoot",
 ];
 
 /// Sources of the pose, the shape and the masks.
@@ -67,7 +79,8 @@ struct Row {
 /// Runs the command.
 pub fn perception(args: &BenchPerceptionArgs, gpu: &GpuContext) -> Result<()> {
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let chosen: Vec<Inputs> = ROWS.into_iter().filter(|row| args.only.is_empty() || args.only.contains(&code(*row))).collect();
+    let chosen: Vec<Inputs> =
+        ROWS.into_iter().filter(|row| args.only.is_empty() || args.only.contains(&code(*row))).collect();
     ensure!(!chosen.is_empty(), "--only names none of: {}", ROWS.map(code).join(", "));
     let mut rows = Vec::new();
     for folder in &args.datasets {
@@ -158,7 +171,9 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         stages_ms: stages.into_iter().map(|s| (s.name.trim().to_owned(), f64::from(s.mean_ms))).collect(),
     };
     eprint!("{}", table(std::slice::from_ref(&row)).lines().skip(2).map(|l| format!("{l}\n")).collect::<String>());
-    let list = |values: &BTreeMap<String, f64>| values.iter().map(|(n, v)| format!("{n} {v:.0}")).collect::<Vec<_>>().join(", ");
+    let list = |values: &BTreeMap<String, f64>| {
+        values.iter().map(|(n, v)| format!("{n} {v:.0}")).collect::<Vec<_>>().join(", ")
+    };
     eprintln!("  mm: {}\n  degrees: {}", list(&row.joints_mm), list(&row.turns_deg));
     Ok(row)
 }

@@ -290,6 +290,15 @@ pub struct DemoArgs {
     /// TOML file with faults of cameras and clocks, like sim/assets/faults.toml.
     #[arg(long)]
     pub faults: Option<PathBuf>,
+    /// Pose from the images, or from the simulator.
+    #[arg(long, value_enum, default_value = "estimated")]
+    pub pose: Origin,
+    /// Masks from the images and the empty room, or from the simulator.
+    #[arg(long, value_enum, default_value = "estimated")]
+    pub masks: Origin,
+    /// Shape of the body from the images, or from the simulator; by default from where the pose comes.
+    #[arg(long, value_enum)]
+    pub shape: Option<Origin>,
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT)]
     pub gaussians: usize,

@@ -8,10 +8,12 @@ use std::{
 };
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
+use flyrig_body::{ShapeParams, default_template};
 use flyrig_capture::{CameraSource, Pacing};
 use flyrig_fusion::{
-    AppearanceMode, AppearanceOptions, BodySettings, GivenPerception, InputFormat, Intake, LivePublisher, LiveRig,
-    LiveViews, OutputSettings, Session, SessionBuilder, SessionSettings, StageSummary, resident_mib,
+    AppearanceMode, AppearanceOptions, BodySettings, EstimatedPerception, GivenPerception, InputFormat, Intake,
+    LivePublisher, LiveRig, LiveViews, Origin, OutputSettings, SHAPE_SECS, SHAPE_SETS, Session, SessionBuilder,
+    SessionSettings, StageSummary, resident_mib,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
@@ -19,7 +21,7 @@ use flyrig_report::{ContactRow, Curve, Report, contact_pictures, dataset, png, p
 use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
 use flyrig_sync::SyncSettings;
 use flyrig_transport::{Publisher, TransportConfig};
-use flyrig_types::{Camera, FrameSet};
+use flyrig_types::{Camera, Frame, FrameSet, Image, Rig};
 use indicatif::ProgressBar;
 use serde::{Deserialize as _, Serialize, de::IntoDeserializer as _};
 
@@ -183,10 +185,7 @@ fn pass(
     appearance: &AppearanceOptions,
     publisher: Option<LivePublisher>,
 ) -> Result<Pass> {
-    let (rig, template, track) = {
-        let simulator = lock(simulator)?;
-        (simulator.rig().clone(), simulator.template().clone(), simulator.track().clone())
-    };
+    let rig = lock(simulator)?.rig().clone();
     let inputs = dataset::pick(&rig, &INPUTS.map(str::to_owned), "the simulated rig")?;
     let held_out = dataset::pick(&rig, &HELD_OUT.map(str::to_owned), "the simulated rig")?.cameras;
     let sources: Vec<Box<dyn CameraSource>> = flyrig_sim::sources(simulator, SimTime::Exact)
@@ -195,12 +194,25 @@ fn pass(
         .map(|source| Box::new(source) as Box<dyn CameraSource>)
         .collect();
     let settings = SessionSettings {
-        body: BodySettings { gaussians: args.gaussians, ..BodySettings::default() },
+        body: BodySettings {
+            gaussians: args.gaussians,
+            pose: args.pose,
+            masks: args.masks,
+            shape: args.shape,
+            ..BodySettings::default()
+        },
         tracking: args.tracking.clone(),
         appearance: appearance.clone(),
     };
-    let perception = GivenPerception::repeating(&inputs, template, track);
-    let session = SessionBuilder::new(gpu.clone(), inputs).settings(settings).perception(perception).build()?;
+    let builder = SessionBuilder::new(gpu.clone(), inputs.clone()).settings(settings);
+    let session = match args.pose {
+        Origin::Given => {
+            let simulator = lock(simulator)?;
+            let given = GivenPerception::repeating(&inputs, simulator.template().clone(), simulator.track().clone());
+            builder.perception(given.with_masks(args.masks, plates(&simulator, &inputs)?)).build()?
+        }
+        Origin::Estimated => builder.perception(find_person(args, simulator, &inputs)?).build()?,
+    };
     if let Some(publisher) = &publisher {
         publisher.publisher().set_calibration(session.rig())?;
     }
@@ -253,6 +265,49 @@ fn pass(
     pass.drops = live.drops();
     live.finish()?;
     Ok(pass)
+}
+
+/// Looks for the person as in front of real cameras; only the simulator knows the shape otherwise.
+fn find_person(args: &DemoArgs, simulator: &Mutex<Simulator>, inputs: &Rig) -> Result<EstimatedPerception> {
+    let mut simulator = lock(simulator)?;
+    let plates = plates(&simulator, inputs)?;
+    if args.shape == Some(Origin::Given) {
+        return Ok(EstimatedPerception::new(inputs, simulator.template(), args.masks, plates)?);
+    }
+    let template = default_template(&ShapeParams::default())?;
+    let mut perception = EstimatedPerception::new(inputs, &template, args.masks, plates)?;
+    eprintln!("demo: learning the person's shape from {SHAPE_SETS} frames of the first {SHAPE_SECS} seconds");
+    let mut sets = Vec::new();
+    for index in 0..SHAPE_SETS {
+        let master_nanos = (SHAPE_SECS * 1e9 * index as f64 / SHAPE_SETS as f64) as i64;
+        let mut frames = Vec::new();
+        for camera in &inputs.cameras {
+            let slot = simulator.rig().slot(&camera.id).context("the input cameras are the simulator's")?;
+            let (image, mask) = simulator.capture(master_nanos, slot)?;
+            frames.push(Some(Arc::new(Frame {
+                camera: camera.id.clone(),
+                sequence: index as u64,
+                capture_nanos: master_nanos,
+                exposure_nanos: None,
+                image,
+                mask: Some(mask),
+            })));
+        }
+        sets.push(FrameSet { index: index as u64, master_nanos, frames });
+    }
+    let fit = perception.learn_shape(&sets)?;
+    eprintln!("demo: the person is {:.2} m tall", fit.height_m);
+    Ok(perception)
+}
+
+/// Images of the empty room.
+fn plates(simulator: &Simulator, inputs: &Rig) -> Result<Vec<Option<Image>>> {
+    let plate = |camera: &Camera| -> Result<Option<Image>> {
+        let slot = simulator.rig().slot(&camera.id).context("the input cameras are the simulator's")?;
+        let plate = simulator.plate(slot)?;
+        Ok(Some(Image::new(plate.width(), plate.height(), plate.format(), plate.bytes().to_vec())?))
+    };
+    inputs.cameras.iter().map(plate).collect()
 }
 
 fn advance(bar: &ProgressBar, position: u64, sheet: &ScoreSheet) {

@@ -8,13 +8,13 @@ use std::{
 use anyhow::{Result, bail};
 use flyrig_capture::{CameraStats, Recorder};
 use flyrig_fusion::{
-    EstimatedPerception, Health, Intake, LivePublisher, LiveRig, LiveViews, Outcome, PersonId, PersonMemory,
-    SHAPE_SETS, Session, SessionBuilder, check_threads, resident_mib,
+    EstimatedPerception, Health, Intake, LivePublisher, LiveRig, LiveViews, Origin, Outcome, PersonId, PersonMemory,
+    SHAPE_SECS, SHAPE_SETS, Session, SessionBuilder, check_threads, resident_mib,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{dataset, stop};
 use flyrig_transport::Publisher;
-use flyrig_types::{ThreadHealth, ThreadWatch};
+use flyrig_types::{FrameSet, ThreadHealth, ThreadWatch};
 
 use crate::{
     config::Config,
@@ -80,7 +80,9 @@ fn capture_people(
     let threads = std::mem::take(&mut source.threads);
     builder = match source.perception(config)? {
         FoundBy::Given(perception) => builder.perception(perception),
-        FoundBy::Estimated(perception) if is_known => builder.perception(*perception),
+        FoundBy::Estimated(perception) if is_known || config.body.shape == Some(Origin::Given) => {
+            builder.perception(*perception)
+        }
         FoundBy::Estimated(mut perception) => {
             if !learn_shape(&mut perception, &mut intake, &threads, recorder, monitor)? {
                 return Ok(());
@@ -182,7 +184,12 @@ fn learn_shape(
         });
         match intake.next_set(STEP) {
             Some(set) => {
-                sets.push(set);
+                // Spread, so that a person who moves is seen in several poses.
+                let every_nanos = (SHAPE_SECS * 1e9 / SHAPE_SETS as f64) as u64;
+                let is_due = |last: &FrameSet| last.master_nanos.abs_diff(set.master_nanos) >= every_nanos;
+                if sets.last().is_none_or(is_due) {
+                    sets.push(set);
+                }
                 monitor.stepped();
             }
             None if intake.ended() => {

@@ -5,8 +5,8 @@ use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
 use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, SourceOpener, VideoOptions, VideoReplay};
 use flyrig_fusion::{EstimatedPerception, GivenPerception, GivenPerson, InputFormat, Origin, PersonId};
 use flyrig_gpu::GpuContext;
-use flyrig_sim::{SimTime, Simulator};
 use flyrig_report::dataset;
+use flyrig_sim::{SimTime, Simulator};
 use flyrig_types::{CameraId, Image, PoseTrack, Rig, ThreadWatch};
 
 use crate::{
@@ -91,6 +91,9 @@ fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
         let simulator = Simulator::new(gpu, &config.sim)?;
         let (rig, template, track) =
             (simulator.reported_rig(), simulator.template().clone(), simulator.track().clone());
+        // Nobody tells an estimator whom it will see.
+        let knows_shape = config.body.shape.unwrap_or(config.body.pose) == Origin::Given;
+        let template = if knows_shape { template } else { default_template(&ShapeParams::default())? };
         let picked = dataset::pick(&rig, &source.names(), "the simulated rig")?;
         let copy = |slot| -> Result<Image> {
             let plate = simulator.plate(slot)?;

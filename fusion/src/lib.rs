@@ -36,7 +36,8 @@ pub use live_rig::{LiveRig, LiveStep};
 pub use live_views::{LiveViews, OutputSettings};
 pub use memory::PersonMemory;
 pub use perception::{
-    EstimatedPerception, GivenPerception, GivenPerson, Observation, Perception, SHAPE_SECS, SHAPE_SETS, SeenPerson, ViewObservation,
+    EstimatedPerception, GivenPerception, GivenPerson, Observation, Perception, SHAPE_SECS, SHAPE_SETS, SeenPerson,
+    ViewObservation,
 };
 pub use session::{Counts, Outcome, Session, SessionBuilder};
 pub use set_reader::{SetReader, next_frame};

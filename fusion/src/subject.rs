@@ -148,7 +148,7 @@ impl Subject {
         let canonical: Vec<[f32; 4]> = surface.positions.iter().map(|p| p.extend(1.0).to_array()).collect();
         gaussians.canonical.write(gpu, &canonical);
         gaussians.color.write(gpu, &vec![[0.5, 0.5, 0.5, 1.0]; count]);
-        let deform = settings.tracking.options(settings.body.pose);
+        let deform = settings.tracking.options();
         Ok(Self {
             id,
             skinner: match deform {

@@ -61,7 +61,7 @@ impl Scene {
         let keys = (0..frames + 2).map(|frame| (frame as i64 * FRAME_NANOS, self.pose(frame as f64))).collect();
         let track = PoseTrack::new(keys).unwrap();
         let tracking = TrackingSettings { rest: 0.0, ..TrackingSettings::default() };
-        let mut options: DeformOptions = tracking.options(BodySettings::default().pose).unwrap();
+        let mut options: DeformOptions = tracking.options().unwrap();
         options.max_level = 1;
         let settings = SessionSettings {
             body: BodySettings { gaussians: 3000, nodes: 60, ..BodySettings::default() },

@@ -10,8 +10,8 @@ use anyhow::{Context, Result, bail};
 use flyrig_body::{ShapeParams, default_template, load_gltf};
 use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay};
 use flyrig_fusion::{
-    EstimatedPerception, GivenPerception, GivenPerson, Origin, PersonId, SHAPE_SECS, SHAPE_SETS, Session, SessionBuilder,
-    SessionSettings, SetReader, next_frame,
+    EstimatedPerception, GivenPerception, GivenPerson, Origin, PersonId, SHAPE_SECS, SHAPE_SETS, Session,
+    SessionBuilder, SessionSettings, SetReader, next_frame,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_sync::SyncSettings;

@@ -9,8 +9,8 @@ use flyrig_types::Pose;
 use glam::{DQuat, DVec3};
 
 use crate::anatomy::{JointRange, Roles, joint_ranges};
-use crate::landmarks::{LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER};
 use crate::habits::add_habits;
+use crate::landmarks::{LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER};
 use crate::surface_marks::{Mark, find_marks};
 use crate::{LANDMARK_COUNT, TrackError, TrackErrorKind};
 

@@ -37,11 +37,6 @@ impl ShapeSpace {
         Self { base: base.clone(), has_targets: base.is_built_in() }
     }
 
-    /// Number of parameters.
-    pub fn count(&self) -> usize {
-        1 + LENGTHS.len() + GIRTHS.len() + if self.has_targets { TARGETS.len() } else { 0 }
-    }
-
     /// Name, mean and standard deviation of each parameter among people.
     pub fn prior(&self) -> Vec<(&'static str, f64, f64)> {
         let of = |names: &'static [&'static str], mean: f64, sigma: f64| names.iter().map(move |n| (*n, mean, sigma));
@@ -53,7 +48,7 @@ impl ShapeSpace {
     }
 
     /// Keeps a parameter where there are bodies.
-    pub fn clamped(&self, index: usize, value: f64) -> f64 {
+    pub fn clamped(index: usize, value: f64) -> f64 {
         let is_target = index > LENGTHS.len() + GIRTHS.len();
         if is_target { value.clamp(0.0, 0.99) } else { value.clamp(0.4, 1.6) }
     }
@@ -67,9 +62,8 @@ impl ShapeSpace {
         let shaped;
         let base = if self.has_targets {
             let targets = TARGETS.iter().map(|name| ((*name).to_owned(), named.get(name).map_or(0.5, |v| *v as f32)));
-            shaped = default_template(&ShapeParams(targets.collect())).map_err(|error| {
-                TrackError::new(TrackErrorKind::Template, format!("the built-in body: {error}"))
-            })?;
+            shaped = default_template(&ShapeParams(targets.collect()))
+                .map_err(|error| TrackError::new(TrackErrorKind::Template, format!("the built-in body: {error}")))?;
             &shaped
         } else {
             &self.base
@@ -185,4 +179,44 @@ pub(crate) fn scale_template(
         }
     }
     Ok(shaped)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::body;
+
+    #[test]
+    fn every_corner_of_the_space_is_a_body() {
+        let built_in = ShapeSpace::new(&body());
+        let mut other = body();
+        other.name = "imported".to_owned();
+        let imported = ShapeSpace::new(&other);
+        assert_eq!(built_in.prior().len(), imported.prior().len() + TARGETS.len());
+        for space in [built_in, imported] {
+            for (k, (name, mean, sigma)) in space.prior().into_iter().enumerate() {
+                for value in [mean - 3.0 * sigma, mean + 3.0 * sigma] {
+                    let mut values: Vec<f64> = space.prior().iter().map(|(_, mean, _)| *mean).collect();
+                    values[k] = ShapeSpace::clamped(k, value);
+                    let template = space.template(&values).unwrap();
+                    assert!(template.check().is_ok(), "{name} {value}");
+                    assert!(BodyModel::new(&template).is_ok(), "{name} {value}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn girths_thicken_limbs_and_leave_the_joints() {
+        let space = ShapeSpace::new(&body());
+        let mean: Vec<f64> = space.prior().iter().map(|(_, mean, _)| *mean).collect();
+        let mut thick = mean.clone();
+        thick[space.prior().iter().position(|(name, ..)| *name == "thigh-girth").unwrap()] = 1.2;
+        let (a, b) = (space.template(&mean).unwrap(), space.template(&thick).unwrap());
+        assert!((b.area_m2() / a.area_m2() - 1.0) > 0.01);
+        let (a, b) = (BodyModel::new(&a).unwrap(), BodyModel::new(&b).unwrap());
+        for (a, b) in a.origins.iter().zip(&b.origins) {
+            assert!(a.distance(*b) < 1e-6);
+        }
+    }
 }

@@ -12,12 +12,16 @@ pub struct PoseConfig {
     pub confidence_threshold: f64,
     /// Distance up to which views agree on a landmark, metres at its depth.
     pub inlier_m: f64,
-    /// Standard deviation of a landmark, metres at its depth.
-    pub sigma_m: f64,
+    /// Standard deviation of the landmarks, as a multiple of the one measured on simulated people.
+    pub landmark_spread: f64,
     /// Standard deviation of the body's outline from the mask's (clothes, the body's shape), metres.
     pub outline_sigma_m: f64,
     /// How often the outline of the body is matched with the masks in a set; 0 fits the pose to landmarks alone.
     pub outline_rounds: usize,
+    /// Rounds in which [`crate::PoseEstimator::fit_shape`] matches outlines with masks to solve for lengths, girths, build and
+    /// poses together; 0 fits bone lengths to landmarks alone. With rounds joints come nearer to the true ones, but views do
+    /// not (docs/benchmarks/perception.md), so that 0 is the default.
+    pub shape_rounds: usize,
     /// Standard deviation of a joint's turn between sets at 30 sets a second, radians; smaller is smoother.
     pub smooth_rad: f64,
     /// Largest number of solver steps a frame set.
@@ -37,19 +41,15 @@ impl Default for PoseConfig {
             presence_threshold: 0.5,
             confidence_threshold: 0.3,
             inlier_m: 0.07,
-            sigma_m: env("SM", 0.015),
-            outline_sigma_m: env("OS", 0.01),
-            outline_rounds: env("OR", 2.0) as usize,
-            smooth_rad: env("SR", 0.15),
+            landmark_spread: 1.0,
+            outline_sigma_m: 0.01,
+            outline_rounds: 2,
+            shape_rounds: 0,
+            smooth_rad: 0.15,
             max_steps: 12,
             fit_shape: true,
             masks: true,
             forget_after: 15,
         }
     }
-}
-
-/// Tuning only.
-pub(crate) fn env(name: &str, default: f64) -> f64 {
-    std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(default)
 }

@@ -40,8 +40,6 @@ const MAX_SPEED: f64 = 12.0;
 const MIN_DELAY_SECS: f64 = 5e-4;
 /// Farthest that the outline of a body near its place lies from the mask's, metres.
 const OUTLINE_REACH_M: f64 = 0.05;
-/// Rounds of matching when the shape is fitted.
-const SHAPE_ROUNDS: usize = 3;
 /// Steps of the solver in each round of matching.
 const OUTLINE_STEPS: usize = 4;
 /// After a loss the whole picture is searched in every set, and ever more rarely up to every so many sets.
@@ -113,7 +111,7 @@ impl Evidence {
             points: self.points,
             velocity: self.velocity,
             before: self.before.clone(),
-            sigma_m: config.sigma_m,
+            landmark_spread: config.landmark_spread,
             robust: 2.0,
         }
     }
@@ -131,7 +129,17 @@ impl PoseEstimator {
         }
         let model = BodyModel::new(template)?;
         let plates = vec![None; rig.cameras.len()];
-        Ok(Self { net, base: template.clone(), template: template.clone(), model, rig: rig.clone(), config, plates, track: None, lost: 0 })
+        Ok(Self {
+            net,
+            base: template.clone(),
+            template: template.clone(),
+            model,
+            rig: rig.clone(),
+            config,
+            plates,
+            track: None,
+            lost: 0,
+        })
     }
 
     /// The template, with the person's bone lengths once [`Self::fit_shape`] has run.
@@ -166,7 +174,7 @@ impl PoseEstimator {
             fit_template_shape(&self.base, &self.rig, &keypoints, &self.config).map_err(|e| last.unwrap_or(e))?;
         self.model = BodyModel::new(&template)?;
         self.template = template;
-        if self.config.outline_rounds > 0 {
+        if self.config.shape_rounds > 0 {
             self.fit_shape_to_outlines(sets, &mut fit)?;
         }
         self.reset();
@@ -185,8 +193,9 @@ impl PoseEstimator {
             found.push((set, fitted, masks));
         }
         let space = ShapeSpace::new(&self.base);
-        let mut shape: Vec<f64> = space.prior().iter().map(|(name, mean, _)| fit.factor(name).unwrap_or(*mean)).collect();
-        for _ in 0..SHAPE_ROUNDS {
+        let mut shape: Vec<f64> =
+            space.prior().iter().map(|(name, mean, _)| fit.factor(name).unwrap_or(*mean)).collect();
+        for _ in 0..self.config.shape_rounds {
             let given = |set: &FrameSet, masks: &[Option<Mask>], slot: usize| -> Option<Mask> {
                 let own = masks.get(slot).cloned().flatten();
                 own.or_else(|| set.frames.get(slot)?.as_ref()?.mask.clone().filter(|_| !self.config.masks))
@@ -200,7 +209,8 @@ impl PoseEstimator {
                     ShapeSet { problem: fitted.evidence.problem(&self.model, &self.config), outline }
                 })
                 .collect();
-            let start = ShapeAndPoses { shape: shape.clone(), poses: found.iter().map(|(_, f, _)| f.turns.clone()).collect() };
+            let start =
+                ShapeAndPoses { shape: shape.clone(), poses: found.iter().map(|(_, f, _)| f.turns.clone()).collect() };
             let Some((solved, sigma)) = (ShapeProblem { space: &space, sets: &problems }).solve(&start) else { break };
             drop(problems);
             for ((_, fitted, _), pose) in found.iter_mut().zip(solved.poses) {
@@ -348,14 +358,14 @@ impl PoseEstimator {
         for round in 0..self.config.outline_rounds {
             // Far first, then only what is near.
             let widen = if round + 1 < self.config.outline_rounds { 2.0 } else { 1.0 };
-            let points = self.outline_points(set, fitted, &turns, masks, widen * crate::config::env("RE", OUTLINE_REACH_M));
+            let points = self.outline_points(set, fitted, &turns, masks, widen * OUTLINE_REACH_M);
             if points.is_empty() {
                 break;
             }
             let mut problem = fitted.evidence.problem(&self.model, &self.config);
             problem.outline = &points;
             problem.outline_sigma_m *= widen;
-            let Some((better, _)) = problem.solve(&turns, crate::config::env("ST", OUTLINE_STEPS as f64) as usize).filter(|(turns, _)| finite(turns)) else {
+            let Some((better, _)) = problem.solve(&turns, OUTLINE_STEPS).filter(|(turns, _)| finite(turns)) else {
                 break;
             };
             turns = better;
@@ -521,12 +531,8 @@ impl PoseEstimator {
         if most < MIN_LANDMARKS {
             return Err(lost("no view shows enough of a person"));
         }
-        let mut evidence = Evidence {
-            views,
-            points: [None; LANDMARK_COUNT],
-            velocity: [DVec3::ZERO; LANDMARK_COUNT],
-            before: None,
-        };
+        let mut evidence =
+            Evidence { views, points: [None; LANDMARK_COUNT], velocity: [DVec3::ZERO; LANDMARK_COUNT], before: None };
         // One view alone says nothing of depth: the network's own guess at the third dimension stands in.
         let triangulated = points.iter().flatten().count();
         let mut world = points.each_ref().map(|point| point.as_ref().map(|p| p.position));

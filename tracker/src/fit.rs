@@ -78,8 +78,8 @@ pub(crate) struct FitProblem<'a> {
     /// Landmark velocities in metres a second, for views that were not taken at the pose's time.
     pub velocity: [DVec3; LANDMARK_COUNT],
     pub before: Option<Before>,
-    /// Standard deviation of a landmark, metres at its depth.
-    pub sigma_m: f64,
+    /// Standard deviation of the landmarks, as a multiple of the one measured.
+    pub landmark_spread: f64,
     /// Residuals of this many standard deviations lose half their weight.
     pub robust: f64,
 }
@@ -118,7 +118,7 @@ impl FitProblem<'_> {
                 let moved = mark + self.velocity[landmark] * view.delay_secs;
                 let Some((pixel, rows)) = view.view.project_with_derivative(moved) else { continue };
                 let Some(px_per_m) = view.view.px_per_m(posed.origin[0]) else { continue };
-                let inverse_sigma = 1.0 / (self.sigma_m * (spread_m(landmark) / 0.015).powf(crate::config::env("SP", 1.0)) * px_per_m);
+                let inverse_sigma = 1.0 / (self.landmark_spread * spread_m(landmark) * px_per_m);
                 let error = (pixel - seen.ideal_px) * inverse_sigma;
                 let trust = LANDMARK_WEIGHT[landmark] * seen.confidence * seen.confidence;
                 let (cost, weight) = kernel.weigh(error.length_squared(), trust);
@@ -161,7 +161,7 @@ impl FitProblem<'_> {
             let inverse_sigma = 1.0 / (self.outline_sigma_m * point.px_per_m);
             let error = (pixel.dot(point.normal) - point.offset) * inverse_sigma;
             let row = (du * point.normal.x + dv * point.normal.y) * inverse_sigma;
-            let importance = (crate::config::env("OC", OUTLINE_COUNT) / counts[point.view]).min(1.0);
+            let importance = (OUTLINE_COUNT / counts[point.view]).min(1.0);
             let (cost, weight) = kernel.weigh(error * error, importance);
             each(point, row, error, weight, cost);
         }
@@ -422,7 +422,8 @@ mod tests {
             points: [None; LANDMARK_COUNT],
             velocity: [DVec3::ZERO; LANDMARK_COUNT],
             before: None,
-            sigma_m: 0.012,
+            // About 12 mm: these landmarks are better than the network's.
+            landmark_spread: 0.6,
             robust: 2.0,
         }
     }

@@ -8,8 +8,8 @@ use crate::body_model::BodyModel;
 use crate::crop::Crop;
 use crate::landmarks::NOSE;
 use crate::pixels::Rgb;
-use crate::surface_marks::Mark;
 use crate::search::{Sighting, project_all};
+use crate::surface_marks::Mark;
 use crate::view::{View, observe};
 use crate::{LANDMARK_COUNT, PoseNet, TrackError};
 
@@ -158,7 +158,9 @@ impl LandmarkStudy {
             }
             let mut squares: Vec<f64> = samples
                 .iter()
-                .map(|Sample { rows, error }| (*error - DVec2::new(rows[0].dot(bias), rows[1].dot(bias))).length_squared())
+                .map(|Sample { rows, error }| {
+                    (*error - DVec2::new(rows[0].dot(bias), rows[1].dot(bias))).length_squared()
+                })
                 .collect();
             // Of a two-dimensional Gaussian: the median square is 2 ln 2 variances.
             let spread_m = (flyrig_solve::median(&mut squares)? / (2.0 * std::f64::consts::LN_2)).sqrt();
@@ -193,5 +195,46 @@ pub(crate) fn left_of(landmark: usize) -> usize {
         1..=3 => landmark,
         _ if landmark.is_multiple_of(2) => landmark - 1,
         _ => landmark,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_right_side_mirrors_the_left() {
+        for (landmark, left) in [(0, 0), (1, 1), (3, 3), (4, 1), (6, 3), (7, 7), (8, 7), (12, 11), (31, 31), (32, 31)] {
+            assert_eq!(left_of(landmark), left, "{landmark}");
+            assert_eq!(is_right(landmark), landmark != left);
+        }
+        assert!((0..LANDMARK_COUNT).all(|landmark| measured(landmark).is_some() && spread_m(landmark) > 0.005));
+    }
+
+    #[test]
+    fn a_bias_is_found_from_several_directions_in_spite_of_outliers() {
+        let net = PoseNet::embedded().unwrap();
+        let mut study = LandmarkStudy::new(net);
+        let bias = DVec3::new(0.01, -0.03, 0.02);
+        for k in 0..300 {
+            let turn = DMat3::from_rotation_y(f64::from(k) * 0.7) * DMat3::from_rotation_x(f64::from(k) * 0.3);
+            let rows = [turn.row(0), turn.row(1)];
+            let noise = DVec2::new(f64::from(k % 7) - 3.0, f64::from(k % 5) - 2.0) * 1e-3;
+            let outlier = if k % 10 == 0 { DVec2::new(0.12, 0.0) } else { DVec2::ZERO };
+            study.samples[11]
+                .push(Sample { rows, error: DVec2::new(rows[0].dot(bias), rows[1].dot(bias)) + noise + outlier });
+        }
+        let habits = study.habits();
+        let [habit] = habits.as_slice() else { panic!("{habits:?}") };
+        assert_eq!((habit.landmark, habit.count), (11, 300));
+        assert!((habit.bias_m - bias).length() < 0.003, "{}", habit.bias_m);
+        assert!((0.001..0.004).contains(&habit.spread_m), "{}", habit.spread_m);
+    }
+
+    #[test]
+    fn one_direction_alone_says_nothing_of_depth() {
+        let mut study = LandmarkStudy::new(PoseNet::embedded().unwrap());
+        study.samples[11] = vec![Sample { rows: [DVec3::X, DVec3::Y], error: DVec2::ZERO }; 100];
+        assert!(study.habits().is_empty());
     }
 }

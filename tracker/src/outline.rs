@@ -161,3 +161,67 @@ fn coverage(mask: &Mask, at: DVec2) -> Option<f64> {
     let bottom = value(x, y + 1) + (value(x + 1, y + 1) - value(x, y + 1)) * fx;
     Some(top + (bottom - top) * fy)
 }
+
+#[cfg(test)]
+mod tests {
+    use flyrig_body::skin_mesh;
+    use flyrig_types::Pose;
+
+    use super::*;
+    use crate::body_model::Turns;
+    use crate::testing::{body, mask_of, random_turns, ring};
+
+    fn matched(camera: &Camera, mask: &Mask, template: &Template, pose: &Pose) -> Vec<OutlinePoint> {
+        let (vertices, normals) = skin_mesh(template, pose);
+        let (view, model) = (View::new(camera), BodyModel::new(template).unwrap());
+        let seen = SeenBody { camera, view: &view, template, model: &model, vertices: &vertices, normals: &normals };
+        seen.match_mask(mask, 0, 0.1)
+    }
+
+    fn place(model: &BodyModel, turns: &Turns, point: &OutlinePoint) -> DVec3 {
+        let posed = model.pose(turns);
+        let part = |(joint, weight, local): &(usize, f64, DVec3)| {
+            (posed.origin[*joint] + posed.rotation[*joint] * *local) * *weight
+        };
+        point.bones.iter().map(part).sum()
+    }
+
+    #[test]
+    fn a_body_lies_on_its_own_outline_and_a_shifted_one_beside_it() {
+        let (template, camera) = (body(), ring(3).cameras[0].clone());
+        let model = BodyModel::new(&template).unwrap();
+        let turns = random_turns(&model, 5);
+        let mask = mask_of(&camera, &template, &model.to_pose(&turns));
+        let points = matched(&camera, &mask, &template, &model.to_pose(&turns));
+        assert!(points.len() > 60, "{} points", points.len());
+        let view = View::new(&camera);
+        let mut moved = turns.clone();
+        moved.root += DVec3::new(0.02, -0.01, 0.015);
+        let distance = |point: &OutlinePoint, turns: &Turns| {
+            let pixel = view.project(place(&model, turns, point)).unwrap();
+            (pixel.dot(point.normal) - point.offset).abs() / point.px_per_m
+        };
+        let median = |turns: &Turns| {
+            let mut all: Vec<f64> = points.iter().map(|point| distance(point, turns)).collect();
+            flyrig_solve::median(&mut all).unwrap()
+        };
+        assert!(median(&turns) < 0.004, "{} m", median(&turns));
+        assert!(median(&moved) > 2.0 * median(&turns), "{} {}", median(&moved), median(&turns));
+    }
+
+    #[test]
+    fn no_mask_a_full_mask_a_body_behind_the_camera_and_poison_match_nothing() {
+        let (template, camera) = (body(), ring(3).cameras[0].clone());
+        let model = BodyModel::new(&template).unwrap();
+        let pose = model.to_pose(&random_turns(&model, 5));
+        let filled = |value: u8| Mask::new(800, 800, vec![value; 800 * 800]).unwrap();
+        assert!(matched(&camera, &filled(0), &template, &pose).is_empty());
+        assert!(matched(&camera, &filled(255), &template, &pose).is_empty(), "the image's border is no outline");
+        let mut behind = pose.clone();
+        behind.root_translation = camera.position() * 3.0;
+        assert!(matched(&camera, &filled(0), &template, &behind).is_empty());
+        let mut poisoned = pose;
+        poisoned.root_translation.x = f64::NAN;
+        assert!(matched(&camera, &filled(255), &template, &poisoned).is_empty());
+    }
+}

@@ -9,7 +9,7 @@ use flyrig_types::Rig;
 use crate::body_model::BodyModel;
 use crate::body_shape::{ShapeSpace, scale_template};
 use crate::triangulate::triangulate;
-use crate::{LANDMARK_COUNT, PoseConfig, TrackError, TrackErrorKind, ViewKeypoints};
+use crate::{LANDMARK_COUNT, PoseConfig, TrackError, ViewKeypoints};
 
 /// Lengths are pulled towards the template's proportions as if those were this many measurements.
 const PRIOR_COUNT: f64 = 2.0;
@@ -161,6 +161,7 @@ mod tests {
     use glam::{DMat4, DVec3};
 
     use super::*;
+    use crate::TrackErrorKind;
     use crate::testing::{body, keypoints_of, random_turns, ring};
 
     #[test]
@@ -193,7 +194,8 @@ mod tests {
     fn the_shaped_skeleton_still_carries_its_skin() {
         let template = body();
         let model = BodyModel::new(&template).unwrap();
-        let groups = [("scale".to_owned(), 0.9), ("thighs".to_owned(), 1.2), ("hips".to_owned(), 0.9)].into_iter().collect();
+        let groups =
+            [("scale".to_owned(), 0.9), ("thighs".to_owned(), 1.2), ("hips".to_owned(), 0.9)].into_iter().collect();
         let shaped = scale_template(&template, &model, &groups).unwrap();
         let matrices = shaped.skeleton.world_from_canonical(&shaped.skeleton.rest_pose());
         // The built-in body rests in its bind pose: the skinning matrices move nothing.

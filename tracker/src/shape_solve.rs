@@ -73,7 +73,7 @@ impl ShapeProblem<'_> {
             .into_par_iter()
             .map(|k| {
                 // Towards the middle of the range, where there are bodies.
-                let step = if self.space.clamped(k, shape[k] + STEP) > shape[k] + 0.5 * STEP { STEP } else { -STEP };
+                let step = if ShapeSpace::clamped(k, shape[k] + STEP) > shape[k] + 0.5 * STEP { STEP } else { -STEP };
                 let mut moved = shape.to_vec();
                 moved[k] += step;
                 let (other, other_model) = self.model(&moved)?;
@@ -115,9 +115,8 @@ impl Problem for ShapeProblem<'_> {
     fn cost(&self, at: &ShapeAndPoses) -> f64 {
         let Some((template, model)) = self.model(&at.shape) else { return f64::NAN };
         let costs = self.sets.par_iter().zip(&at.poses);
-        let data: Vec<f64> = costs
-            .map(|(set, pose)| Self::with_set(set, &template, &model, |problem| problem.cost(pose)))
-            .collect();
+        let data: Vec<f64> =
+            costs.map(|(set, pose)| Self::with_set(set, &template, &model, |problem| problem.cost(pose))).collect();
         // In a fixed order, so that the same input gives the same bits.
         data.iter().sum::<f64>() + self.prior(&at.shape).iter().map(|(error, _)| 0.5 * error * error).sum::<f64>()
     }
@@ -157,7 +156,7 @@ impl Problem for ShapeProblem<'_> {
 
     fn moved(&self, at: &ShapeAndPoses, step: &DVector<f64>) -> ShapeAndPoses {
         let count = at.shape.len();
-        let moved = |(k, value): (usize, &f64)| self.space.clamped(k, value + step[k]);
+        let moved = |(k, value): (usize, &f64)| ShapeSpace::clamped(k, value + step[k]);
         let mut first = count;
         let mut poses = Vec::with_capacity(at.poses.len());
         for (set, pose) in self.sets.iter().zip(&at.poses) {
@@ -166,5 +165,175 @@ impl Problem for ShapeProblem<'_> {
             first += size;
         }
         ShapeAndPoses { shape: at.shape.iter().enumerate().map(moved).collect(), poses }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_body::skin_mesh;
+    use flyrig_types::Camera;
+
+    use super::*;
+    use crate::LANDMARK_COUNT;
+    use crate::fit::FitView;
+    use crate::outline::SeenBody;
+    use crate::testing::{body, keypoints_of, mask_of, random_turns, ring};
+    use crate::view::{View, observe};
+
+    fn views(cameras: &[Camera], model: &BodyModel, turns: &Turns) -> Vec<FitView> {
+        let one = |(slot, camera): (usize, &Camera)| {
+            let view = View::new(camera);
+            let seen = observe(camera, &view, &keypoints_of(camera, &model.marks(turns)), 0.3);
+            FitView { slot, view, seen, delay_secs: 0.0 }
+        };
+        cameras.iter().enumerate().map(one).collect()
+    }
+
+    fn outline(
+        cameras: &[Camera],
+        (truth, true_turns): (&Template, &Turns),
+        (template, model, turns): (&Template, &BodyModel, &Turns),
+    ) -> Vec<OutlinePoint> {
+        let true_model = BodyModel::new(truth).unwrap();
+        let (vertices, normals) = skin_mesh(template, &model.to_pose(turns));
+        let one = |(index, camera): (usize, &Camera)| {
+            let view = View::new(camera);
+            let seen = SeenBody { camera, view: &view, template, model, vertices: &vertices, normals: &normals };
+            seen.match_mask(&mask_of(camera, truth, &true_model.to_pose(true_turns)), index, 0.1)
+        };
+        cameras.iter().enumerate().flat_map(one).collect()
+    }
+
+    fn problem<'a>(model: &'a BodyModel, views: &'a [FitView]) -> FitProblem<'a> {
+        FitProblem {
+            model,
+            views,
+            outline: &[],
+            outline_sigma_m: 0.01,
+            points: [None; LANDMARK_COUNT],
+            velocity: [DVec3::ZERO; LANDMARK_COUNT],
+            before: None,
+            landmark_spread: 1.0,
+            robust: 2.0,
+        }
+    }
+
+    /// A person of another shape, and the space that the shape lies in.
+    fn person() -> (ShapeSpace, Vec<f64>, Template) {
+        let space = ShapeSpace::new(&body());
+        let prior = space.prior();
+        let true_value = |name: &str, mean: f64| match name {
+            "scale" => 1.05,
+            "thighs" => 1.04,
+            "forearms" => 0.95,
+            "thigh-girth" => 1.15,
+            "trunk-depth" => 1.1,
+            "weight" => 0.6,
+            _ => mean,
+        };
+        let values: Vec<f64> = prior.iter().map(|(name, mean, _)| true_value(name, *mean)).collect();
+        let template = space.template(&values).unwrap();
+        (space, values, template)
+    }
+
+    #[test]
+    fn landmarks_and_outlines_bring_lengths_and_girths_back() {
+        let (space, values, truth) = person();
+        let rig = ring(3);
+        let true_model = BodyModel::new(&truth).unwrap();
+        let true_turns: Vec<Turns> = (0..4).map(|seed| random_turns(&true_model, seed)).collect();
+        let mut at = ShapeAndPoses {
+            shape: space.prior().iter().map(|(_, mean, _)| *mean).collect(),
+            poses: true_turns.clone(),
+        };
+        let mut template = space.template(&at.shape).unwrap();
+        let error = |template: &Template| {
+            let pairs = template.positions.iter().zip(&truth.positions);
+            pairs.map(|(a, b)| f64::from(a.distance(*b))).sum::<f64>() / truth.positions.len() as f64
+        };
+        let first = error(&template);
+        let mut sigma = Vec::new();
+        for _ in 0..3 {
+            let model = BodyModel::new(&template).unwrap();
+            let seen: Vec<Vec<FitView>> =
+                true_turns.iter().map(|turns| views(&rig.cameras, &true_model, turns)).collect();
+            let sets: Vec<ShapeSet<'_>> = seen
+                .iter()
+                .zip(&true_turns)
+                .zip(&at.poses)
+                .map(|((views, true_turns), turns)| ShapeSet {
+                    problem: problem(&model, views),
+                    outline: outline(&rig.cameras, (&truth, true_turns), (&template, &model, turns)),
+                })
+                .collect();
+            (at, sigma) = ShapeProblem { space: &space, sets: &sets }.solve(&at).unwrap();
+            template = space.template(&at.shape).unwrap();
+        }
+        assert!(error(&template) < 0.35 * first, "{} of {first} m", error(&template));
+        for (index, (name, ..)) in space.prior().iter().enumerate() {
+            assert!(sigma[index].is_finite() && sigma[index] > 0.0, "{name}");
+            if ["scale", "thighs", "forearms", "thigh-girth"].contains(name) {
+                assert!(
+                    (at.shape[index] - values[index]).abs() < 0.04,
+                    "{name}: {} {}",
+                    at.shape[index],
+                    values[index]
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn the_gradient_matches_differences_of_the_cost() {
+        let (space, values, truth) = person();
+        let rig = ring(3);
+        let true_model = BodyModel::new(&truth).unwrap();
+        let true_turns = random_turns(&true_model, 1);
+        // Off the truth, so that nothing vanishes.
+        let at = ShapeAndPoses {
+            shape: values.iter().enumerate().map(|(k, v)| v + if k % 2 == 0 { 0.02 } else { -0.02 }).collect(),
+            poses: vec![random_turns(&true_model, 1)],
+        };
+        let template = space.template(&at.shape).unwrap();
+        let model = BodyModel::new(&template).unwrap();
+        let seen = views(&rig.cameras, &true_model, &true_turns);
+        let sets = [ShapeSet {
+            problem: problem(&model, &seen),
+            outline: outline(&rig.cameras, (&truth, &true_turns), (&template, &model, &at.poses[0])),
+        }];
+        let problem = ShapeProblem { space: &space, sets: &sets };
+        let ArrowNormal { kept, eliminated } = problem.linearize(&at).unwrap();
+        let analytic: Vec<f64> = kept.gradient.iter().chain(eliminated[0].normal.gradient.iter()).copied().collect();
+        let largest = analytic.iter().fold(0.0f64, |most, g| most.max(g.abs()));
+        let count = space.prior().len();
+        // Targets are piecewise linear and their derivatives are differences; root shifts leave out a pixel's size.
+        let exact = |k: usize| k < count - 3 || k >= count + 3;
+        for k in (0..analytic.len()).filter(|&k| exact(k)) {
+            let step = if k < count { 1e-3 } else { 1e-5 };
+            let cost = |by: f64| {
+                let mut flat = DVector::zeros(analytic.len());
+                flat[k] = by;
+                problem.cost(&problem.moved(&at, &flat))
+            };
+            let numeric = (cost(step) - cost(-step)) / (2.0 * step);
+            let tolerance = if k < count { 0.03 } else { 2e-3 };
+            assert!(
+                (numeric - analytic[k]).abs() < tolerance * (0.02 * largest + numeric.abs()),
+                "{k}: {numeric} {}",
+                analytic[k]
+            );
+        }
+    }
+
+    #[test]
+    fn a_start_that_is_not_finite_has_no_solution() {
+        let (space, mut values, truth) = person();
+        let model = BodyModel::new(&truth).unwrap();
+        let turns = random_turns(&model, 1);
+        let seen = views(&ring(2).cameras, &model, &turns);
+        let sets = [ShapeSet { problem: problem(&model, &seen), outline: Vec::new() }];
+        values[0] = f64::NAN;
+        let start = ShapeAndPoses { shape: values, poses: vec![turns] };
+        assert!(ShapeProblem { space: &space, sets: &sets }.solve(&start).is_none());
     }
 }

@@ -1,12 +1,13 @@
 //! Synthetic rigs, bodies and landmarks for the tests.
 
-use flyrig_body::{ShapeParams, Template, default_template};
+use flyrig_body::{ShapeParams, Template, default_template, skin_mesh};
 use flyrig_solve::exp_rotation;
-use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Rig};
+use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Mask, Pose, Rig};
 use glam::{DQuat, DVec2, DVec3};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use crate::body_model::{BodyModel, Turns};
+use crate::silhouette::drawn_body;
 use crate::{Keypoint, LANDMARK_COUNT, ViewKeypoints};
 
 pub(crate) fn body() -> Template {
@@ -40,6 +41,13 @@ pub(crate) fn keypoints_of(camera: &Camera, points: &[DVec3; LANDMARK_COUNT]) ->
         Some(pixel) => Keypoint { pixel, confidence: 0.9 },
         None => Keypoint::default(),
     })
+}
+
+/// The mask of a posed body.
+pub(crate) fn mask_of(camera: &Camera, template: &Template, pose: &Pose) -> Mask {
+    let (vertices, _) = skin_mesh(template, pose);
+    let ([x0, y0, ..], body) = drawn_body(camera, &vertices, &template.triangles, 4.0).unwrap();
+    body.paste(camera.intrinsics.width as usize, camera.intrinsics.height as usize, x0, y0).unwrap()
 }
 
 /// The same with Gaussian-like noise in pixels.

@@ -26,7 +26,8 @@ pub struct DeformOptions {
     pub views: usize,
     /// Whether head, hands and feet are stiffer than the rest.
     pub stiff_parts: bool,
-    /// Whether, and how freely, the pose is corrected as well.
+    /// Whether, and how freely, the pose is corrected as well. Off by default: joints come nearer to the true ones, but the
+    /// correction changes from frame to frame, and views lose two decibels (docs/benchmarks/perception.md).
     pub pose: Option<PoseFreedom>,
 }
 

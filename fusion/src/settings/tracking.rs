@@ -1,10 +1,10 @@
 //! The table `[tracking]`.
 
 use clap::{Args, ValueEnum};
-use flyrig_tracker::{DeformSettings, DeformSolver, PoseFreedom};
+use flyrig_tracker::{DeformSettings, DeformSolver};
 use serde::{Deserialize, Serialize};
 
-use super::{Origin, check};
+use super::check;
 use crate::{FusionError, deformation::DeformOptions};
 
 /// Weight of the nodes' distance from where clothes of their part's thickness would be: it holds what no view constrains, the
@@ -34,9 +34,9 @@ pub enum Solver {
 }
 
 impl Solver {
-    /// Returns the options of the deformation, `None` when the body is only skinned. An estimated pose is corrected as well.
+    /// Returns the options of the deformation, `None` when the body is only skinned.
     #[must_use]
-    pub fn options(self, pose: Origin) -> Option<DeformOptions> {
+    pub fn options(self) -> Option<DeformOptions> {
         let default = DeformSettings::default();
         match self {
             Self::None => None,
@@ -47,14 +47,7 @@ impl Solver {
                 rest: 0.0,
                 ..default
             })),
-            Self::GaussNewton => Some(DeformOptions {
-                pose: (env("FX", 0.0) > 0.5).then(|| PoseFreedom {
-                    turn: env("PT", 100.0),
-                    shift: env("PS", 1e4),
-                    hold: env("PH", 1.0),
-                }),
-                ..DeformOptions::coarse(DeformSettings { anchor: env("AN", ANCHOR), regularization: env("RG", default.regularization), temporal: env("TE", default.temporal), solver: DeformSolver::GaussNewton { first_iterations: env("FI", 4.0) as usize, iterations: env("IT", 1.0) as usize }, ..default })
-            }),
+            Self::GaussNewton => Some(DeformOptions::coarse(DeformSettings { anchor: ANCHOR, ..default })),
         }
     }
 }
@@ -104,8 +97,8 @@ impl Default for TrackingSettings {
 impl TrackingSettings {
     /// Returns the options of the deformation, `None` when the body is only skinned.
     #[must_use]
-    pub fn options(&self, pose: Origin) -> Option<DeformOptions> {
-        let mut options = self.solver.options(pose)?;
+    pub fn options(&self) -> Option<DeformOptions> {
+        let mut options = self.solver.options()?;
         if let Some(replaced) = self.replaced {
             return Some(replaced);
         }
@@ -138,7 +131,7 @@ mod tests {
 
     #[test]
     fn the_papers_solver_has_the_papers_weights() {
-        let options = Solver::Paper.options(Origin::Given).unwrap();
+        let options = Solver::Paper.options().unwrap();
         assert!((options.color_weight - PAPER_COLOR_WEIGHT).abs() < 1e-6);
         assert!((options.solver.regularization - 200.0).abs() < 1e-9);
         assert!(options.solver.rest <= 0.0, "every frame has its iterations");
@@ -147,12 +140,6 @@ mod tests {
 
     #[test]
     fn the_default_settings_change_nothing_about_the_default_solver() {
-        for pose in [Origin::Given, Origin::Estimated] {
-            assert_eq!(TrackingSettings::default().options(pose), Solver::GaussNewton.options(pose));
-        }
+        assert_eq!(TrackingSettings::default().options(), Solver::GaussNewton.options());
     }
-}
-
-fn env(name: &str, default: f64) -> f64 {
-    std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(default)
 }
