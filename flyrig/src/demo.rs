@@ -21,11 +21,11 @@ use flyrig_report::{ContactRow, Curve, Report, contact_pictures, dataset, png, p
 use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
 use flyrig_sync::SyncSettings;
 use flyrig_transport::{Publisher, TransportConfig};
-use flyrig_types::{Camera, Frame, FrameSet, Image, Rig};
+use flyrig_types::{Camera, Frame, FrameSet, Rig};
 use indicatif::ProgressBar;
 use serde::{Deserialize as _, Serialize, de::IntoDeserializer as _};
 
-use crate::{cli::DemoArgs, watch::WatchStats};
+use crate::{cli::DemoArgs, source::simulated_plates, watch::WatchStats};
 
 /// Cameras that go in, and cameras that are only rendered and compared.
 const INPUTS: [&str; 3] = ["00", "03", "05"];
@@ -209,7 +209,7 @@ fn pass(
         Origin::Given => {
             let simulator = lock(simulator)?;
             let given = GivenPerception::repeating(&inputs, simulator.template().clone(), simulator.track().clone());
-            builder.perception(given.with_masks(args.masks, plates(&simulator, &inputs)?)).build()?
+            builder.perception(given.with_masks(args.masks, simulated_plates(&simulator, &inputs)?)).build()?
         }
         Origin::Estimated => builder.perception(find_person(args, simulator, &inputs)?).build()?,
     };
@@ -270,7 +270,7 @@ fn pass(
 /// Looks for the person as in front of real cameras; only the simulator knows the shape otherwise.
 fn find_person(args: &DemoArgs, simulator: &Mutex<Simulator>, inputs: &Rig) -> Result<EstimatedPerception> {
     let mut simulator = lock(simulator)?;
-    let plates = plates(&simulator, inputs)?;
+    let plates = simulated_plates(&simulator, inputs)?;
     if args.shape == Some(Origin::Given) {
         return Ok(EstimatedPerception::new(inputs, simulator.template(), args.masks, plates)?);
     }
@@ -298,16 +298,6 @@ fn find_person(args: &DemoArgs, simulator: &Mutex<Simulator>, inputs: &Rig) -> R
     let fit = perception.learn_shape(&sets)?;
     eprintln!("demo: the person is {:.2} m tall", fit.height_m);
     Ok(perception)
-}
-
-/// Images of the empty room.
-fn plates(simulator: &Simulator, inputs: &Rig) -> Result<Vec<Option<Image>>> {
-    let plate = |camera: &Camera| -> Result<Option<Image>> {
-        let slot = simulator.rig().slot(&camera.id).context("the input cameras are the simulator's")?;
-        let plate = simulator.plate(slot)?;
-        Ok(Some(Image::new(plate.width(), plate.height(), plate.format(), plate.bytes().to_vec())?))
-    };
-    inputs.cameras.iter().map(plate).collect()
 }
 
 fn advance(bar: &ProgressBar, position: u64, sheet: &ScoreSheet) {

@@ -7,7 +7,7 @@ use flyrig_fusion::{EstimatedPerception, GivenPerception, GivenPerson, InputForm
 use flyrig_gpu::GpuContext;
 use flyrig_report::dataset;
 use flyrig_sim::{SimTime, Simulator};
-use flyrig_types::{CameraId, Image, PoseTrack, Rig, ThreadWatch};
+use flyrig_types::{Camera, CameraId, Image, PoseTrack, Rig, ThreadWatch};
 
 use crate::{
     config::{Config, SourceKind},
@@ -84,6 +84,16 @@ pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
     Ok(source)
 }
 
+/// Returns images of the simulated room without people, by slot of `inputs`.
+pub fn simulated_plates(simulator: &Simulator, inputs: &Rig) -> Result<Vec<Option<Image>>> {
+    let plate = |camera: &Camera| -> Result<Option<Image>> {
+        let slot = simulator.rig().slot(&camera.id).context("the input cameras are the simulator's")?;
+        let plate = simulator.plate(slot)?;
+        Ok(Some(Image::new(plate.width(), plate.height(), plate.format(), plate.bytes().to_vec())?))
+    };
+    inputs.cameras.iter().map(plate).collect()
+}
+
 fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
     let source = &config.source;
     if source.kind == SourceKind::Sim {
@@ -95,12 +105,7 @@ fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
         let knows_shape = config.body.shape.unwrap_or(config.body.pose) == Origin::Given;
         let template = if knows_shape { template } else { default_template(&ShapeParams::default())? };
         let picked = dataset::pick(&rig, &source.names(), "the simulated rig")?;
-        let copy = |slot| -> Result<Image> {
-            let plate = simulator.plate(slot)?;
-            Ok(Image::new(plate.width(), plate.height(), plate.format(), plate.bytes().to_vec())?)
-        };
-        let slots = picked.cameras.iter().filter_map(|camera| rig.slot(&camera.id));
-        let plates = slots.map(|slot| copy(slot).map(Some)).collect::<Result<_>>()?;
+        let plates = simulated_plates(&simulator, &picked)?;
         let simulator = std::sync::Arc::new(std::sync::Mutex::new(simulator));
         let time = if source.real_time { SimTime::Real } else { SimTime::Exact };
         let sources = flyrig_sim::sources(&simulator, time)

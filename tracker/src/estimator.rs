@@ -84,7 +84,7 @@ struct Fitted {
     evidence: Evidence,
 }
 
-/// What a pose was fitted to.
+/// The measurements behind a fitted pose.
 #[derive(Debug, Clone)]
 struct Evidence {
     /// An element a frame.
@@ -382,21 +382,22 @@ impl PoseEstimator {
         masks: &[Option<&Mask>],
         reach_m: f64,
     ) -> Vec<OutlinePoint> {
-        let (now, _) = self.skinned(turns, set, 0.0);
+        let now = self.skinned(turns, set, 0.0);
         let of_view = |(index, view): (usize, &FitView)| {
             let Some(mask) = masks.get(view.slot).copied().flatten() else { return Vec::new() };
-            let (vertices, normals) = self.skinned(turns, set, view.delay_secs);
+            let own = (view.delay_secs.abs() > MIN_DELAY_SECS).then(|| self.skinned(turns, set, view.delay_secs));
+            let (vertices, normals) = own.as_ref().unwrap_or(&now);
             let seen = SeenBody {
                 camera: &self.rig.cameras[view.slot],
                 view: &view.view,
                 template: &self.template,
                 model: &self.model,
-                vertices: &vertices,
-                normals: &normals,
+                vertices,
+                normals,
             };
             let mut points = seen.match_mask(mask, index, reach_m);
             for point in &mut points {
-                point.shift = (vertices[point.vertex] - now[point.vertex]).as_dvec3();
+                point.shift = (vertices[point.vertex] - now.0[point.vertex]).as_dvec3();
             }
             points
         };
