@@ -397,7 +397,7 @@ pub(crate) fn align_trunk(model: &BodyModel, points: &[Option<DVec3>; LANDMARK_C
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{body, keypoints_of, noisy_keypoints, random_turns, ring};
+    use crate::testing::{body, fit_problem, keypoints_of, noisy_keypoints, random_turns, ring};
     use crate::view::observe;
     use rand::{SeedableRng, rngs::StdRng};
 
@@ -413,19 +413,9 @@ mod tests {
             .collect()
     }
 
+    /// With 12 mm or so for each landmark: these are better than the network's.
     fn problem<'a>(model: &'a BodyModel, views: &'a [FitView]) -> FitProblem<'a> {
-        FitProblem {
-            model,
-            views,
-            outline: &[],
-            outline_sigma_m: 0.01,
-            points: [None; LANDMARK_COUNT],
-            velocity: [DVec3::ZERO; LANDMARK_COUNT],
-            before: None,
-            // About 12 mm: these landmarks are better than the network's.
-            landmark_spread: 0.6,
-            robust: 2.0,
-        }
+        fit_problem(model, views, 0.6)
     }
 
     #[test]

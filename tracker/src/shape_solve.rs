@@ -174,10 +174,9 @@ mod tests {
     use flyrig_types::Camera;
 
     use super::*;
-    use crate::LANDMARK_COUNT;
     use crate::fit::FitView;
     use crate::outline::SeenBody;
-    use crate::testing::{body, keypoints_of, mask_of, random_turns, ring};
+    use crate::testing::{body, fit_problem, keypoints_of, mask_of, random_turns, ring};
     use crate::view::{View, observe};
 
     fn views(cameras: &[Camera], model: &BodyModel, turns: &Turns) -> Vec<FitView> {
@@ -202,20 +201,6 @@ mod tests {
             seen.match_mask(&mask_of(camera, truth, &true_model.to_pose(true_turns)), index, 0.1)
         };
         cameras.iter().enumerate().flat_map(one).collect()
-    }
-
-    fn problem<'a>(model: &'a BodyModel, views: &'a [FitView]) -> FitProblem<'a> {
-        FitProblem {
-            model,
-            views,
-            outline: &[],
-            outline_sigma_m: 0.01,
-            points: [None; LANDMARK_COUNT],
-            velocity: [DVec3::ZERO; LANDMARK_COUNT],
-            before: None,
-            landmark_spread: 1.0,
-            robust: 2.0,
-        }
     }
 
     /// A person of another shape, and the space that the shape lies in.
@@ -262,7 +247,7 @@ mod tests {
                 .zip(&true_turns)
                 .zip(&at.poses)
                 .map(|((views, true_turns), turns)| ShapeSet {
-                    problem: problem(&model, views),
+                    problem: fit_problem(&model, views, 1.0),
                     outline: outline(&rig.cameras, (&truth, true_turns), (&template, &model, turns)),
                 })
                 .collect();
@@ -298,7 +283,7 @@ mod tests {
         let model = BodyModel::new(&template).unwrap();
         let seen = views(&rig.cameras, &true_model, &true_turns);
         let sets = [ShapeSet {
-            problem: problem(&model, &seen),
+            problem: fit_problem(&model, &seen, 1.0),
             outline: outline(&rig.cameras, (&truth, &true_turns), (&template, &model, &at.poses[0])),
         }];
         let problem = ShapeProblem { space: &space, sets: &sets };
@@ -331,7 +316,7 @@ mod tests {
         let model = BodyModel::new(&truth).unwrap();
         let turns = random_turns(&model, 1);
         let seen = views(&ring(2).cameras, &model, &turns);
-        let sets = [ShapeSet { problem: problem(&model, &seen), outline: Vec::new() }];
+        let sets = [ShapeSet { problem: fit_problem(&model, &seen, 1.0), outline: Vec::new() }];
         values[0] = f64::NAN;
         let start = ShapeAndPoses { shape: values, poses: vec![turns] };
         assert!(ShapeProblem { space: &space, sets: &sets }.solve(&start).is_none());

@@ -7,6 +7,7 @@ use glam::{DQuat, DVec2, DVec3};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use crate::body_model::{BodyModel, Turns};
+use crate::fit::{FitProblem, FitView};
 use crate::silhouette::drawn_body;
 use crate::{Keypoint, LANDMARK_COUNT, ViewKeypoints};
 
@@ -41,6 +42,21 @@ pub(crate) fn keypoints_of(camera: &Camera, points: &[DVec3; LANDMARK_COUNT]) ->
         Some(pixel) => Keypoint { pixel, confidence: 0.9 },
         None => Keypoint::default(),
     })
+}
+
+/// A fit to landmarks alone, without a pose before.
+pub(crate) fn fit_problem<'a>(model: &'a BodyModel, views: &'a [FitView], landmark_spread: f64) -> FitProblem<'a> {
+    FitProblem {
+        model,
+        views,
+        outline: &[],
+        outline_sigma_m: 0.01,
+        points: [None; LANDMARK_COUNT],
+        velocity: [DVec3::ZERO; LANDMARK_COUNT],
+        before: None,
+        landmark_spread,
+        robust: 2.0,
+    }
 }
 
 /// The mask of a posed body.
