@@ -7,7 +7,7 @@ use std::{collections::BTreeMap, path::Path, time::Instant};
 
 use anyhow::{Context, Result, ensure};
 use flyrig_body::{Skeleton, Template, load_gltf};
-use flyrig_fusion::{BodySettings, Origin, Outcome, PersonId, SessionSettings};
+use flyrig_fusion::{BodySettings, Origin, Outcome, PerceptionSettings, PersonId, SessionSettings};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
 use flyrig_report::{Replay, ReplaySettings, dataset, progress_bar, write_whole};
@@ -106,17 +106,18 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
     let name = folder.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
     let truth = load_gltf(&dataset::gltf_file(folder)?)?;
     let track = truth.track.with_context(|| format!("the glTF file of {name} holds no animation"))?;
-    let body = BodySettings {
+    let perception = PerceptionSettings {
         pose: inputs.pose,
         shape: (inputs.pose == Origin::Estimated).then_some(inputs.shape),
         masks: inputs.masks,
-        ..BodySettings::with_gaussians(args.gaussians)
+        ..PerceptionSettings::default()
     };
+    let body = BodySettings::with_gaussians(args.gaussians);
     let settings = ReplaySettings {
         dataset: folder.to_owned(),
         inputs: args.inputs.clone(),
         holdout: if args.no_views { Vec::new() } else { args.holdout.clone() },
-        session: SessionSettings { body, ..SessionSettings::default() },
+        session: SessionSettings { perception, body, ..SessionSettings::default() },
         fps: args.fps,
         frames: args.frames.clone(),
         lags_nanos: BTreeMap::new(),

@@ -217,7 +217,7 @@ mod tests {
 
     use super::*;
 
-    const RIG: &str = "[source]\nkind = \"v4l2\"\npath = \"calib\"\n[body]\npose = \"estimated\"\n";
+    const RIG: &str = "[source]\nkind = \"v4l2\"\npath = \"calib\"\n[perception]\npose = \"estimated\"\n";
 
     fn parse(cameras: &str) -> Result<Config, String> {
         let text = RIG.replace("[body]", &format!("{cameras}\n[body]"));

@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, net::SocketAddr, ops::Range, path::PathBuf};
 
 use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
-use flyrig_fusion::{AppearanceOptions, BodySettings, NetworksOn, Origin, TrackingSettings};
+use flyrig_fusion::{AppearanceOptions, BodySettings, NetworksOn, Origin, PerceptionSettings, TrackingSettings};
 use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size};
 use flyrig_stfa::NetworkSize;
 use flyrig_types::CameraId;
@@ -269,6 +269,14 @@ pub enum ConfigAction {
     },
 }
 
+impl DemoArgs {
+    /// How the demo finds its person.
+    pub fn perception(&self) -> PerceptionSettings {
+        let Self { pose, masks, shape, .. } = *self;
+        PerceptionSettings { pose, masks, shape, ..PerceptionSettings::default() }
+    }
+}
+
 #[derive(Debug, Args)]
 pub struct DemoArgs {
     /// Folder of the report; created, its old report replaced.
@@ -370,6 +378,8 @@ pub struct EvalArgs {
     /// Folder for pictures, surfaces and the report.
     #[arg(long)]
     pub out: PathBuf,
+    #[command(flatten)]
+    pub perception: PerceptionSettings,
     #[command(flatten)]
     pub body: BodySettings,
     #[command(flatten)]

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail, ensure};
 use flyrig_capture::Rotation;
-use flyrig_fusion::{AppearanceOptions, BodySettings, Origin, OutputSettings, SessionSettings, TrackingSettings};
+use flyrig_fusion::{
+    AppearanceOptions, BodySettings, Origin, OutputSettings, PerceptionSettings, SessionSettings, TrackingSettings,
+};
 use flyrig_sim::SimConfig;
 use flyrig_sync::SyncSettings;
 use flyrig_transport::TransportConfig;
@@ -15,6 +17,9 @@ use crate::cameras::CameraEntry;
 /// The commented default file, as `flyrig config print` writes it. A test keeps it equal to `Config::default()`.
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
 
+/// Keys that stand in `[perception]`, but stood in `[body]` in earlier versions.
+const MOVED_FROM_BODY: [&str; 3] = ["pose", "masks", "shape"];
+
 /// Everything `flyrig run` can be told; the keys are explained in `assets/default.toml`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -23,6 +28,7 @@ pub struct Config {
     pub source: SourceSection,
     pub sim: SimConfig,
     pub sync: SyncSettings,
+    pub perception: PerceptionSettings,
     pub body: BodySettings,
     pub tracking: TrackingSettings,
     pub appearance: AppearanceOptions,
@@ -222,7 +228,15 @@ impl Config {
                 Ok(config)
             }
             Err(error) => {
-                let hint = nearest_key(error.message()).map(|key| format!("did you mean `{key}`?")).unwrap_or_default();
+                let hint = match error.message() {
+                    // Where these keys stood before.
+                    message
+                        if MOVED_FROM_BODY.iter().any(|key| message.starts_with(&format!("unknown field `{key}`"))) =>
+                    {
+                        "pose, masks and shape are keys of [perception]".to_owned()
+                    }
+                    message => nearest_key(message).map(|key| format!("did you mean `{key}`?")).unwrap_or_default(),
+                };
                 bail!("{}{hint}", error.to_string().trim_end_matches(' '))
             }
         }
@@ -258,6 +272,7 @@ impl Config {
     /// The settings of a session.
     pub fn session(&self) -> SessionSettings {
         SessionSettings {
+            perception: self.perception.clone(),
             body: self.body.clone(),
             tracking: self.tracking.clone(),
             appearance: self.appearance.clone(),
@@ -289,9 +304,10 @@ impl Config {
         );
         ensure!(
             self.source.kind == SourceKind::Sim
-                || self.body.pose == Origin::Estimated
+                || self.perception.pose == Origin::Estimated
                 || !self.body.template.as_os_str().is_empty(),
-            "body.pose is \"given\" but body.template is empty: name a skinned glTF file with an animation, or set body.pose = \"estimated\""
+            "perception.pose is \"given\" but body.template is empty: name a skinned glTF file with an animation, or set \
+             perception.pose = \"estimated\""
         );
         Ok(())
     }
@@ -342,7 +358,6 @@ mod tests {
         let tables = "\n[[source.cameras]]\nname = \"left\"\nserial = \"A1\"\nsize = [1280, 720]\n";
         let text = format!("{}{tables}", DEFAULT_TOML.replace("kind = \"sim\"", "kind = \"cameras\""));
         let text = text.replacen("path = \"\"", "path = \"calibration\"", 1);
-        let text = text.replace("pose = \"given\"", "pose = \"estimated\"");
         let config = Config::parse(&text).unwrap();
         assert_eq!(config.source.names(), ["left"]);
     }
@@ -361,10 +376,12 @@ mod tests {
     fn values_out_of_range_are_named() {
         for (text, expected) in [
             ("[sync]\nwindow_ms = nan\n", "sync.window_ms is NaN"),
+            ("[body]\npose = \"given\"\n", "pose, masks and shape are keys of [perception]"),
+            ("[perception]\nheight_m = 9.0\n", "perception.height_m is 9, it must lie between 0.5 and 2.5"),
             ("[body]\ngaussians = 3\n", "body.gaussians is 3, it must lie between 100 and 2000000"),
             ("[body]\ngaussians = 200\nnodes = 1000\n", "body.nodes is 1000, more than body.gaussians"),
             ("[source]\nkind = \"folder\"\n", "source.path is empty"),
-            ("[source]\nkind = \"folder\"\npath = \"x\"\n", "body.template is empty"),
+            ("[source]\nkind = \"folder\"\npath = \"x\"\n[perception]\npose = \"given\"\n", "body.template is empty"),
             ("[rig]\nname = \"a/b\"\n", "rig.name is 'a/b'"),
             ("[transport]\ninbox_bytes = 1000\n", "transport.inbox_bytes is 1000, it must lie between 65536 and"),
             (

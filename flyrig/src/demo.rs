@@ -194,13 +194,8 @@ fn pass(
         .map(|source| Box::new(source) as Box<dyn CameraSource>)
         .collect();
     let settings = SessionSettings {
-        body: BodySettings {
-            gaussians: args.gaussians,
-            pose: args.pose,
-            masks: args.masks,
-            shape: args.shape,
-            ..BodySettings::default()
-        },
+        perception: args.perception(),
+        body: BodySettings { gaussians: args.gaussians, ..BodySettings::default() },
         tracking: args.tracking.clone(),
         appearance: appearance.clone(),
     };
@@ -271,11 +266,11 @@ fn pass(
 fn find_person(args: &DemoArgs, simulator: &Mutex<Simulator>, inputs: &Rig) -> Result<EstimatedPerception> {
     let mut simulator = lock(simulator)?;
     let plates = simulated_plates(&simulator, inputs)?;
-    if args.shape == Some(Origin::Given) {
-        return Ok(EstimatedPerception::new(inputs, simulator.template(), args.masks, plates)?);
+    if args.perception().shape() == Origin::Given {
+        return Ok(EstimatedPerception::new(inputs, simulator.template(), &args.perception(), plates)?);
     }
     let template = default_template(&ShapeParams::default())?;
-    let mut perception = EstimatedPerception::new(inputs, &template, args.masks, plates)?;
+    let mut perception = EstimatedPerception::new(inputs, &template, &args.perception(), plates)?;
     eprintln!("demo: learning the person's shape from {SHAPE_SETS} frames of the first {SHAPE_SECS} seconds");
     let mut sets = Vec::new();
     for index in 0..SHAPE_SETS {

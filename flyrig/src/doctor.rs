@@ -228,7 +228,7 @@ mod tests {
         };
         let tables: String = [("a", "A"), ("b", "B"), ("c", "C"), ("d", "D")].map(|(n, s)| camera(n, s)).concat();
         let tables = format!("{tables}[[source.cameras]]\nname = \"e\"\nnokhwa = \"No Such Cam\"\nsize = [640, 480]\n");
-        let text = format!("[source]\nkind = \"cameras\"\npath = \"x\"\n{tables}[body]\npose = \"estimated\"\n");
+        let text = format!("[source]\nkind = \"cameras\"\npath = \"x\"\n{tables}[perception]\npose = \"estimated\"\n");
         let config = Config::parse(&text).unwrap();
         let mut mends = Vec::new();
         let text = plan(&[report(0, "A"), report(2, "B"), report(4, "C")], Some(&config), &mut mends);

@@ -56,6 +56,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         inputs: args.inputs.clone(),
         holdout: args.holdout.clone(),
         session: SessionSettings {
+            perception: args.perception.clone(),
             body: args.body.clone(),
             tracking: args.tracking.clone(),
             appearance: args.appearance.clone(),
@@ -139,8 +140,8 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         dataset: args.dataset.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned()),
         inputs: &args.inputs,
         holdout: &args.holdout,
-        pose: args.body.pose,
-        masks: args.body.masks,
+        pose: args.perception.pose,
+        masks: args.perception.masks,
         solver: args.tracking.solver,
         appearance: args.appearance.mode,
         gaussians: args.body.gaussians,

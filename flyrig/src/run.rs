@@ -36,7 +36,7 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
     stop::flag();
     let mut monitor = Monitor::start(&config.health.listen, show_table)?;
     let source = source::open(config, Some(gpu))?;
-    dataset::require_masks(config.body.pose, config.body.masks, &source.plates)?;
+    dataset::require_masks(config.perception.pose, config.perception.masks, &source.plates)?;
     let pacing = source::pacing(config);
     let recorder = recording.map(|path| recording::recorder(path, &source.rig, &config.record, pacing)).transpose()?;
     let ended = capture_people(config, gpu, source, recorder.as_ref(), &mut monitor, show_table);
@@ -80,7 +80,7 @@ fn capture_people(
     let threads = std::mem::take(&mut source.threads);
     builder = match source.perception(config)? {
         FoundBy::Given(perception) => builder.perception(perception),
-        FoundBy::Estimated(perception) if is_known || config.body.shape == Some(Origin::Given) => {
+        FoundBy::Estimated(perception) if is_known || config.perception.shape() == Origin::Given => {
             builder.perception(*perception)
         }
         FoundBy::Estimated(mut perception) => {

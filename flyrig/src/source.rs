@@ -37,16 +37,16 @@ pub enum FoundBy {
 impl Source {
     /// How people are found: from the source's pose track, or from the images.
     pub fn perception(&mut self, config: &Config) -> Result<FoundBy> {
-        let (masks, plates) = (config.body.masks, std::mem::take(&mut self.plates));
-        match (config.body.pose, self.track.take()) {
+        let (masks, plates) = (config.perception.masks, std::mem::take(&mut self.plates));
+        match (config.perception.pose, self.track.take()) {
             (Origin::Given, Some(track)) => {
                 let (person, repeat) = (PersonId::default(), config.source.kind == SourceKind::Sim);
                 let given = GivenPerson { person, template: self.template.clone(), track, repeat };
                 Ok(FoundBy::Given(GivenPerception::new(&self.rig, vec![given]).with_masks(masks, plates)))
             }
-            (Origin::Given, None) => bail!("body.pose is \"given\" but the template holds no animation"),
+            (Origin::Given, None) => bail!("perception.pose is \"given\" but the template holds no animation"),
             (Origin::Estimated, _) => {
-                let estimated = EstimatedPerception::new(&self.rig, &self.template, masks, plates)?;
+                let estimated = EstimatedPerception::new(&self.rig, &self.template, &config.perception, plates)?;
                 Ok(FoundBy::Estimated(Box::new(estimated)))
             }
         }
@@ -102,7 +102,7 @@ fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
         let (rig, template, track) =
             (simulator.reported_rig(), simulator.template().clone(), simulator.track().clone());
         // Nobody tells an estimator whom it will see.
-        let knows_shape = config.body.shape.unwrap_or(config.body.pose) == Origin::Given;
+        let knows_shape = config.perception.shape() == Origin::Given;
         let template = if knows_shape { template } else { default_template(&ShapeParams::default())? };
         let picked = dataset::pick(&rig, &source.names(), "the simulated rig")?;
         let plates = simulated_plates(&simulator, &picked)?;
@@ -127,7 +127,7 @@ fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
     let mut threads = Vec::new();
     let sources: Vec<SourceOpener> = match source.kind {
         SourceKind::Folder => {
-            let with_masks = config.body.masks == Origin::Given;
+            let with_masks = config.perception.masks == Origin::Given;
             ready(FolderReplay::open(
                 &source.path,
                 Some(&ids),

@@ -197,7 +197,7 @@ fn open(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Ta
             let gpu = is_sim.then(gpu).transpose()?;
             let is_live = config.source.kind.is_live();
             let source = source::open(&config, gpu.as_ref())?;
-            let given_masks = config.body.masks == Origin::Given;
+            let given_masks = config.perception.masks == Origin::Given;
             Take {
                 sources: source.cameras,
                 is_live,

@@ -42,7 +42,8 @@ pub use perception::{
 pub use session::{Counts, Outcome, Session, SessionBuilder};
 pub use set_reader::{SetReader, next_frame};
 pub use settings::{
-    AppearanceMode, AppearanceOptions, BodySettings, NetworksOn, Origin, SessionSettings, Solver, TrackingSettings,
+    AppearanceMode, AppearanceOptions, BodySettings, NetworksOn, Origin, PerceptionSettings, SessionSettings, Solver,
+    TrackingSettings,
 };
 pub use stage_times::{StageSummary, StageTimes, processor_time, resident_mib};
 pub use subject::{Observed, PROCESSOR_STAGE, Subject};

@@ -2,10 +2,12 @@
 
 mod appearance;
 mod body;
+mod perception;
 mod tracking;
 
 pub use appearance::{AppearanceMode, AppearanceOptions, NetworksOn};
-pub use body::{BodySettings, Origin};
+pub use body::BodySettings;
+pub use perception::{Origin, PerceptionSettings};
 pub use tracking::{Solver, TrackingSettings};
 
 use crate::FusionError;
@@ -13,7 +15,9 @@ use crate::FusionError;
 /// Everything that may be chosen about a session.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SessionSettings {
-    /// The person's surface, and where poses and masks come from.
+    /// Where poses and masks come from.
+    pub perception: PerceptionSettings,
+    /// The person's surface.
     pub body: BodySettings,
     /// How the surface follows the images.
     pub tracking: TrackingSettings,
@@ -27,6 +31,7 @@ impl SessionSettings {
     /// # Errors
     /// [`FusionError::Setting`] names the key and the range.
     pub fn validate(&self) -> Result<(), FusionError> {
+        self.perception.validate()?;
         self.body.validate()?;
         self.tracking.validate()?;
         self.appearance.validate()

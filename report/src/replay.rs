@@ -62,22 +62,22 @@ impl Replay {
         let (rig, holdout) = load_rigs(settings)?;
         let (sets, count) = open_inputs(settings, &rig)?;
         let truth = TruthReader::open(settings, &holdout)?;
-        let body = &settings.session.body;
+        let perceived = &settings.session.perception;
         let plates = dataset::plates(&settings.dataset, &rig)?;
-        dataset::require_masks(body.pose, body.masks, &plates)?;
+        dataset::require_masks(perceived.pose, perceived.masks, &plates)?;
         let builder = SessionBuilder::new(gpu.clone(), rig.clone()).settings(settings.session.clone());
-        let session = match body.pose {
+        let session = match perceived.pose {
             Origin::Given => {
                 let person = given_person(&settings.dataset)?;
-                builder.perception(GivenPerception::new(&rig, vec![person]).with_masks(body.masks, plates))
+                builder.perception(GivenPerception::new(&rig, vec![person]).with_masks(perceived.masks, plates))
             }
             Origin::Estimated => {
-                if body.shape == Some(Origin::Given) {
+                if perceived.shape() == Origin::Given {
                     let template = given_person(&settings.dataset)?.template;
-                    builder.perception(EstimatedPerception::new(&rig, &template, body.masks, plates)?)
+                    builder.perception(EstimatedPerception::new(&rig, &template, perceived, plates)?)
                 } else {
                     let template = default_template(&ShapeParams::default())?;
-                    let mut perception = EstimatedPerception::new(&rig, &template, body.masks, plates)?;
+                    let mut perception = EstimatedPerception::new(&rig, &template, perceived, plates)?;
                     eprintln!("learning the person's shape from {SHAPE_SETS} frames of the first {SHAPE_SECS} seconds");
                     let first = first_sets(settings, &rig)?;
                     let fit = perception.learn_shape(&first).context("no person found in the first frames")?;
@@ -110,7 +110,13 @@ fn load_rigs(args: &ReplaySettings) -> Result<(Rig, Vec<Camera>)> {
     let chosen: Vec<CameraId> = args.inputs.iter().chain(&args.holdout).map(|name| name.as_str().into()).collect();
     let all = dataset::load_rig(&args.dataset, &chosen)?;
     let whose = format!("the calibration of {}", args.dataset.display());
-    let (rig, holdout) = (dataset::pick(&all, &args.inputs, &whose)?, dataset::pick(&all, &args.holdout, &whose)?);
+    let rig = dataset::pick(&all, &args.inputs, &whose)?;
+    // No name would pick all cameras.
+    let holdout = if args.holdout.is_empty() {
+        Rig { cameras: Vec::new(), world_up: all.world_up }
+    } else {
+        dataset::pick(&all, &args.holdout, &whose)?
+    };
     let used = Rig { cameras: rig.cameras.iter().chain(&holdout.cameras).cloned().collect(), world_up: all.world_up };
     let with_lags: Vec<String> = args.lags_nanos.keys().map(CameraId::to_string).collect();
     dataset::pick(&used, &with_lags, "--inputs or --holdout, but in --lag")?;
@@ -146,7 +152,7 @@ fn given_person(root: &Path) -> Result<GivenPerson> {
 /// Opens the input cameras; returns their number of frames as well.
 fn open_inputs(settings: &ReplaySettings, rig: &Rig) -> Result<(SetReader, usize)> {
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
-    let with_masks = settings.true_masks || settings.session.body.masks == Origin::Given;
+    let with_masks = settings.true_masks || settings.session.perception.masks == Origin::Given;
     let options = FolderOptions { fps: settings.fps, frames: settings.frames.clone(), with_masks };
     let sources = FolderReplay::open(&settings.dataset, Some(&ids), &options)?;
     let count = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);

@@ -40,7 +40,7 @@ fn write_rig(folder: &Path, health: u16) {
     assert_eq!(exported.code, Some(0), "{exported:?}");
     let rig = format!(
         "[source]\nkind = \"cameras\"\npath = \"calibration\"\n[[source.cameras]]\nname = \"00\"\nserial = \"none such\"\n\
-         size = [64, 64]\n[body]\npose = \"estimated\"\nmasks = \"estimated\"\n[transport]\n\
+         size = [64, 64]\n[perception]\npose = \"estimated\"\nmasks = \"estimated\"\n[transport]\n\
          listen = [\"tcp/127.0.0.1:0\"]\n[health]\nlisten = \"127.0.0.1:{health}\"\n"
     );
     std::fs::write(folder.join("rig.toml"), rig).unwrap();
@@ -106,7 +106,8 @@ fn a_recording_that_breaks_off_fails_the_command_after_a_clean_end() {
     let folder = tempfile::tempdir().unwrap();
     let config = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = [\"00\", \"01\"]\n\
         [record]\njpeg_quality = 0\nrotate = \"1MB\"\n[sim]\nwidth = 160\nheight = 160\ntexture_px = 64\nframes = 20\n\
-        cameras.count = 2\n[body]\ngaussians = 2000\nnodes = 50\n[transport]\nlisten = [\"tcp/127.0.0.1:0\"]\n";
+        cameras.count = 2\n[perception]\npose = \"given\"\nmasks = \"given\"\n\
+        [body]\ngaussians = 2000\nnodes = 50\n[transport]\nlisten = [\"tcp/127.0.0.1:0\"]\n";
     std::fs::write(folder.path().join("rig.toml"), config).unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
     let whole = command(&["record", "rig.toml", "--out", "whole.mcap"]);

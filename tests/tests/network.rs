@@ -39,7 +39,7 @@ fn cameras_of_another_process_are_recorded_in_whole_sets() {
     let rig = |name: &str| {
         format!(
             "[rig]\nname = \"{name}\"\n[source]\nkind = \"network\"\npath = \"calibration\"\n\
-             cameras = [\"00\", \"01\"]\n[body]\npose = \"estimated\"\nmasks = \"estimated\"\n\
+             cameras = [\"00\", \"01\"]\n[perception]\npose = \"estimated\"\nmasks = \"estimated\"\n\
              [transport]\nconnect = [\"tcp/127.0.0.1:{port}\"]\n"
         )
     };

@@ -6,6 +6,7 @@ use flyrig_tests::run;
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
 const RIG: &str = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = [\"00\", \"01\"]\n\
+    [perception]\npose = \"given\"\nmasks = \"given\"\n\
     [record]\njpeg_quality = 0\n[sim]\nwidth = 64\nheight = 64\ntexture_px = 64\nframes = 6\ncameras.count = 2\n";
 
 #[test]
@@ -72,7 +73,7 @@ fn doctor_says_what_is_there_and_what_to_mend() {
         assert!(doctor.stdout.contains(heading), "{}", doctor.stdout);
     }
     let text = "[source]\nkind = \"v4l2\"\npath = \"x\"\n[[source.cameras]]\nname = \"left\"\nserial = \"none such\"\n\
-                size = [640, 360]\n[body]\npose = \"estimated\"\n";
+                size = [640, 360]\n[perception]\npose = \"estimated\"\n";
     std::fs::write(folder.path().join("rig.toml"), text).unwrap();
     let doctor = run(PROGRAM, &["doctor", "rig.toml"], folder.path()).unwrap();
     assert!(doctor.stdout.contains("camera left of the configuration is not plugged in"), "{}", doctor.stdout);

@@ -6,6 +6,7 @@ use flyrig_tests::run;
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
 const RIG: &str = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = []\n\
+    [perception]\npose = \"given\"\nmasks = \"given\"\n\
     [sim]\nwidth = 112\nheight = 112\ntexture_px = 64\nframes = 75\ncameras.count = 3\nmotion.kind = \"jump\"\n\
     [[sim.faults.fault]]\nkind = \"offset\"\ncamera = \"02\"\nms = 45.0\n";
 

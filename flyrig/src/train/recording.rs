@@ -6,7 +6,7 @@ use std::{
 };
 
 use anyhow::{Context, Result, ensure};
-use flyrig_fusion::{BodySettings, SessionSettings};
+use flyrig_fusion::{BodySettings, PerceptionSettings, SessionSettings};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{Replay, ReplaySettings, dataset, progress_bar, stop, write_whole};
 use flyrig_types::CameraId;
@@ -51,7 +51,8 @@ fn leave_out(
         inputs: cameras.iter().filter(|camera| *camera != left_out).cloned().collect(),
         holdout: vec![left_out.clone()],
         session: SessionSettings {
-            body: BodySettings { pose: args.pose, gaussians: args.gaussians, ..BodySettings::default() },
+            perception: PerceptionSettings { pose: args.pose, ..PerceptionSettings::given() },
+            body: BodySettings { gaussians: args.gaussians, ..BodySettings::default() },
             ..SessionSettings::default()
         },
         fps: args.fps,

@@ -1,13 +1,13 @@
 //! One person found in the images by the pose network.
 
-use std::borrow::Cow;
+use std::{borrow::Cow, time::Duration};
 
 use flyrig_body::Template;
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet, ShapeFit, mask_from_plate};
 use flyrig_types::{FrameSet, Image, PersonId, Rig};
 
 use super::{Observation, Perception, SeenPerson, ViewObservation};
-use crate::{FusionError, Origin, StageTimes};
+use crate::{FusionError, Origin, PerceptionSettings, StageTimes};
 
 /// Frame sets that the shape is fitted to before the first pose.
 pub const SHAPE_SETS: usize = 8;
@@ -26,11 +26,17 @@ pub struct EstimatedPerception {
 
 impl EstimatedPerception {
     /// Looks for one person with the cameras of `rig`. `plates` holds an image of the empty scene by slot, where there is
-    /// one: masks then use the difference to it. Masks come from the frames where `masks` is given.
+    /// one: masks then use the difference to it. Masks come from the frames where those of the settings are given.
     ///
     /// # Errors
     /// [`FusionError::Track`] when template, rig or a plate cannot be used.
-    pub fn new(rig: &Rig, template: &Template, masks: Origin, plates: Vec<Option<Image>>) -> Result<Self, FusionError> {
+    pub fn new(
+        rig: &Rig,
+        template: &Template,
+        settings: &PerceptionSettings,
+        plates: Vec<Option<Image>>,
+    ) -> Result<Self, FusionError> {
+        let masks = settings.masks;
         let config = PoseConfig { masks: masks == Origin::Estimated, ..PoseConfig::default() };
         let mut estimator = PoseEstimator::new(PoseNet::embedded()?, template, rig, config)?;
         for (slot, plate) in plates.iter().enumerate() {
@@ -61,6 +67,15 @@ impl Perception for EstimatedPerception {
             Ok(estimate) => estimate,
             Err(error) => return Ok(vec![Observation::Lost { person, reason: error.to_string() }]),
         };
+        let seconds = estimate.quality.seconds;
+        for (stage, seconds) in [
+            ("  network", seconds.net),
+            ("  fit to landmarks", seconds.triangulate + seconds.fit),
+            ("  masks", seconds.masks),
+            ("  fit to outlines", seconds.outline),
+        ] {
+            stages.add(stage, Duration::from_secs_f64(seconds.max(0.0)));
+        }
         if !estimate.pose.is_valid() {
             let reason = "the pose holds numbers that are not finite".to_owned();
             return Ok(vec![Observation::Lost { person, reason }]);

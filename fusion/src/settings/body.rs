@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 use flyrig_body::{DEFAULT_GAUSSIAN_COUNT, DEFAULT_NODE_COUNT};
 use serde::{Deserialize, Serialize};
 
@@ -12,33 +12,13 @@ use crate::FusionError;
 /// Fewest Gaussians for each node of a small deformation graph.
 const GAUSSIANS_A_NODE: usize = 12;
 
-/// Source of a pose or a mask.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum Origin {
-    /// From the source or the data set.
-    #[default]
-    Given,
-    /// From the images.
-    Estimated,
-}
-
-/// The person's surface, and where poses and masks come from.
+/// The person's surface.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct BodySettings {
     /// A skinned glTF file; empty: the built-in body.
     #[arg(skip)]
     pub template: PathBuf,
-    /// Pose from the data set's glTF animation, or from the images.
-    #[arg(long, value_enum, default_value = "given")]
-    pub pose: Origin,
-    /// Masks from the data set, or from the images.
-    #[arg(long, value_enum, default_value = "given")]
-    pub masks: Origin,
-    /// Shape of the body from the data set's glTF file, or from the images; by default from where the pose comes.
-    #[arg(long, value_enum)]
-    pub shape: Option<Origin>,
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT)]
     pub gaussians: usize,
@@ -54,9 +34,6 @@ impl Default for BodySettings {
     fn default() -> Self {
         Self {
             template: PathBuf::new(),
-            pose: Origin::Given,
-            masks: Origin::Given,
-            shape: None,
             gaussians: DEFAULT_GAUSSIAN_COUNT,
             nodes: DEFAULT_NODE_COUNT,
             person: PathBuf::new(),

@@ -61,8 +61,9 @@ pub fn small_rig(name: &str, folder: &Path, more: &str) -> String {
     let endpoint = format!("tcp/127.0.0.1:{port}");
     let config = format!(
         "[rig]\nname = \"{name}\"\n[source]\ncameras = [\"00\", \"03\"]\n[sim]\nwidth = 96\nheight = 96\n\
-         texture_px = 128\n[body]\ngaussians = 3000\nnodes = 100\n[output]\nwidth = 96\nheight = 96\n[transport]\n\
-         listen = [\"{endpoint}\"]\n{more}"
+         texture_px = 128\n[perception]\npose = \"given\"\nmasks = \"given\"\n\
+         [body]\ngaussians = 3000\nnodes = 100\n[output]\nwidth = 96\nheight = 96\n\
+         [transport]\nlisten = [\"{endpoint}\"]\n{more}"
     );
     std::fs::write(folder.join("rig.toml"), config).unwrap();
     endpoint

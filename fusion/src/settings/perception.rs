@@ -1,0 +1,67 @@
+//! The table `[perception]`.
+
+use clap::{Args, ValueEnum};
+use serde::{Deserialize, Serialize};
+
+use super::check;
+use crate::FusionError;
+
+/// Source of a pose, a shape or a mask.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Origin {
+    /// From the source or the data set.
+    Given,
+    /// From the images.
+    #[default]
+    Estimated,
+}
+
+/// Where poses, shapes and masks of people come from, and how people are found.
+///
+/// A configuration estimates everything by default. The options of commands that replay data sets take what comes with the
+/// data by default.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Args)]
+#[serde(deny_unknown_fields, default)]
+pub struct PerceptionSettings {
+    /// Pose from the data set's glTF animation, or from the images.
+    #[arg(long, value_enum, default_value = "given")]
+    pub pose: Origin,
+    /// Masks from the data set, or from the images.
+    #[arg(long, value_enum, default_value = "given")]
+    pub masks: Origin,
+    /// Shape of the body from the data set's glTF file, or from the images; by default from where the pose comes.
+    #[arg(long, value_enum)]
+    pub shape: Option<Origin>,
+    /// Height of an estimated person in metres; by default measured, or an average one before a single camera.
+    #[arg(long = "height", value_name = "METRES")]
+    pub height_m: Option<f64>,
+}
+
+impl Default for PerceptionSettings {
+    fn default() -> Self {
+        Self { pose: Origin::Estimated, masks: Origin::Estimated, shape: None, height_m: None }
+    }
+}
+
+impl PerceptionSettings {
+    /// Returns settings that take pose, shape and masks from the source.
+    #[must_use]
+    pub fn given() -> Self {
+        Self { pose: Origin::Given, masks: Origin::Given, ..Self::default() }
+    }
+
+    /// Where the shape comes from.
+    #[must_use]
+    pub fn shape(&self) -> Origin {
+        self.shape.unwrap_or(self.pose)
+    }
+
+    /// Checks every value.
+    ///
+    /// # Errors
+    /// [`FusionError::Setting`] names the key and the range.
+    pub fn validate(&self) -> Result<(), FusionError> {
+        self.height_m.map_or(Ok(()), |height| check("perception.height_m", height, 0.5, 2.5))
+    }
+}
