@@ -4,7 +4,7 @@ use std::{ops::Range, path::PathBuf};
 
 use clap::{Args, Parser, Subcommand, builder::TypedValueParser as _};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
-use flyrig_fusion::NetworksOn;
+use flyrig_fusion::{NetworksOn, Origin};
 use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size};
 
 /// Measure run time against error on simulated people.
@@ -178,6 +178,10 @@ pub struct BenchPerceptionArgs {
 
 #[derive(Debug, Args)]
 pub struct BenchSubjectsArgs {
+    /// Poses, shapes and masks from the simulator, or from the images. In the latter case the second person walks around the first,
+    /// and it is counted how often the tracks change places.
+    #[arg(long, value_enum, default_value = "given")]
+    pub pose: Origin,
     /// Folder of the results.
     #[arg(long, default_value = "out/bench-subjects")]
     pub out: PathBuf,

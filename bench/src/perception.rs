@@ -156,6 +156,7 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
     }
     bar.finish_and_clear();
     let stages = replay.session.stages.summary();
+    eprintln!("  {:?}", replay.session.stages.counts().collect::<Vec<_>>());
     let row = Row {
         dataset: name,
         inputs,
@@ -242,7 +243,7 @@ fn mean(values: &[f64]) -> f64 {
 }
 
 /// World places of the joints, and the rotations of the parts that they carry from the bind pose, by name.
-fn places(skeleton: &Skeleton, pose: &Pose) -> BTreeMap<String, (DVec3, DQuat)> {
+pub(crate) fn places(skeleton: &Skeleton, pose: &Pose) -> BTreeMap<String, (DVec3, DQuat)> {
     let world = skeleton.world_from_canonical(pose);
     let place = |(joint, world): (&flyrig_body::Joint, &glam::DMat4)| {
         let origin = joint.joint_from_canonical.inverse().w_axis.truncate();

@@ -2,22 +2,25 @@
 //!
 //! Two simulated people of one rig are composited by depth, so that they hide each other as they would in one room.
 
-use std::{path::Path, sync::Arc, time::Instant};
+use std::{collections::BTreeMap, path::Path, sync::Arc, time::Instant};
 
 use anyhow::{Context, Result};
+use flyrig_body::{ShapeParams, Template, default_template};
 use flyrig_fusion::{
-    BodySettings, GivenPerception, GivenPerson, PersonId, Session, SessionBuilder, SessionSettings, Subject,
+    BodySettings, EstimatedPerception, GivenPerception, GivenPerson, Origin, PerceptionSettings, PersonId, SHAPE_SECS,
+    SHAPE_SETS, Session, SessionBuilder, SessionSettings, Subject, TrackState,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
 use flyrig_report::{png, progress_bar, write_whole};
 use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, SimFrame, Simulator};
-use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat, Rig};
+use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat, Pose, Rig};
 
-use crate::cli::BenchSubjectsArgs;
+use crate::{cli::BenchSubjectsArgs, perception::places};
 
-/// Half of the distance between the two people, metres.
+/// Half of the distance between the two people, metres; of a person from the middle of another one's walk.
 const APART_M: f64 = 0.45;
+const WALK_APART_M: f64 = 0.7;
 /// Input and held-out cameras.
 const INPUTS: [usize; 4] = [0, 2, 4, 6];
 const HELD_OUT: [usize; 3] = [1, 3, 5];
@@ -27,15 +30,51 @@ struct Row {
     name: &'static str,
     psnr_db: f64,
     iou: f64,
+    tracks: Tracks,
     /// Milliseconds a set, and of one drawn view.
     set_ms: f64,
     view_ms: f64,
 }
 
+/// How estimated people were followed.
+#[derive(Default)]
+struct Tracks {
+    /// Which simulated person each id was on last.
+    on: BTreeMap<PersonId, usize>,
+    /// Times that an id changed to another simulated person.
+    swaps: usize,
+    /// Sets in which a person was on nobody's track.
+    missed: usize,
+    /// Distance of the hips from the true ones, millimetres.
+    hips_mm: Vec<f64>,
+}
+
+impl Tracks {
+    /// Compares the tracked people with the simulated ones at a time.
+    fn add(&mut self, session: &Session, people: &[Simulator], chosen: &[usize], nanos: i64) {
+        let hips =
+            |template: &Template, pose: &Pose| places(&template.skeleton, pose).get("Hips").map(|(place, _)| *place);
+        let mut found = Vec::new();
+        for subject in session.subjects().iter().filter(|subject| subject.watch().state() != TrackState::Lost) {
+            let Some(pose) = subject.pose() else { continue };
+            let place = |who: usize| hips(people[who].template(), &people[who].track().at_repeated(nanos));
+            let Some(own) = hips(subject.template(), pose) else { continue };
+            let distance = |who: &usize| place(*who).map_or(f64::INFINITY, |place| 1e3 * place.distance(own));
+            let Some(&nearest) = chosen.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))) else { continue };
+            self.hips_mm.push(distance(&nearest));
+            let before = self.on.insert(subject.id(), nearest);
+            self.swaps += usize::from(before.is_some_and(|before| before != nearest));
+            found.push(nearest);
+        }
+        self.missed += chosen.iter().filter(|who| !found.contains(who)).count();
+    }
+}
+
 /// Runs the command.
 pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let mut people = [-APART_M, APART_M]
+    let apart = if args.pose == Origin::Given { APART_M } else { WALK_APART_M };
+    let mut people = [-apart, apart]
         .into_iter()
         .zip(args.seed..)
         .map(|(x, seed)| simulator(gpu, args, seed, x))
@@ -47,11 +86,21 @@ pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
         rows.push(run(args, gpu, &rig, &mut people, name, chosen, &bar)?);
     }
     bar.finish_and_clear();
-    let mut table = String::from("| people | PSNR dB | mask IoU | ms a set | ms a view |\n|---|---|---|---|---|\n");
+    let mut table = String::from(
+        "| people | PSNR dB | mask IoU | hips mm | tracks that changed places | sets without a track | ms a set | ms a view |\n\
+         |---|---|---|---|---|---|---|---|\n",
+    );
     for row in &rows {
         table += &format!(
-            "| {} | {:.2} | {:.4} | {:.0} | {:.1} |\n",
-            row.name, row.psnr_db, row.iou, row.set_ms, row.view_ms
+            "| {} | {:.2} | {:.4} | {:.0} | {} | {} | {:.0} | {:.1} |\n",
+            row.name,
+            row.psnr_db,
+            row.iou,
+            row.tracks.hips_mm.iter().sum::<f64>() / row.tracks.hips_mm.len() as f64,
+            row.tracks.swaps,
+            row.tracks.missed,
+            row.set_ms,
+            row.view_ms
         );
     }
     if let [first, second, both] = rows.as_slice() {
@@ -66,7 +115,11 @@ pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
 
 fn simulator(gpu: &GpuContext, args: &BenchSubjectsArgs, seed: u64, x: f64) -> Result<Simulator> {
     let motion = MotionConfig {
-        kind: if x < 0.0 { MotionKind::Wave } else { MotionKind::Turn },
+        kind: match (x < 0.0, args.pose) {
+            (true, _) => MotionKind::Wave,
+            (false, Origin::Given) => MotionKind::Turn,
+            (false, Origin::Estimated) => MotionKind::Walk,
+        },
         at_m: [x, 0.0],
         ..MotionConfig::default()
     };
@@ -131,16 +184,22 @@ fn run(
         track: people[who].track().clone(),
         repeat: true,
     };
-    let perception = GivenPerception::new(&inputs, chosen.iter().map(given).collect());
     let settings = SessionSettings { body: BodySettings::with_gaussians(args.gaussians), ..SessionSettings::default() };
-    let mut session = SessionBuilder::new(gpu.clone(), inputs).settings(settings).perception(perception).build()?;
+    let builder = SessionBuilder::new(gpu.clone(), inputs.clone()).settings(settings);
+    let mut session = match args.pose {
+        Origin::Given => builder.perception(GivenPerception::new(&inputs, chosen.iter().map(given).collect())),
+        Origin::Estimated => builder.perception(find_people(people, chosen, rig, &inputs)?),
+    }
+    .build()?;
     let mut sheet = ScoreSheet::default();
+    let mut tracks = Tracks::default();
     let (mut set_secs, mut view_secs, mut views) = (0.0, 0.0, 0u32);
     for index in 0..args.frames as u64 {
         let nanos = people[0].frame_nanos(index);
         let set = frame_set(people, chosen, rig, index, nanos)?;
         let start = Instant::now();
         session.process(&set)?;
+        tracks.add(&session, people, chosen, nanos);
         // The first set compiles and starts from nothing.
         set_secs += if index > 0 { start.elapsed().as_secs_f64() } else { 0.0 };
         if index as usize >= args.frames / 2 {
@@ -168,9 +227,27 @@ fn run(
         name,
         psnr_db: mean.psnr_db,
         iou: mean.iou.unwrap_or(0.0),
+        tracks,
         set_ms: set_secs * 1e3 / (args.frames - 1).max(1) as f64,
         view_ms: view_secs * 1e3 / f64::from(views.max(1)),
     })
+}
+
+/// Looks for the chosen people with the empty room known, and measures them in the first seconds.
+fn find_people(people: &mut [Simulator], chosen: &[usize], rig: &Rig, inputs: &Rig) -> Result<EstimatedPerception> {
+    let settings = PerceptionSettings { people: chosen.len(), ..PerceptionSettings::default() };
+    let plate = |&slot: &usize| -> Result<Option<Image>> {
+        let plate = people[0].plate(slot)?;
+        Ok(Some(Image::new(plate.width(), plate.height(), plate.format(), plate.bytes().to_vec())?))
+    };
+    let plates = INPUTS.iter().map(plate).collect::<Result<Vec<_>>>()?;
+    let mut perception =
+        EstimatedPerception::new(inputs, &default_template(&ShapeParams::default())?, &settings, plates)?;
+    let every_nanos = (SHAPE_SECS * 1e9 / SHAPE_SETS as f64) as i64;
+    let sets = (0..SHAPE_SETS as u64).map(|index| frame_set(people, chosen, rig, index, index as i64 * every_nanos));
+    let fits = perception.learn_shapes(&sets.collect::<Result<Vec<_>>>()?)?;
+    fits.iter().for_each(|fit| eprintln!("a person is {fit}"));
+    Ok(perception)
 }
 
 fn frame_set(people: &mut [Simulator], chosen: &[usize], rig: &Rig, index: u64, nanos: i64) -> Result<FrameSet> {

@@ -290,8 +290,9 @@ fn find_person(args: &DemoArgs, simulator: &Mutex<Simulator>, inputs: &Rig) -> R
         }
         sets.push(FrameSet { index: index as u64, master_nanos, frames });
     }
-    let fit = perception.learn_shape(&sets)?;
-    eprintln!("demo: the person is {:.2} m tall", fit.height_m);
+    for fit in perception.learn_shapes(&sets)? {
+        eprintln!("demo: the person is {fit}");
+    }
     Ok(perception)
 }
 

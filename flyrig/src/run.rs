@@ -5,16 +5,15 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::{Result, bail};
+use anyhow::{Result, ensure};
 use flyrig_capture::{CameraStats, Recorder};
 use flyrig_fusion::{
-    EstimatedPerception, Health, Intake, LivePublisher, LiveRig, LiveViews, Origin, Outcome, PersonId, PersonMemory,
-    SHAPE_SECS, SHAPE_SETS, Session, SessionBuilder, check_threads, resident_mib,
+    Health, Intake, LivePublisher, LiveRig, LiveViews, Outcome, PersonId, PersonMemory, Session, SessionBuilder,
+    resident_mib,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{dataset, stop};
 use flyrig_transport::Publisher;
-use flyrig_types::{FrameSet, ThreadHealth, ThreadWatch};
 
 use crate::{
     config::Config,
@@ -80,12 +79,10 @@ fn capture_people(
     let threads = std::mem::take(&mut source.threads);
     builder = match source.perception(config)? {
         FoundBy::Given(perception) => builder.perception(perception),
-        FoundBy::Estimated(perception) if is_known || config.perception.shape() == Origin::Given => {
-            builder.perception(*perception)
-        }
         FoundBy::Estimated(mut perception) => {
-            if !learn_shape(&mut perception, &mut intake, &threads, recorder, monitor)? {
-                return Ok(());
+            eprintln!("run: looking for people; each is measured for a moment, then drawn");
+            if is_known {
+                perception.know_shape(&source.template)?;
             }
             builder.perception(*perception)
         }
@@ -134,9 +131,14 @@ fn capture_people(
         eprintln!("dropped: {count} {place}");
     }
     let stats = camera_stats(rig.health());
+    let (frames, seen) = (rig.frames(), rig.session.has_people());
     let saved = save_person(&mut rig, config);
     rig.finish()?;
     saved?;
+    ensure!(
+        seen || frames == 0 || stop::requested(),
+        "nobody was seen in {frames} sets: check that people stand in view of two cameras, and the calibration"
+    );
     // A recording ends; live cameras do not.
     if config.source.kind.is_live() && !stop::requested() {
         return Err(ended_by_itself(&stats));
@@ -164,58 +166,4 @@ fn record_pose(poses: Option<&mut PoseRecording>, session: &Session, nanos: i64)
     {
         poses.record(&subject.template().skeleton, &pose, nanos);
     }
-}
-
-/// Waits for a person and learns its shape. Returns false when the command was asked to stop before.
-fn learn_shape(
-    perception: &mut EstimatedPerception,
-    intake: &mut Intake,
-    threads: &[ThreadWatch],
-    recorder: Option<&Recorder>,
-    monitor: &mut Monitor,
-) -> Result<bool> {
-    eprintln!("run: learning the person's shape, please stand in view of all cameras");
-    let (mut tries, mut sets) = (0u64, Vec::new());
-    while !stop::requested() {
-        let threads: Vec<ThreadHealth> = threads.iter().map(ThreadWatch::health).collect();
-        check_threads(threads.iter().cloned())?;
-        monitor.look(|| {
-            (Health { threads, resident_mib: resident_mib(), ..intake.health() }, recorder.map(Recorder::state))
-        });
-        match intake.next_set(STEP) {
-            Some(set) => {
-                // Spread, so that a person who moves is seen in several poses.
-                let every_nanos = (SHAPE_SECS * 1e9 / SHAPE_SETS as f64) as u64;
-                let is_due = |last: &FrameSet| last.master_nanos.abs_diff(set.master_nanos) >= every_nanos;
-                if sets.last().is_none_or(is_due) {
-                    sets.push(set);
-                }
-                monitor.stepped();
-            }
-            None if intake.ended() => {
-                let ended = ended_by_itself(&camera_stats(intake.health()));
-                bail!("nobody was seen, and {ended}");
-            }
-            None => {}
-        }
-        if sets.len() < SHAPE_SETS {
-            continue;
-        }
-        let learnt = perception.learn_shape(&sets);
-        monitor.stepped();
-        match learnt {
-            Ok(fit) => {
-                eprintln!("run: the person is {:.2} m tall", fit.height_m);
-                return Ok(true);
-            }
-            Err(error) => {
-                tries += 1;
-                if tries.is_power_of_two() {
-                    tracing::warn!(%error, tries, "nobody seen, trying again");
-                }
-            }
-        }
-        sets.clear();
-    }
-    Ok(false)
 }

@@ -1,5 +1,6 @@
 //! Who is in front of the cameras: from a frame set to observations of people.
 
+mod colors;
 mod estimated;
 mod given;
 mod split_mask;

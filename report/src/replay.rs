@@ -80,8 +80,9 @@ impl Replay {
                     let mut perception = EstimatedPerception::new(&rig, &template, perceived, plates)?;
                     eprintln!("learning the person's shape from {SHAPE_SETS} frames of the first {SHAPE_SECS} seconds");
                     let first = first_sets(settings, &rig)?;
-                    let fit = perception.learn_shape(&first).context("no person found in the first frames")?;
-                    eprintln!("the person is {:.2} m tall", fit.height_m);
+                    for fit in perception.learn_shapes(&first).context("no person found in the first frames")? {
+                        eprintln!("the person is {fit}");
+                    }
                     builder.perception(perception)
                 }
             }

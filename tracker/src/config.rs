@@ -18,12 +18,17 @@ pub struct PoseConfig {
     pub outline_sigma_m: f64,
     /// How often the outline of the body is matched with the masks in a set; 0 fits the pose to landmarks alone.
     pub outline_rounds: usize,
+    /// Height of the person, metres; `None` measures it, or takes the template's before a single camera.
+    pub height_m: Option<f64>,
     /// Rounds in which [`crate::PoseEstimator::fit_shape`] matches outlines with masks to solve for lengths, girths, build and
     /// poses together; 0 fits bone lengths to landmarks alone. With rounds joints come nearer to the true ones, but views do
     /// not (docs/benchmarks/perception.md), so that 0 is the default.
     pub shape_rounds: usize,
     /// Standard deviation of a joint's turn between sets at 30 sets a second, radians; smaller is smoother.
     pub smooth_rad: f64,
+    /// Distance that the body moves in a view until the network looks at that view again, metres; 0 looks at every view of
+    /// every set.
+    pub look_after_m: f64,
     /// Largest number of solver steps a frame set.
     pub max_steps: usize,
     /// Whether bone lengths are fitted by [`crate::PoseEstimator::fit_shape`]; off for a template that
@@ -31,6 +36,8 @@ pub struct PoseConfig {
     pub fit_shape: bool,
     /// Whether masks are made; off saves time where the source brings its own.
     pub masks: bool,
+    /// Crops of a picture that a search for a person looks at in a set; 0 looks at all of them in every set.
+    pub search_crops: usize,
     /// Frame sets without a person after which the memory of the last pose is dropped.
     pub forget_after: u32,
 }
@@ -44,11 +51,14 @@ impl Default for PoseConfig {
             landmark_spread: 1.0,
             outline_sigma_m: 0.01,
             outline_rounds: 2,
+            height_m: None,
             shape_rounds: 0,
             smooth_rad: 0.15,
+            look_after_m: 0.01,
             max_steps: 12,
             fit_shape: true,
             masks: true,
+            search_crops: 3,
             forget_after: 15,
         }
     }

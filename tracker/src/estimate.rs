@@ -39,7 +39,9 @@ pub struct ViewQuality {
 /// Time spent in the stages of one estimate, seconds.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StageSeconds {
-    /// Crops and network.
+    /// Search of whole images for a person.
+    pub search: f64,
+    /// Network on the crops around a followed person.
     pub net: f64,
     /// Triangulation.
     pub triangulate: f64,
@@ -60,6 +62,8 @@ pub struct PoseQuality {
     pub residual_px: f64,
     /// Landmarks that two or more views agreed on.
     pub triangulated: usize,
+    /// Views that the network looked at; the others' landmarks and masks were carried along.
+    pub looked: usize,
     /// Where the time went.
     pub seconds: StageSeconds,
 }

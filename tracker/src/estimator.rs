@@ -13,16 +13,17 @@ use crate::body_model::{BodyModel, Turns};
 use crate::body_shape::ShapeSpace;
 use crate::crop::Crop;
 use crate::fit::{Before, FitProblem, FitView, align_trunk};
+use crate::looks::{Look, LookBody, carried_mask, corners, due};
 use crate::outline::{OutlinePoint, SeenBody};
 use crate::pixels::Rgb;
 use crate::plate::plate_evidence;
-use crate::search::{Sighting, project_all, search};
-use crate::shape::{fit_template_shape, seen_landmarks};
+use crate::search::{Search, SearchScene, Sighting, project_all};
+use crate::shape::{fit_template_shape, seen_landmarks, template_of_height};
 use crate::shape_solve::{ShapeAndPoses, ShapeProblem, ShapeSet};
-use crate::silhouette::{BodyGate, refine};
+use crate::silhouette::{BodyGate, coarse_mask, refine};
 use crate::single_view::lift;
 use crate::triangulate::{WorldPoint, triangulate};
-use crate::view::{View, observe};
+use crate::view::{Observation, View, observe};
 use crate::{
     LANDMARK_COUNT, NoMask, PoseConfig, PoseEstimate, PoseNet, PoseQuality, ShapeFit, StageSeconds, TrackError,
     TrackErrorKind, ViewKeypoints, ViewQuality,
@@ -45,6 +46,9 @@ const OUTLINE_STEPS: usize = 4;
 /// After a loss the whole picture is searched in every set, and ever more rarely up to every so many sets.
 const RAREST_SEARCH: u32 = 8;
 
+/// Landmarks in the world, metres.
+pub type Marks = [DVec3; LANDMARK_COUNT];
+
 /// The person as last seen.
 #[derive(Debug, Clone)]
 struct Track {
@@ -52,10 +56,20 @@ struct Track {
     nanos: i64,
     marks: [DVec3; LANDMARK_COUNT],
     velocity: [DVec3; LANDMARK_COUNT],
+    /// By slot.
+    looks: Vec<Option<Look>>,
+}
+
+impl Track {
+    /// Landmarks at a time a little later.
+    fn predicted(&self, nanos: i64) -> [DVec3; LANDMARK_COUNT] {
+        let ahead = secs(nanos.saturating_sub(self.nanos)).clamp(0.0, MAX_DELAY_SECS);
+        std::array::from_fn(|i| self.marks[i] + self.velocity[i] * ahead)
+    }
 }
 
 /// Tracks one person through the frame sets of a rig.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct PoseEstimator {
     net: PoseNet,
     /// As it was given.
@@ -67,14 +81,17 @@ pub struct PoseEstimator {
     config: PoseConfig,
     plates: Vec<Option<Vec<u8>>>,
     track: Option<Track>,
+    search: Search,
     /// Sets since the person was last seen.
     lost: u32,
+    /// Whether the network looks at every view of every set.
+    looks_at_all: bool,
 }
 
 /// A fitted pose before it is believed.
 struct Fitted {
     turns: Turns,
-    sightings: Vec<Option<Sighting>>,
+    looks: Vec<Option<Look>>,
     keypoints: Vec<Option<ViewKeypoints>>,
     points: [Option<WorldPoint>; LANDMARK_COUNT],
     views: Vec<ViewQuality>,
@@ -90,7 +107,6 @@ struct Evidence {
     /// An element a frame.
     views: Vec<FitView>,
     points: [Option<(DVec3, f64)>; LANDMARK_COUNT],
-    velocity: [DVec3; LANDMARK_COUNT],
     before: Option<Before>,
 }
 
@@ -109,7 +125,6 @@ impl Evidence {
             outline: &[],
             outline_sigma_m: config.outline_sigma_m,
             points: self.points,
-            velocity: self.velocity,
             before: self.before.clone(),
             landmark_spread: config.landmark_spread,
             robust: 2.0,
@@ -138,8 +153,15 @@ impl PoseEstimator {
             config,
             plates,
             track: None,
+            search: Search::default(),
             lost: 0,
+            looks_at_all: false,
         })
+    }
+
+    /// Lets the network look at every view of every set, whether the body moves or not: for [`Self::fit_shape_to_keypoints`].
+    pub fn look_at_all(&mut self, always: bool) {
+        self.looks_at_all = always;
     }
 
     /// The template, with the person's bone lengths once [`Self::fit_shape`] has run.
@@ -148,48 +170,88 @@ impl PoseEstimator {
         &self.template
     }
 
-    /// Fits bone lengths to the person in a few frame sets (5 to 10, buffered at the start; the more the
-    /// person moves in them the better), replaces the template by the fitted one and forgets the pose. The
-    /// shape is final from then on: estimate the buffered sets again, in order, and go on.
+    /// Fits bone lengths to the person in a few frame sets (5 to 10, buffered at the start; the more the person moves in them the
+    /// better) and replaces the template by the fitted one. Estimate the buffered sets again then, in order, and go on. Nobody of
+    /// `others`, landmarks by person and set, is taken for the person. Returns the person's own landmarks by set as well.
     ///
     /// # Errors
     /// Kind `Lost` when too few of the sets show a person; the template stays as it was.
-    pub fn fit_shape(&mut self, sets: &[FrameSet]) -> Result<ShapeFit, TrackError> {
+    pub fn fit_shape(
+        &mut self,
+        sets: &[FrameSet],
+        others: &[Vec<Option<Marks>>],
+    ) -> Result<(ShapeFit, Vec<Option<Marks>>), TrackError> {
         let mut keypoints = Vec::new();
-        let mut last = None;
-        for set in sets {
-            let result = self.check(set).and_then(|pictures| self.follow_or_search(set, &pictures));
-            match result {
+        let (mut first, mut last) = (None, None);
+        let mut places = Vec::new();
+        for (index, set) in sets.iter().enumerate() {
+            let others: Vec<Marks> = others.iter().filter_map(|marks| *marks.get(index)?).collect();
+            let found = self.find_at_once(set, &others);
+            places.push(found.as_ref().ok().map(|fitted| self.model.marks(&fitted.turns)));
+            match found {
                 Ok(fitted) => {
-                    if seen_landmarks(&fitted.keypoints, self.config.confidence_threshold) >= MIN_LANDMARKS {
-                        keypoints.push(fitted.keypoints);
-                    }
-                    self.remember(set, fitted.turns);
+                    keypoints.push(fitted.keypoints);
+                    first.get_or_insert_with(|| (fitted.turns.clone(), set.master_nanos));
+                    self.remember(set, fitted.turns, fitted.looks);
                 }
                 Err(error) => last = Some(error),
             }
         }
         self.reset();
-        let (template, mut fit) =
-            fit_template_shape(&self.base, &self.rig, &keypoints, &self.config).map_err(|e| last.unwrap_or(e))?;
-        self.model = BodyModel::new(&template)?;
-        self.template = template;
-        if self.config.shape_rounds > 0 {
+        let mut fit = match (first.is_some(), last) {
+            (false, Some(error)) => return Err(error),
+            _ => self.fit_shape_to_keypoints(&keypoints)?,
+        };
+        if self.config.shape_rounds > 0 && self.rig.cameras.len() > 1 {
             self.fit_shape_to_outlines(sets, &mut fit)?;
         }
         self.reset();
+        if let Some((turns, nanos)) = first {
+            self.start_at(turns, nanos);
+        }
+        Ok((fit, places))
+    }
+
+    /// Fits bone lengths to the landmarks of a person in a few sets, by set and slot, and goes on tracking with them. Before a
+    /// single camera, which cannot measure anything, the height is the configuration's or an average one.
+    ///
+    /// # Errors
+    /// Kind `Lost` when too few of the sets show a person in two views; the template stays as it was.
+    pub fn fit_shape_to_keypoints(&mut self, keypoints: &[Vec<Option<ViewKeypoints>>]) -> Result<ShapeFit, TrackError> {
+        let (template, fit) = if self.rig.cameras.len() == 1 {
+            template_of_height(&self.base, self.config.height_m)?
+        } else {
+            let seen = |views: &&Vec<_>| seen_landmarks(views, self.config.confidence_threshold) >= MIN_LANDMARKS;
+            let keypoints: Vec<Vec<_>> = keypoints.iter().filter(seen).cloned().collect();
+            fit_template_shape(&self.base, &self.rig, &keypoints, &self.config)?
+        };
+        self.model = BodyModel::new(&template)?;
+        self.template = template;
+        if let Some(track) = self.track.take() {
+            self.start_at(track.turns, track.nanos);
+        }
         Ok(fit)
+    }
+
+    /// Follows the person, or searches whole pictures: nobody waits for the set.
+    fn find_at_once(&mut self, set: &FrameSet, others: &[Marks]) -> Result<Fitted, TrackError> {
+        let pictures = self.check(set)?;
+        let given = (self.config.search_crops, self.looks_at_all);
+        (self.config.search_crops, self.looks_at_all) = (0, true);
+        let found = self.follow_or_search(set, &pictures, others, true, &mut StageSeconds::default());
+        (self.config.search_crops, self.looks_at_all) = given;
+        found
     }
 
     /// Solves for shape and poses of all sets together, from landmarks and the outlines of masks.
     fn fit_shape_to_outlines(&mut self, sets: &[FrameSet], fit: &mut ShapeFit) -> Result<(), TrackError> {
         let mut found = Vec::new();
         for set in sets {
-            let Ok(pictures) = self.check(set) else { continue };
-            let Ok(mut fitted) = self.follow_or_search(set, &pictures) else { continue };
+            let Ok(mut fitted) = self.find_at_once(set, &[]) else { continue };
+            let pictures = self.check(set)?;
             let masks = self.masks(set, &pictures, &mut fitted);
             fitted.evidence.before = None;
-            self.remember(set, fitted.turns.clone());
+            self.remember(set, fitted.turns.clone(), fitted.looks.clone());
             found.push((set, fitted, masks));
         }
         let space = ShapeSpace::new(&self.base);
@@ -225,6 +287,17 @@ impl PoseEstimator {
         Ok(())
     }
 
+    /// Takes a template of the person's shape instead, and forgets the pose.
+    ///
+    /// # Errors
+    /// Kind `Template` when it is not usable.
+    pub fn set_template(&mut self, template: &Template) -> Result<(), TrackError> {
+        self.model = BodyModel::new(template)?;
+        (self.base, self.template) = (template.clone(), template.clone());
+        self.reset();
+        Ok(())
+    }
+
     /// Gives a camera's empty picture; masks of that camera then heed the difference to it as well.
     ///
     /// # Errors
@@ -244,10 +317,20 @@ impl PoseEstimator {
     /// Looks for the person where a pose puts him at a time; false for a pose that does not fit the template.
     pub fn start_from(&mut self, pose: &flyrig_types::Pose, nanos: i64) -> bool {
         let Some(turns) = self.model.to_turns(pose) else { return false };
-        let marks = self.model.marks(&turns);
-        self.track = Some(Track { turns, nanos, marks, velocity: [DVec3::ZERO; LANDMARK_COUNT] });
-        self.lost = 0;
+        self.start_at(turns, nanos);
         true
+    }
+
+    fn start_at(&mut self, turns: Turns, nanos: i64) {
+        let marks = self.model.marks(&turns);
+        self.track = Some(Track {
+            turns,
+            nanos,
+            marks,
+            velocity: [DVec3::ZERO; LANDMARK_COUNT],
+            looks: vec![None; self.rig.cameras.len()],
+        });
+        self.lost = 0;
     }
 
     /// Forgets the last pose: the next set is searched from nothing.
@@ -256,15 +339,29 @@ impl PoseEstimator {
         self.lost = 0;
     }
 
-    /// Pose, masks and quality of one frame set; sets come in the order of time.
+    /// Returns pose, masks and quality of one frame set; sets come in the order of time.
     ///
     /// # Errors
     /// Kind `Lost` when no person was found: call again with the next set, the search goes on by itself.
     /// Kinds `Frames`, `Image` and `Net` when the input is not usable. The state stays sound in any case.
     pub fn estimate(&mut self, set: &FrameSet) -> Result<PoseEstimate, TrackError> {
+        self.estimate_among(set, &[], true)
+    }
+
+    /// As [`Self::estimate`], beside people whose landmarks are known in the world: a sighting of one of them is nobody else.
+    /// Without `may_search` a person who cannot be followed is lost in this set.
+    ///
+    /// # Errors
+    /// Those of [`Self::estimate`].
+    pub fn estimate_among(
+        &mut self,
+        set: &FrameSet,
+        others: &[Marks],
+        may_search: bool,
+    ) -> Result<PoseEstimate, TrackError> {
         let pictures = self.check(set)?;
         let mut seconds = StageSeconds::default();
-        let mut fitted = match self.follow_or_search_timed(set, &pictures, &mut seconds) {
+        let fitted = match self.follow_or_search(set, &pictures, others, may_search, &mut seconds) {
             Ok(fitted) => fitted,
             Err(error) => {
                 if error.kind == TrackErrorKind::Lost {
@@ -276,8 +373,19 @@ impl PoseEstimator {
                 return Err(error);
             }
         };
+        self.finish(set, &pictures, fitted, seconds)
+    }
+
+    /// Masks, the fit to their outlines, and the estimate.
+    fn finish(
+        &mut self,
+        set: &FrameSet,
+        pictures: &[Option<Rgb<'_>>],
+        mut fitted: Fitted,
+        mut seconds: StageSeconds,
+    ) -> Result<PoseEstimate, TrackError> {
         let start = Instant::now();
-        let mut masks = self.masks(set, &pictures, &mut fitted);
+        let mut masks = self.masks(set, pictures, &mut fitted);
         seconds.masks = start.elapsed().as_secs_f64();
         if self.config.outline_rounds > 0 {
             let start = Instant::now();
@@ -292,7 +400,8 @@ impl PoseEstimator {
         if !self.config.masks {
             masks.fill(None);
         }
-        self.remember(set, fitted.turns.clone());
+        let looked = fitted.looks.iter().flatten().filter(|look| look.body.is_none()).count();
+        self.remember(set, fitted.turns.clone(), fitted.looks);
         let pose = self.model.to_pose(&fitted.turns);
         let views = fitted.views;
         let triangulated = fitted.points.iter().flatten().count();
@@ -301,8 +410,33 @@ impl PoseEstimator {
             masks,
             keypoints: fitted.keypoints,
             points: fitted.points.map(|point| point.map(|p| p.position)),
-            quality: PoseQuality { views, residual_px: fitted.residual_px, triangulated, seconds },
+            quality: PoseQuality { views, residual_px: fitted.residual_px, triangulated, looked, seconds },
         })
+    }
+
+    /// Landmarks of the person at a time, as they have moved of late; `None` while nobody is tracked.
+    #[must_use]
+    pub fn predicted_landmarks(&self, nanos: i64) -> Option<Marks> {
+        self.track.as_ref().map(|track| track.predicted(nanos))
+    }
+
+    /// Frame sets since the person was seen last; 0 for one who is tracked.
+    #[must_use]
+    pub fn sets_lost(&self) -> u32 {
+        if self.track.is_some() { self.lost } else { self.lost.max(1) }
+    }
+
+    /// Gives up what is being tracked: it turned out to be somebody else. The search begins anew.
+    pub fn drop_track(&mut self) {
+        self.track = None;
+        self.lost = self.lost.max(1);
+    }
+
+    /// Lets this estimator follow whom another one follows, from the next set on; the other one has lost the person then.
+    pub fn take_track(&mut self, other: &mut Self) {
+        self.track = other.track.take();
+        self.lost = 0;
+        other.lost = 1;
     }
 
     /// Vertices and normals of a pose at a time after it, as the body has moved since the last set.
@@ -327,11 +461,20 @@ impl PoseEstimator {
                 let camera = &self.rig.cameras[slot];
                 let (vertices, _) = self.skinned(&fitted.turns, set, fitted.delay_secs(slot));
                 let gate = BodyGate::new(camera, &vertices, &self.template.triangles).ok_or(NoMask::OutOfView)?;
-                let sighting = fitted.sightings[slot].as_ref();
-                let sighting = sighting.filter(|s| s.output.presence >= self.config.presence_threshold);
-                let sighting = sighting.ok_or(NoMask::NoPerson)?;
+                let look = fitted.looks[slot].as_ref();
+                let look = look.filter(|l| l.sighting.output.presence >= self.config.presence_threshold);
+                let look = look.ok_or(NoMask::NoPerson)?;
+                let coarse = match &look.body {
+                    None => coarse_mask(&look.sighting, gate.bounds),
+                    Some(body) => {
+                        let (then, _) = self.skinned(&body.turns, set, fitted.delay_secs(slot));
+                        let (then, now) = (corners(camera, &then), corners(camera, &vertices));
+                        carried_mask(&look.sighting, &then, &now, gate.bounds)
+                    }
+                };
                 let evidence = self.plates[slot].as_ref().and_then(|plate| plate_evidence(picture, plate));
-                let mask = refine(picture, sighting, &gate, evidence.as_ref()).ok_or(NoMask::Empty)?;
+                let mask = refine(picture, &coarse, look.sighting.crop.scale(), &gate, evidence.as_ref())
+                    .ok_or(NoMask::Empty)?;
                 let overlap = gate.overlap(&mask);
                 Ok((mask, overlap))
             })
@@ -407,7 +550,7 @@ impl PoseEstimator {
     /// World positions of the landmarks on the template in a pose, metres; `None` for a pose that does not
     /// fit the template.
     #[must_use]
-    pub fn landmarks(&self, pose: &flyrig_types::Pose) -> Option<[DVec3; LANDMARK_COUNT]> {
+    pub fn landmarks(&self, pose: &flyrig_types::Pose) -> Option<Marks> {
         self.model.to_turns(pose).map(|turns| self.model.marks(&turns))
     }
 
@@ -435,30 +578,42 @@ impl PoseEstimator {
         set.frames.iter().zip(&self.rig.cameras).map(read).collect()
     }
 
-    fn follow_or_search(&self, set: &FrameSet, pictures: &[Option<Rgb<'_>>]) -> Result<Fitted, TrackError> {
-        self.follow_or_search_timed(set, pictures, &mut StageSeconds::default())
-    }
-
-    /// Follows the person from the last pose; searches the whole pictures where that fails.
-    fn follow_or_search_timed(
-        &self,
+    /// Follows the person from the last pose; searches the pictures where that fails.
+    fn follow_or_search(
+        &mut self,
         set: &FrameSet,
         pictures: &[Option<Rgb<'_>>],
+        others: &[Marks],
+        may_search: bool,
         seconds: &mut StageSeconds,
     ) -> Result<Fitted, TrackError> {
         if let Some(track) = &self.track
-            && let Some(fitted) = self.follow(set, pictures, track, seconds)?
+            && let Some(fitted) = self.follow(set, pictures, track, others, seconds)?
         {
+            self.search = Search::default();
             return Ok(fitted);
         }
         let rhythm = (self.lost / 4).clamp(1, RAREST_SEARCH);
-        if !self.lost.is_multiple_of(rhythm) {
+        if !may_search || !self.lost.is_multiple_of(rhythm) {
             return Err(TrackError::lost(format!("frame set {}: nobody here; the next search is soon", set.index)));
         }
         let start = Instant::now();
-        let sightings = search(&self.net, &self.rig.cameras, pictures, &self.config)?;
-        seconds.net += start.elapsed().as_secs_f64();
-        let first = self.fit(set, sightings, None, seconds)?;
+        let scene = SearchScene {
+            net: &self.net,
+            cameras: &self.rig.cameras,
+            pictures,
+            plates: &self.plates,
+            nanos: set.master_nanos,
+            taken: others,
+            config: &self.config,
+        };
+        let sightings = self.search.step(&scene)?;
+        let looks: Vec<Option<Look>> = sightings.into_iter().map(|sighting| sighting.map(Look::fresh)).collect();
+        seconds.search += start.elapsed().as_secs_f64();
+        if looks.iter().all(Option::is_none) {
+            return Err(TrackError::lost(format!("frame set {}: nobody found yet; the search goes on", set.index)));
+        }
+        let first = self.fit(set, looks, None, seconds)?;
         // Look again through crops around the fitted body: turned upright, and in the views that chose nobody.
         let marks = self.model.marks(&first.turns);
         let start = Track {
@@ -466,8 +621,9 @@ impl PoseEstimator {
             nanos: set.master_nanos,
             marks,
             velocity: [DVec3::ZERO; LANDMARK_COUNT],
+            looks: vec![None; self.rig.cameras.len()],
         };
-        match self.follow(set, pictures, &start, seconds)? {
+        match self.follow(set, pictures, &start, others, seconds)? {
             Some(second) if second.relative <= first.relative * 1.5 => Ok(second),
             _ => Ok(first),
         }
@@ -479,22 +635,33 @@ impl PoseEstimator {
         set: &FrameSet,
         pictures: &[Option<Rgb<'_>>],
         track: &Track,
+        others: &[Marks],
         seconds: &mut StageSeconds,
     ) -> Result<Option<Fitted>, TrackError> {
         let start = Instant::now();
-        let ahead = secs(set.master_nanos.saturating_sub(track.nanos)).clamp(0.0, MAX_DELAY_SECS);
-        let predicted: [DVec3; LANDMARK_COUNT] = std::array::from_fn(|i| track.marks[i] + track.velocity[i] * ahead);
-        let sightings: Vec<Option<Sighting>> = pictures
+        let predicted = track.predicted(set.master_nanos);
+        let look_after_m = if self.looks_at_all { 0.0 } else { self.config.look_after_m };
+        let has_picture = |slot: usize| pictures.get(slot).is_some_and(Option::is_some);
+        let due = due(&track.looks, has_picture, &predicted, set.master_nanos, look_after_m);
+        let looks: Vec<Option<Look>> = pictures
             .par_iter()
             .zip(&self.rig.cameras)
-            .map(|(picture, camera)| {
-                let Some(picture) = picture else { return Ok(None) };
-                let Some(crop) = Crop::around(&project_all(camera, &predicted)) else { return Ok(None) };
-                Sighting::take(&self.net, picture, crop).map(Some)
+            .enumerate()
+            .map(|(slot, (picture, camera))| {
+                let Some(picture) = picture.as_ref().filter(|_| due[slot]) else {
+                    return Ok(track.looks[slot].clone());
+                };
+                let expected = project_all(camera, &predicted);
+                let Some(crop) = Crop::around(&expected) else { return Ok(None) };
+                let sighting = Sighting::take(&self.net, picture, crop)?;
+                // Two people in one crop: the network may have chosen the other one.
+                let own = sighting.mean_distance(&expected).unwrap_or(f64::INFINITY);
+                let is_other = |marks| sighting.mean_distance(&project_all(camera, marks)).is_some_and(|d| d < own);
+                Ok((!others.iter().any(is_other)).then(|| Look::fresh(sighting)))
             })
             .collect::<Result<_, TrackError>>()?;
         seconds.net += start.elapsed().as_secs_f64();
-        match self.fit(set, sightings, Some(track), seconds) {
+        match self.fit(set, looks, Some((track, &predicted)), seconds) {
             Ok(fitted) if fitted.relative < OFF_TRACK => Ok(Some(fitted)),
             Ok(_) => Ok(None),
             Err(error) if error.kind == TrackErrorKind::Lost => Ok(None),
@@ -505,15 +672,19 @@ impl PoseEstimator {
     fn fit(
         &self,
         set: &FrameSet,
-        sightings: Vec<Option<Sighting>>,
-        track: Option<&Track>,
+        looks: Vec<Option<Look>>,
+        track: Option<(&Track, &[DVec3; LANDMARK_COUNT])>,
         seconds: &mut StageSeconds,
     ) -> Result<Fitted, TrackError> {
         let config = &self.config;
         let lost = |what: &str| TrackError::lost(format!("frame set {}: {what}", set.index));
-        let keypoints: Vec<Option<ViewKeypoints>> = sightings
+        let sees = |look: &&Look| look.sighting.output.presence >= config.presence_threshold;
+        let keypoints: Vec<Option<ViewKeypoints>> = looks
             .iter()
-            .map(|s| s.as_ref().filter(|s| s.output.presence >= config.presence_threshold).map(|s| s.keypoints))
+            .map(|look| {
+                let look = look.as_ref().filter(|look| look.body.is_none());
+                look.filter(sees).map(|look| look.sighting.keypoints)
+            })
             .collect();
         let start = Instant::now();
         let points = triangulate(&self.rig.cameras, &keypoints, config.confidence_threshold, config.inlier_m);
@@ -523,24 +694,34 @@ impl PoseEstimator {
         for (slot, frame) in set.present() {
             let camera = &self.rig.cameras[slot];
             let view = View::new(camera);
-            let observed = |keypoints| observe(camera, &view, keypoints, config.confidence_threshold);
-            let seen = keypoints[slot].as_ref().map_or([None; LANDMARK_COUNT], observed);
-            let delay = secs(frame.capture_nanos.saturating_sub(set.master_nanos));
-            views.push(FitView { slot, view, seen, delay_secs: delay.clamp(-MAX_DELAY_SECS, MAX_DELAY_SECS) });
+            let delay_secs = secs(frame.capture_nanos.saturating_sub(set.master_nanos));
+            let delay_secs = delay_secs.clamp(-MAX_DELAY_SECS, MAX_DELAY_SECS);
+            let mut seen = [None; LANDMARK_COUNT];
+            let mut shift = [DVec3::ZERO; LANDMARK_COUNT];
+            if let Some(look) = looks[slot].as_ref().filter(sees) {
+                seen = observe(camera, &view, &look.sighting.keypoints, config.confidence_threshold);
+                if let Some((track, predicted)) = track {
+                    for (i, (carried, trust)) in look.carried(predicted).into_iter().enumerate() {
+                        shift[i] = track.velocity[i] * delay_secs + carried;
+                        seen[i] = seen[i].map(|seen| Observation { confidence: seen.confidence * trust, ..seen });
+                    }
+                }
+            }
+            views.push(FitView { slot, view, seen, shift, delay_secs });
         }
         let most = views.iter().map(|v| v.seen.iter().flatten().count()).max().unwrap_or(0);
         if most < MIN_LANDMARKS {
             return Err(lost("no view shows enough of a person"));
         }
-        let mut evidence =
-            Evidence { views, points: [None; LANDMARK_COUNT], velocity: [DVec3::ZERO; LANDMARK_COUNT], before: None };
+        let mut evidence = Evidence { views, points: [None; LANDMARK_COUNT], before: None };
         // One view alone says nothing of depth: the network's own guess at the third dimension stands in.
         let triangulated = points.iter().flatten().count();
         let mut world = points.each_ref().map(|point| point.as_ref().map(|p| p.position));
         if triangulated < MIN_LANDMARKS {
-            let seen = keypoints.iter().zip(&sightings).zip(&self.rig.cameras);
+            let sightings = looks.iter().map(|look| look.as_ref().map(|look| &*look.sighting));
+            let seen = keypoints.iter().zip(sightings).zip(&self.rig.cameras);
             let surest = seen
-                .filter_map(|((k, s), camera)| k.as_ref().and(s.as_ref()).map(|s| (s, camera)))
+                .filter_map(|((k, s), camera)| k.as_ref().and(s).map(|s| (s, camera)))
                 .max_by(|a, b| a.0.output.presence.total_cmp(&b.0.output.presence));
             let scale = self.model.trunk_length() / 0.5;
             let lifted = surest.and_then(|(s, camera)| lift(camera, s, config.confidence_threshold, scale));
@@ -550,8 +731,7 @@ impl PoseEstimator {
             }
         }
         let turns = match track {
-            Some(track) => {
-                evidence.velocity = track.velocity;
+            Some((track, _)) => {
                 let dt = secs(set.master_nanos.saturating_sub(track.nanos));
                 let sigma_rad = config.smooth_rad * (dt * 30.0).clamp(0.1, 30.0).sqrt();
                 evidence.before = Some(Before { turns: track.turns.clone(), sigma_rad });
@@ -574,14 +754,14 @@ impl PoseEstimator {
         };
         seconds.fit += start.elapsed().as_secs_f64();
         let (turns, _) = turns.filter(|(turns, _)| finite(turns)).ok_or_else(|| lost("the fit has no finite cost"))?;
-        self.judge(turns, sightings, keypoints, points, evidence).ok_or_else(|| lost("no landmark agrees with the fit"))
+        self.judge(turns, looks, keypoints, points, evidence).ok_or_else(|| lost("no landmark agrees with the fit"))
     }
 
     /// Distances of the landmarks from the fitted body.
     fn judge(
         &self,
         turns: Turns,
-        sightings: Vec<Option<Sighting>>,
+        looks: Vec<Option<Look>>,
         keypoints: Vec<Option<ViewKeypoints>>,
         points: [Option<WorldPoint>; LANDMARK_COUNT],
         evidence: Evidence,
@@ -590,22 +770,17 @@ impl PoseEstimator {
         let mut all = Vec::new();
         let mut all_relative = Vec::new();
         let mut views = Vec::with_capacity(keypoints.len());
-        for (slot, camera) in self.rig.cameras.iter().enumerate() {
-            let presence = sightings[slot].as_ref().map_or(0.0, |s| s.output.presence);
+        for (slot, look) in looks.iter().enumerate() {
+            let presence = look.as_ref().map_or(0.0, |look| look.sighting.output.presence);
             let mut distances = Vec::new();
             let mut inliers = 0;
             let fit_view = evidence.views.iter().find(|view| view.slot == slot);
-            if let (Some(keypoints), Some(fit_view)) = (&keypoints[slot], fit_view) {
-                for (i, keypoint) in keypoints.iter().enumerate() {
-                    let moved = marks[i] + evidence.velocity[i] * fit_view.delay_secs;
-                    let (Some(pixel), Some(px_per_m)) = (camera.project(moved), fit_view.view.px_per_m(marks[i]))
-                    else {
-                        continue;
-                    };
-                    if fit_view.seen[i].is_none() {
-                        continue;
-                    }
-                    let distance = (pixel - keypoint.pixel).length();
+            if let Some(fit_view) = fit_view {
+                for (i, seen) in fit_view.seen.iter().enumerate() {
+                    let Some(seen) = seen else { continue };
+                    let moved = fit_view.view.project(marks[i] + fit_view.shift[i]);
+                    let (Some(pixel), Some(px_per_m)) = (moved, fit_view.view.px_per_m(marks[i])) else { continue };
+                    let distance = (pixel - seen.ideal_px).length();
                     let relative = distance / (px_per_m * self.config.inlier_m);
                     distances.push(distance);
                     all.push(distance);
@@ -626,7 +801,7 @@ impl PoseEstimator {
         let relative = median(&mut all_relative)?;
         (residual_px.is_finite() && relative.is_finite()).then_some(Fitted {
             turns,
-            sightings,
+            looks,
             keypoints,
             points,
             views,
@@ -636,7 +811,7 @@ impl PoseEstimator {
         })
     }
 
-    fn remember(&mut self, set: &FrameSet, turns: Turns) {
+    fn remember(&mut self, set: &FrameSet, turns: Turns, mut looks: Vec<Option<Look>>) {
         let marks = self.model.marks(&turns);
         let mut velocity = [DVec3::ZERO; LANDMARK_COUNT];
         if let Some(last) = &self.track {
@@ -648,7 +823,11 @@ impl PoseEstimator {
                 }
             }
         }
-        self.track = Some(Track { turns, nanos: set.master_nanos, marks, velocity });
+        let body = LookBody { nanos: set.master_nanos, turns: Arc::new(turns.clone()), marks };
+        for look in looks.iter_mut().flatten() {
+            look.body.get_or_insert_with(|| body.clone());
+        }
+        self.track = Some(Track { turns, nanos: set.master_nanos, marks, velocity, looks });
         self.lost = 0;
     }
 }

@@ -41,6 +41,10 @@ const OUTLINE_COUNT: f64 = 80.0;
 /// Outline distances of this many standard deviations lose three quarters of their weight: they belong to another edge.
 const OUTLINE_ROBUST: f64 = 3.0;
 
+/// Weight of outline points where the mask goes beyond the body: a coat or a skirt does that, but no body is outside of its
+/// clothes.
+const CLOTH_WEIGHT: f64 = 0.1;
+
 /// How much freer the root turns than a joint, and how far it moves, between sets.
 const ROOT_FREEDOM: f64 = 2.0;
 const ROOT_MOVE_M: f64 = 0.2;
@@ -52,6 +56,8 @@ pub(crate) struct FitView {
     pub slot: usize,
     pub view: View,
     pub seen: [Option<Observation>; LANDMARK_COUNT],
+    /// Where each landmark was when it was seen less where it is at the pose's time, metres.
+    pub shift: [DVec3; LANDMARK_COUNT],
     /// Capture time less the pose's time, seconds.
     pub delay_secs: f64,
 }
@@ -75,8 +81,6 @@ pub(crate) struct FitProblem<'a> {
     pub outline_sigma_m: f64,
     /// World points of landmarks and their standard deviation in metres.
     pub points: [Option<(DVec3, f64)>; LANDMARK_COUNT],
-    /// Landmark velocities in metres a second, for views that were not taken at the pose's time.
-    pub velocity: [DVec3; LANDMARK_COUNT],
     pub before: Option<Before>,
     /// Standard deviation of the landmarks, as a multiple of the one measured.
     pub landmark_spread: f64,
@@ -115,7 +119,7 @@ impl FitProblem<'_> {
             let mut any = false;
             for view in self.views {
                 let Some(seen) = view.seen[landmark] else { continue };
-                let moved = mark + self.velocity[landmark] * view.delay_secs;
+                let moved = mark + view.shift[landmark];
                 let Some((pixel, rows)) = view.view.project_with_derivative(moved) else { continue };
                 let Some(px_per_m) = view.view.px_per_m(posed.origin[0]) else { continue };
                 let inverse_sigma = 1.0 / (self.landmark_spread * spread_m(landmark) * px_per_m);
@@ -159,9 +163,11 @@ impl FitProblem<'_> {
             }
             let Some((pixel, [du, dv])) = view.project_with_derivative(at) else { continue };
             let inverse_sigma = 1.0 / (self.outline_sigma_m * point.px_per_m);
-            let error = (pixel.dot(point.normal) - point.offset) * inverse_sigma;
+            let error = pixel.dot(point.normal) - point.offset;
+            let cloth = if error < 0.0 { CLOTH_WEIGHT } else { 1.0 };
+            let error = error * inverse_sigma;
             let row = (du * point.normal.x + dv * point.normal.y) * inverse_sigma;
-            let importance = (OUTLINE_COUNT / counts[point.view]).min(1.0);
+            let importance = cloth * (OUTLINE_COUNT / counts[point.view]).min(1.0);
             let (cost, weight) = kernel.weigh(error * error, importance);
             each(point, row, error, weight, cost);
         }
@@ -408,7 +414,7 @@ mod tests {
             .map(|camera| {
                 let view = View::new(camera);
                 let seen = observe(camera, &view, &keypoints(camera), 0.3);
-                FitView { slot: 0, view, seen, delay_secs: 0.0 }
+                FitView { slot: 0, view, seen, shift: [DVec3::ZERO; LANDMARK_COUNT], delay_secs: 0.0 }
             })
             .collect()
     }
@@ -422,10 +428,10 @@ mod tests {
     fn the_gradient_matches_differences_of_the_cost() {
         let model = BodyModel::new(&body()).unwrap();
         let truth = random_turns(&model, 1);
-        let views = views(3, |camera| keypoints_of(camera, &model.marks(&truth)));
+        let mut views = views(3, |camera| keypoints_of(camera, &model.marks(&truth)));
+        views[1].shift = [DVec3::new(0.02, -0.01, 0.005); LANDMARK_COUNT];
         let mut problem = problem(&model, &views);
         problem.points[5] = Some((DVec3::new(0.1, 0.2, 1.4), 0.1));
-        problem.velocity = [DVec3::new(1.0, -0.5, 0.2); LANDMARK_COUNT];
         problem.before = Some(Before { turns: random_turns(&model, 2), sigma_rad: 0.3 });
         let at = random_turns(&model, 4);
         let DenseNormal { matrix: normal, gradient } = problem.linearize(&at).unwrap();

@@ -163,7 +163,7 @@ fn running_mean(from: &[f32], to: &mut [f32], radius: usize) {
 }
 
 /// Labels connected pixels (4 neighbours) that `keep`; calls `each` with every component's pixels.
-fn components(grid: &Grid, keep: impl Fn(f32) -> bool, mut each: impl FnMut(&[usize])) {
+pub(crate) fn components(grid: &Grid, keep: impl Fn(f32) -> bool, mut each: impl FnMut(&[usize])) {
     let (width, height) = (grid.width, grid.height);
     let mut done = vec![false; width * height];
     let mut stack = Vec::new();

@@ -37,7 +37,7 @@ pub fn mask_from_plate(image: &Image, plate: &Image) -> Result<Option<Mask>, Tra
 }
 
 /// The same on plain bytes of equal size.
-fn foreground(picture: &Rgb, plate: &[u8]) -> Option<Mask> {
+pub(crate) fn foreground(picture: &Rgb, plate: &[u8]) -> Option<Mask> {
     let (width, height) = (picture.width, picture.height);
     let evidence = plate_evidence(picture, plate)?;
     // A vote among neighbours removes specks and closes pinholes.

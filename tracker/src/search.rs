@@ -1,19 +1,20 @@
 //! Finding the person: crops over the whole picture, and agreement between the views.
 
 use flyrig_types::Camera;
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use crate::crop::{Crop, search_crops};
+use crate::grid::{Grid, components};
 use crate::net::NetOutput;
 use crate::pixels::Rgb;
+use crate::plate::foreground;
+use crate::single_view::lift;
 use crate::triangulate::{WorldPoint, triangulate};
 use crate::{LANDMARK_COUNT, PoseConfig, PoseNet, TrackError, ViewKeypoints};
 
 /// Hypotheses kept a picture.
 const KEEP: usize = 4;
-/// Crops of the first look that are looked at again.
-const REFINE: usize = 6;
 
 /// What the network saw in one crop of a picture.
 #[derive(Debug, Clone)]
@@ -44,6 +45,18 @@ impl Sighting {
         self.output.presence * self.mean_confidence() * self.crop.side.max(1.0).sqrt()
     }
 
+    /// Whether this is the person with these landmarks in the picture.
+    pub fn shows(&self, pixels: &[Option<DVec2>; LANDMARK_COUNT]) -> bool {
+        self.mean_distance(pixels).is_some_and(|distance| distance < 0.1 * self.crop.side)
+    }
+
+    /// Mean distance of the landmarks from others, pixels; `None` without any.
+    pub fn mean_distance(&self, pixels: &[Option<DVec2>; LANDMARK_COUNT]) -> Option<f64> {
+        let pairs = self.keypoints.iter().zip(pixels).filter_map(|(own, other)| Some((own.pixel, (*other)?)));
+        let (sum, count) = pairs.fold((0.0, 0.0), |(sum, count), (a, b)| (sum + a.distance(b), count + 1.0));
+        (count > 0.0).then(|| sum / count)
+    }
+
     fn overlaps(&self, other: &Self) -> bool {
         let mut distance = 0.0;
         for (a, b) in self.keypoints.iter().zip(&other.keypoints) {
@@ -53,50 +66,189 @@ impl Sighting {
     }
 }
 
-/// Everybody the network finds in a picture, best first.
-fn sightings(net: &PoseNet, picture: &Rgb, config: &PoseConfig) -> Result<Vec<Sighting>, TrackError> {
-    let mut first = Vec::new();
-    for crop in search_crops(picture.width as u32, picture.height as u32) {
-        let sighting = Sighting::take(net, picture, crop)?;
-        if sighting.output.presence >= 0.5 * config.presence_threshold {
-            first.push(sighting);
-        }
-    }
-    first.sort_by(|a, b| b.score().total_cmp(&a.score()));
-    first.truncate(REFINE);
-    let mut found: Vec<Sighting> = Vec::new();
-    for mut sighting in first {
-        for _ in 0..2 {
-            let Some(crop) = sighting.next_crop() else { break };
-            sighting = Sighting::take(net, picture, crop)?;
-        }
-        if sighting.output.presence < config.presence_threshold {
-            continue;
-        }
-        match found.iter_mut().find(|other| other.overlaps(&sighting)) {
-            Some(other) if other.score() >= sighting.score() => {}
-            Some(other) => *other = sighting,
-            None => found.push(sighting),
-        }
-    }
-    found.sort_by(|a, b| b.score().total_cmp(&a.score()));
-    found.truncate(KEEP);
-    Ok(found)
+/// Hypotheses older than this are forgotten, nanoseconds: a person walks on.
+const FORGET_NANOS: i64 = 1_000_000_000;
+/// A crop around a piece of foreground is larger by this factor.
+const BLOB_MARGIN: f64 = 1.25;
+/// Pieces of foreground that are looked at in a picture.
+const BLOBS: usize = 2;
+
+/// What a search is made in.
+pub(crate) struct SearchScene<'a> {
+    pub net: &'a PoseNet,
+    pub cameras: &'a [Camera],
+    pub pictures: &'a [Option<Rgb<'a>>],
+    /// Pictures of the empty scene, by slot.
+    pub plates: &'a [Option<Vec<u8>>],
+    pub nanos: i64,
+    /// Landmarks of people who are tracked already.
+    pub taken: &'a [[DVec3; LANDMARK_COUNT]],
+    pub config: &'a PoseConfig,
 }
 
-/// Finds the person whom most views agree on; a slot a camera. With one view, the surest and largest one.
-pub(crate) fn search(
-    net: &PoseNet,
-    cameras: &[Camera],
-    pictures: &[Option<Rgb<'_>>],
-    config: &PoseConfig,
-) -> Result<Vec<Option<Sighting>>, TrackError> {
-    let found: Vec<Vec<Sighting>> = pictures
-        .par_iter()
-        .map(|picture| picture.as_ref().map_or_else(|| Ok(Vec::new()), |p| sightings(net, p, config)))
-        .collect::<Result<_, _>>()?;
-    let choice = choose(cameras, &found, config);
-    Ok(found.into_iter().zip(choice).map(|(mut found, index)| index.map(|i| found.swap_remove(i))).collect())
+/// The search for a person who may be anywhere, spread over sets so that none takes long.
+///
+/// Each step looks where the picture differs from the empty scene, where other views have seen somebody, and at the next few of
+/// the crops that cover the whole picture.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Search {
+    views: Vec<ViewSearch>,
+}
+
+#[derive(Debug, Clone, Default)]
+struct ViewSearch {
+    /// Next crop of those that cover the picture.
+    next: usize,
+    /// Whether all of them were looked at since the search began.
+    swept: bool,
+    /// Hypotheses, best first, and the times that they were seen at.
+    found: Vec<(Sighting, i64)>,
+}
+
+impl Search {
+    /// Looks further and returns the person whom most views agree on, by slot. Without agreement, and once every picture was
+    /// looked at as a whole, the surest and largest sighting of one view. No sighting at all: go on with the next set.
+    pub fn step(&mut self, scene: &SearchScene<'_>) -> Result<Vec<Option<Sighting>>, TrackError> {
+        self.views.resize_with(scene.cameras.len(), ViewSearch::default);
+        self.views
+            .par_iter_mut()
+            .enumerate()
+            .map(|(slot, view)| view.look(scene, slot))
+            .collect::<Result<Vec<()>, _>>()?;
+        self.ask_other_views(scene)?;
+        let found: Vec<Vec<Sighting>> =
+            self.views.iter().map(|view| view.found.iter().map(|(sighting, _)| sighting.clone()).collect()).collect();
+        let choice = choose(scene.cameras, &found, scene.config);
+        let agreed = choice.iter().flatten().count() > 1;
+        let looked_everywhere =
+            self.views.iter().zip(scene.pictures).all(|(view, picture)| view.swept || picture.is_none());
+        if !agreed && !looked_everywhere {
+            return Ok(vec![None; found.len()]);
+        }
+        if agreed || choice.iter().any(Option::is_some) {
+            self.views.clear();
+        } else {
+            self.views.iter_mut().for_each(|view| view.swept = false);
+        }
+        Ok(found.into_iter().zip(choice).map(|(mut found, index)| index.map(|i| found.swap_remove(i))).collect())
+    }
+
+    /// Looks in the views without a hypothesis where the best one of the others would be seen.
+    fn ask_other_views(&mut self, scene: &SearchScene<'_>) -> Result<(), TrackError> {
+        let best = self.views.iter().enumerate().filter_map(|(slot, view)| Some((slot, &view.found.first()?.0)));
+        let Some((slot, sighting)) = best.max_by(|a, b| a.1.score().total_cmp(&b.1.score())) else { return Ok(()) };
+        let Some(points) = lift(&scene.cameras[slot], sighting, scene.config.confidence_threshold, 1.0) else {
+            return Ok(());
+        };
+        let look = |(other, view): (usize, &mut ViewSearch)| -> Result<(), TrackError> {
+            let Some(picture) = scene.pictures[other].as_ref().filter(|_| view.found.is_empty()) else { return Ok(()) };
+            let pixels = points.map(|point| point.and_then(|point| scene.cameras[other].project(point)));
+            match Crop::around(&pixels) {
+                Some(crop) => view.try_crop(scene, other, picture, crop),
+                None => Ok(()),
+            }
+        };
+        self.views.par_iter_mut().enumerate().map(look).collect::<Result<Vec<()>, _>>()?;
+        Ok(())
+    }
+}
+
+impl ViewSearch {
+    /// Looks at this view's foreground and at its next crops.
+    fn look(&mut self, scene: &SearchScene<'_>, slot: usize) -> Result<(), TrackError> {
+        self.found.retain(|(_, nanos)| scene.nanos.saturating_sub(*nanos).abs() <= FORGET_NANOS);
+        let Some(picture) = &scene.pictures[slot] else { return Ok(()) };
+        let taken: Vec<_> = scene.taken.iter().map(|marks| project_all(&scene.cameras[slot], marks)).collect();
+        let plate = scene.plates.get(slot).and_then(Option::as_ref);
+        for crop in plate.map(|plate| foreground_crops(picture, plate, &taken)).unwrap_or_default() {
+            self.try_crop(scene, slot, picture, crop)?;
+        }
+        if !self.found.is_empty() {
+            return Ok(());
+        }
+        let crops = search_crops(picture.width as u32, picture.height as u32);
+        let most = if scene.config.search_crops == 0 { crops.len() } else { scene.config.search_crops };
+        for _ in 0..most.min(crops.len()) {
+            self.try_crop(scene, slot, picture, crops[self.next % crops.len()])?;
+            self.next += 1;
+            if self.next >= crops.len() {
+                (self.next, self.swept) = (0, true);
+            }
+        }
+        Ok(())
+    }
+
+    /// Keeps the person whom the network sees in a crop, after looking again at what it found.
+    fn try_crop(&mut self, scene: &SearchScene<'_>, slot: usize, picture: &Rgb, crop: Crop) -> Result<(), TrackError> {
+        let config = scene.config;
+        let mut sighting = Sighting::take(scene.net, picture, crop)?;
+        if sighting.output.presence < 0.5 * config.presence_threshold {
+            return Ok(());
+        }
+        for _ in 0..2 {
+            let Some(crop) = sighting.next_crop() else { break };
+            sighting = Sighting::take(scene.net, picture, crop)?;
+        }
+        let camera = &scene.cameras[slot];
+        if sighting.output.presence < config.presence_threshold
+            || scene.taken.iter().any(|marks| sighting.shows(&project_all(camera, marks)))
+        {
+            return Ok(());
+        }
+        match self.found.iter_mut().find(|(other, _)| other.overlaps(&sighting)) {
+            Some((other, _)) if other.score() >= sighting.score() => {}
+            Some(other) => *other = (sighting, scene.nanos),
+            None => self.found.push((sighting, scene.nanos)),
+        }
+        self.found.sort_by(|a, b| b.0.score().total_cmp(&a.0.score()));
+        self.found.truncate(KEEP);
+        Ok(())
+    }
+}
+
+/// Squares around the largest pieces of foreground, without those of people who are tracked already.
+fn foreground_crops(picture: &Rgb, plate: &[u8], taken: &[[Option<DVec2>; LANDMARK_COUNT]]) -> Vec<Crop> {
+    let Some(mask) = foreground(picture, plate) else { return Vec::new() };
+    let (width, height) = (picture.width, picture.height);
+    let mut grid = Grid::new(width, height, 0.0);
+    for (value, coverage) in grid.values.iter_mut().zip(mask.coverage()) {
+        *value = f32::from(*coverage >= 128);
+    }
+    for pixels in taken {
+        let (low, high) = pixels
+            .iter()
+            .flatten()
+            .fold((DVec2::INFINITY, DVec2::NEG_INFINITY), |(low, high), pixel| (low.min(*pixel), high.max(*pixel)));
+        let margin = (BLOB_MARGIN - 1.0) * (high - low).max_element().max(0.0);
+        let side = |value: f64, limit: usize| value.clamp(0.0, limit as f64) as usize;
+        for y in side(low.y - margin, height)..side(high.y + margin, height) {
+            let (from, to) = (side(low.x - margin, width), side(high.x + margin, width));
+            if from < to {
+                grid.values[y * width + from..y * width + to].fill(0.0);
+            }
+        }
+    }
+    let mut boxes: Vec<(usize, DVec2, DVec2)> = Vec::new();
+    components(
+        &grid,
+        |value| value > 0.5,
+        |pixels| {
+            let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+            for &at in pixels {
+                let pixel = DVec2::new((at % width) as f64, (at / width) as f64);
+                (low, high) = (low.min(pixel), high.max(pixel));
+            }
+            if pixels.len() * 500 >= width * height {
+                boxes.push((pixels.len(), low, high));
+            }
+        },
+    );
+    boxes.sort_by_key(|(area, ..)| std::cmp::Reverse(*area));
+    boxes.truncate(BLOBS);
+    boxes
+        .into_iter()
+        .map(|(_, low, high)| Crop::upright(0.5 * (low + high), BLOB_MARGIN * (high - low + 1.0).max_element()))
+        .collect()
 }
 
 /// Index of the chosen hypothesis of each view.
@@ -170,6 +322,48 @@ fn human_size(points: &[Option<WorldPoint>; LANDMARK_COUNT]) -> bool {
 }
 
 /// Where a camera sees world points; `None` where it does not.
-pub(crate) fn project_all(camera: &Camera, points: &[glam::DVec3; LANDMARK_COUNT]) -> [Option<DVec2>; LANDMARK_COUNT] {
+pub(crate) fn project_all(camera: &Camera, points: &[DVec3; LANDMARK_COUNT]) -> [Option<DVec2>; LANDMARK_COUNT] {
     points.map(|point| camera.project(point))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIDE: usize = 120;
+
+    /// Two bright boxes before a grey plate.
+    fn scene() -> (Rgb<'static>, Vec<u8>) {
+        let plate = vec![90; 3 * SIDE * SIDE];
+        let mut bytes = plate.clone();
+        for (x0, x1) in [(10, 30), (70, 100)] {
+            for y in 20..100 {
+                bytes[3 * (y * SIDE + x0)..3 * (y * SIDE + x1)].fill(230);
+            }
+        }
+        (Rgb { width: SIDE, height: SIDE, bytes: bytes.into() }, plate)
+    }
+
+    #[test]
+    fn foreground_is_looked_at_largest_first_and_without_people_who_are_known() {
+        let (picture, plate) = scene();
+        let crops = foreground_crops(&picture, &plate, &[]);
+        assert_eq!(crops.len(), 2);
+        assert!(crops[0].center.distance(DVec2::new(84.5, 59.5)) < 1.5, "{:?}", crops[0]);
+        assert!((80.0..115.0).contains(&crops[0].side), "{:?}", crops[0]);
+        let mut known = [None; LANDMARK_COUNT];
+        (known[0], known[31]) = (Some(DVec2::new(85.0, 22.0)), Some(DVec2::new(85.0, 98.0)));
+        let crops = foreground_crops(&picture, &plate, &[known]);
+        assert_eq!(crops.len(), 1);
+        assert!(crops[0].center.distance(DVec2::new(19.5, 59.5)) < 1.5, "{:?}", crops[0]);
+    }
+
+    #[test]
+    fn no_foreground_poisoned_people_and_a_plate_of_another_size_give_no_crop_too_many() {
+        let (picture, plate) = scene();
+        assert!(foreground_crops(&Rgb { bytes: plate.clone().into(), ..picture.clone() }, &plate, &[]).is_empty());
+        assert!(foreground_crops(&picture, &plate[..30], &[]).is_empty());
+        assert_eq!(foreground_crops(&picture, &plate, &[[None; LANDMARK_COUNT]]).len(), 2);
+        assert_eq!(foreground_crops(&picture, &plate, &[[Some(DVec2::NAN); LANDMARK_COUNT]]).len(), 2);
+    }
 }

@@ -43,6 +43,32 @@ pub struct ShapeFit {
     pub height_m: f64,
     /// Frame sets that gave at least one length.
     pub sets: usize,
+    /// Where the height comes from.
+    pub height_from: HeightFrom,
+}
+
+/// Source of a person's height.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum HeightFrom {
+    /// Two or more views.
+    Measurement,
+    /// [`PoseConfig::height_m`].
+    Configuration,
+    /// The template's: one camera cannot tell a tall person from a near one.
+    Average,
+}
+
+impl std::fmt::Display for ShapeFit {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{:.2} m tall", self.height_m)?;
+        match self.height_from {
+            HeightFrom::Measurement => Ok(()),
+            HeightFrom::Configuration => f.write_str(" (as configured)"),
+            HeightFrom::Average => f.write_str(
+                " (an average height, for one camera cannot measure it: give perception.height_m or --height)",
+            ),
+        }
+    }
 }
 
 impl ShapeFit {
@@ -135,10 +161,27 @@ pub fn fit_template_shape(
         .collect();
     let mut factors = groups.clone();
     factors.insert("scale".to_owned(), scale);
-    let shaped = scale_template(template, &model, &factors)?;
-    let fit = ShapeFit { scale, groups, sigma: BTreeMap::new(), height_m: height_m(&shaped), sets };
+    let mut shaped = scale_template(template, &model, &factors)?;
+    let mut height_from = HeightFrom::Measurement;
+    if let Some(height) = config.height_m {
+        factors.insert("scale".to_owned(), scale * height / height_m(&shaped));
+        shaped = scale_template(template, &model, &factors)?;
+        height_from = HeightFrom::Configuration;
+    }
+    let scale = factors.get("scale").copied().unwrap_or(scale);
+    let fit = ShapeFit { scale, groups, sigma: BTreeMap::new(), height_m: height_m(&shaped), sets, height_from };
     tracing::info!(scale, height_m = fit.height_m, sets, "fitted the template's bone lengths");
     Ok((shaped, fit))
+}
+
+/// Returns a template of a given height in metres, or as it is, where nothing can be measured.
+pub(crate) fn template_of_height(template: &Template, height: Option<f64>) -> Result<(Template, ShapeFit), TrackError> {
+    let scale = height.map_or(1.0, |height| height / height_m(template));
+    let factors = [("scale".to_owned(), scale)].into_iter().collect();
+    let shaped = scale_template(template, &BodyModel::new(template)?, &factors)?;
+    let height_from = if height.is_some() { HeightFrom::Configuration } else { HeightFrom::Average };
+    let (groups, sigma, height_m) = (BTreeMap::new(), BTreeMap::new(), height_m(&shaped));
+    Ok((shaped, ShapeFit { scale, groups, sigma, height_m, sets: 0, height_from }))
 }
 
 /// Height of a template in its bind pose, metres.

@@ -96,7 +96,21 @@ pub(crate) fn drawn_body(
     Some((bounds, body))
 }
 
-/// Person mask of a picture from the network's coarse one; `None` when nothing is left.
+/// The network's probability of a person inside of `bounds` (x0, y0, x1, y1, ends excluded).
+pub(crate) fn coarse_mask(sighting: &Sighting, bounds: [usize; 4]) -> Grid {
+    let [x0, y0, x1, y1] = bounds;
+    let mut coarse = Grid::new(x1 - x0, y1 - y0, 0.0);
+    for y in y0..y1 {
+        for x in x0..x1 {
+            let at = sighting.crop.crop_from_picture(DVec2::new(x as f64, y as f64));
+            coarse.values[(y - y0) * (x1 - x0) + x - x0] = net_probability(&sighting.output.mask, at);
+        }
+    }
+    coarse
+}
+
+/// Person mask of a picture from the network's coarse one inside of the gate's bounds, and the size of one of its pixels in
+/// the picture's; `None` when nothing is left.
 ///
 /// The network's probability is joined with a colour model of person and surroundings (histograms of this
 /// picture's own sure regions) and the distance to the fitted body, then smoothed along the picture's edges
@@ -105,20 +119,13 @@ pub(crate) fn drawn_body(
 /// thin parts that the coarse mask misses, and the coarse mask sees what has the background's colour.
 pub(crate) fn refine(
     picture: &Rgb,
-    sighting: &Sighting,
+    coarse: &Grid,
+    crop_scale: f64,
     gate: &BodyGate,
     plate_evidence: Option<&Grid>,
 ) -> Option<Mask> {
     let [x0, y0, x1, y1] = gate.bounds;
     let (width, height) = (x1 - x0, y1 - y0);
-    // The network's probability, and the luminance that guides it.
-    let mut coarse = Grid::new(width, height, 0.0);
-    for y in 0..height {
-        for x in 0..width {
-            let at = sighting.crop.crop_from_picture(DVec2::new((x + x0) as f64, (y + y0) as f64));
-            coarse.values[y * width + x] = net_probability(&sighting.output.mask, at);
-        }
-    }
     let bin = |x: usize, y: usize| -> usize {
         let [r, g, b] = picture.pixel(x + x0, y + y0).map(|c| usize::from(c) * BINS / 256);
         (r * BINS + g) * BINS + b
@@ -167,7 +174,7 @@ pub(crate) fn refine(
             guide.values[y * width + x] = (0.3 * r + 0.55 * g + 0.15 * b) / 255.0;
         }
     }
-    let radius = (1.5 * sighting.crop.scale()).round().clamp(2.0, 12.0) as usize;
+    let radius = (1.5 * crop_scale).round().clamp(2.0, 12.0) as usize;
     let mut smoothed = probability.guided(&guide, radius, 1e-3);
     for (value, d) in smoothed.values.iter_mut().zip(&gate.distance.values) {
         // A soft step around one half keeps about a pixel of slope.
@@ -193,7 +200,7 @@ fn smooth(histogram: &[f32], bin: usize) -> f32 {
 }
 
 /// Bilinear sample of the network's mask; nobody outside the crop.
-fn net_probability(mask: &[f32], at: DVec2) -> f32 {
+pub(crate) fn net_probability(mask: &[f32], at: DVec2) -> f32 {
     let limit = NET_SIDE as f64 - 1.0;
     if !(at.x >= 0.0 && at.y >= 0.0 && at.x <= limit && at.y <= limit) {
         return 0.0;

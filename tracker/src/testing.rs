@@ -52,7 +52,6 @@ pub(crate) fn fit_problem<'a>(model: &'a BodyModel, views: &'a [FitView], landma
         outline: &[],
         outline_sigma_m: 0.01,
         points: [None; LANDMARK_COUNT],
-        velocity: [DVec3::ZERO; LANDMARK_COUNT],
         before: None,
         landmark_spread,
         robust: 2.0,

@@ -1,32 +1,64 @@
-//! One person found in the images by the pose network.
+//! People found in the images by the pose network.
 
 use std::{borrow::Cow, time::Duration};
 
-use flyrig_body::Template;
-use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet, ShapeFit, mask_from_plate};
-use flyrig_types::{FrameSet, Image, PersonId, Rig};
+use flyrig_body::{Template, skin_mesh};
+use flyrig_tracker::{PoseConfig, PoseEstimate, PoseEstimator, PoseNet, ShapeFit, ViewKeypoints, mask_from_plate};
+use flyrig_types::{FrameSet, Image, Mask, PersonId, Rig};
 
+use super::colors::ClothesColors;
+use super::split_mask::{PosedMesh, split_mask};
 use super::{Observation, Perception, SeenPerson, ViewObservation};
 use crate::{FusionError, Origin, PerceptionSettings, StageTimes};
 
-/// Frame sets that the shape is fitted to before the first pose.
+/// Frame sets that a person's shape is fitted to.
 pub const SHAPE_SETS: usize = 8;
 /// Time that they are spread over, seconds: a person who moves is seen in several poses.
 pub const SHAPE_SECS: f64 = 1.5;
 /// Median residual at which a pose is half believed, pixels.
 const HALF_BELIEVED_PX: f64 = 12.0;
+/// Two tracks whose landmarks are this close on average follow one person, metres.
+const SAME_PERSON_M: f64 = 0.15;
+/// Likeness of clothes from which a person who appears is one who was here before, 0..=1.
+const SAME_CLOTHES: f64 = 0.6;
+/// Sets from one look at a person's clothes to the next.
+const CLOTHES_EVERY: u64 = 30;
+/// A person who was not seen for so many sets has left.
+const LEFT_AFTER_SETS: u32 = 90;
 
-/// Estimates pose and masks of one person.
+/// One person who is tracked, or a place for one who may come.
+#[derive(Debug, Clone)]
+struct Place {
+    id: PersonId,
+    estimator: PoseEstimator,
+    /// Landmarks that the shape will be fitted to, with the time of the last ones; `None` once the shape is known.
+    learning: Option<(Vec<Vec<Option<ViewKeypoints>>>, i64)>,
+    clothes: Option<ClothesColors>,
+    seen: u64,
+}
+
+impl Place {
+    /// The shape is known.
+    fn know(&mut self) {
+        self.learning = None;
+        self.estimator.look_at_all(false);
+    }
+}
+
+/// Estimates shapes, poses and masks of one to four people.
 #[derive(Debug)]
 pub struct EstimatedPerception {
-    estimator: PoseEstimator,
+    places: Vec<Place>,
+    rig: Rig,
     masks: Origin,
     plates: Vec<Option<Image>>,
 }
 
 impl EstimatedPerception {
-    /// Looks for one person with the cameras of `rig`. `plates` holds an image of the empty scene by slot, where there is
-    /// one: masks then use the difference to it. Masks come from the frames where those of the settings are given.
+    /// Looks for people with the cameras of `rig`, as many as the settings say. `plates` holds an image of the empty scene by
+    /// slot, where there is one: masks then use the difference to it. Masks come from the frames where those of the settings
+    /// are given. Everybody has the shape of `template` where the shape is given; else the shape is measured while a person is
+    /// followed, and the person is known from then on.
     ///
     /// # Errors
     /// [`FusionError::Track`] when template, rig or a plate cannot be used.
@@ -36,70 +68,304 @@ impl EstimatedPerception {
         settings: &PerceptionSettings,
         plates: Vec<Option<Image>>,
     ) -> Result<Self, FusionError> {
-        let masks = settings.masks;
-        let config = PoseConfig { masks: masks == Origin::Estimated, ..PoseConfig::default() };
+        let config = PoseConfig {
+            masks: settings.masks == Origin::Estimated,
+            height_m: settings.height_m,
+            ..PoseConfig::default()
+        };
         let mut estimator = PoseEstimator::new(PoseNet::embedded()?, template, rig, config)?;
         for (slot, plate) in plates.iter().enumerate() {
             if let Some(plate) = plate {
                 estimator.set_plate(slot, plate)?;
             }
         }
-        Ok(Self { estimator, masks, plates })
+        let learning = (settings.shape() == Origin::Estimated).then(|| (Vec::new(), i64::MIN));
+        estimator.look_at_all(learning.is_some());
+        let place = |index: usize| Place {
+            id: PersonId(index as u32),
+            estimator: estimator.clone(),
+            learning: learning.clone(),
+            clothes: None,
+            seen: 0,
+        };
+        Ok(Self { places: (0..settings.people).map(place).collect(), rig: rig.clone(), masks: settings.masks, plates })
     }
 
-    /// Fits the template's shape to the person in a few sets ([`SHAPE_SETS`], over [`SHAPE_SECS`]). Call it before the session is built.
+    /// Starts with the shape of the first person, as an earlier session has learnt it.
     ///
     /// # Errors
-    /// [`FusionError::Track`] when too few of the sets show a person; the shape stays as it was.
-    pub fn learn_shape(&mut self, sets: &[FrameSet]) -> Result<ShapeFit, FusionError> {
-        Ok(self.estimator.fit_shape(sets)?)
+    /// [`FusionError::Track`] when the template cannot be used.
+    pub fn know_shape(&mut self, template: &Template) -> Result<(), FusionError> {
+        if let Some(place) = self.places.first_mut() {
+            place.estimator.set_template(template)?;
+            place.know();
+        }
+        Ok(())
     }
+
+    /// Fits shapes to the people in a few sets ([`SHAPE_SETS`], over [`SHAPE_SECS`]) before the session is built, so that they
+    /// are known from the first set on. Returns the fits of those who were found.
+    ///
+    /// # Errors
+    /// [`FusionError::Track`] when too few of the sets show a person; shapes stay as they were.
+    pub fn learn_shapes(&mut self, sets: &[FrameSet]) -> Result<Vec<ShapeFit>, FusionError> {
+        let mut fits = Vec::new();
+        let mut taken = Vec::new();
+        for place in &mut self.places {
+            match place.estimator.fit_shape(sets, &taken) {
+                Ok((fit, landmarks)) => {
+                    fits.push(fit);
+                    taken.push(landmarks);
+                    place.know();
+                }
+                Err(error) if fits.is_empty() => return Err(error.into()),
+                // Fewer people than places.
+                Err(_) => break,
+            }
+        }
+        Ok(fits)
+    }
+
+    /// Estimates everybody in a set, by place: those who are followed first, then one search for those who are not.
+    fn estimate(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Vec<Result<PoseEstimate, String>> {
+        let mut estimates: Vec<Result<PoseEstimate, String>> =
+            self.places.iter().map(|_| Err("nobody is here".to_owned())).collect();
+        let mut order: Vec<usize> = (0..self.places.len()).collect();
+        order.sort_by_key(|&index| self.places[index].estimator.sets_lost() > 0);
+        let mut may_search = true;
+        for index in order {
+            let others: Vec<_> = (0..self.places.len())
+                .filter(|&other| other != index && self.places[other].estimator.sets_lost() == 0)
+                .filter_map(|other| self.places[other].estimator.predicted_landmarks(set.master_nanos))
+                .collect();
+            let was_lost = self.places[index].estimator.sets_lost() > 0;
+            let place = &mut self.places[index];
+            let estimate = place.estimator.estimate_among(set, &others, may_search);
+            may_search &= !was_lost;
+            if let Ok(estimate) = &estimate {
+                count_stages(estimate, stages);
+            }
+            estimates[index] = match estimate {
+                Ok(estimate) if !estimate.pose.is_valid() => {
+                    Err("the pose holds numbers that are not finite".to_owned())
+                }
+                Ok(estimate) if was_lost && self.places.len() > 1 => self.recognise(index, set, estimate),
+                Ok(estimate) => Ok(estimate),
+                Err(error) => Err(error.to_string()),
+            };
+        }
+        self.part_twins(set.master_nanos, &mut estimates);
+        estimates
+    }
+
+    /// Gives somebody who was just found to the place whose clothes are most alike.
+    fn recognise(&mut self, index: usize, set: &FrameSet, found: PoseEstimate) -> Result<PoseEstimate, String> {
+        let Some(colors) = ClothesColors::of(set, &self.own_masks(set, &found)) else { return Ok(found) };
+        let lost = |place: &Place| place.estimator.sets_lost() > 0;
+        let likeness = |place: &Place| place.clothes.as_ref().map(|clothes| clothes.likeness(&colors));
+        let own = likeness(&self.places[index]);
+        let known = self.places.iter().enumerate().filter(|(other, place)| *other != index && lost(place));
+        let best = known
+            .filter_map(|(other, place)| Some((other, likeness(place)?)))
+            .filter(|(_, likeness)| *likeness >= SAME_CLOTHES.max(own.unwrap_or(0.0)))
+            .max_by(|a, b| a.1.total_cmp(&b.1))
+            .map(|(other, _)| other);
+        // A stranger takes a free place rather than that of somebody who has left.
+        let is_stranger = own.is_some_and(|own| own < SAME_CLOTHES);
+        let free = || self.places.iter().position(|place| place.clothes.is_none() && lost(place));
+        let Some(other) = best.or_else(|| is_stranger.then(free).flatten()) else { return Ok(found) };
+        let (low, high) = self.places.split_at_mut(index.max(other));
+        let (to, from) = if other < index { (&mut low[other], &mut high[0]) } else { (&mut high[0], &mut low[index]) };
+        to.estimator.take_track(&mut from.estimator);
+        Err("this is somebody else".to_owned())
+    }
+
+    /// Two tracks on one person: the one that explains the images less well is given up.
+    fn part_twins(&mut self, nanos: i64, estimates: &mut [Result<PoseEstimate, String>]) {
+        for a in 0..self.places.len() {
+            for b in a + 1..self.places.len() {
+                let (Ok(first), Ok(second)) = (&estimates[a], &estimates[b]) else { continue };
+                let marks = |index: usize| self.places[index].estimator.predicted_landmarks(nanos);
+                let (Some(x), Some(y)) = (marks(a), marks(b)) else { continue };
+                let distance = x.iter().zip(&y).map(|(x, y)| x.distance(*y)).sum::<f64>() / x.len() as f64;
+                if distance < SAME_PERSON_M {
+                    let worse = if first.quality.residual_px > second.quality.residual_px { a } else { b };
+                    self.places[worse].estimator.drop_track();
+                    estimates[worse] = Err("another track follows the same person".to_owned());
+                }
+            }
+        }
+    }
+
+    /// Masks of an estimate by slot, or those of the frames where masks are given.
+    fn own_masks<'a>(&self, set: &'a FrameSet, estimate: &'a PoseEstimate) -> Vec<Option<&'a Mask>> {
+        let of_slot = |slot: usize| match self.masks {
+            Origin::Given => set.frames[slot].as_ref().and_then(|frame| frame.mask.as_ref()),
+            Origin::Estimated => estimate.masks.get(slot).and_then(Option::as_ref),
+        };
+        (0..set.frames.len()).map(of_slot).collect()
+    }
+
+    /// Collects landmarks of people whose shape is not known, and fits it once there are enough.
+    fn learn(&mut self, set: &FrameSet, estimates: &[Result<PoseEstimate, String>]) {
+        let every_nanos = (SHAPE_SECS * 1e9 / SHAPE_SETS as f64) as i64;
+        for (place, estimate) in self.places.iter_mut().zip(estimates) {
+            let (Some((keypoints, last)), Ok(estimate)) = (&mut place.learning, estimate) else { continue };
+            if set.master_nanos.saturating_sub(*last) < every_nanos {
+                continue;
+            }
+            keypoints.push(estimate.keypoints.clone());
+            *last = set.master_nanos;
+            if keypoints.len() < SHAPE_SETS {
+                continue;
+            }
+            match place.estimator.fit_shape_to_keypoints(keypoints) {
+                Ok(fit) => {
+                    tracing::warn!("person {} is {fit}", place.id);
+                    place.know();
+                }
+                Err(error) => {
+                    tracing::warn!(%error, "the shape of person {} is not known yet, trying again", place.id);
+                    keypoints.clear();
+                }
+            }
+        }
+    }
+
+    /// Remembers the clothes of people who are seen, and reports who left.
+    fn remember(&mut self, set: &FrameSet, estimates: &[Result<PoseEstimate, String>]) {
+        for index in 0..self.places.len() {
+            match &estimates[index] {
+                Ok(estimate) => {
+                    let masks = self.own_masks(set, estimate);
+                    let place = &mut self.places[index];
+                    if place.seen.is_multiple_of(CLOTHES_EVERY)
+                        && let Some(colors) = ClothesColors::of(set, &masks)
+                    {
+                        place.clothes = Some(colors);
+                    }
+                    place.seen += 1;
+                }
+                Err(_) => {
+                    let place = &self.places[index];
+                    if place.learning.is_none() && place.estimator.sets_lost() == LEFT_AFTER_SETS {
+                        tracing::warn!("person {} has left", place.id);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Adds the run times of an estimate's parts.
+fn count_stages(estimate: &PoseEstimate, stages: &mut StageTimes) {
+    let seconds = estimate.quality.seconds;
+    for (stage, seconds) in [
+        ("  search", seconds.search),
+        ("  network", seconds.net),
+        ("  fit to landmarks", seconds.triangulate + seconds.fit),
+        ("  masks", seconds.masks),
+        ("  fit to outlines", seconds.outline),
+    ] {
+        stages.add(stage, Duration::from_secs_f64(seconds.max(0.0)));
+    }
+    stages.count("views that the network looked at", estimate.quality.looked as u64);
 }
 
 impl Perception for EstimatedPerception {
     fn people(&self) -> Vec<(PersonId, &Template)> {
-        vec![(PersonId::default(), self.estimator.template())]
+        let known = self.places.iter().filter(|place| place.learning.is_none());
+        known.map(|place| (place.id, place.estimator.template())).collect()
     }
 
     fn observe<'a>(&mut self, set: &'a FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation<'a>>, FusionError> {
-        let person = PersonId::default();
-        let estimate = match stages.time("pose from pictures", || self.estimator.estimate(set)) {
-            Ok(estimate) => estimate,
-            Err(error) => return Ok(vec![Observation::Lost { person, reason: error.to_string() }]),
-        };
-        let seconds = estimate.quality.seconds;
-        for (stage, seconds) in [
-            ("  network", seconds.net),
-            ("  fit to landmarks", seconds.triangulate + seconds.fit),
-            ("  masks", seconds.masks),
-            ("  fit to outlines", seconds.outline),
-        ] {
-            stages.add(stage, Duration::from_secs_f64(seconds.max(0.0)));
+        let start = std::time::Instant::now();
+        let mut estimates = self.estimate(set, stages);
+        self.remember(set, &estimates);
+        stages.add("pose from pictures", start.elapsed());
+        let known: Vec<bool> = self.places.iter().map(|place| place.learning.is_none()).collect();
+        self.learn(set, &estimates);
+        let mut views = self.views(set, &mut estimates, stages)?;
+        let mut observations = Vec::new();
+        for (index, estimate) in estimates.into_iter().enumerate().filter(|(index, _)| known[*index]) {
+            let person = self.places[index].id;
+            observations.push(match estimate {
+                Err(reason) => Observation::Lost { person, reason },
+                Ok(estimate) => {
+                    let confidence = 1.0 / (1.0 + (estimate.quality.residual_px / HALF_BELIEVED_PX).powi(2));
+                    let views = std::mem::take(&mut views[index]);
+                    Observation::Seen(SeenPerson { person, pose: estimate.pose, confidence, views })
+                }
+            });
         }
-        if !estimate.pose.is_valid() {
-            let reason = "the pose holds numbers that are not finite".to_owned();
-            return Ok(vec![Observation::Lost { person, reason }]);
+        Ok(observations)
+    }
+}
+
+impl EstimatedPerception {
+    /// The views of everybody, by place, then by present frame. Masks of several people are divided by their bodies.
+    fn views<'a>(
+        &self,
+        set: &'a FrameSet,
+        estimates: &mut [Result<PoseEstimate, String>],
+        stages: &mut StageTimes,
+    ) -> Result<Vec<Vec<ViewObservation<'a>>>, FusionError> {
+        let seen: Vec<usize> = (0..estimates.len()).filter(|&index| estimates[index].is_ok()).collect();
+        let mut views: Vec<Vec<ViewObservation<'a>>> = estimates.iter().map(|_| Vec::new()).collect();
+        let mut meshes = Vec::new();
+        if seen.len() > 1 {
+            for (place, estimate) in self.places.iter().zip(estimates.iter()) {
+                let Ok(estimate) = estimate else { continue };
+                let template = place.estimator.template();
+                let vertices = skin_mesh(template, &estimate.pose).0;
+                meshes.push(PosedMesh { vertices, triangles: &template.triangles });
+            }
         }
-        let (mut masks, mut keypoints) = (estimate.masks, estimate.keypoints);
-        let mut views = Vec::new();
         for (slot, frame) in set.present() {
-            let quality = estimate.quality.views.get(slot);
-            let mask = match (self.masks, self.plates.get(slot).and_then(Option::as_ref)) {
-                (Origin::Given, _) => frame.mask.as_ref().map(Cow::Borrowed),
-                (Origin::Estimated, plate) => match (masks.get_mut(slot).and_then(Option::take), plate) {
-                    (Some(mask), _) => Some(Cow::Owned(mask)),
-                    (None, Some(plate)) => {
+            let mut own = Vec::new();
+            for &index in &seen {
+                let Ok(estimate) = &mut estimates[index] else { continue };
+                let quality = estimate.quality.views.get(slot);
+                let overlap = quality.and_then(|quality| quality.mask_overlap).unwrap_or(0.0);
+                let confidence = if self.masks == Origin::Given { 1.0 } else { overlap };
+                let plate = self.plates.get(slot).and_then(Option::as_ref).filter(|_| seen.len() == 1);
+                let mask = match (self.masks, estimate.masks.get_mut(slot).and_then(Option::take), plate) {
+                    (Origin::Given, ..) => frame.mask.as_ref().map(Cow::Borrowed),
+                    (Origin::Estimated, Some(mask), _) => Some(Cow::Owned(mask)),
+                    (Origin::Estimated, None, Some(plate)) => {
                         stages.time("mask from plate", || mask_from_plate(&frame.image, plate))?.map(Cow::Owned)
                     }
-                    (None, None) => None,
-                },
-            };
-            let overlap = quality.and_then(|quality| quality.mask_overlap).unwrap_or(0.0);
-            let confidence = if self.masks == Origin::Given { 1.0 } else { overlap };
-            let landmarks = keypoints.get_mut(slot).and_then(Option::take);
-            views.push(ViewObservation { landmarks, ..ViewObservation::of_mask(mask, confidence) });
+                    (Origin::Estimated, None, None) => None,
+                };
+                let landmarks = estimate.keypoints.get_mut(slot).and_then(Option::take);
+                own.push(ViewObservation { landmarks, ..ViewObservation::of_mask(mask, confidence) });
+            }
+            if let (2.., Some(camera)) = (own.len(), self.rig.cameras.get(slot)) {
+                let everybody = union(own.iter().filter_map(|view| view.mask.as_deref()));
+                if let Some(everybody) = everybody {
+                    let parts = stages.time("divide masks", || split_mask(camera, &everybody, &meshes));
+                    for (view, (part, others)) in own.iter_mut().zip(parts) {
+                        view.mask = view.mask.is_some().then_some(Cow::Owned(part));
+                        view.others = Some(others);
+                    }
+                }
+            }
+            for (index, view) in seen.iter().zip(own) {
+                views[*index].push(view);
+            }
         }
-        let confidence = 1.0 / (1.0 + (estimate.quality.residual_px / HALF_BELIEVED_PX).powi(2));
-        Ok(vec![Observation::Seen(SeenPerson { person, pose: estimate.pose, confidence, views })])
+        Ok(views)
     }
+}
+
+/// Coverage by anybody; `None` without a mask, or where sizes differ.
+fn union<'a>(mut masks: impl Iterator<Item = &'a Mask>) -> Option<Mask> {
+    let first = masks.next()?;
+    let mut coverage = first.coverage().to_vec();
+    for mask in masks.filter(|mask| (mask.width(), mask.height()) == (first.width(), first.height())) {
+        for (all, one) in coverage.iter_mut().zip(mask.coverage()) {
+            *all = (*all).max(*one);
+        }
+    }
+    Mask::new(first.width(), first.height(), coverage).ok()
 }

@@ -33,6 +33,9 @@ pub struct PerceptionSettings {
     /// Shape of the body from the data set's glTF file, or from the images; by default from where the pose comes.
     #[arg(long, value_enum)]
     pub shape: Option<Origin>,
+    /// People who are tracked at most, 1 to 4; with 1 the one whom most views agree on.
+    #[arg(long, default_value_t = 1)]
+    pub people: usize,
     /// Height of an estimated person in metres; by default measured, or an average one before a single camera.
     #[arg(long = "height", value_name = "METRES")]
     pub height_m: Option<f64>,
@@ -40,7 +43,7 @@ pub struct PerceptionSettings {
 
 impl Default for PerceptionSettings {
     fn default() -> Self {
-        Self { pose: Origin::Estimated, masks: Origin::Estimated, shape: None, height_m: None }
+        Self { pose: Origin::Estimated, masks: Origin::Estimated, shape: None, people: 1, height_m: None }
     }
 }
 
@@ -62,6 +65,7 @@ impl PerceptionSettings {
     /// # Errors
     /// [`FusionError::Setting`] names the key and the range.
     pub fn validate(&self) -> Result<(), FusionError> {
+        check("perception.people", self.people as f64, 1.0, 4.0)?;
         self.height_m.map_or(Ok(()), |height| check("perception.height_m", height, 0.5, 2.5))
     }
 }
