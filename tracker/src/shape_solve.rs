@@ -183,7 +183,7 @@ mod tests {
         let one = |(slot, camera): (usize, &Camera)| {
             let view = View::new(camera);
             let seen = observe(camera, &view, &keypoints_of(camera, &model.marks(turns)), 0.3);
-            FitView { slot, view, seen, shift: [DVec3::ZERO; LANDMARK_COUNT], delay_secs: 0.0 }
+            FitView { slot, view, seen, shift: [DVec3::ZERO; crate::LANDMARK_COUNT], delay_secs: 0.0 }
         };
         cameras.iter().enumerate().map(one).collect()
     }

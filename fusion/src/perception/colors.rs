@@ -70,7 +70,7 @@ mod tests {
     /// A set of one camera that sees trousers of one colour under a shirt of another.
     fn set(shirt: [u8; 3], trousers: [u8; 3]) -> FrameSet {
         let bytes = (0..SIDE).flat_map(|y| (0..SIDE).flat_map(move |_| if y < SIDE / 2 { shirt } else { trousers }));
-        let image = Image::new(SIDE, SIDE, PixelFormat::Rgb8, bytes.collect()).unwrap();
+        let image = Image::new(SIDE, SIDE, PixelFormat::Rgb8, bytes.collect::<Vec<_>>()).unwrap();
         let frame = Frame {
             camera: CameraId::from("00"),
             sequence: 0,
