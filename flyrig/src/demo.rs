@@ -204,7 +204,9 @@ fn pass(
         Origin::Given => {
             let simulator = lock(simulator)?;
             let given = GivenPerception::repeating(&inputs, simulator.template().clone(), simulator.track().clone());
-            builder.perception(given.with_masks(args.masks, simulated_plates(&simulator, &inputs)?)).build()?
+            builder
+                .perception(given.with_masks(&args.perception(), &simulated_plates(&simulator, &inputs)?)?)
+                .build()?
         }
         Origin::Estimated => builder.perception(find_person(args, simulator, &inputs)?).build()?,
     };

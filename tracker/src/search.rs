@@ -54,7 +54,7 @@ impl Sighting {
 }
 
 /// Everybody the network finds in a picture, best first.
-fn sightings(net: &PoseNet, picture: &Rgb, config: &PoseConfig) -> Result<Vec<Sighting>, TrackError> {
+pub(crate) fn sightings(net: &PoseNet, picture: &Rgb, config: &PoseConfig) -> Result<Vec<Sighting>, TrackError> {
     let mut first = Vec::new();
     for crop in search_crops(picture.width as u32, picture.height as u32) {
         let sighting = Sighting::take(net, picture, crop)?;

@@ -2,10 +2,11 @@
 
 use std::{borrow::Cow, time::Duration};
 
-use flyrig_body::Template;
-use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet, ShapeFit, mask_from_plate};
-use flyrig_types::{FrameSet, Image, PersonId, Rig};
+use flyrig_body::{Template, skin_mesh};
+use flyrig_tracker::{BodyGate, Matte, PoseConfig, PoseEstimator, PoseNet, ShapeFit, matte};
+use flyrig_types::{Camera, FrameSet, Image, PersonId, Pose, Rig};
 
+use super::background::{BackgroundWatch, backgrounds, report};
 use super::{Observation, Perception, SeenPerson, ViewObservation};
 use crate::{FusionError, Origin, PerceptionSettings, StageTimes};
 
@@ -20,8 +21,9 @@ const HALF_BELIEVED_PX: f64 = 12.0;
 #[derive(Debug)]
 pub struct EstimatedPerception {
     estimator: PoseEstimator,
+    cameras: Vec<Camera>,
     masks: Origin,
-    plates: Vec<Option<Image>>,
+    watch: BackgroundWatch,
 }
 
 impl EstimatedPerception {
@@ -29,7 +31,7 @@ impl EstimatedPerception {
     /// one: masks then use the difference to it. Masks come from the frames where those of the settings are given.
     ///
     /// # Errors
-    /// [`FusionError::Track`] when template, rig or a plate cannot be used.
+    /// [`FusionError::Track`] when template, rig or a plate cannot be used, [`FusionError::Setting`] for a wrong key colour.
     pub fn new(
         rig: &Rig,
         template: &Template,
@@ -39,12 +41,8 @@ impl EstimatedPerception {
         let masks = settings.masks;
         let config = PoseConfig { masks: masks == Origin::Estimated, ..PoseConfig::default() };
         let mut estimator = PoseEstimator::new(PoseNet::embedded()?, template, rig, config)?;
-        for (slot, plate) in plates.iter().enumerate() {
-            if let Some(plate) = plate {
-                estimator.set_plate(slot, plate)?;
-            }
-        }
-        Ok(Self { estimator, masks, plates })
+        estimator.set_backgrounds(backgrounds(&rig.cameras, settings, &plates)?);
+        Ok(Self { estimator, cameras: rig.cameras.clone(), masks, watch: BackgroundWatch::default() })
     }
 
     /// Fits the template's shape to the person in a few sets ([`SHAPE_SETS`], over [`SHAPE_SECS`]). Call it before the session is built.
@@ -53,6 +51,19 @@ impl EstimatedPerception {
     /// [`FusionError::Track`] when too few of the sets show a person; the shape stays as it was.
     pub fn learn_shape(&mut self, sets: &[FrameSet]) -> Result<ShapeFit, FusionError> {
         Ok(self.estimator.fit_shape(sets)?)
+    }
+
+    /// Lets the backgrounds follow the light where the person does not stand.
+    fn follow_backgrounds(&mut self, set: &FrameSet, pose: &Pose) -> Result<(), FusionError> {
+        let (vertices, _) = skin_mesh(self.estimator.template(), pose);
+        for (slot, frame) in set.present() {
+            let Some(camera) = self.cameras.get(slot) else { continue };
+            let gate = BodyGate::new(camera, &vertices, &self.estimator.template().triangles);
+            if let Some(background) = self.estimator.background_mut(slot) {
+                report(camera, &background.update(&frame.image, gate.as_slice())?);
+            }
+        }
+        Ok(())
     }
 }
 
@@ -84,20 +95,24 @@ impl Perception for EstimatedPerception {
         let mut views = Vec::new();
         for (slot, frame) in set.present() {
             let quality = estimate.quality.views.get(slot);
-            let mask = match (self.masks, self.plates.get(slot).and_then(Option::as_ref)) {
-                (Origin::Given, _) => frame.mask.as_ref().map(Cow::Borrowed),
-                (Origin::Estimated, plate) => match (masks.get_mut(slot).and_then(Option::take), plate) {
-                    (Some(mask), _) => Some(Cow::Owned(mask)),
-                    (None, Some(plate)) => {
-                        stages.time("mask from plate", || mask_from_plate(&frame.image, plate))?.map(Cow::Owned)
+            let (mask, edge_colors) = match self.masks {
+                Origin::Given => (frame.mask.as_ref().map(Cow::Borrowed), Vec::new()),
+                Origin::Estimated => match masks.get_mut(slot).and_then(Option::take) {
+                    Some(mask) => {
+                        let background = self.estimator.background(slot);
+                        let Matte { mask, colors } = stages.time("matte", || matte(&frame.image, &mask, background))?;
+                        (Some(Cow::Owned(mask)), colors)
                     }
-                    (None, None) => None,
+                    None => (None, Vec::new()),
                 },
             };
             let overlap = quality.and_then(|quality| quality.mask_overlap).unwrap_or(0.0);
             let confidence = if self.masks == Origin::Given { 1.0 } else { overlap };
             let landmarks = keypoints.get_mut(slot).and_then(Option::take);
-            views.push(ViewObservation { landmarks, ..ViewObservation::of_mask(mask, confidence) });
+            views.push(ViewObservation { landmarks, edge_colors, ..ViewObservation::of_mask(mask, confidence) });
+        }
+        if self.masks == Origin::Estimated && self.watch.is_due() {
+            stages.time("background", || self.follow_backgrounds(set, &estimate.pose))?;
         }
         let confidence = 1.0 / (1.0 + (estimate.quality.residual_px / HALF_BELIEVED_PX).powi(2));
         Ok(vec![Observation::Seen(SeenPerson { person, pose: estimate.pose, confidence, views })])
