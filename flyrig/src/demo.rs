@@ -269,10 +269,10 @@ fn find_person(args: &DemoArgs, simulator: &Mutex<Simulator>, inputs: &Rig) -> R
     let mut simulator = lock(simulator)?;
     let plates = simulated_plates(&simulator, inputs)?;
     if args.perception().shape() == Origin::Given {
-        return Ok(EstimatedPerception::new(inputs, simulator.template(), &args.perception(), plates)?);
+        return Ok(EstimatedPerception::new(inputs, simulator.template(), &args.perception(), &plates)?);
     }
     let template = default_template(&ShapeParams::default())?;
-    let mut perception = EstimatedPerception::new(inputs, &template, &args.perception(), plates)?;
+    let mut perception = EstimatedPerception::new(inputs, &template, &args.perception(), &plates)?;
     eprintln!("demo: learning the person's shape from {SHAPE_SETS} frames of the first {SHAPE_SECS} seconds");
     let mut sets = Vec::new();
     for index in 0..SHAPE_SETS {

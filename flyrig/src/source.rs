@@ -46,7 +46,7 @@ impl Source {
             }
             (Origin::Given, None) => bail!("perception.pose is \"given\" but the template holds no animation"),
             (Origin::Estimated, _) => {
-                let estimated = EstimatedPerception::new(&self.rig, &self.template, settings, plates)?;
+                let estimated = EstimatedPerception::new(&self.rig, &self.template, settings, &plates)?;
                 Ok(FoundBy::Estimated(Box::new(estimated)))
             }
         }

@@ -74,10 +74,10 @@ impl Replay {
             Origin::Estimated => {
                 if perceived.shape() == Origin::Given {
                     let template = given_person(&settings.dataset)?.template;
-                    builder.perception(EstimatedPerception::new(&rig, &template, perceived, plates)?)
+                    builder.perception(EstimatedPerception::new(&rig, &template, perceived, &plates)?)
                 } else {
                     let template = default_template(&ShapeParams::default())?;
-                    let mut perception = EstimatedPerception::new(&rig, &template, perceived, plates)?;
+                    let mut perception = EstimatedPerception::new(&rig, &template, perceived, &plates)?;
                     eprintln!("learning the person's shape from {SHAPE_SETS} frames of the first {SHAPE_SECS} seconds");
                     let first = first_sets(settings, &rig)?;
                     let fit = perception.learn_shape(&first).context("no person found in the first frames")?;

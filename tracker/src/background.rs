@@ -277,9 +277,9 @@ impl Plate {
                 self.learn(at, now);
             } else if evidence.values[at] < 0.5 {
                 self.different[at] = 0;
-                for k in 0..3 {
-                    let value = &mut self.values[3 * at + k];
-                    *value += FOLLOW * (now[k] / drift.gain[k] - *value);
+                let values = self.values[3 * at..3 * at + 3].iter_mut();
+                for ((value, now), gain) in values.zip(now).zip(drift.gain) {
+                    *value += FOLLOW * (now / gain - *value);
                 }
             } else {
                 self.different[at] += 1;

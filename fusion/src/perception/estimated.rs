@@ -36,12 +36,12 @@ impl EstimatedPerception {
         rig: &Rig,
         template: &Template,
         settings: &PerceptionSettings,
-        plates: Vec<Option<Image>>,
+        plates: &[Option<Image>],
     ) -> Result<Self, FusionError> {
         let masks = settings.masks;
         let config = PoseConfig { masks: masks == Origin::Estimated, ..PoseConfig::default() };
         let mut estimator = PoseEstimator::new(PoseNet::embedded()?, template, rig, config)?;
-        estimator.set_backgrounds(backgrounds(&rig.cameras, settings, &plates)?);
+        estimator.set_backgrounds(backgrounds(&rig.cameras, settings, plates)?);
         Ok(Self { estimator, cameras: rig.cameras.clone(), masks, watch: BackgroundWatch::default() })
     }
 
