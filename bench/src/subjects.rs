@@ -242,7 +242,7 @@ fn find_people(people: &mut [Simulator], chosen: &[usize], rig: &Rig, inputs: &R
     };
     let plates = INPUTS.iter().map(plate).collect::<Result<Vec<_>>>()?;
     let mut perception =
-        EstimatedPerception::new(inputs, &default_template(&ShapeParams::default())?, &settings, plates)?;
+        EstimatedPerception::new(inputs, &default_template(&ShapeParams::default())?, &settings, &plates)?;
     let every_nanos = (SHAPE_SECS * 1e9 / SHAPE_SETS as f64) as i64;
     let sets = (0..SHAPE_SETS as u64).map(|index| frame_set(people, chosen, rig, index, index as i64 * every_nanos));
     let fits = perception.learn_shapes(&sets.collect::<Result<Vec<_>>>()?)?;

@@ -65,6 +65,8 @@ pub enum Command {
     /// Estimate each camera's time offset from the first camera: from the silhouettes of a person where the calibration is
     /// known (recordings, folders), else from motion in the images (live cameras).
     SyncCheck(SyncCheckArgs),
+    /// Record the empty scene before each camera (plates): masks are then made from the difference to it.
+    Plate(PlateArgs),
     /// List cameras with their identifiers, formats and buses, and graphics adapters; suggest fixes.
     Doctor {
         /// A TOML file whose cameras are looked for and whose buses are planned.
@@ -149,6 +151,24 @@ pub struct SyncCheckArgs {
     /// which is more reliable than motion. It replaces the input's own calibration.
     #[arg(long)]
     pub calibration: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct PlateArgs {
+    /// A configuration (*.toml), a recording (*.mcap) or a folder with images/CAM.
+    pub input: PathBuf,
+    /// Folder of the calibration or data set; background/CAM.png are written into it.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Seconds over which each pixel's median is taken.
+    #[arg(long, default_value_t = 3.0, value_parser = parse_seconds)]
+    pub secs: f64,
+    /// Frame rate of a folder.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// Replace plates that are there, and accept pictures in which somebody is found.
+    #[arg(long)]
+    pub force: bool,
 }
 
 #[derive(Debug, Subcommand)]

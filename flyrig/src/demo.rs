@@ -204,7 +204,9 @@ fn pass(
         Origin::Given => {
             let simulator = lock(simulator)?;
             let given = GivenPerception::repeating(&inputs, simulator.template().clone(), simulator.track().clone());
-            builder.perception(given.with_masks(args.masks, simulated_plates(&simulator, &inputs)?)).build()?
+            builder
+                .perception(given.with_masks(&args.perception(), &simulated_plates(&simulator, &inputs)?)?)
+                .build()?
         }
         Origin::Estimated => builder.perception(find_person(args, simulator, &inputs)?).build()?,
     };
@@ -267,10 +269,10 @@ fn find_person(args: &DemoArgs, simulator: &Mutex<Simulator>, inputs: &Rig) -> R
     let mut simulator = lock(simulator)?;
     let plates = simulated_plates(&simulator, inputs)?;
     if args.perception().shape() == Origin::Given {
-        return Ok(EstimatedPerception::new(inputs, simulator.template(), &args.perception(), plates)?);
+        return Ok(EstimatedPerception::new(inputs, simulator.template(), &args.perception(), &plates)?);
     }
     let template = default_template(&ShapeParams::default())?;
-    let mut perception = EstimatedPerception::new(inputs, &template, &args.perception(), plates)?;
+    let mut perception = EstimatedPerception::new(inputs, &template, &args.perception(), &plates)?;
     eprintln!("demo: learning the person's shape from {SHAPE_SETS} frames of the first {SHAPE_SECS} seconds");
     let mut sets = Vec::new();
     for index in 0..SHAPE_SETS {

@@ -15,6 +15,7 @@ mod metrics_server;
 mod metrics_text;
 mod monitor;
 mod network;
+mod plate;
 mod pose_recording;
 mod recording;
 mod run;
@@ -74,6 +75,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         }
         Command::Replay(args) => recording::replay(args),
         Command::SyncCheck(args) => sync_check::sync_check(args, &|| open_gpu(cli.adapter.as_deref())),
+        Command::Plate(args) => plate::plate(args, &|| open_gpu(cli.adapter.as_deref())),
         Command::Doctor { config } => doctor::doctor(config.as_deref()),
         Command::Watch(args) => watch::watch(args),
         Command::Eval(args) => eval::eval(args, &open_gpu(cli.adapter.as_deref())?),

@@ -35,7 +35,7 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
     stop::flag();
     let mut monitor = Monitor::start(&config.health.listen, show_table)?;
     let source = source::open(config, Some(gpu))?;
-    dataset::require_masks(config.perception.pose, config.perception.masks, &source.plates)?;
+    dataset::require_masks(&config.perception, &source.plates)?;
     let pacing = source::pacing(config);
     let recorder = recording.map(|path| recording::recorder(path, &source.rig, &config.record, pacing)).transpose()?;
     let ended = capture_people(config, gpu, source, recorder.as_ref(), &mut monitor, show_table);

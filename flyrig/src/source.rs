@@ -37,16 +37,16 @@ pub enum FoundBy {
 impl Source {
     /// How people are found: from the source's pose track, or from the images.
     pub fn perception(&mut self, config: &Config) -> Result<FoundBy> {
-        let (masks, plates) = (config.perception.masks, std::mem::take(&mut self.plates));
+        let (settings, plates) = (&config.perception, std::mem::take(&mut self.plates));
         match (config.perception.pose, self.track.take()) {
             (Origin::Given, Some(track)) => {
                 let (person, repeat) = (PersonId::default(), config.source.kind == SourceKind::Sim);
                 let given = GivenPerson { person, template: self.template.clone(), track, repeat };
-                Ok(FoundBy::Given(GivenPerception::new(&self.rig, vec![given]).with_masks(masks, plates)))
+                Ok(FoundBy::Given(GivenPerception::new(&self.rig, vec![given]).with_masks(settings, &plates)?))
             }
             (Origin::Given, None) => bail!("perception.pose is \"given\" but the template holds no animation"),
             (Origin::Estimated, _) => {
-                let estimated = EstimatedPerception::new(&self.rig, &self.template, &config.perception, plates)?;
+                let estimated = EstimatedPerception::new(&self.rig, &self.template, settings, &plates)?;
                 Ok(FoundBy::Estimated(Box::new(estimated)))
             }
         }
@@ -75,7 +75,11 @@ pub fn input_format<'a>(kind: SourceKind, rig: &'a Rig) -> InputFormat<'a> {
 
 /// Opens the cameras of a configuration; only simulated ones need a graphics adapter.
 pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
-    let source = open_cameras(config, gpu)?;
+    let mut source = open_without_plates(config, gpu)?;
+    let has_folder = config.source.kind != SourceKind::Mcap || !config.perception.plates.as_os_str().is_empty();
+    if config.source.kind != SourceKind::Sim && has_folder && config.perception.key_color.is_empty() {
+        source.plates = dataset::plates(&dataset::plate_folder(&config.source.path, &config.perception), &source.rig)?;
+    }
     dataset::pick(
         &source.rig,
         &config.sync.lags_nanos.keys().map(CameraId::to_string).collect::<Vec<_>>(),
@@ -94,7 +98,8 @@ pub fn simulated_plates(simulator: &Simulator, inputs: &Rig) -> Result<Vec<Optio
     inputs.cameras.iter().map(plate).collect()
 }
 
-fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
+/// The same without the plates of a folder: they may be missing or wrong.
+pub fn open_without_plates(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
     let source = &config.source;
     if source.kind == SourceKind::Sim {
         let gpu = gpu.context("the simulated rig needs a graphics adapter")?;
@@ -152,10 +157,7 @@ fn open_cameras(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
         let human = load_gltf(&config.body.template)?;
         (human.template, human.track)
     };
-    let plates = match source.kind {
-        SourceKind::Mcap => rig.cameras.iter().map(|_| None).collect(),
-        _ => dataset::plates(&source.path, &rig)?,
-    };
+    let plates = rig.cameras.iter().map(|_| None).collect();
     Ok(Source { cameras: sources, rig, template, track, plates, threads })
 }
 

@@ -257,7 +257,7 @@ fn calibration(folder: &Path, sources: &Sources) -> Result<(Rig, Vec<Option<Imag
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
     let names: Vec<String> = cameras.iter().map(CameraId::to_string).collect();
     let rig = dataset::pick(&dataset::load_rig(folder, &cameras)?, &names, "the calibration")?;
-    let plates = dataset::plates(folder, &rig)?;
+    let plates = dataset::plates(&folder.join("background"), &rig)?;
     Ok((rig, plates))
 }
 

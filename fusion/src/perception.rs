@@ -1,5 +1,6 @@
 //! Who is in front of the cameras: from a frame set to observations of people.
 
+mod background;
 mod colors;
 mod estimated;
 mod given;
@@ -8,9 +9,10 @@ mod split_mask;
 use std::borrow::Cow;
 
 use flyrig_body::Template;
-use flyrig_tracker::ViewKeypoints;
+use flyrig_tracker::{EdgeColor, ViewKeypoints};
 use flyrig_types::{FrameSet, Mask, PersonId, Pose};
 
+pub(crate) use self::background::key_color;
 pub use self::estimated::{EstimatedPerception, SHAPE_SECS, SHAPE_SETS};
 pub use self::given::{GivenPerception, GivenPerson};
 use crate::{FusionError, StageTimes};
@@ -69,6 +71,8 @@ pub struct ViewObservation<'a> {
     pub mask: Option<Cow<'a, Mask>>,
     /// Confidence in the mask, 0..=1; 1 for a given one.
     pub mask_confidence: f64,
+    /// Colours of the mask's outline without the background's share; the image's own elsewhere.
+    pub edge_colors: Vec<EdgeColor>,
     /// Coverage by other people, whose pixels say nothing about this person. `None` without others.
     pub others: Option<Mask>,
     /// Landmarks with their own confidences; `None` for given poses.
@@ -80,6 +84,6 @@ impl<'a> ViewObservation<'a> {
     #[must_use]
     pub fn of_mask(mask: Option<Cow<'a, Mask>>, confidence: f64) -> Self {
         let mask_confidence = if mask.is_some() { confidence } else { 0.0 };
-        Self { mask, mask_confidence, others: None, landmarks: None }
+        Self { mask, mask_confidence, ..Self::default() }
     }
 }

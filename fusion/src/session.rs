@@ -250,7 +250,8 @@ impl Session {
             if let Some((mask, camera)) = mask.zip(self.rig.cameras.get(slot)) {
                 slots.push(slot);
                 let others = view.others.as_ref();
-                views.push(InputView { camera, image: &frame.image, mask, others, pose: pose.as_ref() });
+                let (image, edge_colors) = (&frame.image, view.edge_colors.as_slice());
+                views.push(InputView { camera, image, mask, edge_colors, others, pose: pose.as_ref() });
                 continue;
             }
             self.counts.without_mask += 1;

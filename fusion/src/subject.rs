@@ -12,7 +12,7 @@ use flyrig_renderer::{
     RenderTarget, Splat, UNKNOWN_RGBA, ViewInput, read_splats,
 };
 use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, SharedAppearance, ViewPicture};
-use flyrig_tracker::DeformReport;
+use flyrig_tracker::{DeformReport, EdgeColor};
 use flyrig_types::{Camera, Image, Mask, PersonId, Pose, Rig};
 
 use crate::{
@@ -38,6 +38,8 @@ pub(crate) struct InputView<'a> {
     pub camera: &'a Camera,
     pub image: &'a Image,
     pub mask: &'a Mask,
+    /// Colours of the mask's outline without the background's share.
+    pub edge_colors: &'a [EdgeColor],
     /// Coverage by other people.
     pub others: Option<&'a Mask>,
     /// Pose at the image's own time, where that is not the set's.
@@ -573,7 +575,7 @@ impl Subject {
         skin_mesh(&moved, &deformation.correction().apply(pose))
     }
 
-    /// Converts the images to RGB with the mask as alpha, and uploads each once.
+    /// Converts the images to RGB with the mask as alpha and without the background along its outline, and uploads each once.
     fn take_images(&mut self, gpu: &GpuContext, views: &[InputView<'_>]) -> Result<(), FusionError> {
         for (i, view) in views.iter().enumerate() {
             let (image, mask) = (view.image, view.mask);
@@ -610,6 +612,11 @@ impl Subject {
             let InputImage { rgba, words, .. } = &mut self.inputs[i];
             rgba.clear();
             rgba.extend(rgb.chunks_exact(3).zip(mask.coverage()).flat_map(|(c, &a)| [c[0], c[1], c[2], a]));
+            for EdgeColor { pixel, rgb } in view.edge_colors {
+                if let Some(pixel) = rgba.get_mut(4 * *pixel as usize..).and_then(<[u8]>::first_chunk_mut::<3>) {
+                    *pixel = *rgb;
+                }
+            }
             if let Some(others) = view.others {
                 for (pixel, others) in rgba.chunks_exact_mut(4).zip(others.coverage()) {
                     if *others >= OTHERS_COVER {

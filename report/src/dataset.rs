@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail};
 use flyrig_calib::{CalibError, load_easymocap};
 use flyrig_capture::{VideoOptions, VideoReplay, folder_picture_size};
-use flyrig_fusion::Origin;
+use flyrig_fusion::{Origin, PerceptionSettings};
 use flyrig_types::{Camera, CameraId, Image, PixelFormat, Rig};
 
 /// The named cameras of a rig, in the order of the names; all of them for no names.
@@ -58,16 +58,28 @@ pub fn video_file(root: &Path, id: &CameraId) -> PathBuf {
     root.join("videos").join(format!("{id}.mp4"))
 }
 
-/// The empty pictures `background/CAM.png` by slot, where there are any.
-///
-/// # Errors
-/// Names what is missing or wrong.
-pub fn plates(root: &Path, rig: &Rig) -> Result<Vec<Option<Image>>> {
-    rig.cameras.iter().map(|camera| plate(root, camera)).collect()
+/// Returns the folder of a data set's plates: that of the settings, or `background`.
+#[must_use]
+pub fn plate_folder(root: &Path, settings: &PerceptionSettings) -> PathBuf {
+    if settings.plates.as_os_str().is_empty() { root.join("background") } else { settings.plates.clone() }
 }
 
-fn plate(root: &Path, camera: &Camera) -> Result<Option<Image>> {
-    let path = root.join("background").join(format!("{}.png", camera.id));
+/// Where a camera's plate lies in a folder.
+#[must_use]
+pub fn plate_file(folder: &Path, id: &CameraId) -> PathBuf {
+    folder.join(format!("{id}.png"))
+}
+
+/// Returns the pictures of the empty scene `CAM.png` of a folder by slot, where there are any.
+///
+/// # Errors
+/// Names the file that cannot be read; the camera, both sizes and the fix for one of another size than the camera's pictures.
+pub fn plates(folder: &Path, rig: &Rig) -> Result<Vec<Option<Image>>> {
+    rig.cameras.iter().map(|camera| plate(folder, camera)).collect()
+}
+
+fn plate(folder: &Path, camera: &Camera) -> Result<Option<Image>> {
+    let path = plate_file(folder, &camera.id);
     if !path.exists() {
         return Ok(None);
     }
@@ -75,20 +87,28 @@ fn plate(root: &Path, camera: &Camera) -> Result<Option<Image>> {
     let (width, height) = picture.dimensions();
     let expected = (camera.intrinsics.width, camera.intrinsics.height);
     if (width, height) != expected {
-        bail!("{} is {width}x{height} pixels, the camera's pictures are {}x{}", path.display(), expected.0, expected.1);
+        bail!(
+            "camera {}: the plate {} is {width}x{height} pixels, the camera's pictures are {}x{}; record it again with `flyrig \
+             plate`, or remove it",
+            camera.id,
+            path.display(),
+            expected.0,
+            expected.1
+        );
     }
     Ok(Some(Image::new(width, height, PixelFormat::Rgb8, picture.into_raw())?))
 }
 
-/// Masks that neither lie in the data set nor come with an estimated pose need an empty picture of every camera.
+/// Masks that neither lie in the data set nor come with an estimated pose need a plate of every camera, or a key colour.
 ///
 /// # Errors
 /// Names what is missing or wrong.
-pub fn require_masks(pose: Origin, masks: Origin, plates: &[Option<Image>]) -> Result<()> {
-    if pose == Origin::Given && masks == Origin::Estimated && plates.iter().any(Option::is_none) {
+pub fn require_masks(settings: &PerceptionSettings, plates: &[Option<Image>]) -> Result<()> {
+    let from_plates = settings.masks == Origin::Estimated && settings.key_color.is_empty();
+    if settings.pose == Origin::Given && from_plates && plates.iter().any(Option::is_none) {
         bail!(
-            "a given pose with estimated masks needs an empty picture background/CAM.png of every input camera; add \
-             them, or let the pose be estimated too"
+            "a given pose with estimated masks needs a plate background/CAM.png of every input camera; record them with `flyrig \
+             plate`, name a key colour, or let the pose be estimated too"
         );
     }
     Ok(())

@@ -63,21 +63,21 @@ impl Replay {
         let (sets, count) = open_inputs(settings, &rig)?;
         let truth = TruthReader::open(settings, &holdout)?;
         let perceived = &settings.session.perception;
-        let plates = dataset::plates(&settings.dataset, &rig)?;
-        dataset::require_masks(perceived.pose, perceived.masks, &plates)?;
+        let plates = dataset::plates(&dataset::plate_folder(&settings.dataset, perceived), &rig)?;
+        dataset::require_masks(perceived, &plates)?;
         let builder = SessionBuilder::new(gpu.clone(), rig.clone()).settings(settings.session.clone());
         let session = match perceived.pose {
             Origin::Given => {
                 let person = given_person(&settings.dataset)?;
-                builder.perception(GivenPerception::new(&rig, vec![person]).with_masks(perceived.masks, plates))
+                builder.perception(GivenPerception::new(&rig, vec![person]).with_masks(perceived, &plates)?)
             }
             Origin::Estimated => {
                 if perceived.shape() == Origin::Given {
                     let template = given_person(&settings.dataset)?.template;
-                    builder.perception(EstimatedPerception::new(&rig, &template, perceived, plates)?)
+                    builder.perception(EstimatedPerception::new(&rig, &template, perceived, &plates)?)
                 } else {
                     let template = default_template(&ShapeParams::default())?;
-                    let mut perception = EstimatedPerception::new(&rig, &template, perceived, plates)?;
+                    let mut perception = EstimatedPerception::new(&rig, &template, perceived, &plates)?;
                     eprintln!("learning the person's shape from {SHAPE_SETS} frames of the first {SHAPE_SECS} seconds");
                     let first = first_sets(settings, &rig)?;
                     for fit in perception.learn_shapes(&first).context("no person found in the first frames")? {

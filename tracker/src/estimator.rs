@@ -9,6 +9,7 @@ use flyrig_types::{Frame, FrameSet, Image, Mask, Rig};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
+use crate::background::Background;
 use crate::body_model::{BodyModel, Turns};
 use crate::body_shape::ShapeSpace;
 use crate::crop::Crop;
@@ -16,7 +17,7 @@ use crate::fit::{Before, FitProblem, FitView, align_trunk};
 use crate::looks::{Look, LookBody, carried_mask, corners, due};
 use crate::outline::{OutlinePoint, SeenBody};
 use crate::pixels::Rgb;
-use crate::plate::plate_evidence;
+use crate::plate::gated_mask;
 use crate::search::{Search, SearchScene, Sighting, project_all};
 use crate::shape::{fit_template_shape, seen_landmarks, template_of_height};
 use crate::shape_solve::{ShapeAndPoses, ShapeProblem, ShapeSet};
@@ -79,7 +80,7 @@ pub struct PoseEstimator {
     model: BodyModel,
     rig: Rig,
     config: PoseConfig,
-    plates: Vec<Option<Vec<u8>>>,
+    backgrounds: Vec<Option<Background>>,
     track: Option<Track>,
     search: Search,
     /// Sets since the person was last seen.
@@ -143,7 +144,7 @@ impl PoseEstimator {
             return Err(TrackError::new(TrackErrorKind::Rig, "the rig has no camera; tracking needs at least one"));
         }
         let model = BodyModel::new(template)?;
-        let plates = vec![None; rig.cameras.len()];
+        let backgrounds = vec![None; rig.cameras.len()];
         Ok(Self {
             net,
             base: template.clone(),
@@ -151,7 +152,7 @@ impl PoseEstimator {
             model,
             rig: rig.clone(),
             config,
-            plates,
+            backgrounds,
             track: None,
             search: Search::default(),
             lost: 0,
@@ -309,9 +310,25 @@ impl PoseEstimator {
                 format!("a plate for slot {slot} of a rig of {} cameras", self.rig.cameras.len()),
             )
         })?;
-        check_size(camera, plate)?;
-        self.plates[slot] = Some(Rgb::new(plate)?.bytes.into_owned());
+        self.backgrounds[slot] = Some(Background::from_plate(camera, plate)?);
         Ok(())
+    }
+
+    /// Sets the backgrounds by slot, one a camera; masks then use the difference to them. Fewer leave the last cameras as
+    /// they are.
+    pub fn set_backgrounds(&mut self, backgrounds: Vec<Option<Background>>) {
+        self.backgrounds.iter_mut().zip(backgrounds).for_each(|(own, new)| *own = new);
+    }
+
+    /// Returns a camera's background to update it.
+    pub fn background_mut(&mut self, slot: usize) -> Option<&mut Background> {
+        self.backgrounds.get_mut(slot)?.as_mut()
+    }
+
+    /// Returns a camera's background, where it is known.
+    #[must_use]
+    pub fn background(&self, slot: usize) -> Option<&Background> {
+        self.backgrounds.get(slot)?.as_ref()
     }
 
     /// Looks for the person where a pose puts him at a time; false for a pose that does not fit the template.
@@ -463,18 +480,25 @@ impl PoseEstimator {
                 let gate = BodyGate::new(camera, &vertices, &self.template.triangles).ok_or(NoMask::OutOfView)?;
                 let look = fitted.looks[slot].as_ref();
                 let look = look.filter(|l| l.sighting.output.presence >= self.config.presence_threshold);
-                let look = look.ok_or(NoMask::NoPerson)?;
-                let coarse = match &look.body {
-                    None => coarse_mask(&look.sighting, gate.bounds),
-                    Some(body) => {
-                        let (then, _) = self.skinned(&body.turns, set, fitted.delay_secs(slot));
-                        let (then, now) = (corners(camera, &then), corners(camera, &vertices));
-                        carried_mask(&look.sighting, &then, &now, gate.bounds)
+                let evidence =
+                    self.background(slot).and_then(|known| known.evidence(picture, &|at| !gate.reaches_pixel(at)));
+                let mask = match (look, &evidence) {
+                    (Some(look), evidence) => {
+                        let coarse = match &look.body {
+                            None => coarse_mask(&look.sighting, gate.bounds),
+                            Some(body) => {
+                                let (then, _) = self.skinned(&body.turns, set, fitted.delay_secs(slot));
+                                let (then, now) = (corners(camera, &then), corners(camera, &vertices));
+                                carried_mask(&look.sighting, &then, &now, gate.bounds)
+                            }
+                        };
+                        refine(picture, &coarse, look.sighting.crop.scale(), &gate, evidence.as_ref())
                     }
+                    // The network sees nobody here, but the other cameras place the body in this picture.
+                    (None, Some(evidence)) => gated_mask(evidence, &gate),
+                    (None, None) => return Err(NoMask::NoPerson),
                 };
-                let evidence = self.plates[slot].as_ref().and_then(|plate| plate_evidence(picture, plate));
-                let mask = refine(picture, &coarse, look.sighting.crop.scale(), &gate, evidence.as_ref())
-                    .ok_or(NoMask::Empty)?;
+                let mask = mask.ok_or(NoMask::Empty)?;
                 let overlap = gate.overlap(&mask);
                 Ok((mask, overlap))
             })
@@ -602,7 +626,7 @@ impl PoseEstimator {
             net: &self.net,
             cameras: &self.rig.cameras,
             pictures,
-            plates: &self.plates,
+            backgrounds: &self.backgrounds,
             nanos: set.master_nanos,
             taken: others,
             config: &self.config,

@@ -8,12 +8,13 @@
 //! 2. [`triangulate`] joins the landmarks of the views, leaving out views that disagree.
 //! 3. A damped least-squares fit in pixels turns the template's joints; the bone lengths are
 //!    fitted once, over the first frames ([`PoseEstimator::fit_shape`]).
-//! 4. Masks come from an empty plate ([`mask_from_plate`]) or from the network, sharpened on the picture and
-//!    gated by the fitted body.
+//! 4. Masks come from the background ([`Background`]) and the network, sharpened on the picture and gated by the fitted
+//!    body. [`matte`] solves for coverage and foreground colour along their outlines.
 //!
 //! [`DeformTracker`] then moves the nodes of a deformation graph so that the posed Gaussians explain the pictures.
 
 mod anatomy;
+mod background;
 mod body_model;
 mod body_shape;
 mod config;
@@ -25,12 +26,16 @@ mod estimator;
 mod fit;
 mod grid;
 mod habits;
+mod key;
 mod landmarks;
+mod light;
 mod looks;
+mod matte;
 mod net;
 mod outline;
 mod pixels;
 mod plate;
+mod presence;
 mod search;
 mod shape;
 mod shape_solve;
@@ -42,6 +47,7 @@ mod testing;
 mod triangulate;
 mod view;
 
+pub use background::{Background, BackgroundEvent};
 pub use config::PoseConfig;
 pub use deform::{
     DataTerm, DeformReport, DeformSettings, DeformSolver, DeformTracker, FIRST_FRAMES, PointDerivatives,
@@ -51,8 +57,12 @@ pub use error::{TrackError, TrackErrorKind};
 pub use estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};
 pub use estimator::{Marks, PoseEstimator};
 pub use habits::{Habit, LandmarkStudy};
+pub use key::{KeyColor, KeyColorError};
 pub use landmarks::{Keypoint, LANDMARK_BONES, LANDMARK_COUNT, LANDMARK_NAMES, ViewKeypoints};
+pub use matte::{EdgeColor, Matte, matte};
 pub use net::{CropLandmark, NET_SIDE, NetOutput, PoseNet};
 pub use plate::mask_from_plate;
+pub use presence::shows_person;
 pub use shape::{HeightFrom, ShapeFit, fit_template_shape};
+pub use silhouette::BodyGate;
 pub use triangulate::{WorldPoint, triangulate};

@@ -1,84 +1,148 @@
-//! Masks from an empty plate.
+//! Differences of a picture from the empty scene of the same camera, and masks from them.
 
 use flyrig_solve::median;
 use flyrig_types::{Image, Mask};
 
 use crate::grid::{Grid, clean};
 use crate::pixels::Rgb;
+use crate::silhouette::BodyGate;
 use crate::{TrackError, TrackErrorKind};
 
 /// A shadow darkens the plate to no less than this share, keeping its colour.
 const SHADOW: f32 = 0.45;
 /// Noise is believed to be at least this large, sRGB steps.
 const MIN_NOISE: f32 = 2.0;
+/// The exposure's drift is measured at every so many pixels.
+const GAIN_STEP: usize = 17;
+/// Channels outside of this range are clipped or mostly noise, and measure no gain.
+const GAIN_RANGE: std::ops::RangeInclusive<f32> = 16.0..=245.0;
+/// Limits of the exposure's drift.
+const GAIN_LIMITS: (f32, f32) = (0.6, 1.6);
+/// Samples that a gain needs.
+const GAIN_SAMPLES: usize = 40;
+/// Evidence added on the body, and inside of it by its depth over [`DEEP_M`]; taken off at the gate's reach.
+const ON_BODY: f32 = 0.15;
+const DEEP_IN_BODY: f32 = 0.35;
+const OFF_BODY: f32 = 0.4;
+/// Depth in the body, metres, from which only a sure difference of the picture speaks against a person.
+const DEEP_M: f64 = 0.04;
 
-/// Person mask of a picture from the empty scene of the same camera; `None` when nothing stands out.
+/// Returns the person's mask in a picture from the empty scene of the same camera and the posed body; `None` when nothing
+/// stands out near the body.
 ///
-/// A pixel's colour is split into brightness along the plate's colour and what is left over (Horprasert et
-/// al. 1999): a left-over beyond the picture's own noise, or a brightness that no shadow explains, is
-/// foreground. The largest pieces stay, small holes are filled.
+/// A pixel's colour is split into brightness along the plate's colour and a remainder (Horprasert et al. 1999): a remainder
+/// beyond the picture's own noise, or a brightness that no shadow explains, is foreground, unless it lies out of the gate's
+/// reach. Large pieces stay, small holes are filled.
 ///
 /// # Errors
 /// Kind `Image` when the sizes differ or a format cannot be read.
-pub fn mask_from_plate(image: &Image, plate: &Image) -> Result<Option<Mask>, TrackError> {
-    if (image.width(), image.height()) != (plate.width(), plate.height()) {
-        return Err(TrackError::new(
-            TrackErrorKind::Image,
-            format!(
-                "the picture is {}x{} but the plate {}x{}; take the plate with the same camera settings",
-                image.width(),
-                image.height(),
-                plate.width(),
-                plate.height()
-            ),
-        ));
+pub fn mask_from_plate(image: &Image, plate: &Image, gate: &BodyGate) -> Result<Option<Mask>, TrackError> {
+    let (picture, plate) = (Rgb::new(image)?, Rgb::new(plate)?);
+    for (width, height, whose) in
+        [(plate.width, plate.height, "plate"), (gate.image[0], gate.image[1], "camera's calibration")]
+    {
+        if (picture.width, picture.height) != (width, height) {
+            return Err(TrackError::new(
+                TrackErrorKind::Image,
+                format!(
+                    "the picture is {}x{} but the {whose} {width}x{height}; take the plate with the same camera settings",
+                    picture.width, picture.height
+                ),
+            ));
+        }
     }
-    Ok(foreground(&Rgb::new(image)?, &Rgb::new(plate)?.bytes))
+    let evidence = plate_evidence(&picture, &floats(&plate), &|at| !gate.reaches_pixel(at));
+    Ok(evidence.and_then(|evidence| gated_mask(&evidence, gate)))
 }
 
-/// The same on plain bytes of equal size.
-pub(crate) fn foreground(picture: &Rgb, plate: &[u8]) -> Option<Mask> {
-    let (width, height) = (picture.width, picture.height);
-    let evidence = plate_evidence(picture, plate)?;
-    // A vote among neighbours removes specks and closes pinholes.
-    let mut voted = evidence.box_mean(1);
-    for value in &mut voted.values {
-        *value = ((*value - 0.5) * 2.0 + 0.5).clamp(0.0, 1.0);
+/// Returns the mask that evidence ([`plate_evidence`], of the whole picture) and the body give together.
+pub(crate) fn gated_mask(evidence: &Grid, gate: &BodyGate) -> Option<Mask> {
+    let [x0, y0, x1, y1] = gate.bounds;
+    if x1 > evidence.width || y1 > evidence.height {
+        return None;
     }
-    clean(&mut voted, (width.max(height) / 60).max(2));
-    let least = (width * height / 5000).max(12);
+    let (width, height) = (x1 - x0, y1 - y0);
+    let mut inner = Grid::new(width, height, 0.0);
+    for (y, row) in inner.values.chunks_exact_mut(width).enumerate() {
+        let start = (y + y0) * evidence.width + x0;
+        row.copy_from_slice(&evidence.values[start..start + width]);
+    }
+    // A vote among neighbours removes specks and closes pinholes.
+    let mut voted = inner.box_mean(1);
+    let mut outside = gate.distance.clone();
+    outside.values.iter_mut().for_each(|d| *d = f32::from(*d > 0.0));
+    let depth = outside.distance_to_set();
+    let deep_px = (DEEP_M * gate.px_per_m).max(1.0) as f32;
+    for ((value, distance), depth) in voted.values.iter_mut().zip(&gate.distance.values).zip(&depth.values) {
+        let prior = if *distance > 0.0 {
+            ON_BODY - (ON_BODY + OFF_BODY) * distance
+        } else {
+            ON_BODY + DEEP_IN_BODY * (depth / deep_px).min(1.0)
+        };
+        *value = if *distance >= 1.0 { 0.0 } else { ((*value + prior - 0.5) * 2.0 + 0.5).clamp(0.0, 1.0) };
+    }
+    clean(&mut voted, (0.02 * gate.px_per_m).round().max(2.0) as usize);
+    let least = (evidence.width * evidence.height / 5000).max(12);
     if voted.values.iter().filter(|v| **v >= 0.5).count() < least {
         return None;
     }
-    voted.paste(width, height, 0, 0)
+    voted.paste(evidence.width, evidence.height, x0, y0)
 }
 
-/// How much each pixel speaks for a foreground, 0..=1 with the border at one half; `None` when the sizes differ.
-pub(crate) fn plate_evidence(picture: &Rgb, plate: &[u8]) -> Option<Grid> {
+/// Returns a picture's bytes as numbers.
+pub(crate) fn floats(picture: &Rgb) -> Vec<f32> {
+    picture.bytes.iter().map(|byte| f32::from(*byte)).collect()
+}
+
+/// Exposure of a picture relative to a plate.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Drift {
+    /// Picture over plate, by channel.
+    pub gain: [f32; 3],
+    /// Standard deviation of the background after the gain, sRGB steps.
+    pub noise: f32,
+}
+
+impl Drift {
+    /// Measures the drift at pixels that are known to show the background.
+    pub fn new(picture: &Rgb, plate: &[f32], is_background: &dyn Fn(usize) -> bool) -> Self {
+        let away: Vec<usize> =
+            (0..picture.width * picture.height).step_by(GAIN_STEP).filter(|at| is_background(*at)).collect();
+        let ratio = |k: usize| {
+            let pairs = away.iter().map(|at| (f32::from(picture.bytes[3 * at + k]), plate[3 * at + k]));
+            let usable = pairs.filter(|(now, plate)| GAIN_RANGE.contains(now) && GAIN_RANGE.contains(plate));
+            let mut ratios: Vec<f64> = usable.map(|(now, plate)| f64::from(now / plate)).collect();
+            let enough = ratios.len() >= GAIN_SAMPLES;
+            median(&mut ratios).filter(|_| enough).map(|gain| (gain as f32).clamp(GAIN_LIMITS.0, GAIN_LIMITS.1))
+        };
+        let gains: [Option<f32>; 3] = std::array::from_fn(ratio);
+        // A channel that is dark or clipped everywhere drifts as the others do.
+        let known: Vec<f32> = gains.iter().flatten().copied().collect();
+        let mean = if known.is_empty() { 1.0 } else { known.iter().sum::<f32>() / known.len() as f32 };
+        let gain = gains.map(|gain| gain.unwrap_or(mean));
+        let difference =
+            |at: usize, k: usize| (f32::from(picture.bytes[3 * at + k]) - gain[k] * plate[3 * at + k]).abs();
+        let mut differences: Vec<f64> =
+            away.iter().flat_map(|&at| (0..3).map(move |k| f64::from(difference(at, k)))).collect();
+        let noise = (1.48 * median(&mut differences).unwrap_or(0.0) as f32).clamp(MIN_NOISE, 8.0);
+        Self { gain, noise }
+    }
+}
+
+/// Returns per-pixel evidence for a foreground, 0..=1 with the border at one half; `None` when the sizes differ. `plate` holds
+/// sRGB values, three a pixel; the exposure is measured where `is_background`.
+pub(crate) fn plate_evidence(picture: &Rgb, plate: &[f32], is_background: &dyn Fn(usize) -> bool) -> Option<Grid> {
     let (width, height) = (picture.width, picture.height);
     if plate.len() != picture.bytes.len() {
         return None;
     }
-    let pairs = || picture.bytes.chunks_exact(3).zip(plate.chunks_exact(3));
-    // The exposure may have drifted: the median of the brightness ratio is the background's.
-    let brightness = |c: &[u8]| f64::from(c[0]) + f64::from(c[1]) + f64::from(c[2]);
-    let mut gains: Vec<f64> = pairs()
-        .step_by(17)
-        .filter(|(_, plate)| brightness(plate) > 60.0)
-        .map(|(now, plate)| brightness(now) / brightness(plate))
-        .collect();
-    let gain = median(&mut gains).unwrap_or(1.0).clamp(0.7, 1.4) as f32;
-    let mut differences: Vec<f64> = pairs()
-        .step_by(17)
-        .flat_map(|(now, plate)| (0..3).map(move |k| f64::from((f32::from(now[k]) - gain * f32::from(plate[k])).abs())))
-        .collect();
-    let noise = (1.48 * median(&mut differences).unwrap_or(0.0) as f32).clamp(MIN_NOISE, 8.0);
+    let Drift { gain, noise } = Drift::new(picture, plate, is_background);
     let mut grid = Grid::new(width, height, 0.0);
-    for (value, (now, plate)) in grid.values.iter_mut().zip(pairs()) {
-        let now: [f32; 3] = std::array::from_fn(|k| f32::from(now[k]));
+    let pairs = picture.bytes.chunks_exact(3).zip(plate.chunks_exact(3));
+    for (value, (now, plate)) in grid.values.iter_mut().zip(pairs) {
         // A dark plate has no colour to speak of: lift it so that the split stays sound.
-        let plate: [f32; 3] = std::array::from_fn(|k| gain * f32::from(plate[k]) + 4.0);
-        let now = now.map(|n| n + 4.0);
+        let plate: [f32; 3] = std::array::from_fn(|k| gain[k] * plate[k] + 4.0);
+        let now: [f32; 3] = std::array::from_fn(|k| f32::from(now[k]) + 4.0);
         let dot = |a: [f32; 3], b: [f32; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
         let length = dot(plate, plate).sqrt();
         let along = dot(now, plate) / (length * length);
@@ -125,12 +189,37 @@ mod tests {
         (30..60).contains(&x) && (20..80).contains(&y)
     }
 
+    /// A gate around a body that is 4 pixels narrower than the person on every side.
+    fn gate() -> BodyGate {
+        BodyGate::of_grid(&body(|x, y| (34..56).contains(&x) && (24..76).contains(&y)), 100.0)
+    }
+
+    fn body(inside: impl Fn(usize, usize) -> bool) -> Grid {
+        let mut grid = Grid::new(SIDE, SIDE, 0.0);
+        for at in 0..SIDE * SIDE {
+            grid.values[at] = f32::from(inside(at % SIDE, at / SIDE));
+        }
+        grid
+    }
+
+    fn iou(mask: &Mask, truth: impl Fn(usize, usize) -> bool) -> f64 {
+        let (mut both, mut either) = (0, 0);
+        for y in 0..SIDE {
+            for x in 0..SIDE {
+                let found = mask.coverage()[y * SIDE + x] >= 128;
+                both += usize::from(found && truth(x, y));
+                either += usize::from(found || truth(x, y));
+            }
+        }
+        both as f64 / either as f64
+    }
+
     #[test]
-    fn the_person_is_found_and_the_shadow_is_not() {
+    fn the_person_is_found_and_neither_the_shadow_nor_things_far_from_the_body() {
         let plate = picture(wall, 1);
         let now = picture(
             |x, y| {
-                if person(x, y) {
+                if person(x, y) || (78..90).contains(&x) && y < 60 {
                     [60.0, 60.0, 150.0]
                 } else if (60..85).contains(&x) && y > 60 {
                     wall(x, y).map(|c| c * 0.7)
@@ -140,31 +229,37 @@ mod tests {
             },
             2,
         );
-        let mask = mask_from_plate(&now, &plate).unwrap().unwrap();
-        let (mut both, mut either) = (0, 0);
-        for y in 0..SIDE {
-            for x in 0..SIDE {
-                let found = mask.coverage()[y * SIDE + x] >= 128;
-                both += usize::from(found && person(x, y));
-                either += usize::from(found || person(x, y));
-            }
-        }
-        assert!(f64::from(both as u32) / f64::from(either as u32) > 0.93, "{both} of {either}");
+        let mask = mask_from_plate(&now, &plate, &gate()).unwrap().unwrap();
+        assert!(iou(&mask, person) > 0.93, "{}", iou(&mask, person));
     }
 
     #[test]
-    fn an_empty_scene_has_no_mask_even_when_the_exposure_drifts() {
+    fn an_empty_scene_has_no_mask_off_the_body_even_when_the_exposure_drifts() {
         let plate = picture(wall, 1);
-        assert_eq!(mask_from_plate(&picture(wall, 3), &plate).unwrap(), None);
+        let off_body = BodyGate::of_grid(&body(|x, y| x == 48 && y == 48), 60.0);
+        let mask = |now: &Image, plate: &Image| mask_from_plate(now, plate, &off_body).unwrap();
+        assert_eq!(mask(&picture(wall, 3), &plate), None);
         let brighter = picture(|x, y| wall(x, y).map(|c| c * 1.15), 4);
-        assert_eq!(mask_from_plate(&brighter, &plate).unwrap(), None);
+        assert_eq!(mask(&brighter, &plate), None);
+        let warmer = picture(|x, y| std::array::from_fn(|k| wall(x, y)[k] * [1.2, 1.0, 0.8][k]), 4);
+        assert_eq!(mask(&warmer, &plate), None, "white balance drifts by channel");
         let black = picture(|_, _| [0.0; 3], 5);
-        assert_eq!(mask_from_plate(&black, &black).unwrap(), None);
+        assert_eq!(mask(&black, &black), None);
     }
 
     #[test]
-    fn another_size_is_refused() {
+    fn a_person_of_the_backgrounds_colour_is_kept_by_the_body() {
+        let plate = picture(wall, 1);
+        let mask = mask_from_plate(&picture(wall, 3), &plate, &gate()).unwrap().unwrap();
+        let inner = iou(&mask, |x, y| (34..56).contains(&x) && (24..76).contains(&y));
+        assert!(inner > 0.6, "{inner}");
+    }
+
+    #[test]
+    fn other_sizes_are_refused() {
         let plate = Image::new(2, 2, PixelFormat::Rgb8, vec![0; 12]).unwrap();
-        assert_eq!(mask_from_plate(&picture(wall, 1), &plate).unwrap_err().kind, TrackErrorKind::Image);
+        let refused = |now: &Image, plate: &Image| mask_from_plate(now, plate, &gate()).unwrap_err().kind;
+        assert_eq!(refused(&picture(wall, 1), &plate), TrackErrorKind::Image);
+        assert_eq!(refused(&plate, &plate), TrackErrorKind::Image, "the gate is of another size");
     }
 }

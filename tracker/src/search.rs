@@ -4,11 +4,11 @@ use flyrig_types::Camera;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
+use crate::background::Background;
 use crate::crop::{Crop, search_crops};
 use crate::grid::{Grid, components};
 use crate::net::NetOutput;
 use crate::pixels::Rgb;
-use crate::plate::foreground;
 use crate::single_view::lift;
 use crate::triangulate::{WorldPoint, triangulate};
 use crate::{LANDMARK_COUNT, PoseConfig, PoseNet, TrackError, ViewKeypoints};
@@ -78,8 +78,8 @@ pub(crate) struct SearchScene<'a> {
     pub net: &'a PoseNet,
     pub cameras: &'a [Camera],
     pub pictures: &'a [Option<Rgb<'a>>],
-    /// Pictures of the empty scene, by slot.
-    pub plates: &'a [Option<Vec<u8>>],
+    /// By slot.
+    pub backgrounds: &'a [Option<Background>],
     pub nanos: i64,
     /// Landmarks of people who are tracked already.
     pub taken: &'a [[DVec3; LANDMARK_COUNT]],
@@ -144,7 +144,10 @@ impl Search {
             let Some(picture) = scene.pictures[other].as_ref().filter(|_| view.found.is_empty()) else { return Ok(()) };
             let pixels = points.map(|point| point.and_then(|point| scene.cameras[other].project(point)));
             match Crop::around(&pixels) {
-                Some(crop) => view.try_crop(scene, other, picture, crop),
+                Some(crop) => {
+                    let taken: Vec<_> = scene.taken.iter().map(|m| project_all(&scene.cameras[other], m)).collect();
+                    view.try_crop(scene.net, scene.config, picture, crop, &taken, scene.nanos)
+                }
                 None => Ok(()),
             }
         };
@@ -159,9 +162,10 @@ impl ViewSearch {
         self.found.retain(|(_, nanos)| scene.nanos.saturating_sub(*nanos).abs() <= FORGET_NANOS);
         let Some(picture) = &scene.pictures[slot] else { return Ok(()) };
         let taken: Vec<_> = scene.taken.iter().map(|marks| project_all(&scene.cameras[slot], marks)).collect();
-        let plate = scene.plates.get(slot).and_then(Option::as_ref);
-        for crop in plate.map(|plate| foreground_crops(picture, plate, &taken)).unwrap_or_default() {
-            self.try_crop(scene, slot, picture, crop)?;
+        let background = scene.backgrounds.get(slot).and_then(Option::as_ref);
+        let evidence = background.and_then(|background| background.evidence(picture, &|_| true));
+        for crop in evidence.map(|evidence| foreground_crops(&evidence, &taken)).unwrap_or_default() {
+            self.try_crop(scene.net, scene.config, picture, crop, &taken, scene.nanos)?;
         }
         if !self.found.is_empty() {
             return Ok(());
@@ -169,7 +173,7 @@ impl ViewSearch {
         let crops = search_crops(picture.width as u32, picture.height as u32);
         let most = if scene.config.search_crops == 0 { crops.len() } else { scene.config.search_crops };
         for _ in 0..most.min(crops.len()) {
-            self.try_crop(scene, slot, picture, crops[self.next % crops.len()])?;
+            self.try_crop(scene.net, scene.config, picture, crops[self.next % crops.len()], &taken, scene.nanos)?;
             self.next += 1;
             if self.next >= crops.len() {
                 (self.next, self.swept) = (0, true);
@@ -179,26 +183,30 @@ impl ViewSearch {
     }
 
     /// Keeps the person whom the network sees in a crop, after looking again at what it found.
-    fn try_crop(&mut self, scene: &SearchScene<'_>, slot: usize, picture: &Rgb, crop: Crop) -> Result<(), TrackError> {
-        let config = scene.config;
-        let mut sighting = Sighting::take(scene.net, picture, crop)?;
+    fn try_crop(
+        &mut self,
+        net: &PoseNet,
+        config: &PoseConfig,
+        picture: &Rgb,
+        crop: Crop,
+        taken: &[[Option<DVec2>; LANDMARK_COUNT]],
+        nanos: i64,
+    ) -> Result<(), TrackError> {
+        let mut sighting = Sighting::take(net, picture, crop)?;
         if sighting.output.presence < 0.5 * config.presence_threshold {
             return Ok(());
         }
         for _ in 0..2 {
             let Some(crop) = sighting.next_crop() else { break };
-            sighting = Sighting::take(scene.net, picture, crop)?;
+            sighting = Sighting::take(net, picture, crop)?;
         }
-        let camera = &scene.cameras[slot];
-        if sighting.output.presence < config.presence_threshold
-            || scene.taken.iter().any(|marks| sighting.shows(&project_all(camera, marks)))
-        {
+        if sighting.output.presence < config.presence_threshold || taken.iter().any(|marks| sighting.shows(marks)) {
             return Ok(());
         }
         match self.found.iter_mut().find(|(other, _)| other.overlaps(&sighting)) {
             Some((other, _)) if other.score() >= sighting.score() => {}
-            Some(other) => *other = (sighting, scene.nanos),
-            None => self.found.push((sighting, scene.nanos)),
+            Some(other) => *other = (sighting, nanos),
+            None => self.found.push((sighting, nanos)),
         }
         self.found.sort_by(|a, b| b.0.score().total_cmp(&a.0.score()));
         self.found.truncate(KEEP);
@@ -206,14 +214,20 @@ impl ViewSearch {
     }
 }
 
-/// Squares around the largest pieces of foreground, without those of people who are tracked already.
-fn foreground_crops(picture: &Rgb, plate: &[u8], taken: &[[Option<DVec2>; LANDMARK_COUNT]]) -> Vec<Crop> {
-    let Some(mask) = foreground(picture, plate) else { return Vec::new() };
-    let (width, height) = (picture.width, picture.height);
-    let mut grid = Grid::new(width, height, 0.0);
-    for (value, coverage) in grid.values.iter_mut().zip(mask.coverage()) {
-        *value = f32::from(*coverage >= 128);
+/// Everybody the network finds in a picture, best first.
+pub(crate) fn sightings(net: &PoseNet, picture: &Rgb, config: &PoseConfig) -> Result<Vec<Sighting>, TrackError> {
+    let mut view = ViewSearch::default();
+    for crop in search_crops(picture.width as u32, picture.height as u32) {
+        view.try_crop(net, config, picture, crop, &[], 0)?;
     }
+    Ok(view.found.into_iter().map(|(sighting, _)| sighting).collect())
+}
+
+/// Squares around the largest pieces of foreground, without those of people who are tracked already.
+fn foreground_crops(evidence: &Grid, taken: &[[Option<DVec2>; LANDMARK_COUNT]]) -> Vec<Crop> {
+    let (width, height) = (evidence.width, evidence.height);
+    // A vote among neighbours removes specks.
+    let mut grid = evidence.box_mean(1);
     for pixels in taken {
         let (low, high) = pixels
             .iter()
@@ -332,38 +346,36 @@ mod tests {
 
     const SIDE: usize = 120;
 
-    /// Two bright boxes before a grey plate.
-    fn scene() -> (Rgb<'static>, Vec<u8>) {
-        let plate = vec![90; 3 * SIDE * SIDE];
-        let mut bytes = plate.clone();
+    /// Two boxes of foreground.
+    fn scene() -> Grid {
+        let mut evidence = Grid::new(SIDE, SIDE, 0.1);
         for (x0, x1) in [(10, 30), (70, 100)] {
             for y in 20..100 {
-                bytes[3 * (y * SIDE + x0)..3 * (y * SIDE + x1)].fill(230);
+                evidence.values[y * SIDE + x0..y * SIDE + x1].fill(0.9);
             }
         }
-        (Rgb { width: SIDE, height: SIDE, bytes: bytes.into() }, plate)
+        evidence
     }
 
     #[test]
     fn foreground_is_looked_at_largest_first_and_without_people_who_are_known() {
-        let (picture, plate) = scene();
-        let crops = foreground_crops(&picture, &plate, &[]);
+        let crops = foreground_crops(&scene(), &[]);
         assert_eq!(crops.len(), 2);
         assert!(crops[0].center.distance(DVec2::new(84.5, 59.5)) < 1.5, "{:?}", crops[0]);
         assert!((80.0..115.0).contains(&crops[0].side), "{:?}", crops[0]);
         let mut known = [None; LANDMARK_COUNT];
         (known[0], known[31]) = (Some(DVec2::new(85.0, 22.0)), Some(DVec2::new(85.0, 98.0)));
-        let crops = foreground_crops(&picture, &plate, &[known]);
+        let crops = foreground_crops(&scene(), &[known]);
         assert_eq!(crops.len(), 1);
         assert!(crops[0].center.distance(DVec2::new(19.5, 59.5)) < 1.5, "{:?}", crops[0]);
     }
 
     #[test]
-    fn no_foreground_poisoned_people_and_a_plate_of_another_size_give_no_crop_too_many() {
-        let (picture, plate) = scene();
-        assert!(foreground_crops(&Rgb { bytes: plate.clone().into(), ..picture.clone() }, &plate, &[]).is_empty());
-        assert!(foreground_crops(&picture, &plate[..30], &[]).is_empty());
-        assert_eq!(foreground_crops(&picture, &plate, &[[None; LANDMARK_COUNT]]).len(), 2);
-        assert_eq!(foreground_crops(&picture, &plate, &[[Some(DVec2::NAN); LANDMARK_COUNT]]).len(), 2);
+    fn no_foreground_and_poisoned_people_give_no_crop_too_many() {
+        assert!(foreground_crops(&Grid::new(SIDE, SIDE, 0.1), &[]).is_empty());
+        assert!(foreground_crops(&Grid::new(SIDE, SIDE, f32::NAN), &[]).is_empty());
+        assert!(foreground_crops(&Grid::new(0, 0, 0.0), &[]).is_empty());
+        assert_eq!(foreground_crops(&scene(), &[[None; LANDMARK_COUNT]]).len(), 2);
+        assert_eq!(foreground_crops(&scene(), &[[Some(DVec2::NAN); LANDMARK_COUNT]]).len(), 2);
     }
 }

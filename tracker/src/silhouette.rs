@@ -15,19 +15,23 @@ const PLATE_LOGIT: f32 = 6.0;
 /// Bins a colour channel of the colour model.
 const BINS: usize = 16;
 
-/// Where the fitted body may be in a picture.
+/// Where a posed body and its clothes may be in a picture.
 #[derive(Debug, Clone)]
-pub(crate) struct BodyGate {
+pub struct BodyGate {
+    /// Width and height of the picture.
+    pub(crate) image: [usize; 2],
     /// Box that holds everything allowed: x0, y0, x1, y1 (ends excluded).
-    pub bounds: [usize; 4],
+    pub(crate) bounds: [usize; 4],
     /// Distance to the projected body over the reach, 0 on the body, 1 at the reach; the size of the box.
-    pub distance: Grid,
+    pub(crate) distance: Grid,
     /// Pixels that a metre takes at the body.
-    pub px_per_m: f64,
+    pub(crate) px_per_m: f64,
 }
 
 impl BodyGate {
-    /// `None` when nothing of the body is in the picture.
+    /// Projects the world vertices (metres) and triangles of one or several bodies; `None` when nothing of them is in the
+    /// picture.
+    #[must_use]
     pub fn new(camera: &Camera, vertices: &[Vec3], triangles: &[[u32; 3]]) -> Option<Self> {
         let mut depths: Vec<f64> = vertices
             .iter()
@@ -43,11 +47,33 @@ impl BodyGate {
         for value in &mut distance.values {
             *value /= reach as f32;
         }
-        Some(Self { bounds, distance, px_per_m })
+        let image = [camera.intrinsics.width as usize, camera.intrinsics.height as usize];
+        Some(Self { image, bounds, distance, px_per_m })
+    }
+
+    /// Whether a pixel may show the body or its clothes.
+    pub(crate) fn reaches(&self, x: usize, y: usize) -> bool {
+        let [x0, y0, x1, y1] = self.bounds;
+        (x0..x1).contains(&x)
+            && (y0..y1).contains(&y)
+            && self.distance.values[(y - y0) * self.distance.width + x - x0] < 1.0
+    }
+
+    /// The same of a pixel's index, row by row.
+    pub(crate) fn reaches_pixel(&self, pixel: usize) -> bool {
+        self.reaches(pixel % self.image[0], pixel / self.image[0])
+    }
+
+    /// The gate of a body drawn as 1 in a grid of the picture's size.
+    #[cfg(test)]
+    pub(crate) fn of_grid(body: &Grid, px_per_m: f64) -> Self {
+        let mut distance = body.distance_to_set();
+        distance.values.iter_mut().for_each(|d| *d /= (REACH_M * px_per_m) as f32);
+        Self { image: [body.width, body.height], bounds: [0, 0, body.width, body.height], distance, px_per_m }
     }
 
     /// Intersection over union of a mask of the whole picture and the body's outline.
-    pub fn overlap(&self, mask: &Mask) -> f64 {
+    pub(crate) fn overlap(&self, mask: &Mask) -> f64 {
         let [x0, y0, ..] = self.bounds;
         let (mut both, mut body) = (0usize, 0usize);
         for (i, distance) in self.distance.values.iter().enumerate() {

@@ -3,9 +3,12 @@
 use std::{borrow::Cow, time::Duration};
 
 use flyrig_body::{Template, skin_mesh};
-use flyrig_tracker::{PoseConfig, PoseEstimate, PoseEstimator, PoseNet, ShapeFit, ViewKeypoints, mask_from_plate};
+use flyrig_tracker::{
+    BodyGate, Matte, PoseConfig, PoseEstimate, PoseEstimator, PoseNet, ShapeFit, ViewKeypoints, matte,
+};
 use flyrig_types::{FrameSet, Image, Mask, PersonId, Rig};
 
+use super::background::{BackgroundWatch, backgrounds, report};
 use super::colors::ClothesColors;
 use super::split_mask::{PosedMesh, split_mask};
 use super::{Observation, Perception, SeenPerson, ViewObservation};
@@ -51,7 +54,7 @@ pub struct EstimatedPerception {
     places: Vec<Place>,
     rig: Rig,
     masks: Origin,
-    plates: Vec<Option<Image>>,
+    watch: BackgroundWatch,
 }
 
 impl EstimatedPerception {
@@ -61,12 +64,12 @@ impl EstimatedPerception {
     /// followed, and the person is known from then on.
     ///
     /// # Errors
-    /// [`FusionError::Track`] when template, rig or a plate cannot be used.
+    /// [`FusionError::Track`] when template, rig or a plate cannot be used, [`FusionError::Setting`] for a wrong key colour.
     pub fn new(
         rig: &Rig,
         template: &Template,
         settings: &PerceptionSettings,
-        plates: Vec<Option<Image>>,
+        plates: &[Option<Image>],
     ) -> Result<Self, FusionError> {
         let config = PoseConfig {
             masks: settings.masks == Origin::Estimated,
@@ -74,11 +77,7 @@ impl EstimatedPerception {
             ..PoseConfig::default()
         };
         let mut estimator = PoseEstimator::new(PoseNet::embedded()?, template, rig, config)?;
-        for (slot, plate) in plates.iter().enumerate() {
-            if let Some(plate) = plate {
-                estimator.set_plate(slot, plate)?;
-            }
-        }
+        estimator.set_backgrounds(backgrounds(&rig.cameras, settings, plates)?);
         let learning = (settings.shape() == Origin::Estimated).then(|| (Vec::new(), i64::MIN));
         estimator.look_at_all(learning.is_some());
         let place = |index: usize| Place {
@@ -88,7 +87,12 @@ impl EstimatedPerception {
             clothes: None,
             seen: 0,
         };
-        Ok(Self { places: (0..settings.people).map(place).collect(), rig: rig.clone(), masks: settings.masks, plates })
+        Ok(Self {
+            places: (0..settings.people).map(place).collect(),
+            rig: rig.clone(),
+            masks: settings.masks,
+            watch: BackgroundWatch::default(),
+        })
     }
 
     /// Starts with the shape of the first person, as an earlier session has learnt it.
@@ -286,6 +290,9 @@ impl Perception for EstimatedPerception {
         let known: Vec<bool> = self.places.iter().map(|place| place.learning.is_none()).collect();
         self.learn(set, &estimates);
         let mut views = self.views(set, &mut estimates, stages)?;
+        if self.masks == Origin::Estimated && self.watch.is_due() {
+            stages.time("background", || self.follow_backgrounds(set, &estimates))?;
+        }
         let mut observations = Vec::new();
         for (index, estimate) in estimates.into_iter().enumerate().filter(|(index, _)| known[*index]) {
             let person = self.places[index].id;
@@ -303,6 +310,38 @@ impl Perception for EstimatedPerception {
 }
 
 impl EstimatedPerception {
+    /// Lets the backgrounds follow the light where nobody stands.
+    fn follow_backgrounds(
+        &mut self,
+        set: &FrameSet,
+        estimates: &[Result<PoseEstimate, String>],
+    ) -> Result<(), FusionError> {
+        let Some((first, others)) = self.places.split_first_mut() else { return Ok(()) };
+        let bodies: Vec<_> = std::iter::once(&*first)
+            .chain(others.iter())
+            .zip(estimates)
+            .filter_map(|(place, estimate)| Some((place.estimator.template(), &estimate.as_ref().ok()?.pose)))
+            .map(|(template, pose)| (template.triangles.clone(), skin_mesh(template, pose).0))
+            .collect();
+        // Somebody may stand unseen anywhere.
+        if bodies.is_empty() {
+            return Ok(());
+        }
+        for (slot, frame) in set.present() {
+            let Some(camera) = self.rig.cameras.get(slot) else { continue };
+            let gates: Vec<BodyGate> =
+                bodies.iter().filter_map(|(triangles, vertices)| BodyGate::new(camera, vertices, triangles)).collect();
+            let Some(background) = first.estimator.background_mut(slot) else { continue };
+            report(camera, &background.update(&frame.image, &gates)?);
+            for other in others.iter_mut() {
+                if let Some(copy) = other.estimator.background_mut(slot) {
+                    copy.clone_from(background);
+                }
+            }
+        }
+        Ok(())
+    }
+
     /// The views of everybody, by place, then by present frame. Masks of several people are divided by their bodies.
     fn views<'a>(
         &self,
@@ -328,17 +367,20 @@ impl EstimatedPerception {
                 let quality = estimate.quality.views.get(slot);
                 let overlap = quality.and_then(|quality| quality.mask_overlap).unwrap_or(0.0);
                 let confidence = if self.masks == Origin::Given { 1.0 } else { overlap };
-                let plate = self.plates.get(slot).and_then(Option::as_ref).filter(|_| seen.len() == 1);
-                let mask = match (self.masks, estimate.masks.get_mut(slot).and_then(Option::take), plate) {
-                    (Origin::Given, ..) => frame.mask.as_ref().map(Cow::Borrowed),
-                    (Origin::Estimated, Some(mask), _) => Some(Cow::Owned(mask)),
-                    (Origin::Estimated, None, Some(plate)) => {
-                        stages.time("mask from plate", || mask_from_plate(&frame.image, plate))?.map(Cow::Owned)
-                    }
-                    (Origin::Estimated, None, None) => None,
+                let (mask, edge_colors) = match self.masks {
+                    Origin::Given => (frame.mask.as_ref().map(Cow::Borrowed), Vec::new()),
+                    Origin::Estimated => match estimate.masks.get_mut(slot).and_then(Option::take) {
+                        Some(mask) => {
+                            let background = self.places[index].estimator.background(slot);
+                            let Matte { mask, colors } =
+                                stages.time("matte", || matte(&frame.image, &mask, background))?;
+                            (Some(Cow::Owned(mask)), colors)
+                        }
+                        None => (None, Vec::new()),
+                    },
                 };
                 let landmarks = estimate.keypoints.get_mut(slot).and_then(Option::take);
-                own.push(ViewObservation { landmarks, ..ViewObservation::of_mask(mask, confidence) });
+                own.push(ViewObservation { landmarks, edge_colors, ..ViewObservation::of_mask(mask, confidence) });
             }
             if let (2.., Some(camera)) = (own.len(), self.rig.cameras.get(slot)) {
                 let everybody = union(own.iter().filter_map(|view| view.mask.as_deref()));

@@ -3,12 +3,14 @@
 use std::borrow::Cow;
 
 use flyrig_body::{Template, skin_mesh};
-use flyrig_tracker::mask_from_plate;
-use flyrig_types::{Camera, FrameSet, Image, Mask, PersonId, Pose, PoseTrack, Rig};
+use flyrig_tracker::{Background, BodyGate, Matte, matte};
+use flyrig_types::{Camera, Frame, FrameSet, Image, Mask, PersonId, Pose, PoseTrack, Rig};
+use glam::Vec3;
 
+use super::background::{BackgroundWatch, backgrounds, report};
 use super::split_mask::{PosedMesh, split_mask};
 use super::{Observation, Perception, SeenPerson, ViewObservation};
-use crate::{FusionError, Origin, StageTimes};
+use crate::{FusionError, Origin, PerceptionSettings, StageTimes};
 
 /// One person with a known motion.
 #[derive(Debug, Clone)]
@@ -29,14 +31,15 @@ impl GivenPerson {
     }
 }
 
-/// Poses from tracks; masks from the frames, or from the difference to the empty scene.
+/// Poses from tracks; masks from the frames, or from the difference to the empty scene near the posed bodies.
 #[derive(Debug)]
 pub struct GivenPerception {
     people: Vec<GivenPerson>,
     cameras: Vec<Camera>,
     masks: Origin,
-    /// Images of the empty scene by slot.
-    plates: Vec<Option<Image>>,
+    /// By slot.
+    backgrounds: Vec<Option<Background>>,
+    watch: BackgroundWatch,
 }
 
 impl GivenPerception {
@@ -44,8 +47,14 @@ impl GivenPerception {
     /// is divided among several people by their posed bodies.
     #[must_use]
     pub fn new(rig: &Rig, people: Vec<GivenPerson>) -> Self {
-        let plates = rig.cameras.iter().map(|_| None).collect();
-        Self { people, cameras: rig.cameras.clone(), masks: Origin::Given, plates }
+        let backgrounds = vec![None; rig.cameras.len()];
+        Self {
+            people,
+            cameras: rig.cameras.clone(),
+            masks: Origin::Given,
+            backgrounds,
+            watch: BackgroundWatch::default(),
+        }
     }
 
     /// Observes one person who repeats a motion for ever.
@@ -54,10 +63,14 @@ impl GivenPerception {
         Self::new(rig, vec![GivenPerson { person: PersonId::default(), template, track, repeat: true }])
     }
 
-    /// Makes masks from the difference to images of the empty scene, one slot a camera, where `masks` is estimated.
-    #[must_use]
-    pub fn with_masks(self, masks: Origin, plates: Vec<Option<Image>>) -> Self {
-        Self { masks, plates, ..self }
+    /// Makes masks from the difference to images of the empty scene, one slot a camera, or to the settings' key colour, where
+    /// the settings estimate masks.
+    ///
+    /// # Errors
+    /// [`FusionError::Track`] names the camera whose plate cannot be used, [`FusionError::Setting`] the key colour.
+    pub fn with_masks(self, settings: &PerceptionSettings, plates: &[Option<Image>]) -> Result<Self, FusionError> {
+        let backgrounds = backgrounds(&self.cameras, settings, plates)?;
+        Ok(Self { masks: settings.masks, backgrounds, ..self })
     }
 }
 
@@ -68,21 +81,29 @@ impl Perception for GivenPerception {
 
     fn observe<'a>(&mut self, set: &'a FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation<'a>>, FusionError> {
         let poses: Vec<Pose> = self.people.iter().map(|given| given.at(set.master_nanos)).collect();
-        let mut masks = Vec::new();
+        let (mut masks, mut edge_colors) = (Vec::new(), Vec::new());
         for (slot, frame) in set.present() {
-            masks.push(match (self.masks, self.plates.get(slot).and_then(Option::as_ref)) {
-                (Origin::Given, _) => frame.mask.as_ref().map(Cow::Borrowed),
-                (Origin::Estimated, None) => None,
-                (Origin::Estimated, Some(plate)) => {
-                    stages.time("mask from plate", || mask_from_plate(&frame.image, plate))?.map(Cow::Owned)
+            let (mask, colors) = match self.masks {
+                Origin::Given => (frame.mask.as_ref().map(Cow::Borrowed), Vec::new()),
+                Origin::Estimated => {
+                    let made = stages.time("mask from plate", || self.estimated_mask(slot, frame, &poses))?;
+                    made.map_or_else(Default::default, |Matte { mask, colors }| (Some(Cow::Owned(mask)), colors))
                 }
-            });
+            };
+            masks.push(mask);
+            edge_colors.push(colors);
+        }
+        if self.masks == Origin::Estimated && self.watch.is_due() {
+            stages.time("background", || self.follow_backgrounds(set, &poses))?;
         }
         let confidence = if self.masks == Origin::Given { 1.0 } else { 0.5 };
-        let views = match self.people.as_slice() {
+        let mut views: Vec<Vec<ViewObservation<'a>>> = match self.people.as_slice() {
             [_] => vec![masks.into_iter().map(|mask| ViewObservation::of_mask(mask, confidence)).collect()],
             people => stages.time("divide masks", || self.divide(set, people, &poses, &masks, confidence)),
         };
+        for views in &mut views {
+            views.iter_mut().zip(&edge_colors).for_each(|(view, colors)| view.edge_colors.clone_from(colors));
+        }
         let seen = |((given, pose), views): ((&GivenPerson, Pose), Vec<ViewObservation<'a>>)| {
             let person = given.person;
             if pose.is_valid() {
@@ -100,6 +121,49 @@ impl Perception for GivenPerception {
 }
 
 impl GivenPerception {
+    /// Vertices and triangles of everybody at the time of a frame; of those whose poses are valid.
+    fn bodies(&self, frame: &Frame, poses: &[Pose]) -> (Vec<Vec3>, Vec<[u32; 3]>) {
+        let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
+        for (given, pose) in self.people.iter().zip(poses) {
+            let own = given.at(frame.capture_nanos);
+            let pose = if own.is_valid() { &own } else { pose };
+            if pose.is_valid() {
+                let first = vertices.len() as u32;
+                vertices.extend(skin_mesh(&given.template, pose).0);
+                triangles.extend(given.template.triangles.iter().map(|corners| corners.map(|corner| corner + first)));
+            }
+        }
+        (vertices, triangles)
+    }
+
+    /// Lets the backgrounds follow the light where nobody stands.
+    fn follow_backgrounds(&mut self, set: &FrameSet, poses: &[Pose]) -> Result<(), FusionError> {
+        for (slot, frame) in set.present() {
+            let bodies = self.bodies(frame, poses);
+            let Some((camera, background)) = self.cameras.get(slot).zip(self.backgrounds.get_mut(slot)) else {
+                continue;
+            };
+            if let Some(background) = background {
+                let gate = BodyGate::new(camera, &bodies.0, &bodies.1);
+                report(camera, &background.update(&frame.image, gate.as_slice())?);
+            }
+        }
+        Ok(())
+    }
+
+    /// Everybody's mask in a frame, from the camera's background and the posed bodies.
+    fn estimated_mask(&self, slot: usize, frame: &Frame, poses: &[Pose]) -> Result<Option<Matte>, FusionError> {
+        let Some((camera, background)) =
+            self.cameras.get(slot).zip(self.backgrounds.get(slot).and_then(Option::as_ref))
+        else {
+            return Ok(None);
+        };
+        let (vertices, triangles) = self.bodies(frame, poses);
+        let Some(gate) = BodyGate::new(camera, &vertices, &triangles) else { return Ok(None) };
+        let Some(mask) = background.mask(&frame.image, &gate)? else { return Ok(None) };
+        Ok(Some(matte(&frame.image, &mask, Some(background))?))
+    }
+
     /// Divides everybody's masks: by person, then by present frame.
     fn divide<'a>(
         &self,

@@ -1,10 +1,12 @@
 //! The table `[perception]`.
 
+use std::path::PathBuf;
+
 use clap::{Args, ValueEnum};
 use serde::{Deserialize, Serialize};
 
 use super::check;
-use crate::FusionError;
+use crate::{FusionError, perception::key_color};
 
 /// Source of a pose, a shape or a mask.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
@@ -39,11 +41,25 @@ pub struct PerceptionSettings {
     /// Height of an estimated person in metres; by default measured, or an average one before a single camera.
     #[arg(long = "height", value_name = "METRES")]
     pub height_m: Option<f64>,
+    /// Colour of a screen behind the people: "green", "blue" or one like "#00b140"; empty without a screen.
+    #[arg(long, value_name = "COLOUR", default_value = "", hide_default_value = true)]
+    pub key_color: String,
+    /// Folder of the plates CAM.png (`flyrig plate`); background/ in the data set or the calibration's folder by default.
+    #[arg(long, value_name = "FOLDER", default_value = "", hide_default_value = true)]
+    pub plates: PathBuf,
 }
 
 impl Default for PerceptionSettings {
     fn default() -> Self {
-        Self { pose: Origin::Estimated, masks: Origin::Estimated, shape: None, people: 1, height_m: None }
+        Self {
+            pose: Origin::Estimated,
+            masks: Origin::Estimated,
+            shape: None,
+            people: 1,
+            height_m: None,
+            key_color: String::new(),
+            plates: PathBuf::new(),
+        }
     }
 }
 
@@ -66,6 +82,7 @@ impl PerceptionSettings {
     /// [`FusionError::Setting`] names the key and the range.
     pub fn validate(&self) -> Result<(), FusionError> {
         check("perception.people", self.people as f64, 1.0, 4.0)?;
+        key_color(self)?;
         self.height_m.map_or(Ok(()), |height| check("perception.height_m", height, 0.5, 2.5))
     }
 }

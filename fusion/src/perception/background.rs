@@ -1,0 +1,77 @@
+//! Backgrounds of a rig's cameras: from plates or a key colour, kept up to date, with warnings that name the camera.
+
+use flyrig_tracker::{Background, BackgroundEvent, KeyColor};
+use flyrig_types::{Camera, Image};
+
+use crate::{FusionError, PerceptionSettings};
+
+/// Backgrounds take in one of so many sets.
+const UPDATE_EVERY: u32 = 4;
+
+/// Returns the background of each camera, where the settings or a plate give one. A key colour replaces the plates.
+pub(super) fn backgrounds(
+    cameras: &[Camera],
+    settings: &PerceptionSettings,
+    plates: &[Option<Image>],
+) -> Result<Vec<Option<Background>>, FusionError> {
+    if let Some(key) = key_color(settings)? {
+        return Ok(cameras.iter().map(|camera| Some(Background::from_key(camera, key))).collect());
+    }
+    let of = |(slot, camera): (usize, &Camera)| {
+        let plate = plates.get(slot).and_then(Option::as_ref);
+        Ok(plate.map(|plate| Background::from_plate(camera, plate)).transpose()?)
+    };
+    cameras.iter().enumerate().map(of).collect()
+}
+
+/// The key colour of the settings; `None` for an empty one.
+pub(crate) fn key_color(settings: &PerceptionSettings) -> Result<Option<KeyColor>, FusionError> {
+    let text = settings.key_color.as_str();
+    let parsed = (!text.is_empty()).then(|| text.parse::<KeyColor>()).transpose();
+    parsed.map_err(|error| FusionError::Setting(format!("perception.key_color: {error}")))
+}
+
+/// Counts sets between updates of the backgrounds.
+#[derive(Debug, Default)]
+pub(super) struct BackgroundWatch {
+    sets: u32,
+}
+
+impl BackgroundWatch {
+    /// Counts a set; true when the backgrounds take it in.
+    pub fn is_due(&mut self) -> bool {
+        self.sets = self.sets.wrapping_add(1);
+        self.sets % UPDATE_EVERY == 1
+    }
+}
+
+/// Logs the events of a camera's background.
+pub(super) fn report(camera: &Camera, events: &[BackgroundEvent]) {
+    for event in events {
+        match event {
+            BackgroundEvent::Recovered => tracing::info!(camera = %camera.id, "{event}"),
+            _ => tracing::warn!(camera = %camera.id, "{event}"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_key_colour_is_read_and_a_wrong_one_names_the_key() {
+        let settings = |text: &str| PerceptionSettings { key_color: text.to_owned(), ..PerceptionSettings::default() };
+        assert_eq!(key_color(&settings("")).unwrap(), None);
+        assert!(key_color(&settings("green")).unwrap().is_some());
+        let error = key_color(&settings("grey")).unwrap_err().to_string();
+        assert!(error.contains("perception.key_color") && error.contains("grey"), "{error}");
+    }
+
+    #[test]
+    fn the_first_set_and_every_fourth_are_taken_in() {
+        let mut watch = BackgroundWatch::default();
+        let due: Vec<bool> = (0..9).map(|_| watch.is_due()).collect();
+        assert_eq!(due, [true, false, false, false, true, false, false, false, true]);
+    }
+}

@@ -1,0 +1,476 @@
+//! Alpha and foreground colour of the pixels along a mask's outline.
+//!
+//! A pixel on the outline shows alpha F + (1 - alpha) B, in linear light. The background B is the plate, brought to the
+//! exposure and the shadow of the surely empty pixels nearby, or else their colour; the foreground F comes from the nearest
+//! pixels well inside of the mask. Where F and B are alike, alpha stays that of the mask.
+
+use flyrig_types::{Image, Mask};
+
+use crate::TrackError;
+use crate::background::{Background, BackgroundLight};
+use crate::grid::Grid;
+use crate::light::{byte, linear_of_bytes, step};
+use crate::pixels::Rgb;
+
+/// Distance from the mask's outline up to which alpha is solved for, pixels.
+const BAND_PX: f32 = 3.4;
+/// Pixels of thin parts count as surely inside from this distance to the outline on.
+const THIN_PX: f32 = 1.9;
+/// Width of the surroundings of the mask from which the background is learnt, pixels.
+const MARGIN_PX: usize = 14;
+/// Half of the side of the square in which the background's exposure is compared with the plate's, pixels.
+const LOCAL_PX: usize = 7;
+/// Places around the nearest sure pixel from which colours are tried, pixels.
+const TRIED: [(i64, i64); 9] = [(0, 0), (-2, 0), (2, 0), (0, -2), (0, 2), (-2, -2), (2, -2), (-2, 2), (2, 2)];
+/// Standard deviation of a pixel's colour, sRGB steps.
+const NOISE: f32 = 3.0;
+/// Contrast of foreground and background, in standard deviations, at which the solved alpha is half believed.
+const HALF_BELIEVED: f32 = 4.0;
+/// Weight of the part of a pixel that foreground and background do not explain, as doubt about its alpha.
+const REMAINDER: f32 = 4.0;
+/// Weight of differences in colour beside those in brightness.
+const CHROMA: f32 = 0.8;
+/// Pixels of the mask that look like the background are solved for up to this depth, pixels, as far as evidence is lower.
+const DEEP_PX: f32 = 24.0;
+const LOOKS_EMPTY: f32 = 0.4;
+
+/// Foreground colour of a pixel that also shows the background.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct EdgeColor {
+    /// Index of the pixel, row by row.
+    pub pixel: u32,
+    /// sRGB without the background's share.
+    pub rgb: [u8; 3],
+}
+
+/// Mask with sub-pixel coverage, and colours of its outline without the background.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Matte {
+    /// Coverage.
+    pub mask: Mask,
+    /// Colours of pixels that are covered in part, by rising index.
+    pub colors: Vec<EdgeColor>,
+}
+
+/// Solves for coverage and foreground colour along the outline of a mask. Without a background, or where it is of another
+/// size, the colours around the mask stand in.
+///
+/// # Errors
+/// Kind `Image` when the format cannot be read or the mask is of another size.
+pub fn matte(image: &Image, mask: &Mask, background: Option<&Background>) -> Result<Matte, TrackError> {
+    let picture = Rgb::new(image)?;
+    if (mask.width() as usize, mask.height() as usize) != (picture.width, picture.height) {
+        return Err(TrackError::new(
+            crate::TrackErrorKind::Image,
+            format!(
+                "the mask is {}x{} but the picture {}x{}",
+                mask.width(),
+                mask.height(),
+                picture.width,
+                picture.height
+            ),
+        ));
+    }
+    let Some(band) = Band::new(&picture, mask, background) else {
+        return Ok(Matte { mask: mask.clone(), colors: Vec::new() });
+    };
+    let mut matte = band.solve(mask);
+    if let Some(key) = background.and_then(Background::key) {
+        key.despill(&picture, &mut matte);
+    }
+    Ok(matte)
+}
+
+/// The surroundings of a mask's outline.
+struct Band<'a> {
+    picture: &'a Rgb<'a>,
+    x0: usize,
+    y0: usize,
+    width: usize,
+    height: usize,
+    /// Linear light of the picture's pixels.
+    light: Vec<[f32; 3]>,
+    /// Distance of pixels in the mask to the nearest one outside, and the other way round; 0 on the other side.
+    inner: Grid,
+    outer: Grid,
+    /// Nearest pixel that surely shows the foreground alone, and the background alone.
+    nearest_inside: Vec<u32>,
+    nearest_outside: Vec<u32>,
+    /// Pixels of the mask that look like the background.
+    empty: Vec<bool>,
+    /// Background's linear light where it is known.
+    behind: Vec<Option<[f32; 3]>>,
+}
+
+/// No pixel.
+const NONE: u32 = u32::MAX;
+
+impl<'a> Band<'a> {
+    /// `None` for a mask without an outline.
+    fn new(picture: &'a Rgb<'a>, mask: &Mask, background: Option<&Background>) -> Option<Self> {
+        let inside = |x: usize, y: usize| mask.coverage()[y * picture.width + x] >= 128;
+        let [x0, y0, x1, y1] = mask.bounding_box()?.map(|v| v as usize);
+        let (x0, y0) = (x0.saturating_sub(MARGIN_PX), y0.saturating_sub(MARGIN_PX));
+        let (x1, y1) = ((x1 + MARGIN_PX).min(picture.width), (y1 + MARGIN_PX).min(picture.height));
+        let (width, height) = (x1 - x0, y1 - y0);
+        let mut set = Grid::new(width, height, 0.0);
+        for (at, value) in set.values.iter_mut().enumerate() {
+            *value = f32::from(inside(x0 + at % width, y0 + at / width));
+        }
+        let mut unset = set.clone();
+        unset.values.iter_mut().for_each(|value| *value = 1.0 - *value);
+        let (outer, inner) = (set.distance_to_set(), unset.distance_to_set());
+        let light: Vec<[f32; 3]> =
+            (0..width * height).map(|at| linear_of_bytes(picture.pixel(x0 + at % width, y0 + at / width))).collect();
+        let mut band = Self {
+            picture,
+            x0,
+            y0,
+            width,
+            height,
+            light,
+            inner,
+            outer,
+            nearest_inside: Vec::new(),
+            nearest_outside: Vec::new(),
+            empty: vec![false; width * height],
+            behind: vec![None; width * height],
+        };
+        let mut sure_inside: Vec<bool> = (0..width * height).map(|at| band.is_sure_inside(at)).collect();
+        let mut sure_outside: Vec<bool> = band.outer.values.iter().map(|d| *d > BAND_PX).collect();
+        if let Some(background) = background {
+            let unmasked = |at: usize| mask.coverage()[at] == 0;
+            if let Some(evidence) = background.evidence(picture, &unmasked) {
+                for (at, sure) in sure_outside.iter_mut().enumerate() {
+                    *sure &= evidence.values[(y0 + at / width) * picture.width + x0 + at % width] < 0.5;
+                }
+                let mut local = Grid::new(width, height, 0.0);
+                for (at, value) in local.values.iter_mut().enumerate() {
+                    *value = evidence.values[(y0 + at / width) * picture.width + x0 + at % width];
+                }
+                for (at, value) in local.box_mean(1).values.iter().enumerate() {
+                    let depth = band.inner.values[at];
+                    band.empty[at] = depth > 0.0 && depth <= DEEP_PX && *value < LOOKS_EMPTY;
+                    sure_inside[at] &= !band.empty[at] && *value > 0.5;
+                }
+                if let Some(light) = background.light(picture, &unmasked) {
+                    band.behind = band.local_background(&light, &sure_outside);
+                }
+            }
+        }
+        band.nearest_inside = nearest(&sure_inside, width, height);
+        band.nearest_outside = nearest(&sure_outside, width, height);
+        Some(band)
+    }
+
+    /// Whether a pixel shows the foreground alone: deep in the mask, or in the middle of a thin part.
+    fn is_sure_inside(&self, at: usize) -> bool {
+        let depth = self.inner.values[at];
+        if depth > BAND_PX {
+            return true;
+        }
+        if depth < THIN_PX {
+            return false;
+        }
+        let (x, y) = (at % self.width, at / self.width);
+        let near = |v: usize, side: usize| v.saturating_sub(2)..(v + 3).min(side);
+        near(y, self.height).all(|v| near(x, self.width).all(|u| self.inner.values[v * self.width + u] <= depth))
+    }
+
+    /// The background's light, brought to the exposure and shadow of the sure background nearby.
+    fn local_background(&self, background: &BackgroundLight<'_>, sure: &[bool]) -> Vec<Option<[f32; 3]>> {
+        let behind: Vec<Option<[f32; 3]>> = (0..self.light.len()).map(|at| background.at(self.pixel(at))).collect();
+        let mean = |value: &dyn Fn(usize, [f32; 3]) -> f32| {
+            let of = |at: usize| behind[at].filter(|_| sure[at]).map_or(0.0, |light| value(at, light));
+            Grid { width: self.width, height: self.height, values: (0..sure.len()).map(of).collect() }
+                .box_mean(LOCAL_PX)
+        };
+        let ratios: [Grid; 3] = std::array::from_fn(|k| {
+            let (mut now, plate) = (mean(&|at, _| self.light[at][k]), mean(&|_, light| light[k]));
+            // Without sure background nearby the plate stands as it is.
+            now.values.iter_mut().zip(&plate.values).for_each(|(now, plate)| *now = (*now + 2e-3) / (plate + 2e-3));
+            now
+        });
+        let scaled = |(at, light): (usize, &Option<[f32; 3]>)| {
+            light.map(|light| std::array::from_fn(|k| light[k] * ratios[k].values[at].clamp(0.3, 2.0)))
+        };
+        behind.iter().enumerate().map(scaled).collect()
+    }
+
+    /// Index in the picture of a pixel of the band.
+    fn pixel(&self, at: usize) -> usize {
+        (self.y0 + at / self.width) * self.picture.width + self.x0 + at % self.width
+    }
+
+    /// Whether coverage is solved for.
+    fn is_open(&self, at: usize) -> bool {
+        self.inner.values[at].max(self.outer.values[at]) <= BAND_PX || self.empty[at]
+    }
+
+    fn solve(&self, mask: &Mask) -> Matte {
+        let mut coverage = mask.coverage().to_vec();
+        let mut colors = Vec::new();
+        for at in 0..self.light.len() {
+            let pixel = self.pixel(at);
+            if !self.is_open(at) {
+                // Soft slopes of the mask end with the band.
+                coverage[pixel] = if self.inner.values[at] > 0.0 { 255 } else { 0 };
+                continue;
+            }
+            let geometric = f32::from(coverage[pixel]) / 255.0;
+            let Some(mixed) = self.unmix(at) else { continue };
+            let alpha = geometric + mixed.belief * (mixed.alpha - geometric);
+            coverage[pixel] = (alpha * 255.0).round() as u8;
+            if coverage[pixel] == 0 {
+                continue;
+            }
+            let rgb = self.foreground(at, alpha, &mixed);
+            if rgb != self.picture.pixel(pixel % self.picture.width, pixel / self.picture.width) {
+                colors.push(EdgeColor { pixel: pixel as u32, rgb });
+            }
+        }
+        Matte { mask: Mask::new(mask.width(), mask.height(), coverage).unwrap_or_else(|_| mask.clone()), colors }
+    }
+
+    /// Foreground colour of a pixel of the given coverage.
+    fn foreground(&self, at: usize, alpha: f32, mixed: &Mixed) -> [u8; 3] {
+        // Little coverage says little about the colour.
+        let solved = (1.5 * alpha - 0.25).clamp(0.0, 1.0);
+        std::array::from_fn(|k| {
+            let seen = self.light[at][k];
+            let clean = (seen - (1.0 - alpha) * mixed.background[k]) / alpha.max(0.1);
+            let color = mixed.foreground[k] + solved * (clean.clamp(0.0, 1.0) - mixed.foreground[k]);
+            byte(seen + mixed.belief * (color - seen))
+        })
+    }
+
+    /// Best explanation of a pixel by a foreground and a background nearby.
+    fn unmix(&self, at: usize) -> Option<Mixed> {
+        let seen = self.light[at];
+        let mut best: Option<(f32, Mixed)> = None;
+        let mut try_pair = |foreground: [f32; 3], background: [f32; 3], known: bool| {
+            let mean = |c: [f32; 3]| (c[0] + c[1] + c[2]) / 3.0;
+            let noise = NOISE * step(0.5 * (mean(foreground) + mean(background)).max(4e-3));
+            let across = weighted(std::array::from_fn(|k| foreground[k] - background[k]));
+            let off = weighted(std::array::from_fn(|k| seen[k] - background[k]));
+            let contrast2 = dot(across, across);
+            let raw = dot(off, across) / contrast2.max(1e-9);
+            let alpha = raw.clamp(0.0, 1.0);
+            let left: [f32; 3] = std::array::from_fn(|k| off[k] - alpha * across[k]);
+            let remainder2 = dot(left, left) / (noise * noise);
+            let contrast = contrast2 / (noise * noise);
+            let doubt = HALF_BELIEVED * HALF_BELIEVED + REMAINDER * remainder2;
+            let mut belief = contrast / (contrast + doubt);
+            if !known {
+                belief *= 0.5;
+            }
+            if belief.is_finite() && best.as_ref().is_none_or(|(least, _)| remainder2 < *least) {
+                best = Some((remainder2, Mixed { alpha, foreground, background, belief }));
+            }
+        };
+        let foregrounds = self.samples(&self.nearest_inside, at, &self.inner);
+        match self.behind[at] {
+            Some(behind) => foregrounds.for_each(|foreground| try_pair(foreground, behind, true)),
+            None => {
+                let backgrounds: Vec<[f32; 3]> = self.samples(&self.nearest_outside, at, &self.outer).collect();
+                for foreground in foregrounds {
+                    backgrounds.iter().for_each(|background| try_pair(foreground, *background, false));
+                }
+            }
+        }
+        best.map(|(_, mixed)| mixed)
+    }
+
+    /// Colours around the nearest sure pixel, each the mean of three by three.
+    fn samples<'b>(
+        &'b self,
+        nearest: &[u32],
+        at: usize,
+        depth: &'b Grid,
+    ) -> impl Iterator<Item = [f32; 3]> + use<'b, 'a> {
+        let sure = nearest[at];
+        let (x, y) = (i64::from(sure) % self.width as i64, i64::from(sure) / self.width as i64);
+        let least = if sure == NONE { f32::INFINITY } else { depth.values[sure as usize].min(BAND_PX) };
+        let steps = if sure == NONE { &[][..] } else { &TRIED[..] };
+        steps.iter().filter_map(move |(dx, dy)| self.mean_around(x + dx, y + dy, depth, least))
+    }
+
+    /// Mean light of the pixels around one that are no nearer to the outline than `least`.
+    fn mean_around(&self, x: i64, y: i64, depth: &Grid, least: f32) -> Option<[f32; 3]> {
+        let (width, height) = (self.width as i64, self.height as i64);
+        if x < 0 || y < 0 || x >= width || y >= height || depth.values[(y * width + x) as usize] < least {
+            return None;
+        }
+        let (mut sum, mut count) = ([0.0; 3], 0.0);
+        for v in (y - 1).max(0)..(y + 2).min(height) {
+            for u in (x - 1).max(0)..(x + 2).min(width) {
+                let at = (v * width + u) as usize;
+                if depth.values[at] >= least {
+                    (0..3).for_each(|k| sum[k] += self.light[at][k]);
+                    count += 1.0;
+                }
+            }
+        }
+        Some(sum.map(|s| s / count))
+    }
+}
+
+/// A pixel as a mixture.
+struct Mixed {
+    alpha: f32,
+    foreground: [f32; 3],
+    background: [f32; 3],
+    /// Belief in the mixture, 0..=1.
+    belief: f32,
+}
+
+/// Returns brightness and two differences of colour, which cameras and codecs blur over the outline.
+fn weighted([red, green, blue]: [f32; 3]) -> [f32; 3] {
+    let light = 0.3 * red + 0.59 * green + 0.11 * blue;
+    [1.7 * light, CHROMA * (red - light), CHROMA * (blue - light)]
+}
+
+fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+/// Returns for each pixel the index of the nearest one that is set, by the chamfer distance; [`NONE`] when none is.
+fn nearest(set: &[bool], width: usize, height: usize) -> Vec<u32> {
+    let mut labels: Vec<u32> = set.iter().enumerate().map(|(at, set)| if *set { at as u32 } else { NONE }).collect();
+    let mut distance: Vec<u32> = set.iter().map(|set| if *set { 0 } else { u32::MAX / 2 }).collect();
+    let (w, h) = (width as i64, height as i64);
+    let mut visit = |x: i64, y: i64, steps: [(i64, i64, u32); 4]| {
+        let at = (y * w + x) as usize;
+        for (dx, dy, cost) in steps {
+            let (u, v) = (x + dx, y + dy);
+            if u >= 0 && v >= 0 && u < w && v < h {
+                let from = (v * w + u) as usize;
+                if distance[from] + cost < distance[at] {
+                    (distance[at], labels[at]) = (distance[from] + cost, labels[from]);
+                }
+            }
+        }
+    };
+    for y in 0..h {
+        (0..w).for_each(|x| visit(x, y, [(-1, 0, 3), (0, -1, 3), (-1, -1, 4), (1, -1, 4)]));
+    }
+    for y in (0..h).rev() {
+        (0..w).rev().for_each(|x| visit(x, y, [(1, 0, 3), (0, 1, 3), (1, 1, 4), (-1, 1, 4)]));
+    }
+    labels
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_types::{Intrinsics, Isometry, Lens, PixelFormat};
+    use glam::DVec2;
+
+    use super::*;
+
+    const SIDE: usize = 64;
+    const SHIRT: [f32; 3] = [0.05, 0.08, 0.35];
+
+    fn wall(x: usize, y: usize) -> [f32; 3] {
+        [0.4 + 0.003 * x as f32, 0.35, 0.3 + 0.003 * y as f32]
+    }
+
+    /// Coverage of a tilted half plane with a soft edge: its place is known to a fraction of a pixel.
+    fn truth(x: usize, y: usize) -> f32 {
+        (32.3 - x as f32 + 0.3 * y as f32 - 8.0).clamp(-0.5, 0.5) + 0.5
+    }
+
+    fn picture(paint: impl Fn(usize, usize) -> [f32; 3]) -> Image {
+        let bytes: Vec<u8> = (0..SIDE * SIDE).flat_map(|at| paint(at % SIDE, at / SIDE).map(byte)).collect();
+        Image::new(SIDE as u32, SIDE as u32, PixelFormat::Rgb8, bytes).unwrap()
+    }
+
+    fn over(alpha: f32, front: [f32; 3], back: [f32; 3]) -> [f32; 3] {
+        std::array::from_fn(|k| alpha * front[k] + (1.0 - alpha) * back[k])
+    }
+
+    fn mask(coverage: impl Fn(usize, usize) -> u8) -> Mask {
+        let coverage = (0..SIDE * SIDE).map(|at| coverage(at % SIDE, at / SIDE)).collect();
+        Mask::new(SIDE as u32, SIDE as u32, coverage).unwrap()
+    }
+
+    /// The true outline, a pixel and a half too far out.
+    fn rough() -> Mask {
+        mask(|x, y| if truth(x.saturating_sub(1), y) + truth(x.saturating_sub(2), y) >= 1.0 { 255 } else { 0 })
+    }
+
+    fn background(plate: &Image) -> Background {
+        let camera = flyrig_types::Camera {
+            id: "a".into(),
+            intrinsics: Intrinsics {
+                width: plate.width(),
+                height: plate.height(),
+                focal_px: DVec2::splat(60.0),
+                center_px: DVec2::splat(32.0),
+                lens: Lens::PINHOLE,
+            },
+            camera_from_world: Isometry::IDENTITY,
+        };
+        Background::from_plate(&camera, plate).unwrap()
+    }
+
+    /// Mean error of alpha within two pixels of the true outline, away from the borders.
+    fn error(mask: &Mask) -> f32 {
+        let (mut sum, mut count) = (0.0, 0.0);
+        for y in 6..SIDE - 6 {
+            for x in 2..SIDE - 2 {
+                if (truth(x - 2, y) - truth(x + 2, y)).abs() > 1e-6 {
+                    sum += (f32::from(mask.coverage()[y * SIDE + x]) / 255.0 - truth(x, y)).abs();
+                    count += 1.0;
+                }
+            }
+        }
+        sum / count
+    }
+
+    #[test]
+    fn alpha_and_colour_of_a_known_mixture_are_found() {
+        let now = picture(|x, y| over(truth(x, y), SHIRT, wall(x, y).map(|c| c * 0.9)));
+        let plate = picture(wall);
+        let solved = matte(&now, &rough(), Some(&background(&plate))).unwrap();
+        assert!(error(&rough()) > 0.2 && error(&solved.mask) < 0.03, "{} {}", error(&rough()), error(&solved.mask));
+        let half = |color: &&EdgeColor| (96..200).contains(&solved.mask.coverage()[color.pixel as usize]);
+        let mixed: Vec<&EdgeColor> = solved.colors.iter().filter(half).collect();
+        assert!(mixed.len() > 20, "{} pixels", mixed.len());
+        for EdgeColor { pixel, rgb } in mixed {
+            let off = (0..3).map(|k| i32::from(rgb[k]).abs_diff(i32::from(byte(SHIRT[k])))).max().unwrap();
+            assert!(off <= 14, "pixel {pixel}: {rgb:?}");
+        }
+    }
+
+    #[test]
+    fn without_a_plate_the_colours_around_stand_in() {
+        let now = picture(|x, y| over(truth(x, y), SHIRT, wall(x, y)));
+        let solved = matte(&now, &rough(), None).unwrap();
+        assert!(error(&solved.mask) < 0.7 * error(&rough()), "{} {}", error(&rough()), error(&solved.mask));
+    }
+
+    #[test]
+    fn alike_colours_keep_the_masks_alpha() {
+        let now = picture(wall);
+        let rough = rough();
+        let solved = matte(&now, &rough, Some(&background(&now))).unwrap();
+        let changed = rough.coverage().iter().zip(solved.mask.coverage()).filter(|(a, b)| a.abs_diff(**b) > 64).count();
+        assert!(changed < 20, "{changed} pixels changed");
+    }
+
+    #[test]
+    fn empty_full_and_black_pictures_and_other_sizes_do_no_harm() {
+        let black = picture(|_, _| [0.0; 3]);
+        let plate = background(&black);
+        for coverage in [0, 255] {
+            let mask = mask(|_, _| coverage);
+            assert_eq!(matte(&black, &mask, Some(&plate)).unwrap(), Matte { mask, colors: Vec::new() });
+        }
+        // A mask that touches three borders, and one of a single pixel.
+        matte(&black, &rough(), None).unwrap();
+        matte(&black, &mask(|x, y| if (x, y) == (0, 63) { 255 } else { 0 }), Some(&plate)).unwrap();
+        let small = Image::new(8, 8, PixelFormat::Rgb8, vec![0; 192]).unwrap();
+        assert!(matte(&small, &rough(), None).is_err());
+        assert!(matte(&black, &rough(), Some(&background(&small))).is_ok(), "a plate of another size is not used");
+    }
+}

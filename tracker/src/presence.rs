@@ -1,0 +1,19 @@
+//! Whether a picture shows anybody.
+
+use flyrig_types::Image;
+
+use crate::pixels::Rgb;
+use crate::search::sightings;
+use crate::{PoseConfig, PoseNet, TrackError};
+
+/// Least probability of a person: an empty room has furniture that looks a little like one.
+const SURE: f64 = 0.8;
+
+/// Returns whether the pose network finds a person anywhere in a picture. Takes about a second.
+///
+/// # Errors
+/// Kinds `Image` and `Net` when the picture cannot be read or the network fails.
+pub fn shows_person(net: &PoseNet, image: &Image) -> Result<bool, TrackError> {
+    let config = PoseConfig { presence_threshold: SURE, ..PoseConfig::default() };
+    Ok(!sightings(net, &Rgb::new(image)?, &config)?.is_empty())
+}
