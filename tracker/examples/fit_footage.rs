@@ -72,7 +72,7 @@ fn main() -> Result<()> {
         // Spread over the first second, so that the person is seen in several poses.
         let start: Vec<FrameSet> =
             (0..8).map(|i| set((first + i * 8).min(first + count - 1), &rig)).collect::<Result<_>>()?;
-        println!("{:#?}", estimator.fit_shape(&start)?);
+        println!("{:#?}", estimator.fit_shape(&start, &[])?.0);
     }
     let mut others: Vec<PoseEstimator> = Vec::new();
     for camera in &held_out.cameras {

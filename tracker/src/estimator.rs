@@ -725,7 +725,7 @@ impl PoseEstimator {
             if let Some(look) = looks[slot].as_ref().filter(sees) {
                 seen = observe(camera, &view, &look.sighting.keypoints, config.confidence_threshold);
                 if let Some((track, predicted)) = track {
-                    for (i, (carried, trust)) in look.carried(predicted).into_iter().enumerate() {
+                    for (i, (carried, trust)) in look.carried(&track.marks, predicted).into_iter().enumerate() {
                         shift[i] = track.velocity[i] * delay_secs + carried;
                         seen[i] = seen[i].map(|seen| Observation { confidence: seen.confidence * trust, ..seen });
                     }

@@ -52,12 +52,17 @@ impl Look {
         moved + AGING_M_PER_SEC * 1e-9 * nanos.saturating_sub(body.nanos).max(0) as f64
     }
 
-    /// Where each landmark was at the look less where it is now, metres, and the factor of its confidence.
-    pub fn carried(&self, marks: &[DVec3; LANDMARK_COUNT]) -> [(DVec3, f64); LANDMARK_COUNT] {
+    /// Where each landmark was at the look less where it was at the last set, metres, and the factor of its confidence. An old
+    /// look says nothing of what has moved since the last set: a predicted motion that counted as seen would feed itself.
+    pub fn carried(
+        &self,
+        last: &[DVec3; LANDMARK_COUNT],
+        predicted: &[DVec3; LANDMARK_COUNT],
+    ) -> [(DVec3, f64); LANDMARK_COUNT] {
         let Some(body) = &self.body else { return [(DVec3::ZERO, 1.0); LANDMARK_COUNT] };
         std::array::from_fn(|i| {
-            let shift = body.marks[i] - marks[i];
-            (shift, 1.0 / (1.0 + shift.length_squared() / (CARRIED_M * CARRIED_M)))
+            let moved = body.marks[i].distance(predicted[i]);
+            (body.marks[i] - last[i], 1.0 / (1.0 + (moved / CARRIED_M).powi(2)))
         })
     }
 }

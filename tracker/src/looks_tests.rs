@@ -60,12 +60,12 @@ fn landmarks_are_carried_with_the_body_and_trusted_less() {
     let then = model.marks(&turns);
     let mut now = then;
     now[0] += DVec3::new(CARRIED_M, 0.0, 0.0);
-    let carried = look_at(then, &turns, 0).carried(&now);
+    let carried = look_at(then, &turns, 0).carried(&now, &now);
     assert!((carried[0].0 - DVec3::new(-CARRIED_M, 0.0, 0.0)).length() < 1e-12);
     assert!((carried[0].1 - 0.5).abs() < 1e-12);
     assert_eq!(carried[1], (DVec3::ZERO, 1.0));
     let fresh = Look { body: None, ..look_at(then, &turns, 0) };
-    assert_eq!(fresh.carried(&now)[0], (DVec3::ZERO, 1.0));
+    assert_eq!(fresh.carried(&now, &now)[0], (DVec3::ZERO, 1.0));
 }
 
 #[test]
