@@ -220,7 +220,7 @@ mod tests {
     const RIG: &str = "[source]\nkind = \"v4l2\"\npath = \"calib\"\n[perception]\npose = \"estimated\"\n";
 
     fn parse(cameras: &str) -> Result<Config, String> {
-        let text = RIG.replace("[body]", &format!("{cameras}\n[body]"));
+        let text = RIG.replace("[perception]", &format!("{cameras}\n[perception]"));
         Config::parse(&text).map_err(|error| format!("{error:#}"))
     }
 
