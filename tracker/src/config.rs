@@ -54,7 +54,7 @@ impl Default for PoseConfig {
             height_m: None,
             shape_rounds: 0,
             smooth_rad: 0.15,
-            look_after_m: std::env::var("LOOK").ok().and_then(|v| v.parse().ok()).unwrap_or(0.01),
+            look_after_m: 0.005,
             max_steps: 12,
             fit_shape: true,
             masks: true,

@@ -26,9 +26,9 @@ fn sighting(crop: Crop, coverage: impl Fn(DVec2) -> f32) -> Sighting {
     Sighting { crop, output, keypoints }
 }
 
-fn look_at(marks: [DVec3; LANDMARK_COUNT], turns: &Turns, nanos: i64) -> Look {
+fn look_at(marks: &[DVec3; LANDMARK_COUNT], turns: &Turns, nanos: i64) -> Look {
     let crop = Crop::upright(DVec2::splat(100.0), 200.0);
-    let body = LookBody { nanos, turns: Arc::new(turns.clone()), marks };
+    let body = LookBody { nanos, turns: Arc::new(turns.clone()), marks: *marks };
     Look { body: Some(body), ..Look::fresh(sighting(crop, |_| 0.0)) }
 }
 
@@ -41,7 +41,7 @@ fn views_without_a_look_and_moved_views_are_due_and_still_ones_are_not() {
     moved[15] += DVec3::new(0.0, 0.02, 0.0);
     let mut far = marks;
     far[15] += DVec3::new(0.0, 0.2, 0.0);
-    let looks = |a, b| vec![Some(look_at(a, &turns, 0)), Some(look_at(b, &turns, 0)), None];
+    let looks = |a, b| vec![Some(look_at(&a, &turns, 0)), Some(look_at(&b, &turns, 0)), None];
     let due = |looks: &[Option<Look>], has_third, nanos| due(looks, |slot| slot < 2 || has_third, &marks, nanos, 0.01);
     assert_eq!(due(&looks(marks, marks), false, 0), [false, false, false], "nobody moved");
     assert_eq!(due(&looks(marks, marks), true, 0), [false, false, true], "no look yet");
@@ -60,11 +60,11 @@ fn landmarks_are_carried_with_the_body_and_trusted_less() {
     let then = model.marks(&turns);
     let mut now = then;
     now[0] += DVec3::new(CARRIED_M, 0.0, 0.0);
-    let carried = look_at(then, &turns, 0).carried(&now, &now);
+    let carried = look_at(&then, &turns, 0).carried(&now, &now);
     assert!((carried[0].0 - DVec3::new(-CARRIED_M, 0.0, 0.0)).length() < 1e-12);
     assert!((carried[0].1 - 0.5).abs() < 1e-12);
     assert_eq!(carried[1], (DVec3::ZERO, 1.0));
-    let fresh = Look { body: None, ..look_at(then, &turns, 0) };
+    let fresh = Look { body: None, ..look_at(&then, &turns, 0) };
     assert_eq!(fresh.carried(&now, &now)[0], (DVec3::ZERO, 1.0));
 }
 

@@ -8,8 +8,10 @@ use crate::net::NET_SIDE;
 use crate::pixels::Rgb;
 use crate::search::Sighting;
 
-/// How far clothes and hair may stand off the fitted body, metres.
+/// How far most clothes and hair stand off the fitted body, metres: the unit of a gate's distances.
 const REACH_M: f64 = 0.13;
+/// How far a wide skirt or a coat may stand off, as a multiple: beyond 1, only where picture and background speak for it.
+const CLOTHES_REACH: f32 = 2.5;
 /// Log-odds between a pixel that surely differs from the plate and one that does not.
 const PLATE_LOGIT: f32 = 6.0;
 /// Bins a colour channel of the colour model.
@@ -22,7 +24,7 @@ pub struct BodyGate {
     pub(crate) image: [usize; 2],
     /// Box that holds everything allowed: x0, y0, x1, y1 (ends excluded).
     pub(crate) bounds: [usize; 4],
-    /// Distance to the projected body over the reach, 0 on the body, 1 at the reach; the size of the box.
+    /// Distance to the projected body in units of [`REACH_M`], 0 on the body; the size of the box.
     pub(crate) distance: Grid,
     /// Pixels that a metre takes at the body.
     pub(crate) px_per_m: f64,
@@ -42,7 +44,7 @@ impl BodyGate {
         let depth = flyrig_solve::median(&mut depths)?;
         let px_per_m = camera.intrinsics.focal_px.x / depth;
         let reach = REACH_M * px_per_m;
-        let (bounds, body) = drawn_body(camera, vertices, triangles, reach)?;
+        let (bounds, body) = drawn_body(camera, vertices, triangles, reach * f64::from(CLOTHES_REACH))?;
         let mut distance = body.distance_to_set();
         for value in &mut distance.values {
             *value /= reach as f32;
@@ -56,7 +58,7 @@ impl BodyGate {
         let [x0, y0, x1, y1] = self.bounds;
         (x0..x1).contains(&x)
             && (y0..y1).contains(&y)
-            && self.distance.values[(y - y0) * self.distance.width + x - x0] < 1.0
+            && self.distance.values[(y - y0) * self.distance.width + x - x0] < CLOTHES_REACH
     }
 
     /// The same of a pixel's index, row by row.
@@ -177,7 +179,7 @@ pub(crate) fn refine(
         for x in 0..width {
             let at = y * width + x;
             let (p, d) = (coarse.values[at].clamp(0.02, 0.98), gate.distance.values[at]);
-            if d >= 1.0 {
+            if d >= CLOTHES_REACH {
                 probability.values[at] = 0.0;
                 continue;
             }
@@ -204,7 +206,7 @@ pub(crate) fn refine(
     let mut smoothed = probability.guided(&guide, radius, 1e-3);
     for (value, d) in smoothed.values.iter_mut().zip(&gate.distance.values) {
         // A soft step around one half keeps about a pixel of slope.
-        *value = if *d >= 1.0 { 0.0 } else { ((*value - 0.5) * 3.0 + 0.5).clamp(0.0, 1.0) };
+        *value = if *d >= CLOTHES_REACH { 0.0 } else { ((*value - 0.5) * 3.0 + 0.5).clamp(0.0, 1.0) };
     }
     clean(&mut smoothed, (0.02 * gate.px_per_m).round() as usize);
     smoothed.paste(picture.width, picture.height, x0, y0)

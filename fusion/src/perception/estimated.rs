@@ -74,6 +74,7 @@ impl EstimatedPerception {
         let config = PoseConfig {
             masks: settings.masks == Origin::Estimated,
             height_m: settings.height_m,
+            look_after_m: settings.look_after_m,
             ..PoseConfig::default()
         };
         let mut estimator = PoseEstimator::new(PoseNet::embedded()?, template, rig, config)?;
@@ -238,8 +239,8 @@ impl EstimatedPerception {
 
     /// Remembers the clothes of people who are seen, and reports who left.
     fn remember(&mut self, set: &FrameSet, estimates: &[Result<PoseEstimate, String>]) {
-        for index in 0..self.places.len() {
-            match &estimates[index] {
+        for (index, estimate) in estimates.iter().enumerate().take(self.places.len()) {
+            match estimate {
                 Ok(estimate) => {
                     let masks = self.own_masks(set, estimate);
                     let place = &mut self.places[index];

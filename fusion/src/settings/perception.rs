@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use clap::builder::{OsStringValueParser, TypedValueParser as _};
 use clap::{Args, ValueEnum};
 use serde::{Deserialize, Serialize};
 
@@ -38,6 +39,9 @@ pub struct PerceptionSettings {
     /// People who are tracked at most, 1 to 4; with 1 the one whom most views agree on.
     #[arg(long, default_value_t = 1)]
     pub people: usize,
+    /// Distance that the body moves in a view until the network looks at that view again, metres; 0: at every view of every set.
+    #[arg(skip = Self::default().look_after_m)]
+    pub look_after_m: f64,
     /// Height of an estimated person in metres; by default measured, or an average one before a single camera.
     #[arg(long = "height", value_name = "METRES")]
     pub height_m: Option<f64>,
@@ -45,7 +49,9 @@ pub struct PerceptionSettings {
     #[arg(long, value_name = "COLOUR", default_value = "", hide_default_value = true)]
     pub key_color: String,
     /// Folder of the plates CAM.png (`flyrig plate`); background/ in the data set or the calibration's folder by default.
-    #[arg(long, value_name = "FOLDER", default_value = "", hide_default_value = true)]
+    // The parser of paths refuses the empty default.
+    #[arg(long, value_name = "FOLDER", default_value = "", hide_default_value = true,
+        value_parser = OsStringValueParser::new().map(PathBuf::from))]
     pub plates: PathBuf,
 }
 
@@ -56,6 +62,7 @@ impl Default for PerceptionSettings {
             masks: Origin::Estimated,
             shape: None,
             people: 1,
+            look_after_m: 0.005,
             height_m: None,
             key_color: String::new(),
             plates: PathBuf::new(),
@@ -82,6 +89,7 @@ impl PerceptionSettings {
     /// [`FusionError::Setting`] names the key and the range.
     pub fn validate(&self) -> Result<(), FusionError> {
         check("perception.people", self.people as f64, 1.0, 4.0)?;
+        check("perception.look_after_m", self.look_after_m, 0.0, 1.0)?;
         key_color(self)?;
         self.height_m.map_or(Ok(()), |height| check("perception.height_m", height, 0.5, 2.5))
     }

@@ -1,0 +1,52 @@
+//! People are found, measured and followed from raw images.
+#![allow(clippy::unwrap_used)] // a test may fail by panicking, in its helpers too
+
+use flyrig_tests::run;
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
+
+const RIG: &str = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = []\n\
+    [sim]\nwidth = 256\nheight = 256\ntexture_px = 128\nfps = 10.0\nframes = 22\ncameras.count = 3\n\
+    [body]\ngaussians = 2000\nnodes = 50\n[output]\nwidth = 96\nheight = 96\n\
+    [transport]\nlisten = [\"tcp/127.0.0.1:0\"]\n";
+
+#[test]
+fn a_rig_measures_whoever_comes_and_then_follows_the_person() {
+    let folder = tempfile::tempdir().unwrap();
+    // A place is left free: nobody is in it.
+    std::fs::write(folder.path().join("rig.toml"), format!("{RIG}[perception]\npeople = 2\n")).unwrap();
+    let ran = run(PROGRAM, &["run", "rig.toml"], folder.path()).unwrap();
+    assert_eq!(ran.code, Some(0), "{}", ran.stderr);
+    assert!(ran.stderr.contains("person 0 is 1."), "{}", ran.stderr);
+    assert!(!ran.stderr.contains("person 1 is"), "there is one person: {}", ran.stderr);
+    assert!(ran.stderr.contains("run: 22 sets"), "{}", ran.stderr);
+
+    std::fs::write(folder.path().join("rig.toml"), format!("{RIG}[perception]\npeople = 5\n")).unwrap();
+    let refused = run(PROGRAM, &["run", "rig.toml"], folder.path()).unwrap();
+    assert_eq!(refused.code, Some(1));
+    assert!(refused.stderr.contains("perception.people is 5, it must lie between 1 and 4"), "{}", refused.stderr);
+}
+
+#[test]
+fn one_camera_is_enough_for_a_person_of_known_or_average_height() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("rig.toml"), RIG).unwrap();
+    let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    let exported = command(&["sim", "export", "rig.toml", "--out", "take", "--frames", "3", "--no-truth"]);
+    assert_eq!(exported.code, Some(0), "{exported:?}");
+    let eval = |more: &[&str]| {
+        let mut args = vec!["eval", "take", "--inputs", "00", "--holdout", "01", "--fps", "10", "--out", "eval"];
+        args.extend(["--pose", "estimated", "--masks", "estimated", "--gaussians", "2000", "--nodes", "50"]);
+        args.extend(more);
+        command(&args)
+    };
+    let given = eval(&["--height", "1.82"]);
+    assert_eq!(given.code, Some(0), "{}", given.stderr);
+    assert!(given.stderr.contains("1.82 m tall (as configured)"), "{}", given.stderr);
+    let average = eval(&[]);
+    assert_eq!(average.code, Some(0), "{}", average.stderr);
+    assert!(average.stderr.contains("an average height"), "{}", average.stderr);
+    let tiny = eval(&["--height", "0.1"]);
+    assert_eq!(tiny.code, Some(1));
+    assert!(tiny.stderr.contains("perception.height_m is 0.1"), "{}", tiny.stderr);
+}
