@@ -59,6 +59,7 @@ impl Replay {
     /// # Errors
     /// Names the missing file, camera or person.
     pub fn open(settings: &ReplaySettings, gpu: &GpuContext) -> Result<Self> {
+        settings.session.validate()?;
         let (rig, holdout) = load_rigs(settings)?;
         let (sets, count) = open_inputs(settings, &rig)?;
         let truth = TruthReader::open(settings, &holdout)?;

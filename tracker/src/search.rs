@@ -101,6 +101,8 @@ struct ViewSearch {
     next: usize,
     /// Whether all of them were looked at since the search began.
     swept: bool,
+    /// Whether there was a hypothesis in the last step.
+    has_hope: bool,
     /// Hypotheses, best first, and the times that they were seen at.
     found: Vec<(Sighting, i64)>,
 }
@@ -120,8 +122,11 @@ impl Search {
             self.views.iter().map(|view| view.found.iter().map(|(sighting, _)| sighting.clone()).collect()).collect();
         let choice = choose(scene.cameras, &found, scene.config);
         let agreed = choice.iter().flatten().count() > 1;
+        // Nobody can disagree with a single camera.
+        let is_alone = scene.pictures.iter().flatten().count() == 1;
+        let looked = |view: &ViewSearch| view.swept || (is_alone && !view.found.is_empty());
         let looked_everywhere =
-            self.views.iter().zip(scene.pictures).all(|(view, picture)| view.swept || picture.is_none());
+            self.views.iter().zip(scene.pictures).all(|(view, picture)| looked(view) || picture.is_none());
         if !agreed && !looked_everywhere {
             return Ok(vec![None; found.len()]);
         }
@@ -167,7 +172,9 @@ impl ViewSearch {
         for crop in evidence.map(|evidence| foreground_crops(&evidence, &taken)).unwrap_or_default() {
             self.try_crop(scene.net, scene.config, picture, crop, &taken, scene.nanos)?;
         }
-        if !self.found.is_empty() {
+        // Other views may see the same person at once; if they do not, the hypothesis may be wrong.
+        let had_hope = std::mem::replace(&mut self.has_hope, !self.found.is_empty());
+        if self.has_hope && !had_hope {
             return Ok(());
         }
         let crops = search_crops(picture.width as u32, picture.height as u32);
