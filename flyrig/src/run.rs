@@ -8,8 +8,8 @@ use std::{
 use anyhow::{Result, ensure};
 use flyrig_capture::{CameraStats, Recorder};
 use flyrig_fusion::{
-    Health, Intake, LivePublisher, LiveRig, LiveViews, Outcome, PersonId, PersonMemory, Session, SessionBuilder,
-    resident_mib,
+    Health, Intake, LivePublisher, LiveRig, LiveViews, Origin, Outcome, PersonId, PersonMemory, Session,
+    SessionBuilder, resident_mib,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{dataset, stop};
@@ -70,19 +70,21 @@ fn capture_people(
     Monitor::ready();
     let mut builder = SessionBuilder::new(gpu.clone(), source.rig.clone()).settings(config.session());
     let saved = config.body.person_file().filter(|path| path.exists()).map(PersonMemory::load).transpose()?;
-    let is_known = saved.is_some();
+    let learnt = saved.as_ref().map(|memory| memory.template(&source.template)).transpose()?;
     if let Some(memory) = saved {
-        source.template = memory.template(&source.template)?;
         builder = builder.person(PersonId::default(), memory);
         eprintln!("run: the person is resumed from {}", config.body.person.display());
     }
     let threads = std::mem::take(&mut source.threads);
+    if let (Origin::Given, Some(learnt)) = (config.perception.pose, &learnt) {
+        source.template = learnt.clone();
+    }
     builder = match source.perception(config)? {
         FoundBy::Given(perception) => builder.perception(perception),
         FoundBy::Estimated(mut perception) => {
             eprintln!("run: looking for people; each is measured for a moment, then drawn");
-            if is_known {
-                perception.know_shape(&source.template)?;
+            if let Some(learnt) = &learnt {
+                perception.know_shape(learnt)?;
             }
             builder.perception(*perception)
         }

@@ -226,7 +226,7 @@ impl EstimatedPerception {
             }
             match place.estimator.fit_shape_to_keypoints(keypoints) {
                 Ok(fit) => {
-                    tracing::warn!("person {} is {fit}", place.id);
+                    tracing::info!("person {} is {fit}", place.id);
                     place.know();
                 }
                 Err(error) => {
@@ -254,7 +254,7 @@ impl EstimatedPerception {
                 Err(_) => {
                     let place = &self.places[index];
                     if place.learning.is_none() && place.estimator.sets_lost() == LEFT_AFTER_SETS {
-                        tracing::warn!("person {} has left", place.id);
+                        tracing::info!("person {} has left", place.id);
                     }
                 }
             }
