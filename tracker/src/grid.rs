@@ -94,6 +94,9 @@ impl Grid {
 
     /// Mean over a square of `2 radius + 1` pixels, smaller at the border.
     pub fn box_mean(&self, radius: usize) -> Self {
+        if self.values.is_empty() {
+            return self.clone();
+        }
         let (width, height) = (self.width, self.height);
         let mut across = self.clone();
         for (from, to) in self.values.chunks_exact(width).zip(across.values.chunks_exact_mut(width)) {
