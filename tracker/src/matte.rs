@@ -27,7 +27,7 @@ const NOISE: f32 = 3.0;
 /// Contrast of foreground and background, in standard deviations, at which the solved alpha is half believed.
 const HALF_BELIEVED: f32 = 4.0;
 /// Weight of the part of a pixel that foreground and background do not explain, as doubt about its alpha.
-const REMAINDER: f32 = 16.0;
+const REMAINDER: f32 = 60.0;
 /// Weight of differences in colour beside those in brightness.
 const CHROMA: f32 = 0.8;
 /// Pixels of the mask that look like the background are solved for up to this depth, pixels, as far as evidence is lower.
