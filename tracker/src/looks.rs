@@ -1,4 +1,4 @@
-//! What the network saw in each view, and when it has to look again.
+//! Looks of the network at each view, and when the next one is due.
 //!
 //! A look stays good while the body hardly moves: its landmarks and its mask are carried along with the body. The network is
 //! the dearest part of an estimate, so a view gets a new look only once the body has moved in it.

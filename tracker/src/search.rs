@@ -73,7 +73,7 @@ const BLOB_MARGIN: f64 = 1.25;
 /// Pieces of foreground that are looked at in a picture.
 const BLOBS: usize = 2;
 
-/// What a search is made in.
+/// Images, background and known people of a search.
 pub(crate) struct SearchScene<'a> {
     pub net: &'a PoseNet,
     pub cameras: &'a [Camera],

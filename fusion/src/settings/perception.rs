@@ -49,7 +49,7 @@ pub struct PerceptionSettings {
     #[arg(long, value_name = "COLOUR", default_value = "", hide_default_value = true)]
     pub key_color: String,
     /// Folder of the plates CAM.png (`flyrig plate`); background/ in the data set or the calibration's folder by default.
-    // The parser of paths refuses the empty default.
+    // The parser of paths refuses an empty default.
     #[arg(long, value_name = "FOLDER", default_value = "", hide_default_value = true,
         value_parser = OsStringValueParser::new().map(PathBuf::from))]
     pub plates: PathBuf,
