@@ -1,4 +1,4 @@
-//! The colours of a person's clothes, by which people are told apart.
+//! Colour histograms of clothes, which distinguish people.
 
 use flyrig_capture::to_rgb8;
 use flyrig_types::{FrameSet, Mask};

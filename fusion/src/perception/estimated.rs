@@ -324,8 +324,9 @@ impl EstimatedPerception {
             .filter_map(|(place, estimate)| Some((place.estimator.template(), &estimate.as_ref().ok()?.pose)))
             .map(|(template, pose)| (template.triangles.clone(), skin_mesh(template, pose).0))
             .collect();
-        // Somebody may stand unseen anywhere.
-        if bodies.is_empty() {
+        // Somebody who was lost a moment ago may stand anywhere, and must not become background.
+        let is_missing = |place: &Place| (1..LEFT_AFTER_SETS).contains(&place.estimator.sets_lost()) && place.seen > 0;
+        if bodies.is_empty() || is_missing(first) || others.iter().any(is_missing) {
             return Ok(());
         }
         for (slot, frame) in set.present() {
