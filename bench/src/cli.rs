@@ -168,6 +168,9 @@ pub struct BenchPerceptionArgs {
     /// Leaves out the deformation and the views: poses, shapes and masks alone, in a fraction of the time.
     #[arg(long)]
     pub no_views: bool,
+    /// `perception.look_after_m`: how far the body moves in a view until the network looks at that view again, metres.
+    #[arg(long)]
+    pub look_after_m: Option<f64>,
     /// Folder of the results.
     #[arg(long, default_value = "out/bench-perception")]
     pub out: PathBuf,

@@ -110,6 +110,7 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         pose: inputs.pose,
         shape: (inputs.pose == Origin::Estimated).then_some(inputs.shape),
         masks: inputs.masks,
+        look_after_m: args.look_after_m.unwrap_or(PerceptionSettings::default().look_after_m),
         ..PerceptionSettings::default()
     };
     let body = BodySettings::with_gaussians(args.gaussians);

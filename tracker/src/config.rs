@@ -16,7 +16,8 @@ pub struct PoseConfig {
     pub landmark_spread: f64,
     /// Standard deviation of the body's outline from the mask's (clothes, the body's shape), metres.
     pub outline_sigma_m: f64,
-    /// How often the outline of the body is matched with the masks in a set; 0 fits the pose to landmarks alone.
+    /// How often the outline of the body is matched with the masks, and its texture with the images, in a set; 0 fits the pose
+    /// to landmarks alone.
     pub outline_rounds: usize,
     /// Height of the person, metres; `None` measures it, or takes the template's before a single camera.
     pub height_m: Option<f64>,
@@ -54,7 +55,7 @@ impl Default for PoseConfig {
             height_m: None,
             shape_rounds: 0,
             smooth_rad: 0.15,
-            look_after_m: 0.005,
+            look_after_m: 0.02,
             max_steps: 12,
             fit_shape: true,
             masks: true,

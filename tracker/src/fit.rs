@@ -2,7 +2,7 @@
 //!
 //! The cost is a sum of halves of squared residuals, each divided by its standard deviation: landmark
 //! distances in the pictures and to world points (Cauchy weights), distances of the body's outline from the
-//! masks' (Geman-McClure weights), joint ranges, and the change since the last pose. Levenberg-Marquardt with analytic derivatives; only steps that lower the cost are taken.
+//! masks' and of its texture from the lines of its brightness (Geman-McClure weights), joint ranges, and the change since the last pose. Levenberg-Marquardt with analytic derivatives; only steps that lower the cost are taken.
 
 use flyrig_solve::{
     Convergence, DenseNormal, Kernel, PointPair, Problem, align_rigid, exp_rotation, left_jacobian_inverse,
@@ -14,7 +14,7 @@ use nalgebra::DVector;
 use crate::LANDMARK_COUNT;
 use crate::body_model::{BodyModel, Posed, Turns};
 use crate::habits::spread_m;
-use crate::outline::OutlinePoint;
+use crate::line_point::{LineKind, LinePoint};
 use crate::view::{Observation, View};
 
 /// Share of the network's certainty a landmark deserves in the fit: the face's many points are one body,
@@ -36,10 +36,11 @@ const LANDMARK_WEIGHT: [f64; LANDMARK_COUNT] = {
 
 /// How sharply a joint's limit is enforced, radians.
 const LIMIT_SIGMA: f64 = 0.05;
-/// Outline points in a view that count as many measurements; more of them share their weight, for neighbours err alike.
+/// Points in a view that count as many measurements; more of them share their weight, for neighbours err alike.
 const OUTLINE_COUNT: f64 = 80.0;
-/// Outline distances of this many standard deviations lose three quarters of their weight: they belong to another edge.
-const OUTLINE_ROBUST: f64 = 3.0;
+const TEXTURE_COUNT: f64 = 20.0;
+/// Distances of this many standard deviations lose three quarters of their weight: they belong to another edge.
+const LINE_ROBUST: f64 = 3.0;
 
 /// Weight of outline points where the mask goes beyond the body: a coat or a skirt does that, but no body is outside of its
 /// clothes.
@@ -75,10 +76,8 @@ pub(crate) struct Before {
 pub(crate) struct FitProblem<'a> {
     pub model: &'a BodyModel,
     pub views: &'a [FitView],
-    /// Points of the body's outline with the lines they belong on.
-    pub outline: &'a [OutlinePoint],
-    /// Standard deviation of an outline, metres.
-    pub outline_sigma_m: f64,
+    /// Points of the body's surface with the lines they belong on.
+    pub lines: &'a [LinePoint],
     /// World points of landmarks and their standard deviation in metres.
     pub points: [Option<(DVec3, f64)>; LANDMARK_COUNT],
     pub before: Option<Before>,
@@ -147,27 +146,31 @@ impl FitProblem<'_> {
         }
     }
 
-    /// Calls `each` with every outline point, its place in the world, the derivative of its residual by that place, the
-    /// residual and the weight.
-    fn outline_terms(&self, posed: &Posed, mut each: impl FnMut(&OutlinePoint, DVec3, f64, f64, f64)) {
-        let mut counts = vec![0.0f64; self.views.len()];
-        for point in self.outline {
-            counts[point.view] += 1.0;
+    /// Calls `each` with every point on a line, the derivative of its residual by its place in the world, the residual, the
+    /// weight and the cost.
+    fn line_terms(&self, posed: &Posed, mut each: impl FnMut(&LinePoint, DVec3, f64, f64, f64)) {
+        let mut counts = vec![[0.0f64; 2]; self.views.len()];
+        for point in self.lines {
+            counts[point.view][point.kind as usize] += 1.0;
         }
-        let kernel = Kernel::GemanMcClure(OUTLINE_ROBUST);
-        for point in self.outline {
+        let kernel = Kernel::GemanMcClure(LINE_ROBUST);
+        for point in self.lines {
             let view = &self.views[point.view].view;
             let mut at = point.shift;
             for (joint, weight, local) in &point.bones {
                 at += (posed.origin[*joint] + posed.rotation[*joint] * *local) * *weight;
             }
             let Some((pixel, [du, dv])) = view.project_with_derivative(at) else { continue };
-            let inverse_sigma = 1.0 / (self.outline_sigma_m * point.px_per_m);
+            let inverse_sigma = 1.0 / point.sigma_px;
             let error = pixel.dot(point.normal) - point.offset;
-            let cloth = if error < 0.0 { CLOTH_WEIGHT } else { 1.0 };
+            let count = counts[point.view][point.kind as usize];
+            let importance = match point.kind {
+                LineKind::Outline if error < 0.0 => CLOTH_WEIGHT * (OUTLINE_COUNT / count).min(1.0),
+                LineKind::Outline => (OUTLINE_COUNT / count).min(1.0),
+                LineKind::Texture => (TEXTURE_COUNT / count).min(1.0),
+            };
             let error = error * inverse_sigma;
             let row = (du * point.normal.x + dv * point.normal.y) * inverse_sigma;
-            let importance = cloth * (OUTLINE_COUNT / counts[point.view]).min(1.0);
             let (cost, weight) = kernel.weigh(error * error, importance);
             each(point, row, error, weight, cost);
         }
@@ -215,7 +218,7 @@ impl Problem for FitProblem<'_> {
         let posed = self.model.pose(turns);
         let mut cost = 0.0;
         self.data_terms(&posed, |_, term| cost += term.cost);
-        self.outline_terms(&posed, |_, _, _, _, term| cost += term);
+        self.line_terms(&posed, |_, _, _, _, term| cost += term);
         self.joint_terms(turns, |_, residual, _| cost += 0.5 * residual.length_squared());
         cost + self.root_move(turns).map_or(0.0, |e| 0.5 * e.length_squared())
     }
@@ -280,7 +283,7 @@ impl FitProblem<'_> {
             }
         });
         let mut scalars: Vec<(usize, f64)> = Vec::new();
-        self.outline_terms(&posed, |point, slope, error, weight, _| {
+        self.line_terms(&posed, |point, slope, error, weight, _| {
             scalars.clear();
             scalars.extend(slope.to_array().into_iter().enumerate());
             for (index, &joint) in active.iter().enumerate() {

@@ -29,6 +29,7 @@ mod habits;
 mod key;
 mod landmarks;
 mod light;
+mod line_point;
 mod looks;
 mod matte;
 mod net;
@@ -44,6 +45,7 @@ mod single_view;
 mod surface_marks;
 #[cfg(test)]
 mod testing;
+mod texture;
 mod triangulate;
 mod view;
 

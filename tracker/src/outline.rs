@@ -5,6 +5,7 @@ use flyrig_types::{Camera, Mask};
 use glam::{DVec2, DVec3, Vec3};
 
 use crate::body_model::BodyModel;
+use crate::line_point::{LineKind, LinePoint, bones, undistorted_line};
 use crate::silhouette::drawn_body;
 use crate::view::View;
 
@@ -14,45 +15,6 @@ const RIM_SINE: f64 = 0.4;
 const SPACING_M: f64 = 0.025;
 /// The body must have ended this many pixels outside of a rim point.
 const CLEAR_PX: [f64; 2] = [2.5, 5.0];
-
-/// A point of the body's outline in a view, and the line in the image that it belongs on.
-#[derive(Debug, Clone)]
-pub(crate) struct OutlinePoint {
-    /// Vertex of the template.
-    pub vertex: usize,
-    /// Index of the view in the fit.
-    pub view: usize,
-    /// Normal of the line, undistorted pixels.
-    pub normal: DVec2,
-    /// Place of the line along its normal, undistorted pixels from the principal point.
-    pub offset: f64,
-    /// Pixels that a metre takes at the point.
-    pub px_per_m: f64,
-    /// Joints that carry the vertex, their weights (sum 1) and the vertex from the joint's origin, canonical metres.
-    pub bones: Vec<(usize, f64, DVec3)>,
-    /// Motion from the pose's time to the image's, world metres.
-    pub shift: DVec3,
-}
-
-impl OutlinePoint {
-    /// Hangs the point on the bones of a model of the template's shape.
-    pub fn hang(&mut self, model: &BodyModel, template: &Template) {
-        self.bones = bones(model, template, self.vertex);
-    }
-}
-
-/// Returns joints, weights and places on the bones of a vertex.
-pub(crate) fn bones(model: &BodyModel, template: &Template, vertex: usize) -> Vec<(usize, f64, DVec3)> {
-    let (point, skin) = (template.positions[vertex].as_dvec3(), &template.skin[vertex]);
-    let total: f64 = skin.weights.iter().filter(|w| **w > 0.0).map(|w| f64::from(*w)).sum();
-    let carrying = skin.joints.iter().zip(&skin.weights).filter(|(_, w)| **w > 0.0);
-    carrying
-        .map(|(&joint, &weight)| {
-            let joint = usize::from(joint);
-            (joint, f64::from(weight) / total, point - model.origins[joint])
-        })
-        .collect()
-}
 
 /// A posed body and the camera that sees it.
 pub(crate) struct SeenBody<'a> {
@@ -67,8 +29,8 @@ pub(crate) struct SeenBody<'a> {
 
 impl SeenBody<'_> {
     /// Returns points on the body's outline for which the mask ends within `reach_m` along the outline's normal. Ends of
-    /// the mask at the image's border are no outline.
-    pub fn match_mask(&self, mask: &Mask, view: usize, reach_m: f64) -> Vec<OutlinePoint> {
+    /// the mask at the image's border are no outline. `sigma_m` is the standard deviation of their distance from the mask's.
+    pub fn match_mask(&self, mask: &Mask, view: usize, reach_m: f64, sigma_m: f64) -> Vec<LinePoint> {
         let Some((bounds, body)) = drawn_body(self.camera, self.vertices, &self.template.triangles, 8.0) else {
             return Vec::new();
         };
@@ -106,27 +68,20 @@ impl SeenBody<'_> {
         let point = |(_, vertex, at, direction): (f64, usize, DVec2, DVec2)| {
             let px_per_m = self.view.px_per_m(self.vertices[vertex].as_dvec3())?;
             let end = mask_end(mask, at, direction, reach_m * px_per_m)?;
-            let (on, beyond) = (self.ideal(end)?, self.ideal(end + direction)?);
-            let normal = (beyond - on).normalize_or_zero();
+            let (normal, offset) = undistorted_line(self.camera, self.view, end, direction)?;
             let bones = bones(self.model, self.template, vertex);
-            (normal != DVec2::ZERO && !bones.is_empty()).then(|| OutlinePoint {
+            (!bones.is_empty()).then_some(LinePoint {
+                kind: LineKind::Outline,
                 vertex,
                 view,
                 normal,
-                offset: normal.dot(on),
-                px_per_m,
+                offset,
+                sigma_px: sigma_m * px_per_m,
                 bones,
                 shift: DVec3::ZERO,
             })
         };
         cells.into_values().filter_map(point).collect()
-    }
-
-    /// Undistorted pixel offset from the principal point.
-    fn ideal(&self, pixel: DVec2) -> Option<DVec2> {
-        let intrinsics = &self.camera.intrinsics;
-        let distorted = (pixel - intrinsics.center_px) / intrinsics.focal_px;
-        Some(intrinsics.lens.undistort(distorted)? * self.view.focal_px)
     }
 }
 
@@ -171,14 +126,14 @@ mod tests {
     use crate::body_model::Turns;
     use crate::testing::{body, mask_of, random_turns, ring};
 
-    fn matched(camera: &Camera, mask: &Mask, template: &Template, pose: &Pose) -> Vec<OutlinePoint> {
+    fn matched(camera: &Camera, mask: &Mask, template: &Template, pose: &Pose) -> Vec<LinePoint> {
         let (vertices, normals) = skin_mesh(template, pose);
         let (view, model) = (View::new(camera), BodyModel::new(template).unwrap());
         let seen = SeenBody { camera, view: &view, template, model: &model, vertices: &vertices, normals: &normals };
-        seen.match_mask(mask, 0, 0.1)
+        seen.match_mask(mask, 0, 0.1, 0.01)
     }
 
-    fn place(model: &BodyModel, turns: &Turns, point: &OutlinePoint) -> DVec3 {
+    fn place(model: &BodyModel, turns: &Turns, point: &LinePoint) -> DVec3 {
         let posed = model.pose(turns);
         let part = |(joint, weight, local): &(usize, f64, DVec3)| {
             (posed.origin[*joint] + posed.rotation[*joint] * *local) * *weight
@@ -197,9 +152,9 @@ mod tests {
         let view = View::new(&camera);
         let mut moved = turns.clone();
         moved.root += DVec3::new(0.02, -0.01, 0.015);
-        let distance = |point: &OutlinePoint, turns: &Turns| {
+        let distance = |point: &LinePoint, turns: &Turns| {
             let pixel = view.project(place(&model, turns, point)).unwrap();
-            (pixel.dot(point.normal) - point.offset).abs() / point.px_per_m
+            (pixel.dot(point.normal) - point.offset).abs() / point.sigma_px * 0.01
         };
         let median = |turns: &Turns| {
             let mut all: Vec<f64> = points.iter().map(|point| distance(point, turns)).collect();

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use crate::body_model::{BodyModel, Turns};
 use crate::body_shape::ShapeSpace;
 use crate::fit::{FitProblem, ShapeDerivatives};
-use crate::outline::OutlinePoint;
+use crate::line_point::LinePoint;
 
 /// Step of the derivatives by the shape's parameters.
 const STEP: f64 = 0.01;
@@ -22,7 +22,7 @@ pub(crate) struct ShapeSet<'a> {
     /// Landmarks and views; its model and outline are replaced.
     pub problem: FitProblem<'a>,
     /// Points of the body's outline with the lines they belong on.
-    pub outline: Vec<OutlinePoint>,
+    pub outline: Vec<LinePoint>,
 }
 
 /// Parameters of the shape, and a pose for each set.
@@ -65,7 +65,7 @@ impl ShapeProblem<'_> {
         for point in &mut outline {
             point.hang(model, template);
         }
-        then(&FitProblem { model, outline: &outline, ..set.problem.clone() })
+        then(&FitProblem { model, lines: &outline, ..set.problem.clone() })
     }
 
     fn derivatives(&self, shape: &[f64], template: &Template, model: &BodyModel) -> Option<ShapeDerivatives> {
@@ -192,13 +192,13 @@ mod tests {
         cameras: &[Camera],
         (truth, true_turns): (&Template, &Turns),
         (template, model, turns): (&Template, &BodyModel, &Turns),
-    ) -> Vec<OutlinePoint> {
+    ) -> Vec<LinePoint> {
         let true_model = BodyModel::new(truth).unwrap();
         let (vertices, normals) = skin_mesh(template, &model.to_pose(turns));
         let one = |(index, camera): (usize, &Camera)| {
             let view = View::new(camera);
             let seen = SeenBody { camera, view: &view, template, model, vertices: &vertices, normals: &normals };
-            seen.match_mask(&mask_of(camera, truth, &true_model.to_pose(true_turns)), index, 0.1)
+            seen.match_mask(&mask_of(camera, truth, &true_model.to_pose(true_turns)), index, 0.1, 0.01)
         };
         cameras.iter().enumerate().flat_map(one).collect()
     }

@@ -46,16 +46,7 @@ pub(crate) fn keypoints_of(camera: &Camera, points: &[DVec3; LANDMARK_COUNT]) ->
 
 /// A fit to landmarks alone, without a pose before.
 pub(crate) fn fit_problem<'a>(model: &'a BodyModel, views: &'a [FitView], landmark_spread: f64) -> FitProblem<'a> {
-    FitProblem {
-        model,
-        views,
-        outline: &[],
-        outline_sigma_m: 0.01,
-        points: [None; LANDMARK_COUNT],
-        before: None,
-        landmark_spread,
-        robust: 2.0,
-    }
+    FitProblem { model, views, lines: &[], points: [None; LANDMARK_COUNT], before: None, landmark_spread, robust: 2.0 }
 }
 
 /// The mask of a posed body.

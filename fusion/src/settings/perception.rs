@@ -62,7 +62,7 @@ impl Default for PerceptionSettings {
             masks: Origin::Estimated,
             shape: None,
             people: 1,
-            look_after_m: 0.005,
+            look_after_m: 0.02,
             height_m: None,
             key_color: String::new(),
             plates: PathBuf::new(),

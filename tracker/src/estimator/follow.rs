@@ -1,0 +1,239 @@
+//! From images to landmarks, and from landmarks to a pose.
+
+use super::*;
+
+impl PoseEstimator {
+    /// Follows the person from the last pose; searches the pictures where that fails.
+    pub(super) fn follow_or_search(
+        &mut self,
+        set: &FrameSet,
+        pictures: &[Option<Rgb<'_>>],
+        others: &[Marks],
+        may_search: bool,
+        seconds: &mut StageSeconds,
+    ) -> Result<Fitted, TrackError> {
+        if let Some(track) = &self.track
+            && let Some(fitted) = self.follow(set, pictures, track, others, seconds)?
+        {
+            self.search = Search::default();
+            return Ok(fitted);
+        }
+        let rhythm = (self.lost / 4).clamp(1, RAREST_SEARCH);
+        if !may_search || !self.lost.is_multiple_of(rhythm) {
+            return Err(TrackError::lost(format!("frame set {}: nobody here; the next search is soon", set.index)));
+        }
+        let start = Instant::now();
+        let scene = SearchScene {
+            net: &self.net,
+            cameras: &self.rig.cameras,
+            pictures,
+            backgrounds: &self.backgrounds,
+            nanos: set.master_nanos,
+            taken: others,
+            config: &self.config,
+        };
+        let sightings = self.search.step(&scene)?;
+        let looks: Vec<Option<Look>> = sightings.into_iter().map(|sighting| sighting.map(Look::fresh)).collect();
+        seconds.search += start.elapsed().as_secs_f64();
+        if looks.iter().all(Option::is_none) {
+            return Err(TrackError::lost(format!("frame set {}: nobody found yet; the search goes on", set.index)));
+        }
+        let first = self.fit(set, looks, None, seconds)?;
+        // Look again through crops around the fitted body: turned upright, and in the views that chose nobody.
+        let marks = self.model.marks(&first.turns);
+        let start = Track {
+            turns: first.turns.clone(),
+            nanos: set.master_nanos,
+            marks,
+            velocity: [DVec3::ZERO; LANDMARK_COUNT],
+            looks: vec![None; self.rig.cameras.len()],
+            texture: Texture::default(),
+        };
+        match self.follow(set, pictures, &start, others, seconds)? {
+            Some(second) if second.relative <= first.relative * 1.5 => Ok(second),
+            _ => Ok(first),
+        }
+    }
+
+    /// One look through crops around the predicted body; `None` when the person is not there any more.
+    fn follow(
+        &self,
+        set: &FrameSet,
+        pictures: &[Option<Rgb<'_>>],
+        track: &Track,
+        others: &[Marks],
+        seconds: &mut StageSeconds,
+    ) -> Result<Option<Fitted>, TrackError> {
+        let start = Instant::now();
+        let predicted = track.predicted(set.master_nanos);
+        let look_after_m = if self.looks_at_all { 0.0 } else { self.config.look_after_m };
+        let has_picture = |slot: usize| pictures.get(slot).is_some_and(Option::is_some);
+        let due = due(&track.looks, has_picture, &predicted, set.master_nanos, look_after_m);
+        let looks: Vec<Option<Look>> = pictures
+            .par_iter()
+            .zip(&self.rig.cameras)
+            .enumerate()
+            .map(|(slot, (picture, camera))| {
+                let Some(picture) = picture.as_ref().filter(|_| due[slot]) else {
+                    return Ok(track.looks[slot].clone());
+                };
+                let expected = project_all(camera, &predicted);
+                let Some(crop) = Crop::around(&expected) else { return Ok(None) };
+                let sighting = Sighting::take(&self.net, picture, crop)?;
+                // Two people in one crop: the network may have chosen the other one.
+                let own = sighting.mean_distance(&expected).unwrap_or(f64::INFINITY);
+                let is_other = |marks| sighting.mean_distance(&project_all(camera, marks)).is_some_and(|d| d < own);
+                Ok((!others.iter().any(is_other)).then(|| Look::fresh(sighting)))
+            })
+            .collect::<Result<_, TrackError>>()?;
+        seconds.net += start.elapsed().as_secs_f64();
+        match self.fit(set, looks, Some((track, &predicted)), seconds) {
+            Ok(fitted) if fitted.relative < OFF_TRACK => Ok(Some(fitted)),
+            Ok(_) => Ok(None),
+            Err(error) if error.kind == TrackErrorKind::Lost => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    fn fit(
+        &self,
+        set: &FrameSet,
+        looks: Vec<Option<Look>>,
+        track: Option<(&Track, &[DVec3; LANDMARK_COUNT])>,
+        seconds: &mut StageSeconds,
+    ) -> Result<Fitted, TrackError> {
+        let config = &self.config;
+        let lost = |what: &str| TrackError::lost(format!("frame set {}: {what}", set.index));
+        let sees = |look: &&Look| look.sighting.output.presence >= config.presence_threshold;
+        let keypoints: Vec<Option<ViewKeypoints>> = looks
+            .iter()
+            .map(|look| {
+                let look = look.as_ref().filter(|look| look.body.is_none());
+                look.filter(sees).map(|look| look.sighting.keypoints)
+            })
+            .collect();
+        let start = Instant::now();
+        let points = triangulate(&self.rig.cameras, &keypoints, config.confidence_threshold, config.inlier_m);
+        seconds.triangulate += start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let mut views = Vec::new();
+        for (slot, frame) in set.present() {
+            let camera = &self.rig.cameras[slot];
+            let view = View::new(camera);
+            let delay_secs = secs(frame.capture_nanos.saturating_sub(set.master_nanos));
+            let delay_secs = delay_secs.clamp(-MAX_DELAY_SECS, MAX_DELAY_SECS);
+            let mut seen = [None; LANDMARK_COUNT];
+            let mut shift = [DVec3::ZERO; LANDMARK_COUNT];
+            if let Some(look) = looks[slot].as_ref().filter(sees) {
+                seen = observe(camera, &view, &look.sighting.keypoints, config.confidence_threshold);
+                if let Some((track, predicted)) = track {
+                    for (i, (carried, trust)) in look.carried(&track.marks, predicted).into_iter().enumerate() {
+                        shift[i] = track.velocity[i] * delay_secs + carried;
+                        seen[i] = seen[i].map(|seen| Observation { confidence: seen.confidence * trust, ..seen });
+                    }
+                }
+            }
+            views.push(FitView { slot, view, seen, shift, delay_secs });
+        }
+        let most = views.iter().map(|v| v.seen.iter().flatten().count()).max().unwrap_or(0);
+        if most < MIN_LANDMARKS {
+            return Err(lost("no view shows enough of a person"));
+        }
+        let mut evidence = Evidence { views, points: [None; LANDMARK_COUNT], before: None };
+        // One view alone says nothing of depth: the network's own guess at the third dimension stands in.
+        let triangulated = points.iter().flatten().count();
+        let mut world = points.each_ref().map(|point| point.as_ref().map(|p| p.position));
+        if triangulated < MIN_LANDMARKS {
+            let sightings = looks.iter().map(|look| look.as_ref().map(|look| &*look.sighting));
+            let seen = keypoints.iter().zip(sightings).zip(&self.rig.cameras);
+            let surest = seen
+                .filter_map(|((k, s), camera)| k.as_ref().and(s).map(|s| (s, camera)))
+                .max_by(|a, b| a.0.output.presence.total_cmp(&b.0.output.presence));
+            let scale = self.model.trunk_length() / 0.5;
+            let lifted = surest.and_then(|(s, camera)| lift(camera, s, config.confidence_threshold, scale));
+            if let Some(lifted) = lifted {
+                world = lifted;
+                evidence.points = lifted.map(|point| point.map(|p| (p, 0.1)));
+            }
+        }
+        let turns = match track {
+            Some((track, _)) => {
+                let dt = secs(set.master_nanos.saturating_sub(track.nanos));
+                let sigma_rad = config.smooth_rad * (dt * 30.0).clamp(0.1, 30.0).sqrt();
+                evidence.before = Some(Before { turns: track.turns.clone(), sigma_rad });
+                evidence.problem(&self.model, config).solve(&track.turns, config.max_steps)
+            }
+            None => {
+                let aligned = align_trunk(&self.model, &world)
+                    .ok_or_else(|| lost("the views do not agree on a person's trunk"))?;
+                let problem = evidence.problem(&self.model, config);
+                // World points first: their cost has no far minima behind the cameras.
+                let near = FitProblem {
+                    points: world.map(|point| point.map(|p| (p, 0.03))),
+                    views: &[],
+                    robust: 6.0,
+                    ..problem.clone()
+                };
+                let near = near.solve(&aligned, 40).map_or(aligned, |(turns, _)| turns);
+                problem.solve(&near, 40)
+            }
+        };
+        seconds.fit += start.elapsed().as_secs_f64();
+        let (turns, _) = turns.filter(|(turns, _)| finite(turns)).ok_or_else(|| lost("the fit has no finite cost"))?;
+        self.judge(turns, looks, keypoints, points, evidence).ok_or_else(|| lost("no landmark agrees with the fit"))
+    }
+
+    /// Distances of the landmarks from the fitted body.
+    fn judge(
+        &self,
+        turns: Turns,
+        looks: Vec<Option<Look>>,
+        keypoints: Vec<Option<ViewKeypoints>>,
+        points: [Option<WorldPoint>; LANDMARK_COUNT],
+        evidence: Evidence,
+    ) -> Option<Fitted> {
+        let marks = self.model.marks(&turns);
+        let mut all = Vec::new();
+        let mut all_relative = Vec::new();
+        let mut views = Vec::with_capacity(keypoints.len());
+        for (slot, look) in looks.iter().enumerate() {
+            let presence = look.as_ref().map_or(0.0, |look| look.sighting.output.presence);
+            let mut distances = Vec::new();
+            let mut inliers = 0;
+            let fit_view = evidence.views.iter().find(|view| view.slot == slot);
+            if let Some(fit_view) = fit_view {
+                for (i, seen) in fit_view.seen.iter().enumerate() {
+                    let Some(seen) = seen else { continue };
+                    let moved = fit_view.view.project(marks[i] + fit_view.shift[i]);
+                    let (Some(pixel), Some(px_per_m)) = (moved, fit_view.view.px_per_m(marks[i])) else { continue };
+                    let distance = (pixel - seen.ideal_px).length();
+                    let relative = distance / (px_per_m * self.config.inlier_m);
+                    distances.push(distance);
+                    all.push(distance);
+                    all_relative.push(relative);
+                    inliers += usize::from(relative < 1.0);
+                }
+            }
+            let no_mask = Some(if self.config.masks { NoMask::NoFrame } else { NoMask::Off });
+            views.push(ViewQuality {
+                presence,
+                inliers,
+                residual_px: median(&mut distances),
+                mask_overlap: None,
+                no_mask,
+            });
+        }
+        let residual_px = median(&mut all)?;
+        let relative = median(&mut all_relative)?;
+        (residual_px.is_finite() && relative.is_finite()).then_some(Fitted {
+            turns,
+            looks,
+            keypoints,
+            points,
+            views,
+            residual_px,
+            relative,
+            evidence,
+        })
+    }
+}

@@ -1,0 +1,59 @@
+//! Masks of the person whose pose is known.
+
+use super::*;
+
+impl PoseEstimator {
+    /// Masks by slot; why there is none goes into the views' quality.
+    pub(super) fn masks(&self, set: &FrameSet, pictures: &[Option<Rgb<'_>>], fitted: &mut Fitted) -> Vec<Option<Mask>> {
+        if !self.config.masks {
+            return vec![None; pictures.len()];
+        }
+        let made: Vec<Result<(Mask, f64), NoMask>> = pictures
+            .par_iter()
+            .enumerate()
+            .map(|(slot, picture)| {
+                let picture = picture.as_ref().ok_or(NoMask::NoFrame)?;
+                let camera = &self.rig.cameras[slot];
+                let (vertices, _) = self.skinned(&fitted.turns, set, fitted.delay_secs(slot));
+                let gate = BodyGate::new(camera, &vertices, &self.template.triangles).ok_or(NoMask::OutOfView)?;
+                let look = fitted.looks[slot].as_ref();
+                let look = look.filter(|l| l.sighting.output.presence >= self.config.presence_threshold);
+                let evidence =
+                    self.background(slot).and_then(|known| known.evidence(picture, &|at| !gate.reaches_pixel(at)));
+                let mask = match (look, &evidence) {
+                    (Some(look), evidence) => {
+                        let coarse = match &look.body {
+                            None => coarse_mask(&look.sighting, gate.bounds),
+                            Some(body) => {
+                                let (then, _) = self.skinned(&body.turns, set, fitted.delay_secs(slot));
+                                let (then, now) = (corners(camera, &then), corners(camera, &vertices));
+                                carried_mask(&look.sighting, &then, &now, gate.bounds)
+                            }
+                        };
+                        refine(picture, &coarse, look.sighting.crop.scale(), &gate, evidence.as_ref())
+                    }
+                    // The network sees nobody here, but the other cameras place the body in this picture.
+                    (None, Some(evidence)) => gated_mask(evidence, &gate),
+                    (None, None) => return Err(NoMask::NoPerson),
+                };
+                let mask = mask.ok_or(NoMask::Empty)?;
+                let overlap = gate.overlap(&mask);
+                Ok((mask, overlap))
+            })
+            .collect();
+        let mut masks = Vec::with_capacity(made.len());
+        for (view, made) in fitted.views.iter_mut().zip(made) {
+            masks.push(match made {
+                Ok((made, overlap)) => {
+                    (view.mask_overlap, view.no_mask) = (Some(overlap), None);
+                    Some(made)
+                }
+                Err(reason) => {
+                    view.no_mask = Some(reason);
+                    None
+                }
+            });
+        }
+        masks
+    }
+}

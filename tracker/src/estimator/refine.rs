@@ -1,0 +1,146 @@
+//! The fit of the pose to masks and texture.
+
+use super::*;
+
+/// Farthest that the outline of a body near its place lies from the mask's, metres.
+const OUTLINE_REACH_M: f64 = 0.05;
+/// Steps of the solver in each round of matching.
+const STEPS: usize = 4;
+/// Radius of the filter over an image's brightness, cells: the wider, the farther a surface may be from its place.
+const SMOOTH: [usize; LEVELS] = [2, 1];
+
+/// World positions and normals of the template's vertices.
+type Skinned = (Vec<Vec3>, Vec<Vec3>);
+
+/// The body in a pose, at the set's time and at that of each view's image.
+struct PosedBody {
+    now: Skinned,
+    /// By view of the fit; `None` where it is the set's time.
+    own: Vec<Option<Skinned>>,
+}
+
+impl PosedBody {
+    fn at(&self, view: usize) -> &Skinned {
+        self.own[view].as_ref().unwrap_or(&self.now)
+    }
+}
+
+impl PoseEstimator {
+    /// Moves the pose so that the body's outline lies on that of the masks, and its texture where it was seen before. Returns
+    /// the texture as it is seen now as well.
+    pub(super) fn refine(
+        &self,
+        set: &FrameSet,
+        pictures: &[Option<Rgb<'_>>],
+        fitted: &Fitted,
+        masks: &[Option<&Mask>],
+    ) -> (Turns, Texture) {
+        let mut turns = fitted.turns.clone();
+        let mut body = self.posed(set, fitted, &turns);
+        let of_view = |view: &FitView| {
+            let picture = pictures.get(view.slot).and_then(Option::as_ref);
+            let camera = &self.rig.cameras[view.slot];
+            SMOOTH.map(|smooth| Brightness::around(picture?, camera, &view.view, &body.now.0, smooth))
+        };
+        let images: Vec<[Option<Brightness>; LEVELS]> = fitted.evidence.views.par_iter().map(of_view).collect();
+        let known = self.track.as_ref().map(|track| &track.texture);
+        for round in 0..self.config.outline_rounds {
+            // Far first, then only what is near.
+            let last = round + 1 >= self.config.outline_rounds;
+            let outline = self.outline_points(fitted, &body, masks, if last { 1.0 } else { 2.0 });
+            let texture = known.map_or_else(Vec::new, |texture| {
+                self.texture_points(fitted, &body, texture, usize::from(last), |view, level| {
+                    images[view][level].as_ref()
+                })
+            });
+            let lines = [outline, texture].concat();
+            if lines.is_empty() {
+                break;
+            }
+            let mut problem = fitted.evidence.problem(&self.model, &self.config);
+            problem.lines = &lines;
+            let Some((better, _)) = problem.solve(&turns, STEPS).filter(|(turns, _)| finite(turns)) else {
+                break;
+            };
+            turns = better;
+            body = self.posed(set, fitted, &turns);
+        }
+        let mut texture = known.cloned().unwrap_or_else(|| Texture::new(&self.template, self.rig.cameras.len()));
+        for (index, (view, image)) in fitted.evidence.views.iter().zip(&images).enumerate() {
+            if let [Some(far), Some(near)] = image {
+                let mask = masks.get(view.slot).copied().flatten();
+                texture.learn(&self.textured(view, body.at(index)), [far, near], mask, view.slot, set.master_nanos);
+            }
+        }
+        (turns, texture)
+    }
+
+    /// The outline of the body in a pose, matched with the masks of all views.
+    pub(super) fn match_outline(
+        &self,
+        set: &FrameSet,
+        fitted: &Fitted,
+        turns: &Turns,
+        masks: &[Option<&Mask>],
+        widen: f64,
+    ) -> Vec<LinePoint> {
+        self.outline_points(fitted, &self.posed(set, fitted, turns), masks, widen)
+    }
+
+    fn posed(&self, set: &FrameSet, fitted: &Fitted, turns: &Turns) -> PosedBody {
+        let own = |view: &FitView| {
+            (view.delay_secs.abs() > MIN_DELAY_SECS).then(|| self.skinned(turns, set, view.delay_secs))
+        };
+        PosedBody { now: self.skinned(turns, set, 0.0), own: fitted.evidence.views.iter().map(own).collect() }
+    }
+
+    fn textured<'a>(&'a self, view: &'a FitView, (vertices, normals): &'a Skinned) -> TexturedBody<'a> {
+        TexturedBody { camera: &self.rig.cameras[view.slot], view: &view.view, vertices, normals }
+    }
+
+    /// The surface of the body, matched with its brightness in all views.
+    fn texture_points<'a>(
+        &self,
+        fitted: &Fitted,
+        body: &PosedBody,
+        texture: &Texture,
+        level: usize,
+        image: impl Fn(usize, usize) -> Option<&'a Brightness> + Sync,
+    ) -> Vec<LinePoint> {
+        let of_view = |(index, view): (usize, &FitView)| {
+            let Some(image) = image(index, level) else { return Vec::new() };
+            let seen = self.textured(view, body.at(index));
+            let mut points = texture.lines((&self.template, &self.model), &seen, image, level, (view.slot, index));
+            shift(&mut points, body, index);
+            points
+        };
+        fitted.evidence.views.par_iter().enumerate().flat_map_iter(of_view).collect()
+    }
+
+    /// The outline of the body, matched with the masks of all views within a multiple of the usual reach.
+    fn outline_points(&self, fitted: &Fitted, body: &PosedBody, masks: &[Option<&Mask>], widen: f64) -> Vec<LinePoint> {
+        let of_view = |(index, view): (usize, &FitView)| {
+            let Some(mask) = masks.get(view.slot).copied().flatten() else { return Vec::new() };
+            let (vertices, normals) = body.at(index);
+            let seen = SeenBody {
+                camera: &self.rig.cameras[view.slot],
+                view: &view.view,
+                template: &self.template,
+                model: &self.model,
+                vertices,
+                normals,
+            };
+            let mut points = seen.match_mask(mask, index, widen * OUTLINE_REACH_M, widen * self.config.outline_sigma_m);
+            shift(&mut points, body, index);
+            points
+        };
+        fitted.evidence.views.par_iter().enumerate().flat_map_iter(of_view).collect()
+    }
+}
+
+/// Notes how far the points of a view move from the set's time to the image's.
+fn shift(points: &mut [LinePoint], body: &PosedBody, view: usize) {
+    for point in points {
+        point.shift = (body.at(view).0[point.vertex] - body.now.0[point.vertex]).as_dvec3();
+    }
+}
