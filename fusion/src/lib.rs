@@ -48,6 +48,6 @@ pub use settings::{
 pub use stage_times::{StageSummary, StageTimes, processor_time, resident_mib};
 pub use subject::{Observed, PROCESSOR_STAGE, Subject};
 pub use track_state::{Remedy, TrackState, TrackWatch};
-pub use viewpoints::{center_of_attention, orbit};
+pub use viewpoints::orbit;
 
 pub use flyrig_types::{FrameSet, PersonId};

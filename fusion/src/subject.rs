@@ -20,7 +20,6 @@ use crate::{
     deformation::{DeformTimes, Deformation, Instants, TrackedView},
     pose_curve::PoseCurve,
     stage_times::processor_time,
-    viewpoints::center_of_attention,
 };
 
 /// Seed of the surface sampling: the same template gives the same Gaussians on every run.
@@ -632,7 +631,7 @@ impl Subject {
 
 /// Width on the person of a pixel of the finest camera, at the point that all cameras look at, metres.
 fn finest_pixel_m(rig: &Rig) -> f64 {
-    let center = center_of_attention(rig);
+    let center = rig.center_of_attention();
     let pixel = |camera: &Camera| camera.position().distance(center) / (0.5 * camera.intrinsics.focal_px.element_sum());
     rig.cameras.iter().map(pixel).fold(f64::INFINITY, f64::min)
 }

@@ -1,34 +1,14 @@
 //! Cameras of our own: a circle around the person.
 
 use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Lens, Rig};
-use glam::{DMat3, DQuat, DVec2, DVec3};
-
-/// Returns the point that the rig's cameras look at: closest to all optical axes, in the least-squares sense; world metres.
-#[must_use]
-pub fn center_of_attention(rig: &Rig) -> DVec3 {
-    let mut normal = DMat3::from_diagonal(DVec3::splat(1e-6));
-    let mut right = DVec3::ZERO;
-    for camera in &rig.cameras {
-        let axis = camera.camera_from_world.rotation.inverse() * DVec3::Z;
-        let projector = DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
-        normal += projector;
-        right += projector * camera.position();
-    }
-    let center = normal.inverse() * right;
-    // A single camera, or parallel ones, fix no point: take one 3 m in front.
-    let Some(first) = rig.cameras.first() else { return DVec3::ZERO };
-    if rig.cameras.len() < 2 || !center.is_finite() || center.distance(first.position()) > 1e3 {
-        return first.position() + first.camera_from_world.rotation.inverse() * DVec3::Z * 3.0;
-    }
-    center
-}
+use glam::{DQuat, DVec2};
 
 /// Returns a camera on a circle around the person, starting beside the rig's first camera. `turn` in whole turns. The field
 /// of view is that of the rig's first camera.
 #[must_use]
 pub fn orbit(rig: &Rig, turn: f64, width: u32, height: u32, name: &str) -> Option<Camera> {
     let first = rig.cameras.first()?;
-    let center = center_of_attention(rig);
+    let center = rig.center_of_attention();
     let arm = DQuat::from_axis_angle(rig.world_up, turn * std::f64::consts::TAU) * (first.position() - center);
     let i = &first.intrinsics;
     // The whole height of the first camera's picture fits the height of ours.
@@ -48,6 +28,8 @@ pub fn orbit(rig: &Rig, turn: f64, width: u32, height: u32, name: &str) -> Optio
 
 #[cfg(test)]
 mod tests {
+    use glam::DVec3;
+
     use super::*;
 
     fn rig(eyes: &[DVec3]) -> Rig {
@@ -69,7 +51,7 @@ mod tests {
     #[test]
     fn the_orbit_looks_at_what_the_rig_looks_at() {
         let rig = rig(&[DVec3::new(3.0, 0.0, 1.2), DVec3::new(0.0, 3.0, 1.0), DVec3::new(-2.0, -2.0, 1.4)]);
-        assert!(center_of_attention(&rig).distance(DVec3::new(0.2, 0.1, 1.0)) < 1e-4);
+        assert!(rig.center_of_attention().distance(DVec3::new(0.2, 0.1, 1.0)) < 1e-4);
         for turn in [0.0, 0.25, 0.7] {
             let camera = orbit(&rig, turn, 512, 512, "main").unwrap();
             camera.validate().unwrap();

@@ -68,6 +68,8 @@ impl Sighting {
 
 /// Hypotheses older than this are forgotten, nanoseconds: a person walks on.
 const FORGET_NANOS: i64 = 1_000_000_000;
+/// Somebody this far from what the cameras look at is taken for another half as readily, metres.
+const NEAR_CENTER_M: f64 = 2.0;
 /// A crop around a piece of foreground is larger by this factor.
 const BLOB_MARGIN: f64 = 1.25;
 /// Pieces of foreground that are looked at in a picture.
@@ -81,6 +83,8 @@ pub(crate) struct SearchScene<'a> {
     /// By slot.
     pub backgrounds: &'a [Option<Background>],
     pub nanos: i64,
+    /// What the cameras look at: who stands nearest is chosen, world metres.
+    pub center: DVec3,
     /// Landmarks of people who are tracked already.
     pub taken: &'a [[DVec3; LANDMARK_COUNT]],
     pub config: &'a PoseConfig,
@@ -120,7 +124,7 @@ impl Search {
         self.ask_other_views(scene)?;
         let found: Vec<Vec<Sighting>> =
             self.views.iter().map(|view| view.found.iter().map(|(sighting, _)| sighting.clone()).collect()).collect();
-        let choice = choose(scene.cameras, &found, scene.config);
+        let choice = choose(scene, &found);
         let agreed = choice.iter().flatten().count() > 1;
         // Nobody can disagree with a single camera.
         let is_alone = scene.pictures.iter().flatten().count() == 1;
@@ -273,7 +277,8 @@ fn foreground_crops(evidence: &Grid, taken: &[[Option<DVec2>; LANDMARK_COUNT]]) 
 }
 
 /// Index of the chosen hypothesis of each view.
-fn choose(cameras: &[Camera], found: &[Vec<Sighting>], config: &PoseConfig) -> Vec<Option<usize>> {
+fn choose(scene: &SearchScene<'_>, found: &[Vec<Sighting>]) -> Vec<Option<usize>> {
+    let (cameras, config) = (scene.cameras, scene.config);
     let keypoints = |choice: &[Option<usize>]| -> Vec<Option<ViewKeypoints>> {
         choice.iter().zip(found).map(|(index, found)| index.map(|i| found[i].keypoints)).collect()
     };
@@ -285,7 +290,7 @@ fn choose(cameras: &[Camera], found: &[Vec<Sighting>], config: &PoseConfig) -> V
         let agreeing = points.iter().flatten().map(|p| p.inliers.len() as f64).sum::<f64>();
         let seen: f64 = choice.iter().zip(found).filter_map(|(index, found)| index.map(|i| found[i].score())).sum();
         // Scores only break ties between people whom the same number of views agree on.
-        agreeing + 0.5 * seen
+        (agreeing + 0.5 * seen) / (1.0 + (distance_from(scene.center, &points) / NEAR_CENTER_M).powi(2))
     };
     let mut best = (0.0, vec![None; found.len()]);
     for a in 0..found.len() {
@@ -332,6 +337,13 @@ fn choose(cameras: &[Camera], found: &[Vec<Sighting>], config: &PoseConfig) -> V
     choice
 }
 
+/// Mean distance of a person's landmarks from a place, metres.
+fn distance_from(center: DVec3, points: &[Option<WorldPoint>; LANDMARK_COUNT]) -> f64 {
+    let (sum, count) =
+        points.iter().flatten().fold((DVec3::ZERO, 0.0), |(sum, count), point| (sum + point.position, count + 1.0));
+    (sum / f64::max(count, 1.0)).distance(center)
+}
+
 /// Whether the trunk is there and as large as a person's.
 fn human_size(points: &[Option<WorldPoint>; LANDMARK_COUNT]) -> bool {
     let count = points.iter().flatten().count();
@@ -350,6 +362,8 @@ pub(crate) fn project_all(camera: &Camera, points: &[DVec3; LANDMARK_COUNT]) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::body_model::BodyModel;
+    use crate::testing::{body, keypoints_of, random_turns, ring};
 
     const SIDE: usize = 120;
 
@@ -375,6 +389,50 @@ mod tests {
         let crops = foreground_crops(&scene(), &[known]);
         assert_eq!(crops.len(), 1);
         assert!(crops[0].center.distance(DVec2::new(19.5, 59.5)) < 1.5, "{:?}", crops[0]);
+    }
+
+    /// Sightings of people at several places on the floor by a ring of cameras.
+    fn seen_by(cameras: &[Camera], people: &[DVec3]) -> Vec<Vec<Sighting>> {
+        let model = BodyModel::new(&body()).unwrap();
+        let marks = model.marks(&random_turns(&model, 3));
+        let sighting = |camera: &Camera, place: &DVec3| {
+            let keypoints = keypoints_of(camera, &marks.map(|mark| mark + *place));
+            let output = NetOutput { landmarks: [Default::default(); LANDMARK_COUNT], presence: 0.9, mask: Vec::new() };
+            let crop = Crop::around(&std::array::from_fn(|i| Some(keypoints[i].pixel)))?;
+            Some(Sighting { crop, output, keypoints })
+        };
+        cameras.iter().map(|camera| people.iter().filter_map(|place| sighting(camera, place)).collect()).collect()
+    }
+
+    #[test]
+    fn the_person_nearest_to_what_the_cameras_look_at_is_chosen_whoever_is_larger() {
+        let rig = ring(3);
+        let config = PoseConfig::default();
+        let net = PoseNet::embedded().unwrap();
+        let scene = SearchScene {
+            net: &net,
+            cameras: &rig.cameras,
+            pictures: &[],
+            backgrounds: &[],
+            nanos: 0,
+            center: rig.center_of_attention(),
+            taken: &[],
+            config: &config,
+        };
+        // The second one is nearer to the first camera, so larger in its image.
+        for (people, nearest) in
+            [([DVec3::ZERO, DVec3::new(0.9, 0.9, 0.0)], 0), ([DVec3::new(0.9, 0.9, 0.0), DVec3::new(0.1, 0.0, 0.0)], 1)]
+        {
+            let choice = choose(&scene, &seen_by(&rig.cameras, &people));
+            assert_eq!(choice, vec![Some(nearest); 3], "{people:?}");
+        }
+        let poisoned = SearchScene { center: DVec3::NAN, ..scene };
+        assert_eq!(
+            choose(&poisoned, &seen_by(&rig.cameras, &[DVec3::ZERO])).len(),
+            3,
+            "poison chooses anybody or nobody"
+        );
+        assert!(choose(&poisoned, &[]).is_empty());
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Camera models: pinhole with lens distortion, pose in the world, rigs.
 
-use glam::{DVec2, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::{CameraId, Isometry};
@@ -283,6 +283,26 @@ pub struct Rig {
 }
 
 impl Rig {
+    /// Returns the point that the cameras look at: closest to all optical axes, in the least-squares sense; world metres.
+    #[must_use]
+    pub fn center_of_attention(&self) -> DVec3 {
+        let mut normal = DMat3::from_diagonal(DVec3::splat(1e-6));
+        let mut right = DVec3::ZERO;
+        for camera in &self.cameras {
+            let axis = camera.camera_from_world.rotation.inverse() * DVec3::Z;
+            let projector = DMat3::IDENTITY - DMat3::from_cols(axis * axis.x, axis * axis.y, axis * axis.z);
+            normal += projector;
+            right += projector * camera.position();
+        }
+        let center = normal.inverse() * right;
+        // A single camera, or parallel ones, fix no point: take one 3 m in front.
+        let Some(first) = self.cameras.first() else { return DVec3::ZERO };
+        if self.cameras.len() < 2 || !center.is_finite() || center.distance(first.position()) > 1e3 {
+            return first.position() + first.camera_from_world.rotation.inverse() * DVec3::Z * 3.0;
+        }
+        center
+    }
+
     /// Checks every camera and that names are unique.
     ///
     /// # Errors

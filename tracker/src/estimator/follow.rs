@@ -29,6 +29,7 @@ impl PoseEstimator {
             pictures,
             backgrounds: &self.backgrounds,
             nanos: set.master_nanos,
+            center: self.rig.center_of_attention(),
             taken: others,
             config: &self.config,
         };
