@@ -11,7 +11,7 @@ use flyrig_tracker::{
     FACE_SIDE, FaceNet, FaceStudy, HAND_LANDMARKS, HAND_SIDE, HandConfig, HandNet, HandTracker, HandsQuality,
     PoseConfig, PoseEstimator, PoseNet,
 };
-use flyrig_types::{Frame, FrameSet, Pose};
+use flyrig_types::{Frame, FrameSet, Image, Mask, Pose};
 use glam::DVec3;
 
 use crate::cli::BenchHandsArgs;
@@ -110,7 +110,7 @@ fn frame_set(simulator: &mut Simulator, index: u64) -> Result<FrameSet> {
     let nanos = (index as f64 * SET_SECS * 1e9) as i64;
     let slots: Vec<usize> = (0..simulator.rig().cameras.len()).collect();
     let pictures = simulator.capture_all(nanos, &slots)?;
-    let frame = |(slot, (image, mask))| {
+    let frame = |(slot, (image, mask)): (usize, (Image, Mask))| {
         let camera = simulator.rig().cameras[slot].id.clone();
         let frame =
             Frame { camera, sequence: index, capture_nanos: nanos, exposure_nanos: None, image, mask: Some(mask) };

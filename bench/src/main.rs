@@ -22,6 +22,8 @@ mod write;
 #[cfg(test)]
 mod desync_tests;
 #[cfg(test)]
+mod hands_tests;
+#[cfg(test)]
 mod state_tests;
 
 use std::process::ExitCode;
