@@ -31,6 +31,8 @@ pub enum BenchCommand {
     Appearance(BenchAppearanceArgs),
     /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to whole sets.
     Capture(BenchCaptureArgs),
+    /// Fingertips and the head's rotation on simulated people, estimated and relaxed, and the cost of a crop.
+    Hands(BenchHandsArgs),
     /// Bias and spread of the landmark network on people whose pose is known.
     Landmarks(BenchLandmarksArgs),
     /// Pose, shape and masks from images: errors, and what each of them costs in the views; writes a table and JSON.
@@ -130,6 +132,34 @@ pub struct BenchRecordArgs {
     /// Folder for the recordings, which are removed again; the system's for temporary files otherwise.
     #[arg(long)]
     pub folder: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchHandsArgs {
+    /// Lengths of the hands in the pictures, pixels, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "20,40,80")]
+    pub px: Vec<f64>,
+    /// Seed of the first person; the others follow.
+    #[arg(long, default_value_t = 401)]
+    pub seed: u64,
+    /// How many people.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub people: u64,
+    /// Frame sets of each person, 0.2 seconds apart.
+    #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub frames: u64,
+    /// Cameras on a ring of 3 metres.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=32).map(usize::from))]
+    pub cameras: usize,
+    /// ONNX file of another hand network with the same outputs.
+    #[arg(long)]
+    pub hand_net: Option<PathBuf>,
+    /// Folder for the pictures of each person's first set.
+    #[arg(long)]
+    pub pictures: Option<PathBuf>,
+    /// Learns the face's points instead and prints their table, at the largest of the lengths.
+    #[arg(long)]
+    pub learn_face: bool,
 }
 
 #[derive(Debug, Args)]

@@ -5,6 +5,7 @@ mod capture;
 mod case;
 mod cli;
 mod endure;
+mod hands;
 mod landmarks;
 mod mask_errors;
 mod perception;
@@ -20,6 +21,8 @@ mod write;
 
 #[cfg(test)]
 mod desync_tests;
+#[cfg(test)]
+mod hands_tests;
 #[cfg(test)]
 mod state_tests;
 
@@ -44,6 +47,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         BenchCommand::Endure(args) => endure::endure(args, &gpu()?),
         BenchCommand::Appearance(args) => appearance::appearance(args, &gpu()?),
         BenchCommand::Capture(args) => capture::capture(args),
+        BenchCommand::Hands(args) => hands::hands(args, &gpu()?),
         BenchCommand::Landmarks(args) => landmarks::landmarks(args),
         BenchCommand::Perception(args) => perception::perception(args, &gpu()?),
         BenchCommand::Subjects(args) => subjects::subjects(args, &gpu()?),

@@ -38,7 +38,7 @@ fn part_of_name(name: &str) -> Option<Part> {
     }
 }
 
-fn is_left(name: &str) -> bool {
+pub(crate) fn is_left(name: &str) -> bool {
     if name.contains("right") || name.contains("left") {
         return name.contains("left");
     }

@@ -52,6 +52,9 @@ impl PersonMemory {
     /// [`FusionError::SavedPerson`] when it was learnt with a template of other vertices or joints.
     pub fn template(&self, base: &Template) -> Result<Template, FusionError> {
         let names = |joints: &[Joint]| joints.iter().map(|joint| joint.name.clone()).collect::<Vec<_>>();
+        // A person whose fingers were estimated.
+        let with_fingers = base.with_fingers().ok().filter(|with| names(&self.joints) == names(with.skeleton.joints()));
+        let base = with_fingers.as_ref().unwrap_or(base);
         if self.positions.len() != base.positions.len() || names(&self.joints) != names(base.skeleton.joints()) {
             return Err(fault(
                 &base.name,

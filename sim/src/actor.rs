@@ -28,7 +28,7 @@ pub(crate) struct Shape {
 
 impl Actor {
     pub(crate) fn new(config: &SimConfig) -> Result<Self, SimError> {
-        let person = Person::new(&Look::new(config), config.seed, config.texture_px as usize)?;
+        let person = Person::new(&Look::new(config), config.seed, config.texture_px as usize, config.person.fingers)?;
         let track = motion::track(config, &person)?;
         let cloth = Cloth::new(&person);
         Ok(Self { person, track, cloth })

@@ -68,6 +68,8 @@ pub enum Build {
 pub struct PersonConfig {
     /// Body build.
     pub build: Build,
+    /// Whether the body has finger joints, which make gestures. Poses then have 28 more joints.
+    pub fingers: bool,
 }
 
 /// Kind of motion. All but the clips from files are made for the body, need no file, and close without a seam.

@@ -32,6 +32,7 @@ mod face;
 mod faults;
 mod features;
 mod figure;
+mod fingers;
 mod frame;
 mod furniture;
 mod garments;

@@ -9,6 +9,7 @@ use glam::DVec3;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use crate::clips::{clip, passing};
+use crate::fingers::with_fingers;
 use crate::person::Person;
 use crate::puppet::Puppet;
 use crate::shoes::SOLE_M;
@@ -38,7 +39,10 @@ fn existing(path: &Path) -> Result<PathBuf, SimError> {
 
 /// The configured motion of a person, standing on the floor, around the configured place.
 pub(crate) fn track(config: &SimConfig, person: &Person) -> Result<PoseTrack, SimError> {
-    let track = track_around_origin(config, person)?;
+    let mut track = track_around_origin(config, person)?;
+    if config.person.fingers {
+        track = with_fingers(&track, &person.body.skeleton, config.seed)?;
+    }
     let [x, y] = config.motion.at_m;
     if x == 0.0 && y == 0.0 {
         return Ok(track);

@@ -76,11 +76,14 @@ impl Layer {
 }
 
 impl Person {
-    pub(crate) fn new(look: &Look, seed: u64, texture_px: usize) -> Result<Self, SimError> {
+    pub(crate) fn new(look: &Look, seed: u64, texture_px: usize, fingers: bool) -> Result<Self, SimError> {
         let mut body = default_template(&look.shape)?;
         let average = default_template(&ShapeParams::default())?;
         for (position, average) in body.positions.iter_mut().zip(&average.positions) {
             *position += look.features.moved(*average);
+        }
+        if fingers {
+            body = body.with_fingers()?;
         }
         body.normals = Sheet::of_body(&body, &average.positions).normals(&body.positions);
         let naked = Sheet::of_body(&body, &average.positions);

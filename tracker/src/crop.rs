@@ -50,7 +50,12 @@ impl Crop {
 
     /// Picture pixel of a crop pixel (pixel centres at integers in both).
     pub fn to_picture(self, crop_px: DVec2) -> DVec2 {
-        let offset = (crop_px + 0.5 - 0.5 * NET_SIDE as f64) * self.scale();
+        self.to_picture_from(crop_px, NET_SIDE)
+    }
+
+    /// The same for a network whose crop has another side, pixels.
+    pub fn to_picture_from(self, crop_px: DVec2, net_side: usize) -> DVec2 {
+        let offset = (crop_px + 0.5 - 0.5 * net_side as f64) * (self.side / net_side as f64);
         self.center + DVec2::from_angle(self.angle).rotate(offset)
     }
 
@@ -63,16 +68,21 @@ impl Crop {
     /// The network's input: RGB in 0..=1, black outside the picture. Each value averages enough samples
     /// that a large crop does not alias.
     pub fn sample(&self, picture: &Rgb) -> Vec<f32> {
-        let taps = (self.scale().round() as usize).clamp(1, 4);
-        let mut rgb = Vec::with_capacity(NET_SIDE * NET_SIDE * 3);
+        self.sample_square(picture, NET_SIDE)
+    }
+
+    /// The same for a network whose crop has another side, pixels.
+    pub fn sample_square(&self, picture: &Rgb, net_side: usize) -> Vec<f32> {
+        let taps = ((self.side / net_side as f64).round() as usize).clamp(1, 4);
+        let mut rgb = Vec::with_capacity(net_side * net_side * 3);
         let weight = 1.0 / (255.0 * (taps * taps) as f32);
-        for y in 0..NET_SIDE {
-            for x in 0..NET_SIDE {
+        for y in 0..net_side {
+            for x in 0..net_side {
                 let mut sum = [0.0f32; 3];
                 for ty in 0..taps {
                     for tx in 0..taps {
                         let tap = |t: usize| (t as f64 + 0.5) / taps as f64 - 0.5;
-                        let at = self.to_picture(DVec2::new(x as f64 + tap(tx), y as f64 + tap(ty)));
+                        let at = self.to_picture_from(DVec2::new(x as f64 + tap(tx), y as f64 + tap(ty)), net_side);
                         let color = picture.bilinear(at);
                         for (s, c) in sum.iter_mut().zip(color) {
                             *s += c;

@@ -394,7 +394,7 @@ impl PoseEstimator {
     }
 }
 
-fn check_size(camera: &flyrig_types::Camera, image: &Image) -> Result<(), TrackError> {
+pub(crate) fn check_size(camera: &flyrig_types::Camera, image: &Image) -> Result<(), TrackError> {
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
     if (image.width(), image.height()) == (width, height) {
         return Ok(());

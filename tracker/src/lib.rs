@@ -26,7 +26,9 @@ mod estimator;
 mod fit;
 mod grid;
 mod habits;
+mod hands;
 mod key;
+mod landmark_net;
 mod landmarks;
 mod light;
 mod line_point;
@@ -59,6 +61,10 @@ pub use error::{TrackError, TrackErrorKind};
 pub use estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};
 pub use estimator::{Marks, PoseEstimator};
 pub use habits::{Habit, LandmarkStudy};
+pub use hands::{
+    FACE_LANDMARKS, FACE_SIDE, FaceNet, FaceOutput, FaceStudy, HAND_LANDMARKS, HAND_SIDE, HandConfig, HandNet,
+    HandOutput, HandQuality, HandState, HandTracker, HandsQuality, HeadQuality,
+};
 pub use key::{KeyColor, KeyColorError};
 pub use landmarks::{Keypoint, LANDMARK_BONES, LANDMARK_COUNT, LANDMARK_NAMES, ViewKeypoints};
 pub use matte::{EdgeColor, Matte, matte};

@@ -1,10 +1,7 @@
 //! BlazePose through tract.
 
-use std::sync::Arc;
-
-use tract_onnx::prelude::*;
-
-use crate::{LANDMARK_COUNT, TrackError, TrackErrorKind};
+use crate::landmark_net::{LandmarkNet, sigmoid};
+use crate::{LANDMARK_COUNT, TrackError};
 
 /// Side of the network's picture, pixels.
 pub const NET_SIDE: usize = 256;
@@ -43,7 +40,7 @@ pub struct NetOutput {
 /// The landmark network (BlazePose full, Bazarevsky et al. 2020; licence beside the file in `assets`).
 #[derive(Clone)]
 pub struct PoseNet {
-    model: Arc<TypedRunnableModel>,
+    net: LandmarkNet,
 }
 
 impl std::fmt::Debug for PoseNet {
@@ -56,7 +53,7 @@ impl PoseNet {
     /// The network built into this crate. Takes a few hundred milliseconds; clone it instead of loading it twice.
     ///
     /// # Errors
-    /// Kind [`TrackErrorKind::Net`] when the file does not load.
+    /// Kind [`crate::TrackErrorKind::Net`] when the file does not load.
     pub fn embedded() -> Result<Self, TrackError> {
         Self::from_onnx(EMBEDDED)
     }
@@ -64,54 +61,20 @@ impl PoseNet {
     /// A network from the bytes of an ONNX file with BlazePose's outputs (told apart by their sizes).
     ///
     /// # Errors
-    /// Kind [`TrackErrorKind::Net`] when the file does not load or has other inputs or outputs.
-    pub fn from_onnx(mut bytes: &[u8]) -> Result<Self, TrackError> {
-        let failed = |error: TractError| {
-            TrackError::new(
-                TrackErrorKind::Net,
-                format!("the pose network does not load ({error:#}); use a BlazePose landmark ONNX file"),
-            )
-        };
-        let side = NET_SIDE as i64;
-        let model = onnx()
-            .model_for_read(&mut bytes)
-            .and_then(|model| model.with_input_fact(0, f32::fact(tvec!(1, side, side, 3)).into()))
-            .and_then(InferenceModelExt::into_optimized)
-            .and_then(IntoRunnable::into_runnable)
-            .map_err(failed)?;
-        let net = Self { model };
-        net.run(&vec![0.0; NET_SIDE * NET_SIDE * 3])?;
+    /// Kind [`crate::TrackErrorKind::Net`] when the file does not load or has other inputs or outputs.
+    pub fn from_onnx(bytes: &[u8]) -> Result<Self, TrackError> {
+        let net = Self { net: LandmarkNet::load(bytes, NET_SIDE, "pose")? };
+        net.run(&net.net.blank())?;
         Ok(net)
     }
 
     /// Runs one crop: 256 x 256 x 3 RGB in 0..=1, row by row.
     ///
     /// # Errors
-    /// Kind [`TrackErrorKind::Net`] when the length is wrong or an output is missing or not finite.
+    /// Kind [`crate::TrackErrorKind::Net`] when the length is wrong or an output is missing or not finite.
     pub fn run(&self, rgb: &[f32]) -> Result<NetOutput, TrackError> {
-        let failed =
-            |error: TractError| TrackError::new(TrackErrorKind::Net, format!("the pose network failed: {error:#}"));
-        let input = Tensor::from_shape(&[1, NET_SIDE, NET_SIDE, 3], rgb).map_err(failed)?;
-        let outputs = self.model.run(tvec!(input.into())).map_err(failed)?;
-        let find = |count: usize| -> Result<Vec<f32>, TrackError> {
-            for output in &outputs {
-                if output.len() == count {
-                    let values: Vec<f32> =
-                        output.to_plain_array_view::<f32>().map_err(failed)?.iter().copied().collect();
-                    if values.iter().all(|v| v.is_finite()) {
-                        return Ok(values);
-                    }
-                    return Err(TrackError::new(
-                        TrackErrorKind::Net,
-                        "the pose network gave a value that is not finite",
-                    ));
-                }
-            }
-            Err(TrackError::new(
-                TrackErrorKind::Net,
-                format!("the pose network has no output of {count} numbers; use a BlazePose landmark file"),
-            ))
-        };
+        let outputs = self.net.run(rgb)?;
+        let find = |count| outputs.of_size(count);
         let raw = find(NET_LANDMARKS * LANDMARK_STRIDE)?;
         let world = find(NET_LANDMARKS * 3)?;
         let presence = f64::from(find(1)?[0]).clamp(0.0, 1.0);
@@ -131,13 +94,10 @@ impl PoseNet {
     }
 }
 
-fn sigmoid(logit: f64) -> f64 {
-    1.0 / (1.0 + (-logit).exp())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::TrackErrorKind;
 
     #[test]
     fn the_embedded_network_sees_nobody_in_grey_and_refuses_a_wrong_size() {

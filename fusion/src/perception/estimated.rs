@@ -4,9 +4,10 @@ use std::{borrow::Cow, time::Duration};
 
 use flyrig_body::{Template, skin_mesh};
 use flyrig_tracker::{
-    BodyGate, Matte, PoseConfig, PoseEstimate, PoseEstimator, PoseNet, ShapeFit, ViewKeypoints, matte,
+    BodyGate, HandConfig, HandTracker, Matte, PoseConfig, PoseEstimate, PoseEstimator, PoseNet, ShapeFit, TrackError,
+    ViewKeypoints, matte,
 };
-use flyrig_types::{FrameSet, Image, Mask, PersonId, Rig};
+use flyrig_types::{FrameSet, Image, Mask, PersonId, Pose, Rig};
 
 use super::background::{BackgroundWatch, backgrounds, report};
 use super::colors::ClothesColors;
@@ -38,13 +39,36 @@ struct Place {
     learning: Option<(Vec<Vec<Option<ViewKeypoints>>>, i64)>,
     clothes: Option<ClothesColors>,
     seen: u64,
+    /// Fingers and head, where they are estimated.
+    hands: Option<HandTracker>,
 }
 
 impl Place {
     /// The shape is known.
-    fn know(&mut self) {
+    fn know(&mut self) -> Result<(), TrackError> {
         self.learning = None;
         self.estimator.look_at_all(false);
+        self.hands.as_mut().map_or(Ok(()), |hands| hands.set_template(self.estimator.template()))
+    }
+
+    /// The template that poses are for.
+    fn template(&self) -> &Template {
+        self.hands.as_ref().map_or(self.estimator.template(), HandTracker::template)
+    }
+
+    /// The body's pose with fingers and the head turned, where those are estimated.
+    fn with_hands(&mut self, set: &FrameSet, pose: Pose, stages: &mut StageTimes) -> Result<Pose, TrackError> {
+        let Some(hands) = &mut self.hands else { return Ok(pose) };
+        let (pose, quality) = hands.estimate(set, &pose)?;
+        let [net, fit] = quality.seconds.map(|seconds| Duration::from_secs_f64(seconds.max(0.0)));
+        stages.add("  hands and face: networks", net);
+        stages.add("  hands and face: fit", fit);
+        stages.count("crops of hands", quality.crops[0] as u64);
+        stages.count("crops of faces", quality.crops[1] as u64);
+        stages.count("hands fitted", quality.fitted() as u64);
+        stages.count("hands relaxed", 2 - quality.fitted() as u64);
+        stages.count("heads turned by the face", u64::from(quality.head.views > 0));
+        Ok(pose)
     }
 }
 
@@ -81,12 +105,17 @@ impl EstimatedPerception {
         estimator.set_backgrounds(backgrounds(&rig.cameras, settings, plates)?);
         let learning = (settings.shape() == Origin::Estimated).then(|| (Vec::new(), i64::MIN));
         estimator.look_at_all(learning.is_some());
+        let hands = match settings.hands {
+            Origin::Given => None,
+            Origin::Estimated => Some(HandTracker::new(template, rig, HandConfig::default())?),
+        };
         let place = |index: usize| Place {
             id: PersonId(index as u32),
             estimator: estimator.clone(),
             learning: learning.clone(),
             clothes: None,
             seen: 0,
+            hands: hands.clone(),
         };
         Ok(Self {
             places: (0..settings.people).map(place).collect(),
@@ -103,7 +132,7 @@ impl EstimatedPerception {
     pub fn know_shape(&mut self, template: &Template) -> Result<(), FusionError> {
         if let Some(place) = self.places.first_mut() {
             place.estimator.set_template(template)?;
-            place.know();
+            place.know()?;
         }
         Ok(())
     }
@@ -121,7 +150,7 @@ impl EstimatedPerception {
                 Ok((fit, landmarks)) => {
                     fits.push(fit);
                     taken.push(landmarks);
-                    place.know();
+                    place.know()?;
                 }
                 Err(error) if fits.is_empty() => return Err(error.into()),
                 // Fewer people than places.
@@ -227,7 +256,10 @@ impl EstimatedPerception {
             match place.estimator.fit_shape_to_keypoints(keypoints) {
                 Ok(fit) => {
                     tracing::info!("person {} is {fit}", place.id);
-                    place.know();
+                    if let Err(error) = place.know() {
+                        tracing::warn!(%error, "hands of person {} are not estimated", place.id);
+                        place.hands = None;
+                    }
                 }
                 Err(error) => {
                     tracing::warn!(%error, "the shape of person {} is not known yet, trying again", place.id);
@@ -280,7 +312,7 @@ fn count_stages(estimate: &PoseEstimate, stages: &mut StageTimes) {
 impl Perception for EstimatedPerception {
     fn people(&self) -> Vec<(PersonId, &Template)> {
         let known = self.places.iter().filter(|place| place.learning.is_none());
-        known.map(|place| (place.id, place.estimator.template())).collect()
+        known.map(|place| (place.id, place.template())).collect()
     }
 
     fn observe<'a>(&mut self, set: &'a FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation<'a>>, FusionError> {
@@ -298,11 +330,15 @@ impl Perception for EstimatedPerception {
         for (index, estimate) in estimates.into_iter().enumerate().filter(|(index, _)| known[*index]) {
             let person = self.places[index].id;
             observations.push(match estimate {
-                Err(reason) => Observation::Lost { person, reason },
+                Err(reason) => {
+                    self.places[index].hands.iter_mut().for_each(HandTracker::reset);
+                    Observation::Lost { person, reason }
+                }
                 Ok(estimate) => {
                     let confidence = 1.0 / (1.0 + (estimate.quality.residual_px / HALF_BELIEVED_PX).powi(2));
                     let views = std::mem::take(&mut views[index]);
-                    Observation::Seen(SeenPerson { person, pose: estimate.pose, confidence, views })
+                    let pose = self.places[index].with_hands(set, estimate.pose, stages)?;
+                    Observation::Seen(SeenPerson { person, pose, confidence, views })
                 }
             });
         }

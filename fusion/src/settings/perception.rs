@@ -36,6 +36,10 @@ pub struct PerceptionSettings {
     /// Shape of the body from the data set's glTF file, or from the images; by default from where the pose comes.
     #[arg(long, value_enum)]
     pub shape: Option<Origin>,
+    /// Fingers and the head's rotation: as the pose has them (with an estimated pose fingers are at rest), or from landmarks
+    /// of hands and face in the images. The latter needs an estimated pose and a body with fingers, as the built-in one.
+    #[arg(long, value_enum, default_value = "given")]
+    pub hands: Origin,
     /// People who are tracked at most, 1 to 4; with 1 the one whom most views agree on.
     #[arg(long, default_value_t = 1)]
     pub people: usize,
@@ -60,6 +64,7 @@ impl Default for PerceptionSettings {
         Self {
             pose: Origin::Estimated,
             masks: Origin::Estimated,
+            hands: Origin::Given,
             shape: None,
             people: 1,
             look_after_m: 0.02,
@@ -91,6 +96,12 @@ impl PerceptionSettings {
         check("perception.people", self.people as f64, 1.0, 4.0)?;
         check("perception.look_after_m", self.look_after_m, 0.0, 1.0)?;
         key_color(self)?;
+        if self.hands == Origin::Estimated && self.pose == Origin::Given {
+            return Err(FusionError::Setting(
+                "perception.hands = \"estimated\" needs perception.pose = \"estimated\"; a given pose brings its own fingers"
+                    .to_owned(),
+            ));
+        }
         self.height_m.map_or(Ok(()), |height| check("perception.height_m", height, 0.5, 2.5))
     }
 }

@@ -24,7 +24,7 @@ const ALL: [MotionKind; 9] = [
 fn person(seed: u64, build: Build) -> Person {
     let mut config = SimConfig { seed, texture_px: 64, ..SimConfig::default() };
     config.person.build = build;
-    Person::new(&Look::new(&config), seed, 64).unwrap()
+    Person::new(&Look::new(&config), seed, 64, false).unwrap()
 }
 
 /// The person reduced to its soles, but for the crease between foot and toes, where they bend.

@@ -146,7 +146,7 @@ fn tight_clothes_cost_nothing() {
         *wide_m = 0.0;
     }
     assert!(matches!(look.bottom, Bottom::Trousers { .. }));
-    let person = Person::new(&look, 1, 64).unwrap();
+    let person = Person::new(&look, 1, 64, false).unwrap();
     assert!(Cloth::new(&person).is_none());
     assert!(Cloth::new(&actor(SKIRT, MotionKind::Still, 1.0).person).unwrap().particle_count() > 100);
 }

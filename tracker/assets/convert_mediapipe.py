@@ -1,15 +1,18 @@
 #!/usr/bin/env python3
-"""Converts BlazePose (full) from MediaPipe's TFLite file to the ONNX file that flyrig-tracker embeds.
+"""Converts landmark networks from MediaPipe's TFLite files to the ONNX files that flyrig-tracker embeds.
 
     python3.11 -m venv venv
     venv/bin/pip install tf2onnx==1.17.0 onnx==1.23.2 onnxruntime==1.31.1 tensorflow-cpu==2.21.0
     venv/bin/pip download mediapipe==0.10.21 --no-deps
     venv/bin/python -m zipfile -e mediapipe-0.10.21-*.whl wheel
-    venv/bin/python convert_blazepose.py wheel/mediapipe/modules/pose_landmark/pose_landmark_full.tflite pose_full.onnx
+    modules=wheel/mediapipe/modules
+    venv/bin/python convert_mediapipe.py pose $modules/pose_landmark/pose_landmark_full.tflite pose_full.onnx
+    venv/bin/python convert_mediapipe.py hand $modules/hand_landmark/hand_landmark_lite.tflite hand_lite.onnx
+    venv/bin/python convert_mediapipe.py face $modules/face_landmark/face_landmark.tflite face.onnx
 
-The TFLite file stores its weights as 16-bit floats. The converter widens them; this script narrows
+The TFLite files store their weights as 16-bit floats. The converter widens them; this script narrows
 them back (exactly, checked) behind a Cast, which halves the file. Only the outputs the tracker reads
-are kept: landmarks, presence, mask logits and world landmarks; the heatmaps go.
+are kept (OUTPUTS): the heatmaps of the pose network go, and handedness and world landmarks of the hand's.
 The result is compared with the TFLite interpreter on random pictures.
 """
 
@@ -22,22 +25,27 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-# Outputs told apart by shape: 39 landmarks x 5, one presence, 256x256 mask, 39 world landmarks x 3.
-OUTPUTS = {195: "landmarks", 1: "presence", 65536: "mask", 117: "world_landmarks"}
+# Outputs of each network in the TFLite file and their names here.
+OUTPUTS = {
+    # 39 landmarks x 5, one presence, 256x256 mask, 39 world landmarks x 3.
+    "pose": {"Identity": "landmarks", "Identity_1": "presence", "Identity_2": "mask", "Identity_4": "world_landmarks"},
+    # 21 landmarks x 3, one presence. Left out: handedness, 21 world landmarks x 3.
+    "hand": {"Identity": "landmarks", "Identity_1": "presence"},
+    # 468 landmarks x 3, one presence logit.
+    "face": {"conv2d_21": "landmarks", "conv2d_31": "presence"},
+}
 
 
-def element_count(value):
-    return int(np.prod([max(d.dim_value, 1) for d in value.type.tensor_type.shape.dim]))
-
-
-def keep_outputs(model):
+def keep_outputs(model, names):
     """Renames the wanted outputs and drops the rest with every node that only served them."""
     graph = model.graph
     wanted = []
     for value in list(graph.output):
-        name = OUTPUTS.get(element_count(value))
+        name = names.get(value.name)
         if name is not None:
             wanted.append((value.name, name, value))
+    if len(wanted) != len(names):
+        sys.exit(f"found outputs {[w[0] for w in wanted]} of {list(names)}; is this the right kind of network?")
     del graph.output[:]
     for old, new, value in wanted:
         for node in graph.node:
@@ -86,7 +94,7 @@ def narrow_weights(model):
     print(f"{exact} of {total} weights are exact in 16 bits")
 
 
-def compare(tflite_path, onnx_path):
+def compare(tflite_path, onnx_path, outputs):
     import onnxruntime
     import tensorflow as tf
 
@@ -94,17 +102,17 @@ def compare(tflite_path, onnx_path):
     reference.allocate_tensors()
     session = onnxruntime.InferenceSession(onnx_path)
     names = [o.name for o in session.get_outputs()]
+    side = reference.get_input_details()[0]["shape"][1]
     random = np.random.default_rng(0)
     for _ in range(3):
         coarse = random.random((1, 8, 8, 3), dtype=np.float32)
-        picture = np.repeat(np.repeat(coarse, 32, axis=1), 32, axis=2)
+        picture = np.repeat(np.repeat(coarse, side // 8, axis=1), side // 8, axis=2)
         reference.set_tensor(reference.get_input_details()[0]["index"], picture)
         reference.invoke()
         expected = {}
         for detail in reference.get_output_details():
-            value = reference.get_tensor(detail["index"])
-            if value.size in OUTPUTS:
-                expected[OUTPUTS[value.size]] = value.ravel()
+            if detail["name"] in outputs:
+                expected[outputs[detail["name"]]] = reference.get_tensor(detail["index"]).ravel()
         found = session.run(None, {session.get_inputs()[0].name: picture})
         for name, value in zip(names, found):
             error = np.abs(value.ravel() - expected[name]).max() / max(1.0, np.abs(expected[name]).max())
@@ -115,6 +123,7 @@ def compare(tflite_path, onnx_path):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("kind", choices=OUTPUTS)
     parser.add_argument("tflite")
     parser.add_argument("onnx")
     arguments = parser.parse_args()
@@ -122,11 +131,11 @@ def main():
         command = [sys.executable, "-m", "tf2onnx.convert", "--tflite", arguments.tflite]
         subprocess.run([*command, "--opset", "13", "--output", wide.name], check=True)
         model = onnx.load(wide.name)
-    keep_outputs(model)
+    keep_outputs(model, OUTPUTS[arguments.kind])
     narrow_weights(model)
     onnx.checker.check_model(model)
     onnx.save(model, arguments.onnx)
-    compare(arguments.tflite, arguments.onnx)
+    compare(arguments.tflite, arguments.onnx, OUTPUTS[arguments.kind])
 
 
 if __name__ == "__main__":

@@ -1,0 +1,553 @@
+//! Fingers and head of one person through the frame sets of a rig.
+
+use std::time::Instant;
+
+use flyrig_body::Template;
+use flyrig_solve::RigidMotion;
+use flyrig_types::{Camera, FrameSet, Pose, Rig};
+use glam::{DQuat, DVec3};
+use rayon::prelude::*;
+
+use super::face_points::FACE_POINTS;
+use super::hand_fit::{HandPose, HandProblem, HandSight};
+use super::hand_model::{Bends, HandModel, relaxed};
+use super::head_fit::{FaceSight, HeadProblem};
+use super::looks::{FORGET_SECS, FaceTarget, PartLook, hand_crop, ideal_px};
+use super::{
+    FACE_SIDE, FaceNet, HAND_LANDMARKS, HAND_SIDE, HandNet, HandQuality, HandState, HandsQuality, HeadQuality,
+};
+use crate::body_model::{BodyModel, Posed};
+use crate::crop::Crop;
+use crate::estimator::check_size;
+use crate::habits::template_scale;
+use crate::pixels::Rgb;
+use crate::view::View;
+use crate::{TrackError, TrackErrorKind};
+
+/// Presence from which a network's landmarks are believed.
+const MIN_PRESENCE: f64 = 0.5;
+/// Views whose median landmark is farther off than so many standard deviations see something else.
+const OFF_HAND: f64 = 3.0;
+/// Change of an angle between sets at 30 sets a second, radians.
+const SMOOTH_RAD: f64 = 0.3;
+/// The body's wrist moves no faster, metres a second.
+const MAX_SPEED: f64 = 12.0;
+/// Left hand, right hand, head.
+const PARTS: usize = 3;
+const HEAD: usize = 2;
+
+/// Limits of need and budget.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HandConfig {
+    /// Smallest length of a hand, wrist to fingertip, that the network looks at, pixels.
+    pub min_hand_px: f64,
+    /// Smallest height of a face that the network looks at, pixels.
+    pub min_face_px: f64,
+    /// Crops that the networks look at in a set, hands and faces together; 0 for all that are due.
+    pub crops: usize,
+    /// Motion of a hand or head in metres, or of their flesh through a turn, until a view of it gets a new look. Looks
+    /// grow old by themselves.
+    pub look_after_m: f64,
+    /// Whether fingers are estimated.
+    pub fingers: bool,
+    /// Whether the head's rotation is estimated.
+    pub head: bool,
+}
+
+impl Default for HandConfig {
+    fn default() -> Self {
+        Self { min_hand_px: 30.0, min_face_px: 30.0, crops: 6, look_after_m: 0.005, fingers: true, head: true }
+    }
+}
+
+/// Bends the fingers and turns the head of a body whose pose is estimated otherwise.
+#[derive(Debug, Clone)]
+pub struct HandTracker {
+    hand_net: HandNet,
+    face_net: FaceNet,
+    config: HandConfig,
+    rig: Rig,
+    template: Template,
+    body: BodyModel,
+    hands: [HandModel; 2],
+    scale: f64,
+    /// By part, then slot.
+    looks: [Vec<Option<PartLook>>; PARTS],
+    last: Option<Last>,
+}
+
+/// State after a set.
+#[derive(Debug, Clone)]
+struct Last {
+    nanos: i64,
+    frames: [RigidMotion; PARTS],
+    velocity: [DVec3; PARTS],
+    bends: [Bends; 2],
+}
+
+/// A crop that a network may look at.
+struct Candidate {
+    part: usize,
+    slot: usize,
+    crop: Crop,
+    /// See [`PartLook::staleness_m`]; infinite without a look.
+    staleness_m: f64,
+}
+
+impl HandTracker {
+    /// For a body in the shape of `template`, which gets fingers if it has none, and the cameras of `rig`.
+    ///
+    /// # Errors
+    /// Kind `Template` for a body that cannot have fingers, `Rig` for a rig without cameras, `Net` when a network does not
+    /// load.
+    pub fn new(template: &Template, rig: &Rig, config: HandConfig) -> Result<Self, TrackError> {
+        Self::with_nets(HandNet::embedded()?, FaceNet::embedded()?, template, rig, config)
+    }
+
+    /// As [`Self::new`], with networks that are loaded already.
+    ///
+    /// # Errors
+    /// Kinds `Template` and `Rig` as those of [`Self::new`].
+    pub fn with_nets(
+        hand_net: HandNet,
+        face_net: FaceNet,
+        template: &Template,
+        rig: &Rig,
+        config: HandConfig,
+    ) -> Result<Self, TrackError> {
+        rig.validate().map_err(|error| TrackError::new(TrackErrorKind::Rig, error.to_string()))?;
+        let template = fingered(template)?;
+        let body = BodyModel::new(&template)?;
+        let hands = HandModel::pair(&template)?;
+        let slots = rig.cameras.len();
+        Ok(Self {
+            hand_net,
+            face_net,
+            config,
+            rig: rig.clone(),
+            scale: template_scale(&template),
+            body,
+            hands,
+            template,
+            looks: std::array::from_fn(|_| vec![None; slots]),
+            last: None,
+        })
+    }
+
+    /// The template with fingers that poses are for.
+    #[must_use]
+    pub fn template(&self) -> &Template {
+        &self.template
+    }
+
+    /// World places of the hand landmarks in a pose of [`Self::template`], metres: left, right. `None` for a pose that does
+    /// not fit.
+    #[must_use]
+    pub fn hand_landmarks(&self, pose: &Pose) -> Option<[[DVec3; HAND_LANDMARKS]; 2]> {
+        self.template.skeleton.check_pose(pose).ok()?;
+        let canonical = self.template.skeleton.world_from_canonical(pose);
+        let of = |model: &HandModel| model.marks().map(|(joint, point)| canonical[joint].transform_point3(point));
+        Some([of(&self.hands[0]), of(&self.hands[1])])
+    }
+
+    /// World rotation of the head's flesh from canonical axes in a pose of [`Self::template`]; `None` for a pose that does not
+    /// fit.
+    #[must_use]
+    pub fn head_rotation(&self, pose: &Pose) -> Option<DQuat> {
+        let turns = self.body.to_turns(pose)?;
+        Some(self.body.pose(&turns).rotation[self.body.roles.head])
+    }
+
+    /// Takes a template of another shape and forgets what was seen.
+    ///
+    /// # Errors
+    /// Kind `Template` for a body that cannot have fingers.
+    pub fn set_template(&mut self, template: &Template) -> Result<(), TrackError> {
+        let rig = self.rig.clone();
+        *self = Self::with_nets(self.hand_net.clone(), self.face_net.clone(), template, &rig, self.config)?;
+        Ok(())
+    }
+
+    /// Forgets what was seen: the person was lost.
+    pub fn reset(&mut self) {
+        self.looks.iter_mut().flatten().for_each(|look| *look = None);
+        self.last = None;
+    }
+
+    /// Returns the pose with the finger joints of [`Self::template`] and the head turned, from the body's pose at the set's
+    /// time. The body's pose may lack rotations for the finger joints.
+    ///
+    /// # Errors
+    /// Kind `Template` for a pose that does not fit, `Frames` and `Image` for a set that does not fit the rig, `Net` when a
+    /// network fails. The state stays sound.
+    pub fn estimate(&mut self, set: &FrameSet, pose: &Pose) -> Result<(Pose, HandsQuality), TrackError> {
+        if set.frames.len() != self.rig.cameras.len() {
+            return Err(TrackError::new(
+                TrackErrorKind::Frames,
+                format!("a frame set of {} slots for a rig of {} cameras", set.frames.len(), self.rig.cameras.len()),
+            ));
+        }
+        let mut turns = self.body.to_turns(&self.extended(pose)).ok_or_else(|| {
+            TrackError::new(
+                TrackErrorKind::Template,
+                format!(
+                    "a pose of {} joints that is not for template '{}'",
+                    pose.joint_rotations.len(),
+                    self.template.name
+                ),
+            )
+        })?;
+        for hand in &self.hands {
+            for joint in 0..turns.turns.len() {
+                if joint != hand.hand && self.body.hangs_below(joint, hand.hand) {
+                    turns.turns[joint] = DQuat::IDENTITY;
+                }
+            }
+        }
+        let posed = self.body.pose(&turns);
+        let nanos = set.master_nanos;
+        let frames = self.frames(&posed);
+        let last = self.last.take().filter(|last| (0.0..FORGET_SECS).contains(&(1e-9 * (nanos - last.nanos) as f64)));
+        if last.is_none() {
+            self.looks.iter_mut().flatten().for_each(|look| *look = None);
+        }
+        let velocity = velocities(last.as_ref(), &frames, nanos);
+
+        let start = Instant::now();
+        let (candidates, largest_px) = self.candidates(set, &posed, &frames, last.as_ref());
+        let crops = self.look(set, candidates, &frames, &velocity)?;
+        let net_secs = start.elapsed().as_secs_f64();
+
+        let start = Instant::now();
+        let mut bends = [relaxed(); 2];
+        let mut hands = [HandQuality { state: HandState::TooSmall, largest_px: 0.0, views: 0, residual_px: None }; 2];
+        for side in 0..2 {
+            hands[side].largest_px = largest_px[side];
+            let before = last.as_ref().map(|last| (last.bends[side], 1e-9 * (nanos - last.nanos) as f64));
+            let fitted = self.fit_hand(side, &frames[side], nanos, before, &mut hands[side]);
+            match fitted {
+                Some(found) => {
+                    bends[side] = found.bends;
+                    let hand = self.hands[side].hand;
+                    let parent = self.body.parents[hand].map_or(DQuat::IDENTITY, |parent| posed.rotation[parent]);
+                    turns.turns[hand] = (parent.inverse() * found.turn * posed.rotation[hand]).normalize();
+                }
+                None => bends[side] = before.map_or_else(relaxed, |(before, secs)| calmed(&before, secs)),
+            }
+            for finger in 0..5 {
+                let model = &self.hands[side];
+                for (joint, turn) in model.joints[finger].into_iter().zip(model.turns(finger, bends[side][finger])) {
+                    turns.turns[joint] = turn;
+                }
+            }
+        }
+        let head_joint = self.body.roles.head;
+        let mut head = HeadQuality::default();
+        if let Some(turn) = self.fit_head(&frames[HEAD], nanos, &mut head) {
+            let parent = self.body.parents[head_joint].map_or(DQuat::IDENTITY, |parent| posed.rotation[parent]);
+            turns.turns[head_joint] = (parent.inverse() * turn * posed.rotation[head_joint]).normalize();
+        }
+        self.last = Some(Last { nanos, frames, velocity, bends });
+        let seconds = [net_secs, start.elapsed().as_secs_f64()];
+        Ok((self.body.to_pose(&turns), HandsQuality { hands, head, crops, seconds }))
+    }
+
+    /// The pose with rotations at rest for joints that it lacks.
+    fn extended(&self, pose: &Pose) -> Pose {
+        let mut pose = pose.clone();
+        let rest = self.template.skeleton.joints().iter().map(|joint| joint.rest_rotation);
+        pose.joint_rotations.extend(rest.skip(pose.joint_rotations.len()));
+        pose
+    }
+
+    fn frames(&self, posed: &Posed) -> [RigidMotion; PARTS] {
+        [self.hands[0].hand, self.hands[1].hand, self.body.roles.head]
+            .map(|joint| RigidMotion { rotation: posed.rotation[joint], translation: posed.origin[joint] })
+    }
+
+    /// Crops of hands and faces that are large enough, and the largest length of each hand, pixels.
+    fn candidates(
+        &self,
+        set: &FrameSet,
+        posed: &Posed,
+        frames: &[RigidMotion; PARTS],
+        last: Option<&Last>,
+    ) -> (Vec<Candidate>, [f64; 2]) {
+        let mut found = Vec::new();
+        let mut largest_px = [0.0f64; 2];
+        for (slot, _) in set.present() {
+            let camera = &self.rig.cameras[slot];
+            let view = View::new(camera);
+            let mut offer = |part: usize, crop: Crop, reach_m: f64| {
+                let look = self.looks[part][slot].as_ref();
+                let staleness_m =
+                    look.map_or(f64::INFINITY, |look| look.staleness_m(&frames[part], reach_m, set.master_nanos));
+                found.push(Candidate { part, slot, crop, staleness_m });
+            };
+            for (side, model) in self.hands.iter().enumerate().filter(|_| self.config.fingers) {
+                let Some(px_per_m) = view.px_per_m(frames[side].translation) else { continue };
+                let pose =
+                    HandPose { bends: last.map_or_else(relaxed, |last| last.bends[side]), ..HandPose::relaxed() };
+                let problem = HandProblem { model, sights: &[], wrist: frames[side], before: None };
+                let length_px = model.length_m * px_per_m;
+                let Some(crop) = hand_crop(camera, &problem.points(&pose).0, length_px) else { continue };
+                largest_px[side] = largest_px[side].max(length_px);
+                if length_px >= self.config.min_hand_px {
+                    offer(side, crop, 0.5 * model.length_m);
+                }
+            }
+            if self.config.head
+                && !FACE_POINTS.is_empty()
+                && let Some(face) = FaceTarget::new(camera, &self.body, posed, self.scale)
+                && face.height_px >= self.config.min_face_px
+            {
+                offer(HEAD, face.crop, 0.1 * self.scale);
+            }
+        }
+        (found, largest_px)
+    }
+
+    /// Lets the networks look at the crops that need it most, within the budget. Returns the numbers of hands and faces.
+    fn look(
+        &mut self,
+        set: &FrameSet,
+        mut candidates: Vec<Candidate>,
+        frames: &[RigidMotion; PARTS],
+        velocity: &[DVec3; PARTS],
+    ) -> Result<[usize; 2], TrackError> {
+        candidates.retain(|candidate| candidate.staleness_m > self.config.look_after_m);
+        candidates.sort_by(|a, b| b.staleness_m.total_cmp(&a.staleness_m));
+        if self.config.crops > 0 {
+            candidates.truncate(self.config.crops);
+        }
+        let seen: Vec<(usize, usize, PartLook)> = candidates
+            .par_iter()
+            .map(|&Candidate { part, slot, crop, .. }| {
+                let camera = &self.rig.cameras[slot];
+                let frame = set.frames[slot].as_ref().ok_or_else(|| {
+                    TrackError::new(TrackErrorKind::Frames, format!("camera {} has no frame", camera.id))
+                })?;
+                check_size(camera, &frame.image)?;
+                let picture = Rgb::new(&frame.image)?;
+                let view = View::new(camera);
+                let (seen, presence) = if part == HEAD {
+                    let output = self.face_net.run(&crop.sample_square(&picture, FACE_SIDE))?;
+                    let of_point = |landmark: usize| crop.to_picture_from(output.landmarks[landmark], FACE_SIDE);
+                    let seen = FACE_POINTS.iter().map(|point| ideal_px(camera, &view, of_point(point.landmark)));
+                    (seen.collect(), output.presence)
+                } else {
+                    let output = self.hand_net.run(&crop.sample_square(&picture, HAND_SIDE))?;
+                    let seen = output.landmarks.iter();
+                    let seen = seen.map(|&at| ideal_px(camera, &view, crop.to_picture_from(at, HAND_SIDE)));
+                    (seen.collect(), output.presence)
+                };
+                let delay_secs = 1e-9 * frame.capture_nanos.saturating_sub(set.master_nanos) as f64;
+                let translation = frames[part].translation + velocity[part] * delay_secs.clamp(-0.1, 0.1);
+                let frame = RigidMotion { translation, ..frames[part] };
+                Ok((part, slot, PartLook { nanos: set.master_nanos, seen, presence, frame }))
+            })
+            .collect::<Result<_, TrackError>>()?;
+        let mut crops = [0; 2];
+        for (part, slot, look) in seen {
+            crops[usize::from(part == HEAD)] += 1;
+            self.looks[part][slot] = Some(look);
+        }
+        Ok(crops)
+    }
+
+    /// Looks of a part that may be used at a time.
+    fn usable(&self, part: usize, nanos: i64) -> impl Iterator<Item = (&Camera, &PartLook)> {
+        let looks = self.looks[part].iter().zip(&self.rig.cameras);
+        looks.filter_map(move |(look, camera)| {
+            let look = look.as_ref()?;
+            (look.presence >= MIN_PRESENCE && look.age_secs(nanos) < FORGET_SECS).then_some((camera, look))
+        })
+    }
+
+    /// Fits a hand to the looks at it; `None` leaves it relaxed.
+    fn fit_hand(
+        &self,
+        side: usize,
+        frame: &RigidMotion,
+        nanos: i64,
+        before: Option<(Bends, f64)>,
+        quality: &mut HandQuality,
+    ) -> Option<HandPose> {
+        if quality.largest_px < self.config.min_hand_px {
+            return None;
+        }
+        quality.state = HandState::NotSeen;
+        let sight = |(camera, look): (&Camera, &PartLook)| {
+            let seen = std::array::from_fn(|i| look.seen.get(i).copied().flatten());
+            HandSight { view: View::new(camera), seen, trust: look.trust(nanos), carry: look.carry(frame) }
+        };
+        let mut sights: Vec<HandSight> = self.usable(side, nanos).map(sight).collect();
+        if sights.is_empty() {
+            return None;
+        }
+        quality.state = HandState::Disagrees;
+        let sigma = |secs: f64| SMOOTH_RAD * (secs * 30.0).clamp(0.1, 30.0).sqrt();
+        let prior = before.map(|(bends, secs)| (bends, sigma(secs)));
+        let solve = |sights: &[HandSight]| {
+            let problem = HandProblem { model: &self.hands[side], sights, wrist: *frame, before: prior };
+            let relaxed = problem.solve(&HandPose::relaxed());
+            let last = before.and_then(|(bends, _)| problem.solve(&HandPose { bends, ..HandPose::relaxed() }));
+            relaxed.into_iter().chain(last).min_by(|a, b| a.1.total_cmp(&b.1)).map(|(pose, _)| pose)
+        };
+        let off = |pose: &HandPose, sights: &[HandSight]| -> Vec<Option<(f64, f64)>> {
+            let problem = HandProblem { model: &self.hands[side], sights, wrist: *frame, before: None };
+            sights.iter().map(|sight| problem.residual(pose, sight)).collect()
+        };
+        let mut pose = solve(&sights)?;
+        let first = off(&pose, &sights);
+        let mut good = first.iter().map(|off| off.is_some_and(|(sigmas, _)| sigmas < OFF_HAND));
+        sights.retain(|_| good.next().unwrap_or(false));
+        if sights.is_empty() {
+            return None;
+        }
+        if sights.len() < first.len() {
+            pose = solve(&sights)?;
+        }
+        let mut pixels: Vec<f64> = off(&pose, &sights).into_iter().flatten().map(|(_, pixels)| pixels).collect();
+        quality.residual_px = flyrig_solve::median(&mut pixels);
+        quality.views = sights.len();
+        quality.state = HandState::Fitted;
+        Some(pose)
+    }
+
+    /// Fits the head to the looks at the face; `None` leaves it as it is.
+    fn fit_head(&self, frame: &RigidMotion, nanos: i64, quality: &mut HeadQuality) -> Option<DQuat> {
+        let sight = |(camera, look): (&Camera, &PartLook)| {
+            let points = FACE_POINTS.iter().map(|point| point.place_m(self.scale));
+            let seen = look.seen.iter().zip(points).filter_map(|(seen, point)| Some(((*seen)?, point))).collect();
+            FaceSight { view: View::new(camera), seen, trust: look.trust(nanos), carry: look.carry(frame) }
+        };
+        let mut sights: Vec<FaceSight> =
+            self.usable(HEAD, nanos).map(sight).filter(|sight| !sight.seen.is_empty()).collect();
+        if sights.is_empty() {
+            return None;
+        }
+        let mut pose = HeadProblem { sights: &sights, head: *frame }.solve()?;
+        let count = sights.len();
+        let problem = HeadProblem { sights: &[], head: *frame };
+        sights.retain(|sight| problem.residual(&pose, sight).is_some_and(|(sigmas, _)| sigmas < OFF_HAND));
+        if sights.is_empty() {
+            return None;
+        }
+        if sights.len() < count {
+            pose = HeadProblem { sights: &sights, head: *frame }.solve()?;
+        }
+        let mut pixels: Vec<f64> =
+            sights.iter().filter_map(|sight| problem.residual(&pose, sight)).map(|(_, pixels)| pixels).collect();
+        quality.residual_px = flyrig_solve::median(&mut pixels);
+        quality.views = sights.len();
+        quality.turned_rad = pose.turn.angle_between(DQuat::IDENTITY);
+        Some(pose.turn)
+    }
+}
+
+/// The template with fingers.
+fn fingered(template: &Template) -> Result<Template, TrackError> {
+    template.with_fingers().map_err(|error| TrackError::new(TrackErrorKind::Template, error.to_string()))
+}
+
+/// Velocities of wrists and head since the last set, metres a second.
+fn velocities(last: Option<&Last>, frames: &[RigidMotion; PARTS], nanos: i64) -> [DVec3; PARTS] {
+    let Some(last) = last else { return [DVec3::ZERO; PARTS] };
+    let secs = 1e-9 * (nanos - last.nanos) as f64;
+    if secs < 1e-3 {
+        return last.velocity;
+    }
+    std::array::from_fn(|part| {
+        let moved = frames[part].translation - last.frames[part].translation;
+        (moved / secs).clamp_length_max(MAX_SPEED)
+    })
+}
+
+/// Fingers that nobody sees, on their way to the relaxed hand.
+fn calmed(before: &Bends, secs: f64) -> Bends {
+    let share = (secs / FORGET_SECS).clamp(0.0, 1.0);
+    let calm = relaxed();
+    std::array::from_fn(|finger| {
+        std::array::from_fn(|k| before[finger][k] + (calm[finger][k] - before[finger][k]) * share)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{body, random_turns, ring};
+    use flyrig_types::{Frame, Image, PixelFormat};
+    use std::sync::Arc;
+
+    fn grey_set(rig: &Rig, nanos: i64) -> FrameSet {
+        let frame = |camera: &Camera| {
+            let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+            let bytes = vec![90; (width * height * 3) as usize];
+            let image = Image::new(width, height, PixelFormat::Rgb8, bytes).unwrap();
+            let camera = camera.id.clone();
+            Some(Arc::new(Frame { camera, sequence: 0, capture_nanos: nanos, exposure_nanos: None, image, mask: None }))
+        };
+        FrameSet { index: 0, master_nanos: nanos, frames: rig.cameras.iter().map(frame).collect() }
+    }
+
+    #[test]
+    fn hands_that_nobody_sees_are_relaxed_and_reported() {
+        let (rig, template) = (ring(2), body());
+        let mut tracker = HandTracker::new(&template, &rig, HandConfig::default()).unwrap();
+        let model = BodyModel::new(&template).unwrap();
+        let pose = model.to_pose(&random_turns(&model, 1));
+        let (found, quality) = tracker.estimate(&grey_set(&rig, 0), &pose).unwrap();
+        assert_eq!(found.joint_rotations.len(), 59);
+        assert!(found.is_valid());
+        assert_eq!(quality.fitted(), 0);
+        assert!(quality.hands.iter().all(|hand| hand.state == HandState::NotSeen && hand.views == 0));
+        assert!(quality.crops[0] > 0);
+        // The body is as it was.
+        for (a, b) in found.joint_rotations.iter().zip(&pose.joint_rotations) {
+            assert!(a.dot(*b).abs() > 1.0 - 1e-9, "{a} {b}");
+        }
+        let small = HandConfig { min_hand_px: 5000.0, min_face_px: 5000.0, ..HandConfig::default() };
+        let mut tracker = HandTracker::new(&template, &rig, small).unwrap();
+        let (_, quality) = tracker.estimate(&grey_set(&rig, 0), &pose).unwrap();
+        assert!(quality.hands.iter().all(|hand| hand.state == HandState::TooSmall && hand.largest_px > 30.0));
+        assert_eq!(quality.crops, [0, 0]);
+    }
+
+    #[test]
+    fn the_budget_bounds_the_crops_of_a_set_and_all_views_have_their_turn() {
+        let (rig, template) = (ring(3), body());
+        let config = HandConfig { crops: 2, head: false, ..HandConfig::default() };
+        let mut tracker = HandTracker::new(&template, &rig, config).unwrap();
+        let model = BodyModel::new(&template).unwrap();
+        let pose = model.to_pose(&random_turns(&model, 1));
+        for k in 0..3 {
+            let (_, quality) = tracker.estimate(&grey_set(&rig, k * 1_000_000), &pose).unwrap();
+            assert_eq!(quality.crops, [2, 0]);
+        }
+        assert!(tracker.looks[..2].iter().flatten().all(Option::is_some));
+        // Nothing has moved, and no look is old.
+        let (_, quality) = tracker.estimate(&grey_set(&rig, 4_000_000), &pose).unwrap();
+        assert_eq!(quality.crops, [0, 0]);
+    }
+
+    #[test]
+    fn poses_and_sets_that_do_not_fit_are_refused() {
+        let (rig, template) = (ring(2), body());
+        let mut tracker = HandTracker::new(&template, &rig, HandConfig::default()).unwrap();
+        let pose = template.skeleton.rest_pose();
+        let mut long = pose.clone();
+        long.joint_rotations.extend([DQuat::IDENTITY; 40]);
+        let set = grey_set(&rig, 0);
+        assert_eq!(tracker.estimate(&set, &long).unwrap_err().kind, TrackErrorKind::Template);
+        let mut nan = pose.clone();
+        nan.root_translation = DVec3::NAN;
+        assert_eq!(tracker.estimate(&set, &nan).unwrap_err().kind, TrackErrorKind::Template);
+        let short = FrameSet { frames: set.frames[..1].to_vec(), ..set };
+        assert_eq!(tracker.estimate(&short, &pose).unwrap_err().kind, TrackErrorKind::Frames);
+        let mut statue = template;
+        statue.name = "statue".to_owned();
+        let error = HandTracker::new(&statue, &rig, HandConfig::default()).unwrap_err();
+        assert_eq!(error.kind, TrackErrorKind::Template);
+    }
+}
