@@ -61,8 +61,8 @@ mod tests {
         let mut pose: Pose = body.skeleton.rest_pose();
         for side in 0..2 {
             for finger in 0..5 {
-                for k in 0..3 {
-                    pose.joint_rotations[joints[side][finger][k]] = each(&axes[side][finger], finger, k);
+                for (k, &joint) in joints[side][finger].iter().enumerate() {
+                    pose.joint_rotations[joint] = each(&axes[side][finger], finger, k);
                 }
             }
         }

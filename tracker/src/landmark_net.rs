@@ -43,7 +43,7 @@ impl LandmarkNet {
     /// # Errors
     /// Kind [`TrackErrorKind::Net`] when the length is wrong or the network fails.
     pub fn run(&self, rgb: &[f32]) -> Result<NetOutputs, TrackError> {
-        let failed = |error: TractError| self.failed(format!("failed: {error:#}"));
+        let failed = |error: TractError| self.failed(&format!("failed: {error:#}"));
         let input = Tensor::from_shape(&[1, self.side, self.side, 3], rgb).map_err(failed)?;
         let outputs = self.model.run(tvec!(input.into())).map_err(failed)?;
         Ok(NetOutputs { net: self.clone(), outputs })
@@ -54,7 +54,7 @@ impl LandmarkNet {
         vec![0.0; self.side * self.side * 3]
     }
 
-    fn failed(&self, message: String) -> TrackError {
+    fn failed(&self, message: &str) -> TrackError {
         TrackError::new(TrackErrorKind::Net, format!("the {} network {message}", self.name))
     }
 }
@@ -72,15 +72,15 @@ impl NetOutputs {
     /// Kind [`TrackErrorKind::Net`] when there is none or a number is not finite.
     pub fn of_size(&self, count: usize) -> Result<Vec<f32>, TrackError> {
         let output = self.outputs.iter().find(|output| output.len() == count).ok_or_else(|| {
-            self.net.failed(format!("has no output of {count} numbers; use a file that convert_mediapipe.py made"))
+            self.net.failed(&format!("has no output of {count} numbers; use a file that convert_mediapipe.py made"))
         })?;
         let values =
-            output.to_plain_array_view::<f32>().map_err(|error| self.net.failed(format!("failed: {error:#}")))?;
+            output.to_plain_array_view::<f32>().map_err(|error| self.net.failed(&format!("failed: {error:#}")))?;
         let values: Vec<f32> = values.iter().copied().collect();
         if values.iter().all(|value| value.is_finite()) {
             Ok(values)
         } else {
-            Err(self.net.failed("gave a value that is not finite".to_owned()))
+            Err(self.net.failed("gave a value that is not finite"))
         }
     }
 }

@@ -161,8 +161,8 @@ mod tests {
         let bends: Bends = std::array::from_fn(|f| [0.3 + 0.1 * f as f64, 0.1 - 0.05 * f as f64, 0.7, 0.4]);
         for model in HandModel::pair(&template).unwrap() {
             let mut pose = template.skeleton.rest_pose();
-            for finger in 0..5 {
-                for (joint, turn) in model.joints[finger].into_iter().zip(model.turns(finger, bends[finger])) {
+            for (finger, bend) in bends.into_iter().enumerate() {
+                for (joint, turn) in model.joints[finger].into_iter().zip(model.turns(finger, bend)) {
                     pose.joint_rotations[joint] = turn;
                 }
             }

@@ -207,7 +207,10 @@ impl HandTracker {
         let posed = self.body.pose(&turns);
         let nanos = set.master_nanos;
         let frames = self.frames(&posed);
-        let last = self.last.take().filter(|last| (0.0..FORGET_SECS).contains(&(1e-9 * (nanos - last.nanos) as f64)));
+        let last = self
+            .last
+            .take()
+            .filter(|last| (0.0..FORGET_SECS).contains(&(1e-9 * nanos.saturating_sub(last.nanos) as f64)));
         if last.is_none() {
             self.looks.iter_mut().flatten().for_each(|look| *look = None);
         }
@@ -223,7 +226,7 @@ impl HandTracker {
         let mut hands = [HandQuality { state: HandState::TooSmall, largest_px: 0.0, views: 0, residual_px: None }; 2];
         for side in 0..2 {
             hands[side].largest_px = largest_px[side];
-            let before = last.as_ref().map(|last| (last.bends[side], 1e-9 * (nanos - last.nanos) as f64));
+            let before = last.as_ref().map(|last| (last.bends[side], 1e-9 * nanos.saturating_sub(last.nanos) as f64));
             let fitted = self.fit_hand(side, &frames[side], nanos, before, &mut hands[side]);
             match fitted {
                 Some(found) => {
@@ -234,9 +237,9 @@ impl HandTracker {
                 }
                 None => bends[side] = before.map_or_else(relaxed, |(before, secs)| calmed(&before, secs)),
             }
-            for finger in 0..5 {
-                let model = &self.hands[side];
-                for (joint, turn) in model.joints[finger].into_iter().zip(model.turns(finger, bends[side][finger])) {
+            let model = &self.hands[side];
+            for (finger, bend) in bends[side].into_iter().enumerate() {
+                for (joint, turn) in model.joints[finger].into_iter().zip(model.turns(finger, bend)) {
                     turns.turns[joint] = turn;
                 }
             }
@@ -454,7 +457,7 @@ fn fingered(template: &Template) -> Result<Template, TrackError> {
 /// Velocities of wrists and head since the last set, metres a second.
 fn velocities(last: Option<&Last>, frames: &[RigidMotion; PARTS], nanos: i64) -> [DVec3; PARTS] {
     let Some(last) = last else { return [DVec3::ZERO; PARTS] };
-    let secs = 1e-9 * (nanos - last.nanos) as f64;
+    let secs = 1e-9 * nanos.saturating_sub(last.nanos) as f64;
     if secs < 1e-3 {
         return last.velocity;
     }
