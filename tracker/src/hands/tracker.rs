@@ -506,9 +506,10 @@ mod tests {
         assert_eq!(quality.fitted(), 0);
         assert!(quality.hands.iter().all(|hand| hand.state == HandState::NotSeen && hand.views == 0));
         assert!(quality.crops[0] > 0);
-        // The body is as it was.
-        for (a, b) in found.joint_rotations.iter().zip(&pose.joint_rotations) {
-            assert!(a.dot(*b).abs() > 1.0 - 1e-9, "{a} {b}");
+        // The body is as it was, but for the thumbs, whose first joints the body has without fingers as well.
+        let joints = template.skeleton.joints().iter();
+        for ((a, b), joint) in found.joint_rotations.iter().zip(&pose.joint_rotations).zip(joints) {
+            assert!(joint.name.contains("Thumb") || a.dot(*b).abs() > 1.0 - 1e-9, "{a} {b}");
         }
         let small = HandConfig { min_hand_px: 5000.0, min_face_px: 5000.0, ..HandConfig::default() };
         let mut tracker = HandTracker::new(&template, &rig, small).unwrap();
