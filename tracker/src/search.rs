@@ -16,7 +16,7 @@ use crate::{LANDMARK_COUNT, PoseConfig, PoseNet, TrackError, ViewKeypoints};
 /// Hypotheses kept a picture.
 const KEEP: usize = 4;
 
-/// What the network saw in one crop of a picture.
+/// The network's output for one crop of an image.
 #[derive(Debug, Clone)]
 pub(crate) struct Sighting {
     pub crop: Crop,
@@ -68,7 +68,7 @@ impl Sighting {
 
 /// Hypotheses older than this are forgotten, nanoseconds: a person walks on.
 const FORGET_NANOS: i64 = 1_000_000_000;
-/// Somebody this far from what the cameras look at is taken for another half as readily, metres.
+/// Distance from the cameras' common centre that halves a person's score, metres.
 const NEAR_CENTER_M: f64 = 2.0;
 /// A crop around a piece of foreground is larger by this factor.
 const BLOB_MARGIN: f64 = 1.25;
@@ -83,7 +83,7 @@ pub(crate) struct SearchScene<'a> {
     /// By slot.
     pub backgrounds: &'a [Option<Background>],
     pub nanos: i64,
-    /// What the cameras look at: who stands nearest is chosen, world metres.
+    /// Point nearest to the cameras' optical axes, world metres. People near it are preferred.
     pub center: DVec3,
     /// Landmarks of people who are tracked already.
     pub taken: &'a [[DVec3; LANDMARK_COUNT]],

@@ -119,7 +119,7 @@ impl Brightness {
     }
 }
 
-/// What a camera remembers of a point.
+/// Brightness of a point in earlier images of one camera.
 #[derive(Debug, Clone, Copy)]
 struct Remembered {
     /// By level, 0..1 and its change for each pixel.

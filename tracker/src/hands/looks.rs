@@ -28,7 +28,7 @@ const FACE_MARGIN: f64 = 1.5;
 /// Smallest cosine between a face and the way to the camera.
 const FACING: f64 = 0.2;
 
-/// What a network saw in one view.
+/// A network's landmarks of a hand or a face in one view.
 #[derive(Debug, Clone)]
 pub(crate) struct PartLook {
     pub nanos: i64,
