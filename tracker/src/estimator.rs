@@ -280,7 +280,8 @@ impl PoseEstimator {
         let start = Instant::now();
         let mut masks = self.masks(set, pictures, &mut fitted);
         seconds.masks = start.elapsed().as_secs_f64();
-        let mut texture = Texture::default();
+        let known = self.track.as_mut().map(|track| std::mem::take(&mut track.texture));
+        let mut texture = known.unwrap_or_else(|| Texture::new(&self.template, self.rig.cameras.len()));
         if self.config.outline_rounds > 0 {
             let start = Instant::now();
             let given: Vec<Option<&Mask>> = if self.config.masks {
@@ -288,7 +289,7 @@ impl PoseEstimator {
             } else {
                 set.frames.iter().map(|frame| frame.as_ref().and_then(|frame| frame.mask.as_ref())).collect()
             };
-            (fitted.turns, texture) = self.refine(set, pictures, &fitted, &given);
+            fitted.turns = self.refine(set, pictures, &fitted, &given, &mut texture);
             seconds.outline = start.elapsed().as_secs_f64();
         }
         if !self.config.masks {

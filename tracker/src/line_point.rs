@@ -58,12 +58,7 @@ pub(crate) fn bones(model: &BodyModel, template: &Template, vertex: usize) -> Ve
 
 /// Returns normal and offset on the undistorted plane of a line through a pixel of the image, by its normal in the image.
 pub(crate) fn undistorted_line(camera: &Camera, view: &View, through: DVec2, normal: DVec2) -> Option<(DVec2, f64)> {
-    let intrinsics = &camera.intrinsics;
-    let ideal = |pixel: DVec2| -> Option<DVec2> {
-        let distorted = (pixel - intrinsics.center_px) / intrinsics.focal_px;
-        Some(intrinsics.lens.undistort(distorted)? * view.focal_px)
-    };
-    let (on, beyond) = (ideal(through)?, ideal(through + normal)?);
+    let (on, beyond) = (view.undistorted(camera, through)?, view.undistorted(camera, through + normal)?);
     let normal = (beyond - on).normalize_or_zero();
     (normal != DVec2::ZERO).then(|| (normal, normal.dot(on)))
 }

@@ -42,8 +42,10 @@ const FORGET_SECS: f64 = 0.5;
 /// Coverage of the mask from which on a pixel is surely the person.
 const SURE_COVERAGE: u8 = 230;
 
-/// Filters over an image, from far to near.
+/// Images of a body's brightness, from far to near.
 pub(crate) const LEVELS: usize = 2;
+/// Radius of their filters, cells: the wider, the farther a surface may be from its place.
+const SMOOTH: [usize; LEVELS] = [2, 1];
 
 /// An image's brightness around the body, smoothed.
 #[derive(Debug, Clone)]
@@ -55,9 +57,8 @@ pub(crate) struct Brightness {
 }
 
 impl Brightness {
-    /// Of the part of an image that shows the vertices, with a margin; `smooth` is the radius of the filter in cells. `None` when
-    /// nothing of them is in the image.
-    pub fn around(picture: &Rgb<'_>, camera: &Camera, view: &View, vertices: &[Vec3], smooth: usize) -> Option<Self> {
+    /// Of the part of an image that shows the vertices, with a margin. `None` when nothing of them is in the image.
+    pub fn around(picture: &Rgb<'_>, camera: &Camera, view: &View, vertices: &[Vec3]) -> Option<[Self; LEVELS]> {
         let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
         let mut scales = Vec::new();
         for vertex in vertices.iter().step_by(7) {
@@ -89,10 +90,9 @@ impl Brightness {
             }
             *value = sum * norm;
         }
-        let grid = grid.box_mean(smooth).box_mean(smooth);
         // The middle of a cell's pixels is where its value belongs.
         let origin = DVec2::new((x0 * cell) as f64, (y0 * cell) as f64) + 0.5 * (cell as f64 - 1.0);
-        Some(Self { origin, cell, grid })
+        Some(SMOOTH.map(|radius| Self { origin, cell, grid: grid.box_mean(radius).box_mean(radius) }))
     }
 
     /// Brightness at a pixel, 0..1.
@@ -203,7 +203,7 @@ impl Texture {
     pub fn learn(
         &mut self,
         body: &TexturedBody<'_>,
-        images: [&Brightness; LEVELS],
+        images: &[Brightness; LEVELS],
         mask: Option<&Mask>,
         slot: usize,
         nanos: i64,
@@ -215,7 +215,7 @@ impl Texture {
                 let (x, y) = (pixel.x.round() as usize, pixel.y.round() as usize);
                 mask.coverage().get(y * mask.width() as usize + x).is_some_and(|c| *c >= SURE_COVERAGE)
             });
-            let [Some(far), Some(near)] = images.map(|image| image.slope(pixel)) else { continue };
+            let [Some(far), Some(near)] = images.each_ref().map(|image| image.slope(pixel)) else { continue };
             let levels = [far, near];
             if !covered || !levels.iter().all(|(value, slope)| value.is_finite() && slope.is_finite()) {
                 continue;
@@ -375,7 +375,7 @@ mod tests {
             let pose = self.model.to_pose(shown);
             let photo = photo(camera, view, &self.template, &pose);
             let (vertices, _) = skin_mesh(&self.template, &pose);
-            [2, 1].map(|smooth| Brightness::around(&photo, camera, view, &vertices, smooth).unwrap())
+            Brightness::around(&photo, camera, view, &vertices).unwrap()
         }
 
         fn seen<R>(&self, slot: usize, turns: &Turns, each: impl FnOnce(&TexturedBody<'_>) -> R) -> R {
@@ -387,8 +387,8 @@ mod tests {
         fn learnt(&self, turns: &Turns) -> Texture {
             let mut texture = Texture::new(&self.template, self.cameras.len());
             for slot in 0..self.cameras.len() {
-                let [far, near] = self.images(slot, turns);
-                self.seen(slot, turns, |seen| texture.learn(seen, [&far, &near], None, slot, 0));
+                let images = self.images(slot, turns);
+                self.seen(slot, turns, |seen| texture.learn(seen, &images, None, slot, 0));
             }
             texture
         }
@@ -501,13 +501,13 @@ mod tests {
         let eye = camera.position().as_vec3();
         let near: Vec<Vec3> = vertices.iter().map(|v| eye + (*v - eye) * 0.25).collect();
         for vertices in [&vertices, &near] {
-            let image = Brightness::around(&ramp, camera, view, vertices, 1).unwrap();
+            let [_, image] = Brightness::around(&ramp, camera, view, vertices).unwrap();
             let (value, slope) = image.slope(DVec2::new(402.5, 401.0)).unwrap();
             assert!((value - (402.5 - 1.5) / 4.0 / 255.0).abs() < 2e-3, "{value}");
             assert!((slope - DVec2::new(0.25 / 255.0, 0.0)).length() < 1e-4, "{slope}");
         }
         let behind: Vec<Vec3> = vertices.iter().map(|v| *v + (camera.position() * 3.0).as_vec3()).collect();
-        assert!(Brightness::around(&ramp, camera, view, &behind, 1).is_none());
-        assert!(Brightness::around(&ramp, camera, view, &[], 1).is_none());
+        assert!(Brightness::around(&ramp, camera, view, &behind).is_none());
+        assert!(Brightness::around(&ramp, camera, view, &[]).is_none());
     }
 }

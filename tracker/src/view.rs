@@ -52,6 +52,14 @@ impl View {
         Some((ideal * self.focal_px, [du, dv]))
     }
 
+    /// Undistorted place of a pixel of this view's camera: pixels from the principal point. `None` where the lens model has
+    /// none.
+    pub fn undistorted(&self, camera: &Camera, pixel: DVec2) -> Option<DVec2> {
+        let distorted = (pixel - camera.intrinsics.center_px) / camera.intrinsics.focal_px;
+        let ideal = camera.intrinsics.lens.undistort(distorted)? * self.focal_px;
+        ideal.is_finite().then_some(ideal)
+    }
+
     /// Camera centre in the world.
     pub fn center(&self) -> DVec3 {
         -(self.rotation.transpose() * self.translation)
@@ -77,8 +85,7 @@ pub(crate) fn observe(
         if !keypoint.usable() || keypoint.confidence < confidence_threshold {
             return None;
         }
-        let distorted = (keypoint.pixel - camera.intrinsics.center_px) / camera.intrinsics.focal_px;
-        let ideal = camera.intrinsics.lens.undistort(distorted)?;
-        Some(Observation { ideal_px: ideal * view.focal_px, confidence: keypoint.confidence.min(1.0) })
+        let ideal_px = view.undistorted(camera, keypoint.pixel)?;
+        Some(Observation { ideal_px, confidence: keypoint.confidence.min(1.0) })
     })
 }

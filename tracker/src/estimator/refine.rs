@@ -6,8 +6,6 @@ use super::*;
 const OUTLINE_REACH_M: f64 = 0.05;
 /// Steps of the solver in each round of matching.
 const STEPS: usize = 4;
-/// Radius of the filter over an image's brightness, cells: the wider, the farther a surface may be from its place.
-const SMOOTH: [usize; LEVELS] = [2, 1];
 
 /// World positions and normals of the template's vertices.
 type Skinned = (Vec<Vec3>, Vec<Vec3>);
@@ -26,34 +24,29 @@ impl PosedBody {
 }
 
 impl PoseEstimator {
-    /// Moves the pose so that the body's outline lies on that of the masks, and its texture where it was seen before. Returns
-    /// the texture as it is seen now as well.
+    /// Moves the pose so that the body's outline lies on that of the masks, and its texture where it was seen before. The
+    /// texture takes in the images.
     pub(super) fn refine(
         &self,
         set: &FrameSet,
         pictures: &[Option<Rgb<'_>>],
         fitted: &Fitted,
         masks: &[Option<&Mask>],
-    ) -> (Turns, Texture) {
+        texture: &mut Texture,
+    ) -> Turns {
         let mut turns = fitted.turns.clone();
         let mut body = self.posed(set, fitted, &turns);
         let of_view = |view: &FitView| {
             let picture = pictures.get(view.slot).and_then(Option::as_ref);
             let camera = &self.rig.cameras[view.slot];
-            SMOOTH.map(|smooth| Brightness::around(picture?, camera, &view.view, &body.now.0, smooth))
+            Brightness::around(picture?, camera, &view.view, &body.now.0)
         };
-        let images: Vec<[Option<Brightness>; LEVELS]> = fitted.evidence.views.par_iter().map(of_view).collect();
-        let known = self.track.as_ref().map(|track| &track.texture);
+        let images: Vec<Option<[Brightness; LEVELS]>> = fitted.evidence.views.par_iter().map(of_view).collect();
         for round in 0..self.config.outline_rounds {
             // Far first, then only what is near.
             let last = round + 1 >= self.config.outline_rounds;
-            let outline = self.outline_points(fitted, &body, masks, if last { 1.0 } else { 2.0 });
-            let texture = known.map_or_else(Vec::new, |texture| {
-                self.texture_points(fitted, &body, texture, usize::from(last), |view, level| {
-                    images[view][level].as_ref()
-                })
-            });
-            let lines = [outline, texture].concat();
+            let mut lines = self.outline_points(fitted, &body, masks, if last { 1.0 } else { 2.0 });
+            lines.extend(self.texture_points(fitted, &body, texture, &images, usize::from(last)));
             if lines.is_empty() {
                 break;
             }
@@ -65,14 +58,13 @@ impl PoseEstimator {
             turns = better;
             body = self.posed(set, fitted, &turns);
         }
-        let mut texture = known.cloned().unwrap_or_else(|| Texture::new(&self.template, self.rig.cameras.len()));
         for (index, (view, image)) in fitted.evidence.views.iter().zip(&images).enumerate() {
-            if let [Some(far), Some(near)] = image {
+            if let Some(images) = image {
                 let mask = masks.get(view.slot).copied().flatten();
-                texture.learn(&self.textured(view, body.at(index)), [far, near], mask, view.slot, set.master_nanos);
+                texture.learn(&self.textured(view, body.at(index)), images, mask, view.slot, set.master_nanos);
             }
         }
-        (turns, texture)
+        turns
     }
 
     /// The outline of the body in a pose, matched with the masks of all views.
@@ -99,16 +91,18 @@ impl PoseEstimator {
     }
 
     /// The surface of the body, matched with its brightness in all views.
-    fn texture_points<'a>(
+    fn texture_points(
         &self,
         fitted: &Fitted,
         body: &PosedBody,
         texture: &Texture,
+        images: &[Option<[Brightness; LEVELS]>],
         level: usize,
-        image: impl Fn(usize, usize) -> Option<&'a Brightness> + Sync,
     ) -> Vec<LinePoint> {
         let of_view = |(index, view): (usize, &FitView)| {
-            let Some(image) = image(index, level) else { return Vec::new() };
+            let Some(image) = images.get(index).and_then(Option::as_ref).map(|images| &images[level]) else {
+                return Vec::new();
+            };
             let seen = self.textured(view, body.at(index));
             let mut points = texture.lines((&self.template, &self.model), &seen, image, level, (view.slot, index));
             shift(&mut points, body, index);

@@ -5,7 +5,7 @@ use flyrig_types::{Camera, Image, Pose};
 use glam::{DMat3, DVec3};
 
 use super::face_points::RIGID;
-use super::looks::{FaceTarget, ideal_px};
+use super::looks::FaceTarget;
 use super::{FaceNet, FaceOutput};
 use crate::TrackError;
 use crate::body_model::BodyModel;
@@ -67,7 +67,7 @@ impl FaceStudy {
         let from = rotation * (view.center() - origin) / scale;
         for (rays, &landmark) in self.rays.iter_mut().zip(&RIGID) {
             let pixel = target.crop.to_picture_from(landmarks[landmark], side);
-            let Some(ideal) = ideal_px(camera, &view, pixel) else { continue };
+            let Some(ideal) = view.undistorted(camera, pixel) else { continue };
             let along = rotation * (view.rotation.transpose() * (ideal / view.focal_px).extend(1.0));
             rays.push(Ray { from, along: along.normalize() });
         }

@@ -61,13 +61,6 @@ impl PartLook {
     }
 }
 
-/// Undistorts a picture's pixel: pixels from the principal point; `None` where that is not possible.
-pub(crate) fn ideal_px(camera: &Camera, view: &View, pixel: DVec2) -> Option<DVec2> {
-    let distorted = (pixel - camera.intrinsics.center_px) / camera.intrinsics.focal_px;
-    let ideal = camera.intrinsics.lens.undistort(distorted)?;
-    ideal.is_finite().then(|| ideal * view.focal_px)
-}
-
 fn inside(camera: &Camera, pixel: DVec2) -> bool {
     let size = DVec2::new(f64::from(camera.intrinsics.width), f64::from(camera.intrinsics.height));
     pixel.cmpgt(DVec2::ZERO).all() && pixel.cmplt(size).all()

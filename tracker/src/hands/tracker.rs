@@ -12,7 +12,7 @@ use super::face_points::FACE_POINTS;
 use super::hand_fit::{HandPose, HandProblem, HandSight};
 use super::hand_model::{Bends, HandModel, relaxed};
 use super::head_fit::{FaceSight, HeadProblem};
-use super::looks::{FORGET_SECS, FaceTarget, PartLook, hand_crop, ideal_px};
+use super::looks::{FORGET_SECS, FaceTarget, PartLook, hand_crop};
 use super::{
     FACE_SIDE, FaceNet, HAND_LANDMARKS, HAND_SIDE, HandNet, HandQuality, HandState, HandsQuality, HeadQuality,
 };
@@ -336,12 +336,12 @@ impl HandTracker {
                 let (seen, presence) = if part == HEAD {
                     let output = self.face_net.run(&crop.sample_square(&picture, FACE_SIDE))?;
                     let of_point = |landmark: usize| crop.to_picture_from(output.landmarks[landmark], FACE_SIDE);
-                    let seen = FACE_POINTS.iter().map(|point| ideal_px(camera, &view, of_point(point.landmark)));
+                    let seen = FACE_POINTS.iter().map(|point| view.undistorted(camera, of_point(point.landmark)));
                     (seen.collect(), output.presence)
                 } else {
                     let output = self.hand_net.run(&crop.sample_square(&picture, HAND_SIDE))?;
                     let seen = output.landmarks.iter();
-                    let seen = seen.map(|&at| ideal_px(camera, &view, crop.to_picture_from(at, HAND_SIDE)));
+                    let seen = seen.map(|&at| view.undistorted(camera, crop.to_picture_from(at, HAND_SIDE)));
                     (seen.collect(), output.presence)
                 };
                 let delay_secs = 1e-9 * frame.capture_nanos.saturating_sub(set.master_nanos) as f64;
