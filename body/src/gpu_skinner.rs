@@ -1,7 +1,9 @@
-//! Linear blend skinning on the GPU.
+//! Linear blend skinning of surface Gaussians, on the device or on the processor.
 
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer, dispatch_1d};
 use flyrig_types::Pose;
+use glam::{DMat4, Mat4, Vec3, Vec4};
+use rayon::prelude::*;
 
 use crate::{BodyError, Skeleton, SurfaceGaussians};
 
@@ -9,11 +11,12 @@ const WGSL: &str = include_str!("skin.wgsl");
 /// Default of the kernel's `WORKGROUP_SIZE`.
 const WORKGROUP_SIZE: u32 = 64;
 
-/// Poses surface Gaussians on the GPU: world = LBS(x + t_x), FlyHuman section 3.1. What stays constant is
+/// Poses surface Gaussians where they lie: world = LBS(x + t_x), FlyHuman section 3.1. What stays constant is
 /// uploaded once; a frame uploads 48 bytes a joint.
 #[derive(Debug)]
 pub struct GpuSkinner {
-    kernel: ComputeKernel,
+    /// None on the processor.
+    kernel: Option<ComputeKernel>,
     count: usize,
     joint_rows: StorageBuffer<[f32; 4]>,
     rest: StorageBuffer<[f32; 4]>,
@@ -37,7 +40,7 @@ impl GpuSkinner {
             gaussians.skin.iter().map(|s| [pack(s.joints[0], s.joints[1]), pack(s.joints[2], s.joints[3])]).collect();
         let weights: Vec<[f32; 4]> = gaussians.skin.iter().map(|s| s.weights).collect();
         Ok(Self {
-            kernel: ComputeKernel::new(gpu, "skinning", &[WGSL], "skin"),
+            kernel: (!gpu.is_on_processor()).then(|| ComputeKernel::new(gpu, "skinning", &[WGSL], "skin")),
             count: gaussians.len(),
             joint_rows: StorageBuffer::zeroed(gpu, "joint matrices", skeleton.joints().len() * 3)?,
             rest: StorageBuffer::from_slice(gpu, "Gaussian rest positions", &rest)?,
@@ -88,11 +91,15 @@ impl GpuSkinner {
             return Err(BodyError::Pose(format!("a skeleton of {found} joints where the skinner has {expected}")));
         }
         let matrices = skeleton.world_from_canonical(pose);
-        let joint_rows: Vec<[f32; 4]> =
-            matrices.iter().flat_map(|matrix| [0, 1, 2].map(|row| matrix.row(row).as_vec4().to_array())).collect();
         if self.count == 0 {
             return Ok(());
         }
+        let Some(kernel) = &self.kernel else {
+            self.skin(&matrices, displacement.unwrap_or(&self.no_displacement), center_scale, normal);
+            return Ok(());
+        };
+        let joint_rows: Vec<[f32; 4]> =
+            matrices.iter().flat_map(|matrix| [0, 1, 2].map(|row| matrix.row(row).as_vec4().to_array())).collect();
         self.joint_rows.encode_write(gpu, encoder, &joint_rows);
         let buffers = [
             self.joint_rows.raw(),
@@ -104,14 +111,54 @@ impl GpuSkinner {
             center_scale.raw(),
             normal.raw(),
         ];
-        let bindings = self.kernel.bind(gpu, &buffers.map(wgpu::Buffer::as_entire_binding));
+        let bindings = kernel.bind(gpu, &buffers.map(wgpu::Buffer::as_entire_binding));
         let (x, y) = dispatch_1d(self.count as u32, WORKGROUP_SIZE);
         let mut pass =
             encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some("skinning"), ..Default::default() });
-        pass.set_pipeline(&self.kernel.pipeline);
+        pass.set_pipeline(&kernel.pipeline);
         pass.set_bind_group(0, &bindings, &[]);
         pass.dispatch_workgroups(x, y, 1);
         Ok(())
+    }
+
+    /// The kernel on the processor.
+    fn skin(
+        &self,
+        world_from_canonical: &[DMat4],
+        displacement: &StorageBuffer<[f32; 4]>,
+        center_scale: &StorageBuffer<[f32; 4]>,
+        normal: &StorageBuffer<[f32; 4]>,
+    ) {
+        let joints: Vec<Mat4> = world_from_canonical.iter().map(DMat4::as_mat4).collect();
+        let (Some(rest), Some(rest_normal)) = (self.rest.slice(), self.rest_normal.slice()) else { return };
+        let (Some(skin_joints), Some(weights)) = (self.skin_joints.slice(), self.skin_weights.slice()) else { return };
+        let (Some(displacement), Some(mut center_scale), Some(mut normal)) =
+            (displacement.slice(), center_scale.slice_mut(), normal.slice_mut())
+        else {
+            return;
+        };
+        let outs = center_scale.par_iter_mut().zip(normal.par_iter_mut()).take(self.count);
+        outs.enumerate().with_min_len(4096).for_each(|(i, (center_scale, normal))| {
+            let mut matrix = Mat4::ZERO;
+            let mut total = 0.0;
+            for (k, &weight) in weights[i].iter().enumerate() {
+                let joint = (skin_joints[i][k / 2] >> (16 * (k % 2))) & 0xffff;
+                if let Some(joint) = joints.get(joint as usize).filter(|_| weight > 0.0) {
+                    matrix += *joint * weight;
+                    total += weight;
+                }
+            }
+            let matrix = if total > 0.0 { matrix * (1.0 / total) } else { Mat4::IDENTITY };
+            let [x, y, z, scale] = rest[i];
+            let moved = displacement.get(i).map_or(Vec3::ZERO, |by| Vec4::from(*by).truncate());
+            let point = Vec3::new(x, y, z) + if moved.is_finite() { moved } else { Vec3::ZERO };
+            let world = matrix.x_axis * point.x + matrix.y_axis * point.y + matrix.z_axis * point.z + matrix.w_axis;
+            *center_scale = [world.x, world.y, world.z, scale];
+            let turned = matrix.transform_vector3(Vec4::from(rest_normal[i]).truncate());
+            let length_squared = turned.length_squared();
+            let unit = if length_squared > 1e-20 { turned / length_squared.sqrt() } else { Vec3::ZERO };
+            *normal = unit.extend(0.0).to_array();
+        });
     }
 }
 

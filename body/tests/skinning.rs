@@ -6,7 +6,7 @@ use flyrig_body::{
     BodyError, GpuSkinner, ShapeParams, SurfaceGaussians, default_template, sample_surface, skin_mesh, skin_normal_f64,
     skin_point_f64,
 };
-use flyrig_gpu::{AdapterChoice, GpuContext, StorageBuffer};
+use flyrig_gpu::{GpuContext, StorageBuffer, testing::on_both};
 use flyrig_types::Pose;
 use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
@@ -79,71 +79,82 @@ struct GpuRun {
     normal: Vec<[f32; 4]>,
 }
 
-fn run_gpu(gaussians: &SurfaceGaussians, pose: &Pose, displacement: Option<&[[f32; 4]]>) -> Result<GpuRun, BodyError> {
-    let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+fn run_gpu(
+    gpu: &GpuContext,
+    gaussians: &SurfaceGaussians,
+    pose: &Pose,
+    displacement: Option<&[[f32; 4]]>,
+) -> Result<GpuRun, BodyError> {
     let skeleton = default_template(&ShapeParams::man()).unwrap().skeleton;
-    let skinner = GpuSkinner::new(&gpu, gaussians, &skeleton).unwrap();
-    let center_scale = StorageBuffer::zeroed(&gpu, "centres", gaussians.len()).unwrap();
-    let normal = StorageBuffer::zeroed(&gpu, "normals", gaussians.len()).unwrap();
-    let displacement = displacement.map(|d| StorageBuffer::from_slice(&gpu, "displacements", d).unwrap());
+    let skinner = GpuSkinner::new(gpu, gaussians, &skeleton).unwrap();
+    let center_scale = StorageBuffer::zeroed(gpu, "centres", gaussians.len()).unwrap();
+    let normal = StorageBuffer::zeroed(gpu, "normals", gaussians.len()).unwrap();
+    let displacement = displacement.map(|d| StorageBuffer::from_slice(gpu, "displacements", d).unwrap());
     let mut encoder = gpu.device.create_command_encoder(&Default::default());
-    skinner.encode(&gpu, &mut encoder, &skeleton, pose, displacement.as_ref(), &center_scale, &normal)?;
+    skinner.encode(gpu, &mut encoder, &skeleton, pose, displacement.as_ref(), &center_scale, &normal)?;
     gpu.queue.submit([encoder.finish()]);
-    Ok(GpuRun { center_scale: center_scale.read(&gpu).unwrap(), normal: normal.read(&gpu).unwrap() })
+    Ok(GpuRun { center_scale: center_scale.read(gpu).unwrap(), normal: normal.read(gpu).unwrap() })
 }
 
 #[test]
 fn gpu_skinning_agrees_with_the_reference() {
-    let body = default_template(&ShapeParams::man()).unwrap();
-    let mut gaussians = sample_surface(&body, 3001, 2).unwrap();
-    // One without weights, one on a joint that does not exist: both stay where they are.
-    gaussians.skin[10].weights = [0.0; 4];
-    gaussians.skin[11].joints = [500; 4];
-    let pose = random_pose(&body.skeleton.rest_pose(), 9);
-    let mut rng = rand::rngs::StdRng::seed_from_u64(3);
-    let mut displacement: Vec<[f32; 4]> =
-        (0..gaussians.len()).map(|_| rng.random::<[f32; 4]>().map(|x| (x - 0.5) * 0.1)).collect();
-    displacement[20][1] = f32::NAN;
-    displacement[21][2] = f32::NEG_INFINITY;
-    displacement[22][3] = f32::NAN;
-    let matrices = body.skeleton.world_from_canonical(&pose);
-    for displacement in [None, Some(displacement.as_slice())] {
-        let run = run_gpu(&gaussians, &pose, displacement).unwrap();
-        for i in 0..gaussians.len() {
-            let moved =
-                displacement.map_or(DVec3::ZERO, |d| DVec3::new(d[i][0].into(), d[i][1].into(), d[i][2].into()));
-            let moved = if moved.is_finite() { moved } else { DVec3::ZERO };
-            let expected = skin_point_f64(&matrices, &gaussians.skin[i], gaussians.positions[i].as_dvec3() + moved);
-            let [x, y, z, scale] = run.center_scale[i];
-            let error = (DVec3::new(x.into(), y.into(), z.into()) - expected).length();
-            assert!(error < POSITION_TOLERANCE, "Gaussian {i}: {error} m");
-            assert_eq!(scale.to_bits(), gaussians.scale_m[i].to_bits());
-            let expected = skin_normal_f64(&matrices, &gaussians.skin[i], gaussians.normals[i].as_dvec3());
-            let [x, y, z, _] = run.normal[i];
-            assert!((DVec3::new(x.into(), y.into(), z.into()) - expected).length() < NORMAL_TOLERANCE, "normal {i}");
+    on_both(|gpu| {
+        let body = default_template(&ShapeParams::man()).unwrap();
+        let mut gaussians = sample_surface(&body, 3001, 2).unwrap();
+        // One without weights, one on a joint that does not exist: both stay where they are.
+        gaussians.skin[10].weights = [0.0; 4];
+        gaussians.skin[11].joints = [500; 4];
+        let pose = random_pose(&body.skeleton.rest_pose(), 9);
+        let mut rng = rand::rngs::StdRng::seed_from_u64(3);
+        let mut displacement: Vec<[f32; 4]> =
+            (0..gaussians.len()).map(|_| rng.random::<[f32; 4]>().map(|x| (x - 0.5) * 0.1)).collect();
+        displacement[20][1] = f32::NAN;
+        displacement[21][2] = f32::NEG_INFINITY;
+        displacement[22][3] = f32::NAN;
+        let matrices = body.skeleton.world_from_canonical(&pose);
+        for displacement in [None, Some(displacement.as_slice())] {
+            let run = run_gpu(gpu, &gaussians, &pose, displacement).unwrap();
+            for i in 0..gaussians.len() {
+                let moved =
+                    displacement.map_or(DVec3::ZERO, |d| DVec3::new(d[i][0].into(), d[i][1].into(), d[i][2].into()));
+                let moved = if moved.is_finite() { moved } else { DVec3::ZERO };
+                let expected = skin_point_f64(&matrices, &gaussians.skin[i], gaussians.positions[i].as_dvec3() + moved);
+                let [x, y, z, scale] = run.center_scale[i];
+                let error = (DVec3::new(x.into(), y.into(), z.into()) - expected).length();
+                assert!(error < POSITION_TOLERANCE, "Gaussian {i}: {error} m");
+                assert_eq!(scale.to_bits(), gaussians.scale_m[i].to_bits());
+                let expected = skin_normal_f64(&matrices, &gaussians.skin[i], gaussians.normals[i].as_dvec3());
+                let [x, y, z, _] = run.normal[i];
+                assert!(
+                    (DVec3::new(x.into(), y.into(), z.into()) - expected).length() < NORMAL_TOLERANCE,
+                    "normal {i}"
+                );
+            }
         }
-    }
+    });
 }
 
 #[test]
 fn poses_that_do_not_fit_are_refused_before_the_gpu_sees_them() {
-    let body = default_template(&ShapeParams::man()).unwrap();
-    let gaussians = sample_surface(&body, 8, 2).unwrap();
-    let rest = body.skeleton.rest_pose();
-    let mut poisoned = rest.clone();
-    poisoned.joint_rotations[4].x = f64::NAN;
-    let mut far = rest.clone();
-    far.root_translation.z = f64::INFINITY;
-    let mut short = rest.clone();
-    short.joint_rotations.pop();
-    for pose in [poisoned, far, short] {
-        assert!(matches!(run_gpu(&gaussians, &pose, None), Err(BodyError::Pose(_))));
-    }
-    assert!(matches!(
-        run_gpu(&gaussians, &rest, Some(&[[0.0; 4]; 7])),
-        Err(BodyError::Buffer { found: 7, needed: 8, .. })
-    ));
-    // Missing rotations keep their joints at rest on the CPU.
-    let short = Pose { joint_rotations: Vec::new(), ..rest.clone() };
-    assert_eq!(body.skeleton.world_from_joint(&short), body.skeleton.world_from_joint(&rest));
+    on_both(|gpu| {
+        let body = default_template(&ShapeParams::man()).unwrap();
+        let gaussians = sample_surface(&body, 8, 2).unwrap();
+        let rest = body.skeleton.rest_pose();
+        let mut poisoned = rest.clone();
+        poisoned.joint_rotations[4].x = f64::NAN;
+        let mut far = rest.clone();
+        far.root_translation.z = f64::INFINITY;
+        let mut short = rest.clone();
+        short.joint_rotations.pop();
+        for pose in [poisoned, far, short] {
+            assert!(matches!(run_gpu(gpu, &gaussians, &pose, None), Err(BodyError::Pose(_))));
+        }
+        assert!(matches!(
+            run_gpu(gpu, &gaussians, &rest, Some(&[[0.0; 4]; 7])),
+            Err(BodyError::Buffer { found: 7, needed: 8, .. })
+        ));
+        // Missing rotations keep their joints at rest on the CPU.
+        let short = Pose { joint_rotations: Vec::new(), ..rest.clone() };
+        assert_eq!(body.skeleton.world_from_joint(&short), body.skeleton.world_from_joint(&rest));
+    });
 }

@@ -133,7 +133,7 @@ impl Deformation {
             most_views: options.views,
             chooser: Chooser::default(),
             tracker,
-            backward: BackwardRasterizer::for_device(gpu)?,
+            backward: BackwardRasterizer::new(gpu)?,
             loss: PictureLoss::new(gpu)?,
             coarse_displacement: StorageBuffer::zeroed(gpu, "displacements", count)?,
             displacement: StorageBuffer::zeroed(gpu, "displacements", surface.len())?,

@@ -2,7 +2,7 @@
 
 use std::{
     marker::PhantomData,
-    sync::{Arc, Weak, atomic::Ordering},
+    sync::{Arc, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard, Weak, atomic::Ordering},
 };
 
 use bytemuck::Pod;
@@ -10,13 +10,19 @@ use wgpu::{Buffer, BufferDescriptor, BufferUsages, CommandEncoder};
 
 use crate::{GpuContext, GpuError, shared::Shared};
 
-/// A GPU array of `T`, usable as storage, copy source and copy target. Clones share the array.
+/// An array of `T` on the device, usable as storage, copy source and copy target, or in the processor's memory for a context
+/// whose kernels run there ([`GpuContext::on_processor`]). Clones share the array.
 #[derive(Debug, Clone)]
 pub struct StorageBuffer<T> {
     owner: Arc<Owner>,
+    /// The content where the kernels run on the processor.
+    content: Option<Arc<RwLock<Vec<T>>>>,
     len: usize,
     element: PhantomData<T>,
 }
+
+/// Size of the device's stand-in for an array in the processor's memory.
+const STAND_IN_BYTES: u64 = 16;
 
 /// The buffer of all clones. The last one takes the bind groups along.
 #[derive(Debug)]
@@ -47,14 +53,27 @@ impl<T: Pod> StorageBuffer<T> {
         }
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST | BufferUsages::INDIRECT;
         gpu.shared.counters.storage_buffers.fetch_add(1, Ordering::Relaxed);
+        let content = gpu.is_on_processor().then(|| Arc::new(RwLock::new(vec![T::zeroed(); len])));
         let buffer = gpu.device.create_buffer(&BufferDescriptor {
             label: Some(label),
-            size: needed,
+            size: if content.is_some() { STAND_IN_BYTES } else { needed },
             usage,
             mapped_at_creation: false,
         });
         let owner = Arc::new(Owner { buffer, shared: Arc::downgrade(&gpu.shared) });
-        Ok(Self { owner, len, element: PhantomData })
+        Ok(Self { owner, content, len, element: PhantomData })
+    }
+
+    /// The elements, while nobody changes them; None for an array on the device.
+    #[must_use]
+    pub fn slice(&self) -> Option<RwLockReadGuard<'_, Vec<T>>> {
+        self.content.as_ref().map(|content| content.read().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// The elements, to change them; None for an array on the device. Waits while somebody else holds the elements.
+    #[must_use]
+    pub fn slice_mut(&self) -> Option<RwLockWriteGuard<'_, Vec<T>>> {
+        self.content.as_ref().map(|content| content.write().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// A buffer with the given content.
@@ -70,7 +89,9 @@ impl<T: Pod> StorageBuffer<T> {
     /// Queues a copy of the first elements (extra ones are ignored).
     pub fn write(&self, gpu: &GpuContext, content: &[T]) {
         let count = content.len().min(self.len);
-        if count > 0 {
+        if let Some(mut elements) = self.slice_mut() {
+            elements[..count].copy_from_slice(&content[..count]);
+        } else if count > 0 {
             gpu.queue.write_buffer(self.raw(), 0, bytemuck::cast_slice(&content[..count]));
         }
     }
@@ -79,7 +100,9 @@ impl<T: Pod> StorageBuffer<T> {
     /// those after it the new one. Creates no buffer in the long run. Elements of a multiple of 4 bytes only.
     pub fn encode_write(&self, gpu: &GpuContext, encoder: &mut CommandEncoder, content: &[T]) {
         let count = content.len().min(self.len);
-        if count > 0 {
+        if self.content.is_some() {
+            self.write(gpu, content);
+        } else if count > 0 {
             let bytes = bytemuck::cast_slice(&content[..count]);
             gpu.shared.uploads.record(&gpu.device, &gpu.shared.counters, encoder, bytes, (self.raw(), 0));
         }
@@ -89,17 +112,41 @@ impl<T: Pod> StorageBuffer<T> {
     /// alignment, their number must be a multiple of 4.
     pub fn write_bytes(&self, gpu: &GpuContext, bytes: &[u8]) {
         let count = bytes.len().min(self.len * size_of::<T>()) & !3;
-        if count > 0 {
+        if let Some(mut elements) = self.slice_mut() {
+            bytemuck::cast_slice_mut::<T, u8>(&mut elements)[..count].copy_from_slice(&bytes[..count]);
+        } else if count > 0 {
             gpu.queue.write_buffer(self.raw(), 0, &bytes[..count]);
         }
     }
 
     /// Queues a copy of the elements that both have room for.
     pub fn copy_to(&self, gpu: &GpuContext, other: &Self) {
-        let bytes = self.len.min(other.len) as u64 * size_of::<T>() as u64;
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        encoder.copy_buffer_to_buffer(self.raw(), 0, other.raw(), 0, bytes);
+        self.encode_copy(&mut encoder, other, 0);
         gpu.queue.submit([encoder.finish()]);
+    }
+
+    /// Records a copy to the elements of another array from `first` on, as many as there is room for.
+    pub fn encode_copy(&self, encoder: &mut CommandEncoder, other: &Self, first: usize) {
+        let count = self.len.min(other.len.saturating_sub(first));
+        if let Some((from, to)) = self.content.as_ref().zip(other.content.as_ref()) {
+            if count > 0 && !Arc::ptr_eq(from, to) {
+                let from = from.read().unwrap_or_else(PoisonError::into_inner);
+                let mut to = to.write().unwrap_or_else(PoisonError::into_inner);
+                to[first..first + count].copy_from_slice(&from[..count]);
+            }
+            return;
+        }
+        let element = size_of::<T>() as u64;
+        encoder.copy_buffer_to_buffer(self.raw(), 0, other.raw(), first as u64 * element, count as u64 * element);
+    }
+
+    /// Records setting all elements to zero.
+    pub fn encode_clear(&self, encoder: &mut CommandEncoder) {
+        match self.slice_mut() {
+            Some(mut elements) => elements.fill(T::zeroed()),
+            None => encoder.clear_buffer(self.raw(), 0, None),
+        }
     }
 
     /// Elements.
@@ -114,7 +161,7 @@ impl<T: Pod> StorageBuffer<T> {
         self.len == 0
     }
 
-    /// wgpu's buffer.
+    /// wgpu's buffer; a stand-in without content for an array in the processor's memory.
     #[must_use]
     pub fn raw(&self) -> &Buffer {
         &self.owner.buffer
@@ -125,7 +172,22 @@ impl<T: Pod> StorageBuffer<T> {
     /// # Errors
     /// [`GpuError::Lost`].
     pub fn read(&self, gpu: &GpuContext) -> Result<Vec<T>, GpuError> {
-        read_back(gpu, self.raw(), self.len)
+        self.read_first(gpu, self.len)
+    }
+
+    /// Reads at most `count` elements from the start, as [`Self::read`].
+    ///
+    /// # Errors
+    /// [`GpuError::Lost`].
+    pub fn read_first(&self, gpu: &GpuContext, count: usize) -> Result<Vec<T>, GpuError> {
+        let count = count.min(self.len);
+        match self.slice() {
+            Some(elements) => {
+                gpu.check()?;
+                Ok(elements[..count].to_vec())
+            }
+            None => read_back(gpu, self.raw(), count),
+        }
     }
 }
 

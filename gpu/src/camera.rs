@@ -2,6 +2,7 @@
 
 use bytemuck::{Pod, Zeroable};
 use flyrig_types::{Camera, Lens};
+use glam::{Mat2, Mat4, Vec2, Vec3, Vec4};
 
 /// WGSL: `struct Camera`, `fn project_point`, `fn distort`, `fn projection_jacobian`. Prepend it to a
 /// kernel that declares a `Camera` binding; it declares no bindings itself.
@@ -50,5 +51,97 @@ impl From<&Camera> for CameraConstants {
             valid_radius: i.lens.valid_radius() as f32,
             coefficients,
         }
+    }
+}
+
+/// Distortion of a point of the ideal image plane.
+#[derive(Debug, Clone, Copy)]
+pub struct Distorted {
+    /// The distorted point.
+    pub point: Vec2,
+    /// Its derivative, columns d/dx and d/dy.
+    pub jacobian: Mat2,
+}
+
+/// The functions of [`CAMERA_WGSL`] for kernels on the processor, step by step the same.
+impl CameraConstants {
+    /// World to camera axes (x right, y down, z forward), metres.
+    #[must_use]
+    #[inline]
+    pub fn to_camera(&self, world: Vec3) -> Vec3 {
+        Mat4::from_cols_array_2d(&self.camera_from_world).transform_point3(world)
+    }
+
+    /// Distorts a point of the ideal image plane.
+    #[must_use]
+    #[inline]
+    pub fn distort(&self, ideal: Vec2) -> Distorted {
+        let Vec2 { x, y } = ideal;
+        let r2 = ideal.length_squared();
+        let [k1, k2, k3, k4, k5, ..] = self.coefficients;
+        if self.lens == 0 {
+            let (p1, p2) = (k4, k5);
+            let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+            // d radial / d r2, times 2 for d r2 / dx = 2 x.
+            let slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3));
+            let point = Vec2::new(
+                x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+                y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+            );
+            let cross = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y;
+            let jacobian = Mat2::from_cols(
+                Vec2::new(radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x, cross),
+                Vec2::new(cross, radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x),
+            );
+            return Distorted { point, jacobian };
+        }
+        let r = r2.sqrt();
+        if r < 1e-4 {
+            return Distorted { point: ideal, jacobian: Mat2::IDENTITY };
+        }
+        let theta = r.atan();
+        let t2 = theta * theta;
+        let distorted = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))));
+        let slope = (1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))) / (1.0 + r2);
+        let scale = distorted / r;
+        // d(scale)/dr / r
+        let bend = (slope - scale) / r2;
+        let jacobian = Mat2::from_cols(
+            Vec2::new(scale + bend * x * x, bend * x * y),
+            Vec2::new(bend * x * y, scale + bend * y * y),
+        );
+        Distorted { point: ideal * scale, jacobian }
+    }
+
+    /// Pixel of a point in camera axes. None within `near` of the camera's plane or behind it, farther than 1e9 m, beyond the
+    /// lens's valid radius, or for what is no number.
+    #[must_use]
+    #[inline]
+    pub fn project(&self, in_camera: Vec3, near: f32) -> Option<Vec2> {
+        // Each comparison is false for NaN.
+        let ideal = in_camera.truncate() / in_camera.z;
+        let is_valid = in_camera.z > near
+            && in_camera.z < 1e9
+            && ideal.length_squared() <= self.valid_radius * self.valid_radius;
+        is_valid.then(|| self.distort(ideal).point * Vec2::from(self.focal_px) + Vec2::from(self.center_px))
+    }
+
+    /// Derivative of the pixel by the point in camera axes (z > 0): columns d/dx, d/dy, d/dz.
+    #[must_use]
+    #[inline]
+    pub fn projection_jacobian(&self, in_camera: Vec3) -> [Vec2; 3] {
+        let inverse_z = 1.0 / in_camera.z;
+        let ideal = in_camera.truncate() * inverse_z;
+        let lens = self.distort(ideal).jacobian;
+        let focal = Vec2::from(self.focal_px) * inverse_z;
+        let (dx, dy) = (lens.x_axis * focal, lens.y_axis * focal);
+        [dx, dy, -(ideal.x * dx + ideal.y * dy)]
+    }
+
+    /// Camera centre in the world, metres.
+    #[must_use]
+    #[inline]
+    pub fn center(&self) -> Vec3 {
+        Vec4::from(self.position).truncate()
     }
 }

@@ -99,6 +99,7 @@ pub struct GpuContext {
     adapter: Adapter,
     info: AdapterInfo,
     choice: AdapterChoice,
+    on_processor: bool,
     pub(crate) shared: Arc<Shared>,
 }
 
@@ -160,7 +161,8 @@ impl GpuContext {
         tracing::debug!(adapter = %info.name, backend = %info.backend, driver = %info.driver_info, "graphics adapter");
         let shared = Arc::new(Shared::default());
         shared.fault.watch(&device);
-        Ok(Self { device, queue, instance, adapter, info, choice: choice.clone(), shared })
+        let choice = choice.clone();
+        Ok(Self { device, queue, instance, adapter, info, choice, on_processor: false, shared })
     }
 
     /// Opens the same choice of adapter once more, for a device that is lost. Nothing is shared with this one.
@@ -168,7 +170,27 @@ impl GpuContext {
     /// # Errors
     /// As [`Self::new`].
     pub fn reopen(&self) -> Result<Self, GpuError> {
-        Self::new(&self.choice)
+        Ok(Self { on_processor: self.on_processor, ..Self::new(&self.choice)? })
+    }
+
+    /// The same context for kernels that run natively on the processor: arrays made with it lie in the processor's memory
+    /// ([`StorageBuffer::slice`](crate::StorageBuffer::slice)), and kernels made with it compute when they are recorded.
+    /// Kernels and arrays of the two sorts do not mix.
+    #[must_use]
+    pub fn on_processor(&self) -> Self {
+        Self { on_processor: true, ..self.clone() }
+    }
+
+    /// Whether kernels run natively on the processor.
+    #[must_use]
+    pub fn is_on_processor(&self) -> bool {
+        self.on_processor
+    }
+
+    /// Whether the adapter was asked for by its name.
+    #[must_use]
+    pub fn is_named(&self) -> bool {
+        matches!(self.choice, AdapterChoice::Named(_))
     }
 
     /// Fails when the device was lost, ran out of memory or rejected a command.
@@ -193,6 +215,10 @@ impl GpuContext {
     /// Name, backend and driver of the adapter, for reports.
     #[must_use]
     pub fn adapter_name(&self) -> String {
+        if self.on_processor {
+            let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+            return format!("processor ({threads} threads)");
+        }
         format!("{} ({}, {})", self.info.name, self.info.backend, self.info.driver_info)
     }
 
@@ -213,6 +239,9 @@ impl GpuContext {
     /// # Errors
     /// [`GpuError::Lost`], or the device's first fault.
     pub fn wait(&self) -> Result<(), GpuError> {
+        if self.on_processor {
+            return self.check();
+        }
         let waited = self.device.poll(wgpu::PollType::wait_indefinitely());
         self.check()?;
         waited.map(|_| ()).map_err(|error| GpuError::Lost(error.to_string()))

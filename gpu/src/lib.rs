@@ -8,11 +8,13 @@ mod context;
 mod shader;
 mod shared;
 mod stage_timer;
+#[doc(hidden)]
+pub mod testing;
 mod timer;
 mod uploads;
 
 pub use buffer::{StorageBuffer, read_back};
-pub use camera::{CAMERA_WGSL, CameraConstants};
+pub use camera::{CAMERA_WGSL, CameraConstants, Distorted};
 pub use context::{AdapterChoice, GpuContext, GpuError, adapter_names};
 pub use shader::{ComputeKernel, MAX_WORKGROUPS_PER_DIMENSION, bind, dispatch_1d};
 pub use shared::GpuObjects;

@@ -1,4 +1,4 @@
-//! The WGSL camera model against the f64 one, on whichever adapter there is.
+//! The camera model in WGSL and on the processor against the f64 one.
 
 use flyrig_gpu::{AdapterChoice, CAMERA_WGSL, CameraConstants, ComputeKernel, GpuContext, StorageBuffer, dispatch_1d};
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
@@ -67,7 +67,8 @@ fn wgsl_agrees_with_f64_and_poisoned_points_are_invalid() {
             usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
-        gpu.queue.write_buffer(&uniform, 0, bytemuck::bytes_of(&CameraConstants::from(&camera)));
+        let constants = CameraConstants::from(&camera);
+        gpu.queue.write_buffer(&uniform, 0, bytemuck::bytes_of(&constants));
         let input = StorageBuffer::from_slice(&gpu, "points", &points).unwrap();
         let pixels = StorageBuffer::<[f32; 4]>::zeroed(&gpu, "pixels", points.len()).unwrap();
         let jacobians = StorageBuffer::<[[f32; 2]; 3]>::zeroed(&gpu, "jacobians", points.len()).unwrap();
@@ -91,17 +92,22 @@ fn wgsl_agrees_with_f64_and_poisoned_points_are_invalid() {
         let mut compared = 0;
         for ((point, got), jacobian) in points.iter().zip(&pixels).zip(&jacobians) {
             let world = DVec3::new(point[0].into(), point[1].into(), point[2].into());
+            let in_camera = constants.to_camera(world.as_vec3());
+            let natively = constants.project(in_camera, 1e-3);
             let Some(expected) = camera.project(world) else {
-                assert!(got[3].abs() < 0.5, "{point:?} must be invalid");
+                assert!(got[3].abs() < 0.5 && natively.is_none(), "{point:?} must be invalid");
                 continue;
             };
             compared += 1;
             let error = (DVec2::new(got[0].into(), got[1].into()) - expected).length();
             assert!(error < 2e-3, "{point:?}: {error} px");
+            let error = (natively.unwrap().as_dvec2() - expected).length();
+            assert!(error < 2e-3, "on the processor, {point:?}: {error} px");
             // Finite differences in camera axes, in f64.
             const STEP: f64 = 1e-5;
             let world_from_camera = camera.camera_from_world.rotation.inverse();
-            for (axis, column) in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().zip(jacobian) {
+            let natively = constants.projection_jacobian(in_camera);
+            for ((axis, column), natively) in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().zip(jacobian).zip(natively) {
                 let step = world_from_camera * axis * STEP;
                 let (Some(plus), Some(minus)) = (camera.project(world + step), camera.project(world - step)) else {
                     continue;
@@ -109,6 +115,8 @@ fn wgsl_agrees_with_f64_and_poisoned_points_are_invalid() {
                 let numeric = (plus - minus) / (2.0 * STEP);
                 let error = (DVec2::new(column[0].into(), column[1].into()) - numeric).length();
                 assert!(error < 1e-3 * (1.0 + numeric.length()), "{point:?} {axis}: {error}");
+                let error = (natively.as_dvec2() - numeric).length();
+                assert!(error < 1e-3 * (1.0 + numeric.length()), "on the processor, {point:?} {axis}: {error}");
             }
         }
         assert!(compared > 300, "{compared}");

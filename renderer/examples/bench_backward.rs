@@ -106,7 +106,7 @@ fn measure(
 
     let gaussians = upload(gpu, scene)?;
     let mut forward = Rasterizer::new(gpu, gaussians.count())?;
-    let mut back = BackwardRasterizer::new(gpu, &forward)?;
+    let mut back = BackwardRasterizer::new(gpu)?;
     let target = RenderTarget::new(gpu, width, height)?;
     let gradients = PictureGradients::zeroed(gpu, width, height)?;
     gradients.color.write(gpu, &incoming.color);

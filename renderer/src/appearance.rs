@@ -1,6 +1,6 @@
 //! Colours without learned weights: FlyHuman section 3.2 (Eq. 5 to 12) with linear RGB as the feature.
 //!
-//! Four kernels, no round trip to the host:
+//! Four kernels, on the device without a round trip or on the processor (`appearance/processor.rs`):
 //!
 //! 1. **observe** (a thread a Gaussian, a dispatch a view): projects with the camera's own lens, samples the picture
 //!    in linear light and weighs it by viewing angle and visibility in canonical space. Texels count by their mask
@@ -34,6 +34,7 @@
 mod graph_buffers;
 mod hierarchy;
 mod kernels;
+mod processor;
 mod settings;
 mod update;
 

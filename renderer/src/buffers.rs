@@ -47,10 +47,8 @@ impl GaussianBuffers {
 
     /// Records the copy of all Gaussians into `other`, from its element `first` on; what has no room there is left out.
     pub fn encode_copy(&self, encoder: &mut wgpu::CommandEncoder, other: &Self, first: usize) {
-        let count = self.count().min(other.count().saturating_sub(first));
-        let element = size_of::<GaussianElement>() as u64;
         for (from, to) in self.attributes().into_iter().zip(other.attributes()) {
-            encoder.copy_buffer_to_buffer(from.raw(), 0, to.raw(), first as u64 * element, count as u64 * element);
+            from.encode_copy(encoder, to, first);
         }
     }
 

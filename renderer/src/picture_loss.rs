@@ -1,7 +1,9 @@
 //! How a drawn picture differs from the wanted one, and what the backward rasteriser needs to know of it.
 
+mod processor;
+
 use bytemuck::{Pod, Zeroable, bytes_of};
-use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer, read_back};
+use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer};
 use wgpu::{CommandEncoder, ComputePassDescriptor};
 
 use crate::constants::Constants;
@@ -62,7 +64,7 @@ struct Loss {
     with_unknown: u32,
 }
 
-/// A picture that should be drawn, on the GPU.
+/// A picture that should be drawn.
 #[derive(Debug)]
 pub struct WantedPicture {
     /// Pixels of the bytes, and how many of them make the side of a pixel.
@@ -107,12 +109,18 @@ impl WantedPicture {
     }
 }
 
-/// Compares pictures on the GPU. Sums are made in a fixed order: equal input gives equal bytes on one device.
 #[derive(Debug)]
-pub struct PictureLoss {
+struct Kernels {
     unpack: ComputeKernel,
     compare: ComputeKernel,
     add_up: ComputeKernel,
+}
+
+/// Compares pictures where they lie. Sums are made in a fixed order: equal input gives equal bytes on one device.
+#[derive(Debug)]
+pub struct PictureLoss {
+    /// None on the processor.
+    kernels: Option<Kernels>,
     linear: StorageBuffer<f32>,
     sums: StorageBuffer<[f32; 4]>,
 }
@@ -123,13 +131,14 @@ impl PictureLoss {
     /// # Errors
     /// [`GpuError::TooLarge`].
     pub fn new(gpu: &GpuContext) -> Result<Self, GpuError> {
-        let source = wgsl();
-        let kernel = |entry| ComputeKernel::new(gpu, entry, &[&source], entry);
+        let kernels = (!gpu.is_on_processor()).then(|| {
+            let source = wgsl();
+            let kernel = |entry| ComputeKernel::new(gpu, entry, &[&source], entry);
+            Kernels { unpack: kernel("unpack_wanted"), compare: kernel("compare"), add_up: kernel("add_up") }
+        });
         let linear: Vec<f32> = (0..=255u8).map(|byte| linear_from_srgb(f32::from(byte) / 255.0)).collect();
         Ok(Self {
-            unpack: kernel("unpack_wanted"),
-            compare: kernel("compare"),
-            add_up: kernel("add_up"),
+            kernels,
             linear: StorageBuffer::from_slice(gpu, "linear of sRGB", &linear)?,
             sums: StorageBuffer::zeroed(gpu, "losses", 0)?,
         })
@@ -159,6 +168,9 @@ impl PictureLoss {
     ) {
         let enough = image.len() >= wanted.source[0] as usize * wanted.source[1] as usize;
         let Some((constants, groups)) = constants(wanted, 0, settings).filter(|_| enough) else { return };
+        let Some(Kernels { unpack, .. }) = &self.kernels else {
+            return processor::unpack(&constants, image, &self.linear, &wanted.color);
+        };
         wanted.constants.encode(gpu, encoder, &[bytes_of(&constants)]);
         let mut pass =
             encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("wanted picture"), ..Default::default() });
@@ -168,7 +180,7 @@ impl PictureLoss {
             self.linear.raw().as_entire_binding(),
             wanted.color.raw().as_entire_binding(),
         ];
-        run(gpu, &mut pass, &self.unpack, &resources, groups);
+        run(gpu, &mut pass, unpack, &resources, groups);
     }
 
     /// Records the comparison of a drawn picture as number `index`, and writes its derivatives to `out`, both within
@@ -190,9 +202,15 @@ impl PictureLoss {
             && self.sums.len() >= (index + 1).saturating_mul(SUMS as usize);
         let sums_at = index as u64 * u64::from(SUMS) * 16;
         if fits {
-            encoder.clear_buffer(self.sums.raw(), sums_at, Some(u64::from(SUMS) * 16));
+            match self.sums.slice_mut() {
+                Some(mut sums) => sums[index * SUMS as usize..][..SUMS as usize].fill([0.0; 4]),
+                None => encoder.clear_buffer(self.sums.raw(), sums_at, Some(u64::from(SUMS) * 16)),
+            }
         }
         let Some((constants, groups)) = constants(wanted, index as u32, settings).filter(|_| fits) else { return };
+        let Some(Kernels { compare, add_up, .. }) = &self.kernels else {
+            return processor::compare(&constants, &wanted.color, &drawn.color, out, &self.sums);
+        };
         wanted.constants.encode(gpu, encoder, &[bytes_of(&constants)]);
         let mut pass =
             encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("picture loss"), ..Default::default() });
@@ -205,9 +223,9 @@ impl PictureLoss {
             (6, out.depth_carry.raw().as_entire_binding()),
             (7, partials.clone()),
         ];
-        run_at(gpu, &mut pass, &self.compare, &resources, groups);
+        run_at(gpu, &mut pass, compare, &resources, groups);
         let resources = [(0, wanted.constants.get(0)), (7, partials), (8, self.sums.raw().as_entire_binding())];
-        run_at(gpu, &mut pass, &self.add_up, &resources, (SUMS.div_ceil(64), 1));
+        run_at(gpu, &mut pass, add_up, &resources, (SUMS.div_ceil(64), 1));
     }
 
     /// Waits for the GPU and reads the sums of the first `pictures` pictures.
@@ -216,7 +234,7 @@ impl PictureLoss {
     /// [`GpuError::Lost`].
     pub fn read(&self, gpu: &GpuContext, pictures: usize) -> Result<Vec<PictureSums>, GpuError> {
         let len = pictures.saturating_mul(SUMS as usize).min(self.sums.len());
-        let sums: Vec<[f32; 4]> = read_back(gpu, self.sums.raw(), len)?;
+        let sums = self.sums.read_first(gpu, len)?;
         let total = |one: &[[f32; 4]]| {
             let [loss, mask, color, wanted] =
                 one.iter().fold([0.0; 4], |sum, s| std::array::from_fn(|i| sum[i] + f64::from(s[i])));

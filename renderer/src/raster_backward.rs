@@ -3,7 +3,9 @@
 use flyrig_gpu::{CAMERA_WGSL, ComputeKernel, GpuContext, GpuError, StorageBuffer, dispatch_1d};
 use wgpu::{CommandEncoder, ComputePassDescriptor};
 
-use crate::raster::FRAME;
+use crate::processor::ProcessorBackward;
+use crate::raster::RasterizerOn;
+use crate::raster_device::{DeviceRasterizer, FRAME};
 use crate::raster_kernels::{FRAME_WGSL, RasterShape};
 use crate::scan::run;
 use crate::{GaussianBuffers, Rasterizer, RenderTarget};
@@ -82,8 +84,8 @@ impl GaussianGradients {
 
     /// Records setting everything to zero.
     pub fn clear(&self, encoder: &mut CommandEncoder) {
-        encoder.clear_buffer(self.center.raw(), 0, None);
-        encoder.clear_buffer(self.carried.raw(), 0, None);
+        self.center.encode_clear(encoder);
+        self.carried.encode_clear(encoder);
     }
 }
 
@@ -119,6 +121,18 @@ pub enum BackwardError {
 ///   are not finite are left out.
 #[derive(Debug)]
 pub struct BackwardRasterizer {
+    on: BackwardOn,
+}
+
+#[derive(Debug)]
+enum BackwardOn {
+    Device(Box<DeviceBackward>),
+    Processor(ProcessorBackward),
+}
+
+/// The kernels on the device.
+#[derive(Debug)]
+struct DeviceBackward {
     place: ComputeKernel,
     blend: [ComputeKernel; 2],
     project: [ComputeKernel; 2],
@@ -130,33 +144,17 @@ pub struct BackwardRasterizer {
 }
 
 impl BackwardRasterizer {
-    /// Compiles the kernels for pictures drawn by `rasterizer`; buffers grow with the pictures.
+    /// Compiles the kernels for pictures of any [`Rasterizer::new`] with this context; buffers grow with the pictures.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
-    pub fn new(gpu: &GpuContext, rasterizer: &Rasterizer) -> Result<Self, GpuError> {
-        Self::with_shape(gpu, rasterizer.kernels.shape)
-    }
-
-    /// As [`Self::new`], for pictures of any [`Rasterizer::new`] on this device.
-    ///
-    /// # Errors
-    /// [`GpuError::TooLarge`].
-    pub fn for_device(gpu: &GpuContext) -> Result<Self, GpuError> {
-        Self::with_shape(gpu, RasterShape::for_adapter(gpu))
-    }
-
-    fn with_shape(gpu: &GpuContext, shape: RasterShape) -> Result<Self, GpuError> {
-        let kernel = |entry, source: String| ComputeKernel::new(gpu, entry, &[&source], entry);
-        Ok(Self {
-            place: kernel("place_gaussians", places_wgsl()),
-            blend: [false, true].map(|depth| kernel("blend_backward", blend_wgsl(shape, depth))),
-            project: [false, true].map(|lift| kernel("project_backward", project_wgsl(lift))),
-            places: StorageBuffer::zeroed(gpu, "places of sums", 0)?,
-            tile_limits: StorageBuffer::zeroed(gpu, "walked tiles", 0)?,
-            pair_sums: StorageBuffer::zeroed(gpu, "sums of pairs", 0)?,
-            room: StorageBuffer::zeroed(gpu, "room for sums of pairs", 1)?,
-        })
+    pub fn new(gpu: &GpuContext) -> Result<Self, GpuError> {
+        let on = if gpu.is_on_processor() {
+            BackwardOn::Processor(ProcessorBackward::default())
+        } else {
+            BackwardOn::Device(Box::new(DeviceBackward::new(gpu)?))
+        };
+        Ok(Self { on })
     }
 
     /// Records the derivatives of the picture that `rasterizer` recorded last, with the same `gaussians` and
@@ -176,7 +174,7 @@ impl BackwardRasterizer {
         (incoming, carry): (&PictureGradients, Carry),
         out: &GaussianGradients,
     ) -> Result<(), BackwardError> {
-        let (Some(picture), Some(latest)) = (&rasterizer.picture, &rasterizer.latest) else { return Ok(()) };
+        let Some(latest) = rasterizer.latest() else { return Ok(()) };
         if !latest.outputs.color || latest.gaussians == 0 {
             return Ok(());
         }
@@ -186,6 +184,46 @@ impl BackwardRasterizer {
         check("the drawn picture", target.color.len().min(target.depth.len()), pixels)?;
         check("the Gaussians", gaussians.count(), latest.gaussians)?;
         check("dL/d centres", out.center.len().min(out.carried.len() / 2), latest.gaussians)?;
+        match (&mut self.on, &rasterizer.on) {
+            (BackwardOn::Device(device), RasterizerOn::Device(rasterizer)) => {
+                device.encode(gpu, encoder, rasterizer, gaussians, target, (incoming, carry), out)
+            }
+            (BackwardOn::Processor(processor), RasterizerOn::Processor(rasterizer)) => {
+                processor.add(rasterizer, gaussians, target, (incoming, carry), out);
+                Ok(())
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+impl DeviceBackward {
+    fn new(gpu: &GpuContext) -> Result<Self, GpuError> {
+        let shape = RasterShape::for_adapter(gpu);
+        let kernel = |entry, source: String| ComputeKernel::new(gpu, entry, &[&source], entry);
+        Ok(Self {
+            place: kernel("place_gaussians", places_wgsl()),
+            blend: [false, true].map(|depth| kernel("blend_backward", blend_wgsl(shape, depth))),
+            project: [false, true].map(|lift| kernel("project_backward", project_wgsl(lift))),
+            places: StorageBuffer::zeroed(gpu, "places of sums", 0)?,
+            tile_limits: StorageBuffer::zeroed(gpu, "walked tiles", 0)?,
+            pair_sums: StorageBuffer::zeroed(gpu, "sums of pairs", 0)?,
+            room: StorageBuffer::zeroed(gpu, "room for sums of pairs", 1)?,
+        })
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    fn encode(
+        &mut self,
+        gpu: &GpuContext,
+        encoder: &mut CommandEncoder,
+        rasterizer: &DeviceRasterizer,
+        gaussians: &GaussianBuffers,
+        target: &RenderTarget,
+        (incoming, carry): (&PictureGradients, Carry),
+        out: &GaussianGradients,
+    ) -> Result<(), BackwardError> {
+        let (Some(picture), Some(latest)) = (&rasterizer.picture, &rasterizer.latest) else { return Ok(()) };
         let layout = picture.layout();
         let tiles = layout.tiles[0] as usize * layout.tiles[1] as usize;
         self.grow(gpu, latest.gaussians, tiles, layout.pair_capacity)?;

@@ -11,6 +11,12 @@ const PAIRS_PER_GAUSSIAN: u64 = 16;
 const PAIRS_PER_TILE: u64 = 64;
 const MIN_PAIRS: u64 = 1 << 18;
 
+/// Pairs that a picture has room for, at most `limit`.
+pub(crate) fn pair_capacity(gaussians: usize, tiles: u64, limit: u64) -> u32 {
+    let wanted = PAIRS_PER_GAUSSIAN * gaussians as u64 + PAIRS_PER_TILE * tiles;
+    wanted.max(MIN_PAIRS).min(limit).min(u64::from(u32::MAX)) as u32
+}
+
 #[derive(Debug)]
 pub(crate) struct PictureBuffers {
     layout: Layout,
@@ -84,8 +90,7 @@ impl Layout {
         let limit = limits.max_buffer_size.min(limits.max_storage_buffer_binding_size) / 4;
         // Each invocation of the binning walks over its share of the pairs.
         let limit = limit.min(u64::from(bin_chunks) * MAX_LOOP);
-        let wanted = PAIRS_PER_GAUSSIAN * gaussians as u64 + PAIRS_PER_TILE * u64::from(count);
-        let pair_capacity = wanted.max(MIN_PAIRS).min(limit) as u32;
+        let pair_capacity = pair_capacity(gaussians, u64::from(count), limit);
         Self { tiles, bin_chunks, table_len: count.saturating_mul(bin_chunks), pair_capacity }
     }
 }

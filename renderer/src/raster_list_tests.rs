@@ -32,9 +32,9 @@ fn every_tile_lists_its_gaussians_by_depth() {
     let settings = RasterSettings { cull_backfacing: false, outputs: Outputs::COLOR, ..Default::default() };
     let target = RenderTarget::new(&gpu, 1920, 1080).unwrap();
     for shape in [RasterShape::SOFTWARE, RasterShape::HARDWARE] {
-        let mut rasterizer = Rasterizer::with_shape(&gpu, count, shape).unwrap();
+        let mut rasterizer = DeviceRasterizer::with_shape(&gpu, count, shape).unwrap();
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        rasterizer.encode(&gpu, &mut encoder, &gaussians, &camera, &settings, &target).unwrap();
+        rasterizer.encode_timed(&gpu, &mut encoder, &gaussians, (&camera, &settings), &target, None).unwrap();
         gpu.queue.submit([encoder.finish()]);
         let visible = rasterizer.sort.valid().read(&gpu).unwrap()[0] as usize;
         let ordered = rasterizer.sort.output().read(&gpu).unwrap();

@@ -1,7 +1,7 @@
 //! The picture loss against a plain f64 reference, its derivatives against differences of that reference.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
-use flyrig_gpu::{AdapterChoice, GpuContext, StorageBuffer};
+use flyrig_gpu::{GpuContext, StorageBuffer, testing::on_both};
 use flyrig_renderer::{
     LossSettings, PictureGradients, PictureLoss, PictureSums, RenderTarget, WantedPicture, linear_from_srgb,
 };
@@ -137,86 +137,89 @@ fn case(rng: &mut StdRng, source: [u32; 2], level: u32, settings: LossSettings, 
 
 #[test]
 fn losses_and_slopes_match_the_reference() {
-    let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
-    let mut loss = PictureLoss::new(&gpu).unwrap();
-    let mut rng = StdRng::seed_from_u64(4);
-    let both = LossSettings { color_weight: 2.0, mask_weight: 3.0, area: [0, 0, 96, 80], with_unknown: false };
-    for (name, source, level, settings, coverage) in [
-        ("everything", [96, 80], 0, both, None),
-        ("masks only", [96, 80], 0, LossSettings { color_weight: 0.0, ..both }, None),
-        ("halved", [193, 161], 1, both, None),
-        ("an eighth", [768, 640], 3, both, None),
-        ("an area", [96, 80], 0, LossSettings { area: [7, 5, 61, 78], ..both }, None),
-        ("an area that is too large", [96, 80], 0, LossSettings { area: [16, 0, 4000, 4000], ..both }, None),
-        ("nobody", [96, 80], 0, both, Some(0)),
-        ("everywhere", [96, 80], 0, both, Some(255)),
-        ("one pixel", [1, 1], 0, both, Some(200)),
-        ("one row", [70, 1], 0, both, None),
-    ] {
-        check(&gpu, &mut loss, &case(&mut rng, source, level, settings, coverage), name);
-    }
+    on_both(|gpu| {
+        let mut loss = PictureLoss::new(gpu).unwrap();
+        let mut rng = StdRng::seed_from_u64(4);
+        let both = LossSettings { color_weight: 2.0, mask_weight: 3.0, area: [0, 0, 96, 80], with_unknown: false };
+        for (name, source, level, settings, coverage) in [
+            ("everything", [96, 80], 0, both, None),
+            ("masks only", [96, 80], 0, LossSettings { color_weight: 0.0, ..both }, None),
+            ("halved", [193, 161], 1, both, None),
+            ("an eighth", [768, 640], 3, both, None),
+            ("an area", [96, 80], 0, LossSettings { area: [7, 5, 61, 78], ..both }, None),
+            ("an area that is too large", [96, 80], 0, LossSettings { area: [16, 0, 4000, 4000], ..both }, None),
+            ("nobody", [96, 80], 0, both, Some(0)),
+            ("everywhere", [96, 80], 0, both, Some(255)),
+            ("one pixel", [1, 1], 0, both, Some(200)),
+            ("one row", [70, 1], 0, both, None),
+        ] {
+            check(gpu, &mut loss, &case(&mut rng, source, level, settings, coverage), name);
+        }
+    });
 }
 
 #[test]
 fn an_empty_area_and_a_buffer_that_does_not_fit_cost_nothing() {
-    let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
-    let mut loss = PictureLoss::new(&gpu).unwrap();
-    let mut rng = StdRng::seed_from_u64(5);
-    let settings = LossSettings { color_weight: 1.0, mask_weight: 1.0, area: [9, 9, 9, 20], with_unknown: false };
-    let case = case(&mut rng, [32, 32], 0, settings, None);
-    assert_eq!(WantedPicture::zeroed(&gpu, [1, 5], 2).unwrap().size(), [1, 5], "not below a pixel");
-    let picture = WantedPicture::zeroed(&gpu, case.source, 0).unwrap();
-    let image = StorageBuffer::from_bytes(&gpu, "image", &case.rgba).unwrap();
-    let target = RenderTarget::new(&gpu, 32, 32).unwrap();
-    let (fits, small) =
-        (PictureGradients::zeroed(&gpu, 32, 32).unwrap(), PictureGradients::zeroed(&gpu, 8, 8).unwrap());
-    loss.reserve(&gpu, 1).unwrap();
-    for (area, out) in [([9, 9, 9, 20], &fits), ([0, 0, 32, 32], &small), ([40, 0, 50, 9], &fits)] {
-        let settings = LossSettings { area, ..settings };
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        loss.prepare(&gpu, &mut encoder, &picture, &image, &settings);
-        loss.encode(&gpu, &mut encoder, 0, &target, &picture, &settings, out);
-        gpu.queue.submit([encoder.finish()]);
-        assert_eq!(loss.read(&gpu, 1).unwrap(), [PictureSums::default()]);
-    }
+    on_both(|gpu| {
+        let mut loss = PictureLoss::new(gpu).unwrap();
+        let mut rng = StdRng::seed_from_u64(5);
+        let settings = LossSettings { color_weight: 1.0, mask_weight: 1.0, area: [9, 9, 9, 20], with_unknown: false };
+        let case = case(&mut rng, [32, 32], 0, settings, None);
+        assert_eq!(WantedPicture::zeroed(gpu, [1, 5], 2).unwrap().size(), [1, 5], "not below a pixel");
+        let picture = WantedPicture::zeroed(gpu, case.source, 0).unwrap();
+        let image = StorageBuffer::from_bytes(gpu, "image", &case.rgba).unwrap();
+        let target = RenderTarget::new(gpu, 32, 32).unwrap();
+        let (fits, small) =
+            (PictureGradients::zeroed(gpu, 32, 32).unwrap(), PictureGradients::zeroed(gpu, 8, 8).unwrap());
+        loss.reserve(gpu, 1).unwrap();
+        for (area, out) in [([9, 9, 9, 20], &fits), ([0, 0, 32, 32], &small), ([40, 0, 50, 9], &fits)] {
+            let settings = LossSettings { area, ..settings };
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            loss.prepare(gpu, &mut encoder, &picture, &image, &settings);
+            loss.encode(gpu, &mut encoder, 0, &target, &picture, &settings, out);
+            gpu.queue.submit([encoder.finish()]);
+            assert_eq!(loss.read(gpu, 1).unwrap(), [PictureSums::default()]);
+        }
+    });
 }
 
 #[test]
 fn a_number_that_is_not_finite_is_told_and_stays_where_it_is() {
-    let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
-    let mut loss = PictureLoss::new(&gpu).unwrap();
-    let mut rng = StdRng::seed_from_u64(6);
-    let settings = LossSettings { color_weight: 2.0, mask_weight: 2.0, area: [4, 3, 30, 28], with_unknown: false };
-    let case = case(&mut rng, [32, 32], 0, settings, None);
-    let picture = WantedPicture::zeroed(&gpu, case.source, 0).unwrap();
-    let image = StorageBuffer::from_bytes(&gpu, "image", &case.rgba).unwrap();
-    let target = RenderTarget::new(&gpu, 32, 32).unwrap();
-    let out = PictureGradients::zeroed(&gpu, 32, 32).unwrap();
-    loss.reserve(&gpu, 1).unwrap();
-    let run = |drawn: &[[f32; 4]]| {
-        target.color.write(&gpu, drawn);
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        loss.prepare(&gpu, &mut encoder, &picture, &image, &settings);
-        loss.encode(&gpu, &mut encoder, 0, &target, &picture, &settings, &out);
-        gpu.queue.submit([encoder.finish()]);
-        (loss.read(&gpu, 1).unwrap()[0], out.color.read(&gpu).unwrap(), out.depth_carry.read(&gpu).unwrap())
-    };
-    let sound = run(&case.drawn);
-    assert!(sound.0.loss.is_finite());
-    for bad in [f32::NAN, f32::INFINITY, f32::MAX] {
-        for channel in 0..4 {
-            let mut drawn = case.drawn.clone();
-            drawn[10 * 32 + 12][channel] = bad;
-            let (sums, color, carry) = run(&drawn);
-            assert!(!sums.loss.is_finite(), "{bad} in channel {channel}: {sums:?}");
-            for at in 0..32 * 32usize {
-                let far = (at % 32).abs_diff(12) + (at / 32).abs_diff(10) > 1;
-                assert!(!far || (color[at], carry[at]) == (sound.1[at], sound.2[at]), "{bad} at {at}");
+    on_both(|gpu| {
+        let mut loss = PictureLoss::new(gpu).unwrap();
+        let mut rng = StdRng::seed_from_u64(6);
+        let settings = LossSettings { color_weight: 2.0, mask_weight: 2.0, area: [4, 3, 30, 28], with_unknown: false };
+        let case = case(&mut rng, [32, 32], 0, settings, None);
+        let picture = WantedPicture::zeroed(gpu, case.source, 0).unwrap();
+        let image = StorageBuffer::from_bytes(gpu, "image", &case.rgba).unwrap();
+        let target = RenderTarget::new(gpu, 32, 32).unwrap();
+        let out = PictureGradients::zeroed(gpu, 32, 32).unwrap();
+        loss.reserve(gpu, 1).unwrap();
+        let run = |drawn: &[[f32; 4]]| {
+            target.color.write(gpu, drawn);
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            loss.prepare(gpu, &mut encoder, &picture, &image, &settings);
+            loss.encode(gpu, &mut encoder, 0, &target, &picture, &settings, &out);
+            gpu.queue.submit([encoder.finish()]);
+            (loss.read(gpu, 1).unwrap()[0], out.color.read(gpu).unwrap(), out.depth_carry.read(gpu).unwrap())
+        };
+        let sound = run(&case.drawn);
+        assert!(sound.0.loss.is_finite());
+        for bad in [f32::NAN, f32::INFINITY, f32::MAX] {
+            for channel in 0..4 {
+                let mut drawn = case.drawn.clone();
+                drawn[10 * 32 + 12][channel] = bad;
+                let (sums, color, carry) = run(&drawn);
+                assert!(!sums.loss.is_finite(), "{bad} in channel {channel}: {sums:?}");
+                for at in 0..32 * 32usize {
+                    let far = (at % 32).abs_diff(12) + (at / 32).abs_diff(10) > 1;
+                    assert!(!far || (color[at], carry[at]) == (sound.1[at], sound.2[at]), "{bad} at {at}");
+                }
             }
+            // Outside of the area nobody looks.
+            let mut drawn = case.drawn.clone();
+            drawn[2 * 32 + 12] = [bad; 4];
+            assert!(run(&drawn) == sound);
         }
-        // Outside of the area nobody looks.
-        let mut drawn = case.drawn.clone();
-        drawn[2 * 32 + 12] = [bad; 4];
-        assert!(run(&drawn) == sound);
-    }
+    });
 }

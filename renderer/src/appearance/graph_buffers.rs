@@ -15,15 +15,15 @@ pub(super) struct GraphBuffers {
     pub(super) gaussian_nodes: StorageBuffer<[u32; 4]>,
     pub(super) gaussian_weights: StorageBuffer<[f32; 4]>,
     /// The reverse: first entry of each node, and Gaussian and weight of each entry.
-    entry_start: StorageBuffer<u32>,
-    entries: StorageBuffer<[u32; 2]>,
+    pub(super) entry_start: StorageBuffer<u32>,
+    pub(super) entries: StorageBuffer<[u32; 2]>,
     /// First node and number of nodes of each level; nodes of all levels are numbered through.
-    levels: StorageBuffer<[u32; 4]>,
+    pub(super) levels: StorageBuffer<[u32; 4]>,
     /// Ranges of each node in `edges` and in `children`.
-    links: StorageBuffer<[u32; 4]>,
-    parents: StorageBuffer<u32>,
-    edges: StorageBuffer<[u32; 2]>,
-    children: StorageBuffer<u32>,
+    pub(super) links: StorageBuffer<[u32; 4]>,
+    pub(super) parents: StorageBuffer<u32>,
+    pub(super) edges: StorageBuffer<[u32; 2]>,
+    pub(super) children: StorageBuffer<u32>,
     /// What was seen around each node.
     pub(super) node_seen: StorageBuffer<[f32; 4]>,
     /// Two copies of the diffused colours; the first holds the result.

@@ -10,13 +10,13 @@ use crate::linear_from_srgb;
 pub(super) const WORKGROUP: u32 = 256;
 
 /// Closer to the camera's plane nothing is projected, as in [`flyrig_types::Camera::project`].
-const NEAR_M: f32 = 1e-3;
+pub(super) const NEAR_M: f32 = 1e-3;
 
 /// Less than half covered by Gaussians, a pixel shows no surface to compare with.
-const MIN_RENDERED_ALPHA: f32 = 0.5;
+pub(super) const MIN_RENDERED_ALPHA: f32 = 0.5;
 
 /// A sample with less of the person in it says nothing: its colour would be rounding errors of a sliver.
-const MIN_COVERAGE: f32 = 0.01;
+pub(super) const MIN_COVERAGE: f32 = 0.01;
 
 /// The baseline's small number: far below the weight of a visible view, far above rounding.
 const BASELINE_VIEW_WEIGHT: f32 = 1e-3;
@@ -25,15 +25,15 @@ const BASELINE_VIEW_WEIGHT: f32 = 1e-3;
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(super) struct SettingsConstants {
-    occlusion_per_m: f32,
-    memory_weight_max: f32,
-    min_mask: f32,
-    inpaint_weight: f32,
-    smoothness: f32,
-    view_weight: f32,
-    space: u32,
-    time: u32,
-    sharpness: f32,
+    pub occlusion_per_m: f32,
+    pub memory_weight_max: f32,
+    pub min_mask: f32,
+    pub inpaint_weight: f32,
+    pub smoothness: f32,
+    pub view_weight: f32,
+    pub space: u32,
+    pub time: u32,
+    pub sharpness: f32,
 }
 
 impl SettingsConstants {

@@ -1,7 +1,7 @@
 //! Buffers of direct appearance and the recording of one frame.
 
 use flyrig_body::{DeformationGraph, SurfaceGaussians};
-use flyrig_gpu::{CameraConstants, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d, read_back};
+use flyrig_gpu::{CameraConstants, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
 use flyrig_types::MAX_IMAGE_SIDE;
 use wgpu::{Buffer, BufferUsages, CommandEncoder, ComputePassDescriptor};
 
@@ -9,19 +9,23 @@ use super::{
     AppearanceError, AppearanceSettings, ObservationBuffers, Observations, ViewInput,
     graph_buffers::GraphBuffers,
     kernels::{Kernels, SettingsConstants, WORKGROUP},
+    processor::{self, Seen},
 };
 use crate::{GaussianBuffers, linear_from_srgb};
+
+const KEPT: &str = "observations of a view";
 
 /// Paints every Gaussian from the pictures of this instant and a memory of earlier ones.
 ///
 /// Buffers and pipelines are made once.
 #[derive(Debug)]
 pub struct DirectAppearance {
-    kernels: Kernels,
+    /// None on the processor.
+    device: Option<DeviceKernels>,
     graph: GraphBuffers,
-    settings: Buffer,
     linear_from_srgb: StorageBuffer<f32>,
-    views: Vec<ViewSlot>,
+    /// What each view alone saw; empty unless observations are kept.
+    kept: Vec<StorageBuffer<[f32; 4]>>,
     /// Sum of weight times linear RGB, sum of weights.
     seen: StorageBuffer<[f32; 4]>,
     /// Sum of Eq. 6 weights, exp(-k d) of the best view.
@@ -31,12 +35,13 @@ pub struct DirectAppearance {
     forget: bool,
 }
 
-/// What is uploaded for one view.
+/// The kernels on the device, and what they are uploaded.
 #[derive(Debug)]
-struct ViewSlot {
-    camera: Buffer,
-    /// What this view alone saw; empty unless observations are kept.
-    kept: StorageBuffer<[f32; 4]>,
+struct DeviceKernels {
+    kernels: Kernels,
+    settings: Buffer,
+    /// One a view.
+    cameras: Vec<Buffer>,
 }
 
 impl DirectAppearance {
@@ -60,17 +65,17 @@ impl DirectAppearance {
                 mapped_at_creation: false,
             })
         };
-        let view = |_| {
-            let camera = constants("view camera", size_of::<CameraConstants>());
-            Ok(ViewSlot { camera, kept: StorageBuffer::zeroed(gpu, "observations of a view", 0)? })
-        };
+        let device = (!gpu.is_on_processor()).then(|| DeviceKernels {
+            kernels: Kernels::new(gpu),
+            settings: constants("appearance settings", size_of::<SettingsConstants>()),
+            cameras: (0..max_views).map(|_| constants("view camera", size_of::<CameraConstants>())).collect(),
+        });
         let decoded: Vec<f32> = (0..=255u8).map(|byte| linear_from_srgb(f32::from(byte) / 255.0)).collect();
         Ok(Self {
-            kernels: Kernels::new(gpu),
+            device,
             graph,
-            settings: constants("appearance settings", size_of::<SettingsConstants>()),
             linear_from_srgb: StorageBuffer::from_slice(gpu, "linear values of sRGB bytes", &decoded)?,
-            views: (0..max_views).map(view).collect::<Result<_, GpuError>>()?,
+            kept: (0..max_views).map(|_| StorageBuffer::zeroed(gpu, KEPT, 0)).collect::<Result<_, GpuError>>()?,
             seen: StorageBuffer::zeroed(gpu, "observed colours", count)?,
             quality: StorageBuffer::zeroed(gpu, "observation quality", count)?,
             memory: StorageBuffer::zeroed(gpu, "colour memory", count)?,
@@ -110,19 +115,21 @@ impl DirectAppearance {
         mut timer: Option<&mut GpuTimer>,
     ) -> Result<(), AppearanceError> {
         self.check(gaussians, views, settings)?;
-        for (slot, view) in self.views.iter().zip(views) {
-            gpu.queue.write_buffer(&slot.camera, 0, bytemuck::bytes_of(&CameraConstants::from(view.camera)));
-        }
         let constants = SettingsConstants::new(settings, !self.forget);
-        gpu.queue.write_buffer(&self.settings, 0, bytemuck::bytes_of(&constants));
         if std::mem::take(&mut self.forget) {
-            encoder.clear_buffer(self.memory.raw(), 0, None);
+            self.memory.encode_clear(encoder);
         }
-        encoder.clear_buffer(self.seen.raw(), 0, None);
-        encoder.clear_buffer(self.quality.raw(), 0, None);
-        for slot in self.views.iter().filter(|slot| !slot.kept.is_empty()) {
-            encoder.clear_buffer(slot.kept.raw(), 0, None);
+        self.seen.encode_clear(encoder);
+        self.quality.encode_clear(encoder);
+        self.kept.iter().filter(|kept| !kept.is_empty()).for_each(|kept| kept.encode_clear(encoder));
+        let Some(DeviceKernels { kernels, settings: settings_buffer, cameras }) = &self.device else {
+            self.update_on_processor(gaussians, views, &constants);
+            return Ok(());
+        };
+        for (camera, view) in cameras.iter().zip(views) {
+            gpu.queue.write_buffer(camera, 0, bytemuck::bytes_of(&CameraConstants::from(view.camera)));
         }
+        gpu.queue.write_buffer(settings_buffer, 0, bytemuck::bytes_of(&constants));
         let mut stage = |encoder: &mut CommandEncoder, name, kernel: &wgpu::ComputePipeline, binds: &[_], groups| {
             let timestamp_writes = timer.as_deref_mut().and_then(|timer| timer.stage(name));
             let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor { label: Some(name), timestamp_writes });
@@ -134,14 +141,14 @@ impl DirectAppearance {
             }
         };
         let all_gaussians = dispatch_1d(self.seen.len() as u32, WORKGROUP);
-        let observations: Vec<_> = self
-            .views
+        let observations: Vec<_> = cameras
             .iter()
+            .zip(&self.kept)
             .zip(views)
-            .map(|(slot, view)| {
+            .map(|((camera, kept), view)| {
                 let resources = [
-                    self.settings.as_entire_binding(),
-                    slot.camera.as_entire_binding(),
+                    settings_buffer.as_entire_binding(),
+                    camera.as_entire_binding(),
                     view.picture.raw().as_entire_binding(),
                     view.canonical.raw().as_entire_binding(),
                     view.gaussians.unwrap_or(gaussians).center_scale.raw().as_entire_binding(),
@@ -152,23 +159,23 @@ impl DirectAppearance {
                     self.linear_from_srgb.raw().as_entire_binding(),
                     view.drawn.raw().as_entire_binding(),
                     gaussians.color.raw().as_entire_binding(),
-                    slot.kept.raw().as_entire_binding(),
+                    kept.raw().as_entire_binding(),
                 ];
-                self.kernels.observe.bind(gpu, &resources)
+                kernels.observe.bind(gpu, &resources)
             })
             .collect();
-        stage(encoder, "observe", &self.kernels.observe.pipeline, &observations, all_gaussians);
+        stage(encoder, "observe", &kernels.observe.pipeline, &observations, all_gaussians);
         if settings.space {
-            let bind = self.graph.bind_gather(gpu, &self.kernels.gather, &self.seen);
+            let bind = self.graph.bind_gather(gpu, &kernels.gather, &self.seen);
             let all_nodes = dispatch_1d(self.graph.node_count, WORKGROUP);
-            stage(encoder, "gather", &self.kernels.gather.pipeline, &[bind], all_nodes);
-            let bind = self.graph.bind_diffuse(gpu, &self.kernels.diffuse, &self.settings);
-            stage(encoder, "diffuse", &self.kernels.diffuse.pipeline, &[bind], (1, 1));
+            stage(encoder, "gather", &kernels.gather.pipeline, &[bind], all_nodes);
+            let bind = self.graph.bind_diffuse(gpu, &kernels.diffuse, settings_buffer);
+            stage(encoder, "diffuse", &kernels.diffuse.pipeline, &[bind], (1, 1));
         }
-        let bind = self.kernels.paint.bind(
+        let bind = kernels.paint.bind(
             gpu,
             &[
-                self.settings.as_entire_binding(),
+                settings_buffer.as_entire_binding(),
                 self.seen.raw().as_entire_binding(),
                 self.quality.raw().as_entire_binding(),
                 self.graph.node_color.raw().as_entire_binding(),
@@ -178,8 +185,27 @@ impl DirectAppearance {
                 gaussians.color.raw().as_entire_binding(),
             ],
         );
-        stage(encoder, "paint", &self.kernels.paint.pipeline, &[bind], all_gaussians);
+        stage(encoder, "paint", &kernels.paint.pipeline, &[bind], all_gaussians);
         Ok(())
+    }
+
+    /// The kernels on the processor.
+    fn update_on_processor(&self, gaussians: &GaussianBuffers, views: &[ViewInput<'_>], settings: &SettingsConstants) {
+        let (Some(mut seen), Some(mut quality)) = (self.seen.slice_mut(), self.quality.slice_mut()) else { return };
+        let Some(linear) = self.linear_from_srgb.slice() else { return };
+        for (view, kept) in views.iter().zip(&self.kept) {
+            let Some(mut kept) = kept.slice_mut() else { return };
+            let out = Seen { seen: &mut seen, quality: &mut quality, kept: &mut kept };
+            processor::observe(settings, view, gaussians, &linear, out);
+        }
+        if settings.space != 0 {
+            processor::gather(&self.graph, &seen);
+            processor::diffuse(&self.graph, settings);
+        }
+        let (Some(mut memory), Some(mut color)) = (self.memory.slice_mut(), gaussians.color.slice_mut()) else {
+            return;
+        };
+        processor::paint(settings, &self.graph, (&seen, &quality), &mut memory, &mut color);
     }
 
     /// From the next update on keeps what each view saw, for [`Self::observations`].
@@ -187,8 +213,8 @@ impl DirectAppearance {
     /// # Errors
     /// [`GpuError::TooLarge`].
     pub fn keep_observations(&mut self, gpu: &GpuContext) -> Result<(), GpuError> {
-        for slot in &mut self.views {
-            slot.kept = StorageBuffer::zeroed(gpu, "observations of a view", self.seen.len())?;
+        for kept in &mut self.kept {
+            *kept = StorageBuffer::zeroed(gpu, KEPT, self.seen.len())?;
         }
         Ok(())
     }
@@ -201,11 +227,11 @@ impl DirectAppearance {
     pub fn observations(&self, gpu: &GpuContext, views: usize) -> Result<Observations, GpuError> {
         let nodes = self.graph.node_count as usize;
         Ok(Observations {
-            views: self.views.iter().take(views).map(|slot| slot.kept.read(gpu)).collect::<Result<_, _>>()?,
+            views: self.kept.iter().take(views).map(|kept| kept.read(gpu)).collect::<Result<_, _>>()?,
             seen: self.seen.read(gpu)?,
             quality: self.quality.read(gpu)?,
-            node_seen: read_back(gpu, self.graph.node_seen.raw(), nodes)?,
-            node_color: read_back(gpu, self.graph.node_color.raw(), nodes)?,
+            node_seen: self.graph.node_seen.read_first(gpu, nodes)?,
+            node_color: self.graph.node_color.read_first(gpu, nodes)?,
         })
     }
 
@@ -213,7 +239,7 @@ impl DirectAppearance {
     #[must_use]
     pub fn observation_buffers(&self) -> ObservationBuffers<'_> {
         ObservationBuffers {
-            views: self.views.iter().map(|slot| &slot.kept).collect(),
+            views: self.kept.iter().collect(),
             seen: &self.seen,
             quality: &self.quality,
             nodes: self.graph.node_count as usize,
@@ -260,7 +286,7 @@ impl DirectAppearance {
         if found != expected {
             return Err(AppearanceError::GaussianCount { expected, found });
         }
-        let (max, found) = (self.views.len(), views.len());
+        let (max, found) = (self.kept.len(), views.len());
         if found > max {
             return Err(AppearanceError::TooManyViews { max, found });
         }

@@ -1,0 +1,161 @@
+//! Blending of a tile: `raster_blend.wgsl` on the processor.
+
+use super::lanes::{LANES, Lanes, exp2};
+use super::project::{Splat, TILE};
+use crate::Outputs;
+use crate::raster_kernels::{MAX_ALPHA, OPAQUE};
+
+const ROWS: usize = TILE as usize;
+/// Splats after which it is looked whether every pixel is opaque.
+const OPAQUE_EVERY: usize = 8;
+
+/// One number a pixel of a tile, row by row.
+pub(super) type TileLanes = [Lanes; ROWS];
+
+/// A tile while it is blended. Sums of weight times value; `coverage` the sum of the weights.
+#[derive(Debug, Clone)]
+pub(super) struct Tile {
+    pub transmittance: TileLanes,
+    pub coverage: TileLanes,
+    pub color: [TileLanes; 3],
+    pub depth: TileLanes,
+    pub canonical: [TileLanes; 3],
+}
+
+impl Tile {
+    fn new() -> Self {
+        const ZERO: TileLanes = [[0.0; LANES]; ROWS];
+        Self {
+            transmittance: [[1.0; LANES]; ROWS],
+            coverage: ZERO,
+            color: [ZERO; 3],
+            depth: ZERO,
+            canonical: [ZERO; 3],
+        }
+    }
+}
+
+/// Blends a tile's list front to back.
+pub(super) struct BlendTile<'a> {
+    /// First pixel.
+    pub origin: [f32; 2],
+    /// Gaussians, nearest first.
+    pub list: &'a [u32],
+    pub splats: &'a [Splat],
+    pub color: &'a [[f32; 4]],
+    pub canonical: &'a [[f32; 4]],
+    pub outputs: Outputs,
+}
+
+impl pulp::NullaryFnOnce for BlendTile<'_> {
+    type Output = Tile;
+
+    #[inline(always)]
+    fn call(self) -> Tile {
+        let mut tile = Tile::new();
+        for (index, &gaussian) in self.list.iter().enumerate() {
+            let splat = &self.splats[gaussian as usize];
+            for row in rows_of(splat, self.origin[1]) {
+                let Some(weight) = weigh(splat, self.origin, row, &mut tile.transmittance[row]) else { continue };
+                add(&mut tile.coverage[row], &weight, 1.0);
+                if self.outputs.color {
+                    let color = &self.color[gaussian as usize];
+                    for (sum, value) in tile.color.iter_mut().zip(color) {
+                        add(&mut sum[row], &weight, *value);
+                    }
+                }
+                if self.outputs.depth {
+                    add(&mut tile.depth[row], &weight, splat.depth);
+                }
+                if self.outputs.canonical {
+                    let position = &self.canonical[gaussian as usize];
+                    for (sum, value) in tile.canonical.iter_mut().zip(position) {
+                        add(&mut sum[row], &weight, *value);
+                    }
+                }
+            }
+            if index % OPAQUE_EVERY == OPAQUE_EVERY - 1 && is_opaque(&tile.transmittance) {
+                break;
+            }
+        }
+        tile
+    }
+}
+
+/// Rows of a tile that begins at pixel row `top` in which the splat can be seen.
+#[inline(always)]
+pub(super) fn rows_of(splat: &Splat, top: f32) -> std::ops::Range<usize> {
+    // `as` saturates: rows above the tile become 0.
+    let first = (splat.pixel.y - splat.reach_y - top).ceil() as usize;
+    let end = (splat.pixel.y + splat.reach_y - top + 1.0).floor() as usize;
+    first..end.min(ROWS)
+}
+
+/// log2(alpha) of a splat at the pixels of a row.
+#[inline(always)]
+pub(super) fn exponents(splat: &Splat, origin: [f32; 2], row: usize) -> Lanes {
+    let dy = origin[1] + row as f32 - splat.pixel.y;
+    let [a, b, c] = splat.conic;
+    let mut exponents = [0.0; LANES];
+    for (lane, exponent) in exponents.iter_mut().enumerate() {
+        let dx = origin[0] + lane as f32 - splat.pixel.x;
+        *exponent = splat.log2_opacity - a * dx * dx - dy * (b * dx + c * dy);
+    }
+    exponents
+}
+
+/// Weights of a splat at the pixels of a row, whose transmittance falls; None where it touches none.
+#[inline(always)]
+fn weigh(splat: &Splat, origin: [f32; 2], row: usize, transmittance: &mut Lanes) -> Option<Lanes> {
+    let exponents = exponents(splat, origin, row);
+    let (cut, opaque, most) = (LOG2_CUT, OPAQUE as f32, MAX_ALPHA as f32);
+    let mut touched = 0u32;
+    for lane in 0..LANES {
+        touched |= u32::from(exponents[lane] >= cut) & u32::from(transmittance[lane] >= opaque);
+    }
+    if touched == 0 {
+        return None;
+    }
+    let mut weight = [0.0; LANES];
+    for lane in 0..LANES {
+        let is_touched = (exponents[lane] >= cut) & (transmittance[lane] >= opaque);
+        let power = exp2(exponents[lane]);
+        let power = if power < most { power } else { most };
+        let alpha = if is_touched { power } else { 0.0 };
+        weight[lane] = alpha * transmittance[lane];
+        transmittance[lane] *= 1.0 - alpha;
+    }
+    Some(weight)
+}
+
+/// log2 of the alpha below which a splat does not touch a pixel.
+pub(super) const LOG2_CUT: f32 = -7.994_353_4;
+
+#[inline(always)]
+fn add(sum: &mut Lanes, weight: &Lanes, value: f32) {
+    for lane in 0..LANES {
+        sum[lane] += weight[lane] * value;
+    }
+}
+
+/// Whether every pixel of a tile is finished.
+#[inline(always)]
+pub(super) fn is_opaque(transmittance: &TileLanes) -> bool {
+    let mut open = 0u32;
+    for row in transmittance {
+        for lane in row {
+            open |= u32::from(*lane >= OPAQUE as f32);
+        }
+    }
+    open == 0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_cut_is_that_of_the_other_kernels() {
+        assert!((f64::from(LOG2_CUT) - crate::raster_kernels::CUT.log2()).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,180 @@
+//! Gaussians in depth order and the lists of the tiles: projection, radix sort, and counting sort by tile.
+
+use rayon::prelude::*;
+
+use super::project::{Projection, Rect, Splat, TILE};
+use crate::raster_buffers::pair_capacity;
+
+/// Gaussians that one task projects.
+const CHUNK: usize = 4096;
+/// Bits of a pass of the radix sort, and passes: keys are sorted to so many bits of their range.
+const DIGIT_BITS: u32 = 12;
+const PASSES: u32 = 2;
+
+/// The attributes of all Gaussians, as in [`GaussianBuffers`](crate::GaussianBuffers).
+#[derive(Clone, Copy)]
+pub(super) struct Attributes<'a> {
+    pub center_scale: &'a [[f32; 4]],
+    pub normal: &'a [[f32; 4]],
+    pub color: &'a [[f32; 4]],
+    pub canonical: &'a [[f32; 4]],
+}
+
+/// What a picture is blended from. Its arrays are used again by the next picture.
+#[derive(Debug, Default)]
+pub(super) struct Lists {
+    /// By Gaussian; old where it is not drawn.
+    pub splats: Vec<Splat>,
+    rects: Vec<Rect>,
+    /// Drawn Gaussians of each chunk: bits of the depth, index.
+    visible: Vec<Vec<[u32; 2]>>,
+    /// All of them, nearest first.
+    order: Vec<[u32; 2]>,
+    scratch: Vec<[u32; 2]>,
+    /// Columns and rows of tiles.
+    pub tiles: [u32; 2],
+    /// Where each tile's list begins in `pairs`, and the end.
+    pub starts: Vec<u32>,
+    /// Gaussians by tile, nearest first.
+    pub pairs: Vec<u32>,
+    /// Gaussians that touch the picture.
+    pub visible_gaussians: u32,
+    /// Pairs of a Gaussian and a tile that were wanted, at most one more than there is room for.
+    pub wanted_pairs: u32,
+    /// Whether there was no room for all.
+    pub overflowed: bool,
+}
+
+impl Lists {
+    /// Lists the Gaussians of a picture.
+    pub fn fill(&mut self, projection: &Projection<'_>, gaussians: Attributes<'_>) {
+        self.project(projection, gaussians);
+        self.sort();
+        self.bin(projection.size, gaussians.center_scale.len());
+    }
+
+    fn project(&mut self, projection: &Projection<'_>, gaussians: Attributes<'_>) {
+        let count = gaussians.center_scale.len();
+        self.splats.resize(count, Splat::default());
+        self.rects.resize(count, Rect::default());
+        self.visible.resize(count.div_ceil(CHUNK), Vec::new());
+        let chunks = self.splats.par_chunks_mut(CHUNK).zip(self.rects.par_chunks_mut(CHUNK));
+        chunks.zip(&mut self.visible).enumerate().for_each(|(chunk, ((splats, rects), visible))| {
+            visible.clear();
+            for (offset, (splat, rect)) in splats.iter_mut().zip(rects).enumerate() {
+                let i = chunk * CHUNK + offset;
+                let Attributes { center_scale, normal, color, canonical } = gaussians;
+                let drawn = projection.splat(&center_scale[i], &normal[i], &color[i], &canonical[i]);
+                if let Some(drawn) = drawn {
+                    (*splat, *rect) = drawn;
+                    // The bits of positive floats sort as the floats do.
+                    visible.push([splat.depth.to_bits(), i as u32]);
+                }
+            }
+        });
+    }
+
+    /// Stable radix sort by depth, to 24 bits of the range of the depths' bits.
+    fn sort(&mut self) {
+        self.order.clear();
+        self.visible.iter().for_each(|visible| self.order.extend_from_slice(visible));
+        self.visible_gaussians = self.order.len() as u32;
+        let (low, high) =
+            self.order.iter().fold((u32::MAX, 0), |(low, high), [key, _]| (low.min(*key), high.max(*key)));
+        let range_bits = u32::BITS - high.saturating_sub(low).leading_zeros();
+        let shift = range_bits.saturating_sub(DIGIT_BITS * PASSES);
+        self.scratch.resize(self.order.len(), [0; 2]);
+        for pass in 0..PASSES {
+            let digit = |key: u32| (((key - low) >> shift) >> (pass * DIGIT_BITS)) as usize & ((1 << DIGIT_BITS) - 1);
+            let mut places = vec![0u32; 1 << DIGIT_BITS];
+            self.order.iter().for_each(|[key, _]| places[digit(*key)] += 1);
+            let mut end = 0;
+            for place in &mut places {
+                end += std::mem::replace(place, end);
+            }
+            for one in &self.order {
+                let place = &mut places[digit(one[0])];
+                self.scratch[*place as usize] = *one;
+                *place += 1;
+            }
+            std::mem::swap(&mut self.order, &mut self.scratch);
+        }
+    }
+
+    /// Lists by tile. Where there is no room for all pairs, the farthest Gaussians are left out whole.
+    fn bin(&mut self, size: [u32; 2], count: usize) {
+        self.tiles = size.map(|side| side.div_ceil(TILE));
+        let tiles = self.tiles[0] as usize * self.tiles[1] as usize;
+        let capacity = pair_capacity(count, tiles as u64, u64::from(u32::MAX));
+        let mut pairs = 0;
+        let mut kept = self.order.len();
+        for (rank, [_, gaussian]) in self.order.iter().enumerate() {
+            let more = self.rects[*gaussian as usize].tiles();
+            if more > capacity - pairs {
+                kept = rank;
+                break;
+            }
+            pairs += more;
+        }
+        self.overflowed = kept < self.order.len();
+        self.wanted_pairs = if self.overflowed { capacity + 1 } else { pairs };
+        let order = &self.order[..kept];
+        let [columns, rows] = self.tiles.map(|count| count as usize);
+        // Threads share the rows of tiles; each walks over all Gaussians in their order.
+        let bands = rayon::current_num_threads().clamp(1, rows.max(1));
+        let band_rows = rows.div_ceil(bands).max(1);
+        self.starts.clear();
+        self.starts.resize(tiles + 1, 0);
+        let rects = &self.rects;
+        let counts = &mut self.starts[1..];
+        counts.par_chunks_mut(band_rows * columns.max(1)).enumerate().for_each(|(band, counts)| {
+            for [_, gaussian] in order {
+                each_tile(&rects[*gaussian as usize], band * band_rows, band_rows, columns, |at| counts[at] += 1);
+            }
+        });
+        let mut end = 0;
+        for start in &mut self.starts {
+            end += *start;
+            *start = end;
+        }
+        self.pairs.resize(pairs as usize, 0);
+        // The part of the pairs that belongs to each band.
+        let mut rest = self.pairs.as_mut_slice();
+        let mut parts = Vec::with_capacity(bands);
+        for band in 0..bands {
+            let tile = |row: usize| (row.min(rows) * columns).min(tiles);
+            let range = tile(band * band_rows)..tile((band + 1) * band_rows);
+            let (first, last) = (self.starts[range.start], self.starts[range.end]);
+            let (part, others) = rest.split_at_mut((last - first) as usize);
+            parts.push((band, &self.starts[range], first, part));
+            rest = others;
+        }
+        parts.into_par_iter().for_each(|(band, starts, first, part)| {
+            let mut places: Vec<u32> = starts.iter().map(|start| start - first).collect();
+            for [_, gaussian] in order {
+                each_tile(&rects[*gaussian as usize], band * band_rows, band_rows, columns, |at| {
+                    part[places[at] as usize] = *gaussian;
+                    places[at] += 1;
+                });
+            }
+        });
+    }
+
+    /// Positions in `pairs` of a tile's list.
+    pub fn range(&self, tile: usize) -> std::ops::Range<usize> {
+        self.starts[tile] as usize..self.starts[tile + 1] as usize
+    }
+}
+
+/// Calls `with` for every tile of `rect` within a band of `rows` rows from `first_row` on: the tile's index in the band.
+#[inline]
+fn each_tile(rect: &Rect, first_row: usize, rows: usize, columns: usize, mut with: impl FnMut(usize)) {
+    let (top, bottom) =
+        (usize::from(rect.first[1]).max(first_row), usize::from(rect.last[1]).min(first_row + rows - 1));
+    for row in top..=bottom {
+        let at = (row - first_row) * columns;
+        for column in rect.first[0]..=rect.last[0] {
+            with(at + usize::from(column));
+        }
+    }
+}

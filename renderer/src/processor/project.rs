@@ -1,0 +1,117 @@
+//! Gaussians to splats: `raster_project.wgsl` on the processor.
+
+use flyrig_gpu::CameraConstants;
+use glam::{Vec2, Vec3, Vec4};
+
+use crate::RasterSettings;
+use crate::raster_kernels::{BACKFACING_COSINE, CUT};
+
+/// Side of a tile, pixels.
+pub(super) const TILE: u32 = super::lanes::LANES as u32;
+
+/// A Gaussian in the picture.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Splat {
+    /// Centre, pixels.
+    pub pixel: Vec2,
+    /// Camera-space z, metres.
+    pub depth: f32,
+    /// log2 of the opacity after the filter.
+    pub log2_opacity: f32,
+    /// log2(alpha) = log2_opacity - (x a x + y b x + z c y) at the offset (x, y) in pixels.
+    pub conic: [f32; 3],
+    /// Rows above and below the centre beyond which alpha is below the cut.
+    pub reach_y: f32,
+}
+
+/// First and last tile, columns and rows.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Rect {
+    pub first: [u16; 2],
+    pub last: [u16; 2],
+}
+
+impl Rect {
+    /// Number of tiles.
+    pub fn tiles(&self) -> u32 {
+        let side = |i: usize| u32::from(self.last[i]) - u32::from(self.first[i]) + 1;
+        side(0) * side(1)
+    }
+}
+
+/// What a picture is projected with.
+pub(super) struct Projection<'a> {
+    pub camera: CameraConstants,
+    pub size: [u32; 2],
+    pub settings: &'a RasterSettings,
+}
+
+impl Projection<'_> {
+    /// The splat of a Gaussian and its tiles; None where it is not drawn. Elements as in
+    /// [`GaussianBuffers`](crate::GaussianBuffers).
+    #[inline]
+    pub fn splat(
+        &self,
+        center: &[f32; 4],
+        normal: &[f32; 4],
+        color: &[f32; 4],
+        canonical: &[f32; 4],
+    ) -> Option<(Splat, Rect)> {
+        let finite = |v: &[f32; 4]| Vec4::from(*v).is_finite();
+        let [x, y, z, scale] = *center;
+        if !(finite(center) && finite(color) && scale > 0.0 && color[3] > 0.0) {
+            return None;
+        }
+        let world = Vec3::new(x, y, z);
+        if self.settings.cull_backfacing {
+            let n = Vec4::from(*normal).truncate();
+            let sight = world - self.camera.center();
+            let cosine = BACKFACING_COSINE as f32;
+            // Squared where the signs allow it: most Gaussians need no root.
+            let along = n.dot(sight);
+            let facing_away =
+                along > 0.0 && along * along > cosine * cosine * n.length_squared() * sight.length_squared();
+            if !finite(normal) || facing_away {
+                return None;
+            }
+        }
+        if self.settings.outputs.canonical && !finite(canonical) {
+            return None;
+        }
+        let in_camera = self.camera.to_camera(world);
+        let pixel = self.camera.project(in_camera, self.settings.near_m)?;
+        let [dx, dy, dz] = self.camera.projection_jacobian(in_camera);
+        let row_x = Vec3::new(dx.x, dy.x, dz.x) * scale;
+        let row_y = Vec3::new(dx.y, dy.y, dz.y) * scale;
+        let (xx, xy, yy) = (row_x.dot(row_x), row_x.dot(row_y), row_y.dot(row_y));
+        // det(J J^T) by the Cauchy-Binet formula: never negative, no cancellation for thin ellipses.
+        let det = row_x.cross(row_y).length_squared();
+        // Mip-Splatting's 2D Mip filter (Yu et al. 2024, Eq. 10): a wider ellipse of the same integral.
+        let s = self.settings.filter_variance_px2;
+        let filtered_det = det + s * (xx + yy) + s * s;
+        let opacity = color[3].min(1.0) * (det / filtered_det).sqrt();
+        if !(pixel.is_finite() && filtered_det.is_finite() && opacity > CUT as f32) {
+            return None;
+        }
+        let log2_opacity = opacity.log2();
+        let (xx, yy) = (xx + s, yy + s);
+        // opacity * exp(-r2 / 2) = CUT
+        let r2 = 2.0 * std::f32::consts::LN_2 * (log2_opacity - (CUT as f32).log2());
+        let extent = Vec2::new((r2 * xx).sqrt(), (r2 * yy).sqrt());
+        // Pixel centres are at integers. One hundredth of a pixel covers the rounding.
+        let extent = extent + 0.01;
+        let low = (pixel - extent).ceil();
+        let high = (pixel + extent).floor();
+        let last = Vec2::new((self.size[0] - 1) as f32, (self.size[1] - 1) as f32);
+        let is_outside = high.x < 0.0 || high.y < 0.0 || low.x > last.x || low.y > last.y;
+        if !low.is_finite() || !high.is_finite() || is_outside || low.x > high.x || low.y > high.y {
+            return None;
+        }
+        let tile = |v: f32| (v as u32 / TILE) as u16;
+        let (low, high) = (low.max(Vec2::ZERO), high.min(last));
+        let rect = Rect { first: [tile(low.x), tile(low.y)], last: [tile(high.x), tile(high.y)] };
+        let scale = 0.5 * std::f32::consts::LOG2_E / filtered_det;
+        let conic = [yy * scale, -2.0 * xy * scale, xx * scale];
+        Some((Splat { pixel, depth: in_camera.z, log2_opacity, conic, reach_y: extent.y }, rect))
+    }
+}

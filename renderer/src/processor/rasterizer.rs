@@ -1,0 +1,144 @@
+//! Forward rasteriser.
+
+use flyrig_gpu::CameraConstants;
+use flyrig_types::Camera;
+use rayon::prelude::*;
+
+use super::blend::{BlendTile, Tile};
+use super::lanes::{LANES, vectorized};
+use super::lists::{Attributes, Lists};
+use super::project::{Projection, TILE};
+use crate::raster::{Latest, tile_range};
+use crate::{GaussianBuffers, Outputs, RasterSettings, RasterStats, RenderTarget};
+
+/// [`Rasterizer`](crate::Rasterizer) on the processor: draws when a picture is recorded.
+#[derive(Debug, Default)]
+pub(crate) struct ProcessorRasterizer {
+    pub(super) lists: Lists,
+    /// What was drawn last.
+    pub(super) latest: Option<Drawn>,
+    overflowed_pictures: u32,
+}
+
+/// What the derivative must know of a picture.
+#[derive(Debug, Clone)]
+pub(crate) struct Drawn {
+    pub camera: CameraConstants,
+    pub size: [u32; 2],
+    pub gaussians: usize,
+    pub settings: RasterSettings,
+    /// First tile that was blended, and columns and rows of them.
+    pub first_tile: [u32; 2],
+    pub blended: [u32; 2],
+}
+
+impl ProcessorRasterizer {
+    /// Draws a picture. Arrays of the device are left as they are.
+    pub(crate) fn draw(
+        &mut self,
+        gaussians: &GaussianBuffers,
+        camera: &Camera,
+        settings: &RasterSettings,
+        target: &RenderTarget,
+    ) {
+        self.latest = None;
+        let size = [target.width, target.height];
+        let attributes = gaussians.attributes().map(flyrig_gpu::StorageBuffer::slice);
+        let [Some(center_scale), Some(normal), Some(color), Some(canonical)] = &attributes else { return };
+        if size.contains(&0) {
+            return;
+        }
+        let constants = CameraConstants::from(camera);
+        let projection = Projection { camera: constants, size, settings };
+        let attributes = Attributes { center_scale, normal, color, canonical };
+        self.lists.fill(&projection, attributes);
+        self.overflowed_pictures += u32::from(self.lists.overflowed);
+        let (first_tile, blended) = tile_range(settings.area, self.lists.tiles, TILE);
+        let Outputs { color: with_color, depth: with_depth, canonical: with_canonical } = settings.outputs;
+        let mut pictures = (
+            target.color.slice_mut().filter(|_| with_color),
+            target.depth.slice_mut().filter(|_| with_depth),
+            target.canonical.slice_mut().filter(|_| with_canonical),
+        );
+        let row_of_tiles = (size[0] * TILE) as usize;
+        // Rows of tiles; nothing where a picture is not asked for.
+        let mut bands: Vec<Band<'_>> = (0..self.lists.tiles[1]).map(|_| Band::default()).collect();
+        if let Some(color) = &mut pictures.0 {
+            bands.iter_mut().zip(color.chunks_mut(row_of_tiles)).for_each(|(band, part)| band.color = part);
+        }
+        if let Some(depth) = &mut pictures.1 {
+            bands.iter_mut().zip(depth.chunks_mut(row_of_tiles)).for_each(|(band, part)| band.depth = part);
+        }
+        if let Some(canonical) = &mut pictures.2 {
+            bands.iter_mut().zip(canonical.chunks_mut(row_of_tiles)).for_each(|(band, part)| band.canonical = part);
+        }
+        let rows = first_tile[1] as usize..(first_tile[1] + blended[1]) as usize;
+        let Some(bands) = bands.get_mut(rows) else { return };
+        let lists = &self.lists;
+        bands.par_iter_mut().enumerate().for_each(|(row, band)| {
+            let row = first_tile[1] + row as u32;
+            for column in first_tile[0]..first_tile[0] + blended[0] {
+                let list = &lists.pairs[lists.range((row * lists.tiles[0] + column) as usize)];
+                let tile = vectorized(BlendTile {
+                    origin: [(column * TILE) as f32, (row * TILE) as f32],
+                    list,
+                    splats: &lists.splats,
+                    color: attributes.color,
+                    canonical: attributes.canonical,
+                    outputs: settings.outputs,
+                });
+                band.write(&tile, size[0] as usize, column as usize * LANES);
+            }
+        });
+        let gaussians = gaussians.count();
+        let settings = *settings;
+        self.latest = Some(Drawn { camera: constants, size, gaussians, settings, first_tile, blended });
+    }
+
+    pub(crate) fn latest(&self) -> Option<Latest> {
+        let Drawn { size, gaussians, settings, blended, .. } = self.latest.as_ref()?;
+        Some(Latest { gaussians: *gaussians, size: *size, blended: *blended, outputs: settings.outputs })
+    }
+
+    pub(crate) fn stats(&self) -> RasterStats {
+        RasterStats {
+            visible_gaussians: self.lists.visible_gaussians,
+            pairs: self.lists.wanted_pairs,
+            overflowed_pictures: self.overflowed_pictures,
+        }
+    }
+}
+
+/// A row of tiles of the pictures; empty where one is not drawn.
+#[derive(Default)]
+struct Band<'a> {
+    color: &'a mut [[f32; 4]],
+    depth: &'a mut [f32],
+    canonical: &'a mut [[f32; 4]],
+}
+
+impl Band<'_> {
+    /// Writes a tile whose first pixel is in column `left`.
+    fn write(&mut self, tile: &Tile, width: usize, left: usize) {
+        let columns = LANES.min(width - left);
+        let three = |sums: &[[[f32; LANES]; LANES]; 3], row: usize, lane: usize| {
+            [sums[0][row][lane], sums[1][row][lane], sums[2][row][lane], tile.coverage[row][lane]]
+        };
+        for (row, pixels) in self.color.chunks_mut(width).enumerate() {
+            for (lane, pixel) in pixels[left..left + columns].iter_mut().enumerate() {
+                *pixel = three(&tile.color, row, lane);
+            }
+        }
+        for (row, pixels) in self.depth.chunks_mut(width).enumerate() {
+            for (lane, pixel) in pixels[left..left + columns].iter_mut().enumerate() {
+                // Coverage is 0 or at least the cut.
+                *pixel = tile.depth[row][lane] / tile.coverage[row][lane].max(1e-6);
+            }
+        }
+        for (row, pixels) in self.canonical.chunks_mut(width).enumerate() {
+            for (lane, pixel) in pixels[left..left + columns].iter_mut().enumerate() {
+                *pixel = three(&tile.canonical, row, lane);
+            }
+        }
+    }
+}
