@@ -180,7 +180,7 @@ impl LiveRig {
         for attempt in 1..=ATTEMPTS {
             let gpu = self.session.gpu().reopen();
             let rebuilt =
-                gpu.map_err(FusionError::from).and_then(|gpu| self.session.rebuild(gpu, &self.recovery.memories));
+                gpu.map_err(FusionError::from).and_then(|gpu| self.session.rebuild(&gpu, &self.recovery.memories));
             match rebuilt {
                 Ok(()) => {
                     self.recovery.rebuilt += 1;
@@ -211,7 +211,7 @@ impl LiveRig {
         std::thread::sleep(due.saturating_duration_since(Instant::now()));
         let rebuilt = caught(|| {
             let gpu = self.session.gpu().reopen()?;
-            self.session.rebuild(gpu, &self.recovery.memories)
+            self.session.rebuild(&gpu, &self.recovery.memories)
         });
         rebuilt.map_err(failed)??;
         self.pipeline.restarts += 1;

@@ -7,7 +7,8 @@ use flyrig_renderer::{GaussianBuffers, Splat};
 use flyrig_types::{Camera, FrameSet, PersonId, Pose, RenderedView, Rig};
 
 use crate::{
-    FusionError, Observation, Perception, PersonMemory, Remedy, SeenPerson, SessionSettings, StageTimes, Subject,
+    FusionError, NetworksOn, Observation, Perception, PersonMemory, Remedy, SeenPerson, SessionSettings, StageTimes,
+    Subject,
     drawing::Drawing,
     subject::{InputView, Observed},
 };
@@ -75,9 +76,10 @@ impl SessionBuilder {
     /// [`FusionError`] names the setting, template or saved person that cannot be used, or what the GPU refuses.
     pub fn build(self) -> Result<Session, FusionError> {
         self.settings.validate()?;
+        let gpu = place_kernels(&self.gpu, &self.settings);
         let mut session = Session {
-            drawing: Drawing::new(&self.gpu, self.settings.body.gaussians)?,
-            gpu: self.gpu,
+            drawing: Drawing::new(&gpu, self.settings.body.gaussians)?,
+            gpu,
             rig: self.rig,
             settings: self.settings,
             perception: self.perception.unwrap_or_else(|| Box::new(Nobody)),
@@ -91,6 +93,14 @@ impl SessionBuilder {
         session.add_people()?;
         Ok(session)
     }
+}
+
+/// The context of a session's kernels. Where the adapter is a processor in disguise, and nobody asked for it by name, they
+/// run on the processor itself, several times as fast.
+fn place_kernels(gpu: &GpuContext, settings: &SessionSettings) -> GpuContext {
+    let networks_on_adapter =
+        settings.appearance.mode.is_learned() && settings.appearance.networks_on == NetworksOn::Adapter;
+    if gpu.is_software() && !gpu.is_named() && !networks_on_adapter { gpu.on_processor() } else { gpu.clone() }
 }
 
 /// Finds nobody.
@@ -348,7 +358,12 @@ impl Session {
     ///
     /// # Errors
     /// [`FusionError`] when the new device fails as well.
-    pub fn rebuild(&mut self, gpu: GpuContext, memories: &BTreeMap<PersonId, PersonMemory>) -> Result<(), FusionError> {
+    pub fn rebuild(
+        &mut self,
+        gpu: &GpuContext,
+        memories: &BTreeMap<PersonId, PersonMemory>,
+    ) -> Result<(), FusionError> {
+        let gpu = place_kernels(gpu, &self.settings);
         let drawing = Drawing::new(&gpu, self.settings.body.gaussians)?;
         let mut subjects = Vec::new();
         for old in &self.subjects {

@@ -36,7 +36,7 @@ fn a_session_resumes_on_another_device_with_shape_and_colours() {
     assert!(session.render(&support::camera("a", 20.0)).unwrap_err().is_device_fault());
 
     let reopened = session.gpu().reopen().unwrap();
-    session.rebuild(reopened, &BTreeMap::from([(ME, memory.clone())])).unwrap();
+    session.rebuild(&reopened, &BTreeMap::from([(ME, memory.clone())])).unwrap();
     assert_eq!(colors(&session), before, "the colours are those of the snapshot");
     assert_eq!(session.memory(ME).unwrap(), memory);
     assert_eq!(session.process(&frame_set(5, &images)).unwrap(), Outcome::Updated);
@@ -53,7 +53,7 @@ fn a_session_without_a_snapshot_starts_afresh_on_another_device() {
     session.gpu().simulate_loss();
     assert!(session.process(&frame_set(1, &images)).is_err());
     let reopened = session.gpu().reopen().unwrap();
-    session.rebuild(reopened, &BTreeMap::new()).unwrap();
+    session.rebuild(&reopened, &BTreeMap::new()).unwrap();
     assert_eq!(session.process(&frame_set(2, &images)).unwrap(), Outcome::Updated);
     assert!(colors(&session).iter().filter(|c| c[0] > 4.0 * c[2]).count() > 1000);
 }
@@ -93,7 +93,7 @@ fn a_hundred_losses_leave_the_memory_flat() {
         assert!(session.process(&frame_set(2 * loss + 1, &images)).unwrap_err().is_device_fault());
         let start = std::time::Instant::now();
         let reopened = session.gpu().reopen().unwrap();
-        session.rebuild(reopened, &learnt).unwrap();
+        session.rebuild(&reopened, &learnt).unwrap();
         session.process(&frame_set(2 * loss + 1, &images)).unwrap();
         seconds.push(start.elapsed().as_secs_f64());
         memory.extend(resident_mib());

@@ -120,9 +120,8 @@ impl CameraConstants {
     pub fn project(&self, in_camera: Vec3, near: f32) -> Option<Vec2> {
         // Each comparison is false for NaN.
         let ideal = in_camera.truncate() / in_camera.z;
-        let is_valid = in_camera.z > near
-            && in_camera.z < 1e9
-            && ideal.length_squared() <= self.valid_radius * self.valid_radius;
+        let is_valid =
+            in_camera.z > near && in_camera.z < 1e9 && ideal.length_squared() <= self.valid_radius * self.valid_radius;
         is_valid.then(|| self.distort(ideal).point * Vec2::from(self.focal_px) + Vec2::from(self.center_px))
     }
 
