@@ -21,13 +21,20 @@ const RUNS: usize = 15;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let folder = std::env::args().nth(1).map(PathBuf::from);
-    let gpu = GpuContext::new(&AdapterChoice::Best)?;
+    let device = GpuContext::new(&AdapterChoice::Best)?;
+    let processor = device.on_processor();
     let commit = Command::new("git").args(["rev-parse", "--short", "HEAD"]).output().ok();
     let commit = commit.map(|out| String::from_utf8_lossy(&out.stdout).trim().to_owned()).unwrap_or_default();
-    println!("adapter {}, commit {}", gpu.adapter_name(), if commit.is_empty() { "unknown" } else { &commit });
+    println!(
+        "{} and {}, commit {}",
+        device.adapter_name(),
+        processor.adapter_name(),
+        if commit.is_empty() { "unknown" } else { &commit }
+    );
     println!("times: median of {RUNS} runs, milliseconds; errors: linear colour and alpha over the body's pixels\n");
     println!(
-        "{:>9} {:>7} {:>5} {:>6} | {:>6} {:>7} {:>6} {:>6} {:>7} | {:>7} {:>6} | {:>17} | {:>24}",
+        "{:>9} {:>9} {:>7} {:>5} {:>6} | {:>6} {:>7} {:>6} {:>6} {:>7} | {:>7} {:>6} | {:>17} | {:>24}",
+        "kernels",
         "picture",
         "count",
         "cull",
@@ -58,22 +65,25 @@ fn main() -> Result<(), Box<dyn Error>> {
             ] {
                 let settings = RasterSettings { cull_backfacing: cull, outputs, ..Default::default() };
                 let own = reference(scene, &camera, &settings, width, height);
-                let run = measure(&gpu, scene, &camera, &settings)?;
-                let (max, mean, _) = body_error(&run.pictures, &own);
-                let (full_max, full_mean, seen) = body_error(&run.pictures, &full);
-                let [project, sort, lists, blend] = run.stages;
-                println!(
-                    "{name:>9} {count:>7} {cull:>5} {output:>6} | {project:6.2} {sort:7.2} {lists:6.2} {blend:6.2} {:7.2} | \
+                for gpu in [&device, &processor] {
+                    let kernels = if gpu.is_on_processor() { "processor" } else { "adapter" };
+                    let run = measure(gpu, scene, &camera, &settings)?;
+                    let (max, mean, _) = body_error(&run.pictures, &own);
+                    let (full_max, full_mean, seen) = body_error(&run.pictures, &full);
+                    let [project, sort, lists, blend] = run.stages;
+                    println!(
+                        "{kernels:>9} {name:>9} {count:>7} {cull:>5} {output:>6} | {project:6.2} {sort:7.2} {lists:6.2} {blend:6.2} {:7.2} | \
                      {:>7} {:>6} | {max:8.1e} {mean:8.1e} | {full_max:8.1e} {full_mean:8.1e} {:5.2}%",
-                    run.total,
-                    run.visible,
-                    run.pairs,
-                    seen * 100.0
-                );
-                if let (Some(folder), "all") = (&folder, output) {
-                    std::fs::create_dir_all(folder)?;
-                    let file = format!("{name}-{count}-{}.png", if cull { "culled" } else { "uncut" });
-                    save_png(&folder.join(file), &run.pictures.color, width, height)?;
+                        run.total,
+                        run.visible,
+                        run.pairs,
+                        seen * 100.0
+                    );
+                    if let (Some(folder), "all") = (&folder, output) {
+                        std::fs::create_dir_all(folder)?;
+                        let file = format!("{name}-{count}-{}.png", if cull { "culled" } else { "uncut" });
+                        save_png(&folder.join(file), &run.pictures.color, width, height)?;
+                    }
                 }
             }
         }
@@ -94,22 +104,28 @@ fn measure(gpu: &GpuContext, scene: &Scene, camera: &Camera, settings: &RasterSe
     let gaussians = upload(gpu, scene)?;
     let mut rasterizer = Rasterizer::new(gpu, scene.center_scale.len())?;
     let target = RenderTarget::new(gpu, size.0, size.1)?;
-    let mut timer = GpuTimer::new(gpu, 4);
+    // The processor's clock measures its kernels as a whole.
+    let mut timer = (!gpu.is_on_processor()).then(|| GpuTimer::new(gpu, 4));
     let mut totals = Vec::new();
     let mut stages = [const { Vec::new() }; 4];
     for run in 0..RUNS + 2 {
         let begin = Instant::now();
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        rasterizer.encode_timed(gpu, &mut encoder, &gaussians, (camera, settings), &target, Some(&mut timer))?;
-        timer.resolve(&mut encoder);
+        rasterizer.encode_timed(gpu, &mut encoder, &gaussians, (camera, settings), &target, timer.as_mut())?;
+        if let Some(timer) = &mut timer {
+            timer.resolve(&mut encoder);
+        }
         gpu.queue.submit([encoder.finish()]);
         gpu.wait()?;
         let total = begin.elapsed();
-        let times = timer.collect(gpu)?;
+        let times: Vec<Duration> = match (&mut timer, rasterizer.processor_times()) {
+            (Some(timer), _) => timer.collect(gpu)?.iter().map(|stage| stage.time).collect(),
+            (None, times) => times.map_or_else(Vec::new, Vec::from),
+        };
         if run >= 2 {
             totals.push(total);
             for (list, stage) in stages.iter_mut().zip(times) {
-                list.push(stage.time);
+                list.push(stage);
             }
         }
     }

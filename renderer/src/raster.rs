@@ -1,5 +1,7 @@
 //! Forward splat rasteriser: what it draws and how it is called.
 
+use std::time::Duration;
+
 use flyrig_gpu::{GpuContext, GpuError, GpuTimer};
 use flyrig_types::Camera;
 use wgpu::CommandEncoder;
@@ -157,6 +159,16 @@ impl Rasterizer {
         match &self.on {
             RasterizerOn::Device(device) => device.latest,
             RasterizerOn::Processor(processor) => processor.latest(),
+        }
+    }
+
+    /// Run times of projection, depth sort, tile lists and blending of the latest picture on the processor. None for the
+    /// device: pass a timer to [`Self::encode_timed`] there.
+    #[must_use]
+    pub fn processor_times(&self) -> Option<[Duration; 4]> {
+        match &self.on {
+            RasterizerOn::Device(_) => None,
+            RasterizerOn::Processor(processor) => Some(processor.times()),
         }
     }
 

@@ -1,5 +1,7 @@
 //! Gaussians in depth order and the lists of the tiles: projection, radix sort, and counting sort by tile.
 
+use std::time::{Duration, Instant};
+
 use rayon::prelude::*;
 
 use super::project::{Projection, Rect, Splat, TILE};
@@ -43,14 +45,20 @@ pub(super) struct Lists {
     pub wanted_pairs: u32,
     /// Whether there was no room for all.
     pub overflowed: bool,
+    /// Run times of projection, sort and lists.
+    pub times: [Duration; 3],
 }
 
 impl Lists {
     /// Lists the Gaussians of a picture.
     pub fn fill(&mut self, projection: &Projection<'_>, gaussians: Attributes<'_>) {
+        let start = Instant::now();
         self.project(projection, gaussians);
+        let projected = Instant::now();
         self.sort();
+        let sorted = Instant::now();
         self.bin(projection.size, gaussians.center_scale.len());
+        self.times = [projected - start, sorted - projected, sorted.elapsed()];
     }
 
     fn project(&mut self, projection: &Projection<'_>, gaussians: Attributes<'_>) {

@@ -1,5 +1,7 @@
 //! Forward rasteriser.
 
+use std::time::{Duration, Instant};
+
 use flyrig_gpu::CameraConstants;
 use flyrig_types::Camera;
 use rayon::prelude::*;
@@ -18,6 +20,7 @@ pub(crate) struct ProcessorRasterizer {
     /// What was drawn last.
     pub(super) latest: Option<Drawn>,
     overflowed_pictures: u32,
+    blend_time: Duration,
 }
 
 /// What the derivative must know of a picture.
@@ -60,6 +63,7 @@ impl ProcessorRasterizer {
             target.depth.slice_mut().filter(|_| with_depth),
             target.canonical.slice_mut().filter(|_| with_canonical),
         );
+        let start = Instant::now();
         let row_of_tiles = (size[0] * TILE) as usize;
         // Rows of tiles; nothing where a picture is not asked for.
         let mut bands: Vec<Band<'_>> = (0..self.lists.tiles[1]).map(|_| Band::default()).collect();
@@ -90,6 +94,7 @@ impl ProcessorRasterizer {
                 band.write(&tile, size[0] as usize, column as usize * LANES);
             }
         });
+        self.blend_time = start.elapsed();
         let gaussians = gaussians.count();
         let settings = *settings;
         self.latest = Some(Drawn { camera: constants, size, gaussians, settings, first_tile, blended });
@@ -98,6 +103,11 @@ impl ProcessorRasterizer {
     pub(crate) fn latest(&self) -> Option<Latest> {
         let Drawn { size, gaussians, settings, blended, .. } = self.latest.as_ref()?;
         Some(Latest { gaussians: *gaussians, size: *size, blended: *blended, outputs: settings.outputs })
+    }
+
+    pub(crate) fn times(&self) -> [Duration; 4] {
+        let [project, sort, lists] = self.lists.times;
+        [project, sort, lists, self.blend_time]
     }
 
     pub(crate) fn stats(&self) -> RasterStats {
