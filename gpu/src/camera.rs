@@ -118,11 +118,24 @@ impl CameraConstants {
     #[must_use]
     #[inline]
     pub fn project(&self, in_camera: Vec3, near: f32) -> Option<Vec2> {
+        self.project_with_jacobian(in_camera, near).map(|(pixel, _)| pixel)
+    }
+
+    /// As [`Self::project`], with [`Self::projection_jacobian`].
+    #[must_use]
+    #[inline]
+    pub fn project_with_jacobian(&self, in_camera: Vec3, near: f32) -> Option<(Vec2, [Vec2; 3])> {
         // Each comparison is false for NaN.
-        let ideal = in_camera.truncate() / in_camera.z;
-        let is_valid =
-            in_camera.z > near && in_camera.z < 1e9 && ideal.length_squared() <= self.valid_radius * self.valid_radius;
-        is_valid.then(|| self.distort(ideal).point * Vec2::from(self.focal_px) + Vec2::from(self.center_px))
+        let inverse_z = 1.0 / in_camera.z;
+        let ideal = in_camera.truncate() * inverse_z;
+        let is_valid = in_camera.z > near
+            && in_camera.z < 1e9
+            && ideal.length_squared() <= self.valid_radius * self.valid_radius;
+        is_valid.then(|| {
+            let distorted = self.distort(ideal);
+            let pixel = distorted.point * Vec2::from(self.focal_px) + Vec2::from(self.center_px);
+            (pixel, self.jacobian_of(ideal, inverse_z, distorted.jacobian))
+        })
     }
 
     /// Derivative of the pixel by the point in camera axes (z > 0): columns d/dx, d/dy, d/dz.
@@ -131,7 +144,11 @@ impl CameraConstants {
     pub fn projection_jacobian(&self, in_camera: Vec3) -> [Vec2; 3] {
         let inverse_z = 1.0 / in_camera.z;
         let ideal = in_camera.truncate() * inverse_z;
-        let lens = self.distort(ideal).jacobian;
+        self.jacobian_of(ideal, inverse_z, self.distort(ideal).jacobian)
+    }
+
+    #[inline]
+    fn jacobian_of(&self, ideal: Vec2, inverse_z: f32, lens: Mat2) -> [Vec2; 3] {
         let focal = Vec2::from(self.focal_px) * inverse_z;
         let (dx, dy) = (lens.x_axis * focal, lens.y_axis * focal);
         [dx, dy, -(ideal.x * dx + ideal.y * dy)]

@@ -195,9 +195,9 @@ impl PoseEstimator {
         self.backgrounds.iter_mut().zip(backgrounds).for_each(|(own, new)| *own = new);
     }
 
-    /// Returns a camera's background to update it.
-    pub fn background_mut(&mut self, slot: usize) -> Option<&mut Background> {
-        self.backgrounds.get_mut(slot)?.as_mut()
+    /// Returns the backgrounds by slot, to update them.
+    pub fn backgrounds_mut(&mut self) -> &mut [Option<Background>] {
+        &mut self.backgrounds
     }
 
     /// Returns a camera's background, where it is known.

@@ -1,13 +1,14 @@
 //! People found in the images by the pose network.
 
-use std::{borrow::Cow, time::Duration};
+use std::{borrow::Cow, collections::BTreeMap, sync::Arc, time::Duration};
 
 use flyrig_body::{Template, skin_mesh};
 use flyrig_tracker::{
-    BodyGate, HandConfig, HandTracker, Matte, PoseConfig, PoseEstimate, PoseEstimator, PoseNet, ShapeFit, TrackError,
+    BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PoseConfig, PoseEstimate, PoseEstimator, PoseNet, ShapeFit, TrackError,
     ViewKeypoints, matte,
 };
-use flyrig_types::{FrameSet, Image, Mask, PersonId, Pose, Rig};
+use flyrig_types::{Frame, FrameSet, Image, Mask, PersonId, Pose, Rig};
+use rayon::prelude::*;
 
 use super::background::{BackgroundWatch, backgrounds, report};
 use super::colors::ClothesColors;
@@ -365,19 +366,43 @@ impl EstimatedPerception {
         if bodies.is_empty() || is_missing(first) || others.iter().any(is_missing) {
             return Ok(());
         }
+        let gates = |camera| bodies.iter().filter_map(move |(sides, points)| BodyGate::new(camera, points, sides)).collect();
+        let views = first.estimator.backgrounds_mut().par_iter_mut().zip(&self.rig.cameras).zip(&set.frames);
+        let events: Vec<Vec<BackgroundEvent>> = views
+            .map(|((background, camera), frame)| {
+                let (Some(background), Some(frame)) = (background, frame) else { return Ok(Vec::new()) };
+                let gates: Vec<BodyGate> = gates(camera);
+                background.update(&frame.image, &gates)
+            })
+            .collect::<Result<_, TrackError>>()?;
+        events.iter().zip(&self.rig.cameras).for_each(|(events, camera)| report(camera, events));
+        for other in others {
+            other.estimator.backgrounds_mut().clone_from_slice(first.estimator.backgrounds_mut());
+        }
+        Ok(())
+    }
+
+    /// Solves for coverage and colour along the outlines of all masks; by slot and place.
+    fn mattes(
+        &self,
+        set: &FrameSet,
+        seen: &[usize],
+        estimates: &mut [Result<PoseEstimate, String>],
+    ) -> Result<BTreeMap<(usize, usize), Matte>, FusionError> {
+        let mut masks = Vec::new();
         for (slot, frame) in set.present() {
-            let Some(camera) = self.rig.cameras.get(slot) else { continue };
-            let gates: Vec<BodyGate> =
-                bodies.iter().filter_map(|(triangles, vertices)| BodyGate::new(camera, vertices, triangles)).collect();
-            let Some(background) = first.estimator.background_mut(slot) else { continue };
-            report(camera, &background.update(&frame.image, &gates)?);
-            for other in others.iter_mut() {
-                if let Some(copy) = other.estimator.background_mut(slot) {
-                    copy.clone_from(background);
+            for &index in seen {
+                let Ok(estimate) = &mut estimates[index] else { continue };
+                if let Some(mask) = estimate.masks.get_mut(slot).and_then(Option::take) {
+                    masks.push(((slot, index), frame, mask));
                 }
             }
         }
-        Ok(())
+        let solve = |((slot, index), frame, mask): ((usize, usize), &Arc<Frame>, Mask)| {
+            let background = self.places[index].estimator.background(slot);
+            Ok(((slot, index), matte(&frame.image, &mask, background)?))
+        };
+        masks.into_par_iter().map(solve).collect()
     }
 
     /// The views of everybody, by place, then by present frame. Masks of several people are divided by their bodies.
@@ -398,6 +423,10 @@ impl EstimatedPerception {
                 meshes.push(PosedMesh { vertices, triangles: &template.triangles });
             }
         }
+        let mut mattes = match self.masks {
+            Origin::Given => BTreeMap::new(),
+            Origin::Estimated => stages.time("matte", || self.mattes(set, &seen, estimates))?,
+        };
         for (slot, frame) in set.present() {
             let mut own = Vec::new();
             for &index in &seen {
@@ -407,13 +436,8 @@ impl EstimatedPerception {
                 let confidence = if self.masks == Origin::Given { 1.0 } else { overlap };
                 let (mask, edge_colors) = match self.masks {
                     Origin::Given => (frame.mask.as_ref().map(Cow::Borrowed), Vec::new()),
-                    Origin::Estimated => match estimate.masks.get_mut(slot).and_then(Option::take) {
-                        Some(mask) => {
-                            let background = self.places[index].estimator.background(slot);
-                            let Matte { mask, colors } =
-                                stages.time("matte", || matte(&frame.image, &mask, background))?;
-                            (Some(Cow::Owned(mask)), colors)
-                        }
+                    Origin::Estimated => match mattes.remove(&(slot, index)) {
+                        Some(Matte { mask, colors }) => (Some(Cow::Owned(mask)), colors),
                         None => (None, Vec::new()),
                     },
                 };

@@ -79,8 +79,7 @@ impl Projection<'_> {
             return None;
         }
         let in_camera = self.camera.to_camera(world);
-        let pixel = self.camera.project(in_camera, self.settings.near_m)?;
-        let [dx, dy, dz] = self.camera.projection_jacobian(in_camera);
+        let (pixel, [dx, dy, dz]) = self.camera.project_with_jacobian(in_camera, self.settings.near_m)?;
         let row_x = Vec3::new(dx.x, dy.x, dz.x) * scale;
         let row_y = Vec3::new(dx.y, dy.y, dz.y) * scale;
         let (xx, xy, yy) = (row_x.dot(row_x), row_x.dot(row_y), row_y.dot(row_y));
