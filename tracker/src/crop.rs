@@ -17,14 +17,14 @@ pub(crate) struct Crop {
     pub center: DVec2,
     /// Side, pixels of the picture.
     pub side: f64,
-    /// Turn in radians: the crop's x axis in the picture is (cos, sin).
-    pub angle: f64,
+    /// The crop's x axis in the picture, a unit vector.
+    pub turn: DVec2,
 }
 
 impl Crop {
     /// An upright square.
     pub fn upright(center: DVec2, side: f64) -> Self {
-        Self { center, side, angle: 0.0 }
+        Self { center, side, turn: DVec2::X }
     }
 
     /// The crop for a person's landmarks: centred on the hips, turned hips-to-shoulders up, reaching a
@@ -39,8 +39,8 @@ impl Crop {
             return None;
         }
         // Seen from above or below the trunk has no direction in the picture.
-        let angle = if up.length() < 0.08 * reach { 0.0 } else { up.x.atan2(-up.y) };
-        Some(Self { center: hips, side: 2.0 * MARGIN * reach, angle })
+        let turn = if up.length() < 0.08 * reach { DVec2::X } else { up.perp().normalize() };
+        Some(Self { center: hips, side: 2.0 * MARGIN * reach, turn })
     }
 
     /// Pixels of the picture that one pixel of the network's crop takes.
@@ -56,12 +56,12 @@ impl Crop {
     /// The same for a network whose crop has another side, pixels.
     pub fn to_picture_from(self, crop_px: DVec2, net_side: usize) -> DVec2 {
         let offset = (crop_px + 0.5 - 0.5 * net_side as f64) * (self.side / net_side as f64);
-        self.center + DVec2::from_angle(self.angle).rotate(offset)
+        self.center + self.turn.rotate(offset)
     }
 
     /// Crop pixel of a picture pixel.
     pub fn crop_from_picture(self, picture_px: DVec2) -> DVec2 {
-        let offset = DVec2::from_angle(-self.angle).rotate(picture_px - self.center);
+        let offset = (self.turn * DVec2::new(1.0, -1.0)).rotate(picture_px - self.center);
         offset / self.scale() + 0.5 * NET_SIDE as f64 - 0.5
     }
 
@@ -76,13 +76,16 @@ impl Crop {
         let taps = ((self.side / net_side as f64).round() as usize).clamp(1, 4);
         let mut rgb = Vec::with_capacity(net_side * net_side * 3);
         let weight = 1.0 / (255.0 * (taps * taps) as f32);
+        let origin = self.to_picture_from(DVec2::ZERO, net_side);
+        let (right, down) =
+            (self.to_picture_from(DVec2::X, net_side) - origin, self.to_picture_from(DVec2::Y, net_side) - origin);
         for y in 0..net_side {
             for x in 0..net_side {
                 let mut sum = [0.0f32; 3];
                 for ty in 0..taps {
                     for tx in 0..taps {
                         let tap = |t: usize| (t as f64 + 0.5) / taps as f64 - 0.5;
-                        let at = self.to_picture_from(DVec2::new(x as f64 + tap(tx), y as f64 + tap(ty)), net_side);
+                        let at = origin + right * (x as f64 + tap(tx)) + down * (y as f64 + tap(ty));
                         let color = picture.bilinear(at);
                         for (s, c) in sum.iter_mut().zip(color) {
                             *s += c;

@@ -102,16 +102,22 @@ impl Grid {
         for (from, to) in self.values.chunks_exact(width).zip(across.values.chunks_exact_mut(width)) {
             running_mean(from, to, radius);
         }
+        // All columns at once, a row after the other.
         let mut out = across.clone();
-        let (mut column, mut mean) = (vec![0.0; height], vec![0.0; height]);
-        for x in 0..width {
-            for (y, value) in column.iter_mut().enumerate() {
-                *value = across.values[y * width + x];
+        let mut sums = vec![0.0f64; width];
+        let row = |y: usize| &across.values[y * width..(y + 1) * width];
+        for y in 0..radius.min(height) {
+            sums.iter_mut().zip(row(y)).for_each(|(sum, entering)| *sum += f64::from(*entering));
+        }
+        for (y, means) in out.values.chunks_exact_mut(width).enumerate() {
+            if y + radius < height {
+                sums.iter_mut().zip(row(y + radius)).for_each(|(sum, entering)| *sum += f64::from(*entering));
             }
-            running_mean(&column, &mut mean, radius);
-            for (y, value) in mean.iter().enumerate() {
-                out.values[y * width + x] = *value;
+            if y > radius {
+                sums.iter_mut().zip(row(y - radius - 1)).for_each(|(sum, leaving)| *sum -= f64::from(*leaving));
             }
+            let share = 1.0 / ((y + radius + 1).min(height) - y.saturating_sub(radius)) as f64;
+            means.iter_mut().zip(&sums).for_each(|(mean, sum)| *mean = (sum * share) as f32);
         }
         out
     }
@@ -153,6 +159,7 @@ impl Grid {
 
 fn running_mean(from: &[f32], to: &mut [f32], radius: usize) {
     let mut sum: f64 = from.iter().take(radius).map(|v| f64::from(*v)).sum();
+    let whole = 1.0 / (2 * radius + 1) as f64;
     for (i, out) in to.iter_mut().enumerate() {
         if let Some(entering) = from.get(i + radius) {
             sum += f64::from(*entering);
@@ -161,7 +168,8 @@ fn running_mean(from: &[f32], to: &mut [f32], radius: usize) {
             sum -= f64::from(from[i - radius - 1]);
         }
         let count = (i + radius + 1).min(from.len()) - i.saturating_sub(radius);
-        *out = (sum / count as f64) as f32;
+        let share = if count == 2 * radius + 1 { whole } else { 1.0 / count as f64 };
+        *out = (sum * share) as f32;
     }
 }
 

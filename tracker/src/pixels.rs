@@ -37,20 +37,29 @@ impl<'a> Rgb<'a> {
         if !(at.x > -1.0 && at.y > -1.0 && at.x < self.width as f64 && at.y < self.height as f64) {
             return [0.0; 3];
         }
-        let (x0, y0) = (at.x.floor(), at.y.floor());
-        let (fx, fy) = ((at.x - x0) as f32, (at.y - y0) as f32);
-        let fetch = |x: f64, y: f64| -> [f32; 3] {
-            if x < 0.0 || y < 0.0 || x >= self.width as f64 || y >= self.height as f64 {
-                return [0.0; 3];
-            }
-            self.pixel(x as usize, y as usize).map(f32::from)
+        // Positive where `as` rounds down: one more than the column and row of the upper left pixel.
+        let (right, below) = ((at.x + 1.0) as usize, (at.y + 1.0) as usize);
+        let (fx, fy) = ((at.x + 1.0 - right as f64) as f32, (at.y + 1.0 - below as f64) as f32);
+        let mix = |a: [f32; 3], b: [f32; 3], c: [f32; 3], d: [f32; 3]| {
+            std::array::from_fn(|k| {
+                let top = a[k] + (b[k] - a[k]) * fx;
+                let bottom = c[k] + (d[k] - c[k]) * fx;
+                top + (bottom - top) * fy
+            })
         };
-        let (a, b) = (fetch(x0, y0), fetch(x0 + 1.0, y0));
-        let (c, d) = (fetch(x0, y0 + 1.0), fetch(x0 + 1.0, y0 + 1.0));
-        std::array::from_fn(|k| {
-            let top = a[k] + (b[k] - a[k]) * fx;
-            let bottom = c[k] + (d[k] - c[k]) * fx;
-            top + (bottom - top) * fy
-        })
+        if right > 0 && below > 0 && right < self.width && below < self.height {
+            // Two pixels of two rows, all inside.
+            let row = |y: usize| self.bytes[(y * self.width + right - 1) * 3..].first_chunk::<6>();
+            if let (Some(top), Some(bottom)) = (row(below - 1), row(below)) {
+                let pixel = |row: &[u8; 6], at: usize| [row[at], row[at + 1], row[at + 2]].map(f32::from);
+                return mix(pixel(top, 0), pixel(top, 3), pixel(bottom, 0), pixel(bottom, 3));
+            }
+        }
+        let fetch = |dx: usize, dy: usize| -> [f32; 3] {
+            let (x, y) = (right + dx, below + dy);
+            let is_inside = x > 0 && y > 0 && x <= self.width && y <= self.height;
+            if is_inside { self.pixel(x - 1, y - 1).map(f32::from) } else { [0.0; 3] }
+        };
+        mix(fetch(0, 0), fetch(1, 0), fetch(0, 1), fetch(1, 1))
     }
 }

@@ -18,7 +18,7 @@ pub(crate) fn lift(
 ) -> Option<[Option<DVec3>; LANDMARK_COUNT]> {
     let view = View::new(camera);
     let seen = observe(camera, &view, &sighting.keypoints, confidence_threshold);
-    let turn = DVec2::from_angle(sighting.crop.angle);
+    let turn = sighting.crop.turn;
     let local: [DVec3; LANDMARK_COUNT] = std::array::from_fn(|i| {
         let [x, y, z] = sighting.output.landmarks[i].world;
         (turn.rotate(DVec2::new(x, y)) * scale).extend(z * scale)

@@ -66,9 +66,9 @@ fn inside(camera: &Camera, pixel: DVec2) -> bool {
     pixel.cmpgt(DVec2::ZERO).all() && pixel.cmplt(size).all()
 }
 
-/// Turn of a crop whose `up` points up.
-fn angle_of(up: DVec2) -> f64 {
-    up.x.atan2(-up.y)
+/// The x axis of a crop whose `up` points up.
+fn turn_of(up: DVec2) -> DVec2 {
+    up.perp().normalize_or(DVec2::X)
 }
 
 /// The crop around a hand whose landmarks are expected at world points. `length_px` is the hand's length in the picture.
@@ -79,14 +79,14 @@ pub(crate) fn hand_crop(camera: &Camera, points: &[DVec3; HAND_LANDMARKS], lengt
         *pixel = camera.project(*point).filter(|pixel| pixel.is_finite())?;
     }
     let up = pixels[9] - pixels[0];
-    let angle = if up.length() < 0.05 * length_px { 0.0 } else { angle_of(up) };
-    let turned = PALM.map(|i| DVec2::from_angle(-angle).rotate(pixels[i]));
+    let turn = if up.length() < 0.05 * length_px { DVec2::X } else { turn_of(up) };
+    let turned = PALM.map(|i| (turn * DVec2::new(1.0, -1.0)).rotate(pixels[i]));
     let low = turned.iter().copied().fold(DVec2::INFINITY, DVec2::min);
     let high = turned.iter().copied().fold(DVec2::NEG_INFINITY, DVec2::max);
     let size = high - low;
     let middle = 0.5 * (low + high) - DVec2::new(0.0, HAND_SHIFT * size.y);
     let side = (HAND_MARGIN * size.max_element()).max(LEAST_HANDS * length_px);
-    let crop = Crop { center: DVec2::from_angle(angle).rotate(middle), side, angle };
+    let crop = Crop { center: turn.rotate(middle), side, turn };
     (side.is_finite() && (4.0..1e4).contains(&side) && inside(camera, crop.center)).then_some(crop)
 }
 
@@ -116,7 +116,7 @@ impl FaceTarget {
         let up = eyes - mouth;
         let side = FACE_MARGIN * height_px;
         let usable = center.is_finite() && (4.0..1e4).contains(&side) && inside(camera, center) && up.length() > 0.5;
-        usable.then(|| Self { crop: Crop { center, side, angle: angle_of(up) }, height_px })
+        usable.then(|| Self { crop: Crop { center, side, turn: turn_of(up) }, height_px })
     }
 }
 
