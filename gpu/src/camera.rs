@@ -67,14 +67,14 @@ pub struct Distorted {
 impl CameraConstants {
     /// World to camera axes (x right, y down, z forward), metres.
     #[must_use]
-    #[inline]
+    #[inline(always)]
     pub fn to_camera(&self, world: Vec3) -> Vec3 {
         Mat4::from_cols_array_2d(&self.camera_from_world).transform_point3(world)
     }
 
     /// Distorts a point of the ideal image plane.
     #[must_use]
-    #[inline]
+    #[inline(always)]
     pub fn distort(&self, ideal: Vec2) -> Distorted {
         let Vec2 { x, y } = ideal;
         let r2 = ideal.length_squared();
@@ -116,14 +116,14 @@ impl CameraConstants {
     /// Pixel of a point in camera axes. None within `near` of the camera's plane or behind it, farther than 1e9 m, beyond the
     /// lens's valid radius, or for what is no number.
     #[must_use]
-    #[inline]
+    #[inline(always)]
     pub fn project(&self, in_camera: Vec3, near: f32) -> Option<Vec2> {
         self.project_with_jacobian(in_camera, near).map(|(pixel, _)| pixel)
     }
 
     /// As [`Self::project`], with [`Self::projection_jacobian`].
     #[must_use]
-    #[inline]
+    #[inline(always)]
     pub fn project_with_jacobian(&self, in_camera: Vec3, near: f32) -> Option<(Vec2, [Vec2; 3])> {
         // Each comparison is false for NaN.
         let inverse_z = 1.0 / in_camera.z;
@@ -140,14 +140,14 @@ impl CameraConstants {
 
     /// Derivative of the pixel by the point in camera axes (z > 0): columns d/dx, d/dy, d/dz.
     #[must_use]
-    #[inline]
+    #[inline(always)]
     pub fn projection_jacobian(&self, in_camera: Vec3) -> [Vec2; 3] {
         let inverse_z = 1.0 / in_camera.z;
         let ideal = in_camera.truncate() * inverse_z;
         self.jacobian_of(ideal, inverse_z, self.distort(ideal).jacobian)
     }
 
-    #[inline]
+    #[inline(always)]
     fn jacobian_of(&self, ideal: Vec2, inverse_z: f32, lens: Mat2) -> [Vec2; 3] {
         let focal = Vec2::from(self.focal_px) * inverse_z;
         let (dx, dy) = (lens.x_axis * focal, lens.y_axis * focal);
@@ -156,7 +156,7 @@ impl CameraConstants {
 
     /// Camera centre in the world, metres.
     #[must_use]
-    #[inline]
+    #[inline(always)]
     pub fn center(&self) -> Vec3 {
         Vec4::from(self.position).truncate()
     }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use tract_linalg::multithread::{Executor, multithread_tract_scope};
 use tract_onnx::prelude::*;
 
 use crate::{TrackError, TrackErrorKind};
@@ -45,7 +46,9 @@ impl LandmarkNet {
     pub fn run(&self, rgb: &[f32]) -> Result<NetOutputs, TrackError> {
         let failed = |error: TractError| self.failed(&format!("failed: {error:#}"));
         let input = Tensor::from_shape(&[1, self.side, self.side, 3], rgb).map_err(failed)?;
-        let outputs = self.model.run(tvec!(input.into())).map_err(failed)?;
+        // Three views on two cores: the last one's products are shared by both.
+        let run = || self.model.run(tvec!(input.into()));
+        let outputs = multithread_tract_scope(Executor::RayonGlobal, run).map_err(failed)?;
         Ok(NetOutputs { net: self.clone(), outputs })
     }
 

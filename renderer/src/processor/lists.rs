@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
 
+use super::lanes::vectorized;
 use super::project::{Projection, Rect, Splat, TILE};
 use crate::raster_buffers::pair_capacity;
 
@@ -69,16 +70,7 @@ impl Lists {
         let chunks = self.splats.par_chunks_mut(CHUNK).zip(self.rects.par_chunks_mut(CHUNK));
         chunks.zip(&mut self.visible).enumerate().for_each(|(chunk, ((splats, rects), visible))| {
             visible.clear();
-            for (offset, (splat, rect)) in splats.iter_mut().zip(rects).enumerate() {
-                let i = chunk * CHUNK + offset;
-                let Attributes { center_scale, normal, color, canonical } = gaussians;
-                let drawn = projection.splat(&center_scale[i], &normal[i], &color[i], &canonical[i]);
-                if let Some(drawn) = drawn {
-                    (*splat, *rect) = drawn;
-                    // The bits of positive floats sort as the floats do.
-                    visible.push([splat.depth.to_bits(), i as u32]);
-                }
-            }
+            vectorized(ProjectChunk { projection, gaussians, first: chunk * CHUNK, splats, rects, visible });
         });
     }
 
@@ -171,6 +163,35 @@ impl Lists {
     /// Positions in `pairs` of a tile's list.
     pub fn range(&self, tile: usize) -> std::ops::Range<usize> {
         self.starts[tile] as usize..self.starts[tile + 1] as usize
+    }
+}
+
+/// Projects the Gaussians from number `first` on.
+struct ProjectChunk<'a> {
+    projection: &'a Projection<'a>,
+    gaussians: Attributes<'a>,
+    first: usize,
+    splats: &'a mut [Splat],
+    rects: &'a mut [Rect],
+    visible: &'a mut Vec<[u32; 2]>,
+}
+
+impl pulp::NullaryFnOnce for ProjectChunk<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let Self { projection, gaussians, first, splats, rects, visible } = self;
+        let Attributes { center_scale, normal, color, canonical } = gaussians;
+        for (offset, (splat, rect)) in splats.iter_mut().zip(rects).enumerate() {
+            let i = first + offset;
+            let drawn = projection.splat(&center_scale[i], &normal[i], &color[i], &canonical[i]);
+            if let Some(drawn) = drawn {
+                (*splat, *rect) = drawn;
+                // The bits of positive floats sort as the floats do.
+                visible.push([splat.depth.to_bits(), i as u32]);
+            }
+        }
     }
 }
 

@@ -49,7 +49,7 @@ pub(super) struct Projection<'a> {
 impl Projection<'_> {
     /// The splat of a Gaussian and its tiles; None where it is not drawn. Elements as in
     /// [`GaussianBuffers`](crate::GaussianBuffers).
-    #[inline]
+    #[inline(always)]
     pub fn splat(
         &self,
         center: &[f32; 4],

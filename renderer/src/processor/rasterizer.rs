@@ -83,6 +83,11 @@ impl ProcessorRasterizer {
             let row = first_tile[1] + row as u32;
             for column in first_tile[0]..first_tile[0] + blended[0] {
                 let list = &lists.pairs[lists.range((row * lists.tiles[0] + column) as usize)];
+                let left = column as usize * LANES;
+                if list.is_empty() {
+                    band.clear(size[0] as usize, left);
+                    continue;
+                }
                 let tile = vectorized(BlendTile {
                     origin: [(column * TILE) as f32, (row * TILE) as f32],
                     list,
@@ -91,7 +96,7 @@ impl ProcessorRasterizer {
                     canonical: attributes.canonical,
                     outputs: settings.outputs,
                 });
-                band.write(&tile, size[0] as usize, column as usize * LANES);
+                band.write(&tile, size[0] as usize, left);
             }
         });
         self.blend_time = start.elapsed();
@@ -128,6 +133,14 @@ struct Band<'a> {
 }
 
 impl Band<'_> {
+    /// Clears a tile whose first pixel is in column `left`.
+    fn clear(&mut self, width: usize, left: usize) {
+        let columns = left..width.min(left + LANES);
+        self.color.chunks_mut(width).for_each(|pixels| pixels[columns.clone()].fill([0.0; 4]));
+        self.depth.chunks_mut(width).for_each(|pixels| pixels[columns.clone()].fill(0.0));
+        self.canonical.chunks_mut(width).for_each(|pixels| pixels[columns.clone()].fill([0.0; 4]));
+    }
+
     /// Writes a tile whose first pixel is in column `left`.
     fn write(&mut self, tile: &Tile, width: usize, left: usize) {
         let columns = LANES.min(width - left);
