@@ -128,9 +128,8 @@ impl CameraConstants {
         // Each comparison is false for NaN.
         let inverse_z = 1.0 / in_camera.z;
         let ideal = in_camera.truncate() * inverse_z;
-        let is_valid = in_camera.z > near
-            && in_camera.z < 1e9
-            && ideal.length_squared() <= self.valid_radius * self.valid_radius;
+        let is_valid =
+            in_camera.z > near && in_camera.z < 1e9 && ideal.length_squared() <= self.valid_radius * self.valid_radius;
         is_valid.then(|| {
             let distorted = self.distort(ideal);
             let pixel = distorted.point * Vec2::from(self.focal_px) + Vec2::from(self.center_px);

@@ -4,8 +4,8 @@ use std::{borrow::Cow, collections::BTreeMap, sync::Arc, time::Duration};
 
 use flyrig_body::{Template, skin_mesh};
 use flyrig_tracker::{
-    BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PoseConfig, PoseEstimate, PoseEstimator, PoseNet, ShapeFit, TrackError,
-    ViewKeypoints, matte,
+    BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PoseConfig, PoseEstimate, PoseEstimator, PoseNet,
+    ShapeFit, TrackError, ViewKeypoints, matte,
 };
 use flyrig_types::{Frame, FrameSet, Image, Mask, PersonId, Pose, Rig};
 use rayon::prelude::*;
@@ -366,7 +366,8 @@ impl EstimatedPerception {
         if bodies.is_empty() || is_missing(first) || others.iter().any(is_missing) {
             return Ok(());
         }
-        let gates = |camera| bodies.iter().filter_map(move |(sides, points)| BodyGate::new(camera, points, sides)).collect();
+        let gates =
+            |camera| bodies.iter().filter_map(move |(sides, points)| BodyGate::new(camera, points, sides)).collect();
         let views = first.estimator.backgrounds_mut().par_iter_mut().zip(&self.rig.cameras).zip(&set.frames);
         let events: Vec<Vec<BackgroundEvent>> = views
             .map(|((background, camera), frame)| {

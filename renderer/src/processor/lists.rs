@@ -23,17 +23,26 @@ pub(super) struct Attributes<'a> {
     pub canonical: &'a [[f32; 4]],
 }
 
+/// A Gaussian on its way through the sort. It takes its rectangle along: looked up by Gaussian, the rectangles cost more than
+/// all else in the lists.
+#[derive(Debug, Clone, Copy, Default)]
+struct Ranked {
+    /// Bits of the depth; those of positive floats sort as the floats do.
+    key: u32,
+    gaussian: u32,
+    rect: Rect,
+}
+
 /// What a picture is blended from. Its arrays are used again by the next picture.
 #[derive(Debug, Default)]
 pub(super) struct Lists {
     /// By Gaussian; old where it is not drawn.
     pub splats: Vec<Splat>,
-    rects: Vec<Rect>,
-    /// Drawn Gaussians of each chunk: bits of the depth, index.
-    visible: Vec<Vec<[u32; 2]>>,
+    /// Drawn Gaussians of each chunk.
+    visible: Vec<Vec<Ranked>>,
     /// All of them, nearest first.
-    order: Vec<[u32; 2]>,
-    scratch: Vec<[u32; 2]>,
+    order: Vec<Ranked>,
+    scratch: Vec<Ranked>,
     /// Columns and rows of tiles.
     pub tiles: [u32; 2],
     /// Where each tile's list begins in `pairs`, and the end.
@@ -65,12 +74,11 @@ impl Lists {
     fn project(&mut self, projection: &Projection<'_>, gaussians: Attributes<'_>) {
         let count = gaussians.center_scale.len();
         self.splats.resize(count, Splat::default());
-        self.rects.resize(count, Rect::default());
         self.visible.resize(count.div_ceil(CHUNK), Vec::new());
-        let chunks = self.splats.par_chunks_mut(CHUNK).zip(self.rects.par_chunks_mut(CHUNK));
-        chunks.zip(&mut self.visible).enumerate().for_each(|(chunk, ((splats, rects), visible))| {
+        let chunks = self.splats.par_chunks_mut(CHUNK).zip(&mut self.visible);
+        chunks.enumerate().for_each(|(chunk, (splats, visible))| {
             visible.clear();
-            vectorized(ProjectChunk { projection, gaussians, first: chunk * CHUNK, splats, rects, visible });
+            vectorized(ProjectChunk { projection, gaussians, first: chunk * CHUNK, splats, visible });
         });
     }
 
@@ -80,20 +88,20 @@ impl Lists {
         self.visible.iter().for_each(|visible| self.order.extend_from_slice(visible));
         self.visible_gaussians = self.order.len() as u32;
         let (low, high) =
-            self.order.iter().fold((u32::MAX, 0), |(low, high), [key, _]| (low.min(*key), high.max(*key)));
+            self.order.iter().fold((u32::MAX, 0u32), |(low, high), one| (low.min(one.key), high.max(one.key)));
         let range_bits = u32::BITS - high.saturating_sub(low).leading_zeros();
         let shift = range_bits.saturating_sub(DIGIT_BITS * PASSES);
-        self.scratch.resize(self.order.len(), [0; 2]);
+        self.scratch.resize(self.order.len(), Ranked::default());
         for pass in 0..PASSES {
             let digit = |key: u32| (((key - low) >> shift) >> (pass * DIGIT_BITS)) as usize & ((1 << DIGIT_BITS) - 1);
             let mut places = vec![0u32; 1 << DIGIT_BITS];
-            self.order.iter().for_each(|[key, _]| places[digit(*key)] += 1);
+            self.order.iter().for_each(|one| places[digit(one.key)] += 1);
             let mut end = 0;
             for place in &mut places {
                 end += std::mem::replace(place, end);
             }
             for one in &self.order {
-                let place = &mut places[digit(one[0])];
+                let place = &mut places[digit(one.key)];
                 self.scratch[*place as usize] = *one;
                 *place += 1;
             }
@@ -108,8 +116,8 @@ impl Lists {
         let capacity = pair_capacity(count, tiles as u64, u64::from(u32::MAX));
         let mut pairs = 0;
         let mut kept = self.order.len();
-        for (rank, [_, gaussian]) in self.order.iter().enumerate() {
-            let more = self.rects[*gaussian as usize].tiles();
+        for (rank, one) in self.order.iter().enumerate() {
+            let more = one.rect.tiles();
             if more > capacity - pairs {
                 kept = rank;
                 break;
@@ -125,11 +133,10 @@ impl Lists {
         let band_rows = rows.div_ceil(bands).max(1);
         self.starts.clear();
         self.starts.resize(tiles + 1, 0);
-        let rects = &self.rects;
         let counts = &mut self.starts[1..];
         counts.par_chunks_mut(band_rows * columns.max(1)).enumerate().for_each(|(band, counts)| {
-            for [_, gaussian] in order {
-                each_tile(&rects[*gaussian as usize], band * band_rows, band_rows, columns, |at| counts[at] += 1);
+            for one in order {
+                each_tile(&one.rect, band * band_rows, band_rows, columns, |at| counts[at] += 1);
             }
         });
         let mut end = 0;
@@ -151,9 +158,9 @@ impl Lists {
         }
         parts.into_par_iter().for_each(|(band, starts, first, part)| {
             let mut places: Vec<u32> = starts.iter().map(|start| start - first).collect();
-            for [_, gaussian] in order {
-                each_tile(&rects[*gaussian as usize], band * band_rows, band_rows, columns, |at| {
-                    part[places[at] as usize] = *gaussian;
+            for one in order {
+                each_tile(&one.rect, band * band_rows, band_rows, columns, |at| {
+                    part[places[at] as usize] = one.gaussian;
                     places[at] += 1;
                 });
             }
@@ -172,8 +179,7 @@ struct ProjectChunk<'a> {
     gaussians: Attributes<'a>,
     first: usize,
     splats: &'a mut [Splat],
-    rects: &'a mut [Rect],
-    visible: &'a mut Vec<[u32; 2]>,
+    visible: &'a mut Vec<Ranked>,
 }
 
 impl pulp::NullaryFnOnce for ProjectChunk<'_> {
@@ -181,15 +187,14 @@ impl pulp::NullaryFnOnce for ProjectChunk<'_> {
 
     #[inline(always)]
     fn call(self) {
-        let Self { projection, gaussians, first, splats, rects, visible } = self;
+        let Self { projection, gaussians, first, splats, visible } = self;
         let Attributes { center_scale, normal, color, canonical } = gaussians;
-        for (offset, (splat, rect)) in splats.iter_mut().zip(rects).enumerate() {
+        for (offset, splat) in splats.iter_mut().enumerate() {
             let i = first + offset;
             let drawn = projection.splat(&center_scale[i], &normal[i], &color[i], &canonical[i]);
-            if let Some(drawn) = drawn {
-                (*splat, *rect) = drawn;
-                // The bits of positive floats sort as the floats do.
-                visible.push([splat.depth.to_bits(), i as u32]);
+            if let Some((drawn, rect)) = drawn {
+                *splat = drawn;
+                visible.push(Ranked { key: drawn.depth.to_bits(), gaussian: i as u32, rect });
             }
         }
     }
