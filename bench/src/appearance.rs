@@ -71,7 +71,11 @@ pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
     }
     bar.finish_and_clear();
     print!("{}", table(&rows));
-    println!("\n{}; appearance.csv, appearance.json and appearance.svg in {}", gpu.adapter_name(), args.out.display());
+    println!(
+        "\n{}; appearance.csv, appearance.json and appearance.svg in {}",
+        gpu.fastest().adapter_name(),
+        args.out.display()
+    );
     Ok(())
 }
 

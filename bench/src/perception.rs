@@ -92,7 +92,7 @@ pub fn perception(args: &BenchPerceptionArgs, gpu: &GpuContext) -> Result<()> {
         }
     }
     print!("{}", table(&rows));
-    println!("{}; perception.md and perception.json in {}", gpu.adapter_name(), args.out.display());
+    println!("{}; perception.md and perception.json in {}", gpu.fastest().adapter_name(), args.out.display());
     Ok(())
 }
 

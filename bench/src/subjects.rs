@@ -109,7 +109,7 @@ pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
     }
     write_whole(&args.out.join("subjects.md"), table.as_bytes())?;
     print!("{table}");
-    println!("{}; subjects.md and views in {}", gpu.adapter_name(), args.out.display());
+    println!("{}; subjects.md and views in {}", gpu.fastest().adapter_name(), args.out.display());
     Ok(())
 }
 

@@ -33,7 +33,7 @@ pub fn track(args: &BenchTrackArgs, gpu: &GpuContext) -> Result<()> {
         };
         rows.push(run_case(gpu, &scene, &case)?);
         // After every case, so that a run that is stopped leaves what it has.
-        write::all(&args.out, &gpu.adapter_name(), &rows)?;
+        write::all(&args.out, &gpu.fastest().adapter_name(), &rows)?;
         sequence = Some(scene);
         bar.inc(1);
     }

@@ -76,7 +76,7 @@ struct Metrics {
 /// Runs the command.
 pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    eprintln!("demo: simulated rig on {}", gpu.adapter_name());
+    eprintln!("demo: simulated rig drawn by {}, people by {}", gpu.adapter_name(), gpu.fastest().adapter_name());
     let simulator = Arc::new(Mutex::new(Simulator::new(gpu, &sim_config(args)?)?));
 
     let publisher = Publisher::open(&TransportConfig {
@@ -106,7 +106,7 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     }
 
     let metrics = Metrics {
-        adapter: gpu.adapter_name(),
+        adapter: gpu.fastest().adapter_name(),
         seed: args.seed,
         gaussians: args.gaussians,
         frames: main.frames,

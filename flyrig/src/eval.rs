@@ -146,7 +146,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         appearance: args.appearance.mode,
         gaussians: args.body.gaussians,
         nodes: args.body.nodes,
-        adapter: gpu.adapter_name(),
+        adapter: replay.session.gpu().adapter_name(),
         frames: processed as usize,
         seconds,
         reference: sheet.reference(),

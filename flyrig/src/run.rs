@@ -95,7 +95,7 @@ fn capture_people(
     eprintln!(
         "run: rig '{}' on {}, {} cameras, listening on {} (Ctrl-C ends)",
         config.rig.name,
-        gpu.adapter_name(),
+        session.gpu().adapter_name(),
         session.rig().cameras.len(),
         publisher.endpoints().join(", ")
     );

@@ -95,12 +95,11 @@ impl SessionBuilder {
     }
 }
 
-/// The context of a session's kernels. Where the adapter is a processor in disguise, and nobody asked for it by name, they
-/// run on the processor itself, several times as fast.
+/// The context of a session's kernels. Networks on the adapter need the colours there.
 fn place_kernels(gpu: &GpuContext, settings: &SessionSettings) -> GpuContext {
     let networks_on_adapter =
         settings.appearance.mode.is_learned() && settings.appearance.networks_on == NetworksOn::Adapter;
-    if gpu.is_software() && !gpu.is_named() && !networks_on_adapter { gpu.on_processor() } else { gpu.clone() }
+    if networks_on_adapter { gpu.clone() } else { gpu.fastest() }
 }
 
 /// Finds nobody.

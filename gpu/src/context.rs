@@ -187,10 +187,12 @@ impl GpuContext {
         self.on_processor
     }
 
-    /// Whether the adapter was asked for by its name.
+    /// The same context with the kernels where they run fastest: [`Self::on_processor`] where the adapter is a processor in
+    /// disguise and nobody asked for it by its name, else on the adapter.
     #[must_use]
-    pub fn is_named(&self) -> bool {
-        matches!(self.choice, AdapterChoice::Named(_))
+    pub fn fastest(&self) -> Self {
+        let is_named = matches!(self.choice, AdapterChoice::Named(_));
+        if self.is_software() && !is_named { self.on_processor() } else { self.clone() }
     }
 
     /// Fails when the device was lost, ran out of memory or rejected a command.

@@ -24,11 +24,24 @@ use support::upload;
 const RUNS: usize = 15;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let gpu = GpuContext::new(&AdapterChoice::Best)?;
-    println!("{}; milliseconds, median of {RUNS} alternating runs", gpu.adapter_name());
+    let device = GpuContext::new(&AdapterChoice::Best)?;
+    let processor = device.on_processor();
     println!(
-        "{:>9} {:>7} {:>14} | {:>8} {:>8} {:>6} | {:>14} {:>20}",
-        "picture", "count", "pixels with", "forward", "backward", "ratio", "error to f64", "slope of true loss"
+        "{} and {}; milliseconds, median of {RUNS} alternating runs",
+        device.adapter_name(),
+        processor.adapter_name()
+    );
+    println!(
+        "{:>9} {:>9} {:>7} {:>14} | {:>8} {:>8} {:>6} | {:>14} {:>20}",
+        "kernels",
+        "picture",
+        "count",
+        "pixels with",
+        "forward",
+        "backward",
+        "ratio",
+        "error to f64",
+        "slope of true loss"
     );
     for (count, size, every) in [
         (115_000, 512, 1),
@@ -42,20 +55,23 @@ fn main() -> Result<(), Box<dyn Error>> {
         let scene = body(count)?;
         let view = camera(&scene, size, size, 0.5);
         let settings = RasterSettings { outputs: Outputs::COLOR, ..Default::default() };
-        let row = measure(&gpu, &scene, &view, &settings, every)?;
-        let name = match every {
-            0 => "no gradient".to_owned(),
-            1 => "all".to_owned(),
-            n => format!("rows 1/{n}"),
-        };
-        println!(
-            "{size:>4}x{size:<4} {count:>7} {name:>14} | {:8.2} {:8.2} {:6.2} | {:14.1e} {:>20}",
-            row.forward,
-            row.backward,
-            row.backward / row.forward,
-            row.error,
-            row.slope.map_or(String::new(), |(analytic, real)| format!("{real:.4} of {analytic:.4}"))
-        );
+        for gpu in [&device, &processor] {
+            let kernels = if gpu.is_on_processor() { "processor" } else { "adapter" };
+            let row = measure(gpu, &scene, &view, &settings, every)?;
+            let name = match every {
+                0 => "no gradient".to_owned(),
+                1 => "all".to_owned(),
+                n => format!("rows 1/{n}"),
+            };
+            println!(
+                "{kernels:>9} {size:>4}x{size:<4} {count:>7} {name:>14} | {:8.2} {:8.2} {:6.2} | {:14.1e} {:>20}",
+                row.forward,
+                row.backward,
+                row.backward / row.forward,
+                row.error,
+                row.slope.map_or(String::new(), |(analytic, real)| format!("{real:.4} of {analytic:.4}"))
+            );
+        }
     }
     Ok(())
 }
