@@ -94,6 +94,7 @@ pub fn coarsen(
         skin: kept.iter().map(|&i| surface.skin[i]).collect(),
         triangle: kept.iter().map(|&i| surface.triangle[i]).collect(),
         barycentric: kept.iter().map(|&i| surface.barycentric[i]).collect(),
+        depth_m: kept.iter().map(|&i| surface.depth_m[i]).collect(),
         positions,
         normals,
         scale_m,

@@ -34,7 +34,8 @@ impl GpuSkinner {
     pub fn new(gpu: &GpuContext, gaussians: &SurfaceGaussians, skeleton: &Skeleton) -> Result<Self, GpuError> {
         let rest: Vec<[f32; 4]> =
             gaussians.positions.iter().zip(&gaussians.scale_m).map(|(p, &scale)| [p.x, p.y, p.z, scale]).collect();
-        let normals: Vec<[f32; 4]> = gaussians.normals.iter().map(|n| [n.x, n.y, n.z, 0.0]).collect();
+        let normals: Vec<[f32; 4]> =
+            gaussians.normals.iter().zip(&gaussians.depth_m).map(|(n, &depth)| [n.x, n.y, n.z, depth]).collect();
         let pack = |a: u16, b: u16| u32::from(a) | u32::from(b) << 16;
         let joints: Vec<[u32; 2]> =
             gaussians.skin.iter().map(|s| [pack(s.joints[0], s.joints[1]), pack(s.joints[2], s.joints[3])]).collect();
@@ -57,7 +58,8 @@ impl GpuSkinner {
         self.count
     }
 
-    /// Records the kernel: writes world position and scale to `center_scale` and world normals to `normal`, one
+    /// Records the kernel: writes world position and scale to `center_scale`, world normals and
+    /// [`SurfaceGaussians::depth_m`] to `normal`, one
     /// element a Gaussian. `displacement` holds t_x, canonical metres; an element that is not finite counts as
     /// zero. The pose is uploaded among the encoder's commands: several poses may go into one encoder.
     ///
@@ -157,7 +159,7 @@ impl GpuSkinner {
             let turned = matrix.transform_vector3(Vec4::from(rest_normal[i]).truncate());
             let length_squared = turned.length_squared();
             let unit = if length_squared > 1e-20 { turned / length_squared.sqrt() } else { Vec3::ZERO };
-            *normal = unit.extend(0.0).to_array();
+            *normal = unit.extend(rest_normal[i][3]).to_array();
         });
     }
 }

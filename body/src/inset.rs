@@ -39,6 +39,7 @@ impl SurfaceGaussians {
             let wanted = DRAWN_BEYOND * self.scale_m[i];
             let by = wanted.min(0.9 * half);
             moved.positions[i] = self.positions[i] - self.normals[i] * by;
+            moved.depth_m[i] = self.depth_m[i] + by;
             moved.scale_m[i] = self.scale_m[i] * (by / wanted.max(1e-12)).clamp(LEAST_SCALE, 1.0);
         }
         moved
@@ -58,6 +59,7 @@ mod tests {
         for i in 0..surface.len() {
             let by = (surface.positions[i] - inset.positions[i]).dot(surface.normals[i]);
             assert!(by > 0.0 && by <= 1.7 * surface.scale_m[i] + 1e-6, "{i}: {by}");
+            assert!((by - inset.depth_m[i]).abs() < 1e-6 && surface.depth_m[i] == 0.0, "{i}: {by}");
             assert!(inset.scale_m[i] <= surface.scale_m[i] && inset.scale_m[i] >= 0.59 * surface.scale_m[i]);
             shrunk += usize::from(inset.scale_m[i] < surface.scale_m[i]);
         }

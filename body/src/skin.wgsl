@@ -6,6 +6,7 @@
 @group(0) @binding(0) var<storage, read> joint_rows: array<vec4f>;
 // Canonical position; w: scale.
 @group(0) @binding(1) var<storage, read> rest: array<vec4f>;
+// w: depth below the surface that is drawn.
 @group(0) @binding(2) var<storage, read> rest_normal: array<vec4f>;
 // Four joint indices of 16 bits.
 @group(0) @binding(3) var<storage, read> skin_joints: array<vec2u>;
@@ -66,5 +67,5 @@ fn skin(
     let n = rest_normal[i].xyz;
     let turned = vec3f(dot(x.xyz, n), dot(y.xyz, n), dot(z.xyz, n));
     let length_squared = dot(turned, turned);
-    normal[i] = vec4f(select(vec3f(), turned * inverseSqrt(length_squared), length_squared > 1e-20), 0.0);
+    normal[i] = vec4f(select(vec3f(), turned * inverseSqrt(length_squared), length_squared > 1e-20), rest_normal[i].w);
 }

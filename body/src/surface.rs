@@ -38,6 +38,8 @@ pub struct SurfaceGaussians {
     pub skin: Vec<SkinWeights>,
     /// Standard deviation, metres: 0.975 of the distance to the nearest neighbour on the same side of the body.
     pub scale_m: Vec<f32>,
+    /// How far the centre lies below the surface that is drawn, along the normal, metres; 0 as sampled ([`Self::inset`]).
+    pub depth_m: Vec<f32>,
     /// Triangle of the template, ascending.
     pub triangle: Vec<u32>,
     /// Weights of the triangle's corners, sum 1.
@@ -126,6 +128,7 @@ pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<Su
         parts: skin.iter().map(|s| part_of_joint[usize::from(s.joints[0])]).collect(),
         skin,
         scale_m,
+        depth_m: vec![0.0; kept.len()],
         triangle: kept.iter().map(|&i| candidates[i].0).collect(),
         barycentric: kept.iter().map(|&i| candidates[i].1).collect(),
         positions,

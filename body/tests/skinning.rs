@@ -124,7 +124,8 @@ fn gpu_skinning_agrees_with_the_reference() {
                 assert!(error < POSITION_TOLERANCE, "Gaussian {i}: {error} m");
                 assert_eq!(scale.to_bits(), gaussians.scale_m[i].to_bits());
                 let expected = skin_normal_f64(&matrices, &gaussians.skin[i], gaussians.normals[i].as_dvec3());
-                let [x, y, z, _] = run.normal[i];
+                let [x, y, z, depth] = run.normal[i];
+                assert!((depth - gaussians.depth_m[i]).abs() < 1e-9);
                 assert!(
                     (DVec3::new(x.into(), y.into(), z.into()) - expected).length() < NORMAL_TOLERANCE,
                     "normal {i}"

@@ -64,7 +64,7 @@ pub struct Observed {
     pub pictures: Vec<(u32, u32, Vec<u8>)>,
     /// World centre, metres; w: scale.
     pub center_scale: Vec<[f32; 4]>,
-    /// World normal; w unused.
+    /// World normal; w: depth below the drawn surface, metres.
     pub normal: Vec<[f32; 4]>,
 }
 

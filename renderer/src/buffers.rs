@@ -10,7 +10,7 @@ use crate::schema::{self, GaussianElement};
 pub struct GaussianBuffers {
     /// World position, metres; w: standard deviation of the isotropic Gaussian, metres.
     pub center_scale: StorageBuffer<GaussianElement>,
-    /// World unit normal of the surface; w unused.
+    /// World unit normal of the surface; w: how far the centre lies below the surface that is drawn, metres.
     pub normal: StorageBuffer<GaussianElement>,
     /// Linear RGB; w: opacity in 0..=1.
     pub color: StorageBuffer<GaussianElement>,

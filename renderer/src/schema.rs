@@ -30,9 +30,13 @@ pub const CENTER_SCALE: GaussianAttribute = GaussianAttribute {
     components: ["x", "y", "z", "scale"],
     unit: "metres",
 };
-/// World unit normal of the surface.
-pub const NORMAL: GaussianAttribute =
-    GaussianAttribute { name: "normal", label: "Gaussian normals", components: ["nx", "ny", "nz", ""], unit: "none" };
+/// World unit normal of the surface, and depth of the centre below the surface that is drawn.
+pub const NORMAL: GaussianAttribute = GaussianAttribute {
+    name: "normal",
+    label: "Gaussian normals",
+    components: ["nx", "ny", "nz", "depth"],
+    unit: "none; metres",
+};
 /// Linear colour, and opacity in 0..=1.
 pub const COLOR: GaussianAttribute = GaussianAttribute {
     name: "color",

@@ -22,7 +22,7 @@ const STEP_M: f64 = 1e-4;
 pub struct PosedGaussians<'a> {
     /// World position and standard deviation, metres.
     pub center_scale: &'a [[f32; 4]],
-    /// World unit normal; w unused.
+    /// World unit normal; w is not read.
     pub normal: &'a [[f32; 4]],
 }
 

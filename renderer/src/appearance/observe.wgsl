@@ -6,6 +6,7 @@
 // Canonical position times alpha; w: alpha.
 @group(0) @binding(3) var<storage, read> rendered_canonical: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read> center_scale: array<vec4<f32>>;
+// w: depth of the centre below the drawn surface.
 @group(0) @binding(5) var<storage, read> normals: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read> canonical: array<vec4<f32>>;
 // Sum of weight * linear RGB; w: sum of weights.
@@ -57,7 +58,8 @@ fn main(
     if i >= arrayLength(&seen) {
         return;
     }
-    let position = center_scale[i].xyz;
+    // The drawn surface lies above the centre (body/src/inset.rs): what a camera sees of the Gaussian is there.
+    let position = center_scale[i].xyz + normals[i].w * normals[i].xyz;
     let angle = angle_weight(normals[i].xyz, position - camera.position.xyz);
     if settings.view_weight == 0.0 && !(angle > 0.0) {
         return;

@@ -56,7 +56,7 @@ fn observe(
     let mut seen = Seen::default();
     let [k, min_mask] = [settings.occlusion_per_m, settings.min_mask].map(f64::from);
     let extra = if settings.space { 0.0 } else { 1e-3 };
-    let position = xyz(frame.center_scale[i]);
+    let position = xyz(frame.center_scale[i]) + f64::from(frame.normal[i][3]) * xyz(frame.normal[i]);
     for view in views {
         let Some(pixel) = view.camera.project(position) else { continue };
         let (width, height) = (view.camera.intrinsics.width, view.camera.intrinsics.height);

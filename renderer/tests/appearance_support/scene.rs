@@ -18,6 +18,9 @@ pub struct Person {
     pub body_count: usize,
 }
 
+/// How far the Gaussians lie below the surface that the cameras see, metres.
+pub const DEPTH_M: f32 = 0.004;
+
 /// The posed Gaussians of an instant.
 #[derive(Clone)]
 pub struct Frame {
@@ -86,6 +89,7 @@ pub fn person(gaussians: usize, nodes: usize) -> Person {
             parts: vec![Part::Torso; count],
             skin: vec![SkinWeights::default(); count],
             scale_m: vec![0.003; count],
+            depth_m: vec![0.0; count],
             triangle: vec![0; count],
             barycentric: vec![[1.0, 0.0, 0.0]; count],
         },
@@ -103,10 +107,13 @@ pub fn person(gaussians: usize, nodes: usize) -> Person {
 /// The person turned about the vertical, and shifted.
 pub fn frame(person: &Person, turn: f64) -> Frame {
     let world_from_canonical = Isometry::new(DQuat::from_rotation_y(turn), DVec3::new(0.1 * turn, -1.0, 0.05));
-    let place = |p: &Vec3| world_from_canonical.transform_point(p.as_dvec3()).as_vec3().extend(0.003).to_array();
-    let rotate = |n: &Vec3| (world_from_canonical.rotation * n.as_dvec3()).as_vec3().extend(0.0).to_array();
+    let place = |(p, n): (&Vec3, &Vec3)| {
+        let center = *p - *n * DEPTH_M;
+        world_from_canonical.transform_point(center.as_dvec3()).as_vec3().extend(0.003).to_array()
+    };
+    let rotate = |n: &Vec3| (world_from_canonical.rotation * n.as_dvec3()).as_vec3().extend(DEPTH_M).to_array();
     Frame {
-        center_scale: person.surface.positions.iter().map(place).collect(),
+        center_scale: person.surface.positions.iter().zip(&person.surface.normals).map(place).collect(),
         normal: person.surface.normals.iter().map(rotate).collect(),
         world_from_canonical,
     }
