@@ -70,7 +70,8 @@ impl<T: Pod> StorageBuffer<T> {
         self.content.as_ref().map(|content| content.read().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// The elements, to change them; None for an array on the device. Waits while somebody else holds the elements.
+    /// The elements, to change them; None for an array on the device. Waits while somebody else holds the elements: one thread
+    /// at a time records the kernels of an array.
     #[must_use]
     pub fn slice_mut(&self) -> Option<RwLockWriteGuard<'_, Vec<T>>> {
         self.content.as_ref().map(|content| content.write().unwrap_or_else(PoisonError::into_inner))

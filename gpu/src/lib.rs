@@ -1,5 +1,5 @@
-//! The GPU as flyrig sees it: one device and queue, errors with advice, typed buffers, the camera
-//! model in WGSL and stage timers. Any wgpu adapter will do, Mesa's software rasteriser included.
+//! The GPU as flyrig sees it: one device and queue, errors with advice, typed arrays on the device or in the processor's
+//! memory, the camera model in WGSL and in Rust, and stage timers. Any wgpu adapter will do.
 
 mod bind_groups;
 mod buffer;

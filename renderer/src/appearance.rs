@@ -2,7 +2,8 @@
 //!
 //! Four kernels, on the device without a round trip or on the processor (`appearance/processor.rs`):
 //!
-//! 1. **observe** (a thread a Gaussian, a dispatch a view): projects with the camera's own lens, samples the picture
+//! 1. **observe** (a thread a Gaussian, a dispatch a view): projects the point of the drawn surface above
+//!    the centre (w of the normals) with the camera's own lens, samples the picture
 //!    in linear light and weighs it by viewing angle and visibility in canonical space. Texels count by their mask
 //!    coverage, so the background never bleeds in, and the view's weight shrinks with the coverage left.
 //! 2. **gather** (a thread a graph node): visibility-weighted mean of the Gaussians around the node.

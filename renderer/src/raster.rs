@@ -154,7 +154,7 @@ impl Rasterizer {
         }
     }
 
-    /// What was recorded last; None before the first picture.
+    /// The picture that was recorded last; None before the first picture.
     pub(crate) fn latest(&self) -> Option<Latest> {
         match &self.on {
             RasterizerOn::Device(device) => device.latest,

@@ -12,7 +12,7 @@ use crate::{GaussianBuffers, linear_from_srgb};
 /// Gaussians that one task paints.
 const CHUNK: usize = 2048;
 
-/// What the views saw, an element a Gaussian.
+/// Observations of the views, an element a Gaussian.
 pub(super) struct Seen<'a> {
     /// Sum of weight times linear RGB; sum of weights.
     pub seen: &'a mut [[f32; 4]],
@@ -32,7 +32,7 @@ struct View<'a> {
     drawn: &'a [[f32; 4]],
 }
 
-/// What a view shows at a point.
+/// The images of a view at one pixel.
 struct Sample {
     pixel: Vec2,
     /// Linear RGB of the person's part.

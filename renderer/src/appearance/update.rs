@@ -24,7 +24,7 @@ pub struct DirectAppearance {
     device: Option<DeviceKernels>,
     graph: GraphBuffers,
     linear_from_srgb: StorageBuffer<f32>,
-    /// What each view alone saw; empty unless observations are kept.
+    /// Observations of each view alone; empty unless observations are kept.
     kept: Vec<StorageBuffer<[f32; 4]>>,
     /// Sum of weight times linear RGB, sum of weights.
     seen: StorageBuffer<[f32; 4]>,

@@ -127,7 +127,7 @@ struct Pixels<'a> {
     d_depth: &'a [[f32; 4]],
 }
 
-/// What the pixels of a tile bring in. A pixel that cannot matter starts opaque.
+/// Incoming derivatives of a tile's pixels. A pixel that cannot matter starts opaque.
 struct State {
     transmittance: TileLanes,
     color: [TileLanes; 3],
@@ -143,7 +143,7 @@ struct State {
 }
 
 impl Pixels<'_> {
-    /// What the tile's pixels bring in; None where no pixel matters.
+    /// Incoming derivatives of a tile; None where no pixel matters.
     fn state(&self, column: usize, row: usize) -> Option<State> {
         const ZERO: TileLanes = [[0.0; LANES]; ROWS];
         let mut state = State {

@@ -33,7 +33,7 @@ struct Ranked {
     rect: Rect,
 }
 
-/// What a picture is blended from. Its arrays are used again by the next picture.
+/// Splats and tile lists of one picture. Its arrays are used again by the next picture.
 #[derive(Debug, Default)]
 pub(super) struct Lists {
     /// By Gaussian; old where it is not drawn.

@@ -39,7 +39,7 @@ impl Rect {
     }
 }
 
-/// What a picture is projected with.
+/// Camera and settings of one picture.
 pub(super) struct Projection<'a> {
     pub camera: CameraConstants,
     pub size: [u32; 2],

@@ -17,13 +17,13 @@ use crate::{GaussianBuffers, Outputs, RasterSettings, RasterStats, RenderTarget}
 #[derive(Debug, Default)]
 pub(crate) struct ProcessorRasterizer {
     pub(super) lists: Lists,
-    /// What was drawn last.
+    /// The picture that was drawn last.
     pub(super) latest: Option<Drawn>,
     overflowed_pictures: u32,
     blend_time: Duration,
 }
 
-/// What the derivative must know of a picture.
+/// Parameters of a picture that its derivative needs.
 #[derive(Debug, Clone)]
 pub(crate) struct Drawn {
     pub camera: CameraConstants,
