@@ -7,10 +7,11 @@ use std::{collections::BTreeMap, time::Duration};
 
 use flyrig_capture::Pacing;
 use flyrig_fusion::{InputFormat, Intake, LiveRig, LiveViews, Outcome, OutputSettings, Session, resident_mib};
+use flyrig_gpu::testing::device;
 use flyrig_sync::SyncSettings;
 use flyrig_types::{FrameSet, PersonId};
 
-use support::{frame_set, gpu, images, played, session};
+use support::{frame_set, images, played, session};
 
 const RED: [u8; 3] = [220, 40, 30];
 const ME: PersonId = PersonId(0);
@@ -22,7 +23,7 @@ fn colors(session: &Session) -> Vec<[f32; 3]> {
 #[test]
 fn a_session_resumes_on_another_device_with_shape_and_colours() {
     let images = images(&[(0.0, RED)]);
-    let mut session = session(gpu().reopen().unwrap(), &[(0, 0.0)]);
+    let mut session = session(device(), &[(0, 0.0)]);
     for index in 0..4 {
         assert_eq!(session.process(&frame_set(index, &images)).unwrap(), Outcome::Updated);
     }
@@ -48,7 +49,7 @@ fn a_session_resumes_on_another_device_with_shape_and_colours() {
 #[test]
 fn a_session_without_a_snapshot_starts_afresh_on_another_device() {
     let images = images(&[(0.0, RED)]);
-    let mut session = session(gpu().reopen().unwrap(), &[(0, 0.0)]);
+    let mut session = session(device(), &[(0, 0.0)]);
     session.process(&frame_set(0, &images)).unwrap();
     session.gpu().simulate_loss();
     assert!(session.process(&frame_set(1, &images)).is_err());
@@ -63,7 +64,7 @@ fn a_live_rig_goes_on_by_itself_after_the_loss_of_its_device() {
     let images = images(&[(0.0, RED)]);
     let sets: Vec<FrameSet> = (0..8).map(|index| frame_set(index, &images)).collect();
     let intake = Intake::start(played(&sets), InputFormat::Rgb, &SyncSettings::default(), Pacing::Lossless).unwrap();
-    let session = session(gpu().reopen().unwrap(), &[(0, 0.0)]);
+    let session = session(device(), &[(0, 0.0)]);
     let mut rig = LiveRig::new(session, intake, LiveViews::new(&OutputSettings::default()), None);
     let mut outcomes = Vec::new();
     while !rig.intake.ended() {
@@ -84,7 +85,7 @@ fn a_live_rig_goes_on_by_itself_after_the_loss_of_its_device() {
 #[ignore = "a minute or more: make test-long"]
 fn a_hundred_losses_leave_the_memory_flat() {
     let images = images(&[(0.0, RED)]);
-    let mut session = session(gpu().reopen().unwrap(), &[(0, 0.0)]);
+    let mut session = session(device(), &[(0, 0.0)]);
     let (mut memory, mut seconds) = (Vec::new(), Vec::new());
     for loss in 0..100 {
         session.process(&frame_set(2 * loss, &images)).unwrap();

@@ -8,7 +8,7 @@ use flyrig_fusion::{
     BodySettings, DeformOptions, FrameSet, GivenPerception, Outcome, PersonId, Session, SessionBuilder,
     SessionSettings, TrackingSettings,
 };
-use flyrig_gpu::{AdapterChoice, GpuContext};
+use flyrig_gpu::{GpuContext, testing::device};
 use flyrig_renderer::{GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, rgba8_from_target};
 use flyrig_types::{Camera, Frame, Image, Intrinsics, Isometry, Lens, Mask, PixelFormat, Pose, PoseTrack, Rig};
 use glam::{DVec2, DVec3};
@@ -47,7 +47,7 @@ impl Scene {
         let template = default_template(&ShapeParams::default()).unwrap();
         let surface = sample_surface(&template, 4000, 2).unwrap();
         let cameras = azimuths.iter().map(|&azimuth| camera(azimuth, SIDE)).collect();
-        let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+        let gpu = device();
         Self { gpu, template, surface, rig: Rig { cameras, world_up: DVec3::Y }, shift }
     }
 
@@ -118,7 +118,7 @@ fn twenty_frames_create_no_gpu_object() {
     const WARM_UP: usize = 8;
     const FRAMES: usize = 20;
     let scene = Scene::new(&[0.1, 2.2, 4.4], |_| DVec3::ZERO);
-    let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+    let gpu = device();
     let mut session = scene.session(&gpu, WARM_UP + FRAMES);
     let built = gpu.objects();
     for frame in 0..WARM_UP {
@@ -141,7 +141,7 @@ fn a_person_who_walks_closer_compiles_nothing() {
     // From 5.5 m to 2 m before the cameras, and back.
     let walk = |frame: f64| DVec3::new(0.0, 0.0, -2.5 + 3.5 * (0.5 - 0.5 * (frame * 0.5).cos()));
     let scene = Scene::new(&[0.0, 0.3], walk);
-    let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+    let gpu = device();
     let mut session = scene.session(&gpu, 26);
     let built = gpu.objects();
     let mut halved = Vec::new();
