@@ -152,7 +152,9 @@ impl Background {
     /// Kind `Image` when the format cannot be read.
     pub fn mask(&self, image: &Image, gate: &BodyGate) -> Result<Option<Mask>, TrackError> {
         let picture = Rgb::new(image)?;
-        Ok(self.evidence(&picture, &|at| !gate.reaches_pixel(at)).and_then(|evidence| gated_mask(&evidence, gate)))
+        let light = self.light(&picture, &|at| !gate.reaches_pixel(at));
+        let evidence = light.and_then(|light| light.evidence(&picture, gate.bounds));
+        Ok(evidence.and_then(|evidence| gated_mask(&evidence, gate)))
     }
 
     /// Takes in a picture in which nobody stands but the bodies of `gates`: the background follows slow changes of the light
@@ -170,29 +172,6 @@ impl Background {
         }
     }
 
-    /// Returns per-pixel evidence for a foreground, 0..=1 with the border at one half; `None` for a picture of another size,
-    /// and while nothing is known. The exposure is measured where `is_background`.
-    pub(crate) fn evidence(&self, picture: &Rgb, is_background: &dyn Fn(usize) -> bool) -> Option<Grid> {
-        if (picture.width, picture.height) != (self.width, self.height) {
-            return None;
-        }
-        match &self.kind {
-            Kind::Key(key) => key.evidence(picture),
-            Kind::Plate(plate) => {
-                let mut evidence = plate_evidence(picture, &plate.values, &|at| plate.knows(at) && is_background(at))?;
-                let mut known = 0;
-                for (at, value) in evidence.values.iter_mut().enumerate() {
-                    if plate.knows(at) {
-                        known += 1;
-                    } else {
-                        *value = 0.5;
-                    }
-                }
-                (known > 0).then_some(evidence)
-            }
-        }
-    }
-
     /// Returns the background's light in a picture's exposure, which is measured where `is_background`; `None` for a picture
     /// of another size or without the screen.
     pub(crate) fn light<'a>(
@@ -204,7 +183,7 @@ impl Background {
             return None;
         }
         match &self.kind {
-            Kind::Key(key) => key.screen(picture).map(BackgroundLight::Screen),
+            Kind::Key(key) => key.screen(picture).map(|screen| BackgroundLight::Screen(key, screen)),
             Kind::Plate(plate) => {
                 let drift = Drift::new(picture, &plate.values, &|at| plate.knows(at) && is_background(at));
                 Some(BackgroundLight::Plate(plate, drift))
@@ -224,14 +203,36 @@ impl Background {
 /// The background in the exposure of a picture.
 pub(crate) enum BackgroundLight<'a> {
     Plate(&'a Plate, Drift),
-    Screen(Screen),
+    Screen(&'a KeyColor, Screen),
 }
 
 impl BackgroundLight<'_> {
+    /// Returns per-pixel evidence for a foreground inside of `bounds` (x0, y0, x1, y1, ends excluded) of the picture that this
+    /// was made for, 0..=1 with the border at one half; `None` while nothing is known there.
+    pub fn evidence(&self, picture: &Rgb, bounds: [usize; 4]) -> Option<Grid> {
+        let (plate, drift) = match self {
+            Self::Screen(key, screen) => return Some(key.evidence(picture, screen, bounds)),
+            Self::Plate(plate, drift) => (plate, drift),
+        };
+        let mut evidence = plate_evidence(picture, &plate.values, drift, bounds)?;
+        let mut known = 0;
+        let rows = evidence.values.chunks_exact_mut((bounds[2] - bounds[0]).max(1));
+        for (y, row) in (bounds[1]..).zip(rows) {
+            for (x, value) in (bounds[0]..).zip(row) {
+                if plate.knows(y * picture.width + x) {
+                    known += 1;
+                } else {
+                    *value = 0.5;
+                }
+            }
+        }
+        (known > 0).then_some(evidence)
+    }
+
     /// Returns the linear light of a pixel; `None` where the background is not known.
     pub fn at(&self, pixel: usize) -> Option<[f32; 3]> {
         match self {
-            Self::Screen(screen) => Some(screen.at(pixel)),
+            Self::Screen(_, screen) => Some(screen.at(pixel)),
             Self::Plate(plate, drift) => {
                 let light = |k: usize| crate::light::linear(drift.gain[k] * plate.values[3 * pixel + k]);
                 plate.knows(pixel).then(|| std::array::from_fn(light))
@@ -260,7 +261,7 @@ impl Plate {
             }
         }
         let drift = Drift::new(picture, &self.values, &|at| away[at] && self.knows(at));
-        let evidence = plate_evidence(picture, &self.values, &|at| away[at] && self.knows(at));
+        let evidence = plate_evidence(picture, &self.values, &drift, [0, 0, width, picture.height]);
         let Some(evidence) = evidence else { return events };
         let known = (0..away.len()).filter(|&at| away[at] && self.knows(at)).count();
         let differs = |at: usize| away[at] && self.knows(at) && evidence.values[at] >= 0.5;
@@ -407,8 +408,13 @@ mod tests {
         BodyGate::of_grid(&body, 60.0)
     }
 
+    fn evidence(background: &Background, now: &Image) -> Option<Grid> {
+        let picture = Rgb::new(now).unwrap();
+        background.light(&picture, &|_| true)?.evidence(&picture, [0, 0, SIDE, SIDE])
+    }
+
     fn wrong(background: &Background, now: &Image) -> usize {
-        let evidence = background.evidence(&Rgb::new(now).unwrap(), &|_| true).unwrap();
+        let evidence = evidence(background, now).unwrap();
         evidence.values.iter().filter(|v| **v > 0.5).count()
     }
 
@@ -423,7 +429,7 @@ mod tests {
         for seed in 10..30 {
             let now = picture(seed, dimmed);
             events.extend(background.update(&now, std::slice::from_ref(&gate)).unwrap());
-            if let Some(evidence) = background.evidence(&Rgb::new(&now).unwrap(), &|_| true) {
+            if let Some(evidence) = evidence(&background, &now) {
                 assert!(evidence.values.iter().all(|v| *v <= 0.5), "what is not known is no evidence");
             }
         }
@@ -456,7 +462,7 @@ mod tests {
         let moved = picture(2, |x, y| room(x - 5, y + 3));
         let events = background.update(&moved, &[gate()]).unwrap();
         assert_eq!(events, [BackgroundEvent::Shifted(5, -3)]);
-        assert!(background.evidence(&Rgb::new(&moved).unwrap(), &|_| true).is_none(), "the plate is not used");
+        assert!(evidence(&background, &moved).is_none(), "the plate is not used");
     }
 
     #[test]

@@ -21,7 +21,6 @@ impl Grid {
         let low = a.min(b).min(c);
         let high = a.max(b).max(c);
         let clamp = |v: f64, limit: usize| v.clamp(0.0, limit as f64) as usize;
-        let area = (b - a).perp_dot(c - a);
         for corner in [a, b, c] {
             if corner.x >= 0.0 && corner.y >= 0.0 {
                 let (x, y) = (corner.x as usize, corner.y as usize);
@@ -30,64 +29,48 @@ impl Grid {
                 }
             }
         }
+        let turned = if (b - a).perp_dot(c - a) < 0.0 { -1.0 } else { 1.0 };
+        let sides = [(a, (b - a) * turned), (b, (c - b) * turned), (c, (a - c) * turned)];
+        let columns = clamp(low.x.ceil(), self.width)..clamp(high.x.floor() + 1.0, self.width);
         for y in clamp(low.y.ceil(), self.height)..clamp(high.y.floor() + 1.0, self.height) {
-            for x in clamp(low.x.ceil(), self.width)..clamp(high.x.floor() + 1.0, self.width) {
-                let p = DVec2::new(x as f64, y as f64);
-                let sides = [(b - a).perp_dot(p - a), (c - b).perp_dot(p - b), (a - c).perp_dot(p - c)];
-                if sides.iter().all(|s| s * area >= 0.0) {
-                    self.values[y * self.width + x] = 1.0;
-                }
+            let from = sides.map(|(from, side)| side.x * (y as f64 - from.y) + side.y * from.x);
+            let inside = |x: usize| (0..3).all(|k| from[k] - sides[k].1.y * x as f64 >= 0.0);
+            let Some(first) = columns.clone().find(|x| inside(*x)) else { continue };
+            for x in (first..columns.end).take_while(|x| inside(*x)) {
+                self.values[y * self.width + x] = 1.0;
             }
         }
     }
 
     /// Chamfer distance in pixels (3-4 weights over 3) to the nearest pixel above one half.
     pub fn distance_to_set(&self) -> Self {
-        let far = (self.width + self.height) as f32 * 2.0;
-        let mut out = self.clone();
-        for value in &mut out.values {
-            *value = if *value > 0.5 { 0.0 } else { far };
-        }
         const SIDE: f32 = 1.0;
         const DIAGONAL: f32 = 4.0 / 3.0;
-        let (width, height) = (self.width, self.height);
-        for y in 0..height {
-            for x in 0..width {
-                let at = y * width + x;
-                let mut best = out.values[at];
-                if x > 0 {
-                    best = best.min(out.values[at - 1] + SIDE);
-                }
-                if y > 0 {
-                    best = best.min(out.values[at - width] + SIDE);
-                    if x > 0 {
-                        best = best.min(out.values[at - width - 1] + DIAGONAL);
-                    }
-                    if x + 1 < width {
-                        best = best.min(out.values[at - width + 1] + DIAGONAL);
-                    }
-                }
-                out.values[at] = best;
-            }
+        // Of a row to the one before it: no pixel waits for its neighbour, so that many are compared at once.
+        let across = |row: &mut [f32], before: &[f32]| {
+            row.iter_mut().zip(before).for_each(|(d, before)| *d = d.min(before + SIDE));
+            row.iter_mut().skip(1).zip(before).for_each(|(d, before)| *d = d.min(before + DIAGONAL));
+            row.iter_mut().zip(before.iter().skip(1)).for_each(|(d, before)| *d = d.min(before + DIAGONAL));
+        };
+        let along = |last: f32, d: &mut f32| {
+            *d = d.min(last + SIDE);
+            *d
+        };
+        let far = (self.width + self.height) as f32 * 2.0;
+        let start = |value: &f32| if *value > 0.5 { 0.0 } else { far };
+        let mut out = Self { values: self.values.iter().map(start).collect(), ..*self };
+        let width = self.width;
+        for y in 0..self.height {
+            let (above, rest) = out.values.split_at_mut(y * width);
+            let row = &mut rest[..width];
+            across(row, &above[above.len().saturating_sub(width)..]);
+            row.iter_mut().fold(far, along);
         }
-        for y in (0..height).rev() {
-            for x in (0..width).rev() {
-                let at = y * width + x;
-                let mut best = out.values[at];
-                if x + 1 < width {
-                    best = best.min(out.values[at + 1] + SIDE);
-                }
-                if y + 1 < height {
-                    best = best.min(out.values[at + width] + SIDE);
-                    if x + 1 < width {
-                        best = best.min(out.values[at + width + 1] + DIAGONAL);
-                    }
-                    if x > 0 {
-                        best = best.min(out.values[at + width - 1] + DIAGONAL);
-                    }
-                }
-                out.values[at] = best;
-            }
+        for y in (0..self.height).rev() {
+            let (rest, below) = out.values.split_at_mut((y + 1) * width);
+            let row = &mut rest[y * width..];
+            across(row, &below[..width.min(below.len())]);
+            row.iter_mut().rev().fold(far, along);
         }
         out
     }
@@ -321,6 +304,48 @@ mod tests {
         // Nothing set: far, not infinite. Corners outside do not matter.
         grid.fill_triangle(DVec2::splat(-50.0), DVec2::new(1e9, 3.0), DVec2::NAN);
         assert!(Grid::new(3, 3, 0.0).distance_to_set().values.iter().all(|d| d.is_finite()));
+    }
+
+    #[test]
+    fn distances_are_those_of_the_shortest_paths() {
+        for (width, height) in [(1, 1), (1, 9), (9, 1), (17, 12)] {
+            let value = |i: usize| if (i * 7919) % 23 == 3 { 1.0 } else { 0.2 };
+            let grid = Grid { width, height, values: (0..width * height).map(value).collect() };
+            // Paths of steps to neighbours, made shorter until none is.
+            let far = (width + height) as f64 * 2.0;
+            let mut plain: Vec<f64> = grid.values.iter().map(|v| if *v > 0.5 { 0.0 } else { far }).collect();
+            for _ in 0..width + height {
+                for at in 0..plain.len() {
+                    let (x, y) = (at % width, at / width);
+                    for v in y.saturating_sub(1)..(y + 2).min(height) {
+                        for u in x.saturating_sub(1)..(x + 2).min(width) {
+                            let step = if u != x && v != y { 4.0 / 3.0 } else { 1.0 };
+                            plain[at] = plain[at].min(plain[v * width + u] + step);
+                        }
+                    }
+                }
+            }
+            for (found, expected) in grid.distance_to_set().values.iter().zip(plain) {
+                assert!((f64::from(*found) - expected).abs() < 1e-4, "{width}x{height}: {found} {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_triangle_of_either_winding_holds_the_pixels_between_its_sides() {
+        let corners = [DVec2::new(2.3, 1.1), DVec2::new(16.8, 6.4), DVec2::new(5.5, 17.2)];
+        let cross = |a: DVec2, b: DVec2, p: DVec2| (b - a).perp_dot(p - a);
+        for [a, b, c] in [corners, [corners[1], corners[0], corners[2]]] {
+            let mut grid = Grid::new(20, 20, 0.0);
+            grid.fill_triangle(a, b, c);
+            for at in 0..400 {
+                let p = DVec2::new((at % 20) as f64, (at / 20) as f64);
+                let sides = [cross(a, b, p), cross(b, c, p), cross(c, a, p)];
+                let inside = sides.iter().all(|s| *s >= 0.0) || sides.iter().all(|s| *s <= 0.0);
+                let is_corner = corners.iter().any(|corner| corner.floor() == p);
+                assert_eq!(grid.values[at] > 0.5, inside || is_corner, "{p}");
+            }
+        }
     }
 
     #[test]

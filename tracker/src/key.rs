@@ -129,21 +129,22 @@ impl KeyColor {
         Some(Screen { share, strength, light, is_screen })
     }
 
-    /// Returns evidence for a foreground, 0..=1 with the border at one half; `None` without a screen of this colour.
-    pub(crate) fn evidence(&self, picture: &Rgb) -> Option<Grid> {
-        let screen = self.screen(picture)?;
-        let mut evidence = screen.share.clone();
+    /// Returns evidence for a foreground inside of `bounds` (x0, y0, x1, y1, ends excluded), 0..=1 with the border at one half.
+    pub(crate) fn evidence(&self, picture: &Rgb, screen: &Screen, [x0, y0, x1, y1]: [usize; 4]) -> Grid {
+        let mut evidence = Grid::new(x1 - x0, y1 - y0, 0.0);
         let key = dot(self.chroma, self.chroma).sqrt();
-        for (at, value) in evidence.values.iter_mut().enumerate() {
-            let share = *value;
-            let own = chroma(linear_of_bytes(picture.pixel(at % picture.width, at / picture.width)));
+        let pixels = (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y)));
+        for (value, (x, y)) in evidence.values.iter_mut().zip(pixels) {
+            let at = y * picture.width + x;
+            let share = screen.share.values[at];
+            let own = chroma(linear_of_bytes(picture.pixel(x, y)));
             let cosine = dot(own, self.chroma) / (key * dot(own, own).sqrt()).max(1e-6);
             *value = (1.0 - share).clamp(0.0, 1.0);
             if screen.is_screen[at] || share > SHADOW && cosine > SCREEN_COSINE {
                 *value = value.min(0.35);
             }
         }
-        Some(evidence)
+        evidence
     }
 
     /// Takes the screen's spill off the colours of a matte; leaves it as it is without a screen of this colour.
@@ -243,7 +244,8 @@ mod tests {
     #[test]
     fn a_disc_before_a_screen_of_uneven_light_is_found_and_its_shadow_is_not() {
         let image = scene();
-        let evidence = "green".parse::<KeyColor>().unwrap().evidence(&Rgb::new(&image).unwrap()).unwrap();
+        let (key, picture) = ("green".parse::<KeyColor>().unwrap(), Rgb::new(&image).unwrap());
+        let evidence = key.evidence(&picture, &key.screen(&picture).unwrap(), [0, 0, SIDE, SIDE]);
         let wrong = (0..SIDE * SIDE)
             .filter(|at| {
                 let inside = truth(at % SIDE, at / SIDE);
@@ -280,8 +282,8 @@ mod tests {
     fn without_a_screen_nothing_is_keyed() {
         let key: KeyColor = "blue".parse().unwrap();
         let black = picture(|_, _| [0.0; 3]);
-        assert!(key.evidence(&Rgb::new(&scene()).unwrap()).is_none(), "the screen is green");
-        assert!(key.evidence(&Rgb::new(&black).unwrap()).is_none());
+        assert!(key.screen(&Rgb::new(&scene()).unwrap()).is_none(), "the screen is green");
+        assert!(key.screen(&Rgb::new(&black).unwrap()).is_none());
         let mask = Mask::new(SIDE as u32, SIDE as u32, vec![255; SIDE * SIDE]).unwrap();
         let solved = matte(&black, &mask, Some(&background("blue"))).unwrap();
         assert_eq!(solved, Matte { mask, colors: Vec::new() });

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use tract_linalg::multithread::{Executor, multithread_tract_scope};
 use tract_onnx::prelude::*;
 
+use crate::upsample::replace_doublings;
 use crate::{TrackError, TrackErrorKind};
 
 /// A network that takes one square RGB crop.
@@ -34,7 +35,7 @@ impl LandmarkNet {
             .model_for_read(&mut bytes)
             .and_then(|model| model.with_input_fact(0, f32::fact(tvec!(1, length, length, 3)).into()))
             .and_then(InferenceModelExt::into_optimized)
-            .and_then(IntoRunnable::into_runnable)
+            .and_then(|mut model| replace_doublings(&mut model).and_then(|()| model.into_runnable()))
             .map_err(failed)?;
         Ok(Self { model, side, name })
     }

@@ -49,6 +49,7 @@ mod surface_marks;
 mod testing;
 mod texture;
 mod triangulate;
+mod upsample;
 mod view;
 
 pub use background::{Background, BackgroundEvent};

@@ -3,12 +3,19 @@
 use std::sync::LazyLock;
 
 /// Linear light of each sRGB byte, 0..=1.
-static LINEAR: LazyLock<[f32; 256]> = LazyLock::new(|| std::array::from_fn(|byte| linear(byte as f32)));
+static LINEAR: LazyLock<[f32; 256]> = LazyLock::new(|| std::array::from_fn(|byte| linear_of_byte(byte as f32)));
 
-/// Returns linear light, 0..=1, of an sRGB value, 0..=255.
-pub(crate) fn linear(srgb: f32) -> f32 {
-    let value = (srgb / 255.0).clamp(0.0, 1.0);
+fn linear_of_byte(byte: f32) -> f32 {
+    let value = byte / 255.0;
     if value <= 0.040_45 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
+}
+
+/// Returns linear light, 0..=1, of an sRGB value, 0..=255: that of the two bytes next to it, interpolated.
+pub(crate) fn linear(srgb: f32) -> f32 {
+    let value = srgb.clamp(0.0, 255.0);
+    let byte = (value as usize).min(254);
+    let (low, high) = (LINEAR[byte], LINEAR[byte + 1]);
+    low + (high - low) * (value - byte as f32)
 }
 
 /// Returns linear light of a pixel.
@@ -40,6 +47,16 @@ mod tests {
             assert_eq!(byte(linear_of_bytes([value; 3])[0]), value);
         }
         assert_eq!([byte(f32::NAN), byte(-1.0), byte(7.0)], [0, 0, 255]);
+    }
+
+    #[test]
+    fn between_bytes_the_curve_is_followed() {
+        for i in 0..=2550u16 {
+            let srgb = f32::from(i) * 0.1;
+            assert!((linear(srgb) - linear_of_byte(srgb)).abs() < 1e-5, "{srgb}");
+        }
+        assert!(linear(-5.0).abs() < 1e-6 && (linear(900.0) - 1.0).abs() < 1e-6);
+        assert!(linear(f32::NAN).is_nan());
     }
 
     #[test]

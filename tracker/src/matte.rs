@@ -140,22 +140,16 @@ impl<'a> Band<'a> {
         let mut sure_outside: Vec<bool> = band.outer.values.iter().map(|d| *d > BAND_PX).collect();
         if let Some(background) = background {
             let unmasked = |at: usize| mask.coverage()[at] == 0;
-            if let Some(evidence) = background.evidence(picture, &unmasked) {
-                for (at, sure) in sure_outside.iter_mut().enumerate() {
-                    *sure &= evidence.values[(y0 + at / width) * picture.width + x0 + at % width] < 0.5;
-                }
-                let mut local = Grid::new(width, height, 0.0);
-                for (at, value) in local.values.iter_mut().enumerate() {
-                    *value = evidence.values[(y0 + at / width) * picture.width + x0 + at % width];
-                }
-                for (at, value) in local.box_mean(1).values.iter().enumerate() {
+            let light = background.light(picture, &unmasked);
+            let evidence = light.as_ref().and_then(|light| light.evidence(picture, [x0, y0, x1, y1]));
+            if let Some((light, evidence)) = light.zip(evidence) {
+                sure_outside.iter_mut().zip(&evidence.values).for_each(|(sure, value)| *sure &= *value < 0.5);
+                for (at, value) in evidence.box_mean(1).values.iter().enumerate() {
                     let depth = band.inner.values[at];
                     band.empty[at] = depth > 0.0 && depth <= DEEP_PX && *value < LOOKS_EMPTY;
                     sure_inside[at] &= !band.empty[at] && *value > 0.5;
                 }
-                if let Some(light) = background.light(picture, &unmasked) {
-                    band.behind = band.local_background(&light, &sure_outside);
-                }
+                band.behind = band.local_background(&light, &sure_outside);
             }
         }
         band.nearest_inside = nearest(&sure_inside, width, height);
@@ -336,28 +330,32 @@ fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
 
 /// Returns for each pixel the index of the nearest one that is set, by the chamfer distance; [`NONE`] when none is.
 fn nearest(set: &[bool], width: usize, height: usize) -> Vec<u32> {
-    let mut labels: Vec<u32> = set.iter().enumerate().map(|(at, set)| if *set { at as u32 } else { NONE }).collect();
-    let mut distance: Vec<u32> = set.iter().map(|set| if *set { 0 } else { u32::MAX / 2 }).collect();
-    let (w, h) = (width as i64, height as i64);
-    let mut visit = |x: i64, y: i64, steps: [(i64, i64, u32); 4]| {
-        let at = (y * w + x) as usize;
-        for (dx, dy, cost) in steps {
-            let (u, v) = (x + dx, y + dy);
-            if u >= 0 && v >= 0 && u < w && v < h {
-                let from = (v * w + u) as usize;
-                if distance[from] + cost < distance[at] {
-                    (distance[at], labels[at]) = (distance[from] + cost, labels[from]);
-                }
-            }
-        }
+    const SIDE: u64 = 3 << 32;
+    const DIAGONAL: u64 = 4 << 32;
+    // The distance above the label: the smaller number is nearer.
+    const FAR: u64 = (1 << 62) | NONE as u64;
+    let start = |(at, set): (usize, &bool)| if *set { at as u64 } else { FAR };
+    let mut labels: Vec<u64> = set.iter().enumerate().map(start).collect();
+    let across = |row: &mut [u64], before: &[u64]| {
+        row.iter_mut().zip(before).for_each(|(at, before)| *at = (*at).min(before + SIDE));
+        row.iter_mut().skip(1).zip(before).for_each(|(at, before)| *at = (*at).min(before + DIAGONAL));
+        row.iter_mut().zip(before.iter().skip(1)).for_each(|(at, before)| *at = (*at).min(before + DIAGONAL));
     };
-    for y in 0..h {
-        (0..w).for_each(|x| visit(x, y, [(-1, 0, 3), (0, -1, 3), (-1, -1, 4), (1, -1, 4)]));
+    let along = |last: u64, at: &mut u64| {
+        *at = (*at).min(last + SIDE);
+        *at
+    };
+    for y in 0..height {
+        let (above, rest) = labels.split_at_mut(y * width);
+        across(&mut rest[..width], &above[above.len().saturating_sub(width)..]);
+        rest[..width].iter_mut().fold(FAR, along);
     }
-    for y in (0..h).rev() {
-        (0..w).rev().for_each(|x| visit(x, y, [(1, 0, 3), (0, 1, 3), (1, 1, 4), (-1, 1, 4)]));
+    for y in (0..height).rev() {
+        let (rest, below) = labels.split_at_mut((y + 1) * width);
+        across(&mut rest[y * width..], &below[..width.min(below.len())]);
+        rest[y * width..].iter_mut().rev().fold(FAR, along);
     }
-    labels
+    labels.into_iter().map(|at| at as u32).collect()
 }
 
 #[cfg(test)]
@@ -447,6 +445,21 @@ mod tests {
         let now = picture(|x, y| over(truth(x, y), SHIRT, wall(x, y)));
         let solved = matte(&now, &rough(), None).unwrap();
         assert!(error(&solved.mask) < 0.7 * error(&rough()), "{} {}", error(&rough()), error(&solved.mask));
+    }
+
+    #[test]
+    fn the_nearest_pixel_is_as_near_as_any() {
+        let (width, height) = (19, 13);
+        let set: Vec<bool> = (0..width * height).map(|i| (i * 7919) % 29 == 4).collect();
+        let distance = |a: usize, b: usize| {
+            let (dx, dy) = ((a % width).abs_diff(b % width), (a / width).abs_diff(b / width));
+            3 * dx.max(dy) + dx.min(dy)
+        };
+        for (at, label) in nearest(&set, width, height).into_iter().enumerate() {
+            let least = (0..set.len()).filter(|&other| set[other]).map(|other| distance(at, other)).min();
+            assert!(set[label as usize] && Some(distance(at, label as usize)) == least, "{at}: {label}");
+        }
+        assert!(nearest(&[false; 12], 4, 3).iter().all(|label| *label == NONE));
     }
 
     #[test]

@@ -51,24 +51,20 @@ pub fn mask_from_plate(image: &Image, plate: &Image, gate: &BodyGate) -> Result<
             ));
         }
     }
-    let evidence = plate_evidence(&picture, &floats(&plate), &|at| !gate.reaches_pixel(at));
+    let plate = floats(&plate);
+    let drift = Drift::new(&picture, &plate, &|at| !gate.reaches_pixel(at));
+    let evidence = plate_evidence(&picture, &plate, &drift, gate.bounds);
     Ok(evidence.and_then(|evidence| gated_mask(&evidence, gate)))
 }
 
-/// Returns the mask that evidence ([`plate_evidence`], of the whole picture) and the body give together.
+/// Returns the mask that evidence ([`plate_evidence`], in the gate's bounds) and the body give together.
 pub(crate) fn gated_mask(evidence: &Grid, gate: &BodyGate) -> Option<Mask> {
-    let [x0, y0, x1, y1] = gate.bounds;
-    if x1 > evidence.width || y1 > evidence.height {
+    let ([x0, y0, ..], [width, height]) = (gate.bounds, gate.image);
+    if (evidence.width, evidence.height) != (gate.distance.width, gate.distance.height) {
         return None;
     }
-    let (width, height) = (x1 - x0, y1 - y0);
-    let mut inner = Grid::new(width, height, 0.0);
-    for (y, row) in inner.values.chunks_exact_mut(width).enumerate() {
-        let start = (y + y0) * evidence.width + x0;
-        row.copy_from_slice(&evidence.values[start..start + width]);
-    }
     // A vote among neighbours removes specks and closes pinholes.
-    let mut voted = inner.box_mean(1);
+    let mut voted = evidence.box_mean(1);
     let mut outside = gate.distance.clone();
     outside.values.iter_mut().for_each(|d| *d = f32::from(*d > 0.0));
     let depth = outside.distance_to_set();
@@ -82,11 +78,11 @@ pub(crate) fn gated_mask(evidence: &Grid, gate: &BodyGate) -> Option<Mask> {
         *value = if *distance >= 1.0 { 0.0 } else { ((*value + prior - 0.5) * 2.0 + 0.5).clamp(0.0, 1.0) };
     }
     clean(&mut voted, (0.02 * gate.px_per_m).round().max(2.0) as usize);
-    let least = (evidence.width * evidence.height / 5000).max(12);
+    let least = (width * height / 5000).max(12);
     if voted.values.iter().filter(|v| **v >= 0.5).count() < least {
         return None;
     }
-    voted.paste(evidence.width, evidence.height, x0, y0)
+    voted.paste(width, height, x0, y0)
 }
 
 /// Returns a picture's bytes as numbers.
@@ -129,16 +125,19 @@ impl Drift {
     }
 }
 
-/// Returns per-pixel evidence for a foreground, 0..=1 with the border at one half; `None` when the sizes differ. `plate` holds
-/// sRGB values, three a pixel; the exposure is measured where `is_background`.
-pub(crate) fn plate_evidence(picture: &Rgb, plate: &[f32], is_background: &dyn Fn(usize) -> bool) -> Option<Grid> {
-    let (width, height) = (picture.width, picture.height);
-    if plate.len() != picture.bytes.len() {
+/// Returns per-pixel evidence for a foreground inside of `bounds` (x0, y0, x1, y1, ends excluded), 0..=1 with the border at one
+/// half; `None` when the sizes differ. `plate` holds sRGB values, three a pixel.
+pub(crate) fn plate_evidence(picture: &Rgb, plate: &[f32], drift: &Drift, bounds: [usize; 4]) -> Option<Grid> {
+    let [x0, y0, x1, y1] = bounds;
+    if plate.len() != picture.bytes.len() || x1 > picture.width || y1 > picture.height {
         return None;
     }
-    let Drift { gain, noise } = Drift::new(picture, plate, is_background);
-    let mut grid = Grid::new(width, height, 0.0);
-    let pairs = picture.bytes.chunks_exact(3).zip(plate.chunks_exact(3));
+    let Drift { gain, noise } = *drift;
+    let mut grid = Grid::new(x1 - x0, y1 - y0, 0.0);
+    let pairs = (y0..y1).flat_map(|y| {
+        let row = 3 * (y * picture.width + x0)..3 * (y * picture.width + x1);
+        picture.bytes[row.clone()].chunks_exact(3).zip(plate[row].chunks_exact(3))
+    });
     for (value, (now, plate)) in grid.values.iter_mut().zip(pairs) {
         // A dark plate has no colour to speak of: lift it so that the split stays sound.
         let plate: [f32; 3] = std::array::from_fn(|k| gain[k] * plate[k] + 4.0);

@@ -172,7 +172,8 @@ impl ViewSearch {
         let Some(picture) = &scene.pictures[slot] else { return Ok(()) };
         let taken: Vec<_> = scene.taken.iter().map(|marks| project_all(&scene.cameras[slot], marks)).collect();
         let background = scene.backgrounds.get(slot).and_then(Option::as_ref);
-        let evidence = background.and_then(|background| background.evidence(picture, &|_| true));
+        let light = background.and_then(|background| background.light(picture, &|_| true));
+        let evidence = light.and_then(|light| light.evidence(picture, [0, 0, picture.width, picture.height]));
         for crop in evidence.map(|evidence| foreground_crops(&evidence, &taken)).unwrap_or_default() {
             self.try_crop(scene.net, scene.config, picture, crop, &taken, scene.nanos)?;
         }

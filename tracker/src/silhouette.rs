@@ -143,7 +143,7 @@ pub(crate) fn coarse_mask(sighting: &Sighting, bounds: [usize; 4]) -> Grid {
 /// The network's probability is joined with a colour model of person and surroundings (histograms of this
 /// picture's own sure regions) and the distance to the fitted body, then smoothed along the picture's edges
 /// by a guided filter (He et al. 2010), so that the outline snaps to them.
-/// Evidence from an empty plate ([`crate::mask_from_plate`]'s) counts as well where there is one: it sees
+/// Evidence from an empty plate in the gate's bounds counts as well where there is one: it sees
 /// thin parts that the coarse mask misses, and the coarse mask sees what has the background's colour.
 pub(crate) fn refine(
     picture: &Rgb,
@@ -190,7 +190,7 @@ pub(crate) fn refine(
                 0.0
             };
             let near = 1.0 - 4.0 * d.min(1.0);
-            let plate = plate_evidence.map_or(0.0, |e| PLATE_LOGIT * (e.values[(y + y0) * e.width + x + x0] - 0.5));
+            let plate = plate_evidence.map_or(0.0, |e| PLATE_LOGIT * (e.values[at] - 0.5));
             let logit = (p / (1.0 - p)).ln() + 0.6 * color + near + plate;
             probability.values[at] = 1.0 / (1.0 + (-logit).exp());
         }

@@ -18,8 +18,8 @@ impl PoseEstimator {
                 let gate = BodyGate::new(camera, &vertices, &self.template.triangles).ok_or(NoMask::OutOfView)?;
                 let look = fitted.looks[slot].as_ref();
                 let look = look.filter(|l| l.sighting.output.presence >= self.config.presence_threshold);
-                let evidence =
-                    self.background(slot).and_then(|known| known.evidence(picture, &|at| !gate.reaches_pixel(at)));
+                let light = self.background(slot).and_then(|known| known.light(picture, &|at| !gate.reaches_pixel(at)));
+                let evidence = light.and_then(|light| light.evidence(picture, gate.bounds));
                 let mask = match (look, &evidence) {
                     (Some(look), evidence) => {
                         let coarse = match &look.body {
