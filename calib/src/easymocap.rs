@@ -233,18 +233,8 @@ pub fn save_easymocap(dir: &Path, rig: &Rig) -> Result<(), CalibError> {
         file.strings("names", rig.cameras.iter().map(|camera| camera.id.as_str()))?;
     }
     for camera in &rig.cameras {
-        let (id, i) = (&camera.id, &camera.intrinsics);
-        let Lens::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] } = i.lens else {
-            return Err(CalibError::FisheyeUnsupported { camera: id.clone() });
-        };
-        intri.matrix(
-            &format!("K_{id}"),
-            3,
-            &[i.focal_px.x, 0.0, i.center_px.x, 0.0, i.focal_px.y, i.center_px.y, 0.0, 0.0, 1.0],
-        );
-        intri.matrix(&format!("dist_{id}"), 5, &[k1, k2, p1, p2, k3]);
-        intri.integer(&format!("H_{id}"), i.height);
-        intri.integer(&format!("W_{id}"), i.width);
+        let id = &camera.id;
+        write_intrinsics(&mut intri, id, &camera.intrinsics)?;
         let rotation = camera.camera_from_world.rotation;
         extri.matrix(&format!("R_{id}"), 1, &rotation.to_scaled_axis().to_array());
         extri.matrix(&format!("Rot_{id}"), 3, &DMat3::from_quat(rotation).transpose().to_cols_array());
@@ -252,4 +242,48 @@ pub fn save_easymocap(dir: &Path, rig: &Rig) -> Result<(), CalibError> {
     }
     intri.finish()?;
     extri.finish()
+}
+
+fn write_intrinsics(intri: &mut YamlWriter, id: &CameraId, i: &Intrinsics) -> Result<(), CalibError> {
+    let Lens::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] } = i.lens else {
+        return Err(CalibError::FisheyeUnsupported { camera: id.clone() });
+    };
+    let k = [i.focal_px.x, 0.0, i.center_px.x, 0.0, i.focal_px.y, i.center_px.y, 0.0, 0.0, 1.0];
+    intri.matrix(&format!("K_{id}"), 3, &k);
+    intri.matrix(&format!("dist_{id}"), 5, &[k1, k2, p1, p2, k3]);
+    intri.integer(&format!("H_{id}"), i.height);
+    intri.integer(&format!("W_{id}"), i.width);
+    Ok(())
+}
+
+/// Writes lenses as `intri.yml`, for cameras whose poses are not known yet.
+///
+/// # Errors
+/// As [`save_easymocap`].
+pub fn save_lenses(dir: &Path, lenses: &[(CameraId, Intrinsics)]) -> Result<(), CalibError> {
+    let posed = |(id, intrinsics): &(CameraId, Intrinsics)| Camera {
+        id: id.clone(),
+        intrinsics: *intrinsics,
+        camera_from_world: Isometry::IDENTITY,
+    };
+    validate(&Rig { cameras: lenses.iter().map(posed).collect(), world_up: DVec3::Z }, dir)?;
+    let mut intri = YamlWriter::new(dir.join(INTRINSICS));
+    intri.strings("names", lenses.iter().map(|(id, _)| id.as_str()))?;
+    for (id, intrinsics) in lenses {
+        write_intrinsics(&mut intri, id, intrinsics)?;
+    }
+    intri.finish()
+}
+
+/// Reads the lenses of a folder's `intri.yml`; `picture_size` as in [`load_easymocap`].
+///
+/// # Errors
+/// As [`load_easymocap`].
+pub fn load_lenses(
+    dir: &Path,
+    picture_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>,
+) -> Result<Vec<(CameraId, Intrinsics)>, CalibError> {
+    let intri = YamlFile::open(dir.join(INTRINSICS))?;
+    let names = camera_names(&intri, "K_", "K_<camera>")?;
+    names.into_iter().map(|id| Ok((id.clone(), read_intrinsics(&intri, &id, picture_size(&id))?))).collect()
 }

@@ -109,6 +109,47 @@ pub enum CalibError {
         /// What is wrong.
         source: CameraError,
     },
+    /// A description of a board that is of no use.
+    #[error("{}: {reason}", path.display())]
+    Board {
+        /// Which file.
+        path: PathBuf,
+        /// What is wrong, and the mend.
+        reason: String,
+    },
+    /// Too few views of the board to know a lens.
+    #[error(
+        "camera {camera}: the board is seen in {found} images, {different} of them different; show it in at least {needed} poses, \
+         near and far, tilted, in all corners of the image"
+    )]
+    TooFewViews {
+        /// Which camera.
+        camera: CameraId,
+        /// Images with the board.
+        found: usize,
+        /// Of them, those that differ.
+        different: usize,
+        /// How many are needed.
+        needed: usize,
+    },
+    /// The boards do not fix the lens.
+    #[error(
+        "camera {camera}: the views leave the focal length open; tilt the board by 30 to 45 degrees, and check columns, rows \
+         and dictionary of board.toml"
+    )]
+    LensOpen {
+        /// Which camera.
+        camera: CameraId,
+    },
+    /// Cameras that no board joins.
+    #[error("no board joins the groups of cameras {groups}; show it between them, seen by a camera of each at once")]
+    NotLinked {
+        /// The groups.
+        groups: String,
+    },
+    /// The boards do not fix the rig.
+    #[error("the boards do not fix the cameras' poses; show the board in more places and tilts")]
+    RigOpen,
     /// The format has no place for this lens.
     #[error("camera {camera}: a fisheye lens cannot be written in EasyMocap's format")]
     FisheyeUnsupported {

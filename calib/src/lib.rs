@@ -1,10 +1,28 @@
-//! Where the cameras are: calibration files.
+//! Where the cameras are: calibration from boards, and calibration files.
 //!
 //! Conventions are those of `flyrig_types`: OpenCV camera axes, pixel centres at integers, metres.
 
+mod adjust;
+mod board;
+mod bundle;
+mod detect;
 mod easymocap;
 mod error;
+mod homography;
+mod lens;
+mod print;
+mod projection;
+mod rig;
+mod start;
 mod yaml;
 
-pub use easymocap::{load_easymocap, save_easymocap};
+pub use board::{Board, Pattern};
+pub use bundle::{BoardView, Shot};
+pub use detect::{BoardDetector, GrayImage, SeenCorner, detector};
+pub use easymocap::{load_easymocap, load_lenses, save_easymocap, save_lenses};
 pub use error::CalibError;
+pub use lens::{LensFit, calibrate_lens, coverage};
+pub use print::BoardSheet;
+pub use projection::LensModel;
+pub use rig::{RigCamera, RigFit, RigOptions, calibrate_rig};
+pub use start::Pair;

@@ -1,0 +1,241 @@
+//! Bundle adjustment of cameras, lenses, time offsets and boards.
+
+use flyrig_solve::{BlockProblem, Kernel, Residual, RigidMotion};
+use flyrig_types::Intrinsics;
+use glam::{DMat3, DVec2, DVec3};
+use nalgebra::{DMatrix, DVector};
+
+use crate::{
+    LensModel, SeenCorner,
+    projection::{project, project_with_derivatives},
+};
+
+/// Beyond so many standard deviations a corner loses weight.
+const KERNEL: Kernel = Kernel::Cauchy(3.0);
+
+/// A board in the image of one camera.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BoardView {
+    /// Slot of the camera.
+    pub camera: usize,
+    /// Time stamp of the image, nanoseconds.
+    pub nanos: i64,
+    /// The corners that are seen.
+    pub corners: Vec<SeenCorner>,
+}
+
+/// A board that several cameras saw at about the same time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Shot {
+    /// Time of the shot, nanoseconds.
+    pub nanos: i64,
+    /// At most one view of each camera.
+    pub views: Vec<BoardView>,
+}
+
+/// One camera of an estimate.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct SolvedCamera {
+    pub camera_from_rig: RigidMotion,
+    pub intrinsics: Intrinsics,
+    /// What has to be taken off the camera's stamps, seconds.
+    pub lag_s: f64,
+}
+
+/// Everything that is sought. The rig's axes are those of its first camera.
+#[derive(Debug, Clone)]
+pub(crate) struct Estimate {
+    pub cameras: Vec<SolvedCamera>,
+    /// `rig_from_board` by shot.
+    pub boards: Vec<RigidMotion>,
+}
+
+/// Movement of a board during a shot.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct BoardMotion {
+    /// Rotation vector a second.
+    pub turn: DVec3,
+    /// Metres a second.
+    pub shift: DVec3,
+}
+
+/// Which unknowns are free besides poses of cameras and boards.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct Free {
+    pub lens: Option<LensModel>,
+    pub lags: bool,
+}
+
+/// The least squares problem.
+pub(crate) struct Bundle<'a> {
+    points: &'a [DVec3],
+    shots: &'a [Shot],
+    motions: &'a [BoardMotion],
+    free: Free,
+    /// Standard deviation of a corner, pixels.
+    sigma_px: f64,
+    /// Shot, view and corner of each residual.
+    seen: Vec<(usize, usize, usize)>,
+    cameras: usize,
+    sizes: Vec<usize>,
+    first_eliminated: usize,
+}
+
+impl<'a> Bundle<'a> {
+    /// `points` are the board's corners, `motions` one a shot.
+    pub fn new(
+        points: &'a [DVec3],
+        shots: &'a [Shot],
+        motions: &'a [BoardMotion],
+        cameras: usize,
+        free: Free,
+        sigma_px: f64,
+    ) -> Self {
+        let of_view =
+            |shot: usize, view: usize| (0..shots[shot].views[view].corners.len()).map(move |k| (shot, view, k));
+        let of_shot = |shot: usize| (0..shots[shot].views.len()).flat_map(move |view| of_view(shot, view));
+        let seen = (0..shots.len()).flat_map(of_shot).collect();
+        // Poses of all cameras but the first, whose axes are the rig's; lenses; offsets of all but the first; boards.
+        let others = cameras.saturating_sub(1);
+        let mut sizes = vec![6; others];
+        if let Some(model) = free.lens {
+            sizes.extend(vec![model.parameters(); cameras]);
+        }
+        if free.lags {
+            sizes.extend(vec![1; others]);
+        }
+        let first_eliminated = sizes.len();
+        sizes.extend(vec![6; shots.len()]);
+        Self { points, shots, motions, free, sigma_px, seen, cameras, sizes, first_eliminated }
+    }
+
+    fn lens_block(&self, camera: usize) -> Option<usize> {
+        self.free.lens.map(|_| self.cameras - 1 + camera)
+    }
+
+    fn lag_block(&self, camera: usize) -> Option<usize> {
+        let lenses = if self.free.lens.is_some() { self.cameras } else { 0 };
+        (self.free.lags && camera > 0).then(|| self.cameras - 1 + lenses + camera - 1)
+    }
+
+    /// Pose of a shot's board at the time of a view.
+    fn board_at(&self, at: &Estimate, shot: usize, view: &BoardView) -> RigidMotion {
+        let motion = &self.motions[shot];
+        let secs = seconds(view.nanos, self.shots[shot].nanos) - at.cameras[view.camera].lag_s;
+        at.boards[shot].moved(motion.turn * secs, motion.shift * secs)
+    }
+
+    /// Difference of a drawn and a seen corner, pixels; `None` where it cannot be drawn.
+    pub fn error_px(&self, at: &Estimate, shot: usize, view: &BoardView, corner: &SeenCorner) -> Option<DVec2> {
+        let camera = &at.cameras[view.camera];
+        let place = self.board_at(at, shot, view).apply(*self.points.get(corner.index)?);
+        Some(project(&camera.intrinsics, camera.camera_from_rig.apply(place))? - corner.pixel)
+    }
+}
+
+/// Seconds from one time to another.
+pub(crate) fn seconds(nanos: i64, from: i64) -> f64 {
+    nanos.saturating_sub(from) as f64 * 1e-9
+}
+
+impl BlockProblem for Bundle<'_> {
+    type Unknowns = Estimate;
+
+    fn block_sizes(&self) -> &[usize] {
+        &self.sizes
+    }
+
+    fn first_eliminated(&self) -> usize {
+        self.first_eliminated
+    }
+
+    fn residual_count(&self) -> usize {
+        self.seen.len()
+    }
+
+    fn residual(&self, at: &Estimate, index: usize, with_jacobians: bool) -> Option<Residual> {
+        let (shot, view, corner) = self.seen[index];
+        let view = &self.shots[shot].views[view];
+        let corner = &view.corners[corner];
+        let inverse = 1.0 / self.sigma_px;
+        let residual = |error: DVec2, jacobians| Residual {
+            error: DVector::from_column_slice(&(error * inverse).to_array()),
+            jacobians,
+            kernel: KERNEL,
+            weight: 1.0,
+        };
+        if !with_jacobians {
+            return Some(residual(self.error_px(at, shot, view, corner)?, Vec::new()));
+        }
+        let camera = &at.cameras[view.camera];
+        let board = self.board_at(at, shot, view);
+        let point = *self.points.get(corner.index)?;
+        let place = board.apply(point);
+        let model = self.free.lens.unwrap_or(LensModel::Radial1);
+        let local = camera.camera_from_rig.apply(place);
+        let projected = project_with_derivatives(&camera.intrinsics, model, local)?;
+        let by_local = DMatrix::from_fn(2, 3, |row, column| inverse * projected.by_point[column][row]);
+        let [by_turn, by_shift, by_place] = camera.camera_from_rig.apply_jacobian(place);
+        let by_place = &by_local * matrix(by_place);
+        let mut jacobians = Vec::with_capacity(4);
+        if view.camera > 0 {
+            jacobians.push((view.camera - 1, beside(&(&by_local * matrix(by_turn)), &(&by_local * matrix(by_shift)))));
+        }
+        if let Some(block) = self.lens_block(view.camera) {
+            let by_lens = &projected.by_lens;
+            jacobians.push((block, DMatrix::from_fn(2, by_lens.len(), |row, column| inverse * by_lens[column][row])));
+        }
+        if let Some(block) = self.lag_block(view.camera) {
+            let motion = &self.motions[shot];
+            let velocity = motion.turn.cross(board.rotation * point) + motion.shift;
+            jacobians.push((block, -(&by_place * DMatrix::from_column_slice(3, 1, &velocity.to_array()))));
+        }
+        // The board's step comes before its movement during the shot, which is small: the same to first order.
+        let [by_turn, by_shift, _] = board.apply_jacobian(point);
+        let by_board = beside(&(&by_place * matrix(by_turn)), &(&by_place * matrix(by_shift)));
+        jacobians.push((self.first_eliminated + shot, by_board));
+        Some(residual(projected.pixel - corner.pixel, jacobians))
+    }
+
+    fn moved(&self, at: &Estimate, step: &[f64]) -> Estimate {
+        let mut at = at.clone();
+        let mut rest = step;
+        let mut take = |count: usize| {
+            let (now, later) = rest.split_at(count);
+            rest = later;
+            now
+        };
+        for camera in at.cameras.iter_mut().skip(1) {
+            camera.camera_from_rig = moved(&camera.camera_from_rig, take(6));
+        }
+        if let Some(model) = self.free.lens {
+            for camera in &mut at.cameras {
+                camera.intrinsics = model.moved(&camera.intrinsics, take(model.parameters()));
+            }
+        }
+        if self.free.lags {
+            for camera in at.cameras.iter_mut().skip(1) {
+                camera.lag_s += take(1)[0];
+            }
+        }
+        for board in &mut at.boards {
+            *board = moved(board, take(6));
+        }
+        at
+    }
+}
+
+fn moved(motion: &RigidMotion, step: &[f64]) -> RigidMotion {
+    motion.moved(DVec3::new(step[0], step[1], step[2]), DVec3::new(step[3], step[4], step[5]))
+}
+
+fn matrix(m: DMat3) -> DMatrix<f64> {
+    DMatrix::from_column_slice(3, 3, &m.to_cols_array())
+}
+
+fn beside(left: &DMatrix<f64>, right: &DMatrix<f64>) -> DMatrix<f64> {
+    let mut both = DMatrix::zeros(left.nrows(), left.ncols() + right.ncols());
+    both.columns_mut(0, left.ncols()).copy_from(left);
+    both.columns_mut(left.ncols(), right.ncols()).copy_from(right);
+    both
+}

@@ -1,0 +1,215 @@
+//! Calibration of one lens from a board that is shown in many poses.
+
+use flyrig_solve::RigidMotion;
+use flyrig_types::{CameraId, Intrinsics, Lens};
+use glam::{DVec2, DVec3};
+
+use crate::{
+    Board, BoardView, CalibError, LensModel, Shot,
+    adjust::{Adjusted, adjust},
+    bundle::{Estimate, Free, SolvedCamera},
+    homography::{focal_length, homography},
+    start::{board_poses, rms},
+};
+
+/// Views that are solved for at most, those that differ most.
+const MOST_VIEWS: usize = 60;
+/// Fewest views of a board that fix a lens.
+const LEAST_VIEWS: usize = 4;
+/// Views whose corners move by less than this from one to the next show the same, pixels.
+const SAME_PX: f64 = 1.0;
+/// Every so many views are kept out of the solves that choose the lens model.
+const HOLD_OUT_EVERY: usize = 4;
+/// A richer lens model is taken where it lowers the error of the views that were kept out to this share.
+const WORTH: f64 = 0.97;
+/// Focal lengths that are tried besides the estimated one, in widths of the image.
+const FOCAL_WIDTHS: [f64; 4] = [0.5, 0.8, 1.2, 2.0];
+/// Largest standard deviation of the focal length that is a result, as a share of it.
+const MOST_FOCAL_SHARE: f64 = 0.02;
+/// A view is named as wrong where its error is larger than this multiple of the median view's.
+const SUSPECT: f64 = 3.0;
+/// Cells of the image, across and down, that corners should cover.
+const CELLS: (usize, usize) = (8, 6);
+
+/// A lens and how well it is known.
+#[derive(Debug, Clone)]
+pub struct LensFit {
+    /// The lens.
+    pub intrinsics: Intrinsics,
+    /// Which coefficients it has.
+    pub model: LensModel,
+    /// Root mean square distance of drawn and seen corners, pixels.
+    pub rms_px: f64,
+    /// Standard deviation of a corner's coordinate without outliers, pixels.
+    pub sigma_px: f64,
+    /// Standard deviations of fx, fy, cx, cy, pixels.
+    pub deviations_px: [f64; 4],
+    /// Error of views that were kept out, by lens model, pixels.
+    pub held_out_px: Vec<(LensModel, f64)>,
+    /// Time stamps of the views that were used and their errors, pixels.
+    pub views: Vec<(i64, f64)>,
+    /// Time stamps of views that fit far worse than the others.
+    pub suspects: Vec<i64>,
+    /// Share of the image's cells that corners cover, 0..=1.
+    pub coverage: f64,
+}
+
+/// Calibrates a lens.
+///
+/// # Errors
+/// [`CalibError::TooFewViews`], [`CalibError::LensOpen`] where the boards leave it open.
+pub fn calibrate_lens(
+    board: &Board,
+    camera: &CameraId,
+    size: [u32; 2],
+    views: &[BoardView],
+) -> Result<LensFit, CalibError> {
+    let chosen = different_views(views, MOST_VIEWS);
+    if chosen.len() < LEAST_VIEWS {
+        let (camera, found, different) = (camera.clone(), views.len(), chosen.len());
+        return Err(CalibError::TooFewViews { camera, found, different, needed: LEAST_VIEWS });
+    }
+    let points: Vec<DVec3> = (0..board.corner_count()).map(|index| board.corner(index)).collect();
+    let open = || CalibError::LensOpen { camera: camera.clone() };
+    let rough = first_guess(board, &points, size, &chosen).ok_or_else(open)?;
+    let (kept_out, kept): (Vec<_>, Vec<_>) = chosen.iter().enumerate().partition(|(i, _)| i % HOLD_OUT_EVERY == 1);
+    let unpack = |views: Vec<(usize, &BoardView)>| views.into_iter().map(|(_, view)| view.clone()).collect::<Vec<_>>();
+    let (kept_out, kept) = (unpack(kept_out), unpack(kept));
+    let mut held_out_px = Vec::new();
+    let mut best: Option<(LensModel, f64)> = None;
+    for model in LensModel::ALL {
+        let Some(fit) = solve(board, &points, &rough, &kept, Some(model)) else { continue };
+        let lens = fit.estimate.cameras[0].intrinsics;
+        let Some(test) = solve(board, &points, &lens, &kept_out, None) else { continue };
+        let error = test.sigma_px;
+        held_out_px.push((model, error));
+        if best.is_none_or(|(_, least)| error < WORTH * least) {
+            best = Some((model, error));
+        }
+    }
+    let model = best.ok_or_else(open)?.0;
+    let fit = solve(board, &points, &rough, &chosen, Some(model)).ok_or_else(open)?;
+    let intrinsics = fit.estimate.cameras[0].intrinsics;
+    let covariance = fit.covariance.as_ref().ok_or_else(open)?;
+    let deviation = |k: usize| covariance[(k, k)].max(0.0).sqrt();
+    let deviations_px = [0, 1, 2, 3].map(deviation);
+    if !(deviations_px[0] < MOST_FOCAL_SHARE * intrinsics.focal_px.x
+        && deviations_px[1] < MOST_FOCAL_SHARE * intrinsics.focal_px.y)
+    {
+        return Err(open());
+    }
+    let of_view = |errors: &Vec<Vec<f64>>| rms(errors.iter().flatten().copied());
+    let errors: Vec<f64> = fit.errors_px.iter().map(of_view).collect();
+    let stamps = chosen.iter().map(|view| view.nanos);
+    let mut sorted = errors.clone();
+    let median = flyrig_solve::median(&mut sorted).unwrap_or(0.0);
+    let suspects = stamps.clone().zip(&errors).filter(|(_, error)| **error > SUSPECT * median).map(|(nanos, _)| nanos);
+    Ok(LensFit {
+        suspects: suspects.collect(),
+        intrinsics,
+        model,
+        rms_px: rms(fit.errors_px.iter().flatten().flatten().copied()),
+        sigma_px: fit.sigma_px,
+        deviations_px,
+        held_out_px,
+        views: stamps.zip(errors).collect(),
+        coverage: coverage(size, views),
+    })
+}
+
+/// Share of the image's cells with a corner.
+pub fn coverage(size: [u32; 2], views: &[BoardView]) -> f64 {
+    let mut cells = vec![false; CELLS.0 * CELLS.1];
+    for corner in views.iter().flat_map(|view| &view.corners) {
+        let cell =
+            |at: f64, side: u32, count: usize| ((at / f64::from(side) * count as f64).max(0.0) as usize).min(count - 1);
+        cells[cell(corner.pixel.y, size[1], CELLS.1) * CELLS.0 + cell(corner.pixel.x, size[0], CELLS.0)] = true;
+    }
+    cells.iter().filter(|cell| **cell).count() as f64 / cells.len() as f64
+}
+
+/// Views that show the board differently from each other, at most so many, in the order of time.
+pub(crate) fn different_views(views: &[BoardView], most: usize) -> Vec<BoardView> {
+    // Four numbers that change with the board's place, size and tilt, pixels.
+    let sketch = |view: &BoardView| -> [DVec2; 4] {
+        let pixels: Vec<DVec2> = view.corners.iter().map(|corner| corner.pixel).collect();
+        let middle = pixels.iter().sum::<DVec2>() / pixels.len().max(1) as f64;
+        let farthest = |along: DVec2| {
+            let key = |p: &&DVec2| (**p - middle).dot(along);
+            pixels.iter().max_by(|a, b| key(a).total_cmp(&key(b))).copied().unwrap_or(middle)
+        };
+        [middle, farthest(DVec2::X), farthest(DVec2::Y), farthest(DVec2::new(-1.0, -1.0))]
+    };
+    let sketches: Vec<[DVec2; 4]> = views.iter().map(sketch).collect();
+    let apart =
+        |a: usize, b: usize| sketches[a].iter().zip(&sketches[b]).map(|(a, b)| a.distance(*b)).fold(0.0, f64::max);
+    // Always the one that differs most from all chosen ones.
+    let mut distance = vec![f64::INFINITY; views.len()];
+    let mut chosen = Vec::new();
+    while chosen.len() < most {
+        let usable = (0..views.len()).filter(|&i| distance[i] > SAME_PX && !views[i].corners.is_empty());
+        let Some(next) = usable.max_by(|&a, &b| distance[a].total_cmp(&distance[b]).then(b.cmp(&a))) else { break };
+        chosen.push(next);
+        for (i, distance) in distance.iter_mut().enumerate() {
+            *distance = distance.min(apart(next, i));
+        }
+    }
+    chosen.sort_unstable();
+    chosen.into_iter().map(|i| views[i].clone()).collect()
+}
+
+/// A lens with one coefficient that explains the views best, from several focal lengths.
+fn first_guess(board: &Board, points: &[DVec3], size: [u32; 2], views: &[BoardView]) -> Option<Intrinsics> {
+    let center = DVec2::new(f64::from(size[0]) - 1.0, f64::from(size[1]) - 1.0) * 0.5;
+    let planes: Vec<_> = views
+        .iter()
+        .filter_map(|view| {
+            let pairs: Vec<_> = view
+                .corners
+                .iter()
+                .map(|corner| (board.corner(corner.index).truncate(), (corner.pixel - center) / f64::from(size[0])))
+                .collect();
+            homography(&pairs)
+        })
+        .collect();
+    let focal_px = focal_length(&planes).into_iter().filter(|widths| (0.1..20.0).contains(widths)).chain(FOCAL_WIDTHS);
+    let mut best: Option<(f64, Intrinsics)> = None;
+    for widths in focal_px {
+        let start = Intrinsics {
+            width: size[0],
+            height: size[1],
+            focal_px: DVec2::splat(widths * f64::from(size[0])),
+            center_px: center,
+            lens: Lens::PINHOLE,
+        };
+        let Some(fit) = solve(board, points, &start, views, Some(LensModel::Radial1)) else { continue };
+        if best.is_none_or(|(error, _)| fit.sigma_px < error) {
+            best = Some((fit.sigma_px, fit.estimate.cameras[0].intrinsics));
+        }
+    }
+    best.map(|(_, intrinsics)| intrinsics)
+}
+
+/// Solves for the boards and, where a model is given, the lens.
+fn solve(
+    board: &Board,
+    points: &[DVec3],
+    lens: &Intrinsics,
+    views: &[BoardView],
+    model: Option<LensModel>,
+) -> Option<Adjusted> {
+    let (mut shots, mut boards) = (Vec::new(), Vec::new());
+    for view in views {
+        // A lens that is still wrong leaves large errors: any pose that puts the board before the camera is a start.
+        if let Some(pose) = board_poses(board, lens, view).first() {
+            shots.push(Shot { nanos: view.nanos, views: vec![BoardView { camera: 0, ..view.clone() }] });
+            boards.push(*pose);
+        }
+    }
+    // Every view counts: a focal length that fits half of them is no better.
+    if boards.len() < views.len().min(LEAST_VIEWS) || boards.is_empty() || boards.len() < views.len() * 3 / 4 {
+        return None;
+    }
+    let camera = SolvedCamera { camera_from_rig: RigidMotion::IDENTITY, intrinsics: *lens, lag_s: 0.0 };
+    adjust(points, &shots, Estimate { cameras: vec![camera], boards }, Free { lens: model, lags: false })
+}

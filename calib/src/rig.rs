@@ -1,0 +1,215 @@
+//! Calibration of a whole rig from a board that its cameras see together.
+
+use flyrig_solve::{RigidMotion, log_rotation};
+use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Rig};
+use glam::{DMat3, DQuat, DVec3};
+use nalgebra::DMatrix;
+
+use crate::{
+    Board, CalibError, LensModel, Pair, Shot,
+    adjust::{Adjusted, adjust},
+    bundle::{Estimate, Free},
+    start::{rig_start, rms},
+};
+
+/// Options of [`calibrate_rig`].
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct RigOptions {
+    /// Also refines the lenses, with these coefficients.
+    pub lens: Option<LensModel>,
+    /// Also finds a time offset for each camera.
+    pub lags: bool,
+    /// The first shot's board lies on the floor: it gives height 0 and the direction up.
+    pub floor_first: bool,
+}
+
+/// A camera of a calibrated rig.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RigCamera {
+    /// Root mean square distance of drawn and seen corners, pixels.
+    pub rms_px: f64,
+    /// Corners and views.
+    pub corners: usize,
+    /// Views of the board.
+    pub views: usize,
+    /// Standard deviation of its direction and place against the first camera's: degrees, millimetres. `None` where views
+    /// leave it open.
+    pub deviation: Option<(f64, f64)>,
+    /// Difference of its direction and place between the solves from either half of the shots: degrees, millimetres.
+    pub halves: Option<(f64, f64)>,
+    /// What has to be taken off its stamps, and the standard deviation; seconds.
+    pub lag_s: (f64, f64),
+}
+
+/// A calibrated rig and how well it is known.
+#[derive(Debug, Clone)]
+pub struct RigFit {
+    /// The cameras; world metres, z up.
+    pub rig: Rig,
+    /// In the order of the rig.
+    pub cameras: Vec<RigCamera>,
+    /// Pairs of cameras that saw the board together.
+    pub pairs: Vec<Pair>,
+    /// Root mean square distance of drawn and seen corners, pixels.
+    pub rms_px: f64,
+    /// Standard deviation of a corner's coordinate without outliers, pixels.
+    pub sigma_px: f64,
+    /// Times of the shots, nanoseconds, and their errors, pixels.
+    pub shots: Vec<(i64, f64)>,
+}
+
+impl RigFit {
+    /// Largest ratio of the difference between the halves to what noise explains (two standard deviations of each), with
+    /// its camera; above 1 something else is wrong: a time offset, blur, a bent board, a lens.
+    #[must_use]
+    pub fn worst_disagreement(&self) -> Option<(usize, f64)> {
+        let ratio = |camera: &RigCamera| {
+            let ((deg, mm), (deg_sigma, mm_sigma)) = (camera.halves?, camera.deviation?);
+            // Each half has twice the variance, and their difference twice that again.
+            Some((deg / (4.0 * deg_sigma)).max(mm / (4.0 * mm_sigma)))
+        };
+        let ratios = self.cameras.iter().enumerate().filter_map(|(slot, camera)| Some((slot, ratio(camera)?)));
+        ratios.max_by(|a, b| a.1.total_cmp(&b.1))
+    }
+}
+
+/// Calibrates a rig whose lenses are known at least roughly.
+///
+/// # Errors
+/// [`CalibError::NotLinked`], [`CalibError::RigOpen`].
+pub fn calibrate_rig(
+    board: &Board,
+    ids: &[CameraId],
+    intrinsics: &[Intrinsics],
+    shots: &[Shot],
+    options: RigOptions,
+) -> Result<RigFit, CalibError> {
+    let (start, pairs, shots) = rig_start(board, shots, ids, intrinsics)?;
+    let points: Vec<DVec3> = (0..board.corner_count()).map(|index| board.corner(index)).collect();
+    let free = Free { lens: options.lens, lags: options.lags };
+    let fit = adjust(&points, &shots, start, free).ok_or(CalibError::RigOpen)?;
+    let halves: Vec<Option<Estimate>> =
+        [0, 1].map(|half| half_solve(&points, &shots, &fit.estimate, free, half)).into();
+    let cameras = (0..ids.len()).map(|slot| camera(&fit, &shots, free, slot, &halves)).collect();
+    let up = world_up(&fit, options.floor_first);
+    let world = world_from_rig(board, &fit, up, options.floor_first);
+    let rig = Rig {
+        cameras: ids
+            .iter()
+            .zip(&fit.estimate.cameras)
+            .map(|(id, solved)| {
+                let motion = solved.camera_from_rig * world.inverse();
+                Camera {
+                    id: id.clone(),
+                    intrinsics: solved.intrinsics,
+                    camera_from_world: Isometry::new(motion.rotation, motion.translation),
+                }
+            })
+            .collect(),
+        world_up: DVec3::Z,
+    };
+    rig.validate().map_err(|_| CalibError::RigOpen)?;
+    let of_shot = |errors: &Vec<Vec<f64>>| rms(errors.iter().flatten().copied());
+    Ok(RigFit {
+        cameras,
+        pairs,
+        rms_px: rms(fit.errors_px.iter().flatten().flatten().copied()),
+        sigma_px: fit.sigma_px,
+        shots: shots.iter().map(|shot| shot.nanos).zip(fit.errors_px.iter().map(of_shot)).collect(),
+        rig,
+    })
+}
+
+/// Solves again from every second shot.
+fn half_solve(points: &[DVec3], shots: &[Shot], at: &Estimate, free: Free, half: usize) -> Option<Estimate> {
+    let every_second = |i: &usize| i % 2 == half;
+    let part: Vec<Shot> = (0..shots.len()).filter(every_second).map(|i| shots[i].clone()).collect();
+    let boards = (0..shots.len()).filter(every_second).map(|i| at.boards[i]).collect();
+    let start = Estimate { cameras: at.cameras.clone(), boards };
+    let seen = |slot: usize| part.iter().flat_map(|shot| &shot.views).any(|view| view.camera == slot);
+    if !(0..at.cameras.len()).all(seen) {
+        return None;
+    }
+    let fit = adjust(points, &part, start, free)?;
+    fit.covariance.as_ref()?;
+    Some(fit.estimate)
+}
+
+fn camera(fit: &Adjusted, shots: &[Shot], free: Free, slot: usize, halves: &[Option<Estimate>]) -> RigCamera {
+    let mut errors = Vec::new();
+    let mut views = 0;
+    for (shot, of_shot) in shots.iter().zip(&fit.errors_px) {
+        for (view, of_view) in shot.views.iter().zip(of_shot) {
+            if view.camera == slot {
+                errors.extend_from_slice(of_view);
+                views += 1;
+            }
+        }
+    }
+    let pose = fit.estimate.cameras[slot].camera_from_rig;
+    let deviation = match (&fit.covariance, slot) {
+        (None, _) => None,
+        (Some(_), 0) => Some((0.0, 0.0)),
+        (Some(covariance), _) => Some(deviation(covariance, 6 * (slot - 1), &pose)),
+    };
+    let difference = |a: &RigidMotion, b: &RigidMotion| {
+        let turn = log_rotation(a.rotation * b.rotation.inverse()).length().to_degrees();
+        (turn, 1e3 * a.inverse().translation.distance(b.inverse().translation))
+    };
+    let halves = match halves {
+        [Some(a), Some(b)] => Some(difference(&a.cameras[slot].camera_from_rig, &b.cameras[slot].camera_from_rig)),
+        _ => None,
+    };
+    let lag_sigma = fit.covariance.as_ref().filter(|_| free.lags && slot > 0).map_or(0.0, |covariance| {
+        let others = fit.estimate.cameras.len() - 1;
+        let at = covariance.nrows() - others + slot - 1;
+        covariance[(at, at)].max(0.0).sqrt()
+    });
+    RigCamera {
+        rms_px: rms(errors.iter().copied()),
+        corners: errors.len(),
+        views,
+        deviation,
+        halves,
+        lag_s: (fit.estimate.cameras[slot].lag_s, lag_sigma),
+    }
+}
+
+/// Standard deviations of a camera's direction, degrees, and place, millimetres.
+fn deviation(covariance: &DMatrix<f64>, at: usize, pose: &RigidMotion) -> (f64, f64) {
+    let block = covariance.view((at, at), (6, 6)).into_owned();
+    let turn = (block[(0, 0)] + block[(1, 1)] + block[(2, 2)]).max(0.0).sqrt().to_degrees();
+    // place = -Rᵀ t; lengths do not change with Rᵀ. After exp(δ) R and t + s: t + s + t × δ.
+    let mut by_step = DMatrix::zeros(3, 6);
+    let cross = flyrig_solve::skew(pose.translation).to_cols_array();
+    by_step.view_mut((0, 0), (3, 3)).copy_from_slice(&cross);
+    by_step.view_mut((0, 3), (3, 3)).copy_from(&DMatrix::identity(3, 3));
+    let place = &by_step * block * by_step.transpose();
+    (turn, 1e3 * place.trace().max(0.0).sqrt())
+}
+
+/// Direction up in the rig's axes: off the board on the floor, or what most cameras have above.
+fn world_up(fit: &Adjusted, floor_first: bool) -> DVec3 {
+    match fit.estimate.boards.first().filter(|_| floor_first) {
+        Some(first) => first.rotation * DVec3::NEG_Z,
+        None => {
+            let above = |camera: &crate::bundle::SolvedCamera| camera.camera_from_rig.rotation.inverse() * DVec3::NEG_Y;
+            fit.estimate.cameras.iter().map(above).sum::<DVec3>().normalize_or(DVec3::NEG_Y)
+        }
+    }
+}
+
+/// World axes: z up; the origin is the middle of the board on the floor, or of all boards; the first camera looks along y.
+fn world_from_rig(board: &Board, fit: &Adjusted, up: DVec3, floor_first: bool) -> RigidMotion {
+    let middle = |pose: &RigidMotion| pose.apply(board.middle());
+    let boards = &fit.estimate.boards;
+    let origin = match boards.first().filter(|_| floor_first) {
+        Some(first) => middle(first),
+        None => boards.iter().map(middle).sum::<DVec3>() / boards.len().max(1) as f64,
+    };
+    let forward = (DVec3::Z - up * up.z).try_normalize().unwrap_or_else(|| up.any_orthonormal_vector());
+    let right = forward.cross(up);
+    let world_from_rig = DMat3::from_cols(right, forward, up).transpose();
+    let rotation = DQuat::from_mat3(&world_from_rig).normalize();
+    RigidMotion { rotation, translation: -(rotation * origin) }
+}
