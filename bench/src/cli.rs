@@ -29,6 +29,8 @@ pub enum BenchCommand {
     Endure(BenchEndureArgs),
     /// Appearance: every mode on simulated people that nobody trained on; writes CSV, JSON and SVG.
     Appearance(BenchAppearanceArgs),
+    /// Budgets of time: what each kind of work that may be left out costs in views, and the run time it saves.
+    Budget(BenchBudgetArgs),
     /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to whole sets.
     Capture(BenchCaptureArgs),
     /// Fingertips and the head's rotation on simulated people, estimated and relaxed, and the cost of a crop.
@@ -72,6 +74,36 @@ pub struct BenchAppearanceArgs {
     /// Pixels of a picture's side.
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
     pub side: u32,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchBudgetArgs {
+    /// Data set in EasyMocap layout, as `flyrig eval` and `flyrig sim export` know it.
+    pub dataset: PathBuf,
+    /// Input cameras, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "00,03,05")]
+    pub inputs: Vec<String>,
+    /// Cameras that the views are compared with, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "01,02,04,06")]
+    pub holdout: Vec<String>,
+    /// Where pose and masks come from.
+    #[arg(long, value_enum, default_value = "estimated")]
+    pub pose: Origin,
+    /// Budgets, sets a second, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "1,2,3,4,5,6,8,10,15,30")]
+    pub budgets: Vec<f64>,
+    /// Frames FIRST..END, END excluded; all of them otherwise.
+    #[arg(long, value_parser = parse_range)]
+    pub frames: Option<Range<u64>>,
+    /// Frames a second of the data set.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-budget")]
+    pub out: PathBuf,
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
     pub gaussians: usize,

@@ -1,6 +1,7 @@
 //! `flyrig-bench`: benchmarks that print run time beside error.
 
 mod appearance;
+mod budget;
 mod capture;
 mod case;
 mod cli;
@@ -46,6 +47,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         BenchCommand::Track(args) => track::track(args, &gpu()?),
         BenchCommand::Endure(args) => endure::endure(args, &gpu()?),
         BenchCommand::Appearance(args) => appearance::appearance(args, &gpu()?),
+        BenchCommand::Budget(args) => budget::budget(args, &gpu()?),
         BenchCommand::Capture(args) => capture::capture(args),
         BenchCommand::Hands(args) => hands::hands(args, &gpu()?),
         BenchCommand::Landmarks(args) => landmarks::landmarks(args),

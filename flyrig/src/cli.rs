@@ -4,7 +4,9 @@ use std::{collections::BTreeMap, net::SocketAddr, ops::Range, path::PathBuf};
 
 use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
-use flyrig_fusion::{AppearanceOptions, BodySettings, NetworksOn, Origin, PerceptionSettings, TrackingSettings};
+use flyrig_fusion::{
+    AppearanceOptions, BodySettings, BudgetSettings, NetworksOn, Origin, PerceptionSettings, TrackingSettings,
+};
 use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size};
 use flyrig_stfa::NetworkSize;
 use flyrig_types::CameraId;
@@ -67,6 +69,11 @@ pub enum Command {
     SyncCheck(SyncCheckArgs),
     /// Record the empty scene before each camera (plates): masks are then made from the difference to it.
     Plate(PlateArgs),
+    /// Calibrate a rig: print a board, then calibrate lenses and poses from a take that shows it.
+    Calibrate {
+        #[command(subcommand)]
+        action: CalibrateAction,
+    },
     /// List cameras with their identifiers, formats and buses, and graphics adapters; suggest fixes.
     Doctor {
         /// A TOML file whose cameras are looked for and whose buses are planned.
@@ -151,6 +158,136 @@ pub struct SyncCheckArgs {
     /// which is more reliable than motion. It replaces the input's own calibration.
     #[arg(long)]
     pub calibration: Option<PathBuf>,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum CalibrateAction {
+    /// Write a board to print (SVG, PDF) and its description, board.toml.
+    Board(CalibrateBoardArgs),
+    /// Calibrate the lens of each camera from a take in which it sees the board in many poses.
+    Lens(CalibrateLensArgs),
+    /// Calibrate the poses, and time offsets, of all cameras from a take in which they see the board together.
+    Rig(CalibrateRigArgs),
+}
+
+/// What a board shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum PatternName {
+    /// Squares with markers: any part of the board is recognised.
+    Charuco,
+    /// Squares alone: the whole board must be in the image.
+    Chessboard,
+}
+
+/// Sizes of paper.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Paper {
+    A4,
+    A3,
+    A2,
+    A1,
+    A0,
+}
+
+impl Paper {
+    /// Long and short side, millimetres.
+    pub fn size_mm(self) -> [f64; 2] {
+        match self {
+            Self::A4 => [297.0, 210.0],
+            Self::A3 => [420.0, 297.0],
+            Self::A2 => [594.0, 420.0],
+            Self::A1 => [841.0, 594.0],
+            Self::A0 => [1189.0, 841.0],
+        }
+    }
+}
+
+#[derive(Debug, Args)]
+pub struct CalibrateBoardArgs {
+    /// Folder of board.svg, board.pdf and board.toml.
+    #[arg(long, default_value = "board")]
+    pub out: PathBuf,
+    /// Squares along the long side.
+    #[arg(long, default_value_t = 9)]
+    pub columns: u32,
+    /// Squares along the short side.
+    #[arg(long, default_value_t = 6)]
+    pub rows: u32,
+    /// Side of a square, millimetres.
+    #[arg(long, default_value_t = 30.0)]
+    pub square_mm: f64,
+    #[arg(long, value_enum, default_value = "charuco")]
+    pub pattern: PatternName,
+    /// Dictionary of the markers, as OpenCV names it.
+    #[arg(long, default_value = "DICT_5X5_100")]
+    pub dictionary: String,
+    /// Side of a marker as a share of the square's.
+    #[arg(long, default_value_t = 0.75)]
+    pub marker: f64,
+    /// Paper; a sheet of the board's own size otherwise.
+    #[arg(long, value_enum)]
+    pub paper: Option<Paper>,
+    /// Replace files that are there.
+    #[arg(long)]
+    pub force: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct TakeArgs {
+    /// A configuration (*.toml), a recording (*.mcap), a folder with images/CAM, or the videos of all cameras.
+    #[arg(required = true)]
+    pub input: Vec<PathBuf>,
+    /// Seconds that are looked at.
+    #[arg(long, default_value_t = 120.0, value_parser = parse_seconds)]
+    pub secs: f64,
+    /// Time from one set that is looked at to the next, milliseconds.
+    #[arg(long, default_value_t = 100.0, value_parser = parse_most_ms)]
+    pub every_ms: f64,
+    /// Frame rate of a folder.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+}
+
+#[derive(Debug, Args)]
+pub struct CalibrateLensArgs {
+    #[command(flatten)]
+    pub take: TakeArgs,
+    /// The board's description, as `flyrig calibrate board` writes it.
+    #[arg(long, default_value = "board/board.toml")]
+    pub board: PathBuf,
+    /// Folder of intri.yml.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Replace lenses that are there.
+    #[arg(long)]
+    pub force: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct CalibrateRigArgs {
+    #[command(flatten)]
+    pub take: TakeArgs,
+    /// The board's description, as `flyrig calibrate board` writes it.
+    #[arg(long, default_value = "board/board.toml")]
+    pub board: PathBuf,
+    /// Folder of intri.yml, extri.yml and calibration.json.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Folder with the intri.yml of `flyrig calibrate lens`; the take itself tells the lenses otherwise.
+    #[arg(long)]
+    pub lenses: Option<PathBuf>,
+    /// Solve for the lenses together with the poses.
+    #[arg(long)]
+    pub refine_lenses: bool,
+    /// The take begins with the board on the floor, face up: it gives height 0 and the direction up.
+    #[arg(long)]
+    pub floor: bool,
+    /// Take the cameras' stamps as they are.
+    #[arg(long)]
+    pub no_offsets: bool,
+    /// Replace a calibration that is there.
+    #[arg(long)]
+    pub force: bool,
 }
 
 #[derive(Debug, Args)]
@@ -334,6 +471,8 @@ pub struct DemoArgs {
     pub tracking: TrackingSettings,
     #[command(flatten)]
     pub appearance: AppearanceOptions,
+    #[command(flatten)]
+    pub budget: BudgetSettings,
     /// Also score the modes that `direct` adds to (takes three times as long).
     #[arg(long)]
     pub ablation: bool,
@@ -406,6 +545,8 @@ pub struct EvalArgs {
     pub tracking: TrackingSettings,
     #[command(flatten)]
     pub appearance: AppearanceOptions,
+    #[command(flatten)]
+    pub budget: BudgetSettings,
     /// Frames FIRST..END, END excluded; all of them otherwise.
     #[arg(long, value_parser = parse_range)]
     pub frames: Option<Range<u64>>,

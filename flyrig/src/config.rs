@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, bail, ensure};
 use flyrig_capture::Rotation;
 use flyrig_fusion::{
-    AppearanceOptions, BodySettings, Origin, OutputSettings, PerceptionSettings, SessionSettings, TrackingSettings,
+    AppearanceOptions, BodySettings, BudgetSettings, Origin, OutputSettings, PerceptionSettings, SessionSettings,
+    TrackingSettings,
 };
 use flyrig_sim::SimConfig;
 use flyrig_sync::SyncSettings;
@@ -32,6 +33,7 @@ pub struct Config {
     pub body: BodySettings,
     pub tracking: TrackingSettings,
     pub appearance: AppearanceOptions,
+    pub budget: BudgetSettings,
     pub output: OutputSettings,
     pub capture: CaptureSection,
     pub record: RecordSection,
@@ -276,6 +278,7 @@ impl Config {
             body: self.body.clone(),
             tracking: self.tracking.clone(),
             appearance: self.appearance.clone(),
+            budget: self.budget,
         }
     }
 

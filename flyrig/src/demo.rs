@@ -198,6 +198,7 @@ fn pass(
         body: BodySettings { gaussians: args.gaussians, ..BodySettings::default() },
         tracking: args.tracking.clone(),
         appearance: appearance.clone(),
+        budget: args.budget,
     };
     let builder = SessionBuilder::new(gpu.clone(), inputs.clone()).settings(settings);
     let session = match args.pose {

@@ -60,6 +60,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
             body: args.body.clone(),
             tracking: args.tracking.clone(),
             appearance: args.appearance.clone(),
+            budget: args.budget,
         },
         fps: args.fps,
         frames: args.frames.clone(),
@@ -85,7 +86,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     while let Some(set) = replay.next_set()? {
         let number = frame_number(&set);
         match replay.session.process(&set)? {
-            Outcome::Updated => {}
+            Outcome::Updated | Outcome::Still => {}
             Outcome::Held(reason) => {
                 tracing::warn!(frame = number, %reason, "frame not used");
                 if !replay.session.has_people() {

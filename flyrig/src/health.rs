@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 
 use flyrig_capture::Recorded;
 use flyrig_fusion::{CameraHealth, Health};
+use flyrig_transport::BudgetStats;
 
 /// Returns the names of a rig's camera threads.
 pub fn threads(health: &Health) -> Vec<String> {
@@ -20,6 +21,11 @@ pub fn thread_restarts(health: &Health) -> Vec<(String, u64)> {
     };
     let others = health.threads.iter().map(|thread| (thread.name.clone(), thread.restarts));
     health.cameras.iter().flat_map(of).chain(others).collect()
+}
+
+/// Says how much of the work is done to keep to a budget.
+pub fn effort(budget: BudgetStats) -> String {
+    format!("effort {} of {}", budget.levels.saturating_sub(budget.level), budget.levels)
 }
 
 /// Formats a snapshot as a table for the terminal.
@@ -63,6 +69,10 @@ pub fn table(health: &Health, recorded: Option<&Recorded>) -> String {
         "sets: {} complete, {} partial, {} skipped",
         health.complete_sets, health.partial_sets, health.skipped_sets
     );
+    if let Some(budget) = health.budget {
+        let (fps, ms) = (budget.fps, 1e3 * budget.set_secs);
+        let _ = writeln!(text, "budget: {fps} sets a second, {}, {ms:.0} ms a set", effort(budget));
+    }
     for (thread, count) in thread_restarts(health).into_iter().filter(|(_, count)| *count > 0) {
         let _ = writeln!(text, "thread '{thread}': restarted {count} times");
     }
@@ -130,6 +140,7 @@ pub mod tests {
             partial_sets,
             skipped_sets,
             stages: vec![stage],
+            budget: Some(BudgetStats { fps: 5.0, level: 2, levels: 7, set_secs: 0.15 }),
             device_faults: 0,
             resident_mib,
         }
@@ -157,6 +168,10 @@ pub mod tests {
         let cells: Vec<&str> = row.split_whitespace().collect();
         assert_eq!(cells[..9], ["le\"ft", "900", "7", "3", "5", "2", "1", "0.40", "12.0"]);
         assert!(row.ends_with("  YUYV 640x360 at 30.00  network: 8 lost, clock -1.5000 s +2.5 ppm"), "{row}");
-        assert_eq!(table.lines().last(), Some("sets: 800 complete, 10 partial, 4 skipped"));
+        let last: Vec<&str> = table.lines().skip(2).collect();
+        assert_eq!(
+            last,
+            ["sets: 800 complete, 10 partial, 4 skipped", "budget: 5 sets a second, effort 5 of 7, 150 ms a set"]
+        );
     }
 }

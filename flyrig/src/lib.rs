@@ -2,6 +2,7 @@
 //!
 //! A library only so that the end-to-end tests can build the same program; its documentation is `--help`.
 
+mod calibrate;
 mod cameras;
 mod capture;
 mod cli;
@@ -23,6 +24,7 @@ mod silhouettes;
 mod sim_export;
 mod source;
 mod sync_check;
+mod take;
 mod train;
 mod watch;
 
@@ -76,6 +78,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         Command::Replay(args) => recording::replay(args),
         Command::SyncCheck(args) => sync_check::sync_check(args, &|| open_gpu(cli.adapter.as_deref())),
         Command::Plate(args) => plate::plate(args, &|| open_gpu(cli.adapter.as_deref())),
+        Command::Calibrate { action } => calibrate::calibrate(action, &|| open_gpu(cli.adapter.as_deref())),
         Command::Doctor { config } => doctor::doctor(config.as_deref()),
         Command::Watch(args) => watch::watch(args),
         Command::Eval(args) => eval::eval(args, &open_gpu(cli.adapter.as_deref())?),

@@ -124,6 +124,11 @@ impl Collector for Snapshot {
                 .map(|(quantile, ms)| ([("stage", stage.name.as_str()), ("quantile", quantile)], f64::from(ms) / 1e3))
         });
         page.gauges("stage_seconds", "Time of a stage of the pipeline.", stages)?;
+        if let Some(budget) = health.budget {
+            page.gauge("effort_level", "What is left out to keep to the budget; 0: nothing.", i64::from(budget.level))?;
+            page.gauge("budget_rate", "Sets a second that are wanted.", budget.fps)?;
+            page.gauge("set_seconds", "Smoothed cost of a set.", budget.set_secs)?;
+        }
         page.counter("device_faults", "Times that the graphics device was opened again.", health.device_faults)?;
         if let Some(mib) = health.resident_mib {
             page.gauge("resident_bytes", "Resident memory.", (mib * 1024.0 * 1024.0) as u64)?;
@@ -197,6 +202,9 @@ mod tests {
             "flyrig_stage_seconds{stage=\"draw\",quantile=\"0.95\"} 0.004",
             "flyrig_resident_bytes 2097152",
             "flyrig_device_faults_total 0",
+            "flyrig_effort_level 2",
+            "flyrig_budget_rate 5.0",
+            "flyrig_set_seconds 0.15",
             "flyrig_frames_overtaken_total{camera=\"le\\\"ft\"} 6",
             "flyrig_network_lost_total{camera=\"le\\\"ft\"} 8",
             "flyrig_host_clock_offset_seconds{camera=\"le\\\"ft\"} -1.5",

@@ -6,9 +6,7 @@ use std::{
 };
 
 use anyhow::{Context as _, Result, bail, ensure};
-use flyrig_capture::{
-    CaptureThreads, FolderOptions, FolderReplay, Pacing, PopError, SourceOpener, ThreadsConfig, to_rgb8,
-};
+use flyrig_capture::{CaptureThreads, Pacing, PopError, SourceOpener, ThreadsConfig, to_rgb8};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{dataset, png, progress_bar, stop, write_whole};
 use flyrig_tracker::{PoseNet, shows_person};
@@ -16,8 +14,7 @@ use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
 use crate::{
     cli::PlateArgs,
-    config::{Config, SourceKind},
-    recording, source,
+    take::{self, Take},
 };
 
 /// Frames of a camera that the median is taken over, spread over the time.
@@ -33,7 +30,7 @@ const MOVED_PIXELS: f64 = 0.01;
 /// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
 pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let (sources, pacing) = open(args, gpu)?;
+    let Take { sources, pacing } = take::open(std::slice::from_ref(&args.input), args.fps, gpu)?;
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
     let folder = args.out.join("background");
     let files: Vec<PathBuf> = cameras.iter().map(|camera| dataset::plate_file(&folder, camera)).collect();
@@ -75,27 +72,6 @@ pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         folder.display()
     );
     Ok(())
-}
-
-/// Opens the cameras of a configuration, a recording or a folder.
-fn open(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(Vec<SourceOpener>, Pacing)> {
-    let path = &args.input;
-    let has_ending = |ending: &str| path.extension().is_some_and(|found| found.eq_ignore_ascii_case(ending));
-    if has_ending("toml") {
-        let mut config = Config::load(path)?;
-        let is_sim = config.source.kind == SourceKind::Sim;
-        config.source.real_time &= !is_sim;
-        let gpu = is_sim.then(gpu).transpose()?;
-        let pacing = if config.source.kind.is_live() { Pacing::AsDelivered } else { Pacing::Lossless };
-        return Ok((source::open_without_plates(&config, gpu.as_ref())?.cameras, pacing));
-    }
-    if has_ending("mcap") {
-        let rig = recording::recorded_rig(path)?;
-        return Ok((source::ready(recording::replay_sources(path, &rig)?), Pacing::Lossless));
-    }
-    ensure!(path.is_dir(), "{} is no configuration (*.toml), recording (*.mcap) or folder", path.display());
-    let options = FolderOptions { fps: args.fps, ..FolderOptions::default() };
-    Ok((source::ready(FolderReplay::open(path, None, &options)?), Pacing::Lossless))
 }
 
 /// Collects frames of every camera over some seconds.

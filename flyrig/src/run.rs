@@ -17,6 +17,7 @@ use flyrig_transport::Publisher;
 
 use crate::{
     config::Config,
+    health,
     monitor::{Monitor, ended_by_itself},
     pose_recording::PoseRecording,
     recording,
@@ -112,7 +113,7 @@ fn capture_people(
         }
         monitor.look(|| (rig.health(), recorder.map(Recorder::state)));
         let Some(step) = step else { continue };
-        if step.outcome == Outcome::Updated {
+        if !matches!(step.outcome, Outcome::Held(_)) {
             record_pose(poses.as_mut(), &rig.session, step.set.master_nanos);
         }
         if last_save.elapsed() >= SAVE_EVERY {
@@ -123,7 +124,9 @@ fn capture_people(
             let rate = (rig.frames() - printed) as f64 / last_print.elapsed().as_secs_f64();
             let memory = resident_mib().map_or_else(String::new, |mib| format!(", {mib:.0} MiB"));
             let lost = rig.session.counts.lost;
-            eprintln!("run: {} sets, {rate:.1} a second, {lost} lost{memory}", rig.frames());
+            let effort =
+                rig.session.budget.stats().map_or_else(String::new, |budget| format!(", {}", health::effort(budget)));
+            eprintln!("run: {} sets, {rate:.1} a second, {lost} lost{memory}{effort}", rig.frames());
             (last_print, printed) = (Instant::now(), rig.frames());
         }
     }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use flyrig_capture::CameraStats;
 use flyrig_sync::ClockState;
+use flyrig_transport::BudgetStats;
 use flyrig_types::ThreadHealth;
 
 use crate::{FusionError, StageSummary};
@@ -57,6 +58,8 @@ pub struct Health {
     pub skipped_sets: u64,
     /// Run times of the session's stages.
     pub stages: Vec<StageSummary>,
+    /// Level of effort, where there is a budget.
+    pub budget: Option<BudgetStats>,
     /// How often the graphics device was opened again after a fault.
     pub device_faults: u64,
     /// Resident memory of the process, MiB.

@@ -217,6 +217,7 @@ impl Intake {
             partial_sets: counts.partial,
             skipped_sets: self.skipped_sets,
             stages: Vec::new(),
+            budget: None,
             device_faults: 0,
             resident_mib: None,
         }

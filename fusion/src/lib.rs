@@ -8,8 +8,10 @@
 //!
 //! `examples/embed.rs` shows all of it without network, files or command line.
 
+mod budget;
 mod deformation;
 mod drawing;
+mod effort;
 mod error;
 mod health;
 mod intake;
@@ -23,11 +25,14 @@ mod session;
 mod set_reader;
 mod settings;
 mod stage_times;
+mod stillness;
 mod subject;
 mod track_state;
 mod viewpoints;
 
+pub use budget::Budget;
 pub use deformation::{DeformOptions, PAPER_COLOR_WEIGHT};
+pub use effort::Effort;
 pub use error::FusionError;
 pub use health::{CameraHealth, Health, STUCK_AFTER, check_threads};
 pub use intake::{InputFormat, Intake};
@@ -42,8 +47,8 @@ pub use perception::{
 pub use session::{Counts, Outcome, Session, SessionBuilder};
 pub use set_reader::{SetReader, next_frame};
 pub use settings::{
-    AppearanceMode, AppearanceOptions, BodySettings, NetworksOn, Origin, PerceptionSettings, SessionSettings, Solver,
-    TrackingSettings,
+    AppearanceMode, AppearanceOptions, BodySettings, BudgetSettings, NetworksOn, Origin, PerceptionSettings,
+    SessionSettings, Solver, TrackingSettings,
 };
 pub use stage_times::{StageSummary, StageTimes, processor_time, resident_mib};
 pub use subject::{Observed, PROCESSOR_STAGE, Subject};

@@ -157,6 +157,7 @@ impl LivePublisher {
             dropped: drops.iter().cloned().chain(self.drops()).collect(),
             views,
             viewers: self.publisher.viewpoint_counts().active as u32,
+            budget: session.budget.stats(),
             tracking: TrackingStats::default(),
             subjects: session.subjects().iter().map(stats_of).collect(),
         };

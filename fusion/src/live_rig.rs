@@ -139,6 +139,7 @@ impl LiveRig {
                 tracing::warn!(set = set.index, held = self.held, %reason, "frame set not used");
             }
         }
+        let drawing = Instant::now();
         if let Some(publisher) = &mut self.publisher {
             let turn_time = turn_time.unwrap_or_else(|| self.started.elapsed());
             self.views.publish(&mut self.session, publisher, set, turn_time)?;
@@ -147,6 +148,7 @@ impl LiveRig {
             }
             publisher.publish_stats(&self.session, set, self.frames, &self.intake.drops());
         }
+        self.session.budget.spend(drawing.elapsed());
         if self.recovery.taken.is_none_or(|at| at.elapsed() >= SNAPSHOT_EVERY) && self.session.has_people() {
             self.snapshot()?;
         }
@@ -249,6 +251,7 @@ impl LiveRig {
             stages: self.session.stages.summary(),
             resident_mib: resident_mib(),
             device_faults: self.recovery.rebuilt,
+            budget: self.session.budget.stats(),
             threads: std::iter::once(self.pipeline.clone()).chain(self.other_threads()).collect(),
             ..self.intake.health()
         }

@@ -15,7 +15,7 @@ use flyrig_types::{FrameSet, Mask, PersonId, Pose};
 pub(crate) use self::background::key_color;
 pub use self::estimated::{EstimatedPerception, SHAPE_SECS, SHAPE_SETS};
 pub use self::given::{GivenPerception, GivenPerson};
-use crate::{FusionError, StageTimes};
+use crate::{Effort, FusionError, StageTimes};
 
 /// Finds people in frame sets. Sets come in the order of their times.
 pub trait Perception: Send {
@@ -28,6 +28,11 @@ pub trait Perception: Send {
     /// # Errors
     /// Only those that a later set cannot mend; a person who is not found is [`Observation::Lost`].
     fn observe<'a>(&mut self, set: &'a FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation<'a>>, FusionError>;
+
+    /// Chooses how much work the next sets get.
+    fn set_effort(&mut self, effort: Effort) {
+        let _ = effort;
+    }
 
     /// Returns a person's pose at a time near the last set's, where it is known exactly. `None` lets the session interpolate
     /// the observed poses.

@@ -1,15 +1,16 @@
 //! A session: frame sets in, people as Gaussians and views out.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, time::Instant};
 
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::{GaussianBuffers, Splat};
 use flyrig_types::{Camera, FrameSet, PersonId, Pose, RenderedView, Rig};
 
 use crate::{
-    FusionError, NetworksOn, Observation, Perception, PersonMemory, Remedy, SeenPerson, SessionSettings, StageTimes,
-    Subject,
+    Budget, Effort, FusionError, NetworksOn, Observation, Perception, PersonMemory, Remedy, SeenPerson,
+    SessionSettings, StageTimes, Subject,
     drawing::Drawing,
+    stillness::Stillness,
     subject::{InputView, Observed},
 };
 
@@ -18,6 +19,8 @@ use crate::{
 pub enum Outcome {
     /// At least one person was posed and coloured.
     Updated,
+    /// Nothing moved in any image since everybody was updated: left out to save time, which only a budget does.
+    Still,
     /// Nobody was updated, for this reason.
     Held(String),
 }
@@ -80,6 +83,8 @@ impl SessionBuilder {
         let mut session = Session {
             drawing: Drawing::new(&gpu, self.settings.body.gaussians)?,
             gpu,
+            budget: Budget::new(self.settings.budget),
+            stillness: Stillness::default(),
             rig: self.rig,
             settings: self.settings,
             perception: self.perception.unwrap_or_else(|| Box::new(Nobody)),
@@ -127,6 +132,9 @@ pub struct Session {
     saved: BTreeMap<PersonId, PersonMemory>,
     keep_observations: bool,
     shape_held: bool,
+    stillness: Stillness,
+    /// Budget of time; whoever draws views of a set adds their time ([`Budget::spend`]).
+    pub budget: Budget,
     /// Run times of every stage so far.
     pub stages: StageTimes,
     /// Counts so far.
@@ -195,7 +203,23 @@ impl Session {
     /// Only those that a later set cannot mend. After one that [is a device fault](FusionError::is_device_fault), call
     /// [`Self::rebuild`].
     pub fn process(&mut self, set: &FrameSet) -> Result<Outcome, FusionError> {
+        let start = Instant::now();
+        self.budget.next_set();
+        if self.budget.fps().is_some() && self.stillness.may_rest(set, self.has_people()) {
+            self.budget.leave_out();
+            self.stages.count("sets left out, nothing moved", 1);
+            return Ok(Outcome::Still);
+        }
+        let outcome = self.take_in(set, self.budget.effort());
+        let cost = start.elapsed();
+        self.stillness.taken_in(set.master_nanos, cost);
+        self.budget.spend(cost);
+        outcome
+    }
+
+    fn take_in(&mut self, set: &FrameSet, effort: Effort) -> Result<Outcome, FusionError> {
         self.gpu.check()?;
+        self.perception.set_effort(effort);
         let observations = self.perception.observe(set, &mut self.stages)?;
         self.add_people()?;
         let mut outcome = Outcome::Held("nobody is known".to_owned());
@@ -211,7 +235,7 @@ impl Session {
                     }
                 }
                 Observation::Seen(seen) => {
-                    self.update(set, &seen)?;
+                    self.update(set, &seen, effort)?;
                     outcome = Outcome::Updated;
                 }
             }
@@ -239,7 +263,7 @@ impl Session {
     }
 
     /// Takes in one person of a set.
-    fn update(&mut self, set: &FrameSet, seen: &SeenPerson<'_>) -> Result<(), FusionError> {
+    fn update(&mut self, set: &FrameSet, seen: &SeenPerson<'_>, effort: Effort) -> Result<(), FusionError> {
         let Some(subject) = self.subjects.iter_mut().find(|subject| subject.id() == seen.person) else {
             return Err(FusionError::NoSuchPerson(seen.person));
         };
@@ -279,10 +303,13 @@ impl Session {
                 Remedy::None => {}
             }
         }
-        subject.viewed = slots;
+        if subject.viewed != slots {
+            subject.viewed = slots;
+            subject.views_changed();
+        }
         subject.confidence = seen.confidence;
         self.drawing.people_changed();
-        subject.update(&self.gpu, &mut self.drawing.rasterizer, pose, &views, &mut self.stages)?;
+        subject.update(&self.gpu, &mut self.drawing.rasterizer, pose, &views, effort, &mut self.stages)?;
         if !views.is_empty() {
             let ids = views.iter().map(|view| view.camera.id.clone());
             let judged = ids.zip(subject.agreement()).filter_map(|(id, quality)| Some((id, quality?)));

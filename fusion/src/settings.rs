@@ -2,11 +2,13 @@
 
 mod appearance;
 mod body;
+mod budget;
 mod perception;
 mod tracking;
 
 pub use appearance::{AppearanceMode, AppearanceOptions, NetworksOn};
 pub use body::BodySettings;
+pub use budget::BudgetSettings;
 pub use perception::{Origin, PerceptionSettings};
 pub use tracking::{Solver, TrackingSettings};
 
@@ -23,6 +25,8 @@ pub struct SessionSettings {
     pub tracking: TrackingSettings,
     /// How Gaussians get their colours.
     pub appearance: AppearanceOptions,
+    /// How fast sets have to be taken in.
+    pub budget: BudgetSettings,
 }
 
 impl SessionSettings {
@@ -34,6 +38,7 @@ impl SessionSettings {
         self.perception.validate()?;
         self.body.validate()?;
         self.tracking.validate()?;
+        self.budget.validate()?;
         self.appearance.validate()
     }
 }

@@ -16,7 +16,7 @@ use flyrig_tracker::{DeformReport, EdgeColor};
 use flyrig_types::{Camera, Image, Mask, PersonId, Pose, Rig};
 
 use crate::{
-    FusionError, NetworksOn, PersonMemory, SessionSettings, StageTimes, TrackWatch,
+    Effort, FusionError, NetworksOn, PersonMemory, SessionSettings, StageTimes, TrackWatch,
     deformation::{DeformTimes, Deformation, Instants, TrackedView},
     pose_curve::PoseCurve,
     stage_times::processor_time,
@@ -28,6 +28,8 @@ const SURFACE_SEED: u64 = 1;
 pub const PROCESSOR_STAGE: &str = "  processor";
 /// Stages of an update that the adapter times.
 const TIMED_STAGES: [&str; 3] = ["skinning", "visibility", "appearance"];
+/// Updates of a person who was just met that get all the work.
+const FULL_UPDATES: u32 = 10;
 /// Coverage by other people from which a pixel says nothing about this person.
 const OTHERS_COVER: u8 = 128;
 
@@ -101,8 +103,10 @@ pub struct Subject {
     pub(crate) shape_held: bool,
     /// Colours of direct appearance, while the Gaussians show those of the networks.
     direct_colors: Option<StorageBuffer<[f32; 4]>>,
-    /// Agreement of the deformation with the last update's views.
+    /// Agreement of the deformation with the views that it was solved for last.
     judged: Vec<Option<(f64, bool)>>,
+    /// Updates since the person was met.
+    updates: u32,
     /// Times of the last poses that were used, for what lies between and beyond them.
     pub(crate) curve: PoseCurve,
     pub(crate) watch: TrackWatch,
@@ -171,6 +175,7 @@ impl Subject {
             settings: settings.appearance.mode.settings(),
             posed: Vec::new(),
             judged: Vec::new(),
+            updates: 0,
             visibility: Vec::new(),
             inputs: Vec::new(),
             curve: PoseCurve::default(),
@@ -274,6 +279,11 @@ impl Subject {
         })
     }
 
+    /// Other cameras give images now than in the last update.
+    pub(crate) fn views_changed(&mut self) {
+        self.judged.clear();
+    }
+
     /// Takes in one instant: pose, then colours from the views. A view whose mask is empty adds nothing.
     pub(crate) fn update(
         &mut self,
@@ -281,8 +291,15 @@ impl Subject {
         rasterizer: &mut Rasterizer,
         pose: &Pose,
         views: &[InputView<'_>],
+        effort: Effort,
         stages: &mut StageTimes,
     ) -> Result<(), FusionError> {
+        // Somebody who was just met needs all the work: whatever comes later builds on it.
+        let turn = self.updates.saturating_sub(FULL_UPDATES);
+        self.updates = self.updates.saturating_add(1);
+        let solves = turn.is_multiple_of(effort.solve_every);
+        // Half a cycle later, so that neighbouring sets cost about the same.
+        let paints = turn == 0 || (turn + effort.paint_every / 2).is_multiple_of(effort.paint_every);
         stages.time("convert pictures", || self.take_images(gpu, views))?;
         // One update at a time is under way, and none while the processor's time is measured.
         gpu.wait()?;
@@ -307,8 +324,11 @@ impl Subject {
         let instants: Vec<(&Pose, &GaussianBuffers)> =
             poses.iter().copied().zip(std::iter::once(&self.gaussians).chain(&self.posed)).collect();
 
-        self.judged.clear();
-        if let Some(deformation) = self.deformation.as_mut().filter(|_| !views.is_empty() && !self.shape_held) {
+        let solves = solves && !views.is_empty() && !self.shape_held;
+        if solves || self.shape_held {
+            self.judged.clear();
+        }
+        if let Some(deformation) = self.deformation.as_mut().filter(|_| solves) {
             let (start, processor) = (Instant::now(), processor_time());
             let tracked: Vec<TrackedView<'_>> = views
                 .iter()
@@ -364,6 +384,11 @@ impl Subject {
             stages.add(TIMED_STAGES[0], start.elapsed());
         }
 
+        self.painted.clear();
+        if !paints {
+            stages.count("sets not painted", 1);
+            return Ok(());
+        }
         if let Some(direct) = &self.direct_colors {
             // Direct appearance goes on from its own colours.
             direct.copy_to(gpu, &self.gaussians.color);
@@ -477,6 +502,7 @@ impl Subject {
 
     /// Forgets clothes and colours: another person may come.
     pub(crate) fn forget(&mut self) {
+        self.updates = 0;
         if let Some(deformation) = &mut self.deformation {
             deformation.reset();
         }

@@ -30,6 +30,8 @@ pub struct PoseConfig {
     /// Distance that the body moves in a view until the network looks at that view again, metres; 0 looks at every view of
     /// every set.
     pub look_after_m: f64,
+    /// Views with an earlier look that the network looks at again in a set at most, those that need it most; 0: all that need it.
+    pub looks: usize,
     /// Largest number of solver steps a frame set.
     pub max_steps: usize,
     /// Whether bone lengths are fitted by [`crate::PoseEstimator::fit_shape`]; off for a template that
@@ -56,6 +58,7 @@ impl Default for PoseConfig {
             shape_rounds: 0,
             smooth_rad: 0.15,
             look_after_m: 0.02,
+            looks: 0,
             max_steps: 12,
             fit_shape: true,
             masks: true,

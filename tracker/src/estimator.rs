@@ -168,6 +168,11 @@ impl PoseEstimator {
         self.looks_at_all = always;
     }
 
+    /// Returns the settings, to change them from the next set on.
+    pub fn config_mut(&mut self) -> &mut PoseConfig {
+        &mut self.config
+    }
+
     /// The template, with the person's bone lengths once [`Self::fit_shape`] has run.
     #[must_use]
     pub fn template(&self) -> &Template {

@@ -68,13 +68,15 @@ impl Look {
 }
 
 /// Chooses the views that the network looks at again: all that have no look, all in which the body has moved far, and of
-/// those in which it has moved by more than `limit_m` the one that waits most. Views without a picture get none.
+/// those in which it has moved by more than `limit_m` the one that waits most. Views without a picture get none. Of those
+/// that have a look no more than `most` are chosen.
 pub(crate) fn due(
     looks: &[Option<Look>],
     has_picture: impl Fn(usize) -> bool,
     marks: &[DVec3; LANDMARK_COUNT],
     nanos: i64,
     limit_m: f64,
+    most: usize,
 ) -> Vec<bool> {
     let staleness: Vec<f64> = looks
         .iter()
@@ -85,8 +87,12 @@ pub(crate) fn due(
             Some(look) => look.staleness_m(marks, nanos),
         })
         .collect();
-    let most = staleness.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    staleness.iter().map(|&s| s > URGENT * limit_m || (s > limit_m && s >= most)).collect()
+    let stalest = staleness.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let mut due: Vec<bool> = staleness.iter().map(|&s| s > URGENT * limit_m || (s > limit_m && s >= stalest)).collect();
+    let mut order: Vec<usize> = (0..due.len()).filter(|&slot| due[slot] && looks[slot].is_some()).collect();
+    order.sort_by(|&a, &b| staleness[b].total_cmp(&staleness[a]));
+    order.into_iter().skip(most).for_each(|slot| due[slot] = false);
+    due
 }
 
 /// Corners of a body in a picture: pixel and depth in metres.

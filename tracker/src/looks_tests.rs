@@ -42,14 +42,17 @@ fn views_without_a_look_and_moved_views_are_due_and_still_ones_are_not() {
     let mut far = marks;
     far[15] += DVec3::new(0.0, 0.2, 0.0);
     let looks = |a, b| vec![Some(look_at(&a, &turns, 0)), Some(look_at(&b, &turns, 0)), None];
-    let due = |looks: &[Option<Look>], has_third, nanos| due(looks, |slot| slot < 2 || has_third, &marks, nanos, 0.01);
+    let due =
+        |looks: &[Option<Look>], has_third, nanos| due(looks, |slot| slot < 2 || has_third, &marks, nanos, 0.01, 3);
     assert_eq!(due(&looks(marks, marks), false, 0), [false, false, false], "nobody moved");
     assert_eq!(due(&looks(marks, marks), true, 0), [false, false, true], "no look yet");
     assert_eq!(due(&looks(marks, moved), false, 0), [false, true, false]);
     assert_eq!(due(&looks(moved, far), false, 0), [false, true, false], "the other one waits for its turn");
     assert_eq!(due(&looks(far, far), false, 0), [true, true, false], "too far to wait");
     assert_eq!(due(&looks(marks, marks), false, 1_000_000_000), [true, true, false], "nothing stays believed for ever");
-    let always = super::due(&looks(marks, marks), |_| true, &marks, 1, 0.0);
+    let one = super::due(&looks(far, moved), |_| true, &marks, 0, 0.01, 1);
+    assert_eq!(one, [true, false, true], "one look again, and the one without a look");
+    let always = super::due(&looks(marks, marks), |_| true, &marks, 1, 0.0, 3);
     assert_eq!(always, [true, true, true], "without a limit all views are looked at");
 }
 

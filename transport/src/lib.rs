@@ -65,7 +65,7 @@ pub use printable::{MAX_PRINTABLE, printable};
 pub use publisher::{Publisher, ViewpointCounts};
 pub use report::{LatencyReport, TopicReport};
 pub use splats::{MAX_PERSON_TOPICS, MAX_SPLATS, SplatState};
-pub use stats::{RigStats, StageTime, SubjectStats, TrackingStats, ViewRate};
+pub use stats::{BudgetStats, RigStats, StageTime, SubjectStats, TrackingStats, ViewRate};
 pub use subscriber::{Interests, Received, Subscriber, Views};
 pub use topic::{PublishOutcome, TopicCounts};
 pub use view::{ImageFormat, MAX_IMAGE_BYTES, ViewFrame};

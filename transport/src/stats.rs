@@ -80,6 +80,19 @@ pub struct SubjectStats {
     pub cameras: BTreeMap<String, f64>,
 }
 
+/// Effort of a rig with a budget of time.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct BudgetStats {
+    /// Sets a second that are wanted.
+    pub fps: f64,
+    /// Level of effort: 0 with all the work.
+    pub level: u32,
+    /// Number of levels.
+    pub levels: u32,
+    /// Smoothed cost of a set, seconds.
+    pub set_secs: f64,
+}
+
 /// How the rig is doing over its last interval (about a second).
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RigStats {
@@ -99,6 +112,9 @@ pub struct RigStats {
     pub views: Vec<ViewRate>,
     /// Subscribers with a viewpoint of their own.
     pub viewers: u32,
+    /// Level of effort; `None` without a budget, and from older programs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub budget: Option<BudgetStats>,
     /// The first of `subjects`, for programs that know one person. [`Self::encode`] fills it in from `subjects`, or
     /// `subjects` from it where that is empty; so does [`Self::decode`] with what an older program sent.
     #[serde(default)]

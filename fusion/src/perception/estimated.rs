@@ -14,7 +14,7 @@ use super::background::{BackgroundWatch, backgrounds, report};
 use super::colors::ClothesColors;
 use super::split_mask::{PosedMesh, split_mask};
 use super::{Observation, Perception, SeenPerson, ViewObservation};
-use crate::{FusionError, Origin, PerceptionSettings, StageTimes};
+use crate::{Effort, FusionError, Origin, PerceptionSettings, StageTimes};
 
 /// Frame sets that a person's shape is fitted to.
 pub const SHAPE_SETS: usize = 8;
@@ -80,6 +80,9 @@ pub struct EstimatedPerception {
     rig: Rig,
     masks: Origin,
     watch: BackgroundWatch,
+    /// Rounds of matching outlines and texture with all the work.
+    rounds: usize,
+    mattes: bool,
 }
 
 impl EstimatedPerception {
@@ -102,6 +105,7 @@ impl EstimatedPerception {
             look_after_m: settings.look_after_m,
             ..PoseConfig::default()
         };
+        let rounds = config.outline_rounds;
         let mut estimator = PoseEstimator::new(PoseNet::embedded()?, template, rig, config)?;
         estimator.set_backgrounds(backgrounds(&rig.cameras, settings, plates)?);
         let learning = (settings.shape() == Origin::Estimated).then(|| (Vec::new(), i64::MIN));
@@ -123,6 +127,8 @@ impl EstimatedPerception {
             rig: rig.clone(),
             masks: settings.masks,
             watch: BackgroundWatch::default(),
+            rounds,
+            mattes: true,
         })
     }
 
@@ -311,6 +317,16 @@ fn count_stages(estimate: &PoseEstimate, stages: &mut StageTimes) {
 }
 
 impl Perception for EstimatedPerception {
+    fn set_effort(&mut self, effort: Effort) {
+        self.mattes = effort.mattes;
+        for place in &mut self.places {
+            let config = place.estimator.config_mut();
+            config.looks = effort.looks;
+            config.search_crops = effort.search_crops;
+            config.outline_rounds = self.rounds.min(effort.rounds);
+        }
+    }
+
     fn people(&self) -> Vec<(PersonId, &Template)> {
         let known = self.places.iter().filter(|place| place.learning.is_none());
         known.map(|place| (place.id, place.template())).collect()
@@ -425,8 +441,8 @@ impl EstimatedPerception {
             }
         }
         let mut mattes = match self.masks {
-            Origin::Given => BTreeMap::new(),
-            Origin::Estimated => stages.time("matte", || self.mattes(set, &seen, estimates))?,
+            Origin::Estimated if self.mattes => stages.time("matte", || self.mattes(set, &seen, estimates))?,
+            _ => BTreeMap::new(),
         };
         for (slot, frame) in set.present() {
             let mut own = Vec::new();
@@ -439,7 +455,7 @@ impl EstimatedPerception {
                     Origin::Given => (frame.mask.as_ref().map(Cow::Borrowed), Vec::new()),
                     Origin::Estimated => match mattes.remove(&(slot, index)) {
                         Some(Matte { mask, colors }) => (Some(Cow::Owned(mask)), colors),
-                        None => (None, Vec::new()),
+                        None => (estimate.masks.get_mut(slot).and_then(Option::take).map(Cow::Owned), Vec::new()),
                     },
                 };
                 let landmarks = estimate.keypoints.get_mut(slot).and_then(Option::take);

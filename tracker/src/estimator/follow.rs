@@ -67,9 +67,14 @@ impl PoseEstimator {
     ) -> Result<Option<Fitted>, TrackError> {
         let start = Instant::now();
         let predicted = track.predicted(set.master_nanos);
-        let look_after_m = if self.looks_at_all { 0.0 } else { self.config.look_after_m };
+        let config = &self.config;
+        let (look_after_m, most) = match (self.looks_at_all, config.looks) {
+            (true, _) => (0.0, usize::MAX),
+            (false, 0) => (config.look_after_m, usize::MAX),
+            (false, most) => (config.look_after_m, most),
+        };
         let has_picture = |slot: usize| pictures.get(slot).is_some_and(Option::is_some);
-        let due = due(&track.looks, has_picture, &predicted, set.master_nanos, look_after_m);
+        let due = due(&track.looks, has_picture, &predicted, set.master_nanos, look_after_m, most);
         let looks: Vec<Option<Look>> = pictures
             .par_iter()
             .zip(&self.rig.cameras)

@@ -1,0 +1,30 @@
+//! `flyrig calibrate`: boards, lenses and rigs.
+
+mod board;
+mod lens;
+mod rig;
+mod views;
+
+use std::path::Path;
+
+use anyhow::{Result, bail};
+use flyrig_gpu::GpuContext;
+
+use crate::cli::CalibrateAction;
+
+/// Refuses to replace files of an earlier run.
+fn refuse_existing(folder: &Path, names: &[&str], force: bool) -> Result<()> {
+    match names.iter().map(|name| folder.join(name)).find(|file| file.exists()) {
+        Some(known) if !force => bail!("{} is there already; --force replaces it", known.display()),
+        _ => Ok(()),
+    }
+}
+
+/// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
+pub fn calibrate(action: &CalibrateAction, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
+    match action {
+        CalibrateAction::Board(args) => board::board(args),
+        CalibrateAction::Lens(args) => lens::lens(args, gpu),
+        CalibrateAction::Rig(args) => rig::rig(args, gpu),
+    }
+}

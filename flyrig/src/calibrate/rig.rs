@@ -1,0 +1,156 @@
+//! `flyrig calibrate rig`: poses of all cameras from a board that they see together.
+
+use anyhow::{Context as _, Result, ensure};
+use flyrig_calib::{Board, LensModel, RigFit, RigOptions, calibrate_rig, load_lenses, save_easymocap};
+use flyrig_gpu::GpuContext;
+use flyrig_report::{stop, write_whole};
+use flyrig_types::Intrinsics;
+use serde_json::json;
+
+use super::{lens, refuse_existing, views::Seen};
+use crate::{cli::CalibrateRigArgs, take};
+
+/// Time offsets are kept where they lower the noise to this share.
+const OFFSETS_PAY: f64 = 0.95;
+/// Halves of the shots may differ by so many times what noise explains.
+const MOST_DISAGREEMENT: f64 = 1.5;
+
+/// Runs the command.
+pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
+    stop::flag();
+    let board = Board::load(&args.board)?;
+    refuse_existing(&args.out, &["intri.yml", "extri.yml", "calibration.json"], args.force)?;
+    let seen = Seen::find(
+        take::open(&args.take.input, args.take.fps, gpu)?,
+        &board,
+        args.take.secs,
+        args.take.every_ms * 1e-3,
+    )?;
+    ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
+    seen.check(&board)?;
+    let lenses = lenses(args, &board, &seen)?;
+    let refine = args.refine_lenses.then_some(LensModel::RadialTangential);
+    let solve = |lags| {
+        let options = RigOptions { lens: refine, lags, floor_first: args.floor };
+        calibrate_rig(&board, &seen.ids, &lenses, &seen.shots, options)
+    };
+    let plain = solve(false)?;
+    // Offsets only where the board moved, and where they explain something.
+    let with_offsets = if args.no_offsets { None } else { solve(true).ok() };
+    let better = |fit: &RigFit| {
+        fit.sigma_px < OFFSETS_PAY * plain.sigma_px && fit.cameras.iter().all(|camera| camera.deviation.is_some())
+    };
+    let noise_before = plain.sigma_px;
+    let (fit, has_offsets) = match with_offsets.filter(better) {
+        Some(fit) => (fit, true),
+        None => (plain, false),
+    };
+    print(&seen, &fit, has_offsets.then_some(noise_before));
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    save_easymocap(&args.out, &fit.rig)?;
+    write_whole(&args.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(&seen, &fit))?)?;
+    println!("{}: intri.yml, extri.yml, calibration.json", args.out.display());
+    println!("next: set source.path = \"{}\" in the configuration, then flyrig doctor", args.out.display());
+    Ok(())
+}
+
+/// The lenses of a folder, or those that this take itself tells.
+fn lenses(args: &CalibrateRigArgs, board: &Board, seen: &Seen) -> Result<Vec<Intrinsics>> {
+    let Some(folder) = &args.lenses else {
+        return Ok(lens::solve(board, seen)?.into_iter().map(|(_, intrinsics)| intrinsics).collect());
+    };
+    let size = |id: &_| {
+        let slot = seen.ids.iter().position(|known| known == id)?;
+        seen.sizes[slot].map(|[width, height]| (width, height))
+    };
+    let known = load_lenses(folder, &size)?;
+    let of = |id| {
+        let found = known.iter().find(|(known, _)| known == id).map(|(_, intrinsics)| *intrinsics);
+        found.with_context(|| {
+            format!("camera {id} is not in {}; calibrate its lens, or leave --lenses out", folder.display())
+        })
+    };
+    seen.ids.iter().map(of).collect()
+}
+
+fn print(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) {
+    let pair =
+        |values: Option<(f64, f64)>| values.map_or_else(|| "open".to_owned(), |(deg, mm)| format!("{deg:.3} {mm:.1}"));
+    println!(
+        "{:<14} {:>6} {:>7} {:>14} {:>16} {:>14}",
+        "camera", "boards", "rms px", "+- deg, mm", "halves deg, mm", "offset ms"
+    );
+    for (id, camera) in seen.ids.iter().zip(&fit.cameras) {
+        let (lag, sigma) = camera.lag_s;
+        println!(
+            "{:<14} {:>6} {:>7.3} {:>14} {:>16} {:>14}",
+            id,
+            camera.views,
+            camera.rms_px,
+            pair(camera.deviation),
+            pair(camera.halves),
+            if noise_without_offsets.is_some() {
+                format!("{:.1} +-{:.1}", 1e3 * lag, 1e3 * sigma)
+            } else {
+                "-".to_owned()
+            }
+        );
+    }
+    for pair in &fit.pairs {
+        let (a, b) = pair.cameras;
+        println!("{} and {} share {} boards, {} agree", seen.ids[a], seen.ids[b], pair.shots, pair.agreeing);
+    }
+    println!("rms {:.3} px, noise {:.3} px a coordinate, {} boards", fit.rms_px, fit.sigma_px, fit.shots.len());
+    if let Some(before) = noise_without_offsets {
+        println!(
+            "the cameras' stamps are off: without offsets the noise is {before:.3} px; put them into [sync] lags_ms, or trigger the \
+             cameras"
+        );
+    }
+    match fit.worst_disagreement() {
+        Some((slot, ratio)) if ratio > MOST_DISAGREEMENT => println!(
+            "warning: two solves from either half of the boards differ by {ratio:.1} times what noise explains, most for camera {}: \
+             a time offset that changes, blur, a bent board, or a lens that needs calibrating by itself (flyrig calibrate lens)",
+            seen.ids[slot]
+        ),
+        Some((_, ratio)) => {
+            println!(
+                "two solves from either half of the boards agree ({ratio:.1} times what noise explains, at worst)"
+            );
+        }
+        None => println!("warning: too few boards to solve twice; show more"),
+    }
+    let mut worst: Vec<&(i64, f64)> = fit.shots.iter().collect();
+    worst.sort_by(|a, b| b.1.total_cmp(&a.1));
+    let times: Vec<String> =
+        worst.iter().take(3).map(|(nanos, px)| format!("{:.2} s ({px:.2} px)", *nanos as f64 * 1e-9)).collect();
+    println!("worst boards: {}", times.join(", "));
+}
+
+/// `calibration.json`.
+fn report(seen: &Seen, fit: &RigFit) -> serde_json::Value {
+    let cameras: Vec<_> = seen
+        .ids
+        .iter()
+        .zip(&fit.cameras)
+        .map(|(id, camera)| {
+            json!({
+                "camera": id,
+                "rms_px": camera.rms_px,
+                "boards": camera.views,
+                "corners": camera.corners,
+                "deviation_deg_mm": camera.deviation,
+                "halves_deg_mm": camera.halves,
+                "offset_secs": camera.lag_s.0,
+                "offset_deviation_secs": camera.lag_s.1,
+            })
+        })
+        .collect();
+    json!({
+        "rms_px": fit.rms_px,
+        "sigma_px": fit.sigma_px,
+        "cameras": cameras,
+        "pairs": fit.pairs,
+        "boards": fit.shots.iter().map(|(nanos, px)| json!({ "nanos": nanos, "rms_px": px })).collect::<Vec<_>>(),
+    })
+}

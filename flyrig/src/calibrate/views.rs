@@ -1,0 +1,134 @@
+//! Boards in the images of a take.
+
+use std::{collections::BTreeMap, time::Duration};
+
+use anyhow::{Result, anyhow, ensure};
+use flyrig_calib::{Board, BoardDetector, BoardView, GrayImage, Shot, detector};
+use flyrig_fusion::{InputFormat, Intake};
+use flyrig_report::{progress_bar, stop};
+use flyrig_sync::SyncSettings;
+use flyrig_types::{CameraId, FrameSet};
+use rayon::prelude::*;
+
+use crate::take::Take;
+
+/// Images that are looked at together.
+const BATCH: usize = 16;
+
+/// What a take shows of a board.
+pub struct Seen {
+    pub ids: Vec<CameraId>,
+    /// By camera, pixels; `None` for one without an image.
+    pub sizes: Vec<Option<[u32; 2]>>,
+    /// Sets in which at least one camera saw the board.
+    pub shots: Vec<Shot>,
+    /// By camera: images that were looked at.
+    pub images: Vec<usize>,
+}
+
+impl Seen {
+    /// Looks for the board in a set every `every_secs`, over at most `secs`.
+    pub fn find(take: Take, board: &Board, secs: f64, every_secs: f64) -> Result<Self> {
+        let detector = detector(board).map_err(|reason| anyhow!(reason))?;
+        let ids: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
+        let count = ids.len();
+        let mut seen = Self { ids, sizes: vec![None; count], shots: Vec::new(), images: vec![0; count] };
+        let mut intake =
+            Intake::start_opening(take.sources, InputFormat::AnySize, &SyncSettings::default(), take.pacing)?;
+        let bar = progress_bar((secs * 1e3) as u64, "boards, ms of the take");
+        let (mut first, mut next, mut batch) = (None, i64::MIN, Vec::new());
+        while !intake.ended() && !stop::requested() {
+            let Some(set) = intake.next_set(Duration::from_millis(200)) else { continue };
+            let from = *first.get_or_insert(set.master_nanos);
+            let at = set.master_nanos.saturating_sub(from) as f64 * 1e-9;
+            if at > secs {
+                break;
+            }
+            bar.set_position((at * 1e3) as u64);
+            // A little early is the right set where stamps jitter.
+            if set.master_nanos < next {
+                continue;
+            }
+            next = set.master_nanos.saturating_add((every_secs * 0.9e9) as i64);
+            batch.push(set);
+            if batch.len() * count >= BATCH {
+                seen.look(&batch, detector.as_ref())?;
+                batch.clear();
+                bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
+            }
+        }
+        seen.look(&batch, detector.as_ref())?;
+        bar.finish_and_clear();
+        for (slot, id) in seen.ids.iter().enumerate() {
+            match intake.last_error(slot) {
+                Some(error) if seen.images[slot] == 0 => {
+                    return Err(anyhow!("no image of camera {id} could be used; the last: {error}"));
+                }
+                Some(error) => eprintln!("warning: not every image of camera {id} could be used; the last: {error}"),
+                None => {}
+            }
+        }
+        Ok(seen)
+    }
+
+    fn look(&mut self, sets: &[FrameSet], detector: &dyn BoardDetector) -> Result<()> {
+        let jobs: Vec<(usize, usize)> =
+            sets.iter().enumerate().flat_map(|(i, set)| set.present().map(move |(slot, _)| (i, slot))).collect();
+        let found: BTreeMap<(usize, usize), BoardView> = jobs
+            .par_iter()
+            .filter_map(|&(i, slot)| {
+                let frame = sets[i].frames[slot].as_ref()?;
+                let corners = detector.detect(&GrayImage::of(&frame.image)?);
+                let view = BoardView { camera: slot, nanos: frame.capture_nanos, corners };
+                (!view.corners.is_empty()).then_some(((i, slot), view))
+            })
+            .collect();
+        for (i, slot) in jobs {
+            let Some(frame) = &sets[i].frames[slot] else { continue };
+            let size = [frame.image.width(), frame.image.height()];
+            let known = *self.sizes[slot].get_or_insert(size);
+            ensure!(
+                known == size,
+                "camera {}: its images are {}x{} and {}x{}; calibrate with one size",
+                self.ids[slot],
+                known[0],
+                known[1],
+                size[0],
+                size[1]
+            );
+            self.images[slot] += 1;
+        }
+        for (i, set) in sets.iter().enumerate() {
+            let views: Vec<BoardView> = found.range((i, 0)..(i + 1, 0)).map(|(_, view)| view.clone()).collect();
+            if !views.is_empty() {
+                self.shots.push(Shot { nanos: set.master_nanos, views });
+            }
+        }
+        Ok(())
+    }
+
+    /// Views of one camera, in the order of time.
+    pub fn of_camera(&self, slot: usize) -> Vec<BoardView> {
+        self.shots.iter().flat_map(|shot| &shot.views).filter(|view| view.camera == slot).cloned().collect()
+    }
+
+    /// Checks that every camera saw the board at all.
+    pub fn check(&self, board: &Board) -> Result<()> {
+        for (slot, id) in self.ids.iter().enumerate() {
+            ensure!(
+                !self.of_camera(slot).is_empty(),
+                "camera {id}: no board in its {} images; check board.toml ({} x {} squares), light and focus, and show the whole \
+                 board{}",
+                self.images[slot],
+                board.columns,
+                board.rows,
+                match board.pattern {
+                    flyrig_calib::Pattern::Chessboard => "",
+                    flyrig_calib::Pattern::Charuco { .. } =>
+                        " (its dictionary and size of markers must be those of the print)",
+                }
+            );
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,44 @@
+//! How much work a set gets.
+
+use serde::Serialize;
+
+/// Work on a set. Whatever is left out costs accuracy; docs/benchmarks/budget.md has the prices.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct Effort {
+    /// Views with an earlier look that the pose network looks at again at most; 0: all in which the body has moved.
+    pub looks: usize,
+    /// Crops of an image that a search for a person looks at; 0: all.
+    pub search_crops: usize,
+    /// Rounds in which the pose is matched with outlines and texture, at most.
+    pub rounds: usize,
+    /// Whether coverage and colours along outlines are solved for.
+    pub mattes: bool,
+    /// Sets from one solve of the deformation to the next.
+    pub solve_every: u32,
+    /// Sets from one painting to the next, networks included.
+    pub paint_every: u32,
+}
+
+impl Effort {
+    /// Everything, in every set.
+    pub const FULL: Self = Self { looks: 0, search_crops: 3, rounds: 2, mattes: true, solve_every: 1, paint_every: 1 };
+
+    /// Levels from everything to little. Each gives up what costs the fewest decibels for a millisecond.
+    pub const LEVELS: [Self; 8] = {
+        let mut levels = [Self::FULL; 8];
+        levels[1] = Self { mattes: false, ..levels[0] };
+        levels[2] = Self { paint_every: 2, ..levels[1] };
+        levels[3] = Self { rounds: 1, ..levels[2] };
+        levels[4] = Self { looks: 2, search_crops: 2, ..levels[3] };
+        levels[5] = Self { solve_every: 2, search_crops: 1, ..levels[4] };
+        levels[6] = Self { solve_every: 3, paint_every: 3, ..levels[5] };
+        levels[7] = Self { looks: 1, ..levels[6] };
+        levels
+    };
+}
+
+impl Default for Effort {
+    fn default() -> Self {
+        Self::FULL
+    }
+}
