@@ -14,6 +14,8 @@ mod print;
 mod projection;
 mod rig;
 mod start;
+#[doc(hidden)]
+pub mod testing;
 mod yaml;
 
 pub use board::{Board, Pattern};

@@ -6,7 +6,7 @@ use glam::{DMat3, DQuat, DVec3};
 use nalgebra::DMatrix;
 
 use crate::{
-    Board, CalibError, LensModel, Pair, Shot,
+    Board, BoardView, CalibError, LensModel, Pair, Shot,
     adjust::{Adjusted, adjust},
     bundle::{Estimate, Free},
     start::{rig_start, rms},
@@ -84,7 +84,13 @@ pub fn calibrate_rig(
     shots: &[Shot],
     options: RigOptions,
 ) -> Result<RigFit, CalibError> {
-    let (start, pairs, shots) = rig_start(board, shots, ids, intrinsics)?;
+    if intrinsics.len() != ids.len() || ids.is_empty() {
+        return Err(CalibError::RigOpen);
+    }
+    let is_known = |view: &&BoardView| view.camera < ids.len();
+    let known = |shot: &Shot| Shot { views: shot.views.iter().filter(is_known).cloned().collect(), ..*shot };
+    let shots: Vec<Shot> = shots.iter().map(known).collect();
+    let (start, pairs, shots) = rig_start(board, &shots, ids, intrinsics)?;
     let points: Vec<DVec3> = (0..board.corner_count()).map(|index| board.corner(index)).collect();
     let free = Free { lens: options.lens, lags: options.lags };
     let fit = adjust(&points, &shots, start, free).ok_or(CalibError::RigOpen)?;

@@ -1,128 +1,16 @@
 //! Calibration from simulated corners, against the truth.
 
 use flyrig_calib::{
-    Board, BoardView, CalibError, LensModel, Pattern, RigOptions, SeenCorner, Shot, calibrate_lens, calibrate_rig,
+    Board, BoardView, CalibError, LensModel, Pattern, RigOptions, Shot, calibrate_lens, calibrate_rig,
+    testing::{Random, pose_errors, ring, shots, view},
 };
-use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Lens};
+use flyrig_types::{Camera, CameraId, Intrinsics, Isometry};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 const SIZE: [u32; 2] = [1280, 720];
 
-/// Repeatable random numbers.
-struct Random(u64);
-
-impl Random {
-    fn uniform(&mut self) -> f64 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    fn between(&mut self, low: f64, high: f64) -> f64 {
-        low + (high - low) * self.uniform()
-    }
-
-    fn normal(&mut self) -> f64 {
-        (-2.0 * (1.0 - self.uniform()).ln()).sqrt() * (std::f64::consts::TAU * self.uniform()).cos()
-    }
-
-    fn vector(&mut self) -> DVec3 {
-        DVec3::new(self.normal(), self.normal(), self.normal())
-    }
-}
-
 fn board() -> Board {
     Board { columns: 9, rows: 6, square_mm: 40.0, pattern: Pattern::Chessboard }
-}
-
-fn intrinsics(random: &mut Random) -> Intrinsics {
-    Intrinsics {
-        width: SIZE[0],
-        height: SIZE[1],
-        focal_px: DVec2::new(random.between(850.0, 1000.0), 0.0) + DVec2::Y * random.between(850.0, 1000.0),
-        center_px: DVec2::new(639.5, 359.5) + DVec2::new(random.normal(), random.normal()) * 8.0,
-        lens: Lens::RadialTangential { radial: [random.between(-0.3, -0.1), 0.08, 0.0], tangential: [0.0008, -0.0006] },
-    }
-}
-
-/// Cameras on a ring of 3.2 m that look at its middle, z up.
-fn ring(random: &mut Random, count: usize) -> Vec<Camera> {
-    (0..count)
-        .map(|i| {
-            let angle = std::f64::consts::TAU * i as f64 / count as f64 + 0.1 * random.normal();
-            let eye = DVec3::new(3.2 * angle.cos(), 3.2 * angle.sin(), random.between(1.2, 2.4));
-            Camera {
-                id: format!("{i:02}").into(),
-                intrinsics: intrinsics(random),
-                camera_from_world: Isometry::look_at(eye, DVec3::Z * 0.8 + random.vector() * 0.1, DVec3::Z),
-            }
-        })
-        .collect()
-}
-
-/// What a camera sees of a board at `world_from_board`, with noise; `None` from behind, from the edge, and outside the image.
-fn view(
-    random: &mut Random,
-    camera: &Camera,
-    slot: usize,
-    world_from_board: &Isometry,
-    noise_px: f64,
-) -> Option<BoardView> {
-    let board = board();
-    let normal = world_from_board.rotation * DVec3::Z;
-    let sight = world_from_board.transform_point(board.middle()) - camera.position();
-    if normal.dot(sight.normalize()) < 0.25 {
-        return None;
-    }
-    let inside = |p: DVec2| p.x > 5.0 && p.y > 5.0 && p.x < f64::from(SIZE[0]) - 6.0 && p.y < f64::from(SIZE[1]) - 6.0;
-    let corners: Vec<SeenCorner> = (0..board.corner_count())
-        .filter_map(|index| {
-            let pixel = camera.project(world_from_board.transform_point(board.corner(index)))?;
-            let pixel = pixel + DVec2::new(random.normal(), random.normal()) * noise_px;
-            inside(pixel).then_some(SeenCorner { index, pixel })
-        })
-        .collect();
-    (corners.len() == board.corner_count()).then_some(BoardView { camera: slot, nanos: 0, corners })
-}
-
-/// A board around the middle of the ring in a random pose.
-fn board_pose(random: &mut Random) -> Isometry {
-    let rotation = DQuat::from_scaled_axis(random.vector().normalize() * random.between(0.0, 3.1));
-    let middle = DVec3::new(random.normal(), random.normal(), random.normal() + 2.3) * 0.35;
-    Isometry::new(rotation, middle - rotation * board().middle())
-}
-
-/// Shots of random boards that at least two cameras see.
-fn shots(random: &mut Random, cameras: &[Camera], count: usize, noise_px: f64) -> Vec<Shot> {
-    let mut shots = Vec::new();
-    while shots.len() < count {
-        let pose = board_pose(random);
-        let nanos = shots.len() as i64 * 1_000_000_000;
-        let mut views: Vec<BoardView> = cameras
-            .iter()
-            .enumerate()
-            .filter_map(|(slot, camera)| view(random, camera, slot, &pose, noise_px))
-            .collect();
-        views.iter_mut().for_each(|view| view.nanos = nanos);
-        if views.len() > 1 {
-            shots.push(Shot { nanos, views });
-        }
-    }
-    shots
-}
-
-/// Errors of direction (degrees) and place (millimetres) of each camera relative to the first one.
-fn pose_errors(found: &[Camera], truth: &[Camera]) -> Vec<(f64, f64)> {
-    let relative = |cameras: &[Camera], i: usize| {
-        let (first, other) = (cameras[0].camera_from_world, cameras[i].camera_from_world);
-        let rotation = other.rotation * first.rotation.inverse();
-        (rotation, first.transform_point(cameras[i].position()))
-    };
-    (1..truth.len())
-        .map(|i| {
-            let ((ra, pa), (rb, pb)) = (relative(found, i), relative(truth, i));
-            (ra.angle_between(rb).to_degrees(), 1e3 * pa.distance(pb))
-        })
-        .collect()
 }
 
 fn ids(cameras: &[Camera]) -> Vec<CameraId> {
@@ -139,7 +27,7 @@ fn a_rig_is_found_from_boards_and_knows_how_well() {
     for (seed, count) in [(1, 3), (2, 4), (3, 6), (4, 8)] {
         let mut random = Random(seed);
         let cameras = ring(&mut random, count);
-        let shots = shots(&mut random, &cameras, 60, 0.2);
+        let shots = shots(&mut random, &board(), &cameras, 60, 0.2);
         let fit = calibrate_rig(&board(), &ids(&cameras), &lenses(&cameras), &shots, RigOptions::default()).unwrap();
         assert!((0.17..0.23).contains(&fit.sigma_px), "{count} cameras: {} px", fit.sigma_px);
         for (camera, (deg, mm)) in fit.cameras[1..].iter().zip(pose_errors(&fit.rig.cameras, &cameras)) {
@@ -167,7 +55,7 @@ fn a_lens_is_found_with_the_coefficients_that_pay() {
         let pose = Isometry::new(tilt, place - tilt * board().middle());
         let back = camera.camera_from_world.inverse();
         let pose = Isometry::new(back.rotation * pose.rotation, back.transform_point(pose.translation));
-        if let Some(mut view) = view(&mut random, &camera, 0, &pose, 0.15) {
+        if let Some(mut view) = view(&mut random, &board(), &camera, 0, &pose, 0.15) {
             view.nanos = views.len() as i64;
             views.push(view);
         }
@@ -212,7 +100,7 @@ fn boards_without_tilt_leave_the_lens_open() {
         .filter_map(|i| {
             let turn = DQuat::from_rotation_z(0.2 * f64::from(i));
             let middle = DVec3::new(random.between(-0.2, 0.2), random.between(-0.1, 0.1), 1.0);
-            view(&mut random, &camera, 0, &Isometry::new(turn, middle - turn * board().middle()), 0.2)
+            view(&mut random, &board(), &camera, 0, &Isometry::new(turn, middle - turn * board().middle()), 0.2)
         })
         .collect();
     assert!(views.len() > 5);
@@ -224,7 +112,7 @@ fn boards_without_tilt_leave_the_lens_open() {
 fn cameras_that_share_no_board_are_listed_in_groups() {
     let mut random = Random(7);
     let cameras = ring(&mut random, 4);
-    let mut shots = shots(&mut random, &cameras, 80, 0.2);
+    let mut shots = shots(&mut random, &board(), &cameras, 80, 0.2);
     for shot in &mut shots {
         let low = shot.views[0].camera < 2;
         shot.views.retain(|view| (view.camera < 2) == low);
@@ -240,7 +128,7 @@ fn cameras_that_share_no_board_are_listed_in_groups() {
 fn wrong_views_and_poisoned_corners_are_left_out() {
     let mut random = Random(8);
     let cameras = ring(&mut random, 4);
-    let mut shots = shots(&mut random, &cameras, 60, 0.2);
+    let mut shots = shots(&mut random, &board(), &cameras, 60, 0.2);
     // One view in twelve shows the board turned by half, as a wrong detection does, and some corners are nowhere.
     let last = board().corner_count() - 1;
     for (i, shot) in shots.iter_mut().enumerate() {
@@ -281,7 +169,7 @@ fn time_offsets_are_found_from_a_board_that_moves() {
         for (slot, camera) in cameras.iter().enumerate() {
             // Its stamp says `nanos`, but it was taken `lag` earlier.
             let pose = pose_at(nanos as f64 * 1e-9 - lags_s[slot]);
-            if let Some(seen) = view(&mut random, camera, slot, &pose, 0.2) {
+            if let Some(seen) = view(&mut random, &board(), camera, slot, &pose, 0.2) {
                 views.push(BoardView { nanos, ..seen });
             }
         }
@@ -308,12 +196,15 @@ fn time_offsets_are_found_from_a_board_that_moves() {
 fn the_board_on_the_floor_gives_height_and_up() {
     let mut random = Random(10);
     let cameras = ring(&mut random, 4);
-    let mut shots = shots(&mut random, &cameras, 40, 0.1);
+    let mut shots = shots(&mut random, &board(), &cameras, 40, 0.1);
     // Lies on the floor with its face up: its z axis points down.
     let turn = DQuat::from_mat3(&DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0))) * DQuat::from_rotation_z(0.4);
     let pose = Isometry::new(turn, DVec3::new(0.1, -0.1, 0.0) - turn * board().middle());
-    let views: Vec<BoardView> =
-        cameras.iter().enumerate().filter_map(|(slot, camera)| view(&mut random, camera, slot, &pose, 0.1)).collect();
+    let views: Vec<BoardView> = cameras
+        .iter()
+        .enumerate()
+        .filter_map(|(slot, camera)| view(&mut random, &board(), camera, slot, &pose, 0.1))
+        .collect();
     assert!(views.len() > 1);
     shots.insert(0, Shot { nanos: -1_000_000_000, views });
     let options = RigOptions { floor_first: true, ..RigOptions::default() };

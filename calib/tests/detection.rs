@@ -1,15 +1,11 @@
 //! Printed boards, seen by a camera: every corner has the right number and place.
 #![allow(clippy::unwrap_used)] // helpers of tests
 
-use flyrig_calib::{Board, BoardSheet, GrayImage, Pattern, detector};
+use flyrig_calib::{Board, BoardSheet, GrayImage, Pattern, detector, testing::photograph};
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
 use glam::{DQuat, DVec2, DVec3};
 
 const SIZE: [u32; 2] = [960, 720];
-/// Pixels of the scanned sheet a millimetre, and samples along a side of an image's pixel.
-const SCAN: f64 = 8.0;
-const SAMPLES: i32 = 3;
-
 fn charuco(dictionary: &str) -> Board {
     let pattern = Pattern::Charuco { dictionary: dictionary.to_owned(), marker: 0.75 };
     Board { columns: 7, rows: 5, square_mm: 40.0, pattern }
@@ -33,48 +29,6 @@ fn camera() -> Camera {
     }
 }
 
-/// Photographs the printed board at `world_from_board`, with noise, on a grey wall.
-fn photograph(board: &Board, camera: &Camera, world_from_board: &Isometry, mirrored: bool) -> GrayImage {
-    let sheet = BoardSheet::new(board, None).unwrap();
-    let [width, height] = sheet.size_mm.map(|mm| (mm * SCAN) as usize);
-    let mut scan = vec![235u8; width * height];
-    for [x, y, w, h] in &sheet.rectangles {
-        let pixels = |from: f64, length: f64| (from * SCAN).round() as usize..((from + length) * SCAN).round() as usize;
-        for row in pixels(*y, *h) {
-            scan[row * width..][pixels(*x, *w)].fill(20);
-        }
-    }
-    let side_m = 1e-3 * board.square_mm;
-    let board_from_world = world_from_board.inverse();
-    let origin = board_from_world.transform_point(camera.position());
-    let mut state = 1u32;
-    let mut pixels = Vec::new();
-    for y in 0..SIZE[1] {
-        for x in 0..SIZE[0] {
-            let mut sum = 0.0;
-            for k in 0..SAMPLES * SAMPLES {
-                let offset = DVec2::new(f64::from(k % SAMPLES), f64::from(k / SAMPLES)) / f64::from(SAMPLES);
-                let at = DVec2::new(f64::from(x), f64::from(y)) + offset - 0.5 + 0.5 / f64::from(SAMPLES);
-                let sight = (at - camera.intrinsics.center_px) / camera.intrinsics.focal_px;
-                let ray = board_from_world.rotation * sight.extend(1.0);
-                let on_board = origin + ray * (-origin.z / ray.z);
-                // The first inner corner is a square away from the board's corner.
-                let mut mm = (on_board.truncate() + side_m) * 1e3;
-                if mirrored {
-                    mm.x = f64::from(board.columns) * board.square_mm - mm.x;
-                }
-                let place = (mm + DVec2::from(sheet.board_at_mm)) * SCAN;
-                let inside = place.min_element() >= 0.0 && place.x < width as f64 && place.y < height as f64;
-                sum += if inside { f64::from(scan[place.y as usize * width + place.x as usize]) } else { 120.0 };
-            }
-            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            let noise = f64::from(state >> 24) / 64.0 - 2.0;
-            pixels.push((sum / f64::from(SAMPLES * SAMPLES) + noise).round() as u8);
-        }
-    }
-    GrayImage { width: SIZE[0] as usize, height: SIZE[1] as usize, pixels }
-}
-
 /// The board's middle at a place before the camera, turned.
 fn pose(board: &Board, turn: DVec3, middle: DVec3) -> Isometry {
     let rotation = DQuat::from_scaled_axis(turn);
@@ -84,7 +38,7 @@ fn pose(board: &Board, turn: DVec3, middle: DVec3) -> Isometry {
 /// Number of corners, and the largest distance from the truth, pixels.
 fn check(board: &Board, at: &Isometry) -> (usize, f64) {
     let camera = camera();
-    let seen = detector(board).unwrap().detect(&photograph(board, &camera, at, false));
+    let seen = detector(board).unwrap().detect(&photograph(board, &camera, at, false).unwrap());
     let off = |corner: &flyrig_calib::SeenCorner| {
         camera.project(at.transform_point(board.corner(corner.index))).unwrap().distance(corner.pixel)
     };
@@ -131,10 +85,10 @@ fn a_chessboard_is_numbered_from_the_same_corner_in_any_turn() {
 fn what_is_not_the_board_is_not_seen() {
     let board = charuco("DICT_4X4_50");
     let at = pose(&board, DVec3::new(0.2, 0.1, 0.0), DVec3::new(0.0, 0.0, 0.55));
-    let image = photograph(&board, &camera(), &at, false);
+    let image = photograph(&board, &camera(), &at, false).unwrap();
     let seen = |board: &Board, image: &GrayImage| detector(board).unwrap().detect(image).len();
     assert_eq!(seen(&charuco("DICT_6X6_250"), &image), 0, "another dictionary");
-    assert_eq!(seen(&board, &photograph(&board, &camera(), &at, true)), 0, "mirrored");
+    assert_eq!(seen(&board, &photograph(&board, &camera(), &at, true).unwrap()), 0, "mirrored");
     for (width, height) in [(1, 1), (0, 0), (7, 300), (640, 480)] {
         let empty = GrayImage { width, height, pixels: vec![90; width * height] };
         assert_eq!(seen(&board, &empty) + seen(&chessboard(), &empty), 0, "{width}x{height}");

@@ -22,7 +22,7 @@ const LONGEST_WAIT: u32 = 960;
 /// Sets after which a level with more work has proven itself.
 const PROVEN: u32 = 60;
 /// Cost of each level over that of the one before it, until it has been measured.
-const EXPECTED_STEP: f64 = 0.92;
+const EXPECTED_STEP: f64 = 0.9;
 const LEVELS: usize = Effort::LEVELS.len();
 
 /// Chooses the level of effort from what sets have cost.
@@ -42,7 +42,7 @@ pub struct Budget {
     /// The level before the last change and what it cost.
     before: Option<(usize, f64)>,
     wait: u32,
-    /// Seconds that the set under way has cost so far; `None` for one that is left out, which says nothing about the cost.
+    /// Seconds that the set under way has cost so far; `None` for one that does not count.
     spent: Option<f64>,
 }
 
@@ -85,7 +85,7 @@ impl Budget {
         }
     }
 
-    /// Leaves the set under way out.
+    /// Leaves the set under way out: its cost says nothing about the next ones'.
     pub(crate) fn leave_out(&mut self) {
         self.spent = None;
     }

@@ -29,8 +29,8 @@ impl Effort {
         levels[1] = Self { mattes: false, ..levels[0] };
         levels[2] = Self { paint_every: 2, ..levels[1] };
         levels[3] = Self { rounds: 1, ..levels[2] };
-        levels[4] = Self { looks: 2, search_crops: 2, ..levels[3] };
-        levels[5] = Self { solve_every: 2, search_crops: 1, ..levels[4] };
+        levels[4] = Self { solve_every: 2, search_crops: 2, ..levels[3] };
+        levels[5] = Self { looks: 2, search_crops: 1, ..levels[4] };
         levels[6] = Self { solve_every: 3, paint_every: 3, ..levels[5] };
         levels[7] = Self { looks: 1, ..levels[6] };
         levels

@@ -213,6 +213,10 @@ impl Session {
         let outcome = self.take_in(set, self.budget.effort());
         let cost = start.elapsed();
         self.stillness.taken_in(set.master_nanos, cost);
+        if self.subjects.iter().any(Subject::is_new) {
+            // Gets all the work at whatever level.
+            self.budget.leave_out();
+        }
         self.budget.spend(cost);
         outcome
     }

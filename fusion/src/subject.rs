@@ -279,6 +279,11 @@ impl Subject {
         })
     }
 
+    /// Whether the person was just met, and gets all the work at whatever level of effort.
+    pub(crate) fn is_new(&self) -> bool {
+        (1..=FULL_UPDATES).contains(&self.updates)
+    }
+
     /// Other cameras give images now than in the last update.
     pub(crate) fn views_changed(&mut self) {
         self.judged.clear();

@@ -21,7 +21,10 @@ pub fn open_gpu(adapter: Option<&str>) -> Result<GpuContext> {
 /// Starts logging to standard error, more with each level of `verbose`; as one JSON object a line where asked to.
 pub fn start_log(verbose: u8, json: bool) {
     let level = match verbose {
-        0 => "warn,flyrig=info,flyrig_fusion=info,zenoh=error",
+        // An image without a board is nothing to warn of.
+        0 => {
+            "warn,flyrig=info,flyrig_fusion=info,zenoh=error,calib_targets_chessboard=error,calib_targets_charuco=error"
+        }
         1 => {
             "info,flyrig=debug,flyrig_fusion=debug,flyrig_capture=debug,flyrig_sync=debug,flyrig_calib=debug,\
              flyrig_tracker=debug,flyrig_renderer=debug,flyrig_transport=debug,flyrig_gpu=debug"

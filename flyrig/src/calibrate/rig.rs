@@ -5,6 +5,7 @@ use flyrig_calib::{Board, LensModel, RigFit, RigOptions, calibrate_rig, load_len
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
 use flyrig_types::Intrinsics;
+use glam::DVec3;
 use serde_json::json;
 
 use super::{lens, refuse_existing, views::Seen};
@@ -12,6 +13,10 @@ use crate::{cli::CalibrateRigArgs, take};
 
 /// Time offsets are kept where they lower the noise to this share.
 const OFFSETS_PAY: f64 = 0.95;
+/// A take with `--floor` shows the board within so many seconds.
+const FLOOR_WITHIN_SECS: f64 = 2.0;
+/// Cameras look down on a floor by less than this, degrees.
+const MOST_TILT_DEG: f64 = 70.0;
 /// Halves of the shots may differ by so many times what noise explains.
 const MOST_DISAGREEMENT: f64 = 1.5;
 
@@ -28,6 +33,15 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
     )?;
     ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
     seen.check(&board)?;
+    if args.floor {
+        let first = seen.shots.first().map_or(i64::MAX, |shot| shot.nanos);
+        let late_secs = first.saturating_sub(seen.begin_nanos) as f64 * 1e-9;
+        ensure!(
+            late_secs <= FLOOR_WITHIN_SECS,
+            "--floor: no camera saw the board in the first {FLOOR_WITHIN_SECS} s; begin the take with the board on the floor, in view of a \
+             camera that looks down on it"
+        );
+    }
     let lenses = lenses(args, &board, &seen)?;
     let refine = args.refine_lenses.then_some(LensModel::RadialTangential);
     let solve = |lags| {
@@ -45,6 +59,14 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
         Some(fit) => (fit, true),
         None => (plain, false),
     };
+    let above =
+        fit.rig.cameras.iter().map(|camera| camera.camera_from_world.rotation.inverse() * DVec3::NEG_Y).sum::<DVec3>();
+    let tilt_deg = above.angle_between(fit.rig.world_up).to_degrees();
+    ensure!(
+        !args.floor || tilt_deg < MOST_TILT_DEG,
+        "--floor: the first board stands {tilt_deg:.0} degrees off what the cameras have above them; begin the take with the board on \
+         the floor, face up"
+    );
     print(&seen, &fit, has_offsets.then_some(noise_before));
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     save_easymocap(&args.out, &fit.rig)?;

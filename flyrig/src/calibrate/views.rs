@@ -1,6 +1,9 @@
 //! Boards in the images of a take.
 
-use std::{collections::BTreeMap, time::Duration};
+use std::{
+    collections::BTreeMap,
+    time::{Duration, Instant},
+};
 
 use anyhow::{Result, anyhow, ensure};
 use flyrig_calib::{Board, BoardDetector, BoardView, GrayImage, Shot, detector};
@@ -15,6 +18,9 @@ use crate::take::Take;
 /// Images that are looked at together.
 const BATCH: usize = 16;
 
+/// Seconds that live cameras may take until their first frame.
+const PATIENCE_SECS: f64 = 15.0;
+
 /// What a take shows of a board.
 pub struct Seen {
     pub ids: Vec<CameraId>,
@@ -24,6 +30,8 @@ pub struct Seen {
     pub shots: Vec<Shot>,
     /// By camera: images that were looked at.
     pub images: Vec<usize>,
+    /// Time of the first set, nanoseconds.
+    pub begin_nanos: i64,
 }
 
 impl Seen {
@@ -32,13 +40,22 @@ impl Seen {
         let detector = detector(board).map_err(|reason| anyhow!(reason))?;
         let ids: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
         let count = ids.len();
-        let mut seen = Self { ids, sizes: vec![None; count], shots: Vec::new(), images: vec![0; count] };
+        let mut seen =
+            Self { ids, sizes: vec![None; count], shots: Vec::new(), images: vec![0; count], begin_nanos: 0 };
         let mut intake =
             Intake::start_opening(take.sources, InputFormat::AnySize, &SyncSettings::default(), take.pacing)?;
         let bar = progress_bar((secs * 1e3) as u64, "boards, ms of the take");
+        let started = Instant::now();
         let (mut first, mut next, mut batch) = (None, i64::MIN, Vec::new());
         while !intake.ended() && !stop::requested() {
-            let Some(set) = intake.next_set(Duration::from_millis(200)) else { continue };
+            let Some(set) = intake.next_set(Duration::from_millis(200)) else {
+                let is_silent = first.is_none() && started.elapsed().as_secs_f64() > PATIENCE_SECS;
+                ensure!(
+                    !is_silent,
+                    "no image came in {PATIENCE_SECS} s; flyrig doctor says what is wrong with the cameras"
+                );
+                continue;
+            };
             let from = *first.get_or_insert(set.master_nanos);
             let at = set.master_nanos.saturating_sub(from) as f64 * 1e-9;
             if at > secs {
@@ -57,6 +74,7 @@ impl Seen {
                 bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
             }
         }
+        seen.begin_nanos = first.unwrap_or(0);
         seen.look(&batch, detector.as_ref())?;
         bar.finish_and_clear();
         for (slot, id) in seen.ids.iter().enumerate() {

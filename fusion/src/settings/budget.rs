@@ -11,7 +11,8 @@ use crate::{Effort, FusionError};
 #[serde(deny_unknown_fields, default)]
 pub struct BudgetSettings {
     /// Sets a second that are wanted: accuracy is given up, step by step, until so many are taken in; 0: none is.
-    #[arg(long = "budget", value_name = "FPS", default_value_t = 0.0)]
+    // A name of its own: commands have frame rates as well.
+    #[arg(id = "budget", long = "budget", value_name = "FPS", default_value_t = 0.0)]
     pub fps: f64,
     /// The same effort for every set in place of a budget, for measurements.
     #[arg(skip)]
