@@ -32,7 +32,7 @@ struct Row {
     levels: Vec<usize>,
 }
 
-/// What is run, in this order.
+/// Runs in their order: everything, single kinds of work left out, levels, budgets.
 fn ways(pose: Origin, budgets: &[f64]) -> Vec<(String, BudgetSettings)> {
     let full = Effort::FULL;
     let fixed = |name: &str, effort| (name.to_owned(), BudgetSettings { fps: 0.0, effort: Some(effort) });

@@ -14,7 +14,7 @@ const SQUARE_MM: std::ops::RangeInclusive<f64> = 5.0..=1000.0;
 /// Side of a marker as a share of the square's.
 const MARKER: std::ops::RangeInclusive<f64> = 0.4..=0.9;
 
-/// What is printed on a board.
+/// Print on a board.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "pattern", rename_all = "lowercase", deny_unknown_fields)]
 pub enum Pattern {
@@ -40,7 +40,7 @@ pub struct Board {
     pub rows: u32,
     /// Side of a square, millimetres: measure it on the print.
     pub square_mm: f64,
-    /// What is printed.
+    /// Print.
     #[serde(flatten)]
     pub pattern: Pattern,
 }
@@ -86,7 +86,7 @@ impl Board {
     /// Checks every value; the text names key and mend.
     ///
     /// # Errors
-    /// What is wrong.
+    /// Names the wrong key.
     pub fn check(&self) -> Result<(), String> {
         for (key, count) in [("columns", self.columns), ("rows", self.rows)] {
             if !SQUARES.contains(&count) {

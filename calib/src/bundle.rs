@@ -38,7 +38,7 @@ pub struct Shot {
 pub(crate) struct SolvedCamera {
     pub camera_from_rig: RigidMotion,
     pub intrinsics: Intrinsics,
-    /// What has to be taken off the camera's stamps, seconds.
+    /// Time offset: subtracted from the camera's stamps, seconds.
     pub lag_s: f64,
 }
 

@@ -84,7 +84,7 @@ impl GrayImage {
 /// Returns the detector for a board.
 ///
 /// # Errors
-/// What is wrong with the board, see [`Board::check`].
+/// As [`Board::check`].
 pub fn detector(board: &Board) -> Result<Box<dyn BoardDetector>, String> {
     board.check()?;
     match &board.pattern {

@@ -114,7 +114,7 @@ pub enum CalibError {
     Board {
         /// Which file.
         path: PathBuf,
-        /// What is wrong, and the mend.
+        /// The wrong key and the mend.
         reason: String,
     },
     /// Too few views of the board to know a lens.

@@ -33,7 +33,7 @@ impl BoardSheet {
     /// own size where none is given.
     ///
     /// # Errors
-    /// What is wrong with the board, or that the sheet is too small for it.
+    /// As [`Board::check`]; or the sheet is too small for the board.
     pub fn new(board: &Board, sheet_mm: Option<[f64; 2]>) -> Result<Self, String> {
         board.check()?;
         let side = board.square_mm;

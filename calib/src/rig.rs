@@ -37,7 +37,7 @@ pub struct RigCamera {
     pub deviation: Option<(f64, f64)>,
     /// Difference of its direction and place between the solves from either half of the shots: degrees, millimetres.
     pub halves: Option<(f64, f64)>,
-    /// What has to be taken off its stamps, and the standard deviation; seconds.
+    /// Time offset, subtracted from its stamps, and the standard deviation; seconds.
     pub lag_s: (f64, f64),
 }
 

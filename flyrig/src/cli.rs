@@ -170,7 +170,7 @@ pub enum CalibrateAction {
     Rig(CalibrateRigArgs),
 }
 
-/// What a board shows.
+/// Patterns of boards.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum PatternName {
     /// Squares with markers: any part of the board is recognised.
@@ -273,7 +273,7 @@ pub struct CalibrateRigArgs {
     /// Folder of intri.yml, extri.yml and calibration.json.
     #[arg(long)]
     pub out: PathBuf,
-    /// Folder with the intri.yml of `flyrig calibrate lens`; the take itself tells the lenses otherwise.
+    /// Folder with the intri.yml of `flyrig calibrate lens`; the lenses are calibrated from the take otherwise.
     #[arg(long)]
     pub lenses: Option<PathBuf>,
     /// Solve for the lenses together with the poses.

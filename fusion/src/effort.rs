@@ -24,15 +24,14 @@ impl Effort {
     pub const FULL: Self = Self { looks: 0, search_crops: 3, rounds: 2, mattes: true, solve_every: 1, paint_every: 1 };
 
     /// Levels from everything to little. Each gives up what costs the fewest decibels for a millisecond.
-    pub const LEVELS: [Self; 8] = {
-        let mut levels = [Self::FULL; 8];
+    pub const LEVELS: [Self; 7] = {
+        let mut levels = [Self::FULL; 7];
         levels[1] = Self { mattes: false, ..levels[0] };
         levels[2] = Self { paint_every: 2, ..levels[1] };
         levels[3] = Self { rounds: 1, ..levels[2] };
         levels[4] = Self { solve_every: 2, search_crops: 2, ..levels[3] };
         levels[5] = Self { looks: 2, search_crops: 1, ..levels[4] };
         levels[6] = Self { solve_every: 3, paint_every: 3, ..levels[5] };
-        levels[7] = Self { looks: 1, ..levels[6] };
         levels
     };
 }

@@ -213,10 +213,6 @@ impl Session {
         let outcome = self.take_in(set, self.budget.effort());
         let cost = start.elapsed();
         self.stillness.taken_in(set.master_nanos, cost);
-        if self.subjects.iter().any(Subject::is_new) {
-            // Gets all the work at whatever level.
-            self.budget.leave_out();
-        }
         self.budget.spend(cost);
         outcome
     }
@@ -314,6 +310,10 @@ impl Session {
         subject.confidence = seen.confidence;
         self.drawing.people_changed();
         subject.update(&self.gpu, &mut self.drawing.rasterizer, pose, &views, effort, &mut self.stages)?;
+        if subject.is_new() {
+            // Gets all the work at whatever level.
+            self.budget.leave_out();
+        }
         if !views.is_empty() {
             let ids = views.iter().map(|view| view.camera.id.clone());
             let judged = ids.zip(subject.agreement()).filter_map(|(id, quality)| Some((id, quality?)));

@@ -1,4 +1,4 @@
-//! What a budget leaves out: sets in which nothing moves, and work that a level of effort does without.
+//! Under a budget sets in which nothing moves are left out, and work that a level of effort does without.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
 
 mod support;

@@ -79,7 +79,7 @@ fn a_printed_board_calibrates_lenses_and_rig() {
         let camera = found.cameras.iter().find(|camera| camera.id == truth.id).unwrap();
         let focal = (camera.intrinsics.focal_px - truth.intrinsics.focal_px).abs().max_element();
         assert!(focal < 3.0, "{}: focal length off by {focal} px", truth.id);
-        let other = |rig: &[Camera]| rig.iter().map(|c| c.position()).collect::<Vec<_>>();
+        let other = |rig: &[Camera]| rig.iter().map(Camera::position).collect::<Vec<_>>();
         for (a, b) in other(&found.cameras).into_iter().zip(other(&cameras)) {
             let distance = (camera.position().distance(a) - truth.position().distance(b)).abs();
             assert!(distance < 0.006, "{}: {distance} m", truth.id);

@@ -61,7 +61,7 @@ pub fn ring(random: &mut Random, count: usize) -> Vec<Camera> {
         .collect()
 }
 
-/// What a camera sees of a board at `world_from_board`, with noise; `None` from behind, from the edge, and outside the image.
+/// A board at `world_from_board` in the image of a camera, with noise; `None` from behind, from the edge, and outside the image.
 #[must_use]
 pub fn view(
     random: &mut Random,

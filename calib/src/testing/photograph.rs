@@ -17,7 +17,7 @@ const NOISE: f64 = 2.0;
 /// Photographs the printed board at `world_from_board` with a camera without distortion, from a mirror if asked.
 ///
 /// # Errors
-/// What is wrong with the board.
+/// As [`Board::check`].
 pub fn photograph(
     board: &Board,
     camera: &Camera,

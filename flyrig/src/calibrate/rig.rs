@@ -76,7 +76,7 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
     Ok(())
 }
 
-/// The lenses of a folder, or those that this take itself tells.
+/// The lenses of a folder, or as calibrated from this take.
 fn lenses(args: &CalibrateRigArgs, board: &Board, seen: &Seen) -> Result<Vec<Intrinsics>> {
     let Some(folder) = &args.lenses else {
         return Ok(lens::solve(board, seen)?.into_iter().map(|(_, intrinsics)| intrinsics).collect());

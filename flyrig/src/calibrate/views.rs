@@ -21,7 +21,7 @@ const BATCH: usize = 16;
 /// Seconds that live cameras may take until their first frame.
 const PATIENCE_SECS: f64 = 15.0;
 
-/// What a take shows of a board.
+/// Boards that were seen in a take.
 pub struct Seen {
     pub ids: Vec<CameraId>,
     /// By camera, pixels; `None` for one without an image.
