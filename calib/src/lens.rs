@@ -118,7 +118,7 @@ pub fn calibrate_lens(
 }
 
 /// Share of the image's cells with a corner.
-pub fn coverage(size: [u32; 2], views: &[BoardView]) -> f64 {
+fn coverage(size: [u32; 2], views: &[BoardView]) -> f64 {
     let mut cells = vec![false; CELLS.0 * CELLS.1];
     for corner in views.iter().flat_map(|view| &view.corners) {
         let cell =

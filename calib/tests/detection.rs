@@ -42,6 +42,8 @@ fn check(board: &Board, at: &Isometry) -> (usize, f64) {
     let off = |corner: &flyrig_calib::SeenCorner| {
         camera.project(at.transform_point(board.corner(corner.index))).unwrap().distance(corner.pixel)
     };
+    let rms = (seen.iter().map(|corner| off(corner).powi(2)).sum::<f64>() / seen.len() as f64).sqrt();
+    println!("{} of {} corners, rms {rms:.3} px", seen.len(), board.corner_count());
     (seen.len(), seen.iter().map(off).fold(0.0, f64::max))
 }
 

@@ -7,7 +7,7 @@ use flyrig_report::stop;
 use flyrig_types::{CameraId, Intrinsics};
 
 use super::{refuse_existing, views::Seen};
-use crate::{cli::CalibrateLensArgs, take};
+use crate::cli::CalibrateLensArgs;
 
 /// Coverage below which edges of the image are guesses.
 const GOOD_COVERAGE: f64 = 0.6;
@@ -17,13 +17,7 @@ pub fn lens(args: &CalibrateLensArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
     stop::flag();
     let board = Board::load(&args.board)?;
     refuse_existing(&args.out, &["intri.yml"], args.force)?;
-    let seen = Seen::find(
-        take::open(&args.take.input, args.take.fps, gpu)?,
-        &board,
-        args.take.secs,
-        args.take.every_ms * 1e-3,
-    )?;
-    seen.check(&board)?;
+    let seen = Seen::find(&args.take, &board, gpu)?;
     let lenses = solve(&board, &seen)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     save_lenses(&args.out, &lenses)?;

@@ -9,7 +9,7 @@ use glam::DVec3;
 use serde_json::json;
 
 use super::{lens, refuse_existing, views::Seen};
-use crate::{cli::CalibrateRigArgs, take};
+use crate::cli::CalibrateRigArgs;
 
 /// Time offsets are kept where they lower the noise to this share.
 const OFFSETS_PAY: f64 = 0.95;
@@ -25,14 +25,8 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
     stop::flag();
     let board = Board::load(&args.board)?;
     refuse_existing(&args.out, &["intri.yml", "extri.yml", "calibration.json"], args.force)?;
-    let seen = Seen::find(
-        take::open(&args.take.input, args.take.fps, gpu)?,
-        &board,
-        args.take.secs,
-        args.take.every_ms * 1e-3,
-    )?;
+    let seen = Seen::find(&args.take, &board, gpu)?;
     ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
-    seen.check(&board)?;
     if args.floor {
         let first = seen.shots.first().map_or(i64::MAX, |shot| shot.nanos);
         let late_secs = first.saturating_sub(seen.begin_nanos) as f64 * 1e-9;
@@ -120,7 +114,11 @@ fn print(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) {
     }
     for pair in &fit.pairs {
         let (a, b) = pair.cameras;
-        println!("{} and {} share {} boards, {} agree", seen.ids[a], seen.ids[b], pair.shots, pair.agreeing);
+        let apart_mm = 1e3 * fit.rig.cameras[a].position().distance(fit.rig.cameras[b].position());
+        println!(
+            "{} and {} share {} boards, {} agree; {apart_mm:.2} mm apart",
+            seen.ids[a], seen.ids[b], pair.shots, pair.agreeing
+        );
     }
     println!("rms {:.3} px, noise {:.3} px a coordinate, {} boards", fit.rms_px, fit.sigma_px, fit.shots.len());
     if let Some(before) = noise_without_offsets {

@@ -8,12 +8,16 @@ use std::{
 use anyhow::{Result, anyhow, ensure};
 use flyrig_calib::{Board, BoardDetector, BoardView, GrayImage, Shot, detector};
 use flyrig_fusion::{InputFormat, Intake};
+use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop};
 use flyrig_sync::SyncSettings;
 use flyrig_types::{CameraId, FrameSet};
 use rayon::prelude::*;
 
-use crate::take::Take;
+use crate::{
+    cli::TakeArgs,
+    take::{self, Take},
+};
 
 /// Images that are looked at together.
 const BATCH: usize = 16;
@@ -35,8 +39,15 @@ pub struct Seen {
 }
 
 impl Seen {
-    /// Looks for the board in a set every `every_secs`, over at most `secs`.
-    pub fn find(take: Take, board: &Board, secs: f64, every_secs: f64) -> Result<Self> {
+    /// Opens a take and looks for the board; every camera must see it. `gpu` opens a graphics adapter, for simulated cameras alone.
+    pub fn find(args: &TakeArgs, board: &Board, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
+        let seen = Self::look_through(take::open(&args.input, args.fps, gpu)?, board, args)?;
+        seen.check(board)?;
+        Ok(seen)
+    }
+
+    fn look_through(take: Take, board: &Board, args: &TakeArgs) -> Result<Self> {
+        let (secs, every_nanos) = (args.secs, args.every_ms * 1e6);
         let detector = detector(board).map_err(|reason| anyhow!(reason))?;
         let ids: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
         let count = ids.len();
@@ -66,7 +77,7 @@ impl Seen {
             if set.master_nanos < next {
                 continue;
             }
-            next = set.master_nanos.saturating_add((every_secs * 0.9e9) as i64);
+            next = set.master_nanos.saturating_add((0.9 * every_nanos) as i64);
             batch.push(set);
             if batch.len() * count >= BATCH {
                 seen.look(&batch, detector.as_ref())?;
@@ -131,7 +142,7 @@ impl Seen {
     }
 
     /// Checks that every camera saw the board at all.
-    pub fn check(&self, board: &Board) -> Result<()> {
+    fn check(&self, board: &Board) -> Result<()> {
         for (slot, id) in self.ids.iter().enumerate() {
             ensure!(
                 !self.of_camera(slot).is_empty(),
