@@ -37,6 +37,8 @@ pub enum BenchCommand {
     Hands(BenchHandsArgs),
     /// Bias and spread of the landmark network on people whose pose is known.
     Landmarks(BenchLandmarksArgs),
+    /// Masks of the person in each camera by itself, to score views of several calibrations against.
+    Masks(BenchMasksArgs),
     /// Pose, shape and masks from images: errors, and what each of them costs in the views; writes a table and JSON.
     Perception(BenchPerceptionArgs),
     /// Two people in one scene: views, and the cost beside one person; writes a table and PNG images.
@@ -203,6 +205,18 @@ pub struct BenchLandmarksArgs {
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     pub every: u64,
     /// Frames a second of the data sets.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchMasksArgs {
+    /// A data set in EasyMocap's layout.
+    pub dataset: PathBuf,
+    /// Folder of the masks, CAM/000000.png.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Frames a second of the data set.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
 }

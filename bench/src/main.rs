@@ -9,6 +9,7 @@ mod endure;
 mod hands;
 mod landmarks;
 mod mask_errors;
+mod masks;
 mod perception;
 mod processor;
 mod recording;
@@ -51,6 +52,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         BenchCommand::Capture(args) => capture::capture(args),
         BenchCommand::Hands(args) => hands::hands(args, &gpu()?),
         BenchCommand::Landmarks(args) => landmarks::landmarks(args),
+        BenchCommand::Masks(args) => masks::masks(args),
         BenchCommand::Perception(args) => perception::perception(args, &gpu()?),
         BenchCommand::Subjects(args) => subjects::subjects(args, &gpu()?),
         BenchCommand::Record(args) => recording::record(args, &gpu()?),

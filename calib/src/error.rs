@@ -150,6 +150,12 @@ pub enum CalibError {
     /// The boards do not fix the rig.
     #[error("the boards do not fix the cameras' poses; show the board in more places and tilts")]
     RigOpen,
+    /// The person does not fix the rig.
+    #[error(
+        "the person is not seen by two cameras at once for long enough; let one person move for ten seconds where all cameras see \
+         them whole, and check that the old calibration is roughly right"
+    )]
+    PersonOpen,
     /// The format has no place for this lens.
     #[error("camera {camera}: a fisheye lens cannot be written in EasyMocap's format")]
     FisheyeUnsupported {

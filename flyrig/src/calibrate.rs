@@ -2,6 +2,7 @@
 
 mod board;
 mod lens;
+mod person;
 mod rig;
 mod views;
 
@@ -26,5 +27,6 @@ pub fn calibrate(action: &CalibrateAction, gpu: &dyn Fn() -> Result<GpuContext>)
         CalibrateAction::Board(args) => board::board(args),
         CalibrateAction::Lens(args) => lens::lens(args, gpu),
         CalibrateAction::Rig(args) => rig::rig(args, gpu),
+        CalibrateAction::Person(args) => person::person(args, gpu),
     }
 }

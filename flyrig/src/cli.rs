@@ -168,6 +168,8 @@ pub enum CalibrateAction {
     Lens(CalibrateLensArgs),
     /// Calibrate the poses, and time offsets, of all cameras from a take in which they see the board together.
     Rig(CalibrateRigArgs),
+    /// Refine poses and time offsets of calibrated cameras from one person who moves before them.
+    Person(CalibratePersonArgs),
 }
 
 /// Patterns of boards.
@@ -259,6 +261,34 @@ pub struct CalibrateLensArgs {
     #[arg(long)]
     pub out: PathBuf,
     /// Replace lenses that are there.
+    #[arg(long)]
+    pub force: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct CalibratePersonArgs {
+    /// A configuration (*.toml), a recording (*.mcap), a folder with images/CAM, or the videos of all cameras.
+    #[arg(required = true)]
+    pub input: Vec<PathBuf>,
+    /// Folder of the calibration to refine, where the take has none or another one.
+    #[arg(long)]
+    pub calibration: Option<PathBuf>,
+    /// Seconds that are looked at.
+    #[arg(long, default_value_t = 20.0, value_parser = parse_seconds)]
+    pub secs: f64,
+    /// Seconds that are left out at the beginning.
+    #[arg(long, default_value_t = 0.0, value_parser = parse_from_seconds)]
+    pub from_secs: f64,
+    /// Frame rate of a folder.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// Folder of intri.yml, extri.yml and calibration.json.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Take the cameras' stamps as they are.
+    #[arg(long)]
+    pub no_offsets: bool,
+    /// Replace a calibration that is there.
     #[arg(long)]
     pub force: bool,
 }
@@ -567,6 +597,13 @@ fn parse_most_ms(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(ms) if (4.0..=1000.0).contains(&ms) => Ok(ms),
         _ => Err(format!("'{text}' is not between 4 and 1000 milliseconds")),
+    }
+}
+
+fn parse_from_seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(seconds) if (0.0..=1e6).contains(&seconds) => Ok(seconds),
+        _ => Err(format!("'{text}' is not between 0 and 1000000 seconds")),
     }
 }
 

@@ -1,18 +1,12 @@
 //! `flyrig sync-check`: do the cameras' stamps agree with what moves in their pictures?
 
-use std::{
-    path::{Path, PathBuf},
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail, ensure};
-use flyrig_capture::{
-    CaptureThreads, FolderOptions, FolderReplay, Pacing, PopError, SourceOpener, ThreadsConfig, VideoOptions,
-    VideoReplay, to_rgb8_into,
-};
-use flyrig_fusion::{InputFormat, Intake, Origin};
+use flyrig_capture::{CaptureThreads, Pacing, PopError, SourceOpener, ThreadsConfig, to_rgb8_into};
+use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{dataset, progress_bar, stop};
+use flyrig_report::{progress_bar, stop};
 use flyrig_sync::{
     ClockKind, LagEstimate, MotionSignal, SilhouetteTrack, SyncSettings, estimate_lags, estimate_silhouette_lags,
 };
@@ -20,34 +14,9 @@ use flyrig_types::{CameraId, Image, Rig};
 
 use crate::{
     cli::SyncCheckArgs,
-    config::{Config, SourceKind},
-    recording,
     silhouettes::Silhouettes,
-    source,
+    take::{self, CalibratedTake},
 };
-
-type Sources = Vec<SourceOpener>;
-
-/// What is looked at.
-struct Take {
-    sources: Sources,
-    is_live: bool,
-    /// Where the cameras are, and their empty pictures as far as there are any.
-    calibration: Option<(Rig, Vec<Option<Image>>)>,
-    /// Whether masks that come with the pictures are used.
-    given_masks: bool,
-    /// What is taken off the stamps already.
-    sync: SyncSettings,
-    /// Where lags are told to flyrig.
-    advice: &'static str,
-}
-
-impl Take {
-    /// Of a recording, folder or videos by themselves.
-    fn replayed(sources: Sources, calibration: Option<(Rig, Vec<Option<Image>>)>, given_masks: bool) -> Self {
-        Self { sources, is_live: false, calibration, given_masks, sync: SyncSettings::default(), advice: TELL }
-    }
-}
 
 const ADD_TO_CAMERA: &str = "add it to the lag_ms that its [[source.cameras]] has (0 without one)";
 const ADD_TO_SYNC: &str = "add it to what [sync] lags_ms says of the camera (0 without)";
@@ -57,10 +26,15 @@ const TELL: &str =
 /// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
 pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let mut take = open(args, gpu)?;
+    let mut take = take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu)?;
     let cameras: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(cameras.len() > 1, "one camera alone has no lag; name at least two");
-    let advice = take.advice;
+    let is_configured = matches!(args.input.as_slice(), [path] if path.extension().is_some_and(|ending| ending == "toml"));
+    let advice = match (take.is_live, is_configured) {
+        (true, _) => ADD_TO_CAMERA,
+        (false, true) => ADD_TO_SYNC,
+        (false, false) => TELL,
+    };
     let (estimates, frames, told, mend) = match take.calibration.take() {
         Some((rig, plates)) if !take.is_live => {
             let (estimates, frames) = by_silhouettes(args, &rig, plates, take)?;
@@ -99,7 +73,7 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
 /// The lags by what moves in the pictures, and how many pictures of each camera were compared.
 fn by_motion(
     args: &SyncCheckArgs,
-    sources: Sources,
+    sources: Vec<SourceOpener>,
     cameras: &[CameraId],
     sync: &SyncSettings,
     is_live: bool,
@@ -154,7 +128,7 @@ fn by_silhouettes(
     args: &SyncCheckArgs,
     rig: &Rig,
     plates: Vec<Option<Image>>,
-    take: Take,
+    take: CalibratedTake,
 ) -> Result<(Vec<LagEstimate>, Vec<usize>)> {
     let mut silhouettes = Silhouettes::new(rig, plates, take.given_masks)?;
     // One camera may be ahead by as much as another is behind, and nothing is lost by waiting.
@@ -185,92 +159,18 @@ fn by_silhouettes(
     Ok((estimate_silhouette_lags(&tracks, (args.most_ms * 1e6) as i64), frames))
 }
 
-fn open(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Take> {
-    let has_ending =
-        |path: &Path, ending: &str| path.extension().is_some_and(|found| found.eq_ignore_ascii_case(ending));
-    let mut take = match args.input.as_slice() {
-        [path] if has_ending(path, "toml") => {
-            let mut config = Config::load(path)?;
-            let is_sim = config.source.kind == SourceKind::Sim;
-            // Simulated cameras can wait.
-            config.source.real_time &= !is_sim;
-            let gpu = is_sim.then(gpu).transpose()?;
-            let is_live = config.source.kind.is_live();
-            let source = source::open(&config, gpu.as_ref())?;
-            let given_masks = config.perception.masks == Origin::Given;
-            Take {
-                sources: source.cameras,
-                is_live,
-                calibration: Some((source.rig, source.plates)),
-                given_masks,
-                sync: config.sync,
-                advice: if is_live { ADD_TO_CAMERA } else { ADD_TO_SYNC },
-            }
-        }
-        [path] if has_ending(path, "mcap") => {
-            let rig = recording::recorded_rig(path)?;
-            let plates = rig.cameras.iter().map(|_| None).collect();
-            let sources = source::ready(recording::replay_sources(path, &rig)?);
-            Take::replayed(sources, Some((rig, plates)), false)
-        }
-        [folder] if folder.is_dir() => {
-            let is_calibrated = ["intri.yml", "extri.yml"].iter().all(|file| folder.join(file).exists());
-            let replay = |with_masks| -> Result<Sources> {
-                let options = FolderOptions { fps: args.fps, with_masks, ..FolderOptions::default() };
-                Ok(source::ready(FolderReplay::open(folder, None, &options)?))
-            };
-            let mut sources = replay(false)?;
-            let masks = folder.join("mask");
-            let with_masks = (is_calibrated || args.calibration.is_some())
-                && sources.iter().all(|source| masks.join(source.camera().as_str()).is_dir());
-            if with_masks {
-                sources = replay(true)?;
-            }
-            let calibration = is_calibrated.then(|| calibration(folder, &sources)).transpose()?;
-            Take::replayed(sources, calibration, with_masks)
-        }
-        [path] => {
-            bail!("{} is no configuration, recording or folder; name several videos, or one of these", path.display())
-        }
-        videos => {
-            let video = |path: &PathBuf| -> Result<VideoReplay> {
-                let name = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-                Ok(VideoReplay::open(&name.into(), path, &VideoOptions::default())?)
-            };
-            let sources = source::ready(videos.iter().map(video).collect::<Result<_>>()?);
-            Take::replayed(sources, None, false)
-        }
-    };
-    if let Some(folder) = &args.calibration {
-        ensure!(
-            !take.is_live,
-            "--calibration looks at every frame, which takes longer than live cameras wait; record them first (flyrig \
-             record) and give the recording"
-        );
-        take.calibration = Some(calibration(folder, &take.sources)?);
-    }
-    Ok(take)
-}
-
-/// What a folder tells of the sources' cameras, in their order.
-fn calibration(folder: &Path, sources: &Sources) -> Result<(Rig, Vec<Option<Image>>)> {
-    let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
-    let names: Vec<String> = cameras.iter().map(CameraId::to_string).collect();
-    let rig = dataset::pick(&dataset::load_rig(folder, &cameras)?, &names, "the calibration")?;
-    let plates = dataset::plates(&folder.join("background"), &rig)?;
-    Ok((rig, plates))
-}
-
 #[cfg(test)]
 mod tests {
     use flyrig_capture::CameraSource as _;
     use flyrig_gpu::AdapterChoice;
+    use flyrig_report::dataset;
     use flyrig_sim::{Fault, FaultKind, FaultScript, MotionConfig, MotionKind, SimConfig, SimTime, Simulator};
     use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
     use std::sync::{Arc, Mutex};
 
     use super::*;
+    use crate::source;
 
     const NAMES: [&str; 4] = ["00", "02", "03", "05"];
 
@@ -279,7 +179,7 @@ mod tests {
         /// Milliseconds after the first camera.
         lags_ms: [f64; 4],
         rig: Rig,
-        sources: Sources,
+        sources: Vec<SourceOpener>,
     }
 
     impl Lagging {
@@ -327,7 +227,13 @@ mod tests {
 
         /// With silhouettes that are found in the pictures, without plates.
         fn by_silhouettes(mut self) -> Vec<(Option<f64>, f64)> {
-            let take = Take::replayed(std::mem::take(&mut self.sources), None, false);
+            let take = CalibratedTake {
+                sources: std::mem::take(&mut self.sources),
+                is_live: false,
+                calibration: None,
+                given_masks: false,
+                sync: SyncSettings::default(),
+            };
             let (estimates, frames) = by_silhouettes(&args(), &self.rig, NAMES.map(|_| None).into(), take).unwrap();
             println!("{frames:?} silhouettes");
             self.off(&estimates)

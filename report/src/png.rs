@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::{Context, Result};
-use flyrig_types::RenderedView;
+use flyrig_types::{Mask, RenderedView};
 use image::{
     ExtendedColorType, ImageEncoder as _,
     codecs::png::{CompressionType, FilterType, PngEncoder},
@@ -25,6 +25,14 @@ pub fn encode_rgb(rgb: &[u8], width: u32, height: u32) -> Result<Vec<u8>> {
 /// When the bytes do not fit the size.
 pub fn encode_rgba(view: &RenderedView) -> Result<Vec<u8>> {
     encode(&view.rgba, view.width, view.height, ExtendedColorType::Rgba8)
+}
+
+/// Encodes the coverage of a mask as a grey PNG.
+///
+/// # Errors
+/// When the bytes do not fit the size.
+pub fn encode_mask(mask: &Mask) -> Result<Vec<u8>> {
+    encode(mask.coverage(), mask.width(), mask.height(), ExtendedColorType::L8)
 }
 
 fn encode(bytes: &[u8], width: u32, height: u32, color: ExtendedColorType) -> Result<Vec<u8>> {

@@ -51,6 +51,7 @@ mod texture;
 mod triangulate;
 mod upsample;
 mod view;
+mod viewers;
 
 pub use background::{Background, BackgroundEvent};
 pub use config::PoseConfig;
@@ -75,3 +76,4 @@ pub use presence::shows_person;
 pub use shape::{HeightFrom, ShapeFit, fit_template_shape};
 pub use silhouette::BodyGate;
 pub use triangulate::{WorldPoint, triangulate};
+pub use viewers::Viewers;

@@ -1,0 +1,280 @@
+//! Least squares of cameras, time offsets and the landmarks of a moving person.
+
+use flyrig_solve::{BlockProblem, Kernel, Residual, RigidMotion, skew};
+use flyrig_types::Intrinsics;
+use glam::{DMat3, DVec2, DVec3};
+use nalgebra::{DMatrix, DVector};
+
+use super::tracks::{Place, PersonTracks};
+use crate::{LensModel, projection::{project, project_with_derivatives}};
+
+/// Beyond so many standard deviations a landmark loses half its weight.
+const LANDMARK_KERNEL: Kernel = Kernel::Cauchy(2.0);
+const LIMB_KERNEL: Kernel = Kernel::Cauchy(2.0);
+/// A camera that was bumped does not pull the others along.
+const PRIOR_KERNEL: Kernel = Kernel::Cauchy(1.0);
+/// Standard deviation of a landmark's place from where it started, metres: fixes those that one camera sees.
+const LOOSE_M: f64 = 2.0;
+
+/// Everything that is sought.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Estimate {
+    pub cameras: Vec<RigidMotion>,
+    /// Subtracted from the stamps, seconds; that of the first camera stays.
+    pub lags_s: Vec<f64>,
+    /// By instant and landmark, metres in the world.
+    pub points: Vec<Vec<DVec3>>,
+}
+
+/// What each residual is about.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Term {
+    Seen { instant: usize, camera: usize, landmark: usize },
+    Limb { instant: usize, limb: usize },
+    Loose { instant: usize, landmark: usize },
+    Camera(usize),
+    Lag(usize),
+}
+
+/// What is known besides the images.
+#[derive(Debug, Clone)]
+pub(crate) struct Known<'a> {
+    pub intrinsics: &'a [Intrinsics],
+    pub tracks: &'a PersonTracks,
+    /// Usual time between images by camera, seconds.
+    pub intervals_s: &'a [f64],
+    /// Times of the instants, nanoseconds.
+    pub instants: &'a [i64],
+    /// Joints at a constant distance.
+    pub limbs: &'a [(usize, usize)],
+    /// The calibration before.
+    pub before: Estimate,
+    /// Standard deviations of a camera's direction and place there: radians, metres.
+    pub prior: (f64, f64),
+    /// Standard deviation of a time offset, seconds.
+    pub lag_sigma_s: f64,
+    /// Whether offsets are sought.
+    pub lags: bool,
+}
+
+/// Standard deviations that are estimated in turn with the unknowns.
+#[derive(Debug, Clone)]
+pub(crate) struct Spread {
+    /// By landmark, pixels.
+    pub landmark_px: Vec<f64>,
+    /// Length of each limb and its standard deviation, metres.
+    pub limbs_m: Vec<Option<(f64, f64)>>,
+    /// Weight of an instant: neighbours err alike.
+    pub weight: f64,
+}
+
+/// The least squares problem.
+pub(crate) struct PersonProblem<'a> {
+    known: &'a Known<'a>,
+    spread: &'a Spread,
+    terms: Vec<Term>,
+    sizes: Vec<usize>,
+}
+
+impl<'a> PersonProblem<'a> {
+    pub fn new(known: &'a Known<'a>, spread: &'a Spread, at: &Estimate) -> Self {
+        let (cameras, landmarks) = (known.intrinsics.len(), known.tracks.landmarks());
+        let mut terms: Vec<Term> = (0..cameras).map(Term::Camera).collect();
+        if known.lags {
+            terms.extend((1..cameras).map(Term::Lag));
+        }
+        for instant in 0..known.instants.len() {
+            let mut is_fixed = vec![false; landmarks];
+            for landmark in 0..landmarks {
+                let seen: Vec<usize> =
+                    (0..cameras).filter(|&camera| known.error(at, instant, camera, landmark).is_some()).collect();
+                terms.push(Term::Loose { instant, landmark });
+                if seen.len() > 1 {
+                    is_fixed[landmark] = true;
+                    terms.extend(seen.into_iter().map(|camera| Term::Seen { instant, camera, landmark }));
+                }
+            }
+            let limbs = known.limbs.iter().enumerate().filter(|(limb, (a, b))| {
+                spread.limbs_m[*limb].is_some() && is_fixed[*a] && is_fixed[*b]
+            });
+            terms.extend(limbs.map(|(limb, _)| Term::Limb { instant, limb }));
+        }
+        let mut sizes = vec![6; cameras];
+        if known.lags {
+            sizes.extend(vec![1; cameras.saturating_sub(1)]);
+        }
+        sizes.extend(vec![3 * landmarks; known.instants.len()]);
+        Self { known, spread, terms, sizes }
+    }
+
+    /// Cameras, instants and landmarks of the images' residuals.
+    pub fn seen(&self) -> impl Iterator<Item = (usize, usize, usize)> {
+        self.terms.iter().filter_map(|term| match *term {
+            Term::Seen { instant, camera, landmark } => Some((camera, instant, landmark)),
+            _ => None,
+        })
+    }
+
+    fn seen_residual(&self, at: &Estimate, [instant, camera, landmark]: [usize; 3], with_jacobians: bool) -> Option<Residual> {
+        let weigh = |error: DVec2, place: Option<Place>| Residual {
+            error: DVector::from_column_slice(&(error / self.spread.landmark_px[landmark]).to_array()),
+            jacobians: Vec::new(),
+            kernel: LANDMARK_KERNEL,
+            weight: place.map_or(0.0, |place| self.spread.weight * place.confidence),
+        };
+        // The end of a track that a changed offset has left.
+        let Some(place) = self.known.place(at, instant, camera, landmark) else { return Some(weigh(DVec2::ZERO, None)) };
+        let point = at.points[instant][landmark];
+        let local = at.cameras[camera].apply(point);
+        if !with_jacobians {
+            let pixel = project(&self.known.intrinsics[camera], local)?;
+            return Some(weigh(pixel - place.pixel, Some(place)));
+        }
+        let projected = project_with_derivatives(&self.known.intrinsics[camera], LensModel::Radial1, local)?;
+        let mut residual = weigh(projected.pixel - place.pixel, Some(place));
+        let inverse = 1.0 / self.spread.landmark_px[landmark];
+        let by_local = DMatrix::from_fn(2, 3, |row, column| inverse * projected.by_point[column][row]);
+        let [by_turn, by_shift, by_place] = at.cameras[camera].apply_jacobian(point).map(|by| &by_local * matrix(by));
+        let mut by_camera = DMatrix::zeros(2, 6);
+        by_camera.columns_mut(0, 3).copy_from(&by_turn);
+        by_camera.columns_mut(3, 3).copy_from(&by_shift);
+        residual.jacobians.push((camera, by_camera));
+        if let Some(block) = self.lag_block(camera) {
+            let by_lag = DMatrix::from_column_slice(2, 1, &(-place.velocity * inverse).to_array());
+            residual.jacobians.push((block, by_lag));
+        }
+        let mut by_points = DMatrix::zeros(2, 3 * self.known.tracks.landmarks());
+        by_points.columns_mut(3 * landmark, 3).copy_from(&by_place);
+        residual.jacobians.push((self.first_eliminated() + instant, by_points));
+        Some(residual)
+    }
+
+    fn lag_block(&self, camera: usize) -> Option<usize> {
+        (self.known.lags && camera > 0).then(|| self.known.intrinsics.len() + camera - 1)
+    }
+
+    fn limb_residual(&self, at: &Estimate, instant: usize, limb: usize) -> Option<Residual> {
+        let (a, b) = self.known.limbs[limb];
+        let (length, sigma) = self.spread.limbs_m[limb]?;
+        let points = &at.points[instant];
+        let between = points[a] - points[b];
+        let along = between.try_normalize().unwrap_or(DVec3::X) / sigma;
+        let mut by_points = DMatrix::zeros(1, 3 * points.len());
+        by_points.columns_mut(3 * a, 3).copy_from_slice(&along.to_array());
+        by_points.columns_mut(3 * b, 3).copy_from_slice(&(-along).to_array());
+        Some(Residual {
+            error: DVector::from_element(1, (between.length() - length) / sigma),
+            jacobians: vec![(self.first_eliminated() + instant, by_points)],
+            kernel: LIMB_KERNEL,
+            weight: self.spread.weight,
+        })
+    }
+
+    fn camera_residual(&self, at: &Estimate, camera: usize) -> Residual {
+        let (turn_sigma, place_sigma) = self.known.prior;
+        let (now, before) = (&at.cameras[camera], &self.known.before.cameras[camera]);
+        let quaternion = now.rotation * before.rotation.inverse();
+        let quaternion = if quaternion.w < 0.0 { -quaternion } else { quaternion };
+        let turn = 2.0 * DVec3::new(quaternion.x, quaternion.y, quaternion.z);
+        let moved = now.inverse().translation - before.inverse().translation;
+        let error: Vec<f64> = (turn / turn_sigma).to_array().into_iter().chain((moved / place_sigma).to_array()).collect();
+        let mut by_camera = DMatrix::zeros(6, 6);
+        // After exp(δ): 2 q' = 2 q + w δ - q × δ.
+        let by_turn = (DMat3::IDENTITY * quaternion.w - skew(0.5 * turn)) * (1.0 / turn_sigma);
+        by_camera.view_mut((0, 0), (3, 3)).copy_from(&matrix(by_turn));
+        // The place is -Rᵀ t; after exp(δ) R and t + s it is -Rᵀ (t + s + t × δ).
+        let back = DMat3::from_quat(now.rotation.inverse()) * (-1.0 / place_sigma);
+        by_camera.view_mut((3, 0), (3, 3)).copy_from(&matrix(back * skew(now.translation)));
+        by_camera.view_mut((3, 3), (3, 3)).copy_from(&matrix(back));
+        Residual {
+            error: DVector::from_vec(error),
+            jacobians: vec![(camera, by_camera)],
+            kernel: PRIOR_KERNEL,
+            weight: 1.0,
+        }
+    }
+}
+
+impl Known<'_> {
+    /// Where a track is at an instant.
+    pub fn place(&self, at: &Estimate, instant: usize, camera: usize, landmark: usize) -> Option<Place> {
+        let stamp = self.instants[instant].saturating_add((at.lags_s[camera] * 1e9) as i64);
+        self.tracks.track(camera, landmark).at(stamp, self.intervals_s[camera])
+    }
+
+    /// Difference of a drawn and a seen landmark, pixels; `None` where it is not seen or cannot be drawn.
+    pub fn error(&self, at: &Estimate, instant: usize, camera: usize, landmark: usize) -> Option<DVec2> {
+        let place = self.place(at, instant, camera, landmark)?;
+        let local = at.cameras[camera].apply(at.points[instant][landmark]);
+        Some(project(&self.intrinsics[camera], local)? - place.pixel)
+    }
+}
+
+impl BlockProblem for PersonProblem<'_> {
+    type Unknowns = Estimate;
+
+    fn block_sizes(&self) -> &[usize] {
+        &self.sizes
+    }
+
+    fn first_eliminated(&self) -> usize {
+        self.sizes.len() - self.known.instants.len()
+    }
+
+    fn residual_count(&self) -> usize {
+        self.terms.len()
+    }
+
+    fn residual(&self, at: &Estimate, index: usize, with_jacobians: bool) -> Option<Residual> {
+        match self.terms[index] {
+            Term::Seen { instant, camera, landmark } => {
+                self.seen_residual(at, [instant, camera, landmark], with_jacobians)
+            }
+            Term::Limb { instant, limb } => self.limb_residual(at, instant, limb),
+            Term::Camera(camera) => Some(self.camera_residual(at, camera)),
+            Term::Lag(camera) => Some(Residual {
+                error: DVector::from_element(1, (at.lags_s[camera] - self.known.before.lags_s[camera]) / self.known.lag_sigma_s),
+                jacobians: vec![(self.lag_block(camera)?, DMatrix::from_element(1, 1, 1.0 / self.known.lag_sigma_s))],
+                kernel: Kernel::Squares,
+                weight: 1.0,
+            }),
+            Term::Loose { instant, landmark } => {
+                let moved = at.points[instant][landmark] - self.known.before.points[instant][landmark];
+                let mut by_points = DMatrix::zeros(3, 3 * self.known.tracks.landmarks());
+                for axis in 0..3 {
+                    by_points[(axis, 3 * landmark + axis)] = 1.0 / LOOSE_M;
+                }
+                Some(Residual {
+                    error: DVector::from_column_slice(&(moved / LOOSE_M).to_array()),
+                    jacobians: vec![(self.first_eliminated() + instant, by_points)],
+                    kernel: Kernel::Squares,
+                    weight: 1.0,
+                })
+            }
+        }
+    }
+
+    fn moved(&self, at: &Estimate, step: &[f64]) -> Estimate {
+        let mut at = at.clone();
+        let mut vectors = step.chunks_exact(3).map(|v| DVec3::new(v[0], v[1], v[2]));
+        let mut next = || vectors.next().unwrap_or_default();
+        for camera in &mut at.cameras {
+            let (turn, shift) = (next(), next());
+            *camera = camera.moved(turn, shift);
+        }
+        let lags = if self.known.lags { at.cameras.len().saturating_sub(1) } else { 0 };
+        let rest = &step[6 * at.cameras.len()..];
+        for (lag, by) in at.lags_s.iter_mut().skip(1).zip(&rest[..lags]) {
+            *lag += by;
+        }
+        let points = at.points.iter_mut().flatten();
+        for (point, by) in points.zip(rest[lags..].chunks_exact(3)) {
+            *point += DVec3::new(by[0], by[1], by[2]);
+        }
+        at
+    }
+}
+
+fn matrix(m: DMat3) -> DMatrix<f64> {
+    DMatrix::from_column_slice(3, 3, &m.to_cols_array())
+}

@@ -1,0 +1,121 @@
+#![allow(clippy::unwrap_used)] // helpers of tests
+use super::*;
+use crate::testing::{Random, ring};
+use flyrig_solve::{BlockProblem as _, jacobian_error};
+use glam::DVec2;
+
+/// Landmarks of a figure: limbs of constant length that swing about a place that wanders.
+const LIMBS: [(usize, usize); 9] = [(0, 1), (1, 2), (2, 3), (3, 4), (0, 5), (5, 6), (0, 7), (7, 8), (8, 9)];
+
+fn figure(t: f64) -> [DVec3; 10] {
+    let mut points = [DVec3::ZERO; 10];
+    points[0] = DVec3::new(0.4 * (0.9 * t).sin(), 0.4 * (0.7 * t).cos(), 1.0 + 0.1 * (2.1 * t).sin());
+    for (i, (a, b)) in LIMBS.iter().enumerate() {
+        let phase = i as f64;
+        let (turn, rise) = (0.7 * phase + 1.2 * (1.7 * t + phase).sin(), 1.1 * (1.3 * t + 2.0 * phase).sin());
+        let along = DVec3::new(turn.cos() * rise.cos(), turn.sin() * rise.cos(), rise.sin());
+        points[*b] = points[*a] + along * 0.35;
+    }
+    points
+}
+
+/// What a rig of `count` cameras sees with stamps that are late, its truth, and the calibration that is believed.
+fn scene(seed: u64, count: usize, noise_px: f64, lags: &[f64]) -> (Rig, Rig, PersonTracks) {
+    let mut random = Random(seed);
+    let truth = Rig { cameras: ring(&mut random, count), world_up: DVec3::Z };
+    let mut tracks = PersonTracks::new(count, 10);
+    for (slot, camera) in truth.cameras.iter().enumerate() {
+        // A network errs alike in images that are alike.
+        let biases: Vec<DVec2> = (0..10).map(|_| DVec2::new(random.normal(), random.normal()) * noise_px).collect();
+        for image in 0..240 {
+            let t = image as f64 / 30.0 + 0.004 * slot as f64;
+            let seen: Vec<_> = figure(t)
+                .iter()
+                .zip(&biases)
+                .map(|(point, bias)| {
+                    let noise = DVec2::new(random.normal(), random.normal()) * noise_px;
+                    camera.project(*point).map(|pixel| (pixel + noise + *bias, 0.9))
+                })
+                .collect();
+            tracks.add(slot, ((t + lags[slot]) * 1e9) as i64, &seen);
+        }
+    }
+    let mut believed = truth.clone();
+    for camera in &mut believed.cameras {
+        let motion = RigidMotion {
+            rotation: camera.camera_from_world.rotation,
+            translation: camera.camera_from_world.translation,
+        };
+        let moved = motion.moved(random.vector().normalize() * 0.0174, DVec3::ZERO);
+        let place = motion.inverse().translation + random.vector().normalize() * 0.02;
+        camera.camera_from_world = Isometry::new(moved.rotation, -(moved.rotation * place));
+    }
+    (truth, believed, tracks)
+}
+
+/// Disagreement of a rig's cameras on what the true cameras see: mean distance in the worst camera's image, pixels.
+fn disagreement_px(rig: &Rig, truth: &Rig) -> f64 {
+    let mut errors = vec![Vec::new(); rig.cameras.len()];
+    for point in (0..40).flat_map(|i| figure(0.2 * f64::from(i))) {
+        let pixels: Vec<Option<DVec2>> = truth.cameras.iter().map(|camera| camera.project(point)).collect();
+        let ray = |(camera, pixel): (&Camera, &Option<DVec2>)| {
+            let ray = camera.ray((*pixel)?)?;
+            Some((ray, camera.position(), 1.0))
+        };
+        let rays: Vec<_> = rig.cameras.iter().zip(&pixels).filter_map(ray).collect();
+        let Some(found) = nearest(&rays) else { continue };
+        for ((camera, pixel), errors) in rig.cameras.iter().zip(&pixels).zip(&mut errors) {
+            errors.extend(pixel.and_then(|pixel| Some(camera.project(found)?.distance(pixel))));
+        }
+    }
+    errors.iter().map(|errors| errors.iter().sum::<f64>() / errors.len() as f64).fold(0.0, f64::max)
+}
+
+#[test]
+fn cameras_that_are_a_degree_off_and_late_are_found() {
+    let lags = [0.0, 0.053, -0.031, 0.012];
+    let (truth, believed, tracks) = scene(5, 4, 1.0, &lags);
+    let fit = calibrate_person(&believed, &tracks, &LIMBS, &[], PersonOptions::default()).unwrap();
+    let (before, after) = (disagreement_px(&believed, &truth), disagreement_px(&fit.rig, &truth));
+    println!("worst camera: {before:.2} px before, {after:.2} after");
+    assert!(before > 5.0 && after < 1.2, "{before} {after}");
+    for (camera, lag) in fit.cameras.iter().zip(lags) {
+        println!("{camera:?} true {lag}");
+        assert!((camera.lag_s.0 - lag).abs() < 0.004, "{camera:?} {lag}");
+    }
+}
+
+#[test]
+fn derivatives_are_those_of_finite_differences() {
+    let (_, believed, tracks) = scene(3, 3, 0.0, &[0.0, 0.02, -0.01]);
+    let intrinsics: Vec<Intrinsics> = believed.cameras.iter().map(|camera| camera.intrinsics).collect();
+    let intervals_s = [1.0 / 30.0; 3];
+    let old = motions(&believed);
+    let mut estimate = Estimate { cameras: old.clone(), lags_s: vec![0.0; 3], points: Vec::new() };
+    let instants = instants(&intrinsics, &tracks, &intervals_s, &estimate).unwrap()[..3].to_vec();
+    estimate.points = vec![vec![DVec3::ZERO; 10]; 3];
+    let mut known = Known {
+        intrinsics: &intrinsics,
+        tracks: &tracks,
+        intervals_s: &intervals_s,
+        instants: &instants,
+        limbs: &LIMBS,
+        before: estimate.clone(),
+        prior: (0.02, 0.05),
+        lag_sigma_s: 0.1,
+        lags: true,
+    };
+    triangulate(&known, &mut estimate);
+    known.before.points.clone_from(&estimate.points);
+    let spread =
+        Spread { landmark_px: vec![1.5; 10], limbs_m: vec![Some((0.33, 0.01)); LIMBS.len()], weight: 0.7 };
+    let problem = PersonProblem::new(&known, &spread, &estimate);
+    let mut random = Random(8);
+    let step: Vec<f64> = (0..problem.block_sizes().iter().sum()).map(|_| 0.01 * random.normal()).collect();
+    let at = problem.moved(&estimate, &step);
+    assert!(problem.residual_count() > 100);
+    for index in 0..problem.residual_count() {
+        let error = jacobian_error(&problem, &at, index, 1e-6).unwrap();
+        assert!(error < 2e-2, "residual {index}: {error}");
+    }
+}

@@ -1,0 +1,211 @@
+//! Landmarks of a person over time, in the image of each camera.
+
+use glam::{DMat3, DVec2, DVec3};
+
+/// Standard deviation of the window that smooths a track, seconds; at least so many intervals between images.
+const SMOOTH_S: f64 = 0.03;
+const SMOOTH_INTERVALS: f64 = 1.0;
+/// Samples farther away than so many standard deviations do not count.
+const REACH: f64 = 2.5;
+/// Samples that a place needs, on both sides.
+const LEAST_SAMPLES: usize = 4;
+
+/// One landmark in one camera.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Track {
+    /// Time stamp, pixel, and confidence; in the order of time.
+    samples: Vec<(i64, DVec2, f64)>,
+}
+
+/// Where a landmark is at a time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Place {
+    pub pixel: DVec2,
+    /// Pixels a second.
+    pub velocity: DVec2,
+    /// 0 to 1.
+    pub confidence: f64,
+}
+
+impl Track {
+    /// Standard deviation of the window for images at an interval.
+    fn window_s(interval_s: f64) -> f64 {
+        SMOOTH_S.max(SMOOTH_INTERVALS * interval_s)
+    }
+
+    /// A parabola fitted to what is near a time; `None` where there are too few samples on either side.
+    pub fn at(&self, nanos: i64, interval_s: f64) -> Option<Place> {
+        let window = Self::window_s(interval_s);
+        let reach = (REACH * window * 1e9) as i64;
+        let from = self.samples.partition_point(|(at, ..)| *at < nanos.saturating_sub(reach));
+        let near = self.samples[from..].iter().take_while(|(at, ..)| *at <= nanos.saturating_add(reach));
+        let (mut normal, mut right) = (DMat3::ZERO, [DVec3::ZERO; 2]);
+        let (mut before, mut after, mut sum, mut confidence) = (0, 0, 0.0, 0.0);
+        for (at, pixel, trust) in near {
+            let x = at.saturating_sub(nanos) as f64 * 1e-9 / window;
+            (before, after) = (before + usize::from(x <= 0.0), after + usize::from(x >= 0.0));
+            let kernel = (-0.5 * x * x).exp();
+            (sum, confidence) = (sum + kernel, confidence + kernel * trust);
+            let weight = kernel * trust;
+            let row = DVec3::new(1.0, x, x * x);
+            normal += DMat3::from_cols(row * row.x, row * row.y, row * row.z) * weight;
+            right[0] += row * (weight * pixel.x);
+            right[1] += row * (weight * pixel.y);
+        }
+        if before == 0 || after == 0 || before + after < LEAST_SAMPLES || normal.determinant().abs() < 1e-9 {
+            return None;
+        }
+        let inverse = normal.inverse();
+        let [u, v] = right.map(|right| inverse * right);
+        let pixel = DVec2::new(u.x, v.x);
+        let place = Place { pixel, velocity: DVec2::new(u.y, v.y) / window, confidence: confidence / sum };
+        (place.pixel.is_finite() && place.velocity.is_finite() && place.confidence > 0.0).then_some(place)
+    }
+}
+
+/// Landmarks of one person in the images of all cameras.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PersonTracks {
+    landmarks: usize,
+    cameras: Vec<CameraTracks>,
+}
+
+/// Landmarks in the images of one camera.
+#[derive(Debug, Clone, Default, PartialEq)]
+struct CameraTracks {
+    /// Times of the images.
+    nanos: Vec<i64>,
+    tracks: Vec<Track>,
+}
+
+impl PersonTracks {
+    /// Without any image, for cameras and landmarks by number.
+    #[must_use]
+    pub fn new(cameras: usize, landmarks: usize) -> Self {
+        let empty = CameraTracks { nanos: Vec::new(), tracks: vec![Track::default(); landmarks] };
+        Self { landmarks, cameras: vec![empty; cameras] }
+    }
+
+    /// Adds the landmarks of an image: pixels and confidences, 0 to 1, `None` where one is not seen. Images out of order, of
+    /// cameras that are not there, and values that are not finite are left out.
+    pub fn add(&mut self, camera: usize, nanos: i64, landmarks: &[Option<(DVec2, f64)>]) {
+        let Some(camera) = self.cameras.get_mut(camera) else { return };
+        if camera.nanos.last().is_some_and(|last| *last >= nanos) {
+            return;
+        }
+        camera.nanos.push(nanos);
+        for (track, seen) in camera.tracks.iter_mut().zip(landmarks) {
+            if let Some((pixel, confidence)) = *seen
+                && pixel.is_finite()
+                && confidence > 0.0
+            {
+                track.samples.push((nanos, pixel, confidence.min(1.0)));
+            }
+        }
+    }
+
+    /// Number of cameras.
+    #[must_use]
+    pub fn cameras(&self) -> usize {
+        self.cameras.len()
+    }
+
+    /// Number of landmarks.
+    #[must_use]
+    pub fn landmarks(&self) -> usize {
+        self.landmarks
+    }
+
+    /// Images of a camera in which the person was seen.
+    #[must_use]
+    pub fn images(&self, camera: usize) -> usize {
+        self.cameras.get(camera).map_or(0, |camera| camera.nanos.len())
+    }
+
+    /// Times of the first and the last image of any camera.
+    pub(crate) fn span(&self) -> Option<(i64, i64)> {
+        let first = self.cameras.iter().filter_map(|camera| camera.nanos.first()).min()?;
+        let last = self.cameras.iter().filter_map(|camera| camera.nanos.last()).max()?;
+        Some((*first, *last))
+    }
+
+    /// Usual time between two images of a camera, seconds.
+    pub(crate) fn interval_s(&self, camera: usize) -> f64 {
+        let gaps = self.cameras[camera].nanos.windows(2).map(|pair| pair[1].saturating_sub(pair[0]) as f64 * 1e-9);
+        flyrig_solve::median(&mut gaps.collect::<Vec<f64>>()).unwrap_or(0.0)
+    }
+
+    pub(crate) fn track(&self, camera: usize, landmark: usize) -> &Track {
+        &self.cameras[camera].tracks[landmark]
+    }
+
+    /// Times of a camera's images.
+    pub(crate) fn times(&self, camera: usize) -> Vec<i64> {
+        self.cameras[camera].nanos.clone()
+    }
+
+    /// A landmark as it was seen in the image of a time.
+    pub(crate) fn sample(&self, camera: usize, landmark: usize, nanos: i64) -> Option<DVec2> {
+        let samples = &self.track(camera, landmark).samples;
+        let index = samples.binary_search_by_key(&nanos, |(at, ..)| *at).ok()?;
+        Some(samples[index].1)
+    }
+
+    /// Exchanges two landmarks in the image of a time, if both are seen.
+    pub(crate) fn exchange(&mut self, camera: usize, a: usize, b: usize, nanos: i64) {
+        let tracks = &mut self.cameras[camera].tracks;
+        let at = |landmark: usize| tracks[landmark].samples.binary_search_by_key(&nanos, |(at, ..)| *at).ok();
+        if let (Some(i), Some(k)) = (at(a), at(b)) {
+            let first = tracks[a].samples[i];
+            tracks[a].samples[i] = tracks[b].samples[k];
+            tracks[b].samples[k] = first;
+        }
+    }
+
+    /// Only images of a part of the time, from one share of it to another.
+    pub(crate) fn part(&self, from: f64, to: f64) -> Self {
+        let Some((first, last)) = self.span() else { return self.clone() };
+        let at = |share: f64| first.saturating_add((share * last.saturating_sub(first) as f64) as i64);
+        let (from, to) = (at(from), at(to));
+        let mut part = self.clone();
+        for camera in &mut part.cameras {
+            camera.nanos.retain(|nanos| (from..=to).contains(nanos));
+            camera.tracks.iter_mut().for_each(|track| track.samples.retain(|(at, ..)| (from..=to).contains(at)));
+        }
+        part
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parabolas_are_followed_exactly_and_ends_give_nothing() {
+        let mut tracks = PersonTracks::new(1, 1);
+        let path = |s: f64| DVec2::new(100.0 + 40.0 * s - 300.0 * s * s, 50.0 - 80.0 * s);
+        for i in 0..30 {
+            tracks.add(0, i * 33_000_000, &[Some((path(0.033 * i as f64), 0.8))]);
+        }
+        let interval = tracks.interval_s(0);
+        let place = tracks.track(0, 0).at(400_000_000, interval).unwrap();
+        assert!(place.pixel.distance(path(0.4)) < 1e-9, "{place:?}");
+        assert!(place.velocity.distance(DVec2::new(40.0 - 600.0 * 0.4, -80.0)) < 1e-6, "{place:?}");
+        assert!((place.confidence - 0.8).abs() < 1e-12);
+        for nanos in [-20_000_000, 1_100_000_000, i64::MIN, i64::MAX] {
+            assert_eq!(tracks.track(0, 0).at(nanos, interval), None, "{nanos}");
+        }
+    }
+
+    #[test]
+    fn poisoned_and_late_images_are_left_out() {
+        let mut tracks = PersonTracks::new(1, 2);
+        tracks.add(0, 5, &[Some((DVec2::NAN, 1.0)), Some((DVec2::ONE, f64::NAN))]);
+        tracks.add(0, 5, &[Some((DVec2::ONE, 1.0))]);
+        tracks.add(0, 3, &[Some((DVec2::ONE, 1.0))]);
+        tracks.add(7, 9, &[Some((DVec2::ONE, 1.0))]);
+        assert_eq!((tracks.images(0), tracks.images(7)), (1, 0));
+        assert!(tracks.cameras[0].tracks.iter().all(|track| track.samples.is_empty()));
+        assert_eq!(PersonTracks::new(0, 0).span(), None);
+    }
+}
