@@ -25,7 +25,7 @@ pub use detect::{BoardDetector, GrayImage, SeenCorner, detector};
 pub use easymocap::{load_easymocap, load_lenses, save_easymocap, save_lenses};
 pub use error::CalibError;
 pub use lens::{LensFit, calibrate_lens};
-pub use person::{PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person};
+pub use person::{OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person};
 pub use print::BoardSheet;
 pub use projection::LensModel;
 pub use rig::{RigCamera, RigFit, RigOptions, calibrate_rig};

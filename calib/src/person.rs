@@ -1,10 +1,12 @@
 //! Calibration of a rig from one person who moves before it: better poses of the cameras and their time offsets.
 //!
-//! Landmarks of the person are tracked in the images of each camera by itself. Sought are the cameras' poses, a time offset a
-//! camera, and where the landmarks are at a few hundred instants; limbs keep their lengths, and the calibration that there is
-//! already is what cameras are believed to be as far as the images do not tell. It also gives world frame and scale.
+//! Landmarks and silhouettes of the person come from the images of each camera by itself. Sought are the cameras' poses, a time
+//! offset a camera, and where the landmarks are at some hundred instants. The outermost planes through two cameras' centres that
+//! touch the person must touch both silhouettes, and limbs keep their lengths. The calibration before is what holds as far as
+//! images leave poses open; it also gives world frame and scale.
 
 mod problem;
+mod tangents;
 mod tracks;
 
 use flyrig_solve::{Convergence, RigidMotion, block_covariance, log_rotation, median, minimize_blocks};
@@ -13,10 +15,11 @@ use glam::{DMat3, DVec2, DVec3};
 
 use crate::{CalibError, projection::project};
 use problem::{Estimate, Known, PersonProblem, Spread};
+pub use tangents::OutlineCorner;
 pub use tracks::PersonTracks;
 
 /// Time between two instants at least, seconds.
-const INSTANT_S: f64 = 0.05;
+const INSTANT_S: f64 = 0.025;
 /// Instants times cameras, at most.
 const MOST_IMAGES: usize = 800;
 /// Instants that say something each; more of them share their weight, for a network errs alike in images that are alike.
@@ -36,6 +39,8 @@ const POOLED: f64 = 10.0;
 /// Least standard deviation of a limb's length, metres: landmarks lie on clothes and skin.
 const LEAST_LIMB_M: f64 = 0.005;
 
+/// Least standard deviation of the angle of a plane that touches the person, radians.
+const LEAST_TOUCH: f64 = 5e-4;
 /// Rounds of exchanging left and right.
 const UNTANGLE_ROUNDS: usize = 3;
 /// Left and right are exchanged where that lowers the distances to this share.
@@ -56,7 +61,7 @@ pub struct PersonOptions {
 
 impl Default for PersonOptions {
     fn default() -> Self {
-        Self { lags: true, turn_sigma: 0.02, place_sigma_m: 0.05, lag_sigma_s: 0.1 }
+        Self { lags: true, turn_sigma: 0.01, place_sigma_m: 0.02, lag_sigma_s: 0.1 }
     }
 }
 
@@ -90,7 +95,7 @@ pub struct PersonFit {
     pub sigma_px: f64,
 }
 
-/// Refines poses and time offsets of a rig from the landmarks of one moving person. `limbs` are pairs of landmarks at a constant
+/// Refines poses and time offsets of a rig from one moving person. `limbs` are pairs of landmarks at a constant
 /// distance, `mirrored` groups of pairs (left, right) that the network takes for each other together.
 ///
 /// # Errors
@@ -214,10 +219,12 @@ fn solve(
         prior: (options.turn_sigma, options.place_sigma_m),
         lag_sigma_s: options.lag_sigma_s,
         lags: options.lags,
+        ahead: rig.center_of_attention(),
     };
     let mut spread = Spread {
         landmark_px: vec![LEAST_SIGMA_PX; tracks.landmarks()],
         limbs_m: vec![None; limbs.len()],
+        touch: LEAST_TOUCH,
         weight: (INDEPENDENT / instants.len() as f64).min(1.0),
     };
     triangulate(&known, &mut estimate);
@@ -232,7 +239,6 @@ fn solve(
         let convergence =
             Convergence { max_steps: if is_last { 40 } else { 15 }, min_gain: 1e-7, ..Convergence::default() };
         estimate = minimize_blocks(&problem, &estimate, &convergence).ok()?.unknowns;
-        if std::env::var("DBG").is_ok() { eprintln!("round {round} lags {:?} cameras {:?}", estimate.lags_s.iter().map(|x| x*1e3).collect::<Vec<_>>(), errors_by_camera(&known, &estimate)); }
         if is_last {
             seen = problem.seen().collect();
             let covariance = block_covariance(&problem, &estimate)?;
@@ -288,7 +294,7 @@ fn untangled(rig: &Rig, tracks: &PersonTracks, mirrored: &[Vec<(usize, usize)>])
             };
             cameras.iter().enumerate().filter_map(ray).collect()
         };
-        let mut swapped = 0;
+        let mut is_same = true;
         for (slot, motion) in cameras.iter().enumerate() {
             let intrinsics = &rig.cameras[slot].intrinsics;
             for nanos in before.times(slot) {
@@ -309,13 +315,12 @@ fn untangled(rig: &Rig, tracks: &PersonTracks, mirrored: &[Vec<(usize, usize)>])
                     }
                     if exchanged < CLEARLY * as_seen {
                         group.iter().for_each(|(left, right)| tracks.exchange(slot, *left, *right, nanos));
-                        swapped += 1;
+                        is_same = false;
                     }
                 }
             }
         }
-        if std::env::var("DBG").is_ok() { eprintln!("swapped {swapped}"); }
-        if swapped == 0 {
+        if is_same {
             break;
         }
     }
@@ -422,6 +427,9 @@ fn estimate_spread(known: &Known<'_>, at: &Estimate, spread: &mut Spread, with_l
         let square = (count * own * own + POOLED * pooled * pooled) / (count + POOLED);
         *sigma = square.sqrt().max(LEAST_SIGMA_PX);
     }
+    let touches = (0..at.points.len()).flat_map(|instant| known.touches(at, instant));
+    let mut angles: Vec<f64> = touches.map(|(.., found)| found.angle.abs()).collect();
+    spread.touch = (1.48 * median(&mut angles).unwrap_or(0.0)).max(LEAST_TOUCH);
     // Lengths are worth something once the points are.
     if !with_limbs {
         return;

@@ -5,6 +5,7 @@
 mod clocks;
 #[cfg(test)]
 mod clocks_tests;
+mod hull;
 mod lags;
 #[cfg(test)]
 mod random;
@@ -15,6 +16,7 @@ mod sync;
 mod sync_properties;
 
 pub use clocks::{ClockAligner, ClockKind, ClockState};
+pub use hull::{HullCorner, silhouette_hull};
 pub use lags::{LagEstimate, MotionSignal, estimate_lags};
 pub use settings::SyncSettings;
 pub use silhouette_lags::{SilhouetteTrack, estimate_silhouette_lags};

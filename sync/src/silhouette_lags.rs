@@ -7,8 +7,9 @@
 
 use flyrig_solve::median;
 use flyrig_types::{Camera, Mask};
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 
+use crate::hull::{HullCorner, silhouette_hull};
 use crate::LagEstimate;
 use crate::lags::{Balance, PairLag, balanced};
 
@@ -35,26 +36,15 @@ const LEAST_STRETCH: usize = 30;
 const AMBIGUOUS: f64 = 0.25;
 /// Distance in robust standard deviations from which two curves are more likely to show different things.
 const SCALE: f64 = 1.5;
-/// Coverage of a pixel that is half covered.
-const HALF: f64 = 127.5;
 /// Lags looked for, at most, nanoseconds.
 const MOST: i64 = 1_000_000_000;
-
-/// A corner of the convex hull of a silhouette.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Corner {
-    /// Direction in the world.
-    ray: DVec3,
-    /// Whether the picture ends there, so that the silhouette may go on.
-    is_cut: bool,
-}
 
 /// Silhouettes of one camera over time.
 #[derive(Debug, Clone)]
 pub struct SilhouetteTrack {
     camera: Camera,
-    /// Time, and the convex hull of the silhouette.
-    samples: Vec<(i64, Vec<Corner>)>,
+    /// Time, and the convex hull of the silhouette in the world's axes.
+    samples: Vec<(i64, Vec<HullCorner>)>,
 }
 
 impl SilhouetteTrack {
@@ -69,7 +59,9 @@ impl SilhouetteTrack {
     pub fn add(&mut self, capture_nanos: i64, mask: &Mask) {
         let is_newer = self.samples.last().is_none_or(|(before, _)| *before < capture_nanos);
         if is_newer && [mask.width(), mask.height()] == self.camera.size() {
-            let hull = self.hull(mask);
+            let back = self.camera.camera_from_world.rotation.inverse();
+            let in_world = |corner: HullCorner| HullCorner { ray: back * corner.ray, ..corner };
+            let hull: Vec<HullCorner> = silhouette_hull(&self.camera, mask).into_iter().map(in_world).collect();
             if hull.len() > 2 {
                 self.samples.push((capture_nanos, hull));
             }
@@ -88,26 +80,6 @@ impl SilhouetteTrack {
         self.samples.is_empty()
     }
 
-    /// The convex hull of where coverage crosses one half, without the lens: lines that touch a silhouette touch its hull.
-    fn hull(&self, mask: &Mask) -> Vec<Corner> {
-        let rotation = self.camera.camera_from_world.rotation;
-        let mut points: Vec<(DVec2, bool)> = outline(mask)
-            .into_iter()
-            .filter_map(|(pixel, is_cut)| {
-                let ray = rotation * self.camera.ray(pixel)?;
-                (ray.z > 1e-3).then(|| (ray.truncate() / ray.z, is_cut))
-            })
-            .collect();
-        points.sort_by(|(a, _), (b, _)| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
-        let mut hull = half_hull(points.iter());
-        hull.extend(half_hull(points.iter().rev()));
-        let in_world = |(point, is_cut): (DVec2, bool)| Corner {
-            ray: (rotation.inverse() * point.extend(1.0)).normalize(),
-            is_cut,
-        };
-        hull.into_iter().map(in_world).collect()
-    }
-
     /// Half of the median time between two masks, nanoseconds.
     fn half_interval(&self) -> f64 {
         let mut gaps: Vec<i64> = self.samples.windows(2).map(|pair| pair[1].0.saturating_sub(pair[0].0)).collect();
@@ -118,50 +90,6 @@ impl SilhouetteTrack {
     fn span(&self) -> Option<(i64, i64)> {
         Some((self.samples.first()?.0, self.samples.last()?.0))
     }
-}
-
-/// Where coverage crosses one half between neighbouring pixels, and covered pixels on the picture's border; true where the
-/// silhouette may go on beyond that border.
-fn outline(mask: &Mask) -> Vec<(DVec2, bool)> {
-    let (width, height) = (mask.width() as usize, mask.height() as usize);
-    let at = |x: usize, y: usize| f64::from(mask.coverage()[y * width + x]);
-    let mut points = Vec::new();
-    for y in 0..height {
-        for x in 0..width {
-            let (here, place) = (at(x, y), DVec2::new(x as f64, y as f64));
-            let (on_side, on_end) = (x == 0 || x + 1 == width, y == 0 || y + 1 == height);
-            let mut crossing = |there: f64, to: DVec2, is_cut: bool| {
-                if (here < HALF) != (there < HALF) {
-                    points.push((place + to * ((HALF - here) / (there - here)), is_cut));
-                }
-            };
-            if x + 1 < width {
-                crossing(at(x + 1, y), DVec2::X, on_end);
-            }
-            if y + 1 < height {
-                crossing(at(x, y + 1), DVec2::Y, on_side);
-            }
-            if here >= HALF && (on_side || on_end) {
-                points.push((place, true));
-            }
-        }
-    }
-    points
-}
-
-/// Half of the convex hull of sorted points, without its last one (Andrew 1979).
-fn half_hull<'a>(points: impl Iterator<Item = &'a (DVec2, bool)>) -> Vec<(DVec2, bool)> {
-    let mut hull: Vec<(DVec2, bool)> = Vec::new();
-    for point in points {
-        while let [.., (a, _), (b, _)] = hull.as_slice()
-            && (*b - *a).perp_dot(point.0 - *b) <= 0.0
-        {
-            hull.pop();
-        }
-        hull.push(*point);
-    }
-    hull.pop();
-    hull
 }
 
 /// Lags of all cameras against the first one, of two cameras at most `most_nanos` (at most 1 s); two cameras are enough. The

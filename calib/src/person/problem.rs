@@ -5,14 +5,18 @@ use flyrig_types::Intrinsics;
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
 
-use super::tracks::{Place, PersonTracks};
+use super::tangents::{Eye, Side, Tangency, tangency};
+use super::tracks::{PersonTracks, Place};
 use crate::{LensModel, projection::{project, project_with_derivatives}};
 
 /// Beyond so many standard deviations a landmark loses half its weight.
 const LANDMARK_KERNEL: Kernel = Kernel::Cauchy(2.0);
 const LIMB_KERNEL: Kernel = Kernel::Cauchy(2.0);
-/// A camera that was bumped does not pull the others along.
-const PRIOR_KERNEL: Kernel = Kernel::Cauchy(1.0);
+/// A camera that was bumped pulls the others along only a little.
+const PRIOR_KERNEL: Kernel = Kernel::Huber(1.0);
+/// Weight of a landmark beside an outermost plane: the network errs alike in all images in which it sees a person from one side, and
+/// silhouettes hardly do (docs/benchmarks/calibration.md).
+const LANDMARK_WEIGHT: f64 = 0.1;
 /// Standard deviation of a landmark's place from where it started, metres: fixes those that one camera sees.
 const LOOSE_M: f64 = 2.0;
 
@@ -30,6 +34,7 @@ pub(crate) struct Estimate {
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Term {
     Seen { instant: usize, camera: usize, landmark: usize },
+    Touch { instant: usize, cameras: [usize; 2], side: Side },
     Limb { instant: usize, limb: usize },
     Loose { instant: usize, landmark: usize },
     Camera(usize),
@@ -55,6 +60,8 @@ pub(crate) struct Known<'a> {
     pub lag_sigma_s: f64,
     /// Whether offsets are sought.
     pub lags: bool,
+    /// A place that all cameras look at, metres in the world.
+    pub ahead: DVec3,
 }
 
 /// Standard deviations that are estimated in turn with the unknowns.
@@ -64,6 +71,8 @@ pub(crate) struct Spread {
     pub landmark_px: Vec<f64>,
     /// Length of each limb and its standard deviation, metres.
     pub limbs_m: Vec<Option<(f64, f64)>>,
+    /// Of the angle of a plane that touches the person, radians.
+    pub touch: f64,
     /// Weight of an instant: neighbours err alike.
     pub weight: f64,
 }
@@ -94,6 +103,7 @@ impl<'a> PersonProblem<'a> {
                     terms.extend(seen.into_iter().map(|camera| Term::Seen { instant, camera, landmark }));
                 }
             }
+            terms.extend(known.touches(at, instant).map(|(cameras, side, _)| Term::Touch { instant, cameras, side }));
             let limbs = known.limbs.iter().enumerate().filter(|(limb, (a, b))| {
                 spread.limbs_m[*limb].is_some() && is_fixed[*a] && is_fixed[*b]
             });
@@ -115,12 +125,18 @@ impl<'a> PersonProblem<'a> {
         })
     }
 
+    /// Whether a residual is about a plane that touches the person.
+    #[cfg(test)]
+    pub fn is_touch(&self, index: usize) -> bool {
+        matches!(self.terms[index], Term::Touch { .. })
+    }
+
     fn seen_residual(&self, at: &Estimate, [instant, camera, landmark]: [usize; 3], with_jacobians: bool) -> Option<Residual> {
         let weigh = |error: DVec2, place: Option<Place>| Residual {
             error: DVector::from_column_slice(&(error / self.spread.landmark_px[landmark]).to_array()),
             jacobians: Vec::new(),
             kernel: LANDMARK_KERNEL,
-            weight: place.map_or(0.0, |place| self.spread.weight * place.confidence),
+            weight: place.map_or(0.0, |place| LANDMARK_WEIGHT * self.spread.weight * place.confidence),
         };
         // The end of a track that a changed offset has left.
         let Some(place) = self.known.place(at, instant, camera, landmark) else { return Some(weigh(DVec2::ZERO, None)) };
@@ -147,6 +163,26 @@ impl<'a> PersonProblem<'a> {
         by_points.columns_mut(3 * landmark, 3).copy_from(&by_place);
         residual.jacobians.push((self.first_eliminated() + instant, by_points));
         Some(residual)
+    }
+
+    fn touch_residual(&self, at: &Estimate, instant: usize, cameras: [usize; 2], side: Side, with_jacobians: bool) -> Residual {
+        let inverse = 1.0 / self.spread.touch;
+        let found = self.known.tangency(at, instant, cameras, side, with_jacobians);
+        let mut residual = Residual {
+            error: DVector::from_element(1, found.map_or(0.0, |found| found.angle * inverse)),
+            jacobians: Vec::new(),
+            kernel: LANDMARK_KERNEL,
+            weight: if found.is_some() { self.spread.weight } else { 0.0 },
+        };
+        if let Some(found) = found.filter(|_| with_jacobians) {
+            for ((camera, by_camera), by_lag) in cameras.into_iter().zip(found.by_cameras).zip(found.by_lags) {
+                residual.jacobians.push((camera, DMatrix::from_row_slice(1, 6, &by_camera.map(|by| by * inverse))));
+                if let Some(block) = self.lag_block(camera) {
+                    residual.jacobians.push((block, DMatrix::from_element(1, 1, by_lag * inverse)));
+                }
+            }
+        }
+        residual
     }
 
     fn lag_block(&self, camera: usize) -> Option<usize> {
@@ -196,10 +232,44 @@ impl<'a> PersonProblem<'a> {
 }
 
 impl Known<'_> {
+    /// Outermost planes that two cameras see, at an instant.
+    pub fn touches<'b>(
+        &'b self,
+        at: &'b Estimate,
+        instant: usize,
+    ) -> impl Iterator<Item = ([usize; 2], Side, Tangency)> + 'b {
+        let count = self.intrinsics.len();
+        let pairs = (0..count).flat_map(move |a| (a + 1..count).map(move |b| [a, b]));
+        let sides = pairs.flat_map(|pair| [Side::Low, Side::High].map(|side| (pair, side)));
+        sides.filter_map(move |(pair, side)| Some((pair, side, self.tangency(at, instant, pair, side, false)?)))
+    }
+
+    fn tangency(
+        &self,
+        at: &Estimate,
+        instant: usize,
+        cameras: [usize; 2],
+        side: Side,
+        with_derivatives: bool,
+    ) -> Option<Tangency> {
+        let eye = |camera: usize| Eye {
+            camera: at.cameras[camera],
+            outlines: self.tracks.outlines(camera),
+            stamp: self.stamp(at, instant, camera),
+            interval_s: self.intervals_s[camera],
+        };
+        // The directions of the calibration before: fixed while cameras move.
+        let middle = self.ahead - 0.5 * cameras.map(|c| self.before.cameras[c].inverse().translation).iter().sum::<DVec3>();
+        tangency(cameras.map(eye), side, middle.try_normalize()?, with_derivatives)
+    }
+
+    fn stamp(&self, at: &Estimate, instant: usize, camera: usize) -> i64 {
+        self.instants[instant].saturating_add((at.lags_s[camera] * 1e9) as i64)
+    }
+
     /// Where a track is at an instant.
     pub fn place(&self, at: &Estimate, instant: usize, camera: usize, landmark: usize) -> Option<Place> {
-        let stamp = self.instants[instant].saturating_add((at.lags_s[camera] * 1e9) as i64);
-        self.tracks.track(camera, landmark).at(stamp, self.intervals_s[camera])
+        self.tracks.track(camera, landmark).at(self.stamp(at, instant, camera), self.intervals_s[camera])
     }
 
     /// Difference of a drawn and a seen landmark, pixels; `None` where it is not seen or cannot be drawn.
@@ -229,6 +299,9 @@ impl BlockProblem for PersonProblem<'_> {
         match self.terms[index] {
             Term::Seen { instant, camera, landmark } => {
                 self.seen_residual(at, [instant, camera, landmark], with_jacobians)
+            }
+            Term::Touch { instant, cameras, side } => {
+                Some(self.touch_residual(at, instant, cameras, side, with_jacobians))
             }
             Term::Limb { instant, limb } => self.limb_residual(at, instant, limb),
             Term::Camera(camera) => Some(self.camera_residual(at, camera)),

@@ -2,6 +2,8 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
+use super::tangents::{OutlineCorner, Outlines};
+
 /// Standard deviation of the window that smooths a track, seconds; at least so many intervals between images.
 const SMOOTH_S: f64 = 0.03;
 const SMOOTH_INTERVALS: f64 = 1.0;
@@ -28,39 +30,55 @@ pub(crate) struct Place {
 }
 
 impl Track {
-    /// Standard deviation of the window for images at an interval.
-    fn window_s(interval_s: f64) -> f64 {
-        SMOOTH_S.max(SMOOTH_INTERVALS * interval_s)
-    }
-
     /// A parabola fitted to what is near a time; `None` where there are too few samples on either side.
     pub fn at(&self, nanos: i64, interval_s: f64) -> Option<Place> {
-        let window = Self::window_s(interval_s);
-        let reach = (REACH * window * 1e9) as i64;
-        let from = self.samples.partition_point(|(at, ..)| *at < nanos.saturating_sub(reach));
-        let near = self.samples[from..].iter().take_while(|(at, ..)| *at <= nanos.saturating_add(reach));
-        let (mut normal, mut right) = (DMat3::ZERO, [DVec3::ZERO; 2]);
-        let (mut before, mut after, mut sum, mut confidence) = (0, 0, 0.0, 0.0);
-        for (at, pixel, trust) in near {
-            let x = at.saturating_sub(nanos) as f64 * 1e-9 / window;
-            (before, after) = (before + usize::from(x <= 0.0), after + usize::from(x >= 0.0));
-            let kernel = (-0.5 * x * x).exp();
-            (sum, confidence) = (sum + kernel, confidence + kernel * trust);
-            let weight = kernel * trust;
-            let row = DVec3::new(1.0, x, x * x);
-            normal += DMat3::from_cols(row * row.x, row * row.y, row * row.z) * weight;
-            right[0] += row * (weight * pixel.x);
-            right[1] += row * (weight * pixel.y);
+        let (near, weights) =
+            parabola_weights(&self.samples, |(at, ..)| *at, |(.., trust)| *trust, nanos, interval_s)?;
+        let mut place = Place { pixel: DVec2::ZERO, velocity: DVec2::ZERO, confidence: 0.0 };
+        for ((_, pixel, trust), (value, slope)) in near.iter().zip(weights) {
+            place.pixel += *pixel * value;
+            place.velocity += *pixel * slope;
+            place.confidence += trust / near.len() as f64;
         }
-        if before == 0 || after == 0 || before + after < LEAST_SAMPLES || normal.determinant().abs() < 1e-9 {
-            return None;
-        }
-        let inverse = normal.inverse();
-        let [u, v] = right.map(|right| inverse * right);
-        let pixel = DVec2::new(u.x, v.x);
-        let place = Place { pixel, velocity: DVec2::new(u.y, v.y) / window, confidence: confidence / sum };
         (place.pixel.is_finite() && place.velocity.is_finite() && place.confidence > 0.0).then_some(place)
     }
+}
+
+/// Samples around a time, and the weight of each in the value and in the slope (a second) that a parabola fitted to them has
+/// there; `None` where there are too few on either side.
+pub(crate) fn parabola_weights<T>(
+    samples: &[T],
+    time: impl Fn(&T) -> i64,
+    trust: impl Fn(&T) -> f64,
+    nanos: i64,
+    interval_s: f64,
+) -> Option<(&[T], Vec<(f64, f64)>)> {
+    let window = SMOOTH_S.max(SMOOTH_INTERVALS * interval_s);
+    let reach = (REACH * window * 1e9) as i64;
+    let from = samples.partition_point(|sample| time(sample) < nanos.saturating_sub(reach));
+    let count = samples[from..].partition_point(|sample| time(sample) <= nanos.saturating_add(reach));
+    let near = &samples[from..from + count];
+    let mut normal = DMat3::ZERO;
+    let rows: Vec<(DVec3, f64)> = near
+        .iter()
+        .map(|sample| {
+            let x = time(sample).saturating_sub(nanos) as f64 * 1e-9 / window;
+            let row = DVec3::new(1.0, x, x * x);
+            let weight = (-0.5 * x * x).exp() * trust(sample);
+            normal += DMat3::from_cols(row * row.x, row * row.y, row * row.z) * weight;
+            (row, weight)
+        })
+        .collect();
+    let is_between = rows.iter().any(|(row, _)| row.y <= 0.0) && rows.iter().any(|(row, _)| row.y >= 0.0);
+    if !is_between || near.len() < LEAST_SAMPLES || normal.determinant().abs() < 1e-9 {
+        return None;
+    }
+    let inverse = normal.inverse();
+    let weights = rows.into_iter().map(|(row, weight)| {
+        let solved = inverse * (row * weight);
+        (solved.x, solved.y / window)
+    });
+    Some((near, weights.collect()))
 }
 
 /// Landmarks of one person in the images of all cameras.
@@ -76,13 +94,14 @@ struct CameraTracks {
     /// Times of the images.
     nanos: Vec<i64>,
     tracks: Vec<Track>,
+    outlines: Outlines,
 }
 
 impl PersonTracks {
     /// Without any image, for cameras and landmarks by number.
     #[must_use]
     pub fn new(cameras: usize, landmarks: usize) -> Self {
-        let empty = CameraTracks { nanos: Vec::new(), tracks: vec![Track::default(); landmarks] };
+        let empty = CameraTracks { tracks: vec![Track::default(); landmarks], ..CameraTracks::default() };
         Self { landmarks, cameras: vec![empty; cameras] }
     }
 
@@ -102,6 +121,21 @@ impl PersonTracks {
                 track.samples.push((nanos, pixel, confidence.min(1.0)));
             }
         }
+    }
+
+    /// Adds the convex hull of the person's silhouette in an image. Images out of order, of cameras that are not there, and hulls of
+    /// fewer than three corners or with values that are not finite are left out.
+    pub fn add_outline(&mut self, camera: usize, nanos: i64, corners: Vec<OutlineCorner>) {
+        let Some(camera) = self.cameras.get_mut(camera) else { return };
+        let is_newer = camera.outlines.last().is_none_or(|(last, _)| *last < nanos);
+        if is_newer && corners.len() > 2 && corners.iter().all(|corner| corner.ray.is_finite()) {
+            camera.outlines.push((nanos, corners));
+        }
+    }
+
+    /// Silhouettes of a camera.
+    pub(crate) fn outlines(&self, camera: usize) -> &Outlines {
+        &self.cameras[camera].outlines
     }
 
     /// Number of cameras.
@@ -170,6 +204,7 @@ impl PersonTracks {
         let mut part = self.clone();
         for camera in &mut part.cameras {
             camera.nanos.retain(|nanos| (from..=to).contains(nanos));
+            camera.outlines.retain(|(at, _)| (from..=to).contains(at));
             camera.tracks.iter_mut().for_each(|track| track.samples.retain(|(at, ..)| (from..=to).contains(at)));
         }
         part

@@ -4,12 +4,12 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
 use flyrig_body::{ShapeParams, default_template};
-use flyrig_calib::{PersonFit, PersonOptions, PersonTracks, calibrate_person, save_easymocap};
+use flyrig_calib::{OutlineCorner, PersonFit, PersonOptions, PersonTracks, calibrate_person, save_easymocap};
 use flyrig_capture::Pacing;
 use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop};
-use flyrig_sync::SyncSettings;
+use flyrig_sync::{HullCorner, SyncSettings, silhouette_hull};
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
 use flyrig_types::{Image, Rig};
 use glam::DVec2;
@@ -83,9 +83,8 @@ fn look_through(
     plates: Vec<Option<Image>>,
     take: CalibratedTake,
 ) -> Result<PersonTracks> {
-    let config = PoseConfig { masks: false, outline_rounds: 0, ..PoseConfig::default() };
     let template = default_template(&ShapeParams::default())?;
-    let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, rig, plates, &config)?;
+    let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, rig, plates, &PoseConfig::default())?;
     let mut tracks = PersonTracks::new(rig.cameras.len(), LANDMARKS.len());
     let sync = SyncSettings {
         max_wait_nanos: Some(take.sync.max_wait_nanos.unwrap_or(1_000_000_000)),
@@ -106,8 +105,13 @@ fn look_through(
         }
         bar.set_position((at * 1e3) as u64);
         for (slot, found) in viewers.look(&set)?.into_iter().enumerate() {
-            let Some(keypoints) = found.and_then(|found| found.keypoints.into_iter().next().flatten()) else { continue };
-            let Some(frame) = &set.frames[slot] else { continue };
+            let (Some(found), Some(frame)) = (found, &set.frames[slot]) else { continue };
+            if let Some(mask) = found.masks.iter().flatten().next() {
+                let corner = |corner: HullCorner| OutlineCorner { ray: corner.ray, is_cut: corner.is_cut };
+                let hull = silhouette_hull(&rig.cameras[slot], mask).into_iter().map(corner).collect();
+                tracks.add_outline(slot, frame.capture_nanos, hull);
+            }
+            let Some(keypoints) = found.keypoints.into_iter().next().flatten() else { continue };
             let seen: Vec<Option<(DVec2, f64)>> = LANDMARKS
                 .iter()
                 .map(|landmark| keypoints[*landmark])

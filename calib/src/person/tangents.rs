@@ -1,0 +1,146 @@
+//! Planes through the centres of two cameras that touch a person touch the silhouettes in the images of both (epipolar tangency,
+//! e.g. Wong and Cipolla 2001): how far the two outermost planes are turned about the line through the centres is the same for
+//! both cameras.
+
+use flyrig_solve::RigidMotion;
+use glam::DVec3;
+
+use super::tracks::parabola_weights;
+
+/// Smallest sine of the angle between the line through two cameras and what they see: nearer to that line, planes through it
+/// say little.
+const LEAST_APART: f64 = 0.35;
+/// A silhouette that is wider than this, radians around the line through both cameras, surrounds that line.
+const MOST_SPAN: f64 = 2.0;
+
+/// A corner of the convex hull of a silhouette.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OutlineCorner {
+    /// Direction in the camera's axes.
+    pub ray: DVec3,
+    /// Whether the image ends there, so that the silhouette may go on.
+    pub is_cut: bool,
+}
+
+/// Silhouettes of one camera, in the order of time.
+pub(crate) type Outlines = Vec<(i64, Vec<OutlineCorner>)>;
+
+/// Which of the two outermost planes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Side {
+    Low,
+    High,
+}
+
+/// One camera of a pair.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Eye<'a> {
+    pub camera: RigidMotion,
+    pub outlines: &'a Outlines,
+    /// Time stamp of the instant in this camera, nanoseconds.
+    pub stamp: i64,
+    pub interval_s: f64,
+}
+
+/// Frame in which planes through two cameras are measured.
+struct Pencil {
+    across: DVec3,
+    front: DVec3,
+}
+
+impl Pencil {
+    /// Angle 0 is towards `ahead`, a fixed direction in the world.
+    fn new(a: &RigidMotion, b: &RigidMotion, ahead: DVec3) -> Option<Self> {
+        let line = (b.inverse().translation - a.inverse().translation).try_normalize()?;
+        let front = ahead.reject_from_normalized(line);
+        let is_apart = front.length() >= LEAST_APART * ahead.length();
+        let front = front.try_normalize().filter(|_| is_apart)?;
+        Some(Self { across: line.cross(front), front })
+    }
+
+    fn angle(&self, ray: DVec3) -> f64 {
+        ray.dot(self.across).atan2(ray.dot(self.front))
+    }
+}
+
+/// Corners that touch a plane, in the images around an instant.
+struct Touch {
+    /// Direction in the camera's axes; weight in the angle at the instant, and in its slope a second.
+    corners: Vec<(DVec3, f64, f64)>,
+}
+
+impl Touch {
+    fn new(eye: &Eye<'_>, pencil: &Pencil, side: Side) -> Option<Self> {
+        let (near, weights) = parabola_weights(eye.outlines, |(nanos, _)| *nanos, |_| 1.0, eye.stamp, eye.interval_s)?;
+        let back = eye.camera.rotation.inverse();
+        let corners = near.iter().zip(weights).map(|((_, hull), (value, slope))| {
+            let mut low = (f64::INFINITY, None);
+            let mut high = (f64::NEG_INFINITY, None);
+            for corner in hull {
+                let angle = pencil.angle(back * corner.ray);
+                if angle < low.0 {
+                    low = (angle, Some(corner));
+                }
+                if angle > high.0 {
+                    high = (angle, Some(corner));
+                }
+            }
+            let corner = if side == Side::Low { low.1? } else { high.1? };
+            (high.0 - low.0 < MOST_SPAN && !corner.is_cut).then_some((corner.ray, value, slope))
+        });
+        Some(Self { corners: corners.collect::<Option<_>>()? })
+    }
+
+    fn angle(&self, camera: &RigidMotion, pencil: &Pencil) -> f64 {
+        let back = camera.rotation.inverse();
+        self.corners.iter().map(|(ray, weight, _)| weight * pencil.angle(back * *ray)).sum()
+    }
+
+    /// Radians a second.
+    fn speed(&self, camera: &RigidMotion, pencil: &Pencil) -> f64 {
+        let back = camera.rotation.inverse();
+        self.corners.iter().map(|(ray, _, slope)| slope * pencil.angle(back * *ray)).sum()
+    }
+}
+
+/// Difference of the plane's angles, and its derivatives by the steps of both cameras (turn, shift) and by both offsets.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Tangency {
+    pub angle: f64,
+    pub by_cameras: [[f64; 6]; 2],
+    pub by_lags: [f64; 2],
+}
+
+/// Compares one of the outermost planes of two cameras; `None` where one of them does not see it. `ahead` is any fixed direction
+/// of the world towards what both see.
+pub(crate) fn tangency(eyes: [Eye<'_>; 2], side: Side, ahead: DVec3, with_derivatives: bool) -> Option<Tangency> {
+    let pencil = Pencil::new(&eyes[0].camera, &eyes[1].camera, ahead)?;
+    let touches = [Touch::new(&eyes[0], &pencil, side)?, Touch::new(&eyes[1], &pencil, side)?];
+    let difference = |cameras: [RigidMotion; 2]| {
+        let pencil = Pencil::new(&cameras[0], &cameras[1], ahead)?;
+        Some(touches[1].angle(&cameras[1], &pencil) - touches[0].angle(&cameras[0], &pencil))
+    };
+    let cameras = eyes.map(|eye| eye.camera);
+    let angle = difference(cameras)?;
+    let mut by_cameras = [[0.0; 6]; 2];
+    let mut by_lags = [0.0; 2];
+    if with_derivatives {
+        // Corners stay while cameras move: the outermost ones are where the angle does not change along the outline.
+        const STEP: f64 = 1e-6;
+        for (which, by_camera) in by_cameras.iter_mut().enumerate() {
+            for (k, by) in by_camera.iter_mut().enumerate() {
+                let at = |step: f64| {
+                    let mut twist = [0.0; 6];
+                    twist[k] = step;
+                    let mut cameras = cameras;
+                    let [a, b, c, d, e, f] = twist;
+                    cameras[which] = cameras[which].moved(DVec3::new(a, b, c), DVec3::new(d, e, f));
+                    difference(cameras)
+                };
+                *by = (at(STEP)? - at(-STEP)?) / (2.0 * STEP);
+            }
+        }
+        by_lags = [-touches[0].speed(&cameras[0], &pencil), touches[1].speed(&cameras[1], &pencil)];
+    }
+    angle.is_finite().then_some(Tangency { angle, by_cameras, by_lags })
+}
