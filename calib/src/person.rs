@@ -175,9 +175,7 @@ struct Solved {
 impl Solved {
     /// Mean distance of the person in an image between two poses of its camera.
     fn shift_px(&self, rig: &Rig, slot: usize, a: &RigidMotion, b: &RigidMotion) -> f64 {
-        let project = |motion: &RigidMotion, point| {
-            project(&rig.cameras[slot].intrinsics, motion.apply(point))
-        };
+        let project = |motion: &RigidMotion, point| project(&rig.cameras[slot].intrinsics, motion.apply(point));
         let shifts: Vec<f64> = self
             .seen
             .iter()
@@ -352,7 +350,9 @@ fn triangulate(known: &Known<'_>, estimate: &mut Estimate) {
             let mut rays = Vec::new();
             for camera in 0..estimate.cameras.len() {
                 let Some(place) = known.place(estimate, instant, camera, landmark) else { continue };
-                let Some(ray) = ray(&known.intrinsics[camera], &estimate.cameras[camera], place.pixel) else { continue };
+                let Some(ray) = ray(&known.intrinsics[camera], &estimate.cameras[camera], place.pixel) else {
+                    continue;
+                };
                 rays.push((ray, center(camera), place.confidence));
             }
             *point = nearest(&rays).unwrap_or(fallback);

@@ -1,8 +1,8 @@
 //! Silhouettes of one person in the images of every camera by itself.
 
 use anyhow::Result;
-use flyrig_sync::SilhouetteTrack;
 use flyrig_body::{ShapeParams, default_template};
+use flyrig_sync::SilhouetteTrack;
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
 use flyrig_types::{FrameSet, Image, Rig};
 

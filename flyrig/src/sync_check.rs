@@ -29,7 +29,8 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     let mut take = take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu)?;
     let cameras: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(cameras.len() > 1, "one camera alone has no lag; name at least two");
-    let is_configured = matches!(args.input.as_slice(), [path] if path.extension().is_some_and(|ending| ending == "toml"));
+    let is_configured =
+        matches!(args.input.as_slice(), [path] if path.extension().is_some_and(|ending| ending == "toml"));
     let advice = match (take.is_live, is_configured) {
         (true, _) => ADD_TO_CAMERA,
         (false, true) => ADD_TO_SYNC,

@@ -67,11 +67,7 @@ pub struct CalibratedTake {
 
 impl CalibratedTake {
     /// Of a recording, folder or videos by themselves.
-    fn replayed(
-        sources: Vec<SourceOpener>,
-        calibration: Option<(Rig, Vec<Option<Image>>)>,
-        given_masks: bool,
-    ) -> Self {
+    fn replayed(sources: Vec<SourceOpener>, calibration: Option<(Rig, Vec<Option<Image>>)>, given_masks: bool) -> Self {
         Self { sources, is_live: false, calibration, given_masks, sync: SyncSettings::default() }
     }
 }
@@ -116,8 +112,9 @@ pub fn open_calibrated(
             if with_masks {
                 sources = folder_sources(folder, fps, true)?;
             }
-            let calibration =
-                (is_calibrated && folder_of_calibration.is_none()).then(|| calibration(folder, &sources)).transpose()?;
+            let calibration = (is_calibrated && folder_of_calibration.is_none())
+                .then(|| calibration(folder, &sources))
+                .transpose()?;
             CalibratedTake::replayed(sources, calibration, with_masks)
         }
         [path] if !path.exists() => bail!("{} does not exist", path.display()),

@@ -2,6 +2,8 @@
 
 use flyrig_types::{Intrinsics, Isometry, Lens};
 
+use glam::DVec2;
+
 use super::*;
 use crate::random::Random;
 

@@ -67,22 +67,26 @@ impl Viewers {
             Err(error) if error.kind == TrackErrorKind::Lost => return Ok(found),
             Err(error) => return Err(error),
         };
-        (self.alone.par_iter_mut().zip(&set.frames).zip(&mut found)).filter(|(_, found)| found.is_none()).try_for_each(
-            |((estimator, frame), found)| -> Result<(), TrackError> {
+        (self.alone.par_iter_mut().zip(&set.frames).zip(&mut found))
+            .filter(|(_, found)| found.is_none())
+            .try_for_each(|((estimator, frame), found)| -> Result<(), TrackError> {
                 if let Some(frame) = frame
                     && estimator.start_from(&pose, frame.capture_nanos)
                 {
                     *found = look_alone(estimator, frame, number)?;
                 }
                 Ok(())
-            },
-        )?;
+            })?;
         Ok(found)
     }
 }
 
 /// The person in an image; `None` when nobody is found.
-fn look_alone(estimator: &mut PoseEstimator, frame: &Arc<Frame>, index: u64) -> Result<Option<PoseEstimate>, TrackError> {
+fn look_alone(
+    estimator: &mut PoseEstimator,
+    frame: &Arc<Frame>,
+    index: u64,
+) -> Result<Option<PoseEstimate>, TrackError> {
     let set = FrameSet { index, master_nanos: frame.capture_nanos, frames: vec![Some(Arc::clone(frame))] };
     match estimator.estimate(&set) {
         Ok(estimate) => Ok(Some(estimate)),

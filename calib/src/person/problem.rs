@@ -7,7 +7,10 @@ use nalgebra::{DMatrix, DVector};
 
 use super::tangents::{Eye, Side, Tangency, tangency};
 use super::tracks::{PersonTracks, Place};
-use crate::{LensModel, projection::{project, project_with_derivatives}};
+use crate::{
+    LensModel,
+    projection::{project, project_with_derivatives},
+};
 
 /// Beyond so many standard deviations a landmark loses half its weight.
 const LANDMARK_KERNEL: Kernel = Kernel::Cauchy(2.0);
@@ -104,9 +107,11 @@ impl<'a> PersonProblem<'a> {
                 }
             }
             terms.extend(known.touches(at, instant).map(|(cameras, side, _)| Term::Touch { instant, cameras, side }));
-            let limbs = known.limbs.iter().enumerate().filter(|(limb, (a, b))| {
-                spread.limbs_m[*limb].is_some() && is_fixed[*a] && is_fixed[*b]
-            });
+            let limbs = known
+                .limbs
+                .iter()
+                .enumerate()
+                .filter(|(limb, (a, b))| spread.limbs_m[*limb].is_some() && is_fixed[*a] && is_fixed[*b]);
             terms.extend(limbs.map(|(limb, _)| Term::Limb { instant, limb }));
         }
         let mut sizes = vec![6; cameras];
@@ -131,7 +136,12 @@ impl<'a> PersonProblem<'a> {
         matches!(self.terms[index], Term::Touch { .. })
     }
 
-    fn seen_residual(&self, at: &Estimate, [instant, camera, landmark]: [usize; 3], with_jacobians: bool) -> Option<Residual> {
+    fn seen_residual(
+        &self,
+        at: &Estimate,
+        [instant, camera, landmark]: [usize; 3],
+        with_jacobians: bool,
+    ) -> Option<Residual> {
         let weigh = |error: DVec2, place: Option<Place>| Residual {
             error: DVector::from_column_slice(&(error / self.spread.landmark_px[landmark]).to_array()),
             jacobians: Vec::new(),
@@ -139,7 +149,9 @@ impl<'a> PersonProblem<'a> {
             weight: place.map_or(0.0, |place| LANDMARK_WEIGHT * self.spread.weight * place.confidence),
         };
         // The end of a track that a changed offset has left.
-        let Some(place) = self.known.place(at, instant, camera, landmark) else { return Some(weigh(DVec2::ZERO, None)) };
+        let Some(place) = self.known.place(at, instant, camera, landmark) else {
+            return Some(weigh(DVec2::ZERO, None));
+        };
         let point = at.points[instant][landmark];
         let local = at.cameras[camera].apply(point);
         if !with_jacobians {
@@ -165,7 +177,14 @@ impl<'a> PersonProblem<'a> {
         Some(residual)
     }
 
-    fn touch_residual(&self, at: &Estimate, instant: usize, cameras: [usize; 2], side: Side, with_jacobians: bool) -> Residual {
+    fn touch_residual(
+        &self,
+        at: &Estimate,
+        instant: usize,
+        cameras: [usize; 2],
+        side: Side,
+        with_jacobians: bool,
+    ) -> Residual {
         let inverse = 1.0 / self.spread.touch;
         let found = self.known.tangency(at, instant, cameras, side, with_jacobians);
         let mut residual = Residual {
@@ -213,7 +232,8 @@ impl<'a> PersonProblem<'a> {
         let quaternion = if quaternion.w < 0.0 { -quaternion } else { quaternion };
         let turn = 2.0 * DVec3::new(quaternion.x, quaternion.y, quaternion.z);
         let moved = now.inverse().translation - before.inverse().translation;
-        let error: Vec<f64> = (turn / turn_sigma).to_array().into_iter().chain((moved / place_sigma).to_array()).collect();
+        let error: Vec<f64> =
+            (turn / turn_sigma).to_array().into_iter().chain((moved / place_sigma).to_array()).collect();
         let mut by_camera = DMatrix::zeros(6, 6);
         // After exp(δ): 2 q' = 2 q + w δ - q × δ.
         let by_turn = (DMat3::IDENTITY * quaternion.w - skew(0.5 * turn)) * (1.0 / turn_sigma);
@@ -259,7 +279,8 @@ impl Known<'_> {
             interval_s: self.intervals_s[camera],
         };
         // The directions of the calibration before: fixed while cameras move.
-        let middle = self.ahead - 0.5 * cameras.map(|c| self.before.cameras[c].inverse().translation).iter().sum::<DVec3>();
+        let middle =
+            self.ahead - 0.5 * cameras.map(|c| self.before.cameras[c].inverse().translation).iter().sum::<DVec3>();
         tangency(cameras.map(eye), side, middle.try_normalize()?, with_derivatives)
     }
 
@@ -306,7 +327,10 @@ impl BlockProblem for PersonProblem<'_> {
             Term::Limb { instant, limb } => self.limb_residual(at, instant, limb),
             Term::Camera(camera) => Some(self.camera_residual(at, camera)),
             Term::Lag(camera) => Some(Residual {
-                error: DVector::from_element(1, (at.lags_s[camera] - self.known.before.lags_s[camera]) / self.known.lag_sigma_s),
+                error: DVector::from_element(
+                    1,
+                    (at.lags_s[camera] - self.known.before.lags_s[camera]) / self.known.lag_sigma_s,
+                ),
                 jacobians: vec![(self.lag_block(camera)?, DMatrix::from_element(1, 1, 1.0 / self.known.lag_sigma_s))],
                 kernel: Kernel::Squares,
                 weight: 1.0,

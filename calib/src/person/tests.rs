@@ -83,7 +83,8 @@ fn disagreement_px(rig: &Rig, truth: &Rig) -> f64 {
 #[test]
 fn cameras_that_are_a_degree_off_and_late_are_found() {
     let lags = [0.0, 0.053, -0.031, 0.012];
-    for (seed, with_outlines, most_px, most_s) in [(5, false, 1.5, 0.006), (6, true, 1.0, 0.004), (7, true, 1.0, 0.004)] {
+    for (seed, with_outlines, most_px, most_s) in [(5, false, 1.5, 0.006), (6, true, 1.0, 0.004), (7, true, 1.0, 0.004)]
+    {
         let (truth, believed, tracks) = scene(seed, 4, 1.0, &lags, with_outlines);
         let fit = calibrate_person(&believed, &tracks, &LIMBS, &[], PersonOptions::default()).unwrap();
         let (before, after) = (disagreement_px(&believed, &truth), disagreement_px(&fit.rig, &truth));
@@ -123,7 +124,8 @@ fn left_and_right_that_one_camera_takes_for_each_other_are_exchanged() {
     }
     assert_ne!(mixed, tracks);
     let mended = untangled(&truth, &mixed, &mirrored);
-    let wrong = tracks.times(1).iter().filter(|nanos| mended.sample(1, 2, **nanos) != tracks.sample(1, 2, **nanos)).count();
+    let wrong =
+        tracks.times(1).iter().filter(|nanos| mended.sample(1, 2, **nanos) != tracks.sample(1, 2, **nanos)).count();
     assert!(wrong < 5, "{wrong} of 50 images are still mixed up");
     assert_eq!(untangled(&truth, &tracks, &mirrored), tracks, "what is right stays");
 }

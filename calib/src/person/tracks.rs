@@ -32,8 +32,7 @@ pub(crate) struct Place {
 impl Track {
     /// A parabola fitted to what is near a time; `None` where there are too few samples on either side.
     pub fn at(&self, nanos: i64, interval_s: f64) -> Option<Place> {
-        let (near, weights) =
-            parabola_weights(&self.samples, |(at, ..)| *at, |(.., trust)| *trust, nanos, interval_s)?;
+        let (near, weights) = parabola_weights(&self.samples, |(at, ..)| *at, |(.., trust)| *trust, nanos, interval_s)?;
         let mut place = Place { pixel: DVec2::ZERO, velocity: DVec2::ZERO, confidence: 0.0 };
         for ((_, pixel, trust), (value, slope)) in near.iter().zip(weights) {
             place.pixel += *pixel * value;

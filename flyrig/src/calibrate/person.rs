@@ -4,15 +4,18 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
 use flyrig_body::{ShapeParams, default_template};
-use flyrig_calib::{OutlineCorner, PersonFit, PersonOptions, PersonTracks, calibrate_person, save_easymocap};
+use flyrig_calib::{
+    OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person, save_easymocap,
+};
 use flyrig_capture::Pacing;
 use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{progress_bar, stop};
+use flyrig_report::{progress_bar, stop, write_whole};
 use flyrig_sync::{HullCorner, SyncSettings, silhouette_hull};
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
-use flyrig_types::{Image, Rig};
+use flyrig_types::{Camera, Image, Rig};
 use glam::DVec2;
+use serde_json::json;
 
 use super::refuse_existing;
 use crate::{
@@ -21,8 +24,7 @@ use crate::{
 };
 
 /// Landmarks that are used, by their number in the network: nose, eyes, ears, shoulders to wrists, index fingers, hips to toes.
-const LANDMARKS: [usize; 23] =
-    [0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 19, 20, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32];
+const LANDMARKS: [usize; 23] = [0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 19, 20, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32];
 /// Pairs of the network's landmarks at a constant distance.
 const LIMBS: [(usize, usize); 17] = [
     (7, 8),
@@ -46,21 +48,32 @@ const LIMBS: [(usize, usize); 17] = [
 /// Pairs of the network's landmarks, left and right, that it takes for each other together: of the face, the arms, the legs.
 const MIRRORED: [&[(usize, usize)]; 3] =
     [&[(2, 5), (7, 8)], &[(11, 12), (13, 14), (15, 16), (19, 20)], &[(23, 24), (25, 26), (27, 28), (29, 30), (31, 32)]];
+/// Median distance of a camera's landmarks beyond which it shows somebody else, of the image's longer side.
+const MOST_ERROR: f64 = 0.04;
+/// A camera was off where the person moves in its image by more than this, and so many times what halves of the take differ by.
+const LEAST_MOVED_PX: f64 = 2.0;
+const CLEARLY: f64 = 2.0;
+/// Halves of a take may differ by so much, pixels.
+const MOST_HALVES_PX: f64 = 4.0;
+/// Offsets that matter, and standard deviations of useful ones, seconds.
+const LEAST_LAG_S: f64 = 0.003;
+const MOST_LAG_SIGMA_S: f64 = 0.008;
 /// Landmarks of less confidence are not used.
 const CONFIDENCE: f64 = 0.3;
 
 /// Runs the command.
 pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    refuse_existing(&args.out, &["intri.yml", "extri.yml"], args.force)?;
+    refuse_existing(&args.out, &["intri.yml", "extri.yml", "calibration.json"], args.force)?;
     let mut take = take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu)?;
     ensure!(
         !take.is_live,
         "live cameras cannot be looked at frame by frame; record them first (flyrig record) and give the recording"
     );
-    let (rig, plates) = take.calibration.take().context(
-        "no calibration: name its folder with --calibration; flyrig calibrate rig makes one from a board",
-    )?;
+    let (rig, plates) = take
+        .calibration
+        .take()
+        .context("no calibration: name its folder with --calibration; flyrig calibrate rig makes one from a board")?;
     ensure!(rig.cameras.len() > 1, "one camera alone has nothing to agree with");
     let tracks = look_through(args, &rig, plates, take)?;
     let number = |landmark: usize| LANDMARKS.iter().position(|known| *known == landmark);
@@ -69,10 +82,22 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
     };
     let options = PersonOptions { lags: !args.no_offsets, ..PersonOptions::default() };
     let fit = calibrate_person(&rig, &tracks, &numbers(&LIMBS), &MIRRORED.map(numbers), options)?;
+    for (camera, solved) in rig.cameras.iter().zip(&fit.cameras) {
+        let side = f64::from(camera.intrinsics.width.max(camera.intrinsics.height));
+        ensure!(
+            solved.error_px.1 < MOST_ERROR * side,
+            "camera {}: its landmarks are {:.0} px off those of the other cameras: one person alone may be in view, and the calibration \
+             must be roughly right",
+            camera.id,
+            solved.error_px.1
+        );
+    }
     print(&rig, &tracks, &fit);
+    advise(&rig, &fit, options.lags);
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     save_easymocap(&args.out, &fit.rig)?;
-    println!("{}: intri.yml, extri.yml", args.out.display());
+    write_whole(&args.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(&rig, &fit))?)?;
+    println!("{}: intri.yml, extri.yml, calibration.json", args.out.display());
     Ok(())
 }
 
@@ -86,10 +111,7 @@ fn look_through(
     let template = default_template(&ShapeParams::default())?;
     let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, rig, plates, &PoseConfig::default())?;
     let mut tracks = PersonTracks::new(rig.cameras.len(), LANDMARKS.len());
-    let sync = SyncSettings {
-        max_wait_nanos: Some(take.sync.max_wait_nanos.unwrap_or(1_000_000_000)),
-        ..take.sync
-    };
+    let sync = SyncSettings { max_wait_nanos: Some(take.sync.max_wait_nanos.unwrap_or(1_000_000_000)), ..take.sync };
     let mut intake = Intake::start_opening(take.sources, InputFormat::OfRig(rig), &sync, Pacing::Lossless)?;
     let bar = progress_bar((args.secs * 1e3) as u64, "the person, ms of the take");
     let mut first = None;
@@ -115,7 +137,9 @@ fn look_through(
             let seen: Vec<Option<(DVec2, f64)>> = LANDMARKS
                 .iter()
                 .map(|landmark| keypoints[*landmark])
-                .map(|point| (point.usable() && point.confidence >= CONFIDENCE).then_some((point.pixel, point.confidence)))
+                .map(|point| {
+                    (point.usable() && point.confidence >= CONFIDENCE).then_some((point.pixel, point.confidence))
+                })
                 .collect();
             tracks.add(slot, frame.capture_nanos, &seen);
         }
@@ -152,5 +176,60 @@ fn print(rig: &Rig, tracks: &PersonTracks, fit: &PersonFit) {
             solved.lag_halves_s.map_or_else(|| "?".to_owned(), |secs| format!("{:.1}", 1e3 * secs)),
         );
     }
-    println!("{} instants, landmarks {:.2} px", fit.instants, fit.sigma_px);
+    println!("{} instants; landmarks spread by {:.2} px", fit.instants, fit.sigma_px);
+}
+
+/// Which cameras were wrong, what to do with the offsets, and which movement is missing.
+fn advise(rig: &Rig, fit: &PersonFit, with_lags: bool) {
+    let cameras = || rig.cameras.iter().map(|camera| &camera.id).zip(&fit.cameras);
+    for (id, camera) in cameras() {
+        let doubt = camera.halves_px.unwrap_or(f64::INFINITY);
+        let (deg, mm) = camera.moved;
+        if camera.moved_px > LEAST_MOVED_PX.max(CLEARLY * doubt) {
+            println!(
+                "camera {id} was off: the person lies {:.1} px beside where it was, {deg:.2} degrees and {mm:.0} mm of the camera",
+                camera.moved_px
+            );
+        } else if camera.moved_px > LEAST_MOVED_PX && doubt > LEAST_MOVED_PX {
+            println!(
+                "camera {id} may be off by {:.1} px, but the two halves of the take differ by {doubt:.1} px: show more of the volume",
+                camera.moved_px
+            );
+        }
+    }
+    let lags: Vec<String> = cameras()
+        .filter(|(_, camera)| with_lags && camera.lag_s.0.abs() > (3.0 * camera.lag_s.1).max(LEAST_LAG_S))
+        .map(|(id, camera)| format!("\"{id}\" = {:.1}", 1e3 * camera.lag_s.0))
+        .collect();
+    if !lags.is_empty() {
+        println!("the stamps are off, and these poses hold with offsets: [sync] lags_ms = {{ {} }}", lags.join(", "));
+    }
+    if cameras().any(|(_, camera)| camera.halves_px.is_none_or(|px| px > MOST_HALVES_PX)) {
+        println!(
+            "the two halves of the take disagree: let one person walk through the whole volume, near to every camera and far, with raised \
+             and lowered arms, for 20 s"
+        );
+    }
+    if with_lags && cameras().any(|(_, camera)| camera.lag_s.1 > MOST_LAG_SIGMA_S) {
+        println!("the offsets are vague: jump, squat and wave; slow movements do not show time");
+    }
+}
+
+/// `calibration.json`.
+fn report(rig: &Rig, fit: &PersonFit) -> serde_json::Value {
+    let of = |(camera, solved): (&Camera, &PersonCamera)| {
+        json!({
+            "camera": camera.id,
+            "error_px_before": solved.error_px.0,
+            "error_px": solved.error_px.1,
+            "moved_deg_mm": solved.moved,
+            "moved_px": solved.moved_px,
+            "halves_px": solved.halves_px,
+            "offset_secs": solved.lag_s.0,
+            "offset_deviation_secs": solved.lag_s.1,
+            "halves_secs": solved.lag_halves_s,
+        })
+    };
+    let cameras: Vec<_> = rig.cameras.iter().zip(&fit.cameras).map(of).collect();
+    json!({ "cameras": cameras, "instants": fit.instants, "landmarks_px": fit.sigma_px })
 }

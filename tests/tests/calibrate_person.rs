@@ -1,0 +1,43 @@
+//! A rig whose calibration is a degree off is mended by a person who walks before it.
+#![allow(clippy::unwrap_used)] // helpers of tests
+
+use flyrig_calib::{load_easymocap, testing::rig_errors};
+use flyrig_tests::run;
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
+
+const SIM: &str = "[sim]\nseed = 511\nwidth = 256\nheight = 256\n[sim.motion]\nkind = \"walk\"\n[sim.cameras]\ncount = 4\n\
+                   [sim.calibration_error]\nrotation_deg = 1.0\ntranslation_mm = 20.0\n";
+
+#[test]
+fn somebody_who_walks_mends_the_calibration() {
+    let folder = tempfile::tempdir().unwrap();
+    let command = |text: &str| run(PROGRAM, &text.split(' ').collect::<Vec<_>>(), folder.path()).unwrap();
+    std::fs::write(folder.path().join("sim.toml"), SIM).unwrap();
+    let export = command("sim export sim.toml --out take --frames 90");
+    assert_eq!(export.code, Some(0), "{}", export.stderr);
+    let person = command("calibrate person take --out better");
+    assert_eq!(person.code, Some(0), "{}{}", person.stdout, person.stderr);
+
+    let load = |name: &str| load_easymocap(&folder.path().join(name), &|_| None).unwrap();
+    let truth = load("take/truth");
+    let worst = |name: &str| {
+        let errors = rig_errors(&load(name).cameras, &truth.cameras).unwrap();
+        println!("{name}: {errors:?}");
+        errors.iter().map(|error| error.px).fold(0.0, f64::max)
+    };
+    let (before, after) = (worst("take"), worst("better"));
+    assert!(before > 4.0 && after < 0.3 * before, "{before} px before, {after} px after\n{}", person.stdout);
+    assert!(person.stdout.contains("was off: the person lies"), "{}", person.stdout);
+
+    // What is wrong is said in one line, and nothing is written.
+    let again = command("calibrate person take --out better");
+    assert_eq!(again.code, Some(1));
+    assert!(again.stderr.contains("intri.yml is there already; --force replaces it"), "{}", again.stderr);
+    std::fs::create_dir_all(folder.path().join("bare")).unwrap();
+    std::fs::rename(folder.path().join("take/images"), folder.path().join("bare/images")).unwrap();
+    let bare = command("calibrate person bare --out none");
+    assert_eq!(bare.code, Some(1));
+    assert!(bare.stderr.contains("no calibration: name its folder with --calibration"), "{}", bare.stderr);
+    assert!(!folder.path().join("none").exists());
+}
