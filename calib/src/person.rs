@@ -109,18 +109,14 @@ pub fn calibrate_person(
 ) -> Result<PersonFit, CalibError> {
     let tracks = &untangled(rig, tracks, mirrored);
     let whole = solve(rig, tracks, limbs, options, None).ok_or(CalibError::PersonOpen)?;
-    let halves: Vec<Option<Solved>> = [(0.0, 0.5), (0.5, 1.0)]
-        .map(|(from, to)| solve(rig, &tracks.part(from, to), limbs, options, Some(&whole.estimate)))
-        .into();
+    let part = |from, to| solve(rig, &tracks.part(from, to), limbs, options, Some(&whole.estimate));
+    let halves = part(0.0, 0.5).zip(part(0.5, 1.0));
     let before = motions(rig);
     let cameras = (0..rig.cameras.len())
         .map(|slot| {
             let (now, then) = (whole.estimate.cameras[slot], before[slot]);
             let shift = |a: &RigidMotion, b: &RigidMotion| whole.shift_px(rig, slot, a, b);
-            let both = |of: fn(&Solved, usize) -> f64| match &halves[..] {
-                [Some(a), Some(b)] => Some((of(a, slot) - of(b, slot)).abs()),
-                _ => None,
-            };
+            let halves = halves.as_ref().map(|(a, b)| (&a.estimate, &b.estimate));
             PersonCamera {
                 error_px: whole.error_px[slot],
                 moved: (
@@ -128,12 +124,9 @@ pub fn calibrate_person(
                     1e3 * now.inverse().translation.distance(then.inverse().translation),
                 ),
                 moved_px: shift(&then, &now),
-                halves_px: match &halves[..] {
-                    [Some(a), Some(b)] => Some(shift(&a.estimate.cameras[slot], &b.estimate.cameras[slot])),
-                    _ => None,
-                },
+                halves_px: halves.map(|(a, b)| shift(&a.cameras[slot], &b.cameras[slot])),
                 lag_s: (whole.estimate.lags_s[slot], whole.lag_sigma_s[slot]),
-                lag_halves_s: both(|solved, slot| solved.estimate.lags_s[slot]),
+                lag_halves_s: halves.map(|(a, b)| (a.lags_s[slot] - b.lags_s[slot]).abs()),
             }
         })
         .collect();

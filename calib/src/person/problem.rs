@@ -97,12 +97,12 @@ impl<'a> PersonProblem<'a> {
         }
         for instant in 0..known.instants.len() {
             let mut is_fixed = vec![false; landmarks];
-            for landmark in 0..landmarks {
+            for (landmark, is_fixed) in is_fixed.iter_mut().enumerate() {
                 let seen: Vec<usize> =
                     (0..cameras).filter(|&camera| known.error(at, instant, camera, landmark).is_some()).collect();
                 terms.push(Term::Loose { instant, landmark });
                 if seen.len() > 1 {
-                    is_fixed[landmark] = true;
+                    *is_fixed = true;
                     terms.extend(seen.into_iter().map(|camera| Term::Seen { instant, camera, landmark }));
                 }
             }

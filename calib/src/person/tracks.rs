@@ -43,6 +43,9 @@ impl Track {
     }
 }
 
+/// Samples, and the weight of each in a value and in its slope.
+pub(crate) type Weighted<'a, T> = (&'a [T], Vec<(f64, f64)>);
+
 /// Samples around a time, and the weight of each in the value and in the slope (a second) that a parabola fitted to them has
 /// there; `None` where there are too few on either side.
 pub(crate) fn parabola_weights<T>(
@@ -51,7 +54,7 @@ pub(crate) fn parabola_weights<T>(
     trust: impl Fn(&T) -> f64,
     nanos: i64,
     interval_s: f64,
-) -> Option<(&[T], Vec<(f64, f64)>)> {
+) -> Option<Weighted<'_, T>> {
     let window = SMOOTH_S.max(SMOOTH_INTERVALS * interval_s);
     let reach = (REACH * window * 1e9) as i64;
     let from = samples.partition_point(|sample| time(sample) < nanos.saturating_sub(reach));
