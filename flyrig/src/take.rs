@@ -117,7 +117,9 @@ pub fn open_calibrated(
                 .transpose()?;
             CalibratedTake::replayed(sources, calibration, with_masks)
         }
-        [path] if !path.exists() => bail!("{} does not exist", path.display()),
+        [path] => {
+            bail!("{} is no configuration, recording or folder; name several videos, or one of these", path.display())
+        }
         videos => CalibratedTake::replayed(video_sources(videos)?, None, false),
     };
     if let Some(folder) = folder_of_calibration {

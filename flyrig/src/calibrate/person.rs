@@ -49,7 +49,7 @@ const LIMBS: [(usize, usize); 17] = [
 const MIRRORED: [&[(usize, usize)]; 3] =
     [&[(2, 5), (7, 8)], &[(11, 12), (13, 14), (15, 16), (19, 20)], &[(23, 24), (25, 26), (27, 28), (29, 30), (31, 32)]];
 /// Median distance of a camera's landmarks beyond which it shows somebody else, of the image's longer side.
-const MOST_ERROR: f64 = 0.04;
+const MOST_ERROR: f64 = 0.02;
 /// A camera was off where the person moves in its image by more than this, and so many times what halves of the take differ by.
 const LEAST_MOVED_PX: f64 = 2.0;
 const CLEARLY: f64 = 2.0;
