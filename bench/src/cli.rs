@@ -37,7 +37,7 @@ pub enum BenchCommand {
     Hands(BenchHandsArgs),
     /// Bias and spread of the landmark network on people whose pose is known.
     Landmarks(BenchLandmarksArgs),
-    /// Masks of the person in each camera by itself, to score views of several calibrations against.
+    /// Masks estimated in each camera independently, against which several calibrations are scored.
     Masks(BenchMasksArgs),
     /// Pose, shape and masks from images: errors, and what each of them costs in the views; writes a table and JSON.
     Perception(BenchPerceptionArgs),

@@ -1,5 +1,4 @@
-//! `flyrig-bench masks`: masks of the person in each camera by itself, so that views of several calibrations are scored against the
-//! same masks.
+//! `flyrig-bench masks`: estimates masks in each camera independently, so that several calibrations are scored against the same masks.
 
 use anyhow::{Context as _, Result};
 use flyrig_body::{ShapeParams, default_template};

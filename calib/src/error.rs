@@ -156,6 +156,27 @@ pub enum CalibError {
          them whole, and check that the old calibration is roughly right"
     )]
     PersonOpen,
+    /// The person stands still.
+    #[error(
+        "the person hardly moves ({extent_mm:.0} mm); let one person walk through the whole volume, with raised and lowered arms, and jump"
+    )]
+    PersonStill {
+        /// Extent of the movement, millimetres.
+        extent_mm: f64,
+    },
+    /// Tracks, limbs or mirrored landmarks do not belong to the rig.
+    #[error(
+        "tracks of {cameras} cameras with {landmarks} landmarks for a rig of {expected} cameras; give tracks of this rig, and limbs and \
+         mirrored pairs of these landmarks"
+    )]
+    PersonTracks {
+        /// Cameras of the tracks.
+        cameras: usize,
+        /// Cameras of the rig.
+        expected: usize,
+        /// Landmarks of the tracks.
+        landmarks: usize,
+    },
     /// The format has no place for this lens.
     #[error("camera {camera}: a fisheye lens cannot be written in EasyMocap's format")]
     FisheyeUnsupported {

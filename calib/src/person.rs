@@ -1,59 +1,61 @@
 //! Calibration of a rig from one person who moves before it: better poses of the cameras and their time offsets.
 //!
-//! Landmarks and silhouettes of the person come from the images of each camera by itself. Sought are the cameras' poses, a time
-//! offset a camera, and where the landmarks are at some hundred instants. The outermost planes through two cameras' centres that
-//! touch the person must touch both silhouettes, and limbs keep their lengths. The calibration before is what holds as far as
-//! images leave poses open; it also gives world frame and scale.
+//! Landmarks and silhouettes of the person are found in each camera independently. The unknowns are the cameras' poses, one time
+//! offset per camera, and the positions of the landmarks at up to a few hundred instants. The residuals are reprojection errors of the
+//! landmarks, deviations from constant limb lengths, and differences between the outermost epipolar planes that are tangent to the
+//! silhouettes of two cameras. The old calibration is a prior, which also fixes world frame and scale.
 
 mod problem;
+mod rays;
 mod tangents;
 mod tracks;
+mod untangle;
 
 use flyrig_solve::{Convergence, RigidMotion, block_covariance, log_rotation, median, minimize_blocks};
 use flyrig_types::{Camera, Intrinsics, Isometry, Rig};
-use glam::{DMat3, DVec2, DVec3};
+use glam::DVec3;
 
 use crate::{CalibError, projection::project};
 use problem::{Estimate, Known, PersonProblem, Spread};
+use rays::{Ray, nearest};
 pub use tangents::OutlineCorner;
 pub use tracks::PersonTracks;
+use untangle::untangled;
 
 /// Time between two instants at least, seconds.
 const INSTANT_S: f64 = 0.025;
 /// Instants times cameras, at most.
 const MOST_IMAGES: usize = 800;
-/// Instants that say something each; more of them share their weight, for a network errs alike in images that are alike.
+/// Number of instants with independent errors; more instants share this weight, since the network repeats its errors in similar images.
 const INDEPENDENT: f64 = 3.0;
-/// Landmarks that two cameras see at an instant that counts.
+/// Landmarks seen by two cameras that an instant needs.
 const LEAST_LANDMARKS: usize = 6;
-/// Instants below which nothing is solved.
+/// Instants that a solve needs.
 const LEAST_INSTANTS: usize = 10;
 /// Rounds of estimating spreads and lengths.
 const ROUNDS: usize = 5;
 /// Standard deviation of a coordinate over the median distance of a two-dimensional normal error.
 const SIGMA_PER_MEDIAN: f64 = 1.0 / 1.177;
+/// Standard deviation over the median absolute deviation of a normal distribution.
+const SIGMA_PER_DEVIATION: f64 = 1.48;
 /// Least standard deviation of a landmark, pixels.
 const LEAST_SIGMA_PX: f64 = 0.5;
-/// Measurements that the spread of all landmarks counts for, against those of a landmark's own.
+/// Weight of the standard deviation over all landmarks in that of one landmark, in measurements.
 const POOLED: f64 = 10.0;
 /// Least standard deviation of a limb's length, metres: landmarks lie on clothes and skin.
 const LEAST_LIMB_M: f64 = 0.005;
-
-/// Least standard deviation of the angle of a plane that touches the person, radians.
+/// A quarter of the landmarks must move over more than this, metres.
+const LEAST_EXTENT_M: f64 = 0.1;
+/// Least standard deviation of the angle between tangent planes, radians.
 const LEAST_TOUCH: f64 = 5e-4;
-/// Rounds of exchanging left and right.
-const UNTANGLE_ROUNDS: usize = 3;
-/// Left and right are exchanged where that lowers the distances to this share.
-const CLEARLY: f64 = 0.5;
-
 /// Options of [`calibrate_person`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PersonOptions {
-    /// Whether time offsets are sought.
+    /// Whether to estimate time offsets.
     pub lags: bool,
-    /// Standard deviation of a camera's direction in the calibration before, radians.
+    /// Standard deviation of a camera's orientation in the old calibration, radians.
     pub turn_sigma: f64,
-    /// Standard deviation of a camera's place in it, metres.
+    /// Standard deviation of a camera's position in it, metres.
     pub place_sigma_m: f64,
     /// Standard deviation of a time offset, seconds.
     pub lag_sigma_s: f64,
@@ -68,38 +70,44 @@ impl Default for PersonOptions {
 /// A camera after [`calibrate_person`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct PersonCamera {
-    /// Median distance of drawn and seen landmarks with the calibration before, and now; pixels.
+    /// Median reprojection error of the landmarks with the old calibration and now, pixels.
     pub error_px: (f64, f64),
-    /// How much it has turned, degrees, and moved, millimetres.
+    /// Rotation, degrees, and displacement, millimetres, from the old pose.
     pub moved: (f64, f64),
-    /// Mean distance by which the person has moved in its image by that, pixels.
+    /// Mean displacement of the person in this camera's image caused by the change of pose, pixels.
     pub moved_px: f64,
-    /// The same between solves from the first and the second half of the take; `None` where one of them fails.
+    /// The same between solves of the first and the second half of the take; `None` if one of them fails.
     pub halves_px: Option<f64>,
-    /// Time offset, subtracted from its stamps, and its standard deviation; seconds.
+    /// Time offset, to be subtracted from the timestamps, and its standard deviation; seconds.
     pub lag_s: (f64, f64),
-    /// Difference of the offsets of both halves, seconds.
+    /// Difference between the time offsets of the two halves, seconds.
     pub lag_halves_s: Option<f64>,
 }
 
 /// Result of [`calibrate_person`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct PersonFit {
-    /// The rig in the world of the calibration before.
+    /// The refined rig in the world frame of the old calibration.
     pub rig: Rig,
     /// By slot.
     pub cameras: Vec<PersonCamera>,
-    /// Instants that were used.
+    /// Number of instants used.
     pub instants: usize,
-    /// Typical spread of a landmark's coordinate, pixels.
+    /// Median standard deviation of a landmark's coordinate, pixels.
     pub sigma_px: f64,
+    /// Standard deviation of the angle between outermost tangent planes of two cameras, with the old calibration and now; radians.
+    /// `None` without silhouettes.
+    pub planes_rad: Option<(f64, f64)>,
+    /// Left-right confusions of the network that were corrected: groups of limbs in an image.
+    pub corrections: usize,
 }
 
-/// Refines poses and time offsets of a rig from one moving person. `limbs` are pairs of landmarks at a constant
-/// distance, `mirrored` groups of pairs (left, right) that the network takes for each other together.
+/// Refines poses and time offsets of a rig from one moving person. `limbs` are pairs of landmarks at a constant distance; `mirrored` are
+/// groups of (left, right) landmarks that the network confuses together.
 ///
 /// # Errors
-/// When too few cameras see the person at the same time.
+/// [`CalibError::PersonTracks`] for tracks of another rig, [`CalibError::PersonOpen`] when too few cameras see the person at the same time,
+/// [`CalibError::PersonStill`] when nobody moves.
 pub fn calibrate_person(
     rig: &Rig,
     tracks: &PersonTracks,
@@ -107,8 +115,20 @@ pub fn calibrate_person(
     mirrored: &[Vec<(usize, usize)>],
     options: PersonOptions,
 ) -> Result<PersonFit, CalibError> {
-    let tracks = &untangled(rig, tracks, mirrored);
-    let whole = solve(rig, tracks, limbs, options, None).ok_or(CalibError::PersonOpen)?;
+    let pairs = || limbs.iter().chain(mirrored.iter().flatten());
+    if tracks.cameras() != rig.cameras.len() || pairs().any(|(a, b)| *a.max(b) >= tracks.landmarks()) {
+        return Err(CalibError::PersonTracks {
+            cameras: tracks.cameras(),
+            expected: rig.cameras.len(),
+            landmarks: tracks.landmarks(),
+        });
+    }
+    let (tracks, corrections) = untangled(rig, tracks, mirrored);
+    let whole = solve(rig, &tracks, limbs, options, None).ok_or(CalibError::PersonOpen)?;
+    let extent_m = whole.extent_m();
+    if extent_m < LEAST_EXTENT_M {
+        return Err(CalibError::PersonStill { extent_mm: 1e3 * extent_m });
+    }
     let part = |from, to| solve(rig, &tracks.part(from, to), limbs, options, Some(&whole.estimate));
     let halves = part(0.0, 0.5).zip(part(0.5, 1.0));
     let before = motions(rig);
@@ -143,7 +163,14 @@ pub fn calibrate_person(
         world_up: rig.world_up,
     };
     refined.validate().map_err(|_| CalibError::PersonOpen)?;
-    Ok(PersonFit { rig: refined, cameras, instants: whole.estimate.points.len(), sigma_px: whole.sigma_px })
+    Ok(PersonFit {
+        rig: refined,
+        cameras,
+        instants: whole.estimate.points.len(),
+        sigma_px: whole.sigma_px,
+        planes_rad: whole.planes_rad,
+        corrections,
+    })
 }
 
 fn motions(rig: &Rig) -> Vec<RigidMotion> {
@@ -154,19 +181,41 @@ fn motions(rig: &Rig) -> Vec<RigidMotion> {
     rig.cameras.iter().map(of).collect()
 }
 
-/// A solution from some of the images.
+/// Result of one solve.
 struct Solved {
     estimate: Estimate,
     lag_sigma_s: Vec<f64>,
-    /// By slot: median error with the calibration before and now.
+    /// Median reprojection error by slot, with the old calibration and now.
     error_px: Vec<(f64, f64)>,
     sigma_px: f64,
-    /// By camera, instant, landmark: what was seen.
+    planes_rad: Option<(f64, f64)>,
+    /// Camera, instant, and landmark of each observation.
     seen: Vec<(usize, usize, usize)>,
 }
 
 impl Solved {
-    /// Mean distance of the person in an image between two poses of its camera.
+    /// Returns the distance over which landmarks move, metres: the upper quartile over landmarks of the range that holds four fifths of
+    /// the instants.
+    fn extent_m(&self) -> f64 {
+        let landmarks = self.estimate.points.first().map_or(0, Vec::len);
+        let mut extents: Vec<f64> = (0..landmarks)
+            .filter_map(|landmark| {
+                let mut instants: Vec<usize> =
+                    self.seen.iter().filter(|(.., seen)| *seen == landmark).map(|(_, instant, _)| *instant).collect();
+                instants.sort_unstable();
+                instants.dedup();
+                let places = || instants.iter().map(|instant| self.estimate.points[*instant][landmark]);
+                let middle = places().sum::<DVec3>() / instants.len().max(1) as f64;
+                let mut off: Vec<f64> = places().map(|place| place.distance(middle)).collect();
+                off.sort_by(f64::total_cmp);
+                off.get(off.len() * 4 / 5).map(|radius| 2.0 * radius)
+            })
+            .collect();
+        extents.sort_by(f64::total_cmp);
+        extents.get(extents.len() * 3 / 4).copied().unwrap_or(0.0)
+    }
+
+    /// Returns the mean distance between the person's images under two poses of a camera, pixels.
     fn shift_px(&self, rig: &Rig, slot: usize, a: &RigidMotion, b: &RigidMotion) -> f64 {
         let project = |motion: &RigidMotion, point| project(&rig.cameras[slot].intrinsics, motion.apply(point));
         let shifts: Vec<f64> = self
@@ -220,6 +269,7 @@ fn solve(
     };
     triangulate(&known, &mut estimate);
     let first_errors = errors_by_camera(&known, &estimate);
+    let first_planes = planes_rad(&known, &estimate);
     let mut seen = Vec::new();
     let mut lag_sigma_s = vec![0.0; cameras];
     for round in 0..ROUNDS {
@@ -243,13 +293,14 @@ fn solve(
     Some(Solved {
         error_px: first_errors.into_iter().zip(after).collect(),
         sigma_px: median(&mut spread.landmark_px)?,
+        planes_rad: first_planes.zip(planes_rad(&known, &estimate)),
         estimate,
         lag_sigma_s,
         seen,
     })
 }
 
-/// Times at which enough landmarks are seen by two cameras.
+/// Returns evenly spaced times at which two cameras see enough landmarks.
 fn instants(intrinsics: &[Intrinsics], tracks: &PersonTracks, intervals_s: &[f64], at: &Estimate) -> Option<Vec<i64>> {
     let (first, last) = tracks.span()?;
     let span_s = last.saturating_sub(first) as f64 * 1e-9;
@@ -270,131 +321,32 @@ fn instants(intrinsics: &[Intrinsics], tracks: &PersonTracks, intervals_s: &[f64
     (instants.len() >= LEAST_INSTANTS).then_some(instants)
 }
 
-/// Exchanges left and right where a camera took one for the other and the other cameras did not.
-fn untangled(rig: &Rig, tracks: &PersonTracks, mirrored: &[Vec<(usize, usize)>]) -> PersonTracks {
-    let cameras = motions(rig);
-    let mut tracks = tracks.clone();
-    for _ in 0..UNTANGLE_ROUNDS {
-        let before = tracks.clone();
-        let intervals_s: Vec<f64> = (0..cameras.len()).map(|slot| before.interval_s(slot)).collect();
-        let rays_at = |nanos: i64, landmark: usize| -> Vec<(DVec3, DVec3, f64)> {
-            let ray = |(slot, motion): (usize, &RigidMotion)| {
-                let place = before.track(slot, landmark).at(nanos, intervals_s[slot])?;
-                let ray = ray(&rig.cameras[slot].intrinsics, motion, place.pixel)?;
-                Some((ray, motion.inverse().translation, place.confidence))
-            };
-            cameras.iter().enumerate().filter_map(ray).collect()
-        };
-        let mut is_same = true;
-        for (slot, motion) in cameras.iter().enumerate() {
-            let intrinsics = &rig.cameras[slot].intrinsics;
-            for nanos in before.times(slot) {
-                let drawn = |landmark: usize| {
-                    let rays = rays_at(nanos, landmark);
-                    (rays.len() > 2).then(|| project(intrinsics, motion.apply(nearest(&rays)?))).flatten()
-                };
-                for group in mirrored {
-                    let (mut as_seen, mut exchanged) = (0.0, 0.0);
-                    for (left, right) in group {
-                        let seen = |landmark| before.sample(slot, landmark, nanos);
-                        let (Some(a), Some(b)) = (seen(*left), seen(*right)) else { continue };
-                        let (Some(left), Some(right)) = (drawn(*left), drawn(*right)) else { continue };
-                        let far = 0.5 * left.distance(right).max(1.0);
-                        let off = |pixel: DVec2, drawn: DVec2| (pixel.distance(drawn) / far).min(2.0);
-                        as_seen += off(a, left) + off(b, right);
-                        exchanged += off(b, left) + off(a, right);
-                    }
-                    if exchanged < CLEARLY * as_seen {
-                        group.iter().for_each(|(left, right)| tracks.exchange(slot, *left, *right, nanos));
-                        is_same = false;
-                    }
-                }
-            }
-        }
-        if is_same {
-            break;
-        }
-    }
-    tracks
-}
-
-/// Direction of a pixel in the world.
-fn ray(intrinsics: &Intrinsics, camera: &RigidMotion, pixel: DVec2) -> Option<DVec3> {
-    let ideal = intrinsics.lens.undistort((pixel - intrinsics.center_px) / intrinsics.focal_px)?;
-    Some(camera.rotation.inverse() * ideal.extend(1.0).normalize())
-}
-
-/// Places of the landmarks as the cameras see them now, by the shortest distances to their rays.
+/// Triangulates all landmarks with the current poses.
 fn triangulate(known: &Known<'_>, estimate: &mut Estimate) {
-    let center = |camera: usize| estimate.cameras[camera].inverse().translation;
-    // Somewhere in view for those that nobody sees: they count for nothing.
-    let fallback = {
-        let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
-        for (camera, motion) in estimate.cameras.iter().enumerate() {
-            let (across, at) = plane(motion.rotation.inverse() * DVec3::Z, center(camera));
-            normal += across;
-            right += at;
-        }
-        normal.inverse() * right
-    };
     let mut points = estimate.points.clone();
     for (instant, points) in points.iter_mut().enumerate() {
         for (landmark, point) in points.iter_mut().enumerate() {
             let mut rays = Vec::new();
             for camera in 0..estimate.cameras.len() {
                 let Some(place) = known.place(estimate, instant, camera, landmark) else { continue };
-                let Some(ray) = ray(&known.intrinsics[camera], &estimate.cameras[camera], place.pixel) else {
-                    continue;
-                };
-                rays.push((ray, center(camera), place.confidence));
+                let (intrinsics, motion) = (&known.intrinsics[camera], &estimate.cameras[camera]);
+                rays.extend(Ray::new(intrinsics, motion, place.pixel, place.confidence));
             }
-            *point = nearest(&rays).unwrap_or(fallback);
+            // Landmarks without a place count for nothing.
+            *point = nearest(&rays).unwrap_or(known.ahead);
         }
     }
     estimate.points = points;
 }
 
-/// Matrix across a ray, and its product with a point on the ray.
-fn plane(ray: DVec3, at: DVec3) -> (DMat3, DVec3) {
-    let across = DMat3::IDENTITY - DMat3::from_cols(ray * ray.x, ray * ray.y, ray * ray.z);
-    (across, across * at)
-}
-
-/// Point nearest to rays, of which one that passes far away counts little.
-fn nearest(rays: &[(DVec3, DVec3, f64)]) -> Option<DVec3> {
-    if rays.len() < 2 {
-        return None;
-    }
-    let mut weights: Vec<f64> = rays.iter().map(|(.., confidence)| *confidence).collect();
-    let mut point = DVec3::ZERO;
-    for _ in 0..8 {
-        let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
-        for ((ray, center, _), weight) in rays.iter().zip(&weights) {
-            let (across, at) = plane(*ray, *center);
-            normal += across * *weight;
-            right += at * *weight;
-        }
-        if normal.determinant() < 1e-6 * weights.iter().sum::<f64>().powi(3) {
-            return None;
-        }
-        point = normal.inverse() * right;
-        for ((ray, center, confidence), weight) in rays.iter().zip(&mut weights) {
-            let off = (plane(*ray, point - *center)).1.length();
-            *weight = confidence / (1.0 + (off / 0.05).powi(2));
-        }
-    }
-    let is_ahead = rays.iter().all(|(ray, center, _)| ray.dot(point - *center) > 0.1);
-    (is_ahead && point.is_finite()).then_some(point)
-}
-
-/// Median errors by camera, over landmarks that two cameras see.
+/// Returns the median reprojection error by camera, over landmarks seen by two cameras.
 fn errors_by_camera(known: &Known<'_>, at: &Estimate) -> Vec<f64> {
     let mut errors = vec![Vec::new(); at.cameras.len()];
     each_error(known, at, |camera, _, px| errors[camera].push(px));
     errors.iter_mut().map(|errors| median(errors).unwrap_or(f64::NAN)).collect()
 }
 
-/// Calls `each` with camera, landmark and error of what at least two cameras see.
+/// Calls `each` with camera, landmark and reprojection error of landmarks seen by at least two cameras.
 fn each_error(known: &Known<'_>, at: &Estimate, mut each: impl FnMut(usize, usize, f64)) {
     for instant in 0..at.points.len() {
         for landmark in 0..known.tracks.landmarks() {
@@ -408,7 +360,14 @@ fn each_error(known: &Known<'_>, at: &Estimate, mut each: impl FnMut(usize, usiz
     }
 }
 
-/// Spreads of landmarks and limbs as the residuals show them.
+/// Returns the robust standard deviation of the angles between outermost tangent planes, radians; `None` without silhouettes.
+fn planes_rad(known: &Known<'_>, at: &Estimate) -> Option<f64> {
+    let touches = (0..at.points.len()).flat_map(|instant| known.touches(at, instant));
+    let mut angles: Vec<f64> = touches.map(|(.., found)| found.angle.abs()).collect();
+    Some(SIGMA_PER_DEVIATION * median(&mut angles)?)
+}
+
+/// Estimates the standard deviations of landmarks, planes and limb lengths from the residuals.
 fn estimate_spread(known: &Known<'_>, at: &Estimate, spread: &mut Spread, with_limbs: bool) {
     let mut errors = vec![Vec::new(); known.tracks.landmarks()];
     each_error(known, at, |_, landmark, px| errors[landmark].push(px));
@@ -420,10 +379,8 @@ fn estimate_spread(known: &Known<'_>, at: &Estimate, spread: &mut Spread, with_l
         let square = (count * own * own + POOLED * pooled * pooled) / (count + POOLED);
         *sigma = square.sqrt().max(LEAST_SIGMA_PX);
     }
-    let touches = (0..at.points.len()).flat_map(|instant| known.touches(at, instant));
-    let mut angles: Vec<f64> = touches.map(|(.., found)| found.angle.abs()).collect();
-    spread.touch = (1.48 * median(&mut angles).unwrap_or(0.0)).max(LEAST_TOUCH);
-    // Lengths are worth something once the points are.
+    spread.touch = planes_rad(known, at).unwrap_or(0.0).max(LEAST_TOUCH);
+    // Limb lengths need points that are already refined.
     if !with_limbs {
         return;
     }
@@ -440,7 +397,7 @@ fn estimate_spread(known: &Known<'_>, at: &Estimate, spread: &mut Spread, with_l
         } else {
             median(&mut lengths).and_then(|length| {
                 let mut off: Vec<f64> = lengths.iter().map(|other| (other - length).abs()).collect();
-                Some((length, (1.48 * median(&mut off)?).max(LEAST_LIMB_M)))
+                Some((length, (SIGMA_PER_DEVIATION * median(&mut off)?).max(LEAST_LIMB_M)))
             })
         };
     }

@@ -6,7 +6,7 @@ use flyrig_sync::SilhouetteTrack;
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
 use flyrig_types::{FrameSet, Image, Rig};
 
-/// Finds silhouettes.
+/// Finder of silhouettes.
 pub struct Silhouettes {
     viewers: Viewers,
     tracks: Vec<SilhouetteTrack>,
@@ -14,7 +14,7 @@ pub struct Silhouettes {
 }
 
 impl Silhouettes {
-    /// `plates` are empty images by slot; `given_masks` uses those that come with the images.
+    /// Creates a finder. `plates` are images of the empty scene by slot; `given_masks` uses the masks of the take.
     pub fn new(rig: &Rig, plates: Vec<Option<Image>>, given_masks: bool) -> Result<Self> {
         let template = default_template(&ShapeParams::default())?;
         let viewers = Viewers::new(&PoseNet::embedded()?, &template, rig, plates, &PoseConfig::default())?;
@@ -44,7 +44,7 @@ impl Silhouettes {
         Ok(())
     }
 
-    /// What was found, a track a camera.
+    /// Returns one track per camera.
     pub fn into_tracks(self) -> Vec<SilhouetteTrack> {
         self.tracks
     }

@@ -4,9 +4,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail, ensure};
 use flyrig_capture::{CaptureThreads, Pacing, PopError, SourceOpener, ThreadsConfig, to_rgb8_into};
-use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{progress_bar, stop};
+use flyrig_report::stop;
 use flyrig_sync::{
     ClockKind, LagEstimate, MotionSignal, SilhouetteTrack, SyncSettings, estimate_lags, estimate_silhouette_lags,
 };
@@ -132,28 +131,25 @@ fn by_silhouettes(
     take: CalibratedTake,
 ) -> Result<(Vec<LagEstimate>, Vec<usize>)> {
     let mut silhouettes = Silhouettes::new(rig, plates, take.given_masks)?;
-    // One camera may be ahead by as much as another is behind, and nothing is lost by waiting.
-    let max_wait_nanos = Some(take.sync.max_wait_nanos.unwrap_or(1_000_000_000) + (args.most_ms * 2e6) as u64);
-    let sync = SyncSettings { max_wait_nanos, ..take.sync };
-    let mut intake = Intake::start_opening(take.sources, InputFormat::OfRig(rig), &sync, Pacing::Lossless)?;
-    let bar = progress_bar((args.seconds * 1e3) as u64, "silhouettes, ms of the take");
-    let (mut first, mut pictures) = (None, vec![0usize; rig.cameras.len()]);
-    while !intake.ended() && !stop::requested() {
-        let Some(set) = intake.next_set(Duration::from_millis(200)) else { continue };
-        let from = *first.get_or_insert(set.master_nanos);
-        let at = set.master_nanos.saturating_sub(from) as f64 * 1e-9;
-        if at > args.seconds {
-            break;
-        }
-        bar.set_position((at * 1e3) as u64);
-        set.present().for_each(|(slot, _)| pictures[slot] += 1);
-        silhouettes.add(&set)?;
-    }
-    bar.finish_and_clear();
+    let mut pictures = vec![0usize; rig.cameras.len()];
+    // One camera may be ahead by as much as another is behind.
+    let spread_nanos = (args.most_ms * 2e6) as u64;
+    let errors = take::each_set(
+        take.sources,
+        rig,
+        take.sync,
+        spread_nanos,
+        [0.0, args.seconds],
+        "silhouettes, ms of the take",
+        |set| {
+            set.present().for_each(|(slot, _)| pictures[slot] += 1);
+            silhouettes.add(set)
+        },
+    )?;
     let tracks = silhouettes.into_tracks();
     let frames: Vec<usize> = tracks.iter().map(SilhouetteTrack::len).collect();
     if let Some((slot, error)) =
-        (0..pictures.len()).filter(|&slot| pictures[slot] == 0).find_map(|slot| Some((slot, intake.last_error(slot)?)))
+        (0..pictures.len()).filter(|&slot| pictures[slot] == 0).find_map(|slot| Some((slot, errors.of(slot)?)))
     {
         bail!("no picture of camera {} could be used; the last: {error}", rig.cameras[slot].id);
     }

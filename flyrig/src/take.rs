@@ -1,14 +1,17 @@
 //! A take: a configuration, a recording, a folder of images, or videos, opened with or without its calibration.
 
-use std::path::{Path, PathBuf};
+use std::{
+    path::{Path, PathBuf},
+    time::Duration,
+};
 
 use anyhow::{Result, bail, ensure};
 use flyrig_capture::{FolderOptions, FolderReplay, Pacing, SourceOpener, VideoOptions, VideoReplay};
-use flyrig_fusion::Origin;
+use flyrig_fusion::{InputFormat, Intake, Origin};
 use flyrig_gpu::GpuContext;
-use flyrig_report::dataset;
+use flyrig_report::{dataset, progress_bar, stop};
 use flyrig_sync::SyncSettings;
-use flyrig_types::{CameraId, Image, Rig};
+use flyrig_types::{CameraId, FrameSet, Image, Rig};
 
 use crate::{
     config::{Config, SourceKind},
@@ -53,23 +56,66 @@ pub fn open(input: &[PathBuf], fps: f64, gpu: &dyn Fn() -> Result<GpuContext>) -
     }
 }
 
-/// A take and what is known of its cameras.
+/// A take with its calibration.
 pub struct CalibratedTake {
     pub sources: Vec<SourceOpener>,
     pub is_live: bool,
-    /// Where the cameras are, and their empty images as far as there are any.
+    /// The rig and its plates by slot; `None` without a calibration.
     pub calibration: Option<(Rig, Vec<Option<Image>>)>,
-    /// Whether masks that come with the images are used.
+    /// Whether to use the masks of the take.
     pub given_masks: bool,
-    /// What is taken off the stamps already.
+    /// How frames are joined; its time offsets are subtracted from the timestamps.
     pub sync: SyncSettings,
 }
 
 impl CalibratedTake {
-    /// Of a recording, folder or videos by themselves.
+    /// Creates the take of a recording, a folder or videos.
     fn replayed(sources: Vec<SourceOpener>, calibration: Option<(Rig, Vec<Option<Image>>)>, given_masks: bool) -> Self {
         Self { sources, is_live: false, calibration, given_masks, sync: SyncSettings::default() }
     }
+}
+
+/// Errors of the images of a take, by slot.
+pub struct ReadErrors(Vec<Option<String>>);
+
+impl ReadErrors {
+    /// Returns the last error of a camera.
+    pub fn of(&self, slot: usize) -> Option<&str> {
+        self.0.get(slot)?.as_deref()
+    }
+}
+
+/// Calls `each` with every set whose time lies within `secs` (from, to) of the first one's, until Ctrl-C, under a progress bar. Sets
+/// wait for cameras by up to `spread_nanos` longer than usual: nothing is lost by waiting in a recording.
+pub fn each_set(
+    sources: Vec<SourceOpener>,
+    rig: &Rig,
+    sync: SyncSettings,
+    spread_nanos: u64,
+    secs: [f64; 2],
+    label: &'static str,
+    mut each: impl FnMut(&FrameSet) -> Result<()>,
+) -> Result<ReadErrors> {
+    let max_wait_nanos = Some(sync.max_wait_nanos.unwrap_or(1_000_000_000).saturating_add(spread_nanos));
+    let sync = SyncSettings { max_wait_nanos, ..sync };
+    let mut intake = Intake::start_opening(sources, InputFormat::OfRig(rig), &sync, Pacing::Lossless)?;
+    let bar = progress_bar((secs[1] * 1e3) as u64, label);
+    let mut first = None;
+    while !intake.ended() && !stop::requested() {
+        let Some(set) = intake.next_set(Duration::from_millis(200)) else { continue };
+        let from = *first.get_or_insert(set.master_nanos);
+        let at = set.master_nanos.saturating_sub(from) as f64 * 1e-9;
+        if at > secs[1] {
+            break;
+        }
+        bar.set_position((at * 1e3) as u64);
+        // Timestamps jitter by less than a millisecond.
+        if at >= secs[0] - 1e-3 {
+            each(&set)?;
+        }
+    }
+    bar.finish_and_clear();
+    Ok(ReadErrors((0..rig.cameras.len()).map(|slot| intake.last_error(slot).map(|error| error.to_string())).collect()))
 }
 
 /// Opens a take with its calibration: its own, or that of a folder.
@@ -133,7 +179,7 @@ pub fn open_calibrated(
     Ok(take)
 }
 
-/// What a folder says of the sources' cameras, in their order.
+/// Reads calibration and plates of the sources' cameras from a folder.
 fn calibration(folder: &Path, sources: &[SourceOpener]) -> Result<(Rig, Vec<Option<Image>>)> {
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
     let names: Vec<String> = cameras.iter().map(CameraId::to_string).collect();

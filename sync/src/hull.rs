@@ -1,4 +1,4 @@
-//! Convex hulls of silhouettes, without the lens: lines that touch a silhouette touch its hull.
+//! Convex hulls of silhouettes on the undistorted image plane; a line is tangent to a silhouette if it is tangent to its hull.
 
 use flyrig_types::{Camera, Mask};
 use glam::{DVec2, DVec3};
@@ -11,11 +11,11 @@ const HALF: f64 = 127.5;
 pub struct HullCorner {
     /// Direction, of length 1.
     pub ray: DVec3,
-    /// Whether the image ends there, so that the silhouette may go on.
+    /// Whether the corner lies on the image border, where the silhouette may continue.
     pub is_cut: bool,
 }
 
-/// Returns the corners of the convex hull of where a mask's coverage crosses one half, as directions in the camera's axes.
+/// Returns the convex hull of a mask's half-coverage contour, as directions in the camera's axes.
 #[must_use]
 pub fn silhouette_hull(camera: &Camera, mask: &Mask) -> Vec<HullCorner> {
     let rotation = camera.camera_from_world.rotation;
@@ -32,8 +32,8 @@ pub fn silhouette_hull(camera: &Camera, mask: &Mask) -> Vec<HullCorner> {
     hull.into_iter().map(|(point, is_cut)| HullCorner { ray: point.extend(1.0).normalize(), is_cut }).collect()
 }
 
-/// Where coverage crosses one half between neighbouring pixels, and covered pixels on the picture's border; true where the
-/// silhouette may go on beyond that border.
+/// Returns the half-coverage contour, interpolated between neighbouring pixels, and covered pixels on the image border; true on the
+/// border.
 fn outline(mask: &Mask) -> Vec<(DVec2, bool)> {
     let (width, height) = (mask.width() as usize, mask.height() as usize);
     let at = |x: usize, y: usize| f64::from(mask.coverage()[y * width + x]);
@@ -61,7 +61,7 @@ fn outline(mask: &Mask) -> Vec<(DVec2, bool)> {
     points
 }
 
-/// Half of the convex hull of sorted points, without its last one (Andrew 1979).
+/// Returns half of the convex hull of sorted points, without its last point (Andrew 1979).
 fn half_hull<'a>(points: impl Iterator<Item = &'a (DVec2, bool)>) -> Vec<(DVec2, bool)> {
     let mut hull: Vec<(DVec2, bool)> = Vec::new();
     for point in points {

@@ -1,5 +1,4 @@
-//! One person in the images of every camera by itself: neither time stamps nor poses of the cameras against each other have a part
-//! in what is found.
+//! Pose estimation in each camera independently, so that wrong timestamps and extrinsics do not affect the result.
 
 use std::sync::Arc;
 
@@ -9,17 +8,17 @@ use rayon::prelude::*;
 
 use crate::{PoseConfig, PoseEstimate, PoseEstimator, PoseNet, TrackError, TrackErrorKind};
 
-/// A pose estimator for each camera.
+/// One pose estimator per camera.
 #[derive(Debug, Clone)]
 pub struct Viewers {
     alone: Vec<PoseEstimator>,
-    /// All cameras at once: finds the person for a camera that does not by itself, from the side for example.
+    /// Uses all cameras; locates the person for a camera that fails alone.
     together: PoseEstimator,
     sets: u64,
 }
 
 impl Viewers {
-    /// For any person, from a template; `plates` are empty images by slot.
+    /// Creates estimators for one person. `plates` are images of the empty scene by slot.
     ///
     /// # Errors
     /// Those of [`PoseEstimator::new`] and [`PoseEstimator::set_plate`].
@@ -45,8 +44,8 @@ impl Viewers {
         Ok(Self { alone, together: PoseEstimator::new(net.clone(), template, rig, together)?, sets: 0 })
     }
 
-    /// Looks at the images of a set, each by itself. Its stamps are only believed to a stride or so, and only to find who is
-    /// not seen. `None` by slot where there is no image, or nobody in it.
+    /// Estimates the pose in each image of a set independently. Timestamps matter only for locating a person whom a camera does not find
+    /// alone. Returns `None` for slots without an image or a person.
     ///
     /// # Errors
     /// Those of [`PoseEstimator::estimate`] but `Lost`.
@@ -81,7 +80,7 @@ impl Viewers {
     }
 }
 
-/// The person in an image; `None` when nobody is found.
+/// Estimates the pose in one image; `None` when nobody is found.
 fn look_alone(
     estimator: &mut PoseEstimator,
     frame: &Arc<Frame>,

@@ -12,71 +12,77 @@ use crate::{
     projection::{project, project_with_derivatives},
 };
 
-/// Beyond so many standard deviations a landmark loses half its weight.
+/// A landmark at this many standard deviations loses half its weight.
 const LANDMARK_KERNEL: Kernel = Kernel::Cauchy(2.0);
 const LIMB_KERNEL: Kernel = Kernel::Cauchy(2.0);
 /// A camera that was bumped pulls the others along only a little.
 const PRIOR_KERNEL: Kernel = Kernel::Huber(1.0);
-/// Weight of a landmark beside an outermost plane: the network errs alike in all images in which it sees a person from one side, and
-/// silhouettes hardly do (docs/benchmarks/calibration.md).
+/// Weight of a landmark relative to a tangent plane: the network's errors depend on the viewing direction and persist over time,
+/// those of silhouettes hardly do (docs/benchmarks/calibration.md).
 const LANDMARK_WEIGHT: f64 = 0.1;
-/// Standard deviation of a landmark's place from where it started, metres: fixes those that one camera sees.
+/// Standard deviation of a landmark from its start, metres: determines landmarks seen by one camera only.
 const LOOSE_M: f64 = 2.0;
 
-/// Everything that is sought.
+/// Unknowns of the problem.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Estimate {
     pub cameras: Vec<RigidMotion>,
-    /// Subtracted from the stamps, seconds; that of the first camera stays.
+    /// Time offsets, subtracted from the timestamps, seconds; the first camera's is fixed.
     pub lags_s: Vec<f64>,
     /// By instant and landmark, metres in the world.
     pub points: Vec<Vec<DVec3>>,
 }
 
-/// What each residual is about.
+/// Kind of a residual.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Term {
+    /// Reprojection error of a landmark.
     Seen { instant: usize, camera: usize, landmark: usize },
+    /// Angle between the tangent planes of two cameras.
     Touch { instant: usize, cameras: [usize; 2], side: Side },
+    /// Deviation from a limb's length.
     Limb { instant: usize, limb: usize },
+    /// Weak prior of a landmark's position.
     Loose { instant: usize, landmark: usize },
+    /// Prior of a camera's pose.
     Camera(usize),
+    /// Prior of a camera's time offset.
     Lag(usize),
 }
 
-/// What is known besides the images.
+/// Measurements, priors and options.
 #[derive(Debug, Clone)]
 pub(crate) struct Known<'a> {
     pub intrinsics: &'a [Intrinsics],
     pub tracks: &'a PersonTracks,
-    /// Usual time between images by camera, seconds.
+    /// Median interval between images by camera, seconds.
     pub intervals_s: &'a [f64],
     /// Times of the instants, nanoseconds.
     pub instants: &'a [i64],
-    /// Joints at a constant distance.
+    /// Pairs of landmarks at a constant distance.
     pub limbs: &'a [(usize, usize)],
-    /// The calibration before.
+    /// The old calibration.
     pub before: Estimate,
-    /// Standard deviations of a camera's direction and place there: radians, metres.
+    /// Standard deviations of a camera's orientation and position there: radians, metres.
     pub prior: (f64, f64),
     /// Standard deviation of a time offset, seconds.
     pub lag_sigma_s: f64,
-    /// Whether offsets are sought.
+    /// Whether to estimate time offsets.
     pub lags: bool,
-    /// A place that all cameras look at, metres in the world.
+    /// The rig's centre of attention, metres in the world.
     pub ahead: DVec3,
 }
 
-/// Standard deviations that are estimated in turn with the unknowns.
+/// Standard deviations, estimated alternately with the unknowns.
 #[derive(Debug, Clone)]
 pub(crate) struct Spread {
     /// By landmark, pixels.
     pub landmark_px: Vec<f64>,
     /// Length of each limb and its standard deviation, metres.
     pub limbs_m: Vec<Option<(f64, f64)>>,
-    /// Of the angle of a plane that touches the person, radians.
+    /// Standard deviation of the angle between tangent planes, radians.
     pub touch: f64,
-    /// Weight of an instant: neighbours err alike.
+    /// Weight of one instant, below 1 because errors of nearby instants are correlated.
     pub weight: f64,
 }
 
@@ -122,7 +128,7 @@ impl<'a> PersonProblem<'a> {
         Self { known, spread, terms, sizes }
     }
 
-    /// Cameras, instants and landmarks of the images' residuals.
+    /// Returns camera, instant and landmark of each reprojection residual.
     pub fn seen(&self) -> impl Iterator<Item = (usize, usize, usize)> {
         self.terms.iter().filter_map(|term| match *term {
             Term::Seen { instant, camera, landmark } => Some((camera, instant, landmark)),
@@ -130,7 +136,7 @@ impl<'a> PersonProblem<'a> {
         })
     }
 
-    /// Whether a residual is about a plane that touches the person.
+    /// Whether a residual compares tangent planes.
     #[cfg(test)]
     pub fn is_touch(&self, index: usize) -> bool {
         matches!(self.terms[index], Term::Touch { .. })
@@ -148,7 +154,7 @@ impl<'a> PersonProblem<'a> {
             kernel: LANDMARK_KERNEL,
             weight: place.map_or(0.0, |place| LANDMARK_WEIGHT * self.spread.weight * place.confidence),
         };
-        // The end of a track that a changed offset has left.
+        // A changed time offset has moved the instant beyond the end of the track.
         let Some(place) = self.known.place(at, instant, camera, landmark) else {
             return Some(weigh(DVec2::ZERO, None));
         };
@@ -252,7 +258,7 @@ impl<'a> PersonProblem<'a> {
 }
 
 impl Known<'_> {
-    /// Outermost planes that two cameras see, at an instant.
+    /// Compares the outermost tangent planes of all pairs of cameras at an instant.
     pub fn touches<'b>(
         &'b self,
         at: &'b Estimate,
@@ -278,7 +284,7 @@ impl Known<'_> {
             stamp: self.stamp(at, instant, camera),
             interval_s: self.intervals_s[camera],
         };
-        // The directions of the calibration before: fixed while cameras move.
+        // From the old calibration, so that it stays fixed while cameras move.
         let middle =
             self.ahead - 0.5 * cameras.map(|c| self.before.cameras[c].inverse().translation).iter().sum::<DVec3>();
         tangency(cameras.map(eye), side, middle.try_normalize()?, with_derivatives)
@@ -288,12 +294,12 @@ impl Known<'_> {
         self.instants[instant].saturating_add((at.lags_s[camera] * 1e9) as i64)
     }
 
-    /// Where a track is at an instant.
+    /// Returns the smoothed landmark of a camera at an instant.
     pub fn place(&self, at: &Estimate, instant: usize, camera: usize, landmark: usize) -> Option<Place> {
         self.tracks.track(camera, landmark).at(self.stamp(at, instant, camera), self.intervals_s[camera])
     }
 
-    /// Difference of a drawn and a seen landmark, pixels; `None` where it is not seen or cannot be drawn.
+    /// Returns the reprojection error of a landmark, pixels; `None` where it is not seen or cannot be projected.
     pub fn error(&self, at: &Estimate, instant: usize, camera: usize, landmark: usize) -> Option<DVec2> {
         let place = self.place(at, instant, camera, landmark)?;
         let local = at.cameras[camera].apply(at.points[instant][landmark]);

@@ -1,16 +1,14 @@
-//! Planes through the centres of two cameras that touch a person touch the silhouettes in the images of both (epipolar tangency,
-//! e.g. Wong and Cipolla 2001): how far the two outermost planes are turned about the line through the centres is the same for
-//! both cameras.
+//! Epipolar tangency (e.g. Wong and Cipolla 2001): an epipolar plane that is tangent to a body is tangent to its silhouettes in both
+//! cameras, so the angles of the two outermost tangent planes about the baseline are the same in both.
 
 use flyrig_solve::RigidMotion;
 use glam::DVec3;
 
 use super::tracks::parabola_weights;
 
-/// Smallest sine of the angle between the line through two cameras and what they see: nearer to that line, planes through it
-/// say little.
+/// Smallest sine of the angle between the baseline and the viewing direction: near the baseline the angle is ill-conditioned.
 const LEAST_APART: f64 = 0.35;
-/// A silhouette that is wider than this, radians around the line through both cameras, surrounds that line.
+/// A silhouette wider than this, radians about the baseline, surrounds the epipole.
 const MOST_SPAN: f64 = 2.0;
 
 /// A corner of the convex hull of a silhouette.
@@ -18,14 +16,14 @@ const MOST_SPAN: f64 = 2.0;
 pub struct OutlineCorner {
     /// Direction in the camera's axes.
     pub ray: DVec3,
-    /// Whether the image ends there, so that the silhouette may go on.
+    /// Whether the corner lies on the image border, where the silhouette may continue.
     pub is_cut: bool,
 }
 
 /// Silhouettes of one camera, in the order of time.
 pub(crate) type Outlines = Vec<(i64, Vec<OutlineCorner>)>;
 
-/// Which of the two outermost planes.
+/// One of the two outermost tangent planes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Side {
     Low,
@@ -37,19 +35,19 @@ pub(crate) enum Side {
 pub(crate) struct Eye<'a> {
     pub camera: RigidMotion,
     pub outlines: &'a Outlines,
-    /// Time stamp of the instant in this camera, nanoseconds.
+    /// Timestamp of the instant in this camera, nanoseconds.
     pub stamp: i64,
     pub interval_s: f64,
 }
 
-/// Frame in which planes through two cameras are measured.
+/// Reference frame for the angles of epipolar planes.
 struct Pencil {
     across: DVec3,
     front: DVec3,
 }
 
 impl Pencil {
-    /// Angle 0 is towards `ahead`, a fixed direction in the world.
+    /// Angle 0 points towards `ahead`, a fixed direction in the world.
     fn new(a: &RigidMotion, b: &RigidMotion, ahead: DVec3) -> Option<Self> {
         let line = (b.inverse().translation - a.inverse().translation).try_normalize()?;
         let front = ahead.reject_from_normalized(line);
@@ -63,7 +61,7 @@ impl Pencil {
     }
 }
 
-/// Corners that touch a plane, in the images around an instant.
+/// Hull corners at which an outermost plane is tangent, in the images around an instant.
 struct Touch {
     /// Direction in the camera's axes; weight in the angle at the instant, and in its slope a second.
     corners: Vec<(DVec3, f64, f64)>,
@@ -103,7 +101,7 @@ impl Touch {
     }
 }
 
-/// Difference of the plane's angles, and its derivatives by the steps of both cameras (turn, shift) and by both offsets.
+/// Difference between a plane's angles in two cameras, with derivatives by the steps of both poses (turn, shift) and both time offsets.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Tangency {
     pub angle: f64,
@@ -111,8 +109,8 @@ pub(crate) struct Tangency {
     pub by_lags: [f64; 2],
 }
 
-/// Compares one of the outermost planes of two cameras; `None` where one of them does not see it. `ahead` is any fixed direction
-/// of the world towards what both see.
+/// Compares one outermost tangent plane of two cameras; `None` where one of them does not see it. `ahead` is a fixed direction in the
+/// world, roughly from the cameras to the person.
 pub(crate) fn tangency(eyes: [Eye<'_>; 2], side: Side, ahead: DVec3, with_derivatives: bool) -> Option<Tangency> {
     let pencil = Pencil::new(&eyes[0].camera, &eyes[1].camera, ahead)?;
     let touches = [Touch::new(&eyes[0], &pencil, side)?, Touch::new(&eyes[1], &pencil, side)?];
@@ -125,7 +123,7 @@ pub(crate) fn tangency(eyes: [Eye<'_>; 2], side: Side, ahead: DVec3, with_deriva
     let mut by_cameras = [[0.0; 6]; 2];
     let mut by_lags = [0.0; 2];
     if with_derivatives {
-        // Corners stay while cameras move: the outermost ones are where the angle does not change along the outline.
+        // Corners stay fixed: at the outermost ones the angle is stationary along the outline.
         const STEP: f64 = 1e-6;
         for (which, by_camera) in by_cameras.iter_mut().enumerate() {
             for (k, by) in by_camera.iter_mut().enumerate() {

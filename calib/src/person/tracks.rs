@@ -1,25 +1,25 @@
-//! Landmarks of a person over time, in the image of each camera.
+//! Image tracks of a person's landmarks and silhouettes, one set per camera.
 
 use glam::{DMat3, DVec2, DVec3};
 
 use super::tangents::{OutlineCorner, Outlines};
 
-/// Standard deviation of the window that smooths a track, seconds; at least so many intervals between images.
+/// Standard deviation of the smoothing window, seconds, and its least value in intervals between images.
 const SMOOTH_S: f64 = 0.03;
 const SMOOTH_INTERVALS: f64 = 1.0;
-/// Samples farther away than so many standard deviations do not count.
+/// Radius of the window in standard deviations.
 const REACH: f64 = 2.5;
-/// Samples that a place needs, on both sides.
+/// Samples that a smoothed value needs.
 const LEAST_SAMPLES: usize = 4;
 
-/// One landmark in one camera.
+/// Image track of one landmark in one camera.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Track {
-    /// Time stamp, pixel, and confidence; in the order of time.
+    /// Timestamp (nanoseconds), pixel, and confidence, sorted by time.
     samples: Vec<(i64, DVec2, f64)>,
 }
 
-/// Where a landmark is at a time.
+/// Smoothed position and velocity of a landmark in the image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Place {
     pub pixel: DVec2,
@@ -30,7 +30,7 @@ pub(crate) struct Place {
 }
 
 impl Track {
-    /// A parabola fitted to what is near a time; `None` where there are too few samples on either side.
+    /// Returns the local quadratic fit at a time; `None` with too few samples, or samples on one side only.
     pub fn at(&self, nanos: i64, interval_s: f64) -> Option<Place> {
         let (near, weights) = parabola_weights(&self.samples, |(at, ..)| *at, |(.., trust)| *trust, nanos, interval_s)?;
         let mut place = Place { pixel: DVec2::ZERO, velocity: DVec2::ZERO, confidence: 0.0 };
@@ -43,11 +43,11 @@ impl Track {
     }
 }
 
-/// Samples, and the weight of each in a value and in its slope.
+/// Samples in a window, with their weights in the fitted value and in its slope.
 pub(crate) type Weighted<'a, T> = (&'a [T], Vec<(f64, f64)>);
 
-/// Samples around a time, and the weight of each in the value and in the slope (a second) that a parabola fitted to them has
-/// there; `None` where there are too few on either side.
+/// Returns the samples around a time with their weights in the value and the slope (per second) of the local quadratic fit there; `None`
+/// with too few samples, or samples on one side only.
 pub(crate) fn parabola_weights<T>(
     samples: &[T],
     time: impl Fn(&T) -> i64,
@@ -83,7 +83,7 @@ pub(crate) fn parabola_weights<T>(
     Some((near, weights.collect()))
 }
 
-/// Landmarks of one person in the images of all cameras.
+/// Landmarks and silhouettes of one person in the images of all cameras.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PersonTracks {
     landmarks: usize,
@@ -100,15 +100,15 @@ struct CameraTracks {
 }
 
 impl PersonTracks {
-    /// Without any image, for cameras and landmarks by number.
+    /// Creates empty tracks for a number of cameras and landmarks.
     #[must_use]
     pub fn new(cameras: usize, landmarks: usize) -> Self {
         let empty = CameraTracks { tracks: vec![Track::default(); landmarks], ..CameraTracks::default() };
         Self { landmarks, cameras: vec![empty; cameras] }
     }
 
-    /// Adds the landmarks of an image: pixels and confidences, 0 to 1, `None` where one is not seen. Images out of order, of
-    /// cameras that are not there, and values that are not finite are left out.
+    /// Adds the landmarks of an image: pixel and confidence (0 to 1), `None` for unseen ones. Ignores images out of order, unknown
+    /// cameras, and values that are not finite.
     pub fn add(&mut self, camera: usize, nanos: i64, landmarks: &[Option<(DVec2, f64)>]) {
         let Some(camera) = self.cameras.get_mut(camera) else { return };
         if camera.nanos.last().is_some_and(|last| *last >= nanos) {
@@ -125,8 +125,8 @@ impl PersonTracks {
         }
     }
 
-    /// Adds the convex hull of the person's silhouette in an image. Images out of order, of cameras that are not there, and hulls of
-    /// fewer than three corners or with values that are not finite are left out.
+    /// Adds the convex hull of the silhouette in an image. Ignores images out of order, unknown cameras, hulls of fewer than three
+    /// corners, and values that are not finite.
     pub fn add_outline(&mut self, camera: usize, nanos: i64, corners: Vec<OutlineCorner>) {
         let Some(camera) = self.cameras.get_mut(camera) else { return };
         let is_newer = camera.outlines.last().is_none_or(|(last, _)| *last < nanos);
@@ -135,37 +135,37 @@ impl PersonTracks {
         }
     }
 
-    /// Silhouettes of a camera.
+    /// Returns the silhouettes of a camera.
     pub(crate) fn outlines(&self, camera: usize) -> &Outlines {
         &self.cameras[camera].outlines
     }
 
-    /// Number of cameras.
+    /// Returns the number of cameras.
     #[must_use]
     pub fn cameras(&self) -> usize {
         self.cameras.len()
     }
 
-    /// Number of landmarks.
+    /// Returns the number of landmarks.
     #[must_use]
     pub fn landmarks(&self) -> usize {
         self.landmarks
     }
 
-    /// Images of a camera in which the person was seen.
+    /// Returns the number of images of a camera in which the person was seen.
     #[must_use]
     pub fn images(&self, camera: usize) -> usize {
         self.cameras.get(camera).map_or(0, |camera| camera.nanos.len())
     }
 
-    /// Times of the first and the last image of any camera.
+    /// Returns the times of the first and the last image of any camera.
     pub(crate) fn span(&self) -> Option<(i64, i64)> {
         let first = self.cameras.iter().filter_map(|camera| camera.nanos.first()).min()?;
         let last = self.cameras.iter().filter_map(|camera| camera.nanos.last()).max()?;
         Some((*first, *last))
     }
 
-    /// Usual time between two images of a camera, seconds.
+    /// Returns the median interval between images of a camera, seconds.
     pub(crate) fn interval_s(&self, camera: usize) -> f64 {
         let gaps = self.cameras[camera].nanos.windows(2).map(|pair| pair[1].saturating_sub(pair[0]) as f64 * 1e-9);
         flyrig_solve::median(&mut gaps.collect::<Vec<f64>>()).unwrap_or(0.0)
@@ -175,19 +175,19 @@ impl PersonTracks {
         &self.cameras[camera].tracks[landmark]
     }
 
-    /// Times of a camera's images.
+    /// Returns the timestamps of a camera's images.
     pub(crate) fn times(&self, camera: usize) -> Vec<i64> {
         self.cameras[camera].nanos.clone()
     }
 
-    /// A landmark as it was seen in the image of a time.
+    /// Returns the unsmoothed landmark of the image with a timestamp.
     pub(crate) fn sample(&self, camera: usize, landmark: usize, nanos: i64) -> Option<DVec2> {
         let samples = &self.track(camera, landmark).samples;
         let index = samples.binary_search_by_key(&nanos, |(at, ..)| *at).ok()?;
         Some(samples[index].1)
     }
 
-    /// Exchanges two landmarks in the image of a time, if both are seen.
+    /// Exchanges two landmarks in the image with a timestamp, if both are seen.
     pub(crate) fn exchange(&mut self, camera: usize, a: usize, b: usize, nanos: i64) {
         let tracks = &mut self.cameras[camera].tracks;
         let at = |landmark: usize| tracks[landmark].samples.binary_search_by_key(&nanos, |(at, ..)| *at).ok();
@@ -198,7 +198,7 @@ impl PersonTracks {
         }
     }
 
-    /// Only images of a part of the time, from one share of it to another.
+    /// Returns the images between two fractions of the take's duration.
     pub(crate) fn part(&self, from: f64, to: f64) -> Self {
         let Some((first, last)) = self.span() else { return self.clone() };
         let at = |share: f64| first.saturating_add((share * last.saturating_sub(first) as f64) as i64);

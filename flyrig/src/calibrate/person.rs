@@ -1,17 +1,13 @@
 //! `flyrig calibrate person`: better poses and time offsets of cameras from one person who moves.
 
-use std::time::Duration;
-
 use anyhow::{Context as _, Result, ensure};
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_calib::{
     OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person, save_easymocap,
 };
-use flyrig_capture::Pacing;
-use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{progress_bar, stop, write_whole};
-use flyrig_sync::{HullCorner, SyncSettings, silhouette_hull};
+use flyrig_report::{stop, write_whole};
+use flyrig_sync::{HullCorner, silhouette_hull};
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
 use flyrig_types::{Camera, Image, Rig};
 use glam::DVec2;
@@ -23,7 +19,7 @@ use crate::{
     take::{self, CalibratedTake},
 };
 
-/// Landmarks that are used, by their number in the network: nose, eyes, ears, shoulders to wrists, index fingers, hips to toes.
+/// Landmarks in use, by their index in the network: nose, eyes, ears, shoulders to wrists, index fingers, hips to toes.
 const LANDMARKS: [usize; 23] = [0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 19, 20, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32];
 /// Pairs of the network's landmarks at a constant distance.
 const LIMBS: [(usize, usize); 17] = [
@@ -45,20 +41,20 @@ const LIMBS: [(usize, usize); 17] = [
     (28, 30),
     (29, 31),
 ];
-/// Pairs of the network's landmarks, left and right, that it takes for each other together: of the face, the arms, the legs.
+/// Groups of (left, right) landmarks that the network confuses together: face, arms, legs.
 const MIRRORED: [&[(usize, usize)]; 3] =
     [&[(2, 5), (7, 8)], &[(11, 12), (13, 14), (15, 16), (19, 20)], &[(23, 24), (25, 26), (27, 28), (29, 30), (31, 32)]];
-/// Median distance of a camera's landmarks beyond which it shows somebody else, of the image's longer side.
+/// Median reprojection error, as a fraction of the image's longer side, beyond which a camera shows somebody else.
 const MOST_ERROR: f64 = 0.02;
-/// A camera was off where the person moves in its image by more than this, and so many times what halves of the take differ by.
+/// A camera was wrong if the person moves in its image by more than this, and by this multiple of the halves' difference.
 const LEAST_MOVED_PX: f64 = 2.0;
 const CLEARLY: f64 = 2.0;
-/// Halves of a take may differ by so much, pixels.
+/// Acceptable difference between the halves of a take, pixels.
 const MOST_HALVES_PX: f64 = 4.0;
-/// Offsets that matter, and standard deviations of useful ones, seconds.
+/// Least offset worth reporting, and largest standard deviation of a useful one, seconds.
 const LEAST_LAG_S: f64 = 0.003;
 const MOST_LAG_SIGMA_S: f64 = 0.008;
-/// Landmarks of less confidence are not used.
+/// Confidence that a landmark needs.
 const CONFIDENCE: f64 = 0.3;
 
 /// Runs the command.
@@ -101,7 +97,7 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
     Ok(())
 }
 
-/// Landmarks of the person in all images.
+/// Finds landmarks and silhouettes of the person in all images.
 fn look_through(
     args: &CalibratePersonArgs,
     rig: &Rig,
@@ -111,22 +107,9 @@ fn look_through(
     let template = default_template(&ShapeParams::default())?;
     let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, rig, plates, &PoseConfig::default())?;
     let mut tracks = PersonTracks::new(rig.cameras.len(), LANDMARKS.len());
-    let sync = SyncSettings { max_wait_nanos: Some(take.sync.max_wait_nanos.unwrap_or(1_000_000_000)), ..take.sync };
-    let mut intake = Intake::start_opening(take.sources, InputFormat::OfRig(rig), &sync, Pacing::Lossless)?;
-    let bar = progress_bar((args.secs * 1e3) as u64, "the person, ms of the take");
-    let mut first = None;
-    while !intake.ended() && !stop::requested() {
-        let Some(set) = intake.next_set(Duration::from_millis(200)) else { continue };
-        let from = *first.get_or_insert(set.master_nanos);
-        let at = set.master_nanos.saturating_sub(from) as f64 * 1e-9 - args.from_secs;
-        if at < -1e-3 {
-            continue;
-        }
-        if at > args.secs {
-            break;
-        }
-        bar.set_position((at * 1e3) as u64);
-        for (slot, found) in viewers.look(&set)?.into_iter().enumerate() {
+    let secs = [args.from_secs, args.from_secs + args.secs];
+    let errors = take::each_set(take.sources, rig, take.sync, 0, secs, "the person, ms of the take", |set| {
+        for (slot, found) in viewers.look(set)?.into_iter().enumerate() {
             let (Some(found), Some(frame)) = (found, &set.frames[slot]) else { continue };
             if let Some(mask) = found.masks.iter().flatten().next() {
                 let corner = |corner: HullCorner| OutlineCorner { ray: corner.ray, is_cut: corner.is_cut };
@@ -143,10 +126,10 @@ fn look_through(
                 .collect();
             tracks.add(slot, frame.capture_nanos, &seen);
         }
-    }
-    bar.finish_and_clear();
+        Ok(())
+    })?;
     for (slot, camera) in rig.cameras.iter().enumerate() {
-        if let Some(error) = intake.last_error(slot) {
+        if let Some(error) = errors.of(slot) {
             eprintln!("warning: not every image of camera {} could be used; the last: {error}", camera.id);
         }
         ensure!(
@@ -176,10 +159,20 @@ fn print(rig: &Rig, tracks: &PersonTracks, fit: &PersonFit) {
             solved.lag_halves_s.map_or_else(|| "?".to_owned(), |secs| format!("{:.1}", 1e3 * secs)),
         );
     }
-    println!("{} instants; landmarks spread by {:.2} px", fit.instants, fit.sigma_px);
+    println!(
+        "{} instants; landmarks spread by {:.2} px; left and right were confused in {} groups of limbs",
+        fit.instants, fit.sigma_px, fit.corrections
+    );
+    if let Some((before, after)) = fit.planes_rad {
+        println!(
+            "planes that touch the silhouettes of two cameras disagree by {:.1} -> {:.1} mrad",
+            1e3 * before,
+            1e3 * after
+        );
+    }
 }
 
-/// Which cameras were wrong, what to do with the offsets, and which movement is missing.
+/// Prints which cameras were wrong, how to use the time offsets, and which movement is missing.
 fn advise(rig: &Rig, fit: &PersonFit, with_lags: bool) {
     let cameras = || rig.cameras.iter().map(|camera| &camera.id).zip(&fit.cameras);
     for (id, camera) in cameras() {
@@ -231,5 +224,5 @@ fn report(rig: &Rig, fit: &PersonFit) -> serde_json::Value {
         })
     };
     let cameras: Vec<_> = rig.cameras.iter().zip(&fit.cameras).map(of).collect();
-    json!({ "cameras": cameras, "instants": fit.instants, "landmarks_px": fit.sigma_px })
+    json!({ "cameras": cameras, "instants": fit.instants, "landmarks_px": fit.sigma_px, "planes_rad": fit.planes_rad })
 }
