@@ -1,14 +1,14 @@
 //! Errors of calibrations whose truth is known: `cargo run --release -p flyrig-calib --example compare_rigs -- TRUTH FOUND...`, folders
-//! with intri.yml and extri.yml.
+//! of calibrations.
 
 use std::{error::Error, path::Path};
 
-use flyrig_calib::{load_easymocap, testing::rig_errors};
+use flyrig_calib::{load_calibration, testing::rig_errors};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let folders: Vec<String> = std::env::args().skip(1).collect();
     let [truth, found @ ..] = folders.as_slice() else { return Err("name the truth and what was found".into()) };
-    let load = |folder: &String| load_easymocap(Path::new(folder), &|_| None);
+    let load = |folder: &String| load_calibration(Path::new(folder), &|_| None);
     let truth = load(truth)?;
     println!("{:<24} {:>16} {:>18} {:>16}", "mean, largest of", "px", "degrees", "mm");
     for folder in found {

@@ -1,6 +1,6 @@
 //! Calibration in the format of EasyMocap and ZJU-MoCap: `intri.yml` and `extri.yml`.
 //!
-//! Per camera `x`: `K_x` 3x3, `dist_x` (k1 k2 p1 p2 k3), `Rot_x` 3x3 or `R_x` as a Rodrigues
+//! Per camera `x`: `K_x` 3x3, `dist_x` (k1 k2 p1 p2 k3, or with k4 k5 k6 of the rational model), `Rot_x` 3x3 or `R_x` as a Rodrigues
 //! vector, `T_x`; `x_camera = Rot x_world + T`. Picture sizes `H_x`, `W_x` are optional.
 
 use std::{
@@ -13,14 +13,12 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use crate::{
     CalibError,
+    convert::{opencv_coefficients, opencv_lens, rotation_of},
     yaml::{Matrix, YamlFile, YamlWriter},
 };
 
 const INTRINSICS: &str = "intri.yml";
 const EXTRINSICS: &str = "extri.yml";
-
-/// Largest entry of `RᵀR - 1` that rounding in a text file explains.
-const ROTATION_TOLERANCE: f64 = 1e-3;
 
 /// Reads `intri.yml` and `extri.yml` of a folder. `picture_size` gives width and height of a
 /// camera's pictures in pixels for files that do not say it, and is checked against those that do.
@@ -47,7 +45,7 @@ pub fn load_easymocap(dir: &Path, picture_size: &dyn Fn(&CameraId) -> Option<(u3
         .map(|id| {
             let intrinsics = read_intrinsics(&intri, &id, picture_size(&id))?;
             let camera_from_world = read_extrinsics(&extri, &id)?;
-            Ok(Camera { id, intrinsics, camera_from_world })
+            Ok(Camera { time_offset_nanos: 0, id, intrinsics, camera_from_world })
         })
         .collect::<Result<Vec<_>, CalibError>>()?;
     let world_up = Rig::guess_world_up(&cameras);
@@ -150,16 +148,8 @@ fn read_lens(file: &YamlFile, id: &CameraId) -> Result<Lens, CalibError> {
     if matrix.rows != 1 && matrix.cols != 1 || ![4, 5, 8, 12, 14].contains(&matrix.values.len()) {
         return Err(entry.wrong_shape(&matrix, "a row of 4, 5, 8, 12 or 14 numbers"));
     }
-    let mut coefficients = matrix.values.clone();
-    coefficients.resize(14, 0.0);
-    if let Some((i, value)) = coefficients.iter().enumerate().skip(5).find(|(_, value)| **value != 0.0) {
-        return Err(entry.wrong(
-            format!("has coefficient {} = {value} of the rational, prism or tilt model", i + 1),
-            "calibrate with k1 k2 p1 p2 k3 only",
-        ));
-    }
-    let [k1, k2, p1, p2, k3] = [0, 1, 2, 3, 4].map(|i| coefficients[i]);
-    Ok(Lens::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] })
+    opencv_lens(&matrix.values)
+        .map_err(|problem| entry.wrong(format!("has {problem}"), "use at most k1 k2 p1 p2 k3 k4 k5 k6"))
 }
 
 fn picture_size(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>) -> Result<(u32, u32), CalibError> {
@@ -188,12 +178,12 @@ fn picture_size(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>) ->
 fn read_extrinsics(file: &YamlFile, id: &CameraId) -> Result<Isometry, CalibError> {
     let entry = Entry::new(file, id, "Rot");
     let rotation = match entry.read()? {
-        Some(matrix) => rotation_of(&entry, entry.matrix3(&matrix)?)?,
+        Some(matrix) => rotation(&entry, &matrix)?,
         None => {
             let rodrigues = Entry::new(file, id, "R");
             let matrix = rodrigues.read()?.ok_or_else(|| entry.missing("or give a Rodrigues vector R"))?;
             if matrix.values.len() == 9 {
-                rotation_of(&rodrigues, rodrigues.matrix3(&matrix)?)?
+                rotation(&rodrigues, &matrix)?
             } else {
                 DQuat::from_scaled_axis(rodrigues.vector3(&matrix)?)
             }
@@ -204,23 +194,13 @@ fn read_extrinsics(file: &YamlFile, id: &CameraId) -> Result<Isometry, CalibErro
     Ok(Isometry::new(rotation, translation))
 }
 
-fn rotation_of(entry: &Entry<'_>, matrix: DMat3) -> Result<DQuat, CalibError> {
-    let excess = matrix.transpose() * matrix - DMat3::IDENTITY;
-    let deviation = excess.to_cols_array().into_iter().fold(0.0, |worst: f64, value| worst.max(value.abs()));
-    // Written so that NaN is refused too: entries near the largest double overflow the product.
-    let is_rotation = deviation <= ROTATION_TOLERANCE && matrix.determinant() > 0.0;
-    if !is_rotation {
-        let determinant = matrix.determinant();
-        return Err(entry.wrong(
-            format!("is no rotation (determinant {determinant:.4}, columns {deviation:.2e} from orthonormal)"),
-            "export the calibration again; a mirrored axis gives determinant -1",
-        ));
-    }
-    Ok(DQuat::from_mat3(&matrix).normalize())
+fn rotation(entry: &Entry<'_>, matrix: &Matrix) -> Result<DQuat, CalibError> {
+    rotation_of(entry.matrix3(matrix)?)
+        .map_err(|problem| entry.wrong(problem, "export the calibration again; a mirrored axis gives determinant -1"))
 }
 
 /// Writes a rig as `intri.yml` and `extri.yml` with picture sizes, so that [`load_easymocap`] reads
-/// the same cameras back. The format has no place for [`Rig::world_up`]. Both files are made before
+/// the same cameras back. The format has no place for [`Rig::world_up`] and time offsets. Both files are made before
 /// the first one is written.
 ///
 /// # Errors
@@ -245,41 +225,22 @@ pub fn save_easymocap(dir: &Path, rig: &Rig) -> Result<(), CalibError> {
 }
 
 fn write_intrinsics(intri: &mut YamlWriter, id: &CameraId, i: &Intrinsics) -> Result<(), CalibError> {
-    let Lens::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] } = i.lens else {
+    let Some(coefficients) = opencv_coefficients(&i.lens) else {
         return Err(CalibError::FisheyeUnsupported { camera: id.clone() });
     };
     let k = [i.focal_px.x, 0.0, i.center_px.x, 0.0, i.focal_px.y, i.center_px.y, 0.0, 0.0, 1.0];
     intri.matrix(&format!("K_{id}"), 3, &k);
-    intri.matrix(&format!("dist_{id}"), 5, &[k1, k2, p1, p2, k3]);
+    intri.matrix(&format!("dist_{id}"), coefficients.len(), &coefficients);
     intri.integer(&format!("H_{id}"), i.height);
     intri.integer(&format!("W_{id}"), i.width);
     Ok(())
-}
-
-/// Writes lenses as `intri.yml`, for cameras whose poses are not known yet.
-///
-/// # Errors
-/// As [`save_easymocap`].
-pub fn save_lenses(dir: &Path, lenses: &[(CameraId, Intrinsics)]) -> Result<(), CalibError> {
-    let posed = |(id, intrinsics): &(CameraId, Intrinsics)| Camera {
-        id: id.clone(),
-        intrinsics: *intrinsics,
-        camera_from_world: Isometry::IDENTITY,
-    };
-    validate(&Rig { cameras: lenses.iter().map(posed).collect(), world_up: DVec3::Z }, dir)?;
-    let mut intri = YamlWriter::new(dir.join(INTRINSICS));
-    intri.strings("names", lenses.iter().map(|(id, _)| id.as_str()))?;
-    for (id, intrinsics) in lenses {
-        write_intrinsics(&mut intri, id, intrinsics)?;
-    }
-    intri.finish()
 }
 
 /// Reads the lenses of a folder's `intri.yml`; `picture_size` as in [`load_easymocap`].
 ///
 /// # Errors
 /// As [`load_easymocap`].
-pub fn load_lenses(
+pub(crate) fn load_lenses(
     dir: &Path,
     picture_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>,
 ) -> Result<Vec<(CameraId, Intrinsics)>, CalibError> {

@@ -8,7 +8,7 @@ use flyrig_types::{CameraError, CameraId};
 #[derive(Debug, thiserror::Error)]
 pub enum CalibError {
     /// The file cannot be read.
-    #[error("{}: cannot be read: {source}; a calibration folder holds intri.yml and extri.yml", path.display())]
+    #[error("{}: cannot be read: {source}; a calibration folder holds calibration.toml, or intri.yml and extri.yml", path.display())]
     Read {
         /// Which file.
         path: PathBuf,
@@ -22,6 +22,14 @@ pub enum CalibError {
         path: PathBuf,
         /// What went wrong.
         reason: String,
+    },
+    /// A file that is not what it should be, in any format.
+    #[error("{}: {problem}", path.display())]
+    Format {
+        /// Which file.
+        path: PathBuf,
+        /// What is wrong, and the fix.
+        problem: String,
     },
     /// Not a file of OpenCV's FileStorage.
     #[error("{}: is not a YAML file of OpenCV's FileStorage ({reason}); export the calibration again", path.display())]
@@ -178,7 +186,7 @@ pub enum CalibError {
         landmarks: usize,
     },
     /// The format has no place for this lens.
-    #[error("camera {camera}: a fisheye lens cannot be written in EasyMocap's format")]
+    #[error("camera {camera}: EasyMocap's format has no fisheye lens; write calibration.toml, or another format")]
     FisheyeUnsupported {
         /// Which camera.
         camera: CameraId,

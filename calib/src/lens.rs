@@ -23,7 +23,9 @@ const HOLD_OUT_EVERY: usize = 4;
 /// A richer lens model is taken where it lowers the error of the views that were kept out to this share.
 const WORTH: f64 = 0.97;
 /// Focal lengths that are tried besides the estimated one, in widths of the image.
-const FOCAL_WIDTHS: [f64; 4] = [0.5, 0.8, 1.2, 2.0];
+const FOCAL_WIDTHS: [f64; 5] = [0.33, 0.5, 0.8, 1.2, 2.0];
+/// A fisheye is tried where corners lie farther than this from the optical axis, radians: closer to it, all lenses are alike.
+const FISHEYE_FROM_RAD: f64 = 0.45;
 /// Largest standard deviation of the focal length that is a result, as a share of it.
 const MOST_FOCAL_SHARE: f64 = 0.02;
 /// A view is named as wrong where its error is larger than this multiple of the median view's.
@@ -71,13 +73,17 @@ pub fn calibrate_lens(
     }
     let points: Vec<DVec3> = (0..board.corner_count()).map(|index| board.corner(index)).collect();
     let open = || CalibError::LensOpen { camera: camera.clone() };
-    let rough = first_guess(board, &points, size, &chosen).ok_or_else(open)?;
+    let straight = first_guess(board, &points, size, &chosen, LensModel::Radial1);
+    let is_wide = straight.is_none_or(|lens| widest_angle(&lens, &chosen) > FISHEYE_FROM_RAD);
+    let fisheye = if is_wide { first_guess(board, &points, size, &chosen, LensModel::Fisheye) } else { None };
+    let rough = |model| if model == LensModel::Fisheye { fisheye } else { straight };
     let (kept_out, kept): (Vec<_>, Vec<_>) = chosen.iter().enumerate().partition(|(i, _)| i % HOLD_OUT_EVERY == 1);
     let unpack = |views: Vec<(usize, &BoardView)>| views.into_iter().map(|(_, view)| view.clone()).collect::<Vec<_>>();
     let (kept_out, kept) = (unpack(kept_out), unpack(kept));
     let mut held_out_px = Vec::new();
     let mut best: Option<(LensModel, f64)> = None;
     for model in LensModel::ALL {
+        let Some(rough) = rough(model) else { continue };
         let Some(fit) = solve(board, &points, &rough, &kept, Some(model)) else { continue };
         let lens = fit.estimate.cameras[0].intrinsics;
         let Some(test) = solve(board, &points, &lens, &kept_out, None) else { continue };
@@ -88,7 +94,7 @@ pub fn calibrate_lens(
         }
     }
     let model = best.ok_or_else(open)?.0;
-    let fit = solve(board, &points, &rough, &chosen, Some(model)).ok_or_else(open)?;
+    let fit = rough(model).and_then(|rough| solve(board, &points, &rough, &chosen, Some(model))).ok_or_else(open)?;
     let intrinsics = fit.estimate.cameras[0].intrinsics;
     let covariance = fit.covariance.as_ref().ok_or_else(open)?;
     let deviation = |k: usize| covariance[(k, k)].max(0.0).sqrt();
@@ -158,8 +164,23 @@ pub(crate) fn different_views(views: &[BoardView], most: usize) -> Vec<BoardView
     chosen.into_iter().map(|i| views[i].clone()).collect()
 }
 
-/// A lens with one coefficient that explains the views best, from several focal lengths.
-fn first_guess(board: &Board, points: &[DVec3], size: [u32; 2], views: &[BoardView]) -> Option<Intrinsics> {
+/// Largest angle between the optical axis and a corner's ray, radians; 90 degrees where a corner has none.
+fn widest_angle(lens: &Intrinsics, views: &[BoardView]) -> f64 {
+    let angle = |pixel: DVec2| {
+        let ideal = lens.lens.undistort((pixel - lens.center_px) / lens.focal_px);
+        ideal.map_or(std::f64::consts::FRAC_PI_2, |ideal| ideal.length().atan())
+    };
+    views.iter().flat_map(|view| &view.corners).map(|corner| angle(corner.pixel)).fold(0.0, f64::max)
+}
+
+/// A lens of few coefficients that explains the views best, from several focal lengths.
+fn first_guess(
+    board: &Board,
+    points: &[DVec3],
+    size: [u32; 2],
+    views: &[BoardView],
+    model: LensModel,
+) -> Option<Intrinsics> {
     let center = DVec2::new(f64::from(size[0]) - 1.0, f64::from(size[1]) - 1.0) * 0.5;
     let planes: Vec<_> = views
         .iter()
@@ -180,9 +201,9 @@ fn first_guess(board: &Board, points: &[DVec3], size: [u32; 2], views: &[BoardVi
             height: size[1],
             focal_px: DVec2::splat(widths * f64::from(size[0])),
             center_px: center,
-            lens: Lens::PINHOLE,
+            lens: model.start(Lens::PINHOLE),
         };
-        let Some(fit) = solve(board, points, &start, views, Some(LensModel::Radial1)) else { continue };
+        let Some(fit) = solve(board, points, &start, views, Some(model)) else { continue };
         if best.is_none_or(|(error, _)| fit.sigma_px < error) {
             best = Some((fit.sigma_px, fit.estimate.cameras[0].intrinsics));
         }
@@ -198,6 +219,7 @@ fn solve(
     views: &[BoardView],
     model: Option<LensModel>,
 ) -> Option<Adjusted> {
+    let lens = &Intrinsics { lens: model.map_or(lens.lens, |model| model.start(lens.lens)), ..*lens };
     let (mut shots, mut boards) = (Vec::new(), Vec::new());
     for view in views {
         // A lens that is still wrong leaves large errors: any pose that puts the board before the camera is a start.

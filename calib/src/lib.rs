@@ -5,9 +5,12 @@
 mod adjust;
 mod board;
 mod bundle;
+mod calibration_file;
+mod convert;
 mod detect;
 mod easymocap;
 mod error;
+mod folder;
 mod homography;
 mod lens;
 mod person;
@@ -21,9 +24,12 @@ mod yaml;
 
 pub use board::{Board, Pattern};
 pub use bundle::{BoardView, Shot};
+pub use calibration_file::{Deviation, calibration_toml, save_calibration, save_lenses};
+pub use convert::{Format, Imported, ImportedCamera};
 pub use detect::{BoardDetector, GrayImage, SeenCorner, detector};
-pub use easymocap::{load_easymocap, load_lenses, save_easymocap, save_lenses};
+pub use easymocap::{load_easymocap, save_easymocap};
 pub use error::CalibError;
+pub use folder::{load_calibration, load_lenses, parse_calibration, save_export};
 pub use lens::{LensFit, calibrate_lens};
 pub use person::{OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person};
 pub use print::BoardSheet;

@@ -106,6 +106,7 @@ pub fn calibrate_rig(
             .map(|(id, solved)| {
                 let motion = solved.camera_from_rig * world.inverse();
                 Camera {
+                    time_offset_nanos: 0,
                     id: id.clone(),
                     intrinsics: solved.intrinsics,
                     camera_from_world: Isometry::new(motion.rotation, motion.translation),

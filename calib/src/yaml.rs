@@ -23,8 +23,9 @@ pub(crate) struct Matrix {
     pub values: Vec<f64>,
 }
 
+/// A value of a file.
 #[derive(Debug, Clone, PartialEq)]
-enum Value {
+pub(crate) enum Value {
     /// As it stands; whether it was quoted.
     Scalar(String, bool),
     List(Vec<Value>),
@@ -32,7 +33,8 @@ enum Value {
 }
 
 impl Value {
-    fn number(&self) -> Option<f64> {
+    /// A number; `None` for anything else.
+    pub fn number(&self) -> Option<f64> {
         let Self::Scalar(text, false) = self else { return None };
         match text.as_str() {
             ".Inf" | ".inf" | "+.Inf" => Some(f64::INFINITY),
@@ -44,10 +46,48 @@ impl Value {
         }
     }
 
-    fn get(&self, key: &str) -> Option<&Self> {
+    /// A value of a map.
+    pub fn get(&self, key: &str) -> Option<&Self> {
         let Self::Map(entries) = self else { return None };
         entries.iter().find(|(name, _)| name == key).map(|(_, value)| value)
     }
+
+    /// A word, quoted or not.
+    pub fn word(&self) -> Option<&str> {
+        let Self::Scalar(text, _) = self else { return None };
+        Some(text)
+    }
+
+    /// A list of numbers.
+    pub fn numbers(&self) -> Option<Vec<f64>> {
+        let Self::List(values) = self else { return None };
+        values.iter().map(Self::number).collect()
+    }
+
+    /// A list of lists of numbers.
+    pub fn rows(&self) -> Option<Vec<Vec<f64>>> {
+        let Self::List(values) = self else { return None };
+        values.iter().map(Self::numbers).collect()
+    }
+}
+
+/// Reads a plain YAML file, of maps in maps with lists, as Kalibr writes them.
+pub(crate) fn parse_tree(path: &Path) -> Result<Value, CalibError> {
+    let bytes = std::fs::read(path).map_err(|source| CalibError::Read { path: path.to_owned(), source })?;
+    let parsed = text_of(&bytes).and_then(|text| Lines::new(text).map());
+    parsed.map(Value::Map).map_err(|reason| CalibError::Format {
+        path: path.to_owned(),
+        problem: format!("is no YAML of a camera chain ({reason}); export it again"),
+    })
+}
+
+/// Checks that bytes are text of a sensible length.
+fn text_of(bytes: &[u8]) -> Result<&str, String> {
+    if bytes.len() > MAX_BYTES {
+        return Err(format!("it has {} bytes, at most {MAX_BYTES}", bytes.len()));
+    }
+    let text = std::str::from_utf8(bytes).ok().filter(|text| !text.contains('\0')).ok_or("it is not text")?;
+    Ok(text.trim_start_matches('\u{feff}'))
 }
 
 /// A parsed file.
@@ -69,11 +109,7 @@ impl YamlFile {
     }
 
     fn parse(bytes: &[u8]) -> Result<Vec<(String, Value)>, String> {
-        if bytes.len() > MAX_BYTES {
-            return Err(format!("it has {} bytes, at most {MAX_BYTES}", bytes.len()));
-        }
-        let text = std::str::from_utf8(bytes).ok().filter(|text| !text.contains('\0')).ok_or("it is not text")?;
-        let text = text.trim_start_matches('\u{feff}');
+        let text = text_of(bytes)?;
         if !text.trim_start().starts_with("%YAML") {
             return Err("it does not begin with %YAML".to_owned());
         }
@@ -206,9 +242,12 @@ impl<'a> Lines<'a> {
         let is_item = |body: &str| body == "-" || body.starts_with("- ");
         if is_item(body) && inner >= indent {
             let mut items = Vec::new();
-            while let Some((_, _, body)) = self.lines.get(self.at).filter(|line| line.1 == inner && is_item(line.2)) {
-                items.push(scalar(body[1..].trim()));
+            while let Some(&(number, _, body)) =
+                self.lines.get(self.at).filter(|line| line.1 == inner && is_item(line.2))
+            {
                 self.at += 1;
+                let item = body[1..].trim();
+                items.push(if item.starts_with('[') { self.flow(number, item)? } else { scalar(item) });
             }
             return Ok(Value::List(items));
         }
@@ -306,6 +345,11 @@ impl YamlWriter {
             self.text,
             "{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {data} ]"
         );
+    }
+
+    /// Returns the text without writing it.
+    pub fn into_text(self) -> String {
+        self.text
     }
 
     pub fn finish(self) -> Result<(), CalibError> {

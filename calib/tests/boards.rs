@@ -4,7 +4,8 @@ use flyrig_calib::{
     Board, BoardView, CalibError, LensModel, Pattern, RigOptions, Shot, calibrate_lens, calibrate_rig,
     testing::{Random, pose_errors, ring, shots, view},
 };
-use flyrig_types::{Camera, CameraId, Intrinsics, Isometry};
+use flyrig_solve::{PointPair, align_rigid};
+use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Lens};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 const SIZE: [u32; 2] = [1280, 720];
@@ -43,23 +44,76 @@ fn a_rig_is_found_from_boards_and_knows_how_well() {
     assert!(inside * 100 >= 90 * all, "{inside} of {all} within two standard deviations");
 }
 
-#[test]
-fn a_lens_is_found_with_the_coefficients_that_pay() {
-    let mut random = Random(5);
-    let camera = ring(&mut random, 1).remove(0);
+/// Views of a tilted board before a camera, as far as `reach` from the optical axis, metres.
+fn before(random: &mut Random, camera: &Camera, count: usize, reach: f64) -> Vec<BoardView> {
     let mut views = Vec::new();
-    while views.len() < 40 {
-        // Before the camera, tilted.
+    while views.len() < count {
         let tilt = DQuat::from_scaled_axis(DVec3::new(random.normal(), random.normal(), random.normal()) * 0.4);
-        let place = DVec3::new(random.between(-0.5, 0.5), random.between(-0.3, 0.3), random.between(0.5, 1.2));
+        let place = DVec3::new(
+            random.between(-reach, reach),
+            random.between(-0.6 * reach, 0.6 * reach),
+            random.between(0.5, 1.2),
+        );
         let pose = Isometry::new(tilt, place - tilt * board().middle());
         let back = camera.camera_from_world.inverse();
         let pose = Isometry::new(back.rotation * pose.rotation, back.transform_point(pose.translation));
-        if let Some(mut view) = view(&mut random, &board(), &camera, 0, &pose, 0.15) {
+        if let Some(mut view) = view(random, &board(), camera, 0, &pose, 0.15) {
             view.nanos = views.len() as i64;
             views.push(view);
         }
     }
+    views
+}
+
+#[test]
+fn a_fisheye_and_a_wide_lens_are_found() {
+    for (lens, focal, expected) in [
+        (Lens::Fisheye { coefficients: [0.03, -0.008, 0.002, -0.0004] }, 420.0, LensModel::Fisheye),
+        (
+            Lens::Rational { radial: [6.0, 1.5, 0.02, 6.4, 3.1, 0.15], tangential: [0.006, -0.004] },
+            520.0,
+            LensModel::Rational,
+        ),
+    ] {
+        let mut random = Random(15);
+        let mut camera = ring(&mut random, 1).remove(0);
+        camera.intrinsics.lens = lens;
+        camera.intrinsics.focal_px = DVec2::new(focal, 1.003 * focal);
+        let views = before(&mut random, &camera, 60, 1.4);
+        let fit = calibrate_lens(&board(), &camera.id, SIZE, &views).unwrap();
+        assert_eq!(fit.model, expected, "{:?}", fit.held_out_px);
+        assert!((0.12..0.18).contains(&fit.sigma_px), "{}", fit.sigma_px);
+        // Rays agree over all that boards covered, out to the corners; a turn of the camera, which poses take up, apart.
+        let ray = |i: &Intrinsics, pixel: DVec2| {
+            i.lens.undistort((pixel - i.center_px) / i.focal_px).map(|ideal| ideal.extend(1.0).normalize())
+        };
+        let grid = || {
+            (0..7).flat_map(|x| {
+                (0..5).map(move |y| DVec2::new(100.0 + 180.0 * f64::from(x), 80.0 + 140.0 * f64::from(y)))
+            })
+        };
+        let rays = |i: &Intrinsics| grid().map(|pixel| ray(i, pixel).unwrap()).collect::<Vec<_>>();
+        let (found, truth) = (rays(&fit.intrinsics), rays(&camera.intrinsics));
+        // With every ray's opposite, centroids are zero and the alignment is a turn alone.
+        let opposite = |side: f64| {
+            move |(from, to): (&DVec3, &DVec3)| PointPair { from: *from * side, to: *to * side, weight: 1.0 }
+        };
+        let rays = || found.iter().zip(&truth);
+        let pairs: Vec<PointPair> = rays().map(opposite(1.0)).chain(rays().map(opposite(-1.0))).collect();
+        let turn = align_rigid(&pairs).unwrap().motion().rotation;
+        let off: Vec<f64> = rays().map(|(found, truth)| (turn * *found).angle_between(*truth) * focal).collect();
+        let rms = (off.iter().map(|px| px * px).sum::<f64>() / off.len() as f64).sqrt();
+        let worst = off.iter().copied().fold(0.0, f64::max);
+        let deviation = fit.deviations_px.into_iter().fold(0.0, f64::max);
+        assert!(deviation < 2.0 && rms < 1.5 * deviation && worst < 3.0 * deviation, "{rms} {worst} {deviation} px");
+    }
+}
+
+#[test]
+fn a_lens_is_found_with_the_coefficients_that_pay() {
+    let mut random = Random(5);
+    let camera = ring(&mut random, 1).remove(0);
+    let views = before(&mut random, &camera, 40, 0.5);
     let fit = calibrate_lens(&board(), &camera.id, SIZE, &views).unwrap();
     let truth = camera.intrinsics;
     let off = (fit.intrinsics.focal_px - truth.focal_px).abs();

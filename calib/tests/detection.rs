@@ -17,6 +17,7 @@ fn chessboard() -> Board {
 
 fn camera() -> Camera {
     Camera {
+        time_offset_nanos: 0,
         id: "00".into(),
         intrinsics: Intrinsics {
             width: SIZE[0],

@@ -114,6 +114,7 @@ fn cameras_are_found_without_names_and_with_unquoted_ones() {
 #[test]
 fn a_rig_comes_back_as_it_was_written() {
     let camera = |id: &str, eye: DVec3| Camera {
+        time_offset_nanos: 0,
         id: id.into(),
         intrinsics: Intrinsics {
             width: 1088,
@@ -152,7 +153,7 @@ fn what_the_format_cannot_hold_is_not_written() {
     let mut rig = load_easymocap(dir.path(), &SIZE).unwrap();
     rig.cameras[1].intrinsics.lens = Lens::Fisheye { coefficients: [0.0; 4] };
     let text = save_easymocap(dir.path(), &rig).unwrap_err().to_string();
-    assert_eq!(text, "camera b: a fisheye lens cannot be written in EasyMocap's format");
+    assert_eq!(text, "camera b: EasyMocap's format has no fisheye lens; write calibration.toml, or another format");
     rig.cameras[1].intrinsics.lens = Lens::PINHOLE;
     let text = save_easymocap(Path::new("/no/such/folder"), &rig).unwrap_err().to_string();
     assert!(text.contains("/no/such/folder/intri.yml: cannot be written"), "{text}");

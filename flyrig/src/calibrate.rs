@@ -1,6 +1,7 @@
-//! `flyrig calibrate`: boards, lenses and rigs.
+//! `flyrig calibrate`: boards, lenses, rigs, and files of other programs.
 
 mod board;
+mod convert;
 mod lens;
 mod person;
 mod rig;
@@ -12,6 +13,9 @@ use anyhow::{Result, bail};
 use flyrig_gpu::GpuContext;
 
 use crate::cli::CalibrateAction;
+
+/// Files of a calibrated rig.
+const FILES: [&str; 2] = ["calibration.toml", "calibration.json"];
 
 /// Refuses to replace files of an earlier run.
 fn refuse_existing(folder: &Path, names: &[&str], force: bool) -> Result<()> {
@@ -28,5 +32,6 @@ pub fn calibrate(action: &CalibrateAction, gpu: &dyn Fn() -> Result<GpuContext>)
         CalibrateAction::Lens(args) => lens::lens(args, gpu),
         CalibrateAction::Rig(args) => rig::rig(args, gpu),
         CalibrateAction::Person(args) => person::person(args, gpu),
+        CalibrateAction::Convert(args) => convert::convert(args),
     }
 }

@@ -4,6 +4,7 @@ use std::{collections::BTreeMap, net::SocketAddr, ops::Range, path::PathBuf};
 
 use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
+use flyrig_calib::Format;
 use flyrig_fusion::{
     AppearanceOptions, BodySettings, BudgetSettings, NetworksOn, Origin, PerceptionSettings, TrackingSettings,
 };
@@ -154,7 +155,7 @@ pub struct SyncCheckArgs {
     /// Frame rate of a folder.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
-    /// Folder with intri.yml and extri.yml, for an input without a calibration: silhouettes of one person are then compared,
+    /// Folder of a calibration, for an input without one: silhouettes of one person are then compared,
     /// which is more reliable than motion. It replaces the input's own calibration.
     #[arg(long)]
     pub calibration: Option<PathBuf>,
@@ -170,6 +171,8 @@ pub enum CalibrateAction {
     Rig(CalibrateRigArgs),
     /// Refine poses and time offsets of calibrated cameras from one person who moves before them.
     Person(CalibratePersonArgs),
+    /// Convert a calibration of another program, or to one.
+    Convert(CalibrateConvertArgs),
 }
 
 /// Patterns of boards.
@@ -251,13 +254,51 @@ pub struct TakeArgs {
 }
 
 #[derive(Debug, Args)]
+pub struct CalibrateConvertArgs {
+    /// A file or folder of the other program; see --from.
+    pub input: PathBuf,
+    /// Folder of the new files.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Format of the input, recognised by its names otherwise: flyrig, easymocap, opencv, kalibr, colmap, nerfstudio, qualisys,
+    /// anipose (Pose2Sim and caliscope too), mrcal.
+    #[arg(long, value_parser = parse_format)]
+    pub from: Option<Format>,
+    /// Format of the output, one of the same.
+    #[arg(long, value_parser = parse_format, default_value = "flyrig")]
+    pub to: Format,
+    /// Metres of a unit of length in the input: 0.001 for millimetres; for COLMAP and nerfstudio the size of theirs in the room.
+    #[arg(long, default_value_t = 1.0, value_parser = parse_scale)]
+    pub scale: f64,
+    /// Folder with images/CAM, for formats that do not say how large the images are; the input otherwise.
+    #[arg(long)]
+    pub images: Option<PathBuf>,
+    /// Replace files that are there.
+    #[arg(long)]
+    pub force: bool,
+}
+
+fn parse_format(text: &str) -> Result<Format, String> {
+    let known = Format::ALL.map(Format::name);
+    Format::ALL
+        .into_iter()
+        .find(|format| format.name() == text)
+        .ok_or_else(|| format!("no such format; known: {}", known.join(", ")))
+}
+
+fn parse_scale(text: &str) -> Result<f64, String> {
+    let scale = text.parse().ok().filter(|scale| (1e-9..=1e9).contains(scale));
+    scale.ok_or_else(|| "expected metres of a unit, between 1e-9 and 1e9".to_owned())
+}
+
+#[derive(Debug, Args)]
 pub struct CalibrateLensArgs {
     #[command(flatten)]
     pub take: TakeArgs,
     /// The board's description, as `flyrig calibrate board` writes it.
     #[arg(long, default_value = "board/board.toml")]
     pub board: PathBuf,
-    /// Folder of intri.yml.
+    /// Folder of calibration.toml.
     #[arg(long)]
     pub out: PathBuf,
     /// Replace lenses that are there.
@@ -282,7 +323,7 @@ pub struct CalibratePersonArgs {
     /// Frame rate of a folder.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
-    /// Folder of intri.yml, extri.yml and calibration.json.
+    /// Folder of calibration.toml and calibration.json.
     #[arg(long)]
     pub out: PathBuf,
     /// Take the cameras' stamps as they are.
@@ -300,10 +341,10 @@ pub struct CalibrateRigArgs {
     /// The board's description, as `flyrig calibrate board` writes it.
     #[arg(long, default_value = "board/board.toml")]
     pub board: PathBuf,
-    /// Folder of intri.yml, extri.yml and calibration.json.
+    /// Folder of calibration.toml and calibration.json.
     #[arg(long)]
     pub out: PathBuf,
-    /// Folder with the intri.yml of `flyrig calibrate lens`; the lenses are calibrated from the take otherwise.
+    /// Folder of `flyrig calibrate lens`, or of any calibration; the lenses are calibrated from the take otherwise.
     #[arg(long)]
     pub lenses: Option<PathBuf>,
     /// Solve for the lenses together with the poses.

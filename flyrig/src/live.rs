@@ -1,7 +1,7 @@
 //! Real cameras: from the configuration to sources.
 
 use anyhow::Result;
-use flyrig_calib::load_easymocap;
+use flyrig_calib::load_calibration;
 use flyrig_capture::{CameraOptions, CameraSource, CaptureError, NokhwaCamera, SourceOpener};
 use flyrig_types::{CameraId, Rig};
 
@@ -10,14 +10,14 @@ use crate::{
     config::SourceSection,
 };
 
-/// The calibration; where its files do not say how large the pictures are, the configuration does, and where both do,
+/// Reads the calibration; where its files do not say how large the pictures are, the configuration does, and where both do,
 /// they must agree.
 pub fn load_rig(source: &SourceSection) -> Result<Rig> {
     let size = |id: &CameraId| {
         let entry = source.cameras.iter().find(|entry| entry.name() == id.as_str())?;
         entry.device().ok().map(|section| (section.size[0], section.size[1]))
     };
-    Ok(load_easymocap(&source.path, &size)?)
+    Ok(load_calibration(&source.path, &size)?)
 }
 
 /// Returns an opener for every camera of the configuration; the images come in the cameras' own formats.

@@ -7,7 +7,7 @@ use std::{
 };
 
 use anyhow::{Context as _, Result, bail, ensure};
-use flyrig_calib::save_easymocap;
+use flyrig_calib::{calibration_toml, parse_calibration, save_export};
 use flyrig_capture::{
     CameraSource, CaptureThreads, Compression, McapReplay, Note, Pacing, PopError, Recorded, Recorder, RecorderConfig,
     SourceOpener, ThreadsConfig, recorded_notes, to_rgb8,
@@ -18,8 +18,8 @@ use flyrig_sync::{SyncSettings, Synchronizer};
 use flyrig_transport::{decode_calibration, decode_transforms, encode_calibration, encode_transforms};
 use flyrig_types::{Camera, CameraId, Frame, FrameSet, PixelFormat, Rig};
 use foxglove::{
-    Encode,
-    messages::{CameraCalibration, FrameTransforms},
+    Decode as _, Encode,
+    messages::{CameraCalibration, FrameTransforms, Log},
 };
 
 use crate::{
@@ -33,6 +33,8 @@ use crate::{
 /// Topics of the calibration in a recording, as on the network.
 const CALIBRATION: &str = "calibration/";
 const TRANSFORMS: &str = "transforms";
+/// Topic of the whole calibration, time offsets included, as the text of a foxglove `Log`.
+const CALIBRATION_FILE: &str = "calibration.toml";
 /// How often a line with counts is printed.
 const PRINT_EVERY: Duration = Duration::from_secs(5);
 
@@ -49,7 +51,11 @@ pub fn recorder(path: &Path, rig: &Rig, settings: &RecordSection, pacing: Pacing
     let keep_all = pacing == Pacing::Lossless;
     let quality = settings.jpeg_quality;
     let compression = (quality > 0).then_some(Compression { quality, keep_all });
-    let mut notes = vec![note::<FrameTransforms>(TRANSFORMS.to_owned(), encode_transforms(rig)?)];
+    let log = Log { name: CALIBRATION_FILE.to_owned(), message: calibration_toml(rig, &[])?, ..Log::default() };
+    let mut text = Vec::new();
+    log.encode(&mut text)?;
+    let mut notes = vec![note::<Log>(CALIBRATION_FILE.to_owned(), text)];
+    notes.push(note::<FrameTransforms>(TRANSFORMS.to_owned(), encode_transforms(rig)?));
     for camera in &rig.cameras {
         notes.push(note::<CameraCalibration>(format!("{CALIBRATION}{}", camera.id), encode_calibration(camera)?));
     }
@@ -66,6 +72,11 @@ pub fn tap(recorder: &Recorder, cameras: Vec<SourceOpener>) -> Result<Vec<Source
 pub fn recorded_rig(path: &Path) -> Result<Rig> {
     let notes = recorded_notes(path)?;
     let named = |text: &str| format!("{}: {text}", path.display());
+    if let Some((_, bytes)) = notes.iter().find(|(topic, _)| topic == CALIBRATION_FILE) {
+        let log = Log::decode(bytes.as_slice()).with_context(|| named("its calibration is damaged"))?;
+        return Ok(parse_calibration(path, &log.message)?);
+    }
+    // Recordings of earlier versions.
     let transforms = notes.iter().find(|(topic, _)| topic == TRANSFORMS);
     let (_, bytes) = transforms.with_context(|| named("holds no calibration; it is no recording of flyrig's"))?;
     let transforms = decode_transforms(bytes)?;
@@ -74,7 +85,7 @@ pub fn recorded_rig(path: &Path) -> Result<Rig> {
         let (id, intrinsics) = decode_calibration(bytes)?;
         let place = transforms.camera_from_world.iter().find(|(camera, _)| *camera == id);
         let (_, camera_from_world) = place.with_context(|| named(&format!("camera {id} has no place")))?;
-        cameras.push(Camera { id, intrinsics, camera_from_world: *camera_from_world });
+        cameras.push(Camera { time_offset_nanos: 0, id, intrinsics, camera_from_world: *camera_from_world });
     }
     let rig = Rig { cameras, world_up: transforms.world_up };
     rig.validate()?;
@@ -163,13 +174,14 @@ pub fn replay(args: &ReplayArgs) -> Result<()> {
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     let threads_config = ThreadsConfig { queue_capacity: 4 * ids.len().max(1), pacing: Pacing::Lossless };
     let threads = CaptureThreads::start(replay_sources(&args.recording, &rig)?, threads_config)?;
-    let mut sync = Synchronizer::new(&ids, &SyncSettings { lags_nanos: args.lags.nanos(), ..SyncSettings::default() });
+    let settings = SyncSettings { lags_nanos: args.lags.nanos(), ..SyncSettings::default() }.with_offsets_of(&rig);
+    let mut sync = Synchronizer::new(&ids, &settings);
     if let Some(folder) = &args.export {
         ensure!(!folder.exists(), "{} is there already; name a new folder", folder.display());
         for id in &ids {
             fs::create_dir_all(folder.join("images").join(id.as_str()))?;
         }
-        save_easymocap(folder, &rig)?;
+        save_export(folder, &rig)?;
     }
     let mut tallies = vec![Tally::default(); ids.len()];
     let mut digest = Digest::default();

@@ -18,9 +18,7 @@ use crate::{
 };
 
 const ADD_TO_CAMERA: &str = "add it to the lag_ms that its [[source.cameras]] has (0 without one)";
-const ADD_TO_SYNC: &str = "add it to what [sync] lags_ms says of the camera (0 without)";
-const TELL: &str =
-    "put it into [sync] lags_ms in place of what stands there, or tell flyrig eval or replay --lag CAM=MS";
+const ADD: &str = "add it to the camera's time_offset_ms in calibration.toml, or to [sync] lags_ms or --lag CAM=MS, which replace that";
 
 /// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
 pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
@@ -28,12 +26,9 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     let mut take = take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu)?;
     let cameras: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(cameras.len() > 1, "one camera alone has no lag; name at least two");
-    let is_configured =
-        matches!(args.input.as_slice(), [path] if path.extension().is_some_and(|ending| ending == "toml"));
-    let advice = match (take.is_live, is_configured) {
-        (true, _) => ADD_TO_CAMERA,
-        (false, true) => ADD_TO_SYNC,
-        (false, false) => TELL,
+    let advice = match take.is_live {
+        true => ADD_TO_CAMERA,
+        false => ADD,
     };
     let (estimates, frames, told, mend) = match take.calibration.take() {
         Some((rig, plates)) if !take.is_live => {

@@ -150,7 +150,8 @@ pub fn open_calibrated(
             CalibratedTake::replayed(sources, Some((rig, plates)), false)
         }
         [folder] if folder.is_dir() => {
-            let is_calibrated = ["intri.yml", "extri.yml"].iter().all(|file| folder.join(file).exists());
+            let has = |file: &str| folder.join(file).exists();
+            let is_calibrated = has("calibration.toml") || has("intri.yml") && has("extri.yml");
             let mut sources = folder_sources(folder, fps, false)?;
             let masks = folder.join("mask");
             let with_masks = (is_calibrated || folder_of_calibration.is_some())
@@ -175,6 +176,9 @@ pub fn open_calibrated(
              record) and give the recording"
         );
         take.calibration = Some(calibration(folder, &take.sources)?);
+    }
+    if let Some((rig, _)) = &take.calibration {
+        take.sync = take.sync.with_offsets_of(rig);
     }
     Ok(take)
 }

@@ -150,6 +150,7 @@ fn viewpoint(eye: [f64; 3], args: &WatchArgs, world_up: DVec3) -> Result<Camera>
     ensure!(args.fov_degrees > 1.0 && args.fov_degrees < 170.0, "--fov-degrees must lie between 1 and 170");
     let focal = f64::from(height) / 2.0 / (args.fov_degrees.to_radians() / 2.0).tan();
     Ok(Camera {
+        time_offset_nanos: 0,
         id: "watch".into(),
         intrinsics: Intrinsics {
             width,

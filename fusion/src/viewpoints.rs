@@ -14,6 +14,7 @@ pub fn orbit(rig: &Rig, turn: f64, width: u32, height: u32, name: &str) -> Optio
     // The whole height of the first camera's picture fits the height of ours.
     let focal = i.focal_px.y * f64::from(height) / f64::from(i.height);
     Some(Camera {
+        time_offset_nanos: 0,
         id: CameraId::from(name),
         intrinsics: Intrinsics {
             width,
@@ -35,6 +36,7 @@ mod tests {
     fn rig(eyes: &[DVec3]) -> Rig {
         let target = DVec3::new(0.2, 0.1, 1.0);
         let camera = |eye: &DVec3| Camera {
+            time_offset_nanos: 0,
             id: format!("{eye}").into(),
             intrinsics: Intrinsics {
                 width: 640,

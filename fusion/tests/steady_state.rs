@@ -21,6 +21,7 @@ fn camera(azimuth: f64, side: u32) -> Camera {
     let middle = DVec3::new(0.0, 0.9, 0.0);
     let eye = middle + DVec3::new(azimuth.sin(), 0.15, azimuth.cos()) * 3.0;
     Camera {
+        time_offset_nanos: 0,
         id: format!("{azimuth}").into(),
         intrinsics: Intrinsics {
             width: side,

@@ -22,11 +22,11 @@ pub struct CameraConstants {
     pub center_px: [f32; 2],
     /// Pixels.
     pub size: [u32; 2],
-    /// 0 radial-tangential, 1 fisheye.
+    /// 0 radial-tangential or rational, 1 fisheye.
     pub lens: u32,
     /// See [`Lens::valid_radius`].
     pub valid_radius: f32,
-    /// k1 k2 k3 p1 p2, or the fisheye's k1 to k4.
+    /// k1 k2 k3 p1 p2 k4 k5 k6, or the fisheye's k1 to k4.
     pub coefficients: [f32; 8],
 }
 
@@ -34,13 +34,14 @@ impl From<&Camera> for CameraConstants {
     fn from(camera: &Camera) -> Self {
         let i = &camera.intrinsics;
         let (lens, c) = match i.lens {
-            Lens::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] } => (0, [k1, k2, k3, p1, p2]),
-            Lens::Fisheye { coefficients: [k1, k2, k3, k4] } => (1, [k1, k2, k3, k4, 0.0]),
+            Lens::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] } => {
+                (0, [k1, k2, k3, p1, p2, 0.0, 0.0, 0.0])
+            }
+            Lens::Rational { radial: [k1, k2, k3, k4, k5, k6], tangential: [p1, p2] } => {
+                (0, [k1, k2, k3, p1, p2, k4, k5, k6])
+            }
+            Lens::Fisheye { coefficients: [k1, k2, k3, k4] } => (1, [k1, k2, k3, k4, 0.0, 0.0, 0.0, 0.0]),
         };
-        let mut coefficients = [0.0; 8];
-        for (to, from) in coefficients.iter_mut().zip(c) {
-            *to = from as f32;
-        }
         Self {
             camera_from_world: camera.camera_from_world.to_matrix().as_mat4().to_cols_array_2d(),
             position: camera.position().as_vec3().extend(1.0).to_array(),
@@ -49,7 +50,7 @@ impl From<&Camera> for CameraConstants {
             size: [i.width, i.height],
             lens,
             valid_radius: i.lens.valid_radius() as f32,
-            coefficients,
+            coefficients: c.map(|value| value as f32),
         }
     }
 }
@@ -78,12 +79,15 @@ impl CameraConstants {
     pub fn distort(&self, ideal: Vec2) -> Distorted {
         let Vec2 { x, y } = ideal;
         let r2 = ideal.length_squared();
-        let [k1, k2, k3, k4, k5, ..] = self.coefficients;
         if self.lens == 0 {
-            let (p1, p2) = (k4, k5);
-            let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+            let [k1, k2, k3, p1, p2, k4, k5, k6] = self.coefficients;
+            // Without k4 to k6 the division is by 1 and changes no bit.
+            let below = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)));
+            let radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * below;
             // d radial / d r2, times 2 for d r2 / dx = 2 x.
-            let slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3));
+            let above_slope = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3);
+            let below_slope = k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6);
+            let slope = 2.0 * (above_slope - radial * below_slope) * below;
             let point = Vec2::new(
                 x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
                 y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
@@ -95,6 +99,7 @@ impl CameraConstants {
             );
             return Distorted { point, jacobian };
         }
+        let [k1, k2, k3, k4, ..] = self.coefficients;
         let r = r2.sqrt();
         if r < 1e-4 {
             return Distorted { point: ideal, jacobian: Mat2::IDENTITY };

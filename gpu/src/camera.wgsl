@@ -7,7 +7,7 @@ struct Camera {
     size: vec2<u32>,
     lens: u32,
     valid_radius: f32,
-    // k1 k2 k3 p1 | p2 (radial-tangential), or k1 k2 k3 k4 (fisheye)
+    // k1 k2 k3 p1 | p2 k4 k5 k6 (radial-tangential, rational), or k1 k2 k3 k4 (fisheye)
     coefficients_a: vec4<f32>,
     coefficients_b: vec4<f32>,
 }
@@ -37,9 +37,14 @@ fn distort(camera: Camera, ideal: vec2<f32>) -> Distorted {
         let k3 = k.z;
         let p1 = k.w;
         let p2 = camera.coefficients_b.x;
-        let radial = 1.0 + r2 * (k.x + r2 * (k.y + r2 * k3));
+        let d = camera.coefficients_b.yzw;
+        // Without k4 to k6 the division is by 1 and changes no bit.
+        let below = 1.0 / (1.0 + r2 * (d.x + r2 * (d.y + r2 * d.z)));
+        let radial = (1.0 + r2 * (k.x + r2 * (k.y + r2 * k3))) * below;
         // d radial / d r2, times 2 for d r2 / dx = 2 x.
-        let slope = 2.0 * (k.x + r2 * (2.0 * k.y + r2 * 3.0 * k3));
+        let above_slope = k.x + r2 * (2.0 * k.y + r2 * 3.0 * k3);
+        let below_slope = d.x + r2 * (2.0 * d.y + r2 * 3.0 * d.z);
+        let slope = 2.0 * (above_slope - radial * below_slope) * below;
         out.point = vec2(
             x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
             y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,

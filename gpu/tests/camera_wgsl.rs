@@ -31,10 +31,12 @@ fn cameras() -> Vec<Camera> {
     [
         Lens::PINHOLE,
         Lens::RadialTangential { radial: [-0.25, 0.08, -0.01], tangential: [0.002, -0.001] },
+        Lens::Rational { radial: [0.5, 0.12, 0.01, 0.8, 0.25, 0.02], tangential: [0.002, -0.001] },
         Lens::Fisheye { coefficients: [0.06, -0.02, 0.004, -0.001] },
     ]
     .into_iter()
     .map(|lens| Camera {
+        time_offset_nanos: 0,
         id: "test".into(),
         intrinsics: Intrinsics {
             width: 640,

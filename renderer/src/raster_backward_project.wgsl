@@ -34,8 +34,14 @@ fn through_lens_jacobian(camera: Camera, ideal: vec2<f32>, d: mat2x2<f32>) -> ve
     var p1 = 0.0;
     var p2 = 0.0;
     if camera.lens == 0u {
-        first = 2.0 * (k.x + r2 * (2.0 * k.y + r2 * 3.0 * k.z));
-        second = 8.0 * k.y + 24.0 * k.z * r2;
+        // s = above / below, polynomials of q = r^2: first = 2 ds/dq, second = 4 d2s/dq2.
+        let d = camera.coefficients_b.yzw;
+        let below = 1.0 / (1.0 + r2 * (d.x + r2 * (d.y + r2 * d.z)));
+        let below_slope = d.x + r2 * (2.0 * d.y + r2 * 3.0 * d.z);
+        let s = (1.0 + r2 * (k.x + r2 * (k.y + r2 * k.z))) * below;
+        let slope = (k.x + r2 * (2.0 * k.y + r2 * 3.0 * k.z) - s * below_slope) * below;
+        first = 2.0 * slope;
+        second = 4.0 * (2.0 * k.y + 6.0 * k.z * r2 - 2.0 * slope * below_slope - s * (2.0 * d.y + 6.0 * d.z * r2)) * below;
         p1 = k.w;
         p2 = camera.coefficients_b.x;
     } else if r2 < 1e-4 {
@@ -57,7 +63,7 @@ fn through_lens_jacobian(camera: Camera, ideal: vec2<f32>, d: mat2x2<f32>) -> ve
     let u_xy = y * first + x * x * y * second + 2.0 * p1;
     let u_yy = x * first + x * y * y * second + 2.0 * p2;
     let v_yy = 3.0 * y * first + y * y * y * second + 6.0 * p1;
-    // v_xx = u_xy and v_xy = u_yy for both lenses.
+    // v_xx = u_xy and v_xy = u_yy for all lenses.
     return vec2(
         d[0].x * u_xx + (d[1].x + d[0].y) * u_xy + d[1].y * u_yy,
         d[0].x * u_xy + (d[1].x + d[0].y) * u_yy + d[1].y * v_yy,

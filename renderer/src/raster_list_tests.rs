@@ -19,6 +19,7 @@ fn every_tile_lists_its_gaussians_by_depth() {
     gaussians.color.write(&gpu, &vec![[1.0; 4]; count]);
     let middle = DVec3::new(0.0, 0.85, 0.0);
     let camera = Camera {
+        time_offset_nanos: 0,
         id: "test".into(),
         intrinsics: Intrinsics {
             width: 1920,

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
-use flyrig_calib::{CalibError, load_easymocap};
+use flyrig_calib::{CalibError, load_calibration};
 use flyrig_capture::{VideoOptions, VideoReplay, folder_picture_size};
 use flyrig_fusion::{Origin, PerceptionSettings};
 use flyrig_types::{Camera, CameraId, Image, PixelFormat, Rig};
@@ -36,7 +36,7 @@ pub fn pick(rig: &Rig, names: &[String], whose: &str) -> Result<Rig> {
 /// # Errors
 /// Names what is missing or wrong.
 pub fn load_rig(root: &Path, chosen: &[CameraId]) -> Result<Rig> {
-    load_easymocap(root, &|id| picture_size(root, id)).or_else(|error| {
+    load_calibration(root, &|id| picture_size(root, id)).or_else(|error| {
         if matches!(error, CalibError::UnknownSize { .. }) {
             for camera in chosen.iter().filter(|id| !video_file(root, id).exists()) {
                 folder_picture_size(root, camera)?;

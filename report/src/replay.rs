@@ -34,7 +34,7 @@ pub struct ReplaySettings {
     pub fps: f64,
     /// All frames where `None`.
     pub frames: Option<Range<u64>>,
-    /// Time offsets that are subtracted from the timestamps, nanoseconds.
+    /// Time offsets that are subtracted from the timestamps, nanoseconds, in place of the calibration's.
     pub lags_nanos: BTreeMap<CameraId, i64>,
     /// Whether frames carry their true masks even where masks are estimated, for scores.
     pub true_masks: bool,
@@ -61,6 +61,7 @@ impl Replay {
     pub fn open(settings: &ReplaySettings, gpu: &GpuContext) -> Result<Self> {
         settings.session.validate()?;
         let (rig, holdout) = load_rigs(settings)?;
+        let settings = &with_offsets(settings, rig.cameras.iter().chain(&holdout));
         let (sets, count) = open_inputs(settings, &rig)?;
         let truth = TruthReader::open(settings, &holdout)?;
         let perceived = &settings.session.perception;
@@ -106,6 +107,15 @@ impl Replay {
         let damaged = self.sets.damaged();
         serde_json::json!({ "complete": counts.complete, "partial": counts.partial, "broken_pictures": damaged })
     }
+}
+
+/// Adds the calibration's time offsets for cameras that have none in the settings.
+fn with_offsets<'a>(settings: &ReplaySettings, cameras: impl Iterator<Item = &'a Camera>) -> ReplaySettings {
+    let mut settings = settings.clone();
+    for camera in cameras.filter(|camera| camera.time_offset_nanos != 0) {
+        settings.lags_nanos.entry(camera.id.clone()).or_insert(camera.time_offset_nanos);
+    }
+    settings
 }
 
 fn load_rigs(args: &ReplaySettings) -> Result<(Rig, Vec<Camera>)> {

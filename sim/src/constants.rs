@@ -64,15 +64,17 @@ impl ViewHead {
         let valid = i.lens.valid_radius() as f32;
         let mut view = Self::zeroed();
         match i.lens {
-            Lens::RadialTangential { radial, tangential: [p1, p2] } => {
-                let [k1, k2, k3] = radial.map(|k| k as f32);
-                view.radial = [k1, k2, k3, valid];
-                view.tangential = [p1 as f32, p2 as f32, 0.0, 0.0];
-            }
             Lens::Fisheye { coefficients } => {
                 view.radial[3] = valid;
                 view.tangential[2] = 1.0;
                 view.fisheye = coefficients.map(|k| k as f32);
+            }
+            lens @ (Lens::RadialTangential { .. } | Lens::Rational { .. }) => {
+                let (radial, [p1, p2]) = lens.rational().unwrap_or_default();
+                let [k1, k2, k3, k4, k5, k6] = radial.map(|k| k as f32);
+                view.radial = [k1, k2, k3, valid];
+                view.fisheye = [k4, k5, k6, 0.0];
+                view.tangential = [p1 as f32, p2 as f32, 0.0, 0.0];
             }
         }
         view.camera_from_world = camera.camera_from_world.to_matrix().as_mat4().to_cols_array_2d();

@@ -713,6 +713,7 @@ mod tests {
         let lenses = [
             (1.3, Lens::PINHOLE),
             (1.1, Lens::RadialTangential { radial: [-0.25, 0.06, -0.004], tangential: [0.004, -0.003] }),
+            (1.0, Lens::Rational { radial: [0.5, 0.1, 0.01, 0.8, 0.2, 0.02], tangential: [0.002, -0.001] }),
             (0.6, Lens::Fisheye { coefficients: [0.05, -0.01, 0.004, -0.001] }),
         ];
         for (focal_heights, lens) in lenses {
@@ -724,6 +725,7 @@ mod tests {
                 lens,
             };
             let camera = Camera {
+                time_offset_nanos: 0,
                 id: CameraId::from("00".to_owned()),
                 intrinsics,
                 camera_from_world: Isometry::look_at(DVec3::new(0.3, -3.0, 1.5), DVec3::new(0.0, 0.0, 1.0), DVec3::Z),

@@ -5,7 +5,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use flyrig_body::{write_glb, write_mesh_ply};
-use flyrig_calib::save_easymocap;
+use flyrig_calib::save_export;
 use flyrig_types::{CameraId, write_whole};
 use image::{ExtendedColorType, ImageEncoder as _};
 use serde_json::json;
@@ -108,7 +108,7 @@ impl Folder {
                 self.folder(&format!("{kind}/{camera}"))?;
             }
         }
-        save_easymocap(&self.root, &simulator.reported_rig())?;
+        save_export(&self.root, &simulator.reported_rig())?;
         for (slot, camera) in cameras.iter().enumerate() {
             let plate = simulator.plate(slot)?;
             let size = [plate.width(), plate.height()];
@@ -122,7 +122,7 @@ impl Folder {
         self.text("simulation.toml", &config)?;
         if options.truth {
             self.folder("truth/surface")?;
-            save_easymocap(&self.root.join("truth"), simulator.rig())?;
+            save_export(&self.root.join("truth"), simulator.rig())?;
         }
         let mut times = "frame,camera,delivery,true_nanos,stamp_nanos,exposure\n".to_owned();
         let mut poses = String::new();

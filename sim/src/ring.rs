@@ -42,6 +42,7 @@ pub fn camera_ring(config: &SimConfig) -> Result<Rig, SimError> {
             intrinsics.focal_px *= 1.0 + draw(6) * ring.focal_jitter_percent * 0.01;
             unfolded(config, &intrinsics)?;
             Ok(Camera {
+                time_offset_nanos: 0,
                 id: CameraId::from(format!("{slot:02}")),
                 intrinsics,
                 camera_from_world: turn * Isometry::look_at(eye, target, DVec3::Z),

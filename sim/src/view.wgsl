@@ -19,7 +19,7 @@ struct View {
     radial: vec4<f32>,
     // p1, p2; z is 1 for a fisheye.
     tangential: vec4<f32>,
-    // k1 to k4 of a fisheye.
+    // k1 to k4 of a fisheye; else k4, k5, k6 of a rational lens.
     fisheye: vec4<f32>,
     // xy: point on the lens in camera axes, metres; z: 1 / distance of sharpness.
     lens_point: vec4<f32>,
@@ -54,7 +54,8 @@ fn pixel_of(camera: vec3<f32>) -> vec2<f32> {
         bent *= theta * (1.0 + t2 * (k.x + t2 * (k.y + t2 * (k.z + t2 * k.w)))) / max(radius, 1e-9);
     } else {
         let k = view.radial.xyz;
-        bent *= 1.0 + r2 * (k.x + r2 * (k.y + r2 * k.z));
+        let d = view.fisheye.xyz;
+        bent *= (1.0 + r2 * (k.x + r2 * (k.y + r2 * k.z))) / (1.0 + r2 * (d.x + r2 * (d.y + r2 * d.z)));
         let p = view.tangential.xy;
         let q = ideal * (r / max(radius, 1e-9));
         bent += 2.0 * p * q.x * q.y + p.yx * (vec2(r2) + 2.0 * q * q);

@@ -51,6 +51,7 @@ impl Stage {
         let middle = DVec3::new(0.0, 0.85, 0.0);
         let [width, height] = SIZE;
         Camera {
+            time_offset_nanos: 0,
             id: format!("{azimuth}").as_str().into(),
             intrinsics: Intrinsics {
                 width,

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use flyrig_types::CameraId;
+use flyrig_types::{CameraId, Rig};
 use serde::{Deserialize, Serialize};
 
 use crate::ClockKind;
@@ -23,7 +23,7 @@ pub struct SyncSettings {
     #[serde(rename = "max_wait_ms", with = "max_wait")]
     pub max_wait_nanos: Option<u64>,
     /// Time offset of each camera's timestamps against the other cameras'; subtracted before anything else. Sets wait longer
-    /// by the spread of the offsets.
+    /// by the spread of the offsets. Replaces the calibration's ([`Self::with_offsets_of`]).
     #[serde(rename = "lags_ms", with = "lags")]
     pub lags_nanos: BTreeMap<CameraId, i64>,
     /// The camera whose frames set the times of the sets; the rig's first when `None`.
@@ -31,6 +31,18 @@ pub struct SyncSettings {
     pub master: Option<CameraId>,
     /// Whether the cameras share a clock.
     pub clocks: ClockKind,
+}
+
+impl SyncSettings {
+    /// Returns the settings with the time offsets of a calibration for the cameras that have none here.
+    #[must_use]
+    pub fn with_offsets_of(&self, rig: &Rig) -> Self {
+        let mut settings = self.clone();
+        for camera in rig.cameras.iter().filter(|camera| camera.time_offset_nanos != 0) {
+            settings.lags_nanos.entry(camera.id.clone()).or_insert(camera.time_offset_nanos);
+        }
+        settings
+    }
 }
 
 /// Converts milliseconds within a range; `key` names the setting in the error.

@@ -13,7 +13,12 @@ fn camera(name: &str, eye: DVec3, target: DVec3) -> Camera {
     let lens = Lens::RadialTangential { radial: [-0.1, 0.02, 0.0], tangential: [0.0; 2] };
     let intrinsics =
         Intrinsics { width: 144, height: 192, focal_px: DVec2::splat(195.0), center_px: DVec2::new(71.5, 95.5), lens };
-    Camera { id: name.into(), intrinsics, camera_from_world: Isometry::look_at(eye, target, DVec3::Z) }
+    Camera {
+        time_offset_nanos: 0,
+        id: name.into(),
+        intrinsics,
+        camera_from_world: Isometry::look_at(eye, target, DVec3::Z),
+    }
 }
 
 /// Cameras around the origin, at different heights.

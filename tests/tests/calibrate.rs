@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use flyrig_calib::{Board, load_easymocap, testing::photograph};
+use flyrig_calib::{Board, load_calibration, testing::photograph};
 use flyrig_tests::run;
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
 use glam::{DQuat, DVec2, DVec3};
@@ -19,6 +19,7 @@ fn cameras() -> Vec<Camera> {
         .map(|(name, angle, focal)| {
             let eye = DVec3::new(angle.sin(), -angle.cos(), 0.65 + 0.1 * angle);
             Camera {
+                time_offset_nanos: 0,
                 id: name.into(),
                 intrinsics: Intrinsics {
                     width: SIZE[0],
@@ -74,7 +75,7 @@ fn a_printed_board_calibrates_lenses_and_rig() {
     let rig = command("calibrate rig take --fps 1 --lenses lenses --out calibration --floor");
     assert_eq!(rig.code, Some(0), "{}{}", rig.stdout, rig.stderr);
     assert!(rig.stdout.contains("left and middle share"), "{}", rig.stdout);
-    let found = load_easymocap(&folder.path().join("calibration"), &|_| None).unwrap();
+    let found = load_calibration(&folder.path().join("calibration"), &|_| None).unwrap();
     for truth in &cameras {
         let camera = found.cameras.iter().find(|camera| camera.id == truth.id).unwrap();
         let focal = (camera.intrinsics.focal_px - truth.intrinsics.focal_px).abs().max_element();
@@ -91,7 +92,7 @@ fn a_printed_board_calibrates_lenses_and_rig() {
     // Nothing is replaced unasked, and what is wrong is said in one line.
     let again = command("calibrate rig take --fps 1 --lenses lenses --out calibration");
     assert_eq!(again.code, Some(1));
-    assert!(again.stderr.contains("intri.yml is there already; --force replaces it"), "{}", again.stderr);
+    assert!(again.stderr.contains("calibration.toml is there already; --force replaces it"), "{}", again.stderr);
     let text = std::fs::read_to_string(folder.path().join("board/board.toml")).unwrap();
     std::fs::write(folder.path().join("other.toml"), text.replace("4X4_50", "5X5_100")).unwrap();
     let other = command("calibrate rig take --fps 1 --board other.toml --lenses lenses --out none");

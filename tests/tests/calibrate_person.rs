@@ -1,7 +1,7 @@
 //! A rig whose calibration is a degree off is mended by a person who walks before it.
 #![allow(clippy::unwrap_used)] // helpers of tests
 
-use flyrig_calib::{load_easymocap, testing::rig_errors};
+use flyrig_calib::{load_calibration, testing::rig_errors};
 use flyrig_tests::run;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
@@ -19,7 +19,7 @@ fn somebody_who_walks_mends_the_calibration() {
     let person = command("calibrate person take --out better");
     assert_eq!(person.code, Some(0), "{}{}", person.stdout, person.stderr);
 
-    let load = |name: &str| load_easymocap(&folder.path().join(name), &|_| None).unwrap();
+    let load = |name: &str| load_calibration(&folder.path().join(name), &|_| None).unwrap();
     let truth = load("take/truth");
     let worst = |name: &str| {
         let errors = rig_errors(&load(name).cameras, &truth.cameras).unwrap();
@@ -33,7 +33,7 @@ fn somebody_who_walks_mends_the_calibration() {
     // What is wrong is said in one line, and nothing is written.
     let again = command("calibrate person take --out better");
     assert_eq!(again.code, Some(1));
-    assert!(again.stderr.contains("intri.yml is there already; --force replaces it"), "{}", again.stderr);
+    assert!(again.stderr.contains("calibration.toml is there already; --force replaces it"), "{}", again.stderr);
     std::fs::create_dir_all(folder.path().join("bare")).unwrap();
     std::fs::rename(folder.path().join("take/images"), folder.path().join("bare/images")).unwrap();
     let bare = command("calibrate person bare --out none");

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use flyrig_body::{ShapeParams, default_template, load_gltf, skin_mesh};
-use flyrig_calib::load_easymocap;
+use flyrig_calib::load_calibration;
 use flyrig_tracker::{LANDMARK_BONES, LANDMARK_COUNT, PoseConfig, PoseEstimate, PoseEstimator, PoseNet};
 use flyrig_types::{Camera, CameraId, Frame, FrameSet, Image, Mask, PixelFormat, Rig};
 use glam::{DVec2, DVec3};
@@ -29,7 +29,7 @@ fn main() -> Result<()> {
     let (root, out) = (PathBuf::from(root), PathBuf::from(out));
     std::fs::create_dir_all(&out)?;
 
-    let all = load_easymocap(&root, &|id| image::image_dimensions(picture_path(&root, id, first)?).ok())?;
+    let all = load_calibration(&root, &|id| image::image_dimensions(picture_path(&root, id, first)?).ok())?;
     let wanted: Vec<CameraId> = cameras.split(',').map(CameraId::from).collect();
     let keep = |inside: bool| Rig {
         cameras: all.cameras.iter().filter(|c| wanted.contains(&c.id) == inside).cloned().collect(),

@@ -368,6 +368,7 @@ mod tests {
 
     fn camera() -> Camera {
         Camera {
+            time_offset_nanos: 0,
             id: "left".into(),
             intrinsics: Intrinsics {
                 width: SIDE as u32,

@@ -211,6 +211,7 @@ mod tests {
 
     fn background(key: &str) -> Background {
         let camera = Camera {
+            time_offset_nanos: 0,
             id: "a".into(),
             intrinsics: Intrinsics {
                 width: SIDE as u32,

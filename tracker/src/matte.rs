@@ -398,6 +398,7 @@ mod tests {
 
     fn background(plate: &Image) -> Background {
         let camera = flyrig_types::Camera {
+            time_offset_nanos: 0,
             id: "a".into(),
             intrinsics: Intrinsics {
                 width: plate.width(),

@@ -22,6 +22,7 @@ pub(crate) fn ring(count: usize) -> Rig {
             let angle = i as f64 * std::f64::consts::TAU / (count as f64 + 0.5);
             let eye = DVec3::new(3.5 * angle.cos(), 3.5 * angle.sin(), 1.5);
             Camera {
+                time_offset_nanos: 0,
                 id: format!("{i}").into(),
                 intrinsics: Intrinsics {
                     width: 800,

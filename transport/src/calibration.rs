@@ -33,6 +33,9 @@ pub fn encode_calibration(camera: &Camera) -> Result<Vec<u8>, TransportError> {
         Lens::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] } => {
             ("plumb_bob", vec![k1, k2, p1, p2, k3])
         }
+        Lens::Rational { radial: [k1, k2, k3, k4, k5, k6], tangential: [p1, p2] } => {
+            ("rational_polynomial", vec![k1, k2, p1, p2, k3, k4, k5, k6])
+        }
         Lens::Fisheye { coefficients } => ("kannala_brandt", coefficients.to_vec()),
     };
     let (f, c) = (i.focal_px, i.center_px);
@@ -66,11 +69,14 @@ pub fn decode_calibration(bytes: &[u8]) -> Result<(CameraId, Intrinsics), Transp
     }
     let lens = match (message.distortion_model.as_str(), message.d.as_slice()) {
         ("plumb_bob", &[k1, k2, p1, p2, k3]) => Lens::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] },
+        ("rational_polynomial", &[k1, k2, p1, p2, k3, k4, k5, k6]) => {
+            Lens::Rational { radial: [k1, k2, k3, k4, k5, k6], tangential: [p1, p2] }
+        }
         ("kannala_brandt", &[k1, k2, k3, k4]) => Lens::Fisheye { coefficients: [k1, k2, k3, k4] },
         ("", []) => Lens::PINHOLE,
         (model, d) => {
             let text = format!(
-                "distortion {model:?} with {} numbers; known: plumb_bob with 5, kannala_brandt with 4",
+                "distortion {model:?} with {} numbers; known: plumb_bob with 5, rational_polynomial with 8, kannala_brandt with 4",
                 d.len()
             );
             return Err(malformed(text));
@@ -84,7 +90,7 @@ pub fn decode_calibration(bytes: &[u8]) -> Result<(CameraId, Intrinsics), Transp
         lens,
     };
     let id = camera_id("calibration", &message.frame_id)?;
-    let camera = Camera { id: id.clone(), intrinsics, camera_from_world: Isometry::IDENTITY };
+    let camera = Camera { time_offset_nanos: 0, id: id.clone(), intrinsics, camera_from_world: Isometry::IDENTITY };
     camera.validate().map_err(|error| malformed(error.to_string()))?;
     Ok((id, intrinsics))
 }

@@ -275,7 +275,12 @@ impl Inbox {
             let (publisher, places) = state.places.as_ref()?;
             let cameras = places.camera_from_world.iter().map(|(id, camera_from_world)| {
                 let (from, intrinsics) = state.lenses.get(id)?;
-                let camera = Camera { id: id.clone(), intrinsics: *intrinsics, camera_from_world: *camera_from_world };
+                let camera = Camera {
+                    time_offset_nanos: 0,
+                    id: id.clone(),
+                    intrinsics: *intrinsics,
+                    camera_from_world: *camera_from_world,
+                };
                 (from == publisher).then_some(camera)
             });
             Some(Rig { cameras: cameras.collect::<Option<_>>()?, world_up: places.world_up })

@@ -8,6 +8,9 @@ use crate::{CameraId, Isometry};
 /// Largest image side that anything in flyrig accepts, pixels.
 pub const MAX_IMAGE_SIDE: u32 = 16_384;
 
+/// Largest time offset between cameras, milliseconds.
+const MAX_TIME_OFFSET_MS: f64 = 1000.0;
+
 /// Distortion from the ideal image plane `(x/z, y/z)`, OpenCV's coefficients.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -16,6 +19,13 @@ pub enum Lens {
     RadialTangential {
         /// k1, k2, k3.
         radial: [f64; 3],
+        /// p1, p2.
+        tangential: [f64; 2],
+    },
+    /// As [`Self::RadialTangential`], with the radial factor `(1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)`.
+    Rational {
+        /// k1 to k6.
+        radial: [f64; 6],
         /// p1, p2.
         tangential: [f64; 2],
     },
@@ -30,30 +40,47 @@ impl Lens {
     /// No distortion at all.
     pub const PINHOLE: Self = Self::RadialTangential { radial: [0.0; 3], tangential: [0.0; 2] };
 
+    /// Returns k1 to k6, p1 and p2 of a lens that is not a fisheye; k4 to k6 are 0 for [`Self::RadialTangential`].
+    #[must_use]
+    pub fn rational(&self) -> Option<([f64; 6], [f64; 2])> {
+        match *self {
+            Self::RadialTangential { radial: [k1, k2, k3], tangential } => {
+                Some(([k1, k2, k3, 0.0, 0.0, 0.0], tangential))
+            }
+            Self::Rational { radial, tangential } => Some((radial, tangential)),
+            Self::Fisheye { .. } => None,
+        }
+    }
+
+    /// Returns all coefficients, in the order of the variant's fields.
+    #[must_use]
+    pub fn coefficients(&self) -> Vec<f64> {
+        match *self {
+            Self::RadialTangential { radial, tangential } => radial.into_iter().chain(tangential).collect(),
+            Self::Rational { radial, tangential } => radial.into_iter().chain(tangential).collect(),
+            Self::Fisheye { coefficients } => coefficients.to_vec(),
+        }
+    }
+
     /// Maps a point of the ideal plane to the distorted plane.
     #[must_use]
     pub fn distort(&self, ideal: DVec2) -> DVec2 {
-        match *self {
-            Self::RadialTangential { radial: [k1, k2, k3], tangential: [p1, p2] } => {
-                let (x, y) = (ideal.x, ideal.y);
-                let r2 = ideal.length_squared();
-                let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
-                DVec2::new(
-                    x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-                    y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-                )
+        if let Self::Fisheye { coefficients } = self {
+            let r = ideal.length();
+            if r < 1e-9 {
+                return ideal;
             }
-            Self::Fisheye { coefficients: [k1, k2, k3, k4] } => {
-                let r = ideal.length();
-                if r < 1e-9 {
-                    return ideal;
-                }
-                let theta = r.atan();
-                let t2 = theta * theta;
-                let distorted = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))));
-                ideal * (distorted / r)
-            }
+            let theta = r.atan();
+            return ideal * (theta * polynomial(&series(coefficients), theta * theta) / r);
         }
+        let (k, [p1, p2]) = self.rational().unwrap_or_default();
+        let (x, y) = (ideal.x, ideal.y);
+        let r2 = ideal.length_squared();
+        let radial = polynomial(&series(&k[..3]), r2) / polynomial(&series(&k[3..]), r2);
+        DVec2::new(
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        )
     }
 
     /// Radius on the ideal plane up to which the radial part grows, so that no two directions share
@@ -61,20 +88,15 @@ impl Lens {
     #[must_use]
     pub fn valid_radius(&self) -> f64 {
         const LIMIT: f64 = 1e3;
-        let grows = |r: f64| match *self {
-            Self::RadialTangential { radial: [k1, k2, k3], .. } => {
-                let r2 = r * r;
-                1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * 7.0 * k3)) > 0.0
-            }
-            Self::Fisheye { coefficients: [k1, k2, k3, k4] } => {
-                let t2 = r.atan().powi(2);
-                1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4))) > 0.0
-            }
-        };
         if self.surely_grows(LIMIT) {
             return LIMIT;
         }
-        // The derivative may dip below zero and rise again: walk outwards, then bisect the first dip.
+        let conditions = self.conditions();
+        let grows = |r: f64| {
+            let s = self.squared_argument(r);
+            conditions.iter().all(|condition| polynomial(condition, s) > 0.0)
+        };
+        // A condition may dip below zero and rise again: walk outwards, then bisect the first dip.
         let (mut low, mut r) = (0.0, 0.01);
         while r < LIMIT {
             if !grows(r) {
@@ -98,23 +120,45 @@ impl Lens {
         self.surely_grows(radius) || radius <= self.valid_radius()
     }
 
-    /// Quick and on the safe side: counting the negative coefficients alone, the radial part's derivative shrinks
-    /// with the radius, so where it is positive it is so all the way there.
+    /// Quick and on the safe side: counting the negative coefficients alone, each condition shrinks with the radius, so where
+    /// it is positive it is so all the way there.
     fn surely_grows(&self, radius: f64) -> bool {
-        let negative = |c: f64| c.min(0.0);
-        let least = match *self {
-            Self::RadialTangential { radial: [k1, k2, k3], .. } => {
-                let r2 = radius * radius;
-                1.0 + r2 * (3.0 * negative(k1) + r2 * (5.0 * negative(k2) + r2 * 7.0 * negative(k3)))
+        let s = self.squared_argument(radius);
+        self.conditions().iter().all(|condition| {
+            let negative: [f64; 7] = std::array::from_fn(|i| if i == 0 { condition[0] } else { condition[i].min(0.0) });
+            polynomial(&negative, s) > 0.0
+        })
+    }
+
+    /// Variable of [`Self::conditions`] at a radius of the ideal plane: its square, or that of the angle for a fisheye.
+    fn squared_argument(&self, radius: f64) -> f64 {
+        match self {
+            Self::Fisheye { .. } => radius.atan().powi(2),
+            Self::RadialTangential { .. } | Self::Rational { .. } => radius * radius,
+        }
+    }
+
+    /// Polynomials that are positive where the radial part grows: the numerator of its derivative, and its denominator.
+    fn conditions(&self) -> [[f64; 7]; 2] {
+        let mut slope = [0.0; 7];
+        let mut denominator = [0.0; 7];
+        denominator[0] = 1.0;
+        let Some((k, _)) = self.rational() else {
+            let Self::Fisheye { coefficients } = self else { return [slope, denominator] };
+            for (i, c) in series(coefficients).into_iter().enumerate() {
+                slope[i] = (2 * i + 1) as f64 * c;
             }
-            Self::Fisheye { coefficients: [k1, k2, k3, k4] } => {
-                let t2 = radius.atan().powi(2);
-                1.0 + t2
-                    * (3.0 * negative(k1)
-                        + t2 * (5.0 * negative(k2) + t2 * (7.0 * negative(k3) + t2 * 9.0 * negative(k4))))
-            }
+            return [slope, denominator];
         };
-        least > 0.0
+        // With N(s), D(s), s = r²: d/dr (r N/D) D² = (N + 2 s N') D - 2 s N D'.
+        let (above, below) = (series(&k[..3]), series(&k[3..]));
+        for (i, n) in above.into_iter().take(4).enumerate() {
+            for (j, d) in below.into_iter().take(4).enumerate() {
+                slope[i + j] += n * d * (1.0 + 2.0 * i as f64 - 2.0 * j as f64);
+            }
+        }
+        denominator[..4].copy_from_slice(&below[..4]);
+        [slope, denominator]
     }
 
     /// Inverse of [`Self::distort`] by damped fixed-point and Newton steps; `None` when nothing on
@@ -144,6 +188,16 @@ impl Lens {
         let good = (self.distort(ideal) - distorted).length() < 1e-8 * (1.0 + distorted.length());
         (good && ideal.is_finite()).then_some(ideal)
     }
+}
+
+/// Returns 1 followed by the coefficients, at most four.
+fn series(coefficients: &[f64]) -> [f64; 5] {
+    std::array::from_fn(|i| if i == 0 { 1.0 } else { coefficients.get(i - 1).copied().unwrap_or_default() })
+}
+
+/// Value of a polynomial, lowest power first.
+fn polynomial(coefficients: &[f64], at: f64) -> f64 {
+    coefficients.iter().rev().fold(0.0, |sum, c| sum * at + c)
 }
 
 /// What a camera does to a point in front of it.
@@ -198,6 +252,14 @@ pub struct Camera {
     pub intrinsics: Intrinsics,
     /// World to camera axes.
     pub camera_from_world: Isometry,
+    /// Time offset of its timestamps against the other cameras', nanoseconds: subtracted before frames are joined. 0 for
+    /// cameras that are only drawn.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub time_offset_nanos: i64,
+}
+
+fn is_zero(nanos: &i64) -> bool {
+    *nanos == 0
 }
 
 impl Camera {
@@ -244,14 +306,10 @@ impl Camera {
         let camera = || self.id.clone();
         let i = &self.intrinsics;
         let not_finite = |field| CameraError::NotFinite { camera: camera(), field };
-        let coefficients: Vec<f64> = match i.lens {
-            Lens::RadialTangential { radial, tangential } => radial.into_iter().chain(tangential).collect(),
-            Lens::Fisheye { coefficients } => coefficients.to_vec(),
-        };
         if !i.focal_px.is_finite() || !i.center_px.is_finite() {
             return Err(not_finite("the camera matrix K"));
         }
-        if !coefficients.iter().all(|c| c.is_finite()) {
+        if !i.lens.coefficients().iter().all(|c| c.is_finite()) {
             return Err(not_finite("the lens distortion"));
         }
         if !self.camera_from_world.rotation.is_finite() {
@@ -269,7 +327,9 @@ impl Camera {
         range("focal length fx", i.focal_px.x, i.focal_px.x > 0.0, "a positive number of pixels")?;
         range("focal length fy", i.focal_px.y, i.focal_px.y > 0.0, "a positive number of pixels")?;
         let norm = self.camera_from_world.rotation.length();
-        range("rotation quaternion length", norm, (norm - 1.0).abs() < 1e-6, "1")
+        range("rotation quaternion length", norm, (norm - 1.0).abs() < 1e-6, "1")?;
+        let offset_ms = self.time_offset_nanos as f64 * 1e-6;
+        range("time offset", offset_ms, offset_ms.abs() <= MAX_TIME_OFFSET_MS, "-1000 to 1000 ms")
     }
 }
 
@@ -349,6 +409,7 @@ mod tests {
                 lens,
             },
             camera_from_world: Isometry::look_at(DVec3::new(0.0, -3.0, 1.0), DVec3::new(0.0, 0.0, 1.0), DVec3::Z),
+            time_offset_nanos: 0,
         }
     }
 
@@ -368,6 +429,7 @@ mod tests {
             Lens::RadialTangential { radial: [-0.3, 0.1, -0.02], tangential: [0.001, -0.002] },
             Lens::RadialTangential { radial: [0.12, -0.03, 0.0], tangential: [0.0, 0.0] },
             Lens::Fisheye { coefficients: [0.05, -0.01, 0.002, -0.0005] },
+            Lens::Rational { radial: [0.4, 0.05, 0.001, 0.7, 0.1, 0.004], tangential: [0.001, -0.002] },
         ];
         for lens in lenses {
             let camera = camera(lens);
@@ -391,6 +453,18 @@ mod tests {
     }
 
     #[test]
+    fn a_rational_lens_is_cut_where_it_turns_and_at_its_pole() {
+        let lens = |radial| Lens::Rational { radial, tangential: [0.0; 2] };
+        // d/dr (r / (1 + r²)) = 0 at r = 1; 1 - 0.25 r² = 0 at r = 2.
+        assert!((lens([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]).valid_radius() - 1.0).abs() < 1e-9);
+        assert!((lens([0.0, 0.0, 0.0, -0.25, 0.0, 0.0]).valid_radius() - 2.0).abs() < 1e-9);
+        let plain = Lens::RadialTangential { radial: [-0.2, 0.03, 0.01], tangential: [0.003, -0.001] };
+        let same = Lens::Rational { radial: [-0.2, 0.03, 0.01, 0.0, 0.0, 0.0], tangential: [0.003, -0.001] };
+        let point = DVec2::new(0.4, -0.7);
+        assert_eq!((plain.distort(point), plain.valid_radius()), (same.distort(point), same.valid_radius()));
+    }
+
+    #[test]
     fn the_quick_check_never_lets_a_point_beyond_the_valid_radius_through() {
         let coefficients = [-0.9, -0.3, -0.01, 0.0, 0.02, 0.4];
         for (i, k1) in coefficients.into_iter().enumerate() {
@@ -398,6 +472,7 @@ mod tests {
                 let k3 = coefficients[(i + 2 * j) % 6];
                 for lens in [
                     Lens::RadialTangential { radial: [k1, k2, k3], tangential: [0.0; 2] },
+                    Lens::Rational { radial: [k1, k2, k3, k3, k1, k2], tangential: [0.0; 2] },
                     Lens::Fisheye { coefficients: [k1, k2, k3, k1] },
                 ] {
                     let valid = lens.valid_radius();

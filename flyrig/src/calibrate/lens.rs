@@ -16,12 +16,13 @@ const GOOD_COVERAGE: f64 = 0.6;
 pub fn lens(args: &CalibrateLensArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     let board = Board::load(&args.board)?;
-    refuse_existing(&args.out, &["intri.yml"], args.force)?;
+    refuse_existing(&args.out, &["calibration.toml"], args.force)?;
     let seen = Seen::find(&args.take, &board, gpu)?;
     let lenses = solve(&board, &seen)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     save_lenses(&args.out, &lenses)?;
-    println!("{}: intri.yml; next: flyrig calibrate rig TAKE --lenses {}", args.out.display(), args.out.display());
+    println!("{}: calibration.toml with lenses alone", args.out.display());
+    println!("next: flyrig calibrate rig TAKE --lenses {}", args.out.display());
     Ok(())
 }
 

@@ -3,7 +3,7 @@
 use anyhow::{Context as _, Result, ensure};
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_calib::{
-    OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person, save_easymocap,
+    OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person, save_calibration,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
@@ -13,7 +13,7 @@ use flyrig_types::{Camera, Image, Rig};
 use glam::DVec2;
 use serde_json::json;
 
-use super::refuse_existing;
+use super::{FILES, refuse_existing};
 use crate::{
     cli::CalibratePersonArgs,
     take::{self, CalibratedTake},
@@ -60,7 +60,7 @@ const CONFIDENCE: f64 = 0.3;
 /// Runs the command.
 pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    refuse_existing(&args.out, &["intri.yml", "extri.yml", "calibration.json"], args.force)?;
+    refuse_existing(&args.out, &FILES, args.force)?;
     let mut take = take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu)?;
     ensure!(
         !take.is_live,
@@ -71,6 +71,7 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
         .take()
         .context("no calibration: name its folder with --calibration; flyrig calibrate rig makes one from a board")?;
     ensure!(rig.cameras.len() > 1, "one camera alone has nothing to agree with");
+    let known_nanos = take.sync.lags_nanos.clone();
     let tracks = look_through(args, &rig, plates, take)?;
     let number = |landmark: usize| LANDMARKS.iter().position(|known| *known == landmark);
     let numbers = |pairs: &[(usize, usize)]| -> Vec<(usize, usize)> {
@@ -90,10 +91,21 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
     }
     print(&rig, &tracks, &fit);
     advise(&rig, &fit, options.lags);
+    // What was subtracted already, and what is left of it.
+    let mut better = fit.rig.clone();
+    for (camera, solved) in better.cameras.iter_mut().zip(&fit.cameras) {
+        let known = known_nanos.get(&camera.id).copied().unwrap_or_default();
+        if options.lags {
+            camera.time_offset_nanos = known + (1e9 * solved.lag_s.0).round() as i64;
+        }
+        if known != rig.cameras.iter().find(|old| old.id == camera.id).map_or(0, |old| old.time_offset_nanos) {
+            println!("take camera {} out of [sync] lags_ms: that replaces the offset of calibration.toml", camera.id);
+        }
+    }
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    save_easymocap(&args.out, &fit.rig)?;
+    save_calibration(&args.out, &better, &[])?;
     write_whole(&args.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(&rig, &fit))?)?;
-    println!("{}: intri.yml, extri.yml, calibration.json", args.out.display());
+    println!("{}: {}", args.out.display(), FILES.join(", "));
     Ok(())
 }
 
@@ -192,10 +204,13 @@ fn advise(rig: &Rig, fit: &PersonFit, with_lags: bool) {
     }
     let lags: Vec<String> = cameras()
         .filter(|(_, camera)| with_lags && camera.lag_s.0.abs() > (3.0 * camera.lag_s.1).max(LEAST_LAG_S))
-        .map(|(id, camera)| format!("\"{id}\" = {:.1}", 1e3 * camera.lag_s.0))
+        .map(|(id, camera)| format!("{id} {:.1}", 1e3 * camera.lag_s.0))
         .collect();
     if !lags.is_empty() {
-        println!("the stamps are off, and these poses hold with offsets: [sync] lags_ms = {{ {} }}", lags.join(", "));
+        println!(
+            "the stamps are off by so many milliseconds: {}. calibration.toml holds the offsets, and they are applied wherever it is read",
+            lags.join(", ")
+        );
     }
     if cameras().any(|(_, camera)| camera.halves_px.is_none_or(|px| px > MOST_HALVES_PX)) {
         println!(

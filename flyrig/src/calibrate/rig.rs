@@ -1,14 +1,14 @@
 //! `flyrig calibrate rig`: poses of all cameras from a board that they see together.
 
 use anyhow::{Context as _, Result, ensure};
-use flyrig_calib::{Board, LensModel, RigFit, RigOptions, calibrate_rig, load_lenses, save_easymocap};
+use flyrig_calib::{Board, Deviation, LensModel, RigFit, RigOptions, calibrate_rig, load_lenses, save_calibration};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
 use flyrig_types::Intrinsics;
 use glam::DVec3;
 use serde_json::json;
 
-use super::{lens, refuse_existing, views::Seen};
+use super::{FILES, lens, refuse_existing, views::Seen};
 use crate::cli::CalibrateRigArgs;
 
 /// Time offsets are kept where they lower the noise to this share.
@@ -24,7 +24,7 @@ const MOST_DISAGREEMENT: f64 = 1.5;
 pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     let board = Board::load(&args.board)?;
-    refuse_existing(&args.out, &["intri.yml", "extri.yml", "calibration.json"], args.force)?;
+    refuse_existing(&args.out, &FILES, args.force)?;
     let seen = Seen::find(&args.take, &board, gpu)?;
     ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
     if args.floor {
@@ -63,9 +63,22 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
     );
     print(&seen, &fit, has_offsets.then_some(noise_before));
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    save_easymocap(&args.out, &fit.rig)?;
+    let mut rig = fit.rig.clone();
+    let mut deviations = Vec::new();
+    for (camera, solved) in rig.cameras.iter_mut().zip(&fit.cameras) {
+        let (lag_s, sigma_s) = solved.lag_s;
+        if has_offsets {
+            camera.time_offset_nanos = (1e9 * lag_s).round() as i64;
+        }
+        deviations.push(solved.deviation.map(|(rotation_deg, position_mm)| Deviation {
+            rotation_deg,
+            position_mm,
+            time_offset_ms: has_offsets.then_some(1e3 * sigma_s),
+        }));
+    }
+    save_calibration(&args.out, &rig, &deviations)?;
     write_whole(&args.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(&seen, &fit))?)?;
-    println!("{}: intri.yml, extri.yml, calibration.json", args.out.display());
+    println!("{}: {}", args.out.display(), FILES.join(", "));
     println!("next: set source.path = \"{}\" in the configuration, then flyrig doctor", args.out.display());
     Ok(())
 }
@@ -123,8 +136,8 @@ fn print(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) {
     println!("rms {:.3} px, noise {:.3} px a coordinate, {} boards", fit.rms_px, fit.sigma_px, fit.shots.len());
     if let Some(before) = noise_without_offsets {
         println!(
-            "the cameras' stamps are off: without offsets the noise is {before:.3} px; put them into [sync] lags_ms, or trigger the \
-             cameras"
+            "the cameras' stamps are off: without offsets the noise is {before:.3} px. calibration.toml holds the offsets, and they are \
+             applied wherever it is read"
         );
     }
     match fit.worst_disagreement() {

@@ -59,6 +59,7 @@ mod tests {
         let one = |(i, deg): (usize, &f64)| {
             let at = DVec3::new(deg.to_radians().cos(), deg.to_radians().sin(), 0.0) * 3.0;
             Camera {
+                time_offset_nanos: 0,
                 id: format!("{i}").into(),
                 intrinsics: Intrinsics {
                     width: 64,

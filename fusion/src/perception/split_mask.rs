@@ -114,6 +114,7 @@ mod tests {
 
     fn camera() -> Camera {
         Camera {
+            time_offset_nanos: 0,
             id: "a".into(),
             intrinsics: Intrinsics {
                 width: 40,

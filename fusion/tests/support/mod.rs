@@ -28,6 +28,7 @@ pub fn camera(name: &str, degrees: f64) -> Camera {
     let (sin, cos) = degrees.to_radians().sin_cos();
     let middle = DVec3::new(0.0, 0.85, 0.0);
     Camera {
+        time_offset_nanos: 0,
         id: name.into(),
         intrinsics: Intrinsics {
             width: SIZE,

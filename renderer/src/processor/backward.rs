@@ -344,13 +344,19 @@ fn project_backward(
 fn through_lens_jacobian(camera: &CameraConstants, ideal: Vec2, d: [Vec2; 2]) -> Vec2 {
     let Vec2 { x, y } = ideal;
     let r2 = ideal.length_squared();
-    let [k1, k2, k3, k4, k5, ..] = camera.coefficients;
+    let [k1, k2, k3, k4, ..] = camera.coefficients;
     // A radial factor s(r): first = s'/r, second = (s'/r)'/r.
     let (first, second, p1, p2);
     if camera.lens == 0 {
-        first = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3));
-        second = 8.0 * k2 + 24.0 * k3 * r2;
-        (p1, p2) = (k4, k5);
+        // s = above / below, polynomials of q = r^2: first = 2 ds/dq, second = 4 d2s/dq2.
+        let [d1, d2, d3] = [camera.coefficients[5], camera.coefficients[6], camera.coefficients[7]];
+        let below = 1.0 / (1.0 + r2 * (d1 + r2 * (d2 + r2 * d3)));
+        let below_slope = d1 + r2 * (2.0 * d2 + r2 * 3.0 * d3);
+        let s = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * below;
+        let slope = (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3) - s * below_slope) * below;
+        first = 2.0 * slope;
+        second = 4.0 * (2.0 * k2 + 6.0 * k3 * r2 - 2.0 * slope * below_slope - s * (2.0 * d2 + 6.0 * d3 * r2)) * below;
+        (p1, p2) = (camera.coefficients[3], camera.coefficients[4]);
     } else if r2 < 1e-4 {
         // Taylor: s = 1 + (k1 - 1/3) r^2 + O(r^4); the formulas below cancel here.
         first = 2.0 * (k1 - 1.0 / 3.0);
@@ -372,7 +378,7 @@ fn through_lens_jacobian(camera: &CameraConstants, ideal: Vec2, d: [Vec2; 2]) ->
     let u_xy = y * first + x * x * y * second + 2.0 * p1;
     let u_yy = x * first + x * y * y * second + 2.0 * p2;
     let v_yy = 3.0 * y * first + y * y * y * second + 6.0 * p1;
-    // v_xx = u_xy and v_xy = u_yy for both lenses.
+    // v_xx = u_xy and v_xy = u_yy for all lenses.
     let off_diagonal = d[1].x + d[0].y;
     Vec2::new(d[0].x * u_xx + off_diagonal * u_xy + d[1].y * u_yy, d[0].x * u_xy + off_diagonal * u_yy + d[1].y * v_yy)
 }

@@ -124,6 +124,7 @@ pub fn camera(name: &str, azimuth: f64, size: u32, lens: Lens) -> Camera {
     let eye = DVec3::new(2.5 * azimuth.sin(), 0.3, 2.5 * azimuth.cos());
     let side = f64::from(size);
     Camera {
+        time_offset_nanos: 0,
         id: name.into(),
         intrinsics: Intrinsics {
             width: size,

@@ -10,16 +10,18 @@ use rand::rngs::StdRng;
 use super::reference::Scene;
 
 /// Every kind of lens.
-pub const LENSES: [Lens; 4] = [
+pub const LENSES: [Lens; 5] = [
     Lens::PINHOLE,
     Lens::RadialTangential { radial: [-0.25, 0.08, -0.01], tangential: [0.001, -0.002] },
     Lens::RadialTangential { radial: [0.1, -0.02, 0.0], tangential: [-0.003, 0.001] },
+    Lens::Rational { radial: [0.5, 0.12, 0.01, 0.8, 0.25, 0.02], tangential: [0.002, -0.001] },
     Lens::Fisheye { coefficients: [0.04, -0.01, 0.002, -0.0005] },
 ];
 
 fn camera(lens: Lens, width: u32, height: u32, camera_from_world: Isometry) -> Camera {
     let focal = f64::from(width.max(height));
     Camera {
+        time_offset_nanos: 0,
         id: "test".into(),
         intrinsics: Intrinsics {
             width,

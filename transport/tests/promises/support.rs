@@ -88,6 +88,7 @@ pub fn publish_until_seen(
 
 pub fn camera(name: &str, lens: Lens) -> Camera {
     Camera {
+        time_offset_nanos: 0,
         id: name.into(),
         intrinsics: Intrinsics {
             width: 640,
@@ -102,9 +103,10 @@ pub fn camera(name: &str, lens: Lens) -> Camera {
 
 pub fn rig() -> Rig {
     let brown = Lens::RadialTangential { radial: [-0.3, 0.1, -0.02], tangential: [0.001, -0.002] };
+    let rational = Lens::Rational { radial: [0.5, 0.12, 0.01, 0.8, 0.25, 0.02], tangential: [0.002, -0.001] };
     let fisheye = Lens::Fisheye { coefficients: [0.05, -0.01, 0.002, -0.0005] };
     Rig {
-        cameras: vec![camera("zeta", brown), camera("alpha", fisheye)],
+        cameras: vec![camera("zeta", brown), camera("alpha", fisheye), camera("mid", rational)],
         world_up: DVec3::new(0.1, -0.9, 0.2).normalize(),
     }
 }

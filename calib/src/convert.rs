@@ -1,0 +1,228 @@
+//! Calibrations of other programs, read and written.
+//!
+//! Every reader returns flyrig's conventions: OpenCV camera axes, metres, pixel centres at integers. The world's axes stay those of
+//! the file.
+
+mod anipose;
+mod colmap;
+mod imported;
+mod kalibr;
+mod mrcal;
+mod nerfstudio;
+mod opencv;
+mod python;
+mod qualisys;
+mod shared;
+
+use std::{io::Write as _, path::Path};
+
+use flyrig_types::{CameraId, Rig, write_whole};
+
+pub use self::imported::{Imported, ImportedCamera};
+use self::shared::{bad, files_with, inside, one_file};
+pub(crate) use self::shared::{opencv_coefficients, opencv_lens, rotation_of};
+use crate::{CalibError, calibration_file, easymocap};
+
+/// A calibration format.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// `calibration.toml`.
+    Flyrig,
+    /// `intri.yml` and `extri.yml`; also ZJU-MoCap's.
+    EasyMocap,
+    /// A file `CAM.yml` of FileStorage for each camera, with the keys of OpenCV's calibration sample, and `rvec`, `tvec`.
+    OpenCv,
+    /// `camchain.yaml`.
+    Kalibr,
+    /// `cameras.txt` and `images.txt`.
+    Colmap,
+    /// `transforms.json`.
+    Nerfstudio,
+    /// `*.qca.txt` or `*.xml` of the Qualisys Track Manager.
+    Qualisys,
+    /// TOML of anipose, Pose2Sim and caliscope.
+    Anipose,
+    /// A file `CAM.cameramodel` for each camera.
+    Mrcal,
+}
+
+impl Format {
+    /// All formats.
+    pub const ALL: [Self; 9] = [
+        Self::Flyrig,
+        Self::EasyMocap,
+        Self::OpenCv,
+        Self::Kalibr,
+        Self::Colmap,
+        Self::Nerfstudio,
+        Self::Qualisys,
+        Self::Anipose,
+        Self::Mrcal,
+    ];
+
+    /// Name on the command line.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Flyrig => "flyrig",
+            Self::EasyMocap => "easymocap",
+            Self::OpenCv => "opencv",
+            Self::Kalibr => "kalibr",
+            Self::Colmap => "colmap",
+            Self::Nerfstudio => "nerfstudio",
+            Self::Qualisys => "qualisys",
+            Self::Anipose => "anipose",
+            Self::Mrcal => "mrcal",
+        }
+    }
+
+    /// Returns camera axes, pixel origin, world and unit of the format in a line.
+    #[must_use]
+    pub fn conventions(self) -> &'static str {
+        match self {
+            Self::Flyrig | Self::EasyMocap | Self::OpenCv | Self::Mrcal => {
+                "camera axes x right, y down, z forward; pixel centres at integers; world to camera; metres"
+            }
+            Self::Kalibr => {
+                "camera axes x right, y down, z forward; pixel centres at integers; each camera from the one before, the world is cam0; \
+                 metres"
+            }
+            Self::Colmap => {
+                "camera axes x right, y down, z forward; pixel centres at halves; world to camera; any scale unless it was set"
+            }
+            Self::Nerfstudio => {
+                "camera axes x right, y up, z backward; pixel centres at halves; camera to world; any scale unless it was set"
+            }
+            Self::Qualisys => {
+                "camera axes x right, y up, z backward; 64ths of a pixel from the image's edge; camera to world, z up; millimetres"
+            }
+            Self::Anipose => {
+                "camera axes x right, y down, z forward; pixel centres at integers; world to camera; the unit of the board"
+            }
+        }
+    }
+
+    /// Recognises the format of a file or folder by its name and contents.
+    #[must_use]
+    pub fn detect(path: &Path) -> Option<Self> {
+        let has = |name: &str| path.join(name).is_file();
+        if path.is_dir() {
+            let of_folder = [
+                (calibration_file::FILE, Self::Flyrig),
+                ("intri.yml", Self::EasyMocap),
+                (kalibr::FILE, Self::Kalibr),
+                (colmap::CAMERAS, Self::Colmap),
+                (nerfstudio::FILE, Self::Nerfstudio),
+                (anipose::FILE, Self::Anipose),
+                ("camera_array.toml", Self::Anipose),
+                ("config.toml", Self::Anipose),
+            ];
+            let named = of_folder.into_iter().find(|(name, _)| has(name)).map(|(_, format)| format);
+            let by_ending = || {
+                let with = |ending: &str| files_with(path, ending).ok().filter(|files| !files.is_empty());
+                let found = |(ending, format): (&str, Self)| with(ending).map(|_| format);
+                [(".cameramodel", Self::Mrcal), (".qca.txt", Self::Qualisys), (".yml", Self::OpenCv)]
+                    .into_iter()
+                    .find_map(found)
+            };
+            return named.or_else(by_ending);
+        }
+        let name = path.file_name()?.to_string_lossy().to_lowercase();
+        let text = || calibration_file::read(path).unwrap_or_default();
+        match name.as_str() {
+            calibration_file::FILE if text().contains("[[cameras]]") => Some(Self::Flyrig),
+            "intri.yml" | "extri.yml" => Some(Self::EasyMocap),
+            "cameras.txt" | "images.txt" => Some(Self::Colmap),
+            name if name.ends_with(".cameramodel") => Some(Self::Mrcal),
+            name if name.ends_with(".qca.txt") || name.ends_with(".xml") => Some(Self::Qualisys),
+            name if name.ends_with(".json") => Some(Self::Nerfstudio),
+            name if name.ends_with(".toml") => Some(Self::Anipose),
+            name if name.ends_with(".yaml") || name.ends_with(".yml") => {
+                Some(if text().contains("cam0:") { Self::Kalibr } else { Self::OpenCv })
+            }
+            _ => None,
+        }
+    }
+
+    /// Reads a calibration from a file or a folder. `image_size` gives width and height of a camera's images for formats that may
+    /// leave them out. Lengths are multiplied by `scale`.
+    ///
+    /// # Errors
+    /// [`CalibError`] names the file, the camera and the fix.
+    pub fn read(
+        self,
+        path: &Path,
+        image_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>,
+        scale: f64,
+    ) -> Result<Imported, CalibError> {
+        let dir = || if path.is_dir() { path } else { path.parent().unwrap_or(Path::new(".")) };
+        let of_rig = |rig: Rig| {
+            let cameras = rig.cameras.into_iter().map(|camera| ImportedCamera {
+                id: camera.id,
+                intrinsics: camera.intrinsics,
+                pose: Some(camera.camera_from_world),
+                time_offset_nanos: camera.time_offset_nanos,
+            });
+            Imported { cameras: cameras.collect(), up: Some(rig.world_up) }
+        };
+        let mut imported = match self {
+            Self::Flyrig => {
+                calibration_file::parse(path, &calibration_file::read(&inside(path, &[calibration_file::FILE]))?)?
+            }
+            Self::EasyMocap => of_rig(easymocap::load_easymocap(dir(), image_size)?),
+            Self::OpenCv => opencv::read(path)?,
+            Self::Kalibr => kalibr::read(&inside(path, &[kalibr::FILE]))?,
+            Self::Colmap => colmap::read(dir())?,
+            Self::Nerfstudio => nerfstudio::read(&inside(path, &[nerfstudio::FILE]))?,
+            Self::Qualisys => qualisys::read(&one_file(path, ".qca.txt")?)?,
+            Self::Anipose => anipose::read(&inside(path, &[anipose::FILE, "camera_array.toml", "config.toml"]))?,
+            Self::Mrcal => mrcal::read(path)?,
+        };
+        if imported.cameras.is_empty() {
+            return Err(CalibError::NoCameras { path: path.to_owned(), expected: "of this format" });
+        }
+        for camera in &mut imported.cameras {
+            camera.scale(scale);
+            camera.check(path)?;
+        }
+        for (i, camera) in imported.cameras.iter().enumerate() {
+            if imported.cameras[..i].iter().any(|other| other.id == camera.id) {
+                return Err(bad(path, format!("camera {} is in it twice; take one out", camera.id)));
+            }
+        }
+        Ok(imported)
+    }
+
+    /// Writes a rig into a folder and returns the names of the files. Nothing is written where the format cannot hold a camera.
+    ///
+    /// # Errors
+    /// [`CalibError`] names the camera and what the format lacks.
+    pub fn write(self, dir: &Path, rig: &Rig) -> Result<Vec<String>, CalibError> {
+        rig.validate().map_err(|source| CalibError::Camera { path: dir.to_owned(), source })?;
+        let files: Vec<(String, String)> = match self {
+            Self::Flyrig => vec![(calibration_file::FILE.to_owned(), calibration_file::calibration_toml(rig, &[])?)],
+            Self::EasyMocap => {
+                easymocap::save_easymocap(dir, rig)?;
+                return Ok(vec!["intri.yml".to_owned(), "extri.yml".to_owned()]);
+            }
+            Self::OpenCv => opencv::files(dir, rig)?,
+            Self::Kalibr => vec![(kalibr::FILE.to_owned(), kalibr::text(dir, rig)?)],
+            Self::Colmap => colmap::files(rig),
+            Self::Nerfstudio => vec![(nerfstudio::FILE.to_owned(), nerfstudio::text(dir, rig)?)],
+            Self::Qualisys => vec![("calibration.qca.txt".to_owned(), qualisys::text(dir, rig)?)],
+            Self::Anipose => vec![(anipose::FILE.to_owned(), anipose::text(rig))],
+            Self::Mrcal => mrcal::files(dir, rig)?,
+        };
+        let is_plain =
+            |name: &str| Path::new(name).file_name().is_some_and(|file| file == name) && !name.contains('\\');
+        if let Some((name, _)) = files.iter().find(|(name, _)| !is_plain(name)) {
+            return Err(bad(dir, format!("a camera's name makes {name:?} no file name; rename the camera")));
+        }
+        for (name, text) in &files {
+            let path = dir.join(name);
+            write_whole(&path, |out| out.write_all(text.as_bytes()))
+                .map_err(|error| CalibError::Write { path, reason: error.to_string() })?;
+        }
+        Ok(files.into_iter().map(|(name, _)| name).collect())
+    }
+}

@@ -1,0 +1,117 @@
+//! Cameras of a foreign file.
+
+use std::path::Path;
+
+use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Rig};
+use glam::DVec3;
+
+use super::shared::bad;
+use crate::CalibError;
+
+/// Right-hand axes of cameras on a level rig lie in a plane; this share of their spread may stand out of it, at most.
+const LEVEL_SHARE: f64 = 0.2;
+/// An axis of the world this close to the estimate is up whatever the scatter, and beyond the other it never is, radians.
+const LEAST_SNAP_RAD: f64 = 0.02;
+const MOST_SNAP_RAD: f64 = 0.35;
+
+/// Cameras of a file; poses may be unknown.
+#[derive(Debug, Clone)]
+pub struct Imported {
+    /// In the file's order.
+    pub cameras: Vec<ImportedCamera>,
+    /// Unit vector against gravity, world axes, where the format says it.
+    pub up: Option<DVec3>,
+}
+
+/// A camera whose pose may be unknown.
+#[derive(Debug, Clone)]
+pub struct ImportedCamera {
+    /// Name.
+    pub id: CameraId,
+    /// Lens and sensor.
+    pub intrinsics: Intrinsics,
+    /// World to camera axes, metres.
+    pub pose: Option<Isometry>,
+    /// See [`Camera::time_offset_nanos`].
+    pub time_offset_nanos: i64,
+}
+
+impl ImportedCamera {
+    pub(super) fn scale(&mut self, scale: f64) {
+        if let Some(pose) = &mut self.pose {
+            pose.translation *= scale;
+        }
+    }
+
+    pub(super) fn check(&self, path: &Path) -> Result<(), CalibError> {
+        self.camera(self.pose.unwrap_or(Isometry::IDENTITY))
+            .validate()
+            .map_err(|source| CalibError::Camera { path: path.to_owned(), source })
+    }
+
+    fn camera(&self, camera_from_world: Isometry) -> Camera {
+        Camera {
+            id: self.id.clone(),
+            intrinsics: self.intrinsics,
+            camera_from_world,
+            time_offset_nanos: self.time_offset_nanos,
+        }
+    }
+}
+
+impl Imported {
+    /// Returns the rig, with a guess of the direction up where the file does not say it; `None` where no camera has a pose.
+    ///
+    /// # Errors
+    /// Names the camera without a pose, where others have one.
+    pub fn rig(&self, path: &Path) -> Result<Option<Rig>, CalibError> {
+        if self.cameras.iter().all(|camera| camera.pose.is_none()) {
+            return Ok(None);
+        }
+        let posed = |camera: &ImportedCamera| {
+            let pose = camera.pose.ok_or_else(|| {
+                let text = format!(
+                    "camera {} has no pose, but others have; calibrate it with them, or take it out",
+                    camera.id
+                );
+                bad(path, text)
+            })?;
+            Ok(camera.camera(pose))
+        };
+        let cameras = self.cameras.iter().map(posed).collect::<Result<Vec<_>, _>>()?;
+        let world_up = self.up.unwrap_or_else(|| level_up(&cameras));
+        Ok(Some(Rig { cameras, world_up }))
+    }
+
+    /// Returns the lenses.
+    #[must_use]
+    pub fn lenses(&self) -> Vec<(CameraId, Intrinsics)> {
+        self.cameras.iter().map(|camera| (camera.id.clone(), camera.intrinsics)).collect()
+    }
+}
+
+/// Direction up of cameras that are held level, however far they look down: normal to their right-hand axes, or the axis of the world
+/// that lies within their scatter about level. Where those axes are nearly parallel, the mean of what the cameras have above them.
+fn level_up(cameras: &[Camera]) -> DVec3 {
+    let axis = |camera: &Camera, axis: DVec3| camera.camera_from_world.rotation.inverse() * axis;
+    let above: DVec3 = cameras.iter().map(|camera| axis(camera, DVec3::NEG_Y)).sum();
+    let mut moments = nalgebra::Matrix3::<f64>::zeros();
+    for camera in cameras {
+        let right = nalgebra::Vector3::from(axis(camera, DVec3::X).to_array());
+        moments += right * right.transpose();
+    }
+    let eigen = moments.symmetric_eigen();
+    let mut order = [0, 1, 2];
+    order.sort_by(|&a, &b| eigen.eigenvalues[a].total_cmp(&eigen.eigenvalues[b]));
+    let normal = eigen.eigenvectors.column(order[0]);
+    let normal = DVec3::new(normal[0], normal[1], normal[2]);
+    let is_plane = eigen.eigenvalues[order[0]] < LEVEL_SHARE * eigen.eigenvalues[order[1]];
+    let Some(normal) = normal.try_normalize().filter(|_| is_plane) else {
+        return above.try_normalize().unwrap_or(DVec3::Z);
+    };
+    let up = normal * normal.dot(above).signum();
+    let scatter = (eigen.eigenvalues[order[0]].max(0.0) / eigen.eigenvalues[order[1]]).sqrt().atan();
+    let near = (2.0 * scatter).clamp(LEAST_SNAP_RAD, MOST_SNAP_RAD);
+    let axes = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| axis * axis.dot(up).signum());
+    axes.into_iter().find(|axis| axis.angle_between(up) < near).unwrap_or(up)
+}

@@ -1,0 +1,129 @@
+//! Parts that several formats share.
+
+use std::path::{Path, PathBuf};
+
+use flyrig_types::{CameraId, Intrinsics, Isometry, Lens};
+use glam::{DMat3, DQuat, DVec2, DVec3};
+
+use crate::CalibError;
+
+/// Largest entry of `RᵀR - 1` that rounding in a text file explains.
+const ROTATION_TOLERANCE: f64 = 1e-3;
+
+/// Reports a fault of a file.
+pub(super) fn bad(path: &Path, problem: impl Into<String>) -> CalibError {
+    CalibError::Format { path: path.to_owned(), problem: problem.into() }
+}
+
+/// Returns the first of the names that a folder holds, or the file itself.
+pub(super) fn inside(path: &Path, names: &[&str]) -> PathBuf {
+    if !path.is_dir() {
+        return path.to_owned();
+    }
+    let known = names.iter().map(|name| path.join(name)).find(|file| file.is_file());
+    known.unwrap_or_else(|| path.join(names.first().copied().unwrap_or_default()))
+}
+
+/// Files of a folder whose name ends so, in order.
+pub(super) fn files_with(dir: &Path, ending: &str) -> Result<Vec<PathBuf>, CalibError> {
+    let refused = |source| CalibError::Read { path: dir.to_owned(), source };
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(dir).map_err(refused)? {
+        let path = entry.map_err(refused)?.path();
+        if path.is_file() && path.to_string_lossy().to_lowercase().ends_with(ending) {
+            files.push(path);
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+/// Returns the file, or the folder's one file with that ending.
+pub(super) fn one_file(path: &Path, ending: &str) -> Result<PathBuf, CalibError> {
+    if !path.is_dir() {
+        return Ok(path.to_owned());
+    }
+    let mut files = files_with(path, ending)?;
+    match (files.pop(), files.is_empty()) {
+        (Some(file), true) => Ok(file),
+        (Some(_), false) => Err(bad(path, format!("holds several *{ending}; name one"))),
+        (None, _) => Err(bad(path, format!("holds no *{ending}; name the file"))),
+    }
+}
+
+/// Camera of an image by its path: the folder that holds the image, or the image's name where that folder is the one of all images.
+pub(super) fn camera_of_image(image: &str) -> CameraId {
+    let parts: Vec<&str> = image.split(['/', '\\']).filter(|part| !part.is_empty() && *part != ".").collect();
+    let is_common = |folder: &str| folder.to_lowercase().starts_with("image") || folder == "..";
+    let name = match parts.as_slice() {
+        [.., folder, _] if !is_common(folder) => folder,
+        [.., file] => file.rsplit_once('.').map_or(*file, |(stem, _)| stem),
+        [] => "",
+    };
+    CameraId::from(name)
+}
+
+/// Reads a rotation matrix; the text says what is wrong with it.
+pub(crate) fn rotation_of(matrix: DMat3) -> Result<DQuat, String> {
+    let excess = matrix.transpose() * matrix - DMat3::IDENTITY;
+    let deviation = excess.to_cols_array().into_iter().fold(0.0, |worst: f64, value| worst.max(value.abs()));
+    // Written so that NaN is refused too: entries near the largest double overflow the product.
+    let is_rotation = deviation <= ROTATION_TOLERANCE && matrix.determinant() > 0.0;
+    if !is_rotation {
+        let determinant = matrix.determinant();
+        return Err(format!("is no rotation (determinant {determinant:.4}, columns {deviation:.2e} from orthonormal)"));
+    }
+    Ok(DQuat::from_mat3(&matrix).normalize())
+}
+
+/// Lens of OpenCV's coefficients k1 k2 p1 p2 k3 k4 k5 k6, as many as there are; those of prisms and tilted sensors must be 0.
+pub(crate) fn opencv_lens(coefficients: &[f64]) -> Result<Lens, String> {
+    if ![0, 4, 5, 8, 12, 14].contains(&coefficients.len()) {
+        return Err(format!("{} distortion coefficients, expected 0, 4, 5, 8, 12 or 14", coefficients.len()));
+    }
+    let mut c = [0.0; 14];
+    c[..coefficients.len()].copy_from_slice(coefficients);
+    if let Some((i, value)) = c.iter().enumerate().skip(8).find(|(_, value)| **value != 0.0) {
+        return Err(format!(
+            "distortion coefficient {} = {value} of the prism or tilt model; calibrate without it",
+            i + 1
+        ));
+    }
+    let tangential = [c[2], c[3]];
+    if c[5..8].iter().all(|k| *k == 0.0) {
+        return Ok(Lens::RadialTangential { radial: [c[0], c[1], c[4]], tangential });
+    }
+    Ok(Lens::Rational { radial: [c[0], c[1], c[4], c[5], c[6], c[7]], tangential })
+}
+
+/// OpenCV's coefficients of a lens, 5 or 8; `None` for a fisheye.
+pub(crate) fn opencv_coefficients(lens: &Lens) -> Option<Vec<f64>> {
+    let ([k1, k2, k3, k4, k5, k6], [p1, p2]) = lens.rational()?;
+    let plain = vec![k1, k2, p1, p2, k3];
+    Some(if matches!(lens, Lens::Rational { .. }) { [plain, vec![k4, k5, k6]].concat() } else { plain })
+}
+
+/// Intrinsics of a size in whole pixels; anything else is left for the check of the camera.
+pub(super) fn intrinsics([width, height]: [f64; 2], focal_px: DVec2, center_px: DVec2, lens: Lens) -> Intrinsics {
+    let side = |value: f64| if value.fract() == 0.0 { value as u32 } else { 0 };
+    Intrinsics { width: side(width), height: side(height), focal_px, center_px, lens }
+}
+
+/// Rotation and translation as a 4x4 matrix, row by row.
+pub(super) fn rows4(isometry: &Isometry) -> [[f64; 4]; 4] {
+    let r = DMat3::from_quat(isometry.rotation).transpose().to_cols_array_2d();
+    let t = isometry.translation.to_array();
+    let row = |i: usize| [r[i][0], r[i][1], r[i][2], t[i]];
+    [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
+}
+
+/// Reads a rigid motion from a 3x4 or 4x4 matrix, row by row.
+pub(super) fn motion_of(rows: &[Vec<f64>]) -> Result<Isometry, String> {
+    let is_motion =
+        matches!(rows.len(), 3 | 4) && rows.iter().all(|row| row.len() == 4 && row.iter().all(|v| v.is_finite()));
+    if !is_motion {
+        return Err("is no 4x4 matrix of finite numbers".to_owned());
+    }
+    let matrix = DMat3::from_cols_array_2d(&[0, 1, 2].map(|i| [rows[i][0], rows[i][1], rows[i][2]])).transpose();
+    Ok(Isometry::new(rotation_of(matrix)?, DVec3::new(rows[0][3], rows[1][3], rows[2][3])))
+}

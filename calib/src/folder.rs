@@ -1,0 +1,82 @@
+//! Calibration folders: `calibration.toml`, or EasyMocap's two files where there is none.
+
+use std::path::Path;
+
+use flyrig_types::{CameraId, Intrinsics, Lens, Rig};
+
+use crate::{CalibError, calibration_file, easymocap};
+
+/// Reads the rig of a folder. `image_size` gives width and height of a camera's images in pixels, for files that do not say it; it is
+/// checked against those that do.
+///
+/// # Errors
+/// [`CalibError`] names the file, the camera and the fix.
+pub fn load_calibration(dir: &Path, image_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>) -> Result<Rig, CalibError> {
+    let path = dir.join(calibration_file::FILE);
+    // Where neither is there, the error is that of EasyMocap's files and names both.
+    if !path.is_file() {
+        return easymocap::load_easymocap(dir, image_size);
+    }
+    let rig = parse_calibration(&path, &calibration_file::read(&path)?)?;
+    check_sizes(&path, rig.cameras.iter().map(|camera| (&camera.id, &camera.intrinsics)), image_size)?;
+    Ok(rig)
+}
+
+/// Reads a rig from the text of a `calibration.toml`; `path` is for errors.
+///
+/// # Errors
+/// As [`load_calibration`].
+pub fn parse_calibration(path: &Path, text: &str) -> Result<Rig, CalibError> {
+    let imported = calibration_file::parse(path, text)?;
+    let rig = imported.rig(path)?.ok_or_else(|| CalibError::Format {
+        path: path.to_owned(),
+        problem: "holds lenses alone, no poses; run flyrig calibrate rig with --lenses".to_owned(),
+    })?;
+    rig.validate().map_err(|source| CalibError::Camera { path: path.to_owned(), source })?;
+    Ok(rig)
+}
+
+/// Reads the lenses of a folder; poses may be missing. `image_size` as in [`load_calibration`].
+///
+/// # Errors
+/// As [`load_calibration`].
+pub fn load_lenses(
+    dir: &Path,
+    image_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>,
+) -> Result<Vec<(CameraId, Intrinsics)>, CalibError> {
+    let path = dir.join(calibration_file::FILE);
+    if !path.is_file() {
+        return easymocap::load_lenses(dir, image_size);
+    }
+    let lenses = calibration_file::parse(&path, &calibration_file::read(&path)?)?.lenses();
+    check_sizes(&path, lenses.iter().map(|(id, intrinsics)| (id, intrinsics)), image_size)?;
+    Ok(lenses)
+}
+
+fn check_sizes<'a>(
+    path: &Path,
+    cameras: impl Iterator<Item = (&'a CameraId, &'a Intrinsics)>,
+    image_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>,
+) -> Result<(), CalibError> {
+    for (id, intrinsics) in cameras {
+        let calibrated = (intrinsics.width, intrinsics.height);
+        if let Some(pictures) = image_size(id).filter(|size| *size != calibrated) {
+            return Err(CalibError::OtherSize { path: path.to_owned(), camera: id.clone(), calibrated, pictures });
+        }
+    }
+    Ok(())
+}
+
+/// Writes the rig of exported images: EasyMocap's files, which other programs read too, or `calibration.toml` where those cannot
+/// hold a lens. Time offsets are left out, since exported images have no timestamps of their own.
+///
+/// # Errors
+/// As [`crate::save_calibration`].
+pub fn save_export(dir: &Path, rig: &Rig) -> Result<(), CalibError> {
+    let mut rig = rig.clone();
+    rig.cameras.iter_mut().for_each(|camera| camera.time_offset_nanos = 0);
+    if rig.cameras.iter().any(|camera| matches!(camera.intrinsics.lens, Lens::Fisheye { .. })) {
+        return calibration_file::save_calibration(dir, &rig, &[]);
+    }
+    easymocap::save_easymocap(dir, &rig)
+}

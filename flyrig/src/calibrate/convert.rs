@@ -1,0 +1,70 @@
+//! `flyrig calibrate convert`: calibrations of other programs.
+
+use anyhow::{Context as _, Result, bail, ensure};
+use flyrig_calib::{Format, save_lenses};
+use flyrig_capture::folder_picture_size;
+
+use super::refuse_existing;
+use crate::cli::CalibrateConvertArgs;
+
+/// Runs the command.
+pub fn convert(args: &CalibrateConvertArgs) -> Result<()> {
+    let input = &args.input;
+    ensure!(input.exists(), "{} does not exist", input.display());
+    let from = args.from.or_else(|| Format::detect(input)).with_context(|| {
+        let known = Format::ALL.map(Format::name);
+        format!("{}: the format is not recognised; name it with --from: {}", input.display(), known.join(", "))
+    })?;
+    let size = |id: &_| folder_picture_size(args.images.as_ref().unwrap_or(input), id).ok();
+    let imported = from.read(input, &size, args.scale)?;
+    let rig = imported.rig(input)?;
+    let names = match args.to {
+        Format::Flyrig => vec!["calibration.toml"],
+        Format::EasyMocap => vec!["intri.yml", "extri.yml"],
+        _ => Vec::new(),
+    };
+    refuse_existing(&args.out, &names, args.force)?;
+    ensure!(
+        args.force || !names.is_empty() || !args.out.exists(),
+        "{} is there already; name a new folder, or replace its files with --force",
+        args.out.display()
+    );
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    println!("from {}: {}", from.name(), from.conventions());
+    println!("to {}: {}", args.to.name(), args.to.conventions());
+    let Some(rig) = rig else {
+        if args.to != Format::Flyrig {
+            bail!("{} holds lenses without poses; they can be written as flyrig's alone", input.display());
+        }
+        save_lenses(&args.out, &imported.lenses())?;
+        println!("{}: calibration.toml with lenses alone", args.out.display());
+        println!("next: flyrig calibrate rig TAKE --lenses {}", args.out.display());
+        return Ok(());
+    };
+    for camera in &rig.cameras {
+        let (i, at) = (&camera.intrinsics, camera.position());
+        let offset = match camera.time_offset_nanos {
+            0 => String::new(),
+            nanos => format!(", stamps {:.1} ms late", nanos as f64 * 1e-6),
+        };
+        println!(
+            "camera {}: {}x{}, focal length {:.1} px, at {:.3} {:.3} {:.3} m{offset}",
+            camera.id, i.width, i.height, i.focal_px.x, at.x, at.y, at.z
+        );
+    }
+    if imported.up.is_none() {
+        let up = rig.world_up;
+        println!(
+            "up is {:.3} {:.3} {:.3}, if the cameras are held level; correct it in calibration.toml",
+            up.x, up.y, up.z
+        );
+    }
+    let lost = args.to != Format::Flyrig && args.to != Format::Kalibr;
+    if lost && rig.cameras.iter().any(|camera| camera.time_offset_nanos != 0) {
+        println!("warning: {} has no place for time offsets; they are left out", args.to.name());
+    }
+    // A folder that stays empty goes again.
+    let files = args.to.write(&args.out, &rig).inspect_err(|_| drop(std::fs::remove_dir(&args.out)))?;
+    println!("{}: {}", args.out.display(), files.join(", "));
+    Ok(())
+}
