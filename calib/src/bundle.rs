@@ -210,7 +210,7 @@ impl BlockProblem for Bundle<'_> {
         }
         if let Some(model) = self.free.lens {
             for camera in &mut at.cameras {
-                camera.intrinsics = model.moved(&camera.intrinsics, take(model.parameters()));
+                camera.intrinsics = LensModel::moved(&camera.intrinsics, take(model.parameters()));
             }
         }
         if self.free.lags {

@@ -149,7 +149,7 @@ fn read_lens(file: &YamlFile, id: &CameraId) -> Result<Lens, CalibError> {
         return Err(entry.wrong_shape(&matrix, "a row of 4, 5, 8, 12 or 14 numbers"));
     }
     opencv_lens(&matrix.values)
-        .map_err(|problem| entry.wrong(format!("has {problem}"), "use at most k1 k2 p1 p2 k3 k4 k5 k6"))
+        .map_err(|problem| entry.wrong(format!("has {problem}"), "k1 k2 p1 p2 k3 k4 k5 k6 can be used"))
 }
 
 fn picture_size(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>) -> Result<(u32, u32), CalibError> {

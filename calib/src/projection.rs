@@ -70,8 +70,8 @@ impl LensModel {
         }
     }
 
-    /// Returns the intrinsics after a step of the parameters: fx, fy, cx, cy, then the coefficients.
-    pub(crate) fn moved(self, from: &Intrinsics, step: &[f64]) -> Intrinsics {
+    /// Returns the intrinsics after a step of the parameters: fx, fy, cx, cy, then as many coefficients as the step has.
+    pub(crate) fn moved(from: &Intrinsics, step: &[f64]) -> Intrinsics {
         let at = |k: usize| step.get(COMMON + k).copied().unwrap_or(0.0);
         let lens = match from.lens {
             Lens::Fisheye { coefficients: [k1, k2, k3, k4] } => {
@@ -213,7 +213,7 @@ mod tests {
                     let moved = |by: f64| {
                         let mut step = vec![0.0; model.parameters()];
                         step[k] = by;
-                        project(&model.moved(&intrinsics, &step), point).unwrap()
+                        project(&LensModel::moved(&intrinsics, &step), point).unwrap()
                     };
                     let numeric = (moved(1e-6) - moved(-1e-6)) / 2e-6;
                     assert!(

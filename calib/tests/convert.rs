@@ -355,7 +355,7 @@ fn cut_and_changed_files_never_panic() {
                     2 => bad.insert(at.min(bad.len()), b"[]{}'\"\\#-0e9\n\xff"[next(14)]),
                     _ => {
                         if let Some(byte) = bad.get_mut(at) {
-                            *byte = next(256) as u8
+                            *byte = next(256) as u8;
                         }
                     }
                 }

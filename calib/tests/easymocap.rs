@@ -243,8 +243,17 @@ fn distortion_that_we_cannot_model_is_refused_but_zeros_are_fine() {
     let rig = load_easymocap(dir.path(), &SIZE).unwrap();
     let lens = Lens::RadialTangential { radial: [0.1, 0.0, 0.2], tangential: [0.0; 2] };
     assert_eq!(rig.cameras[0].intrinsics.lens, lens);
-    let text = refusal(&with(8, "0.1, 0., 0., 0., 0., 0., 0.5, 0."), EXTRI);
-    assert!(text.contains("camera 00: dist_00 has coefficient 7 = 0.5 of the rational, prism or tilt model"), "{text}");
+    let dir = folder(&with(8, "0.1, 0., 0., 0., 0.3, 0., 0.5, 0.7"), EXTRI);
+    let rig = load_easymocap(dir.path(), &SIZE).unwrap();
+    let lens = Lens::Rational { radial: [0.1, 0.0, 0.3, 0.0, 0.5, 0.7], tangential: [0.0; 2] };
+    assert_eq!(rig.cameras[0].intrinsics.lens, lens);
+    let text = refusal(&with(12, "0.1, 0., 0., 0., 0., 0., 0., 0., 0., 0.5, 0., 0."), EXTRI);
+    assert!(
+        text.contains(
+            "camera 00: dist_00 has distortion coefficient 10 = 0.5 of the prism or tilt model; calibrate without it"
+        ),
+        "{text}"
+    );
     let text = refusal(&with(3, "0.1, 0., 0."), EXTRI);
     assert!(text.contains("camera 00: dist_00 is 1x3, expected a row of 4, 5, 8, 12 or 14 numbers"), "{text}");
 }

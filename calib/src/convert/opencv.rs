@@ -40,7 +40,7 @@ fn camera(path: &Path) -> Result<ImportedCamera, CalibError> {
     let &[fx, skew, cx, zero, fy, cy, _, _, one] = k.values.as_slice() else {
         return Err(bad(path, "camera_matrix is not 3x3; export the camera again"));
     };
-    if skew.abs() > 0.01 || zero != 0.0 || one != 1.0 {
+    if skew.abs() > 0.01 || zero != 0.0 || (one - 1.0).abs() > 1e-9 {
         return Err(bad(path, "camera_matrix has skew; calibrate without it"));
     }
     let d =
