@@ -25,7 +25,7 @@ fn late_joiners_get_the_calibration_and_its_changes() {
     publisher.set_calibration(&moved).unwrap();
     for subscriber in [&early, &late] {
         wait_until("the new calibration", || {
-            subscriber.rig(Duration::ZERO).unwrap().is_some_and(|rig| rig.cameras.len() == 1)
+            subscriber.rig(Duration::ZERO).unwrap().is_some_and(|rig| rig.cameras.len() == moved.cameras.len())
         });
         assert_same_rig(&subscriber.rig(PATIENCE).unwrap().unwrap(), &moved);
     }
