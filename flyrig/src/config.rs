@@ -78,6 +78,7 @@ impl SourceKind {
 pub struct SourceSection {
     pub kind: SourceKind,
     pub path: PathBuf,
+    pub calibration: PathBuf,
     pub cameras: Vec<CameraEntry>,
     pub fps: f64,
     pub real_time: bool,
@@ -87,6 +88,20 @@ impl SourceSection {
     /// Names of the chosen cameras; none for all.
     pub fn names(&self) -> Vec<String> {
         self.cameras.iter().map(|entry| entry.name().to_owned()).collect()
+    }
+
+    /// Folder of the calibration; `None` where the recording holds it.
+    pub fn calibration_folder(&self) -> Option<&Path> {
+        let named = Some(self.calibration.as_path()).filter(|folder| !folder.as_os_str().is_empty());
+        named.or((self.kind != SourceKind::Mcap).then_some(self.path.as_path()))
+    }
+
+    /// Whether a calibration is named or lies in the folder. One that is damaged is there, too.
+    pub fn has_calibration(&self) -> bool {
+        let holds = |folder: &Path| {
+            ["calibration.toml", "intri.yml", "extri.yml"].iter().any(|file| folder.join(file).exists())
+        };
+        !self.calibration.as_os_str().is_empty() || !self.path.as_os_str().is_empty() && holds(&self.path)
     }
 
     fn check(&self) -> Result<()> {
@@ -127,6 +142,7 @@ impl Default for SourceSection {
         Self {
             kind: SourceKind::Sim,
             path: PathBuf::new(),
+            calibration: PathBuf::new(),
             cameras: ["00", "03", "05"].map(|name| CameraEntry::Named(name.to_owned())).to_vec(),
             fps: 30.0,
             real_time: true,
@@ -297,7 +313,9 @@ impl Config {
     /// What tracking needs beyond values in their ranges.
     pub fn check_scene(&self) -> Result<()> {
         ensure!(
-            self.source.kind == SourceKind::Sim || !self.source.path.as_os_str().is_empty(),
+            self.source.kind == SourceKind::Sim
+                || !self.source.path.as_os_str().is_empty()
+                || self.source.kind.is_live() && !self.source.calibration.as_os_str().is_empty(),
             "source.path is empty: name the folder of the data set, the folder of the calibration for real cameras, or the recording"
         );
         ensure!(

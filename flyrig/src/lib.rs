@@ -64,7 +64,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
             run::run(&config, &open_gpu(adapter)?, record.as_deref(), *table)
         }
         Command::Record(args) => {
-            let config = Config::load(&args.config)?;
+            let config = Config::load_for_capture(&args.config)?;
             let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
             let gpu = (config.source.kind == SourceKind::Sim).then(|| open_gpu(adapter)).transpose()?;
             recording::record(&config, args, gpu.as_ref())

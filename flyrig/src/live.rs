@@ -17,7 +17,7 @@ pub fn load_rig(source: &SourceSection) -> Result<Rig> {
         let entry = source.cameras.iter().find(|entry| entry.name() == id.as_str())?;
         entry.device().ok().map(|section| (section.size[0], section.size[1]))
     };
-    Ok(load_calibration(&source.path, &size)?)
+    Ok(load_calibration(source.calibration_folder().unwrap_or(&source.path), &size)?)
 }
 
 /// Returns an opener for every camera of the configuration; the images come in the cameras' own formats.

@@ -13,7 +13,7 @@ use flyrig_capture::{
     SourceOpener, ThreadsConfig, recorded_notes, to_rgb8,
 };
 use flyrig_gpu::GpuContext;
-use flyrig_report::{dataset, png, stop, write_whole};
+use flyrig_report::{png, stop, write_whole};
 use flyrig_sync::{SyncSettings, Synchronizer};
 use flyrig_transport::{decode_calibration, decode_transforms, encode_calibration, encode_transforms};
 use flyrig_types::{Camera, CameraId, Frame, FrameSet, PixelFormat, Rig};
@@ -24,7 +24,8 @@ use foxglove::{
 
 use crate::{
     cli::{RecordArgs, ReplayArgs},
-    config::{Config, RecordSection},
+    config::{Config, RecordSection, SourceKind},
+    live,
     monitor::{Arrivals, Monitor, ended_by_itself},
     pose_recording,
     source::{self, Source},
@@ -33,6 +34,8 @@ use crate::{
 /// Topics of the calibration in a recording, as on the network.
 const CALIBRATION: &str = "calibration/";
 const TRANSFORMS: &str = "transforms";
+/// Topic of the cameras' names, one in a line, as the text of a foxglove `Log`.
+const CAMERAS: &str = "cameras";
 /// Topic of the whole calibration, time offsets included, as the text of a foxglove `Log`.
 const CALIBRATION_FILE: &str = "calibration.toml";
 /// How often a line with counts is printed.
@@ -43,21 +46,35 @@ pub fn schema<M: Encode>() -> (String, String, Vec<u8>) {
     M::get_schema().map(|schema| (schema.name, schema.encoding, schema.data.into_owned())).unwrap_or_default()
 }
 
-/// Opens a recording file and writes the rig into it. Sources that are read without loss are recorded without loss.
-pub fn recorder(path: &Path, rig: &Rig, settings: &RecordSection, pacing: Pacing) -> Result<Recorder> {
+/// Opens a recording file and writes the names of the cameras into it, and the rig where it is known. Sources that are read without
+/// loss are recorded without loss.
+pub fn recorder(
+    path: &Path,
+    cameras: &[CameraId],
+    rig: Option<&Rig>,
+    settings: &RecordSection,
+    pacing: Pacing,
+) -> Result<Recorder> {
     fn note<M: Encode>(topic: String, payload: Vec<u8>) -> Note {
         Note { topic, schema: schema::<M>(), payload }
     }
     let keep_all = pacing == Pacing::Lossless;
     let quality = settings.jpeg_quality;
     let compression = (quality > 0).then_some(Compression { quality, keep_all });
-    let log = Log { name: CALIBRATION_FILE.to_owned(), message: calibration_toml(rig, &[])?, ..Log::default() };
-    let mut text = Vec::new();
-    log.encode(&mut text)?;
-    let mut notes = vec![note::<Log>(CALIBRATION_FILE.to_owned(), text)];
-    notes.push(note::<FrameTransforms>(TRANSFORMS.to_owned(), encode_transforms(rig)?));
-    for camera in &rig.cameras {
-        notes.push(note::<CameraCalibration>(format!("{CALIBRATION}{}", camera.id), encode_calibration(camera)?));
+    let text = |topic: &str, message: String| -> Result<Note> {
+        let log = Log { name: topic.to_owned(), message, ..Log::default() };
+        let mut payload = Vec::new();
+        log.encode(&mut payload)?;
+        Ok(note::<Log>(topic.to_owned(), payload))
+    };
+    let names: Vec<&str> = cameras.iter().map(CameraId::as_str).collect();
+    let mut notes = vec![text(CAMERAS, names.join("\n"))?];
+    if let Some(rig) = rig {
+        notes.push(text(CALIBRATION_FILE, calibration_toml(rig, &[])?)?);
+        notes.push(note::<FrameTransforms>(TRANSFORMS.to_owned(), encode_transforms(rig)?));
+        for camera in &rig.cameras {
+            notes.push(note::<CameraCalibration>(format!("{CALIBRATION}{}", camera.id), encode_calibration(camera)?));
+        }
     }
     let settings = RecorderConfig { compression, rotation: settings.rotate, ..RecorderConfig::default() };
     Ok(Recorder::create_with(path, &notes, &settings)?)
@@ -68,17 +85,41 @@ pub fn tap(recorder: &Recorder, cameras: Vec<SourceOpener>) -> Result<Vec<Source
     cameras.into_iter().map(|camera| Ok(camera.recorded(recorder.source_tap())?)).collect()
 }
 
+/// Cameras of a recording, and the rig where it was calibrated when the recording was made.
+pub fn recorded_cameras(path: &Path) -> Result<(Vec<CameraId>, Option<Rig>)> {
+    let notes = recorded_notes(path)?;
+    let text = |wanted: &str| -> Result<Option<String>> {
+        let Some((_, bytes)) = notes.iter().find(|(topic, _)| topic == wanted) else { return Ok(None) };
+        let log = Log::decode(bytes.as_slice()).with_context(|| format!("{}: {wanted} is damaged", path.display()))?;
+        Ok(Some(log.message))
+    };
+    let rig = match text(CALIBRATION_FILE)? {
+        Some(text) => Some(parse_calibration(path, &text)?),
+        None => rig_of_messages(path, &notes)?,
+    };
+    let cameras = match (&rig, text(CAMERAS)?) {
+        (Some(rig), _) => rig.cameras.iter().map(|camera| camera.id.clone()).collect(),
+        (None, Some(names)) => names.lines().map(CameraId::from).collect(),
+        (None, None) => bail!("{}: names no cameras; it is no recording of flyrig's", path.display()),
+    };
+    Ok((cameras, rig))
+}
+
 /// The rig that a recording was made with.
 pub fn recorded_rig(path: &Path) -> Result<Rig> {
-    let notes = recorded_notes(path)?;
+    recorded_cameras(path)?.1.with_context(|| {
+        format!(
+            "{}: was recorded without a calibration; make one with flyrig calibrate, and name its folder as source.calibration, or with \
+             --calibration",
+            path.display()
+        )
+    })
+}
+
+/// The rig of recordings of earlier versions.
+fn rig_of_messages(path: &Path, notes: &[(String, Vec<u8>)]) -> Result<Option<Rig>> {
     let named = |text: &str| format!("{}: {text}", path.display());
-    if let Some((_, bytes)) = notes.iter().find(|(topic, _)| topic == CALIBRATION_FILE) {
-        let log = Log::decode(bytes.as_slice()).with_context(|| named("its calibration is damaged"))?;
-        return Ok(parse_calibration(path, &log.message)?);
-    }
-    // Recordings of earlier versions.
-    let transforms = notes.iter().find(|(topic, _)| topic == TRANSFORMS);
-    let (_, bytes) = transforms.with_context(|| named("holds no calibration; it is no recording of flyrig's"))?;
+    let Some((_, bytes)) = notes.iter().find(|(topic, _)| topic == TRANSFORMS) else { return Ok(None) };
     let transforms = decode_transforms(bytes)?;
     let mut cameras = Vec::new();
     for (_, bytes) in notes.iter().filter(|(topic, _)| topic.starts_with(CALIBRATION)) {
@@ -89,15 +130,12 @@ pub fn recorded_rig(path: &Path) -> Result<Rig> {
     }
     let rig = Rig { cameras, world_up: transforms.world_up };
     rig.validate()?;
-    Ok(rig)
+    Ok(Some(rig))
 }
 
-/// One source a camera of the rig.
-pub fn replay_sources(path: &Path, rig: &Rig) -> Result<Vec<Box<dyn CameraSource>>> {
-    rig.cameras
-        .iter()
-        .map(|camera| Ok(Box::new(McapReplay::open(&camera.id, path)?) as Box<dyn CameraSource>))
-        .collect()
+/// Opens one source for each camera.
+pub fn replay_sources(path: &Path, cameras: &[CameraId]) -> Result<Vec<Box<dyn CameraSource>>> {
+    cameras.iter().map(|id| Ok(Box::new(McapReplay::open(id, path)?) as Box<dyn CameraSource>)).collect()
 }
 
 /// Summarises a finished recording in one line.
@@ -123,14 +161,22 @@ pub fn summary(recorded: &Recorded, path: &Path) -> Result<String> {
 pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> Result<()> {
     let stop = stop::flag();
     let mut monitor = Monitor::start(&config.health.listen, false)?;
-    let Source { rig, cameras, .. } = source::open(config, gpu)?;
+    // A take to calibrate from comes before the calibration.
+    let (cameras, rig) = if config.source.kind == SourceKind::Cameras && !config.source.has_calibration() {
+        eprintln!("record: no calibration; the recording is for flyrig calibrate, or gets one as source.calibration");
+        (live::openers(&config.source)?, None)
+    } else {
+        config.check_scene()?;
+        let Source { rig, cameras, .. } = source::open(config, gpu)?;
+        (cameras, Some(rig))
+    };
     let pacing = if config.source.kind.is_live() { Pacing::AsDelivered } else { Pacing::Lossless };
-    let recorder = recorder(&args.out, &rig, &config.record, pacing)?;
+    let ids: Vec<CameraId> = cameras.iter().map(|camera| camera.camera().clone()).collect();
+    let recorder = recorder(&args.out, &ids, rig.as_ref(), &config.record, pacing)?;
     let tapped = tap(&recorder, cameras)?;
-    let ids: Vec<CameraId> = tapped.iter().map(|camera| camera.camera().clone()).collect();
     let mut arrivals = Arrivals::new(&ids);
     let threads = CaptureThreads::start_opening(tapped, ThreadsConfig { pacing, ..ThreadsConfig::default() })?;
-    eprintln!("record: {} cameras to {} (Ctrl-C ends)", rig.cameras.len(), args.out.display());
+    eprintln!("record: {} cameras to {} (Ctrl-C ends)", ids.len(), args.out.display());
     Monitor::ready();
     let (started, mut printed, mut has_ended) = (Instant::now(), Instant::now(), false);
     let is_over = || args.seconds.is_some_and(|seconds| started.elapsed().as_secs_f64() >= seconds);
@@ -169,19 +215,26 @@ pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> R
 /// Runs `flyrig replay`: plays a recording through, tells what is in it, and exports it where asked to.
 pub fn replay(args: &ReplayArgs) -> Result<()> {
     let stop = stop::flag();
-    let rig = recorded_rig(&args.recording)?;
-    dataset::pick(&rig, &args.lags.cameras(), "the recording, but in --lag")?;
-    let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+    let (ids, rig) = recorded_cameras(&args.recording)?;
+    for camera in args.lags.cameras() {
+        let known: Vec<&str> = ids.iter().map(CameraId::as_str).collect();
+        let is_known = known.contains(&camera.as_str());
+        ensure!(is_known, "camera {camera} is not in the recording, but in --lag; it has: {}", known.join(", "));
+    }
     let threads_config = ThreadsConfig { queue_capacity: 4 * ids.len().max(1), pacing: Pacing::Lossless };
-    let threads = CaptureThreads::start(replay_sources(&args.recording, &rig)?, threads_config)?;
-    let settings = SyncSettings { lags_nanos: args.lags.nanos(), ..SyncSettings::default() }.with_offsets_of(&rig);
+    let threads = CaptureThreads::start(replay_sources(&args.recording, &ids)?, threads_config)?;
+    let settings = SyncSettings { lags_nanos: args.lags.nanos(), ..SyncSettings::default() };
+    let settings = rig.as_ref().map_or_else(|| settings.clone(), |rig| settings.with_offsets_of(rig));
     let mut sync = Synchronizer::new(&ids, &settings);
     if let Some(folder) = &args.export {
         ensure!(!folder.exists(), "{} is there already; name a new folder", folder.display());
         for id in &ids {
             fs::create_dir_all(folder.join("images").join(id.as_str()))?;
         }
-        save_export(folder, &rig)?;
+        match &rig {
+            Some(rig) => save_export(folder, rig)?,
+            None => println!("the recording has no calibration, so neither has {}", folder.display()),
+        }
     }
     let mut tallies = vec![Tally::default(); ids.len()];
     let mut digest = Digest::default();
@@ -193,7 +246,7 @@ pub fn replay(args: &ReplayArgs) -> Result<()> {
         ensure!(!stop.load(std::sync::atomic::Ordering::Relaxed), "stopped before the end");
         match threads.queue().pop(Duration::from_millis(200)) {
             Ok(frame) => {
-                if let Some(slot) = rig.slot(&frame.camera) {
+                if let Some(slot) = ids.iter().position(|id| *id == frame.camera) {
                     tallies[slot].add(&frame);
                 }
                 digest.add(&frame);
@@ -285,5 +338,52 @@ impl Digest {
         for byte in name.iter().chain(numbers.iter().flatten()).chain(frame.image.bytes()) {
             self.0 = (self.0 ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_types::{Intrinsics, Isometry, Lens};
+    use glam::{DVec2, DVec3};
+
+    use super::*;
+
+    #[test]
+    fn a_recording_keeps_the_whole_calibration_or_says_that_it_has_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let ids = ["left".into(), "right".into()];
+        let make = |name: &str, rig: Option<&Rig>| {
+            let path = folder.path().join(name);
+            let made = recorder(&path, &ids, rig, &RecordSection::default(), Pacing::Lossless).unwrap();
+            assert!(made.finish().problem.is_none());
+            path
+        };
+        let bare = make("bare.mcap", None);
+        let (cameras, rig) = recorded_cameras(&bare).unwrap();
+        assert_eq!((cameras.as_slice(), rig), (ids.as_slice(), None));
+        let text = recorded_rig(&bare).unwrap_err().to_string();
+        assert!(
+            text.contains("bare.mcap: was recorded without a calibration; make one with flyrig calibrate"),
+            "{text}"
+        );
+
+        let lens = Lens::Rational { radial: [0.5, 0.12, 0.01, 0.8, 0.25, 0.02], tangential: [0.002, -0.001] };
+        let camera = |id: &CameraId, lens| Camera {
+            id: id.clone(),
+            intrinsics: Intrinsics {
+                width: 640,
+                height: 480,
+                focal_px: DVec2::splat(500.0),
+                center_px: DVec2::new(320.0, 240.0),
+                lens,
+            },
+            camera_from_world: Isometry::IDENTITY,
+            time_offset_nanos: -45_712_345,
+        };
+        let cameras =
+            vec![camera(&ids[0], lens), camera(&ids[1], Lens::Fisheye { coefficients: [0.1, 0.0, 0.0, 0.0] })];
+        let rig = Rig { cameras, world_up: DVec3::new(0.0, 0.6, 0.8) };
+        let (_, found) = recorded_cameras(&make("whole.mcap", Some(&rig))).unwrap();
+        assert_eq!(found, Some(rig));
     }
 }

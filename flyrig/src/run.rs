@@ -38,7 +38,9 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
     let source = source::open(config, Some(gpu))?;
     dataset::require_masks(&config.perception, &source.plates)?;
     let pacing = source::pacing(config);
-    let recorder = recording.map(|path| recording::recorder(path, &source.rig, &config.record, pacing)).transpose()?;
+    let ids: Vec<_> = source.rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+    let recorder =
+        recording.map(|path| recording::recorder(path, &ids, Some(&source.rig), &config.record, pacing)).transpose()?;
     let ended = capture_people(config, gpu, source, recorder.as_ref(), &mut monitor, show_table);
     let recorded = match (recorder, recording) {
         (Some(recorder), Some(path)) => recording::summary(&recorder.finish(), path)

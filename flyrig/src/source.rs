@@ -2,7 +2,10 @@
 
 use anyhow::{Context as _, Result, bail};
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
-use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, Pacing, SourceOpener, VideoOptions, VideoReplay};
+use flyrig_calib::load_calibration;
+use flyrig_capture::{
+    CameraSource, FolderOptions, FolderReplay, Pacing, SourceOpener, VideoOptions, VideoReplay, folder_picture_size,
+};
 use flyrig_fusion::{EstimatedPerception, GivenPerception, GivenPerson, InputFormat, Origin, PersonId};
 use flyrig_gpu::GpuContext;
 use flyrig_report::dataset;
@@ -76,9 +79,11 @@ pub fn input_format<'a>(kind: SourceKind, rig: &'a Rig) -> InputFormat<'a> {
 /// Opens the cameras of a configuration; only simulated ones need a graphics adapter.
 pub fn open(config: &Config, gpu: Option<&GpuContext>) -> Result<Source> {
     let mut source = open_without_plates(config, gpu)?;
-    let has_folder = config.source.kind != SourceKind::Mcap || !config.perception.plates.as_os_str().is_empty();
+    let folder = config.source.calibration_folder();
+    let has_folder = folder.is_some() || !config.perception.plates.as_os_str().is_empty();
     if config.source.kind != SourceKind::Sim && has_folder && config.perception.key_color.is_empty() {
-        source.plates = dataset::plates(&dataset::plate_folder(&config.source.path, &config.perception), &source.rig)?;
+        let folder = dataset::plate_folder(folder.unwrap_or(&config.source.path), &config.perception);
+        source.plates = dataset::plates(&folder, &source.rig)?;
     }
     dataset::pick(
         &source.rig,
@@ -124,8 +129,13 @@ pub fn open_without_plates(config: &Config, gpu: Option<&GpuContext>) -> Result<
     let chosen: Vec<CameraId> = source.names().into_iter().map(CameraId::from).collect();
     let rig = match source.kind {
         SourceKind::Cameras | SourceKind::Network => live::load_rig(source)?,
-        SourceKind::Mcap => recording::recorded_rig(&source.path)?,
-        SourceKind::Folder | SourceKind::Video | SourceKind::Sim => dataset::load_rig(&source.path, &chosen)?,
+        SourceKind::Mcap | SourceKind::Folder | SourceKind::Video | SourceKind::Sim => {
+            match source.calibration_folder() {
+                Some(folder) if folder == source.path => dataset::load_rig(folder, &chosen)?,
+                Some(folder) => load_calibration(folder, &|id| folder_picture_size(&source.path, id).ok())?,
+                None => recording::recorded_rig(&source.path)?,
+            }
+        }
     };
     let rig = dataset::pick(&rig, &source.names(), "the calibration")?;
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
@@ -145,7 +155,7 @@ pub fn open_without_plates(config: &Config, gpu: Option<&GpuContext>) -> Result<
             threads.push(clocks);
             openers
         }
-        SourceKind::Mcap => ready(recording::replay_sources(&source.path, &rig)?),
+        SourceKind::Mcap => ready(recording::replay_sources(&source.path, &ids)?),
         SourceKind::Video | SourceKind::Sim => {
             let open = |id| VideoReplay::open(id, &dataset::video_file(&source.path, id), &VideoOptions::default());
             ready(ids.iter().map(open).collect::<Result<_, _>>()?)

@@ -47,8 +47,8 @@ pub fn open(input: &[PathBuf], fps: f64, gpu: &dyn Fn() -> Result<GpuContext>) -
             Ok(Take { sources: source::open_without_plates(&config, gpu.as_ref())?.cameras, pacing })
         }
         [path] if has_ending(path, "mcap") => {
-            let rig = recording::recorded_rig(path)?;
-            Ok(Take::replayed(source::ready(recording::replay_sources(path, &rig)?)))
+            let (cameras, _) = recording::recorded_cameras(path)?;
+            Ok(Take::replayed(source::ready(recording::replay_sources(path, &cameras)?)))
         }
         [folder] if folder.is_dir() => Ok(Take::replayed(folder_sources(folder, fps, false)?)),
         [path] if !path.exists() => bail!("{} does not exist", path.display()),
@@ -144,10 +144,13 @@ pub fn open_calibrated(
             }
         }
         [path] if has_ending(path, "mcap") => {
-            let rig = recording::recorded_rig(path)?;
-            let plates = rig.cameras.iter().map(|_| None).collect();
-            let sources = source::ready(recording::replay_sources(path, &rig)?);
-            CalibratedTake::replayed(sources, Some((rig, plates)), false)
+            let (cameras, rig) = recording::recorded_cameras(path)?;
+            let sources = source::ready(recording::replay_sources(path, &cameras)?);
+            let without_plates = |rig: Rig| {
+                let plates = rig.cameras.iter().map(|_| None).collect();
+                (rig, plates)
+            };
+            CalibratedTake::replayed(sources, rig.map(without_plates), false)
         }
         [folder] if folder.is_dir() => {
             let has = |file: &str| folder.join(file).exists();

@@ -45,6 +45,31 @@ fn a_lag_is_found_and_taken_off() {
 }
 
 #[test]
+fn the_calibrations_time_offset_is_applied_and_can_be_replaced() {
+    let folder = tempfile::tempdir().unwrap();
+    let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    std::fs::write(folder.path().join("rig.toml"), RIG).unwrap();
+    let exported = command(&["record", "rig.toml", "--out", "take.mcap", "--seconds", "60"]);
+    assert_eq!(exported.code, Some(0), "{exported:?}");
+    let sim = RIG.split_once("[sim]").unwrap().1;
+    std::fs::write(folder.path().join("sim.toml"), format!("[sim]{}", sim.split_once("[[").unwrap().0)).unwrap();
+    let frames = command(&["sim", "export", "sim.toml", "--out", "room", "--frames", "1"]);
+    assert_eq!(frames.code, Some(0), "{frames:?}");
+    let converted = command(&["calibrate", "convert", "room", "--out", "late"]);
+    assert_eq!(converted.code, Some(0), "{converted:?}");
+    let file = folder.path().join("late/calibration.toml");
+    let text = std::fs::read_to_string(&file).unwrap();
+    assert!(text.trim_end().contains("name = \"02\""), "{text}");
+    std::fs::write(&file, format!("{text}time_offset_ms = 45.0\n")).unwrap();
+    for (calibration, truth) in [("room", 45.0), ("late", 0.0)] {
+        let checked = command(&["sync-check", "take.mcap", "--calibration", calibration, "--most-ms", "150"]);
+        assert_eq!(checked.code, Some(0), "{checked:?}");
+        let found = lags(&checked.stdout);
+        assert!((found[2].1 - truth).abs() <= 4.0, "{calibration}: {found:?}\n{}", checked.stdout);
+    }
+}
+
+#[test]
 fn what_cannot_be_checked_is_refused_in_words() {
     let folder = tempfile::tempdir().unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
