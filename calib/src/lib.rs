@@ -20,6 +20,7 @@ mod rig;
 mod start;
 #[doc(hidden)]
 pub mod testing;
+mod watch;
 mod yaml;
 
 pub use board::{Board, Pattern};
@@ -36,3 +37,4 @@ pub use print::BoardSheet;
 pub use projection::LensModel;
 pub use rig::{RigCamera, RigFit, RigOptions, calibrate_rig};
 pub use start::Pair;
+pub use watch::{CameraMotion, CameraWatch, WatchState, WatchedImage};
