@@ -37,6 +37,8 @@ pub enum BenchCommand {
     Hands(BenchHandsArgs),
     /// Bias and spread of the landmark network on people whose pose is known.
     Landmarks(BenchLandmarksArgs),
+    /// Bumped cameras among switched lights, a walking person and exposure jumps: time to the report, error, false alarms, cost.
+    Watch(BenchWatchArgs),
     /// Masks estimated in each camera independently, against which several calibrations are scored.
     Masks(BenchMasksArgs),
     /// Pose, shape and masks from images: errors, and what each of them costs in the views; writes a table and JSON.
@@ -207,6 +209,33 @@ pub struct BenchLandmarksArgs {
     /// Frames a second of the data sets.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchWatchArgs {
+    /// Number of bumps.
+    #[arg(long, default_value_t = 12)]
+    pub bumps: u32,
+    /// Rotation of a bump, degrees.
+    #[arg(long, default_value_t = 0.3)]
+    pub deg: f64,
+    /// Translation of a bump, millimetres.
+    #[arg(long, default_value_t = 5.0)]
+    pub mm: f64,
+    /// Simulated minutes without a bump.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_minutes)]
+    pub minutes: f64,
+    /// Number of cameras.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
+    pub cameras: u32,
+    /// Width of an image, pixels.
+    #[arg(long, default_value_t = 1280)]
+    pub width: u32,
+    /// Height of an image, pixels.
+    #[arg(long, default_value_t = 720)]
+    pub height: u32,
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
 }
 
 #[derive(Debug, Args)]

@@ -19,6 +19,7 @@ mod subjects;
 mod summary;
 mod surface;
 mod track;
+mod watch;
 mod write;
 
 #[cfg(test)]
@@ -52,6 +53,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         BenchCommand::Capture(args) => capture::capture(args),
         BenchCommand::Hands(args) => hands::hands(args, &gpu()?),
         BenchCommand::Landmarks(args) => landmarks::landmarks(args),
+        BenchCommand::Watch(args) => watch::watch(args, &gpu()?),
         BenchCommand::Masks(args) => masks::masks(args),
         BenchCommand::Perception(args) => perception::perception(args, &gpu()?),
         BenchCommand::Subjects(args) => subjects::subjects(args, &gpu()?),

@@ -24,7 +24,7 @@ const WIDTH: usize = 640;
 const AGREE_PX: f64 = 0.75;
 /// Fewest patches, and least share of those that were found again, that must agree.
 const LEAST_PATCHES: usize = 12;
-const LEAST_SHARE: f64 = 0.5;
+const LEAST_SHARE: f64 = 0.4;
 /// Share of the patches that must be found again before a large shift is looked for.
 const FEW_FOUND: f64 = 0.3;
 /// Mean motion of the image that counts, pixels of the reduced image.
@@ -93,7 +93,12 @@ impl CameraWatch {
         }
         let factor = reference.width.div_ceil(WIDTH);
         let pyramid = Pyramid::new(reference, factor)?;
-        let patches = choose(&pyramid);
+        let ray = |at: DVec2| {
+            let pixel = at * factor as f64;
+            let ideal = intrinsics.lens.undistort((pixel - intrinsics.center_px) / intrinsics.focal_px)?;
+            Some(ideal.extend(1.0).normalize())
+        };
+        let patches = choose(&pyramid, &ray);
         (patches.len() >= LEAST_PATCHES).then(|| Self {
             intrinsics: *intrinsics,
             factor: factor as f64,
@@ -108,6 +113,12 @@ impl CameraWatch {
     #[must_use]
     pub fn state(&self) -> WatchState {
         self.state
+    }
+
+    /// Motion in the last image in which enough of the background was found again, whether it counts or not.
+    #[must_use]
+    pub fn last_motion(&self) -> Option<CameraMotion> {
+        self.recent.last().copied()
     }
 
     /// Compares an image, about once a second, and returns the new state. A motion is reported once three looks agree on it; an image in
@@ -170,20 +181,14 @@ impl CameraWatch {
         Some(CameraMotion { rotation, pixels, agreeing: (agreeing, self.patches.len()) })
     }
 
-    /// Direction of a patch in the reference, camera axes.
-    fn ray(&self, patch: &Patch) -> Option<DVec3> {
-        let i = &self.intrinsics;
-        Some(i.lens.undistort((patch.at * self.factor - i.center_px) / i.focal_px)?.extend(1.0).normalize())
-    }
-
     /// Pixel of a patch after the camera turned. What stands still turns the other way in the camera's axes.
     fn pixel(&self, patch: &Patch, rotation: DVec3) -> Option<DVec2> {
-        project(&self.intrinsics, exp_rotation(-rotation) * self.ray(patch)?)
+        project(&self.intrinsics, exp_rotation(-rotation) * patch.ray)
     }
 
     /// Derivative of the pixel by the rotation vector, columns.
     fn by_rotation(&self, patch: &Patch, rotation: DVec3) -> Option<(DVec2, [DVec2; 3])> {
-        let ray = exp_rotation(-rotation) * self.ray(patch)?;
+        let ray = exp_rotation(-rotation) * patch.ray;
         let projected = project_with_derivatives(&self.intrinsics, LensModel::Radial1, ray)?;
         let column = |axis: DVec3| {
             let by = ray.cross(axis);

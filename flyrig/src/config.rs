@@ -29,6 +29,7 @@ pub struct Config {
     pub source: SourceSection,
     pub sim: SimConfig,
     pub sync: SyncSettings,
+    pub calibration: CalibrationSection,
     pub perception: PerceptionSettings,
     pub body: BodySettings,
     pub tracking: TrackingSettings,
@@ -40,6 +41,22 @@ pub struct Config {
     pub transport: TransportSection,
     pub health: HealthSection,
     pub gpu: GpuSection,
+}
+
+/// How the calibration is looked after while the rig runs.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CalibrationSection {
+    pub watch: WatchMode,
+}
+
+/// Whether cameras are watched for bumps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum WatchMode {
+    Off,
+    #[default]
+    Warn,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -2,6 +2,7 @@
 
 use std::fmt::Write as _;
 
+use flyrig_calib::WatchState;
 use flyrig_capture::Recorded;
 use flyrig_fusion::{CameraHealth, Health};
 use flyrig_transport::BudgetStats;
@@ -43,6 +44,9 @@ pub fn table(health: &Health, recorded: Option<&Recorded>) -> String {
             (None, true, false) => "is being opened".to_owned(),
             (_, true, true) => stats.health.mode.to_string(),
         };
+        if let WatchState::Moved(motion) = camera.watch {
+            let _ = write!(mode, "  moved: {:.1} px", motion.pixels);
+        }
         if let Some(network) = stats.health.network {
             let offset = network.clock_offset_nanos.map(|nanos| nanos as f64 * 1e-9);
             let drift = network.clock_drift_ppb as f64 * 1e-3;
@@ -95,6 +99,7 @@ pub fn table(health: &Health, recorded: Option<&Recorded>) -> String {
 pub mod tests {
     use std::collections::BTreeMap;
 
+    use flyrig_calib::CameraMotion;
     use flyrig_capture::{CameraStats, CaptureErrorKind, SourceHealth};
     use flyrig_fusion::StageSummary;
     use flyrig_sync::ClockState;
@@ -127,8 +132,10 @@ pub mod tests {
             opened: true,
         };
         let clock = Some(ClockState { drift_ppm: -12.5, ..ClockState::default() });
+        let rotation = glam::DVec3::new(0.0, 0.01, 0.0);
+        let watch = WatchState::Moved(CameraMotion { rotation, pixels: 9.5, agreeing: (80, 96) });
         let (interval_ms, jitter_ms, lateness_ms, quiet_s) = (33.3, 0.4, Some(12.0), Some(0.1));
-        let camera = CameraHealth { stats, in_no_set: 5, interval_ms, jitter_ms, lateness_ms, quiet_s, clock };
+        let camera = CameraHealth { stats, in_no_set: 5, interval_ms, jitter_ms, lateness_ms, quiet_s, clock, watch };
         let stage = StageSummary { name: "draw".into(), frames: 1, mean_ms: 2.0, p50_ms: 2.0, p95_ms: 4.0 };
         let (complete_sets, partial_sets, skipped_sets) = (800, 10, 4);
         let resident_mib = Some(2.0);
@@ -154,9 +161,13 @@ pub mod tests {
         let recorded =
             Recorded { frames: 7, bytes: 2_000_000, files: 2, free_bytes: Some(9), problem, ..Recorded::default() };
         let text = table(&health, Some(&recorded));
-        for part in
-            ["'camera le\"ft': restarted 2 times", "'stage le\"ft': stuck", "7 frames, 2.0 MB, 2 files", "disk full"]
-        {
+        for part in [
+            "moved: 9.5 px",
+            "'camera le\"ft': restarted 2 times",
+            "'stage le\"ft': stuck",
+            "7 frames, 2.0 MB, 2 files",
+            "disk full",
+        ] {
             assert!(text.contains(part), "{part} in\n{text}");
         }
     }

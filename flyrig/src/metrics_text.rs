@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use flyrig_calib::WatchState;
 use flyrig_capture::{NetworkHealth, Recorded};
 use flyrig_fusion::{CameraHealth, Health};
 use prometheus_client::{
@@ -72,10 +73,15 @@ const CAMERA_COUNTERS: [Counter; 12] = [
     }),
 ];
 
-const CAMERA_GAUGES: [Gauge; 8] = [
+const CAMERA_GAUGES: [Gauge; 9] = [
     ("quiet_seconds", "Since the last frame.", |c| c.quiet_s),
     ("interval_seconds", "Mean time between captures.", |c| {
         (c.is_up() && c.interval_ms > 0.0).then_some(c.interval_ms / 1e3)
+    }),
+    ("moved_pixels", "How far its image lies from where it was calibrated; 0: it was not moved.", |c| match c.watch {
+        WatchState::Unknown => None,
+        WatchState::Steady => Some(0.0),
+        WatchState::Moved(motion) => Some(motion.pixels),
     }),
     ("jitter_seconds", "Standard deviation of the time between captures.", |c| {
         (c.is_up() && c.interval_ms > 0.0).then_some(c.jitter_ms / 1e3)

@@ -8,6 +8,7 @@ use std::{
 };
 
 use anyhow::{Result, anyhow};
+use flyrig_calib::WatchState;
 use flyrig_capture::{CameraStats, CaptureThreads, Recorded};
 use flyrig_fusion::{CameraHealth, Health, STUCK_AFTER, resident_mib};
 use flyrig_gpu::GpuContext;
@@ -227,6 +228,7 @@ impl Arrivals {
             lateness_ms: None,
             quiet_s: last.map(|at| at.elapsed().as_secs_f64()),
             clock: None,
+            watch: WatchState::Unknown,
         };
         Health {
             cameras: threads.stats().into_iter().zip(&self.0).map(camera).collect(),

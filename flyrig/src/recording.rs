@@ -46,6 +46,13 @@ pub fn schema<M: Encode>() -> (String, String, Vec<u8>) {
     M::get_schema().map(|schema| (schema.name, schema.encoding, schema.data.into_owned())).unwrap_or_default()
 }
 
+/// Encodes a text as foxglove `Log`.
+pub fn log(name: &str, message: String) -> Result<Vec<u8>> {
+    let mut payload = Vec::new();
+    Log { name: name.to_owned(), message, ..Log::default() }.encode(&mut payload)?;
+    Ok(payload)
+}
+
 /// Opens a recording file and writes the names of the cameras into it, and the rig where it is known. Sources that are read without
 /// loss are recorded without loss.
 pub fn recorder(
@@ -61,12 +68,8 @@ pub fn recorder(
     let keep_all = pacing == Pacing::Lossless;
     let quality = settings.jpeg_quality;
     let compression = (quality > 0).then_some(Compression { quality, keep_all });
-    let text = |topic: &str, message: String| -> Result<Note> {
-        let log = Log { name: topic.to_owned(), message, ..Log::default() };
-        let mut payload = Vec::new();
-        log.encode(&mut payload)?;
-        Ok(note::<Log>(topic.to_owned(), payload))
-    };
+    let text =
+        |topic: &str, message: String| -> Result<Note> { Ok(note::<Log>(topic.to_owned(), log(topic, message)?)) };
     let names: Vec<&str> = cameras.iter().map(CameraId::as_str).collect();
     let mut notes = vec![text(CAMERAS, names.join("\n"))?];
     if let Some(rig) = rig {

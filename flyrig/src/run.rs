@@ -8,15 +8,16 @@ use std::{
 use anyhow::{Result, ensure};
 use flyrig_capture::{CameraStats, Recorder};
 use flyrig_fusion::{
-    Health, Intake, LivePublisher, LiveRig, LiveViews, Origin, Outcome, PersonId, PersonMemory, Session,
+    Health, Intake, LivePublisher, LiveRig, LiveViews, Origin, Outcome, PersonId, PersonMemory, RigWatch, Session,
     SessionBuilder, resident_mib,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{dataset, stop};
 use flyrig_transport::Publisher;
+use foxglove::messages::Log;
 
 use crate::{
-    config::Config,
+    config::{Config, WatchMode},
     health,
     monitor::{Monitor, ended_by_itself},
     pose_recording::PoseRecording,
@@ -80,6 +81,8 @@ fn capture_people(
         eprintln!("run: the person is resumed from {}", config.body.person.display());
     }
     let threads = std::mem::take(&mut source.threads);
+    let watch = (config.calibration.watch == WatchMode::Warn).then(|| RigWatch::new(&source.rig, &source.plates));
+    let mut watched = recorder.map(|recorder| recorder.messages("watch", recording::schema::<Log>()));
     if let (Origin::Given, Some(learnt)) = (config.perception.pose, &learnt) {
         source.template = learnt.clone();
     }
@@ -107,6 +110,9 @@ fn capture_people(
     let mut rig = LiveRig::new(session, intake, LiveViews::new(&config.output), Some(publisher))
         .with_splats(config.output.splats)
         .with_threads(threads);
+    if let Some(watch) = watch {
+        rig = rig.with_watch(watch);
+    }
     let (started, mut last_print, mut printed) = (Instant::now(), Instant::now(), 0u64);
     let mut last_save = Instant::now();
     while !stop::requested() && !rig.intake.ended() {
@@ -116,6 +122,9 @@ fn capture_people(
         }
         monitor.look(|| (rig.health(), recorder.map(Recorder::state)));
         let Some(step) = step else { continue };
+        if let (Some(event), Some(recorded)) = (&step.watched, &mut watched) {
+            recorded.record(event.nanos, recording::log("watch", event.to_string())?);
+        }
         if !matches!(step.outcome, Outcome::Held(_)) {
             record_pose(poses.as_mut(), &rig.session, step.set.master_nanos);
         }

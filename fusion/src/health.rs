@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use flyrig_calib::WatchState;
 use flyrig_capture::CameraStats;
 use flyrig_sync::ClockState;
 use flyrig_transport::BudgetStats;
@@ -31,6 +32,8 @@ pub struct CameraHealth {
     pub quiet_s: Option<f64>,
     /// State of the camera's own clock, where it has one.
     pub clock: Option<ClockState>,
+    /// Whether it still stands as calibrated; unknown without a [`crate::RigWatch`].
+    pub watch: WatchState,
 }
 
 impl CameraHealth {

@@ -5,6 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use flyrig_calib::WatchState;
 use flyrig_capture::{
     CameraSource, CaptureError, CaptureThreads, Decoding, FrameStage, Pacing, PopError, SourceOpener, ThreadsConfig,
     monotonic_nanos,
@@ -207,6 +208,7 @@ impl Intake {
                 lateness_ms: self.is_live.then_some(timing.lateness_ms),
                 quiet_s: timing.arrived.map(|at| at.elapsed().as_secs_f64()),
                 clock: clocks.get(slot).copied(),
+                watch: WatchState::Unknown,
             }
         });
         Health {

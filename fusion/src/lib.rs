@@ -21,6 +21,7 @@ mod live_views;
 mod memory;
 mod perception;
 mod pose_curve;
+mod rig_watch;
 mod session;
 mod set_reader;
 mod settings;
@@ -44,6 +45,7 @@ pub use perception::{
     EstimatedPerception, GivenPerception, GivenPerson, Observation, Perception, SHAPE_SECS, SHAPE_SETS, SeenPerson,
     ViewObservation,
 };
+pub use rig_watch::{RigWatch, WatchEvent};
 pub use session::{Counts, Outcome, Session, SessionBuilder};
 pub use set_reader::{SetReader, next_frame};
 pub use settings::{

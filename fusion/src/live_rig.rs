@@ -5,10 +5,12 @@ use std::{
     time::{Duration, Instant},
 };
 
+use flyrig_calib::WatchState;
 use flyrig_types::{FrameSet, PersonId, Restarts, ThreadHealth, ThreadWatch, caught};
 
 use crate::{
-    FusionError, Health, Intake, LivePublisher, LiveViews, Outcome, PersonMemory, Session, check_threads, resident_mib,
+    FusionError, Health, Intake, LivePublisher, LiveViews, Outcome, PersonMemory, RigWatch, Session, WatchEvent,
+    check_threads, resident_mib,
 };
 
 /// Name of the thread that calls [`LiveRig::step`], in health and errors.
@@ -30,6 +32,8 @@ pub struct LiveStep {
     pub set: FrameSet,
     /// Its result.
     pub outcome: Outcome,
+    /// A camera that was found moved, or back in its place.
+    pub watched: Option<WatchEvent>,
 }
 
 /// Cameras in, people out, for as long as the cameras give frames.
@@ -41,6 +45,7 @@ pub struct LiveRig {
     publisher: Option<LivePublisher>,
     views: LiveViews,
     splats: bool,
+    watch: Option<RigWatch>,
     started: Instant,
     frames: u64,
     held: u64,
@@ -75,6 +80,7 @@ impl LiveRig {
             publisher,
             views,
             splats: true,
+            watch: None,
             started: Instant::now(),
             frames,
             held,
@@ -97,6 +103,12 @@ impl LiveRig {
         Self { splats, ..self }
     }
 
+    /// Watches whether the cameras stay where they are.
+    #[must_use]
+    pub fn with_watch(self, watch: RigWatch) -> Self {
+        Self { watch: Some(watch), ..self }
+    }
+
     /// Waits for a set, takes it in and publishes the views that are watched. Returns `None` when no set came in time. The
     /// rig's own views turn with `turn_time`, or with the time since the start.
     ///
@@ -114,17 +126,23 @@ impl LiveRig {
             Err(panic) => return self.restart(panic).map(|()| None),
         };
         match caught(|| self.take_in(&set, turn_time)) {
-            Ok(Ok(outcome)) => Ok(Some(LiveStep { set, outcome })),
+            Ok(Ok(outcome)) => {
+                let watched = self.watch.as_mut().and_then(|watch| watch.look(&set));
+                if let Some(event) = &watched {
+                    tracing::warn!("{event}");
+                }
+                Ok(Some(LiveStep { set, outcome, watched }))
+            }
             Ok(Err(fault)) if fault.is_device_fault() => {
                 self.recover(fault)?;
                 let outcome = Outcome::Held("the graphics device was opened again".to_owned());
-                Ok(Some(LiveStep { set, outcome }))
+                Ok(Some(LiveStep { set, outcome, watched: None }))
             }
             Ok(Err(error)) => Err(error),
             Err(panic) => {
                 let outcome = Outcome::Held(format!("the pipeline was restarted after a panic: {panic}"));
                 self.restart(panic)?;
-                Ok(Some(LiveStep { set, outcome }))
+                Ok(Some(LiveStep { set, outcome, watched: None }))
             }
         }
     }
@@ -247,13 +265,17 @@ impl LiveRig {
     /// Reports the health of cameras, sets, stages and memory.
     #[must_use]
     pub fn health(&self) -> Health {
+        let mut health = self.intake.health();
+        for (slot, camera) in health.cameras.iter_mut().enumerate() {
+            camera.watch = self.watch.as_ref().map_or(WatchState::Unknown, |watch| watch.state(slot));
+        }
         Health {
             stages: self.session.stages.summary(),
             resident_mib: resident_mib(),
             device_faults: self.recovery.rebuilt,
             budget: self.session.budget.stats(),
             threads: std::iter::once(self.pipeline.clone()).chain(self.other_threads()).collect(),
-            ..self.intake.health()
+            ..health
         }
     }
 

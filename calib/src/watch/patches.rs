@@ -1,18 +1,19 @@
 //! Patches of a reference image, found again in another image.
 
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 
 use super::WatchedImage;
 
-/// Half the side of a patch, pixels.
-const HALF: isize = 7;
+/// Half the side of a patch, and its side, pixels.
+const HALF: usize = 7;
+const SIDE: usize = 2 * HALF + 1;
 /// Levels of the pyramid, each half as large as the one before.
 const LEVELS: usize = 3;
 /// Cells of the image, across and down, and the most patches of each.
 const CELLS: (usize, usize) = (12, 8);
 const A_CELL: usize = 2;
 /// Least contrast of a patch: the smaller eigenvalue of its mean squared gradients, grey levels of 255 per pixel.
-const LEAST_GRADIENT: f32 = 6.0;
+const LEAST_GRADIENT: f32 = 1.5;
 /// Steps of the descent, and the step that ends it, pixels.
 const STEPS: usize = 12;
 const SMALL_STEP: f32 = 0.01;
@@ -42,7 +43,7 @@ impl Pyramid {
     pub fn new(image: &WatchedImage<'_>, factor: usize) -> Option<Self> {
         let (width, height) = (image.width / factor, image.height / factor);
         let length = image.width.checked_mul(image.height)?.checked_mul(image.channels)?;
-        let least = (2 * HALF as usize + 3) << (LEVELS - 1);
+        let least = (SIDE + 2) << (LEVELS - 1);
         if image.bytes.len() != length || ![1, 3].contains(&image.channels) || width.min(height) < least {
             return None;
         }
@@ -58,7 +59,7 @@ impl Pyramid {
             }
             row.iter_mut().zip(&sums).for_each(|(to, sum)| *to = *sum as f32 * share);
         }
-        let mut levels = vec![Level { width, height, gray }];
+        let mut levels = vec![Level { width, height, gray }.smoothed()];
         while levels.len() < LEVELS {
             let half = levels.last().map(Level::halved)?;
             levels.push(half);
@@ -68,6 +69,22 @@ impl Pyramid {
 }
 
 impl Level {
+    /// Weighs each pixel with its neighbours (1 2 1 across and down): noise falls to 3/8, corners stay.
+    fn smoothed(self) -> Self {
+        let (width, height) = (self.width, self.height);
+        let pass = |from: &Gray, step: usize, index: &dyn Fn(usize) -> (usize, usize)| -> Gray {
+            let value = |i: usize| {
+                let (at, side) = index(i);
+                let (before, after) = (if at > 0 { i - step } else { i }, if at + 1 < side { i + step } else { i });
+                0.5 * from[i] + 0.25 * (from[before] + from[after])
+            };
+            (0..from.len()).map(value).collect()
+        };
+        let across = pass(&self.gray, 1, &|i| (i % width, width));
+        let gray = pass(&across, width, &|i| (i / width, height));
+        Self { width, height, gray }
+    }
+
     fn halved(&self) -> Self {
         let (width, height) = (self.width / 2, self.height / 2);
         let at = |x: usize, y: usize| self.gray[y * self.width + x];
@@ -78,30 +95,32 @@ impl Level {
         Self { width, height, gray: (0..width * height).map(pixel).collect() }
     }
 
-    /// Brightness between pixels; `None` outside.
-    fn sample(&self, x: f32, y: f32) -> Option<f32> {
-        let inside = x >= 0.0 && y >= 0.0 && x < (self.width - 1) as f32 && y < (self.height - 1) as f32;
+    /// Brightness around a place between pixels, row by row; `None` where a part lies outside.
+    fn raw_patch(&self, x: f32, y: f32) -> Option<Gray> {
+        let reach = HALF as f32;
+        let inside =
+            x >= reach && y >= reach && x + reach < (self.width - 1) as f32 && y + reach < (self.height - 1) as f32;
         if !inside {
             return None;
         }
         let (x0, y0) = (x as usize, y as usize);
         let (fx, fy) = (x - x0 as f32, y - y0 as f32);
-        let row = |y: usize| {
-            let at = y * self.width + x0;
-            self.gray[at] + fx * (self.gray[at + 1] - self.gray[at])
-        };
-        Some(row(y0) + fy * (row(y0 + 1) - row(y0)))
+        let mut values = Vec::with_capacity(SIDE * SIDE);
+        for row in 0..SIDE {
+            let at = (y0 + row - HALF) * self.width + x0 - HALF;
+            let (above, below) = (&self.gray[at..=at + SIDE], &self.gray[at + self.width..=at + self.width + SIDE]);
+            for column in 0..SIDE {
+                let top = above[column] + fx * (above[column + 1] - above[column]);
+                let bottom = below[column] + fx * (below[column + 1] - below[column]);
+                values.push(top + fy * (bottom - top));
+            }
+        }
+        Some(values)
     }
 
     /// Brightness of a patch, brought to mean 0 and length 1; `None` at the edge and without contrast.
     fn patch(&self, x: f32, y: f32) -> Option<Gray> {
-        let mut values = Vec::with_capacity(((2 * HALF + 1) * (2 * HALF + 1)) as usize);
-        for dy in -HALF..=HALF {
-            for dx in -HALF..=HALF {
-                values.push(self.sample(x + dx as f32, y + dy as f32)?);
-            }
-        }
-        normalised(values)
+        normalised(self.raw_patch(x, y)?)
     }
 }
 
@@ -129,15 +148,7 @@ struct Template {
 impl Template {
     fn new(level: &Level, x: f32, y: f32) -> Option<Self> {
         let values = level.patch(x, y)?;
-        let raw = |dx: f32, dy: f32| -> Option<Gray> {
-            let mut all = Vec::with_capacity(values.len());
-            for j in -HALF..=HALF {
-                for i in -HALF..=HALF {
-                    all.push(level.sample(x + i as f32 + dx, y + j as f32 + dy)?);
-                }
-            }
-            Some(all)
-        };
+        let raw = |dx: f32, dy: f32| level.raw_patch(x + dx, y + dy);
         // Derivatives of the normalised patch, up to its length.
         let mean = raw(0.0, 0.0)?;
         let middle = mean.iter().sum::<f32>() / mean.len() as f32;
@@ -162,15 +173,17 @@ impl Template {
 pub(super) struct Patch {
     /// Pixel of the finest level.
     pub at: DVec2,
+    /// Its direction, camera axes.
+    pub ray: DVec3,
     templates: Vec<Template>,
 }
 
-/// Chooses corners all over the image.
-pub(super) fn choose(pyramid: &Pyramid) -> Vec<Patch> {
+/// Chooses corners all over the image; `ray` gives the direction of a pixel of the finest level.
+pub(super) fn choose(pyramid: &Pyramid, ray: &dyn Fn(DVec2) -> Option<DVec3>) -> Vec<Patch> {
     let Some(level) = pyramid.0.first() else { return Vec::new() };
     let (w, h) = (level.width, level.height);
     // The smaller eigenvalue of the squared gradients over a small window, on every second pixel.
-    let reach = HALF as usize + 2;
+    let reach = HALF + 2;
     let strength = |x: usize, y: usize| {
         let (mut xx, mut xy, mut yy) = (0.0f32, 0.0f32, 0.0f32);
         for v in y - 3..=y + 3 {
@@ -201,18 +214,18 @@ pub(super) fn choose(pyramid: &Pyramid) -> Vec<Patch> {
             corners.sort_by(|a, b| b.0.total_cmp(&a.0));
             let mut chosen: Vec<(usize, usize)> = Vec::new();
             for (_, x, y) in corners {
-                let is_apart = |(a, b): &(usize, usize)| a.abs_diff(x).max(b.abs_diff(y)) > HALF as usize;
+                let is_apart = |(a, b): &(usize, usize)| a.abs_diff(x).max(b.abs_diff(y)) > HALF;
                 if chosen.len() < A_CELL && chosen.iter().all(is_apart) {
                     chosen.push((x, y));
                 }
             }
-            patches.extend(chosen.into_iter().filter_map(|(x, y)| patch(pyramid, x as f32, y as f32)));
+            patches.extend(chosen.into_iter().filter_map(|(x, y)| patch(pyramid, x as f32, y as f32, ray)));
         }
     }
     patches
 }
 
-fn patch(pyramid: &Pyramid, x: f32, y: f32) -> Option<Patch> {
+fn patch(pyramid: &Pyramid, x: f32, y: f32, ray: &dyn Fn(DVec2) -> Option<DVec3>) -> Option<Patch> {
     let mut templates = vec![Template::new(pyramid.0.first()?, x, y)?];
     for (k, level) in pyramid.0.iter().enumerate().skip(1) {
         let (x, y) = reduced(x, y, k);
@@ -222,7 +235,8 @@ fn patch(pyramid: &Pyramid, x: f32, y: f32) -> Option<Patch> {
             None => break,
         }
     }
-    Some(Patch { at: DVec2::new(f64::from(x), f64::from(y)), templates })
+    let at = DVec2::new(f64::from(x), f64::from(y));
+    Some(Patch { at, ray: ray(at)?, templates })
 }
 
 /// Place in level `k` of a pixel of the finest one: pixel centres lie at integers in both.

@@ -1,0 +1,187 @@
+//! `flyrig-bench watch`: how soon a bumped camera is found among switched lights, passers-by and exposure jumps, how well the bump is
+//! measured, at which cost, and how often nothing is taken for a bump.
+
+use std::time::Instant;
+
+use anyhow::{Context as _, Result};
+use flyrig_calib::{CameraWatch, WatchState, WatchedImage};
+use flyrig_gpu::GpuContext;
+use flyrig_report::progress_bar;
+use flyrig_sim::{LightConfig, LightSwitch, MotionConfig, MotionKind, RingConfig, Shot, SimConfig, Simulator};
+use flyrig_types::{Image, Isometry};
+use glam::{DQuat, DVec3};
+use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
+
+use crate::cli::BenchWatchArgs;
+
+/// Time between looks, seconds.
+const EVERY_SECS: f64 = 1.0;
+/// Looks before a bump, and after it at most.
+const BEFORE: u64 = 6;
+const AFTER: u64 = 20;
+/// Mean times between switches of a lamp and between exposure jumps, seconds.
+const SWITCH_SECS: f64 = 20.0;
+const JUMP_SECS: f64 = 15.0;
+
+/// Runs the command.
+pub fn watch(args: &BenchWatchArgs, gpu: &GpuContext) -> Result<()> {
+    let mut look_ms = Vec::new();
+    let (mut found, mut other, mut late_secs, mut shares) = (0u32, 0u32, Vec::new(), Vec::new());
+    let bar = progress_bar(u64::from(args.bumps), "bumps");
+    for bump in 0..args.bumps {
+        let mut room = Room::new(args, gpu, u64::from(bump), (BEFORE + AFTER) as f64 * EVERY_SECS)?;
+        let slot = bump as usize % args.cameras as usize;
+        let turn = room.direction() * args.deg.to_radians();
+        let shift = Isometry::new(DQuat::from_scaled_axis(turn), room.direction() * (1e-3 * args.mm));
+        let mut watches = room.watches()?;
+        let mut reported = None;
+        for look in 1..BEFORE + AFTER {
+            for (of, watch) in watches.iter_mut().enumerate() {
+                let bumped = (of == slot && look >= BEFORE).then_some(shift);
+                let (state, ms) = look_at(watch, &room.capture(look, of, bumped)?);
+                look_ms.push(ms);
+                match state {
+                    WatchState::Moved(motion) if of == slot && look >= BEFORE => {
+                        reported.get_or_insert((look - BEFORE, motion));
+                    }
+                    WatchState::Moved(_) => other += 1,
+                    _ => {}
+                }
+            }
+            if reported.is_some() {
+                break;
+            }
+        }
+        if reported.is_none() {
+            let axis = turn / turn.length();
+            println!("bump {bump}, about {axis:.2}, was not found; the last look: {:.2?}", watches[slot].last_motion());
+        }
+        if let Some((looks, motion)) = reported {
+            found += 1;
+            late_secs.push((looks + 1) as f64 * EVERY_SECS);
+            // What stood still turned the other way.
+            shares.push((motion.rotation + turn).length() / turn.length());
+        }
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    let median = |values: &mut Vec<f64>| {
+        values.sort_by(f64::total_cmp);
+        (values.get(values.len() / 2).copied().unwrap_or(f64::NAN), values.last().copied().unwrap_or(f64::NAN))
+    };
+    let ((late, latest), (share, worst)) = (median(&mut late_secs), median(&mut shares));
+    println!(
+        "bumps of {} degrees and {} mm, {} cameras of {}x{}: {found} of {} found, after {late:.0} s (at worst {latest:.0} s); rotation off by \
+         {:.0} % of the bump (at worst {:.0} %), its translation included; {other} looks at other cameras took them for bumped",
+        args.deg,
+        args.mm,
+        args.cameras,
+        args.width,
+        args.height,
+        args.bumps,
+        100.0 * share,
+        100.0 * worst
+    );
+    let looks = (args.minutes * 60.0 / EVERY_SECS) as u64;
+    let mut room = Room::new(args, gpu, 1000, args.minutes * 60.0)?;
+    let mut watches = room.watches()?;
+    let bar = progress_bar(looks, "looks without a bump");
+    let (mut alarms, mut steady) = (0u64, 0u64);
+    for look in 1..=looks {
+        for (slot, watch) in watches.iter_mut().enumerate() {
+            let before = watch.state();
+            let (state, ms) = look_at(watch, &room.capture(look, slot, None)?);
+            look_ms.push(ms);
+            let is_moved = |state: WatchState| matches!(state, WatchState::Moved(_));
+            alarms += u64::from(is_moved(state) && !is_moved(before));
+            steady += u64::from(state == WatchState::Steady);
+        }
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    println!(
+        "{:.0} minutes of switched lights, somebody walking, and exposure jumps: {alarms} false alarms; {steady} of {} looks steady",
+        args.minutes,
+        looks * u64::from(args.cameras)
+    );
+    let (ms, worst_ms) = median(&mut look_ms);
+    println!(
+        "a look takes {ms:.1} ms (at worst {worst_ms:.1}): {:.2} % of a core for each camera",
+        0.1 * ms / EVERY_SECS
+    );
+    Ok(())
+}
+
+fn look_at(watch: &mut CameraWatch, image: &Image) -> (WatchState, f64) {
+    let started = Instant::now();
+    let state = watch.look(&watched(image));
+    (state, 1e3 * started.elapsed().as_secs_f64())
+}
+
+fn watched(image: &Image) -> WatchedImage<'_> {
+    let (width, height) = (image.width() as usize, image.height() as usize);
+    WatchedImage { width, height, channels: 3, bytes: image.bytes() }
+}
+
+/// A simulated room whose lights are switched.
+struct Room {
+    simulator: Simulator,
+    random: SmallRng,
+    exposures: Vec<f64>,
+}
+
+impl Room {
+    fn new(args: &BenchWatchArgs, gpu: &GpuContext, seed: u64, secs: f64) -> Result<Self> {
+        let mut random = SmallRng::seed_from_u64(args.seed + seed);
+        let lamp = |azimuth_deg: f64, random: &mut SmallRng| {
+            let mut switch = Vec::new();
+            let mut at = 0.0;
+            while at < secs {
+                at += random.random_range(0.5..1.5) * SWITCH_SECS;
+                switch.push(LightSwitch { secs: at, level: random.random_range(0.2..1.5) });
+            }
+            LightConfig { azimuth_deg, elevation_deg: 50.0, intensity: 0.6, switch, ..LightConfig::default() }
+        };
+        let lights = [20.0, 140.0, 260.0].map(|azimuth| lamp(azimuth, &mut random)).to_vec();
+        let config = SimConfig {
+            seed: args.seed + seed,
+            width: args.width,
+            height: args.height,
+            motion: MotionConfig { kind: MotionKind::Walk, ..MotionConfig::default() },
+            cameras: RingConfig { count: args.cameras as usize, ..RingConfig::default() },
+            lights,
+            ..SimConfig::default()
+        };
+        Ok(Self { simulator: Simulator::new(gpu, &config)?, random, exposures: vec![1.0; args.cameras as usize] })
+    }
+
+    fn direction(&mut self) -> DVec3 {
+        loop {
+            let v = DVec3::from([0; 3].map(|_| self.random.random_range(-1.0..1.0)));
+            if (0.1..1.0).contains(&v.length()) {
+                return v.normalize();
+            }
+        }
+    }
+
+    fn capture(&mut self, look: u64, slot: usize, camera_shift: Option<Isometry>) -> Result<Image> {
+        if self.random.random_bool(EVERY_SECS / JUMP_SECS) {
+            self.exposures[slot] = self.random.random_range(0.4..1.8);
+        }
+        let nanos = (look as f64 * EVERY_SECS * 1e9) as i64;
+        let exposure = self.exposures[slot];
+        Ok(self.simulator.capture_with(&Shot { exposure, camera_shift, ..Shot::new(nanos, slot) })?.0)
+    }
+
+    /// Watches every camera, its first image being the reference.
+    fn watches(&mut self) -> Result<Vec<CameraWatch>> {
+        (0..self.exposures.len())
+            .map(|slot| {
+                let image = self.capture(0, slot, None)?;
+                let camera = &self.simulator.rig().cameras[slot];
+                CameraWatch::new(&camera.intrinsics, &watched(&image))
+                    .with_context(|| format!("camera {} shows too few corners", camera.id))
+            })
+            .collect()
+    }
+}
