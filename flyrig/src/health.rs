@@ -178,7 +178,10 @@ pub mod tests {
         let row = table.lines().nth(1).unwrap();
         let cells: Vec<&str> = row.split_whitespace().collect();
         assert_eq!(cells[..9], ["le\"ft", "900", "7", "3", "5", "2", "1", "0.40", "12.0"]);
-        assert!(row.ends_with("  YUYV 640x360 at 30.00  network: 8 lost, clock -1.5000 s +2.5 ppm"), "{row}");
+        assert!(
+            row.ends_with("  YUYV 640x360 at 30.00  moved: 9.5 px  network: 8 lost, clock -1.5000 s +2.5 ppm"),
+            "{row}"
+        );
         let last: Vec<&str> = table.lines().skip(2).collect();
         assert_eq!(
             last,

@@ -180,7 +180,7 @@ mod tests {
             }
             let texts: Vec<String> = events.iter().map(WatchEvent::to_string).collect();
             assert_eq!(events.len(), 2, "{texts:?}");
-            assert!(texts[0].starts_with("camera right was moved: it turned by 0.7"), "{texts:?}");
+            assert!(texts[0].starts_with("camera right was moved: it turned by 0.69 degrees"), "{texts:?}");
             assert!(events[0].nanos < 10_000_000_000 + 5_000_000_000, "within five seconds: {texts:?}");
             assert_eq!(texts[1], "camera right stands where it stood when its reference was taken");
             assert_eq!((watch.state(0), watch.state(1)), (WatchState::Steady, WatchState::Steady));
