@@ -167,7 +167,8 @@ impl Format {
         };
         let mut imported = match self {
             Self::Flyrig => {
-                calibration_file::parse(path, &calibration_file::read(&inside(path, &[calibration_file::FILE]))?)?
+                let file = inside(path, &[calibration_file::FILE]);
+                calibration_file::parse(&file, &calibration_file::read(&file)?)?
             }
             Self::EasyMocap => of_rig(easymocap::load_easymocap(dir(), image_size)?),
             Self::OpenCv => opencv::read(path)?,

@@ -264,7 +264,7 @@ fn damaged_files_are_named_with_the_fix() {
     check(Format::Qualisys, &[("a.qca.txt", "<a/>")], "names no camera");
     check(Format::Anipose, &[("anipose.toml", "[a]\nmatrix = 3\n")], "camera a: matrix is missing or not");
     check(Format::OpenCv, &[("a.yml", "%YAML:1.0\n---\nk: 1\n")], "camera_matrix is missing");
-    check(Format::Flyrig, &[("calibration.toml", "version = 9\n")], "version 9 is not known");
+    check(Format::Flyrig, &[("calibration.toml", "version = 9\n")], "calibration.toml: version 9 is not known");
     let good = "version = 1\nup = [0, 0, 1]\n[[cameras]]\nname = \"a\"\nsize = [640, 480]\nfocal_px = [500, 500]\ncenter_px = [320, 240]\n\
         lens = { model = \"fisheye\", coefficients = [0, 0, 0, 0] }\nrotation = [[1,0,0],[0,1,0],[0,0,1]]\ntranslation_m = [0, 0, 0]\n";
     for (from, to, expected) in [
