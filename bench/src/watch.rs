@@ -59,7 +59,7 @@ pub fn watch(args: &BenchWatchArgs, gpu: &GpuContext) -> Result<()> {
         if let Some((looks, motion)) = reported {
             found += 1;
             late_secs.push((looks + 1) as f64 * EVERY_SECS);
-            // What stood still turned the other way.
+            // `turn` moves points into the axes of the moved camera: the opposite of its own rotation.
             shares.push((motion.rotation + turn).length() / turn.length());
         }
         bar.inc(1);

@@ -28,7 +28,7 @@ pub enum CalibError {
     Format {
         /// Which file.
         path: PathBuf,
-        /// What is wrong, and the fix.
+        /// The fault and the fix.
         problem: String,
     },
     /// Not a file of OpenCV's FileStorage.

@@ -91,7 +91,7 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
     }
     print(&rig, &tracks, &fit);
     advise(&rig, &fit, options.lags);
-    // What was subtracted already, and what is left of it.
+    // Total of the offset that was subtracted already and the residual one.
     let mut better = fit.rig.clone();
     for (camera, solved) in better.cameras.iter_mut().zip(&fit.cameras) {
         let known = known_nanos.get(&camera.id).copied().unwrap_or_default();
