@@ -227,7 +227,7 @@ pub fn replay(args: &ReplayArgs) -> Result<()> {
     let threads_config = ThreadsConfig { queue_capacity: 4 * ids.len().max(1), pacing: Pacing::Lossless };
     let threads = CaptureThreads::start(replay_sources(&args.recording, &ids)?, threads_config)?;
     let settings = SyncSettings { lags_nanos: args.lags.nanos(), ..SyncSettings::default() };
-    let settings = rig.as_ref().map_or_else(|| settings.clone(), |rig| settings.with_offsets_of(rig));
+    let settings = settings.with_offsets_of(rig.as_ref().map_or(&[], |rig| rig.cameras.as_slice()));
     let mut sync = Synchronizer::new(&ids, &settings);
     if let Some(folder) = &args.export {
         ensure!(!folder.exists(), "{} is there already; name a new folder", folder.display());

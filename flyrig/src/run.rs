@@ -67,7 +67,7 @@ fn capture_people(
     }
     let mut poses = recorder.map(PoseRecording::new);
     let format = source::input_format(config.source.kind, &source.rig);
-    let sync = config.sync.with_offsets_of(&source.rig);
+    let sync = config.sync.with_offsets_of(&source.rig.cameras);
     let mut intake = Intake::start_opening(cameras, format, &sync, source::pacing(config))?;
     if config.source.kind.is_live() {
         intake = intake.live();

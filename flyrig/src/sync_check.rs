@@ -26,10 +26,7 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     let mut take = take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu)?;
     let cameras: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(cameras.len() > 1, "one camera alone has no lag; name at least two");
-    let advice = match take.is_live {
-        true => ADD_TO_CAMERA,
-        false => ADD,
-    };
+    let advice = if take.is_live { ADD_TO_CAMERA } else { ADD };
     let (estimates, frames, told, mend) = match take.calibration.take() {
         Some((rig, plates)) if !take.is_live => {
             let (estimates, frames) = by_silhouettes(args, &rig, plates, take)?;

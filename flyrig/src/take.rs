@@ -181,7 +181,7 @@ pub fn open_calibrated(
         take.calibration = Some(calibration(folder, &take.sources)?);
     }
     if let Some((rig, _)) = &take.calibration {
-        take.sync = take.sync.with_offsets_of(rig);
+        take.sync = take.sync.with_offsets_of(&rig.cameras);
     }
     Ok(take)
 }

@@ -61,7 +61,9 @@ impl Replay {
     pub fn open(settings: &ReplaySettings, gpu: &GpuContext) -> Result<Self> {
         settings.session.validate()?;
         let (rig, holdout) = load_rigs(settings)?;
-        let settings = &with_offsets(settings, rig.cameras.iter().chain(&holdout));
+        let sync = SyncSettings { lags_nanos: settings.lags_nanos.clone(), ..SyncSettings::default() };
+        let lags_nanos = sync.with_offsets_of(&rig.cameras).with_offsets_of(&holdout).lags_nanos;
+        let settings = &ReplaySettings { lags_nanos, ..settings.clone() };
         let (sets, count) = open_inputs(settings, &rig)?;
         let truth = TruthReader::open(settings, &holdout)?;
         let perceived = &settings.session.perception;
@@ -107,15 +109,6 @@ impl Replay {
         let damaged = self.sets.damaged();
         serde_json::json!({ "complete": counts.complete, "partial": counts.partial, "broken_pictures": damaged })
     }
-}
-
-/// Adds the calibration's time offsets for cameras that have none in the settings.
-fn with_offsets<'a>(settings: &ReplaySettings, cameras: impl Iterator<Item = &'a Camera>) -> ReplaySettings {
-    let mut settings = settings.clone();
-    for camera in cameras.filter(|camera| camera.time_offset_nanos != 0) {
-        settings.lags_nanos.entry(camera.id.clone()).or_insert(camera.time_offset_nanos);
-    }
-    settings
 }
 
 fn load_rigs(args: &ReplaySettings) -> Result<(Rig, Vec<Camera>)> {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use flyrig_types::{CameraId, Rig};
+use flyrig_types::{Camera, CameraId};
 use serde::{Deserialize, Serialize};
 
 use crate::ClockKind;
@@ -34,11 +34,11 @@ pub struct SyncSettings {
 }
 
 impl SyncSettings {
-    /// Returns the settings with the time offsets of a calibration for the cameras that have none here.
+    /// Returns the settings with the time offsets of calibrated cameras that have none here.
     #[must_use]
-    pub fn with_offsets_of(&self, rig: &Rig) -> Self {
+    pub fn with_offsets_of(&self, cameras: &[Camera]) -> Self {
         let mut settings = self.clone();
-        for camera in rig.cameras.iter().filter(|camera| camera.time_offset_nanos != 0) {
+        for camera in cameras.iter().filter(|camera| camera.time_offset_nanos != 0) {
             settings.lags_nanos.entry(camera.id.clone()).or_insert(camera.time_offset_nanos);
         }
         settings
