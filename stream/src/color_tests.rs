@@ -1,0 +1,175 @@
+//! Colours: quality, losses, budgets and damaged messages.
+
+#![allow(clippy::unwrap_used)] // helpers of tests
+
+use std::{vec, vec::Vec};
+
+use crate::{
+    ColorDecoder, ColorEncoder, ColorSettings, EncodedTemplate, LAYERS, Stamp,
+    testing::{Person, damaged},
+};
+
+const FRAME_NANOS: i64 = 33_333_333;
+
+fn stamp(frame: u64) -> Stamp {
+    Stamp { frame, capture_nanos: frame as i64 * FRAME_NANOS, ..Stamp::default() }
+}
+
+fn code(linear: f32) -> f64 {
+    let linear = f64::from(linear);
+    255.0 * if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
+}
+
+/// Root mean square error of the decoder's colours, sRGB codes.
+fn rms(decoder: &mut ColorDecoder, encoded: &EncodedTemplate, truth: &[[f32; 4]]) -> f64 {
+    let mut colors = Vec::new();
+    decoder.colors(&mut colors);
+    let mut sum = 0.0;
+    for (found, &from) in colors.iter().zip(&encoded.gaussian_order) {
+        sum += (0..3).map(|c| (code(found[c]) - code(truth[from as usize][c])).powi(2)).sum::<f64>();
+    }
+    (sum / (3 * colors.len()) as f64).sqrt()
+}
+
+#[test]
+fn colours_follow_within_their_step() {
+    let person = Person::tube(4000, 0);
+    let encoded = person.encode();
+    for step in [2.0, 8.0] {
+        let settings = ColorSettings { step, ..ColorSettings::default() };
+        let mut encoder = ColorEncoder::new(&encoded, settings, 1);
+        let mut decoder = ColorDecoder::new(&encoded.template);
+        for frame in 0..20 {
+            let colors = person.colors(0.02 * frame as f32);
+            for message in encoder.encode(stamp(frame), &colors) {
+                assert_eq!(decoder.take(&message).unwrap().frame, frame);
+            }
+            let error = rms(&mut decoder, &encoded, &colors);
+            assert!(error < 0.6 * f64::from(step), "{step} {frame}: {error}");
+        }
+        assert_eq!((decoder.known(0), decoder.known(2)), (1.0, 1.0));
+    }
+}
+
+#[test]
+fn a_scene_at_rest_costs_its_refresh_alone() {
+    let person = Person::tube(4000, 0);
+    let encoded = person.encode();
+    let mut encoder = ColorEncoder::new(&encoded, ColorSettings::default(), 1);
+    let colors = person.colors(0.0);
+    let bytes = |messages: [Vec<u8>; LAYERS]| messages.iter().map(Vec::len).sum::<usize>();
+    let first = bytes(encoder.encode(stamp(0), &colors));
+    let rest: usize = (1..31).map(|frame| bytes(encoder.encode(stamp(frame), &colors))).sum();
+    // A second of frames repeats everything once; headers aside.
+    let headers = 30 * LAYERS * 60;
+    assert!(rest < first * 2 + headers, "{first} {rest}");
+}
+
+#[test]
+fn a_loss_is_repaired_within_a_second_and_a_refresh_changes_nothing() {
+    let person = Person::tube(4000, 0);
+    let encoded = person.encode();
+    let mut encoder = ColorEncoder::new(&encoded, ColorSettings::default(), 1);
+    let mut whole = ColorDecoder::new(&encoded.template);
+    // One loses messages, the other comes late.
+    let mut lossy = ColorDecoder::new(&encoded.template);
+    let mut late = ColorDecoder::new(&encoded.template);
+    let (mut a, mut b, mut c) = (Vec::new(), Vec::new(), Vec::new());
+    for frame in 0..100 {
+        let colors = person.colors(0.05 * (frame as f32).min(60.0));
+        for message in encoder.encode(stamp(frame), &colors) {
+            whole.take(&message).unwrap();
+            if !(40..60).contains(&frame) || frame % 3 == 0 {
+                lossy.take(&message).unwrap();
+            }
+            if frame >= 50 {
+                late.take(&message).unwrap();
+            }
+        }
+        if frame == 58 {
+            whole.colors(&mut a);
+            lossy.colors(&mut b);
+            assert_ne!(a, b);
+        }
+    }
+    assert!(lossy.missed(0) > 10 && whole.missed(0) == 0);
+    whole.colors(&mut a);
+    lossy.colors(&mut b);
+    late.colors(&mut c);
+    assert!(a == b && a == c);
+}
+
+#[test]
+fn frames_keep_their_budget_and_catch_up() {
+    let person = Person::tube(20_000, 0);
+    let encoded = person.encode();
+    let settings = ColorSettings { step: 2.0, max_frame_bytes: 6000, ..ColorSettings::default() };
+    let mut encoder = ColorEncoder::new(&encoded, settings, 1);
+    let mut decoder = ColorDecoder::new(&encoded.template);
+    let colors = person.colors(0.0);
+    let mut errors = Vec::new();
+    for frame in 0..60 {
+        let messages = encoder.encode(stamp(frame), &colors);
+        let bytes: usize = messages.iter().map(Vec::len).sum();
+        // What is left of a budget holds the header of an empty message.
+        assert!(bytes <= 6000 + 2 * 60, "{frame}: {bytes}");
+        for message in messages {
+            decoder.take(&message).unwrap();
+        }
+        errors.push(rms(&mut decoder, &encoded, &colors));
+    }
+    assert!(errors[0] > 2.0 && errors[59] < 0.6 * 2.0, "{} {}", errors[0], errors[59]);
+}
+
+#[test]
+fn an_encoder_that_begins_anew_is_followed() {
+    let person = Person::tube(1000, 0);
+    let encoded = person.encode();
+    let mut decoder = ColorDecoder::new(&encoded.template);
+    for (epoch, time) in [(1, 0.0), (2, 3.0)] {
+        let colors = person.colors(time);
+        let mut encoder = ColorEncoder::new(&encoded, ColorSettings::default(), epoch);
+        for message in encoder.encode(stamp(0), &colors) {
+            decoder.take(&message).unwrap();
+        }
+        assert!(rms(&mut decoder, &encoded, &colors) < 5.0);
+    }
+}
+
+#[test]
+fn poisoned_colours_and_sizes_are_no_panic() {
+    for count in [1, 2, 5, 33, 1000] {
+        let person = Person::tube(count, 0);
+        let encoded = person.encode();
+        let mut encoder = ColorEncoder::new(&encoded, ColorSettings { step: f32::NAN, ..ColorSettings::default() }, 1);
+        let mut decoder = ColorDecoder::new(&encoded.template);
+        let mut found = Vec::new();
+        decoder.colors(&mut found);
+        assert_eq!(found.len(), count);
+        for colors in [vec![[f32::NAN; 4]; count], vec![[f32::INFINITY; 4]; count], vec![[-1e30; 4]; count], Vec::new()]
+        {
+            for message in encoder.encode(stamp(0), &colors) {
+                decoder.take(&message).unwrap();
+            }
+            decoder.colors(&mut found);
+            assert!(found.iter().flatten().all(|v| (0.0..=1.0).contains(v)), "{count}");
+        }
+    }
+}
+
+#[test]
+fn damaged_messages_are_no_panic() {
+    let person = Person::tube(2000, 0);
+    let encoded = person.encode();
+    let mut encoder = ColorEncoder::new(&encoded, ColorSettings::default(), 1);
+    let mut decoder = ColorDecoder::new(&encoded.template);
+    let mut found = Vec::new();
+    for message in encoder.encode(stamp(0), &person.colors(0.0)) {
+        damaged(&message, 1500, |bytes| {
+            // Refused or not: it goes on.
+            let _ = decoder.take(bytes);
+            decoder.colors(&mut found);
+            assert!(found.iter().flatten().all(|v| (0.0..=1.0).contains(v)));
+        });
+    }
+}

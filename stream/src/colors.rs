@@ -1,0 +1,401 @@
+//! Colours: changes of quantised Haar coefficients from frame to frame, in layers from coarse to fine.
+//!
+//! Encoder and decoder keep the coefficients in whole steps. A message changes some segments of the surface, each either by
+//! the difference from the encoder's last state or by the state itself (a refresh, after which a decoder is right whatever it
+//! missed). Every segment is refreshed once in [`ColorSettings::refresh_secs`]; the refresh of a segment that a decoder followed changes
+//! nothing, so it cannot be seen. A decoder that misses a message errs by the changes of that message alone.
+//!
+//! A message ends where its bytes do: the remaining segments wait for the next frame.
+
+use alloc::{vec, vec::Vec};
+use core::ops::Range;
+
+use crate::{
+    EncodedTemplate, MAX_MESSAGE_BYTES, Stamp, StreamError, Template,
+    bytes::Fields,
+    coefficients::{CoefficientModel, GROUP, Levels},
+    integers::MOST,
+    motion::{quantise, step_at},
+    range_coder::{BitCoder, Probability, RangeDecoder, RangeEncoder},
+    srgb::Srgb,
+    tree::{CHANNELS, HaarTree},
+};
+
+/// Layers, from coarse to fine: a viewer can show any number of the first ones.
+pub const LAYERS: usize = 3;
+
+const MAGIC: [u8; 3] = *b"FLC";
+const WHAT: &str = "colour message";
+/// Step of the two colour differences against that of the brightness.
+const CHROMA: f32 = 1.8;
+/// Changes below `1 - ROUND_UP` of a step count as none.
+const ROUND_UP: f32 = 0.3;
+
+/// How colours are coded.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ColorSettings {
+    /// Quantisation step of the brightness, codes of 0..=255 sRGB.
+    pub step: f32,
+    /// Within this time every segment is refreshed, seconds.
+    pub refresh_secs: f32,
+    /// Most bytes of a frame in all layers.
+    pub max_frame_bytes: usize,
+}
+
+impl Default for ColorSettings {
+    fn default() -> Self {
+        Self { step: 8.0, refresh_secs: 1.0, max_frame_bytes: 60_000 }
+    }
+}
+
+/// Levels of a layer: the finest three belong to the last layer, the next three to the one before.
+fn layer_levels(tree: &HaarTree, layer: usize) -> Range<u32> {
+    let all = tree.levels();
+    let end = |layer: usize| all.end.saturating_sub((LAYERS - 1 - layer) as u32 * GROUP).max(all.start);
+    let start = if layer == 0 { all.start } else { end(layer - 1) };
+    start..end(layer)
+}
+
+/// The groups of a layer's levels, the last one full.
+fn groups(levels: Range<u32>) -> impl Iterator<Item = Range<u32>> {
+    let count = (levels.end - levels.start).div_ceil(GROUP);
+    (0..count).rev().map(move |i| {
+        let end = levels.end - i * GROUP;
+        end.saturating_sub(GROUP).max(levels.start)..end
+    })
+}
+
+/// Probabilities of a message.
+#[derive(Debug, Clone, Copy, Default)]
+struct Model {
+    is_refresh: Probability,
+    /// Differences and states look different.
+    coefficients: [CoefficientModel; 2],
+}
+
+impl Model {
+    /// Codes a segment's part of a layer.
+    fn code(
+        &mut self,
+        coder: &mut impl BitCoder,
+        tree: &HaarTree,
+        (layer, segment): (usize, usize),
+        is_refresh: bool,
+        values: &mut [Levels],
+    ) -> bool {
+        let is_refresh = coder.bit(&mut self.is_refresh, is_refresh);
+        let model = &mut self.coefficients[usize::from(is_refresh)];
+        if layer == 0 {
+            model.code_mean(coder, &mut values[segment]);
+        }
+        for group in groups(layer_levels(tree, layer)) {
+            model.code_group(coder, tree, group, segment, values);
+        }
+        is_refresh
+    }
+}
+
+/// Calls `each` with the places of a segment's coefficients in a layer.
+fn each_place(tree: &HaarTree, layer: usize, segment: usize, mut each: impl FnMut(usize)) {
+    if layer == 0 {
+        each(segment);
+    }
+    for level in layer_levels(tree, layer) {
+        tree.places(level, segment).for_each(&mut each);
+    }
+}
+
+/// Codes brightness and two colour differences.
+fn differences_of([r, g, b]: [f32; 3]) -> [f32; CHANNELS] {
+    [0.25 * (r + 2.0 * g + b), (r - b) / CHROMA, (g - 0.5 * (r + b)) / CHROMA]
+}
+
+fn color_of([y, red_blue, green]: [f32; CHANNELS]) -> [f32; 3] {
+    let (red_blue, green) = (red_blue * CHROMA, green * CHROMA);
+    let others = y - 0.5 * green;
+    [others + 0.5 * red_blue, y + 0.5 * green, others - 0.5 * red_blue]
+}
+
+/// Encodes the colours of one template, frame after frame.
+#[derive(Debug, Clone)]
+pub struct ColorEncoder {
+    template: u64,
+    settings: ColorSettings,
+    /// Tells decoders that the states begin anew.
+    epoch: u32,
+    order: Vec<u32>,
+    tree: HaarTree,
+    srgb: Srgb,
+    steps: Vec<f32>,
+    state: Vec<Levels>,
+    changes: Vec<Levels>,
+    layers: [LayerState; LAYERS],
+    /// Capture time of the message before.
+    last_nanos: Option<i64>,
+    items: Vec<[f32; 3]>,
+    coefficients: Vec<[f32; 3]>,
+    means: Vec<[f32; 3]>,
+}
+
+#[derive(Debug, Clone)]
+struct LayerState {
+    sequence: u32,
+    /// Segment that is coded first in the next message.
+    first: usize,
+    /// Whether the decoders can know a segment.
+    is_known: Vec<bool>,
+    /// Segment that is refreshed next, and how many are due.
+    next_refresh: usize,
+    due: f32,
+}
+
+impl ColorEncoder {
+    /// For a template. `epoch` must differ from that of an earlier encoder of the same person and template.
+    #[must_use]
+    pub fn new(template: &EncodedTemplate, settings: ColorSettings, epoch: u32) -> Self {
+        let tree = HaarTree::new(template.template.gaussians());
+        let is_known = vec![false; tree.segments()];
+        let layer = LayerState { sequence: 0, first: 0, is_known, next_refresh: 0, due: 0.0 };
+        let settings = ColorSettings {
+            step: if settings.step.is_finite() { settings.step.clamp(0.25, 128.0) } else { 8.0 },
+            refresh_secs: settings.refresh_secs.max(0.1),
+            max_frame_bytes: settings.max_frame_bytes,
+        };
+        Self {
+            template: template.template.hash,
+            settings,
+            epoch,
+            order: template.gaussian_order.clone(),
+            srgb: Srgb::new(),
+            steps: coefficient_steps(&tree, settings.step),
+            state: vec![[0; CHANNELS]; tree.coefficients()],
+            changes: vec![[0; CHANNELS]; tree.coefficients()],
+            layers: core::array::from_fn(|_| layer.clone()),
+            last_nanos: None,
+            items: vec![[0.0; 3]; tree.items()],
+            coefficients: vec![[0.0; 3]; tree.coefficients()],
+            means: Vec::new(),
+            tree,
+        }
+    }
+
+    /// Encodes the linear colours of a frame, in the order of the template's source: a message a layer. A colour that is missing
+    /// or not finite counts as black.
+    pub fn encode(&mut self, stamp: Stamp, colors: &[[f32; 4]]) -> [Vec<u8>; LAYERS] {
+        let stamp = Stamp { template: self.template, ..stamp };
+        for (item, &from) in self.items.iter_mut().zip(&self.order) {
+            let [r, g, b, _] = colors.get(from as usize).copied().unwrap_or_default();
+            *item = differences_of([r, g, b].map(|linear| self.srgb.code(linear)));
+        }
+        self.tree.forward(&self.items, &mut self.coefficients, &mut self.means);
+        let elapsed = self.last_nanos.map_or(0.0, |last| stamp.capture_nanos.saturating_sub(last) as f32 / 1e9);
+        self.last_nanos = Some(stamp.capture_nanos);
+        let refreshed = self.tree.segments() as f32 * (elapsed / self.settings.refresh_secs).clamp(0.0, 1.0);
+        let mut left = self.settings.max_frame_bytes;
+        core::array::from_fn(|layer| {
+            self.layers[layer].due += refreshed;
+            let message = self.encode_layer(stamp, layer, left.min(MAX_MESSAGE_BYTES));
+            left = left.saturating_sub(message.len());
+            message
+        })
+    }
+
+    fn encode_layer(&mut self, stamp: Stamp, layer: usize, max_bytes: usize) -> Vec<u8> {
+        let segments = self.tree.segments();
+        let LayerState { sequence, first, .. } = self.layers[layer];
+        let mut bytes = stamp.begin(MAGIC);
+        bytes.extend(self.epoch.to_le_bytes());
+        bytes.extend(self.settings.step.to_le_bytes());
+        bytes.extend(sequence.to_le_bytes());
+        bytes.push(layer as u8);
+        bytes.push(first as u8);
+        let count_at = bytes.len();
+        bytes.push(0);
+
+        let due = (self.layers[layer].due as usize).min(segments);
+        let refreshes = self.layers[layer].next_refresh..self.layers[layer].next_refresh + due;
+        let is_due = |segment: usize| refreshes.contains(&segment) || refreshes.contains(&(segment + segments));
+        let mut encoder = RangeEncoder::new(bytes);
+        let mut model = Model::default();
+        let mut count = 0;
+        for i in 0..segments {
+            let segment = (first + i) % segments;
+            let is_refresh = is_due(segment) || !self.layers[layer].is_known[segment];
+            let mark = encoder.mark();
+            let (coefficients, state, steps) = (&self.coefficients, &self.state, &self.steps);
+            let changes = &mut self.changes;
+            each_place(&self.tree, layer, segment, |place| {
+                let step = 1.0 / steps[place];
+                changes[place] = core::array::from_fn(|c| {
+                    let (value, old) = (coefficients[place][c] * step, state[place][c]);
+                    let change = quantise(value - old as f32, ROUND_UP);
+                    let new = (old + change).clamp(-MOST, MOST);
+                    if is_refresh { new } else { (new - old).clamp(-MOST, MOST) }
+                });
+            });
+            model.code(&mut encoder, &self.tree, (layer, segment), is_refresh, &mut self.changes);
+            if encoder.len() > max_bytes {
+                encoder.rewind(mark);
+                break;
+            }
+            let (state, changes) = (&mut self.state, &self.changes);
+            each_place(&self.tree, layer, segment, |place| {
+                state[place] =
+                    core::array::from_fn(|c| changes[place][c] + if is_refresh { 0 } else { state[place][c] });
+            });
+            self.layers[layer].is_known[segment] = true;
+            count += 1;
+        }
+        let layer = &mut self.layers[layer];
+        layer.sequence = layer.sequence.wrapping_add(1);
+        // Where it broke off the next message begins; a complete one begins anywhere.
+        layer.first = (first + count) % segments;
+        // Refreshes that did not fit stay due.
+        let coded = |segment: usize| (segment + segments - first) % segments < count;
+        while layer.due >= 1.0 && coded(layer.next_refresh) {
+            layer.next_refresh = (layer.next_refresh + 1) % segments;
+            layer.due -= 1.0;
+        }
+        layer.due = layer.due.min(segments as f32);
+        let mut bytes = encoder.finish();
+        bytes[count_at] = count as u8;
+        bytes
+    }
+}
+
+/// Step of each coefficient.
+fn coefficient_steps(tree: &HaarTree, step: f32) -> Vec<f32> {
+    let (mean_step, steps) = tree.steps(step);
+    (0..tree.coefficients()).map(|place| step_at(tree, place, mean_step, &steps)).collect()
+}
+
+/// Decodes the colours of one person and template.
+#[derive(Debug, Clone)]
+pub struct ColorDecoder {
+    template: u64,
+    tree: HaarTree,
+    srgb: Srgb,
+    step: f32,
+    steps: Vec<f32>,
+    epoch: Option<u32>,
+    state: Vec<Levels>,
+    values: Vec<Levels>,
+    layers: [DecodedLayer; LAYERS],
+    means: Vec<[f32; 3]>,
+}
+
+#[derive(Debug, Clone)]
+struct DecodedLayer {
+    is_known: Vec<bool>,
+    sequence: Option<u32>,
+    missed: u64,
+}
+
+impl ColorDecoder {
+    /// For a template, all grey.
+    #[must_use]
+    pub fn new(template: &Template) -> Self {
+        let tree = HaarTree::new(template.gaussians());
+        let layer = DecodedLayer { is_known: vec![false; tree.segments()], sequence: None, missed: 0 };
+        Self {
+            template: template.hash,
+            srgb: Srgb::new(),
+            step: 0.0,
+            steps: Vec::new(),
+            epoch: None,
+            state: vec![[0; CHANNELS]; tree.coefficients()],
+            values: vec![[0; CHANNELS]; tree.coefficients()],
+            layers: core::array::from_fn(|_| layer.clone()),
+            means: Vec::new(),
+            tree,
+        }
+    }
+
+    /// Takes in a message and returns its stamp.
+    ///
+    /// # Errors
+    /// [`StreamError`]; a message of another template changes nothing.
+    pub fn take(&mut self, bytes: &[u8]) -> Result<Stamp, StreamError> {
+        let mut fields = Fields::of(WHAT, MAGIC, bytes)?;
+        fields.check(bytes.len() <= MAX_MESSAGE_BYTES, "it is too large")?;
+        let stamp = Stamp::read(&mut fields)?;
+        if stamp.template != self.template {
+            return Err(StreamError::OtherTemplate { what: WHAT });
+        }
+        let (epoch, step, sequence) = (fields.u32()?, fields.f32()?, fields.u32()?);
+        let (layer, first, count) = (usize::from(fields.u8()?), usize::from(fields.u8()?), usize::from(fields.u8()?));
+        let segments = self.tree.segments();
+        fields.check((0.25..=128.0).contains(&step), "its quantisation step makes no sense")?;
+        fields.check(layer < LAYERS && first < segments && count <= segments, "it names a part that does not exist")?;
+        if self.epoch != Some(epoch) || self.step.to_bits() != step.to_bits() {
+            self.begin(epoch, step);
+        }
+        let known = &mut self.layers[layer];
+        let next = known.sequence.map_or(sequence, |last| last.wrapping_add(1));
+        known.missed += u64::from(sequence.wrapping_sub(next).min(1 << 16));
+        known.sequence = Some(sequence);
+        let mut decoder = RangeDecoder::new(fields.bytes);
+        let mut model = Model::default();
+        for i in 0..count {
+            let segment = (first + i) % segments;
+            let is_refresh = model.code(&mut decoder, &self.tree, (layer, segment), false, &mut self.values);
+            let is_known = &mut self.layers[layer].is_known[segment];
+            *is_known |= is_refresh;
+            if !*is_known {
+                continue;
+            }
+            let (state, values) = (&mut self.state, &self.values);
+            each_place(&self.tree, layer, segment, |place| {
+                state[place] = core::array::from_fn(|c| {
+                    let old = if is_refresh { 0 } else { state[place][c] };
+                    (old + values[place][c]).clamp(-MOST, MOST)
+                });
+            });
+        }
+        Ok(stamp)
+    }
+
+    /// The encoder began anew.
+    fn begin(&mut self, epoch: u32, step: f32) {
+        (self.epoch, self.step) = (Some(epoch), step);
+        self.steps = coefficient_steps(&self.tree, step);
+        self.state.fill([0; CHANNELS]);
+        for layer in &mut self.layers {
+            layer.is_known.fill(false);
+            layer.sequence = None;
+        }
+    }
+
+    /// Counts the messages of a layer that were missed since the start.
+    #[must_use]
+    pub fn missed(&self, layer: usize) -> u64 {
+        self.layers.get(layer).map_or(0, |layer| layer.missed)
+    }
+
+    /// Returns the share of a layer's segments that have come, 0..=1.
+    #[must_use]
+    pub fn known(&self, layer: usize) -> f32 {
+        self.layers.get(layer).map_or(0.0, |layer| {
+            layer.is_known.iter().filter(|known| **known).count() as f32 / layer.is_known.len().max(1) as f32
+        })
+    }
+
+    /// Writes the linear colours, opacity 1, in the template's order. Segments that have not come yet are grey.
+    pub fn colors(&mut self, colors: &mut Vec<[f32; 4]>) {
+        colors.clear();
+        colors.resize(self.tree.items(), [0.0, 0.0, 0.0, 1.0]);
+        let (state, steps, base) = (&self.state, &self.steps, &self.layers[0].is_known);
+        let at = |place: usize| {
+            if place < base.len() && !base[place] {
+                return [128.0, 0.0, 0.0];
+            }
+            let step = steps.get(place).copied().unwrap_or(0.0);
+            state[place].map(|v| v as f32 * step)
+        };
+        let srgb = &self.srgb;
+        self.tree.inverse(at, &mut self.means, |i, item| {
+            let [r, g, b] = color_of(item).map(|code| srgb.linear(code));
+            colors[i] = [r, g, b, 1.0];
+        });
+    }
+}

@@ -1,0 +1,122 @@
+//! Models of integers.
+
+use crate::range_coder::{BitCoder, Probability};
+
+/// Largest magnitude of a coded value.
+pub(crate) const MOST: i32 = 1 << 20;
+
+/// Steps of a magnitude that have a probability of their own.
+const STEPS: usize = 14;
+
+/// Magnitudes of values that are not zero: steps up from 1 while small, then an Elias gamma code.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct MagnitudeModel([Probability; STEPS]);
+
+impl MagnitudeModel {
+    /// Codes a value of -[`MOST`]..=[`MOST`] that is not zero.
+    pub fn code(&mut self, coder: &mut impl BitCoder, value: i32) -> i32 {
+        let is_negative = coder.raw(1, u32::from(value < 0)) == 1;
+        let magnitude = value.unsigned_abs();
+        let mut found = 1;
+        for step in &mut self.0 {
+            if !coder.bit(step, magnitude > found) {
+                return if is_negative { -(found as i32) } else { found as i32 };
+            }
+            found += 1;
+        }
+        let found = (found + gamma(coder, magnitude.saturating_sub(found))).min(MOST as u32) as i32;
+        if is_negative { -found } else { found }
+    }
+}
+
+/// Elias gamma code of `value + 1`, for values below 2^23.
+fn gamma(coder: &mut impl BitCoder, value: u32) -> u32 {
+    let bits = (value + 1).ilog2();
+    let mut found = 0;
+    while found < 23 && coder.raw(1, u32::from(bits > found)) == 1 {
+        found += 1;
+    }
+    let below = coder.raw(found, (value + 1) & ((1 << bits) - 1));
+    (1 << found | below) - 1
+}
+
+/// Numbers of any size below 2^24: their length as a tree of adaptive decisions, then their upper two bits with a model
+/// and the rest without.
+#[derive(Debug, Clone)]
+pub(crate) struct NumberModel {
+    length: [Probability; 32],
+    upper: [[Probability; 4]; 32],
+}
+
+impl Default for NumberModel {
+    fn default() -> Self {
+        Self { length: [Probability::default(); 32], upper: [[Probability::default(); 4]; 32] }
+    }
+}
+
+impl NumberModel {
+    /// Codes a number below 2^24.
+    pub fn code(&mut self, coder: &mut impl BitCoder, number: u32) -> u32 {
+        let length = 32 - number.leading_zeros();
+        let mut node = 1;
+        for at in (0..5).rev() {
+            node = 2 * node + usize::from(coder.bit(&mut self.length[node & 31], length >> at & 1 == 1));
+        }
+        let length = (node & 31).min(24) as u32;
+        if length < 2 {
+            return length;
+        }
+        // Behind the leading 1: two bits with a model, then the rest.
+        let mut found = 1;
+        let modelled = (length - 1).min(2);
+        let mut node = 1;
+        for at in 0..modelled {
+            let bit = number >> (length - 2 - at) & 1 == 1;
+            let bit = coder.bit(&mut self.upper[length as usize][node & 3], bit);
+            node = 2 * node + usize::from(bit);
+            found = found << 1 | u32::from(bit);
+        }
+        let rest = length - 1 - modelled;
+        found << rest | coder.raw(rest, number & ((1 << rest) - 1))
+    }
+
+    /// Codes a signed number of magnitude below 2^23.
+    pub fn code_signed(&mut self, coder: &mut impl BitCoder, number: i32) -> i32 {
+        let folded = ((number << 1) ^ (number >> 31)) as u32;
+        let folded = self.code(coder, folded);
+        (folded >> 1) as i32 ^ -((folded & 1) as i32)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use alloc::vec::Vec;
+
+    use super::*;
+    use crate::range_coder::{RangeDecoder, RangeEncoder};
+
+    #[test]
+    fn values_of_every_size_come_back() {
+        let values: Vec<i32> =
+            (0..21).flat_map(|bits| [1 << bits, (1 << bits) - 1, -(1 << bits), 1 - (1 << bits)]).collect();
+        let mut encoder = RangeEncoder::new(Vec::new());
+        let (mut magnitudes, mut numbers) = (MagnitudeModel::default(), NumberModel::default());
+        for value in &values {
+            if *value != 0 {
+                magnitudes.code(&mut encoder, *value);
+            }
+            numbers.code_signed(&mut encoder, *value);
+            numbers.code(&mut encoder, value.unsigned_abs());
+        }
+        let bytes = encoder.finish();
+        let mut decoder = RangeDecoder::new(&bytes);
+        let (mut magnitudes, mut numbers) = (MagnitudeModel::default(), NumberModel::default());
+        for value in &values {
+            if *value != 0 {
+                assert_eq!(magnitudes.code(&mut decoder, 1), *value);
+            }
+            assert_eq!(numbers.code_signed(&mut decoder, 0), *value);
+            assert_eq!(numbers.code(&mut decoder, 0), value.unsigned_abs());
+        }
+    }
+}

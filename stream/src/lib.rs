@@ -1,0 +1,56 @@
+//! Codec of the tracked person, for lines of 10 Mbit/s: what a rig sends to those who draw the person themselves.
+//!
+//! | message | content | when |
+//! |---|---|---|
+//! | [`Template`] | Gaussians at rest, skin and node weights, skeleton | once a viewer, by its hash |
+//! | [`Motion`] | pose, translations of the deformation graph's nodes | every frame, readable by itself |
+//! | colours, in [`LAYERS`] layers | changes since the message before, from coarse to fine | every frame |
+//!
+//! The viewer poses the Gaussians itself ([`Template::pose`]): FlyHuman Eq. 2 is linear in the node translations, and a pose is
+//! a few hundred bytes. Colours are coded as Haar coefficients over a tree of the template's surface ([`ColorEncoder`]).
+//!
+//! Each message but the template has at most [`MAX_MESSAGE_BYTES`]. No decoder panics on any input, allocates more than
+//! in proportion to the template, or takes longer than for a valid message of the same template.
+//!
+//! The crate needs `alloc` only, so that the same code runs in a browser.
+
+#![no_std]
+
+extern crate alloc;
+#[cfg(test)]
+extern crate std;
+
+mod bytes;
+mod coefficients;
+#[cfg(test)]
+mod color_tests;
+mod colors;
+mod error;
+mod integers;
+mod motion;
+mod order;
+mod planes;
+mod pose;
+#[cfg(test)]
+mod pose_tests;
+mod range_coder;
+mod srgb;
+mod stamp;
+mod template;
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // helpers of tests
+mod testing;
+mod tree;
+
+pub use colors::{ColorDecoder, ColorEncoder, ColorSettings, LAYERS};
+pub use error::StreamError;
+pub use motion::{Motion, MotionEncoder};
+pub use pose::Posed;
+pub use stamp::Stamp;
+pub use template::{EncodedTemplate, Joint, MAX_TEMPLATE_BYTES, Template, TemplateSource};
+
+/// Version of every message of this codec.
+pub const CODEC_VERSION: u8 = 1;
+
+/// Most bytes of a message that is not a template: with zenoh's own header it fits in one of its batches of 65,535 bytes.
+pub const MAX_MESSAGE_BYTES: usize = 65_000;

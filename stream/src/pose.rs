@@ -1,0 +1,86 @@
+//! Forward kinematics and linear blend skinning of a template.
+
+use alloc::vec::Vec;
+
+use crate::{Motion, Template};
+
+/// Gaussians in the world; both lists have one element a Gaussian.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Posed {
+    /// Centre, metres, and standard deviation, metres.
+    pub center_scale: Vec<[f32; 4]>,
+    /// Unit normal; w: 0.
+    pub normal: Vec<[f32; 4]>,
+}
+
+/// Three rows of an affine motion.
+type Rows = [[f32; 4]; 3];
+
+impl Template {
+    /// Poses the Gaussians: world = LBS(x + sum of w t) (FlyHuman Eq. 1 and 2). A motion that lacks joints or nodes leaves
+    /// them at rest.
+    pub fn pose(&self, motion: &Motion, posed: &mut Posed) {
+        let matrices = self.world_from_canonical(motion);
+        posed.center_scale.clear();
+        posed.normal.clear();
+        for (i, (&[x, y, z, scale], normal)) in self.center_scale.iter().zip(&self.normals).enumerate() {
+            let mut point = [x, y, z];
+            if let Some(nodes) = self.node_weights.get(i) {
+                for (node, share) in nodes.index.into_iter().zip(nodes.shares()) {
+                    if let Some(by) = motion.nodes.get(node as usize) {
+                        for k in 0..3 {
+                            point[k] += share * by[k];
+                        }
+                    }
+                }
+            }
+            let mut rows: Rows = [[0.0; 4]; 3];
+            let skin = &self.skin[i];
+            for (joint, share) in skin.index.into_iter().zip(skin.shares()).filter(|(_, share)| *share > 0.0) {
+                for (row, of_joint) in rows.iter_mut().zip(&matrices[joint as usize]) {
+                    for k in 0..4 {
+                        row[k] += share * of_joint[k];
+                    }
+                }
+            }
+            let [px, py, pz] = rows.map(|[a, b, c, d]| a * point[0] + b * point[1] + c * point[2] + d);
+            posed.center_scale.push([px, py, pz, scale]);
+            let turned = rows.map(|[a, b, c, _]| a * normal[0] + b * normal[1] + c * normal[2]);
+            let squared = turned.iter().map(|v| v * v).sum::<f32>();
+            let by = if squared > 1e-20 { 1.0 / libm::sqrtf(squared) } else { 0.0 };
+            posed.normal.push([turned[0] * by, turned[1] * by, turned[2] * by, 0.0]);
+        }
+    }
+
+    /// Skinning matrices of all joints.
+    fn world_from_canonical(&self, motion: &Motion) -> Vec<Rows> {
+        let mut world: Vec<Rows> = Vec::with_capacity(self.joints.len());
+        for (i, joint) in self.joints.iter().enumerate() {
+            let rotation = motion.joint_rotations.get(i).copied().unwrap_or([0.0, 0.0, 0.0, 1.0]);
+            let rows = match joint.parent {
+                None => rigid(rotation, motion.root_translation),
+                Some(parent) => product(&world[usize::from(parent)], &rigid(rotation, joint.translation)),
+            };
+            world.push(rows);
+        }
+        world.iter().zip(&self.joints).map(|(world, joint)| product(world, &joint.joint_from_canonical)).collect()
+    }
+}
+
+/// Of a unit quaternion x, y, z, w and a translation.
+fn rigid([x, y, z, w]: [f32; 4], [tx, ty, tz]: [f32; 3]) -> Rows {
+    [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w), tx],
+        [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w), ty],
+        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y), tz],
+    ]
+}
+
+fn product(a: &Rows, b: &Rows) -> Rows {
+    a.map(|row| {
+        core::array::from_fn(|k| {
+            let moved = if k == 3 { row[3] } else { 0.0 };
+            row[0] * b[0][k] + row[1] * b[1][k] + row[2] * b[2][k] + moved
+        })
+    })
+}

@@ -1,0 +1,194 @@
+//! Template and motion against a plain f64 reference, and damaged ones.
+
+#![allow(clippy::unwrap_used)] // helpers of tests
+
+use std::{string::ToString as _, vec::Vec};
+
+use crate::{
+    Motion, MotionEncoder, Posed, StreamError, Template, TemplateSource,
+    testing::{Person, damaged},
+};
+
+/// LBS(x + sum of w t) in f64, by matrices of 4 x 4.
+fn reference(person: &Person, motion: &Motion) -> Vec<[f64; 3]> {
+    type Matrix = [[f64; 4]; 4];
+    let product = |a: &Matrix, b: &Matrix| -> Matrix {
+        core::array::from_fn(|i| core::array::from_fn(|j| (0..4).map(|k| a[i][k] * b[k][j]).sum()))
+    };
+    let rigid = |q: [f32; 4], t: [f32; 3]| -> Matrix {
+        let [x, y, z, w] = q.map(f64::from);
+        let t = t.map(f64::from);
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w), t[0]],
+            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w), t[1]],
+            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y), t[2]],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    };
+    let mut world: Vec<Matrix> = Vec::new();
+    for (i, joint) in person.joints.iter().enumerate() {
+        let own = rigid(motion.joint_rotations[i], if i == 0 { motion.root_translation } else { joint.translation });
+        world.push(joint.parent.map_or(own, |parent| product(&world[usize::from(parent)], &own)));
+    }
+    let skinning: Vec<Matrix> = world
+        .iter()
+        .zip(&person.joints)
+        .map(|(world, joint)| {
+            let mut bind = [[0.0, 0.0, 0.0, 1.0]; 4];
+            for (row, from) in bind.iter_mut().zip(joint.joint_from_canonical) {
+                *row = from.map(f64::from);
+            }
+            product(world, &bind)
+        })
+        .collect();
+    let normalised = |weights: [f32; 4]| {
+        let sum: f64 = weights.iter().map(|w| f64::from(*w)).sum();
+        weights.map(|w| f64::from(w) / sum)
+    };
+    (0..person.center_scale.len())
+        .map(|i| {
+            let mut point: [f64; 4] = person.center_scale[i].map(f64::from);
+            point[3] = 1.0;
+            if let Some((nodes, weights)) = person.node_weights.get(i) {
+                for (node, weight) in nodes.iter().zip(normalised(*weights)) {
+                    for k in 0..3 {
+                        point[k] += weight * f64::from(motion.nodes[*node as usize][k]);
+                    }
+                }
+            }
+            let (joints, weights) = person.skin[i];
+            let mut found = [0.0; 3];
+            for (joint, weight) in joints.iter().zip(normalised(weights)) {
+                for (k, row) in skinning[*joint as usize][..3].iter().enumerate() {
+                    found[k] += weight * row.iter().zip(point).map(|(a, b)| a * b).sum::<f64>();
+                }
+            }
+            found
+        })
+        .collect()
+}
+
+#[test]
+fn posed_gaussians_stay_near_the_reference() {
+    for nodes in [0, 1, 200] {
+        let person = Person::tube(3000, nodes);
+        let encoded = person.encode();
+        let decoded = Template::decode(&encoded.bytes).unwrap();
+        assert_eq!(decoded, encoded.template);
+        let mut encoder = MotionEncoder::new(&encoded);
+        for seed in 0..3 {
+            let motion = person.motion(seed);
+            let bytes = encoder.encode(&motion).unwrap();
+            let received = Motion::decode(&bytes, &decoded).unwrap();
+            assert_eq!((received.stamp.frame, received.stamp.person), (seed, 3));
+            let mut posed = Posed::default();
+            decoded.pose(&received, &mut posed);
+            let expected = reference(&person, &motion);
+            for (i, &from) in encoded.gaussian_order.iter().enumerate() {
+                let [x, y, z, scale] = posed.center_scale[i];
+                let expected = expected[from as usize];
+                let apart =
+                    [x, y, z].iter().zip(expected).map(|(a, b)| (f64::from(*a) - b).powi(2)).sum::<f64>().sqrt();
+                // Weights of 1/255 shift points between joints that lie 0.5 m apart and turn by 0.4.
+                assert!(apart < 1e-3, "{nodes} {seed} {i}: {apart}");
+                assert!((scale - person.center_scale[from as usize][3]).abs() < 5e-6);
+                let length: f32 = posed.normal[i].iter().map(|v| v * v).sum();
+                assert!((length - 1.0).abs() < 1e-4);
+            }
+        }
+    }
+}
+
+#[test]
+fn every_motion_is_readable_by_itself() {
+    let person = Person::tube(500, 50);
+    let encoded = person.encode();
+    let mut encoder = MotionEncoder::new(&encoded);
+    let first = encoder.encode(&person.motion(1)).unwrap();
+    encoder.encode(&person.motion(2)).unwrap();
+    assert_eq!(encoder.encode(&person.motion(1)).unwrap(), first);
+    assert_eq!(MotionEncoder::new(&encoded).encode(&person.motion(1)).unwrap(), first);
+}
+
+#[test]
+fn poisoned_motions_are_refused_or_rest() {
+    let person = Person::tube(100, 10);
+    let encoded = person.encode();
+    let mut encoder = MotionEncoder::new(&encoded);
+    let mut bad = person.motion(1);
+    bad.nodes[3] = [f32::NAN, 0.0, f32::INFINITY];
+    bad.nodes.truncate(8);
+    let motion = Motion::decode(&encoder.encode(&bad).unwrap(), &encoded.template).unwrap();
+    let at_rest = encoded.node_order.iter().position(|&node| node == 3).unwrap();
+    assert!(motion.nodes[at_rest].iter().all(|v| v.abs() < 1e-3));
+    assert!(motion.nodes.iter().flatten().all(|v| v.is_finite()));
+    for (poison, text) in [
+        (
+            Motion { joint_rotations: [[0.0, 0.0, 0.0, 1.0]; 2].to_vec(), ..person.motion(1) },
+            "another number of joints",
+        ),
+        (Motion { joint_rotations: [[0.0; 4]; 3].to_vec(), ..person.motion(1) }, "not of unit length"),
+        (Motion { root_translation: [f32::NAN; 3], ..person.motion(1) }, "not finite"),
+        (Motion { root_translation: [1e9; 3], ..person.motion(1) }, "not finite"),
+    ] {
+        let error = encoder.encode(&poison).unwrap_err().to_string();
+        assert!(error.contains(text), "{error}");
+    }
+}
+
+#[test]
+fn poisoned_templates_are_refused() {
+    let good = Person::tube(50, 5);
+    let refused = |source: TemplateSource<'_>, text: &str| {
+        let error = source.encode().unwrap_err().to_string();
+        assert!(error.contains(text), "{error}");
+    };
+    refused(
+        TemplateSource { center_scale: &[], normals: &[], skin: &[], node_weights: &[], ..good.source() },
+        "one Gaussian",
+    );
+    refused(TemplateSource { joints: &[], ..good.source() }, "one joint");
+    refused(TemplateSource { normals: &good.normals[1..], ..good.source() }, "differ in length");
+    refused(TemplateSource { nodes: &good.nodes[..1], ..good.source() }, "node that does not exist");
+    refused(TemplateSource { joints: &good.joints[..1], ..good.source() }, "joint that does not exist");
+    let mut bad = Person::tube(50, 5);
+    bad.center_scale[3][1] = f32::NAN;
+    refused(bad.source(), "centre is not finite");
+    let mut bad = Person::tube(50, 5);
+    bad.skin[3].1 = [-1.0; 4];
+    refused(bad.source(), "weight is negative");
+    let mut bad = Person::tube(50, 5);
+    bad.joints[1].parent = Some(2);
+    refused(bad.source(), "before its parent");
+}
+
+#[test]
+fn damaged_templates_and_motions_are_no_panic() {
+    let person = Person::tube(300, 20);
+    let encoded = person.encode();
+    let mut refused = 0;
+    damaged(&encoded.bytes, 3000, |bytes| match Template::decode(bytes) {
+        Ok(template) => {
+            let mut posed = Posed::default();
+            template.pose(&person.motion(1), &mut posed);
+        }
+        Err(_) => refused += 1,
+    });
+    assert!(refused > 500, "{refused}");
+    let motion = MotionEncoder::new(&encoded).encode(&person.motion(1)).unwrap();
+    damaged(&motion, 3000, |bytes| {
+        if let Ok(motion) = Motion::decode(bytes, &encoded.template) {
+            assert_eq!((motion.joint_rotations.len(), motion.nodes.len()), (3, 20));
+            assert!(
+                motion.nodes.iter().flatten().chain(motion.joint_rotations.iter().flatten()).all(|v| v.is_finite())
+            );
+        }
+    });
+    let mut newer = motion.clone();
+    newer[3] = 2;
+    let error = Motion::decode(&newer, &encoded.template).unwrap_err();
+    assert_eq!(error, StreamError::Version { what: "motion", found: 2 });
+    assert!(error.to_string().contains("update the older of the two"), "{error}");
+    let other = Person::tube(301, 20).encode();
+    assert_eq!(Motion::decode(&motion, &other.template), Err(StreamError::OtherTemplate { what: "motion" }));
+}

@@ -1,0 +1,67 @@
+//! sRGB by tables.
+
+use alloc::vec::Vec;
+
+/// Steps of linear light in the table of codes.
+const LINEAR_STEPS: usize = 4096;
+/// Steps of codes in the table of linear light, four to each of 256.
+const CODE_STEPS: usize = 1020;
+
+/// Both directions of the sRGB curve (IEC 61966-2-1) on 0..=1, without a power at each value.
+#[derive(Debug, Clone)]
+pub(crate) struct Srgb {
+    code: Vec<f32>,
+    linear: Vec<f32>,
+}
+
+impl Srgb {
+    pub fn new() -> Self {
+        let code = |linear: f32| {
+            if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * libm::powf(linear, 1.0 / 2.4) - 0.055 }
+        };
+        let linear = |code: f32| if code <= 0.040_45 { code / 12.92 } else { libm::powf((code + 0.055) / 1.055, 2.4) };
+        Self {
+            code: (0..=LINEAR_STEPS + 1).map(|i| 255.0 * code((i as f32 / LINEAR_STEPS as f32).min(1.0))).collect(),
+            linear: (0..=CODE_STEPS).map(|i| linear(i as f32 / CODE_STEPS as f32)).collect(),
+        }
+    }
+
+    /// Returns the code, 0..=255 and not rounded, of linear light; 0 for what is not a number.
+    pub fn code(&self, linear: f32) -> f32 {
+        // `max` and `min` take NaN to the bound.
+        let at = linear.max(0.0).min(1.0) * LINEAR_STEPS as f32;
+        let below = at as usize;
+        let (a, b) = (self.code[below], self.code[below + 1]);
+        a + (b - a) * (at - below as f32)
+    }
+
+    /// Returns the linear light of a code, to a quarter of a code.
+    pub fn linear(&self, code: f32) -> f32 {
+        let at = code * (CODE_STEPS as f32 / 255.0) + 0.5;
+        // The cast takes negative numbers and NaN to 0.
+        self.linear[(at as usize).min(CODE_STEPS)]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_tables_agree_with_the_curve() {
+        let table = Srgb::new();
+        for i in 0..=100_000 {
+            let code = f64::from(i) / 100_000.0;
+            let linear = if code <= 0.04045 { code / 12.92 } else { ((code + 0.055) / 1.055).powf(2.4) };
+            let found = f64::from(table.code(linear as f32));
+            assert!((found - 255.0 * code).abs() < 0.12, "{linear}: {found} {}", 255.0 * code);
+            let back = f64::from(table.code(table.linear(255.0 * code as f32)));
+            assert!((back - 255.0 * code).abs() < 0.26, "{code}: {back}");
+        }
+        let ends = [f32::NAN, -1.0, f32::NEG_INFINITY, 0.0].map(|linear| table.code(linear));
+        assert!(ends.iter().all(|code| *code == 0.0), "{ends:?}");
+        assert!((table.code(f32::INFINITY) - 255.0).abs() < 1e-3);
+        assert_eq!(table.linear(f32::NAN), 0.0);
+        assert_eq!(table.linear(1e9), 1.0);
+    }
+}

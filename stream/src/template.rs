@@ -1,0 +1,282 @@
+//! The template: what stays the same of a person from frame to frame.
+
+use alloc::vec::Vec;
+
+use crate::{
+    CODEC_VERSION, StreamError,
+    bytes::Fields,
+    order::spatial_order,
+    planes::{
+        GaussianModel, Influences, NORMAL_LEVELS, POSITION_LEVELS, Quantised, SCALE_LEVELS, normal_of, octahedral,
+    },
+    range_coder::{RangeDecoder, RangeEncoder},
+};
+
+/// Most bytes of a template.
+pub const MAX_TEMPLATE_BYTES: usize = 32 << 20;
+/// Most Gaussians.
+const MAX_GAUSSIANS: usize = 1 << 20;
+/// Most joints.
+const MAX_JOINTS: usize = 1024;
+/// Most nodes of the deformation graph.
+const MAX_NODES: usize = 1 << 16;
+/// Largest coordinate, metres.
+const MAX_COORDINATE_M: f32 = 1e4;
+
+const MAGIC: [u8; 3] = *b"FLT";
+const WHAT: &str = "template";
+
+/// A joint of the skeleton.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Joint {
+    /// Index of the parent, smaller than the joint's own; none for the first joint alone.
+    pub parent: Option<u16>,
+    /// Origin in the parent's frame, metres.
+    pub translation: [f32; 3],
+    /// Three rows of the inverse bind matrix: canonical space into the joint's frame.
+    pub joint_from_canonical: [[f32; 4]; 3],
+}
+
+/// A person as the rig knows it; all slices of Gaussians have one element a Gaussian.
+#[derive(Debug, Clone, Copy)]
+pub struct TemplateSource<'a> {
+    /// Parents before children.
+    pub joints: &'a [Joint],
+    /// Canonical centre, metres, and standard deviation, metres.
+    pub center_scale: &'a [[f32; 4]],
+    /// Unit normal of the surface.
+    pub normals: &'a [[f32; 3]],
+    /// Joints that move a Gaussian, with weights.
+    pub skin: &'a [([u32; 4], [f32; 4])],
+    /// Nodes that move a Gaussian, with weights; empty without a deformation graph.
+    pub node_weights: &'a [([u32; 4], [f32; 4])],
+    /// Canonical positions of the nodes, metres.
+    pub nodes: &'a [[f32; 3]],
+}
+
+/// A template in the order of its bytes: a decoder's Gaussians and nodes are numbered so.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Template {
+    /// XXH3 of the bytes.
+    pub hash: u64,
+    pub(crate) joints: Vec<Joint>,
+    pub(crate) nodes: usize,
+    /// Centre and standard deviation, metres.
+    pub(crate) center_scale: Vec<[f32; 4]>,
+    pub(crate) normals: Vec<[f32; 3]>,
+    pub(crate) skin: Vec<Influences>,
+    pub(crate) node_weights: Vec<Influences>,
+}
+
+/// A template with its bytes and the source's order.
+#[derive(Debug, Clone)]
+pub struct EncodedTemplate {
+    /// As a decoder will have it.
+    pub template: Template,
+    /// The message.
+    pub bytes: Vec<u8>,
+    /// Index in the source of each Gaussian of the template.
+    pub gaussian_order: Vec<u32>,
+    /// Index in the source of each node of the template.
+    pub node_order: Vec<u32>,
+}
+
+impl TemplateSource<'_> {
+    /// Orders, quantises and encodes it.
+    ///
+    /// # Errors
+    /// [`StreamError::Template`] when counts differ, an index points nowhere or a number is not finite.
+    pub fn encode(&self) -> Result<EncodedTemplate, StreamError> {
+        self.check()?;
+        let (count, nodes) = (self.center_scale.len(), self.nodes.len());
+        let points: Vec<[f32; 3]> = self.center_scale.iter().map(|&[x, y, z, _]| [x, y, z]).collect();
+        let gaussian_order = spatial_order(&points, Some(self.normals));
+        let node_order = spatial_order(self.nodes, None);
+        let mut new_node = alloc::vec![0u32; nodes];
+        for (new, &old) in node_order.iter().enumerate() {
+            new_node[old as usize] = new as u32;
+        }
+
+        let mut min = [f32::INFINITY; 3];
+        let mut extent = 0.0f32;
+        for axis in 0..3 {
+            let max = points.iter().map(|p| p[axis]).fold(f32::NEG_INFINITY, f32::max);
+            min[axis] = points.iter().map(|p| p[axis]).fold(f32::INFINITY, f32::min);
+            extent = extent.max(max - min[axis]);
+        }
+        let largest = self.center_scale.iter().map(|s| s[3]).fold(0.0, f32::max);
+        let per_metre = if extent > 0.0 { POSITION_LEVELS / extent } else { 0.0 };
+        let per_scale = if largest > 0.0 { SCALE_LEVELS / largest } else { 0.0 };
+
+        let mut bytes = Vec::new();
+        bytes.extend(MAGIC);
+        bytes.push(CODEC_VERSION);
+        // Planes beyond those of an isotropic surface: none yet.
+        bytes.extend(0u32.to_le_bytes());
+        bytes.extend((count as u32).to_le_bytes());
+        bytes.extend((nodes as u32).to_le_bytes());
+        bytes.extend((self.joints.len() as u16).to_le_bytes());
+        for joint in self.joints {
+            bytes.extend(joint.parent.unwrap_or(u16::MAX).to_le_bytes());
+            let numbers = joint.translation.iter().chain(joint.joint_from_canonical.iter().flatten());
+            bytes.extend(numbers.flat_map(|number| number.to_le_bytes()));
+        }
+        bytes.extend(min.into_iter().chain([extent, largest]).flat_map(f32::to_le_bytes));
+
+        let mut encoder = RangeEncoder::new(bytes);
+        let mut model = GaussianModel::default();
+        let mut before = Quantised::default();
+        for &i in &gaussian_order {
+            let i = i as usize;
+            let [x, y, z, scale] = self.center_scale[i];
+            let level = |v: f32, axis: usize| ((v - min[axis]) * per_metre + 0.5) as i32;
+            let on_nodes = self.node_weights.get(i).map_or_else(Influences::default, |(index, weight)| {
+                Influences::new(index.map(|node| new_node[node as usize]), *weight)
+            });
+            let gaussian = Quantised {
+                position: [level(x, 0), level(y, 1), level(z, 2)],
+                normal: octahedral(self.normals[i]),
+                scale: (scale * per_scale + 0.5) as i32,
+                joints: Influences::new(self.skin[i].0, self.skin[i].1),
+                nodes: on_nodes,
+            };
+            model.code(&mut encoder, &before, &gaussian, nodes > 0);
+            before = gaussian;
+        }
+        let bytes = encoder.finish();
+        let template = Template::decode(&bytes)?;
+        Ok(EncodedTemplate { template, bytes, gaussian_order, node_order })
+    }
+
+    fn check(&self) -> Result<(), StreamError> {
+        let count = self.center_scale.len();
+        let check = |holds: bool, problem| if holds { Ok(()) } else { Err(StreamError::Template(problem)) };
+        check((1..=MAX_GAUSSIANS).contains(&count), "it needs one Gaussian to a million")?;
+        check((1..=MAX_JOINTS).contains(&self.joints.len()), "it needs one joint to 1024")?;
+        check(self.nodes.len() <= MAX_NODES, "it has more than 65,536 nodes")?;
+        let node_weights = if self.nodes.is_empty() { 0 } else { count };
+        check(
+            self.normals.len() == count && self.skin.len() == count && self.node_weights.len() == node_weights,
+            "its lists differ in length",
+        )?;
+        let finite = |v: &f32| v.abs() <= MAX_COORDINATE_M;
+        check(self.center_scale.iter().flatten().all(finite), "a centre is not finite")?;
+        check(self.center_scale.iter().all(|splat| splat[3] >= 0.0), "a scale is negative")?;
+        check(self.normals.iter().flatten().all(finite), "a normal is not finite")?;
+        check(self.nodes.iter().flatten().all(finite), "a node is not finite")?;
+        let mut weights = self.skin.iter().chain(self.node_weights).flat_map(|(_, weights)| weights);
+        check(weights.all(|w| (0.0..=MAX_COORDINATE_M).contains(w)), "a weight is negative or not finite")?;
+        let within =
+            |list: &[([u32; 4], [f32; 4])], end: usize| list.iter().all(|(i, _)| i.iter().all(|&i| (i as usize) < end));
+        check(within(self.skin, self.joints.len()), "a Gaussian hangs on a joint that does not exist")?;
+        check(within(self.node_weights, self.nodes.len()), "a Gaussian hangs on a node that does not exist")?;
+        for (i, joint) in self.joints.iter().enumerate() {
+            let numbers = joint.translation.iter().chain(joint.joint_from_canonical.iter().flatten());
+            check(numbers.into_iter().all(|v| v.is_finite()), "a joint is not finite")?;
+            check(is_parent(joint.parent, i), "a joint stands before its parent")?;
+        }
+        Ok(())
+    }
+}
+
+/// Whether `parent` may be that of joint `index`.
+fn is_parent(parent: Option<u16>, index: usize) -> bool {
+    parent.map_or(index == 0, |parent| usize::from(parent) < index)
+}
+
+impl Template {
+    /// Reads a template's bytes.
+    ///
+    /// # Errors
+    /// [`StreamError::Version`] or [`StreamError::Malformed`].
+    pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
+        let mut fields = Fields::of(WHAT, MAGIC, bytes)?;
+        fields.check(bytes.len() <= MAX_TEMPLATE_BYTES, "it is too large")?;
+        let planes = fields.u32()?;
+        fields.check(planes == 0, "it has planes that this program does not know; update it")?;
+        let (count, nodes) = (fields.u32()? as usize, fields.u32()? as usize);
+        let joint_count = usize::from(fields.u16()?);
+        fields.check((1..=MAX_GAUSSIANS).contains(&count), "it has no Gaussians or too many")?;
+        // A Gaussian takes a dozen bytes: what claims to be much denser is no template.
+        fields.check(count <= 64 + bytes.len(), "it claims more Gaussians than its bytes can hold")?;
+        fields.check(nodes <= MAX_NODES, "it has too many nodes")?;
+        fields.check((1..=MAX_JOINTS).contains(&joint_count), "it has no joints or too many")?;
+        let mut joints = Vec::new();
+        for i in 0..joint_count {
+            let parent = Some(fields.u16()?).filter(|parent| *parent != u16::MAX);
+            fields.check(is_parent(parent, i), "a joint stands before its parent")?;
+            let mut numbers = [0.0; 15];
+            for number in &mut numbers {
+                *number = fields.f32()?;
+            }
+            joints.push(Joint {
+                parent,
+                translation: core::array::from_fn(|k| numbers[k]),
+                joint_from_canonical: core::array::from_fn(|row| core::array::from_fn(|k| numbers[3 + 4 * row + k])),
+            });
+        }
+        let min = [fields.f32()?, fields.f32()?, fields.f32()?];
+        let (extent, largest) = (fields.f32()?, fields.f32()?);
+        let is_box = (0.0..=4.0 * MAX_COORDINATE_M).contains(&extent)
+            && min.iter().all(|v| v.abs() <= MAX_COORDINATE_M)
+            && (0.0..=MAX_COORDINATE_M).contains(&largest);
+        fields.check(is_box, "its bounding box or largest scale makes no sense")?;
+
+        let mut decoder = RangeDecoder::new(fields.bytes);
+        let mut model = GaussianModel::default();
+        let mut before = Quantised::default();
+        let mut template = Self {
+            hash: xxhash_rust::xxh3::xxh3_64(bytes),
+            joints,
+            nodes,
+            center_scale: Vec::with_capacity(count),
+            normals: Vec::with_capacity(count),
+            skin: Vec::with_capacity(count),
+            node_weights: Vec::with_capacity(if nodes > 0 { count } else { 0 }),
+        };
+        let (step, scale_step) = (extent / POSITION_LEVELS, largest / SCALE_LEVELS);
+        for _ in 0..count {
+            before = model.code(&mut decoder, &before, &Quantised::default(), nodes > 0);
+            let Quantised { position, normal, scale, joints, nodes: on_nodes } = before;
+            let is_in = |values: &[i32], most: f32| values.iter().all(|v| (0..=most as i32).contains(v));
+            let is_valid = is_in(&position, POSITION_LEVELS)
+                && is_in(&normal, NORMAL_LEVELS)
+                && is_in(&[scale], SCALE_LEVELS)
+                && hangs_on(&joints, joint_count)
+                && (nodes == 0 || hangs_on(&on_nodes, nodes));
+            fields.check(is_valid, "a Gaussian is out of range")?;
+            let at = |axis: usize| min[axis] + step * position[axis] as f32;
+            template.center_scale.push([at(0), at(1), at(2), scale_step * scale as f32]);
+            template.normals.push(normal_of(normal));
+            template.skin.push(joints);
+            if nodes > 0 {
+                template.node_weights.push(on_nodes);
+            }
+        }
+        Ok(template)
+    }
+
+    /// Number of Gaussians.
+    #[must_use]
+    pub fn gaussians(&self) -> usize {
+        self.center_scale.len()
+    }
+
+    /// Number of nodes of the deformation graph.
+    #[must_use]
+    pub fn nodes(&self) -> usize {
+        self.nodes
+    }
+
+    /// The skeleton.
+    #[must_use]
+    pub fn joints(&self) -> &[Joint] {
+        &self.joints
+    }
+}
+
+/// Whether all indices are below `end` and no weight is negative.
+fn hangs_on(influences: &Influences, end: usize) -> bool {
+    influences.index.iter().all(|&i| usize::try_from(i).is_ok_and(|i| i < end))
+        && influences.weight.iter().all(|&w| w >= 0)
+}

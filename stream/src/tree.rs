@@ -1,0 +1,207 @@
+//! A balanced binary tree over a list of items, and the Haar transform on it.
+//!
+//! The tree follows from the number of items alone: a node of n items has one of the first n - n/2 and one of the last n/2, down
+//! to the level whose nodes have one or two. All nodes of a level weigh the same, whatever their items cover.
+
+use alloc::{vec, vec::Vec};
+use core::ops::Range;
+
+/// Segments are the nodes of this level, where the tree has it.
+const SEGMENT_LEVEL: u32 = 5;
+
+/// Channels of an item.
+pub(crate) const CHANNELS: usize = 3;
+
+/// The tree of so many items.
+///
+/// Coefficients lie in a list: first the mean of each segment, then from `1 << level` on the differences of a level's nodes
+/// between their first and their second half.
+#[derive(Debug, Clone)]
+pub(crate) struct HaarTree {
+    items: usize,
+    /// Level whose nodes have one or two items.
+    deepest: u32,
+    segment_level: u32,
+    /// First item of each node of the deepest level, and the number of items.
+    starts: Vec<u32>,
+}
+
+impl HaarTree {
+    /// Of at least one item.
+    pub fn new(items: usize) -> Self {
+        let items = items.max(1);
+        let deepest = items.ilog2();
+        let mut starts = vec![0, items as u32];
+        for _ in 0..deepest {
+            let halves = starts.windows(2).flat_map(|pair| [pair[0], pair[1] - (pair[1] - pair[0]) / 2]);
+            let mut next: Vec<u32> = halves.collect();
+            next.push(items as u32);
+            starts = next;
+        }
+        Self { items, deepest, segment_level: deepest.min(SEGMENT_LEVEL), starts }
+    }
+
+    pub fn items(&self) -> usize {
+        self.items
+    }
+
+    /// Number of coefficients, unused ones included.
+    pub fn coefficients(&self) -> usize {
+        2 << self.deepest
+    }
+
+    pub fn segments(&self) -> usize {
+        1 << self.segment_level
+    }
+
+    /// Levels that have differences.
+    pub fn levels(&self) -> Range<u32> {
+        self.segment_level..self.deepest + 1
+    }
+
+    /// Places of a level's coefficients that belong to a segment.
+    pub fn places(&self, level: u32, segment: usize) -> Range<usize> {
+        let width = 1 << (level - self.segment_level);
+        let first = (1 << level) + segment * width;
+        first..first + width
+    }
+
+    /// Whether a node of the deepest level has two items; `place` is that of its coefficient.
+    pub fn is_pair(&self, place: usize) -> bool {
+        let node = place - (1 << self.deepest);
+        self.starts[node + 1] - self.starts[node] == 2
+    }
+
+    pub fn deepest(&self) -> u32 {
+        self.deepest
+    }
+
+    /// Returns the quantisation steps of the means and of each of [`Self::levels`], for an error of items that a step of
+    /// `step` would cause in an orthonormal transform: what moves n items is n times as fine in squares.
+    pub fn steps(&self, step: f32) -> (f32, Vec<f32>) {
+        let items = |level: u32| self.items as f32 / (1u32 << level) as f32;
+        let of_level = |level: u32| 2.0 * step / libm::sqrtf(items(level).max(2.0));
+        (step / libm::sqrtf(items(self.segment_level)), self.levels().map(of_level).collect())
+    }
+
+    /// Writes the coefficients of the items.
+    pub fn forward(&self, items: &[[f32; CHANNELS]], coefficients: &mut [[f32; CHANNELS]], means: &mut Vec<[f32; 3]>) {
+        let first = 1usize << self.deepest;
+        means.clear();
+        for (node, pair) in self.starts.windows(2).enumerate() {
+            let a = items[pair[0] as usize];
+            if pair[1] - pair[0] == 2 {
+                let b = items[pair[0] as usize + 1];
+                coefficients[first + node] = core::array::from_fn(|c| a[c] - b[c]);
+                means.push(core::array::from_fn(|c| 0.5 * (a[c] + b[c])));
+            } else {
+                coefficients[first + node] = [0.0; CHANNELS];
+                means.push(a);
+            }
+        }
+        for level in (self.segment_level..self.deepest).rev() {
+            let first = 1usize << level;
+            for node in 0..first {
+                let (a, b) = (means[2 * node], means[2 * node + 1]);
+                coefficients[first + node] = core::array::from_fn(|c| a[c] - b[c]);
+                means[node] = core::array::from_fn(|c| 0.5 * (a[c] + b[c]));
+            }
+        }
+        coefficients[..self.segments()].copy_from_slice(&means[..self.segments()]);
+    }
+
+    /// Calls `set` with each item, in order, whose coefficients `at` returns by their place; `means` is scratch.
+    pub fn inverse(
+        &self,
+        at: impl Fn(usize) -> [f32; CHANNELS],
+        means: &mut Vec<[f32; CHANNELS]>,
+        mut set: impl FnMut(usize, [f32; CHANNELS]),
+    ) {
+        let halves = |mean: [f32; CHANNELS], difference: [f32; CHANNELS]| -> [[f32; CHANNELS]; 2] {
+            [
+                core::array::from_fn(|c| mean[c] + 0.5 * difference[c]),
+                core::array::from_fn(|c| mean[c] - 0.5 * difference[c]),
+            ]
+        };
+        means.clear();
+        means.resize(1 << self.deepest, [0.0; CHANNELS]);
+        for (segment, mean) in means.iter_mut().take(self.segments()).enumerate() {
+            *mean = at(segment);
+        }
+        for level in self.segment_level..self.deepest {
+            let first = 1usize << level;
+            for node in (0..first).rev() {
+                let [a, b] = halves(means[node], at(first + node));
+                means[2 * node] = a;
+                means[2 * node + 1] = b;
+            }
+        }
+        let first = 1usize << self.deepest;
+        for (node, pair) in self.starts.windows(2).enumerate() {
+            if pair[1] - pair[0] == 2 {
+                let [a, b] = halves(means[node], at(first + node));
+                set(pair[0] as usize, a);
+                set(pair[0] as usize + 1, b);
+            } else {
+                set(pair[0] as usize, means[node]);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
+
+    use super::*;
+
+    #[test]
+    fn the_inverse_undoes_the_transform_for_any_number_of_items() {
+        let mut random = StdRng::seed_from_u64(3);
+        for count in (1..80).chain([1000, 1023, 1024, 1025, 4097]) {
+            let tree = HaarTree::new(count);
+            let items: Vec<[f32; 3]> = (0..count).map(|_| [0; 3].map(|_| random.random_range(-9.0..9.0))).collect();
+            let mut coefficients = vec![[0.0; 3]; tree.coefficients()];
+            let mut scratch = Vec::new();
+            tree.forward(&items, &mut coefficients, &mut scratch);
+            let mut back = vec![[f32::NAN; 3]; count];
+            tree.inverse(|place| coefficients[place], &mut scratch, |i, item| back[i] = item);
+            for (a, b) in items.iter().flatten().zip(back.iter().flatten()) {
+                assert!((a - b).abs() < 1e-4, "{count}");
+            }
+            // Every coefficient belongs to one segment.
+            let mut owners = vec![0; tree.coefficients()];
+            for segment in 0..tree.segments() {
+                owners[segment] += 1;
+                for place in tree.levels().flat_map(|level| tree.places(level, segment)) {
+                    owners[place] += 1;
+                }
+            }
+            assert!(owners.iter().all(|count| *count == 1), "{count}: {owners:?}");
+        }
+    }
+
+    #[test]
+    fn steps_give_each_level_its_share_of_the_error() {
+        // Uniform noise of one step in each coefficient: items must err by the same step's noise.
+        let mut random = StdRng::seed_from_u64(4);
+        let tree = HaarTree::new(6000);
+        let (mean_step, steps) = tree.steps(3.0);
+        let step_of = |place: usize| if place < 32 { mean_step } else { steps[(place.ilog2() - 5) as usize] };
+        let noise: Vec<f32> =
+            (0..tree.coefficients()).map(|place| step_of(place) * random.random_range(-0.5..0.5)).collect();
+        let (mut sum, mut count) = (0.0, 0);
+        let mut scratch = Vec::new();
+        tree.inverse(
+            |place| [noise[place], 0.0, 0.0],
+            &mut scratch,
+            |_, item| {
+                sum += f64::from(item[0]).powi(2);
+                count += 1;
+            },
+        );
+        let expected = 3.0 / 12f64.sqrt();
+        let rms = (sum / f64::from(count)).sqrt();
+        assert!((rms / expected - 1.0).abs() < 0.1, "{rms} {expected}");
+    }
+}
