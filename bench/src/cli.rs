@@ -39,6 +39,8 @@ pub enum BenchCommand {
     Landmarks(BenchLandmarksArgs),
     /// Bumped cameras among switched lights, a walking person and exposure jumps: time to the report, error, false alarms, cost.
     Watch(BenchWatchArgs),
+    /// The person stream: bytes and run times against what it loses; writes a table, CSV, JSON and SVG.
+    Stream(BenchStreamArgs),
     /// Masks estimated in each camera independently, against which several calibrations are scored.
     Masks(BenchMasksArgs),
     /// Pose, shape and masks from images: errors, and what each of them costs in the views; writes a table and JSON.
@@ -107,6 +109,37 @@ pub struct BenchBudgetArgs {
     pub fps: f64,
     /// Folder of the results.
     #[arg(long, default_value = "out/bench-budget")]
+    pub out: PathBuf,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchStreamArgs {
+    /// Data sets in EasyMocap layout, as `flyrig eval` and `flyrig sim export` know them.
+    #[arg(required = true)]
+    pub datasets: Vec<PathBuf>,
+    /// Input cameras, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "00,03,05")]
+    pub inputs: Vec<String>,
+    /// Cameras that the views are compared in, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "01,02,04,06")]
+    pub holdout: Vec<String>,
+    /// Where pose and masks come from.
+    #[arg(long, value_enum, default_value = "given")]
+    pub pose: Origin,
+    /// Quantisation steps of the colours, codes of 255, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "4,8,12,16")]
+    pub steps: Vec<f32>,
+    /// Frames FIRST..END, END excluded; all of them otherwise.
+    #[arg(long, value_parser = parse_range)]
+    pub frames: Option<Range<u64>>,
+    /// Frames a second of the data sets.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-stream")]
     pub out: PathBuf,
     /// Gaussians on the person's surface.
     #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]

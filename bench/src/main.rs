@@ -15,6 +15,7 @@ mod processor;
 mod recording;
 mod sequence;
 mod steady;
+mod stream;
 mod subjects;
 mod summary;
 mod surface;
@@ -53,6 +54,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         BenchCommand::Capture(args) => capture::capture(args),
         BenchCommand::Hands(args) => hands::hands(args, &gpu()?),
         BenchCommand::Landmarks(args) => landmarks::landmarks(args),
+        BenchCommand::Stream(args) => stream::stream(args, &gpu()?),
         BenchCommand::Watch(args) => watch::watch(args, &gpu()?),
         BenchCommand::Masks(args) => masks::masks(args),
         BenchCommand::Perception(args) => perception::perception(args, &gpu()?),

@@ -76,7 +76,7 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
     let mut sink = args.out.as_deref().map(Sink::new).transpose()?;
     let config = TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) };
     let views = if args.eye.is_some() { Views::None } else { Views::Named(vec![args.view.clone()]) };
-    let subscriber = Subscriber::open(&config, &Interests { views, splats: false, stats: false })?;
+    let subscriber = Subscriber::open(&config, &Interests { views, ..Interests::default() })?;
     let mut complaints = Complaints::default();
     eprintln!("watch: rig '{}' at {}, waiting for pictures (Ctrl-C ends)", args.rig, args.connect);
     if let Some(eye) = args.eye {

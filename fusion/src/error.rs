@@ -63,6 +63,9 @@ pub enum FusionError {
         /// What is wrong, and the fix.
         problem: String,
     },
+    /// A person that cannot be sent as a stream.
+    #[error(transparent)]
+    Stream(#[from] flyrig_stream::StreamError),
     /// A thread that the system did not start.
     #[error(
         "cannot start the thread '{name}': {source}; end other programs, or raise the limit of processes (ulimit -u)"

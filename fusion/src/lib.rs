@@ -20,6 +20,7 @@ mod live_rig;
 mod live_views;
 mod memory;
 mod perception;
+mod person_stream;
 mod pose_curve;
 mod rig_watch;
 mod session;
@@ -45,6 +46,7 @@ pub use perception::{
     EstimatedPerception, GivenPerception, GivenPerson, Observation, Perception, SHAPE_SECS, SHAPE_SETS, SeenPerson,
     ViewObservation,
 };
+pub use person_stream::{PersonEncoder, PersonFrame, PersonMessages};
 pub use rig_watch::{RigWatch, WatchEvent};
 pub use session::{Counts, Outcome, Session, SessionBuilder};
 pub use set_reader::{SetReader, next_frame};

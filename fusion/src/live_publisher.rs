@@ -17,7 +17,7 @@ use flyrig_transport::{
 use flyrig_types::{FrameSet, RenderedView, SupervisedThread, ThreadHealth};
 use image::{ExtendedColorType, ImageEncoder as _, codecs::jpeg::JpegEncoder};
 
-use crate::{FusionError, Session, Subject};
+use crate::{FusionError, Session, Subject, person_stream::PersonPublisher};
 
 /// Views that may wait for compression, all together.
 const WAITING_PICTURES: usize = 8;
@@ -38,6 +38,7 @@ pub struct LivePublisher {
     publisher: Arc<Publisher>,
     jobs: Arc<LatestQueue<Job>>,
     encoder: SupervisedThread,
+    people: PersonPublisher,
     failures: Arc<AtomicU64>,
     started: Instant,
     last_stats: Instant,
@@ -72,10 +73,12 @@ impl LivePublisher {
             };
             SupervisedThread::start("encode", work).map_err(|source| FusionError::Thread { name: "encode", source })?
         };
+        let people = PersonPublisher::start(Arc::clone(&publisher))?;
         Ok(Self {
             publisher,
             jobs,
             encoder,
+            people,
             failures,
             started: Instant::now(),
             last_stats: Instant::now(),
@@ -114,6 +117,19 @@ impl LivePublisher {
                 invalid: 0,
             };
             self.publisher.publish_splats(Arc::new(state));
+        }
+        Ok(())
+    }
+
+    /// Reads everybody's colours back and hands them over with the motion.
+    ///
+    /// # Errors
+    /// [`FusionError::Gpu`].
+    pub fn publish_people(&self, session: &Session, set: &FrameSet) -> Result<(), FusionError> {
+        for subject in session.subjects() {
+            if let Some(frame) = session.person_frame(subject.id(), set)? {
+                self.people.push(frame);
+            }
         }
         Ok(())
     }
@@ -169,8 +185,8 @@ impl LivePublisher {
 
     /// Returns the health of the threads that compress and publish.
     #[must_use]
-    pub fn threads(&self) -> [ThreadHealth; 2] {
-        [self.encoder.health(), self.publisher.thread()]
+    pub fn threads(&self) -> [ThreadHealth; 3] {
+        [self.encoder.health(), self.people.health(), self.publisher.thread()]
     }
 
     /// Counts the views lost on the way out, by place.
@@ -178,6 +194,7 @@ impl LivePublisher {
     pub fn drops(&self) -> Vec<(String, u64)> {
         let mut drops = vec![
             ("pictures waiting for compression".to_owned(), self.jobs.dropped()),
+            ("people waiting for the stream".to_owned(), self.people.dropped()),
             ("pictures that failed".to_owned(), self.failures.load(Ordering::Relaxed)),
         ];
         drops.extend(self.publisher.counts().into_iter().map(|(topic, c)| (format!("published {topic}"), c.replaced)));
@@ -191,6 +208,7 @@ impl LivePublisher {
     pub fn finish(mut self) -> Result<(), FusionError> {
         self.jobs.close();
         self.encoder.join();
+        self.people.finish();
         match Arc::try_unwrap(self.publisher) {
             Ok(publisher) => Ok(publisher.close()?),
             Err(_) => Ok(()),
@@ -263,7 +281,7 @@ mod tests {
         for index in 0..1000 {
             let set = FrameSet { index, master_nanos: 0, frames: Vec::new() };
             publisher.publish("main", RenderedView { width: 1, height: 1, rgba: vec![0; 4] }, &set);
-            let [encoder, _] = publisher.threads();
+            let [encoder, ..] = publisher.threads();
             if is_wanted(&encoder) {
                 return (publisher, encoder);
             }
@@ -283,7 +301,7 @@ mod tests {
         let (publisher, encoder) = publish_until(encode, |_| last.load(Ordering::Relaxed) > 5);
         let panic = Some("frame 1".to_owned());
         assert_eq!(encoder, ThreadHealth { name: "encode".to_owned(), restarts: 1, panic, has_failed: false });
-        assert_eq!(publisher.drops()[1], ("pictures that failed".to_owned(), 1));
+        assert_eq!(publisher.drops()[2], ("pictures that failed".to_owned(), 1));
         publisher.finish().unwrap();
     }
 

@@ -164,6 +164,9 @@ impl LiveRig {
             if self.splats && publisher.publisher().has_splat_subscribers() {
                 publisher.publish_splats(&self.session, set)?;
             }
+            if publisher.publisher().has_person_subscribers() {
+                publisher.publish_people(&self.session, set)?;
+            }
             publisher.publish_stats(&self.session, set, self.frames, &self.intake.drops());
         }
         self.session.budget.spend(drawing.elapsed());

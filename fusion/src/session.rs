@@ -7,7 +7,7 @@ use flyrig_renderer::{GaussianBuffers, Splat};
 use flyrig_types::{Camera, FrameSet, PersonId, Pose, RenderedView, Rig};
 
 use crate::{
-    Budget, Effort, FusionError, NetworksOn, Observation, Perception, PersonMemory, Remedy, SeenPerson,
+    Budget, Effort, FusionError, NetworksOn, Observation, Perception, PersonFrame, PersonMemory, Remedy, SeenPerson,
     SessionSettings, StageTimes, Subject,
     drawing::Drawing,
     stillness::Stillness,
@@ -358,6 +358,14 @@ impl Session {
     /// [`FusionError::NoSuchPerson`], [`FusionError::Gpu`].
     pub fn splats(&self, person: PersonId) -> Result<Vec<Splat>, FusionError> {
         self.known(person)?.splats(&self.gpu)
+    }
+
+    /// Reads a person's colours back for the person stream, with its motion at this set; None before its first pose.
+    ///
+    /// # Errors
+    /// [`FusionError::NoSuchPerson`] and [`FusionError::Gpu`].
+    pub fn person_frame(&self, person: PersonId, set: &FrameSet) -> Result<Option<PersonFrame>, FusionError> {
+        self.known(person)?.person_frame(&self.gpu, set.index, set.master_nanos)
     }
 
     /// Reads back what a person's last update observed. Needs [`Self::keep_observations`].

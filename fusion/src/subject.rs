@@ -1,6 +1,6 @@
 //! One person: the template, its Gaussians on the GPU, deformation, colours, and how well the person is tracked.
 
-use std::time::Instant;
+use std::{sync::Arc, time::Instant};
 
 use flyrig_body::{
     DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, SurfaceGaussians, Template, build_graph, sample_surface, skin_mesh,
@@ -12,12 +12,14 @@ use flyrig_renderer::{
     RenderTarget, Splat, UNKNOWN_RGBA, ViewInput, read_splats,
 };
 use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, SharedAppearance, ViewPicture};
+use flyrig_stream::EncodedTemplate;
 use flyrig_tracker::{DeformReport, EdgeColor};
 use flyrig_types::{Camera, Image, Mask, PersonId, Pose, Rig};
 
 use crate::{
     Effort, FusionError, NetworksOn, PersonMemory, SessionSettings, StageTimes, TrackWatch,
     deformation::{DeformTimes, Deformation, Instants, TrackedView},
+    person_stream::encode_template,
     pose_curve::PoseCurve,
     stage_times::processor_time,
 };
@@ -83,6 +85,8 @@ enum Networks {
 pub struct Subject {
     id: PersonId,
     template: Template,
+    /// The same for those who draw the person themselves.
+    stream_template: Arc<EncodedTemplate>,
     skinner: GpuSkinner,
     gaussians: GaussianBuffers,
     /// The Gaussians as they stood at the second, third ... instant of a set.
@@ -154,12 +158,13 @@ impl Subject {
         gaussians.canonical.write(gpu, &canonical);
         gaussians.color.write(gpu, &vec![[0.5, 0.5, 0.5, 1.0]; count]);
         let deform = settings.tracking.options();
+        let inset = deform.as_ref().map(|_| surface.inset());
+        let drawn = inset.as_ref().unwrap_or(surface);
+        let stream_template = encode_template(drawn, deform.as_ref().map(|_| graph), &template.skeleton)?;
         Ok(Self {
             id,
-            skinner: match deform {
-                Some(_) => GpuSkinner::new(gpu, &surface.inset(), &template.skeleton)?,
-                None => GpuSkinner::new(gpu, surface, &template.skeleton)?,
-            },
+            stream_template: Arc::new(stream_template),
+            skinner: GpuSkinner::new(gpu, drawn, &template.skeleton)?,
             shape_held: false,
             direct_colors: None,
             deformation: deform
@@ -220,6 +225,16 @@ impl Subject {
     #[must_use]
     pub fn drawn_pose(&self) -> Option<Pose> {
         self.last_pose.as_ref().map(|pose| self.corrected(pose))
+    }
+
+    /// The template for the person stream.
+    pub(crate) fn stream_template(&self) -> Arc<EncodedTemplate> {
+        Arc::clone(&self.stream_template)
+    }
+
+    /// Canonical translations of the deformation graph's nodes, metres; empty without a deformation.
+    pub(crate) fn node_translations(&self) -> &[glam::DVec3] {
+        self.deformation.as_ref().map_or(&[], Deformation::translations)
     }
 
     /// The Gaussians as they are drawn.

@@ -159,7 +159,7 @@ fn measure(load: Load, shared_memory: bool, express: bool, seconds: f64) -> Resu
 fn watch(endpoint: &str, shared_memory: bool, seconds: Duration) -> Result<(), Failure> {
     let config =
         TransportConfig { connect: vec![endpoint.to_owned()], shared_memory, ..TransportConfig::subscriber("bench") };
-    let subscriber = Subscriber::open(&config, &Interests { views: Views::All, splats: true, stats: false })?;
+    let subscriber = Subscriber::open(&config, &Interests { views: Views::All, splats: true, ..Interests::default() })?;
     let mut millis = Vec::new();
     let mut first = None;
     let start = Instant::now();

@@ -32,11 +32,24 @@ pub enum MessageKind {
     Frame,
     /// [`crate::CameraStatus`].
     CameraStatus,
+    /// [`flyrig_stream::Motion`].
+    Motion,
+    /// A layer of a person's colours, for [`flyrig_stream::ColorDecoder`].
+    Colors,
 }
 
 impl MessageKind {
-    const ALL: [Self; 7] =
-        [Self::View, Self::Splats, Self::Calibration, Self::Transforms, Self::Stats, Self::Frame, Self::CameraStatus];
+    const ALL: [Self; 9] = [
+        Self::View,
+        Self::Splats,
+        Self::Calibration,
+        Self::Transforms,
+        Self::Stats,
+        Self::Frame,
+        Self::CameraStatus,
+        Self::Motion,
+        Self::Colors,
+    ];
 
     fn code(self) -> u8 {
         match self {
@@ -47,6 +60,8 @@ impl MessageKind {
             Self::Stats => 5,
             Self::Frame => 6,
             Self::CameraStatus => 7,
+            Self::Motion => 8,
+            Self::Colors => 9,
         }
     }
 }

@@ -99,11 +99,11 @@ impl State {
         }
     }
 
-    /// Forgets the person whose splats came longest ago when there are as many as are kept: persons come and go for days.
-    fn forget_person(&mut self) {
-        let persons = self.slots.iter().filter(|(label, _)| label.starts_with(keys::PERSON_SPLATS));
+    /// Forgets the topic of a person that came longest ago when there are as many as are kept: persons come and go for days.
+    fn forget_person(&mut self, prefix: &str, most: usize) {
+        let persons = self.slots.iter().filter(|(label, _)| label.starts_with(prefix));
         let oldest = persons.clone().min_by_key(|(_, slot)| slot.arrival).map(|(label, _)| label.clone());
-        if let Some(oldest) = oldest.filter(|_| persons.count() >= MAX_PERSON_TOPICS) {
+        if let Some(oldest) = oldest.filter(|_| persons.count() >= most) {
             self.take(&oldest);
             self.slots.remove(&oldest);
         }
@@ -157,11 +157,18 @@ impl Inbox {
         {
             return Err(malformed("names no person; expected a number".to_owned()));
         }
+        if keys::is_person(label) && keys::person_in(label).is_none() {
+            return Err(malformed("names no part of the person stream".to_owned()));
+        }
         let (expected, limit) = match label {
             "splats" => (MessageKind::Splats, splats::MAX_BYTES),
             "stats" => (MessageKind::Stats, crate::stats::MAX_JSON_BYTES),
             "transforms" => (MessageKind::Transforms, crate::calibration::MAX_BYTES),
             _ if label.starts_with(keys::PERSON_SPLATS) => (MessageKind::Splats, splats::MAX_BYTES),
+            _ if keys::is_person(label) && label.ends_with("/motion") => {
+                (MessageKind::Motion, flyrig_stream::MAX_MESSAGE_BYTES)
+            }
+            _ if keys::is_person(label) => (MessageKind::Colors, flyrig_stream::MAX_MESSAGE_BYTES),
             _ if label.starts_with("calibration/") => (MessageKind::Calibration, crate::calibration::MAX_BYTES),
             _ => (MessageKind::View, view::MAX_MESSAGE_BYTES),
         };
@@ -191,13 +198,18 @@ impl Inbox {
             | MessageKind::Splats
             | MessageKind::Stats
             | MessageKind::Frame
-            | MessageKind::CameraStatus => {}
+            | MessageKind::CameraStatus
+            | MessageKind::Motion
+            | MessageKind::Colors => {}
         }
         if state.slots.len() >= MAX_TOPICS && !state.slots.contains_key(label) {
             return Err(malformed(format!("more than {MAX_TOPICS} topics")));
         }
         if label.starts_with(keys::PERSON_SPLATS) && !state.slots.contains_key(label) {
-            state.forget_person();
+            state.forget_person(keys::PERSON_SPLATS, MAX_PERSON_TOPICS);
+        }
+        if keys::is_person(label) && !state.slots.contains_key(label) {
+            state.forget_person(keys::PERSON, (1 + flyrig_stream::LAYERS) * MAX_PERSON_TOPICS);
         }
         let waits = !matches!(expected, MessageKind::Calibration | MessageKind::Transforms);
         let is_replaced = waits && state.take(label).is_some();

@@ -43,6 +43,44 @@ pub(crate) fn splats_label(person: u32) -> String {
     if person == 0 { "splats".to_owned() } else { format!("{PERSON_SPLATS}{person}") }
 }
 
+/// Labels of the person stream begin so.
+pub(crate) const PERSON: &str = "person/";
+
+/// Last parts of the key where a person's motion goes.
+pub(crate) fn motion_label(person: u32) -> String {
+    format!("{PERSON}{person}/motion")
+}
+
+/// Last parts of the key where a layer of a person's colours goes.
+pub(crate) fn color_label(person: u32, layer: usize) -> String {
+    format!("{PERSON}{person}/color-{layer}")
+}
+
+/// The person that a label of the person stream names, and the layer of a label of colours; None for any other label.
+pub(crate) fn person_in(label: &str) -> Option<(u32, Option<usize>)> {
+    let person: u32 = label.strip_prefix(PERSON)?.split('/').next()?.parse().ok()?;
+    if label == motion_label(person) {
+        return Some((person, None));
+    }
+    (0..flyrig_stream::LAYERS).find(|layer| label == color_label(person, *layer)).map(|layer| (person, Some(layer)))
+}
+
+/// Whether a label belongs, or claims to belong, to the person stream.
+pub(crate) fn is_person(label: &str) -> bool {
+    label.starts_with(PERSON)
+}
+
+/// Last parts of the key where a chunk of a template is asked for.
+pub(crate) fn chunk_label(hash: u64, chunk: u32) -> String {
+    format!("template/{hash:016x}-{chunk}")
+}
+
+/// Hash and chunk of such a label.
+pub(crate) fn chunk_in(label: &str) -> Option<(u64, u32)> {
+    let (hash, chunk) = label.strip_prefix("template/")?.split_once('-')?;
+    Some((u64::from_str_radix(hash, 16).ok()?, chunk.parse().ok()?))
+}
+
 /// Whether a label is that of splats.
 pub(crate) fn is_splats(label: &str) -> bool {
     label == "splats" || label.starts_with(PERSON_SPLATS)
@@ -103,6 +141,19 @@ mod tests {
         assert_eq!(name_in("flyrig/v1/studio/viewer/ab12/view", "viewer", "/alive"), None);
         assert_eq!(name_in("flyrig/v1", "view", ""), None);
         assert_eq!(version_in("flyrig/v7/studio/alive/x"), Some("v7"));
+    }
+
+    #[test]
+    fn persons_come_back_out_of_labels() {
+        assert_eq!(person_in(&motion_label(7)), Some((7, None)));
+        assert_eq!(person_in(&color_label(0, 2)), Some((0, Some(2))));
+        assert_eq!(chunk_in(&chunk_label(u64::MAX - 3, 12)), Some((u64::MAX - 3, 12)));
+        assert_eq!(chunk_in("template/zz-1"), None);
+        for bad in
+            ["person/07/motion", "person/x/motion", "person/1/color-3", "person/1", "person/1/motion/x", "splats"]
+        {
+            assert_eq!(person_in(bad), None, "{bad}");
+        }
     }
 
     #[test]

@@ -9,6 +9,9 @@
 //! | `view/<name>` | foxglove `CompressedImage`, protobuf |
 //! | `viewer/<subscriber>/view` | the same, a subscriber's own viewpoint |
 //! | `splats`, `splats/<person>` | [`SplatState`] of the first person and of the others, own binary layout |
+//! | `person/<person>/motion` | [`flyrig_stream::Motion`] |
+//! | `person/<person>/color-<layer>` | a layer of colours, for [`flyrig_stream::ColorDecoder`] |
+//! | `template/<hash>-<chunk>` | query and reply: u32 size of a [`flyrig_stream::Template`], and 60,000 of its bytes |
 //! | `calibration/<camera>` | foxglove `CameraCalibration`, protobuf |
 //! | `transforms` | foxglove `FrameTransforms`: `world_from_camera` of every camera and the world's up |
 //! | `stats` | [`RigStats`], JSON |
@@ -42,6 +45,7 @@ mod header;
 mod host_clock;
 mod inbox;
 mod keys;
+mod people;
 mod printable;
 mod publisher;
 mod renewal;
@@ -61,6 +65,7 @@ pub use error::{TransportError, TransportErrorKind};
 pub use frame::{CameraStatus, FRAME_HEADER_BYTES, FrameHeader, MAX_FRAME_BYTES};
 pub use header::{HEADER_BYTES, Header, MessageKind, SCHEMA_VERSION};
 pub use host_clock::{ClockEstimate, HostClock};
+pub use people::PersonMessage;
 pub use printable::{MAX_PRINTABLE, printable};
 pub use publisher::{Publisher, ViewpointCounts};
 pub use report::{LatencyReport, TopicReport};

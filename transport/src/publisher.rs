@@ -7,6 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use flyrig_stream::{LAYERS, Stamp};
 use flyrig_types::{Rig, ThreadHealth};
 use prost::bytes::Bytes;
 use zenoh::{Session, Wait, liveliness::LivelinessToken, query::Query, sample::SampleKind};
@@ -17,6 +18,7 @@ use crate::{
     config::LARGEST_QUESTION,
     drain::{Drain, DrainThread, Retained, Shared, empty_header},
     keys::{self, VIEWER_PREFIX},
+    people::{People, answer_template},
     printable,
     splats::MAX_PERSON_TOPICS,
     stats::{MAX_JSON_BYTES, from_json, to_json},
@@ -46,6 +48,7 @@ pub struct Publisher {
     splats: Arc<Topic>,
     /// Splats of other persons than the first, the one that was published last at the end.
     persons: Mutex<Vec<(u32, Arc<Topic>)>>,
+    people: Arc<People>,
     stats: Arc<Topic>,
     endpoints: Vec<String>,
     drain: DrainThread,
@@ -76,7 +79,10 @@ impl Publisher {
         let stats = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
         let lease = Duration::from_millis(config.viewpoint_lease_millis);
         let leases = Leases::new(config.max_viewers, lease, config.viewpoint_pixels_per_second);
-        let (shared, woken) = Shared::new(rig, &session, &[splats.clone(), stats.clone()], leases);
+        let people = Arc::new(People::new());
+        let mut topics = vec![splats.clone(), stats.clone()];
+        topics.extend(people.first_topics());
+        let (shared, woken) = Shared::new(rig, &session, &topics, leases);
 
         let state = shared.clone();
         session
@@ -99,12 +105,19 @@ impl Publisher {
             .background()
             .wait()
             .map_err(failed)?;
+        let templates = people.clone();
+        session
+            .declare_queryable(keys::key(rig, "template/*"))
+            .callback(move |query| answer_template(&templates, &query))
+            .background()
+            .wait()
+            .map_err(failed)?;
         let alive = keys::key(rig, &format!("alive/{}", session.zid()));
         let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
 
         let drain = DrainThread::start(Drain { shared: shared.clone(), session, express: config.express, woken })?;
         let persons = Mutex::default();
-        Ok(Self { shared, splats, persons, stats, endpoints, drain, _alive: alive })
+        Ok(Self { shared, splats, persons, people, stats, endpoints, drain, _alive: alive })
     }
 
     /// Endpoints it listens on, port 0 replaced by the real one.
@@ -160,6 +173,31 @@ impl Publisher {
             person => self.person_topic(person),
         };
         self.offer(&topic, Body::Splats(state), header)
+    }
+
+    /// Whether anybody subscribes to the person stream.
+    #[must_use]
+    pub fn has_person_subscribers(&self) -> bool {
+        self.people.is_watched()
+    }
+
+    /// Keeps a person's template for those who ask for it; one of the last [`MAX_PERSON_TOPICS`] + 1 persons.
+    pub fn offer_template(&self, person: u32, hash: u64, bytes: Bytes) {
+        self.people.offer_template(person, hash, bytes);
+    }
+
+    /// Hands in a frame of the person stream: motion, and each layer of the colours. A message that still waits is replaced.
+    pub fn publish_person(&self, stamp: &Stamp, motion: Bytes, colors: [Bytes; LAYERS]) -> PublishOutcome {
+        let header = Header { frame: stamp.frame, capture_nanos: stamp.capture_nanos, ..empty_header() };
+        let topics = self.people.topics(stamp.person, &self.shared);
+        let mut outcome = PublishOutcome::Unwatched;
+        for (i, (topic, bytes)) in topics.iter().zip(std::iter::once(motion).chain(colors)).enumerate() {
+            let offered = self.offer(topic, Body::Bytes(bytes), header);
+            if i == 0 {
+                outcome = offered;
+            }
+        }
+        outcome
     }
 
     fn person_topic(&self, person: u32) -> Arc<Topic> {

@@ -2,6 +2,7 @@
 
 use std::{sync::Arc, time::Duration};
 
+use flyrig_stream::Template;
 use flyrig_types::{Camera, Rig};
 use prost::bytes::Bytes;
 use zenoh::{Session, Wait, liveliness::LivelinessToken, sample::SampleKind};
@@ -11,6 +12,7 @@ use crate::{
     config::LARGEST_QUESTION,
     inbox::{Inbox, Raw, as_malformed},
     keys::{self, VIEWER_PREFIX},
+    people::{self, PersonMessage},
     renewal::Renewal,
     splats,
     view::MAX_MESSAGE_BYTES,
@@ -36,6 +38,8 @@ pub struct Interests {
     pub views: Views,
     /// The splat stream.
     pub splats: bool,
+    /// The person stream.
+    pub people: bool,
     /// The rig's statistics.
     pub stats: bool,
 }
@@ -59,6 +63,7 @@ pub struct Received<T> {
 pub struct Subscriber {
     inbox: Arc<Inbox>,
     id: String,
+    rig: String,
     renewal: Renewal,
     session: Session,
     closed: bool,
@@ -99,6 +104,7 @@ impl Subscriber {
         if interests.splats {
             labels.extend(["splats".to_owned(), format!("{}*", keys::PERSON_SPLATS)]);
         }
+        labels.extend(interests.people.then(|| format!("{}*/*", keys::PERSON)));
         labels.extend(interests.stats.then(|| "stats".to_owned()));
         for label in labels {
             let inbox = inbox.clone();
@@ -124,7 +130,7 @@ impl Subscriber {
         let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
         let key = keys::key(rig, &format!("viewpoint/{id}"));
         let renewal = Renewal::start(session.clone(), key, format!("{VIEWER_PREFIX}{id}"))?;
-        Ok(Self { inbox, id, renewal, session, closed: false, _alive: alive })
+        Ok(Self { inbox, id, rig: rig.clone(), renewal, session, closed: false, _alive: alive })
     }
 
     /// Our name towards the publisher.
@@ -160,6 +166,26 @@ impl Subscriber {
     pub fn next_splats(&self, timeout: Duration) -> Result<Option<Received<SplatState>>, TransportError> {
         let Some((label, raw)) = self.inbox.next(timeout, keys::is_splats)? else { return Ok(None) };
         self.received(label, raw, |_, _, payload| SplatState::decode(&payload)).map(Some)
+    }
+
+    /// The next message of the person stream nobody has taken yet, topics in turns; `None` after the timeout. Take messages as
+    /// they come: only the newest of a topic waits.
+    ///
+    /// # Errors
+    /// As [`Self::next_view`].
+    pub fn next_person(&self, timeout: Duration) -> Result<Option<Received<PersonMessage>>, TransportError> {
+        let Some((label, raw)) = self.inbox.next(timeout, keys::is_person)? else { return Ok(None) };
+        let (person, layer) = keys::person_in(&label).unwrap_or_default();
+        self.received(label, raw, |_, _, bytes| Ok(PersonMessage { person, layer, bytes })).map(Some)
+    }
+
+    /// Asks the rig for the template of a motion's stamp; `None` when nobody answers in time;
+    /// ask again then.
+    ///
+    /// # Errors
+    /// `Malformed` when the answer is not that template, `Session` when the question cannot be asked.
+    pub fn template(&self, hash: u64, timeout: Duration) -> Result<Option<Template>, TransportError> {
+        people::ask_template(&self.session, &self.rig, hash, timeout)
     }
 
     /// The newest statistics nobody has taken yet; `None` after the timeout.

@@ -136,6 +136,11 @@ impl Topic {
     /// Small messages travel in a queue of their own, so that pictures never hold them up.
     pub(crate) fn priority(&self) -> Priority {
         match self.kind {
+            MessageKind::Motion => Priority::InteractiveHigh,
+            // The coarse layer makes a person, the finest is missed least.
+            MessageKind::Colors if self.label.ends_with("color-0") => Priority::DataHigh,
+            MessageKind::Colors if self.label.ends_with("color-1") => Priority::Data,
+            MessageKind::Colors => Priority::DataLow,
             MessageKind::View | MessageKind::Splats | MessageKind::Frame => Priority::Data,
             MessageKind::Calibration | MessageKind::Transforms | MessageKind::Stats | MessageKind::CameraStatus => {
                 Priority::InteractiveLow
@@ -152,6 +157,8 @@ impl Topic {
             MessageKind::Stats => Encoding::APPLICATION_JSON.with_schema("flyrig.RigStats"),
             MessageKind::Frame => Encoding::APPLICATION_OCTET_STREAM.with_schema("flyrig.Frame"),
             MessageKind::CameraStatus => Encoding::APPLICATION_JSON.with_schema("flyrig.CameraStatus"),
+            MessageKind::Motion => Encoding::APPLICATION_OCTET_STREAM.with_schema("flyrig.Motion"),
+            MessageKind::Colors => Encoding::APPLICATION_OCTET_STREAM.with_schema("flyrig.Colors"),
         }
     }
 }

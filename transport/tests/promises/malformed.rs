@@ -180,7 +180,7 @@ fn stranger() -> (zenoh::Session, String) {
 #[test]
 fn foreign_messages_on_our_keys_are_told_counted_and_survived() {
     let publisher = open_publisher(|_| {});
-    let interests = Interests { views: Views::All, splats: true, stats: true };
+    let interests = Interests { views: Views::All, splats: true, people: true, stats: true };
     let subscriber = open_subscriber(&publisher, &interests);
     publish_until_seen(&publisher, &subscriber, "front", &mut 0);
 
@@ -232,7 +232,8 @@ fn a_hostile_publisher_ends_no_watcher_and_holds_no_message_up() {
     let (stranger, endpoint) = stranger();
     let mut both = subscriber_config(publisher.endpoints());
     both.connect.push(endpoint);
-    let subscriber = Subscriber::open(&both, &Interests { views: Views::All, splats: true, stats: true }).unwrap();
+    let subscriber =
+        Subscriber::open(&both, &Interests { views: Views::All, splats: true, people: true, stats: true }).unwrap();
     // Answers to the viewpoint's question: nonsense, and no end of it.
     let noise = ["{", r#"{"schema_version":1,"granted":7}"#, &"x".repeat(300_000)].map(String::from);
     stranger

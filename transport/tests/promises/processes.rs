@@ -22,7 +22,7 @@ const ENDPOINT: &str = "FLYRIG_TEST_ENDPOINT";
 #[ignore = "the child process of the other tests"]
 fn child_watcher() {
     let Ok(endpoint) = std::env::var(ENDPOINT) else { return };
-    let interests = Interests { views: Views::All, splats: true, stats: true };
+    let interests = Interests { views: Views::All, splats: true, people: true, stats: true };
     let subscriber = Subscriber::open(&subscriber_config(&[endpoint]), &interests).unwrap();
     subscriber.request_viewpoint(&camera("mine", Lens::PINHOLE), 30.0).unwrap();
     let mut out = std::io::stdout();

@@ -1,0 +1,202 @@
+//! A person for the stream: template, motion and colours, encoded on a thread of its own.
+
+use std::{collections::BTreeMap, sync::Arc, time::Duration};
+
+use flyrig_body::{DeformationGraph, Skeleton, SurfaceGaussians};
+use flyrig_capture::{LatestQueue, PopError};
+use flyrig_stream::{
+    ColorEncoder, ColorSettings, EncodedTemplate, Joint, Motion, MotionEncoder, StreamError, TemplateSource,
+};
+use flyrig_transport::Publisher;
+use flyrig_types::{PersonId, Pose, SupervisedThread, ThreadHealth};
+use glam::DVec3;
+
+use crate::{FusionError, Subject};
+
+/// Frames of people that may wait for the encoder.
+const WAITING: usize = 4;
+
+/// Encodes a person's template: `surface` as it is skinned, and the graph that deforms it, if one does.
+pub(crate) fn encode_template(
+    surface: &SurfaceGaussians,
+    graph: Option<&DeformationGraph>,
+    skeleton: &Skeleton,
+) -> Result<EncodedTemplate, StreamError> {
+    let joint = |joint: &flyrig_body::Joint| Joint {
+        parent: joint.parent.map(|parent| parent as u16),
+        translation: joint.rest_translation.as_vec3().to_array(),
+        joint_from_canonical: [0, 1, 2].map(|row| joint.joint_from_canonical.row(row).as_vec4().to_array()),
+    };
+    let joints: Vec<Joint> = skeleton.joints().iter().map(joint).collect();
+    let center_scale: Vec<[f32; 4]> =
+        surface.positions.iter().zip(&surface.scale_m).map(|(p, scale)| p.extend(*scale).to_array()).collect();
+    let normals: Vec<[f32; 3]> = surface.normals.iter().map(|n| n.to_array()).collect();
+    let skin: Vec<_> = surface.skin.iter().map(|skin| (skin.joints.map(u32::from), skin.weights)).collect();
+    let node_weights: Vec<_> = graph.map_or_else(Vec::new, |graph| {
+        graph.gaussian_nodes.iter().copied().zip(graph.gaussian_weights.iter().copied()).collect()
+    });
+    let nodes: Vec<[f32; 3]> =
+        graph.map_or_else(Vec::new, |graph| graph.nodes.iter().map(|node| node.to_array()).collect());
+    TemplateSource {
+        joints: &joints,
+        center_scale: &center_scale,
+        normals: &normals,
+        skin: &skin,
+        node_weights: &node_weights,
+        nodes: &nodes,
+    }
+    .encode()
+}
+
+/// A pose and the nodes' translations as the stream has them; the stamp is empty.
+pub(crate) fn motion(pose: &Pose, translations: &[DVec3]) -> Motion {
+    Motion {
+        root_translation: pose.root_translation.as_vec3().to_array(),
+        joint_rotations: pose.joint_rotations.iter().map(|rotation| rotation.as_quat().to_array()).collect(),
+        nodes: translations.iter().map(|translation| translation.as_vec3().to_array()).collect(),
+        ..Motion::default()
+    }
+}
+
+/// A person at one instant, before it is encoded.
+#[derive(Debug)]
+pub struct PersonFrame {
+    template: Arc<EncodedTemplate>,
+    motion: Motion,
+    colors: Vec<[f32; 4]>,
+}
+
+impl Subject {
+    /// Reads a person's colours back for the stream; None before the first pose.
+    pub(crate) fn person_frame(
+        &self,
+        gpu: &flyrig_gpu::GpuContext,
+        frame: u64,
+        capture_nanos: i64,
+    ) -> Result<Option<PersonFrame>, FusionError> {
+        let Some(pose) = self.drawn_pose() else { return Ok(None) };
+        let mut motion = motion(&pose, self.node_translations());
+        motion.stamp.person = self.id().0;
+        (motion.stamp.frame, motion.stamp.capture_nanos) = (frame, capture_nanos);
+        Ok(Some(PersonFrame { template: self.stream_template(), motion, colors: self.gaussians().color.read(gpu)? }))
+    }
+}
+
+/// One person's encoders.
+#[derive(Debug)]
+pub struct PersonEncoder {
+    hash: u64,
+    motion: MotionEncoder,
+    colors: ColorEncoder,
+}
+
+/// Messages of one frame: motion, and the layers of the colours.
+#[derive(Debug)]
+pub struct PersonMessages {
+    /// Which template, person and frame.
+    pub stamp: flyrig_stream::Stamp,
+    /// Motion.
+    pub motion: Vec<u8>,
+    /// Colours.
+    pub colors: [Vec<u8>; flyrig_stream::LAYERS],
+}
+
+impl PersonEncoder {
+    /// For the person of a frame. `epoch` tells its colours from those of earlier encoders.
+    #[must_use]
+    pub fn new(frame: &PersonFrame, settings: ColorSettings, epoch: u32) -> Self {
+        Self {
+            hash: frame.template.template.hash,
+            motion: MotionEncoder::new(&frame.template),
+            colors: ColorEncoder::new(&frame.template, settings, epoch),
+        }
+    }
+
+    /// Encodes a frame.
+    ///
+    /// # Errors
+    /// [`FusionError::Stream`].
+    pub fn encode(&mut self, frame: &PersonFrame) -> Result<PersonMessages, FusionError> {
+        let stamp = flyrig_stream::Stamp { template: self.hash, ..frame.motion.stamp };
+        let motion = self.motion.encode(&frame.motion)?;
+        Ok(PersonMessages { stamp, motion, colors: self.colors.encode(stamp, &frame.colors) })
+    }
+}
+
+impl PersonFrame {
+    /// The person's template.
+    #[must_use]
+    pub fn template(&self) -> &EncodedTemplate {
+        &self.template
+    }
+}
+
+/// Encodes and publishes people without making the session wait: of frames that wait, the oldest is dropped.
+pub(crate) struct PersonPublisher {
+    frames: Arc<LatestQueue<PersonFrame>>,
+    thread: SupervisedThread,
+}
+
+impl PersonPublisher {
+    pub fn start(publisher: Arc<Publisher>) -> Result<Self, FusionError> {
+        let frames = Arc::new(LatestQueue::<PersonFrame>::new(WAITING));
+        let waiting = Arc::clone(&frames);
+        let mut encoders = BTreeMap::<u32, PersonEncoder>::new();
+        let work = move || {
+            loop {
+                let frame = match waiting.pop(Duration::from_millis(200)) {
+                    Ok(frame) => frame,
+                    Err(PopError::Timeout) => continue,
+                    Err(PopError::Closed) => return,
+                };
+                publish(&publisher, &mut encoders, &frame);
+            }
+        };
+        let thread =
+            SupervisedThread::start("person", work).map_err(|source| FusionError::Thread { name: "person", source })?;
+        Ok(Self { frames, thread })
+    }
+
+    pub fn push(&self, frame: PersonFrame) {
+        drop(self.frames.push(frame));
+    }
+
+    pub fn dropped(&self) -> u64 {
+        self.frames.dropped()
+    }
+
+    pub fn health(&self) -> ThreadHealth {
+        self.thread.health()
+    }
+
+    /// Publishes what waits and ends the thread.
+    pub fn finish(mut self) {
+        self.frames.close();
+        self.thread.join();
+    }
+}
+
+/// Epoch of an encoder that starts now.
+fn epoch() -> u32 {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    since.map_or(0, |since| since.as_micros() as u32)
+}
+
+fn publish(publisher: &Publisher, encoders: &mut BTreeMap<u32, PersonEncoder>, frame: &PersonFrame) {
+    let person = frame.motion.stamp.person;
+    let template = &frame.template;
+    if encoders.get(&person).is_none_or(|encoder| encoder.hash != template.template.hash) {
+        while encoders.len() > flyrig_transport::MAX_PERSON_TOPICS {
+            encoders.pop_first();
+        }
+        publisher.offer_template(person, template.template.hash, template.bytes.clone().into());
+        encoders.insert(person, PersonEncoder::new(frame, ColorSettings::default(), epoch()));
+    }
+    let Some(encoder) = encoders.get_mut(&person) else { return };
+    match encoder.encode(frame) {
+        Ok(PersonMessages { stamp, motion, colors }) => {
+            publisher.publish_person(&stamp, motion.into(), colors.map(Into::into));
+        }
+        Err(error) => tracing::warn!(person = %PersonId(person), %error, "person not published"),
+    }
+}

@@ -1,0 +1,140 @@
+//! One person of the stream, as it has come so far.
+
+use std::{
+    collections::VecDeque,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use flyrig_stream::{ColorDecoder, Motion, Posed, Stamp, StreamError, Template};
+
+/// Motions that are kept to interpolate between.
+const KEPT: usize = 16;
+/// Longest delay that interpolation may add.
+const MOST_DELAY_SECS: f64 = 0.5;
+/// How fast the estimate of the fastest way follows a clock that drifts, seconds a second.
+const DRIFT: f64 = 1e-3;
+/// A person who has not moved for so long is gone.
+const GONE_AFTER: Duration = Duration::from_secs(3);
+
+/// Template, last motions and colours of one person.
+#[derive(Debug)]
+pub struct StreamPerson {
+    template: Arc<Template>,
+    decoder: ColorDecoder,
+    colors: Vec<[f32; 4]>,
+    colors_are_current: bool,
+    motions: VecDeque<(Instant, Motion)>,
+    /// Smoothed time between motions, seconds of the rig's clock.
+    interval: f64,
+    /// Least of arrival (since `since`) minus capture time: the fastest way, seconds.
+    fastest: Option<f64>,
+    since: Instant,
+}
+
+impl StreamPerson {
+    /// A person nothing is known of but its template.
+    #[must_use]
+    pub fn new(template: Arc<Template>) -> Self {
+        Self {
+            decoder: ColorDecoder::new(&template),
+            colors: Vec::new(),
+            colors_are_current: false,
+            motions: VecDeque::new(),
+            interval: 0.0,
+            fastest: None,
+            since: Instant::now(),
+            template,
+        }
+    }
+
+    /// The template.
+    #[must_use]
+    pub fn template(&self) -> &Template {
+        &self.template
+    }
+
+    /// Takes in a motion that came at `now`; one that is older than the newest is left out.
+    ///
+    /// # Errors
+    /// [`StreamError`].
+    pub fn take_motion(&mut self, bytes: &[u8], now: Instant) -> Result<(), StreamError> {
+        let motion = Motion::decode(bytes, &self.template)?;
+        let capture = |motion: &Motion| motion.stamp.capture_nanos as f64 / 1e9;
+        if let Some((_, last)) = self.motions.back() {
+            let step = capture(&motion) - capture(last);
+            if step <= 0.0 && step > -GONE_AFTER.as_secs_f64() {
+                return Ok(());
+            }
+            if step <= 0.0 || step > GONE_AFTER.as_secs_f64() {
+                // The rig began anew, or was away.
+                self.motions.clear();
+                (self.fastest, self.interval) = (None, 0.0);
+            } else {
+                self.interval = if self.interval > 0.0 { self.interval + 0.2 * (step - self.interval) } else { step };
+            }
+        }
+        let way = now.duration_since(self.since).as_secs_f64() - capture(&motion);
+        self.fastest = Some(self.fastest.map_or(way, |fastest| way.min(fastest + DRIFT * self.interval)));
+        self.motions.push_back((now, motion));
+        while self.motions.len() > KEPT {
+            self.motions.pop_front();
+        }
+        Ok(())
+    }
+
+    /// Takes in a layer of colours.
+    ///
+    /// # Errors
+    /// [`StreamError`].
+    pub fn take_colors(&mut self, bytes: &[u8]) -> Result<Stamp, StreamError> {
+        let stamp = self.decoder.take(bytes)?;
+        self.colors_are_current = false;
+        Ok(stamp)
+    }
+
+    /// The motion to show at `now`: the newest, or interpolated one interval and a half later than the fastest message would
+    /// allow, so that the next one has usually come. None for a person who is gone.
+    #[must_use]
+    pub fn motion_at(&self, now: Instant, interpolate: bool) -> Option<Motion> {
+        let (arrived, newest) = self.motions.back()?;
+        if now.saturating_duration_since(*arrived) > GONE_AFTER {
+            return None;
+        }
+        let (Some(fastest), true) = (self.fastest, interpolate) else { return Some(newest.clone()) };
+        let delay = (1.5 * self.interval).min(MOST_DELAY_SECS);
+        let wanted = now.saturating_duration_since(self.since).as_secs_f64() - fastest - delay;
+        let capture = |at: usize| self.motions[at].1.stamp.capture_nanos as f64 / 1e9;
+        let next = (0..self.motions.len()).find(|&at| capture(at) > wanted);
+        Some(match next {
+            None => newest.clone(),
+            Some(0) => self.motions[0].1.clone(),
+            Some(at) => {
+                let (before, after) = (&self.motions[at - 1].1, &self.motions[at].1);
+                let share = (wanted - capture(at - 1)) / (capture(at) - capture(at - 1));
+                before.interpolate(after, share as f32)
+            }
+        })
+    }
+
+    /// Poses the person and returns its colours, an element a Gaussian each.
+    pub fn pose(&mut self, motion: &Motion, posed: &mut Posed) -> &[[f32; 4]] {
+        self.template.pose(motion, posed);
+        if !std::mem::replace(&mut self.colors_are_current, true) {
+            self.decoder.colors(&mut self.colors);
+        }
+        &self.colors
+    }
+
+    /// Whether every part of the person has its colours, down to the finest layer.
+    #[must_use]
+    pub fn is_complete(&self) -> bool {
+        (0..flyrig_stream::LAYERS).all(|layer| self.decoder.known(layer) >= 1.0)
+    }
+
+    /// Messages of colours that were missed.
+    #[must_use]
+    pub fn missed(&self) -> u64 {
+        (0..flyrig_stream::LAYERS).map(|layer| self.decoder.missed(layer)).sum()
+    }
+}

@@ -1,0 +1,79 @@
+//! People of the stream, drawn into a view.
+
+use flyrig_gpu::{GpuContext, GpuError};
+use flyrig_renderer::{GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, rgba8_from_target};
+use flyrig_stream::Posed;
+use flyrig_types::{Camera, RenderedView};
+
+/// A rasteriser with room for the people that are shown.
+#[derive(Debug)]
+pub struct Scene {
+    gpu: GpuContext,
+    rasterizer: Rasterizer,
+    gaussians: GaussianBuffers,
+    target: RenderTarget,
+}
+
+impl Scene {
+    /// An empty scene.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn new(gpu: &GpuContext) -> Result<Self, GpuError> {
+        Ok(Self {
+            gpu: gpu.clone(),
+            rasterizer: Rasterizer::new(gpu, 1)?,
+            gaussians: GaussianBuffers::zeroed(gpu, 1)?,
+            target: RenderTarget::of_color(gpu, 16, 16)?,
+        })
+    }
+
+    /// Where it is drawn, for reports.
+    #[must_use]
+    pub fn adapter_name(&self) -> String {
+        self.gpu.adapter_name()
+    }
+
+    /// Puts people into the scene, in place of those before: centres and normals, and linear colours of as many Gaussians.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn set_people<'a>(
+        &mut self,
+        people: impl IntoIterator<Item = (&'a Posed, &'a [[f32; 4]])>,
+    ) -> Result<(), GpuError> {
+        let (mut centers, mut normals, mut colors) = (Vec::new(), Vec::new(), Vec::new());
+        for (posed, of_person) in people {
+            let count = posed.center_scale.len().min(of_person.len());
+            centers.extend_from_slice(&posed.center_scale[..count]);
+            normals.extend_from_slice(&posed.normal[..count]);
+            colors.extend_from_slice(&of_person[..count]);
+        }
+        if self.gaussians.count() != centers.len().max(1) {
+            self.gaussians = GaussianBuffers::zeroed(&self.gpu, centers.len().max(1))?;
+        }
+        if !centers.is_empty() {
+            self.gaussians.center_scale.write(&self.gpu, &centers);
+            self.gaussians.normal.write(&self.gpu, &normals);
+            self.gaussians.color.write(&self.gpu, &colors);
+        }
+        Ok(())
+    }
+
+    /// Draws the people as a camera sees them, at its size; straight alpha.
+    ///
+    /// # Errors
+    /// [`GpuError`].
+    pub fn draw(&mut self, camera: &Camera) -> Result<RenderedView, GpuError> {
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+        if (self.target.width, self.target.height) != (width, height) {
+            self.target = RenderTarget::of_color(&self.gpu, width, height)?;
+        }
+        let settings = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
+        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+        self.rasterizer.encode(&self.gpu, &mut encoder, &self.gaussians, camera, &settings, &self.target)?;
+        self.gpu.queue.submit([encoder.finish()]);
+        self.gpu.wait()?;
+        Ok(RenderedView { width, height, rgba: rgba8_from_target(&self.target.color.read(&self.gpu)?) })
+    }
+}
