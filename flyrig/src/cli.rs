@@ -80,6 +80,8 @@ pub enum Command {
         /// A TOML file whose cameras are looked for and whose buses are planned.
         config: Option<PathBuf>,
     },
+    /// Walk around the people of a running rig, in a window.
+    View(ViewArgs),
     /// Watch a running rig: print rates and latency, write pictures or a video.
     Watch(WatchArgs),
     /// Replay a data set, render its held-out cameras and score them.
@@ -593,6 +595,34 @@ pub struct WatchArgs {
     /// Write rates and latency as JSON at the end.
     #[arg(long)]
     pub stats: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct ViewArgs {
+    /// Name of the rig.
+    #[arg(long, default_value = "flyrig")]
+    pub rig: String,
+    /// Where the rig or a router listens (zenoh endpoint).
+    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
+    pub connect: String,
+    /// Show the newest frame at once; without it, motion is interpolated and shown a frame and a half later.
+    #[arg(long)]
+    pub lowest_latency: bool,
+    /// Move along with the person from the start (F).
+    #[arg(long)]
+    pub follow: bool,
+    /// Name of the rig's camera to stand at first.
+    #[arg(long)]
+    pub camera: Option<String>,
+    /// Size of the window, WIDTHxHEIGHT.
+    #[arg(long, value_parser = parse_size, default_value = "1280x720")]
+    pub size: [u32; 2],
+    /// Save the window as PNG as soon as a person is shown with all colours, and close it.
+    #[arg(long)]
+    pub screenshot: Option<PathBuf>,
+    /// Close after so many seconds.
+    #[arg(long, value_parser = parse_seconds)]
+    pub seconds: Option<f64>,
 }
 
 #[derive(Debug, Args)]

@@ -26,6 +26,7 @@ mod source;
 mod sync_check;
 mod take;
 mod train;
+mod view;
 mod watch;
 
 use std::process::ExitCode;
@@ -80,6 +81,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         Command::Plate(args) => plate::plate(args, &|| open_gpu(cli.adapter.as_deref())),
         Command::Calibrate { action } => calibrate::calibrate(action, &|| open_gpu(cli.adapter.as_deref())),
         Command::Doctor { config } => doctor::doctor(config.as_deref()),
+        Command::View(args) => view::view(args, &open_gpu(cli.adapter.as_deref())?),
         Command::Watch(args) => watch::watch(args),
         Command::Eval(args) => eval::eval(args, &open_gpu(cli.adapter.as_deref())?),
         Command::Sim { action: SimAction::Export(args) } => {

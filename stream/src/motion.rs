@@ -150,10 +150,12 @@ impl Motion {
     }
 
     /// Between two motions of one template, `t` in 0..=1: along the shortest turn of each joint. The stamp is that of the
-    /// nearer one.
+    /// nearer one, with the capture time in between.
     #[must_use]
     pub fn interpolate(&self, other: &Self, t: f32) -> Self {
         let mix = |a: f32, b: f32| a + (b - a) * t;
+        let later = other.stamp.capture_nanos.saturating_sub(self.stamp.capture_nanos);
+        let capture_nanos = self.stamp.capture_nanos.saturating_add((later as f64 * f64::from(t)) as i64);
         let mix3 = |a: [f32; 3], b: [f32; 3]| core::array::from_fn(|k| mix(a[k], b[k]));
         let turn = |a: [f32; 4], b: [f32; 4]| {
             let dot: f32 = a.iter().zip(b).map(|(a, b)| a * b).sum();
@@ -164,7 +166,7 @@ impl Motion {
         };
         let pairs = |a: &[[f32; 3]], b: &[[f32; 3]]| a.iter().zip(b).map(|(a, b)| mix3(*a, *b)).collect();
         Self {
-            stamp: if t < 0.5 { self.stamp } else { other.stamp },
+            stamp: Stamp { capture_nanos, ..if t < 0.5 { self.stamp } else { other.stamp } },
             root_translation: mix3(self.root_translation, other.root_translation),
             joint_rotations: self
                 .joint_rotations

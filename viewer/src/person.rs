@@ -14,7 +14,7 @@ const KEPT: usize = 16;
 const MOST_DELAY_SECS: f64 = 0.5;
 /// How fast the estimate of the fastest way follows a clock that drifts, seconds a second.
 const DRIFT: f64 = 1e-3;
-/// A person who has not moved for so long is gone.
+/// A person of whom no motion came for so long, and three intervals, is gone.
 const GONE_AFTER: Duration = Duration::from_secs(3);
 
 /// Template, last motions and colours of one person.
@@ -66,7 +66,7 @@ impl StreamPerson {
             if step <= 0.0 && step > -GONE_AFTER.as_secs_f64() {
                 return Ok(());
             }
-            if step <= 0.0 || step > GONE_AFTER.as_secs_f64() {
+            if step <= 0.0 || step > 10.0 * GONE_AFTER.as_secs_f64() {
                 // The rig began anew, or was away.
                 self.motions.clear();
                 (self.fastest, self.interval) = (None, 0.0);
@@ -98,7 +98,8 @@ impl StreamPerson {
     #[must_use]
     pub fn motion_at(&self, now: Instant, interpolate: bool) -> Option<Motion> {
         let (arrived, newest) = self.motions.back()?;
-        if now.saturating_duration_since(*arrived) > GONE_AFTER {
+        // A slow rig has long intervals.
+        if now.saturating_duration_since(*arrived).as_secs_f64() > GONE_AFTER.as_secs_f64() + 3.0 * self.interval {
             return None;
         }
         let (Some(fastest), true) = (self.fastest, interpolate) else { return Some(newest.clone()) };

@@ -1,0 +1,32 @@
+//! `flyrig view`: a window in which one walks around the people of a running rig.
+
+use anyhow::Result;
+use flyrig_gpu::GpuContext;
+use flyrig_report::{png, write_whole};
+use flyrig_transport::TransportConfig;
+use flyrig_viewer::{ViewOptions, open_window};
+
+use crate::cli::ViewArgs;
+
+/// Time for a screenshot, seconds, unless another one is given.
+const SCREENSHOT_SECS: f64 = 60.0;
+
+/// Runs the command.
+pub fn view(args: &ViewArgs, gpu: &GpuContext) -> Result<()> {
+    let options = ViewOptions {
+        transport: TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) },
+        lowest_latency: args.lowest_latency,
+        follow: args.follow,
+        camera: args.camera.clone(),
+        size: args.size,
+        screenshot: args.screenshot.is_some(),
+        seconds: args.seconds.or(args.screenshot.is_some().then_some(SCREENSHOT_SECS)),
+    };
+    eprintln!("view: rig '{}' at {}; close the window to end", args.rig, args.connect);
+    let shot = open_window(options, &gpu.fastest())?;
+    if let (Some(path), Some(shot)) = (&args.screenshot, shot) {
+        write_whole(path, &png::encode_rgb(&shot.rgb, shot.width, shot.height)?)?;
+        println!("{}", path.display());
+    }
+    Ok(())
+}

@@ -1,0 +1,229 @@
+//! Where the viewer stands: orbit, fly, zoom, follow.
+
+use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Rig};
+use glam::{DVec2, DVec3};
+
+/// Nearest and farthest distance to the point looked at, metres.
+const DISTANCE_M: std::ops::RangeInclusive<f64> = 0.2..=50.0;
+/// Closest the line of sight comes to the vertical, radians.
+const FROM_POLE: f64 = 0.05;
+/// Vertical field of view, radians.
+const FIELD: f64 = 0.8;
+
+/// A camera that turns around a point.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Navigation {
+    up: DVec3,
+    /// Point that is looked at, metres.
+    target: DVec3,
+    distance: f64,
+    /// Around the world's up, and above the horizon, radians.
+    heading: f64,
+    elevation: f64,
+    /// Height against width of what is seen.
+    field: f64,
+    /// Where the target was last set by following, to keep the viewer's own shift.
+    followed: Option<DVec3>,
+}
+
+impl Navigation {
+    /// Beside the rig's first camera, looking at what the cameras look at.
+    #[must_use]
+    pub fn new(rig: &Rig) -> Self {
+        let mut navigation = Self {
+            up: rig.world_up.try_normalize().unwrap_or(DVec3::Z),
+            target: rig.center_of_attention(),
+            distance: 3.0,
+            heading: 0.0,
+            elevation: 0.1,
+            field: FIELD,
+            followed: None,
+        };
+        if let Some(camera) = rig.cameras.first() {
+            navigation.stand_at(camera.position());
+        }
+        navigation
+    }
+
+    /// Two horizontal axes that headings are measured from.
+    fn axes(&self) -> (DVec3, DVec3) {
+        let x = if self.up.cross(DVec3::X).length() > 0.1 { DVec3::X } else { DVec3::Y };
+        let x = (x - self.up * x.dot(self.up)).normalize();
+        (x, self.up.cross(x))
+    }
+
+    /// Stands at a point, looking at the same target.
+    fn stand_at(&mut self, eye: DVec3) {
+        let (x, y) = self.axes();
+        let arm = eye - self.target;
+        self.distance = arm.length().clamp(*DISTANCE_M.start(), *DISTANCE_M.end());
+        self.heading = arm.dot(y).atan2(arm.dot(x));
+        let most = std::f64::consts::FRAC_PI_2 - FROM_POLE;
+        self.elevation = (arm.dot(self.up) / arm.length().max(1e-9)).clamp(-1.0, 1.0).asin().clamp(-most, most);
+    }
+
+    fn arm(&self) -> DVec3 {
+        let (x, y) = self.axes();
+        let level = x * self.heading.cos() + y * self.heading.sin();
+        (level * self.elevation.cos() + self.up * self.elevation.sin()) * self.distance
+    }
+
+    /// Distance to the point that is looked at, metres.
+    #[must_use]
+    pub fn distance(&self) -> f64 {
+        self.distance
+    }
+
+    /// Turns around the target; angles in radians.
+    pub fn orbit(&mut self, right: f64, down: f64) {
+        let most = std::f64::consts::FRAC_PI_2 - FROM_POLE;
+        self.heading = (self.heading - right) % std::f64::consts::TAU;
+        self.elevation = (self.elevation + down).clamp(-most, most);
+    }
+
+    /// Comes nearer by a factor above 1, goes away by one below.
+    pub fn zoom(&mut self, factor: f64) {
+        if factor.is_finite() && factor > 0.0 {
+            self.distance = (self.distance / factor).clamp(*DISTANCE_M.start(), *DISTANCE_M.end());
+        }
+    }
+
+    /// Moves eye and target along the view's axes, metres.
+    pub fn fly(&mut self, right: f64, up: f64, forward: f64) {
+        let ahead = -self.arm().normalize();
+        let aside = ahead.cross(self.up).normalize();
+        self.target += aside * right + aside.cross(ahead) * up + ahead * forward;
+    }
+
+    /// Shifts the view by a share of its height, so that the target follows the pointer.
+    pub fn shift(&mut self, right: f64, down: f64) {
+        let height = 2.0 * self.distance * (0.5 * self.field).tan();
+        self.fly(-right * height, down * height, 0.0);
+    }
+
+    /// Moves along with a person at `place`; the viewer's own shift against the person stays. `None` ends following.
+    pub fn follow(&mut self, place: Option<DVec3>) {
+        if let (Some(before), Some(now)) = (self.followed, place.filter(|place| place.is_finite())) {
+            self.target += now - before;
+        }
+        self.followed = place;
+    }
+
+    /// Looks at a point from where it stands, relative to the target before.
+    pub fn look_at(&mut self, place: DVec3) {
+        if place.is_finite() {
+            self.target = place;
+        }
+    }
+
+    /// Jumps to a camera of the rig: its place, its field of view, and the line of sight's point nearest to the target.
+    pub fn jump(&mut self, camera: &Camera) {
+        let eye = camera.position();
+        let ahead = camera.camera_from_world.rotation.inverse() * DVec3::Z;
+        let reach = (self.target - eye).dot(ahead).clamp(0.5, *DISTANCE_M.end());
+        self.target = eye + ahead * reach;
+        self.stand_at(eye);
+        let lens = &camera.intrinsics;
+        self.field = 2.0 * (0.5 * f64::from(lens.height) / lens.focal_px.y).atan();
+    }
+
+    /// The camera of a picture of this size.
+    #[must_use]
+    pub fn camera(&self, width: u32, height: u32) -> Camera {
+        let focal = 0.5 * f64::from(height) / (0.5 * self.field).tan();
+        Camera {
+            time_offset_nanos: 0,
+            id: "view".into(),
+            intrinsics: Intrinsics {
+                width,
+                height,
+                focal_px: DVec2::splat(focal),
+                center_px: (DVec2::new(f64::from(width), f64::from(height)) - 1.0) / 2.0,
+                lens: Lens::PINHOLE,
+            },
+            camera_from_world: Isometry::look_at(self.target + self.arm(), self.target, self.up),
+        }
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    fn rig() -> Rig {
+        let camera = |eye: DVec3| Camera {
+            time_offset_nanos: 0,
+            id: format!("{eye}").into(),
+            intrinsics: Intrinsics {
+                width: 640,
+                height: 480,
+                focal_px: DVec2::splat(500.0),
+                center_px: DVec2::new(319.5, 239.5),
+                lens: Lens::PINHOLE,
+            },
+            camera_from_world: Isometry::look_at(eye, DVec3::new(0.2, 0.1, 1.0), DVec3::Z),
+        };
+        let eyes = [DVec3::new(3.0, 0.0, 1.2), DVec3::new(0.0, 3.0, 1.0), DVec3::new(-2.0, -2.0, 3.4)];
+        Rig { cameras: eyes.into_iter().map(camera).collect(), world_up: DVec3::Z }
+    }
+
+    #[test]
+    fn it_starts_at_the_first_camera_and_jumps_to_any() {
+        let rig = rig();
+        let mut navigation = Navigation::new(&rig);
+        for camera in &rig.cameras {
+            let view = navigation.camera(640, 480);
+            if camera.id == rig.cameras[0].id {
+                assert!(view.position().distance(camera.position()) < 1e-3, "{}", view.position());
+            }
+            navigation.jump(camera);
+            let view = navigation.camera(640, 480);
+            view.validate().unwrap();
+            // The same picture: place, direction and field of view.
+            for point in [DVec3::new(0.2, 0.1, 1.0), DVec3::new(0.5, 0.0, 1.5)] {
+                let (a, b) = (camera.project(point).unwrap(), view.project(point).unwrap());
+                assert!(a.distance(b) < 0.5, "{a} {b}");
+            }
+        }
+    }
+
+    #[test]
+    fn dragging_keeps_the_target_under_the_pointer() {
+        let mut navigation = Navigation::new(&rig());
+        let target = navigation.target;
+        navigation.shift(0.25, -0.1);
+        let pixel = navigation.camera(640, 480).project(target).unwrap();
+        assert!((pixel - DVec2::new(319.5 + 0.25 * 480.0, 239.5 - 0.1 * 480.0)).length() < 1.0, "{pixel}");
+    }
+
+    #[test]
+    fn following_keeps_the_view_of_the_person() {
+        let mut navigation = Navigation::new(&rig());
+        navigation.shift(0.1, 0.1);
+        let person = DVec3::new(0.3, 0.2, 0.9);
+        navigation.follow(Some(person));
+        let before = navigation.camera(640, 480).project(person).unwrap();
+        let moved = person + DVec3::new(0.5, -0.4, 0.1);
+        navigation.follow(Some(moved));
+        assert!(navigation.camera(640, 480).project(moved).unwrap().distance(before) < 1e-6);
+        // Who is lost and found elsewhere does not drag the view along.
+        navigation.follow(None);
+        let view = navigation.camera(640, 480);
+        navigation.follow(Some(DVec3::splat(100.0)));
+        assert_eq!(navigation.camera(640, 480), view);
+    }
+
+    #[test]
+    fn no_input_breaks_the_camera() {
+        let mut navigation = Navigation::new(&Rig { cameras: Vec::new(), world_up: DVec3::ZERO });
+        for by in [1e9, -1e9, 0.3] {
+            navigation.orbit(by, by);
+            navigation.zoom(by);
+            navigation.zoom(f64::NAN);
+            navigation.follow(Some(DVec3::NAN));
+            navigation.look_at(DVec3::NAN);
+            navigation.camera(64, 48).validate().unwrap();
+        }
+    }
+}

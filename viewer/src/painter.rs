@@ -1,0 +1,180 @@
+//! Draws the people on a thread of its own, so that the window answers at once.
+
+use std::{
+    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
+    time::{Duration, Instant},
+};
+
+use flyrig_gpu::GpuContext;
+use flyrig_renderer::composite_over;
+use flyrig_stream::Posed;
+use flyrig_types::{Camera, SupervisedThread, ThreadHealth};
+use glam::DVec3;
+
+use crate::{Receiver, Scene, receiver::age_secs};
+
+/// Grey behind the people, sRGB.
+const BACKDROP: u8 = 30;
+
+/// What to draw.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Request {
+    pub camera: Camera,
+    pub interpolate: bool,
+}
+
+/// A drawn view.
+#[derive(Debug)]
+pub(crate) struct Drawn {
+    pub width: u32,
+    pub height: u32,
+    pub rgb: Vec<u8>,
+    /// The rig's frame, capture time, and age when it was drawn, where this host's clock knows it.
+    pub frame: u64,
+    pub age_secs: Option<f64>,
+    /// Root of the first person that is shown.
+    pub place: Option<DVec3>,
+    pub people: usize,
+    /// Whether all colours of everybody have come.
+    pub is_complete: bool,
+    pub took: Duration,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    request: Option<Request>,
+    drawn: Option<Drawn>,
+    fault: Option<String>,
+    is_ended: bool,
+}
+
+/// The drawing thread.
+pub(crate) struct Painter {
+    shared: Arc<Shared>,
+    thread: SupervisedThread,
+    pub adapter: String,
+}
+
+impl Painter {
+    /// Starts it; `finished` is called after each view.
+    pub fn start(
+        gpu: &GpuContext,
+        receiver: Arc<Receiver>,
+        finished: impl Fn() + Send + 'static,
+    ) -> std::io::Result<Self> {
+        let shared = Arc::new(Shared::default());
+        let (of_thread, gpu) = (Arc::clone(&shared), gpu.clone());
+        let adapter = gpu.adapter_name();
+        let work = move || {
+            let (mut scene, mut posed) = (None, Vec::new());
+            while let Some(request) = of_thread.next() {
+                let drawn = draw(&gpu, &mut scene, &mut posed, &receiver, &request);
+                let mut state = of_thread.lock();
+                match drawn {
+                    Ok(drawn) => (state.drawn, state.fault) = (Some(drawn), None),
+                    // A device that is lost is not opened again here: the window says so.
+                    Err(error) => state.fault = Some(error.to_string()),
+                }
+                drop(state);
+                finished();
+            }
+        };
+        Ok(Self { shared, thread: SupervisedThread::start("draw", work)?, adapter })
+    }
+
+    /// Asks for a view; one that waits is replaced.
+    pub fn ask(&self, request: Request) {
+        self.shared.lock().request = Some(request);
+        self.shared.changed.notify_all();
+    }
+
+    /// Takes the view that was drawn last, once, and what kept one from being drawn.
+    pub fn take(&self) -> (Option<Drawn>, Option<String>) {
+        let mut state = self.shared.lock();
+        (state.drawn.take(), state.fault.clone())
+    }
+
+    pub fn thread(&self) -> ThreadHealth {
+        self.thread.health()
+    }
+}
+
+impl Drop for Painter {
+    fn drop(&mut self) {
+        self.shared.lock().is_ended = true;
+        self.shared.changed.notify_all();
+        self.thread.join();
+    }
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Waits for the next request; None at the end.
+    fn next(&self) -> Option<Request> {
+        let mut state = self.lock();
+        loop {
+            if state.is_ended {
+                return None;
+            }
+            if let Some(request) = state.request.take() {
+                return Some(request);
+            }
+            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+}
+
+fn draw(
+    gpu: &GpuContext,
+    scene: &mut Option<Scene>,
+    posed: &mut Vec<(Posed, Vec<[f32; 4]>)>,
+    receiver: &Receiver,
+    request: &Request,
+) -> Result<Drawn, flyrig_gpu::GpuError> {
+    let start = Instant::now();
+    let (mut shown, mut place, mut is_complete, mut stamp) = (0, None, true, None);
+    {
+        let mut state = receiver.state();
+        for person in state.people.values_mut() {
+            let Some(motion) = person.motion_at(start, request.interpolate) else { continue };
+            if posed.len() <= shown {
+                posed.push(Default::default());
+            }
+            let (centers, colors) = &mut posed[shown];
+            let known = person.pose(&motion, centers);
+            colors.clear();
+            colors.extend_from_slice(known);
+            shown += 1;
+            is_complete &= person.is_complete();
+            place = place.or_else(|| Some(DVec3::from(motion.root_translation.map(f64::from))));
+            stamp = stamp.or(Some(motion.stamp));
+        }
+    }
+    let scene = match scene {
+        Some(scene) => scene,
+        none => none.insert(Scene::new(gpu)?),
+    };
+    scene.set_people(posed[..shown].iter().map(|(posed, colors)| (posed, colors.as_slice())))?;
+    let view = scene.draw(&request.camera)?;
+    let backdrop = vec![BACKDROP; view.width as usize * view.height as usize * 3];
+    Ok(Drawn {
+        width: view.width,
+        height: view.height,
+        rgb: composite_over(&view.rgba, &backdrop),
+        frame: stamp.map_or(0, |stamp| stamp.frame),
+        age_secs: stamp.and_then(|stamp| age_secs(stamp.capture_nanos)),
+        place,
+        people: shown,
+        is_complete: is_complete && shown > 0,
+        took: start.elapsed(),
+    })
+}

@@ -1,0 +1,400 @@
+//! The window.
+
+use std::{
+    collections::VecDeque,
+    sync::{Arc, Mutex, OnceLock, PoisonError},
+    time::{Duration, Instant},
+};
+
+use eframe::egui;
+use flyrig_gpu::{GpuContext, GpuError};
+use flyrig_transport::{TransportConfig, TransportError};
+use glam::DVec3;
+
+use crate::{
+    Navigation, Receiver, ReceiverState,
+    painter::{Drawn, Painter, Request},
+};
+
+/// Largest view that is drawn without a graphics adapter, pixels; larger windows show it scaled.
+const MOST_PIXELS_ON_PROCESSOR: f64 = 640.0 * 480.0;
+/// Turn of a drag over the height of the window, radians.
+const DRAG_TURN: f64 = std::f64::consts::PI;
+/// Speed of flying, in distances to the target a second.
+const FLY_SPEED: f64 = 0.5;
+/// How long a problem is shown.
+const SHOW_PROBLEM: Duration = Duration::from_secs(5);
+/// How often the window looks around when nothing comes.
+const IDLE: Duration = Duration::from_millis(250);
+/// Rates of what is shown are means over this time.
+const RATE_OVER: Duration = Duration::from_secs(2);
+/// Keys of the first cameras.
+const CAMERA_KEYS: [egui::Key; 9] = [
+    egui::Key::Num1,
+    egui::Key::Num2,
+    egui::Key::Num3,
+    egui::Key::Num4,
+    egui::Key::Num5,
+    egui::Key::Num6,
+    egui::Key::Num7,
+    egui::Key::Num8,
+    egui::Key::Num9,
+];
+const HELP: &str = "drag: turn   right drag: shift   wheel: nearer   W A S D Q E: fly   1-9: camera   F: follow   R: start again   H: hide this";
+
+/// What to show and how.
+#[derive(Debug, Clone)]
+pub struct ViewOptions {
+    /// The rig and where it is.
+    pub transport: TransportConfig,
+    /// Shows the newest frame at once, in place of smooth motion a frame and a half later.
+    pub lowest_latency: bool,
+    /// Follows the person from the start.
+    pub follow: bool,
+    /// Camera to stand at first, by name.
+    pub camera: Option<String>,
+    /// Inner size of the window, points.
+    pub size: [u32; 2],
+    /// Returns the window's content as soon as a person is shown with all colours, and closes it.
+    pub screenshot: bool,
+    /// Closes after so many seconds.
+    pub seconds: Option<f64>,
+}
+
+/// RGB pixels of the window.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Screenshot {
+    /// Pixels.
+    pub width: u32,
+    /// Pixels.
+    pub height: u32,
+    /// Row by row.
+    pub rgb: Vec<u8>,
+}
+
+/// Why nothing is shown.
+#[derive(Debug, thiserror::Error)]
+pub enum ViewerError {
+    /// No session.
+    #[error(transparent)]
+    Transport(#[from] TransportError),
+    /// No graphics.
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
+    /// No window.
+    #[error(
+        "cannot open a window: {0}. Run it in a desktop session (DISPLAY or WAYLAND_DISPLAY is set), or save images without a \
+         window: flyrig watch --out FOLDER"
+    )]
+    Window(String),
+    /// A thread that the system did not start.
+    #[error("cannot start a thread: {0}; end other programs, or raise the limit of processes (ulimit -u)")]
+    Thread(#[from] std::io::Error),
+    /// Time was up before there was anything to save.
+    #[error("no screenshot in {0:.0} s: {1}")]
+    NothingShown(f64, String),
+}
+
+/// Opens the window and shows the rig's people until it is closed. Returns the screenshot, where one is asked for.
+///
+/// # Errors
+/// [`ViewerError`].
+pub fn open_window(options: ViewOptions, gpu: &GpuContext) -> Result<Option<Screenshot>, ViewerError> {
+    // The receiver starts first: whoever has a bad endpoint learns it without a window.
+    let repaint: Arc<OnceLock<egui::Context>> = Arc::default();
+    let wake = {
+        let repaint = Arc::clone(&repaint);
+        move || {
+            if let Some(context) = repaint.get() {
+                context.request_repaint();
+            }
+        }
+    };
+    let receiver = Arc::new(Receiver::start(&options.transport, wake.clone())?);
+    let painter = Painter::start(gpu, Arc::clone(&receiver), wake)?;
+    let shot: Arc<Mutex<Option<Screenshot>>> = Arc::default();
+    let limit = options.seconds;
+    let (rig, endpoint) = (options.transport.rig.clone(), options.transport.connect.join(", "));
+    let [width, height] = options.size.map(|side| side as f32);
+    let native = eframe::NativeOptions {
+        viewport: egui::ViewportBuilder::default()
+            .with_title(format!("flyrig - {rig}"))
+            .with_inner_size([width, height])
+            .with_min_inner_size([320.0, 240.0]),
+        ..eframe::NativeOptions::default()
+    };
+    let wants_shot = options.screenshot;
+    let view = View {
+        receiver: Arc::clone(&receiver),
+        painter,
+        navigation: None,
+        follows: options.follow,
+        hides: false,
+        on_processor: gpu.is_on_processor(),
+        texture: None,
+        shown: Shown::default(),
+        shot: Arc::clone(&shot),
+        asked_for_shot: false,
+        started: Instant::now(),
+        last: Instant::now(),
+        endpoint: endpoint.clone(),
+        options,
+    };
+    let opened = eframe::run_native(
+        "flyrig",
+        native,
+        Box::new(move |creation| {
+            drop(repaint.set(creation.egui_ctx.clone()));
+            Ok(Box::new(view))
+        }),
+    );
+    opened.map_err(|error| ViewerError::Window(error.to_string()))?;
+    let shot = shot.lock().unwrap_or_else(PoisonError::into_inner).take();
+    if let (true, None, Some(limit)) = (wants_shot, &shot, limit) {
+        let trouble = receiver.state().trouble(&rig, &endpoint);
+        return Err(ViewerError::NothingShown(
+            limit,
+            trouble.unwrap_or_else(|| "the colours are incomplete".to_owned()),
+        ));
+    }
+    Ok(shot)
+}
+
+/// What is on the screen.
+#[derive(Debug, Default)]
+struct Shown {
+    /// When a new frame of the rig was shown.
+    changes: VecDeque<Instant>,
+    frame: u64,
+    age_secs: Option<f64>,
+    took: Duration,
+    people: usize,
+    place: Option<DVec3>,
+    is_complete: bool,
+    fault: Option<String>,
+}
+
+struct View {
+    options: ViewOptions,
+    receiver: Arc<Receiver>,
+    painter: Painter,
+    /// None until the rig's cameras are known.
+    navigation: Option<Navigation>,
+    follows: bool,
+    hides: bool,
+    on_processor: bool,
+    texture: Option<egui::TextureHandle>,
+    shown: Shown,
+    shot: Arc<Mutex<Option<Screenshot>>>,
+    asked_for_shot: bool,
+    started: Instant,
+    last: Instant,
+    endpoint: String,
+}
+
+impl eframe::App for View {
+    fn ui(&mut self, ui: &mut egui::Ui, _frame: &mut eframe::Frame) {
+        let context = ui.ctx().clone();
+        let now = Instant::now();
+        let elapsed = now.duration_since(self.last).as_secs_f64();
+        self.last = now;
+        self.start_navigation();
+        let area = ui.max_rect();
+        let response = ui.allocate_rect(area, egui::Sense::click_and_drag());
+        self.navigate(&context, &response, elapsed);
+        self.take_drawn(&context, now);
+        self.ask(area, context.pixels_per_point());
+        let painter = ui.painter_at(area);
+        painter.rect_filled(area, 0.0, egui::Color32::from_gray(30));
+        if let Some(texture) = &self.texture {
+            let whole = egui::Rect::from_min_max(egui::pos2(0.0, 0.0), egui::pos2(1.0, 1.0));
+            painter.image(texture.id(), area, whole, egui::Color32::WHITE);
+        }
+        if !self.hides {
+            self.write_over(&painter, area, now);
+        }
+        let is_over = self.options.seconds.is_some_and(|limit| self.started.elapsed().as_secs_f64() >= limit);
+        self.take_shot(&context);
+        let has_shot = self.shot.lock().unwrap_or_else(PoisonError::into_inner).is_some();
+        if is_over || has_shot {
+            context.send_viewport_cmd(egui::ViewportCommand::Close);
+        }
+        // Interpolated motion goes on between messages.
+        let is_moving = !self.options.lowest_latency && self.shown.people > 0;
+        context.request_repaint_after(if is_moving { Duration::from_millis(8) } else { IDLE });
+    }
+}
+
+impl View {
+    /// Stands somewhere as soon as the rig's cameras are known.
+    fn start_navigation(&mut self) {
+        if self.navigation.is_some() {
+            return;
+        }
+        let state = self.receiver.state();
+        let Some(rig) = &state.rig else { return };
+        let mut navigation = Navigation::new(rig);
+        let wanted = self.options.camera.as_deref();
+        if let Some(camera) = rig.cameras.iter().find(|camera| Some(camera.id.as_str()) == wanted) {
+            navigation.jump(camera);
+        }
+        self.navigation = Some(navigation);
+    }
+
+    fn navigate(&mut self, context: &egui::Context, response: &egui::Response, elapsed: f64) {
+        let height = f64::from(response.rect.height()).max(1.0);
+        let drag = response.drag_delta();
+        let (right, down) = (f64::from(drag.x) / height, f64::from(drag.y) / height);
+        let by = |button| response.dragged_by(button);
+        let shifts = by(egui::PointerButton::Secondary) || by(egui::PointerButton::Middle);
+        let pressed = |key| context.input(|input| input.key_pressed(key));
+        let held = |key| f64::from(u8::from(context.input(|input| input.key_down(key))));
+        let wheel = f64::from(context.input(|input| input.smooth_scroll_delta().y));
+        self.follows ^= pressed(egui::Key::F);
+        self.hides ^= pressed(egui::Key::H);
+        if pressed(egui::Key::R) {
+            self.navigation = None;
+            self.start_navigation();
+        }
+        let jump = CAMERA_KEYS
+            .iter()
+            .position(|key| pressed(*key))
+            .and_then(|index| self.receiver.state().rig.as_ref().and_then(|rig| rig.cameras.get(index).cloned()));
+        let Some(navigation) = &mut self.navigation else { return };
+        if let Some(camera) = jump {
+            navigation.jump(&camera);
+        }
+        if shifts {
+            navigation.shift(right, down);
+        } else if by(egui::PointerButton::Primary) {
+            navigation.orbit(right * DRAG_TURN, down * DRAG_TURN);
+        }
+        if wheel != 0.0 {
+            navigation.zoom((wheel * 0.003).exp());
+        }
+        let step = FLY_SPEED * navigation.distance() * elapsed.min(0.1);
+        navigation.fly(
+            step * (held(egui::Key::D) - held(egui::Key::A)),
+            step * (held(egui::Key::E) - held(egui::Key::Q)),
+            step * (held(egui::Key::W) - held(egui::Key::S)),
+        );
+        navigation.follow(self.shown.place.filter(|_| self.follows));
+    }
+
+    fn take_drawn(&mut self, context: &egui::Context, now: Instant) {
+        let (drawn, fault) = self.painter.take();
+        self.shown.fault = fault;
+        let Some(Drawn { width, height, rgb, frame, age_secs, place, people, is_complete, took }) = drawn else {
+            return;
+        };
+        let image = egui::ColorImage::from_rgb([width as usize, height as usize], &rgb);
+        match &mut self.texture {
+            Some(texture) => texture.set(image, egui::TextureOptions::LINEAR),
+            None => self.texture = Some(context.load_texture("view", image, egui::TextureOptions::LINEAR)),
+        }
+        let shown = &mut self.shown;
+        if people > 0 && frame != shown.frame {
+            shown.changes.push_back(now);
+            shown.frame = frame;
+        }
+        while shown.changes.front().is_some_and(|at| now.duration_since(*at) > RATE_OVER) {
+            shown.changes.pop_front();
+        }
+        (shown.age_secs, shown.place, shown.people, shown.is_complete, shown.took) =
+            (age_secs, place, people, is_complete, took);
+    }
+
+    fn ask(&self, area: egui::Rect, pixels_per_point: f32) {
+        let Some(navigation) = &self.navigation else { return };
+        let pixels = f64::from(area.width() * area.height() * pixels_per_point * pixels_per_point);
+        let scale = if self.on_processor { (MOST_PIXELS_ON_PROCESSOR / pixels.max(1.0)).sqrt().min(1.0) } else { 1.0 };
+        let side = |points: f32| ((f64::from(points * pixels_per_point) * scale) as u32).clamp(16, 4096);
+        let camera = navigation.camera(side(area.width()), side(area.height()));
+        self.painter.ask(Request { camera, interpolate: !self.options.lowest_latency });
+    }
+
+    fn write_over(&self, painter: &egui::Painter, area: egui::Rect, now: Instant) {
+        let state = self.receiver.state();
+        let (bytes, motions) = state.rates(now);
+        let shown = self.shown.changes.len() as f64 / RATE_OVER.as_secs_f64();
+        let mut lines = Vec::new();
+        if let Some(trouble) = state.trouble(&self.options.transport.rig, &self.endpoint) {
+            lines.push((trouble, true));
+        } else {
+            let age = match (self.shown.age_secs, state.age) {
+                (Some(age), _) => format!("age {:.0} ms", 1e3 * age),
+                // Another host's clock, or a recording's: the way alone is known.
+                (None, Some((way, _))) => format!("{:.0} ms on the way", 1e3 * way),
+                (None, None) => "age unknown".to_owned(),
+            };
+            lines.push((
+                format!(
+                    "{shown:.1} of {motions:.1} frames/s shown   {age}   {:.2} Mbit/s   drawn in {:.0} ms by {}",
+                    8e-6 * bytes,
+                    1e3 * self.shown.took.as_secs_f64(),
+                    self.painter.adapter
+                ),
+                false,
+            ));
+            lines.extend(people_lines(&state, self.shown.people));
+        }
+        if let Some((_, text)) = state.problem.as_ref().filter(|(at, _)| now.duration_since(*at) < SHOW_PROBLEM) {
+            lines.push((text.clone(), true));
+        }
+        drop(state);
+        lines.extend(self.shown.fault.iter().map(|fault| (fault.clone(), true)));
+        for health in [self.receiver.thread(), self.painter.thread()].into_iter().filter(|health| health.has_failed) {
+            let panic = health.panic.unwrap_or_default();
+            lines.push((format!("the thread '{}' failed: {panic}; please report it", health.name), true));
+        }
+        let font = egui::FontId::proportional(15.0);
+        let mut at = area.left_top() + egui::vec2(12.0, 10.0);
+        for (text, is_trouble) in lines {
+            let color = if is_trouble { egui::Color32::from_rgb(255, 190, 90) } else { egui::Color32::from_gray(220) };
+            let galley = painter.layout(text, font.clone(), color, area.width() - 24.0);
+            let height = galley.size().y;
+            painter.galley(at, galley, color);
+            at.y += height + 3.0;
+        }
+        let faint = egui::Color32::from_gray(140);
+        let hint = if self.follows { format!("{HELP}   (following)") } else { HELP.to_owned() };
+        let hint = painter.layout(hint, egui::FontId::proportional(12.0), faint, area.width() - 24.0);
+        let bottom = area.left_bottom() + egui::vec2(12.0, -8.0 - hint.size().y);
+        painter.galley(bottom, hint, faint);
+    }
+
+    /// Asks for a screenshot as soon as somebody is shown completely.
+    fn take_shot(&mut self, context: &egui::Context) {
+        if !self.options.screenshot || self.asked_for_shot || !self.shown.is_complete {
+            return;
+        }
+        self.asked_for_shot = true;
+        let (shot, repaint) = (Arc::clone(&self.shot), context.clone());
+        let callback = egui::ScreenshotCallback::new(move |image| {
+            let rgb = image.pixels.iter().flat_map(|pixel| [pixel.r(), pixel.g(), pixel.b()]).collect();
+            let [width, height] = image.size.map(|side| side as u32);
+            *shot.lock().unwrap_or_else(PoisonError::into_inner) = Some(Screenshot { width, height, rgb });
+            repaint.request_repaint();
+        });
+        context.send_viewport_cmd(egui::ViewportCommand::Screenshot(callback));
+    }
+}
+
+/// Tracking quality of everybody, and what is wrong with it.
+fn people_lines(state: &ReceiverState, shown: usize) -> Vec<(String, bool)> {
+    let Some(stats) = &state.stats else { return Vec::new() };
+    let mut lines: Vec<(String, bool)> = stats
+        .subjects
+        .iter()
+        .map(|subject| {
+            let quality =
+                subject.quality.map_or_else(String::new, |quality| format!(", {:.0} % agree", 100.0 * quality));
+            let is_trouble = matches!(subject.state.as_str(), "lost" | "searching" | "recovering");
+            (format!("person {}: {}{quality}", subject.person, subject.state), is_trouble)
+        })
+        .collect();
+    if shown == 0 {
+        lines.push(("The person has left, or the rig has stopped sending".to_owned(), true));
+    }
+    lines
+}
