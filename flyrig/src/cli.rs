@@ -8,7 +8,7 @@ use flyrig_calib::Format;
 use flyrig_fusion::{
     AppearanceOptions, BodySettings, BudgetSettings, NetworksOn, Origin, PerceptionSettings, TrackingSettings,
 };
-use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size};
+use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size, parse_speed};
 use flyrig_stfa::NetworkSize;
 use flyrig_types::CameraId;
 
@@ -82,6 +82,8 @@ pub enum Command {
     },
     /// Walk around the people of a running rig, in a window.
     View(ViewArgs),
+    /// Publish a recorded person stream again, at its own pace, to try viewers without a rig.
+    Play(PlayArgs),
     /// Watch a running rig: print rates and latency, write pictures or a video.
     Watch(WatchArgs),
     /// Replay a data set, render its held-out cameras and score them.
@@ -583,6 +585,9 @@ pub struct WatchArgs {
     /// Write every picture as PNG into this folder, or, when the name ends in .mp4 or .avi, a video.
     #[arg(long)]
     pub out: Option<PathBuf>,
+    /// Record the person stream into this file (MCAP), for `flyrig play`; no pictures are received then.
+    #[arg(long, conflicts_with_all = ["out", "eye", "count", "stats"])]
+    pub record: Option<PathBuf>,
     /// Stop after so many pictures.
     #[arg(long)]
     pub count: Option<usize>,
@@ -595,6 +600,27 @@ pub struct WatchArgs {
     /// Write rates and latency as JSON at the end.
     #[arg(long)]
     pub stats: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct PlayArgs {
+    /// Recording of `flyrig watch --record`.
+    pub recording: PathBuf,
+    /// Name of the rig that it is published as.
+    #[arg(long, default_value = "flyrig")]
+    pub rig: String,
+    /// Where viewers connect (zenoh endpoint).
+    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
+    pub listen: String,
+    /// Begin again at the end, until Ctrl-C.
+    #[arg(long)]
+    pub repeat: bool,
+    /// Begin when the first viewer is there.
+    #[arg(long)]
+    pub wait: bool,
+    /// Pace against that of the recording.
+    #[arg(long, default_value_t = 1.0, value_parser = parse_speed)]
+    pub speed: f64,
 }
 
 #[derive(Debug, Args)]

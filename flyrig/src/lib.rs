@@ -23,6 +23,7 @@ mod run;
 mod silhouettes;
 mod sim_export;
 mod source;
+mod stream_recording;
 mod sync_check;
 mod take;
 mod train;
@@ -82,7 +83,11 @@ fn dispatch(cli: &Cli) -> Result<()> {
         Command::Calibrate { action } => calibrate::calibrate(action, &|| open_gpu(cli.adapter.as_deref())),
         Command::Doctor { config } => doctor::doctor(config.as_deref()),
         Command::View(args) => view::view(args, &open_gpu(cli.adapter.as_deref())?),
-        Command::Watch(args) => watch::watch(args),
+        Command::Watch(args) => match &args.record {
+            Some(path) => stream_recording::record(args, path),
+            None => watch::watch(args),
+        },
+        Command::Play(args) => stream_recording::play(args),
         Command::Eval(args) => eval::eval(args, &open_gpu(cli.adapter.as_deref())?),
         Command::Sim { action: SimAction::Export(args) } => {
             let config = args.config.as_deref().map(Config::load).transpose()?.unwrap_or_default();

@@ -195,7 +195,10 @@ fn publish(publisher: &Publisher, encoders: &mut BTreeMap<u32, PersonEncoder>, f
     let Some(encoder) = encoders.get_mut(&person) else { return };
     match encoder.encode(frame) {
         Ok(PersonMessages { stamp, motion, colors }) => {
-            publisher.publish_person(&stamp, motion.into(), colors.map(Into::into));
+            publisher.publish_person(&stamp, None, motion.into());
+            for (layer, bytes) in colors.into_iter().enumerate() {
+                publisher.publish_person(&stamp, Some(layer), bytes.into());
+            }
         }
         Err(error) => tracing::warn!(person = %PersonId(person), %error, "person not published"),
     }

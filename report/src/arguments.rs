@@ -36,6 +36,17 @@ pub fn parse_seconds(text: &str) -> Result<f64, String> {
     }
 }
 
+/// Parses a pace of 0.01 to 100 times the recorded one.
+///
+/// # Errors
+/// Says what was expected.
+pub fn parse_speed(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(speed) if (0.01..=100.0).contains(&speed) => Ok(speed),
+        _ => Err(format!("'{text}' is not between 0.01 and 100 times the recorded pace")),
+    }
+}
+
 /// Parses 0.1 to 1000 frames a second.
 ///
 /// # Errors

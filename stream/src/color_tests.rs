@@ -173,3 +173,29 @@ fn damaged_messages_are_no_panic() {
         });
     }
 }
+
+#[test]
+fn what_is_played_again_is_as_new() {
+    let person = Person::tube(1000, 10);
+    let encoded = person.encode();
+    let mut encoder = ColorEncoder::new(&encoded, ColorSettings::default(), 7);
+    let mut decoder = ColorDecoder::new(&encoded.template);
+    let colors = person.colors(0.0);
+    let messages = encoder.encode(stamp(3), &colors);
+    for round in 0..3 {
+        for message in &messages {
+            let mut message = message.clone();
+            restamp(&mut message, -5 - i64::from(round), round).unwrap();
+            let taken = decoder.take(&message).unwrap();
+            assert_eq!((taken.capture_nanos, taken.frame), (-5 - i64::from(round), 3));
+            assert_eq!(stamp_of(&message).unwrap(), taken);
+        }
+        assert!(rms(&mut decoder, &encoded, &colors) < 5.0);
+        assert_eq!(decoder.missed(0), 0);
+    }
+    let mut motion = MotionEncoder::new(&encoded).encode(&person.motion(2)).unwrap();
+    restamp(&mut motion, 99, 1).unwrap();
+    let back = Motion::decode(&motion, &encoded.template).unwrap();
+    assert_eq!(back.stamp, Stamp { capture_nanos: 99, ..stamp_of(&motion).unwrap() });
+    assert!(restamp(&mut motion[..20], 1, 0).is_err() && restamp(&mut [], 1, 0).is_err());
+}

@@ -24,7 +24,7 @@ use crate::{
 /// Layers, from coarse to fine: a viewer can show any number of the first ones.
 pub const LAYERS: usize = 3;
 
-const MAGIC: [u8; 3] = *b"FLC";
+pub(crate) const MAGIC: [u8; 3] = *b"FLC";
 const WHAT: &str = "colour message";
 /// Step of the two colour differences against that of the brightness.
 const CHROMA: f32 = 1.8;

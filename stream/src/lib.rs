@@ -46,8 +46,8 @@ pub use colors::{ColorDecoder, ColorEncoder, ColorSettings, LAYERS};
 pub use error::StreamError;
 pub use motion::{Motion, MotionEncoder};
 pub use pose::Posed;
-pub use stamp::Stamp;
-pub use template::{EncodedTemplate, Joint, MAX_TEMPLATE_BYTES, Template, TemplateSource};
+pub use stamp::{Stamp, restamp, stamp_of};
+pub use template::{EncodedTemplate, Joint, MAX_TEMPLATE_BYTES, Template, TemplateSource, template_hash};
 
 /// Version of every message of this codec.
 pub const CODEC_VERSION: u8 = 1;

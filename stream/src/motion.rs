@@ -11,7 +11,7 @@ use crate::{
     tree::HaarTree,
 };
 
-const MAGIC: [u8; 3] = *b"FLM";
+pub(crate) const MAGIC: [u8; 3] = *b"FLM";
 const WHAT: &str = "motion";
 /// Step of node translations, metres: an error of 0.14 mm.
 const NODE_STEP_M: f32 = 5e-4;
@@ -109,14 +109,6 @@ impl MotionEncoder {
 }
 
 impl Motion {
-    /// Reads the stamp alone, to find the template that a motion needs.
-    ///
-    /// # Errors
-    /// As [`Self::decode`].
-    pub fn stamp(bytes: &[u8]) -> Result<Stamp, StreamError> {
-        Stamp::read(&mut Fields::of(WHAT, MAGIC, bytes)?)
-    }
-
     /// Reads a motion of this template.
     ///
     /// # Errors

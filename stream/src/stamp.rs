@@ -4,6 +4,11 @@ use alloc::vec::Vec;
 
 use crate::{CODEC_VERSION, StreamError, bytes::Fields};
 
+/// Bytes before a stamp: three letters and the version.
+const STAMP_AT: usize = 4;
+/// Bytes of a stamp.
+const STAMP_BYTES: usize = 28;
+
 /// The template, person and frame of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Stamp {
@@ -34,4 +39,32 @@ impl Stamp {
     pub(crate) fn read(fields: &mut Fields<'_>) -> Result<Self, StreamError> {
         Ok(Self { template: fields.u64()?, person: fields.u32()?, frame: fields.u64()?, capture_nanos: fields.i64()? })
     }
+}
+
+/// Reads the stamp of a motion or of a message of colours.
+///
+/// # Errors
+/// [`StreamError`].
+pub fn stamp_of(bytes: &[u8]) -> Result<Stamp, StreamError> {
+    let magic = if bytes.starts_with(&crate::colors::MAGIC) { crate::colors::MAGIC } else { crate::motion::MAGIC };
+    Stamp::read(&mut Fields::of("message of the person stream", magic, bytes)?)
+}
+
+/// Gives a motion or a message of colours another capture time, and colours another epoch: for recordings that are played
+/// again. A decoder takes the colours of another epoch as those of an encoder that began anew.
+///
+/// # Errors
+/// [`StreamError`] as for [`stamp_of`]; the bytes are as they were then.
+pub fn restamp(bytes: &mut [u8], capture_nanos: i64, epochs_later: u32) -> Result<(), StreamError> {
+    stamp_of(bytes)?;
+    let end = STAMP_AT + STAMP_BYTES;
+    if let Some(field) = bytes.get_mut(end - 8..end) {
+        field.copy_from_slice(&capture_nanos.to_le_bytes());
+    }
+    if bytes.starts_with(&crate::colors::MAGIC)
+        && let Some(field) = bytes.get_mut(end..).and_then(<[u8]>::first_chunk_mut::<4>)
+    {
+        *field = u32::from_le_bytes(*field).wrapping_add(epochs_later).to_le_bytes();
+    }
+    Ok(())
 }

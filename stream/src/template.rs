@@ -179,6 +179,12 @@ impl TemplateSource<'_> {
     }
 }
 
+/// Returns the hash that motions name a template by.
+#[must_use]
+pub fn template_hash(bytes: &[u8]) -> u64 {
+    xxhash_rust::xxh3::xxh3_64(bytes)
+}
+
 /// Whether `parent` may be that of joint `index`.
 fn is_parent(parent: Option<u16>, index: usize) -> bool {
     parent.map_or(index == 0, |parent| usize::from(parent) < index)
@@ -226,7 +232,7 @@ impl Template {
         let mut model = GaussianModel::default();
         let mut before = Quantised::default();
         let mut template = Self {
-            hash: xxhash_rust::xxh3::xxh3_64(bytes),
+            hash: template_hash(bytes),
             joints,
             nodes,
             center_scale: Vec::with_capacity(count),

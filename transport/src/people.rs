@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_stream::{LAYERS, MAX_TEMPLATE_BYTES, Template};
+use flyrig_stream::{LAYERS, MAX_TEMPLATE_BYTES, template_hash};
 use prost::bytes::Bytes;
 use zenoh::{
     Session, Wait,
@@ -134,7 +134,7 @@ pub(crate) fn ask_template(
     rig: &str,
     hash: u64,
     timeout: Duration,
-) -> Result<Option<Template>, TransportError> {
+) -> Result<Option<Vec<u8>>, TransportError> {
     let deadline = Instant::now() + timeout;
     let malformed = |problem: String| TransportError::malformed(keys::chunk_label(hash, 0), problem);
     let Some((size, mut bytes)) = ask_chunks(session, rig, hash, 0..1, deadline)?.pop() else { return Ok(None) };
@@ -154,8 +154,11 @@ pub(crate) fn ask_template(
             next += 1;
         }
     }
-    let template = Template::decode(&bytes).map_err(|error| malformed(error.to_string()))?;
-    if template.hash == hash { Ok(Some(template)) } else { Err(malformed("the answer is another template".to_owned())) }
+    if template_hash(&bytes) == hash {
+        Ok(Some(bytes))
+    } else {
+        Err(malformed("the answer is another template".to_owned()))
+    }
 }
 
 /// Asks for chunks at once; returns the template's size and the bytes of those that came, up to the first that did not.

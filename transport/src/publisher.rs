@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_stream::{LAYERS, Stamp};
+use flyrig_stream::Stamp;
 use flyrig_types::{Rig, ThreadHealth};
 use prost::bytes::Bytes;
 use zenoh::{Session, Wait, liveliness::LivelinessToken, query::Query, sample::SampleKind};
@@ -186,18 +186,14 @@ impl Publisher {
         self.people.offer_template(person, hash, bytes);
     }
 
-    /// Hands in a frame of the person stream: motion, and each layer of the colours. A message that still waits is replaced.
-    pub fn publish_person(&self, stamp: &Stamp, motion: Bytes, colors: [Bytes; LAYERS]) -> PublishOutcome {
+    /// Hands in a message of the person stream: motion, or a layer of the colours. One of the same kind that still waits is
+    /// replaced.
+    pub fn publish_person(&self, stamp: &Stamp, layer: Option<usize>, bytes: Bytes) -> PublishOutcome {
         let header = Header { frame: stamp.frame, capture_nanos: stamp.capture_nanos, ..empty_header() };
         let topics = self.people.topics(stamp.person, &self.shared);
-        let mut outcome = PublishOutcome::Unwatched;
-        for (i, (topic, bytes)) in topics.iter().zip(std::iter::once(motion).chain(colors)).enumerate() {
-            let offered = self.offer(topic, Body::Bytes(bytes), header);
-            if i == 0 {
-                outcome = offered;
-            }
-        }
-        outcome
+        topics
+            .get(layer.map_or(0, |layer| layer + 1))
+            .map_or(PublishOutcome::Unwatched, |topic| self.offer(topic, Body::Bytes(bytes), header))
     }
 
     fn person_topic(&self, person: u32) -> Arc<Topic> {

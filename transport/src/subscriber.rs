@@ -2,7 +2,6 @@
 
 use std::{sync::Arc, time::Duration};
 
-use flyrig_stream::Template;
 use flyrig_types::{Camera, Rig};
 use prost::bytes::Bytes;
 use zenoh::{Session, Wait, liveliness::LivelinessToken, sample::SampleKind};
@@ -179,12 +178,12 @@ impl Subscriber {
         self.received(label, raw, |_, _, bytes| Ok(PersonMessage { person, layer, bytes })).map(Some)
     }
 
-    /// Asks the rig for the template of a motion's stamp; `None` when nobody answers in time;
+    /// Asks the rig for the bytes of the [`flyrig_stream::Template`] that a motion's stamp names; `None` when nobody answers in time;
     /// ask again then.
     ///
     /// # Errors
     /// `Malformed` when the answer is not that template, `Session` when the question cannot be asked.
-    pub fn template(&self, hash: u64, timeout: Duration) -> Result<Option<Template>, TransportError> {
+    pub fn template(&self, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
         people::ask_template(&self.session, &self.rig, hash, timeout)
     }
 

@@ -9,7 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_stream::{Motion, StreamError};
+use flyrig_stream::{StreamError, Template, stamp_of};
 use flyrig_transport::{Interests, PersonMessage, RigStats, Subscriber, TransportConfig, TransportError};
 use flyrig_types::{Rig, SupervisedThread, ThreadHealth};
 
@@ -209,7 +209,7 @@ impl Link<'_> {
         match taken {
             Ok(()) => {}
             Err(StreamError::OtherTemplate { .. }) if message.layer.is_none() => {
-                let Ok(stamp) = Motion::stamp(&message.bytes) else { return };
+                let Ok(stamp) = stamp_of(&message.bytes) else { return };
                 self.meet(message.person, stamp.template);
                 // A motion is shown as soon as its template is there; those after it come by themselves.
                 if give(self.state, &message, now).is_ok() {
@@ -235,7 +235,11 @@ impl Link<'_> {
             return;
         }
         match self.subscriber.template(hash, TEMPLATE_PATIENCE) {
-            Ok(Some(template)) => {
+            Ok(Some(bytes)) => {
+                let template = match Template::decode(&bytes) {
+                    Ok(template) => template,
+                    Err(error) => return self.refuse(hash, error.to_string()),
+                };
                 let mut state = lock(self.state);
                 if state.people.len() >= MOST_PEOPLE && !state.people.contains_key(&person) {
                     state.people.pop_first();
@@ -244,11 +248,13 @@ impl Link<'_> {
                 self.asked = None;
             }
             Ok(None) => self.asked = Some((hash, Instant::now())),
-            Err(error) => {
-                self.asked = Some((hash, Instant::now()));
-                lock(self.state).complain(error.to_string());
-            }
+            Err(error) => self.refuse(hash, error.to_string()),
         }
+    }
+
+    fn refuse(&mut self, hash: u64, problem: String) {
+        self.asked = Some((hash, Instant::now()));
+        lock(self.state).complain(problem);
     }
 }
 

@@ -6,6 +6,7 @@ mod calibration;
 mod cameras;
 mod clocks;
 mod malformed;
+mod people;
 mod processes;
 mod sessions;
 mod splats;

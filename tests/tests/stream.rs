@@ -1,0 +1,112 @@
+//! The person stream, end to end: a rig's person is recorded, played again, and drawn by a viewer as the rig draws it.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
+
+mod support;
+
+use std::time::{Duration, Instant};
+
+use flyrig_gpu::{AdapterChoice, GpuContext};
+use flyrig_stream::Posed;
+use flyrig_transport::{Interests, Subscriber, TransportConfig, Views};
+use flyrig_viewer::{Receiver, Scene};
+use support::{PATIENCE, Process, small_rig, wait_until};
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
+
+fn config(rig: &str, endpoint: &str) -> TransportConfig {
+    TransportConfig { connect: vec![endpoint.to_owned()], ..TransportConfig::subscriber(rig) }
+}
+
+/// The people of a rig as a viewer has them once all colours have come, drawn through a camera.
+fn view(receiver: &Receiver, gpu: &GpuContext, camera: &flyrig_types::Camera) -> (u64, flyrig_types::RenderedView) {
+    wait_until("a person with all colours", || {
+        let state = receiver.state();
+        state
+            .people
+            .get(&0)
+            .is_some_and(|person| person.is_complete() && person.motion_at(Instant::now(), false).is_some())
+    });
+    let mut state = receiver.state();
+    let person = state.people.get_mut(&0).unwrap();
+    let motion = person.motion_at(Instant::now(), false).unwrap();
+    let mut posed = Posed::default();
+    let colors = person.pose(&motion, &mut posed).to_vec();
+    let mut scene = Scene::new(&gpu.fastest()).unwrap();
+    scene.set_people([(&posed, colors.as_slice())]).unwrap();
+    (motion.stamp.frame, scene.draw(camera).unwrap())
+}
+
+#[test]
+fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
+    let folder = tempfile::tempdir().unwrap();
+    // Standing still, so that frames of different times look alike.
+    let endpoint = small_rig("stream", folder.path(), "[sim.motion]\nkind = \"still\"\n");
+    let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+
+    // The viewer comes first.
+    let receiver = Receiver::start(&config("stream", &endpoint), || {}).unwrap();
+    assert!(receiver.state().trouble("stream", &endpoint).unwrap().contains("No rig 'stream'"));
+    let mut record = Process::start(
+        PROGRAM,
+        &["watch", "--rig", "stream", "--connect", &endpoint, "--record", "take.mcap", "--until-end"],
+        folder.path(),
+        "record",
+    );
+    let mut rig = Process::start(PROGRAM, &["run", "rig.toml"], folder.path(), "run");
+    wait_until("the rig's cameras", || receiver.state().rig.is_some());
+    let mut camera = receiver.state().rig.clone().unwrap().cameras[0].clone();
+    // The rig draws through the same lens when it is asked to.
+    camera.intrinsics.lens = flyrig_types::Lens::PINHOLE;
+    let (frame, ours) = view(&receiver, &gpu, &camera);
+    assert!(receiver.state().trouble("stream", &endpoint).is_none());
+    let pictures =
+        Subscriber::open(&config("stream", &endpoint), &Interests { views: Views::None, ..Interests::default() })
+            .unwrap();
+    pictures.request_viewpoint(&camera, 30.0).unwrap();
+    let theirs = loop {
+        let deadline = Instant::now() + PATIENCE;
+        if let Ok(Some(picture)) = pictures.next_view(Duration::from_millis(200)) {
+            break picture.body;
+        }
+        assert!(Instant::now() < deadline);
+    };
+    assert!(theirs.frame + 1000 > frame);
+    let jpeg = image::load_from_memory(&theirs.bytes).unwrap().into_rgb8();
+    let ours_on_grey = flyrig_renderer::composite_over(&ours.rgba, &vec![30; ours.rgba.len() / 4 * 3]);
+    let psnr = psnr(&ours_on_grey, &jpeg);
+    // JPEG and a person who breathes stay between the two.
+    assert!(psnr > 28.0, "{psnr}");
+    let shown = ours.rgba.chunks_exact(4).filter(|pixel| pixel[3] > 127).count();
+    assert!(shown > 300, "{shown} pixels");
+    rig.signal("INT");
+    wait_until("the rig to end", || rig.0.try_wait().unwrap().is_some());
+    wait_until("the recording to end", || record.0.try_wait().unwrap().is_some());
+    assert!(record.0.wait().unwrap().success());
+    drop(receiver);
+
+    // Another rig of the same person, out of the file.
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let endpoint = format!("tcp/127.0.0.1:{port}");
+    let play = ["play", "take.mcap", "--rig", "again", "--listen", &endpoint, "--repeat", "--wait"];
+    let _play = Process::start(PROGRAM, &play, folder.path(), "play");
+    let receiver = Receiver::start(&config("again", &endpoint), || {}).unwrap();
+    let (_, played) = view(&receiver, &gpu, &camera);
+    let played = flyrig_renderer::composite_over(&played.rgba, &vec![30; played.rgba.len() / 4 * 3]);
+    let psnr =
+        self::psnr(&played, &ours_on_grey_image(&ours_on_grey, camera.intrinsics.width, camera.intrinsics.height));
+    assert!(psnr > 28.0, "{psnr}");
+    let state = receiver.state();
+    assert_eq!(state.rig.as_ref().unwrap().cameras.len(), 2);
+    assert!(state.age.unwrap().1, "the age of what is played is known exactly");
+    assert!(state.problem.is_none(), "{:?}", state.problem);
+}
+
+fn ours_on_grey_image(rgb: &[u8], width: u32, height: u32) -> image::RgbImage {
+    image::RgbImage::from_raw(width, height, rgb.to_vec()).unwrap()
+}
+
+fn psnr(ours: &[u8], theirs: &image::RgbImage) -> f64 {
+    assert_eq!(ours.len(), theirs.as_raw().len());
+    let sum: f64 = ours.iter().zip(theirs.as_raw()).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
+    -10.0 * (sum / ours.len() as f64 / 255.0f64.powi(2)).log10()
+}

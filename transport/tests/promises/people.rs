@@ -1,0 +1,108 @@
+//! The person stream: messages, templates in chunks, and what claims to belong to it.
+
+use std::time::Duration;
+
+use flyrig_stream::{Joint, LAYERS, MAX_MESSAGE_BYTES, Stamp, Template, TemplateSource};
+use flyrig_transport::{Interests, MAX_PERSON_TOPICS, PersonMessage, PublishOutcome, Received, Subscriber};
+
+use crate::support::*;
+
+fn people() -> Interests {
+    Interests { people: true, ..Interests::default() }
+}
+
+/// Bytes of a template that takes several chunks.
+fn template(count: usize) -> Vec<u8> {
+    let joint = Joint {
+        parent: None,
+        translation: [0.0; 3],
+        joint_from_canonical: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]],
+    };
+    let hash = |i: usize, k: u32| (i as u32).wrapping_mul(2_654_435_761).rotate_left(k * 7) as f32 / u32::MAX as f32;
+    let center_scale: Vec<[f32; 4]> = (0..count).map(|i| [hash(i, 1), hash(i, 2), hash(i, 3), 0.01]).collect();
+    let normals: Vec<[f32; 3]> = (0..count).map(|i| [hash(i, 4) - 0.5, hash(i, 5) - 0.5, 0.7]).collect();
+    let source = TemplateSource {
+        joints: &[joint],
+        center_scale: &center_scale,
+        normals: &normals,
+        skin: &vec![([0; 4], [1.0, 0.0, 0.0, 0.0]); count],
+        node_weights: &[],
+        nodes: &[],
+    };
+    source.encode().unwrap().bytes
+}
+
+fn next(subscriber: &Subscriber) -> Option<Received<PersonMessage>> {
+    subscriber.next_person(Duration::from_millis(500)).unwrap()
+}
+
+#[test]
+fn a_person_arrives_with_its_template() {
+    let publisher = open_publisher(|_| {});
+    let subscriber = open_subscriber(&publisher, &people());
+    wait_until("the subscription", || publisher.has_person_subscribers());
+    let bytes = template(30_000);
+    assert!(bytes.len() > 3 * 60_000, "{}", bytes.len());
+    let hash = flyrig_stream::template_hash(&bytes);
+    publisher.offer_template(0, hash, bytes.clone().into());
+    let fetched = subscriber.template(hash, Duration::from_secs(20)).unwrap().unwrap();
+    assert!(fetched == bytes);
+    assert_eq!(Template::decode(&fetched).unwrap().gaussians(), 30_000);
+    // Nobody has that one.
+    assert_eq!(subscriber.template(hash ^ 1, Duration::from_secs(5)).unwrap(), None);
+
+    let stamp = Stamp { template: hash, person: 0, frame: 9, capture_nanos: -3 };
+    wait_until("all parts of a frame", || {
+        publisher.publish_person(&stamp, None, vec![1, 2].into());
+        for layer in 0..LAYERS {
+            publisher.publish_person(&stamp, Some(layer), vec![layer as u8; 100].into());
+        }
+        let mut seen = std::collections::BTreeSet::new();
+        while let Some(received) = next(&subscriber) {
+            assert_eq!((received.body.person, received.header.frame, received.header.capture_nanos), (0, 9, -3));
+            let expected = received.body.layer.map_or(vec![1, 2], |layer| vec![layer as u8; 100]);
+            assert_eq!(received.body.bytes, expected);
+            seen.insert(received.body.layer);
+            if seen.len() == 1 + LAYERS {
+                return true;
+            }
+        }
+        false
+    });
+}
+
+#[test]
+fn any_number_of_people_come_and_go() {
+    let publisher = open_publisher(|_| {});
+    let subscriber = open_subscriber(&publisher, &people());
+    wait_until("the subscription", || publisher.has_person_subscribers());
+    for person in 1..200 {
+        let stamp = Stamp { person, ..Stamp::default() };
+        publisher.publish_person(&stamp, None, vec![3; 10].into());
+        publisher.offer_template(person, u64::from(person), vec![0; 10].into());
+    }
+    let topics = publisher.counts().into_iter().filter(|(label, _)| label.starts_with("person/")).count();
+    assert_eq!(topics, (1 + MAX_PERSON_TOPICS) * (1 + LAYERS));
+    wait_until("a person who came late", || {
+        let stamp = Stamp { person: 199, ..Stamp::default() };
+        publisher.publish_person(&stamp, None, vec![7; 10].into()) != PublishOutcome::Unwatched
+            && next(&subscriber).is_some_and(|received| received.body.person == 199)
+    });
+    assert!(subscriber.template(150, Duration::from_secs(5)).unwrap().is_none());
+}
+
+#[test]
+fn what_is_too_large_or_names_no_part_is_refused_in_words() {
+    let publisher = open_publisher(|_| {});
+    let subscriber = open_subscriber(&publisher, &people());
+    wait_until("the subscription", || publisher.has_person_subscribers());
+    let error = loop {
+        publisher.publish_person(&Stamp::default(), None, vec![0; MAX_MESSAGE_BYTES + 1].into());
+        if let Err(error) = subscriber.next_person(Duration::from_millis(100)) {
+            break error;
+        }
+    };
+    assert!(error.to_string().contains("65001 bytes, at most 65000"), "{error}");
+    // A layer that does not exist is not sent.
+    assert_eq!(publisher.publish_person(&Stamp::default(), Some(LAYERS), vec![0].into()), PublishOutcome::Unwatched);
+}
