@@ -5,7 +5,8 @@
 use std::{vec, vec::Vec};
 
 use crate::{
-    ColorDecoder, ColorEncoder, ColorSettings, EncodedTemplate, LAYERS, Stamp,
+    ColorDecoder, ColorEncoder, ColorSettings, EncodedTemplate, LAYERS, Motion, MotionEncoder, Stamp, restamp,
+    stamp_of,
     testing::{Person, damaged},
 };
 
