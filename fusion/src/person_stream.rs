@@ -30,13 +30,13 @@ pub(crate) fn encode_template(
     let joints: Vec<Joint> = skeleton.joints().iter().map(joint).collect();
     let center_scale: Vec<[f32; 4]> =
         surface.positions.iter().zip(&surface.scale_m).map(|(p, scale)| p.extend(*scale).to_array()).collect();
-    let normals: Vec<[f32; 3]> = surface.normals.iter().map(|n| n.to_array()).collect();
+    let normals: Vec<[f32; 3]> = surface.normals.iter().map(glam::Vec3::to_array).collect();
     let skin: Vec<_> = surface.skin.iter().map(|skin| (skin.joints.map(u32::from), skin.weights)).collect();
     let node_weights: Vec<_> = graph.map_or_else(Vec::new, |graph| {
         graph.gaussian_nodes.iter().copied().zip(graph.gaussian_weights.iter().copied()).collect()
     });
     let nodes: Vec<[f32; 3]> =
-        graph.map_or_else(Vec::new, |graph| graph.nodes.iter().map(|node| node.to_array()).collect());
+        graph.map_or_else(Vec::new, |graph| graph.nodes.iter().map(glam::Vec3::to_array).collect());
     TemplateSource {
         joints: &joints,
         center_scale: &center_scale,

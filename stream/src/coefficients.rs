@@ -31,9 +31,9 @@ pub(crate) struct CoefficientModel {
 impl CoefficientModel {
     /// Codes the mean of a segment.
     pub fn code_mean(&mut self, coder: &mut impl BitCoder, value: &mut Levels) {
-        for c in 0..CHANNELS {
-            let is_nonzero = coder.bit(&mut self.mean_nonzero[c], value[c] != 0);
-            value[c] = if is_nonzero { self.mean[c].code(coder, value[c]) } else { 0 };
+        for ((value, nonzero), mean) in value.iter_mut().zip(&mut self.mean_nonzero).zip(&mut self.mean) {
+            let is_nonzero = coder.bit(nonzero, *value != 0);
+            *value = if is_nonzero { mean.code(coder, *value) } else { 0 };
         }
     }
 
@@ -80,9 +80,10 @@ impl CoefficientModel {
         }
         let mut active = [0; (1 << GROUP) - 1];
         let mut active_channels = 0;
-        for c in 0..CHANNELS {
+        let models = self.channel.iter_mut().zip(&mut self.nonzero).zip(&mut self.magnitude);
+        for (c, ((channel, nonzero), magnitude)) in models.enumerate() {
             let is_any = places.iter().any(|(place, has_value)| *has_value && values[*place][c] != 0);
-            if !coder.bit(&mut self.channel[c][active_channels], is_any) {
+            if !coder.bit(&mut channel[active_channels], is_any) {
                 for (place, _) in places.iter() {
                     values[*place][c] = 0;
                 }
@@ -100,8 +101,8 @@ impl CoefficientModel {
                 let before = i > 0 && is_nonzero[i - 1];
                 let context = usize::from(above) + usize::from(before) + usize::from(active[i] > 0);
                 let level = (i + 1).ilog2() as usize;
-                is_nonzero[i] = coder.bit(&mut self.nonzero[c][level][context], *value != 0);
-                *value = if is_nonzero[i] { self.magnitude[c][level].code(coder, *value) } else { 0 };
+                is_nonzero[i] = coder.bit(&mut nonzero[level][context], *value != 0);
+                *value = if is_nonzero[i] { magnitude[level].code(coder, *value) } else { 0 };
                 active[i] += u8::from(is_nonzero[i]);
             }
         }
@@ -129,9 +130,9 @@ mod tests {
                         [0; 3].map(|_| if random.random::<f64>() < share { random.random_range(-40..40) } else { 0 })
                     })
                     .collect();
-                for place in 1 << tree.deepest()..tree.coefficients() {
+                for (place, value) in values.iter_mut().enumerate().skip(1 << tree.deepest()) {
                     if !tree.is_pair(place) {
-                        values[place] = [0; 3];
+                        *value = [0; 3];
                     }
                 }
                 let code = |coder: &mut dyn FnMut(&mut CoefficientModel, usize, &mut [Levels])| {

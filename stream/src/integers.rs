@@ -42,16 +42,10 @@ fn gamma(coder: &mut impl BitCoder, value: u32) -> u32 {
 
 /// Numbers of any size below 2^24: their length as a tree of adaptive decisions, then their upper two bits with a model
 /// and the rest without.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct NumberModel {
     length: [Probability; 32],
     upper: [[Probability; 4]; 32],
-}
-
-impl Default for NumberModel {
-    fn default() -> Self {
-        Self { length: [Probability::default(); 32], upper: [[Probability::default(); 4]; 32] }
-    }
 }
 
 impl NumberModel {

@@ -173,8 +173,8 @@ impl Motion {
 
 fn code_nodes(coder: &mut impl BitCoder, tree: &HaarTree, levels: &mut [Levels]) {
     let mut model = CoefficientModel::default();
-    for segment in 0..tree.segments() {
-        model.code_mean(coder, &mut levels[segment]);
+    for mean in &mut levels[..tree.segments()] {
+        model.code_mean(coder, mean);
     }
     for first in tree.levels().step_by(GROUP as usize) {
         let group = first..(first + GROUP).min(tree.levels().end);

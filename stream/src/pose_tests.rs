@@ -51,8 +51,8 @@ fn reference(person: &Person, motion: &Motion) -> Vec<[f64; 3]> {
             point[3] = 1.0;
             if let Some((nodes, weights)) = person.node_weights.get(i) {
                 for (node, weight) in nodes.iter().zip(normalised(*weights)) {
-                    for k in 0..3 {
-                        point[k] += weight * f64::from(motion.nodes[*node as usize][k]);
+                    for (value, by) in point.iter_mut().zip(motion.nodes[*node as usize]) {
+                        *value += weight * f64::from(by);
                     }
                 }
             }
