@@ -191,7 +191,7 @@ fn run(args: &BenchStreamArgs, gpu: &GpuContext, dataset: &Path) -> Result<Vec<R
 
 impl Chain {
     /// Sends a frame through and returns what a viewer has of it.
-    fn code(&mut self, frame: &PersonFrame, counts: bool, session: &Session) -> Result<(Posed, Vec<[f32; 4]>)> {
+    fn code(&mut self, frame: &PersonFrame, counts: bool, session: &Session) -> Result<(Posed, Arc<Vec<[f32; 4]>>)> {
         let start = Instant::now();
         match &mut self.form {
             Form::Stream { settings, coder } => {
@@ -205,7 +205,7 @@ impl Chain {
                 let Some(coder) = coder else { anyhow::bail!("no coder") };
                 let (encoder, person) = &mut **coder;
                 self.template_bytes = frame.template().bytes.len();
-                let start = Instant::now();
+                let start = Instant::now(); // without making the encoder
                 let PersonMessages { motion, colors, .. } = encoder.encode(frame)?;
                 let encoded = Instant::now();
                 person.take_motion(&motion, encoded)?;
@@ -215,7 +215,7 @@ impl Chain {
                 let Some(received) = person.motion_at(encoded, false) else { anyhow::bail!("no motion was received") };
                 let decoded_motion = Instant::now();
                 let mut posed = Posed::default();
-                let known = person.pose(&received, &mut posed).to_vec();
+                let known = person.pose(&received, &mut posed);
                 let decoded = Instant::now();
                 // The inverse transform belongs to decoding, posing is timed by itself.
                 let mut again = Posed::default();
@@ -256,7 +256,7 @@ impl Chain {
                     self.times[1] += 1e3 * encoded.elapsed().as_secs_f64();
                 }
                 let normal = splats.iter().map(|s| [s.normal[0], s.normal[1], s.normal[2], 0.0]).collect();
-                Ok((Posed { center_scale: back.center_scale, normal }, back.color))
+                Ok((Posed { center_scale: back.center_scale, normal }, Arc::new(back.color)))
             }
         }
     }

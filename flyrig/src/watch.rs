@@ -13,8 +13,8 @@ use flyrig_transport::{
     ImageFormat, Interests, Received, Subscriber, TransportConfig, TransportError, TransportErrorKind, ViewFrame,
     ViewpointStatus, Views, printable,
 };
-use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
-use glam::{DVec2, DVec3};
+use flyrig_types::{Camera, Intrinsics, Isometry};
+use glam::DVec3;
 use opencv::{
     core::{Mat, MatTraitConst as _, Size, Vec3b},
     videoio::{VideoWriter, VideoWriterTrait as _, VideoWriterTraitConst as _},
@@ -152,13 +152,7 @@ fn viewpoint(eye: [f64; 3], args: &WatchArgs, world_up: DVec3) -> Result<Camera>
     Ok(Camera {
         time_offset_nanos: 0,
         id: "watch".into(),
-        intrinsics: Intrinsics {
-            width,
-            height,
-            focal_px: DVec2::splat(focal),
-            center_px: DVec2::new(f64::from(width) - 1.0, f64::from(height) - 1.0) / 2.0,
-            lens: Lens::PINHOLE,
-        },
+        intrinsics: Intrinsics::pinhole(width, height, focal),
         camera_from_world: Isometry::look_at(eye, target, world_up),
     })
 }

@@ -1,7 +1,7 @@
 //! Cameras of our own: a circle around the person.
 
-use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Lens, Rig};
-use glam::{DQuat, DVec2};
+use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Rig};
+use glam::DQuat;
 
 /// Returns a camera on a circle around the person, starting beside the rig's first camera. `turn` in whole turns. The field
 /// of view is that of the rig's first camera.
@@ -16,20 +16,14 @@ pub fn orbit(rig: &Rig, turn: f64, width: u32, height: u32, name: &str) -> Optio
     Some(Camera {
         time_offset_nanos: 0,
         id: CameraId::from(name),
-        intrinsics: Intrinsics {
-            width,
-            height,
-            focal_px: DVec2::splat(focal),
-            center_px: DVec2::new(f64::from(width) - 1.0, f64::from(height) - 1.0) / 2.0,
-            lens: Lens::PINHOLE,
-        },
+        intrinsics: Intrinsics::pinhole(width, height, focal),
         camera_from_world: Isometry::look_at(center + arm, center, rig.world_up),
     })
 }
 
 #[cfg(test)]
 mod tests {
-    use glam::DVec3;
+    use glam::{DVec2, DVec3};
 
     use super::*;
 
@@ -38,13 +32,7 @@ mod tests {
         let camera = |eye: &DVec3| Camera {
             time_offset_nanos: 0,
             id: format!("{eye}").into(),
-            intrinsics: Intrinsics {
-                width: 640,
-                height: 480,
-                focal_px: DVec2::splat(500.0),
-                center_px: DVec2::new(319.5, 239.5),
-                lens: Lens::PINHOLE,
-            },
+            intrinsics: Intrinsics::pinhole(640, 480, 500.0),
             camera_from_world: Isometry::look_at(*eye, target, DVec3::Z),
         };
         Rig { cameras: eyes.iter().map(camera).collect(), world_up: DVec3::Z }

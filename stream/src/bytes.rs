@@ -4,7 +4,7 @@ use crate::StreamError;
 
 /// Takes fields off the front of a message.
 pub(crate) struct Fields<'a> {
-    /// What the message is, for errors.
+    /// Name of the message, for errors.
     pub what: &'static str,
     pub bytes: &'a [u8],
 }

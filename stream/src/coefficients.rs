@@ -14,7 +14,7 @@ pub(crate) type Levels = [i32; CHANNELS];
 /// Levels in a group.
 pub(crate) const GROUP: u32 = 3;
 
-/// Probabilities of one message; what is coded first teaches what follows.
+/// Probabilities of one message, which adapt from its beginning to its end.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct CoefficientModel {
     /// Whether a block is not all zero, by the same of the two blocks before it.

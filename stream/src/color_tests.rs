@@ -112,7 +112,7 @@ fn frames_keep_their_budget_and_catch_up() {
     for frame in 0..60 {
         let messages = encoder.encode(stamp(frame), &colors);
         let bytes: usize = messages.iter().map(Vec::len).sum();
-        // What is left of a budget holds the header of an empty message.
+        // The rest of a budget may be shorter than the header of an empty message.
         assert!(bytes <= 6000 + 2 * 60, "{frame}: {bytes}");
         for message in messages {
             decoder.take(&message).unwrap();

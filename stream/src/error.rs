@@ -16,7 +16,7 @@ pub enum StreamError {
     Malformed {
         /// The message.
         what: &'static str,
-        /// What is wrong.
+        /// The fault.
         problem: &'static str,
     },
     /// Belongs to another template than the decoder's.

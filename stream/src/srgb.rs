@@ -26,7 +26,7 @@ impl Srgb {
         }
     }
 
-    /// Returns the code, 0..=255 and not rounded, of linear light; 0 for what is not a number.
+    /// Returns the code, 0..=255 and not rounded, of linear light; 0 for NaN.
     pub fn code(&self, linear: f32) -> f32 {
         let at = if linear > 0.0 { linear.min(1.0) * LINEAR_STEPS as f32 } else { 0.0 };
         let below = at as usize;

@@ -1,4 +1,4 @@
-//! What a message of a frame belongs to.
+//! Template, person and frame of a message.
 
 use alloc::vec::Vec;
 

@@ -30,7 +30,7 @@ fn view(receiver: &Receiver, gpu: &GpuContext, camera: &flyrig_types::Camera) ->
     let person = state.people.get_mut(&0).unwrap();
     let motion = person.motion_at(Instant::now(), false).unwrap();
     let mut posed = Posed::default();
-    let colors = person.pose(&motion, &mut posed).to_vec();
+    let colors = person.pose(&motion, &mut posed);
     let mut scene = Scene::new(&gpu.fastest()).unwrap();
     scene.set_people([(&posed, colors.as_slice())]).unwrap();
     (motion.stamp.frame, scene.draw(camera).unwrap())

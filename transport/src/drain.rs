@@ -201,7 +201,7 @@ impl Drain {
                 lanes.push(Lane { topic, publisher: None, declare_at: now });
             }
         }
-        // What is urgent leaves first: sending can wait a moment for a slow subscriber.
+        // Urgent topics first: a send can wait a moment for a slow subscriber.
         lanes.sort_by_key(|lane| lane.topic.priority() as u8);
         for lane in lanes.iter_mut().filter(|lane| lane.publisher.is_none() && lane.declare_at <= now) {
             let declared = self

@@ -167,7 +167,7 @@ impl Subscriber {
         self.received(label, raw, |_, _, payload| SplatState::decode(&payload)).map(Some)
     }
 
-    /// The next message of the person stream nobody has taken yet, topics in turns; `None` after the timeout. Take messages as
+    /// The next message of the person stream that was not taken yet, topics in turns; `None` after the timeout. Take messages as
     /// they come: only the newest of a topic waits.
     ///
     /// # Errors

@@ -215,6 +215,20 @@ pub struct Intrinsics {
     pub lens: Lens,
 }
 
+impl Intrinsics {
+    /// A pinhole of square pixels with the principal point in the middle.
+    #[must_use]
+    pub fn pinhole(width: u32, height: u32, focal_px: f64) -> Self {
+        Self {
+            width,
+            height,
+            focal_px: DVec2::splat(focal_px),
+            center_px: (DVec2::new(f64::from(width), f64::from(height)) - 1.0) / 2.0,
+            lens: Lens::PINHOLE,
+        }
+    }
+}
+
 /// Why a camera model is refused.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CameraError {

@@ -1,7 +1,7 @@
 //! Where the viewer stands: orbit, fly, zoom, follow.
 
-use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Rig};
-use glam::{DVec2, DVec3};
+use flyrig_types::{Camera, Intrinsics, Isometry, Rig};
+use glam::DVec3;
 
 /// Nearest and farthest distance to the point looked at, metres.
 const DISTANCE_M: std::ops::RangeInclusive<f64> = 0.2..=50.0;
@@ -20,7 +20,7 @@ pub struct Navigation {
     /// Around the world's up, and above the horizon, radians.
     heading: f64,
     elevation: f64,
-    /// Height against width of what is seen.
+    /// Vertical field of view, radians.
     field: f64,
     /// Where the target was last set by following, to keep the viewer's own shift.
     followed: Option<DVec3>,
@@ -109,13 +109,6 @@ impl Navigation {
         self.followed = place;
     }
 
-    /// Looks at a point from where it stands, relative to the target before.
-    pub fn look_at(&mut self, place: DVec3) {
-        if place.is_finite() {
-            self.target = place;
-        }
-    }
-
     /// Jumps to a camera of the rig: its place, its field of view, and the line of sight's point nearest to the target.
     pub fn jump(&mut self, camera: &Camera) {
         let eye = camera.position();
@@ -134,13 +127,7 @@ impl Navigation {
         Camera {
             time_offset_nanos: 0,
             id: "view".into(),
-            intrinsics: Intrinsics {
-                width,
-                height,
-                focal_px: DVec2::splat(focal),
-                center_px: (DVec2::new(f64::from(width), f64::from(height)) - 1.0) / 2.0,
-                lens: Lens::PINHOLE,
-            },
+            intrinsics: Intrinsics::pinhole(width, height, focal),
             camera_from_world: Isometry::look_at(self.target + self.arm(), self.target, self.up),
         }
     }
@@ -149,19 +136,15 @@ impl Navigation {
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
+    use glam::DVec2;
+
     use super::*;
 
     fn rig() -> Rig {
         let camera = |eye: DVec3| Camera {
             time_offset_nanos: 0,
             id: format!("{eye}").into(),
-            intrinsics: Intrinsics {
-                width: 640,
-                height: 480,
-                focal_px: DVec2::splat(500.0),
-                center_px: DVec2::new(319.5, 239.5),
-                lens: Lens::PINHOLE,
-            },
+            intrinsics: Intrinsics::pinhole(640, 480, 500.0),
             camera_from_world: Isometry::look_at(eye, DVec3::new(0.2, 0.1, 1.0), DVec3::Z),
         };
         let eyes = [DVec3::new(3.0, 0.0, 1.2), DVec3::new(0.0, 3.0, 1.0), DVec3::new(-2.0, -2.0, 3.4)];
@@ -222,7 +205,6 @@ mod tests {
             navigation.zoom(by);
             navigation.zoom(f64::NAN);
             navigation.follow(Some(DVec3::NAN));
-            navigation.look_at(DVec3::NAN);
             navigation.camera(64, 48).validate().unwrap();
         }
     }

@@ -7,16 +7,16 @@ use std::{
 
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::composite_over;
-use flyrig_stream::Posed;
+use flyrig_stream::{Posed, Stamp};
 use flyrig_types::{Camera, SupervisedThread, ThreadHealth};
 use glam::DVec3;
 
-use crate::{Receiver, Scene, receiver::age_secs};
+use crate::{Receiver, Scene, StreamPerson, receiver::age_secs};
 
 /// Grey behind the people, sRGB.
 const BACKDROP: u8 = 30;
 
-/// What to draw.
+/// A view that is wanted.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Request {
     pub camera: Camera,
@@ -72,14 +72,18 @@ impl Painter {
         let (of_thread, gpu) = (Arc::clone(&shared), gpu.clone());
         let adapter = gpu.adapter_name();
         let work = move || {
-            let (mut scene, mut posed) = (None, Vec::new());
+            let (mut scene, mut posed, mut last) = (None, Vec::new(), None);
             while let Some(request) = of_thread.next() {
-                let drawn = draw(&gpu, &mut scene, &mut posed, &receiver, &request);
+                let drawn = draw(&gpu, &mut scene, &mut posed, &receiver, &request, &mut last);
                 let mut state = of_thread.lock();
                 match drawn {
-                    Ok(drawn) => (state.drawn, state.fault) = (Some(drawn), None),
+                    Ok(None) => continue,
+                    Ok(Some(drawn)) => (state.drawn, state.fault) = (Some(drawn), None),
                     // A device that is lost is not opened again here: the window says so.
-                    Err(error) => state.fault = Some(error.to_string()),
+                    Err(error) => {
+                        last = None;
+                        state.fault = Some(error.to_string());
+                    }
                 }
                 drop(state);
                 finished();
@@ -133,26 +137,41 @@ impl Shared {
     }
 }
 
+/// Everything that a view depends on: the same again need not be drawn. Of each person its number, stamp and colours.
+type Content = (Request, Vec<(u32, Stamp, u64)>);
+
+/// Draws a view, unless it would be the same as the `last` one.
 fn draw(
     gpu: &GpuContext,
     scene: &mut Option<Scene>,
-    posed: &mut Vec<(Posed, Vec<[f32; 4]>)>,
+    posed: &mut Vec<(Posed, Arc<Vec<[f32; 4]>>)>,
     receiver: &Receiver,
     request: &Request,
-) -> Result<Drawn, flyrig_gpu::GpuError> {
+    last: &mut Option<Content>,
+) -> Result<Option<Drawn>, flyrig_gpu::GpuError> {
     let start = Instant::now();
     let (mut shown, mut place, mut is_complete, mut stamp) = (0, None, true, None);
     {
         let mut state = receiver.state();
-        for person in state.people.values_mut() {
-            let Some(motion) = person.motion_at(start, request.interpolate) else { continue };
+        let motions: Vec<_> = state
+            .people
+            .iter()
+            .filter_map(|(&number, person)| Some((number, person.motion_at(start, request.interpolate)?)))
+            .collect();
+        let version = |number: &u32| state.people.get(number).map_or(0, StreamPerson::color_changes);
+        let people = motions.iter().map(|(number, motion)| (*number, motion.stamp, version(number))).collect();
+        let content = (request.clone(), people);
+        if last.as_ref() == Some(&content) {
+            return Ok(None);
+        }
+        *last = Some(content);
+        for (number, motion) in motions {
+            let Some(person) = state.people.get_mut(&number) else { continue };
             if posed.len() <= shown {
                 posed.push(Default::default());
             }
             let (centers, colors) = &mut posed[shown];
-            let known = person.pose(&motion, centers);
-            colors.clear();
-            colors.extend_from_slice(known);
+            *colors = person.pose(&motion, centers);
             shown += 1;
             is_complete &= person.is_complete();
             place = place.or_else(|| Some(DVec3::from(motion.root_translation.map(f64::from))));
@@ -166,7 +185,7 @@ fn draw(
     scene.set_people(posed[..shown].iter().map(|(posed, colors)| (posed, colors.as_slice())))?;
     let view = scene.draw(&request.camera)?;
     let backdrop = vec![BACKDROP; view.width as usize * view.height as usize * 3];
-    Ok(Drawn {
+    Ok(Some(Drawn {
         width: view.width,
         height: view.height,
         rgb: composite_over(&view.rgba, &backdrop),
@@ -176,5 +195,5 @@ fn draw(
         people: shown,
         is_complete: is_complete && shown > 0,
         took: start.elapsed(),
-    })
+    }))
 }

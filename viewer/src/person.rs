@@ -22,8 +22,11 @@ const GONE_AFTER: Duration = Duration::from_secs(3);
 pub struct StreamPerson {
     template: Arc<Template>,
     decoder: ColorDecoder,
-    colors: Vec<[f32; 4]>,
+    /// Shared with the views under way.
+    colors: Arc<Vec<[f32; 4]>>,
     colors_are_current: bool,
+    /// Counts the messages of colours.
+    color_changes: u64,
     motions: VecDeque<(Instant, Motion)>,
     /// Smoothed time between motions, seconds of the rig's clock.
     interval: f64,
@@ -38,8 +41,9 @@ impl StreamPerson {
     pub fn new(template: Arc<Template>) -> Self {
         Self {
             decoder: ColorDecoder::new(&template),
-            colors: Vec::new(),
+            colors: Arc::default(),
             colors_are_current: false,
+            color_changes: 0,
             motions: VecDeque::new(),
             interval: 0.0,
             fastest: None,
@@ -90,6 +94,7 @@ impl StreamPerson {
     pub fn take_colors(&mut self, bytes: &[u8]) -> Result<Stamp, StreamError> {
         let stamp = self.decoder.take(bytes)?;
         self.colors_are_current = false;
+        self.color_changes += 1;
         Ok(stamp)
     }
 
@@ -119,12 +124,12 @@ impl StreamPerson {
     }
 
     /// Poses the person and returns its colours, an element a Gaussian each.
-    pub fn pose(&mut self, motion: &Motion, posed: &mut Posed) -> &[[f32; 4]] {
+    pub fn pose(&mut self, motion: &Motion, posed: &mut Posed) -> Arc<Vec<[f32; 4]>> {
         self.template.pose(motion, posed);
         if !std::mem::replace(&mut self.colors_are_current, true) {
-            self.decoder.colors(&mut self.colors);
+            self.decoder.colors(Arc::make_mut(&mut self.colors));
         }
-        &self.colors
+        Arc::clone(&self.colors)
     }
 
     /// Whether every part of the person has its colours, down to the finest layer.
@@ -133,9 +138,9 @@ impl StreamPerson {
         (0..flyrig_stream::LAYERS).all(|layer| self.decoder.known(layer) >= 1.0)
     }
 
-    /// Messages of colours that were missed.
+    /// Number of colour messages so far: the same number means the same colours.
     #[must_use]
-    pub fn missed(&self) -> u64 {
-        (0..flyrig_stream::LAYERS).map(|layer| self.decoder.missed(layer)).sum()
+    pub fn color_changes(&self) -> u64 {
+        self.color_changes
     }
 }

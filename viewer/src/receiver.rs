@@ -18,6 +18,8 @@ use crate::StreamPerson;
 /// How long a message is waited for.
 const PATIENCE: Duration = Duration::from_millis(50);
 
+/// How often statistics and calibration are looked at.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
 /// How long a template is waited for; asked again later.
 const TEMPLATE_PATIENCE: Duration = Duration::from_secs(10);
 /// Pause after a template that did not come.
@@ -29,7 +31,7 @@ const MOST_PEOPLE: usize = 32;
 /// Colour messages that wait for their template.
 const MOST_WAITING: usize = 64;
 
-/// What is known of a rig; lock it briefly.
+/// State of a rig as it was received; lock it briefly.
 #[derive(Debug, Default)]
 pub struct ReceiverState {
     /// People by their number.
@@ -42,8 +44,6 @@ pub struct ReceiverState {
     pub problem: Option<(Instant, String)>,
     /// Number of publishers of this rig that live now.
     pub publishers: usize,
-    /// Counts the motions that came.
-    pub motions: u64,
     /// Age of the newest motion when it came, seconds, and whether both ends run on one host so that it is exact.
     pub age: Option<(f64, bool)>,
     /// Arrival, bytes and whether it was a motion, of the last messages.
@@ -87,7 +87,6 @@ impl ReceiverState {
         while self.recent.front().is_some_and(|(at, ..)| now.saturating_duration_since(*at) > RATE_OVER) {
             self.recent.pop_front();
         }
-        self.motions += u64::from(is_motion);
     }
 }
 
@@ -111,7 +110,8 @@ impl Receiver {
         let work = move || {
             // Begun anew after a panic: what it left behind may be anything.
             lock(&shared).people.clear();
-            let mut link = Link { subscriber: &subscriber, state: &shared, waiting: VecDeque::new(), asked: None };
+            let mut link =
+                Link { subscriber: &subscriber, state: &shared, waiting: VecDeque::new(), asked: None, looked: None };
             while !ended.load(Ordering::Relaxed) {
                 link.turn(&arrived);
             }
@@ -148,7 +148,7 @@ fn lock(state: &Mutex<ReceiverState>) -> MutexGuard<'_, ReceiverState> {
     state.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// What the thread works with.
+/// State of the receiving thread.
 struct Link<'a> {
     subscriber: &'a Subscriber,
     state: &'a Mutex<ReceiverState>,
@@ -156,11 +156,16 @@ struct Link<'a> {
     waiting: VecDeque<PersonMessage>,
     /// Template that was asked for last without an answer.
     asked: Option<(u64, Instant)>,
+    /// When statistics and calibration were looked at last.
+    looked: Option<Instant>,
 }
 
 impl Link<'_> {
     fn turn(&mut self, arrived: &impl Fn()) {
-        self.look();
+        if self.looked.is_none_or(|at| at.elapsed() >= LOOK_EVERY) {
+            self.looked = Some(Instant::now());
+            self.look();
+        }
         match self.subscriber.next_person(PATIENCE) {
             Ok(Some(received)) => {
                 let now = Instant::now();
@@ -187,8 +192,8 @@ impl Link<'_> {
         }
     }
 
-    /// Takes in what is not a person.
-    fn look(&mut self) {
+    /// Takes in statistics and calibration.
+    fn look(&self) {
         let stats = self.subscriber.next_stats(Duration::ZERO);
         let rig = self.subscriber.rig(Duration::ZERO);
         let mut state = lock(self.state);

@@ -28,12 +28,6 @@ impl Scene {
         })
     }
 
-    /// Where it is drawn, for reports.
-    #[must_use]
-    pub fn adapter_name(&self) -> String {
-        self.gpu.adapter_name()
-    }
-
     /// Puts people into the scene, in place of those before: centres and normals, and linear colours of as many Gaussians.
     ///
     /// # Errors
@@ -42,20 +36,30 @@ impl Scene {
         &mut self,
         people: impl IntoIterator<Item = (&'a Posed, &'a [[f32; 4]])>,
     ) -> Result<(), GpuError> {
-        let (mut centers, mut normals, mut colors) = (Vec::new(), Vec::new(), Vec::new());
-        for (posed, of_person) in people {
-            let count = posed.center_scale.len().min(of_person.len());
-            centers.extend_from_slice(&posed.center_scale[..count]);
-            normals.extend_from_slice(&posed.normal[..count]);
-            colors.extend_from_slice(&of_person[..count]);
+        let mut people = people.into_iter().map(|(posed, colors)| {
+            let count = posed.center_scale.len().min(colors.len());
+            (&posed.center_scale[..count], &posed.normal[..count], &colors[..count])
+        });
+        let first = people.next().unwrap_or_default();
+        let Some(second) = people.next() else { return self.write(first.0, first.1, first.2) };
+        let (mut centers, mut normals, mut colors) = (first.0.to_vec(), first.1.to_vec(), first.2.to_vec());
+        for (of_centers, of_normals, of_colors) in std::iter::once(second).chain(people) {
+            centers.extend_from_slice(of_centers);
+            normals.extend_from_slice(of_normals);
+            colors.extend_from_slice(of_colors);
         }
-        if self.gaussians.count() != centers.len().max(1) {
+        self.write(&centers, &normals, &colors)
+    }
+
+    fn write(&mut self, centers: &[[f32; 4]], normals: &[[f32; 4]], colors: &[[f32; 4]]) -> Result<(), GpuError> {
+        // A buffer has at least one element: zero, which is not drawn.
+        if self.gaussians.count() != centers.len().max(1) || centers.is_empty() {
             self.gaussians = GaussianBuffers::zeroed(&self.gpu, centers.len().max(1))?;
         }
         if !centers.is_empty() {
-            self.gaussians.center_scale.write(&self.gpu, &centers);
-            self.gaussians.normal.write(&self.gpu, &normals);
-            self.gaussians.color.write(&self.gpu, &colors);
+            self.gaussians.center_scale.write(&self.gpu, centers);
+            self.gaussians.normal.write(&self.gpu, normals);
+            self.gaussians.color.write(&self.gpu, colors);
         }
         Ok(())
     }

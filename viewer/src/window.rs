@@ -26,7 +26,7 @@ const FLY_SPEED: f64 = 0.5;
 const SHOW_PROBLEM: Duration = Duration::from_secs(5);
 /// How often the window looks around when nothing comes.
 const IDLE: Duration = Duration::from_millis(250);
-/// Rates of what is shown are means over this time.
+/// Rates of shown frames are means over this time.
 const RATE_OVER: Duration = Duration::from_secs(2);
 /// Keys of the first cameras.
 const CAMERA_KEYS: [egui::Key; 9] = [
@@ -42,7 +42,7 @@ const CAMERA_KEYS: [egui::Key; 9] = [
 ];
 const HELP: &str = "drag: turn   right drag: shift   wheel: nearer   W A S D Q E: fly   1-9: camera   F: follow   R: start again   H: hide this";
 
-/// What to show and how.
+/// Options of the window.
 #[derive(Debug, Clone)]
 pub struct ViewOptions {
     /// The rig and where it is.
@@ -100,7 +100,7 @@ pub enum ViewerError {
 /// # Errors
 /// [`ViewerError`].
 pub fn open_window(options: ViewOptions, gpu: &GpuContext) -> Result<Option<Screenshot>, ViewerError> {
-    // The receiver starts first: whoever has a bad endpoint learns it without a window.
+    // The receiver starts first: a bad endpoint is reported without a window.
     let repaint: Arc<OnceLock<egui::Context>> = Arc::default();
     let wake = {
         let repaint = Arc::clone(&repaint);
@@ -160,13 +160,14 @@ pub fn open_window(options: ViewOptions, gpu: &GpuContext) -> Result<Option<Scre
     Ok(shot)
 }
 
-/// What is on the screen.
+/// State of the screen.
 #[derive(Debug, Default)]
 struct Shown {
     /// When a new frame of the rig was shown.
     changes: VecDeque<Instant>,
     frame: u64,
     age_secs: Option<f64>,
+    drawn_at: Option<Instant>,
     took: Duration,
     people: usize,
     place: Option<DVec3>,
@@ -219,9 +220,9 @@ impl eframe::App for View {
         if is_over || has_shot {
             context.send_viewport_cmd(egui::ViewportCommand::Close);
         }
-        // Interpolated motion goes on between messages.
+        // Interpolated motion goes on between messages; a view that would not change is not drawn again.
         let is_moving = !self.options.lowest_latency && self.shown.people > 0;
-        context.request_repaint_after(if is_moving { Duration::from_millis(8) } else { IDLE });
+        context.request_repaint_after(if is_moving { Duration::from_millis(16) } else { IDLE });
     }
 }
 
@@ -300,6 +301,7 @@ impl View {
         while shown.changes.front().is_some_and(|at| now.duration_since(*at) > RATE_OVER) {
             shown.changes.pop_front();
         }
+        shown.drawn_at = Some(now);
         (shown.age_secs, shown.place, shown.people, shown.is_complete, shown.took) =
             (age_secs, place, people, is_complete, took);
     }
@@ -322,7 +324,11 @@ impl View {
             lines.push((trouble, true));
         } else {
             let age = match (self.shown.age_secs, state.age) {
-                (Some(age), _) => format!("age {:.0} ms", 1e3 * age),
+                // It grows until something new is drawn.
+                (Some(age), _) => {
+                    let since = self.shown.drawn_at.map_or(0.0, |at| now.duration_since(at).as_secs_f64());
+                    format!("age {:.0} ms", 1e3 * (age + since))
+                }
                 // Another host's clock, or a recording's: the way alone is known.
                 (None, Some((way, _))) => format!("{:.0} ms on the way", 1e3 * way),
                 (None, None) => "age unknown".to_owned(),
@@ -380,7 +386,7 @@ impl View {
     }
 }
 
-/// Tracking quality of everybody, and what is wrong with it.
+/// Tracking quality of every person; true for trouble.
 fn people_lines(state: &ReceiverState, shown: usize) -> Vec<(String, bool)> {
     let Some(stats) = &state.stats else { return Vec::new() };
     let mut lines: Vec<(String, bool)> = stats
