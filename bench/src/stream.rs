@@ -18,7 +18,8 @@ use flyrig_report::{
 use flyrig_stream::{ColorSettings, Posed};
 use flyrig_transport::SplatState;
 use flyrig_types::{Mask, RenderedView};
-use flyrig_viewer::{Scene, StreamPerson};
+use flyrig_viewer::Scene;
+use flyrig_viewing::StreamPerson;
 use serde::Serialize;
 
 use crate::cli::BenchStreamArgs;
@@ -208,11 +209,11 @@ impl Chain {
                 let start = Instant::now(); // without making the encoder
                 let PersonMessages { motion, colors, .. } = encoder.encode(frame)?;
                 let encoded = Instant::now();
-                person.take_motion(&motion, encoded)?;
+                person.take_motion(&motion, 0.0)?;
                 for layer in &colors {
                     person.take_colors(layer)?;
                 }
-                let Some(received) = person.motion_at(encoded, false) else { anyhow::bail!("no motion was received") };
+                let Some(received) = person.motion_at(0.0, false) else { anyhow::bail!("no motion was received") };
                 let decoded_motion = Instant::now();
                 let mut posed = Posed::default();
                 let known = person.pose(&received, &mut posed);

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_stream::Posed;
 use flyrig_transport::{Interests, Subscriber, TransportConfig, Views};
-use flyrig_viewer::{Receiver, Scene};
+use flyrig_viewer::{Receiver, Scene, clock_secs};
 use support::{PATIENCE, Process, small_rig, wait_until};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
@@ -23,12 +23,12 @@ fn view(receiver: &Receiver, gpu: &GpuContext, camera: &flyrig_types::Camera) ->
         let state = receiver.state();
         state
             .people
-            .get(&0)
-            .is_some_and(|person| person.is_complete() && person.motion_at(Instant::now(), false).is_some())
+            .get(0)
+            .is_some_and(|person| person.is_complete() && person.motion_at(clock_secs(), false).is_some())
     });
     let mut state = receiver.state();
-    let person = state.people.get_mut(&0).unwrap();
-    let motion = person.motion_at(Instant::now(), false).unwrap();
+    let person = state.people.get_mut(0).unwrap();
+    let motion = person.motion_at(clock_secs(), false).unwrap();
     let mut posed = Posed::default();
     let colors = person.pose(&motion, &mut posed);
     let mut scene = Scene::new(&gpu.fastest()).unwrap();

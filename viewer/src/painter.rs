@@ -9,9 +9,13 @@ use flyrig_gpu::GpuContext;
 use flyrig_renderer::composite_over;
 use flyrig_stream::{Posed, Stamp};
 use flyrig_types::{Camera, SupervisedThread, ThreadHealth};
+use flyrig_viewing::StreamPerson;
 use glam::DVec3;
 
-use crate::{Receiver, Scene, StreamPerson, receiver::age_secs};
+use crate::{
+    Receiver, Scene,
+    receiver::{age_secs, clock_secs},
+};
 
 /// Grey behind the people, sRGB.
 const BACKDROP: u8 = 30;
@@ -149,16 +153,16 @@ fn draw(
     request: &Request,
     last: &mut Option<Content>,
 ) -> Result<Option<Drawn>, flyrig_gpu::GpuError> {
-    let start = Instant::now();
+    let (start, now) = (Instant::now(), clock_secs());
     let (mut shown, mut place, mut is_complete, mut stamp) = (0, None, true, None);
     {
         let mut state = receiver.state();
         let motions: Vec<_> = state
             .people
             .iter()
-            .filter_map(|(&number, person)| Some((number, person.motion_at(start, request.interpolate)?)))
+            .filter_map(|(number, person)| Some((number, person.motion_at(now, request.interpolate)?)))
             .collect();
-        let version = |number: &u32| state.people.get(number).map_or(0, StreamPerson::color_changes);
+        let version = |number: &u32| state.people.get(*number).map_or(0, StreamPerson::color_changes);
         let people = motions.iter().map(|(number, motion)| (*number, motion.stamp, version(number))).collect();
         let content = (request.clone(), people);
         if last.as_ref() == Some(&content) {
@@ -166,7 +170,7 @@ fn draw(
         }
         *last = Some(content);
         for (number, motion) in motions {
-            let Some(person) = state.people.get_mut(&number) else { continue };
+            let Some(person) = state.people.get_mut(number) else { continue };
             if posed.len() <= shown {
                 posed.push(Default::default());
             }

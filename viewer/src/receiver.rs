@@ -1,7 +1,7 @@
 //! Keeps people, cameras and statistics as they come from a rig.
 
 use std::{
-    collections::{BTreeMap, VecDeque},
+    collections::VecDeque,
     sync::{
         Arc, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicBool, Ordering},
@@ -9,11 +9,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_stream::{StreamError, Template, stamp_of};
+use flyrig_stream::Template;
 use flyrig_transport::{Interests, PersonMessage, RigStats, Subscriber, TransportConfig, TransportError};
 use flyrig_types::{Rig, SupervisedThread, ThreadHealth};
-
-use crate::StreamPerson;
+use flyrig_viewing::{People, Taken};
 
 /// How long a message is waited for.
 const PATIENCE: Duration = Duration::from_millis(50);
@@ -26,16 +25,12 @@ const TEMPLATE_PATIENCE: Duration = Duration::from_secs(10);
 const TEMPLATE_RETRY: Duration = Duration::from_millis(500);
 /// Rates are means over this time.
 const RATE_OVER: Duration = Duration::from_secs(2);
-/// Most people that are kept.
-const MOST_PEOPLE: usize = 32;
-/// Colour messages that wait for their template.
-const MOST_WAITING: usize = 64;
 
 /// State of a rig as it was received; lock it briefly.
 #[derive(Debug, Default)]
 pub struct ReceiverState {
-    /// People by their number.
-    pub people: BTreeMap<u32, StreamPerson>,
+    /// People; their clock is [`clock_secs`].
+    pub people: People,
     /// The rig's cameras and its up.
     pub rig: Option<Rig>,
     /// The rig's statistics, about every second.
@@ -110,8 +105,7 @@ impl Receiver {
         let work = move || {
             // Begun anew after a panic: what it left behind may be anything.
             lock(&shared).people.clear();
-            let mut link =
-                Link { subscriber: &subscriber, state: &shared, waiting: VecDeque::new(), asked: None, looked: None };
+            let mut link = Link { subscriber: &subscriber, state: &shared, asked: None, looked: None };
             while !ended.load(Ordering::Relaxed) {
                 link.turn(&arrived);
             }
@@ -152,8 +146,6 @@ fn lock(state: &Mutex<ReceiverState>) -> MutexGuard<'_, ReceiverState> {
 struct Link<'a> {
     subscriber: &'a Subscriber,
     state: &'a Mutex<ReceiverState>,
-    /// Messages of people whose template is on its way.
-    waiting: VecDeque<PersonMessage>,
     /// Template that was asked for last without an answer.
     asked: Option<(u64, Instant)>,
     /// When statistics and calibration were looked at last.
@@ -182,7 +174,7 @@ impl Link<'_> {
                         state.age = Some((own_clock.unwrap_or(way), own_clock.is_some()));
                     }
                 }
-                self.take(received.body, now);
+                self.take(&received.body);
                 if is_motion {
                     arrived();
                 }
@@ -209,26 +201,13 @@ impl Link<'_> {
         }
     }
 
-    fn take(&mut self, message: PersonMessage, now: Instant) {
-        let taken = give(self.state, &message, now);
+    fn take(&mut self, message: &PersonMessage) {
+        let is_motion = message.layer.is_none();
+        let taken = lock(self.state).people.take(message.person, is_motion, &message.bytes, clock_secs());
         match taken {
-            Ok(()) => {}
-            Err(StreamError::OtherTemplate { .. }) if message.layer.is_none() => {
-                let Ok(stamp) = stamp_of(&message.bytes) else { return };
-                self.meet(message.person, stamp.template);
-                // A motion is shown as soon as its template is there; those after it come by themselves.
-                if give(self.state, &message, now).is_ok() {
-                    for colors in std::mem::take(&mut self.waiting) {
-                        drop(give(self.state, &colors, now));
-                    }
-                }
-            }
-            Err(StreamError::OtherTemplate { .. }) => {
-                self.waiting.push_back(message);
-                while self.waiting.len() > MOST_WAITING {
-                    self.waiting.pop_front();
-                }
-            }
+            // Colours wait for the motion beside them, which is shown as soon as its template is there.
+            Ok(Taken::Needs(template)) if is_motion => self.meet(message.person, template),
+            Ok(_) => {}
             Err(error) => lock(self.state).complain(format!("person {}: {error}", message.person)),
         }
     }
@@ -245,11 +224,7 @@ impl Link<'_> {
                     Ok(template) => template,
                     Err(error) => return self.refuse(hash, error.to_string()),
                 };
-                let mut state = lock(self.state);
-                if state.people.len() >= MOST_PEOPLE && !state.people.contains_key(&person) {
-                    state.people.pop_first();
-                }
-                state.people.insert(person, StreamPerson::new(Arc::new(template)));
+                lock(self.state).people.meet(person, Arc::new(template));
                 self.asked = None;
             }
             Ok(None) => self.asked = Some((hash, Instant::now())),
@@ -263,16 +238,11 @@ impl Link<'_> {
     }
 }
 
-/// Hands a message to its person; one who is not known has another template.
-fn give(state: &Mutex<ReceiverState>, message: &PersonMessage, now: Instant) -> Result<(), StreamError> {
-    let mut state = lock(state);
-    let Some(person) = state.people.get_mut(&message.person) else {
-        return Err(StreamError::OtherTemplate { what: "message" });
-    };
-    match message.layer {
-        None => person.take_motion(&message.bytes, now),
-        Some(_) => person.take_colors(&message.bytes).map(drop),
-    }
+/// This host's `CLOCK_MONOTONIC`, seconds: the clock that [`ReceiverState::people`] is kept by.
+#[must_use]
+pub fn clock_secs() -> f64 {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    now.tv_sec as f64 + now.tv_nsec as f64 / 1e9
 }
 
 /// Age of a capture time of this host's `CLOCK_MONOTONIC`, seconds.

@@ -9,10 +9,11 @@ use std::{
 use eframe::egui;
 use flyrig_gpu::{GpuContext, GpuError};
 use flyrig_transport::{TransportConfig, TransportError};
+use flyrig_viewing::Navigation;
 use glam::DVec3;
 
 use crate::{
-    Navigation, Receiver, ReceiverState,
+    Receiver, ReceiverState,
     painter::{Drawn, Painter, Request},
 };
 

@@ -1,10 +1,6 @@
 //! One person of the stream, as it has come so far.
 
-use std::{
-    collections::VecDeque,
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{collections::VecDeque, sync::Arc};
 
 use flyrig_stream::{ColorDecoder, Motion, Posed, Stamp, StreamError, Template};
 
@@ -15,7 +11,7 @@ const MOST_DELAY_SECS: f64 = 0.5;
 /// How fast the estimate of the fastest way follows a clock that drifts, seconds a second.
 const DRIFT: f64 = 1e-3;
 /// A person of whom no motion came for so long, and three intervals, is gone.
-const GONE_AFTER: Duration = Duration::from_secs(3);
+const GONE_AFTER_SECS: f64 = 3.0;
 
 /// Template, last motions and colours of one person.
 #[derive(Debug)]
@@ -27,12 +23,12 @@ pub struct StreamPerson {
     colors_are_current: bool,
     /// Counts the messages of colours.
     color_changes: u64,
-    motions: VecDeque<(Instant, Motion)>,
+    /// Arrival, seconds of the viewer's clock, and motion.
+    motions: VecDeque<(f64, Motion)>,
     /// Smoothed time between motions, seconds of the rig's clock.
     interval: f64,
-    /// Least of arrival (since `since`) minus capture time: the fastest way, seconds.
+    /// Least of arrival minus capture time: the fastest way, seconds.
     fastest: Option<f64>,
-    since: Instant,
 }
 
 impl StreamPerson {
@@ -47,7 +43,6 @@ impl StreamPerson {
             motions: VecDeque::new(),
             interval: 0.0,
             fastest: None,
-            since: Instant::now(),
             template,
         }
     }
@@ -58,19 +53,19 @@ impl StreamPerson {
         &self.template
     }
 
-    /// Takes in a motion that came at `now`; one that is older than the newest is left out.
+    /// Takes in a motion that came at `now`, seconds of the viewer's clock; one that is older than the newest is left out.
     ///
     /// # Errors
     /// [`StreamError`].
-    pub fn take_motion(&mut self, bytes: &[u8], now: Instant) -> Result<(), StreamError> {
+    pub fn take_motion(&mut self, bytes: &[u8], now: f64) -> Result<(), StreamError> {
         let motion = Motion::decode(bytes, &self.template)?;
         let capture = |motion: &Motion| motion.stamp.capture_nanos as f64 / 1e9;
         if let Some((_, last)) = self.motions.back() {
             let step = capture(&motion) - capture(last);
-            if step <= 0.0 && step > -GONE_AFTER.as_secs_f64() {
+            if step <= 0.0 && step > -GONE_AFTER_SECS {
                 return Ok(());
             }
-            if step <= 0.0 || step > 10.0 * GONE_AFTER.as_secs_f64() {
+            if step <= 0.0 || step > 10.0 * GONE_AFTER_SECS {
                 // The rig began anew, or was away.
                 self.motions.clear();
                 (self.fastest, self.interval) = (None, 0.0);
@@ -78,7 +73,7 @@ impl StreamPerson {
                 self.interval = if self.interval > 0.0 { self.interval + 0.2 * (step - self.interval) } else { step };
             }
         }
-        let way = now.duration_since(self.since).as_secs_f64() - capture(&motion);
+        let way = now - capture(&motion);
         self.fastest = Some(self.fastest.map_or(way, |fastest| way.min(fastest + DRIFT * self.interval)));
         self.motions.push_back((now, motion));
         while self.motions.len() > KEPT {
@@ -101,15 +96,15 @@ impl StreamPerson {
     /// The motion to show at `now`: the newest, or interpolated one interval and a half later than the fastest message would
     /// allow, so that the next one has usually come. None for a person who is gone.
     #[must_use]
-    pub fn motion_at(&self, now: Instant, interpolate: bool) -> Option<Motion> {
+    pub fn motion_at(&self, now: f64, interpolate: bool) -> Option<Motion> {
         let (arrived, newest) = self.motions.back()?;
         // A slow rig has long intervals.
-        if now.saturating_duration_since(*arrived).as_secs_f64() > GONE_AFTER.as_secs_f64() + 3.0 * self.interval {
+        if now - arrived > GONE_AFTER_SECS + 3.0 * self.interval {
             return None;
         }
         let (Some(fastest), true) = (self.fastest, interpolate) else { return Some(newest.clone()) };
         let delay = (1.5 * self.interval).min(MOST_DELAY_SECS);
-        let wanted = now.saturating_duration_since(self.since).as_secs_f64() - fastest - delay;
+        let wanted = now - fastest - delay;
         let capture = |at: usize| self.motions[at].1.stamp.capture_nanos as f64 / 1e9;
         let next = (0..self.motions.len()).find(|&at| capture(at) > wanted);
         Some(match next {
