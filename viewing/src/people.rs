@@ -111,3 +111,106 @@ impl People {
         self.by_number.iter().map(|(&number, person)| (number, person))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use flyrig_stream::{
+        ColorEncoder, ColorSettings, EncodedTemplate, Joint, Motion, MotionEncoder, Posed, Stamp, TemplateSource,
+    };
+
+    use super::*;
+
+    /// A person of a few Gaussians on one joint; `size` makes another template.
+    fn person(size: f32) -> EncodedTemplate {
+        let rows = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+        let joints = [Joint { parent: None, translation: [0.0; 3], joint_from_canonical: rows }];
+        let center_scale: Vec<[f32; 4]> = (0..40).map(|i| [size * i as f32 / 40.0, size, 0.0, 0.01]).collect();
+        let skin = vec![([0; 4], [1.0, 0.0, 0.0, 0.0]); 40];
+        let normals = vec![[0.0, 0.0, 1.0]; 40];
+        let (center_scale, normals, skin) = (&center_scale, &normals, &skin);
+        let source = TemplateSource { joints: &joints, center_scale, normals, skin, node_weights: &[], nodes: &[] };
+        source.encode().unwrap()
+    }
+
+    fn motion(template: &EncodedTemplate, frame: u64, x: f32) -> Vec<u8> {
+        let stamp = Stamp { frame, capture_nanos: 100_000_000 * frame as i64, ..Stamp::default() };
+        let joint_rotations = vec![[0.0, 0.0, 0.0, 1.0]];
+        let motion = Motion { stamp, root_translation: [x, 0.0, 0.0], joint_rotations, nodes: Vec::new() };
+        MotionEncoder::new(template).encode(&motion).unwrap()
+    }
+
+    #[test]
+    fn what_comes_before_the_template_is_applied_with_it() {
+        let (template, other) = (person(1.0), person(2.0));
+        let hash = template.template.hash;
+        let mut encoder = ColorEncoder::new(&template, ColorSettings::default(), 7);
+        let colors = encoder.encode(Stamp::default(), &[[0.5, 0.2, 0.1, 1.0]; 40]);
+        let mut people = People::default();
+        for layer in &colors {
+            assert_eq!(people.take(3, false, layer, 0.0), Ok(Taken::Needs(hash)));
+        }
+        assert_eq!(people.take(3, true, &motion(&template, 1, 0.25), 0.0), Ok(Taken::Needs(hash)));
+        assert!(people.is_empty() && people.get(3).is_none());
+        // Somebody else's template changes nothing for this one.
+        people.meet(4, Arc::new(other.template.clone()));
+        assert!(people.get(4).unwrap().motion_at(0.1, false).is_none());
+        people.meet(3, Arc::new(template.template.clone()));
+        let shown = people.get(3).unwrap();
+        assert!(shown.is_complete() && shown.color_changes() == colors.len() as u64);
+        let found = shown.motion_at(0.1, false).unwrap();
+        assert!((found.root_translation[0] - 0.25).abs() < 1e-3);
+        let (mut posed, person) = (Posed::default(), people.get_mut(3).unwrap());
+        let colors = person.pose(&found, &mut posed);
+        assert!(colors.iter().all(|c| (c[0] - 0.5).abs() < 0.05 && (c[2] - 0.1).abs() < 0.05), "{:?}", colors[0]);
+        // The rig takes another template for the same person.
+        let hash = other.template.hash;
+        assert_eq!(people.take(3, true, &motion(&other, 2, 0.0), 0.2), Ok(Taken::Needs(hash)));
+        people.meet(3, Arc::new(other.template));
+        assert_eq!(people.get(3).unwrap().motion_at(0.2, false).unwrap().stamp.template, hash);
+        // Damaged bytes are an error and keep what is there.
+        people.take(3, true, b"FLM", 0.3).unwrap_err();
+        people.take(9, false, &[], 0.3).unwrap_err();
+        assert!(people.get(3).unwrap().motion_at(0.3, false).is_some());
+    }
+
+    #[test]
+    fn motion_is_interpolated_and_ends() {
+        let template = person(1.0);
+        let mut people = People::default();
+        people.meet(0, Arc::new(template.template.clone()));
+        // A frame each 100 ms, 1 m/s; the rig's clock is 5 s behind the viewer's, and every other message is 30 ms late.
+        for frame in 1..=10u64 {
+            let late = 0.03 * (frame % 2) as f64;
+            let message = motion(&template, frame, 0.1 * frame as f32);
+            assert_eq!(people.take(0, true, &message, 5.0 + 0.1 * frame as f64 + late), Ok(Taken::Applied));
+        }
+        let place = |now: f64| people.get(0).unwrap().motion_at(now, true).map(|motion| motion.root_translation[0]);
+        for now in [5.7, 5.78, 5.91] {
+            let (found, expected) = (place(now).unwrap(), (now - 5.0 - 0.15) as f32);
+            assert!((found - expected).abs() < 2e-3, "{now}: {found}, {expected}");
+        }
+        // Held while nothing comes, then gone.
+        assert!((place(7.0).unwrap() - 1.0).abs() < 1e-3);
+        assert_eq!(place(9.5), None);
+        // A late or repeated frame is left out; a rig that began anew is followed.
+        assert_eq!(people.take(0, true, &motion(&template, 4, 9.0), 6.1), Ok(Taken::Applied));
+        assert!(people.get(0).unwrap().motion_at(6.1, false).unwrap().root_translation[0] < 1.01);
+        assert_eq!(people.take(0, true, &motion(&template, 400, 9.0), 6.2), Ok(Taken::Applied));
+        assert!((people.get(0).unwrap().motion_at(6.2, true).unwrap().root_translation[0] - 9.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn endless_people_and_messages_are_bounded() {
+        let (template, other) = (Arc::new(person(1.0).template), person(2.0));
+        let mut people = People::default();
+        for number in 0..100 {
+            people.meet(number, Arc::clone(&template));
+            let message = motion(&other, u64::from(number), 0.0);
+            assert!(matches!(people.take(number, true, &message, 0.0), Ok(Taken::Needs(_))));
+        }
+        assert_eq!(people.iter().count(), MAX_PEOPLE);
+        assert_eq!(people.waiting.len(), MAX_WAITING);
+        people.clear();
+        assert!(people.is_empty() && people.waiting.is_empty());
+    }
+}
