@@ -6,7 +6,7 @@
 
 use std::{collections::BTreeMap, error::Error, path::PathBuf, time::Instant};
 
-use flyrig_calib::{Board, BoardView, LensModel, Pattern, RigFit, RigOptions, SeenCorner, Shot, calibrate_rig};
+use flyrig_calib::{Board, BoardShot, BoardView, LensModel, Pattern, RigFit, RigOptions, SeenCorner, calibrate_rig};
 use flyrig_types::{CameraId, Intrinsics, Lens};
 use glam::DVec2;
 
@@ -80,7 +80,7 @@ fn cameras(text: &str) -> Result<(Vec<CameraId>, Vec<Intrinsics>), Box<dyn Error
     Ok((ids, lenses))
 }
 
-fn shots(text: &str, ids: &[CameraId]) -> Result<Vec<Shot>, Box<dyn Error>> {
+fn shots(text: &str, ids: &[CameraId]) -> Result<Vec<BoardShot>, Box<dyn Error>> {
     let mut sets: BTreeMap<i64, BTreeMap<usize, BoardView>> = BTreeMap::new();
     for line in text.lines().skip(1) {
         let cells: Vec<&str> = line.split(',').collect();
@@ -94,7 +94,7 @@ fn shots(text: &str, ids: &[CameraId]) -> Result<Vec<Shot>, Box<dyn Error>> {
     let shot = |views: BTreeMap<usize, BoardView>| {
         let views: Vec<BoardView> = views.into_values().collect();
         let nanos = views.iter().map(|view| view.nanos).sum::<i64>() / views.len() as i64;
-        Shot { nanos, views }
+        BoardShot { nanos, views }
     };
     Ok(sets.into_values().map(shot).collect())
 }

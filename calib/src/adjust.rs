@@ -4,7 +4,7 @@ use flyrig_solve::{Convergence, RigidMotion, block_covariance, log_rotation, med
 use glam::DVec3;
 use nalgebra::DMatrix;
 
-use crate::bundle::{BoardMotion, Bundle, Estimate, Free, Shot, seconds};
+use crate::bundle::{BoardMotion, BoardShot, Bundle, Estimate, Free, seconds};
 
 /// Rounds of estimating noise and movement.
 const ROUNDS: usize = 4;
@@ -27,7 +27,7 @@ pub(crate) struct Adjusted {
 }
 
 /// Minimises the reprojection errors from a start.
-pub(crate) fn adjust(points: &[DVec3], shots: &[Shot], start: Estimate, free: Free) -> Option<Adjusted> {
+pub(crate) fn adjust(points: &[DVec3], shots: &[BoardShot], start: Estimate, free: Free) -> Option<Adjusted> {
     let cameras = start.cameras.len();
     let mut estimate = start;
     let mut sigma_px = 1.0;
@@ -57,8 +57,8 @@ pub(crate) fn adjust(points: &[DVec3], shots: &[Shot], start: Estimate, free: Fr
     Some(Adjusted { covariance, errors_px, estimate, sigma_px })
 }
 
-fn errors_px(bundle: &Bundle<'_>, shots: &[Shot], at: &Estimate) -> Option<Vec<Vec<Vec<f64>>>> {
-    let of_shot = |(index, shot): (usize, &Shot)| {
+fn errors_px(bundle: &Bundle<'_>, shots: &[BoardShot], at: &Estimate) -> Option<Vec<Vec<Vec<f64>>>> {
+    let of_shot = |(index, shot): (usize, &BoardShot)| {
         let of_view = |view| {
             let shot: &crate::BoardView = view;
             shot.corners.iter().map(|corner| Some(bundle.error_px(at, index, shot, corner)?.length())).collect()
@@ -69,7 +69,7 @@ fn errors_px(bundle: &Bundle<'_>, shots: &[Shot], at: &Estimate) -> Option<Vec<V
 }
 
 /// Velocities of the boards from the shots before and after. Accelerations would follow the noise: they were tried.
-fn board_motions(shots: &[Shot], boards: &[RigidMotion]) -> Vec<BoardMotion> {
+fn board_motions(shots: &[BoardShot], boards: &[RigidMotion]) -> Vec<BoardMotion> {
     let between = |a: usize, b: usize| {
         let secs = seconds(shots[b].nanos, shots[a].nanos);
         let near = secs > 0.0 && secs < LONGEST_GAP_S;

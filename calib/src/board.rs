@@ -56,7 +56,7 @@ impl Board {
     /// Reads `board.toml`.
     ///
     /// # Errors
-    /// [`CalibError::Board`] names the file, the key and the mend.
+    /// [`CalibError::Board`] names the file, the key and the fix.
     pub fn load(path: &Path) -> Result<Self, CalibError> {
         let refused = |reason: String| CalibError::Board { path: path.to_owned(), reason };
         let text = std::fs::read_to_string(path)

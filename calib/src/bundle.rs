@@ -26,7 +26,7 @@ pub struct BoardView {
 
 /// A board that several cameras saw at about the same time.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Shot {
+pub struct BoardShot {
     /// Time of the shot, nanoseconds.
     pub nanos: i64,
     /// At most one view of each camera.
@@ -69,7 +69,7 @@ pub(crate) struct Free {
 /// The least squares problem.
 pub(crate) struct Bundle<'a> {
     points: &'a [DVec3],
-    shots: &'a [Shot],
+    shots: &'a [BoardShot],
     motions: &'a [BoardMotion],
     free: Free,
     /// Standard deviation of a corner, pixels.
@@ -85,7 +85,7 @@ impl<'a> Bundle<'a> {
     /// `points` are the board's corners, `motions` one a shot.
     pub fn new(
         points: &'a [DVec3],
-        shots: &'a [Shot],
+        shots: &'a [BoardShot],
         motions: &'a [BoardMotion],
         cameras: usize,
         free: Free,

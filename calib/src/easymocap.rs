@@ -26,7 +26,7 @@ const EXTRINSICS: &str = "extri.yml";
 /// ([`Rig::guess_world_up`]).
 ///
 /// # Errors
-/// [`CalibError`] names the file, the camera and the mend.
+/// [`CalibError`] names the file, the camera and the fix.
 pub fn load_easymocap(dir: &Path, picture_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>) -> Result<Rig, CalibError> {
     let intri = YamlFile::open(dir.join(INTRINSICS))?;
     let extri = YamlFile::open(dir.join(EXTRINSICS))?;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use flyrig_types::{CameraError, CameraId};
 
-/// Each text names the file, the camera where there is one, and the mend.
+/// Each text names the file, the camera where there is one, and the fix.
 #[derive(Debug, thiserror::Error)]
 pub enum CalibError {
     /// The file cannot be read.
@@ -122,7 +122,7 @@ pub enum CalibError {
     Board {
         /// Which file.
         path: PathBuf,
-        /// The wrong key and the mend.
+        /// The wrong key and the fix.
         reason: String,
     },
     /// Too few views of the board to know a lens.

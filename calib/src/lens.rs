@@ -5,7 +5,7 @@ use flyrig_types::{CameraId, Intrinsics, Lens};
 use glam::{DVec2, DVec3};
 
 use crate::{
-    Board, BoardView, CalibError, LensModel, Shot,
+    Board, BoardShot, BoardView, CalibError, LensModel,
     adjust::{Adjusted, adjust},
     bundle::{Estimate, Free, SolvedCamera},
     homography::{focal_length, homography},
@@ -224,7 +224,7 @@ fn solve(
     for view in views {
         // A lens that is still wrong leaves large errors: any pose that puts the board before the camera is a start.
         if let Some(pose) = board_poses(board, lens, view).first() {
-            shots.push(Shot { nanos: view.nanos, views: vec![BoardView { camera: 0, ..view.clone() }] });
+            shots.push(BoardShot { nanos: view.nanos, views: vec![BoardView { camera: 0, ..view.clone() }] });
             boards.push(*pose);
         }
     }

@@ -24,7 +24,7 @@ mod watch;
 mod yaml;
 
 pub use board::{Board, Pattern};
-pub use bundle::{BoardView, Shot};
+pub use bundle::{BoardShot, BoardView};
 pub use calibration_file::{Deviation, calibration_toml, save_calibration, save_lenses};
 pub use convert::{Format, Imported, ImportedCamera};
 pub use detect::{BoardDetector, GrayImage, SeenCorner, detector};

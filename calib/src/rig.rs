@@ -6,7 +6,7 @@ use glam::{DMat3, DQuat, DVec3};
 use nalgebra::DMatrix;
 
 use crate::{
-    Board, BoardView, CalibError, LensModel, Pair, Shot,
+    Board, BoardShot, BoardView, CalibError, LensModel, Pair,
     adjust::{Adjusted, adjust},
     bundle::{Estimate, Free},
     start::{rig_start, rms},
@@ -81,15 +81,15 @@ pub fn calibrate_rig(
     board: &Board,
     ids: &[CameraId],
     intrinsics: &[Intrinsics],
-    shots: &[Shot],
+    shots: &[BoardShot],
     options: RigOptions,
 ) -> Result<RigFit, CalibError> {
     if intrinsics.len() != ids.len() || ids.is_empty() {
         return Err(CalibError::RigOpen);
     }
     let is_known = |view: &&BoardView| view.camera < ids.len();
-    let known = |shot: &Shot| Shot { views: shot.views.iter().filter(is_known).cloned().collect(), ..*shot };
-    let shots: Vec<Shot> = shots.iter().map(known).collect();
+    let known = |shot: &BoardShot| BoardShot { views: shot.views.iter().filter(is_known).cloned().collect(), ..*shot };
+    let shots: Vec<BoardShot> = shots.iter().map(known).collect();
     let (start, pairs, shots) = rig_start(board, &shots, ids, intrinsics)?;
     let points: Vec<DVec3> = (0..board.corner_count()).map(|index| board.corner(index)).collect();
     let free = Free { lens: options.lens, lags: options.lags };
@@ -128,9 +128,9 @@ pub fn calibrate_rig(
 }
 
 /// Solves again from every second shot.
-fn half_solve(points: &[DVec3], shots: &[Shot], at: &Estimate, free: Free, half: usize) -> Option<Estimate> {
+fn half_solve(points: &[DVec3], shots: &[BoardShot], at: &Estimate, free: Free, half: usize) -> Option<Estimate> {
     let every_second = |i: &usize| i % 2 == half;
-    let part: Vec<Shot> = (0..shots.len()).filter(every_second).map(|i| shots[i].clone()).collect();
+    let part: Vec<BoardShot> = (0..shots.len()).filter(every_second).map(|i| shots[i].clone()).collect();
     let boards = (0..shots.len()).filter(every_second).map(|i| at.boards[i]).collect();
     let start = Estimate { cameras: at.cameras.clone(), boards };
     let seen = |slot: usize| part.iter().flat_map(|shot| &shot.views).any(|view| view.camera == slot);
@@ -142,7 +142,7 @@ fn half_solve(points: &[DVec3], shots: &[Shot], at: &Estimate, free: Free, half:
     Some(fit.estimate)
 }
 
-fn camera(fit: &Adjusted, shots: &[Shot], free: Free, slot: usize, halves: &[Option<Estimate>]) -> RigCamera {
+fn camera(fit: &Adjusted, shots: &[BoardShot], free: Free, slot: usize, halves: &[Option<Estimate>]) -> RigCamera {
     let mut errors = Vec::new();
     let mut views = 0;
     for (shot, of_shot) in shots.iter().zip(&fit.errors_px) {

@@ -7,7 +7,7 @@ use flyrig_types::{CameraId, Intrinsics};
 use glam::{DVec2, DVec3};
 
 use crate::{
-    Board, BoardView, CalibError, Shot,
+    Board, BoardShot, BoardView, CalibError,
     adjust::adjust,
     bundle::{Estimate, Free, SolvedCamera},
     homography::{homography, plane_poses, spread_out},
@@ -37,7 +37,7 @@ pub(crate) fn board_poses(board: &Board, intrinsics: &Intrinsics, view: &BoardVi
     }
     let Some(starts) = homography(&ideal).and_then(|h| plane_poses(&h)) else { return Vec::new() };
     let points: Vec<DVec3> = (0..board.corner_count()).map(|index| board.corner(index)).collect();
-    let shots = [Shot { nanos: view.nanos, views: vec![BoardView { camera: 0, ..view.clone() }] }];
+    let shots = [BoardShot { nanos: view.nanos, views: vec![BoardView { camera: 0, ..view.clone() }] }];
     let mut found: Vec<(f64, RigidMotion)> = Vec::new();
     for start in starts {
         let camera = SolvedCamera { camera_from_rig: RigidMotion::IDENTITY, intrinsics: *intrinsics, lag_s: 0.0 };
@@ -86,10 +86,10 @@ pub struct Pair {
 /// [`CalibError::NotLinked`] lists the groups of cameras that never saw the board together.
 pub(crate) fn rig_start(
     board: &Board,
-    shots: &[Shot],
+    shots: &[BoardShot],
     ids: &[CameraId],
     intrinsics: &[Intrinsics],
-) -> Result<(Estimate, Vec<Pair>, Vec<Shot>), CalibError> {
+) -> Result<(Estimate, Vec<Pair>, Vec<BoardShot>), CalibError> {
     // By shot and camera: the poses of the board, camera axes.
     let poses: Vec<BTreeMap<usize, Vec<RigidMotion>>> = shots
         .iter()
@@ -173,7 +173,7 @@ pub(crate) fn rig_start(
         let views: Vec<BoardView> = shot.views.iter().filter(visible).cloned().collect();
         if !views.is_empty() {
             boards.push(pose);
-            kept.push(Shot { nanos: shot.nanos, views });
+            kept.push(BoardShot { nanos: shot.nanos, views });
         }
     }
     Ok((Estimate { cameras, boards }, pairs, kept))

@@ -1,7 +1,7 @@
 //! Calibration from simulated corners, against the truth.
 
 use flyrig_calib::{
-    Board, BoardView, CalibError, LensModel, Pattern, RigOptions, Shot, calibrate_lens, calibrate_rig,
+    Board, BoardShot, BoardView, CalibError, LensModel, Pattern, RigOptions, calibrate_lens, calibrate_rig,
     testing::{Random, pose_errors, ring, shots, view},
 };
 use flyrig_solve::{PointPair, align_rigid};
@@ -228,7 +228,7 @@ fn time_offsets_are_found_from_a_board_that_moves() {
             }
         }
         if !views.is_empty() {
-            shots.push(Shot { nanos, views });
+            shots.push(BoardShot { nanos, views });
         }
     }
     let solve = |lags| {
@@ -260,7 +260,7 @@ fn the_board_on_the_floor_gives_height_and_up() {
         .filter_map(|(slot, camera)| view(&mut random, &board(), camera, slot, &pose, 0.1))
         .collect();
     assert!(views.len() > 1);
-    shots.insert(0, Shot { nanos: -1_000_000_000, views });
+    shots.insert(0, BoardShot { nanos: -1_000_000_000, views });
     let options = RigOptions { floor_first: true, ..RigOptions::default() };
     let fit = calibrate_rig(&board(), &ids(&cameras), &lenses(&cameras), &shots, options).unwrap();
     for (found, truth) in fit.rig.cameras.iter().zip(&cameras) {

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// How a camera is told from the others.
+/// Identity of a camera.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum CameraIdentity {
     /// Serial number of the USB device.

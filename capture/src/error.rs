@@ -38,7 +38,7 @@ pub struct CaptureError {
     pub camera: Option<CameraId>,
     /// What to do about it.
     pub kind: CaptureErrorKind,
-    /// What happened and how to mend it.
+    /// What happened and the fix.
     pub message: String,
 }
 

@@ -34,7 +34,7 @@ const FORMATS: [(FrameFormat, FormatChoice, PixelFormat); 6] = [
 /// How long the system may take to ask its user whether cameras may be used.
 const ASKING: Duration = Duration::from_secs(4);
 
-/// How a camera is told from the others.
+/// Identity of a camera.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum NokhwaDevice {
     /// Its number in the system's list; on Linux that of `/dev/video`. It may be another after a replug: prefer the name.
@@ -95,7 +95,7 @@ impl NokhwaCamera {
     ///
     /// # Errors
     /// `NotFound` when no such camera is there, `Unsupported` for what it cannot do, `Io` when it is in use, may not be
-    /// opened or hangs. Every text names the camera, the cause and the mend.
+    /// opened or hangs. Every text names the camera, the cause and the fix.
     pub fn open(camera: &CameraId, options: &NokhwaOptions) -> Result<Self, CaptureError> {
         let (size, lag_secs) = ((options.width, options.height), options.lag_secs);
         let expected = Expected { size, fps: options.fps, lag_secs };

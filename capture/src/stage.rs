@@ -1,15 +1,13 @@
 //! Work on frames between a camera's thread and the common queue, in a thread of its own.
 
-use std::{sync::Arc, time::Duration};
+use std::sync::Arc;
 
 use flyrig_types::{CameraId, Frame, caught};
 
-use crate::{CaptureError, CaptureErrorKind, LatestQueue, PopError, threads::Shared};
+use crate::{CaptureError, LatestQueue};
 
 /// Frames that may wait for a stage: one to work on next, one for jitter. More would only be older.
 const WAITING: usize = 2;
-/// A stage without frames shows that it lives so often.
-const TURN: Duration = Duration::from_millis(500);
 
 /// Work on every frame of a camera that shall not hold up the camera's own thread: decoding, compressing.
 pub trait FrameStage: Send {
@@ -46,52 +44,11 @@ pub(crate) struct Stage {
 
 impl Stage {
     /// Replaces the stage, if another can be made.
-    fn renew(&mut self, camera: &CameraId) -> bool {
+    pub fn renew(&mut self, camera: &CameraId) -> bool {
         let Some(maker) = &self.maker else { return false };
         let Ok(fresh) = caught(|| maker(camera)) else { return false };
         let broken = std::mem::replace(&mut self.stage, fresh);
         let _ = caught(move || drop(broken));
         true
-    }
-}
-
-impl Shared {
-    /// The body of a stage's thread.
-    pub(crate) fn run_stage(&self, slot: usize, mut stage: Stage) {
-        let Some(hand) = self.hand(slot) else { return };
-        let (camera, pulse) = (self.camera(slot), &self.pulses(slot).stage);
-        // Ends when the camera's thread has closed the queue, and all that was in it is done.
-        loop {
-            pulse.beat();
-            let (frame, order_nanos) = match hand.0.pop(TURN) {
-                Ok(next) => next,
-                Err(PopError::Timeout) => continue,
-                Err(PopError::Closed) => break,
-            };
-            pulse.beat();
-            let sequence = frame.sequence;
-            let done = caught(|| stage.stage.process(frame)).unwrap_or_else(|text| {
-                if stage.renew(&camera) {
-                    self.count_stage_restart(slot);
-                }
-                let message = format!("made the decoder fail inside: {text}");
-                Err(CaptureError::general(CaptureErrorKind::Corrupt, message))
-            });
-            match done {
-                Ok(frame) => {
-                    if !self.deliver(slot, pulse, frame, order_nanos) {
-                        hand.close();
-                        break;
-                    }
-                }
-                Err(error) => {
-                    let message = format!("frame {sequence} {}", error.message);
-                    self.count(slot, CaptureError { message, ..error }.of(&camera));
-                }
-            }
-        }
-        let _ = caught(move || drop(stage));
-        pulse.rest();
-        self.end(slot);
     }
 }

@@ -255,7 +255,7 @@ fn a_source_that_panics_is_opened_anew_up_to_a_cap() {
             Ok(source("bad", frames(3), step.clone()))
         });
         let threads = CaptureThreads::start_opening(vec![opener, healthy("good")], live(10_000)).unwrap();
-        until(&threads, "bad", "it is opened anew", |stats| stats.restarts == 5);
+        until(&threads, "bad", "it is opened again", |stats| stats.restarts == 5);
         let capped = until(&threads, "bad", "the last one fails", |stats| stats.errors.values().sum::<u64>() == 6);
         flows(&threads, "good");
         std::thread::sleep(Duration::from_millis(500));

@@ -271,7 +271,7 @@ pub struct CalibrateConvertArgs {
     /// Format of the output, one of the same.
     #[arg(long, value_parser = parse_format, default_value = "flyrig")]
     pub to: Format,
-    /// Metres of a unit of length in the input: 0.001 for millimetres; for COLMAP and nerfstudio the size of theirs in the room.
+    /// Metres of a unit of length in the input: 0.001 for millimetres; for COLMAP and nerfstudio, whose unit is arbitrary, its length in the room.
     #[arg(long, default_value_t = 1.0, value_parser = parse_scale)]
     pub scale: f64,
     /// Folder with images/CAM, for formats that do not say how large the images are; the input otherwise.
@@ -708,7 +708,9 @@ fn parse_lag(text: &str) -> Result<(String, f64), String> {
     let parts = text.split_once('=').and_then(|(camera, lag)| Some((camera.to_owned(), lag.parse::<f64>().ok()?)));
     match parts {
         Some((camera, lag)) if !camera.is_empty() && lag.abs() <= 1000.0 => Ok((camera, lag)),
-        _ => Err(format!("'{text}' is no camera with its lag in milliseconds like 03=-50.2 (at most 1000)")),
+        _ => Err(format!(
+            "'{text}' is not CAM=MS, a camera and its time offset in milliseconds like 03=-50.2 (at most 1000)"
+        )),
     }
 }
 

@@ -21,7 +21,7 @@ pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
 /// Keys that stand in `[perception]`, but stood in `[body]` in earlier versions.
 const MOVED_FROM_BODY: [&str; 3] = ["pose", "masks", "shape"];
 
-/// Everything `flyrig run` can be told; the keys are explained in `assets/default.toml`.
+/// Configuration of `flyrig run`; the keys are explained in `assets/default.toml`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {

@@ -232,7 +232,7 @@ fn pass(
         }
         let turn_time = Duration::from_secs_f64(pass.frames as f64 / 12.0);
         let Some(step) = live.step(Duration::from_secs(10), Some(turn_time))? else {
-            if live.intake.ended() {
+            if live.ended() {
                 break;
             }
             bail!("the simulated cameras gave nothing for 10 s; run with -v to see why");

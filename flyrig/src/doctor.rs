@@ -1,4 +1,4 @@
-//! `flyrig doctor`: what is plugged in, whether it works together, and what to mend.
+//! `flyrig doctor`: lists cameras, checks that they work together, and suggests fixes.
 
 use std::{fmt::Write as _, path::Path};
 
@@ -28,7 +28,7 @@ pub fn doctor(config: Option<&Path>) -> Result<()> {
     } else if adapters.iter().all(|name| name.ends_with(", software)")) {
         mends.push("only a software graphics adapter: a rig in real time needs a GPU and its Vulkan driver".to_owned());
     }
-    println!("to mend");
+    println!("problems");
     for mend in &mends {
         println!("  {mend}");
     }

@@ -13,7 +13,7 @@ pub fn threads(health: &Health) -> Vec<String> {
     health.cameras.iter().flat_map(of).collect()
 }
 
-/// Returns how often the work of each thread was begun anew, by thread.
+/// Returns how often the work of each thread was restarted, by thread.
 pub fn thread_restarts(health: &Health) -> Vec<(String, u64)> {
     let of = |camera: &CameraHealth| {
         let stats = &camera.stats;

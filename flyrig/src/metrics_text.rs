@@ -117,7 +117,7 @@ impl Collector for Snapshot {
         page.counters("camera_errors", "Errors of cameras by kind.", errors)?;
         let restarts = health::thread_restarts(health);
         let restarts = restarts.iter().map(|(thread, count)| ([("thread", thread.as_str())], *count));
-        page.counters("thread_restarts", "Times that a thread's work was begun anew.", restarts)?;
+        page.counters("thread_restarts", "Restarts of a thread after a panic.", restarts)?;
         let threads = health::threads(health);
         let stuck =
             threads.iter().map(|thread| ([("thread", thread.as_str())], i64::from(health.stuck.contains(thread))));

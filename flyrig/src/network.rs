@@ -56,7 +56,7 @@ struct NetworkCamera {
     is_missed: bool,
     returns: u64,
     silences: u64,
-    /// The link when this was opened. It goes on counting while a camera is opened anew, and the counts of earlier sources
+    /// The link when this was opened. It goes on counting while a camera is opened again, and the counts of earlier sources
     /// are kept elsewhere.
     opened: CameraLink,
     health: SourceHealth,
@@ -162,7 +162,7 @@ impl CameraSource for NetworkCamera {
         let (width, height) = (frame.image.width(), frame.image.height());
         if (width, height) != self.size {
             let text = format!(
-                "frame {} is {width}x{height}, its calibration {}x{}; set its size on its computer, or calibrate it anew",
+                "frame {} is {width}x{height}, its calibration {}x{}; set its size on its computer, or recalibrate it",
                 frame.sequence, self.size.0, self.size.1
             );
             return Err(self.error(CaptureErrorKind::Corrupt, text));

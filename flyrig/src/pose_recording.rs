@@ -90,7 +90,7 @@ fn decode(payload: &[u8]) -> Result<(Vec<String>, Pose)> {
 }
 
 /// What a recording's poses are, as one line; none without any.
-pub fn told(path: &Path) -> Result<Option<String>> {
+pub fn summarize(path: &Path) -> Result<Option<String>> {
     let (mut count, mut bad, mut joints) = (0u64, 0u64, 0);
     let mut times: Option<(i64, i64)> = None;
     for (nanos, payload) in recorded_messages(path, TOPIC)? {
@@ -135,7 +135,7 @@ mod tests {
         let joints = skeleton.joints();
         assert!(names.iter().zip(joints).all(|(name, joint)| *name == joint.name) && names.len() == joints.len());
         assert_eq!(found, pose);
-        assert_eq!(told(&path).unwrap().unwrap(), format!("5 of {} joints in 2.00 s", joints.len()));
+        assert_eq!(summarize(&path).unwrap().unwrap(), format!("5 of {} joints in 2.00 s", joints.len()));
         // As any program reads it: links of a tree under "world", bones as long as the skeleton's.
         let message = FrameTransforms::decode(messages[0].1.as_slice()).unwrap();
         for (transform, joint) in message.transforms.iter().zip(joints).skip(1) {

@@ -215,7 +215,7 @@ pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> R
     Ok(())
 }
 
-/// Runs `flyrig replay`: plays a recording through, tells what is in it, and exports it where asked to.
+/// Runs `flyrig replay`: plays a recording through, summarises its contents, and exports it where asked to.
 pub fn replay(args: &ReplayArgs) -> Result<()> {
     let stop = stop::flag();
     let (ids, rig) = recorded_cameras(&args.recording)?;
@@ -263,7 +263,7 @@ pub fn replay(args: &ReplayArgs) -> Result<()> {
     for (id, tally) in ids.iter().zip(&tallies) {
         println!("camera {id}: {}", tally.line());
     }
-    if let Some(poses) = pose_recording::told(&args.recording)? {
+    if let Some(poses) = pose_recording::summarize(&args.recording)? {
         println!("poses: {poses}");
     }
     let counts = sync.counts();

@@ -115,7 +115,7 @@ fn capture_people(
     }
     let (started, mut last_print, mut printed) = (Instant::now(), Instant::now(), 0u64);
     let mut last_save = Instant::now();
-    while !stop::requested() && !rig.intake.ended() {
+    while !stop::requested() && !rig.ended() {
         let step = rig.step(STEP, None)?;
         if step.is_some() {
             monitor.stepped();

@@ -25,13 +25,13 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     stop::flag();
     let mut take = take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu)?;
     let cameras: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
-    ensure!(cameras.len() > 1, "one camera alone has no lag; name at least two");
+    ensure!(cameras.len() > 1, "a time offset needs at least two cameras; name another one");
     let advice = if take.is_live { ADD_TO_CAMERA } else { ADD };
     let (estimates, frames, told, mend) = match take.calibration.take() {
         Some((rig, plates)) if !take.is_live => {
             let (estimates, frames) = by_silhouettes(args, &rig, plates, take)?;
             let told = "by silhouettes; +- is the standard error, fit how much better the lag fits than others";
-            let mend = "the silhouettes do not tell it to 5 ms: let one person whom all cameras see whole jump, squat and wave \
+            let mend = "the estimate is less certain than 5 ms: let one person whom all cameras see whole jump, squat and wave \
                         above the head, for eight seconds";
             (estimates, frames, told, mend)
         }
@@ -45,10 +45,9 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
                 eprintln!("sync-check: jump and wave both arms before all cameras for {} s, please", args.seconds);
             }
             let (estimates, frames) = by_motion(args, take.sources, &cameras, &take.sync, take.is_live)?;
-            let mend = "nothing moves there as elsewhere, too slowly, or not for long enough (five seconds): jump and wave both \
+            let mend = "its motion does not correlate with that of other cameras, is too slow, or too short (under five seconds): jump and wave both \
                         arms before all cameras; surer, with a calibration: flyrig record, and sync-check of the recording";
-            let told =
-                "by what moves; +- is what pairs of cameras disagree by, fit the best correlation with another camera";
+            let told = "from motion; +- is the disagreement between camera pairs, fit the best correlation with another camera";
             (estimates, frames, told, mend)
         }
     };
@@ -57,7 +56,7 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     if estimates.iter().any(|estimate| estimate.lag_nanos.is_none()) {
         println!("?: {mend}");
     } else {
-        println!("lag ms is how much later than the first camera's a camera's stamps are: {advice}");
+        println!("offset ms is each camera's time offset from the first camera: {advice}");
     }
     Ok(())
 }
@@ -106,7 +105,7 @@ fn by_motion(
 }
 
 fn print(estimates: &[LagEstimate], frames: &[usize]) {
-    println!("{:<14} {:>7} {:>9} {:>8} {:>6}", "camera", "frames", "lag ms", "+- ms", "fit");
+    println!("{:<14} {:>7} {:>9} {:>8} {:>6}", "camera", "frames", "offset ms", "+- ms", "fit");
     for (estimate, frames) in estimates.iter().zip(frames) {
         let lag = estimate.lag_nanos.map_or_else(|| "?".to_owned(), |nanos| format!("{:.1}", nanos as f64 * 1e-6));
         let error = estimate.disagreement_nanos * 1e-6;

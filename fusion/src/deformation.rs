@@ -1,5 +1,5 @@
 //! Deformation tracking on the GPU: draws the Gaussians with the colours of the last instant into every input view and
-//! tells the solver how the pictures differ (FlyHuman Eq. 3).
+//! passes the image residuals to the solver (FlyHuman Eq. 3).
 
 mod area;
 mod choose;

@@ -12,7 +12,7 @@ use std::{
 use flyrig_capture::{LatestQueue, PopError};
 use flyrig_renderer::composite_over;
 use flyrig_transport::{
-    ImageFormat, Publisher, RigStats, SplatState, StageTime, SubjectStats, TrackingStats, ViewFrame, ViewRate,
+    ImageFormat, Publisher, RigStats, SplatState, StageStats, SubjectStats, TrackingStats, ViewFrame, ViewRate,
 };
 use flyrig_types::{FrameSet, RenderedView, SupervisedThread, ThreadHealth};
 use image::{ExtendedColorType, ImageEncoder as _, codecs::jpeg::JpegEncoder};
@@ -164,7 +164,7 @@ impl LivePublisher {
                 .stages
                 .summary()
                 .iter()
-                .map(|s| StageTime {
+                .map(|s| StageStats {
                     stage: s.name.clone(),
                     mean_millis: f64::from(s.mean_ms),
                     p95_millis: f64::from(s.p95_ms),
@@ -193,9 +193,9 @@ impl LivePublisher {
     #[must_use]
     pub fn drops(&self) -> Vec<(String, u64)> {
         let mut drops = vec![
-            ("pictures waiting for compression".to_owned(), self.jobs.dropped()),
+            ("images waiting for compression".to_owned(), self.jobs.dropped()),
             ("people waiting for the stream".to_owned(), self.people.dropped()),
-            ("pictures that failed".to_owned(), self.failures.load(Ordering::Relaxed)),
+            ("images that failed".to_owned(), self.failures.load(Ordering::Relaxed)),
         ];
         drops.extend(self.publisher.counts().into_iter().map(|(topic, c)| (format!("published {topic}"), c.replaced)));
         drops
@@ -301,7 +301,7 @@ mod tests {
         let (publisher, encoder) = publish_until(encode, |_| last.load(Ordering::Relaxed) > 5);
         let panic = Some("frame 1".to_owned());
         assert_eq!(encoder, ThreadHealth { name: "encode".to_owned(), restarts: 1, panic, has_failed: false });
-        assert_eq!(publisher.drops()[2], ("pictures that failed".to_owned(), 1));
+        assert_eq!(publisher.drops()[2], ("images that failed".to_owned(), 1));
         publisher.finish().unwrap();
     }
 

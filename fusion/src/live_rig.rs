@@ -10,11 +10,13 @@ use flyrig_types::{FrameSet, PersonId, Restarts, ThreadHealth, ThreadWatch, caug
 
 use crate::{
     FusionError, Health, Intake, LivePublisher, LiveViews, Outcome, PersonMemory, RigWatch, Session, WatchEvent,
-    check_threads, resident_mib,
+    check_threads, perceiver::Perceived, resident_mib,
 };
 
 /// Name of the thread that calls [`LiveRig::step`], in health and errors.
 const PIPELINE: &str = "pipeline";
+/// Name of the thread that observes the next set.
+const PERCEPTION: &str = "perception";
 
 /// How often what was learnt about the people is read back, to survive the loss of the graphics device.
 const SNAPSHOT_EVERY: Duration = Duration::from_secs(10);
@@ -36,12 +38,17 @@ pub struct LiveStep {
     pub watched: Option<WatchEvent>,
 }
 
+/// Result of a call that may fail or panic; the text is the panic's.
+type Attempt<T> = Result<Result<T, FusionError>, String>;
+
 /// Cameras in, people out, for as long as the cameras give frames.
 pub struct LiveRig {
     /// The people.
     pub session: Session,
     /// The cameras.
     pub intake: Intake,
+    /// The next set, observed while the one before it was reconstructed.
+    ahead: Option<(FrameSet, Attempt<Perceived>)>,
     publisher: Option<LivePublisher>,
     views: LiveViews,
     splats: bool,
@@ -77,6 +84,7 @@ impl LiveRig {
         Self {
             session,
             intake,
+            ahead: None,
             publisher,
             views,
             splats: true,
@@ -112,44 +120,98 @@ impl LiveRig {
     /// Waits for a set, takes it in and publishes the views that are watched. Returns `None` when no set came in time. The
     /// rig's own views turn with `turn_time`, or with the time since the start.
     ///
+    /// Where another set waits already, its people are observed in a thread of its own meanwhile, so that a step takes as
+    /// long as the longer of the two. Results do not depend on it: perception never waits for a reconstruction.
+    ///
     /// A graphics device that is lost, out of memory or rejects a command is opened again, and the people are resumed from
-    /// the last snapshot. After a panic everything is built anew in the same way, as often as [`Restarts`] lets it at once.
+    /// the last snapshot. After a panic everything is built again in the same way, as often as [`Restarts`] lets it at once.
     ///
     /// # Errors
-    /// Faults that going on does not mend: the rig must end. [`FusionError::ThreadFailed`] for a thread that panicked too
+    /// Faults from which the rig cannot recover: it must end. [`FusionError::ThreadFailed`] for a thread that panicked too
     /// often.
     pub fn step(&mut self, timeout: Duration, turn_time: Option<Duration>) -> Result<Option<LiveStep>, FusionError> {
         check_threads(self.other_threads())?;
-        let set = match caught(|| self.intake.next_set(timeout)) {
-            Ok(Some(set)) => set,
-            Ok(None) => return Ok(None),
-            Err(panic) => return self.restart(panic).map(|()| None),
-        };
-        match caught(|| self.take_in(&set, turn_time)) {
-            Ok(Ok(outcome)) => {
-                let watched = self.watch.as_mut().and_then(|watch| watch.look(&set));
-                if let Some(event) = &watched {
-                    tracing::warn!("{event}");
-                }
-                Ok(Some(LiveStep { set, outcome, watched }))
+        let (set, perceived, start) = match self.ahead.take() {
+            Some((set, perceived)) => {
+                self.session.budget.next_set();
+                (set, perceived, Instant::now())
             }
+            None => {
+                let set = match caught(|| self.intake.next_set(timeout)) {
+                    Ok(Some(set)) => set,
+                    Ok(None) => return Ok(None),
+                    Err(panic) => return self.restart(panic).map(|()| None),
+                };
+                let start = Instant::now();
+                self.session.budget.next_set();
+                let perceived = caught(|| self.session.perceive(&set));
+                (set, perceived, start)
+            }
+        };
+        self.frames += 1;
+        let outcome = match perceived {
+            Ok(Ok(perceived)) => self.take_in_and_look_ahead(&set, perceived, turn_time),
+            Ok(Err(error)) => Ok(Err(error)),
+            Err(panic) => Err(panic),
+        };
+        self.session.budget.spend(start.elapsed());
+        let held = |reason: String| Outcome::Held(reason);
+        let (outcome, watched) = match outcome {
+            Ok(Ok(outcome)) => (outcome, self.watch.as_mut().and_then(|watch| watch.look(&set))),
             Ok(Err(fault)) if fault.is_device_fault() => {
                 self.recover(fault)?;
-                let outcome = Outcome::Held("the graphics device was opened again".to_owned());
-                Ok(Some(LiveStep { set, outcome, watched: None }))
+                (held("the graphics device was opened again".to_owned()), None)
             }
-            Ok(Err(error)) => Err(error),
+            Ok(Err(error)) => return Err(error),
             Err(panic) => {
-                let outcome = Outcome::Held(format!("the pipeline was restarted after a panic: {panic}"));
+                let reason = format!("the pipeline was restarted after a panic: {panic}");
                 self.restart(panic)?;
-                Ok(Some(LiveStep { set, outcome, watched: None }))
+                (held(reason), None)
             }
+        };
+        if let Some(event) = &watched {
+            tracing::warn!("{event}");
         }
+        Ok(Some(LiveStep { set, outcome, watched }))
     }
 
-    fn take_in(&mut self, set: &FrameSet, turn_time: Option<Duration>) -> Result<Outcome, FusionError> {
-        self.frames += 1;
-        let outcome = self.session.process(set)?;
+    /// Takes in a set; where the next one waits already, its people are observed meanwhile.
+    fn take_in_and_look_ahead(
+        &mut self,
+        set: &FrameSet,
+        perceived: Perceived,
+        turn_time: Option<Duration>,
+    ) -> Attempt<Outcome> {
+        let next = caught(|| self.intake.next_set(Duration::ZERO))?;
+        let Some(next) = next else { return caught(|| self.take_in(set, perceived, turn_time)) };
+        if self.session.may_rest(&next) {
+            let outcome = caught(|| self.take_in(set, perceived, turn_time));
+            self.ahead = Some((next, Ok(Ok(Perceived::Still))));
+            return outcome;
+        }
+        let mut perceiver = self.session.lend_perceiver();
+        let (outcome, observed) = std::thread::scope(|scope| {
+            let look = || caught(|| perceiver.perceive(&next));
+            let thread = std::thread::Builder::new().name(PERCEPTION.to_owned()).spawn_scoped(scope, look);
+            let outcome = caught(|| self.take_in(set, perceived, turn_time));
+            let observed = match thread {
+                Ok(thread) => thread.join().unwrap_or_else(|_| Err("the perception thread ended".to_owned())),
+                Err(source) => Ok(Err(FusionError::Thread { name: PERCEPTION, source })),
+            };
+            (outcome, observed)
+        });
+        self.session.return_perceiver(perceiver);
+        self.ahead = Some((next, observed));
+        outcome
+    }
+
+    fn take_in(
+        &mut self,
+        set: &FrameSet,
+        perceived: Perceived,
+        turn_time: Option<Duration>,
+    ) -> Result<Outcome, FusionError> {
+        let outcome = self.session.reconstruct(set, perceived)?;
         if let Outcome::Held(reason) = &outcome {
             self.held += 1;
             // The 1st, 2nd, 4th ...: a room that is empty all night must not fill the disk.
@@ -157,7 +219,6 @@ impl LiveRig {
                 tracing::warn!(set = set.index, held = self.held, %reason, "frame set not used");
             }
         }
-        let drawing = Instant::now();
         if let Some(publisher) = &mut self.publisher {
             let turn_time = turn_time.unwrap_or_else(|| self.started.elapsed());
             self.views.publish(&mut self.session, publisher, set, turn_time)?;
@@ -169,11 +230,16 @@ impl LiveRig {
             }
             publisher.publish_stats(&self.session, set, self.frames, &self.intake.drops());
         }
-        self.session.budget.spend(drawing.elapsed());
         if self.recovery.taken.is_none_or(|at| at.elapsed() >= SNAPSHOT_EVERY) && self.session.has_people() {
             self.snapshot()?;
         }
         Ok(outcome)
+    }
+
+    /// Whether the cameras have ended and every set was taken in.
+    #[must_use]
+    pub fn ended(&self) -> bool {
+        self.ahead.is_none() && self.intake.ended()
     }
 
     /// Reads back what was learnt about everybody.

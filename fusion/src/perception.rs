@@ -6,13 +6,10 @@ mod estimated;
 mod given;
 mod split_mask;
 
-use std::borrow::Cow;
-
 use flyrig_body::Template;
 use flyrig_tracker::{EdgeColor, ViewKeypoints};
 use flyrig_types::{FrameSet, Mask, PersonId, Pose};
 
-pub(crate) use self::background::key_color;
 pub use self::estimated::{EstimatedPerception, SHAPE_SECS, SHAPE_SETS};
 pub use self::given::{GivenPerception, GivenPerson};
 use crate::{Effort, FusionError, StageTimes};
@@ -26,27 +23,20 @@ pub trait Perception: Send {
     /// Observes every known person in one set: one element a person, in the order of [`Self::people`].
     ///
     /// # Errors
-    /// Only those that a later set cannot mend; a person who is not found is [`Observation::Lost`].
-    fn observe<'a>(&mut self, set: &'a FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation<'a>>, FusionError>;
+    /// Only errors from which later sets cannot recover; a person who is not found is [`Observation::Lost`].
+    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError>;
 
     /// Chooses how much work the next sets get.
     fn set_effort(&mut self, effort: Effort) {
         let _ = effort;
     }
-
-    /// Returns a person's pose at a time near the last set's, where it is known exactly. `None` lets the session interpolate
-    /// the observed poses.
-    fn pose_at(&self, person: PersonId, nanos: i64) -> Option<Pose> {
-        let _ = (person, nanos);
-        None
-    }
 }
 
 /// Observation of one person in a set.
 #[derive(Debug, Clone)]
-pub enum Observation<'a> {
+pub enum Observation {
     /// The person was found.
-    Seen(SeenPerson<'a>),
+    Seen(SeenPerson),
     /// The person was not found.
     Lost {
         /// Who.
@@ -58,7 +48,7 @@ pub enum Observation<'a> {
 
 /// A person found in a set.
 #[derive(Debug, Clone)]
-pub struct SeenPerson<'a> {
+pub struct SeenPerson {
     /// Who.
     pub person: PersonId,
     /// Pose at the set's time, for the person's template.
@@ -66,14 +56,14 @@ pub struct SeenPerson<'a> {
     /// Confidence in the pose, 0..=1; 1 for a given one.
     pub confidence: f64,
     /// One element a present frame, in their order.
-    pub views: Vec<ViewObservation<'a>>,
+    pub views: Vec<ViewObservation>,
 }
 
 /// A person in one image.
 #[derive(Debug, Clone, Default)]
-pub struct ViewObservation<'a> {
+pub struct ViewObservation {
     /// Coverage by the person; `None` when it is not known.
-    pub mask: Option<Cow<'a, Mask>>,
+    pub mask: Option<Mask>,
     /// Confidence in the mask, 0..=1; 1 for a given one.
     pub mask_confidence: f64,
     /// Colours of the mask's outline without the background's share; the image's own elsewhere.
@@ -82,12 +72,15 @@ pub struct ViewObservation<'a> {
     pub others: Option<Mask>,
     /// Landmarks with their own confidences; `None` for given poses.
     pub landmarks: Option<ViewKeypoints>,
+    /// Pose at the image's own capture time, where it is known exactly and differs from that of the set. `None` lets the
+    /// session interpolate the observed poses.
+    pub pose: Option<Pose>,
 }
 
-impl<'a> ViewObservation<'a> {
+impl ViewObservation {
     /// Returns an observation of a mask alone; its confidence is 0 without one.
     #[must_use]
-    pub fn of_mask(mask: Option<Cow<'a, Mask>>, confidence: f64) -> Self {
+    pub fn of_mask(mask: Option<Mask>, confidence: f64) -> Self {
         let mask_confidence = if mask.is_some() { confidence } else { 0.0 };
         Self { mask, mask_confidence, ..Self::default() }
     }

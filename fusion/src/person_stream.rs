@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, sync::Arc, time::Duration};
 use flyrig_body::{DeformationGraph, Skeleton, SurfaceGaussians};
 use flyrig_capture::{LatestQueue, PopError};
 use flyrig_stream::{
-    ColorEncoder, ColorSettings, EncodedTemplate, Joint, Motion, MotionEncoder, StreamError, TemplateSource,
+    ColorEncoder, ColorSettings, EncodedTemplate, Motion, MotionEncoder, StreamError, StreamJoint, TemplateSource,
 };
 use flyrig_transport::Publisher;
 use flyrig_types::{PersonId, Pose, SupervisedThread, ThreadHealth};
@@ -22,12 +22,12 @@ pub(crate) fn encode_template(
     graph: Option<&DeformationGraph>,
     skeleton: &Skeleton,
 ) -> Result<EncodedTemplate, StreamError> {
-    let joint = |joint: &flyrig_body::Joint| Joint {
+    let joint = |joint: &flyrig_body::Joint| StreamJoint {
         parent: joint.parent.map(|parent| parent as u16),
         translation: joint.rest_translation.as_vec3().to_array(),
         joint_from_canonical: [0, 1, 2].map(|row| joint.joint_from_canonical.row(row).as_vec4().to_array()),
     };
-    let joints: Vec<Joint> = skeleton.joints().iter().map(joint).collect();
+    let joints: Vec<StreamJoint> = skeleton.joints().iter().map(joint).collect();
     let center_scale: Vec<[f32; 4]> =
         surface.positions.iter().zip(&surface.scale_m).map(|(p, scale)| p.extend(*scale).to_array()).collect();
     let normals: Vec<[f32; 3]> = surface.normals.iter().map(glam::Vec3::to_array).collect();
@@ -102,7 +102,7 @@ pub struct PersonMessages {
 }
 
 impl PersonEncoder {
-    /// For the person of a frame. `epoch` tells its colours from those of earlier encoders.
+    /// For the person of a frame. `epoch` distinguishes its colours from those of earlier encoders.
     #[must_use]
     pub fn new(frame: &PersonFrame, settings: ColorSettings, epoch: u32) -> Self {
         Self {

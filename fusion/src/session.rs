@@ -1,15 +1,17 @@
 //! A session: frame sets in, people as Gaussians and views out.
 
-use std::{collections::BTreeMap, time::Instant};
+use std::{collections::BTreeMap, sync::Arc, time::Instant};
 
+use flyrig_body::Template;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::{GaussianBuffers, Splat};
-use flyrig_types::{Camera, FrameSet, PersonId, Pose, RenderedView, Rig};
+use flyrig_types::{Camera, Frame, FrameSet, PersonId, Pose, RenderedView, Rig};
 
 use crate::{
     Budget, Effort, FusionError, NetworksOn, Observation, Perception, PersonFrame, PersonMemory, Remedy, SeenPerson,
-    SessionSettings, StageTimes, Subject,
+    SessionSettings, StageTimes, Subject, ViewObservation,
     drawing::Drawing,
+    perceiver::{Perceived, Perceiver},
     stillness::Stillness,
     subject::{InputView, Observed},
 };
@@ -87,7 +89,7 @@ impl SessionBuilder {
             stillness: Stillness::default(),
             rig: self.rig,
             settings: self.settings,
-            perception: self.perception.unwrap_or_else(|| Box::new(Nobody)),
+            perceiver: self.perception.map(Perceiver::new).unwrap_or_default(),
             subjects: Vec::new(),
             saved: self.saved,
             keep_observations: false,
@@ -95,7 +97,8 @@ impl SessionBuilder {
             stages: StageTimes::default(),
             counts: Counts::default(),
         };
-        session.add_people()?;
+        let people = session.perceiver.newcomers(&[]);
+        session.add_people(people)?;
         Ok(session)
     }
 }
@@ -107,25 +110,12 @@ fn place_kernels(gpu: &GpuContext, settings: &SessionSettings) -> GpuContext {
     if networks_on_adapter { gpu.clone() } else { gpu.fastest() }
 }
 
-/// Finds nobody.
-struct Nobody;
-
-impl Perception for Nobody {
-    fn people(&self) -> Vec<(PersonId, &flyrig_body::Template)> {
-        Vec::new()
-    }
-
-    fn observe<'a>(&mut self, _: &'a FrameSet, _: &mut StageTimes) -> Result<Vec<Observation<'a>>, FusionError> {
-        Ok(Vec::new())
-    }
-}
-
 /// The live reconstruction of any number of people from one rig.
 pub struct Session {
     gpu: GpuContext,
     rig: Rig,
     settings: SessionSettings,
-    perception: Box<dyn Perception>,
+    perceiver: Perceiver,
     subjects: Vec<Subject>,
     drawing: Drawing,
     /// Of people who are not subjects yet.
@@ -174,7 +164,7 @@ impl Session {
 
     /// Finds people in another way from now on.
     pub fn set_perception(&mut self, perception: impl Perception + 'static) {
-        self.perception = Box::new(perception);
+        self.perceiver = Perceiver::new(Box::new(perception));
     }
 
     /// Keeps the observations of each view from the next set on, for [`Self::observed`].
@@ -200,28 +190,68 @@ impl Session {
     /// Takes in one frame set. A person who is not found keeps the last state.
     ///
     /// # Errors
-    /// Only those that a later set cannot mend. After one that [is a device fault](FusionError::is_device_fault), call
+    /// Only errors from which later sets cannot recover. After one that [is a device fault](FusionError::is_device_fault), call
     /// [`Self::rebuild`].
     pub fn process(&mut self, set: &FrameSet) -> Result<Outcome, FusionError> {
         let start = Instant::now();
         self.budget.next_set();
-        if self.budget.fps().is_some() && self.stillness.may_rest(set, self.has_people()) {
-            self.budget.leave_out();
-            self.stages.count("sets left out, nothing moved", 1);
-            return Ok(Outcome::Still);
-        }
-        let outcome = self.take_in(set, self.budget.effort());
-        let cost = start.elapsed();
-        self.stillness.taken_in(set.master_nanos, cost);
-        self.budget.spend(cost);
+        let outcome = self.perceive(set).and_then(|perceived| self.reconstruct(set, perceived));
+        self.budget.spend(start.elapsed());
         outcome
     }
 
-    fn take_in(&mut self, set: &FrameSet, effort: Effort) -> Result<Outcome, FusionError> {
+    /// Observes the people in a set, for [`Self::reconstruct`].
+    pub(crate) fn perceive(&mut self, set: &FrameSet) -> Result<Perceived, FusionError> {
+        if self.may_rest(set) {
+            return Ok(Perceived::Still);
+        }
+        self.ready_perceiver();
+        self.perceiver.perceive(set)
+    }
+
+    /// Returns whether a set may be left out because nothing moves, which only a budget allows.
+    pub(crate) fn may_rest(&mut self, set: &FrameSet) -> bool {
+        self.budget.fps().is_some() && self.stillness.may_rest(set, self.has_people())
+    }
+
+    /// Lends perception out, ready for the next set; until it is returned this session finds nobody.
+    pub(crate) fn lend_perceiver(&mut self) -> Perceiver {
+        self.ready_perceiver();
+        std::mem::take(&mut self.perceiver)
+    }
+
+    fn ready_perceiver(&mut self) {
+        self.perceiver.ready(self.budget.effort(), self.subjects.iter().map(Subject::id).collect());
+    }
+
+    /// Takes perception back.
+    pub(crate) fn return_perceiver(&mut self, perceiver: Perceiver) {
+        self.perceiver = perceiver;
+    }
+
+    /// Updates the people from what [`Self::perceive`] found in the same set. Does not use perception.
+    pub(crate) fn reconstruct(&mut self, set: &FrameSet, perceived: Perceived) -> Result<Outcome, FusionError> {
+        let start = Instant::now();
+        let Perceived::People { observations, newcomers, effort, stages, took } = perceived else {
+            self.budget.leave_out();
+            self.stages.count("sets left out, nothing moved", 1);
+            return Ok(Outcome::Still);
+        };
+        self.stages.merge(&stages);
+        let outcome = self.update_people(set, observations, newcomers, effort);
+        self.stillness.taken_in(set.master_nanos, took + start.elapsed());
+        outcome
+    }
+
+    fn update_people(
+        &mut self,
+        set: &FrameSet,
+        observations: Vec<Observation>,
+        newcomers: Vec<(PersonId, Template)>,
+        effort: Effort,
+    ) -> Result<Outcome, FusionError> {
         self.gpu.check()?;
-        self.perception.set_effort(effort);
-        let observations = self.perception.observe(set, &mut self.stages)?;
-        self.add_people()?;
+        self.add_people(newcomers)?;
         let mut outcome = Outcome::Held("nobody is known".to_owned());
         for observation in observations {
             match observation {
@@ -243,13 +273,13 @@ impl Session {
         Ok(outcome)
     }
 
-    /// Makes a subject of everybody whom perception knows and who is none yet.
-    fn add_people(&mut self) -> Result<(), FusionError> {
-        for (id, template) in self.perception.people() {
+    /// Makes subjects of people who are none yet.
+    fn add_people(&mut self, people: Vec<(PersonId, Template)>) -> Result<(), FusionError> {
+        for (id, template) in people {
             if self.subjects.iter().any(|subject| subject.id() == id) {
                 continue;
             }
-            let mut subject = Subject::new(&self.gpu, id, template.clone(), &self.rig, &self.settings)?;
+            let mut subject = Subject::new(&self.gpu, id, template, &self.rig, &self.settings)?;
             if self.keep_observations {
                 subject.keep_observations(&self.gpu)?;
             }
@@ -263,23 +293,22 @@ impl Session {
     }
 
     /// Takes in one person of a set.
-    fn update(&mut self, set: &FrameSet, seen: &SeenPerson<'_>, effort: Effort) -> Result<(), FusionError> {
+    fn update(&mut self, set: &FrameSet, seen: &SeenPerson, effort: Effort) -> Result<(), FusionError> {
         let Some(subject) = self.subjects.iter_mut().find(|subject| subject.id() == seen.person) else {
             return Err(FusionError::NoSuchPerson(seen.person));
         };
         let pose = &seen.pose;
         subject.curve.push(set.master_nanos, pose);
-        let pose_at = |nanos: i64| {
-            if !self.settings.tracking.per_view_time || nanos == set.master_nanos {
+        let pose_of = |(view, (_, frame)): (&ViewObservation, (usize, &Arc<Frame>))| {
+            if !self.settings.tracking.per_view_time || frame.capture_nanos == set.master_nanos {
                 return None;
             }
-            let exact = self.perception.pose_at(seen.person, nanos);
-            exact.or_else(|| subject.curve.at(nanos)).filter(Pose::is_valid)
+            view.pose.clone().or_else(|| subject.curve.at(frame.capture_nanos)).filter(Pose::is_valid)
         };
-        let poses: Vec<Option<Pose>> = set.present().map(|(_, frame)| pose_at(frame.capture_nanos)).collect();
+        let poses: Vec<Option<Pose>> = seen.views.iter().zip(set.present()).map(pose_of).collect();
         let (mut slots, mut views) = (Vec::new(), Vec::new());
         for (((slot, frame), view), pose) in set.present().zip(&seen.views).zip(&poses) {
-            let mask = view.mask.as_deref().filter(|mask| mask.area_px() > 0);
+            let mask = view.mask.as_ref().filter(|mask| mask.area_px() > 0);
             if let Some((mask, camera)) = mask.zip(self.rig.cameras.get(slot)) {
                 slots.push(slot);
                 let others = view.others.as_ref();

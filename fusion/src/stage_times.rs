@@ -42,6 +42,10 @@ impl StageTimes {
 
     /// Adds one measurement.
     pub fn add(&mut self, name: &'static str, time: Duration) {
+        self.push(name, time.as_secs_f32() * 1e3);
+    }
+
+    fn push(&mut self, name: &'static str, millis: f32) {
         let stage = match self.stages.iter_mut().find(|stage| stage.name == name) {
             Some(stage) => stage,
             None => {
@@ -50,7 +54,6 @@ impl StageTimes {
                 &mut self.stages[last]
             }
         };
-        let millis = time.as_secs_f32() * 1e3;
         if stage.millis.len() < Self::WINDOW {
             stage.millis.push(millis);
         } else {
@@ -65,6 +68,16 @@ impl StageTimes {
         let result = work();
         self.add(name, start.elapsed());
         result
+    }
+
+    /// Adds the samples and counts of `other`.
+    pub(crate) fn merge(&mut self, other: &Self) {
+        for stage in &other.stages {
+            stage.millis.iter().for_each(|millis| self.push(stage.name, *millis));
+        }
+        for &(name, by) in &other.counts {
+            self.count(name, by);
+        }
     }
 
     /// Counts work that was left out.
@@ -159,6 +172,11 @@ mod tests {
         times.count("views left out", 3);
         assert_eq!(times.counts().collect::<Vec<_>>(), [("views left out", 5)]);
         assert_eq!(times.table().lines().count(), 4);
+        let mut sum = StageTimes::default();
+        sum.add("b", Duration::from_millis(5));
+        sum.merge(&times);
+        assert!((sum.total_ms("b") - 8.0).abs() < 1e-3 && (sum.total_ms("a") - 36_000.0).abs() < 0.5);
+        assert_eq!(sum.counts().collect::<Vec<_>>(), [("views left out", 5)]);
     }
 
     #[test]

@@ -320,7 +320,7 @@ impl Subject {
         let solves = turn.is_multiple_of(effort.solve_every);
         // Half a cycle later, so that neighbouring sets cost about the same.
         let paints = turn == 0 || (turn + effort.paint_every / 2).is_multiple_of(effort.paint_every);
-        stages.time("convert pictures", || self.take_images(gpu, views))?;
+        stages.time("convert images", || self.take_images(gpu, views))?;
         // One update at a time is under way, and none while the processor's time is measured.
         gpu.wait()?;
         self.collect_times(stages);
@@ -378,7 +378,7 @@ impl Subject {
             stages.count("views not compared", left_out as u64);
             let distrusted = deformation.judged().iter().flatten().filter(|(_, trusted)| !trusted).count();
             stages.count("views not believed", distrusted as u64);
-            stages.count("pictures halved", deformation.halved_pictures() as u64);
+            stages.count("images halved", deformation.halved_pictures() as u64);
         }
 
         let start = Instant::now();
@@ -515,7 +515,7 @@ impl Subject {
         stages.add("networks", start.elapsed());
         let counts = learned.counts;
         stages.count("views not encoded", counts.views_kept - before.views_kept);
-        stages.count("Gaussians not corrected anew", counts.colors_kept - before.colors_kept);
+        stages.count("Gaussian corrections used again", counts.colors_kept - before.colors_kept);
         stages.count("corrections that were no numbers", counts.poisoned - before.poisoned);
         Ok(())
     }
@@ -565,7 +565,7 @@ impl Subject {
         Ok(())
     }
 
-    /// Takes over what belongs to no device: poses and tracking quality. For the same person on another device.
+    /// Takes over what belongs to no device: poses, tracking quality, and the memory of networks on the processor. For the same person on another device.
     pub(crate) fn take_over(&mut self, old: &Self) {
         let resumed = self.watch.is_resumed();
         self.curve.clone_from(&old.curve);
@@ -574,6 +574,12 @@ impl Subject {
         (self.confidence, self.shape_held) = (old.confidence, old.shape_held);
         if resumed {
             self.watch.clone_from(&old.watch);
+            // Those on the adapter went with the device.
+            if let (Some(Networks::Processor(networks)), Some(Networks::Processor(old))) =
+                (&mut self.networks, &old.networks)
+            {
+                networks.resume(old);
+            }
         }
     }
 

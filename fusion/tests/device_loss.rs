@@ -67,7 +67,7 @@ fn a_live_rig_goes_on_by_itself_after_the_loss_of_its_device() {
     let session = session(device(), &[(0, 0.0)]);
     let mut rig = LiveRig::new(session, intake, LiveViews::new(&OutputSettings::default()), None);
     let mut outcomes = Vec::new();
-    while !rig.intake.ended() {
+    while !rig.ended() {
         if let Some(step) = rig.step(Duration::from_secs(5), None).unwrap() {
             outcomes.push(step.outcome);
             if outcomes.len() == 4 {
@@ -78,6 +78,29 @@ fn a_live_rig_goes_on_by_itself_after_the_loss_of_its_device() {
     let held: Vec<usize> = (0..outcomes.len()).filter(|&i| outcomes[i] != Outcome::Updated).collect();
     assert_eq!((outcomes.len(), held), (8, vec![4]), "one set is lost: {outcomes:?}");
     assert_eq!((rig.rebuilt(), rig.health().device_faults), (1, 1));
+    assert!(colors(&rig.session).iter().filter(|c| c[0] > 4.0 * c[2]).count() > 1000);
+}
+
+#[test]
+fn a_live_rig_goes_on_by_itself_after_a_rejected_command() {
+    let images = images(&[(0.0, RED)]);
+    let sets: Vec<FrameSet> = (0..6).map(|index| frame_set(index, &images)).collect();
+    let intake = Intake::start(played(&sets), InputFormat::Rgb, &SyncSettings::default(), Pacing::Lossless).unwrap();
+    let mut rig =
+        LiveRig::new(session(device(), &[(0, 0.0)]), intake, LiveViews::new(&OutputSettings::default()), None);
+    let mut held = 0;
+    while !rig.ended() {
+        if let Some(step) = rig.step(Duration::from_secs(5), None).unwrap() {
+            held += usize::from(step.outcome != Outcome::Updated);
+            if step.set.index == 2 {
+                // Buffers of this usage cannot be mapped.
+                let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::STORAGE;
+                let wrong = wgpu::BufferDescriptor { label: None, size: 16, usage, mapped_at_creation: false };
+                let _ = rig.session.gpu().device.create_buffer(&wrong);
+            }
+        }
+    }
+    assert_eq!((held, rig.frames(), rig.rebuilt()), (1, 6, 1), "one set is lost");
     assert!(colors(&rig.session).iter().filter(|c| c[0] > 4.0 * c[2]).count() > 1000);
 }
 

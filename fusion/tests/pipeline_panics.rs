@@ -12,7 +12,7 @@ use flyrig_fusion::{
     Perception, SessionBuilder, StageTimes,
 };
 use flyrig_sync::SyncSettings;
-use flyrig_types::{FrameSet, PersonId, Pose, SupervisedThread};
+use flyrig_types::{FrameSet, PersonId, SupervisedThread};
 
 use support::{frame_set, gpu, images, people, played, rig, settings};
 
@@ -29,13 +29,9 @@ impl Perception for Unlucky {
         self.inner.people()
     }
 
-    fn observe<'a>(&mut self, set: &'a FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation<'a>>, FusionError> {
+    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
         assert!(!(self.panics_at)(set.index), "set {}", set.index);
         self.inner.observe(set, stages)
-    }
-
-    fn pose_at(&self, person: PersonId, nanos: i64) -> Option<Pose> {
-        self.inner.pose_at(person, nanos)
     }
 }
 
@@ -55,7 +51,7 @@ fn live_rig(panics_at: fn(u64) -> bool) -> LiveRig {
 fn a_live_rig_goes_on_after_a_panic_with_what_it_has_learnt() {
     let mut rig = live_rig(|index| index == 4);
     let mut outcomes = Vec::new();
-    while !rig.intake.ended() {
+    while !rig.ended() {
         outcomes.extend(rig.step(Duration::from_secs(5), None).unwrap().map(|step| step.outcome));
     }
     let held: Vec<usize> = (0..outcomes.len()).filter(|&i| outcomes[i] != Outcome::Updated).collect();
@@ -73,7 +69,7 @@ fn a_live_rig_that_panics_again_and_again_ends() {
     let mut rig = live_rig(|index| index >= 2);
     let error = loop {
         match rig.step(Duration::from_secs(5), None) {
-            Ok(_) => assert!(!rig.intake.ended(), "it went on for ever"),
+            Ok(_) => assert!(!rig.ended(), "it went on for ever"),
             Err(error) => break error.to_string(),
         }
     };

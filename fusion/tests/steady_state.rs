@@ -148,11 +148,11 @@ fn a_person_who_walks_closer_compiles_nothing() {
     let mut halved = Vec::new();
     for frame in 0..26 {
         step(&mut session, &scene.set(frame));
-        halved.push(session.stages.counts().find(|(name, _)| *name == "pictures halved").map_or(0, |(_, count)| count));
+        halved.push(session.stages.counts().find(|(name, _)| *name == "images halved").map_or(0, |(_, count)| count));
         assert_eq!(gpu.objects().pipelines, built.pipelines, "frame {frame}");
     }
     let by_frame: Vec<u64> = halved.iter().zip(std::iter::once(&0).chain(&halved)).map(|(a, b)| a - b).collect();
-    println!("pictures halved by frame: {by_frame:?}");
+    println!("images halved by frame: {by_frame:?}");
     let changes = by_frame.windows(2).filter(|pair| pair[0] != pair[1]).count();
     assert!(changes >= 4, "closer, away, closer and away: {by_frame:?}");
 }

@@ -3,43 +3,20 @@
 
 use std::{
     collections::HashMap,
-    sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicU64, Ordering},
-    },
+    sync::{Arc, Mutex, atomic::Ordering},
 };
 
 use wgpu::{Buffer, BufferDescriptor, BufferUsages, ComputePipeline, Device};
 
-use crate::{GpuError, bind_groups::BindGroups, uploads::Uploads};
+use crate::{
+    GpuError, GpuObjects,
+    bind_groups::BindGroups,
+    objects::{Counters, lock},
+    uploads::Uploads,
+};
 
 /// Read-back buffers kept for later reads; a frame uses a few sizes.
 const IDLE_READ_BACKS: usize = 24;
-
-/// Numbers of GPU objects that were created since the device was opened.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct GpuObjects {
-    /// Compiled compute pipelines.
-    pub pipelines: u64,
-    /// Storage buffers.
-    pub storage_buffers: u64,
-    /// Staging buffers of read-backs.
-    pub read_backs: u64,
-    /// Staging buffers of constants.
-    pub uploads: u64,
-    /// Bind groups of compute kernels.
-    pub bind_groups: u64,
-}
-
-/// [`GpuObjects`] while they are counted.
-#[derive(Debug, Default)]
-pub(crate) struct Counters {
-    pub pipelines: AtomicU64,
-    pub storage_buffers: AtomicU64,
-    pub read_backs: AtomicU64,
-    pub uploads: AtomicU64,
-    pub bind_groups: AtomicU64,
-}
 
 /// The device's first fault, written by wgpu's callbacks. It holds no wgpu object, which would keep the device alive.
 #[derive(Debug, Clone, Default)]
@@ -144,19 +121,6 @@ impl Shared {
     }
 
     pub fn objects(&self) -> GpuObjects {
-        let get = |count: &AtomicU64| count.load(Ordering::Relaxed);
-        let Counters { pipelines, storage_buffers, read_backs, uploads, bind_groups } = &self.counters;
-        GpuObjects {
-            pipelines: get(pipelines),
-            storage_buffers: get(storage_buffers),
-            read_backs: get(read_backs),
-            uploads: get(uploads),
-            bind_groups: get(bind_groups),
-        }
+        self.counters.read()
     }
-}
-
-/// Locks a mutex, even a poisoned one: the values behind these locks are consistent at every step.
-pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -8,7 +8,7 @@ use crate::raster::RasterizerOn;
 use crate::raster_device::{DeviceRasterizer, FRAME};
 use crate::raster_kernels::{FRAME_WGSL, RasterShape};
 use crate::scan::run;
-use crate::{GaussianBuffers, Rasterizer, RenderTarget};
+use crate::{Carry, GaussianBuffers, GaussianGradients, PictureGradients, Rasterizer, RenderTarget};
 
 const BACKWARD_FRAME_WGSL: &str = include_str!("raster_backward_frame.wgsl");
 const PLACES_WGSL: &str = include_str!("raster_backward_places.wgsl");
@@ -23,71 +23,6 @@ const MAX_LIST: u32 = 24_576;
 const MAX_TILES: u32 = 60_000;
 /// Bytes of workgroup memory for partial sums; WebGPU promises 16 KiB.
 const PARTIAL_BYTES: u32 = 12 << 10;
-
-/// Derivatives of a loss L with respect to the pictures of one view, row by row, one element a pixel. A pixel with a
-/// number that is not finite counts as zero; so does one where nothing was drawn.
-#[derive(Debug)]
-pub struct PictureGradients {
-    /// dL/d of the premultiplied linear red, green, blue, and of alpha ([`RenderTarget::color`]).
-    pub color: StorageBuffer<[f32; 4]>,
-    /// x: dL/d [`RenderTarget::depth`], per metre (ignored when the forward pass drew no depth); yzw: three numbers
-    /// that the pixel hands to its Gaussians, see [`Carry`].
-    pub depth_carry: StorageBuffer<[f32; 4]>,
-}
-
-impl PictureGradients {
-    /// For pictures of `width` x `height` pixels, all zero.
-    ///
-    /// # Errors
-    /// [`GpuError::TooLarge`].
-    pub fn zeroed(gpu: &GpuContext, width: u32, height: u32) -> Result<Self, GpuError> {
-        let pixels = width as usize * height as usize;
-        Ok(Self {
-            color: StorageBuffer::zeroed(gpu, "dL/d colour", pixels)?,
-            depth_carry: StorageBuffer::zeroed(gpu, "dL/d depth", pixels)?,
-        })
-    }
-}
-
-/// What happens to the numbers that a pixel hands to its Gaussians by their blending weights.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Carry {
-    /// They are added up. With dL/d (red, green, blue) as the numbers, the sums are dL/d the Gaussian's colour.
-    Sum,
-    /// They are the entries (xx, xy, yy) of a 2x2 matrix C in the picture, per square pixel; their sum is lifted to
-    /// the world, `J^T C J` with J = d pixel / d centre. With C from the picture's own slopes this is the
-    /// Gauss-Newton matrix of the pixels as if all that is seen in one moved together (Lucas and Kanade 1981).
-    Lift,
-}
-
-/// Derivatives with respect to the Gaussians, summed over the views since [`Self::clear`].
-#[derive(Debug)]
-pub struct GaussianGradients {
-    /// xyz: dL/d world centre, per metre; w: blending weight in the pixels that had a gradient (0: it cannot matter).
-    pub center: StorageBuffer<[f32; 4]>,
-    /// Two elements a Gaussian. [`Carry::Sum`]: the three numbers, the rest 0. [`Carry::Lift`]: entries xx, xy, xz,
-    /// yy | yz, zz, 0, 0 of the symmetric matrix, per square metre.
-    pub carried: StorageBuffer<[f32; 4]>,
-}
-
-impl GaussianGradients {
-    /// For `count` Gaussians, all zero.
-    ///
-    /// # Errors
-    /// [`GpuError::TooLarge`].
-    pub fn zeroed(gpu: &GpuContext, count: usize) -> Result<Self, GpuError> {
-        Ok(Self {
-            center: StorageBuffer::zeroed(gpu, "dL/d centres", count)?,
-            carried: StorageBuffer::zeroed(gpu, "carried sums", 2 * count)?,
-        })
-    }
-
-    /// Records setting everything to zero.
-    pub fn clear(&self, encoder: &mut CommandEncoder) {
-        self.center.encode_clear(encoder);
-        self.carried.encode_clear(encoder);
-    }
-}
 
 /// Why there is no derivative.
 #[derive(Debug, thiserror::Error)]
@@ -139,7 +74,7 @@ struct DeviceBackward {
     places: StorageBuffer<[u32; 4]>,
     tile_limits: StorageBuffer<u32>,
     pair_sums: StorageBuffer<[[f32; 4]; 3]>,
-    /// Elements of `pair_sums`, in x; made anew with it.
+    /// Elements of `pair_sums`, in x; made again with it.
     room: StorageBuffer<[u32; 4]>,
 }
 

@@ -9,9 +9,9 @@ use flyrig_types::Camera;
 use wgpu::{BindingResource, CommandEncoder, ComputePass, ComputePassDescriptor};
 
 use crate::constants::Constants;
-use crate::raster::{Latest, tile_range};
 use crate::raster_buffers::{Layout, PictureBuffers};
 use crate::raster_kernels::{Frame, RasterKernels, RasterShape};
+use crate::raster_settings::{Latest, tile_range};
 use crate::scan::{CHUNK_GROUP, MAX_LOOP, Scan, run, run_at};
 use crate::sort::{RadixSort, SortPass};
 use crate::{GaussianBuffers, Outputs, RasterSettings, RasterStats, RenderTarget};

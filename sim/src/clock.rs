@@ -3,6 +3,10 @@
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+/// An instant that took long to draw is followed by a rest, so that drawing takes this part of the time at most: real
+/// cameras leave the machine to the reconstruction.
+const DRAWING_PART: u32 = 3;
+
 /// How simulated time goes on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SimTime {
@@ -27,6 +31,10 @@ struct State {
     origin: Option<Instant>,
     /// The instant that is being taken; none before the first.
     index: Option<u64>,
+    /// When it was begun.
+    began: Option<Instant>,
+    /// End of the rest after it, once all have delivered it.
+    rest_until: Option<Instant>,
     cameras: Vec<Progress>,
     skipped: u64,
 }
@@ -48,6 +56,8 @@ impl RealClock {
             state: Mutex::new(State {
                 origin: None,
                 index: None,
+                began: None,
+                rest_until: None,
                 cameras: vec![Progress::default(); cameras],
                 skipped: 0,
             }),
@@ -80,11 +90,12 @@ impl RealClock {
                 let origin = *state.origin.get_or_insert(now);
                 let next = state.index.map_or(0, |index| index + 1);
                 let current = (now.duration_since(origin).as_secs_f64() / self.interval.as_secs_f64()) as u64;
-                if current >= next {
-                    state.begin(current, current - next);
+                let rested = state.rest_until(now);
+                if current >= next && now >= rested {
+                    state.begin(current, current - next, now);
                     continue;
                 }
-                until = until.min(origin + self.interval.mul_f64(next as f64));
+                until = until.min(rested.max(origin + self.interval.mul_f64(next as f64)));
             }
             if now >= deadline {
                 return None;
@@ -102,8 +113,15 @@ impl RealClock {
 }
 
 impl State {
-    fn begin(&mut self, index: u64, skipped: u64) {
+    /// End of the rest after the instant that all have delivered.
+    fn rest_until(&mut self, now: Instant) -> Instant {
+        let Some(began) = self.began else { return now };
+        *self.rest_until.get_or_insert_with(|| began + now.duration_since(began) * DRAWING_PART)
+    }
+
+    fn begin(&mut self, index: u64, skipped: u64, now: Instant) {
         self.index = Some(index);
+        (self.began, self.rest_until) = (Some(now), None);
         let before = self.skipped;
         self.skipped += skipped;
         // The 1st, 2nd, 4th ...: a rig that runs all night must not fill the disk.
@@ -160,6 +178,18 @@ mod tests {
         clock.leave(0);
         clock.leave(1);
         assert!(clock.next(1, LONG).unwrap() > second);
+    }
+
+    #[test]
+    fn drawing_leaves_two_thirds_of_the_time_to_others() {
+        let clock = late(1);
+        let start = Instant::now();
+        clock.next(0, LONG).unwrap();
+        std::thread::sleep(Duration::from_millis(10));
+        let drawn = start.elapsed();
+        assert!(drawn >= Duration::from_millis(10));
+        clock.next(0, LONG).unwrap();
+        assert!(start.elapsed() >= Duration::from_millis(30), "{:?}", start.elapsed());
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! What the shaders are told, in their layouts.
+//! Constants of the shaders, in their layouts.
 
 use bytemuck::{Pod, Zeroable};
 use flyrig_types::{Camera, Lens};

@@ -47,7 +47,7 @@ pub struct Exported {
 /// returning false. Everything is written beside the folder first: it appears whole or not at all.
 ///
 /// # Errors
-/// [`SimError::Export`] names the file and the mend, [`SimError::Stopped`] after `go_on` said so; others when a picture
+/// [`SimError::Export`] names the file and the fix, [`SimError::Stopped`] after `go_on` said so; others when a picture
 /// cannot be drawn.
 pub fn export(
     simulator: &mut Simulator,

@@ -2,7 +2,7 @@
 //!
 //! A seed makes a person: body, face, hair, hat, layered clothes, cloth and shoes. The person moves by a clip
 //! or turns around on the spot, stands in a lit room, and is seen by a ring of cameras with radial distortion or
-//! fisheye lenses, whose sensors and clocks err as told. Pictures are made by an ordinary textured-triangle
+//! fisheye lenses, whose sensors and clocks have the configured errors. Pictures are made by an ordinary textured-triangle
 //! rasteriser with a z-buffer; this crate knows nothing of splats, so that no method is judged on its own drawings.
 //!
 //! # Conventions
@@ -91,4 +91,4 @@ pub use sensor::SensorConfig;
 pub use shot::Shot;
 pub use simulator::Simulator;
 pub use source::{SimSource, sources};
-pub use training::{TrainingConfig, TrainingSample, TrainingSamples, random_config};
+pub use training::{SimSample, TrainingConfig, TrainingSamples, random_config};

@@ -38,7 +38,7 @@ impl Default for TrainingConfig {
 
 /// A few consecutive instants of somebody, seen by all cameras of a rig.
 #[derive(Debug)]
-pub struct TrainingSample {
+pub struct SimSample {
     /// What makes it again.
     pub config: SimConfig,
     /// The cameras as their calibration reports them: what a method is given.
@@ -74,7 +74,7 @@ impl TrainingSamples {
         Ok(Self { gpu: gpu.clone(), config, given: 0, simulator: None })
     }
 
-    fn sample(&mut self) -> Result<TrainingSample, SimError> {
+    fn sample(&mut self) -> Result<SimSample, SimError> {
         let a_person = self.config.samples_a_person as u64;
         let (person, place) = (self.given / a_person, self.given % a_person);
         let mut simulator = match self.simulator.take() {
@@ -93,7 +93,7 @@ impl TrainingSamples {
             }
             instants.push(frames);
         }
-        let sample = TrainingSample {
+        let sample = SimSample {
             config: simulator.config().clone(),
             reported_rig: simulator.reported_rig(),
             rig: simulator.rig().clone(),
@@ -107,7 +107,7 @@ impl TrainingSamples {
 }
 
 impl Iterator for TrainingSamples {
-    type Item = Result<TrainingSample, SimError>;
+    type Item = Result<SimSample, SimError>;
 
     /// The next sample. After an error the next call goes on with another person.
     fn next(&mut self) -> Option<Self::Item> {

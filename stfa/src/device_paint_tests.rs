@@ -134,7 +134,7 @@ fn what_did_not_change_is_kept() {
     assert_eq!((kept.counts.views_kept, kept.counts.colors_kept), (0, 0));
     assert_eq!(kept.paint(&seen, &views(&pictures), &settings).unwrap(), first);
     assert_eq!((kept.counts.views_kept, kept.counts.colors_kept), (3, body.gaussians() as u64));
-    // Another picture: its features are made anew, and the colours of all who see it.
+    // Another picture: its features are made again, and the colours of all who see it.
     let middle = pictures[1].len() / 2;
     pictures[1][middle - 2000..middle + 2000].iter_mut().for_each(|value| *value = 255 - *value / 2);
     let changed = kept.paint(&seen, &views(&pictures), &settings).unwrap();

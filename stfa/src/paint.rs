@@ -92,6 +92,11 @@ impl LearnedAppearance {
         }
     }
 
+    /// Continues from the features that `old` has accumulated, for the same body and weights.
+    pub fn resume(&mut self, old: &Self) {
+        self.memory.clone_from(&old.memory);
+    }
+
     /// Forgets all earlier frames.
     pub fn reset(&mut self) {
         self.memory.clear();

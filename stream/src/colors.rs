@@ -11,7 +11,7 @@ use alloc::{vec, vec::Vec};
 use core::ops::Range;
 
 use crate::{
-    EncodedTemplate, MAX_MESSAGE_BYTES, Stamp, StreamError, Template,
+    EncodedTemplate, MAX_MESSAGE_BYTES, Stamp, StreamError, StreamTemplate,
     bytes::Fields,
     coefficients::{CoefficientModel, GROUP, Levels},
     integers::MOST,
@@ -294,7 +294,7 @@ struct DecodedLayer {
 impl ColorDecoder {
     /// For a template, all grey.
     #[must_use]
-    pub fn new(template: &Template) -> Self {
+    pub fn new(template: &StreamTemplate) -> Self {
         let tree = HaarTree::new(template.gaussians());
         let layer = DecodedLayer { is_known: vec![false; tree.segments()], sequence: None, missed: 0 };
         Self {

@@ -2,11 +2,11 @@
 //!
 //! | message | content | when |
 //! |---|---|---|
-//! | [`Template`] | Gaussians at rest, skin and node weights, skeleton | once a viewer, by its hash |
+//! | [`StreamTemplate`] | Gaussians at rest, skin and node weights, skeleton | once a viewer, by its hash |
 //! | [`Motion`] | pose, translations of the deformation graph's nodes | every frame, readable by itself |
 //! | colours, in [`LAYERS`] layers | changes since the message before, from coarse to fine | every frame |
 //!
-//! The viewer poses the Gaussians itself ([`Template::pose`]): FlyHuman Eq. 2 is linear in the node translations, and a pose is
+//! The viewer poses the Gaussians itself ([`StreamTemplate::pose`]): FlyHuman Eq. 2 is linear in the node translations, and a pose is
 //! a few hundred bytes. Colours are coded as Haar coefficients over a tree of the template's surface ([`ColorEncoder`]).
 //!
 //! Each message but the template has at most [`MAX_MESSAGE_BYTES`]. No decoder panics on any input, allocates more than
@@ -47,7 +47,7 @@ pub use error::StreamError;
 pub use motion::{Motion, MotionEncoder};
 pub use pose::Posed;
 pub use stamp::{Stamp, restamp, stamp_of};
-pub use template::{EncodedTemplate, Joint, MAX_TEMPLATE_BYTES, Template, TemplateSource, template_hash};
+pub use template::{EncodedTemplate, MAX_TEMPLATE_BYTES, StreamJoint, StreamTemplate, TemplateSource, template_hash};
 
 /// Version of every message of this codec.
 pub const CODEC_VERSION: u8 = 1;

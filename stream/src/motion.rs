@@ -3,7 +3,7 @@
 use alloc::{vec, vec::Vec};
 
 use crate::{
-    EncodedTemplate, MAX_MESSAGE_BYTES, Stamp, StreamError, Template,
+    EncodedTemplate, MAX_MESSAGE_BYTES, Stamp, StreamError, StreamTemplate,
     bytes::Fields,
     coefficients::{CoefficientModel, GROUP, Levels},
     integers::MOST,
@@ -113,7 +113,7 @@ impl Motion {
     ///
     /// # Errors
     /// [`StreamError`].
-    pub fn decode(bytes: &[u8], template: &Template) -> Result<Self, StreamError> {
+    pub fn decode(bytes: &[u8], template: &StreamTemplate) -> Result<Self, StreamError> {
         let mut fields = Fields::of(WHAT, MAGIC, bytes)?;
         fields.check(bytes.len() <= MAX_MESSAGE_BYTES, "it is too large")?;
         let stamp = Stamp::read(&mut fields)?;

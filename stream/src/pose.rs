@@ -2,7 +2,7 @@
 
 use alloc::vec::Vec;
 
-use crate::{Motion, Template};
+use crate::{Motion, StreamTemplate};
 
 /// Gaussians in the world; both lists have one element a Gaussian.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -16,7 +16,7 @@ pub struct Posed {
 /// Three rows of an affine motion.
 type Rows = [[f32; 4]; 3];
 
-impl Template {
+impl StreamTemplate {
     /// Poses the Gaussians: world = LBS(x + sum of w t) (FlyHuman Eq. 1 and 2). A motion that lacks joints or nodes leaves
     /// them at rest.
     pub fn pose(&self, motion: &Motion, posed: &mut Posed) {

@@ -5,7 +5,7 @@
 use std::{string::ToString as _, vec::Vec};
 
 use crate::{
-    Motion, MotionEncoder, Posed, StreamError, Template, TemplateSource,
+    Motion, MotionEncoder, Posed, StreamError, StreamTemplate, TemplateSource,
     testing::{Person, damaged},
 };
 
@@ -73,7 +73,7 @@ fn posed_gaussians_stay_near_the_reference() {
     for nodes in [0, 1, 200] {
         let person = Person::tube(3000, nodes);
         let encoded = person.encode();
-        let decoded = Template::decode(&encoded.bytes).unwrap();
+        let decoded = StreamTemplate::decode(&encoded.bytes).unwrap();
         assert_eq!(decoded, encoded.template);
         let mut encoder = MotionEncoder::new(&encoded);
         for seed in 0..3 {
@@ -167,7 +167,7 @@ fn damaged_templates_and_motions_are_no_panic() {
     let person = Person::tube(300, 20);
     let encoded = person.encode();
     let mut refused = 0;
-    damaged(&encoded.bytes, 3000, |bytes| match Template::decode(bytes) {
+    damaged(&encoded.bytes, 3000, |bytes| match StreamTemplate::decode(bytes) {
         Ok(template) => {
             let mut posed = Posed::default();
             template.pose(&person.motion(1), &mut posed);

@@ -28,7 +28,7 @@ const WHAT: &str = "template";
 
 /// A joint of the skeleton.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Joint {
+pub struct StreamJoint {
     /// Index of the parent, smaller than the joint's own; none for the first joint alone.
     pub parent: Option<u16>,
     /// Origin in the parent's frame, metres.
@@ -41,7 +41,7 @@ pub struct Joint {
 #[derive(Debug, Clone, Copy)]
 pub struct TemplateSource<'a> {
     /// Parents before children.
-    pub joints: &'a [Joint],
+    pub joints: &'a [StreamJoint],
     /// Canonical centre, metres, and standard deviation, metres.
     pub center_scale: &'a [[f32; 4]],
     /// Unit normal of the surface.
@@ -56,10 +56,10 @@ pub struct TemplateSource<'a> {
 
 /// A template in the order of its bytes: a decoder's Gaussians and nodes are numbered so.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Template {
+pub struct StreamTemplate {
     /// XXH3 of the bytes.
     pub hash: u64,
-    pub(crate) joints: Vec<Joint>,
+    pub(crate) joints: Vec<StreamJoint>,
     pub(crate) nodes: usize,
     /// Centre and standard deviation, metres.
     pub(crate) center_scale: Vec<[f32; 4]>,
@@ -72,7 +72,7 @@ pub struct Template {
 #[derive(Debug, Clone)]
 pub struct EncodedTemplate {
     /// As a decoder will have it.
-    pub template: Template,
+    pub template: StreamTemplate,
     /// The message.
     pub bytes: Vec<u8>,
     /// Index in the source of each Gaussian of the template.
@@ -144,7 +144,7 @@ impl TemplateSource<'_> {
             before = gaussian;
         }
         let bytes = encoder.finish();
-        let template = Template::decode(&bytes)?;
+        let template = StreamTemplate::decode(&bytes)?;
         Ok(EncodedTemplate { template, bytes, gaussian_order, node_order })
     }
 
@@ -190,7 +190,7 @@ fn is_parent(parent: Option<u16>, index: usize) -> bool {
     parent.map_or(index == 0, |parent| usize::from(parent) < index)
 }
 
-impl Template {
+impl StreamTemplate {
     /// Reads a template's bytes.
     ///
     /// # Errors
@@ -215,7 +215,7 @@ impl Template {
             for number in &mut numbers {
                 *number = fields.f32()?;
             }
-            joints.push(Joint {
+            joints.push(StreamJoint {
                 parent,
                 translation: core::array::from_fn(|k| numbers[k]),
                 joint_from_canonical: core::array::from_fn(|row| core::array::from_fn(|k| numbers[3 + 4 * row + k])),
@@ -276,7 +276,7 @@ impl Template {
 
     /// The skeleton.
     #[must_use]
-    pub fn joints(&self) -> &[Joint] {
+    pub fn joints(&self) -> &[StreamJoint] {
         &self.joints
     }
 }

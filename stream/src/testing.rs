@@ -4,11 +4,11 @@ use std::vec::Vec;
 
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
-use crate::{EncodedTemplate, Joint, Motion, Stamp, TemplateSource};
+use crate::{EncodedTemplate, Motion, Stamp, StreamJoint, TemplateSource};
 
 /// A person's lists, so that a source can borrow them.
 pub(crate) struct Person {
-    pub joints: Vec<Joint>,
+    pub joints: Vec<StreamJoint>,
     pub center_scale: Vec<[f32; 4]>,
     pub normals: Vec<[f32; 3]>,
     pub skin: Vec<([u32; 4], [f32; 4])>,
@@ -20,7 +20,7 @@ impl Person {
     /// A tube of three joints, 1.5 m tall.
     pub fn tube(count: usize, nodes: usize) -> Self {
         let mut random = StdRng::seed_from_u64(11);
-        let joint = |i: usize| Joint {
+        let joint = |i: usize| StreamJoint {
             parent: i.checked_sub(1).map(|p| p as u16),
             translation: if i == 0 { [0.0; 3] } else { [0.0, 0.5, 0.0] },
             joint_from_canonical: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, -0.5 * i as f32], [0.0, 0.0, 1.0, 0.0]],

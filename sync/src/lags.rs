@@ -167,7 +167,7 @@ pub fn estimate_lags(signals: &[MotionSignal], most_nanos: i64) -> Vec<LagEstima
         .collect()
 }
 
-/// What two cameras tell of each other.
+/// Time offset estimated from a pair of cameras.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PairLag {
     /// Slots of the cameras.
@@ -179,7 +179,7 @@ pub(crate) struct PairLag {
     pub weight: f64,
 }
 
-/// What the pairs tell of one camera.
+/// Estimates of one camera from its pairs.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Balance {
     /// Nanoseconds after the first camera; none where no pairs reach it.

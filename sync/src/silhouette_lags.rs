@@ -28,7 +28,7 @@ const STRETCH: usize = 125;
 const LEAST_CONTRAST: f64 = 0.3;
 /// What a mask is believed to lean by where somebody moves, pixels.
 const LEANING_PX: f64 = 0.1;
-/// Standard error beyond which a lag is not told, nanoseconds.
+/// Standard error beyond which a time offset is not reported, nanoseconds.
 const MOST_ERROR: f64 = 5e6;
 /// Samples of a kind of stretches below which their lag is not asked for.
 const LEAST_STRETCH: usize = 30;
@@ -95,7 +95,7 @@ impl SilhouetteTrack {
 /// Lags of all cameras against the first one, of two cameras at most `most_nanos` (at most 1 s); two cameras are enough. The
 /// correlation of an estimate is how much better than the mean of all lags the best one fits, 0 to 1; its disagreement the
 /// standard error, by the noise of the curves, by what pairs of cameras disagree on, and by what alternating half seconds
-/// disagree on. Nothing is told of a camera where that is more than 5 ms, or that has nothing in common with the first one
+/// disagree on. No offset is reported for a camera where that is more than 5 ms, or that has nothing in common with the first one
 /// (error infinite).
 #[must_use]
 pub fn estimate_silhouette_lags(tracks: &[SilhouetteTrack], most_nanos: i64) -> Vec<LagEstimate> {
@@ -158,7 +158,7 @@ struct Fit {
     weight: f64,
 }
 
-/// What the lowest and the highest tangents of two cameras tell, as far as they do.
+/// Estimates from the lowest and the highest tangents of two cameras.
 fn fits(a: &SilhouetteTrack, b: &SilhouetteTrack, most: i64) -> Vec<Fit> {
     let (Some(pencil), Some((a0, a1)), Some((b0, b1))) = (Pencil::new(a, b), a.span(), b.span()) else {
         return Vec::new();

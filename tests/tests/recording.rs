@@ -69,7 +69,7 @@ fn doctor_says_what_is_there_and_what_to_mend() {
     let folder = tempfile::tempdir().unwrap();
     let doctor = run(PROGRAM, &["doctor"], folder.path()).unwrap();
     assert_eq!(doctor.code, Some(0), "{doctor:?}");
-    for heading in ["cameras\n", "graphics adapters\n", "to mend\n"] {
+    for heading in ["cameras\n", "graphics adapters\n", "problems\n"] {
         assert!(doctor.stdout.contains(heading), "{}", doctor.stdout);
     }
     let text = "[source]\nkind = \"v4l2\"\npath = \"x\"\n[[source.cameras]]\nname = \"left\"\nserial = \"none such\"\n\

@@ -4,11 +4,11 @@ use std::fmt;
 
 use flyrig_types::{Camera, Image, Mask};
 
+use crate::gate::BodyGate;
 use crate::grid::Grid;
 use crate::key::{KeyColor, Screen};
 use crate::pixels::Rgb;
 use crate::plate::{Drift, floats, gated_mask, plate_evidence};
-use crate::silhouette::BodyGate;
 use crate::{TrackError, TrackErrorKind};
 
 /// Share of the picture away from people that differs from the plate when the whole room has changed.
@@ -19,7 +19,7 @@ const LEAST_AWAY: f32 = 0.2;
 const STEADY_UPDATES: u8 = 8;
 /// A change of a channel from update to update that is not noise, sRGB steps.
 const STEADY: f32 = 14.0;
-/// Updates in which a pixel away from people differs from the plate before it is learnt anew.
+/// Updates in which a pixel away from people differs from the plate before it is relearnt.
 const DIFFERENT_UPDATES: u8 = 15;
 /// Share of the difference that the plate takes over in an update.
 const FOLLOW: f32 = 1.0 / 16.0;
@@ -41,7 +41,7 @@ const SHIFT_SAMPLES: usize = 120;
 #[non_exhaustive]
 pub enum BackgroundEvent {
     /// The picture differs from the plate in this share of what shows nobody, 0..=1; the plate is not used until it is
-    /// learnt anew.
+    /// relearnt.
     Changed(f64),
     /// The plate is in use again.
     Recovered,
@@ -57,10 +57,10 @@ impl fmt::Display for BackgroundEvent {
             Self::Changed(share) => write!(
                 f,
                 "{:.0} % of the background differs from the plate (lights switched, or a plate of another scene); masks do \
-                 without the plate until the background is learnt anew, where nobody stands",
+                 without the plate until the background has been relearnt, where nobody stands",
                 100.0 * share
             ),
-            Self::Recovered => f.write_str("the background is learnt anew and used again"),
+            Self::Recovered => f.write_str("the background has been relearnt and is in use again"),
             Self::Shifted(x, y) => write!(
                 f,
                 "the picture is shifted by {x}, {y} pixels against the plate: the camera was moved; calibrate again and \
@@ -69,7 +69,7 @@ impl fmt::Display for BackgroundEvent {
             Self::Differs(share, [x, y]) => write!(
                 f,
                 "{:.1} % of the picture around pixel {x}, {y} differ from the plate where nobody is tracked: something was moved, \
-                 or somebody stood in the plate; it is learnt anew, but better record the plate again (`flyrig plate`)",
+                 or somebody stood in the plate; it is being relearnt; recording the plate again (`flyrig plate`) is more accurate",
                 100.0 * share
             ),
         }
@@ -99,7 +99,7 @@ pub(crate) struct Plate {
     steady: Vec<u8>,
     /// Updates in which a known pixel differed from the plate.
     different: Vec<u8>,
-    /// Whether the plate is learnt anew after the whole room changed.
+    /// Whether the plate is relearnt after the whole room changed.
     renewing: bool,
     /// Whether a shift was looked for, and a difference reported.
     compared: bool,
@@ -158,7 +158,7 @@ impl Background {
     }
 
     /// Takes in a picture in which nobody stands but the bodies of `gates`: the background follows slow changes of the light
-    /// and is learnt anew after sudden ones. Returns what its owner should know, each once.
+    /// and is relearnt after sudden ones. Returns what its owner should know, each once.
     ///
     /// # Errors
     /// Kind `Image` when the format cannot be read. Pictures of another size change nothing.

@@ -23,7 +23,7 @@ pub enum TrackErrorKind {
 pub struct TrackError {
     /// What sort of trouble.
     pub kind: TrackErrorKind,
-    /// What happened and how to mend it.
+    /// What happened and the fix.
     pub message: String,
 }
 

@@ -6,9 +6,9 @@
 use std::fmt;
 use std::str::FromStr;
 
+use crate::edge_color::{EdgeColor, Matte};
 use crate::grid::Grid;
 use crate::light::{byte, linear_of_bytes};
-use crate::matte::{EdgeColor, Matte};
 use crate::pixels::Rgb;
 
 /// Cosine between the chroma of a pixel and of the key from which the pixel shows the screen.

@@ -20,10 +20,12 @@ mod body_shape;
 mod config;
 mod crop;
 mod deform;
+mod edge_color;
 mod error;
 mod estimate;
 mod estimator;
 mod fit;
+mod gate;
 mod grid;
 mod habits;
 mod hands;
@@ -42,6 +44,7 @@ mod presence;
 mod search;
 mod shape;
 mod shape_solve;
+mod sighting;
 mod silhouette;
 mod single_view;
 mod surface_marks;
@@ -59,9 +62,11 @@ pub use deform::{
     DataTerm, DeformReport, DeformSettings, DeformSolver, DeformTracker, FIRST_FRAMES, PointDerivatives,
     PoseCorrection, PoseFreedom,
 };
+pub use edge_color::{EdgeColor, Matte};
 pub use error::{TrackError, TrackErrorKind};
 pub use estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};
 pub use estimator::{Marks, PoseEstimator};
+pub use gate::BodyGate;
 pub use habits::{Habit, LandmarkStudy};
 pub use hands::{
     FACE_LANDMARKS, FACE_SIDE, FaceNet, FaceOutput, FaceStudy, HAND_LANDMARKS, HAND_SIDE, HandConfig, HandNet,
@@ -69,11 +74,10 @@ pub use hands::{
 };
 pub use key::{KeyColor, KeyColorError};
 pub use landmarks::{Keypoint, LANDMARK_BONES, LANDMARK_COUNT, LANDMARK_NAMES, ViewKeypoints};
-pub use matte::{EdgeColor, Matte, matte};
+pub use matte::matte;
 pub use net::{CropLandmark, NET_SIDE, NetOutput, PoseNet};
 pub use plate::mask_from_plate;
 pub use presence::shows_person;
 pub use shape::{HeightFrom, ShapeFit, fit_template_shape};
-pub use silhouette::BodyGate;
 pub use triangulate::{WorldPoint, triangulate};
 pub use viewers::Viewers;

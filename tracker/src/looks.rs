@@ -11,7 +11,7 @@ use glam::{DVec2, DVec3, Vec3};
 use crate::LANDMARK_COUNT;
 use crate::body_model::Turns;
 use crate::grid::Grid;
-use crate::search::Sighting;
+use crate::sighting::Sighting;
 use crate::silhouette::net_probability;
 
 /// A look grows old by this much a second, metres, so that a person who is gone is noticed.

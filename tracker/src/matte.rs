@@ -8,6 +8,7 @@ use flyrig_types::{Image, Mask};
 
 use crate::TrackError;
 use crate::background::{Background, BackgroundLight};
+use crate::edge_color::{EdgeColor, Matte};
 use crate::grid::Grid;
 use crate::light::{byte, linear_of_bytes, step};
 use crate::pixels::Rgb;
@@ -33,24 +34,6 @@ const CHROMA: f32 = 0.8;
 /// Pixels of the mask that look like the background are solved for up to this depth, pixels, as far as evidence is lower.
 const DEEP_PX: f32 = 24.0;
 const LOOKS_EMPTY: f32 = 0.4;
-
-/// Foreground colour of a pixel that also shows the background.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct EdgeColor {
-    /// Index of the pixel, row by row.
-    pub pixel: u32,
-    /// sRGB without the background's share.
-    pub rgb: [u8; 3],
-}
-
-/// Mask with sub-pixel coverage, and colours of its outline without the background.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Matte {
-    /// Coverage.
-    pub mask: Mask,
-    /// Colours of pixels that are covered in part, by rising index.
-    pub colors: Vec<EdgeColor>,
-}
 
 /// Solves for coverage and foreground colour along the outline of a mask. Without a background, or where it is of another
 /// size, the colours around the mask stand in.

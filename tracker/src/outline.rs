@@ -5,8 +5,8 @@ use flyrig_types::{Camera, Mask};
 use glam::{DVec2, DVec3, Vec3};
 
 use crate::body_model::BodyModel;
+use crate::gate::drawn_body;
 use crate::line_point::{LineKind, LinePoint, bones, undistorted_line};
-use crate::silhouette::drawn_body;
 use crate::view::View;
 
 /// A vertex is on the rim where the angle between its normal and the image plane has a smaller sine.

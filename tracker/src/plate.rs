@@ -3,9 +3,9 @@
 use flyrig_solve::median;
 use flyrig_types::{Image, Mask};
 
+use crate::gate::BodyGate;
 use crate::grid::{Grid, clean};
 use crate::pixels::Rgb;
-use crate::silhouette::BodyGate;
 use crate::{TrackError, TrackErrorKind};
 
 /// A shadow darkens the plate to no less than this share, keeping its colour.

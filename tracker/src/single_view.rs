@@ -4,7 +4,7 @@ use flyrig_types::Camera;
 use glam::{DMat3, DVec2, DVec3};
 
 use crate::LANDMARK_COUNT;
-use crate::search::Sighting;
+use crate::sighting::Sighting;
 use crate::view::{View, observe};
 
 /// World points from one view: the network's hip-centred landmarks (in metres, for a trunk of half a

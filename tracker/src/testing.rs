@@ -8,7 +8,7 @@ use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use crate::body_model::{BodyModel, Turns};
 use crate::fit::{FitProblem, FitView};
-use crate::silhouette::drawn_body;
+use crate::gate::drawn_body;
 use crate::{Keypoint, LANDMARK_COUNT, ViewKeypoints};
 
 pub(crate) fn body() -> Template {

@@ -37,7 +37,7 @@ const DOUBT_CELLS: f64 = 1.0;
 /// Share of a new brightness in what is remembered, once a point was seen twice. A slow memory would keep the errors of the pose
 /// in which it was learnt.
 const LEARN: f64 = 0.6;
-/// A point that was hidden for longer is learnt anew, seconds: it comes back in other light.
+/// A point that was hidden for longer is relearnt, seconds: it comes back in other light.
 const FORGET_SECS: f64 = 0.5;
 /// Coverage of the mask from which on a pixel is surely the person.
 const SURE_COVERAGE: u8 = 230;

@@ -201,7 +201,7 @@ impl CameraInbox {
         }
     }
 
-    /// The oldest frame that waits, or what is to be told first.
+    /// Returns the oldest waiting frame, or the error to report first.
     pub fn take(&mut self, camera: &CameraId) -> Result<Option<Result<Frame, TransportError>>, TransportError> {
         let slot = self.slots.iter_mut().find(|slot| slot.camera == *camera);
         let slot = slot.ok_or_else(|| TransportError::config(format!("camera {camera}"), "was not asked for"))?;
@@ -232,7 +232,7 @@ impl CameraInbox {
         let is_there = slot.publisher.map(|publisher| self.hosts.contains_key(&publisher));
         if is_there == Some(false) {
             return format!(
-                "{computer} is gone from the network; start `flyrig capture` there again, or mend the cable"
+                "{computer} is gone from the network; start `flyrig capture` there again, or check the cable"
             );
         }
         let problem = status.map(|status| status.problem.as_str()).filter(|problem| !problem.is_empty());

@@ -155,7 +155,7 @@ impl CameraSubscriber {
         lock(&self.shared.inbox).link(camera, self.shared.clock.now_nanos())
     }
 
-    /// Why nothing comes of a camera, and the mend.
+    /// Why nothing comes of a camera, and the fix.
     #[must_use]
     pub fn absence(&self, camera: &CameraId) -> String {
         lock(&self.shared.inbox).absence(camera, &self.connect)

@@ -17,7 +17,7 @@ pub enum TransportErrorKind {
     Closed,
 }
 
-/// An error that names the thing and the mend. Both texts are [`printable`]: either may repeat what another program sent.
+/// An error that names the thing and the fix. Both texts are [`printable`]: either may repeat what another program sent.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{topic}: {message}")]
 pub struct TransportError {

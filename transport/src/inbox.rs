@@ -231,7 +231,7 @@ impl Inbox {
         Ok(())
     }
 
-    /// A message or publisher that cannot be read: counted, and told once.
+    /// A message or publisher that cannot be read: counted, and reported once.
     pub(crate) fn refuse(&self, error: TransportError) {
         let mut state = lock(&self.state);
         state.unreadable += 1;

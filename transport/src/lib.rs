@@ -11,7 +11,7 @@
 //! | `splats`, `splats/<person>` | [`SplatState`] of the first person and of the others, own binary layout |
 //! | `person/<person>/motion` | [`flyrig_stream::Motion`] |
 //! | `person/<person>/color-<layer>` | a layer of colours, for [`flyrig_stream::ColorDecoder`] |
-//! | `template/<hash>-<chunk>` | query and reply: u32 size of a [`flyrig_stream::Template`], and 60,000 of its bytes |
+//! | `template/<hash>-<chunk>` | query and reply: u32 size of a [`flyrig_stream::StreamTemplate`], and 60,000 of its bytes |
 //! | `calibration/<camera>` | foxglove `CameraCalibration`, protobuf |
 //! | `transforms` | foxglove `FrameTransforms`: `world_from_camera` of every camera and the world's up |
 //! | `stats` | [`RigStats`], JSON |
@@ -70,7 +70,7 @@ pub use printable::{MAX_PRINTABLE, printable};
 pub use publisher::{Publisher, ViewpointCounts};
 pub use report::{LatencyReport, TopicReport};
 pub use splats::{MAX_PERSON_TOPICS, MAX_SPLATS, SplatState};
-pub use stats::{BudgetStats, RigStats, StageTime, SubjectStats, TrackingStats, ViewRate};
+pub use stats::{BudgetStats, RigStats, StageStats, SubjectStats, TrackingStats, ViewRate};
 pub use subscriber::{Interests, Received, Subscriber, Views};
 pub use topic::{PublishOutcome, TopicCounts};
 pub use view::{ImageFormat, MAX_IMAGE_BYTES, ViewFrame};

@@ -14,8 +14,8 @@ pub(crate) const MAX_JSON_BYTES: usize = 1 << 18;
 /// On the wire the percentile also stands as `max_millis`, its name before, so that older and newer programs read each
 /// other.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(from = "WireStageTime", into = "WireStageTime")]
-pub struct StageTime {
+#[serde(from = "WireStageStats", into = "WireStageStats")]
+pub struct StageStats {
     /// Name of the stage.
     pub stage: String,
     /// Mean over the interval, milliseconds.
@@ -25,22 +25,22 @@ pub struct StageTime {
 }
 
 #[derive(Serialize, Deserialize)]
-struct WireStageTime {
+struct WireStageStats {
     stage: String,
     mean_millis: f64,
     max_millis: f64,
     p95_millis: Option<f64>,
 }
 
-impl From<WireStageTime> for StageTime {
-    fn from(wire: WireStageTime) -> Self {
-        let WireStageTime { stage, mean_millis, max_millis, p95_millis } = wire;
+impl From<WireStageStats> for StageStats {
+    fn from(wire: WireStageStats) -> Self {
+        let WireStageStats { stage, mean_millis, max_millis, p95_millis } = wire;
         Self { stage, mean_millis, p95_millis: p95_millis.unwrap_or(max_millis) }
     }
 }
 
-impl From<StageTime> for WireStageTime {
-    fn from(StageTime { stage, mean_millis, p95_millis }: StageTime) -> Self {
+impl From<StageStats> for WireStageStats {
+    fn from(StageStats { stage, mean_millis, p95_millis }: StageStats) -> Self {
         Self { stage, mean_millis, max_millis: p95_millis, p95_millis: Some(p95_millis) }
     }
 }
@@ -105,7 +105,7 @@ pub struct RigStats {
     /// Frame sets a second through the whole pipeline.
     pub frames_per_second: f64,
     /// In the order of the pipeline.
-    pub stages: Vec<StageTime>,
+    pub stages: Vec<StageStats>,
     /// Frames lost since the start, by place.
     pub dropped: BTreeMap<String, u64>,
     /// Published views.
@@ -246,7 +246,7 @@ mod tests {
 
     #[test]
     fn older_and_newer_programs_read_each_other() {
-        let stages = vec![StageTime { stage: "draw".to_owned(), mean_millis: 2.0, p95_millis: 4.0 }];
+        let stages = vec![StageStats { stage: "draw".to_owned(), mean_millis: 2.0, p95_millis: 4.0 }];
         let sent = RigStats { stages, subjects: vec![subject(3), subject(7)], ..RigStats::default() };
         let bytes = sent.encode().unwrap();
         let found = RigStats::decode(&bytes).unwrap();
@@ -275,7 +275,7 @@ mod tests {
     fn names_come_out_printable() {
         let bad = || "\u{1b}[2J\u{202e}".to_owned();
         let stats = RigStats {
-            stages: vec![StageTime { stage: bad(), mean_millis: 1.0, p95_millis: 1.0 }],
+            stages: vec![StageStats { stage: bad(), mean_millis: 1.0, p95_millis: 1.0 }],
             dropped: [(bad(), 1)].into(),
             views: vec![ViewRate { view: bad(), per_second: 1.0, bytes_per_second: 1.0 }],
             subjects: vec![SubjectStats { person: 1, state: bad(), quality: None, cameras: [(bad(), 1.0)].into() }],

@@ -178,7 +178,7 @@ impl Subscriber {
         self.received(label, raw, |_, _, bytes| Ok(PersonMessage { person, layer, bytes })).map(Some)
     }
 
-    /// Asks the rig for the bytes of the [`flyrig_stream::Template`] that a motion's stamp names; `None` when nobody answers in time;
+    /// Asks the rig for the bytes of the [`flyrig_stream::StreamTemplate`] that a motion's stamp names; `None` when nobody answers in time;
     /// ask again then.
     ///
     /// # Errors

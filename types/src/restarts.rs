@@ -1,4 +1,4 @@
-//! How often work that failed is begun anew.
+//! How often work that failed is restarted.
 
 use std::time::{Duration, Instant};
 
@@ -18,7 +18,7 @@ pub struct Restarts {
 }
 
 impl Restarts {
-    /// Returns when work that has failed `now` may be begun anew, and counts that restart.
+    /// Returns when work that has failed `now` may be restarted, and counts that restart.
     pub fn after_failure(&mut self, now: Instant) -> Instant {
         if self.last.is_some_and(|last| now.saturating_duration_since(last) >= WINDOW) {
             self.in_a_row = 0;

@@ -1,4 +1,4 @@
-//! Threads whose work is begun anew after a panic.
+//! Threads whose work is restarted after a panic.
 
 use std::{
     io,
@@ -14,7 +14,7 @@ use crate::{Restarts, caught};
 pub struct ThreadHealth {
     /// The thread's name.
     pub name: String,
-    /// Times that its work was begun anew after a panic.
+    /// Times that its work was restarted after a panic.
     pub restarts: u64,
     /// Text of the last panic.
     pub panic: Option<String>,
@@ -38,7 +38,7 @@ impl ThreadWatch {
     }
 }
 
-/// Thread whose work is begun anew after a panic, as often as [`Restarts`] lets it at once; then it has failed for good.
+/// Thread whose work is restarted after a panic, as often as [`Restarts`] lets it at once; then it has failed for good.
 #[derive(Debug)]
 pub struct SupervisedThread {
     watch: ThreadWatch,

@@ -9,7 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_stream::Template;
+use flyrig_stream::StreamTemplate;
 use flyrig_transport::{Interests, PersonMessage, RigStats, Subscriber, TransportConfig, TransportError};
 use flyrig_types::{Rig, SupervisedThread, ThreadHealth};
 use flyrig_viewing::{People, Taken};
@@ -220,7 +220,7 @@ impl Link<'_> {
         }
         match self.subscriber.template(hash, TEMPLATE_PATIENCE) {
             Ok(Some(bytes)) => {
-                let template = match Template::decode(&bytes) {
+                let template = match StreamTemplate::decode(&bytes) {
                     Ok(template) => template,
                     Err(error) => return self.refuse(hash, error.to_string()),
                 };

@@ -5,7 +5,7 @@ use std::{
     sync::Arc,
 };
 
-use flyrig_stream::{StreamError, Template, stamp_of};
+use flyrig_stream::{StreamError, StreamTemplate, stamp_of};
 
 use crate::StreamPerson;
 
@@ -67,7 +67,7 @@ impl People {
     }
 
     /// Gives a person a template, and applies the messages that waited for it.
-    pub fn meet(&mut self, person: u32, template: Arc<Template>) {
+    pub fn meet(&mut self, person: u32, template: Arc<StreamTemplate>) {
         if self.by_number.len() >= MAX_PEOPLE && !self.by_number.contains_key(&person) {
             self.by_number.pop_first();
         }
@@ -115,7 +115,7 @@ impl People {
 #[cfg(test)]
 mod tests {
     use flyrig_stream::{
-        ColorEncoder, ColorSettings, EncodedTemplate, Joint, Motion, MotionEncoder, Posed, Stamp, TemplateSource,
+        ColorEncoder, ColorSettings, EncodedTemplate, Motion, MotionEncoder, Posed, Stamp, StreamJoint, TemplateSource,
     };
 
     use super::*;
@@ -123,7 +123,7 @@ mod tests {
     /// A person of a few Gaussians on one joint; `size` makes another template.
     fn person(size: f32) -> EncodedTemplate {
         let rows = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-        let joints = [Joint { parent: None, translation: [0.0; 3], joint_from_canonical: rows }];
+        let joints = [StreamJoint { parent: None, translation: [0.0; 3], joint_from_canonical: rows }];
         let center_scale: Vec<[f32; 4]> = (0..40).map(|i| [size * i as f32 / 40.0, size, 0.0, 0.01]).collect();
         let skin = vec![([0; 4], [1.0, 0.0, 0.0, 0.0]); 40];
         let normals = vec![[0.0, 0.0, 1.0]; 40];

@@ -2,7 +2,7 @@
 
 use std::{collections::VecDeque, sync::Arc};
 
-use flyrig_stream::{ColorDecoder, Motion, Posed, Stamp, StreamError, Template};
+use flyrig_stream::{ColorDecoder, Motion, Posed, Stamp, StreamError, StreamTemplate};
 
 /// Motions that are kept to interpolate between.
 const KEPT: usize = 16;
@@ -16,7 +16,7 @@ const GONE_AFTER_SECS: f64 = 3.0;
 /// Template, last motions and colours of one person.
 #[derive(Debug)]
 pub struct StreamPerson {
-    template: Arc<Template>,
+    template: Arc<StreamTemplate>,
     decoder: ColorDecoder,
     /// Shared with the views under way.
     colors: Arc<Vec<[f32; 4]>>,
@@ -34,7 +34,7 @@ pub struct StreamPerson {
 impl StreamPerson {
     /// A person nothing is known of but its template.
     #[must_use]
-    pub fn new(template: Arc<Template>) -> Self {
+    pub fn new(template: Arc<StreamTemplate>) -> Self {
         Self {
             decoder: ColorDecoder::new(&template),
             colors: Arc::default(),
@@ -49,7 +49,7 @@ impl StreamPerson {
 
     /// The template.
     #[must_use]
-    pub fn template(&self) -> &Template {
+    pub fn template(&self) -> &StreamTemplate {
         &self.template
     }
 

@@ -3,7 +3,7 @@
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
 use glam::{DQuat, DVec2, DVec3};
 
-use crate::{Board, BoardView, SeenCorner, Shot};
+use crate::{Board, BoardShot, BoardView, SeenCorner};
 
 /// Pixels of every image.
 const SIZE: [u32; 2] = [1280, 720];
@@ -97,7 +97,7 @@ fn board_pose(random: &mut Random, board: &Board) -> Isometry {
 
 /// Shots of random boards that at least two cameras see.
 #[must_use]
-pub fn shots(random: &mut Random, board: &Board, cameras: &[Camera], count: usize, noise_px: f64) -> Vec<Shot> {
+pub fn shots(random: &mut Random, board: &Board, cameras: &[Camera], count: usize, noise_px: f64) -> Vec<BoardShot> {
     let mut shots = Vec::new();
     while shots.len() < count {
         let pose = board_pose(random, board);
@@ -109,7 +109,7 @@ pub fn shots(random: &mut Random, board: &Board, cameras: &[Camera], count: usiz
             .collect();
         views.iter_mut().for_each(|view| view.nanos = nanos);
         if views.len() > 1 {
-            shots.push(Shot { nanos, views });
+            shots.push(BoardShot { nanos, views });
         }
     }
     shots

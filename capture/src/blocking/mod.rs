@@ -120,7 +120,7 @@ impl Session {
 }
 
 impl<O: Opener> Watched<O> {
-    /// Opens at once, so that what is wrong is told at the start.
+    /// Opens at once, so that errors are reported at the start.
     pub fn open(camera: &CameraId, expected: Expected, opener: O) -> Result<Self, CaptureError> {
         let abandoned = left::take(&opener.device());
         let mut watched = Self {
@@ -145,7 +145,7 @@ impl<O: Opener> Watched<O> {
         let line = Arc::clone(&session.line);
         watched.session = Some(session);
         match opened {
-            Ok(_) => watched.tell_mode(&line, ""),
+            Ok(_) => watched.report_mode(&line, ""),
             Err(PopError::Closed) => return Err(of_camera(line.end())),
             Err(PopError::Timeout) => {
                 let text = format!(
@@ -165,7 +165,7 @@ impl<O: Opener> Watched<O> {
         Ok(Session { line, heard, is_flowing: false, is_back, was_asked: false, is_stuck: false, overtaken })
     }
 
-    fn tell_mode(&mut self, line: &Line, stamps: &str) {
+    fn report_mode(&mut self, line: &Line, stamps: &str) {
         let mode = format!("{}{stamps}", line.mode.get().map_or("", String::as_str));
         if *self.health.mode != *mode {
             self.health.mode = mode.into();
@@ -240,7 +240,7 @@ impl<O: Opener> Watched<O> {
         let half = if source == StampSource::Other { half_period } else { 0 };
         let capture = self.stamps.capture_nanos(stamp, source, shot.arrival_nanos, half);
         self.health.stamps_replaced = self.stamps.replaced;
-        self.tell_mode(line, told);
+        self.report_mode(line, told);
         Ok(Frame {
             camera: self.camera.clone(),
             sequence: number,

@@ -111,7 +111,7 @@ impl CameraSource for McapReplay {
             let sequence = self.last.map_or(u64::from(message.sequence), |(before, counted)| {
                 match message.sequence.wrapping_sub(before) {
                     step if step <= u32::MAX / 2 => counted.wrapping_add(u64::from(step)),
-                    // Back: the camera was opened anew and counts from its start.
+                    // Back: the camera was opened again and counts from its start.
                     _ => counted.wrapping_add(1),
                 }
             });

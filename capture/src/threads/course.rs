@@ -1,4 +1,4 @@
-//! State that is kept while a camera's source is opened anew.
+//! State that is kept while a camera's source is opened again.
 
 use flyrig_types::Frame;
 

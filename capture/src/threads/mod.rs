@@ -3,7 +3,9 @@
 mod course;
 mod opener;
 mod pulse;
+mod run_stage;
 mod shared;
+mod stats;
 
 use std::{
     collections::BTreeMap,
@@ -15,11 +17,11 @@ use std::{
 use flyrig_types::{CameraId, Frame};
 
 pub use self::opener::SourceOpener;
-pub(crate) use self::shared::Shared;
+pub use self::stats::{CameraStats, Pacing, ThreadsConfig};
 use self::{
     opener::{How, Opening},
     pulse::Pulse,
-    shared::{Pulses, Supply, lock},
+    shared::{Pulses, Shared, Supply, lock},
 };
 use crate::{
     CameraSource, CaptureError, CaptureErrorKind, FrameStage, LatestQueue, SourceHealth,
@@ -32,65 +34,10 @@ const CLOSING: Duration = Duration::from_secs(15);
 /// How often it looks.
 const LOOK: Duration = Duration::from_millis(2);
 
-/// When frames go into the queue, and what happens when it is full.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Pacing {
-    /// As the sources give them; the oldest is dropped. For live cameras.
-    #[default]
-    AsDelivered,
-    /// At the pace of their capture times; the oldest is dropped. For a recording played as live.
-    RealTime,
-    /// As fast as they are taken out, nothing is dropped, and in the order of capture over all
-    /// cameras, so that every run is the same. For evaluation.
-    Lossless,
-}
-
-/// Settings of [`CaptureThreads`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ThreadsConfig {
-    /// Frames of all cameras together that wait in the queue.
-    pub queue_capacity: usize,
-    /// See [`Pacing`].
-    pub pacing: Pacing,
-}
-
-impl Default for ThreadsConfig {
-    fn default() -> Self {
-        Self { queue_capacity: 16, pacing: Pacing::default() }
-    }
-}
-
-/// Counts of one camera's thread.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct CameraStats {
-    /// Which camera.
-    pub camera: CameraId,
-    /// Frames put into the queue.
-    pub frames: u64,
-    /// Frames of this camera that were dropped out of the full queue.
-    pub dropped: u64,
-    /// Frames that newer ones overtook before the camera's stage (see [`FrameStage`]) came to them.
-    pub overtaken: u64,
-    /// Errors by kind; the end of a recording is none.
-    pub errors: BTreeMap<CaptureErrorKind, u64>,
-    /// The error that came last.
-    pub last_error: Option<CaptureError>,
-    /// Health as the source reports it; counts are over all sources of the camera.
-    pub health: SourceHealth,
-    /// Times that the camera was opened anew because its source had failed for good or panicked.
-    pub restarts: u64,
-    /// Times that its stage was made anew because it had panicked.
-    pub stage_restarts: u64,
-    /// Whether the camera has a source now. Without one it is being opened, or, when not `running`, has ended.
-    pub opened: bool,
-    /// Whether the thread still reads.
-    pub running: bool,
-}
-
 /// Reads every source in a thread of its own, named after its camera, into one queue.
 ///
 /// A thread goes on after errors that may pass, with growing pauses while a camera is gone. A source that fails for good or
-/// panics (`Disconnected`) ends that camera alone; where it came from a [`SourceOpener`] with a function, it is opened anew:
+/// panics (`Disconnected`) ends that camera alone; where it came from a [`SourceOpener`] with a function, it is opened again:
 /// five times at once, then once a minute. The queue closes when all threads have ended. Dropping this stops the threads
 /// and waits for them; one that does not come out of a source's or a stage's call within 15 seconds is left behind.
 ///
@@ -128,7 +75,7 @@ impl CaptureThreads {
     /// of up to 5 s as long as that fails, and joins when it comes; meanwhile its [`CameraStats`] hold the last error.
     ///
     /// Only live cameras are waited for: with another pacing than [`Pacing::AsDelivered`] all sources are opened first, one
-    /// after the other, and none is opened anew, since a recording would begin again.
+    /// after the other, and none is opened again, since a recording would begin again.
     ///
     /// # Errors
     /// As [`Self::start`]; and, where the sources are opened first, the first error of these.
@@ -136,7 +83,7 @@ impl CaptureThreads {
         Self::start_all(openers, Vec::new(), config)
     }
 
-    /// The same, with a stage behind every source; one that panics is made anew.
+    /// The same, with a stage behind every source; one that panics is made again.
     ///
     /// # Errors
     /// As [`Self::start_opening`].

@@ -8,7 +8,12 @@ use std::{
 use crossbeam::channel::RecvTimeoutError;
 use flyrig_types::{CameraId, Frame, Restarts, caught};
 
-use super::{CameraStats, Pacing, course::Course, opener::Opening, pulse::Pulse};
+use super::{
+    course::Course,
+    opener::Opening,
+    pulse::Pulse,
+    stats::{CameraStats, Pacing},
+};
 use crate::{CameraSource, CaptureError, CaptureErrorKind, LatestQueue, stage::Hand, turns::Turns};
 
 /// How long a source may wait for a frame before its thread looks whether it shall stop.

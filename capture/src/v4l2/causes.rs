@@ -9,7 +9,7 @@ use crate::{CaptureError, CaptureErrorKind};
 pub(crate) fn lost(error: &io::Error) -> CaptureError {
     let text = match error.raw_os_error() {
         Some(libc::ENODEV | libc::ENXIO) => {
-            "was unplugged or its driver let go of it; waiting for it to come back".to_owned()
+            "was unplugged or released by its driver; waiting for it to come back".to_owned()
         }
         Some(libc::EIO) => "its driver reports a failed transfer; starting it again".to_owned(),
         _ => format!("its stream broke ({error}); starting it again"),
@@ -17,7 +17,7 @@ pub(crate) fn lost(error: &io::Error) -> CaptureError {
     CaptureError::general(CaptureErrorKind::Disconnected, text)
 }
 
-/// Why a camera cannot be set up, with the mend.
+/// Why a camera cannot be set up, with the fix.
 pub(crate) fn explain(error: &io::Error, what: &str, node: &Path) -> CaptureError {
     let place = node.display();
     match error.raw_os_error() {

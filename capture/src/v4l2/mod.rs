@@ -48,7 +48,7 @@ impl V4l2Camera {
     ///
     /// # Errors
     /// `NotFound` when no such camera is there, `Unsupported` for what it cannot do, `Io` when it is in use, may not be
-    /// opened, or its bus has no room. Every text names the camera, the cause and the mend.
+    /// opened, or its bus has no room. Every text names the camera, the cause and the fix.
     pub fn open(camera: &CameraId, options: &CameraOptions) -> Result<Self, CaptureError> {
         Stream::open(camera, options, System).map(Self)
     }

@@ -5,8 +5,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use super::sys::MAX_PLANES;
 use crate::stamps::StampSource;
+
+/// Most memory planes of a buffer (`VIDEO_MAX_PLANES`).
+pub(crate) const MAX_PLANES: usize = 8;
 
 /// Fewest buffers in the driver's hands with which a stream flows; a driver without a free buffer drops frames.
 const MIN_QUEUED: usize = 2;

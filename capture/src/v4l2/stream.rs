@@ -80,7 +80,7 @@ struct Session<D: BufferDevice> {
 }
 
 impl<H: Host> Stream<H> {
-    /// Connects at once, so that what is wrong is told at the start.
+    /// Connects at once, so that errors are reported at the start.
     pub fn open(camera: &CameraId, options: &CameraOptions, host: H) -> Result<Self, CaptureError> {
         let mut stream = Self {
             camera: camera.clone(),

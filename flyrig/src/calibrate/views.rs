@@ -6,7 +6,7 @@ use std::{
 };
 
 use anyhow::{Result, anyhow, ensure};
-use flyrig_calib::{Board, BoardDetector, BoardView, GrayImage, Shot, detector};
+use flyrig_calib::{Board, BoardDetector, BoardShot, BoardView, GrayImage, detector};
 use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop};
@@ -31,7 +31,7 @@ pub struct Seen {
     /// By camera, pixels; `None` for one without an image.
     pub sizes: Vec<Option<[u32; 2]>>,
     /// Sets in which at least one camera saw the board.
-    pub shots: Vec<Shot>,
+    pub shots: Vec<BoardShot>,
     /// By camera: images that were looked at.
     pub images: Vec<usize>,
     /// Time of the first set, nanoseconds.
@@ -130,7 +130,7 @@ impl Seen {
         for (i, set) in sets.iter().enumerate() {
             let views: Vec<BoardView> = found.range((i, 0)..(i + 1, 0)).map(|(_, view)| view.clone()).collect();
             if !views.is_empty() {
-                self.shots.push(Shot { nanos: set.master_nanos, views });
+                self.shots.push(BoardShot { nanos: set.master_nanos, views });
             }
         }
         Ok(())

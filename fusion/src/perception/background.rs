@@ -1,6 +1,6 @@
 //! Backgrounds of a rig's cameras: from plates or a key colour, kept up to date, with warnings that name the camera.
 
-use flyrig_tracker::{Background, BackgroundEvent, KeyColor};
+use flyrig_tracker::{Background, BackgroundEvent};
 use flyrig_types::{Camera, Image};
 
 use crate::{FusionError, PerceptionSettings};
@@ -14,7 +14,7 @@ pub(super) fn backgrounds(
     settings: &PerceptionSettings,
     plates: &[Option<Image>],
 ) -> Result<Vec<Option<Background>>, FusionError> {
-    if let Some(key) = key_color(settings)? {
+    if let Some(key) = settings.key()? {
         return Ok(cameras.iter().map(|camera| Some(Background::from_key(camera, key))).collect());
     }
     let of = |(slot, camera): (usize, &Camera)| {
@@ -22,13 +22,6 @@ pub(super) fn backgrounds(
         Ok(plate.map(|plate| Background::from_plate(camera, plate)).transpose()?)
     };
     cameras.iter().enumerate().map(of).collect()
-}
-
-/// The key colour of the settings; `None` for an empty one.
-pub(crate) fn key_color(settings: &PerceptionSettings) -> Result<Option<KeyColor>, FusionError> {
-    let text = settings.key_color.as_str();
-    let parsed = (!text.is_empty()).then(|| text.parse::<KeyColor>()).transpose();
-    parsed.map_err(|error| FusionError::Setting(format!("perception.key_color: {error}")))
 }
 
 /// Counts sets between updates of the backgrounds.
@@ -62,9 +55,9 @@ mod tests {
     #[test]
     fn a_key_colour_is_read_and_a_wrong_one_names_the_key() {
         let settings = |text: &str| PerceptionSettings { key_color: text.to_owned(), ..PerceptionSettings::default() };
-        assert_eq!(key_color(&settings("")).unwrap(), None);
-        assert!(key_color(&settings("green")).unwrap().is_some());
-        let error = key_color(&settings("grey")).unwrap_err().to_string();
+        assert_eq!(settings("").key().unwrap(), None);
+        assert!(settings("green").key().unwrap().is_some());
+        let error = settings("grey").key().unwrap_err().to_string();
         assert!(error.contains("perception.key_color") && error.contains("grey"), "{error}");
     }
 

@@ -1,6 +1,6 @@
 //! People found in the images by the pose network.
 
-use std::{borrow::Cow, collections::BTreeMap, sync::Arc, time::Duration};
+use std::{collections::BTreeMap, sync::Arc, time::Duration};
 
 use flyrig_body::{Template, skin_mesh};
 use flyrig_tracker::{
@@ -332,7 +332,7 @@ impl Perception for EstimatedPerception {
         known.map(|place| (place.id, place.template())).collect()
     }
 
-    fn observe<'a>(&mut self, set: &'a FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation<'a>>, FusionError> {
+    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
         let start = std::time::Instant::now();
         let mut estimates = self.estimate(set, stages);
         self.remember(set, &estimates);
@@ -423,14 +423,14 @@ impl EstimatedPerception {
     }
 
     /// The views of everybody, by place, then by present frame. Masks of several people are divided by their bodies.
-    fn views<'a>(
+    fn views(
         &self,
-        set: &'a FrameSet,
+        set: &FrameSet,
         estimates: &mut [Result<PoseEstimate, String>],
         stages: &mut StageTimes,
-    ) -> Result<Vec<Vec<ViewObservation<'a>>>, FusionError> {
+    ) -> Result<Vec<Vec<ViewObservation>>, FusionError> {
         let seen: Vec<usize> = (0..estimates.len()).filter(|&index| estimates[index].is_ok()).collect();
-        let mut views: Vec<Vec<ViewObservation<'a>>> = estimates.iter().map(|_| Vec::new()).collect();
+        let mut views: Vec<Vec<ViewObservation>> = estimates.iter().map(|_| Vec::new()).collect();
         let mut meshes = Vec::new();
         if seen.len() > 1 {
             for (place, estimate) in self.places.iter().zip(estimates.iter()) {
@@ -452,21 +452,21 @@ impl EstimatedPerception {
                 let overlap = quality.and_then(|quality| quality.mask_overlap).unwrap_or(0.0);
                 let confidence = if self.masks == Origin::Given { 1.0 } else { overlap };
                 let (mask, edge_colors) = match self.masks {
-                    Origin::Given => (frame.mask.as_ref().map(Cow::Borrowed), Vec::new()),
+                    Origin::Given => (frame.mask.clone(), Vec::new()),
                     Origin::Estimated => match mattes.remove(&(slot, index)) {
-                        Some(Matte { mask, colors }) => (Some(Cow::Owned(mask)), colors),
-                        None => (estimate.masks.get_mut(slot).and_then(Option::take).map(Cow::Owned), Vec::new()),
+                        Some(Matte { mask, colors }) => (Some(mask), colors),
+                        None => (estimate.masks.get_mut(slot).and_then(Option::take), Vec::new()),
                     },
                 };
                 let landmarks = estimate.keypoints.get_mut(slot).and_then(Option::take);
                 own.push(ViewObservation { landmarks, edge_colors, ..ViewObservation::of_mask(mask, confidence) });
             }
             if let (2.., Some(camera)) = (own.len(), self.rig.cameras.get(slot)) {
-                let everybody = union(own.iter().filter_map(|view| view.mask.as_deref()));
+                let everybody = union(own.iter().filter_map(|view| view.mask.as_ref()));
                 if let Some(everybody) = everybody {
                     let parts = stages.time("divide masks", || split_mask(camera, &everybody, &meshes));
                     for (view, (part, others)) in own.iter_mut().zip(parts) {
-                        view.mask = view.mask.is_some().then_some(Cow::Owned(part));
+                        view.mask = view.mask.is_some().then_some(part);
                         view.others = Some(others);
                     }
                 }

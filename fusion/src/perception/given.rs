@@ -1,7 +1,5 @@
 //! People whose poses are known: a simulator's, a recorded motion's.
 
-use std::borrow::Cow;
-
 use flyrig_body::{Template, skin_mesh};
 use flyrig_tracker::{Background, BodyGate, Matte, matte};
 use flyrig_types::{Camera, Frame, FrameSet, Image, Mask, PersonId, Pose, PoseTrack, Rig};
@@ -79,15 +77,15 @@ impl Perception for GivenPerception {
         self.people.iter().map(|given| (given.person, &given.template)).collect()
     }
 
-    fn observe<'a>(&mut self, set: &'a FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation<'a>>, FusionError> {
+    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
         let poses: Vec<Pose> = self.people.iter().map(|given| given.at(set.master_nanos)).collect();
         let (mut masks, mut edge_colors) = (Vec::new(), Vec::new());
         for (slot, frame) in set.present() {
             let (mask, colors) = match self.masks {
-                Origin::Given => (frame.mask.as_ref().map(Cow::Borrowed), Vec::new()),
+                Origin::Given => (frame.mask.clone(), Vec::new()),
                 Origin::Estimated => {
                     let made = stages.time("mask from plate", || self.estimated_mask(slot, frame, &poses))?;
-                    made.map_or_else(Default::default, |Matte { mask, colors }| (Some(Cow::Owned(mask)), colors))
+                    made.map_or_else(Default::default, |Matte { mask, colors }| (Some(mask), colors))
                 }
             };
             masks.push(mask);
@@ -97,14 +95,18 @@ impl Perception for GivenPerception {
             stages.time("background", || self.follow_backgrounds(set, &poses))?;
         }
         let confidence = if self.masks == Origin::Given { 1.0 } else { 0.5 };
-        let mut views: Vec<Vec<ViewObservation<'a>>> = match self.people.as_slice() {
+        let mut views: Vec<Vec<ViewObservation>> = match self.people.as_slice() {
             [_] => vec![masks.into_iter().map(|mask| ViewObservation::of_mask(mask, confidence)).collect()],
             people => stages.time("divide masks", || self.divide(set, people, &poses, &masks, confidence)),
         };
-        for views in &mut views {
-            views.iter_mut().zip(&edge_colors).for_each(|(view, colors)| view.edge_colors.clone_from(colors));
+        for (given, views) in self.people.iter().zip(&mut views) {
+            for ((view, colors), (_, frame)) in views.iter_mut().zip(&edge_colors).zip(set.present()) {
+                view.edge_colors.clone_from(colors);
+                let nanos = frame.capture_nanos;
+                view.pose = (nanos != set.master_nanos).then(|| given.at(nanos)).filter(Pose::is_valid);
+            }
         }
-        let seen = |((given, pose), views): ((&GivenPerson, Pose), Vec<ViewObservation<'a>>)| {
+        let seen = |((given, pose), views): ((&GivenPerson, Pose), Vec<ViewObservation>)| {
             let person = given.person;
             if pose.is_valid() {
                 Observation::Seen(SeenPerson { person, pose, confidence: 1.0, views })
@@ -113,10 +115,6 @@ impl Perception for GivenPerception {
             }
         };
         Ok(self.people.iter().zip(poses).zip(views).map(seen).collect())
-    }
-
-    fn pose_at(&self, person: PersonId, nanos: i64) -> Option<Pose> {
-        self.people.iter().find(|given| given.person == person).map(|given| given.at(nanos))
     }
 }
 
@@ -165,15 +163,15 @@ impl GivenPerception {
     }
 
     /// Divides everybody's masks: by person, then by present frame.
-    fn divide<'a>(
+    fn divide(
         &self,
-        set: &'a FrameSet,
+        set: &FrameSet,
         people: &[GivenPerson],
         poses: &[Pose],
-        masks: &[Option<Cow<'a, Mask>>],
+        masks: &[Option<Mask>],
         confidence: f64,
-    ) -> Vec<Vec<ViewObservation<'a>>> {
-        let mut views: Vec<Vec<ViewObservation<'a>>> = people.iter().map(|_| Vec::new()).collect();
+    ) -> Vec<Vec<ViewObservation>> {
+        let mut views: Vec<Vec<ViewObservation>> = people.iter().map(|_| Vec::new()).collect();
         for ((slot, frame), mask) in set.present().zip(masks) {
             let Some((mask, camera)) = mask.as_ref().zip(self.cameras.get(slot)) else {
                 views.iter_mut().for_each(|views| views.push(ViewObservation::default()));
@@ -191,7 +189,7 @@ impl GivenPerception {
                 })
                 .collect();
             for (views, (own, others)) in views.iter_mut().zip(split_mask(camera, mask, &meshes)) {
-                let mut view = ViewObservation::of_mask(Some(Cow::Owned(own)), confidence);
+                let mut view = ViewObservation::of_mask(Some(own), confidence);
                 view.others = Some(others);
                 views.push(view);
             }

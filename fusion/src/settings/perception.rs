@@ -4,10 +4,11 @@ use std::path::PathBuf;
 
 use clap::builder::{OsStringValueParser, TypedValueParser as _};
 use clap::{Args, ValueEnum};
+use flyrig_tracker::KeyColor;
 use serde::{Deserialize, Serialize};
 
 use super::check;
-use crate::{FusionError, perception::key_color};
+use crate::FusionError;
 
 /// Source of a pose, a shape or a mask.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
@@ -88,6 +89,13 @@ impl PerceptionSettings {
         self.shape.unwrap_or(self.pose)
     }
 
+    /// Returns the key colour; `None` for an empty one.
+    pub(crate) fn key(&self) -> Result<Option<KeyColor>, FusionError> {
+        let text = self.key_color.as_str();
+        let parsed = (!text.is_empty()).then(|| text.parse::<KeyColor>()).transpose();
+        parsed.map_err(|error| FusionError::Setting(format!("perception.key_color: {error}")))
+    }
+
     /// Checks every value.
     ///
     /// # Errors
@@ -95,7 +103,7 @@ impl PerceptionSettings {
     pub fn validate(&self) -> Result<(), FusionError> {
         check("perception.people", self.people as f64, 1.0, 4.0)?;
         check("perception.look_after_m", self.look_after_m, 0.0, 1.0)?;
-        key_color(self)?;
+        self.key()?;
         if self.hands == Origin::Estimated && self.pose == Origin::Given {
             return Err(FusionError::Setting(
                 "perception.hands = \"estimated\" needs perception.pose = \"estimated\"; a given pose brings its own fingers"

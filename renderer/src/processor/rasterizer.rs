@@ -10,7 +10,7 @@ use super::blend::{BlendTile, Tile};
 use super::lanes::{LANES, vectorized};
 use super::lists::{Attributes, Lists};
 use super::project::{Projection, TILE};
-use crate::raster::{Latest, tile_range};
+use crate::raster_settings::{Latest, tile_range};
 use crate::{GaussianBuffers, Outputs, RasterSettings, RasterStats, RenderTarget};
 
 /// [`Rasterizer`](crate::Rasterizer) on the processor: draws when a picture is recorded.

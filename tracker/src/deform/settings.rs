@@ -5,7 +5,7 @@
 pub enum DeformSolver {
     /// Plain gradient descent as in FlyHuman section 3.1: 10 iterations for the first 10 frames, then 2.
     Paper {
-        /// Length of a step over the gradient, square metres a unit of loss. The paper does not tell its own.
+        /// Length of a step over the gradient, square metres a unit of loss. The paper gives no value.
         rate: f64,
     },
     /// Damped Gauss-Newton with the graph Laplacian.
@@ -17,7 +17,7 @@ pub enum DeformSolver {
     },
 }
 
-/// Weights and limits. In another unit of length everything here that has metres in its unit must be told in that one,
+/// Weights and limits. In another unit of length everything here that has metres in its unit must be given in that one,
 /// and the solution is the same.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DeformSettings {
@@ -32,7 +32,7 @@ pub struct DeformSettings {
     /// Price of a node's distance from where its pose puts it, units of loss a square metre. Without, a shift of all nodes
     /// together costs nothing, and a free pose has nothing to win.
     pub anchor: f64,
-    /// Share of this frame's translation in the smoothed one of Eq. 4, 0..=1. The paper does not tell its own.
+    /// Share of this frame's translation in the smoothed one of Eq. 4, 0..=1. The paper gives no value.
     pub smoothing: f64,
     /// Levenberg damping to begin with, as a share of the mean diagonal of the data's matrix.
     pub damping: f64,

@@ -168,7 +168,7 @@ impl DeformTracker {
         Ok(self)
     }
 
-    /// Learns how thick the clothes of every part are where the pictures tell it, and believes it where they do not. One
+    /// Estimates the thickness of clothes on each part where images constrain it, and applies it where they do not. One
     /// canonical unit normal and one part number a node. Gradient descent knows nothing of it.
     ///
     /// # Errors
@@ -337,7 +337,7 @@ impl DeformTracker {
         all_dropped
     }
 
-    /// All of the loss that the pictures do not tell, and its gradient by the nodes where asked.
+    /// Returns the regularisation terms of the loss and, where asked, their gradient by the nodes.
     fn prior(&self, gradient: Option<&mut [DVec3]>) -> f64 {
         self.regularizer.loss(&self.translations, &self.smooth, self.thickness.as_ref(), gradient)
             + self.pose.as_ref().map_or(0.0, PoseFix::loss)
@@ -433,7 +433,7 @@ impl DeformTracker {
         self.displace();
     }
 
-    /// Moves the nodes and tells the loss there. A step or a loss that is not finite is undone, and so is one that the
+    /// Moves the nodes and returns the loss there. A step or a loss that is not finite is undone, and so is one that the
     /// data term fails at.
     fn try_step<D: DataTerm>(&mut self, step: &[DVec3], data: &mut D) -> Result<f64, D::Error> {
         let old = (self.translations.clone(), self.correction().clone());

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use flyrig_stream::{Joint, LAYERS, MAX_MESSAGE_BYTES, Stamp, Template, TemplateSource};
+use flyrig_stream::{LAYERS, MAX_MESSAGE_BYTES, Stamp, StreamJoint, StreamTemplate, TemplateSource};
 use flyrig_transport::{Interests, MAX_PERSON_TOPICS, PersonMessage, PublishOutcome, Received, Subscriber};
 
 use crate::support::*;
@@ -13,7 +13,7 @@ fn people() -> Interests {
 
 /// Bytes of a template that takes several chunks.
 fn template(count: usize) -> Vec<u8> {
-    let joint = Joint {
+    let joint = StreamJoint {
         parent: None,
         translation: [0.0; 3],
         joint_from_canonical: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]],
@@ -47,7 +47,7 @@ fn a_person_arrives_with_its_template() {
     publisher.offer_template(0, hash, bytes.clone().into());
     let fetched = subscriber.template(hash, Duration::from_secs(20)).unwrap().unwrap();
     assert!(fetched == bytes);
-    assert_eq!(Template::decode(&fetched).unwrap().gaussians(), 30_000);
+    assert_eq!(StreamTemplate::decode(&fetched).unwrap().gaussians(), 30_000);
     // Nobody has that one.
     assert_eq!(subscriber.template(hash ^ 1, Duration::from_secs(5)).unwrap(), None);
 

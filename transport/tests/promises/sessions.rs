@@ -3,7 +3,7 @@
 use std::{sync::Arc, time::Duration};
 
 use flyrig_transport::{
-    Interests, PublishOutcome, Publisher, RigStats, StageTime, Subscriber, TransportConfig, TransportErrorKind, Views,
+    Interests, PublishOutcome, Publisher, RigStats, StageStats, Subscriber, TransportConfig, TransportErrorKind, Views,
 };
 
 use crate::support::*;
@@ -57,7 +57,7 @@ fn splats_and_statistics_come_out_as_they_went_in() {
         frame: 9,
         capture_nanos: -1,
         frames_per_second: 29.97,
-        stages: vec![StageTime { stage: "render".into(), mean_millis: 4.5, p95_millis: 9.25 }],
+        stages: vec![StageStats { stage: "render".into(), mean_millis: 4.5, p95_millis: 9.25 }],
         dropped: [("sync".to_owned(), 3)].into(),
         ..RigStats::default()
     };

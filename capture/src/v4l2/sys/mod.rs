@@ -29,8 +29,7 @@ use v4l::{
 use self::buffers::Mapping;
 pub(crate) use self::settings::{ActiveFormat, Capability, ControlRange, SizeRange};
 
-/// Most memory planes of a buffer (`VIDEO_MAX_PLANES`).
-pub(crate) const MAX_PLANES: usize = 8;
+pub(crate) use super::queue::MAX_PLANES;
 
 /// Plain data of the kernel's interface, for which all zeros is a value.
 ///

@@ -181,7 +181,7 @@ impl Rig {
         }
     }
 
-    /// The same rig with its streams started anew.
+    /// The same rig with its streams started again.
     pub fn restarted(self) -> Self {
         let cameras = self.cameras;
         drop(self);

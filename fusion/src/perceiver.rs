@@ -1,0 +1,83 @@
+//! One set's perception as a job that may run beside the reconstruction of the set before.
+
+use std::time::{Duration, Instant};
+
+use flyrig_body::Template;
+use flyrig_types::{FrameSet, PersonId};
+
+use crate::{Effort, FusionError, Observation, Perception, StageTimes};
+
+/// What perception found in one set.
+pub(crate) enum Perceived {
+    /// Nothing moved: the set is left out.
+    Still,
+    /// The set was looked at.
+    People {
+        /// One element a known person.
+        observations: Vec<Observation>,
+        /// People whom the session did not know when perception began.
+        newcomers: Vec<(PersonId, Template)>,
+        /// The work that the set gets.
+        effort: Effort,
+        /// Run times of perception's stages.
+        stages: StageTimes,
+        /// Run time of perception.
+        took: Duration,
+    },
+}
+
+/// A [`Perception`] with what the next set needs of the session.
+pub(crate) struct Perceiver {
+    perception: Box<dyn Perception>,
+    effort: Effort,
+    /// People of the session.
+    known: Vec<PersonId>,
+}
+
+impl Perceiver {
+    pub fn new(perception: Box<dyn Perception>) -> Self {
+        Self { perception, effort: Effort::FULL, known: Vec::new() }
+    }
+
+    /// Chooses the work for the next set, and whom the session knows.
+    pub fn ready(&mut self, effort: Effort, known: Vec<PersonId>) {
+        (self.effort, self.known) = (effort, known);
+    }
+
+    /// Observes everybody in a set.
+    ///
+    /// # Errors
+    /// Those of [`Perception::observe`].
+    pub fn perceive(&mut self, set: &FrameSet) -> Result<Perceived, FusionError> {
+        let (start, mut stages) = (Instant::now(), StageTimes::default());
+        self.perception.set_effort(self.effort);
+        let observations = self.perception.observe(set, &mut stages)?;
+        let newcomers = self.newcomers(&self.known);
+        Ok(Perceived::People { observations, newcomers, effort: self.effort, stages, took: start.elapsed() })
+    }
+
+    /// People whom perception knows but who are not among `known`, with their templates.
+    pub fn newcomers(&self, known: &[PersonId]) -> Vec<(PersonId, Template)> {
+        let people = self.perception.people().into_iter();
+        people.filter(|(id, _)| !known.contains(id)).map(|(id, template)| (id, template.clone())).collect()
+    }
+}
+
+impl Default for Perceiver {
+    fn default() -> Self {
+        Self::new(Box::new(Nobody))
+    }
+}
+
+/// Finds nobody.
+struct Nobody;
+
+impl Perception for Nobody {
+    fn people(&self) -> Vec<(PersonId, &Template)> {
+        Vec::new()
+    }
+
+    fn observe(&mut self, _: &FrameSet, _: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
+        Ok(Vec::new())
+    }
+}

@@ -1,0 +1,80 @@
+//! Settings of a rendering, and figures of the latest one.
+
+/// Which pictures of a [`crate::RenderTarget`] are written; the others keep their content.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Outputs {
+    /// [`crate::RenderTarget::color`].
+    pub color: bool,
+    /// [`crate::RenderTarget::depth`].
+    pub depth: bool,
+    /// [`crate::RenderTarget::canonical`].
+    pub canonical: bool,
+}
+
+impl Outputs {
+    /// Every picture.
+    pub const ALL: Self = Self { color: true, depth: true, canonical: true };
+    /// Colour and alpha only.
+    pub const COLOR: Self = Self { color: true, depth: false, canonical: false };
+    /// Colour, alpha and canonical positions: the inputs of direct appearance.
+    pub const SURFACE: Self = Self { color: true, depth: false, canonical: true };
+}
+
+/// How to render.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RasterSettings {
+    /// Gaussians whose centre is closer to the camera's plane are skipped, metres.
+    pub near_m: f32,
+    /// Skip Gaussians whose normal points away from the camera ([`crate::BACKFACING_COSINE`]). For closed surfaces.
+    pub cull_backfacing: bool,
+    /// What to write.
+    pub outputs: Outputs,
+    /// Variance of the low-pass filter that is added to every splat on the screen, square pixels.
+    /// The splat's opacity falls so that its integral stays: Mip-Splatting's 2D Mip filter (Yu et al.
+    /// 2024, Eq. 10). 0.1 is that paper's value for one pixel.
+    pub filter_variance_px2: f32,
+    /// Only the tiles that this part of the picture touches are blended, `[left, top, right, bottom]` in pixels, right
+    /// and bottom excluded; all others keep their content. None: the whole picture.
+    pub area: Option<[u32; 4]>,
+}
+
+impl Default for RasterSettings {
+    fn default() -> Self {
+        Self { near_m: 0.05, cull_backfacing: true, outputs: Outputs::ALL, filter_variance_px2: 0.1, area: None }
+    }
+}
+
+/// What the latest picture needed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RasterStats {
+    /// Gaussians that touch the picture.
+    pub visible_gaussians: u32,
+    /// Pairs of a Gaussian and a tile, at most one more than there is room for.
+    pub pairs: u32,
+    /// Pictures since this rasteriser was made that wanted more pairs than there was room for: they
+    /// lack their farthest Gaussians.
+    pub overflowed_pictures: u32,
+}
+
+/// What the backward pass must know about the picture that was recorded last.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Latest {
+    pub gaussians: usize,
+    pub size: [u32; 2],
+    /// Columns and rows of tiles that were blended.
+    pub blended: [u32; 2],
+    pub outputs: Outputs,
+}
+
+/// First tile, and columns and rows of the tiles that an area of pixels touches.
+pub(crate) fn tile_range(area: Option<[u32; 4]>, tiles: [u32; 2], tile: u32) -> ([u32; 2], [u32; 2]) {
+    let Some([left, top, right, bottom]) = area else { return ([0; 2], tiles) };
+    let range = |first: u32, end: u32, count: u32| {
+        let tiles = if first < end { end.div_ceil(tile).min(count) } else { 0 };
+        let first = (first / tile).min(count);
+        (first, tiles.saturating_sub(first))
+    };
+    let (x, columns) = range(left, right, tiles[0]);
+    let (y, rows) = range(top, bottom, tiles[1]);
+    ([x, y], [columns, rows])
+}

@@ -1,0 +1,117 @@
+//! Where a mask may be: near the posed body.
+
+use flyrig_types::{Camera, Mask};
+use glam::{DVec2, Vec3};
+
+use crate::grid::Grid;
+
+/// How far most clothes and hair stand off the fitted body, metres: the unit of a gate's distances.
+const REACH_M: f64 = 0.13;
+/// How far a wide skirt or a coat may stand off, as a multiple: beyond 1, only where picture and background speak for it.
+pub(crate) const CLOTHES_REACH: f32 = 2.5;
+/// Where a posed body and its clothes may be in a picture.
+#[derive(Debug, Clone)]
+pub struct BodyGate {
+    /// Width and height of the picture.
+    pub(crate) image: [usize; 2],
+    /// Box that holds everything allowed: x0, y0, x1, y1 (ends excluded).
+    pub(crate) bounds: [usize; 4],
+    /// Distance to the projected body in units of [`REACH_M`], 0 on the body; the size of the box.
+    pub(crate) distance: Grid,
+    /// Pixels that a metre takes at the body.
+    pub(crate) px_per_m: f64,
+}
+
+impl BodyGate {
+    /// Projects the world vertices (metres) and triangles of one or several bodies; `None` when nothing of them is in the
+    /// picture.
+    #[must_use]
+    pub fn new(camera: &Camera, vertices: &[Vec3], triangles: &[[u32; 3]]) -> Option<Self> {
+        let mut depths: Vec<f64> = vertices
+            .iter()
+            .step_by(37)
+            .map(|v| camera.camera_from_world.transform_point(v.as_dvec3()).z)
+            .filter(|z| *z > 0.1)
+            .collect();
+        let depth = flyrig_solve::median(&mut depths)?;
+        let px_per_m = camera.intrinsics.focal_px.x / depth;
+        let reach = REACH_M * px_per_m;
+        let (bounds, body) = drawn_body(camera, vertices, triangles, reach * f64::from(CLOTHES_REACH))?;
+        let mut distance = body.distance_to_set();
+        for value in &mut distance.values {
+            *value /= reach as f32;
+        }
+        let image = [camera.intrinsics.width as usize, camera.intrinsics.height as usize];
+        Some(Self { image, bounds, distance, px_per_m })
+    }
+
+    /// Whether a pixel may show the body or its clothes.
+    pub(crate) fn reaches(&self, x: usize, y: usize) -> bool {
+        let [x0, y0, x1, y1] = self.bounds;
+        (x0..x1).contains(&x)
+            && (y0..y1).contains(&y)
+            && self.distance.values[(y - y0) * self.distance.width + x - x0] < CLOTHES_REACH
+    }
+
+    /// The same of a pixel's index, row by row.
+    pub(crate) fn reaches_pixel(&self, pixel: usize) -> bool {
+        self.reaches(pixel % self.image[0], pixel / self.image[0])
+    }
+
+    /// The gate of a body drawn as 1 in a grid of the picture's size.
+    #[cfg(test)]
+    pub(crate) fn of_grid(body: &Grid, px_per_m: f64) -> Self {
+        let mut distance = body.distance_to_set();
+        distance.values.iter_mut().for_each(|d| *d /= (REACH_M * px_per_m) as f32);
+        Self { image: [body.width, body.height], bounds: [0, 0, body.width, body.height], distance, px_per_m }
+    }
+
+    /// Intersection over union of a mask of the whole picture and the body's outline.
+    pub(crate) fn overlap(&self, mask: &Mask) -> f64 {
+        let [x0, y0, ..] = self.bounds;
+        let (mut both, mut body) = (0usize, 0usize);
+        for (i, distance) in self.distance.values.iter().enumerate() {
+            let (x, y) = (i % self.distance.width + x0, i / self.distance.width + y0);
+            let inside = mask.coverage()[y * mask.width() as usize + x] >= 128;
+            let on_body = *distance <= 0.0;
+            body += usize::from(on_body);
+            both += usize::from(on_body && inside);
+        }
+        both as f64 / (mask.area_px() + body - both).max(1) as f64
+    }
+}
+
+/// Draws a posed body: the box around it with a margin in pixels (x0, y0, x1, y1, ends excluded), and 1 on the body inside
+/// that box. `None` when nothing of it is in the image.
+pub(crate) fn drawn_body(
+    camera: &Camera,
+    vertices: &[Vec3],
+    triangles: &[[u32; 3]],
+    margin_px: f64,
+) -> Option<([usize; 4], Grid)> {
+    let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
+    let pixels: Vec<Option<DVec2>> = vertices.iter().map(|v| camera.project(v.as_dvec3())).collect();
+    let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+    for pixel in pixels.iter().flatten() {
+        (low, high) = (low.min(*pixel), high.max(*pixel));
+    }
+    let side = |value: f64, limit: usize| value.clamp(0.0, limit as f64) as usize;
+    let bounds = [
+        side(low.x - margin_px, width),
+        side(low.y - margin_px, height),
+        side(high.x + margin_px + 1.0, width),
+        side(high.y + margin_px + 1.0, height),
+    ];
+    if bounds[2] <= bounds[0] || bounds[3] <= bounds[1] {
+        return None;
+    }
+    let mut body = Grid::new(bounds[2] - bounds[0], bounds[3] - bounds[1], 0.0);
+    let origin = DVec2::new(bounds[0] as f64, bounds[1] as f64);
+    for triangle in triangles {
+        let corner = |k: usize| pixels.get(triangle[k] as usize).copied().flatten().map(|p| p - origin);
+        if let (Some(a), Some(b), Some(c)) = (corner(0), corner(1), corner(2)) {
+            body.fill_triangle(a, b, c);
+        }
+    }
+    Some((bounds, body))
+}
