@@ -47,7 +47,7 @@ fn estimated_fingers_are_nearer_to_the_true_ones_than_the_relaxed_hand() {
     let given_pose = PerceptionSettings { pose: Origin::Given, ..settings.clone() };
     assert!(given_pose.validate().unwrap_err().to_string().contains("perception.hands"));
     let mut perception = EstimatedPerception::new(&rig, &template, &settings, &plates).unwrap();
-    assert_eq!(perception.people()[0].1.skeleton.joints().len(), 59);
+    assert_eq!(perception.people()[0].template.skeleton.joints().len(), 59);
     let off = HandConfig { fingers: false, head: false, ..HandConfig::default() };
     let mut relaxed = HandTracker::new(&template, &rig, off).unwrap();
     let measure = HandTracker::new(&template, &rig, off).unwrap();

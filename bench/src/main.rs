@@ -28,6 +28,8 @@ mod desync_tests;
 #[cfg(test)]
 mod hands_tests;
 #[cfg(test)]
+mod other_person_tests;
+#[cfg(test)]
 mod state_tests;
 
 use std::process::ExitCode;

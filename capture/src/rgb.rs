@@ -3,6 +3,8 @@
 //! YUV is what cameras deliver: ITU-R BT.601 with limited range (Y 16 to 235, U and V 16 to 240),
 //! the chroma of a pair or a 2x2 block used for all of its pixels.
 
+use std::array::from_fn;
+
 use flyrig_types::{Image, PixelFormat};
 
 use crate::{
@@ -57,19 +59,24 @@ pub(crate) fn convert(image: &Image, rgb: &mut Vec<u8>, scratch: &mut JpegScratc
             if width % 2 != 0 {
                 return Err(unsupported(format!("{format:?} needs an even width, not {width}")));
             }
-            let pairs = pixels(4).zip(rgb.chunks_exact_mut(6));
-            if format == PixelFormat::Yuyv {
-                pairs.for_each(|(p, out)| pair_of_yuv([p[0], p[2]], p[1], p[3], out));
-            } else {
-                pairs.for_each(|(p, out)| pair_of_yuv([p[1], p[3]], p[0], p[2], out));
-            }
+            // Offsets of the two lumas, U and V in a pair of pixels.
+            let offsets = if format == PixelFormat::Yuyv { [0, 2, 1, 3] } else { [1, 3, 0, 2] };
+            packed_to_rgb(bytes, offsets, rgb);
         }
         PixelFormat::Nv12 => {
             let (luma, chroma) = bytes.split_at(width * height);
             let rows = luma.chunks_exact(width).zip(rgb.chunks_exact_mut(width * 3));
             for (y, (row, out)) in rows.enumerate() {
-                let uv = chroma[y / 2 * width.div_ceil(2) * 2..].chunks_exact(2);
-                for ((lumas, out), uv) in row.chunks(2).zip(out.chunks_mut(6)).zip(uv) {
+                let chroma = &chroma[y / 2 * width.div_ceil(2) * 2..];
+                let (blocks, rest) = row.as_chunks::<BLOCK>();
+                let (colors, rest_out) = out.as_chunks_mut::<{ 3 * BLOCK }>();
+                let (chromas, _) = chroma.as_chunks::<BLOCK>();
+                for ((luma, uv), out) in blocks.iter().zip(chromas).zip(colors) {
+                    let [u, v] = from_fn(|k| from_fn(|i| uv[2 * i + k]));
+                    block_of_yuv(luma, &u, &v, out);
+                }
+                let uv = chroma[blocks.len() * BLOCK..].chunks_exact(2);
+                for ((lumas, out), uv) in rest.chunks(2).zip(rest_out.chunks_mut(6)).zip(uv) {
                     let chroma = chroma_of(uv[0], uv[1]);
                     for (&luma, out) in lumas.iter().zip(out.chunks_exact_mut(3)) {
                         out.copy_from_slice(&rgb_of(luma, chroma));
@@ -118,11 +125,36 @@ fn chroma_of(u: u8, v: u8) -> [i32; 3] {
     [104_597 * v, -25_675 * u - 53_279 * v, 132_201 * u]
 }
 
-/// Two pixels with one chroma.
-fn pair_of_yuv(y: [u8; 2], u: u8, v: u8, out: &mut [u8]) {
-    let chroma = chroma_of(u, v);
-    out[..3].copy_from_slice(&rgb_of(y[0], chroma));
-    out[3..6].copy_from_slice(&rgb_of(y[1], chroma));
+/// Pixels of a block, whose arithmetic the compiler turns into vector instructions; even, so that it ends with a pair.
+const BLOCK: usize = 32;
+
+/// Pairs of pixels with one chroma, whose four bytes are [luma, luma, U, V] at these offsets.
+fn packed_to_rgb(bytes: &[u8], [first, second, u, v]: [usize; 4], rgb: &mut [u8]) {
+    let (blocks, rest) = bytes.as_chunks::<{ 2 * BLOCK }>();
+    let (colors, rest_out) = rgb.as_chunks_mut::<{ 3 * BLOCK }>();
+    for (bytes, out) in blocks.iter().zip(colors) {
+        let luma = from_fn(|i| bytes[4 * (i / 2) + if i % 2 == 0 { first } else { second }]);
+        block_of_yuv(&luma, &from_fn(|i| bytes[4 * i + u]), &from_fn(|i| bytes[4 * i + v]), out);
+    }
+    for (bytes, out) in rest.chunks_exact(4).zip(rest_out.chunks_exact_mut(6)) {
+        let chroma = chroma_of(bytes[u], bytes[v]);
+        out[..3].copy_from_slice(&rgb_of(bytes[first], chroma));
+        out[3..].copy_from_slice(&rgb_of(bytes[second], chroma));
+    }
+}
+
+/// [`rgb_of`] for a block of pixels, two with one chroma.
+#[inline]
+fn block_of_yuv(luma: &[u8; BLOCK], u: &[u8; BLOCK / 2], v: &[u8; BLOCK / 2], out: &mut [u8; 3 * BLOCK]) {
+    // Planes first: written three bytes at a time, nothing would be computed in vectors.
+    let mut planes = [[0u8; BLOCK]; 3];
+    for i in 0..BLOCK {
+        let color = rgb_of(luma[i], chroma_of(u[i / 2], v[i / 2]));
+        (planes[0][i], planes[1][i], planes[2][i]) = (color[0], color[1], color[2]);
+    }
+    for i in 0..BLOCK {
+        (out[3 * i], out[3 * i + 1], out[3 * i + 2]) = (planes[0][i], planes[1][i], planes[2][i]);
+    }
 }
 
 /// Bilinear: a colour that a pixel lacks is the mean of its neighbours of that colour; the border
@@ -205,21 +237,25 @@ mod tests {
 
     #[test]
     fn packed_yuv_has_its_bytes_in_order() {
-        let bytes = noise(6 * 4 * 2);
-        let expected: Vec<f64> = bytes
-            .chunks(4)
-            .flat_map(|p| [reference(p[0], p[1], p[3]), reference(p[2], p[1], p[3])])
-            .flatten()
-            .collect();
-        close(&convert(6, 4, PixelFormat::Yuyv, bytes.clone()).unwrap(), &expected);
-        let swapped = bytes.chunks(2).flat_map(|p| [p[1], p[0]]).collect();
-        close(&convert(6, 4, PixelFormat::Uyvy, swapped).unwrap(), &expected);
+        // Blocks and a rest; a rest alone.
+        for (width, height) in [(6, 4), (54, 3), (64, 1)] {
+            let bytes = noise(width * height * 2);
+            let (width, height) = (width as u32, height as u32);
+            let expected: Vec<f64> = bytes
+                .chunks(4)
+                .flat_map(|p| [reference(p[0], p[1], p[3]), reference(p[2], p[1], p[3])])
+                .flatten()
+                .collect();
+            close(&convert(width, height, PixelFormat::Yuyv, bytes.clone()).unwrap(), &expected);
+            let swapped = bytes.chunks(2).flat_map(|p| [p[1], p[0]]).collect();
+            close(&convert(width, height, PixelFormat::Uyvy, swapped).unwrap(), &expected);
+        }
         assert_eq!(convert(3, 1, PixelFormat::Yuyv, noise(6)).unwrap_err().kind, CaptureErrorKind::Unsupported);
     }
 
     #[test]
     fn nv12_of_even_and_odd_size() {
-        for (width, height) in [(6usize, 4usize), (5, 3), (1, 1)] {
+        for (width, height) in [(6usize, 4usize), (5, 3), (1, 1), (64, 2), (99, 5)] {
             let chroma_width = width.div_ceil(2);
             let bytes = noise(width * height + chroma_width * height.div_ceil(2) * 2);
             let mut expected = Vec::new();

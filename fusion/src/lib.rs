@@ -44,8 +44,8 @@ pub use live_rig::{LiveRig, LiveStep};
 pub use live_views::{LiveViews, OutputSettings};
 pub use memory::PersonMemory;
 pub use perception::{
-    EstimatedPerception, GivenPerception, GivenPerson, Observation, Perception, SHAPE_SECS, SHAPE_SETS, SeenPerson,
-    ViewObservation,
+    EstimatedPerception, GivenPerception, GivenPerson, KnownPerson, Observation, Perception, SHAPE_SECS, SHAPE_SETS,
+    SeenPerson, ViewObservation,
 };
 pub use person_stream::{PersonEncoder, PersonFrame, PersonMessages};
 pub use rig_watch::{RigWatch, WatchEvent};

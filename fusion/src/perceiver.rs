@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use flyrig_body::Template;
 use flyrig_types::{FrameSet, PersonId};
 
-use crate::{Effort, FusionError, Observation, Perception, StageTimes};
+use crate::{Effort, FusionError, KnownPerson, Observation, Perception, StageTimes};
 
 /// What perception found in one set.
 pub(crate) enum Perceived {
@@ -15,8 +15,8 @@ pub(crate) enum Perceived {
     People {
         /// One element a known person.
         observations: Vec<Observation>,
-        /// People whom the session did not know when perception began.
-        newcomers: Vec<(PersonId, Template)>,
+        /// People whom the session did not know when perception began, or knew in another shape.
+        newcomers: Vec<Newcomer>,
         /// The work that the set gets.
         effort: Effort,
         /// Run times of perception's stages.
@@ -26,12 +26,19 @@ pub(crate) enum Perceived {
     },
 }
 
+/// A person who is new to the session.
+pub(crate) struct Newcomer {
+    pub person: PersonId,
+    pub shape: u32,
+    pub template: Template,
+}
+
 /// A [`Perception`] with what the next set needs of the session.
 pub(crate) struct Perceiver {
     perception: Box<dyn Perception>,
     effort: Effort,
-    /// People of the session.
-    known: Vec<PersonId>,
+    /// People of the session, and the numbers of their shapes.
+    known: Vec<(PersonId, u32)>,
 }
 
 impl Perceiver {
@@ -40,7 +47,7 @@ impl Perceiver {
     }
 
     /// Chooses the work for the next set, and whom the session knows.
-    pub fn ready(&mut self, effort: Effort, known: Vec<PersonId>) {
+    pub fn ready(&mut self, effort: Effort, known: Vec<(PersonId, u32)>) {
         (self.effort, self.known) = (effort, known);
     }
 
@@ -56,10 +63,12 @@ impl Perceiver {
         Ok(Perceived::People { observations, newcomers, effort: self.effort, stages, took: start.elapsed() })
     }
 
-    /// People whom perception knows but who are not among `known`, with their templates.
-    pub fn newcomers(&self, known: &[PersonId]) -> Vec<(PersonId, Template)> {
+    /// People whom perception knows but who are not among `known` in this shape.
+    pub fn newcomers(&self, known: &[(PersonId, u32)]) -> Vec<Newcomer> {
         let people = self.perception.people().into_iter();
-        people.filter(|(id, _)| !known.contains(id)).map(|(id, template)| (id, template.clone())).collect()
+        let is_new = |found: &KnownPerson<'_>| !known.contains(&(found.person, found.shape));
+        let newcomer = |KnownPerson { person, shape, template }| Newcomer { person, shape, template: template.clone() };
+        people.filter(is_new).map(newcomer).collect()
     }
 }
 
@@ -73,7 +82,7 @@ impl Default for Perceiver {
 struct Nobody;
 
 impl Perception for Nobody {
-    fn people(&self) -> Vec<(PersonId, &Template)> {
+    fn people(&self) -> Vec<KnownPerson<'_>> {
         Vec::new()
     }
 

@@ -16,9 +16,9 @@ use crate::{Effort, FusionError, StageTimes};
 
 /// Finds people in frame sets. Sets come in the order of their times.
 pub trait Perception: Send {
-    /// The people known so far, each with a template of their shape in its bind pose. People may be added while the session
-    /// runs; the template of a known person does not change.
-    fn people(&self) -> Vec<(PersonId, &Template)>;
+    /// The people known so far. People may be added while the session runs. A person whose shape number changes is somebody
+    /// else: the session forgets what it has learnt about the person.
+    fn people(&self) -> Vec<KnownPerson<'_>>;
 
     /// Observes every known person in one set: one element a person, in the order of [`Self::people`].
     ///
@@ -30,6 +30,17 @@ pub trait Perception: Send {
     fn set_effort(&mut self, effort: Effort) {
         let _ = effort;
     }
+}
+
+/// A person whose shape is known.
+#[derive(Debug, Clone, Copy)]
+pub struct KnownPerson<'a> {
+    /// Who.
+    pub person: PersonId,
+    /// Number of the shape; another one for another template.
+    pub shape: u32,
+    /// The person's shape in its bind pose.
+    pub template: &'a Template,
 }
 
 /// Observation of one person in a set.

@@ -2,7 +2,6 @@
 
 use std::{collections::BTreeMap, sync::Arc, time::Instant};
 
-use flyrig_body::Template;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::{GaussianBuffers, Splat};
 use flyrig_types::{Camera, Frame, FrameSet, PersonId, Pose, RenderedView, Rig};
@@ -11,7 +10,7 @@ use crate::{
     Budget, Effort, FusionError, NetworksOn, Observation, Perception, PersonFrame, PersonMemory, Remedy, SeenPerson,
     SessionSettings, StageTimes, Subject, ViewObservation,
     drawing::Drawing,
-    perceiver::{Perceived, Perceiver},
+    perceiver::{Newcomer, Perceived, Perceiver},
     stillness::Stillness,
     subject::{InputView, Observed},
 };
@@ -221,7 +220,8 @@ impl Session {
     }
 
     fn ready_perceiver(&mut self) {
-        self.perceiver.ready(self.budget.effort(), self.subjects.iter().map(Subject::id).collect());
+        let known = self.subjects.iter().map(|subject| (subject.id(), subject.shape)).collect();
+        self.perceiver.ready(self.budget.effort(), known);
     }
 
     /// Takes perception back.
@@ -247,7 +247,7 @@ impl Session {
         &mut self,
         set: &FrameSet,
         observations: Vec<Observation>,
-        newcomers: Vec<(PersonId, Template)>,
+        newcomers: Vec<Newcomer>,
         effort: Effort,
     ) -> Result<Outcome, FusionError> {
         self.gpu.check()?;
@@ -273,13 +273,15 @@ impl Session {
         Ok(outcome)
     }
 
-    /// Makes subjects of people who are none yet.
-    fn add_people(&mut self, people: Vec<(PersonId, Template)>) -> Result<(), FusionError> {
-        for (id, template) in people {
-            if self.subjects.iter().any(|subject| subject.id() == id) {
+    /// Makes subjects of people who are none yet, and of those whose shape is another now.
+    fn add_people(&mut self, people: Vec<Newcomer>) -> Result<(), FusionError> {
+        for Newcomer { person: id, shape, template } in people {
+            let place = self.subjects.iter().position(|subject| subject.id() == id);
+            if place.is_some_and(|place| self.subjects[place].shape == shape) {
                 continue;
             }
             let mut subject = Subject::new(&self.gpu, id, template, &self.rig, &self.settings)?;
+            subject.shape = shape;
             if self.keep_observations {
                 subject.keep_observations(&self.gpu)?;
             }
@@ -287,7 +289,10 @@ impl Session {
             if let Some(memory) = self.saved.remove(&id) {
                 subject.restore(&self.gpu, &memory)?;
             }
-            self.subjects.push(subject);
+            match place {
+                Some(place) => self.subjects[place] = subject,
+                None => self.subjects.push(subject),
+            }
         }
         Ok(())
     }

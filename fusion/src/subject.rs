@@ -84,6 +84,8 @@ enum Networks {
 #[derive(Debug)]
 pub struct Subject {
     id: PersonId,
+    /// Number of the shape, see [`crate::KnownPerson`].
+    pub(crate) shape: u32,
     template: Template,
     /// The same for those who draw the person themselves.
     stream_template: Arc<EncodedTemplate>,
@@ -163,6 +165,7 @@ impl Subject {
         let stream_template = encode_template(drawn, deform.as_ref().map(|_| graph), &template.skeleton)?;
         Ok(Self {
             id,
+            shape: 0,
             stream_template: Arc::new(stream_template),
             skinner: GpuSkinner::new(gpu, drawn, &template.skeleton)?,
             shape_held: false,
@@ -571,7 +574,7 @@ impl Subject {
         self.curve.clone_from(&old.curve);
         self.last_pose.clone_from(&old.last_pose);
         self.viewed.clone_from(&old.viewed);
-        (self.confidence, self.shape_held) = (old.confidence, old.shape_held);
+        (self.confidence, self.shape_held, self.shape) = (old.confidence, old.shape_held, old.shape);
         if resumed {
             self.watch.clone_from(&old.watch);
             // Those on the adapter went with the device.

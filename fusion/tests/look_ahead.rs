@@ -8,11 +8,10 @@ use std::{
     time::Duration,
 };
 
-use flyrig_body::Template;
 use flyrig_capture::Pacing;
 use flyrig_fusion::{
-    FusionError, GivenPerception, InputFormat, Intake, LiveRig, LiveViews, Observation, Outcome, OutputSettings,
-    Perception, SessionBuilder, StageTimes,
+    FusionError, GivenPerception, InputFormat, Intake, KnownPerson, LiveRig, LiveViews, Observation, Outcome,
+    OutputSettings, Perception, SessionBuilder, StageTimes,
 };
 use flyrig_sync::SyncSettings;
 use flyrig_types::{FrameSet, PersonId};
@@ -29,7 +28,7 @@ struct Logged {
 }
 
 impl Perception for Logged {
-    fn people(&self) -> Vec<(PersonId, &Template)> {
+    fn people(&self) -> Vec<KnownPerson<'_>> {
         self.inner.people()
     }
 

@@ -5,11 +5,10 @@ mod support;
 
 use std::time::Duration;
 
-use flyrig_body::Template;
 use flyrig_capture::Pacing;
 use flyrig_fusion::{
-    FusionError, GivenPerception, InputFormat, Intake, LiveRig, LiveViews, Observation, Outcome, OutputSettings,
-    Perception, SessionBuilder, StageTimes,
+    FusionError, GivenPerception, InputFormat, Intake, KnownPerson, LiveRig, LiveViews, Observation, Outcome,
+    OutputSettings, Perception, SessionBuilder, StageTimes,
 };
 use flyrig_sync::SyncSettings;
 use flyrig_types::{FrameSet, PersonId, SupervisedThread};
@@ -25,7 +24,7 @@ struct Unlucky {
 }
 
 impl Perception for Unlucky {
-    fn people(&self) -> Vec<(PersonId, &Template)> {
+    fn people(&self) -> Vec<KnownPerson<'_>> {
         self.inner.people()
     }
 

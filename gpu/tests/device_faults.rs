@@ -10,7 +10,8 @@ fn a_rejected_command_is_a_fault_of_the_device() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     assert!(gpu.check().is_ok());
     let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::STORAGE;
-    let _ = gpu.device.create_buffer(&wgpu::BufferDescriptor { label: None, size: 16, usage, mapped_at_creation: false });
+    let _ =
+        gpu.device.create_buffer(&wgpu::BufferDescriptor { label: None, size: 16, usage, mapped_at_creation: false });
     let fault = gpu.wait().unwrap_err();
     assert!(matches!(fault, GpuError::Rejected(_)) && fault.is_device_fault(), "{fault}");
     assert!(gpu.reopen().unwrap().wait().is_ok());

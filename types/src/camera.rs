@@ -504,8 +504,12 @@ mod tests {
                         if radius < valid.min(100.0) {
                             let seen = lens.distort(DVec2::new(0.6, -0.8) * radius);
                             let (quick, slow) = (lens.undistort(seen), lens.undistort_within(seen, valid));
-                            let off = quick.zip(slow).map(|(a, b)| a.distance(b) / (1.0 + b.length()));
-                            assert!(off.is_some_and(|off| off < 1e-9), "{lens:?} {share}: {quick:?} {slow:?}");
+                            // Near the fold neither converges.
+                            let same = match (quick, slow) {
+                                (Some(quick), Some(slow)) => quick.distance(slow) < 1e-9 * (1.0 + slow.length()),
+                                (quick, slow) => quick.is_none() && slow.is_none() && share > 0.99,
+                            };
+                            assert!(same, "{lens:?} {share}: {quick:?} {slow:?}");
                         }
                     }
                 }

@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use super::background::{BackgroundWatch, backgrounds, report};
 use super::colors::ClothesColors;
 use super::split_mask::{PosedMesh, split_mask};
-use super::{Observation, Perception, SeenPerson, ViewObservation};
+use super::{KnownPerson, Observation, Perception, SeenPerson, ViewObservation};
 use crate::{Effort, FusionError, Origin, PerceptionSettings, StageTimes};
 
 /// Frame sets that a person's shape is fitted to.
@@ -28,18 +28,28 @@ const SAME_PERSON_M: f64 = 0.15;
 const SAME_CLOTHES: f64 = 0.6;
 /// Sets from one look at a person's clothes to the next.
 const CLOTHES_EVERY: u64 = 30;
-/// A person who was not seen for so many sets has left.
-const LEFT_AFTER_SETS: u32 = 90;
+/// A person who was not seen for so long has left, nanoseconds. Whoever comes then is measured again.
+const LEFT_AFTER_NANOS: u64 = 3_000_000_000;
+/// Somebody whose bones differ by more than this from those of the person before, as a mean share of their length, is another.
+const OTHER_SHAPE: f64 = 0.03;
 
 /// One person who is tracked, or a place for one who may come.
 #[derive(Debug, Clone)]
 struct Place {
     id: PersonId,
     estimator: PoseEstimator,
-    /// Landmarks that the shape will be fitted to, with the time of the last ones; `None` once the shape is known.
+    /// Landmarks that the shape will be fitted to, with the time of the last ones; `None` while nobody is measured.
     learning: Option<(Vec<Vec<Option<ViewKeypoints>>>, i64)>,
+    /// Whether a shape is known.
+    known: bool,
+    /// Number of the shape.
+    shape: u32,
     clothes: Option<ClothesColors>,
     seen: u64,
+    /// Time since which nobody is seen; `None` while somebody is.
+    missing_since: Option<i64>,
+    /// Whether nobody is seen for [`LEFT_AFTER_NANOS`].
+    has_left: bool,
     /// Fingers and head, where they are estimated.
     hands: Option<HandTracker>,
 }
@@ -47,7 +57,7 @@ struct Place {
 impl Place {
     /// The shape is known.
     fn know(&mut self) -> Result<(), TrackError> {
-        self.learning = None;
+        (self.learning, self.known) = (None, true);
         self.estimator.look_at_all(false);
         self.hands.as_mut().map_or(Ok(()), |hands| hands.set_template(self.estimator.template()))
     }
@@ -80,6 +90,8 @@ pub struct EstimatedPerception {
     rig: Rig,
     masks: Origin,
     watch: BackgroundWatch,
+    /// Whether shapes are measured, by two or more views.
+    measures: bool,
     /// Rounds of matching outlines and texture with all the work.
     rounds: usize,
     mattes: bool,
@@ -118,8 +130,12 @@ impl EstimatedPerception {
             id: PersonId(index as u32),
             estimator: estimator.clone(),
             learning: learning.clone(),
+            known: learning.is_none(),
+            shape: 0,
             clothes: None,
             seen: 0,
+            missing_since: None,
+            has_left: false,
             hands: hands.clone(),
         };
         Ok(Self {
@@ -127,12 +143,14 @@ impl EstimatedPerception {
             rig: rig.clone(),
             masks: settings.masks,
             watch: BackgroundWatch::default(),
+            measures: settings.shape() == Origin::Estimated && rig.cameras.len() > 1,
             rounds,
             mattes: true,
         })
     }
 
-    /// Starts with the shape of the first person, as an earlier session has learnt it.
+    /// Starts with the shape of the first person, as an earlier session has learnt it. Where shapes are estimated, whoever comes
+    /// is compared with it.
     ///
     /// # Errors
     /// [`FusionError::Track`] when the template cannot be used.
@@ -140,6 +158,8 @@ impl EstimatedPerception {
         if let Some(place) = self.places.first_mut() {
             place.estimator.set_template(template)?;
             place.know()?;
+            // Whoever comes first may be somebody else.
+            place.has_left = true;
         }
         Ok(())
     }
@@ -260,18 +280,24 @@ impl EstimatedPerception {
             if keypoints.len() < SHAPE_SETS {
                 continue;
             }
-            match place.estimator.fit_shape_to_keypoints(keypoints) {
-                Ok(fit) => {
+            let measured = place.estimator.measure_shape(keypoints);
+            let taken = measured.and_then(|(template, fit)| {
+                let is_other = place.known && bone_difference(place.estimator.template(), &template) > OTHER_SHAPE;
+                if is_other {
+                    tracing::info!("person {} is somebody else now, {fit}", place.id);
+                    place.shape += 1;
+                } else if !place.known {
                     tracing::info!("person {} is {fit}", place.id);
-                    if let Err(error) = place.know() {
-                        tracing::warn!(%error, "hands of person {} are not estimated", place.id);
-                        place.hands = None;
-                    }
                 }
-                Err(error) => {
-                    tracing::warn!(%error, "the shape of person {} is not known yet, trying again", place.id);
-                    keypoints.clear();
-                }
+                // Somebody who comes back keeps the shape, and with it the colours.
+                if is_other || !place.known { place.estimator.take_shape(template) } else { Ok(()) }
+            });
+            if let Err(error) = taken {
+                tracing::warn!(%error, "the shape of person {} is not known yet, trying again", place.id);
+                keypoints.clear();
+            } else if let Err(error) = place.know() {
+                tracing::warn!(%error, "hands of person {} are not estimated", place.id);
+                place.hands = None;
             }
         }
     }
@@ -289,16 +315,38 @@ impl EstimatedPerception {
                         place.clothes = Some(colors);
                     }
                     place.seen += 1;
+                    place.missing_since = None;
+                    if std::mem::take(&mut place.has_left) && place.known && self.measures {
+                        place.learning = Some((Vec::new(), i64::MIN));
+                        place.estimator.look_at_all(true);
+                    }
                 }
                 Err(_) => {
-                    let place = &self.places[index];
-                    if place.learning.is_none() && place.estimator.sets_lost() == LEFT_AFTER_SETS {
-                        tracing::info!("person {} has left", place.id);
+                    let place = &mut self.places[index];
+                    let since = *place.missing_since.get_or_insert(set.master_nanos);
+                    if !place.has_left && since.abs_diff(set.master_nanos) >= LEFT_AFTER_NANOS {
+                        place.has_left = true;
+                        if place.known && place.seen > 0 {
+                            tracing::info!("person {} has left", place.id);
+                        }
                     }
                 }
             }
         }
     }
+}
+
+/// Mean difference of the bones' lengths, as a share of the mean length; infinite for templates of other joints.
+fn bone_difference(a: &Template, b: &Template) -> f64 {
+    let lengths = |template: &Template| -> Vec<f64> {
+        let joints = template.skeleton.joints().iter().filter(|joint| joint.parent.is_some());
+        joints.map(|joint| joint.rest_translation.length()).collect()
+    };
+    let (a, b) = (lengths(a), lengths(b));
+    if a.len() != b.len() || a.is_empty() {
+        return f64::INFINITY;
+    }
+    a.iter().zip(&b).map(|(a, b)| (a - b).abs()).sum::<f64>() / a.iter().sum::<f64>()
 }
 
 /// Adds the run times of an estimate's parts.
@@ -327,9 +375,9 @@ impl Perception for EstimatedPerception {
         }
     }
 
-    fn people(&self) -> Vec<(PersonId, &Template)> {
-        let known = self.places.iter().filter(|place| place.learning.is_none());
-        known.map(|place| (place.id, place.template())).collect()
+    fn people(&self) -> Vec<KnownPerson<'_>> {
+        let known = self.places.iter().filter(|place| place.known);
+        known.map(|place| KnownPerson { person: place.id, shape: place.shape, template: place.template() }).collect()
     }
 
     fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
@@ -337,14 +385,17 @@ impl Perception for EstimatedPerception {
         let mut estimates = self.estimate(set, stages);
         self.remember(set, &estimates);
         stages.add("pose from pictures", start.elapsed());
-        let known: Vec<bool> = self.places.iter().map(|place| place.learning.is_none()).collect();
+        let before: Vec<(bool, u32)> = self.places.iter().map(|place| (place.known, place.shape)).collect();
         self.learn(set, &estimates);
         let mut views = self.views(set, &mut estimates, stages)?;
         if self.masks == Origin::Estimated && self.watch.is_due() {
             stages.time("background", || self.follow_backgrounds(set, &estimates))?;
         }
         let mut observations = Vec::new();
-        for (index, estimate) in estimates.into_iter().enumerate().filter(|(index, _)| known[*index]) {
+        // A pose belongs to the shape that it was estimated with.
+        let fitting: Vec<bool> =
+            self.places.iter().zip(&before).map(|(place, before)| *before == (true, place.shape)).collect();
+        for (index, estimate) in estimates.into_iter().enumerate().filter(|(index, _)| fitting[*index]) {
             let person = self.places[index].id;
             observations.push(match estimate {
                 Err(reason) => {
@@ -378,7 +429,7 @@ impl EstimatedPerception {
             .map(|(template, pose)| (template.triangles.clone(), skin_mesh(template, pose).0))
             .collect();
         // Somebody who was lost a moment ago may stand anywhere, and must not become background.
-        let is_missing = |place: &Place| (1..LEFT_AFTER_SETS).contains(&place.estimator.sets_lost()) && place.seen > 0;
+        let is_missing = |place: &Place| place.missing_since.is_some() && !place.has_left && place.seen > 0;
         if bodies.is_empty() || is_missing(first) || others.iter().any(is_missing) {
             return Ok(());
         }

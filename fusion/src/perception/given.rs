@@ -7,7 +7,7 @@ use glam::Vec3;
 
 use super::background::{BackgroundWatch, backgrounds, report};
 use super::split_mask::{PosedMesh, split_mask};
-use super::{Observation, Perception, SeenPerson, ViewObservation};
+use super::{KnownPerson, Observation, Perception, SeenPerson, ViewObservation};
 use crate::{FusionError, Origin, PerceptionSettings, StageTimes};
 
 /// One person with a known motion.
@@ -73,8 +73,9 @@ impl GivenPerception {
 }
 
 impl Perception for GivenPerception {
-    fn people(&self) -> Vec<(PersonId, &Template)> {
-        self.people.iter().map(|given| (given.person, &given.template)).collect()
+    fn people(&self) -> Vec<KnownPerson<'_>> {
+        let people = self.people.iter();
+        people.map(|given| KnownPerson { person: given.person, shape: 0, template: &given.template }).collect()
     }
 
     fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {

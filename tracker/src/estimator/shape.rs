@@ -51,19 +51,37 @@ impl PoseEstimator {
     /// # Errors
     /// Kind `Lost` when too few of the sets show a person in two views; the template stays as it was.
     pub fn fit_shape_to_keypoints(&mut self, keypoints: &[Vec<Option<ViewKeypoints>>]) -> Result<ShapeFit, TrackError> {
-        let (template, fit) = if self.rig.cameras.len() == 1 {
-            template_of_height(&self.base, self.config.height_m)?
+        let (template, fit) = self.measure_shape(keypoints)?;
+        self.take_shape(template)?;
+        Ok(fit)
+    }
+
+    /// Fits bone lengths as [`Self::fit_shape_to_keypoints`] does, but goes on with the shape as it is. Returns the template of
+    /// the fitted shape for [`Self::take_shape`].
+    ///
+    /// # Errors
+    /// Kind `Lost` when too few of the sets show a person in two views.
+    pub fn measure_shape(&self, keypoints: &[Vec<Option<ViewKeypoints>>]) -> Result<(Template, ShapeFit), TrackError> {
+        if self.rig.cameras.len() == 1 {
+            template_of_height(&self.base, self.config.height_m)
         } else {
             let seen = |views: &&Vec<_>| seen_landmarks(views, self.config.confidence_threshold) >= MIN_LANDMARKS;
             let keypoints: Vec<Vec<_>> = keypoints.iter().filter(seen).cloned().collect();
-            fit_template_shape(&self.base, &self.rig, &keypoints, &self.config)?
-        };
+            fit_template_shape(&self.base, &self.rig, &keypoints, &self.config)
+        }
+    }
+
+    /// Goes on tracking with a template of [`Self::measure_shape`].
+    ///
+    /// # Errors
+    /// Kind `Template` when it is not usable.
+    pub fn take_shape(&mut self, template: Template) -> Result<(), TrackError> {
         self.model = BodyModel::new(&template)?;
         self.template = template;
         if let Some(track) = self.track.take() {
             self.start_at(track.turns, track.nanos);
         }
-        Ok(fit)
+        Ok(())
     }
 
     /// Follows the person, or searches whole pictures: nobody waits for the set.
