@@ -45,6 +45,8 @@ pub enum BenchCommand {
     Masks(BenchMasksArgs),
     /// Pose, shape and masks from images: errors, and what each of them costs in the views; writes a table and JSON.
     Perception(BenchPerceptionArgs),
+    /// Turns, covered cameras, switched lights, people who leave: errors before, during and after, and the time to recover.
+    Stress(BenchStressArgs),
     /// Two people in one scene: views, and the cost beside one person; writes a table and PNG images.
     Subjects(BenchSubjectsArgs),
     /// Recording uncompressed cameras: bytes, processor time and loss of each JPEG quality against pictures as they come.
@@ -375,4 +377,26 @@ mod tests {
     fn the_command_line_is_consistent() {
         Cli::command().debug_assert();
     }
+}
+
+#[derive(Debug, Args)]
+pub struct BenchStressArgs {
+    /// Folder of the table and images.
+    #[arg(long, default_value = "out/bench-stress")]
+    pub out: PathBuf,
+    /// Only the cases whose names contain one of these texts, comma separated.
+    #[arg(long, value_delimiter = ',')]
+    pub only: Vec<String>,
+    /// Seed of the person and the room.
+    #[arg(long, default_value_t = 501)]
+    pub seed: u64,
+    /// Width and height of the images, pixels.
+    #[arg(long, default_value_t = 384, value_parser = clap::value_parser!(u32).range(96..=2048))]
+    pub side: u32,
+    /// Cameras on a ring of 3 metres.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=16).map(usize::from))]
+    pub cameras: usize,
+    /// Frame sets a second.
+    #[arg(long, default_value_t = 10.0, value_parser = parse_fps)]
+    pub fps: f64,
 }

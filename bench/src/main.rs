@@ -16,6 +16,7 @@ mod recording;
 mod sequence;
 mod steady;
 mod stream;
+mod stress;
 mod subjects;
 mod summary;
 mod surface;
@@ -54,6 +55,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         BenchCommand::Appearance(args) => appearance::appearance(args, &gpu()?),
         BenchCommand::Budget(args) => budget::budget(args, &gpu()?),
         BenchCommand::Capture(args) => capture::capture(args),
+        BenchCommand::Stress(args) => stress::stress(args, &gpu()?),
         BenchCommand::Hands(args) => hands::hands(args, &gpu()?),
         BenchCommand::Landmarks(args) => landmarks::landmarks(args),
         BenchCommand::Stream(args) => stream::stream(args, &gpu()?),

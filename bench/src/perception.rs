@@ -18,7 +18,7 @@ use serde::Serialize;
 use crate::{cli::BenchPerceptionArgs, mask_errors::MaskErrors};
 
 /// Joints that are compared, by the names of the CMU skeleton.
-const JOINTS: [&str; 14] = [
+pub(crate) const JOINTS: [&str; 14] = [
     "Hips",
     "Head",
     "LeftArm",

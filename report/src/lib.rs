@@ -14,6 +14,6 @@ pub mod stop;
 
 pub use contact::contact_pictures;
 pub use html::{ContactRow, Curve, Report, write_whole};
-pub use outlines::outlined_inputs;
+pub use outlines::{outlined_inputs, paint_outline};
 pub use progress::progress_bar;
 pub use replay::{Replay, ReplaySettings, TruthReader, frame_number};

@@ -32,8 +32,8 @@ pub fn outlined_inputs(session: &mut Session, person: PersonId) -> Result<Vec<(S
     Ok(out)
 }
 
-/// Paints the pixels of `rgb` that are covered by half or more in `rgba` and have a neighbour that is not.
-fn paint_outline(rgb: &mut [u8], rgba: &[u8], width: usize, height: usize, color: [u8; 3]) {
+/// Paints the pixels of `rgb` that are covered by half or more in the alpha of `rgba` and have a neighbour that is not.
+pub fn paint_outline(rgb: &mut [u8], rgba: &[u8], width: usize, height: usize, color: [u8; 3]) {
     let covered = |x: usize, y: usize| rgba[(y * width + x) * 4 + 3] >= 128;
     for y in 0..height {
         for x in 0..width {

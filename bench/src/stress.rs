@@ -1,0 +1,348 @@
+//! `flyrig-bench stress`: what disturbs perception, one thing after the other, with everything estimated from images.
+//!
+//! Every case is one simulated person in front of a rig: calm, then the disturbance, then calm again. Joints are compared
+//! with the true ones, and the time from the end of the disturbance until they are as near as before is the recovery.
+
+use std::{collections::BTreeMap, path::Path, sync::Arc};
+
+use anyhow::{Context, Result};
+use flyrig_body::{ShapeParams, default_template};
+use flyrig_fusion::{EstimatedPerception, Observation, Perception as _, PerceptionSettings, SeenPerson, StageTimes};
+use flyrig_gpu::GpuContext;
+use flyrig_metrics::mask_iou;
+use flyrig_report::{paint_outline, png, progress_bar, write_whole};
+use flyrig_sim::{
+    Build, LightConfig, LightSwitch, MotionConfig, MotionKind, PersonConfig, RingConfig, SceneConfig, SceneKind,
+    SimConfig, Simulator,
+};
+use flyrig_types::{Frame, FrameSet, Image, PixelFormat};
+use glam::{DQuat, DVec3};
+
+use crate::{cli::BenchStressArgs, perception::places};
+
+/// Colour of a mask's outline.
+const OUTLINE: [u8; 3] = [0, 255, 80];
+/// Sets after the disturbance whose errors are compared with those before it, seconds.
+const AFTER_SECS: f64 = 2.0;
+/// Somebody is measured for 1.5 s first.
+const BEFORE_SECS: f64 = 3.0;
+/// Joints are as near as before again below this multiple of the error before, and this error at least.
+const RECOVERED: (f64, f64) = (1.5, 30.0);
+
+/// What happens between the calm times.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Disturbance {
+    /// Nothing but the movement itself.
+    Motion,
+    /// The person stands so far from the middle, metres: parts leave the images.
+    OffCentre(f64),
+    /// A camera gives black images.
+    Covered,
+    /// A camera gives nothing.
+    Missing,
+    /// All cameras give black images.
+    Dark,
+    /// The lamps fall to this part of their light.
+    Lights(f64),
+    /// A camera's exposure jumps by this factor.
+    Exposure(f64),
+    /// Nobody is there.
+    Away,
+    /// Nobody is there, then somebody of another build.
+    Replaced,
+}
+
+struct Case {
+    name: &'static str,
+    motion: MotionKind,
+    speed: f64,
+    secs: f64,
+    what: Disturbance,
+}
+
+const fn case(name: &'static str, motion: MotionKind, secs: f64, what: Disturbance) -> Case {
+    Case { name, motion, speed: 1.0, secs, what }
+}
+
+const CASES: [Case; 15] = [
+    Case { name: "turn by 360 degrees", motion: MotionKind::Turn, speed: 2.0, secs: 5.0, what: Disturbance::Motion },
+    case("crossed arms", MotionKind::CrossArms, 4.0, Disturbance::Motion),
+    case("sitting", MotionKind::Sit, 4.0, Disturbance::Motion),
+    case("dance", MotionKind::Dance, 4.0, Disturbance::Motion),
+    case("jump", MotionKind::Jump, 4.0, Disturbance::Motion),
+    case("0.7 m from the middle", MotionKind::Wave, 3.0, Disturbance::OffCentre(0.7)),
+    case("1.1 m from the middle", MotionKind::Wave, 3.0, Disturbance::OffCentre(1.1)),
+    case("one camera covered", MotionKind::Wave, 5.0, Disturbance::Covered),
+    case("one camera missing", MotionKind::Wave, 5.0, Disturbance::Missing),
+    case("all cameras dark", MotionKind::Wave, 1.0, Disturbance::Dark),
+    case("lights to a third", MotionKind::Wave, 4.0, Disturbance::Lights(0.33)),
+    case("lights to double", MotionKind::Wave, 4.0, Disturbance::Lights(2.0)),
+    case("exposure of one camera halved", MotionKind::Wave, 4.0, Disturbance::Exposure(0.5)),
+    case("gone for 4 s", MotionKind::Wave, 4.0, Disturbance::Away),
+    case("replaced by a taller person", MotionKind::Wave, 4.0, Disturbance::Replaced),
+];
+
+/// Result of one case.
+#[derive(Debug, Default)]
+struct Row {
+    name: &'static str,
+    /// Mean joint errors before, during and after, millimetres; NaN without a pose.
+    mm: [f64; 3],
+    p95_mm: [f64; 3],
+    /// Sets, and those in which the person was not found, before, during and after.
+    sets: [usize; 3],
+    lost: [usize; 3],
+    /// Seconds from the end of the disturbance until the joints were as near as before; `None` when they never were.
+    recovery_secs: Option<f64>,
+    /// Mean mask IoU before, during and after.
+    iou: [f64; 3],
+    set_ms: f64,
+}
+
+/// Runs the command.
+pub fn stress(args: &BenchStressArgs, gpu: &GpuContext) -> Result<()> {
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    let mut table = String::from(
+        "| disturbance | joints mm (95 %) before | during | after | mask IoU before | during | after | not found before | during | \
+         after | recovery s | ms a set |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+    );
+    for (index, case) in CASES.iter().enumerate() {
+        if !args.only.is_empty() && !args.only.iter().any(|part| case.name.contains(part.as_str())) {
+            continue;
+        }
+        let row = run(args, gpu, case, index)?;
+        let line = format_row(&row);
+        eprint!("{line}");
+        table += &line;
+        write_whole(&args.out.join("stress.md"), table.as_bytes())?;
+    }
+    print!("{table}");
+    println!("stress.md and images in {}", args.out.display());
+    Ok(())
+}
+
+fn format_row(row: &Row) -> String {
+    let joints = |k: usize| format!("{:.0} ({:.0})", row.mm[k], row.p95_mm[k]);
+    let lost = |k: usize| format!("{} of {}", row.lost[k], row.sets[k]);
+    let recovery = row.recovery_secs.map_or_else(|| "never".to_owned(), |secs| format!("{secs:.2}"));
+    format!(
+        "| {} | {} | {} | {} | {:.3} | {:.3} | {:.3} | {} | {} | {} | {recovery} | {:.0} |\n",
+        row.name,
+        joints(0),
+        joints(1),
+        joints(2),
+        row.iou[0],
+        row.iou[1],
+        row.iou[2],
+        lost(0),
+        lost(1),
+        lost(2),
+        row.set_ms
+    )
+}
+
+fn simulator(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, build: Build, at_m: f64) -> Result<Simulator> {
+    let lights = match case.what {
+        Disturbance::Lights(level) => vec![LightConfig {
+            switch: vec![
+                LightSwitch { secs: BEFORE_SECS, level },
+                LightSwitch { secs: BEFORE_SECS + case.secs, level: 1.0 },
+            ],
+            ..LightConfig::default()
+        }],
+        _ => Vec::new(),
+    };
+    let config = SimConfig {
+        seed: args.seed,
+        person: PersonConfig { build, ..PersonConfig::default() },
+        motion: MotionConfig { kind: case.motion, speed: case.speed, at_m: [at_m, 0.0], ..MotionConfig::default() },
+        cameras: RingConfig { count: args.cameras, ..RingConfig::default() },
+        width: args.side,
+        height: args.side,
+        scene: SceneConfig { kind: SceneKind::Office, seed: Some(args.seed), ..SceneConfig::default() },
+        lights,
+        ..SimConfig::default()
+    };
+    Ok(Simulator::new(gpu, &config)?)
+}
+
+fn copy(image: &Image) -> Result<Image> {
+    Ok(Image::new(image.width(), image.height(), image.format(), image.bytes().to_vec())?)
+}
+
+/// The image with every sRGB value multiplied.
+fn scaled(image: &Image, factor: f64) -> Result<Image> {
+    let bytes: Vec<u8> =
+        image.bytes().iter().map(|&byte| (f64::from(byte) * factor).round().min(255.0) as u8).collect();
+    Ok(Image::new(image.width(), image.height(), image.format(), bytes)?)
+}
+
+fn run(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, index: usize) -> Result<Row> {
+    let at_m = match case.what {
+        Disturbance::OffCentre(metres) => metres,
+        _ => 0.0,
+    };
+    let mut usual = simulator(args, gpu, case, Build::SlimWoman, 0.0)?;
+    let mut other = match case.what {
+        Disturbance::OffCentre(_) => Some(simulator(args, gpu, case, Build::SlimWoman, at_m)?),
+        Disturbance::Replaced => Some(simulator(args, gpu, case, Build::HeavyMan, 0.0)?),
+        _ => None,
+    };
+    let rig = usual.rig().clone();
+    let slots: Vec<usize> = (0..rig.cameras.len()).collect();
+    let plates = slots.iter().map(|&slot| Ok(Some(copy(usual.plate(slot)?)?))).collect::<Result<Vec<_>>>()?;
+    let template = default_template(&ShapeParams::default())?;
+    let mut perception = EstimatedPerception::new(&rig, &template, &PerceptionSettings::default(), &plates)?;
+
+    let total = ((BEFORE_SECS + case.secs + AFTER_SECS) * args.fps) as u64;
+    let bar = progress_bar(total, case.name);
+    let mut row = Row { name: case.name, ..Row::default() };
+    let mut errors: [Vec<f64>; 3] = Default::default();
+    let mut ious: [Vec<f64>; 3] = Default::default();
+    let mut sheet: BTreeMap<usize, Vec<Image>> = BTreeMap::new();
+    let mut seconds = 0.0;
+    for set_index in 0..total {
+        let secs = set_index as f64 / args.fps;
+        let phase = if secs < BEFORE_SECS { 0 } else { 1 + usize::from(secs >= BEFORE_SECS + case.secs) };
+        let (shows_other, is_empty) = match case.what {
+            Disturbance::OffCentre(_) => (phase == 1, false),
+            Disturbance::Away => (false, phase == 1),
+            Disturbance::Replaced => (phase == 2, phase == 1),
+            _ => (false, false),
+        };
+        let shown = match &mut other {
+            Some(other) if shows_other => other,
+            _ => &mut usual,
+        };
+        let nanos = (secs * 1e9) as i64;
+        let taken = shown.capture_all(nanos, &slots)?;
+        let mut frames = Vec::new();
+        let mut truths = Vec::new();
+        for (slot, (image, mask)) in taken.into_iter().enumerate() {
+            let hit = phase == 1 && slot == 1;
+            let image = match case.what {
+                _ if is_empty => copy(shown.plate(slot)?)?,
+                Disturbance::Covered if hit => scaled(&image, 0.0)?,
+                Disturbance::Dark if phase == 1 => scaled(&image, 0.0)?,
+                Disturbance::Exposure(factor) if hit => scaled(&image, factor)?,
+                _ => image,
+            };
+            truths.push((!is_empty).then_some(mask));
+            let is_missing = case.what == Disturbance::Missing && hit;
+            let frame = Frame {
+                camera: rig.cameras[slot].id.clone(),
+                sequence: set_index,
+                capture_nanos: nanos,
+                exposure_nanos: None,
+                image,
+                mask: None,
+            };
+            frames.push((!is_missing).then(|| Arc::new(frame)));
+        }
+        let set = FrameSet { index: set_index, master_nanos: nanos, frames };
+        let start = std::time::Instant::now();
+        let observations = perception.observe(&set, &mut StageTimes::default())?;
+        seconds += start.elapsed().as_secs_f64();
+        bar.inc(1);
+        let seen = observations.into_iter().find_map(|observation| match observation {
+            Observation::Seen(seen) => Some(seen),
+            Observation::Lost { .. } => None,
+        });
+        let known = perception.people();
+        let Some(known) = known.first() else { continue };
+        row.sets[phase] += usize::from(!is_empty);
+        let error = seen.as_ref().map(|seen| {
+            let ours = places(&known.template.skeleton, &seen.pose);
+            joint_error_mm(&ours, &places(&shown.template().skeleton, &shown.track().at_repeated(nanos)))
+        });
+        if !is_empty {
+            row.lost[phase] += usize::from(error.is_none());
+            errors[phase].extend(error.iter().flatten().copied());
+            for (view, truth) in seen.iter().flat_map(|seen| present_masks(seen, &set, &truths)) {
+                ious[phase].push(mask_iou(view, truth)?);
+            }
+        }
+        if phase == 2 && row.recovery_secs.is_none() {
+            let limit = (RECOVERED.0 * mean(&errors[0])).max(RECOVERED.1);
+            if error.is_some_and(|error| mean(&error) < limit) {
+                row.recovery_secs = Some(secs - BEFORE_SECS - case.secs);
+            }
+        }
+        // One image of the middle of each phase, and of the recovery.
+        let middles = [0.75 * BEFORE_SECS, BEFORE_SECS + 0.5 * case.secs, BEFORE_SECS + case.secs + 0.5];
+        for (place, middle) in middles.into_iter().enumerate() {
+            if (secs - middle).abs() < 0.5 / args.fps {
+                sheet.insert(place, outlined(&set, seen.as_ref())?);
+            }
+        }
+    }
+    bar.finish_and_clear();
+    row.mm = [0, 1, 2].map(|k| mean(&errors[k]));
+    row.p95_mm = [0, 1, 2].map(|k| percentile(&errors[k], 0.95));
+    row.iou = [0, 1, 2].map(|k| mean(&ious[k]));
+    row.set_ms = 1e3 * seconds / total.max(1) as f64;
+    let name = format!("{index:02}-{}.png", case.name.replace([' ', '.'], "-"));
+    write_sheet(&args.out.join(name), &sheet.into_values().collect::<Vec<_>>())?;
+    Ok(row)
+}
+
+/// Masks of the views beside the true ones.
+fn present_masks<'a>(
+    seen: &'a SeenPerson,
+    set: &'a FrameSet,
+    truths: &'a [Option<flyrig_types::Mask>],
+) -> impl Iterator<Item = (&'a flyrig_types::Mask, &'a flyrig_types::Mask)> {
+    let views = seen.views.iter().zip(set.present());
+    views.filter_map(|(view, (slot, _))| view.mask.as_ref().zip(truths.get(slot)?.as_ref()))
+}
+
+/// Distances of the joints that both have, millimetres.
+fn joint_error_mm(ours: &BTreeMap<String, (DVec3, DQuat)>, truth: &BTreeMap<String, (DVec3, DQuat)>) -> Vec<f64> {
+    crate::perception::JOINTS
+        .iter()
+        .filter_map(|name| Some(1e3 * ours.get(*name)?.0.distance(truth.get(*name)?.0)))
+        .collect()
+}
+
+/// RGB images of a set with the masks' outlines.
+fn outlined(set: &FrameSet, seen: Option<&SeenPerson>) -> Result<Vec<Image>> {
+    let mut images = Vec::new();
+    for (at, (_, frame)) in set.present().enumerate() {
+        let (image, mut rgb) = (&frame.image, frame.image.bytes().to_vec());
+        if let Some(mask) = seen.and_then(|seen| seen.views.get(at)?.mask.as_ref()) {
+            let rgba: Vec<u8> = mask.coverage().iter().flat_map(|&alpha| [0, 0, 0, alpha]).collect();
+            paint_outline(&mut rgb, &rgba, image.width() as usize, image.height() as usize, OUTLINE);
+        }
+        images.push(Image::new(image.width(), image.height(), PixelFormat::Rgb8, rgb)?);
+    }
+    Ok(images)
+}
+
+/// Writes images side by side, one row a phase.
+fn write_sheet(path: &Path, rows: &[Vec<Image>]) -> Result<()> {
+    let Some(first) = rows.first().and_then(|row| row.first()) else { return Ok(()) };
+    let (width, height) = (first.width() as usize, first.height() as usize);
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let mut rgb = vec![0; 3 * width * columns * height * rows.len()];
+    for (y, row) in rows.iter().enumerate() {
+        for (x, image) in row.iter().enumerate() {
+            for (line, bytes) in image.bytes().chunks_exact(3 * width).enumerate() {
+                let start = 3 * ((y * height + line) * width * columns + x * width);
+                rgb[start..start + 3 * width].copy_from_slice(bytes);
+            }
+        }
+    }
+    let png = png::encode_rgb(&rgb, (width * columns) as u32, (height * rows.len()) as u32)?;
+    write_whole(path, &png)?;
+    Ok(())
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+fn percentile(values: &[f64], share: f64) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted.get(((sorted.len().max(1) - 1) as f64 * share) as usize).copied().unwrap_or(f64::NAN)
+}
