@@ -377,6 +377,8 @@ impl PoseEstimator {
                     Rgb::new(&frame.image)
                 })
                 .transpose()
+                // A covered lens would pull the pose: the view counts as missing.
+                .map(|picture| picture.filter(|picture| !picture.is_blank()))
         };
         set.frames.iter().zip(&self.rig.cameras).map(read).collect()
     }

@@ -76,6 +76,7 @@ pub use key::{KeyColor, KeyColorError};
 pub use landmarks::{Keypoint, LANDMARK_BONES, LANDMARK_COUNT, LANDMARK_NAMES, ViewKeypoints};
 pub use matte::matte;
 pub use net::{CropLandmark, NET_SIDE, NetOutput, PoseNet};
+pub use pixels::is_blank;
 pub use plate::mask_from_plate;
 pub use presence::shows_person;
 pub use shape::{HeightFrom, ShapeFit, fit_template_shape};

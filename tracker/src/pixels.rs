@@ -27,6 +27,29 @@ impl<'a> Rgb<'a> {
         Ok(Self { width: image.width() as usize, height: image.height() as usize, bytes })
     }
 
+    /// Whether the picture is uniform but for noise, as before a covered lens.
+    pub fn is_blank(&self) -> bool {
+        /// Blocks in each direction whose means are compared, and side of a block, pixels.
+        const BLOCKS: usize = 24;
+        const SIDE: usize = 6;
+        /// Standard deviation of the means below which nothing is to be seen, levels of 0 to 255.
+        const LEAST: f64 = 2.0;
+        if self.width < BLOCKS * SIDE || self.height < BLOCKS * SIDE {
+            return false;
+        }
+        let mean = |block: usize| {
+            let corner = |index: usize, size: usize| index * (size - SIDE) / (BLOCKS - 1);
+            let (x, y) = (corner(block % BLOCKS, self.width), corner(block / BLOCKS, self.height));
+            let row = |y: usize| &self.bytes[3 * (y * self.width + x)..][..3 * SIDE];
+            let sum: u32 = (y..y + SIDE).flat_map(row).map(|&byte| u32::from(byte)).sum();
+            f64::from(sum) / (3 * SIDE * SIDE) as f64
+        };
+        let means: Vec<f64> = (0..BLOCKS * BLOCKS).map(mean).collect();
+        let middle = means.iter().sum::<f64>() / means.len() as f64;
+        let variance = means.iter().map(|mean| (mean - middle).powi(2)).sum::<f64>() / means.len() as f64;
+        variance < LEAST * LEAST
+    }
+
     pub fn pixel(&self, x: usize, y: usize) -> [u8; 3] {
         let at = (y * self.width + x) * 3;
         [self.bytes[at], self.bytes[at + 1], self.bytes[at + 2]]
@@ -61,5 +84,46 @@ impl<'a> Rgb<'a> {
             if is_inside { self.pixel(x - 1, y - 1).map(f32::from) } else { [0.0; 3] }
         };
         mix(fetch(0, 0), fetch(1, 0), fetch(0, 1), fetch(1, 1))
+    }
+}
+
+/// Whether an image is uniform but for noise, as before a covered lens; such an image tells nothing about people or background.
+///
+/// # Errors
+/// Kind `Image` when the format cannot be read.
+pub fn is_blank(image: &Image) -> Result<bool, TrackError> {
+    Ok(Rgb::new(image)?.is_blank())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn covered_lenses_are_blank_and_dark_rooms_are_not() {
+        let (width, height) = (320usize, 240usize);
+        let image = |level: &dyn Fn(usize, usize) -> f64, noise: f64| {
+            let mut state = 9u64;
+            let mut bytes = Vec::new();
+            for at in 0..width * height {
+                for _ in 0..3 {
+                    state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                    let unit = (state >> 40) as f64 / (1u64 << 24) as f64;
+                    bytes.push((level(at % width, at / width) + noise * (2.0 * unit - 1.0)).clamp(0.0, 255.0) as u8);
+                }
+            }
+            Image::new(width as u32, height as u32, PixelFormat::Rgb8, bytes).unwrap()
+        };
+        assert!(is_blank(&image(&|_, _| 0.0, 0.0)).unwrap());
+        assert!(is_blank(&image(&|_, _| 12.0, 12.0)).unwrap(), "noise alone");
+        assert!(is_blank(&image(&|_, _| 255.0, 0.0)).unwrap(), "overexposed");
+        assert!(!is_blank(&image(&|x, _| if x < width / 2 { 8.0 } else { 16.0 }, 8.0)).unwrap(), "a dark room");
+        let person = |x: usize, y: usize| {
+            let is_inside = (140..180).contains(&x) && (60..200).contains(&y);
+            if is_inside { 40.0 } else { 100.0 }
+        };
+        assert!(!is_blank(&image(&person, 5.0)).unwrap(), "somebody before a plain wall");
+        let small = Image::new(20, 20, PixelFormat::Rgb8, vec![0; 1200]).unwrap();
+        assert!(!is_blank(&small).unwrap(), "too small to say");
     }
 }

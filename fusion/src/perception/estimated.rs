@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, sync::Arc, time::Duration};
 use flyrig_body::{Template, skin_mesh};
 use flyrig_tracker::{
     BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PoseConfig, PoseEstimate, PoseEstimator, PoseNet,
-    ShapeFit, TrackError, ViewKeypoints, matte,
+    ShapeFit, TrackError, ViewKeypoints, is_blank, matte,
 };
 use flyrig_types::{Frame, FrameSet, Image, Mask, PersonId, Pose, Rig};
 use rayon::prelude::*;
@@ -90,6 +90,8 @@ pub struct EstimatedPerception {
     rig: Rig,
     masks: Origin,
     watch: BackgroundWatch,
+    /// Whether each camera's last image was uniform, by slot.
+    blank: Vec<bool>,
     /// Whether shapes are measured, by two or more views.
     measures: bool,
     /// Rounds of matching outlines and texture with all the work.
@@ -143,6 +145,7 @@ impl EstimatedPerception {
             rig: rig.clone(),
             masks: settings.masks,
             watch: BackgroundWatch::default(),
+            blank: vec![false; rig.cameras.len()],
             measures: settings.shape() == Origin::Estimated && rig.cameras.len() > 1,
             rounds,
             mattes: true,
@@ -382,6 +385,7 @@ impl Perception for EstimatedPerception {
 
     fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
         let start = std::time::Instant::now();
+        self.watch_for_blank_images(set)?;
         let mut estimates = self.estimate(set, stages);
         self.remember(set, &estimates);
         stages.add("pose from pictures", start.elapsed());
@@ -415,6 +419,25 @@ impl Perception for EstimatedPerception {
 }
 
 impl EstimatedPerception {
+    /// Reports cameras whose images have become uniform, and those that see again.
+    fn watch_for_blank_images(&mut self, set: &FrameSet) -> Result<(), FusionError> {
+        for ((frame, camera), was) in set.frames.iter().zip(&self.rig.cameras).zip(&mut self.blank) {
+            let Some(frame) = frame else { continue };
+            let now = is_blank(&frame.image)?;
+            match (std::mem::replace(was, now), now) {
+                (false, true) => {
+                    let camera = &camera.id;
+                    tracing::warn!(
+                        "camera {camera}: the image is uniform, so it is left out; uncover the lens, or check exposure and light"
+                    );
+                }
+                (true, false) => tracing::info!("camera {}: the image is no longer uniform", camera.id),
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
     /// Lets the backgrounds follow the light where nobody stands.
     fn follow_backgrounds(
         &mut self,
@@ -435,10 +458,13 @@ impl EstimatedPerception {
         }
         let gates =
             |camera| bodies.iter().filter_map(move |(sides, points)| BodyGate::new(camera, points, sides)).collect();
-        let views = first.estimator.backgrounds_mut().par_iter_mut().zip(&self.rig.cameras).zip(&set.frames);
+        let slots = self.rig.cameras.par_iter().zip(&set.frames).zip(&self.blank);
+        let views = first.estimator.backgrounds_mut().par_iter_mut().zip(slots);
         let events: Vec<Vec<BackgroundEvent>> = views
-            .map(|((background, camera), frame)| {
-                let (Some(background), Some(frame)) = (background, frame) else { return Ok(Vec::new()) };
+            .map(|(background, ((camera, frame), is_blank))| {
+                let (Some(background), Some(frame), false) = (background, frame, is_blank) else {
+                    return Ok(Vec::new());
+                };
                 let gates: Vec<BodyGate> = gates(camera);
                 background.update(&frame.image, &gates)
             })
