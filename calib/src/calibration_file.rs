@@ -11,7 +11,10 @@ use serde::Deserialize;
 
 use crate::{
     CalibError,
-    convert::{Imported, ImportedCamera, rotation_of},
+    convert::{
+        imported::{Imported, ImportedCamera},
+        shared::rotation_of,
+    },
 };
 
 /// Name of the file in a calibration folder.

@@ -5,14 +5,14 @@
 
 mod anipose;
 mod colmap;
-mod imported;
+pub(crate) mod imported;
 mod kalibr;
 mod mrcal;
 mod nerfstudio;
 mod opencv;
 mod python;
 mod qualisys;
-mod shared;
+pub(crate) mod shared;
 
 use std::{io::Write as _, path::Path};
 
@@ -20,7 +20,6 @@ use flyrig_types::{CameraId, Rig, write_whole};
 
 pub use self::imported::{Imported, ImportedCamera};
 use self::shared::{bad, files_with, inside, one_file};
-pub(crate) use self::shared::{opencv_coefficients, opencv_lens, rotation_of};
 use crate::{CalibError, calibration_file, easymocap};
 
 /// A calibration format.

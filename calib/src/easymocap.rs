@@ -13,7 +13,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use crate::{
     CalibError,
-    convert::{opencv_coefficients, opencv_lens, rotation_of},
+    convert::shared::{opencv_coefficients, opencv_lens, rotation_of},
     yaml::{Matrix, YamlFile, YamlWriter},
 };
 

@@ -9,7 +9,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use toml::{Table, Value};
 
 use super::{
-    Imported, ImportedCamera,
+    imported::{Imported, ImportedCamera},
     shared::{bad, intrinsics, opencv_coefficients, opencv_lens, rotation_of},
 };
 use crate::{CalibError, calibration_file};

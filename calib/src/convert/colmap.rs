@@ -12,7 +12,7 @@ use flyrig_types::{Intrinsics, Isometry, Lens, Rig};
 use glam::{DQuat, DVec2, DVec3};
 
 use super::{
-    Imported, ImportedCamera,
+    imported::{Imported, ImportedCamera},
     shared::{bad, camera_of_image, intrinsics},
 };
 use crate::{CalibError, calibration_file};

@@ -9,7 +9,7 @@ use flyrig_types::{CameraId, Isometry, Lens, Rig};
 use glam::DVec2;
 
 use super::{
-    Imported, ImportedCamera,
+    imported::{Imported, ImportedCamera},
     shared::{bad, intrinsics, motion_of, rows4},
 };
 use crate::{

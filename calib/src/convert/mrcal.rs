@@ -8,7 +8,8 @@ use glam::{DQuat, DVec2, DVec3};
 use serde_json::Value;
 
 use super::{
-    Imported, ImportedCamera, python,
+    imported::{Imported, ImportedCamera},
+    python,
     shared::{bad, files_with, intrinsics, opencv_coefficients, opencv_lens},
 };
 use crate::{CalibError, calibration_file};

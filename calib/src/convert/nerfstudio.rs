@@ -8,8 +8,8 @@ use glam::{DQuat, DVec2, DVec3};
 use serde_json::{Map, Value, json};
 
 use super::{
-    Imported, ImportedCamera,
     colmap::same_pose,
+    imported::{Imported, ImportedCamera},
     shared::{bad, camera_of_image, intrinsics, motion_of, rows4},
 };
 use crate::{CalibError, calibration_file};

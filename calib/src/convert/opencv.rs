@@ -9,7 +9,7 @@ use flyrig_types::{CameraId, Isometry, Lens, Rig};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use super::{
-    Imported, ImportedCamera,
+    imported::{Imported, ImportedCamera},
     shared::{bad, files_with, intrinsics, opencv_coefficients, opencv_lens, rotation_of},
 };
 use crate::{

@@ -11,7 +11,7 @@ use glam::{DMat3, DVec2, DVec3};
 use roxmltree::{Document, Node};
 
 use super::{
-    Imported, ImportedCamera,
+    imported::{Imported, ImportedCamera},
     nerfstudio::flip,
     shared::{bad, intrinsics, opencv_lens, rotation_of},
 };
