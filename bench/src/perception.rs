@@ -138,8 +138,8 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         bar.inc(1);
         frames += 1;
         let Some(subject) = replay.session.subject(person).filter(|_| outcome == Outcome::Updated) else { continue };
-        if let Some(pose) = subject.drawn_pose() {
-            joints.add(subject.template(), &pose, &truth.template, &track.at(set.master_nanos));
+        if let Some(pose) = subject.pose() {
+            joints.add(subject.template(), pose, &truth.template, &track.at(set.master_nanos));
         }
         for (view, camera) in replay.session.viewed(person).iter().enumerate() {
             let Some(frame) = frame_of(&set, camera.id.as_str()) else { continue };

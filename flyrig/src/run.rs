@@ -179,8 +179,8 @@ fn camera_stats(health: Health) -> Vec<CameraStats> {
 fn record_pose(poses: Option<&mut PoseRecording>, session: &Session, nanos: i64) {
     let subject = session.subject(PersonId::default());
     if let (Some(poses), Some(subject)) = (poses, subject)
-        && let Some(pose) = subject.drawn_pose()
+        && let Some(pose) = subject.pose()
     {
-        poses.record(&subject.template().skeleton, &pose, nanos);
+        poses.record(&subject.template().skeleton, pose, nanos);
     }
 }

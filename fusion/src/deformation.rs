@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use flyrig_body::{DeformationGraph, GpuSkinner, Part, Skeleton, SurfaceGaussians, Template, coarsen};
 use flyrig_gpu::{GpuContext, StorageBuffer};
 use flyrig_renderer::{BackwardRasterizer, ColorMeans, GaussianBuffers, GaussianGradients, PictureLoss};
-use flyrig_tracker::{DeformReport, DeformTracker, PoseCorrection};
+use flyrig_tracker::{DeformReport, DeformTracker};
 use flyrig_types::{Camera, Pose};
 use glam::{DVec3, Vec3};
 
@@ -124,9 +124,6 @@ impl Deformation {
         let stiffness: Vec<f64> = parts.iter().map(|&part| options.stiffness(part)).collect();
         tracker = tracker.with_stiffness(&stiffness)?;
         tracker = tracker.with_thickness(normals, parts.iter().map(|&part| part as usize).collect())?;
-        if let Some(freedom) = options.pose {
-            tracker = tracker.with_pose(&template.skeleton, landmarks.nodes().to_vec(), freedom)?;
-        }
         Ok(Self {
             max_level: options.max_level,
             color_weight: options.color_weight,
@@ -206,9 +203,9 @@ impl Deformation {
             if self.painted { self.color_weight } else { 0.0 },
         );
         let prepare = start.elapsed();
-        pictures.distrust(self.tracker.displacement(), self.tracker.correction())?;
+        pictures.distrust(self.tracker.displacement())?;
         let report = self.tracker.track(&mut pictures)?;
-        let judged = pictures.judged(self.tracker.displacement(), self.tracker.correction());
+        let judged = pictures.judged(self.tracker.displacement());
         let (draw, derivatives) = pictures.times();
         self.judged.clear();
         self.judged.resize(all_views.len(), None);
@@ -269,11 +266,6 @@ impl Deformation {
     /// What the last solve did.
     pub fn report(&self) -> Option<&DeformReport> {
         self.report.as_ref()
-    }
-
-    /// What the poses are corrected by.
-    pub fn correction(&self) -> &PoseCorrection {
-        self.tracker.correction()
     }
 
     /// Canonical displacement of every Gaussian.

@@ -74,8 +74,8 @@ impl Subject {
         frame: u64,
         capture_nanos: i64,
     ) -> Result<Option<PersonFrame>, FusionError> {
-        let Some(pose) = self.drawn_pose() else { return Ok(None) };
-        let mut motion = motion(&pose, self.node_translations());
+        let Some(pose) = self.pose() else { return Ok(None) };
+        let mut motion = motion(pose, self.node_translations());
         motion.stamp.person = self.id().0;
         (motion.stamp.frame, motion.stamp.capture_nanos) = (frame, capture_nanos);
         Ok(Some(PersonFrame { template: self.stream_template(), motion, colors: self.gaussians().color.read(gpu)? }))

@@ -212,7 +212,7 @@ impl Subject {
         &self.watch
     }
 
-    /// Pose of the last update, as it was observed.
+    /// Pose of the last update.
     #[must_use]
     pub fn pose(&self) -> Option<&Pose> {
         self.last_pose.as_ref()
@@ -222,12 +222,6 @@ impl Subject {
     #[must_use]
     pub fn confidence(&self) -> f64 {
         self.confidence
-    }
-
-    /// Pose in which the last update drew the person: an estimated one with the solver's correction.
-    #[must_use]
-    pub fn drawn_pose(&self) -> Option<Pose> {
-        self.last_pose.as_ref().map(|pose| self.corrected(pose))
     }
 
     /// The template for the person stream.
@@ -385,9 +379,8 @@ impl Subject {
         }
 
         let start = Instant::now();
-        let corrected: Vec<Pose> = instants.iter().map(|(pose, _)| self.corrected(pose)).collect();
         let displacement = self.deformation.as_ref().map(Deformation::displacement);
-        for (i, (pose, (_, gaussians))) in corrected.iter().zip(&instants).enumerate() {
+        for (i, (pose, gaussians)) in instants.iter().enumerate() {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             if i == 0 {
                 self.timer.begin(&mut encoder);
@@ -614,11 +607,6 @@ impl Subject {
         Ok(read_splats(gpu, &self.gaussians)?)
     }
 
-    /// A pose with what the deformation's solver corrected last.
-    pub(crate) fn corrected(&self, pose: &Pose) -> Pose {
-        self.deformation.as_ref().map_or_else(|| pose.clone(), |deformation| deformation.correction().apply(pose))
-    }
-
     /// The tracked surface: world positions and normals of the template's vertices.
     pub fn surface(&self, pose: &Pose) -> (Vec<glam::Vec3>, Vec<glam::Vec3>) {
         let Some(deformation) = &self.deformation else { return skin_mesh(&self.template, pose) };
@@ -626,7 +614,7 @@ impl Subject {
         for (position, by) in moved.positions.iter_mut().zip(deformation.vertex_displacement()) {
             *position += by;
         }
-        skin_mesh(&moved, &deformation.correction().apply(pose))
+        skin_mesh(&moved, pose)
     }
 
     /// Converts the images to RGB with the mask as alpha and without the background along its outline, and uploads each once.

@@ -16,13 +16,11 @@
 mod carry;
 mod data;
 mod normal;
-mod pose_fix;
 mod regularizer;
 mod settings;
 mod thickness;
 mod track;
 
 pub use data::{DataTerm, PointDerivatives};
-pub use pose_fix::{PoseCorrection, PoseFreedom};
 pub use settings::{DeformSettings, DeformSolver, FIRST_FRAMES};
 pub use track::{DeformReport, DeformTracker};

@@ -58,10 +58,7 @@ mod viewers;
 
 pub use background::{Background, BackgroundEvent};
 pub use config::PoseConfig;
-pub use deform::{
-    DataTerm, DeformReport, DeformSettings, DeformSolver, DeformTracker, FIRST_FRAMES, PointDerivatives,
-    PoseCorrection, PoseFreedom,
-};
+pub use deform::{DataTerm, DeformReport, DeformSettings, DeformSolver, DeformTracker, FIRST_FRAMES, PointDerivatives};
 pub use edge_color::{EdgeColor, Matte};
 pub use error::{TrackError, TrackErrorKind};
 pub use estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};

@@ -39,11 +39,6 @@ impl Landmarks {
         Self { points: graph.node_gaussian.iter().filter_map(point).collect() }
     }
 
-    /// Place and skin weights of every node.
-    pub fn nodes(&self) -> &[(DVec3, SkinWeights)] {
-        &self.points
-    }
-
     /// Middle of the body, world metres.
     pub fn center(&self, skeleton: &Skeleton, pose: &Pose) -> DVec3 {
         self.posed_center(&skeleton.world_from_canonical(pose))

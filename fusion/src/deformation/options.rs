@@ -2,7 +2,7 @@
 
 use flyrig_body::Part;
 use flyrig_renderer::WantedPicture;
-use flyrig_tracker::{DeformSettings, PoseFreedom};
+use flyrig_tracker::DeformSettings;
 
 /// So many are compared even where the person is a few pixels high.
 const LEAST_GAUSSIANS: f64 = 2000.0;
@@ -26,9 +26,6 @@ pub struct DeformOptions {
     pub views: usize,
     /// Whether head, hands and feet are stiffer than the rest.
     pub stiff_parts: bool,
-    /// Whether, and how freely, the pose is corrected as well. Off by default: joints come nearer to the true ones, but the
-    /// correction changes from frame to frame, and views lose two decibels (docs/benchmarks/perception.md).
-    pub pose: Option<PoseFreedom>,
 }
 
 impl DeformOptions {
@@ -78,7 +75,6 @@ impl DeformOptions {
             max_level: WantedPicture::MAX_LEVEL,
             views: 0,
             stiff_parts: true,
-            pose: None,
         }
     }
 }

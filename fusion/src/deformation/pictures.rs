@@ -8,7 +8,7 @@ use flyrig_renderer::{
     BackwardRasterizer, Carry, GaussianBuffers, GaussianGradients, LossSettings, Outputs, PictureGradients,
     PictureLoss, PictureSums, RasterSettings, Rasterizer, RenderTarget, WantedPicture,
 };
-use flyrig_tracker::{DataTerm, PointDerivatives, PoseCorrection};
+use flyrig_tracker::{DataTerm, PointDerivatives};
 use flyrig_types::Camera;
 
 use super::area::ViewPlan;
@@ -79,7 +79,7 @@ pub struct Pictures<'a> {
     sums: Vec<PictureSums>,
     derived_sums: Vec<PictureSums>,
     /// What is drawn now, and its loss.
-    drawn: Option<(Vec<[f32; 4]>, PoseCorrection, f64)>,
+    drawn: Option<(Vec<[f32; 4]>, f64)>,
     draw_time: Duration,
     derivatives_time: Duration,
 }
@@ -134,8 +134,8 @@ impl<'a> Pictures<'a> {
     }
 
     /// Leaves out what disagrees with all others: a camera that is covered, or whose mask shows something else.
-    pub fn distrust(&mut self, displacement: &[[f32; 4]], correction: &PoseCorrection) -> Result<()> {
-        self.draw(displacement, correction)?;
+    pub fn distrust(&mut self, displacement: &[[f32; 4]]) -> Result<()> {
+        self.draw(displacement)?;
         let best = self.sums.iter().map(agreement).fold(0.0, f64::max);
         if best > AGREES {
             self.trusted = self.sums.iter().map(|sums| agreement(sums) > DISAGREES).collect();
@@ -148,8 +148,8 @@ impl<'a> Pictures<'a> {
     }
 
     /// By view how much agrees in this state, which must have been drawn or derived last, and whether it counted.
-    pub fn judged(&self, displacement: &[[f32; 4]], correction: &PoseCorrection) -> Vec<(f64, bool)> {
-        let is_drawn = self.drawn.as_ref().is_some_and(|(d, c, _)| d == displacement && c == correction);
+    pub fn judged(&self, displacement: &[[f32; 4]]) -> Vec<(f64, bool)> {
+        let is_drawn = self.drawn.as_ref().is_some_and(|(d, _)| d == displacement);
         let sums = if is_drawn || self.derived_sums.is_empty() { &self.sums } else { &self.derived_sums };
         sums.iter().map(agreement).zip(self.trusted.iter().copied()).collect()
     }
@@ -159,10 +159,9 @@ impl<'a> Pictures<'a> {
     }
 
     /// Draws all views, unless that is what is drawn already, and returns the loss.
-    fn draw(&mut self, displacement: &[[f32; 4]], correction: &PoseCorrection) -> Result<f64> {
-        if let Some((moved, corrected, loss)) = &self.drawn
+    fn draw(&mut self, displacement: &[[f32; 4]]) -> Result<f64> {
+        if let Some((moved, loss)) = &self.drawn
             && moved == displacement
-            && corrected == correction
         {
             return Ok(*loss);
         }
@@ -174,15 +173,7 @@ impl<'a> Pictures<'a> {
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         for (pose, gaussians) in instants.iter().zip(*posed) {
             let (centers, normals) = (&gaussians.center_scale, &gaussians.normal);
-            skinner.encode(
-                gpu,
-                &mut encoder,
-                skeleton,
-                &correction.apply(pose),
-                Some(self.kernels.displacement),
-                centers,
-                normals,
-            )?;
+            skinner.encode(gpu, &mut encoder, skeleton, pose, Some(self.kernels.displacement), centers, normals)?;
         }
         for (i, (view, settings)) in self.views.iter().zip(&self.settings).enumerate() {
             let Some(gaussians) = posed.get(view.instant) else { continue };
@@ -201,7 +192,7 @@ impl<'a> Pictures<'a> {
         gpu.queue.submit([encoder.finish()]);
         self.sums = loss.read(gpu, self.views.len())?;
         let loss = self.trusted_loss();
-        self.drawn = Some((displacement.to_vec(), correction.clone(), loss));
+        self.drawn = Some((displacement.to_vec(), loss));
         self.draw_time += start.elapsed();
         Ok(loss)
     }
@@ -210,17 +201,12 @@ impl<'a> Pictures<'a> {
 impl DataTerm for Pictures<'_> {
     type Error = FusionError;
 
-    fn loss(&mut self, displacement: &[[f32; 4]], correction: &PoseCorrection) -> Result<f64> {
-        self.draw(displacement, correction)
+    fn loss(&mut self, displacement: &[[f32; 4]]) -> Result<f64> {
+        self.draw(displacement)
     }
 
-    fn derivatives(
-        &mut self,
-        displacement: &[[f32; 4]],
-        correction: &PoseCorrection,
-        out: &mut Vec<PointDerivatives>,
-    ) -> Result<f64> {
-        let loss = self.draw(displacement, correction)?;
+    fn derivatives(&mut self, displacement: &[[f32; 4]], out: &mut Vec<PointDerivatives>) -> Result<f64> {
+        let loss = self.draw(displacement)?;
         self.derived_sums.clone_from(&self.sums);
         let start = Instant::now();
         let Instants { gpu, skeleton, poses: instants, .. } = &self.scene;
@@ -239,10 +225,8 @@ impl DataTerm for Pictures<'_> {
         gpu.queue.submit([encoder.finish()]);
         out.clear();
         for (pose, sums) in instants.iter().zip(self.kernels.gradients) {
-            let pose = correction.apply(pose);
             out.push(PointDerivatives {
-                world_from_canonical: skeleton.world_from_canonical(&pose),
-                world_from_joint: skeleton.world_from_joint(&pose),
+                world_from_canonical: skeleton.world_from_canonical(pose),
                 gradient: sums.center.read(gpu)?,
                 curvature: sums.carried.read(gpu)?,
             });

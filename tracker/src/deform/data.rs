@@ -2,15 +2,11 @@
 
 use glam::DMat4;
 
-use super::PoseCorrection;
-
 /// Derivatives of the data loss by the Gaussians' world centres at one instant, as the backward rasteriser lays them out.
 #[derive(Debug, Clone, Default)]
 pub struct PointDerivatives {
     /// Skinning matrices of the instant, one a joint.
     pub world_from_canonical: Vec<DMat4>,
-    /// `world_from_joint` of the instant; only needed where the pose is corrected as well.
-    pub world_from_joint: Vec<DMat4>,
     /// One a Gaussian. xyz: dL/d world centre, per metre; w: how much it is seen, 0 for one that cannot matter.
     pub gradient: Vec<[f32; 4]>,
     /// Two a Gaussian: xx, xy, xz, yy | yz, zz, unused, unused of the symmetric, positive semidefinite Gauss-Newton
@@ -24,21 +20,16 @@ pub trait DataTerm {
     /// Why it cannot.
     type Error;
 
-    /// The loss with the Gaussians at `LBS(x + displacement)`, canonical metres, w unused, in the corrected pose.
+    /// The loss with the Gaussians at `LBS(x + displacement)`, canonical metres, w unused.
     ///
     /// # Errors
     /// The implementation's.
-    fn loss(&mut self, displacement: &[[f32; 4]], correction: &PoseCorrection) -> Result<f64, Self::Error>;
+    fn loss(&mut self, displacement: &[[f32; 4]]) -> Result<f64, Self::Error>;
 
     /// The loss, and its derivatives into `out`: one element an instant that pictures were taken at (all together when
     /// the cameras are synchronous); the sum of all counts.
     ///
     /// # Errors
     /// The implementation's.
-    fn derivatives(
-        &mut self,
-        displacement: &[[f32; 4]],
-        correction: &PoseCorrection,
-        out: &mut Vec<PointDerivatives>,
-    ) -> Result<f64, Self::Error>;
+    fn derivatives(&mut self, displacement: &[[f32; 4]], out: &mut Vec<PointDerivatives>) -> Result<f64, Self::Error>;
 }

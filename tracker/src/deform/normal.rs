@@ -1,10 +1,7 @@
 //! The normal equations of the graph: symmetric 3x3 blocks for pairs of nodes, solved by conjugate gradients.
 
 use glam::{DMat3, DVec3};
-use nalgebra::{Cholesky, Dyn};
 use rayon::prelude::*;
-
-use super::pose_fix::{Basis, solve_dense};
 
 /// Entry of a list of pairs that stands for none.
 const NONE: u32 = u32::MAX;
@@ -127,54 +124,16 @@ impl NormalMatrix {
     }
 
     /// Solves `(H + stiffness L + damping) x = right`; `damping` above 0 keeps it regular whatever H and L are.
-    ///
-    /// With a pose, the nodes move by `x + M p`, only `x` has neighbours to stay with, `p` has prices of its own, and `right`
-    /// continues with the unknowns of the pose; so does the result.
-    pub(super) fn solve(
-        &self,
-        stiffness: f64,
-        damping: f64,
-        right: &[DVec3],
-        pose: Option<(&Basis, &[f64])>,
-    ) -> Vec<DVec3> {
+    pub(super) fn solve(&self, stiffness: f64, damping: f64, right: &[DVec3]) -> Vec<DVec3> {
         let nodes = self.diagonal.len();
         let own =
             |n: usize| self.diagonal[n] + DMat3::from_diagonal(DVec3::splat(stiffness * self.node_edges[n] + damping));
         let inverses: Vec<DMat3> = (0..nodes).map(|n| inverse(own(n))).collect();
-        let rows = |row: &(dyn Fn(usize) -> DVec3 + Sync)| -> Vec<DVec3> {
+        let times = |x: &[DVec3]| -> Vec<DVec3> {
+            let row = |n: usize| self.times_data(x, n) + stiffness * self.times_laplacian(x, n) + damping * x[n];
             (0..nodes).into_par_iter().with_min_len(ROWS_A_TASK).map(row).collect()
         };
-        let Some((basis, prices)) = pose else {
-            let times = |x: &[DVec3]| {
-                rows(&|n| self.times_data(x, n) + stiffness * self.times_laplacian(x, n) + damping * x[n])
-            };
-            return conjugate_gradients(right, times, |r| r.iter().zip(&inverses).map(|(r, m)| *m * *r).collect());
-        };
-        let times = |x: &[DVec3]| {
-            let (x, p) = x.split_at(nodes);
-            let moved = basis.moved(x, p);
-            let data = rows(&|n| self.times_data(&moved, n));
-            let mut y: Vec<DVec3> = rows(&|n| data[n] + stiffness * self.times_laplacian(x, n) + damping * x[n]);
-            y.extend(basis.gathered(&data).into_iter().zip(p).zip(prices).map(|((y, p), price)| y + *p * *price));
-            y
-        };
-        let factors: Option<Cholesky<f64, Dyn>> = basis.factors(&self.row_sums(), prices);
-        let precondition = |r: &[DVec3]| -> Vec<DVec3> {
-            let (x, p) = r.split_at(nodes);
-            let mut z: Vec<DVec3> = x.iter().zip(&inverses).map(|(r, m)| *m * *r).collect();
-            z.extend(solve_dense(factors.as_ref(), p, prices));
-            z
-        };
-        conjugate_gradients(right, times, precondition)
-    }
-
-    /// Each node's row of H, added up.
-    fn row_sums(&self) -> Vec<DMat3> {
-        let row = |n: usize| {
-            let others = &self.others[self.rows[n]..self.rows[n + 1]];
-            others.iter().fold(self.diagonal[n], |sum, &(_, k)| sum + self.off_diagonal[k as usize])
-        };
-        (0..self.diagonal.len()).map(row).collect()
+        conjugate_gradients(right, times, |r| r.iter().zip(&inverses).map(|(r, m)| *m * *r).collect())
     }
 }
 

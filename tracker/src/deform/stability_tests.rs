@@ -59,17 +59,12 @@ struct Flat<'a> {
 impl DataTerm for Flat<'_> {
     type Error = Infallible;
 
-    fn loss(&mut self, displacement: &[[f32; 4]], correction: &PoseCorrection) -> Result<f64, Infallible> {
-        self.inner.loss(displacement, correction)
+    fn loss(&mut self, displacement: &[[f32; 4]]) -> Result<f64, Infallible> {
+        self.inner.loss(displacement)
     }
 
-    fn derivatives(
-        &mut self,
-        displacement: &[[f32; 4]],
-        correction: &PoseCorrection,
-        out: &mut Vec<PointDerivatives>,
-    ) -> Result<f64, Infallible> {
-        let loss = self.inner.derivatives(displacement, correction, out)?;
+    fn derivatives(&mut self, displacement: &[[f32; 4]], out: &mut Vec<PointDerivatives>) -> Result<f64, Infallible> {
+        let loss = self.inner.derivatives(displacement, out)?;
         for (g, h) in out[0].curvature.chunks_exact_mut(2).enumerate() {
             let turn = DMat3::from_quat(DQuat::from_scaled_axis(DVec3::new(0.3, 1.0, -0.7) * self.turn * g as f64));
             let m = turn * DMat3::from_diagonal(DVec3::from(self.keep) * f64::from(h[0][0])) * turn.transpose();
@@ -99,7 +94,7 @@ fn nearly_singular_matrices_give_finite_steps_that_lower_the_loss() {
                     assert!(tracker.translations().iter().all(|t| t.is_finite()), "{told}");
                     moved += report.accepted;
                     // The first frame has no history yet, which the second one adds to the loss.
-                    let after = data.loss(tracker.displacement(), &PoseCorrection::default()).unwrap();
+                    let after = data.loss(tracker.displacement()).unwrap();
                     assert!(after <= before || regularization > 0.0, "{told}: {before} {after}");
                     before = after;
                 }

@@ -39,17 +39,12 @@ pub(super) fn wide(v: [f32; 4]) -> DVec3 {
 impl DataTerm for Goals<'_> {
     type Error = Infallible;
 
-    fn loss(&mut self, displacement: &[[f32; 4]], _: &PoseCorrection) -> Result<f64, Infallible> {
+    fn loss(&mut self, displacement: &[[f32; 4]]) -> Result<f64, Infallible> {
         self.calls += 1;
         Ok((0..self.goals.len()).map(|g| self.weights[g] * self.off(g, wide(displacement[g])).length_squared()).sum())
     }
 
-    fn derivatives(
-        &mut self,
-        displacement: &[[f32; 4]],
-        correction: &PoseCorrection,
-        out: &mut Vec<PointDerivatives>,
-    ) -> Result<f64, Infallible> {
+    fn derivatives(&mut self, displacement: &[[f32; 4]], out: &mut Vec<PointDerivatives>) -> Result<f64, Infallible> {
         let one = PointDerivatives { world_from_canonical: self.bones.to_vec(), ..Default::default() };
         *out = vec![one];
         let out = &mut out[0];
@@ -60,7 +55,7 @@ impl DataTerm for Goals<'_> {
             out.curvature.push([2.0 * weight, 0.0, 0.0, 2.0 * weight]);
             out.curvature.push([0.0, 2.0 * weight, 0.0, 0.0]);
         }
-        self.loss(displacement, correction)
+        self.loss(displacement)
     }
 }
 
@@ -182,7 +177,7 @@ fn gradient_and_matrix_match_differences_and_a_dense_solve() {
     tracker.displace();
     let mut derivatives = Vec::new();
     let displacement = tracker.displacement().to_vec();
-    let data_loss = data.derivatives(&displacement, &PoseCorrection::default(), &mut derivatives).unwrap();
+    let data_loss = data.derivatives(&displacement, &mut derivatives).unwrap();
     tracker.derivatives = derivatives;
     let mut gradient = vec![DVec3::ZERO; nodes];
     let loss = data_loss + tracker.regularizer.loss(&t, &smooth, tracker.thickness.as_ref(), Some(&mut gradient));
@@ -220,7 +215,7 @@ fn gradient_and_matrix_match_differences_and_a_dense_solve() {
     }
     let expected = dense.clone().lu().solve(&right).unwrap();
     let minus: Vec<DVec3> = gradient.iter().map(|g| -*g).collect();
-    let ours = tracker.matrix.solve(tracker.regularizer.stiffness(), own_damping, &minus, None);
+    let ours = tracker.matrix.solve(tracker.regularizer.stiffness(), own_damping, &minus);
     let flat = DVector::from_iterator(3 * nodes, ours.iter().flat_map(DVec3::to_array));
     let error = (&flat - &expected).norm() / expected.norm();
     println!("step against a dense f64 solve: {error:.1e}");
@@ -322,17 +317,12 @@ struct Poisoned<'a> {
 impl DataTerm for Poisoned<'_> {
     type Error = Infallible;
 
-    fn loss(&mut self, displacement: &[[f32; 4]], correction: &PoseCorrection) -> Result<f64, Infallible> {
-        Ok(self.loss.unwrap_or(self.inner.loss(displacement, correction)?))
+    fn loss(&mut self, displacement: &[[f32; 4]]) -> Result<f64, Infallible> {
+        Ok(self.loss.unwrap_or(self.inner.loss(displacement)?))
     }
 
-    fn derivatives(
-        &mut self,
-        displacement: &[[f32; 4]],
-        correction: &PoseCorrection,
-        out: &mut Vec<PointDerivatives>,
-    ) -> Result<f64, Infallible> {
-        let loss = self.inner.derivatives(displacement, correction, out)?;
+    fn derivatives(&mut self, displacement: &[[f32; 4]], out: &mut Vec<PointDerivatives>) -> Result<f64, Infallible> {
+        let loss = self.inner.derivatives(displacement, out)?;
         out.iter_mut().for_each(self.spoil);
         Ok(self.loss.unwrap_or(loss))
     }

@@ -1,15 +1,14 @@
 //! The deformation from frame to frame.
 
-use flyrig_body::{DeformationGraph, Skeleton, SkinWeights};
+use flyrig_body::{DeformationGraph, SkinWeights};
 use glam::DVec3;
 
 use super::carry::to_canonical;
 use super::normal::NormalMatrix;
-use super::pose_fix::{Basis, PoseFix};
 use super::regularizer::Regularizer;
 use super::settings::FIRST_FRAMES;
 use super::thickness::Thickness;
-use super::{DataTerm, DeformSettings, DeformSolver, PointDerivatives, PoseCorrection, PoseFreedom};
+use super::{DataTerm, DeformSettings, DeformSolver, PointDerivatives};
 use crate::{TrackError, TrackErrorKind};
 
 /// Damping never falls below or rises above these shares of the mean diagonal.
@@ -56,9 +55,7 @@ pub struct DeformTracker {
     smooth: Vec<DVec3>,
     displacement: Vec<[f32; 4]>,
     derivatives: Vec<PointDerivatives>,
-    pose: Option<PoseFix>,
     thickness: Option<Thickness>,
-    no_correction: PoseCorrection,
     damping: f64,
     /// Loss below which there is nothing left to gain.
     floor: Option<f64>,
@@ -113,38 +110,10 @@ impl DeformTracker {
             smooth: vec![DVec3::ZERO; nodes],
             displacement: vec![[0.0; 4]; count],
             derivatives: Vec::new(),
-            pose: None,
             thickness: None,
-            no_correction: PoseCorrection::default(),
             floor: None,
             frame: 0,
         })
-    }
-
-    /// Corrects the pose as well: only what no turn of a joint explains is left to the nodes. `nodes` holds canonical place
-    /// and skin weights of every node. Gradient descent knows nothing of it.
-    ///
-    /// # Errors
-    /// [`TrackErrorKind::Template`] when the nodes are not the graph's or a price is not usable.
-    pub fn with_pose(
-        mut self,
-        skeleton: &Skeleton,
-        nodes: Vec<(DVec3, SkinWeights)>,
-        freedom: PoseFreedom,
-    ) -> Result<Self, TrackError> {
-        let fail = |message: String| Err(TrackError::new(TrackErrorKind::Template, message));
-        if nodes.len() != self.translations.len() {
-            return fail(format!("{} places for {} nodes of the graph", nodes.len(), self.translations.len()));
-        }
-        let above = [freedom.turn, freedom.shift].into_iter().all(|v| v.is_finite() && v > 0.0);
-        let usable = above && freedom.hold.is_finite() && freedom.hold >= 0.0;
-        if !usable {
-            return fail("the prices of a corrected pose must be finite and above 0".to_owned());
-        }
-        if matches!(self.settings.solver, DeformSolver::GaussNewton { .. }) {
-            self.pose = Some(PoseFix::new(skeleton, nodes, freedom));
-        }
-        Ok(self)
     }
 
     /// Makes parts of the body stiffer: an edge's share of Eq. 4 counts as many times as the geometric mean of its two
@@ -185,20 +154,11 @@ impl DeformTracker {
         Ok(self)
     }
 
-    /// What the pose is corrected by.
-    #[must_use]
-    pub fn correction(&self) -> &PoseCorrection {
-        self.pose.as_ref().map_or(&self.no_correction, |pose| &pose.now)
-    }
-
     /// Back to rest: the next frame counts as the first.
     pub fn reset(&mut self) {
         self.translations.fill(DVec3::ZERO);
         self.smooth.fill(DVec3::ZERO);
         self.displacement.fill([0.0; 4]);
-        if let Some(pose) = &mut self.pose {
-            pose.reset();
-        }
         if let Some(thickness) = &mut self.thickness {
             thickness.forget();
         }
@@ -207,12 +167,9 @@ impl DeformTracker {
         self.frame = 0;
     }
 
-    /// Keeps what is known of the clothes; the next frame counts as the first again, and the pose is no longer corrected.
+    /// Keeps what is known of the clothes; the next frame counts as the first again.
     pub fn restart(&mut self) {
         self.smooth.clone_from(&self.translations);
-        if let Some(pose) = &mut self.pose {
-            pose.reset();
-        }
         self.damping = self.settings.damping;
         self.floor = None;
         self.frame = 0;
@@ -229,7 +186,7 @@ impl DeformTracker {
             return Err(TrackError::new(TrackErrorKind::Template, message));
         }
         self.reset();
-        self.restore((translations.to_vec(), self.correction().clone()));
+        self.restore(translations.to_vec());
         self.smooth.clone_from(&self.translations);
         Ok(())
     }
@@ -252,11 +209,11 @@ impl DeformTracker {
     /// The data term's; the state is then that of the last accepted step.
     pub fn track<D: DataTerm>(&mut self, data: &mut D) -> Result<DeformReport, D::Error> {
         let mut report = DeformReport::default();
-        let start = (self.translations.clone(), self.correction().clone());
+        let start = self.translations.clone();
         // Before the first frame there is nothing to stay close to.
         self.regularizer.history = self.frame > 0;
         if let Some(floor) = self.floor.filter(|_| self.frame >= FIRST_FRAMES) {
-            let loss = data.loss(&self.displacement, self.correction())? + self.prior(None);
+            let loss = data.loss(&self.displacement)? + self.prior(None);
             if loss <= floor * (1.0 + self.settings.rest) {
                 report.losses.push(loss);
                 report.at_rest = true;
@@ -266,7 +223,7 @@ impl DeformTracker {
         for _ in 0..self.settings.iterations(self.frame) {
             let mut gradient = vec![DVec3::ZERO; self.translations.len()];
             let mut derivatives = std::mem::take(&mut self.derivatives);
-            let data_loss = data.derivatives(&self.displacement, self.correction(), &mut derivatives);
+            let data_loss = data.derivatives(&self.displacement, &mut derivatives);
             self.derivatives = derivatives;
             let loss = data_loss? + self.prior(Some(&mut gradient));
             if !loss.is_finite() {
@@ -291,7 +248,7 @@ impl DeformTracker {
                         report.accepted += 1;
                     }
                 }
-                DeformSolver::GaussNewton { .. } => self.step_downhill(&gradient, &by_data, loss, data, &mut report)?,
+                DeformSolver::GaussNewton { .. } => self.step_downhill(&gradient, loss, data, &mut report)?,
             }
             if report.accepted == before {
                 break;
@@ -305,9 +262,6 @@ impl DeformTracker {
         let share = self.settings.smoothing;
         for (smooth, t) in self.smooth.iter_mut().zip(&self.translations) {
             *smooth += (*t - *smooth) * share;
-        }
-        if let Some(pose) = &mut self.pose {
-            pose.next_frame();
         }
         if let Some(thickness) = &mut self.thickness {
             thickness.learn(&self.translations, &self.matrix);
@@ -340,47 +294,33 @@ impl DeformTracker {
     /// Returns the regularisation terms of the loss and, where asked, their gradient by the nodes.
     fn prior(&self, gradient: Option<&mut [DVec3]>) -> f64 {
         self.regularizer.loss(&self.translations, &self.smooth, self.thickness.as_ref(), gradient)
-            + self.pose.as_ref().map_or(0.0, PoseFix::loss)
-    }
-
-    /// How the pose's unknowns move the nodes, and what they cost.
-    fn pose_basis(&self) -> Option<(Basis, Vec<f64>)> {
-        let (pose, first) = (self.pose.as_ref()?, self.derivatives.first()?);
-        let basis = pose.basis(&first.world_from_canonical, &first.world_from_joint, &self.translations);
-        Some((basis, pose.stiffness()))
     }
 
     fn step_downhill<D: DataTerm>(
         &mut self,
         gradient: &[DVec3],
-        by_data: &[DVec3],
         loss: f64,
         data: &mut D,
         report: &mut DeformReport,
     ) -> Result<(), D::Error> {
-        let pose = self.pose_basis();
-        let mut right: Vec<DVec3> = gradient.iter().map(|g| -*g).collect();
-        if let (Some((basis, _)), Some(fix)) = (&pose, &self.pose) {
-            right.extend(basis.gathered(by_data).into_iter().zip(fix.gradient()).map(|(data, own)| -(data + own)));
-        }
+        let right: Vec<DVec3> = gradient.iter().map(|g| -*g).collect();
         if right.iter().all(|g| *g == DVec3::ZERO) {
             return Ok(());
         }
-        let pose = pose.as_ref().map(|(basis, prices)| (basis, prices.as_slice()));
         for _ in 0..self.settings.attempts {
             let stiffness = self.regularizer.stiffness();
             let by_data = self.matrix.mean_diagonal();
             let damping = self.damping * by_data + LEAST_DAMPING * (by_data + stiffness * self.matrix.mean_edges());
-            let step = self.matrix.solve(stiffness, damping + 2.0 * self.regularizer.anchor, &right, pose);
+            let step = self.matrix.solve(stiffness, damping + 2.0 * self.regularizer.anchor, &right);
             // Of the quadratic model, which the step s solves: (A + damping) s = -g.
             let share = self.shrink(&step);
             let along: f64 = right.iter().zip(&step).map(|(r, s)| r.dot(*s)).sum();
-            let squared: f64 = step.iter().take(gradient.len()).map(|s| s.length_squared()).sum();
+            let squared: f64 = step.iter().map(|s| s.length_squared()).sum();
             let predicted = share * along - 0.5 * share * share * (along - damping * squared);
             if predicted < LEAST_GAIN * loss {
                 return Ok(());
             }
-            let state = (self.translations.clone(), self.correction().clone());
+            let state = self.translations.clone();
             let new = self.try_step(&step, data)?;
             if new < loss {
                 let gain = (loss - new) / predicted;
@@ -402,13 +342,11 @@ impl DeformTracker {
 
     /// The share of a step that keeps every node within the longest one.
     fn shrink(&self, step: &[DVec3]) -> f64 {
-        let nodes = step.iter().take(self.translations.len());
-        let longest = nodes.map(|s| s.length()).fold(0.0, f64::max);
+        let longest = step.iter().map(|s| s.length()).fold(0.0, f64::max);
         if longest > self.settings.max_step_m { self.settings.max_step_m / longest } else { 1.0 }
     }
 
-    /// Moves the nodes, and the pose where it is free, within the limits; none, and nothing done, when the step is not
-    /// finite.
+    /// Moves the nodes within the limits; `None`, and nothing done, when the step is not finite.
     fn step(&mut self, step: &[DVec3]) -> Option<()> {
         if !step.iter().all(|s| s.is_finite()) {
             return None;
@@ -418,29 +356,23 @@ impl DeformTracker {
         for (t, s) in self.translations.iter_mut().zip(step) {
             *t = (*t + *s * shrink).clamp_length_max(limit);
         }
-        if let (Some(pose), Some(unknowns)) = (&mut self.pose, step.get(self.translations.len()..)) {
-            pose.step(unknowns, shrink);
-        }
         self.displace();
         Some(())
     }
 
-    fn restore(&mut self, (translations, correction): (Vec<DVec3>, PoseCorrection)) {
+    fn restore(&mut self, translations: Vec<DVec3>) {
         self.translations = translations;
-        if let Some(pose) = &mut self.pose {
-            pose.now = correction;
-        }
         self.displace();
     }
 
     /// Moves the nodes and returns the loss there. A step or a loss that is not finite is undone, and so is one that the
     /// data term fails at.
     fn try_step<D: DataTerm>(&mut self, step: &[DVec3], data: &mut D) -> Result<f64, D::Error> {
-        let old = (self.translations.clone(), self.correction().clone());
+        let old = self.translations.clone();
         if self.step(step).is_none() {
             return Ok(f64::NAN);
         }
-        let loss = data.loss(&self.displacement, self.correction());
+        let loss = data.loss(&self.displacement);
         let total = loss.map(|loss| loss + self.prior(None));
         if !matches!(total, Ok(total) if total.is_finite()) {
             self.restore(old);
