@@ -20,7 +20,7 @@ setup:
 	@scripts/setup.sh
 
 demo: setup
-	@echo "demo: building flyrig (the first build takes 14 to 30 minutes on two cores, later ones seconds)"
+	@echo "demo: building flyrig (the first build takes about 20 minutes on two cores, later ones seconds)"
 	$(CARGO) build --release --locked --workspace --bin flyrig
 	$(CARGO) run --release --locked -q --bin flyrig -- demo --out $(OUT)
 

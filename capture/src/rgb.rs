@@ -113,16 +113,30 @@ fn unsupported(message: String) -> CaptureError {
 }
 
 /// BT.601 limited range in 16-bit fixed point: `R = 255/219 (Y-16) + 2 (1-Kr) 255/224 (V-128)` and
-/// so on with Kr = 0.299, Kb = 0.114.
+/// so on with Kr = 0.299, Kb = 0.114. Nothing here can overflow; checks for it would keep the compiler from vectors.
+#[inline]
 fn rgb_of(y: u8, chroma: [i32; 3]) -> [u8; 3] {
-    let y = 76_309 * (i32::from(y) - 16) + (1 << 15);
-    chroma.map(|c| ((y + c) >> 16).clamp(0, 255) as u8)
+    chroma.map(|c| level(scaled_luma(y).wrapping_add(c)))
+}
+
+/// What luma adds to every colour, with half a level for rounding.
+#[inline]
+fn scaled_luma(y: u8) -> i32 {
+    i32::from(y).wrapping_sub(16).wrapping_mul(76_309).wrapping_add(1 << 15)
+}
+
+/// Level of a colour in fixed point.
+#[inline]
+fn level(fixed: i32) -> u8 {
+    (fixed >> 16).clamp(0, 255) as u8
 }
 
 /// What chroma adds to red, green and blue.
+#[inline]
 fn chroma_of(u: u8, v: u8) -> [i32; 3] {
-    let (u, v) = (i32::from(u) - 128, i32::from(v) - 128);
-    [104_597 * v, -25_675 * u - 53_279 * v, 132_201 * u]
+    let (u, v) = (i32::from(u).wrapping_sub(128), i32::from(v).wrapping_sub(128));
+    let green = u.wrapping_mul(-25_675).wrapping_sub(v.wrapping_mul(53_279));
+    [v.wrapping_mul(104_597), green, u.wrapping_mul(132_201)]
 }
 
 /// Pixels of a block, whose arithmetic the compiler turns into vector instructions; even, so that it ends with a pair.
@@ -146,12 +160,14 @@ fn packed_to_rgb(bytes: &[u8], [first, second, u, v]: [usize; 4], rgb: &mut [u8]
 /// [`rgb_of`] for a block of pixels, two with one chroma.
 #[inline]
 fn block_of_yuv(luma: &[u8; BLOCK], u: &[u8; BLOCK / 2], v: &[u8; BLOCK / 2], out: &mut [u8; 3 * BLOCK]) {
-    // Planes first: written three bytes at a time, nothing would be computed in vectors.
-    let mut planes = [[0u8; BLOCK]; 3];
+    // One simple loop a step, and planes first: anything else is computed pixel by pixel.
+    let luma = luma.map(scaled_luma);
+    let mut chroma = [[0i32; BLOCK]; 3];
     for i in 0..BLOCK {
-        let color = rgb_of(luma[i], chroma_of(u[i / 2], v[i / 2]));
-        (planes[0][i], planes[1][i], planes[2][i]) = (color[0], color[1], color[2]);
+        let pixel = chroma_of(u[i / 2], v[i / 2]);
+        (chroma[0][i], chroma[1][i], chroma[2][i]) = (pixel[0], pixel[1], pixel[2]);
     }
+    let planes: [[u8; BLOCK]; 3] = from_fn(|c| from_fn(|i| level(luma[i].wrapping_add(chroma[c][i]))));
     for i in 0..BLOCK {
         (out[3 * i], out[3 * i + 1], out[3 * i + 2]) = (planes[0][i], planes[1][i], planes[2][i]);
     }
