@@ -7,6 +7,8 @@ use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig, Simulator};
 use flyrig_types::{Frame, FrameSet, Image};
 
+use crate::stress::copy;
+
 /// Time from set to set while somebody is seen, and while nobody is.
 const STEP_NANOS: i64 = 200_000_000;
 const EMPTY_STEP_NANOS: i64 = 600_000_000;
@@ -25,16 +27,12 @@ fn simulator(gpu: &GpuContext, build: Build) -> Simulator {
     Simulator::new(gpu, &config).unwrap()
 }
 
-fn copy(image: &Image) -> Image {
-    Image::new(image.width(), image.height(), image.format(), image.bytes().to_vec()).unwrap()
-}
-
 /// The rig's images, at a time of the simulation or of the empty room.
 fn set(simulator: &mut Simulator, index: u64, nanos: i64, shown: Option<i64>) -> FrameSet {
     let slots: Vec<usize> = (0..simulator.rig().cameras.len()).collect();
     let images: Vec<Image> = match shown {
         Some(at) => simulator.capture_all(at, &slots).unwrap().into_iter().map(|(image, _)| image).collect(),
-        None => slots.iter().map(|&slot| copy(simulator.plate(slot).unwrap())).collect(),
+        None => slots.iter().map(|&slot| copy(simulator.plate(slot).unwrap()).unwrap()).collect(),
     };
     let frame = |(slot, image): (usize, Image)| {
         let camera = simulator.rig().cameras[slot].id.clone();
@@ -75,7 +73,7 @@ fn somebody_of_another_build_gets_another_shape_and_who_comes_back_keeps_it() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     let (mut small, mut tall) = (simulator(&gpu, Build::SlimWoman), simulator(&gpu, Build::HeavyMan));
     let rig = small.rig().clone();
-    let plates: Vec<Option<Image>> = (0..3).map(|slot| Some(copy(small.plate(slot).unwrap()))).collect();
+    let plates: Vec<Option<Image>> = (0..3).map(|slot| Some(copy(small.plate(slot).unwrap()).unwrap())).collect();
     let template = flyrig_body::default_template(&flyrig_body::ShapeParams::default()).unwrap();
     let perception = EstimatedPerception::new(&rig, &template, &PerceptionSettings::default(), &plates).unwrap();
     let mut studio = Studio { perception, index: 0, nanos: 0 };

@@ -239,7 +239,7 @@ fn lengths(vectors: &[DVec3]) -> Vec<f64> {
     vectors.iter().map(|v| v.length()).collect()
 }
 
-fn mean(values: &[f64]) -> f64 {
+pub(crate) fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 

@@ -1,4 +1,4 @@
-//! `flyrig-bench stress`: what disturbs perception, one thing after the other, with everything estimated from images.
+//! `flyrig-bench stress`: disturbances of perception, one at a time, with everything estimated from images.
 //!
 //! Every case is one simulated person in front of a rig: calm, then the disturbance, then calm again. Joints are compared
 //! with the true ones, and the time from the end of the disturbance until they are as near as before is the recovery.
@@ -18,7 +18,10 @@ use flyrig_sim::{
 use flyrig_types::{Frame, FrameSet, Image, PixelFormat};
 use glam::{DQuat, DVec3};
 
-use crate::{cli::BenchStressArgs, perception::places};
+use crate::{
+    cli::BenchStressArgs,
+    perception::{mean, places},
+};
 
 /// Colour of a mask's outline.
 const OUTLINE: [u8; 3] = [0, 255, 80];
@@ -29,7 +32,7 @@ const BEFORE_SECS: f64 = 3.0;
 /// Joints are as near as before again below this multiple of the error before, and this error at least.
 const RECOVERED: (f64, f64) = (1.5, 30.0);
 
-/// What happens between the calm times.
+/// Disturbance between two calm periods.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Disturbance {
     /// Nothing but the movement itself.
@@ -166,7 +169,7 @@ fn simulator(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, build: Build
     Ok(Simulator::new(gpu, &config)?)
 }
 
-fn copy(image: &Image) -> Result<Image> {
+pub(crate) fn copy(image: &Image) -> Result<Image> {
     Ok(Image::new(image.width(), image.height(), image.format(), image.bytes().to_vec())?)
 }
 
@@ -335,10 +338,6 @@ fn write_sheet(path: &Path, rows: &[Vec<Image>]) -> Result<()> {
     let png = png::encode_rgb(&rgb, (width * columns) as u32, (height * rows.len()) as u32)?;
     write_whole(path, &png)?;
     Ok(())
-}
-
-fn mean(values: &[f64]) -> f64 {
-    values.iter().sum::<f64>() / values.len() as f64
 }
 
 fn percentile(values: &[f64], share: f64) -> f64 {

@@ -28,7 +28,7 @@ pub enum BodyError {
     Gltf {
         /// Which file.
         path: PathBuf,
-        /// What is wrong and the fix.
+        /// Problem and fix.
         message: String,
     },
     /// A BVH file that is damaged.
@@ -38,7 +38,7 @@ pub enum BodyError {
         path: PathBuf,
         /// Line, counted from 1.
         line: usize,
-        /// What is wrong and the fix.
+        /// Problem and fix.
         message: String,
     },
     /// A shape target that the built-in body does not have.
@@ -69,7 +69,7 @@ pub enum BodyError {
     Mesh {
         /// Which template.
         name: String,
-        /// What is wrong and the fix.
+        /// Problem and fix.
         message: String,
     },
     /// A skeleton that makes no tree or does not fit.

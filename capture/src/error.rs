@@ -38,7 +38,7 @@ pub struct CaptureError {
     pub camera: Option<CameraId>,
     /// What to do about it.
     pub kind: CaptureErrorKind,
-    /// What happened and the fix.
+    /// Problem and fix.
     pub message: String,
 }
 

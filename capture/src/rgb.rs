@@ -119,19 +119,19 @@ fn rgb_of(y: u8, chroma: [i32; 3]) -> [u8; 3] {
     chroma.map(|c| level(scaled_luma(y).wrapping_add(c)))
 }
 
-/// What luma adds to every colour, with half a level for rounding.
+/// Contribution of luma to red, green and blue, with half a level for rounding.
 #[inline]
 fn scaled_luma(y: u8) -> i32 {
     i32::from(y).wrapping_sub(16).wrapping_mul(76_309).wrapping_add(1 << 15)
 }
 
-/// Level of a colour in fixed point.
+/// Rounds a colour in fixed point to its level.
 #[inline]
 fn level(fixed: i32) -> u8 {
     (fixed >> 16).clamp(0, 255) as u8
 }
 
-/// What chroma adds to red, green and blue.
+/// Contributions of chroma to red, green and blue.
 #[inline]
 fn chroma_of(u: u8, v: u8) -> [i32; 3] {
     let (u, v) = (i32::from(u).wrapping_sub(128), i32::from(v).wrapping_sub(128));

@@ -60,7 +60,7 @@ pub enum FusionError {
     SavedPerson {
         /// The file's name, or the person's.
         name: String,
-        /// What is wrong, and the fix.
+        /// Problem and fix.
         problem: String,
     },
     /// A person that cannot be sent as a stream.

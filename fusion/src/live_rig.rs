@@ -155,18 +155,17 @@ impl LiveRig {
             Err(panic) => Err(panic),
         };
         self.session.budget.spend(start.elapsed());
-        let held = |reason: String| Outcome::Held(reason);
         let (outcome, watched) = match outcome {
             Ok(Ok(outcome)) => (outcome, self.watch.as_mut().and_then(|watch| watch.look(&set))),
             Ok(Err(fault)) if fault.is_device_fault() => {
                 self.recover(fault)?;
-                (held("the graphics device was opened again".to_owned()), None)
+                (Outcome::Held("the graphics device was opened again".to_owned()), None)
             }
             Ok(Err(error)) => return Err(error),
             Err(panic) => {
                 let reason = format!("the pipeline was restarted after a panic: {panic}");
                 self.restart(panic)?;
-                (held(reason), None)
+                (Outcome::Held(reason), None)
             }
         };
         if let Some(event) = &watched {
@@ -194,12 +193,11 @@ impl LiveRig {
             let look = || caught(|| perceiver.perceive(&next));
             let thread = std::thread::Builder::new().name(PERCEPTION.to_owned()).spawn_scoped(scope, look);
             let outcome = caught(|| self.take_in(set, perceived, turn_time));
-            let observed = match thread {
-                Ok(thread) => thread.join().unwrap_or_else(|_| Err("the perception thread ended".to_owned())),
-                Err(source) => Ok(Err(FusionError::Thread { name: PERCEPTION, source })),
-            };
-            (outcome, observed)
+            let joined = thread.map(|thread| thread.join().unwrap_or_else(|_| Err("perception panicked".to_owned())));
+            (outcome, joined)
         });
+        // Without another thread the set is observed in this one.
+        let observed = observed.unwrap_or_else(|_| caught(|| perceiver.perceive(&next)));
         self.session.return_perceiver(perceiver);
         self.ahead = Some((next, observed));
         outcome

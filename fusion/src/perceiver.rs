@@ -7,7 +7,7 @@ use flyrig_types::{FrameSet, PersonId};
 
 use crate::{Effort, FusionError, KnownPerson, Observation, Perception, StageTimes};
 
-/// What perception found in one set.
+/// Result of perception for one set.
 pub(crate) enum Perceived {
     /// Nothing moved: the set is left out.
     Still,

@@ -65,7 +65,7 @@ pub enum GpuError {
 }
 
 impl GpuError {
-    /// Whether the device can no longer be relied on, so that everything on it must be built anew.
+    /// Whether the device can no longer be relied on, so that everything on it must be rebuilt.
     #[must_use]
     pub fn is_device_fault(&self) -> bool {
         matches!(self, Self::Lost(_) | Self::OutOfMemory | Self::Rejected(_))

@@ -28,7 +28,7 @@ impl PictureGradients {
     }
 }
 
-/// What happens to the numbers that a pixel hands to its Gaussians by their blending weights.
+/// Treatment of the numbers that a pixel passes to its Gaussians, weighted by their blending weights.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Carry {
     /// They are added up. With dL/d (red, green, blue) as the numbers, the sums are dL/d the Gaussian's colour.

@@ -20,14 +20,14 @@ impl Outputs {
     pub const SURFACE: Self = Self { color: true, depth: false, canonical: true };
 }
 
-/// How to render.
+/// Settings of a rendering.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RasterSettings {
     /// Gaussians whose centre is closer to the camera's plane are skipped, metres.
     pub near_m: f32,
     /// Skip Gaussians whose normal points away from the camera ([`crate::BACKFACING_COSINE`]). For closed surfaces.
     pub cull_backfacing: bool,
-    /// What to write.
+    /// Images to write.
     pub outputs: Outputs,
     /// Variance of the low-pass filter that is added to every splat on the screen, square pixels.
     /// The splat's opacity falls so that its integral stays: Mip-Splatting's 2D Mip filter (Yu et al.
@@ -44,7 +44,7 @@ impl Default for RasterSettings {
     }
 }
 
-/// What the latest picture needed.
+/// Resources used by the latest picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RasterStats {
     /// Gaussians that touch the picture.
@@ -56,7 +56,7 @@ pub struct RasterStats {
     pub overflowed_pictures: u32,
 }
 
-/// What the backward pass must know about the picture that was recorded last.
+/// Description of the picture that was recorded last, for the backward pass.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Latest {
     pub gaussians: usize,

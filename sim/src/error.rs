@@ -62,7 +62,7 @@ pub enum SimError {
     Export {
         /// Which.
         path: PathBuf,
-        /// What is wrong with it, and the fix.
+        /// Problem and fix.
         message: String,
     },
     /// An export that was told to stop.

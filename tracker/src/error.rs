@@ -23,7 +23,7 @@ pub enum TrackErrorKind {
 pub struct TrackError {
     /// What sort of trouble.
     pub kind: TrackErrorKind,
-    /// What happened and the fix.
+    /// Problem and fix.
     pub message: String,
 }
 

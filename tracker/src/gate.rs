@@ -5,11 +5,11 @@ use glam::{DVec2, Vec3};
 
 use crate::grid::Grid;
 
-/// How far most clothes and hair stand off the fitted body, metres: the unit of a gate's distances.
+/// Distance of most clothes and hair from the fitted body, metres: the unit of a gate's distances.
 const REACH_M: f64 = 0.13;
-/// How far a wide skirt or a coat may stand off, as a multiple: beyond 1, only where picture and background speak for it.
+/// Distance of wide skirts and coats, as a multiple of it: beyond 1, only where picture and background speak for it.
 pub(crate) const CLOTHES_REACH: f32 = 2.5;
-/// Where a posed body and its clothes may be in a picture.
+/// Region of a picture that a posed body and its clothes may cover.
 #[derive(Debug, Clone)]
 pub struct BodyGate {
     /// Width and height of the picture.

@@ -27,7 +27,7 @@ impl<'a> Rgb<'a> {
         Ok(Self { width: image.width() as usize, height: image.height() as usize, bytes })
     }
 
-    /// Whether the picture is uniform but for noise, as before a covered lens.
+    /// Returns whether the picture is uniform except for noise, as with a covered lens.
     pub fn is_blank(&self) -> bool {
         /// Blocks in each direction whose means are compared, and side of a block, pixels.
         const BLOCKS: usize = 24;
@@ -87,7 +87,7 @@ impl<'a> Rgb<'a> {
     }
 }
 
-/// Whether an image is uniform but for noise, as before a covered lens; such an image tells nothing about people or background.
+/// Returns whether an image is uniform except for noise, as with a covered lens. It contains neither people nor background.
 ///
 /// # Errors
 /// Kind `Image` when the format cannot be read.
