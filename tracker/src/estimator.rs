@@ -261,7 +261,13 @@ impl PoseEstimator {
     ) -> Result<PoseEstimate, TrackError> {
         let pictures = self.check(set)?;
         let mut seconds = StageSeconds::default();
-        let fitted = match self.follow_or_search(set, &pictures, others, may_search, &mut seconds) {
+        let found = if pictures.iter().all(Option::is_none) {
+            // A prediction alone is nobody.
+            Err(TrackError::new(TrackErrorKind::Lost, "every image is uniform; uncover the lenses, or check the light"))
+        } else {
+            self.follow_or_search(set, &pictures, others, may_search, &mut seconds)
+        };
+        let fitted = match found {
             Ok(fitted) => fitted,
             Err(error) => {
                 if error.kind == TrackErrorKind::Lost {
