@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-use anyhow::{Result, ensure};
-use flyrig_capture::{CameraControls, CameraIdentity, CameraOptions, FormatChoice, NokhwaDevice, NokhwaOptions};
+use anyhow::Result;
+use flyrig_capture::DeviceSettings;
 use serde::{
     Deserialize, Deserializer, Serialize,
     de::{MapAccess, Visitor, value::MapAccessDeserializer},
@@ -14,56 +14,7 @@ use serde::{
 #[serde(untagged)]
 pub enum CameraEntry {
     Named(String),
-    Device(Box<CameraSection>),
-}
-
-/// How a real camera is opened.
-#[derive(Debug, Clone, PartialEq)]
-pub enum DeviceOptions {
-    V4l2(CameraOptions),
-    Nokhwa(NokhwaOptions),
-}
-
-/// A real camera.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct CameraSection {
-    pub name: String,
-    #[serde(default)]
-    pub serial: String,
-    #[serde(default)]
-    pub path: String,
-    #[serde(default)]
-    pub bus: String,
-    #[serde(default)]
-    pub nokhwa: String,
-    pub size: [u32; 2],
-    #[serde(default = "default_fps")]
-    pub fps: f64,
-    #[serde(default)]
-    pub format: FormatChoice,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub exposure_ms: Option<f64>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub gain: Option<i32>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub white_balance_kelvin: Option<i32>,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub focus: Option<i32>,
-    #[serde(default)]
-    pub readout_ms: f64,
-    #[serde(default)]
-    pub lag_ms: f64,
-    #[serde(default = "default_buffers")]
-    pub buffers: u32,
-}
-
-fn default_fps() -> f64 {
-    30.0
-}
-
-fn default_buffers() -> u32 {
-    6
+    Device(Box<DeviceSettings>),
 }
 
 /// Not derived: an untagged enum would swallow the names of unknown keys.
@@ -82,7 +33,7 @@ impl<'de> Deserialize<'de> for CameraEntry {
             }
 
             fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<CameraEntry, A::Error> {
-                CameraSection::deserialize(MapAccessDeserializer::new(map))
+                DeviceSettings::deserialize(MapAccessDeserializer::new(map))
                     .map(|section| CameraEntry::Device(Box::new(section)))
             }
         }
@@ -103,7 +54,7 @@ impl CameraEntry {
     ///
     /// # Errors
     /// Says what to write when there is only a name.
-    pub fn device(&self) -> Result<&CameraSection> {
+    pub fn device(&self) -> Result<&DeviceSettings> {
         match self {
             Self::Device(section) => Ok(section),
             Self::Named(name) => anyhow::bail!(
@@ -114,105 +65,10 @@ impl CameraEntry {
     }
 }
 
-impl CameraSection {
-    /// Checks every value.
-    pub fn check(&self) -> Result<()> {
-        let range = |key: &str, value: f64, low: f64, high: f64| -> Result<()> {
-            ensure!(
-                value.is_finite() && (low..=high).contains(&value),
-                "camera {}: {key} is {value}, it must lie between {low} and {high}",
-                self.name
-            );
-            Ok(())
-        };
-        ensure!(!self.name.is_empty(), "a table [[source.cameras]] has an empty name");
-        self.options()?;
-        range("size[0]", f64::from(self.size[0]), 16.0, 16_384.0)?;
-        range("size[1]", f64::from(self.size[1]), 16.0, 16_384.0)?;
-        range("fps", self.fps, 0.1, 1000.0)?;
-        range("exposure_ms", self.exposure_ms.unwrap_or(1.0), 0.1, 10_000.0)?;
-        range("white_balance_kelvin", self.white_balance_kelvin.unwrap_or(5000).into(), 1000.0, 20_000.0)?;
-        range("readout_ms", self.readout_ms, 0.0, 1000.0)?;
-        range("lag_ms", self.lag_ms, -10_000.0, 10_000.0)?;
-        range("buffers", self.buffers.into(), 3.0, 32.0)
-    }
-
-    /// What the camera is opened as.
-    ///
-    /// # Errors
-    /// When it is named in no way or in several, and when nokhwa cannot do what is asked for.
-    pub fn options(&self) -> Result<DeviceOptions> {
-        let name = &self.name;
-        let given = [&self.serial, &self.path, &self.bus, &self.nokhwa];
-        let count = given.iter().filter(|text| !text.is_empty()).count();
-        ensure!(count < 2, "camera {name}: name it by one of serial, path, bus and nokhwa, not by several");
-        let identity = if !self.serial.is_empty() {
-            CameraIdentity::Serial(self.serial.clone())
-        } else if !self.path.is_empty() {
-            CameraIdentity::Path(self.path.clone())
-        } else if !self.bus.is_empty() {
-            CameraIdentity::Bus(self.bus.clone())
-        } else {
-            ensure!(
-                count > 0,
-                "camera {name}: serial, path, bus and nokhwa are all empty; set one (`flyrig doctor` lists them)"
-            );
-            return Ok(DeviceOptions::Nokhwa(self.nokhwa_options()?));
-        };
-        Ok(DeviceOptions::V4l2(CameraOptions {
-            identity,
-            width: self.size[0],
-            height: self.size[1],
-            fps: self.fps,
-            format: self.format,
-            controls: CameraControls {
-                exposure_secs: self.exposure_ms.map(|ms| ms / 1e3),
-                gain: self.gain,
-                white_balance_kelvin: self.white_balance_kelvin,
-                focus: self.focus,
-            },
-            readout_secs: self.readout_ms / 1e3,
-            lag_secs: self.lag_ms / 1e3,
-            buffers: self.buffers,
-        }))
-    }
-
-    fn nokhwa_options(&self) -> Result<NokhwaOptions> {
-        let set = [
-            ("exposure_ms", self.exposure_ms.is_some()),
-            ("gain", self.gain.is_some()),
-            ("white_balance_kelvin", self.white_balance_kelvin.is_some()),
-            ("focus", self.focus.is_some()),
-            ("readout_ms", self.readout_ms > 0.0),
-            ("buffers", self.buffers != default_buffers()),
-        ];
-        if let Some((key, _)) = set.into_iter().find(|(_, is_set)| *is_set) {
-            anyhow::bail!(
-                "camera {}: {key} cannot be set through nokhwa; leave it out, or name the camera by serial, path or bus",
-                self.name
-            );
-        }
-        for (format, text) in [(FormatChoice::Uyvy, "uyvy"), (FormatChoice::Bayer8, "bayer8")] {
-            ensure!(
-                self.format != format,
-                "camera {}: format \"{text}\" cannot be had through nokhwa; set another, or name the camera by serial, \
-                 path or bus",
-                self.name
-            );
-        }
-        Ok(NokhwaOptions {
-            device: NokhwaDevice::from(self.nokhwa.as_str()),
-            width: self.size[0],
-            height: self.size[1],
-            fps: self.fps,
-            format: self.format,
-            lag_secs: self.lag_ms / 1e3,
-        })
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use flyrig_capture::{CameraIdentity, DeviceOptions, FormatChoice, NokhwaDevice};
+
     use crate::config::Config;
 
     use super::*;

@@ -12,15 +12,14 @@ use flyrig_capture::{
 };
 use flyrig_fusion::{Health, check_threads};
 use flyrig_gpu::GpuContext;
+use flyrig_monitor::{Arrivals, Monitor, ended_by_itself};
 use flyrig_report::stop;
 use flyrig_transport::{CameraPublisher, CameraStatus};
 use flyrig_types::{CameraId, Frame};
 
 use crate::{
     config::{Config, SourceKind},
-    live,
-    monitor::{Arrivals, Monitor, ended_by_itself},
-    network, source,
+    live, network, source,
 };
 
 /// How often the state of cameras is published.

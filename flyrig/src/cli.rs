@@ -2,14 +2,12 @@
 
 use std::{collections::BTreeMap, net::SocketAddr, ops::Range, path::PathBuf};
 
-use clap::{Args, Parser, Subcommand, ValueEnum, builder::TypedValueParser as _};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
 use flyrig_calib::Format;
-use flyrig_fusion::{
-    AppearanceOptions, BodySettings, BudgetSettings, NetworksOn, Origin, PerceptionSettings, TrackingSettings,
-};
+use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, Origin, PerceptionSettings, TrackingSettings};
 use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size, parse_speed};
-use flyrig_stfa::NetworkSize;
+use flyrig_training::TrainArgs;
 use flyrig_types::CameraId;
 
 /// Live free-viewpoint video of a person from a few cameras.
@@ -404,92 +402,6 @@ pub struct SimExportArgs {
     pub no_truth: bool,
 }
 
-#[derive(Debug, Args)]
-pub struct TrainArgs {
-    /// Folder of samples, checkpoint, weights and curves. A folder with a checkpoint is gone on with.
-    #[arg(long)]
-    pub out: PathBuf,
-    /// Simulated people to train on.
-    #[arg(long, default_value_t = 60)]
-    pub people: u64,
-    /// Simulated people, of another seed, that only measure progress.
-    #[arg(long, default_value_t = 8)]
-    pub test_people: u64,
-    /// Instants of each simulated person.
-    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=100))]
-    pub instants: u64,
-    /// Seed of people, starting weights and order.
-    #[arg(long, default_value_t = 1)]
-    pub seed: u64,
-    /// Recorded data set (EasyMocap layout, with masks) to train on as well, every camera held out in turn; may be given
-    /// several times.
-    #[arg(long)]
-    pub dataset: Vec<PathBuf>,
-    /// Cameras of --dataset, comma separated; all of them otherwise.
-    #[arg(long, value_delimiter = ',')]
-    pub cameras: Vec<String>,
-    /// Frames of --dataset from one sample to the next.
-    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=100_000))]
-    pub every: u64,
-    /// Pose in --dataset: from its glTF animation, or from the pictures.
-    #[arg(long, value_enum, default_value = "given")]
-    pub pose: Origin,
-    /// Frame rate of --dataset.
-    #[arg(long, default_value_t = 30.0)]
-    pub fps: f64,
-    /// Folder of further samples, as an earlier run left them; may be given several times.
-    #[arg(long)]
-    pub extra: Vec<PathBuf>,
-    /// Steps in all.
-    #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
-    pub steps: u64,
-    /// Adam's rate at the start; it falls to zero along half a cosine.
-    #[arg(long, default_value_t = 2e-3)]
-    pub rate: f32,
-    /// Weight of structural similarity beside the mean squared difference.
-    #[arg(long, default_value_t = 0.2)]
-    pub structure: f32,
-    /// Weight of fine contrast beside it, which keeps prints from fading.
-    #[arg(long, default_value_t = 1.0)]
-    pub contrast: f32,
-    /// How large the networks are.
-    #[arg(long, value_enum, default_value = "tiny", conflicts_with = "from")]
-    pub size: SizeName,
-    /// Weights file to start from in place of random weights; "small" or "tiny" for the networks that come with flyrig.
-    #[arg(long)]
-    pub from: Option<PathBuf>,
-    /// Where the networks are trained; "adapter" needs a flyrig that was built with the feature gpu-networks.
-    #[arg(long, value_enum, default_value = "processor")]
-    pub networks_on: NetworksOn,
-    /// Checkpoints (one every 250 steps) from one measurement on the test people to the next.
-    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
-    pub test_every: u64,
-    /// Pixels of a simulated picture's side.
-    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
-    pub side: u32,
-    /// Gaussians on the person's surface.
-    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
-    pub gaussians: usize,
-}
-
-/// Sizes of the networks of learned appearance.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum SizeName {
-    Tiny,
-    Small,
-    Medium,
-}
-
-impl SizeName {
-    pub fn size(self) -> NetworkSize {
-        match self {
-            Self::Tiny => NetworkSize::TINY,
-            Self::Small => NetworkSize::SMALL,
-            Self::Medium => NetworkSize::MEDIUM,
-        }
-    }
-}
-
 #[derive(Debug, Subcommand)]
 pub enum ConfigAction {
     /// Print the default configuration with a comment on every key.
@@ -743,5 +655,14 @@ mod tests {
         for bad in ["0x0", "640", "640x100000", "x"] {
             assert!(parse_size(bad).is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    fn the_service_file_starts_what_there_is() {
+        let service = include_str!("../../packaging/flyrig.service");
+        let start = service.lines().find_map(|line| line.strip_prefix("ExecStart=")).unwrap();
+        let cli = Cli::try_parse_from(start.split_whitespace()).unwrap();
+        assert!(matches!(cli.command, Command::Run { .. }));
+        assert!(service.contains("Type=notify") && service.contains("WatchdogSec="));
     }
 }

@@ -38,7 +38,7 @@ pub struct Config {
     pub output: OutputSettings,
     pub capture: CaptureSection,
     pub record: RecordSection,
-    pub transport: TransportSection,
+    pub transport: TransportConfig,
     pub health: HealthSection,
     pub gpu: GpuSection,
 }
@@ -194,29 +194,6 @@ impl Default for RecordSection {
     }
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct TransportSection {
-    pub listen: Vec<String>,
-    pub connect: Vec<String>,
-    pub max_viewers: usize,
-    pub viewpoint_pixels_per_second: u64,
-    pub inbox_bytes: u64,
-}
-
-impl Default for TransportSection {
-    fn default() -> Self {
-        let TransportConfig { viewpoint_pixels_per_second, inbox_bytes, .. } = TransportConfig::default();
-        Self {
-            listen: vec!["tcp/127.0.0.1:7447".to_owned()],
-            connect: Vec::new(),
-            max_viewers: 4,
-            viewpoint_pixels_per_second,
-            inbox_bytes,
-        }
-    }
-}
-
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GpuSection {
@@ -297,10 +274,6 @@ impl Config {
         self.output.validate()?;
         range("capture.jpeg_quality", f64::from(self.capture.jpeg_quality), 0.0, 100.0)?;
         range("record.jpeg_quality", f64::from(self.record.jpeg_quality), 0.0, 100.0)?;
-        range("transport.max_viewers", self.transport.max_viewers as f64, 0.0, 64.0)?;
-        let pixels = self.transport.viewpoint_pixels_per_second as f64;
-        range("transport.viewpoint_pixels_per_second", pixels, 0.0, 1e11)?;
-        range("transport.inbox_bytes", self.transport.inbox_bytes as f64, 65_536.0, 4_294_967_296.0)?;
         self.transport().validate().context("in [rig] or [transport]")
     }
 
@@ -317,14 +290,7 @@ impl Config {
 
     /// The settings of the transport session.
     pub fn transport(&self) -> TransportConfig {
-        TransportConfig {
-            listen: self.transport.listen.clone(),
-            connect: self.transport.connect.clone(),
-            max_viewers: self.transport.max_viewers,
-            viewpoint_pixels_per_second: self.transport.viewpoint_pixels_per_second,
-            inbox_bytes: self.transport.inbox_bytes,
-            ..TransportConfig::publisher(&self.rig.name)
-        }
+        TransportConfig { rig: self.rig.name.clone(), ..self.transport.clone() }
     }
 
     /// What tracking needs beyond values in their ranges.
@@ -421,10 +387,10 @@ mod tests {
             ("[source]\nkind = \"folder\"\n", "source.path is empty"),
             ("[source]\nkind = \"folder\"\npath = \"x\"\n[perception]\npose = \"given\"\n", "body.template is empty"),
             ("[rig]\nname = \"a/b\"\n", "rig.name is 'a/b'"),
-            ("[transport]\ninbox_bytes = 1000\n", "transport.inbox_bytes is 1000, it must lie between 65536 and"),
+            ("[transport]\ninbox_bytes = 1000\n", "in [rig] or [transport]: inbox_bytes: is 1000, expected 65536 to"),
             (
                 "[transport]\nviewpoint_pixels_per_second = 1000000000000\n",
-                "viewpoint_pixels_per_second is 1000000000000",
+                "viewpoint_pixels_per_second: is 1000000000000, at most",
             ),
             ("[record]\nrotate = \"4\"\n", "without a unit"),
             ("[sim]\nwidth = -4\n", "invalid value: integer `-4`"),

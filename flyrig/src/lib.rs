@@ -10,11 +10,7 @@ mod config;
 mod demo;
 mod doctor;
 mod eval;
-mod health;
 mod live;
-mod metrics_server;
-mod metrics_text;
-mod monitor;
 mod network;
 mod plate;
 mod pose_recording;
@@ -26,7 +22,6 @@ mod source;
 mod stream_recording;
 mod sync_check;
 mod take;
-mod train;
 mod view;
 mod watch;
 
@@ -94,7 +89,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
             let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
             sim_export::sim_export(args, &config.sim, &open_gpu(adapter)?)
         }
-        Command::Train(args) => train::train(args, &|| open_gpu(cli.adapter.as_deref())),
+        Command::Train(args) => flyrig_training::train(args, &|| open_gpu(cli.adapter.as_deref())),
         Command::Config { action: ConfigAction::Print } => {
             print!("{DEFAULT_TOML}");
             Ok(())

@@ -2,13 +2,10 @@
 
 use anyhow::Result;
 use flyrig_calib::load_calibration;
-use flyrig_capture::{CameraOptions, CameraSource, CaptureError, NokhwaCamera, SourceOpener};
+use flyrig_capture::SourceOpener;
 use flyrig_types::{CameraId, Rig};
 
-use crate::{
-    cameras::{CameraEntry, DeviceOptions},
-    config::SourceSection,
-};
+use crate::{cameras::CameraEntry, config::SourceSection};
 
 /// Reads the calibration; where its files do not say how large the pictures are, the configuration does, and where both do,
 /// they must agree.
@@ -28,35 +25,12 @@ pub fn openers(source: &SourceSection) -> Result<Vec<SourceOpener>> {
     let opener = |entry: &CameraEntry| -> Result<SourceOpener> {
         let id = CameraId::from(entry.name());
         let options = entry.device()?.options()?;
-        #[cfg(not(target_os = "linux"))]
-        if let DeviceOptions::V4l2(options) = &options {
-            let identity = &options.identity;
-            anyhow::bail!("camera {id}: {identity} needs Linux; name it by its name or number in the key nokhwa");
-        }
         let of_thread = id.clone();
         Ok(SourceOpener::new(&id, move || {
-            let camera = open(&of_thread, &options)?;
+            let camera = options.open(&of_thread)?;
             tracing::info!("camera {of_thread}: {}", camera.health().mode);
             Ok(camera)
         }))
     };
     source.cameras.iter().map(opener).collect()
-}
-
-fn open(camera: &CameraId, options: &DeviceOptions) -> Result<Box<dyn CameraSource>, CaptureError> {
-    Ok(match options {
-        DeviceOptions::V4l2(options) => open_v4l2(camera, options)?,
-        DeviceOptions::Nokhwa(options) => Box::new(NokhwaCamera::open(camera, options)?),
-    })
-}
-
-#[cfg(target_os = "linux")]
-fn open_v4l2(camera: &CameraId, options: &CameraOptions) -> Result<Box<dyn CameraSource>, CaptureError> {
-    Ok(Box::new(flyrig_capture::V4l2Camera::open(camera, options)?))
-}
-
-/// Only Linux has V4L2; [`openers`] refuses such a camera.
-#[cfg(not(target_os = "linux"))]
-fn open_v4l2(camera: &CameraId, _options: &CameraOptions) -> Result<Box<dyn CameraSource>, CaptureError> {
-    Err(CaptureError::new(camera, flyrig_capture::CaptureErrorKind::Unsupported, "V4L2 needs Linux"))
 }

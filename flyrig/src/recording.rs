@@ -13,6 +13,7 @@ use flyrig_capture::{
     SourceOpener, ThreadsConfig, recorded_notes, to_rgb8,
 };
 use flyrig_gpu::GpuContext;
+use flyrig_monitor::{Arrivals, Monitor, ended_by_itself};
 use flyrig_report::{png, stop, write_whole};
 use flyrig_sync::{SyncSettings, Synchronizer};
 use flyrig_transport::{decode_calibration, decode_transforms, encode_calibration, encode_transforms};
@@ -25,9 +26,7 @@ use foxglove::{
 use crate::{
     cli::{RecordArgs, ReplayArgs},
     config::{Config, RecordSection, SourceKind},
-    live,
-    monitor::{Arrivals, Monitor, ended_by_itself},
-    pose_recording,
+    live, pose_recording,
     source::{self, Source},
 };
 

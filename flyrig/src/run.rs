@@ -12,14 +12,13 @@ use flyrig_fusion::{
     SessionBuilder, resident_mib,
 };
 use flyrig_gpu::GpuContext;
+use flyrig_monitor::{Monitor, effort, ended_by_itself};
 use flyrig_report::{dataset, stop};
 use flyrig_transport::Publisher;
 use foxglove::messages::Log;
 
 use crate::{
     config::{Config, WatchMode},
-    health,
-    monitor::{Monitor, ended_by_itself},
     pose_recording::PoseRecording,
     recording,
     source::{self, FoundBy, Source},
@@ -136,8 +135,7 @@ fn capture_people(
             let rate = (rig.frames() - printed) as f64 / last_print.elapsed().as_secs_f64();
             let memory = resident_mib().map_or_else(String::new, |mib| format!(", {mib:.0} MiB"));
             let lost = rig.session.counts.lost;
-            let effort =
-                rig.session.budget.stats().map_or_else(String::new, |budget| format!(", {}", health::effort(budget)));
+            let effort = rig.session.budget.stats().map_or_else(String::new, |budget| format!(", {}", effort(budget)));
             eprintln!("run: {} sets, {rate:.1} a second, {lost} lost{memory}{effort}", rig.frames());
             (last_print, printed) = (Instant::now(), rig.frames());
         }

@@ -1,11 +1,13 @@
 //! Draws all people of a session into one view.
 
-use flyrig_gpu::GpuContext;
+use flyrig_gpu::{GpuContext, StageTimer};
 use flyrig_renderer::{GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, rgba8_from_target};
 use flyrig_types::{Camera, RenderedView};
 
 use crate::{FusionError, StageTimes};
 
+/// Name of the stage.
+const STAGE: &str = "render a view";
 /// Targets kept for views of different sizes.
 const TARGETS: usize = 4;
 
@@ -19,17 +21,24 @@ pub(crate) struct Drawing {
     joined: Option<GaussianBuffers>,
     /// Whether `joined` holds the people as they are now.
     is_current: bool,
+    /// Of [`STAGE`].
+    timer: StageTimer,
 }
 
 impl Drawing {
     pub fn new(gpu: &GpuContext, max_gaussians: usize) -> Result<Self, FusionError> {
         let rasterizer = Rasterizer::new(gpu, max_gaussians)?;
-        Ok(Self { rasterizer, targets: Vec::new(), joined: None, is_current: false })
+        Ok(Self { rasterizer, targets: Vec::new(), joined: None, is_current: false, timer: StageTimer::new(gpu, 1) })
     }
 
     /// Somebody has moved or changed colour.
     pub fn people_changed(&mut self) {
         self.is_current = false;
+    }
+
+    /// Whether views are timed without waiting for what was submitted before.
+    pub fn is_timed_by_adapter(&self) -> bool {
+        self.timer.is_supported()
     }
 
     /// Draws these people as `camera` sees them. People hide each other.
@@ -52,6 +61,7 @@ impl Drawing {
             }
         };
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        self.timer.begin(&mut encoder);
         let gaussians = match people {
             [one] => one,
             people => {
@@ -61,12 +71,20 @@ impl Drawing {
         };
         let settings = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
         self.rasterizer.encode(gpu, &mut encoder, gaussians, camera, &settings, &target)?;
+        self.timer.mark(&mut encoder, STAGE);
+        self.timer.finish(&mut encoder);
         gpu.queue.submit([encoder.finish()]);
-        gpu.wait()?;
-        stages.add("render a view", start.elapsed());
+        if !self.timer.is_supported() {
+            gpu.wait()?;
+            stages.add(STAGE, start.elapsed());
+        }
+        // Where the adapter measures its own time, reading back is also what waits for it.
         let rgba = stages.time("read a view back", || -> Result<_, FusionError> {
             Ok(rgba8_from_target(&target.color.read(gpu)?))
         })?;
+        for stage in self.timer.collect() {
+            stages.add(stage.name, stage.time);
+        }
         self.targets.push(target);
         Ok(RenderedView { width, height, rgba })
     }

@@ -364,8 +364,10 @@ impl Session {
     /// # Errors
     /// [`FusionError::Gpu`]; a view that is too large for the adapter leaves the session as it was.
     pub fn render(&mut self, camera: &Camera) -> Result<RenderedView, FusionError> {
-        // Else the time of the updates under way would be that of the view.
-        self.gpu.wait()?;
+        if !self.drawing.is_timed_by_adapter() {
+            // Else the time of the updates under way would be that of the view.
+            self.gpu.wait()?;
+        }
         self.subjects.iter_mut().for_each(|subject| subject.collect_times(&mut self.stages));
         let posed = |subject: &&Subject| subject.last_pose.is_some();
         let mut people: Vec<&GaussianBuffers> = self.subjects.iter().filter(posed).map(Subject::gaussians).collect();

@@ -3,7 +3,7 @@
 //!
 //! Prints duration of the publish calls, latency from the call to the receipt in the other process,
 //! rates and losses: 60 kB pictures of four views and splat states of 115k Gaussians, at 30 a second and
-//! as fast as they go, with and without shared memory and zenoh's express flag.
+//! as fast as they go, with and without shared memory.
 
 use std::{
     io::Read,
@@ -32,12 +32,10 @@ fn main() -> Result<(), Failure> {
     }
     let seconds: f64 = arguments.first().map_or(Ok(3.0), |seconds| seconds.parse())?;
     codec()?;
-    println!("\nload            shm   express  publish us p50/p99  latency ms p50/p99/max  MiB/s  a second  missed");
+    println!("\nload            shm  publish us p50/p99  latency ms p50/p99/max  MiB/s  a second  missed");
     for shared_memory in [true, false] {
-        for express in [true, false] {
-            for load in [Load::Views, Load::Splats, Load::FastViews, Load::FastSplats] {
-                measure(load, shared_memory, express, seconds)?;
-            }
+        for load in [Load::Views, Load::Splats, Load::FastViews, Load::FastSplats] {
+            measure(load, shared_memory, seconds)?;
         }
     }
     Ok(())
@@ -87,11 +85,10 @@ fn codec() -> Result<(), TransportError> {
     Ok(())
 }
 
-fn measure(load: Load, shared_memory: bool, express: bool, seconds: f64) -> Result<(), Failure> {
+fn measure(load: Load, shared_memory: bool, seconds: f64) -> Result<(), Failure> {
     let config = TransportConfig {
         listen: vec!["tcp/127.0.0.1:0".to_owned()],
         shared_memory,
-        express,
         ..TransportConfig::publisher("bench")
     };
     let publisher = Publisher::open(&config)?;
@@ -150,7 +147,7 @@ fn measure(load: Load, shared_memory: bool, express: bool, seconds: f64) -> Resu
     }
     child.wait()?;
     let (p50, p99) = (percentile(&mut micros, 0.5), percentile(&mut micros, 0.99));
-    println!("{:<14} {shared_memory:>5} {express:>7}  {p50:>9.1} / {p99:>6.1}   {}", format!("{load:?}"), line.trim());
+    println!("{:<14} {shared_memory:>5}  {p50:>9.1} / {p99:>6.1}   {}", format!("{load:?}"), line.trim());
     publisher.close()?;
     Ok(())
 }

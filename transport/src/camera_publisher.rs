@@ -69,7 +69,7 @@ impl CameraPublisher {
         clock_exchange::answer(&session, keys::key(rig, &format!("clock/{host}")), clock).map_err(failed)?;
         let alive = keys::key(rig, &format!("host/{host}"));
         let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
-        let drain = DrainThread::start(Drain { shared: shared.clone(), session, express: config.express, woken })?;
+        let drain = DrainThread::start(Drain { shared: shared.clone(), session, woken })?;
         Ok(Self { shared, cameras, endpoints, drain, _alive: alive })
     }
 

@@ -7,9 +7,10 @@ use crate::{TransportError, keys};
 
 /// Where a rig is found and how its sessions behave; one structure for both sides.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields, rename_all = "kebab-case")]
+#[serde(default, deny_unknown_fields)]
 pub struct TransportConfig {
-    /// Name of the rig, part of every key: 1 to 64 of `A-Z a-z 0-9 _ . -`.
+    /// Name of the rig, part of every key: 1 to 64 of `A-Z a-z 0-9 _ . -`. A configuration has it elsewhere.
+    #[serde(skip)]
     pub rig: String,
     /// zenoh endpoints to listen on, such as `tcp/127.0.0.1:7447`; port 0 takes a free one.
     /// There is no access control: listen on other addresses only inside a trusted network.
@@ -20,8 +21,6 @@ pub struct TransportConfig {
     pub multicast: bool,
     /// Pass large payloads through shared memory between processes of one host.
     pub shared_memory: bool,
-    /// Send each message at once instead of filling a batch under back-pressure; no gain was measured on loopback.
-    pub express: bool,
     /// Publisher: how many subscribers may have a viewpoint of their own.
     pub max_viewers: usize,
     /// Publisher: how long a viewpoint lives without being renewed, milliseconds.
@@ -40,18 +39,21 @@ pub(crate) const LARGEST_QUESTION: usize = 1 << 20;
 /// Range of [`TransportConfig::inbox_bytes`].
 const INBOX_BYTES: std::ops::RangeInclusive<u64> = 1 << 16..=1 << 32;
 
+/// Bound of [`TransportConfig::viewpoint_pixels_per_second`].
+const MOST_PIXELS_PER_SECOND: u64 = 100_000_000_000;
+
 /// Endpoint where a publisher listens unless told otherwise.
 const DEFAULT_ENDPOINT: &str = "tcp/127.0.0.1:7447";
 
+/// A publisher named "flyrig" that listens on loopback, zenoh's usual port.
 impl Default for TransportConfig {
     fn default() -> Self {
         Self {
-            rig: "rig".to_owned(),
-            listen: vec![],
+            rig: "flyrig".to_owned(),
+            listen: vec![DEFAULT_ENDPOINT.to_owned()],
             connect: vec![],
             multicast: false,
             shared_memory: true,
-            express: false,
             max_viewers: 4,
             viewpoint_lease_millis: 3000,
             viewpoint_pixels_per_second: 512 * 512 * 30 * 4,
@@ -65,13 +67,13 @@ impl TransportConfig {
     /// A publisher that listens on loopback, zenoh's usual port.
     #[must_use]
     pub fn publisher(rig: &str) -> Self {
-        Self { rig: rig.to_owned(), listen: vec![DEFAULT_ENDPOINT.to_owned()], ..Self::default() }
+        Self { rig: rig.to_owned(), ..Self::default() }
     }
 
     /// A subscriber that connects to a publisher on this host.
     #[must_use]
     pub fn subscriber(rig: &str) -> Self {
-        Self { rig: rig.to_owned(), connect: vec![DEFAULT_ENDPOINT.to_owned()], ..Self::default() }
+        Self { rig: rig.to_owned(), listen: vec![], connect: vec![DEFAULT_ENDPOINT.to_owned()], ..Self::default() }
     }
 
     /// Checks names, endpoints and limits.
@@ -96,19 +98,25 @@ impl TransportConfig {
         }
         if !(100..=600_000).contains(&self.viewpoint_lease_millis) {
             return Err(TransportError::config(
-                "viewpoint-lease-millis",
+                "viewpoint_lease_millis",
                 format!("is {}, expected 100 to 600000", self.viewpoint_lease_millis),
+            ));
+        }
+        if self.viewpoint_pixels_per_second > MOST_PIXELS_PER_SECOND {
+            return Err(TransportError::config(
+                "viewpoint_pixels_per_second",
+                format!("is {}, at most {MOST_PIXELS_PER_SECOND}", self.viewpoint_pixels_per_second),
             ));
         }
         if !INBOX_BYTES.contains(&self.inbox_bytes) {
             let (min, max) = (INBOX_BYTES.start(), INBOX_BYTES.end());
             return Err(TransportError::config(
-                "inbox-bytes",
+                "inbox_bytes",
                 format!("is {}, expected {min} to {max}", self.inbox_bytes),
             ));
         }
         if self.max_viewers > 64 {
-            return Err(TransportError::config("max-viewers", format!("is {}, at most 64", self.max_viewers)));
+            return Err(TransportError::config("max_viewers", format!("is {}, at most 64", self.max_viewers)));
         }
         Ok(())
     }
@@ -161,11 +169,11 @@ mod tests {
         assert!(refused(TransportConfig { rig: "a/**".into(), ..good.clone() }).contains("a/**"));
         assert!(refused(TransportConfig { rig: String::new(), ..good.clone() }).contains("rig"));
         assert!(refused(TransportConfig { listen: vec!["udp/1.2.3.4:5".into()], ..good.clone() }).contains("udp/"));
-        assert!(refused(TransportConfig::default()).contains("meets nobody"));
+        assert!(refused(TransportConfig { listen: vec![], ..good.clone() }).contains("meets nobody"));
         assert!(refused(TransportConfig { viewpoint_lease_millis: 0, ..good.clone() }).contains("lease"));
         for inbox_bytes in [0, 1000, u64::MAX] {
-            assert!(refused(TransportConfig { inbox_bytes, ..good.clone() }).contains("inbox-bytes"));
+            assert!(refused(TransportConfig { inbox_bytes, ..good.clone() }).contains("inbox_bytes"));
         }
-        assert!(refused(TransportConfig { max_viewers: 1000, ..good }).contains("max-viewers"));
+        assert!(refused(TransportConfig { max_viewers: 1000, ..good }).contains("max_viewers"));
     }
 }

@@ -101,7 +101,6 @@ struct Lane {
 pub(crate) struct Drain {
     pub shared: Arc<Shared>,
     pub session: Session,
-    pub express: bool,
     pub woken: Receiver<()>,
 }
 
@@ -209,7 +208,6 @@ impl Drain {
                 .declare_publisher(keys::key(&self.shared.rig, &lane.topic.label))
                 .congestion_control(CongestionControl::Drop)
                 .priority(lane.topic.priority())
-                .express(self.express)
                 .encoding(lane.topic.encoding())
                 .wait();
             match declared {
@@ -279,7 +277,7 @@ mod tests {
         let topic = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
         let leases = Leases::new(0, Duration::ZERO, 0);
         let (shared, woken) = Shared::new("drill", &session, std::slice::from_ref(&topic), leases);
-        (Drain { shared, session, express: false, woken }, topic)
+        (Drain { shared, session, woken }, topic)
     }
 
     fn wait_until(what: &str, is_true: impl Fn() -> bool) {

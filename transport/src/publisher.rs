@@ -115,7 +115,7 @@ impl Publisher {
         let alive = keys::key(rig, &format!("alive/{}", session.zid()));
         let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
 
-        let drain = DrainThread::start(Drain { shared: shared.clone(), session, express: config.express, woken })?;
+        let drain = DrainThread::start(Drain { shared: shared.clone(), session, woken })?;
         let persons = Mutex::default();
         Ok(Self { shared, splats, persons, people, stats, endpoints, drain, _alive: alive })
     }

@@ -210,7 +210,7 @@ impl Leases {
             let max = self.max_viewers;
             return Err(TransportError::config(
                 topic,
-                format!("all {max} viewpoints of the rig are taken; wait for one or raise max-viewers"),
+                format!("all {max} viewpoints of the rig are taken; wait for one or raise max_viewers"),
             ));
         }
         self.active.push(Lease { viewpoint, ends, next_due: None });

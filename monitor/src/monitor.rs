@@ -14,7 +14,7 @@ use flyrig_fusion::{CameraHealth, Health, STUCK_AFTER, resident_mib};
 use flyrig_gpu::GpuContext;
 use flyrig_types::CameraId;
 
-use crate::{health, metrics_server::MetricsServer, metrics_text};
+use crate::{metrics_server::MetricsServer, metrics_text, table};
 
 /// How often the health is reported.
 const EVERY: Duration = Duration::from_secs(1);
@@ -85,12 +85,12 @@ impl Monitor {
         }
         if self.show_table {
             // Clears the terminal first.
-            eprint!("\x1b[2J\x1b[H{}", health::table(&health, recorded.as_ref()));
+            eprint!("\x1b[2J\x1b[H{}", table::table(&health, recorded.as_ref()));
         }
     }
 
     fn log(&mut self, health: &Health) {
-        for (thread, restarts) in health::thread_restarts(health) {
+        for (thread, restarts) in table::thread_restarts(health) {
             let logged = self.logged.entry(thread.clone()).or_default();
             if restarts > logged.0 {
                 tracing::warn!("thread '{thread}' was restarted, {restarts} times so far");
@@ -184,7 +184,8 @@ fn notify(state: &str) {
 #[cfg(not(target_os = "linux"))]
 fn notify(_state: &str) {}
 
-/// Returns why a live rig ended without a request.
+/// Returns the error of a live rig that ended without a request.
+#[must_use]
 pub fn ended_by_itself(cameras: &[CameraStats]) -> anyhow::Error {
     let all: Vec<&CameraStats> = cameras.iter().collect();
     anyhow!("all cameras have ended{}", last_errors(&all))
@@ -244,7 +245,7 @@ mod tests {
     use flyrig_capture::{CaptureError, CaptureErrorKind};
 
     use super::*;
-    use crate::health::tests::health;
+    use crate::table::tests::health;
 
     #[test]
     fn the_watchdog_is_fed_by_steps_alone_while_cameras_deliver() {
@@ -299,15 +300,5 @@ mod tests {
             },
         );
         assert_eq!((done, fed.load(SeqCst)), ("done", 3), "once for each step, and not while it hung");
-    }
-
-    #[test]
-    fn the_service_file_starts_what_there_is() {
-        use clap::Parser as _;
-        let service = include_str!("../../packaging/flyrig.service");
-        let start = service.lines().find_map(|line| line.strip_prefix("ExecStart=")).unwrap();
-        let cli = crate::cli::Cli::try_parse_from(start.split_whitespace()).unwrap();
-        assert!(matches!(cli.command, crate::cli::Command::Run { .. }));
-        assert!(service.contains("Type=notify") && service.contains("WatchdogSec="));
     }
 }

@@ -1,8 +1,9 @@
-//! `flyrig train`: networks for learned appearance, from simulated people and recorded rigs.
+//! Training of the networks for learned appearance, from simulated people and recorded rigs.
 //!
 //! Everything lies in one folder and survives being killed at any time: samples are made once and kept as files, the
 //! state of the training is written whole every few hundred steps.
 
+mod arguments;
 mod gather;
 mod people;
 mod recording;
@@ -19,16 +20,21 @@ use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop, write_whole};
 use flyrig_stfa::{NetworkDevice, Parameters, SampleErrors, TrainSettings, Trainer, TrainingSample, evaluate};
 
-use self::people::People;
-use self::report::{Progress, Scores};
-use crate::cli::TrainArgs;
+pub use self::arguments::{SizeName, TrainArgs};
+use self::{
+    people::People,
+    report::{Progress, Scores},
+};
 
 /// Added to the seed of the people that only measure progress.
 const HELD_OUT_SEED: u64 = 1 << 40;
 /// Steps between two checkpoints.
 const CHECKPOINT_STEPS: u64 = 250;
 
-/// Runs the command.
+/// Makes samples, trains, and writes weights and curves into the folder of the arguments; `gpu` opens the adapter where one is needed.
+///
+/// # Errors
+/// Names what is missing, damaged, or in contradiction to a checkpoint in the folder.
 pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     let started = Instant::now();

@@ -12,7 +12,7 @@ use prometheus_client::{
     registry::Registry,
 };
 
-use crate::health;
+use crate::table;
 
 /// Formats a snapshot, and the state of a recording where there is one, as OpenMetrics text.
 pub fn prometheus(health: &Health, recorded: Option<&Recorded>) -> String {
@@ -115,10 +115,10 @@ impl Collector for Snapshot {
             camera.stats.errors.iter().map(move |(kind, count)| (labels(kind), *count))
         });
         page.counters("camera_errors", "Errors of cameras by kind.", errors)?;
-        let restarts = health::thread_restarts(health);
+        let restarts = table::thread_restarts(health);
         let restarts = restarts.iter().map(|(thread, count)| ([("thread", thread.as_str())], *count));
         page.counters("thread_restarts", "Restarts of a thread after a panic.", restarts)?;
-        let threads = health::threads(health);
+        let threads = table::threads(health);
         let stuck =
             threads.iter().map(|thread| ([("thread", thread.as_str())], i64::from(health.stuck.contains(thread))));
         page.gauges("thread_stuck", "Whether a thread hangs.", stuck)?;
@@ -194,7 +194,7 @@ mod tests {
     use flyrig_types::ThreadHealth;
 
     use super::*;
-    use crate::health::tests::health;
+    use crate::table::tests::health;
 
     #[test]
     fn every_line_of_the_metrics_is_well_formed() {

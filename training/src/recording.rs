@@ -11,8 +11,10 @@ use flyrig_gpu::GpuContext;
 use flyrig_report::{Replay, ReplaySettings, dataset, progress_bar, stop, write_whole};
 use flyrig_types::CameraId;
 
-use super::gather::{HeldOut, gather};
-use crate::cli::TrainArgs;
+use super::{
+    TrainArgs,
+    gather::{HeldOut, gather},
+};
 
 /// Writes what is missing of a data set's samples into a folder below `out`, and tells which one.
 pub fn record(args: &TrainArgs, root: &Path, out: &Path, gpu: &GpuContext) -> Result<PathBuf> {
