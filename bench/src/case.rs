@@ -40,7 +40,7 @@ pub struct Row {
     pub variant: String,
     pub solver: Solver,
     pub gaussians: usize,
-    /// Gaussians that were compared with the pictures.
+    /// Gaussians that were compared with the images.
     pub compared: usize,
     pub views: usize,
     pub sequence: SequenceConfig,

@@ -49,7 +49,7 @@ pub enum BenchCommand {
     Stress(BenchStressArgs),
     /// Two people in one scene: views, and the cost beside one person; writes a table and PNG images.
     Subjects(BenchSubjectsArgs),
-    /// Recording uncompressed cameras: bytes, processor time and loss of each JPEG quality against pictures as they come.
+    /// Recording uncompressed cameras: bytes, processor time and loss of each JPEG quality against images as they come.
     Record(BenchRecordArgs),
 }
 
@@ -79,7 +79,7 @@ pub struct BenchAppearanceArgs {
     /// Where the networks run; "adapter" needs a program that was built with the feature gpu-networks.
     #[arg(long, value_enum, default_value = "processor")]
     pub networks_on: NetworksOn,
-    /// Pixels of a picture's side.
+    /// Pixels of an image's side.
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
     pub side: u32,
     /// Gaussians on the person's surface.
@@ -159,7 +159,7 @@ pub struct BenchEndureArgs {
     /// Frames in all.
     #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u64).range(300..=10_000_000))]
     pub frames: u64,
-    /// Pixels of a picture's side.
+    /// Pixels of an image's side.
     #[arg(long, default_value_t = 160, value_parser = clap::value_parser!(u32).range(64..=2048))]
     pub side: u32,
     /// Gaussians on the person's surface.
@@ -178,7 +178,7 @@ pub struct BenchCaptureArgs {
     /// Frames a second.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
-    /// Size of the pictures, WIDTHxHEIGHT.
+    /// Size of the images, WIDTHxHEIGHT.
     #[arg(long, value_parser = parse_size, default_value = "640x360")]
     pub size: [u32; 2],
 }
@@ -194,10 +194,10 @@ pub struct BenchRecordArgs {
     /// Frames a second.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
-    /// Size of the pictures, WIDTHxHEIGHT.
+    /// Size of the images, WIDTHxHEIGHT.
     #[arg(long, value_parser = parse_size, default_value = "640x360")]
     pub size: [u32; 2],
-    /// JPEG qualities, comma separated; 0 records pictures as they come.
+    /// JPEG qualities, comma separated; 0 records images as they come.
     #[arg(long, value_delimiter = ',', default_values_t = [0, 80, 90, 95, 98], value_parser = clap::value_parser!(u8).range(0..=100))]
     pub qualities: Vec<u8>,
     /// Folder for the recordings, which are removed again; the system's for temporary files otherwise.
@@ -207,7 +207,7 @@ pub struct BenchRecordArgs {
 
 #[derive(Debug, Args)]
 pub struct BenchHandsArgs {
-    /// Lengths of the hands in the pictures, pixels, comma separated.
+    /// Lengths of the hands in the images, pixels, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "20,40,80")]
     pub px: Vec<f64>,
     /// Seed of the first person; the others follow.
@@ -225,9 +225,9 @@ pub struct BenchHandsArgs {
     /// ONNX file of another hand network with the same outputs.
     #[arg(long)]
     pub hand_net: Option<PathBuf>,
-    /// Folder for the pictures of each person's first set.
+    /// Folder for the images of each person's first set.
     #[arg(long)]
-    pub pictures: Option<PathBuf>,
+    pub images: Option<PathBuf>,
     /// Learns the face's points instead and prints their table, at the largest of the lengths.
     #[arg(long)]
     pub learn_face: bool,
@@ -353,7 +353,7 @@ pub struct BenchTrackArgs {
     /// Frames of the sequence.
     #[arg(long, default_value_t = 14, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
     pub frames: usize,
-    /// Pixels of a picture's side.
+    /// Pixels of an image's side.
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
     pub side: u32,
     /// Gaussians on the person's surface.

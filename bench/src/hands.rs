@@ -16,9 +16,9 @@ use glam::DVec3;
 
 use crate::cli::BenchHandsArgs;
 
-/// Length of a hand that picture sizes are computed from, metres.
+/// Length of a hand that image sizes are computed from, metres.
 const HAND_M: f64 = 0.18;
-/// Distance of the cameras, metres, and their focal length in picture heights.
+/// Distance of the cameras, metres, and their focal length in image heights.
 const RADIUS_M: f64 = 3.0;
 const FOCAL_HEIGHTS: f64 = 1.36;
 /// Seconds between the sets that are measured: each shows other fingers.
@@ -157,7 +157,7 @@ fn measure(
         let (pose, quality) = on_true.estimate(&set, &given)?;
         add(2, &on_true, &pose, Some(quality))?;
         if number == 0
-            && let Some(folder) = &args.pictures
+            && let Some(folder) = &args.images
         {
             pictures(folder, &format!("{px}px-{}", args.seed + index), &on_true, &set, &rig, &pose)?;
         }
@@ -251,7 +251,7 @@ fn cost(hand_net: &HandNet) -> Result<()> {
     Ok(())
 }
 
-/// Writes the pictures of a set with the landmarks of the estimated hands as green dots.
+/// Writes the images of a set with the landmarks of the estimated hands as green dots.
 fn pictures(
     folder: &std::path::Path,
     name: &str,
@@ -301,7 +301,7 @@ fn learn_face(args: &BenchHandsArgs, gpu: &GpuContext) -> Result<()> {
         }
         bar.finish_and_clear();
     }
-    println!("// {seen} faces in {looked} pictures; median distance of each landmark in mm");
+    println!("// {seen} faces in {looked} images; median distance of each landmark in mm");
     for (landmark, place, off) in study.places() {
         let [x, y, z] = (place * 1e3).to_array();
         println!("    FacePoint {{ landmark: {landmark}, place_mm: [{x:.1}, {y:.1}, {z:.1}] }}, // {:.1}", off * 1e3);

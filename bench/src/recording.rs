@@ -1,6 +1,6 @@
 //! `flyrig-bench record`: what recording uncompressed cameras costs, and what is lost.
 //!
-//! Plain cameras of this process give pictures of a simulated person with a sensor's noise, as YUYV.
+//! Plain cameras of this process give images of a simulated person with a sensor's noise, as YUYV.
 
 use std::{
     path::Path,
@@ -23,7 +23,7 @@ use crate::{
     steady::{Steady, host_clock},
 };
 
-/// Pictures that a camera gives in turn.
+/// Images that a camera gives in turn.
 const PICTURES: usize = 4;
 /// Of a sensor of a webcam's kind, electrons.
 const FULL_WELL: f64 = 8000.0;
@@ -38,7 +38,7 @@ struct Row {
     /// Cores of one camera's compression, and of the file's thread.
     compressing: f64,
     writing: f64,
-    /// Of the pictures that come back, in RGB; infinite when they are the same.
+    /// Of the images that come back, in RGB; infinite when they are the same.
     psnr_db: f64,
 }
 
@@ -116,7 +116,7 @@ fn run(args: &BenchRecordArgs, quality: u8, path: &Path, pictures: &Arc<Vec<Vec<
     Ok(Row { quality, recorded, seconds, compressing, writing: of("recorder"), psnr_db })
 }
 
-/// Of the first pictures of the first camera against what it sent.
+/// Of the first images of the first camera against what it sent.
 fn psnr_db(path: &Path, [width, height]: [u32; 2], pictures: &[Vec<u8>]) -> Result<f64> {
     let mut replay = McapReplay::open(&"00".into(), path)?;
     let (mut square, mut count) = (0.0, 0usize);
@@ -132,7 +132,7 @@ fn psnr_db(path: &Path, [width, height]: [u32; 2], pictures: &[Vec<u8>]) -> Resu
     Ok(10.0 * (255.0 * 255.0 * count as f64 / square).log10())
 }
 
-/// Pictures of a simulated person, as YUYV.
+/// Images of a simulated person, as YUYV.
 fn pictures([width, height]: [u32; 2], gpu: &GpuContext) -> Result<Arc<Vec<Vec<u8>>>> {
     ensure!(width % 2 == 0, "YUYV needs an even width, not {width}");
     let sensor = SensorConfig {
@@ -167,7 +167,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pictures_become_yuyv_and_back() {
+    fn images_become_yuyv_and_back() {
         let rgb: Vec<u8> = (0..24u8).flat_map(|n| [n * 10, 200 - n * 5, 40 + n / 2 * 3].repeat(2)).collect();
         let image = Image::new(4, 12, PixelFormat::Yuyv, yuyv(&rgb)).unwrap();
         let back = to_rgb8(&image).unwrap();

@@ -33,7 +33,7 @@ pub struct SequenceConfig {
     pub motion: Motion,
     /// Of the person.
     pub seed: u64,
-    /// Pixels of a picture's side.
+    /// Pixels of an image's side.
     pub side: u32,
     /// Instants.
     pub frames: usize,
@@ -55,7 +55,7 @@ pub struct Sequence {
     frames: Vec<Vec<Option<Arc<Frame>>>>,
     /// World points of the clothed surface at the last instant.
     pub truth: Points,
-    /// Depth pictures of the input cameras at the last instant.
+    /// Depth images of the input cameras at the last instant.
     depths: Vec<(Camera, Vec<f32>)>,
 }
 
@@ -137,7 +137,7 @@ impl Sequence {
         })
     }
 
-    /// Held-out cameras and their pictures at an instant.
+    /// Held-out cameras and their images at an instant.
     pub fn held_out(&self, index: usize) -> Result<Vec<(&Camera, Arc<Frame>)>> {
         let row = self.frames.get(index).context("no such instant")?;
         let one = |slot: usize| Some((&self.rig.cameras[slot], row[slot].clone()?));

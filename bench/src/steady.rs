@@ -11,7 +11,7 @@ pub fn host_clock() -> HostClock {
     HostClock::new(flyrig_capture::monotonic_nanos)
 }
 
-/// A camera that gives a few pictures in turn at a fixed rate, as a driver does: late readers lose frames, by number.
+/// A camera that gives a few images in turn at a fixed rate, as a driver does: late readers lose frames, by number.
 pub struct Steady {
     camera: CameraId,
     clock: HostClock,
@@ -26,7 +26,7 @@ pub struct Steady {
 }
 
 impl Steady {
-    /// Begins in a fifth of a second. Every picture has the bytes of its size and format.
+    /// Begins in a fifth of a second. Every image has the bytes of its size and format.
     pub fn new(
         camera: CameraId,
         clock: &HostClock,

@@ -48,8 +48,8 @@ fn skips(rows: &[Row]) -> String {
     let low = small(side);
     let pairs = [
         ("Gaussians: fewer are compared", "default", but(ALL_GAUSSIANS), VIEWS, side, Motion::Turn),
-        ("Gaussians: two a pixel (small pictures)", "default", but(ALL_DETAIL), VIEWS, low, Motion::Turn),
-        ("pixels: pictures are halved", "default", but(FULL_SIZE), VIEWS, side, Motion::Turn),
+        ("Gaussians: two a pixel (small images)", "default", but(ALL_DETAIL), VIEWS, low, Motion::Turn),
+        ("pixels: images are halved", "default", but(FULL_SIZE), VIEWS, side, Motion::Turn),
         ("iterations: none at rest (person stands)", "default", but(NO_REST), VIEWS, side, Motion::Still),
         ("views: 4 of 6", "default, 4 compared", but(ALL_VIEWS), 6, side, Motion::Turn),
         ("views: 3 of 6", "default, 3 compared", but(ALL_VIEWS), 6, side, Motion::Turn),

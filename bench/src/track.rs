@@ -108,7 +108,7 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
     cases
 }
 
-/// Pictures where a pixel covers several of the compared Gaussians.
+/// Images where a pixel covers several of the compared Gaussians.
 pub fn small(side: u32) -> u32 {
     (side * 5 / 16).max(16)
 }

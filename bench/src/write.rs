@@ -1,4 +1,4 @@
-//! CSV, JSON, tables and pictures of a benchmark.
+//! CSV, JSON, tables and images of a benchmark.
 
 use std::{fmt::Write as _, path::Path};
 

@@ -1,7 +1,7 @@
 //! Calibration in the format of EasyMocap and ZJU-MoCap: `intri.yml` and `extri.yml`.
 //!
 //! Per camera `x`: `K_x` 3x3, `dist_x` (k1 k2 p1 p2 k3, or with k4 k5 k6 of the rational model), `Rot_x` 3x3 or `R_x` as a Rodrigues
-//! vector, `T_x`; `x_camera = Rot x_world + T`. Picture sizes `H_x`, `W_x` are optional.
+//! vector, `T_x`; `x_camera = Rot x_world + T`. Image sizes `H_x`, `W_x` are optional.
 
 use std::{
     collections::BTreeSet,
@@ -20,14 +20,14 @@ use crate::{
 const INTRINSICS: &str = "intri.yml";
 const EXTRINSICS: &str = "extri.yml";
 
-/// Reads `intri.yml` and `extri.yml` of a folder. `picture_size` gives width and height of a
-/// camera's pictures in pixels for files that do not say it, and is checked against those that do.
+/// Reads `intri.yml` and `extri.yml` of a folder. `image_size` gives width and height of a
+/// camera's images in pixels for files that do not say it, and is checked against those that do.
 /// The world's axes stay as they are; which of them is up is guessed from the cameras
 /// ([`Rig::guess_world_up`]).
 ///
 /// # Errors
 /// [`CalibError`] names the file, the camera and the fix.
-pub fn load_easymocap(dir: &Path, picture_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>) -> Result<Rig, CalibError> {
+pub fn load_easymocap(dir: &Path, image_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>) -> Result<Rig, CalibError> {
     let intri = YamlFile::open(dir.join(INTRINSICS))?;
     let extri = YamlFile::open(dir.join(EXTRINSICS))?;
     let with_intrinsics = camera_names(&intri, "K_", "K_<camera>")?;
@@ -43,7 +43,7 @@ pub fn load_easymocap(dir: &Path, picture_size: &dyn Fn(&CameraId) -> Option<(u3
     let cameras = with_intrinsics
         .into_iter()
         .map(|id| {
-            let intrinsics = read_intrinsics(&intri, &id, picture_size(&id))?;
+            let intrinsics = read_intrinsics(&intri, &id, image_size(&id))?;
             let camera_from_world = read_extrinsics(&extri, &id)?;
             Ok(Camera { time_offset_nanos: 0, id, intrinsics, camera_from_world })
         })
@@ -132,7 +132,7 @@ fn read_intrinsics(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>)
             "calibrate without skew",
         ));
     }
-    let (width, height) = picture_size(file, id, pictures)?;
+    let (width, height) = image_size(file, id, pictures)?;
     Ok(Intrinsics {
         width,
         height,
@@ -152,7 +152,7 @@ fn read_lens(file: &YamlFile, id: &CameraId) -> Result<Lens, CalibError> {
         .map_err(|problem| entry.wrong(format!("has {problem}"), "k1 k2 p1 p2 k3 k4 k5 k6 can be used"))
 }
 
-fn picture_size(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>) -> Result<(u32, u32), CalibError> {
+fn image_size(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>) -> Result<(u32, u32), CalibError> {
     let side =
         |prefix: &str| -> Result<Option<u32>, CalibError> {
             let entry = Entry::new(file, id, prefix);
@@ -199,7 +199,7 @@ fn rotation(entry: &Entry<'_>, matrix: &Matrix) -> Result<DQuat, CalibError> {
         .map_err(|problem| entry.wrong(problem, "export the calibration again; a mirrored axis gives determinant -1"))
 }
 
-/// Writes a rig as `intri.yml` and `extri.yml` with picture sizes, so that [`load_easymocap`] reads
+/// Writes a rig as `intri.yml` and `extri.yml` with image sizes, so that [`load_easymocap`] reads
 /// the same cameras back. The format has no place for [`Rig::world_up`] and time offsets. Both files are made before
 /// the first one is written.
 ///
@@ -236,15 +236,15 @@ fn write_intrinsics(intri: &mut YamlWriter, id: &CameraId, i: &Intrinsics) -> Re
     Ok(())
 }
 
-/// Reads the lenses of a folder's `intri.yml`; `picture_size` as in [`load_easymocap`].
+/// Reads the lenses of a folder's `intri.yml`; `image_size` as in [`load_easymocap`].
 ///
 /// # Errors
 /// As [`load_easymocap`].
 pub(crate) fn load_lenses(
     dir: &Path,
-    picture_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>,
+    image_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>,
 ) -> Result<Vec<(CameraId, Intrinsics)>, CalibError> {
     let intri = YamlFile::open(dir.join(INTRINSICS))?;
     let names = camera_names(&intri, "K_", "K_<camera>")?;
-    names.into_iter().map(|id| Ok((id.clone(), read_intrinsics(&intri, &id, picture_size(&id))?))).collect()
+    names.into_iter().map(|id| Ok((id.clone(), read_intrinsics(&intri, &id, image_size(&id))?))).collect()
 }

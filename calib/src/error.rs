@@ -86,17 +86,17 @@ pub enum CalibError {
         /// What to do.
         mend: &'static str,
     },
-    /// Nothing says how large the pictures are.
-    #[error("{}: camera {camera}: the picture size is unknown; add H_{camera} and W_{camera}, or give pictures", path.display())]
+    /// Nothing says how large the images are.
+    #[error("{}: camera {camera}: the image size is unknown; add H_{camera} and W_{camera}, or give images", path.display())]
     UnknownSize {
         /// Which file.
         path: PathBuf,
         /// Which camera.
         camera: CameraId,
     },
-    /// The calibration is for pictures of another size.
+    /// The calibration is for images of another size.
     #[error(
-        "{}: camera {camera}: calibrated for pictures of {}x{}, but they are {}x{}; scale K with the pictures or replace them",
+        "{}: camera {camera}: calibrated for images of {}x{}, but they are {}x{}; scale K with the images or replace them",
         path.display(), calibrated.0, calibrated.1, pictures.0, pictures.1
     )]
     OtherSize {
@@ -106,7 +106,7 @@ pub enum CalibError {
         camera: CameraId,
         /// Width and height in the file.
         calibrated: (u32, u32),
-        /// Width and height of the pictures.
+        /// Width and height of the images.
         pictures: (u32, u32),
     },
     /// A camera model that no camera has.

@@ -312,7 +312,7 @@ fn a_calibration_folder_is_read_whatever_it_holds() {
     assert!(back.world_up.distance(rig.world_up) < 1e-12 && difference_px(&rig, &back) < 1e-9);
     assert_eq!(back.cameras[2].time_offset_nanos, 1_234_567);
     let other = load_calibration(dir.path(), &|_| Some((640, 480))).unwrap_err().to_string();
-    assert!(other.contains("camera left: calibrated for pictures of 1280x720, but they are 640x480"), "{other}");
+    assert!(other.contains("camera left: calibrated for images of 1280x720, but they are 640x480"), "{other}");
 
     // Lenses alone are no rig.
     let lenses: Vec<_> = rig.cameras.iter().map(|camera| (camera.id.clone(), camera.intrinsics)).collect();

@@ -163,15 +163,15 @@ fn what_the_format_cannot_hold_is_not_written() {
 }
 
 #[test]
-fn the_picture_size_comes_from_the_file_or_the_pictures_and_they_agree() {
+fn the_image_size_comes_from_the_file_or_the_images_and_they_agree() {
     let dir = folder(INTRI, EXTRI);
     let text = load_easymocap(dir.path(), &|_| None).unwrap_err().to_string();
-    assert!(text.ends_with("camera 00: the picture size is unknown; add H_00 and W_00, or give pictures"), "{text}");
+    assert!(text.ends_with("camera 00: the image size is unknown; add H_00 and W_00, or give images"), "{text}");
     let sized = format!("{INTRI}H_00: 480\nW_00: 640\nH_b: 480.\nW_b: 640.\n");
     let dir = folder(&sized, EXTRI);
     assert_eq!(load_easymocap(dir.path(), &|_| None).unwrap().cameras[1].intrinsics.width, 640);
     let text = load_easymocap(dir.path(), &|_| Some((320, 240))).unwrap_err().to_string();
-    assert!(text.contains("camera 00: calibrated for pictures of 640x480, but they are 320x240"), "{text}");
+    assert!(text.contains("camera 00: calibrated for images of 640x480, but they are 320x240"), "{text}");
     let absurd = refusal(&format!("{INTRI}H_00: -480\nW_00: 640\n"), EXTRI);
     assert!(absurd.contains("camera 00: H_00 is -480, expected 1 to 16384 pixels"), "{absurd}");
 }

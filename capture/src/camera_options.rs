@@ -30,7 +30,7 @@ impl fmt::Display for CameraIdentity {
 #[serde(rename_all = "lowercase")]
 pub enum FormatChoice {
     /// The first that the camera has of YUYV, UYVY, NV12, RGB24, MJPEG, Bayer and grey; MJPEG first where uncompressed
-    /// pictures would not fit the bus.
+    /// images would not fit the bus.
     #[default]
     Auto,
     /// 4:2:2, `YUYV`.
@@ -39,7 +39,7 @@ pub enum FormatChoice {
     Uyvy,
     /// 4:2:0 in one memory plane (`NV12`) or two (`NM12`).
     Nv12,
-    /// A JPEG picture a frame, `MJPG` or `JPEG`.
+    /// A JPEG image a frame, `MJPG` or `JPEG`.
     Mjpeg,
     /// 8 bits of luminance, `GREY`.
     Grey,

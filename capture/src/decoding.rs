@@ -1,4 +1,4 @@
-//! Pictures as cameras send them, made RGB.
+//! Images as cameras send them, made RGB.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ const POOLED_FRAMES: usize = 16;
 
 /// Makes `Rgb8` frames of a camera's frames, in buffers that are used again; frames that are RGB already pass.
 ///
-/// A picture that cannot be decoded is a `Corrupt` error, one of another size than expected an `Unsupported` one; each
+/// An image that cannot be decoded is a `Corrupt` error, one of another size than expected an `Unsupported` one; each
 /// costs its own frame alone.
 #[derive(Debug)]
 pub struct Decoding {
@@ -22,8 +22,8 @@ pub struct Decoding {
 }
 
 impl Decoding {
-    /// For pictures of this width and height in pixels; of any without it. With it, a header that lies cannot ask for more
-    /// memory than the camera's pictures need.
+    /// For images of this width and height in pixels; of any without it. With it, a header that lies cannot ask for more
+    /// memory than the camera's images need.
     #[must_use]
     pub fn new(size: Option<[u32; 2]>) -> Self {
         Self { size, pool: BufferPool::new(POOLED_FRAMES), scratch: JpegScratch::default() }
@@ -46,7 +46,7 @@ impl FrameStage for Decoding {
         }
         let mut bytes = self.pool.take();
         let decoded = rgb::convert(&frame.image, &mut bytes, &mut self.scratch);
-        // Back to the pool, whether it is a picture or not.
+        // Back to the pool, whether it is an image or not.
         let bytes = self.pool.lease(bytes);
         decoded?;
         let image = Image::new(width, height, PixelFormat::Rgb8, bytes)
@@ -60,7 +60,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_picture_that_claims_to_be_huge_gets_no_memory() {
+    fn an_image_that_claims_to_be_huge_gets_no_memory() {
         let frame = Frame {
             camera: "a".into(),
             sequence: 3,

@@ -1,4 +1,4 @@
-//! Uncompressed pictures made JPEG, for the network and the disk.
+//! Uncompressed images made JPEG, for the network and the disk.
 
 use flyrig_types::{Frame, Image, PixelFormat};
 use opencv::{
@@ -27,7 +27,7 @@ impl JpegEncoding {
         Self { quality, rgb: Vec::new(), bgr: Mat::default(), jpeg: Vector::new(), scratch: JpegScratch::default() }
     }
 
-    /// A JPEG picture of a picture.
+    /// A JPEG image of an image.
     ///
     /// # Errors
     /// `Unsupported` and `Corrupt` for what cannot be made RGB first.
@@ -68,7 +68,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_survives_but_for_what_jpeg_takes() {
+    fn an_image_survives_but_for_what_jpeg_takes() {
         let rgb: Vec<u8> =
             (0..32u32).flat_map(|y| (0..48u32).flat_map(move |x| [x as u8 * 5, y as u8 * 7, 90])).collect();
         let mut stage = JpegEncoding::new(95);

@@ -13,7 +13,7 @@ use flyrig_types::{CameraId, Frame, Image, Mask, PixelFormat};
 
 use crate::{
     CameraSource, CaptureError, CaptureErrorKind,
-    picture::{self, PICTURE_ENDINGS},
+    image_file::{self, IMAGE_ENDINGS},
 };
 
 /// How a folder is replayed.
@@ -39,8 +39,8 @@ impl Default for FolderOptions {
 ///
 /// A frame's number is its stem where every stem of the chosen cameras is a number, else its place
 /// in the sorted list of all stems; number and rate give the time, and the number is the frame's
-/// sequence number. A number that only other cameras have, a damaged picture, a mask that is
-/// missing or of another size, and a picture of another size than the camera's first are `Corrupt`
+/// sequence number. A number that only other cameras have, a damaged image, a mask that is
+/// missing or of another size, and an image of another size than the camera's first are `Corrupt`
 /// errors, and the next frame follows. Mask values are coverage; a mask with no value above 31 is
 /// taken for one of labels, where everything but 0 is the person. An all-zero mask is an empty one.
 #[derive(Debug)]
@@ -67,7 +67,7 @@ impl FolderReplay {
     ///
     /// # Errors
     /// `NotFound` names the camera and lists those there are, or says that no frame is in the range;
-    /// `Unsupported` for a bad rate or two pictures of one number; `Io`.
+    /// `Unsupported` for a bad rate or two images of one number; `Io`.
     pub fn open(root: &Path, cameras: Option<&[CameraId]>, options: &FolderOptions) -> Result<Vec<Self>, CaptureError> {
         if !options.fps.is_finite() || options.fps <= 0.0 {
             let message = format!("the frame rate is {}, expected a positive number of frames a second", options.fps);
@@ -79,7 +79,7 @@ impl FolderReplay {
         };
         let mut sources = Vec::with_capacity(cameras.len());
         for camera in cameras {
-            let pictures = camera_pictures(root, &camera)?;
+            let pictures = camera_images(root, &camera)?;
             let masks = options.with_masks.then(|| camera_files(root, "mask", &camera)).transpose()?;
             let (fps, shots) = (options.fps, Arc::default());
             sources.push(Self { camera, fps, shots, pictures, masks, next: 0, size: None });
@@ -104,12 +104,12 @@ impl FolderReplay {
                 CaptureError::general(CaptureErrorKind::Corrupt, message)
             })
         };
-        let picture = picture::read(&file(&self.pictures, "picture")?)?.into_rgb8();
+        let picture = image_file::read(&file(&self.pictures, "image")?)?.into_rgb8();
         let (width, height) = picture.dimensions();
         if let Some((first_width, first_height)) = self.size.filter(|size| *size != (width, height)) {
             let message = format!(
                 "frame {} is {width}x{height}, the frames before it {first_width}x{first_height}; \
-                 all pictures of a camera must have one size",
+                 all images of a camera must have one size",
                 shot.number
             );
             return Err(CaptureError::general(CaptureErrorKind::Corrupt, message));
@@ -146,18 +146,18 @@ impl CameraSource for FolderReplay {
     }
 }
 
-/// Width and height of a camera's first readable picture, from its header alone; for calibration
+/// Width and height of a camera's first readable image, from its header alone; for calibration
 /// files that do not say them.
 ///
 /// # Errors
-/// `NotFound` when there is no such camera, `Corrupt` when none of its pictures has a header.
-pub fn folder_picture_size(root: &Path, camera: &CameraId) -> Result<(u32, u32), CaptureError> {
-    let pictures = camera_pictures(root, camera)?;
+/// `NotFound` when there is no such camera, `Corrupt` when none of its images has a header.
+pub fn folder_image_size(root: &Path, camera: &CameraId) -> Result<(u32, u32), CaptureError> {
+    let pictures = camera_images(root, camera)?;
     pictures.values().find_map(|path| image::image_dimensions(path).ok()).ok_or_else(|| {
         CaptureError::new(
             camera,
             CaptureErrorKind::Corrupt,
-            format!("none of its {} pictures can be read", pictures.len()),
+            format!("none of its {} images can be read", pictures.len()),
         )
     })
 }
@@ -187,7 +187,7 @@ fn list_cameras(root: &Path) -> Result<Vec<CameraId>, CaptureError> {
     Ok(names.into_iter().map(CameraId::from).collect())
 }
 
-fn camera_pictures(root: &Path, camera: &CameraId) -> Result<BTreeMap<String, PathBuf>, CaptureError> {
+fn camera_images(root: &Path, camera: &CameraId) -> Result<BTreeMap<String, PathBuf>, CaptureError> {
     let present = list_cameras(root)?;
     if !present.contains(camera) {
         let names: Vec<&str> = present.iter().map(CameraId::as_str).collect();
@@ -197,7 +197,7 @@ fn camera_pictures(root: &Path, camera: &CameraId) -> Result<BTreeMap<String, Pa
     camera_files(root, "images", camera)
 }
 
-/// Pictures in `root/kind/camera` by stem.
+/// Images in `root/kind/camera` by stem.
 fn camera_files(root: &Path, kind: &str, camera: &CameraId) -> Result<BTreeMap<String, PathBuf>, CaptureError> {
     let folder = root.join(kind).join(camera.as_str());
     let fail = |error: &io::Error| {
@@ -211,7 +211,7 @@ fn camera_files(root: &Path, kind: &str, camera: &CameraId) -> Result<BTreeMap<S
         let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase());
         let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned());
         let (Some(ending), Some(stem)) = (ending, stem) else { continue };
-        if stem.starts_with('.') || !PICTURE_ENDINGS.contains(&ending.as_str()) {
+        if stem.starts_with('.') || !IMAGE_ENDINGS.contains(&ending.as_str()) {
             continue;
         }
         if let Some(twin) = files.insert(stem, path.clone()) {
@@ -266,11 +266,11 @@ fn shots(sources: &[FolderReplay], range: Option<&Range<u64>>) -> Result<Arc<[Sh
 fn read_mask(path: &Path, picture: (u32, u32)) -> Result<Mask, CaptureError> {
     /// Largest value that is a label and no coverage.
     const LAST_LABEL: u8 = 31;
-    let mask = picture::read(path)?.into_luma8();
+    let mask = image_file::read(path)?.into_luma8();
     let (width, height) = mask.dimensions();
     if (width, height) != picture {
         let message = format!(
-            "{} is {width}x{height}, its picture {}x{}; make the mask again at the picture's size",
+            "{} is {width}x{height}, its image {}x{}; make the mask again at the image's size",
             path.display(),
             picture.0,
             picture.1

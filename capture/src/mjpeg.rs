@@ -1,14 +1,14 @@
-//! JPEG pictures as cameras send them: often without Huffman tables, sometimes padded, sometimes damaged.
+//! JPEG images as cameras send them: often without Huffman tables, sometimes padded, sometimes damaged.
 
 use zune_jpeg::{
     JpegDecoder,
     zune_core::{bytestream::ZCursor, colorspace::ColorSpace, options::DecoderOptions},
 };
 
-use crate::{CaptureError, CaptureErrorKind, picture};
+use crate::{CaptureError, CaptureErrorKind, image_file};
 
 /// Decodes into `rgb`, `3 * width * height` bytes. Strict: what a lenient decoder would paint grey is an error here, for
-/// a broken picture must not colour a person.
+/// a broken image must not colour a person.
 ///
 /// # Errors
 /// `Corrupt`, whatever is wrong with the bytes.
@@ -21,12 +21,12 @@ pub(crate) fn decode(
 ) -> Result<(), CaptureError> {
     let corrupt = |text: String| CaptureError::general(CaptureErrorKind::Corrupt, text);
     if !bytes.starts_with(&[0xff, 0xd8]) {
-        return Err(corrupt("is not a JPEG picture".to_owned()));
+        return Err(corrupt("is not a JPEG image".to_owned()));
     }
-    if !picture::jpeg_has_end(bytes) {
-        return Err(corrupt("is a JPEG picture that is cut off".to_owned()));
+    if !image_file::jpeg_has_end(bytes) {
+        return Err(corrupt("is a JPEG image that is cut off".to_owned()));
     }
-    let damaged = |error: &dyn std::fmt::Display| corrupt(format!("is a damaged JPEG picture ({error})"));
+    let damaged = |error: &dyn std::fmt::Display| corrupt(format!("is a damaged JPEG image ({error})"));
     let whole = if scratch.complete(bytes) { &scratch.0 } else { bytes };
     let options = DecoderOptions::default()
         .set_strict_mode(true)
@@ -81,12 +81,12 @@ pub(crate) fn jpeg_size(bytes: &[u8]) -> Option<(usize, usize)> {
     Some((usize::from(u16::from_be_bytes([w1, w0])), usize::from(u16::from_be_bytes([h1, h0]))))
 }
 
-/// Memory that is used again from picture to picture.
+/// Memory that is used again from image to image.
 #[derive(Debug, Default)]
 pub(crate) struct JpegScratch(Vec<u8>);
 
 impl JpegScratch {
-    /// Puts the standard's tables before the scan of a picture that has none of its own: USB cameras leave them out. False
+    /// Puts the standard's tables before the scan of an image that has none of its own: USB cameras leave them out. False
     /// where nothing is missing.
     fn complete(&mut self, bytes: &[u8]) -> bool {
         let mut scan = None;
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_without_tables_is_the_same_picture() {
+    fn an_image_without_tables_is_the_same_image() {
         let whole = jpeg(48, 32);
         let bare = without_tables(&whole);
         assert!(bare.len() + 400 < whole.len(), "the tables were not there to begin with");
@@ -190,13 +190,13 @@ mod tests {
     }
 
     #[test]
-    fn a_grey_picture_has_three_equal_colours() {
+    fn a_grey_image_has_three_equal_colours() {
         let mut bytes = Cursor::new(Vec::new());
         image::GrayImage::from_pixel(16, 16, image::Luma([77])).write_to(&mut bytes, image::ImageFormat::Jpeg).unwrap();
         assert!(decoded(&bytes.into_inner(), 16, 16).unwrap().iter().all(|&c| c.abs_diff(77) <= 1));
     }
 
-    /// Many damaged pictures, from every kind of damage: none panics, and none whose scan is cut short comes through.
+    /// Many damaged images, from every kind of damage: none panics, and none whose scan is cut short comes through.
     fn damage(rounds: usize) -> (usize, usize) {
         let whole = jpeg(48, 32);
         let sources = [without_tables(&whole), whole];
@@ -227,11 +227,11 @@ mod tests {
                     }
                 }
             }
-            let is_cut = !picture::jpeg_has_end(&bytes);
+            let is_cut = !image_file::jpeg_has_end(&bytes);
             let result = catch_unwind(std::panic::AssertUnwindSafe(|| decode(&bytes, 48, 32, &mut rgb, &mut scratch)));
-            match result.expect("a damaged picture made the decoder panic") {
+            match result.expect("a damaged image made the decoder panic") {
                 Ok(()) => {
-                    assert!(!is_cut, "a picture without its end came through");
+                    assert!(!is_cut, "an image without its end came through");
                     taken += 1;
                 }
                 Err(error) => {
@@ -244,17 +244,15 @@ mod tests {
     }
 
     #[test]
-    fn damaged_pictures_never_panic() {
+    fn damaged_images_never_panic() {
         let (refused, taken) = damage(20_000);
         assert!(refused > 5_000, "{refused} refused, {taken} taken");
     }
 
     #[test]
-    #[ignore = "a million pictures: `make test-long`"]
-    fn a_million_damaged_pictures_never_panic() {
+    #[ignore = "a million images: `make test-long`"]
+    fn a_million_damaged_images_never_panic() {
         let (refused, taken) = damage(1_000_000);
-        println!(
-            "of 1000000 damaged JPEG pictures {refused} were refused, {taken} decoded to some picture, none panicked"
-        );
+        println!("of 1000000 damaged JPEG images {refused} were refused, {taken} decoded to some image, none panicked");
     }
 }

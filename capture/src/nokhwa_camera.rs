@@ -19,7 +19,7 @@ use crate::{
     CameraSource, CaptureError, CaptureErrorKind, FormatChoice, SourceHealth,
     blocking::{BlockingCamera, Expected, Opener, Shot, Watched},
     clock::monotonic_nanos,
-    mjpeg, picture,
+    image_file, mjpeg,
 };
 
 /// Formats that the crate knows and what we call them, in the order in which [`FormatChoice::Auto`] takes them.
@@ -195,7 +195,7 @@ impl System {
         let list = if list.is_empty() { "none that nokhwa knows".to_owned() } else { list.join(", ") };
         let NokhwaOptions { width, height, fps, format, .. } = &self.0;
         let text = format!(
-            "gives no {format:?} pictures of {width}x{height} at {fps} frames a second ({error}); what it has at that \
+            "gives no {format:?} images of {width}x{height} at {fps} frames a second ({error}); what it has at that \
              size: {list}"
         );
         CaptureError::general(CaptureErrorKind::Unsupported, text)
@@ -261,7 +261,7 @@ impl BlockingCamera for OpenCamera {
     }
 }
 
-/// Copies the picture alone: the crate may give the driver's whole buffer. Gives its size.
+/// Copies the image alone: the crate may give the driver's whole buffer. Gives its size.
 fn cut(
     format: PixelFormat,
     (width, height): (u32, u32),
@@ -270,14 +270,14 @@ fn cut(
 ) -> Result<(u32, u32), CaptureError> {
     let corrupt = |text: String| CaptureError::general(CaptureErrorKind::Corrupt, text);
     let (length, size) = if format == PixelFormat::Mjpeg {
-        let found = picture::jpeg_length(given).zip(mjpeg::jpeg_size(given));
-        let (length, size) = found.ok_or_else(|| corrupt("a picture is no whole JPEG".to_owned()))?;
+        let found = image_file::jpeg_length(given).zip(mjpeg::jpeg_size(given));
+        let (length, size) = found.ok_or_else(|| corrupt("an image is no whole JPEG".to_owned()))?;
         (length, (size.0 as u32, size.1 as u32))
     } else {
         (format.byte_len(width, height).unwrap_or(usize::MAX), (width, height))
     };
     let given = given.get(..length);
-    bytes.extend_from_slice(given.ok_or_else(|| corrupt(format!("a picture is cut off: it has no {length} bytes")))?);
+    bytes.extend_from_slice(given.ok_or_else(|| corrupt(format!("an image is cut off: it has no {length} bytes")))?);
     Ok(size)
 }
 
@@ -332,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_behind_a_picture_is_left_out() {
+    fn what_lies_behind_an_image_is_left_out() {
         let mut bytes = Vec::new();
         let given: Vec<u8> = (0..100).collect();
         assert_eq!(cut(PixelFormat::Yuyv, (4, 2), &given, &mut bytes), Ok((4, 2)));
@@ -341,12 +341,12 @@ mod tests {
         let mut jpeg = std::io::Cursor::new(Vec::new());
         image::RgbImage::new(16, 8).write_to(&mut jpeg, image::ImageFormat::Jpeg).unwrap();
         let whole = jpeg.into_inner();
-        // As the driver's buffer looks: the rest of a longer picture before it.
+        // As the driver's buffer looks: the rest of a longer image before it.
         let padded: Vec<u8> = whole.iter().copied().chain([7; 3000]).chain([0xff, 0xd9]).collect();
         bytes.clear();
         assert_eq!(cut(PixelFormat::Mjpeg, (640, 360), &padded, &mut bytes), Ok((16, 8)));
         assert_eq!(bytes, whole);
         assert!(cut(PixelFormat::Mjpeg, (16, 8), &whole[..whole.len() - 2], &mut bytes).is_err());
-        assert!(cut(PixelFormat::Mjpeg, (16, 8), b"no picture", &mut bytes).is_err());
+        assert!(cut(PixelFormat::Mjpeg, (16, 8), b"no image", &mut bytes).is_err());
     }
 }

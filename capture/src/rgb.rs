@@ -353,7 +353,7 @@ mod tests {
         let cut = convert(16, 8, PixelFormat::Mjpeg, jpeg[..jpeg.len() - 2].to_vec()).unwrap_err();
         assert_eq!(
             (cut.kind, cut.to_string().as_str()),
-            (CaptureErrorKind::Corrupt, "is a JPEG picture that is cut off")
+            (CaptureErrorKind::Corrupt, "is a JPEG image that is cut off")
         );
         assert_eq!(convert(16, 8, PixelFormat::Mjpeg, vec![]).unwrap_err().kind, CaptureErrorKind::Corrupt);
     }

@@ -96,7 +96,7 @@ impl VideoReplay {
 
     /// Width and height in pixels by the file's header.
     #[must_use]
-    pub fn picture_size(&self) -> Option<(u32, u32)> {
+    pub fn image_size(&self) -> Option<(u32, u32)> {
         let side = |id| self.video.get(id).ok().filter(|pixels| *pixels >= 1.0).map(|pixels| pixels as u32);
         side(CAP_PROP_FRAME_WIDTH).zip(side(CAP_PROP_FRAME_HEIGHT))
     }

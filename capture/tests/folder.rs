@@ -4,7 +4,7 @@
 
 use std::{fs, path::Path, time::Duration};
 
-use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, FolderOptions, FolderReplay, folder_picture_size};
+use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, FolderOptions, FolderReplay, folder_image_size};
 use flyrig_types::{CameraId, Frame, PixelFormat};
 use image::{ImageBuffer, Luma, Rgb, RgbImage};
 
@@ -88,7 +88,7 @@ fn numbers_sort_as_numbers_and_names_as_names() {
 }
 
 #[test]
-fn grey_deep_and_transparent_pictures_become_rgb8() {
+fn grey_deep_and_transparent_images_become_rgb8() {
     let dir = tempfile::tempdir().unwrap();
     let images = dir.path().join("images/a");
     fs::create_dir_all(&images).unwrap();
@@ -114,9 +114,9 @@ fn broken_frames_are_named_and_the_next_one_follows() {
     let results = all(&mut open(dir.path(), &MASKED)[0]);
     assert_eq!(results.len(), 5);
     let expected = [
-        "camera 00: frame 0 has no picture, though others have; restore the file",
-        "000001.PNG is a damaged or cut off picture (",
-        "000002.png is 4x4, its picture 8x6; make the mask again at the picture's size",
+        "camera 00: frame 0 has no image, though others have; restore the file",
+        "000001.PNG is a damaged or cut off image (",
+        "000002.png is 4x4, its image 8x6; make the mask again at the image's size",
         "camera 00: frame 3 has no mask, though others have; restore the file",
     ];
     for (result, expected) in results.iter().zip(expected) {
@@ -136,12 +136,12 @@ fn a_cut_jpeg_is_corrupt() {
     fs::write(dir.path().join("images/a/0.jpg"), &whole[..whole.len() - 30]).unwrap();
     let results = all(&mut open(dir.path(), &FolderOptions::default())[0]);
     let text = results[0].as_ref().unwrap_err().to_string();
-    assert!(text.ends_with("0.jpg is a JPEG picture that is cut off"), "{text}");
+    assert!(text.ends_with("0.jpg is a JPEG image that is cut off"), "{text}");
     assert!(results[1].is_ok());
 }
 
 #[test]
-fn a_picture_of_another_size_midway_is_corrupt() {
+fn an_image_of_another_size_midway_is_corrupt() {
     let dir = folder();
     paint(&dir.path().join("images/00/000002.png"), 16, 12, 2);
     let results = all(&mut open(dir.path(), &FolderOptions::default())[0]);
@@ -198,9 +198,9 @@ fn what_is_not_there_is_said_with_what_is() {
 }
 
 #[test]
-fn the_picture_size_is_read_from_a_header() {
+fn the_image_size_is_read_from_a_header() {
     let dir = folder();
     fs::write(dir.path().join("images/00/000000.png"), b"rubbish").unwrap();
-    assert_eq!(folder_picture_size(dir.path(), &"00".into()).unwrap(), (8, 6));
-    assert_eq!(folder_picture_size(dir.path(), &"x".into()).unwrap_err().kind, CaptureErrorKind::NotFound);
+    assert_eq!(folder_image_size(dir.path(), &"00".into()).unwrap(), (8, 6));
+    assert_eq!(folder_image_size(dir.path(), &"x".into()).unwrap_err().kind, CaptureErrorKind::NotFound);
 }

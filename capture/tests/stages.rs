@@ -58,7 +58,7 @@ fn grey(_: u64) -> Image {
     Image::new(1, 1, PixelFormat::Gray8, vec![9]).unwrap()
 }
 
-/// Every third picture is cut off.
+/// Every third image is cut off.
 fn sometimes_damaged(sequence: u64) -> Image {
     if sequence % 3 == 1 {
         return Image::new(2, 1, PixelFormat::Mjpeg, vec![0xff, 0xd8, 1]).unwrap();
@@ -158,7 +158,7 @@ fn a_recording_played_as_live_does_not_overtake_itself() {
 }
 
 #[test]
-fn a_damaged_picture_costs_its_own_frame() {
+fn a_damaged_image_costs_its_own_frame() {
     let taken = Arc::default();
     let sources = vec![Fast::boxed("a", 9, &taken, sometimes_damaged)];
     let config = ThreadsConfig { queue_capacity: 1, pacing: Pacing::Lossless };
@@ -172,7 +172,7 @@ fn a_damaged_picture_costs_its_own_frame() {
     let stats = ended(&threads);
     assert_eq!(stats[0].errors[&CaptureErrorKind::Corrupt], 3);
     let text = stats[0].last_error.as_ref().unwrap().to_string();
-    assert_eq!(text, "camera a: frame 7 is a JPEG picture that is cut off");
+    assert_eq!(text, "camera a: frame 7 is a JPEG image that is cut off");
 }
 
 #[test]

@@ -44,7 +44,7 @@ fn every_frame_comes_with_its_number_and_time() {
         let path = dir.path().join(name);
         write(&path, codec, 10);
         let mut source = open(&path, &VideoOptions::default());
-        assert_eq!(source.picture_size(), Some((64, 48)));
+        assert_eq!(source.image_size(), Some((64, 48)));
         let frames: Vec<Frame> = all(&mut source).into_iter().map(Result::unwrap).collect();
         assert_eq!(frames.len(), 10, "{name}");
         for (i, frame) in frames.iter().enumerate() {

@@ -13,7 +13,7 @@ use flyrig_types::CameraId;
 /// Live free-viewpoint video of a person from a few cameras.
 ///
 /// Start with `flyrig demo`: it runs a simulated rig, publishes the result, watches it from a second process and
-/// writes a report with pictures. `flyrig eval` does the same honestly on a data set of yours. For a rig that stays
+/// writes a report with images. `flyrig eval` does the same honestly on a data set of yours. For a rig that stays
 /// up, print a configuration, edit it and run it:
 ///
 ///     flyrig doctor
@@ -82,7 +82,7 @@ pub enum Command {
     View(ViewArgs),
     /// Publish a recorded person stream again, at its own pace, to try viewers without a rig.
     Play(PlayArgs),
-    /// Watch a running rig: print rates and latency, write pictures or a video.
+    /// Watch a running rig: print rates and latency, write images or a video.
     Watch(WatchArgs),
     /// Replay a data set, render its held-out cameras and score them.
     Eval(EvalArgs),
@@ -136,7 +136,7 @@ impl LagArgs {
 pub struct ReplayArgs {
     /// The MCAP file.
     pub recording: PathBuf,
-    /// Write the synchronised pictures and the calibration into this new folder (EasyMocap layout).
+    /// Write the synchronised images and the calibration into this new folder (EasyMocap layout).
     #[arg(long)]
     pub export: Option<PathBuf>,
     #[command(flatten)]
@@ -376,7 +376,7 @@ pub struct PlateArgs {
     /// Frame rate of a folder.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
-    /// Replace plates that are there, and accept pictures in which somebody is found.
+    /// Replace plates that are there, and accept images in which somebody is found.
     #[arg(long)]
     pub force: bool,
 }
@@ -491,16 +491,16 @@ pub struct WatchArgs {
     /// Vertical field of view of the viewpoint of --eye, degrees.
     #[arg(long, default_value_t = 40.0)]
     pub fov_degrees: f64,
-    /// Most pictures a second of the viewpoint of --eye; viewers share the rig's budget of pixels a second.
+    /// Most images a second of the viewpoint of --eye; viewers share the rig's budget of pixels a second.
     #[arg(long, default_value_t = 30.0)]
     pub max_fps: f64,
-    /// Write every picture as PNG into this folder, or, when the name ends in .mp4 or .avi, a video.
+    /// Write every image as PNG into this folder, or, when the name ends in .mp4 or .avi, a video.
     #[arg(long)]
     pub out: Option<PathBuf>,
-    /// Record the person stream into this file (MCAP), for `flyrig play`; no pictures are received then.
+    /// Record the person stream into this file (MCAP), for `flyrig play`; no images are received then.
     #[arg(long, conflicts_with_all = ["out", "eye", "count", "stats"])]
     pub record: Option<PathBuf>,
-    /// Stop after so many pictures.
+    /// Stop after so many images.
     #[arg(long)]
     pub count: Option<usize>,
     /// Stop after so many seconds.
@@ -573,7 +573,7 @@ pub struct EvalArgs {
     /// Cameras to render and score, comma separated.
     #[arg(long, value_delimiter = ',', required = true)]
     pub holdout: Vec<String>,
-    /// Folder for pictures, surfaces and the report.
+    /// Folder for images, surfaces and the report.
     #[arg(long)]
     pub out: PathBuf,
     #[command(flatten)]

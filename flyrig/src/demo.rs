@@ -17,7 +17,7 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
-use flyrig_report::{ContactRow, Curve, Report, contact_pictures, dataset, png, progress_bar, stop, write_whole};
+use flyrig_report::{ContactRow, Curve, Report, contact_images, dataset, png, progress_bar, stop, write_whole};
 use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
 use flyrig_sync::SyncSettings;
 use flyrig_transport::{Publisher, TransportConfig};
@@ -40,7 +40,7 @@ const CONTACT_ROWS: usize = 4;
 const MEMORY_EVERY: Duration = Duration::from_secs(5);
 /// The viewer must have connected by then, or the demo goes on without it.
 const VIEWER_DEADLINE: Duration = Duration::from_secs(15);
-/// How long the viewer may take to write its last pictures.
+/// How long the viewer may take to write its last images.
 const VIEWER_END: Duration = Duration::from_secs(15);
 
 /// What one pass over the motion gave.
@@ -133,7 +133,7 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
         println!("{name:<24} {value}");
     }
     println!(
-        "\nreport: {} (open it in a browser); the viewer's pictures: {}",
+        "\nreport: {} (open it in a browser); the viewer's images: {}",
         path.display(),
         args.out.join("watched").display()
     );
@@ -328,7 +328,7 @@ fn score(
                     png::encode_rgb(image.bytes(), image.width(), image.height())?,
                 ));
             }
-            pictures.extend(contact_pictures(&camera.id, &ours, &truth.color, Some(&truth.mask))?);
+            pictures.extend(contact_images(&camera.id, &ours, &truth.color, Some(&truth.mask))?);
             pass.contact.push(ContactRow { label: format!("frame {}", set.index), pictures });
         }
     }
@@ -390,7 +390,7 @@ fn summary(metrics: &Metrics) -> Vec<(String, String)> {
     ];
     if let Some(w) = &metrics.watch {
         let latency = w.latency_p50_ms.map_or_else(String::new, |p50| format!(", latency {p50:.1} ms median"));
-        facts.push(("viewer process".to_owned(), format!("{} pictures, {} missed{latency}", w.received, w.missed)));
+        facts.push(("viewer process".to_owned(), format!("{} images, {} missed{latency}", w.received, w.missed)));
     } else {
         facts.push(("viewer process".to_owned(), "gave no statistics".to_owned()));
     }

@@ -8,7 +8,7 @@ use flyrig_fusion::{AppearanceMode, Counts, Origin, Outcome, PersonId, SessionSe
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, FrameScore, ScoreSheet, error_parts, score_view};
 use flyrig_report::{
-    ContactRow, Curve, Replay, ReplaySettings, Report, contact_pictures, frame_number, outlined_inputs, png,
+    ContactRow, Curve, Replay, ReplaySettings, Report, contact_images, frame_number, outlined_inputs, png,
     progress_bar, write_whole,
 };
 use flyrig_types::{Camera, Frame, RenderedView};
@@ -37,7 +37,7 @@ struct Metrics<'a> {
     adapter: String,
     frames: usize,
     seconds: f64,
-    /// "mask": on black inside the held-out mask's box; "own silhouette": composited over the held-out picture
+    /// "mask": on black inside the held-out mask's box; "own silhouette": composited over the held-out image
     /// inside the box of our own silhouette, because the data set has no mask of that camera.
     reference: &'static str,
     mean: Option<CameraScore>,
@@ -188,7 +188,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     print!("{}", sheet.table());
     println!();
     print!("{}", replay.session.stages.table());
-    println!("\n{processed} frames in {seconds:.1} s; pictures and report in {}", args.out.display());
+    println!("\n{processed} frames in {seconds:.1} s; images and report in {}", args.out.display());
     Ok(())
 }
 
@@ -208,7 +208,7 @@ fn contact_row(
     let mut pictures = Vec::new();
     let shown = if truths.is_empty() { 0 } else { (best + number as usize) % truths.len() };
     if let (Some(view), Some(Some(truth))) = (views.get(shown), truths.get(shown)) {
-        pictures.extend(contact_pictures(&holdout[shown].id, view, &truth.image, truth.mask.as_ref())?);
+        pictures.extend(contact_images(&holdout[shown].id, view, &truth.image, truth.mask.as_ref())?);
     }
     Ok(ContactRow { label: format!("frame {number}"), pictures })
 }

@@ -7,7 +7,7 @@ use flyrig_types::{CameraId, Rig};
 
 use crate::{cameras::CameraEntry, config::SourceSection};
 
-/// Reads the calibration; where its files do not say how large the pictures are, the configuration does, and where both do,
+/// Reads the calibration; where its files do not say how large the images are, the configuration does, and where both do,
 /// they must agree.
 pub fn load_rig(source: &SourceSection) -> Result<Rig> {
     let size = |id: &CameraId| {

@@ -1,4 +1,4 @@
-//! `flyrig plate`: records the empty scene, with which masks compare the pictures.
+//! `flyrig plate`: records the empty scene, with which masks compare the images.
 
 use std::{
     path::PathBuf,
@@ -38,7 +38,7 @@ pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         bail!("{} is there already; --force replaces it", known.display());
     }
     if pacing == Pacing::AsDelivered {
-        eprintln!("recording the empty scene for {} s: nobody may be in the pictures", args.secs);
+        eprintln!("recording the empty scene for {} s: nobody may be in the images", args.secs);
     }
     let scenes = record(args.secs, sources, pacing, &cameras)?;
     let net = PoseNet::embedded()?;
@@ -47,13 +47,13 @@ pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         let plate = scene.plate()?;
         if !args.force && shows_person(&net, &plate.image)? {
             bail!(
-                "camera {}: somebody stands in the picture; leave the scene empty and try again, or accept it with --force",
+                "camera {}: somebody stands in the image; leave the scene empty and try again, or accept it with --force",
                 scene.camera
             );
         }
         if plate.moved > MOVED_PIXELS {
             eprintln!(
-                "warning: camera {}: {:.1} % of the picture moved; the plate is right only where most frames agree",
+                "warning: camera {}: {:.1} % of the image moved; the plate is right only where most frames agree",
                 scene.camera,
                 100.0 * plate.moved
             );
@@ -101,7 +101,7 @@ fn record(secs: f64, sources: Vec<SourceOpener>, pacing: Pacing, cameras: &[Came
     if let Some(scene) = scenes.iter().find(|scene| scene.frames.is_empty()) {
         let stats = threads.stats().into_iter().find(|stats| stats.camera == scene.camera);
         let error = stats.and_then(|stats| stats.last_error).map(|error| format!("; the last error: {error}"));
-        bail!("no picture of camera {} came{}", scene.camera, error.unwrap_or_default());
+        bail!("no image of camera {} came{}", scene.camera, error.unwrap_or_default());
     }
     Ok(scenes)
 }
@@ -145,7 +145,7 @@ impl Scene {
         }
         ensure!(
             size == self.size,
-            "camera {}: pictures of {}x{} and of {}x{} pixels; a plate needs one size",
+            "camera {}: images of {}x{} and of {}x{} pixels; a plate needs one size",
             self.camera,
             self.size[0],
             self.size[1],
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn pictures_of_two_sizes_are_refused_and_one_frame_is_a_plate() {
+    fn images_of_two_sizes_are_refused_and_one_frame_is_a_plate() {
         let mut scene = Scene::new("a".into(), 1.0);
         scene.add(&frame(0, 8, |x, _| x as u8)).unwrap();
         let plate = scene.plate().unwrap();

@@ -146,7 +146,7 @@ pub fn replay_sources(path: &Path, cameras: &[CameraId]) -> Result<Vec<Box<dyn C
 /// When it broke off.
 pub fn summary(recorded: &Recorded, path: &Path) -> Result<String> {
     let mut text = format!("{} frames, {:.1} MB in {}", recorded.frames, recorded.bytes as f64 / 1e6, path.display());
-    // Messages are a little longer than their pictures.
+    // Messages are a little longer than their images.
     if recorded.bytes_sent > recorded.bytes {
         text += &format!(", as JPEG; {:.1} MB as the cameras sent them", recorded.bytes_sent as f64 / 1e6);
     }
@@ -274,7 +274,7 @@ pub fn replay(args: &ReplayArgs) -> Result<()> {
     Ok(())
 }
 
-/// JPEG pictures as they are, every other as PNG.
+/// JPEG images as they are, every other as PNG.
 fn write_set(folder: &Path, set: &FrameSet) -> Result<()> {
     for (_, frame) in set.present() {
         let (image, stem) = (&frame.image, format!("{:06}", set.index));

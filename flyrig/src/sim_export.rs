@@ -24,7 +24,7 @@ pub fn sim_export(args: &SimExportArgs, config: &SimConfig, gpu: &GpuContext) ->
     let exported = exported?;
     let names: Vec<&str> = simulator.rig().cameras.iter().map(|camera| camera.id.as_str()).collect();
     println!(
-        "{}: {} frames of {} cameras, {} pictures in {:.1} s on {}",
+        "{}: {} frames of {} cameras, {} images in {:.1} s on {}",
         args.out.display(),
         args.frames,
         names.len(),

@@ -4,7 +4,7 @@ use anyhow::{Context as _, Result, bail};
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
 use flyrig_calib::load_calibration;
 use flyrig_capture::{
-    CameraSource, FolderOptions, FolderReplay, Pacing, SourceOpener, VideoOptions, VideoReplay, folder_picture_size,
+    CameraSource, FolderOptions, FolderReplay, Pacing, SourceOpener, VideoOptions, VideoReplay, folder_image_size,
 };
 use flyrig_fusion::{EstimatedPerception, GivenPerception, GivenPerson, InputFormat, Origin, PersonId};
 use flyrig_gpu::GpuContext;
@@ -132,7 +132,7 @@ pub fn open_without_plates(config: &Config, gpu: Option<&GpuContext>) -> Result<
         SourceKind::Mcap | SourceKind::Folder | SourceKind::Video | SourceKind::Sim => {
             match source.calibration_folder() {
                 Some(folder) if folder == source.path => dataset::load_rig(folder, &chosen)?,
-                Some(folder) => load_calibration(folder, &|id| folder_picture_size(&source.path, id).ok())?,
+                Some(folder) => load_calibration(folder, &|id| folder_image_size(&source.path, id).ok())?,
                 None => recording::recorded_rig(&source.path)?,
             }
         }

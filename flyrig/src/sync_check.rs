@@ -1,4 +1,4 @@
-//! `flyrig sync-check`: do the cameras' stamps agree with what moves in their pictures?
+//! `flyrig sync-check`: do the cameras' stamps agree with what moves in their images?
 
 use std::time::{Duration, Instant};
 
@@ -61,7 +61,7 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     Ok(())
 }
 
-/// The lags by what moves in the pictures, and how many pictures of each camera were compared.
+/// The lags by what moves in the images, and how many images of each camera were compared.
 fn by_motion(
     args: &SyncCheckArgs,
     sources: Vec<SourceOpener>,
@@ -97,7 +97,7 @@ fn by_motion(
         && let Some(error) = stats.last_error
         && is_live
     {
-        bail!("no picture of camera {} came; the last: {error}", stats.camera);
+        bail!("no image of camera {} came; the last: {error}", stats.camera);
     }
     drop(threads);
     let estimates = estimate_lags(&signals, (args.most_ms * 1e6) as i64);
@@ -142,7 +142,7 @@ fn by_silhouettes(
     if let Some((slot, error)) =
         (0..pictures.len()).filter(|&slot| pictures[slot] == 0).find_map(|slot| Some((slot, errors.of(slot)?)))
     {
-        bail!("no picture of camera {} could be used; the last: {error}", rig.cameras[slot].id);
+        bail!("no image of camera {} could be used; the last: {error}", rig.cameras[slot].id);
     }
     Ok((estimate_silhouette_lags(&tracks, (args.most_ms * 1e6) as i64), frames))
 }
@@ -213,7 +213,7 @@ mod tests {
             self.off(&estimates)
         }
 
-        /// With silhouettes that are found in the pictures, without plates.
+        /// With silhouettes that are found in the images, without plates.
         fn by_silhouettes(mut self) -> Vec<(Option<f64>, f64)> {
             let take = CalibratedTake {
                 sources: std::mem::take(&mut self.sources),

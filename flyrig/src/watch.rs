@@ -25,7 +25,7 @@ use crate::cli::WatchArgs;
 
 /// How often rates are printed.
 const PRINT_EVERY: Duration = Duration::from_secs(1);
-/// Frame rate written into a video: the pictures come as they come, a file needs one number.
+/// Frame rate written into a video: the images come as they come, a file needs one number.
 const VIDEO_FPS: f64 = 25.0;
 
 /// `--stats`.
@@ -37,7 +37,7 @@ pub struct WatchStats {
     pub unreadable: u64,
     pub publisher_restarts: u64,
     pub seconds: f64,
-    pub pictures_per_second: f64,
+    pub images_per_second: f64,
     pub latency_p50_ms: Option<f64>,
     pub latency_p99_ms: Option<f64>,
     pub latency_is_exact: Option<bool>,
@@ -78,7 +78,7 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
     let views = if args.eye.is_some() { Views::None } else { Views::Named(vec![args.view.clone()]) };
     let subscriber = Subscriber::open(&config, &Interests { views, ..Interests::default() })?;
     let mut complaints = Complaints::default();
-    eprintln!("watch: rig '{}' at {}, waiting for pictures (Ctrl-C ends)", args.rig, args.connect);
+    eprintln!("watch: rig '{}' at {}, waiting for images (Ctrl-C ends)", args.rig, args.connect);
     if let Some(eye) = args.eye {
         // The rig says which way is up.
         let rig = loop {
@@ -133,8 +133,8 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
     }
     let stats = stats(&subscriber, received, first.map_or(0.0, |first| first.elapsed().as_secs_f64()));
     eprintln!(
-        "watch: {received} pictures, {} missed, {} replaced unseen, {:.1} a second",
-        stats.missed, stats.replaced, stats.pictures_per_second
+        "watch: {received} images, {} missed, {} replaced unseen, {:.1} a second",
+        stats.missed, stats.replaced, stats.images_per_second
     );
     if let Some(path) = &args.stats {
         write_whole(path, &serde_json::to_vec_pretty(&stats)?)?;
@@ -176,7 +176,7 @@ fn line(subscriber: &Subscriber, args: &WatchArgs) -> String {
         .collect();
     match (reports.is_empty(), subscriber.publishers()) {
         (true, 0) => format!("watch: no rig '{}' at {} yet; check --rig and --connect", args.rig, args.connect),
-        (true, _) => format!("watch: rig '{}' is up, no picture of view '{}' yet", args.rig, args.view),
+        (true, _) => format!("watch: rig '{}' is up, no image of view '{}' yet", args.rig, args.view),
         (false, _) => format!("watch: {}", reports.join("; ")),
     }
 }
@@ -184,7 +184,7 @@ fn line(subscriber: &Subscriber, args: &WatchArgs) -> String {
 fn stats(subscriber: &Subscriber, received: u64, seconds: f64) -> WatchStats {
     let mut stats = WatchStats { received, seconds, unreadable: subscriber.unreadable(), ..WatchStats::default() };
     if seconds > 0.0 {
-        stats.pictures_per_second = received as f64 / seconds;
+        stats.images_per_second = received as f64 / seconds;
     }
     for (_, report) in subscriber.reports().into_iter().filter(|(topic, _)| topic.starts_with("view")) {
         stats.missed += report.missed;
@@ -199,7 +199,7 @@ fn stats(subscriber: &Subscriber, received: u64, seconds: f64) -> WatchStats {
     stats
 }
 
-/// Where pictures go.
+/// Where images go.
 enum Sink {
     Folder(PathBuf),
     Video { path: PathBuf, writer: Option<(VideoWriter, u32, u32)> },
@@ -215,14 +215,14 @@ impl Sink {
         Ok(Self::Folder(path.to_owned()))
     }
 
-    /// Writes a picture; one that cannot be used is skipped. Errors are those of the disk and of the encoder.
+    /// Writes an image; one that cannot be used is skipped. Errors are those of the disk and of the encoder.
     fn write(&mut self, picture: &Received<ViewFrame>, complaints: &mut Complaints) -> Result<()> {
         let body = &picture.body;
         let rgb = match decode(body) {
             Ok(rgb) => rgb,
             Err(error) => {
-                let text = format!("picture of frame {} cannot be decoded ({error}); skipped", body.frame);
-                complaints.add("damaged pictures", printable(&text));
+                let text = format!("image of frame {} cannot be decoded ({error}); skipped", body.frame);
+                complaints.add("damaged images", printable(&text));
                 return Ok(());
             }
         };
@@ -238,12 +238,12 @@ impl Sink {
                 }
                 let Some((writer, w, h)) = writer else { return Ok(()) };
                 if (*w, *h) != (width, height) {
-                    let text = format!("a picture of {width}x{height} is left out of {}, of {w}x{h}", path.display());
-                    complaints.add("pictures of another size", text);
+                    let text = format!("an image of {width}x{height} is left out of {}, of {w}x{h}", path.display());
+                    complaints.add("images of another size", text);
                     return Ok(());
                 }
                 let bgr: Vec<Vec3b> = rgb.pixels().map(|p| Vec3b::from([p.0[2], p.0[1], p.0[0]])).collect();
-                let flat = Mat::from_slice(&bgr).context("handing a picture to the video writer")?;
+                let flat = Mat::from_slice(&bgr).context("handing an image to the video writer")?;
                 writer.write(&flat.reshape(3, height as i32)?).context("writing a video frame")?;
                 Ok(())
             }
@@ -258,7 +258,7 @@ impl Sink {
     }
 }
 
-/// Decodes a picture of the size that its message states, within that size's memory.
+/// Decodes an image of the size that its message states, within that size's memory.
 fn decode(frame: &ViewFrame) -> Result<image::RgbImage> {
     let format = match frame.format {
         ImageFormat::Jpeg => image::ImageFormat::Jpeg,
@@ -313,10 +313,10 @@ mod tests {
     }
 
     #[test]
-    fn no_picture_ends_a_recording() {
+    fn no_image_ends_a_recording() {
         let folder = tempfile::tempdir().unwrap();
         let mut complaints = Complaints::default();
-        for name in ["pictures", "video.avi"] {
+        for name in ["images", "video.avi"] {
             let mut sink = Sink::new(&folder.path().join(name)).unwrap();
             let mut write = |bytes: Vec<u8>, width, height| {
                 sink.write(&picture(bytes, width, height), &mut complaints).unwrap();
@@ -332,9 +332,9 @@ mod tests {
             write(png(64, 48), 64, 48);
             sink.finish().unwrap();
         }
-        assert!(folder.path().join("pictures/000007.png").exists());
-        assert_eq!(complaints.0["damaged pictures"], 30);
-        assert_eq!(complaints.0["pictures of another size"], 5);
+        assert!(folder.path().join("images/000007.png").exists());
+        assert_eq!(complaints.0["damaged images"], 30);
+        assert_eq!(complaints.0["images of another size"], 5);
     }
 
     #[test]

@@ -3,25 +3,25 @@
 
 mod area;
 mod choose;
+mod images;
 mod motion;
 mod options;
-mod pictures;
 mod vertex_means;
 
 use std::time::{Duration, Instant};
 
 use flyrig_body::{DeformationGraph, GpuSkinner, Part, Skeleton, SurfaceGaussians, Template, coarsen};
 use flyrig_gpu::{GpuContext, StorageBuffer};
-use flyrig_renderer::{BackwardRasterizer, ColorMeans, GaussianBuffers, GaussianGradients, PictureLoss};
+use flyrig_renderer::{BackwardRasterizer, ColorMeans, GaussianBuffers, GaussianGradients, ImageLoss};
 use flyrig_tracker::{DeformReport, DeformTracker};
 use flyrig_types::{Camera, Pose};
 use glam::{DVec3, Vec3};
 
 use self::area::Landmarks;
 use self::choose::Chooser;
+use self::images::{Images, Kernels, ViewBuffers};
 use self::motion::MeshMotion;
 pub use self::options::{DeformOptions, PAPER_COLOR_WEIGHT};
-use self::pictures::{Kernels, Pictures, ViewBuffers};
 use crate::FusionError;
 
 /// Share of the last instant's colours in those that are compared. Painting follows the surface wherever it slides; colours
@@ -37,7 +37,7 @@ pub struct Deformation {
     chooser: Chooser,
     tracker: DeformTracker,
     backward: BackwardRasterizer,
-    loss: PictureLoss,
+    loss: ImageLoss,
     /// Of the coarse Gaussians that are compared, and of all of them.
     coarse_displacement: StorageBuffer<[f32; 4]>,
     displacement: StorageBuffer<[f32; 4]>,
@@ -52,10 +52,10 @@ pub struct Deformation {
     views: Vec<ViewBuffers>,
     landmarks: Landmarks,
     report: Option<DeformReport>,
-    /// Of the views of the last frame that were compared: how much of the person is where the picture shows it, and whether
+    /// Of the views of the last frame that were compared: how much of the person is where the image shows it, and whether
     /// it counted.
     judged: Vec<Option<(f64, bool)>>,
-    /// Views of the last frame whose pictures were halved.
+    /// Views of the last frame whose images were halved.
     halved: usize,
     /// Whether the Gaussians have colours yet.
     painted: bool,
@@ -92,7 +92,7 @@ pub struct Instants<'a> {
 /// Run times of one frame's solve.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct DeformTimes {
-    /// Uploading and preparing the pictures.
+    /// Uploading and preparing the images.
     pub prepare: Duration,
     /// Skinning, drawing and comparing.
     pub draw: Duration,
@@ -131,7 +131,7 @@ impl Deformation {
             chooser: Chooser::default(),
             tracker,
             backward: BackwardRasterizer::new(gpu)?,
-            loss: PictureLoss::new(gpu)?,
+            loss: ImageLoss::new(gpu)?,
             coarse_displacement: StorageBuffer::zeroed(gpu, "displacements", count)?,
             displacement: StorageBuffer::zeroed(gpu, "displacements", surface.len())?,
             skinner: GpuSkinner::new(gpu, &coarse.gaussians.inset(), &template.skeleton)?,
@@ -187,7 +187,7 @@ impl Deformation {
         self.colored = self.painted;
         self.colors.encode(gpu, &mut encoder, &scene.gaussians.color, &self.posed[0].color, rate);
         gpu.queue.submit([encoder.finish()]);
-        let mut pictures = Pictures::new(
+        let mut pictures = Images::new(
             scene,
             views,
             &plans,
@@ -247,19 +247,19 @@ impl Deformation {
         self.tracker.restart();
     }
 
-    /// By view of the last frame: how much of the person is where the picture shows it (1: all; 0: as much is wrong as there
+    /// By view of the last frame: how much of the person is where the image shows it (1: all; 0: as much is wrong as there
     /// is), and whether the view counted: one that disagrees with all others does not. None for one that was not compared.
     pub fn judged(&self) -> &[Option<(f64, bool)>] {
         &self.judged
     }
 
-    /// How many Gaussians are compared with the pictures.
+    /// How many Gaussians are compared with the images.
     pub fn compared(&self) -> usize {
         self.posed[0].count()
     }
 
-    /// Views of the last frame whose pictures were compared at a half of their size or less.
-    pub fn halved_pictures(&self) -> usize {
+    /// Views of the last frame whose images were compared at a half of their size or less.
+    pub fn halved_images(&self) -> usize {
         self.halved
     }
 

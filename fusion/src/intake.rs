@@ -90,7 +90,7 @@ impl Intake {
         Self::start_opening(sources.into_iter().map(SourceOpener::ready).collect(), format, sync, pacing)
     }
 
-    /// Starts a thread a camera, and another one each that makes RGB of its pictures where they are not. With
+    /// Starts a thread a camera, and another one each that makes RGB of its images where they are not. With
     /// [`Pacing::Lossless`] every set comes, in order; else the newest one wins. A live camera that cannot be opened yet
     /// joins later; meanwhile sets come without it.
     ///

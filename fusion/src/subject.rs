@@ -11,7 +11,7 @@ use flyrig_renderer::{
     AppearanceSettings, DirectAppearance, GaussianBuffers, Observations, Outputs, RasterSettings, Rasterizer,
     RenderTarget, Splat, UNKNOWN_RGBA, ViewInput, read_splats,
 };
-use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, SharedAppearance, ViewPicture};
+use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, SharedAppearance, ViewImage};
 use flyrig_stream::EncodedTemplate;
 use flyrig_tracker::{DeformReport, EdgeColor};
 use flyrig_types::{Camera, Image, Mask, PersonId, Pose, Rig};
@@ -322,7 +322,7 @@ impl Subject {
         gpu.wait()?;
         self.collect_times(stages);
 
-        // The instant itself, and each other one that a picture was taken at.
+        // The instant itself, and each other one that an image was taken at.
         let mut instants = vec![pose];
         let instant_of: Vec<usize> = views
             .iter()
@@ -375,7 +375,7 @@ impl Subject {
             stages.count("views not compared", left_out as u64);
             let distrusted = deformation.judged().iter().flatten().filter(|(_, trusted)| !trusted).count();
             stages.count("views not believed", distrusted as u64);
-            stages.count("images halved", deformation.halved_pictures() as u64);
+            stages.count("images halved", deformation.halved_images() as u64);
         }
 
         let start = Instant::now();
@@ -492,7 +492,7 @@ impl Subject {
         }
         let picture = |&i: &usize| {
             let InputImage { size: [width, height], rgba, .. } = &self.inputs[i];
-            ViewPicture { width: *width, height: *height, rgba }
+            ViewImage { width: *width, height: *height, rgba }
         };
         let pictures: Vec<_> = self.painted.iter().map(picture).collect();
         let learned = match networks {
@@ -586,13 +586,13 @@ impl Subject {
         }
     }
 
-    /// By view of the last update: how much of the person is where the picture shows it, 0 to 1. Empty when the body was not
-    /// compared with the pictures, None for a view that was not.
+    /// By view of the last update: how much of the person is where the image shows it, 0 to 1. Empty when the body was not
+    /// compared with the images, None for a view that was not.
     pub(crate) fn agreement(&self) -> Vec<Option<f64>> {
         self.judged.iter().map(|judged| judged.map(|(quality, _)| quality)).collect()
     }
 
-    /// How many Gaussians are compared with the pictures; 0 where the body is only skinned.
+    /// How many Gaussians are compared with the images; 0 where the body is only skinned.
     pub fn compared_gaussians(&self) -> usize {
         self.deformation.as_ref().map_or(0, Deformation::compared)
     }

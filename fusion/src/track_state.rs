@@ -78,7 +78,7 @@ impl TrackWatch {
         self.state
     }
 
-    /// Of the last frame: how much of the person is where the pictures show it, 0 to 1. None when nothing was compared.
+    /// Of the last frame: how much of the person is where the images show it, 0 to 1. None when nothing was compared.
     pub fn quality(&self) -> Option<f64> {
         self.quality
     }

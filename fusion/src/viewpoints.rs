@@ -11,7 +11,7 @@ pub fn orbit(rig: &Rig, turn: f64, width: u32, height: u32, name: &str) -> Optio
     let center = rig.center_of_attention();
     let arm = DQuat::from_axis_angle(rig.world_up, turn * std::f64::consts::TAU) * (first.position() - center);
     let i = &first.intrinsics;
-    // The whole height of the first camera's picture fits the height of ours.
+    // The whole height of the first camera's image fits the height of ours.
     let focal = i.focal_px.y * f64::from(height) / f64::from(i.height);
     Some(Camera {
         time_offset_nanos: 0,

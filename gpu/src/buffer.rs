@@ -168,7 +168,7 @@ impl<T: Pod> StorageBuffer<T> {
         &self.owner.buffer
     }
 
-    /// Waits for the GPU and copies the elements out. For tests, exports and published pictures.
+    /// Waits for the GPU and copies the elements out. For tests, exports and published images.
     ///
     /// # Errors
     /// [`GpuError::Lost`].

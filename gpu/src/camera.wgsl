@@ -13,7 +13,7 @@ struct Camera {
 }
 
 struct Projected {
-    // Position in the picture, pixels.
+    // Position in the image, pixels.
     pixel: vec2<f32>,
     // z in camera axes, metres.
     depth: f32,

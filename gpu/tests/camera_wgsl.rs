@@ -134,6 +134,6 @@ fn unknown_adapter_names_the_ones_there_are() {
 #[test]
 fn a_buffer_beyond_the_adapter_is_refused_by_name() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
-    let error = StorageBuffer::<[f32; 4]>::zeroed(&gpu, "a million pictures", usize::MAX / 64).unwrap_err();
-    assert!(error.to_string().starts_with("a million pictures needs "), "{error}");
+    let error = StorageBuffer::<[f32; 4]>::zeroed(&gpu, "a million images", usize::MAX / 64).unwrap_err();
+    assert!(error.to_string().starts_with("a million images needs "), "{error}");
 }

@@ -1,4 +1,4 @@
-//! Where the error of a drawn picture lies: what better colours could gain, and what only a better surface could.
+//! Where the error of a drawn image lies: what better colours could gain, and what only a better surface could.
 
 use flyrig_types::Mask;
 use serde::Serialize;
@@ -10,10 +10,10 @@ pub const SCALES_PX: [f64; 3] = [8.0, 4.0, 2.0];
 
 /// From this coverage on a pixel counts as wholly covered.
 const COVERED: u8 = 250;
-/// Decibels stand for a perfect picture beyond this.
+/// Decibels stand for a perfect image beyond this.
 const MOST_DB: f64 = 99.0;
 
-/// Parts of a picture's squared error, and what mending each would gain.
+/// Parts of an image's squared error, and what mending each would gain.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct ErrorParts {
     /// Share of the squared error where drawing or truth cover a pixel in part or not at all.
@@ -21,12 +21,12 @@ pub struct ErrorParts {
     /// dB that perfect colours would gain where both cover the pixel.
     pub colors_db: f64,
     /// dB that colours would gain there which are right but for detail finer than each of [`SCALES_PX`]: the difference of
-    /// the two pictures, blurred, is taken off. Nobody without the truth could do so; it is a bound.
+    /// the two images, blurred, is taken off. Nobody without the truth could do so; it is a bound.
     pub smooth_db: [f64; 3],
 }
 
 impl ErrorParts {
-    /// Of two pictures on black of one size, inside `area` (left, top, right, bottom). `drawn` is our coverage.
+    /// Of two images on black of one size, inside `area` (left, top, right, bottom). `drawn` is our coverage.
     pub fn new(ours: &Picture, truth: &Picture, drawn: &Mask, mask: &Mask, area: [u32; 4]) -> Self {
         let [left, top, right, bottom] = area;
         let width = (right - left) as usize;
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_pictures_and_no_pictures_have_no_error() {
+    fn equal_images_and_no_images_have_no_error() {
         let whole = mask(|_, _| true);
         let same = picture(|x, y| (x + y) as u8);
         assert_eq!(ErrorParts::new(&same, &same, &whole, &whole, ALL), ErrorParts::default());

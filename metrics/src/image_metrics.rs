@@ -1,4 +1,4 @@
-//! How far two pictures are apart, inside a box around the person.
+//! How far two images are apart, inside a box around the person.
 //!
 //! PSNR and SSIM agree with OpenCV-based reference scripts: sRGB values in 0..=1, data range 1.
 
@@ -10,23 +10,23 @@ use flyrig_types::Mask;
 pub use flip::{FlipMap, flip};
 pub use ssim::ssim;
 
-/// Part of a picture in pixels: `[x0, y0, x1, y1]`, ends excluded.
+/// Part of an image in pixels: `[x0, y0, x1, y1]`, ends excluded.
 pub type PixelBox = [u32; 4];
 
 /// Margin around the person in our evaluation, pixels.
 pub const BOX_MARGIN_PX: u32 = 10;
 
-/// PSNR of equal pictures, decibels; no PSNR is reported higher.
+/// PSNR of equal images, decibels; no PSNR is reported higher.
 pub const MAX_PSNR_DB: f64 = 99.0;
 
-/// Why two pictures cannot be compared.
+/// Why two images cannot be compared.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum MetricError {
     /// An image that cannot be read.
     #[error("{0}")]
     Image(String),
     /// Two sizes.
-    #[error("pictures of different size cannot be compared: {}x{} and {}x{}", first.0, first.1, second.0, second.1)]
+    #[error("images of different size cannot be compared: {}x{} and {}x{}", first.0, first.1, second.0, second.1)]
     SizeMismatch {
         /// Pixels.
         first: (u32, u32),
@@ -34,7 +34,7 @@ pub enum MetricError {
         second: (u32, u32),
     },
     /// The byte count does not fit the size.
-    #[error("a {width}x{height} picture needs {needed} values but has {found}")]
+    #[error("a {width}x{height} image needs {needed} values but has {found}")]
     ByteCount {
         /// Pixels.
         width: u32,
@@ -46,7 +46,7 @@ pub enum MetricError {
         found: usize,
     },
     /// No pixel to compare.
-    #[error("the box {area:?} (x0, y0, x1, y1) holds no pixel of a {width}x{height} picture")]
+    #[error("the box {area:?} (x0, y0, x1, y1) holds no pixel of a {width}x{height} image")]
     EmptyBox {
         /// The box.
         area: PixelBox,
@@ -55,10 +55,10 @@ pub enum MetricError {
         /// Pixels.
         height: u32,
     },
-    /// Nobody in the picture.
+    /// Nobody in the image.
     #[error("the mask is empty: there is no person to put a box around")]
     EmptyMask,
-    /// A poisoned picture.
+    /// A poisoned image.
     #[error("pixel ({x}, {y}) is not a finite number")]
     NotFinite {
         /// Column.
@@ -68,7 +68,7 @@ pub enum MetricError {
     },
 }
 
-/// A picture as the metrics see it: sRGB values in 0..=1.
+/// An image as the metrics see it: sRGB values in 0..=1.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Picture {
     width: u32,
@@ -149,7 +149,7 @@ impl Picture {
         if first == second { Ok(()) } else { Err(MetricError::SizeMismatch { first, second }) }
     }
 
-    /// The part inside a box, which is cut at the picture's border.
+    /// The part inside a box, which is cut at the image's border.
     fn crop(&self, area: PixelBox) -> Result<Self, MetricError> {
         let [x0, y0, x1, y1] = area;
         let (x1, y1) = (x1.min(self.width), y1.min(self.height));
@@ -161,14 +161,14 @@ impl Picture {
         Ok(Self { width: x1 - x0, height: y1 - y0, pixels })
     }
 
-    /// Both pictures inside the box.
+    /// Both images inside the box.
     fn crop_both(&self, other: &Self, area: PixelBox) -> Result<(Self, Self), MetricError> {
         self.same_size(other)?;
         Ok((self.crop(area)?, other.crop(area)?))
     }
 }
 
-/// The person's box with a margin, cut at the picture's border.
+/// The person's box with a margin, cut at the image's border.
 ///
 /// # Errors
 /// [`MetricError::EmptyMask`].
@@ -191,11 +191,11 @@ pub fn psnr(first: &Picture, second: &Picture, area: PixelBox) -> Result<f64, Me
     let (a, b) = (a.pixels.as_flattened(), b.pixels.as_flattened());
     let sum: f64 = a.iter().zip(b).map(|(x, y)| f64::from(x - y).powi(2)).sum();
     let mean_square = sum / a.len() as f64;
-    // log10(0) is minus infinity: equal pictures get the cap.
+    // log10(0) is minus infinity: equal images get the cap.
     Ok((-10.0 * mean_square.log10()).min(MAX_PSNR_DB))
 }
 
-/// Intersection over union of the pixels of at least half coverage, whole picture; 0 when both are empty.
+/// Intersection over union of the pixels of at least half coverage, whole image; 0 when both are empty.
 ///
 /// # Errors
 /// [`MetricError::SizeMismatch`].

@@ -1,4 +1,4 @@
-//! Scores of rendered views against held-out pictures, and the pictures that show them.
+//! Scores of rendered views against held-out images, and the images that show them.
 
 use std::fmt::Write as _;
 
@@ -10,7 +10,7 @@ use crate::{BOX_MARGIN_PX, ErrorParts, MetricError, Picture, flip, mask_iou, per
 
 type Result<T, E = MetricError> = std::result::Result<T, E>;
 
-/// Scores of one picture.
+/// Scores of one image.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FrameScore {
     /// The held-out camera.
@@ -135,12 +135,12 @@ impl ScoreSheet {
         self.frames.extend(scores);
     }
 
-    /// One score a picture.
+    /// One score an image.
     pub fn frames(&self) -> &[FrameScore] {
         &self.frames
     }
 
-    /// What the pictures were compared with.
+    /// What the images were compared with.
     pub fn reference(&self) -> &'static str {
         if self.frames.iter().any(|score| score.iou.is_some()) { "mask" } else { "own silhouette" }
     }
@@ -159,7 +159,7 @@ impl ScoreSheet {
             .collect()
     }
 
-    /// Mean over all pictures.
+    /// Mean over all images.
     pub fn mean(&self) -> Option<CameraScore> {
         mean("all", &self.frames.iter())
     }

@@ -12,7 +12,7 @@ use std::time::Instant;
 
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_renderer::{
-    BackwardRasterizer, Carry, GaussianGradients, Outputs, PictureGradients, RasterSettings, Rasterizer, RenderTarget,
+    BackwardRasterizer, Carry, GaussianGradients, ImageGradients, Outputs, RasterSettings, Rasterizer, RenderTarget,
 };
 use flyrig_types::Camera;
 use glam::DVec3;
@@ -34,7 +34,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     println!(
         "{:>9} {:>9} {:>7} {:>14} | {:>8} {:>8} {:>6} | {:>14} {:>20}",
         "kernels",
-        "picture",
+        "image",
         "count",
         "pixels with",
         "forward",
@@ -124,7 +124,7 @@ fn measure(
     let mut forward = Rasterizer::new(gpu, gaussians.count())?;
     let mut back = BackwardRasterizer::new(gpu)?;
     let target = RenderTarget::new(gpu, width, height)?;
-    let gradients = PictureGradients::zeroed(gpu, width, height)?;
+    let gradients = ImageGradients::zeroed(gpu, width, height)?;
     gradients.color.write(gpu, &incoming.color);
     let out = GaussianGradients::zeroed(gpu, gaussians.count())?;
     let (mut forwards, mut backwards) = (Vec::new(), Vec::new());

@@ -35,7 +35,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     println!(
         "{:>9} {:>9} {:>7} {:>5} {:>6} | {:>6} {:>7} {:>6} {:>6} {:>7} | {:>7} {:>6} | {:>17} | {:>24}",
         "kernels",
-        "picture",
+        "image",
         "count",
         "cull",
         "output",
@@ -149,7 +149,7 @@ fn median(mut times: Vec<Duration>) -> f64 {
     times.get(times.len() / 2).map_or(f64::NAN, |t| t.as_secs_f64() * 1e3)
 }
 
-/// Largest and mean error of colour and alpha where either picture shows the body, and the share of those
+/// Largest and mean error of colour and alpha where either image shows the body, and the share of those
 /// pixels that differ by more than 1/255.
 fn body_error(ours: &Pictures, reference: &Picture) -> (f64, f64, f64) {
     let d = Difference::between(ours, reference);

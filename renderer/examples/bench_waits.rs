@@ -55,7 +55,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut appearance = DirectAppearance::new(&gpu, &surface, &graph, VIEWS)?;
     let cameras: Vec<Camera> = (0..VIEWS).map(|i| camera(1.5 * i as f64, side)).collect();
     let targets = cameras.iter().map(|_| RenderTarget::new(&gpu, side, side)).collect::<Result<Vec<_>, _>>()?;
-    let picture = StorageBuffer::from_slice(&gpu, "picture", &vec![0xff40_80c0_u32; (side * side) as usize])?;
+    let picture = StorageBuffer::from_slice(&gpu, "image", &vec![0xff40_80c0_u32; (side * side) as usize])?;
     let pose = template.skeleton.rest_pose();
     let settings = RasterSettings { outputs: Outputs::SURFACE, ..RasterSettings::default() };
     let mut timer = StageTimer::new(&gpu, STAGES.len() as u32);

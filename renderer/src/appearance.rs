@@ -3,7 +3,7 @@
 //! Four kernels, on the device without a round trip or on the processor (`appearance/processor.rs`):
 //!
 //! 1. **observe** (a thread a Gaussian, a dispatch a view): projects the point of the drawn surface above
-//!    the centre (w of the normals) with the camera's own lens, samples the picture
+//!    the centre (w of the normals) with the camera's own lens, samples the image
 //!    in linear light and weighs it by viewing angle and visibility in canonical space. Texels count by their mask
 //!    coverage, so the background never bleeds in, and the view's weight shrinks with the coverage left.
 //! 2. **gather** (a thread a graph node): visibility-weighted mean of the Gaussians around the node.
@@ -24,13 +24,13 @@
 //!   We lengthen the best view's d by `-ln(s) / k`, s being the share of the current colour that was really
 //!   seen: 0 for a point seen well (the equation as printed), infinite for an unseen one (the memory rules).
 //!   So `w = (w_acc / w_max) (1 - s exp(-k d))`. Best view: the smallest d among those with a positive weight.
-//! - **Sharpness.** Every Gaussian is drawn over its neighbours, so that colours taken from a picture draw a blurred one. What
-//!   a view tells is raised by what drawing takes away: W + g (c - D c), with W the picture, c the colours of the last frame
+//! - **Sharpness.** Every Gaussian is drawn over its neighbours, so that colours taken from an image draw a blurred one. What
+//!   a view tells is raised by what drawing takes away: W + g (c - D c), with W the image, c the colours of the last frame
 //!   and D c their drawing, both at the Gaussian. Repeated, that solves (1 - g + g D) c = W: for g towards 1 the drawing is
-//!   the picture, for less noise that drawing cannot show stays bounded. It costs no drawing of its own: the visibility needs
+//!   the image, for less noise that drawing cannot show stays bounded. It costs no drawing of its own: the visibility needs
 //!   one anyway.
-//! - **No spatial aggregation**: the paper's baseline. A camera that has the point inside picture and mask gets a
-//!   small extra weight, visible or not; the weights are normalised. Points inside no picture are grey.
+//! - **No spatial aggregation**: the paper's baseline. A camera that has the point inside image and mask gets a
+//!   small extra weight, visible or not; the weights are normalised. Points inside no image are grey.
 
 mod graph_buffers;
 mod hierarchy;

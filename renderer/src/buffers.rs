@@ -65,7 +65,7 @@ impl GaussianBuffers {
     }
 }
 
-/// Pictures of one view, row by row, one element a pixel.
+/// Images of one view, row by row, one element a pixel.
 #[derive(Debug)]
 pub struct RenderTarget {
     /// Pixels.
@@ -81,7 +81,7 @@ pub struct RenderTarget {
 }
 
 impl RenderTarget {
-    /// Pictures of `width` x `height` pixels, all zero.
+    /// Images of `width` x `height` pixels, all zero.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].

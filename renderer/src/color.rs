@@ -29,7 +29,7 @@ fn byte(value: f32) -> u8 {
 /// [`RenderTarget::color`](crate::RenderTarget::color). Where alpha is 0 (or not finite) all four bytes are 0.
 ///
 /// The colour is un-premultiplied in linear light and then encoded, so multiplying the sRGB bytes by alpha gives
-/// the picture on black as an ordinary 8-bit compositor (and our evaluation) makes it.
+/// the image on black as an ordinary 8-bit compositor (and our evaluation) makes it.
 #[must_use]
 pub fn rgba8_from_target(color: &[[f32; 4]]) -> Vec<u8> {
     use rayon::prelude::*;
@@ -47,7 +47,7 @@ pub fn rgba8_from_target(color: &[[f32; 4]]) -> Vec<u8> {
 }
 
 /// Straight-alpha RGBA over an RGB background, composited on the sRGB values as an 8-bit compositor does; RGB bytes.
-/// A background shorter than the picture counts as black.
+/// A background shorter than the image counts as black.
 #[must_use]
 pub fn composite_over(rgba: &[u8], background_rgb: &[u8]) -> Vec<u8> {
     let mut out = vec![0; rgba.len() / 4 * 3];

@@ -10,7 +10,7 @@ use wgpu::{BindingResource, BufferBinding, BufferSize, CommandEncoder};
 const ALIGNMENT: usize = 256;
 
 /// Several constants in one buffer. Each encoding records their upload among its own commands: a queued write would
-/// land before all pictures of a submission, not between them.
+/// land before all images of a submission, not between them.
 #[derive(Debug)]
 pub(crate) struct Constants {
     buffer: StorageBuffer<u32>,

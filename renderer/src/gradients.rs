@@ -1,12 +1,12 @@
-//! Derivatives with respect to pictures and Gaussians: what the backward rasteriser reads and writes.
+//! Derivatives with respect to images and Gaussians: what the backward rasteriser reads and writes.
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 use wgpu::CommandEncoder;
 
-/// Derivatives of a loss L with respect to the pictures of one view, row by row, one element a pixel. A pixel with a
+/// Derivatives of a loss L with respect to the images of one view, row by row, one element a pixel. A pixel with a
 /// number that is not finite counts as zero; so does one where nothing was drawn.
 #[derive(Debug)]
-pub struct PictureGradients {
+pub struct ImageGradients {
     /// dL/d of the premultiplied linear red, green, blue, and of alpha ([`crate::RenderTarget::color`]).
     pub color: StorageBuffer<[f32; 4]>,
     /// x: dL/d [`crate::RenderTarget::depth`], per metre (ignored when the forward pass drew no depth); yzw: three numbers
@@ -14,8 +14,8 @@ pub struct PictureGradients {
     pub depth_carry: StorageBuffer<[f32; 4]>,
 }
 
-impl PictureGradients {
-    /// For pictures of `width` x `height` pixels, all zero.
+impl ImageGradients {
+    /// For images of `width` x `height` pixels, all zero.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -33,8 +33,8 @@ impl PictureGradients {
 pub enum Carry {
     /// They are added up. With dL/d (red, green, blue) as the numbers, the sums are dL/d the Gaussian's colour.
     Sum,
-    /// They are the entries (xx, xy, yy) of a 2x2 matrix C in the picture, per square pixel; their sum is lifted to
-    /// the world, `J^T C J` with J = d pixel / d centre. With C from the picture's own slopes this is the
+    /// They are the entries (xx, xy, yy) of a 2x2 matrix C in the image, per square pixel; their sum is lifted to
+    /// the world, `J^T C J` with J = d pixel / d centre. With C from the image's own slopes this is the
     /// Gauss-Newton matrix of the pixels as if all that is seen in one moved together (Lucas and Kanade 1981).
     Lift,
 }

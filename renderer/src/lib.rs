@@ -1,4 +1,4 @@
-//! Splats to pictures and back: forward and backward rasteriser, direct appearance, splat export.
+//! Splats to images and back: forward and backward rasteriser, direct appearance, splat export.
 
 mod appearance;
 mod buffers;
@@ -7,7 +7,7 @@ mod color_means;
 mod constants;
 mod export;
 mod gradients;
-mod picture_loss;
+mod image_loss;
 mod processor;
 mod raster;
 mod raster_backward;
@@ -28,8 +28,8 @@ pub use buffers::{GaussianBuffers, RenderTarget};
 pub use color::{composite_over, linear_from_srgb, rgba8_from_target, srgb_from_linear};
 pub use color_means::ColorMeans;
 pub use export::{ExportError, Splat, read_splats, write_splat_ply};
-pub use gradients::{Carry, GaussianGradients, PictureGradients};
-pub use picture_loss::{LossSettings, PictureLoss, PictureSums, UNKNOWN_RGBA, WantedPicture};
+pub use gradients::{Carry, GaussianGradients, ImageGradients};
+pub use image_loss::{ImageLoss, ImageSums, LossSettings, UNKNOWN_RGBA, WantedImage};
 pub use raster::Rasterizer;
 pub use raster_backward::{BackwardError, BackwardRasterizer};
 pub use raster_kernels::BACKFACING_COSINE;

@@ -11,9 +11,9 @@ use crate::raster_device::DeviceRasterizer;
 use crate::raster_settings::Latest;
 use crate::{GaussianBuffers, RasterSettings, RasterStats, RenderTarget};
 
-/// Draws isotropic Gaussians into pictures: projection through the camera's lens (EWA splatting), stable
+/// Draws isotropic Gaussians into images: projection through the camera's lens (EWA splatting), stable
 /// sort by depth, lists by tile, and front-to-back blending, all on the device without a wait, or on the processor when the
-/// picture is recorded.
+/// image is recorded.
 ///
 /// - Depth order is that of the centres, to 24 bits of the range of their depths as floats; equal depths keep the
 ///   order of the buffers. Equal input gives equal bytes on one device.
@@ -21,7 +21,7 @@ use crate::{GaussianBuffers, RasterSettings, RasterStats, RenderTarget};
 ///   finished when less than 1e-4 of the light behind it would pass.
 /// - A Gaussian with any number that is not finite, with scale or opacity not above 0, behind
 ///   [`RasterSettings::near_m`], beyond 1e9 m, or outside the lens's valid radius is not drawn.
-/// - Buffers and pipelines are made once; they grow with the picture and the number of Gaussians.
+/// - Buffers and pipelines are made once; they grow with the image and the number of Gaussians.
 #[derive(Debug)]
 pub struct Rasterizer {
     pub(crate) on: RasterizerOn,
@@ -48,8 +48,8 @@ impl Rasterizer {
         Ok(Self { on })
     }
 
-    /// Records the rendering of one picture. Its size is the target's; the camera's own width and height
-    /// do not matter. Any number of pictures can go into one encoder.
+    /// Records the rendering of one image. Its size is the target's; the camera's own width and height
+    /// do not matter. Any number of images can go into one encoder.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`] when buffers must grow and cannot.
@@ -89,7 +89,7 @@ impl Rasterizer {
         }
     }
 
-    /// The picture that was recorded last; None before the first picture.
+    /// The image that was recorded last; None before the first image.
     pub(crate) fn latest(&self) -> Option<Latest> {
         match &self.on {
             RasterizerOn::Device(device) => device.latest,
@@ -97,7 +97,7 @@ impl Rasterizer {
         }
     }
 
-    /// Run times of projection, depth sort, tile lists and blending of the latest picture on the processor. None for the
+    /// Run times of projection, depth sort, tile lists and blending of the latest image on the processor. None for the
     /// device: pass a timer to [`Self::encode_timed`] there.
     #[must_use]
     pub fn processor_times(&self) -> Option<[Duration; 4]> {
@@ -107,7 +107,7 @@ impl Rasterizer {
         }
     }
 
-    /// Waits for the device and returns what the latest picture needed.
+    /// Waits for the device and returns what the latest image needed.
     ///
     /// # Errors
     /// [`GpuError::Lost`].

@@ -1,4 +1,4 @@
-//! Backward splat rasteriser: what a change of the Gaussians does to a loss on the pictures.
+//! Backward splat rasteriser: what a change of the Gaussians does to a loss on the images.
 
 use flyrig_gpu::{CAMERA_WGSL, ComputeKernel, GpuContext, GpuError, StorageBuffer, dispatch_1d};
 use wgpu::{CommandEncoder, ComputePassDescriptor};
@@ -8,7 +8,7 @@ use crate::raster::RasterizerOn;
 use crate::raster_device::{DeviceRasterizer, FRAME};
 use crate::raster_kernels::{FRAME_WGSL, RasterShape};
 use crate::scan::run;
-use crate::{Carry, GaussianBuffers, GaussianGradients, PictureGradients, Rasterizer, RenderTarget};
+use crate::{Carry, GaussianBuffers, GaussianGradients, ImageGradients, Rasterizer, RenderTarget};
 
 const BACKWARD_FRAME_WGSL: &str = include_str!("raster_backward_frame.wgsl");
 const PLACES_WGSL: &str = include_str!("raster_backward_places.wgsl");
@@ -30,8 +30,8 @@ pub enum BackwardError {
     /// Buffers must grow and cannot.
     #[error(transparent)]
     Gpu(#[from] GpuError),
-    /// A buffer does not belong to the picture that was drawn last.
-    #[error("{what}: {found} elements where the picture drawn last needs {needed}; make it for that picture")]
+    /// A buffer does not belong to the image that was drawn last.
+    #[error("{what}: {found} elements where the image drawn last needs {needed}; make it for that image")]
     Buffer {
         /// Which buffer.
         what: &'static str,
@@ -42,9 +42,9 @@ pub enum BackwardError {
     },
 }
 
-/// Derivatives of [`Rasterizer`]'s pictures with respect to the centres of the Gaussians (FlyHuman section 3.1).
+/// Derivatives of [`Rasterizer`]'s images with respect to the centres of the Gaussians (FlyHuman section 3.1).
 ///
-/// - Complete where the picture is smooth: place, depth, and the size and shape of the ellipse, through the lens and
+/// - Complete where the image is smooth: place, depth, and the size and shape of the ellipse, through the lens and
 ///   the low-pass filter. What jumps passes nothing on: a splat that enters or leaves a pixel at alpha 1/255, a pixel
 ///   that is finished, the order by depth, back-face culling; at the clamp (alpha 0.99) alpha itself is constant. On
 ///   the built-in body the jumps are 4 to 6 % of the loss's true slope (`bench_backward`).
@@ -79,7 +79,7 @@ struct DeviceBackward {
 }
 
 impl BackwardRasterizer {
-    /// Compiles the kernels for pictures of any [`Rasterizer::new`] with this context; buffers grow with the pictures.
+    /// Compiles the kernels for images of any [`Rasterizer::new`] with this context; buffers grow with the images.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -92,9 +92,9 @@ impl BackwardRasterizer {
         Ok(Self { on })
     }
 
-    /// Records the derivatives of the picture that `rasterizer` recorded last, with the same `gaussians` and
+    /// Records the derivatives of the image that `rasterizer` recorded last, with the same `gaussians` and
     /// `target`, and adds them to `out`. Views of one submission: encode a view, its loss, its derivative, the next
-    /// view. Without a picture before, or with one without colour, nothing is recorded.
+    /// view. Without an image before, or with one without colour, nothing is recorded.
     ///
     /// # Errors
     /// [`BackwardError`]; nothing is recorded then.
@@ -106,7 +106,7 @@ impl BackwardRasterizer {
         rasterizer: &Rasterizer,
         gaussians: &GaussianBuffers,
         target: &RenderTarget,
-        (incoming, carry): (&PictureGradients, Carry),
+        (incoming, carry): (&ImageGradients, Carry),
         out: &GaussianGradients,
     ) -> Result<(), BackwardError> {
         let Some(latest) = rasterizer.latest() else { return Ok(()) };
@@ -116,7 +116,7 @@ impl BackwardRasterizer {
         let pixels = latest.size[0] as usize * latest.size[1] as usize;
         check("dL/d colour", incoming.color.len(), pixels)?;
         check("dL/d depth", incoming.depth_carry.len(), pixels)?;
-        check("the drawn picture", target.color.len().min(target.depth.len()), pixels)?;
+        check("the drawn image", target.color.len().min(target.depth.len()), pixels)?;
         check("the Gaussians", gaussians.count(), latest.gaussians)?;
         check("dL/d centres", out.center.len().min(out.carried.len() / 2), latest.gaussians)?;
         match (&mut self.on, &rasterizer.on) {
@@ -155,7 +155,7 @@ impl DeviceBackward {
         rasterizer: &DeviceRasterizer,
         gaussians: &GaussianBuffers,
         target: &RenderTarget,
-        (incoming, carry): (&PictureGradients, Carry),
+        (incoming, carry): (&ImageGradients, Carry),
         out: &GaussianGradients,
     ) -> Result<(), BackwardError> {
         let (Some(picture), Some(latest)) = (&rasterizer.picture, &rasterizer.latest) else { return Ok(()) };

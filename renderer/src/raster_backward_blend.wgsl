@@ -11,7 +11,7 @@
 @group(0) @binding(3) var<storage, read> table: array<u32>;
 @group(0) @binding(4) var<storage, read> pairs: array<u32>;
 @group(0) @binding(5) var<storage, read> places: array<Place>;
-// The pictures that the forward pass drew.
+// The images that the forward pass drew.
 @group(0) @binding(6) var<storage, read> drawn_color: array<vec4<f32>>;
 @group(0) @binding(7) var<storage, read> drawn_depth: array<f32>;
 // dL/d (red, green, blue, alpha)

@@ -1,7 +1,7 @@
 // Derivative of the projection: one invocation a Gaussian adds up its tiles row by row and carries the sums through
 // the filtered ellipse, the lens and the camera to the world. Adds to the outputs, so that views can follow each other.
 //
-// Complete where the picture is smooth: position in the picture, depth, and the ellipse's size and shape (with the
+// Complete where the image is smooth: position in the image, depth, and the ellipse's size and shape (with the
 // lens's second derivatives). Nothing flows through what jumps: the cut at CUT, the end at OPAQUE, the order by depth,
 // back-face culling.
 // Prefix: camera.wgsl, raster_frame.wgsl, raster_backward_frame.wgsl, const LIFT.
@@ -149,7 +149,7 @@ fn project_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgr
         center_out[i] += in_world;
     }
     if LIFT {
-        // J^T C J with C = (xx, xy, yy) of the picture, J = d pixel / d world.
+        // J^T C J with C = (xx, xy, yy) of the image, J = d pixel / d world.
         let du = vec3(along_x.x, along_y.x, along_z.x) * rotation;
         let dv = vec3(along_x.y, along_y.y, along_z.y) * rotation;
         let column_u = carried.x * du + carried.y * dv;

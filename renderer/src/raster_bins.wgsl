@@ -15,7 +15,7 @@
 // table[tile * bin_chunks + chunk]
 @group(0) @binding(6) var<storage, read_write> table: array<u32>;
 @group(0) @binding(7) var<storage, read_write> pairs: array<u32>;
-// visible Gaussians, pairs wanted, pictures so far that wanted more pairs than there is room for
+// visible Gaussians, pairs wanted, images so far that wanted more pairs than there is room for
 @group(0) @binding(8) var<storage, read_write> stats: array<u32>;
 
 struct Rect {

@@ -1,7 +1,7 @@
 // One workgroup a tile, one invocation for four pixels of a column: blends the tile's list front to back.
 // Four pixels share the loads of a splat, which is what the time goes into on Mesa's software adapter. No
 // workgroup memory and no barrier, so that every subgroup can leave as soon as its pixels are opaque.
-// Lines between "// only NAME" and "// end" are left out of kernels that do not write that picture: a binding counts
+// Lines between "// only NAME" and "// end" are left out of kernels that do not write that image: a binding counts
 // against the adapter's limit wherever it is declared and named, reached or not.
 // Prefix: camera.wgsl, raster_frame.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE.
 @group(0) @binding(0) var<storage, read> frame: Frame;

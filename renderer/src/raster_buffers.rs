@@ -1,4 +1,4 @@
-//! Buffers of the rasteriser whose size follows the picture.
+//! Buffers of the rasteriser whose size follows the image.
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 
@@ -6,19 +6,19 @@ use crate::raster_kernels::RasterShape;
 use crate::scan::MAX_LOOP;
 
 /// Room for pairs of a Gaussian and a tile. A body-like surface needs about three a Gaussian; the share
-/// of the tiles is for a few Gaussians that cover the whole picture.
+/// of the tiles is for a few Gaussians that cover the whole image.
 const PAIRS_PER_GAUSSIAN: u64 = 16;
 const PAIRS_PER_TILE: u64 = 64;
 const MIN_PAIRS: u64 = 1 << 18;
 
-/// Pairs that a picture has room for, at most `limit`.
+/// Pairs that an image has room for, at most `limit`.
 pub(crate) fn pair_capacity(gaussians: usize, tiles: u64, limit: u64) -> u32 {
     let wanted = PAIRS_PER_GAUSSIAN * gaussians as u64 + PAIRS_PER_TILE * tiles;
     wanted.max(MIN_PAIRS).min(limit).min(u64::from(u32::MAX)) as u32
 }
 
 #[derive(Debug)]
-pub(crate) struct PictureBuffers {
+pub(crate) struct ImageBuffers {
     layout: Layout,
     size: [u32; 2],
     gaussians: usize,
@@ -26,7 +26,7 @@ pub(crate) struct PictureBuffers {
     pub pairs: StorageBuffer<u32>,
 }
 
-/// What a picture of some size needs.
+/// What an image of some size needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Layout {
     /// Columns and rows of tiles.
@@ -39,7 +39,7 @@ pub(crate) struct Layout {
     pub pair_capacity: u32,
 }
 
-impl PictureBuffers {
+impl ImageBuffers {
     pub(crate) fn new(
         gpu: &GpuContext,
         shape: RasterShape,
@@ -56,7 +56,7 @@ impl PictureBuffers {
         })
     }
 
-    /// Ready for pictures of `size`; allocates only when the room does not suffice.
+    /// Ready for images of `size`; allocates only when the room does not suffice.
     pub(crate) fn fit(
         &mut self,
         gpu: &GpuContext,

@@ -9,14 +9,14 @@ use flyrig_types::Camera;
 use wgpu::{BindingResource, CommandEncoder, ComputePass, ComputePassDescriptor};
 
 use crate::constants::Constants;
-use crate::raster_buffers::{Layout, PictureBuffers};
+use crate::raster_buffers::{ImageBuffers, Layout};
 use crate::raster_kernels::{Frame, RasterKernels, RasterShape};
 use crate::raster_settings::{Latest, tile_range};
 use crate::scan::{CHUNK_GROUP, MAX_LOOP, Scan, run, run_at};
 use crate::sort::{RadixSort, SortPass};
 use crate::{GaussianBuffers, Outputs, RasterSettings, RasterStats, RenderTarget};
 
-/// [`Rasterizer`](crate::Rasterizer) on the device. Buffers and pipelines are made once; they grow with the picture and the
+/// [`Rasterizer`](crate::Rasterizer) on the device. Buffers and pipelines are made once; they grow with the image and the
 /// number of Gaussians.
 #[derive(Debug)]
 pub(crate) struct DeviceRasterizer {
@@ -29,9 +29,9 @@ pub(crate) struct DeviceRasterizer {
     pub(crate) pairs_before: StorageBuffer<u32>,
     pair_total: StorageBuffer<u32>,
     stats: StorageBuffer<u32>,
-    /// Of the picture recorded last.
+    /// Of the image recorded last.
     pub(crate) constants: Constants,
-    pub(crate) picture: Option<PictureBuffers>,
+    pub(crate) picture: Option<ImageBuffers>,
     pub(crate) latest: Option<Latest>,
 }
 
@@ -112,7 +112,7 @@ impl DeviceRasterizer {
     pub(crate) fn stats(&self, gpu: &GpuContext) -> Result<RasterStats, GpuError> {
         let stats = self.stats.read(gpu)?;
         let get = |i: usize| stats.get(i).copied().unwrap_or_default();
-        Ok(RasterStats { visible_gaussians: get(0), pairs: get(1), overflowed_pictures: get(2) })
+        Ok(RasterStats { visible_gaussians: get(0), pairs: get(1), overflowed_images: get(2) })
     }
 
     fn grow(&mut self, gpu: &GpuContext, count: usize, target: &RenderTarget) -> Result<(), GpuError> {
@@ -128,7 +128,7 @@ impl DeviceRasterizer {
         match &mut self.picture {
             Some(picture) => picture.fit(gpu, shape, size, self.splats.len()),
             none => {
-                *none = Some(PictureBuffers::new(gpu, shape, size, self.splats.len())?);
+                *none = Some(ImageBuffers::new(gpu, shape, size, self.splats.len())?);
                 Ok(())
             }
         }
@@ -162,13 +162,13 @@ const SORT_TABLE: usize = 1;
 const TILE_TABLE: usize = 2;
 const SORT_PASSES: usize = 3;
 
-/// Everything that one picture's kernels are bound to.
+/// Everything that one image's kernels are bound to.
 struct Stages<'a> {
     gpu: &'a GpuContext,
     rasterizer: &'a DeviceRasterizer,
     gaussians: &'a GaussianBuffers,
     target: &'a RenderTarget,
-    picture: &'a PictureBuffers,
+    picture: &'a ImageBuffers,
     blended: [u32; 2],
 }
 

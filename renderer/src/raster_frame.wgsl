@@ -1,4 +1,4 @@
-// What every raster kernel knows about the picture. Needs struct Camera.
+// What every raster kernel knows about the image. Needs struct Camera.
 struct Frame {
     camera: Camera,
     // Pixels.
@@ -19,7 +19,7 @@ struct Frame {
 }
 
 struct Splat {
-    // Centre in the picture, pixels.
+    // Centre in the image, pixels.
     pixel: vec2<f32>,
     // Camera-space z, metres.
     depth: f32,

@@ -70,7 +70,7 @@ impl RasterShape {
     }
 }
 
-/// Constants of one picture, `struct Frame` in raster_frame.wgsl.
+/// Constants of one image, `struct Frame` in raster_frame.wgsl.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(crate) struct Frame {
@@ -146,7 +146,7 @@ impl RasterKernels {
             list_pairs: bin_kernel("list_pairs"),
             blend: Mutex::default(),
         };
-        // What a live session draws; anything else is compiled with the first picture that asks for it.
+        // What a live session draws; anything else is compiled with the first image that asks for it.
         for outputs in [Outputs::COLOR, Outputs::SURFACE] {
             kernels.blend(gpu, outputs);
         }

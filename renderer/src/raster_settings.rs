@@ -1,6 +1,6 @@
 //! Settings of a rendering, and figures of the latest one.
 
-/// Which pictures of a [`crate::RenderTarget`] are written; the others keep their content.
+/// Which images of a [`crate::RenderTarget`] are written; the others keep their content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Outputs {
     /// [`crate::RenderTarget::color`].
@@ -12,7 +12,7 @@ pub struct Outputs {
 }
 
 impl Outputs {
-    /// Every picture.
+    /// Every image.
     pub const ALL: Self = Self { color: true, depth: true, canonical: true };
     /// Colour and alpha only.
     pub const COLOR: Self = Self { color: true, depth: false, canonical: false };
@@ -33,8 +33,8 @@ pub struct RasterSettings {
     /// The splat's opacity falls so that its integral stays: Mip-Splatting's 2D Mip filter (Yu et al.
     /// 2024, Eq. 10). 0.1 is that paper's value for one pixel.
     pub filter_variance_px2: f32,
-    /// Only the tiles that this part of the picture touches are blended, `[left, top, right, bottom]` in pixels, right
-    /// and bottom excluded; all others keep their content. None: the whole picture.
+    /// Only the tiles that this part of the image touches are blended, `[left, top, right, bottom]` in pixels, right
+    /// and bottom excluded; all others keep their content. None: the whole image.
     pub area: Option<[u32; 4]>,
 }
 
@@ -44,19 +44,19 @@ impl Default for RasterSettings {
     }
 }
 
-/// Resources used by the latest picture.
+/// Resources used by the latest image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RasterStats {
-    /// Gaussians that touch the picture.
+    /// Gaussians that touch the image.
     pub visible_gaussians: u32,
     /// Pairs of a Gaussian and a tile, at most one more than there is room for.
     pub pairs: u32,
-    /// Pictures since this rasteriser was made that wanted more pairs than there was room for: they
+    /// Images since this rasteriser was made that wanted more pairs than there was room for: they
     /// lack their farthest Gaussians.
-    pub overflowed_pictures: u32,
+    pub overflowed_images: u32,
 }
 
-/// Description of the picture that was recorded last, for the backward pass.
+/// Description of the image that was recorded last, for the backward pass.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Latest {
     pub gaussians: usize,

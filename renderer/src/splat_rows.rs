@@ -1,6 +1,6 @@
-//! Which Gaussians make up which pixels: the rasteriser's picture as a sparse matrix over the colours.
+//! Which Gaussians make up which pixels: the rasteriser's image as a sparse matrix over the colours.
 //!
-//! A picture is linear in the Gaussians' colours while nothing moves. Training colours on a few thousand pixels needs the
+//! An image is linear in the Gaussians' colours while nothing moves. Training colours on a few thousand pixels needs the
 //! rows of that matrix once, not a rendering a step.
 
 use std::collections::HashMap;

@@ -235,7 +235,7 @@ fn poison_never_reaches_the_memory() {
 }
 
 #[test]
-fn what_is_painted_draws_the_picture_again() {
+fn what_is_painted_draws_the_image_again() {
     on_both(|gpu| {
         let gaussians = 6000;
         let mut rig = Rig::new(gpu, gaussians, 300);
@@ -270,7 +270,7 @@ fn what_is_painted_draws_the_picture_again() {
             (errors.0 / errors.1).sqrt()
         };
         let [plain, once, sharp] = [(0.0, 12), (0.8, 1), (0.8, 12)].map(|(share, frames)| error_after(share, frames));
-        println!("RMS of the drawn pictures, linear light: plain {plain:.4}, sharpened {sharp:.4}");
+        println!("RMS of the drawn images, linear light: plain {plain:.4}, sharpened {sharp:.4}");
         assert!((once - plain).abs() < 0.02 * plain, "nothing is known in the first frame: {once}, {plain}");
         assert!(sharp < 0.8 * plain, "{sharp} {plain}");
     });
@@ -360,7 +360,7 @@ fn refusals_name_the_view_and_the_mend() {
         let mut short = views.clone();
         short[1].rgba.pop();
         let message = rig.try_update(&frame, &short, &settings).unwrap_err().to_string();
-        assert_eq!(message, "camera radial: the picture has 255 pixels, its 16x16 picture needs 256");
+        assert_eq!(message, "camera radial: the image has 255 pixels, its 16x16 image needs 256");
         let mut other = views.clone();
         other[2].canonical.pop();
         let message = rig.try_update(&frame, &other, &settings).unwrap_err().to_string();
@@ -368,7 +368,7 @@ fn refusals_name_the_view_and_the_mend() {
         let mut no_drawing = views.clone();
         no_drawing[0].drawn.clear();
         let message = rig.try_update(&frame, &no_drawing, &settings).unwrap_err().to_string();
-        assert!(message.contains("the drawn picture has 0 pixels"), "{message}");
+        assert!(message.contains("the drawn image has 0 pixels"), "{message}");
         let four = [&views[..], &views[..1]].concat();
         let message = rig.try_update(&frame, &four, &settings).unwrap_err().to_string();
         assert!(message.contains("made for 3 views but is given 4"), "{message}");

@@ -43,7 +43,7 @@ fn check(
     // Depths reach 4 m, canonical coordinates 1 m.
     assert!(d.depth_max < 4.0 * MAX_ERROR && d.depth_mean < 4.0 * MEAN_ERROR, "{name}: {d:?}");
     assert!(d.canonical_max < MAX_ERROR && d.canonical_mean < MEAN_ERROR, "{name}: {d:?}");
-    assert_eq!(rasterizer.stats(gpu).unwrap().overflowed_pictures, 0);
+    assert_eq!(rasterizer.stats(gpu).unwrap().overflowed_images, 0);
     d
 }
 
@@ -117,7 +117,7 @@ fn hard_cases_agree_with_the_reference() {
         }
         check("on and behind the camera plane", &plane, &camera);
 
-        // Standard deviation 60 m seen from 2 m: the picture lies well inside.
+        // Standard deviation 60 m seen from 2 m: the image lies well inside.
         let mut wide = scene.clone();
         wide.center_scale[7] = [0.0, 0.0, 0.0, 300.0];
         check("a Gaussian 1e4 px wide", &wide, &camera);
@@ -127,7 +127,7 @@ fn hard_cases_agree_with_the_reference() {
 }
 
 #[test]
-fn from_millimetres_to_kilometres_the_pictures_agree_with_the_reference() {
+fn from_millimetres_to_kilometres_the_images_agree_with_the_reference() {
     on_both(|gpu| {
         let mut rasterizer = Rasterizer::new(gpu, 300).unwrap();
         for unit in [1e-6, 1e-3, 1.0, 1e3, 1e6] {
@@ -163,7 +163,7 @@ fn from_millimetres_to_kilometres_the_pictures_agree_with_the_reference() {
 }
 
 #[test]
-fn two_runs_give_the_same_bytes_and_one_submission_may_hold_many_pictures() {
+fn two_runs_give_the_same_bytes_and_one_submission_may_hold_many_images() {
     on_both(|gpu| {
         let mut rng = StdRng::seed_from_u64(3);
         let scene = random_scene(&mut rng, 5000);
@@ -190,7 +190,7 @@ fn two_runs_give_the_same_bytes_and_one_submission_may_hold_many_pictures() {
 }
 
 #[test]
-fn pictures_that_were_not_asked_for_keep_their_content_and_the_others_do_not_change() {
+fn images_that_were_not_asked_for_keep_their_content_and_the_others_do_not_change() {
     on_both(|gpu| {
         let mut rng = StdRng::seed_from_u64(4);
         let scene = random_scene(&mut rng, 400);
@@ -208,7 +208,7 @@ fn pictures_that_were_not_asked_for_keep_their_content_and_the_others_do_not_cha
 #[test]
 fn when_the_room_for_pairs_is_spent_the_farthest_are_missing_and_it_is_told() {
     on_both(|gpu| {
-        // 4000 Gaussians that each cover the whole picture: more pairs than there is room for.
+        // 4000 Gaussians that each cover the whole image: more pairs than there is room for.
         let mut rng = StdRng::seed_from_u64(5);
         let count = 4000;
         let mut scene = random_scene(&mut rng, count);
@@ -222,10 +222,10 @@ fn when_the_room_for_pairs_is_spent_the_farthest_are_missing_and_it_is_told() {
         let mut rasterizer = Rasterizer::new(gpu, count).unwrap();
         let ours = render(gpu, &mut rasterizer, &gaussians, &camera, &settings, (640, 480)).unwrap();
         let stats = rasterizer.stats(gpu).unwrap();
-        assert_eq!(stats.overflowed_pictures, 1);
+        assert_eq!(stats.overflowed_images, 1);
         assert_eq!(stats.visible_gaussians, count as u32);
         assert!(ours.is_finite());
-        // The nearest that fit, found from what is left in the middle of the picture.
+        // The nearest that fit, found from what is left in the middle of the image.
         let alpha = f64::from(ours.color[240 * 640 + 320][3]);
         let kept = ((1.0 - alpha).ln() / (1.0f64 - 0.005).ln()).round() as usize;
         assert!(kept > 10 && kept < count, "{kept}");

@@ -1,4 +1,4 @@
-//! Drawing, and its derivative, in a part of the picture only.
+//! Drawing, and its derivative, in a part of the image only.
 
 #![allow(clippy::float_cmp)] // the same bytes are what is promised
 
@@ -6,13 +6,13 @@ mod support;
 
 use flyrig_gpu::testing::on_both;
 use flyrig_renderer::{
-    BackwardRasterizer, Carry, GaussianGradients, Outputs, PictureGradients, RasterSettings, Rasterizer, RenderTarget,
+    BackwardRasterizer, Carry, GaussianGradients, ImageGradients, Outputs, RasterSettings, Rasterizer, RenderTarget,
 };
 use support::body_scene::{body, camera};
 use support::upload;
 
 #[test]
-fn an_area_is_drawn_as_in_the_whole_picture_and_the_rest_stays() {
+fn an_area_is_drawn_as_in_the_whole_image_and_the_rest_stays() {
     on_both(|gpu| {
         let scene = body(6000).unwrap();
         let gaussians = upload(gpu, &scene).unwrap();
@@ -21,10 +21,10 @@ fn an_area_is_drawn_as_in_the_whole_picture_and_the_rest_stays() {
         let mut rasterizer = Rasterizer::new(gpu, gaussians.count()).unwrap();
         let mut backward = BackwardRasterizer::new(gpu).unwrap();
         let target = RenderTarget::new(gpu, width, height).unwrap();
-        let incoming = PictureGradients::zeroed(gpu, width, height).unwrap();
+        let incoming = ImageGradients::zeroed(gpu, width, height).unwrap();
         let pixels = (width * height) as usize;
         let mark = [7.0; 4];
-        // Derivatives of the whole picture's pixels within `within` only.
+        // Derivatives of the whole image's pixels within `within` only.
         let mut run = |area: Option<[u32; 4]>, within: [u32; 4]| {
             target.color.write(gpu, &vec![mark; pixels]);
             let inside = |at: u32| {
@@ -54,7 +54,7 @@ fn an_area_is_drawn_as_in_the_whole_picture_and_the_rest_stays() {
             assert_eq!(part[at], if inside { whole[at] } else { mark }, "{x} {y}");
         }
         assert!(part_slopes == whole_slopes, "what lies outside passes nothing on");
-        // Beyond the picture, empty, and at its ragged end.
+        // Beyond the image, empty, and at its ragged end.
         for area in [[500, 500, 900, 900], [20, 20, 20, 20], [192, 176, 4000, 4000]] {
             let (part, _) = run(Some(area), area);
             let touched = part.iter().filter(|p| **p != mark).count();

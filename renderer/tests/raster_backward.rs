@@ -5,7 +5,7 @@ mod support;
 
 use flyrig_gpu::{GpuContext, testing::on_both};
 use flyrig_renderer::{
-    BackwardRasterizer, Carry, GaussianGradients, PictureGradients, RasterSettings, Rasterizer, RenderTarget,
+    BackwardRasterizer, Carry, GaussianGradients, ImageGradients, RasterSettings, Rasterizer, RenderTarget,
 };
 use flyrig_types::{Camera, Lens};
 use glam::DVec3;
@@ -50,7 +50,7 @@ impl<'a> Gpu<'a> {
         for (camera, incoming) in views {
             let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
             let target = RenderTarget::new(gpu, width, height).unwrap();
-            let gradients = PictureGradients::zeroed(gpu, width, height).unwrap();
+            let gradients = ImageGradients::zeroed(gpu, width, height).unwrap();
             gradients.color.write(gpu, &incoming.color);
             gradients.depth_carry.write(gpu, &incoming.depth_carry);
             self.forward.encode(gpu, &mut encoder, &gaussians, camera, settings, &target).unwrap();

@@ -1,4 +1,4 @@
-//! The picture as a matrix over the colours is the picture that the rasteriser draws.
+//! The image as a matrix over the colours is the image that the rasteriser draws.
 #![allow(clippy::unwrap_used)] // helpers of tests
 
 mod support;
@@ -10,7 +10,7 @@ use support::{body_scene, render, upload};
 const SIZE: (u32, u32) = (128, 160);
 
 #[test]
-fn rows_times_colours_are_the_rendered_picture() {
+fn rows_times_colours_are_the_rendered_image() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     let scene = body_scene::body(12_000).unwrap();
     let camera = body_scene::camera(&scene, SIZE.0, SIZE.1, 0.7);

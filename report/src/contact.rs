@@ -10,7 +10,7 @@ use crate::png;
 ///
 /// # Errors
 /// When sizes differ or an image cannot be read.
-pub fn contact_pictures(
+pub fn contact_images(
     camera: &CameraId,
     view: &RenderedView,
     truth: &Image,

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use flyrig_calib::{CalibError, load_calibration};
-use flyrig_capture::{VideoOptions, VideoReplay, folder_picture_size};
+use flyrig_capture::{VideoOptions, VideoReplay, folder_image_size};
 use flyrig_fusion::{Origin, PerceptionSettings};
 use flyrig_types::{Camera, CameraId, Image, PixelFormat, Rig};
 
@@ -30,26 +30,26 @@ pub fn pick(rig: &Rig, names: &[String], whose: &str) -> Result<Rig> {
     Ok(picked)
 }
 
-/// The calibrated cameras of a data set. A calibration without picture sizes needs the pictures of every camera; when
+/// The calibrated cameras of a data set. A calibration without image sizes needs the images of every camera; when
 /// one of the `chosen` has none, the error says so.
 ///
 /// # Errors
 /// Names what is missing or wrong.
 pub fn load_rig(root: &Path, chosen: &[CameraId]) -> Result<Rig> {
-    load_calibration(root, &|id| picture_size(root, id)).or_else(|error| {
+    load_calibration(root, &|id| image_size(root, id)).or_else(|error| {
         if matches!(error, CalibError::UnknownSize { .. }) {
             for camera in chosen.iter().filter(|id| !video_file(root, id).exists()) {
-                folder_picture_size(root, camera)?;
+                folder_image_size(root, camera)?;
             }
         }
         Err(error.into())
     })
 }
 
-/// Size of a camera's first readable picture, or else of its video, for calibrations that do not say.
-fn picture_size(root: &Path, id: &CameraId) -> Option<(u32, u32)> {
-    let of_video = || VideoReplay::open(id, &video_file(root, id), &VideoOptions::default()).ok()?.picture_size();
-    folder_picture_size(root, id).ok().or_else(of_video)
+/// Size of a camera's first readable image, or else of its video, for calibrations that do not say.
+fn image_size(root: &Path, id: &CameraId) -> Option<(u32, u32)> {
+    let of_video = || VideoReplay::open(id, &video_file(root, id), &VideoOptions::default()).ok()?.image_size();
+    folder_image_size(root, id).ok().or_else(of_video)
 }
 
 /// Where a camera's video lies.
@@ -70,10 +70,10 @@ pub fn plate_file(folder: &Path, id: &CameraId) -> PathBuf {
     folder.join(format!("{id}.png"))
 }
 
-/// Returns the pictures of the empty scene `CAM.png` of a folder by slot, where there are any.
+/// Returns the images of the empty scene `CAM.png` of a folder by slot, where there are any.
 ///
 /// # Errors
-/// Names the file that cannot be read; the camera, both sizes and the fix for one of another size than the camera's pictures.
+/// Names the file that cannot be read; the camera, both sizes and the fix for one of another size than the camera's images.
 pub fn plates(folder: &Path, rig: &Rig) -> Result<Vec<Option<Image>>> {
     rig.cameras.iter().map(|camera| plate(folder, camera)).collect()
 }
@@ -88,7 +88,7 @@ fn plate(folder: &Path, camera: &Camera) -> Result<Option<Image>> {
     let expected = (camera.intrinsics.width, camera.intrinsics.height);
     if (width, height) != expected {
         bail!(
-            "camera {}: the plate {} is {width}x{height} pixels, the camera's pictures are {}x{}; record it again with `flyrig \
+            "camera {}: the plate {} is {width}x{height} pixels, the camera's images are {}x{}; record it again with `flyrig \
              plate`, or remove it",
             camera.id,
             path.display(),

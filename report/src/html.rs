@@ -1,4 +1,4 @@
-//! A self-contained HTML page: pictures, scores, times, memory.
+//! A self-contained HTML page: images, scores, times, memory.
 
 use std::{fmt::Write as _, io::Write as _, path::Path};
 
@@ -92,7 +92,7 @@ impl Report {
             page.push_str("</table>");
         }
         if !self.contact.is_empty() {
-            page.push_str("<h2>Pictures</h2>");
+            page.push_str("<h2>Images</h2>");
         }
         for row in &self.contact {
             let _ = write!(page, "<figcaption>{}</figcaption><div class=row>", escape(&row.label));

@@ -12,7 +12,7 @@ mod progress;
 mod replay;
 pub mod stop;
 
-pub use contact::contact_pictures;
+pub use contact::contact_images;
 pub use html::{ContactRow, Curve, Report, write_whole};
 pub use outlines::{outlined_inputs, paint_outline};
 pub use progress::progress_bar;

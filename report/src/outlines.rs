@@ -1,4 +1,4 @@
-//! Input pictures with the outlines of mask and drawn person: shows whether masks, pose and calibration fit.
+//! Input images with the outlines of mask and drawn person: shows whether masks, pose and calibration fit.
 
 use anyhow::Result;
 use flyrig_fusion::{PersonId, Session};

@@ -236,7 +236,7 @@ fn log_ticks(range: &Range<f64>) -> Vec<f64> {
     all.filter(|value| range.contains(value)).collect()
 }
 
-/// Returns the lower left corner of a point's label: beside it, inside of the picture, and not on a box in `taken`.
+/// Returns the lower left corner of a point's label: beside it, inside of the image, and not on a box in `taken`.
 fn free_place(taken: &mut Vec<[f64; 4]>, [px, py]: [f64; 2], label: &str, [width, height]: [f64; 2]) -> [f64; 2] {
     let (long, tall) = (6.0 * label.chars().count() as f64, 11.0);
     let left = (px + 6.0).min(width - 4.0 - long);

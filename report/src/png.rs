@@ -39,7 +39,7 @@ fn encode(bytes: &[u8], width: u32, height: u32, color: ExtendedColorType) -> Re
     let mut png = Vec::new();
     PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Adaptive)
         .write_image(bytes, width, height, color)
-        .context("encoding a PNG picture")?;
+        .context("encoding a PNG image")?;
     Ok(png)
 }
 

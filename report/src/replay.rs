@@ -107,7 +107,7 @@ impl Replay {
     pub fn sync_summary(&self) -> serde_json::Value {
         let counts = self.sets.counts();
         let damaged = self.sets.damaged();
-        serde_json::json!({ "complete": counts.complete, "partial": counts.partial, "broken_pictures": damaged })
+        serde_json::json!({ "complete": counts.complete, "partial": counts.partial, "broken_images": damaged })
     }
 }
 

@@ -40,7 +40,7 @@ fn main() -> Result<(), Box<dyn Error>> {
                 sheet.put_pixel(x, y, image::Rgb([pixel[0], pixel[1], pixel[2]]));
             }
         }
-        println!("seed {}: set up in {setup:.2?}, {:.2?} a picture", row + 1, start.elapsed() / cameras);
+        println!("seed {}: set up in {setup:.2?}, {:.2?} an image", row + 1, start.elapsed() / cameras);
     }
     sheet.save(out)?;
     println!("{out}");

@@ -17,7 +17,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     if let [_, width, height, cameras, options @ ..] = &args[..] {
         return measure(instants, [width.parse()?, height.parse()?], cameras.parse()?, options);
     }
-    println!("| pictures | cameras | what | set-up s | ms an instant | frames/s | peak MiB |");
+    println!("| images | cameras | what | set-up s | ms an instant | frames/s | peak MiB |");
     println!("|---|---|---|---|---|---|---|");
     for [width, height] in [["512", "512"], ["1920", "1080"]] {
         for cameras in ["1", "4", "8"] {

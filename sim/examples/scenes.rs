@@ -12,7 +12,7 @@ use flyrig_sim::{LightConfig, LightSwitch, MotionKind, OpticsConfig, SceneKind, 
 
 const COLUMNS: u32 = 4;
 
-/// A change of the configuration, the time and the camera of a picture.
+/// A change of the configuration, the time and the camera of an image.
 type Tile = (&'static str, fn(&mut SimConfig), f64, usize);
 
 const TILES: [Tile; 16] = [

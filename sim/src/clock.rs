@@ -75,7 +75,7 @@ impl RealClock {
         let deadline = Instant::now() + timeout;
         let mut state = self.lock();
         state.cameras[slot].away = false;
-        // To have taken it is not enough: a camera that is still waiting for its picture would fall behind the others.
+        // To have taken it is not enough: a camera that is still waiting for its image would fall behind the others.
         state.cameras[slot].busy = false;
         self.changed.notify_all();
         loop {
@@ -129,7 +129,7 @@ impl State {
             tracing::warn!(
                 skipped = self.skipped,
                 "this machine cannot draw the simulated cameras at their rate; instants are skipped. Lower sim.fps or the \
-                 pictures' size, or set source.real_time = false to have every instant"
+                 images' size, or set source.real_time = false to have every instant"
             );
         }
     }

@@ -19,7 +19,7 @@ pub struct SimConfig {
     pub motion: MotionConfig,
     /// Where the cameras stand.
     pub cameras: RingConfig,
-    /// The cameras' sensors; camera `i` has the sensor of place `i` modulo their number. Without any, pictures are as drawn.
+    /// The cameras' sensors; camera `i` has the sensor of place `i` modulo their number. Without any, images are as drawn.
     pub sensors: Vec<SensorConfig>,
     /// The cameras' shutters and lens openings, given to cameras like `sensors`.
     pub optics: Vec<OpticsConfig>,

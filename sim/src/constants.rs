@@ -35,7 +35,7 @@ pub(crate) fn shader_sources(lamps: usize) -> [(&'static str, String); 5] {
         ("shade on simulated people", [&constants, view, light, points, include_str!("shade.wgsl")].concat()),
         ("simulated room", [&constants, view, light, include_str!("room.wgsl")].concat()),
         ("simulated plate", [&constants, view, include_str!("plate.wgsl")].concat()),
-        ("simulated picture", [&constants, view, light, include_str!("compose.wgsl")].concat()),
+        ("simulated image", [&constants, view, light, include_str!("compose.wgsl")].concat()),
     ]
 }
 

@@ -1,4 +1,4 @@
-//! The drawing of one instant: shadow maps, plates, people before them, truth at pixel centres. All pictures of an
+//! The drawing of one instant: shadow maps, plates, people before them, truth at pixel centres. All images of an
 //! instant are drawn in one submission and read back at once.
 
 use bytemuck::Zeroable;
@@ -24,7 +24,7 @@ use crate::person::Person;
 use crate::plates::{Plate, Plates};
 use crate::scene::Scene;
 
-/// Sides of the lamps' pictures of people and of the room, pixels.
+/// Sides of the lamps' images of people and of the room, pixels.
 const PEOPLE_MAP_PX: u32 = 512;
 const ROOM_MAP_PX: u32 = 2048;
 
@@ -42,7 +42,7 @@ pub(crate) struct Moment {
     pub capsules: Vec<Capsule>,
 }
 
-/// One picture to draw.
+/// One image to draw.
 #[derive(Debug, Clone)]
 pub(crate) struct Take {
     pub nanos: i64,
@@ -141,7 +141,7 @@ impl Drawing {
             plate: layout(gpu, "plate", &[Slot::ManySamples, Slot::Write]),
             picture: layout(
                 gpu,
-                "picture",
+                "image",
                 &[
                     Slot::ManySamples,
                     Slot::ManyDepths,
@@ -213,7 +213,7 @@ impl Drawing {
         let read = TextureUsages::COPY_SRC;
         let glows = scene.glows();
         let layers = 1 + scene.lamps.len() + usize::from(glows);
-        let pixels = StorageBuffer::<[u32; 2]>::zeroed(gpu, "simulated picture", width as usize * height as usize)?;
+        let pixels = StorageBuffer::<[u32; 2]>::zeroed(gpu, "simulated image", width as usize * height as usize)?;
         let drawing = Self {
             gpu: gpu.clone(),
             size,
@@ -272,7 +272,7 @@ impl Drawing {
         Ok(())
     }
 
-    /// Draws pictures of one instant.
+    /// Draws images of one instant.
     pub(crate) fn pictures(&mut self, takes: &[Take]) -> Result<Vec<Raw>, GpuError> {
         let steps = steps(takes);
         self.plates.next_round();
@@ -301,7 +301,7 @@ impl Drawing {
 
         let bytes = u64::from(self.size[0]) * u64::from(self.size[1]) * 8;
         let staging = self.gpu.device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some("simulated pictures"),
+            label: Some("simulated images"),
             size: bytes * takes.len() as u64,
             usage: BufferUsages::COPY_DST | BufferUsages::COPY_SRC,
             mapped_at_creation: false,
@@ -327,7 +327,7 @@ impl Drawing {
         Ok(all.chunks_exact(pixels).map(<[_]>::to_vec).collect())
     }
 
-    /// Truth of one picture: of the middle of its exposure through the lens's middle, each row at its own time.
+    /// Truth of one image: of the middle of its exposure through the lens's middle, each row at its own time.
     pub(crate) fn truth(&mut self, take: &Take) -> Result<Truth, GpuError> {
         let frame = SubFrame { secs: 0.0, lens_point: Vec2::ZERO };
         let step = Step { secs: 0.0, take: 0, frame, first: true, last: true };
@@ -706,7 +706,7 @@ mod tests {
     use crate::texture::Texture as Picture;
 
     /// A glowing square in the dark: the middle of its light against the f64 model's, for each lens model and each
-    /// corner of the picture.
+    /// corner of the image.
     #[test]
     fn furniture_lands_where_each_lens_puts_it() {
         let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();

@@ -51,11 +51,11 @@ pub enum SimError {
     /// The graphics adapter.
     #[error(transparent)]
     Gpu(#[from] GpuError),
-    /// A picture.
+    /// An image.
     #[error(transparent)]
     Image(#[from] ImageError),
-    /// A picture's JPEG or PNG code.
-    #[error("coding a simulated picture: {0}")]
+    /// An image's JPEG or PNG code.
+    #[error("coding a simulated image: {0}")]
     Code(#[from] image::ImageError),
     /// A folder or a file of an export.
     #[error("{} {message}", path.display())]

@@ -26,7 +26,7 @@ pub struct ExportOptions {
 /// What was exported.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Exported {
-    /// Pictures of all cameras.
+    /// Images of all cameras.
     pub pictures: u64,
     /// Frames that the fault script lost.
     pub lost: u64,
@@ -41,13 +41,13 @@ pub struct Exported {
 /// - `truth/frames.csv`: when each frame was taken, what its stamp said, and whether it came,
 /// - `truth/poses.jsonl`: a line a frame with pose and joints,
 /// - `truth/surface/000000.ply`: the clothed surface with canonical positions and how far the cloth swings (`cloth_*`, metres),
-/// - `truth/CAM/000000.exr`: depth, normal, canonical position and part at each pixel, as the picture shows them.
+/// - `truth/CAM/000000.exr`: depth, normal, canonical position and part at each pixel, as the image shows them.
 ///
-/// A frame that the fault script loses has no picture. `go_on` is told how many frames are done and ends the export by
+/// A frame that the fault script loses has no image. `go_on` is told how many frames are done and ends the export by
 /// returning false. Everything is written beside the folder first: it appears whole or not at all.
 ///
 /// # Errors
-/// [`SimError::Export`] names the file and the fix, [`SimError::Stopped`] after `go_on` said so; others when a picture
+/// [`SimError::Export`] names the file and the fix, [`SimError::Stopped`] after `go_on` said so; others when an image
 /// cannot be drawn.
 pub fn export(
     simulator: &mut Simulator,

@@ -109,7 +109,7 @@ fn brows(look: &Look, noise: Noise, colour: Srgb, p: Vec3, front: f32) -> Srgb {
     mix3(colour, scale3(look.hair, 0.85), scalp * under)
 }
 
-/// Colour of an eyeball; `at` is the offset from the pupil in eyeball radii, x to the picture's right.
+/// Colour of an eyeball; `at` is the offset from the pupil in eyeball radii, x to the image's right.
 pub(crate) fn eye_colour(look: &Look, at: Vec2) -> Srgb {
     let r = at.length();
     let white = mix3([0.90, 0.88, 0.86], [0.72, 0.58, 0.55], smoothstep(0.55, 1.0, r));

@@ -37,7 +37,7 @@ pub enum FaultKind {
     Lag,
     /// The frame is lost; the sequence numbers show a gap.
     Drop,
-    /// The picture of the frame before, under this frame's sequence number and stamp.
+    /// The image of the frame before, under this frame's sequence number and stamp.
     Duplicate,
     /// The source times out in place of the frame.
     Stall,
@@ -45,7 +45,7 @@ pub enum FaultKind {
     Disconnect,
     /// The stamp of a single frame is off by `ms`.
     WrongTimestamp,
-    /// The lower part of the picture, from a random row on, is garbage.
+    /// The lower part of the image, from a random row on, is garbage.
     Corrupt,
     /// The frame cannot be decoded: an error in its place.
     Undecodable,
@@ -145,13 +145,13 @@ pub enum Delivery {
 pub struct FramePlan {
     /// What the source gives.
     pub delivery: Delivery,
-    /// The instant that the picture shows.
+    /// The instant that the image shows.
     pub true_nanos: i64,
     /// The time that the frame claims.
     pub stamp_nanos: i64,
     /// On the sensor's exposure.
     pub exposure: f64,
-    /// Share of the picture's rows above the garbage, where there is some.
+    /// Share of the image's rows above the garbage, where there is some.
     pub sound_share: Option<f64>,
     /// From the axes of the camera where it was set up to those of the camera where it is now.
     pub bump: Option<Isometry>,
@@ -248,7 +248,7 @@ impl FaultScript {
         }
     }
 
-    /// Garbage over the rows of an RGB picture below `sound_share` of its height.
+    /// Garbage over the rows of an RGB image below `sound_share` of its height.
     pub(crate) fn spoil(&self, rgb: &mut [u8], sound_share: f64, index: u64) {
         let from = (rgb.len() as f64 * sound_share) as usize;
         let key = hash(hash(self.seed, 3), index);

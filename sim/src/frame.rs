@@ -4,9 +4,9 @@ use flyrig_body::Part;
 use flyrig_types::{Image, Mask, Pose};
 use glam::Vec3;
 
-/// One picture with the truth of its instant. Pictures are row by row, one element a pixel; the truth but for `mask`
+/// One image with the truth of its instant. Images are row by row, one element a pixel; the truth but for `mask`
 /// is taken at pixel centres, through the middle of the lens, at the middle of the exposure: of a rolling shutter each
-/// row at the middle of its own. `mask` is blurred like the picture.
+/// row at the middle of its own. `mask` is blurred like the image.
 #[derive(Debug)]
 pub struct SimFrame {
     /// Middle of the middle row's exposure.

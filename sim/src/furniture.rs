@@ -80,7 +80,7 @@ pub(crate) fn chair(mesh: &mut SceneMesh, tint: Vec3) {
     }
 }
 
-/// A screen on its foot; `lit` is the light of its picture, `layer` the plate's layer of what glows.
+/// A screen on its foot; `lit` is the light of its image, `layer` the plate's layer of what glows.
 pub(crate) fn screen(mesh: &mut SceneMesh, at: Vec3, picture: Surface, lit: f32, layer: usize) {
     let case = metal();
     mesh.block(at + Vec3::new(0.0, 0.02, 0.008), Vec3::new(0.12, 0.09, 0.008), case);
@@ -319,7 +319,7 @@ pub(crate) fn flight_case(mesh: &mut SceneMesh, half: Vec3) {
     }
 }
 
-/// A framed picture on a wall behind it.
+/// A framed image on a wall behind it.
 pub(crate) fn poster(mesh: &mut SceneMesh, middle: Vec3, half: [f32; 2], picture: Surface) {
     let frame = Coat::new(Surface::Plain, Vec3::splat(0.05)).glossy(0.1);
     let [x, z] = half;

@@ -14,7 +14,7 @@ use crate::texture::{Texture as Picture, linear_from_srgb};
 pub(crate) const LIGHT: TextureFormat = TextureFormat::Rgba16Float;
 /// Of textures: square roots of linear colour, which Mesa's software adapter filters faster than sRGB.
 const PAINT: TextureFormat = TextureFormat::Rgba8Unorm;
-/// Of depth pictures.
+/// Of depth images.
 pub(crate) const DEPTH: TextureFormat = TextureFormat::Depth32Float;
 /// Of truth.
 pub(crate) const TRUTH: TextureFormat = TextureFormat::Rgba32Float;

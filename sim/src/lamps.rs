@@ -49,7 +49,7 @@ impl Lamp {
         self.config.level(secs) as f32
     }
 
-    /// The lamp's picture of the room, and the tangent of half its angle.
+    /// The lamp's image of the room, and the tangent of half its angle.
     pub(crate) fn room_view(&self) -> (Mat4, f32) {
         let tangent = CONE_DEG[0].to_radians().tan();
         (clip_from_world(self.place, self.axis, tangent), tangent)
@@ -88,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lamp_sees_what_it_lights_in_the_middle_and_a_ball_fills_its_picture() {
+    fn a_lamp_sees_what_it_lights_in_the_middle_and_a_ball_fills_its_image() {
         let lamp = Lamp::new(&LightConfig::default(), STAGE, 0.2);
         let (clip, _) = lamp.room_view();
         let middle = clip * STAGE.extend(1.0);

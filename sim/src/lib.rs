@@ -2,7 +2,7 @@
 //!
 //! A seed makes a person: body, face, hair, hat, layered clothes, cloth and shoes. The person moves by a clip
 //! or turns around on the spot, stands in a lit room, and is seen by a ring of cameras with radial distortion or
-//! fisheye lenses, whose sensors and clocks have the configured errors. Pictures are made by an ordinary textured-triangle
+//! fisheye lenses, whose sensors and clocks have the configured errors. Images are made by an ordinary textured-triangle
 //! rasteriser with a z-buffer; this crate knows nothing of splats, so that no method is judged on its own drawings.
 //!
 //! # Conventions

@@ -2,7 +2,7 @@
 // `LAMP_NEAR_M`.
 
 struct Lamp {
-    // The lamp's picture of the room, and of the people alone.
+    // The lamp's image of the room, and of the people alone.
     room_from_world: mat4x4<f32>,
     people_from_world: mat4x4<f32>,
     // World position, metres; w: the lamp's width, metres.
@@ -11,7 +11,7 @@ struct Lamp {
     axis: vec4<f32>,
     // Light times squared metres; w: cosine of the angle where its light begins to fall.
     color: vec4<f32>,
-    // Tangents of half the angle of the two pictures.
+    // Tangents of half the angle of the two images.
     tangents: vec4<f32>,
 }
 
@@ -72,7 +72,7 @@ fn lamp_depth(z: f32) -> f32 {
 // Turns by the golden angle, whose multiples fill a circle evenly.
 const GOLDEN = mat2x2<f32>(vec2(-0.7373688, 0.6754903), vec2(-0.6754903, -0.7373688));
 
-// Share of a lamp's light that passes, at a point of its picture: with a penumbra as wide as the lamp and the distance
+// Share of a lamp's light that passes, at a point of its image: with a penumbra as wide as the lamp and the distance
 // to what is in its way make it.
 fn soft_share(
     map: texture_depth_2d_array,

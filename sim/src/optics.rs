@@ -9,7 +9,7 @@ use crate::sensor::uniform;
 
 /// One camera's shutter and aperture; the default is an instant and a pinhole.
 ///
-/// A frame's time is the middle of the middle row's exposure. Blur and defocus are means of `samples` pictures in linear
+/// A frame's time is the middle of the middle row's exposure. Blur and defocus are means of `samples` images in linear
 /// light; they are as bright as a sharp one: how much light there is stands in [`crate::SensorConfig::exposure`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -22,7 +22,7 @@ pub struct OpticsConfig {
     pub aperture_mm: f64,
     /// Distance of the plane that is sharp, metres.
     pub focus_m: f64,
-    /// Pictures that make one with blur or defocus.
+    /// Images that make one with blur or defocus.
     pub samples: u32,
 }
 
@@ -32,7 +32,7 @@ impl Default for OpticsConfig {
     }
 }
 
-/// One of the pictures of which a picture is the mean.
+/// One of the images of which an image is the mean.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct SubFrame {
     /// Seconds from the shot's instant.
@@ -50,7 +50,7 @@ impl OpticsConfig {
         check("optics.samples", self.samples.into(), 1.0, 256.0, "1 to 256")
     }
 
-    /// The pictures to take: evenly over the exposure, and over the lens in an order that has nothing to do with time.
+    /// The images to take: evenly over the exposure, and over the lens in an order that has nothing to do with time.
     pub(crate) fn sub_frames(&self) -> Vec<SubFrame> {
         if self.exposure_ms == 0.0 && self.aperture_mm == 0.0 {
             return vec![SubFrame { secs: 0.0, lens_point: Vec2::ZERO }];

@@ -36,7 +36,7 @@ fn look(index: u32) -> Seen {
     var seen = still;
     var camera = (camera_from_world * vec4(seen.place.xyz, 1.0)).xyz;
     var pixel = pixel_of(camera);
-    // The row in which the point is seen at that row's own time: a contraction, since nothing crosses the picture
+    // The row in which the point is seen at that row's own time: a contraction, since nothing crosses the image
     // within one readout.
     let steps = select(0, ROW_STEPS, view.moment.y != 0.0);
     for (var i = 0; i < steps; i++) {
@@ -122,7 +122,7 @@ fn vs_lit(vertex: Vertex) -> Lit {
     return out;
 }
 
-// Share of a lamp's light that reaches a point: one filtered tap of its picture, whose texels are as wide as the edges of
+// Share of a lamp's light that reaches a point: one filtered tap of its image, whose texels are as wide as the edges of
 // soft shadows on a body.
 fn reaching(l: u32, place: vec3<f32>) -> f32 {
     let at = place.xy / place.z * vec2(0.5, -0.5) + 0.5;

@@ -29,7 +29,7 @@ pub(crate) struct Plate {
     used: u64,
 }
 
-/// The plates of one picture size and scene.
+/// The plates of one image size and scene.
 #[derive(Debug)]
 pub(crate) struct Plates {
     size: [u32; 2],
@@ -151,7 +151,7 @@ impl Plates {
     }
 }
 
-/// Corners of the grid's cells along a side of the picture.
+/// Corners of the grid's cells along a side of the image.
 pub(crate) fn grid_columns(side: u32) -> usize {
     (f64::from(side) / GRID_CELL_PX).ceil() as usize + 2
 }

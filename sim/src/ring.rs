@@ -11,7 +11,7 @@ use crate::{SimConfig, SimError};
 /// The ring of a configuration: `00`, `01`, ... counter-clockwise seen from above, `00` at -y, z up.
 ///
 /// # Errors
-/// [`SimError::Config`] for settings out of range and for a lens that folds the picture.
+/// [`SimError::Config`] for settings out of range and for a lens that folds the image.
 pub fn camera_ring(config: &SimConfig) -> Result<Rig, SimError> {
     config.validate()?;
     let ring = &config.cameras;
@@ -54,7 +54,7 @@ pub fn camera_ring(config: &SimConfig) -> Result<Rig, SimError> {
     Ok(rig)
 }
 
-/// Refuses a lens that has no direction for a corner of the picture.
+/// Refuses a lens that has no direction for a corner of the image.
 fn unfolded(config: &SimConfig, intrinsics: &Intrinsics) -> Result<(), SimError> {
     let ring = &config.cameras;
     let (width, height) = (f64::from(config.width), f64::from(config.height));
@@ -67,7 +67,7 @@ fn unfolded(config: &SimConfig, intrinsics: &Intrinsics) -> Result<(), SimError>
     Err(SimError::Config {
         field: if ring.fisheye.is_some() { "cameras.fisheye" } else { "cameras.radial" },
         found: ring.fisheye.map_or_else(|| format!("{:?}", ring.radial), |k| format!("{k:?}")),
-        expected: "a lens that does not fold over inside the picture (weaker distortion or longer focal length)",
+        expected: "a lens that does not fold over inside the image (weaker distortion or longer focal length)",
     })
 }
 
@@ -76,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_centre_is_in_the_middle_of_every_picture_and_up_is_up() {
+    fn the_centre_is_in_the_middle_of_every_image_and_up_is_up() {
         let config = SimConfig::default();
         let rig = camera_ring(&config).unwrap();
         assert_eq!(rig.cameras.len(), 7);

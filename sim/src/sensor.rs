@@ -19,7 +19,7 @@ use crate::texture::linear_from_srgb;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SensorConfig {
-    /// Light gathered, 1 for the drawn picture's.
+    /// Light gathered, 1 for the drawn image's.
     pub exposure: f64,
     /// Amplification after the noise.
     pub gain: f64,
@@ -34,7 +34,7 @@ pub struct SensorConfig {
     pub full_well_electrons: Option<f64>,
     /// Standard deviation of the noise of reading, electrons.
     pub read_noise_electrons: f64,
-    /// Quality of the JPEG code that the picture goes through, 1 to 100; without it there is none.
+    /// Quality of the JPEG code that the image goes through, 1 to 100; without it there is none.
     pub jpeg_quality: Option<u8>,
 }
 

@@ -5,7 +5,7 @@ use flyrig_types::Isometry;
 use crate::SimError;
 use crate::error::check;
 
-/// One picture to take.
+/// One image to take.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shot {
     /// Middle of the middle row's exposure, nanoseconds.

@@ -121,7 +121,7 @@ impl Simulator {
         Ok(self.config.faults.plan(&self.camera(slot)?.id, index, |index| self.frame_nanos(index)))
     }
 
-    /// Picture and truth of one camera at a time.
+    /// Image and truth of one camera at a time.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
@@ -129,7 +129,7 @@ impl Simulator {
         self.render_with(&Shot::new(nanos, slot))
     }
 
-    /// Picture and truth of a shot.
+    /// Image and truth of a shot.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Config`] for a shot out of range, [`SimError::Gpu`].
@@ -154,7 +154,7 @@ impl Simulator {
         Ok(frame)
     }
 
-    /// Picture and mask only, at less cost than [`Self::render`]. Cameras that were asked for the same instants before
+    /// Image and mask only, at less cost than [`Self::render`]. Cameras that were asked for the same instants before
     /// are drawn together, when the first of them is asked for.
     ///
     /// # Errors
@@ -163,7 +163,7 @@ impl Simulator {
         self.capture_with(&Shot::new(nanos, slot))
     }
 
-    /// Picture and mask of a shot.
+    /// Image and mask of a shot.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Config`] for a shot out of range, [`SimError::Gpu`].
@@ -172,7 +172,7 @@ impl Simulator {
         self.finished(&raw, shot)
     }
 
-    /// Pictures and masks of several cameras at one time, drawn in one pass.
+    /// Images and masks of several cameras at one time, drawn in one pass.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].

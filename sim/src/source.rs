@@ -160,7 +160,7 @@ pub(crate) fn shot(plan: &FramePlan, slot: usize) -> Shot {
     Shot { exposure: plan.exposure, camera_shift: plan.bump, ..Shot::new(plan.true_nanos, slot) }
 }
 
-/// Garbage over a picture, where the fault script says so.
+/// Garbage over an image, where the fault script says so.
 pub(crate) fn spoilt(simulator: &Simulator, plan: &FramePlan, index: u64, image: Image) -> Result<Image, SimError> {
     let Some(share) = plan.sound_share else { return Ok(image) };
     let mut rgb = image.bytes().to_vec();

@@ -23,7 +23,7 @@ pub(crate) enum Surface {
     Concrete,
     Leaf,
     Rug,
-    /// Pictures fill the thing that they are on.
+    /// Images fill the thing that they are on.
     PosterA,
     PosterB,
     PosterC,
@@ -55,7 +55,7 @@ impl Surface {
         Self::Outside,
     ];
 
-    /// How often the texture comes in a metre; none for pictures that fill what they are on.
+    /// How often the texture comes in a metre; none for images that fill what they are on.
     pub(crate) fn repeats_a_metre(self) -> Option<f32> {
         match self {
             Self::Plain | Self::Plaster => Some(0.7),

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use crate::sheet::Sheet;
 use crate::wardrobe::Srgb;
 
-/// A square sRGB picture.
+/// A square sRGB image.
 #[derive(Debug, Clone)]
 pub(crate) struct Texture {
     pub side: usize,
@@ -85,7 +85,7 @@ impl Texture {
         Self { side, pixels }
     }
 
-    /// The same picture of a glossy surface, 0..=1; the gloss is what the fourth channel lacks to full.
+    /// The same image of a glossy surface, 0..=1; the gloss is what the fourth channel lacks to full.
     pub(crate) fn glossy(mut self, gloss: f32) -> Self {
         let fourth = ((1.0 - gloss.clamp(0.0, 1.0)) * 255.0).round() as u8;
         for pixel in &mut self.pixels {

@@ -20,13 +20,13 @@ pub struct TrainingConfig {
     pub seed: u64,
     /// Cameras of each rig, 1 to 128.
     pub cameras: usize,
-    /// Size of the pictures, pixels.
+    /// Size of the images, pixels.
     pub size: [u32; 2],
     /// Side of each texture, pixels.
     pub texture_px: u32,
     /// Consecutive instants of a sample, 1 to 1000.
     pub instants: usize,
-    /// Samples of one person in one rig (making them costs about as much as a dozen pictures), at least 1.
+    /// Samples of one person in one rig (making them costs about as much as a dozen images), at least 1.
     pub samples_a_person: usize,
 }
 
@@ -130,7 +130,7 @@ pub fn random_config(training: &TrainingConfig, person: u64) -> SimConfig {
         radius_m,
         height_m: rng.random_range(0.8..2.4),
         target_height_m: rng.random_range(0.85..1.0),
-        // The person fills more or less of the picture's height.
+        // The person fills more or less of the image's height.
         focal_heights: rng.random_range(0.36..0.5) * radius_m,
         radial: [rng.random_range(-0.18..0.05), rng.random_range(-0.02..0.05)],
         fisheye: fisheye.then(|| [rng.random_range(-0.05..0.08), rng.random_range(-0.015..0.01), 0.002, 0.0]),

@@ -1,4 +1,4 @@
-//! The truth about a picture as an OpenEXR file.
+//! The truth about an image as an OpenEXR file.
 
 use std::path::Path;
 

@@ -28,7 +28,7 @@ struct View {
     moment: vec4<f32>,
     // First key's seconds from the shot's instant, keys a second, number of keys.
     keys: vec4<f32>,
-    // x: share of this sub-frame in its picture; y, z: 1 for the first and for the last sub-frame;
+    // x: share of this sub-frame in its image; y, z: 1 for the first and for the last sub-frame;
     // w: 1 where people are there.
     sum: vec4<f32>,
     rows: array<Row>,

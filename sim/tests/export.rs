@@ -34,7 +34,7 @@ fn channel(path: &Path, name: &str) -> Vec<f32> {
 }
 
 #[test]
-fn pictures_calibration_and_truth_lie_in_the_folder() {
+fn images_calibration_and_truth_lie_in_the_folder() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("take");
     let mut simulator = simulator(&config());

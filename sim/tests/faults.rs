@@ -98,7 +98,7 @@ fn dropped_frames_leave_a_gap_in_sequence_and_time() {
 }
 
 #[test]
-fn a_duplicate_is_the_picture_before_with_a_stamp_of_its_own() {
+fn a_duplicate_is_the_image_before_with_a_stamp_of_its_own() {
     let (mut cameras, _) = rig("[[fault]]\nkind = \"duplicate\"\nfrom_frame = 2\nframes = 1\n");
     let frames: Vec<Frame> = (0..4).map(|_| next(&mut cameras[0]).unwrap()).collect();
     assert_eq!(frames[2].image.bytes(), frames[1].image.bytes());

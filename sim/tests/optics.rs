@@ -25,7 +25,7 @@ fn differences(a: &[[f32; 3]], b: &[[f32; 3]]) -> Vec<f64> {
 }
 
 #[test]
-fn motion_blur_is_the_mean_of_sharp_pictures_in_linear_light() {
+fn motion_blur_is_the_mean_of_sharp_images_in_linear_light() {
     let mut config = small_config(3);
     config.motion.turn_secs = 2.0;
     let optics = OpticsConfig { exposure_ms: 40.0, samples: 8, ..OpticsConfig::default() };
@@ -47,7 +47,7 @@ fn motion_blur_is_the_mean_of_sharp_pictures_in_linear_light() {
         average(&off),
         at(0.995)
     );
-    // The lamps' pictures are fitted to all of the exposure, so that edges of shadows fall a texel beside.
+    // The lamps' images are fitted to all of the exposure, so that edges of shadows fall a texel beside.
     assert!(average(&off) < 1.5e-3 && at(0.995) < 0.03, "{} {}", average(&off), at(0.995));
     assert!(unblurred > 4.0 * average(&off), "{unblurred}");
 }

@@ -55,7 +55,7 @@ fn samples_go_on_without_a_disk_and_repeat_exactly() {
             assert_eq!((frame.color.width(), frame.color.height(), frame.depth.len()), (96, 64, 96 * 64));
         }
         let covered = sample.instants.iter().flatten().filter(|f| f.depth.iter().any(|&z| z > 0.0)).count();
-        assert!(covered >= 3, "the person is seen in {covered} of 4 pictures");
+        assert!(covered >= 3, "the person is seen in {covered} of 4 images");
     }
     for (a, b) in samples.iter().zip(make()) {
         let b = b.unwrap();

@@ -1,4 +1,4 @@
-//! Picture, mask, depth, canonical positions, surface and pose speak of the same person.
+//! Image, mask, depth, canonical positions, surface and pose speak of the same person.
 
 #![allow(clippy::unwrap_used)]
 
@@ -79,7 +79,7 @@ fn strong_distortion_is_drawn_to_a_tenth_of_a_pixel() {
     println!("95 of 100 pixels within {worst:.4} px");
     // A tenth of a pixel is promised; the tighter bound notices a lost k2 (0.05 px).
     assert!(worst < 0.02, "{worst} px");
-    // Without the lens the same picture is off by far more.
+    // Without the lens the same image is off by far more.
     let camera = simulator.rig().cameras[0].clone();
     let mut pinhole = camera.clone();
     pinhole.intrinsics.lens = flyrig_types::Lens::PINHOLE;
@@ -124,7 +124,7 @@ fn the_mask_covers_what_has_depth_and_the_rest_is_the_plate() {
     assert!(area > 600, "the person covers {area} pixels");
     // The mask samples beside the centre, so outlines differ a little.
     assert!(disagree * 20 < area, "{disagree} of {area}");
-    // Partly covered pixels exist: the picture is anti-aliased.
+    // Partly covered pixels exist: the image is anti-aliased.
     assert!(frame.mask.coverage().iter().any(|&c| (1..255).contains(&c)));
 }
 

@@ -1,4 +1,4 @@
-//! What the networks know of a body before the first picture.
+//! What the networks know of a body before the first image.
 
 use flyrig_body::{DeformationGraph, Part, SurfaceGaussians};
 use glam::Vec3;

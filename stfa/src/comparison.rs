@@ -132,7 +132,7 @@ impl Comparison {
             let parts = color.select(0, which.clone()).reshape([pixels, SHARES, 3])
                 * shares.clone().reshape([pixels, SHARES, 1]);
             let premultiplied = parts.sum_dim(1).reshape([pixels, 3]);
-            // As the rasteriser's pictures are encoded: straight alpha, the sRGB value times alpha.
+            // As the rasteriser's images are encoded: straight alpha, the sRGB value times alpha.
             srgb_from_linear(premultiplied / alpha.clone().clamp_min(1e-3)) * alpha.clone()
         };
         let truth = target.truth.iter().flat_map(|pixel| {
@@ -208,7 +208,7 @@ fn with_graph(
     network.fill(visible, weight, around)
 }
 
-/// The input pictures in this variation, as the encoder takes them.
+/// The input images in this variation, as the encoder takes them.
 pub(crate) fn planes(network: &Network, sample: &TrainingSample, variation: Variation) -> Tensor<4> {
     let crops = &sample.crops;
     let pixels = crops.width * crops.height;

@@ -1,4 +1,4 @@
-//! The person's box of every input picture, and its fine detail.
+//! The person's box of every input image, and its fine detail.
 
 use flyrig_renderer::AppearanceSettings;
 use rayon::prelude::*;
@@ -15,9 +15,9 @@ const MULTIPLE: usize = 4;
 /// Detail is what these blurs take away, standard deviations in pixels.
 pub(crate) const BLURS_PX: [f32; 2] = [1.0, 3.0];
 
-/// A picture as the engine holds it.
+/// An image as the engine holds it.
 #[derive(Debug, Clone, Copy)]
-pub struct ViewPicture<'a> {
+pub struct ViewImage<'a> {
     /// Pixels.
     pub width: u32,
     /// Pixels.
@@ -29,24 +29,24 @@ pub struct ViewPicture<'a> {
 /// The person's boxes, all of one size.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Crops {
-    /// Number of pictures.
+    /// Number of images.
     pub views: usize,
     /// Pixels, a multiple of four.
     pub width: usize,
     /// Pixels, a multiple of four.
     pub height: usize,
-    /// Pixel of each picture that lies on the crop's first one.
+    /// Pixel of each image that lies on the crop's first one.
     pub origins: Vec<[u32; 2]>,
     /// View by view, row by row: sRGB and mask coverage.
     pub rgba: Vec<u8>,
 }
 
 impl Crops {
-    /// Cuts the masks' boxes out, grown to a common size. A picture without a person gives an empty crop.
+    /// Cuts the masks' boxes out, grown to a common size. An image without a person gives an empty crop.
     ///
     /// # Errors
-    /// [`StfaError::Frame`] when a picture's bytes do not fit its size.
-    pub fn cut(pictures: &[ViewPicture<'_>]) -> Result<Self, StfaError> {
+    /// [`StfaError::Frame`] when an image's bytes do not fit its size.
+    pub fn cut(pictures: &[ViewImage<'_>]) -> Result<Self, StfaError> {
         let mut boxes = Vec::with_capacity(pictures.len());
         for (view, picture) in pictures.iter().enumerate() {
             let (width, height) = (picture.width as usize, picture.height as usize);
@@ -218,7 +218,7 @@ mod tests {
             picture(60, 50, |x, y| ((20..23).contains(&x) && (30..44).contains(&y)).then_some([x as u8, y as u8, 9]));
         let nobody = picture(40, 30, |_, _| None);
         let whole = picture(33, 21, |x, y| Some([x as u8, y as u8, 1]));
-        let pictures = [(60, 50, &one), (40, 30, &nobody), (33, 21, &whole)].map(|(width, height, rgba)| ViewPicture {
+        let pictures = [(60, 50, &one), (40, 30, &nobody), (33, 21, &whole)].map(|(width, height, rgba)| ViewImage {
             width,
             height,
             rgba,
@@ -231,18 +231,18 @@ mod tests {
         assert_eq!(at(2, 32, 20), [32, 20, 1, 255]);
         assert_eq!(at(2, 33, 20), [0; 4]);
         assert!(crops.planes(1, &AppearanceSettings::default()).iter().all(|v| *v == 0.0));
-        let error = Crops::cut(&[ViewPicture { width: 4, height: 4, rgba: &one }]).unwrap_err().to_string();
+        let error = Crops::cut(&[ViewImage { width: 4, height: 4, rgba: &one }]).unwrap_err().to_string();
         assert!(error.contains("view 0") && error.contains("4x4"), "{error}");
     }
 
     #[test]
     fn detail_is_zero_on_flat_cloth_and_never_sees_the_background() {
         let flat = picture(40, 40, |x, _| (x > 10).then_some([200, 100, 50]));
-        let crops = Crops::cut(&[ViewPicture { width: 40, height: 40, rgba: &flat }]).unwrap();
+        let crops = Crops::cut(&[ViewImage { width: 40, height: 40, rgba: &flat }]).unwrap();
         let detail = crops.detail(&AppearanceSettings::default());
         assert!(detail.values.iter().all(|v| v.abs() < 1e-5), "flat cloth");
         let stripes = picture(40, 40, |x, _| Some(if x % 2 == 0 { [255; 3] } else { [0; 3] }));
-        let crops = Crops::cut(&[ViewPicture { width: 40, height: 40, rgba: &stripes }]).unwrap();
+        let crops = Crops::cut(&[ViewImage { width: 40, height: 40, rgba: &stripes }]).unwrap();
         let detail = crops.detail(&AppearanceSettings::default());
         let middle = &detail.values[(20 * crops.width + 20) * DETAIL..][..DETAIL];
         assert!(middle[0] > 0.4 && middle[3].abs() < 0.02, "stripes of a pixel are fine detail: {middle:?}");
@@ -278,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn no_picture_at_all_gives_empty_crops() {
+    fn no_image_at_all_gives_empty_crops() {
         let crops = Crops::cut(&[]).unwrap();
         assert_eq!(crops, Crops::default());
         assert!(crops.detail(&AppearanceSettings::default()).values.is_empty());

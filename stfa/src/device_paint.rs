@@ -121,7 +121,7 @@ impl DevicePainter {
         settings: &AppearanceSettings,
     ) -> Result<Tensor<2>, StfaError> {
         if observed.views.len() != crops.views {
-            return Err(StfaError::Frame(format!("{} views, {} pictures", observed.views.len(), crops.views)));
+            return Err(StfaError::Frame(format!("{} views, {} images", observed.views.len(), crops.views)));
         }
         let observed = observed.tamed();
         let sampled = self.sample(&observed, crops, settings);
@@ -158,7 +158,7 @@ impl DevicePainter {
         (gathered * self.body.weights.clone()).sum_dim(1).reshape([self.gaussians, columns])
     }
 
-    /// What the pictures show at the Gaussians (Eq. 5) and around the nodes.
+    /// What the images show at the Gaussians (Eq. 5) and around the nodes.
     fn sample(&self, observed: &ObservedTensors, crops: &Crops, settings: &AppearanceSettings) -> Sampled {
         let device = &self.network.device;
         let features = self.network.size.feature();
@@ -169,7 +169,7 @@ impl DevicePainter {
             let planes: Vec<f32> = (0..crops.views).flat_map(|view| crops.planes(view, settings)).collect();
             let planes = self.network.pictures(planes, crops.views, crops.height, crops.width);
             let maps = self.network.encode(planes.clone());
-            let shown = picture_maps(planes, device);
+            let shown = image_maps(planes, device);
             for (view, kept) in observed.views.iter().enumerate() {
                 let place = Place::new(kept, crops.origins[view]);
                 let weight = place.weight.clone();
@@ -268,7 +268,7 @@ impl DevicePainter {
     }
 }
 
-/// What the pictures show, all views together.
+/// What the images show, all views together.
 struct Sampled {
     /// f_vis of each Gaussian.
     feature: Tensor<2>,
@@ -325,8 +325,8 @@ impl Place {
     }
 }
 
-/// Colours with belief and detail of all pictures, channels last: [`Crops::colors`] and [`Crops::detail`].
-fn picture_maps(planes: Tensor<4>, device: &Device) -> Tensor<4> {
+/// Colours with belief and detail of all images, channels last: [`Crops::colors`] and [`Crops::detail`].
+fn image_maps(planes: Tensor<4>, device: &Device) -> Tensor<4> {
     let [views, _, height, width] = planes.dims();
     let blurred = |sigma: f32| {
         let kernel = blur_kernel(sigma);

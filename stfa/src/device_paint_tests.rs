@@ -6,7 +6,7 @@ use flyrig_renderer::{AppearanceSettings, Observations};
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
 use super::*;
-use crate::{LearnedAppearance, NetworkSize, crops::ViewPicture, parameters::to_vec};
+use crate::{LearnedAppearance, NetworkSize, crops::ViewImage, parameters::to_vec};
 
 const SIZES: [[u32; 2]; 3] = [[61, 90], [48, 64], [50, 40]];
 
@@ -103,7 +103,7 @@ fn compare(device: &Device, size: NetworkSize, settings: &AppearanceSettings, bo
         let worst = expected.as_flattened().iter().zip(&found).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(worst < bound, "{size:?}, frame {frame}: {worst}");
         let apart = expected.iter().zip(&expected[1..]).any(|(a, b)| (a[0] - b[0]).abs() > 0.1);
-        assert!(apart, "a flat picture tells nothing");
+        assert!(apart, "a flat image tells nothing");
     }
 }
 
@@ -119,8 +119,8 @@ fn tensors_paint_what_the_processor_paints() {
     }
 }
 
-fn views(pictures: &[Vec<u8>]) -> Vec<ViewPicture<'_>> {
-    pictures.iter().zip(&SIZES).map(|(rgba, &[width, height])| ViewPicture { width, height, rgba }).collect()
+fn views(pictures: &[Vec<u8>]) -> Vec<ViewImage<'_>> {
+    pictures.iter().zip(&SIZES).map(|(rgba, &[width, height])| ViewImage { width, height, rgba }).collect()
 }
 
 #[test]
@@ -134,7 +134,7 @@ fn what_did_not_change_is_kept() {
     assert_eq!((kept.counts.views_kept, kept.counts.colors_kept), (0, 0));
     assert_eq!(kept.paint(&seen, &views(&pictures), &settings).unwrap(), first);
     assert_eq!((kept.counts.views_kept, kept.counts.colors_kept), (3, body.gaussians() as u64));
-    // Another picture: its features are made again, and the colours of all who see it.
+    // Another image: its features are made again, and the colours of all who see it.
     let middle = pictures[1].len() / 2;
     pictures[1][middle - 2000..middle + 2000].iter_mut().for_each(|value| *value = 255 - *value / 2);
     let changed = kept.paint(&seen, &views(&pictures), &settings).unwrap();
@@ -145,7 +145,7 @@ fn what_did_not_change_is_kept() {
         a.as_flattened().iter().zip(b.as_flattened()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
     };
     assert!(worst(&changed, &expected) < 1e-4 && worst(&changed, &first) > 1e-3);
-    // One picture fewer, and masks that are believed otherwise: nothing of before may be used.
+    // One image fewer, and masks that are believed otherwise: nothing of before may be used.
     let mut fewer = seen.clone();
     fewer.views.truncate(2);
     kept.paint(&fewer, &views(&pictures)[..2], &settings).unwrap();
@@ -160,7 +160,7 @@ fn frames_that_do_not_fit_are_refused() {
     let seen = observed(&body, &mut SmallRng::seed_from_u64(1));
     let error =
         painter.paint(&ObservedTensors::upload(&seen, &device), &Crops::default(), &AppearanceSettings::default());
-    assert!(error.unwrap_err().to_string().contains("3 views, 0 pictures"));
+    assert!(error.unwrap_err().to_string().contains("3 views, 0 images"));
 }
 
 #[cfg(feature = "wgpu")]

@@ -5,7 +5,7 @@
 //!
 //! # What goes through
 //!
-//! 1. **Encoder**: three scales of feature maps over the person's box of every picture.
+//! 1. **Encoder**: three scales of feature maps over the person's box of every image.
 //! 2. **Aggregation** (Eq. 5 to 8): bilinear samples at the projected Gaussians, with the weights that direct appearance
 //!    found ([`Observations`](flyrig_renderer::Observations)).
 //! 3. **Graph**: graph-transformer layers over the deformation graph's nodes, which know their place on the body, what was
@@ -40,14 +40,14 @@ mod weights;
 
 pub use body_graph::{BodyGraph, EDGES, PLACE, POOLED};
 pub use comparison::{Errors, SampleErrors, evaluate};
-pub use crops::{Crops, DETAIL, ViewPicture};
+pub use crops::{Crops, DETAIL, ViewImage};
 pub use error::StfaError;
 pub use inputs::{CANDIDATES, FrameInputs, NODE, STATE, frame_inputs};
 pub use memory::FeatureMemory;
 pub use network_device::NetworkDevice;
 pub use paint::{LearnedAppearance, PaintCounts};
 pub use parameters::{NetworkSize, Parameters};
-pub use sample::{PATCH, SHARES, Target, TargetPicture, TrainingSample, training_sample};
+pub use sample::{PATCH, SHARES, Target, TargetImage, TrainingSample, training_sample};
 pub use shared::SharedAppearance;
 pub use taps::{FeatureMaps, Tap, Taps};
 pub use train::{Loss, TrainSettings, Trainer};

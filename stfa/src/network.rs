@@ -38,7 +38,7 @@ impl Network {
         activation::relu(module::conv2d(x, weight, Some(bias), options))
     }
 
-    /// Feature maps at three scales, channels last, of pictures (views, 4, height, width).
+    /// Feature maps at three scales, channels last, of images (views, 4, height, width).
     pub(crate) fn encode(&self, pictures: Tensor<4>) -> [Tensor<4>; 3] {
         let full = self.conv(pictures, "full", 1);
         let half = self.conv(full.clone(), "half", 2);

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::{
     BodyGraph, Parameters, StfaError,
-    crops::{Crops, ViewPicture},
+    crops::{Crops, ViewImage},
     inputs::{FrameInputs, STATE, frame_inputs},
     memory::FeatureMemory,
     network::{Network, feature_maps},
@@ -22,9 +22,9 @@ const CHUNK: usize = if cfg!(test) { 1000 } else { 16_384 };
 /// What was done and what was left out since the start.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct PaintCounts {
-    /// Pictures that were encoded.
+    /// Images that were encoded.
     pub views_encoded: u64,
-    /// Pictures that had not changed: their features were at hand.
+    /// Images that had not changed: their features were at hand.
     pub views_kept: u64,
     /// Gaussians that went through the colour network.
     pub colors_computed: u64,
@@ -34,12 +34,12 @@ pub struct PaintCounts {
     pub poisoned: u64,
 }
 
-/// Feature maps of all pictures, and the pictures themselves where features are to be reused.
+/// Feature maps of all images, and the images themselves where features are to be reused.
 #[derive(Debug, Default)]
 struct Encoded {
     crops: Crops,
     levels: Vec<FeatureMaps>,
-    /// What the pictures' masks were believed by.
+    /// What the images' masks were believed by.
     min_mask: Option<f32>,
 }
 
@@ -64,7 +64,7 @@ pub struct LearnedAppearance {
     memory: FeatureMemory,
     encoded: Encoded,
     corrections: Corrections,
-    /// What is kept from frame to frame: features of pictures that did not change at all, and what the networks add to a
+    /// What is kept from frame to frame: features of images that did not change at all, and what the networks add to a
     /// Gaussian none of whose inputs changed by more than this. 0: nothing is kept.
     pub reuse: f32,
     /// What was done so far.
@@ -103,15 +103,15 @@ impl LearnedAppearance {
         self.corrections = Corrections::default();
     }
 
-    /// Linear RGB of every Gaussian (opacity 1) from what direct appearance observed with these settings in these pictures,
+    /// Linear RGB of every Gaussian (opacity 1) from what direct appearance observed with these settings in these images,
     /// view by view. Without `settings.space` no graph network runs, without `settings.time` nothing is remembered.
     ///
     /// # Errors
-    /// [`StfaError::Frame`] when observations and pictures do not fit.
+    /// [`StfaError::Frame`] when observations and images do not fit.
     pub fn paint(
         &mut self,
         observed: &Observations,
-        pictures: &[ViewPicture<'_>],
+        pictures: &[ViewImage<'_>],
         settings: &AppearanceSettings,
     ) -> Result<Vec<[f32; 4]>, StfaError> {
         let crops = Crops::cut(pictures)?;
@@ -194,7 +194,7 @@ impl LearnedAppearance {
         rows
     }
 
-    /// Brings the feature maps up to date; those of unchanged pictures are kept.
+    /// Brings the feature maps up to date; those of unchanged images are kept.
     fn encode(&mut self, crops: Crops, settings: &AppearanceSettings) {
         if crops.rgba.is_empty() {
             self.encoded = Encoded::default();

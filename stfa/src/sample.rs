@@ -10,7 +10,7 @@ use safetensors::SafeTensors;
 use crate::{
     BodyGraph, StfaError,
     body_graph::{EDGES, PLACE},
-    crops::{Crops, ViewPicture},
+    crops::{Crops, ViewImage},
     inputs::{NODE, STATE, frame_inputs},
     taps::{Tap, Taps},
     tensor_file::{TensorFile, array, read, rows},
@@ -29,14 +29,14 @@ const TRIES: usize = 40;
 
 /// A camera that is not an input, and what it saw.
 #[derive(Debug, Clone, Copy)]
-pub struct TargetPicture<'a> {
+pub struct TargetImage<'a> {
     /// The camera as it is.
     pub camera: &'a Camera,
-    /// Its picture with mask.
-    pub picture: ViewPicture<'a>,
+    /// Its image with mask.
+    pub picture: ViewImage<'a>,
 }
 
-/// Pixels of one held-out picture and the Gaussians that they show.
+/// Pixels of one held-out image and the Gaussians that they show.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Target {
     /// A row a Gaussian.
@@ -58,7 +58,7 @@ pub struct Target {
 /// One instant.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TrainingSample {
-    /// The person in the input pictures.
+    /// The person in the input images.
     pub crops: Crops,
     /// A row a node.
     pub node_taps: Taps,
@@ -68,12 +68,12 @@ pub struct TrainingSample {
     pub edges: Vec<[u32; EDGES]>,
     /// Place of each node.
     pub place: Vec<[f32; PLACE]>,
-    /// Held-out pictures.
+    /// Held-out images.
     pub targets: Vec<Target>,
 }
 
 /// Gathers a sample: the networks' inputs from `pictures` as direct appearance observed them, and `patches` squares of every
-/// held-out picture, drawn at random by `seed`.
+/// held-out image, drawn at random by `seed`.
 ///
 /// # Errors
 /// [`StfaError::Frame`] when something does not fit.
@@ -81,10 +81,10 @@ pub struct TrainingSample {
 pub fn training_sample(
     body: &BodyGraph,
     observed: &Observations,
-    pictures: &[ViewPicture<'_>],
+    pictures: &[ViewImage<'_>],
     settings: &AppearanceSettings,
     posed: PosedGaussians<'_>,
-    targets: &[TargetPicture<'_>],
+    targets: &[TargetImage<'_>],
     patches: usize,
     seed: u64,
 ) -> Result<TrainingSample, StfaError> {
@@ -94,7 +94,7 @@ pub fn training_sample(
     for target in targets {
         let picture = target.picture;
         if picture.rgba.len() != picture.width as usize * picture.height as usize * 4 {
-            return Err(StfaError::Frame(format!("the picture of camera {} has another size", target.camera.id)));
+            return Err(StfaError::Frame(format!("the image of camera {} has another size", target.camera.id)));
         }
         let pixels = patch_pixels(picture, patches, &mut rng);
         let shown = pixel_shares(target.camera, posed, &pixels, &RasterSettings::default()).rows;
@@ -136,7 +136,7 @@ pub fn training_sample(
 }
 
 /// Pixels of random squares on the person, square by square, row by row.
-fn patch_pixels(picture: ViewPicture<'_>, patches: usize, rng: &mut SmallRng) -> Vec<[u32; 2]> {
+fn patch_pixels(picture: ViewImage<'_>, patches: usize, rng: &mut SmallRng) -> Vec<[u32; 2]> {
     let side = PATCH as u32;
     let mut pixels = Vec::new();
     if picture.width < side || picture.height < side {

@@ -13,7 +13,7 @@ use flyrig_renderer::{AppearanceSettings, DirectAppearance, GaussianBuffers};
 
 use crate::{
     BodyGraph, Parameters, StfaError,
-    crops::{Crops, ViewPicture},
+    crops::{Crops, ViewImage},
     device_paint::{DevicePainter, ObservedTensors},
 };
 
@@ -43,17 +43,17 @@ impl SharedAppearance {
         self.painter.reset();
     }
 
-    /// Repaints [`GaussianBuffers::color`] from what `direct` observed with these settings in these pictures, view by view.
+    /// Repaints [`GaussianBuffers::color`] from what `direct` observed with these settings in these images, view by view.
     /// Direct appearance must keep its observations, and its update must have been submitted.
     ///
     /// # Errors
-    /// [`StfaError::Frame`] when observations and pictures do not fit, [`StfaError::Device`].
+    /// [`StfaError::Frame`] when observations and images do not fit, [`StfaError::Device`].
     pub fn paint(
         &mut self,
         gpu: &GpuContext,
         direct: &DirectAppearance,
         gaussians: &GaussianBuffers,
-        pictures: &[ViewPicture<'_>],
+        pictures: &[ViewImage<'_>],
         settings: &AppearanceSettings,
     ) -> Result<(), StfaError> {
         let crops = Crops::cut(pictures)?;
@@ -62,7 +62,7 @@ impl SharedAppearance {
         for (what, found, expected) in [
             ("Gaussians", gaussians.count(), self.painter.gaussians()),
             ("nodes", buffers.nodes, self.painter.nodes()),
-            ("pictures", pictures.len(), pictures.len().min(buffers.views.len())),
+            ("images", pictures.len(), pictures.len().min(buffers.views.len())),
         ] {
             if found != expected {
                 return Err(StfaError::Frame(format!("{found} {what}, expected {expected}")));

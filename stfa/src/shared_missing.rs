@@ -4,7 +4,7 @@ use burn_tensor::Device;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::{AppearanceSettings, DirectAppearance, GaussianBuffers};
 
-use crate::{BodyGraph, Parameters, StfaError, ViewPicture};
+use crate::{BodyGraph, Parameters, StfaError, ViewImage};
 
 /// Networks on the drawing device; this flyrig was built without them.
 #[derive(Debug)]
@@ -29,7 +29,7 @@ impl SharedAppearance {
         _: &GpuContext,
         _: &DirectAppearance,
         _: &GaussianBuffers,
-        _: &[ViewPicture<'_>],
+        _: &[ViewImage<'_>],
         _: &AppearanceSettings,
     ) -> Result<(), StfaError> {
         match *self {}

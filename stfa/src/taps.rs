@@ -135,7 +135,7 @@ impl Taps {
         out
     }
 
-    /// The same looks at pictures of `width` pixels that were turned left to right.
+    /// The same looks at images of `width` pixels that were turned left to right.
     #[must_use]
     pub fn flipped(&self, width: usize) -> Self {
         let last = width.saturating_sub(1) as f32;

@@ -1,7 +1,7 @@
 //! Training: pixels of cameras that were not inputs, compared with what the coloured Gaussians would show there.
 //!
-//! A picture is linear in the Gaussians' colours, so a sample carries the shares of the Gaussians in its pixels and no
-//! picture is drawn. The temporal memory is left out, as the paper does. Pixel-aligned sampling stands between two tapes:
+//! An image is linear in the Gaussians' colours, so a sample carries the shares of the Gaussians in its pixels and no
+//! image is drawn. The temporal memory is left out, as the paper does. Pixel-aligned sampling stands between two tapes:
 //! the gradient of the sampled features is carried back to the feature maps by hand and handed to the encoder's tape.
 
 use std::{collections::BTreeMap, path::Path};

@@ -9,7 +9,7 @@ use flyrig_renderer::{
     AppearanceSettings, DirectAppearance, GaussianBuffers, Observations, Outputs, RasterSettings, Rasterizer,
     RenderTarget, ViewInput, rgba8_from_target,
 };
-use flyrig_stfa::{BodyGraph, Crops, LearnedAppearance, NetworkSize, Parameters, ViewPicture, frame_inputs};
+use flyrig_stfa::{BodyGraph, Crops, LearnedAppearance, NetworkSize, Parameters, ViewImage, frame_inputs};
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
 use glam::{DVec2, DVec3};
 
@@ -118,8 +118,8 @@ impl Stage {
     }
 }
 
-fn views(pictures: &[Vec<u8>]) -> Vec<ViewPicture<'_>> {
-    pictures.iter().map(|rgba| ViewPicture { width: SIZE[0], height: SIZE[1], rgba }).collect()
+fn views(pictures: &[Vec<u8>]) -> Vec<ViewImage<'_>> {
+    pictures.iter().map(|rgba| ViewImage { width: SIZE[0], height: SIZE[1], rgba }).collect()
 }
 
 #[test]
@@ -196,7 +196,7 @@ fn poison_never_reaches_the_colours() {
         LearnedAppearance::new(&parameters, stage.body()).paint(&observed, &views(&pictures), &settings).unwrap();
     assert_eq!(after, fresh);
 
-    // A black picture, a picture without a person, no picture at all.
+    // A black image, an image without a person, no image at all.
     let black: Vec<u8> = pictures[0].chunks_exact(4).flat_map(|p| [0, 0, 0, p[3]]).collect();
     let nobody = vec![0; pictures[0].len()];
     for given in [vec![black, pictures[1].clone()], vec![nobody.clone(), nobody]] {

@@ -1,4 +1,4 @@
-//! Constant lags between cameras out of what moves in their pictures, for stamps that cannot be trusted.
+//! Constant lags between cameras out of what moves in their images, for stamps that cannot be trusted.
 
 use flyrig_solve::DenseNormal;
 use flyrig_types::CameraId;
@@ -7,9 +7,9 @@ use flyrig_types::CameraId;
 const STEP: i64 = 4_000_000;
 /// What is slower than this is light and background, not motion, nanoseconds.
 const TREND: i64 = 1_000_000_000;
-/// Bands of a picture whose changes are measured: fine enough for a hand, coarse enough for noise.
+/// Bands of an image whose changes are measured: fine enough for a hand, coarse enough for noise.
 const BANDS: usize = 64;
-/// Parts of a picture from top to bottom whose changes are compared each by itself: what the hands do is not mistaken for
+/// Parts of an image from top to bottom whose changes are compared each by itself: what the hands do is not mistaken for
 /// what the feet do, so that the lag does not lean towards whatever a camera sees best.
 const ZONES: usize = 16;
 /// How many zones higher or lower another camera may see the same.
@@ -25,12 +25,12 @@ const MOST_DISAGREEMENT: f64 = 2e6;
 /// Correlation that is asked of a pair that no third camera can contradict.
 const LONE_CORRELATION: f64 = 0.75;
 
-/// How much moves up and down in the pictures of one camera over time.
+/// How much moves up and down in the images of one camera over time.
 #[derive(Debug, Clone)]
 pub struct MotionSignal {
     camera: CameraId,
     last: Option<(i64, Vec<f32>)>,
-    /// Time in the middle between two pictures, and how much changed a second, by zone.
+    /// Time in the middle between two images, and how much changed a second, by zone.
     samples: Vec<(i64, [f64; ZONES])>,
 }
 
@@ -41,7 +41,7 @@ impl MotionSignal {
         Self { camera, last: None, samples: Vec::new() }
     }
 
-    /// Adds a picture of `width * height` pixels of 3 bytes. Pictures of no size, of another size than the bytes', and out
+    /// Adds an image of `width * height` pixels of 3 bytes. Images of no size, of another size than the bytes', and out
     /// of order are left out.
     pub fn add(&mut self, capture_nanos: i64, rgb: &[u8], width: usize, height: usize) {
         if width == 0 || height == 0 || rgb.len() != width * height * 3 {
@@ -64,7 +64,7 @@ impl MotionSignal {
         self.last = Some((capture_nanos, bands));
     }
 
-    /// Pictures that were compared.
+    /// Images that were compared.
     #[must_use]
     pub fn len(&self) -> usize {
         self.samples.len()
@@ -259,7 +259,7 @@ fn settled(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>
 }
 
 /// How much later `b`'s motion is than `a`'s, nanoseconds, and the correlation there. Cameras that see the person higher or
-/// lower in their pictures are compared with the offset at which they agree best.
+/// lower in their images are compared with the offset at which they agree best.
 fn pair_lag(a: &MotionSignal, b: &MotionSignal, most: i64) -> Option<(f64, f64)> {
     let ((a0, a1), (b0, b1)) = (a.span()?, b.span()?);
     let (start, end) = (a0.max(b0), a1.min(b1));
@@ -314,7 +314,7 @@ mod tests {
         }
     }
 
-    /// A camera's pictures: two blobs where it sees the hands from its side, and noise.
+    /// A camera's images: two blobs where it sees the hands from its side, and noise.
     fn lags(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<Option<f64>> {
         settled(count, pairs).into_iter().map(|(lag, _)| lag.map(f64::round)).collect()
     }

@@ -1,6 +1,6 @@
 //! Constant lags between calibrated cameras out of the silhouettes of whoever moves before them.
 //!
-//! Planes through the centres of two cameras that touch a body touch its silhouettes in both pictures (epipolar tangency, e.g.
+//! Planes through the centres of two cameras that touch a body touch its silhouettes in both images (epipolar tangency, e.g.
 //! Wong and Cipolla 2001; used for synchronisation by Sinha and Pollefeys 2004). How far the two outermost planes are turned
 //! is therefore the same for both cameras at one instant, whatever side they see: two curves over time for every pair of
 //! cameras that differ by nothing but the lag.
@@ -24,7 +24,7 @@ const MOST_SPAN: f64 = 2.0;
 const LEAST_COMMON: usize = 187;
 /// Alternating stretches of time whose lags must agree, samples.
 const STRETCH: usize = 125;
-/// How much better than the mean of all lags a pair's best one must fit, 0 to 1: below, masks of too small pictures lead astray.
+/// How much better than the mean of all lags a pair's best one must fit, 0 to 1: below, masks of too small images lead astray.
 const LEAST_CONTRAST: f64 = 0.3;
 /// What a mask is believed to lean by where somebody moves, pixels.
 const LEANING_PX: f64 = 0.1;
@@ -54,7 +54,7 @@ impl SilhouetteTrack {
         Self { camera: camera.clone(), samples: Vec::new() }
     }
 
-    /// Adds the mask of a picture. Masks out of order, of another size than the camera's pictures, and empty ones are left
+    /// Adds the mask of an image. Masks out of order, of another size than the camera's images, and empty ones are left
     /// out.
     pub fn add(&mut self, capture_nanos: i64, mask: &Mask) {
         let is_newer = self.samples.last().is_none_or(|(before, _)| *before < capture_nanos);
@@ -319,7 +319,7 @@ impl Pencil {
 }
 
 /// A curve every [`STEP`] from `start` on: lines fitted to what is near, so that between two samples there is no less noise than
-/// at them (which would draw the lags to the middle between two pictures). NaN where there are no samples on both sides.
+/// at them (which would draw the lags to the middle between two images). NaN where there are no samples on both sides.
 fn smoothed(samples: &[(i64, f64)], sigma: f64, start: i64, count: usize) -> Vec<f64> {
     let reach = 3.0 * sigma;
     let mut from = 0;

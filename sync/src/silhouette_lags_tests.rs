@@ -143,8 +143,8 @@ fn outermost_planes_are_those_that_touch_the_balls() {
 }
 
 #[test]
-fn what_the_picture_cuts_off_is_not_compared() {
-    // The first camera aims low: the top is above its picture.
+fn what_the_image_cuts_off_is_not_compared() {
+    // The first camera aims low: the top is above its image.
     let mut cameras = ring(2);
     cameras[0] = camera("low", cameras[0].position(), DVec3::new(0.0, 0.0, -0.4));
     let mut track = SilhouetteTrack::new(&cameras[0]);
@@ -204,7 +204,7 @@ fn too_little_and_senseless_input_is_borne() {
     odd.add(5, &good);
     odd.add(4, &good);
     assert_eq!(odd.len(), 1);
-    // All of the picture: every corner is cut.
+    // All of the image: every corner is cut.
     odd.add(i64::MAX, &Mask::new(width, height, vec![255; (width * height) as usize]).unwrap());
     assert_eq!(odd.len(), 2);
     let mut blind = SilhouetteTrack::new(&Camera {

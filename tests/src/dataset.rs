@@ -7,7 +7,7 @@ use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{ExportOptions, SimConfig, Simulator, export};
 use tempfile::TempDir;
 
-/// Side of the pictures, pixels.
+/// Side of the images, pixels.
 pub const SIDE: u32 = 160;
 /// Frames a camera, 30 a second.
 pub const FRAMES: u64 = 6;
@@ -27,7 +27,7 @@ impl Dataset {
         self.folder.path().join("out")
     }
 
-    /// Path of a picture.
+    /// Path of an image.
     #[must_use]
     pub fn picture(&self, camera: &str, frame: u64) -> PathBuf {
         self.root.join(format!("images/{camera}/{frame:06}.png"))

@@ -1,4 +1,4 @@
-//! A damaged data set gives one clear line and a failing exit, or costs the one picture that is damaged.
+//! A damaged data set gives one clear line and a failing exit, or costs the one image that is damaged.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use flyrig_tests::{Dataset, FRAMES, Finished, run, write_dataset};
@@ -29,7 +29,7 @@ fn a_missing_camera_is_named_with_those_there_are() {
     assert_refused(&data, &finished, "02");
     assert!(finished.stderr.contains("00"), "lists what there is: {}", finished.stderr);
 
-    // Nor is it put down to the calibration when that says nothing of the pictures' sizes.
+    // Nor is it put down to the calibration when that says nothing of the images' sizes.
     let intri = data.root.join("intri.yml");
     let text = std::fs::read_to_string(&intri).unwrap();
     let sizeless: Vec<&str> = text.lines().filter(|line| !line.starts_with("H_") && !line.starts_with("W_")).collect();
@@ -48,7 +48,7 @@ fn a_missing_camera_is_named_with_those_there_are() {
 }
 
 #[test]
-fn a_truncated_picture_costs_that_picture() {
+fn a_truncated_image_costs_that_image() {
     let data = write_dataset().unwrap();
     let path = data.picture("02", 1);
     let bytes = std::fs::read(&path).unwrap();
@@ -60,7 +60,7 @@ fn a_truncated_picture_costs_that_picture() {
         serde_json::from_slice(&std::fs::read(data.out().join("metrics.json")).unwrap()).unwrap();
     assert_eq!(metrics["frames"], FRAMES, "every frame was rendered");
     assert_eq!(metrics["sync"]["partial"], 1);
-    assert_eq!(metrics["sync"]["broken_pictures"], 1);
+    assert_eq!(metrics["sync"]["broken_images"], 1);
 }
 
 #[test]
@@ -81,7 +81,7 @@ fn an_empty_mask_costs_that_view() {
 }
 
 #[test]
-fn a_mask_of_another_size_costs_that_picture_and_names_both_sizes() {
+fn a_mask_of_another_size_costs_that_image_and_names_both_sizes() {
     let data = write_dataset().unwrap();
     image::GrayImage::new(30, 20).save(data.mask("00", 0)).unwrap();
     let finished = eval(&data, &[]);

@@ -44,7 +44,7 @@ fn a_recording_is_replayed_to_the_bit_and_exported() {
 }
 
 #[test]
-fn pictures_are_recorded_as_jpeg_unless_told_otherwise_and_poses_beside_them() {
+fn images_are_recorded_as_jpeg_unless_told_otherwise_and_poses_beside_them() {
     let folder = tempfile::tempdir().unwrap();
     let rig = RIG.replace("jpeg_quality = 0", "jpeg_quality = 95");
     std::fs::write(

@@ -22,7 +22,7 @@ fn the_rig_outlives_every_kind_of_viewer() {
     let early = watch("early");
     std::thread::sleep(Duration::from_millis(500));
     let mut rig = Process::start(PROGRAM, &["run", "rig.toml"], folder.path(), "run");
-    wait_until("the early viewer's pictures", || seen("early") > 3);
+    wait_until("the early viewer's images", || seen("early") > 3);
 
     // Twice at the same time, one of them through a viewpoint of its own.
     let second = Process::start(
@@ -43,7 +43,7 @@ fn the_rig_outlives_every_kind_of_viewer() {
         folder.path(),
         "second",
     );
-    wait_until("the second viewer's pictures", || seen("second") > 3);
+    wait_until("the second viewer's images", || seen("second") > 3);
     let own = std::fs::read_dir(folder.path().join("second")).unwrap().flatten().next().unwrap().path();
     let size = image::image_dimensions(own).unwrap();
     assert_eq!(size, (64, 48));
@@ -51,7 +51,7 @@ fn the_rig_outlives_every_kind_of_viewer() {
     // Stopped: the other one and the rig go on.
     early.signal("STOP");
     let (before, while_stopped) = (seen("second"), seen("early"));
-    wait_until("pictures while one viewer is stopped", || seen("second") > before + 20);
+    wait_until("images while one viewer is stopped", || seen("second") > before + 20);
     assert!(seen("early") <= while_stopped + 1, "it really was stopped");
     early.signal("CONT");
     wait_until("the stopped viewer to catch up", || seen("early") > while_stopped + 5);
@@ -59,7 +59,7 @@ fn the_rig_outlives_every_kind_of_viewer() {
     // Killed.
     early.signal("KILL");
     let before = seen("second");
-    wait_until("pictures after one viewer was killed", || seen("second") > before + 20);
+    wait_until("images after one viewer was killed", || seen("second") > before + 20);
     drop(second);
     assert!(rig.0.try_wait().unwrap().is_none(), "the rig is still up");
 

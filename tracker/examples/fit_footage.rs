@@ -4,7 +4,7 @@
 //! cargo run --release -p flyrig-tracker --example fit_footage -- DATASET OUT 01,02,04 [FIRST COUNT FPS DRAW_EVERY]
 //! ```
 //!
-//! Cameras that are not named are held out: the fitted body is drawn over their pictures too, and compared
+//! Cameras that are not named are held out: the fitted body is drawn over their images too, and compared
 //! with what the network sees there.
 
 use std::path::{Path, PathBuf};
@@ -29,7 +29,7 @@ fn main() -> Result<()> {
     let (root, out) = (PathBuf::from(root), PathBuf::from(out));
     std::fs::create_dir_all(&out)?;
 
-    let all = load_calibration(&root, &|id| image::image_dimensions(picture_path(&root, id, first)?).ok())?;
+    let all = load_calibration(&root, &|id| image::image_dimensions(image_path(&root, id, first)?).ok())?;
     let wanted: Vec<CameraId> = cameras.split(',').map(CameraId::from).collect();
     let keep = |inside: bool| Rig {
         cameras: all.cameras.iter().filter(|c| wanted.contains(&c.id) == inside).cloned().collect(),
@@ -199,7 +199,7 @@ fn median(values: &mut [f64]) -> f64 {
     values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
 }
 
-fn picture_path(root: &Path, camera: &CameraId, index: i64) -> Option<PathBuf> {
+fn image_path(root: &Path, camera: &CameraId, index: i64) -> Option<PathBuf> {
     let folder = root.join("images").join(camera.as_str());
     ["jpg", "png"].iter().map(|ext| folder.join(format!("{index:06}.{ext}"))).find(|path| path.exists())
 }
@@ -211,7 +211,7 @@ fn to_image(picture: &RgbImage) -> Result<Image> {
 fn frame_set(root: &Path, rig: &Rig, first: i64, index: i64, fps: i64) -> Result<FrameSet> {
     let nanos = index * 1_000_000_000 / fps;
     let frame = |camera: &Camera| -> Result<Option<Arc<Frame>>> {
-        let Some(path) = picture_path(root, &camera.id, index) else { return Ok(None) };
+        let Some(path) = image_path(root, &camera.id, index) else { return Ok(None) };
         let image = to_image(&image::open(path)?.to_rgb8())?;
         Ok(Some(Arc::new(Frame {
             camera: camera.id.clone(),
@@ -243,7 +243,7 @@ fn draw(
         rig.cameras.iter().map(Some).enumerate().chain(held_out.cameras.iter().map(|c| (usize::MAX, Some(c))))
     {
         let Some(camera) = camera else { continue };
-        let Some(source) = picture_path(root, &camera.id, index) else { continue };
+        let Some(source) = image_path(root, &camera.id, index) else { continue };
         let mut picture = image::open(source)?.to_rgb8();
         if let Some(mask) = estimate.masks.get(slot).and_then(Option::as_ref) {
             outline(&mut picture, mask);
@@ -260,7 +260,7 @@ fn draw(
                 dot(&mut picture, Some(keypoint.pixel), 2, color);
             }
         }
-        // Only the person, at the pictures' own scale.
+        // Only the person, at the images' own scale.
         let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
         for pixel in vertices.iter().filter_map(|v| camera.project(v.as_dvec3())) {
             (low, high) = (low.min(pixel - 25.0), high.max(pixel + 25.0));

@@ -11,9 +11,9 @@ use crate::pixels::Rgb;
 use crate::plate::{Drift, floats, gated_mask, plate_evidence};
 use crate::{TrackError, TrackErrorKind};
 
-/// Share of the picture away from people that differs from the plate when the whole room has changed.
+/// Share of the image away from people that differs from the plate when the whole room has changed.
 const ALL_CHANGED: f32 = 0.4;
-/// Share of the picture away from people below which it says nothing about the room.
+/// Share of the image away from people below which it says nothing about the room.
 const LEAST_AWAY: f32 = 0.2;
 /// Updates in which a pixel keeps its colour before it is known.
 const STEADY_UPDATES: u8 = 8;
@@ -23,7 +23,7 @@ const STEADY: f32 = 14.0;
 const DIFFERENT_UPDATES: u8 = 15;
 /// Share of the difference that the plate takes over in an update.
 const FOLLOW: f32 = 1.0 / 16.0;
-/// Share of the picture that differs where nobody stands from which it is reported.
+/// Share of the image that differs where nobody stands from which it is reported.
 const REPORTED: f32 = 0.003;
 /// Share of the pixels away from people that have to be known again after a change.
 const RECOVERED: f32 = 0.7;
@@ -40,14 +40,14 @@ const SHIFT_SAMPLES: usize = 120;
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum BackgroundEvent {
-    /// The picture differs from the plate in this share of what shows nobody, 0..=1; the plate is not used until it is
+    /// The image differs from the plate in this share of what shows nobody, 0..=1; the plate is not used until it is
     /// relearnt.
     Changed(f64),
     /// The plate is in use again.
     Recovered,
-    /// The picture is shifted against the plate by so many pixels (x, y).
+    /// The image is shifted against the plate by so many pixels (x, y).
     Shifted(i64, i64),
-    /// This share of the picture, around a pixel, differs from the plate although nobody is tracked there.
+    /// This share of the image, around a pixel, differs from the plate although nobody is tracked there.
     Differs(f64, [u32; 2]),
 }
 
@@ -63,12 +63,12 @@ impl fmt::Display for BackgroundEvent {
             Self::Recovered => f.write_str("the background has been relearnt and is in use again"),
             Self::Shifted(x, y) => write!(
                 f,
-                "the picture is shifted by {x}, {y} pixels against the plate: the camera was moved; calibrate again and \
+                "the image is shifted by {x}, {y} pixels against the plate: the camera was moved; calibrate again and \
                  record new plates (`flyrig plate`); until then masks learn the background where nobody stands"
             ),
             Self::Differs(share, [x, y]) => write!(
                 f,
-                "{:.1} % of the picture around pixel {x}, {y} differ from the plate where nobody is tracked: something was moved, \
+                "{:.1} % of the image around pixel {x}, {y} differ from the plate where nobody is tracked: something was moved, \
                  or somebody stood in the plate; it is being relearnt; recording the plate again (`flyrig plate`) is more accurate",
                 100.0 * share
             ),
@@ -90,7 +90,7 @@ enum Kind {
     Key(KeyColor),
 }
 
-/// A picture of the empty scene that is kept up to date.
+/// An image of the empty scene that is kept up to date.
 #[derive(Debug, Clone)]
 pub(crate) struct Plate {
     /// sRGB values, three a pixel.
@@ -107,7 +107,7 @@ pub(crate) struct Plate {
 }
 
 impl Background {
-    /// Starts from a picture of the empty scene.
+    /// Starts from an image of the empty scene.
     ///
     /// # Errors
     /// Kind `Image` names the camera when the size is not that of its calibration or the format cannot be read.
@@ -146,7 +146,7 @@ impl Background {
     }
 
     /// Returns the person's mask from this background and the posed body alone; `None` when nothing stands out near the body
-    /// or the picture has another size.
+    /// or the image has another size.
     ///
     /// # Errors
     /// Kind `Image` when the format cannot be read.
@@ -157,11 +157,11 @@ impl Background {
         Ok(evidence.and_then(|evidence| gated_mask(&evidence, gate)))
     }
 
-    /// Takes in a picture in which nobody stands but the bodies of `gates`: the background follows slow changes of the light
+    /// Takes in an image in which nobody stands but the bodies of `gates`: the background follows slow changes of the light
     /// and is relearnt after sudden ones. Returns what its owner should know, each once.
     ///
     /// # Errors
-    /// Kind `Image` when the format cannot be read. Pictures of another size change nothing.
+    /// Kind `Image` when the format cannot be read. Images of another size change nothing.
     pub fn update(&mut self, image: &Image, gates: &[BodyGate]) -> Result<Vec<BackgroundEvent>, TrackError> {
         let picture = Rgb::new(image)?;
         match &mut self.kind {
@@ -172,7 +172,7 @@ impl Background {
         }
     }
 
-    /// Returns the background's light in a picture's exposure, which is measured where `is_background`; `None` for a picture
+    /// Returns the background's light in an image's exposure, which is measured where `is_background`; `None` for an image
     /// of another size or without the screen.
     pub(crate) fn light<'a>(
         &'a self,
@@ -200,14 +200,14 @@ impl Background {
     }
 }
 
-/// The background in the exposure of a picture.
+/// The background in the exposure of an image.
 pub(crate) enum BackgroundLight<'a> {
     Plate(&'a Plate, Drift),
     Screen(&'a KeyColor, Screen),
 }
 
 impl BackgroundLight<'_> {
-    /// Returns per-pixel evidence for a foreground inside of `bounds` (x0, y0, x1, y1, ends excluded) of the picture that this
+    /// Returns per-pixel evidence for a foreground inside of `bounds` (x0, y0, x1, y1, ends excluded) of the image that this
     /// was made for, 0..=1 with the border at one half; `None` while nothing is known there.
     pub fn evidence(&self, picture: &Rgb, bounds: [usize; 4]) -> Option<Grid> {
         let (plate, drift) = match self {
@@ -323,7 +323,7 @@ impl Plate {
         }
     }
 
-    /// Returns how far the picture is shifted against the plate, where a shift explains most of their difference.
+    /// Returns how far the image is shifted against the plate, where a shift explains most of their difference.
     fn shift(&self, picture: &Rgb, away: &[bool]) -> Option<[i64; 2]> {
         let (width, height) = (picture.width as i64, picture.height as i64);
         let first = |x: i64, y: i64| 3 * (y * width + x) as usize;
@@ -489,7 +489,7 @@ mod tests {
             assert_eq!(background.update(&picture(seed, person), std::slice::from_ref(&gate)).unwrap(), []);
         }
         assert!(wrong(&background, &picture(60, person)) > 400);
-        // The body everywhere, pictures of other sizes, black ones.
+        // The body everywhere, images of other sizes, black ones.
         let mut everywhere = Grid::new(SIDE, SIDE, 1.0);
         everywhere.values[0] = 1.0;
         assert_eq!(background.update(&picture(1, dimmed), &[BodyGate::of_grid(&everywhere, 60.0)]).unwrap(), []);

@@ -39,7 +39,7 @@ pub struct PoseConfig {
     pub fit_shape: bool,
     /// Whether masks are made; off saves time where the source brings its own.
     pub masks: bool,
-    /// Crops of a picture that a search for a person looks at in a set; 0 looks at all of them in every set.
+    /// Crops of an image that a search for a person looks at in a set; 0 looks at all of them in every set.
     pub search_crops: usize,
     /// Frame sets without a person after which the memory of the last pose is dropped.
     pub forget_after: u32,

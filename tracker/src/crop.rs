@@ -10,14 +10,14 @@ use crate::{Keypoint, LANDMARK_COUNT, ViewKeypoints};
 /// Room around the farthest landmark; the network was trained with a quarter more than the person.
 const MARGIN: f64 = 1.25;
 
-/// A square of a picture, turned so that the person stands upright in it.
+/// A square of an image, turned so that the person stands upright in it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Crop {
-    /// Middle, pixels of the picture.
+    /// Middle, pixels of the image.
     pub center: DVec2,
-    /// Side, pixels of the picture.
+    /// Side, pixels of the image.
     pub side: f64,
-    /// The crop's x axis in the picture, a unit vector.
+    /// The crop's x axis in the image, a unit vector.
     pub turn: DVec2,
 }
 
@@ -38,34 +38,34 @@ impl Crop {
         if !(reach.is_finite() && (8.0..1e5).contains(&reach)) {
             return None;
         }
-        // Seen from above or below the trunk has no direction in the picture.
+        // Seen from above or below the trunk has no direction in the image.
         let turn = if up.length() < 0.08 * reach { DVec2::X } else { up.perp().normalize() };
         Some(Self { center: hips, side: 2.0 * MARGIN * reach, turn })
     }
 
-    /// Pixels of the picture that one pixel of the network's crop takes.
+    /// Pixels of the image that one pixel of the network's crop takes.
     pub fn scale(&self) -> f64 {
         self.side / NET_SIDE as f64
     }
 
-    /// Picture pixel of a crop pixel (pixel centres at integers in both).
-    pub fn to_picture(self, crop_px: DVec2) -> DVec2 {
-        self.to_picture_from(crop_px, NET_SIDE)
+    /// Image pixel of a crop pixel (pixel centres at integers in both).
+    pub fn to_image(self, crop_px: DVec2) -> DVec2 {
+        self.to_image_from(crop_px, NET_SIDE)
     }
 
     /// The same for a network whose crop has another side, pixels.
-    pub fn to_picture_from(self, crop_px: DVec2, net_side: usize) -> DVec2 {
+    pub fn to_image_from(self, crop_px: DVec2, net_side: usize) -> DVec2 {
         let offset = (crop_px + 0.5 - 0.5 * net_side as f64) * (self.side / net_side as f64);
         self.center + self.turn.rotate(offset)
     }
 
-    /// Crop pixel of a picture pixel.
-    pub fn crop_from_picture(self, picture_px: DVec2) -> DVec2 {
-        let offset = (self.turn * DVec2::new(1.0, -1.0)).rotate(picture_px - self.center);
+    /// Crop pixel of an image pixel.
+    pub fn crop_from_image(self, image_px: DVec2) -> DVec2 {
+        let offset = (self.turn * DVec2::new(1.0, -1.0)).rotate(image_px - self.center);
         offset / self.scale() + 0.5 * NET_SIDE as f64 - 0.5
     }
 
-    /// The network's input: RGB in 0..=1, black outside the picture. Each value averages enough samples
+    /// The network's input: RGB in 0..=1, black outside the image. Each value averages enough samples
     /// that a large crop does not alias.
     pub fn sample(&self, picture: &Rgb) -> Vec<f32> {
         self.sample_square(picture, NET_SIDE)
@@ -76,9 +76,9 @@ impl Crop {
         let taps = ((self.side / net_side as f64).round() as usize).clamp(1, 4);
         let mut rgb = Vec::with_capacity(net_side * net_side * 3);
         let weight = 1.0 / (255.0 * (taps * taps) as f32);
-        let origin = self.to_picture_from(DVec2::ZERO, net_side);
+        let origin = self.to_image_from(DVec2::ZERO, net_side);
         let (right, down) =
-            (self.to_picture_from(DVec2::X, net_side) - origin, self.to_picture_from(DVec2::Y, net_side) - origin);
+            (self.to_image_from(DVec2::X, net_side) - origin, self.to_image_from(DVec2::Y, net_side) - origin);
         for y in 0..net_side {
             for x in 0..net_side {
                 let mut sum = [0.0f32; 3];
@@ -98,16 +98,16 @@ impl Crop {
         rgb
     }
 
-    /// The network's landmarks in the picture.
+    /// The network's landmarks in the image.
     pub fn keypoints(&self, output: &NetOutput) -> ViewKeypoints {
         std::array::from_fn(|i| {
             let landmark = output.landmarks[i];
-            Keypoint { pixel: self.to_picture(DVec2::new(landmark.x, landmark.y)), confidence: landmark.confidence }
+            Keypoint { pixel: self.to_image(DVec2::new(landmark.x, landmark.y)), confidence: landmark.confidence }
         })
     }
 }
 
-/// Upright squares of several sizes that cover a picture, the whole picture first.
+/// Upright squares of several sizes that cover an image, the whole image first.
 pub(crate) fn search_crops(width: u32, height: u32) -> Vec<Crop> {
     let (width, height) = (f64::from(width), f64::from(height));
     let long = width.max(height);
@@ -142,12 +142,12 @@ mod tests {
         points[LEFT_SHOULDER] = Some(DVec2::new(160.0, 100.0));
         points[RIGHT_SHOULDER] = Some(DVec2::new(160.0, 120.0));
         let crop = Crop::around(&points).unwrap();
-        let at = |i: usize| crop.crop_from_picture(points[i].unwrap());
+        let at = |i: usize| crop.crop_from_image(points[i].unwrap());
         assert!(at(LEFT_SHOULDER).y < at(LEFT_HIP).y - 40.0);
         assert!((at(LEFT_SHOULDER).x - at(LEFT_HIP).x).abs() < 1e-9);
         let there = DVec2::new(31.0, 77.0);
-        assert!((crop.crop_from_picture(crop.to_picture(there)) - there).length() < 1e-9);
-        assert!((crop.to_picture(DVec2::splat(127.5)) - crop.center).length() < 1e-9);
+        assert!((crop.crop_from_image(crop.to_image(there)) - there).length() < 1e-9);
+        assert!((crop.to_image(DVec2::splat(127.5)) - crop.center).length() < 1e-9);
     }
 
     #[test]
@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn search_covers_every_picture_shape() {
+    fn search_covers_every_image_shape() {
         for (width, height) in [(1, 1), (540, 960), (4000, 300)] {
             let crops = search_crops(width, height);
             assert!((3..200).contains(&crops.len()));

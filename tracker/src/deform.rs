@@ -1,5 +1,5 @@
 //! On-the-fly deformation (FlyHuman section 3.1): moves the nodes of a deformation graph until the posed Gaussians
-//! explain the pictures.
+//! explain the images.
 //!
 //! The unknowns are the nodes' canonical translations `t_i`. A Gaussian at canonical `x` moves by `t_x`, the Eq. 2 mean
 //! of its nodes, and stands in the world at `LBS(x + t_x)`. A [`DataTerm`] draws and compares; here its derivatives

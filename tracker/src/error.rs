@@ -5,7 +5,7 @@
 pub enum TrackErrorKind {
     /// No person was found in this frame set, or too little of one. The estimator searches again on the next set.
     Lost,
-    /// The frame set does not fit the rig: wrong number of slots, no frame at all, another picture size.
+    /// The frame set does not fit the rig: wrong number of slots, no frame at all, another image size.
     Frames,
     /// The pixels are not usable: another size than needed, or a format that cannot be read.
     Image,

@@ -12,7 +12,7 @@ pub enum NoMask {
     NoFrame,
     /// The network saw no person in the crop.
     NoPerson,
-    /// The fitted body lies outside this picture or behind the camera.
+    /// The fitted body lies outside this image or behind the camera.
     OutOfView,
     /// Nothing was left after cleaning.
     Empty,
@@ -73,7 +73,7 @@ pub struct PoseQuality {
 pub struct PoseEstimate {
     /// For the skeleton of [`crate::PoseEstimator::template`], at the set's master time.
     pub pose: Pose,
-    /// A slot a camera: the person's mask at the picture's size.
+    /// A slot a camera: the person's mask at the image's size.
     pub masks: Vec<Option<Mask>>,
     /// A slot a camera: what the network saw.
     pub keypoints: Vec<Option<ViewKeypoints>>,

@@ -49,7 +49,7 @@ const MAX_DELAY_SECS: f64 = 0.1;
 const MAX_SPEED: f64 = 12.0;
 /// Cameras that expose nearer to the set's time see the body where it is then, seconds.
 const MIN_DELAY_SECS: f64 = 5e-4;
-/// After a loss the whole picture is searched in every set, and ever more rarely up to every so many sets.
+/// After a loss the whole image is searched in every set, and ever more rarely up to every so many sets.
 const RAREST_SEARCH: u32 = 8;
 
 /// Landmarks in the world, metres.
@@ -181,7 +181,7 @@ impl PoseEstimator {
         &self.template
     }
 
-    /// Gives a camera's empty picture; masks of that camera then heed the difference to it as well.
+    /// Gives a camera's empty image; masks of that camera then heed the difference to it as well.
     ///
     /// # Errors
     /// Kind `Frames` when there is no such camera, `Image` when the size differs or the format cannot be read.
@@ -418,7 +418,7 @@ pub(crate) fn check_size(camera: &flyrig_types::Camera, image: &Image) -> Result
     Err(TrackError::new(
         TrackErrorKind::Image,
         format!(
-            "camera {}: the picture is {}x{} but its calibration is for {width}x{height}",
+            "camera {}: the image is {}x{} but its calibration is for {width}x{height}",
             camera.id,
             image.width(),
             image.height()

@@ -1,7 +1,7 @@
 //! Damped least squares of a body's turns on landmarks.
 //!
 //! The cost is a sum of halves of squared residuals, each divided by its standard deviation: landmark
-//! distances in the pictures and to world points (Cauchy weights), distances of the body's outline from the
+//! distances in the images and to world points (Cauchy weights), distances of the body's outline from the
 //! masks' and of its texture from the lines of its brightness (Geman-McClure weights), joint ranges, and the change since the last pose. Levenberg-Marquardt with analytic derivatives; only steps that lower the cost are taken.
 
 use flyrig_solve::{

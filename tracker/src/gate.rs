@@ -7,12 +7,12 @@ use crate::grid::Grid;
 
 /// Distance of most clothes and hair from the fitted body, metres: the unit of a gate's distances.
 const REACH_M: f64 = 0.13;
-/// Distance of wide skirts and coats, as a multiple of it: beyond 1, only where picture and background speak for it.
+/// Distance of wide skirts and coats, as a multiple of it: beyond 1, only where image and background speak for it.
 pub(crate) const CLOTHES_REACH: f32 = 2.5;
-/// Region of a picture that a posed body and its clothes may cover.
+/// Region of an image that a posed body and its clothes may cover.
 #[derive(Debug, Clone)]
 pub struct BodyGate {
-    /// Width and height of the picture.
+    /// Width and height of the image.
     pub(crate) image: [usize; 2],
     /// Box that holds everything allowed: x0, y0, x1, y1 (ends excluded).
     pub(crate) bounds: [usize; 4],
@@ -24,7 +24,7 @@ pub struct BodyGate {
 
 impl BodyGate {
     /// Projects the world vertices (metres) and triangles of one or several bodies; `None` when nothing of them is in the
-    /// picture.
+    /// image.
     #[must_use]
     pub fn new(camera: &Camera, vertices: &[Vec3], triangles: &[[u32; 3]]) -> Option<Self> {
         let mut depths: Vec<f64> = vertices
@@ -58,7 +58,7 @@ impl BodyGate {
         self.reaches(pixel % self.image[0], pixel / self.image[0])
     }
 
-    /// The gate of a body drawn as 1 in a grid of the picture's size.
+    /// The gate of a body drawn as 1 in a grid of the image's size.
     #[cfg(test)]
     pub(crate) fn of_grid(body: &Grid, px_per_m: f64) -> Self {
         let mut distance = body.distance_to_set();
@@ -66,7 +66,7 @@ impl BodyGate {
         Self { image: [body.width, body.height], bounds: [0, 0, body.width, body.height], distance, px_per_m }
     }
 
-    /// Intersection over union of a mask of the whole picture and the body's outline.
+    /// Intersection over union of a mask of the whole image and the body's outline.
     pub(crate) fn overlap(&self, mask: &Mask) -> f64 {
         let [x0, y0, ..] = self.bounds;
         let (mut both, mut body) = (0usize, 0usize);

@@ -1,9 +1,9 @@
-//! One-channel float pictures and what masks need of them.
+//! One-channel float images and what masks need of them.
 
 use flyrig_types::Mask;
 use glam::DVec2;
 
-/// A small picture of numbers, row by row.
+/// A small image of numbers, row by row.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Grid {
     pub width: usize,
@@ -124,7 +124,7 @@ impl Grid {
         Self { values: values.collect(), ..*self }
     }
 
-    /// As a mask of a larger picture; `None` when no pixel reaches one half.
+    /// As a mask of a larger image; `None` when no pixel reaches one half.
     pub fn paste(&self, width: usize, height: usize, x0: usize, y0: usize) -> Option<Mask> {
         if !self.values.iter().any(|v| *v >= 0.5) {
             return None;

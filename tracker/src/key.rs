@@ -1,7 +1,7 @@
 //! Masks before a screen of one colour.
 //!
 //! A screen's chroma (linear light less its mean) lies along that of the key colour, and its strength varies slowly over the
-//! picture with the lamps. Coverage is what is missing of the screen's chroma; what remains of it on the foreground is spill.
+//! image with the lamps. Coverage is what is missing of the screen's chroma; what remains of it on the foreground is spill.
 
 use std::fmt;
 use std::str::FromStr;
@@ -15,7 +15,7 @@ use crate::pixels::Rgb;
 const SCREEN_COSINE: f32 = 0.94;
 /// Least chroma of the screen over the key's: a screen in the shade.
 const LEAST_CHROMA: f32 = 0.12;
-/// Share of a picture that has to show the screen for the key to be used.
+/// Share of an image that has to show the screen for the key to be used.
 const LEAST_SCREEN: f32 = 0.02;
 /// Half of the side of the square in which the screen's light is averaged, pixels.
 const LOCAL_PX: usize = 24;
@@ -65,7 +65,7 @@ impl fmt::Display for KeyColor {
     }
 }
 
-/// The screen as a picture shows it.
+/// The screen as an image shows it.
 pub(crate) struct Screen {
     /// Chroma of each pixel along the key's, over that of the screen there: 1 on the screen.
     share: Grid,
@@ -85,7 +85,7 @@ impl Screen {
 }
 
 impl KeyColor {
-    /// `None` when the picture shows no screen of this colour.
+    /// `None` when the image shows no screen of this colour.
     pub(crate) fn screen(&self, picture: &Rgb) -> Option<Screen> {
         let (width, height) = (picture.width, picture.height);
         let key2 = dot(self.chroma, self.chroma);

@@ -76,10 +76,10 @@ pub const LANDMARK_BONES: [(usize, usize); 30] = [
     (17, 19),
 ];
 
-/// One landmark in one picture.
+/// One landmark in one image.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Keypoint {
-    /// Pixels of the picture; pixel centres at integers. May lie outside the picture.
+    /// Pixels of the image; pixel centres at integers. May lie outside the image.
     pub pixel: DVec2,
     /// 0 unusable (or unseen) to 1 certain.
     pub confidence: f64,

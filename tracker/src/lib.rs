@@ -1,17 +1,17 @@
 //! Person masks, keypoints, triangulation, the pose and shape fit of a template, and its deformation.
 //!
-//! Pictures of several calibrated cameras go in as a [`flyrig_types::FrameSet`]; the pose of a
+//! Images of several calibrated cameras go in as a [`flyrig_types::FrameSet`]; the pose of a
 //! [`flyrig_body::Template`] and one mask a camera come out:
 //!
-//! 1. [`PoseNet`] (BlazePose) finds 33 landmarks and a coarse mask in a turned square crop of each picture;
-//!    the crop follows the person, and is searched over the whole picture after the person was lost.
+//! 1. [`PoseNet`] (BlazePose) finds 33 landmarks and a coarse mask in a turned square crop of each image;
+//!    the crop follows the person, and is searched over the whole image after the person was lost.
 //! 2. [`triangulate`] joins the landmarks of the views, leaving out views that disagree.
 //! 3. A damped least-squares fit in pixels turns the template's joints; the bone lengths are
 //!    fitted once, over the first frames ([`PoseEstimator::fit_shape`]).
-//! 4. Masks come from the background ([`Background`]) and the network, sharpened on the picture and gated by the fitted
+//! 4. Masks come from the background ([`Background`]) and the network, sharpened on the image and gated by the fitted
 //!    body. [`matte`] solves for coverage and foreground colour along their outlines.
 //!
-//! [`DeformTracker`] then moves the nodes of a deformation graph so that the posed Gaussians explain the pictures.
+//! [`DeformTracker`] then moves the nodes of a deformation graph so that the posed Gaussians explain the images.
 
 mod anatomy;
 mod background;

@@ -68,11 +68,11 @@ impl Look {
 }
 
 /// Chooses the views that the network looks at again: all that have no look, all in which the body has moved far, and of
-/// those in which it has moved by more than `limit_m` the one that waits most. Views without a picture get none. Of those
+/// those in which it has moved by more than `limit_m` the one that waits most. Views without an image get none. Of those
 /// that have a look no more than `most` are chosen.
 pub(crate) fn due(
     looks: &[Option<Look>],
-    has_picture: impl Fn(usize) -> bool,
+    has_image: impl Fn(usize) -> bool,
     marks: &[DVec3; LANDMARK_COUNT],
     nanos: i64,
     limit_m: f64,
@@ -82,7 +82,7 @@ pub(crate) fn due(
         .iter()
         .enumerate()
         .map(|(slot, look)| match look {
-            _ if !has_picture(slot) => f64::NEG_INFINITY,
+            _ if !has_image(slot) => f64::NEG_INFINITY,
             None => f64::INFINITY,
             Some(look) => look.staleness_m(marks, nanos),
         })
@@ -95,7 +95,7 @@ pub(crate) fn due(
     due
 }
 
-/// Corners of a body in a picture: pixel and depth in metres.
+/// Corners of a body in an image: pixel and depth in metres.
 pub(crate) type Corners = Vec<Option<(DVec2, f64)>>;
 
 /// Projects the vertices of a body.
@@ -139,7 +139,7 @@ pub(crate) fn carried_mask(sighting: &Sighting, then: &Corners, now: &Corners, b
             let pixel = DVec2::new(x as f64, y as f64);
             let Some(at) = cell_of(pixel) else { continue };
             let before = pixel - motion[at] / f64::max(count[at], 1e-9);
-            let value = net_probability(&sighting.output.mask, sighting.crop.crop_from_picture(before));
+            let value = net_probability(&sighting.output.mask, sighting.crop.crop_from_image(before));
             coarse.values[(y - y0) * (x1 - x0) + x - x0] = value;
         }
     }

@@ -12,12 +12,12 @@ use crate::crop::Crop;
 use crate::net::{CropLandmark, NET_SIDE, NetOutput};
 use crate::testing::{body, mask_of, random_turns, ring};
 
-/// A network that sees a person on the coverage of a picture.
+/// A network that sees a person on the coverage of an image.
 fn sighting(crop: Crop, coverage: impl Fn(DVec2) -> f32) -> Sighting {
     let mut mask = Vec::new();
     for y in 0..NET_SIDE {
         for x in 0..NET_SIDE {
-            mask.push(coverage(crop.to_picture(DVec2::new(x as f64, y as f64))));
+            mask.push(coverage(crop.to_image(DVec2::new(x as f64, y as f64))));
         }
     }
     let landmarks = [CropLandmark::default(); LANDMARK_COUNT];

@@ -46,7 +46,7 @@ pub fn matte(image: &Image, mask: &Mask, background: Option<&Background>) -> Res
         return Err(TrackError::new(
             crate::TrackErrorKind::Image,
             format!(
-                "the mask is {}x{} but the picture {}x{}",
+                "the mask is {}x{} but the image {}x{}",
                 mask.width(),
                 mask.height(),
                 picture.width,
@@ -71,7 +71,7 @@ struct Band<'a> {
     y0: usize,
     width: usize,
     height: usize,
-    /// Linear light of the picture's pixels.
+    /// Linear light of the image's pixels.
     light: Vec<[f32; 3]>,
     /// Distance of pixels in the mask to the nearest one outside, and the other way round; 0 on the other side.
     inner: Grid,
@@ -174,7 +174,7 @@ impl<'a> Band<'a> {
         behind.iter().enumerate().map(scaled).collect()
     }
 
-    /// Index in the picture of a pixel of the band.
+    /// Index in the image of a pixel of the band.
     fn pixel(&self, at: usize) -> usize {
         (self.y0 + at / self.width) * self.picture.width + self.x0 + at % self.width
     }
@@ -456,7 +456,7 @@ mod tests {
     }
 
     #[test]
-    fn empty_full_and_black_pictures_and_other_sizes_do_no_harm() {
+    fn empty_full_and_black_images_and_other_sizes_do_no_harm() {
         let black = picture(|_, _| [0.0; 3]);
         let plate = background(&black);
         for coverage in [0, 255] {

@@ -3,7 +3,7 @@
 use crate::landmark_net::{LandmarkNet, sigmoid};
 use crate::{LANDMARK_COUNT, TrackError};
 
-/// Side of the network's picture, pixels.
+/// Side of the network's image, pixels.
 pub const NET_SIDE: usize = 256;
 
 /// Floats a landmark takes in the network's output.

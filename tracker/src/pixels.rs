@@ -1,4 +1,4 @@
-//! Pictures as plain RGB bytes.
+//! Images as plain RGB bytes.
 
 use std::borrow::Cow;
 
@@ -7,7 +7,7 @@ use glam::DVec2;
 
 use crate::{TrackError, TrackErrorKind};
 
-/// RGB bytes of a picture, borrowed where the picture already has them.
+/// RGB bytes of an image, borrowed where the image already has them.
 #[derive(Debug, Clone)]
 pub(crate) struct Rgb<'a> {
     pub width: usize,
@@ -17,17 +17,18 @@ pub(crate) struct Rgb<'a> {
 
 impl<'a> Rgb<'a> {
     pub fn new(image: &'a Image) -> Result<Self, TrackError> {
-        let bytes = if image.format() == PixelFormat::Rgb8 {
-            Cow::Borrowed(image.bytes())
-        } else {
-            Cow::Owned(flyrig_capture::to_rgb8(image).map_err(|error| {
-                TrackError::new(TrackErrorKind::Image, format!("a picture cannot be read: {error}"))
-            })?)
-        };
+        let bytes =
+            if image.format() == PixelFormat::Rgb8 {
+                Cow::Borrowed(image.bytes())
+            } else {
+                Cow::Owned(flyrig_capture::to_rgb8(image).map_err(|error| {
+                    TrackError::new(TrackErrorKind::Image, format!("an image cannot be read: {error}"))
+                })?)
+            };
         Ok(Self { width: image.width() as usize, height: image.height() as usize, bytes })
     }
 
-    /// Returns whether the picture is uniform except for noise, as with a covered lens.
+    /// Returns whether the image is uniform except for noise, as with a covered lens.
     pub fn is_blank(&self) -> bool {
         /// Blocks in each direction whose means are compared, and side of a block, pixels.
         const BLOCKS: usize = 24;

@@ -1,4 +1,4 @@
-//! Differences of a picture from the empty scene of the same camera, and masks from them.
+//! Differences of an image from the empty scene of the same camera, and masks from them.
 
 use flyrig_solve::median;
 use flyrig_types::{Image, Mask};
@@ -24,14 +24,14 @@ const GAIN_SAMPLES: usize = 40;
 const ON_BODY: f32 = 0.15;
 const DEEP_IN_BODY: f32 = 0.35;
 const OFF_BODY: f32 = 0.4;
-/// Depth in the body, metres, from which only a sure difference of the picture speaks against a person.
+/// Depth in the body, metres, from which only a sure difference of the image speaks against a person.
 const DEEP_M: f64 = 0.04;
 
-/// Returns the person's mask in a picture from the empty scene of the same camera and the posed body; `None` when nothing
+/// Returns the person's mask in an image from the empty scene of the same camera and the posed body; `None` when nothing
 /// stands out near the body.
 ///
 /// A pixel's colour is split into brightness along the plate's colour and a remainder (Horprasert et al. 1999): a remainder
-/// beyond the picture's own noise, or a brightness that no shadow explains, is foreground, unless it lies out of the gate's
+/// beyond the image's own noise, or a brightness that no shadow explains, is foreground, unless it lies out of the gate's
 /// reach. Large pieces stay, small holes are filled.
 ///
 /// # Errors
@@ -45,7 +45,7 @@ pub fn mask_from_plate(image: &Image, plate: &Image, gate: &BodyGate) -> Result<
             return Err(TrackError::new(
                 TrackErrorKind::Image,
                 format!(
-                    "the picture is {}x{} but the {whose} {width}x{height}; take the plate with the same camera settings",
+                    "the image is {}x{} but the {whose} {width}x{height}; take the plate with the same camera settings",
                     picture.width, picture.height
                 ),
             ));
@@ -85,15 +85,15 @@ pub(crate) fn gated_mask(evidence: &Grid, gate: &BodyGate) -> Option<Mask> {
     voted.paste(width, height, x0, y0)
 }
 
-/// Returns a picture's bytes as numbers.
+/// Returns an image's bytes as numbers.
 pub(crate) fn floats(picture: &Rgb) -> Vec<f32> {
     picture.bytes.iter().map(|byte| f32::from(*byte)).collect()
 }
 
-/// Exposure of a picture relative to a plate.
+/// Exposure of an image relative to a plate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Drift {
-    /// Picture over plate, by channel.
+    /// Image over plate, by channel.
     pub gain: [f32; 3],
     /// Standard deviation of the background after the gain, sRGB steps.
     pub noise: f32,

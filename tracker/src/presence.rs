@@ -1,4 +1,4 @@
-//! Whether a picture shows anybody.
+//! Whether an image shows anybody.
 
 use flyrig_types::Image;
 
@@ -9,10 +9,10 @@ use crate::{PoseConfig, PoseNet, TrackError};
 /// Least probability of a person: an empty room has furniture that looks a little like one.
 const SURE: f64 = 0.8;
 
-/// Returns whether the pose network finds a person anywhere in a picture. Takes about a second.
+/// Returns whether the pose network finds a person anywhere in an image. Takes about a second.
 ///
 /// # Errors
-/// Kinds `Image` and `Net` when the picture cannot be read or the network fails.
+/// Kinds `Image` and `Net` when the image cannot be read or the network fails.
 pub fn shows_person(net: &PoseNet, image: &Image) -> Result<bool, TrackError> {
     let config = PoseConfig { presence_threshold: SURE, ..PoseConfig::default() };
     Ok(!sightings(net, &Rgb::new(image)?, &config)?.is_empty())

@@ -1,4 +1,4 @@
-//! Finding the person: crops over the whole picture, and agreement between the views.
+//! Finding the person: crops over the whole image, and agreement between the views.
 
 use flyrig_types::Camera;
 use glam::{DVec2, DVec3};
@@ -13,7 +13,7 @@ use crate::single_view::lift;
 use crate::triangulate::{WorldPoint, triangulate};
 use crate::{LANDMARK_COUNT, PoseConfig, PoseNet, TrackError, ViewKeypoints};
 
-/// Hypotheses kept a picture.
+/// Hypotheses kept an image.
 const KEEP: usize = 4;
 
 /// Hypotheses older than this are forgotten, nanoseconds: a person walks on.
@@ -22,7 +22,7 @@ const FORGET_NANOS: i64 = 1_000_000_000;
 const NEAR_CENTER_M: f64 = 2.0;
 /// A crop around a piece of foreground is larger by this factor.
 const BLOB_MARGIN: f64 = 1.25;
-/// Pieces of foreground that are looked at in a picture.
+/// Pieces of foreground that are looked at in an image.
 const BLOBS: usize = 2;
 
 /// Images, background and known people of a search.
@@ -42,8 +42,8 @@ pub(crate) struct SearchScene<'a> {
 
 /// The search for a person who may be anywhere, spread over sets so that none takes long.
 ///
-/// Each step looks where the picture differs from the empty scene, where other views have seen somebody, and at the next few of
-/// the crops that cover the whole picture.
+/// Each step looks where the image differs from the empty scene, where other views have seen somebody, and at the next few of
+/// the crops that cover the whole image.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Search {
     views: Vec<ViewSearch>,
@@ -51,7 +51,7 @@ pub(crate) struct Search {
 
 #[derive(Debug, Clone, Default)]
 struct ViewSearch {
-    /// Next crop of those that cover the picture.
+    /// Next crop of those that cover the image.
     next: usize,
     /// Whether all of them were looked at since the search began.
     swept: bool,
@@ -62,7 +62,7 @@ struct ViewSearch {
 }
 
 impl Search {
-    /// Looks further and returns the person whom most views agree on, by slot. Without agreement, and once every picture was
+    /// Looks further and returns the person whom most views agree on, by slot. Without agreement, and once every image was
     /// looked at as a whole, the surest and largest sighting of one view. No sighting at all: go on with the next set.
     pub fn step(&mut self, scene: &SearchScene<'_>) -> Result<Vec<Option<Sighting>>, TrackError> {
         self.views.resize_with(scene.cameras.len(), ViewSearch::default);
@@ -176,7 +176,7 @@ impl ViewSearch {
     }
 }
 
-/// Everybody the network finds in a picture, best first.
+/// Everybody the network finds in an image, best first.
 pub(crate) fn sightings(net: &PoseNet, picture: &Rgb, config: &PoseConfig) -> Result<Vec<Sighting>, TrackError> {
     let mut view = ViewSearch::default();
     for crop in search_crops(picture.width as u32, picture.height as u32) {

@@ -36,7 +36,7 @@ impl Sighting {
         self.output.presence * self.mean_confidence() * self.crop.side.max(1.0).sqrt()
     }
 
-    /// Whether this is the person with these landmarks in the picture.
+    /// Whether this is the person with these landmarks in the image.
     pub fn shows(&self, pixels: &[Option<DVec2>; LANDMARK_COUNT]) -> bool {
         self.mean_distance(pixels).is_some_and(|distance| distance < 0.1 * self.crop.side)
     }

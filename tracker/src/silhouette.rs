@@ -1,4 +1,4 @@
-//! Masks without a plate: the network's coarse mask, sharpened on the picture and gated by the fitted body.
+//! Masks without a plate: the network's coarse mask, sharpened on the image and gated by the fitted body.
 
 use flyrig_types::Mask;
 use glam::DVec2;
@@ -20,18 +20,18 @@ pub(crate) fn coarse_mask(sighting: &Sighting, bounds: [usize; 4]) -> Grid {
     let mut coarse = Grid::new(x1 - x0, y1 - y0, 0.0);
     for y in y0..y1 {
         for x in x0..x1 {
-            let at = sighting.crop.crop_from_picture(DVec2::new(x as f64, y as f64));
+            let at = sighting.crop.crop_from_image(DVec2::new(x as f64, y as f64));
             coarse.values[(y - y0) * (x1 - x0) + x - x0] = net_probability(&sighting.output.mask, at);
         }
     }
     coarse
 }
 
-/// Person mask of a picture from the network's coarse one inside of the gate's bounds, and the size of one of its pixels in
-/// the picture's; `None` when nothing is left.
+/// Person mask of an image from the network's coarse one inside of the gate's bounds, and the size of one of its pixels in
+/// the image's; `None` when nothing is left.
 ///
 /// The network's probability is joined with a colour model of person and surroundings (histograms of this
-/// picture's own sure regions) and the distance to the fitted body, then smoothed along the picture's edges
+/// image's own sure regions) and the distance to the fitted body, then smoothed along the image's edges
 /// by a guided filter (He et al. 2010), so that the outline snaps to them.
 /// Evidence from an empty plate in the gate's bounds counts as well where there is one: it sees
 /// thin parts that the coarse mask misses, and the coarse mask sees what has the background's colour.

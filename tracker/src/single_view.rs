@@ -1,4 +1,4 @@
-//! A guess at the third dimension from one picture.
+//! A guess at the third dimension from one image.
 
 use flyrig_types::Camera;
 use glam::{DMat3, DVec2, DVec3};
@@ -8,7 +8,7 @@ use crate::sighting::Sighting;
 use crate::view::{View, observe};
 
 /// World points from one view: the network's hip-centred landmarks (in metres, for a trunk of half a
-/// metre; times `scale`), turned by the crop, moved to where they explain the picture best (linear least squares).
+/// metre; times `scale`), turned by the crop, moved to where they explain the image best (linear least squares).
 /// `None` when that place is behind the camera or not finite.
 pub(crate) fn lift(
     camera: &Camera,

@@ -42,7 +42,7 @@ fn vertices_below(template: &Template, joints: &[usize]) -> Vec<usize> {
 /// The landmarks' places on the template.
 ///
 /// Joints for shoulders, elbows, wrists, hips, knees, ankles; for the face, the hands and the feet places on
-/// the surface: the network was taught on pictures, where people click the skin.
+/// the surface: the network was taught on images, where people click the skin.
 pub(crate) fn find_marks(
     template: &Template,
     roles: &Roles,

@@ -16,7 +16,7 @@ pub struct WorldPoint {
     pub position: DVec3,
     /// Views that agree (rig slots).
     pub inliers: Vec<usize>,
-    /// Root mean square distance of the agreeing views, pixels of the undistorted picture.
+    /// Root mean square distance of the agreeing views, pixels of the undistorted image.
     pub residual_px: f64,
 }
 

@@ -35,7 +35,7 @@ pub struct TrainArgs {
     /// Frames of --dataset from one sample to the next.
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=100_000))]
     pub every: u64,
-    /// Pose in --dataset: from its glTF animation, or from the pictures.
+    /// Pose in --dataset: from its glTF animation, or from the images.
     #[arg(long, value_enum, default_value = "given")]
     pub pose: Origin,
     /// Frame rate of --dataset.
@@ -68,7 +68,7 @@ pub struct TrainArgs {
     /// Checkpoints (one every 250 steps) from one measurement on the test people to the next.
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub test_every: u64,
-    /// Pixels of a simulated picture's side.
+    /// Pixels of a simulated image's side.
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
     pub side: u32,
     /// Gaussians on the person's surface.

@@ -1,13 +1,13 @@
-//! From an engine's last update and held-out pictures to a training sample.
+//! From an engine's last update and held-out images to a training sample.
 
 use anyhow::{Context as _, Result, ensure};
 use flyrig_capture::to_rgb8;
 use flyrig_fusion::{Observed, PersonId, Session};
 use flyrig_renderer::{AppearanceSettings, PosedGaussians};
-use flyrig_stfa::{TargetPicture, TrainingSample, ViewPicture, training_sample};
+use flyrig_stfa::{TargetImage, TrainingSample, ViewImage, training_sample};
 use flyrig_types::{Camera, Image, Mask};
 
-/// Squares of pixels a held-out picture.
+/// Squares of pixels a held-out image.
 const PATCHES: usize = 16;
 
 /// What a camera saw that was no input.
@@ -28,15 +28,15 @@ pub fn gather(
     let person = PersonId::default();
     let subject = session.subject(person).context("nobody was simulated")?;
     let Observed { observations, pictures, center_scale, normal } = session.observed(person)?;
-    let pictures: Vec<ViewPicture<'_>> =
-        pictures.iter().map(|(width, height, rgba)| ViewPicture { width: *width, height: *height, rgba }).collect();
+    let pictures: Vec<ViewImage<'_>> =
+        pictures.iter().map(|(width, height, rgba)| ViewImage { width: *width, height: *height, rgba }).collect();
     let rgba: Vec<Vec<u8>> = held_out.iter().map(rgba).collect::<Result<_>>()?;
-    let targets: Vec<TargetPicture<'_>> = held_out
+    let targets: Vec<TargetImage<'_>> = held_out
         .iter()
         .zip(&rgba)
         .map(|(of, rgba)| {
             let (width, height) = (of.image.width(), of.image.height());
-            TargetPicture { camera: of.camera, picture: ViewPicture { width, height, rgba } }
+            TargetImage { camera: of.camera, picture: ViewImage { width, height, rgba } }
         })
         .collect();
     let posed = PosedGaussians { center_scale: &center_scale, normal: &normal };
@@ -46,6 +46,6 @@ pub fn gather(
 fn rgba(of: &HeldOut<'_>) -> Result<Vec<u8>> {
     let rgb = to_rgb8(of.image)?;
     let coverage = of.mask.coverage();
-    ensure!(rgb.len() == coverage.len() * 3, "camera {}: mask and picture differ in size", of.camera.id);
+    ensure!(rgb.len() == coverage.len() * 3, "camera {}: mask and image differ in size", of.camera.id);
     Ok(rgb.chunks_exact(3).zip(coverage).flat_map(|(c, &a)| [c[0], c[1], c[2], a]).collect())
 }

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use super::gather::{HeldOut, gather};
 /// Cameras around each person.
 const CAMERAS: usize = 7;
-/// Pictures that are compared an instant.
+/// Images that are compared an instant.
 const TARGETS: usize = 3;
 /// Instants before the first sample, in which the deformation finds the clothes.
 const WARM_UP: u64 = 3;
@@ -35,7 +35,7 @@ pub struct People {
     pub seed: u64,
     /// Instants of each person, each with cameras, lens and pose of its own.
     pub instants: u64,
-    /// Pixels of a picture's side, from 0.85 to 1.3 times as many for each person.
+    /// Pixels of an image's side, from 0.85 to 1.3 times as many for each person.
     pub side: u32,
     /// Gaussians on the person's surface.
     pub gaussians: usize,
@@ -45,7 +45,7 @@ impl People {
     /// The capture of one person: the simulator's random people, motion, rooms, lights, lenses and calibration errors.
     /// What only costs time stays away: lens openings and rolling shutters (which draw the room several times), most of
     /// the furnished rooms. Sensors differ less than at worst, since a rig's colours are matched, and the held-out
-    /// pictures would only teach their own casts.
+    /// images would only teach their own casts.
     pub fn capture(&self, person: u64) -> SimConfig {
         let training =
             TrainingConfig { seed: self.seed, cameras: CAMERAS, size: [self.side; 2], ..TrainingConfig::default() };

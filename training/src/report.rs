@@ -1,4 +1,4 @@
-//! How a training goes: curve, table, picture.
+//! How a training goes: curve, table, image.
 
 use std::{fmt, path::Path};
 
@@ -103,7 +103,7 @@ impl Progress {
         format!("{ours:.2} dB, {:+.2} over direct{held_out}", ours - direct)
     }
 
-    /// Writes table, picture and what a resumed run needs.
+    /// Writes table, image and what a resumed run needs.
     pub fn save(&self, folder: &Path) -> Result<()> {
         write_whole(&folder.join("progress.json"), &serde_json::to_vec(&(&self.losses, &self.scores))?)?;
         let rows: Vec<String> =

@@ -2,7 +2,7 @@
 //! `cargo run --release -p flyrig-transport --example throughput [-- SECONDS]`.
 //!
 //! Prints duration of the publish calls, latency from the call to the receipt in the other process,
-//! rates and losses: 60 kB pictures of four views and splat states of 115k Gaussians, at 30 a second and
+//! rates and losses: 60 kB images of four views and splat states of 115k Gaussians, at 30 a second and
 //! as fast as they go, with and without shared memory.
 
 use std::{

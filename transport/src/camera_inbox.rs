@@ -32,7 +32,7 @@ const EAGER_QUESTIONS: u32 = 100;
 pub(crate) struct CameraInbox {
     rig: String,
     slots: Vec<Slot>,
-    /// Most bytes of pictures that wait, over all cameras.
+    /// Most bytes of images that wait, over all cameras.
     quota: u64,
     /// By publisher.
     hosts: BTreeMap<u64, Host>,
@@ -191,7 +191,7 @@ impl CameraInbox {
         self.fit();
     }
 
-    /// Drops the oldest frames of the camera with the most bytes waiting until the quota holds: a camera of huge pictures
+    /// Drops the oldest frames of the camera with the most bytes waiting until the quota holds: a camera of huge images
     /// loses its own.
     fn fit(&mut self) {
         while self.slots.iter().map(Slot::waiting_bytes).sum::<u64>() > self.quota {

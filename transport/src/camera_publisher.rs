@@ -82,12 +82,12 @@ impl CameraPublisher {
     /// Hands in a frame.
     ///
     /// # Errors
-    /// `Config` for a camera that was not named at the start and a picture of more than [`MAX_FRAME_BYTES`].
+    /// `Config` for a camera that was not named at the start and an image of more than [`MAX_FRAME_BYTES`].
     pub fn publish(&self, frame: Frame) -> Result<PublishOutcome, TransportError> {
         let lane = self.lane(&frame.camera)?;
         let length = frame.image.bytes().len();
         if length > MAX_FRAME_BYTES {
-            let text = format!("picture of {length} bytes, at most {MAX_FRAME_BYTES}; choose a smaller size");
+            let text = format!("image of {length} bytes, at most {MAX_FRAME_BYTES}; choose a smaller size");
             return Err(TransportError::config(format!("camera {}", frame.camera), text));
         }
         let header = Header {

@@ -57,7 +57,7 @@ impl Default for TransportConfig {
             max_viewers: 4,
             viewpoint_lease_millis: 3000,
             viewpoint_pixels_per_second: 512 * 512 * 30 * 4,
-            // Four waiting pictures of 1280x720 YUYV from each of 16 cameras are 118 MB.
+            // Four waiting images of 1280x720 YUYV from each of 16 cameras are 118 MB.
             inbox_bytes: 256 << 20,
         }
     }
@@ -138,7 +138,7 @@ impl TransportConfig {
             // Gossip would connect the viewers of one rig to each other for nothing.
             ("scouting/gossip/enabled", self.multicast.to_string()),
             ("transport/shared_memory/enabled", self.shared_memory.to_string()),
-            // zenoh's 2 batches of 64 KiB overflow when several pictures leave at once; 8 hold two frames of four views.
+            // zenoh's 2 batches of 64 KiB overflow when several images leave at once; 8 hold two frames of four views.
             ("transport/link/tx/queue/size/data", "8".to_owned()),
             ("transport/link/rx/max_message_size", largest.to_string()),
         ];

@@ -1,4 +1,4 @@
-//! A camera's picture on the wire: its bytes as the payload, what they are in the attachment.
+//! A camera's image on the wire: its bytes as the payload, what they are in the attachment.
 
 use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 use serde::{Deserialize, Serialize};
@@ -10,7 +10,7 @@ use crate::{
     stats::{from_json, to_json},
 };
 
-/// Largest picture of a camera, bytes: 16 million pixels of three.
+/// Largest image of a camera, bytes: 16 million pixels of three.
 pub const MAX_FRAME_BYTES: usize = 48 << 20;
 
 /// Bytes of an encoded [`FrameHeader`].
@@ -35,7 +35,7 @@ const FORMATS: [(u8, PixelFormat); 12] = [
     (12, PixelFormat::Mjpeg),
 ];
 
-/// The attachment of a camera's picture: a [`Header`] (`frame` is the camera's own sequence number, `capture_nanos` the
+/// The attachment of a camera's image: a [`Header`] (`frame` is the camera's own sequence number, `capture_nanos` the
 /// middle of the exposure by the clock of the camera's computer), then 24 bytes, little-endian: exposure u64 (nanoseconds,
 /// all ones where it is not known), messages of this topic that never left u64, pixel format u8, seven zeros.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -73,7 +73,7 @@ impl FrameHeader {
         let header = Header::decode(topic, head)?;
         let malformed = |text: String| TransportError::malformed(topic, text);
         if header.kind != MessageKind::Frame {
-            return Err(malformed(format!("holds {:?}, expected a camera's picture", header.kind)));
+            return Err(malformed(format!("holds {:?}, expected a camera's image", header.kind)));
         }
         let mut reader = Reader(tail);
         let parts = (tail.len() == TAIL_BYTES)
@@ -100,7 +100,7 @@ impl FrameHeader {
     pub fn frame(&self, topic: &str, camera: &CameraId, bytes: Vec<u8>) -> Result<Frame, TransportError> {
         let Header { width, height, frame, capture_nanos, .. } = self.header;
         if bytes.is_empty() || bytes.len() > MAX_FRAME_BYTES {
-            let text = format!("picture of {} bytes, expected 1 to {MAX_FRAME_BYTES}", bytes.len());
+            let text = format!("image of {} bytes, expected 1 to {MAX_FRAME_BYTES}", bytes.len());
             return Err(TransportError::malformed(topic, text));
         }
         let image = Image::new(width, height, self.format, bytes)
@@ -215,7 +215,7 @@ mod tests {
         let mut version = good.encode();
         version[4] = 7;
         assert_eq!(FrameHeader::decode("x", &version).unwrap_err().kind, TransportErrorKind::UnknownVersion);
-        for (bytes, text) in [(0, "picture of 0 bytes"), (15, "needs 16 bytes but has 15"), (17, "has 17")] {
+        for (bytes, text) in [(0, "image of 0 bytes"), (15, "needs 16 bytes but has 15"), (17, "has 17")] {
             let error = good.frame("x", &"left".into(), vec![0; bytes]).unwrap_err();
             assert!(error.to_string().contains(text), "{error}");
         }

@@ -28,7 +28,7 @@ pub enum MessageKind {
     Transforms,
     /// [`crate::RigStats`].
     Stats,
-    /// A camera's picture, see [`crate::FrameHeader`].
+    /// A camera's image, see [`crate::FrameHeader`].
     Frame,
     /// [`crate::CameraStatus`].
     CameraStatus,

@@ -198,7 +198,7 @@ mod tests {
         }
     }
 
-    /// A wire of 200 us each way; every third exchange waits up to 20 ms more behind pictures, on one way only.
+    /// A wire of 200 us each way; every third exchange waits up to 20 ms more behind images, on one way only.
     fn exchange(fit: &mut ClockFit, truth: &Truth, local: i64, random: &mut Random) {
         let mut way = || 200_000 + (random.unit() * 30_000.0) as i64;
         let (mut there, mut back) = (way(), way());

@@ -27,7 +27,7 @@ pub(crate) fn key(rig: &str, rest: &str) -> String {
     format!("flyrig/v{SCHEMA_VERSION}/{rig}/{rest}")
 }
 
-/// Last parts of the key where a view's pictures go.
+/// Last parts of the key where a view's images go.
 pub(crate) fn view_label(name: &str) -> String {
     match name.strip_prefix(VIEWER_PREFIX) {
         Some(subscriber) => format!("viewer/{subscriber}/view"),
@@ -94,7 +94,7 @@ pub(crate) fn any_version_alive(rig: &str) -> String {
 /// Labels of a camera's status begin so.
 pub(crate) const STATUS: &str = "camera-status/";
 
-/// Last parts of the key where a camera's pictures go.
+/// Last parts of the key where a camera's images go.
 pub(crate) fn frames_label(camera: &CameraId) -> String {
     format!("camera/{camera}")
 }

@@ -16,7 +16,7 @@
 //! | `transforms` | foxglove `FrameTransforms`: `world_from_camera` of every camera and the world's up |
 //! | `stats` | [`RigStats`], JSON |
 //! | `viewpoint/<subscriber>` | query and reply: JSON, the request and the answer |
-//! | `camera/<camera>` | a camera's picture as it came, [`FrameHeader`] as the attachment |
+//! | `camera/<camera>` | a camera's image as it came, [`FrameHeader`] as the attachment |
 //! | `camera-status/<camera>` | [`CameraStatus`], JSON |
 //! | `clock/<host>` | query and reply: that computer's `CLOCK_MONOTONIC`, nanoseconds, i64 little-endian |
 //! | `alive/<publisher>`, `viewer/<subscriber>/alive`, `host/<host>` | liveliness tokens |

@@ -126,7 +126,7 @@ impl Publisher {
         &self.endpoints
     }
 
-    /// Makes a view known so that subscribers of it are noticed before its first picture.
+    /// Makes a view known so that subscribers of it are noticed before its first image.
     ///
     /// # Errors
     /// `Config` for a bad name or more than 64 views.
@@ -147,7 +147,7 @@ impl Publisher {
         self.splats.is_watched()
     }
 
-    /// Hands in a picture.
+    /// Hands in an image.
     ///
     /// # Errors
     /// `Config` for a bad name, size or more than 64 views.
@@ -254,8 +254,8 @@ impl Publisher {
         leases.viewpoints()
     }
 
-    /// Viewpoints to draw for the frame set at `now`: those that are watched and whose last picture is a period of their
-    /// `max_fps` old. Each is taken: its next picture is due a period later, so call this once a frame set.
+    /// Viewpoints to draw for the frame set at `now`: those that are watched and whose last image is a period of their
+    /// `max_fps` old. Each is taken: its next image is due a period later, so call this once a frame set.
     #[must_use]
     pub fn due_viewpoints(&self, now: Instant) -> Vec<Viewpoint> {
         let watched = |topic: &&Arc<Topic>| topic.is_watched() && topic.name.starts_with(VIEWER_PREFIX);

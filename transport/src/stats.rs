@@ -50,7 +50,7 @@ impl From<StageStats> for WireStageStats {
 pub struct ViewRate {
     /// Name of the view.
     pub view: String,
-    /// Pictures a second.
+    /// Images a second.
     pub per_second: f64,
     /// Bytes a second.
     pub bytes_per_second: f64,
@@ -61,7 +61,7 @@ pub struct ViewRate {
 pub struct TrackingStats {
     /// "searching", "first", "steady", "recovering" or "lost".
     pub state: String,
-    /// How much of the person is where the pictures show it, 0 to 1; none when nothing was compared.
+    /// How much of the person is where the images show it, 0 to 1; none when nothing was compared.
     pub quality: Option<f64>,
     /// The same by camera; one that is covered is near 0.
     pub cameras: BTreeMap<String, f64>,

@@ -144,7 +144,7 @@ impl Subscriber {
         format!("{VIEWER_PREFIX}{}", self.id)
     }
 
-    /// The next picture nobody has taken yet, of any view (views take turns); `None` after the timeout.
+    /// The next image nobody has taken yet, of any view (views take turns); `None` after the timeout.
     ///
     /// # Errors
     /// `UnknownVersion` or `Malformed`, once for each such message or publisher, whichever topic it was
@@ -204,8 +204,8 @@ impl Subscriber {
         self.inbox.rig(timeout)
     }
 
-    /// Asks for pictures through a camera of our own, or moves it; renewed until given back. The
-    /// pictures come with [`Self::next_view`] as the view [`Self::viewpoint_view`].
+    /// Asks for images through a camera of our own, or moves it; renewed until given back. The
+    /// images come with [`Self::next_view`] as the view [`Self::viewpoint_view`].
     ///
     /// # Errors
     /// `Config` when the camera is not valid, larger than 4096 pixels a side, or `max_fps` is not in 0..=1000.

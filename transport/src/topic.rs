@@ -133,7 +133,7 @@ impl Topic {
         TopicCounts { watched: self.is_watched(), ..lock(&self.state).counts }
     }
 
-    /// Small messages travel in a queue of their own, so that pictures never hold them up.
+    /// Small messages travel in a queue of their own, so that images never hold them up.
     pub(crate) fn priority(&self) -> Priority {
         match self.kind {
             MessageKind::Motion => Priority::InteractiveHigh,

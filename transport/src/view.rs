@@ -1,4 +1,4 @@
-//! Pictures on the wire: foxglove `CompressedImage`.
+//! Images on the wire: foxglove `CompressedImage`.
 
 use foxglove::{
     Decode, Encode,
@@ -8,13 +8,13 @@ use prost::bytes::Bytes;
 
 use crate::TransportError;
 
-/// Largest compressed picture, bytes.
+/// Largest compressed image, bytes.
 pub const MAX_IMAGE_BYTES: usize = 32 << 20;
 
-/// Largest message of a view: the picture and the few fields around it, bytes.
+/// Largest message of a view: the image and the few fields around it, bytes.
 pub(crate) const MAX_MESSAGE_BYTES: usize = MAX_IMAGE_BYTES + (4 << 10);
 
-/// How a picture is compressed.
+/// How an image is compressed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ImageFormat {
     /// JPEG.
@@ -38,7 +38,7 @@ impl ImageFormat {
     }
 }
 
-/// A compressed picture of a view; the caller compresses and decompresses.
+/// A compressed image of a view; the caller compresses and decompresses.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ViewFrame {
     /// Pixels.
@@ -47,7 +47,7 @@ pub struct ViewFrame {
     pub height: u32,
     /// What `bytes` are.
     pub format: ImageFormat,
-    /// The compressed picture; `Bytes::from(vec)` takes a `Vec<u8>` without copying.
+    /// The compressed image; `Bytes::from(vec)` takes a `Vec<u8>` without copying.
     pub bytes: Bytes,
     /// The rig's frame number.
     pub frame: u64,
@@ -103,7 +103,7 @@ impl ViewFrame {
     /// `Malformed`.
     pub fn decode(view: &str, header: &crate::Header, payload: Bytes) -> Result<Self, TransportError> {
         if payload.len() > MAX_MESSAGE_BYTES {
-            return Err(TransportError::malformed(view, format!("{} bytes are too many for a picture", payload.len())));
+            return Err(TransportError::malformed(view, format!("{} bytes are too many for an image", payload.len())));
         }
         let image = CompressedImage::decode(payload)
             .map_err(|error| TransportError::malformed(view, format!("not a CompressedImage: {error}")))?;
@@ -129,6 +129,6 @@ fn check_len(view: &str, len: usize) -> Result<(), TransportError> {
     }
     Err(TransportError::config(
         format!("view {view}"),
-        format!("picture of {len} bytes; it must hold 1 to {MAX_IMAGE_BYTES} bytes"),
+        format!("image of {len} bytes; it must hold 1 to {MAX_IMAGE_BYTES} bytes"),
     ))
 }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{TransportError, keys, printable::clean, stats::from_json};
 
-/// Largest side of a picture that a subscriber may ask for, pixels.
+/// Largest side of an image that a subscriber may ask for, pixels.
 pub const MAX_VIEWPOINT_SIDE: u32 = 4096;
 
 /// How long a request that could not be drawn is refused.
@@ -24,11 +24,11 @@ const MAX_REFUSALS: usize = 64;
 pub struct Viewpoint {
     /// Who asked.
     pub subscriber: String,
-    /// Name of the view to publish the pictures under.
+    /// Name of the view to publish the images under.
     pub view: String,
     /// Where it looks from; validated, at most 4096 pixels a side, its name printable.
     pub camera: Camera,
-    /// Pictures a second that the subscriber wants at most.
+    /// Images a second that the subscriber wants at most.
     pub max_fps: f64,
 }
 
@@ -86,7 +86,7 @@ pub(crate) fn check_camera(topic: &str, camera: &Camera, max_fps: f64) -> Result
         return refuse(format!("{width}x{height} pixels asked for, at most {MAX_VIEWPOINT_SIDE} a side"));
     }
     if !(max_fps > 0.0 && max_fps <= 1000.0) {
-        return refuse(format!("{max_fps} pictures a second asked for, expected more than 0, at most 1000"));
+        return refuse(format!("{max_fps} images a second asked for, expected more than 0, at most 1000"));
     }
     Ok(())
 }
@@ -94,19 +94,19 @@ pub(crate) fn check_camera(topic: &str, camera: &Camera, max_fps: f64) -> Result
 struct Lease {
     viewpoint: Viewpoint,
     ends: Instant,
-    /// When its next picture is due; none before the first.
+    /// When its next image is due; none before the first.
     next_due: Option<Instant>,
 }
 
 impl Lease {
-    /// Whether a picture is due; then the next one is a period later.
+    /// Whether an image is due; then the next one is a period later.
     fn take_due(&mut self, now: Instant) -> bool {
         let period = Duration::from_secs_f64(1.0 / self.viewpoint.max_fps);
         let Some(due) = self.next_due else {
             self.next_due = now.checked_add(period);
             return true;
         };
-        // A rig of the same rate that comes a little early must not lose its picture.
+        // A rig of the same rate that comes a little early must not lose its image.
         if now + period / 8 < due {
             return false;
         }
@@ -218,11 +218,11 @@ impl Leases {
         Ok(())
     }
 
-    /// Whether a viewpoint fits the largest picture and, beside the other subscribers' viewpoints, the budget.
+    /// Whether a viewpoint fits the largest image and, beside the other subscribers' viewpoints, the budget.
     fn check_pixels(&self, topic: &str, viewpoint: &Viewpoint) -> Result<(), TransportError> {
         let refuse = |message: String| Err(TransportError::config(topic, message));
         let (width, height) = (viewpoint.camera.intrinsics.width, viewpoint.camera.intrinsics.height);
-        // The largest picture of the same shape with so many pixels.
+        // The largest image of the same shape with so many pixels.
         let within = |most: f64| {
             let scale = (most / pixels(viewpoint)).sqrt();
             format!("{}x{}", (f64::from(width) * scale) as u32, (f64::from(height) * scale) as u32)
@@ -260,7 +260,7 @@ impl Leases {
         ))
     }
 
-    /// Sets the largest picture; viewpoints over it end.
+    /// Sets the largest image; viewpoints over it end.
     pub(crate) fn set_max_view_pixels(&mut self, most: u64) {
         self.max_view_pixels = most;
         let before = self.active.len();
@@ -280,7 +280,7 @@ impl Leases {
         self.refusals.push_back(Refusal { viewpoint, reason: reason.to_owned(), ends: now + REFUSAL });
     }
 
-    /// Takes the viewpoints that are watched and whose next picture is due.
+    /// Takes the viewpoints that are watched and whose next image is due.
     pub(crate) fn take_due(&mut self, now: Instant, is_watched: impl Fn(&str) -> bool) -> Vec<Viewpoint> {
         self.expire(now);
         let due = self.active.iter_mut().filter(|lease| is_watched(&lease.viewpoint.view));
@@ -401,7 +401,7 @@ mod tests {
     }
 
     #[test]
-    fn pictures_too_large_for_the_rig_are_refused_and_ended() {
+    fn images_too_large_for_the_rig_are_refused_and_ended() {
         let (mut leases, now) = (Leases::new(8, LEASE, u64::MAX), Instant::now());
         assert_eq!(ask(&mut leases, "a", (4096, 4096), 30.0, now), "");
         assert_eq!(ask(&mut leases, "b", (2048, 1024), 30.0, now), "");
@@ -443,7 +443,7 @@ mod tests {
         assert_eq!(leases.refusals.len(), MAX_REFUSALS);
     }
 
-    /// Pictures that each viewer gets in 20 s of a rig of `rig_fps`, its sets up to `jitter` of an interval early or late.
+    /// Images that each viewer gets in 20 s of a rig of `rig_fps`, its sets up to `jitter` of an interval early or late.
     fn pictures(rates: &[f64], rig_fps: f64, jitter: f64) -> Vec<usize> {
         let (mut leases, start) = (Leases::new(8, LEASE, u64::MAX), Instant::now());
         let mut counts = vec![0; rates.len()];

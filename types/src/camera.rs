@@ -284,7 +284,7 @@ fn is_zero(nanos: &i64) -> bool {
 }
 
 impl Camera {
-    /// Width and height of its pictures, pixels.
+    /// Width and height of its images, pixels.
     #[must_use]
     pub fn size(&self) -> [u32; 2] {
         [self.intrinsics.width, self.intrinsics.height]
@@ -404,7 +404,7 @@ impl Rig {
         self.cameras.iter().position(|camera| camera.id == *id)
     }
 
-    /// World axis closest to "up" in the cameras' pictures: what a data set that does not say means.
+    /// World axis closest to "up" in the cameras' images: what a data set that does not say means.
     #[must_use]
     pub fn guess_world_up(cameras: &[Camera]) -> DVec3 {
         let up: DVec3 = cameras.iter().map(|c| c.camera_from_world.rotation.inverse() * DVec3::NEG_Y).sum();

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use crate::{CameraId, Image, Mask};
 
-/// One picture of one camera.
+/// One image of one camera.
 #[derive(Debug)]
 pub struct Frame {
     /// Which camera.

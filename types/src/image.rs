@@ -29,7 +29,7 @@ pub enum PixelFormat {
     BayerGbrg8,
     /// Bayer mosaic of 8 bits, rows BG and GR.
     BayerBggr8,
-    /// One JPEG picture, any length up to the raw size.
+    /// One JPEG image, any length up to the raw size.
     Mjpeg,
 }
 
@@ -124,7 +124,7 @@ pub enum ImageError {
     },
 }
 
-/// One picture in memory, rows top to bottom without padding.
+/// One image in memory, rows top to bottom without padding.
 #[derive(Debug)]
 pub struct Image {
     width: u32,
@@ -179,7 +179,7 @@ impl Image {
     }
 }
 
-/// Foreground coverage of a picture: 0 background, 255 person, one byte a pixel.
+/// Foreground coverage of an image: 0 background, 255 person, one byte a pixel.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Mask {
     width: u32,

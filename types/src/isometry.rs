@@ -86,7 +86,7 @@ mod tests {
         let camera_from_world = Isometry::look_at(DVec3::new(0.0, -3.0, 1.0), DVec3::new(0.0, 0.0, 1.0), DVec3::Z);
         let target = camera_from_world.transform_point(DVec3::new(0.0, 0.0, 1.0));
         assert!((target - DVec3::new(0.0, 0.0, 3.0)).length() < 1e-12);
-        // A point above the target is up in the picture: negative y. A point to world +x is on the right.
+        // A point above the target is up in the image: negative y. A point to world +x is on the right.
         assert!(camera_from_world.transform_point(DVec3::new(0.0, 0.0, 1.5)).y < -0.49);
         assert!(camera_from_world.transform_point(DVec3::new(0.5, 0.0, 1.0)).x > 0.49);
     }

@@ -120,7 +120,7 @@ impl Navigation {
         self.field = 2.0 * (0.5 * f64::from(lens.height) / lens.focal_px.y).atan();
     }
 
-    /// The camera of a picture of this size.
+    /// The camera of an image of this size.
     #[must_use]
     pub fn camera(&self, width: u32, height: u32) -> Camera {
         let focal = 0.5 * f64::from(height) / (0.5 * self.field).tan();
@@ -163,7 +163,7 @@ mod tests {
             navigation.jump(camera);
             let view = navigation.camera(640, 480);
             view.validate().unwrap();
-            // The same picture: place, direction and field of view.
+            // The same image: place, direction and field of view.
             for point in [DVec3::new(0.2, 0.1, 1.0), DVec3::new(0.5, 0.0, 1.5)] {
                 let (a, b) = (camera.project(point).unwrap(), view.project(point).unwrap());
                 assert!(a.distance(b) < 0.5, "{a} {b}");

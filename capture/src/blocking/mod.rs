@@ -35,10 +35,10 @@ pub(crate) trait BlockingCamera {
     /// Format, size and rate, for people.
     fn mode(&self) -> String;
 
-    /// Waits for the next picture as long as it takes, and puts its bytes into `bytes`, which are empty.
+    /// Waits for the next image as long as it takes, and puts its bytes into `bytes`, which are empty.
     ///
     /// # Errors
-    /// `Corrupt` costs the picture; after every other kind the camera is closed.
+    /// `Corrupt` costs the image; after every other kind the camera is closed.
     fn read(&mut self, bytes: &mut Vec<u8>) -> Result<Shot, CaptureError>;
 }
 
@@ -53,7 +53,7 @@ pub(crate) trait Opener: Send + Sync + 'static {
     fn open(&self) -> Result<Self::Camera, CaptureError>;
 }
 
-/// A picture without its bytes.
+/// An image without its bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Shot {
     pub size: (u32, u32),

@@ -111,7 +111,7 @@ impl BlockingCamera for Fake {
                 std::thread::sleep(Duration::from_millis(2));
                 shot.stamp_nanos = Some(arrival_nanos - age);
             }
-            Step::Damaged => return Err(CaptureError::general(CaptureErrorKind::Corrupt, "half a picture")),
+            Step::Damaged => return Err(CaptureError::general(CaptureErrorKind::Corrupt, "half an image")),
             Step::Fails => return Err(CaptureError::general(CaptureErrorKind::Io, "no such device")),
             Step::Panics => panic!("index out of bounds"),
             Step::PanicsTwice => {
@@ -221,7 +221,7 @@ fn the_systems_stamp_is_taken_where_it_can_be_right() {
 }
 
 #[test]
-fn a_picture_of_another_size_or_damaged_costs_itself_alone() {
+fn an_image_of_another_size_or_damaged_costs_itself_alone() {
     let steps = vec![Step::Sized(8, 2), Step::Damaged, Step::Frame];
     let mut camera = open(&script(&[Open::Camera(steps)])).unwrap();
     let mut seen = Vec::new();
@@ -234,7 +234,7 @@ fn a_picture_of_another_size_or_damaged_costs_itself_alone() {
     }
     assert!(!seen.is_empty() && seen.iter().all(|(kind, _)| *kind == CaptureErrorKind::Corrupt), "{seen:?}");
     let size = "camera left: frame 0: it is 8x2 and not 4x2 as asked for";
-    assert!(seen.iter().all(|(_, text)| text == size || text == "camera left: half a picture"), "{seen:?}");
+    assert!(seen.iter().all(|(_, text)| text == size || text == "camera left: half an image"), "{seen:?}");
     assert_eq!(camera.health().reconnects, 0);
 }
 

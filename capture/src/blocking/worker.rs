@@ -22,7 +22,7 @@ pub(super) enum Event {
     /// The camera is open and has a mode.
     Opened,
     Shot(Shot, PixelBuffer),
-    /// A picture is lost.
+    /// An image is lost.
     Damaged(CaptureError),
 }
 

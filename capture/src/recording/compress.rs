@@ -1,4 +1,4 @@
-//! Uncompressed pictures made JPEG before they are recorded, in a thread of their own.
+//! Uncompressed images made JPEG before they are recorded, in a thread of their own.
 
 use std::{
     sync::Arc,
@@ -11,13 +11,13 @@ use flyrig_types::{CameraId, Frame, Image, caught};
 use super::outlet::Outlet;
 use crate::{BufferPool, CaptureError, CaptureErrorKind, JpegEncoding, LatestQueue};
 
-/// Pictures of a camera that may wait for their compression: a quarter of a second of 30 frames a second.
+/// Images of a camera that may wait for their compression: a quarter of a second of 30 frames a second.
 const WAITING: usize = 8;
 
-/// How uncompressed pictures are recorded.
+/// How uncompressed images are recorded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Compression {
-    /// Of the JPEG pictures, 1 to 100 (libjpeg's scale).
+    /// Of the JPEG images, 1 to 100 (libjpeg's scale).
     pub quality: u8,
     /// Rather make the cameras wait than lose a frame: for sources that can wait. Otherwise the oldest waiting frame is
     /// dropped, and counted, where a machine is too slow.

@@ -11,7 +11,7 @@ use prost::bytes::Bytes;
 
 use crate::{CaptureError, CaptureErrorKind, mjpeg};
 
-/// Topics of pictures begin so.
+/// Topics of images begin so.
 pub(super) const TOPIC: &str = "camera/";
 const EXPOSURE: &str = "exposure_nanos";
 
@@ -88,10 +88,10 @@ pub(super) fn exposure_nanos(metadata: &BTreeMap<String, String>) -> Option<u64>
     metadata.get(EXPOSURE)?.parse().ok()
 }
 
-/// The picture of a message.
+/// The image of a message.
 ///
 /// # Errors
-/// `Corrupt` for what is no picture, `Unsupported` for other kinds of messages and encodings.
+/// `Corrupt` for what is no image, `Unsupported` for other kinds of messages and encodings.
 pub(super) fn decode(camera: &CameraId, schema: &str, payload: Vec<u8>) -> Result<Image, CaptureError> {
     let corrupt = |text: String| CaptureError::new(camera, CaptureErrorKind::Corrupt, text);
     let payload = Bytes::from(payload);
@@ -99,7 +99,7 @@ pub(super) fn decode(camera: &CameraId, schema: &str, payload: Vec<u8>) -> Resul
         "foxglove.CompressedImage" => {
             let image = CompressedImage::decode(payload).map_err(|error| corrupt(error.to_string()))?;
             let Some((width, height)) = mjpeg::jpeg_size(&image.data) else {
-                return Err(corrupt(format!("a picture of format {:?} that is no JPEG", image.format)));
+                return Err(corrupt(format!("an image of format {:?} that is no JPEG", image.format)));
             };
             let (width, height) = (width as u32, height as u32);
             Image::new(width, height, PixelFormat::Mjpeg, Vec::from(image.data))

@@ -1,6 +1,6 @@
 //! Recordings: MCAP files of foxglove messages, which other programs open too.
 //!
-//! `camera/<name>` holds foxglove `CompressedImage` (JPEG pictures as the camera sent them, and what a [`Compression`] made
+//! `camera/<name>` holds foxglove `CompressedImage` (JPEG images as the camera sent them, and what a [`Compression`] made
 //! of others) or `RawImage` (every other format, bytes as they came), protobuf, logged at capture time. A replay gives the
 //! very frames that are in the file. What else a program wants to find (calibrations) stands before the first frame.
 //! A [`Rotation`] divides a long recording into files that are complete each by itself.

@@ -143,7 +143,7 @@ impl Outlet {
         self.send(Item { channel: Arc::clone(channel), nanos, sequence, payload, bytes_sent: None });
     }
 
-    /// Records a picture of a frame, by its channel. `bytes_sent` is its length as the camera sent it.
+    /// Records an image of a frame, by its channel. `bytes_sent` is its length as the camera sent it.
     pub fn frame(&mut self, channel: &mut Option<Arc<Channel>>, frame: &Frame, bytes_sent: usize) {
         if !self.is_open() {
             return;

@@ -28,7 +28,7 @@ impl SourceTap {
     }
 }
 
-/// A source whose frames are recorded as they pass: JPEG pictures as they came, others compressed where the recorder was
+/// A source whose frames are recorded as they pass: JPEG images as they came, others compressed where the recorder was
 /// told so. The frames themselves go on as they are.
 #[derive(Debug)]
 pub struct Recording<S> {

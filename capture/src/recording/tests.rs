@@ -22,7 +22,7 @@ fn jpeg() -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// Frame `n` of a camera: raw pictures of camera "a", JPEG pictures of every other.
+/// Frame `n` of a camera: raw images of camera "a", JPEG images of every other.
 pub(super) fn frame(camera: &CameraId, n: u64) -> Frame {
     let image = if camera.as_str() == "a" {
         Image::new(4, 2, PixelFormat::Yuyv, vec![n as u8; 16])
@@ -262,7 +262,7 @@ fn what_is_no_recording_is_refused() {
     assert!(replayed(&path, "a").is_empty());
 }
 
-/// Gives pictures that were made before.
+/// Gives images that were made before.
 struct Pictures(CameraId, std::vec::IntoIter<Image>, u64);
 
 impl Pictures {
@@ -297,7 +297,7 @@ fn compressed(quality: u8, keep_all: bool) -> Option<Compression> {
 }
 
 #[test]
-fn uncompressed_pictures_are_recorded_as_jpeg_and_go_on_as_they_are() {
+fn uncompressed_images_are_recorded_as_jpeg_and_go_on_as_they_are() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("take.mcap");
     let recorder = Recorder::create(&path, &[], compressed(95, true)).unwrap();

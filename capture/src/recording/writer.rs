@@ -38,7 +38,7 @@ const SYNC_TIME: Duration = Duration::from_secs(2);
 /// Settings of a [`Recorder`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RecorderConfig {
-    /// Without it every picture is recorded as it came.
+    /// Without it every image is recorded as it came.
     pub compression: Option<Compression>,
     /// When a new file is begun.
     pub rotation: Rotation,

@@ -41,7 +41,7 @@ const LOOK: Duration = Duration::from_millis(2);
 /// five times at once, then once a minute. The queue closes when all threads have ended. Dropping this stops the threads
 /// and waits for them; one that does not come out of a source's or a stage's call within 15 seconds is left behind.
 ///
-/// With a [`FrameStage`] each camera has a second thread for it, so that a slow or damaged picture holds up neither the
+/// With a [`FrameStage`] each camera has a second thread for it, so that a slow or damaged image holds up neither the
 /// driver's buffers nor another camera.
 #[derive(Debug)]
 pub struct CaptureThreads {

@@ -29,7 +29,7 @@ impl FormatChoice {
         Self::ORDER.into_iter().find(|choice| choice.fourccs().contains(&fourcc))
     }
 
-    /// Bytes of a picture on the bus. A JPEG picture is reckoned at 0.3 bytes a pixel.
+    /// Bytes of an image on the bus. A JPEG image is reckoned at 0.3 bytes a pixel.
     pub(crate) fn bytes_per_frame(self, width: u32, height: u32) -> u64 {
         let pixels = u64::from(width) * u64::from(height);
         match self {

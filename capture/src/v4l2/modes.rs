@@ -38,7 +38,7 @@ pub(crate) fn usb_capacity(speed_mbit: u32) -> (u64, u64) {
     }
 }
 
-/// The modes to try, best first: the wanted one, compressed pictures at the same rate, then slower rates. Each takes fewer
+/// The modes to try, best first: the wanted one, compressed images at the same rate, then slower rates. Each takes fewer
 /// bytes a second than the one before.
 ///
 /// # Errors
@@ -72,7 +72,7 @@ pub(crate) fn ladder(
         choice => available.iter().find(|(found, _)| *found == choice),
     };
     let Some(&(choice, offer)) = first else {
-        return Err(format!("has no {wanted:?} pictures of {width}x{height}; its formats at that size: {}", list()));
+        return Err(format!("has no {wanted:?} images of {width}x{height}; its formats at that size: {}", list()));
     };
     if !has_rate(offer, fps) {
         let rates: Vec<String> = offer.rates.iter().map(|rate| format!("{rate:.4}")).collect();
@@ -160,7 +160,7 @@ mod tests {
     #[test]
     fn what_the_camera_lacks_is_told_with_what_it_has() {
         let error = ladder(FormatChoice::Nv12, 30.0, SIZE, &offers(), None).unwrap_err();
-        assert_eq!(error, "has no Nv12 pictures of 640x360; its formats at that size: MJPG, YUYV");
+        assert_eq!(error, "has no Nv12 images of 640x360; its formats at that size: MJPG, YUYV");
         let error = ladder(FormatChoice::Mjpeg, 60.0, SIZE, &offers(), None).unwrap_err();
         assert_eq!(error, "has no 60 frames a second at Mjpeg 640x360; it has 30, 15; set fps to one of them");
         assert!(ladder(FormatChoice::Auto, 30.0, SIZE, &[], None).unwrap_err().ends_with("none"));

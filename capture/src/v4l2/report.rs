@@ -40,7 +40,7 @@ pub struct CameraReport {
     pub problem: Option<CaptureError>,
 }
 
-/// Every camera of this computer; nodes that give no pictures, like metadata, are left out.
+/// Every camera of this computer; nodes that give no images, like metadata, are left out.
 #[must_use]
 pub fn camera_reports() -> Vec<CameraReport> {
     identity::scan(&Roots::default()).into_iter().filter_map(report).collect()
@@ -151,7 +151,7 @@ mod tests {
         let compressed = plan_buses(["a", "b", "c"].map(|name| camera(name, 1, FormatChoice::Mjpeg)));
         assert!(compressed[0].fits());
         let large = plan_buses([("a", 1, 480, FormatChoice::Auto, (1920, 1080), 30.0)]);
-        assert!(large[0].fits(), "compressed pictures are taken by themselves");
+        assert!(large[0].fits(), "compressed images are taken by themselves");
     }
 
     #[test]

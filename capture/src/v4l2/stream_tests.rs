@@ -293,7 +293,7 @@ fn what_is_wrong_at_the_start_is_told_at_once() {
     assert!(denied.message.contains("usermod -aG video"), "{denied}");
     let size = error(vec![Ok(webcam(vec![]))], &CameraOptions { width: 6, ..options() });
     assert_eq!(size.kind, CaptureErrorKind::Unsupported);
-    assert!(size.message.contains("has no Yuyv pictures of 6x2"), "{size}");
+    assert!(size.message.contains("has no Yuyv images of 6x2"), "{size}");
     let control = CameraControls { focus: Some(1), ..CameraControls::default() };
     let control = error(vec![Ok(webcam(vec![]))], &CameraOptions { controls: control, ..options() });
     assert!(control.message.contains("no control for focus"), "{control}");

@@ -2,7 +2,7 @@
 
 use anyhow::{Context as _, Result, bail, ensure};
 use flyrig_calib::{Format, save_lenses};
-use flyrig_capture::folder_picture_size;
+use flyrig_capture::folder_image_size;
 
 use super::refuse_existing;
 use crate::cli::CalibrateConvertArgs;
@@ -15,7 +15,7 @@ pub fn convert(args: &CalibrateConvertArgs) -> Result<()> {
         let known = Format::ALL.map(Format::name);
         format!("{}: the format is not recognised; name it with --from: {}", input.display(), known.join(", "))
     })?;
-    let size = |id: &_| folder_picture_size(args.images.as_ref().unwrap_or(input), id).ok();
+    let size = |id: &_| folder_image_size(args.images.as_ref().unwrap_or(input), id).ok();
     let imported = from.read(input, &size, args.scale)?;
     let rig = imported.rig(input)?;
     let names = match args.to {

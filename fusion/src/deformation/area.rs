@@ -1,14 +1,14 @@
-//! Which part of a picture the person can be in, and how fine it is worth looking at.
+//! Which part of an image the person can be in, and how fine it is worth looking at.
 
 use flyrig_body::{DeformationGraph, Skeleton, SkinWeights, SurfaceGaussians, skin_point_f64};
-use flyrig_renderer::WantedPicture;
+use flyrig_renderer::WantedImage;
 use flyrig_types::{Camera, Pose};
 use glam::{DMat4, DVec3};
 
 use super::TrackedView;
 
 /// The area ends at multiples of this: the sides of the rasteriser's tiles divide it at every level.
-const GRID_PX: u32 = 16 << WantedPicture::MAX_LEVEL;
+const GRID_PX: u32 = 16 << WantedImage::MAX_LEVEL;
 /// What the area reaches beyond mask and body, as a share of its longer side.
 const MARGIN: f64 = 0.06;
 
@@ -18,9 +18,9 @@ const PAPER_PIXELS_A_M2: f64 = (400.0 / 1.75) * (400.0 / 1.75);
 /// How a view is looked at.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ViewPlan {
-    /// Pictures are halved so often.
+    /// Images are halved so often.
     pub level: u32,
-    /// Pixels of the halved picture that count.
+    /// Pixels of the halved image that count.
     pub area: [u32; 4],
     /// Factor of the loss: a square metre counts the same at any resolution.
     pub weight: f64,
@@ -63,8 +63,7 @@ impl Landmarks {
             let bones = bones.get(view.instant).map_or(&[][..], Vec::as_slice);
             let depth = view.camera.camera_from_world.transform_point(self.posed_center(bones)).z.max(1e-3);
             let fine = view.camera.intrinsics.focal_px.element_sum() * 0.5 / depth;
-            let level =
-                (fine * spacing_m).log2().round().clamp(0.0, f64::from(max_level.min(WantedPicture::MAX_LEVEL)));
+            let level = (fine * spacing_m).log2().round().clamp(0.0, f64::from(max_level.min(WantedImage::MAX_LEVEL)));
             let shrink = level.exp2();
             let pixels_a_m = fine / shrink;
             let area = self.area(bones, view.camera, view.size, view.rgba);
@@ -79,7 +78,7 @@ impl Landmarks {
     }
 
     /// The pixels that mask or posed body may touch, `[left, top, right, bottom]`, right and bottom excluded; the whole
-    /// picture when a part of the body has no place in it.
+    /// image when a part of the body has no place in it.
     fn area(&self, bones: &[DMat4], camera: &Camera, [width, height]: [u32; 2], rgba: &[u8]) -> [u32; 4] {
         let mut low = [f64::INFINITY; 2];
         let mut high = [f64::NEG_INFINITY; 2];

@@ -1,7 +1,7 @@
 //! How the deformation is tracked.
 
 use flyrig_body::Part;
-use flyrig_renderer::WantedPicture;
+use flyrig_renderer::WantedImage;
 use flyrig_tracker::DeformSettings;
 
 /// So many are compared even where the person is a few pixels high.
@@ -14,13 +14,13 @@ pub const PAPER_COLOR_WEIGHT: f32 = 2.0;
 pub struct DeformOptions {
     /// Steps, weights and limits.
     pub solver: DeformSettings,
-    /// Gaussians that are compared with the pictures; the others follow.
+    /// Gaussians that are compared with the images; the others follow.
     pub gaussians: usize,
     /// Gaussians that are compared at most for every pixel that the person's whole surface would take in the finest view.
     pub gaussians_a_pixel: f64,
     /// λ_color of Eq. 3, over the sum of squared differences (linear light, 0..=1) of all pixels.
     pub color_weight: f32,
-    /// Pictures are halved at most so often, while a pixel stays finer than the compared Gaussians' spacing.
+    /// Images are halved at most so often, while a pixel stays finer than the compared Gaussians' spacing.
     pub max_level: u32,
     /// Views that are compared at most, those from the most different directions; 0: all.
     pub views: usize,
@@ -72,7 +72,7 @@ impl DeformOptions {
             gaussians_a_pixel: 2.0,
             // With more the colours, which are painted anew every frame, push the surface along itself.
             color_weight: 0.1 * PAPER_COLOR_WEIGHT,
-            max_level: WantedPicture::MAX_LEVEL,
+            max_level: WantedImage::MAX_LEVEL,
             views: 0,
             stiff_parts: true,
         }

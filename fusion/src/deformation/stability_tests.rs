@@ -1,4 +1,4 @@
-//! The chain from pictures to displaced Gaussians on hard scenes, twice over, and beside an f64 reference.
+//! The chain from images to displaced Gaussians on hard scenes, twice over, and beside an f64 reference.
 
 mod chain;
 mod hard;
@@ -65,7 +65,7 @@ fn apart(ours: &[[f32; 4]], reference: &[DVec3]) -> Apart {
     Apart { max: all.iter().copied().fold(0.0, f64::max), mean: all.iter().sum::<f64>() / all.len() as f64 }
 }
 
-/// The default solver over a moving scene of 80 Gaussians on 10 nodes, three pictures of 48x48 compared at 24x24.
+/// The default solver over a moving scene of 80 Gaussians on 10 nodes, three images of 48x48 compared at 24x24.
 fn diverge(frames: usize) -> Vec<Row> {
     let scene = SmallScene::new(80, 10, 48);
     let settings = DeformSettings::default();

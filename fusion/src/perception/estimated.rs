@@ -388,7 +388,7 @@ impl Perception for EstimatedPerception {
         self.watch_for_blank_images(set)?;
         let mut estimates = self.estimate(set, stages);
         self.remember(set, &estimates);
-        stages.add("pose from pictures", start.elapsed());
+        stages.add("pose from images", start.elapsed());
         let before: Vec<(bool, u32)> = self.places.iter().map(|place| (place.known, place.shape)).collect();
         self.learn(set, &estimates);
         let mut views = self.views(set, &mut estimates, stages)?;

@@ -18,14 +18,14 @@ pub struct FlipMap {
 }
 
 impl FlipMap {
-    /// The error as a picture, RGB bytes in the perceptually even magma colours: black is equal, bright is far.
+    /// The error as an image, RGB bytes in the perceptually even magma colours: black is equal, bright is far.
     #[must_use]
     pub fn to_rgb8(&self) -> Vec<u8> {
         FlipImageFloat::with_data(self.width, self.height, &self.error).apply_color_lut(&magma_lut()).to_vec()
     }
 }
 
-/// ꟻLIP between the truth and ours inside the box, at 67 pixels a degree (ꟻLIP's own default); pictures are rounded
+/// ꟻLIP between the truth and ours inside the box, at 67 pixels a degree (ꟻLIP's own default); images are rounded
 /// to 8 bits.
 ///
 /// # Errors

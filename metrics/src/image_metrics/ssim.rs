@@ -45,7 +45,7 @@ fn kernel() -> [f64; 2 * RADIUS as usize + 1] {
     raw.map(|x| x / sum)
 }
 
-/// Mirror without repeating the edge, as often as a narrow picture needs.
+/// Mirror without repeating the edge, as often as a narrow image needs.
 fn mirror(index: i64, len: usize) -> usize {
     let last = len as i64 - 1;
     if last == 0 {

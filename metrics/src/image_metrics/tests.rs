@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// A reproducible picture with structure; the same formula made the OpenCV figures below.
+/// A reproducible image with structure; the same formula made the OpenCV figures below.
 fn waves(width: u32, height: u32, phase: f64) -> Picture {
     let value = |x: u32, y: u32, c: u32| {
         let (x, y, c) = (f64::from(x), f64::from(y), f64::from(c));
@@ -30,7 +30,7 @@ const OPENCV: [(PixelBox, f64, f64); 3] = [
 ];
 
 #[test]
-fn equal_pictures_are_perfect() {
+fn equal_images_are_perfect() {
     let a = waves(20, 20, 0.0);
     let area = [2, 2, 18, 18];
     assert!((psnr(&a, &a, area).unwrap() - MAX_PSNR_DB).abs() < 1e-12);
@@ -65,7 +65,7 @@ fn psnr_of_a_known_error() {
 }
 
 #[test]
-fn pictures_composite_without_rounding() {
+fn images_composite_without_rounding() {
     let rgba = [100, 200, 50, 128, 10, 20, 30, 0];
     let black = Picture::on_black(2, 1, &rgba).unwrap();
     assert!((black.pixels()[0][0] - 100.0 / 255.0 * (128.0 / 255.0)).abs() < 1e-7);
@@ -81,7 +81,7 @@ fn refusals_say_what_is_wrong() {
     let a = waves(20, 20, 0.0);
     let b = waves(20, 10, 0.0);
     for error in [psnr(&a, &b, [0, 0, 5, 5]).unwrap_err(), flip(&a, &b, [0, 0, 5, 5]).unwrap_err()] {
-        assert_eq!(error.to_string(), "pictures of different size cannot be compared: 20x20 and 20x10");
+        assert_eq!(error.to_string(), "images of different size cannot be compared: 20x20 and 20x10");
     }
     for area in [[5, 5, 5, 9], [20, 0, 30, 5], [9, 9, 3, 3]] {
         for error in [psnr(&a, &a, area).unwrap_err(), ssim(&a, &a, area).unwrap_err(), flip(&a, &a, area).unwrap_err()]

@@ -36,7 +36,7 @@ fn angle_weight(normal: vec3<f32>, camera_to_point: vec3<f32>) -> f32 {
     return 1.0 - min(length(cross(normal, camera_to_point)) / lengths, 1.0);
 }
 
-// Adds what drawing takes away: a Gaussian's picture is its colour mixed with its neighbours'.
+// Adds what drawing takes away: a Gaussian's image is its colour mixed with its neighbours'.
 fn sharpened(color: vec3<f32>, last: vec3<f32>, shown: vec4<f32>) -> vec3<f32> {
     if !(settings.sharpness > 0.0 && shown.w >= MIN_RENDERED_ALPHA) {
         return color;

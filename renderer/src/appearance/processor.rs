@@ -148,7 +148,7 @@ impl View<'_> {
         is_enough.then(|| Sample { pixel, color: color / coverage, coverage, rendered, shown })
     }
 
-    /// Adds what drawing takes away: a Gaussian's picture is its colour mixed with its neighbours'.
+    /// Adds what drawing takes away: a Gaussian's image is its colour mixed with its neighbours'.
     #[inline]
     fn sharpened(&self, color: Vec3, last: Vec3, shown: Vec4) -> Vec3 {
         let sharpness = self.settings.sharpness;

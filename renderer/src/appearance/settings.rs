@@ -7,7 +7,7 @@ use flyrig_types::{Camera, CameraId, MAX_IMAGE_SIDE};
 /// What one camera saw at this instant.
 #[derive(Debug, Clone, Copy)]
 pub struct ViewInput<'a> {
-    /// The camera that took the picture, at the picture's size.
+    /// The camera that took the image, at the image's size.
     pub camera: &'a Camera,
     /// sRGB bytes, a pixel an element (red in the lowest byte), rows without padding; a: mask coverage, 255 on the person.
     /// The colour is not multiplied by it.
@@ -18,7 +18,7 @@ pub struct ViewInput<'a> {
     /// The Gaussians with the colours of the last update as this camera sees them: [`RenderTarget::color`](crate::RenderTarget)
     /// of the same rendering.
     pub drawn: &'a StorageBuffer<[f32; 4]>,
-    /// The Gaussians as they stood when this picture was taken, where that is another instant.
+    /// The Gaussians as they stood when this image was taken, where that is another instant.
     pub gaussians: Option<&'a GaussianBuffers>,
 }
 
@@ -59,7 +59,7 @@ pub struct ObservationBuffers<'a> {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AppearanceSettings {
     /// Fill what no camera sees from its surroundings on the surface. Off: the paper's baseline, every camera that
-    /// has the point inside its picture gets a small extra weight, visible or not.
+    /// has the point inside its image gets a small extra weight, visible or not.
     pub space: bool,
     /// Remember earlier frames. Off: neither the memory nor the last colours are read.
     pub time: bool,
@@ -151,8 +151,8 @@ pub enum AppearanceError {
         /// Now.
         found: usize,
     },
-    /// A picture that does not fit its camera.
-    #[error("camera {camera}: {what} has {found} {unit}, its {width}x{height} picture needs {needed}")]
+    /// An image that does not fit its camera.
+    #[error("camera {camera}: {what} has {found} {unit}, its {width}x{height} image needs {needed}")]
     ViewSize {
         /// Which camera.
         camera: CameraId,
@@ -170,8 +170,8 @@ pub enum AppearanceError {
         found: usize,
     },
     /// A camera without pixels, or with an absurd number of them.
-    #[error("camera {camera}: its picture is {width}x{height}, expected 1 to {MAX_IMAGE_SIDE} pixels a side")]
-    PictureSize {
+    #[error("camera {camera}: its image is {width}x{height}, expected 1 to {MAX_IMAGE_SIDE} pixels a side")]
+    ImageSize {
         /// Which camera.
         camera: CameraId,
         /// Pixels.

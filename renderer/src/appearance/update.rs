@@ -15,7 +15,7 @@ use crate::{GaussianBuffers, linear_from_srgb};
 
 const KEPT: &str = "observations of a view";
 
-/// Paints every Gaussian from the pictures of this instant and a memory of earlier ones.
+/// Paints every Gaussian from the images of this instant and a memory of earlier ones.
 ///
 /// Buffers and pipelines are made once.
 #[derive(Debug)]
@@ -45,7 +45,7 @@ struct DeviceKernels {
 }
 
 impl DirectAppearance {
-    /// For the Gaussians and graph of one body and at most `max_views` pictures a frame.
+    /// For the Gaussians and graph of one body and at most `max_views` images a frame.
     ///
     /// # Errors
     /// [`AppearanceError::Graph`] when the two do not fit, [`AppearanceError::Gpu`].
@@ -84,7 +84,7 @@ impl DirectAppearance {
     }
 
     /// Records the painting of [`GaussianBuffers::color`] (opacity 1) and uploads the cameras. Any number of views
-    /// up to the maximum will do; a camera that gave no picture is left out of `views`.
+    /// up to the maximum will do; a camera that gave no image is left out of `views`.
     ///
     /// Submit the encoder before the next update: uploads take effect at the submission.
     ///
@@ -295,12 +295,12 @@ impl DirectAppearance {
             let (width, height) = (view.camera.intrinsics.width, view.camera.intrinsics.height);
             let pixels = width as usize * height as usize;
             if pixels == 0 || width.max(height) > MAX_IMAGE_SIDE {
-                return Err(AppearanceError::PictureSize { camera, width, height });
+                return Err(AppearanceError::ImageSize { camera, width, height });
             }
             let inputs = [
-                ("the picture", "pixels", pixels, view.picture.len()),
+                ("the image", "pixels", pixels, view.picture.len()),
                 ("the canonical map", "pixels", pixels, view.canonical.len()),
-                ("the drawn picture", "pixels", pixels, view.drawn.len()),
+                ("the drawn image", "pixels", pixels, view.drawn.len()),
             ];
             for (what, unit, needed, found) in inputs {
                 if needed != found {

@@ -11,7 +11,7 @@ use super::lanes::{LANES, Lanes, exp2, sum, vectorized};
 use super::project::{Splat, TILE};
 use super::rasterizer::{Drawn, ProcessorRasterizer};
 use crate::raster_kernels::{MAX_ALPHA, OPAQUE};
-use crate::{Carry, GaussianBuffers, GaussianGradients, PictureGradients, RenderTarget};
+use crate::{Carry, GaussianBuffers, GaussianGradients, ImageGradients, RenderTarget};
 
 const ROWS: usize = TILE as usize;
 /// Gaussians that one task carries to the world.
@@ -34,13 +34,13 @@ pub(crate) struct ProcessorBackward {
 }
 
 impl ProcessorBackward {
-    /// Adds the derivatives of the picture that `rasterizer` drew last. Arrays have been checked.
+    /// Adds the derivatives of the image that `rasterizer` drew last. Arrays have been checked.
     pub(crate) fn add(
         &mut self,
         rasterizer: &ProcessorRasterizer,
         gaussians: &GaussianBuffers,
         target: &RenderTarget,
-        (incoming, carry): (&PictureGradients, Carry),
+        (incoming, carry): (&ImageGradients, Carry),
         out: &GaussianGradients,
     ) {
         let ProcessorRasterizer { lists, latest: Some(drawn), .. } = rasterizer else { return };
@@ -118,7 +118,7 @@ impl ProcessorBackward {
     }
 }
 
-/// The pictures of one view.
+/// The images of one view.
 struct Pixels<'a> {
     size: [usize; 2],
     color: &'a [[f32; 4]],
@@ -323,7 +323,7 @@ fn project_backward(
     let [first, second] = match carry {
         Carry::Sum => [Vec4::new(carried[0], carried[1], carried[2], 0.0), Vec4::ZERO],
         Carry::Lift => {
-            // J^T C J with C = (xx, xy, yy) of the picture, J = d pixel / d world.
+            // J^T C J with C = (xx, xy, yy) of the image, J = d pixel / d world.
             let du = world_from_camera * Vec3::new(along_x.x, along_y.x, along_z.x);
             let dv = world_from_camera * Vec3::new(along_x.y, along_y.y, along_z.y);
             let (u, v) = (carried[0] * du + carried[1] * dv, carried[1] * du + carried[2] * dv);

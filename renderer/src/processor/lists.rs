@@ -33,7 +33,7 @@ struct Ranked {
     rect: Rect,
 }
 
-/// Splats and tile lists of one picture. Its arrays are used again by the next picture.
+/// Splats and tile lists of one image. Its arrays are used again by the next image.
 #[derive(Debug, Default)]
 pub(super) struct Lists {
     /// By Gaussian; old where it is not drawn.
@@ -49,7 +49,7 @@ pub(super) struct Lists {
     pub starts: Vec<u32>,
     /// Gaussians by tile, nearest first.
     pub pairs: Vec<u32>,
-    /// Gaussians that touch the picture.
+    /// Gaussians that touch the image.
     pub visible_gaussians: u32,
     /// Pairs of a Gaussian and a tile that were wanted, at most one more than there is room for.
     pub wanted_pairs: u32,
@@ -60,7 +60,7 @@ pub(super) struct Lists {
 }
 
 impl Lists {
-    /// Lists the Gaussians of a picture.
+    /// Lists the Gaussians of an image.
     pub fn fill(&mut self, projection: &Projection<'_>, gaussians: Attributes<'_>) {
         let start = Instant::now();
         self.project(projection, gaussians);

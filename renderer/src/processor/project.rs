@@ -9,7 +9,7 @@ use crate::raster_kernels::{BACKFACING_COSINE, CUT};
 /// Side of a tile, pixels.
 pub(super) const TILE: u32 = super::lanes::LANES as u32;
 
-/// A Gaussian in the picture.
+/// A Gaussian in the image.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Splat {
     /// Centre, pixels.
@@ -39,7 +39,7 @@ impl Rect {
     }
 }
 
-/// Camera and settings of one picture.
+/// Camera and settings of one image.
 pub(super) struct Projection<'a> {
     pub camera: CameraConstants,
     pub size: [u32; 2],

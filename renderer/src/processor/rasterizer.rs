@@ -13,17 +13,17 @@ use super::project::{Projection, TILE};
 use crate::raster_settings::{Latest, tile_range};
 use crate::{GaussianBuffers, Outputs, RasterSettings, RasterStats, RenderTarget};
 
-/// [`Rasterizer`](crate::Rasterizer) on the processor: draws when a picture is recorded.
+/// [`Rasterizer`](crate::Rasterizer) on the processor: draws when an image is recorded.
 #[derive(Debug, Default)]
 pub(crate) struct ProcessorRasterizer {
     pub(super) lists: Lists,
-    /// The picture that was drawn last.
+    /// The image that was drawn last.
     pub(super) latest: Option<Drawn>,
-    overflowed_pictures: u32,
+    overflowed_images: u32,
     blend_time: Duration,
 }
 
-/// Parameters of a picture that its derivative needs.
+/// Parameters of an image that its derivative needs.
 #[derive(Debug, Clone)]
 pub(crate) struct Drawn {
     pub camera: CameraConstants,
@@ -36,7 +36,7 @@ pub(crate) struct Drawn {
 }
 
 impl ProcessorRasterizer {
-    /// Draws a picture. Arrays of the device are left as they are.
+    /// Draws an image. Arrays of the device are left as they are.
     pub(crate) fn draw(
         &mut self,
         gaussians: &GaussianBuffers,
@@ -55,7 +55,7 @@ impl ProcessorRasterizer {
         let projection = Projection { camera: constants, size, settings };
         let attributes = Attributes { center_scale, normal, color, canonical };
         self.lists.fill(&projection, attributes);
-        self.overflowed_pictures += u32::from(self.lists.overflowed);
+        self.overflowed_images += u32::from(self.lists.overflowed);
         let (first_tile, blended) = tile_range(settings.area, self.lists.tiles, TILE);
         let Outputs { color: with_color, depth: with_depth, canonical: with_canonical } = settings.outputs;
         let mut pictures = (
@@ -65,7 +65,7 @@ impl ProcessorRasterizer {
         );
         let start = Instant::now();
         let row_of_tiles = (size[0] * TILE) as usize;
-        // Rows of tiles; nothing where a picture is not asked for.
+        // Rows of tiles; nothing where an image is not asked for.
         let mut bands: Vec<Band<'_>> = (0..self.lists.tiles[1]).map(|_| Band::default()).collect();
         if let Some(color) = &mut pictures.0 {
             bands.iter_mut().zip(color.chunks_mut(row_of_tiles)).for_each(|(band, part)| band.color = part);
@@ -119,12 +119,12 @@ impl ProcessorRasterizer {
         RasterStats {
             visible_gaussians: self.lists.visible_gaussians,
             pairs: self.lists.wanted_pairs,
-            overflowed_pictures: self.overflowed_pictures,
+            overflowed_images: self.overflowed_images,
         }
     }
 }
 
-/// A row of tiles of the pictures; empty where one is not drawn.
+/// A row of tiles of the images; empty where one is not drawn.
 #[derive(Default)]
 struct Band<'a> {
     color: &'a mut [[f32; 4]],

@@ -1,5 +1,5 @@
 //! A person of two parts that no edge connects: an egg-shaped body and a ball in front of its belly. Surfaces have
-//! formulas, so pictures and canonical maps are made without any rasteriser of ours.
+//! formulas, so images and canonical maps are made without any rasteriser of ours.
 
 use flyrig_body::{DeformationGraph, Part, SkinWeights, SurfaceGaussians};
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
@@ -35,7 +35,7 @@ pub struct View {
     pub camera: Camera,
     pub rgba: Vec<u8>,
     pub canonical: Vec<[f32; 4]>,
-    /// What the last frame's Gaussians are drawn like: paler than the picture.
+    /// What the last frame's Gaussians are drawn like: paler than the image.
     pub drawn: Vec<[f32; 4]>,
 }
 

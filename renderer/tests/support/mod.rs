@@ -57,7 +57,7 @@ impl Pictures {
     }
 }
 
-/// Differences of two sets of pictures.
+/// Differences of two sets of images.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Difference {
     /// Colour and alpha.

@@ -14,7 +14,7 @@ pub struct Scene {
     pub canonical: Vec<[f32; 4]>,
 }
 
-/// Pictures in f64, as in `RenderTarget`.
+/// Images in f64, as in `RenderTarget`.
 #[derive(Debug, Clone)]
 pub struct Picture {
     pub color: Vec<[f64; 4]>,
@@ -22,7 +22,7 @@ pub struct Picture {
     pub canonical: Vec<[f64; 4]>,
 }
 
-/// One Gaussian in the picture: place in the world and in pixels, camera z, opacity and inverse covariance after the
+/// One Gaussian in the image: place in the world and in pixels, camera z, opacity and inverse covariance after the
 /// filter.
 #[derive(Debug, Clone, Copy)]
 pub struct Splat {

@@ -12,7 +12,7 @@ const CUT: f64 = 1.0 / 255.0;
 const MAX_ALPHA: f64 = 0.99;
 const OPAQUE: f64 = 1e-4;
 
-/// dL/d the pictures, element for element as in `PictureGradients`.
+/// dL/d the images, element for element as in `ImageGradients`.
 #[derive(Debug, Clone)]
 pub struct Incoming<T = f32> {
     pub color: Vec<[T; 4]>,
@@ -87,7 +87,7 @@ fn rgb(color: [f64; 4]) -> DVec3 {
     DVec3::new(color[0], color[1], color[2])
 }
 
-/// The loss that is linear in the pictures with `incoming` as its derivative, with the lists of `touched` kept while
+/// The loss that is linear in the images with `incoming` as its derivative, with the lists of `touched` kept while
 /// `splats` may have moved.
 pub fn linear_loss(scene: &Scene, touched: &Touched, splats: &[Splat], incoming: &Incoming, width: u32) -> f64 {
     let mut loss = 0.0;
@@ -199,7 +199,7 @@ pub fn backward<T: Copy + Into<f64>>(
     out
 }
 
-/// Entries xx, xy, xz, yy, yz, zz of `J^T C J`, with C = (xx, xy, yy) of the picture and J = d pixel / d centre of a
+/// Entries xx, xy, xz, yy, yz, zz of `J^T C J`, with C = (xx, xy, yy) of the image and J = d pixel / d centre of a
 /// splat by differences.
 pub fn lift(
     scene: &Scene,

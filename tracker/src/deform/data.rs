@@ -1,4 +1,4 @@
-//! What the solver asks of the pictures.
+//! What the solver asks of the images.
 
 use glam::DMat4;
 
@@ -14,7 +14,7 @@ pub struct PointDerivatives {
     pub curvature: Vec<[f32; 4]>,
 }
 
-/// Compares the posed, displaced Gaussians with the pictures of this instant: `λ_color L_color + λ_mask L_mask` of
+/// Compares the posed, displaced Gaussians with the images of this instant: `λ_color L_color + λ_mask L_mask` of
 /// Eq. 3.
 pub trait DataTerm {
     /// Why it cannot.
@@ -26,7 +26,7 @@ pub trait DataTerm {
     /// The implementation's.
     fn loss(&mut self, displacement: &[[f32; 4]]) -> Result<f64, Self::Error>;
 
-    /// The loss, and its derivatives into `out`: one element an instant that pictures were taken at (all together when
+    /// The loss, and its derivatives into `out`: one element an instant that images were taken at (all together when
     /// the cameras are synchronous); the sum of all counts.
     ///
     /// # Errors

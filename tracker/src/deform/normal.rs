@@ -6,7 +6,7 @@ use rayon::prelude::*;
 /// Entry of a list of pairs that stands for none.
 const NONE: u32 = u32::MAX;
 /// Conjugate gradients end at this share of the first residual, or after so many iterations. The step is tested on the
-/// pictures anyway: 1e-4 lowers the loss no further and takes twice as long.
+/// images anyway: 1e-4 lowers the loss no further and takes twice as long.
 const TOLERANCE: f64 = 1e-3;
 const MAX_ITERATIONS: usize = 200;
 /// Rows that one task of a product takes.

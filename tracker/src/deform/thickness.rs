@@ -9,7 +9,7 @@ const LEAST_SHARE: f64 = 0.01;
 /// Share of a frame in what is known, once something is.
 const RATE: f64 = 0.5;
 
-/// The mean displacement of each part along its normals, where the pictures tell it. Smoothness (Eq. 4) then counts from
+/// The mean displacement of each part along its normals, where the images tell it. Smoothness (Eq. 4) then counts from
 /// there, so that the unseen side of a sleeve is not dragged along by the seen one but follows it outwards.
 #[derive(Debug)]
 pub(super) struct Thickness {
@@ -38,7 +38,7 @@ impl Thickness {
         self.normals[node] * known[self.parts[node]]
     }
 
-    /// Learns from a frame's result: what the pictures say along the normals, `n^T H n`, is a node's weight.
+    /// Learns from a frame's result: what the images say along the normals, `n^T H n`, is a node's weight.
     pub(super) fn learn(&mut self, translations: &[DVec3], matrix: &NormalMatrix) {
         let count = self.parts.iter().max().map_or(0, |most| most + 1);
         let mut sums = vec![(0.0, 0.0); count];

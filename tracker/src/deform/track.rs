@@ -16,10 +16,10 @@ const DAMPING_RANGE: (f64, f64) = (1e-3, 1e6);
 /// Shares of the predicted fall of the loss above and below which the damping changes after a step.
 const GOOD_GAIN: f64 = 0.75;
 const POOR_GAIN: f64 = 0.25;
-/// A step is not tried when it promises to lower the loss by less than this share: the pictures' sums are `f32`, and what
+/// A step is not tried when it promises to lower the loss by less than this share: the images' sums are `f32`, and what
 /// rounding says of so small a step would decide on the damping of the next frames.
 const LEAST_GAIN: f64 = 1e-5;
-/// Keeps the matrix regular where neither picture nor neighbour says anything, as a share of its mean diagonal: the unit
+/// Keeps the matrix regular where neither image nor neighbour says anything, as a share of its mean diagonal: the unit
 /// of length does not matter.
 const LEAST_DAMPING: f64 = 1e-11;
 

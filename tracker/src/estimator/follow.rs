@@ -3,7 +3,7 @@
 use super::*;
 
 impl PoseEstimator {
-    /// Follows the person from the last pose; searches the pictures where that fails.
+    /// Follows the person from the last pose; searches the images where that fails.
     pub(super) fn follow_or_search(
         &mut self,
         set: &FrameSet,
@@ -73,8 +73,8 @@ impl PoseEstimator {
             (false, 0) => (config.look_after_m, usize::MAX),
             (false, most) => (config.look_after_m, most),
         };
-        let has_picture = |slot: usize| pictures.get(slot).is_some_and(Option::is_some);
-        let due = due(&track.looks, has_picture, &predicted, set.master_nanos, look_after_m, most);
+        let has_image = |slot: usize| pictures.get(slot).is_some_and(Option::is_some);
+        let due = due(&track.looks, has_image, &predicted, set.master_nanos, look_after_m, most);
         let looks: Vec<Option<Look>> = pictures
             .par_iter()
             .zip(&self.rig.cameras)

@@ -32,7 +32,7 @@ impl PoseEstimator {
                         };
                         refine(picture, &coarse, look.sighting.crop.scale(), &gate, evidence.as_ref())
                     }
-                    // The network sees nobody here, but the other cameras place the body in this picture.
+                    // The network sees nobody here, but the other cameras place the body in this image.
                     (None, Some(evidence)) => gated_mask(evidence, &gate),
                     (None, None) => return Err(NoMask::NoPerson),
                 };

@@ -84,7 +84,7 @@ impl PoseEstimator {
         Ok(())
     }
 
-    /// Follows the person, or searches whole pictures: nobody waits for the set.
+    /// Follows the person, or searches whole images: nobody waits for the set.
     fn find_at_once(&mut self, set: &FrameSet, others: &[Marks]) -> Result<Fitted, TrackError> {
         let pictures = self.check(set)?;
         let given = (self.config.search_crops, self.looks_at_all);

@@ -66,7 +66,7 @@ impl FaceStudy {
         let (rotation, origin) = (posed.rotation[model.roles.head].inverse(), posed.origin[model.roles.head]);
         let from = rotation * (view.center() - origin) / scale;
         for (rays, &landmark) in self.rays.iter_mut().zip(&RIGID) {
-            let pixel = target.crop.to_picture_from(landmarks[landmark], side);
+            let pixel = target.crop.to_image_from(landmarks[landmark], side);
             let Some(ideal) = view.undistorted(camera, pixel) else { continue };
             let along = rotation * (view.rotation.transpose() * (ideal / view.focal_px).extend(1.0));
             rays.push(Ray { from, along: along.normalize() });

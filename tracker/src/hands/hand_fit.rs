@@ -1,7 +1,7 @@
 //! Damped least squares of one hand on the landmarks of all views.
 //!
 //! Unknown are the wrist's shift and turn relative to the body's pose and 20 angles of the fingers. The cost adds up halves
-//! of squared residuals over standard deviations: landmark distances in the pictures (Cauchy weights), the wrist's change,
+//! of squared residuals over standard deviations: landmark distances in the images (Cauchy weights), the wrist's change,
 //! deviations of angles from the relaxed hand and from the last set, limits of angles, and the coupling of a finger's last
 //! two joints (the last bends about two thirds as far as the one before: Lin, Wu and Huang, "Modeling the constraints of human
 //! hand motion", 2000, eq. 4).
@@ -18,7 +18,7 @@ use crate::view::View;
 
 /// Unknowns: shift, turn, four angles of five fingers.
 const SIZE: usize = 26;
-/// Standard deviation of a landmark, metres and pixels of the picture.
+/// Standard deviation of a landmark, metres and pixels of the image.
 const SPREAD_M: f64 = 0.006;
 const SPREAD_PX: f64 = 1.0;
 /// Residuals of this many standard deviations lose half their weight.
@@ -42,7 +42,7 @@ pub(crate) struct HandSight {
     pub seen: [Option<DVec2>; HAND_LANDMARKS],
     /// Importance, 0..=1.
     pub trust: f64,
-    /// From the world at the set's time to where the hand was in this picture, as far as the wrist moved it.
+    /// From the world at the set's time to where the hand was in this image, as far as the wrist moved it.
     pub carry: RigidMotion,
 }
 

@@ -82,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn damaged_and_foreign_files_and_poisoned_pictures_are_errors() {
+    fn damaged_and_foreign_files_and_poisoned_images_are_errors() {
         for bytes in [b"not an ONNX file".as_slice(), b"", &EMBEDDED[..EMBEDDED.len() / 2]] {
             assert_eq!(HandNet::from_onnx(bytes).unwrap_err().kind, TrackErrorKind::Net);
         }

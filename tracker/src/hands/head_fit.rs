@@ -13,7 +13,7 @@ use crate::view::View;
 
 /// Unknowns: shift, turn, logarithm of the size.
 const SIZE: usize = 7;
-/// Standard deviation of a landmark, metres and pixels of the picture.
+/// Standard deviation of a landmark, metres and pixels of the image.
 const SPREAD_M: f64 = 0.005;
 const SPREAD_PX: f64 = 1.0;
 /// Residuals of this many standard deviations lose half their weight.
@@ -36,7 +36,7 @@ pub(crate) struct FaceSight {
     pub seen: Vec<(DVec2, DVec3)>,
     /// Importance, 0..=1.
     pub trust: f64,
-    /// From the world at the set's time to where the head was in this picture, as far as its joint moved it.
+    /// From the world at the set's time to where the head was in this image, as far as its joint moved it.
     pub carry: RigidMotion,
 }
 

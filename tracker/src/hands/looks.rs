@@ -35,7 +35,7 @@ pub(crate) struct PartLook {
     /// Pixels from the principal point, without distortion; `None` where a landmark cannot be used.
     pub seen: Vec<Option<DVec2>>,
     pub presence: f64,
-    /// The hand or the head by the body's pose when the picture was taken.
+    /// The hand or the head by the body's pose when the image was taken.
     pub frame: RigidMotion,
 }
 
@@ -55,7 +55,7 @@ impl PartLook {
         1e-9 * nanos.saturating_sub(self.nanos).max(0) as f64
     }
 
-    /// From the world now to the world when the picture was taken, as far as the wrist or the head moved.
+    /// From the world now to the world when the image was taken, as far as the wrist or the head moved.
     pub fn carry(&self, frame: &RigidMotion) -> RigidMotion {
         self.frame * frame.inverse()
     }
@@ -71,8 +71,8 @@ fn turn_of(up: DVec2) -> DVec2 {
     up.perp().normalize_or(DVec2::X)
 }
 
-/// The crop around a hand whose landmarks are expected at world points. `length_px` is the hand's length in the picture.
-/// `None` where the hand is out of the picture.
+/// The crop around a hand whose landmarks are expected at world points. `length_px` is the hand's length in the image.
+/// `None` where the hand is out of the image.
 pub(crate) fn hand_crop(camera: &Camera, points: &[DVec3; HAND_LANDMARKS], length_px: f64) -> Option<Crop> {
     let mut pixels = [DVec2::ZERO; HAND_LANDMARKS];
     for (pixel, point) in pixels.iter_mut().zip(points) {
@@ -90,7 +90,7 @@ pub(crate) fn hand_crop(camera: &Camera, points: &[DVec3; HAND_LANDMARKS], lengt
     (side.is_finite() && (4.0..1e4).contains(&side) && inside(camera, crop.center)).then_some(crop)
 }
 
-/// A face in a picture.
+/// A face in an image.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct FaceTarget {
     pub crop: Crop,
@@ -99,7 +99,7 @@ pub(crate) struct FaceTarget {
 }
 
 impl FaceTarget {
-    /// The face of a posed body; `None` where it looks away from the camera or is out of the picture.
+    /// The face of a posed body; `None` where it looks away from the camera or is out of the image.
     pub fn new(camera: &Camera, model: &BodyModel, posed: &Posed, scale: f64) -> Option<Self> {
         const EYES: [usize; 2] = [2, 5];
         const MOUTH: [usize; 2] = [9, 10];
@@ -135,7 +135,7 @@ mod tests {
             let points = model.bend(&relaxed()).points.map(|p| DVec3::new(0.1, 0.0, 1.2) + turn * p);
             let length_px = model.length_m * View::new(camera).px_per_m(points[0]).unwrap();
             let crop = hand_crop(camera, &points, length_px).unwrap();
-            let at = |i: usize| crop.crop_from_picture(camera.project(points[i]).unwrap()) / 256.0;
+            let at = |i: usize| crop.crop_from_image(camera.project(points[i]).unwrap()) / 256.0;
             assert!(at(9).y < at(0).y && (at(9).x - at(0).x).abs() < 0.02);
             for i in 0..HAND_LANDMARKS {
                 let p = at(i);

@@ -335,13 +335,13 @@ impl HandTracker {
                 let view = View::new(camera);
                 let (seen, presence) = if part == HEAD {
                     let output = self.face_net.run(&crop.sample_square(&picture, FACE_SIDE))?;
-                    let of_point = |landmark: usize| crop.to_picture_from(output.landmarks[landmark], FACE_SIDE);
+                    let of_point = |landmark: usize| crop.to_image_from(output.landmarks[landmark], FACE_SIDE);
                     let seen = FACE_POINTS.iter().map(|point| view.undistorted(camera, of_point(point.landmark)));
                     (seen.collect(), output.presence)
                 } else {
                     let output = self.hand_net.run(&crop.sample_square(&picture, HAND_SIDE))?;
                     let seen = output.landmarks.iter();
-                    let seen = seen.map(|&at| view.undistorted(camera, crop.to_picture_from(at, HAND_SIDE)));
+                    let seen = seen.map(|&at| view.undistorted(camera, crop.to_image_from(at, HAND_SIDE)));
                     (seen.collect(), output.presence)
                 };
                 let delay_secs = 1e-9 * frame.capture_nanos.saturating_sub(set.master_nanos) as f64;

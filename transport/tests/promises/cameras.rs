@@ -322,7 +322,7 @@ fn a_computer_whose_clock_does_not_answer_gives_no_frames() {
 }
 
 #[test]
-fn the_camera_of_huge_pictures_loses_its_own_where_bytes_are_short() {
+fn the_camera_of_huge_images_loses_its_own_where_bytes_are_short() {
     let host = host("test", &["small", "huge"], "tcp/127.0.0.1:0");
     let (small, huge) = (CameraId::from("small"), CameraId::from("huge"));
     let config = TransportConfig {
@@ -338,7 +338,7 @@ fn the_camera_of_huge_pictures_loses_its_own_where_bytes_are_short() {
         ..frame("huge", sequence)
     };
     // Two of four that may wait fit.
-    wait_until("four huge pictures", || {
+    wait_until("four huge images", || {
         sequence += 1;
         host.publish(picture(45_000, sequence)).unwrap();
         host.publish(frame("small", sequence | 1)).unwrap();

@@ -29,7 +29,7 @@ fn offset_and_drift_of_another_computer_are_taken_off() {
     wait_until("fifty frames after the drift is known", || {
         sequence += 1;
         let taken = now_nanos();
-        // Pictures fill the wire between the questions.
+        // Images fill the wire between the questions.
         let image = Image::new(640, 360, PixelFormat::Yuyv, vec![0; 640 * 360 * 2]).unwrap();
         let capture_nanos = other_clock(taken);
         host.publish(Frame { camera: a.clone(), sequence, capture_nanos, exposure_nanos: None, image, mask: None })

@@ -74,7 +74,7 @@ fn splat_states_that_lie() {
 }
 
 #[test]
-fn pictures_calibrations_and_statistics_that_lie() {
+fn images_calibrations_and_statistics_that_lie() {
     let view_header = header(MessageKind::View);
     let decode = |image: &CompressedImage| ViewFrame::decode("front", &view_header, bytes_of(image).into());
     let good = view(1, 10).encode("front").unwrap();
@@ -286,7 +286,7 @@ fn a_hostile_publisher_ends_no_watcher_and_holds_no_message_up() {
     });
     let mut frame = 0;
     for name in ["front".to_owned(), subscriber.viewpoint_view()] {
-        wait_until("a picture", || {
+        wait_until("an image", || {
             flood();
             frame += 1;
             publisher.publish_view(&name, view(frame, 5000)).unwrap();

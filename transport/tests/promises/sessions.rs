@@ -9,7 +9,7 @@ use flyrig_transport::{
 use crate::support::*;
 
 #[test]
-fn a_picture_comes_out_as_it_went_in() {
+fn an_image_comes_out_as_it_went_in() {
     let publisher = open_publisher(|_| {});
     publisher.add_view("front").unwrap();
     assert!(!publisher.has_subscribers("front"));
@@ -17,7 +17,7 @@ fn a_picture_comes_out_as_it_went_in() {
     wait_until("the subscription", || publisher.has_subscribers("front"));
     let sent = view(7, 61_234);
     // Again until it is there: on a busy machine zenoh may drop one.
-    let received = wait_for("the picture", || {
+    let received = wait_for("the image", || {
         assert_ne!(publisher.publish_view("front", sent.clone()).unwrap(), PublishOutcome::Unwatched);
         subscriber.next_view(Duration::from_millis(200)).unwrap()
     });
@@ -85,7 +85,7 @@ fn what_nobody_watches_is_dropped_unencoded_and_counted() {
     assert_eq!((of("view/b").offered, of("view/b").unwatched, of("view/b").sent), (1, 1, 0));
     assert_eq!((of("splats").unwatched, of("splats").bytes), (1, 0));
     // A message is counted as sent a moment after it is.
-    wait_until("every picture to be accounted for", || {
+    wait_until("every image to be accounted for", || {
         let a = of("view/a");
         a.offered == a.unwatched + a.replaced + a.sent && a.sent > 0
     });
@@ -95,7 +95,7 @@ fn what_nobody_watches_is_dropped_unencoded_and_counted() {
 fn bad_names_sizes_and_too_many_views_are_refused() {
     let publisher = open_publisher(|_| {});
     assert!(publisher.publish_view("a/*", view(1, 10)).unwrap_err().to_string().contains("a/*"));
-    assert!(publisher.publish_view("a", view(1, 0)).unwrap_err().to_string().contains("picture of 0 bytes"));
+    assert!(publisher.publish_view("a", view(1, 0)).unwrap_err().to_string().contains("image of 0 bytes"));
     let flat = flyrig_transport::ViewFrame { height: 0, ..view(1, 10) };
     assert!(publisher.publish_view("a", flat).unwrap_err().to_string().contains("64x0"));
     for i in 0..64 {
@@ -125,9 +125,9 @@ fn a_subscriber_may_come_first_and_outlives_a_restart_of_the_publisher() {
     wait_until("the end of the token", || subscriber.publishers() == 0);
 
     let second = open();
-    // Pictures of the first may still wait: go on until one of the second is there.
+    // Images of the first may still wait: go on until one of the second is there.
     let restarted = frame;
-    wait_until("a picture of the second", || {
+    wait_until("an image of the second", || {
         publish_until_seen(&second, &subscriber, "front", &mut frame).header.frame > restarted
     });
     wait_until("the second token", || subscriber.publishers() == 1);
@@ -147,7 +147,7 @@ fn two_subscribers_each_get_all_and_one_may_leave() {
     publish_until_seen(&publisher, &two, "front", &mut frame);
     one.close().unwrap();
     let before = frame;
-    wait_until("a later picture", || publish_until_seen(&publisher, &two, "front", &mut frame).header.frame > before);
+    wait_until("a later image", || publish_until_seen(&publisher, &two, "front", &mut frame).header.frame > before);
     assert!(publisher.has_subscribers("front"));
 }
 

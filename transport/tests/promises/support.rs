@@ -79,7 +79,7 @@ pub fn publish_until_seen(
     name: &str,
     frame: &mut u64,
 ) -> Received<ViewFrame> {
-    wait_for(&format!("a picture of {name}"), || {
+    wait_for(&format!("an image of {name}"), || {
         *frame += 1;
         publisher.publish_view(name, view(*frame, 5000)).unwrap();
         subscriber.next_view(Duration::from_millis(20)).unwrap().filter(|received| received.topic == name)

@@ -23,7 +23,7 @@ pub(crate) struct Capability {
     pub driver: String,
     pub card: String,
     pub bus_info: String,
-    /// Whether it gives pictures through memory-mapped buffers.
+    /// Whether it gives images through memory-mapped buffers.
     pub captures: bool,
     pub(super) multi_planar: bool,
 }
@@ -55,7 +55,7 @@ pub(crate) struct ControlRange {
     pub flags: u32,
 }
 
-/// Picture sizes of a format.
+/// Image sizes of a format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum SizeRange {
     One(u32, u32),

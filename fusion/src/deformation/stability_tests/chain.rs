@@ -1,4 +1,4 @@
-//! The whole chain, plainly and slowly in f64: pictures in, displaced positions out. Written from the equations; it
+//! The whole chain, plainly and slowly in f64: images in, displaced positions out. Written from the equations; it
 //! shares the skeleton, the f64 skinning and the inset of the surface with the product.
 
 use flyrig_body::{SurfaceGaussians, skin_jacobian_f64, skin_point_f64};
@@ -15,7 +15,7 @@ use super::small_scene::{Shot, SmallScene};
 /// A person 400 pixels high.
 const PAPER_PIXELS_A_M2: f64 = (400.0 / 1.75) * (400.0 / 1.75);
 
-/// A picture as it is compared.
+/// An image as it is compared.
 struct View {
     camera: Camera,
     bones: Vec<DMat4>,
@@ -118,7 +118,7 @@ impl<'a> Chain<'a> {
 
     /// Eq. 3 without its regulariser.
     fn data_loss(&self, views: &[View], t: &[DVec3]) -> f64 {
-        views.iter().map(|view| picture_loss(view, &self.draw(view, t).2.color)).sum()
+        views.iter().map(|view| image_loss(view, &self.draw(view, t).2.color)).sum()
     }
 
     /// The data's loss, gradient by the nodes and Gauss-Newton matrix.
@@ -128,7 +128,7 @@ impl<'a> Chain<'a> {
         let mut matrix = vec![vec![DMat3::ZERO; nodes]; nodes];
         for view in views {
             let (scene, splats, picture) = self.draw(view, t);
-            loss += picture_loss(view, &picture.color);
+            loss += image_loss(view, &picture.color);
             let (width, height) = (view.camera.intrinsics.width, view.camera.intrinsics.height);
             let touched = touched_by(splats, (width, height));
             let incoming = incoming(view, &picture.color);
@@ -309,14 +309,14 @@ fn wanted(rgba: &[u8], width: usize, height: usize, side: usize) -> Vec<[f64; 4]
     (0..height / side).flat_map(|y| (0..width / side).map(move |x| pixel(x, y))).collect()
 }
 
-fn picture_loss(view: &View, drawn: &[[f64; 4]]) -> f64 {
+fn image_loss(view: &View, drawn: &[[f64; 4]]) -> f64 {
     let pixel = |(drawn, wanted): (&[f64; 4], &[f64; 4])| -> f64 {
         (0..4).map(|c| view.weights[c] * (drawn[c] - wanted[c]).powi(2)).sum()
     };
     drawn.iter().zip(&view.wanted).map(pixel).sum()
 }
 
-/// dL/d the picture, and of the Gauss-Newton matrix what a shift of the picture by a pixel does.
+/// dL/d the image, and of the Gauss-Newton matrix what a shift of the image by a pixel does.
 fn incoming(view: &View, drawn: &[[f64; 4]]) -> Incoming<f64> {
     let width = view.camera.intrinsics.width as usize;
     let height = drawn.len() / width;

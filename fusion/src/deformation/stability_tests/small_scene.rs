@@ -22,7 +22,7 @@ pub struct SmallScene {
     pub cameras: Vec<Camera>,
 }
 
-/// Pictures of one frame, each with its own pose.
+/// Images of one frame, each with its own pose.
 pub struct Shot {
     pub poses: Vec<Pose>,
     /// sRGB bytes with coverage.

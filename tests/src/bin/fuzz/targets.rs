@@ -22,7 +22,7 @@ pub struct Target {
 pub const TARGETS: [Target; 10] = [
     Target { name: "pixels", words: &[], run: pixels },
     Target { name: "jpeg", words: &["\u{fffd}\u{fffd}", "JFIF", "Exif", "Adobe"], run: jpeg },
-    Target { name: "picture", words: &["IHDR", "IDAT", "IEND", "PLTE", "tRNS"], run: picture },
+    Target { name: "image", words: &["IHDR", "IDAT", "IEND", "PLTE", "tRNS"], run: picture },
     Target { name: "mcap", words: &["foxglove.RawImage", "camera/a", "protobuf", "\u{89}MCAP0\r\n"], run: mcap },
     Target { name: "calibration", words: CALIBRATION_WORDS, run: calibration },
     Target { name: "config", words: CONFIG_WORDS, run: config },
@@ -107,7 +107,7 @@ fn jpeg(input: &[u8]) -> Result<String, String> {
     let image = Image::new(48, 32, PixelFormat::Mjpeg, input.to_vec()).map_err(|error| error.to_string())?;
     let rgb = to_rgb8(&image).map_err(|error| error.to_string())?;
     assert_eq!(rgb.len(), 48 * 32 * 3, "pixels went missing");
-    Ok("a picture".into())
+    Ok("an image".into())
 }
 
 thread_local! {

@@ -124,8 +124,8 @@ fn cut(table: &mut Table, bench: &Bench) {
     let back = rig.until(Duration::from_secs(10), |cameras| cameras[0].frames > 3);
     let hit = &rig.now()[0];
     table.row(
-        "cut off pictures (USB)",
-        "JPEG pictures of one camera end in the middle for a while",
+        "cut off images (USB)",
+        "JPEG images of one camera end in the middle for a while",
         &format!("{} frames refused, none given on", hit.errors_of(CaptureErrorKind::Corrupt)),
         "each costs itself; no restart; flowing again",
         &format!("flowing {:.0} ms after the last one", back.ms()),

@@ -1,5 +1,5 @@
 //! USB cameras out of thin air: a UVC device that speaks USB/IP to the kernel's virtual host controller, so that the real
-//! `uvcvideo` driver works on it. It can be unplugged, fall silent, and send broken pictures.
+//! `uvcvideo` driver works on it. It can be unplugged, fall silent, and send broken images.
 
 use std::{
     collections::VecDeque,
@@ -27,7 +27,7 @@ const INTERVALS: [u32; 2] = [333_333, 666_666];
 pub struct Knobs {
     /// Sends nothing.
     pub silent: AtomicBool,
-    /// So many of the next pictures are cut off in the middle.
+    /// So many of the next images are cut off in the middle.
     pub cut: AtomicU64,
 }
 
@@ -66,7 +66,7 @@ impl UvcCamera {
             changed: Condvar::new(),
             gone: AtomicBool::new(false),
         });
-        let (for_requests, for_pictures) = (Arc::clone(&shared), Arc::clone(&shared));
+        let (for_requests, for_images) = (Arc::clone(&shared), Arc::clone(&shared));
         let serial = serial.to_owned();
         let threads = vec![
             Builder::new().name("uvc requests".to_owned()).spawn(move || {
@@ -75,8 +75,8 @@ impl UvcCamera {
                 for_requests.gone.store(true, Ordering::Relaxed);
                 for_requests.changed.notify_all();
             })?,
-            Builder::new().name("uvc pictures".to_owned()).spawn(move || {
-                let _ = send_pictures(&for_pictures, &pictures);
+            Builder::new().name("uvc images".to_owned()).spawn(move || {
+                let _ = send_images(&for_images, &pictures);
             })?,
         ];
         Ok(Self { shared, threads })
@@ -94,7 +94,7 @@ impl Drop for UvcCamera {
     }
 }
 
-/// JPEG pictures of something that moves.
+/// JPEG images of something that moves.
 pub fn pictures() -> Vec<Vec<u8>> {
     let picture = |n: u32| {
         let (width, height) = (u32::from(WIDTH), u32::from(HEIGHT));
@@ -170,7 +170,7 @@ fn answer(mut requests: UnixStream, shared: &Shared, serial: &str) -> io::Result
     }
 }
 
-fn send_pictures(shared: &Shared, pictures: &[Vec<u8>]) -> io::Result<()> {
+fn send_images(shared: &Shared, pictures: &[Vec<u8>]) -> io::Result<()> {
     let (mut next, mut toggle) = (Instant::now(), 0);
     for picture in pictures.iter().cycle() {
         let mut payload = vec![2, 0x82 | toggle];

@@ -1,9 +1,9 @@
-//! The picture loss against a plain f64 reference, its derivatives against differences of that reference.
+//! The image loss against a plain f64 reference, its derivatives against differences of that reference.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use flyrig_gpu::{GpuContext, StorageBuffer, testing::on_both};
 use flyrig_renderer::{
-    LossSettings, PictureGradients, PictureLoss, PictureSums, RenderTarget, WantedPicture, linear_from_srgb,
+    ImageGradients, ImageLoss, ImageSums, LossSettings, RenderTarget, WantedImage, linear_from_srgb,
 };
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
@@ -16,7 +16,7 @@ struct Case {
     settings: LossSettings,
 }
 
-/// Halved picture: premultiplied linear colour and coverage.
+/// Halved image: premultiplied linear colour and coverage.
 fn wanted(case: &Case) -> (usize, usize, Vec<[f64; 4]>) {
     let side = 1usize << case.level;
     let (width, height) = (case.source[0] as usize >> case.level, case.source[1] as usize >> case.level);
@@ -44,14 +44,14 @@ fn pixel_loss(settings: &LossSettings, goal: [f64; 4], seen: [f64; 4]) -> f64 {
     f64::from(settings.color_weight) * squared + f64::from(settings.mask_weight) * (seen[3] - goal[3]).powi(2)
 }
 
-fn check(gpu: &GpuContext, loss: &mut PictureLoss, case: &Case, name: &str) {
+fn check(gpu: &GpuContext, loss: &mut ImageLoss, case: &Case, name: &str) {
     let (width, height, goal) = wanted(case);
     let target = RenderTarget::new(gpu, width as u32, height as u32).unwrap();
     target.color.write(gpu, &case.drawn);
-    let picture = WantedPicture::zeroed(gpu, case.source, case.level).unwrap();
+    let picture = WantedImage::zeroed(gpu, case.source, case.level).unwrap();
     let image = StorageBuffer::from_bytes(gpu, "image", &case.rgba).unwrap();
     assert_eq!(picture.size(), [width as u32, height as u32]);
-    let out = PictureGradients::zeroed(gpu, width as u32, height as u32).unwrap();
+    let out = ImageGradients::zeroed(gpu, width as u32, height as u32).unwrap();
     loss.reserve(gpu, 2).unwrap();
     let run = || {
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
@@ -65,7 +65,7 @@ fn check(gpu: &GpuContext, loss: &mut PictureLoss, case: &Case, name: &str) {
 
     let [left, top, right, bottom] = case.settings.area.map(|v| v as usize);
     let (right, bottom) = (right.min(width), bottom.min(height));
-    let mut expected = PictureSums::default();
+    let mut expected = ImageSums::default();
     let at_drawn = |at: usize| case.drawn[at].map(f64::from);
     let mut worst = [0.0f64; 2];
     for y in top..bottom {
@@ -138,7 +138,7 @@ fn case(rng: &mut StdRng, source: [u32; 2], level: u32, settings: LossSettings, 
 #[test]
 fn losses_and_slopes_match_the_reference() {
     on_both(|gpu| {
-        let mut loss = PictureLoss::new(gpu).unwrap();
+        let mut loss = ImageLoss::new(gpu).unwrap();
         let mut rng = StdRng::seed_from_u64(4);
         let both = LossSettings { color_weight: 2.0, mask_weight: 3.0, area: [0, 0, 96, 80], with_unknown: false };
         for (name, source, level, settings, coverage) in [
@@ -161,16 +161,15 @@ fn losses_and_slopes_match_the_reference() {
 #[test]
 fn an_empty_area_and_a_buffer_that_does_not_fit_cost_nothing() {
     on_both(|gpu| {
-        let mut loss = PictureLoss::new(gpu).unwrap();
+        let mut loss = ImageLoss::new(gpu).unwrap();
         let mut rng = StdRng::seed_from_u64(5);
         let settings = LossSettings { color_weight: 1.0, mask_weight: 1.0, area: [9, 9, 9, 20], with_unknown: false };
         let case = case(&mut rng, [32, 32], 0, settings, None);
-        assert_eq!(WantedPicture::zeroed(gpu, [1, 5], 2).unwrap().size(), [1, 5], "not below a pixel");
-        let picture = WantedPicture::zeroed(gpu, case.source, 0).unwrap();
+        assert_eq!(WantedImage::zeroed(gpu, [1, 5], 2).unwrap().size(), [1, 5], "not below a pixel");
+        let picture = WantedImage::zeroed(gpu, case.source, 0).unwrap();
         let image = StorageBuffer::from_bytes(gpu, "image", &case.rgba).unwrap();
         let target = RenderTarget::new(gpu, 32, 32).unwrap();
-        let (fits, small) =
-            (PictureGradients::zeroed(gpu, 32, 32).unwrap(), PictureGradients::zeroed(gpu, 8, 8).unwrap());
+        let (fits, small) = (ImageGradients::zeroed(gpu, 32, 32).unwrap(), ImageGradients::zeroed(gpu, 8, 8).unwrap());
         loss.reserve(gpu, 1).unwrap();
         for (area, out) in [([9, 9, 9, 20], &fits), ([0, 0, 32, 32], &small), ([40, 0, 50, 9], &fits)] {
             let settings = LossSettings { area, ..settings };
@@ -178,7 +177,7 @@ fn an_empty_area_and_a_buffer_that_does_not_fit_cost_nothing() {
             loss.prepare(gpu, &mut encoder, &picture, &image, &settings);
             loss.encode(gpu, &mut encoder, 0, &target, &picture, &settings, out);
             gpu.queue.submit([encoder.finish()]);
-            assert_eq!(loss.read(gpu, 1).unwrap(), [PictureSums::default()]);
+            assert_eq!(loss.read(gpu, 1).unwrap(), [ImageSums::default()]);
         }
     });
 }
@@ -186,14 +185,14 @@ fn an_empty_area_and_a_buffer_that_does_not_fit_cost_nothing() {
 #[test]
 fn a_number_that_is_not_finite_is_told_and_stays_where_it_is() {
     on_both(|gpu| {
-        let mut loss = PictureLoss::new(gpu).unwrap();
+        let mut loss = ImageLoss::new(gpu).unwrap();
         let mut rng = StdRng::seed_from_u64(6);
         let settings = LossSettings { color_weight: 2.0, mask_weight: 2.0, area: [4, 3, 30, 28], with_unknown: false };
         let case = case(&mut rng, [32, 32], 0, settings, None);
-        let picture = WantedPicture::zeroed(gpu, case.source, 0).unwrap();
+        let picture = WantedImage::zeroed(gpu, case.source, 0).unwrap();
         let image = StorageBuffer::from_bytes(gpu, "image", &case.rgba).unwrap();
         let target = RenderTarget::new(gpu, 32, 32).unwrap();
-        let out = PictureGradients::zeroed(gpu, 32, 32).unwrap();
+        let out = ImageGradients::zeroed(gpu, 32, 32).unwrap();
         loss.reserve(gpu, 1).unwrap();
         let run = |drawn: &[[f32; 4]]| {
             target.color.write(gpu, drawn);

@@ -1,4 +1,4 @@
-//! `picture_loss.wgsl` on the processor. Threads share rows; sums are made a row at a time, in the rows' order.
+//! `image_loss.wgsl` on the processor. Threads share rows; sums are made a row at a time, in the rows' order.
 
 use std::array::from_fn;
 
@@ -6,7 +6,7 @@ use flyrig_gpu::StorageBuffer;
 use glam::Vec4;
 use rayon::prelude::*;
 
-use super::{Loss, PictureGradients, SUMS, UNKNOWN_RGBA};
+use super::{ImageGradients, Loss, SUMS, UNKNOWN_RGBA};
 
 /// Converts sRGB bytes with coverage to premultiplied linear colour at the compared size; negative where nothing is known.
 pub(super) fn unpack(
@@ -40,12 +40,12 @@ pub(super) fn unpack(
     });
 }
 
-/// Compares a drawn picture with the wanted one.
+/// Compares a drawn image with the wanted one.
 pub(super) fn compare(
     loss: &Loss,
     wanted: &StorageBuffer<[f32; 4]>,
     drawn: &StorageBuffer<[f32; 4]>,
-    out: &PictureGradients,
+    out: &ImageGradients,
     sums: &StorageBuffer<[f32; 4]>,
 ) {
     let (Some(wanted), Some(drawn), Some(mut sums)) = (wanted.slice(), drawn.slice(), sums.slice_mut()) else { return };
@@ -93,7 +93,7 @@ pub(super) fn compare(
     }
 }
 
-/// The rows of the area within a picture: number of the row, and its part in the area.
+/// The rows of the area within an image: number of the row, and its part in the area.
 fn rows<'a>(
     loss: &Loss,
     picture: &'a mut [[f32; 4]],

@@ -1,4 +1,4 @@
-//! How a drawn picture differs from the wanted one, and what the backward rasteriser needs to know of it.
+//! How a drawn image differs from the wanted one, and what the backward rasteriser needs to know of it.
 
 mod processor;
 
@@ -8,15 +8,15 @@ use wgpu::{CommandEncoder, ComputePassDescriptor};
 
 use crate::constants::Constants;
 use crate::scan::{run, run_at};
-use crate::{PictureGradients, RenderTarget, linear_from_srgb};
+use crate::{ImageGradients, RenderTarget, linear_from_srgb};
 
-const WGSL: &str = include_str!("picture_loss.wgsl");
+const WGSL: &str = include_str!("image_loss.wgsl");
 /// Pixels of a column that one invocation compares.
 const ROWS: u32 = 4;
-/// Sums a picture that are read back; the CPU adds them up in `f64`.
+/// Sums an image that are read back; the CPU adds them up in `f64`.
 const SUMS: u32 = 64;
 
-/// Weights of a picture's loss
+/// Weights of an image's loss
 /// `color_weight * |Δ colour|² + mask_weight * (Δ alpha)²`, summed over the pixels of an area: FlyHuman's Eq. 3 over
 /// premultiplied linear colour and coverage.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -36,9 +36,9 @@ pub struct LossSettings {
 /// example.
 pub const UNKNOWN_RGBA: [u8; 4] = [0, 0, 1, 0];
 
-/// Sums of one picture over its area.
+/// Sums of one image over its area.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct PictureSums {
+pub struct ImageSums {
     /// The loss.
     pub loss: f64,
     /// Squared difference of alpha, pixels.
@@ -49,7 +49,7 @@ pub struct PictureSums {
     pub wanted: f64,
 }
 
-/// Constants of one comparison, `struct Loss` in picture_loss.wgsl.
+/// Constants of one comparison, `struct Loss` in image_loss.wgsl.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct Loss {
@@ -64,9 +64,9 @@ struct Loss {
     with_unknown: u32,
 }
 
-/// A picture that should be drawn.
+/// An image that should be drawn.
 #[derive(Debug)]
-pub struct WantedPicture {
+pub struct WantedImage {
     /// Pixels of the bytes, and how many of them make the side of a pixel.
     source: [u32; 2],
     shrink: u32,
@@ -77,11 +77,11 @@ pub struct WantedPicture {
     constants: Constants,
 }
 
-impl WantedPicture {
+impl WantedImage {
     /// The smallest is an 8th as wide and high.
     pub const MAX_LEVEL: u32 = 3;
 
-    /// For pictures of `source` pixels, compared at `1 / 2^level` of that in each direction (rounded down, at least a
+    /// For images of `source` pixels, compared at `1 / 2^level` of that in each direction (rounded down, at least a
     /// pixel): colours are means, in linear light and by coverage.
     ///
     /// # Errors
@@ -102,7 +102,7 @@ impl WantedPicture {
         })
     }
 
-    /// Pixels of the picture as it is compared, width and height.
+    /// Pixels of the image as it is compared, width and height.
     #[must_use]
     pub fn size(&self) -> [u32; 2] {
         [self.width, self.height]
@@ -116,16 +116,16 @@ struct Kernels {
     add_up: ComputeKernel,
 }
 
-/// Compares pictures where they lie. Sums are made in a fixed order: equal input gives equal bytes on one device.
+/// Compares images where they lie. Sums are made in a fixed order: equal input gives equal bytes on one device.
 #[derive(Debug)]
-pub struct PictureLoss {
+pub struct ImageLoss {
     /// None on the processor.
     kernels: Option<Kernels>,
     linear: StorageBuffer<f32>,
     sums: StorageBuffer<[f32; 4]>,
 }
 
-impl PictureLoss {
+impl ImageLoss {
     /// Compiles the kernels.
     ///
     /// # Errors
@@ -144,7 +144,7 @@ impl PictureLoss {
         })
     }
 
-    /// Room for the sums of `pictures` pictures.
+    /// Room for the sums of `pictures` images.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -162,7 +162,7 @@ impl PictureLoss {
         &self,
         gpu: &GpuContext,
         encoder: &mut CommandEncoder,
-        wanted: &WantedPicture,
+        wanted: &WantedImage,
         image: &StorageBuffer<u32>,
         settings: &LossSettings,
     ) {
@@ -173,7 +173,7 @@ impl PictureLoss {
         };
         wanted.constants.encode(gpu, encoder, &[bytes_of(&constants)]);
         let mut pass =
-            encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("wanted picture"), ..Default::default() });
+            encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("wanted image"), ..Default::default() });
         let resources = [
             wanted.constants.get(0),
             image.raw().as_entire_binding(),
@@ -183,8 +183,8 @@ impl PictureLoss {
         run(gpu, &mut pass, unpack, &resources, groups);
     }
 
-    /// Records the comparison of a drawn picture as number `index`, and writes its derivatives to `out`, both within
-    /// `settings.area`. Pictures smaller than the wanted one are not compared.
+    /// Records the comparison of a drawn image as number `index`, and writes its derivatives to `out`, both within
+    /// `settings.area`. Images smaller than the wanted one are not compared.
     #[allow(clippy::too_many_arguments)]
     pub fn encode(
         &self,
@@ -192,9 +192,9 @@ impl PictureLoss {
         encoder: &mut CommandEncoder,
         index: usize,
         drawn: &RenderTarget,
-        wanted: &WantedPicture,
+        wanted: &WantedImage,
         settings: &LossSettings,
-        out: &PictureGradients,
+        out: &ImageGradients,
     ) {
         let pixels = wanted.width as usize * wanted.height as usize;
         let fits = (drawn.width, drawn.height) == (wanted.width, wanted.height)
@@ -213,7 +213,7 @@ impl PictureLoss {
         };
         wanted.constants.encode(gpu, encoder, &[bytes_of(&constants)]);
         let mut pass =
-            encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("picture loss"), ..Default::default() });
+            encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("image loss"), ..Default::default() });
         let partials = wanted.partials.raw().as_entire_binding();
         let resources = [
             (0, wanted.constants.get(0)),
@@ -228,24 +228,24 @@ impl PictureLoss {
         run_at(gpu, &mut pass, add_up, &resources, (SUMS.div_ceil(64), 1));
     }
 
-    /// Waits for the GPU and reads the sums of the first `pictures` pictures.
+    /// Waits for the GPU and reads the sums of the first `pictures` images.
     ///
     /// # Errors
     /// [`GpuError::Lost`].
-    pub fn read(&self, gpu: &GpuContext, pictures: usize) -> Result<Vec<PictureSums>, GpuError> {
+    pub fn read(&self, gpu: &GpuContext, pictures: usize) -> Result<Vec<ImageSums>, GpuError> {
         let len = pictures.saturating_mul(SUMS as usize).min(self.sums.len());
         let sums = self.sums.read_first(gpu, len)?;
         let total = |one: &[[f32; 4]]| {
             let [loss, mask, color, wanted] =
                 one.iter().fold([0.0; 4], |sum, s| std::array::from_fn(|i| sum[i] + f64::from(s[i])));
-            PictureSums { loss, mask, color, wanted }
+            ImageSums { loss, mask, color, wanted }
         };
         Ok(sums.chunks(SUMS as usize).map(total).collect())
     }
 }
 
 /// Constants of a comparison and its workgroups; None where there is no area.
-fn constants(wanted: &WantedPicture, index: u32, settings: &LossSettings) -> Option<(Loss, (u32, u32))> {
+fn constants(wanted: &WantedImage, index: u32, settings: &LossSettings) -> Option<(Loss, (u32, u32))> {
     let [left, top, right, bottom] = settings.area;
     let (right, bottom) = (right.min(wanted.width), bottom.min(wanted.height));
     if left >= right || top >= bottom {

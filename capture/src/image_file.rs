@@ -1,4 +1,4 @@
-//! Picture files: decoding that notices what is cut off.
+//! Image files: decoding that notices what is cut off.
 
 use std::{io::Cursor, path::Path};
 
@@ -7,24 +7,24 @@ use image::{DynamicImage, ImageFormat, ImageReader, Limits};
 
 use crate::{CaptureError, CaptureErrorKind};
 
-/// Endings of picture files, lower case.
-pub(crate) const PICTURE_ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
+/// Endings of image files, lower case.
+pub(crate) const IMAGE_ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
 
 /// Decodes a whole JPEG or PNG. The text of the error has no file name in it.
 pub(crate) fn decode(bytes: &[u8]) -> Result<DynamicImage, CaptureError> {
     let corrupt = |text: String| CaptureError::general(CaptureErrorKind::Corrupt, text);
     let format = image::guess_format(bytes).ok().filter(|f| [ImageFormat::Jpeg, ImageFormat::Png].contains(f));
-    let Some(format) = format else { return Err(corrupt("is neither a JPEG nor a PNG picture".to_owned())) };
+    let Some(format) = format else { return Err(corrupt("is neither a JPEG nor a PNG image".to_owned())) };
     // The decoder paints what is missing grey and says nothing.
     if format == ImageFormat::Jpeg && !jpeg_has_end(bytes) {
-        return Err(corrupt("is a JPEG picture that is cut off".to_owned()));
+        return Err(corrupt("is a JPEG image that is cut off".to_owned()));
     }
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     let mut limits = Limits::default();
     limits.max_image_width = Some(MAX_IMAGE_SIDE);
     limits.max_image_height = Some(MAX_IMAGE_SIDE);
     reader.limits(limits);
-    reader.decode().map_err(|error| corrupt(format!("is a damaged or cut off picture ({error})")))
+    reader.decode().map_err(|error| corrupt(format!("is a damaged or cut off image ({error})")))
 }
 
 /// Reads and decodes a file; the error names it.
@@ -70,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn every_cut_of_a_picture_is_noticed() {
+    fn every_cut_of_an_image_is_noticed() {
         for (format, tail) in [(ImageFormat::Jpeg, 0), (ImageFormat::Png, 16)] {
             let whole = encoded(format);
             assert_eq!(decode(&whole).unwrap().width(), 40);
@@ -82,7 +82,7 @@ mod tests {
         }
         let mut padded = encoded(ImageFormat::Jpeg);
         padded.extend([0; 100]);
-        assert!(decode(&padded).is_ok(), "cameras pad JPEG pictures");
+        assert!(decode(&padded).is_ok(), "cameras pad JPEG images");
         assert_eq!(jpeg_length(&padded), Some(padded.len() - 100));
     }
 
@@ -105,6 +105,6 @@ mod tests {
 
     #[test]
     fn other_formats_are_refused_in_words() {
-        assert_eq!(decode(b"GIF89a").unwrap_err().to_string(), "is neither a JPEG nor a PNG picture");
+        assert_eq!(decode(b"GIF89a").unwrap_err().to_string(), "is neither a JPEG nor a PNG image");
     }
 }

@@ -1,13 +1,13 @@
-// How a drawn picture differs from a wanted one (FlyHuman Eq. 3), and its derivatives for the backward rasteriser.
+// How a drawn image differs from a wanted one (FlyHuman Eq. 3), and its derivatives for the backward rasteriser.
 // One invocation for four pixels of a column; sums in a fixed order.
 // Prefix: const ROWS, SUMS, UNKNOWN.
 struct Loss {
-    // Pixels of the picture.
+    // Pixels of the image.
     size: vec2<u32>,
     // First pixel of the area, and its pixels.
     first: vec2<u32>,
     area: vec2<u32>,
-    // Where the sums of this picture begin.
+    // Where the sums of this image begin.
     sums_at: u32,
     color_weight: f32,
     mask_weight: f32,
@@ -40,7 +40,7 @@ struct Sums {
 @group(0) @binding(7) var<storage, read_write> partials: array<Sums>;
 @group(0) @binding(8) var<storage, read_write> sums: array<Sums>;
 
-// First pixel of an invocation's column; x beyond the picture where there is none.
+// First pixel of an invocation's column; x beyond the image where there is none.
 fn column(id: vec3<u32>) -> vec2<u32> {
     if id.x >= loss.area.x || id.y * ROWS >= loss.area.y {
         return vec2(0xffffffffu);

@@ -1,12 +1,12 @@
-//! The pictures of one instant as the solver's data term.
+//! The images of one instant as the solver's data term.
 
 use std::time::{Duration, Instant};
 
 use flyrig_body::GpuSkinner;
 use flyrig_gpu::{GpuContext, StorageBuffer};
 use flyrig_renderer::{
-    BackwardRasterizer, Carry, GaussianBuffers, GaussianGradients, LossSettings, Outputs, PictureGradients,
-    PictureLoss, PictureSums, RasterSettings, Rasterizer, RenderTarget, WantedPicture,
+    BackwardRasterizer, Carry, GaussianBuffers, GaussianGradients, ImageGradients, ImageLoss, ImageSums, LossSettings,
+    Outputs, RasterSettings, Rasterizer, RenderTarget, WantedImage,
 };
 use flyrig_tracker::{DataTerm, PointDerivatives};
 use flyrig_types::Camera;
@@ -31,13 +31,13 @@ pub struct ViewBuffers {
     level: u32,
     rasterizer: Rasterizer,
     target: RenderTarget,
-    wanted: WantedPicture,
-    incoming: PictureGradients,
+    wanted: WantedImage,
+    incoming: ImageGradients,
 }
 
 impl ViewBuffers {
     pub fn new(gpu: &GpuContext, gaussians: usize, source: [u32; 2], level: u32) -> Result<Self> {
-        let wanted = WantedPicture::zeroed(gpu, source, level)?;
+        let wanted = WantedImage::zeroed(gpu, source, level)?;
         let [width, height] = wanted.size();
         Ok(Self {
             source,
@@ -45,7 +45,7 @@ impl ViewBuffers {
             rasterizer: Rasterizer::new(gpu, gaussians)?,
             target: RenderTarget::new(gpu, width, height)?,
             wanted,
-            incoming: PictureGradients::zeroed(gpu, width, height)?,
+            incoming: ImageGradients::zeroed(gpu, width, height)?,
         })
     }
 
@@ -58,14 +58,14 @@ impl ViewBuffers {
 pub struct Kernels<'a> {
     pub skinner: &'a GpuSkinner,
     pub posed: &'a [GaussianBuffers],
-    pub loss: &'a PictureLoss,
+    pub loss: &'a ImageLoss,
     pub backward: &'a mut BackwardRasterizer,
     pub displacement: &'a StorageBuffer<[f32; 4]>,
     pub gradients: &'a [GaussianGradients],
 }
 
 /// Draws and compares.
-pub struct Pictures<'a> {
+pub struct Images<'a> {
     scene: Instants<'a>,
     views: &'a [TrackedView<'a>],
     /// The views' cameras at the size that is compared.
@@ -76,15 +76,15 @@ pub struct Pictures<'a> {
     /// Views that count.
     trusted: Vec<bool>,
     /// Sums of what is drawn now, and of what the last derivatives were made of.
-    sums: Vec<PictureSums>,
-    derived_sums: Vec<PictureSums>,
+    sums: Vec<ImageSums>,
+    derived_sums: Vec<ImageSums>,
     /// What is drawn now, and its loss.
     drawn: Option<(Vec<[f32; 4]>, f64)>,
     draw_time: Duration,
     derivatives_time: Duration,
 }
 
-impl<'a> Pictures<'a> {
+impl<'a> Images<'a> {
     /// Prepares the images at the size that is compared.
     pub fn new(
         scene: Instants<'a>,
@@ -181,7 +181,7 @@ impl<'a> Pictures<'a> {
             let raster = RasterSettings {
                 outputs: Outputs::COLOR,
                 area: Some(settings.area),
-                // As wide as in the whole picture: a wider filter draws a wider person, and the solver makes it thinner.
+                // As wide as in the whole image: a wider filter draws a wider person, and the solver makes it thinner.
                 filter_variance_px2: plain.filter_variance_px2 * 0.25f32.powi(self.buffers[i].level as i32),
                 ..plain
             };
@@ -198,7 +198,7 @@ impl<'a> Pictures<'a> {
     }
 }
 
-impl DataTerm for Pictures<'_> {
+impl DataTerm for Images<'_> {
     type Error = FusionError;
 
     fn loss(&mut self, displacement: &[[f32; 4]]) -> Result<f64> {
@@ -236,12 +236,12 @@ impl DataTerm for Pictures<'_> {
     }
 }
 
-/// Share of the person that is where the picture shows it, less what is drawn elsewhere, 0..=1.
-fn agreement(sums: &PictureSums) -> f64 {
+/// Share of the person that is where the image shows it, less what is drawn elsewhere, 0..=1.
+fn agreement(sums: &ImageSums) -> f64 {
     if sums.wanted > 0.0 && sums.mask.is_finite() { (1.0 - sums.mask / sums.wanted).max(0.0) } else { 0.0 }
 }
 
-/// The same camera with pictures halved so often; pixel centres are at integers.
+/// The same camera with images halved so often; pixel centres are at integers.
 fn halved(camera: &Camera, level: u32) -> Camera {
     let mut camera = camera.clone();
     let share = 0.5f64.powi(level as i32);
