@@ -10,6 +10,8 @@ use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seco
 use flyrig_training::TrainArgs;
 use flyrig_types::CameraId;
 
+use crate::config::WebSection;
+
 /// Live free-viewpoint video of a person from a few cameras.
 ///
 /// Start with `flyrig demo`: it runs a simulated rig, publishes the result, watches it from a second process and
@@ -80,6 +82,8 @@ pub enum Command {
     },
     /// Walk around the people of a running rig, in a window.
     View(ViewArgs),
+    /// Serve a web page on which browsers show the people of a running rig. `flyrig run` does it too, where web.listen is set.
+    Serve(ServeArgs),
     /// Publish a recorded person stream again, at its own pace, to try viewers without a rig.
     Play(PlayArgs),
     /// Watch a running rig: print rates and latency, write images or a video.
@@ -561,6 +565,18 @@ pub struct ViewArgs {
     /// Close after so many seconds.
     #[arg(long, value_parser = parse_seconds)]
     pub seconds: Option<f64>,
+}
+
+#[derive(Debug, Args)]
+pub struct ServeArgs {
+    /// Name of the rig.
+    #[arg(long, default_value = "flyrig")]
+    pub rig: String,
+    /// Where the rig or a router listens (zenoh endpoint).
+    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
+    pub connect: String,
+    #[command(flatten)]
+    pub web: WebSection,
 }
 
 #[derive(Debug, Args)]

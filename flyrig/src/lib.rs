@@ -16,6 +16,7 @@ mod plate;
 mod pose_recording;
 mod recording;
 mod run;
+mod serve;
 mod silhouettes;
 mod sim_export;
 mod source;
@@ -78,6 +79,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         Command::Calibrate { action } => calibrate::calibrate(action, &|| open_gpu(cli.adapter.as_deref())),
         Command::Doctor { config } => doctor::doctor(config.as_deref()),
         Command::View(args) => view::view(args, &open_gpu(cli.adapter.as_deref())?),
+        Command::Serve(args) => serve::serve(args),
         Command::Watch(args) => match &args.record {
             Some(path) => stream_recording::record(args, path),
             None => watch::watch(args),

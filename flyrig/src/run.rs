@@ -14,13 +14,13 @@ use flyrig_fusion::{
 use flyrig_gpu::GpuContext;
 use flyrig_monitor::{Monitor, effort, ended_by_itself};
 use flyrig_report::{dataset, stop};
-use flyrig_transport::Publisher;
+use flyrig_transport::{Publisher, TransportConfig};
 use foxglove::messages::Log;
 
 use crate::{
     config::{Config, WatchMode},
     pose_recording::PoseRecording,
-    recording,
+    recording, serve,
     source::{self, FoundBy, Source},
 };
 
@@ -105,6 +105,15 @@ fn capture_people(
         session.rig().cameras.len(),
         publisher.endpoints().join(", ")
     );
+    // It is a viewer like any other, beside the rig.
+    let own = TransportConfig {
+        connect: publisher.endpoints().first().map(|at| loopback_of(at)).into_iter().collect(),
+        ..TransportConfig::subscriber(&config.rig.name)
+    };
+    let web = (!config.web.listen.is_empty()).then(|| serve::start(&config.web, own)).transpose()?;
+    if let Some(web) = &web {
+        eprintln!("run: people are shown at {}", web.link());
+    }
     let publisher = LivePublisher::start(publisher, config.output.jpeg_quality)?;
     let mut rig = LiveRig::new(session, intake, LiveViews::new(&config.output), Some(publisher))
         .with_splats(config.output.splats)
@@ -159,6 +168,11 @@ fn capture_people(
         return Err(ended_by_itself(&stats));
     }
     Ok(())
+}
+
+/// The endpoint as this computer reaches it: a rig that listens on all its addresses listens on loopback, too.
+fn loopback_of(endpoint: &str) -> String {
+    endpoint.replace("tcp/0.0.0.0:", "tcp/127.0.0.1:").replace("tcp/[::]:", "tcp/[::1]:")
 }
 
 /// Saves what was learnt about the person, where the configuration names a file.

@@ -1,0 +1,163 @@
+//! The interface that JavaScript calls. There is one page in a module; memory is handed over by address in the module's own memory.
+#![allow(unsafe_code, reason = "exported names are unsafe attributes; there is no unsafe block")]
+
+use std::cell::RefCell;
+
+use crate::{MAX_MESSAGE_BYTES, MessageKind, Page};
+
+#[derive(Default)]
+struct State {
+    page: Page,
+    input: Vec<u8>,
+    error: String,
+    moved: bool,
+    recolored: bool,
+}
+
+thread_local! {
+    static STATE: RefCell<State> = RefCell::default();
+}
+
+fn with<T>(work: impl FnOnce(&mut State) -> T) -> T {
+    STATE.with(|state| work(&mut state.borrow_mut()))
+}
+
+/// Makes room for a message and returns its address; 0 when it is too long.
+#[unsafe(no_mangle)]
+pub extern "C" fn input(length: usize) -> *mut u8 {
+    with(|state| {
+        if length > MAX_MESSAGE_BYTES {
+            return std::ptr::null_mut();
+        }
+        state.input.resize(length, 0);
+        state.input.as_mut_ptr()
+    })
+}
+
+/// Takes the message in that lies in the input. Returns 0, or 1 for one that was refused ([`error`] says why).
+#[unsafe(no_mangle)]
+pub extern "C" fn take(kind: u32, person: u32, now: f64) -> u32 {
+    with(|state| {
+        let input = std::mem::take(&mut state.input);
+        let taken = match MessageKind::of(kind) {
+            Some(kind) => state.page.take(kind, person, &input, now).map_err(|error| error.to_string()),
+            None => Err(format!("message of unknown kind {kind}; load the page again")),
+        };
+        state.input = input;
+        state.error = taken.err().unwrap_or_default();
+        u32::from(!state.error.is_empty())
+    })
+}
+
+/// Address of the last message's error, UTF-8.
+#[unsafe(no_mangle)]
+pub extern "C" fn error() -> *const u8 {
+    with(|state| state.error.as_ptr())
+}
+
+/// Bytes of the last message's error.
+#[unsafe(no_mangle)]
+pub extern "C" fn error_length() -> usize {
+    with(|state| state.error.len())
+}
+
+/// [`Page::forget_people`].
+#[unsafe(no_mangle)]
+pub extern "C" fn forget_people() {
+    with(|state| state.page.forget_people());
+}
+
+/// [`Page::pose`]; returns the number of Gaussians.
+#[unsafe(no_mangle)]
+pub extern "C" fn pose(now: f64, interpolate: u32) -> usize {
+    with(|state| {
+        (state.moved, state.recolored) = state.page.pose(now, interpolate != 0);
+        state.page.centers().len()
+    })
+}
+
+/// Whether the last [`pose`] changed centres (1) and colours (2).
+#[unsafe(no_mangle)]
+pub extern "C" fn changes() -> u32 {
+    with(|state| u32::from(state.moved) | u32::from(state.recolored) << 1)
+}
+
+/// Address of the centres and standard deviations, four floats a Gaussian.
+#[unsafe(no_mangle)]
+pub extern "C" fn centers() -> *const [f32; 4] {
+    with(|state| state.page.centers().as_ptr())
+}
+
+/// Address of the linear RGB and opacities, four floats a Gaussian.
+#[unsafe(no_mangle)]
+pub extern "C" fn colors() -> *const [f32; 4] {
+    with(|state| state.page.colors().as_ptr())
+}
+
+/// [`Page::order`]; returns its address. [`order_length`] is valid afterwards.
+#[unsafe(no_mangle)]
+pub extern "C" fn order(width: u32, height: u32) -> *const u32 {
+    with(|state| {
+        let order = state.page.order(width, height);
+        ORDERED.set(order.len());
+        order.as_ptr()
+    })
+}
+
+thread_local! {
+    static ORDERED: std::cell::Cell<usize> = const { std::cell::Cell::new(0) };
+}
+
+/// Number of Gaussians of the last [`order`].
+#[unsafe(no_mangle)]
+pub extern "C" fn order_length() -> usize {
+    ORDERED.get()
+}
+
+/// Address of the camera of the last [`order`], [`crate::CAMERA_FLOATS`] floats.
+#[unsafe(no_mangle)]
+pub extern "C" fn camera() -> *const f32 {
+    with(|state| state.page.camera().as_ptr())
+}
+
+/// Turns around the target, radians.
+#[unsafe(no_mangle)]
+pub extern "C" fn orbit(right: f64, down: f64) {
+    with(|state| state.page.navigation().map(|view| view.orbit(right, down)));
+}
+
+/// Shifts the view by shares of its height.
+#[unsafe(no_mangle)]
+pub extern "C" fn shift(right: f64, down: f64) {
+    with(|state| state.page.navigation().map(|view| view.shift(right, down)));
+}
+
+/// Comes nearer by a factor.
+#[unsafe(no_mangle)]
+pub extern "C" fn zoom(factor: f64) {
+    with(|state| state.page.navigation().map(|view| view.zoom(factor)));
+}
+
+/// Moves along the view's axes, metres.
+#[unsafe(no_mangle)]
+pub extern "C" fn fly(right: f64, up: f64, forward: f64) {
+    with(|state| state.page.navigation().map(|view| view.fly(right, up, forward)));
+}
+
+/// [`Page::set_follows`].
+#[unsafe(no_mangle)]
+pub extern "C" fn follow(follows: u32) {
+    with(|state| state.page.set_follows(follows != 0));
+}
+
+/// [`Page::jump`].
+#[unsafe(no_mangle)]
+pub extern "C" fn jump(camera: usize) {
+    with(|state| state.page.jump(camera));
+}
+
+/// People who are shown, and whether everybody has all colours (bit 8).
+#[unsafe(no_mangle)]
+pub extern "C" fn people() -> u32 {
+    with(|state| state.page.people_shown() as u32 | u32::from(state.page.is_complete()) << 8)
+}

@@ -1,0 +1,236 @@
+//! State of one page.
+
+use std::{fmt, sync::Arc};
+
+use flyrig_stream::{Posed, StreamError, StreamTemplate};
+use flyrig_types::Rig;
+use flyrig_viewing::{Navigation, People, Taken};
+use glam::DVec3;
+
+use crate::DrawOrder;
+
+/// Longest message that is taken, bytes: a template has less.
+pub const MAX_MESSAGE_BYTES: usize = 16 << 20;
+/// Numbers of a camera: `camera_from_world` by columns, then focal length and principal point, pixels.
+pub const CAMERA_FLOATS: usize = 19;
+
+/// Kind of a message; the number is its first byte.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MessageKind {
+    /// Cameras and up of the rig, JSON.
+    Rig,
+    /// A person's template.
+    Template,
+    /// A person's motion.
+    Motion,
+    /// A layer of a person's colours.
+    Colors,
+}
+
+impl MessageKind {
+    /// Returns the kind of a number.
+    #[must_use]
+    pub fn of(number: u32) -> Option<Self> {
+        [Self::Rig, Self::Template, Self::Motion, Self::Colors].get(number as usize).copied()
+    }
+}
+
+/// Why a message was refused.
+#[derive(Debug, PartialEq)]
+pub enum PageError {
+    /// Damaged bytes.
+    Stream(StreamError),
+    /// A rig that is no rig.
+    Rig(String),
+}
+
+impl fmt::Display for PageError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Stream(error) => error.fmt(f),
+            Self::Rig(problem) => write!(f, "the rig's calibration is damaged: {problem}"),
+        }
+    }
+}
+
+/// People, viewpoint, and the Gaussians as they are shown now.
+#[derive(Debug, Default)]
+pub struct Page {
+    people: People,
+    rig: Option<Rig>,
+    navigation: Option<Navigation>,
+    follows: bool,
+    centers: Vec<[f32; 4]>,
+    normals: Vec<[f32; 4]>,
+    colors: Vec<[f32; 4]>,
+    /// What is shown: each person's number, frame and share of interpolation, and the number of its colour messages.
+    shown: Vec<(u32, u64, u64)>,
+    posed: Posed,
+    order: DrawOrder,
+    camera: [f32; CAMERA_FLOATS],
+}
+
+impl Page {
+    /// Takes in a message that came at `now`. Messages of a person whose template is missing wait for it.
+    ///
+    /// # Errors
+    /// [`PageError`] for damaged bytes; what was there before stays.
+    pub fn take(&mut self, kind: MessageKind, person: u32, bytes: &[u8], now: f64) -> Result<(), PageError> {
+        match kind {
+            MessageKind::Rig => return self.take_rig(bytes),
+            MessageKind::Template => {
+                let template = StreamTemplate::decode(bytes).map_err(PageError::Stream)?;
+                self.people.meet(person, Arc::new(template));
+            }
+            MessageKind::Motion | MessageKind::Colors => {
+                let is_motion = kind == MessageKind::Motion;
+                let taken: Result<Taken, StreamError> = self.people.take(person, is_motion, bytes, now);
+                taken.map_err(PageError::Stream)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn take_rig(&mut self, bytes: &[u8]) -> Result<(), PageError> {
+        let rig: Rig = serde_json::from_slice(bytes).map_err(|error| PageError::Rig(error.to_string()))?;
+        rig.validate().map_err(|error| PageError::Rig(error.to_string()))?;
+        if self.rig.as_ref() != Some(&rig) {
+            self.navigation = Some(Navigation::new(&rig));
+            self.rig = Some(rig);
+        }
+        Ok(())
+    }
+
+    /// Forgets people, for a rig that begins anew; the viewpoint stays.
+    pub fn forget_people(&mut self) {
+        self.people.clear();
+        self.shown.clear();
+    }
+
+    /// Poses everybody as they are shown at `now`. Returns whether centres, and whether colours, differ from those before.
+    pub fn pose(&mut self, now: f64, interpolate: bool) -> (bool, bool) {
+        let numbers: Vec<u32> = self.people.iter().map(|(number, _)| number).collect();
+        let mut motions = Vec::new();
+        for number in numbers {
+            let Some(person) = self.people.get(number) else { continue };
+            if let Some(motion) = person.motion_at(now, interpolate) {
+                // The time that is shown tells interpolated motions apart.
+                let key = (number, motion_key(&motion), person.color_changes());
+                motions.push((key, motion));
+            }
+        }
+        let shown: Vec<(u32, u64, u64)> = motions.iter().map(|(key, _)| *key).collect();
+        if self.follows
+            && let (Some(navigation), Some((_, motion))) = (&mut self.navigation, motions.first())
+        {
+            navigation.follow(Some(DVec3::from(motion.root_translation.map(f64::from))));
+        }
+        if shown == self.shown {
+            return (false, false);
+        }
+        let same = |part: fn(&(u32, u64, u64)) -> (u32, u64)| {
+            shown.len() == self.shown.len() && shown.iter().zip(&self.shown).all(|(a, b)| part(a) == part(b))
+        };
+        let (moved, recolored) = (!same(|key| (key.0, key.1)), !same(|key| (key.0, key.2)));
+        for list in [&mut self.centers, &mut self.normals, &mut self.colors] {
+            list.clear();
+        }
+        for ((number, ..), motion) in &motions {
+            let Some(person) = self.people.get_mut(*number) else { continue };
+            let colors = person.pose(motion, &mut self.posed);
+            let count = self.posed.center_scale.len().min(colors.len());
+            self.centers.extend_from_slice(&self.posed.center_scale[..count]);
+            self.normals.extend_from_slice(&self.posed.normal[..count]);
+            self.colors.extend_from_slice(&colors[..count]);
+        }
+        self.shown = shown;
+        (moved, recolored)
+    }
+
+    /// Returns the indices of the Gaussians to draw into an image of this size, farthest first; nothing before the rig is known.
+    pub fn order(&mut self, width: u32, height: u32) -> &[u32] {
+        let Some(navigation) = &self.navigation else { return &[] };
+        let camera = navigation.camera(width.clamp(1, 16_384), height.clamp(1, 16_384));
+        let from_world = camera.camera_from_world;
+        let matrix = glam::DMat4::from_rotation_translation(from_world.rotation, from_world.translation);
+        for (to, from) in self.camera.iter_mut().zip(matrix.to_cols_array()) {
+            *to = from as f32;
+        }
+        let lens = &camera.intrinsics;
+        let rest = [lens.focal_px.x, lens.center_px.x, lens.center_px.y];
+        for (to, from) in self.camera[16..].iter_mut().zip(rest) {
+            *to = from as f32;
+        }
+        self.order.sort(&camera, &self.centers, &self.normals)
+    }
+
+    /// Camera of the last [`Self::order`].
+    #[must_use]
+    pub fn camera(&self) -> &[f32; CAMERA_FLOATS] {
+        &self.camera
+    }
+
+    /// Centre and standard deviation of each Gaussian, metres, world.
+    #[must_use]
+    pub fn centers(&self) -> &[[f32; 4]] {
+        &self.centers
+    }
+
+    /// Linear RGB and opacity of each Gaussian.
+    #[must_use]
+    pub fn colors(&self) -> &[[f32; 4]] {
+        &self.colors
+    }
+
+    /// The viewpoint, once the rig is known.
+    pub fn navigation(&mut self) -> Option<&mut Navigation> {
+        self.navigation.as_mut()
+    }
+
+    /// Sets whether the viewpoint moves along with the first person.
+    pub fn set_follows(&mut self, follows: bool) {
+        self.follows = follows;
+        if !follows && let Some(navigation) = &mut self.navigation {
+            navigation.follow(None);
+        }
+    }
+
+    /// Stands where a camera of the rig stands; a number beyond them changes nothing.
+    pub fn jump(&mut self, camera: usize) {
+        let camera = self.rig.as_ref().and_then(|rig| rig.cameras.get(camera));
+        if let (Some(camera), Some(navigation)) = (camera, &mut self.navigation) {
+            navigation.jump(camera);
+        }
+    }
+
+    /// Number of people who are shown.
+    #[must_use]
+    pub fn people_shown(&self) -> usize {
+        self.shown.len()
+    }
+
+    /// Whether everybody who is known has all colours; false without anybody.
+    #[must_use]
+    pub fn is_complete(&self) -> bool {
+        !self.people.is_empty() && self.people.iter().all(|(_, person)| person.is_complete())
+    }
+}
+
+/// A number that differs where motions differ.
+fn motion_key(motion: &flyrig_stream::Motion) -> u64 {
+    // Interpolated motions of one pair share the stamp; the root and one rotation separate them.
+    let numbers = motion
+        .root_translation
+        .iter()
+        .chain(motion.joint_rotations.iter().flatten())
+        .chain(motion.nodes.iter().flatten());
+    let hash = numbers.fold(motion.stamp.frame, |hash, number| {
+        (hash ^ u64::from(number.to_bits())).wrapping_mul(0x0000_0100_0000_01b3).rotate_left(5)
+    });
+    hash ^ motion.stamp.template
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+#[path = "page_tests.rs"]
+mod tests;

@@ -1,0 +1,143 @@
+use flyrig_stream::{
+    ColorEncoder, ColorSettings, EncodedTemplate, Motion, MotionEncoder, Stamp, StreamJoint, TemplateSource,
+};
+use flyrig_types::{Camera, Intrinsics, Isometry};
+
+use super::*;
+
+const GAUSSIANS: usize = 60;
+
+fn template(size: f32) -> EncodedTemplate {
+    let rows = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+    let joints = [StreamJoint { parent: None, translation: [0.0; 3], joint_from_canonical: rows }];
+    let center_scale: Vec<[f32; 4]> = (0..GAUSSIANS).map(|i| [size * i as f32 / 60.0, 0.0, 0.0, 0.01]).collect();
+    let skin = vec![([0; 4], [1.0, 0.0, 0.0, 0.0]); GAUSSIANS];
+    let normals = vec![[0.0, -1.0, 0.0]; GAUSSIANS];
+    let (center_scale, normals, skin) = (&center_scale, &normals, &skin);
+    let source = TemplateSource { joints: &joints, center_scale, normals, skin, node_weights: &[], nodes: &[] };
+    source.encode().unwrap()
+}
+
+fn motion(template: &EncodedTemplate, frame: u64, x: f32) -> Vec<u8> {
+    let stamp = Stamp { frame, capture_nanos: 100_000_000 * frame as i64, ..Stamp::default() };
+    let rotation = vec![[0.0, 0.0, 0.0, 1.0]];
+    let motion = Motion { stamp, root_translation: [x, 0.0, 1.0], joint_rotations: rotation, nodes: Vec::new() };
+    MotionEncoder::new(template).encode(&motion).unwrap()
+}
+
+fn rig() -> Rig {
+    let camera = |name: &str, x: f64| Camera {
+        time_offset_nanos: 0,
+        id: name.into(),
+        intrinsics: Intrinsics::pinhole(640, 480, 500.0),
+        camera_from_world: Isometry::look_at(DVec3::new(x, -3.0, 1.0), DVec3::Z, DVec3::Z),
+    };
+    Rig { cameras: vec![camera("a", -1.0), camera("b", 1.0)], world_up: DVec3::Z }
+}
+
+fn page() -> Page {
+    let mut page = Page::default();
+    page.take(MessageKind::Rig, 0, &serde_json::to_vec(&rig()).unwrap(), 0.0).unwrap();
+    page
+}
+
+#[test]
+fn a_person_is_shown_once_template_motion_and_rig_are_there() {
+    let encoded = template(1.0);
+    let mut page = Page::default();
+    assert!(page.order(640, 480).is_empty() && page.people_shown() == 0 && !page.is_complete());
+    page.take(MessageKind::Motion, 2, &motion(&encoded, 1, 0.5), 0.0).unwrap();
+    assert_eq!(page.pose(0.0, false), (false, false));
+    page.take(MessageKind::Template, 2, &encoded.bytes, 0.0).unwrap();
+    assert_eq!(page.pose(0.0, false), (true, true), "a motion that came early is applied");
+    assert!((page.centers()[0][0] - 0.5).abs() < 1e-3 && page.centers().len() == GAUSSIANS);
+    assert!(page.order(640, 480).is_empty(), "without a rig there is no viewpoint");
+    page.take(MessageKind::Rig, 0, &serde_json::to_vec(&rig()).unwrap(), 0.0).unwrap();
+    assert_eq!(page.order(640, 480).len(), GAUSSIANS);
+
+    let mut colors = ColorEncoder::new(&encoded, ColorSettings::default(), 7);
+    for layer in &colors.encode(Stamp::default(), &[[0.5, 0.2, 0.1, 1.0]; GAUSSIANS]) {
+        page.take(MessageKind::Colors, 2, layer, 0.0).unwrap();
+    }
+    assert_eq!(page.pose(0.0, false), (false, true));
+    assert!(page.is_complete() && (page.colors()[5][0] - 0.5).abs() < 0.05);
+    assert_eq!(page.pose(0.0, false), (false, false), "nothing is done twice");
+    page.take(MessageKind::Motion, 2, &motion(&encoded, 2, 0.6), 0.1).unwrap();
+    assert_eq!(page.pose(0.1, false), (true, false));
+    // Whoever is gone is not drawn.
+    assert_eq!((page.pose(60.0, false), page.people_shown()), ((true, true), 0));
+    page.forget_people();
+    assert!(page.centers().is_empty());
+}
+
+#[test]
+fn the_camera_is_that_of_the_window() {
+    let mut page = page();
+    page.jump(1);
+    page.jump(99);
+    page.order(320, 240);
+    let expected = {
+        let mut navigation = Navigation::new(&rig());
+        navigation.jump(&rig().cameras[1]);
+        navigation.camera(320, 240)
+    };
+    let found = *page.camera();
+    let matrix = glam::Mat4::from_cols_slice(&found[..16]);
+    for point in [DVec3::Z, DVec3::new(0.3, 0.2, 0.5)] {
+        let ours = matrix.transform_point3(point.as_vec3());
+        let pixel = glam::Vec2::new(found[17], found[18]) + found[16] * ours.truncate() / ours.z;
+        let wanted = expected.project(point).unwrap().as_vec2();
+        assert!((pixel - wanted).length() < 1e-3, "{pixel} {wanted}");
+    }
+}
+
+#[test]
+fn following_moves_the_viewpoint_with_the_person() {
+    let (mut page, encoded) = (page(), template(1.0));
+    page.take(MessageKind::Template, 0, &encoded.bytes, 0.0).unwrap();
+    page.set_follows(true);
+    let mut place = |page: &mut Page, frame: u64, x: f32| {
+        page.take(MessageKind::Motion, 0, &motion(&encoded, frame, x), 0.1 * frame as f64).unwrap();
+        page.pose(0.1 * frame as f64, false);
+        page.order(64, 64);
+        let camera = *page.camera();
+        glam::Mat4::from_cols_slice(&camera[..16]).transform_point3(glam::Vec3::new(x, 0.0, 1.0))
+    };
+    let before = place(&mut page, 1, 0.0);
+    let after = place(&mut page, 2, 0.7);
+    assert!((before - after).length() < 1e-2, "{before} {after}");
+    page.set_follows(false);
+    let left = place(&mut page, 3, 1.4);
+    assert!((left - after).length() > 0.3);
+}
+
+#[test]
+fn damaged_messages_are_refused_and_change_nothing() {
+    let (mut page, encoded) = (page(), template(1.0));
+    page.take(MessageKind::Template, 0, &encoded.bytes, 0.0).unwrap();
+    let good = motion(&encoded, 1, 0.2);
+    page.take(MessageKind::Motion, 0, &good, 0.0).unwrap();
+    page.pose(0.0, false);
+    let before = page.centers().to_vec();
+    let mut state = 1u32;
+    for kind in [MessageKind::Rig, MessageKind::Template, MessageKind::Motion, MessageKind::Colors] {
+        page.take(kind, 0, &[], 0.0).unwrap_err();
+        page.take(kind, 0, b"\xff\x00noise", 0.0).unwrap_err();
+        let original = if kind == MessageKind::Template { encoded.bytes.clone() } else { good.clone() };
+        for _ in 0..2000 {
+            let mut bytes = original.clone();
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            let at = state as usize % bytes.len();
+            bytes[at] ^= 1 << (state >> 29);
+            bytes.truncate(bytes.len() - (state >> 8) as usize % 3);
+            // Damage that is not noticed changes numbers, never the program.
+            drop(page.take(kind, 7, &bytes, 0.0));
+        }
+    }
+    page.pose(0.0, false);
+    assert_eq!(page.centers()[..GAUSSIANS], before[..]);
+    let rig = String::from_utf8(serde_json::to_vec(&rig()).unwrap()).unwrap().replace("500.0", "-1.0");
+    let error = page.take(MessageKind::Rig, 0, rig.as_bytes(), 0.0).unwrap_err().to_string();
+    assert!(error.starts_with("the rig's calibration is damaged"), "{error}");
+    assert_eq!(MessageKind::of(4), None);
+}

@@ -1,0 +1,202 @@
+// Draws Gaussians with WebGL2, as renderer/src/raster_project.wgsl and raster_blend.wgsl do: EWA projection, Mip filter, blending in
+// linear light. Gaussians come sorted, farthest first.
+
+const TEXELS = 1024; // Gaussians in a row of the data textures
+const FILTER_PX2 = 0.1; // RasterSettings::filter_variance_px2
+
+const PROJECT = `#version 300 es
+precision highp float;
+precision highp sampler2D;
+uniform sampler2D centers;
+uniform sampler2D colors;
+uniform mat4 cameraFromWorld;
+uniform vec3 lens; // focal length and principal point, pixels; pixel centres are at integers
+uniform vec2 size;
+in uint index;
+in vec2 corner;
+out vec2 offset;
+flat out vec3 conic;
+flat out float log2Opacity;
+flat out vec3 paint;
+const float CUT = 1.0 / 255.0;
+void main() {
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+  ivec2 at = ivec2(int(index) % ${TEXELS}, int(index) / ${TEXELS});
+  vec4 center = texelFetch(centers, at, 0);
+  vec4 color = texelFetch(colors, at, 0);
+  vec3 p = (cameraFromWorld * vec4(center.xyz, 1.0)).xyz;
+  float focal = lens.x / p.z;
+  vec2 pixel = focal * p.xy + lens.yz;
+  vec3 rowX = vec3(focal, 0.0, -focal * p.x / p.z) * center.w;
+  vec3 rowY = vec3(0.0, focal, -focal * p.y / p.z) * center.w;
+  float xx = dot(rowX, rowX), xy = dot(rowX, rowY), yy = dot(rowY, rowY);
+  vec3 normal = cross(rowX, rowY);
+  float det = dot(normal, normal);
+  const float s = ${FILTER_PX2};
+  float filteredDet = det + s * (xx + yy) + s * s;
+  float opacity = min(color.w, 1.0) * sqrt(det / filteredDet);
+  if (!(opacity > CUT)) return;
+  float r2 = 2.0 * log(opacity / CUT);
+  vec2 extent = sqrt(r2 * vec2(xx + s, yy + s)) + 0.01;
+  offset = corner * extent;
+  conic = vec3(yy + s, -2.0 * xy, xx + s) * (0.72134752 / filteredDet);
+  log2Opacity = log2(opacity);
+  paint = color.rgb;
+  vec2 ndc = (pixel + offset + 0.5) / size * 2.0 - 1.0;
+  gl_Position = vec4(ndc.x, -ndc.y, 0.0, 1.0);
+}`;
+
+const BLEND = `#version 300 es
+precision highp float;
+in vec2 offset;
+flat in vec3 conic;
+flat in float log2Opacity;
+flat in vec3 paint;
+out vec4 color;
+void main() {
+  float exponent = log2Opacity - conic.x * offset.x * offset.x - offset.y * (conic.y * offset.x + conic.z * offset.y);
+  if (exponent < -7.9943534) discard; // log2(1 / 255)
+  float alpha = min(exp2(exponent), 0.99);
+  color = vec4(paint * alpha, alpha);
+}`;
+
+const WHOLE = `#version 300 es
+in vec2 corner;
+void main() { gl_Position = vec4(corner, 0.0, 1.0); }`;
+
+// Straight alpha over the background, on sRGB values, as in the images of the rig.
+const COMPOSE = `#version 300 es
+precision highp float;
+uniform sampler2D light;
+uniform vec3 background;
+out vec4 color;
+vec3 srgb(vec3 c) {
+  c = clamp(c, 0.0, 1.0);
+  return mix(12.92 * c, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c));
+}
+void main() {
+  vec4 seen = texelFetch(light, ivec2(gl_FragCoord.xy), 0);
+  vec3 person = seen.a > 0.0 ? srgb(seen.rgb / seen.a) : vec3(0.0);
+  color = vec4(mix(background, person, min(seen.a, 1.0)), 1.0);
+}`;
+
+function program(gl, vertex, fragment) {
+  const made = gl.createProgram();
+  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
+      throw new Error(gl.getShaderInfoLog(shader));
+    }
+    gl.attachShader(made, shader);
+  }
+  gl.bindAttribLocation(made, 0, "corner");
+  gl.bindAttribLocation(made, 1, "index");
+  gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) throw new Error(gl.getProgramInfoLog(made));
+  const places = new Map();
+  return { made, place: name => {
+    if (!places.has(name)) places.set(name, gl.getUniformLocation(made, name));
+    return places.get(name);
+  } };
+}
+
+/** A drawing of one canvas. Make a new one after the context was lost. */
+export class Drawing {
+  constructor(canvas) {
+    const options = { alpha: false, antialias: false, depth: false, stencil: false, preserveDrawingBuffer: true };
+    const gl = this.gl = canvas.getContext("webgl2", options);
+    if (!gl) throw new Error("This browser has no WebGL2; update it, or switch hardware acceleration on.");
+    // Without half floats, 8 bits of sRGB with linear blending.
+    this.format = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float")
+      ? gl.RGBA16F : gl.SRGB8_ALPHA8;
+    this.splats = program(gl, PROJECT, BLEND);
+    this.compose = program(gl, WHOLE, COMPOSE);
+    this.corners = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.corners);
+    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
+    this.indices = gl.createBuffer();
+    this.vertices = gl.createVertexArray();
+    gl.bindVertexArray(this.vertices);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
+    gl.enableVertexAttribArray(1);
+    gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(1, 1);
+    gl.bindVertexArray(null);
+    this.centers = { texture: gl.createTexture(), rows: 0 };
+    this.colors = { texture: gl.createTexture(), rows: 0 };
+    this.light = gl.createTexture();
+    this.frame = gl.createFramebuffer();
+    this.size = [0, 0];
+  }
+
+  /** Uploads four floats for each of `count` Gaussians, the end of the last row as zeros. */
+  upload(data, floats, count) {
+    const gl = this.gl;
+    const rows = Math.max(1, Math.ceil(count / TEXELS));
+    gl.bindTexture(gl.TEXTURE_2D, data.texture);
+    if (data.rows !== rows) {
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, TEXELS, rows, 0, gl.RGBA, gl.FLOAT, null);
+      for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+      data.rows = rows;
+    }
+    const whole = Math.floor(count / TEXELS);
+    if (whole > 0) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXELS, whole, gl.RGBA, gl.FLOAT, floats);
+    const rest = count - whole * TEXELS;
+    if (rest > 0) {
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, whole, rest, 1, gl.RGBA, gl.FLOAT, floats.subarray(4 * whole * TEXELS));
+    }
+  }
+
+  setCenters(floats, count) { this.upload(this.centers, floats, count); }
+  setColors(floats, count) { this.upload(this.colors, floats, count); }
+
+  /** Draws the Gaussians of `order`, farthest first, with a camera of 19 numbers (page/src/page.rs). */
+  draw(order, camera, background) {
+    const gl = this.gl;
+    const width = gl.drawingBufferWidth, height = gl.drawingBufferHeight;
+    if (this.size[0] !== width || this.size[1] !== height) {
+      gl.bindTexture(gl.TEXTURE_2D, this.light);
+      const [kind, bytes] = this.format === gl.RGBA16F ? [gl.RGBA, gl.HALF_FLOAT] : [gl.RGBA, gl.UNSIGNED_BYTE];
+      gl.texImage2D(gl.TEXTURE_2D, 0, this.format, width, height, 0, kind, bytes, null);
+      for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.light, 0);
+      this.size = [width, height];
+    }
+    gl.viewport(0, 0, width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    gl.bindVertexArray(this.vertices);
+    if (order.length > 0 && this.centers.rows > 0 && this.colors.rows > 0) {
+      gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
+      gl.bufferData(gl.ARRAY_BUFFER, order, gl.STREAM_DRAW);
+      gl.useProgram(this.splats.made);
+      gl.activeTexture(gl.TEXTURE1);
+      gl.bindTexture(gl.TEXTURE_2D, this.colors.texture);
+      gl.activeTexture(gl.TEXTURE0);
+      gl.bindTexture(gl.TEXTURE_2D, this.centers.texture);
+      gl.uniform1i(this.splats.place("centers"), 0);
+      gl.uniform1i(this.splats.place("colors"), 1);
+      gl.uniformMatrix4fv(this.splats.place("cameraFromWorld"), false, camera.subarray(0, 16));
+      gl.uniform3fv(this.splats.place("lens"), camera.subarray(16, 19));
+      gl.uniform2f(this.splats.place("size"), width, height);
+      gl.enable(gl.BLEND);
+      gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, order.length);
+      gl.disable(gl.BLEND);
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.useProgram(this.compose.made);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.light);
+    gl.uniform1i(this.compose.place("light"), 0);
+    gl.uniform3fv(this.compose.place("background"), background);
+    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+    gl.bindVertexArray(null);
+  }
+}

@@ -1,0 +1,126 @@
+//! Who may ask: names of this computer, pages of this server, holders of the link.
+
+use std::net::IpAddr;
+
+use hyper::{
+    HeaderMap,
+    header::{HOST, HeaderValue, ORIGIN},
+};
+
+/// Bytes of a token.
+const TOKEN_BYTES: usize = 16;
+
+/// What a link contains after `#`.
+#[derive(Debug, Clone)]
+pub(crate) struct Token(Option<String>);
+
+impl Token {
+    /// Anybody may watch.
+    pub const NONE: Self = Self(None);
+
+    /// A new secret of 128 random bits.
+    pub fn random() -> Result<Self, getrandom::Error> {
+        let mut bytes = [0u8; TOKEN_BYTES];
+        getrandom::fill(&mut bytes)?;
+        Ok(Self(Some(bytes.iter().map(|byte| format!("{byte:02x}")).collect())))
+    }
+
+    /// The text of the link after its path.
+    pub fn fragment(&self) -> String {
+        self.0.as_ref().map_or_else(String::new, |token| format!("#{token}"))
+    }
+
+    /// Compares in a time that does not depend on where the texts differ.
+    pub fn admits(&self, given: &str) -> bool {
+        let Some(token) = &self.0 else { return true };
+        let differs = token.bytes().zip(given.bytes()).fold(0u8, |differs, (a, b)| differs | (a ^ b));
+        token.len() == given.len() && differs == 0
+    }
+}
+
+/// Checks the names in a request's headers; the error is shown to the one who asked.
+///
+/// A page of another site cannot read what this server answers, but it could open a WebSocket, or make a name of its own point to
+/// this address. So the host must be an address, `localhost` or a name that was given, and the origin must be that host.
+pub(crate) fn check_names(headers: &HeaderMap, names: &[String]) -> Result<(), String> {
+    let text = |value: &HeaderValue| value.to_str().map(str::to_owned).unwrap_or_default();
+    let host = headers.get(HOST).map(text).unwrap_or_default();
+    let name = host_name(&host);
+    let is_address = name.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>().is_ok();
+    if !(is_address || name.eq_ignore_ascii_case("localhost") || names.iter().any(|own| own.eq_ignore_ascii_case(name)))
+    {
+        return Err(format!(
+            "this server is not known as '{}'; start it with --name, or use its address\n",
+            printable(name)
+        ));
+    }
+    match headers.get(ORIGIN).map(text) {
+        None => Ok(()),
+        Some(origin) if origin.eq_ignore_ascii_case(&format!("http://{host}")) => Ok(()),
+        Some(origin) => Err(format!("pages of {} may not watch\n", printable(&origin))),
+    }
+}
+
+/// The host without its port.
+fn host_name(host: &str) -> &str {
+    match host.rsplit_once(':') {
+        Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,
+        _ => host,
+    }
+}
+
+/// A short text without control characters.
+fn printable(text: &str) -> String {
+    text.chars().filter(|c| !c.is_control()).take(80).collect()
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_own_names_and_own_pages_pass() {
+        let check = |host: &str, origin: &str| {
+            let mut headers = HeaderMap::new();
+            headers.insert(HOST, host.parse().unwrap());
+            if !origin.is_empty() {
+                headers.insert(ORIGIN, origin.parse().unwrap());
+            }
+            check_names(&headers, &["rig.local".to_owned()])
+        };
+        for (host, origin) in [
+            ("127.0.0.1:8080", ""),
+            ("127.0.0.1:8080", "http://127.0.0.1:8080"),
+            ("localhost:8080", "http://localhost:8080"),
+            ("[::1]:8080", "http://[::1]:8080"),
+            ("[::1]", ""),
+            ("Rig.local:80", "http://rig.local:80"),
+        ] {
+            assert_eq!(check(host, origin), Ok(()), "{host} {origin}");
+        }
+        for (host, origin) in [
+            ("evil.example:8080", ""),
+            ("evil.example", "http://evil.example"),
+            ("127.0.0.1:8080", "http://evil.example"),
+            ("127.0.0.1:8080", "http://127.0.0.1:8081"),
+            ("127.0.0.1:8080", "https://127.0.0.1:8080"),
+            ("localhost:8080", "null"),
+            ("", ""),
+            ("127.0.0.1.evil.example", ""),
+        ] {
+            assert!(check(host, origin).is_err(), "{host} {origin}");
+        }
+        assert!(check_names(&HeaderMap::new(), &[]).is_err());
+    }
+
+    #[test]
+    fn a_token_admits_itself_alone() {
+        let (token, other) = (Token::random().unwrap(), Token::random().unwrap());
+        let text = token.fragment()[1..].to_owned();
+        assert_eq!(text.len(), 32);
+        assert!(token.admits(&text) && !other.admits(&text));
+        assert!(!token.admits("") && !token.admits(&text[1..]) && !token.admits(&format!("{text}0")));
+        assert!(Token::NONE.admits("") && Token::NONE.admits("anything") && Token::NONE.fragment().is_empty());
+    }
+}

@@ -1,0 +1,292 @@
+//! What all browsers get, and what waits for each of them.
+
+use std::{
+    collections::{BTreeMap, VecDeque},
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+};
+
+use bytes::{BufMut as _, Bytes, BytesMut};
+use tokio::sync::Notify;
+
+/// Bytes of colours that may wait for a browser; beyond them the oldest are left out, and come again within a second.
+const COLOR_BYTES: usize = 256 << 10;
+/// People whose messages are kept.
+const MAX_PEOPLE: usize = 32;
+
+/// Kind of a message: its first byte.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub(crate) enum Kind {
+    /// Cameras of the rig, JSON.
+    Rig = 0,
+    /// Template of a person.
+    Template = 1,
+    /// Motion of a person.
+    Motion = 2,
+    /// A layer of a person's colours.
+    Colors = 3,
+    /// State in words and numbers, JSON.
+    State = 4,
+    /// The rig began anew: everybody is to be forgotten.
+    Forget = 5,
+}
+
+/// Puts a message together.
+fn message(kind: Kind, person: u32, payload: &[u8]) -> Bytes {
+    let mut bytes = BytesMut::with_capacity(8 + payload.len());
+    bytes.put_slice(&[kind as u8, 0, 0, 0]);
+    bytes.put_u32_le(person);
+    bytes.put_slice(payload);
+    bytes.freeze()
+}
+
+/// The last messages, and all browsers.
+#[derive(Debug, Default)]
+pub(crate) struct Hub(Mutex<Inner>);
+
+#[derive(Debug, Default)]
+struct Inner {
+    rig: Option<Bytes>,
+    /// By person, with its hash.
+    templates: BTreeMap<u32, (u64, Bytes)>,
+    motions: BTreeMap<u32, Bytes>,
+    state: Option<Bytes>,
+    browsers: BTreeMap<u64, Browser>,
+    next: u64,
+}
+
+/// What waits for one browser.
+#[derive(Debug, Default)]
+struct Browser {
+    wake: Arc<Notify>,
+    forget: Option<Bytes>,
+    rig: Option<Bytes>,
+    templates: BTreeMap<u32, Bytes>,
+    motions: BTreeMap<u32, Bytes>,
+    colors: VecDeque<Bytes>,
+    color_bytes: usize,
+    state: Option<Bytes>,
+}
+
+impl Browser {
+    /// Takes the next message: what others depend on first, motion before colours.
+    fn take(&mut self) -> Option<Bytes> {
+        let first = |map: &mut BTreeMap<u32, Bytes>| map.pop_first().map(|(_, bytes)| bytes);
+        let next = self.forget.take().or_else(|| self.rig.take()).or_else(|| first(&mut self.templates));
+        next.or_else(|| first(&mut self.motions)).or_else(|| self.state.take()).or_else(|| {
+            let colors = self.colors.pop_front()?;
+            self.color_bytes -= colors.len();
+            Some(colors)
+        })
+    }
+
+    fn push_colors(&mut self, colors: Bytes) {
+        self.color_bytes += colors.len();
+        self.colors.push_back(colors);
+        while self.color_bytes > COLOR_BYTES && self.colors.len() > 1 {
+            self.color_bytes -= self.colors.pop_front().map_or(0, |dropped| dropped.len());
+        }
+    }
+}
+
+impl Hub {
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Number of browsers.
+    pub fn browsers(&self) -> usize {
+        self.lock().browsers.len()
+    }
+
+    /// Adds a browser, unless there are so many already; it first gets what is known now.
+    pub fn join(self: &Arc<Self>, most: usize) -> Option<Place> {
+        let mut inner = self.lock();
+        if inner.browsers.len() >= most {
+            return None;
+        }
+        let number = inner.next;
+        inner.next += 1;
+        let wake = Arc::<Notify>::default();
+        let browser = Browser {
+            wake: Arc::clone(&wake),
+            rig: inner.rig.clone(),
+            templates: inner.templates.iter().map(|(person, (_, bytes))| (*person, bytes.clone())).collect(),
+            motions: inner.motions.clone(),
+            state: inner.state.clone(),
+            ..Browser::default()
+        };
+        wake.notify_one();
+        inner.browsers.insert(number, browser);
+        Some(Place { hub: Arc::clone(self), number, wake })
+    }
+
+    fn to_all(inner: &mut Inner, put: impl Fn(&mut Browser)) {
+        for browser in inner.browsers.values_mut() {
+            put(browser);
+            browser.wake.notify_one();
+        }
+    }
+
+    /// Sends the rig's cameras.
+    pub fn rig(&self, json: &[u8]) {
+        let bytes = message(Kind::Rig, 0, json);
+        let mut inner = self.lock();
+        if inner.rig.as_ref() != Some(&bytes) {
+            inner.rig = Some(bytes.clone());
+            Self::to_all(&mut inner, |browser| browser.rig = Some(bytes.clone()));
+        }
+    }
+
+    /// Whether this is a person's template.
+    pub fn has_template(&self, person: u32, hash: u64) -> bool {
+        self.lock().templates.get(&person).is_some_and(|(known, _)| *known == hash)
+    }
+
+    /// Sends a person's template. Beyond the most people kept, nobody new comes in.
+    pub fn template(&self, person: u32, hash: u64, payload: &[u8]) {
+        let bytes = message(Kind::Template, person, payload);
+        let mut inner = self.lock();
+        if inner.templates.len() < MAX_PEOPLE || inner.templates.contains_key(&person) {
+            inner.templates.insert(person, (hash, bytes.clone()));
+            inner.motions.remove(&person);
+            Self::to_all(&mut inner, |browser| drop(browser.templates.insert(person, bytes.clone())));
+        }
+    }
+
+    /// Sends a person's motion in place of any that waits.
+    pub fn motion(&self, person: u32, payload: &[u8]) {
+        let bytes = message(Kind::Motion, person, payload);
+        let mut inner = self.lock();
+        if inner.templates.contains_key(&person) {
+            inner.motions.insert(person, bytes.clone());
+            Self::to_all(&mut inner, |browser| drop(browser.motions.insert(person, bytes.clone())));
+        }
+    }
+
+    /// Sends a layer of a person's colours.
+    pub fn colors(&self, person: u32, payload: &[u8]) {
+        let bytes = message(Kind::Colors, person, payload);
+        Self::to_all(&mut self.lock(), |browser| browser.push_colors(bytes.clone()));
+    }
+
+    /// Sends the state.
+    pub fn state(&self, json: &[u8]) {
+        let bytes = message(Kind::State, 0, json);
+        let mut inner = self.lock();
+        if inner.state.as_ref() != Some(&bytes) {
+            inner.state = Some(bytes.clone());
+            Self::to_all(&mut inner, |browser| browser.state = Some(bytes.clone()));
+        }
+    }
+
+    /// Forgets everybody: the rig began anew.
+    pub fn forget_people(&self) {
+        let bytes = message(Kind::Forget, 0, &[]);
+        let mut inner = self.lock();
+        inner.templates.clear();
+        inner.motions.clear();
+        Self::to_all(&mut inner, |browser| {
+            let (wake, rig, state) = (Arc::clone(&browser.wake), browser.rig.take(), browser.state.take());
+            *browser = Browser { wake, rig, state, forget: Some(bytes.clone()), ..Browser::default() };
+        });
+    }
+}
+
+/// A browser's place among the others, until it is dropped.
+#[derive(Debug)]
+pub(crate) struct Place {
+    hub: Arc<Hub>,
+    number: u64,
+    wake: Arc<Notify>,
+}
+
+impl Place {
+    /// Waits for the next message of this browser.
+    pub async fn next(&self) -> Bytes {
+        loop {
+            if let Some(bytes) = self.hub.lock().browsers.get_mut(&self.number).and_then(Browser::take) {
+                return bytes;
+            }
+            self.wake.notified().await;
+        }
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.hub.lock().browsers.remove(&self.number);
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    /// All that waits for a browser.
+    fn drain(place: &Place) -> Vec<(u8, u32, Vec<u8>)> {
+        let mut inner = place.hub.lock();
+        let browser = inner.browsers.get_mut(&place.number).unwrap();
+        let part = |bytes: Bytes| (bytes[0], u32::from_le_bytes(bytes[4..8].try_into().unwrap()), bytes[8..].to_vec());
+        std::iter::from_fn(|| browser.take()).map(part).collect()
+    }
+
+    #[test]
+    fn a_slow_browser_gets_the_newest_and_what_it_depends_on_first() {
+        let hub = Arc::<Hub>::default();
+        let place = hub.join(1).unwrap();
+        assert!(hub.join(1).is_none());
+        hub.motion(3, b"nobody knows this person yet");
+        hub.colors(3, b"c1");
+        hub.state(b"s1");
+        hub.template(3, 7, b"t");
+        assert!(hub.has_template(3, 7) && !hub.has_template(3, 8) && !hub.has_template(4, 7));
+        for motion in [b"m1", b"m2", b"m3"] {
+            hub.motion(3, motion);
+        }
+        hub.rig(b"r");
+        hub.rig(b"r");
+        hub.colors(3, b"c2");
+        let text = |bytes: &[u8]| bytes.to_vec();
+        let expected = [
+            (0, 0, text(b"r")),
+            (1, 3, text(b"t")),
+            (2, 3, text(b"m3")),
+            (4, 0, text(b"s1")),
+            (3, 3, text(b"c1")),
+            (3, 3, text(b"c2")),
+        ];
+        assert_eq!(drain(&place), expected);
+        assert!(drain(&place).is_empty());
+        drop(place);
+        // Who comes later starts with all that does not come again.
+        let late = hub.join(1).unwrap();
+        assert_eq!(drain(&late), expected[..4]);
+        hub.motion(3, b"m4");
+        hub.forget_people();
+        assert_eq!(drain(&late), [(5, 0, Vec::new())]);
+        assert_eq!(hub.browsers(), 1);
+    }
+
+    #[test]
+    fn what_waits_is_bounded() {
+        let hub = Arc::<Hub>::default();
+        let place = hub.join(9).unwrap();
+        let layer = vec![1u8; 60_000];
+        for _ in 0..100 {
+            hub.colors(0, &layer);
+        }
+        for person in 0..100 {
+            hub.template(person, 1, b"t");
+            hub.motion(person, b"m");
+        }
+        let waiting = drain(&place);
+        let count = |kind: u8| waiting.iter().filter(|(of, ..)| *of == kind).count();
+        assert_eq!((count(1), count(2)), (MAX_PEOPLE, MAX_PEOPLE));
+        assert!(count(3) * layer.len() <= COLOR_BYTES && count(3) > 0, "{}", count(3));
+        // One message beyond the bound still comes.
+        hub.colors(0, &vec![1u8; 2 * COLOR_BYTES]);
+        assert_eq!(drain(&place).len(), 1);
+    }
+}

@@ -1,0 +1,273 @@
+//! The HTTP server.
+
+use std::{
+    convert::Infallible,
+    net::SocketAddr,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread::{Builder, JoinHandle},
+    time::Duration,
+};
+
+use flyrig_transport::TransportConfig;
+use flyrig_types::{SupervisedThread, ThreadHealth};
+use http_body_util::Full;
+use hyper::{
+    Method, Request, Response, StatusCode,
+    body::{Bytes, Incoming},
+    header::{CONNECTION, CONTENT_TYPE, HeaderName, HeaderValue, SEC_WEBSOCKET_ACCEPT, SEC_WEBSOCKET_KEY, UPGRADE},
+    server::conn::http1,
+    service::service_fn,
+};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use tokio::{
+    net::{TcpListener, TcpSocket, TcpStream},
+    runtime,
+    sync::{Semaphore, oneshot},
+    time::sleep,
+};
+use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
+
+use crate::{
+    WebError,
+    assets::asset,
+    guard::{Token, check_names},
+    hub::Hub,
+    socket, upstream,
+};
+
+/// Time that a client has to ask.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// Longest request that is read, the smallest bound that hyper takes.
+const REQUEST_BYTES: usize = 8192;
+/// Connections at the same time; the others wait in the system's queue.
+const CONNECTIONS: usize = 512;
+/// Pause after a connection could not be accepted: with no file descriptor left, trying at once only costs time.
+const PAUSE: Duration = Duration::from_millis(100);
+/// Bytes that the system keeps for a connection: what lies there cannot be overtaken by newer motion.
+const SEND_BUFFER: u32 = 64 << 10;
+/// Headers of every answer: nothing from elsewhere, and no frame of another page around it.
+const HEADERS: [(&str, &str); 5] = [
+    (
+        "content-security-policy",
+        "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'unsafe-inline'; connect-src 'self' ws:; img-src data:; \
+         frame-ancestors 'none'; base-uri 'none'",
+    ),
+    ("x-content-type-options", "nosniff"),
+    ("referrer-policy", "no-referrer"),
+    ("cross-origin-resource-policy", "same-origin"),
+    // A newer flyrig at the same address has a newer page.
+    ("cache-control", "no-cache"),
+];
+
+/// Settings of the page's server.
+#[derive(Debug, Clone)]
+pub struct WebOptions {
+    /// Address to listen on; port 0 takes a free one.
+    pub listen: SocketAddr,
+    /// Listen where other computers reach it, without encryption; who watches needs the link's token.
+    pub insecure: bool,
+    /// Names of this computer by which browsers may reach it, beside its addresses and `localhost`.
+    pub names: Vec<String>,
+    /// Most browsers at a time.
+    pub max_browsers: usize,
+    /// The rig.
+    pub transport: TransportConfig,
+}
+
+/// Serves the page until it is dropped.
+#[derive(Debug)]
+pub struct WebServer {
+    address: SocketAddr,
+    token: Token,
+    hub: Arc<Hub>,
+    upstream: SupervisedThread,
+    ended: Arc<AtomicBool>,
+    /// Dropping it ends the server's thread.
+    stop: Option<oneshot::Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// What all connections share.
+struct Shared {
+    hub: Arc<Hub>,
+    token: Token,
+    names: Vec<String>,
+    max_browsers: usize,
+}
+
+impl WebServer {
+    /// Starts to listen. The rig may come later; it is subscribed to while browsers watch.
+    ///
+    /// # Errors
+    /// [`WebError`]: an address that others reach without `insecure`, or one that is taken.
+    pub fn start(options: &WebOptions) -> Result<Self, WebError> {
+        let is_loopback = options.listen.ip().is_loopback();
+        if !is_loopback && !options.insecure {
+            return Err(WebError::NotLoopback(options.listen));
+        }
+        let start = |problem: String| WebError::Start(problem);
+        let token =
+            if is_loopback { Token::NONE } else { Token::random().map_err(|error| start(error.to_string()))? };
+        let runtime = runtime::Builder::new_current_thread().enable_io().enable_time().build();
+        let runtime = runtime.map_err(|error| start(error.to_string()))?;
+        let listener = {
+            let _inside = runtime.enter();
+            listen(options.listen).map_err(|problem| WebError::Listen { address: options.listen, problem })?
+        };
+        let address = listener.local_addr().map_err(|error| start(error.to_string()))?;
+        let hub = Arc::<Hub>::default();
+        let names = options.names.clone();
+        let most = options.max_browsers;
+        let shared = Arc::new(Shared { hub: Arc::clone(&hub), token: token.clone(), names, max_browsers: most });
+        let (stop, stopped) = oneshot::channel::<()>();
+        let work = move || {
+            runtime.block_on(async {
+                tokio::select! {
+                    () = accept(&listener, &shared) => {}
+                    _ = stopped => {}
+                }
+            });
+            // What browsers are being sent goes with them.
+            runtime.shutdown_timeout(PAUSE);
+        };
+        let thread = Builder::new().name("web".to_owned()).spawn(work).map_err(|error| start(error.to_string()))?;
+        let ended = Arc::new(AtomicBool::new(false));
+        let (config, fed, until) = (options.transport.clone(), Arc::clone(&hub), Arc::clone(&ended));
+        let upstream = SupervisedThread::start("web upstream", move || upstream::run(&config, &fed, &until));
+        let upstream = upstream.map_err(|error| start(error.to_string()))?;
+        Ok(Self { address, token, hub, upstream, ended, stop: Some(stop), thread: Some(thread) })
+    }
+
+    /// Address that is listened on.
+    #[must_use]
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Link to the page, with the token where one is needed.
+    #[must_use]
+    pub fn link(&self) -> String {
+        format!("http://{}/{}", self.address, self.token.fragment())
+    }
+
+    /// Number of browsers that watch.
+    #[must_use]
+    pub fn browsers(&self) -> usize {
+        self.hub.browsers()
+    }
+
+    /// Health of the thread that receives from the rig.
+    #[must_use]
+    pub fn thread(&self) -> ThreadHealth {
+        self.upstream.health()
+    }
+}
+
+impl Drop for WebServer {
+    fn drop(&mut self) {
+        self.ended.store(true, Ordering::Relaxed);
+        drop(self.stop.take());
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+        self.upstream.join();
+    }
+}
+
+/// Must be called inside of the runtime.
+fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
+    let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() }?;
+    socket.set_reuseaddr(cfg!(unix))?;
+    // Connections inherit it.
+    socket.set_send_buffer_size(SEND_BUFFER)?;
+    socket.bind(address)?;
+    socket.listen(1024)
+}
+
+async fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
+    let places = Arc::new(Semaphore::new(CONNECTIONS));
+    while let Ok(place) = Arc::clone(&places).acquire_owned().await {
+        match listener.accept().await {
+            Ok((client, _)) => {
+                let shared = Arc::clone(shared);
+                tokio::spawn(async move {
+                    let _place = place;
+                    // A client that asks badly is its own loss.
+                    let _ = answer(client, shared).await;
+                });
+            }
+            Err(_) => sleep(PAUSE).await,
+        }
+    }
+}
+
+async fn answer(client: TcpStream, shared: Arc<Shared>) -> hyper::Result<()> {
+    let _ = client.set_nodelay(true);
+    let service = service_fn(move |request| {
+        let shared = Arc::clone(&shared);
+        async move { Ok::<_, Infallible>(respond(request, &shared)) }
+    });
+    http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(PATIENCE)
+        .max_buf_size(REQUEST_BYTES)
+        .keep_alive(false)
+        .serve_connection(TokioIo::new(client), service)
+        .with_upgrades()
+        .await
+}
+
+fn respond(mut request: Request<Incoming>, shared: &Arc<Shared>) -> Response<Full<Bytes>> {
+    if let Err(reason) = check_names(request.headers(), &shared.names) {
+        return page(StatusCode::FORBIDDEN, "text/plain; charset=utf-8", Bytes::from(reason));
+    }
+    let text =
+        |status, text: &'static str| page(status, "text/plain; charset=utf-8", Bytes::from_static(text.as_bytes()));
+    if request.method() != Method::GET && request.method() != Method::HEAD {
+        return text(StatusCode::METHOD_NOT_ALLOWED, "only GET is answered\n");
+    }
+    if request.uri().path() == "/stream" {
+        let is_upgrade =
+            request.headers().get(UPGRADE).is_some_and(|value| value.as_bytes().eq_ignore_ascii_case(b"websocket"));
+        let key = request
+            .headers()
+            .get(SEC_WEBSOCKET_KEY)
+            .filter(|_| is_upgrade)
+            .map(|key| derive_accept_key(key.as_bytes()));
+        let Some(accept) = key.and_then(|key| HeaderValue::from_str(&key).ok()) else {
+            return text(StatusCode::UPGRADE_REQUIRED, "this address is for the page's WebSocket\n");
+        };
+        let upgrade = hyper::upgrade::on(&mut request);
+        let shared = Arc::clone(shared);
+        tokio::spawn(async move {
+            if let Ok(upgraded) = upgrade.await {
+                socket::serve(upgraded, &shared.hub, &shared.token, shared.max_browsers).await;
+            }
+        });
+        let mut response = Response::new(Full::default());
+        *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
+        let headers = response.headers_mut();
+        headers.insert(UPGRADE, HeaderValue::from_static("websocket"));
+        headers.insert(CONNECTION, HeaderValue::from_static("Upgrade"));
+        headers.insert(SEC_WEBSOCKET_ACCEPT, accept);
+        return response;
+    }
+    match asset(request.uri().path()) {
+        Some(asset) => page(StatusCode::OK, asset.kind, Bytes::from_static(asset.bytes)),
+        None => text(StatusCode::NOT_FOUND, "there is nothing here; the page is at /\n"),
+    }
+}
+
+fn page(status: StatusCode, kind: &'static str, body: Bytes) -> Response<Full<Bytes>> {
+    let mut response = Response::new(Full::new(body));
+    *response.status_mut() = status;
+    let headers = response.headers_mut();
+    headers.insert(CONTENT_TYPE, HeaderValue::from_static(kind));
+    for (name, value) in HEADERS {
+        headers.insert(HeaderName::from_static(name), HeaderValue::from_static(value));
+    }
+    response
+}

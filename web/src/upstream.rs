@@ -1,0 +1,155 @@
+//! The one subscription to the rig, while somebody watches.
+
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use flyrig_stream::stamp_of;
+use flyrig_transport::{Interests, PersonMessage, RigStats, Subscriber, TransportConfig};
+use serde::Serialize;
+
+use crate::hub::Hub;
+
+/// How long a message is waited for.
+const PATIENCE: Duration = Duration::from_millis(50);
+/// How often statistics and calibration are looked at.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
+/// How long a template is waited for at a time.
+const TEMPLATE_PATIENCE: Duration = Duration::from_secs(2);
+/// Pause after a template that did not come.
+const TEMPLATE_RETRY: Duration = Duration::from_millis(500);
+/// How long the subscription outlives the last browser: a page that is loaded again finds it.
+const LINGER: Duration = Duration::from_secs(5);
+
+/// State of the rig, for the page.
+#[derive(Debug, Serialize)]
+struct State<'a> {
+    rig: &'a str,
+    /// What keeps people from being shown, in words.
+    trouble: Option<String>,
+    sets_per_second: f64,
+    /// Quality of tracking of each person, 0..=1.
+    people: Vec<(u32, Option<f64>)>,
+}
+
+/// Feeds browsers until `stop` is set.
+pub(crate) fn run(config: &TransportConfig, hub: &Arc<Hub>, stop: &AtomicBool) {
+    let mut link: Option<Link> = None;
+    let mut watched = Instant::now();
+    while !stop.load(Ordering::Relaxed) {
+        if hub.browsers() > 0 {
+            watched = Instant::now();
+        } else if watched.elapsed() >= LINGER || link.is_none() {
+            if link.take().is_some() {
+                hub.forget_people();
+            }
+            std::thread::sleep(PATIENCE);
+            continue;
+        }
+        match &mut link {
+            Some(link) => link.turn(config, hub),
+            None => match Subscriber::open(config, &Interests { people: true, stats: true, ..Interests::default() }) {
+                Ok(subscriber) => link = Some(Link::new(subscriber)),
+                Err(error) => {
+                    tell(hub, &config.rig, Some(error.to_string()), None);
+                    std::thread::sleep(TEMPLATE_RETRY);
+                }
+            },
+        }
+    }
+}
+
+struct Link {
+    subscriber: Subscriber,
+    /// Template that was asked for last without an answer.
+    asked: Option<(u64, Instant)>,
+    looked: Option<Instant>,
+    stats: Option<RigStats>,
+    was_up: bool,
+}
+
+impl Link {
+    fn new(subscriber: Subscriber) -> Self {
+        Self { subscriber, asked: None, looked: None, stats: None, was_up: false }
+    }
+
+    fn turn(&mut self, config: &TransportConfig, hub: &Hub) {
+        if self.looked.is_none_or(|at| at.elapsed() >= LOOK_EVERY) {
+            self.looked = Some(Instant::now());
+            self.look(config, hub);
+        }
+        match self.subscriber.next_person(PATIENCE) {
+            Ok(Some(received)) => self.take(&received.body, hub),
+            Ok(None) => {}
+            Err(error) => tracing::debug!("{error}"),
+        }
+    }
+
+    fn take(&mut self, message: &PersonMessage, hub: &Hub) {
+        let Ok(stamp) = stamp_of(&message.bytes) else { return };
+        let is_known =
+            hub.has_template(message.person, stamp.template) || self.fetch(message.person, stamp.template, hub);
+        match message.layer {
+            // Colours of a template that is not there yet come again.
+            _ if !is_known => {}
+            None => hub.motion(message.person, &message.bytes),
+            Some(_) => hub.colors(message.person, &message.bytes),
+        }
+    }
+
+    /// Fetches a template. Returns whether it came.
+    fn fetch(&mut self, person: u32, hash: u64, hub: &Hub) -> bool {
+        if self.asked.is_some_and(|(asked, at)| asked == hash && at.elapsed() < TEMPLATE_RETRY) {
+            return false;
+        }
+        match self.subscriber.template(hash, TEMPLATE_PATIENCE) {
+            Ok(Some(bytes)) => {
+                hub.template(person, hash, &bytes);
+                self.asked = None;
+                true
+            }
+            answer => {
+                if let Err(error) = answer {
+                    tracing::debug!("{error}");
+                }
+                self.asked = Some((hash, Instant::now()));
+                false
+            }
+        }
+    }
+
+    /// Passes on calibration, statistics and the state in words.
+    fn look(&mut self, config: &TransportConfig, hub: &Hub) {
+        if let Ok(Some(stats)) = self.subscriber.next_stats(Duration::ZERO) {
+            self.stats = Some(stats.body);
+        }
+        let is_up = self.subscriber.publishers() > 0;
+        if std::mem::replace(&mut self.was_up, is_up) && !is_up {
+            hub.forget_people();
+            self.stats = None;
+        }
+        let rig = self.subscriber.rig(Duration::ZERO).ok().flatten();
+        if let Some(json) = rig.as_ref().and_then(|rig| serde_json::to_vec(rig).ok()) {
+            hub.rig(&json);
+        }
+        let trouble = match (is_up, &rig) {
+            (false, _) => Some(format!("No rig '{}' yet: check that `flyrig run` is up", config.rig)),
+            (true, None) => Some("Waiting for the rig's calibration".to_owned()),
+            (true, Some(_)) => None,
+        };
+        tell(hub, &config.rig, trouble, self.stats.as_ref());
+    }
+}
+
+fn tell(hub: &Hub, rig: &str, trouble: Option<String>, stats: Option<&RigStats>) {
+    let people = stats.map(|stats| stats.subjects.iter().map(|of| (of.person, of.quality)).collect());
+    let sets_per_second = stats.map_or(0.0, |stats| stats.frames_per_second);
+    let state = State { rig, trouble, sets_per_second, people: people.unwrap_or_default() };
+    if let Ok(json) = serde_json::to_vec(&state) {
+        hub.state(&json);
+    }
+}

@@ -1,0 +1,305 @@
+//! Browsers at the web page of a rig: what they get, what they cannot do, and what they cannot do to each other.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
+
+use std::{
+    io::{Read as _, Write as _},
+    net::{SocketAddr, TcpStream},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread::JoinHandle,
+    time::{Duration, Instant},
+};
+
+use flyrig_page::{MessageKind, Page};
+use flyrig_stream::{
+    ColorEncoder, ColorSettings, EncodedTemplate, Motion, MotionEncoder, Stamp, StreamJoint, TemplateSource,
+};
+use flyrig_transport::{Publisher, TransportConfig};
+use flyrig_types::{Camera, Intrinsics, Isometry, Rig};
+use flyrig_web::{WebOptions, WebServer};
+use glam::DVec3;
+use tokio_tungstenite::tungstenite::{self, Message, WebSocket, client::IntoClientRequest as _};
+
+const PATIENCE: Duration = Duration::from_secs(60);
+const GAUSSIANS: usize = 500;
+const NAME: &str = "web-test";
+
+/// A rig of one person who stands at x; it publishes until it is dropped.
+struct TestRig {
+    endpoint: String,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl TestRig {
+    fn start(listen: &str, x: f32) -> Self {
+        let config = TransportConfig { listen: vec![listen.to_owned()], ..TransportConfig::publisher(NAME) };
+        let publisher = Publisher::open(&config).unwrap();
+        publisher.set_calibration(&cameras()).unwrap();
+        let endpoint = publisher.endpoints()[0].clone();
+        let stop = Arc::<AtomicBool>::default();
+        let ended = Arc::clone(&stop);
+        let work = move || {
+            let encoded = template(1.0 + x);
+            publisher.offer_template(4, encoded.template.hash, encoded.bytes.clone().into());
+            let mut motions = MotionEncoder::new(&encoded);
+            let mut colors = ColorEncoder::new(&encoded, ColorSettings::default(), 1);
+            for frame in 1.. {
+                if ended.load(Ordering::Relaxed) {
+                    break;
+                }
+                let capture_nanos = 33_000_000 * frame as i64;
+                let stamp = Stamp { template: encoded.template.hash, person: 4, frame, capture_nanos };
+                let motion = Motion {
+                    stamp,
+                    root_translation: [x, 0.0, 1.0],
+                    joint_rotations: vec![[0.0, 0.0, 0.0, 1.0]],
+                    nodes: Vec::new(),
+                };
+                publisher.publish_person(&stamp, None, motions.encode(&motion).unwrap().into());
+                let layers = colors.encode(stamp, &[[0.5, 0.2, 0.1, 1.0]; GAUSSIANS]);
+                for (layer, bytes) in layers.into_iter().enumerate().filter(|(_, bytes)| !bytes.is_empty()) {
+                    publisher.publish_person(&stamp, Some(layer), bytes.into());
+                }
+                std::thread::sleep(Duration::from_millis(33));
+            }
+            publisher.close().unwrap();
+        };
+        Self { endpoint, stop, thread: Some(std::thread::spawn(work)) }
+    }
+}
+
+impl Drop for TestRig {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.take().unwrap().join().unwrap();
+    }
+}
+
+fn cameras() -> Rig {
+    let camera = Camera {
+        time_offset_nanos: 0,
+        id: "a".into(),
+        intrinsics: Intrinsics::pinhole(640, 480, 500.0),
+        camera_from_world: Isometry::look_at(DVec3::new(0.0, -3.0, 1.0), DVec3::Z, DVec3::Z),
+    };
+    Rig { cameras: vec![camera], world_up: DVec3::Z }
+}
+
+fn template(size: f32) -> EncodedTemplate {
+    let rows = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+    let joints = [StreamJoint { parent: None, translation: [0.0; 3], joint_from_canonical: rows }];
+    let center_scale: Vec<[f32; 4]> =
+        (0..GAUSSIANS).map(|i| [0.0, 0.0, size * i as f32 / GAUSSIANS as f32, 0.01]).collect();
+    let skin = vec![([0; 4], [1.0, 0.0, 0.0, 0.0]); GAUSSIANS];
+    let normals = vec![[0.0, -1.0, 0.0]; GAUSSIANS];
+    let (center_scale, normals, skin) = (&center_scale, &normals, &skin);
+    let source = TemplateSource { joints: &joints, center_scale, normals, skin, node_weights: &[], nodes: &[] };
+    source.encode().unwrap()
+}
+
+fn server(endpoint: &str, listen: &str, insecure: bool) -> WebServer {
+    let transport = TransportConfig { connect: vec![endpoint.to_owned()], ..TransportConfig::subscriber(NAME) };
+    let names = vec!["rig.local".to_owned()];
+    WebServer::start(&WebOptions { listen: listen.parse().unwrap(), insecure, names, max_browsers: 3, transport })
+        .unwrap()
+}
+
+type Socket = WebSocket<TcpStream>;
+
+fn browser(address: SocketAddr, token: &str) -> Socket {
+    let stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    let request = format!("ws://{address}/stream").into_client_request().unwrap();
+    let (mut socket, _) = tungstenite::client(request, stream).unwrap();
+    socket.send(Message::text(token)).unwrap();
+    socket
+}
+
+/// The next message: kind, person, payload.
+fn next(socket: &mut Socket) -> (u8, u32, Vec<u8>) {
+    loop {
+        if let Message::Binary(bytes) = socket.read().unwrap() {
+            return (bytes[0], u32::from_le_bytes(bytes[4..8].try_into().unwrap()), bytes[8..].to_vec());
+        }
+    }
+}
+
+/// Reads as the page does until `done`.
+fn watch(socket: &mut Socket, page: &mut Page, what: &str, mut done: impl FnMut(&mut Page, &str) -> bool) {
+    let started = Instant::now();
+    let mut state = String::new();
+    while !done(page, &state) {
+        assert!(started.elapsed() < PATIENCE, "waited in vain for {what}: {state}");
+        let (kind, person, payload) = next(socket);
+        match kind {
+            4 => state = String::from_utf8(payload).unwrap(),
+            5 => page.forget_people(),
+            kind => page
+                .take(MessageKind::of(kind.into()).unwrap(), person, &payload, started.elapsed().as_secs_f64())
+                .unwrap(),
+        }
+        page.pose(started.elapsed().as_secs_f64(), false);
+    }
+}
+
+fn ask(address: SocketAddr, request: &str) -> String {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.write_all(request.as_bytes()).unwrap();
+    let mut answer = Vec::new();
+    let _ = stream.read_to_end(&mut answer);
+    String::from_utf8_lossy(&answer).into_owned()
+}
+
+#[test]
+fn browsers_see_a_rig_that_comes_late_goes_and_comes_again_as_another() {
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let endpoint = format!("tcp/127.0.0.1:{port}");
+    let server = server(&endpoint, "127.0.0.1:0", false);
+    let (mut socket, mut page) = (browser(server.address(), ""), Page::default());
+    watch(&mut socket, &mut page, "a rig that is not there", |_, state| state.contains("No rig 'web-test' yet"));
+    let stands_at = |page: &mut Page, x: f32| {
+        page.is_complete()
+            && page.people_shown() == 1
+            && page.centers().first().is_some_and(|center| (center[0] - x).abs() < 1e-2)
+    };
+    let rig = TestRig::start(&endpoint, 0.25);
+    assert_eq!(rig.endpoint, endpoint);
+    watch(&mut socket, &mut page, "the person", |page, state| {
+        stands_at(page, 0.25) && state.contains("\"trouble\":null")
+    });
+    assert!((page.colors()[7][0] - 0.5).abs() < 0.05 && page.order(320, 240).len() == GAUSSIANS);
+    // A second browser joins a stream under way.
+    let (mut second, mut late) = (browser(server.address(), ""), Page::default());
+    watch(&mut second, &mut late, "the person, late", |page, _| stands_at(page, 0.25));
+    drop(rig);
+    watch(&mut socket, &mut page, "the end of the rig", |page, state| {
+        page.people_shown() == 0 && state.contains("No rig")
+    });
+    let _rig = TestRig::start(&endpoint, 0.75);
+    watch(&mut socket, &mut page, "the other person", |page, _| stands_at(page, 0.75));
+}
+
+#[test]
+fn a_browser_that_stops_reading_holds_nobody_up() {
+    let rig = TestRig::start("tcp/127.0.0.1:0", 0.5);
+    let server = server(&rig.endpoint, "127.0.0.1:0", false);
+    let _stopped = [browser(server.address(), ""), browser(server.address(), "")];
+    let mut socket = browser(server.address(), "");
+    let (started, mut motions) = (Instant::now(), 0);
+    while started.elapsed() < Duration::from_secs(3) || motions == 0 {
+        motions += u32::from(next(&mut socket).0 == 2);
+        assert!(started.elapsed() < PATIENCE);
+    }
+    assert!(motions > 20, "{motions} motions in three seconds");
+    // Three may watch.
+    let mut fourth = browser(server.address(), "");
+    let closed = loop {
+        match fourth.read().unwrap() {
+            Message::Close(frame) => break frame.unwrap(),
+            message => assert!(!message.is_binary(), "somebody beyond the most is served"),
+        }
+    };
+    assert!(closed.reason.contains("all places are taken"), "{closed}");
+    drop(socket);
+    let deadline = Instant::now() + PATIENCE;
+    while server.browsers() > 2 {
+        assert!(Instant::now() < deadline, "the place of a browser that left stays taken");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn strangers_are_refused_in_words() {
+    let server = server("tcp/127.0.0.1:1", "127.0.0.1:0", false);
+    let (address, port) = (server.address(), server.address().port());
+    assert_eq!(server.link(), format!("http://127.0.0.1:{port}/"));
+    let get =
+        |path: &str, more: &str| ask(address, &format!("GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n{more}\r\n"));
+    let page = get("/", "");
+    assert!(
+        page.starts_with("HTTP/1.1 200") && page.contains("content-security-policy") && page.contains("<canvas"),
+        "{page}"
+    );
+    for (path, kind) in [("/page.js", "javascript"), ("/draw.js", "javascript"), ("/page.wasm", "application/wasm")] {
+        let answer = get(path, "");
+        assert!(answer.starts_with("HTTP/1.1 200") && answer.contains(kind), "{path}");
+    }
+    assert!(get("/../etc/passwd", "").starts_with("HTTP/1.1 404"));
+    assert!(get("/stream", "").starts_with("HTTP/1.1 426"));
+    assert!(get("/", "Origin: http://evil.example\r\n").contains("pages of http://evil.example may not watch"));
+    let named = ask(address, "GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n");
+    assert!(named.starts_with("HTTP/1.1 403") && named.contains("not known as 'evil.example'"), "{named}");
+    assert!(ask(address, "GET / HTTP/1.1\r\nHost: rig.local:80\r\n\r\n").starts_with("HTTP/1.1 200"));
+    let posted = ask(address, &format!("POST / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nContent-Length: 1\r\n\r\nx"));
+    assert!(posted.starts_with("HTTP/1.1 405"), "{posted}");
+    for noise in ["\r\n\r\n", "GET / HTTP/9.9\r\n\r\n", "\u{0}\u{1}\u{2}\r\n\r\n"] {
+        assert!(!ask(address, noise).contains("200 OK"));
+    }
+    ask(address, &format!("GET /{} HTTP/1.1\r\nHost: localhost\r\n\r\n", "a".repeat(100_000)));
+
+    // Somebody who talks.
+    let mut chatty = browser(address, "");
+    chatty.send(Message::text("what")).unwrap();
+    let reason = loop {
+        match chatty.read().unwrap() {
+            Message::Close(frame) => break frame.unwrap().reason.to_string(),
+            _ => {}
+        }
+    };
+    assert!(reason.contains("nothing to say"), "{reason}");
+}
+
+#[test]
+fn other_computers_need_permission_and_a_token() {
+    let transport = TransportConfig::subscriber(NAME);
+    let options = WebOptions {
+        listen: "0.0.0.0:0".parse().unwrap(),
+        insecure: false,
+        names: Vec::new(),
+        max_browsers: 3,
+        transport: transport.clone(),
+    };
+    let refused = WebServer::start(&options).unwrap_err().to_string();
+    assert!(refused.contains("--insecure") && refused.contains("ssh -L"), "{refused}");
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let listen = taken.local_addr().unwrap();
+    let refused = WebServer::start(&WebOptions { listen, ..options }).unwrap_err().to_string();
+    assert!(refused.contains("cannot listen on") && refused.contains("another"), "{refused}");
+
+    let rig = TestRig::start("tcp/127.0.0.1:0", 0.5);
+    let server = server(&rig.endpoint, "0.0.0.0:0", true);
+    let address = SocketAddr::from(([127, 0, 0, 1], server.address().port()));
+    let link = server.link();
+    let token = link.split_once('#').unwrap().1.to_owned();
+    for wrong in ["", &token[1..], &token.replace(&token[..1], "x")] {
+        let mut socket = browser(address, wrong);
+        let Message::Close(Some(frame)) = socket.read().unwrap() else { panic!("'{wrong}' was let in") };
+        assert!(frame.reason.contains("token is wrong or missing"), "{frame}");
+    }
+    assert_eq!(next(&mut browser(address, &token)).0 % 4, 0, "a state or the rig comes first");
+}
+
+#[test]
+fn half_open_connections_and_floods_hold_nobody_up() {
+    let server = server("tcp/127.0.0.1:1", "127.0.0.1:0", false);
+    let address = server.address();
+    // Nothing is ever said on these.
+    let half_open: Vec<TcpStream> = (0..800).filter_map(|_| TcpStream::connect(address).ok()).collect();
+    assert!(half_open.len() > 400, "{}", half_open.len());
+    let started = Instant::now();
+    for _ in 0..200 {
+        let answer = ask(address, "GET / HTTP/1.1\r\nHost: localhost\r\n\r\n");
+        assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+    }
+    assert!(started.elapsed() < PATIENCE);
+    drop(half_open);
+    // A message that claims to be huge costs its sender the place.
+    let mut socket = browser(address, "");
+    let _ = socket.send(Message::binary(vec![0u8; 1 << 20]));
+    let ended = (0..100).any(|_| matches!(socket.read(), Err(_) | Ok(Message::Close(_))));
+    assert!(ended);
+}
