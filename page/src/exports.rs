@@ -161,3 +161,9 @@ pub extern "C" fn jump(camera: usize) {
 pub extern "C" fn people() -> u32 {
     with(|state| state.page.people_shown() as u32 | u32::from(state.page.is_complete()) << 8)
 }
+
+/// [`Page::frame`].
+#[unsafe(no_mangle)]
+pub extern "C" fn frame() -> f64 {
+    with(|state| state.page.frame() as f64)
+}

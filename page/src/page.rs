@@ -65,6 +65,10 @@ pub struct Page {
     colors: Vec<[f32; 4]>,
     /// What is shown: each person's number, frame and share of interpolation, and the number of its colour messages.
     shown: Vec<(u32, u64, u64)>,
+    /// Whether somebody has a new template, or is forgotten.
+    is_stale: bool,
+    /// The rig's frame number of the first person's motion.
+    frame: u64,
     posed: Posed,
     order: DrawOrder,
     camera: [f32; CAMERA_FLOATS],
@@ -81,6 +85,7 @@ impl Page {
             MessageKind::Template => {
                 let template = StreamTemplate::decode(bytes).map_err(PageError::Stream)?;
                 self.people.meet(person, Arc::new(template));
+                self.is_stale = true;
             }
             MessageKind::Motion | MessageKind::Colors => {
                 let is_motion = kind == MessageKind::Motion;
@@ -104,7 +109,7 @@ impl Page {
     /// Forgets people, for a rig that begins anew; the viewpoint stays.
     pub fn forget_people(&mut self) {
         self.people.clear();
-        self.shown.clear();
+        self.is_stale = true;
     }
 
     /// Poses everybody as they are shown at `now`. Returns whether centres, and whether colours, differ from those before.
@@ -125,11 +130,14 @@ impl Page {
         {
             navigation.follow(Some(DVec3::from(motion.root_translation.map(f64::from))));
         }
-        if shown == self.shown {
+        let is_stale = std::mem::take(&mut self.is_stale);
+        if shown == self.shown && !is_stale {
             return (false, false);
         }
         let same = |part: fn(&(u32, u64, u64)) -> (u32, u64)| {
-            shown.len() == self.shown.len() && shown.iter().zip(&self.shown).all(|(a, b)| part(a) == part(b))
+            !is_stale
+                && shown.len() == self.shown.len()
+                && shown.iter().zip(&self.shown).all(|(a, b)| part(a) == part(b))
         };
         let (moved, recolored) = (!same(|key| (key.0, key.1)), !same(|key| (key.0, key.2)));
         for list in [&mut self.centers, &mut self.normals, &mut self.colors] {
@@ -143,6 +151,7 @@ impl Page {
             self.normals.extend_from_slice(&self.posed.normal[..count]);
             self.colors.extend_from_slice(&colors[..count]);
         }
+        self.frame = motions.first().map_or(0, |(_, motion)| motion.stamp.frame);
         self.shown = shown;
         (moved, recolored)
     }
@@ -207,6 +216,12 @@ impl Page {
     #[must_use]
     pub fn people_shown(&self) -> usize {
         self.shown.len()
+    }
+
+    /// The rig's frame number of the first person who is shown.
+    #[must_use]
+    pub fn frame(&self) -> u64 {
+        self.frame
     }
 
     /// Whether everybody who is known has all colours; false without anybody.

@@ -63,10 +63,13 @@ fn a_person_is_shown_once_template_motion_and_rig_are_there() {
     assert!(page.is_complete() && (page.colors()[5][0] - 0.5).abs() < 0.05);
     assert_eq!(page.pose(0.0, false), (false, false), "nothing is done twice");
     page.take(MessageKind::Motion, 2, &motion(&encoded, 2, 0.6), 0.1).unwrap();
-    assert_eq!(page.pose(0.1, false), (true, false));
+    assert_eq!((page.pose(0.1, false), page.frame()), ((true, false), 2));
     // Whoever is gone is not drawn.
     assert_eq!((page.pose(60.0, false), page.people_shown()), ((true, true), 0));
+    page.take(MessageKind::Motion, 2, &motion(&encoded, 3, 0.6), 60.1).unwrap();
+    assert!(page.pose(60.1, false).0 && !page.centers().is_empty());
     page.forget_people();
+    assert_eq!(page.pose(60.1, false), (true, true));
     assert!(page.centers().is_empty());
 }
 

@@ -26,6 +26,14 @@ let scale = 1; // canvas pixels for a pixel of the screen
 let dirty = true;
 const recent = []; // [time ms, bytes] of messages
 const drawn = []; // times ms of images
+const spent = { decode: 0, pose: 0, draw: 0 }; // smoothed ms of a message, an image's posing and sorting, and its drawing
+
+function timed(what, work) {
+  const start = performance.now();
+  const result = work();
+  spent[what] += 0.05 * (performance.now() - start - spent[what]);
+  return result;
+}
 
 // --- Messages ---
 
@@ -43,7 +51,7 @@ function take(buffer) {
     const address = wasm.input(payload.length);
     if (address === 0) return;
     new Uint8Array(wasm.memory.buffer, address, payload.length).set(payload);
-    if (wasm.take(kind, person, now()) !== 0) {
+    if (timed("decode", () => wasm.take(kind, person, now())) !== 0) {
       const problem = text.decode(new Uint8Array(wasm.memory.buffer, wasm.error(), wasm.error_length()).slice());
       console.warn(problem);
       if (kind <= 1) linkTrouble = problem;
@@ -168,17 +176,21 @@ function tick(time) {
     [canvas.width, canvas.height] = [width, height];
     dirty = true;
   }
+  const start = performance.now();
   const count = wasm.pose(now(), interpolates ? 1 : 0);
   const changes = uploaded ? wasm.changes() : 3;
   if (changes === 0 && !dirty) return;
   const order = wasm.order(width, height);
   const length = wasm.order_length();
-  // The memory may have moved until here.
-  if (changes & 1) drawing.setCenters(floats(wasm.centers(), 4 * count), count);
-  if (changes & 2) drawing.setColors(floats(wasm.colors(), 4 * count), count);
-  uploaded = true;
-  dirty = false;
-  drawing.draw(new Uint32Array(wasm.memory.buffer, order, length), floats(wasm.camera(), 19), BACKGROUND);
+  spent.pose += 0.05 * (performance.now() - start - spent.pose);
+  timed("draw", () => {
+    // The memory may have moved until here.
+    if (changes & 1) drawing.setCenters(floats(wasm.centers(), 4 * count), count);
+    if (changes & 2) drawing.setColors(floats(wasm.colors(), 4 * count), count);
+    drawing.draw(new Uint32Array(wasm.memory.buffer, order, length), floats(wasm.camera(), 19), BACKGROUND);
+  });
+  [uploaded, dirty] = [true, false];
+  document.documentElement.dataset.frame = wasm.frame();
   drawn.push(time);
   if (drawn.length > 200) drawn.splice(0, 100);
   if (!parameters.has("fixed")) adapt();
@@ -195,7 +207,9 @@ function showState(time) {
   troubleText.textContent = linkTrouble || state.trouble || nobody;
   stateText.textContent = parameters.has("bare") ? "" : [
     state.rig ?? "",
-    `${rate(drawn).toFixed(0)} images/s, rig ${state.sets_per_second.toFixed(1)} sets/s, ${bits.toFixed(1)} Mbit/s`,
+    `${rate(drawn).toFixed(0)} images/s` + (state.sets_per_second > 0 ? `, rig ${state.sets_per_second.toFixed(1)} sets/s` : "")
+      + `, ${bits.toFixed(1)} Mbit/s`,
+    `decode ${spent.decode.toFixed(1)} ms, pose and sort ${spent.pose.toFixed(1)} ms, draw ${spent.draw.toFixed(1)} ms`,
     quality.length > 0 ? `tracking ${quality.join(", ")}` : "",
     shown > 0 && !complete ? "colours are still coming" : "",
   ].filter(line => line).join("\n");

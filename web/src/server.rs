@@ -214,7 +214,6 @@ async fn answer(client: TcpStream, shared: Arc<Shared>) -> hyper::Result<()> {
         .timer(TokioTimer::new())
         .header_read_timeout(PATIENCE)
         .max_buf_size(REQUEST_BYTES)
-        .keep_alive(false)
         .serve_connection(TokioIo::new(client), service)
         .with_upgrades()
         .await
@@ -266,6 +265,8 @@ fn page(status: StatusCode, kind: &'static str, body: Bytes) -> Response<Full<By
     *response.status_mut() = status;
     let headers = response.headers_mut();
     headers.insert(CONTENT_TYPE, HeaderValue::from_static(kind));
+    // A place is for the next one.
+    headers.insert(CONNECTION, HeaderValue::from_static("close"));
     for (name, value) in HEADERS {
         headers.insert(HeaderName::from_static(name), HeaderValue::from_static(value));
     }

@@ -1,0 +1,186 @@
+//! A real browser (Chromium without a window) at the web page of a rig: the image on its canvas is the one that the rig's own renderer
+//! draws. Ignored, since it needs Chromium: `make test-browser`.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
+
+mod support;
+
+use std::{
+    collections::BTreeMap,
+    io::{Read as _, Write as _},
+    net::TcpStream,
+    process::Command,
+    time::{Duration, Instant},
+};
+
+use base64::Engine as _;
+use flyrig_gpu::{AdapterChoice, GpuContext};
+use flyrig_stream::{Motion, Posed};
+use flyrig_transport::TransportConfig;
+use flyrig_viewer::{Receiver, Scene, clock_secs};
+use flyrig_viewing::Navigation;
+use serde_json::{Value, json};
+use support::{Process, small_rig, wait_until};
+use tokio_tungstenite::tungstenite::{self, Message, WebSocket, client::IntoClientRequest as _};
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
+const SIDE: u32 = 512;
+const BACKGROUND: [u8; 3] = [27, 29, 32];
+
+/// A page, controlled by the browser's debugging protocol.
+struct Browser {
+    socket: WebSocket<TcpStream>,
+    calls: u64,
+    _process: Process,
+}
+
+impl Browser {
+    fn open(url: &str, folder: &std::path::Path, port: u16) -> Self {
+        let (port_text, profile) =
+            (format!("--remote-debugging-port={port}"), format!("--user-data-dir={}/profile", folder.display()));
+        let args = [
+            "--headless=new",
+            "--no-sandbox",
+            "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader",
+            "--remote-allow-origins=*",
+            &port_text,
+            &profile,
+            url,
+        ];
+        let process = Process::start("chromium", &args, folder, "chromium");
+        let mut address = None;
+        wait_until("the browser", || {
+            address = page_address(port);
+            address.is_some()
+        });
+        let stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
+        let (socket, _) = tungstenite::client(address.unwrap().into_client_request().unwrap(), stream).unwrap();
+        Self { socket, calls: 0, _process: process }
+    }
+
+    fn call(&mut self, method: &str, parameters: &Value) -> Value {
+        self.calls += 1;
+        let text = json!({ "id": self.calls, "method": method, "params": parameters }).to_string();
+        self.socket.send(Message::text(text)).unwrap();
+        loop {
+            if let Message::Text(text) = self.socket.read().unwrap() {
+                let answer: Value = serde_json::from_str(&text).unwrap();
+                if answer["id"] == self.calls {
+                    return answer["result"].clone();
+                }
+            }
+        }
+    }
+
+    fn evaluate(&mut self, expression: &str) -> Value {
+        let answer = self.call("Runtime.evaluate", &json!({ "expression": expression, "returnByValue": true }));
+        answer["result"]["value"].clone()
+    }
+}
+
+/// WebSocket of the browser's first page.
+fn page_address(port: u16) -> Option<String> {
+    let mut stream = TcpStream::connect(("127.0.0.1", port)).ok()?;
+    write!(stream, "GET /json HTTP/1.0\r\nHost: 127.0.0.1:{port}\r\n\r\n").ok()?;
+    stream.set_read_timeout(Some(Duration::from_secs(2))).ok()?;
+    let mut answer = Vec::new();
+    let _ = stream.read_to_end(&mut answer);
+    let text = String::from_utf8_lossy(&answer).into_owned();
+    let pages: Value = serde_json::from_str(text.split_once("\r\n\r\n")?.1.trim()).ok()?;
+    let page = pages.as_array()?.iter().find(|page| page["type"] == "page")?;
+    page["webSocketDebuggerUrl"].as_str().map(str::to_owned)
+}
+
+#[test]
+#[ignore = "needs Chromium; make test-browser"]
+fn a_browser_shows_the_person_as_the_rig_draws_it() {
+    assert!(
+        Command::new("chromium").arg("--version").output().is_ok(),
+        "chromium is missing: make test-browser installs it"
+    );
+    let folder = tempfile::tempdir().unwrap();
+    let port = || std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let (web, debugging) = (port(), port());
+    let more = format!("[sim.motion]\nkind = \"still\"\n[web]\nlisten = \"127.0.0.1:{web}\"\n");
+    let endpoint = small_rig("browser", folder.path(), &more);
+    let config = std::fs::read_to_string(folder.path().join("rig.toml")).unwrap();
+    let config = config.replace("width = 96\nheight = 96\ntexture_px = 128", "width = 384\nheight = 384\nfps = 4");
+    std::fs::write(folder.path().join("rig.toml"), config.replace("gaussians = 3000", "gaussians = 40000")).unwrap();
+    let _rig = Process::start(PROGRAM, &["run", "rig.toml"], folder.path(), "run");
+    wait_until("the page", || TcpStream::connect(("127.0.0.1", web)).is_ok());
+
+    let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+    let subscriber = TransportConfig { connect: vec![endpoint], ..TransportConfig::subscriber("browser") };
+    let receiver = Receiver::start(&subscriber, || {}).unwrap();
+    let url = format!("http://127.0.0.1:{web}/?bare&fixed&lowest-latency&camera=00");
+    let mut browser = Browser::open(&url, folder.path(), debugging);
+    let size = json!({ "width": SIDE, "height": SIDE, "deviceScaleFactor": 1, "mobile": false });
+    browser.call("Emulation.setDeviceMetricsOverride", &size);
+
+    // Motions and colours by frame, as this program received them.
+    let mut known: BTreeMap<u64, (Motion, Vec<[f32; 4]>)> = BTreeMap::new();
+    let mut note = |receiver: &Receiver| {
+        let mut state = receiver.state();
+        let Some(person) = state.people.get_mut(0).filter(|person| person.is_complete()) else { return };
+        let Some(motion) = person.motion_at(clock_secs(), false) else { return };
+        let colors = person.pose(&motion, &mut Posed::default()).to_vec();
+        known.insert(motion.stamp.frame, (motion, colors));
+    };
+    let started = Instant::now();
+    wait_until("the person in the browser", || {
+        note(&receiver);
+        browser.evaluate("document.documentElement.dataset.ready") == "yes"
+    });
+    let seconds = started.elapsed().as_secs_f64();
+    // Some seconds more, so that every colour is refined.
+    let until = Instant::now() + Duration::from_secs(6);
+    while Instant::now() < until {
+        note(&receiver);
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let shown = browser.evaluate(
+        "({frame: Number(document.documentElement.dataset.frame), image: document.getElementById('view').toDataURL('image/png')})",
+    );
+    let until = Instant::now() + Duration::from_secs(1);
+    while Instant::now() < until {
+        note(&receiver);
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let encoded = shown["image"].as_str().unwrap().strip_prefix("data:image/png;base64,").unwrap();
+    let bytes = base64::engine::general_purpose::STANDARD.decode(encoded).unwrap();
+    let browsers = image::load_from_memory(&bytes).unwrap().into_rgb8();
+    assert_eq!(browsers.dimensions(), (SIDE, SIDE));
+    let (motion, colors) = known.get(&shown["frame"].as_u64().unwrap()).unwrap();
+
+    let mut state = receiver.state();
+    let rig = state.rig.clone().unwrap();
+    let mut navigation = Navigation::new(&rig);
+    navigation.jump(&rig.cameras[0]);
+    let mut posed = Posed::default();
+    state.people.get_mut(0).unwrap().template().pose(motion, &mut posed);
+    drop(state);
+    let mut scene = Scene::new(&gpu.fastest()).unwrap();
+    scene.set_people([(&posed, colors.as_slice())]).unwrap();
+    let ours = scene.draw(&navigation.camera(SIDE, SIDE)).unwrap();
+    let behind: Vec<u8> = BACKGROUND.repeat((SIDE * SIDE) as usize);
+    let on_grey = flyrig_renderer::composite_over(&ours.rgba, &behind);
+
+    // On the person alone: the background would flatter.
+    let (mut sum, mut count) = (0.0, 0usize);
+    for (pixel, (a, b)) in ours.rgba.chunks_exact(4).zip(on_grey.chunks_exact(3).zip(browsers.as_raw().chunks_exact(3)))
+    {
+        let is_grey = b.iter().zip(BACKGROUND).all(|(b, grey)| b.abs_diff(grey) <= 1);
+        if pixel[3] > 0 || !is_grey {
+            sum += a.iter().zip(b).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum::<f64>();
+            count += 3;
+        }
+    }
+    let psnr = -10.0 * (sum / count as f64 / 255.0f64.powi(2)).log10();
+    println!("a person with all colours after {seconds:.1} s; {psnr:.2} dB on {} pixels of the person", count / 3);
+    if let Ok(out) = std::env::var("FLYRIG_TEST_OUT") {
+        browsers.save(format!("{out}/browser.png")).unwrap();
+        image::RgbImage::from_raw(SIDE, SIDE, on_grey).unwrap().save(format!("{out}/rig.png")).unwrap();
+    }
+    assert!(count / 3 > 5000, "{count}");
+    assert!(psnr > 35.0, "{psnr} dB");
+}
