@@ -3,7 +3,7 @@ CARGO ?= cargo
 OUT ?= out/demo
 MINUTES ?= 30
 
-.PHONY: help setup demo test test-long test-v4l2 test-gpu-networks soak fuzz check
+.PHONY: help setup demo test test-long test-v4l2 test-gpu-networks test-browser soak fuzz check
 
 help:
 	@echo "make demo    install what is missing, build, run the simulated rig, show the report (OUT=$(OUT))"
@@ -11,6 +11,7 @@ help:
 	@echo "make test-long  the long stability runs"
 	@echo "make test-v4l2  camera capture against the kernel's test drivers, in an emulated machine"
 	@echo "make test-gpu-networks  networks on the graphics adapter (about twenty processor minutes more to build)"
+	@echo "make test-browser  the web page in Chromium, which it installs"
 	@echo "make soak    four plain cameras for MINUTES (30): memory, latency, processor time"
 	@echo "make fuzz    damaged input for everything that reads foreign bytes, MINUTES (30) for each"
 	@echo "make check   format, lints and documentation, as CI runs them"
@@ -36,6 +37,10 @@ test-v4l2: setup
 test-gpu-networks: setup
 	$(CARGO) clippy --release --locked -p flyrig-stfa --features wgpu --all-targets -- -D warnings
 	$(CARGO) test --release --locked -p flyrig-stfa --features wgpu
+
+test-browser: setup
+	@scripts/setup.sh chromium
+	$(CARGO) test --release --locked --workspace --test browser -- --ignored --nocapture
 
 soak: setup
 	$(CARGO) run --release --locked -q --bin flyrig-bench -- capture --minutes $(MINUTES)

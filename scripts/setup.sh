@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Installs what flyrig needs and this machine lacks; says what and why. Safe to run again: it then does nothing.
-# Usage: scripts/setup.sh [--check]   (--check only tells, and fails when something is missing)
+# Usage: scripts/setup.sh [--check] [chromium]   (--check only tells, and fails when something is missing; chromium is for test-browser)
 set -euo pipefail
 
 check_only=false
@@ -21,6 +21,10 @@ if ! ls /usr/share/vulkan/icd.d/*.json /etc/vulkan/icd.d/*.json >/dev/null 2>&1;
 fi
 # Recorded motion for the simulated people.
 wanted+=("assimp-testmodels:holds a captured walk (CMU 01_01.bvh) for the simulated people")
+
+case " $* " in
+  *" chromium "*) wanted+=("chromium:a browser, for the test of the web page") ;;
+esac
 
 say() { printf 'setup: %s\n' "$*"; }
 

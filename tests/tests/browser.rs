@@ -81,7 +81,7 @@ impl Browser {
 /// WebSocket of the browser's first page.
 fn page_address(port: u16) -> Option<String> {
     let mut stream = TcpStream::connect(("127.0.0.1", port)).ok()?;
-    write!(stream, "GET /json HTTP/1.0\r\nHost: 127.0.0.1:{port}\r\n\r\n").ok()?;
+    write!(stream, "GET /json HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n").ok()?;
     stream.set_read_timeout(Some(Duration::from_secs(2))).ok()?;
     let mut answer = Vec::new();
     let _ = stream.read_to_end(&mut answer);
@@ -112,6 +112,7 @@ fn a_browser_shows_the_person_as_the_rig_draws_it() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     let subscriber = TransportConfig { connect: vec![endpoint], ..TransportConfig::subscriber("browser") };
     let receiver = Receiver::start(&subscriber, || {}).unwrap();
+    let started = Instant::now();
     let url = format!("http://127.0.0.1:{web}/?bare&fixed&lowest-latency&camera=00");
     let mut browser = Browser::open(&url, folder.path(), debugging);
     let size = json!({ "width": SIDE, "height": SIDE, "deviceScaleFactor": 1, "mobile": false });
@@ -126,7 +127,6 @@ fn a_browser_shows_the_person_as_the_rig_draws_it() {
         let colors = person.pose(&motion, &mut Posed::default()).to_vec();
         known.insert(motion.stamp.frame, (motion, colors));
     };
-    let started = Instant::now();
     wait_until("the person in the browser", || {
         note(&receiver);
         browser.evaluate("document.documentElement.dataset.ready") == "yes"
@@ -176,7 +176,10 @@ fn a_browser_shows_the_person_as_the_rig_draws_it() {
         }
     }
     let psnr = -10.0 * (sum / count as f64 / 255.0f64.powi(2)).log10();
-    println!("a person with all colours after {seconds:.1} s; {psnr:.2} dB on {} pixels of the person", count / 3);
+    println!(
+        "a person with all colours {seconds:.1} s after the browser was started; {psnr:.2} dB on {} pixels of the person",
+        count / 3
+    );
     if let Ok(out) = std::env::var("FLYRIG_TEST_OUT") {
         browsers.save(format!("{out}/browser.png")).unwrap();
         image::RgbImage::from_raw(SIDE, SIDE, on_grey).unwrap().save(format!("{out}/rig.png")).unwrap();

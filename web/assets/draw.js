@@ -9,11 +9,10 @@ precision highp float;
 precision highp sampler2D;
 uniform sampler2D centers;
 uniform sampler2D colors;
+uniform highp usampler2D order;
 uniform mat4 cameraFromWorld;
 uniform vec3 lens; // focal length and principal point, pixels; pixel centres are at integers
 uniform vec2 size;
-in uint index;
-in vec2 corner;
 out vec2 offset;
 flat out vec3 conic;
 flat out float log2Opacity;
@@ -21,7 +20,11 @@ flat out vec3 paint;
 const float CUT = 1.0 / 255.0;
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-  ivec2 at = ivec2(int(index) % ${TEXELS}, int(index) / ${TEXELS});
+  // Four vertices a Gaussian.
+  int rank = gl_VertexID / 4;
+  vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
+  int index = int(texelFetch(order, ivec2(rank % ${TEXELS}, rank / ${TEXELS}), 0).r);
+  ivec2 at = ivec2(index % ${TEXELS}, index / ${TEXELS});
   vec4 center = texelFetch(centers, at, 0);
   vec4 color = texelFetch(colors, at, 0);
   vec3 p = (cameraFromWorld * vec4(center.xyz, 1.0)).xyz;
@@ -61,8 +64,7 @@ void main() {
 }`;
 
 const WHOLE = `#version 300 es
-in vec2 corner;
-void main() { gl_Position = vec4(corner, 0.0, 1.0); }`;
+void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
 // Straight alpha over the background, on sRGB values, as in the images of the rig.
 const COMPOSE = `#version 300 es
@@ -91,8 +93,6 @@ function program(gl, vertex, fragment) {
     }
     gl.attachShader(made, shader);
   }
-  gl.bindAttribLocation(made, 0, "corner");
-  gl.bindAttribLocation(made, 1, "index");
   gl.linkProgram(made);
   if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) throw new Error(gl.getProgramInfoLog(made));
   const places = new Map();
@@ -113,46 +113,51 @@ export class Drawing {
       ? gl.RGBA16F : gl.SRGB8_ALPHA8;
     this.splats = program(gl, PROJECT, BLEND);
     this.compose = program(gl, WHOLE, COMPOSE);
-    this.corners = gl.createBuffer();
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.corners);
-    gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
-    this.indices = gl.createBuffer();
+    // No attributes: vertices are numbered. Instances of four vertices would be slow on some drivers, most of all on software.
     this.vertices = gl.createVertexArray();
-    gl.bindVertexArray(this.vertices);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribPointer(0, 2, gl.FLOAT, false, 0, 0);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
-    gl.enableVertexAttribArray(1);
-    gl.vertexAttribIPointer(1, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(1, 1);
-    gl.bindVertexArray(null);
+    this.indices = gl.createBuffer();
+    this.capacity = 0; // Gaussians that the indices are for
+    this.order = { texture: gl.createTexture(), rows: 0 };
     this.centers = { texture: gl.createTexture(), rows: 0 };
     this.colors = { texture: gl.createTexture(), rows: 0 };
+    this.four = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
+    this.one = [gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, 1];
     this.light = gl.createTexture();
     this.frame = gl.createFramebuffer();
     this.size = [0, 0];
   }
 
-  /** Uploads four floats for each of `count` Gaussians, the end of the last row as zeros. */
-  upload(data, floats, count) {
+  /** Uploads the texels of `count` Gaussians, TEXELS in a row. `kind`: internal format, format, type and numbers of a texel. */
+  upload(data, numbers, count, [internal, format, type, each]) {
     const gl = this.gl;
     const rows = Math.max(1, Math.ceil(count / TEXELS));
     gl.bindTexture(gl.TEXTURE_2D, data.texture);
-    if (data.rows !== rows) {
-      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, TEXELS, rows, 0, gl.RGBA, gl.FLOAT, null);
+    if (data.rows < rows) {
+      gl.texImage2D(gl.TEXTURE_2D, 0, internal, TEXELS, rows, 0, format, type, null);
       for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
       data.rows = rows;
     }
-    const whole = Math.floor(count / TEXELS);
-    if (whole > 0) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXELS, whole, gl.RGBA, gl.FLOAT, floats);
-    const rest = count - whole * TEXELS;
+    const whole = Math.floor(count / TEXELS), rest = count % TEXELS;
+    if (whole > 0) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, TEXELS, whole, format, type, numbers);
     if (rest > 0) {
-      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, whole, rest, 1, gl.RGBA, gl.FLOAT, floats.subarray(4 * whole * TEXELS));
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, whole, rest, 1, format, type, numbers.subarray(each * whole * TEXELS));
     }
   }
 
-  setCenters(floats, count) { this.upload(this.centers, floats, count); }
-  setColors(floats, count) { this.upload(this.colors, floats, count); }
+  /** Six indices for each of so many Gaussians. */
+  reserve(count) {
+    if (count <= this.capacity) return;
+    const gl = this.gl;
+    const made = new Uint32Array(6 * count);
+    for (let i = 0; i < count; i++) made.set([4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 2, 4 * i + 1, 4 * i + 3], 6 * i);
+    gl.bindVertexArray(this.vertices);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.indices);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, made, gl.STATIC_DRAW);
+    this.capacity = count;
+  }
+
+  setCenters(floats, count) { this.upload(this.centers, floats, count, this.four); this.reserve(count); }
+  setColors(floats, count) { this.upload(this.colors, floats, count, this.four); }
 
   /** Draws the Gaussians of `order`, farthest first, with a camera of 19 numbers (page/src/page.rs). */
   draw(order, camera, background) {
@@ -173,8 +178,8 @@ export class Drawing {
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.bindVertexArray(this.vertices);
     if (order.length > 0 && this.centers.rows > 0 && this.colors.rows > 0) {
-      gl.bindBuffer(gl.ARRAY_BUFFER, this.indices);
-      gl.bufferData(gl.ARRAY_BUFFER, order, gl.STREAM_DRAW);
+      gl.activeTexture(gl.TEXTURE2);
+      this.upload(this.order, order, order.length, this.one);
       gl.useProgram(this.splats.made);
       gl.activeTexture(gl.TEXTURE1);
       gl.bindTexture(gl.TEXTURE_2D, this.colors.texture);
@@ -182,12 +187,13 @@ export class Drawing {
       gl.bindTexture(gl.TEXTURE_2D, this.centers.texture);
       gl.uniform1i(this.splats.place("centers"), 0);
       gl.uniform1i(this.splats.place("colors"), 1);
+      gl.uniform1i(this.splats.place("order"), 2);
       gl.uniformMatrix4fv(this.splats.place("cameraFromWorld"), false, camera.subarray(0, 16));
       gl.uniform3fv(this.splats.place("lens"), camera.subarray(16, 19));
       gl.uniform2f(this.splats.place("size"), width, height);
       gl.enable(gl.BLEND);
       gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, order.length);
+      gl.drawElements(gl.TRIANGLES, 6 * Math.min(order.length, this.capacity), gl.UNSIGNED_INT, 0);
       gl.disable(gl.BLEND);
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -196,7 +202,7 @@ export class Drawing {
     gl.bindTexture(gl.TEXTURE_2D, this.light);
     gl.uniform1i(this.compose.place("light"), 0);
     gl.uniform3fv(this.compose.place("background"), background);
-    gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindVertexArray(null);
   }
 }

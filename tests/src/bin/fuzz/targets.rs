@@ -6,6 +6,7 @@ use std::{cell::RefCell, fs, path::Path, time::Duration};
 use flyrig_body::{load_gltf, parse_bvh};
 use flyrig_calib::load_easymocap;
 use flyrig_capture::{CameraSource as _, FolderOptions, FolderReplay, McapReplay, recorded_notes, to_rgb8};
+use flyrig_page::{MessageKind, Page};
 use flyrig_transport::{
     CameraStatus, FRAME_HEADER_BYTES, FrameHeader, HEADER_BYTES, Header, RigStats, SplatState, ViewFrame,
     decode_calibration, decode_transforms,
@@ -19,7 +20,7 @@ pub struct Target {
     pub run: fn(&[u8]) -> Result<String, String>,
 }
 
-pub const TARGETS: [Target; 10] = [
+pub const TARGETS: [Target; 11] = [
     Target { name: "pixels", words: &[], run: pixels },
     Target { name: "jpeg", words: &["\u{fffd}\u{fffd}", "JFIF", "Exif", "Adobe"], run: jpeg },
     Target { name: "image", words: &["IHDR", "IDAT", "IEND", "PLTE", "tRNS"], run: picture },
@@ -29,6 +30,7 @@ pub const TARGETS: [Target; 10] = [
     Target { name: "wire", words: &["schema_version", "FLYR", "null", "{", "[", "1e999"], run: wire },
     Target { name: "network-frame", words: &["FLYR"], run: network_frame },
     Target { name: "splats", words: &[], run: splats },
+    Target { name: "stream", words: &["FLT", "FLM", "FLC", "cameras", "world_up", "1e999"], run: stream },
     Target {
         name: "motion",
         words: &["JOINT", "OFFSET", "CHANNELS", "End Site", "MOTION", "Frames:", "{", "}"],
@@ -225,6 +227,23 @@ fn splats(input: &[u8]) -> Result<String, String> {
     let state = SplatState::decode(input).map_err(|error| error.to_string())?;
     assert!(state.center_scale.iter().flatten().all(|value| value.is_finite()), "a number that is none came through");
     Ok("splats".into())
+}
+
+/// A message as a browser gets it, its kind first, for a person who is there already.
+fn stream(input: &[u8]) -> Result<String, String> {
+    const TEMPLATE: &[u8] = include_bytes!("../../../corpus/stream/template");
+    const RIG: &[u8] = include_bytes!("../../../corpus/stream/rig");
+    let (kind, bytes) = input.split_first().ok_or("short")?;
+    let mut page = Page::default();
+    for known in [RIG, TEMPLATE] {
+        let kind = MessageKind::of(known[0].into()).ok_or("no kind")?;
+        page.take(kind, 0, &known[1..], 0.0).map_err(|error| error.to_string())?;
+    }
+    let kind = MessageKind::of(u32::from(kind % 4)).ok_or("no kind")?;
+    let taken = page.take(kind, 0, bytes, 0.1).map_err(|error| error.to_string());
+    page.pose(0.1, true);
+    let shown = page.order(64, 64).len();
+    taken.map(|()| format!("{kind:?} {}", if shown > 0 { "shown" } else { "hidden" }))
 }
 
 /// BVH text, or a binary glTF file.
