@@ -64,6 +64,12 @@ pub trait CameraSource: Send {
         frame.capture_nanos
     }
 
+    /// Earliest [`Self::order_nanos`] that the next frame can have, nanoseconds, where the source knows it after an error: the others
+    /// then go on without it.
+    fn next_nanos(&self) -> Option<i64> {
+        None
+    }
+
     /// Counts beyond frames and errors.
     fn health(&self) -> SourceHealth {
         SourceHealth::default()
@@ -81,6 +87,10 @@ impl<S: CameraSource + ?Sized> CameraSource for Box<S> {
 
     fn order_nanos(&self, frame: &Frame) -> i64 {
         (**self).order_nanos(frame)
+    }
+
+    fn next_nanos(&self) -> Option<i64> {
+        (**self).next_nanos()
     }
 
     fn health(&self) -> SourceHealth {

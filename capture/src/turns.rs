@@ -30,7 +30,8 @@ impl Turns {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits until the frame at `nanos` is the earliest of all, the lower slot first among equals.
+    /// Waits until the frame at `nanos`, or the time until which the thread has none, is the earliest of all, the lower slot first
+    /// among equals.
     /// `false` when closed meanwhile.
     pub fn wait(&self, slot: usize, nanos: i64) -> bool {
         let mut state = self.lock();

@@ -155,6 +155,9 @@ pub struct SyncCheckArgs {
     /// Seconds that are compared.
     #[arg(long, default_value_t = 20.0, value_parser = parse_seconds)]
     pub seconds: f64,
+    /// Seconds of the take that are skipped before: an early and a late part show whether clocks drift.
+    #[arg(long, default_value_t = 0.0, value_parser = parse_from_seconds)]
+    pub from_secs: f64,
     /// Largest time offset that is searched for, milliseconds.
     #[arg(long, default_value_t = 250.0, value_parser = parse_most_ms)]
     pub most_ms: f64,

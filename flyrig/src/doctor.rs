@@ -6,7 +6,7 @@ use anyhow::Result;
 use flyrig_capture::NokhwaDevice;
 use flyrig_gpu::adapter_names;
 
-use crate::config::Config;
+use crate::config::{Config, SourceKind};
 
 const NO_CAMERA: &str = "no camera: plug one in, or simulate a rig with source.kind = \"sim\"";
 
@@ -15,6 +15,10 @@ pub fn doctor(config: Option<&Path>) -> Result<()> {
     let config = config.map(Config::load_for_capture).transpose()?;
     let mut mends = Vec::new();
     print!("{}", cameras(config.as_ref(), &mut mends));
+    if config.as_ref().is_some_and(|config| config.source.kind != SourceKind::Cameras) {
+        // A rig that needs no camera of this computer.
+        mends.retain(|mend| mend != NO_CAMERA);
+    }
     println!("graphics adapters");
     let adapters = adapter_names();
     for name in &adapters {

@@ -209,7 +209,15 @@ pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> R
         let error = camera.last_error.as_ref().map_or_else(String::new, |error| format!("; last error: {error}"));
         eprintln!("record: camera {}: {} frames, {lost} lost before us{error}", camera.camera, camera.frames);
     }
-    println!("record: {}", summary(&recorder.finish(), &args.out)?);
+    let recorded = recorder.finish();
+    if recorded.frames == 0 && recorded.problem.is_none() {
+        // Else the next attempt would be refused for its file.
+        fs::remove_file(&recorded.file).with_context(|| format!("cannot remove {}", recorded.file.display()))?;
+        let last = stats.iter().find_map(|camera| camera.last_error.as_ref());
+        let why = last.map_or_else(|| "no camera delivered anything".to_owned(), ToString::to_string);
+        bail!("no frame was recorded, so {} was not kept: {why}", recorded.file.display());
+    }
+    println!("record: {}", summary(&recorded, &args.out)?);
     ensure!(!has_ended || !config.source.kind.is_live(), ended_by_itself(&stats));
     Ok(())
 }

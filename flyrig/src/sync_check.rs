@@ -54,7 +54,11 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     print(&estimates, &frames);
     println!("{told}");
     if estimates.iter().any(|estimate| estimate.lag_nanos.is_none()) {
-        println!("?: {mend}");
+        println!(
+            "?: {mend}. Or the offset is larger than --most-ms {}, or the clocks drift: compare --seconds 5 of an early and a late part \
+             (--from-secs)",
+            args.most_ms
+        );
     } else {
         println!("offset ms is each camera's time offset from the first camera: {advice}");
     }
@@ -77,12 +81,20 @@ fn by_motion(
         let frame = match threads.queue().pop(Duration::from_millis(200)) {
             Ok(frame) => frame,
             Err(PopError::Closed) => break,
-            Err(PopError::Timeout) if is_live && started.elapsed().as_secs_f64() > args.seconds + 5.0 => break,
+            Err(PopError::Timeout)
+                if is_live && started.elapsed().as_secs_f64() > args.from_secs + args.seconds + 5.0 =>
+            {
+                break;
+            }
             Err(PopError::Timeout) => continue,
         };
         let from = *first.get_or_insert(frame.capture_nanos);
-        if frame.capture_nanos.saturating_sub(from) as f64 * 1e-9 > args.seconds {
+        let at = frame.capture_nanos.saturating_sub(from) as f64 * 1e-9;
+        if at > args.from_secs + args.seconds {
             break;
+        }
+        if at < args.from_secs {
+            continue;
         }
         let image = &frame.image;
         if let Some(slot) = cameras.iter().position(|camera| *camera == frame.camera)
@@ -130,7 +142,7 @@ fn by_silhouettes(
         rig,
         take.sync,
         spread_nanos,
-        [0.0, args.seconds],
+        [args.from_secs, args.from_secs + args.seconds],
         "silhouettes, ms of the take",
         |set| {
             set.present().for_each(|(slot, _)| pictures[slot] += 1);
@@ -229,7 +241,7 @@ mod tests {
     }
 
     fn args() -> SyncCheckArgs {
-        SyncCheckArgs { input: Vec::new(), seconds: 20.0, most_ms: 250.0, fps: 30.0, calibration: None }
+        SyncCheckArgs { input: Vec::new(), seconds: 20.0, from_secs: 0.0, most_ms: 250.0, fps: 30.0, calibration: None }
     }
 
     #[test]

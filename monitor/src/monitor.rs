@@ -1,7 +1,7 @@
 //! The health of a running command: once a second to the metrics page, the terminal's table and the service manager.
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, BTreeSet},
     sync::mpsc::{RecvTimeoutError, sync_channel},
     thread::Builder,
     time::{Duration, Instant},
@@ -27,6 +27,8 @@ pub struct Monitor {
     watchdog: Watchdog,
     /// Restarts of threads, and whether they are stuck, as logged last.
     logged: BTreeMap<String, (u64, bool)>,
+    /// Cameras that were reported as silent.
+    silent: BTreeSet<CameraId>,
     status: String,
 }
 
@@ -42,8 +44,8 @@ impl Monitor {
             let health = Health { resident_mib: resident_mib(), ..Health::default() };
             metrics.publish(metrics_text::prometheus(&health, None));
         }
-        let (looked, watchdog, logged) = Default::default();
-        Ok(Self { metrics, show_table, looked, watchdog, logged, status: String::new() })
+        let (looked, watchdog, logged, silent) = Default::default();
+        Ok(Self { metrics, show_table, looked, watchdog, logged, silent, status: String::new() })
     }
 
     /// Reports that the service is up: the watchdog is in force from here on.
@@ -90,6 +92,16 @@ impl Monitor {
     }
 
     fn log(&mut self, health: &Health) {
+        for camera in &health.cameras {
+            let name = &camera.stats.camera;
+            match table::silence_s(camera) {
+                Some(seconds) if self.silent.insert(name.clone()) => tracing::warn!(
+                    "camera {name}: no frame for {seconds:.0} s, and no error either; look at its trigger, its cable and its bus"
+                ),
+                None if self.silent.remove(name) => tracing::info!("camera {name}: frames come again"),
+                _ => {}
+            }
+        }
         for (thread, restarts) in table::thread_restarts(health) {
             let logged = self.logged.entry(thread.clone()).or_default();
             if restarts > logged.0 {

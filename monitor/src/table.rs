@@ -24,6 +24,15 @@ pub fn thread_restarts(health: &Health) -> Vec<(String, u64)> {
     health.cameras.iter().flat_map(of).chain(others).collect()
 }
 
+/// Silence of a camera from which it is reported, seconds.
+const SILENT_FROM_S: f64 = 5.0;
+
+/// Returns for how long an open camera gave no frame, seconds; `None` while that is not worth a word.
+pub fn silence_s(camera: &CameraHealth) -> Option<f64> {
+    let is_open = camera.stats.running && camera.stats.opened;
+    camera.quiet_s.filter(|quiet| is_open && *quiet >= SILENT_FROM_S.max(5e-3 * camera.interval_ms))
+}
+
 /// Says how much of the work is done to keep to a budget.
 pub fn effort(budget: BudgetStats) -> String {
     format!("effort {} of {}", budget.levels.saturating_sub(budget.level), budget.levels)
@@ -42,8 +51,12 @@ pub fn table(health: &Health, recorded: Option<&Recorded>) -> String {
             (_, false, _) => "ended".to_owned(),
             (Some(error), true, false) => format!("not there: {}", error.message),
             (None, true, false) => "is being opened".to_owned(),
+            (Some(error), true, true) if stats.frames == 0 => format!("no frame yet: {}", error.message),
             (_, true, true) => stats.health.mode.to_string(),
         };
+        if let Some(seconds) = silence_s(camera) {
+            let _ = write!(mode, "  silent for {seconds:.0} s");
+        }
         if let WatchState::Moved(motion) = camera.watch {
             let _ = write!(mode, "  moved: {:.1} px", motion.pixels);
         }
@@ -170,6 +183,14 @@ pub mod tests {
         ] {
             assert!(text.contains(part), "{part} in\n{text}");
         }
+        assert!(!text.contains("silent"));
+        health.cameras[0].quiet_s = Some(12.0);
+        assert!(table(&health, None).contains("  silent for 12 s"));
+        // A slow camera is silent later, one that is gone says so itself.
+        health.cameras[0].interval_ms = 5000.0;
+        assert!(!table(&health, None).contains("silent"));
+        (health.cameras[0].interval_ms, health.cameras[0].stats.opened) = (33.3, false);
+        assert!(!table(&health, None).contains("silent"));
     }
 
     #[test]

@@ -27,14 +27,19 @@ pub struct SimSource {
     order_nanos: Option<i64>,
     disconnected: bool,
     frames: Option<u64>,
+    /// Frames a second.
+    fps: f64,
 }
+
+/// Frames lost in a row after which a call returns: nobody waits for ever.
+const MOST_DROPPED: u32 = 64;
 
 /// A source for every camera of the rig, in rig order. In [`SimTime::Real`] each needs a thread of its own, since all
 /// wait for each other.
 #[must_use]
 pub fn sources(simulator: &Arc<Mutex<Simulator>>, time: SimTime) -> Vec<SimSource> {
     let guard = simulator.lock().unwrap_or_else(PoisonError::into_inner);
-    let frames = guard.config().frames;
+    let (frames, fps) = (guard.config().frames, guard.config().fps);
     let clock = match time {
         SimTime::Exact => None,
         SimTime::Real => Some(Arc::new(RealClock::new(guard.rig().cameras.len(), guard.config().fps))),
@@ -52,6 +57,7 @@ pub fn sources(simulator: &Arc<Mutex<Simulator>>, time: SimTime) -> Vec<SimSourc
             order_nanos: None,
             disconnected: false,
             frames,
+            fps,
         })
         .collect()
 }
@@ -90,10 +96,15 @@ impl CameraSource for SimSource {
     fn order_nanos(&self, frame: &Frame) -> i64 {
         self.order_nanos.unwrap_or(frame.capture_nanos)
     }
+
+    fn next_nanos(&self) -> Option<i64> {
+        Some((self.next_index as f64 * 1e9 / self.fps) as i64)
+    }
 }
 
 impl SimSource {
     fn next_delivery(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
+        let mut dropped = 0;
         loop {
             if let Some(clock) = &self.clock {
                 self.next_index = clock.next(self.slot, timeout).ok_or_else(|| {
@@ -120,7 +131,12 @@ impl SimSource {
                     self.order_nanos = Some(simulator.frame_nanos(index));
                     return self.taken(&mut simulator, index, plan);
                 }
-                Delivery::Dropped => {}
+                Delivery::Dropped => {
+                    dropped += 1;
+                    if dropped >= MOST_DROPPED {
+                        return fault(CaptureErrorKind::Timeout, "all frames are dropped by the fault script");
+                    }
+                }
                 Delivery::Stalled => return fault(CaptureErrorKind::Timeout, "stalled by the fault script"),
                 Delivery::Disconnected => {
                     self.disconnected = true;

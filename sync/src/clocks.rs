@@ -245,7 +245,11 @@ impl ClockAligner {
                 if clock.suspects.len() >= CONFIRMATIONS {
                     clock.state.steps += 1;
                     clock.step(off);
-                    tracing::warn!(camera = %id, "the clock stepped by {:.3} s, which is taken off", -(off as f64) * 1e-9);
+                    // The 1st, 2nd, 4th ...: a clock that steps all night must not fill the disk.
+                    if clock.state.steps.is_power_of_two() {
+                        let (ms, count) = (-(off as f64) * 1e-6, clock.state.steps);
+                        tracing::warn!(camera = %id, count, "the clock stepped by {ms:.1} ms, which is taken off");
+                    }
                 }
                 time = told;
             }

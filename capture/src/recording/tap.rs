@@ -73,6 +73,10 @@ impl<S: CameraSource> CameraSource for Recording<S> {
         self.source.order_nanos(frame)
     }
 
+    fn next_nanos(&self) -> Option<i64> {
+        self.source.next_nanos()
+    }
+
     fn health(&self) -> SourceHealth {
         self.source.health()
     }

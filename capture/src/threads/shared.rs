@@ -238,6 +238,14 @@ impl Shared {
             if !kind.is_recoverable() {
                 return End::Failed;
             }
+            if let (Pacing::Lossless, Some(nanos)) = (self.pacing, source.next_nanos()) {
+                // The others go on without it, and it does not run ahead of them.
+                pulse.rest();
+                if !self.turns.wait(slot, nanos) {
+                    return End::Over;
+                }
+                continue;
+            }
             failures += 1;
             // What is read without loss does not come back with the wall clock's time.
             let returns = self.pacing != Pacing::Lossless;

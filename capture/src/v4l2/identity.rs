@@ -185,10 +185,11 @@ pub(crate) fn find(
         ([(node, _)], _) => Ok((*node).clone()),
         ([], Some(error)) => Err(error),
         ([], None) => {
-            let there = if others.is_empty() { "no other camera".to_owned() } else { others.join("; ") };
-            let text = format!(
-                "there is no camera with {identity}; plug it in or correct the configuration. There is: {there}"
-            );
+            let there = match others.as_slice() {
+                [] => "No other camera is plugged in".to_owned(),
+                others => format!("There is: {}", others.join("; ")),
+            };
+            let text = format!("there is no camera with {identity}; plug it in or correct the configuration. {there}");
             Err(CaptureError::general(CaptureErrorKind::NotFound, text))
         }
         (several, _) => {
@@ -317,7 +318,7 @@ pub(crate) mod tests {
         }
         assert!(!error.message.contains("video1)"), "metadata nodes are no cameras: {error}");
         let none = found(&CameraIdentity::Bus("x".into()), &[]).unwrap_err();
-        assert!(none.message.ends_with("There is: no other camera"), "{none}");
+        assert!(none.message.ends_with("No other camera is plugged in"), "{none}");
     }
 
     #[test]
