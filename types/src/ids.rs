@@ -37,7 +37,8 @@ impl From<CameraId> for String {
 
 impl fmt::Display for CameraId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.0)
+        // Pads, so that tables have columns.
+        f.pad(&self.0)
     }
 }
 
