@@ -99,6 +99,7 @@ fn run(args: &BenchBudgetArgs, gpu: &GpuContext, name: String, budget: BudgetSet
         frames: args.frames.clone(),
         lags_nanos: Default::default(),
         true_masks: false,
+        true_joints: Vec::new(),
     };
     let mut replay = Replay::open(&settings, gpu)?;
     let (mut sheet, mut millis, mut levels) = (ScoreSheet::default(), Vec::new(), Vec::new());

@@ -305,6 +305,10 @@ pub struct BenchPerceptionArgs {
     /// Only these rows: letters of pose, shape and masks, g for given and e for estimated, comma separated.
     #[arg(long, value_delimiter = ',')]
     pub only: Vec<String>,
+    /// Parts of the names of joints whose orientation is the true one, or "place" for the true position, comma separated: what a part
+    /// of the pose costs. For the rows with an estimated pose and the given shape.
+    #[arg(long, value_delimiter = ',')]
+    pub true_joints: Vec<String>,
     /// Leaves out the deformation and the views: poses, shapes and masks alone, in a fraction of the time.
     #[arg(long)]
     pub no_views: bool,

@@ -123,6 +123,7 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         frames: args.frames.clone(),
         lags_nanos: BTreeMap::new(),
         true_masks: true,
+        true_joints: args.true_joints.clone(),
     };
     let mut replay = Replay::open(&settings, gpu)?;
     let holdout = replay.holdout.clone();

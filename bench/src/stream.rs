@@ -120,6 +120,7 @@ fn run(args: &BenchStreamArgs, gpu: &GpuContext, dataset: &Path) -> Result<Vec<R
         frames: args.frames.clone(),
         lags_nanos: Default::default(),
         true_masks: false,
+        true_joints: Vec::new(),
     };
     let mut replay = Replay::open(&settings, gpu)?;
     let holdout = replay.holdout.clone();

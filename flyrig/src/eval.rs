@@ -66,6 +66,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         frames: args.frames.clone(),
         lags_nanos: args.lags.nanos(),
         true_masks: false,
+        true_joints: Vec::new(),
     };
     let mut replay = Replay::open(&settings, gpu)?;
     let holdout = replay.holdout.clone();

@@ -11,6 +11,7 @@ pub mod program;
 mod progress;
 mod replay;
 pub mod stop;
+mod true_joints;
 
 pub use contact::contact_images;
 pub use html::{ContactRow, Curve, Report, write_whole};

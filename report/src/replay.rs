@@ -17,7 +17,7 @@ use flyrig_gpu::GpuContext;
 use flyrig_sync::SyncSettings;
 use flyrig_types::{Camera, CameraId, Frame, FrameSet, Rig};
 
-use crate::dataset;
+use crate::{dataset, true_joints::TrueJoints};
 
 /// Settings of a replayed data set.
 #[derive(Debug, Clone)]
@@ -38,6 +38,9 @@ pub struct ReplaySettings {
     pub lags_nanos: BTreeMap<CameraId, i64>,
     /// Whether frames carry their true masks even where masks are estimated, for scores.
     pub true_masks: bool,
+    /// Parts of the names of joints whose estimated orientation is replaced by the true one; "place" for the root's position. Needs an
+    /// estimated pose and the given shape.
+    pub true_joints: Vec<String>,
 }
 
 /// A data set that is replayed into a session.
@@ -77,8 +80,12 @@ impl Replay {
             }
             Origin::Estimated => {
                 if perceived.shape() == Origin::Given {
-                    let template = given_person(&settings.dataset)?.template;
-                    builder.perception(EstimatedPerception::new(&rig, &template, perceived, &plates)?)
+                    let GivenPerson { template, track, .. } = given_person(&settings.dataset)?;
+                    let inner = EstimatedPerception::new(&rig, &template, perceived, &plates)?;
+                    match settings.true_joints.as_slice() {
+                        [] => builder.perception(inner),
+                        names => builder.perception(TrueJoints { inner, template, track, names: names.to_vec() }),
+                    }
                 } else {
                     let template = default_template(&ShapeParams::default())?;
                     let mut perception = EstimatedPerception::new(&rig, &template, perceived, &plates)?;

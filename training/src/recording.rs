@@ -61,6 +61,7 @@ fn leave_out(
         frames: None,
         lags_nanos: BTreeMap::new(),
         true_masks: false,
+        true_joints: Vec::new(),
     };
     let appearance = settings.session.appearance.mode.settings();
     let mut replay = Replay::open(&settings, gpu)?;
