@@ -99,7 +99,7 @@ fn following_moves_the_viewpoint_with_the_person() {
     let (mut page, encoded) = (page(), template(1.0));
     page.take(MessageKind::Template, 0, &encoded.bytes, 0.0).unwrap();
     page.set_follows(true);
-    let mut place = |page: &mut Page, frame: u64, x: f32| {
+    let place = |page: &mut Page, frame: u64, x: f32| {
         page.take(MessageKind::Motion, 0, &motion(&encoded, frame, x), 0.1 * frame as f64).unwrap();
         page.pose(0.1 * frame as f64, false);
         page.order(64, 64);

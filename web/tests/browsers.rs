@@ -67,7 +67,8 @@ impl TestRig {
             }
             publisher.close().unwrap();
         };
-        Self { endpoint, stop, thread: Some(std::thread::spawn(work)) }
+        let thread = std::thread::Builder::new().name("rig".to_owned()).spawn(work).unwrap();
+        Self { endpoint, stop, thread: Some(thread) }
     }
 }
 
@@ -245,9 +246,8 @@ fn strangers_are_refused_in_words() {
     let mut chatty = browser(address, "");
     chatty.send(Message::text("what")).unwrap();
     let reason = loop {
-        match chatty.read().unwrap() {
-            Message::Close(frame) => break frame.unwrap().reason.to_string(),
-            _ => {}
+        if let Message::Close(frame) = chatty.read().unwrap() {
+            break frame.unwrap().reason.to_string();
         }
     };
     assert!(reason.contains("nothing to say"), "{reason}");
