@@ -4,7 +4,7 @@
 //! is too slow for is left out, newest first. The page decodes and poses people with the code of the window (`page/`, as WebAssembly)
 //! and draws them with WebGL2.
 //!
-//! A WebSocket message is a kind ([`hub`]), three zero bytes, a person's number (u32, little endian) and the payload. The browser
+//! A WebSocket message is a kind (0 rig, 1 template, 2 motion, 3 colours, 4 state, 5 forget), three zero bytes, a person's number (u32, little endian) and the payload. The browser
 //! sends one text message, the token of its link.
 
 mod assets;
