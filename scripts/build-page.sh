@@ -6,14 +6,11 @@ cd "$(dirname "$0")/.."
 target="${CARGO_TARGET_DIR:-target}/page"
 # Paths of this computer do not belong into the file.
 flags="--remap-path-prefix=$HOME=home --remap-path-prefix=$PWD=flyrig"
-if rustc --print target-libdir --target wasm32-unknown-unknown 2>/dev/null | xargs test -d; then
-    echo "building with the toolchain's wasm32-unknown-unknown"
-    RUSTFLAGS="$flags" cargo build --locked --profile page --target wasm32-unknown-unknown -p flyrig-page --target-dir "$target"
-elif command -v rustup >/dev/null && rustup target add wasm32-unknown-unknown; then
-    RUSTFLAGS="$flags" cargo build --locked --profile page --target wasm32-unknown-unknown -p flyrig-page --target-dir "$target"
-else
+libraries="$(rustc --print target-libdir --target wasm32-unknown-unknown)"
+if ! test -d "$libraries" && ! rustup target add wasm32-unknown-unknown; then
     echo "the target wasm32-unknown-unknown is missing; run: rustup target add wasm32-unknown-unknown" >&2
     exit 1
 fi
+RUSTFLAGS="$flags" cargo build --locked --profile page --target wasm32-unknown-unknown -p flyrig-page --target-dir "$target"
 cp "$target/wasm32-unknown-unknown/page/flyrig_page.wasm" web/assets/page.wasm
 ls -l web/assets/page.wasm

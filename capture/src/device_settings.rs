@@ -21,7 +21,7 @@ pub enum DeviceOptions {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DeviceSettings {
-    /// What the rest of the rig calls it.
+    /// Name of the camera in calibration, logs and topics.
     pub name: String,
     /// Serial number, as [`CameraIdentity::Serial`].
     #[serde(default)]

@@ -140,7 +140,7 @@ impl ScoreSheet {
         &self.frames
     }
 
-    /// What the images were compared with.
+    /// Returns the name of the reference: true masks, or our own silhouettes.
     pub fn reference(&self) -> &'static str {
         if self.frames.iter().any(|score| score.iou.is_some()) { "mask" } else { "own silhouette" }
     }

@@ -63,7 +63,7 @@ pub struct Page {
     centers: Vec<[f32; 4]>,
     normals: Vec<[f32; 4]>,
     colors: Vec<[f32; 4]>,
-    /// What is shown: each person's number, frame and share of interpolation, and the number of its colour messages.
+    /// Number, hash of the motion and count of colour messages of each person in the lists below.
     shown: Vec<(u32, u64, u64)>,
     /// Whether somebody has a new template, or is forgotten.
     is_stale: bool,
@@ -119,7 +119,7 @@ impl Page {
         for number in numbers {
             let Some(person) = self.people.get(number) else { continue };
             if let Some(motion) = person.motion_at(now, interpolate) {
-                // The time that is shown tells interpolated motions apart.
+                // Interpolated motions share a frame number; the hash differs.
                 let key = (number, motion_key(&motion), person.color_changes());
                 motions.push((key, motion));
             }

@@ -26,7 +26,7 @@ pub(crate) struct ImageBuffers {
     pub pairs: StorageBuffer<u32>,
 }
 
-/// What an image of some size needs.
+/// Buffers for an image of one size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Layout {
     /// Columns and rows of tiles.

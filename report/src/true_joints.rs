@@ -1,4 +1,4 @@
-//! An estimated pose some of whose joints are the true ones: tells which part of a pose costs how much.
+//! Replaces some joints of an estimated pose by the true ones, to measure the cost of each part of a pose.
 
 use flyrig_body::Template;
 use flyrig_fusion::{

@@ -43,7 +43,7 @@ pub struct Exported {
 /// - `truth/surface/000000.ply`: the clothed surface with canonical positions and how far the cloth swings (`cloth_*`, metres),
 /// - `truth/CAM/000000.exr`: depth, normal, canonical position and part at each pixel, as the image shows them.
 ///
-/// A frame that the fault script loses has no image. `go_on` is told how many frames are done and ends the export by
+/// A frame that the fault script loses has no image. `go_on` gets the number of frames done, and ends the export by
 /// returning false. Everything is written beside the folder first: it appears whole or not at all.
 ///
 /// # Errors

@@ -16,7 +16,7 @@ pub enum WebError {
     Listen {
         /// The address.
         address: SocketAddr,
-        /// What the system says.
+        /// Error of the operating system.
         problem: std::io::Error,
     },
     /// The system gives no thread, or no random numbers.

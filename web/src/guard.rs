@@ -10,7 +10,7 @@ use hyper::{
 /// Bytes of a token.
 const TOKEN_BYTES: usize = 16;
 
-/// What a link contains after `#`.
+/// Secret of the page's link, after `#`.
 #[derive(Debug, Clone)]
 pub(crate) struct Token(Option<String>);
 

@@ -1,4 +1,4 @@
-//! What all browsers get, and what waits for each of them.
+//! Fan-out of messages to browsers: the newest of each kind, and a bounded queue for each browser.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -55,7 +55,7 @@ struct Inner {
     next: u64,
 }
 
-/// What waits for one browser.
+/// Messages that one browser has not been sent yet.
 #[derive(Debug, Default)]
 struct Browser {
     wake: Arc<Notify>,

@@ -90,7 +90,7 @@ pub struct WebServer {
     thread: Option<JoinHandle<()>>,
 }
 
-/// What all connections share.
+/// State shared by all connections.
 struct Shared {
     hub: Arc<Hub>,
     token: Token,
@@ -130,7 +130,7 @@ impl WebServer {
                     _ = stopped => {}
                 }
             });
-            // What browsers are being sent goes with them.
+            // Messages under way are dropped with the tasks.
             runtime.shutdown_timeout(PAUSE);
         };
         let thread = Builder::new().name("web".to_owned()).spawn(work).map_err(|error| start(error.to_string()))?;

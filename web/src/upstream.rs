@@ -29,7 +29,7 @@ const LINGER: Duration = Duration::from_secs(5);
 #[derive(Debug, Serialize)]
 struct State<'a> {
     rig: &'a str,
-    /// What keeps people from being shown, in words.
+    /// Reason in words why nobody can be shown; `None` without one.
     trouble: Option<String>,
     sets_per_second: f64,
     /// Quality of tracking of each person, 0..=1.

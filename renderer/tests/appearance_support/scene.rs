@@ -35,7 +35,7 @@ pub struct View {
     pub camera: Camera,
     pub rgba: Vec<u8>,
     pub canonical: Vec<[f32; 4]>,
-    /// What the last frame's Gaussians are drawn like: paler than the image.
+    /// Colours of the last frame's Gaussians, paler than the image.
     pub drawn: Vec<[f32; 4]>,
 }
 
