@@ -178,8 +178,8 @@ impl Subscriber {
         self.received(label, raw, |_, _, bytes| Ok(PersonMessage { person, layer, bytes })).map(Some)
     }
 
-    /// Asks the rig for the bytes of the [`flyrig_stream::StreamTemplate`] that a motion's stamp names; `None` when nobody answers in time;
-    /// ask again then.
+    /// Asks the rig for the bytes of the [`flyrig_stream::StreamTemplate`] that a motion's stamp names. Returns `None` when nobody
+    /// answers within `timeout`, and at once while no publisher is known that answers for templates; ask again then.
     ///
     /// # Errors
     /// `Malformed` when the answer is not that template, `Session` when the question cannot be asked.

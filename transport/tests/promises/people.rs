@@ -45,7 +45,9 @@ fn a_person_arrives_with_its_template() {
     assert!(bytes.len() > 3 * 60_000, "{}", bytes.len());
     let hash = flyrig_stream::template_hash(&bytes);
     publisher.offer_template(0, hash, bytes.clone().into());
-    let fetched = subscriber.template(hash, Duration::from_secs(20)).unwrap().unwrap();
+    // The publisher may know of the subscriber before the subscriber knows who answers for templates: ask again, as
+    // the viewers do.
+    let fetched = wait_for("the template", || subscriber.template(hash, Duration::from_secs(20)).unwrap());
     assert!(fetched == bytes);
     assert_eq!(StreamTemplate::decode(&fetched).unwrap().gaussians(), 30_000);
     // Nobody has that one.
