@@ -3,13 +3,11 @@
 use std::{fmt::Write as _, time::Instant};
 
 use anyhow::{Context, Result};
-use flyrig_fusion::{
-    BodySettings, BudgetSettings, Effort, Origin, Outcome, PerceptionSettings, PersonId, SessionSettings,
-};
+use flyrig_fusion::{BudgetSettings, Effort, Origin, Outcome, PersonId};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
 use flyrig_report::{
-    Replay, ReplaySettings, frame_number,
+    Replay, frame_number,
     plot::{Line, Plot, Series},
     progress_bar, stop, write_whole,
 };
@@ -84,23 +82,7 @@ pub fn budget(args: &BenchBudgetArgs, gpu: &GpuContext) -> Result<()> {
 }
 
 fn run(args: &BenchBudgetArgs, gpu: &GpuContext, name: String, budget: BudgetSettings) -> Result<Row> {
-    let perception = PerceptionSettings { pose: args.pose, masks: args.pose, ..PerceptionSettings::default() };
-    let settings = ReplaySettings {
-        dataset: args.dataset.clone(),
-        inputs: args.inputs.clone(),
-        holdout: args.holdout.clone(),
-        session: SessionSettings {
-            perception,
-            body: BodySettings { gaussians: args.gaussians, ..BodySettings::default() },
-            budget,
-            ..SessionSettings::default()
-        },
-        fps: args.fps,
-        frames: args.frames.clone(),
-        lags_nanos: Default::default(),
-        true_masks: false,
-        true_joints: Vec::new(),
-    };
+    let settings = args.replay.settings(&args.dataset, args.pose, budget);
     let mut replay = Replay::open(&settings, gpu)?;
     let (mut sheet, mut millis, mut levels) = (ScoreSheet::default(), Vec::new(), Vec::new());
     let holdout = replay.holdout.clone();

@@ -1,11 +1,17 @@
 //! The command line of `flyrig-bench`.
 
-use std::{ops::Range, path::PathBuf};
+use std::{
+    ops::Range,
+    path::{Path, PathBuf},
+};
 
 use clap::{Args, Parser, Subcommand, builder::TypedValueParser as _};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
-use flyrig_fusion::{NetworksOn, Origin};
-use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size};
+use flyrig_fusion::{BodySettings, BudgetSettings, NetworksOn, Origin, PerceptionSettings, SessionSettings};
+use flyrig_report::{
+    ReplaySettings,
+    arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size},
+};
 
 /// Measure run time against error on simulated people.
 #[derive(Debug, Parser)]
@@ -87,34 +93,60 @@ pub struct BenchAppearanceArgs {
     pub gaussians: usize,
 }
 
+/// Frames and cameras of recorded data sets.
 #[derive(Debug, Args)]
-pub struct BenchBudgetArgs {
-    /// Data set in EasyMocap layout, as `flyrig eval` and `flyrig sim export` know it.
-    pub dataset: PathBuf,
+pub struct ReplayArgs {
     /// Input cameras, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "00,03,05")]
     pub inputs: Vec<String>,
     /// Cameras that the views are compared with, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "01,02,04,06")]
     pub holdout: Vec<String>,
+    /// Frames FIRST..END, END excluded; all of them otherwise.
+    #[arg(long, value_parser = parse_range)]
+    pub frames: Option<Range<u64>>,
+    /// Frames a second of the data sets.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
+}
+
+impl ReplayArgs {
+    /// Returns settings for one data set, with poses and masks from `origin`.
+    pub fn settings(&self, dataset: &Path, origin: Origin, budget: BudgetSettings) -> ReplaySettings {
+        let perception = PerceptionSettings { pose: origin, masks: origin, ..PerceptionSettings::default() };
+        let body = BodySettings { gaussians: self.gaussians, ..BodySettings::default() };
+        ReplaySettings {
+            dataset: dataset.to_owned(),
+            inputs: self.inputs.clone(),
+            holdout: self.holdout.clone(),
+            session: SessionSettings { perception, body, budget, ..SessionSettings::default() },
+            fps: self.fps,
+            frames: self.frames.clone(),
+            lags_nanos: Default::default(),
+            true_masks: false,
+            true_joints: Vec::new(),
+        }
+    }
+}
+
+#[derive(Debug, Args)]
+pub struct BenchBudgetArgs {
+    /// Data set in EasyMocap layout, as `flyrig eval` and `flyrig sim export` know it.
+    pub dataset: PathBuf,
+    #[command(flatten)]
+    pub replay: ReplayArgs,
     /// Where pose and masks come from.
     #[arg(long, value_enum, default_value = "estimated")]
     pub pose: Origin,
     /// Budgets, sets a second, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "1,2,3,4,5,6,8,10,15,30")]
     pub budgets: Vec<f64>,
-    /// Frames FIRST..END, END excluded; all of them otherwise.
-    #[arg(long, value_parser = parse_range)]
-    pub frames: Option<Range<u64>>,
-    /// Frames a second of the data set.
-    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
-    pub fps: f64,
     /// Folder of the results.
     #[arg(long, default_value = "out/bench-budget")]
     pub out: PathBuf,
-    /// Gaussians on the person's surface.
-    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
-    pub gaussians: usize,
 }
 
 #[derive(Debug, Args)]
@@ -122,30 +154,17 @@ pub struct BenchStreamArgs {
     /// Data sets in EasyMocap layout, as `flyrig eval` and `flyrig sim export` know them.
     #[arg(required = true)]
     pub datasets: Vec<PathBuf>,
-    /// Input cameras, comma separated.
-    #[arg(long, value_delimiter = ',', default_value = "00,03,05")]
-    pub inputs: Vec<String>,
-    /// Cameras that the views are compared in, comma separated.
-    #[arg(long, value_delimiter = ',', default_value = "01,02,04,06")]
-    pub holdout: Vec<String>,
+    #[command(flatten)]
+    pub replay: ReplayArgs,
     /// Where pose and masks come from.
     #[arg(long, value_enum, default_value = "given")]
     pub pose: Origin,
     /// Quantisation steps of the colours, codes of 255, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "4,8,12,16")]
     pub steps: Vec<f32>,
-    /// Frames FIRST..END, END excluded; all of them otherwise.
-    #[arg(long, value_parser = parse_range)]
-    pub frames: Option<Range<u64>>,
-    /// Frames a second of the data sets.
-    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
-    pub fps: f64,
     /// Folder of the results.
     #[arg(long, default_value = "out/bench-stream")]
     pub out: PathBuf,
-    /// Gaussians on the person's surface.
-    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
-    pub gaussians: usize,
 }
 
 #[derive(Debug, Args)]

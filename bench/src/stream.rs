@@ -4,14 +4,11 @@ use std::{fmt::Write as _, io::Write as _, path::Path, sync::Arc, time::Instant}
 
 use anyhow::{Context, Result, ensure};
 use flate2::{Compression, write::DeflateEncoder};
-use flyrig_fusion::{
-    BodySettings, Outcome, PerceptionSettings, PersonEncoder, PersonFrame, PersonId, PersonMessages, Session,
-    SessionSettings,
-};
+use flyrig_fusion::{BudgetSettings, Outcome, PersonEncoder, PersonFrame, PersonId, PersonMessages, Session};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{Picture, ScoreSheet, person_box, psnr, score_view};
 use flyrig_report::{
-    Replay, ReplaySettings, frame_number,
+    Replay, frame_number,
     plot::{Line, Plot, Series},
     progress_bar, stop, write_whole,
 };
@@ -106,22 +103,7 @@ pub fn stream(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<()> {
 }
 
 fn run(args: &BenchStreamArgs, gpu: &GpuContext, dataset: &Path) -> Result<Vec<Row>> {
-    let perception = PerceptionSettings { pose: args.pose, masks: args.pose, ..PerceptionSettings::default() };
-    let settings = ReplaySettings {
-        dataset: dataset.to_owned(),
-        inputs: args.inputs.clone(),
-        holdout: args.holdout.clone(),
-        session: SessionSettings {
-            perception,
-            body: BodySettings { gaussians: args.gaussians, ..BodySettings::default() },
-            ..SessionSettings::default()
-        },
-        fps: args.fps,
-        frames: args.frames.clone(),
-        lags_nanos: Default::default(),
-        true_masks: false,
-        true_joints: Vec::new(),
-    };
+    let settings = args.replay.settings(dataset, args.pose, BudgetSettings::default());
     let mut replay = Replay::open(&settings, gpu)?;
     let holdout = replay.holdout.clone();
     let forms = args

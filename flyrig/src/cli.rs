@@ -9,8 +9,7 @@ use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, Origin, Per
 use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size, parse_speed};
 use flyrig_training::TrainArgs;
 use flyrig_types::CameraId;
-
-use crate::config::WebSection;
+use flyrig_web::WebConfig;
 
 /// Live free-viewpoint video of a person from a few cameras.
 ///
@@ -579,7 +578,7 @@ pub struct ServeArgs {
     #[arg(long, default_value = "tcp/127.0.0.1:7447")]
     pub connect: String,
     #[command(flatten)]
-    pub web: WebSection,
+    pub web: WebConfig,
 }
 
 #[derive(Debug, Args)]

@@ -1,12 +1,8 @@
 //! The configuration file: one commented default, strict reading, errors that name line and key.
 
-use std::{
-    net::SocketAddr,
-    path::{Path, PathBuf},
-};
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, anyhow, bail, ensure};
-use clap::Args;
+use anyhow::{Context, Result, bail, ensure};
 use flyrig_capture::Rotation;
 use flyrig_fusion::{
     AppearanceOptions, BodySettings, BudgetSettings, Origin, OutputSettings, PerceptionSettings, SessionSettings,
@@ -15,6 +11,7 @@ use flyrig_fusion::{
 use flyrig_sim::SimConfig;
 use flyrig_sync::SyncSettings;
 use flyrig_transport::TransportConfig;
+use flyrig_web::WebConfig;
 use serde::{Deserialize, Serialize};
 
 use crate::cameras::CameraEntry;
@@ -43,7 +40,7 @@ pub struct Config {
     pub capture: CaptureSection,
     pub record: RecordSection,
     pub transport: TransportConfig,
-    pub web: WebSection,
+    pub web: WebConfig,
     pub health: HealthSection,
     pub gpu: GpuSection,
 }
@@ -199,37 +196,6 @@ impl Default for RecordSection {
     }
 }
 
-/// The web page for browsers.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Args)]
-#[serde(deny_unknown_fields, default)]
-pub struct WebSection {
-    /// Address of the page; port 0 takes a free one.
-    #[arg(long, default_value = "127.0.0.1:8080", value_parser = parse_address)]
-    pub listen: String,
-    /// Listen where other computers reach the page, without encryption; who watches needs the link with its token.
-    #[arg(long)]
-    pub insecure: bool,
-    /// Name by which browsers reach this computer, besides its addresses and localhost; may be repeated.
-    #[arg(long = "name", value_name = "NAME")]
-    pub names: Vec<String>,
-    /// Most browsers at a time.
-    #[arg(long, default_value_t = Self::default().max_browsers)]
-    pub max_browsers: usize,
-}
-
-impl Default for WebSection {
-    fn default() -> Self {
-        Self { listen: String::new(), insecure: false, names: Vec::new(), max_browsers: 32 }
-    }
-}
-
-fn parse_address(text: &str) -> Result<String, String> {
-    match text.parse::<SocketAddr>() {
-        Ok(_) => Ok(text.to_owned()),
-        Err(_) => Err(format!("'{text}' is no address and port, such as 127.0.0.1:8080")),
-    }
-}
-
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GpuSection {
@@ -310,10 +276,7 @@ impl Config {
         self.output.validate()?;
         range("capture.jpeg_quality", f64::from(self.capture.jpeg_quality), 0.0, 100.0)?;
         range("record.jpeg_quality", f64::from(self.record.jpeg_quality), 0.0, 100.0)?;
-        if !self.web.listen.is_empty() {
-            parse_address(&self.web.listen).map_err(|error| anyhow!("web.listen: {error}"))?;
-        }
-        range("web.max_browsers", self.web.max_browsers as f64, 1.0, 256.0)?;
+        self.web.validate()?;
         self.transport().validate().context("in [rig] or [transport]")
     }
 

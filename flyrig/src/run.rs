@@ -15,12 +15,13 @@ use flyrig_gpu::GpuContext;
 use flyrig_monitor::{Monitor, effort, ended_by_itself};
 use flyrig_report::{dataset, stop};
 use flyrig_transport::{Publisher, TransportConfig};
+use flyrig_web::WebServer;
 use foxglove::messages::Log;
 
 use crate::{
     config::{Config, WatchMode},
     pose_recording::PoseRecording,
-    recording, serve,
+    recording,
     source::{self, FoundBy, Source},
 };
 
@@ -110,7 +111,7 @@ fn capture_people(
         connect: publisher.endpoints().first().map(|at| loopback_of(at)).into_iter().collect(),
         ..TransportConfig::subscriber(&config.rig.name)
     };
-    let web = (!config.web.listen.is_empty()).then(|| serve::start(&config.web, own)).transpose()?;
+    let web = (!config.web.listen.is_empty()).then(|| WebServer::start(&config.web, own)).transpose()?;
     if let Some(web) = &web {
         eprintln!("run: people are shown at {}", web.link());
     }

@@ -7,7 +7,8 @@ use prost::bytes::Bytes;
 use zenoh::{Session, Wait, liveliness::LivelinessToken, sample::SampleKind};
 
 use crate::{
-    Header, RigStats, SplatState, TopicReport, TransportConfig, TransportError, ViewFrame, ViewpointStatus,
+    Header, RigStats, SplatState, TemplateFetcher, TopicReport, TransportConfig, TransportError, ViewFrame,
+    ViewpointStatus,
     config::LARGEST_QUESTION,
     inbox::{Inbox, Raw, as_malformed},
     keys::{self, VIEWER_PREFIX},
@@ -185,6 +186,14 @@ impl Subscriber {
     /// `Malformed` when the answer is not that template, `Session` when the question cannot be asked.
     pub fn template(&self, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
         people::ask_template(&self.session, &self.rig, hash, timeout)
+    }
+
+    /// Returns a fetcher of templates that works beside us.
+    ///
+    /// # Errors
+    /// `Session` when no thread can be started.
+    pub fn template_fetcher(&self) -> Result<TemplateFetcher, TransportError> {
+        TemplateFetcher::start(&self.session, &self.rig)
     }
 
     /// The newest statistics nobody has taken yet; `None` after the timeout.

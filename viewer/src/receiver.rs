@@ -10,7 +10,9 @@ use std::{
 };
 
 use flyrig_stream::StreamTemplate;
-use flyrig_transport::{Interests, PersonMessage, RigStats, Subscriber, TransportConfig, TransportError};
+use flyrig_transport::{
+    FetchedTemplate, Interests, PersonMessage, RigStats, Subscriber, TemplateFetcher, TransportConfig, TransportError,
+};
 use flyrig_types::{Rig, SupervisedThread, ThreadHealth};
 use flyrig_viewing::{People, Taken};
 
@@ -19,10 +21,6 @@ const PATIENCE: Duration = Duration::from_millis(50);
 
 /// How often statistics and calibration are looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
-/// How long a template is waited for; asked again later.
-const TEMPLATE_PATIENCE: Duration = Duration::from_secs(10);
-/// Pause after a template that did not come.
-const TEMPLATE_RETRY: Duration = Duration::from_millis(500);
 /// Rates are means over this time.
 const RATE_OVER: Duration = Duration::from_secs(2);
 
@@ -100,12 +98,13 @@ impl Receiver {
     pub fn start(config: &TransportConfig, arrived: impl Fn() + Send + 'static) -> Result<Self, TransportError> {
         let interests = Interests { people: true, stats: true, ..Interests::default() };
         let subscriber = Subscriber::open(config, &interests)?;
+        let mut templates = subscriber.template_fetcher()?;
         let (state, stop) = (Arc::new(Mutex::new(ReceiverState::default())), Arc::new(AtomicBool::new(false)));
         let (shared, ended) = (Arc::clone(&state), Arc::clone(&stop));
         let work = move || {
             // Begun anew after a panic: what it left behind may be anything.
             lock(&shared).people.clear();
-            let mut link = Link { subscriber: &subscriber, state: &shared, asked: None, looked: None };
+            let mut link = Link { subscriber: &subscriber, state: &shared, templates: &mut templates, looked: None };
             while !ended.load(Ordering::Relaxed) {
                 link.turn(&arrived);
             }
@@ -146,8 +145,7 @@ fn lock(state: &Mutex<ReceiverState>) -> MutexGuard<'_, ReceiverState> {
 struct Link<'a> {
     subscriber: &'a Subscriber,
     state: &'a Mutex<ReceiverState>,
-    /// Template that was asked for last without an answer.
-    asked: Option<(u64, Instant)>,
+    templates: &'a mut TemplateFetcher,
     /// When statistics and calibration were looked at last.
     looked: Option<Instant>,
 }
@@ -157,6 +155,11 @@ impl Link<'_> {
         if self.looked.is_none_or(|at| at.elapsed() >= LOOK_EVERY) {
             self.looked = Some(Instant::now());
             self.look();
+        }
+        match self.templates.next() {
+            Ok(Some(fetched)) => self.meet(&fetched),
+            Ok(None) => {}
+            Err(error) => lock(self.state).complain(error.to_string()),
         }
         match self.subscriber.next_person(PATIENCE) {
             Ok(Some(received)) => {
@@ -206,35 +209,24 @@ impl Link<'_> {
         let taken = lock(self.state).people.take(message.person, is_motion, &message.bytes, clock_secs());
         match taken {
             // Colours wait for the motion beside them, which is shown as soon as its template is there.
-            Ok(Taken::Needs(template)) if is_motion => self.meet(message.person, template),
+            Ok(Taken::Needs(template)) if is_motion => self.templates.ask(message.person, template),
             Ok(_) => {}
             Err(error) => lock(self.state).complain(format!("person {}: {error}", message.person)),
         }
     }
 
-    /// Fetches a template and makes its person.
-    fn meet(&mut self, person: u32, hash: u64) {
-        let refused = |(asked, at): (u64, Instant)| asked == hash && at.elapsed() < TEMPLATE_RETRY;
-        if self.asked.is_some_and(refused) {
-            return;
-        }
-        match self.subscriber.template(hash, TEMPLATE_PATIENCE) {
-            Ok(Some(bytes)) => {
-                let template = match StreamTemplate::decode(&bytes) {
-                    Ok(template) => template,
-                    Err(error) => return self.refuse(hash, error.to_string()),
-                };
-                lock(self.state).people.meet(person, Arc::new(template));
-                self.asked = None;
+    /// Makes the people of a template.
+    fn meet(&mut self, fetched: &FetchedTemplate) {
+        match StreamTemplate::decode(&fetched.bytes).map(Arc::new) {
+            Ok(template) => {
+                let mut state = lock(self.state);
+                fetched.people.iter().for_each(|person| state.people.meet(*person, Arc::clone(&template)));
             }
-            Ok(None) => self.asked = Some((hash, Instant::now())),
-            Err(error) => self.refuse(hash, error.to_string()),
+            Err(error) => {
+                self.templates.refuse(fetched.hash);
+                lock(self.state).complain(error.to_string());
+            }
         }
-    }
-
-    fn refuse(&mut self, hash: u64, problem: String) {
-        self.asked = Some((hash, Instant::now()));
-        lock(self.state).complain(problem);
     }
 }
 

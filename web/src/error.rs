@@ -5,6 +5,9 @@ use std::net::SocketAddr;
 /// Why no page is served.
 #[derive(Debug, thiserror::Error)]
 pub enum WebError {
+    /// A setting is not valid.
+    #[error("{0}")]
+    Config(String),
     /// The address is no loopback address.
     #[error(
         "web: {0} can be reached from other computers, and nothing is encrypted yet; listen on 127.0.0.1, forward the port (ssh -L \

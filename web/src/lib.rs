@@ -8,6 +8,7 @@
 //! sends one text message, the token of its link.
 
 mod assets;
+mod config;
 mod error;
 mod guard;
 mod hub;
@@ -15,5 +16,6 @@ mod server;
 mod socket;
 mod upstream;
 
+pub use config::WebConfig;
 pub use error::WebError;
-pub use server::{WebOptions, WebServer};
+pub use server::WebServer;

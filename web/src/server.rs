@@ -31,7 +31,7 @@ use tokio::{
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
 use crate::{
-    WebError,
+    WebConfig, WebError,
     assets::asset,
     guard::{Token, check_names},
     hub::Hub,
@@ -62,21 +62,6 @@ const HEADERS: [(&str, &str); 5] = [
     ("cache-control", "no-cache"),
 ];
 
-/// Settings of the page's server.
-#[derive(Debug, Clone)]
-pub struct WebOptions {
-    /// Address to listen on; port 0 takes a free one.
-    pub listen: SocketAddr,
-    /// Listen where other computers reach it, without encryption; who watches needs the link's token.
-    pub insecure: bool,
-    /// Names of this computer by which browsers may reach it, beside its addresses and `localhost`.
-    pub names: Vec<String>,
-    /// Most browsers at a time.
-    pub max_browsers: usize,
-    /// The rig.
-    pub transport: TransportConfig,
-}
-
 /// Serves the page until it is dropped.
 #[derive(Debug)]
 pub struct WebServer {
@@ -102,11 +87,13 @@ impl WebServer {
     /// Starts to listen. The rig may come later; it is subscribed to while browsers watch.
     ///
     /// # Errors
-    /// [`WebError`]: an address that others reach without `insecure`, or one that is taken.
-    pub fn start(options: &WebOptions) -> Result<Self, WebError> {
-        let is_loopback = options.listen.ip().is_loopback();
-        if !is_loopback && !options.insecure {
-            return Err(WebError::NotLoopback(options.listen));
+    /// [`WebError`]: settings that are not valid, an address that others reach without `insecure`, or one that is taken.
+    pub fn start(config: &WebConfig, transport: TransportConfig) -> Result<Self, WebError> {
+        config.validate()?;
+        let wanted = config.address()?;
+        let is_loopback = wanted.ip().is_loopback();
+        if !is_loopback && !config.insecure {
+            return Err(WebError::NotLoopback(wanted));
         }
         let start = |problem: String| WebError::Start(problem);
         let token =
@@ -115,12 +102,17 @@ impl WebServer {
         let runtime = runtime.map_err(|error| start(error.to_string()))?;
         let listener = {
             let _inside = runtime.enter();
-            listen(options.listen).map_err(|problem| WebError::Listen { address: options.listen, problem })?
+            listen(wanted).map_err(|problem| WebError::Listen { address: wanted, problem })?
         };
         let address = listener.local_addr().map_err(|error| start(error.to_string()))?;
+        if !is_loopback {
+            tracing::warn!(
+                "the web page at {address} is not encrypted: whoever can read this network can watch. Who watches needs the whole link"
+            );
+        }
         let hub = Arc::<Hub>::default();
-        let names = options.names.clone();
-        let most = options.max_browsers;
+        let names = config.names.clone();
+        let most = config.max_browsers;
         let shared = Arc::new(Shared { hub: Arc::clone(&hub), token: token.clone(), names, max_browsers: most });
         let (stop, stopped) = oneshot::channel::<()>();
         let work = move || {
@@ -135,8 +127,8 @@ impl WebServer {
         };
         let thread = Builder::new().name("web".to_owned()).spawn(work).map_err(|error| start(error.to_string()))?;
         let ended = Arc::new(AtomicBool::new(false));
-        let (config, fed, until) = (options.transport.clone(), Arc::clone(&hub), Arc::clone(&ended));
-        let upstream = SupervisedThread::start("web upstream", move || upstream::run(&config, &fed, &until));
+        let (fed, until) = (Arc::clone(&hub), Arc::clone(&ended));
+        let upstream = SupervisedThread::start("web upstream", move || upstream::run(&transport, &fed, &until));
         let upstream = upstream.map_err(|error| start(error.to_string()))?;
         Ok(Self { address, token, hub, upstream, ended, stop: Some(stop), thread: Some(thread) })
     }

@@ -9,7 +9,9 @@ use std::{
 };
 
 use flyrig_stream::stamp_of;
-use flyrig_transport::{Interests, PersonMessage, RigStats, Subscriber, TransportConfig};
+use flyrig_transport::{
+    FetchedTemplate, Interests, PersonMessage, RigStats, Subscriber, TemplateFetcher, TransportConfig, TransportError,
+};
 use serde::Serialize;
 
 use crate::hub::Hub;
@@ -18,10 +20,8 @@ use crate::hub::Hub;
 const PATIENCE: Duration = Duration::from_millis(50);
 /// How often statistics and calibration are looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
-/// How long a template is waited for at a time.
-const TEMPLATE_PATIENCE: Duration = Duration::from_secs(2);
-/// Pause after a template that did not come.
-const TEMPLATE_RETRY: Duration = Duration::from_millis(500);
+/// Pause after a session that could not be opened.
+const SESSION_RETRY: Duration = Duration::from_millis(500);
 /// How long the subscription outlives the last browser: a page that is loaded again finds it.
 const LINGER: Duration = Duration::from_secs(5);
 
@@ -52,11 +52,11 @@ pub(crate) fn run(config: &TransportConfig, hub: &Arc<Hub>, stop: &AtomicBool) {
         }
         match &mut link {
             Some(link) => link.turn(config, hub),
-            None => match Subscriber::open(config, &Interests { people: true, stats: true, ..Interests::default() }) {
-                Ok(subscriber) => link = Some(Link::new(subscriber)),
+            None => match Link::open(config) {
+                Ok(opened) => link = Some(opened),
                 Err(error) => {
                     tell(hub, &config.rig, Some(error.to_string()), None);
-                    std::thread::sleep(TEMPLATE_RETRY);
+                    std::thread::sleep(SESSION_RETRY);
                 }
             },
         }
@@ -65,22 +65,30 @@ pub(crate) fn run(config: &TransportConfig, hub: &Arc<Hub>, stop: &AtomicBool) {
 
 struct Link {
     subscriber: Subscriber,
-    /// Template that was asked for last without an answer.
-    asked: Option<(u64, Instant)>,
+    templates: TemplateFetcher,
     looked: Option<Instant>,
     stats: Option<RigStats>,
     was_up: bool,
 }
 
 impl Link {
-    fn new(subscriber: Subscriber) -> Self {
-        Self { subscriber, asked: None, looked: None, stats: None, was_up: false }
+    fn open(config: &TransportConfig) -> Result<Self, TransportError> {
+        let subscriber = Subscriber::open(config, &Interests { people: true, stats: true, ..Interests::default() })?;
+        let templates = subscriber.template_fetcher()?;
+        Ok(Self { subscriber, templates, looked: None, stats: None, was_up: false })
     }
 
     fn turn(&mut self, config: &TransportConfig, hub: &Hub) {
         if self.looked.is_none_or(|at| at.elapsed() >= LOOK_EVERY) {
             self.looked = Some(Instant::now());
             self.look(config, hub);
+        }
+        match self.templates.next() {
+            Ok(Some(FetchedTemplate { people, hash, bytes })) => {
+                people.into_iter().for_each(|person| hub.template(person, hash, &bytes));
+            }
+            Ok(None) => {}
+            Err(error) => tracing::debug!("{error}"),
         }
         match self.subscriber.next_person(PATIENCE) {
             Ok(Some(received)) => self.take(&received.body, hub),
@@ -91,34 +99,13 @@ impl Link {
 
     fn take(&mut self, message: &PersonMessage, hub: &Hub) {
         let Ok(stamp) = stamp_of(&message.bytes) else { return };
-        let is_known =
-            hub.has_template(message.person, stamp.template) || self.fetch(message.person, stamp.template, hub);
+        if !hub.has_template(message.person, stamp.template) {
+            // Motion and colours of a template that is not there yet come again.
+            return self.templates.ask(message.person, stamp.template);
+        }
         match message.layer {
-            // Colours of a template that is not there yet come again.
-            _ if !is_known => {}
             None => hub.motion(message.person, &message.bytes),
             Some(_) => hub.colors(message.person, &message.bytes),
-        }
-    }
-
-    /// Fetches a template. Returns whether it came.
-    fn fetch(&mut self, person: u32, hash: u64, hub: &Hub) -> bool {
-        if self.asked.is_some_and(|(asked, at)| asked == hash && at.elapsed() < TEMPLATE_RETRY) {
-            return false;
-        }
-        match self.subscriber.template(hash, TEMPLATE_PATIENCE) {
-            Ok(Some(bytes)) => {
-                hub.template(person, hash, &bytes);
-                self.asked = None;
-                true
-            }
-            answer => {
-                if let Err(error) = answer {
-                    tracing::debug!("{error}");
-                }
-                self.asked = Some((hash, Instant::now()));
-                false
-            }
         }
     }
 

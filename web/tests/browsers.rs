@@ -18,7 +18,7 @@ use flyrig_stream::{
 };
 use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::{Camera, Intrinsics, Isometry, Rig};
-use flyrig_web::{WebOptions, WebServer};
+use flyrig_web::{WebConfig, WebServer};
 use glam::DVec3;
 use tokio_tungstenite::tungstenite::{self, Message, WebSocket, client::IntoClientRequest as _};
 
@@ -104,8 +104,8 @@ fn template(size: f32) -> EncodedTemplate {
 fn server(endpoint: &str, listen: &str, insecure: bool) -> WebServer {
     let transport = TransportConfig { connect: vec![endpoint.to_owned()], ..TransportConfig::subscriber(NAME) };
     let names = vec!["rig.local".to_owned()];
-    WebServer::start(&WebOptions { listen: listen.parse().unwrap(), insecure, names, max_browsers: 3, transport })
-        .unwrap()
+    let config = WebConfig { listen: listen.to_owned(), insecure, names, max_browsers: 3 };
+    WebServer::start(&config, transport).unwrap()
 }
 
 type Socket = WebSocket<TcpStream>;
@@ -256,19 +256,20 @@ fn strangers_are_refused_in_words() {
 #[test]
 fn other_computers_need_permission_and_a_token() {
     let transport = TransportConfig::subscriber(NAME);
-    let options = WebOptions {
-        listen: "0.0.0.0:0".parse().unwrap(),
-        insecure: false,
-        names: Vec::new(),
-        max_browsers: 3,
-        transport: transport.clone(),
-    };
-    let refused = WebServer::start(&options).unwrap_err().to_string();
-    assert!(refused.contains("--insecure") && refused.contains("ssh -L"), "{refused}");
+    let refused = |config: &WebConfig| WebServer::start(config, transport.clone()).unwrap_err().to_string();
+    let listening = |listen: &str| WebConfig { listen: listen.to_owned(), ..WebConfig::default() };
+    for (config, words) in [
+        (listening(""), "'' is no address and port, such as"),
+        (listening("localhost"), "web.listen: 'localhost' is no address"),
+        (WebConfig { max_browsers: 0, ..listening("127.0.0.1:0") }, "web.max_browsers is 0, it must be in 1..=256"),
+    ] {
+        assert!(refused(&config).contains(words), "{}", refused(&config));
+    }
+    let refusal = refused(&listening("0.0.0.0:0"));
+    assert!(refusal.contains("--insecure") && refusal.contains("ssh -L"), "{refusal}");
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-    let listen = taken.local_addr().unwrap();
-    let refused = WebServer::start(&WebOptions { listen, ..options }).unwrap_err().to_string();
-    assert!(refused.contains("cannot listen on") && refused.contains("another"), "{refused}");
+    let refusal = refused(&listening(&taken.local_addr().unwrap().to_string()));
+    assert!(refusal.contains("cannot listen on") && refusal.contains("another"), "{refusal}");
 
     let rig = TestRig::start("tcp/127.0.0.1:0", 0.5);
     let server = server(&rig.endpoint, "0.0.0.0:0", true);

@@ -1,0 +1,199 @@
+//! Fetches templates on a thread of its own, so that one that is late delays nobody's motion.
+
+use std::{
+    collections::{HashMap, HashSet},
+    thread::Builder,
+    time::{Duration, Instant},
+};
+
+use crossbeam::channel::{Receiver, Sender, bounded, unbounded};
+use flyrig_types::caught;
+use zenoh::Session;
+
+use crate::{TransportError, people, splats::MAX_PERSON_TOPICS};
+
+/// How long one template may take before the next has its turn.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// Pause after a template that did not come.
+const RETRY: Duration = Duration::from_millis(500);
+/// Templates that wait for their turn; what does not fit is asked for again by a later motion.
+const MAX_WAITING: usize = MAX_PERSON_TOPICS + 1;
+
+type Fetched = (u64, Result<Option<Vec<u8>>, TransportError>);
+
+/// Fetches the templates that motions name, each once; made by [`crate::Subscriber::template_fetcher`]. Dropping it does
+/// not wait for a fetch under way.
+#[derive(Debug)]
+pub struct TemplateFetcher {
+    wanted: Sender<u64>,
+    fetched: Receiver<Fetched>,
+    /// The people who wait for a template, by its hash.
+    waiting: HashMap<u64, HashSet<u32>>,
+    /// When templates failed last.
+    failed: HashMap<u64, Instant>,
+}
+
+impl TemplateFetcher {
+    pub(crate) fn start(session: &Session, rig: &str) -> Result<Self, TransportError> {
+        let (session, rig) = (session.clone(), rig.to_owned());
+        Self::with(move |hash| people::ask_template(&session, &rig, hash, PATIENCE))
+    }
+
+    fn with(
+        ask: impl Fn(u64) -> Result<Option<Vec<u8>>, TransportError> + Send + 'static,
+    ) -> Result<Self, TransportError> {
+        let (wanted, hashes) = bounded(MAX_WAITING);
+        let (answers, fetched) = unbounded();
+        let work = move || {
+            for hash in hashes {
+                let answer = caught(|| ask(hash));
+                let answer = answer.unwrap_or_else(|panic| Err(TransportError::session("fetching a template", &panic)));
+                if answers.send((hash, answer)).is_err() {
+                    return;
+                }
+            }
+        };
+        // It ends when this is dropped, after the fetch under way.
+        Builder::new()
+            .name("flyrig-templates".to_owned())
+            .spawn(work)
+            .map_err(|error| TransportError::session("template thread", &error))?;
+        Ok(Self { wanted, fetched, waiting: HashMap::new(), failed: HashMap::new() })
+    }
+
+    /// Asks for a person's template unless it is on its way or failed just now. Never waits.
+    pub fn ask(&mut self, person: u32, hash: u64) {
+        if self.failed.get(&hash).is_some_and(|at| at.elapsed() < RETRY) {
+            return;
+        }
+        if let Some(people) = self.waiting.get_mut(&hash) {
+            people.insert(person);
+        } else if self.wanted.try_send(hash).is_ok() {
+            self.waiting.insert(hash, HashSet::from([person]));
+        }
+    }
+
+    /// Notes that a template is of no use, so that the motions that name it do not fetch it again at once.
+    pub fn refuse(&mut self, hash: u64) {
+        self.failed.insert(hash, Instant::now());
+    }
+
+    /// Returns the people of a template that has come, its hash and its bytes; None when none has come since. Never waits.
+    ///
+    /// # Errors
+    /// As [`crate::Subscriber::template`]; the template is asked for again when [`Self::ask`] is called again.
+    pub fn next(&mut self) -> Result<Option<FetchedTemplate>, TransportError> {
+        while let Ok((hash, answer)) = self.fetched.try_recv() {
+            let people = self.waiting.remove(&hash).unwrap_or_default();
+            self.failed.retain(|_, at| at.elapsed() < RETRY);
+            match answer {
+                Ok(Some(bytes)) => {
+                    return Ok(Some(FetchedTemplate { people: people.into_iter().collect(), hash, bytes }));
+                }
+                Ok(None) => self.refuse(hash),
+                Err(error) => {
+                    self.refuse(hash);
+                    return Err(error);
+                }
+            }
+        }
+        Ok(None)
+    }
+}
+
+/// A template that has come.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FetchedTemplate {
+    /// The people who were waiting for it.
+    pub people: Vec<u32>,
+    /// Its hash.
+    pub hash: u64,
+    /// For [`flyrig_stream::StreamTemplate::decode`].
+    pub bytes: Vec<u8>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn next_within(
+        fetcher: &mut TemplateFetcher,
+        patience: Duration,
+    ) -> Option<Result<FetchedTemplate, TransportError>> {
+        let end = Instant::now() + patience;
+        while Instant::now() < end {
+            if let Some(next) = fetcher.next().transpose() {
+                return Some(next);
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        None
+    }
+
+    #[test]
+    fn a_late_template_is_fetched_once_for_everybody_and_delays_nobody() {
+        let (release, held) = bounded::<()>(0);
+        let (count, asked) = unbounded();
+        let mut fetcher = TemplateFetcher::with(move |hash| {
+            count.send(hash).unwrap();
+            if hash == 1 {
+                held.recv().unwrap();
+            }
+            Ok(Some(vec![hash as u8]))
+        })
+        .unwrap();
+        for person in [4, 7, 4] {
+            fetcher.ask(person, 1);
+        }
+        fetcher.ask(5, 2);
+        // It is held up: asking and looking come back at once all the same.
+        assert_eq!(fetcher.next().unwrap(), None);
+        release.send(()).unwrap();
+        let mut first = next_within(&mut fetcher, Duration::from_secs(20)).unwrap().unwrap();
+        first.people.sort_unstable();
+        assert_eq!(first, FetchedTemplate { people: vec![4, 7], hash: 1, bytes: vec![1] });
+        let second = next_within(&mut fetcher, Duration::from_secs(20)).unwrap().unwrap();
+        assert_eq!((second.people, second.hash), (vec![5], 2));
+        assert_eq!(asked.try_iter().collect::<Vec<_>>(), [1, 2]);
+    }
+
+    #[test]
+    fn failures_panics_and_answers_of_nobody_are_asked_again_after_a_pause() {
+        let turn = std::sync::atomic::AtomicU32::new(0);
+        let fetcher = TemplateFetcher::with(move |_| match turn.fetch_add(1, std::sync::atomic::Ordering::Relaxed) {
+            0 => Ok(None),
+            1 => Err(TransportError::session("line", &"cut")),
+            2 => panic!("out of luck"),
+            _ => Ok(Some(Vec::new())),
+        });
+        let mut fetcher = fetcher.unwrap();
+        let (mut errors, end) = (Vec::new(), Instant::now() + Duration::from_secs(30));
+        let start = Instant::now();
+        let fetched = loop {
+            assert!(Instant::now() < end);
+            fetcher.ask(0, 9);
+            match fetcher.next() {
+                Ok(Some(template)) => break template,
+                Ok(None) => std::thread::sleep(Duration::from_millis(2)),
+                Err(error) => errors.push(error.to_string()),
+            }
+        };
+        assert_eq!((fetched.people, errors.len()), (vec![0], 2), "{errors:?}");
+        assert!(errors[0].contains("cut") && errors[1].contains("out of luck"), "{errors:?}");
+        assert!(start.elapsed() >= 3 * RETRY);
+    }
+
+    #[test]
+    fn no_more_wait_than_there_is_room_for() {
+        let (_release, held) = bounded::<()>(0);
+        let mut fetcher = TemplateFetcher::with(move |_| {
+            let _ = held.recv();
+            Ok(None)
+        })
+        .unwrap();
+        for hash in 0..10_000 {
+            fetcher.ask(0, hash);
+        }
+        assert!(fetcher.waiting.len() <= MAX_WAITING + 1, "{}", fetcher.waiting.len());
+    }
+}

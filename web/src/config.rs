@@ -1,0 +1,66 @@
+//! Settings of the page's server.
+
+use std::net::SocketAddr;
+
+use clap::Args;
+use serde::{Deserialize, Serialize};
+
+use crate::WebError;
+
+/// Browsers that may be allowed at a time.
+const BROWSERS: std::ops::RangeInclusive<usize> = 1..=256;
+
+/// The web page for browsers.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Args)]
+#[serde(deny_unknown_fields, default)]
+pub struct WebConfig {
+    /// Address of the page; port 0 takes a free one.
+    #[arg(long, default_value = "127.0.0.1:8080", value_parser = checked_address)]
+    pub listen: String,
+    /// Listen where other computers reach the page, without encryption; who watches needs the link with its token.
+    #[arg(long)]
+    pub insecure: bool,
+    /// Name by which browsers reach this computer, besides its addresses and localhost; may be repeated.
+    #[arg(long = "name", value_name = "NAME")]
+    pub names: Vec<String>,
+    /// Most browsers at a time.
+    #[arg(long, default_value_t = Self::default().max_browsers)]
+    pub max_browsers: usize,
+}
+
+impl Default for WebConfig {
+    /// Listens nowhere.
+    fn default() -> Self {
+        Self { listen: String::new(), insecure: false, names: Vec::new(), max_browsers: 32 }
+    }
+}
+
+impl WebConfig {
+    /// Checks every field; an empty address means that no page is wanted.
+    ///
+    /// # Errors
+    /// [`WebError::Config`] with the field's name and what it may be.
+    pub fn validate(&self) -> Result<(), WebError> {
+        if !self.listen.is_empty() {
+            self.address()?;
+        }
+        if BROWSERS.contains(&self.max_browsers) {
+            return Ok(());
+        }
+        let (least, most) = (BROWSERS.start(), BROWSERS.end());
+        Err(WebError::Config(format!("web.max_browsers is {}, it must be in {least}..={most}", self.max_browsers)))
+    }
+
+    /// Returns the address to listen on.
+    pub(crate) fn address(&self) -> Result<SocketAddr, WebError> {
+        parse_address(&self.listen).map_err(|problem| WebError::Config(format!("web.listen: {problem}")))
+    }
+}
+
+fn parse_address(text: &str) -> Result<SocketAddr, String> {
+    text.parse().map_err(|_| format!("'{text}' is no address and port, such as 127.0.0.1:8080"))
+}
+
+fn checked_address(text: &str) -> Result<String, String> {
+    parse_address(text).map(|_| text.to_owned())
+}
