@@ -110,13 +110,21 @@ impl<T: Pod> StorageBuffer<T> {
     }
 
     /// Queues a copy of little-endian bytes to the start of the buffer (extra ones are ignored). The bytes need no
-    /// alignment, their number must be a multiple of 4.
+    /// alignment, their number must be a multiple of 4. Creates no buffer in the long run, for contents of one size.
     pub fn write_bytes(&self, gpu: &GpuContext, bytes: &[u8]) {
         let count = bytes.len().min(self.len * size_of::<T>()) & !3;
         if let Some(mut elements) = self.slice_mut() {
             bytemuck::cast_slice_mut::<T, u8>(&mut elements)[..count].copy_from_slice(&bytes[..count]);
         } else if count > 0 {
-            gpu.queue.write_buffer(self.raw(), 0, &bytes[..count]);
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            gpu.shared.uploads.record(
+                &gpu.device,
+                &gpu.shared.counters,
+                &mut encoder,
+                &bytes[..count],
+                (self.raw(), 0),
+            );
+            gpu.queue.submit([encoder.finish()]);
         }
     }
 

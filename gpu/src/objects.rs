@@ -14,7 +14,7 @@ pub struct GpuObjects {
     pub storage_buffers: u64,
     /// Staging buffers of read-backs.
     pub read_backs: u64,
-    /// Staging buffers of constants.
+    /// Staging buffers of constants and images.
     pub uploads: u64,
     /// Bind groups of compute kernels.
     pub bind_groups: u64,

@@ -1,4 +1,4 @@
-//! Buffers that carry constants from the processor into a command encoder.
+//! Buffers that carry constants and images from the processor into a command encoder.
 
 use std::sync::{Arc, Mutex, atomic::Ordering};
 
@@ -8,9 +8,11 @@ use crate::objects::{Counters, lock};
 
 /// Sizes are multiples of this, bytes; the constants of most encodings fit one.
 const STEP: u64 = 2048;
-/// Buffers that are created together when none is idle, so that the exact moment at which the GPU finishes does not decide
-/// whether a frame creates one.
-const BATCH: usize = 16;
+/// Bytes that are created together when no buffer is idle, in [`BATCHES`] buffers, so that the exact moment at which the GPU
+/// finishes does not decide whether a frame creates one.
+const BATCH_BYTES: u64 = 1 << 20;
+/// Least and most buffers that are created together: images, and constants.
+const BATCHES: [u64; 2] = [2, 16];
 /// Idle buffers kept.
 const IDLE: usize = 256;
 
@@ -62,8 +64,9 @@ impl Uploads {
         if let Some(index) = idle.iter().rposition(|buffer| buffer.size() == size) {
             return Some(idle.swap_remove(index));
         }
-        counters.uploads.fetch_add(BATCH as u64, Ordering::Relaxed);
-        idle.extend((0..BATCH).map(|_| {
+        let batch = (BATCH_BYTES / size.max(1)).clamp(BATCHES[0], BATCHES[1]);
+        counters.uploads.fetch_add(batch, Ordering::Relaxed);
+        idle.extend((0..batch).map(|_| {
             device.create_buffer(&BufferDescriptor {
                 label: Some("upload"),
                 size,

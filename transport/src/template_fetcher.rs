@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crossbeam::channel::{Receiver, Sender, bounded, unbounded};
+use crossbeam::channel::{Receiver, Sender, bounded};
 use flyrig_types::caught;
 use zenoh::Session;
 
@@ -43,7 +43,7 @@ impl TemplateFetcher {
         ask: impl Fn(u64) -> Result<Option<Vec<u8>>, TransportError> + Send + 'static,
     ) -> Result<Self, TransportError> {
         let (wanted, hashes) = bounded(MAX_WAITING);
-        let (answers, fetched) = unbounded();
+        let (answers, fetched) = bounded(MAX_WAITING);
         let work = move || {
             for hash in hashes {
                 let answer = caught(|| ask(hash));
@@ -82,7 +82,7 @@ impl TemplateFetcher {
     ///
     /// # Errors
     /// As [`crate::Subscriber::template`]; the template is asked for again when [`Self::ask`] is called again.
-    pub fn next(&mut self) -> Result<Option<FetchedTemplate>, TransportError> {
+    pub fn take(&mut self) -> Result<Option<FetchedTemplate>, TransportError> {
         while let Ok((hash, answer)) = self.fetched.try_recv() {
             let people = self.waiting.remove(&hash).unwrap_or_default();
             self.failed.retain(|_, at| at.elapsed() < RETRY);
@@ -122,7 +122,7 @@ mod tests {
     ) -> Option<Result<FetchedTemplate, TransportError>> {
         let end = Instant::now() + patience;
         while Instant::now() < end {
-            if let Some(next) = fetcher.next().transpose() {
+            if let Some(next) = fetcher.take().transpose() {
                 return Some(next);
             }
             std::thread::sleep(Duration::from_millis(2));
@@ -133,7 +133,7 @@ mod tests {
     #[test]
     fn a_late_template_is_fetched_once_for_everybody_and_delays_nobody() {
         let (release, held) = bounded::<()>(0);
-        let (count, asked) = unbounded();
+        let (count, asked) = bounded(9);
         let mut fetcher = TemplateFetcher::with(move |hash| {
             count.send(hash).unwrap();
             if hash == 1 {
@@ -147,7 +147,7 @@ mod tests {
         }
         fetcher.ask(5, 2);
         // It is held up: asking and looking come back at once all the same.
-        assert_eq!(fetcher.next().unwrap(), None);
+        assert_eq!(fetcher.take().unwrap(), None);
         release.send(()).unwrap();
         let mut first = next_within(&mut fetcher, Duration::from_secs(20)).unwrap().unwrap();
         first.people.sort_unstable();
@@ -172,7 +172,7 @@ mod tests {
         let fetched = loop {
             assert!(Instant::now() < end);
             fetcher.ask(0, 9);
-            match fetcher.next() {
+            match fetcher.take() {
                 Ok(Some(template)) => break template,
                 Ok(None) => std::thread::sleep(Duration::from_millis(2)),
                 Err(error) => errors.push(error.to_string()),

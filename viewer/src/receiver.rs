@@ -156,7 +156,7 @@ impl Link<'_> {
             self.looked = Some(Instant::now());
             self.look();
         }
-        match self.templates.next() {
+        match self.templates.take() {
             Ok(Some(fetched)) => self.meet(&fetched),
             Ok(None) => {}
             Err(error) => lock(self.state).complain(error.to_string()),

@@ -83,7 +83,7 @@ impl Link {
             self.looked = Some(Instant::now());
             self.look(config, hub);
         }
-        match self.templates.next() {
+        match self.templates.take() {
             Ok(Some(FetchedTemplate { people, hash, bytes })) => {
                 people.into_iter().for_each(|person| hub.template(person, hash, &bytes));
             }
