@@ -27,6 +27,8 @@ mod write;
 #[cfg(test)]
 mod desync_tests;
 #[cfg(test)]
+mod first_sets_tests;
+#[cfg(test)]
 mod hands_tests;
 #[cfg(test)]
 mod other_person_tests;

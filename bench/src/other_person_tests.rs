@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use flyrig_fusion::{EstimatedPerception, Perception as _, PerceptionSettings, StageTimes};
+use flyrig_fusion::{EstimatedPerception, Origin, Perception as _, PerceptionSettings, StageTimes};
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig, Simulator};
 use flyrig_types::{Frame, FrameSet, Image};
@@ -91,4 +91,25 @@ fn somebody_of_another_build_gets_another_shape_and_who_comes_back_keeps_it() {
     let other = studio.show(&mut tall, 16, false).unwrap();
     assert_eq!(other.0, 1, "{first:?} {other:?}");
     assert!(other.1 > 1.03 * first.1, "{first:?} {other:?}");
+}
+
+#[test]
+fn a_body_that_does_not_fit_is_measured_again_on_request() {
+    let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+    let mut simulator = simulator(&gpu, Build::SlimWoman);
+    let rig = simulator.rig().clone();
+    let plates: Vec<Option<Image>> = (0..3).map(|slot| Some(copy(simulator.plate(slot).unwrap()).unwrap())).collect();
+    let template = flyrig_body::default_template(&flyrig_body::ShapeParams::default()).unwrap();
+    let perception = EstimatedPerception::new(&rig, &template, &PerceptionSettings::default(), &plates).unwrap();
+    let mut studio = Studio { perception, index: 0, nanos: 0 };
+    let measured = studio.show(&mut simulator, 16, false).expect("she is measured");
+    // The same again but for noise, under another number.
+    assert!(studio.perception.measure_again());
+    let again = studio.show(&mut simulator, 16, false).unwrap();
+    assert_eq!(again.0, 1);
+    assert!((again.1 / measured.1 - 1.0).abs() < 0.03, "{measured:?} {again:?}");
+    assert_eq!(studio.show(&mut simulator, 16, false), Some(again), "once for each request");
+    // Nobody is measured whose shape is given.
+    let settings = PerceptionSettings { shape: Some(Origin::Given), ..PerceptionSettings::default() };
+    assert!(!EstimatedPerception::new(&rig, &template, &settings, &plates).unwrap().measure_again());
 }

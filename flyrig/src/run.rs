@@ -2,10 +2,14 @@
 
 use std::{
     path::Path,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
     time::{Duration, Instant},
 };
 
-use anyhow::{Result, ensure};
+use anyhow::{Context, Result, ensure};
 use flyrig_capture::{CameraStats, Recorder};
 use flyrig_fusion::{
     Health, Intake, LivePublisher, LiveRig, LiveViews, Origin, Outcome, PersonId, PersonMemory, RigWatch, Session,
@@ -17,6 +21,7 @@ use flyrig_report::{dataset, stop};
 use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_web::WebServer;
 use foxglove::messages::Log;
+use signal_hook::consts::SIGUSR1;
 
 use crate::{
     config::{Config, WatchMode},
@@ -124,7 +129,17 @@ fn capture_people(
     }
     let (started, mut last_print, mut printed) = (Instant::now(), Instant::now(), 0u64);
     let mut last_save = Instant::now();
+    let measure = Arc::new(AtomicBool::new(false));
+    signal_hook::flag::register(SIGUSR1, Arc::clone(&measure)).context("cannot listen for SIGUSR1")?;
     while !stop::requested() && !rig.ended() {
+        if measure.swap(false, Ordering::Relaxed) {
+            match rig.session.measure_again() {
+                true => eprintln!("run: SIGUSR1, everybody is measured again"),
+                false => eprintln!(
+                    "run: SIGUSR1, but nobody is measured: perception.shape is \"given\", or there is only one camera"
+                ),
+            }
+        }
         let step = rig.step(STEP, None)?;
         if step.is_some() {
             monitor.stepped();

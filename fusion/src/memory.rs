@@ -4,6 +4,7 @@
 use std::{collections::HashMap, io::Write as _, path::Path};
 
 use flyrig_body::{Joint, Skeleton, Template};
+use flyrig_stfa::FeatureMemory;
 use glam::{DMat4, DQuat, DVec3, Vec3};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 
@@ -15,6 +16,8 @@ const VERSION: &str = "1";
 const VERSION_KEY: &str = "flyrig-person";
 /// Key of the joints' names, one a line.
 const JOINTS_KEY: &str = "joints";
+/// Key of the digest of the networks' weights, hexadecimal, where a memory of networks is saved.
+const NETWORKS_KEY: &str = "networks";
 /// A larger file is no saved person, bytes.
 const MOST_BYTES: u64 = 1 << 30;
 
@@ -31,6 +34,16 @@ pub struct PersonMemory {
     pub(crate) memory: Vec<[f32; 4]>,
     /// Linear RGB of each Gaussian, and its opacity.
     pub(crate) colors: Vec<[f32; 4]>,
+    /// Features that learned appearance has accumulated on the processor.
+    pub(crate) networks: Option<NetworkMemory>,
+}
+
+/// Features that networks have accumulated.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct NetworkMemory {
+    /// Digest of the networks' weights: to others, the features mean nothing.
+    pub digest: u64,
+    pub memory: FeatureMemory,
 }
 
 impl PersonMemory {
@@ -40,10 +53,11 @@ impl PersonMemory {
         translations: Vec<DVec3>,
         memory: Vec<[f32; 4]>,
         colors: Vec<[f32; 4]>,
+        networks: Option<NetworkMemory>,
     ) -> Self {
         let joints = template.skeleton.joints().to_vec();
         let (positions, normals) = (template.positions.clone(), template.normals.clone());
-        Self { positions, normals, joints, translations, memory, colors }
+        Self { positions, normals, joints, translations, memory, colors, networks }
     }
 
     /// Returns the person's template: `base` with the learnt shape.
@@ -90,7 +104,7 @@ impl PersonMemory {
             |numbers: fn(&Joint) -> Vec<f64>| bytes(self.joints.iter().flat_map(numbers).map(f64::to_le_bytes));
         let translations = bytes(self.translations.iter().flat_map(DVec3::to_array).map(f64::to_le_bytes));
         let count = self.joints.len();
-        let tensors = [
+        let mut tensors = vec![
             ("positions", Dtype::F32, vec![self.positions.len(), 3], vec3(&self.positions)),
             ("normals", Dtype::F32, vec![self.normals.len(), 3], vec3(&self.normals)),
             ("parents", Dtype::F64, vec![count, 1], joints(|j| vec![j.parent.map_or(-1.0, |p| p as f64)])),
@@ -101,14 +115,21 @@ impl PersonMemory {
             ("memory", Dtype::F32, vec![self.memory.len(), 4], vec4(&self.memory)),
             ("colors", Dtype::F32, vec![self.colors.len(), 4], vec4(&self.colors)),
         ];
+        if let Some(NetworkMemory { memory, .. }) = &self.networks {
+            let (rows, numbers) =
+                (memory.weights().len(), |numbers: &[f32]| bytes(numbers.iter().map(|v| v.to_le_bytes())));
+            tensors.push(("network_weights", Dtype::F32, vec![rows, 1], numbers(memory.weights())));
+            tensors.push(("network_features", Dtype::F32, vec![rows, memory.width()], numbers(memory.features())));
+        }
         let views: Vec<(&str, TensorView<'_>)> = tensors
             .iter()
             .map(|(name, dtype, shape, data)| Ok((*name, TensorView::new(*dtype, shape.clone(), data)?)))
             .collect::<Result<_, safetensors::SafeTensorError>>()
             .map_err(|error| fail(error.to_string()))?;
         let names: Vec<&str> = self.joints.iter().map(|joint| joint.name.as_str()).collect();
-        let metadata =
+        let mut metadata =
             HashMap::from([(VERSION_KEY.to_owned(), VERSION.to_owned()), (JOINTS_KEY.to_owned(), names.join("\n"))]);
+        metadata.extend(self.networks.iter().map(|of| (NETWORKS_KEY.to_owned(), format!("{:016x}", of.digest))));
         let file = safetensors::serialize(views, Some(metadata)).map_err(|error| fail(error.to_string()))?;
         flyrig_types::write_whole(path, |out| out.write_all(&file))
             .map_err(|error| fail(format!("cannot be written ({error}); check that the folder exists and has room")))
@@ -186,6 +207,22 @@ impl PersonMemory {
             joint_from_canonical: DMat4::from_cols_slice(&binds[16 * i..]),
         };
         let translations = rows("translations", Dtype::F64, 3)?.chunks_exact(3).map(DVec3::from_slice).collect();
+        let networks = match metadata.get(NETWORKS_KEY) {
+            None => None,
+            Some(digest) => {
+                let digest =
+                    u64::from_str_radix(digest, 16).map_err(|_| damaged("the networks' digest is no number"))?;
+                let width = tensors.tensor("network_features").ok().and_then(|view| view.shape().get(1).copied());
+                let width = width.ok_or_else(|| damaged("lacks network_features"))?;
+                let numbers = |tensor, columns| -> Result<Vec<f32>, FusionError> {
+                    Ok(rows(tensor, Dtype::F32, columns)?.into_iter().map(|v| v as f32).collect())
+                };
+                let (weights, features) = (numbers("network_weights", 1)?, numbers("network_features", width)?);
+                let memory = FeatureMemory::from_parts(width, weights, features)
+                    .ok_or_else(|| damaged("the networks' memory does not fit itself"))?;
+                Some(NetworkMemory { digest, memory })
+            }
+        };
         Ok(Self {
             positions: vec3("positions")?,
             normals: vec3("normals")?,
@@ -193,6 +230,7 @@ impl PersonMemory {
             translations,
             memory: vec4("memory")?,
             colors: vec4("colors")?,
+            networks,
         })
     }
 }
@@ -215,7 +253,8 @@ mod tests {
         let mut template = default_template(&ShapeParams::default()).unwrap();
         template.positions[7] += Vec3::new(0.01, 0.0, -0.02);
         let translations = vec![DVec3::new(0.001, -0.002, 0.003); 5];
-        let memory = PersonMemory::new(&template, translations, vec![[0.1, 0.2, 0.3, 8.0]; 9], vec![[0.5; 4]; 9]);
+        let colors = vec![[0.5; 4]; 9];
+        let memory = PersonMemory::new(&template, translations, vec![[0.1, 0.2, 0.3, 8.0]; 9], colors, None);
         (template, memory)
     }
 
@@ -253,6 +292,40 @@ mod tests {
         let other = safetensors::serialize(Vec::<(&str, TensorView<'_>)>::new(), None).unwrap();
         assert!(PersonMemory::decode("p", &other).unwrap_err().to_string().contains("is no saved person"));
         assert!(PersonMemory::load(&folder.path().join("none")).unwrap_err().to_string().contains("cannot be read"));
+    }
+
+    #[test]
+    fn the_memory_of_networks_comes_back_and_damage_to_it_is_found() {
+        let (_, mut memory) = memory();
+        let features =
+            FeatureMemory::from_parts(2, vec![0.5, 8.0, 0.0], vec![0.1, -3.0, 1e-30, 4.0, 0.0, -0.0]).unwrap();
+        memory.networks = Some(NetworkMemory { digest: u64::MAX - 6, memory: features });
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("person.safetensors");
+        memory.save(&path).unwrap();
+        assert_eq!(PersonMemory::load(&path).unwrap(), memory);
+
+        let whole = std::fs::read(&path).unwrap();
+        let replaced = |old: &str, new: &str| {
+            assert_eq!(old.len(), new.len());
+            let at = whole.windows(old.len()).position(|window| window == old.as_bytes()).unwrap();
+            let mut file = whole.clone();
+            file[at..at + new.len()].copy_from_slice(new.as_bytes());
+            PersonMemory::decode("p", &file).unwrap_err().to_string()
+        };
+        assert!(replaced("network_features", "network_featuers").contains("lacks network_features"));
+        assert!(replaced("network_weights", "network_weihgts").contains("lacks network_weights"));
+        assert!(replaced("fffffffffffffff9", "fffffffffffffffx").contains("digest is no number"));
+        let features = FeatureMemory::from_parts(2, vec![1.0; 2], vec![0.0; 4]).unwrap();
+        memory.networks = Some(NetworkMemory { digest: 1, memory: features });
+        memory.save(&path).unwrap();
+        let mut file = std::fs::read(&path).unwrap();
+        // The weights of both Gaussians are the only ones in the file.
+        let ones = [1.0f32.to_le_bytes(), 1.0f32.to_le_bytes()].concat();
+        let at = file.windows(8).rposition(|window| window == ones).unwrap();
+        file[at..at + 4].copy_from_slice(&(-1.0f32).to_le_bytes());
+        let error = PersonMemory::decode("p", &file).unwrap_err().to_string();
+        assert!(error.contains("the networks' memory does not fit itself"), "{error}");
     }
 
     #[test]

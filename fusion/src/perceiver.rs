@@ -51,6 +51,11 @@ impl Perceiver {
         (self.effort, self.known) = (effort, known);
     }
 
+    /// See [`Perception::measure_again`].
+    pub fn measure_again(&mut self) -> bool {
+        self.perception.measure_again()
+    }
+
     /// Observes everybody in a set.
     ///
     /// # Errors

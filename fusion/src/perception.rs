@@ -26,6 +26,11 @@ pub trait Perception: Send {
     /// Only errors from which later sets cannot recover; a person who is not found is [`Observation::Lost`].
     fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError>;
 
+    /// Measures everybody's shape again from the next sets on. Returns whether shapes are measured at all.
+    fn measure_again(&mut self) -> bool {
+        false
+    }
+
     /// Chooses how much work the next sets get.
     fn set_effort(&mut self, effort: Effort) {
         let _ = effort;

@@ -213,6 +213,13 @@ impl Session {
         self.budget.fps().is_some() && self.stillness.may_rest(set, self.has_people())
     }
 
+    /// Measures everybody's shape again from the next sets on, for a body that does not fit. A person whose shape comes out
+    /// differently is learnt anew, colours included. Returns whether shapes are measured at all: not where they are given,
+    /// nor by a single camera.
+    pub fn measure_again(&mut self) -> bool {
+        self.perceiver.measure_again()
+    }
+
     /// Lends perception out, ready for the next set; until it is returned this session finds nobody.
     pub(crate) fn lend_perceiver(&mut self) -> Perceiver {
         self.ready_perceiver();

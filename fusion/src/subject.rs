@@ -19,6 +19,7 @@ use flyrig_types::{Camera, Image, Mask, PersonId, Pose, Rig};
 use crate::{
     Effort, FusionError, NetworksOn, PersonMemory, SessionSettings, StageTimes, TrackWatch,
     deformation::{DeformTimes, Deformation, Instants, TrackedView},
+    memory::NetworkMemory,
     person_stream::encode_template,
     pose_curve::PoseCurve,
     stage_times::processor_time,
@@ -534,7 +535,15 @@ impl Subject {
     pub(crate) fn memory(&self, gpu: &GpuContext) -> Result<PersonMemory, FusionError> {
         let translations = self.deformation.as_ref().map_or_else(Vec::new, |known| known.translations().to_vec());
         let colors = self.direct_colors.as_ref().unwrap_or(&self.gaussians.color);
-        Ok(PersonMemory::new(&self.template, translations, self.appearance.memory(gpu)?, colors.read(gpu)?))
+        let networks = match &self.networks {
+            Some(Networks::Processor(learned)) if !learned.memory().weights().is_empty() => {
+                Some(NetworkMemory { digest: learned.digest(), memory: learned.memory().clone() })
+            }
+            // Those on the adapter begin anew.
+            _ => None,
+        };
+        let (memory, colors) = (self.appearance.memory(gpu)?, colors.read(gpu)?);
+        Ok(PersonMemory::new(&self.template, translations, memory, colors, networks))
     }
 
     /// Resumes from what an earlier session has learnt about the same person.
@@ -556,6 +565,11 @@ impl Subject {
         self.gaussians.color.write(gpu, &memory.colors);
         if let Some(direct) = &self.direct_colors {
             direct.write(gpu, &memory.colors);
+        }
+        if let (Some(Networks::Processor(learned)), Some(of)) = (&mut self.networks, &memory.networks)
+            && learned.digest() == of.digest
+        {
+            learned.restore(of.memory.clone());
         }
         self.watch.resume();
         Ok(())

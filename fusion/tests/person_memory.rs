@@ -3,7 +3,7 @@
 
 mod support;
 
-use flyrig_fusion::{PersonId, PersonMemory, Session, SessionBuilder, TrackState};
+use flyrig_fusion::{AppearanceMode, PersonId, PersonMemory, Session, SessionBuilder, TrackState};
 
 use support::{frame_set, gpu, images, people, rig, session, settings};
 
@@ -39,4 +39,46 @@ fn a_session_resumes_a_saved_person_and_refuses_one_that_does_not_fit() {
 
     let refused = resume(2000).err().unwrap().to_string();
     assert!(refused.contains("3000 Gaussians") && refused.contains("body.gaussians"), "{refused}");
+}
+
+#[test]
+fn what_networks_have_seen_outlives_the_program_too() {
+    const SETS: u64 = 12;
+    let mut images = images(&[(0.0, [30, 160, 60])]);
+    // Behind, the person is red.
+    for (rgb, mask) in &mut images[2..3] {
+        rgb.chunks_exact_mut(3).zip(mask).filter(|(_, mask)| **mask > 0).for_each(|(p, _)| {
+            p.copy_from_slice(&[170, 30, 40]);
+        });
+    }
+    let builder = |weights: &str| {
+        let mut settings = settings(2000);
+        (settings.appearance.mode, settings.appearance.weights) = (AppearanceMode::Stfa, Some(weights.into()));
+        SessionBuilder::new(gpu(), rig()).settings(settings).perception(people(&rig(), &[(0, 0.0)]))
+    };
+    let mut first = builder("tiny").build().unwrap();
+    for index in 0..SETS {
+        first.process(&frame_set(index, &images)).unwrap();
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("me.person");
+    first.memory(ME).unwrap().save(&path).unwrap();
+
+    // Afterwards only the camera in front delivers.
+    let mut front = frame_set(SETS, &images);
+    front.frames[1..].fill(None);
+    first.process(&front).unwrap();
+    let expected = colors(&first);
+    let resumed = |weights: &str| {
+        let memory = PersonMemory::load(&path).unwrap();
+        let mut session = builder(weights).person(ME, memory).build().unwrap();
+        session.process(&front).unwrap();
+        let near = |(a, b): &(&[f32; 3], &[f32; 3])| a.iter().zip(*b).all(|(a, b)| (a - b).abs() < 0.03);
+        colors(&session).iter().zip(&expected).filter(near).count() as f64 / expected.len() as f64
+    };
+    let red = expected.iter().filter(|color| color[0] > 2.0 * color[1]).count();
+    assert!(red > expected.len() / 4, "{red} of {} Gaussians are red", expected.len());
+    let (same, other) = (resumed("tiny"), resumed("small"));
+    assert!(same > 0.98, "{same} of the Gaussians look as if nothing had happened");
+    assert!(other < same, "to other networks the features mean nothing: {other}, {same}");
 }

@@ -249,6 +249,7 @@ impl SimConfig {
         LightConfig::validate_all(&self.lights)?;
         self.sensors.iter().try_for_each(SensorConfig::validate)?;
         self.faults.validate()?;
+        self.faults.check_cameras(ring.count)?;
         check("motion.turn_secs", motion.turn_secs, 1.0, 600.0, "1 to 600 seconds")?;
         check("motion.speed", motion.speed, 0.0, 3.0, "0 to 3")?;
         check("motion.phase", motion.phase, 0.0, 1.0, "0 to 1 of the clip")?;

@@ -21,6 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::SimError;
 use crate::error::check;
+use crate::ring::camera_name;
 use crate::sensor::{gaussian, hash, uniform};
 
 /// Kind of a [`Fault`].
@@ -166,6 +167,19 @@ impl FaultScript {
         let script: Self = toml::from_str(text)?;
         script.validate()?;
         Ok(script)
+    }
+
+    /// Checks that every fault's camera stands in a ring of `count` cameras.
+    pub(crate) fn check_cameras(&self, count: usize) -> Result<(), SimError> {
+        let stands = |name: &String| (0..count).any(|slot| camera_name(slot) == *name);
+        match self.faults.iter().filter_map(|fault| fault.camera.as_ref()).find(|name| !stands(name)) {
+            None => Ok(()),
+            Some(name) => Err(SimError::Config {
+                field: "fault.camera",
+                found: format!("'{name}' beside cameras {} to {}", camera_name(0), camera_name(count.max(1) - 1)),
+                expected: "one of those, or no name for all of them",
+            }),
+        }
     }
 
     pub(crate) fn validate(&self) -> Result<(), SimError> {

@@ -8,6 +8,11 @@ use glam::{DQuat, DVec2, DVec3, EulerRot};
 use crate::sensor::{hash, uniform};
 use crate::{SimConfig, SimError};
 
+/// Name of a camera of the ring.
+pub(crate) fn camera_name(slot: usize) -> String {
+    format!("{slot:02}")
+}
+
 /// The ring of a configuration: `00`, `01`, ... counter-clockwise seen from above, `00` at -y, z up.
 ///
 /// # Errors
@@ -43,7 +48,7 @@ pub fn camera_ring(config: &SimConfig) -> Result<Rig, SimError> {
             unfolded(config, &intrinsics)?;
             Ok(Camera {
                 time_offset_nanos: 0,
-                id: CameraId::from(format!("{slot:02}")),
+                id: CameraId::from(camera_name(slot)),
                 intrinsics,
                 camera_from_world: turn * Isometry::look_at(eye, target, DVec3::Z),
             })

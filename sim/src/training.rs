@@ -6,6 +6,7 @@ use flyrig_types::Rig;
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
 use crate::error::check;
+use crate::ring::camera_name;
 use crate::sensor::hash;
 use crate::source::shot;
 use crate::{
@@ -164,7 +165,7 @@ pub fn random_config(training: &TrainingConfig, person: u64) -> SimConfig {
     let lags = (0..training.cameras).filter_map(|slot| {
         let lagging = rng.random_bool(0.3);
         lagging.then(|| Fault {
-            camera: Some(format!("{slot:02}")),
+            camera: Some(camera_name(slot)),
             ms: Some(rng.random_range(-6.0..6.0)),
             ..Fault::new(FaultKind::Lag)
         })

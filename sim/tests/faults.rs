@@ -222,3 +222,18 @@ fn what_is_no_fault_is_refused_by_name() {
     assert!(refusal("[[fault]]\nkind = \"drift\"\nppm = nan\n").contains("fault.ppm is NaN"));
     assert!(refusal("[[fault]]\nkind = \"drop\"\nprobability = 1.5\n").contains("fault.probability is 1.5"));
 }
+
+#[test]
+fn a_fault_of_a_camera_that_does_not_stand_in_the_ring_is_refused() {
+    let refusal = |camera: &str| {
+        let mut config = small_config(2);
+        config.faults = FaultScript::parse(&format!("[[fault]]\nkind = \"drop\"\ncamera = \"{camera}\"\n")).unwrap();
+        config.validate().map_err(|error| error.to_string())
+    };
+    assert_eq!(refusal("01"), Ok(()));
+    for unknown in ["02", "1", "cam1", ""] {
+        let text = refusal(unknown).unwrap_err();
+        let expected = format!("fault.camera is '{unknown}' beside cameras 00 to 01, expected one of those");
+        assert!(text.contains(&expected), "{text}");
+    }
+}

@@ -14,6 +14,33 @@ pub struct FeatureMemory {
 }
 
 impl FeatureMemory {
+    /// Puts a memory together from w_acc of each Gaussian and f_acc, `width` numbers a Gaussian. Returns `None` for lengths that
+    /// do not fit each other, numbers that are not finite, and negative weights.
+    #[must_use]
+    pub fn from_parts(width: usize, weights: Vec<f32>, features: Vec<f32>) -> Option<Self> {
+        let fits = weights.len().checked_mul(width) == Some(features.len());
+        let sound = weights.iter().all(|w| w.is_finite() && *w >= 0.0) && features.iter().all(|f| f.is_finite());
+        (fits && sound).then_some(Self { width, weights, features })
+    }
+
+    /// Returns w_acc of each Gaussian.
+    #[must_use]
+    pub fn weights(&self) -> &[f32] {
+        &self.weights
+    }
+
+    /// Returns f_acc by Gaussian, [`Self::width`] numbers each.
+    #[must_use]
+    pub fn features(&self) -> &[f32] {
+        &self.features
+    }
+
+    /// Returns the numbers of a Gaussian.
+    #[must_use]
+    pub fn width(&self) -> usize {
+        self.width
+    }
+
     /// Forgets everything.
     pub fn clear(&mut self) {
         self.weights.clear();
@@ -95,6 +122,22 @@ mod tests {
                 assert!((f64::from(row[c]) - expected).abs() < 1e-5, "frame {frame}");
             }
         }
+    }
+
+    #[test]
+    fn a_memory_is_put_together_again_unless_its_parts_are_unsound() {
+        let mut memory = FeatureMemory::default();
+        memory.fit(2, 3);
+        memory.fuse(0, &mut [1.0, 2.0, 3.0], &[0.5], &[[1.0, 1.0]], &AppearanceSettings::default());
+        let (weights, features) = (memory.weights().to_vec(), memory.features().to_vec());
+        assert_eq!(FeatureMemory::from_parts(3, weights.clone(), features.clone()), Some(memory));
+        let unsound = |weights: &[f32], features: &[f32]| {
+            FeatureMemory::from_parts(3, weights.to_vec(), features.to_vec()).is_none()
+        };
+        assert!(unsound(&weights, &features[1..]) && unsound(&weights[1..], &features));
+        assert!(unsound(&[f32::NAN, 0.0], &features) && unsound(&[-1.0, 0.0], &features));
+        assert!(unsound(&weights, &[f32::INFINITY; 6]));
+        assert!(FeatureMemory::from_parts(usize::MAX, vec![0.0; 2], Vec::new()).is_none());
     }
 
     #[test]

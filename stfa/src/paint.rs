@@ -58,6 +58,7 @@ struct Corrections {
 #[derive(Debug)]
 pub struct LearnedAppearance {
     network: Network,
+    digest: u64,
     body: BodyGraph,
     place: Tensor<2>,
     edges: Tensor<1, Int>,
@@ -81,6 +82,7 @@ impl LearnedAppearance {
         let (place, edges) = network.body_tensors(&body);
         Self {
             network,
+            digest: parameters.digest(),
             body,
             place,
             edges,
@@ -95,6 +97,24 @@ impl LearnedAppearance {
     /// Continues from the features that `old` has accumulated, for the same body and weights.
     pub fn resume(&mut self, old: &Self) {
         self.memory.clone_from(&old.memory);
+    }
+
+    /// Returns the features that were accumulated.
+    #[must_use]
+    pub fn memory(&self) -> &FeatureMemory {
+        &self.memory
+    }
+
+    /// Continues from accumulated features, of the same body and weights; a memory of another size is forgotten by the next
+    /// [`Self::paint`].
+    pub fn restore(&mut self, memory: FeatureMemory) {
+        self.memory = memory;
+    }
+
+    /// Returns [`Parameters::digest`] of the weights.
+    #[must_use]
+    pub fn digest(&self) -> u64 {
+        self.digest
     }
 
     /// Forgets all earlier frames.

@@ -33,6 +33,14 @@ impl Parameters {
         file.write(path, self.metadata(card))
     }
 
+    /// Returns a number that differs for other weights: FNV-1a of all values in the order of their names.
+    #[must_use]
+    pub fn digest(&self) -> u64 {
+        let values = self.by_name.values().flat_map(|parameter| &parameter.values);
+        let fold = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
+        values.flat_map(|value| value.to_le_bytes()).fold(0xcbf2_9ce4_8422_2325, fold)
+    }
+
     pub(crate) fn push_to(&self, file: &mut TensorFile, prefix: &str) {
         for (name, parameter) in &self.by_name {
             file.push(format!("{prefix}{name}"), parameter.shape.clone(), &parameter.values);

@@ -1,6 +1,11 @@
 //! People are found, measured and followed from raw images.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking, in its helpers too
 
+use std::{
+    io::{BufRead as _, BufReader},
+    process::{Command, Stdio},
+};
+
 use flyrig_tests::run;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
@@ -25,6 +30,32 @@ fn a_rig_measures_whoever_comes_and_then_follows_the_person() {
     let refused = run(PROGRAM, &["run", "rig.toml"], folder.path()).unwrap();
     assert_eq!(refused.code, Some(1));
     assert!(refused.stderr.contains("perception.people is 5, it must lie between 1 and 4"), "{}", refused.stderr);
+}
+
+#[test]
+fn a_signal_has_everybody_measured_again() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("rig.toml"), RIG.replace("frames = 22", "frames = 70")).unwrap();
+    let mut rig = Command::new(PROGRAM)
+        .args(["run", "rig.toml"])
+        .current_dir(folder.path())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let id = rig.id().to_string();
+    let mut said = Vec::new();
+    // Until the rig ends, after its last frame.
+    for line in BufReader::new(rig.stderr.take().unwrap()).lines() {
+        let line = line.unwrap();
+        if line.contains("person 0 is 1.") {
+            assert!(Command::new("kill").args(["-USR1", &id]).status().unwrap().success());
+        }
+        said.push(line);
+    }
+    let said = said.join("\n");
+    assert!(rig.wait().unwrap().success(), "{said}");
+    assert_eq!(said.matches("SIGUSR1, everybody is measured again").count(), 1, "{said}");
+    assert_eq!(said.matches("person 0 was measured again: 1.").count(), 1, "{said}");
 }
 
 #[test]

@@ -61,7 +61,8 @@ struct Track {
     turns: Turns,
     nanos: i64,
     marks: [DVec3; LANDMARK_COUNT],
-    velocity: [DVec3; LANDMARK_COUNT],
+    /// Metres a second; `None` of a person who was seen at one instant only.
+    velocity: Option<[DVec3; LANDMARK_COUNT]>,
     /// By slot.
     looks: Vec<Option<Look>>,
     texture: Texture,
@@ -71,7 +72,12 @@ impl Track {
     /// Landmarks at a time a little later.
     fn predicted(&self, nanos: i64) -> [DVec3; LANDMARK_COUNT] {
         let ahead = secs(nanos.saturating_sub(self.nanos)).clamp(0.0, MAX_DELAY_SECS);
-        std::array::from_fn(|i| self.marks[i] + self.velocity[i] * ahead)
+        std::array::from_fn(|i| self.marks[i] + self.motion(i, ahead))
+    }
+
+    /// How far a landmark moves in a time, metres.
+    fn motion(&self, landmark: usize, secs: f64) -> DVec3 {
+        self.velocity.map_or(DVec3::ZERO, |velocity| velocity[landmark] * secs)
     }
 }
 
@@ -226,7 +232,7 @@ impl PoseEstimator {
             turns,
             nanos,
             marks,
-            velocity: [DVec3::ZERO; LANDMARK_COUNT],
+            velocity: None,
             looks: vec![None; self.rig.cameras.len()],
             texture: Texture::new(&self.template, self.rig.cameras.len()),
         });
@@ -391,16 +397,19 @@ impl PoseEstimator {
 
     fn remember(&mut self, set: &FrameSet, turns: Turns, mut looks: Vec<Option<Look>>, texture: Texture) {
         let marks = self.model.marks(&turns);
-        let mut velocity = [DVec3::ZERO; LANDMARK_COUNT];
-        if let Some(last) = &self.track {
+        let velocity = self.track.as_ref().and_then(|last| {
             let dt = secs(set.master_nanos.saturating_sub(last.nanos));
-            if (1e-3..0.2).contains(&dt) {
-                for (i, v) in velocity.iter_mut().enumerate() {
+            match dt {
+                // The same set again.
+                _ if dt < 1e-3 => last.velocity,
+                // Too long ago to say anything of now.
+                _ if dt >= 0.2 => Some([DVec3::ZERO; LANDMARK_COUNT]),
+                _ => Some(std::array::from_fn(|i| {
                     let now = ((marks[i] - last.marks[i]) / dt).clamp_length_max(MAX_SPEED);
-                    *v = 0.5 * (last.velocity[i] + now);
-                }
+                    last.velocity.map_or(now, |before| 0.5 * (before[i] + now))
+                })),
             }
-        }
+        });
         let body = LookBody { nanos: set.master_nanos, turns: Arc::new(turns.clone()), marks };
         for look in looks.iter_mut().flatten() {
             look.body.get_or_insert_with(|| body.clone());

@@ -42,6 +42,8 @@ struct Place {
     learning: Option<(Vec<Vec<Option<ViewKeypoints>>>, i64)>,
     /// Whether a shape is known.
     known: bool,
+    /// Whether the shape that is being measured replaces the known one, however little they differ.
+    renews: bool,
     /// Number of the shape.
     shape: u32,
     clothes: Option<ClothesColors>,
@@ -57,9 +59,15 @@ struct Place {
 impl Place {
     /// The shape is known.
     fn know(&mut self) -> Result<(), TrackError> {
-        (self.learning, self.known) = (None, true);
+        (self.learning, self.known, self.renews) = (None, true, false);
         self.estimator.look_at_all(false);
         self.hands.as_mut().map_or(Ok(()), |hands| hands.set_template(self.estimator.template()))
+    }
+
+    /// Begins to measure the person who is followed.
+    fn measure(&mut self) {
+        self.learning = Some((Vec::new(), i64::MIN));
+        self.estimator.look_at_all(true);
     }
 
     /// The template that poses are for.
@@ -133,6 +141,7 @@ impl EstimatedPerception {
             estimator: estimator.clone(),
             learning: learning.clone(),
             known: learning.is_none(),
+            renews: false,
             shape: 0,
             clothes: None,
             seen: 0,
@@ -286,14 +295,15 @@ impl EstimatedPerception {
             let measured = place.estimator.measure_shape(keypoints);
             let taken = measured.and_then(|(template, fit)| {
                 let is_other = place.known && bone_difference(place.estimator.template(), &template) > OTHER_SHAPE;
-                if is_other {
-                    tracing::info!("person {} is somebody else now, {fit}", place.id);
-                    place.shape += 1;
-                } else if !place.known {
-                    tracing::info!("person {} is {fit}", place.id);
+                match (place.known, is_other, place.renews) {
+                    (false, ..) => tracing::info!("person {} is {fit}", place.id),
+                    (.., true) => tracing::info!("person {} was measured again: {fit}", place.id),
+                    (_, true, _) => tracing::info!("person {} is somebody else now, {fit}", place.id),
+                    // Somebody who comes back keeps the shape, and with it the colours.
+                    _ => return Ok(()),
                 }
-                // Somebody who comes back keeps the shape, and with it the colours.
-                if is_other || !place.known { place.estimator.take_shape(template) } else { Ok(()) }
+                place.shape += u32::from(place.known);
+                place.estimator.take_shape(template)
             });
             if let Err(error) = taken {
                 tracing::warn!(%error, "the shape of person {} is not known yet, trying again", place.id);
@@ -320,8 +330,7 @@ impl EstimatedPerception {
                     place.seen += 1;
                     place.missing_since = None;
                     if std::mem::take(&mut place.has_left) && place.known && self.measures {
-                        place.learning = Some((Vec::new(), i64::MIN));
-                        place.estimator.look_at_all(true);
+                        place.measure();
                     }
                 }
                 Err(_) => {
@@ -368,6 +377,15 @@ fn count_stages(estimate: &PoseEstimate, stages: &mut StageTimes) {
 }
 
 impl Perception for EstimatedPerception {
+    fn measure_again(&mut self) -> bool {
+        let known = self.places.iter_mut().filter(|place| self.measures && place.known);
+        known.for_each(|place| {
+            place.renews = true;
+            place.measure();
+        });
+        self.measures
+    }
+
     fn set_effort(&mut self, effort: Effort) {
         self.mattes = effort.mattes;
         for place in &mut self.places {

@@ -46,7 +46,7 @@ impl PoseEstimator {
             turns: first.turns.clone(),
             nanos: set.master_nanos,
             marks,
-            velocity: [DVec3::ZERO; LANDMARK_COUNT],
+            velocity: None,
             looks: vec![None; self.rig.cameras.len()],
             texture: Texture::default(),
         };
@@ -68,7 +68,8 @@ impl PoseEstimator {
         let start = Instant::now();
         let predicted = track.predicted(set.master_nanos);
         let config = &self.config;
-        let (look_after_m, most) = match (self.looks_at_all, config.looks) {
+        // How far somebody has moved who was seen once, nobody can predict.
+        let (look_after_m, most) = match (self.looks_at_all || track.velocity.is_none(), config.looks) {
             (true, _) => (0.0, usize::MAX),
             (false, 0) => (config.look_after_m, usize::MAX),
             (false, most) => (config.look_after_m, most),
@@ -134,7 +135,7 @@ impl PoseEstimator {
                 seen = observe(camera, &view, &look.sighting.keypoints, config.confidence_threshold);
                 if let Some((track, predicted)) = track {
                     for (i, (carried, trust)) in look.carried(&track.marks, predicted).into_iter().enumerate() {
-                        shift[i] = track.velocity[i] * delay_secs + carried;
+                        shift[i] = track.motion(i, delay_secs) + carried;
                         seen[i] = seen[i].map(|seen| Observation { confidence: seen.confidence * trust, ..seen });
                     }
                 }
