@@ -5,14 +5,14 @@ use std::sync::Arc;
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, Simulator};
 use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet};
-use flyrig_types::{Frame, FrameSet};
+use flyrig_types::{Frame, FrameSet, Image};
 
 const STEP_NANOS: i64 = 33_333_333;
 
 fn set(simulator: &mut Simulator, index: u64, nanos: i64) -> FrameSet {
     let slots: Vec<usize> = (0..simulator.rig().cameras.len()).collect();
     let images = simulator.capture_all(nanos, &slots).unwrap();
-    let frame = |(slot, (image, _))| {
+    let frame = |(slot, (image, _)): (usize, (Image, _))| {
         let camera = simulator.rig().cameras[slot].id.clone();
         Some(Arc::new(Frame { camera, sequence: index, capture_nanos: nanos, exposure_nanos: None, image, mask: None }))
     };

@@ -168,7 +168,14 @@ impl PoseEstimator {
                 let dt = secs(set.master_nanos.saturating_sub(track.nanos));
                 let sigma_rad = config.smooth_rad * (dt * 30.0).clamp(0.1, 30.0).sqrt();
                 evidence.before = Some(Before { turns: track.turns.clone(), sigma_rad });
-                evidence.problem(&self.model, config).solve(&track.turns, config.max_steps)
+                let has_news = looks.iter().flatten().any(|look| look.body.is_none());
+                if has_news {
+                    evidence.problem(&self.model, config).solve(&track.turns, config.max_steps)
+                } else {
+                    // Landmarks that were carried along say nothing new. A fit to them alone would leave what outlines and
+                    // texture have found, and masks made there follow its bias.
+                    Some((track.turns.clone(), 0))
+                }
             }
             None => {
                 let aligned = align_trunk(&self.model, &world)
