@@ -15,6 +15,7 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use crate::background::Background;
+use crate::beside::beside_each_other;
 use crate::body_model::{BodyModel, Turns};
 use crate::body_shape::ShapeSpace;
 use crate::crop::Crop;

@@ -47,9 +47,11 @@ impl LandmarkNet {
     pub fn run(&self, rgb: &[f32]) -> Result<NetOutputs, TrackError> {
         let failed = |error: TractError| self.failed(&format!("failed: {error:#}"));
         let input = Tensor::from_shape(&[1, self.side, self.side, 3], rgb).map_err(failed)?;
-        // Three views on two cores: the last one's products are shared by both.
-        let run = || self.model.run(tvec!(input.into()));
-        let outputs = multithread_tract_scope(Executor::RayonGlobal, run).map_err(failed)?;
+        // All cores share the products. Not so on one of rayon's threads: while it waits for another one's share it would take up
+        // other work, and tract panics where that is another run.
+        let is_of_pool = rayon::current_thread_index().is_some();
+        let executor = if is_of_pool { Executor::SingleThread } else { Executor::RayonGlobal };
+        let outputs = multithread_tract_scope(executor, || self.model.run(tvec!(input.into()))).map_err(failed)?;
         Ok(NetOutputs { net: self.clone(), outputs })
     }
 

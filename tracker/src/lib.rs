@@ -15,6 +15,7 @@
 
 mod anatomy;
 mod background;
+mod beside;
 mod body_model;
 mod body_shape;
 mod config;

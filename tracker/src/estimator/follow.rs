@@ -76,23 +76,22 @@ impl PoseEstimator {
         };
         let has_image = |slot: usize| pictures.get(slot).is_some_and(Option::is_some);
         let due = due(&track.looks, has_image, &predicted, set.master_nanos, look_after_m, most);
-        let looks: Vec<Option<Look>> = pictures
-            .par_iter()
-            .zip(&self.rig.cameras)
-            .enumerate()
-            .map(|(slot, (picture, camera))| {
-                let Some(picture) = picture.as_ref().filter(|_| due[slot]) else {
-                    return Ok(track.looks[slot].clone());
-                };
-                let expected = project_all(camera, &predicted);
-                let Some(crop) = Crop::around(&expected) else { return Ok(None) };
-                let sighting = Sighting::take(&self.net, picture, crop)?;
-                // Two people in one crop: the network may have chosen the other one.
-                let own = sighting.mean_distance(&expected).unwrap_or(f64::INFINITY);
-                let is_other = |marks| sighting.mean_distance(&project_all(camera, marks)).is_some_and(|d| d < own);
-                Ok((!others.iter().any(is_other)).then(|| Look::fresh(sighting)))
-            })
-            .collect::<Result<_, TrackError>>()?;
+        let look = |slot: usize| -> Result<Option<Look>, TrackError> {
+            let Some(picture) = &pictures[slot] else { return Ok(None) };
+            let camera = &self.rig.cameras[slot];
+            let expected = project_all(camera, &predicted);
+            let Some(crop) = Crop::around(&expected) else { return Ok(None) };
+            let sighting = Sighting::take(&self.net, picture, crop)?;
+            // Two people in one crop: the network may have chosen the other one.
+            let own = sighting.mean_distance(&expected).unwrap_or(f64::INFINITY);
+            let is_other = |marks| sighting.mean_distance(&project_all(camera, marks)).is_some_and(|d| d < own);
+            Ok((!others.iter().any(is_other)).then(|| Look::fresh(sighting)))
+        };
+        let slots: Vec<usize> = (0..pictures.len()).filter(|&slot| due[slot]).collect();
+        let mut looks = track.looks.clone();
+        for (slot, look) in slots.iter().zip(beside_each_other(slots.len(), |at| look(slots[at]))) {
+            looks[*slot] = look?;
+        }
         seconds.net += start.elapsed().as_secs_f64();
         match self.fit(set, looks, Some((track, &predicted)), seconds) {
             Ok(fitted) if fitted.relative < OFF_TRACK => Ok(Some(fitted)),

@@ -1,0 +1,31 @@
+//! Runs of a network beside each other.
+
+use rayon::prelude::*;
+
+/// Returns `work` of every index below `count`. As many as there are cores run beside each other, each on one of rayon's threads,
+/// where a network works alone ([`crate::landmark_net::LandmarkNet::run`]); the few that are left over run one after the other
+/// on this thread, each with all cores.
+pub(crate) fn beside_each_other<T: Send>(count: usize, work: impl Fn(usize) -> T + Sync + Send) -> Vec<T> {
+    let threads = rayon::current_num_threads().max(1);
+    let left = count % threads;
+    let alone = if 2 * left <= threads { count - left } else { count };
+    let mut results: Vec<T> = (0..alone).into_par_iter().map(&work).collect();
+    results.extend((alone..count).map(work));
+    results
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn everything_is_done_once_in_order_from_any_thread() {
+        let square = |at: usize| at * at;
+        for count in [0, 1, 2, 7, 100] {
+            let expected: Vec<usize> = (0..count).map(square).collect();
+            assert_eq!(beside_each_other(count, square), expected);
+            let (inside, _) = rayon::join(|| beside_each_other(count, square), || ());
+            assert_eq!(inside, expected);
+        }
+    }
+}
