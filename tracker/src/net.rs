@@ -110,6 +110,23 @@ mod tests {
     }
 
     #[test]
+    fn runs_from_many_threads_and_from_rayons_own_do_not_meet() {
+        use rayon::prelude::*;
+        let net = PoseNet::embedded().unwrap();
+        let grey = vec![0.5; NET_SIDE * NET_SIDE * 3];
+        let run = |_| net.run(&grey).unwrap().presence;
+        let expected = run(0);
+        std::thread::scope(|scope| {
+            for thread in 0..4 {
+                scope.spawn(move || match thread % 2 {
+                    0 => (0..8).into_par_iter().for_each(|i| assert_eq!(run(i), expected)),
+                    _ => (0..8).for_each(|i| assert_eq!(run(i), expected)),
+                });
+            }
+        });
+    }
+
+    #[test]
     fn a_damaged_file_is_an_error() {
         assert_eq!(PoseNet::from_onnx(b"not an ONNX file").unwrap_err().kind, TrackErrorKind::Net);
         assert_eq!(PoseNet::from_onnx(&EMBEDDED[..EMBEDDED.len() / 2]).unwrap_err().kind, TrackErrorKind::Net);
