@@ -114,7 +114,7 @@ mod tests {
         use rayon::prelude::*;
         let net = PoseNet::embedded().unwrap();
         let grey = vec![0.5; NET_SIDE * NET_SIDE * 3];
-        let run = |_| net.run(&grey).unwrap().presence;
+        let run = |_| net.run(&grey).unwrap().presence.to_bits();
         let expected = run(0);
         std::thread::scope(|scope| {
             for thread in 0..4 {
