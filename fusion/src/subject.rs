@@ -588,7 +588,7 @@ impl Subject {
             if let (Some(Networks::Processor(networks)), Some(Networks::Processor(old))) =
                 (&mut self.networks, &old.networks)
             {
-                networks.resume(old);
+                networks.restore(old.memory().clone());
             }
         }
     }

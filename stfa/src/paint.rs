@@ -94,11 +94,6 @@ impl LearnedAppearance {
         }
     }
 
-    /// Continues from the features that `old` has accumulated, for the same body and weights.
-    pub fn resume(&mut self, old: &Self) {
-        self.memory.clone_from(&old.memory);
-    }
-
     /// Returns the features that were accumulated.
     #[must_use]
     pub fn memory(&self) -> &FeatureMemory {
