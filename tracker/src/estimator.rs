@@ -125,6 +125,11 @@ struct Evidence {
 }
 
 impl Fitted {
+    /// Views that the network looked at in this set.
+    fn looked(&self) -> usize {
+        self.looks.iter().flatten().filter(|look| look.body.is_none()).count()
+    }
+
     /// Time of a slot's frame less the set's, seconds.
     fn delay_secs(&self, slot: usize) -> f64 {
         self.evidence.views.iter().find(|view| view.slot == slot).map_or(0.0, |view| view.delay_secs)
@@ -286,22 +291,45 @@ impl PoseEstimator {
                 return Err(error);
             }
         };
-        self.finish(set, &pictures, fitted, seconds)
+        let known = self.track.as_mut().map(|track| std::mem::take(&mut track.texture));
+        let mut texture = known.unwrap_or_else(|| Texture::new(&self.template, self.rig.cameras.len()));
+        let before = (fitted.looked() == 0).then(|| texture.clone());
+        let (mut fitted, mut masks) = self.finish(set, &pictures, fitted, &mut texture, &mut seconds);
+        if let Some(before) = before
+            && let Some(again) = self.look_after_all(set, &pictures, &fitted.turns, others, &mut seconds)?
+        {
+            texture = before;
+            (fitted, masks) = self.finish(set, &pictures, again, &mut texture, &mut seconds);
+        }
+        let looked = fitted.looked();
+        self.remember(set, fitted.turns.clone(), fitted.looks, texture);
+        Ok(PoseEstimate {
+            pose: self.model.to_pose(&fitted.turns),
+            masks,
+            keypoints: fitted.keypoints,
+            quality: PoseQuality {
+                views: fitted.views,
+                residual_px: fitted.residual_px,
+                triangulated: fitted.points.iter().flatten().count(),
+                looked,
+                seconds,
+            },
+            points: fitted.points.map(|point| point.map(|p| p.position)),
+        })
     }
 
-    /// Masks, the fit to their outlines, and the estimate.
+    /// Makes the masks, and fits the pose to their outlines and the texture.
     fn finish(
-        &mut self,
+        &self,
         set: &FrameSet,
         pictures: &[Option<Rgb<'_>>],
         mut fitted: Fitted,
-        mut seconds: StageSeconds,
-    ) -> Result<PoseEstimate, TrackError> {
+        texture: &mut Texture,
+        seconds: &mut StageSeconds,
+    ) -> (Fitted, Vec<Option<Mask>>) {
         let start = Instant::now();
         let mut masks = self.masks(set, pictures, &mut fitted);
-        seconds.masks = start.elapsed().as_secs_f64();
-        let known = self.track.as_mut().map(|track| std::mem::take(&mut track.texture));
-        let mut texture = known.unwrap_or_else(|| Texture::new(&self.template, self.rig.cameras.len()));
+        seconds.masks += start.elapsed().as_secs_f64();
         if self.config.outline_rounds > 0 {
             let start = Instant::now();
             let given: Vec<Option<&Mask>> = if self.config.masks {
@@ -309,24 +337,13 @@ impl PoseEstimator {
             } else {
                 set.frames.iter().map(|frame| frame.as_ref().and_then(|frame| frame.mask.as_ref())).collect()
             };
-            fitted.turns = self.refine(set, pictures, &fitted, &given, &mut texture);
-            seconds.outline = start.elapsed().as_secs_f64();
+            fitted.turns = self.refine(set, pictures, &fitted, &given, texture);
+            seconds.outline += start.elapsed().as_secs_f64();
         }
         if !self.config.masks {
             masks.fill(None);
         }
-        let looked = fitted.looks.iter().flatten().filter(|look| look.body.is_none()).count();
-        self.remember(set, fitted.turns.clone(), fitted.looks, texture);
-        let pose = self.model.to_pose(&fitted.turns);
-        let views = fitted.views;
-        let triangulated = fitted.points.iter().flatten().count();
-        Ok(PoseEstimate {
-            pose,
-            masks,
-            keypoints: fitted.keypoints,
-            points: fitted.points.map(|point| point.map(|p| p.position)),
-            quality: PoseQuality { views, residual_px: fitted.residual_px, triangulated, looked, seconds },
-        })
+        (fitted, masks)
     }
 
     /// Landmarks of the person at a time, as they have moved of late; `None` while nobody is tracked.

@@ -13,7 +13,8 @@ impl PoseEstimator {
         seconds: &mut StageSeconds,
     ) -> Result<Fitted, TrackError> {
         if let Some(track) = &self.track
-            && let Some(fitted) = self.follow(set, pictures, track, others, seconds)?
+            && let Some(fitted) =
+                self.follow(set, pictures, (track, &track.predicted(set.master_nanos)), others, seconds)?
         {
             self.search = Search::default();
             return Ok(fitted);
@@ -50,36 +51,57 @@ impl PoseEstimator {
             looks: vec![None; self.rig.cameras.len()],
             texture: Texture::default(),
         };
-        match self.follow(set, pictures, &start, others, seconds)? {
+        match self.follow(set, pictures, (&start, &start.marks), others, seconds)? {
             Some(second) if second.relative <= first.relative * 1.5 => Ok(second),
             _ => Ok(first),
         }
     }
 
-    /// One look through crops around the predicted body; `None` when the person is not there any more.
+    /// The views that the network looks at again when the body's landmarks are at `marks`.
+    fn due(&self, set: &FrameSet, pictures: &[Option<Rgb<'_>>], track: &Track, marks: &Marks) -> Vec<bool> {
+        // How far somebody has moved who was seen once, nobody can predict.
+        let (look_after_m, most) = match (self.looks_at_all || track.velocity.is_none(), self.config.looks) {
+            (true, _) => (0.0, usize::MAX),
+            (false, 0) => (self.config.look_after_m, usize::MAX),
+            (false, most) => (self.config.look_after_m, most),
+        };
+        let has_image = |slot: usize| pictures.get(slot).is_some_and(Option::is_some);
+        due(&track.looks, has_image, marks, set.master_nanos, look_after_m, most)
+    }
+
+    /// Looks after all where outlines and texture have moved the body of a set without a look farther than was predicted;
+    /// `None` where they have not, or where the looks agree with nobody.
+    pub(super) fn look_after_all(
+        &self,
+        set: &FrameSet,
+        pictures: &[Option<Rgb<'_>>],
+        turns: &Turns,
+        others: &[Marks],
+        seconds: &mut StageSeconds,
+    ) -> Result<Option<Fitted>, TrackError> {
+        let Some(track) = &self.track else { return Ok(None) };
+        let marks = self.model.marks(turns);
+        if !self.due(set, pictures, track, &marks).contains(&true) {
+            return Ok(None);
+        }
+        self.follow(set, pictures, (track, &marks), others, seconds)
+    }
+
+    /// One look through crops around the landmarks where they are expected; `None` when the person is not there any more.
     fn follow(
         &self,
         set: &FrameSet,
         pictures: &[Option<Rgb<'_>>],
-        track: &Track,
+        (track, predicted): (&Track, &Marks),
         others: &[Marks],
         seconds: &mut StageSeconds,
     ) -> Result<Option<Fitted>, TrackError> {
         let start = Instant::now();
-        let predicted = track.predicted(set.master_nanos);
-        let config = &self.config;
-        // How far somebody has moved who was seen once, nobody can predict.
-        let (look_after_m, most) = match (self.looks_at_all || track.velocity.is_none(), config.looks) {
-            (true, _) => (0.0, usize::MAX),
-            (false, 0) => (config.look_after_m, usize::MAX),
-            (false, most) => (config.look_after_m, most),
-        };
-        let has_image = |slot: usize| pictures.get(slot).is_some_and(Option::is_some);
-        let due = due(&track.looks, has_image, &predicted, set.master_nanos, look_after_m, most);
+        let due = self.due(set, pictures, track, predicted);
         let look = |slot: usize| -> Result<Option<Look>, TrackError> {
             let Some(picture) = &pictures[slot] else { return Ok(None) };
             let camera = &self.rig.cameras[slot];
-            let expected = project_all(camera, &predicted);
+            let expected = project_all(camera, predicted);
             let Some(crop) = Crop::around(&expected) else { return Ok(None) };
             let sighting = Sighting::take(&self.net, picture, crop)?;
             // Two people in one crop: the network may have chosen the other one.
@@ -93,7 +115,7 @@ impl PoseEstimator {
             looks[*slot] = look?;
         }
         seconds.net += start.elapsed().as_secs_f64();
-        match self.fit(set, looks, Some((track, &predicted)), seconds) {
+        match self.fit(set, looks, Some((track, predicted)), seconds) {
             Ok(fitted) if fitted.relative < OFF_TRACK => Ok(Some(fitted)),
             Ok(_) => Ok(None),
             Err(error) if error.kind == TrackErrorKind::Lost => Ok(None),
