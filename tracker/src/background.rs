@@ -23,6 +23,14 @@ const STEADY: f32 = 14.0;
 const DIFFERENT_UPDATES: u8 = 15;
 /// Share of the difference that the plate takes over in an update.
 const FOLLOW: f32 = 1.0 / 16.0;
+/// Distance from body and mask, in the gate's unit, from which a pixel in a person's reach is likely to show background.
+const CLEAR: f32 = 0.4;
+/// Such pixels are learnt in one of so many updates: a part of the person that the mask misses has time to move.
+const CLEAR_EVERY: u32 = 4;
+/// Share of the background around the body that has to be known for a mask from it and the body alone.
+pub(crate) const MOSTLY_KNOWN: f64 = 0.7;
+/// Updates in which a background that is being learnt asks for every image.
+const EAGER_UPDATES: u32 = 60;
 /// Share of the image that differs where nobody stands from which it is reported.
 const REPORTED: f32 = 0.003;
 /// Share of the pixels away from people that have to be known again after a change.
@@ -104,6 +112,28 @@ pub(crate) struct Plate {
     /// Whether a shift was looked for, and a difference reported.
     compared: bool,
     reported: bool,
+    /// Updates since the start, or since everything was forgotten.
+    updates: u32,
+}
+
+/// Where a person may be in an image.
+#[derive(Debug, Clone)]
+pub struct PersonArea<'a> {
+    /// Reach of the posed body.
+    pub gate: BodyGate,
+    /// The person's mask; without one nothing in the body's reach is learnt.
+    pub mask: Option<&'a Mask>,
+}
+
+/// What a pixel may show.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Shows {
+    /// Nobody reaches it.
+    Background,
+    /// In somebody's reach, but away from body and mask.
+    LikelyBackground,
+    /// On a person, or close by.
+    Person,
 }
 
 impl Background {
@@ -126,16 +156,26 @@ impl Background {
             ));
         }
         let picture = Rgb::new(plate)?;
-        let pixels = picture.width * picture.height;
         let plate = Plate {
             values: floats(&picture),
-            steady: vec![STEADY_UPDATES; pixels],
-            different: vec![0; pixels],
-            renewing: false,
-            compared: false,
-            reported: false,
+            steady: vec![STEADY_UPDATES; picture.width * picture.height],
+            ..Plate::unknown(picture.width, picture.height)
         };
+        let plate = Plate { compared: false, updates: EAGER_UPDATES, ..plate };
         Ok(Self { width: picture.width, height: picture.height, kind: Kind::Plate(plate) })
+    }
+
+    /// Starts with nothing known of what `camera` sees: [`Self::update`] learns it where nobody stands.
+    #[must_use]
+    pub fn unknown(camera: &Camera) -> Self {
+        let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
+        Self { width, height, kind: Kind::Plate(Plate::unknown(width, height)) }
+    }
+
+    /// Whether much is to be learnt: the next image is worth an update.
+    #[must_use]
+    pub fn is_learning(&self) -> bool {
+        matches!(&self.kind, Kind::Plate(plate) if plate.updates < EAGER_UPDATES)
     }
 
     /// A screen of one colour behind the people that `camera` sees.
@@ -153,20 +193,25 @@ impl Background {
     pub fn mask(&self, image: &Image, gate: &BodyGate) -> Result<Option<Mask>, TrackError> {
         let picture = Rgb::new(image)?;
         let light = self.light(&picture, &|at| !gate.reaches_pixel(at));
+        let light = light.filter(|light| light.known_share(picture.width, gate.bounds) > MOSTLY_KNOWN);
         let evidence = light.and_then(|light| light.evidence(&picture, gate.bounds));
         Ok(evidence.and_then(|evidence| gated_mask(&evidence, gate)))
     }
 
-    /// Takes in an image in which nobody stands but the bodies of `gates`: the background follows slow changes of the light
-    /// and is relearnt after sudden ones. Returns what its owner should know, each once.
+    /// Takes in an image in which nobody stands but `people`: the background follows slow changes of the light and is relearnt
+    /// after sudden ones. Returns what its owner should know, each once.
     ///
     /// # Errors
     /// Kind `Image` when the format cannot be read. Images of another size change nothing.
-    pub fn update(&mut self, image: &Image, gates: &[BodyGate]) -> Result<Vec<BackgroundEvent>, TrackError> {
+    pub fn update(
+        &mut self,
+        image: &Image,
+        people: &[PersonArea<'_>],
+    ) -> Result<Vec<BackgroundEvent>, TrackError> {
         let picture = Rgb::new(image)?;
         match &mut self.kind {
             Kind::Plate(plate) if self.width == picture.width && self.height == picture.height => {
-                Ok(plate.update(&picture, gates))
+                Ok(plate.update(&picture, people))
             }
             _ => Ok(Vec::new()),
         }
@@ -229,6 +274,14 @@ impl BackgroundLight<'_> {
         (known > 0).then_some(evidence)
     }
 
+    /// Share of `bounds` where the background is known, 0..=1.
+    pub fn known_share(&self, width: usize, bounds: [usize; 4]) -> f64 {
+        let Self::Plate(plate, _) = self else { return 1.0 };
+        let [x0, y0, x1, y1] = bounds;
+        let known = (y0..y1).map(|y| (x0..x1).filter(|x| plate.knows(y * width + x)).count()).sum::<usize>();
+        known as f64 / ((x1 - x0) * (y1 - y0)).max(1) as f64
+    }
+
     /// Returns the linear light of a pixel; `None` where the background is not known.
     pub fn at(&self, pixel: usize) -> Option<[f32; 3]> {
         match self {
@@ -242,16 +295,29 @@ impl BackgroundLight<'_> {
 }
 
 impl Plate {
+    fn unknown(width: usize, height: usize) -> Self {
+        Self {
+            values: vec![0.0; 3 * width * height],
+            steady: vec![0; width * height],
+            different: vec![0; width * height],
+            renewing: false,
+            compared: true,
+            reported: false,
+            updates: 0,
+        }
+    }
+
     fn knows(&self, pixel: usize) -> bool {
         self.steady[pixel] >= STEADY_UPDATES
     }
 
-    fn update(&mut self, picture: &Rgb, gates: &[BodyGate]) -> Vec<BackgroundEvent> {
+    fn update(&mut self, picture: &Rgb, people: &[PersonArea<'_>]) -> Vec<BackgroundEvent> {
         let mut events = Vec::new();
         let width = picture.width;
-        let away: Vec<bool> = (0..width * picture.height)
-            .map(|at| !gates.iter().any(|gate| gate.reaches(at % width, at / width)))
-            .collect();
+        self.updates = self.updates.saturating_add(1);
+        let learns_near = self.updates.is_multiple_of(CLEAR_EVERY);
+        let shows = what_pixels_show(picture, people, learns_near);
+        let away: Vec<bool> = shows.iter().map(|shows| *shows == Shows::Background).collect();
         let away_count = away.iter().filter(|away| **away).count();
         if !self.compared {
             self.compared = true;
@@ -272,10 +338,12 @@ impl Plate {
             events.push(BackgroundEvent::Changed(different as f64 / known as f64));
         }
         let (mut old, mut center) = (0usize, [0usize; 2]);
-        for at in (0..away.len()).filter(|&at| away[at]) {
+        for at in (0..shows.len()).filter(|&at| shows[at] != Shows::Person) {
             let now: [f32; 3] = std::array::from_fn(|k| f32::from(picture.bytes[3 * at + k]));
             if !self.knows(at) {
                 self.learn(at, now);
+            } else if !away[at] {
+                // Known well enough, and too near to somebody to be relearnt.
             } else if evidence.values[at] < 0.5 {
                 self.different[at] = 0;
                 let values = self.values[3 * at..3 * at + 3].iter_mut();
@@ -307,7 +375,7 @@ impl Plate {
     fn forget(&mut self) {
         self.steady.fill(0);
         self.different.fill(0);
-        self.renewing = true;
+        (self.renewing, self.updates) = (true, 0);
     }
 
     /// Adds a colour of a pixel that is not known: its mean is, once it has been steady.
@@ -354,6 +422,42 @@ impl Plate {
         let far = best.1[0].abs().max(best.1[1].abs()) >= LEAST_SHIFT;
         (far && best.0 < SHIFT_GAIN * difference(0, 0)).then_some(best.1)
     }
+}
+
+/// What each pixel of an image may show. Without `tells_near` everything in somebody's reach may show the person.
+fn what_pixels_show(picture: &Rgb, people: &[PersonArea<'_>], tells_near: bool) -> Vec<Shows> {
+    let mut shows = vec![Shows::Background; picture.width * picture.height];
+    for PersonArea { gate, mask } in people {
+        let [x0, y0, x1, y1] = gate.bounds;
+        let own_size = |mask: &&Mask| (mask.width() as usize, mask.height() as usize) == (picture.width, picture.height);
+        let mask = mask.filter(own_size).filter(|_| tells_near);
+        let clear_px = CLEAR * gate.unit_px() as f32;
+        let from_mask = mask.map(|mask| {
+            let mut covered = Grid::new(x1 - x0, y1 - y0, 0.0);
+            for (row, y) in covered.values.chunks_exact_mut((x1 - x0).max(1)).zip(y0..y1) {
+                let coverage = &mask.coverage()[y * picture.width + x0..y * picture.width + x1];
+                row.iter_mut().zip(coverage).for_each(|(covered, coverage)| *covered = f32::from(*coverage > 25));
+            }
+            covered.distance_to_set()
+        });
+        for y in y0..y1.min(picture.height) {
+            for x in x0..x1.min(picture.width) {
+                if !gate.reaches(x, y) {
+                    continue;
+                }
+                let at = (y - y0) * gate.distance.width + x - x0;
+                let is_clear = gate.distance.values[at] > CLEAR
+                    && from_mask.as_ref().is_some_and(|distance| distance.values[at] > clear_px);
+                let shown = &mut shows[y * picture.width + x];
+                *shown = match (is_clear, *shown) {
+                    (true, Shows::Background) => Shows::LikelyBackground,
+                    (true, before) => before,
+                    (false, _) => Shows::Person,
+                };
+            }
+        }
+    }
+    shows
 }
 
 #[cfg(test)]
@@ -409,6 +513,10 @@ mod tests {
         BodyGate::of_grid(&body, 60.0)
     }
 
+    fn area(gate: &BodyGate) -> PersonArea<'static> {
+        PersonArea { gate: gate.clone(), mask: None }
+    }
+
     fn evidence(background: &Background, now: &Image) -> Option<Grid> {
         let picture = Rgb::new(now).unwrap();
         background.light(&picture, &|_| true)?.evidence(&picture, [0, 0, SIDE, SIDE])
@@ -424,12 +532,12 @@ mod tests {
         let mut background = Background::from_plate(&camera(), &picture(1, room)).unwrap();
         let gate = gate();
         for seed in 2..6 {
-            assert_eq!(background.update(&picture(seed, room), std::slice::from_ref(&gate)).unwrap(), []);
+            assert_eq!(background.update(&picture(seed, room), &[area(&gate)]).unwrap(), []);
         }
         let mut events = Vec::new();
         for seed in 10..30 {
             let now = picture(seed, dimmed);
-            events.extend(background.update(&now, std::slice::from_ref(&gate)).unwrap());
+            events.extend(background.update(&now, &[area(&gate)]).unwrap());
             if let Some(evidence) = evidence(&background, &now) {
                 assert!(evidence.values.iter().all(|v| *v <= 0.5), "what is not known is no evidence");
             }
@@ -452,7 +560,7 @@ mod tests {
                 let lamp = 1.0 + 0.4 * warm * (x as f64 / SIDE as f64);
                 std::array::from_fn(|k| room(x, y)[k] * lamp * [1.0 + 0.1 * warm, 1.0, 1.0 - 0.3 * warm][k])
             });
-            assert_eq!(background.update(&now, std::slice::from_ref(&gate)).unwrap(), [], "step {step}");
+            assert_eq!(background.update(&now, &[area(&gate)]).unwrap(), [], "step {step}");
             assert!(wrong(&background, &now) < 40, "step {step}: {}", wrong(&background, &now));
         }
     }
@@ -461,7 +569,7 @@ mod tests {
     fn a_shifted_plate_is_recognised() {
         let mut background = Background::from_plate(&camera(), &picture(1, room)).unwrap();
         let moved = picture(2, |x, y| room(x - 5, y + 3));
-        let events = background.update(&moved, &[gate()]).unwrap();
+        let events = background.update(&moved, &[area(&gate())]).unwrap();
         assert_eq!(events, [BackgroundEvent::Shifted(5, -3)]);
         assert!(evidence(&background, &moved).is_none(), "the plate is not used");
     }
@@ -472,7 +580,7 @@ mod tests {
         let mut background = Background::from_plate(&camera(), &picture(1, in_plate)).unwrap();
         let (gate, mut events) = (gate(), Vec::new());
         for seed in 2..40 {
-            events.extend(background.update(&picture(seed, room), std::slice::from_ref(&gate)).unwrap());
+            events.extend(background.update(&picture(seed, room), &[area(&gate)]).unwrap());
         }
         let [BackgroundEvent::Differs(share, [x, y])] = events[..] else { panic!("{events:?}") };
         assert!(share > 0.05 && (8..18).contains(&x) && (50..75).contains(&y), "{share} at {x}, {y}");
@@ -486,13 +594,13 @@ mod tests {
         let person =
             |x: i64, y: i64| if (42..54).contains(&x) && (30..70).contains(&y) { [10.0; 3] } else { room(x, y) };
         for seed in 0..40 {
-            assert_eq!(background.update(&picture(seed, person), std::slice::from_ref(&gate)).unwrap(), []);
+            assert_eq!(background.update(&picture(seed, person), &[area(&gate)]).unwrap(), []);
         }
         assert!(wrong(&background, &picture(60, person)) > 400);
         // The body everywhere, images of other sizes, black ones.
         let mut everywhere = Grid::new(SIDE, SIDE, 1.0);
         everywhere.values[0] = 1.0;
-        assert_eq!(background.update(&picture(1, dimmed), &[BodyGate::of_grid(&everywhere, 60.0)]).unwrap(), []);
+        assert_eq!(background.update(&picture(1, dimmed), &[area(&BodyGate::of_grid(&everywhere, 60.0))]).unwrap(), []);
         let small = Image::new(2, 2, PixelFormat::Rgb8, vec![0; 12]).unwrap();
         assert_eq!(background.update(&small, &[]).unwrap(), []);
         let black = picture(1, |_, _| [-9.0; 3]);

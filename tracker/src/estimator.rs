@@ -93,7 +93,8 @@ pub struct PoseEstimator {
     model: BodyModel,
     rig: Rig,
     config: PoseConfig,
-    backgrounds: Vec<Option<Background>>,
+    /// By slot.
+    backgrounds: Vec<Option<Arc<Background>>>,
     track: Option<Track>,
     search: Search,
     /// Sets since the person was last seen.
@@ -204,25 +205,26 @@ impl PoseEstimator {
                 format!("a plate for slot {slot} of a rig of {} cameras", self.rig.cameras.len()),
             )
         })?;
-        self.backgrounds[slot] = Some(Background::from_plate(camera, plate)?);
+        self.backgrounds[slot] = Some(Arc::new(Background::from_plate(camera, plate)?));
         Ok(())
     }
 
-    /// Sets the backgrounds by slot, one a camera; masks then use the difference to them. Fewer leave the last cameras as
-    /// they are.
-    pub fn set_backgrounds(&mut self, backgrounds: Vec<Option<Background>>) {
-        self.backgrounds.iter_mut().zip(backgrounds).for_each(|(own, new)| *own = new);
+    /// Sets the backgrounds by slot, one a camera; masks then use the difference to them. Fewer leave the last cameras without
+    /// one.
+    pub fn set_backgrounds(&mut self, mut backgrounds: Vec<Option<Arc<Background>>>) {
+        backgrounds.resize(self.rig.cameras.len(), None);
+        self.backgrounds = backgrounds;
     }
 
-    /// Returns the backgrounds by slot, to update them.
-    pub fn backgrounds_mut(&mut self) -> &mut [Option<Background>] {
-        &mut self.backgrounds
+    /// Returns the backgrounds by slot, to update them; masks do without until they are set again.
+    pub fn take_backgrounds(&mut self) -> Vec<Option<Arc<Background>>> {
+        std::mem::replace(&mut self.backgrounds, vec![None; self.rig.cameras.len()])
     }
 
     /// Returns a camera's background, where it is known.
     #[must_use]
     pub fn background(&self, slot: usize) -> Option<&Background> {
-        self.backgrounds.get(slot)?.as_ref()
+        self.backgrounds.get(slot)?.as_deref()
     }
 
     /// Looks for the person where a pose puts him at a time; false for a pose that does not fit the template.

@@ -45,6 +45,11 @@ impl BodyGate {
         Some(Self { image, bounds, distance, px_per_m })
     }
 
+    /// The unit of [`Self::distance`], pixels.
+    pub(crate) fn unit_px(&self) -> f64 {
+        REACH_M * self.px_per_m
+    }
+
     /// Whether a pixel may show the body or its clothes.
     pub(crate) fn reaches(&self, x: usize, y: usize) -> bool {
         let [x0, y0, x1, y1] = self.bounds;

@@ -57,7 +57,7 @@ mod upsample;
 mod view;
 mod viewers;
 
-pub use background::{Background, BackgroundEvent};
+pub use background::{Background, BackgroundEvent, PersonArea};
 pub use config::PoseConfig;
 pub use deform::{DataTerm, DeformReport, DeformSettings, DeformSolver, DeformTracker, FIRST_FRAMES, PointDerivatives};
 pub use edge_color::{EdgeColor, Matte};

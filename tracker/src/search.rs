@@ -1,5 +1,7 @@
 //! Finding the person: crops over the whole image, and agreement between the views.
 
+use std::sync::Arc;
+
 use flyrig_types::Camera;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
@@ -31,7 +33,7 @@ pub(crate) struct SearchScene<'a> {
     pub cameras: &'a [Camera],
     pub pictures: &'a [Option<Rgb<'a>>],
     /// By slot.
-    pub backgrounds: &'a [Option<Background>],
+    pub backgrounds: &'a [Option<Arc<Background>>],
     pub nanos: i64,
     /// Point nearest to the cameras' optical axes, world metres. People near it are preferred.
     pub center: DVec3,

@@ -8,7 +8,7 @@ use crate::{FusionError, PerceptionSettings};
 /// Backgrounds take in one of so many sets.
 const UPDATE_EVERY: u32 = 4;
 
-/// Returns the background of each camera, where the settings or a plate give one. A key colour replaces the plates.
+/// Returns the background of each camera: that of its plate, or one that is not known yet. A key colour replaces the plates.
 pub(super) fn backgrounds(
     cameras: &[Camera],
     settings: &PerceptionSettings,
@@ -19,7 +19,8 @@ pub(super) fn backgrounds(
     }
     let of = |(slot, camera): (usize, &Camera)| {
         let plate = plates.get(slot).and_then(Option::as_ref);
-        Ok(plate.map(|plate| Background::from_plate(camera, plate)).transpose()?)
+        let known = plate.map(|plate| Background::from_plate(camera, plate)).transpose()?;
+        Ok(Some(known.unwrap_or_else(|| Background::unknown(camera))))
     };
     cameras.iter().enumerate().map(of).collect()
 }
@@ -31,10 +32,10 @@ pub(super) struct BackgroundWatch {
 }
 
 impl BackgroundWatch {
-    /// Counts a set; true when the backgrounds take it in.
-    pub fn is_due(&mut self) -> bool {
+    /// Counts a set; true when the backgrounds take it in. Those that are being learnt take in every set.
+    pub fn is_due(&mut self, are_learning: bool) -> bool {
         self.sets = self.sets.wrapping_add(1);
-        self.sets % UPDATE_EVERY == 1
+        self.sets % UPDATE_EVERY == 1 || are_learning
     }
 }
 
@@ -64,7 +65,7 @@ mod tests {
     #[test]
     fn the_first_set_and_every_fourth_are_taken_in() {
         let mut watch = BackgroundWatch::default();
-        let due: Vec<bool> = (0..9).map(|_| watch.is_due()).collect();
+        let due: Vec<bool> = (0..9).map(|_| watch.is_due(false)).collect();
         assert_eq!(due, [true, false, false, false, true, false, false, false, true]);
     }
 }

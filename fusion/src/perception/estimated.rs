@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, sync::Arc, time::Duration};
 
 use flyrig_body::{Template, skin_mesh};
 use flyrig_tracker::{
-    BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PoseConfig, PoseEstimate, PoseEstimator, PoseNet,
+    BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PersonArea, PoseConfig, PoseEstimate, PoseEstimator, PoseNet,
     ShapeFit, TrackError, ViewKeypoints, is_blank, matte,
 };
 use flyrig_types::{Frame, FrameSet, Image, Mask, PersonId, Pose, Rig};
@@ -129,7 +129,8 @@ impl EstimatedPerception {
         };
         let rounds = config.outline_rounds;
         let mut estimator = PoseEstimator::new(PoseNet::embedded()?, template, rig, config)?;
-        estimator.set_backgrounds(backgrounds(&rig.cameras, settings, plates)?);
+        let backgrounds = backgrounds(&rig.cameras, settings, plates)?;
+        estimator.set_backgrounds(backgrounds.into_iter().map(|background| background.map(Arc::new)).collect());
         let learning = (settings.shape() == Origin::Estimated).then(|| (Vec::new(), i64::MIN));
         estimator.look_at_all(learning.is_some());
         let hands = match settings.hands {
@@ -410,8 +411,10 @@ impl Perception for EstimatedPerception {
         let before: Vec<(bool, u32)> = self.places.iter().map(|place| (place.known, place.shape)).collect();
         self.learn(set, &estimates);
         let mut views = self.views(set, &mut estimates, stages)?;
-        if self.masks == Origin::Estimated && self.watch.is_due() {
-            stages.time("background", || self.follow_backgrounds(set, &estimates))?;
+        let known = self.places.first().map(|place| &place.estimator);
+        let mut known = (0..self.rig.cameras.len()).filter_map(|slot| known?.background(slot));
+        if self.masks == Origin::Estimated && self.watch.is_due(known.any(Background::is_learning)) {
+            stages.time("background", || self.follow_backgrounds(set, &estimates, &views))?;
         }
         let mut observations = Vec::new();
         // A pose belongs to the shape that it was estimated with.
@@ -461,36 +464,44 @@ impl EstimatedPerception {
         &mut self,
         set: &FrameSet,
         estimates: &[Result<PoseEstimate, String>],
+        views: &[Vec<ViewObservation>],
     ) -> Result<(), FusionError> {
-        let Some((first, others)) = self.places.split_first_mut() else { return Ok(()) };
-        let bodies: Vec<_> = std::iter::once(&*first)
-            .chain(others.iter())
+        let bodies: Vec<_> = (self.places.iter())
             .zip(estimates)
-            .filter_map(|(place, estimate)| Some((place.estimator.template(), &estimate.as_ref().ok()?.pose)))
-            .map(|(template, pose)| (template.triangles.clone(), skin_mesh(template, pose).0))
+            .zip(views)
+            .filter_map(|((place, estimate), views)| {
+                let (template, pose) = (place.estimator.template(), &estimate.as_ref().ok()?.pose);
+                Some((template.triangles.clone(), skin_mesh(template, pose).0, views))
+            })
             .collect();
         // Somebody who was lost a moment ago may stand anywhere, and must not become background.
         let is_missing = |place: &Place| place.missing_since.is_some() && !place.has_left && place.seen > 0;
-        if bodies.is_empty() || is_missing(first) || others.iter().any(is_missing) {
+        if bodies.is_empty() || self.places.iter().any(is_missing) {
             return Ok(());
         }
-        let gates =
-            |camera| bodies.iter().filter_map(move |(sides, points)| BodyGate::new(camera, points, sides)).collect();
-        let slots = self.rig.cameras.par_iter().zip(&set.frames).zip(&self.blank);
-        let views = first.estimator.backgrounds_mut().par_iter_mut().zip(slots);
-        let events: Vec<Vec<BackgroundEvent>> = views
-            .map(|(background, ((camera, frame), is_blank))| {
-                let (Some(background), Some(frame), false) = (background, frame, is_blank) else {
-                    return Ok(Vec::new());
-                };
-                let gates: Vec<BodyGate> = gates(camera);
-                background.update(&frame.image, &gates)
+        // Everybody shares them: with one owner they need not be copied.
+        let places = self.places.iter_mut();
+        let mut taken = places.fold(Vec::new(), |_, place| place.estimator.take_backgrounds());
+        let slots: Vec<usize> = set.present().map(|(slot, _)| slot).collect();
+        let areas = |slot: usize, camera| -> Vec<PersonArea<'_>> {
+            let present = slots.iter().position(|present| *present == slot);
+            let area = |(sides, points, views): &'_ (_, Vec<_>, &'_ Vec<ViewObservation>)| {
+                let mask = present.and_then(|index| views.get(index)?.mask.as_ref());
+                Some(PersonArea { gate: BodyGate::new(camera, points, sides)?, mask })
+            };
+            bodies.iter().filter_map(area).collect()
+        };
+        let cameras = self.rig.cameras.par_iter().zip(&set.frames).zip(&self.blank).enumerate();
+        let events: Result<Vec<Vec<BackgroundEvent>>, TrackError> = (taken.par_iter_mut().zip(cameras))
+            .map(|(background, (slot, ((camera, frame), is_blank)))| match (background, frame, is_blank) {
+                (Some(background), Some(frame), false) => {
+                    Arc::make_mut(background).update(&frame.image, &areas(slot, camera))
+                }
+                _ => Ok(Vec::new()),
             })
-            .collect::<Result<_, TrackError>>()?;
-        events.iter().zip(&self.rig.cameras).for_each(|(events, camera)| report(camera, events));
-        for other in others {
-            other.estimator.backgrounds_mut().clone_from_slice(first.estimator.backgrounds_mut());
-        }
+            .collect();
+        self.places.iter_mut().for_each(|place| place.estimator.set_backgrounds(taken.clone()));
+        events?.iter().zip(&self.rig.cameras).for_each(|(events, camera)| report(camera, events));
         Ok(())
     }
 

@@ -1,7 +1,7 @@
 //! People whose poses are known: a simulator's, a recorded motion's.
 
 use flyrig_body::{Template, skin_mesh};
-use flyrig_tracker::{Background, BodyGate, Matte, matte};
+use flyrig_tracker::{Background, BodyGate, Matte, PersonArea, matte};
 use flyrig_types::{Camera, Frame, FrameSet, Image, Mask, PersonId, Pose, PoseTrack, Rig};
 use glam::Vec3;
 
@@ -92,7 +92,7 @@ impl Perception for GivenPerception {
             masks.push(mask);
             edge_colors.push(colors);
         }
-        if self.masks == Origin::Estimated && self.watch.is_due() {
+        if self.masks == Origin::Estimated && self.watch.is_due(self.backgrounds.iter().flatten().any(Background::is_learning)) {
             stages.time("background", || self.follow_backgrounds(set, &poses))?;
         }
         let confidence = if self.masks == Origin::Given { 1.0 } else { 0.5 };
@@ -144,7 +144,8 @@ impl GivenPerception {
             };
             if let Some(background) = background {
                 let gate = BodyGate::new(camera, &bodies.0, &bodies.1);
-                report(camera, &background.update(&frame.image, gate.as_slice())?);
+                let people = gate.map(|gate| PersonArea { gate, mask: None });
+                report(camera, &background.update(&frame.image, people.as_slice())?);
             }
         }
         Ok(())

@@ -1,6 +1,7 @@
 //! Masks of the person whose pose is known.
 
 use super::*;
+use crate::background::MOSTLY_KNOWN;
 
 impl PoseEstimator {
     /// Masks by slot; why there is none goes into the views' quality.
@@ -19,7 +20,7 @@ impl PoseEstimator {
                 let look = fitted.looks[slot].as_ref();
                 let look = look.filter(|l| l.sighting.output.presence >= self.config.presence_threshold);
                 let light = self.background(slot).and_then(|known| known.light(picture, &|at| !gate.reaches_pixel(at)));
-                let evidence = light.and_then(|light| light.evidence(picture, gate.bounds));
+                let evidence = light.as_ref().and_then(|light| light.evidence(picture, gate.bounds));
                 let mask = match (look, &evidence) {
                     (Some(look), evidence) => {
                         let coarse = match &look.body {
@@ -33,8 +34,12 @@ impl PoseEstimator {
                         refine(picture, &coarse, look.sighting.crop.scale(), &gate, evidence.as_ref())
                     }
                     // The network sees nobody here, but the other cameras place the body in this image.
-                    (None, Some(evidence)) => gated_mask(evidence, &gate),
-                    (None, None) => return Err(NoMask::NoPerson),
+                    (None, Some(evidence))
+                        if light.is_some_and(|light| light.known_share(picture.width, gate.bounds) > MOSTLY_KNOWN) =>
+                    {
+                        gated_mask(evidence, &gate)
+                    }
+                    (None, _) => return Err(NoMask::NoPerson),
                 };
                 let mask = mask.ok_or(NoMask::Empty)?;
                 let overlap = gate.overlap(&mask);
