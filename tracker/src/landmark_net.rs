@@ -1,4 +1,4 @@
-//! Landmark networks through tract: loading, running and checking of outputs.
+//! Networks on one image through tract: loading, running and checking of outputs.
 
 use std::sync::Arc;
 
@@ -8,45 +8,60 @@ use tract_onnx::prelude::*;
 use crate::upsample::replace_doublings;
 use crate::{TrackError, TrackErrorKind};
 
-/// A network that takes one square RGB crop.
+/// A network that takes one crop of an image.
 #[derive(Clone)]
 pub(crate) struct LandmarkNet {
     model: Arc<TypedRunnableModel>,
-    /// Side of the crop, pixels.
-    side: usize,
-    /// Name in messages: "pose", "hand" or "face".
-    name: &'static str,
+    /// Shape of the input: an image, and its rows, columns and channels in the network's order.
+    shape: [usize; 4],
+    /// Name in messages: "pose", "hand", "face", or that of a file.
+    name: Arc<str>,
 }
 
 impl LandmarkNet {
-    /// Loads an ONNX file whose input is `side` x `side` x 3.
+    /// Loads an ONNX file that takes square RGB crops of `side` x `side` x 3.
     ///
     /// # Errors
     /// Kind [`TrackErrorKind::Net`] when the file does not load.
-    pub fn load(mut bytes: &[u8], side: usize, name: &'static str) -> Result<Self, TrackError> {
-        let failed = |error: TractError| {
-            TrackError::new(
-                TrackErrorKind::Net,
-                format!("the {name} network does not load ({error:#}); use a file that convert_mediapipe.py made"),
-            )
-        };
-        let length = side as i64;
-        let model = onnx()
-            .model_for_read(&mut bytes)
-            .and_then(|model| model.with_input_fact(0, f32::fact(tvec!(1, length, length, 3)).into()))
-            .and_then(InferenceModelExt::into_optimized)
-            .and_then(|mut model| replace_doublings(&mut model).and_then(|()| model.into_runnable()))
-            .map_err(failed)?;
-        Ok(Self { model, side, name })
+    pub fn load(bytes: &[u8], side: usize, name: &str) -> Result<Self, TrackError> {
+        let hint = "use a file that convert_mediapipe.py made";
+        Self::load_shaped(bytes, |_| Ok([1, side, side, 3]), name).map_err(|mut error| {
+            error.message = format!("{}; {hint}", error.message);
+            error
+        })
     }
 
-    /// Runs one crop: RGB in 0..=1, row by row.
+    /// Loads an ONNX file whose input has the shape that `shape` chooses, given the sides that the file leaves open as `None`.
+    ///
+    /// # Errors
+    /// Kind [`TrackErrorKind::Net`] when the file does not load, or with the message of `shape`.
+    pub fn load_shaped(
+        mut bytes: &[u8],
+        shape: impl FnOnce(&[Option<usize>]) -> Result<[usize; 4], String>,
+        name: &str,
+    ) -> Result<Self, TrackError> {
+        let failed = |what: String| TrackError::new(TrackErrorKind::Net, format!("the {name} network {what}"));
+        let failed_load = |error: TractError| failed(format!("does not load ({error:#})"));
+        let model = onnx().model_for_read(&mut bytes).map_err(failed_load)?;
+        let sides = &model.input_fact(0).map_err(failed_load)?.shape;
+        let sides: Vec<Option<usize>> =
+            sides.dims().map(|side| side.concretize().and_then(|side| side.to_usize().ok())).collect();
+        let shape = shape(&sides).map_err(failed)?;
+        let model = model
+            .with_input_fact(0, f32::fact(shape).into())
+            .and_then(InferenceModelExt::into_optimized)
+            .and_then(|mut model| replace_doublings(&mut model).and_then(|()| model.into_runnable()))
+            .map_err(failed_load)?;
+        Ok(Self { model, shape, name: name.into() })
+    }
+
+    /// Runs one crop, whose numbers are in the order of the input's shape.
     ///
     /// # Errors
     /// Kind [`TrackErrorKind::Net`] when the length is wrong or the network fails.
-    pub fn run(&self, rgb: &[f32]) -> Result<NetOutputs, TrackError> {
+    pub fn run(&self, crop: &[f32]) -> Result<NetOutputs, TrackError> {
         let failed = |error: TractError| self.failed(&format!("failed: {error:#}"));
-        let input = Tensor::from_shape(&[1, self.side, self.side, 3], rgb).map_err(failed)?;
+        let input = Tensor::from_shape(&self.shape, crop).map_err(failed)?;
         // All cores share the products. Not so on one of rayon's threads: while it waits for another one's share it would take up
         // other work, and tract panics where that is another run.
         let is_of_pool = rayon::current_thread_index().is_some();
@@ -57,10 +72,16 @@ impl LandmarkNet {
 
     /// Zeros in the size of a crop.
     pub fn blank(&self) -> Vec<f32> {
-        vec![0.0; self.side * self.side * 3]
+        vec![0.0; self.shape.iter().product()]
     }
 
-    fn failed(&self, message: &str) -> TrackError {
+    /// Shape of the input.
+    pub fn shape(&self) -> [usize; 4] {
+        self.shape
+    }
+
+    /// Returns an error of this network.
+    pub fn failed(&self, message: &str) -> TrackError {
         TrackError::new(TrackErrorKind::Net, format!("the {} network {message}", self.name))
     }
 }
@@ -80,6 +101,18 @@ impl NetOutputs {
         let output = self.outputs.iter().find(|output| output.len() == count).ok_or_else(|| {
             self.net.failed(&format!("has no output of {count} numbers; use a file that convert_mediapipe.py made"))
         })?;
+        self.numbers(output)
+    }
+
+    /// Returns all outputs: their shapes and numbers.
+    ///
+    /// # Errors
+    /// Kind [`TrackErrorKind::Net`] when one holds no numbers, or one that is not finite.
+    pub fn all(&self) -> Result<Vec<(Vec<usize>, Vec<f32>)>, TrackError> {
+        self.outputs.iter().map(|output| Ok((output.shape().to_vec(), self.numbers(output)?))).collect()
+    }
+
+    fn numbers(&self, output: &TValue) -> Result<Vec<f32>, TrackError> {
         let values =
             output.to_plain_array_view::<f32>().map_err(|error| self.net.failed(&format!("failed: {error:#}")))?;
         let values: Vec<f32> = values.iter().copied().collect();

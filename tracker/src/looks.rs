@@ -10,6 +10,7 @@ use glam::{DVec2, DVec3, Vec3};
 
 use crate::LANDMARK_COUNT;
 use crate::body_model::Turns;
+use crate::crop::Crop;
 use crate::grid::Grid;
 use crate::sighting::Sighting;
 use crate::silhouette::net_probability;
@@ -108,9 +109,9 @@ pub(crate) fn corners(camera: &Camera, vertices: &[Vec3]) -> Corners {
 }
 
 /// The network's mask inside of `bounds` (x0, y0, x1, y1, ends excluded), carried from the body `then` to the body `now`.
-pub(crate) fn carried_mask(sighting: &Sighting, then: &Corners, now: &Corners, bounds: [usize; 4]) -> Grid {
+pub(crate) fn carried_mask(mask: &[f32], crop: Crop, then: &Corners, now: &Corners, bounds: [usize; 4]) -> Grid {
     let [x0, y0, x1, y1] = bounds;
-    let cell = (2.0 * sighting.crop.scale()).max(2.0);
+    let cell = (2.0 * crop.scale()).max(2.0);
     let (columns, rows) = (((x1 - x0) as f64 / cell) as usize + 1, ((y1 - y0) as f64 / cell) as usize + 1);
     let origin = DVec2::new(x0 as f64, y0 as f64);
     let cell_of = |pixel: DVec2| -> Option<usize> {
@@ -139,7 +140,7 @@ pub(crate) fn carried_mask(sighting: &Sighting, then: &Corners, now: &Corners, b
             let pixel = DVec2::new(x as f64, y as f64);
             let Some(at) = cell_of(pixel) else { continue };
             let before = pixel - motion[at] / f64::max(count[at], 1e-9);
-            let value = net_probability(&sighting.output.mask, sighting.crop.crop_from_image(before));
+            let value = net_probability(mask, crop.crop_from_image(before));
             coarse.values[(y - y0) * (x1 - x0) + x - x0] = value;
         }
     }

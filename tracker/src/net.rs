@@ -1,6 +1,11 @@
-//! BlazePose through tract.
+//! The landmark network: BlazePose, or one of the user's choice.
 
+use std::path::Path;
+
+use crate::chosen_net::ChosenNet;
+use crate::crop::Crop;
 use crate::landmark_net::{LandmarkNet, sigmoid};
+use crate::pixels::Rgb;
 use crate::{LANDMARK_COUNT, TrackError};
 
 /// Side of the network's image, pixels.
@@ -22,8 +27,14 @@ pub struct CropLandmark {
     pub y: f64,
     /// Smaller of the probabilities that the landmark is visible and that it lies in the crop.
     pub confidence: f64,
-    /// Metres from the middle of the hips, axes of the crop: x right, y down, z away from the camera.
-    pub world: [f64; 3],
+    /// Metres from the middle of the hips, axes of the crop: x right, y down, z away from the camera; `None` of a network that
+    /// gives no depth.
+    pub world: Option<[f64; 3]>,
+}
+
+impl CropLandmark {
+    /// A landmark that the network does not give.
+    pub(crate) const UNSEEN: Self = Self { x: f64::NAN, y: f64::NAN, confidence: 0.0, world: None };
 }
 
 /// What the network sees in one crop.
@@ -33,14 +44,21 @@ pub struct NetOutput {
     pub landmarks: [CropLandmark; LANDMARK_COUNT],
     /// Probability of a person.
     pub presence: f64,
-    /// Person probability, 256 x 256, row by row, 0..1.
-    pub mask: Vec<f32>,
+    /// Person probability, 256 x 256, row by row, 0..1; `None` of a network without masks.
+    pub mask: Option<Vec<f32>>,
 }
 
-/// The landmark network (BlazePose full, Bazarevsky et al. 2020; licence beside the file in `assets`).
+/// A landmark network: the one built in (BlazePose full, Bazarevsky et al. 2020; licence beside the file in `assets`), or one of
+/// the user's choice.
 #[derive(Clone)]
 pub struct PoseNet {
-    net: LandmarkNet,
+    kind: Kind,
+}
+
+#[derive(Clone)]
+enum Kind {
+    BlazePose(LandmarkNet),
+    Chosen(ChosenNet),
 }
 
 impl std::fmt::Debug for PoseNet {
@@ -63,35 +81,57 @@ impl PoseNet {
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the file does not load or has other inputs or outputs.
     pub fn from_onnx(bytes: &[u8]) -> Result<Self, TrackError> {
-        let net = Self { net: LandmarkNet::load(bytes, NET_SIDE, "pose")? };
-        net.run(&net.net.blank())?;
-        Ok(net)
+        let net = LandmarkNet::load(bytes, NET_SIDE, "pose")?;
+        run_blazepose(&net, &net.blank())?;
+        Ok(Self { kind: Kind::BlazePose(net) })
     }
 
-    /// Runs one crop: 256 x 256 x 3 RGB in 0..=1, row by row.
+    /// A network of the user's choice, from a TOML file that describes it (docs/guide/people.md).
     ///
     /// # Errors
-    /// Kind [`crate::TrackErrorKind::Net`] when the length is wrong or an output is missing or not finite.
-    pub fn run(&self, rgb: &[f32]) -> Result<NetOutput, TrackError> {
-        let outputs = self.net.run(rgb)?;
-        let find = |count| outputs.of_size(count);
-        let raw = find(NET_LANDMARKS * LANDMARK_STRIDE)?;
-        let world = find(NET_LANDMARKS * 3)?;
-        let presence = f64::from(find(1)?[0]).clamp(0.0, 1.0);
-        let mask = find(NET_SIDE * NET_SIDE)?.into_iter().map(|logit| 1.0 / (1.0 + (-logit).exp())).collect();
-        let mut landmarks = [CropLandmark::default(); LANDMARK_COUNT];
-        for (i, landmark) in landmarks.iter_mut().enumerate() {
-            let [x, y, _, visible, present] = std::array::from_fn(|k| f64::from(raw[i * LANDMARK_STRIDE + k]));
-            *landmark = CropLandmark {
-                // The network's coordinates have pixel corners at integers.
-                x: x - 0.5,
-                y: y - 0.5,
-                confidence: sigmoid(visible).min(sigmoid(present)),
-                world: std::array::from_fn(|k| f64::from(world[i * 3 + k])),
-            };
-        }
-        Ok(NetOutput { landmarks, presence, mask })
+    /// Kind [`crate::TrackErrorKind::Net`] names the file, and the key where one is wrong.
+    pub fn from_description(path: &Path) -> Result<Self, TrackError> {
+        Ok(Self { kind: Kind::Chosen(ChosenNet::read(path)?) })
     }
+
+    /// Whether outputs hold a mask and the landmarks' depth.
+    #[must_use]
+    pub fn sees_depth(&self) -> bool {
+        matches!(self.kind, Kind::BlazePose(_))
+    }
+
+    /// Looks at the person in a square of an image.
+    ///
+    /// # Errors
+    /// Kind [`crate::TrackErrorKind::Net`] when the network fails, or an output is missing or not finite.
+    pub(crate) fn look(&self, picture: &Rgb, crop: Crop) -> Result<NetOutput, TrackError> {
+        match &self.kind {
+            Kind::BlazePose(net) => run_blazepose(net, &crop.sample(picture)),
+            Kind::Chosen(net) => net.look(picture, crop),
+        }
+    }
+}
+
+/// Runs one crop: 256 x 256 x 3 RGB in 0..=1, row by row.
+fn run_blazepose(net: &LandmarkNet, rgb: &[f32]) -> Result<NetOutput, TrackError> {
+    let outputs = net.run(rgb)?;
+    let find = |count| outputs.of_size(count);
+    let raw = find(NET_LANDMARKS * LANDMARK_STRIDE)?;
+    let world = find(NET_LANDMARKS * 3)?;
+    let presence = f64::from(find(1)?[0]).clamp(0.0, 1.0);
+    let mask = find(NET_SIDE * NET_SIDE)?.into_iter().map(|logit| 1.0 / (1.0 + (-logit).exp())).collect();
+    let mut landmarks = [CropLandmark::default(); LANDMARK_COUNT];
+    for (i, landmark) in landmarks.iter_mut().enumerate() {
+        let [x, y, _, visible, present] = std::array::from_fn(|k| f64::from(raw[i * LANDMARK_STRIDE + k]));
+        *landmark = CropLandmark {
+            // The network's coordinates have pixel corners at integers.
+            x: x - 0.5,
+            y: y - 0.5,
+            confidence: sigmoid(visible).min(sigmoid(present)),
+            world: Some(std::array::from_fn(|k| f64::from(world[i * 3 + k]))),
+        };
+    }
+    Ok(NetOutput { landmarks, presence, mask: Some(mask) })
 }
 
 #[cfg(test)]
@@ -99,22 +139,31 @@ mod tests {
     use super::*;
     use crate::TrackErrorKind;
 
+    fn grey() -> Rgb<'static> {
+        Rgb { width: NET_SIDE, height: NET_SIDE, bytes: vec![128; NET_SIDE * NET_SIDE * 3].into() }
+    }
+
+    fn whole() -> Crop {
+        Crop::upright(glam::DVec2::splat(0.5 * NET_SIDE as f64 - 0.5), NET_SIDE as f64)
+    }
+
     #[test]
     fn the_embedded_network_sees_nobody_in_grey_and_refuses_a_wrong_size() {
         let net = PoseNet::embedded().unwrap();
-        let output = net.run(&vec![0.5; NET_SIDE * NET_SIDE * 3]).unwrap();
+        let output = net.look(&grey(), whole()).unwrap();
         assert!(output.presence < 0.5, "presence {}", output.presence);
-        assert_eq!(output.mask.len(), NET_SIDE * NET_SIDE);
-        assert!(output.mask.iter().all(|p| (0.0..=1.0).contains(p)));
-        assert_eq!(net.run(&[0.5; 12]).unwrap_err().kind, TrackErrorKind::Net);
+        let mask = output.mask.unwrap();
+        assert_eq!(mask.len(), NET_SIDE * NET_SIDE);
+        assert!(mask.iter().all(|p| (0.0..=1.0).contains(p)));
+        let Kind::BlazePose(net) = net.kind else { panic!("the embedded network is BlazePose") };
+        assert_eq!(run_blazepose(&net, &[0.5; 12]).unwrap_err().kind, TrackErrorKind::Net);
     }
 
     #[test]
     fn runs_from_many_threads_and_from_rayons_own_do_not_meet() {
         use rayon::prelude::*;
         let net = PoseNet::embedded().unwrap();
-        let grey = vec![0.5; NET_SIDE * NET_SIDE * 3];
-        let run = |_| net.run(&grey).unwrap().presence.to_bits();
+        let run = |_| net.look(&grey(), whole()).unwrap().presence.to_bits();
         let expected = run(0);
         std::thread::scope(|scope| {
             for thread in 0..4 {

@@ -351,7 +351,7 @@ mod tests {
         let marks = model.marks(&random_turns(&model, 3));
         let sighting = |camera: &Camera, place: &DVec3| {
             let keypoints = keypoints_of(camera, &marks.map(|mark| mark + *place));
-            let output = NetOutput { landmarks: [Default::default(); LANDMARK_COUNT], presence: 0.9, mask: Vec::new() };
+            let output = NetOutput { landmarks: [Default::default(); LANDMARK_COUNT], presence: 0.9, mask: None };
             let crop = Crop::around(&std::array::from_fn(|i| Some(keypoints[i].pixel)))?;
             Some(Sighting { crop, output, keypoints })
         };

@@ -17,18 +17,20 @@ pub(crate) struct Sighting {
 
 impl Sighting {
     pub fn take(net: &PoseNet, picture: &Rgb, crop: Crop) -> Result<Self, TrackError> {
-        let output = net.run(&crop.sample(picture))?;
+        let output = net.look(picture, crop)?;
         let keypoints = crop.keypoints(&output);
         Ok(Self { crop, output, keypoints })
     }
 
     /// The crop that the landmarks ask for.
     pub fn next_crop(&self) -> Option<Crop> {
-        Crop::around(&std::array::from_fn(|i| Some(self.keypoints[i].pixel)))
+        Crop::around(&self.keypoints.map(|keypoint| Some(keypoint.pixel).filter(|pixel| pixel.is_finite())))
     }
 
     pub fn mean_confidence(&self) -> f64 {
-        self.keypoints.iter().map(|k| k.confidence).sum::<f64>() / LANDMARK_COUNT as f64
+        let known = self.keypoints.iter().filter(|keypoint| keypoint.pixel.is_finite());
+        let (sum, count) = known.fold((0.0, 0.0), |(sum, count), keypoint| (sum + keypoint.confidence, count + 1.0));
+        sum / f64::max(count, 1.0)
     }
 
     /// Larger and surer is better.
@@ -43,16 +45,14 @@ impl Sighting {
 
     /// Mean distance of the landmarks from others, pixels; `None` without any.
     pub fn mean_distance(&self, pixels: &[Option<DVec2>; LANDMARK_COUNT]) -> Option<f64> {
-        let pairs = self.keypoints.iter().zip(pixels).filter_map(|(own, other)| Some((own.pixel, (*other)?)));
+        let known = self.keypoints.iter().zip(pixels).filter(|(own, _)| own.pixel.is_finite());
+        let pairs = known.filter_map(|(own, other)| Some((own.pixel, (*other)?)));
         let (sum, count) = pairs.fold((0.0, 0.0), |(sum, count), (a, b)| (sum + a.distance(b), count + 1.0));
         (count > 0.0).then(|| sum / count)
     }
 
     pub fn overlaps(&self, other: &Self) -> bool {
-        let mut distance = 0.0;
-        for (a, b) in self.keypoints.iter().zip(&other.keypoints) {
-            distance += (a.pixel - b.pixel).length();
-        }
-        distance / (LANDMARK_COUNT as f64) < 0.1 * self.crop.side.max(other.crop.side)
+        let pixels = other.keypoints.map(|keypoint| Some(keypoint.pixel).filter(|pixel| pixel.is_finite()));
+        self.mean_distance(&pixels).is_some_and(|distance| distance < 0.1 * self.crop.side.max(other.crop.side))
     }
 }

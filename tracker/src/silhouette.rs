@@ -14,16 +14,28 @@ const PLATE_LOGIT: f32 = 6.0;
 /// Bins a colour channel of the colour model.
 const BINS: usize = 16;
 
-/// The network's probability of a person inside of `bounds` (x0, y0, x1, y1, ends excluded).
-pub(crate) fn coarse_mask(sighting: &Sighting, bounds: [usize; 4]) -> Grid {
-    let [x0, y0, x1, y1] = bounds;
+/// Distance from the body, in the gate's unit, at which a mask from the body alone ends, and over which it fades.
+const CLOTHES: f32 = 0.2;
+const FADE: f32 = 0.1;
+
+/// The network's probability of a person inside of the gate's bounds; one from the body alone where the network has no mask.
+pub(crate) fn coarse_mask(sighting: &Sighting, gate: &BodyGate) -> Grid {
+    let [x0, y0, x1, y1] = gate.bounds;
+    let Some(mask) = &sighting.output.mask else { return body_mask(gate) };
     let mut coarse = Grid::new(x1 - x0, y1 - y0, 0.0);
     for y in y0..y1 {
         for x in x0..x1 {
             let at = sighting.crop.crop_from_image(DVec2::new(x as f64, y as f64));
-            coarse.values[(y - y0) * (x1 - x0) + x - x0] = net_probability(&sighting.output.mask, at);
+            coarse.values[(y - y0) * (x1 - x0) + x - x0] = net_probability(mask, at);
         }
     }
+    coarse
+}
+
+/// The probability that the body's distance gives.
+pub(crate) fn body_mask(gate: &BodyGate) -> Grid {
+    let mut coarse = gate.distance.clone();
+    coarse.values.iter_mut().for_each(|distance| *distance = 1.0 / (1.0 + ((*distance - CLOTHES) / FADE).exp()));
     coarse
 }
 

@@ -19,16 +19,16 @@ pub(crate) fn lift(
     let view = View::new(camera);
     let seen = observe(camera, &view, &sighting.keypoints, confidence_threshold);
     let turn = sighting.crop.turn;
-    let local: [DVec3; LANDMARK_COUNT] = std::array::from_fn(|i| {
-        let [x, y, z] = sighting.output.landmarks[i].world;
-        (turn.rotate(DVec2::new(x, y)) * scale).extend(z * scale)
+    let local = sighting.output.landmarks.map(|landmark| {
+        let [x, y, z] = landmark.world?;
+        Some((turn.rotate(DVec2::new(x, y)) * scale).extend(z * scale))
     });
     // (x + t_x) = u (z + t_z), the same for v.
     let mut normal = DMat3::ZERO;
     let mut right = DVec3::ZERO;
     let mut count = 0;
     for (local, seen) in local.iter().zip(&seen) {
-        let Some(seen) = seen else { continue };
+        let (Some(local), Some(seen)) = (local, seen) else { continue };
         let u = seen.ideal_px / view.focal_px;
         for (row, value) in [
             (DVec3::new(1.0, 0.0, -u.x), u.x * local.z - local.x),
@@ -48,6 +48,7 @@ pub(crate) fn lift(
     }
     let world_from_camera = view.rotation.transpose();
     Some(std::array::from_fn(|i| {
-        seen[i].map(|_| world_from_camera * (local[i] + translation - view.translation)).filter(|p| p.is_finite())
+        let place = |local| world_from_camera * (local + translation - view.translation);
+        seen[i].and(local[i]).map(place).filter(|p| p.is_finite())
     }))
 }

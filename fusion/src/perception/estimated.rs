@@ -114,7 +114,8 @@ impl EstimatedPerception {
     /// followed, and the person is known from then on.
     ///
     /// # Errors
-    /// [`FusionError::Track`] when template, rig or a plate cannot be used, [`FusionError::Setting`] for a wrong key colour.
+    /// [`FusionError::Track`] when template, rig, network or a plate cannot be used, [`FusionError::Setting`] for a wrong key
+    /// colour, or a network without depth before a single camera.
     pub fn new(
         rig: &Rig,
         template: &Template,
@@ -128,7 +129,7 @@ impl EstimatedPerception {
             ..PoseConfig::default()
         };
         let rounds = config.outline_rounds;
-        let mut estimator = PoseEstimator::new(PoseNet::embedded()?, template, rig, config)?;
+        let mut estimator = PoseEstimator::new(network(settings, rig)?, template, rig, config)?;
         let backgrounds = backgrounds(&rig.cameras, settings, plates)?;
         estimator.set_backgrounds(backgrounds.into_iter().map(|background| background.map(Arc::new)).collect());
         let learning = (settings.shape() == Origin::Estimated).then(|| (Vec::new(), i64::MIN));
@@ -347,6 +348,21 @@ impl EstimatedPerception {
             }
         }
     }
+}
+
+/// The landmark network of the settings.
+fn network(settings: &PerceptionSettings, rig: &Rig) -> Result<PoseNet, FusionError> {
+    if settings.network.as_os_str().is_empty() {
+        return Ok(PoseNet::embedded()?);
+    }
+    let network = PoseNet::from_description(&settings.network)?;
+    if rig.cameras.len() < 2 && !network.sees_depth() {
+        return Err(FusionError::Setting(format!(
+            "perception.network: {} gives no depth, and a single camera needs it; leave the setting out, or add a camera",
+            settings.network.display()
+        )));
+    }
+    Ok(network)
 }
 
 /// Mean difference of the bones' lengths, as a share of the mean length; infinite for templates of other joints.

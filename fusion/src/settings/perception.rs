@@ -44,6 +44,11 @@ pub struct PerceptionSettings {
     /// People who are tracked at most, 1 to 4; with 1 the one whom most views agree on.
     #[arg(long, default_value_t = 1)]
     pub people: usize,
+    /// Description of a landmark network to use in place of the one built in: a TOML file, see docs/guide/people.md. It needs
+    /// two cameras or more.
+    #[arg(long, value_name = "FILE", default_value = "", hide_default_value = true,
+        value_parser = OsStringValueParser::new().map(PathBuf::from))]
+    pub network: PathBuf,
     /// Distance that the body moves in a view until the network looks at that view again, metres; 0: at every view of every set.
     #[arg(skip = Self::default().look_after_m)]
     pub look_after_m: f64,
@@ -68,6 +73,7 @@ impl Default for PerceptionSettings {
             hands: Origin::Given,
             shape: None,
             people: 1,
+            network: PathBuf::new(),
             look_after_m: 0.02,
             height_m: None,
             key_color: String::new(),

@@ -23,13 +23,13 @@ impl PoseEstimator {
                 let evidence = light.as_ref().and_then(|light| light.evidence(picture, gate.bounds));
                 let mask = match (look, &evidence) {
                     (Some(look), evidence) => {
-                        let coarse = match &look.body {
-                            None => coarse_mask(&look.sighting, gate.bounds),
-                            Some(body) => {
+                        let coarse = match (&look.body, &look.sighting.output.mask) {
+                            (Some(body), Some(mask)) => {
                                 let (then, _) = self.skinned(&body.turns, set, fitted.delay_secs(slot));
                                 let (then, now) = (corners(camera, &then), corners(camera, &vertices));
-                                carried_mask(&look.sighting, &then, &now, gate.bounds)
+                                carried_mask(mask, look.sighting.crop, &then, &now, gate.bounds)
                             }
+                            _ => coarse_mask(&look.sighting, &gate),
                         };
                         refine(picture, &coarse, look.sighting.crop.scale(), &gate, evidence.as_ref())
                     }
