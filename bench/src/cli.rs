@@ -334,6 +334,12 @@ pub struct BenchPerceptionArgs {
     /// `perception.look_after_m`: how far the body moves in a view until the network looks at that view again, metres.
     #[arg(long)]
     pub look_after_m: Option<f64>,
+    /// Folder of the plates CAM.png; an empty one measures without plates. The data set's own by default.
+    #[arg(long, value_name = "FOLDER")]
+    pub plates: Option<PathBuf>,
+    /// Description of a landmark network to use in place of the one built in.
+    #[arg(long, value_name = "FILE")]
+    pub network: Option<PathBuf>,
     /// Folder of the results.
     #[arg(long, default_value = "out/bench-perception")]
     pub out: PathBuf,

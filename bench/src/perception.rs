@@ -111,6 +111,8 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         shape: (inputs.pose == Origin::Estimated).then_some(inputs.shape),
         masks: inputs.masks,
         look_after_m: args.look_after_m.unwrap_or(PerceptionSettings::default().look_after_m),
+        plates: args.plates.clone().unwrap_or_default(),
+        network: args.network.clone().unwrap_or_default(),
         ..PerceptionSettings::default()
     };
     let body = BodySettings::with_gaussians(args.gaussians);
