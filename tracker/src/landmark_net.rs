@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use tract_linalg::multithread::{Executor, multithread_tract_scope};
 use tract_onnx::prelude::*;
+use tract_onnx::tract_hir::infer::Factoid as _;
 
 use crate::upsample::replace_doublings;
 use crate::{TrackError, TrackErrorKind};
@@ -45,7 +46,7 @@ impl LandmarkNet {
         let model = onnx().model_for_read(&mut bytes).map_err(failed_load)?;
         let sides = &model.input_fact(0).map_err(failed_load)?.shape;
         let sides: Vec<Option<usize>> =
-            sides.dims().map(|side| side.concretize().and_then(|side| side.to_usize().ok())).collect();
+            sides.dims().map(|side| side.concretize().and_then(|side| side.to_i64().ok()).and_then(|side| usize::try_from(side).ok())).collect();
         let shape = shape(&sides).map_err(failed)?;
         let model = model
             .with_input_fact(0, f32::fact(shape).into())
@@ -73,11 +74,6 @@ impl LandmarkNet {
     /// Zeros in the size of a crop.
     pub fn blank(&self) -> Vec<f32> {
         vec![0.0; self.shape.iter().product()]
-    }
-
-    /// Shape of the input.
-    pub fn shape(&self) -> [usize; 4] {
-        self.shape
     }
 
     /// Returns an error of this network.

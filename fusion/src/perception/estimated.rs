@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, sync::Arc, time::Duration};
 
 use flyrig_body::{Template, skin_mesh};
 use flyrig_tracker::{
-    BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PersonArea, PoseConfig, PoseEstimate, PoseEstimator, PoseNet,
+    Background, BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PersonArea, PoseConfig, PoseEstimate, PoseEstimator, PoseNet,
     ShapeFit, TrackError, ViewKeypoints, is_blank, matte,
 };
 use flyrig_types::{Frame, FrameSet, Image, Mask, PersonId, Pose, Rig};
@@ -501,11 +501,11 @@ impl EstimatedPerception {
         let slots: Vec<usize> = set.present().map(|(slot, _)| slot).collect();
         let areas = |slot: usize, camera| -> Vec<PersonArea<'_>> {
             let present = slots.iter().position(|present| *present == slot);
-            let area = |(sides, points, views): &'_ (_, Vec<_>, &'_ Vec<ViewObservation>)| {
+            let areas = bodies.iter().filter_map(|(sides, points, views)| {
                 let mask = present.and_then(|index| views.get(index)?.mask.as_ref());
                 Some(PersonArea { gate: BodyGate::new(camera, points, sides)?, mask })
-            };
-            bodies.iter().filter_map(area).collect()
+            });
+            areas.collect()
         };
         let cameras = self.rig.cameras.par_iter().zip(&set.frames).zip(&self.blank).enumerate();
         let events: Result<Vec<Vec<BackgroundEvent>>, TrackError> = (taken.par_iter_mut().zip(cameras))
