@@ -337,6 +337,10 @@ pub struct BenchPerceptionArgs {
     /// Folder of the plates CAM.png; an empty one measures without plates. The data set's own by default.
     #[arg(long, value_name = "FOLDER")]
     pub plates: Option<PathBuf>,
+    /// Writes a picture of every so many sets' masks beside the results: red where the person is missing, blue where the mask
+    /// is too large.
+    #[arg(long, value_name = "SETS", value_parser = clap::value_parser!(u64).range(1..))]
+    pub mask_pictures: Option<u64>,
     /// Description of a landmark network to use in place of the one built in.
     #[arg(long, value_name = "FILE")]
     pub network: Option<PathBuf>,

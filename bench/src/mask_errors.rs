@@ -1,5 +1,8 @@
 //! Errors of estimated masks.
 
+use std::path::Path;
+
+use anyhow::{Context, Result};
 use flyrig_metrics::mask_iou;
 use flyrig_types::Mask;
 use serde::Serialize;
@@ -52,6 +55,24 @@ impl MaskErrors {
             count: self.count,
         }
     }
+}
+
+/// Writes an image in grey, red where our coverage is too small and blue where it is too large.
+///
+/// # Errors
+/// Names the file that cannot be written.
+pub fn write_errors(path: &Path, rgba: &[u8], truth: &Mask) -> Result<()> {
+    let pixels = rgba.chunks_exact(4).zip(truth.coverage());
+    let bytes: Vec<u8> = pixels
+        .flat_map(|(pixel, truth)| {
+            let grey = pixel[..3].iter().map(|c| u16::from(*c)).sum::<u16>() / 6 + 40;
+            let error = i16::from(pixel[3]) - i16::from(*truth);
+            let tint = |error: i16| (f32::from(grey) + f32::from(error.clamp(0, 255)) * 0.6).min(255.0) as u8;
+            [tint(-error), grey as u8, tint(error)]
+        })
+        .collect();
+    let image = image::RgbImage::from_raw(truth.width(), truth.height(), bytes).context("the mask has another size")?;
+    image.save(path).with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// Pixels inside of a mask with a neighbour outside.

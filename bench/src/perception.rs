@@ -15,7 +15,10 @@ use flyrig_types::{Frame, FrameSet, Mask, Pose};
 use glam::{DQuat, DVec3};
 use serde::Serialize;
 
-use crate::{cli::BenchPerceptionArgs, mask_errors::MaskErrors};
+use crate::{
+    cli::BenchPerceptionArgs,
+    mask_errors::{MaskErrors, write_errors},
+};
 
 /// Joints that are compared, by the names of the CMU skeleton.
 pub(crate) const JOINTS: [&str; 14] = [
@@ -148,6 +151,10 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
             let Some(frame) = frame_of(&set, camera.id.as_str()) else { continue };
             let (Some(subject), Some(truth)) = (replay.session.subject(person), &frame.mask) else { continue };
             masks.add(subject.input(view), truth);
+            if args.mask_pictures.is_some_and(|every| set.index.is_multiple_of(every)) {
+                let file = format!("{name}-{}-{}-{:06}.png", code(inputs), camera.id, set.index);
+                write_errors(&args.out.join(file), subject.input(view), truth)?;
+            }
         }
         if holdout.is_empty() {
             continue;
