@@ -31,6 +31,12 @@ const HALF_BELIEVED: f32 = 4.0;
 const REMAINDER: f32 = 60.0;
 /// Weight of differences in colour beside those in brightness.
 const CHROMA: f32 = 0.8;
+/// Farthest that an outline is blurred, pixels.
+const BLUR_PX: f32 = 1.7;
+/// Shares of its light that a shadow leaves to the background, and how much better a mixture has to explain a pixel beyond the
+/// mask than a shadow does, squared standard deviations.
+const SHADOWS: std::ops::RangeInclusive<f32> = 0.15..=1.05;
+const BETTER_THAN_SHADOW: f32 = 4.0;
 /// Pixels of the mask that look like the background are solved for up to this depth, pixels, as far as evidence is lower.
 const DEEP_PX: f32 = 24.0;
 const LOOKS_EMPTY: f32 = 0.4;
@@ -186,27 +192,46 @@ impl<'a> Band<'a> {
 
     fn solve(&self, mask: &Mask) -> Matte {
         let mut coverage = mask.coverage().to_vec();
+        let mixtures: Vec<Option<Mixed>> =
+            (0..self.light.len()).map(|at| self.unmix(at).filter(|_| self.is_open(at))).collect();
+        let mut alphas = Grid::new(self.width, self.height, 0.0);
+        for (at, mixed) in mixtures.iter().enumerate() {
+            // Soft slopes of the mask end with the band.
+            let beyond = f32::from(self.inner.values[at] > 0.0);
+            let geometric = f32::from(coverage[self.pixel(at)]) / 255.0;
+            alphas.values[at] = match mixed {
+                Some(mixed) => geometric + mixed.belief * (mixed.alpha - geometric),
+                None if self.is_open(at) => geometric,
+                None => beyond,
+            };
+        }
+        self.sharpen(&mut alphas);
         let mut colors = Vec::new();
-        for at in 0..self.light.len() {
-            let pixel = self.pixel(at);
-            if !self.is_open(at) {
-                // Soft slopes of the mask end with the band.
-                coverage[pixel] = if self.inner.values[at] > 0.0 { 255 } else { 0 };
-                continue;
-            }
-            let geometric = f32::from(coverage[pixel]) / 255.0;
-            let Some(mixed) = self.unmix(at) else { continue };
-            let alpha = geometric + mixed.belief * (mixed.alpha - geometric);
+        for (at, mixed) in mixtures.iter().enumerate() {
+            let (pixel, alpha) = (self.pixel(at), alphas.values[at]);
             coverage[pixel] = (alpha * 255.0).round() as u8;
-            if coverage[pixel] == 0 {
-                continue;
-            }
-            let rgb = self.foreground(at, alpha, &mixed);
+            let Some(mixed) = mixed.as_ref().filter(|_| coverage[pixel] > 0 && coverage[pixel] < 255) else { continue };
+            let rgb = self.foreground(at, alpha, mixed);
             if rgb != self.picture.pixel(pixel % self.picture.width, pixel / self.picture.width) {
                 colors.push(EdgeColor { pixel: pixel as u32, rgb });
             }
         }
         Matte { mask: Mask::new(mask.width(), mask.height(), coverage).unwrap_or_else(|_| mask.clone()), colors }
+    }
+
+    /// Completes what is farther from the solved outline than a lens blurs it: there a mixture is a shade of the foreground, or
+    /// a shadow of the background.
+    fn sharpen(&self, alphas: &mut Grid) {
+        let mut unset = alphas.clone();
+        unset.values.iter_mut().for_each(|alpha| *alpha = 1.0 - *alpha);
+        let (outer, inner) = (alphas.distance_to_set(), unset.distance_to_set());
+        for (at, alpha) in alphas.values.iter_mut().enumerate() {
+            if inner.values[at] > BLUR_PX {
+                *alpha = 1.0;
+            } else if outer.values[at] > BLUR_PX {
+                *alpha = 0.0;
+            }
+        }
     }
 
     /// Foreground colour of a pixel of the given coverage.
@@ -255,7 +280,22 @@ impl<'a> Band<'a> {
                 }
             }
         }
-        best.map(|(_, mixed)| mixed)
+        let (remainder2, mixed) = best?;
+        // A shadow in front of dark clothes looks like a mixture.
+        let is_shadow = self.outer.values[at] > 1.0
+            && self.behind[at].is_some_and(|behind| self.shadow_remainder2(at, behind) < remainder2 + BETTER_THAN_SHADOW);
+        Some(if is_shadow { Mixed { belief: 0.0, ..mixed } } else { mixed })
+    }
+
+    /// What a shadow on the background leaves unexplained of a pixel, squared standard deviations; infinite where no shadow is so
+    /// dark, or brightens.
+    fn shadow_remainder2(&self, at: usize, behind: [f32; 3]) -> f32 {
+        let (seen, behind) = (self.light[at], weighted(behind));
+        let noise = NOISE * step((seen.iter().sum::<f32>() / 3.0).max(4e-3));
+        let seen = weighted(seen);
+        let share = dot(seen, behind) / dot(behind, behind).max(1e-9);
+        let left: [f32; 3] = std::array::from_fn(|k| seen[k] - share * behind[k]);
+        if SHADOWS.contains(&share) { dot(left, left) / (noise * noise) } else { f32::INFINITY }
     }
 
     /// Colours around the nearest sure pixel, each the mean of three by three.
