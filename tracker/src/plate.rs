@@ -149,7 +149,8 @@ pub(crate) fn plate_evidence(picture: &Rgb, plate: &[f32], drift: &Drift, bounds
         let color = dot(left, left).sqrt() / (4.0 * noise);
         let change = (along - 1.0) * length;
         let light = if along < SHADOW {
-            2.0
+            // Where feet touch the floor shadows are this dark, too.
+            1.0 + (1.5 * (1.0 - along / SHADOW)).clamp(0.0, 1.0)
         } else if change > 0.0 {
             change / (7.0 * noise)
         } else {

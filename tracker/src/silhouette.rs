@@ -9,7 +9,8 @@ use crate::net::NET_SIDE;
 use crate::pixels::Rgb;
 use crate::sighting::Sighting;
 
-/// Log-odds between a pixel that surely differs from the plate and one that does not.
+/// Twice the log-odds of a pixel that surely differs from the plate, and of one that does not.
+const DIFFERENT_LOGIT: f32 = 10.0;
 const PLATE_LOGIT: f32 = 6.0;
 /// Bins a colour channel of the colour model.
 const BINS: usize = 16;
@@ -92,7 +93,10 @@ pub(crate) fn refine(
                 0.0
             };
             let near = 1.0 - 4.0 * d.min(1.0);
-            let plate = plate_evidence.map_or(0.0, |e| PLATE_LOGIT * (e.values[at] - 0.5));
+            let plate = plate_evidence.map_or(0.0, |e| {
+                let evidence = e.values[at] - 0.5;
+                evidence * if evidence > 0.0 { DIFFERENT_LOGIT } else { PLATE_LOGIT }
+            });
             let logit = (p / (1.0 - p)).ln() + 0.6 * color + near + plate;
             probability.values[at] = 1.0 / (1.0 + (-logit).exp());
         }
