@@ -203,11 +203,7 @@ impl Background {
     ///
     /// # Errors
     /// Kind `Image` when the format cannot be read. Images of another size change nothing.
-    pub fn update(
-        &mut self,
-        image: &Image,
-        people: &[PersonArea<'_>],
-    ) -> Result<Vec<BackgroundEvent>, TrackError> {
+    pub fn update(&mut self, image: &Image, people: &[PersonArea<'_>]) -> Result<Vec<BackgroundEvent>, TrackError> {
         let picture = Rgb::new(image)?;
         match &mut self.kind {
             Kind::Plate(plate) if self.width == picture.width && self.height == picture.height => {
@@ -429,7 +425,8 @@ fn what_pixels_show(picture: &Rgb, people: &[PersonArea<'_>], tells_near: bool) 
     let mut shows = vec![Shows::Background; picture.width * picture.height];
     for PersonArea { gate, mask } in people {
         let [x0, y0, x1, y1] = gate.bounds;
-        let own_size = |mask: &&Mask| (mask.width() as usize, mask.height() as usize) == (picture.width, picture.height);
+        let own_size =
+            |mask: &&Mask| (mask.width() as usize, mask.height() as usize) == (picture.width, picture.height);
         let mask = mask.filter(own_size).filter(|_| tells_near);
         let clear_px = CLEAR * gate.unit_px() as f32;
         let from_mask = mask.map(|mask| {
@@ -548,6 +545,42 @@ mod tests {
         );
         let now = picture(31, |x, y| if x < 12 { [250.0, 20.0, 20.0] } else { dimmed(x, y) });
         assert!((SIDE * 11..SIDE * 13).contains(&wrong(&background, &now)), "{}", wrong(&background, &now));
+    }
+
+    #[test]
+    fn an_unknown_background_is_learnt_away_from_body_and_mask_and_never_on_them() {
+        let mut background = Background::unknown(&camera());
+        let gate = gate();
+        // The person reaches beyond the body, and the mask shows it.
+        let person = |x: i64, y: i64| (38..58).contains(&x) && (26..74).contains(&y);
+        let now = |seed| picture(seed, |x, y| if person(x, y) { [10.0; 3] } else { room(x, y) });
+        let coverage = (0..SIDE * SIDE).map(|at| 255 * u8::from(person((at % SIDE) as i64, (at / SIDE) as i64)));
+        let mask = Mask::new(SIDE as u32, SIDE as u32, coverage.collect()).unwrap();
+        let knows = |background: &Background, x: usize, y: usize| {
+            let Kind::Plate(plate) = &background.kind else { panic!("a learnt background is a plate") };
+            plate.knows(y * SIDE + x)
+        };
+        assert!(evidence(&background, &now(0)).is_none() && background.is_learning());
+        for seed in 0..10 {
+            let area = PersonArea { gate: gate.clone(), mask: Some(&mask) };
+            assert_eq!(background.update(&now(seed), &[area]).unwrap(), []);
+        }
+        assert!(knows(&background, 2, 50) && !knows(&background, 64, 50), "far first");
+        for seed in 10..50 {
+            let area = PersonArea { gate: gate.clone(), mask: Some(&mask) };
+            assert_eq!(background.update(&now(seed), &[area]).unwrap(), []);
+        }
+        assert!(knows(&background, 64, 50), "then what is clear of the mask");
+        for (x, y) in [(48, 50), (39, 50), (48, 27), (57, 73)] {
+            assert!(!knows(&background, x, y), "the person at {x}, {y}");
+        }
+        // Without a mask nothing in reach is learnt.
+        let mut careful = Background::unknown(&camera());
+        for seed in 0..60 {
+            assert_eq!(careful.update(&now(seed), &[area(&gate)]).unwrap(), []);
+        }
+        assert!(knows(&careful, 2, 50) && !knows(&careful, 64, 50) && !careful.is_learning());
+        assert!(careful.mask(&now(70), &gate).unwrap().is_none(), "too little is known around the body");
     }
 
     #[test]

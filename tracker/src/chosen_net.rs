@@ -92,7 +92,10 @@ impl ChosenNet {
         if self.channels_first {
             (0..3).flat_map(rows).map(|(x, y, channel)| value(x, y, channel)).collect()
         } else {
-            rows(0).flat_map(|(x, y, _)| (0..3).map(move |channel| (x, y, channel))).map(|(x, y, c)| value(x, y, c)).collect()
+            rows(0)
+                .flat_map(|(x, y, _)| (0..3).map(move |channel| (x, y, channel)))
+                .map(|(x, y, c)| value(x, y, c))
+                .collect()
         }
     }
 
@@ -123,7 +126,11 @@ fn input(sides: &[Option<usize>], given: Option<[usize; 2]>) -> Result<([usize; 
     let (height, width, channels_first) = match *sides {
         [_, Some(3), height, width] => (height, width, true),
         [_, height, width, Some(3)] => (height, width, false),
-        _ => return Err(format!("takes {sides:?}, expected images of three channels: [1, 3, height, width] or [1, height, width, 3]")),
+        _ => {
+            return Err(format!(
+                "takes {sides:?}, expected images of three channels: [1, 3, height, width] or [1, height, width, 3]"
+            ));
+        }
     };
     match (width, height, given) {
         (Some(width), Some(height), Some(given)) if given != [width, height] => {
@@ -196,9 +203,7 @@ fn heatmaps(outputs: &[Array<'_>], count: usize, size: [usize; 2]) -> Option<Poi
 
 /// The highest bins along x and y; the lower one of the two heights is the confidence.
 fn simcc(outputs: &[Array<'_>], count: usize, [width, height]: [usize; 2]) -> Option<Points> {
-    let axis = |output: &&Array, side: usize| {
-        matches!(output.shape, [1, landmarks, bins] if *landmarks >= count && bins.is_multiple_of(side) && *bins > 0)
-    };
+    let axis = |output: &&Array, side: usize| matches!(output.shape, [1, landmarks, bins] if *landmarks >= count && bins.is_multiple_of(side) && *bins > 0);
     // Square inputs have two outputs of one shape, x first.
     let along_x = outputs.iter().position(|output| axis(&output, width))?;
     let along_y = (0..outputs.len()).find(|&y| y != along_x && axis(&&outputs[y], height))?;

@@ -188,7 +188,11 @@ fn a_network_that_does_not_fit_its_description_is_named_with_what_it_has() {
     assert!(error.contains("8 landmarks"), "{error}");
     let error = refused("output = \"heatmaps\"\ninput = [64, 64]", SPOTS, &heatmaps);
     assert!(error.contains("48x64"), "{error}");
-    let error = refused("output = \"points\"\npoint = [\"x\", \"y\", \"skip\", \"skip\", \"skip\", \"skip\", \"skip\"]", SPOTS, &heatmaps);
+    let error = refused(
+        "output = \"points\"\npoint = [\"x\", \"y\", \"skip\", \"skip\", \"skip\", \"skip\", \"skip\"]",
+        SPOTS,
+        &heatmaps,
+    );
     assert!(error.contains("point"), "{error}");
     let error = refused("output = \"heatmaps\"", SPOTS, &heatmap_onnx(&[1, 5, HEIGHT as i64, WIDTH as i64]));
     assert!(error.contains("three channels"), "{error}");
@@ -210,7 +214,9 @@ fn peaks_lie_between_bins_and_flat_rows_do_no_harm() {
     let parabola = |x: f64| -(x - 0.3).powi(2);
     let at = |x: f64| Some(parabola(x) as f32);
     assert!((between(at(-1.0), parabola(0.0) as f32, at(1.0)) - 0.3).abs() < 1e-5);
-    for (before, value, after) in [(Some(1.0), 1.0, Some(1.0)), (None, 1.0, Some(0.5)), (Some(f32::NAN), 1.0, Some(0.0))] {
+    for (before, value, after) in
+        [(Some(1.0), 1.0, Some(1.0)), (None, 1.0, Some(0.5)), (Some(f32::NAN), 1.0, Some(0.0))]
+    {
         assert!(between(before, value, after).abs() <= 0.5);
     }
     assert_eq!(highest(&[]), None);

@@ -22,8 +22,7 @@ pub struct PoseConfig {
     /// Height of the person, metres; `None` measures it, or takes the template's before a single camera.
     pub height_m: Option<f64>,
     /// Rounds in which [`crate::PoseEstimator::fit_shape`] matches outlines with masks to solve for lengths, girths, build and
-    /// poses together; 0 fits bone lengths to landmarks alone. With rounds joints come nearer to the true ones, but views do
-    /// not (docs/benchmarks/perception.md), so that 0 is the default.
+    /// poses together; 0 fits bone lengths to landmarks alone (docs/benchmarks/perception.md, "Shape from outlines").
     pub shape_rounds: usize,
     /// Standard deviation of a joint's turn between sets at 30 sets a second, radians; smaller is smoother.
     pub smooth_rad: f64,
@@ -55,7 +54,7 @@ impl Default for PoseConfig {
             outline_sigma_m: 0.01,
             outline_rounds: 2,
             height_m: None,
-            shape_rounds: 0,
+            shape_rounds: 2,
             smooth_rad: 0.15,
             look_after_m: 0.02,
             looks: 0,

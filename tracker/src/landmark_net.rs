@@ -45,8 +45,12 @@ impl LandmarkNet {
         let failed_load = |error: TractError| failed(format!("does not load ({error:#})"));
         let model = onnx().model_for_read(&mut bytes).map_err(failed_load)?;
         let sides = &model.input_fact(0).map_err(failed_load)?.shape;
-        let sides: Vec<Option<usize>> =
-            sides.dims().map(|side| side.concretize().and_then(|side| side.to_i64().ok()).and_then(|side| usize::try_from(side).ok())).collect();
+        let sides: Vec<Option<usize>> = sides
+            .dims()
+            .map(|side| {
+                side.concretize().and_then(|side| side.to_i64().ok()).and_then(|side| usize::try_from(side).ok())
+            })
+            .collect();
         let shape = shape(&sides).map_err(failed)?;
         let model = model
             .with_input_fact(0, f32::fact(shape).into())

@@ -86,7 +86,13 @@ fn a_mask_is_carried_to_where_the_body_went() {
         let (x, y) = (at.x.round().max(0.0) as usize, at.y.round().max(0.0) as usize);
         if x < width && y < height { f32::from(before.coverage()[y * width + x]) / 255.0 } else { 0.0 }
     });
-    let carried = carried_mask(seen.output.mask.as_ref().unwrap(), seen.crop, &place(&turns), &place(&moved), [0, 0, width, height]);
+    let carried = carried_mask(
+        seen.output.mask.as_ref().unwrap(),
+        seen.crop,
+        &place(&turns),
+        &place(&moved),
+        [0, 0, width, height],
+    );
     let overlap = |mask: &flyrig_types::Mask| {
         let pairs = carried.values.iter().zip(mask.coverage()).map(|(a, b)| (*a > 0.5, *b > 127));
         let (both, either) =
@@ -105,5 +111,9 @@ fn nothing_is_carried_of_a_body_out_of_view_and_poison_stays_out() {
         let carried = carried_mask(seen.output.mask.as_ref().unwrap(), seen.crop, &body, &body, [0, 0, 8, 8]);
         assert!(carried.values.iter().all(|value| value.is_finite() && (0.0..=1.0).contains(value)));
     }
-    assert!(carried_mask(seen.output.mask.as_ref().unwrap(), seen.crop, &Vec::new(), &Vec::new(), [3, 3, 3, 3]).values.is_empty());
+    assert!(
+        carried_mask(seen.output.mask.as_ref().unwrap(), seen.crop, &Vec::new(), &Vec::new(), [3, 3, 3, 3])
+            .values
+            .is_empty()
+    );
 }

@@ -283,7 +283,8 @@ impl<'a> Band<'a> {
         let (remainder2, mixed) = best?;
         // A shadow in front of dark clothes looks like a mixture.
         let is_shadow = self.outer.values[at] > 1.0
-            && self.behind[at].is_some_and(|behind| self.shadow_remainder2(at, behind) < remainder2 + BETTER_THAN_SHADOW);
+            && self.behind[at]
+                .is_some_and(|behind| self.shadow_remainder2(at, behind) < remainder2 + BETTER_THAN_SHADOW);
         Some(if is_shadow { Mixed { belief: 0.0, ..mixed } } else { mixed })
     }
 

@@ -111,15 +111,17 @@ impl NetworkFile {
     /// # Errors
     /// Kind [`TrackErrorKind::Net`] names the file, and the key where one is wrong.
     pub fn read(path: &Path) -> Result<(Self, Vec<u8>), TrackError> {
-        let failed = |file: &Path, what: String| {
-            TrackError::new(TrackErrorKind::Net, format!("{}: {what}", file.display()))
-        };
+        let failed =
+            |file: &Path, what: String| TrackError::new(TrackErrorKind::Net, format!("{}: {what}", file.display()));
         let text = std::fs::read_to_string(path).map_err(|error| failed(path, error.to_string()))?;
         let described = Self::parse(&text).map_err(|what| failed(path, what))?;
         let onnx = path.parent().unwrap_or(Path::new("")).join(&described.file);
         let length = std::fs::metadata(&onnx).map_err(|error| failed(&onnx, error.to_string()))?.len();
         if length > MOST_BYTES {
-            return Err(failed(&onnx, format!("{length} bytes are too many for a landmark network; at most {MOST_BYTES}")));
+            return Err(failed(
+                &onnx,
+                format!("{length} bytes are too many for a landmark network; at most {MOST_BYTES}"),
+            ));
         }
         let bytes = std::fs::read(&onnx).map_err(|error| failed(&onnx, error.to_string()))?;
         Ok((described, bytes))
@@ -148,7 +150,9 @@ impl NetworkFile {
         }
         let has = |number| self.point.iter().filter(|own| **own == number).count() == 1;
         if !(has(Number::X) && has(Number::Y)) {
-            return Err("point needs \"x\" and \"y\" once each, beside \"confidence\", \"logit\" or \"skip\"".to_owned());
+            return Err(
+                "point needs \"x\" and \"y\" once each, beside \"confidence\", \"logit\" or \"skip\"".to_owned()
+            );
         }
         let indices = self.indices()?;
         if indices.iter().flatten().count() < LEAST_LANDMARKS {
@@ -196,7 +200,10 @@ mod tests {
     #[test]
     fn a_description_is_read_and_defaults_are_bytes_to_one() {
         let described = NetworkFile::parse(GOOD).unwrap();
-        assert_eq!((described.output, described.channels, described.unit), (OutputForm::Simcc, Channels::Rgb, Unit::Pixels));
+        assert_eq!(
+            (described.output, described.channels, described.unit),
+            (OutputForm::Simcc, Channels::Rgb, Unit::Pixels)
+        );
         assert_eq!(described.deviation.map(f32::to_bits), [255.0f32; 3].map(f32::to_bits));
         let indices = described.indices().unwrap();
         assert_eq!((indices[0], indices[LEFT_HIP], indices[32]), (Some(0), Some(11), None));

@@ -4,8 +4,8 @@ use std::{collections::BTreeMap, sync::Arc, time::Duration};
 
 use flyrig_body::{Template, skin_mesh};
 use flyrig_tracker::{
-    Background, BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PersonArea, PoseConfig, PoseEstimate, PoseEstimator, PoseNet,
-    ShapeFit, TrackError, ViewKeypoints, is_blank, matte,
+    Background, BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PersonArea, PoseConfig, PoseEstimate,
+    PoseEstimator, PoseNet, ShapeFit, TrackError, ViewKeypoints, is_blank, matte,
 };
 use flyrig_types::{Frame, FrameSet, Image, Mask, PersonId, Pose, Rig};
 use rayon::prelude::*;

@@ -92,7 +92,9 @@ impl Perception for GivenPerception {
             masks.push(mask);
             edge_colors.push(colors);
         }
-        if self.masks == Origin::Estimated && self.watch.is_due(self.backgrounds.iter().flatten().any(Background::is_learning)) {
+        if self.masks == Origin::Estimated
+            && self.watch.is_due(self.backgrounds.iter().flatten().any(Background::is_learning))
+        {
             stages.time("background", || self.follow_backgrounds(set, &poses))?;
         }
         let confidence = if self.masks == Origin::Given { 1.0 } else { 0.5 };
