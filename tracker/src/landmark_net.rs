@@ -86,6 +86,9 @@ impl LandmarkNet {
     }
 }
 
+/// Shape of an output, and its numbers row by row.
+pub(crate) type ShapedNumbers = (Vec<usize>, Vec<f32>);
+
 /// Outputs of one run.
 pub(crate) struct NetOutputs {
     net: LandmarkNet,
@@ -108,7 +111,7 @@ impl NetOutputs {
     ///
     /// # Errors
     /// Kind [`TrackErrorKind::Net`] when one holds no numbers, or one that is not finite.
-    pub fn all(&self) -> Result<Vec<(Vec<usize>, Vec<f32>)>, TrackError> {
+    pub fn all(&self) -> Result<Vec<ShapedNumbers>, TrackError> {
         self.outputs.iter().map(|output| Ok((output.shape().to_vec(), self.numbers(output)?))).collect()
     }
 

@@ -205,7 +205,7 @@ impl<'a> Band<'a> {
                 None => beyond,
             };
         }
-        self.sharpen(&mut alphas);
+        sharpen(&mut alphas);
         let mut colors = Vec::new();
         for (at, mixed) in mixtures.iter().enumerate() {
             let (pixel, alpha) = (self.pixel(at), alphas.values[at]);
@@ -217,21 +217,6 @@ impl<'a> Band<'a> {
             }
         }
         Matte { mask: Mask::new(mask.width(), mask.height(), coverage).unwrap_or_else(|_| mask.clone()), colors }
-    }
-
-    /// Completes what is farther from the solved outline than a lens blurs it: there a mixture is a shade of the foreground, or
-    /// a shadow of the background.
-    fn sharpen(&self, alphas: &mut Grid) {
-        let mut unset = alphas.clone();
-        unset.values.iter_mut().for_each(|alpha| *alpha = 1.0 - *alpha);
-        let (outer, inner) = (alphas.distance_to_set(), unset.distance_to_set());
-        for (at, alpha) in alphas.values.iter_mut().enumerate() {
-            if inner.values[at] > BLUR_PX {
-                *alpha = 1.0;
-            } else if outer.values[at] > BLUR_PX {
-                *alpha = 0.0;
-            }
-        }
     }
 
     /// Foreground colour of a pixel of the given coverage.
@@ -330,6 +315,21 @@ impl<'a> Band<'a> {
             }
         }
         Some(sum.map(|s| s / count))
+    }
+}
+
+/// Completes what is farther from the solved outline than a lens blurs it: there a mixture is a shade of the foreground, or
+/// a shadow of the background.
+fn sharpen(alphas: &mut Grid) {
+    let mut unset = alphas.clone();
+    unset.values.iter_mut().for_each(|alpha| *alpha = 1.0 - *alpha);
+    let (outer, inner) = (alphas.distance_to_set(), unset.distance_to_set());
+    for (at, alpha) in alphas.values.iter_mut().enumerate() {
+        if inner.values[at] > BLUR_PX {
+            *alpha = 1.0;
+        } else if outer.values[at] > BLUR_PX {
+            *alpha = 0.0;
+        }
     }
 }
 

@@ -58,7 +58,7 @@ pub struct PoseNet {
 #[derive(Clone)]
 enum Kind {
     BlazePose(LandmarkNet),
-    Chosen(ChosenNet),
+    Chosen(Box<ChosenNet>),
 }
 
 impl std::fmt::Debug for PoseNet {
@@ -91,7 +91,7 @@ impl PoseNet {
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] names the file, and the key where one is wrong.
     pub fn from_description(path: &Path) -> Result<Self, TrackError> {
-        Ok(Self { kind: Kind::Chosen(ChosenNet::read(path)?) })
+        Ok(Self { kind: Kind::Chosen(Box::new(ChosenNet::read(path)?)) })
     }
 
     /// Whether outputs hold a mask and the landmarks' depth.
