@@ -102,7 +102,7 @@ impl ChosenNet {
     fn points(&self, input: &[f32]) -> Result<Points, TrackError> {
         let outputs = self.net.run(input)?.all()?;
         let outputs: Vec<Array> = outputs.iter().map(|(shape, values)| Array { shape, values }).collect();
-        let count = self.indices.iter().flatten().max().map_or(0, |most| most + 1);
+        let count = self.indices.iter().flatten().max().map_or(0, |most| most.saturating_add(1));
         let found = match self.file.output {
             OutputForm::Points => points(&outputs, count, &self.file, self.size),
             OutputForm::Heatmaps => heatmaps(&outputs, count, self.size),
@@ -159,7 +159,7 @@ impl Array<'_> {
 fn points(outputs: &[Array<'_>], count: usize, file: &NetworkFile, [width, height]: [usize; 2]) -> Option<Points> {
     let numbers = file.point.len();
     // Several may fit: an array whose rows are landmarks comes first, then the smallest.
-    let fits = |output: &&Array| output.values.len().is_multiple_of(numbers) && output.values.len() >= count * numbers;
+    let fits = |output: &&Array| output.values.len().is_multiple_of(numbers) && output.values.len() / numbers >= count;
     let output = outputs
         .iter()
         .filter(fits)

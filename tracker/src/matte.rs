@@ -193,7 +193,7 @@ impl<'a> Band<'a> {
     fn solve(&self, mask: &Mask) -> Matte {
         let mut coverage = mask.coverage().to_vec();
         let mixtures: Vec<Option<Mixed>> =
-            (0..self.light.len()).map(|at| self.unmix(at).filter(|_| self.is_open(at))).collect();
+            (0..self.light.len()).map(|at| self.is_open(at).then(|| self.unmix(at)).flatten()).collect();
         let mut alphas = Grid::new(self.width, self.height, 0.0);
         for (at, mixed) in mixtures.iter().enumerate() {
             // Soft slopes of the mask end with the band.
@@ -273,8 +273,8 @@ impl<'a> Band<'a> {
         Some(if is_shadow { Mixed { belief: 0.0, ..mixed } } else { mixed })
     }
 
-    /// What a shadow on the background leaves unexplained of a pixel, squared standard deviations; infinite where no shadow is so
-    /// dark, or brightens.
+    /// Returns the squared residual of a pixel explained as background in shadow, in squared standard deviations; infinite
+    /// where the pixel is too dark for a shadow, or brighter than the background.
     fn shadow_remainder2(&self, at: usize, behind: [f32; 3]) -> f32 {
         let (seen, behind) = (self.light[at], weighted(behind));
         let noise = NOISE * step((seen.iter().sum::<f32>() / 3.0).max(4e-3));
@@ -318,8 +318,8 @@ impl<'a> Band<'a> {
     }
 }
 
-/// Completes what is farther from the solved outline than a lens blurs it: there a mixture is a shade of the foreground, or
-/// a shadow of the background.
+/// Sets alpha to 0 or 1 farther from the solved outline than a lens blurs it. There, a mixture is a shade of the foreground or a
+/// shadow on the background.
 fn sharpen(alphas: &mut Grid) {
     let mut unset = alphas.clone();
     unset.values.iter_mut().for_each(|alpha| *alpha = 1.0 - *alpha);

@@ -29,12 +29,12 @@ pub(crate) struct NetworkFile {
     /// Mean of each channel, taken off the bytes 0 to 255, in the order of the channels.
     #[serde(default)]
     pub mean: [f32; 3],
-    /// What is left is divided by this.
+    /// Divisor of each channel, after the mean is taken off.
     #[serde(default = "bytes")]
     pub deviation: [f32; 3],
     /// Form of the output.
     pub output: OutputForm,
-    /// What the numbers of a landmark are, where the output holds points.
+    /// Meaning of each number of a landmark, where the output holds points.
     #[serde(default = "xy_confidence")]
     pub point: Vec<Number>,
     /// Unit of those points.

@@ -34,7 +34,7 @@ pub(crate) fn coarse_mask(sighting: &Sighting, gate: &BodyGate) -> Grid {
 }
 
 /// The probability that the body's distance gives.
-pub(crate) fn body_mask(gate: &BodyGate) -> Grid {
+fn body_mask(gate: &BodyGate) -> Grid {
     let mut coarse = gate.distance.clone();
     coarse.values.iter_mut().for_each(|distance| *distance = 1.0 / (1.0 + ((*distance - CLOTHES) / FADE).exp()));
     coarse

@@ -8,7 +8,7 @@ use crate::{FusionError, PerceptionSettings};
 /// Backgrounds take in one of so many sets.
 const UPDATE_EVERY: u32 = 4;
 
-/// Returns the background of each camera: that of its plate, or one that is not known yet. A key colour replaces the plates.
+/// Returns the background of each camera, where the settings or a plate give one. A key colour replaces the plates.
 pub(super) fn backgrounds(
     cameras: &[Camera],
     settings: &PerceptionSettings,
@@ -19,8 +19,7 @@ pub(super) fn backgrounds(
     }
     let of = |(slot, camera): (usize, &Camera)| {
         let plate = plates.get(slot).and_then(Option::as_ref);
-        let known = plate.map(|plate| Background::from_plate(camera, plate)).transpose()?;
-        Ok(Some(known.unwrap_or_else(|| Background::unknown(camera))))
+        Ok(plate.map(|plate| Background::from_plate(camera, plate)).transpose()?)
     };
     cameras.iter().enumerate().map(of).collect()
 }

@@ -130,8 +130,11 @@ impl EstimatedPerception {
         };
         let rounds = config.outline_rounds;
         let mut estimator = PoseEstimator::new(network(settings, rig)?, template, rig, config)?;
-        let backgrounds = backgrounds(&rig.cameras, settings, plates)?;
-        estimator.set_backgrounds(backgrounds.into_iter().map(|background| background.map(Arc::new)).collect());
+        if settings.masks == Origin::Estimated {
+            let known = backgrounds(&rig.cameras, settings, plates)?.into_iter().zip(&rig.cameras);
+            let learnt = known.map(|(known, camera)| known.unwrap_or_else(|| Background::unknown(camera)));
+            estimator.set_backgrounds(learnt.map(|background| Some(Arc::new(background))).collect());
+        }
         let learning = (settings.shape() == Origin::Estimated).then(|| (Vec::new(), i64::MIN));
         estimator.look_at_all(learning.is_some());
         let hands = match settings.hands {
