@@ -139,7 +139,7 @@ fn measure(
     let off = HandConfig { fingers: false, head: false, ..config };
     let [mut on_true, mut on_estimate] = [tracker(config)?, tracker(config)?];
     let [mut relaxed_true, mut relaxed_estimate] = [tracker(off)?, tracker(off)?];
-    let body_config = PoseConfig { fit_shape: false, masks: false, ..PoseConfig::default() };
+    let body_config = PoseConfig { masks: false, ..PoseConfig::default() };
     let mut body = PoseEstimator::new(PoseNet::embedded()?, &template, &rig, body_config)?;
     let bar = progress_bar(args.frames, format!("{px} px, person {}", args.seed + index));
     for number in 0..args.frames {

@@ -21,7 +21,7 @@ pub struct PoseConfig {
     pub outline_rounds: usize,
     /// Height of the person, metres; `None` measures it, or takes the template's before a single camera.
     pub height_m: Option<f64>,
-    /// Rounds in which [`crate::PoseEstimator::fit_shape`] matches outlines with masks to solve for lengths, girths, build and
+    /// Rounds in which [`crate::PoseEstimator::measure_shape`] matches outlines with masks to solve for lengths, girths, build and
     /// poses together; 0 fits bone lengths to landmarks alone (docs/benchmarks/perception.md, "Shape from outlines").
     pub shape_rounds: usize,
     /// Standard deviation of a joint's turn between sets at 30 sets a second, radians; smaller is smoother.
@@ -33,9 +33,6 @@ pub struct PoseConfig {
     pub looks: usize,
     /// Largest number of solver steps a frame set.
     pub max_steps: usize,
-    /// Whether bone lengths are fitted by [`crate::PoseEstimator::fit_shape`]; off for a template that
-    /// already is the person.
-    pub fit_shape: bool,
     /// Whether masks are made; off saves time where the source brings its own.
     pub masks: bool,
     /// Crops of an image that a search for a person looks at in a set; 0 looks at all of them in every set.
@@ -59,7 +56,6 @@ impl Default for PoseConfig {
             look_after_m: 0.02,
             looks: 0,
             max_steps: 12,
-            fit_shape: true,
             masks: true,
             search_crops: 3,
             forget_after: 15,

@@ -5,6 +5,8 @@ mod masks;
 mod refine;
 mod shape;
 
+pub use shape::ShapeSighting;
+
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -101,9 +103,13 @@ pub struct PoseEstimator {
     lost: u32,
     /// Whether the network looks at every view of every set.
     looks_at_all: bool,
+    /// Whether sightings are kept, and the last one.
+    keeps_sightings: bool,
+    sighting: Option<ShapeSighting>,
 }
 
 /// A fitted pose before it is believed.
+#[derive(Debug, Clone)]
 struct Fitted {
     turns: Turns,
     looks: Vec<Option<Look>>,
@@ -175,12 +181,24 @@ impl PoseEstimator {
             search: Search::default(),
             lost: 0,
             looks_at_all: false,
+            keeps_sightings: false,
+            sighting: None,
         })
     }
 
-    /// Lets the network look at every view of every set, whether the body moves or not: for [`Self::fit_shape_to_keypoints`].
-    pub fn look_at_all(&mut self, always: bool) {
+    /// Lets the network look at every view of every set, whether the body moves or not.
+    pub(crate) fn look_at_all(&mut self, always: bool) {
         self.looks_at_all = always;
+    }
+
+    /// Keeps each set's sighting for [`Self::measure_shape`]; the network looks at every view of every set then.
+    pub fn keep_sightings(&mut self, keep: bool) {
+        (self.looks_at_all, self.keeps_sightings, self.sighting) = (keep, keep, None);
+    }
+
+    /// Returns the sighting of the last set that was estimated; `None` where there was nobody, or where none is kept.
+    pub fn take_sighting(&mut self) -> Option<ShapeSighting> {
+        self.sighting.take()
     }
 
     /// Returns the settings, to change them from the next set on.
@@ -274,6 +292,7 @@ impl PoseEstimator {
         may_search: bool,
     ) -> Result<PoseEstimate, TrackError> {
         let pictures = self.check(set)?;
+        self.sighting = None;
         let mut seconds = StageSeconds::default();
         let found = if pictures.iter().all(Option::is_none) {
             // A prediction alone is nobody.
@@ -304,6 +323,8 @@ impl PoseEstimator {
             (fitted, masks) = self.finish(set, &pictures, again, &mut texture, &mut seconds);
         }
         let looked = fitted.looked();
+        self.sighting =
+            self.keeps_sightings.then(|| ShapeSighting { set: set.clone(), fitted: fitted.clone() });
         self.remember(set, fitted.turns.clone(), fitted.looks, texture);
         Ok(PoseEstimate {
             pose: self.model.to_pose(&fitted.turns),

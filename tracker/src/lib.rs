@@ -65,7 +65,7 @@ pub use deform::{DataTerm, DeformReport, DeformSettings, DeformSolver, DeformTra
 pub use edge_color::{EdgeColor, Matte};
 pub use error::{TrackError, TrackErrorKind};
 pub use estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};
-pub use estimator::{Marks, PoseEstimator};
+pub use estimator::{Marks, PoseEstimator, ShapeSighting};
 pub use gate::BodyGate;
 pub use habits::{Habit, LandmarkStudy};
 pub use hands::{

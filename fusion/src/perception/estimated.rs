@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, sync::Arc, time::Duration};
 use flyrig_body::{Template, skin_mesh};
 use flyrig_tracker::{
     Background, BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PersonArea, PoseConfig, PoseEstimate,
-    PoseEstimator, PoseNet, ShapeFit, TrackError, ViewKeypoints, is_blank, matte,
+    PoseEstimator, PoseNet, ShapeFit, ShapeSighting, TrackError, is_blank, matte,
 };
 use flyrig_types::{Frame, FrameSet, Image, Mask, PersonId, Pose, Rig};
 use rayon::prelude::*;
@@ -38,8 +38,8 @@ const OTHER_SHAPE: f64 = 0.03;
 struct Place {
     id: PersonId,
     estimator: PoseEstimator,
-    /// Landmarks that the shape will be fitted to, with the time of the last ones; `None` while nobody is measured.
-    learning: Option<(Vec<Vec<Option<ViewKeypoints>>>, i64)>,
+    /// What the shape will be fitted to, with the time of the last sighting; `None` while nobody is measured.
+    learning: Option<(Vec<ShapeSighting>, i64)>,
     /// Whether a shape is known.
     known: bool,
     /// Whether the shape that is being measured replaces the known one, however little they differ.
@@ -60,14 +60,14 @@ impl Place {
     /// The shape is known.
     fn know(&mut self) -> Result<(), TrackError> {
         (self.learning, self.known, self.renews) = (None, true, false);
-        self.estimator.look_at_all(false);
+        self.estimator.keep_sightings(false);
         self.hands.as_mut().map_or(Ok(()), |hands| hands.set_template(self.estimator.template()))
     }
 
     /// Begins to measure the person who is followed.
     fn measure(&mut self) {
         self.learning = Some((Vec::new(), i64::MIN));
-        self.estimator.look_at_all(true);
+        self.estimator.keep_sightings(true);
     }
 
     /// The template that poses are for.
@@ -136,7 +136,7 @@ impl EstimatedPerception {
             estimator.set_backgrounds(learnt.map(|background| Some(Arc::new(background))).collect());
         }
         let learning = (settings.shape() == Origin::Estimated).then(|| (Vec::new(), i64::MIN));
-        estimator.look_at_all(learning.is_some());
+        estimator.keep_sightings(learning.is_some());
         let hands = match settings.hands {
             Origin::Given => None,
             Origin::Estimated => Some(HandTracker::new(template, rig, HandConfig::default())?),
@@ -284,20 +284,21 @@ impl EstimatedPerception {
         (0..set.frames.len()).map(of_slot).collect()
     }
 
-    /// Collects landmarks of people whose shape is not known, and fits it once there are enough.
+    /// Collects sightings of people whose shape is not known, and fits it once there are enough.
     fn learn(&mut self, set: &FrameSet, estimates: &[Result<PoseEstimate, String>]) {
         let every_nanos = (SHAPE_SECS * 1e9 / SHAPE_SETS as f64) as i64;
         for (place, estimate) in self.places.iter_mut().zip(estimates) {
-            let (Some((keypoints, last)), Ok(estimate)) = (&mut place.learning, estimate) else { continue };
+            let (Some((sightings, last)), Ok(_)) = (&mut place.learning, estimate) else { continue };
             if set.master_nanos.saturating_sub(*last) < every_nanos {
                 continue;
             }
-            keypoints.push(estimate.keypoints.clone());
+            let Some(sighting) = place.estimator.take_sighting() else { continue };
+            sightings.push(sighting);
             *last = set.master_nanos;
-            if keypoints.len() < SHAPE_SETS {
+            if sightings.len() < SHAPE_SETS {
                 continue;
             }
-            let measured = place.estimator.measure_shape(keypoints);
+            let measured = place.estimator.measure_shape(sightings);
             let taken = measured.and_then(|(template, fit)| {
                 let is_other = place.known && bone_difference(place.estimator.template(), &template) > OTHER_SHAPE;
                 match (place.known, is_other, place.renews) {
@@ -312,7 +313,7 @@ impl EstimatedPerception {
             });
             if let Err(error) = taken {
                 tracing::warn!(%error, "the shape of person {} is not known yet, trying again", place.id);
-                keypoints.clear();
+                sightings.clear();
             } else if let Err(error) = place.know() {
                 tracing::warn!(%error, "hands of person {} are not estimated", place.id);
                 place.hands = None;

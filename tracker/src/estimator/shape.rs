@@ -2,8 +2,18 @@
 
 use super::*;
 
+/// Steps of the solver to a pose in a new shape.
+const POSE_STEPS: usize = 40;
+
+/// A person as seen in one frame set, to measure the shape by.
+#[derive(Debug, Clone)]
+pub struct ShapeSighting {
+    pub(super) set: FrameSet,
+    pub(super) fitted: Fitted,
+}
+
 impl PoseEstimator {
-    /// Fits bone lengths to the person in a few frame sets (5 to 10, buffered at the start; the more the person moves in them the
+    /// Fits the shape to the person in a few frame sets (5 to 10, buffered at the start; the more the person moves in them the
     /// better) and replaces the template by the fitted one. Estimate the buffered sets again then, in order, and go on. Nobody of
     /// `others`, landmarks by person and set, is taken for the person. Returns the person's own landmarks by set as well.
     ///
@@ -14,8 +24,8 @@ impl PoseEstimator {
         sets: &[FrameSet],
         others: &[Vec<Option<Marks>>],
     ) -> Result<(ShapeFit, Vec<Option<Marks>>), TrackError> {
-        let mut keypoints = Vec::new();
-        let (mut first, mut last) = (None, None);
+        let mut sightings = Vec::new();
+        let mut last = None;
         let mut places = Vec::new();
         for (index, set) in sets.iter().enumerate() {
             let others: Vec<Marks> = others.iter().filter_map(|marks| *marks.get(index)?).collect();
@@ -23,52 +33,48 @@ impl PoseEstimator {
             places.push(found.as_ref().ok().map(|fitted| self.model.marks(&fitted.turns)));
             match found {
                 Ok(fitted) => {
-                    keypoints.push(fitted.keypoints);
-                    first.get_or_insert_with(|| (fitted.turns.clone(), set.master_nanos));
-                    self.remember(set, fitted.turns, fitted.looks, Texture::default());
+                    self.remember(set, fitted.turns.clone(), fitted.looks.clone(), Texture::default());
+                    sightings.push(ShapeSighting { set: set.clone(), fitted });
                 }
                 Err(error) => last = Some(error),
             }
         }
         self.reset();
-        let mut fit = match (first.is_some(), last) {
-            (false, Some(error)) => return Err(error),
-            _ => self.fit_shape_to_keypoints(&keypoints)?,
+        let measured = match (sightings.is_empty(), last) {
+            (true, Some(error)) => Err(error),
+            _ => self.measure_shape(&sightings),
         };
-        if self.config.shape_rounds > 0 && self.rig.cameras.len() > 1 {
-            self.fit_shape_to_outlines(sets, &mut fit)?;
-        }
-        self.reset();
-        if let Some((turns, nanos)) = first {
-            self.start_at(turns, nanos);
+        let (template, fit) = measured?;
+        self.take_shape(template)?;
+        if let Some(first) = sightings.into_iter().next() {
+            self.start_at(first.fitted.turns, first.set.master_nanos);
         }
         Ok((fit, places))
     }
 
-    /// Fits bone lengths to the landmarks of a person in a few sets, by set and slot, and goes on tracking with them. Before a
-    /// single camera, which cannot measure anything, the height is the configuration's or an average one.
-    ///
-    /// # Errors
-    /// Kind `Lost` when too few of the sets show a person in two views; the template stays as it was.
-    pub fn fit_shape_to_keypoints(&mut self, keypoints: &[Vec<Option<ViewKeypoints>>]) -> Result<ShapeFit, TrackError> {
-        let (template, fit) = self.measure_shape(keypoints)?;
-        self.take_shape(template)?;
-        Ok(fit)
-    }
-
-    /// Fits bone lengths as [`Self::fit_shape_to_keypoints`] does, but goes on with the shape as it is. Returns the template of
+    /// Fits the shape to a person seen in a few sets: bone lengths to the landmarks, then lengths, girths and build to landmarks
+    /// and outlines, together with the poses ([`crate::PoseConfig::shape_rounds`]). Before a single camera, which cannot measure
+    /// anything, the height is the configuration's or an average one. Goes on with the shape as it is; returns the template of
     /// the fitted shape for [`Self::take_shape`].
     ///
     /// # Errors
     /// Kind `Lost` when too few of the sets show a person in two views.
-    pub fn measure_shape(&self, keypoints: &[Vec<Option<ViewKeypoints>>]) -> Result<(Template, ShapeFit), TrackError> {
+    pub fn measure_shape(&self, sightings: &[ShapeSighting]) -> Result<(Template, ShapeFit), TrackError> {
         if self.rig.cameras.len() == 1 {
-            template_of_height(&self.base, self.config.height_m)
-        } else {
-            let seen = |views: &&Vec<_>| seen_landmarks(views, self.config.confidence_threshold) >= MIN_LANDMARKS;
-            let keypoints: Vec<Vec<_>> = keypoints.iter().filter(seen).cloned().collect();
-            fit_template_shape(&self.base, &self.rig, &keypoints, &self.config)
+            return template_of_height(&self.base, self.config.height_m);
         }
+        let seen = |views: &&Vec<_>| seen_landmarks(views, self.config.confidence_threshold) >= MIN_LANDMARKS;
+        let keypoints = sightings.iter().map(|sighting| &sighting.fitted.keypoints);
+        let keypoints: Vec<Vec<_>> = keypoints.filter(seen).cloned().collect();
+        let (template, mut fit) = fit_template_shape(&self.base, &self.rig, &keypoints, &self.config)?;
+        if self.config.shape_rounds == 0 {
+            return Ok((template, fit));
+        }
+        // Masks and outlines are those of the body in the new shape.
+        let mut shaped = Self { track: None, ..self.clone() };
+        shaped.take_shape(template)?;
+        shaped.fit_shape_to_outlines(sightings, &mut fit)?;
+        Ok((shaped.template, fit))
     }
 
     /// Goes on tracking with a template of [`Self::measure_shape`].
@@ -95,14 +101,17 @@ impl PoseEstimator {
     }
 
     /// Solves for shape and poses of all sets together, from landmarks and the outlines of masks.
-    fn fit_shape_to_outlines(&mut self, sets: &[FrameSet], fit: &mut ShapeFit) -> Result<(), TrackError> {
+    fn fit_shape_to_outlines(&mut self, sightings: &[ShapeSighting], fit: &mut ShapeFit) -> Result<(), TrackError> {
         let mut found = Vec::new();
-        for set in sets {
-            let Ok(mut fitted) = self.find_at_once(set, &[]) else { continue };
-            let pictures = self.check(set)?;
-            let masks = self.masks(set, &pictures, &mut fitted);
+        for ShapeSighting { set, fitted } in sightings {
+            let mut fitted = fitted.clone();
             fitted.evidence.before = None;
-            self.remember(set, fitted.turns.clone(), fitted.looks.clone(), Texture::default());
+            let problem = fitted.evidence.problem(&self.model, &self.config);
+            let Some((turns, _)) = problem.solve(&fitted.turns, POSE_STEPS).filter(|(turns, _)| finite(turns)) else {
+                continue;
+            };
+            fitted.turns = turns;
+            let masks = self.masks(set, &self.check(set)?, &mut fitted);
             found.push((set, fitted, masks));
         }
         let space = ShapeSpace::new(&self.base);
