@@ -8,7 +8,7 @@ use crate::gate::BodyGate;
 use crate::grid::Grid;
 use crate::key::{KeyColor, Screen};
 use crate::pixels::Rgb;
-use crate::plate::{Drift, floats, gated_mask, plate_evidence};
+use crate::plate::{Drift, NO_EVIDENCE, floats, gated_mask, plate_evidence};
 use crate::{TrackError, TrackErrorKind};
 
 /// Share of the image away from people that differs from the plate when the whole room has changed.
@@ -262,7 +262,7 @@ impl BackgroundLight<'_> {
                 if plate.knows(y * picture.width + x) {
                     known += 1;
                 } else {
-                    *value = 0.5;
+                    *value = NO_EVIDENCE;
                 }
             }
         }

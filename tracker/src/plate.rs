@@ -24,6 +24,8 @@ const GAIN_SAMPLES: usize = 40;
 const ON_BODY: f32 = 0.15;
 const DEEP_IN_BODY: f32 = 0.35;
 const OFF_BODY: f32 = 0.4;
+/// Evidence where the background is not known.
+pub(crate) const NO_EVIDENCE: f32 = 0.5;
 /// Depth in the body, metres, from which only a sure difference of the image speaks against a person.
 const DEEP_M: f64 = 0.04;
 

@@ -7,6 +7,7 @@ use crate::gate::{BodyGate, CLOTHES_REACH};
 use crate::grid::{Grid, clean};
 use crate::net::NET_SIDE;
 use crate::pixels::Rgb;
+use crate::plate::NO_EVIDENCE;
 use crate::sighting::Sighting;
 
 /// Twice the log-odds of a pixel that surely differs from the plate, and of one that does not.
@@ -93,10 +94,10 @@ pub(crate) fn refine(
                 0.0
             };
             let near = 1.0 - 4.0 * d.min(1.0);
-            let plate = plate_evidence.map_or(0.0, |e| {
-                let evidence = e.values[at] - 0.5;
-                evidence * if evidence > 0.0 { DIFFERENT_LOGIT } else { PLATE_LOGIT }
-            });
+            let evidence = plate_evidence.map_or(NO_EVIDENCE, |e| e.values[at]) - NO_EVIDENCE;
+            let plate = evidence * if evidence > 0.0 { DIFFERENT_LOGIT } else { PLATE_LOGIT };
+            // What the surroundings look like here the plate knows better: shoes of the floor's colour are no floor.
+            let color = if evidence == 0.0 { color } else { color.max(0.0) };
             let logit = (p / (1.0 - p)).ln() + 0.6 * color + near + plate;
             probability.values[at] = 1.0 / (1.0 + (-logit).exp());
         }
