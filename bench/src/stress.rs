@@ -125,18 +125,21 @@ pub fn stress(args: &BenchStressArgs, gpu: &GpuContext) -> Result<()> {
 }
 
 fn format_row(row: &Row) -> String {
-    let joints = |k: usize| format!("{:.0} ({:.0})", row.mm[k], row.p95_mm[k]);
+    // Nobody is there to compare with while the room is empty or dark.
+    let known = |value: f64, text: String| if value.is_finite() { text } else { "-".to_owned() };
+    let joints = |k: usize| known(row.mm[k], format!("{:.0} ({:.0})", row.mm[k], row.p95_mm[k]));
+    let iou = |k: usize| known(row.iou[k], format!("{:.3}", row.iou[k]));
     let lost = |k: usize| format!("{} of {}", row.lost[k], row.sets[k]);
     let recovery = row.recovery_secs.map_or_else(|| "never".to_owned(), |secs| format!("{secs:.2}"));
     format!(
-        "| {} | {} | {} | {} | {:.3} | {:.3} | {:.3} | {} | {} | {} | {recovery} | {:.0} |\n",
+        "| {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {recovery} | {:.0} |\n",
         row.name,
         joints(0),
         joints(1),
         joints(2),
-        row.iou[0],
-        row.iou[1],
-        row.iou[2],
+        iou(0),
+        iou(1),
+        iou(2),
         lost(0),
         lost(1),
         lost(2),

@@ -81,3 +81,32 @@ fn one_camera_is_enough_for_a_person_of_known_or_average_height() {
     assert_eq!(tiny.code, Some(1));
     assert!(tiny.stderr.contains("perception.height_m is 0.1"), "{}", tiny.stderr);
 }
+
+#[test]
+fn hands_and_face_are_found_in_images_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let rig = RIG.replace("width = 256\nheight = 256", "width = 640\nheight = 640\nperson.fingers = true");
+    std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
+    let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    let exported = command(&["sim", "export", "rig.toml", "--out", "take", "--frames", "4", "--no-truth"]);
+    assert_eq!(exported.code, Some(0), "{exported:?}");
+    let eval = |pose: &str| {
+        let mut args = vec!["eval", "take", "--inputs", "00,01", "--holdout", "02", "--fps", "10", "--out", "eval"];
+        args.extend(["--pose", pose, "--masks", "estimated", "--hands", "estimated"]);
+        args.extend(["--gaussians", "2000", "--nodes", "50"]);
+        command(&args)
+    };
+    let ran = eval("estimated");
+    assert_eq!(ran.code, Some(0), "{}", ran.stderr);
+    let counted = |what: &str| -> u64 {
+        let line = ran.stdout.lines().find_map(|line| line.trim().strip_prefix(what));
+        line.and_then(|rest| rest.trim().parse().ok()).unwrap_or(0)
+    };
+    // Four sets of two hands and a head.
+    assert!(counted("hands fitted") >= 4, "{}", ran.stdout);
+    assert_eq!(counted("hands fitted") + counted("hands relaxed"), 8, "{}", ran.stdout);
+    assert!(counted("heads turned by the face") >= 2, "{}", ran.stdout);
+    let refused = eval("given");
+    assert_eq!(refused.code, Some(1));
+    assert!(refused.stderr.contains("a given pose brings its own fingers"), "{}", refused.stderr);
+}

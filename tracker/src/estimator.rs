@@ -323,8 +323,7 @@ impl PoseEstimator {
             (fitted, masks) = self.finish(set, &pictures, again, &mut texture, &mut seconds);
         }
         let looked = fitted.looked();
-        self.sighting =
-            self.keeps_sightings.then(|| ShapeSighting { set: set.clone(), fitted: fitted.clone() });
+        self.sighting = self.keeps_sightings.then(|| ShapeSighting { set: set.clone(), fitted: fitted.clone() });
         self.remember(set, fitted.turns.clone(), fitted.looks, texture);
         Ok(PoseEstimate {
             pose: self.model.to_pose(&fitted.turns),

@@ -170,7 +170,7 @@ pub fn fit_template_shape(
     }
     let scale = factors.get("scale").copied().unwrap_or(scale);
     let fit = ShapeFit { scale, groups, sigma: BTreeMap::new(), height_m: height_m(&shaped), sets, height_from };
-    tracing::info!(scale, height_m = fit.height_m, sets, "fitted the template's bone lengths");
+    tracing::debug!(scale, height_m = fit.height_m, sets, "fitted the template's bone lengths");
     Ok((shaped, fit))
 }
 

@@ -143,7 +143,7 @@ impl PoseEstimator {
             self.model = BodyModel::new(&self.template)?;
             fit.set(&space, &shape, &sigma, &self.template);
         }
-        tracing::info!(?fit, "fitted the body to landmarks and outlines");
+        tracing::debug!(?fit, "fitted the body to landmarks and outlines");
         Ok(())
     }
 

@@ -56,7 +56,7 @@ pub struct HandConfig {
 
 impl Default for HandConfig {
     fn default() -> Self {
-        Self { min_hand_px: 30.0, min_face_px: 30.0, crops: 6, look_after_m: 0.005, fingers: true, head: true }
+        Self { min_hand_px: 20.0, min_face_px: 30.0, crops: 6, look_after_m: 0.005, fingers: true, head: true }
     }
 }
 
