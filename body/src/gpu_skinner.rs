@@ -60,8 +60,8 @@ impl GpuSkinner {
 
     /// Records the kernel: writes world position and scale to `center_scale`, world normals and
     /// [`SurfaceGaussians::depth_m`] to `normal`, one
-    /// element a Gaussian. `displacement` holds t_x, canonical metres; an element that is not finite counts as
-    /// zero. The pose is uploaded among the encoder's commands: several poses may go into one encoder.
+    /// element a Gaussian. `displacement` holds t_x, canonical metres, and in w the share by which the surface is larger than at rest,
+    /// and Gaussians and their depths with it ([`crate::displacement`]); what is not finite counts as zero. The pose is uploaded among the encoder's commands: several poses may go into one encoder.
     ///
     /// # Errors
     /// [`BodyError::Pose`] when the pose does not fit or is not finite, [`BodyError::Buffer`] when a buffer is too
@@ -152,14 +152,16 @@ impl GpuSkinner {
             }
             let matrix = if total > 0.0 { matrix * (1.0 / total) } else { Mat4::IDENTITY };
             let [x, y, z, scale] = rest[i];
-            let moved = displacement.get(i).map_or(Vec3::ZERO, |by| Vec4::from(*by).truncate());
-            let point = Vec3::new(x, y, z) + if moved.is_finite() { moved } else { Vec3::ZERO };
+            let by = displacement.get(i).map_or(Vec4::ZERO, |by| Vec4::from(*by));
+            let by = if by.truncate().is_finite() { by } else { Vec4::ZERO };
+            let growth = if by.w.is_finite() { 1.0 + by.w.max(0.0) } else { 1.0 };
+            let point = Vec3::new(x, y, z) + by.truncate();
             let world = matrix.x_axis * point.x + matrix.y_axis * point.y + matrix.z_axis * point.z + matrix.w_axis;
-            *center_scale = [world.x, world.y, world.z, scale];
+            *center_scale = [world.x, world.y, world.z, growth * scale];
             let turned = matrix.transform_vector3(Vec4::from(rest_normal[i]).truncate());
             let length_squared = turned.length_squared();
             let unit = if length_squared > 1e-20 { turned / length_squared.sqrt() } else { Vec3::ZERO };
-            *normal = unit.extend(rest_normal[i][3]).to_array();
+            *normal = unit.extend(growth * rest_normal[i][3]).to_array();
         });
     }
 }

@@ -3,7 +3,7 @@
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 
 use crate::surface_links::SurfaceLinks;
 use crate::{BodyError, SurfaceGaussians, Template};
@@ -80,6 +80,32 @@ pub fn build_graph(
         (0..count).map(|i| hang(gaussians.positions[i], &nearest[i], &nodes, sigma2_m2)).unzip();
     Ok(DeformationGraph { nodes, node_gaussian, neighbors, gaussian_nodes, gaussian_weights })
 }
+
+/// Returns the canonical displacement of a Gaussian by the translations of its nodes (FlyHuman Eq. 2), metres; and in w the
+/// share by which it grows with the surface around it, 0 where that is hardly longer than at rest: by the distances between its nodes,
+/// as a root of the mean square. So wide clothes have no holes. `rest` holds all nodes,
+/// canonical metres; nodes that are missing there or in `translations` count as at rest.
+#[must_use]
+pub fn displacement(rest: &[Vec3], translations: &[DVec3], nodes: [u32; 4], weights: [f32; 4]) -> [f32; 4] {
+    let moved = nodes.map(|node| translations.get(node as usize).copied().unwrap_or(DVec3::ZERO));
+    let by: DVec3 = moved.iter().zip(weights).map(|(t, weight)| *t * f64::from(weight)).sum();
+    let (mut then, mut now) = (0.0, 0.0);
+    for (a, b) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)] {
+        if let (Some(first), Some(other)) = (rest.get(nodes[a] as usize), rest.get(nodes[b] as usize)) {
+            let apart = (*other - *first).as_dvec3();
+            then += apart.length_squared();
+            now += (apart + moved[b] - moved[a]).length_squared();
+        }
+    }
+    let longer = if then > 0.0 && now.is_finite() { (now / then).sqrt() / CLOSED } else { 1.0 };
+    let longer = longer.clamp(1.0, MOST_GROWTH) - 1.0;
+    by.as_vec3().extend(longer as f32).to_array()
+}
+
+/// Gaussians overlap enough to close a surface that is longer than at rest by this factor; larger ones would only blur it.
+const CLOSED: f64 = 1.25;
+/// Most that a Gaussian grows, as a factor.
+const MOST_GROWTH: f64 = 4.0;
 
 /// No node.
 const NONE: u32 = u32::MAX;

@@ -48,7 +48,7 @@ pub use fingers::{FingerJoints, find_fingers};
 pub use gltf_export::write_glb;
 pub use gltf_import::{GltfHuman, load_gltf};
 pub use gpu_skinner::GpuSkinner;
-pub use graph::{DEFAULT_NODE_COUNT, DEFAULT_SIGMA2_M2, DeformationGraph, build_graph};
+pub use graph::{DEFAULT_NODE_COUNT, DEFAULT_SIGMA2_M2, DeformationGraph, build_graph, displacement};
 pub use mesh_ply::write_mesh_ply;
 pub use motion_clip::MotionClip;
 pub use retarget::RetargetOptions;

@@ -1,5 +1,5 @@
 // Linear blend skinning of surface Gaussians: world = LBS(x + t_x), FlyHuman section 3.1.
-// One invocation a Gaussian. A displacement that is not finite counts as none; a buffer of one element
+// One invocation a Gaussian. A displacement or growth that is not finite counts as none; a buffer of one element
 // displaces nobody else.
 
 // Three rows of world_from_canonical a joint.
@@ -11,6 +11,7 @@
 // Four joint indices of 16 bits.
 @group(0) @binding(3) var<storage, read> skin_joints: array<vec2u>;
 @group(0) @binding(4) var<storage, read> skin_weights: array<vec4f>;
+// w: share by which the surface, its Gaussians and their depth are larger than at rest.
 @group(0) @binding(5) var<storage, read> displacement: array<vec4f>;
 @group(0) @binding(6) var<storage, read_write> center_scale: array<vec4f>;
 @group(0) @binding(7) var<storage, read_write> normal: array<vec4f>;
@@ -59,13 +60,15 @@ fn skin(
         z = vec4f(0.0, 0.0, 1.0, 0.0);
     }
     var point = rest[i].xyz;
+    var growth = 1.0;
     if i < arrayLength(&displacement) && finite(displacement[i].xyz) {
         point += displacement[i].xyz;
+        growth += select(0.0, max(displacement[i].w, 0.0), finite(displacement[i].www));
     }
     let p = vec4f(point, 1.0);
-    center_scale[i] = vec4f(dot(x, p), dot(y, p), dot(z, p), rest[i].w);
+    center_scale[i] = vec4f(dot(x, p), dot(y, p), dot(z, p), growth * rest[i].w);
     let n = rest_normal[i].xyz;
     let turned = vec3f(dot(x.xyz, n), dot(y.xyz, n), dot(z.xyz, n));
     let length_squared = dot(turned, turned);
-    normal[i] = vec4f(select(vec3f(), turned * inverseSqrt(length_squared), length_squared > 1e-20), rest_normal[i].w);
+    normal[i] = vec4f(select(vec3f(), turned * inverseSqrt(length_squared), length_squared > 1e-20), growth * rest_normal[i].w);
 }

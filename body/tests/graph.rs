@@ -6,9 +6,9 @@ mod common;
 
 use flyrig_body::{
     DEFAULT_SIGMA2_M2, DeformationGraph, Part, ShapeParams, SurfaceGaussians, Template, build_graph, default_template,
-    sample_surface, skin_mesh,
+    displacement, sample_surface, skin_mesh,
 };
-use glam::{DQuat, Vec3};
+use glam::{DQuat, DVec3, Vec3};
 
 fn graph_of(template: &Template, gaussians: usize, nodes: usize) -> (SurfaceGaussians, DeformationGraph) {
     let gaussians = sample_surface(template, gaussians, 3).unwrap();
@@ -208,4 +208,25 @@ fn bad_input_is_refused() {
     let mut foreign = gaussians;
     foreign.triangle[0] = 1_000_000;
     assert!(refused(&foreign, 5, 0.001).contains("sample its surface again"));
+}
+
+/// Gaussians grow with the surface once that is much longer than at rest, and no rigid motion makes them grow.
+#[test]
+fn gaussians_grow_with_a_surface_that_is_stretched() {
+    let (_, graph) = graph_of(&common::square(), 500, 40);
+    let at = |i: usize, translations: &[DVec3]| {
+        displacement(&graph.nodes, translations, graph.gaussian_nodes[i], graph.gaussian_weights[i])
+    };
+    let stretched = |by: f64| -> Vec<DVec3> { graph.nodes.iter().map(|p| p.as_dvec3() * (by - 1.0)).collect() };
+    for i in 0..graph.gaussian_nodes.len() {
+        let shifted = at(i, &vec![DVec3::new(0.1, -0.2, 0.3); 40]);
+        assert!((Vec3::from_slice(&shifted) - Vec3::new(0.1, -0.2, 0.3)).length() < 1e-6 && shifted[3] < 1e-6);
+        for (by, growth) in [(0.2, 1.0), (1.2, 1.0), (2.0, 1.6), (4.0, 3.2), (50.0, 4.0)] {
+            assert!((at(i, &stretched(by))[3] + 1.0 - growth).abs() < 1e-4, "{by}");
+        }
+        assert!(at(i, &[])[3].abs() < 1e-6, "nodes without a translation are at rest");
+        assert!(at(i, &vec![DVec3::NAN; 40])[3].abs() < 1e-6);
+    }
+    let nowhere = displacement(&[], &[DVec3::X], [0; 4], [1.0, 0.0, 0.0, 0.0]);
+    assert!((Vec3::from_slice(&nowhere) - Vec3::X).length() < 1e-6 && nowhere[3].abs() < 1e-6);
 }

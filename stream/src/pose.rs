@@ -2,7 +2,12 @@
 
 use alloc::vec::Vec;
 
-use crate::{Motion, StreamTemplate};
+use crate::{Motion, StreamTemplate, planes::Influences};
+
+/// Gaussians overlap enough to close a surface that is longer than at rest by this factor.
+const CLOSED: f32 = 1.25;
+/// Most that a Gaussian grows, as a factor.
+const MOST_GROWTH: f32 = 4.0;
 
 /// Gaussians in the world; both lists have one element a Gaussian.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -17,14 +22,15 @@ pub struct Posed {
 type Rows = [[f32; 4]; 3];
 
 impl StreamTemplate {
-    /// Poses the Gaussians: world = LBS(x + sum of w t) (FlyHuman Eq. 1 and 2). A motion that lacks joints or nodes leaves
-    /// them at rest.
+    /// Poses the Gaussians: world = LBS(x + sum of w t) (FlyHuman Eq. 1 and 2). They grow where the surface around them is longer
+    /// than at rest. A motion that lacks joints or nodes leaves them at rest.
     pub fn pose(&self, motion: &Motion, posed: &mut Posed) {
         let matrices = self.world_from_canonical(motion);
         posed.center_scale.clear();
         posed.normal.clear();
         for (i, (&[x, y, z, scale], normal)) in self.center_scale.iter().zip(&self.normals).enumerate() {
             let mut point = [x, y, z];
+            let mut growth = 1.0;
             if let Some(nodes) = self.node_weights.get(i) {
                 for (node, share) in nodes.index.into_iter().zip(nodes.shares()) {
                     if let Some(by) = motion.nodes.get(node as usize) {
@@ -33,6 +39,7 @@ impl StreamTemplate {
                         }
                     }
                 }
+                growth = self.growth(motion, nodes);
             }
             let mut rows: Rows = [[0.0; 4]; 3];
             let skin = &self.skin[i];
@@ -44,12 +51,30 @@ impl StreamTemplate {
                 }
             }
             let [px, py, pz] = rows.map(|[a, b, c, d]| a * point[0] + b * point[1] + c * point[2] + d);
-            posed.center_scale.push([px, py, pz, scale]);
+            posed.center_scale.push([px, py, pz, growth * scale]);
             let turned = rows.map(|[a, b, c, _]| a * normal[0] + b * normal[1] + c * normal[2]);
             let squared = turned.iter().map(|v| v * v).sum::<f32>();
             let by = if squared > 1e-20 { 1.0 / libm::sqrtf(squared) } else { 0.0 };
             posed.normal.push([turned[0] * by, turned[1] * by, turned[2] * by, 0.0]);
         }
+    }
+
+    /// How much a Gaussian grows with the surface between its nodes, as `displacement` in the crate `body` has it.
+    fn growth(&self, motion: &Motion, nodes: &Influences) -> f32 {
+        let (mut then, mut now) = (0.0, 0.0);
+        for (a, b) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)] {
+            let (a, b) = (nodes.index[a] as usize, nodes.index[b] as usize);
+            let (Some(first), Some(other)) = (self.node_places.get(a), self.node_places.get(b)) else { continue };
+            let still = [0.0; 3];
+            let (from, to) = (motion.nodes.get(a).unwrap_or(&still), motion.nodes.get(b).unwrap_or(&still));
+            for k in 0..3 {
+                let apart = other[k] - first[k];
+                let moved = apart + to[k] - from[k];
+                (then, now) = (then + apart * apart, now + moved * moved);
+            }
+        }
+        let longer = if then > 0.0 && now.is_finite() { libm::sqrtf(now / then) / CLOSED } else { 1.0 };
+        longer.clamp(1.0, MOST_GROWTH)
     }
 
     /// Skinning matrices of all joints.

@@ -100,6 +100,24 @@ fn posed_gaussians_stay_near_the_reference() {
 }
 
 #[test]
+fn gaussians_grow_with_a_surface_that_is_stretched() {
+    let person = Person::tube(3000, 200);
+    let template = person.encode().template;
+    let mut motion = person.motion(1);
+    let mut posed = Posed::default();
+    for (by, growth) in [(0.0, 1.0), (0.2, 1.0), (1.0, 1.6), (49.0, 4.0), (f32::NAN, 1.0)] {
+        motion.nodes = template.node_places.iter().map(|place| place.map(|v| by * v)).collect();
+        template.pose(&motion, &mut posed);
+        for (splat, rest) in posed.center_scale.iter().zip(&template.center_scale) {
+            assert!((splat[3] - growth * rest[3]).abs() < 1e-5, "{by}: {} {}", splat[3], rest[3]);
+        }
+    }
+    motion.nodes.clear();
+    template.pose(&motion, &mut posed);
+    assert!(posed.center_scale.iter().zip(&template.center_scale).all(|(a, b)| (a[3] - b[3]).abs() < 1e-9));
+}
+
+#[test]
 fn every_motion_is_readable_by_itself() {
     let person = Person::tube(500, 50);
     let encoded = person.encode();

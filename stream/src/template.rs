@@ -66,6 +66,8 @@ pub struct StreamTemplate {
     pub(crate) normals: Vec<[f32; 3]>,
     pub(crate) skin: Vec<Influences>,
     pub(crate) node_weights: Vec<Influences>,
+    /// Canonical positions of the nodes, metres: each that of the Gaussian which hangs on it most.
+    pub(crate) node_places: Vec<[f32; 3]>,
 }
 
 /// A template with its bytes and the source's order.
@@ -239,7 +241,9 @@ impl StreamTemplate {
             normals: Vec::with_capacity(count),
             skin: Vec::with_capacity(count),
             node_weights: Vec::with_capacity(if nodes > 0 { count } else { 0 }),
+            node_places: alloc::vec![[0.0; 3]; nodes],
         };
+        let mut most = alloc::vec![0; nodes];
         let (step, scale_step) = (extent / POSITION_LEVELS, largest / SCALE_LEVELS);
         for _ in 0..count {
             before = model.code(&mut decoder, &before, &Quantised::default(), nodes > 0);
@@ -256,6 +260,12 @@ impl StreamTemplate {
             template.normals.push(normal_of(normal));
             template.skin.push(joints);
             if nodes > 0 {
+                for (node, weight) in on_nodes.index.into_iter().zip(on_nodes.weight) {
+                    let node = node as usize;
+                    if weight > most[node] {
+                        (most[node], template.node_places[node]) = (weight, [at(0), at(1), at(2)]);
+                    }
+                }
                 template.node_weights.push(on_nodes);
             }
         }

@@ -1,6 +1,6 @@
 //! From the nodes to all Gaussians, and to the template's vertices.
 
-use flyrig_body::{DeformationGraph, SurfaceGaussians, Template};
+use flyrig_body::{DeformationGraph, SurfaceGaussians, Template, displacement};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
@@ -9,6 +9,7 @@ use super::vertex_means::VertexMeans;
 /// Eq. 2 for every Gaussian, whether the solver looks at it or not.
 #[derive(Debug)]
 pub struct MeshMotion {
+    rest: Vec<Vec3>,
     nodes: Vec<[u32; 4]>,
     weights: Vec<[f32; 4]>,
     displacement: Vec<[f32; 4]>,
@@ -18,6 +19,7 @@ pub struct MeshMotion {
 impl MeshMotion {
     pub fn new(template: &Template, surface: &SurfaceGaussians, graph: &DeformationGraph) -> Self {
         Self {
+            rest: graph.nodes.clone(),
             nodes: graph.gaussian_nodes.clone(),
             weights: graph.gaussian_weights.clone(),
             displacement: vec![[0.0; 4]; surface.len()],
@@ -25,13 +27,11 @@ impl MeshMotion {
         }
     }
 
-    /// Follows the nodes; canonical displacements t_x, metres, w 0.
+    /// Follows the nodes; canonical displacements t_x, metres, and growth, as [`displacement`] has them.
     pub fn follow(&mut self, translations: &[DVec3]) -> &[[f32; 4]] {
+        let rest = &self.rest;
         let one = |((out, nodes), weights): ((&mut [f32; 4], &[u32; 4]), &[f32; 4])| {
-            let moved = |(&node, &weight): (&u32, &f32)| {
-                translations.get(node as usize).map_or(DVec3::ZERO, |t| *t * f64::from(weight))
-            };
-            *out = nodes.iter().zip(weights).map(moved).sum::<DVec3>().as_vec3().extend(0.0).to_array();
+            *out = displacement(rest, translations, *nodes, *weights);
         };
         self.displacement.par_iter_mut().zip(&self.nodes).zip(&self.weights).with_min_len(4096).for_each(one);
         &self.displacement

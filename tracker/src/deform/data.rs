@@ -20,7 +20,7 @@ pub trait DataTerm {
     /// Why it cannot.
     type Error;
 
-    /// The loss with the Gaussians at `LBS(x + displacement)`, canonical metres, w unused.
+    /// The loss with the Gaussians at `LBS(x + displacement)`, canonical metres, and growth in w.
     ///
     /// # Errors
     /// The implementation's.

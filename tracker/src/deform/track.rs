@@ -1,7 +1,7 @@
 //! The deformation from frame to frame.
 
-use flyrig_body::{DeformationGraph, SkinWeights};
-use glam::DVec3;
+use flyrig_body::{DeformationGraph, SkinWeights, displacement};
+use glam::{DVec3, Vec3};
 
 use super::carry::to_canonical;
 use super::normal::NormalMatrix;
@@ -46,6 +46,7 @@ pub struct DeformReport {
 #[derive(Debug)]
 pub struct DeformTracker {
     settings: DeformSettings,
+    rest: Vec<Vec3>,
     gaussian_nodes: Vec<[u32; 4]>,
     gaussian_weights: Vec<[f32; 4]>,
     skin: Vec<SkinWeights>,
@@ -101,6 +102,7 @@ impl DeformTracker {
         Ok(Self {
             damping: settings.damping,
             settings,
+            rest: graph.nodes.clone(),
             gaussian_nodes: graph.gaussian_nodes.clone(),
             gaussian_weights: graph.gaussian_weights.clone(),
             skin: skin.to_vec(),
@@ -197,7 +199,7 @@ impl DeformTracker {
         &self.translations
     }
 
-    /// Canonical displacements t_x of the Gaussians (Eq. 2), metres; w is 0.
+    /// Canonical displacements t_x of the Gaussians (Eq. 2), metres, and their growth in w ([`flyrig_body::displacement`]).
     #[must_use]
     pub fn displacement(&self) -> &[[f32; 4]] {
         &self.displacement
@@ -382,14 +384,9 @@ impl DeformTracker {
 
     /// Eq. 2.
     fn displace(&mut self) {
-        for ((out, nodes), weights) in
-            self.displacement.iter_mut().zip(&self.gaussian_nodes).zip(&self.gaussian_weights)
-        {
-            let mut sum = DVec3::ZERO;
-            for (&node, &weight) in nodes.iter().zip(weights) {
-                sum += self.translations[node as usize] * f64::from(weight);
-            }
-            *out = sum.as_vec3().extend(0.0).to_array();
+        let hung = self.gaussian_nodes.iter().zip(&self.gaussian_weights);
+        for (out, (nodes, weights)) in self.displacement.iter_mut().zip(hung) {
+            *out = displacement(&self.rest, &self.translations, *nodes, *weights);
         }
     }
 }
