@@ -60,8 +60,9 @@ impl GpuSkinner {
 
     /// Records the kernel: writes world position and scale to `center_scale`, world normals and
     /// [`SurfaceGaussians::depth_m`] to `normal`, one
-    /// element a Gaussian. `displacement` holds t_x, canonical metres, and in w the share by which the surface is larger than at rest,
-    /// and Gaussians and their depths with it ([`crate::displacement`]); what is not finite counts as zero. The pose is uploaded among the encoder's commands: several poses may go into one encoder.
+    /// element a Gaussian. `displacement` holds t_x, canonical metres; its w is the share by which a Gaussian and its depth below the
+    /// surface grow ([`crate::displacement`]). An element that is not finite counts as zero. The pose is uploaded among the
+    /// encoder's commands: several poses may go into one encoder.
     ///
     /// # Errors
     /// [`BodyError::Pose`] when the pose does not fit or is not finite, [`BodyError::Buffer`] when a buffer is too

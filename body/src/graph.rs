@@ -81,10 +81,10 @@ pub fn build_graph(
     Ok(DeformationGraph { nodes, node_gaussian, neighbors, gaussian_nodes, gaussian_weights })
 }
 
-/// Returns the canonical displacement of a Gaussian by the translations of its nodes (FlyHuman Eq. 2), metres; and in w the
-/// share by which it grows with the surface around it, 0 where that is hardly longer than at rest: by the distances between its nodes,
-/// as a root of the mean square. So wide clothes have no holes. `rest` holds all nodes,
-/// canonical metres; nodes that are missing there or in `translations` count as at rest.
+/// Returns the canonical displacement of a Gaussian by the translations of its nodes (FlyHuman Eq. 2), metres, and in w the share by
+/// which the Gaussian grows, so that a stretched surface (skirts, coats) has no holes. The stretch is the root mean square distance
+/// between the Gaussian's nodes over that at rest; growth starts at a stretch of 1.25. `rest` holds the canonical positions of all nodes,
+/// metres; nodes that are missing there or in `translations` count as at rest.
 #[must_use]
 pub fn displacement(rest: &[Vec3], translations: &[DVec3], nodes: [u32; 4], weights: [f32; 4]) -> [f32; 4] {
     let moved = nodes.map(|node| translations.get(node as usize).copied().unwrap_or(DVec3::ZERO));

@@ -59,7 +59,8 @@ impl StreamTemplate {
         }
     }
 
-    /// How much a Gaussian grows with the surface between its nodes, as `displacement` in the crate `body` has it.
+    /// Returns the factor by which a Gaussian grows with the surface between its nodes: the formula and the constants of
+    /// `displacement` in the crate `body`, which this crate cannot use (`no_std`).
     fn growth(&self, motion: &Motion, nodes: &Influences) -> f32 {
         let (mut then, mut now) = (0.0, 0.0);
         for (a, b) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)] {

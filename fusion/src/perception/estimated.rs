@@ -38,7 +38,7 @@ const OTHER_SHAPE: f64 = 0.03;
 struct Place {
     id: PersonId,
     estimator: PoseEstimator,
-    /// What the shape will be fitted to, with the time of the last sighting; `None` while nobody is measured.
+    /// Sightings for the shape fit and the last one's time, nanoseconds; `None` while the shape is not being measured.
     learning: Option<(Vec<ShapeSighting>, i64)>,
     /// Whether a shape is known.
     known: bool,

@@ -2,6 +2,7 @@
 
 use flyrig_body::{DeformationGraph, SkinWeights, displacement};
 use glam::{DVec3, Vec3};
+use rayon::prelude::*;
 
 use super::carry::to_canonical;
 use super::normal::NormalMatrix;
@@ -384,10 +385,11 @@ impl DeformTracker {
 
     /// Eq. 2.
     fn displace(&mut self) {
-        let hung = self.gaussian_nodes.iter().zip(&self.gaussian_weights);
-        for (out, (nodes, weights)) in self.displacement.iter_mut().zip(hung) {
-            *out = displacement(&self.rest, &self.translations, *nodes, *weights);
-        }
+        let (rest, translations) = (&self.rest, &self.translations);
+        let hung = self.gaussian_nodes.par_iter().zip(&self.gaussian_weights);
+        self.displacement.par_iter_mut().zip(hung).with_min_len(4096).for_each(|(out, (nodes, weights))| {
+            *out = displacement(rest, translations, *nodes, *weights);
+        });
     }
 }
 
