@@ -55,6 +55,8 @@ pub enum BenchCommand {
     Stress(BenchStressArgs),
     /// Two people in one scene: views, and the cost beside one person; writes a table and PNG images.
     Subjects(BenchSubjectsArgs),
+    /// Who is who: takes of several people who walk past one another, found and followed from images alone.
+    Takes(BenchTakesArgs),
     /// Recording uncompressed cameras: bytes, processor time and loss of each JPEG quality against images as they come.
     Record(BenchRecordArgs),
 }
@@ -373,6 +375,31 @@ pub struct BenchSubjectsArgs {
     /// Gaussians on each person's surface.
     #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
     pub gaussians: usize,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchTakesArgs {
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-takes")]
+    pub out: PathBuf,
+    /// How many takes, each with people and a room of its own.
+    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub takes: u64,
+    /// People in each take: one stays in the middle, the others walk around.
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(2..=4).map(usize::from))]
+    pub people: usize,
+    /// Seed of the first take.
+    #[arg(long, default_value_t = 601)]
+    pub seed: u64,
+    /// Seconds of a take.
+    #[arg(long, default_value_t = 5.0)]
+    pub secs: f64,
+    /// Frame sets a second.
+    #[arg(long, default_value_t = 10.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// Pixels of an image's side.
+    #[arg(long, default_value_t = 384, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
 }
 
 #[derive(Debug, Args)]

@@ -20,6 +20,7 @@ mod stress;
 mod subjects;
 mod summary;
 mod surface;
+mod takes;
 mod track;
 mod watch;
 mod write;
@@ -64,6 +65,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         BenchCommand::Watch(args) => watch::watch(args, &gpu()?),
         BenchCommand::Masks(args) => masks::masks(args),
         BenchCommand::Perception(args) => perception::perception(args, &gpu()?),
+        BenchCommand::Takes(args) => takes::takes(args, &gpu()?),
         BenchCommand::Subjects(args) => subjects::subjects(args, &gpu()?),
         BenchCommand::Record(args) => recording::record(args, &gpu()?),
     }

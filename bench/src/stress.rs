@@ -15,7 +15,7 @@ use flyrig_sim::{
     Build, LightConfig, LightSwitch, MotionConfig, MotionKind, PersonConfig, RingConfig, SceneConfig, SceneKind,
     SimConfig, Simulator,
 };
-use flyrig_types::{Frame, FrameSet, Image, PixelFormat};
+use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat};
 use glam::{DQuat, DVec3};
 
 use crate::{
@@ -49,6 +49,10 @@ enum Disturbance {
     Lights(f64),
     /// A camera's exposure jumps by this factor.
     Exposure(f64),
+    /// Somebody walks past.
+    PasserBy,
+    /// Below the neck this share is left of the difference between the person and what is behind.
+    Camouflaged(f64),
     /// Nobody is there.
     Away,
     /// Nobody is there, then somebody of another build.
@@ -67,10 +71,11 @@ const fn case(name: &'static str, motion: MotionKind, secs: f64, what: Disturban
     Case { name, motion, speed: 1.0, secs, what }
 }
 
-const CASES: [Case; 15] = [
+const CASES: [Case; 18] = [
     Case { name: "turn by 360 degrees", motion: MotionKind::Turn, speed: 2.0, secs: 5.0, what: Disturbance::Motion },
     case("crossed arms", MotionKind::CrossArms, 4.0, Disturbance::Motion),
     case("sitting", MotionKind::Sit, 4.0, Disturbance::Motion),
+    case("lying", MotionKind::Lie, 8.0, Disturbance::Motion),
     case("dance", MotionKind::Dance, 4.0, Disturbance::Motion),
     case("jump", MotionKind::Jump, 4.0, Disturbance::Motion),
     case("0.7 m from the middle", MotionKind::Wave, 3.0, Disturbance::OffCentre(0.7)),
@@ -81,6 +86,8 @@ const CASES: [Case; 15] = [
     case("lights to a third", MotionKind::Wave, 4.0, Disturbance::Lights(0.33)),
     case("lights to double", MotionKind::Wave, 4.0, Disturbance::Lights(2.0)),
     case("exposure of one camera halved", MotionKind::Wave, 4.0, Disturbance::Exposure(0.5)),
+    case("somebody walks past", MotionKind::Wave, 5.0, Disturbance::PasserBy),
+    case("clothes like the background", MotionKind::Wave, 4.0, Disturbance::Camouflaged(0.2)),
     case("gone for 4 s", MotionKind::Wave, 4.0, Disturbance::Away),
     case("replaced by a taller person", MotionKind::Wave, 4.0, Disturbance::Replaced),
 ];
@@ -147,7 +154,13 @@ fn format_row(row: &Row) -> String {
     )
 }
 
-fn simulator(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, build: Build, at_m: f64) -> Result<Simulator> {
+fn simulator(
+    args: &BenchStressArgs,
+    gpu: &GpuContext,
+    case: &Case,
+    build: Build,
+    (at_m, passer_by): (f64, bool),
+) -> Result<Simulator> {
     let lights = match case.what {
         Disturbance::Lights(level) => vec![LightConfig {
             switch: vec![
@@ -165,7 +178,7 @@ fn simulator(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, build: Build
         cameras: RingConfig { count: args.cameras, ..RingConfig::default() },
         width: args.side,
         height: args.side,
-        scene: SceneConfig { kind: SceneKind::Office, seed: Some(args.seed), ..SceneConfig::default() },
+        scene: SceneConfig { kind: SceneKind::Office, seed: Some(args.seed), passer_by, ..SceneConfig::default() },
         lights,
         ..SimConfig::default()
     };
@@ -183,15 +196,30 @@ fn scaled(image: &Image, factor: f64) -> Result<Image> {
     Ok(Image::new(image.width(), image.height(), image.format(), bytes)?)
 }
 
+/// The image with only a share of the difference from the plate left where the mask covers rows from `top` on.
+fn camouflaged(image: &Image, plate: &Image, mask: &Mask, top: usize, share: f64) -> Result<Image> {
+    let width = image.width() as usize;
+    let mut bytes = image.bytes().to_vec();
+    for (at, alpha) in mask.coverage().iter().enumerate().skip(top * width) {
+        let keep = 1.0 - (1.0 - share) * f64::from(*alpha) / 255.0;
+        for (now, plate) in bytes[3 * at..3 * at + 3].iter_mut().zip(&plate.bytes()[3 * at..3 * at + 3]) {
+            let difference = f64::from(*now) - f64::from(*plate);
+            *now = (f64::from(*plate) + keep * difference).round() as u8;
+        }
+    }
+    Ok(Image::new(image.width(), image.height(), image.format(), bytes)?)
+}
+
 fn run(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, index: usize) -> Result<Row> {
     let at_m = match case.what {
         Disturbance::OffCentre(metres) => metres,
         _ => 0.0,
     };
-    let mut usual = simulator(args, gpu, case, Build::SlimWoman, 0.0)?;
+    let mut usual = simulator(args, gpu, case, Build::SlimWoman, (0.0, false))?;
     let mut other = match case.what {
-        Disturbance::OffCentre(_) => Some(simulator(args, gpu, case, Build::SlimWoman, at_m)?),
-        Disturbance::Replaced => Some(simulator(args, gpu, case, Build::HeavyMan, 0.0)?),
+        Disturbance::OffCentre(_) => Some(simulator(args, gpu, case, Build::SlimWoman, (at_m, false))?),
+        Disturbance::PasserBy => Some(simulator(args, gpu, case, Build::SlimWoman, (0.0, true))?),
+        Disturbance::Replaced => Some(simulator(args, gpu, case, Build::HeavyMan, (0.0, false))?),
         _ => None,
     };
     let rig = usual.rig().clone();
@@ -211,7 +239,7 @@ fn run(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, index: usize) -> R
         let secs = set_index as f64 / args.fps;
         let phase = if secs < BEFORE_SECS { 0 } else { 1 + usize::from(secs >= BEFORE_SECS + case.secs) };
         let (shows_other, is_empty) = match case.what {
-            Disturbance::OffCentre(_) => (phase == 1, false),
+            Disturbance::OffCentre(_) | Disturbance::PasserBy => (phase == 1, false),
             Disturbance::Away => (false, phase == 1),
             Disturbance::Replaced => (phase == 2, phase == 1),
             _ => (false, false),
@@ -230,6 +258,12 @@ fn run(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, index: usize) -> R
                 _ if is_empty => copy(shown.plate(slot)?)?,
                 Disturbance::Covered if hit => scaled(&image, 0.0)?,
                 Disturbance::Dark if phase == 1 => scaled(&image, 0.0)?,
+                Disturbance::Camouflaged(share) if phase == 1 => {
+                    let pose = shown.track().at_repeated(nanos);
+                    let neck = places(&shown.template().skeleton, &pose).get("Neck").map(|(place, _)| *place);
+                    let top = neck.and_then(|neck| rig.cameras[slot].project(neck)).map_or(0.0, |pixel| pixel.y);
+                    camouflaged(&image, shown.plate(slot)?, &mask, top.max(0.0) as usize, share)?
+                }
                 Disturbance::Exposure(factor) if hit => scaled(&image, factor)?,
                 _ => image,
             };
@@ -296,8 +330,8 @@ fn run(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, index: usize) -> R
 fn present_masks<'a>(
     seen: &'a SeenPerson,
     set: &'a FrameSet,
-    truths: &'a [Option<flyrig_types::Mask>],
-) -> impl Iterator<Item = (&'a flyrig_types::Mask, &'a flyrig_types::Mask)> {
+    truths: &'a [Option<Mask>],
+) -> impl Iterator<Item = (&'a Mask, &'a Mask)> {
     let views = seen.views.iter().zip(set.present());
     views.filter_map(|(view, (slot, _))| view.mask.as_ref().zip(truths.get(slot)?.as_ref()))
 }

@@ -22,7 +22,7 @@ use crate::{cli::BenchSubjectsArgs, perception::places};
 const APART_M: f64 = 0.45;
 const WALK_APART_M: f64 = 0.7;
 /// Input and held-out cameras.
-const INPUTS: [usize; 4] = [0, 2, 4, 6];
+pub(crate) const INPUTS: [usize; 4] = [0, 2, 4, 6];
 const HELD_OUT: [usize; 3] = [1, 3, 5];
 
 /// One way of tracking.
@@ -250,7 +250,13 @@ fn find_people(people: &mut [Simulator], chosen: &[usize], rig: &Rig, inputs: &R
     Ok(perception)
 }
 
-fn frame_set(people: &mut [Simulator], chosen: &[usize], rig: &Rig, index: u64, nanos: i64) -> Result<FrameSet> {
+pub(crate) fn frame_set(
+    people: &mut [Simulator],
+    chosen: &[usize],
+    rig: &Rig,
+    index: u64,
+    nanos: i64,
+) -> Result<FrameSet> {
     let frame = |slot: usize| -> Result<Option<Arc<Frame>>> {
         let (image, mask) = capture(people, chosen, nanos, slot)?;
         Ok(Some(Arc::new(Frame {

@@ -441,7 +441,7 @@ pub struct DemoArgs {
     /// Seed of the person and the room.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// "turn", "walk", "wave", "squat", "reach", "sit", "jump", "cross-arms", "dance", "still", "by-seed", "bvh" (a captured
+    /// "turn", "walk", "wave", "squat", "reach", "sit", "lie", "jump", "cross-arms", "dance", "still", "by-seed", "bvh" (a captured
     /// walk from Debian's assimp-testmodels), or a *.bvh, *.glb or *.gltf file.
     #[arg(long, default_value = "turn")]
     pub motion: String,

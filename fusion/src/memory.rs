@@ -3,7 +3,7 @@
 
 use std::{collections::HashMap, io::Write as _, path::Path};
 
-use flyrig_body::{Joint, Skeleton, Template};
+use flyrig_body::{Joint, Skeleton, Skirt, Template};
 use flyrig_stfa::FeatureMemory;
 use glam::{DMat4, DQuat, DVec3, Vec3};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
@@ -18,6 +18,8 @@ const VERSION_KEY: &str = "flyrig-person";
 const JOINTS_KEY: &str = "joints";
 /// Key of the digest of the networks' weights, hexadecimal, where a memory of networks is saved.
 const NETWORKS_KEY: &str = "networks";
+/// Key of a skirt's length and flare, where the person wears one.
+const SKIRT_KEY: &str = "skirt";
 /// A larger file is no saved person, bytes.
 const MOST_BYTES: u64 = 1 << 30;
 
@@ -28,6 +30,7 @@ pub struct PersonMemory {
     positions: Vec<Vec3>,
     normals: Vec<Vec3>,
     joints: Vec<Joint>,
+    skirt: Option<Skirt>,
     /// Canonical translation of each node of the deformation graph, metres; empty where the body is only skinned.
     pub(crate) translations: Vec<DVec3>,
     /// Accumulated linear RGB of each Gaussian, and its weight.
@@ -47,9 +50,9 @@ pub(crate) struct NetworkMemory {
 }
 
 impl PersonMemory {
-    /// Collects what is known; the shape is the template's.
+    /// Collects what is known; the shape is the template's, without the skirt.
     pub(crate) fn new(
-        template: &Template,
+        (template, skirt): (&Template, Option<Skirt>),
         translations: Vec<DVec3>,
         memory: Vec<[f32; 4]>,
         colors: Vec<[f32; 4]>,
@@ -57,7 +60,13 @@ impl PersonMemory {
     ) -> Self {
         let joints = template.skeleton.joints().to_vec();
         let (positions, normals) = (template.positions.clone(), template.normals.clone());
-        Self { positions, normals, joints, translations, memory, colors, networks }
+        Self { positions, normals, joints, skirt, translations, memory, colors, networks }
+    }
+
+    /// What the person wears around both legs.
+    #[must_use]
+    pub fn skirt(&self) -> Option<Skirt> {
+        self.skirt
     }
 
     /// Returns the person's template: `base` with the learnt shape.
@@ -130,6 +139,7 @@ impl PersonMemory {
         let mut metadata =
             HashMap::from([(VERSION_KEY.to_owned(), VERSION.to_owned()), (JOINTS_KEY.to_owned(), names.join("\n"))]);
         metadata.extend(self.networks.iter().map(|of| (NETWORKS_KEY.to_owned(), format!("{:016x}", of.digest))));
+        metadata.extend(self.skirt.map(|Skirt { length, flare }| (SKIRT_KEY.to_owned(), format!("{length} {flare}"))));
         let file = safetensors::serialize(views, Some(metadata)).map_err(|error| fail(error.to_string()))?;
         flyrig_types::write_whole(path, |out| out.write_all(&file))
             .map_err(|error| fail(format!("cannot be written ({error}); check that the folder exists and has room")))
@@ -223,7 +233,16 @@ impl PersonMemory {
                 Some(NetworkMemory { digest, memory })
             }
         };
+        let skirt = metadata.get(SKIRT_KEY).map(|text| {
+            let (length, flare) = text.split_once(' ')?;
+            let numbers = (length.parse().ok()?, flare.parse().ok()?);
+            Some(Skirt { length: numbers.0, flare: numbers.1 })
+        });
+        if skirt == Some(None) {
+            return Err(damaged("the skirt's length and flare are no numbers"));
+        }
         Ok(Self {
+            skirt: skirt.flatten(),
             positions: vec3("positions")?,
             normals: vec3("normals")?,
             joints: names.iter().enumerate().map(joint).collect(),
@@ -254,7 +273,8 @@ mod tests {
         template.positions[7] += Vec3::new(0.01, 0.0, -0.02);
         let translations = vec![DVec3::new(0.001, -0.002, 0.003); 5];
         let colors = vec![[0.5; 4]; 9];
-        let memory = PersonMemory::new(&template, translations, vec![[0.1, 0.2, 0.3, 8.0]; 9], colors, None);
+        let skirt = Some(Skirt { length: 0.55, flare: 0.15 });
+        let memory = PersonMemory::new((&template, skirt), translations, vec![[0.1, 0.2, 0.3, 8.0]; 9], colors, None);
         (template, memory)
     }
 

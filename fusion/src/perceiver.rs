@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use flyrig_body::Template;
+use flyrig_body::{Skirt, Template};
 use flyrig_types::{FrameSet, PersonId};
 
 use crate::{Effort, FusionError, KnownPerson, Observation, Perception, StageTimes};
@@ -31,6 +31,7 @@ pub(crate) struct Newcomer {
     pub person: PersonId,
     pub shape: u32,
     pub template: Template,
+    pub skirt: Option<Skirt>,
 }
 
 /// A [`Perception`] with what the next set needs of the session.
@@ -72,7 +73,10 @@ impl Perceiver {
     pub fn newcomers(&self, known: &[(PersonId, u32)]) -> Vec<Newcomer> {
         let people = self.perception.people().into_iter();
         let is_new = |found: &KnownPerson<'_>| !known.contains(&(found.person, found.shape));
-        let newcomer = |KnownPerson { person, shape, template }| Newcomer { person, shape, template: template.clone() };
+        let newcomer = |KnownPerson { person, shape, template, skirt }| {
+            let template = template.clone();
+            Newcomer { person, shape, template, skirt }
+        };
         people.filter(is_new).map(newcomer).collect()
     }
 }

@@ -6,7 +6,7 @@ mod estimated;
 mod given;
 mod split_mask;
 
-use flyrig_body::Template;
+use flyrig_body::{Skirt, Template};
 use flyrig_tracker::{EdgeColor, ViewKeypoints};
 use flyrig_types::{FrameSet, Mask, PersonId, Pose};
 
@@ -46,6 +46,8 @@ pub struct KnownPerson<'a> {
     pub shape: u32,
     /// The person's shape in its bind pose.
     pub template: &'a Template,
+    /// What hangs around both legs, where it does.
+    pub skirt: Option<Skirt>,
 }
 
 /// Observation of one person in a set.

@@ -203,3 +203,56 @@ fn publish(publisher: &Publisher, encoders: &mut BTreeMap<u32, PersonEncoder>, f
         Err(error) => tracing::warn!(person = %PersonId(person), %error, "person not published"),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use flyrig_body::{
+        DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, displacement, sample_surface, skin_point_f64,
+    };
+    use flyrig_stream::Posed;
+    use glam::{DQuat, Vec3};
+
+    use super::*;
+
+    /// Viewers skin, displace and grow the Gaussians with code of their own; it must be the rig's formula.
+    #[test]
+    fn viewers_pose_and_grow_gaussians_as_the_rig_does() {
+        let template = default_template(&ShapeParams::default()).unwrap();
+        let surface = sample_surface(&template, 1500, 1).unwrap();
+        let graph = build_graph(&template, &surface, 60, DEFAULT_SIGMA2_M2).unwrap();
+        let wave = |k: usize| (k as f64 * 12.9898).sin();
+        let mut pose = template.skeleton.rest_pose();
+        for (k, rotation) in pose.joint_rotations.iter_mut().enumerate() {
+            *rotation *= DQuat::from_rotation_y(0.3 * wave(k));
+        }
+        let by = |node: usize| if node.is_multiple_of(3) { 0.3 } else { 0.02 };
+        let translations: Vec<DVec3> = (0..graph.nodes.len())
+            .map(|node| by(node) * DVec3::new(wave(3 * node), wave(3 * node + 1), wave(3 * node + 2)))
+            .collect();
+
+        let encoded = encode_template(&surface, Some(&graph), &template.skeleton).unwrap();
+        let source = motion(&pose, &translations);
+        let own =
+            Motion { nodes: encoded.node_order.iter().map(|node| source.nodes[*node as usize]).collect(), ..source };
+        let mut posed = Posed::default();
+        encoded.template.pose(&own, &mut posed);
+
+        let matrices = template.skeleton.world_from_canonical(&pose);
+        let (mut grown, mut most) = (0, 0.0f32);
+        for (splat, &source) in posed.center_scale.iter().zip(&encoded.gaussian_order) {
+            let i = source as usize;
+            let [x, y, z, growth] =
+                displacement(&graph.nodes, &translations, graph.gaussian_nodes[i], graph.gaussian_weights[i]);
+            let moved = surface.positions[i] + Vec3::new(x, y, z);
+            let expected = skin_point_f64(&matrices, &surface.skin[i], moved.as_dvec3()).as_vec3();
+            let place = Vec3::from_slice(&splat[..3]);
+            assert!(place.distance(expected) < 4e-3, "Gaussian {i}: {place} for {expected}");
+            // Positions and weights are quantised in the template.
+            let ratio = splat[3] / (surface.scale_m[i] * (1.0 + growth));
+            assert!((ratio - 1.0).abs() < 0.04, "Gaussian {i}: {ratio} of the rig's size, which grew by {growth}");
+            grown += usize::from(growth > 0.1);
+            most = most.max(growth);
+        }
+        assert!(grown > 200 && grown < 1500 && most > 1.0, "{grown} grew, by {most} at most");
+    }
+}

@@ -282,12 +282,12 @@ impl Session {
 
     /// Makes subjects of people who are none yet, and of those whose shape is another now.
     fn add_people(&mut self, people: Vec<Newcomer>) -> Result<(), FusionError> {
-        for Newcomer { person: id, shape, template } in people {
+        for Newcomer { person: id, shape, template, skirt } in people {
             let place = self.subjects.iter().position(|subject| subject.id() == id);
             if place.is_some_and(|place| self.subjects[place].shape == shape) {
                 continue;
             }
-            let mut subject = Subject::new(&self.gpu, id, template, &self.rig, &self.settings)?;
+            let mut subject = Subject::new(&self.gpu, id, (template, skirt), &self.rig, &self.settings)?;
             subject.shape = shape;
             if self.keep_observations {
                 subject.keep_observations(&self.gpu)?;
@@ -448,7 +448,7 @@ impl Session {
         let drawing = Drawing::new(&gpu, self.settings.body.gaussians)?;
         let mut subjects = Vec::new();
         for old in &self.subjects {
-            let mut subject = Subject::new(&gpu, old.id(), old.template().clone(), &self.rig, &self.settings)?;
+            let mut subject = Subject::new(&gpu, old.id(), old.shape_and_skirt(), &self.rig, &self.settings)?;
             if self.keep_observations {
                 subject.keep_observations(&gpu)?;
             }

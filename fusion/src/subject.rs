@@ -3,7 +3,8 @@
 use std::{sync::Arc, time::Instant};
 
 use flyrig_body::{
-    DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, SurfaceGaussians, Template, build_graph, sample_surface, skin_mesh,
+    DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, Skirt, SurfaceGaussians, Template, build_graph, sample_surface,
+    skin_mesh,
 };
 use flyrig_capture::to_rgb8;
 use flyrig_gpu::{GpuContext, StageTimer, StorageBuffer};
@@ -87,7 +88,10 @@ pub struct Subject {
     id: PersonId,
     /// Number of the shape, see [`crate::KnownPerson`].
     pub(crate) shape: u32,
+    /// As it is drawn: with the skirt.
     template: Template,
+    /// The body below a skirt, and the skirt; `None` without one.
+    undressed: Option<(Template, Skirt)>,
     /// The same for those who draw the person themselves.
     stream_template: Arc<EncodedTemplate>,
     skinner: GpuSkinner,
@@ -129,14 +133,16 @@ impl Subject {
     pub(crate) fn new(
         gpu: &GpuContext,
         id: PersonId,
-        template: Template,
+        (shape, skirt): (Template, Option<Skirt>),
         rig: &Rig,
         settings: &SessionSettings,
     ) -> Result<Self, FusionError> {
         let body = &settings.body;
+        let template = skirt.map_or_else(|| Ok(shape.clone()), |skirt| skirt.on(&shape))?;
         let surface = sample_surface(&template, body.gaussians, SURFACE_SEED)?;
         let graph = build_graph(&template, &surface, body.nodes, DEFAULT_SIGMA2_M2)?;
         let mut subject = Self::from_parts(gpu, id, template, &surface, &graph, rig, settings)?;
+        subject.undressed = skirt.map(|skirt| (shape, skirt));
         if let Some(networks) = settings.appearance.load_networks()? {
             subject.use_networks(gpu, &networks, settings)?;
         }
@@ -180,6 +186,7 @@ impl Subject {
             timer: StageTimer::new(gpu, TIMED_STAGES.len() as u32),
             painted: Vec::new(),
             template,
+            undressed: None,
             gaussians,
             settings: settings.appearance.mode.settings(),
             posed: Vec::new(),
@@ -205,6 +212,14 @@ impl Subject {
     #[must_use]
     pub fn template(&self) -> &Template {
         &self.template
+    }
+
+    /// The body's shape without the skirt, and the skirt.
+    pub(crate) fn shape_and_skirt(&self) -> (Template, Option<Skirt>) {
+        match &self.undressed {
+            Some((shape, skirt)) => (shape.clone(), Some(*skirt)),
+            None => (self.template.clone(), None),
+        }
     }
 
     /// How well the person is tracked.
@@ -543,7 +558,9 @@ impl Subject {
             _ => None,
         };
         let (memory, colors) = (self.appearance.memory(gpu)?, colors.read(gpu)?);
-        Ok(PersonMemory::new(&self.template, translations, memory, colors, networks))
+        let (shape, skirt) =
+            self.undressed.as_ref().map_or((&self.template, None), |(shape, skirt)| (shape, Some(*skirt)));
+        Ok(PersonMemory::new((shape, skirt), translations, memory, colors, networks))
     }
 
     /// Resumes from what an earlier session has learnt about the same person.

@@ -97,7 +97,9 @@ pub enum MotionKind {
     CrossArms,
     /// Dances a mixture of moves, another one each seed.
     Dance,
-    /// The seed chooses one of the kinds above, its speed (0.5 to 1.5 times `motion.speed`) and where it starts.
+    /// Lies down on the back, knees up, and gets up.
+    Lie,
+    /// The seed chooses one of the kinds above but for lying down, its speed (0.5 to 1.5 times `motion.speed`) and where it starts.
     BySeed,
     /// A BVH clip.
     Bvh,

@@ -105,6 +105,8 @@ pub struct PoseEstimator {
     looks_at_all: bool,
     /// Whether sightings are kept, and the last one.
     keeps_sightings: bool,
+    /// Whether nobody else was known in the last set.
+    is_alone: bool,
     sighting: Option<ShapeSighting>,
 }
 
@@ -182,6 +184,7 @@ impl PoseEstimator {
             lost: 0,
             looks_at_all: false,
             keeps_sightings: false,
+            is_alone: true,
             sighting: None,
         })
     }
@@ -292,7 +295,7 @@ impl PoseEstimator {
         may_search: bool,
     ) -> Result<PoseEstimate, TrackError> {
         let pictures = self.check(set)?;
-        self.sighting = None;
+        (self.sighting, self.is_alone) = (None, others.is_empty());
         let mut seconds = StageSeconds::default();
         let found = if pictures.iter().all(Option::is_none) {
             // A prediction alone is nobody.

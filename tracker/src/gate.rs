@@ -9,6 +9,7 @@ use crate::grid::Grid;
 const REACH_M: f64 = 0.13;
 /// Distance of wide skirts and coats, as a multiple of it: beyond 1, only where image and background speak for it.
 pub(crate) const CLOTHES_REACH: f32 = 2.5;
+
 /// Region of an image that a posed body and its clothes may cover.
 #[derive(Debug, Clone)]
 pub struct BodyGate {
@@ -20,6 +21,8 @@ pub struct BodyGate {
     pub(crate) distance: Grid,
     /// Pixels that a metre takes at the body.
     pub(crate) px_per_m: f64,
+    /// Least and greatest depth of the body in the camera, metres.
+    pub(crate) depths_m: [f64; 2],
 }
 
 impl BodyGate {
@@ -34,6 +37,7 @@ impl BodyGate {
             .filter(|z| *z > 0.1)
             .collect();
         let depth = flyrig_solve::median(&mut depths)?;
+        let depths_m = depths.iter().fold([f64::INFINITY, 0.0], |[low, high], z| [z.min(low), z.max(high)]);
         let px_per_m = camera.intrinsics.focal_px.x / depth;
         let reach = REACH_M * px_per_m;
         let (bounds, body) = drawn_body(camera, vertices, triangles, reach * f64::from(CLOTHES_REACH))?;
@@ -42,7 +46,13 @@ impl BodyGate {
             *value /= reach as f32;
         }
         let image = [camera.intrinsics.width as usize, camera.intrinsics.height as usize];
-        Some(Self { image, bounds, distance, px_per_m })
+        Some(Self { image, bounds, distance, px_per_m, depths_m })
+    }
+
+    /// Depths along the camera's axis between which person and clothes may be, metres.
+    pub(crate) fn depth_range_m(&self) -> [f64; 2] {
+        let reach = REACH_M * f64::from(CLOTHES_REACH);
+        [(self.depths_m[0] - reach).max(0.05), self.depths_m[1] + reach]
     }
 
     /// The unit of [`Self::distance`], pixels.
@@ -68,7 +78,13 @@ impl BodyGate {
     pub(crate) fn of_grid(body: &Grid, px_per_m: f64) -> Self {
         let mut distance = body.distance_to_set();
         distance.values.iter_mut().for_each(|d| *d /= (REACH_M * px_per_m) as f32);
-        Self { image: [body.width, body.height], bounds: [0, 0, body.width, body.height], distance, px_per_m }
+        Self {
+            image: [body.width, body.height],
+            bounds: [0, 0, body.width, body.height],
+            distance,
+            px_per_m,
+            depths_m: [1.0; 2],
+        }
     }
 
     /// Intersection over union of a mask of the whole image and the body's outline.

@@ -50,6 +50,8 @@ mod shape_solve;
 mod sighting;
 mod silhouette;
 mod single_view;
+mod skirt_fit;
+mod support;
 mod surface_marks;
 #[cfg(test)]
 mod testing;

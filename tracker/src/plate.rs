@@ -3,8 +3,8 @@
 use flyrig_solve::median;
 use flyrig_types::{Image, Mask};
 
-use crate::gate::BodyGate;
-use crate::grid::{Grid, clean};
+use crate::gate::{BodyGate, CLOTHES_REACH};
+use crate::grid::{Grid, clean, components};
 use crate::pixels::Rgb;
 use crate::{TrackError, TrackErrorKind};
 
@@ -20,7 +20,7 @@ const GAIN_RANGE: std::ops::RangeInclusive<f32> = 16.0..=245.0;
 const GAIN_LIMITS: (f32, f32) = (0.6, 1.6);
 /// Samples that a gain needs.
 const GAIN_SAMPLES: usize = 40;
-/// Evidence added on the body, and inside of it by its depth over [`DEEP_M`]; taken off at the gate's reach.
+/// Evidence added on the body, and inside of it by its depth over [`DEEP_M`]; taken off where most clothes end, and beyond.
 const ON_BODY: f32 = 0.15;
 const DEEP_IN_BODY: f32 = 0.35;
 const OFF_BODY: f32 = 0.4;
@@ -34,7 +34,8 @@ const DEEP_M: f64 = 0.04;
 ///
 /// A pixel's colour is split into brightness along the plate's colour and a remainder (Horprasert et al. 1999): a remainder
 /// beyond the image's own noise, or a brightness that no shadow explains, is foreground, unless it lies out of the gate's
-/// reach. Large pieces stay, small holes are filled.
+/// reach. Farther away than most clothes hang, only what surely differs and touches something nearer counts: a wide skirt.
+/// Large pieces stay, small holes are filled.
 ///
 /// # Errors
 /// Kind `Image` when the sizes differ or a format cannot be read.
@@ -73,18 +74,32 @@ pub(crate) fn gated_mask(evidence: &Grid, gate: &BodyGate) -> Option<Mask> {
     let deep_px = (DEEP_M * gate.px_per_m).max(1.0) as f32;
     for ((value, distance), depth) in voted.values.iter_mut().zip(&gate.distance.values).zip(&depth.values) {
         let prior = if *distance > 0.0 {
-            ON_BODY - (ON_BODY + OFF_BODY) * distance
+            ON_BODY - (ON_BODY + OFF_BODY) * distance.min(1.0)
         } else {
             ON_BODY + DEEP_IN_BODY * (depth / deep_px).min(1.0)
         };
-        *value = if *distance >= 1.0 { 0.0 } else { ((*value + prior - 0.5) * 2.0 + 0.5).clamp(0.0, 1.0) };
+        let is_out = *distance >= CLOTHES_REACH;
+        *value = if is_out { 0.0 } else { ((*value + prior - 0.5) * 2.0 + 0.5).clamp(0.0, 1.0) };
     }
+    drop_what_hangs_on_nothing(&mut voted, &gate.distance);
     clean(&mut voted, (0.02 * gate.px_per_m).round().max(2.0) as usize);
     let least = (width * height / 5000).max(12);
     if voted.values.iter().filter(|v| **v >= 0.5).count() < least {
         return None;
     }
     voted.paste(width, height, x0, y0)
+}
+
+/// Clears pieces that lie farther from the body than most clothes as a whole: other things than a person's clothes.
+fn drop_what_hangs_on_nothing(voted: &mut Grid, distance: &Grid) {
+    let mut alone = Vec::new();
+    let take_alone = |pixels: &[usize]| {
+        if pixels.iter().all(|at| distance.values[*at] >= 1.0) {
+            alone.extend_from_slice(pixels);
+        }
+    };
+    components(voted, |value| value >= 0.5, take_alone);
+    alone.into_iter().for_each(|at| voted.values[at] = 0.0);
 }
 
 /// Returns an image's bytes as numbers.
@@ -233,6 +248,17 @@ mod tests {
         );
         let mask = mask_from_plate(&now, &plate, &gate()).unwrap().unwrap();
         assert!(iou(&mask, person) > 0.93, "{}", iou(&mask, person));
+    }
+
+    #[test]
+    fn a_skirt_that_hangs_on_the_body_is_kept_where_most_clothes_end() {
+        let plate = picture(wall, 1);
+        let skirt = |x: usize, y: usize| person(x, y) || (40..80).contains(&y) && x < 60 + (y - 40) * 3 / 4 && x >= 30;
+        let now = picture(|x, y| if skirt(x, y) { [60.0, 60.0, 150.0] } else { wall(x, y) }, 2);
+        let mask = mask_from_plate(&now, &plate, &gate()).unwrap().unwrap();
+        // 22 pixels from the body are 22 cm; the reach ends at 32.
+        assert_eq!(mask.coverage()[78 * SIDE + 78], 255);
+        assert!(iou(&mask, skirt) > 0.93, "{}", iou(&mask, skirt));
     }
 
     #[test]

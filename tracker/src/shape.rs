@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use flyrig_body::Template;
+use flyrig_body::{Skirt, Template};
 use flyrig_solve::median;
 use flyrig_types::Rig;
 
@@ -45,6 +45,8 @@ pub struct ShapeFit {
     pub sets: usize,
     /// Where the height comes from.
     pub height_from: HeightFrom,
+    /// What hangs around both legs, where it does.
+    pub skirt: Option<Skirt>,
 }
 
 /// Source of a person's height.
@@ -61,13 +63,14 @@ pub enum HeightFrom {
 impl std::fmt::Display for ShapeFit {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{:.2} m tall", self.height_m)?;
-        match self.height_from {
-            HeightFrom::Measurement => Ok(()),
-            HeightFrom::Configuration => f.write_str(" (as configured)"),
-            HeightFrom::Average => f.write_str(
-                " (an average height, for one camera cannot measure it: give perception.height_m or --height)",
-            ),
-        }
+        f.write_str(match self.height_from {
+            HeightFrom::Measurement => "",
+            HeightFrom::Configuration => " (as configured)",
+            HeightFrom::Average => {
+                " (an average height, for one camera cannot measure it: give perception.height_m or --height)"
+            }
+        })?;
+        if self.skirt.is_some() { f.write_str(", in a skirt or long coat") } else { Ok(()) }
     }
 }
 
@@ -169,7 +172,8 @@ pub fn fit_template_shape(
         height_from = HeightFrom::Configuration;
     }
     let scale = factors.get("scale").copied().unwrap_or(scale);
-    let fit = ShapeFit { scale, groups, sigma: BTreeMap::new(), height_m: height_m(&shaped), sets, height_from };
+    let fit =
+        ShapeFit { scale, groups, sigma: BTreeMap::new(), height_m: height_m(&shaped), sets, height_from, skirt: None };
     tracing::debug!(scale, height_m = fit.height_m, sets, "fitted the template's bone lengths");
     Ok((shaped, fit))
 }
@@ -181,7 +185,7 @@ pub(crate) fn template_of_height(template: &Template, height: Option<f64>) -> Re
     let shaped = scale_template(template, &BodyModel::new(template)?, &factors)?;
     let height_from = if height.is_some() { HeightFrom::Configuration } else { HeightFrom::Average };
     let (groups, sigma, height_m) = (BTreeMap::new(), BTreeMap::new(), height_m(&shaped));
-    Ok((shaped, ShapeFit { scale, groups, sigma, height_m, sets: 0, height_from }))
+    Ok((shaped, ShapeFit { scale, groups, sigma, height_m, sets: 0, height_from, skirt: None }))
 }
 
 /// Height of a template in its bind pose, metres.

@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeMap, sync::Arc, time::Duration};
 
-use flyrig_body::{Template, skin_mesh};
+use flyrig_body::{Skirt, Template, skin_mesh};
 use flyrig_tracker::{
     Background, BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PersonArea, PoseConfig, PoseEstimate,
     PoseEstimator, PoseNet, ShapeFit, ShapeSighting, TrackError, is_blank, matte,
@@ -46,6 +46,7 @@ struct Place {
     renews: bool,
     /// Number of the shape.
     shape: u32,
+    skirt: Option<Skirt>,
     clothes: Option<ClothesColors>,
     seen: u64,
     /// Time since which nobody is seen; `None` while somebody is.
@@ -148,6 +149,7 @@ impl EstimatedPerception {
             known: learning.is_none(),
             renews: false,
             shape: 0,
+            skirt: None,
             clothes: None,
             seen: 0,
             missing_since: None,
@@ -166,13 +168,14 @@ impl EstimatedPerception {
         })
     }
 
-    /// Starts with the shape of the first person, as an earlier session has learnt it. Where shapes are estimated, whoever comes
+    /// Starts with the shape and skirt of the first person, as an earlier session has learnt them. Where shapes are estimated, whoever comes
     /// is compared with it.
     ///
     /// # Errors
     /// [`FusionError::Track`] when the template cannot be used.
-    pub fn know_shape(&mut self, template: &Template) -> Result<(), FusionError> {
+    pub fn know_shape(&mut self, template: &Template, skirt: Option<Skirt>) -> Result<(), FusionError> {
         if let Some(place) = self.places.first_mut() {
+            place.skirt = skirt;
             place.estimator.set_template(template)?;
             place.know()?;
             // Whoever comes first may be somebody else.
@@ -192,6 +195,7 @@ impl EstimatedPerception {
         for place in &mut self.places {
             match place.estimator.fit_shape(sets, &taken) {
                 Ok((fit, landmarks)) => {
+                    place.skirt = fit.skirt;
                     fits.push(fit);
                     taken.push(landmarks);
                     place.know()?;
@@ -309,6 +313,7 @@ impl EstimatedPerception {
                     _ => return Ok(()),
                 }
                 place.shape += u32::from(place.known);
+                place.skirt = fit.skirt;
                 place.estimator.take_shape(template)
             });
             if let Err(error) = taken {
@@ -419,7 +424,14 @@ impl Perception for EstimatedPerception {
 
     fn people(&self) -> Vec<KnownPerson<'_>> {
         let known = self.places.iter().filter(|place| place.known);
-        known.map(|place| KnownPerson { person: place.id, shape: place.shape, template: place.template() }).collect()
+        known
+            .map(|place| KnownPerson {
+                person: place.id,
+                shape: place.shape,
+                template: place.template(),
+                skirt: place.skirt,
+            })
+            .collect()
     }
 
     fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {

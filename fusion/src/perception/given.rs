@@ -75,7 +75,9 @@ impl GivenPerception {
 impl Perception for GivenPerception {
     fn people(&self) -> Vec<KnownPerson<'_>> {
         let people = self.people.iter();
-        people.map(|given| KnownPerson { person: given.person, shape: 0, template: &given.template }).collect()
+        people
+            .map(|given| KnownPerson { person: given.person, shape: 0, template: &given.template, skirt: None })
+            .collect()
     }
 
     fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {

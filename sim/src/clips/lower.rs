@@ -1,4 +1,4 @@
-//! Squatting and sitting down.
+//! Squatting, sitting down and lying down.
 
 use glam::{DVec2, DVec3};
 
@@ -84,6 +84,45 @@ pub(crate) fn sit<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
                 curl: 0.30,
             };
             *arm = arm.mix(&on_thigh, hands);
+        }
+        posture
+    })
+}
+
+/// Height of the hips' joint above the floor on which somebody lies, metres of the average body.
+const LYING_M: f64 = 0.125;
+
+/// Squats down, sits on the floor, lies back with the knees up, looks around and gets up.
+pub(crate) fn lie<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
+    const SECS: f64 = 10.0;
+    Clip::new(SECS / speed, move |phase| {
+        let down = closed(phase, &[(0.03, 0.0), (0.08, 0.06), (0.24, 1.0), (0.78, 1.0), (0.92, 0.06), (0.97, 0.0)]);
+        // The trunk leans forward on the way, and falls back once the hips are on the floor.
+        let lean = closed(
+            phase,
+            &[(0.02, 0.0), (0.14, 1.0), (0.26, 0.3), (0.34, 0.0), (0.66, 0.0), (0.78, 0.8), (0.86, 1.0), (0.98, 0.0)],
+        );
+        let back = closed(phase, &[(0.22, 0.0), (0.38, 1.0), (0.62, 1.0), (0.78, 0.0)]);
+        let look = closed(phase, &[(0.38, 0.0), (0.46, 1.0), (0.54, -0.8), (0.62, 0.0)]);
+        let mut posture = puppet.standing();
+        breathe(&mut posture, phase, SECS);
+        for (foot, side) in posture.feet.iter_mut().zip([1.0, -1.0]) {
+            foot.at.x += side * 0.02;
+        }
+        posture.hips += DVec3::new(0.0, -(0.875 - LYING_M) * down, -0.42 * down - 0.06 * back);
+        posture.pelvis.x += 0.55 * lean - 1.50 * back;
+        posture.trunk.x += 0.45 * lean - 0.04 * back;
+        posture.head += DVec3::new(-0.30 * lean, 0.0, 0.60 * look);
+        posture.knees_out = 0.08 * down;
+        for arm in &mut posture.arms {
+            let front = Arm {
+                upper: DVec3::new(0.14, -0.55, 0.80).normalize_or(DVec3::Z),
+                fore: DVec3::new(-0.08, -0.25, 0.95).normalize_or(DVec3::Z),
+                hand: [0.0, 0.0],
+                curl: 0.2,
+            };
+            let beside = Arm::angled(0.02, puppet.hang_out() + 0.25, 0.10, 0.0);
+            *arm = arm.mix(&front, down).mix(&beside, back);
         }
         posture
     })

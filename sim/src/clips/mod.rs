@@ -66,6 +66,7 @@ pub(crate) fn clip<'a>(kind: MotionKind, puppet: &'a Puppet<'_>, seed: u64, turn
         MotionKind::CrossArms => gestures::cross_arms(puppet, speed),
         MotionKind::Squat => lower::squat(puppet, speed),
         MotionKind::Sit => lower::sit(puppet, speed),
+        MotionKind::Lie => lower::lie(puppet, speed),
         MotionKind::Jump => jump::jump(puppet, speed),
         MotionKind::Dance => dance::dance(puppet, seed, speed),
         MotionKind::Still | MotionKind::BySeed | MotionKind::Bvh | MotionKind::Gltf => gestures::still(puppet),

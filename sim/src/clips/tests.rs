@@ -9,13 +9,14 @@ use crate::motion::pass_by;
 use crate::person::Person;
 use crate::{Build, SimConfig};
 
-const ALL: [MotionKind; 9] = [
+const ALL: [MotionKind; 10] = [
     MotionKind::Turn,
     MotionKind::Walk,
     MotionKind::Wave,
     MotionKind::Squat,
     MotionKind::Reach,
     MotionKind::Sit,
+    MotionKind::Lie,
     MotionKind::Jump,
     MotionKind::CrossArms,
     MotionKind::Dance,

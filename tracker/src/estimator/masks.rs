@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::background::MOSTLY_KNOWN;
+use crate::support::drop_unsupported;
 
 impl PoseEstimator {
     /// Masks by slot; why there is none goes into the views' quality.
@@ -9,7 +10,7 @@ impl PoseEstimator {
         if !self.config.masks {
             return vec![None; pictures.len()];
         }
-        let made: Vec<Result<(Mask, f64), NoMask>> = pictures
+        let made: Vec<Result<(Mask, BodyGate), NoMask>> = pictures
             .par_iter()
             .enumerate()
             .map(|(slot, picture)| {
@@ -41,23 +42,21 @@ impl PoseEstimator {
                     }
                     (None, _) => return Err(NoMask::NoPerson),
                 };
-                let mask = mask.ok_or(NoMask::Empty)?;
-                let overlap = gate.overlap(&mask);
-                Ok((mask, overlap))
+                Ok((mask.ok_or(NoMask::Empty)?, gate))
             })
             .collect();
-        let mut masks = Vec::with_capacity(made.len());
+        let (mut masks, mut gates) = (Vec::with_capacity(made.len()), Vec::with_capacity(made.len()));
         for (view, made) in fitted.views.iter_mut().zip(made) {
-            masks.push(match made {
-                Ok((made, overlap)) => {
-                    (view.mask_overlap, view.no_mask) = (Some(overlap), None);
-                    Some(made)
-                }
-                Err(reason) => {
-                    view.no_mask = Some(reason);
-                    None
-                }
-            });
+            view.no_mask = made.as_ref().err().copied();
+            let (mask, gate) = made.ok().unzip();
+            masks.push(mask);
+            gates.push(gate);
+        }
+        if self.is_alone {
+            drop_unsupported(&self.rig.cameras, &gates, &mut masks);
+        }
+        for ((view, mask), gate) in fitted.views.iter_mut().zip(&masks).zip(&gates) {
+            view.mask_overlap = mask.as_ref().zip(gate.as_ref()).map(|(mask, gate)| gate.overlap(mask));
         }
         masks
     }

@@ -1,6 +1,8 @@
 //! The person's shape: bone lengths from landmarks, and lengths, girths and build from outlines.
 
 use super::*;
+use crate::skirt_fit::{MaskedPoses, MaskedView, find_skirt};
+use flyrig_body::Skirt;
 
 /// Steps of the solver to a pose in a new shape.
 const POSE_STEPS: usize = 40;
@@ -143,8 +145,21 @@ impl PoseEstimator {
             self.model = BodyModel::new(&self.template)?;
             fit.set(&space, &shape, &sigma, &self.template);
         }
+        fit.skirt = self.skirt(&found);
         tracing::debug!(?fit, "fitted the body to landmarks and outlines");
         Ok(())
+    }
+
+    /// The skirt that the masks of fitted sets show.
+    fn skirt(&self, found: &[(&FrameSet, Fitted, Vec<Option<Mask>>)]) -> Option<Skirt> {
+        let poses = found.iter().map(|(_, fitted, _)| self.model.to_pose(&fitted.turns)).collect();
+        let views = found.iter().enumerate().flat_map(|(pose, (set, _, masks))| {
+            let given = |slot: usize| set.frames.get(slot)?.as_ref()?.mask.as_ref().filter(|_| !self.config.masks);
+            let masks =
+                masks.iter().enumerate().filter_map(move |(slot, mask)| Some((slot, mask.as_ref().or(given(slot))?)));
+            masks.map(move |(slot, mask)| MaskedView { camera: &self.rig.cameras[slot], pose, mask })
+        });
+        find_skirt(&self.template, &MaskedPoses { views: views.collect(), poses })
     }
 
     /// Takes a template of the person's shape instead, and forgets the pose.

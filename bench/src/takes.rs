@@ -1,0 +1,189 @@
+//! `flyrig-bench takes`: several people who walk past one another, again and again, and whether each keeps the own track.
+
+use std::{collections::BTreeMap, time::Instant};
+
+use anyhow::{Context, Result};
+use flyrig_body::{ShapeParams, Template, default_template};
+use flyrig_fusion::{
+    EstimatedPerception, KnownPerson, Observation, Perception as _, PerceptionSettings, PersonId, StageTimes,
+};
+use flyrig_gpu::GpuContext;
+use flyrig_report::{progress_bar, write_whole};
+use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SceneConfig, SimConfig, Simulator};
+use flyrig_types::{Image, Pose, Rig};
+use glam::DVec3;
+
+use crate::{
+    cli::BenchTakesArgs,
+    perception::{mean, places},
+    stress::copy,
+    subjects::{INPUTS, frame_set},
+};
+
+/// A track farther than this from everybody follows nobody, metres.
+const ON_SOMEBODY_M: f64 = 0.4;
+/// Everybody must be on a track from this time on, seconds.
+const ARRIVAL_SECS: f64 = 1.0;
+
+/// What happened in a take.
+#[derive(Debug, Default)]
+struct Take {
+    /// Changes of a track to another person.
+    swaps: usize,
+    /// Sets in which a person was on no track, and all of people and sets, after [`ARRIVAL_SECS`].
+    missed: usize,
+    all: usize,
+    /// Sets in which a track followed nobody.
+    astray: usize,
+    hips_mm: Vec<f64>,
+    secs: f64,
+    sets: usize,
+    /// Who each track followed last.
+    on: BTreeMap<PersonId, usize>,
+}
+
+/// Runs the command.
+pub fn takes(args: &BenchTakesArgs, gpu: &GpuContext) -> Result<()> {
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    let sets = (args.secs * args.fps).round().max(1.0) as u64;
+    let bar = progress_bar(args.takes * sets, "bench takes");
+    let mut table = String::from(
+        "| take | changes of a track | without a track | tracks on nobody | hips mm | ms a set |\n|---|---|---|---|---|---|\n",
+    );
+    let mut total = Take::default();
+    for index in 0..args.takes {
+        let take = run(args, gpu, args.seed + index * args.people as u64, sets, &bar)?;
+        table += &row(&(args.seed + index * args.people as u64).to_string(), &take);
+        total.add(take);
+        write_whole(&args.out.join("takes.md"), table.as_bytes())?;
+    }
+    bar.finish_and_clear();
+    table += &row("all", &total);
+    write_whole(&args.out.join("takes.md"), table.as_bytes())?;
+    print!("{table}");
+    println!("{} people; {}; takes.md in {}", args.people, gpu.fastest().adapter_name(), args.out.display());
+    Ok(())
+}
+
+fn row(name: &str, take: &Take) -> String {
+    format!(
+        "| {name} | {} | {} of {} | {} | {:.0} | {:.0} |\n",
+        take.swaps,
+        take.missed,
+        take.all,
+        take.astray,
+        mean(&take.hips_mm),
+        1e3 * take.secs / take.sets.max(1) as f64
+    )
+}
+
+impl Take {
+    fn add(&mut self, other: Self) {
+        self.swaps += other.swaps;
+        self.missed += other.missed;
+        self.all += other.all;
+        self.astray += other.astray;
+        self.hips_mm.extend(other.hips_mm);
+        self.secs += other.secs;
+        self.sets += other.sets;
+    }
+
+    /// Compares the tracks of a set with the people's true places.
+    fn compare(&mut self, tracks: &[(PersonId, DVec3)], truth: &[DVec3], counts: bool) {
+        let mut found = vec![false; truth.len()];
+        for (id, hips) in tracks {
+            let nearest =
+                (0..truth.len()).min_by(|a, b| truth[*a].distance(*hips).total_cmp(&truth[*b].distance(*hips)));
+            let Some(nearest) = nearest.filter(|who| truth[*who].distance(*hips) < ON_SOMEBODY_M) else {
+                self.astray += 1;
+                continue;
+            };
+            self.hips_mm.push(1e3 * truth[nearest].distance(*hips));
+            found[nearest] = true;
+            let before = self.on.insert(*id, nearest);
+            self.swaps += usize::from(before.is_some_and(|before| before != nearest));
+        }
+        if counts {
+            self.all += truth.len();
+            self.missed += found.iter().filter(|found| !**found).count();
+        }
+    }
+}
+
+fn run(args: &BenchTakesArgs, gpu: &GpuContext, seed: u64, sets: u64, bar: &indicatif::ProgressBar) -> Result<Take> {
+    let mut people = (0..args.people).map(|who| simulator(gpu, args, seed, who)).collect::<Result<Vec<_>>>()?;
+    let rig = people[0].rig().clone();
+    let inputs = Rig { cameras: INPUTS.map(|slot| rig.cameras[slot].clone()).into(), world_up: rig.world_up };
+    let plates: Vec<Option<Image>> =
+        INPUTS.iter().map(|&slot| Ok(Some(copy(people[0].plate(slot)?)?))).collect::<Result<_>>()?;
+    let settings = PerceptionSettings { people: args.people, ..PerceptionSettings::default() };
+    let template = default_template(&ShapeParams::default())?;
+    let mut perception = EstimatedPerception::new(&inputs, &template, &settings, &plates)?;
+    let chosen: Vec<usize> = (0..args.people).collect();
+    let mut take = Take::default();
+    for index in 0..sets {
+        let nanos = (index as f64 / args.fps * 1e9) as i64;
+        let set = frame_set(&mut people, &chosen, &rig, index, nanos)?;
+        let start = Instant::now();
+        let observations = perception.observe(&set, &mut StageTimes::default())?;
+        take.secs += start.elapsed().as_secs_f64();
+        take.sets += 1;
+        let known = perception.people();
+        let tracks: Vec<(PersonId, DVec3)> = observations
+            .iter()
+            .filter_map(|observation| {
+                let Observation::Seen(seen) = observation else { return None };
+                let template = |known: &&KnownPerson| known.person == seen.person;
+                Some((seen.person, hips(&known.iter().find(template)?.template, &seen.pose)?))
+            })
+            .collect();
+        let truth: Vec<DVec3> =
+            people.iter().filter_map(|person| hips(person.template(), &person.track().at_repeated(nanos))).collect();
+        take.compare(&tracks, &truth, index as f64 >= ARRIVAL_SECS * args.fps);
+        bar.inc(1);
+    }
+    Ok(take)
+}
+
+fn hips(template: &Template, pose: &Pose) -> Option<DVec3> {
+    places(&template.skeleton, pose).get("Hips").map(|(place, _)| *place)
+}
+
+/// The first person waves in the middle, the others walk on a circle around at equal distances.
+fn simulator(gpu: &GpuContext, args: &BenchTakesArgs, seed: u64, who: usize) -> Result<Simulator> {
+    let motion = MotionConfig {
+        kind: if who == 0 { MotionKind::Wave } else { MotionKind::Walk },
+        phase: (seed as f64 * 0.37 + who as f64 / (args.people - 1) as f64).fract(),
+        ..MotionConfig::default()
+    };
+    let config = SimConfig {
+        seed: seed + who as u64,
+        motion,
+        cameras: RingConfig { count: 7, radius_m: 3.4, ..RingConfig::default() },
+        width: args.side,
+        height: args.side,
+        // One room for all.
+        scene: SceneConfig { seed: Some(seed), ..SceneConfig::default() },
+        ..SimConfig::default()
+    };
+    Ok(Simulator::new(gpu, &config)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn changes_absences_and_strays_are_counted() {
+        let truth = [DVec3::ZERO, DVec3::X];
+        let (a, b) = (PersonId(0), PersonId(1));
+        let mut take = Take::default();
+        take.compare(&[(a, DVec3::ZERO), (b, DVec3::X * 0.9)], &truth, true);
+        assert_eq!((take.swaps, take.missed, take.all, take.astray), (0, 0, 2, 0));
+        take.compare(&[(a, DVec3::X)], &truth, true);
+        assert_eq!((take.swaps, take.missed, take.all, take.astray), (1, 1, 4, 0), "a changed over, one is missing");
+        take.compare(&[(a, DVec3::X), (b, DVec3::Z * 5.0)], &truth, false);
+        assert_eq!((take.swaps, take.missed, take.all, take.astray), (1, 1, 4, 1));
+        assert!((mean(&take.hips_mm) - 25.0).abs() < 1e-9, "{:?}", take.hips_mm);
+    }
+}
