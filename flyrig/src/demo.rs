@@ -203,11 +203,11 @@ fn pass(
     let builder = SessionBuilder::new(gpu.clone(), inputs.clone()).settings(settings);
     let session = match args.pose {
         Origin::Given => {
-            let simulator = lock(simulator)?;
+            let mut simulator = lock(simulator)?;
             let given = GivenPerception::repeating(&inputs, simulator.template().clone(), simulator.track().clone());
-            builder
-                .perception(given.with_masks(&args.perception(), &simulated_plates(&simulator, &inputs)?)?)
-                .build()?
+            let mut given = given.with_masks(&args.perception(), &simulated_plates(&simulator, &inputs)?)?;
+            given.find_skirts(&first_sets(&mut simulator, &inputs)?)?;
+            builder.perception(given).build()?
         }
         Origin::Estimated => builder.perception(find_person(args, simulator, &inputs)?).build()?,
     };
@@ -269,12 +269,23 @@ fn pass(
 fn find_person(args: &DemoArgs, simulator: &Mutex<Simulator>, inputs: &Rig) -> Result<EstimatedPerception> {
     let mut simulator = lock(simulator)?;
     let plates = simulated_plates(&simulator, inputs)?;
+    let sets = first_sets(&mut simulator, inputs)?;
     if args.perception().shape() == Origin::Given {
-        return Ok(EstimatedPerception::new(inputs, simulator.template(), &args.perception(), &plates)?);
+        let mut perception = EstimatedPerception::new(inputs, simulator.template(), &args.perception(), &plates)?;
+        perception.find_skirts(&sets)?;
+        return Ok(perception);
     }
     let template = default_template(&ShapeParams::default())?;
     let mut perception = EstimatedPerception::new(inputs, &template, &args.perception(), &plates)?;
     eprintln!("demo: learning the person's shape from {SHAPE_SETS} frames of the first {SHAPE_SECS} seconds");
+    for fit in perception.learn_shapes(&sets)? {
+        eprintln!("demo: the person is {fit}");
+    }
+    Ok(perception)
+}
+
+/// Sets of the first seconds, from which shape and clothes are learnt.
+fn first_sets(simulator: &mut Simulator, inputs: &Rig) -> Result<Vec<FrameSet>> {
     let mut sets = Vec::new();
     for index in 0..SHAPE_SETS {
         let master_nanos = (SHAPE_SECS * 1e9 * index as f64 / SHAPE_SETS as f64) as i64;
@@ -293,10 +304,7 @@ fn find_person(args: &DemoArgs, simulator: &Mutex<Simulator>, inputs: &Rig) -> R
         }
         sets.push(FrameSet { index: index as u64, master_nanos, frames });
     }
-    for fit in perception.learn_shapes(&sets)? {
-        eprintln!("demo: the person is {fit}");
-    }
-    Ok(perception)
+    Ok(sets)
 }
 
 fn advance(bar: &ProgressBar, position: u64, sheet: &ScoreSheet) {

@@ -4,6 +4,7 @@ mod background;
 mod colors;
 mod estimated;
 mod given;
+mod skirts;
 mod split_mask;
 
 use flyrig_body::{Skirt, Template};

@@ -82,5 +82,6 @@ pub use pixels::is_blank;
 pub use plate::mask_from_plate;
 pub use presence::shows_person;
 pub use shape::{HeightFrom, ShapeFit, fit_template_shape};
+pub use skirt_fit::{MaskedPoses, MaskedView, find_skirt};
 pub use triangulate::{WorldPoint, triangulate};
 pub use viewers::Viewers;

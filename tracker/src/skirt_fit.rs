@@ -19,16 +19,22 @@ const FIRST_FLARE: f32 = 0.16;
 const GAIN: f64 = 0.015;
 
 /// A person in one image.
-pub(crate) struct MaskedView<'a> {
+#[derive(Debug, Clone, Copy)]
+pub struct MaskedView<'a> {
+    /// The camera.
     pub camera: &'a Camera,
-    /// At the image's time, by [`MaskedPoses::poses`].
+    /// Which of [`MaskedPoses::poses`] the person has.
     pub pose: usize,
+    /// Coverage by the person.
     pub mask: &'a Mask,
 }
 
-/// A person in a few sets.
-pub(crate) struct MaskedPoses<'a> {
+/// A person in several images.
+#[derive(Debug, Clone, Default)]
+pub struct MaskedPoses<'a> {
+    /// Poses of the body, world frame.
     pub poses: Vec<Pose>,
+    /// Images that show it in one of them.
     pub views: Vec<MaskedView<'a>>,
 }
 
@@ -42,6 +48,9 @@ struct Target<'a> {
 impl<'a> Target<'a> {
     /// `None` where nothing of the person is before the camera.
     fn new(view: &'a MaskedView<'a>, pose: &Pose) -> Option<Self> {
+        if [view.mask.width(), view.mask.height()] != view.camera.size() {
+            return None;
+        }
         let depth = view.camera.camera_from_world.transform_point(pose.root_translation).z;
         if !(depth > 0.1 && depth.is_finite()) {
             return None;
@@ -76,8 +85,10 @@ impl<'a> Target<'a> {
     }
 }
 
-/// Returns the skirt in which the body covers the masks best; `None` where trousers do as well, and for a body that carries none.
-pub(crate) fn find_skirt(body: &Template, seen: &MaskedPoses<'_>) -> Option<Skirt> {
+/// Returns the skirt in which the body covers the masks best, by intersection over union of all views; `None` where trousers do as well,
+/// and for a body that carries none. Views of poses that do not exist, and masks of another size than their camera's images, count nothing.
+#[must_use]
+pub fn find_skirt(body: &Template, seen: &MaskedPoses<'_>) -> Option<Skirt> {
     let targets: Vec<Target<'_>> =
         seen.views.iter().filter_map(|view| Target::new(view, seen.poses.get(view.pose)?)).collect();
     if targets.is_empty() {

@@ -12,6 +12,7 @@ use rayon::prelude::*;
 
 use super::background::{BackgroundWatch, backgrounds, report};
 use super::colors::ClothesColors;
+use super::skirts::SkirtSearch;
 use super::split_mask::{PosedMesh, split_mask};
 use super::{KnownPerson, Observation, Perception, SeenPerson, ViewObservation};
 use crate::{Effort, FusionError, Origin, PerceptionSettings, StageTimes};
@@ -47,6 +48,8 @@ struct Place {
     /// Number of the shape.
     shape: u32,
     skirt: Option<Skirt>,
+    /// Where the shape is given.
+    skirt_search: Option<SkirtSearch>,
     clothes: Option<ClothesColors>,
     seen: u64,
     /// Time since which nobody is seen; `None` while somebody is.
@@ -150,6 +153,7 @@ impl EstimatedPerception {
             renews: false,
             shape: 0,
             skirt: None,
+            skirt_search: learning.is_none().then(SkirtSearch::default),
             clothes: None,
             seen: 0,
             missing_since: None,
@@ -427,7 +431,8 @@ impl Perception for EstimatedPerception {
         known
             .map(|place| KnownPerson {
                 person: place.id,
-                shape: place.shape,
+                // Another one once a skirt is found on a given shape.
+                shape: place.shape + u32::from(place.skirt_search.is_some() && place.skirt.is_some()),
                 template: place.template(),
                 skirt: place.skirt,
             })
@@ -467,11 +472,43 @@ impl Perception for EstimatedPerception {
                 }
             });
         }
+        for observation in &observations {
+            let Observation::Seen(seen) = observation else { continue };
+            let Some(place) = self.places.iter_mut().find(|place| place.id == seen.person) else { continue };
+            if let Some(search) = &mut place.skirt_search {
+                let body = place.hands.as_ref().map_or(place.estimator.template(), HandTracker::template);
+                search.take(set, seen, body, &self.rig.cameras);
+                place.skirt = search.skirt();
+            }
+        }
         Ok(observations)
     }
 }
 
 impl EstimatedPerception {
+    /// Looks for skirts on people whose shapes are given, in a few sets ([`SHAPE_SETS`], over [`SHAPE_SECS`]) before the session is
+    /// built, so that they are known from the first set on. Otherwise they are found in the first seconds.
+    ///
+    /// # Errors
+    /// Those of [`Perception::observe`].
+    pub fn find_skirts(&mut self, sets: &[FrameSet]) -> Result<(), FusionError> {
+        let mut searches = vec![SkirtSearch::default(); self.places.len()];
+        for set in sets {
+            for observation in self.observe(set, &mut StageTimes::default())? {
+                let Observation::Seen(seen) = observation else { continue };
+                if let Some(index) = self.places.iter().position(|place| place.id == seen.person) {
+                    searches[index].add(set, &seen);
+                }
+            }
+        }
+        for (place, mut search) in self.places.iter_mut().zip(searches) {
+            search.finish(place.id, place.template(), &self.rig.cameras);
+            (place.skirt, place.skirt_search) = (search.skirt(), Some(search));
+            place.estimator.reset();
+        }
+        Ok(())
+    }
+
     /// Reports cameras whose images have become uniform, and those that see again.
     fn watch_for_blank_images(&mut self, set: &FrameSet) -> Result<(), FusionError> {
         for ((frame, camera), was) in set.frames.iter().zip(&self.rig.cameras).zip(&mut self.blank) {

@@ -6,9 +6,10 @@ use flyrig_types::{Camera, Frame, FrameSet, Image, Mask, PersonId, Pose, PoseTra
 use glam::Vec3;
 
 use super::background::{BackgroundWatch, backgrounds, report};
+use super::skirts::SkirtSearch;
 use super::split_mask::{PosedMesh, split_mask};
 use super::{KnownPerson, Observation, Perception, SeenPerson, ViewObservation};
-use crate::{FusionError, Origin, PerceptionSettings, StageTimes};
+use crate::{FusionError, Origin, PerceptionSettings, SHAPE_SECS, SHAPE_SETS, StageTimes};
 
 /// One person with a known motion.
 #[derive(Debug, Clone)]
@@ -37,6 +38,8 @@ pub struct GivenPerception {
     masks: Origin,
     /// By slot.
     backgrounds: Vec<Option<Background>>,
+    /// By person.
+    skirts: Vec<SkirtSearch>,
     watch: BackgroundWatch,
 }
 
@@ -47,6 +50,7 @@ impl GivenPerception {
     pub fn new(rig: &Rig, people: Vec<GivenPerson>) -> Self {
         let backgrounds = vec![None; rig.cameras.len()];
         Self {
+            skirts: vec![SkirtSearch::default(); people.len()],
             people,
             cameras: rig.cameras.clone(),
             masks: Origin::Given,
@@ -74,9 +78,14 @@ impl GivenPerception {
 
 impl Perception for GivenPerception {
     fn people(&self) -> Vec<KnownPerson<'_>> {
-        let people = self.people.iter();
+        let people = self.people.iter().zip(&self.skirts);
         people
-            .map(|given| KnownPerson { person: given.person, shape: 0, template: &given.template, skirt: None })
+            .map(|(given, search)| KnownPerson {
+                person: given.person,
+                shape: u32::from(search.skirt().is_some()),
+                template: &given.template,
+                skirt: search.skirt(),
+            })
             .collect()
     }
 
@@ -119,11 +128,39 @@ impl Perception for GivenPerception {
                 Observation::Lost { person, reason: "the pose holds numbers that are not finite".to_owned() }
             }
         };
-        Ok(self.people.iter().zip(poses).zip(views).map(seen).collect())
+        // A skirt that is found here is drawn from the next set on.
+        let observations: Vec<Observation> = self.people.iter().zip(poses).zip(views).map(seen).collect();
+        for ((given, search), observation) in self.people.iter().zip(&mut self.skirts).zip(&observations) {
+            if let Observation::Seen(seen) = observation {
+                search.take(set, seen, &given.template, &self.cameras);
+            }
+        }
+        Ok(observations)
     }
 }
 
 impl GivenPerception {
+    /// Looks for skirts in a few sets ([`SHAPE_SETS`], over [`SHAPE_SECS`]) before the session is built, so that they are known from the
+    /// first set on. Otherwise they are found in the first seconds.
+    ///
+    /// # Errors
+    /// Those of [`Perception::observe`].
+    pub fn find_skirts(&mut self, sets: &[FrameSet]) -> Result<(), FusionError> {
+        let mut searches = vec![SkirtSearch::default(); self.people.len()];
+        for set in sets {
+            for (search, observation) in searches.iter_mut().zip(self.observe(set, &mut StageTimes::default())?) {
+                if let Observation::Seen(seen) = observation {
+                    search.add(set, &seen);
+                }
+            }
+        }
+        for (search, given) in searches.iter_mut().zip(&self.people) {
+            search.finish(given.person, &given.template, &self.cameras);
+        }
+        self.skirts = searches;
+        Ok(())
+    }
+
     /// Vertices and triangles of everybody at the time of a frame; of those whose poses are valid.
     fn bodies(&self, frame: &Frame, poses: &[Pose]) -> (Vec<Vec3>, Vec<[u32; 3]>) {
         let (mut vertices, mut triangles) = (Vec::new(), Vec::new());

@@ -1,0 +1,63 @@
+//! The search for a skirt on a person whose shape is given.
+
+use flyrig_body::{Skirt, Template};
+use flyrig_tracker::{MaskedPoses, MaskedView, find_skirt};
+use flyrig_types::{Camera, FrameSet, Mask, PersonId, Pose};
+
+use super::SeenPerson;
+use crate::{SHAPE_SECS, SHAPE_SETS};
+
+/// Collects poses and masks of a person, as many as a shape takes, and looks for a skirt once.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct SkirtSearch {
+    poses: Vec<Pose>,
+    /// Which pose, which slot.
+    masks: Vec<(usize, usize, Mask)>,
+    last_nanos: Option<i64>,
+    is_over: bool,
+    skirt: Option<Skirt>,
+}
+
+impl SkirtSearch {
+    /// What was found.
+    pub fn skirt(&self) -> Option<Skirt> {
+        self.skirt
+    }
+
+    /// Takes in a set of a running session, and looks for a skirt once enough time has passed.
+    pub fn take(&mut self, set: &FrameSet, seen: &SeenPerson, body: &Template, cameras: &[Camera]) {
+        let every_nanos = (SHAPE_SECS * 1e9 / SHAPE_SETS as f64) as i64;
+        let is_soon = self.last_nanos.is_some_and(|last| set.master_nanos.saturating_sub(last) < every_nanos);
+        if self.is_over || is_soon {
+            return;
+        }
+        self.last_nanos = Some(set.master_nanos);
+        self.add(set, seen);
+        if self.poses.len() >= SHAPE_SETS {
+            self.finish(seen.person, body, cameras);
+        }
+    }
+
+    /// Keeps the pose and masks of a set.
+    pub fn add(&mut self, set: &FrameSet, seen: &SeenPerson) {
+        for ((slot, _), view) in set.present().zip(&seen.views) {
+            // Where somebody else hides a part, the mask says nothing of clothes.
+            let own = view.mask.as_ref().filter(|_| view.others.is_none());
+            self.masks.extend(own.map(|mask| (self.poses.len(), slot, mask.clone())));
+        }
+        self.poses.push(seen.pose.clone());
+    }
+
+    /// Looks for a skirt in what was taken in. Later sets change nothing.
+    pub fn finish(&mut self, person: PersonId, body: &Template, cameras: &[Camera]) {
+        let (poses, masks) = (std::mem::take(&mut self.poses), std::mem::take(&mut self.masks));
+        let views = masks
+            .iter()
+            .filter_map(|(pose, slot, mask)| Some(MaskedView { camera: cameras.get(*slot)?, pose: *pose, mask }))
+            .collect();
+        (self.skirt, self.is_over) = (find_skirt(body, &MaskedPoses { poses, views }), true);
+        if self.skirt.is_some() {
+            tracing::info!("person {person} wears a skirt or a long coat");
+        }
+    }
+}
