@@ -22,8 +22,8 @@ use crate::{
 
 /// A track farther than this from everybody follows nobody, metres.
 const ON_SOMEBODY_M: f64 = 0.4;
-/// Everybody must be on a track from this time on, seconds.
-const ARRIVAL_SECS: f64 = 1.0;
+/// Everybody must be on a track from this time on, seconds: people are measured for 1.5 s first.
+const ARRIVAL_SECS: f64 = 2.0;
 
 /// What happened in a take.
 #[derive(Debug, Default)]

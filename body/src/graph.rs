@@ -83,14 +83,17 @@ pub fn build_graph(
 
 /// Returns the canonical displacement of a Gaussian by the translations of its nodes (FlyHuman Eq. 2), metres, and in w the share by
 /// which the Gaussian grows, so that a stretched surface (skirts, coats) has no holes. The stretch is the root mean square distance
-/// between the Gaussian's nodes over that at rest; growth starts at a stretch of 1.25. `rest` holds the canonical positions of all nodes,
-/// metres; nodes that are missing there or in `translations` count as at rest.
+/// between the Gaussian's nodes over that at rest, without nodes of next to no weight; growth starts at a stretch of 1.25. `rest` holds
+/// the canonical positions of all nodes, metres; nodes that are missing there or in `translations` count as at rest.
 #[must_use]
 pub fn displacement(rest: &[Vec3], translations: &[DVec3], nodes: [u32; 4], weights: [f32; 4]) -> [f32; 4] {
     let moved = nodes.map(|node| translations.get(node as usize).copied().unwrap_or(DVec3::ZERO));
     let by: DVec3 = moved.iter().zip(weights).map(|(t, weight)| *t * f64::from(weight)).sum();
     let (mut then, mut now) = (0.0, 0.0);
     for (a, b) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)] {
+        if weights[a].min(weights[b]) < LEAST_WEIGHT {
+            continue;
+        }
         if let (Some(first), Some(other)) = (rest.get(nodes[a] as usize), rest.get(nodes[b] as usize)) {
             let apart = (*other - *first).as_dvec3();
             then += apart.length_squared();
@@ -106,6 +109,8 @@ pub fn displacement(rest: &[Vec3], translations: &[DVec3], nodes: [u32; 4], weig
 const CLOSED: f64 = 1.25;
 /// Most that a Gaussian grows, as a factor.
 const MOST_GROWTH: f64 = 4.0;
+/// Weights below this are 0 in the person stream, which has 255 steps: its viewers do not know which node it was.
+const LEAST_WEIGHT: f32 = 0.5 / 255.0;
 
 /// No node.
 const NONE: u32 = u32::MAX;

@@ -70,6 +70,9 @@ impl Skirt {
         for ring in 0..=rings {
             let y = top + (hem - top) * ring as f32 / rings as f32;
             let outline = outline_at(body, &trunk, y, legs.centre);
+            if ring == 0 && outline.iter().any(|radius| *radius <= CLEARANCE_M) {
+                return Err(fail("there is no surface around the hips for a skirt to hang on".to_owned()));
+            }
             for (radius, outline) in radii.iter_mut().zip(outline) {
                 *radius = (*radius + self.flare * (top - hem) / rings as f32 * f32::from(ring > 0))
                     .max(outline + CLEARANCE_M);
@@ -78,9 +81,6 @@ impl Skirt {
                 let at = legs.centre + direction(k) * radii[k];
                 Vec3::new(at.x, y, at.y)
             }));
-        }
-        if radii.iter().any(|radius| *radius <= 2.0 * CLEARANCE_M) {
-            return Err(fail("there is no surface between hips and feet for a skirt to hang on".to_owned()));
         }
 
         let is_hidden = |vertex: u32| {
@@ -95,7 +95,7 @@ impl Skirt {
         for ring in 0..rings {
             for k in 0..AROUND {
                 let [a, b, c, d] = [at(ring, k), at(ring, k + 1), at(ring + 1, k + 1), at(ring + 1, k)];
-                dressed.triangles.extend([[a, b, c], [a, c, d]]);
+                dressed.triangles.extend([[a, c, b], [a, d, c]]);
             }
         }
         for (index, point) in points.iter().enumerate() {
@@ -243,12 +243,12 @@ mod tests {
             let faces: Vec<Vec3> = faces.collect();
             assert!(faces.iter().any(|n| n.z > 0.0) && faces.iter().any(|n| n.z < 0.0), "at {y}: {faces:?}");
         }
-        for (triangle, at) in dressed.triangles.iter().zip(0..).rev().take(AROUND * 10) {
+        for (at, triangle) in dressed.triangles.iter().rev().take(AROUND * 10).enumerate() {
             let [a, b, c] = triangle.map(|v| dressed.positions[v as usize]);
             let normal = (b - a).cross(c - a);
-            assert!(normal.dot(dressed.normals[triangle[0] as usize]) > 0.0, "triangle {at}");
+            assert!(normal.dot(dressed.normals[triangle[0] as usize]) > 0.0, "triangle {at} from the end");
             let outwards = a - Vec3::new(legs.centre.x, a.y, legs.centre.y);
-            assert!(normal.dot(outwards) > 0.0, "triangle {at} faces inwards");
+            assert!(normal.dot(outwards) > 0.0, "triangle {at} from the end faces inwards");
         }
         // No leg is left inside of it, both feet are.
         let inside = |p: &&Vec3| p.y > hem + 0.01 && p.y < legs.hip_y - 0.01 && p.truncate().x.abs() < 0.05;

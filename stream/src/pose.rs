@@ -64,6 +64,9 @@ impl StreamTemplate {
     fn growth(&self, motion: &Motion, nodes: &Influences) -> f32 {
         let (mut then, mut now) = (0.0, 0.0);
         for (a, b) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)] {
+            if nodes.weight[a] == 0 || nodes.weight[b] == 0 {
+                continue;
+            }
             let (a, b) = (nodes.index[a] as usize, nodes.index[b] as usize);
             let (Some(first), Some(other)) = (self.node_places.get(a), self.node_places.get(b)) else { continue };
             let still = [0.0; 3];

@@ -72,7 +72,9 @@ fn reference(person: &Person, motion: &Motion) -> Vec<[f64; 3]> {
 fn growth(template: &StreamTemplate, motion: &Motion, gaussian: usize) -> f64 {
     let Some(nodes) = template.node_weights.get(gaussian) else { return 1.0 };
     let mut squares = [0.0; 2];
-    for (a, b) in nodes.index.iter().flat_map(|a| nodes.index.iter().map(move |b| (*a as usize, *b as usize))) {
+    let weighs = |i: &usize| nodes.weight[*i] > 0;
+    for (i, j) in (0..4).filter(weighs).flat_map(|i| (0..4).filter(weighs).map(move |j| (i, j))) {
+        let (a, b) = (nodes.index[i] as usize, nodes.index[j] as usize);
         for k in 0..3 {
             let place = |node: usize| f64::from(template.node_places[node][k]);
             let moved = |node: usize| place(node) + f64::from(motion.nodes[node][k]);

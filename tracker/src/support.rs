@@ -21,7 +21,7 @@ const DEPTH_STEP_M: f64 = 0.03;
 const MIN_SQUARES: usize = 6;
 
 /// Of more than this many other cameras one may miss a part that the rest has.
-const MAY_DISSENT: usize = 2;
+const MAY_DISSENT: usize = 3;
 
 /// A mask in squares: which hold some of it, widened by one square for errors of calibration and time.
 struct Coarse {
@@ -56,7 +56,7 @@ impl Coarse {
 }
 
 /// Clears pieces of `masks` beside the body that are at no depth where clothes may hang in the masks of the other cameras that look there
-/// (all of two, all but one of more). Slices are by camera; a camera without a mask or a gate is not asked. The masks are of a person who
+/// (all of up to three, all but one of more). Slices are by camera; a camera without a mask or a gate is not asked. The masks are of a person who
 /// is alone: another one would hide parts that a mask has to have.
 pub(crate) fn drop_unsupported(cameras: &[Camera], gates: &[Option<BodyGate>], masks: &mut [Option<Mask>]) {
     let side_px = |gate: &BodyGate| (SQUARE_M * gate.px_per_m).round().max(MIN_SQUARE_PX) as usize;
@@ -223,7 +223,7 @@ mod tests {
             let mut scene = scene(count);
             let before = scene.masks.clone();
             drop_unsupported(&scene.rig.cameras, &scene.gates, &mut scene.masks);
-            assert_eq!(scene.masks, before, "{count} cameras");
+            assert!(scene.masks == before, "{count} cameras");
         }
     }
 
@@ -236,7 +236,7 @@ mod tests {
             let painted = paint(&mut scene.masks[0], at);
             assert!(painted > 400, "{painted}");
             drop_unsupported(&scene.rig.cameras, &scene.gates, &mut scene.masks);
-            assert_eq!(scene.masks, whole, "{count} cameras");
+            assert!(scene.masks == whole, "{count} cameras");
         }
     }
 
@@ -252,7 +252,7 @@ mod tests {
         }
         let before = scene.masks.clone();
         drop_unsupported(&scene.rig.cameras, &scene.gates, &mut scene.masks);
-        assert_eq!(scene.masks, before);
+        assert!(scene.masks == before);
     }
 
     #[test]
@@ -263,10 +263,10 @@ mod tests {
         (scene.masks[1], scene.masks[2]) = (None, None);
         let before = scene.masks.clone();
         drop_unsupported(&scene.rig.cameras, &scene.gates, &mut scene.masks);
-        assert_eq!(scene.masks, before, "nobody else has a mask");
+        assert!(scene.masks == before, "nobody else has a mask");
         scene.gates[0] = None;
         drop_unsupported(&scene.rig.cameras, &scene.gates, &mut scene.masks);
-        assert_eq!(scene.masks, before, "no body");
+        assert!(scene.masks == before, "no body");
         drop_unsupported(&[], &[], &mut []);
     }
 
@@ -277,7 +277,7 @@ mod tests {
         let before = scene.masks[1].clone();
         scene.rig.cameras[2].camera_from_world.translation.x = f64::NAN;
         drop_unsupported(&scene.rig.cameras, &scene.gates, &mut scene.masks);
-        assert_eq!(scene.masks[1], before);
+        assert!(scene.masks[1] == before);
         assert!(scene.masks[0].as_ref().unwrap().area_px() > 1000);
     }
 }
