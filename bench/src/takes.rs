@@ -134,7 +134,7 @@ fn run(args: &BenchTakesArgs, gpu: &GpuContext, seed: u64, sets: u64, bar: &indi
             .filter_map(|observation| {
                 let Observation::Seen(seen) = observation else { return None };
                 let template = |known: &&KnownPerson| known.person == seen.person;
-                Some((seen.person, hips(&known.iter().find(template)?.template, &seen.pose)?))
+                Some((seen.person, hips(known.iter().find(template)?.template, &seen.pose)?))
             })
             .collect();
         let truth: Vec<DVec3> =

@@ -208,7 +208,7 @@ fn kept(body: &Template, triangles: &[[u32; 3]]) -> Template {
         normals: used.iter().map(|v| body.normals[*v]).collect(),
         uvs: used.iter().map(|v| body.uvs[*v]).collect(),
         triangles: triangles.iter().map(|triangle| triangle.map(|v| number[v as usize])).collect(),
-        skin: used.iter().map(|v| body.skin[*v].clone()).collect(),
+        skin: used.iter().map(|v| body.skin[*v]).collect(),
         parts: used.iter().map(|v| body.parts[*v]).collect(),
         skeleton: body.skeleton.clone(),
     }

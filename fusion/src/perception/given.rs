@@ -9,7 +9,7 @@ use super::background::{BackgroundWatch, backgrounds, report};
 use super::skirts::SkirtSearch;
 use super::split_mask::{PosedMesh, split_mask};
 use super::{KnownPerson, Observation, Perception, SeenPerson, ViewObservation};
-use crate::{FusionError, Origin, PerceptionSettings, SHAPE_SECS, SHAPE_SETS, StageTimes};
+use crate::{FusionError, Origin, PerceptionSettings, StageTimes};
 
 /// One person with a known motion.
 #[derive(Debug, Clone)]
@@ -140,7 +140,7 @@ impl Perception for GivenPerception {
 }
 
 impl GivenPerception {
-    /// Looks for skirts in a few sets ([`SHAPE_SETS`], over [`SHAPE_SECS`]) before the session is built, so that they are known from the
+    /// Looks for skirts in a few sets ([`crate::SHAPE_SETS`], over [`crate::SHAPE_SECS`]) before the session is built, so that they are known from the
     /// first set on. Otherwise they are found in the first seconds.
     ///
     /// # Errors
