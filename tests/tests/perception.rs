@@ -110,3 +110,37 @@ fn hands_and_face_are_found_in_images_alone() {
     assert_eq!(refused.code, Some(1));
     assert!(refused.stderr.contains("a given pose brings its own fingers"), "{}", refused.stderr);
 }
+
+#[test]
+fn a_skirt_is_found_and_drawn_and_trousers_are_none() {
+    let folder = tempfile::tempdir().unwrap();
+    let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    let take = |seed: u32| {
+        let rig = RIG
+            .replace("[sim]\n", &format!("[sim]\nseed = {seed}\n"))
+            .replace("cameras.count = 3", "cameras.count = 4");
+        std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
+        let exported = command(&["sim", "export", "rig.toml", "--out", &format!("take{seed}"), "--frames", "8"]);
+        assert_eq!(exported.code, Some(0), "{exported:?}");
+    };
+    let eval = |seed: u32, given_or_estimated: &str| {
+        let take = format!("take{seed}");
+        let mut args = vec!["eval", take.as_str(), "--inputs", "00,01,03", "--holdout", "02", "--fps", "10"];
+        args.extend(["--pose", given_or_estimated, "--masks", given_or_estimated]);
+        args.extend(["--gaussians", "4000", "--nodes", "200", "--out", "eval"]);
+        let ran = command(&args);
+        assert_eq!(ran.code, Some(0), "{}", ran.stderr);
+        let metrics = std::fs::read(folder.path().join("eval/metrics.json")).unwrap();
+        let metrics: serde_json::Value = serde_json::from_slice(&metrics).unwrap();
+        (ran.stderr, metrics["mean"]["iou"].as_f64().unwrap())
+    };
+    // A wide skirt, then trousers.
+    for (seed, worn) in [(306, true), (303, false)] {
+        take(seed);
+        let (estimated, _) = eval(seed, "estimated");
+        assert_eq!(estimated.contains("tall, in a skirt or long coat"), worn, "{estimated}");
+        let (given, iou) = eval(seed, "given");
+        assert_eq!(given.contains("person 0 wears a skirt or a long coat"), worn, "{given}");
+        assert!(iou > 0.85, "seed {seed}: {iou}");
+    }
+}
