@@ -10,7 +10,7 @@ pub use shape::ShapeSighting;
 use std::sync::Arc;
 use std::time::Instant;
 
-use flyrig_body::{Template, skin_mesh};
+use flyrig_body::{Skirt, Template, skin_mesh};
 use flyrig_solve::median;
 use flyrig_types::{Frame, FrameSet, Image, Mask, Rig};
 use glam::{DVec3, Vec3};
@@ -105,9 +105,21 @@ pub struct PoseEstimator {
     looks_at_all: bool,
     /// Whether sightings are kept, and the last one.
     keeps_sightings: bool,
+    clothes: Clothes,
     /// Whether nobody else was known in the last set.
     is_alone: bool,
     sighting: Option<ShapeSighting>,
+}
+
+/// Clothes of the person.
+#[derive(Debug, Clone)]
+enum Clothes {
+    /// Nobody has looked yet.
+    Unknown,
+    /// They follow trunk and legs.
+    Close,
+    /// The body in a skirt.
+    Skirt(Arc<Template>),
 }
 
 /// A fitted pose before it is believed.
@@ -184,6 +196,7 @@ impl PoseEstimator {
             lost: 0,
             looks_at_all: false,
             keeps_sightings: false,
+            clothes: Clothes::Unknown,
             is_alone: true,
             sighting: None,
         })
@@ -383,6 +396,28 @@ impl PoseEstimator {
         if self.track.is_some() { self.lost } else { self.lost.max(1) }
     }
 
+    /// Chooses the clothes that masks allow for: a skirt, or none of that kind. Once they are known, masks reach less far from the body,
+    /// and things and people nearby are no part of them.
+    ///
+    /// # Errors
+    /// Kind `Template` for a body that carries no skirt.
+    pub fn wear(&mut self, skirt: Option<Skirt>) -> Result<(), TrackError> {
+        self.clothes = match skirt {
+            None => Clothes::Close,
+            Some(skirt) => {
+                let dressed = skirt.on(&self.template);
+                let dressed = dressed.map_err(|error| TrackError::new(TrackErrorKind::Template, error.to_string()))?;
+                Clothes::Skirt(Arc::new(dressed))
+            }
+        };
+        Ok(())
+    }
+
+    /// Lets masks reach as far as wide clothes: somebody else may have come.
+    pub fn forget_clothes(&mut self) {
+        self.clothes = Clothes::Unknown;
+    }
+
     /// Gives up what is being tracked: it turned out to be somebody else. The search begins anew.
     pub fn drop_track(&mut self) {
         self.track = None;
@@ -398,11 +433,22 @@ impl PoseEstimator {
 
     /// Vertices and normals of a pose at a time after it, as the body has moved since the last set.
     fn skinned(&self, turns: &Turns, set: &FrameSet, delay_secs: f64) -> (Vec<Vec3>, Vec<Vec3>) {
+        self.skinned_in(&self.template, turns, set, delay_secs)
+    }
+
+    /// The same of the body as it is dressed.
+    fn skinned_in(
+        &self,
+        template: &Template,
+        turns: &Turns,
+        set: &FrameSet,
+        delay_secs: f64,
+    ) -> (Vec<Vec3>, Vec<Vec3>) {
         let moved = self.track.as_ref().filter(|_| delay_secs.abs() > MIN_DELAY_SECS).and_then(|track| {
             let since = secs(set.master_nanos.saturating_sub(track.nanos));
             (since > 1e-3).then(|| turns.advanced(&track.turns, (delay_secs / since).clamp(-1.0, 1.0)))
         });
-        skin_mesh(&self.template, &self.model.to_pose(moved.as_ref().unwrap_or(turns)))
+        skin_mesh(template, &self.model.to_pose(moved.as_ref().unwrap_or(turns)))
     }
 
     /// World positions of the landmarks on the template in a pose, metres; `None` for a pose that does not

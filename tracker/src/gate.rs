@@ -8,7 +8,9 @@ use crate::grid::Grid;
 /// Distance of most clothes and hair from the fitted body, metres: the unit of a gate's distances.
 const REACH_M: f64 = 0.13;
 /// Distance of wide skirts and coats, as a multiple of it: beyond 1, only where image and background speak for it.
-pub(crate) const CLOTHES_REACH: f32 = 2.5;
+const CLOTHES_REACH: f32 = 2.5;
+/// The same of clothes whose skirt, if there is one, is part of the body that was drawn: hair and loose sleeves are left.
+const KNOWN_CLOTHES_REACH: f32 = 1.5;
 
 /// Region of an image that a posed body and its clothes may cover.
 #[derive(Debug, Clone)]
@@ -21,6 +23,8 @@ pub struct BodyGate {
     pub(crate) distance: Grid,
     /// Pixels that a metre takes at the body.
     pub(crate) px_per_m: f64,
+    /// Distance at which nothing belongs to the person, in the unit of `distance`.
+    pub(crate) reach: f32,
     /// Least and greatest depth of the body in the camera, metres.
     pub(crate) depths_m: [f64; 2],
 }
@@ -46,12 +50,18 @@ impl BodyGate {
             *value /= reach as f32;
         }
         let image = [camera.intrinsics.width as usize, camera.intrinsics.height as usize];
-        Some(Self { image, bounds, distance, px_per_m, depths_m })
+        Some(Self { image, bounds, distance, px_per_m, reach: CLOTHES_REACH, depths_m })
+    }
+
+    /// The gate of a body that wears what the person does, skirt or none: it reaches less far.
+    #[must_use]
+    pub fn of_known_clothes(self) -> Self {
+        Self { reach: KNOWN_CLOTHES_REACH, ..self }
     }
 
     /// Depths along the camera's axis between which person and clothes may be, metres.
     pub(crate) fn depth_range_m(&self) -> [f64; 2] {
-        let reach = REACH_M * f64::from(CLOTHES_REACH);
+        let reach = REACH_M * f64::from(self.reach);
         [(self.depths_m[0] - reach).max(0.05), self.depths_m[1] + reach]
     }
 
@@ -65,7 +75,7 @@ impl BodyGate {
         let [x0, y0, x1, y1] = self.bounds;
         (x0..x1).contains(&x)
             && (y0..y1).contains(&y)
-            && self.distance.values[(y - y0) * self.distance.width + x - x0] < CLOTHES_REACH
+            && self.distance.values[(y - y0) * self.distance.width + x - x0] < self.reach
     }
 
     /// The same of a pixel's index, row by row.
@@ -83,6 +93,7 @@ impl BodyGate {
             bounds: [0, 0, body.width, body.height],
             distance,
             px_per_m,
+            reach: CLOTHES_REACH,
             depths_m: [1.0; 2],
         }
     }

@@ -3,7 +3,7 @@
 use flyrig_solve::median;
 use flyrig_types::{Image, Mask};
 
-use crate::gate::{BodyGate, CLOTHES_REACH};
+use crate::gate::BodyGate;
 use crate::grid::{Grid, clean, components};
 use crate::pixels::Rgb;
 use crate::{TrackError, TrackErrorKind};
@@ -78,7 +78,7 @@ pub(crate) fn gated_mask(evidence: &Grid, gate: &BodyGate) -> Option<Mask> {
         } else {
             ON_BODY + DEEP_IN_BODY * (depth / deep_px).min(1.0)
         };
-        let is_out = *distance >= CLOTHES_REACH;
+        let is_out = *distance >= gate.reach;
         *value = if is_out { 0.0 } else { ((*value + prior - 0.5) * 2.0 + 0.5).clamp(0.0, 1.0) };
     }
     drop_what_hangs_on_nothing(&mut voted, &gate.distance);
@@ -259,6 +259,10 @@ mod tests {
         // 22 pixels from the body are 22 cm; the reach ends at 32.
         assert!(mask.coverage()[78 * SIDE + 78] >= 128);
         assert!(iou(&mask, skirt) > 0.93, "{}", iou(&mask, skirt));
+        // Of somebody who wears no skirt it is something else.
+        let mask = mask_from_plate(&now, &plate, &gate().of_known_clothes()).unwrap().unwrap();
+        assert_eq!(mask.coverage()[78 * SIDE + 79], 0);
+        assert!(mask.coverage()[70 * SIDE + 62] >= 128);
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use flyrig_types::Mask;
 use glam::DVec2;
 
-use crate::gate::{BodyGate, CLOTHES_REACH};
+use crate::gate::BodyGate;
 use crate::grid::{Grid, clean};
 use crate::net::NET_SIDE;
 use crate::pixels::Rgb;
@@ -83,7 +83,7 @@ pub(crate) fn refine(
         for x in 0..width {
             let at = y * width + x;
             let (p, d) = (coarse.values[at].clamp(0.02, 0.98), gate.distance.values[at]);
-            if d >= CLOTHES_REACH {
+            if d >= gate.reach {
                 probability.values[at] = 0.0;
                 continue;
             }
@@ -113,7 +113,7 @@ pub(crate) fn refine(
     let mut smoothed = probability.guided(&guide, radius, 1e-3);
     for (value, d) in smoothed.values.iter_mut().zip(&gate.distance.values) {
         // A soft step around one half keeps about a pixel of slope.
-        *value = if *d >= CLOTHES_REACH { 0.0 } else { ((*value - 0.5) * 3.0 + 0.5).clamp(0.0, 1.0) };
+        *value = if *d >= gate.reach { 0.0 } else { ((*value - 0.5) * 3.0 + 0.5).clamp(0.0, 1.0) };
     }
     clean(&mut smoothed, (0.02 * gate.px_per_m).round() as usize);
     smoothed.paste(picture.width, picture.height, x0, y0)

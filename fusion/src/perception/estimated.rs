@@ -65,12 +65,14 @@ impl Place {
     fn know(&mut self) -> Result<(), TrackError> {
         (self.learning, self.known, self.renews) = (None, true, false);
         self.estimator.keep_sightings(false);
+        self.estimator.wear(self.skirt)?;
         self.hands.as_mut().map_or(Ok(()), |hands| hands.set_template(self.estimator.template()))
     }
 
     /// Begins to measure the person who is followed.
     fn measure(&mut self) {
         self.learning = Some((Vec::new(), i64::MIN));
+        self.estimator.forget_clothes();
         self.estimator.keep_sightings(true);
     }
 
@@ -477,8 +479,12 @@ impl Perception for EstimatedPerception {
             let Some(place) = self.places.iter_mut().find(|place| place.id == seen.person) else { continue };
             if let Some(search) = &mut place.skirt_search {
                 let body = place.hands.as_ref().map_or(place.estimator.template(), HandTracker::template);
+                let was_over = search.is_over();
                 search.take(set, seen, body, &self.rig.cameras);
                 place.skirt = search.skirt();
+                if search.is_over() && !was_over {
+                    place.estimator.wear(place.skirt)?;
+                }
             }
         }
         Ok(observations)
@@ -505,6 +511,7 @@ impl EstimatedPerception {
             search.finish(place.id, place.template(), &self.rig.cameras);
             (place.skirt, place.skirt_search) = (search.skirt(), Some(search));
             place.estimator.reset();
+            place.estimator.wear(place.skirt)?;
         }
         Ok(())
     }

@@ -164,13 +164,14 @@ impl GivenPerception {
     /// Vertices and triangles of everybody at the time of a frame; of those whose poses are valid.
     fn bodies(&self, frame: &Frame, poses: &[Pose]) -> (Vec<Vec3>, Vec<[u32; 3]>) {
         let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
-        for (given, pose) in self.people.iter().zip(poses) {
+        for ((given, search), pose) in self.people.iter().zip(&self.skirts).zip(poses) {
             let own = given.at(frame.capture_nanos);
             let pose = if own.is_valid() { &own } else { pose };
             if pose.is_valid() {
                 let first = vertices.len() as u32;
-                vertices.extend(skin_mesh(&given.template, pose).0);
-                triangles.extend(given.template.triangles.iter().map(|corners| corners.map(|corner| corner + first)));
+                let template = search.dressed().unwrap_or(&given.template);
+                vertices.extend(skin_mesh(template, pose).0);
+                triangles.extend(template.triangles.iter().map(|corners| corners.map(|corner| corner + first)));
             }
         }
         (vertices, triangles)
@@ -201,6 +202,8 @@ impl GivenPerception {
         };
         let (vertices, triangles) = self.bodies(frame, poses);
         let Some(gate) = BodyGate::new(camera, &vertices, &triangles) else { return Ok(None) };
+        let are_dressed = self.skirts.iter().all(SkirtSearch::is_over);
+        let gate = if are_dressed { gate.of_known_clothes() } else { gate };
         let Some(mask) = background.mask(&frame.image, &gate)? else { return Ok(None) };
         Ok(Some(matte(&frame.image, &mask, Some(background))?))
     }

@@ -16,12 +16,23 @@ pub(crate) struct SkirtSearch {
     last_nanos: Option<i64>,
     is_over: bool,
     skirt: Option<Skirt>,
+    dressed: Option<Template>,
 }
 
 impl SkirtSearch {
     /// What was found.
     pub fn skirt(&self) -> Option<Skirt> {
         self.skirt
+    }
+
+    /// The body in the skirt that was found.
+    pub fn dressed(&self) -> Option<&Template> {
+        self.dressed.as_ref()
+    }
+
+    /// Whether the search is over.
+    pub fn is_over(&self) -> bool {
+        self.is_over
     }
 
     /// Takes in a set of a running session, and looks for a skirt once enough time has passed.
@@ -56,6 +67,7 @@ impl SkirtSearch {
             .filter_map(|(pose, slot, mask)| Some(MaskedView { camera: cameras.get(*slot)?, pose: *pose, mask }))
             .collect();
         (self.skirt, self.is_over) = (find_skirt(body, &MaskedPoses { poses, views }), true);
+        self.dressed = self.skirt.and_then(|skirt| skirt.on(body).ok());
         if self.skirt.is_some() {
             tracing::info!("person {person} wears a skirt or a long coat");
         }

@@ -17,7 +17,17 @@ impl PoseEstimator {
                 let picture = picture.as_ref().ok_or(NoMask::NoFrame)?;
                 let camera = &self.rig.cameras[slot];
                 let (vertices, _) = self.skinned(&fitted.turns, set, fitted.delay_secs(slot));
-                let gate = BodyGate::new(camera, &vertices, &self.template.triangles).ok_or(NoMask::OutOfView)?;
+                let gate = match &self.clothes {
+                    Clothes::Unknown => BodyGate::new(camera, &vertices, &self.template.triangles),
+                    Clothes::Close => {
+                        BodyGate::new(camera, &vertices, &self.template.triangles).map(BodyGate::of_known_clothes)
+                    }
+                    Clothes::Skirt(dressed) => {
+                        let (vertices, _) = self.skinned_in(dressed, &fitted.turns, set, fitted.delay_secs(slot));
+                        BodyGate::new(camera, &vertices, &dressed.triangles).map(BodyGate::of_known_clothes)
+                    }
+                };
+                let gate = gate.ok_or(NoMask::OutOfView)?;
                 let look = fitted.looks[slot].as_ref();
                 let look = look.filter(|l| l.sighting.output.presence >= self.config.presence_threshold);
                 let light = self.background(slot).and_then(|known| known.light(picture, &|at| !gate.reaches_pixel(at)));

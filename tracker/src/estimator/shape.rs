@@ -2,7 +2,6 @@
 
 use super::*;
 use crate::skirt_fit::{MaskedPoses, MaskedView, find_skirt};
-use flyrig_body::Skirt;
 
 /// Steps of the solver to a pose in a new shape.
 const POSE_STEPS: usize = 40;
@@ -73,7 +72,7 @@ impl PoseEstimator {
             return Ok((template, fit));
         }
         // Masks and outlines are those of the body in the new shape.
-        let mut shaped = Self { track: None, ..self.clone() };
+        let mut shaped = Self { track: None, clothes: Clothes::Unknown, ..self.clone() };
         shaped.take_shape(template)?;
         shaped.fit_shape_to_outlines(sightings, &mut fit)?;
         Ok((shaped.template, fit))
