@@ -51,7 +51,7 @@ enum Disturbance {
     Exposure(f64),
     /// Somebody walks past.
     PasserBy,
-    /// Below the neck this share is left of the difference between the person and what is behind.
+    /// Below the neck, this share of the difference between the person and the background is left.
     Camouflaged(f64),
     /// Nobody is there.
     Away,

@@ -5,7 +5,7 @@
 use std::{collections::BTreeMap, path::Path, sync::Arc, time::Instant};
 
 use anyhow::{Context, Result};
-use flyrig_body::{ShapeParams, Template, default_template};
+use flyrig_body::{ShapeParams, default_template};
 use flyrig_fusion::{
     BodySettings, EstimatedPerception, GivenPerception, GivenPerson, Origin, PerceptionSettings, PersonId, SHAPE_SECS,
     SHAPE_SETS, Session, SessionBuilder, SessionSettings, Subject, TrackState,
@@ -14,9 +14,9 @@ use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
 use flyrig_report::{png, progress_bar, write_whole};
 use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, SimFrame, Simulator};
-use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat, Pose, Rig};
+use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat, Rig};
 
-use crate::{cli::BenchSubjectsArgs, perception::places};
+use crate::{cli::BenchSubjectsArgs, takes::hips};
 
 /// Half of the distance between the two people, metres; of a person from the middle of another one's walk.
 const APART_M: f64 = 0.45;
@@ -52,8 +52,6 @@ struct Tracks {
 impl Tracks {
     /// Compares the tracked people with the simulated ones at a time.
     fn add(&mut self, session: &Session, people: &[Simulator], chosen: &[usize], nanos: i64) {
-        let hips =
-            |template: &Template, pose: &Pose| places(&template.skeleton, pose).get("Hips").map(|(place, _)| *place);
         let mut found = Vec::new();
         for subject in session.subjects().iter().filter(|subject| subject.watch().state() != TrackState::Lost) {
             let Some(pose) = subject.pose() else { continue };

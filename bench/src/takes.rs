@@ -1,4 +1,4 @@
-//! `flyrig-bench takes`: several people who walk past one another, again and again, and whether each keeps the own track.
+//! `flyrig-bench takes`: several people who walk past one another, again and again, and whether each keeps one track.
 
 use std::{collections::BTreeMap, time::Instant};
 
@@ -25,7 +25,7 @@ const ON_SOMEBODY_M: f64 = 0.4;
 /// Everybody must be on a track from this time on, seconds: people are measured for 1.5 s first.
 const ARRIVAL_SECS: f64 = 2.0;
 
-/// What happened in a take.
+/// Counts of one take.
 #[derive(Debug, Default)]
 struct Take {
     /// Changes of a track to another person.
@@ -145,7 +145,8 @@ fn run(args: &BenchTakesArgs, gpu: &GpuContext, seed: u64, sets: u64, bar: &indi
     Ok(take)
 }
 
-fn hips(template: &Template, pose: &Pose) -> Option<DVec3> {
+/// World position of the hips in a pose, metres.
+pub(crate) fn hips(template: &Template, pose: &Pose) -> Option<DVec3> {
     places(&template.skeleton, pose).get("Hips").map(|(place, _)| *place)
 }
 

@@ -25,7 +25,7 @@ const BLEND_M: f32 = 0.12;
 pub struct Skirt {
     /// Height of the hem below the hip joints, as a share of the way to the ankles: 0.55 ends at the knees.
     pub length: f32,
-    /// Metres outwards for each metre down, beyond what hangs straight from the hips.
+    /// Metres outwards for each metre down, beyond a skirt that hangs straight from the hips.
     pub flare: f32,
 }
 

@@ -63,7 +63,7 @@ impl PersonMemory {
         Self { positions, normals, joints, skirt, translations, memory, colors, networks }
     }
 
-    /// What the person wears around both legs.
+    /// The person's skirt or long coat; `None` without one.
     #[must_use]
     pub fn skirt(&self) -> Option<Skirt> {
         self.skirt

@@ -47,7 +47,7 @@ pub struct KnownPerson<'a> {
     pub shape: u32,
     /// The person's shape in its bind pose.
     pub template: &'a Template,
-    /// What hangs around both legs, where it does.
+    /// The person's skirt or long coat; `None` without one.
     pub skirt: Option<Skirt>,
 }
 

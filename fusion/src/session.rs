@@ -293,7 +293,10 @@ impl Session {
                 subject.keep_observations(&self.gpu)?;
             }
             subject.shape_held = self.shape_held;
-            if let Some(memory) = self.saved.remove(&id) {
+            // Colours and deformation belong to one surface: a skirt may be found later.
+            if self.saved.get(&id).is_some_and(|memory| memory.skirt() == skirt)
+                && let Some(memory) = self.saved.remove(&id)
+            {
                 subject.restore(&self.gpu, &memory)?;
             }
             match place {
@@ -448,11 +451,12 @@ impl Session {
         let drawing = Drawing::new(&gpu, self.settings.body.gaussians)?;
         let mut subjects = Vec::new();
         for old in &self.subjects {
-            let mut subject = Subject::new(&gpu, old.id(), old.shape_and_skirt(), &self.rig, &self.settings)?;
+            let (shape, skirt) = old.shape_and_skirt();
+            let mut subject = Subject::new(&gpu, old.id(), (shape, skirt), &self.rig, &self.settings)?;
             if self.keep_observations {
                 subject.keep_observations(&gpu)?;
             }
-            if let Some(memory) = memories.get(&old.id()) {
+            if let Some(memory) = memories.get(&old.id()).filter(|memory| memory.skirt() == skirt) {
                 subject.restore(&gpu, memory)?;
             }
             subject.take_over(old);

@@ -45,7 +45,7 @@ pub struct ShapeFit {
     pub sets: usize,
     /// Where the height comes from.
     pub height_from: HeightFrom,
-    /// What hangs around both legs, where it does.
+    /// Skirt or long coat; `None` without one.
     pub skirt: Option<Skirt>,
 }
 

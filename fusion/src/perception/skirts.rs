@@ -20,17 +20,17 @@ pub(crate) struct SkirtSearch {
 }
 
 impl SkirtSearch {
-    /// What was found.
+    /// Returns the skirt that was found.
     pub fn skirt(&self) -> Option<Skirt> {
         self.skirt
     }
 
-    /// The body in the skirt that was found.
+    /// Returns the body in that skirt.
     pub fn dressed(&self) -> Option<&Template> {
         self.dressed.as_ref()
     }
 
-    /// Whether the search is over.
+    /// Returns whether the search is over.
     pub fn is_over(&self) -> bool {
         self.is_over
     }
@@ -59,7 +59,7 @@ impl SkirtSearch {
         self.poses.push(seen.pose.clone());
     }
 
-    /// Looks for a skirt in what was taken in. Later sets change nothing.
+    /// Looks for a skirt in the sets so far. Later sets change nothing.
     pub fn finish(&mut self, person: PersonId, body: &Template, cameras: &[Camera]) {
         let (poses, masks) = (std::mem::take(&mut self.poses), std::mem::take(&mut self.masks));
         let views = masks
