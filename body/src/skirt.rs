@@ -1,10 +1,9 @@
 //! A skirt or the lower half of a coat: one surface around both legs, where the body has two.
 
-use std::f32::consts::TAU;
-
 use glam::{Vec2, Vec3};
 
 use crate::part::part_of_joints;
+use crate::rings::{add_rings, convex_radii, cut, direction, kept};
 use crate::{BodyError, Part, Skeleton, SkinWeights, Template};
 
 /// Vertices around, and metres between two rings.
@@ -69,7 +68,7 @@ impl Skirt {
         let mut points = Vec::with_capacity((rings + 1) * AROUND);
         for ring in 0..=rings {
             let y = top + (hem - top) * ring as f32 / rings as f32;
-            let outline = outline_at(body, &trunk, y, legs.centre);
+            let outline = convex_radii::<AROUND>(&cut(body, &trunk, y), legs.centre);
             if ring == 0 && outline.iter().any(|radius| *radius <= CLEARANCE_M) {
                 return Err(fail("there is no surface around the hips for a skirt to hang on".to_owned()));
             }
@@ -78,7 +77,7 @@ impl Skirt {
                     .max(outline + CLEARANCE_M);
             }
             points.extend((0..AROUND).map(|k| {
-                let at = legs.centre + direction(k) * radii[k];
+                let at = legs.centre + direction::<AROUND>(k) * radii[k];
                 Vec3::new(at.x, y, at.y)
             }));
         }
@@ -90,35 +89,10 @@ impl Skirt {
         let left: Vec<[u32; 3]> =
             body.triangles.iter().filter(|triangle| !triangle.iter().all(|v| is_hidden(*v))).copied().collect();
         let mut dressed = kept(body, &left);
-        let first = dressed.positions.len() as u32;
-        let at = |ring: usize, k: usize| first + (ring * AROUND + k % AROUND) as u32;
-        for ring in 0..rings {
-            for k in 0..AROUND {
-                let [a, b, c, d] = [at(ring, k), at(ring, k + 1), at(ring + 1, k + 1), at(ring + 1, k)];
-                dressed.triangles.extend([[a, c, b], [a, d, c]]);
-            }
-        }
-        for (index, point) in points.iter().enumerate() {
-            let (ring, k) = (index / AROUND, index % AROUND);
-            let of = |ring: usize, k: usize| points[ring * AROUND + k % AROUND];
-            let down = of((ring + 1).min(rings), k) - of(ring.saturating_sub(1), k);
-            let around = of(ring, k + 1) - of(ring, k + AROUND - 1);
-            let outwards = direction(k);
-            dressed.normals.push(down.cross(around).normalize_or(Vec3::new(outwards.x, 0.0, outwards.y)));
-            dressed.skin.push(legs.weights(*point));
-            dressed.parts.push(Part::Torso);
-            dressed.uvs.push(Vec2::ZERO);
-        }
-        dressed.positions.extend(points);
+        add_rings::<AROUND>(&mut dressed, &points, Part::Torso, |point| legs.weights(point));
         dressed.check()?;
         Ok(dressed)
     }
-}
-
-/// Direction of a vertex around, x to the left and z (as y) to the front; indices run so that triangles face outwards.
-fn direction(k: usize) -> Vec2 {
-    let angle = -TAU * k as f32 / AROUND as f32;
-    Vec2::new(angle.cos(), angle.sin())
 }
 
 /// Where the legs are, canonical.
@@ -159,58 +133,6 @@ impl Legs {
         let influences = [(self.hips, 1.0 - thighs), (self.left, thighs * left), (self.right, thighs * (1.0 - left))];
         SkinWeights::strongest(&influences)
             .unwrap_or(SkinWeights { joints: [self.hips; 4], weights: [1.0, 0.0, 0.0, 0.0] })
-    }
-}
-
-/// Distances from the centre to the convex outline of a mesh's cut at a height, by direction; 0 where it has none.
-fn outline_at(body: &Template, triangles: &[[u32; 3]], y: f32, centre: Vec2) -> [f32; AROUND] {
-    let mut cut = Vec::new();
-    for triangle in triangles {
-        for (a, b) in [(0, 1), (1, 2), (2, 0)] {
-            let [a, b] = [triangle[a], triangle[b]].map(|v| body.positions[v as usize]);
-            if (a.y < y) != (b.y < y) {
-                let at = a.lerp(b, (y - a.y) / (b.y - a.y));
-                cut.push(Vec2::new(at.x, at.z) - centre);
-            }
-        }
-    }
-    // The convex outline's distance in a direction is the least, over all half-planes that hold the cut, to their edge.
-    let supports: Vec<(Vec2, f32)> = (0..4 * AROUND)
-        .map(|k| {
-            let angle = TAU * k as f32 / (4 * AROUND) as f32;
-            let normal = Vec2::new(angle.cos(), angle.sin());
-            (normal, cut.iter().map(|point| point.dot(normal)).fold(0.0, f32::max))
-        })
-        .collect();
-    std::array::from_fn(|k| {
-        let direction = direction(k);
-        supports
-            .iter()
-            .filter(|(normal, _)| normal.dot(direction) > 0.05)
-            .map(|(normal, support)| support / normal.dot(direction))
-            .fold(f32::INFINITY, f32::min)
-    })
-}
-
-/// The template with only these triangles and the vertices that they use.
-fn kept(body: &Template, triangles: &[[u32; 3]]) -> Template {
-    let mut number = vec![u32::MAX; body.positions.len()];
-    let mut used = Vec::new();
-    for vertex in triangles.iter().flatten().map(|v| *v as usize) {
-        if number[vertex] == u32::MAX {
-            number[vertex] = used.len() as u32;
-            used.push(vertex);
-        }
-    }
-    Template {
-        name: body.name.clone(),
-        positions: used.iter().map(|v| body.positions[*v]).collect(),
-        normals: used.iter().map(|v| body.normals[*v]).collect(),
-        uvs: used.iter().map(|v| body.uvs[*v]).collect(),
-        triangles: triangles.iter().map(|triangle| triangle.map(|v| number[v as usize])).collect(),
-        skin: used.iter().map(|v| body.skin[*v]).collect(),
-        parts: used.iter().map(|v| body.parts[*v]).collect(),
-        skeleton: body.skeleton.clone(),
     }
 }
 
@@ -268,7 +190,8 @@ mod tests {
         for point in &body.positions {
             if (point.y - hem[0].y).abs() < 0.01 && point.x.abs() < 0.35 {
                 let from = Vec2::new(point.x, point.z) - legs.centre;
-                let nearest = (0..AROUND).max_by(|a, b| direction(*a).dot(from).total_cmp(&direction(*b).dot(from)));
+                let nearest = (0..AROUND)
+                    .max_by(|a, b| direction::<AROUND>(*a).dot(from).total_cmp(&direction::<AROUND>(*b).dot(from)));
                 let radius = (Vec2::new(hem[nearest.unwrap()].x, hem[nearest.unwrap()].z) - legs.centre).length();
                 assert!(from.length() < radius + 0.003, "{point} is outside of the skirt");
             }

@@ -206,7 +206,7 @@ fn pass(
             let mut simulator = lock(simulator)?;
             let given = GivenPerception::repeating(&inputs, simulator.template().clone(), simulator.track().clone());
             let mut given = given.with_masks(&args.perception(), &simulated_plates(&simulator, &inputs)?)?;
-            given.find_skirts(&first_sets(&mut simulator, &inputs)?)?;
+            given.find_outfits(&first_sets(&mut simulator, &inputs)?)?;
             builder.perception(given).build()?
         }
         Origin::Estimated => builder.perception(find_person(args, simulator, &inputs)?).build()?,
@@ -272,7 +272,7 @@ fn find_person(args: &DemoArgs, simulator: &Mutex<Simulator>, inputs: &Rig) -> R
     let sets = first_sets(&mut simulator, inputs)?;
     if args.perception().shape() == Origin::Given {
         let mut perception = EstimatedPerception::new(inputs, simulator.template(), &args.perception(), &plates)?;
-        perception.find_skirts(&sets)?;
+        perception.find_outfits(&sets)?;
         return Ok(perception);
     }
     let template = default_template(&ShapeParams::default())?;

@@ -80,7 +80,7 @@ fn capture_people(
     Monitor::ready();
     let mut builder = SessionBuilder::new(gpu.clone(), source.rig.clone()).settings(config.session());
     let saved = config.body.person_file().filter(|path| path.exists()).map(PersonMemory::load).transpose()?;
-    let skirt = saved.as_ref().and_then(PersonMemory::skirt);
+    let outfit = saved.as_ref().map(PersonMemory::outfit).unwrap_or_default();
     let learnt = saved.as_ref().map(|memory| memory.template(&source.template)).transpose()?;
     if let Some(memory) = saved {
         builder = builder.person(PersonId::default(), memory);
@@ -97,7 +97,7 @@ fn capture_people(
         FoundBy::Estimated(mut perception) => {
             eprintln!("run: looking for people; each is measured for a moment, then drawn");
             if let Some(learnt) = &learnt {
-                perception.know_shape(learnt, skirt)?;
+                perception.know_shape(learnt, outfit)?;
             }
             builder.perception(*perception)
         }

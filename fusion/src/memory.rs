@@ -3,7 +3,7 @@
 
 use std::{collections::HashMap, io::Write as _, path::Path};
 
-use flyrig_body::{Joint, Skeleton, Skirt, Template};
+use flyrig_body::{Joint, Outfit, Shoes, Skeleton, Skirt, Template};
 use flyrig_stfa::FeatureMemory;
 use glam::{DMat4, DQuat, DVec3, Vec3};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
@@ -20,6 +20,8 @@ const JOINTS_KEY: &str = "joints";
 const NETWORKS_KEY: &str = "networks";
 /// Key of a skirt's length and flare, where the person wears one.
 const SKIRT_KEY: &str = "skirt";
+/// Key of the soles' thickness in metres, where the person wears shoes.
+const SHOES_KEY: &str = "shoes";
 /// A larger file is no saved person, bytes.
 const MOST_BYTES: u64 = 1 << 30;
 
@@ -30,7 +32,7 @@ pub struct PersonMemory {
     positions: Vec<Vec3>,
     normals: Vec<Vec3>,
     joints: Vec<Joint>,
-    skirt: Option<Skirt>,
+    outfit: Outfit,
     /// Canonical translation of each node of the deformation graph, metres; empty where the body is only skinned.
     pub(crate) translations: Vec<DVec3>,
     /// Accumulated linear RGB of each Gaussian, and its weight.
@@ -50,9 +52,9 @@ pub(crate) struct NetworkMemory {
 }
 
 impl PersonMemory {
-    /// Collects what is known; the shape is the template's, without the skirt.
+    /// Collects what is known; the shape is the template's, without clothes.
     pub(crate) fn new(
-        (template, skirt): (&Template, Option<Skirt>),
+        (template, outfit): (&Template, Outfit),
         translations: Vec<DVec3>,
         memory: Vec<[f32; 4]>,
         colors: Vec<[f32; 4]>,
@@ -60,13 +62,13 @@ impl PersonMemory {
     ) -> Self {
         let joints = template.skeleton.joints().to_vec();
         let (positions, normals) = (template.positions.clone(), template.normals.clone());
-        Self { positions, normals, joints, skirt, translations, memory, colors, networks }
+        Self { positions, normals, joints, outfit, translations, memory, colors, networks }
     }
 
-    /// The person's skirt or long coat; `None` without one.
+    /// What the person wears.
     #[must_use]
-    pub fn skirt(&self) -> Option<Skirt> {
-        self.skirt
+    pub fn outfit(&self) -> Outfit {
+        self.outfit
     }
 
     /// Returns the person's template: `base` with the learnt shape.
@@ -139,7 +141,9 @@ impl PersonMemory {
         let mut metadata =
             HashMap::from([(VERSION_KEY.to_owned(), VERSION.to_owned()), (JOINTS_KEY.to_owned(), names.join("\n"))]);
         metadata.extend(self.networks.iter().map(|of| (NETWORKS_KEY.to_owned(), format!("{:016x}", of.digest))));
-        metadata.extend(self.skirt.map(|Skirt { length, flare }| (SKIRT_KEY.to_owned(), format!("{length} {flare}"))));
+        let Outfit { skirt, shoes } = self.outfit;
+        metadata.extend(skirt.map(|Skirt { length, flare }| (SKIRT_KEY.to_owned(), format!("{length} {flare}"))));
+        metadata.extend(shoes.map(|Shoes { sole_m }| (SHOES_KEY.to_owned(), sole_m.to_string())));
         let file = safetensors::serialize(views, Some(metadata)).map_err(|error| fail(error.to_string()))?;
         flyrig_types::write_whole(path, |out| out.write_all(&file))
             .map_err(|error| fail(format!("cannot be written ({error}); check that the folder exists and has room")))
@@ -233,16 +237,16 @@ impl PersonMemory {
                 Some(NetworkMemory { digest, memory })
             }
         };
-        let skirt = metadata.get(SKIRT_KEY).map(|text| {
+        let skirt = |text: &String| {
             let (length, flare) = text.split_once(' ')?;
-            let numbers = (length.parse().ok()?, flare.parse().ok()?);
-            Some(Skirt { length: numbers.0, flare: numbers.1 })
-        });
-        if skirt == Some(None) {
-            return Err(damaged("the skirt's length and flare are no numbers"));
-        }
+            Some(Skirt { length: length.parse().ok()?, flare: flare.parse().ok()? })
+        };
+        let skirt = metadata.get(SKIRT_KEY).map(|text| skirt(text));
+        let skirt = skirt.map(|skirt| skirt.ok_or_else(|| damaged("the skirt's length and flare are no numbers")));
+        let shoes = metadata.get(SHOES_KEY).map(|text| text.parse().map(|sole_m| Shoes { sole_m }));
+        let shoes = shoes.map(|shoes| shoes.map_err(|_| damaged("the shoes' soles are no number")));
         Ok(Self {
-            skirt: skirt.flatten(),
+            outfit: Outfit { skirt: skirt.transpose()?, shoes: shoes.transpose()? },
             positions: vec3("positions")?,
             normals: vec3("normals")?,
             joints: names.iter().enumerate().map(joint).collect(),
@@ -273,8 +277,8 @@ mod tests {
         template.positions[7] += Vec3::new(0.01, 0.0, -0.02);
         let translations = vec![DVec3::new(0.001, -0.002, 0.003); 5];
         let colors = vec![[0.5; 4]; 9];
-        let skirt = Some(Skirt { length: 0.55, flare: 0.15 });
-        let memory = PersonMemory::new((&template, skirt), translations, vec![[0.1, 0.2, 0.3, 8.0]; 9], colors, None);
+        let outfit = Outfit { skirt: Some(Skirt { length: 0.55, flare: 0.15 }), shoes: Some(Shoes { sole_m: 0.02 }) };
+        let memory = PersonMemory::new((&template, outfit), translations, vec![[0.1, 0.2, 0.3, 8.0]; 9], colors, None);
         (template, memory)
     }
 

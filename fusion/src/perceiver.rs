@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use flyrig_body::{Skirt, Template};
+use flyrig_body::{Outfit, Template};
 use flyrig_types::{FrameSet, PersonId};
 
 use crate::{Effort, FusionError, KnownPerson, Observation, Perception, StageTimes};
@@ -31,7 +31,7 @@ pub(crate) struct Newcomer {
     pub person: PersonId,
     pub shape: u32,
     pub template: Template,
-    pub skirt: Option<Skirt>,
+    pub outfit: Outfit,
 }
 
 /// A [`Perception`] with what the next set needs of the session.
@@ -73,9 +73,9 @@ impl Perceiver {
     pub fn newcomers(&self, known: &[(PersonId, u32)]) -> Vec<Newcomer> {
         let people = self.perception.people().into_iter();
         let is_new = |found: &KnownPerson<'_>| !known.contains(&(found.person, found.shape));
-        let newcomer = |KnownPerson { person, shape, template, skirt }| {
+        let newcomer = |KnownPerson { person, shape, template, outfit }| {
             let template = template.clone();
-            Newcomer { person, shape, template, skirt }
+            Newcomer { person, shape, template, outfit }
         };
         people.filter(is_new).map(newcomer).collect()
     }

@@ -4,10 +4,10 @@ mod background;
 mod colors;
 mod estimated;
 mod given;
-mod skirts;
+mod outfits;
 mod split_mask;
 
-use flyrig_body::{Skirt, Template};
+use flyrig_body::{Outfit, Template};
 use flyrig_tracker::{EdgeColor, ViewKeypoints};
 use flyrig_types::{FrameSet, Mask, PersonId, Pose};
 
@@ -47,8 +47,8 @@ pub struct KnownPerson<'a> {
     pub shape: u32,
     /// The person's shape in its bind pose.
     pub template: &'a Template,
-    /// The person's skirt or long coat; `None` without one.
-    pub skirt: Option<Skirt>,
+    /// What the person wears, as far as it is known.
+    pub outfit: Outfit,
 }
 
 /// Observation of one person in a set.

@@ -282,19 +282,19 @@ impl Session {
 
     /// Makes subjects of people who are none yet, and of those whose shape is another now.
     fn add_people(&mut self, people: Vec<Newcomer>) -> Result<(), FusionError> {
-        for Newcomer { person: id, shape, template, skirt } in people {
+        for Newcomer { person: id, shape, template, outfit } in people {
             let place = self.subjects.iter().position(|subject| subject.id() == id);
             if place.is_some_and(|place| self.subjects[place].shape == shape) {
                 continue;
             }
-            let mut subject = Subject::new(&self.gpu, id, (template, skirt), &self.rig, &self.settings)?;
+            let mut subject = Subject::new(&self.gpu, id, (template, outfit), &self.rig, &self.settings)?;
             subject.shape = shape;
             if self.keep_observations {
                 subject.keep_observations(&self.gpu)?;
             }
             subject.shape_held = self.shape_held;
-            // Colours and deformation belong to one surface: a skirt may be found later.
-            if self.saved.get(&id).is_some_and(|memory| memory.skirt() == skirt)
+            // Colours and deformation belong to one surface: clothes may be found later.
+            if self.saved.get(&id).is_some_and(|memory| memory.outfit() == outfit)
                 && let Some(memory) = self.saved.remove(&id)
             {
                 subject.restore(&self.gpu, &memory)?;
@@ -451,12 +451,12 @@ impl Session {
         let drawing = Drawing::new(&gpu, self.settings.body.gaussians)?;
         let mut subjects = Vec::new();
         for old in &self.subjects {
-            let (shape, skirt) = old.shape_and_skirt();
-            let mut subject = Subject::new(&gpu, old.id(), (shape, skirt), &self.rig, &self.settings)?;
+            let (shape, outfit) = old.shape_and_outfit();
+            let mut subject = Subject::new(&gpu, old.id(), (shape, outfit), &self.rig, &self.settings)?;
             if self.keep_observations {
                 subject.keep_observations(&gpu)?;
             }
-            if let Some(memory) = memories.get(&old.id()).filter(|memory| memory.skirt() == skirt) {
+            if let Some(memory) = memories.get(&old.id()).filter(|memory| memory.outfit() == outfit) {
                 subject.restore(&gpu, memory)?;
             }
             subject.take_over(old);

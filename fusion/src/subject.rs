@@ -3,7 +3,7 @@
 use std::{sync::Arc, time::Instant};
 
 use flyrig_body::{
-    DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, Skirt, SurfaceGaussians, Template, build_graph, sample_surface,
+    DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, Outfit, SurfaceGaussians, Template, build_graph, sample_surface,
     skin_mesh,
 };
 use flyrig_capture::to_rgb8;
@@ -88,10 +88,10 @@ pub struct Subject {
     id: PersonId,
     /// Number of the shape, see [`crate::KnownPerson`].
     pub(crate) shape: u32,
-    /// As it is drawn: with the skirt.
+    /// As it is drawn: with its clothes.
     template: Template,
-    /// The body below a skirt, and the skirt; `None` without one.
-    undressed: Option<(Template, Skirt)>,
+    /// The body below the clothes, and these; `None` without any.
+    undressed: Option<(Template, Outfit)>,
     /// The same for those who draw the person themselves.
     stream_template: Arc<EncodedTemplate>,
     skinner: GpuSkinner,
@@ -133,16 +133,16 @@ impl Subject {
     pub(crate) fn new(
         gpu: &GpuContext,
         id: PersonId,
-        (shape, skirt): (Template, Option<Skirt>),
+        (shape, outfit): (Template, Outfit),
         rig: &Rig,
         settings: &SessionSettings,
     ) -> Result<Self, FusionError> {
         let body = &settings.body;
-        let template = skirt.map_or_else(|| Ok(shape.clone()), |skirt| skirt.on(&shape))?;
+        let template = outfit.on(&shape)?;
         let surface = sample_surface(&template, body.gaussians, SURFACE_SEED)?;
         let graph = build_graph(&template, &surface, body.nodes, DEFAULT_SIGMA2_M2)?;
         let mut subject = Self::from_parts(gpu, id, template, &surface, &graph, rig, settings)?;
-        subject.undressed = skirt.map(|skirt| (shape, skirt));
+        subject.undressed = (!outfit.is_bare()).then_some((shape, outfit));
         if let Some(networks) = settings.appearance.load_networks()? {
             subject.use_networks(gpu, &networks, settings)?;
         }
@@ -214,11 +214,11 @@ impl Subject {
         &self.template
     }
 
-    /// The body's shape without the skirt, and the skirt.
-    pub(crate) fn shape_and_skirt(&self) -> (Template, Option<Skirt>) {
+    /// The body's shape without clothes, and these.
+    pub(crate) fn shape_and_outfit(&self) -> (Template, Outfit) {
         match &self.undressed {
-            Some((shape, skirt)) => (shape.clone(), Some(*skirt)),
-            None => (self.template.clone(), None),
+            Some((shape, outfit)) => (shape.clone(), *outfit),
+            None => (self.template.clone(), Outfit::default()),
         }
     }
 
@@ -558,9 +558,9 @@ impl Subject {
             _ => None,
         };
         let (memory, colors) = (self.appearance.memory(gpu)?, colors.read(gpu)?);
-        let (shape, skirt) =
-            self.undressed.as_ref().map_or((&self.template, None), |(shape, skirt)| (shape, Some(*skirt)));
-        Ok(PersonMemory::new((shape, skirt), translations, memory, colors, networks))
+        let bare = (&self.template, Outfit::default());
+        let (shape, outfit) = self.undressed.as_ref().map_or(bare, |(shape, outfit)| (shape, *outfit));
+        Ok(PersonMemory::new((shape, outfit), translations, memory, colors, networks))
     }
 
     /// Resumes from what an earlier session has learnt about the same person.

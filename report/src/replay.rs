@@ -77,14 +77,14 @@ impl Replay {
             Origin::Given => {
                 let person = given_person(&settings.dataset)?;
                 let mut perception = GivenPerception::new(&rig, vec![person]).with_masks(perceived, &plates)?;
-                perception.find_skirts(&first_sets(settings, &rig)?)?;
+                perception.find_outfits(&first_sets(settings, &rig)?)?;
                 builder.perception(perception)
             }
             Origin::Estimated => {
                 if perceived.shape() == Origin::Given {
                     let GivenPerson { template, track, .. } = given_person(&settings.dataset)?;
                     let mut inner = EstimatedPerception::new(&rig, &template, perceived, &plates)?;
-                    inner.find_skirts(&first_sets(settings, &rig)?)?;
+                    inner.find_outfits(&first_sets(settings, &rig)?)?;
                     match settings.true_joints.as_slice() {
                         [] => builder.perception(inner),
                         names => builder.perception(TrueJoints { inner, template, track, names: names.to_vec() }),

@@ -23,7 +23,7 @@ pub(crate) const LENGTHS: [&str; 8] =
 /// Parts whose girth varies: the trunk from front to back, limbs around their bones, the head as a whole.
 pub(crate) const GIRTHS: [&str; 5] = ["trunk-depth", "arm-girth", "thigh-girth", "shank-girth", "head-size"];
 /// Targets of the built-in body.
-const TARGETS: [&str; 3] = ["gender", "weight", "muscle"];
+const TARGETS: [&str; 6] = ["gender", "weight", "muscle", "age", "height", "proportions"];
 
 /// A template whose shape has parameters: the whole-body scale, lengths, girths, and the targets of the built-in body.
 #[derive(Debug, Clone)]

@@ -10,7 +10,7 @@ pub use shape::ShapeSighting;
 use std::sync::Arc;
 use std::time::Instant;
 
-use flyrig_body::{Skirt, Template, skin_mesh};
+use flyrig_body::{Outfit, Template, skin_mesh};
 use flyrig_solve::median;
 use flyrig_types::{Frame, FrameSet, Image, Mask, Rig};
 use glam::{DVec3, Vec3};
@@ -92,6 +92,8 @@ pub struct PoseEstimator {
     base: Template,
     /// In the person's shape.
     template: Template,
+    /// The same in shoes, where they are known: what outlines and texture are compared with.
+    surface: Arc<Template>,
     model: BodyModel,
     rig: Rig,
     config: PoseConfig,
@@ -116,10 +118,8 @@ pub struct PoseEstimator {
 enum Clothes {
     /// Nobody has looked yet.
     Unknown,
-    /// They follow trunk and legs.
-    Close,
-    /// The body in a skirt.
-    Skirt(Arc<Template>),
+    /// The body as it is dressed.
+    Known(Arc<Template>),
 }
 
 /// A fitted pose before it is believed.
@@ -187,6 +187,7 @@ impl PoseEstimator {
             net,
             base: template.clone(),
             template: template.clone(),
+            surface: Arc::new(template.clone()),
             model,
             rig: rig.clone(),
             config,
@@ -276,7 +277,7 @@ impl PoseEstimator {
             marks,
             velocity: None,
             looks: vec![None; self.rig.cameras.len()],
-            texture: Texture::new(&self.template, self.rig.cameras.len()),
+            texture: Texture::new(&self.surface, self.rig.cameras.len()),
         });
         self.lost = 0;
     }
@@ -329,7 +330,7 @@ impl PoseEstimator {
             }
         };
         let known = self.track.as_mut().map(|track| std::mem::take(&mut track.texture));
-        let mut texture = known.unwrap_or_else(|| Texture::new(&self.template, self.rig.cameras.len()));
+        let mut texture = known.unwrap_or_else(|| Texture::new(&self.surface, self.rig.cameras.len()));
         let before = (fitted.looked() == 0).then(|| texture.clone());
         let (mut fitted, mut masks) = self.finish(set, &pictures, fitted, &mut texture, &mut seconds);
         if let Some(before) = before
@@ -396,21 +397,29 @@ impl PoseEstimator {
         if self.track.is_some() { self.lost } else { self.lost.max(1) }
     }
 
-    /// Chooses the clothes that masks allow for: a skirt, or none of that kind. Once they are known, masks reach less far from the body,
-    /// and things and people nearby are no part of them.
+    /// Chooses the clothes that masks allow for, and the shoes whose outlines the pose is fitted to. Once they are known, masks reach less
+    /// far from the body, and things and people nearby are no part of them.
     ///
     /// # Errors
-    /// Kind `Template` for a body that carries no skirt.
-    pub fn wear(&mut self, skirt: Option<Skirt>) -> Result<(), TrackError> {
-        self.clothes = match skirt {
-            None => Clothes::Close,
-            Some(skirt) => {
-                let dressed = skirt.on(&self.template);
-                let dressed = dressed.map_err(|error| TrackError::new(TrackErrorKind::Template, error.to_string()))?;
-                Clothes::Skirt(Arc::new(dressed))
-            }
+    /// Kind `Template` for a body that cannot wear them.
+    pub fn wear(&mut self, outfit: Outfit) -> Result<(), TrackError> {
+        let dressed = |outfit: Outfit| -> Result<Arc<Template>, TrackError> {
+            let dressed = outfit.on(&self.template);
+            dressed.map(Arc::new).map_err(|error| TrackError::new(TrackErrorKind::Template, error.to_string()))
         };
+        // A skirt swings: its outline says nothing of the legs.
+        let surface = dressed(Outfit { skirt: None, ..outfit })?;
+        self.clothes = Clothes::Known(if outfit.skirt.is_some() { dressed(outfit)? } else { surface.clone() });
+        self.change_surface(surface);
         Ok(())
+    }
+
+    /// Takes another surface of the person; a texture belongs to one surface.
+    fn change_surface(&mut self, surface: Arc<Template>) {
+        if let Some(track) = self.track.as_mut().filter(|_| *surface != *self.surface) {
+            track.texture = Texture::new(&surface, self.rig.cameras.len());
+        }
+        self.surface = surface;
     }
 
     /// Lets masks reach as far as wide clothes: somebody else may have come.
@@ -433,7 +442,7 @@ impl PoseEstimator {
 
     /// Vertices and normals of a pose at a time after it, as the body has moved since the last set.
     fn skinned(&self, turns: &Turns, set: &FrameSet, delay_secs: f64) -> (Vec<Vec3>, Vec<Vec3>) {
-        self.skinned_in(&self.template, turns, set, delay_secs)
+        self.skinned_in(&self.surface, turns, set, delay_secs)
     }
 
     /// The same of the body as it is dressed.

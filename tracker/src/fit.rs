@@ -299,6 +299,7 @@ impl FitProblem<'_> {
                 scalars.extend((0..shape.count).map(|k| {
                     let mut moved = DVec3::ZERO;
                     for (bone, share, _) in &point.bones {
+                        // What is worn over the body keeps its thickness.
                         let local = shape.positions[k][point.vertex] - shape.origins[k][*bone];
                         moved += (moves[k][*bone] + posed.rotation[*bone] * local) * *share;
                     }

@@ -22,6 +22,8 @@ pub(crate) struct LinePoint {
     pub kind: LineKind,
     /// Vertex of the template.
     pub vertex: usize,
+    /// From that vertex to the point, canonical metres: what is worn over the body.
+    pub worn: DVec3,
     /// Index of the view in the fit.
     pub view: usize,
     /// Normal of the line, undistorted pixels.
@@ -40,6 +42,16 @@ impl LinePoint {
     /// Hangs the point on the bones of a model of the template's shape.
     pub fn hang(&mut self, model: &BodyModel, template: &Template) {
         self.bones = bones(model, template, self.vertex);
+        self.bones.iter_mut().for_each(|(_, _, local)| *local += self.worn);
+    }
+
+    /// Hangs a point of a dressed body on the nearest vertex of the bare one, as far outside as it is: it then moves with the body's shape.
+    pub fn undress(&mut self, dressed: &Template, bare: &Template) {
+        let Some(at) = dressed.positions.get(self.vertex) else { return };
+        let distance = |v: &usize| bare.positions[*v].distance_squared(*at);
+        if let Some(nearest) = (0..bare.positions.len()).min_by(|a, b| distance(a).total_cmp(&distance(b))) {
+            (self.vertex, self.worn) = (nearest, (*at - bare.positions[nearest]).as_dvec3());
+        }
     }
 }
 
@@ -61,4 +73,45 @@ pub(crate) fn undistorted_line(camera: &Camera, view: &View, through: DVec2, nor
     let (on, beyond) = (view.undistorted(camera, through)?, view.undistorted(camera, through + normal)?);
     let normal = (beyond - on).normalize_or_zero();
     (normal != DVec2::ZERO).then(|| (normal, normal.dot(on)))
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_body::Shoes;
+
+    use super::*;
+    use crate::testing::body;
+
+    #[test]
+    fn a_point_of_a_shoe_hangs_on_the_foot_as_far_outside_as_it_is() {
+        let body = body();
+        let dressed = Shoes { sole_m: 0.03 }.on(&body).unwrap();
+        let model = BodyModel::new(&body).unwrap();
+        let lowest = |template: &Template| {
+            let height = |v: &usize| template.positions[*v].y;
+            (0..template.positions.len()).min_by(|a, b| height(a).total_cmp(&height(b))).unwrap()
+        };
+        for vertex in [lowest(&dressed), 5, dressed.positions.len() - 1] {
+            let mut point = LinePoint {
+                kind: LineKind::Outline,
+                vertex,
+                worn: DVec3::ZERO,
+                view: 0,
+                normal: DVec2::X,
+                offset: 0.0,
+                sigma_px: 1.0,
+                bones: bones(&model, &dressed, vertex),
+                shift: DVec3::ZERO,
+            };
+            let place = |point: &LinePoint| -> DVec3 {
+                point.bones.iter().map(|(bone, weight, local)| (model.origins[*bone] + *local) * *weight).sum()
+            };
+            let before = place(&point);
+            point.undress(&dressed, &body);
+            assert!(point.vertex < body.positions.len());
+            assert!(vertex != 5 || point.worn == DVec3::ZERO, "bare skin is where it was");
+            point.hang(&model, &body);
+            assert!((place(&point) - before).length() < 1e-6, "{} and {before}", place(&point));
+        }
+    }
 }

@@ -73,6 +73,7 @@ impl SeenBody<'_> {
             (!bones.is_empty()).then_some(LinePoint {
                 kind: LineKind::Outline,
                 vertex,
+                worn: DVec3::ZERO,
                 view,
                 normal,
                 offset,

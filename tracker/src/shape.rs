@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use flyrig_body::{Skirt, Template};
+use flyrig_body::{Outfit, Template};
 use flyrig_solve::median;
 use flyrig_types::Rig;
 
@@ -45,8 +45,8 @@ pub struct ShapeFit {
     pub sets: usize,
     /// Where the height comes from.
     pub height_from: HeightFrom,
-    /// Skirt or long coat; `None` without one.
-    pub skirt: Option<Skirt>,
+    /// What the person wears.
+    pub outfit: Outfit,
 }
 
 /// Source of a person's height.
@@ -70,7 +70,7 @@ impl std::fmt::Display for ShapeFit {
                 " (an average height, for one camera cannot measure it: give perception.height_m or --height)"
             }
         })?;
-        if self.skirt.is_some() { f.write_str(", in a skirt or long coat") } else { Ok(()) }
+        if self.outfit.is_bare() { Ok(()) } else { write!(f, ", in {}", self.outfit) }
     }
 }
 
@@ -172,8 +172,15 @@ pub fn fit_template_shape(
         height_from = HeightFrom::Configuration;
     }
     let scale = factors.get("scale").copied().unwrap_or(scale);
-    let fit =
-        ShapeFit { scale, groups, sigma: BTreeMap::new(), height_m: height_m(&shaped), sets, height_from, skirt: None };
+    let fit = ShapeFit {
+        scale,
+        groups,
+        sigma: BTreeMap::new(),
+        height_m: height_m(&shaped),
+        sets,
+        height_from,
+        outfit: Outfit::default(),
+    };
     tracing::debug!(scale, height_m = fit.height_m, sets, "fitted the template's bone lengths");
     Ok((shaped, fit))
 }
@@ -185,7 +192,7 @@ pub(crate) fn template_of_height(template: &Template, height: Option<f64>) -> Re
     let shaped = scale_template(template, &BodyModel::new(template)?, &factors)?;
     let height_from = if height.is_some() { HeightFrom::Configuration } else { HeightFrom::Average };
     let (groups, sigma, height_m) = (BTreeMap::new(), BTreeMap::new(), height_m(&shaped));
-    Ok((shaped, ShapeFit { scale, groups, sigma, height_m, sets: 0, height_from, skirt: None }))
+    Ok((shaped, ShapeFit { scale, groups, sigma, height_m, sets: 0, height_from, outfit: Outfit::default() }))
 }
 
 /// Height of a template in its bind pose, metres.

@@ -193,7 +193,17 @@ impl Texture {
             let bones = bones(model, template, vertex);
             if !bones.is_empty() {
                 let kind = LineKind::Texture;
-                lines.push(LinePoint { kind, vertex, view, normal, offset, sigma_px, bones, shift: DVec3::ZERO });
+                lines.push(LinePoint {
+                    kind,
+                    vertex,
+                    worn: DVec3::ZERO,
+                    view,
+                    normal,
+                    offset,
+                    sigma_px,
+                    bones,
+                    shift: DVec3::ZERO,
+                });
             }
         }
         lines

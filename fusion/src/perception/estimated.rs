@@ -2,7 +2,7 @@
 
 use std::{collections::BTreeMap, sync::Arc, time::Duration};
 
-use flyrig_body::{Skirt, Template, skin_mesh};
+use flyrig_body::{Outfit, Template, skin_mesh};
 use flyrig_tracker::{
     Background, BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PersonArea, PoseConfig, PoseEstimate,
     PoseEstimator, PoseNet, ShapeFit, ShapeSighting, TrackError, is_blank, matte,
@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 use super::background::{BackgroundWatch, backgrounds, report};
 use super::colors::ClothesColors;
-use super::skirts::SkirtSearch;
+use super::outfits::OutfitSearch;
 use super::split_mask::{PosedMesh, split_mask};
 use super::{KnownPerson, Observation, Perception, SeenPerson, ViewObservation};
 use crate::{Effort, FusionError, Origin, PerceptionSettings, StageTimes};
@@ -47,9 +47,9 @@ struct Place {
     renews: bool,
     /// Number of the shape.
     shape: u32,
-    skirt: Option<Skirt>,
+    outfit: Outfit,
     /// Where the shape is given.
-    skirt_search: Option<SkirtSearch>,
+    outfit_search: Option<OutfitSearch>,
     clothes: Option<ClothesColors>,
     seen: u64,
     /// Time since which nobody is seen; `None` while somebody is.
@@ -65,7 +65,7 @@ impl Place {
     fn know(&mut self) -> Result<(), TrackError> {
         (self.learning, self.known, self.renews) = (None, true, false);
         self.estimator.keep_sightings(false);
-        self.estimator.wear(self.skirt)?;
+        self.estimator.wear(self.outfit)?;
         self.hands.as_mut().map_or(Ok(()), |hands| hands.set_template(self.estimator.template()))
     }
 
@@ -154,8 +154,8 @@ impl EstimatedPerception {
             known: learning.is_none(),
             renews: false,
             shape: 0,
-            skirt: None,
-            skirt_search: learning.is_none().then(SkirtSearch::default),
+            outfit: Outfit::default(),
+            outfit_search: learning.is_none().then(OutfitSearch::default),
             clothes: None,
             seen: 0,
             missing_since: None,
@@ -174,14 +174,14 @@ impl EstimatedPerception {
         })
     }
 
-    /// Starts with the shape and skirt of the first person, as an earlier session has learnt them. Where shapes are estimated, whoever comes
+    /// Starts with the shape and outfit of the first person, as an earlier session has learnt them. Where shapes are estimated, whoever comes
     /// is compared with it.
     ///
     /// # Errors
     /// [`FusionError::Track`] when the template cannot be used.
-    pub fn know_shape(&mut self, template: &Template, skirt: Option<Skirt>) -> Result<(), FusionError> {
+    pub fn know_shape(&mut self, template: &Template, outfit: Outfit) -> Result<(), FusionError> {
         if let Some(place) = self.places.first_mut() {
-            place.skirt = skirt;
+            place.outfit = outfit;
             place.estimator.set_template(template)?;
             place.know()?;
             // Whoever comes first may be somebody else.
@@ -201,7 +201,7 @@ impl EstimatedPerception {
         for place in &mut self.places {
             match place.estimator.fit_shape(sets, &taken) {
                 Ok((fit, landmarks)) => {
-                    place.skirt = fit.skirt;
+                    place.outfit = fit.outfit;
                     fits.push(fit);
                     taken.push(landmarks);
                     place.know()?;
@@ -319,7 +319,7 @@ impl EstimatedPerception {
                     _ => return Ok(()),
                 }
                 place.shape += u32::from(place.known);
-                place.skirt = fit.skirt;
+                place.outfit = fit.outfit;
                 place.estimator.take_shape(template)
             });
             if let Err(error) = taken {
@@ -433,10 +433,10 @@ impl Perception for EstimatedPerception {
         known
             .map(|place| KnownPerson {
                 person: place.id,
-                // Another one once a skirt is found on a given shape.
-                shape: place.shape + u32::from(place.skirt_search.is_some() && place.skirt.is_some()),
+                // Another one once clothes are found on a given shape.
+                shape: place.shape + u32::from(place.outfit_search.is_some() && !place.outfit.is_bare()),
                 template: place.template(),
-                skirt: place.skirt,
+                outfit: place.outfit,
             })
             .collect()
     }
@@ -477,13 +477,13 @@ impl Perception for EstimatedPerception {
         for observation in &observations {
             let Observation::Seen(seen) = observation else { continue };
             let Some(place) = self.places.iter_mut().find(|place| place.id == seen.person) else { continue };
-            if let Some(search) = &mut place.skirt_search {
+            if let Some(search) = &mut place.outfit_search {
                 let body = place.hands.as_ref().map_or(place.estimator.template(), HandTracker::template);
                 let was_over = search.is_over();
                 search.take(set, seen, body, &self.rig.cameras);
-                place.skirt = search.skirt();
+                place.outfit = search.outfit();
                 if search.is_over() && !was_over {
-                    place.estimator.wear(place.skirt)?;
+                    place.estimator.wear(place.outfit)?;
                 }
             }
         }
@@ -492,13 +492,13 @@ impl Perception for EstimatedPerception {
 }
 
 impl EstimatedPerception {
-    /// Looks for skirts on people whose shapes are given, in a few sets ([`SHAPE_SETS`], over [`SHAPE_SECS`]) before the session is
+    /// Looks for clothes on people whose shapes are given, in a few sets ([`SHAPE_SETS`], over [`SHAPE_SECS`]) before the session is
     /// built, so that they are known from the first set on. Otherwise they are found in the first seconds.
     ///
     /// # Errors
     /// Those of [`Perception::observe`].
-    pub fn find_skirts(&mut self, sets: &[FrameSet]) -> Result<(), FusionError> {
-        let mut searches = vec![SkirtSearch::default(); self.places.len()];
+    pub fn find_outfits(&mut self, sets: &[FrameSet]) -> Result<(), FusionError> {
+        let mut searches = vec![OutfitSearch::default(); self.places.len()];
         for set in sets {
             for observation in self.observe(set, &mut StageTimes::default())? {
                 let Observation::Seen(seen) = observation else { continue };
@@ -509,9 +509,9 @@ impl EstimatedPerception {
         }
         for (place, mut search) in self.places.iter_mut().zip(searches) {
             search.finish(place.id, place.template(), &self.rig.cameras);
-            (place.skirt, place.skirt_search) = (search.skirt(), Some(search));
+            (place.outfit, place.outfit_search) = (search.outfit(), Some(search));
             place.estimator.reset();
-            place.estimator.wear(place.skirt)?;
+            place.estimator.wear(place.outfit)?;
         }
         Ok(())
     }

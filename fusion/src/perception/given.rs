@@ -6,7 +6,7 @@ use flyrig_types::{Camera, Frame, FrameSet, Image, Mask, PersonId, Pose, PoseTra
 use glam::Vec3;
 
 use super::background::{BackgroundWatch, backgrounds, report};
-use super::skirts::SkirtSearch;
+use super::outfits::OutfitSearch;
 use super::split_mask::{PosedMesh, split_mask};
 use super::{KnownPerson, Observation, Perception, SeenPerson, ViewObservation};
 use crate::{FusionError, Origin, PerceptionSettings, StageTimes};
@@ -39,7 +39,7 @@ pub struct GivenPerception {
     /// By slot.
     backgrounds: Vec<Option<Background>>,
     /// By person.
-    skirts: Vec<SkirtSearch>,
+    outfits: Vec<OutfitSearch>,
     watch: BackgroundWatch,
 }
 
@@ -50,7 +50,7 @@ impl GivenPerception {
     pub fn new(rig: &Rig, people: Vec<GivenPerson>) -> Self {
         let backgrounds = vec![None; rig.cameras.len()];
         Self {
-            skirts: vec![SkirtSearch::default(); people.len()],
+            outfits: vec![OutfitSearch::default(); people.len()],
             people,
             cameras: rig.cameras.clone(),
             masks: Origin::Given,
@@ -78,13 +78,13 @@ impl GivenPerception {
 
 impl Perception for GivenPerception {
     fn people(&self) -> Vec<KnownPerson<'_>> {
-        let people = self.people.iter().zip(&self.skirts);
+        let people = self.people.iter().zip(&self.outfits);
         people
             .map(|(given, search)| KnownPerson {
                 person: given.person,
-                shape: u32::from(search.skirt().is_some()),
+                shape: u32::from(!search.outfit().is_bare()),
                 template: &given.template,
-                skirt: search.skirt(),
+                outfit: search.outfit(),
             })
             .collect()
     }
@@ -128,9 +128,9 @@ impl Perception for GivenPerception {
                 Observation::Lost { person, reason: "the pose holds numbers that are not finite".to_owned() }
             }
         };
-        // A skirt that is found here is drawn from the next set on.
+        // Clothes that are found here are drawn from the next set on.
         let observations: Vec<Observation> = self.people.iter().zip(poses).zip(views).map(seen).collect();
-        for ((given, search), observation) in self.people.iter().zip(&mut self.skirts).zip(&observations) {
+        for ((given, search), observation) in self.people.iter().zip(&mut self.outfits).zip(&observations) {
             if let Observation::Seen(seen) = observation {
                 search.take(set, seen, &given.template, &self.cameras);
             }
@@ -140,13 +140,13 @@ impl Perception for GivenPerception {
 }
 
 impl GivenPerception {
-    /// Looks for skirts in a few sets ([`crate::SHAPE_SETS`], over [`crate::SHAPE_SECS`]) before the session is built, so that they are known from the
+    /// Looks for clothes in a few sets ([`crate::SHAPE_SETS`], over [`crate::SHAPE_SECS`]) before the session is built, so that they are known from the
     /// first set on. Otherwise they are found in the first seconds.
     ///
     /// # Errors
     /// Those of [`Perception::observe`].
-    pub fn find_skirts(&mut self, sets: &[FrameSet]) -> Result<(), FusionError> {
-        let mut searches = vec![SkirtSearch::default(); self.people.len()];
+    pub fn find_outfits(&mut self, sets: &[FrameSet]) -> Result<(), FusionError> {
+        let mut searches = vec![OutfitSearch::default(); self.people.len()];
         for set in sets {
             for (search, observation) in searches.iter_mut().zip(self.observe(set, &mut StageTimes::default())?) {
                 if let Observation::Seen(seen) = observation {
@@ -157,14 +157,14 @@ impl GivenPerception {
         for (search, given) in searches.iter_mut().zip(&self.people) {
             search.finish(given.person, &given.template, &self.cameras);
         }
-        self.skirts = searches;
+        self.outfits = searches;
         Ok(())
     }
 
     /// Vertices and triangles of everybody at the time of a frame; of those whose poses are valid.
     fn bodies(&self, frame: &Frame, poses: &[Pose]) -> (Vec<Vec3>, Vec<[u32; 3]>) {
         let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
-        for ((given, search), pose) in self.people.iter().zip(&self.skirts).zip(poses) {
+        for ((given, search), pose) in self.people.iter().zip(&self.outfits).zip(poses) {
             let own = given.at(frame.capture_nanos);
             let pose = if own.is_valid() { &own } else { pose };
             if pose.is_valid() {
@@ -202,7 +202,7 @@ impl GivenPerception {
         };
         let (vertices, triangles) = self.bodies(frame, poses);
         let Some(gate) = BodyGate::new(camera, &vertices, &triangles) else { return Ok(None) };
-        let are_dressed = self.skirts.iter().all(SkirtSearch::is_over);
+        let are_dressed = self.outfits.iter().all(OutfitSearch::is_over);
         let gate = if are_dressed { gate.of_known_clothes() } else { gate };
         let Some(mask) = background.mask(&frame.image, &gate)? else { return Ok(None) };
         Ok(Some(matte(&frame.image, &mask, Some(background))?))

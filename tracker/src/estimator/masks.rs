@@ -18,14 +18,13 @@ impl PoseEstimator {
                 let camera = &self.rig.cameras[slot];
                 let (vertices, _) = self.skinned(&fitted.turns, set, fitted.delay_secs(slot));
                 let gate = match &self.clothes {
-                    Clothes::Unknown | Clothes::Close => BodyGate::new(camera, &vertices, &self.template.triangles),
-                    Clothes::Skirt(dressed) => {
+                    Clothes::Unknown => BodyGate::new(camera, &vertices, &self.surface.triangles),
+                    Clothes::Known(dressed) => {
                         let (vertices, _) = self.skinned_in(dressed, &fitted.turns, set, fitted.delay_secs(slot));
-                        BodyGate::new(camera, &vertices, &dressed.triangles)
+                        BodyGate::new(camera, &vertices, &dressed.triangles).map(BodyGate::of_known_clothes)
                     }
                 };
                 let gate = gate.ok_or(NoMask::OutOfView)?;
-                let gate = if matches!(self.clothes, Clothes::Unknown) { gate } else { gate.of_known_clothes() };
                 let look = fitted.looks[slot].as_ref();
                 let look = look.filter(|l| l.sighting.output.presence >= self.config.presence_threshold);
                 let light = self.background(slot).and_then(|known| known.light(picture, &|at| !gate.reaches_pixel(at)));

@@ -104,7 +104,7 @@ impl PoseEstimator {
                 return Vec::new();
             };
             let seen = self.textured(view, body.at(index));
-            let mut points = texture.lines((&self.template, &self.model), &seen, image, level, (view.slot, index));
+            let mut points = texture.lines((&self.surface, &self.model), &seen, image, level, (view.slot, index));
             shift(&mut points, body, index);
             points
         };
@@ -119,7 +119,7 @@ impl PoseEstimator {
             let seen = SeenBody {
                 camera: &self.rig.cameras[view.slot],
                 view: &view.view,
-                template: &self.template,
+                template: &self.surface,
                 model: &self.model,
                 vertices,
                 normals,

@@ -1,7 +1,13 @@
 //! The person's shape: bone lengths from landmarks, and lengths, girths and build from outlines.
 
 use super::*;
-use crate::skirt_fit::{MaskedPoses, MaskedView, find_skirt};
+use crate::outfit_fit::{MaskedPoses, MaskedView, find_outfit};
+use flyrig_body::Shoes;
+
+/// The body in shoes; bare feet where it has none to put them on.
+fn shod(body: &Template, shoes: Option<Shoes>) -> Arc<Template> {
+    Arc::new(Outfit { skirt: None, shoes }.on(body).unwrap_or_else(|_| body.clone()))
+}
 
 /// Steps of the solver to a pose in a new shape.
 const POSE_STEPS: usize = 40;
@@ -84,6 +90,7 @@ impl PoseEstimator {
     /// Kind `Template` when it is not usable.
     pub fn take_shape(&mut self, template: Template) -> Result<(), TrackError> {
         self.model = BodyModel::new(&template)?;
+        self.surface = Arc::new(template.clone());
         self.template = template;
         if let Some(track) = self.track.take() {
             self.start_at(track.turns, track.nanos);
@@ -101,7 +108,7 @@ impl PoseEstimator {
         found
     }
 
-    /// Solves for shape and poses of all sets together, from landmarks and the outlines of masks.
+    /// Solves for shape and poses of all sets together, from landmarks and the outlines of masks, and finds the clothes.
     fn fit_shape_to_outlines(&mut self, sightings: &[ShapeSighting], fit: &mut ShapeFit) -> Result<(), TrackError> {
         let mut found = Vec::new();
         for ShapeSighting { set, fitted } in sightings {
@@ -115,9 +122,28 @@ impl PoseEstimator {
             let masks = self.masks(set, &self.check(set)?, &mut fitted);
             found.push((set, fitted, masks));
         }
+        // Almost everybody wears shoes, and legs that end at their soles are too long.
+        let shoes = Some(Shoes::default());
+        self.solve_shape(&mut found, shoes, fit)?;
+        fit.outfit = self.outfit(&found);
+        if fit.outfit.shoes.is_none() {
+            self.solve_shape(&mut found, None, fit)?;
+        }
+        tracing::debug!(?fit, "fitted the body to landmarks and outlines");
+        Ok(())
+    }
+
+    /// The same of a person in given shoes.
+    fn solve_shape(
+        &mut self,
+        found: &mut [(&FrameSet, Fitted, Vec<Option<Mask>>)],
+        shoes: Option<Shoes>,
+        fit: &mut ShapeFit,
+    ) -> Result<(), TrackError> {
         let space = ShapeSpace::new(&self.base);
         let mut shape: Vec<f64> =
             space.prior().iter().map(|(name, mean, _)| fit.factor(name).unwrap_or(*mean)).collect();
+        self.surface = shod(&self.template, shoes);
         for _ in 0..self.config.shape_rounds {
             let given = |set: &FrameSet, masks: &[Option<Mask>], slot: usize| -> Option<Mask> {
                 let own = masks.get(slot).cloned().flatten();
@@ -128,7 +154,8 @@ impl PoseEstimator {
                 .map(|(set, fitted, masks)| {
                     let masks: Vec<Option<Mask>> = (0..masks.len()).map(|slot| given(set, masks, slot)).collect();
                     let masks: Vec<Option<&Mask>> = masks.iter().map(Option::as_ref).collect();
-                    let outline = self.match_outline(set, fitted, &fitted.turns, &masks, 2.0);
+                    let mut outline = self.match_outline(set, fitted, &fitted.turns, &masks, 2.0);
+                    outline.par_iter_mut().for_each(|point| point.undress(&self.surface, &self.template));
                     ShapeSet { problem: fitted.evidence.problem(&self.model, &self.config), outline }
                 })
                 .collect();
@@ -141,16 +168,15 @@ impl PoseEstimator {
             }
             shape = solved.shape;
             self.template = space.template(&shape)?;
+            self.surface = shod(&self.template, shoes);
             self.model = BodyModel::new(&self.template)?;
             fit.set(&space, &shape, &sigma, &self.template);
         }
-        fit.skirt = self.skirt(&found);
-        tracing::debug!(?fit, "fitted the body to landmarks and outlines");
         Ok(())
     }
 
-    /// The skirt that the masks of fitted sets show.
-    fn skirt(&self, found: &[(&FrameSet, Fitted, Vec<Option<Mask>>)]) -> Option<Skirt> {
+    /// The clothes that the masks of fitted sets show.
+    fn outfit(&self, found: &[(&FrameSet, Fitted, Vec<Option<Mask>>)]) -> Outfit {
         let poses = found.iter().map(|(_, fitted, _)| self.model.to_pose(&fitted.turns)).collect();
         let views = found.iter().enumerate().flat_map(|(pose, (set, _, masks))| {
             let given = |slot: usize| set.frames.get(slot)?.as_ref()?.mask.as_ref().filter(|_| !self.config.masks);
@@ -158,7 +184,7 @@ impl PoseEstimator {
                 masks.iter().enumerate().filter_map(move |(slot, mask)| Some((slot, mask.as_ref().or(given(slot))?)));
             masks.map(move |(slot, mask)| MaskedView { camera: &self.rig.cameras[slot], pose, mask })
         });
-        find_skirt(&self.template, &MaskedPoses { views: views.collect(), poses })
+        find_outfit(&self.template, &MaskedPoses { views: views.collect(), poses })
     }
 
     /// Takes a template of the person's shape instead, and forgets the pose.
@@ -168,6 +194,7 @@ impl PoseEstimator {
     pub fn set_template(&mut self, template: &Template) -> Result<(), TrackError> {
         self.model = BodyModel::new(template)?;
         (self.base, self.template) = (template.clone(), template.clone());
+        self.surface = Arc::new(template.clone());
         self.reset();
         Ok(())
     }

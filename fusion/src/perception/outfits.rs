@@ -1,31 +1,31 @@
-//! The search for a skirt on a person whose shape is given.
+//! The search for clothes on a person whose shape is given.
 
-use flyrig_body::{Skirt, Template};
-use flyrig_tracker::{MaskedPoses, MaskedView, find_skirt};
+use flyrig_body::{Outfit, Template};
+use flyrig_tracker::{MaskedPoses, MaskedView, find_outfit};
 use flyrig_types::{Camera, FrameSet, Mask, PersonId, Pose};
 
 use super::SeenPerson;
 use crate::{SHAPE_SECS, SHAPE_SETS};
 
-/// Collects poses and masks of a person, as many as a shape takes, and looks for a skirt once.
+/// Collects poses and masks of a person, as many as a shape takes, and looks for clothes once.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct SkirtSearch {
+pub(crate) struct OutfitSearch {
     poses: Vec<Pose>,
     /// Which pose, which slot.
     masks: Vec<(usize, usize, Mask)>,
     last_nanos: Option<i64>,
     is_over: bool,
-    skirt: Option<Skirt>,
+    outfit: Outfit,
     dressed: Option<Template>,
 }
 
-impl SkirtSearch {
-    /// Returns the skirt that was found.
-    pub fn skirt(&self) -> Option<Skirt> {
-        self.skirt
+impl OutfitSearch {
+    /// Returns the clothes that were found.
+    pub fn outfit(&self) -> Outfit {
+        self.outfit
     }
 
-    /// Returns the body in that skirt.
+    /// Returns the body in these clothes; `None` while it is bare.
     pub fn dressed(&self) -> Option<&Template> {
         self.dressed.as_ref()
     }
@@ -35,7 +35,7 @@ impl SkirtSearch {
         self.is_over
     }
 
-    /// Takes in a set of a running session, and looks for a skirt once enough time has passed.
+    /// Takes in a set of a running session, and looks for clothes once enough time has passed.
     pub fn take(&mut self, set: &FrameSet, seen: &SeenPerson, body: &Template, cameras: &[Camera]) {
         let every_nanos = (SHAPE_SECS * 1e9 / SHAPE_SETS as f64) as i64;
         let is_soon = self.last_nanos.is_some_and(|last| set.master_nanos.saturating_sub(last) < every_nanos);
@@ -59,17 +59,17 @@ impl SkirtSearch {
         self.poses.push(seen.pose.clone());
     }
 
-    /// Looks for a skirt in the sets so far. Later sets change nothing.
+    /// Looks for clothes in the sets so far. Later sets change nothing.
     pub fn finish(&mut self, person: PersonId, body: &Template, cameras: &[Camera]) {
         let (poses, masks) = (std::mem::take(&mut self.poses), std::mem::take(&mut self.masks));
         let views = masks
             .iter()
             .filter_map(|(pose, slot, mask)| Some(MaskedView { camera: cameras.get(*slot)?, pose: *pose, mask }))
             .collect();
-        (self.skirt, self.is_over) = (find_skirt(body, &MaskedPoses { poses, views }), true);
-        self.dressed = self.skirt.and_then(|skirt| skirt.on(body).ok());
-        if self.skirt.is_some() {
-            tracing::info!("person {person} wears a skirt or a long coat");
+        (self.outfit, self.is_over) = (find_outfit(body, &MaskedPoses { poses, views }), true);
+        if !self.outfit.is_bare() {
+            self.dressed = self.outfit.on(body).ok();
+            tracing::info!("person {person} wears {}", self.outfit);
         }
     }
 }

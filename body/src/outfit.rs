@@ -1,0 +1,41 @@
+//! What a person wears that the body's own surface cannot take the shape of.
+
+use crate::{BodyError, Shoes, Skirt, Template};
+
+/// Clothes with a surface of their own; others follow the body and its deformation.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Outfit {
+    /// Skirt or long coat; `None` without one.
+    pub skirt: Option<Skirt>,
+    /// `None` for bare feet.
+    pub shoes: Option<Shoes>,
+}
+
+impl Outfit {
+    /// Returns whether there is nothing to put on.
+    #[must_use]
+    pub fn is_bare(self) -> bool {
+        self == Self::default()
+    }
+
+    /// Returns the body in this outfit; joints are the same.
+    ///
+    /// # Errors
+    /// Those of [`Skirt::on`] and [`Shoes::on`].
+    pub fn on(self, body: &Template) -> Result<Template, BodyError> {
+        let shod = self.shoes.map(|shoes| shoes.on(body)).transpose()?;
+        let shod = shod.as_ref().unwrap_or(body);
+        self.skirt.map_or_else(|| Ok(shod.clone()), |skirt| skirt.on(shod))
+    }
+}
+
+impl std::fmt::Display for Outfit {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match (self.skirt, self.shoes) {
+            (Some(_), Some(_)) => "a skirt or long coat, shoes",
+            (Some(_), None) => "a skirt or long coat, bare feet",
+            (None, Some(_)) => "shoes",
+            (None, None) => "bare feet",
+        })
+    }
+}
