@@ -85,16 +85,20 @@ pub(crate) fn add_rings<const N: usize>(
             dressed.triangles.extend([[a, c, b], [a, d, c]]);
         }
     }
+    let mut normals: Vec<Vec3> = Vec::with_capacity(points.len());
     for (index, point) in points.iter().enumerate() {
         let (ring, k) = (index / N, index % N);
         let of = |ring: usize, k: usize| points[ring * N + k % N];
         let down = of((ring + 1).min(rings), k) - of(ring.saturating_sub(1), k);
         let around = of(ring, k + 1) - of(ring, k + N - 1);
         let outwards = direction::<N>(k);
-        dressed.normals.push(down.cross(around).normalize_or(Vec3::new(outwards.x, 0.0, outwards.y)));
+        // The last ring may be a single point.
+        let above = if ring > 0 { normals[index - N] } else { Vec3::new(outwards.x, 0.0, outwards.y) };
+        normals.push(down.cross(around).try_normalize().unwrap_or(above));
         dressed.skin.push(skin(*point));
         dressed.parts.push(part);
         dressed.uvs.push(Vec2::ZERO);
     }
+    dressed.normals.extend(normals);
     dressed.positions.extend(points);
 }
