@@ -8,7 +8,8 @@ use serde::{Deserialize, Serialize};
 pub struct PoseConfig {
     /// Crops whose presence is lower than this show no person, 0..1.
     pub presence_threshold: f64,
-    /// Landmarks of lower confidence (the smaller of visibility and presence) are not used, 0..1.
+    /// Landmarks of lower confidence (the smaller of visibility and presence) are hidden: they prove nobody's presence and are not
+    /// triangulated, but the fit heeds where the network expects them, 0..1.
     pub confidence_threshold: f64,
     /// Distance up to which views agree on a landmark, metres at its depth.
     pub inlier_m: f64,

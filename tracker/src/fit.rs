@@ -13,12 +13,11 @@ use nalgebra::DVector;
 
 use crate::LANDMARK_COUNT;
 use crate::body_model::{BodyModel, Posed, Turns};
-use crate::habits::spread_m;
+use crate::habits::{doubt, spread_m};
 use crate::line_point::{LineKind, LinePoint};
 use crate::view::{Observation, View};
 
-/// Share of the network's certainty a landmark deserves in the fit: the face's many points are one body,
-/// and the fingers' are vague.
+/// Weight of a landmark in the fit: the face's many points are one body, and the fingers' are vague.
 const LANDMARK_WEIGHT: [f64; LANDMARK_COUNT] = {
     let mut weight = [1.0; LANDMARK_COUNT];
     let mut i = 1;
@@ -121,9 +120,10 @@ impl FitProblem<'_> {
                 let moved = mark + view.shift[landmark];
                 let Some((pixel, rows)) = view.view.project_with_derivative(moved) else { continue };
                 let Some(px_per_m) = view.view.px_per_m(posed.origin[0]) else { continue };
-                let inverse_sigma = 1.0 / (self.landmark_spread * spread_m(landmark) * px_per_m);
+                let spread_m = spread_m(landmark) * doubt(seen.confidence);
+                let inverse_sigma = 1.0 / (self.landmark_spread * spread_m * px_per_m);
                 let error = (pixel - seen.ideal_px) * inverse_sigma;
-                let trust = LANDMARK_WEIGHT[landmark] * seen.confidence * seen.confidence;
+                let trust = LANDMARK_WEIGHT[landmark] * seen.trust * seen.trust;
                 let (cost, weight) = kernel.weigh(error.length_squared(), trust);
                 term.cost += cost;
                 for (row, e) in rows.into_iter().zip([error.x, error.y]) {

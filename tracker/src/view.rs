@@ -71,6 +71,8 @@ impl View {
 pub(crate) struct Observation {
     pub ideal_px: DVec2,
     pub confidence: f64,
+    /// 1 for a look at this very image, less for one that was carried along, 0..=1.
+    pub trust: f64,
 }
 
 /// Undistorts the usable landmarks of one view.
@@ -86,6 +88,6 @@ pub(crate) fn observe(
             return None;
         }
         let ideal_px = view.undistorted(camera, keypoint.pixel)?;
-        Some(Observation { ideal_px, confidence: keypoint.confidence.min(1.0) })
+        Some(Observation { ideal_px, confidence: keypoint.confidence.min(1.0), trust: 1.0 })
     })
 }

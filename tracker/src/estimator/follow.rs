@@ -153,17 +153,19 @@ impl PoseEstimator {
             let mut seen = [None; LANDMARK_COUNT];
             let mut shift = [DVec3::ZERO; LANDMARK_COUNT];
             if let Some(look) = looks[slot].as_ref().filter(sees) {
-                seen = observe(camera, &view, &look.sighting.keypoints, config.confidence_threshold);
+                // Hidden landmarks as well: the network guesses where they are, and the fit knows how well.
+                seen = observe(camera, &view, &look.sighting.keypoints, 0.0);
                 if let Some((track, predicted)) = track {
                     for (i, (carried, trust)) in look.carried(&track.marks, predicted).into_iter().enumerate() {
                         shift[i] = track.motion(i, delay_secs) + carried;
-                        seen[i] = seen[i].map(|seen| Observation { confidence: seen.confidence * trust, ..seen });
+                        seen[i] = seen[i].map(|seen| Observation { trust, ..seen });
                     }
                 }
             }
             views.push(FitView { slot, view, seen, shift, delay_secs });
         }
-        let most = views.iter().map(|v| v.seen.iter().flatten().count()).max().unwrap_or(0);
+        let is_sure = |seen: &&Observation| seen.confidence >= config.confidence_threshold;
+        let most = views.iter().map(|v| v.seen.iter().flatten().filter(is_sure).count()).max().unwrap_or(0);
         if most < MIN_LANDMARKS {
             return Err(lost("no view shows enough of a person"));
         }
@@ -238,7 +240,8 @@ impl PoseEstimator {
             let fit_view = evidence.views.iter().find(|view| view.slot == slot);
             if let Some(fit_view) = fit_view {
                 for (i, seen) in fit_view.seen.iter().enumerate() {
-                    let Some(seen) = seen else { continue };
+                    let sure = seen.filter(|seen| seen.confidence >= self.config.confidence_threshold);
+                    let Some(seen) = sure else { continue };
                     let moved = fit_view.view.project(marks[i] + fit_view.shift[i]);
                     let (Some(pixel), Some(px_per_m)) = (moved, fit_view.view.px_per_m(marks[i])) else { continue };
                     let distance = (pixel - seen.ideal_px).length();
