@@ -7,7 +7,7 @@ use flyrig_body::load_gltf;
 use flyrig_capture::{FolderOptions, FolderReplay};
 use flyrig_fusion::next_frame;
 use flyrig_report::{dataset, progress_bar};
-use flyrig_tracker::{LANDMARK_NAMES, LandmarkStudy, PoseNet};
+use flyrig_tracker::{Doubt, LANDMARK_NAMES, LandmarkStudy, PoseNet};
 
 use crate::cli::BenchLandmarksArgs;
 
@@ -40,6 +40,10 @@ pub fn landmarks(args: &BenchLandmarksArgs) -> Result<()> {
         let [x, y, z] = (habit.bias_m * 1e3).to_array();
         let (name, spread) = (LANDMARK_NAMES[habit.landmark], habit.spread_m * 1e3);
         println!("{:>3} {name:<20} {x:>7.1} {y:>7.1} {z:>7.1} {spread:>8.1} {:>6}", habit.landmark, habit.count);
+    }
+    println!("\nspread of less certain landmarks, as a multiple of the above");
+    for Doubt { up_to, times, count } in study.doubts() {
+        println!("confidence up to {up_to:.2} {times:>6.2} {count:>6}");
     }
     Ok(())
 }

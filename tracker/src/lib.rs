@@ -69,7 +69,7 @@ pub use error::{TrackError, TrackErrorKind};
 pub use estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};
 pub use estimator::{Marks, PoseEstimator, ShapeSighting};
 pub use gate::BodyGate;
-pub use habits::{Habit, LandmarkStudy};
+pub use habits::{Doubt, Habit, LandmarkStudy};
 pub use hands::{
     FACE_LANDMARKS, FACE_SIDE, FaceNet, FaceOutput, FaceStudy, HAND_LANDMARKS, HAND_SIDE, HandConfig, HandNet,
     HandOutput, HandQuality, HandState, HandTracker, HandsQuality, HeadQuality,
