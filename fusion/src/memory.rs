@@ -241,7 +241,7 @@ impl PersonMemory {
             let (length, flare) = text.split_once(' ')?;
             Some(Skirt { length: length.parse().ok()?, flare: flare.parse().ok()? })
         };
-        let skirt = metadata.get(SKIRT_KEY).map(|text| skirt(text));
+        let skirt = metadata.get(SKIRT_KEY).map(skirt);
         let skirt = skirt.map(|skirt| skirt.ok_or_else(|| damaged("the skirt's length and flare are no numbers")));
         let shoes = metadata.get(SHOES_KEY).map(|text| text.parse().map(|sole_m| Shoes { sole_m }));
         let shoes = shoes.map(|shoes| shoes.map_err(|_| damaged("the shoes' soles are no number")));
@@ -340,6 +340,10 @@ mod tests {
         assert!(replaced("network_features", "network_featuers").contains("lacks network_features"));
         assert!(replaced("network_weights", "network_weihgts").contains("lacks network_weights"));
         assert!(replaced("fffffffffffffff9", "fffffffffffffffx").contains("digest is no number"));
+        assert!(replaced("\"shoes\":\"0.02", "\"shoes\":\"0,02").contains("the shoes' soles are no number"));
+        assert!(
+            replaced("\"skirt\":\"0.55 ", "\"skirt\":\"0.55-").contains("the skirt's length and flare are no numbers")
+        );
         let features = FeatureMemory::from_parts(2, vec![1.0; 2], vec![0.0; 4]).unwrap();
         memory.networks = Some(NetworkMemory { digest: 1, memory: features });
         memory.save(&path).unwrap();
