@@ -146,7 +146,7 @@ pub fn find_outfit(body: &Template, seen: &MaskedPoses<'_>) -> Outfit {
 }
 
 fn find_shoes(body: &Template, seen: &MaskedPoses<'_>) -> Option<Shoes> {
-    let on_foot = |vertex: usize| matches!(body.parts[vertex], Part::LeftFoot | Part::RightFoot);
+    let on_foot = |vertex: usize| matches!(body.parts.get(vertex), Some(Part::LeftFoot | Part::RightFoot));
     let feet: Vec<Vec<Vec3>> = seen
         .poses
         .par_iter()
@@ -165,12 +165,11 @@ fn find_shoes(body: &Template, seen: &MaskedPoses<'_>) -> Option<Shoes> {
         return None;
     }
     let bare = overlap(&targets, &seen.poses, Ok(body.clone()));
-    let tried = SOLES_M.map(|sole_m| {
+    let tried = SOLES_M.into_iter().map(|sole_m| {
         let shoes = Shoes { sole_m };
         (shoes, overlap(&targets, &seen.poses, shoes.on(body)))
     });
-    tracing::debug!(?tried, "tried shoes");
-    let (best, gain) = tried.into_iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
+    let (best, gain) = tried.max_by(|a, b| a.1.total_cmp(&b.1))?;
     tracing::debug!(bare, gain = gain - bare, ?best, "compared bare feet with shoes");
     (gain - bare > SHOES_GAIN).then_some(best)
 }
