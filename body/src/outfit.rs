@@ -33,7 +33,7 @@ impl std::fmt::Display for Outfit {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match (self.skirt, self.shoes) {
             (Some(_), Some(_)) => "a skirt or long coat, shoes",
-            (Some(_), None) => "a skirt or long coat, bare feet",
+            (Some(_), None) => "a skirt or long coat",
             (None, Some(_)) => "shoes",
             (None, None) => "bare feet",
         })
