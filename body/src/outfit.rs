@@ -1,4 +1,4 @@
-//! What a person wears that the body's own surface cannot take the shape of.
+//! Clothes that the body's own surface cannot take the shape of: skirts, long coats, shoes.
 
 use crate::{BodyError, Shoes, Skirt, Template};
 

@@ -19,7 +19,7 @@ const WELT_M: f32 = 0.007;
 const TOE_ROOM_M: f32 = 0.013;
 /// Height of the toe cap above the ground that the bare foot stands on, metres.
 const CAP_M: f32 = 0.06;
-/// What of the foot stands on the sole: lower than this, metres.
+/// The part of the foot below this height stands on the sole, metres.
 const STANDS_M: f32 = 0.03;
 
 /// Soles that shoes may have.
@@ -83,7 +83,7 @@ struct Foot {
     vertices: Vec<usize>,
     ground_y: f32,
     collar_y: f32,
-    /// From heel to toes (x, z), and the middle of what stands on the ground.
+    /// Direction from heel to toes (x, z), and the middle of the part that stands on the sole.
     forward: Vec2,
     centre: Vec2,
 }

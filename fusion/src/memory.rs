@@ -65,7 +65,7 @@ impl PersonMemory {
         Self { positions, normals, joints, outfit, translations, memory, colors, networks }
     }
 
-    /// What the person wears.
+    /// Returns the person's clothes.
     #[must_use]
     pub fn outfit(&self) -> Outfit {
         self.outfit

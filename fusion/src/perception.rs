@@ -47,7 +47,7 @@ pub struct KnownPerson<'a> {
     pub shape: u32,
     /// The person's shape in its bind pose.
     pub template: &'a Template,
-    /// What the person wears, as far as it is known.
+    /// Clothes of the person, as far as they are known.
     pub outfit: Outfit,
 }
 

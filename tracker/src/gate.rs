@@ -53,7 +53,7 @@ impl BodyGate {
         Some(Self { image, bounds, distance, px_per_m, reach: CLOTHES_REACH, depths_m })
     }
 
-    /// Returns the gate of a body that is drawn with its skirt, or known to wear none: it reaches less far.
+    /// Returns the gate of a body that is drawn in its clothes, once these are known: it reaches less far.
     #[must_use]
     pub fn of_known_clothes(self) -> Self {
         Self { reach: KNOWN_CLOTHES_REACH, ..self }

@@ -45,7 +45,7 @@ const MEASURED: [Measured; 17] = [
     Measured { landmark: 31, bias_mm: [-1.0, -7.0, -5.0], spread_mm: 28.0 },
 ];
 
-/// How many times a sure landmark's spread it has at a confidence: nine of ten lie within it. Printed by the same command for twelve
+/// Confidence of a landmark, and its spread as a multiple of a sure one's: nine of ten lie within it. Printed by the same command for twelve
 /// further people (seeds 401 to 412): the network guesses where hidden joints are, and not badly.
 const DOUBTS: [(f64, f64); 8] =
     [(0.025, 7.4), (0.075, 4.6), (0.15, 4.4), (0.25, 3.6), (0.4, 2.5), (0.6, 1.6), (0.8, 1.2), (0.95, 1.0)];

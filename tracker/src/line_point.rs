@@ -22,7 +22,7 @@ pub(crate) struct LinePoint {
     pub kind: LineKind,
     /// Vertex of the template.
     pub vertex: usize,
-    /// From that vertex to the point, canonical metres: what is worn over the body.
+    /// Offset from that vertex to the point, canonical metres: the thickness of clothes.
     pub worn: DVec3,
     /// Index of the view in the fit.
     pub view: usize,

@@ -45,7 +45,7 @@ pub struct ShapeFit {
     pub sets: usize,
     /// Where the height comes from.
     pub height_from: HeightFrom,
-    /// What the person wears.
+    /// Clothes of the person.
     pub outfit: Outfit,
 }
 
