@@ -3,7 +3,7 @@
 use std::{fmt::Write as _, time::Instant};
 
 use anyhow::{Context, Result};
-use flyrig_fusion::{BudgetSettings, Effort, Origin, Outcome, PersonId};
+use flyrig_fusion::{BudgetSettings, Effort, Origin, Outcome, PersonId, Solver};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
 use flyrig_report::{
@@ -30,11 +30,24 @@ struct Row {
     levels: Vec<usize>,
 }
 
-/// Runs in their order: everything, single kinds of work left out, levels, budgets.
-fn ways(pose: Origin, budgets: &[f64]) -> Vec<(String, BudgetSettings)> {
+/// What is special about a run.
+struct Way {
+    name: String,
+    budget: BudgetSettings,
+    solver: Solver,
+}
+
+/// Runs in their order: everything, the other solvers, single kinds of work left out, levels, budgets.
+fn ways(pose: Origin, budgets: &[f64]) -> Vec<Way> {
     let full = Effort::FULL;
-    let fixed = |name: &str, effort| (name.to_owned(), BudgetSettings { fps: 0.0, effort: Some(effort) });
-    let mut ways = vec![fixed("everything", full)];
+    let way = |name: &str, budget| Way { name: name.to_owned(), budget, solver: Solver::GaussNewton };
+    let fixed = |name: &str, effort| way(name, BudgetSettings { fps: 0.0, effort: Some(effort) });
+    let solved = |name, solver| Way { solver, ..fixed(name, full) };
+    let mut ways = vec![
+        fixed("everything", full),
+        solved("the paper's solver", Solver::Paper),
+        solved("no deformation", Solver::None),
+    ];
     let perceived = [
         fixed("two looks again", Effort { looks: 2, ..full }),
         fixed("one look again", Effort { looks: 1, ..full }),
@@ -52,7 +65,7 @@ fn ways(pose: Origin, budgets: &[f64]) -> Vec<(String, BudgetSettings)> {
     ]);
     let levels = Effort::LEVELS.iter().enumerate().skip(1);
     ways.extend(levels.map(|(level, effort)| fixed(&format!("level {level}"), *effort)));
-    ways.extend(budgets.iter().map(|&fps| (format!("budget {fps}"), BudgetSettings { fps, effort: None })));
+    ways.extend(budgets.iter().map(|&fps| way(&format!("budget {fps}"), BudgetSettings { fps, effort: None })));
     ways
 }
 
@@ -62,12 +75,12 @@ pub fn budget(args: &BenchBudgetArgs, gpu: &GpuContext) -> Result<()> {
     let ways = ways(args.pose, &args.budgets);
     let bar = progress_bar(ways.len() as u64, "bench budget");
     let mut rows = Vec::new();
-    for (name, settings) in ways {
+    for way in ways {
         if stop::requested() {
             break;
         }
-        bar.set_message(name.clone());
-        rows.push(run(args, gpu, name, settings)?);
+        bar.set_message(way.name.clone());
+        rows.push(run(args, gpu, way)?);
         bar.inc(1);
     }
     bar.finish_and_clear();
@@ -81,8 +94,10 @@ pub fn budget(args: &BenchBudgetArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-fn run(args: &BenchBudgetArgs, gpu: &GpuContext, name: String, budget: BudgetSettings) -> Result<Row> {
-    let settings = args.replay.settings(&args.dataset, args.pose, budget);
+fn run(args: &BenchBudgetArgs, gpu: &GpuContext, way: Way) -> Result<Row> {
+    let Way { name, budget, solver } = way;
+    let mut settings = args.replay.settings(&args.dataset, args.pose, budget);
+    settings.session.tracking.solver = solver;
     let mut replay = Replay::open(&settings, gpu)?;
     let (mut sheet, mut millis, mut levels) = (ScoreSheet::default(), Vec::new(), Vec::new());
     let holdout = replay.holdout.clone();
@@ -154,7 +169,7 @@ fn table(rows: &[Row]) -> String {
     text
 }
 
-/// Run time against error: kinds of work alone, levels, budgets.
+/// Run time against error: fixed configurations, levels, budgets.
 fn plot(rows: &[Row]) -> Plot {
     let full = rows.first().map_or(0.0, |row| row.score.psnr_db);
     let of = |name: &str, line, belongs: &dyn Fn(&str) -> bool| Series {
@@ -174,7 +189,7 @@ fn plot(rows: &[Row]) -> Plot {
         log_x: false,
         log_y: false,
         series: vec![
-            of("one kind of work left out", Line::Front, &|name| !level(name) && !budget(name)),
+            of("fixed configurations", Line::Front, &|name| !level(name) && !budget(name)),
             of("levels", Line::Through, &level),
             of("budgets", Line::Front, &budget),
         ],

@@ -57,6 +57,8 @@ pub enum BenchCommand {
     Subjects(BenchSubjectsArgs),
     /// Who is who: takes of several people who walk past one another, found and followed from images alone.
     Takes(BenchTakesArgs),
+    /// Run time and error by pixels, input cameras and Gaussians, and the exponents of the run time.
+    Scale(BenchScaleArgs),
     /// Recording uncompressed cameras: bytes, processor time and loss of each JPEG quality against images as they come.
     Record(BenchRecordArgs),
 }
@@ -375,6 +377,31 @@ pub struct BenchSubjectsArgs {
     /// Gaussians on each person's surface.
     #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
     pub gaussians: usize,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchScaleArgs {
+    /// Pose and masks from the simulator, or from the images.
+    #[arg(long, value_enum, default_value = "given")]
+    pub pose: Origin,
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-scale")]
+    pub out: PathBuf,
+    /// Seed of the person.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Frames of a sequence; the first twelve are neither timed nor scored.
+    #[arg(long, default_value_t = 24, value_parser = clap::value_parser!(u16).range(13..=1000).map(usize::from))]
+    pub frames: usize,
+    /// Pixels of an image's side, comma separated. The first one is that of the other rows.
+    #[arg(long, value_delimiter = ',', default_value = "512,256,1024,1440", value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub sides: Vec<u32>,
+    /// Numbers of input cameras, comma separated. The first one is that of the other rows.
+    #[arg(long, value_delimiter = ',', default_value = "3,2,4,6", value_parser = clap::value_parser!(u8).range(1..=6).map(usize::from))]
+    pub views: Vec<usize>,
+    /// Numbers of Gaussians on the person's surface, comma separated. The first one is that of the other rows.
+    #[arg(long, value_delimiter = ',', default_value = "115000,29000,58000,230000", value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: Vec<usize>,
 }
 
 #[derive(Debug, Args)]

@@ -13,6 +13,7 @@ mod masks;
 mod perception;
 mod processor;
 mod recording;
+mod scale;
 mod sequence;
 mod steady;
 mod stream;
@@ -65,6 +66,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         BenchCommand::Watch(args) => watch::watch(args, &gpu()?),
         BenchCommand::Masks(args) => masks::masks(args),
         BenchCommand::Perception(args) => perception::perception(args, &gpu()?),
+        BenchCommand::Scale(args) => scale::scale(args, &gpu()?),
         BenchCommand::Takes(args) => takes::takes(args, &gpu()?),
         BenchCommand::Subjects(args) => subjects::subjects(args, &gpu()?),
         BenchCommand::Record(args) => recording::record(args, &gpu()?),

@@ -6,11 +6,11 @@ use anyhow::{Context, Result};
 use flyrig_body::Template;
 use flyrig_gpu::GpuContext;
 use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, Simulator, SurfaceMesh};
-use flyrig_types::{Camera, Frame, FrameSet, PoseTrack, Rig};
+use flyrig_types::{Camera, Frame, FrameSet, Image, PoseTrack, Rig};
 use glam::DVec3;
 use serde::Serialize;
 
-use super::surface::Points;
+use super::{stress::copy, surface::Points};
 
 /// Points on the true surface that completeness is measured at.
 const TRUE_POINTS: usize = 20_000;
@@ -57,6 +57,8 @@ pub struct Sequence {
     pub truth: Points,
     /// Depth images of the input cameras at the last instant.
     depths: Vec<(Camera, Vec<f32>)>,
+    /// The room without people, by camera.
+    plates: Vec<Image>,
 }
 
 impl Sequence {
@@ -112,7 +114,8 @@ impl Sequence {
             .map(|slot| Ok((rig.cameras[slot].clone(), simulator.render(last, slot)?.depth)))
             .collect::<Result<_>>()?;
         let (template, track) = (simulator.template().clone(), simulator.track().clone());
-        Ok(Self { config, rig, template, track, frames, truth, depths })
+        let plates = (0..rig.cameras.len()).map(|slot| copy(simulator.plate(slot)?)).collect::<Result<_>>()?;
+        Ok(Self { config, rig, template, track, frames, truth, depths, plates })
     }
 
     /// What was simulated.
@@ -125,6 +128,11 @@ impl Sequence {
         let mut rig = self.rig.clone();
         rig.cameras = INPUTS.iter().take(views).map(|&slot| self.rig.cameras[slot].clone()).collect();
         rig
+    }
+
+    /// The room without people, as the first `views` input cameras see it.
+    pub fn plates(&self, views: usize) -> Result<Vec<Option<Image>>> {
+        INPUTS.iter().take(views).map(|&slot| Ok(Some(copy(&self.plates[slot])?))).collect()
     }
 
     /// What these cameras give at every instant.

@@ -1,0 +1,263 @@
+//! `flyrig-bench scale`: run time and error by pixels, input cameras and Gaussians, one at a time and all at their most.
+
+use std::{fmt::Write as _, time::Instant};
+
+use anyhow::{Context, Result};
+use flyrig_body::{ShapeParams, default_template};
+use flyrig_fusion::{
+    BodySettings, EstimatedPerception, GivenPerception, Origin, PerceptionSettings, SHAPE_SETS, Session,
+    SessionBuilder, SessionSettings,
+};
+use flyrig_gpu::GpuContext;
+use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
+use flyrig_report::{
+    plot::{Line, Plot, Series},
+    progress_bar, write_whole,
+};
+use serde::Serialize;
+
+use crate::{
+    cli::BenchScaleArgs,
+    sequence::{Motion, Sequence, SequenceConfig},
+};
+
+/// Sets that are neither timed nor scored: the first ones get more work.
+const WARM_UP: u64 = 12;
+/// Stage of an estimated person, masks included.
+const PERCEPTION: &str = "pose from images";
+
+/// What grows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+enum Axis {
+    Pixels,
+    Views,
+    Gaussians,
+    /// Pixels and views together.
+    Both,
+}
+
+/// One size of the work.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+struct Size {
+    side: u32,
+    views: usize,
+    gaussians: usize,
+}
+
+/// What a size takes.
+#[derive(Debug, Serialize)]
+struct Row {
+    /// The axes along which this size stands.
+    axes: Vec<Axis>,
+    size: Size,
+    /// Means, milliseconds: finding the person, the rest of a set, and a view of the images' size.
+    perception_ms: f64,
+    reconstruction_ms: f64,
+    view_ms: f64,
+    score: CameraScore,
+}
+
+/// Runs the command.
+pub fn scale(args: &BenchScaleArgs, gpu: &GpuContext) -> Result<()> {
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    let sizes = sizes(args)?;
+    let bar = progress_bar(sizes.len() as u64, "bench scale");
+    let mut sequence: Option<Sequence> = None;
+    let mut rows = Vec::new();
+    for (axes, size) in sizes {
+        bar.set_message(format!("{}², {} cameras, {} Gaussians", size.side, size.views, size.gaussians));
+        let config =
+            SequenceConfig { motion: Motion::Turn, seed: args.seed, side: size.side, frames: args.frames, fps: 30.0 };
+        let scene = match sequence.take().filter(|known| known.config() == config) {
+            Some(known) => known,
+            None => Sequence::simulate(gpu, config)?,
+        };
+        rows.push(run(args.pose, gpu, &scene, axes, size)?);
+        sequence = Some(scene);
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    let table = table(&rows);
+    write_whole(&args.out.join("scale.md"), table.as_bytes())?;
+    write_whole(&args.out.join("scale.json"), &serde_json::to_vec_pretty(&rows)?)?;
+    write_whole(&args.out.join("scale.svg"), plot(&rows).svg().as_bytes())?;
+    print!("{table}");
+    println!("{}; scale.md, .json and .svg in {}", gpu.fastest().adapter_name(), args.out.display());
+    Ok(())
+}
+
+/// The sizes, those of one image side together, so that a sequence is simulated once.
+fn sizes(args: &BenchScaleArgs) -> Result<Vec<(Vec<Axis>, Size)>> {
+    let first = |known: Option<usize>, what| known.with_context(|| format!("--{what} needs a number"));
+    let base = Size {
+        side: *args.sides.first().context("--sides needs a number")?,
+        views: first(args.views.first().copied(), "views")?,
+        gaussians: first(args.gaussians.first().copied(), "gaussians")?,
+    };
+    let mut sizes: Vec<(Vec<Axis>, Size)> = Vec::new();
+    let mut add = |axis, size| match sizes.iter_mut().find(|(_, known)| *known == size) {
+        Some((axes, _)) => axes.push(axis),
+        None => sizes.push((vec![axis], size)),
+    };
+    args.views.iter().for_each(|&views| add(Axis::Views, Size { views, ..base }));
+    args.gaussians.iter().for_each(|&gaussians| add(Axis::Gaussians, Size { gaussians, ..base }));
+    args.sides.iter().for_each(|&side| add(Axis::Pixels, Size { side, ..base }));
+    let most = Size {
+        side: args.sides.iter().copied().fold(base.side, u32::max),
+        views: args.views.iter().copied().fold(base.views, usize::max),
+        ..base
+    };
+    add(Axis::Both, most);
+    Ok(sizes)
+}
+
+fn session(pose: Origin, gpu: &GpuContext, sequence: &Sequence, size: Size) -> Result<Session> {
+    let rig = sequence.inputs(size.views);
+    let settings = SessionSettings { body: BodySettings::with_gaussians(size.gaussians), ..SessionSettings::default() };
+    let builder = SessionBuilder::new(gpu.clone(), rig.clone()).settings(settings);
+    if pose == Origin::Given {
+        let perception = GivenPerception::repeating(&rig, sequence.template.clone(), sequence.track.clone());
+        return Ok(builder.perception(perception).build()?);
+    }
+    let template = default_template(&ShapeParams::default())?;
+    let settings = PerceptionSettings::default();
+    let mut perception = EstimatedPerception::new(&rig, &template, &settings, &sequence.plates(size.views)?)?;
+    let every = (sequence.config().frames / SHAPE_SETS).max(1);
+    let sets: Vec<_> = sequence.sets(size.views).step_by(every).take(SHAPE_SETS).collect();
+    perception.learn_shapes(&sets)?;
+    Ok(builder.perception(perception).build()?)
+}
+
+fn run(pose: Origin, gpu: &GpuContext, sequence: &Sequence, axes: Vec<Axis>, size: Size) -> Result<Row> {
+    let mut session = session(pose, gpu, sequence, size)?;
+    let (mut set_ms, mut perception_ms, mut view_ms, mut count) = (0.0, 0.0, 0.0, 0.0);
+    let mut sheet = ScoreSheet::default();
+    for set in sequence.sets(size.views) {
+        let (start, before) = (Instant::now(), session.stages.total_ms(PERCEPTION));
+        session.process(&set)?;
+        if set.index < WARM_UP {
+            continue;
+        }
+        set_ms += 1e3 * start.elapsed().as_secs_f64();
+        perception_ms += session.stages.total_ms(PERCEPTION) - before;
+        count += 1.0;
+        for (at, (camera, truth)) in sequence.held_out(set.index as usize)?.into_iter().enumerate() {
+            let start = Instant::now();
+            let view = session.render(camera)?;
+            if at == 0 {
+                view_ms += 1e3 * start.elapsed().as_secs_f64();
+            }
+            sheet.extend(score_view(&camera.id, set.index, &view, &truth.image, truth.mask.as_ref())?);
+        }
+    }
+    anyhow::ensure!(session.has_people(), "nobody was found with {} cameras of {} pixels", size.views, size.side);
+    let score = sheet.mean().with_context(|| format!("nothing to compare: give more than {WARM_UP} frames"))?;
+    let (perception_ms, set_ms) = (perception_ms / count, set_ms / count);
+    let reconstruction_ms = set_ms - perception_ms;
+    Ok(Row { axes, size, perception_ms, reconstruction_ms, view_ms: view_ms / count, score })
+}
+
+impl Row {
+    /// Milliseconds of a set with one view drawn.
+    fn all_ms(&self) -> f64 {
+        self.perception_ms + self.reconstruction_ms + self.view_ms
+    }
+
+    /// How much there is along an axis.
+    fn amount(&self, axis: Axis) -> f64 {
+        match axis {
+            Axis::Pixels => f64::from(self.size.side).powi(2),
+            Axis::Views => self.size.views as f64,
+            Axis::Gaussians => self.size.gaussians as f64,
+            Axis::Both => f64::from(self.size.side).powi(2) * self.size.views as f64,
+        }
+    }
+}
+
+/// Exponent p of `y = c x^p` through points, by least squares of the logarithms; NaN without two places.
+fn exponent(points: &[(f64, f64)]) -> f64 {
+    let logs: Vec<(f64, f64)> = points.iter().map(|(x, y)| (x.ln(), y.ln())).collect();
+    let count = logs.len() as f64;
+    let (mean_x, mean_y) =
+        (logs.iter().map(|(x, _)| x).sum::<f64>() / count, logs.iter().map(|(_, y)| y).sum::<f64>() / count);
+    let covariance: f64 = logs.iter().map(|(x, y)| (x - mean_x) * (y - mean_y)).sum();
+    covariance / logs.iter().map(|(x, _)| (x - mean_x).powi(2)).sum::<f64>()
+}
+
+fn table(rows: &[Row]) -> String {
+    let mut text = String::from(
+        "| image | cameras | Gaussians | perception ms | reconstruction ms | a view ms | all ms | PSNR dB | SSIM | FLIP | mask IoU |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|\n",
+    );
+    for row in rows {
+        let Row { size: Size { side, views, gaussians }, score, .. } = row;
+        let _ = writeln!(
+            text,
+            "| {side}x{side} | {views} | {gaussians} | {:.0} | {:.0} | {:.0} | {:.0} | {:.2} | {:.4} | {:.4} | {:.4} |",
+            row.perception_ms,
+            row.reconstruction_ms,
+            row.view_ms,
+            row.all_ms(),
+            score.psnr_db,
+            score.ssim,
+            score.flip,
+            score.iou.unwrap_or(f64::NAN),
+        );
+    }
+    text += "\n| run time grows with | perception | reconstruction | a view | all |\n|---|---|---|---|---|\n";
+    for (axis, name) in [(Axis::Pixels, "pixels"), (Axis::Views, "cameras"), (Axis::Gaussians, "Gaussians")] {
+        let of = |ms: &dyn Fn(&Row) -> f64| {
+            let along = rows.iter().filter(|row| row.axes.contains(&axis));
+            let power = exponent(&along.map(|row| (row.amount(axis), ms(row))).collect::<Vec<_>>());
+            if power.is_finite() { format!("{power:.2}") } else { "-".to_owned() }
+        };
+        let _ = writeln!(
+            text,
+            "| {name}, to the power of | {} | {} | {} | {} |",
+            of(&|row| row.perception_ms),
+            of(&|row| row.reconstruction_ms),
+            of(&|row| row.view_ms),
+            of(&Row::all_ms),
+        );
+    }
+    text
+}
+
+/// Run time over each quantity, as multiples of the first row's.
+fn plot(rows: &[Row]) -> Plot {
+    let base = rows.first();
+    let of = |axis: Axis, name: &str| {
+        let along = rows.iter().filter(|row| row.axes.contains(&axis));
+        let mut points: Vec<(f64, f64, String)> = along
+            .filter_map(|row| Some((row.amount(axis) / base?.amount(axis), row.all_ms(), String::new())))
+            .collect();
+        points.sort_by(|a, b| a.0.total_cmp(&b.0));
+        Series { name: name.to_owned(), points, line: Line::Through }
+    };
+    Plot {
+        title: "Run time of a set with one view".to_owned(),
+        x_label: "times as many".to_owned(),
+        y_label: "milliseconds".to_owned(),
+        log_x: true,
+        log_y: true,
+        series: vec![of(Axis::Pixels, "pixels"), of(Axis::Views, "cameras"), of(Axis::Gaussians, "Gaussians")],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exponents_are_those_of_powers() {
+        let of = |power: f64| exponent(&[1.0f64, 2.0, 5.0, 11.0].map(|x| (x, 3.0 * x.powf(power))));
+        for power in [0.0, 0.5, 1.0, 2.0] {
+            assert!((of(power) - power).abs() < 1e-9, "{power}: {}", of(power));
+        }
+        assert!(exponent(&[(3.0, 4.0)]).is_nan());
+        assert!(exponent(&[]).is_nan());
+        // A run time of nothing (a given pose has no perception) is no power.
+        assert!(!exponent(&[(1.0, 0.0), (2.0, 0.0)]).is_finite());
+    }
+}
