@@ -59,7 +59,7 @@ fn a_signal_has_everybody_measured_again() {
 }
 
 #[test]
-fn one_camera_is_enough_for_a_person_of_known_or_average_height() {
+fn one_camera_measures_people_by_the_floor_or_takes_a_known_or_average_height() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("rig.toml"), RIG).unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
@@ -74,12 +74,19 @@ fn one_camera_is_enough_for_a_person_of_known_or_average_height() {
     let given = eval(&["--height", "1.82"]);
     assert_eq!(given.code, Some(0), "{}", given.stderr);
     assert!(given.stderr.contains("1.82 m tall (as configured)"), "{}", given.stderr);
-    let average = eval(&[]);
+    let standing = eval(&[]);
+    assert_eq!(standing.code, Some(0), "{}", standing.stderr);
+    assert!(standing.stderr.contains("by where the feet stand on a floor at height 0;"), "{}", standing.stderr);
+    // A floor above the camera.
+    let average = eval(&["--floor", "5"]);
     assert_eq!(average.code, Some(0), "{}", average.stderr);
     assert!(average.stderr.contains("an average height"), "{}", average.stderr);
     let tiny = eval(&["--height", "0.1"]);
     assert_eq!(tiny.code, Some(1));
     assert!(tiny.stderr.contains("perception.height_m is 0.1"), "{}", tiny.stderr);
+    let deep = eval(&["--floor", "-20"]);
+    assert_eq!(deep.code, Some(1));
+    assert!(deep.stderr.contains("perception.floor_m is -20"), "{}", deep.stderr);
 }
 
 #[test]

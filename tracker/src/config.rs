@@ -20,8 +20,11 @@ pub struct PoseConfig {
     /// How often the outline of the body is matched with the masks, and its texture with the images, in a set; 0 fits the pose
     /// to landmarks alone.
     pub outline_rounds: usize,
-    /// Height of the person, metres; `None` measures it, or takes the template's before a single camera.
+    /// Height of the person, metres; `None` measures it.
     pub height_m: Option<f64>,
+    /// Height of the floor in the world, along the rig's up, metres. A single camera, without [`Self::height_m`], measures people by where
+    /// their feet stand.
+    pub floor_m: f64,
     /// Rounds in which [`crate::PoseEstimator::measure_shape`] matches outlines with masks to solve for lengths, girths, build and
     /// poses together; 0 fits bone lengths to landmarks alone (docs/benchmarks/perception.md, "Shape from outlines").
     pub shape_rounds: usize,
@@ -52,6 +55,7 @@ impl Default for PoseConfig {
             outline_sigma_m: 0.01,
             outline_rounds: 2,
             height_m: None,
+            floor_m: 0.0,
             shape_rounds: 2,
             smooth_rad: 0.15,
             look_after_m: 0.02,

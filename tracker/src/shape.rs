@@ -50,12 +50,14 @@ pub struct ShapeFit {
 }
 
 /// Source of a person's height.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum HeightFrom {
     /// Two or more views.
     Measurement,
     /// [`PoseConfig::height_m`].
     Configuration,
+    /// Where the feet stand before a single camera, for a floor at this height ([`PoseConfig::floor_m`]).
+    Floor(f64),
     /// The template's: one camera cannot tell a tall person from a near one.
     Average,
 }
@@ -63,13 +65,18 @@ pub enum HeightFrom {
 impl std::fmt::Display for ShapeFit {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{:.2} m tall", self.height_m)?;
-        f.write_str(match self.height_from {
-            HeightFrom::Measurement => "",
-            HeightFrom::Configuration => " (as configured)",
-            HeightFrom::Average => {
-                " (an average height, for one camera cannot measure it: give perception.height_m or --height)"
-            }
-        })?;
+        match self.height_from {
+            HeightFrom::Measurement => {}
+            HeightFrom::Configuration => f.write_str(" (as configured)")?,
+            HeightFrom::Floor(floor_m) => write!(
+                f,
+                " (one camera: by where the feet stand on a floor at height {floor_m}; if it is elsewhere give perception.floor_m or --floor)"
+            )?,
+            HeightFrom::Average => f.write_str(
+                " (an average height, for one camera sees no feet on the floor: give perception.height_m or --height, or \
+                 perception.floor_m or --floor)",
+            )?,
+        }
         if self.outfit.is_bare() { Ok(()) } else { write!(f, ", in {}", self.outfit) }
     }
 }
@@ -185,18 +192,21 @@ pub fn fit_template_shape(
     Ok((shaped, fit))
 }
 
-/// Returns a template of a given height in metres, or as it is, where nothing can be measured.
-pub(crate) fn template_of_height(template: &Template, height: Option<f64>) -> Result<(Template, ShapeFit), TrackError> {
+/// Returns a template of a given height in metres, or as it is where none is known.
+pub(crate) fn template_of_height(
+    template: &Template,
+    height: Option<f64>,
+    height_from: HeightFrom,
+) -> Result<(Template, ShapeFit), TrackError> {
     let scale = height.map_or(1.0, |height| height / height_m(template));
     let factors = [("scale".to_owned(), scale)].into_iter().collect();
     let shaped = scale_template(template, &BodyModel::new(template)?, &factors)?;
-    let height_from = if height.is_some() { HeightFrom::Configuration } else { HeightFrom::Average };
     let (groups, sigma, height_m) = (BTreeMap::new(), BTreeMap::new(), height_m(&shaped));
     Ok((shaped, ShapeFit { scale, groups, sigma, height_m, sets: 0, height_from, outfit: Outfit::default() }))
 }
 
 /// Height of a template in its bind pose, metres.
-fn height_m(template: &Template) -> f64 {
+pub(crate) fn height_m(template: &Template) -> f64 {
     let heights = template.positions.iter().map(|p| f64::from(p.y));
     let (low, high) = heights.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), y| (low.min(y), high.max(y)));
     high - low

@@ -1,7 +1,7 @@
-//! A guess at the third dimension from one image.
+//! What one camera knows of the third dimension: a guess at joints' depths, and the size of people who stand on the floor.
 
 use flyrig_types::Camera;
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DMat3, DVec2, DVec3, Vec3};
 
 use crate::LANDMARK_COUNT;
 use crate::sighting::Sighting;
@@ -51,4 +51,78 @@ pub(crate) fn lift(
         let place = |local| world_from_camera * (local + translation - view.translation);
         seen[i].and(local[i]).map(place).filter(|p| p.is_finite())
     }))
+}
+
+/// Share of the sets that may have feet in the air: these seem to stand farther away.
+const IN_THE_AIR: f64 = 0.6;
+
+/// Returns how many times larger a person is than these bodies (world vertices, one body a set), which fill the person's part of a camera's
+/// images: bodies grow along the lines of sight until their lowest points meet a floor at a height along `up`. `None` where the camera does
+/// not look down on their feet.
+pub(crate) fn growth_to_floor(camera: &Camera, up: DVec3, floor_m: f64, bodies: &[Vec<Vec3>]) -> Option<f64> {
+    let up = up.try_normalize()?;
+    let above = |at: DVec3| at.dot(up) - floor_m;
+    let eye = above(camera.position());
+    let growth = |body: &Vec<Vec3>| {
+        let lowest = body.iter().map(|at| above(at.as_dvec3())).fold(f64::INFINITY, f64::min);
+        let growth = eye / (eye - lowest);
+        (growth > 0.0 && growth.is_finite()).then_some(growth)
+    };
+    let mut growths: Vec<f64> = bodies.iter().filter_map(growth).collect();
+    growths.sort_by(f64::total_cmp);
+    growths.get(((1.0 - IN_THE_AIR) * growths.len() as f64) as usize).copied().filter(|_| eye > 0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{body, ring};
+    use flyrig_body::skin_mesh;
+    use glam::DQuat;
+
+    /// The built-in body on the floor at a place, `height` above it, as a body of `size` times its size that fills the same pixels.
+    fn seen_as(camera: &Camera, place: [f64; 2], height: f64, size: f64) -> Vec<Vec3> {
+        let body = body();
+        let mut pose = body.skeleton.rest_pose();
+        pose.joint_rotations[0] = DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
+        pose.root_translation = DVec3::ZERO;
+        let (vertices, _) = skin_mesh(&body, &pose);
+        let lowest = vertices.iter().map(|at| at.z).fold(f32::INFINITY, f32::min);
+        let moved = DVec3::new(place[0], place[1], height - f64::from(lowest));
+        let eye = camera.position();
+        vertices.iter().map(|at| eye.lerp(at.as_dvec3() + moved, size).as_vec3()).collect()
+    }
+
+    #[test]
+    fn bodies_grow_to_the_floor_that_they_stand_on() {
+        let camera = &ring(1).cameras[0];
+        for floor_m in [0.0, -0.8] {
+            for size in [0.8, 1.0, 1.15] {
+                // Three of eight jump.
+                let bodies: Vec<Vec<Vec3>> = (0..8)
+                    .map(|i| {
+                        seen_as(camera, [0.1 * f64::from(i), -0.2], floor_m + [0.0, 0.3][usize::from(i < 3)], size)
+                    })
+                    .collect();
+                let growth = growth_to_floor(camera, 2.0 * DVec3::Z, floor_m, &bodies).unwrap();
+                assert!((growth * size - 1.0).abs() < 0.02, "{growth} for a body of {size} on a floor at {floor_m}");
+            }
+        }
+    }
+
+    #[test]
+    fn nothing_is_measured_without_a_floor_below_the_camera() {
+        let camera = &ring(1).cameras[0];
+        let body = seen_as(camera, [0.0, 0.0], 0.0, 1.0);
+        let of = |up: DVec3, floor_m: f64, bodies: &[Vec<Vec3>]| growth_to_floor(camera, up, floor_m, bodies);
+        assert_eq!(of(DVec3::Z, 0.0, &[]), None);
+        assert_eq!(of(DVec3::Z, 0.0, &[Vec::new()]).filter(|growth| *growth > 0.0), None, "a body without vertices");
+        assert_eq!(of(DVec3::Z, 5.0, std::slice::from_ref(&body)), None, "a floor above the camera");
+        assert_eq!(of(DVec3::ZERO, 0.0, std::slice::from_ref(&body)), None);
+        assert_eq!(of(DVec3::NAN, 0.0, std::slice::from_ref(&body)), None);
+        assert_eq!(of(DVec3::Z, f64::NAN, std::slice::from_ref(&body)), None);
+        assert_eq!(of(DVec3::Z, 0.0, &[vec![Vec3::new(0.0, 0.0, 9.0)]]), None, "all of it above the camera");
+        let growth = of(DVec3::Z, 0.0, &[vec![Vec3::NAN], body]).unwrap();
+        assert!((growth - 1.0).abs() < 0.01);
+    }
 }

@@ -131,6 +131,7 @@ impl EstimatedPerception {
         let config = PoseConfig {
             masks: settings.masks == Origin::Estimated,
             height_m: settings.height_m,
+            floor_m: settings.floor_m,
             look_after_m: settings.look_after_m,
             ..PoseConfig::default()
         };

@@ -52,9 +52,12 @@ pub struct PerceptionSettings {
     /// Distance that the body moves in a view until the network looks at that view again, metres; 0: at every view of every set.
     #[arg(skip = Self::default().look_after_m)]
     pub look_after_m: f64,
-    /// Height of an estimated person in metres; by default measured, or an average one before a single camera.
+    /// Height of an estimated person in metres; by default measured.
     #[arg(long = "height", value_name = "METRES")]
     pub height_m: Option<f64>,
+    /// Height of the floor in the calibration's world, metres: a single camera measures people by where their feet stand.
+    #[arg(long = "floor", value_name = "METRES", default_value_t = 0.0, allow_negative_numbers = true)]
+    pub floor_m: f64,
     /// Colour of a screen behind the people: "green", "blue" or one like "#00b140"; empty without a screen.
     #[arg(long, value_name = "COLOUR", default_value = "", hide_default_value = true)]
     pub key_color: String,
@@ -76,6 +79,7 @@ impl Default for PerceptionSettings {
             network: PathBuf::new(),
             look_after_m: 0.02,
             height_m: None,
+            floor_m: 0.0,
             key_color: String::new(),
             plates: PathBuf::new(),
         }
@@ -116,6 +120,7 @@ impl PerceptionSettings {
                     .to_owned(),
             ));
         }
+        check("perception.floor_m", self.floor_m, -10.0, 10.0)?;
         self.height_m.map_or(Ok(()), |height| check("perception.height_m", height, 0.5, 2.5))
     }
 }

@@ -1,13 +1,18 @@
 //! The person's shape: bone lengths from landmarks, and lengths, girths and build from outlines.
 
 use super::*;
+use crate::HeightFrom;
 use crate::outfit_fit::{MaskedPoses, MaskedView, find_outfit};
 use flyrig_body::Shoes;
+use flyrig_types::Camera;
 
 /// The body in shoes; bare feet where it has none to put them on.
 fn shod(body: &Template, shoes: Option<Shoes>) -> Arc<Template> {
     Arc::new(Outfit { skirt: None, shoes }.on(body).unwrap_or_else(|_| body.clone()))
 }
+
+/// Heights that a single camera believes, metres.
+const HEIGHTS_M: std::ops::RangeInclusive<f64> = 1.2..=2.2;
 
 /// Steps of the solver to a pose in a new shape.
 const POSE_STEPS: usize = 40;
@@ -47,6 +52,7 @@ impl PoseEstimator {
             }
         }
         self.reset();
+        let before = height_m(&self.template);
         let measured = match (sightings.is_empty(), last) {
             (true, Some(error)) => Err(error),
             _ => self.measure_shape(&sightings),
@@ -54,21 +60,26 @@ impl PoseEstimator {
         let (template, fit) = measured?;
         self.take_shape(template)?;
         if let Some(first) = sightings.into_iter().next() {
-            self.start_at(first.fitted.turns, first.set.master_nanos);
+            self.start_at(self.resized(first.fitted.turns, before), first.set.master_nanos);
         }
         Ok((fit, places))
     }
 
     /// Fits the shape to a person seen in a few sets: bone lengths to the landmarks, then lengths, girths and build to landmarks
-    /// and outlines, together with the poses ([`crate::PoseConfig::shape_rounds`]). Before a single camera, which cannot measure
-    /// anything, the height is the configuration's or an average one. Goes on with the shape as it is; returns the template of
+    /// and outlines, together with the poses ([`crate::PoseConfig::shape_rounds`]). Before a single camera, which measures nothing
+    /// else, the height is the configuration's, that of somebody who stands on the floor ([`crate::PoseConfig::floor_m`]), or an average one. Goes on with the shape as it is; returns the template of
     /// the fitted shape for [`Self::take_shape`].
     ///
     /// # Errors
     /// Kind `Lost` when too few of the sets show a person in two views.
     pub fn measure_shape(&self, sightings: &[ShapeSighting]) -> Result<(Template, ShapeFit), TrackError> {
-        if self.rig.cameras.len() == 1 {
-            return template_of_height(&self.base, self.config.height_m);
+        if let [camera] = self.rig.cameras.as_slice() {
+            let (height, from) = match (self.config.height_m, self.height_on_floor(camera, sightings)) {
+                (Some(height), _) => (Some(height), HeightFrom::Configuration),
+                (None, Some(height)) => (Some(height), HeightFrom::Floor(self.config.floor_m)),
+                (None, None) => (None, HeightFrom::Average),
+            };
+            return template_of_height(&self.base, height, from);
         }
         let seen = |views: &&Vec<_>| seen_landmarks(views, self.config.confidence_threshold) >= MIN_LANDMARKS;
         let keypoints = sightings.iter().map(|sighting| &sighting.fitted.keypoints);
@@ -91,11 +102,28 @@ impl PoseEstimator {
     pub fn take_shape(&mut self, template: Template) -> Result<(), TrackError> {
         self.model = BodyModel::new(&template)?;
         self.surface = Arc::new(template.clone());
-        self.template = template;
+        let before = height_m(&std::mem::replace(&mut self.template, template));
         if let Some(track) = self.track.take() {
-            self.start_at(track.turns, track.nanos);
+            self.start_at(self.resized(track.turns, before), track.nanos);
         }
         Ok(())
+    }
+
+    /// Moves a body that was as tall as `before` to where the template fills the same part of a single camera's image.
+    fn resized(&self, mut turns: Turns, before: f64) -> Turns {
+        if let [camera] = self.rig.cameras.as_slice() {
+            turns.root = camera.position().lerp(turns.root, height_m(&self.template) / before);
+        }
+        turns
+    }
+
+    /// Height of a person whose feet stand on the floor, from one camera, metres; `None` where that is no person's height, or the
+    /// camera does not look down on the feet.
+    fn height_on_floor(&self, camera: &Camera, sightings: &[ShapeSighting]) -> Option<f64> {
+        let body = |sighting: &ShapeSighting| skin_mesh(&self.surface, &self.model.to_pose(&sighting.fitted.turns)).0;
+        let bodies: Vec<Vec<Vec3>> = sightings.iter().map(body).collect();
+        let growth = growth_to_floor(camera, self.rig.world_up, self.config.floor_m, &bodies)?;
+        Some(growth * height_m(&self.template)).filter(|height| HEIGHTS_M.contains(height))
     }
 
     /// Follows the person, or searches whole images: nobody waits for the set.
