@@ -3,6 +3,11 @@ CARGO ?= cargo
 OUT ?= out/demo
 MINUTES ?= 30
 
+# Without a desktop Mesa's driver prints errors about a missing one.
+ifndef XDG_RUNTIME_DIR
+export NODEVICE_SELECT = 1
+endif
+
 .PHONY: help setup demo test test-long test-v4l2 test-gpu-networks test-browser soak fuzz check
 
 help:
