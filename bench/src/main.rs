@@ -41,14 +41,17 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Parser as _;
-use flyrig_report::program::{self, open_gpu};
+use flyrig_report::{
+    program::{self, open_gpu},
+    traced,
+};
 
 use crate::cli::{BenchCommand, Cli};
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
     program::start_log(cli.verbose, false);
-    program::exit_code(dispatch(&cli))
+    program::exit_code(traced(cli.trace.as_deref(), || dispatch(&cli)))
 }
 
 fn dispatch(cli: &Cli) -> Result<()> {

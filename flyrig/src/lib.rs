@@ -30,7 +30,10 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Parser as _;
-use flyrig_report::program::{self, open_gpu};
+use flyrig_report::{
+    program::{self, open_gpu},
+    traced,
+};
 
 use crate::{
     cli::{Cli, Command, ConfigAction, SimAction},
@@ -50,7 +53,7 @@ pub fn check_config(text: &str) -> Result<(), String> {
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
     program::start_log(cli.verbose, cli.log_json);
-    program::exit_code(dispatch(&cli))
+    program::exit_code(traced(cli.trace.as_deref(), || dispatch(&cli)))
 }
 
 fn dispatch(cli: &Cli) -> Result<()> {

@@ -83,7 +83,7 @@ impl Drawing {
             Ok(rgba8_from_target(&target.color.read(gpu)?))
         })?;
         for stage in self.timer.collect() {
-            stages.add(stage.name, stage.time);
+            stages.add_of_adapter(stage.name, stage.time);
         }
         self.targets.push(target);
         Ok(RenderedView { width, height, rgba })

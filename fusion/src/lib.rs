@@ -28,6 +28,7 @@ mod session;
 mod set_reader;
 mod settings;
 mod stage_times;
+mod stage_trace;
 mod stillness;
 mod subject;
 mod track_state;
@@ -56,6 +57,7 @@ pub use settings::{
     SessionSettings, Solver, TrackingSettings,
 };
 pub use stage_times::{StageSummary, StageTimes, processor_time, resident_mib};
+pub use stage_trace::{TracedStage, start_stage_trace, take_stage_trace};
 pub use subject::{Observed, PROCESSOR_STAGE, Subject};
 pub use track_state::{Remedy, TrackState, TrackWatch};
 pub use viewpoints::orbit;

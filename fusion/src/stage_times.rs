@@ -7,6 +7,8 @@ use std::{
 
 use serde::Serialize;
 
+use crate::stage_trace::{trace_adapter, trace_stage};
+
 /// Run times of named stages over many frames; keeps the last 3600 samples of each.
 #[derive(Debug, Default)]
 pub struct StageTimes {
@@ -40,8 +42,20 @@ impl StageTimes {
     /// Samples kept a stage: bounds the memory of a rig that runs for days.
     const WINDOW: usize = 3600;
 
-    /// Adds one measurement.
+    /// Adds one measurement of what has just ended.
     pub fn add(&mut self, name: &'static str, time: Duration) {
+        trace_stage(name, time);
+        self.push(name, time.as_secs_f32() * 1e3);
+    }
+
+    /// Adds a time that the graphics adapter measured.
+    pub(crate) fn add_of_adapter(&mut self, name: &'static str, time: Duration) {
+        trace_adapter(name, time);
+        self.push(name, time.as_secs_f32() * 1e3);
+    }
+
+    /// Adds processor time, which is no part of a stage's run time.
+    pub(crate) fn add_processor_time(&mut self, name: &'static str, time: Duration) {
         self.push(name, time.as_secs_f32() * 1e3);
     }
 

@@ -384,7 +384,7 @@ impl Subject {
             stages.add("  draw and compare", draw);
             stages.add("  derivatives", derivatives);
             stages.add("  solve", solve);
-            stages.add(PROCESSOR_STAGE, processor_time().saturating_sub(processor));
+            stages.add_processor_time(PROCESSOR_STAGE, processor_time().saturating_sub(processor));
             let at_rest = deformation.report().is_some_and(|report| report.at_rest);
             stages.count("frames at rest, not solved", u64::from(at_rest));
             let left_out = deformation.judged().iter().filter(|judged| judged.is_none()).count();
@@ -495,7 +495,7 @@ impl Subject {
     /// Adds the adapter's times of updates that were waited for.
     pub(crate) fn collect_times(&mut self, stages: &mut StageTimes) {
         for stage in self.timer.collect() {
-            stages.add(stage.name, stage.time);
+            stages.add_of_adapter(stage.name, stage.time);
         }
     }
 

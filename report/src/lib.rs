@@ -11,6 +11,7 @@ pub mod program;
 mod progress;
 mod replay;
 pub mod stop;
+mod trace;
 mod true_joints;
 
 pub use contact::contact_images;
@@ -18,3 +19,4 @@ pub use html::{ContactRow, Curve, Report, write_whole};
 pub use outlines::{outlined_inputs, paint_outline};
 pub use progress::progress_bar;
 pub use replay::{Replay, ReplaySettings, TruthReader, frame_number};
+pub use trace::traced;

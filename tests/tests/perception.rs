@@ -74,9 +74,19 @@ fn one_camera_measures_people_by_the_floor_or_takes_a_known_or_average_height() 
     let given = eval(&["--height", "1.82"]);
     assert_eq!(given.code, Some(0), "{}", given.stderr);
     assert!(given.stderr.contains("1.82 m tall (as configured)"), "{}", given.stderr);
-    let standing = eval(&[]);
+    let standing = eval(&["--trace", "trace.json"]);
     assert_eq!(standing.code, Some(0), "{}", standing.stderr);
     assert!(standing.stderr.contains("by where the feet stand on a floor at height 0;"), "{}", standing.stderr);
+    let trace: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(folder.path().join("trace.json")).unwrap()).unwrap();
+    let times = |stage: &str| {
+        let events = trace["traceEvents"].as_array().unwrap().iter();
+        events.filter(|event| event["name"] == stage && event["dur"].as_f64() > Some(0.0)).count()
+    };
+    // Three sets, and one view of each.
+    for stage in ["pose from images", "network", "deformation", "render a view", "read a view back"] {
+        assert_eq!(times(stage), 3, "{stage}");
+    }
     // A floor above the camera.
     let average = eval(&["--floor", "5"]);
     assert_eq!(average.code, Some(0), "{}", average.stderr);
