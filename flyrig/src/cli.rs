@@ -34,7 +34,7 @@ pub struct Cli {
     /// Part of a graphics adapter's name; the fastest one otherwise.
     #[arg(long, global = true)]
     pub adapter: Option<String>,
-    /// Write when each stage ran into this file, for https://ui.perfetto.dev or about:tracing.
+    /// Write when each stage ran into this file, for Perfetto (ui.perfetto.dev) or about:tracing.
     #[arg(long, global = true, value_name = "FILE")]
     pub trace: Option<PathBuf>,
     #[command(subcommand)]

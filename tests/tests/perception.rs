@@ -83,10 +83,11 @@ fn one_camera_measures_people_by_the_floor_or_takes_a_known_or_average_height() 
         let events = trace["traceEvents"].as_array().unwrap().iter();
         events.filter(|event| event["name"] == stage && event["dur"].as_f64() > Some(0.0)).count()
     };
-    // Three sets, and one view of each.
-    for stage in ["pose from images", "network", "deformation", "render a view", "read a view back"] {
+    // Three sets; the report draws views of its own.
+    for stage in ["pose from images", "network", "deformation"] {
         assert_eq!(times(stage), 3, "{stage}");
     }
+    assert!(times("render a view") >= 3);
     // A floor above the camera.
     let average = eval(&["--floor", "5"]);
     assert_eq!(average.code, Some(0), "{}", average.stderr);
