@@ -78,6 +78,13 @@ pub(crate) fn refine(
             }
         }
     }
+    // By bin: pixels outnumber bins.
+    let speaks = inside_total > 50.0 && outside_total > 50.0;
+    let color_logit = |bin: usize| {
+        let (i, o) = (smooth(&inside, bin) / inside_total, smooth(&outside, bin) / outside_total);
+        ((i + 1e-5) / (o + 1e-5)).ln().clamp(-2.5, 2.5)
+    };
+    let color_logits: Vec<f32> = (0..inside.len()).map(|bin| if speaks { color_logit(bin) } else { 0.0 }).collect();
     let mut probability = coarse.clone();
     for y in 0..height {
         for x in 0..width {
@@ -87,12 +94,7 @@ pub(crate) fn refine(
                 probability.values[at] = 0.0;
                 continue;
             }
-            let color = if inside_total > 50.0 && outside_total > 50.0 {
-                let (i, o) = (smooth(&inside, bin(x, y)) / inside_total, smooth(&outside, bin(x, y)) / outside_total);
-                ((i + 1e-5) / (o + 1e-5)).ln().clamp(-2.5, 2.5)
-            } else {
-                0.0
-            };
+            let color = color_logits[bin(x, y)];
             let near = 1.0 - 4.0 * d.min(1.0);
             let evidence = plate_evidence.map_or(NO_EVIDENCE, |e| e.values[at]) - NO_EVIDENCE;
             let plate = evidence * if evidence > 0.0 { DIFFERENT_LOGIT } else { PLATE_LOGIT };
