@@ -23,8 +23,8 @@ use crate::{
 
 /// Sets that are neither timed nor scored: the first ones get more work.
 const WARM_UP: u64 = 12;
-/// Stage of an estimated person, masks included.
-const PERCEPTION: &str = "pose from images";
+/// Stage of an estimated person: network, masks and fits, without mattes and backgrounds.
+const POSE: &str = "pose from images";
 
 /// What grows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -51,9 +51,9 @@ struct Row {
     /// The axes along which this size stands.
     axes: Vec<Axis>,
     size: Size,
-    /// Means, milliseconds: finding the person, the rest of a set, and a view of the images' size.
-    perception_ms: f64,
-    reconstruction_ms: f64,
+    /// Means, milliseconds: an estimated pose with its masks, the rest of a set, and a view of the images' size.
+    pose_ms: f64,
+    rest_ms: f64,
     view_ms: f64,
     score: CameraScore,
 }
@@ -131,16 +131,16 @@ fn session(pose: Origin, gpu: &GpuContext, sequence: &Sequence, size: Size) -> R
 
 fn run(pose: Origin, gpu: &GpuContext, sequence: &Sequence, axes: Vec<Axis>, size: Size) -> Result<Row> {
     let mut session = session(pose, gpu, sequence, size)?;
-    let (mut set_ms, mut perception_ms, mut view_ms, mut count) = (0.0, 0.0, 0.0, 0.0);
+    let (mut set_ms, mut pose_ms, mut view_ms, mut count) = (0.0, 0.0, 0.0, 0.0);
     let mut sheet = ScoreSheet::default();
     for set in sequence.sets(size.views) {
-        let (start, before) = (Instant::now(), session.stages.total_ms(PERCEPTION));
+        let (start, before) = (Instant::now(), session.stages.total_ms(POSE));
         session.process(&set)?;
         if set.index < WARM_UP {
             continue;
         }
         set_ms += 1e3 * start.elapsed().as_secs_f64();
-        perception_ms += session.stages.total_ms(PERCEPTION) - before;
+        pose_ms += session.stages.total_ms(POSE) - before;
         count += 1.0;
         for (at, (camera, truth)) in sequence.held_out(set.index as usize)?.into_iter().enumerate() {
             let start = Instant::now();
@@ -153,15 +153,15 @@ fn run(pose: Origin, gpu: &GpuContext, sequence: &Sequence, axes: Vec<Axis>, siz
     }
     anyhow::ensure!(session.has_people(), "nobody was found with {} cameras of {} pixels", size.views, size.side);
     let score = sheet.mean().with_context(|| format!("nothing to compare: give more than {WARM_UP} frames"))?;
-    let (perception_ms, set_ms) = (perception_ms / count, set_ms / count);
-    let reconstruction_ms = set_ms - perception_ms;
-    Ok(Row { axes, size, perception_ms, reconstruction_ms, view_ms: view_ms / count, score })
+    let (pose_ms, set_ms) = (pose_ms / count, set_ms / count);
+    let rest_ms = set_ms - pose_ms;
+    Ok(Row { axes, size, pose_ms, rest_ms, view_ms: view_ms / count, score })
 }
 
 impl Row {
     /// Milliseconds of a set with one view drawn.
     fn all_ms(&self) -> f64 {
-        self.perception_ms + self.reconstruction_ms + self.view_ms
+        self.pose_ms + self.rest_ms + self.view_ms
     }
 
     /// How much there is along an axis.
@@ -187,7 +187,7 @@ fn exponent(points: &[(f64, f64)]) -> f64 {
 
 fn table(rows: &[Row]) -> String {
     let mut text = String::from(
-        "| image | cameras | Gaussians | perception ms | reconstruction ms | a view ms | all ms | PSNR dB | SSIM | FLIP | mask IoU |\n\
+        "| image | cameras | Gaussians | pose ms | rest of the set ms | a view ms | all ms | PSNR dB | SSIM | FLIP | mask IoU |\n\
          |---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for row in rows {
@@ -195,8 +195,8 @@ fn table(rows: &[Row]) -> String {
         let _ = writeln!(
             text,
             "| {side}x{side} | {views} | {gaussians} | {:.0} | {:.0} | {:.0} | {:.0} | {:.2} | {:.4} | {:.4} | {:.4} |",
-            row.perception_ms,
-            row.reconstruction_ms,
+            row.pose_ms,
+            row.rest_ms,
             row.view_ms,
             row.all_ms(),
             score.psnr_db,
@@ -205,7 +205,7 @@ fn table(rows: &[Row]) -> String {
             score.iou.unwrap_or(f64::NAN),
         );
     }
-    text += "\n| run time grows with | perception | reconstruction | a view | all |\n|---|---|---|---|---|\n";
+    text += "\n| run time grows with | pose | rest of the set | a view | all |\n|---|---|---|---|---|\n";
     for (axis, name) in [(Axis::Pixels, "pixels"), (Axis::Views, "cameras"), (Axis::Gaussians, "Gaussians")] {
         let of = |ms: &dyn Fn(&Row) -> f64| {
             let along = rows.iter().filter(|row| row.axes.contains(&axis));
@@ -215,8 +215,8 @@ fn table(rows: &[Row]) -> String {
         let _ = writeln!(
             text,
             "| {name}, to the power of | {} | {} | {} | {} |",
-            of(&|row| row.perception_ms),
-            of(&|row| row.reconstruction_ms),
+            of(&|row| row.pose_ms),
+            of(&|row| row.rest_ms),
             of(&|row| row.view_ms),
             of(&Row::all_ms),
         );
