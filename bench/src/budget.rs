@@ -30,7 +30,7 @@ struct Row {
     levels: Vec<usize>,
 }
 
-/// What is special about a run.
+/// Settings of a run.
 struct Way {
     name: String,
     budget: BudgetSettings,

@@ -1,4 +1,4 @@
-//! `flyrig-bench scale`: run time and error by pixels, input cameras and Gaussians, one at a time and all at their most.
+//! `flyrig-bench scale`: run time and error by pixels, input cameras and Gaussians, one at a time, and pixels and cameras at their most.
 
 use std::{fmt::Write as _, time::Instant};
 
@@ -26,15 +26,13 @@ const WARM_UP: u64 = 12;
 /// Stage of an estimated person: network, masks and fits, without mattes and backgrounds.
 const POSE: &str = "pose from images";
 
-/// What grows.
+/// Quantity that grows from row to row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 enum Axis {
     Pixels,
     Views,
     Gaussians,
-    /// Pixels and views together.
-    Both,
 }
 
 /// One size of the work.
@@ -45,10 +43,10 @@ struct Size {
     gaussians: usize,
 }
 
-/// What a size takes.
+/// Run times and scores of a size.
 #[derive(Debug, Serialize)]
 struct Row {
-    /// The axes along which this size stands.
+    /// The axes along which this size stands; none for pixels and cameras at their most.
     axes: Vec<Axis>,
     size: Size,
     /// Means, milliseconds: an estimated pose with its masks, the rest of a set, and a view of the images' size.
@@ -108,7 +106,9 @@ fn sizes(args: &BenchScaleArgs) -> Result<Vec<(Vec<Axis>, Size)>> {
         views: args.views.iter().copied().fold(base.views, usize::max),
         ..base
     };
-    add(Axis::Both, most);
+    if !sizes.iter().any(|(_, known)| *known == most) {
+        sizes.push((Vec::new(), most));
+    }
     Ok(sizes)
 }
 
@@ -170,7 +170,6 @@ impl Row {
             Axis::Pixels => f64::from(self.size.side).powi(2),
             Axis::Views => self.size.views as f64,
             Axis::Gaussians => self.size.gaussians as f64,
-            Axis::Both => f64::from(self.size.side).powi(2) * self.size.views as f64,
         }
     }
 }

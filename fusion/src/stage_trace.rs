@@ -26,7 +26,7 @@ pub struct TracedStage {
     pub time: Duration,
 }
 
-/// What a track did last.
+/// Last stage of a track, and parts that wait for theirs.
 #[derive(Debug, Default)]
 struct Track {
     /// Where the next part of the last stage begins, and where that stage ends.

@@ -1,4 +1,4 @@
-//! What one camera knows of the third dimension: a guess at joints' depths, and the size of people who stand on the floor.
+//! Depth from a single camera: joints by the network's guess, and the size of people who stand on the floor.
 
 use flyrig_types::Camera;
 use glam::{DMat3, DVec2, DVec3, Vec3};

@@ -74,11 +74,10 @@ impl PoseEstimator {
     /// Kind `Lost` when too few of the sets show a person in two views.
     pub fn measure_shape(&self, sightings: &[ShapeSighting]) -> Result<(Template, ShapeFit), TrackError> {
         if let [camera] = self.rig.cameras.as_slice() {
-            let (height, from) = match (self.config.height_m, self.height_on_floor(camera, sightings)) {
-                (Some(height), _) => (Some(height), HeightFrom::Configuration),
-                (None, Some(height)) => (Some(height), HeightFrom::Floor(self.config.floor_m)),
-                (None, None) => (None, HeightFrom::Average),
-            };
+            let standing = || Some((self.height_on_floor(camera, sightings)?, HeightFrom::Floor(self.config.floor_m)));
+            let configured = self.config.height_m.map(|height| (height, HeightFrom::Configuration));
+            let (height, from) =
+                configured.or_else(standing).map_or((None, HeightFrom::Average), |(height, from)| (Some(height), from));
             return template_of_height(&self.base, height, from);
         }
         let seen = |views: &&Vec<_>| seen_landmarks(views, self.config.confidence_threshold) >= MIN_LANDMARKS;
