@@ -13,6 +13,8 @@ use crate::{ImageGradients, RenderTarget, linear_from_srgb};
 const WGSL: &str = include_str!("image_loss.wgsl");
 /// Pixels of a column that one invocation compares.
 const ROWS: u32 = 4;
+/// Columns that a workgroup compares.
+const LANES: u32 = 64;
 /// Sums an image that are read back; the CPU adds them up in `f64`.
 const SUMS: u32 = 64;
 
@@ -90,7 +92,7 @@ impl WantedImage {
         let level = level.min(source[0].min(source[1]).max(1).ilog2()).min(Self::MAX_LEVEL);
         let [width, height] = source.map(|side| side >> level);
         let pixels = width as usize * height as usize;
-        let partials = width as usize * height.div_ceil(ROWS) as usize;
+        let partials = width.div_ceil(LANES) as usize * height.div_ceil(ROWS) as usize;
         Ok(Self {
             source,
             shrink: 1 << level,
@@ -225,7 +227,7 @@ impl ImageLoss {
         ];
         run_at(gpu, &mut pass, compare, &resources, groups);
         let resources = [(0, wanted.constants.get(0)), (7, partials), (8, self.sums.raw().as_entire_binding())];
-        run_at(gpu, &mut pass, add_up, &resources, (SUMS.div_ceil(64), 1));
+        run_at(gpu, &mut pass, add_up, &resources, (1, 1));
     }
 
     /// Waits for the GPU and reads the sums of the first `pictures` images.
@@ -263,12 +265,14 @@ fn constants(wanted: &WantedImage, index: u32, settings: &LossSettings) -> Optio
         shrink: wanted.shrink,
         with_unknown: settings.with_unknown.into(),
     };
-    Some((constants, (area[0].div_ceil(64), area[1].div_ceil(ROWS))))
+    Some((constants, (area[0].div_ceil(LANES), area[1].div_ceil(ROWS))))
 }
 
 fn wgsl() -> String {
     let unknown = u32::from_le_bytes(UNKNOWN_RGBA);
-    format!("const ROWS: u32 = {ROWS}u;\nconst SUMS: u32 = {SUMS}u;\nconst UNKNOWN: u32 = {unknown}u;\n{WGSL}")
+    format!(
+        "const ROWS: u32 = {ROWS}u;\nconst SUMS: u32 = {SUMS}u;\nconst LANES: u32 = {LANES}u;\nconst UNKNOWN: u32 = {unknown}u;\n{WGSL}"
+    )
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 // How a drawn image differs from a wanted one (FlyHuman Eq. 3), and its derivatives for the backward rasteriser.
 // One invocation for four pixels of a column; sums in a fixed order.
-// Prefix: const ROWS, SUMS, UNKNOWN.
+// Prefix: const ROWS, LANES, SUMS, UNKNOWN.
 struct Loss {
     // Pixels of the image.
     size: vec2<u32>,
@@ -52,7 +52,7 @@ fn end_row() -> u32 {
     return loss.first.y + loss.area.y;
 }
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(LANES)
 fn unpack_wanted(@builtin(global_invocation_id) id: vec3<u32>) {
     let first = column(id);
     if first.x == 0xffffffffu {
@@ -77,16 +77,24 @@ fn unpack_wanted(@builtin(global_invocation_id) id: vec3<u32>) {
     }
 }
 
-@compute @workgroup_size(64)
-fn compare(@builtin(global_invocation_id) id: vec3<u32>) {
+var<workgroup> lanes: array<Sums, LANES>;
+
+fn both(a: Sums, b: Sums) -> Sums {
+    return Sums(a.loss + b.loss, a.mask + b.mask, a.color + b.color, a.wanted + b.wanted);
+}
+
+@compute @workgroup_size(LANES)
+fn compare(@builtin(global_invocation_id) id: vec3<u32>, @builtin(workgroup_id) group: vec3<u32>,
+           @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let first = column(id);
-    if first.x == 0xffffffffu {
-        return;
-    }
     let weights = vec4(vec3(loss.color_weight), loss.mask_weight);
     let last = loss.first + loss.area - vec2(1u);
+    var end = first.y;
+    if first.x != 0xffffffffu {
+        end = min(first.y + ROWS, end_row());
+    }
     var sum = Sums(0.0, 0.0, 0.0, 0.0);
-    for (var y = first.y; y < min(first.y + ROWS, end_row()); y++) {
+    for (var y = first.y; y < end; y++) {
         let at = y * loss.size.x + first.x;
         let goal = wanted[at];
         if goal.w < 0.0 {
@@ -111,25 +119,27 @@ fn compare(@builtin(global_invocation_id) id: vec3<u32>) {
         }
         d_carry[at] = vec4(0.0, bend);
     }
-    partials[id.y * loss.area.x + id.x] = sum;
+    lanes[lane] = sum;
+    for (var half = LANES / 2u; half > 0u; half /= 2u) {
+        workgroupBarrier();
+        if lane < half {
+            lanes[lane] = both(lanes[lane], lanes[lane + half]);
+        }
+    }
+    if lane == 0u {
+        partials[group.y * groups.x + group.x] = lanes[0];
+    }
 }
 
-// SUMS invocations share the partial sums, each an equal share in their order.
-@compute @workgroup_size(64)
+// SUMS invocations share the workgroups' sums, each an equal share in their order.
+@compute @workgroup_size(SUMS)
 fn add_up(@builtin(global_invocation_id) id: vec3<u32>) {
-    if id.x >= SUMS {
-        return;
-    }
-    let count = loss.area.x * ((loss.area.y + ROWS - 1u) / ROWS);
+    let count = ((loss.area.x + LANES - 1u) / LANES) * ((loss.area.y + ROWS - 1u) / ROWS);
     let size = (count + SUMS - 1u) / SUMS;
     let begin = min(id.x * size, count);
     var sum = Sums(0.0, 0.0, 0.0, 0.0);
     for (var i = begin; i < min(begin + size, count); i++) {
-        let one = partials[i];
-        sum.loss += one.loss;
-        sum.mask += one.mask;
-        sum.color += one.color;
-        sum.wanted += one.wanted;
+        sum = both(sum, partials[i]);
     }
     sums[loss.sums_at + id.x] = sum;
 }

@@ -6,8 +6,9 @@ use wgpu::{CommandEncoder, ComputePassDescriptor};
 use crate::processor::ProcessorBackward;
 use crate::raster::RasterizerOn;
 use crate::raster_device::{DeviceRasterizer, FRAME};
-use crate::raster_kernels::{FRAME_WGSL, RasterShape};
+use crate::raster_kernels::{FRAME_WGSL, Tile};
 use crate::scan::run;
+use crate::sort::Keys;
 use crate::{Carry, GaussianBuffers, GaussianGradients, ImageGradients, Rasterizer, RenderTarget};
 
 const BACKWARD_FRAME_WGSL: &str = include_str!("raster_backward_frame.wgsl");
@@ -17,7 +18,8 @@ const PROJECT_WGSL: &str = include_str!("raster_backward_project.wgsl");
 
 /// Bytes of `struct PairSum`.
 const PAIR_SUM_BYTES: u64 = 48;
-/// Pairs that one tile's invocations walk over; each costs them about two iterations of [`crate::scan::MAX_LOOP`].
+/// Pairs that one tile's invocations walk over; each costs them about two iterations, and Mesa's software adapter ends all loops
+/// of an invocation after 65,535 iterations together, without a word.
 const MAX_LIST: u32 = 24_576;
 /// Tiles that one Gaussian adds up, for the same reason.
 const MAX_TILES: u32 = 60_000;
@@ -134,11 +136,11 @@ impl BackwardRasterizer {
 
 impl DeviceBackward {
     fn new(gpu: &GpuContext) -> Result<Self, GpuError> {
-        let shape = RasterShape::for_adapter(gpu);
+        let tile = Tile::for_adapter(gpu);
         let kernel = |entry, source: String| ComputeKernel::new(gpu, entry, &[&source], entry);
         Ok(Self {
             place: kernel("place_gaussians", places_wgsl()),
-            blend: [false, true].map(|depth| kernel("blend_backward", blend_wgsl(shape, depth))),
+            blend: [false, true].map(|depth| kernel("blend_backward", blend_wgsl(tile, depth))),
             project: [false, true].map(|lift| kernel("project_backward", project_wgsl(lift))),
             places: StorageBuffer::zeroed(gpu, "places of sums", 0)?,
             tile_limits: StorageBuffer::zeroed(gpu, "walked tiles", 0)?,
@@ -176,7 +178,7 @@ impl DeviceBackward {
             &[
                 rasterizer.constants.get(FRAME),
                 self.room.raw().as_entire_binding(),
-                rasterizer.sort.output().raw().as_entire_binding(),
+                rasterizer.sort.output(Keys::Scaled).raw().as_entire_binding(),
                 rasterizer.sort.valid().raw().as_entire_binding(),
                 rasterizer.rects.raw().as_entire_binding(),
                 rasterizer.pairs_before.raw().as_entire_binding(),
@@ -192,8 +194,8 @@ impl DeviceBackward {
                 rasterizer.constants.get(FRAME),
                 rasterizer.splats.raw().as_entire_binding(),
                 gaussians.color.raw().as_entire_binding(),
-                picture.table.raw().as_entire_binding(),
-                picture.pairs.raw().as_entire_binding(),
+                picture.ends.raw().as_entire_binding(),
+                picture.lists().raw().as_entire_binding(),
                 self.places.raw().as_entire_binding(),
                 target.color.raw().as_entire_binding(),
                 target.depth.raw().as_entire_binding(),
@@ -249,12 +251,12 @@ pub(crate) fn places_wgsl() -> String {
     [&constants, CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, PLACES_WGSL].concat()
 }
 
-pub(crate) fn blend_wgsl(shape: RasterShape, with_depth: bool) -> String {
-    let invocations = shape.tile * shape.tile / 4;
+pub(crate) fn blend_wgsl(tile: Tile, with_depth: bool) -> String {
+    let invocations = tile.0 * tile.0 / 4;
     let batch = PARTIAL_BYTES / (invocations * PAIR_SUM_BYTES as u32);
     let constants = format!(
         "{}const WITH_DEPTH: bool = {with_depth};\nconst BATCH: u32 = {batch}u;\nconst MAX_LIST: u32 = {MAX_LIST}u;\n",
-        shape.wgsl()
+        tile.wgsl()
     );
     [&constants, CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, BLEND_WGSL].concat()
 }

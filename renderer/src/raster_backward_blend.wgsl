@@ -8,8 +8,9 @@
 @group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;
 @group(0) @binding(2) var<storage, read> color: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read> table: array<u32>;
-@group(0) @binding(4) var<storage, read> pairs: array<u32>;
+@group(0) @binding(3) var<storage, read> ends: array<u32>;
+// (tile, Gaussian)
+@group(0) @binding(4) var<storage, read> pairs: array<vec2<u32>>;
 @group(0) @binding(5) var<storage, read> places: array<Place>;
 // The images that the forward pass drew.
 @group(0) @binding(6) var<storage, read> drawn_color: array<vec4<f32>>;
@@ -25,10 +26,13 @@ const ROWS = 4u;
 const INVOCATIONS = TILE * TILE / ROWS;
 const VECTORS = 3u;
 const LN_2 = 0.6931471805599453;
+// Parts of a sum over the invocations, so that as many of them as possible add up.
+const PARTS = max(1u, INVOCATIONS / (BATCH * VECTORS * 4u) * 4u);
+const PART = INVOCATIONS / PARTS;
 
 // partial[(splat of the batch * VECTORS + vector) * INVOCATIONS + invocation]
 var<workgroup> partials: array<vec4<f32>, BATCH * VECTORS * INVOCATIONS>;
-var<workgroup> busy: array<u32, INVOCATIONS>;
+var<workgroup> busy: atomic<u32>;
 var<workgroup> go_on: u32;
 
 // On the bits, since compilers may assume that comparisons never see NaN.
@@ -38,14 +42,12 @@ fn finite(v: vec4<f32>) -> bool {
 
 // Whether any invocation of the workgroup is busy; to be called by all of them together.
 fn any_busy(local: u32, mine: bool) -> bool {
-    busy[local] = u32(mine);
+    if mine {
+        atomicStore(&busy, 1u);
+    }
     workgroupBarrier();
     if local == 0u {
-        var any = 0u;
-        for (var i = 0u; i < INVOCATIONS; i += 4u) {
-            any |= busy[i] | busy[i + 1u] | busy[i + 2u] | busy[i + 3u];
-        }
-        go_on = any;
+        go_on = atomicExchange(&busy, 0u);
     }
     return workgroupUniformLoad(&go_on) != 0u;
 }
@@ -104,12 +106,11 @@ fn blend_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invoca
         }
         return;
     }
-    let list = tile_index * frame.bin_chunks;
     var begin = 0u;
-    if list > 0u {
-        begin = table[list - 1u];
+    if tile_index > 0u {
+        begin = ends[tile_index - 1u];
     }
-    let end = min(table[list + frame.bin_chunks - 1u], begin + MAX_LIST);
+    let end = min(ends[tile_index], begin + MAX_LIST);
     let x = f32(first.x);
     let y = f32(first.y) + vec4(0.0, 1.0, 2.0, 3.0);
     let log2_cut = vec4(log2(CUT));
@@ -117,7 +118,7 @@ fn blend_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invoca
     for (var batch = begin; batch < end; batch += BATCH) {
         let count = min(BATCH, end - batch);
         for (var b = 0u; b < count; b++) {
-            let g = pairs[batch + b];
+            let g = pairs[batch + b].y;
             let splat = splats[g];
             let dx = x - splat.pixel.x;
             let dy = y - splat.pixel.y;
@@ -153,14 +154,25 @@ fn blend_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invoca
             partials[at + 2u * INVOCATIONS] = carried;
         }
         let more = any_busy(index, any(transmittance >= vec4(OPAQUE)));
+        // Each sum in PARTS parts, then the parts, always in the same order.
+        for (var part = index; part < count * VECTORS * PARTS; part += INVOCATIONS) {
+            let first = part * PART;
+            var sum = vec4(0.0);
+            for (var i = first; i < first + PART; i += 4u) {
+                sum += (partials[i] + partials[i + 1u]) + (partials[i + 2u] + partials[i + 3u]);
+            }
+            partials[first] = sum;
+        }
+        if PARTS > 1u {
+            workgroupBarrier();
+        }
         for (var item = index; item < count * VECTORS; item += INVOCATIONS) {
-            let g = pairs[batch + item / VECTORS];
+            let g = pairs[batch + item / VECTORS].y;
             let place = places[g];
             if place.fits != 0u {
                 var sum = vec4(0.0);
-                for (var i = 0u; i < INVOCATIONS; i += 4u) {
-                    let at = item * INVOCATIONS + i;
-                    sum += (partials[at] + partials[at + 1u]) + (partials[at + 2u] + partials[at + 3u]);
+                for (var i = 0u; i < INVOCATIONS; i += PART) {
+                    sum += partials[item * INVOCATIONS + i];
                 }
                 let slot = place.offset + (tile.y - (place.first >> 16u)) * place_width(place)
                     + tile.x - (place.first & 0xffffu);
@@ -177,7 +189,7 @@ fn blend_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invoca
         // Lists are in depth order, in which offsets grow.
         var limit = 0u;
         if walked > begin {
-            limit = places[pairs[walked - 1u]].offset + 1u;
+            limit = places[pairs[walked - 1u].y].offset + 1u;
         }
         tile_limits[tile_index] = limit;
     }

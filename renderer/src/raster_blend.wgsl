@@ -12,8 +12,9 @@
 // only canonical
 @group(0) @binding(3) var<storage, read> canonical: array<vec4<f32>>;
 // end
-@group(0) @binding(4) var<storage, read> table: array<u32>;
-@group(0) @binding(5) var<storage, read> pairs: array<u32>;
+@group(0) @binding(4) var<storage, read> ends: array<u32>;
+// (tile, Gaussian)
+@group(0) @binding(5) var<storage, read> pairs: array<vec2<u32>>;
 // only color
 @group(0) @binding(6) var<storage, read_write> color_out: array<vec4<f32>>;
 // end
@@ -33,12 +34,12 @@ fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) 
     if any(first >= frame.size) {
         return;
     }
-    let list = (tile.y * frame.tiles.x + tile.x) * frame.bin_chunks;
+    let list = tile.y * frame.tiles.x + tile.x;
     var begin = 0u;
     if list > 0u {
-        begin = table[list - 1u];
+        begin = ends[list - 1u];
     }
-    let end = table[list + frame.bin_chunks - 1u];
+    let end = ends[list];
     let x = f32(first.x);
     let y = f32(first.y) + vec4(0.0, 1.0, 2.0, 3.0);
     let log2_cut = vec4(log2(CUT));
@@ -54,7 +55,7 @@ fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) 
     var seen_y = vec4(0.0);
     var seen_z = vec4(0.0);
     for (var k = begin; k < end; k++) {
-        let g = pairs[k];
+        let g = pairs[k].y;
         let splat = splats[g];
         let dx = x - splat.pixel.x;
         let dy = y - splat.pixel.y;

@@ -2,8 +2,8 @@
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 
-use crate::raster_kernels::RasterShape;
-use crate::scan::MAX_LOOP;
+use crate::raster_kernels::Tile;
+use crate::sort::{Keys, MOST_ELEMENTS, RadixSort};
 
 /// Room for pairs of a Gaussian and a tile. A body-like surface needs about three a Gaussian; the share
 /// of the tiles is for a few Gaussians that cover the whole image.
@@ -22,8 +22,10 @@ pub(crate) struct ImageBuffers {
     layout: Layout,
     size: [u32; 2],
     gaussians: usize,
-    pub table: StorageBuffer<u32>,
-    pub pairs: StorageBuffer<u32>,
+    /// End of each tile's list.
+    pub ends: StorageBuffer<u32>,
+    /// Sorts (tile, Gaussian) by tile.
+    pub sort: RadixSort,
 }
 
 /// Buffers for an image of one size.
@@ -31,28 +33,19 @@ pub(crate) struct ImageBuffers {
 pub(crate) struct Layout {
     /// Columns and rows of tiles.
     pub tiles: [u32; 2],
-    /// Columns of the tile table.
-    pub bin_chunks: u32,
-    /// Elements of the tile table.
-    pub table_len: u32,
     /// Pairs of a Gaussian and a tile that can be listed.
     pub pair_capacity: u32,
 }
 
 impl ImageBuffers {
-    pub(crate) fn new(
-        gpu: &GpuContext,
-        shape: RasterShape,
-        size: [u32; 2],
-        gaussians: usize,
-    ) -> Result<Self, GpuError> {
-        let layout = Layout::new(gpu, shape, size, gaussians);
+    pub(crate) fn new(gpu: &GpuContext, tile: Tile, size: [u32; 2], gaussians: usize) -> Result<Self, GpuError> {
+        let layout = Layout::new(gpu, tile, size, gaussians);
         Ok(Self {
             layout,
             size,
             gaussians,
-            table: StorageBuffer::zeroed(gpu, "tile table", layout.table_len as usize)?,
-            pairs: StorageBuffer::zeroed(gpu, "tile lists", layout.pair_capacity as usize)?,
+            ends: StorageBuffer::zeroed(gpu, "ends of tile lists", layout.tile_count() as usize)?,
+            sort: RadixSort::new(gpu, layout.pair_capacity as usize)?,
         })
     }
 
@@ -60,16 +53,16 @@ impl ImageBuffers {
     pub(crate) fn fit(
         &mut self,
         gpu: &GpuContext,
-        shape: RasterShape,
+        tile: Tile,
         size: [u32; 2],
         gaussians: usize,
     ) -> Result<(), GpuError> {
         if (self.size, self.gaussians) == (size, gaussians) {
             return Ok(());
         }
-        let layout = Layout::new(gpu, shape, size, gaussians);
-        if layout.table_len as usize > self.table.len() || layout.pair_capacity as usize > self.pairs.len() {
-            *self = Self::new(gpu, shape, size, gaussians)?;
+        let layout = Layout::new(gpu, tile, size, gaussians);
+        if layout.tile_count() as usize > self.ends.len() || layout.pair_capacity as usize > self.sort.capacity() {
+            *self = Self::new(gpu, tile, size, gaussians)?;
         } else {
             (self.layout, self.size, self.gaussians) = (layout, size, gaussians);
         }
@@ -79,18 +72,30 @@ impl ImageBuffers {
     pub(crate) fn layout(&self) -> Layout {
         self.layout
     }
+
+    /// The lists, one after the other: (tile, Gaussian).
+    pub(crate) fn lists(&self) -> &StorageBuffer<[u32; 2]> {
+        self.sort.output(self.layout.keys())
+    }
 }
 
 impl Layout {
-    fn new(gpu: &GpuContext, shape: RasterShape, size: [u32; 2], gaussians: usize) -> Self {
-        let tiles = size.map(|side| side.div_ceil(shape.tile));
-        let count = tiles[0].saturating_mul(tiles[1]).max(1);
-        let bin_chunks = (shape.max_tile_table / count).clamp(1, shape.max_bin_chunks);
+    fn new(gpu: &GpuContext, tile: Tile, size: [u32; 2], gaussians: usize) -> Self {
+        let tiles = size.map(|side| side.div_ceil(tile.0));
         let limits = gpu.device.limits();
-        let limit = limits.max_buffer_size.min(limits.max_storage_buffer_binding_size) / 4;
-        // Each invocation of the binning walks over its share of the pairs.
-        let limit = limit.min(u64::from(bin_chunks) * MAX_LOOP);
-        let pair_capacity = pair_capacity(gaussians, u64::from(count), limit);
-        Self { tiles, bin_chunks, table_len: count.saturating_mul(bin_chunks), pair_capacity }
+        let limit = limits.max_buffer_size.min(limits.max_storage_buffer_binding_size) / size_of::<[u32; 2]>() as u64;
+        let limit = limit.min(MOST_ELEMENTS as u64);
+        let mut layout = Self { tiles, pair_capacity: 0 };
+        layout.pair_capacity = pair_capacity(gaussians, u64::from(layout.tile_count()), limit);
+        layout
+    }
+
+    pub(crate) fn tile_count(self) -> u32 {
+        self.tiles[0].saturating_mul(self.tiles[1]).max(1)
+    }
+
+    /// Of the sort by tile.
+    pub(crate) fn keys(self) -> Keys {
+        Keys::Below(self.tile_count())
     }
 }

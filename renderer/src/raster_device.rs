@@ -10,10 +10,10 @@ use wgpu::{BindingResource, CommandEncoder, ComputePass, ComputePassDescriptor};
 
 use crate::constants::Constants;
 use crate::raster_buffers::{ImageBuffers, Layout};
-use crate::raster_kernels::{Frame, RasterKernels, RasterShape};
+use crate::raster_kernels::{Frame, RasterKernels, Tile};
 use crate::raster_settings::{Latest, tile_range};
-use crate::scan::{CHUNK_GROUP, MAX_LOOP, Scan, run, run_at};
-use crate::sort::{RadixSort, SortPass};
+use crate::scan::{Scan, run, run_at};
+use crate::sort::{DIGIT_BITS, KEY_BITS, Keys, MOST_ELEMENTS, RadixSort, SortPass, table_len};
 use crate::{GaussianBuffers, Outputs, RasterSettings, RasterStats, RenderTarget};
 
 /// [`Rasterizer`](crate::Rasterizer) on the device. Buffers and pipelines are made once; they grow with the image and the
@@ -25,7 +25,6 @@ pub(crate) struct DeviceRasterizer {
     pub(crate) sort: RadixSort,
     pub(crate) splats: StorageBuffer<[f32; 8]>,
     pub(crate) rects: StorageBuffer<[u32; 2]>,
-    chunk_pairs: StorageBuffer<u32>,
     pub(crate) pairs_before: StorageBuffer<u32>,
     pair_total: StorageBuffer<u32>,
     stats: StorageBuffer<u32>,
@@ -37,21 +36,21 @@ pub(crate) struct DeviceRasterizer {
 
 impl DeviceRasterizer {
     pub(crate) fn new(gpu: &GpuContext, max_gaussians: usize) -> Result<Self, GpuError> {
-        Self::with_shape(gpu, max_gaussians, RasterShape::for_adapter(gpu))
+        Self::with_tile(gpu, max_gaussians, Tile::for_adapter(gpu))
     }
 
-    pub(crate) fn with_shape(gpu: &GpuContext, max_gaussians: usize, shape: RasterShape) -> Result<Self, GpuError> {
-        check_count(max_gaussians, shape)?;
-        let mut constants = vec![size_of::<Frame>(), size_of::<[u32; 4]>(), size_of::<[u32; 4]>()];
-        constants.resize(SORT_PASSES + shape.sort.digit_passes as usize, size_of::<SortPass>());
+    pub(crate) fn with_tile(gpu: &GpuContext, max_gaussians: usize, tile: Tile) -> Result<Self, GpuError> {
+        check_count(max_gaussians)?;
+        let mut constants = vec![size_of::<Frame>()];
+        constants.resize(DEPTH_PASSES, size_of::<[u32; 4]>());
+        constants.resize(TILE_PASSES + MOST_TILE_PASSES, size_of::<SortPass>());
         Ok(Self {
             constants: Constants::new(gpu, &constants)?,
-            kernels: RasterKernels::new(gpu, shape),
-            scan: Scan::new(gpu, shape.sort.chunks)?,
-            sort: RadixSort::new(gpu, max_gaussians, shape.sort)?,
+            kernels: RasterKernels::new(gpu, tile),
+            scan: Scan::new(gpu)?,
+            sort: RadixSort::new(gpu, max_gaussians)?,
             splats: StorageBuffer::zeroed(gpu, "splats", max_gaussians)?,
             rects: StorageBuffer::zeroed(gpu, "splat rectangles", max_gaussians)?,
-            chunk_pairs: StorageBuffer::zeroed(gpu, "pairs a chunk", shape.max_bin_chunks as usize)?,
             pairs_before: StorageBuffer::zeroed(gpu, "pairs before", max_gaussians)?,
             pair_total: StorageBuffer::zeroed(gpu, "pair total", 1)?,
             stats: StorageBuffer::zeroed(gpu, "raster statistics", 3)?,
@@ -76,7 +75,7 @@ impl DeviceRasterizer {
         self.grow(gpu, gaussians.count(), target)?;
         let Some(picture) = &self.picture else { return Ok(()) };
         let layout = picture.layout();
-        let (first_tile, blended) = tile_range(settings.area, layout.tiles, self.kernels.shape.tile);
+        let (first_tile, blended) = tile_range(settings.area, layout.tiles, self.kernels.tile.0);
         let frame = Frame {
             camera: CameraConstants::from(camera),
             size: [target.width, target.height],
@@ -87,13 +86,12 @@ impl DeviceRasterizer {
             pair_capacity: layout.pair_capacity,
             near_m: settings.near_m,
             filter_variance_px2: settings.filter_variance_px2,
-            bin_chunks: layout.bin_chunks,
-            unused: 0,
+            unused: [0; 2],
             first_tile,
             unused_too: [0; 2],
         };
         self.encode_constants(gpu, encoder, &frame, layout);
-        encoder.clear_buffer(picture.table.raw(), 0, Some(u64::from(layout.table_len) * 4));
+        self.sort.prepare(encoder);
         let blend = self.kernels.blend(gpu, settings.outputs);
         let stages = Stages { gpu, rasterizer: self, gaussians, target, picture, blended };
         let mut pass = |name, record: &dyn Fn(&mut ComputePass<'_>)| {
@@ -116,7 +114,7 @@ impl DeviceRasterizer {
     }
 
     fn grow(&mut self, gpu: &GpuContext, count: usize, target: &RenderTarget) -> Result<(), GpuError> {
-        check_count(count, self.kernels.shape)?;
+        check_count(count)?;
         if count > self.splats.len() {
             self.sort.grow(gpu, count)?;
             self.rects = StorageBuffer::zeroed(gpu, "splat rectangles", count)?;
@@ -124,20 +122,21 @@ impl DeviceRasterizer {
             self.splats = StorageBuffer::zeroed(gpu, "splats", count)?;
         }
         let size = [target.width, target.height];
-        let shape = self.kernels.shape;
+        let tile = self.kernels.tile;
         match &mut self.picture {
-            Some(picture) => picture.fit(gpu, shape, size, self.splats.len()),
+            Some(picture) => picture.fit(gpu, tile, size, self.splats.len()),
             none => {
-                *none = Some(ImageBuffers::new(gpu, shape, size, self.splats.len())?);
+                *none = Some(ImageBuffers::new(gpu, tile, size, self.splats.len())?);
                 Ok(())
             }
         }
     }
 
     fn encode_constants(&self, gpu: &GpuContext, encoder: &mut CommandEncoder, frame: &Frame, layout: Layout) {
-        let sort = self.kernels.shape.sort;
-        let lengths = [[sort.table_len(), 0, 0, 0], [layout.table_len, 0, 0, 0]];
-        let passes: Vec<SortPass> = (0..sort.digit_passes).map(|index| SortPass::new(frame.gaussians, index)).collect();
+        let (count, pairs) = (frame.gaussians as usize, layout.pair_capacity as usize);
+        let lengths = [frame.gaussians, table_len(count), table_len(pairs)].map(|length| [length, 0, 0, 0]);
+        let passes = |count, keys: Keys| (0..keys.passes()).map(move |index| SortPass::new(count, keys, index));
+        let passes: Vec<SortPass> = passes(count, Keys::Scaled).chain(passes(pairs, layout.keys())).collect();
         let mut values = vec![bytes_of(frame)];
         values.extend(lengths.iter().map(bytes_of));
         values.extend(passes.iter().map(bytes_of));
@@ -145,22 +144,26 @@ impl DeviceRasterizer {
     }
 }
 
-/// Refuses more Gaussians than the invocations of the sort may loop over.
-fn check_count(count: usize, shape: RasterShape) -> Result<(), GpuError> {
-    let limit = u64::from(shape.sort.chunks) * MAX_LOOP;
-    let bytes = size_of::<[u32; 2]>() as u64;
-    if count as u64 > limit {
+/// Refuses more Gaussians than can be sorted.
+fn check_count(count: usize) -> Result<(), GpuError> {
+    let bytes = |count: usize| count as u64 * size_of::<[u32; 2]>() as u64;
+    if count > MOST_ELEMENTS {
         let what = format!("the depth sort of {count} Gaussians");
-        return Err(GpuError::TooLarge { what, needed: count as u64 * bytes, limit: limit * bytes });
+        return Err(GpuError::TooLarge { what, needed: bytes(count), limit: bytes(MOST_ELEMENTS) });
     }
     Ok(())
 }
 
-/// Places in the [`Constants`] of one encoding.
+/// Places in the [`Constants`] of one encoding: the frame, lengths of what is scanned, passes of the sorts.
 pub(crate) const FRAME: usize = 0;
-const SORT_TABLE: usize = 1;
-const TILE_TABLE: usize = 2;
-const SORT_PASSES: usize = 3;
+const RANKS: usize = 1;
+const DEPTH_TABLE: usize = 2;
+const TILE_TABLE: usize = 3;
+const DEPTH_PASSES: usize = 4;
+const TILE_PASSES: usize = DEPTH_PASSES + KEY_BITS.div_ceil(DIGIT_BITS) as usize;
+const MOST_TILE_PASSES: usize = u32::BITS.div_ceil(DIGIT_BITS) as usize;
+/// Invocations of a workgroup of raster_bins.wgsl.
+const LANES: u32 = 256;
 
 /// Everything that one image's kernels are bound to.
 struct Stages<'a> {
@@ -189,32 +192,43 @@ impl Stages<'_> {
     }
 
     fn depth_sort(&self, pass: &mut ComputePass<'_>) {
-        let r = self.rasterizer;
-        let passes: Vec<_> = (0..r.kernels.shape.sort.digit_passes as usize)
-            .map(|i| self.rasterizer.constants.get(SORT_PASSES + i))
-            .collect();
-        r.sort.encode(self.gpu, pass, &r.scan, &passes, &self.rasterizer.constants.get(SORT_TABLE));
+        let (r, sorted) = (self.rasterizer, (self.gaussians.count(), Keys::Scaled));
+        let passes = self.passes(DEPTH_PASSES, Keys::Scaled);
+        r.sort.encode(self.gpu, pass, sorted, &r.scan, &passes, &r.constants.get(DEPTH_TABLE));
+    }
+
+    fn passes(&self, first: usize, keys: Keys) -> Vec<BindingResource<'_>> {
+        (0..keys.passes() as usize).map(|index| self.rasterizer.constants.get(first + index)).collect()
     }
 
     fn tile_lists(&self, pass: &mut ComputePass<'_>) {
         let (r, p) = (self.rasterizer, self.picture);
-        let resources: [BindingResource<'_>; 9] = [
+        let layout = p.layout();
+        let mut resources: [BindingResource<'_>; 10] = [
             r.constants.get(FRAME),
-            r.sort.output().raw().as_entire_binding(),
+            r.sort.output(Keys::Scaled).raw().as_entire_binding(),
             r.sort.valid().raw().as_entire_binding(),
             r.rects.raw().as_entire_binding(),
-            r.chunk_pairs.raw().as_entire_binding(),
             r.pairs_before.raw().as_entire_binding(),
-            p.table.raw().as_entire_binding(),
-            p.pairs.raw().as_entire_binding(),
+            r.pair_total.raw().as_entire_binding(),
+            p.sort.valid().raw().as_entire_binding(),
+            p.sort.input().raw().as_entire_binding(),
+            p.ends.raw().as_entire_binding(),
             r.stats.raw().as_entire_binding(),
         ];
-        let groups = (p.layout().bin_chunks.div_ceil(CHUNK_GROUP), 1);
-        run(self.gpu, pass, &r.kernels.count_pairs, &resources[..5], groups);
-        run(self.gpu, pass, &r.kernels.place_pairs, &resources[..6], groups);
-        run_at(self.gpu, pass, &r.kernels.count_tiles, &numbered(&resources, &[0, 1, 2, 3, 4, 5, 6, 8]), groups);
-        r.scan.encode(self.gpu, pass, &self.rasterizer.constants.get(TILE_TABLE), &p.table, &r.pair_total);
-        run(self.gpu, pass, &r.kernels.list_pairs, &resources[..8], groups);
+        let k = &r.kernels;
+        let ranks = dispatch_1d(self.gaussians.count() as u32, LANES);
+        run_at(self.gpu, pass, &k.count_pairs, &numbered(&resources, &[0, 1, 2, 3, 4]), ranks);
+        r.scan.encode(self.gpu, pass, &r.constants.get(RANKS), &r.pairs_before, &r.pair_total);
+        run_at(self.gpu, pass, &k.keep_pairs, &numbered(&resources, &[0, 2, 4, 5, 6, 9]), (1, 1));
+        let pairs = dispatch_1d(layout.pair_capacity, LANES);
+        run_at(self.gpu, pass, &k.write_pairs, &numbered(&resources, &[0, 1, 2, 3, 4, 6, 7]), pairs);
+        let passes = self.passes(TILE_PASSES, layout.keys());
+        let sorted = (layout.pair_capacity as usize, layout.keys());
+        p.sort.encode(self.gpu, pass, sorted, &r.scan, &passes, &r.constants.get(TILE_TABLE));
+        resources[7] = p.lists().raw().as_entire_binding();
+        let tiles = dispatch_1d(layout.tile_count(), LANES);
+        run_at(self.gpu, pass, &k.end_lists, &numbered(&resources, &[0, 6, 7, 8]), tiles);
     }
 
     fn blend(&self, pass: &mut ComputePass<'_>, kernels: &[(Outputs, Arc<ComputeKernel>)]) {
@@ -224,8 +238,8 @@ impl Stages<'_> {
             r.splats.raw().as_entire_binding(),
             self.gaussians.color.raw().as_entire_binding(),
             self.gaussians.canonical.raw().as_entire_binding(),
-            p.table.raw().as_entire_binding(),
-            p.pairs.raw().as_entire_binding(),
+            p.ends.raw().as_entire_binding(),
+            p.lists().raw().as_entire_binding(),
             t.color.raw().as_entire_binding(),
             t.depth.raw().as_entire_binding(),
             t.canonical.raw().as_entire_binding(),

@@ -10,9 +10,7 @@ struct Frame {
     pair_capacity: u32,
     near_m: f32,
     filter_variance_px2: f32,
-    // Invocations that share the binning, each with its own column of the tile table.
-    bin_chunks: u32,
-    unused: u32,
+    unused: vec2<u32>,
     // First of the tiles that are blended; the others keep their content.
     first_tile: vec2<u32>,
     unused_too: vec2<u32>,

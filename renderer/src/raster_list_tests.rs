@@ -32,13 +32,13 @@ fn every_tile_lists_its_gaussians_by_depth() {
     };
     let settings = RasterSettings { cull_backfacing: false, outputs: Outputs::COLOR, ..Default::default() };
     let target = RenderTarget::new(&gpu, 1920, 1080).unwrap();
-    for shape in [RasterShape::SOFTWARE, RasterShape::HARDWARE] {
-        let mut rasterizer = DeviceRasterizer::with_shape(&gpu, count, shape).unwrap();
+    for side in [Tile::SOFTWARE, Tile::HARDWARE] {
+        let mut rasterizer = DeviceRasterizer::with_tile(&gpu, count, side).unwrap();
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         rasterizer.encode_timed(&gpu, &mut encoder, &gaussians, (&camera, &settings), &target, None).unwrap();
         gpu.queue.submit([encoder.finish()]);
         let visible = rasterizer.sort.valid().read(&gpu).unwrap()[0] as usize;
-        let ordered = rasterizer.sort.output().read(&gpu).unwrap();
+        let ordered = rasterizer.sort.output(Keys::Scaled).read(&gpu).unwrap();
         assert!(ordered[..visible].is_sorted(), "by depth, then by number");
         let rects = rasterizer.rects.read(&gpu).unwrap();
         let picture = rasterizer.picture.as_ref().unwrap();
@@ -52,12 +52,13 @@ fn every_tile_lists_its_gaussians_by_depth() {
                 }
             }
         }
-        let ends = picture.table.read(&gpu).unwrap();
-        let pairs = picture.pairs.read(&gpu).unwrap();
+        let ends = picture.ends.read(&gpu).unwrap();
+        let lists = picture.lists().read(&gpu).unwrap();
         let mut begin = 0;
         for (tile, list) in expected.iter().enumerate() {
-            let end = ends[(tile + 1) * layout.bin_chunks as usize - 1] as usize;
-            assert!(pairs[begin..end] == *list, "tile {tile} of {shape:?}: {} {}", end - begin, list.len());
+            let end = ends[tile] as usize;
+            let found: Vec<u32> = lists[begin..end].iter().map(|pair| pair[1]).collect();
+            assert!(found == *list, "tile {tile} of {side:?}: {} {}", end - begin, list.len());
             begin = end;
         }
         assert!(begin > count, "{begin} pairs");

@@ -4,8 +4,8 @@ use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 
 use super::*;
 use crate::raster_backward;
-use crate::scan::{SCAN_WGSL, scan_prefix};
-use crate::sort::SORT_WGSL;
+use crate::scan::scan_wgsl;
+use crate::sort::sort_wgsl;
 
 fn validate(name: &str, source: &str) {
     assert!(!source.contains("var<uniform>"), "{name}: see constants.rs");
@@ -18,16 +18,16 @@ fn validate(name: &str, source: &str) {
 
 #[test]
 fn every_kernel_is_valid_wgsl_and_the_uniform_has_its_layout() {
-    for shape in [RasterShape::SOFTWARE, RasterShape::HARDWARE] {
-        validate("scan", &[&scan_prefix(shape.sort.chunks), SCAN_WGSL].concat());
-        validate("sort", &[&shape.sort.wgsl(), SORT_WGSL].concat());
-        validate("project", &project_wgsl(shape));
+    validate("scan", &scan_wgsl());
+    validate("sort", &sort_wgsl());
+    for tile in [Tile::SOFTWARE, Tile::HARDWARE] {
+        validate("project", &project_wgsl(tile));
         for bits in 0..8 {
             let outputs = Outputs { color: bits & 1 != 0, depth: bits & 2 != 0, canonical: bits & 4 != 0 };
-            validate("blend", &blend_wgsl(shape, outputs));
+            validate("blend", &blend_wgsl(tile, outputs));
         }
         for switch in [false, true] {
-            validate("blend backward", &raster_backward::blend_wgsl(shape, switch));
+            validate("blend backward", &raster_backward::blend_wgsl(tile, switch));
             validate("project backward", &raster_backward::project_wgsl(switch));
         }
     }
@@ -58,13 +58,8 @@ fn storage_buffers(source: &str) -> Vec<(String, usize)> {
 
 #[test]
 fn drawing_needs_no_more_storage_buffers_than_browsers_promise() {
-    let shape = RasterShape::HARDWARE;
-    let mut sources = vec![
-        project_wgsl(shape),
-        bins_wgsl(),
-        [&scan_prefix(shape.sort.chunks), SCAN_WGSL].concat(),
-        [&shape.sort.wgsl(), SORT_WGSL].concat(),
-    ];
+    let tile = Tile::HARDWARE;
+    let mut sources = vec![project_wgsl(tile), bins_wgsl(), scan_wgsl(), sort_wgsl()];
     for bits in 0..8 {
         let outputs = Outputs { color: bits & 1 != 0, depth: bits & 2 != 0, canonical: bits & 4 != 0 };
         let (passes, count) = blend_passes(outputs);
@@ -72,7 +67,7 @@ fn drawing_needs_no_more_storage_buffers_than_browsers_promise() {
             .iter()
             .fold([false; 3], |[c, d, k], pass| [c | pass.color, d | pass.depth, k | pass.canonical]);
         assert_eq!(written, [outputs.color, outputs.depth, outputs.canonical]);
-        sources.extend(passes[..count].iter().map(|&pass| blend_wgsl(shape, pass)));
+        sources.extend(passes[..count].iter().map(|&pass| blend_wgsl(tile, pass)));
     }
     let counts: Vec<_> = sources.iter().flat_map(|source| storage_buffers(source)).collect();
     println!("{counts:?}");

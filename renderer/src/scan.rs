@@ -3,32 +3,28 @@
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer};
 use wgpu::{BindGroup, BindingResource, ComputePass};
 
-pub(crate) const SCAN_WGSL: &str = include_str!("scan.wgsl");
-/// `@workgroup_size` of every kernel whose invocations own chunks; chunk counts are multiples of it.
-pub(crate) const CHUNK_GROUP: u32 = 32;
-/// Iterations that one invocation may spend in loops. Mesa's software adapter ends all loops of an invocation
-/// after 65535 iterations together, without a word.
-pub(crate) const MAX_LOOP: u64 = 60_000;
+const SCAN_WGSL: &str = include_str!("scan.wgsl");
+/// Workgroups that share a scan.
+const SEGMENTS: u32 = 128;
+/// Sums stop here: two of them do not overflow.
+const MOST: u32 = (1 << 31) - 1;
 
-/// Exclusive prefix sum in place, in two kernels, with one contiguous segment an invocation.
+/// Exclusive prefix sum in place, in two kernels, with one contiguous segment a workgroup. Sums stop at 2³¹ - 1.
 #[derive(Debug)]
 pub(crate) struct Scan {
     reduce: ComputeKernel,
     apply: ComputeKernel,
     sums: StorageBuffer<u32>,
-    segments: u32,
 }
 
 impl Scan {
-    /// `segments` invocations share the work (a multiple of [`CHUNK_GROUP`]).
-    pub(crate) fn new(gpu: &GpuContext, segments: u32) -> Result<Self, GpuError> {
-        let prefix = scan_prefix(segments);
-        let kernel = |entry| ComputeKernel::new(gpu, entry, &[&prefix, SCAN_WGSL], entry);
+    pub(crate) fn new(gpu: &GpuContext) -> Result<Self, GpuError> {
+        let source = scan_wgsl();
+        let kernel = |entry| ComputeKernel::new(gpu, entry, &[&source], entry);
         Ok(Self {
             reduce: kernel("reduce"),
             apply: kernel("apply"),
-            sums: StorageBuffer::zeroed(gpu, "scan sums", segments as usize)?,
-            segments,
+            sums: StorageBuffer::zeroed(gpu, "scan sums", SEGMENTS as usize)?,
         })
     }
 
@@ -45,14 +41,13 @@ impl Scan {
         let values = values.raw().as_entire_binding();
         let sums = self.sums.raw().as_entire_binding();
         let total = total.raw().as_entire_binding();
-        let groups = self.segments.div_ceil(CHUNK_GROUP);
-        run(gpu, pass, &self.reduce, &[length.clone(), values.clone(), sums.clone()], (groups, 1));
-        run(gpu, pass, &self.apply, &[length.clone(), values, sums, total], (groups, 1));
+        run(gpu, pass, &self.reduce, &[length.clone(), values.clone(), sums.clone()], (SEGMENTS, 1));
+        run(gpu, pass, &self.apply, &[length.clone(), values, sums, total], (SEGMENTS, 1));
     }
 }
 
-pub(crate) fn scan_prefix(segments: u32) -> String {
-    format!("const SEGMENTS: u32 = {segments}u;\n")
+pub(crate) fn scan_wgsl() -> String {
+    format!("const SEGMENTS: u32 = {SEGMENTS}u;\nconst MOST: u32 = {MOST}u;\n{SCAN_WGSL}")
 }
 
 /// Binds and dispatches one kernel.

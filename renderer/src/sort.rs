@@ -2,23 +2,40 @@
 
 use bytemuck::{Pod, Zeroable};
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer};
-use wgpu::{BindingResource, ComputePass};
+use wgpu::{BindingResource, CommandEncoder, ComputePass};
 
-use crate::scan::{CHUNK_GROUP, Scan, run};
+use crate::scan::{Scan, run};
 
-pub(crate) const SORT_WGSL: &str = include_str!("sort.wgsl");
+const SORT_WGSL: &str = include_str!("sort.wgsl");
 /// Elements with this key are left out of the result.
 pub(crate) const INVALID_KEY: u32 = u32::MAX;
+/// Bits a pass.
+pub(crate) const DIGIT_BITS: u32 = 8;
+/// Bits of their range to which scaled keys are compared.
+pub(crate) const KEY_BITS: u32 = 24;
+/// Elements of a workgroup.
+const BLOCK: usize = 1024;
+/// Elements that can be sorted: a dispatch has no more workgroups.
+pub(crate) const MOST_ELEMENTS: usize = flyrig_gpu::MAX_WORKGROUPS_PER_DIMENSION as usize * BLOCK;
 
-/// How the work is cut.
+/// How keys are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct SortShape {
-    /// Invocations, a multiple of [`CHUNK_GROUP`].
-    pub chunks: u32,
-    /// Bits a pass.
-    pub digit_bits: u32,
-    /// Passes. Keys are compared to `digit_bits * digit_passes` bits of their range.
-    pub digit_passes: u32,
+pub(crate) enum Keys {
+    /// By `(key - smallest) >> shift`, the shift being the least that fits the range of the keys into [`KEY_BITS`]: exact
+    /// for ranges up to `2^KEY_BITS`, else keys closer than `2^shift` may count as equal. Elements with [`INVALID_KEY`] are left out.
+    Scaled,
+    /// All below this number, as they are. How many elements there are says [`RadixSort::valid`] beforehand.
+    Below(u32),
+}
+
+impl Keys {
+    /// Passes that a sort of these takes.
+    pub(crate) fn passes(self) -> u32 {
+        match self {
+            Self::Scaled => KEY_BITS.div_ceil(DIGIT_BITS),
+            Self::Below(end) => (u32::BITS - end.saturating_sub(1).leading_zeros()).div_ceil(DIGIT_BITS).max(1),
+        }
+    }
 }
 
 /// Constants of one pass.
@@ -27,28 +44,35 @@ pub(crate) struct SortShape {
 pub(crate) struct SortPass {
     count: u32,
     index: u32,
-    unused: [u32; 2],
+    blocks: u32,
+    scaled: u32,
 }
 
 impl SortPass {
-    pub(crate) fn new(count: u32, index: u32) -> Self {
-        Self { count, index, unused: [0; 2] }
+    /// Of a sort of at most `count` elements.
+    pub(crate) fn new(count: usize, keys: Keys, index: u32) -> Self {
+        Self { count: count as u32, index, blocks: blocks(count), scaled: (keys == Keys::Scaled).into() }
     }
 }
 
+/// Workgroups that sort so many elements.
+fn blocks(count: usize) -> u32 {
+    count.div_ceil(BLOCK).max(1) as u32
+}
+
+/// Elements of the table for a sort of at most so many elements.
+pub(crate) fn table_len(count: usize) -> u32 {
+    blocks(count) << DIGIT_BITS
+}
+
 /// Stable least-significant-digit radix sort of `(key, payload)`, smallest key first. Equal input gives
-/// equal bytes: no atomics, and no assumption about when other workgroups make progress.
-///
-/// Keys are sorted by `(key - smallest) >> shift`, the shift being the least that fits the range of the
-/// keys into the digits: exact for ranges up to `2^(digit_bits * digit_passes)`, else keys closer than
-/// `2^shift` may count as equal.
+/// equal bytes: no assumption about when other workgroups make progress.
 #[derive(Debug)]
 pub(crate) struct RadixSort {
-    shape: SortShape,
     find_range: ComputeKernel,
     count_digits: ComputeKernel,
     scatter: ComputeKernel,
-    ranges: StorageBuffer<[u32; 2]>,
+    extremes: StorageBuffer<u32>,
     table: StorageBuffer<u32>,
     valid: StorageBuffer<u32>,
     /// Input, then every second pass's output.
@@ -57,16 +81,15 @@ pub(crate) struct RadixSort {
 }
 
 impl RadixSort {
-    pub(crate) fn new(gpu: &GpuContext, capacity: usize, shape: SortShape) -> Result<Self, GpuError> {
-        let prefix = shape.wgsl();
-        let kernel = |entry| ComputeKernel::new(gpu, entry, &[&prefix, SORT_WGSL], entry);
+    pub(crate) fn new(gpu: &GpuContext, capacity: usize) -> Result<Self, GpuError> {
+        let source = sort_wgsl();
+        let kernel = |entry| ComputeKernel::new(gpu, entry, &[&source], entry);
         Ok(Self {
-            shape,
             find_range: kernel("find_range"),
             count_digits: kernel("count_digits"),
             scatter: kernel("scatter"),
-            ranges: StorageBuffer::zeroed(gpu, "sort key ranges", shape.chunks as usize)?,
-            table: StorageBuffer::zeroed(gpu, "sort table", shape.table_len() as usize)?,
+            extremes: StorageBuffer::zeroed(gpu, "sort extremes", 2)?,
+            table: StorageBuffer::zeroed(gpu, "sort table", table_len(capacity) as usize)?,
             valid: StorageBuffer::zeroed(gpu, "sort valid count", 1)?,
             elements: StorageBuffer::zeroed(gpu, "sort elements", capacity)?,
             other: StorageBuffer::zeroed(gpu, "sort elements, other", capacity)?,
@@ -76,10 +99,14 @@ impl RadixSort {
     /// Room for `capacity` elements from now on.
     pub(crate) fn grow(&mut self, gpu: &GpuContext, capacity: usize) -> Result<(), GpuError> {
         if capacity > self.elements.len() {
-            self.elements = StorageBuffer::zeroed(gpu, "sort elements", capacity)?;
-            self.other = StorageBuffer::zeroed(gpu, "sort elements, other", capacity)?;
+            *self = Self::new(gpu, capacity)?;
         }
         Ok(())
+    }
+
+    /// Elements there is room for.
+    pub(crate) fn capacity(&self) -> usize {
+        self.elements.len()
     }
 
     /// Where the elements must be before [`Self::encode`].
@@ -88,58 +115,56 @@ impl RadixSort {
     }
 
     /// Where they are after it; only the first [`Self::valid`] mean anything.
-    pub(crate) fn output(&self) -> &StorageBuffer<[u32; 2]> {
-        if self.shape.digit_passes.is_multiple_of(2) { &self.elements } else { &self.other }
+    pub(crate) fn output(&self, keys: Keys) -> &StorageBuffer<[u32; 2]> {
+        if keys.passes().is_multiple_of(2) { &self.elements } else { &self.other }
     }
 
-    /// Number of elements whose key was valid.
+    /// Number of elements that are sorted.
     pub(crate) fn valid(&self) -> &StorageBuffer<u32> {
         &self.valid
     }
 
-    /// Sorts; `passes` holds one [`SortPass`] constants a pass, `scan_length` the length of the table.
+    /// Records what a sort needs before its pass.
+    pub(crate) fn prepare(&self, encoder: &mut CommandEncoder) {
+        self.extremes.encode_clear(encoder);
+    }
+
+    /// Sorts at most `count` elements; `passes` holds the constants of each [`SortPass`], `scan_length` [`table_len`].
     pub(crate) fn encode(
         &self,
         gpu: &GpuContext,
         pass: &mut ComputePass<'_>,
+        (count, keys): (usize, Keys),
         scan: &Scan,
         passes: &[BindingResource<'_>],
         scan_length: &BindingResource<'_>,
     ) {
-        let ranges = self.ranges.raw().as_entire_binding();
+        let extremes = self.extremes.raw().as_entire_binding();
         let table = self.table.raw().as_entire_binding();
         let valid = self.valid.raw().as_entire_binding();
-        let groups = (self.shape.chunks.div_ceil(CHUNK_GROUP), 1);
+        let groups = (blocks(count), 1);
         let (mut from, mut to) = (&self.elements, &self.other);
         for (index, constants) in passes.iter().enumerate() {
             let source = from.raw().as_entire_binding();
             let target = to.raw().as_entire_binding();
-            if index == 0 {
-                run(gpu, pass, &self.find_range, &[constants.clone(), source.clone(), ranges.clone()], groups);
+            if index == 0 && keys == Keys::Scaled {
+                run(gpu, pass, &self.find_range, &[constants.clone(), source.clone(), extremes.clone()], groups);
             }
-            let mut resources = vec![constants.clone(), source, ranges.clone(), table.clone(), valid.clone()];
+            let mut resources = vec![constants.clone(), source, extremes.clone(), table.clone(), valid.clone()];
             run(gpu, pass, &self.count_digits, &resources, groups);
             scan.encode(gpu, pass, scan_length, &self.table, &self.valid);
             resources.push(target);
-            // The scatter reads its column of the table only; the count of elements stays untouched.
             run(gpu, pass, &self.scatter, &resources, groups);
             (from, to) = (to, from);
         }
     }
 }
 
-impl SortShape {
-    pub(crate) fn table_len(self) -> u32 {
-        self.chunks << self.digit_bits
-    }
-
-    pub(crate) fn wgsl(self) -> String {
-        let Self { chunks, digit_bits, digit_passes } = self;
-        format!(
-            "const CHUNKS: u32 = {chunks}u;\nconst DIGIT_BITS: u32 = {digit_bits}u;\n\
-             const DIGIT_PASSES: u32 = {digit_passes}u;\nconst INVALID_KEY: u32 = {INVALID_KEY}u;\n"
-        )
-    }
+pub(crate) fn sort_wgsl() -> String {
+    format!(
+        "const DIGIT_BITS: u32 = {DIGIT_BITS}u;\nconst KEY_BITS: u32 = {KEY_BITS}u;\n\
+         const INVALID_KEY: u32 = {INVALID_KEY}u;\n{SORT_WGSL}"
+    )
 }
 
 #[cfg(test)]

@@ -1,89 +1,164 @@
-// One pass of a stable least-significant-digit radix sort. Each invocation owns one contiguous chunk
-// and its own column of the histogram table; nothing depends on when other workgroups run.
-// Prefix: const CHUNKS, DIGIT_BITS, DIGIT_PASSES, INVALID_KEY.
+// One pass of a stable least-significant-digit radix sort. A workgroup owns one contiguous block and its own column of the
+// histogram table; nothing depends on when other workgroups run. Atomics only count, so that their order does not matter.
+// Prefix: const DIGIT_BITS, KEY_BITS, INVALID_KEY.
 struct SortPass {
     // Elements before the first pass.
     count: u32,
+    // Number of the digit.
     index: u32,
+    // Columns of the table.
+    blocks: u32,
+    // Whether keys are taken from the smallest on, and invalid ones left out; else as they are, `valid[0]` of them.
+    scaled: u32,
 }
 
 @group(0) @binding(0) var<storage, read> sort_pass: SortPass;
 // (key, payload)
 @group(0) @binding(1) var<storage, read_write> source: array<vec2<u32>>;
-// Smallest and largest valid key of every chunk.
-@group(0) @binding(2) var<storage, read_write> ranges: array<vec2<u32>>;
-// Digit-major: table[digit * CHUNKS + chunk].
+// Largest ~key and largest key of all that are valid (zeroed before).
+@group(0) @binding(2) var<storage, read_write> extremes: array<atomic<u32>, 2>;
+// Digit-major: table[digit * blocks + block].
 @group(0) @binding(3) var<storage, read_write> table: array<u32>;
 // Number of valid elements, known after the first pass.
 @group(0) @binding(4) var<storage, read_write> valid: array<u32>;
 @group(0) @binding(5) var<storage, read_write> sorted: array<vec2<u32>>;
 
-fn chunk(index: u32) -> vec2<u32> {
-    var count = sort_pass.count;
-    if sort_pass.index > 0u {
-        count = valid[0];
+const DIGITS = 1u << DIGIT_BITS;
+const LANES = 128u;
+const BLOCK = 1024u;
+// Lanes that walk over elements in their order, and elements of each.
+const WALKERS = 16u;
+const WALK = BLOCK / WALKERS;
+// Rows and columns are one element apart more than they are long, so that lanes do not meet in a bank of memory.
+const WORDS = DIGITS / 2u;
+const ROW = WALKERS + 1u;
+const NONE = 0xffffffffu;
+
+var<workgroup> low: atomic<u32>;
+var<workgroup> high: atomic<u32>;
+var<workgroup> histogram: array<atomic<u32>, DIGITS>;
+// Digit of every element, then its place.
+var<workgroup> places: array<u32, WALKERS * (WALK + 1u)>;
+// Counts of two digits a word, by walker.
+var<workgroup> counts: array<u32, WORDS * ROW>;
+var<workgroup> starts: array<u32, DIGITS>;
+
+fn count_of_elements() -> u32 {
+    if sort_pass.scaled != 0u && sort_pass.index == 0u {
+        return sort_pass.count;
     }
-    let size = (count + CHUNKS - 1u) / CHUNKS;
-    let begin = min(index * size, count);
-    return vec2(begin, min(begin + size, count));
+    return min(valid[0], sort_pass.count);
 }
 
-@compute @workgroup_size(32)
-fn find_range(@builtin(global_invocation_id) id: vec3<u32>) {
-    let size = (sort_pass.count + CHUNKS - 1u) / CHUNKS;
-    let begin = min(id.x * size, sort_pass.count);
-    let end = min(begin + size, sort_pass.count);
-    var range = vec2(0xffffffffu, 0u);
-    for (var i = begin; i < end; i++) {
-        let key = source[i].x;
-        if key != INVALID_KEY {
-            range = vec2(min(range.x, key), max(range.y, key));
+@compute @workgroup_size(LANES)
+fn find_range(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    var range = vec2(0u);
+    for (var k = 0u; k < BLOCK / LANES; k++) {
+        let i = group.x * BLOCK + k * LANES + lane;
+        if i < sort_pass.count {
+            let key = source[i].x;
+            if key != INVALID_KEY {
+                range = max(range, vec2(~key, key));
+            }
         }
     }
-    ranges[id.x] = range;
+    atomicMax(&low, range.x);
+    atomicMax(&high, range.y);
+    workgroupBarrier();
+    if lane == 0u {
+        atomicMax(&extremes[0], atomicLoad(&low));
+        atomicMax(&extremes[1], atomicLoad(&high));
+    }
 }
 
-// x: smallest key; y: right shift that makes the range of the keys fit all digits.
+// x: smallest key; y: right shift that makes the range of the keys fit KEY_BITS.
 fn key_scaling() -> vec2<u32> {
-    var range = vec2(0xffffffffu, 0u);
-    for (var c = 0u; c < CHUNKS; c++) {
-        let r = ranges[c];
-        range = vec2(min(range.x, r.x), max(range.y, r.y));
+    if sort_pass.scaled == 0u {
+        return vec2(0u);
     }
-    let bits = 32u - countLeadingZeros(max(range.x, range.y) - range.x);
-    return vec2(range.x, max(bits, DIGIT_BITS * DIGIT_PASSES) - DIGIT_BITS * DIGIT_PASSES);
+    let smallest = ~atomicLoad(&extremes[0]);
+    let largest = atomicLoad(&extremes[1]);
+    let bits = 32u - countLeadingZeros(max(smallest, largest) - smallest);
+    return vec2(smallest, max(bits, KEY_BITS) - KEY_BITS);
 }
 
-fn digit(key: u32, scaling: vec2<u32>) -> u32 {
-    return (((key - scaling.x) >> scaling.y) >> (DIGIT_BITS * sort_pass.index)) & ((1u << DIGIT_BITS) - 1u);
+// NONE for an element that is left out.
+fn digit_of(i: u32, count: u32, scaling: vec2<u32>) -> u32 {
+    if i >= count {
+        return NONE;
+    }
+    let key = source[i].x;
+    if key == INVALID_KEY {
+        return NONE;
+    }
+    return (((key - scaling.x) >> scaling.y) >> (DIGIT_BITS * sort_pass.index)) & (DIGITS - 1u);
 }
 
-@compute @workgroup_size(32)
-fn count_digits(@builtin(global_invocation_id) id: vec3<u32>) {
-    for (var d = 0u; d < (1u << DIGIT_BITS); d++) {
-        table[d * CHUNKS + id.x] = 0u;
-    }
+@compute @workgroup_size(LANES)
+fn count_digits(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let count = count_of_elements();
     let scaling = key_scaling();
-    let range = chunk(id.x);
-    for (var i = range.x; i < range.y; i++) {
-        let key = source[i].x;
-        if key != INVALID_KEY {
-            table[digit(key, scaling) * CHUNKS + id.x] += 1u;
+    for (var k = 0u; k < BLOCK / LANES; k++) {
+        let digit = digit_of(group.x * BLOCK + k * LANES + lane, count, scaling);
+        if digit != NONE {
+            atomicAdd(&histogram[digit], 1u);
         }
     }
+    workgroupBarrier();
+    for (var digit = lane; digit < DIGITS; digit += LANES) {
+        table[digit * sort_pass.blocks + group.x] = atomicLoad(&histogram[digit]);
+    }
 }
 
-@compute @workgroup_size(32)
-fn scatter(@builtin(global_invocation_id) id: vec3<u32>) {
+@compute @workgroup_size(LANES)
+fn scatter(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let count = count_of_elements();
     let scaling = key_scaling();
-    let range = chunk(id.x);
-    for (var i = range.x; i < range.y; i++) {
-        let element = source[i];
-        if element.x != INVALID_KEY {
-            let cell = digit(element.x, scaling) * CHUNKS + id.x;
-            let place = table[cell];
-            table[cell] = place + 1u;
-            sorted[place] = element;
+    let first = group.x * BLOCK;
+    for (var k = 0u; k < BLOCK / LANES; k++) {
+        let i = k * LANES + lane;
+        places[i + i / WALK] = digit_of(first + i, count, scaling);
+    }
+    for (var digit = lane; digit < DIGITS; digit += LANES) {
+        starts[digit] = table[digit * sort_pass.blocks + group.x];
+    }
+    workgroupBarrier();
+    if lane < WALKERS {
+        for (var k = 0u; k < WALK; k++) {
+            let digit = places[lane * (WALK + 1u) + k];
+            if digit != NONE {
+                counts[(digit / 2u) * ROW + lane] += 1u << (16u * (digit & 1u));
+            }
+        }
+    }
+    workgroupBarrier();
+    for (var word = lane; word < WORDS; word += LANES) {
+        var sum = 0u;
+        for (var walker = 0u; walker < WALKERS; walker++) {
+            let own = counts[word * ROW + walker];
+            counts[word * ROW + walker] = sum;
+            sum += own;
+        }
+    }
+    workgroupBarrier();
+    if lane < WALKERS {
+        for (var k = 0u; k < WALK; k++) {
+            let at = lane * (WALK + 1u) + k;
+            let digit = places[at];
+            if digit != NONE {
+                let cell = (digit / 2u) * ROW + lane;
+                let shift = 16u * (digit & 1u);
+                places[at] = starts[digit] + ((counts[cell] >> shift) & 0xffffu);
+                counts[cell] += 1u << shift;
+            }
+        }
+    }
+    workgroupBarrier();
+    for (var k = 0u; k < BLOCK / LANES; k++) {
+        let i = k * LANES + lane;
+        let place = places[i + i / WALK];
+        if place != NONE {
+            sorted[place] = source[first + i];
         }
     }
 }
