@@ -204,7 +204,7 @@ impl DeviceBackward {
                 self.pair_sums.raw().as_entire_binding(),
                 self.tile_limits.raw().as_entire_binding(),
             ],
-            latest.blended.into(),
+            <(u32, u32)>::from(latest.blended),
         );
         run(
             gpu,

@@ -2,7 +2,7 @@
 // (sort.wgsl) makes lists of them. Sharing by pairs bounds every loop, whatever the footprints: Mesa's software adapter
 // silently ends loops after 65535 iterations of one invocation.
 // No kernel uses more than 8 of the bindings: all that browsers promise (raster_shader_tests.rs).
-// Prefix: camera.wgsl, raster_frame.wgsl.
+// Prefix: const BLOCK, DIGIT_BITS of the sort, camera.wgsl, raster_frame.wgsl.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 // (depth key, Gaussian), nearest first
 @group(0) @binding(1) var<storage, read> ordered: array<vec2<u32>>;
@@ -19,8 +19,18 @@
 @group(0) @binding(8) var<storage, read_write> ends: array<u32>;
 // visible Gaussians, pairs wanted, images so far that wanted more pairs than there is room for
 @group(0) @binding(9) var<storage, read_write> stats: array<u32>;
+@group(0) @binding(10) var<storage, read_write> work: Work;
 
 const LANES = 256u;
+
+// Of the kernels whose work depends on the number of pairs.
+struct Work {
+    // x: length of the table that the sort by tile scans.
+    table_length: vec4<u32>,
+    // xyz: workgroups of write_pairs, and of the sort by tile.
+    write_groups: vec4<u32>,
+    sort_groups: vec4<u32>,
+}
 
 struct Rect {
     first: vec2<u32>,
@@ -78,6 +88,10 @@ fn keep_pairs() {
         stats[2] += 1u;
     }
     kept[0] = fitting;
+    let blocks = max(1u, (fitting + BLOCK - 1u) / BLOCK);
+    work.table_length.x = blocks << DIGIT_BITS;
+    work.write_groups = vec4((fitting + LANES - 1u) / LANES, 1u, 1u, 0u);
+    work.sort_groups = vec4(blocks, 1u, 1u, 0u);
     stats[0] = visible[0];
     stats[1] = wanted;
 }

@@ -1,15 +1,17 @@
 //! Buffers of the rasteriser whose size follows the image.
 
-use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
+use flyrig_gpu::{GpuContext, GpuError, MAX_WORKGROUPS_PER_DIMENSION, StorageBuffer};
 
 use crate::raster_kernels::Tile;
-use crate::sort::{Keys, MOST_ELEMENTS, RadixSort};
+use crate::sort::{Keys, RadixSort};
 
 /// Room for pairs of a Gaussian and a tile. A body-like surface needs about three a Gaussian; the share
 /// of the tiles is for a few Gaussians that cover the whole image.
 const PAIRS_PER_GAUSSIAN: u64 = 16;
 const PAIRS_PER_TILE: u64 = 64;
 const MIN_PAIRS: u64 = 1 << 18;
+/// The kernel that writes them has a workgroup for every 256.
+const MOST_PAIRS: u64 = MAX_WORKGROUPS_PER_DIMENSION as u64 * 256;
 
 /// Pairs that an image has room for, at most `limit`.
 pub(crate) fn pair_capacity(gaussians: usize, tiles: u64, limit: u64) -> u32 {
@@ -84,7 +86,7 @@ impl Layout {
         let tiles = size.map(|side| side.div_ceil(tile.0));
         let limits = gpu.device.limits();
         let limit = limits.max_buffer_size.min(limits.max_storage_buffer_binding_size) / size_of::<[u32; 2]>() as u64;
-        let limit = limit.min(MOST_ELEMENTS as u64);
+        let limit = limit.min(MOST_PAIRS);
         let mut layout = Self { tiles, pair_capacity: 0 };
         layout.pair_capacity = pair_capacity(gaussians, u64::from(layout.tile_count()), limit);
         layout

@@ -6,14 +6,14 @@ use std::sync::Arc;
 use bytemuck::bytes_of;
 use flyrig_gpu::{CameraConstants, ComputeKernel, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
 use flyrig_types::Camera;
-use wgpu::{BindingResource, CommandEncoder, ComputePass, ComputePassDescriptor};
+use wgpu::{BindingResource, BufferBinding, BufferSize, CommandEncoder, ComputePass, ComputePassDescriptor};
 
 use crate::constants::Constants;
 use crate::raster_buffers::{ImageBuffers, Layout};
 use crate::raster_kernels::{Frame, RasterKernels, Tile};
 use crate::raster_settings::{Latest, tile_range};
-use crate::scan::{Scan, run, run_at};
-use crate::sort::{DIGIT_BITS, KEY_BITS, Keys, MOST_ELEMENTS, RadixSort, SortPass, table_len};
+use crate::scan::{Groups, Scan, run, run_at};
+use crate::sort::{DIGIT_BITS, KEY_BITS, Keys, MOST_ELEMENTS, RadixSort, SortPass, blocks, table_len};
 use crate::{GaussianBuffers, Outputs, RasterSettings, RasterStats, RenderTarget};
 
 /// [`Rasterizer`](crate::Rasterizer) on the device. Buffers and pipelines are made once; they grow with the image and the
@@ -27,6 +27,8 @@ pub(crate) struct DeviceRasterizer {
     pub(crate) rects: StorageBuffer<[u32; 2]>,
     pub(crate) pairs_before: StorageBuffer<u32>,
     pair_total: StorageBuffer<u32>,
+    /// `struct Work` of raster_bins.wgsl.
+    work: StorageBuffer<u32>,
     stats: StorageBuffer<u32>,
     /// Of the image recorded last.
     pub(crate) constants: Constants,
@@ -53,6 +55,7 @@ impl DeviceRasterizer {
             rects: StorageBuffer::zeroed(gpu, "splat rectangles", max_gaussians)?,
             pairs_before: StorageBuffer::zeroed(gpu, "pairs before", max_gaussians)?,
             pair_total: StorageBuffer::zeroed(gpu, "pair total", 1)?,
+            work: StorageBuffer::zeroed(gpu, "work on pairs", 12)?,
             stats: StorageBuffer::zeroed(gpu, "raster statistics", 3)?,
             picture: None,
             latest: None,
@@ -134,7 +137,7 @@ impl DeviceRasterizer {
 
     fn encode_constants(&self, gpu: &GpuContext, encoder: &mut CommandEncoder, frame: &Frame, layout: Layout) {
         let (count, pairs) = (frame.gaussians as usize, layout.pair_capacity as usize);
-        let lengths = [frame.gaussians, table_len(count), table_len(pairs)].map(|length| [length, 0, 0, 0]);
+        let lengths = [frame.gaussians, table_len(count)].map(|length| [length, 0, 0, 0]);
         let passes = |count, keys: Keys| (0..keys.passes()).map(move |index| SortPass::new(count, keys, index));
         let passes: Vec<SortPass> = passes(count, Keys::Scaled).chain(passes(pairs, layout.keys())).collect();
         let mut values = vec![bytes_of(frame)];
@@ -158,8 +161,7 @@ fn check_count(count: usize) -> Result<(), GpuError> {
 pub(crate) const FRAME: usize = 0;
 const RANKS: usize = 1;
 const DEPTH_TABLE: usize = 2;
-const TILE_TABLE: usize = 3;
-const DEPTH_PASSES: usize = 4;
+const DEPTH_PASSES: usize = 3;
 const TILE_PASSES: usize = DEPTH_PASSES + KEY_BITS.div_ceil(DIGIT_BITS) as usize;
 const MOST_TILE_PASSES: usize = u32::BITS.div_ceil(DIGIT_BITS) as usize;
 /// Invocations of a workgroup of raster_bins.wgsl.
@@ -192,7 +194,7 @@ impl Stages<'_> {
     }
 
     fn depth_sort(&self, pass: &mut ComputePass<'_>) {
-        let (r, sorted) = (self.rasterizer, (self.gaussians.count(), Keys::Scaled));
+        let (r, sorted) = (self.rasterizer, ((blocks(self.gaussians.count()), 1).into(), Keys::Scaled));
         let passes = self.passes(DEPTH_PASSES, Keys::Scaled);
         r.sort.encode(self.gpu, pass, sorted, &r.scan, &passes, &r.constants.get(DEPTH_TABLE));
     }
@@ -204,7 +206,7 @@ impl Stages<'_> {
     fn tile_lists(&self, pass: &mut ComputePass<'_>) {
         let (r, p) = (self.rasterizer, self.picture);
         let layout = p.layout();
-        let mut resources: [BindingResource<'_>; 10] = [
+        let mut resources: [BindingResource<'_>; 11] = [
             r.constants.get(FRAME),
             r.sort.output(Keys::Scaled).raw().as_entire_binding(),
             r.sort.valid().raw().as_entire_binding(),
@@ -215,17 +217,19 @@ impl Stages<'_> {
             p.sort.input().raw().as_entire_binding(),
             p.ends.raw().as_entire_binding(),
             r.stats.raw().as_entire_binding(),
+            r.work.raw().as_entire_binding(),
         ];
         let k = &r.kernels;
         let ranks = dispatch_1d(self.gaussians.count() as u32, LANES);
         run_at(self.gpu, pass, &k.count_pairs, &numbered(&resources, &[0, 1, 2, 3, 4]), ranks);
         r.scan.encode(self.gpu, pass, &r.constants.get(RANKS), &r.pairs_before, &r.pair_total);
-        run_at(self.gpu, pass, &k.keep_pairs, &numbered(&resources, &[0, 2, 4, 5, 6, 9]), (1, 1));
-        let pairs = dispatch_1d(layout.pair_capacity, LANES);
+        run_at(self.gpu, pass, &k.keep_pairs, &numbered(&resources, &[0, 2, 4, 5, 6, 9, 10]), (1, 1));
+        let pairs = Groups::Counted(&r.work, 16);
         run_at(self.gpu, pass, &k.write_pairs, &numbered(&resources, &[0, 1, 2, 3, 4, 6, 7]), pairs);
         let passes = self.passes(TILE_PASSES, layout.keys());
-        let sorted = (layout.pair_capacity as usize, layout.keys());
-        p.sort.encode(self.gpu, pass, sorted, &r.scan, &passes, &r.constants.get(TILE_TABLE));
+        let length = BufferBinding { buffer: r.work.raw(), offset: 0, size: BufferSize::new(16) };
+        let sorted = (Groups::Counted(&r.work, 32), layout.keys());
+        p.sort.encode(self.gpu, pass, sorted, &r.scan, &passes, &BindingResource::Buffer(length));
         resources[7] = p.lists().raw().as_entire_binding();
         let tiles = dispatch_1d(layout.tile_count(), LANES);
         run_at(self.gpu, pass, &k.end_lists, &numbered(&resources, &[0, 6, 7, 8]), tiles);
@@ -249,7 +253,7 @@ impl Stages<'_> {
             used.extend(if outputs.color { &[2, 6][..] } else { &[] });
             used.extend(if outputs.depth { &[7][..] } else { &[] });
             used.extend(if outputs.canonical { &[3, 8][..] } else { &[] });
-            run_at(self.gpu, pass, kernel, &numbered(&resources, &used), self.blended.into());
+            run_at(self.gpu, pass, kernel, &numbered(&resources, &used), <(u32, u32)>::from(self.blended));
         }
     }
 }

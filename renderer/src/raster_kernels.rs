@@ -8,7 +8,7 @@ use flyrig_gpu::{CAMERA_WGSL, CameraConstants, ComputeKernel, GpuContext};
 
 use crate::Outputs;
 use crate::schema::bindings_wgsl;
-use crate::sort::INVALID_KEY;
+use crate::sort::{BLOCK, DIGIT_BITS, INVALID_KEY};
 
 pub(crate) const FRAME_WGSL: &str = include_str!("raster_frame.wgsl");
 const PROJECT_WGSL: &str = include_str!("raster_project.wgsl");
@@ -73,7 +73,8 @@ pub(crate) fn project_wgsl(tile: Tile) -> String {
 }
 
 pub(crate) fn bins_wgsl() -> String {
-    [CAMERA_WGSL, FRAME_WGSL, BINS_WGSL].concat()
+    let constants = format!("const BLOCK: u32 = {BLOCK}u;\nconst DIGIT_BITS: u32 = {DIGIT_BITS}u;\n");
+    [&constants, CAMERA_WGSL, FRAME_WGSL, BINS_WGSL].concat()
 }
 
 /// The kernel that writes these outputs; at most two of them fit the bindings of one.

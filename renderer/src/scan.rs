@@ -50,30 +50,48 @@ pub(crate) fn scan_wgsl() -> String {
     format!("const SEGMENTS: u32 = {SEGMENTS}u;\nconst MOST: u32 = {MOST}u;\n{SCAN_WGSL}")
 }
 
+/// How many workgroups a dispatch has.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Groups<'a> {
+    /// In x and y.
+    Fixed(u32, u32),
+    /// As three numbers in a buffer say, from this byte on.
+    Counted(&'a StorageBuffer<u32>, u64),
+}
+
+impl From<(u32, u32)> for Groups<'_> {
+    fn from((x, y): (u32, u32)) -> Self {
+        Self::Fixed(x, y)
+    }
+}
+
 /// Binds and dispatches one kernel.
-pub(crate) fn run(
+pub(crate) fn run<'a>(
     gpu: &GpuContext,
     pass: &mut ComputePass<'_>,
     kernel: &ComputeKernel,
     resources: &[BindingResource<'_>],
-    groups: (u32, u32),
+    groups: impl Into<Groups<'a>>,
 ) {
-    dispatch(pass, kernel, &kernel.bind(gpu, resources), groups);
+    dispatch(pass, kernel, &kernel.bind(gpu, resources), groups.into());
 }
 
 /// As [`run`], with bindings whose numbers do not follow each other.
-pub(crate) fn run_at(
+pub(crate) fn run_at<'a>(
     gpu: &GpuContext,
     pass: &mut ComputePass<'_>,
     kernel: &ComputeKernel,
     resources: &[(u32, BindingResource<'_>)],
-    groups: (u32, u32),
+    groups: impl Into<Groups<'a>>,
 ) {
-    dispatch(pass, kernel, &kernel.bind_at(gpu, resources), groups);
+    dispatch(pass, kernel, &kernel.bind_at(gpu, resources), groups.into());
 }
 
-fn dispatch(pass: &mut ComputePass<'_>, kernel: &ComputeKernel, group: &BindGroup, (x, y): (u32, u32)) {
+fn dispatch(pass: &mut ComputePass<'_>, kernel: &ComputeKernel, group: &BindGroup, groups: Groups<'_>) {
     pass.set_pipeline(&kernel.pipeline);
     pass.set_bind_group(0, group, &[]);
-    pass.dispatch_workgroups(x, y, 1);
+    match groups {
+        Groups::Fixed(x, y) => pass.dispatch_workgroups(x, y, 1),
+        Groups::Counted(counts, offset) => pass.dispatch_workgroups_indirect(counts.raw(), offset),
+    }
 }

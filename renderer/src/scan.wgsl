@@ -6,9 +6,9 @@
 @group(0) @binding(2) var<storage, read_write> segment_sums: array<u32>;
 @group(0) @binding(3) var<storage, read_write> total: array<u32>;
 
-const LANES = 256u;
+const LANES = 64u;
 // Values a lane takes at a time.
-const EACH = 4u;
+const EACH = 16u;
 
 var<workgroup> sums: array<u32, LANES>;
 var<workgroup> before: u32;

@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer};
 use wgpu::{BindingResource, CommandEncoder, ComputePass};
 
-use crate::scan::{Scan, run};
+use crate::scan::{Groups, Scan, run};
 
 const SORT_WGSL: &str = include_str!("sort.wgsl");
 /// Elements with this key are left out of the result.
@@ -13,8 +13,8 @@ pub(crate) const INVALID_KEY: u32 = u32::MAX;
 pub(crate) const DIGIT_BITS: u32 = 8;
 /// Bits of their range to which scaled keys are compared.
 pub(crate) const KEY_BITS: u32 = 24;
-/// Elements of a workgroup.
-const BLOCK: usize = 1024;
+/// Elements of a workgroup, also in raster_bins.wgsl.
+pub(crate) const BLOCK: usize = 1024;
 /// Elements that can be sorted: a dispatch has no more workgroups.
 pub(crate) const MOST_ELEMENTS: usize = flyrig_gpu::MAX_WORKGROUPS_PER_DIMENSION as usize * BLOCK;
 
@@ -44,19 +44,19 @@ impl Keys {
 pub(crate) struct SortPass {
     count: u32,
     index: u32,
-    blocks: u32,
     scaled: u32,
+    unused: u32,
 }
 
 impl SortPass {
     /// Of a sort of at most `count` elements.
     pub(crate) fn new(count: usize, keys: Keys, index: u32) -> Self {
-        Self { count: count as u32, index, blocks: blocks(count), scaled: (keys == Keys::Scaled).into() }
+        Self { count: count as u32, index, scaled: (keys == Keys::Scaled).into(), unused: 0 }
     }
 }
 
 /// Workgroups that sort so many elements.
-fn blocks(count: usize) -> u32 {
+pub(crate) fn blocks(count: usize) -> u32 {
     count.div_ceil(BLOCK).max(1) as u32
 }
 
@@ -129,12 +129,13 @@ impl RadixSort {
         self.extremes.encode_clear(encoder);
     }
 
-    /// Sorts at most `count` elements; `passes` holds the constants of each [`SortPass`], `scan_length` [`table_len`].
+    /// Sorts with [`blocks`] workgroups of what is sorted at least; `passes` holds the constants of each [`SortPass`], `scan_length` the [`table_len`] of the
+    /// number that is sorted.
     pub(crate) fn encode(
         &self,
         gpu: &GpuContext,
         pass: &mut ComputePass<'_>,
-        (count, keys): (usize, Keys),
+        (groups, keys): (Groups<'_>, Keys),
         scan: &Scan,
         passes: &[BindingResource<'_>],
         scan_length: &BindingResource<'_>,
@@ -142,7 +143,6 @@ impl RadixSort {
         let extremes = self.extremes.raw().as_entire_binding();
         let table = self.table.raw().as_entire_binding();
         let valid = self.valid.raw().as_entire_binding();
-        let groups = (blocks(count), 1);
         let (mut from, mut to) = (&self.elements, &self.other);
         for (index, constants) in passes.iter().enumerate() {
             let source = from.raw().as_entire_binding();

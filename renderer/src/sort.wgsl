@@ -6,10 +6,9 @@ struct SortPass {
     count: u32,
     // Number of the digit.
     index: u32,
-    // Columns of the table.
-    blocks: u32,
     // Whether keys are taken from the smallest on, and invalid ones left out; else as they are, `valid[0]` of them.
     scaled: u32,
+    unused: u32,
 }
 
 @group(0) @binding(0) var<storage, read> sort_pass: SortPass;
@@ -17,7 +16,7 @@ struct SortPass {
 @group(0) @binding(1) var<storage, read_write> source: array<vec2<u32>>;
 // Largest ~key and largest key of all that are valid (zeroed before).
 @group(0) @binding(2) var<storage, read_write> extremes: array<atomic<u32>, 2>;
-// Digit-major: table[digit * blocks + block].
+// Digit-major: table[digit * blocks + block], for the blocks that there are elements for.
 @group(0) @binding(3) var<storage, read_write> table: array<u32>;
 // Number of valid elements, known after the first pass.
 @group(0) @binding(4) var<storage, read_write> valid: array<u32>;
@@ -42,12 +41,17 @@ var<workgroup> places: array<u32, WALKERS * (WALK + 1u)>;
 // Counts of two digits a word, by walker.
 var<workgroup> counts: array<u32, WORDS * ROW>;
 var<workgroup> starts: array<u32, DIGITS>;
+var<workgroup> sizes: vec2<u32>;
 
-fn count_of_elements() -> u32 {
-    if sort_pass.scaled != 0u && sort_pass.index == 0u {
-        return sort_pass.count;
+// Elements, and columns of the table; to be called by all lanes together.
+fn find_sizes(lane: u32) -> vec2<u32> {
+    if lane == 0u {
+        let known = min(valid[0], sort_pass.count);
+        let all = select(known, sort_pass.count, sort_pass.scaled != 0u);
+        let count = select(known, all, sort_pass.index == 0u);
+        sizes = vec2(count, max(1u, (all + BLOCK - 1u) / BLOCK));
     }
-    return min(valid[0], sort_pass.count);
+    return workgroupUniformLoad(&sizes);
 }
 
 @compute @workgroup_size(LANES)
@@ -96,31 +100,37 @@ fn digit_of(i: u32, count: u32, scaling: vec2<u32>) -> u32 {
 
 @compute @workgroup_size(LANES)
 fn count_digits(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let count = count_of_elements();
+    let size = find_sizes(lane);
+    if group.x >= size.y {
+        return;
+    }
     let scaling = key_scaling();
     for (var k = 0u; k < BLOCK / LANES; k++) {
-        let digit = digit_of(group.x * BLOCK + k * LANES + lane, count, scaling);
+        let digit = digit_of(group.x * BLOCK + k * LANES + lane, size.x, scaling);
         if digit != NONE {
             atomicAdd(&histogram[digit], 1u);
         }
     }
     workgroupBarrier();
     for (var digit = lane; digit < DIGITS; digit += LANES) {
-        table[digit * sort_pass.blocks + group.x] = atomicLoad(&histogram[digit]);
+        table[digit * size.y + group.x] = atomicLoad(&histogram[digit]);
     }
 }
 
 @compute @workgroup_size(LANES)
 fn scatter(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let count = count_of_elements();
-    let scaling = key_scaling();
+    let size = find_sizes(lane);
     let first = group.x * BLOCK;
+    if first >= size.x {
+        return;
+    }
+    let scaling = key_scaling();
     for (var k = 0u; k < BLOCK / LANES; k++) {
         let i = k * LANES + lane;
-        places[i + i / WALK] = digit_of(first + i, count, scaling);
+        places[i + i / WALK] = digit_of(first + i, size.x, scaling);
     }
     for (var digit = lane; digit < DIGITS; digit += LANES) {
-        starts[digit] = table[digit * sort_pass.blocks + group.x];
+        starts[digit] = table[digit * size.y + group.x];
     }
     workgroupBarrier();
     if lane < WALKERS {

@@ -24,7 +24,7 @@ fn sort_on_gpu(gpu: &GpuContext, sort: &mut RadixSort, scan: &Scan, keys: &[u32]
     constants.encode(gpu, &mut encoder, &values);
     sort.prepare(&mut encoder);
     let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor::default());
-    sort.encode(gpu, &mut pass, (keys.len(), kind), scan, &passes, &constants.get(0));
+    sort.encode(gpu, &mut pass, ((blocks(keys.len()), 1).into(), kind), scan, &passes, &constants.get(0));
     drop(pass);
     gpu.queue.submit([encoder.finish()]);
     let valid = sort.valid().read(gpu).unwrap()[0] as usize;
