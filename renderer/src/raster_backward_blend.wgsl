@@ -30,6 +30,12 @@ const LN_2 = 0.6931471805599453;
 const PARTS = max(1u, INVOCATIONS / (BATCH * VECTORS * 4u) * 4u);
 const PART = INVOCATIONS / PARTS;
 
+// Splats that are loaded together, a multiple of BATCH: loads one after the other are what a graphics processor waits for.
+const LOADED = 32u;
+
+var<workgroup> loaded_splats: array<Splat, LOADED>;
+var<workgroup> loaded_color: array<vec3<f32>, LOADED>;
+var<workgroup> loaded_places: array<Place, LOADED>;
 // partial[(splat of the batch * VECTORS + vector) * INVOCATIONS + invocation]
 var<workgroup> partials: array<vec4<f32>, BATCH * VECTORS * INVOCATIONS>;
 var<workgroup> busy: atomic<u32>;
@@ -117,9 +123,18 @@ fn blend_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invoca
     var walked = begin;
     for (var batch = begin; batch < end; batch += BATCH) {
         let count = min(BATCH, end - batch);
+        let loaded = (batch - begin) % LOADED;
+        if loaded == 0u {
+            for (var k = index; k < min(LOADED, end - batch); k += INVOCATIONS) {
+                let g = pairs[batch + k].y;
+                loaded_splats[k] = splats[g];
+                loaded_color[k] = color[g].rgb;
+                loaded_places[k] = places[g];
+            }
+            workgroupBarrier();
+        }
         for (var b = 0u; b < count; b++) {
-            let g = pairs[batch + b].y;
-            let splat = splats[g];
+            let splat = loaded_splats[loaded + b];
             let dx = x - splat.pixel.x;
             let dy = y - splat.pixel.y;
             let exponent =
@@ -132,7 +147,7 @@ fn blend_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invoca
                 let unclamped = exp2(exponent);
                 let alpha = select(vec4(0.0), min(unclamped, vec4(MAX_ALPHA)), touched);
                 let weight = alpha * transmittance;
-                let paint = color[g];
+                let paint = loaded_color[loaded + b];
                 let value =
                     red * paint.r + green * paint.g + blue * paint.b + by_depth * (splat.depth - mean_depth);
                 behind -= weight * value;
@@ -167,8 +182,7 @@ fn blend_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invoca
             workgroupBarrier();
         }
         for (var item = index; item < count * VECTORS; item += INVOCATIONS) {
-            let g = pairs[batch + item / VECTORS].y;
-            let place = places[g];
+            let place = loaded_places[loaded + item / VECTORS];
             if place.fits != 0u {
                 var sum = vec4(0.0);
                 for (var i = 0u; i < INVOCATIONS; i += PART) {

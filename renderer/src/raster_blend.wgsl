@@ -1,6 +1,6 @@
 // One workgroup a tile, one invocation for four pixels of a column: blends the tile's list front to back.
-// Four pixels share the loads of a splat, which is what the time goes into on Mesa's software adapter. No
-// workgroup memory and no barrier, so that every subgroup can leave as soon as its pixels are opaque.
+// Invocations load the list together, a batch at a time: one after the other, its loads are what a graphics processor waits for.
+// Four pixels share what is loaded of a splat, which is what the time goes into on Mesa's software adapter.
 // Lines between "// only NAME" and "// end" are left out of kernels that do not write that image: a binding counts
 // against the adapter's limit wherever it is declared and named, reached or not.
 // Prefix: camera.wgsl, raster_frame.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE.
@@ -26,14 +26,38 @@
 // end
 
 const ROWS = 4u;
+const LANES = TILE * TILE / ROWS;
+// Splats of a batch.
+const BATCH = 64u;
+
+var<workgroup> batch_splats: array<Splat, BATCH>;
+// only color
+var<workgroup> batch_color: array<vec3<f32>, BATCH>;
+// end
+// only canonical
+var<workgroup> batch_canonical: array<vec3<f32>, BATCH>;
+// end
+var<workgroup> busy: atomic<u32>;
+var<workgroup> go_on: u32;
+
+// Whether any invocation of the workgroup is busy; to be called by all of them together.
+fn any_busy(lane: u32, mine: bool) -> bool {
+    if mine {
+        atomicStore(&busy, 1u);
+    }
+    workgroupBarrier();
+    if lane == 0u {
+        go_on = atomicExchange(&busy, 0u);
+    }
+    return workgroupUniformLoad(&go_on) != 0u;
+}
 
 @compute @workgroup_size(TILE, TILE / ROWS)
-fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) local: vec3<u32>) {
+fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) local: vec3<u32>,
+         @builtin(local_invocation_index) lane: u32) {
     let tile = group.xy + frame.first_tile;
     let first = vec2(tile.x * TILE + local.x, tile.y * TILE + local.y * ROWS);
-    if any(first >= frame.size) {
-        return;
-    }
+    let inside = all(first < frame.size);
     let list = tile.y * frame.tiles.x + tile.x;
     var begin = 0u;
     if list > 0u {
@@ -54,37 +78,58 @@ fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) 
     var seen_x = vec4(0.0);
     var seen_y = vec4(0.0);
     var seen_z = vec4(0.0);
-    for (var k = begin; k < end; k++) {
-        let g = pairs[k].y;
-        let splat = splats[g];
-        let dx = x - splat.pixel.x;
-        let dy = y - splat.pixel.y;
-        let exponent = splat.log2_opacity - splat.conic.x * dx * dx - dy * (splat.conic.y * dx + splat.conic.z * dy);
-        let touched = (exponent >= log2_cut) & (transmittance >= vec4(OPAQUE));
-        if any(touched) {
-            let alpha = select(vec4(0.0), min(exp2(exponent), vec4(MAX_ALPHA)), touched);
-            let weight = alpha * transmittance;
+    var open = inside && begin < end;
+    for (var batch = begin; any_busy(lane, open); batch += BATCH) {
+        let count = min(BATCH, end - batch);
+        for (var k = lane; k < count; k += LANES) {
+            let g = pairs[batch + k].y;
+            batch_splats[k] = splats[g];
             // only color
-            let paint = color[g];
-            seen_red += weight * paint.r;
-            seen_green += weight * paint.g;
-            seen_blue += weight * paint.b;
-            // end
-            // only depth
-            seen_depth += weight * splat.depth;
+            batch_color[k] = color[g].rgb;
             // end
             // only canonical
-            let position = canonical[g];
-            seen_x += weight * position.x;
-            seen_y += weight * position.y;
-            seen_z += weight * position.z;
+            batch_canonical[k] = canonical[g].xyz;
             // end
-            coverage += weight;
-            transmittance *= 1.0 - alpha;
         }
-        if all(transmittance < vec4(OPAQUE)) {
-            break;
+        workgroupBarrier();
+        if open {
+            for (var k = 0u; k < count; k++) {
+                let splat = batch_splats[k];
+                let dx = x - splat.pixel.x;
+                let dy = y - splat.pixel.y;
+                let exponent =
+                    splat.log2_opacity - splat.conic.x * dx * dx - dy * (splat.conic.y * dx + splat.conic.z * dy);
+                let touched = (exponent >= log2_cut) & (transmittance >= vec4(OPAQUE));
+                if any(touched) {
+                    let alpha = select(vec4(0.0), min(exp2(exponent), vec4(MAX_ALPHA)), touched);
+                    let weight = alpha * transmittance;
+                    // only color
+                    let paint = batch_color[k];
+                    seen_red += weight * paint.r;
+                    seen_green += weight * paint.g;
+                    seen_blue += weight * paint.b;
+                    // end
+                    // only depth
+                    seen_depth += weight * splat.depth;
+                    // end
+                    // only canonical
+                    let position = batch_canonical[k];
+                    seen_x += weight * position.x;
+                    seen_y += weight * position.y;
+                    seen_z += weight * position.z;
+                    // end
+                    coverage += weight;
+                    transmittance *= 1.0 - alpha;
+                }
+                if all(transmittance < vec4(OPAQUE)) {
+                    break;
+                }
+            }
+            open = any(transmittance >= vec4(OPAQUE)) && batch + count < end;
         }
+    }
+    if !inside {
+        return;
     }
     for (var row = 0u; row < min(ROWS, frame.size.y - first.y); row++) {
         let at = (first.y + row) * frame.size.x + first.x;
