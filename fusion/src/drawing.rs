@@ -1,7 +1,7 @@
 //! Draws all people of a session into one view.
 
 use flyrig_gpu::{GpuContext, StageTimer};
-use flyrig_renderer::{GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, rgba8_from_target};
+use flyrig_renderer::{GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, ViewBytes};
 use flyrig_types::{Camera, RenderedView};
 
 use crate::{FusionError, StageTimes};
@@ -23,12 +23,14 @@ pub(crate) struct Drawing {
     is_current: bool,
     /// Of [`STAGE`].
     timer: StageTimer,
+    bytes: ViewBytes,
 }
 
 impl Drawing {
     pub fn new(gpu: &GpuContext, max_gaussians: usize) -> Result<Self, FusionError> {
         let rasterizer = Rasterizer::new(gpu, max_gaussians)?;
-        Ok(Self { rasterizer, targets: Vec::new(), joined: None, is_current: false, timer: StageTimer::new(gpu, 1) })
+        let (timer, bytes) = (StageTimer::new(gpu, 1), ViewBytes::new(gpu)?);
+        Ok(Self { rasterizer, targets: Vec::new(), joined: None, is_current: false, timer, bytes })
     }
 
     /// Somebody has moved or changed colour.
@@ -71,6 +73,7 @@ impl Drawing {
         };
         let settings = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
         self.rasterizer.encode(gpu, &mut encoder, gaussians, camera, &settings, &target)?;
+        self.bytes.encode(gpu, &mut encoder, &target)?;
         self.timer.mark(&mut encoder, STAGE);
         self.timer.finish(&mut encoder);
         gpu.queue.submit([encoder.finish()]);
@@ -79,9 +82,7 @@ impl Drawing {
             stages.add(STAGE, start.elapsed());
         }
         // Where the adapter measures its own time, reading back is also what waits for it.
-        let rgba = stages.time("read a view back", || -> Result<_, FusionError> {
-            Ok(rgba8_from_target(&target.color.read(gpu)?))
-        })?;
+        let rgba = stages.time("read a view back", || self.bytes.read(gpu, &target))?;
         for stage in self.timer.collect() {
             stages.add_of_adapter(stage.name, stage.time);
         }

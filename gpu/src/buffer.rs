@@ -200,6 +200,26 @@ impl<T: Pod> StorageBuffer<T> {
     }
 }
 
+/// Waits once for the GPU and copies the elements of several arrays out.
+///
+/// # Errors
+/// [`GpuError::Lost`].
+pub fn read_all<T: Pod>(gpu: &GpuContext, arrays: &[&StorageBuffer<T>]) -> Result<Vec<Vec<T>>, GpuError> {
+    if arrays.iter().any(|array| array.content.is_some()) {
+        return arrays.iter().map(|array| array.read(gpu)).collect();
+    }
+    let element = size_of::<T>() as u64;
+    let ranges: Vec<(&Buffer, u64)> = arrays.iter().map(|array| (array.raw(), array.len as u64 * element)).collect();
+    let all: Vec<T> = read_back_ranges(gpu, &ranges)?;
+    let mut rest = all.as_slice();
+    let split = |array: &&StorageBuffer<T>| {
+        let (first, others) = rest.split_at(array.len.min(rest.len()));
+        rest = others;
+        first.to_vec()
+    };
+    Ok(arrays.iter().map(split).collect())
+}
+
 impl StorageBuffer<u32> {
     /// A buffer of little-endian words; up to three bytes at the end that fill none are left out.
     ///
@@ -217,14 +237,24 @@ impl StorageBuffer<u32> {
 /// # Errors
 /// [`GpuError::Lost`].
 pub fn read_back<T: Pod>(gpu: &GpuContext, buffer: &Buffer, len: usize) -> Result<Vec<T>, GpuError> {
-    if len == 0 {
+    read_back_ranges(gpu, &[(buffer, len as u64 * size_of::<T>() as u64)])
+}
+
+/// Waits for the GPU and copies the first bytes of several buffers, one after the other. Where there are several, their sizes are
+/// multiples of 4 bytes.
+fn read_back_ranges<T: Pod>(gpu: &GpuContext, ranges: &[(&Buffer, u64)]) -> Result<Vec<T>, GpuError> {
+    let bytes: u64 = ranges.iter().map(|(_, bytes)| bytes).sum();
+    if bytes == 0 {
         return Ok(Vec::new());
     }
-    let bytes = len as u64 * size_of::<T>() as u64;
     let size = bytes.next_multiple_of(wgpu::COPY_BUFFER_ALIGNMENT);
     let staging = gpu.shared.take_read_back(&gpu.device, size);
     let mut encoder = gpu.device.create_command_encoder(&Default::default());
-    encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, size);
+    let mut at = 0;
+    for (buffer, bytes) in ranges {
+        encoder.copy_buffer_to_buffer(buffer, 0, &staging, at, bytes.next_multiple_of(wgpu::COPY_BUFFER_ALIGNMENT));
+        at += bytes;
+    }
     gpu.queue.submit([encoder.finish()]);
     let (sender, receiver) = std::sync::mpsc::sync_channel(1);
     staging.map_async(wgpu::MapMode::Read, .., move |result| {

@@ -15,7 +15,7 @@ pub mod testing;
 mod timer;
 mod uploads;
 
-pub use buffer::{StorageBuffer, read_back};
+pub use buffer::{StorageBuffer, read_all, read_back};
 pub use camera::{CAMERA_WGSL, CameraConstants, Distorted};
 pub use context::{AdapterChoice, GpuContext, adapter_names};
 pub use error::GpuError;

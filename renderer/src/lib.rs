@@ -19,6 +19,7 @@ mod scan;
 mod schema;
 mod sort;
 mod splat_rows;
+mod view_bytes;
 
 pub use appearance::{
     AppearanceError, AppearanceSettings, DiffusionHierarchy, DiffusionLevel, DirectAppearance, ObservationBuffers,
@@ -36,3 +37,4 @@ pub use raster_kernels::BACKFACING_COSINE;
 pub use raster_settings::{Outputs, RasterSettings, RasterStats};
 pub use schema::{GAUSSIAN_ATTRIBUTES, GaussianAttribute, GaussianElement, PLY_PROPERTIES};
 pub use splat_rows::{PixelShares, PosedGaussians, pixel_shares};
+pub use view_bytes::ViewBytes;

@@ -1,7 +1,7 @@
 //! People of the stream, drawn into a view.
 
 use flyrig_gpu::{GpuContext, GpuError};
-use flyrig_renderer::{GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, rgba8_from_target};
+use flyrig_renderer::{GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, ViewBytes};
 use flyrig_stream::Posed;
 use flyrig_types::{Camera, RenderedView};
 
@@ -12,6 +12,7 @@ pub struct Scene {
     rasterizer: Rasterizer,
     gaussians: GaussianBuffers,
     target: RenderTarget,
+    bytes: ViewBytes,
 }
 
 impl Scene {
@@ -25,6 +26,7 @@ impl Scene {
             rasterizer: Rasterizer::new(gpu, 1)?,
             gaussians: GaussianBuffers::zeroed(gpu, 1)?,
             target: RenderTarget::of_color(gpu, 16, 16)?,
+            bytes: ViewBytes::new(gpu)?,
         })
     }
 
@@ -76,8 +78,8 @@ impl Scene {
         let settings = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         self.rasterizer.encode(&self.gpu, &mut encoder, &self.gaussians, camera, &settings, &self.target)?;
+        self.bytes.encode(&self.gpu, &mut encoder, &self.target)?;
         self.gpu.queue.submit([encoder.finish()]);
-        self.gpu.wait()?;
-        Ok(RenderedView { width, height, rgba: rgba8_from_target(&self.target.color.read(&self.gpu)?) })
+        Ok(RenderedView { width, height, rgba: self.bytes.read(&self.gpu, &self.target)? })
     }
 }

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use flyrig_body::GpuSkinner;
-use flyrig_gpu::{GpuContext, StorageBuffer};
+use flyrig_gpu::{GpuContext, StorageBuffer, read_all};
 use flyrig_renderer::{
     BackwardRasterizer, Carry, GaussianBuffers, GaussianGradients, ImageGradients, ImageLoss, ImageSums, LossSettings,
     Outputs, RasterSettings, Rasterizer, RenderTarget, WantedImage,
@@ -223,13 +223,13 @@ impl DataTerm for Images<'_> {
             self.kernels.backward.encode(gpu, &mut encoder, rasterizer, gaussians, target, what, sums)?;
         }
         gpu.queue.submit([encoder.finish()]);
+        let sums = self.kernels.gradients.iter().take(instants.len()).flat_map(|sums| [&sums.center, &sums.carried]);
+        let mut read = read_all(gpu, &sums.collect::<Vec<_>>())?.into_iter();
         out.clear();
-        for (pose, sums) in instants.iter().zip(self.kernels.gradients) {
-            out.push(PointDerivatives {
-                world_from_canonical: skeleton.world_from_canonical(pose),
-                gradient: sums.center.read(gpu)?,
-                curvature: sums.carried.read(gpu)?,
-            });
+        for pose in *instants {
+            let (Some(gradient), Some(curvature)) = (read.next(), read.next()) else { break };
+            let world_from_canonical = skeleton.world_from_canonical(pose);
+            out.push(PointDerivatives { world_from_canonical, gradient, curvature });
         }
         self.derivatives_time += start.elapsed();
         Ok(loss)

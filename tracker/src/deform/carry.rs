@@ -6,26 +6,25 @@ use rayon::prelude::*;
 
 use super::PointDerivatives;
 
-/// Of one Gaussian that matters.
+/// Of one Gaussian.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Carried {
-    pub gaussian: usize,
     /// dL/d t_x, per metre.
     pub gradient: DVec3,
     /// Gauss-Newton matrix by t_x, per square metre.
     pub matrix: DMat3,
 }
 
-/// With B the blended bone matrix of a Gaussian (d LBS(x + t_x) / d t_x): `B^T g` and `B^T H B`, for the Gaussians that
-/// are seen, in their order; and how many were left out because a number was not finite.
+/// With B the blended bone matrix of a Gaussian (d LBS(x + t_x) / d t_x): `B^T g` and `B^T H B`, zero for Gaussians that are not
+/// seen; and how many were left out because a number was not finite.
 pub(super) fn to_canonical(derivatives: &PointDerivatives, skin: &[SkinWeights]) -> (Vec<Carried>, usize) {
-    let one = |g: usize| -> Option<Result<Carried, ()>> {
-        let gradient = derivatives.gradient.get(g)?;
+    let one = |g: usize| -> Result<Carried, ()> {
+        let gradient = derivatives.gradient.get(g).copied().unwrap_or_default();
         // NaN counts as seen, and falls below.
         if gradient[3] <= 0.0 {
-            return None;
+            return Ok(UNSEEN);
         }
-        let bones = skin_jacobian_f64(&derivatives.world_from_canonical, skin.get(g)?);
+        let bones = skin_jacobian_f64(&derivatives.world_from_canonical, &skin[g]);
         let world = DVec3::new(gradient[0].into(), gradient[1].into(), gradient[2].into());
         let zero = [0.0; 4];
         let first = derivatives.curvature.get(2 * g).unwrap_or(&zero).map(f64::from);
@@ -35,12 +34,17 @@ pub(super) fn to_canonical(derivatives: &PointDerivatives, skin: &[SkinWeights])
             DVec3::new(first[1], first[3], second[0]),
             DVec3::new(first[2], second[0], second[1]),
         );
-        let carried =
-            Carried { gaussian: g, gradient: bones.transpose() * world, matrix: bones.transpose() * h * bones };
+        let carried = Carried { gradient: bones.transpose() * world, matrix: bones.transpose() * h * bones };
         let fine = gradient[3].is_finite() && carried.gradient.is_finite() && carried.matrix.is_finite();
-        Some(if fine { Ok(carried) } else { Err(()) })
+        if fine { Ok(carried) } else { Err(()) }
     };
-    let all: Vec<Result<Carried, ()>> = (0..skin.len()).into_par_iter().filter_map(one).collect();
+    let all: Vec<Result<Carried, ()>> =
+        (0..skin.len()).into_par_iter().with_min_len(GAUSSIANS_A_TASK).map(one).collect();
     let dropped = all.iter().filter(|one| one.is_err()).count();
-    (all.into_iter().filter_map(Result::ok).collect(), dropped)
+    (all.into_iter().map(|one| one.unwrap_or(UNSEEN)).collect(), dropped)
 }
+
+/// What a Gaussian that is not seen counts with.
+const UNSEEN: Carried = Carried { gradient: DVec3::ZERO, matrix: DMat3::ZERO };
+/// Gaussians that one task carries.
+const GAUSSIANS_A_TASK: usize = 1024;

@@ -3,6 +3,8 @@
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
+use super::carry::Carried;
+
 /// Entry of a list of pairs that stands for none.
 const NONE: u32 = u32::MAX;
 /// Conjugate gradients end at this share of the first residual, or after so many iterations. The step is tested on the
@@ -11,12 +13,48 @@ const TOLERANCE: f64 = 1e-3;
 const MAX_ITERATIONS: usize = 200;
 /// Rows that one task of a product takes.
 const ROWS_A_TASK: usize = 128;
+/// Nodes or pairs whose Gaussians one task adds up.
+const SUMS_A_TASK: usize = 64;
+
+/// For each node or pair of nodes its Gaussians in their order, and the weight that each counts with.
+#[derive(Debug)]
+struct Shares {
+    ends: Vec<usize>,
+    shares: Vec<(u32, f64)>,
+}
+
+impl Shares {
+    /// Of `(node or pair, Gaussian, weight)`, ordered by Gaussian.
+    fn new(count: usize, all: &[(u32, u32, f64)]) -> Self {
+        let mut ends = vec![0; count];
+        for &(of, ..) in all {
+            ends[of as usize] += 1;
+        }
+        let mut before = 0;
+        for end in &mut ends {
+            (*end, before) = (before, before + *end);
+        }
+        let mut shares = vec![(0, 0.0); all.len()];
+        for &(of, gaussian, weight) in all {
+            let at = &mut ends[of as usize];
+            shares[*at] = (gaussian, weight);
+            *at += 1;
+        }
+        Self { ends, shares }
+    }
+
+    fn of(&self, index: usize) -> &[(u32, f64)] {
+        let begin = if index > 0 { self.ends[index - 1] } else { 0 };
+        &self.shares[begin..self.ends[index]]
+    }
+}
 
 /// `H + stiffness * L` with a sparsity that never changes: nodes that share a Gaussian or an edge.
 #[derive(Debug)]
 pub(super) struct NormalMatrix {
-    /// For each Gaussian the pairs of its nodes (0,1) (0,2) (0,3) (1,2) (1,3) (2,3), or none.
-    gaussian_pairs: Vec<[u32; 6]>,
+    /// Weights of the Gaussians that hang on each node, and products of their weights for each pair.
+    of_node: Shares,
+    of_pair: Shares,
     /// Row by row: the other node and the pair's number; `rows[n]..rows[n + 1]` is node n's.
     rows: Vec<usize>,
     others: Vec<(u32, u32)>,
@@ -47,9 +85,17 @@ impl NormalMatrix {
         pairs.sort_unstable();
         pairs.dedup();
         let find = |pair| pairs.binary_search(&pair).map_or(NONE, |at| at as u32);
-        let gaussian_pairs = (0..gaussian_nodes.len())
-            .map(|g| CORNERS.map(|corner| of_gaussian(g, corner).map_or(NONE, find)))
-            .collect();
+        let (mut of_node, mut of_pair) = (Vec::new(), Vec::new());
+        for (g, (own_nodes, weights)) in gaussian_nodes.iter().zip(weights).enumerate() {
+            let weights = weights.map(f64::from);
+            of_node.extend(own_nodes.iter().zip(weights).filter(|(_, w)| *w > 0.0).map(|(&n, w)| (n, g as u32, w)));
+            for (a, b) in CORNERS {
+                if let Some(pair) = of_gaussian(g, (a, b)).map(find).filter(|&pair| pair != NONE) {
+                    of_pair.push((pair, g as u32, weights[a] * weights[b]));
+                }
+            }
+        }
+        let (of_node, of_pair) = (Shares::new(nodes, &of_node), Shares::new(pairs.len(), &of_pair));
         let mut pair_edges = vec![0.0; pairs.len()];
         let mut node_edges = vec![0.0; nodes];
         for &(a, b, stiff) in edges {
@@ -72,7 +118,7 @@ impl NormalMatrix {
             .collect();
         let others = by_row.concat();
         let (diagonal, off_diagonal) = (vec![DMat3::ZERO; nodes], vec![DMat3::ZERO; pairs.len()]);
-        Self { gaussian_pairs, rows, others, pair_edges, node_edges, diagonal, off_diagonal }
+        Self { of_node, of_pair, rows, others, pair_edges, node_edges, diagonal, off_diagonal }
     }
 
     pub(super) fn clear(&mut self) {
@@ -80,18 +126,27 @@ impl NormalMatrix {
         self.off_diagonal.fill(DMat3::ZERO);
     }
 
-    /// Adds the matrix of a Gaussian's own displacement, spread over its nodes.
-    pub(super) fn add_gaussian(&mut self, g: usize, nodes: [u32; 4], weights: [f32; 4], matrix: DMat3) {
-        let weights = weights.map(f64::from);
-        for (&node, weight) in nodes.iter().zip(weights) {
-            if weight > 0.0 {
-                self.diagonal[node as usize] += matrix * (weight * weight);
+    /// Adds the gradients of the Gaussians' own displacements to those of their nodes, and where asked their matrices. Each sum is
+    /// made in the order of the Gaussians: equal input gives equal bytes for any number of threads.
+    pub(super) fn take_in(&mut self, own: &[Carried], gradient: &mut [DVec3], with_matrix: bool) {
+        let Self { of_node, of_pair, diagonal, off_diagonal, .. } = self;
+        let nodes = gradient.par_iter_mut().zip(diagonal).enumerate().with_min_len(SUMS_A_TASK);
+        nodes.for_each(|(n, (gradient, diagonal))| {
+            for &(g, weight) in of_node.of(n) {
+                let one = &own[g as usize];
+                *gradient += one.gradient * weight;
+                if with_matrix {
+                    *diagonal += one.matrix * (weight * weight);
+                }
             }
-        }
-        for (&pair, (a, b)) in self.gaussian_pairs[g].iter().zip(CORNERS) {
-            if pair != NONE {
-                self.off_diagonal[pair as usize] += matrix * (weights[a] * weights[b]);
-            }
+        });
+        if with_matrix {
+            let pairs = off_diagonal.par_iter_mut().enumerate().with_min_len(SUMS_A_TASK);
+            pairs.for_each(|(k, sum)| {
+                for &(g, weight) in of_pair.of(k) {
+                    *sum += own[g as usize].matrix * weight;
+                }
+            });
         }
     }
 

@@ -36,9 +36,8 @@ impl Case {
 
     fn normal_matrix(&self) -> NormalMatrix {
         let mut normal = NormalMatrix::new(NODES, &self.nodes, &self.weights, &self.edges);
-        for (g, matrix) in self.matrices.iter().enumerate() {
-            normal.add_gaussian(g, self.nodes[g], self.weights[g], *matrix);
-        }
+        let own: Vec<Carried> = self.matrices.iter().map(|&matrix| Carried { gradient: DVec3::ONE, matrix }).collect();
+        normal.take_in(&own, &mut [DVec3::ZERO; NODES], true);
         normal
     }
 

@@ -281,15 +281,7 @@ impl DeformTracker {
         for derivatives in &self.derivatives {
             let (carried, dropped) = to_canonical(derivatives, &self.skin);
             all_dropped += dropped;
-            for one in carried {
-                let (nodes, weights) = (self.gaussian_nodes[one.gaussian], self.gaussian_weights[one.gaussian]);
-                for (&node, weight) in nodes.iter().zip(weights) {
-                    gradient[node as usize] += one.gradient * f64::from(weight);
-                }
-                if with_matrix {
-                    self.matrix.add_gaussian(one.gaussian, nodes, weights, one.matrix);
-                }
-            }
+            self.matrix.take_in(&carried, gradient, with_matrix);
         }
         all_dropped
     }
