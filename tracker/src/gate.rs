@@ -2,6 +2,7 @@
 
 use flyrig_types::{Camera, Mask};
 use glam::{DVec2, Vec3};
+use rayon::prelude::*;
 
 use crate::grid::Grid;
 
@@ -113,6 +114,9 @@ impl BodyGate {
     }
 }
 
+/// Vertices that one task projects.
+const VERTICES_A_TASK: usize = 2048;
+
 /// Draws a posed body: the box around it with a margin in pixels (x0, y0, x1, y1, ends excluded), and 1 on the body inside
 /// that box. `None` when nothing of it is in the image.
 pub(crate) fn drawn_body(
@@ -122,7 +126,8 @@ pub(crate) fn drawn_body(
     margin_px: f64,
 ) -> Option<([usize; 4], Grid)> {
     let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
-    let pixels: Vec<Option<DVec2>> = vertices.iter().map(|v| camera.project(v.as_dvec3())).collect();
+    let project = |v: &Vec3| camera.project(v.as_dvec3());
+    let pixels: Vec<Option<DVec2>> = vertices.par_iter().with_min_len(VERTICES_A_TASK).map(project).collect();
     let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
     for pixel in pixels.iter().flatten() {
         (low, high) = (low.min(*pixel), high.max(*pixel));
@@ -139,11 +144,7 @@ pub(crate) fn drawn_body(
     }
     let mut body = Grid::new(bounds[2] - bounds[0], bounds[3] - bounds[1], 0.0);
     let origin = DVec2::new(bounds[0] as f64, bounds[1] as f64);
-    for triangle in triangles {
-        let corner = |k: usize| pixels.get(triangle[k] as usize).copied().flatten().map(|p| p - origin);
-        if let (Some(a), Some(b), Some(c)) = (corner(0), corner(1), corner(2)) {
-            body.fill_triangle(a, b, c);
-        }
-    }
+    let places: Vec<Option<DVec2>> = pixels.iter().map(|pixel| pixel.map(|pixel| pixel - origin)).collect();
+    body.fill_mesh(&places, triangles);
     Some((bounds, body))
 }

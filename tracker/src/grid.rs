@@ -1,7 +1,13 @@
 //! One-channel float images and what masks need of them.
 
+use std::ops::Range;
+
 use flyrig_types::Mask;
 use glam::DVec2;
+use rayon::prelude::*;
+
+/// Rows that one task takes.
+const ROWS_A_TASK: usize = 32;
 
 /// A small image of numbers, row by row.
 #[derive(Debug, Clone, PartialEq)]
@@ -16,30 +22,27 @@ impl Grid {
         Self { width, height, values: vec![value; width * height] }
     }
 
-    /// Sets the pixels whose centre lies in a triangle, and the pixels of its corners, to 1.
-    pub fn fill_triangle(&mut self, a: DVec2, b: DVec2, c: DVec2) {
-        let low = a.min(b).min(c);
-        let high = a.max(b).max(c);
-        let clamp = |v: f64, limit: usize| v.clamp(0.0, limit as f64) as usize;
-        for corner in [a, b, c] {
-            if corner.x >= 0.0 && corner.y >= 0.0 {
-                let (x, y) = (corner.x as usize, corner.y as usize);
-                if x < self.width && y < self.height {
-                    self.values[y * self.width + x] = 1.0;
-                }
-            }
-        }
-        let turned = if (b - a).perp_dot(c - a) < 0.0 { -1.0 } else { 1.0 };
-        let sides = [(a, (b - a) * turned), (b, (c - b) * turned), (c, (a - c) * turned)];
-        let columns = clamp(low.x.ceil(), self.width)..clamp(high.x.floor() + 1.0, self.width);
-        for y in clamp(low.y.ceil(), self.height)..clamp(high.y.floor() + 1.0, self.height) {
-            let from = sides.map(|(from, side)| side.x * (y as f64 - from.y) + side.y * from.x);
-            let inside = |x: usize| (0..3).all(|k| from[k] - sides[k].1.y * x as f64 >= 0.0);
-            let Some(first) = columns.clone().find(|x| inside(*x)) else { continue };
-            for x in (first..columns.end).take_while(|x| inside(*x)) {
-                self.values[y * self.width + x] = 1.0;
-            }
-        }
+    /// The rows with their numbers, for all cores; several rows follow each other on one.
+    pub fn rows_mut(&mut self) -> impl IndexedParallelIterator<Item = (usize, &mut [f32])> {
+        self.values.par_chunks_mut(self.width.max(1)).enumerate().with_min_len(ROWS_A_TASK)
+    }
+
+    /// Sets the pixels whose centre lies in one of the triangles, and the pixels of their corners, to 1. Triangles with a vertex that
+    /// has no place are left out.
+    pub fn fill_mesh(&mut self, places: &[Option<DVec2>], triangles: &[[u32; 3]]) {
+        let place = |vertex: u32| places.get(vertex as usize).copied().flatten();
+        let placed = triangles.iter().filter_map(|&[a, b, c]| Some([place(a)?, place(b)?, place(c)?]));
+        self.fill_triangles(&placed.collect::<Vec<_>>());
+    }
+
+    fn fill_triangles(&mut self, triangles: &[[DVec2; 3]]) {
+        let (width, height) = (self.width, self.height);
+        let bands = self.values.par_chunks_mut((width * ROWS_A_TASK).max(1)).enumerate();
+        bands.for_each(|(band, values)| {
+            let first = band * ROWS_A_TASK;
+            let mut band = Band { width, rows: first..(first + ROWS_A_TASK).min(height), values };
+            triangles.iter().for_each(|&[a, b, c]| band.fill_triangle(a, b, c));
+        });
     }
 
     /// Chamfer distance in pixels (3-4 weights over 3) to the nearest pixel above one half.
@@ -109,17 +112,17 @@ impl Grid {
     pub fn guided(&self, guide: &Self, radius: usize, epsilon: f32) -> Self {
         let product =
             |a: &Self, b: &Self| Self { values: a.values.iter().zip(&b.values).map(|(a, b)| a * b).collect(), ..*a };
-        let mean_guide = guide.box_mean(radius);
-        let mean_self = self.box_mean(radius);
-        let mut slope = product(guide, self).box_mean(radius);
-        let mut offset = product(guide, guide).box_mean(radius);
+        let ((mean_guide, mean_self), (mut slope, mut offset)) = rayon::join(
+            || rayon::join(|| guide.box_mean(radius), || self.box_mean(radius)),
+            || rayon::join(|| product(guide, self).box_mean(radius), || product(guide, guide).box_mean(radius)),
+        );
         for i in 0..slope.values.len() {
             let (g, s) = (mean_guide.values[i], mean_self.values[i]);
             let a = (slope.values[i] - g * s) / ((offset.values[i] - g * g).max(0.0) + epsilon);
             slope.values[i] = a;
             offset.values[i] = s - a * g;
         }
-        let (slope, offset) = (slope.box_mean(radius), offset.box_mean(radius));
+        let (slope, offset) = rayon::join(|| slope.box_mean(radius), || offset.box_mean(radius));
         let values = guide.values.iter().zip(&slope.values).zip(&offset.values).map(|((g, a), b)| a * g + b);
         Self { values: values.collect(), ..*self }
     }
@@ -137,6 +140,46 @@ impl Grid {
             }
         }
         Mask::new(width as u32, height as u32, coverage).ok()
+    }
+}
+
+/// Some rows of a grid.
+struct Band<'a> {
+    width: usize,
+    rows: Range<usize>,
+    values: &'a mut [f32],
+}
+
+impl Band<'_> {
+    /// Sets the pixels whose centre lies in a triangle, and the pixels of its corners, to 1.
+    fn fill_triangle(&mut self, a: DVec2, b: DVec2, c: DVec2) {
+        let low = a.min(b).min(c);
+        let high = a.max(b).max(c);
+        let rows = self.rows.clone();
+        // Also leaves out what is no number.
+        if !(high.y >= rows.start as f64 && low.y < rows.end as f64 + 1.0) {
+            return;
+        }
+        let clamp = |v: f64, first: usize, end: usize| v.clamp(first as f64, end as f64) as usize;
+        for corner in [a, b, c] {
+            if corner.x >= 0.0 && corner.y >= 0.0 {
+                let (x, y) = (corner.x as usize, corner.y as usize);
+                if x < self.width && rows.contains(&y) {
+                    self.values[(y - rows.start) * self.width + x] = 1.0;
+                }
+            }
+        }
+        let turned = if (b - a).perp_dot(c - a) < 0.0 { -1.0 } else { 1.0 };
+        let sides = [(a, (b - a) * turned), (b, (c - b) * turned), (c, (a - c) * turned)];
+        let columns = clamp(low.x.ceil(), 0, self.width)..clamp(high.x.floor() + 1.0, 0, self.width);
+        for y in clamp(low.y.ceil(), rows.start, rows.end)..clamp(high.y.floor() + 1.0, rows.start, rows.end) {
+            let from = sides.map(|(from, side)| side.x * (y as f64 - from.y) + side.y * from.x);
+            let inside = |x: usize| (0..3).all(|k| from[k] - sides[k].1.y * x as f64 >= 0.0);
+            let Some(first) = columns.clone().find(|x| inside(*x)) else { continue };
+            for x in (first..columns.end).take_while(|x| inside(*x)) {
+                self.values[(y - rows.start) * self.width + x] = 1.0;
+            }
+        }
     }
 }
 
@@ -245,7 +288,7 @@ pub(crate) fn clean(grid: &mut Grid, hole_radius: usize) {
 mod tests {
     use super::*;
 
-    fn square(width: usize, height: usize, x: std::ops::Range<usize>, y: std::ops::Range<usize>) -> Grid {
+    fn square(width: usize, height: usize, x: Range<usize>, y: Range<usize>) -> Grid {
         let mut grid = Grid::new(width, height, 0.0);
         for y in y {
             for x in x.clone() {
@@ -297,12 +340,12 @@ mod tests {
     #[test]
     fn a_triangle_and_the_distance_to_it() {
         let mut grid = Grid::new(20, 20, 0.0);
-        grid.fill_triangle(DVec2::new(2.0, 2.0), DVec2::new(12.0, 2.0), DVec2::new(2.0, 12.0));
+        grid.fill_triangles(&[[DVec2::new(2.0, 2.0), DVec2::new(12.0, 2.0), DVec2::new(2.0, 12.0)]]);
         assert!(grid.values[4 * 20 + 4] > 0.5 && grid.values[11 * 20 + 11] < 0.5);
         let distance = grid.distance_to_set();
         assert!((distance.values[2 * 20 + 17] - 5.0).abs() < 0.1);
         // Nothing set: far, not infinite. Corners outside do not matter.
-        grid.fill_triangle(DVec2::splat(-50.0), DVec2::new(1e9, 3.0), DVec2::NAN);
+        grid.fill_triangles(&[[DVec2::splat(-50.0), DVec2::new(1e9, 3.0), DVec2::NAN]]);
         assert!(Grid::new(3, 3, 0.0).distance_to_set().values.iter().all(|d| d.is_finite()));
     }
 
@@ -333,12 +376,13 @@ mod tests {
 
     #[test]
     fn a_triangle_of_either_winding_holds_the_pixels_between_its_sides() {
-        let corners = [DVec2::new(2.3, 1.1), DVec2::new(16.8, 6.4), DVec2::new(5.5, 17.2)];
+        // Over several tasks' rows.
+        let corners = [DVec2::new(2.3, 1.1), DVec2::new(16.8, 36.4), DVec2::new(5.5, 77.2)];
         let cross = |a: DVec2, b: DVec2, p: DVec2| (b - a).perp_dot(p - a);
         for [a, b, c] in [corners, [corners[1], corners[0], corners[2]]] {
-            let mut grid = Grid::new(20, 20, 0.0);
-            grid.fill_triangle(a, b, c);
-            for at in 0..400 {
+            let mut grid = Grid::new(20, 80, 0.0);
+            grid.fill_mesh(&[Some(a), Some(b), Some(c), None], &[[0, 1, 2], [0, 1, 3], [0, 1, 4]]);
+            for at in 0..1600 {
                 let p = DVec2::new((at % 20) as f64, (at / 20) as f64);
                 let sides = [cross(a, b, p), cross(b, c, p), cross(c, a, p)];
                 let inside = sides.iter().all(|s| *s >= 0.0) || sides.iter().all(|s| *s <= 0.0);

@@ -5,6 +5,7 @@
 //! pixels well inside of the mask. Where F and B are alike, alpha stays that of the mask.
 
 use flyrig_types::{Image, Mask};
+use rayon::prelude::*;
 
 use crate::TrackError;
 use crate::background::{Background, BackgroundLight};
@@ -93,6 +94,8 @@ struct Band<'a> {
 
 /// No pixel.
 const NONE: u32 = u32::MAX;
+/// Pixels that one task takes.
+const PIXELS_A_TASK: usize = 8192;
 
 impl<'a> Band<'a> {
     /// `None` for a mask without an outline.
@@ -108,9 +111,12 @@ impl<'a> Band<'a> {
         }
         let mut unset = set.clone();
         unset.values.iter_mut().for_each(|value| *value = 1.0 - *value);
-        let (outer, inner) = (set.distance_to_set(), unset.distance_to_set());
-        let light: Vec<[f32; 3]> =
-            (0..width * height).map(|at| linear_of_bytes(picture.pixel(x0 + at % width, y0 + at / width))).collect();
+        let (outer, inner) = rayon::join(|| set.distance_to_set(), || unset.distance_to_set());
+        let light: Vec<[f32; 3]> = (0..width * height)
+            .into_par_iter()
+            .with_min_len(PIXELS_A_TASK)
+            .map(|at| linear_of_bytes(picture.pixel(x0 + at % width, y0 + at / width)))
+            .collect();
         let mut band = Self {
             picture,
             x0,
@@ -125,7 +131,8 @@ impl<'a> Band<'a> {
             empty: vec![false; width * height],
             behind: vec![None; width * height],
         };
-        let mut sure_inside: Vec<bool> = (0..width * height).map(|at| band.is_sure_inside(at)).collect();
+        let pixels = (0..width * height).into_par_iter().with_min_len(PIXELS_A_TASK);
+        let mut sure_inside: Vec<bool> = pixels.map(|at| band.is_sure_inside(at)).collect();
         let mut sure_outside: Vec<bool> = band.outer.values.iter().map(|d| *d > BAND_PX).collect();
         if let Some(background) = background {
             let unmasked = |at: usize| mask.coverage()[at] == 0;
@@ -141,8 +148,8 @@ impl<'a> Band<'a> {
                 band.behind = band.local_background(&light, &sure_outside);
             }
         }
-        band.nearest_inside = nearest(&sure_inside, width, height);
-        band.nearest_outside = nearest(&sure_outside, width, height);
+        (band.nearest_inside, band.nearest_outside) =
+            rayon::join(|| nearest(&sure_inside, width, height), || nearest(&sure_outside, width, height));
         Some(band)
     }
 
@@ -163,17 +170,20 @@ impl<'a> Band<'a> {
     /// The background's light, brought to the exposure and shadow of the sure background nearby.
     fn local_background(&self, background: &BackgroundLight<'_>, sure: &[bool]) -> Vec<Option<[f32; 3]>> {
         let behind: Vec<Option<[f32; 3]>> = (0..self.light.len()).map(|at| background.at(self.pixel(at))).collect();
-        let mean = |value: &dyn Fn(usize, [f32; 3]) -> f32| {
+        let mean = |value: &(dyn Fn(usize, [f32; 3]) -> f32 + Sync)| {
             let of = |at: usize| behind[at].filter(|_| sure[at]).map_or(0.0, |light| value(at, light));
             Grid { width: self.width, height: self.height, values: (0..sure.len()).map(of).collect() }
                 .box_mean(LOCAL_PX)
         };
-        let ratios: [Grid; 3] = std::array::from_fn(|k| {
-            let (mut now, plate) = (mean(&|at, _| self.light[at][k]), mean(&|_, light| light[k]));
+        let ratio = |k: usize| {
+            let (mut now, plate) =
+                rayon::join(|| mean(&|at, _| self.light[at][k]), || mean(&|_, light: [f32; 3]| light[k]));
             // Without sure background nearby the plate stands as it is.
             now.values.iter_mut().zip(&plate.values).for_each(|(now, plate)| *now = (*now + 2e-3) / (plate + 2e-3));
             now
-        });
+        };
+        let (red, (green, blue)) = rayon::join(|| ratio(0), || rayon::join(|| ratio(1), || ratio(2)));
+        let ratios = [red, green, blue];
         let scaled = |(at, light): (usize, &Option<[f32; 3]>)| {
             light.map(|light| std::array::from_fn(|k| light[k] * ratios[k].values[at].clamp(0.3, 2.0)))
         };
@@ -192,8 +202,9 @@ impl<'a> Band<'a> {
 
     fn solve(&self, mask: &Mask) -> Matte {
         let mut coverage = mask.coverage().to_vec();
+        let pixels = (0..self.light.len()).into_par_iter().with_min_len(PIXELS_A_TASK);
         let mixtures: Vec<Option<Mixed>> =
-            (0..self.light.len()).map(|at| self.is_open(at).then(|| self.unmix(at)).flatten()).collect();
+            pixels.map(|at| self.is_open(at).then(|| self.unmix(at)).flatten()).collect();
         let mut alphas = Grid::new(self.width, self.height, 0.0);
         for (at, mixed) in mixtures.iter().enumerate() {
             // Soft slopes of the mask end with the band.
@@ -323,7 +334,7 @@ impl<'a> Band<'a> {
 fn sharpen(alphas: &mut Grid) {
     let mut unset = alphas.clone();
     unset.values.iter_mut().for_each(|alpha| *alpha = 1.0 - *alpha);
-    let (outer, inner) = (alphas.distance_to_set(), unset.distance_to_set());
+    let (outer, inner) = rayon::join(|| alphas.distance_to_set(), || unset.distance_to_set());
     for (at, alpha) in alphas.values.iter_mut().enumerate() {
         if inner.values[at] > BLUR_PX {
             *alpha = 1.0;

@@ -101,12 +101,7 @@ impl<'a> Target<'a> {
         let place = |v: &Vec3| Some((self.view.camera.project(v.as_dvec3())? + 0.5) / self.side_px - 0.5);
         let pixels: Vec<Option<DVec2>> = vertices.iter().map(place).collect();
         let mut drawn = Grid::new(self.squares.width, self.squares.height, 0.0);
-        for triangle in triangles {
-            let corner = |k: usize| pixels.get(triangle[k] as usize).copied().flatten();
-            if let (Some(a), Some(b), Some(c)) = (corner(0), corner(1), corner(2)) {
-                drawn.fill_triangle(a, b, c);
-            }
-        }
+        drawn.fill_mesh(&pixels, triangles);
         let [left, right, top, bottom] = self.counted;
         let (mut both, mut either) = (0, 0);
         for row in top..bottom {

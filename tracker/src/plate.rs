@@ -2,6 +2,7 @@
 
 use flyrig_solve::median;
 use flyrig_types::{Image, Mask};
+use rayon::prelude::*;
 
 use crate::gate::BodyGate;
 use crate::grid::{Grid, clean, components};
@@ -151,11 +152,7 @@ pub(crate) fn plate_evidence(picture: &Rgb, plate: &[f32], drift: &Drift, bounds
     }
     let Drift { gain, noise } = *drift;
     let mut grid = Grid::new(x1 - x0, y1 - y0, 0.0);
-    let pairs = (y0..y1).flat_map(|y| {
-        let row = 3 * (y * picture.width + x0)..3 * (y * picture.width + x1);
-        picture.bytes[row.clone()].chunks_exact(3).zip(plate[row].chunks_exact(3))
-    });
-    for (value, (now, plate)) in grid.values.iter_mut().zip(pairs) {
+    let of_pixel = |(value, (now, plate)): (&mut f32, (&[u8], &[f32]))| {
         // A dark plate has no colour to speak of: lift it so that the split stays sound.
         let plate: [f32; 3] = std::array::from_fn(|k| gain[k] * plate[k] + 4.0);
         let now: [f32; 3] = std::array::from_fn(|k| f32::from(now[k]) + 4.0);
@@ -175,7 +172,12 @@ pub(crate) fn plate_evidence(picture: &Rgb, plate: &[f32], drift: &Drift, bounds
             (-change / (16.0 * noise)).min(0.45 + 0.8 * (1.0 - along))
         };
         *value = color.max(light).min(2.0) * 0.5;
-    }
+    };
+    grid.rows_mut().for_each(|(y, values)| {
+        let row = 3 * ((y + y0) * picture.width + x0)..3 * ((y + y0) * picture.width + x1);
+        let pairs = picture.bytes[row.clone()].chunks_exact(3).zip(plate[row].chunks_exact(3));
+        values.iter_mut().zip(pairs).for_each(of_pixel);
+    });
     Some(grid)
 }
 

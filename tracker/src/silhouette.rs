@@ -2,6 +2,7 @@
 
 use flyrig_types::Mask;
 use glam::DVec2;
+use rayon::prelude::*;
 
 use crate::gate::BodyGate;
 use crate::grid::{Grid, clean};
@@ -25,12 +26,12 @@ pub(crate) fn coarse_mask(sighting: &Sighting, gate: &BodyGate) -> Grid {
     let [x0, y0, x1, y1] = gate.bounds;
     let Some(mask) = &sighting.output.mask else { return body_mask(gate) };
     let mut coarse = Grid::new(x1 - x0, y1 - y0, 0.0);
-    for y in y0..y1 {
-        for x in x0..x1 {
-            let at = sighting.crop.crop_from_image(DVec2::new(x as f64, y as f64));
-            coarse.values[(y - y0) * (x1 - x0) + x - x0] = net_probability(mask, at);
+    coarse.rows_mut().for_each(|(y, row)| {
+        for (x, value) in row.iter_mut().enumerate() {
+            let pixel = DVec2::new((x + x0) as f64, (y + y0) as f64);
+            *value = net_probability(mask, sighting.crop.crop_from_image(pixel));
         }
-    }
+    });
     coarse
 }
 
@@ -84,14 +85,18 @@ pub(crate) fn refine(
         let (i, o) = (smooth(&inside, bin) / inside_total, smooth(&outside, bin) / outside_total);
         ((i + 1e-5) / (o + 1e-5)).ln().clamp(-2.5, 2.5)
     };
-    let color_logits: Vec<f32> = (0..inside.len()).map(|bin| if speaks { color_logit(bin) } else { 0.0 }).collect();
+    let color_logits: Vec<f32> = (0..inside.len())
+        .into_par_iter()
+        .with_min_len(512)
+        .map(|bin| if speaks { color_logit(bin) } else { 0.0 })
+        .collect();
     let mut probability = coarse.clone();
-    for y in 0..height {
-        for x in 0..width {
+    probability.rows_mut().for_each(|(y, row)| {
+        for (x, probability) in row.iter_mut().enumerate() {
             let at = y * width + x;
             let (p, d) = (coarse.values[at].clamp(0.02, 0.98), gate.distance.values[at]);
             if d >= gate.reach {
-                probability.values[at] = 0.0;
+                *probability = 0.0;
                 continue;
             }
             let color = color_logits[bin(x, y)];
@@ -101,16 +106,16 @@ pub(crate) fn refine(
             // What the surroundings look like here the plate knows better: shoes of the floor's colour are no floor.
             let color = if evidence == 0.0 { color } else { color.max(0.0) };
             let logit = (p / (1.0 - p)).ln() + 0.6 * color + near + plate;
-            probability.values[at] = 1.0 / (1.0 + (-logit).exp());
+            *probability = 1.0 / (1.0 + (-logit).exp());
         }
-    }
+    });
     let mut guide = Grid::new(width, height, 0.0);
-    for y in 0..height {
-        for x in 0..width {
+    guide.rows_mut().for_each(|(y, row)| {
+        for (x, guide) in row.iter_mut().enumerate() {
             let [r, g, b] = picture.pixel(x + x0, y + y0).map(f32::from);
-            guide.values[y * width + x] = (0.3 * r + 0.55 * g + 0.15 * b) / 255.0;
+            *guide = (0.3 * r + 0.55 * g + 0.15 * b) / 255.0;
         }
-    }
+    });
     let radius = (1.5 * crop_scale).round().clamp(2.0, 12.0) as usize;
     let mut smoothed = probability.guided(&guide, radius, 1e-3);
     for (value, d) in smoothed.values.iter_mut().zip(&gate.distance.values) {
