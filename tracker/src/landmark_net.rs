@@ -7,6 +7,7 @@ use tract_onnx::prelude::*;
 use tract_onnx::tract_hir::infer::Factoid as _;
 
 use crate::upsample::replace_doublings;
+use crate::vector_state::{clear_after_products, clear_upper_halves};
 use crate::{TrackError, TrackErrorKind};
 
 /// A network that takes one crop of an image.
@@ -55,7 +56,11 @@ impl LandmarkNet {
         let model = model
             .with_input_fact(0, f32::fact(shape).into())
             .and_then(InferenceModelExt::into_optimized)
-            .and_then(|mut model| replace_doublings(&mut model).and_then(|()| model.into_runnable()))
+            .and_then(|mut model| {
+                replace_doublings(&mut model)?;
+                clear_after_products(&mut model)?;
+                model.into_runnable()
+            })
             .map_err(failed_load)?;
         Ok(Self { model, shape, name: name.into() })
     }
@@ -71,7 +76,12 @@ impl LandmarkNet {
         // other work, and tract panics where that is another run.
         let is_of_pool = rayon::current_thread_index().is_some();
         let executor = if is_of_pool { Executor::SingleThread } else { Executor::RayonGlobal };
-        let outputs = multithread_tract_scope(executor, || self.model.run(tvec!(input.into()))).map_err(failed)?;
+        let outputs = multithread_tract_scope(executor, || self.model.run(tvec!(input.into())));
+        clear_upper_halves();
+        if !is_of_pool {
+            rayon::spawn_broadcast(|_| clear_upper_halves());
+        }
+        let outputs = outputs.map_err(failed)?;
         Ok(NetOutputs { net: self.clone(), outputs })
     }
 

@@ -58,6 +58,7 @@ mod testing;
 mod texture;
 mod triangulate;
 mod upsample;
+mod vector_state;
 mod view;
 mod viewers;
 

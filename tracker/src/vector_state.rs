@@ -1,0 +1,58 @@
+//! State of the vector registers after a network's products.
+//!
+//! tract's products (0.23, written in assembly) return without `vzeroupper`. The upper halves of the vector registers then still
+//! hold something, and on x86 processors every SSE instruction of the thread must merge with them until somebody clears them: box
+//! means ran 3.5 times slower on threads that had run a network.
+
+use tract_onnx::prelude::*;
+use tract_onnx::tract_core::internal::*;
+use tract_onnx::tract_core::ops::matmul::optimized::OptMatMul;
+
+/// Clears the upper halves of this thread's vector registers. Changes no result.
+pub(crate) fn clear_upper_halves() {
+    #[cfg(target_arch = "x86_64")]
+    if let Some(v3) = pulp::x86::V3::try_new() {
+        v3.avx._mm256_zeroupper();
+    }
+}
+
+/// Hands a tensor on as it is, after [`clear_upper_halves`].
+#[derive(Debug, Clone, Hash, PartialEq, Eq)]
+struct ClearUpperHalves;
+
+/// Clears them after each product of an optimised network, for the operators between the products.
+pub(crate) fn clear_after_products(model: &mut TypedModel) -> TractResult<()> {
+    for id in 0..model.nodes.len() {
+        if model.node(id).op_is::<OptMatMul>() {
+            let outlet = OutletId::new(id, 0);
+            let (name, fact) = (format!("{}.clear", model.node(id).name), model.outlet_fact(outlet)?.clone());
+            TypedModelPatch::intercept(model, outlet, name, ClearUpperHalves, fact)?.apply(model)?;
+        }
+    }
+    Ok(())
+}
+
+impl Op for ClearUpperHalves {
+    fn name(&self) -> StaticName {
+        "ClearUpperHalves".into()
+    }
+
+    op_as_typed_op!();
+}
+
+impl EvalOp for ClearUpperHalves {
+    op_out_of_plan!();
+
+    fn eval(&self, _: &EvalContext, inputs: TVec<TValue>) -> TractResult<TVec<TValue>> {
+        clear_upper_halves();
+        Ok(inputs)
+    }
+}
+
+impl TypedOp for ClearUpperHalves {
+    as_op!();
+
+    fn output_facts(&self, inputs: &[&TypedFact]) -> TractResult<TVec<TypedFact>> {
+        Ok(tvec!(inputs[0].clone()))
+    }
+}
