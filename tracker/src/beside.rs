@@ -2,16 +2,32 @@
 
 use rayon::prelude::*;
 
-/// Returns `work` of every index below `count`. As many as there are cores run beside each other, each on one of rayon's threads,
-/// where a network works alone ([`crate::landmark_net::LandmarkNet::run`]); the few that are left over run one after the other
-/// on this thread, each with all cores.
+/// Returns `work` of every index below `count`. Where there are two cores and more for each, all run at once on threads of their own, and
+/// their networks' products share the cores ([`crate::landmark_net::LandmarkNet::run`]). Else as many as there are cores run beside each
+/// other, each on one of rayon's threads, where a network works alone; the few that are left over run one after the other on this
+/// thread, each with all cores.
 pub(crate) fn beside_each_other<T: Send>(count: usize, work: impl Fn(usize) -> T + Sync + Send) -> Vec<T> {
     let threads = rayon::current_num_threads().max(1);
+    if count > 1 && threads >= 2 * count && rayon::current_thread_index().is_none() {
+        return on_own_threads(count, &work);
+    }
     let left = count % threads;
     let alone = if 2 * left <= threads { count - left } else { count };
     let mut results: Vec<T> = (0..alone).into_par_iter().map(&work).collect();
     results.extend((alone..count).map(work));
     results
+}
+
+/// Returns `work` of every index below `count`, each on a thread of its own.
+fn on_own_threads<T: Send>(count: usize, work: &(impl Fn(usize) -> T + Sync)) -> Vec<T> {
+    std::thread::scope(|scope| {
+        let threads: Vec<_> = (0..count).map(|at| scope.spawn(move || work(at))).collect();
+        let join = |thread: std::thread::ScopedJoinHandle<'_, T>| match thread.join() {
+            Ok(result) => result,
+            Err(panic) => std::panic::resume_unwind(panic),
+        };
+        threads.into_iter().map(join).collect()
+    })
 }
 
 #[cfg(test)]
@@ -26,6 +42,7 @@ mod tests {
             assert_eq!(beside_each_other(count, square), expected);
             let (inside, _) = rayon::join(|| beside_each_other(count, square), || ());
             assert_eq!(inside, expected);
+            assert_eq!(on_own_threads(count, &square), expected);
         }
     }
 }
