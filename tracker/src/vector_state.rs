@@ -56,3 +56,29 @@ impl TypedOp for ClearUpperHalves {
         Ok(tvec!(inputs[0].clone()))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_product_of_the_pose_network_is_followed_by_a_clearing_that_changes_nothing() {
+        let mut bytes = &include_bytes!("../assets/pose_full.onnx")[..];
+        let fact = f32::fact(tvec!(1, 256, 256, 3)).into();
+        let model = onnx().model_for_read(&mut bytes).and_then(|model| model.with_input_fact(0, fact)).unwrap();
+        let plain = model.into_optimized().unwrap();
+        let mut cleared = plain.clone();
+        clear_after_products(&mut cleared).unwrap();
+        let products = plain.nodes.iter().filter(|node| node.op_is::<OptMatMul>()).count();
+        let clearings: Vec<_> = cleared.nodes.iter().filter(|node| node.op_is::<ClearUpperHalves>()).collect();
+        assert!(products > 20 && clearings.len() == products, "{} after {products} products", clearings.len());
+        assert!(clearings.iter().all(|node| cleared.node(node.inputs[0].node).op_is::<OptMatMul>()));
+        let pixels: Vec<f32> = (0..256 * 256 * 3).map(|i| ((i * 7919) % 256) as f32 / 255.0).collect();
+        let run = |model: TypedModel| {
+            let input = Tensor::from_shape(&[1, 256, 256, 3], &pixels).unwrap();
+            let outputs = model.into_runnable().unwrap().run(tvec!(input.into())).unwrap();
+            outputs.iter().map(|output| output.to_plain_array_view::<f32>().unwrap().to_owned()).collect::<Vec<_>>()
+        };
+        assert!(run(plain) == run(cleared));
+    }
+}
