@@ -120,6 +120,7 @@ impl GpuSkinner {
             encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some("skinning"), ..Default::default() });
         pass.set_pipeline(&kernel.pipeline);
         pass.set_bind_group(0, &bindings, &[]);
+        gpu.count_dispatch();
         pass.dispatch_workgroups(x, y, 1);
         Ok(())
     }

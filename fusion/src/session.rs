@@ -245,7 +245,9 @@ impl Session {
             return Ok(Outcome::Still);
         };
         self.stages.merge(&stages);
+        let before = self.gpu.traffic();
         let outcome = self.update_people(set, observations, newcomers, effort);
+        self.stages.count_traffic(self.gpu.traffic().since(before));
         self.stillness.taken_in(set.master_nanos, took + start.elapsed());
         outcome
     }
@@ -389,7 +391,10 @@ impl Session {
             let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
             return Ok(RenderedView { width, height, rgba: vec![0; 4 * width as usize * height as usize] });
         }
-        self.drawing.render(&self.gpu, &people, camera, &mut self.stages)
+        let before = self.gpu.traffic();
+        let view = self.drawing.render(&self.gpu, &people, camera, &mut self.stages);
+        self.stages.count_traffic(self.gpu.traffic().since(before));
+        view
     }
 
     /// Largest view that the adapter can hold, pixels.

@@ -5,6 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use flyrig_gpu::GpuTraffic;
 use serde::Serialize;
 
 use crate::stage_trace::{trace_adapter, trace_stage};
@@ -94,7 +95,21 @@ impl StageTimes {
         }
     }
 
-    /// Counts work that was left out.
+    /// Counts what the device was asked for; nothing where it was not asked.
+    pub(crate) fn count_traffic(&mut self, traffic: GpuTraffic) {
+        let GpuTraffic { dispatches, waits, uploaded_bytes, read_bytes } = traffic;
+        let kinds = [
+            ("dispatches of kernels", dispatches),
+            ("waits for the device", waits),
+            ("KiB uploaded", uploaded_bytes / 1024),
+            ("KiB read back", read_bytes / 1024),
+        ];
+        for (name, count) in kinds.into_iter().filter(|(_, count)| *count > 0) {
+            self.count(name, count);
+        }
+    }
+
+    /// Counts work that was done or left out.
     pub fn count(&mut self, name: &'static str, by: u64) {
         match self.counts.iter_mut().find(|(known, _)| *known == name) {
             Some((_, count)) => *count += by,
@@ -102,7 +117,7 @@ impl StageTimes {
         }
     }
 
-    /// Counts of the work that was left out so far.
+    /// Counts of what was done and left out so far.
     pub fn counts(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
         self.counts.iter().copied()
     }
@@ -186,6 +201,12 @@ mod tests {
         times.count("views left out", 3);
         assert_eq!(times.counts().collect::<Vec<_>>(), [("views left out", 5)]);
         assert_eq!(times.table().lines().count(), 4);
+        let mut device = StageTimes::default();
+        device.count_traffic(GpuTraffic::default());
+        assert_eq!(device.counts().count(), 0, "nothing of a device that is not asked");
+        device.count_traffic(GpuTraffic { dispatches: 7, waits: 1, uploaded_bytes: 5000, read_bytes: 0 });
+        let expected = [("dispatches of kernels", 7), ("waits for the device", 1), ("KiB uploaded", 4)];
+        assert_eq!(device.counts().collect::<Vec<_>>(), expected);
         let mut sum = StageTimes::default();
         sum.add("b", Duration::from_millis(5));
         sum.merge(&times);

@@ -93,7 +93,9 @@ impl<T: Pod> StorageBuffer<T> {
         if let Some(mut elements) = self.slice_mut() {
             elements[..count].copy_from_slice(&content[..count]);
         } else if count > 0 {
-            gpu.queue.write_buffer(self.raw(), 0, bytemuck::cast_slice(&content[..count]));
+            let bytes: &[u8] = bytemuck::cast_slice(&content[..count]);
+            gpu.shared.traffic.upload(bytes.len());
+            gpu.queue.write_buffer(self.raw(), 0, bytes);
         }
     }
 
@@ -104,7 +106,8 @@ impl<T: Pod> StorageBuffer<T> {
         if self.content.is_some() {
             self.write(gpu, content);
         } else if count > 0 {
-            let bytes = bytemuck::cast_slice(&content[..count]);
+            let bytes: &[u8] = bytemuck::cast_slice(&content[..count]);
+            gpu.shared.traffic.upload(bytes.len());
             gpu.shared.uploads.record(&gpu.device, &gpu.shared.counters, encoder, bytes, (self.raw(), 0));
         }
     }
@@ -116,6 +119,7 @@ impl<T: Pod> StorageBuffer<T> {
         if let Some(mut elements) = self.slice_mut() {
             bytemuck::cast_slice_mut::<T, u8>(&mut elements)[..count].copy_from_slice(&bytes[..count]);
         } else if count > 0 {
+            gpu.shared.traffic.upload(count);
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             gpu.shared.uploads.record(
                 &gpu.device,
@@ -248,6 +252,7 @@ fn read_back_ranges<T: Pod>(gpu: &GpuContext, ranges: &[(&Buffer, u64)]) -> Resu
         return Ok(Vec::new());
     }
     let size = bytes.next_multiple_of(wgpu::COPY_BUFFER_ALIGNMENT);
+    gpu.shared.traffic.read_back(bytes);
     let staging = gpu.shared.take_read_back(&gpu.device, size);
     let mut encoder = gpu.device.create_command_encoder(&Default::default());
     let mut at = 0;

@@ -172,6 +172,7 @@ impl GpuContext {
         if self.on_processor {
             return self.check();
         }
+        self.shared.traffic.wait();
         let waited = self.device.poll(wgpu::PollType::wait_indefinitely());
         self.check()?;
         waited.map(|_| ()).map_err(|error| GpuError::Lost(error.to_string()))

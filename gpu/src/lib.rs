@@ -13,6 +13,7 @@ mod stage_timer;
 #[doc(hidden)]
 pub mod testing;
 mod timer;
+mod traffic;
 mod uploads;
 
 pub use buffer::{StorageBuffer, read_all, read_back};
@@ -23,3 +24,4 @@ pub use objects::GpuObjects;
 pub use shader::{ComputeKernel, MAX_WORKGROUPS_PER_DIMENSION, bind, dispatch_1d};
 pub use stage_timer::StageTimer;
 pub use timer::{GpuTimer, StageTime};
+pub use traffic::GpuTraffic;

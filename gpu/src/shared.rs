@@ -12,6 +12,7 @@ use crate::{
     GpuError, GpuObjects,
     bind_groups::BindGroups,
     objects::{Counters, lock},
+    traffic::TrafficCounters,
     uploads::Uploads,
 };
 
@@ -73,6 +74,7 @@ pub(crate) struct Shared {
     pub uploads: Uploads,
     pub bind_groups: BindGroups,
     pub counters: Counters,
+    pub traffic: TrafficCounters,
 }
 
 impl Shared {

@@ -1,7 +1,7 @@
 //! Constants that are uploaded within encoders, and bind groups that are used again.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking, in its helpers too
 
-use flyrig_gpu::{AdapterChoice, ComputeKernel, GpuContext, StorageBuffer, read_all};
+use flyrig_gpu::{AdapterChoice, ComputeKernel, GpuContext, GpuTraffic, StorageBuffer, read_all};
 use wgpu::{Buffer, CommandEncoder};
 
 /// Writes `constants[1]` to the place `constants[0]`.
@@ -103,8 +103,12 @@ fn several_arrays_are_read_with_one_wait() {
     flyrig_gpu::testing::on_both(|gpu| {
         let contents = [vec![[1.0f32, 2.0]; 5], Vec::new(), vec![[3.0, 4.0], [5.0, 6.0]]];
         let make = |content: &Vec<[f32; 2]>| StorageBuffer::from_slice(gpu, "array", content).unwrap();
+        let before = gpu.traffic();
         let arrays = contents.each_ref().map(make);
         assert_eq!(read_all(gpu, &arrays.each_ref()).unwrap(), contents);
+        let (waits, bytes) = if gpu.is_on_processor() { (0, 0) } else { (1, 7 * 8) };
+        let expected = GpuTraffic { dispatches: 0, waits, uploaded_bytes: bytes, read_bytes: bytes };
+        assert_eq!(gpu.traffic().since(before), expected);
         assert!(read_all::<u32>(gpu, &[]).unwrap().is_empty());
     });
 }

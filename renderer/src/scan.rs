@@ -73,7 +73,7 @@ pub(crate) fn run<'a>(
     resources: &[BindingResource<'_>],
     groups: impl Into<Groups<'a>>,
 ) {
-    dispatch(pass, kernel, &kernel.bind(gpu, resources), groups.into());
+    dispatch(gpu, pass, kernel, &kernel.bind(gpu, resources), groups.into());
 }
 
 /// As [`run`], with bindings whose numbers do not follow each other.
@@ -84,10 +84,17 @@ pub(crate) fn run_at<'a>(
     resources: &[(u32, BindingResource<'_>)],
     groups: impl Into<Groups<'a>>,
 ) {
-    dispatch(pass, kernel, &kernel.bind_at(gpu, resources), groups.into());
+    dispatch(gpu, pass, kernel, &kernel.bind_at(gpu, resources), groups.into());
 }
 
-fn dispatch(pass: &mut ComputePass<'_>, kernel: &ComputeKernel, group: &BindGroup, groups: Groups<'_>) {
+fn dispatch(
+    gpu: &GpuContext,
+    pass: &mut ComputePass<'_>,
+    kernel: &ComputeKernel,
+    group: &BindGroup,
+    groups: Groups<'_>,
+) {
+    gpu.count_dispatch();
     pass.set_pipeline(&kernel.pipeline);
     pass.set_bind_group(0, group, &[]);
     match groups {

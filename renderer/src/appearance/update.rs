@@ -137,6 +137,7 @@ impl DirectAppearance {
             let (x, y): (u32, u32) = groups;
             for bind in binds {
                 pass.set_bind_group(0, bind, &[]);
+                gpu.count_dispatch();
                 pass.dispatch_workgroups(x, y, 1);
             }
         };
