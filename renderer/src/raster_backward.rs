@@ -6,7 +6,7 @@ use wgpu::{CommandEncoder, ComputePassDescriptor};
 use crate::processor::ProcessorBackward;
 use crate::raster::RasterizerOn;
 use crate::raster_device::{DeviceRasterizer, FRAME};
-use crate::raster_kernels::{FRAME_WGSL, Tile};
+use crate::raster_kernels::{BUSY_WGSL, FRAME_WGSL, Tile};
 use crate::scan::run;
 use crate::sort::Keys;
 use crate::{Carry, GaussianBuffers, GaussianGradients, ImageGradients, Rasterizer, RenderTarget};
@@ -258,7 +258,7 @@ pub(crate) fn blend_wgsl(tile: Tile, with_depth: bool) -> String {
         "{}const WITH_DEPTH: bool = {with_depth};\nconst BATCH: u32 = {batch}u;\nconst MAX_LIST: u32 = {MAX_LIST}u;\n",
         tile.wgsl()
     );
-    [&constants, CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, BLEND_WGSL].concat()
+    [&constants, CAMERA_WGSL, FRAME_WGSL, BUSY_WGSL, BACKWARD_FRAME_WGSL, BLEND_WGSL].concat()
 }
 
 pub(crate) fn project_wgsl(lift: bool) -> String {

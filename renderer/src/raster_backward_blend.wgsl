@@ -3,7 +3,7 @@
 // what was blended so far. Each (tile, Gaussian) pair gets one sum over the tile's pixels, in a fixed order.
 //
 // A tile whose incoming gradients are all zero ends at once; a pixel without any counts as finished.
-// Prefix: camera.wgsl, raster_frame.wgsl, raster_backward_frame.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE, WITH_DEPTH,
+// Prefix: camera.wgsl, raster_frame.wgsl, raster_busy.wgsl, raster_backward_frame.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE, WITH_DEPTH,
 // BATCH, MAX_LIST.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;
@@ -38,24 +38,10 @@ var<workgroup> loaded_color: array<vec3<f32>, LOADED>;
 var<workgroup> loaded_places: array<Place, LOADED>;
 // partial[(splat of the batch * VECTORS + vector) * INVOCATIONS + invocation]
 var<workgroup> partials: array<vec4<f32>, BATCH * VECTORS * INVOCATIONS>;
-var<workgroup> busy: atomic<u32>;
-var<workgroup> go_on: u32;
 
 // On the bits, since compilers may assume that comparisons never see NaN.
 fn finite(v: vec4<f32>) -> bool {
     return all((bitcast<vec4<u32>>(v) & vec4(0x7f800000u)) != vec4(0x7f800000u));
-}
-
-// Whether any invocation of the workgroup is busy; to be called by all of them together.
-fn any_busy(local: u32, mine: bool) -> bool {
-    if mine {
-        atomicStore(&busy, 1u);
-    }
-    workgroupBarrier();
-    if local == 0u {
-        go_on = atomicExchange(&busy, 0u);
-    }
-    return workgroupUniformLoad(&go_on) != 0u;
 }
 
 @compute @workgroup_size(TILE, TILE / ROWS)

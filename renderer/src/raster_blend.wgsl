@@ -3,7 +3,7 @@
 // Four pixels share what is loaded of a splat, which is what the time goes into on Mesa's software adapter.
 // Lines between "// only NAME" and "// end" are left out of kernels that do not write that image: a binding counts
 // against the adapter's limit wherever it is declared and named, reached or not.
-// Prefix: camera.wgsl, raster_frame.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE.
+// Prefix: camera.wgsl, raster_frame.wgsl, raster_busy.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;
 // only color
@@ -37,20 +37,6 @@ var<workgroup> batch_color: array<vec3<f32>, BATCH>;
 // only canonical
 var<workgroup> batch_canonical: array<vec3<f32>, BATCH>;
 // end
-var<workgroup> busy: atomic<u32>;
-var<workgroup> go_on: u32;
-
-// Whether any invocation of the workgroup is busy; to be called by all of them together.
-fn any_busy(lane: u32, mine: bool) -> bool {
-    if mine {
-        atomicStore(&busy, 1u);
-    }
-    workgroupBarrier();
-    if lane == 0u {
-        go_on = atomicExchange(&busy, 0u);
-    }
-    return workgroupUniformLoad(&go_on) != 0u;
-}
 
 @compute @workgroup_size(TILE, TILE / ROWS)
 fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) local: vec3<u32>,

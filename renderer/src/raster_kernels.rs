@@ -13,6 +13,7 @@ use crate::sort::{BLOCK, DIGIT_BITS, INVALID_KEY};
 pub(crate) const FRAME_WGSL: &str = include_str!("raster_frame.wgsl");
 const PROJECT_WGSL: &str = include_str!("raster_project.wgsl");
 const BINS_WGSL: &str = include_str!("raster_bins.wgsl");
+pub(crate) const BUSY_WGSL: &str = include_str!("raster_busy.wgsl");
 const BLEND_WGSL: &str = include_str!("raster_blend.wgsl");
 
 /// Alpha below which a splat does not touch a pixel.
@@ -92,7 +93,7 @@ pub(crate) fn blend_wgsl(tile: Tile, outputs: Outputs) -> String {
             _ => {}
         }
     }
-    [&tile.wgsl(), CAMERA_WGSL, FRAME_WGSL, &kept].concat()
+    [&tile.wgsl(), CAMERA_WGSL, FRAME_WGSL, BUSY_WGSL, &kept].concat()
 }
 
 /// The outputs of each kernel that draws `outputs`, so that none binds more than 8 buffers.
