@@ -95,7 +95,7 @@ impl StageTimes {
         }
     }
 
-    /// Counts what the device was asked for; nothing where it was not asked.
+    /// Counts dispatches, waits and bytes of the device; leaves out what is 0.
     pub(crate) fn count_traffic(&mut self, traffic: GpuTraffic) {
         let GpuTraffic { dispatches, waits, uploaded_bytes, read_bytes } = traffic;
         let kinds = [
@@ -117,7 +117,7 @@ impl StageTimes {
         }
     }
 
-    /// Counts of what was done and left out so far.
+    /// Counts of work that was done or left out so far.
     pub fn counts(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
         self.counts.iter().copied()
     }

@@ -214,14 +214,7 @@ pub fn read_all<T: Pod>(gpu: &GpuContext, arrays: &[&StorageBuffer<T>]) -> Resul
     }
     let element = size_of::<T>() as u64;
     let ranges: Vec<(&Buffer, u64)> = arrays.iter().map(|array| (array.raw(), array.len as u64 * element)).collect();
-    let all: Vec<T> = read_back_ranges(gpu, &ranges)?;
-    let mut rest = all.as_slice();
-    let split = |array: &&StorageBuffer<T>| {
-        let (first, others) = rest.split_at(array.len.min(rest.len()));
-        rest = others;
-        first.to_vec()
-    };
-    Ok(arrays.iter().map(split).collect())
+    read_back_ranges(gpu, &ranges)
 }
 
 impl StorageBuffer<u32> {
@@ -241,15 +234,14 @@ impl StorageBuffer<u32> {
 /// # Errors
 /// [`GpuError::Lost`].
 pub fn read_back<T: Pod>(gpu: &GpuContext, buffer: &Buffer, len: usize) -> Result<Vec<T>, GpuError> {
-    read_back_ranges(gpu, &[(buffer, len as u64 * size_of::<T>() as u64)])
+    Ok(read_back_ranges(gpu, &[(buffer, len as u64 * size_of::<T>() as u64)])?.pop().unwrap_or_default())
 }
 
-/// Waits for the GPU and copies the first bytes of several buffers, one after the other. Where there are several, their sizes are
-/// multiples of 4 bytes.
-fn read_back_ranges<T: Pod>(gpu: &GpuContext, ranges: &[(&Buffer, u64)]) -> Result<Vec<T>, GpuError> {
+/// Waits for the GPU and copies the first bytes of each buffer. Where there are several, their sizes are multiples of 4 bytes.
+fn read_back_ranges<T: Pod>(gpu: &GpuContext, ranges: &[(&Buffer, u64)]) -> Result<Vec<Vec<T>>, GpuError> {
     let bytes: u64 = ranges.iter().map(|(_, bytes)| bytes).sum();
     if bytes == 0 {
-        return Ok(Vec::new());
+        return Ok(vec![Vec::new(); ranges.len()]);
     }
     let size = bytes.next_multiple_of(wgpu::COPY_BUFFER_ALIGNMENT);
     gpu.shared.traffic.read_back(bytes);
@@ -274,7 +266,13 @@ fn read_back_ranges<T: Pod>(gpu: &GpuContext, ranges: &[(&Buffer, u64)]) -> Resu
     }
     let content = {
         let view = staging.get_mapped_range(..bytes).map_err(|error| GpuError::Lost(error.to_string()))?;
-        bytemuck::pod_collect_to_vec(&view[..])
+        let mut rest = &view[..];
+        let mut take = |bytes: u64| {
+            let (first, others) = rest.split_at((bytes as usize).min(rest.len()));
+            rest = others;
+            bytemuck::pod_collect_to_vec(first)
+        };
+        ranges.iter().map(|(_, bytes)| take(*bytes)).collect()
     };
     staging.unmap();
     gpu.shared.give_read_back(staging);

@@ -1,17 +1,17 @@
-//! What the processor asks of the device.
+//! Counts of the work given to the device, and of the data that goes to it and comes back.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::GpuContext;
 
-/// Work that was given to the device and data that went to and fro, since it was opened.
+/// Work given to the device, and data copied to it and back, since it was opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct GpuTraffic {
     /// Dispatches of compute kernels.
     pub dispatches: u64,
     /// Waits of the processor for the device.
     pub waits: u64,
-    /// Bytes copied to the device.
+    /// Bytes of arrays copied to the device.
     pub uploaded_bytes: u64,
     /// Bytes read back from it.
     pub read_bytes: u64,
@@ -58,9 +58,13 @@ impl TrafficCounters {
 }
 
 impl GpuContext {
-    /// Returns what the device was asked for so far, by all clones of this context. Nothing on the processor.
+    /// Returns the counts so far, of all clones of this context: a simulator that draws on the same device counts as well. All are 0
+    /// where kernels run on the processor.
     #[must_use]
     pub fn traffic(&self) -> GpuTraffic {
+        if self.is_on_processor() {
+            return GpuTraffic::default();
+        }
         let get = |count: &AtomicU64| count.load(Ordering::Relaxed);
         let TrafficCounters { dispatches, waits, uploaded_bytes, read_bytes } = &self.shared.traffic;
         GpuTraffic {

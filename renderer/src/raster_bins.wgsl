@@ -2,7 +2,7 @@
 // (sort.wgsl) makes lists of them. Sharing by pairs bounds every loop, whatever the footprints: Mesa's software adapter
 // silently ends loops after 65535 iterations of one invocation.
 // No kernel uses more than 8 of the bindings: all that browsers promise (raster_shader_tests.rs).
-// Prefix: const BLOCK, DIGIT_BITS of the sort, camera.wgsl, raster_frame.wgsl.
+// Prefix: const LANES, BLOCK and DIGIT_BITS of the sort, camera.wgsl, raster_frame.wgsl.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 // (depth key, Gaussian), nearest first
 @group(0) @binding(1) var<storage, read> ordered: array<vec2<u32>>;
@@ -20,8 +20,6 @@
 // visible Gaussians, pairs wanted, images so far that wanted more pairs than there is room for
 @group(0) @binding(9) var<storage, read_write> stats: array<u32>;
 @group(0) @binding(10) var<storage, read_write> work: Work;
-
-const LANES = 256u;
 
 // Of the kernels whose work depends on the number of pairs.
 struct Work {

@@ -2,7 +2,7 @@
 
 use flyrig_gpu::{GpuContext, GpuError, MAX_WORKGROUPS_PER_DIMENSION, StorageBuffer};
 
-use crate::raster_kernels::Tile;
+use crate::raster_kernels::{BINS_LANES, Tile};
 use crate::sort::{Keys, RadixSort};
 
 /// Room for pairs of a Gaussian and a tile. A body-like surface needs about three a Gaussian; the share
@@ -10,8 +10,8 @@ use crate::sort::{Keys, RadixSort};
 const PAIRS_PER_GAUSSIAN: u64 = 16;
 const PAIRS_PER_TILE: u64 = 64;
 const MIN_PAIRS: u64 = 1 << 18;
-/// The kernel that writes them has a workgroup for every 256.
-const MOST_PAIRS: u64 = MAX_WORKGROUPS_PER_DIMENSION as u64 * 256;
+/// What one dispatch of the kernel that writes them reaches.
+const MOST_PAIRS: u64 = MAX_WORKGROUPS_PER_DIMENSION as u64 * BINS_LANES as u64;
 
 /// Pairs that an image has room for, at most `limit`.
 pub(crate) fn pair_capacity(gaussians: usize, tiles: u64, limit: u64) -> u32 {

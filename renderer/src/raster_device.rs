@@ -10,7 +10,7 @@ use wgpu::{BindingResource, BufferBinding, BufferSize, CommandEncoder, ComputePa
 
 use crate::constants::Constants;
 use crate::raster_buffers::{ImageBuffers, Layout};
-use crate::raster_kernels::{Frame, RasterKernels, Tile};
+use crate::raster_kernels::{BINS_LANES, Frame, RasterKernels, Tile};
 use crate::raster_settings::{Latest, tile_range};
 use crate::scan::{Groups, Scan, run, run_at};
 use crate::sort::{DIGIT_BITS, KEY_BITS, Keys, MOST_ELEMENTS, RadixSort, SortPass, blocks, table_len};
@@ -164,8 +164,6 @@ const DEPTH_TABLE: usize = 2;
 const DEPTH_PASSES: usize = 3;
 const TILE_PASSES: usize = DEPTH_PASSES + KEY_BITS.div_ceil(DIGIT_BITS) as usize;
 const MOST_TILE_PASSES: usize = u32::BITS.div_ceil(DIGIT_BITS) as usize;
-/// Invocations of a workgroup of raster_bins.wgsl.
-const LANES: u32 = 256;
 
 /// Everything that one image's kernels are bound to.
 struct Stages<'a> {
@@ -220,7 +218,7 @@ impl Stages<'_> {
             r.work.raw().as_entire_binding(),
         ];
         let k = &r.kernels;
-        let ranks = dispatch_1d(self.gaussians.count() as u32, LANES);
+        let ranks = dispatch_1d(self.gaussians.count() as u32, BINS_LANES);
         run_at(self.gpu, pass, &k.count_pairs, &numbered(&resources, &[0, 1, 2, 3, 4]), ranks);
         r.scan.encode(self.gpu, pass, &r.constants.get(RANKS), &r.pairs_before, &r.pair_total);
         run_at(self.gpu, pass, &k.keep_pairs, &numbered(&resources, &[0, 2, 4, 5, 6, 9, 10]), (1, 1));
@@ -231,7 +229,7 @@ impl Stages<'_> {
         let sorted = (Groups::Counted(&r.work, 32), layout.keys());
         p.sort.encode(self.gpu, pass, sorted, &r.scan, &passes, &BindingResource::Buffer(length));
         resources[7] = p.lists().raw().as_entire_binding();
-        let tiles = dispatch_1d(layout.tile_count(), LANES);
+        let tiles = dispatch_1d(layout.tile_count(), BINS_LANES);
         run_at(self.gpu, pass, &k.end_lists, &numbered(&resources, &[0, 6, 7, 8]), tiles);
     }
 

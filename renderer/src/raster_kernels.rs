@@ -16,6 +16,9 @@ const BINS_WGSL: &str = include_str!("raster_bins.wgsl");
 pub(crate) const BUSY_WGSL: &str = include_str!("raster_busy.wgsl");
 const BLEND_WGSL: &str = include_str!("raster_blend.wgsl");
 
+/// Invocations of a workgroup of raster_bins.wgsl.
+pub(crate) const BINS_LANES: u32 = 256;
+
 /// Alpha below which a splat does not touch a pixel.
 pub(crate) const CUT: f64 = 1.0 / 255.0;
 /// Largest alpha of one splat (Kerbl et al. 2023).
@@ -74,7 +77,9 @@ pub(crate) fn project_wgsl(tile: Tile) -> String {
 }
 
 pub(crate) fn bins_wgsl() -> String {
-    let constants = format!("const BLOCK: u32 = {BLOCK}u;\nconst DIGIT_BITS: u32 = {DIGIT_BITS}u;\n");
+    let constants = format!(
+        "const LANES: u32 = {BINS_LANES}u;\nconst BLOCK: u32 = {BLOCK}u;\nconst DIGIT_BITS: u32 = {DIGIT_BITS}u;\n"
+    );
     [&constants, CAMERA_WGSL, FRAME_WGSL, BINS_WGSL].concat()
 }
 

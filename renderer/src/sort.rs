@@ -13,7 +13,7 @@ pub(crate) const INVALID_KEY: u32 = u32::MAX;
 pub(crate) const DIGIT_BITS: u32 = 8;
 /// Bits of their range to which scaled keys are compared.
 pub(crate) const KEY_BITS: u32 = 24;
-/// Elements of a workgroup, also in raster_bins.wgsl.
+/// Elements of a workgroup.
 pub(crate) const BLOCK: usize = 1024;
 /// Elements that can be sorted: a dispatch has no more workgroups.
 pub(crate) const MOST_ELEMENTS: usize = flyrig_gpu::MAX_WORKGROUPS_PER_DIMENSION as usize * BLOCK;
@@ -129,8 +129,8 @@ impl RadixSort {
         self.extremes.encode_clear(encoder);
     }
 
-    /// Sorts with [`blocks`] workgroups of what is sorted at least; `passes` holds the constants of each [`SortPass`], `scan_length` the [`table_len`] of the
-    /// number that is sorted.
+    /// Sorts. `groups` are at least the [`blocks`] of what is sorted, `passes` the constants of each [`SortPass`], `scan_length`
+    /// the [`table_len`] of the number that is sorted.
     pub(crate) fn encode(
         &self,
         gpu: &GpuContext,
@@ -162,7 +162,7 @@ impl RadixSort {
 
 pub(crate) fn sort_wgsl() -> String {
     format!(
-        "const DIGIT_BITS: u32 = {DIGIT_BITS}u;\nconst KEY_BITS: u32 = {KEY_BITS}u;\n\
+        "const BLOCK: u32 = {BLOCK}u;\nconst DIGIT_BITS: u32 = {DIGIT_BITS}u;\nconst KEY_BITS: u32 = {KEY_BITS}u;\n\
          const INVALID_KEY: u32 = {INVALID_KEY}u;\n{SORT_WGSL}"
     )
 }

@@ -1,6 +1,6 @@
 // One pass of a stable least-significant-digit radix sort. A workgroup owns one contiguous block and its own column of the
 // histogram table; nothing depends on when other workgroups run. Atomics only count, so that their order does not matter.
-// Prefix: const DIGIT_BITS, KEY_BITS, INVALID_KEY.
+// Prefix: const BLOCK, DIGIT_BITS, KEY_BITS, INVALID_KEY.
 struct SortPass {
     // Elements before the first pass.
     count: u32,
@@ -24,7 +24,6 @@ struct SortPass {
 
 const DIGITS = 1u << DIGIT_BITS;
 const LANES = 128u;
-const BLOCK = 1024u;
 // Lanes that walk over elements in their order, and elements of each.
 const WALKERS = 16u;
 const WALK = BLOCK / WALKERS;

@@ -54,30 +54,28 @@ fn sorting_is_a_stable_permutation_for_random_and_adversarial_keys() {
     let depth = |z: f32| z.to_bits();
     let scan = Scan::new(&gpu).unwrap();
     let mut sort = RadixSort::new(&gpu, 0).unwrap();
-    {
-        let mut check = |name: &str, keys: Vec<u32>| {
-            let sorted = sort_on_gpu(&gpu, &mut sort, &scan, &keys, Keys::Scaled);
-            assert!(sorted == expected(&keys, Keys::Scaled), "{name}, {} keys", keys.len());
-            let again = sort_on_gpu(&gpu, &mut sort, &scan, &keys, Keys::Scaled);
-            assert!(sorted == again, "{name}: two runs differ");
-        };
-        check("none", vec![]);
-        check("one", vec![7]);
-        check("one, not valid", vec![INVALID_KEY]);
-        check("all not valid", vec![INVALID_KEY; 1000]);
-        for count in [31, 1000, 65_537, 115_000, 200_000] {
-            check("random u32", (0..count).map(|_| rng.random::<u32>()).collect());
-            check("all equal", vec![depth(2.5); count]);
-            check("ascending", (0..count).map(|i| depth(1.0 + i as f32 * 1e-5)).collect());
-            check("descending", (0..count).rev().map(|i| depth(1.0 + i as f32 * 1e-5)).collect());
-            check("two values in turn", (0..count).map(|i| depth([3.0, 2.0][i % 2])).collect());
-            check("depths", (0..count).map(|_| depth(rng.random_range(2.0..4.0))).collect());
-            let with_nan = |i: usize| if i.is_multiple_of(3) { INVALID_KEY } else { depth(3.0 - i as f32 * 1e-6) };
-            check("a third not valid", (0..count).map(with_nan).collect());
-            // NaN depths never reach the sort as such, but would only be large keys.
-            check("NaN bits", (0..count).map(|i| [depth(f32::NAN), depth(1.0), depth(2.0)][i % 3]).collect());
-            check("far outlier", (0..count).map(|i| depth(if i == 5 { 9e8 } else { 0.06 + i as f32 })).collect());
-        }
+    let mut check = |name: &str, keys: Vec<u32>| {
+        let sorted = sort_on_gpu(&gpu, &mut sort, &scan, &keys, Keys::Scaled);
+        assert!(sorted == expected(&keys, Keys::Scaled), "{name}, {} keys", keys.len());
+        let again = sort_on_gpu(&gpu, &mut sort, &scan, &keys, Keys::Scaled);
+        assert!(sorted == again, "{name}: two runs differ");
+    };
+    check("none", vec![]);
+    check("one", vec![7]);
+    check("one, not valid", vec![INVALID_KEY]);
+    check("all not valid", vec![INVALID_KEY; 1000]);
+    for count in [31, 1000, 65_537, 115_000, 200_000] {
+        check("random u32", (0..count).map(|_| rng.random::<u32>()).collect());
+        check("all equal", vec![depth(2.5); count]);
+        check("ascending", (0..count).map(|i| depth(1.0 + i as f32 * 1e-5)).collect());
+        check("descending", (0..count).rev().map(|i| depth(1.0 + i as f32 * 1e-5)).collect());
+        check("two values in turn", (0..count).map(|i| depth([3.0, 2.0][i % 2])).collect());
+        check("depths", (0..count).map(|_| depth(rng.random_range(2.0..4.0))).collect());
+        let with_nan = |i: usize| if i.is_multiple_of(3) { INVALID_KEY } else { depth(3.0 - i as f32 * 1e-6) };
+        check("a third not valid", (0..count).map(with_nan).collect());
+        // NaN depths never reach the sort as such, but would only be large keys.
+        check("NaN bits", (0..count).map(|i| [depth(f32::NAN), depth(1.0), depth(2.0)][i % 3]).collect());
+        check("far outlier", (0..count).map(|i| depth(if i == 5 { 9e8 } else { 0.06 + i as f32 })).collect());
     }
 }
 

@@ -44,7 +44,7 @@ pub(super) fn to_canonical(derivatives: &PointDerivatives, skin: &[SkinWeights])
     (all.into_iter().map(|one| one.unwrap_or(UNSEEN)).collect(), dropped)
 }
 
-/// What a Gaussian that is not seen counts with.
+/// A Gaussian that is not seen.
 const UNSEEN: Carried = Carried { gradient: DVec3::ZERO, matrix: DMat3::ZERO };
 /// Gaussians that one task carries.
 const GAUSSIANS_A_TASK: usize = 1024;
