@@ -13,6 +13,7 @@ mod masks;
 mod perception;
 mod processor;
 mod recording;
+mod rest;
 mod scale;
 mod sequence;
 mod steady;

@@ -6,7 +6,7 @@
 use std::{collections::BTreeMap, path::Path, time::Instant};
 
 use anyhow::{Context, Result, ensure};
-use flyrig_body::{Skeleton, Template, load_gltf};
+use flyrig_body::{ShapeParams, Skeleton, Template, default_template, load_gltf};
 use flyrig_fusion::{BodySettings, Origin, Outcome, PerceptionSettings, PersonId, SessionSettings};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
@@ -18,6 +18,7 @@ use serde::Serialize;
 use crate::{
     cli::BenchPerceptionArgs,
     mask_errors::{MaskErrors, write_errors},
+    rest,
 };
 
 /// Joints that are compared, by the names of the CMU skeleton.
@@ -73,6 +74,9 @@ struct Row {
     joints_mm: BTreeMap<String, f64>,
     /// Mean angle between our parts and the true ones, by joint.
     turns_deg: BTreeMap<String, f64>,
+    /// Distance of our body without clothes in its bind pose from the true one, and of the average body from it, millimetres.
+    shape_mm: Option<f64>,
+    average_shape_mm: Option<f64>,
     masks: MaskErrors,
     view: Option<CameraScore>,
     set_ms: f64,
@@ -166,6 +170,8 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         }
     }
     bar.finish_and_clear();
+    let average = default_template(&ShapeParams::default())?;
+    let subject = replay.session.subject(person);
     let stages = replay.session.stages.summary();
     eprintln!("  {:?}", replay.session.stages.counts().collect::<Vec<_>>());
     let row = Row {
@@ -178,6 +184,8 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         jitter_mm: joints.jitter_mm(),
         joints_mm: joints.by_joint_mm(),
         turns_deg: joints.turns_deg(),
+        shape_mm: subject.and_then(|subject| rest::surface_mm(subject.body(), &truth.template)),
+        average_shape_mm: rest::surface_mm(&average, &truth.template),
         masks: masks.mean(),
         view: sheet.mean(),
         set_ms: 1e3 * seconds / f64::from(frames.max(1) as u32),
@@ -187,6 +195,13 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
     let list = |values: &BTreeMap<String, f64>| {
         values.iter().map(|(n, v)| format!("{n} {v:.0}")).collect::<Vec<_>>().join(", ")
     };
+    if let (Some(ours), Some(average), Some(subject)) = (row.shape_mm, row.average_shape_mm, subject) {
+        let [height, true_height] = [subject.body(), &truth.template].map(rest::height_m);
+        eprintln!(
+            "  body at rest: {ours:.1} mm from the true one, the average body's {average:.1} mm; {height:.3} m tall, \
+             truth {true_height:.3} m"
+        );
+    }
     eprintln!("  mm: {}\n  degrees: {}", list(&row.joints_mm), list(&row.turns_deg));
     Ok(row)
 }
@@ -266,8 +281,8 @@ pub(crate) fn places(skeleton: &Skeleton, pose: &Pose) -> BTreeMap<String, (DVec
 
 fn table(rows: &[Row]) -> String {
     let mut text = String::from(
-        "| data | pose | shape | masks | joints mm | p95 | jitter | mask IoU | boundary F | alpha in band | PSNR dB | SSIM | FLIP | \
-         IoU | lost | ms a set |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+        "| data | pose | shape | masks | joints mm | p95 | jitter | shape mm | mask IoU | boundary F | alpha in band | PSNR dB | SSIM | FLIP | \
+         IoU | lost | ms a set |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for row in rows {
         let name = |origin| if origin == Origin::Given { "given" } else { "estimated" };
@@ -277,7 +292,7 @@ fn table(rows: &[Row]) -> String {
         );
         let MaskErrors { iou, boundary_f, band_alpha, .. } = row.masks;
         text += &format!(
-            "| {} | {} | {} | {} | {:.1} | {:.1} | {:.1} | {iou:.4} | {boundary_f:.3} | {band_alpha:.3} | {view} | {} | {:.0} |\n",
+            "| {} | {} | {} | {} | {:.1} | {:.1} | {:.1} | {} | {iou:.4} | {boundary_f:.3} | {band_alpha:.3} | {view} | {} | {:.0} |\n",
             row.dataset,
             name(row.inputs.pose),
             name(row.inputs.shape),
@@ -285,6 +300,7 @@ fn table(rows: &[Row]) -> String {
             row.joint_mean_mm,
             row.joint_p95_mm,
             row.jitter_mm,
+            row.shape_mm.map_or_else(|| "-".to_owned(), |mm| format!("{mm:.1}")),
             row.lost,
             row.set_ms,
         );

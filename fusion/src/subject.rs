@@ -214,6 +214,12 @@ impl Subject {
         &self.template
     }
 
+    /// The body's shape without its clothes.
+    #[must_use]
+    pub fn body(&self) -> &Template {
+        self.undressed.as_ref().map_or(&self.template, |(shape, _)| shape)
+    }
+
     /// The body's shape without clothes, and these.
     pub(crate) fn shape_and_outfit(&self) -> (Template, Outfit) {
         match &self.undressed {
