@@ -361,14 +361,17 @@ pub struct BenchPerceptionArgs {
 
 #[derive(Debug, Args)]
 pub struct BenchSubjectsArgs {
-    /// Poses, shapes and masks from the simulator, or from the images. In the latter case the second person walks around the first,
-    /// and it is counted how often the tracks change places.
+    /// People in the scene: one waves, the others turn or walk.
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(2..=4).map(usize::from))]
+    pub people: usize,
+    /// Poses, shapes and masks from the simulator, or from the images. In the latter case all but the first walk, and it is counted
+    /// how often the tracks change places.
     #[arg(long, value_enum, default_value = "given")]
     pub pose: Origin,
     /// Folder of the results.
     #[arg(long, default_value = "out/bench-subjects")]
     pub out: PathBuf,
-    /// Seed of the first person; the next one makes the second.
+    /// Seed of the first person; the next ones make the others.
     #[arg(long, default_value_t = 3)]
     pub seed: u64,
     /// Frames of the sequence; the second half is scored.
@@ -422,8 +425,11 @@ pub struct BenchTakesArgs {
     #[arg(long, default_value_t = 601)]
     pub seed: u64,
     /// Seconds of a take.
-    #[arg(long, default_value_t = 5.0)]
+    #[arg(long, default_value_t = 5.0, value_parser = parse_seconds)]
     pub secs: f64,
+    /// The last person leaves 3 s after the start, for so many seconds; nobody leaves otherwise.
+    #[arg(long, value_parser = parse_seconds)]
+    pub away_secs: Option<f64>,
     /// Frame sets a second.
     #[arg(long, default_value_t = 10.0, value_parser = parse_fps)]
     pub fps: f64,

@@ -1,6 +1,7 @@
-//! `flyrig-bench subjects`: two people in one scene, with the views and the cost beside those of one person.
+//! `flyrig-bench subjects`: several people in one scene, with the views and the cost beside those of one person.
 //!
-//! Two simulated people of one rig are composited by depth, so that they hide each other as they would in one room.
+//! Simulated people of one rig are composited by depth, so that they hide each other as they would in one room. Each person's
+//! colours are also compared alone and in the scene, on the same pixels: those that show the person in the scene.
 
 use std::{collections::BTreeMap, path::Path, sync::Arc, time::Instant};
 
@@ -14,22 +15,26 @@ use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
 use flyrig_report::{png, progress_bar, write_whole};
 use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, SimFrame, Simulator};
-use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat, Rig};
+use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat, RenderedView, Rig};
 
 use crate::{cli::BenchSubjectsArgs, takes::hips};
 
-/// Half of the distance between the two people, metres; of a person from the middle of another one's walk.
+/// Half of the distance between two people, metres; of a person from the middle of another one's walk.
 const APART_M: f64 = 0.45;
 const WALK_APART_M: f64 = 0.7;
+/// Coverage from which on a pixel shows somebody.
+const COVERED: u8 = 128;
 /// Input and held-out cameras.
 pub(crate) const INPUTS: [usize; 4] = [0, 2, 4, 6];
 const HELD_OUT: [usize; 3] = [1, 3, 5];
 
 /// One way of tracking.
 struct Row {
-    name: &'static str,
+    name: String,
     psnr_db: f64,
     iou: f64,
+    /// PSNR on the pixels that show each of the chosen people in the scene of all.
+    own_db: Vec<f64>,
     tracks: Tracks,
     /// Milliseconds a set, and of one drawn view.
     set_ms: f64,
@@ -71,28 +76,27 @@ impl Tracks {
 /// Runs the command.
 pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let apart = if args.pose == Origin::Given { APART_M } else { WALK_APART_M };
-    let mut people = [-apart, apart]
-        .into_iter()
-        .zip(args.seed..)
-        .map(|(x, seed)| simulator(gpu, args, seed, x))
-        .collect::<Result<Vec<_>>>()?;
+    let mut people = (0..args.people).map(|who| simulator(gpu, args, who)).collect::<Result<Vec<_>>>()?;
     let rig = people[0].rig().clone();
-    let bar = progress_bar(args.frames as u64 * 3, "bench subjects");
+    let bar = progress_bar((args.frames * (args.people + 1)) as u64, "bench subjects");
+    let all: Vec<usize> = (0..args.people).collect();
     let mut rows = Vec::new();
-    for (name, chosen) in [("first alone", &[0usize][..]), ("second alone", &[1]), ("both", &[0, 1])] {
-        rows.push(run(args, gpu, &rig, &mut people, name, chosen, &bar)?);
+    for who in &all {
+        rows.push(run(args, gpu, &rig, &mut people, format!("person {} alone", who + 1), &[*who], &bar)?);
     }
+    rows.push(run(args, gpu, &rig, &mut people, format!("all {}", args.people), &all, &bar)?);
     bar.finish_and_clear();
     let mut table = String::from(
-        "| people | PSNR dB | mask IoU | hips mm | tracks that changed places | sets without a track | ms a set | ms a view |\n\
-         |---|---|---|---|---|---|---|---|\n",
+        "| people | PSNR dB | on own pixels dB | mask IoU | hips mm | tracks that changed places | sets without a track | ms a set | ms a view |\n\
+         |---|---|---|---|---|---|---|---|---|\n",
     );
     for row in &rows {
+        let own: Vec<String> = row.own_db.iter().map(|db| format!("{db:.2}")).collect();
         table += &format!(
-            "| {} | {:.2} | {:.4} | {:.0} | {} | {} | {:.0} | {:.1} |\n",
+            "| {} | {:.2} | {} | {:.4} | {:.0} | {} | {} | {:.0} | {:.1} |\n",
             row.name,
             row.psnr_db,
+            own.join(", "),
             row.iou,
             row.tracks.hips_mm.iter().sum::<f64>() / row.tracks.hips_mm.len() as f64,
             row.tracks.swaps,
@@ -101,9 +105,9 @@ pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
             row.view_ms
         );
     }
-    if let [first, second, both] = rows.as_slice() {
-        let alone = (first.set_ms + second.set_ms) / 2.0;
-        table += &format!("\nboth take {:.2} times as long as one person\n", both.set_ms / alone);
+    if let Some((together, alone)) = rows.split_last() {
+        let one_ms = alone.iter().map(|row| row.set_ms).sum::<f64>() / alone.len() as f64;
+        table += &format!("\nall take {:.2} times as long as one person\n", together.set_ms / one_ms);
     }
     write_whole(&args.out.join("subjects.md"), table.as_bytes())?;
     print!("{table}");
@@ -111,37 +115,43 @@ pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-fn simulator(gpu: &GpuContext, args: &BenchSubjectsArgs, seed: u64, x: f64) -> Result<Simulator> {
+/// Two people stand side by side; more stand or walk at equal distances around the middle.
+fn simulator(gpu: &GpuContext, args: &BenchSubjectsArgs, who: usize) -> Result<Simulator> {
+    let apart = if args.pose == Origin::Given { APART_M } else { WALK_APART_M };
+    let turn = std::f64::consts::PI + std::f64::consts::TAU * who as f64 / args.people as f64;
+    // As far from each other as two are.
+    let radius = apart / (std::f64::consts::PI / args.people as f64).sin();
     let motion = MotionConfig {
-        kind: match (x < 0.0, args.pose) {
-            (true, _) => MotionKind::Wave,
-            (false, Origin::Given) => MotionKind::Turn,
-            (false, Origin::Estimated) => MotionKind::Walk,
+        kind: match (who, args.pose) {
+            (0, _) => MotionKind::Wave,
+            (_, Origin::Given) => MotionKind::Turn,
+            (_, Origin::Estimated) => MotionKind::Walk,
         },
-        at_m: [x, 0.0],
+        at_m: [radius * turn.cos(), radius * turn.sin()],
         ..MotionConfig::default()
     };
     let mut config = SimConfig {
-        seed,
+        seed: args.seed + who as u64,
         motion,
         cameras: RingConfig { count: 7, radius_m: 3.4, ..RingConfig::default() },
         width: args.side,
         height: args.side,
         ..SimConfig::default()
     };
-    // One room for both.
+    // One room for all.
     config.scene.seed = Some(args.seed);
     Ok(Simulator::new(gpu, &config)?)
 }
 
-/// Image and mask of the chosen people as one camera sees them, the nearer one in front.
-fn composite(frames: &[SimFrame]) -> Result<(Image, Mask)> {
+/// Image and mask of people as one camera sees them, the nearer one in front, and which of them each pixel shows.
+fn composite(frames: &[SimFrame]) -> Result<(Image, Mask, Vec<usize>)> {
     let first = frames.first().context("nobody was chosen")?;
     let (width, height) = (first.color.width(), first.color.height());
     let mut rgb = first.color.bytes().to_vec();
     let mut coverage = first.mask.coverage().to_vec();
     let mut depth = first.depth.clone();
-    for frame in &frames[1..] {
+    let mut shown = vec![0; depth.len()];
+    for (who, frame) in frames.iter().enumerate().skip(1) {
         for i in 0..depth.len() {
             let (own, cover) = (frame.depth[i], u32::from(frame.mask.coverage()[i]));
             let in_front = own > 0.0 && (depth[i] <= 0.0 || own < depth[i]);
@@ -155,15 +165,41 @@ fn composite(frames: &[SimFrame]) -> Result<(Image, Mask)> {
             coverage[i] = coverage[i].max(frame.mask.coverage()[i]);
             if in_front {
                 depth[i] = own;
+                shown[i] = who;
             }
         }
     }
-    Ok((Image::new(width, height, PixelFormat::Rgb8, rgb)?, Mask::new(width, height, coverage)?))
+    Ok((Image::new(width, height, PixelFormat::Rgb8, rgb)?, Mask::new(width, height, coverage)?, shown))
 }
 
-fn capture(people: &mut [Simulator], chosen: &[usize], nanos: i64, slot: usize) -> Result<(Image, Mask)> {
+fn capture(people: &mut [Simulator], chosen: &[usize], nanos: i64, slot: usize) -> Result<(Image, Mask, Vec<usize>)> {
     let frames = chosen.iter().map(|&who| Ok(people[who].render(nanos, slot)?)).collect::<Result<Vec<_>>>()?;
     composite(&frames)
+}
+
+/// Sum of squared differences of colours, 0 to 1, and their number.
+#[derive(Default, Clone, Copy)]
+struct Squares(f64, usize);
+
+impl Squares {
+    /// Adds the pixels of a view over black that show `who` where everybody is in the scene.
+    fn add(&mut self, view: &RenderedView, truth: &Image, (everybody, shown): (&Mask, &[usize]), who: usize) {
+        let pixels = view.rgba.chunks_exact(4).zip(truth.bytes().chunks_exact(3));
+        for ((ours, theirs), (cover, shown)) in pixels.zip(everybody.coverage().iter().zip(shown)) {
+            if *cover < COVERED || *shown != who {
+                continue;
+            }
+            let alpha = f64::from(ours[3]) / 255.0;
+            for c in 0..3 {
+                self.0 += ((alpha * f64::from(ours[c]) - f64::from(theirs[c])) / 255.0).powi(2);
+            }
+            self.1 += 3;
+        }
+    }
+
+    fn db(self) -> f64 {
+        -10.0 * (self.0 / self.1 as f64).log10()
+    }
 }
 
 fn run(
@@ -171,7 +207,7 @@ fn run(
     gpu: &GpuContext,
     rig: &Rig,
     people: &mut [Simulator],
-    name: &'static str,
+    name: String,
     chosen: &[usize],
     bar: &indicatif::ProgressBar,
 ) -> Result<Row> {
@@ -189,7 +225,9 @@ fn run(
         Origin::Estimated => builder.perception(find_people(people, chosen, rig, &inputs)?),
     }
     .build()?;
+    let everybody: Vec<usize> = (0..people.len()).collect();
     let mut sheet = ScoreSheet::default();
+    let mut own = vec![Squares::default(); chosen.len()];
     let mut tracks = Tracks::default();
     let (mut set_secs, mut view_secs, mut views) = (0.0, 0.0, 0u32);
     for index in 0..args.frames as u64 {
@@ -203,12 +241,16 @@ fn run(
         if index as usize >= args.frames / 2 {
             for slot in HELD_OUT {
                 let camera = &rig.cameras[slot];
-                let (image, mask) = capture(people, chosen, nanos, slot)?;
+                let (image, mask, _) = capture(people, chosen, nanos, slot)?;
                 let start = Instant::now();
                 let view = session.render(camera)?;
                 view_secs += start.elapsed().as_secs_f64();
                 views += 1;
                 sheet.extend(score_view(&camera.id, index, &view, &image, Some(&mask))?);
+                let (_, cover, shown) = capture(people, &everybody, nanos, slot)?;
+                for (squares, who) in own.iter_mut().zip(chosen) {
+                    squares.add(&view, &image, (&cover, &shown), *who);
+                }
                 if index as usize + 1 == args.frames {
                     let file = format!("{}-{}", name.replace(' ', "-"), camera.id);
                     png::write_view(&args.out.join(format!("{file}.png")), &view)?;
@@ -219,12 +261,13 @@ fn run(
         }
         bar.inc(1);
     }
-    write_subjects(&args.out, name, &session)?;
+    write_subjects(&args.out, &name, &session)?;
     let mean = sheet.mean().context("nothing to compare")?;
     Ok(Row {
         name,
         psnr_db: mean.psnr_db,
         iou: mean.iou.unwrap_or(0.0),
+        own_db: own.into_iter().map(Squares::db).collect(),
         tracks,
         set_ms: set_secs * 1e3 / (args.frames - 1).max(1) as f64,
         view_ms: view_secs * 1e3 / f64::from(views.max(1)),
@@ -256,7 +299,7 @@ pub(crate) fn frame_set(
     nanos: i64,
 ) -> Result<FrameSet> {
     let frame = |slot: usize| -> Result<Option<Arc<Frame>>> {
-        let (image, mask) = capture(people, chosen, nanos, slot)?;
+        let (image, mask, _) = capture(people, chosen, nanos, slot)?;
         Ok(Some(Arc::new(Frame {
             camera: rig.cameras[slot].id.clone(),
             sequence: index,

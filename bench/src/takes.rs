@@ -24,6 +24,9 @@ use crate::{
 const ON_SOMEBODY_M: f64 = 0.4;
 /// Everybody must be on a track from this time on, seconds: people are measured for 1.5 s first.
 const ARRIVAL_SECS: f64 = 2.0;
+/// When the last person leaves, where it does, and the time after its return that the search for it may take, seconds.
+const LEAVES_SECS: f64 = 3.0;
+const RETURN_SECS: f64 = 1.0;
 
 /// Counts of one take.
 #[derive(Debug, Default)]
@@ -40,6 +43,9 @@ struct Take {
     sets: usize,
     /// Who each track followed last.
     on: BTreeMap<PersonId, usize>,
+    /// Returns of the person who went away to the track from before, and returns to another one.
+    same: usize,
+    other: usize,
 }
 
 /// Runs the command.
@@ -48,7 +54,8 @@ pub fn takes(args: &BenchTakesArgs, gpu: &GpuContext) -> Result<()> {
     let sets = (args.secs * args.fps).round().max(1.0) as u64;
     let bar = progress_bar(args.takes * sets, "bench takes");
     let mut table = String::from(
-        "| take | changes of a track | without a track | tracks on nobody | hips mm | ms a set |\n|---|---|---|---|---|---|\n",
+        "| take | changes of a track | without a track | tracks on nobody | returns to the own track | to another | hips mm | ms a set \
+         |\n|---|---|---|---|---|---|---|---|\n",
     );
     let mut total = Take::default();
     for index in 0..args.takes {
@@ -67,11 +74,13 @@ pub fn takes(args: &BenchTakesArgs, gpu: &GpuContext) -> Result<()> {
 
 fn row(name: &str, take: &Take) -> String {
     format!(
-        "| {name} | {} | {} of {} | {} | {:.0} | {:.0} |\n",
+        "| {name} | {} | {} of {} | {} | {} | {} | {:.0} | {:.0} |\n",
         take.swaps,
         take.missed,
         take.all,
         take.astray,
+        take.same,
+        take.other,
         mean(&take.hips_mm),
         1e3 * take.secs / take.sets.max(1) as f64
     )
@@ -83,30 +92,39 @@ impl Take {
         self.missed += other.missed;
         self.all += other.all;
         self.astray += other.astray;
+        self.same += other.same;
+        self.other += other.other;
         self.hips_mm.extend(other.hips_mm);
         self.secs += other.secs;
         self.sets += other.sets;
     }
 
-    /// Compares the tracks of a set with the people's true places.
-    fn compare(&mut self, tracks: &[(PersonId, DVec3)], truth: &[DVec3], counts: bool) {
-        let mut found = vec![false; truth.len()];
+    /// Compares the tracks of a set with the true places of the people who are there.
+    /// Returns the tracks by the people whom they follow.
+    fn compare(
+        &mut self,
+        tracks: &[(PersonId, DVec3)],
+        truth: &[(usize, DVec3)],
+        counts: bool,
+    ) -> BTreeMap<usize, PersonId> {
+        let mut found = BTreeMap::new();
         for (id, hips) in tracks {
-            let nearest =
-                (0..truth.len()).min_by(|a, b| truth[*a].distance(*hips).total_cmp(&truth[*b].distance(*hips)));
-            let Some(nearest) = nearest.filter(|who| truth[*who].distance(*hips) < ON_SOMEBODY_M) else {
+            let nearest = truth.iter().min_by(|a, b| a.1.distance(*hips).total_cmp(&b.1.distance(*hips)));
+            let Some((nearest, place)) = nearest.copied().filter(|(_, place)| place.distance(*hips) < ON_SOMEBODY_M)
+            else {
                 self.astray += 1;
                 continue;
             };
-            self.hips_mm.push(1e3 * truth[nearest].distance(*hips));
-            found[nearest] = true;
+            self.hips_mm.push(1e3 * place.distance(*hips));
+            found.insert(nearest, *id);
             let before = self.on.insert(*id, nearest);
             self.swaps += usize::from(before.is_some_and(|before| before != nearest));
         }
         if counts {
             self.all += truth.len();
-            self.missed += found.iter().filter(|found| !**found).count();
+            self.missed += truth.iter().filter(|(who, _)| !found.contains_key(who)).count();
         }
+        found
     }
 }
 
@@ -119,11 +137,17 @@ fn run(args: &BenchTakesArgs, gpu: &GpuContext, seed: u64, sets: u64, bar: &indi
     let settings = PerceptionSettings { people: args.people, ..PerceptionSettings::default() };
     let template = default_template(&ShapeParams::default())?;
     let mut perception = EstimatedPerception::new(&inputs, &template, &settings, &plates)?;
-    let chosen: Vec<usize> = (0..args.people).collect();
+    let (everybody, last) = ((0..args.people).collect::<Vec<_>>(), args.people - 1);
     let mut take = Take::default();
+    // The last person's track, and whether it left and was not found since.
+    let (mut own, mut has_left) = (None, false);
     for index in 0..sets {
-        let nanos = (index as f64 / args.fps * 1e9) as i64;
-        let set = frame_set(&mut people, &chosen, &rig, index, nanos)?;
+        let secs = index as f64 / args.fps;
+        let nanos = (secs * 1e9) as i64;
+        let back_secs = LEAVES_SECS + args.away_secs.unwrap_or(0.0);
+        let is_away = (LEAVES_SECS..back_secs).contains(&secs);
+        let chosen = &everybody[..args.people - usize::from(is_away)];
+        let set = frame_set(&mut people, chosen, &rig, index, nanos)?;
         let start = Instant::now();
         let observations = perception.observe(&set, &mut StageTimes::default())?;
         take.secs += start.elapsed().as_secs_f64();
@@ -137,9 +161,18 @@ fn run(args: &BenchTakesArgs, gpu: &GpuContext, seed: u64, sets: u64, bar: &indi
                 Some((seen.person, hips(known.iter().find(template)?.template, &seen.pose)?))
             })
             .collect();
-        let truth: Vec<DVec3> =
-            people.iter().filter_map(|person| hips(person.template(), &person.track().at_repeated(nanos))).collect();
-        take.compare(&tracks, &truth, index as f64 >= ARRIVAL_SECS * args.fps);
+        let place = |who: &usize| hips(people[*who].template(), &people[*who].track().at_repeated(nanos));
+        let truth: Vec<(usize, DVec3)> = chosen.iter().filter_map(|who| Some((*who, place(who)?))).collect();
+        let is_arriving = args.away_secs.is_some() && (back_secs..back_secs + RETURN_SECS).contains(&secs);
+        let found = take.compare(&tracks, &truth, secs >= ARRIVAL_SECS && !is_arriving);
+        if let Some(now) = found.get(&last) {
+            if std::mem::take(&mut has_left) {
+                take.same += usize::from(own == Some(*now));
+                take.other += usize::from(own != Some(*now));
+            }
+            own = Some(*now);
+        }
+        has_left |= is_away;
         bar.inc(1);
     }
     Ok(take)
@@ -176,12 +209,13 @@ mod tests {
 
     #[test]
     fn changes_absences_and_strays_are_counted() {
-        let truth = [DVec3::ZERO, DVec3::X];
+        let truth = [(0, DVec3::ZERO), (1, DVec3::X)];
         let (a, b) = (PersonId(0), PersonId(1));
         let mut take = Take::default();
         take.compare(&[(a, DVec3::ZERO), (b, DVec3::X * 0.9)], &truth, true);
         assert_eq!((take.swaps, take.missed, take.all, take.astray), (0, 0, 2, 0));
-        take.compare(&[(a, DVec3::X)], &truth, true);
+        let found = take.compare(&[(a, DVec3::X)], &truth, true);
+        assert_eq!(found, BTreeMap::from([(1, a)]));
         assert_eq!((take.swaps, take.missed, take.all, take.astray), (1, 1, 4, 0), "a changed over, one is missing");
         take.compare(&[(a, DVec3::X), (b, DVec3::Z * 5.0)], &truth, false);
         assert_eq!((take.swaps, take.missed, take.all, take.astray), (1, 1, 4, 1));

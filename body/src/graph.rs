@@ -213,26 +213,42 @@ impl Ord for Far {
     }
 }
 
-/// The five nearest nodes of every Gaussian along the surface, nearest first, [`NONE`] where there are fewer:
-/// one Dijkstra search from all nodes at once that lets five of them pass each point.
+/// The five nearest nodes of every Gaussian along the surface, nearest first, [`NONE`] where there are fewer: one Dijkstra search
+/// from all nodes at once that lets five of them pass each point.
 fn nearest_nodes(links: &SurfaceLinks, count: usize, node_gaussian: &[u32]) -> Vec<[u32; NEAREST + 1]> {
-    let mut nearest = vec![[NONE; NEAREST + 1]; count];
-    let mut front: BinaryHeap<Reached> =
-        node_gaussian.iter().zip(0..).map(|(&gaussian, node)| Reached { distance: 0.0, gaussian, node }).collect();
+    // The shortest ways found so far, nearest first: they only become shorter, so whatever is longer than all five leads nowhere.
+    let mut nearest = vec![[(f32::INFINITY, NONE); NEAREST + 1]; count];
+    let mut front: BinaryHeap<Reached> = BinaryHeap::new();
+    for (&gaussian, node) in node_gaussian.iter().zip(0..) {
+        if shorten(&mut nearest[gaussian as usize], 0.0, node) {
+            front.push(Reached { distance: 0.0, gaussian, node });
+        }
+    }
     while let Some(Reached { distance, gaussian, node }) = front.pop() {
-        let slots = &mut nearest[gaussian as usize];
-        // Filled from the front; a node that was here came by a shorter way.
-        let Some(free) = slots.iter().position(|&known| known == NONE || known == node) else { continue };
-        if slots[free] == node {
+        if !nearest[gaussian as usize].contains(&(distance, node)) {
             continue;
         }
-        slots[free] = node;
         for &(next, step) in links.of(gaussian as usize) {
-            let slots = &nearest[next as usize];
-            if slots[NEAREST] == NONE && !slots.contains(&node) {
+            if shorten(&mut nearest[next as usize], distance + step, node) {
                 front.push(Reached { distance: distance + step, gaussian: next, node });
             }
         }
     }
-    nearest
+    nearest.into_iter().map(|ways| ways.map(|(_, node)| node)).collect()
+}
+
+/// Enters a way to a node among the shortest ones; returns whether it is one.
+fn shorten(ways: &mut [(f32, u32); NEAREST + 1], distance: f32, node: u32) -> bool {
+    let place = ways.iter().position(|&(_, known)| known == node).unwrap_or(NEAREST);
+    // Of two nodes as far away, the one of the lower index counts as nearer.
+    if (distance, node) >= ways[place] {
+        return false;
+    }
+    ways[place] = (distance, node);
+    let mut at = place;
+    while at > 0 && ways[at] < ways[at - 1] {
+        ways.swap(at, at - 1);
+        at -= 1;
+    }
+    true
 }

@@ -102,7 +102,10 @@ fn capture_people(
             builder.perception(*perception)
         }
     };
-    let session = monitor.during(gpu, || builder.build())?;
+    let mut session = monitor.during(gpu, || builder.build())?;
+    if config.source.real_time {
+        session.work_beside();
+    }
     let publisher = Publisher::open(&config.transport())?;
     publisher.set_calibration(session.rig())?;
     eprintln!(

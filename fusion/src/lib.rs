@@ -19,6 +19,7 @@ mod live_publisher;
 mod live_rig;
 mod live_views;
 mod memory;
+mod newcomers;
 mod perceiver;
 mod perception;
 mod person_stream;

@@ -57,6 +57,11 @@ impl Perceiver {
         self.perception.measure_again()
     }
 
+    /// See [`Perception::work_beside`].
+    pub fn work_beside(&mut self) {
+        self.perception.work_beside();
+    }
+
     /// Observes everybody in a set.
     ///
     /// # Errors

@@ -32,6 +32,9 @@ pub trait Perception: Send {
         false
     }
 
+    /// Measures people in threads of their own from now on, so that no set waits for it.
+    fn work_beside(&mut self) {}
+
     /// Chooses how much work the next sets get.
     fn set_effort(&mut self, effort: Effort) {
         let _ = effort;

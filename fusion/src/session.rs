@@ -10,6 +10,7 @@ use crate::{
     Budget, Effort, FusionError, NetworksOn, Observation, Perception, PersonFrame, PersonMemory, Remedy, SeenPerson,
     SessionSettings, StageTimes, Subject, ViewObservation,
     drawing::Drawing,
+    newcomers::Newcomers,
     perceiver::{Newcomer, Perceived, Perceiver},
     stillness::Stillness,
     subject::{InputView, Observed},
@@ -91,6 +92,7 @@ impl SessionBuilder {
             perceiver: self.perception.map(Perceiver::new).unwrap_or_default(),
             subjects: Vec::new(),
             saved: self.saved,
+            newcomers: Newcomers::default(),
             keep_observations: false,
             shape_held: false,
             stages: StageTimes::default(),
@@ -119,6 +121,7 @@ pub struct Session {
     drawing: Drawing,
     /// Of people who are not subjects yet.
     saved: BTreeMap<PersonId, PersonMemory>,
+    newcomers: Newcomers,
     keep_observations: bool,
     shape_held: bool,
     stillness: Stillness,
@@ -273,6 +276,13 @@ impl Session {
                         outcome = Outcome::Held(reason);
                     }
                 }
+                Observation::Seen(seen)
+                    if self.newcomers.is_preparing(seen.person) && self.subject(seen.person).is_none() =>
+                {
+                    if outcome != Outcome::Updated {
+                        outcome = Outcome::Held(format!("person {} is being prepared", seen.person));
+                    }
+                }
                 Observation::Seen(seen) => {
                     self.update(set, &seen, effort)?;
                     outcome = Outcome::Updated;
@@ -282,15 +292,23 @@ impl Session {
         Ok(outcome)
     }
 
+    /// Prepares people who arrive in threads of their own from now on, and lets perception measure them there, so that nobody
+    /// waits meanwhile. Results then depend on the speed of the machine.
+    pub fn work_beside(&mut self) {
+        self.newcomers.work_beside();
+        self.perceiver.work_beside();
+    }
+
     /// Makes subjects of people who are none yet, and of those whose shape is another now.
     fn add_people(&mut self, people: Vec<Newcomer>) -> Result<(), FusionError> {
-        for Newcomer { person: id, shape, template, outfit } in people {
+        for newcomer in people {
+            let (id, outfit) = (newcomer.person, newcomer.outfit);
             let place = self.subjects.iter().position(|subject| subject.id() == id);
-            if place.is_some_and(|place| self.subjects[place].shape == shape) {
+            if place.is_some_and(|place| self.subjects[place].shape == newcomer.shape) {
                 continue;
             }
-            let mut subject = Subject::new(&self.gpu, id, (template, outfit), &self.rig, &self.settings)?;
-            subject.shape = shape;
+            let subject = self.newcomers.subject(newcomer, &self.gpu, &self.rig, &self.settings)?;
+            let Some(mut subject) = subject else { continue };
             if self.keep_observations {
                 subject.keep_observations(&self.gpu)?;
             }
@@ -467,6 +485,7 @@ impl Session {
             subject.take_over(old);
             subjects.push(subject);
         }
+        self.newcomers.clear();
         (self.gpu, self.drawing, self.subjects) = (gpu, drawing, subjects);
         Ok(())
     }

@@ -1,8 +1,10 @@
 //! Points of the body's surface that belong on lines in an image: what outlines and texture say of a pose.
 
+use std::collections::HashMap;
+
 use flyrig_body::Template;
 use flyrig_types::Camera;
-use glam::{DVec2, DVec3};
+use glam::{DVec2, DVec3, Vec3};
 
 use crate::body_model::BodyModel;
 use crate::view::View;
@@ -44,15 +46,35 @@ impl LinePoint {
         self.bones = bones(model, template, self.vertex);
         self.bones.iter_mut().for_each(|(_, _, local)| *local += self.worn);
     }
+}
+
+/// The vertices of a body below its clothes.
+pub(crate) struct BareBody<'a> {
+    body: &'a Template,
+    /// Most of a dressed body's vertices are those of the bare one, at other indices.
+    by_place: HashMap<[u32; 3], usize>,
+}
+
+impl<'a> BareBody<'a> {
+    pub fn new(body: &'a Template) -> Self {
+        let by_place = body.positions.iter().enumerate().map(|(vertex, at)| (key(*at), vertex)).collect();
+        Self { body, by_place }
+    }
 
     /// Hangs a point of a dressed body on the nearest vertex of the bare one, as far outside as it is: it then moves with the body's shape.
-    pub fn undress(&mut self, dressed: &Template, bare: &Template) {
-        let Some(at) = dressed.positions.get(self.vertex) else { return };
-        let distance = |v: &usize| bare.positions[*v].distance_squared(*at);
-        if let Some(nearest) = (0..bare.positions.len()).min_by(|a, b| distance(a).total_cmp(&distance(b))) {
-            (self.vertex, self.worn) = (nearest, (*at - bare.positions[nearest]).as_dvec3());
+    pub fn undress(&self, point: &mut LinePoint, dressed: &Template) {
+        let Some(at) = dressed.positions.get(point.vertex) else { return };
+        let bare = &self.body.positions;
+        let distance = |v: &usize| bare[*v].distance_squared(*at);
+        let search = || (0..bare.len()).min_by(|a, b| distance(a).total_cmp(&distance(b)));
+        if let Some(nearest) = self.by_place.get(&key(*at)).copied().or_else(search) {
+            (point.vertex, point.worn) = (nearest, (*at - bare[nearest]).as_dvec3());
         }
     }
+}
+
+fn key(at: Vec3) -> [u32; 3] {
+    at.to_array().map(f32::to_bits)
 }
 
 /// Returns joints, weights and places on the bones of a vertex.
@@ -107,7 +129,7 @@ mod tests {
                 point.bones.iter().map(|(bone, weight, local)| (model.origins[*bone] + *local) * *weight).sum()
             };
             let before = place(&point);
-            point.undress(&dressed, &body);
+            BareBody::new(&body).undress(&mut point, &dressed);
             assert!(point.vertex < body.positions.len());
             assert!(vertex != 5 || point.worn == DVec3::ZERO, "bare skin is where it was");
             point.hang(&model, &body);

@@ -1,11 +1,11 @@
 //! People found in the images by the pose network.
 
-use std::{collections::BTreeMap, sync::Arc, time::Duration};
+use std::{collections::BTreeMap, sync::Arc, thread::JoinHandle, time::Duration};
 
 use flyrig_body::{Outfit, Template, skin_mesh};
 use flyrig_tracker::{
     Background, BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PersonArea, PoseConfig, PoseEstimate,
-    PoseEstimator, PoseNet, ShapeFit, ShapeSighting, TrackError, is_blank, matte,
+    PoseEstimator, PoseNet, ShapeFit, ShapeSighting, TrackError, TrackErrorKind, is_blank, matte,
 };
 use flyrig_types::{Frame, FrameSet, Image, Mask, PersonId, Pose, Rig};
 use rayon::prelude::*;
@@ -34,13 +34,18 @@ const LEFT_AFTER_NANOS: u64 = 3_000_000_000;
 /// Somebody whose bones differ by more than this from those of the person before, as a mean share of their length, is another.
 const OTHER_SHAPE: f64 = 0.03;
 
+/// A shape that is being measured in a thread of its own.
+type Measurement = JoinHandle<Result<(Template, ShapeFit), TrackError>>;
+
 /// One person who is tracked, or a place for one who may come.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 struct Place {
     id: PersonId,
     estimator: PoseEstimator,
     /// Sightings for the shape fit and the last one's time, nanoseconds; `None` while the shape is not being measured.
     learning: Option<(Vec<ShapeSighting>, i64)>,
+    /// Measurement of the sightings, while it goes on.
+    measurement: Option<Measurement>,
     /// Whether a shape is known.
     known: bool,
     /// Whether the shape that is being measured replaces the known one, however little they differ.
@@ -71,9 +76,32 @@ impl Place {
 
     /// Begins to measure the person who is followed.
     fn measure(&mut self) {
-        self.learning = Some((Vec::new(), i64::MIN));
+        (self.learning, self.measurement) = (Some((Vec::new(), i64::MIN)), None);
         self.estimator.forget_clothes();
         self.estimator.keep_sightings(true);
+    }
+
+    /// Goes on with the shape that was measured, or measures it again.
+    fn take_measurement(&mut self, measured: Result<(Template, ShapeFit), TrackError>) {
+        let taken = measured.and_then(|(template, fit)| {
+            let is_other = self.known && bone_difference(self.estimator.template(), &template) > OTHER_SHAPE;
+            match (self.known, is_other, self.renews) {
+                (false, ..) => tracing::info!("person {} is {fit}", self.id),
+                (.., true) => tracing::info!("person {} was measured again: {fit}", self.id),
+                (_, true, _) => tracing::info!("person {} is somebody else now, {fit}", self.id),
+                // Somebody who comes back keeps the shape, and with it the colours.
+                _ => return Ok(()),
+            }
+            self.shape += u32::from(self.known);
+            self.outfit = fit.outfit;
+            self.estimator.take_shape(template)
+        });
+        if let Err(error) = taken {
+            tracing::warn!(%error, "the shape of person {} is not known yet, trying again", self.id);
+        } else if let Err(error) = self.know() {
+            tracing::warn!(%error, "hands of person {} are not estimated", self.id);
+            self.hands = None;
+        }
     }
 
     /// The template that poses are for.
@@ -108,6 +136,8 @@ pub struct EstimatedPerception {
     blank: Vec<bool>,
     /// Whether shapes are measured, by two or more views.
     measures: bool,
+    /// Whether they are measured in threads of their own.
+    beside: bool,
     /// Rounds of matching outlines and texture with all the work.
     rounds: usize,
     mattes: bool,
@@ -152,6 +182,7 @@ impl EstimatedPerception {
             id: PersonId(index as u32),
             estimator: estimator.clone(),
             learning: learning.clone(),
+            measurement: None,
             known: learning.is_none(),
             renews: false,
             shape: 0,
@@ -170,6 +201,7 @@ impl EstimatedPerception {
             watch: BackgroundWatch::default(),
             blank: vec![false; rig.cameras.len()],
             measures: settings.shape() == Origin::Estimated && rig.cameras.len() > 1,
+            beside: false,
             rounds,
             mattes: true,
         })
@@ -299,8 +331,13 @@ impl EstimatedPerception {
     fn learn(&mut self, set: &FrameSet, estimates: &[Result<PoseEstimate, String>]) {
         let every_nanos = (SHAPE_SECS * 1e9 / SHAPE_SETS as f64) as i64;
         for (place, estimate) in self.places.iter_mut().zip(estimates) {
+            if let Some(measurement) = place.measurement.take_if(|measurement| measurement.is_finished()) {
+                let panicked = "measuring the person panicked; please report it with the log".to_owned();
+                let panicked = TrackError { kind: TrackErrorKind::Lost, message: panicked };
+                place.take_measurement(measurement.join().unwrap_or(Err(panicked)));
+            }
             let (Some((sightings, last)), Ok(_)) = (&mut place.learning, estimate) else { continue };
-            if set.master_nanos.saturating_sub(*last) < every_nanos {
+            if place.measurement.is_some() || set.master_nanos.saturating_sub(*last) < every_nanos {
                 continue;
             }
             let Some(sighting) = place.estimator.take_sighting() else { continue };
@@ -309,26 +346,16 @@ impl EstimatedPerception {
             if sightings.len() < SHAPE_SETS {
                 continue;
             }
-            let measured = place.estimator.measure_shape(sightings);
-            let taken = measured.and_then(|(template, fit)| {
-                let is_other = place.known && bone_difference(place.estimator.template(), &template) > OTHER_SHAPE;
-                match (place.known, is_other, place.renews) {
-                    (false, ..) => tracing::info!("person {} is {fit}", place.id),
-                    (.., true) => tracing::info!("person {} was measured again: {fit}", place.id),
-                    (_, true, _) => tracing::info!("person {} is somebody else now, {fit}", place.id),
-                    // Somebody who comes back keeps the shape, and with it the colours.
-                    _ => return Ok(()),
+            let sightings = std::mem::take(sightings);
+            let estimator = place.estimator.clone();
+            let measure = move || estimator.measure_shape(&sightings);
+            if self.beside {
+                match std::thread::Builder::new().name("shape".to_owned()).spawn(measure) {
+                    Ok(thread) => place.measurement = Some(thread),
+                    Err(error) => tracing::warn!(%error, "person {} cannot be measured, trying again", place.id),
                 }
-                place.shape += u32::from(place.known);
-                place.outfit = fit.outfit;
-                place.estimator.take_shape(template)
-            });
-            if let Err(error) = taken {
-                tracing::warn!(%error, "the shape of person {} is not known yet, trying again", place.id);
-                sightings.clear();
-            } else if let Err(error) = place.know() {
-                tracing::warn!(%error, "hands of person {} are not estimated", place.id);
-                place.hands = None;
+            } else {
+                place.take_measurement(measure());
             }
         }
     }
@@ -417,6 +444,10 @@ impl Perception for EstimatedPerception {
             place.measure();
         });
         self.measures
+    }
+
+    fn work_beside(&mut self) {
+        self.beside = true;
     }
 
     fn set_effort(&mut self, effort: Effort) {

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::HeightFrom;
+use crate::line_point::BareBody;
 use crate::outfit_fit::{MaskedPoses, MaskedView, find_outfit};
 use flyrig_body::Shoes;
 use flyrig_types::Camera;
@@ -176,13 +177,14 @@ impl PoseEstimator {
                 let own = masks.get(slot).cloned().flatten();
                 own.or_else(|| set.frames.get(slot)?.as_ref()?.mask.clone().filter(|_| !self.config.masks))
             };
+            let bare = BareBody::new(&self.template);
             let problems: Vec<ShapeSet<'_>> = found
                 .iter()
                 .map(|(set, fitted, masks)| {
                     let masks: Vec<Option<Mask>> = (0..masks.len()).map(|slot| given(set, masks, slot)).collect();
                     let masks: Vec<Option<&Mask>> = masks.iter().map(Option::as_ref).collect();
                     let mut outline = self.match_outline(set, fitted, &fitted.turns, &masks, 2.0);
-                    outline.par_iter_mut().for_each(|point| point.undress(&self.surface, &self.template));
+                    outline.par_iter_mut().for_each(|point| bare.undress(point, &self.surface));
                     ShapeSet { problem: fitted.evidence.problem(&self.model, &self.config), outline }
                 })
                 .collect();
