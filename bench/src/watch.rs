@@ -8,7 +8,7 @@ use flyrig_calib::{CameraWatch, WatchState, WatchedImage};
 use flyrig_gpu::GpuContext;
 use flyrig_report::progress_bar;
 use flyrig_sim::{LightConfig, LightSwitch, MotionConfig, MotionKind, RingConfig, Shot, SimConfig, Simulator};
-use flyrig_types::{Image, Isometry};
+use flyrig_types::{Camera, Image, Isometry};
 use glam::{DQuat, DVec3};
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
@@ -27,6 +27,7 @@ const JUMP_SECS: f64 = 15.0;
 pub fn watch(args: &BenchWatchArgs, gpu: &GpuContext) -> Result<()> {
     let mut look_ms = Vec::new();
     let (mut found, mut other, mut late_secs, mut shares) = (0u32, 0u32, Vec::new(), Vec::new());
+    let (mut left_shares, mut left_px) = (Vec::new(), Vec::new());
     let bar = progress_bar(u64::from(args.bumps), "bumps");
     for bump in 0..args.bumps {
         let mut room = Room::new(args, gpu, u64::from(bump), (BEFORE + AFTER) as f64 * EVERY_SECS)?;
@@ -61,6 +62,12 @@ pub fn watch(args: &BenchWatchArgs, gpu: &GpuContext) -> Result<()> {
             late_secs.push((looks + 1) as f64 * EVERY_SECS);
             // `turn` moves points into the axes of the moved camera: the opposite of its own rotation.
             shares.push((motion.rotation + turn).length() / turn.length());
+            let calibrated = &room.simulator.rig().cameras[slot];
+            let bumped = Camera { camera_from_world: shift * calibrated.camera_from_world, ..calibrated.clone() };
+            let [as_it_was, corrected] =
+                [calibrated, &motion.applied_to(calibrated)].map(|camera| apart_px(camera, &bumped));
+            left_shares.push(corrected / as_it_was);
+            left_px.push(corrected);
         }
         bar.inc(1);
     }
@@ -79,6 +86,13 @@ pub fn watch(args: &BenchWatchArgs, gpu: &GpuContext) -> Result<()> {
         args.width,
         args.height,
         args.bumps,
+        100.0 * share,
+        100.0 * worst
+    );
+    let ((share, worst), (px, worst_px)) = (median(&mut left_shares), median(&mut left_px));
+    println!(
+        "where people stand, images of the corrected cameras are {px:.1} px off (at worst {worst_px:.1}): {:.0} % of what they are without \
+         correction (at worst {:.0} %)",
         100.0 * share,
         100.0 * worst
     );
@@ -110,6 +124,15 @@ pub fn watch(args: &BenchWatchArgs, gpu: &GpuContext) -> Result<()> {
         0.1 * ms / EVERY_SECS
     );
     Ok(())
+}
+
+/// Mean distance between the images of points in the volume that people fill, pixels.
+fn apart_px(camera: &Camera, other: &Camera) -> f64 {
+    let heights = [0.1, 0.6, 1.1, 1.6];
+    let places = [-0.4, 0.0, 0.4];
+    let points = heights.iter().flat_map(|z| places.iter().flat_map(move |y| places.map(|x| DVec3::new(x, *y, *z))));
+    let apart: Vec<f64> = points.filter_map(|at| Some(camera.project(at)?.distance(other.project(at)?))).collect();
+    apart.iter().sum::<f64>() / apart.len() as f64
 }
 
 fn look_at(watch: &mut CameraWatch, image: &Image) -> (WatchState, f64) {

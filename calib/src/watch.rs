@@ -9,7 +9,7 @@ mod patches;
 mod tests;
 
 use flyrig_solve::exp_rotation;
-use flyrig_types::Intrinsics;
+use flyrig_types::{Camera, Intrinsics, Isometry};
 use glam::{DMat3, DVec2, DVec3};
 
 use self::patches::{Patch, Pyramid, choose, coarse_shift, track};
@@ -44,6 +44,16 @@ pub struct CameraMotion {
     pub pixels: f64,
     /// Patches that agree, of those of the reference.
     pub agreeing: (usize, usize),
+}
+
+impl CameraMotion {
+    /// The camera after this motion.
+    #[must_use]
+    pub fn applied_to(&self, camera: &Camera) -> Camera {
+        // What stands still turns the other way in the camera's axes.
+        let turned = Isometry::new(exp_rotation(-self.rotation), DVec3::ZERO);
+        Camera { camera_from_world: turned * camera.camera_from_world, ..camera.clone() }
+    }
 }
 
 /// State of a camera.

@@ -59,6 +59,7 @@ pub enum WatchMode {
     Off,
     #[default]
     Warn,
+    Correct,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -10,6 +10,7 @@ use std::{
 };
 
 use anyhow::{Context, Result, ensure};
+use flyrig_calib::calibration_toml;
 use flyrig_capture::{CameraStats, Recorder};
 use flyrig_fusion::{
     Health, Intake, LivePublisher, LiveRig, LiveViews, Origin, Outcome, PersonId, PersonMemory, RigWatch, Session,
@@ -19,6 +20,7 @@ use flyrig_gpu::GpuContext;
 use flyrig_monitor::{Monitor, effort, ended_by_itself};
 use flyrig_report::{dataset, stop};
 use flyrig_transport::{Publisher, TransportConfig};
+use flyrig_types::Image;
 use flyrig_web::WebServer;
 use foxglove::messages::Log;
 use signal_hook::consts::SIGUSR1;
@@ -57,6 +59,20 @@ pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_tab
     ended.and(recorded)
 }
 
+/// Watches the cameras for bumps, where the configuration wants it.
+fn rig_watch(mode: WatchMode, source: &Source) -> Result<Option<RigWatch>> {
+    let watch = || RigWatch::new(&source.rig, &source.plates);
+    let copy = |plate: &Option<Image>| {
+        let copy = |plate: &Image| Image::new(plate.width(), plate.height(), plate.format(), plate.bytes().to_vec());
+        plate.as_ref().map(copy).transpose()
+    };
+    Ok(match mode {
+        WatchMode::Off => None,
+        WatchMode::Warn => Some(watch()),
+        WatchMode::Correct => Some(watch().correcting(source.plates.iter().map(copy).collect::<Result<_, _>>()?)),
+    })
+}
+
 /// Runs the rig until its cameras end or it is asked to stop.
 fn capture_people(
     config: &Config,
@@ -87,8 +103,10 @@ fn capture_people(
         eprintln!("run: the person is resumed from {}", config.body.person.display());
     }
     let threads = std::mem::take(&mut source.threads);
-    let watch = (config.calibration.watch == WatchMode::Warn).then(|| RigWatch::new(&source.rig, &source.plates));
-    let mut watched = recorder.map(|recorder| recorder.messages("watch", recording::schema::<Log>()));
+    let watch = rig_watch(config.calibration.watch, &source)?;
+    let mut watched = recorder.map(|recorder| {
+        ["watch", "corrected/calibration.toml"].map(|topic| recorder.messages(topic, recording::schema::<Log>()))
+    });
     if let (Origin::Given, Some(learnt)) = (config.perception.pose, &learnt) {
         source.template = learnt.clone();
     }
@@ -150,8 +168,12 @@ fn capture_people(
         }
         monitor.look(|| (rig.health(), recorder.map(Recorder::state)));
         let Some(step) = step else { continue };
-        if let (Some(event), Some(recorded)) = (&step.watched, &mut watched) {
-            recorded.record(event.nanos, recording::log("watch", event.to_string())?);
+        if let (Some(event), Some([messages, calibrations])) = (&step.watched, &mut watched) {
+            messages.record(event.nanos, recording::log("watch", event.to_string())?);
+            if event.corrected.is_some() {
+                let text = calibration_toml(rig.session.rig(), &[])?;
+                calibrations.record(event.nanos, recording::log("corrected/calibration.toml", text)?);
+            }
         }
         if !matches!(step.outcome, Outcome::Held(_)) {
             record_pose(poses.as_mut(), &rig.session, step.set.master_nanos);

@@ -50,7 +50,7 @@ pub use perception::{
     SeenPerson, ViewObservation,
 };
 pub use person_stream::{PersonEncoder, PersonFrame, PersonMessages};
-pub use rig_watch::{RigWatch, WatchEvent};
+pub use rig_watch::{Correction, RigWatch, WatchEvent};
 pub use session::{Counts, Outcome, Session, SessionBuilder};
 pub use set_reader::{SetReader, next_frame};
 pub use settings::{

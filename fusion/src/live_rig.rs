@@ -9,8 +9,8 @@ use flyrig_calib::WatchState;
 use flyrig_types::{FrameSet, PersonId, Restarts, ThreadHealth, ThreadWatch, caught};
 
 use crate::{
-    FusionError, Health, Intake, LivePublisher, LiveViews, Outcome, PersonMemory, RigWatch, Session, WatchEvent,
-    check_threads, perceiver::Perceived, resident_mib,
+    Correction, FusionError, Health, Intake, LivePublisher, LiveViews, Outcome, PersonMemory, RigWatch, Session,
+    WatchEvent, check_threads, perceiver::Perceived, resident_mib,
 };
 
 /// Name of the thread that calls [`LiveRig::step`], in health and errors.
@@ -170,6 +170,12 @@ impl LiveRig {
         };
         if let Some(event) = &watched {
             tracing::warn!("{event}");
+            if let Some(Correction { slot, camera, plate }) = &event.corrected {
+                self.session.move_camera(*slot, camera, plate.as_ref())?;
+                if let Some(publisher) = &self.publisher {
+                    publisher.publisher().set_calibration(self.session.rig())?;
+                }
+            }
         }
         Ok(Some(LiveStep { set, outcome, watched }))
     }

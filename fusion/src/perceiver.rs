@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use flyrig_body::{Outfit, Template};
-use flyrig_types::{FrameSet, PersonId};
+use flyrig_types::{Camera, FrameSet, Image, PersonId};
 
 use crate::{Effort, FusionError, KnownPerson, Observation, Perception, StageTimes};
 
@@ -55,6 +55,11 @@ impl Perceiver {
     /// See [`Perception::measure_again`].
     pub fn measure_again(&mut self) -> bool {
         self.perception.measure_again()
+    }
+
+    /// See [`Perception::move_camera`].
+    pub fn move_camera(&mut self, slot: usize, camera: &Camera, plate: Option<&Image>) -> Result<(), FusionError> {
+        self.perception.move_camera(slot, camera, plate)
     }
 
     /// See [`Perception::work_beside`].

@@ -9,7 +9,7 @@ mod split_mask;
 
 use flyrig_body::{Outfit, Template};
 use flyrig_tracker::{EdgeColor, ViewKeypoints};
-use flyrig_types::{FrameSet, Mask, PersonId, Pose};
+use flyrig_types::{Camera, FrameSet, Image, Mask, PersonId, Pose};
 
 pub use self::estimated::{EstimatedPerception, SHAPE_SECS, SHAPE_SETS};
 pub use self::given::{GivenPerception, GivenPerson};
@@ -30,6 +30,15 @@ pub trait Perception: Send {
     /// Measures everybody's shape again from the next sets on. Returns whether shapes are measured at all.
     fn measure_again(&mut self) -> bool {
         false
+    }
+
+    /// A camera stands elsewhere from the next set on; `plate` is the empty scene as it sees it now, where one is known.
+    ///
+    /// # Errors
+    /// [`FusionError::Track`] for a plate of another size.
+    fn move_camera(&mut self, slot: usize, camera: &Camera, plate: Option<&Image>) -> Result<(), FusionError> {
+        let _ = (slot, camera, plate);
+        Ok(())
     }
 
     /// Measures people in threads of their own from now on, so that no set waits for it.

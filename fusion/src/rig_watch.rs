@@ -3,28 +3,37 @@
 use std::fmt;
 
 use flyrig_calib::{CameraWatch, WatchState, WatchedImage};
-use flyrig_types::{CameraId, FrameSet, Image, Intrinsics, PixelFormat, Rig};
+use flyrig_types::{Camera, CameraId, FrameSet, Image, Intrinsics, PixelFormat, Rig};
+use glam::{DVec2, DVec3};
 
 /// Time between two looks at a camera, nanoseconds.
 const EVERY_NANOS: i64 = 1_000_000_000;
+/// A corrected camera is corrected again when it turns by so many pixels, and by this share of its turn.
+const NEWS_PX: f64 = 1.0;
+const NEWS_SHARE: f64 = 0.1;
 
 /// Compares one camera of a set at a time with its reference: the plate, or the first image where there is none.
 #[derive(Debug)]
 pub struct RigWatch {
     /// By slot.
     cameras: Vec<Watched>,
+    corrects: bool,
 }
 
 #[derive(Debug)]
 struct Watched {
-    id: CameraId,
-    intrinsics: Intrinsics,
+    /// As it was calibrated.
+    camera: Camera,
+    /// Kept where moves are corrected.
+    plate: Option<Image>,
+    /// Rotation vector that the last correction applied, radians.
+    corrected: Option<DVec3>,
     watch: Option<CameraWatch>,
     looked_nanos: Option<i64>,
 }
 
 /// A camera was moved, or stands again where it stood.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct WatchEvent {
     /// Which camera.
     pub camera: CameraId,
@@ -32,21 +41,40 @@ pub struct WatchEvent {
     pub state: WatchState,
     /// Capture time of the image that decided, nanoseconds.
     pub nanos: i64,
+    /// The camera as the session goes on with it, where moves are corrected.
+    pub corrected: Option<Correction>,
+}
+
+/// Where a camera stands now.
+#[derive(Debug)]
+pub struct Correction {
+    /// Slot of the camera in the rig.
+    pub slot: usize,
+    /// The calibrated camera, turned as its background says.
+    pub camera: Camera,
+    /// The empty scene as it sees it now, where there was a plate.
+    pub plate: Option<Image>,
 }
 
 impl fmt::Display for WatchEvent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.state {
-            WatchState::Moved(motion) => write!(
-                f,
-                "camera {} was moved: it turned by {:.2} degrees, and its image lies {:.1} pixels off ({} of {} points of the background \
-                 agree); put it back, or calibrate again (flyrig calibrate person)",
-                self.camera,
-                motion.rotation.length().to_degrees(),
-                motion.pixels,
-                motion.agreeing.0,
-                motion.agreeing.1
-            ),
+            WatchState::Moved(motion) => {
+                write!(
+                    f,
+                    "camera {} was moved: it turned by {:.2} degrees, and its image lies {:.1} pixels off ({} of {} points of the \
+                     background agree); ",
+                    self.camera,
+                    motion.rotation.length().to_degrees(),
+                    motion.pixels,
+                    motion.agreeing.0,
+                    motion.agreeing.1
+                )?;
+                f.write_str(match self.corrected {
+                    Some(_) => "its calibration is turned along until it is put back, or calibrated again (flyrig calibrate person)",
+                    None => "put it back, or calibrate again (flyrig calibrate person)",
+                })
+            }
             WatchState::Steady | WatchState::Unknown => {
                 write!(f, "camera {} stands where it stood when its reference was taken", self.camera)
             }
@@ -58,33 +86,44 @@ impl RigWatch {
     /// Takes the plates of a rig, by slot, as references.
     #[must_use]
     pub fn new(rig: &Rig, plates: &[Option<Image>]) -> Self {
-        let watched = |(slot, camera): (usize, &flyrig_types::Camera)| Watched {
-            id: camera.id.clone(),
-            intrinsics: camera.intrinsics,
+        let watched = |(slot, camera): (usize, &Camera)| Watched {
+            camera: camera.clone(),
+            plate: None,
+            corrected: None,
             watch: plates.get(slot).and_then(Option::as_ref).and_then(|plate| watch(&camera.intrinsics, plate)),
             looked_nanos: None,
         };
-        Self { cameras: rig.cameras.iter().enumerate().map(watched).collect() }
+        Self { cameras: rig.cameras.iter().enumerate().map(watched).collect(), corrects: false }
+    }
+
+    /// Corrects cameras that were moved: events say where they stand. `plates`, by slot, are turned along.
+    #[must_use]
+    pub fn correcting(mut self, plates: Vec<Option<Image>>) -> Self {
+        self.corrects = true;
+        self.cameras.iter_mut().zip(plates).for_each(|(camera, plate)| camera.plate = plate);
+        self
     }
 
     /// Looks at the camera that was not looked at for longest, if that is a second ago.
     pub fn look(&mut self, set: &FrameSet) -> Option<WatchEvent> {
-        let due =
-            self.cameras.iter_mut().zip(&set.frames).filter_map(|(camera, frame)| Some((camera, frame.as_ref()?)));
-        let (camera, frame) = due.min_by_key(|(camera, _)| camera.looked_nanos)?;
+        let due = self.cameras.iter_mut().zip(&set.frames).enumerate();
+        let due = due.filter_map(|(slot, (camera, frame))| Some((slot, camera, frame.as_ref()?)));
+        let (slot, watched, frame) = due.min_by_key(|(_, camera, _)| camera.looked_nanos)?;
         let nanos = frame.capture_nanos;
-        if camera.looked_nanos.is_some_and(|last| nanos.saturating_sub(last) < EVERY_NANOS) {
+        if watched.looked_nanos.is_some_and(|last| nanos.saturating_sub(last) < EVERY_NANOS) {
             return None;
         }
-        camera.looked_nanos = Some(nanos);
-        let Some(known) = &mut camera.watch else {
-            camera.watch = watch(&camera.intrinsics, &frame.image);
+        watched.looked_nanos = Some(nanos);
+        let Some(known) = &mut watched.watch else {
+            watched.watch = watch(&watched.camera.intrinsics, &frame.image);
             return None;
         };
         let before = known.state();
-        let state = known.look(&watched(&frame.image)?);
+        let state = known.look(&as_watched(&frame.image)?);
         let is_moved = |state: WatchState| matches!(state, WatchState::Moved(_));
-        (is_moved(before) != is_moved(state)).then(|| WatchEvent { camera: camera.id.clone(), state, nanos })
+        let corrected = self.corrects.then(|| watched.correction(slot, state)).flatten();
+        let is_news = corrected.is_some() || is_moved(before) != is_moved(state);
+        is_news.then(|| WatchEvent { camera: watched.camera.id.clone(), state, nanos, corrected })
     }
 
     /// State of a camera.
@@ -95,12 +134,65 @@ impl RigWatch {
     }
 }
 
+impl Watched {
+    /// Returns where the camera stands, if that is news.
+    fn correction(&mut self, slot: usize, state: WatchState) -> Option<Correction> {
+        let turned = match state {
+            WatchState::Moved(motion) => Some(motion.rotation),
+            WatchState::Steady => None,
+            WatchState::Unknown => return None,
+        };
+        let px = self.camera.intrinsics.focal_px.max_element();
+        let is_same = match (self.corrected, turned) {
+            (None, None) => true,
+            (Some(before), Some(now)) => px * before.distance(now) < NEWS_PX.max(NEWS_SHARE * px * now.length()),
+            _ => false,
+        };
+        if is_same {
+            return None;
+        }
+        self.corrected = turned;
+        let camera = match state {
+            WatchState::Moved(motion) => motion.applied_to(&self.camera),
+            _ => self.camera.clone(),
+        };
+        let plate = self.plate.as_ref().and_then(|plate| turned_plate(plate, &self.camera, &camera));
+        Some(Correction { slot, camera, plate })
+    }
+}
+
+/// The empty scene as a camera sees it after it was turned on the spot; pixels that it did not see before have the colour of the nearest
+/// one that it saw. `None` for formats other than [`as_watched`]'s.
+fn turned_plate(plate: &Image, from: &Camera, to: &Camera) -> Option<Image> {
+    let WatchedImage { width, height, channels, bytes } = as_watched(plate)?;
+    if [width as u32, height as u32] != from.size() {
+        return None;
+    }
+    let pixel = |at: usize| {
+        let (x, y) = (at % width, at / width);
+        let seen = to.ray(DVec2::new(x as f64, y as f64)).and_then(|ray| from.project(from.position() + ray));
+        let at = seen.unwrap_or(DVec2::new(x as f64, y as f64));
+        let at = at.clamp(DVec2::ZERO, DVec2::new(width as f64 - 1.0, height as f64 - 1.0));
+        let (low, share) = (at.floor(), at.fract());
+        let value = move |dx: usize, dy: usize, channel: usize| {
+            let (x, y) = ((low.x as usize + dx).min(width - 1), (low.y as usize + dy).min(height - 1));
+            f64::from(bytes[channels * (y * width + x) + channel])
+        };
+        (0..channels).map(move |channel| {
+            let row = |dy: usize| value(0, dy, channel) * (1.0 - share.x) + value(1, dy, channel) * share.x;
+            (row(0) * (1.0 - share.y) + row(1) * share.y).round() as u8
+        })
+    };
+    let bytes: Vec<u8> = (0..width * height).flat_map(pixel).collect();
+    Image::new(plate.width(), plate.height(), plate.format(), bytes).ok()
+}
+
 fn watch(intrinsics: &Intrinsics, reference: &Image) -> Option<CameraWatch> {
-    CameraWatch::new(intrinsics, &watched(reference)?)
+    CameraWatch::new(intrinsics, &as_watched(reference)?)
 }
 
 /// Views an image as bytes; `None` for formats that a session does not take either.
-fn watched(image: &Image) -> Option<WatchedImage<'_>> {
+fn as_watched(image: &Image) -> Option<WatchedImage<'_>> {
     let channels = match image.format() {
         PixelFormat::Rgb8 => 3,
         PixelFormat::Gray8 => 1,
@@ -114,8 +206,7 @@ fn watched(image: &Image) -> Option<WatchedImage<'_>> {
 mod tests {
     use std::sync::Arc;
 
-    use flyrig_types::{Camera, Frame, Isometry, Lens};
-    use glam::{DVec2, DVec3};
+    use flyrig_types::{Frame, Isometry, Lens};
 
     use super::*;
 
@@ -186,6 +277,35 @@ mod tests {
             assert_eq!((watch.state(0), watch.state(1)), (WatchState::Steady, WatchState::Steady));
             assert_eq!(watch.state(9), WatchState::Unknown);
         }
+    }
+
+    #[test]
+    fn a_camera_that_was_moved_is_turned_along_with_its_plate_and_back_again() {
+        let rig = rig();
+        let plates = || vec![Some(image(0, 1.0)), Some(image(0, 1.0))];
+        let mut watch = RigWatch::new(&rig, &plates()).correcting(plates());
+        let mut events = Vec::new();
+        for index in 0..200 {
+            // Turned, turned further, put back.
+            let shift = [0, 5, 12, 0][(index / 40).min(3) as usize];
+            events.extend(watch.look(&set(&rig, index, [Some(image(0, 1.0)), Some(image(shift, 0.9))])));
+        }
+        let texts: Vec<String> = events.iter().map(WatchEvent::to_string).collect();
+        assert_eq!(events.len(), 3, "{texts:?}");
+        assert!(texts[0].contains("its calibration is turned along"), "{texts:?}");
+        // A point far away is seen where the image has moved to.
+        let far = DVec3::new(0.0, 0.0, 1000.0);
+        for (event, shift) in events.iter().zip([5.0, 12.0, 0.0]) {
+            let Correction { slot, camera, plate } = event.corrected.as_ref().unwrap();
+            assert_eq!(*slot, 1);
+            let moved = camera.project(far).unwrap() - rig.cameras[1].project(far).unwrap();
+            assert!(moved.distance(DVec2::new(shift, 0.0)) < 0.3, "{moved}, {shift}");
+            let (ours, now) = (plate.as_ref().unwrap(), image(shift as u32, 1.0));
+            let middle = |image: &Image| image.bytes()[(120 * SIZE.0 as usize + 60) * 3..][..300].to_vec();
+            let off = middle(ours).iter().zip(middle(&now)).filter(|(a, b)| a.abs_diff(*b) > 20).count();
+            assert!(off < 30, "{off} of 300 values of the plate differ");
+        }
+        assert_eq!(events[2].corrected.as_ref().unwrap().camera, rig.cameras[1], "as it was calibrated");
     }
 
     #[test]

@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, sync::Arc, time::Instant};
 
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::{GaussianBuffers, Splat};
-use flyrig_types::{Camera, Frame, FrameSet, PersonId, Pose, RenderedView, Rig};
+use flyrig_types::{Camera, Frame, FrameSet, Image, PersonId, Pose, RenderedView, Rig};
 
 use crate::{
     Budget, Effort, FusionError, NetworksOn, Observation, Perception, PersonFrame, PersonMemory, Remedy, SeenPerson,
@@ -290,6 +290,19 @@ impl Session {
             }
         }
         Ok(outcome)
+    }
+
+    /// A camera stands elsewhere from the next set on; `plate` is the empty scene as it sees it now, where one is known. A slot that
+    /// does not exist changes nothing.
+    ///
+    /// # Errors
+    /// [`FusionError::Track`] for a plate of another size.
+    pub fn move_camera(&mut self, slot: usize, camera: &Camera, plate: Option<&Image>) -> Result<(), FusionError> {
+        self.perceiver.move_camera(slot, camera, plate)?;
+        if let Some(known) = self.rig.cameras.get_mut(slot) {
+            known.clone_from(camera);
+        }
+        Ok(())
     }
 
     /// Prepares people who arrive in threads of their own from now on, and lets perception measure them there, so that nobody

@@ -71,9 +71,11 @@ impl Monitor {
         if self.looked.is_some_and(|at| at.elapsed() < EVERY) {
             return;
         }
+        // After a long step frames wait to be taken, and their cameras are not to blame.
+        let was_busy = self.looked.is_some_and(|at| at.elapsed() > 2 * EVERY);
         self.looked = Some(Instant::now());
         let (health, recorded) = snapshot();
-        self.log(&health);
+        self.log(&health, was_busy);
         let (feeds, status) = self.watchdog.judge(&health);
         if feeds {
             notify("WATCHDOG=1");
@@ -91,11 +93,11 @@ impl Monitor {
         }
     }
 
-    fn log(&mut self, health: &Health) {
+    fn log(&mut self, health: &Health, was_busy: bool) {
         for camera in &health.cameras {
             let name = &camera.stats.camera;
             match table::silence_s(camera) {
-                Some(seconds) if self.silent.insert(name.clone()) => tracing::warn!(
+                Some(seconds) if !was_busy && self.silent.insert(name.clone()) => tracing::warn!(
                     "camera {name}: no frame for {seconds:.0} s, and no error either; look at its trigger, its cable and its bus"
                 ),
                 None if self.silent.remove(name) => tracing::info!("camera {name}: frames come again"),

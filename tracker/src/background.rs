@@ -185,6 +185,19 @@ impl Background {
         Self { width, height, kind: Kind::Key(key) }
     }
 
+    /// Returns the background after the camera was moved: from `plate`, the empty scene as the camera sees it now, else with nothing
+    /// known. A screen of one colour stays one.
+    ///
+    /// # Errors
+    /// Those of [`Self::from_plate`].
+    pub fn after_move(&self, camera: &Camera, plate: Option<&Image>) -> Result<Self, TrackError> {
+        match (&self.kind, plate) {
+            (Kind::Key(_), _) => Ok(self.clone()),
+            (Kind::Plate(_), Some(plate)) => Self::from_plate(camera, plate),
+            (Kind::Plate(_), None) => Ok(Self::unknown(camera)),
+        }
+    }
+
     /// Returns the person's mask from this background and the posed body alone; `None` when nothing stands out near the body
     /// or the image has another size.
     ///

@@ -12,7 +12,7 @@ use std::time::Instant;
 
 use flyrig_body::{Outfit, Template, skin_mesh};
 use flyrig_solve::median;
-use flyrig_types::{Frame, FrameSet, Image, Mask, Rig};
+use flyrig_types::{Camera, Frame, FrameSet, Image, Mask, Rig};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
@@ -254,6 +254,16 @@ impl PoseEstimator {
     /// Returns the backgrounds by slot, to update them; masks do without until they are set again.
     pub fn take_backgrounds(&mut self) -> Vec<Option<Arc<Background>>> {
         std::mem::replace(&mut self.backgrounds, vec![None; self.rig.cameras.len()])
+    }
+
+    /// A camera stands elsewhere from the next set on. What the network saw in its last image is forgotten; its background is not
+    /// moved along. A slot that does not exist changes nothing.
+    pub fn move_camera(&mut self, slot: usize, camera: &Camera) {
+        if let Some(known) = self.rig.cameras.get_mut(slot) {
+            known.clone_from(camera);
+            let look = self.track.as_mut().and_then(|track| track.looks.get_mut(slot));
+            look.into_iter().for_each(|look| *look = None);
+        }
     }
 
     /// Returns a camera's background, where it is known.
@@ -517,7 +527,7 @@ impl PoseEstimator {
     }
 }
 
-pub(crate) fn check_size(camera: &flyrig_types::Camera, image: &Image) -> Result<(), TrackError> {
+pub(crate) fn check_size(camera: &Camera, image: &Image) -> Result<(), TrackError> {
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
     if (image.width(), image.height()) == (width, height) {
         return Ok(());

@@ -7,7 +7,7 @@ use flyrig_tracker::{
     Background, BackgroundEvent, BodyGate, HandConfig, HandTracker, Matte, PersonArea, PoseConfig, PoseEstimate,
     PoseEstimator, PoseNet, ShapeFit, ShapeSighting, TrackError, TrackErrorKind, is_blank, matte,
 };
-use flyrig_types::{Frame, FrameSet, Image, Mask, PersonId, Pose, Rig};
+use flyrig_types::{Camera, Frame, FrameSet, Image, Mask, PersonId, Pose, Rig};
 use rayon::prelude::*;
 
 use super::background::{BackgroundWatch, backgrounds, report};
@@ -448,6 +448,22 @@ impl Perception for EstimatedPerception {
 
     fn work_beside(&mut self) {
         self.beside = true;
+    }
+
+    fn move_camera(&mut self, slot: usize, camera: &Camera, plate: Option<&Image>) -> Result<(), FusionError> {
+        let Some(known) = self.rig.cameras.get_mut(slot) else { return Ok(()) };
+        known.clone_from(camera);
+        let background = self.places.first().and_then(|place| place.estimator.background(slot));
+        let moved = background.map(|background| background.after_move(camera, plate)).transpose()?.map(Arc::new);
+        for place in &mut self.places {
+            place.estimator.move_camera(slot, camera);
+            place.hands.iter_mut().for_each(|hands| hands.move_camera(slot, camera));
+            // All places share one background.
+            let mut backgrounds = place.estimator.take_backgrounds();
+            backgrounds[slot].clone_from(&moved);
+            place.estimator.set_backgrounds(backgrounds);
+        }
+        Ok(())
     }
 
     fn set_effort(&mut self, effort: Effort) {

@@ -77,6 +77,15 @@ impl GivenPerception {
 }
 
 impl Perception for GivenPerception {
+    fn move_camera(&mut self, slot: usize, camera: &Camera, plate: Option<&Image>) -> Result<(), FusionError> {
+        let known = self.cameras.get_mut(slot).zip(self.backgrounds.get_mut(slot));
+        if let Some((known, background)) = known {
+            known.clone_from(camera);
+            *background = background.as_ref().map(|background| background.after_move(camera, plate)).transpose()?;
+        }
+        Ok(())
+    }
+
     fn people(&self) -> Vec<KnownPerson<'_>> {
         let people = self.people.iter().zip(&self.outfits);
         people

@@ -158,6 +158,14 @@ impl HandTracker {
         Some(self.body.pose(&turns).rotation[self.body.roles.head])
     }
 
+    /// A camera stands elsewhere from the next set on. A slot that does not exist changes nothing.
+    pub fn move_camera(&mut self, slot: usize, camera: &Camera) {
+        if let Some(known) = self.rig.cameras.get_mut(slot) {
+            known.clone_from(camera);
+            self.looks.iter_mut().filter_map(|looks| looks.get_mut(slot)).for_each(|look| *look = None);
+        }
+    }
+
     /// Takes a template of another shape and forgets what was seen.
     ///
     /// # Errors
