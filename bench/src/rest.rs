@@ -61,6 +61,6 @@ mod tests {
         assert!(heavy > 5.0 && heavy < 60.0, "{heavy}");
         let mut empty = body.clone();
         empty.triangles.clear();
-        assert!(surface_mm(&empty, &body).is_some_and(|mm| mm.is_finite()), "no triangles");
+        assert!(surface_mm(&empty, &body).is_some_and(f64::is_finite), "no triangles");
     }
 }
