@@ -40,7 +40,7 @@ fn row(cameras: usize, boards: usize, noise_px: f64) -> Result<(), Box<dyn Error
         let start = Instant::now();
         let fit = calibrate_rig(&board, &ids, &lenses, &shots, RigOptions::default())?;
         secs += start.elapsed().as_secs_f64();
-        corners += fit.cameras.iter().map(|camera| camera.corners).sum::<usize>();
+        corners += fit.cameras.iter().map(|camera| camera.corners.len()).sum::<usize>();
         for (camera, (deg, mm)) in fit.cameras[1..].iter().zip(pose_errors(&fit.rig.cameras, &truth)) {
             let (deg_sigma, mm_sigma) = camera.deviation.ok_or("no deviation")?;
             inside += usize::from(deg < 2.0 * deg_sigma) + usize::from(mm < 2.0 * mm_sigma);

@@ -1,7 +1,7 @@
 //! Rounds of bundle adjustment: noise, movement of the boards, and wrong views are estimated in turn with the unknowns.
 
 use flyrig_solve::{Convergence, RigidMotion, block_covariance, log_rotation, median, minimize_blocks};
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use nalgebra::DMatrix;
 
 use crate::bundle::{BoardMotion, BoardShot, Bundle, Estimate, Free, seconds};
@@ -20,8 +20,8 @@ pub(crate) struct Adjusted {
     pub estimate: Estimate,
     /// Standard deviation of a corner's coordinate, pixels.
     pub sigma_px: f64,
-    /// By shot, view, corner: distance of the drawn corner from the seen one, pixels.
-    pub errors_px: Vec<Vec<Vec<f64>>>,
+    /// By shot, view, corner: the drawn corner from the seen one, pixels.
+    pub off_px: Vec<Vec<Vec<DVec2>>>,
     /// Of the free unknowns but the boards, in the order of the blocks; `None` where views leave some open.
     pub covariance: Option<DMatrix<f64>>,
 }
@@ -45,23 +45,30 @@ pub(crate) fn adjust(points: &[DVec3], shots: &[BoardShot], start: Estimate, fre
             ..Convergence::default()
         };
         estimate = minimize_blocks(&bundle, &estimate, &options).ok()?.unknowns;
-        let errors = errors_px(&bundle, shots, &estimate)?;
+        let off = off_px(&bundle, shots, &estimate)?;
         // A board that one camera saw fits whatever the cameras' poses are.
-        let is_shared = |errors: &&Vec<Vec<f64>>| cameras == 1 || errors.len() > 1;
-        let mut errors: Vec<f64> = errors.iter().filter(is_shared).flatten().flatten().copied().collect();
+        let is_shared = |off: &&Vec<Vec<DVec2>>| cameras == 1 || off.len() > 1;
+        let mut errors: Vec<f64> = off.iter().filter(is_shared).flatten().flatten().map(|off| off.length()).collect();
         sigma_px = (SIGMA_PER_MEDIAN * median(&mut errors)?).clamp(SIGMA_PX.0, SIGMA_PX.1);
     }
     let bundle = Bundle::new(points, shots, &motions, cameras, free, sigma_px);
-    let errors_px = errors_px(&bundle, shots, &estimate)?;
+    let off_px = off_px(&bundle, shots, &estimate)?;
     let covariance = block_covariance(&bundle, &estimate);
-    Some(Adjusted { covariance, errors_px, estimate, sigma_px })
+    Some(Adjusted { covariance, off_px, estimate, sigma_px })
 }
 
-fn errors_px(bundle: &Bundle<'_>, shots: &[BoardShot], at: &Estimate) -> Option<Vec<Vec<Vec<f64>>>> {
+impl Adjusted {
+    /// Distances of drawn corners from seen ones, pixels.
+    pub fn errors_px(&self) -> impl Iterator<Item = f64> {
+        self.off_px.iter().flatten().flatten().map(|off| off.length())
+    }
+}
+
+fn off_px(bundle: &Bundle<'_>, shots: &[BoardShot], at: &Estimate) -> Option<Vec<Vec<Vec<DVec2>>>> {
     let of_shot = |(index, shot): (usize, &BoardShot)| {
         let of_view = |view| {
             let shot: &crate::BoardView = view;
-            shot.corners.iter().map(|corner| Some(bundle.error_px(at, index, shot, corner)?.length())).collect()
+            shot.corners.iter().map(|corner| bundle.error_px(at, index, shot, corner)).collect()
         };
         shot.views.iter().map(of_view).collect()
     };

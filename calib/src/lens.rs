@@ -104,8 +104,8 @@ pub fn calibrate_lens(
     {
         return Err(open());
     }
-    let of_view = |errors: &Vec<Vec<f64>>| rms(errors.iter().flatten().copied());
-    let errors: Vec<f64> = fit.errors_px.iter().map(of_view).collect();
+    let of_view = |off: &Vec<Vec<DVec2>>| rms(off.iter().flatten().map(|off| off.length()));
+    let errors: Vec<f64> = fit.off_px.iter().map(of_view).collect();
     let stamps = chosen.iter().map(|view| view.nanos);
     let mut sorted = errors.clone();
     let median = flyrig_solve::median(&mut sorted).unwrap_or(0.0);
@@ -114,7 +114,7 @@ pub fn calibrate_lens(
         suspects: suspects.collect(),
         intrinsics,
         model,
-        rms_px: rms(fit.errors_px.iter().flatten().flatten().copied()),
+        rms_px: rms(fit.errors_px()),
         sigma_px: fit.sigma_px,
         deviations_px,
         held_out_px,

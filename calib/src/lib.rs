@@ -20,6 +20,7 @@ mod rig;
 mod start;
 #[doc(hidden)]
 pub mod testing;
+mod uncertainty;
 mod watch;
 mod yaml;
 
@@ -35,6 +36,7 @@ pub use lens::{LensFit, calibrate_lens};
 pub use person::{OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person};
 pub use print::BoardSheet;
 pub use projection::LensModel;
-pub use rig::{RigCamera, RigFit, RigOptions, calibrate_rig};
+pub use rig::{CornerError, RigCamera, RigFit, RigOptions, calibrate_rig};
 pub use start::Pair;
+pub use uncertainty::Uncertainty;
 pub use watch::{CameraMotion, CameraWatch, WatchState, WatchedImage};

@@ -2,11 +2,11 @@
 
 use flyrig_solve::{RigidMotion, log_rotation};
 use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Rig};
-use glam::{DMat3, DQuat, DVec3};
-use nalgebra::DMatrix;
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use nalgebra::SMatrix;
 
 use crate::{
-    Board, BoardShot, BoardView, CalibError, LensModel, Pair,
+    Board, BoardShot, BoardView, CalibError, LensModel, Pair, Uncertainty,
     adjust::{Adjusted, adjust},
     bundle::{Estimate, Free},
     start::{rig_start, rms},
@@ -28,17 +28,28 @@ pub struct RigOptions {
 pub struct RigCamera {
     /// Root mean square distance of drawn and seen corners, pixels.
     pub rms_px: f64,
-    /// Corners and views.
-    pub corners: usize,
+    /// The corners that it saw, of all shots.
+    pub corners: Vec<CornerError>,
     /// Views of the board.
     pub views: usize,
     /// Standard deviation of its direction and place against the first camera's: degrees, millimetres. `None` where views
     /// leave it open.
     pub deviation: Option<(f64, f64)>,
+    /// What that means across its image and where the boards were; `None` where views leave the pose open.
+    pub uncertainty: Option<Uncertainty>,
     /// Difference of its direction and place between the solves from either half of the shots: degrees, millimetres.
     pub halves: Option<(f64, f64)>,
     /// Time offset, subtracted from its stamps, and the standard deviation; seconds.
     pub lag_s: (f64, f64),
+}
+
+/// A corner of a board as a camera saw it, and as it is drawn after the solve.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CornerError {
+    /// Pixel where it is seen.
+    pub pixel: DVec2,
+    /// The drawn corner from the seen one, pixels.
+    pub off_px: DVec2,
 }
 
 /// A calibrated rig and how well it is known.
@@ -96,7 +107,9 @@ pub fn calibrate_rig(
     let fit = adjust(&points, &shots, start, free).ok_or(CalibError::RigOpen)?;
     let halves: Vec<Option<Estimate>> =
         [0, 1].map(|half| half_solve(&points, &shots, &fit.estimate, free, half)).into();
-    let cameras = (0..ids.len()).map(|slot| camera(&fit, &shots, free, slot, &halves)).collect();
+    let boards = &fit.estimate.boards;
+    let middle = boards.iter().map(|pose| pose.apply(board.middle())).sum::<DVec3>() / boards.len().max(1) as f64;
+    let cameras = (0..ids.len()).map(|slot| camera(&fit, &shots, free, slot, &halves, middle)).collect();
     let up = world_up(&fit, options.floor_first);
     let world = world_from_rig(board, &fit, up, options.floor_first);
     let rig = Rig {
@@ -116,13 +129,13 @@ pub fn calibrate_rig(
         world_up: DVec3::Z,
     };
     rig.validate().map_err(|_| CalibError::RigOpen)?;
-    let of_shot = |errors: &Vec<Vec<f64>>| rms(errors.iter().flatten().copied());
+    let of_shot = |off: &Vec<Vec<DVec2>>| rms(off.iter().flatten().map(|off| off.length()));
     Ok(RigFit {
         cameras,
         pairs,
-        rms_px: rms(fit.errors_px.iter().flatten().flatten().copied()),
+        rms_px: rms(fit.errors_px()),
         sigma_px: fit.sigma_px,
-        shots: shots.iter().map(|shot| shot.nanos).zip(fit.errors_px.iter().map(of_shot)).collect(),
+        shots: shots.iter().map(|shot| shot.nanos).zip(fit.off_px.iter().map(of_shot)).collect(),
         rig,
     })
 }
@@ -142,23 +155,34 @@ fn half_solve(points: &[DVec3], shots: &[BoardShot], at: &Estimate, free: Free, 
     Some(fit.estimate)
 }
 
-fn camera(fit: &Adjusted, shots: &[BoardShot], free: Free, slot: usize, halves: &[Option<Estimate>]) -> RigCamera {
-    let mut errors = Vec::new();
+fn camera(
+    fit: &Adjusted,
+    shots: &[BoardShot],
+    free: Free,
+    slot: usize,
+    halves: &[Option<Estimate>],
+    middle: DVec3,
+) -> RigCamera {
+    let mut corners = Vec::new();
     let mut views = 0;
-    for (shot, of_shot) in shots.iter().zip(&fit.errors_px) {
+    for (shot, of_shot) in shots.iter().zip(&fit.off_px) {
         for (view, of_view) in shot.views.iter().zip(of_shot) {
             if view.camera == slot {
-                errors.extend_from_slice(of_view);
+                let errors = view.corners.iter().zip(of_view);
+                corners.extend(errors.map(|(seen, off)| CornerError { pixel: seen.pixel, off_px: *off }));
                 views += 1;
             }
         }
     }
-    let pose = fit.estimate.cameras[slot].camera_from_rig;
-    let deviation = match (&fit.covariance, slot) {
-        (None, _) => None,
-        (Some(_), 0) => Some((0.0, 0.0)),
-        (Some(covariance), _) => Some(deviation(covariance, 6 * (slot - 1), &pose)),
-    };
+    let solved = &fit.estimate.cameras[slot];
+    let pose = solved.camera_from_rig;
+    let covariance = fit.covariance.as_ref().map(|covariance| match slot {
+        // The others are measured against the first one.
+        0 => SMatrix::zeros(),
+        _ => covariance.fixed_view::<6, 6>(6 * (slot - 1), 6 * (slot - 1)).into_owned(),
+    });
+    let deviation = covariance.map(|covariance| deviation(&covariance, &pose));
+    let uncertainty = covariance.map(|covariance| Uncertainty::new(&covariance, &pose, &solved.intrinsics, middle));
     let difference = |a: &RigidMotion, b: &RigidMotion| {
         let turn = log_rotation(a.rotation * b.rotation.inverse()).length().to_degrees();
         (turn, 1e3 * a.inverse().translation.distance(b.inverse().translation))
@@ -173,25 +197,25 @@ fn camera(fit: &Adjusted, shots: &[BoardShot], free: Free, slot: usize, halves: 
         covariance[(at, at)].max(0.0).sqrt()
     });
     RigCamera {
-        rms_px: rms(errors.iter().copied()),
-        corners: errors.len(),
+        rms_px: rms(corners.iter().map(|corner| corner.off_px.length())),
+        corners,
         views,
         deviation,
+        uncertainty,
         halves,
         lag_s: (fit.estimate.cameras[slot].lag_s, lag_sigma),
     }
 }
 
 /// Standard deviations of a camera's direction, degrees, and place, millimetres.
-fn deviation(covariance: &DMatrix<f64>, at: usize, pose: &RigidMotion) -> (f64, f64) {
-    let block = covariance.view((at, at), (6, 6)).into_owned();
+fn deviation(block: &SMatrix<f64, 6, 6>, pose: &RigidMotion) -> (f64, f64) {
     let turn = (block[(0, 0)] + block[(1, 1)] + block[(2, 2)]).max(0.0).sqrt().to_degrees();
     // place = -Rᵀ t; lengths do not change with Rᵀ. After exp(δ) R and t + s: t + s + t × δ.
-    let mut by_step = DMatrix::zeros(3, 6);
+    let mut by_step = SMatrix::<f64, 3, 6>::zeros();
     let cross = flyrig_solve::skew(pose.translation).to_cols_array();
     by_step.view_mut((0, 0), (3, 3)).copy_from_slice(&cross);
-    by_step.view_mut((0, 3), (3, 3)).copy_from(&DMatrix::identity(3, 3));
-    let place = &by_step * block * by_step.transpose();
+    by_step.view_mut((0, 3), (3, 3)).copy_from(&SMatrix::<f64, 3, 3>::identity());
+    let place = by_step * block * by_step.transpose();
     (turn, 1e3 * place.trace().max(0.0).sqrt())
 }
 

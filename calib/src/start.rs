@@ -43,7 +43,7 @@ pub(crate) fn board_poses(board: &Board, intrinsics: &Intrinsics, view: &BoardVi
         let camera = SolvedCamera { camera_from_rig: RigidMotion::IDENTITY, intrinsics: *intrinsics, lag_s: 0.0 };
         let start = Estimate { cameras: vec![camera], boards: vec![start] };
         let Some(adjusted) = adjust(&points, &shots, start, Free::default()) else { continue };
-        let error = rms(adjusted.errors_px.iter().flatten().flatten().copied());
+        let error = rms(adjusted.errors_px());
         if error < MOST_ERROR * f64::from(intrinsics.width) {
             found.push((error, adjusted.estimate.boards[0]));
         }

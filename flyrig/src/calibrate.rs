@@ -3,6 +3,7 @@
 mod board;
 mod convert;
 mod lens;
+mod page;
 mod person;
 mod rig;
 mod views;

@@ -441,5 +441,6 @@ fn report(metrics: &Metrics, main: Pass, summary: &[(String, String)]) -> Report
             },
         ],
         contact: main.contact,
+        ..Report::default()
     }
 }

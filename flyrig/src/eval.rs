@@ -184,6 +184,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
             lines: sheet.curves(),
         }],
         contact,
+        ..Report::default()
     };
     report.save(&args.out.join("index.html"))?;
     print!("{}", sheet.table());

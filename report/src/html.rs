@@ -16,6 +16,12 @@ pub struct Report {
     pub title: String,
     /// Name and value pairs: adapter, commit, frame rate, counts.
     pub facts: Vec<(String, String)>,
+    /// Sentences below the heading: what the page says in short.
+    pub sentences: Vec<String>,
+    /// Tables of text.
+    pub tables: Vec<Table>,
+    /// Heading and SVG of each drawing.
+    pub drawings: Vec<(String, String)>,
     /// Heading and rows of each table of scores.
     pub scores: Vec<(String, Vec<CameraScore>)>,
     /// Run time of each stage.
@@ -24,6 +30,17 @@ pub struct Report {
     pub curves: Vec<Curve>,
     /// Rows of images.
     pub contact: Vec<ContactRow>,
+}
+
+/// A table of text.
+#[derive(Debug, Default)]
+pub struct Table {
+    /// Heading.
+    pub title: String,
+    /// Heading of each column.
+    pub head: Vec<String>,
+    /// Cells, row by row.
+    pub rows: Vec<Vec<String>>,
 }
 
 /// A line plot.
@@ -64,12 +81,25 @@ impl Report {
             page,
             "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content=\"width=device-width\"><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
         );
+        for sentence in &self.sentences {
+            let _ = write!(page, "<p>{}", escape(sentence));
+        }
         if !self.facts.is_empty() {
             page.push_str("<table>");
             for (name, value) in &self.facts {
                 let _ = write!(page, "<tr><td>{}<td style=\"text-align:left\">{}", escape(name), escape(value));
             }
             page.push_str("</table>");
+        }
+        for Table { title, head, rows } in &self.tables {
+            let cells = |mark: &str, row: &[String]| -> String {
+                row.iter().map(|cell| format!("<{mark}>{}", escape(cell))).collect()
+            };
+            let rows: String = rows.iter().map(|row| format!("<tr>{}", cells("td", row))).collect();
+            let _ = write!(page, "<h2>{}</h2><table><tr>{}{rows}</table>", escape(title), cells("th", head));
+        }
+        for (title, svg) in &self.drawings {
+            let _ = write!(page, "<h2>{}</h2>{svg}", escape(title));
         }
         for (name, scores) in &self.scores {
             let _ = write!(
@@ -191,6 +221,13 @@ mod tests {
                     ("none".to_owned(), vec![]),
                 ],
             }],
+            sentences: vec!["1 < 2".to_owned()],
+            tables: vec![Table {
+                title: "cameras".to_owned(),
+                head: vec!["camera".to_owned()],
+                rows: vec![vec!["left & right".to_owned()]],
+            }],
+            drawings: vec![("above".to_owned(), "<svg><circle r=\"1\"/></svg>".to_owned())],
             contact: vec![ContactRow {
                 label: "frame 1".to_owned(),
                 pictures: vec![("input".to_owned(), vec![1, 2, 3])],
@@ -199,6 +236,8 @@ mod tests {
         };
         let html = report.html();
         assert!(html.contains("a &lt;b&gt;") && html.contains("x &amp; y"));
+        assert!(html.contains("<p>1 &lt; 2") && html.contains("<th>camera<tr><td>left &amp; right</table>"));
+        assert!(html.contains("<h2>above</h2><svg><circle"));
         assert!(html.contains("data:image/png;base64,AQID"));
         assert!(html.contains("<polyline") && !html.contains("NaN"));
         assert!(!html.contains("http"), "self-contained");

@@ -15,7 +15,7 @@ mod trace;
 mod true_joints;
 
 pub use contact::contact_images;
-pub use html::{ContactRow, Curve, Report, write_whole};
+pub use html::{ContactRow, Curve, Report, Table, write_whole};
 pub use outlines::{outlined_inputs, paint_outline};
 pub use progress::progress_bar;
 pub use replay::{Replay, ReplaySettings, TruthReader, frame_number};

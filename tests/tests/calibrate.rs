@@ -89,6 +89,14 @@ fn a_printed_board_calibrates_lenses_and_rig() {
         assert!(height.abs() < 0.01, "{}: {height} m above the true height", truth.id);
     }
 
+    let page = std::fs::read_to_string(folder.path().join("calibration/calibration.html")).unwrap();
+    assert_eq!(page.matches("<svg").count(), 5, "from above, three images, and the boards");
+    assert!(
+        page.contains("<td>left and middle<td>") && page.contains("two solves from either half of the boards"),
+        "{page:.2000}"
+    );
+    assert!(!page.contains("NaN") && !page.contains("http"), "complete and self-contained");
+
     // Nothing is replaced unasked, and what is wrong is said in one line.
     let again = command("calibrate rig take --fps 1 --lenses lenses --out calibration");
     assert_eq!(again.code, Some(1));

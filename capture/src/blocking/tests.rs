@@ -222,19 +222,21 @@ fn the_systems_stamp_is_taken_where_it_can_be_right() {
 
 #[test]
 fn an_image_of_another_size_or_damaged_costs_itself_alone() {
-    let steps = vec![Step::Sized(8, 2), Step::Damaged, Step::Frame];
+    // Newer ones may overtake any of them.
+    let steps = [Step::Sized(8, 2), Step::Damaged, Step::Frame].repeat(30);
     let mut camera = open(&script(&[Open::Camera(steps)])).unwrap();
     let mut seen = Vec::new();
-    // Newer ones may overtake the first.
     loop {
         match next(&mut camera) {
+            Ok(_) if seen.is_empty() => {}
             Ok(_) => break,
             Err(error) => seen.push((error.kind, error.to_string())),
         }
     }
-    assert!(!seen.is_empty() && seen.iter().all(|(kind, _)| *kind == CaptureErrorKind::Corrupt), "{seen:?}");
-    let size = "camera left: frame 0: it is 8x2 and not 4x2 as asked for";
-    assert!(seen.iter().all(|(_, text)| text == size || text == "camera left: half an image"), "{seen:?}");
+    assert!(seen.iter().all(|(kind, _)| *kind == CaptureErrorKind::Corrupt), "{seen:?}");
+    let is_size =
+        |text: &str| text.starts_with("camera left: frame ") && text.ends_with(": it is 8x2 and not 4x2 as asked for");
+    assert!(seen.iter().all(|(_, text)| is_size(text) || text == "camera left: half an image"), "{seen:?}");
     assert_eq!(camera.health().reconnects, 0);
 }
 

@@ -8,9 +8,11 @@ use flyrig_types::Intrinsics;
 use glam::DVec3;
 use serde_json::json;
 
-use super::{FILES, lens, refuse_existing, views::Seen};
+use super::{FILES, lens, page, refuse_existing, views::Seen};
 use crate::cli::CalibrateRigArgs;
 
+/// Name of the page about the calibration.
+const PAGE: &str = "calibration.html";
 /// Time offsets are kept where they lower the noise to this share.
 const OFFSETS_PAY: f64 = 0.95;
 /// A take with `--floor` shows the board within so many seconds.
@@ -24,7 +26,7 @@ const MOST_DISAGREEMENT: f64 = 1.5;
 pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     let board = Board::load(&args.board)?;
-    refuse_existing(&args.out, &FILES, args.force)?;
+    refuse_existing(&args.out, &[&FILES[..], &[PAGE]].concat(), args.force)?;
     let seen = Seen::find(&args.take, &board, gpu)?;
     ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
     if args.floor {
@@ -61,7 +63,9 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
         "--floor: the first board stands {tilt_deg:.0} degrees off what the cameras have above them; begin the take with the board on \
          the floor, face up"
     );
-    print(&seen, &fit, has_offsets.then_some(noise_before));
+    print(&seen, &fit, has_offsets);
+    let sentences = sentences(&seen, &fit, has_offsets.then_some(noise_before));
+    sentences.iter().for_each(|sentence| println!("{sentence}"));
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     let mut rig = fit.rig.clone();
     let mut deviations = Vec::new();
@@ -78,8 +82,13 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
     }
     save_calibration(&args.out, &rig, &deviations)?;
     write_whole(&args.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(&seen, &fit))?)?;
-    println!("{}: {}", args.out.display(), FILES.join(", "));
-    println!("next: set source.path = \"{}\" in the configuration, then flyrig doctor", args.out.display());
+    page::page(&seen.ids, &fit, sentences).save(&args.out.join(PAGE))?;
+    println!("{}: {}, {PAGE}", args.out.display(), FILES.join(", "));
+    println!(
+        "next: look at {}, set source.path = \"{}\" in the configuration, then flyrig doctor",
+        args.out.join(PAGE).display(),
+        args.out.display()
+    );
     Ok(())
 }
 
@@ -102,7 +111,7 @@ fn lenses(args: &CalibrateRigArgs, board: &Board, seen: &Seen) -> Result<Vec<Int
     seen.ids.iter().map(of).collect()
 }
 
-fn print(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) {
+fn print(seen: &Seen, fit: &RigFit, has_offsets: bool) {
     let pair =
         |values: Option<(f64, f64)>| values.map_or_else(|| "open".to_owned(), |(deg, mm)| format!("{deg:.3} {mm:.1}"));
     println!(
@@ -118,11 +127,7 @@ fn print(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) {
             camera.rms_px,
             pair(camera.deviation),
             pair(camera.halves),
-            if noise_without_offsets.is_some() {
-                format!("{:.1} +-{:.1}", 1e3 * lag, 1e3 * sigma)
-            } else {
-                "-".to_owned()
-            }
+            if has_offsets { format!("{:.1} +-{:.1}", 1e3 * lag, 1e3 * sigma) } else { "-".to_owned() }
         );
     }
     for pair in &fit.pairs {
@@ -133,31 +138,48 @@ fn print(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) {
             seen.ids[a], seen.ids[b], pair.shots, pair.agreeing
         );
     }
-    println!("rms {:.3} px, noise {:.3} px a coordinate, {} boards", fit.rms_px, fit.sigma_px, fit.shots.len());
+}
+
+/// What the solve says, in sentences.
+fn sentences(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) -> Vec<String> {
+    let mut lines = vec![format!(
+        "rms {:.3} px, noise {:.3} px a coordinate, {} boards",
+        fit.rms_px,
+        fit.sigma_px,
+        fit.shots.len()
+    )];
     if let Some(before) = noise_without_offsets {
-        println!(
+        lines.push(format!(
             "the cameras' stamps are off: without offsets the noise is {before:.3} px. calibration.toml holds the offsets, and they are \
              applied wherever it is read"
-        );
+        ));
     }
-    match fit.worst_disagreement() {
-        Some((slot, ratio)) if ratio > MOST_DISAGREEMENT => println!(
+    lines.push(match fit.worst_disagreement() {
+        Some((slot, ratio)) if ratio > MOST_DISAGREEMENT => format!(
             "warning: two solves from either half of the boards differ by {ratio:.1} times what noise explains, most for camera {}: \
              a time offset that changes, blur, a bent board, or a lens that needs calibrating by itself (flyrig calibrate lens)",
             seen.ids[slot]
         ),
         Some((_, ratio)) => {
-            println!(
-                "two solves from either half of the boards agree ({ratio:.1} times what noise explains, at worst)"
-            );
+            format!("two solves from either half of the boards agree ({ratio:.1} times what noise explains, at worst)")
         }
-        None => println!("warning: too few boards to solve twice; show more"),
+        None => "warning: too few boards to solve twice; show more".to_owned(),
+    });
+    let deviations =
+        seen.ids.iter().zip(&fit.cameras).filter_map(|(id, camera)| Some((id, camera.uncertainty.as_ref()?)));
+    if let Some((id, worst)) = deviations.max_by(|a, b| a.1.middle_mm.total_cmp(&b.1.middle_mm)) {
+        lines.push(format!(
+            "in the middle of the boards, camera {id} is known worst: to {:.2} mm, and to {:.2} px in its image (one standard deviation)",
+            worst.middle_mm,
+            worst.worst_px()
+        ));
     }
     let mut worst: Vec<&(i64, f64)> = fit.shots.iter().collect();
     worst.sort_by(|a, b| b.1.total_cmp(&a.1));
     let times: Vec<String> =
         worst.iter().take(3).map(|(nanos, px)| format!("{:.2} s ({px:.2} px)", *nanos as f64 * 1e-9)).collect();
-    println!("worst boards: {}", times.join(", "));
+    lines.push(format!("worst boards: {}", times.join(", ")));
+    lines
 }
 
 /// `calibration.json`.
@@ -171,7 +193,7 @@ fn report(seen: &Seen, fit: &RigFit) -> serde_json::Value {
                 "camera": id,
                 "rms_px": camera.rms_px,
                 "boards": camera.views,
-                "corners": camera.corners,
+                "corners": camera.corners.len(),
                 "deviation_deg_mm": camera.deviation,
                 "halves_deg_mm": camera.halves,
                 "offset_secs": camera.lag_s.0,

@@ -1,0 +1,204 @@
+//! The page about a calibrated rig: what it says in words, its cameras from above, and each camera's image with the errors in it.
+
+use std::fmt::Write as _;
+
+use flyrig_calib::{RigCamera, RigFit};
+use flyrig_report::{Curve, Report, Table};
+use flyrig_types::{Camera, CameraId};
+use glam::{DVec2, DVec3};
+
+/// Errors are drawn so many times as long as they are.
+const LONGER: f64 = 50.0;
+/// At most so many errors are drawn for each camera.
+const MOST_ERRORS: usize = 1500;
+/// Width of the drawing of an image, and side of the drawing from above.
+const WIDTH: f64 = 380.0;
+const ABOVE: f64 = 460.0;
+/// Shared boards from which on two cameras are well linked.
+const WELL_LINKED: usize = 12;
+/// Columns and rows of cells that say where a camera has seen the board.
+const CELLS: [usize; 2] = [8, 6];
+
+/// Builds the page. `sentences` are those that the terminal shows.
+pub(super) fn page(ids: &[CameraId], fit: &RigFit, sentences: Vec<String>) -> Report {
+    let begin = fit.shots.first().map_or(0, |(nanos, _)| *nanos);
+    let secs = |nanos: i64| nanos.saturating_sub(begin) as f64 * 1e-9;
+    let errors = fit.shots.iter().map(|(nanos, px)| (secs(*nanos), *px)).collect();
+    Report {
+        title: format!("Calibration of {} cameras", ids.len()),
+        sentences,
+        tables: vec![cameras(ids, fit), pairs(ids, fit)],
+        drawings: vec![
+            ("From above: cameras, where they look, and the boards that they share".to_owned(), above(ids, fit)),
+            (
+                format!(
+                    "Images: corners that were seen, errors {LONGER} times as long, cells without a corner grey, deviations in pixels"
+                ),
+                ids.iter()
+                    .zip(&fit.rig.cameras)
+                    .zip(&fit.cameras)
+                    .map(|((id, of), camera)| image(id, of, camera))
+                    .collect(),
+            ),
+        ],
+        curves: vec![Curve {
+            title: "Error of each board".to_owned(),
+            x_label: "seconds of the take".to_owned(),
+            y_label: "rms, pixels".to_owned(),
+            lines: vec![("boards".to_owned(), errors)],
+        }],
+        ..Report::default()
+    }
+}
+
+fn cameras(ids: &[CameraId], fit: &RigFit) -> Table {
+    let both = |values: Option<(f64, f64)>| match values {
+        Some((degrees, millimetres)) => format!("{degrees:.3}°, {millimetres:.1} mm"),
+        None => "open".to_owned(),
+    };
+    let row = |(id, camera): (&CameraId, &RigCamera)| {
+        let worst = camera.uncertainty.as_ref().map(|uncertainty| (uncertainty.worst_px(), uncertainty.middle_mm));
+        vec![
+            id.to_string(),
+            camera.views.to_string(),
+            camera.corners.len().to_string(),
+            format!("{:.3}", camera.rms_px),
+            both(camera.deviation),
+            both(camera.halves),
+            worst.map_or_else(|| "open".to_owned(), |(px, _)| format!("{px:.2}")),
+            worst.map_or_else(|| "open".to_owned(), |(_, mm)| format!("{mm:.2}")),
+            format!("{:.1} ± {:.1}", 1e3 * camera.lag_s.0, 1e3 * camera.lag_s.1),
+        ]
+    };
+    let head = [
+        "camera",
+        "boards",
+        "corners",
+        "rms px",
+        "deviation",
+        "two halves differ by",
+        "worst in the image, px",
+        "in the middle of the boards, mm",
+        "time offset ms",
+    ];
+    Table {
+        title: "Cameras; deviations are against the first one".to_owned(),
+        head: head.map(str::to_owned).into(),
+        rows: ids.iter().zip(&fit.cameras).map(row).collect(),
+    }
+}
+
+fn pairs(ids: &[CameraId], fit: &RigFit) -> Table {
+    let rows = fit.pairs.iter().map(|pair| {
+        let (a, b) = pair.cameras;
+        let apart_m = fit.rig.cameras[a].position().distance(fit.rig.cameras[b].position());
+        vec![
+            format!("{} and {}", ids[a], ids[b]),
+            pair.shots.to_string(),
+            pair.agreeing.to_string(),
+            format!("{apart_m:.3}"),
+        ]
+    });
+    Table {
+        title: "Pairs of cameras that saw the board together".to_owned(),
+        head: ["pair", "boards", "of them agree", "metres apart"].map(str::to_owned).into(),
+        rows: rows.collect(),
+    }
+}
+
+/// Cameras from above, x to the right, y up; lines join those that share boards, the thicker the more.
+fn above(ids: &[CameraId], fit: &RigFit) -> String {
+    let places: Vec<DVec2> = fit.rig.cameras.iter().map(|camera| camera.position().truncate()).collect();
+    let reach = places.iter().map(|place| place.length()).fold(0.5, f64::max);
+    let drawn = |place: DVec2| DVec2::splat(ABOVE / 2.0) + DVec2::new(place.x, -place.y) * (0.42 * ABOVE / reach);
+    let mut svg = format!("<svg width=\"{ABOVE}\" height=\"{ABOVE}\" viewBox=\"0 0 {ABOVE} {ABOVE}\">");
+    for pair in &fit.pairs {
+        let [a, b] = [pair.cameras.0, pair.cameras.1].map(|slot| drawn(places[slot]));
+        let width = 1.0 + 5.0 * (pair.agreeing as f64 / WELL_LINKED as f64).min(1.0);
+        let color = if pair.agreeing < WELL_LINKED { "#d97706" } else { "#9db8d6" };
+        let _ = write!(
+            svg,
+            "<line x1=\"{:.1}\" y1=\"{:.1}\" x2=\"{:.1}\" y2=\"{:.1}\" stroke=\"{color}\" stroke-width=\"{width:.1}\" stroke-opacity=\"0.6\"/>",
+            a.x, a.y, b.x, b.y
+        );
+    }
+    for ((id, camera), place) in ids.iter().zip(&fit.rig.cameras).zip(&places) {
+        let forward = (camera.camera_from_world.rotation.inverse() * DVec3::Z).truncate().normalize_or_zero();
+        let (at, tip) = (drawn(*place), drawn(*place + forward * (0.22 * reach)));
+        let _ = write!(
+            svg,
+            "<line x1=\"{:.1}\" y1=\"{:.1}\" x2=\"{:.1}\" y2=\"{:.1}\" stroke=\"#1c2430\"/><circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"5\" \
+             fill=\"#1c2430\"/><text x=\"{:.1}\" y=\"{:.1}\" font-size=\"13\">{}</text>",
+            at.x,
+            at.y,
+            tip.x,
+            tip.y,
+            at.x,
+            at.y,
+            at.x + 8.0,
+            at.y - 8.0,
+            escape(id)
+        );
+    }
+    svg + "</svg>"
+}
+
+/// An image with its corners and their errors.
+fn image(id: &CameraId, of: &Camera, camera: &RigCamera) -> String {
+    let [width, height] = of.size().map(f64::from);
+    let scale = WIDTH / width;
+    let mut svg = format!(
+        "<svg width=\"{WIDTH}\" height=\"{:.0}\" viewBox=\"0 0 {WIDTH} {:.0}\" style=\"margin:0 8px 8px 0\">",
+        height * scale + 20.0,
+        height * scale + 20.0
+    );
+    let seen = |column: usize, row: usize| {
+        let cell = |pixel: DVec2| pixel / DVec2::new(width, height) * DVec2::new(CELLS[0] as f64, CELLS[1] as f64);
+        camera.corners.iter().any(|corner| cell(corner.pixel).floor() == DVec2::new(column as f64, row as f64))
+    };
+    let cell = DVec2::new(WIDTH / CELLS[0] as f64, height * scale / CELLS[1] as f64);
+    for (column, row) in (0..CELLS[0]).flat_map(|column| (0..CELLS[1]).map(move |row| (column, row))) {
+        if !seen(column, row) {
+            let _ = write!(
+                svg,
+                "<rect x=\"{:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{:.1}\" fill=\"#e3e7ec\"/>",
+                column as f64 * cell.x,
+                row as f64 * cell.y,
+                cell.x,
+                cell.y
+            );
+        }
+    }
+    let every = camera.corners.len().div_ceil(MOST_ERRORS).max(1);
+    for corner in camera.corners.iter().step_by(every) {
+        let (from, to) = (corner.pixel * scale, (corner.pixel + corner.off_px * LONGER) * scale);
+        let _ = write!(
+            svg,
+            "<line x1=\"{:.1}\" y1=\"{:.1}\" x2=\"{:.1}\" y2=\"{:.1}\" stroke=\"#c2410c\" stroke-width=\"0.7\"/><circle cx=\"{:.1}\" \
+             cy=\"{:.1}\" r=\"1\" fill=\"#2563a8\"/>",
+            from.x, from.y, to.x, to.y, from.x, from.y
+        );
+    }
+    for (pixel, px) in camera.uncertainty.iter().flat_map(|uncertainty| &uncertainty.image_px).step_by(2) {
+        let at = *pixel * scale;
+        let _ = write!(
+            svg,
+            "<text x=\"{:.1}\" y=\"{:.1}\" font-size=\"9\" fill=\"#5a6675\" text-anchor=\"middle\">{px:.2}</text>",
+            at.x.clamp(12.0, WIDTH - 12.0),
+            at.y.clamp(9.0, height * scale - 2.0)
+        );
+    }
+    let _ = write!(
+        svg,
+        "<text x=\"2\" y=\"{:.0}\" font-size=\"13\">camera {}: {} boards, rms {:.3} px</text></svg>",
+        height * scale + 15.0,
+        escape(id),
+        camera.views,
+        camera.rms_px
+    );
+    svg
+}
+
+fn escape(id: &CameraId) -> String {
+    id.as_str().replace('&', "&amp;").replace('<', "&lt;")
+}
