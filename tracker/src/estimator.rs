@@ -84,10 +84,6 @@ impl Track {
     }
 }
 
-/// Overlap of mask and body below which a view shows nobody there, and above which it shows somebody.
-const EMPTY_OVERLAP: f64 = 0.25;
-const SURE_OVERLAP: f64 = 0.5;
-
 /// Tracks one person through the frame sets of a rig.
 #[derive(Debug, Clone)]
 pub struct PoseEstimator {
@@ -335,7 +331,10 @@ impl PoseEstimator {
             Ok(fitted) => fitted,
             Err(error) => {
                 if error.kind == TrackErrorKind::Lost {
-                    self.lose();
+                    self.lost = self.lost.saturating_add(1);
+                    if self.lost > self.config.forget_after {
+                        self.track = None;
+                    }
                 }
                 return Err(error);
             }
@@ -349,13 +348,6 @@ impl PoseEstimator {
         {
             texture = before;
             (fitted, masks) = self.finish(set, &pictures, again, &mut texture, &mut seconds);
-        }
-        if stands_nowhere(&fitted.views) {
-            self.lose();
-            return Err(TrackError::lost(format!(
-                "frame set {}: the background is seen where the person was",
-                set.index
-            )));
         }
         let looked = fitted.looked();
         self.sighting = self.keeps_sightings.then(|| ShapeSighting { set: set.clone(), fitted: fitted.clone() });
@@ -373,14 +365,6 @@ impl PoseEstimator {
             },
             points: fitted.points.map(|point| point.map(|p| p.position)),
         })
-    }
-
-    /// Counts a set in which the person was not found.
-    fn lose(&mut self) {
-        self.lost = self.lost.saturating_add(1);
-        if self.lost > self.config.forget_after {
-            self.track = None;
-        }
     }
 
     /// Makes the masks, and fits the pose to their outlines and the texture.
@@ -543,18 +527,6 @@ impl PoseEstimator {
     }
 }
 
-/// Whether the masks show nobody where the body was fitted: in two views at least, and the opposite in none. Landmarks alone may be
-/// those of somebody else nearby.
-fn stands_nowhere(views: &[ViewQuality]) -> bool {
-    let overlap = |view: &ViewQuality| match view.no_mask {
-        Some(NoMask::Empty | NoMask::NoPerson) => Some(0.0),
-        _ => view.mask_overlap,
-    };
-    let overlaps = || views.iter().filter_map(overlap);
-    overlaps().filter(|overlap| *overlap < EMPTY_OVERLAP).count() >= 2
-        && overlaps().all(|overlap| overlap < SURE_OVERLAP)
-}
-
 pub(crate) fn check_size(camera: &Camera, image: &Image) -> Result<(), TrackError> {
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
     if (image.width(), image.height()) == (width, height) {
@@ -577,30 +549,4 @@ fn finite(turns: &Turns) -> bool {
 
 fn secs(nanos: i64) -> f64 {
     nanos as f64 * 1e-9
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn somebody_is_nowhere_whom_two_views_do_not_show_and_none_does() {
-        let view = |mask_overlap: Option<f64>, no_mask: Option<NoMask>| ViewQuality {
-            presence: 0.9,
-            inliers: 20,
-            residual_px: Some(2.0),
-            mask_overlap,
-            no_mask,
-        };
-        let of = |overlaps: &[f64]| overlaps.iter().map(|o| view(Some(*o), None)).collect::<Vec<_>>();
-        assert!(stands_nowhere(&of(&[0.1, 0.2, 0.4])));
-        assert!(!stands_nowhere(&of(&[0.1, 0.2, 0.6])), "one view shows the person");
-        assert!(!stands_nowhere(&of(&[0.1, 0.3, 0.3])), "one view may be wrong");
-        assert!(!stands_nowhere(&of(&[f64::NAN, 0.9])) && !stands_nowhere(&[]));
-        let empty = || view(None, Some(NoMask::Empty));
-        assert!(stands_nowhere(&[empty(), view(None, Some(NoMask::NoPerson))]));
-        let unknown = [NoMask::NoFrame, NoMask::OutOfView, NoMask::Off].map(|why| view(None, Some(why)));
-        assert!(!stands_nowhere(&unknown), "these say nothing");
-        assert!(!stands_nowhere(&[empty(), unknown[1].clone()]));
-    }
 }
