@@ -146,6 +146,9 @@ fn capture_people(
     let mut rig = LiveRig::new(session, intake, LiveViews::new(&config.output), Some(publisher))
         .with_splats(config.output.splats)
         .with_threads(threads);
+    if config.source.real_time {
+        rig = rig.with_ages();
+    }
     if let Some(watch) = watch {
         rig = rig.with_watch(watch);
     }

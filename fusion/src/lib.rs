@@ -8,6 +8,7 @@
 //!
 //! `examples/embed.rs` shows all of it without network, files or command line.
 
+mod age;
 mod budget;
 mod deformation;
 mod drawing;

@@ -10,7 +10,11 @@ use flyrig_types::{FrameSet, PersonId, Restarts, ThreadHealth, ThreadWatch, caug
 
 use crate::{
     Correction, FusionError, Health, Intake, LivePublisher, LiveViews, Outcome, PersonMemory, RigWatch, Session,
-    WatchEvent, check_threads, perceiver::Perceived, resident_mib,
+    WatchEvent,
+    age::{AGE, Ages},
+    check_threads,
+    perceiver::Perceived,
+    resident_mib,
 };
 
 /// Name of the thread that calls [`LiveRig::step`], in health and errors.
@@ -52,6 +56,7 @@ pub struct LiveRig {
     publisher: Option<LivePublisher>,
     views: LiveViews,
     splats: bool,
+    ages: Option<Ages>,
     watch: Option<RigWatch>,
     started: Instant,
     frames: u64,
@@ -88,6 +93,7 @@ impl LiveRig {
             publisher,
             views,
             splats: true,
+            ages: None,
             watch: None,
             started: Instant::now(),
             frames,
@@ -109,6 +115,12 @@ impl LiveRig {
     #[must_use]
     pub fn with_splats(self, splats: bool) -> Self {
         Self { splats, ..self }
+    }
+
+    /// Measures how old sets are when they have been published, as a stage: for cameras that go on meanwhile.
+    #[must_use]
+    pub fn with_ages(self) -> Self {
+        Self { ages: Some(Ages::new()), ..self }
     }
 
     /// Watches whether the cameras stay where they are.
@@ -142,6 +154,7 @@ impl LiveRig {
                     Ok(None) => return Ok(None),
                     Err(panic) => return self.restart(panic).map(|()| None),
                 };
+                self.ages.iter_mut().for_each(|ages| ages.arrived(set.master_nanos));
                 let start = Instant::now();
                 self.session.budget.next_set();
                 let perceived = caught(|| self.session.perceive(&set));
@@ -189,6 +202,7 @@ impl LiveRig {
     ) -> Attempt<Outcome> {
         let next = caught(|| self.intake.next_set(Duration::ZERO))?;
         let Some(next) = next else { return caught(|| self.take_in(set, perceived, turn_time)) };
+        self.ages.iter_mut().for_each(|ages| ages.arrived(next.master_nanos));
         if self.session.may_rest(&next) {
             let outcome = caught(|| self.take_in(set, perceived, turn_time));
             self.ahead = Some((next, Ok(Ok(Perceived::Still))));
@@ -231,6 +245,9 @@ impl LiveRig {
             }
             if publisher.publisher().has_person_subscribers() {
                 publisher.publish_people(&self.session, set)?;
+            }
+            if let Some(age) = self.ages.as_ref().and_then(|ages| ages.of(set.master_nanos)) {
+                self.session.stages.add(AGE, age);
             }
             publisher.publish_stats(&self.session, set, self.frames, &self.intake.drops());
         }

@@ -1,0 +1,61 @@
+//! How old a set is when it has been published, by the rig's own clock.
+
+use std::time::{Duration, Instant};
+
+/// Name of the age among the stages.
+pub(crate) const AGE: &str = "age when published";
+
+/// Compares the cameras' clock with the rig's: the set that came soonest after its capture counts as 0 old when it came. What every set
+/// takes at least from the lens to here (exposure, transfer, decoding, joining) is therefore not in an age.
+#[derive(Debug)]
+pub(crate) struct Ages {
+    started: Instant,
+    /// Least nanoseconds from a set's time to its arrival since the start; `None` before the first set.
+    soonest: Option<i64>,
+}
+
+impl Ages {
+    pub fn new() -> Self {
+        Self { started: Instant::now(), soonest: None }
+    }
+
+    /// A set of this time has come.
+    pub fn arrived(&mut self, master_nanos: i64) {
+        let after = self.after(master_nanos);
+        self.soonest = Some(self.soonest.map_or(after, |soonest| soonest.min(after)));
+    }
+
+    /// Age of a set now; `None` before any has come.
+    pub fn of(&self, master_nanos: i64) -> Option<Duration> {
+        let age = self.after(master_nanos).saturating_sub(self.soonest?);
+        Some(Duration::from_nanos(u64::try_from(age).unwrap_or(0)))
+    }
+
+    fn after(&self, master_nanos: i64) -> i64 {
+        let elapsed = i64::try_from(self.started.elapsed().as_nanos()).unwrap_or(i64::MAX);
+        elapsed.saturating_sub(master_nanos)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_set_that_came_soonest_is_the_measure() {
+        let mut ages = Ages::new();
+        assert_eq!(ages.of(0), None, "nothing has come");
+        // An hour by the cameras' clock, whose zero is anywhere.
+        let zero = 3_600_000_000_000;
+        ages.arrived(zero);
+        std::thread::sleep(Duration::from_millis(30));
+        let age = ages.of(zero).unwrap_or_default();
+        assert!(age >= Duration::from_millis(30), "{age:?}");
+        // This one took a second longer on its way than the first.
+        ages.arrived(zero - 1_000_000_000);
+        let late = ages.of(zero - 1_000_000_000).unwrap_or_default();
+        assert!(late >= Duration::from_millis(1030), "{late:?}");
+        assert_eq!(ages.of(i64::MAX), Some(Duration::ZERO), "a set of the future");
+        assert!(ages.of(i64::MIN).is_some());
+    }
+}
