@@ -35,7 +35,7 @@ pub struct RigCamera {
     /// Standard deviation of its direction and place against the first camera's: degrees, millimetres. `None` where views
     /// leave it open.
     pub deviation: Option<(f64, f64)>,
-    /// What that means across its image and where the boards were; `None` where views leave the pose open.
+    /// The same as deviations across its image and in the middle of the boards; `None` where views leave the pose open.
     pub uncertainty: Option<Uncertainty>,
     /// Difference of its direction and place between the solves from either half of the shots: degrees, millimetres.
     pub halves: Option<(f64, f64)>,

@@ -1,16 +1,16 @@
-//! What the covariance of a camera's pose means: pixels across its image, and millimetres where people stand.
+//! Propagates the covariance of a camera's pose: to pixels across its image, and to millimetres in the middle of the boards.
 
 use flyrig_solve::RigidMotion;
 use flyrig_types::Intrinsics;
 use glam::{DVec2, DVec3};
-use nalgebra::{DMatrix, SMatrix};
+use nalgebra::SMatrix;
 
 use crate::{LensModel, projection::project_with_derivatives};
 
 /// Places along the width and the height of an image.
 const GRID: [usize; 2] = [9, 7];
 
-/// Standard deviation of where a camera draws things, because of what its pose is uncertain by against the first camera's.
+/// Standard deviations of a camera's projections that follow from the covariance of its pose against the first camera's.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Uncertainty {
     /// Pixels all over the image, and the deviation there of points that are as far away as the boards were; pixels.
@@ -40,7 +40,7 @@ impl Uncertainty {
             let point = ideal.extend(1.0) * seen.z.abs();
             let by_point = project_with_derivatives(intrinsics, LensModel::Radial1, point)?.by_point;
             let by_step = by_point_of_step(camera_from_rig, point);
-            let by_point = DMatrix::from_fn(2, 3, |row, column| by_point[column][row]);
+            let by_point = SMatrix::<f64, 2, 3>::from_fn(|row, column| by_point[column][row]);
             Some((pixel, deviation(&(by_point * by_step), covariance)))
         });
         Self {
@@ -57,18 +57,17 @@ impl Uncertainty {
 }
 
 /// Derivative of a point in the camera's axes by the step: `exp(turn) (point - t) + t + shift`.
-fn by_point_of_step(camera_from_rig: &RigidMotion, point: DVec3) -> DMatrix<f64> {
+fn by_point_of_step(camera_from_rig: &RigidMotion, point: DVec3) -> SMatrix<f64, 3, 6> {
     let by_turn = -flyrig_solve::skew(point - camera_from_rig.translation);
     let by_turn = by_turn.to_cols_array();
-    DMatrix::from_fn(3, 6, |row, column| match column {
+    SMatrix::from_fn(|row, column| match column {
         0..3 => by_turn[3 * column + row],
         _ => f64::from(u8::from(column - 3 == row)),
     })
 }
 
 /// Root of the trace of `J C Jᵀ`.
-fn deviation(by_step: &DMatrix<f64>, covariance: &SMatrix<f64, 6, 6>) -> f64 {
-    let covariance = DMatrix::from_fn(6, 6, |row, column| covariance[(row, column)]);
+fn deviation<const N: usize>(by_step: &SMatrix<f64, N, 6>, covariance: &SMatrix<f64, 6, 6>) -> f64 {
     (by_step * covariance * by_step.transpose()).trace().max(0.0).sqrt()
 }
 

@@ -10,7 +10,7 @@ use crate::sort::{Keys, RadixSort};
 const PAIRS_PER_GAUSSIAN: u64 = 16;
 const PAIRS_PER_TILE: u64 = 64;
 const MIN_PAIRS: u64 = 1 << 18;
-/// What one dispatch of the kernel that writes them reaches.
+/// Most pairs that one dispatch of the kernel that writes them can reach.
 const MOST_PAIRS: u64 = MAX_WORKGROUPS_PER_DIMENSION as u64 * BINS_LANES as u64;
 
 /// Pairs that an image has room for, at most `limit`.

@@ -1,4 +1,4 @@
-//! The page about a calibrated rig: what it says in words, its cameras from above, and each camera's image with the errors in it.
+//! HTML page of a calibrated rig: results in sentences, a plan of the cameras, and each camera's image with its reprojection errors.
 
 use std::fmt::Write as _;
 

@@ -140,7 +140,7 @@ fn print(seen: &Seen, fit: &RigFit, has_offsets: bool) {
     }
 }
 
-/// What the solve says, in sentences.
+/// Returns the results of the solve as sentences, for the terminal and the page.
 fn sentences(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) -> Vec<String> {
     let mut lines = vec![format!(
         "rms {:.3} px, noise {:.3} px a coordinate, {} boards",
