@@ -29,6 +29,7 @@ fn row(name: &str, board: &Board, images: u64) -> Result<(), Box<dyn Error>> {
         intrinsics: Intrinsics::pinhole(1280, 720, 1000.0),
         camera_from_world: Isometry::IDENTITY,
         time_offset_nanos: 0,
+        color: Default::default(),
     };
     let taken: Vec<(Isometry, GrayImage)> = (0..images)
         .into_par_iter()

@@ -5,7 +5,7 @@
 
 use std::{fmt::Write as _, io::Write as _, path::Path};
 
-use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Lens, Rig, write_whole};
+use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry, Lens, Rig, write_whole};
 use glam::{DMat3, DVec2, DVec3};
 use serde::Deserialize;
 
@@ -55,6 +55,8 @@ struct Entry {
     translation_m: Option<[f64; 3]>,
     #[serde(default)]
     time_offset_ms: f64,
+    #[serde(default)]
+    color: ColorMatch,
     /// For readers; nothing is computed from it.
     #[serde(rename = "deviation")]
     _deviation: Option<DeviationEntry>,
@@ -156,7 +158,7 @@ fn camera(path: &Path, entry: Entry) -> Result<ImportedCamera, CalibError> {
     }
     // Too large an offset saturates, and the rig's check names it.
     let time_offset_nanos = (entry.time_offset_ms * 1e6).round() as i64;
-    Ok(ImportedCamera { id, intrinsics, pose, time_offset_nanos })
+    Ok(ImportedCamera { id, intrinsics, pose, time_offset_nanos, color: entry.color })
 }
 
 /// Returns the text of a `calibration.toml`; `deviations` by slot, as far as they are known.
@@ -174,6 +176,10 @@ pub fn calibration_toml(rig: &Rig, deviations: &[Option<Deviation>]) -> Result<S
         let _ = writeln!(text, "translation_m = {:?}", camera.camera_from_world.translation.to_array());
         if camera.time_offset_nanos != 0 {
             let _ = writeln!(text, "time_offset_ms = {:.6}", camera.time_offset_nanos as f64 * 1e-6);
+        }
+        if camera.color != ColorMatch::NONE {
+            let ColorMatch { gain, exponent, falloff } = camera.color;
+            let _ = writeln!(text, "color = {{ gain = {gain:?}, exponent = {exponent:?}, falloff = {falloff:?} }}");
         }
         let finite = |d: &&Deviation| {
             d.rotation_deg.is_finite() && d.position_mm.is_finite() && d.time_offset_ms.is_none_or(f64::is_finite)
@@ -205,6 +211,7 @@ pub fn save_calibration(dir: &Path, rig: &Rig, deviations: &[Option<Deviation>])
 pub fn save_lenses(dir: &Path, lenses: &[(CameraId, Intrinsics)]) -> Result<(), CalibError> {
     let posed = |(id, intrinsics): &(CameraId, Intrinsics)| Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: id.clone(),
         intrinsics: *intrinsics,
         camera_from_world: Isometry::IDENTITY,
@@ -222,6 +229,7 @@ fn header() -> String {
     format!(
         "# Cameras of a rig. x_camera = rotation x_world + translation_m, metres; camera axes: x right, y down, z forward.\n\
          # Pixel centres lie at integers. Time offsets are subtracted from timestamps.\n\
+         # Colours: light = gain * linear(srgb^exponent) * exp(falloff[0] r^2 + falloff[1] r^4), r: distance from center_px over half the diagonal.\n\
          version = {VERSION}\n"
     )
 }

@@ -161,6 +161,7 @@ impl Format {
                 intrinsics: camera.intrinsics,
                 pose: Some(camera.camera_from_world),
                 time_offset_nanos: camera.time_offset_nanos,
+                color: camera.color,
             });
             Imported { cameras: cameras.collect(), up: Some(rig.world_up) }
         };

@@ -45,7 +45,7 @@ pub fn load_easymocap(dir: &Path, image_size: &dyn Fn(&CameraId) -> Option<(u32,
         .map(|id| {
             let intrinsics = read_intrinsics(&intri, &id, image_size(&id))?;
             let camera_from_world = read_extrinsics(&extri, &id)?;
-            Ok(Camera { time_offset_nanos: 0, id, intrinsics, camera_from_world })
+            Ok(Camera { time_offset_nanos: 0, color: Default::default(), id, intrinsics, camera_from_world })
         })
         .collect::<Result<Vec<_>, CalibError>>()?;
     let world_up = Rig::guess_world_up(&cameras);

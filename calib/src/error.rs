@@ -172,6 +172,19 @@ pub enum CalibError {
         /// Extent of the movement, millimetres.
         extent_mm: f64,
     },
+    /// A camera's colours cannot be compared with those of the others.
+    #[error(
+        "camera {camera}: {found} points of people are seen by it and another camera at once, and {needed} are needed; let somebody walk where \
+         it looks together with the others, in light that neither clips nor drowns"
+    )]
+    ColorsOpen {
+        /// Which camera.
+        camera: CameraId,
+        /// Points that it shares.
+        found: usize,
+        /// How many are needed.
+        needed: usize,
+    },
     /// Tracks, limbs or mirrored landmarks do not belong to the rig.
     #[error(
         "tracks of {cameras} cameras with {landmarks} landmarks for a rig of {expected} cameras; give tracks of this rig, and limbs and \

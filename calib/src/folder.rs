@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use flyrig_types::{CameraId, Intrinsics, Lens, Rig};
+use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Lens, Rig};
 
 use crate::{CalibError, calibration_file, easymocap};
 
@@ -68,14 +68,16 @@ fn check_sizes<'a>(
 }
 
 /// Writes the rig of exported images: EasyMocap's files, which other programs read too, or `calibration.toml` where those cannot
-/// hold a lens. Time offsets are left out, since exported images have no timestamps of their own.
+/// hold a lens or a colour correction. Time offsets are left out, since exported images have no timestamps of their own.
 ///
 /// # Errors
 /// As [`crate::save_calibration`].
 pub fn save_export(dir: &Path, rig: &Rig) -> Result<(), CalibError> {
     let mut rig = rig.clone();
     rig.cameras.iter_mut().for_each(|camera| camera.time_offset_nanos = 0);
-    if rig.cameras.iter().any(|camera| matches!(camera.intrinsics.lens, Lens::Fisheye { .. })) {
+    let needs_ours =
+        |camera: &Camera| matches!(camera.intrinsics.lens, Lens::Fisheye { .. }) || camera.color != ColorMatch::NONE;
+    if rig.cameras.iter().any(needs_ours) {
         return calibration_file::save_calibration(dir, &rig, &[]);
     }
     easymocap::save_easymocap(dir, &rig)

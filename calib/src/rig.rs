@@ -120,6 +120,7 @@ pub fn calibrate_rig(
                 let motion = solved.camera_from_rig * world.inverse();
                 Camera {
                     time_offset_nanos: 0,
+                    color: Default::default(),
                     id: id.clone(),
                     intrinsics: solved.intrinsics,
                     camera_from_world: Isometry::new(motion.rotation, motion.translation),

@@ -4,7 +4,7 @@
 use std::{fs, path::Path};
 
 use flyrig_calib::{Deviation, Format, load_calibration, load_lenses, save_calibration, save_export, save_lenses};
-use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Rig};
+use flyrig_types::{Camera, ColorMatch, Intrinsics, Isometry, Lens, Rig};
 use glam::{DVec2, DVec3};
 
 const NO_SIZE: fn(&flyrig_types::CameraId) -> Option<(u32, u32)> = |_| None;
@@ -21,6 +21,7 @@ fn camera(name: &str, eye: DVec3, lens: Lens) -> Camera {
         },
         camera_from_world: Isometry::look_at(eye, DVec3::new(0.0, 0.1, 0.9), DVec3::Z),
         time_offset_nanos: 0,
+        color: Default::default(),
     }
 }
 
@@ -300,6 +301,7 @@ fn a_calibration_folder_is_read_whatever_it_holds() {
     let mut rig = rig(&[CUBIC, RATIONAL, FISHEYE]);
     rig.world_up = DVec3::new(0.1, -0.2, 0.9).normalize();
     rig.cameras[2].time_offset_nanos = 1_234_567;
+    rig.cameras[1].color = ColorMatch { gain: [1.25, 1.0, 0.8], exponent: 1.1, falloff: [0.125, -0.5] };
     let dir = tempfile::tempdir().unwrap();
     let deviation = Deviation { rotation_deg: 0.01234, position_mm: 1.5, time_offset_ms: Some(0.25) };
     save_calibration(dir.path(), &rig, &[None, Some(deviation)]).unwrap();
@@ -311,6 +313,7 @@ fn a_calibration_folder_is_read_whatever_it_holds() {
     let back = load_calibration(dir.path(), &NO_SIZE).unwrap();
     assert!(back.world_up.distance(rig.world_up) < 1e-12 && difference_px(&rig, &back) < 1e-9);
     assert_eq!(back.cameras[2].time_offset_nanos, 1_234_567);
+    assert_eq!((back.cameras[0].color, back.cameras[1].color), (ColorMatch::NONE, rig.cameras[1].color));
     let other = load_calibration(dir.path(), &|_| Some((640, 480))).unwrap_err().to_string();
     assert!(other.contains("camera left: calibrated for images of 1280x720, but they are 640x480"), "{other}");
 

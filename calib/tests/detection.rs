@@ -18,6 +18,7 @@ fn chessboard() -> Board {
 fn camera() -> Camera {
     Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: "00".into(),
         intrinsics: Intrinsics {
             width: SIZE[0],

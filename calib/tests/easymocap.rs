@@ -115,6 +115,7 @@ fn cameras_are_found_without_names_and_with_unquoted_ones() {
 fn a_rig_comes_back_as_it_was_written() {
     let camera = |id: &str, eye: DVec3| Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: id.into(),
         intrinsics: Intrinsics {
             width: 1088,

@@ -1,6 +1,7 @@
 //! `flyrig calibrate`: boards, lenses, rigs, and files of other programs.
 
 mod board;
+mod color;
 mod convert;
 mod lens;
 mod page;
@@ -26,13 +27,14 @@ fn refuse_existing(folder: &Path, names: &[&str], force: bool) -> Result<()> {
     }
 }
 
-/// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
+/// Runs the command. `gpu` opens a graphics adapter, for simulated cameras and for following people.
 pub fn calibrate(action: &CalibrateAction, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     match action {
         CalibrateAction::Board(args) => board::board(args),
         CalibrateAction::Lens(args) => lens::lens(args, gpu),
         CalibrateAction::Rig(args) => rig::rig(args, gpu),
         CalibrateAction::Person(args) => person::person(args, gpu),
+        CalibrateAction::Color(args) => color::color(args, gpu),
         CalibrateAction::Convert(args) => convert::convert(args),
     }
 }

@@ -182,6 +182,8 @@ pub enum CalibrateAction {
     Rig(CalibrateRigArgs),
     /// Refine poses and time offsets of calibrated cameras from one person who moves before them.
     Person(CalibratePersonArgs),
+    /// Match the colours of calibrated cameras: exposure, white balance, response and vignetting, from people before them.
+    Color(CalibrateColorArgs),
     /// Convert a calibration of another program, or to one.
     Convert(CalibrateConvertArgs),
 }
@@ -340,6 +342,34 @@ pub struct CalibratePersonArgs {
     /// Take the cameras' stamps as they are.
     #[arg(long)]
     pub no_offsets: bool,
+    /// Replace a calibration that is there.
+    #[arg(long)]
+    pub force: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct CalibrateColorArgs {
+    /// A configuration (*.toml), a recording (*.mcap), a folder with images/CAM, or the videos of all cameras.
+    #[arg(required = true)]
+    pub input: Vec<PathBuf>,
+    /// Folder of the calibration whose colours are matched, where the take has none or another one.
+    #[arg(long)]
+    pub calibration: Option<PathBuf>,
+    /// Seconds that are looked at.
+    #[arg(long, default_value_t = 10.0, value_parser = parse_seconds)]
+    pub secs: f64,
+    /// Seconds that are left out at the beginning.
+    #[arg(long, default_value_t = 0.0, value_parser = parse_from_seconds)]
+    pub from_secs: f64,
+    /// Frame rate of a folder.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// People who are followed at most.
+    #[arg(long, default_value_t = 1)]
+    pub people: usize,
+    /// Folder of calibration.toml and calibration.json.
+    #[arg(long)]
+    pub out: PathBuf,
     /// Replace a calibration that is there.
     #[arg(long)]
     pub force: bool,

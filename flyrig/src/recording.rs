@@ -128,7 +128,13 @@ fn rig_of_messages(path: &Path, notes: &[(String, Vec<u8>)]) -> Result<Option<Ri
         let (id, intrinsics) = decode_calibration(bytes)?;
         let place = transforms.camera_from_world.iter().find(|(camera, _)| *camera == id);
         let (_, camera_from_world) = place.with_context(|| named(&format!("camera {id} has no place")))?;
-        cameras.push(Camera { time_offset_nanos: 0, id, intrinsics, camera_from_world: *camera_from_world });
+        cameras.push(Camera {
+            time_offset_nanos: 0,
+            color: Default::default(),
+            id,
+            intrinsics,
+            camera_from_world: *camera_from_world,
+        });
     }
     let rig = Rig { cameras, world_up: transforms.world_up };
     rig.validate()?;
@@ -353,7 +359,7 @@ impl Digest {
 
 #[cfg(test)]
 mod tests {
-    use flyrig_types::{Intrinsics, Isometry, Lens};
+    use flyrig_types::{ColorMatch, Intrinsics, Isometry, Lens};
     use glam::{DVec2, DVec3};
 
     use super::*;
@@ -389,6 +395,7 @@ mod tests {
             },
             camera_from_world: Isometry::IDENTITY,
             time_offset_nanos: -45_712_345,
+            color: ColorMatch { gain: [1.1, 1.0, 0.9], exponent: 1.05, falloff: [0.2, 0.1] },
         };
         let cameras =
             vec![camera(&ids[0], lens), camera(&ids[1], Lens::Fisheye { coefficients: [0.1, 0.0, 0.0, 0.0] })];

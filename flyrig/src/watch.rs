@@ -151,6 +151,7 @@ fn viewpoint(eye: [f64; 3], args: &WatchArgs, world_up: DVec3) -> Result<Camera>
     let focal = f64::from(height) / 2.0 / (args.fov_degrees.to_radians() / 2.0).tan();
     Ok(Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: "watch".into(),
         intrinsics: Intrinsics::pinhole(width, height, focal),
         camera_from_world: Isometry::look_at(eye, target, world_up),

@@ -23,6 +23,7 @@ fn camera(name: &str, degrees: f64) -> Camera {
     let (focal_px, center_px) = (DVec2::splat(210.0), DVec2::splat(0.5 * f64::from(SIZE) - 0.5));
     Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: name.into(),
         intrinsics: Intrinsics { width: SIZE, height: SIZE, focal_px, center_px, lens: Lens::PINHOLE },
         camera_from_world: Isometry::look_at(middle + DVec3::new(sin, 0.2, cos) * 3.0, middle, DVec3::Y),

@@ -229,6 +229,7 @@ mod tests {
     fn rig() -> Rig {
         let camera = |name: &str| Camera {
             time_offset_nanos: 0,
+            color: Default::default(),
             id: name.into(),
             intrinsics: Intrinsics {
                 width: SIZE.0,

@@ -37,6 +37,8 @@ pub struct StageSummary {
     pub p50_ms: f32,
     /// 95th percentile, milliseconds.
     pub p95_ms: f32,
+    /// 99th percentile, milliseconds.
+    pub p99_ms: f32,
 }
 
 impl StageTimes {
@@ -144,6 +146,7 @@ impl StageTimes {
                     mean_ms: sorted.iter().sum::<f32>() / sorted.len() as f32,
                     p50_ms: at(0.5),
                     p95_ms: at(0.95),
+                    p99_ms: at(0.99),
                 }
             })
             .collect()
@@ -152,10 +155,14 @@ impl StageTimes {
     /// Formats a table for the terminal.
     #[must_use]
     pub fn table(&self) -> String {
-        let mut text = format!("{:<28} {:>7} {:>9} {:>9} {:>9}\n", "stage", "frames", "mean ms", "p50 ms", "p95 ms");
-        for s in self.summary() {
-            let _ =
-                writeln!(text, "{:<28} {:>7} {:>9.2} {:>9.2} {:>9.2}", s.name, s.frames, s.mean_ms, s.p50_ms, s.p95_ms);
+        let [mean, half, most, all] = ["mean ms", "p50 ms", "p95 ms", "p99 ms"];
+        let mut text = format!("{:<28} {:>7} {mean:>9} {half:>9} {most:>9} {all:>9}\n", "stage", "frames");
+        for StageSummary { name, frames, mean_ms, p50_ms, p95_ms, p99_ms } in self.summary() {
+            let _ = write!(text, "{name:<28} {frames:>7}");
+            for millis in [mean_ms, p50_ms, p95_ms, p99_ms] {
+                let _ = write!(text, " {millis:>9.2}");
+            }
+            text.push('\n');
         }
         for (name, count) in self.counts() {
             let _ = writeln!(text, "{name:<28} {count:>7}");

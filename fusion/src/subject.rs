@@ -9,8 +9,8 @@ use flyrig_body::{
 use flyrig_capture::to_rgb8;
 use flyrig_gpu::{GpuContext, StageTimer, StorageBuffer};
 use flyrig_renderer::{
-    AppearanceSettings, DirectAppearance, GaussianBuffers, Observations, Outputs, RasterSettings, Rasterizer,
-    RenderTarget, Splat, UNKNOWN_RGBA, ViewInput, read_splats,
+    AppearanceSettings, ColorMatcher, DirectAppearance, GaussianBuffers, Observations, Outputs, RasterSettings,
+    Rasterizer, RenderTarget, Splat, UNKNOWN_RGBA, ViewInput, read_splats,
 };
 use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, SharedAppearance, ViewImage};
 use flyrig_stream::EncodedTemplate;
@@ -59,6 +59,8 @@ struct InputImage {
     rgba: Vec<u8>,
     /// The same on the GPU, a pixel an element.
     words: StorageBuffer<u32>,
+    /// Of the camera that took it; `None` where its colours stay as they are.
+    matcher: Option<ColorMatcher>,
 }
 
 /// The inputs and results of a person's last update, read back: the raw material of training samples.
@@ -66,6 +68,8 @@ struct InputImage {
 pub struct Observed {
     /// Of direct appearance, by observing view.
     pub observations: Observations,
+    /// Slots of the observing views' cameras.
+    pub slots: Vec<usize>,
     /// The observing views: width, height, and pixels with the mask as alpha.
     pub pictures: Vec<(u32, u32, Vec<u8>)>,
     /// World centre, metres; w: scale.
@@ -307,6 +311,7 @@ impl Subject {
         };
         Ok(Observed {
             observations: self.appearance.observations(gpu, self.painted.len())?,
+            slots: self.painted.iter().filter_map(|&i| self.viewed.get(i).copied()).collect(),
             pictures: self.painted.iter().map(picture).collect(),
             center_scale: self.gaussians.center_scale.read(gpu)?,
             normal: self.gaussians.normal.read(gpu)?,
@@ -674,7 +679,7 @@ impl Subject {
                     &format!("the image of camera {}", view.camera.id),
                     size[0] as usize * size[1] as usize,
                 )?;
-                let input = InputImage { size, rgba: Vec::new(), words };
+                let input = InputImage { size, rgba: Vec::new(), words, matcher: None };
                 if i < self.inputs.len() {
                     self.inputs[i] = input;
                 } else {
@@ -688,13 +693,19 @@ impl Subject {
                 converted = to_rgb8(image)?;
                 &converted
             };
-            let InputImage { rgba, words, .. } = &mut self.inputs[i];
+            let InputImage { rgba, words, matcher, .. } = &mut self.inputs[i];
             rgba.clear();
             rgba.extend(rgb.chunks_exact(3).zip(mask.coverage()).flat_map(|(c, &a)| [c[0], c[1], c[2], a]));
             for EdgeColor { pixel, rgb } in view.edge_colors {
                 if let Some(pixel) = rgba.get_mut(4 * *pixel as usize..).and_then(<[u8]>::first_chunk_mut::<3>) {
                     *pixel = *rgb;
                 }
+            }
+            if matcher.as_ref().is_none_or(|matcher| !matcher.is_of(view.camera)) {
+                *matcher = ColorMatcher::new(view.camera);
+            }
+            if let Some(matcher) = matcher {
+                matcher.correct(rgba, 4, size[0] as usize, |pixel| pixel[3] == 0);
             }
             if let Some(others) = view.others {
                 for (pixel, others) in rgba.chunks_exact_mut(4).zip(others.coverage()) {

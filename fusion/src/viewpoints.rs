@@ -15,6 +15,7 @@ pub fn orbit(rig: &Rig, turn: f64, width: u32, height: u32, name: &str) -> Optio
     let focal = i.focal_px.y * f64::from(height) / f64::from(i.height);
     Some(Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: CameraId::from(name),
         intrinsics: Intrinsics::pinhole(width, height, focal),
         camera_from_world: Isometry::look_at(center + arm, center, rig.world_up),
@@ -31,6 +32,7 @@ mod tests {
         let target = DVec3::new(0.2, 0.1, 1.0);
         let camera = |eye: &DVec3| Camera {
             time_offset_nanos: 0,
+            color: Default::default(),
             id: format!("{eye}").into(),
             intrinsics: Intrinsics::pinhole(640, 480, 500.0),
             camera_from_world: Isometry::look_at(*eye, target, DVec3::Z),

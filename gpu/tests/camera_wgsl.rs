@@ -37,6 +37,7 @@ fn cameras() -> Vec<Camera> {
     .into_iter()
     .map(|lens| Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: "test".into(),
         intrinsics: Intrinsics {
             width: 640,

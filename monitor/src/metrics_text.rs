@@ -126,7 +126,7 @@ impl Collector for Snapshot {
             [("complete", health.complete_sets), ("partial", health.partial_sets), ("skipped", health.skipped_sets)];
         page.counters("sets", "Sets of frames.", sets.map(|(kind, count)| ([("kind", kind)], count)))?;
         let stages = health.stages.iter().flat_map(|stage| {
-            [("0.5", stage.p50_ms), ("0.95", stage.p95_ms)]
+            [("0.5", stage.p50_ms), ("0.95", stage.p95_ms), ("0.99", stage.p99_ms)]
                 .map(|(quantile, ms)| ([("stage", stage.name.as_str()), ("quantile", quantile)], f64::from(ms) / 1e3))
         });
         page.gauges("stage_seconds", "Time of a stage of the pipeline.", stages)?;

@@ -149,7 +149,8 @@ pub mod tests {
         let watch = WatchState::Moved(CameraMotion { rotation, pixels: 9.5, agreeing: (80, 96) });
         let (interval_ms, jitter_ms, lateness_ms, quiet_s) = (33.3, 0.4, Some(12.0), Some(0.1));
         let camera = CameraHealth { stats, in_no_set: 5, interval_ms, jitter_ms, lateness_ms, quiet_s, clock, watch };
-        let stage = StageSummary { name: "draw".into(), frames: 1, mean_ms: 2.0, p50_ms: 2.0, p95_ms: 4.0 };
+        let stage =
+            StageSummary { name: "draw".into(), frames: 1, mean_ms: 2.0, p50_ms: 2.0, p95_ms: 4.0, p99_ms: 4.0 };
         let (complete_sets, partial_sets, skipped_sets) = (800, 10, 4);
         let resident_mib = Some(2.0);
         Health {

@@ -71,6 +71,7 @@ mod tests {
     fn camera() -> Camera {
         Camera {
             time_offset_nanos: 0,
+            color: Default::default(),
             id: "view".into(),
             intrinsics: Intrinsics::pinhole(640, 480, 500.0),
             camera_from_world: Isometry::look_at(DVec3::new(0.0, -3.0, 1.0), DVec3::new(0.0, 0.0, 1.0), DVec3::Z),

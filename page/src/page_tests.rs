@@ -28,6 +28,7 @@ fn motion(template: &EncodedTemplate, frame: u64, x: f32) -> Vec<u8> {
 fn rig() -> Rig {
     let camera = |name: &str, x: f64| Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: name.into(),
         intrinsics: Intrinsics::pinhole(640, 480, 500.0),
         camera_from_world: Isometry::look_at(DVec3::new(x, -3.0, 1.0), DVec3::Z, DVec3::Z),

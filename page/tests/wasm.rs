@@ -76,6 +76,7 @@ fn the_shipped_module_decodes_poses_and_sorts_as_this_crate_does() {
     let colors: Vec<[f32; 4]> = (0..GAUSSIANS).map(|_| [random().abs(), random().abs(), random().abs(), 1.0]).collect();
     let camera = Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: "a".into(),
         intrinsics: Intrinsics::pinhole(640, 480, 500.0),
         camera_from_world: Isometry::look_at(DVec3::new(0.5, -3.0, 1.0), DVec3::Z, DVec3::Z),

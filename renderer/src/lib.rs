@@ -3,6 +3,7 @@
 mod appearance;
 mod buffers;
 mod color;
+mod color_match;
 mod color_means;
 mod constants;
 mod export;
@@ -27,6 +28,7 @@ pub use appearance::{
 };
 pub use buffers::{GaussianBuffers, RenderTarget};
 pub use color::{composite_over, linear_from_srgb, rgba8_from_target, srgb_from_linear};
+pub use color_match::ColorMatcher;
 pub use color_means::ColorMeans;
 pub use export::{ExportError, Splat, read_splats, write_splat_ply};
 pub use gradients::{Carry, GaussianGradients, ImageGradients};

@@ -20,6 +20,7 @@ fn every_tile_lists_its_gaussians_by_depth() {
     let middle = DVec3::new(0.0, 0.85, 0.0);
     let camera = Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: "test".into(),
         intrinsics: Intrinsics {
             width: 1920,

@@ -137,16 +137,19 @@ impl Report {
             page.push_str("</div>");
         }
         if !self.stages.is_empty() {
-            page.push_str("<h2>Time per stage</h2><table><tr><th>stage<th>frames<th>mean ms<th>median ms<th>95 % ms");
+            page.push_str(
+                "<h2>Time per stage</h2><table><tr><th>stage<th>frames<th>mean ms<th>median ms<th>95 % ms<th>99 % ms",
+            );
             for s in &self.stages {
                 let _ = write!(
                     page,
-                    "<tr><td>{}<td>{}<td>{:.2}<td>{:.2}<td>{:.2}",
+                    "<tr><td>{}<td>{}<td>{:.2}<td>{:.2}<td>{:.2}<td>{:.2}",
                     escape(&s.name),
                     s.frames,
                     s.mean_ms,
                     s.p50_ms,
-                    s.p95_ms
+                    s.p95_ms,
+                    s.p99_ms
                 );
             }
             page.push_str("</table>");

@@ -8,14 +8,15 @@ use std::{
 
 use anyhow::{Context, Result, bail};
 use flyrig_body::{ShapeParams, default_template, load_gltf};
-use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay};
+use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay, to_rgb8};
 use flyrig_fusion::{
     EstimatedPerception, GivenPerception, GivenPerson, Origin, PersonId, SHAPE_SECS, SHAPE_SETS, Session,
     SessionBuilder, SessionSettings, SetReader, next_frame,
 };
 use flyrig_gpu::GpuContext;
+use flyrig_renderer::ColorMatcher;
 use flyrig_sync::SyncSettings;
-use flyrig_types::{Camera, CameraId, Frame, FrameSet, Rig};
+use flyrig_types::{Camera, CameraId, Frame, FrameSet, Image, PixelFormat, Rig};
 
 use crate::{dataset, true_joints::TrueJoints};
 
@@ -182,9 +183,31 @@ fn open_inputs(settings: &ReplaySettings, rig: &Rig) -> Result<(SetReader, usize
 
 /// Reads the held-out cameras alongside, never ahead of what is scored.
 pub struct TruthReader {
-    /// With what is taken off the stamps, nanoseconds, and the frame of the last time.
-    sources: Vec<(FolderReplay, i64, Option<Frame>)>,
+    sources: Vec<TrueImages>,
     window_nanos: u64,
+}
+
+/// Images of one held-out camera.
+struct TrueImages {
+    source: FolderReplay,
+    /// Is taken off the stamps, nanoseconds.
+    lag_nanos: i64,
+    matcher: Option<ColorMatcher>,
+    /// Frame of the last time.
+    current: Option<Frame>,
+}
+
+impl TrueImages {
+    /// Corrects time and colours of a frame as those of an input camera are corrected.
+    fn corrected(&self, frame: Frame) -> Result<Frame> {
+        let capture_nanos = frame.capture_nanos.saturating_sub(self.lag_nanos);
+        let Some(matcher) = &self.matcher else { return Ok(Frame { capture_nanos, ..frame }) };
+        let (width, height) = (frame.image.width(), frame.image.height());
+        let mut rgb = to_rgb8(&frame.image)?;
+        matcher.correct(&mut rgb, 3, width as usize, |_| false);
+        let image = Image::new(width, height, PixelFormat::Rgb8, rgb)?;
+        Ok(Frame { capture_nanos, image, ..frame })
+    }
 }
 
 impl TruthReader {
@@ -193,8 +216,13 @@ impl TruthReader {
         let with_masks = ids.iter().all(|id| args.dataset.join("mask").join(id.as_str()).is_dir());
         let options = FolderOptions { fps: args.fps, frames: args.frames.clone(), with_masks };
         let sources = FolderReplay::open(&args.dataset, Some(&ids), &options)?;
-        let lag = |id: &CameraId| args.lags_nanos.get(id).copied().unwrap_or_default();
-        let sources = sources.into_iter().zip(&ids).map(|(source, id)| (source, lag(id), None)).collect();
+        let of = |(source, camera): (FolderReplay, &Camera)| TrueImages {
+            source,
+            lag_nanos: args.lags_nanos.get(&camera.id).copied().unwrap_or_default(),
+            matcher: ColorMatcher::new(camera),
+            current: None,
+        };
+        let sources = sources.into_iter().zip(holdout).map(of).collect();
         Ok(Self { sources, window_nanos: half_period_nanos(args.fps) })
     }
 
@@ -203,13 +231,11 @@ impl TruthReader {
     /// # Errors
     /// Names the image that cannot be read; one that is broken is left out.
     pub fn at(&mut self, nanos: i64) -> Result<Vec<Option<&Frame>>> {
-        for (source, lag, current) in &mut self.sources {
+        for images in &mut self.sources {
             let earliest = nanos.saturating_sub_unsigned(self.window_nanos);
-            while current.as_ref().is_none_or(|frame| frame.capture_nanos < earliest) {
-                match next_frame(&mut *source) {
-                    Ok(Some(frame)) => {
-                        *current = Some(Frame { capture_nanos: frame.capture_nanos.saturating_sub(*lag), ..frame });
-                    }
+            while images.current.as_ref().is_none_or(|frame| frame.capture_nanos < earliest) {
+                match next_frame(&mut images.source) {
+                    Ok(Some(frame)) => images.current = Some(images.corrected(frame)?),
                     Ok(None) => break,
                     Err(error) if error.kind == CaptureErrorKind::Corrupt => {
                         tracing::warn!("held-out {error}; that frame is not scored");
@@ -219,7 +245,7 @@ impl TruthReader {
             }
         }
         let near = |frame: &&Frame| frame.capture_nanos.abs_diff(nanos) <= self.window_nanos;
-        Ok(self.sources.iter().map(|(_, _, frame)| frame.as_ref().filter(near)).collect())
+        Ok(self.sources.iter().map(|images| images.current.as_ref().filter(near)).collect())
     }
 }
 

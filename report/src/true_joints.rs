@@ -91,6 +91,7 @@ mod tests {
         let track = PoseTrack::new(vec![(0, truth.clone()), (1_000, truth.clone())]).unwrap();
         let camera = Camera {
             time_offset_nanos: 0,
+            color: Default::default(),
             id: "a".into(),
             intrinsics: Intrinsics::pinhole(64, 64, 60.0),
             camera_from_world: Isometry::look_at(DVec3::new(0.0, -3.0, 1.0), DVec3::Z, DVec3::Z),

@@ -726,6 +726,7 @@ mod tests {
             };
             let camera = Camera {
                 time_offset_nanos: 0,
+                color: Default::default(),
                 id: CameraId::from("00".to_owned()),
                 intrinsics,
                 camera_from_world: Isometry::look_at(DVec3::new(0.3, -3.0, 1.5), DVec3::new(0.0, 0.0, 1.0), DVec3::Z),

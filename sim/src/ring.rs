@@ -48,6 +48,7 @@ pub fn camera_ring(config: &SimConfig) -> Result<Rig, SimError> {
             unfolded(config, &intrinsics)?;
             Ok(Camera {
                 time_offset_nanos: 0,
+                color: Default::default(),
                 id: CameraId::from(camera_name(slot)),
                 intrinsics,
                 camera_from_world: turn * Isometry::look_at(eye, target, DVec3::Z),

@@ -52,6 +52,7 @@ impl Stage {
         let [width, height] = SIZE;
         Camera {
             time_offset_nanos: 0,
+            color: Default::default(),
             id: format!("{azimuth}").as_str().into(),
             intrinsics: Intrinsics {
                 width,

@@ -15,6 +15,7 @@ fn camera(name: &str, eye: DVec3, target: DVec3) -> Camera {
         Intrinsics { width: 144, height: 192, focal_px: DVec2::splat(195.0), center_px: DVec2::new(71.5, 95.5), lens };
     Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: name.into(),
         intrinsics,
         camera_from_world: Isometry::look_at(eye, target, DVec3::Z),

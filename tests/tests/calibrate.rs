@@ -20,6 +20,7 @@ fn cameras() -> Vec<Camera> {
             let eye = DVec3::new(angle.sin(), -angle.cos(), 0.65 + 0.1 * angle);
             Camera {
                 time_offset_nanos: 0,
+                color: Default::default(),
                 id: name.into(),
                 intrinsics: Intrinsics {
                     width: SIZE[0],

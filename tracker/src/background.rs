@@ -483,6 +483,7 @@ mod tests {
     fn camera() -> Camera {
         Camera {
             time_offset_nanos: 0,
+            color: Default::default(),
             id: "left".into(),
             intrinsics: Intrinsics {
                 width: SIDE as u32,

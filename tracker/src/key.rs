@@ -212,6 +212,7 @@ mod tests {
     fn background(key: &str) -> Background {
         let camera = Camera {
             time_offset_nanos: 0,
+            color: Default::default(),
             id: "a".into(),
             intrinsics: Intrinsics {
                 width: SIDE as u32,

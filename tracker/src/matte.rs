@@ -434,6 +434,7 @@ mod tests {
     fn background(plate: &Image) -> Background {
         let camera = flyrig_types::Camera {
             time_offset_nanos: 0,
+            color: Default::default(),
             id: "a".into(),
             intrinsics: Intrinsics {
                 width: plate.width(),

@@ -23,6 +23,7 @@ pub(crate) fn ring(count: usize) -> Rig {
             let eye = DVec3::new(3.5 * angle.cos(), 3.5 * angle.sin(), 1.5);
             Camera {
                 time_offset_nanos: 0,
+                color: Default::default(),
                 id: format!("{i}").into(),
                 intrinsics: Intrinsics {
                     width: 800,

@@ -27,7 +27,7 @@ pub fn gather(
 ) -> Result<TrainingSample> {
     let person = PersonId::default();
     let subject = session.subject(person).context("nobody was simulated")?;
-    let Observed { observations, pictures, center_scale, normal } = session.observed(person)?;
+    let Observed { observations, pictures, center_scale, normal, .. } = session.observed(person)?;
     let pictures: Vec<ViewImage<'_>> =
         pictures.iter().map(|(width, height, rgba)| ViewImage { width: *width, height: *height, rgba }).collect();
     let rgba: Vec<Vec<u8>> = held_out.iter().map(rgba).collect::<Result<_>>()?;

@@ -90,7 +90,13 @@ pub fn decode_calibration(bytes: &[u8]) -> Result<(CameraId, Intrinsics), Transp
         lens,
     };
     let id = camera_id("calibration", &message.frame_id)?;
-    let camera = Camera { time_offset_nanos: 0, id: id.clone(), intrinsics, camera_from_world: Isometry::IDENTITY };
+    let camera = Camera {
+        time_offset_nanos: 0,
+        color: Default::default(),
+        id: id.clone(),
+        intrinsics,
+        camera_from_world: Isometry::IDENTITY,
+    };
     camera.validate().map_err(|error| malformed(error.to_string()))?;
     Ok((id, intrinsics))
 }

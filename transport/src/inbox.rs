@@ -289,6 +289,7 @@ impl Inbox {
                 let (from, intrinsics) = state.lenses.get(id)?;
                 let camera = Camera {
                     time_offset_nanos: 0,
+                    color: Default::default(),
                     id: id.clone(),
                     intrinsics: *intrinsics,
                     camera_from_world: *camera_from_world,

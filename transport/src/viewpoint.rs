@@ -343,6 +343,7 @@ mod tests {
     fn camera(width: u32, height: u32) -> Camera {
         Camera {
             time_offset_nanos: 0,
+            color: Default::default(),
             id: "mine".into(),
             intrinsics: Intrinsics {
                 width,

@@ -3,7 +3,7 @@
 use glam::{DMat3, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::{CameraId, Isometry};
+use crate::{CameraId, ColorMatch, Isometry};
 
 /// Largest image side that anything in flyrig accepts, pixels.
 pub const MAX_IMAGE_SIDE: u32 = 16_384;
@@ -277,10 +277,17 @@ pub struct Camera {
     /// cameras that are only drawn.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub time_offset_nanos: i64,
+    /// Correction of its colours towards those of the other cameras, before they are used.
+    #[serde(default, skip_serializing_if = "is_unmatched")]
+    pub color: ColorMatch,
 }
 
 fn is_zero(nanos: &i64) -> bool {
     *nanos == 0
+}
+
+fn is_unmatched(color: &ColorMatch) -> bool {
+    *color == ColorMatch::NONE
 }
 
 impl Camera {
@@ -350,7 +357,8 @@ impl Camera {
         let norm = self.camera_from_world.rotation.length();
         range("rotation quaternion length", norm, (norm - 1.0).abs() < 1e-6, "1")?;
         let offset_ms = self.time_offset_nanos as f64 * 1e-6;
-        range("time offset", offset_ms, offset_ms.abs() <= MAX_TIME_OFFSET_MS, "-1000 to 1000 ms")
+        range("time offset", offset_ms, offset_ms.abs() <= MAX_TIME_OFFSET_MS, "-1000 to 1000 ms")?;
+        self.color.fault().map_or(Ok(()), |(field, value, expected)| range(field, value, false, expected))
     }
 }
 
@@ -431,6 +439,7 @@ mod tests {
             },
             camera_from_world: Isometry::look_at(DVec3::new(0.0, -3.0, 1.0), DVec3::new(0.0, 0.0, 1.0), DVec3::Z),
             time_offset_nanos: 0,
+            color: Default::default(),
         }
     }
 

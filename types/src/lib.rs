@@ -12,6 +12,7 @@
 //! - **Colour** is sRGB with 8 bits on the outside and linear `f32` inside.
 
 mod camera;
+mod color_match;
 mod frame;
 mod ids;
 mod image;
@@ -25,6 +26,7 @@ mod supervised;
 mod whole_file;
 
 pub use camera::{Camera, CameraError, Intrinsics, Lens, MAX_IMAGE_SIDE, Rig};
+pub use color_match::ColorMatch;
 pub use frame::{Frame, FrameSet, SetKind};
 pub use ids::CameraId;
 pub use image::{Image, ImageError, Mask, PixelBuffer, PixelFormat, Recycle};

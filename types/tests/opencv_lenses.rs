@@ -16,6 +16,7 @@ fn check(lens: Lens, focal: [f64; 2], points: &[[f64; 3]], pixels: &[[f64; 2]]) 
         },
         camera_from_world: Isometry::IDENTITY,
         time_offset_nanos: 0,
+        color: Default::default(),
     };
     for (point, expected) in points.iter().zip(pixels) {
         let (point, expected) = (DVec3::from(*point), DVec2::from(*expected));

@@ -126,6 +126,7 @@ impl Navigation {
         let focal = 0.5 * f64::from(height) / (0.5 * self.field).tan();
         Camera {
             time_offset_nanos: 0,
+            color: Default::default(),
             id: "view".into(),
             intrinsics: Intrinsics::pinhole(width, height, focal),
             camera_from_world: Isometry::look_at(self.target + self.arm(), self.target, self.up),
@@ -143,6 +144,7 @@ mod tests {
     fn rig() -> Rig {
         let camera = |eye: DVec3| Camera {
             time_offset_nanos: 0,
+            color: Default::default(),
             id: format!("{eye}").into(),
             intrinsics: Intrinsics::pinhole(640, 480, 500.0),
             camera_from_world: Isometry::look_at(eye, DVec3::new(0.2, 0.1, 1.0), DVec3::Z),

@@ -82,6 +82,7 @@ impl Drop for TestRig {
 fn cameras() -> Rig {
     let camera = Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: "a".into(),
         intrinsics: Intrinsics::pinhole(640, 480, 500.0),
         camera_from_world: Isometry::look_at(DVec3::new(0.0, -3.0, 1.0), DVec3::Z, DVec3::Z),

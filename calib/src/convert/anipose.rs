@@ -77,6 +77,7 @@ fn camera(key: &str, table: &Table) -> Result<ImportedCamera, String> {
         intrinsics: intrinsics([width, height], DVec2::new(fx, fy), DVec2::new(cx, cy), lens),
         pose,
         time_offset_nanos: 0,
+        color: Default::default(),
     })
 }
 

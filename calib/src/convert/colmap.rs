@@ -139,6 +139,7 @@ fn image(line: &str, lenses: &BTreeMap<String, Intrinsics>) -> Result<ImportedCa
         intrinsics: *intrinsics,
         pose: Some(Isometry::new(rotation.normalize(), DVec3::new(tx, ty, tz))),
         time_offset_nanos: 0,
+        color: Default::default(),
     })
 }
 

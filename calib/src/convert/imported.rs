@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Rig};
+use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry, Rig};
 use glam::DVec3;
 
 use super::shared::bad;
@@ -34,6 +34,8 @@ pub struct ImportedCamera {
     pub pose: Option<Isometry>,
     /// See [`Camera::time_offset_nanos`].
     pub time_offset_nanos: i64,
+    /// See [`Camera::color`].
+    pub color: ColorMatch,
 }
 
 impl ImportedCamera {
@@ -55,6 +57,7 @@ impl ImportedCamera {
             intrinsics: self.intrinsics,
             camera_from_world,
             time_offset_nanos: self.time_offset_nanos,
+            color: self.color,
         }
     }
 }

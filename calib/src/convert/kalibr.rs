@@ -74,6 +74,7 @@ pub(super) fn read(path: &Path) -> Result<Imported, CalibError> {
             intrinsics: intrinsics([width, height], DVec2::new(fx, fy), DVec2::new(cx, cy), lens),
             pose,
             time_offset_nanos: ((first - shift) * 1e9).round() as i64,
+            color: Default::default(),
         });
     }
     // One camera alone was calibrated for its lens.

@@ -61,6 +61,7 @@ fn model(id: CameraId, root: &Value) -> Result<ImportedCamera, String> {
         intrinsics: intrinsics([width, height], DVec2::new(fx, fy), DVec2::new(cx, cy), opencv_lens(coefficients)?),
         pose: Some(Isometry::new(DQuat::from_scaled_axis(DVec3::new(rx, ry, rz)), DVec3::new(x, y, z))),
         time_offset_nanos: 0,
+        color: Default::default(),
     })
 }
 

@@ -73,6 +73,7 @@ fn camera(root: &Value, frame: &Value) -> Result<ImportedCamera, String> {
         intrinsics: intrinsics([need("w")?, need("h")?], DVec2::new(fx, number("fl_y").unwrap_or(fx)), center, lens),
         pose: Some(Isometry::new(flip(), DVec3::ZERO) * world_from_camera.inverse()),
         time_offset_nanos: 0,
+        color: Default::default(),
     })
 }
 

@@ -61,7 +61,7 @@ fn camera(path: &Path) -> Result<ImportedCamera, CalibError> {
         _ => return Err(bad(path, "one of rvec and tvec is missing; give both, or neither")),
     };
     let intrinsics = intrinsics(size, DVec2::new(fx, fy), DVec2::new(cx, cy), lens);
-    Ok(ImportedCamera { id, intrinsics, pose, time_offset_nanos: 0 })
+    Ok(ImportedCamera { id, intrinsics, pose, time_offset_nanos: 0, color: Default::default() })
 }
 
 fn pose(rotation: &Matrix, translation: &Matrix) -> Result<Isometry, String> {

@@ -74,6 +74,7 @@ fn camera(id: &str, node: Node<'_, '_>) -> Result<ImportedCamera, String> {
         intrinsics: intrinsics(size, focal, center, opencv_lens(&coefficients)?),
         pose: Some(Isometry::new(rotation, -(rotation * position))),
         time_offset_nanos: 0,
+        color: Default::default(),
     })
 }
 

@@ -54,6 +54,7 @@ pub fn ring(random: &mut Random, count: usize) -> Vec<Camera> {
             let eye = DVec3::new(3.2 * angle.cos(), 3.2 * angle.sin(), random.between(1.2, 2.4));
             Camera {
                 time_offset_nanos: 0,
+                color: Default::default(),
                 id: format!("{i:02}").into(),
                 intrinsics: intrinsics(random),
                 camera_from_world: Isometry::look_at(eye, DVec3::Z * 0.8 + random.vector() * 0.1, DVec3::Z),

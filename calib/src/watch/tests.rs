@@ -19,6 +19,7 @@ fn camera() -> Camera {
         },
         camera_from_world: Isometry::look_at(DVec3::new(2.0, -1.5, 1.8), DVec3::new(-0.5, 0.5, 0.9), DVec3::Z),
         time_offset_nanos: 0,
+        color: Default::default(),
     }
 }
 

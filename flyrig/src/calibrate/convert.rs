@@ -3,6 +3,7 @@
 use anyhow::{Context as _, Result, bail, ensure};
 use flyrig_calib::{Format, save_lenses};
 use flyrig_capture::folder_image_size;
+use flyrig_types::ColorMatch;
 
 use super::refuse_existing;
 use crate::cli::CalibrateConvertArgs;
@@ -62,6 +63,9 @@ pub fn convert(args: &CalibrateConvertArgs) -> Result<()> {
     let lost = args.to != Format::Flyrig && args.to != Format::Kalibr;
     if lost && rig.cameras.iter().any(|camera| camera.time_offset_nanos != 0) {
         println!("warning: {} has no place for time offsets; they are left out", args.to.name());
+    }
+    if args.to != Format::Flyrig && rig.cameras.iter().any(|camera| camera.color != ColorMatch::NONE) {
+        println!("warning: {} has no place for colour corrections; they are left out", args.to.name());
     }
     // A folder that stays empty goes again.
     let files = args.to.write(&args.out, &rig).inspect_err(|_| drop(std::fs::remove_dir(&args.out)))?;

@@ -60,6 +60,7 @@ mod tests {
             let at = DVec3::new(deg.to_radians().cos(), deg.to_radians().sin(), 0.0) * 3.0;
             Camera {
                 time_offset_nanos: 0,
+                color: Default::default(),
                 id: format!("{i}").into(),
                 intrinsics: Intrinsics {
                     width: 64,

@@ -165,6 +165,7 @@ mod tests {
     fn camera() -> Camera {
         Camera {
             time_offset_nanos: 0,
+            color: Default::default(),
             id: "a".into(),
             intrinsics: Intrinsics {
                 width: 40,

@@ -29,6 +29,7 @@ pub fn camera(name: &str, degrees: f64) -> Camera {
     let middle = DVec3::new(0.0, 0.85, 0.0);
     Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: name.into(),
         intrinsics: Intrinsics {
             width: SIZE,

@@ -125,6 +125,7 @@ pub fn camera(name: &str, azimuth: f64, size: u32, lens: Lens) -> Camera {
     let side = f64::from(size);
     Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: name.into(),
         intrinsics: Intrinsics {
             width: size,

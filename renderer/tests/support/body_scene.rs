@@ -28,6 +28,7 @@ pub fn camera(scene: &Scene, width: u32, height: u32, azimuth: f64) -> Camera {
     let focal = 0.78 * f64::from(height) * distance / tall;
     Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: "bench".into(),
         intrinsics: Intrinsics {
             width,

@@ -22,6 +22,7 @@ fn camera(lens: Lens, width: u32, height: u32, camera_from_world: Isometry) -> C
     let focal = f64::from(width.max(height));
     Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: "test".into(),
         intrinsics: Intrinsics {
             width,

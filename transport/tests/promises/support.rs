@@ -89,6 +89,7 @@ pub fn publish_until_seen(
 pub fn camera(name: &str, lens: Lens) -> Camera {
     Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: name.into(),
         intrinsics: Intrinsics {
             width: 640,

@@ -123,6 +123,7 @@ fn camera(azimuth: f64, side: u32) -> Camera {
     let eye = middle + DVec3::new(azimuth.sin(), 0.15, azimuth.cos()) * 3.0;
     Camera {
         time_offset_nanos: 0,
+        color: Default::default(),
         id: format!("{azimuth}").into(),
         intrinsics: Intrinsics {
             width: side,

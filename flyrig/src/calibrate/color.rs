@@ -1,0 +1,237 @@
+//! `flyrig calibrate color`: colours of the cameras, matched by people whom several of them see.
+
+use anyhow::{Context as _, Result, ensure};
+use flyrig_body::{ShapeParams, default_template};
+use flyrig_calib::{CameraColors, ColorFit, ColorPoint, ColorSample, match_colors, save_calibration};
+use flyrig_fusion::{
+    EstimatedPerception, Observed, Origin, PerceptionSettings, SHAPE_SECS, SHAPE_SETS, Session, SessionBuilder,
+    SessionSettings, TrackState,
+};
+use flyrig_gpu::GpuContext;
+use flyrig_report::{stop, write_whole};
+use flyrig_types::{CameraId, ColorMatch, FrameSet, Rig};
+use glam::DVec2;
+use serde_json::json;
+
+use super::{FILES, refuse_existing};
+use crate::{
+    cli::CalibrateColorArgs,
+    take::{self, CalibratedTake},
+};
+
+/// Gaussians on a person: enough for colours, in a quarter of the time.
+const GAUSSIANS: usize = 30_000;
+/// Points that are taken of a person and a set.
+const POINTS: usize = 2000;
+/// Sets from one whose colours are taken to the next.
+const EVERY: u64 = 4;
+/// Weight of the angle (Eq. 7), and nearness to the drawn surface exp(-k d), that a point needs in a view.
+const LEAST_WEIGHT: f32 = 0.3;
+const LEAST_NEARNESS: f32 = 0.85;
+/// A surface is looked at within a square that reaches this share of the image's width to each side.
+const REACH: u32 = 200;
+/// Range of sRGB values there, as a share of their mean, at which a sample counts half; and beyond which it is not used.
+const EVEN: (f64, f64) = (0.05, 0.5);
+/// Differences between cameras that are not worth a correction.
+const MATCHED: f64 = 0.02;
+/// Gains of the halves of a take may differ by this share.
+const MOST_HALVES: f64 = 0.03;
+
+/// Runs the command.
+pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
+    stop::flag();
+    refuse_existing(&args.out, &FILES, args.force)?;
+    let open = || take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu);
+    let mut take = open()?;
+    ensure!(
+        !take.is_live,
+        "live cameras cannot be looked at frame by frame; record them first (flyrig record) and give the recording"
+    );
+    let (mut rig, plates) = take
+        .calibration
+        .take()
+        .context("no calibration: name its folder with --calibration; flyrig calibrate rig makes one from a board")?;
+    ensure!(rig.cameras.len() > 1, "one camera alone has nothing to match");
+    // An earlier correction is replaced.
+    rig.cameras.iter_mut().for_each(|camera| camera.color = ColorMatch::NONE);
+    let perception = PerceptionSettings {
+        masks: if take.given_masks { Origin::Given } else { Origin::Estimated },
+        people: args.people,
+        ..PerceptionSettings::default()
+    };
+    let template = default_template(&ShapeParams::default())?;
+    let mut estimated = EstimatedPerception::new(&rig, &template, &perception, &plates)?;
+    // Somebody who comes later is measured then.
+    if let Err(error) = estimated.learn_shapes(&first_sets(args, &rig, open()?)?) {
+        tracing::debug!(%error, "nobody in the first sets");
+    }
+    let mut settings = SessionSettings { perception, ..SessionSettings::default() };
+    settings.body.gaussians = GAUSSIANS;
+    let mut session = SessionBuilder::new(gpu()?, rig.clone()).settings(settings).perception(estimated).build()?;
+    session.keep_observations()?;
+    let points = look_through(args, &rig, &mut session, take)?;
+    ensure!(!points.is_empty(), "nobody is followed; let one person walk where all cameras see them whole");
+    let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+    let fit = match_colors(&ids, &points)?;
+    for (camera, solved) in rig.cameras.iter_mut().zip(&fit.cameras) {
+        camera.color = solved.color;
+    }
+    rig.validate().context("the colours cannot be matched; are the exposures of the cameras alike?")?;
+    print(&ids, &fit);
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    save_calibration(&args.out, &rig, &[])?;
+    write_whole(&args.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(&ids, &fit))?)?;
+    println!("{}: {}", args.out.display(), FILES.join(", "));
+    println!("next: set path (of a folder: calibration) = \"{}\" in [source]", args.out.display());
+    Ok(())
+}
+
+/// Returns sets of the first seconds, from which shapes are measured.
+fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: CalibratedTake) -> Result<Vec<FrameSet>> {
+    let secs = [args.from_secs, args.from_secs + SHAPE_SECS];
+    let (mut sets, mut first): (Vec<FrameSet>, _) = (Vec::new(), None);
+    take::each_set(take.sources, rig, take.sync, 0, secs, "the person's shape, ms of the take", |set| {
+        let from = *first.get_or_insert(set.master_nanos);
+        let due = SHAPE_SECS * sets.len() as f64 / SHAPE_SETS as f64;
+        if set.master_nanos.saturating_sub(from) as f64 * 1e-9 >= due - 1e-3 {
+            sets.push(set.clone());
+        }
+        Ok(())
+    })?;
+    Ok(sets)
+}
+
+/// Follows people through the take and collects what cameras see of their surfaces.
+fn look_through(
+    args: &CalibrateColorArgs,
+    rig: &Rig,
+    session: &mut Session,
+    take: CalibratedTake,
+) -> Result<Vec<ColorPoint>> {
+    let secs = [args.from_secs, args.from_secs + args.secs];
+    let (mut points, mut sets) = (Vec::new(), 0u64);
+    let errors = take::each_set(take.sources, rig, take.sync, 0, secs, "colours, ms of the take", |set| {
+        session.process(set)?;
+        sets += 1;
+        if !sets.is_multiple_of(EVERY) {
+            return Ok(());
+        }
+        let people: Vec<_> = session.subjects().iter().map(|subject| subject.id()).collect();
+        for person in people {
+            if session.subject(person).is_some_and(|subject| subject.watch().state() == TrackState::Steady) {
+                points.extend(seen(rig, &session.observed(person)?, sets / EVERY));
+            }
+        }
+        Ok(())
+    })?;
+    for (slot, camera) in rig.cameras.iter().enumerate() {
+        if let Some(error) = errors.of(slot) {
+            eprintln!("warning: not every image of camera {} could be used; the last: {error}", camera.id);
+        }
+    }
+    Ok(points)
+}
+
+/// Takes the points that two views or more see well.
+fn seen(rig: &Rig, observed: &Observed, instant: u64) -> Vec<ColorPoint> {
+    let views = &observed.observations.views;
+    let count = observed.center_scale.len();
+    let sample = |view: usize, gaussian: usize| {
+        let [x, y, weight, nearness] = *views.get(view)?.get(gaussian)?;
+        if weight < LEAST_WEIGHT || nearness < LEAST_NEARNESS {
+            return None;
+        }
+        let (camera, (width, height, rgba)) = (*observed.slots.get(view)?, observed.pictures.get(view)?);
+        let (srgb, evenness) = srgb_at([*width, *height], rgba, [x, y])?;
+        let intrinsics = &rig.cameras.get(camera)?.intrinsics;
+        let diagonal = DVec2::new(f64::from(*width), f64::from(*height)).length();
+        let r = DVec2::new(x.into(), y.into()).distance(intrinsics.center_px) / (0.5 * diagonal);
+        Some(ColorSample { camera, srgb, r2: r * r, weight: evenness * f64::from(weight) })
+    };
+    let point = |gaussian| {
+        let samples: Vec<ColorSample> = (0..views.len()).filter_map(|view| sample(view, gaussian)).collect();
+        (samples.len() > 1).then_some(ColorPoint { instant, samples })
+    };
+    let all: Vec<ColorPoint> = (0..count).filter_map(point).collect();
+    let step = all.len().div_ceil(POINTS).max(1);
+    // Others each time.
+    all.into_iter().skip(instant as usize % step).step_by(step).collect()
+}
+
+/// Returns the mean sRGB values around a pixel of an image with the mask as alpha, and how much they count, 0 to 1: where the surface is
+/// patterned, a small error of its place is one of its colour. `None` at the mask's edge and outside.
+fn srgb_at([width, height]: [u32; 2], rgba: &[u8], [x, y]: [f32; 2]) -> Option<([f64; 3], f64)> {
+    let reach = i64::from(width / REACH).max(1);
+    let (x, y) = (x.round() as i64, y.round() as i64);
+    if x < reach || y < reach || x + reach >= i64::from(width) || y + reach >= i64::from(height) {
+        return None;
+    }
+    let (mut sums, mut least, mut most) = ([0u32; 3], [u8::MAX; 3], [0u8; 3]);
+    for row in y - reach..=y + reach {
+        let from = 4 * (row as usize * width as usize + (x - reach) as usize);
+        for pixel in rgba.get(from..from + 4 * (2 * reach as usize + 1))?.chunks_exact(4) {
+            if pixel[3] < 255 {
+                return None;
+            }
+            for k in 0..3 {
+                sums[k] += u32::from(pixel[k]);
+                (least[k], most[k]) = (least[k].min(pixel[k]), most[k].max(pixel[k]));
+            }
+        }
+    }
+    let count = (2 * reach + 1).pow(2) as f64;
+    let mean: [f64; 3] = sums.map(|sum| f64::from(sum) / (255.0 * count));
+    let range = (0..3).map(|k| f64::from(most[k] - least[k]) / (255.0 * mean[k])).fold(0.0, f64::max);
+    // NaN, of black, is not below.
+    (range < EVEN.1).then(|| (mean, 1.0 / (1.0 + (range / EVEN.0).powi(2))))
+}
+
+fn print(ids: &[CameraId], fit: &ColorFit) {
+    println!(
+        "{:<14} {:>8} {:>20} {:>9} {:>9} {:>9} {:>16}",
+        "camera", "points", "gain r g b", "exponent", "corner", "halves %", "difference %"
+    );
+    for (id, camera) in ids.iter().zip(&fit.cameras) {
+        let CameraColors { color: ColorMatch { gain: [r, g, b], exponent, falloff }, points, halves, difference } =
+            camera;
+        println!(
+            "{id:<14} {points:>8} {:>20} {exponent:>9.3} {:>9.3} {:>9.2} {:>16}",
+            format!("{r:.3} {g:.3} {b:.3}"),
+            (falloff[0] + falloff[1]).exp(),
+            100.0 * halves,
+            format!("{:.1} -> {:.1}", 100.0 * difference.0, 100.0 * difference.1),
+        );
+    }
+    let sought = match (fit.model.response, fit.model.falloff) {
+        (false, false) => "gains alone: exponents and corners explain no more",
+        (true, false) => "gains and exponents: corners explain no more",
+        (false, true) => "gains and corners: exponents explain no more",
+        (true, true) => "gains, exponents and corners",
+    };
+    println!("{sought}");
+    if fit.cameras.iter().all(|camera| (0..3).all(|k| (camera.color.gain[k] - 1.0).abs() < MATCHED)) {
+        println!("the cameras are matched already: no gain is off by more than {:.0} %", 100.0 * MATCHED);
+    }
+    for (id, _) in ids.iter().zip(&fit.cameras).filter(|(_, camera)| camera.halves > MOST_HALVES) {
+        println!(
+            "warning: camera {id}: the two halves of the take disagree by more than {:.0} %: its exposure or white balance may be \
+             automatic (flyrig doctor), or the light changed",
+            100.0 * MOST_HALVES
+        );
+    }
+}
+
+/// `calibration.json`.
+fn report(ids: &[CameraId], fit: &ColorFit) -> serde_json::Value {
+    let of = |(id, camera): (&CameraId, &CameraColors)| {
+        json!({
+            "camera": id,
+            "color": camera.color,
+            "points": camera.points,
+            "halves": camera.halves,
+            "difference_before": camera.difference.0,
+            "difference": camera.difference.1,
+        })
+    };
+    json!({ "cameras": ids.iter().zip(&fit.cameras).map(of).collect::<Vec<_>>() })
+}
