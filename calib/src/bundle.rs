@@ -48,6 +48,19 @@ pub(crate) struct Estimate {
     pub cameras: Vec<SolvedCamera>,
     /// `rig_from_board` by shot.
     pub boards: Vec<RigidMotion>,
+    /// Depth of the board's surface behind its plane at a corner: these times [`bend_shares`], metres.
+    pub bend_m: [f64; 3],
+}
+
+/// u², u v and v² of each corner, where (u, v) is its place from the middle of all as a share of half their diagonal.
+pub(crate) fn bend_shares(points: &[DVec3]) -> Vec<[f64; 3]> {
+    let (least, most) = points.iter().fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(a, b), p| (a.min(*p), b.max(*p)));
+    let (middle, reach) = (0.5 * (least + most), 0.5 * least.distance(most));
+    let share = |point: &DVec3| {
+        let from = (*point - middle) / reach;
+        [from.x * from.x, from.x * from.y, from.y * from.y]
+    };
+    points.iter().map(share).collect()
 }
 
 /// Movement of a board during a shot.
@@ -64,11 +77,13 @@ pub(crate) struct BoardMotion {
 pub(crate) struct Free {
     pub lens: Option<LensModel>,
     pub lags: bool,
+    pub bend: bool,
 }
 
 /// The least squares problem.
 pub(crate) struct Bundle<'a> {
     points: &'a [DVec3],
+    bend_shares: Vec<[f64; 3]>,
     shots: &'a [BoardShot],
     motions: &'a [BoardMotion],
     free: Free,
@@ -95,7 +110,7 @@ impl<'a> Bundle<'a> {
             |shot: usize, view: usize| (0..shots[shot].views[view].corners.len()).map(move |k| (shot, view, k));
         let of_shot = |shot: usize| (0..shots[shot].views.len()).flat_map(move |view| of_view(shot, view));
         let seen = (0..shots.len()).flat_map(of_shot).collect();
-        // Poses of all cameras but the first, whose axes are the rig's; lenses; offsets of all but the first; boards.
+        // Poses of all cameras but the first, whose axes are the rig's; lenses; offsets of all but the first; the bend; boards.
         let others = cameras.saturating_sub(1);
         let mut sizes = vec![6; others];
         if let Some(model) = free.lens {
@@ -104,9 +119,23 @@ impl<'a> Bundle<'a> {
         if free.lags {
             sizes.extend(vec![1; others]);
         }
+        if free.bend {
+            sizes.push(3);
+        }
         let first_eliminated = sizes.len();
         sizes.extend(vec![6; shots.len()]);
-        Self { points, shots, motions, free, sigma_px, seen, cameras, sizes, first_eliminated }
+        Self {
+            points,
+            bend_shares: bend_shares(points),
+            shots,
+            motions,
+            free,
+            sigma_px,
+            seen,
+            cameras,
+            sizes,
+            first_eliminated,
+        }
     }
 
     fn lens_block(&self, camera: usize) -> Option<usize> {
@@ -116,6 +145,12 @@ impl<'a> Bundle<'a> {
     fn lag_block(&self, camera: usize) -> Option<usize> {
         let lenses = if self.free.lens.is_some() { self.cameras } else { 0 };
         (self.free.lags && camera > 0).then(|| self.cameras - 1 + lenses + camera - 1)
+    }
+
+    /// A corner on the bent board, board axes, metres.
+    fn bent(&self, at: &Estimate, corner: &SeenCorner) -> Option<DVec3> {
+        let (point, shares) = (self.points.get(corner.index)?, self.bend_shares.get(corner.index)?);
+        Some(*point + DVec3::Z * at.bend_m.iter().zip(shares).map(|(bend, share)| bend * share).sum::<f64>())
     }
 
     /// Pose of a shot's board at the time of a view.
@@ -128,7 +163,7 @@ impl<'a> Bundle<'a> {
     /// Difference of a drawn and a seen corner, pixels; `None` where it cannot be drawn.
     pub fn error_px(&self, at: &Estimate, shot: usize, view: &BoardView, corner: &SeenCorner) -> Option<DVec2> {
         let camera = &at.cameras[view.camera];
-        let place = self.board_at(at, shot, view).apply(*self.points.get(corner.index)?);
+        let place = self.board_at(at, shot, view).apply(self.bent(at, corner)?);
         Some(project(&camera.intrinsics, camera.camera_from_rig.apply(place))? - corner.pixel)
     }
 }
@@ -169,7 +204,7 @@ impl BlockProblem for Bundle<'_> {
         }
         let camera = &at.cameras[view.camera];
         let board = self.board_at(at, shot, view);
-        let point = *self.points.get(corner.index)?;
+        let point = self.bent(at, corner)?;
         let place = board.apply(point);
         let model = self.free.lens.unwrap_or(LensModel::Radial1);
         let local = camera.camera_from_rig.apply(place);
@@ -177,7 +212,7 @@ impl BlockProblem for Bundle<'_> {
         let by_local = DMatrix::from_fn(2, 3, |row, column| inverse * projected.by_point[column][row]);
         let [by_turn, by_shift, by_place] = camera.camera_from_rig.apply_jacobian(place);
         let by_place = &by_local * matrix(by_place);
-        let mut jacobians = Vec::with_capacity(4);
+        let mut jacobians = Vec::with_capacity(5);
         if view.camera > 0 {
             jacobians.push((view.camera - 1, beside(&(&by_local * matrix(by_turn)), &(&by_local * matrix(by_shift)))));
         }
@@ -189,6 +224,11 @@ impl BlockProblem for Bundle<'_> {
             let motion = &self.motions[shot];
             let velocity = motion.turn.cross(board.rotation * point) + motion.shift;
             jacobians.push((block, -(&by_place * DMatrix::from_column_slice(3, 1, &velocity.to_array()))));
+        }
+        if self.free.bend {
+            let by_depth = &by_place * DMatrix::from_column_slice(3, 1, &(board.rotation * DVec3::Z).to_array());
+            let shares = DMatrix::from_row_slice(1, 3, &self.bend_shares[corner.index]);
+            jacobians.push((self.first_eliminated - 1, by_depth * shares));
         }
         // The board's step comes before its movement during the shot, which is small: the same to first order.
         let [by_turn, by_shift, _] = board.apply_jacobian(point);
@@ -218,6 +258,11 @@ impl BlockProblem for Bundle<'_> {
                 camera.lag_s += take(1)[0];
             }
         }
+        if self.free.bend {
+            for (bend, step) in at.bend_m.iter_mut().zip(take(3)) {
+                *bend += step;
+            }
+        }
         for board in &mut at.boards {
             *board = moved(board, take(6));
         }
@@ -238,4 +283,58 @@ fn beside(left: &DMatrix<f64>, right: &DMatrix<f64>) -> DMatrix<f64> {
     both.columns_mut(0, left.ncols()).copy_from(left);
     both.columns_mut(left.ncols(), right.ncols()).copy_from(right);
     both
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_solve::jacobian_error;
+
+    use super::*;
+    use crate::{
+        Board,
+        testing::{Random, bent_shots, ring},
+    };
+
+    #[test]
+    fn derivatives_are_those_of_finite_differences() {
+        let (mut random, board) = (Random(4), Board::default());
+        let cameras = ring(&mut random, 3);
+        let points: Vec<DVec3> = (0..board.corner_count()).map(|index| board.corner(index)).collect();
+        let mut shots = bent_shots(&mut random, (&board, 0.003), &cameras, 3, 0.5);
+        for (i, view) in shots.iter_mut().flat_map(|shot| &mut shot.views).enumerate() {
+            view.nanos += 5_000_000 * i as i64;
+        }
+        let motions: Vec<BoardMotion> =
+            shots.iter().map(|_| BoardMotion { turn: random.vector() * 0.3, shift: random.vector() * 0.2 }).collect();
+        // Somewhere before all cameras.
+        let of = |camera: &flyrig_types::Camera| SolvedCamera {
+            camera_from_rig: RigidMotion {
+                rotation: camera.camera_from_world.rotation,
+                translation: camera.camera_from_world.translation,
+            },
+            intrinsics: camera.intrinsics,
+            lag_s: 0.003,
+        };
+        let middle = RigidMotion { rotation: Default::default(), translation: DVec3::Z * 0.8 };
+        let at = Estimate {
+            cameras: cameras.iter().map(of).collect(),
+            boards: vec![middle; shots.len()],
+            bend_m: [0.002, -0.001, 0.003],
+        };
+        for lens in [None, Some(LensModel::RadialTangential)] {
+            let free = Free { lens, lags: true, bend: true };
+            let bundle = Bundle::new(&points, &shots, &motions, cameras.len(), free, 0.7);
+            for index in 0..bundle.residual_count() {
+                let error = jacobian_error(&bundle, &at, index, 1e-6).unwrap();
+                // The board's step is taken before its movement during the shot.
+                assert!(error < 1e-2, "residual {index}: {error}");
+            }
+            let still = vec![BoardMotion::default(); shots.len()];
+            let bundle = Bundle::new(&points, &shots, &still, cameras.len(), free, 0.7);
+            for index in 0..bundle.residual_count() {
+                let error = jacobian_error(&bundle, &at, index, 1e-6).unwrap();
+                assert!(error < 1e-5, "residual {index}: {error}");
+            }
+        }
+    }
 }

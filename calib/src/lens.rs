@@ -233,5 +233,6 @@ fn solve(
         return None;
     }
     let camera = SolvedCamera { camera_from_rig: RigidMotion::IDENTITY, intrinsics: *lens, lag_s: 0.0 };
-    adjust(points, &shots, Estimate { cameras: vec![camera], boards }, Free { lens: model, lags: false })
+    let start = Estimate { cameras: vec![camera], boards, bend_m: [0.0; 3] };
+    adjust(points, &shots, start, Free { lens: model, ..Free::default() })
 }

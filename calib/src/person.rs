@@ -14,8 +14,9 @@ mod untangle;
 use flyrig_solve::{Convergence, RigidMotion, block_covariance, log_rotation, median, minimize_blocks};
 use flyrig_types::{Camera, Intrinsics, Isometry, Rig};
 use glam::DVec3;
+use nalgebra::SMatrix;
 
-use crate::{CalibError, projection::project};
+use crate::{CalibError, projection::project, uncertainty::pose_deviation};
 use problem::{Estimate, Known, PersonProblem, Spread};
 use rays::{Ray, nearest};
 pub use tangents::OutlineCorner;
@@ -74,6 +75,8 @@ pub struct PersonCamera {
     pub error_px: (f64, f64),
     /// Rotation, degrees, and displacement, millimetres, from the old pose.
     pub moved: (f64, f64),
+    /// Standard deviation of its direction and place, with the old calibration as a prior: degrees, millimetres.
+    pub deviation: (f64, f64),
     /// Mean displacement of the person in this camera's image caused by the change of pose, pixels.
     pub moved_px: f64,
     /// The same between solves of the first and the second half of the take; `None` if one of them fails.
@@ -143,6 +146,7 @@ pub fn calibrate_person(
                     log_rotation(now.rotation * then.rotation.inverse()).length().to_degrees(),
                     1e3 * now.inverse().translation.distance(then.inverse().translation),
                 ),
+                deviation: pose_deviation(&whole.poses[slot], &now),
                 moved_px: shift(&then, &now),
                 halves_px: halves.map(|(a, b)| shift(&a.cameras[slot], &b.cameras[slot])),
                 lag_s: (whole.estimate.lags_s[slot], whole.lag_sigma_s[slot]),
@@ -185,6 +189,8 @@ fn motions(rig: &Rig) -> Vec<RigidMotion> {
 struct Solved {
     estimate: Estimate,
     lag_sigma_s: Vec<f64>,
+    /// Covariance of each camera's pose: rotation vector, then shift, applied on the left.
+    poses: Vec<SMatrix<f64, 6, 6>>,
     /// Median reprojection error by slot, with the old calibration and now.
     error_px: Vec<(f64, f64)>,
     sigma_px: f64,
@@ -272,6 +278,7 @@ fn solve(
     let first_planes = planes_rad(&known, &estimate);
     let mut seen = Vec::new();
     let mut lag_sigma_s = vec![0.0; cameras];
+    let mut poses = Vec::new();
     for round in 0..ROUNDS {
         known.before.points.clone_from(&estimate.points);
         estimate_spread(&known, &estimate, &mut spread, round > 0);
@@ -283,6 +290,7 @@ fn solve(
         if is_last {
             seen = problem.seen().collect();
             let covariance = block_covariance(&problem, &estimate)?;
+            poses = (0..cameras).map(|slot| covariance.fixed_view::<6, 6>(6 * slot, 6 * slot).into_owned()).collect();
             for (slot, sigma) in lag_sigma_s.iter_mut().enumerate().skip(1).filter(|_| options.lags) {
                 let at = 6 * cameras + slot - 1;
                 *sigma = covariance[(at, at)].max(0.0).sqrt();
@@ -296,6 +304,7 @@ fn solve(
         planes_rad: first_planes.zip(planes_rad(&known, &estimate)),
         estimate,
         lag_sigma_s,
+        poses,
         seen,
     })
 }

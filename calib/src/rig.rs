@@ -8,8 +8,9 @@ use nalgebra::SMatrix;
 use crate::{
     Board, BoardShot, BoardView, CalibError, LensModel, Pair, Uncertainty,
     adjust::{Adjusted, adjust},
-    bundle::{Estimate, Free},
+    bundle::{Estimate, Free, bend_shares},
     start::{rig_start, rms},
+    uncertainty::pose_deviation,
 };
 
 /// Options of [`calibrate_rig`].
@@ -19,6 +20,8 @@ pub struct RigOptions {
     pub lens: Option<LensModel>,
     /// Also finds a time offset for each camera.
     pub lags: bool,
+    /// Also finds how the board is bent.
+    pub bend: bool,
     /// The first shot's board lies on the floor: it gives height 0 and the direction up.
     pub floor_first: bool,
 }
@@ -65,6 +68,8 @@ pub struct RigFit {
     pub rms_px: f64,
     /// Standard deviation of a corner's coordinate without outliers, pixels.
     pub sigma_px: f64,
+    /// Deepest place of the board's surface behind its highest, and the standard deviation, where a bend was sought; millimetres.
+    pub bend_mm: Option<(f64, f64)>,
     /// Times of the shots, nanoseconds, and their errors, pixels.
     pub shots: Vec<(i64, f64)>,
 }
@@ -103,7 +108,7 @@ pub fn calibrate_rig(
     let shots: Vec<BoardShot> = shots.iter().map(known).collect();
     let (start, pairs, shots) = rig_start(board, &shots, ids, intrinsics)?;
     let points: Vec<DVec3> = (0..board.corner_count()).map(|index| board.corner(index)).collect();
-    let free = Free { lens: options.lens, lags: options.lags };
+    let free = Free { lens: options.lens, lags: options.lags, bend: options.bend };
     let fit = adjust(&points, &shots, start, free).ok_or(CalibError::RigOpen)?;
     let halves: Vec<Option<Estimate>> =
         [0, 1].map(|half| half_solve(&points, &shots, &fit.estimate, free, half)).into();
@@ -136,6 +141,7 @@ pub fn calibrate_rig(
         pairs,
         rms_px: rms(fit.errors_px()),
         sigma_px: fit.sigma_px,
+        bend_mm: options.bend.then(|| bend_mm(&points, &fit)),
         shots: shots.iter().map(|shot| shot.nanos).zip(fit.off_px.iter().map(of_shot)).collect(),
         rig,
     })
@@ -146,7 +152,7 @@ fn half_solve(points: &[DVec3], shots: &[BoardShot], at: &Estimate, free: Free, 
     let every_second = |i: &usize| i % 2 == half;
     let part: Vec<BoardShot> = (0..shots.len()).filter(every_second).map(|i| shots[i].clone()).collect();
     let boards = (0..shots.len()).filter(every_second).map(|i| at.boards[i]).collect();
-    let start = Estimate { cameras: at.cameras.clone(), boards };
+    let start = Estimate { cameras: at.cameras.clone(), boards, bend_m: at.bend_m };
     let seen = |slot: usize| part.iter().flat_map(|shot| &shot.views).any(|view| view.camera == slot);
     if !(0..at.cameras.len()).all(seen) {
         return None;
@@ -182,7 +188,7 @@ fn camera(
         0 => SMatrix::zeros(),
         _ => covariance.fixed_view::<6, 6>(6 * (slot - 1), 6 * (slot - 1)).into_owned(),
     });
-    let deviation = covariance.map(|covariance| deviation(&covariance, &pose));
+    let deviation = covariance.map(|covariance| pose_deviation(&covariance, &pose));
     let uncertainty = covariance.map(|covariance| Uncertainty::new(&covariance, &pose, &solved.intrinsics, middle));
     let difference = |a: &RigidMotion, b: &RigidMotion| {
         let turn = log_rotation(a.rotation * b.rotation.inverse()).length().to_degrees();
@@ -194,7 +200,7 @@ fn camera(
     };
     let lag_sigma = fit.covariance.as_ref().filter(|_| free.lags && slot > 0).map_or(0.0, |covariance| {
         let others = fit.estimate.cameras.len() - 1;
-        let at = covariance.nrows() - others + slot - 1;
+        let at = covariance.nrows() - 3 * usize::from(free.bend) - others + slot - 1;
         covariance[(at, at)].max(0.0).sqrt()
     });
     RigCamera {
@@ -208,16 +214,21 @@ fn camera(
     }
 }
 
-/// Standard deviations of a camera's direction, degrees, and place, millimetres.
-fn deviation(block: &SMatrix<f64, 6, 6>, pose: &RigidMotion) -> (f64, f64) {
-    let turn = (block[(0, 0)] + block[(1, 1)] + block[(2, 2)]).max(0.0).sqrt().to_degrees();
-    // place = -Rᵀ t; lengths do not change with Rᵀ. After exp(δ) R and t + s: t + s + t × δ.
-    let mut by_step = SMatrix::<f64, 3, 6>::zeros();
-    let cross = flyrig_solve::skew(pose.translation).to_cols_array();
-    by_step.view_mut((0, 0), (3, 3)).copy_from_slice(&cross);
-    by_step.view_mut((0, 3), (3, 3)).copy_from(&SMatrix::<f64, 3, 3>::identity());
-    let place = by_step * block * by_step.transpose();
-    (turn, 1e3 * place.trace().max(0.0).sqrt())
+/// How much of a bend there is: the range of the surface's depth over the corners, and the deviation of the corner that is known worst.
+fn bend_mm(points: &[DVec3], fit: &Adjusted) -> (f64, f64) {
+    let shares = bend_shares(points);
+    let depth = |share: &[f64; 3]| fit.estimate.bend_m.iter().zip(share).map(|(bend, share)| bend * share).sum::<f64>();
+    let (least, most) =
+        shares.iter().map(depth).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), z| (a.min(z), b.max(z)));
+    let deviation = fit.covariance.as_ref().map_or(f64::INFINITY, |covariance| {
+        let block = covariance.fixed_view::<3, 3>(covariance.nrows() - 3, covariance.nrows() - 3);
+        let of = |share: &[f64; 3]| {
+            let share = nalgebra::Vector3::from(*share);
+            (share.transpose() * block * share)[(0, 0)].max(0.0).sqrt()
+        };
+        shares.iter().map(of).fold(0.0, f64::max)
+    });
+    (1e3 * (most - least), 1e3 * deviation)
 }
 
 /// Direction up in the rig's axes: off the board on the floor, or what most cameras have above.

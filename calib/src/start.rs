@@ -41,7 +41,7 @@ pub(crate) fn board_poses(board: &Board, intrinsics: &Intrinsics, view: &BoardVi
     let mut found: Vec<(f64, RigidMotion)> = Vec::new();
     for start in starts {
         let camera = SolvedCamera { camera_from_rig: RigidMotion::IDENTITY, intrinsics: *intrinsics, lag_s: 0.0 };
-        let start = Estimate { cameras: vec![camera], boards: vec![start] };
+        let start = Estimate { cameras: vec![camera], boards: vec![start], bend_m: [0.0; 3] };
         let Some(adjusted) = adjust(&points, &shots, start, Free::default()) else { continue };
         let error = rms(adjusted.errors_px());
         if error < MOST_ERROR * f64::from(intrinsics.width) {
@@ -176,7 +176,7 @@ pub(crate) fn rig_start(
             kept.push(BoardShot { nanos: shot.nanos, views });
         }
     }
-    Ok((Estimate { cameras, boards }, pairs, kept))
+    Ok((Estimate { cameras, boards, bend_m: [0.0; 3] }, pairs, kept))
 }
 
 /// Groups of cameras that links join, by name.

@@ -4,6 +4,6 @@ mod corners;
 mod photograph;
 mod rig_errors;
 
-pub use corners::{Random, pose_errors, ring, shots, view};
+pub use corners::{Random, bent_shots, pose_errors, ring, shots, view};
 pub use photograph::photograph;
 pub use rig_errors::{RigError, rig_errors};

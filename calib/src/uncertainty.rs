@@ -66,6 +66,19 @@ fn by_point_of_step(camera_from_rig: &RigidMotion, point: DVec3) -> SMatrix<f64,
     })
 }
 
+/// Standard deviations of a camera's direction, degrees, and place, millimetres, from the covariance of a step that is applied to its pose
+/// on the left.
+pub(crate) fn pose_deviation(block: &SMatrix<f64, 6, 6>, pose: &RigidMotion) -> (f64, f64) {
+    let turn = (block[(0, 0)] + block[(1, 1)] + block[(2, 2)]).max(0.0).sqrt().to_degrees();
+    // place = -Rᵀ t; lengths do not change with Rᵀ. After exp(δ) R and t + s: t + s + t × δ.
+    let mut by_step = SMatrix::<f64, 3, 6>::zeros();
+    let cross = flyrig_solve::skew(pose.translation).to_cols_array();
+    by_step.view_mut((0, 0), (3, 3)).copy_from_slice(&cross);
+    by_step.view_mut((0, 3), (3, 3)).copy_from(&SMatrix::<f64, 3, 3>::identity());
+    let place = by_step * block * by_step.transpose();
+    (turn, 1e3 * place.trace().max(0.0).sqrt())
+}
+
 /// Root of the trace of `J C Jᵀ`.
 fn deviation<const N: usize>(by_step: &SMatrix<f64, N, 6>, covariance: &SMatrix<f64, 6, 6>) -> f64 {
     (by_step * covariance * by_step.transpose()).trace().max(0.0).sqrt()

@@ -1,8 +1,8 @@
 //! Calibration from simulated corners, against the truth.
 
 use flyrig_calib::{
-    Board, BoardShot, BoardView, CalibError, LensModel, Pattern, RigOptions, calibrate_lens, calibrate_rig,
-    testing::{Random, pose_errors, ring, shots, view},
+    Board, BoardShot, BoardView, CalibError, LensModel, Pattern, RigFit, RigOptions, calibrate_lens, calibrate_rig,
+    testing::{Random, bent_shots, pose_errors, ring, shots, view},
 };
 use flyrig_solve::{PointPair, align_rigid};
 use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Lens};
@@ -42,6 +42,30 @@ fn a_rig_is_found_from_boards_and_knows_how_well() {
     }
     // Lengths of three numbers, of which two standard deviations hold more than 95 %.
     assert!(inside * 100 >= 90 * all, "{inside} of {all} within two standard deviations");
+}
+
+#[test]
+fn a_bent_board_is_found_out() {
+    let mut random = Random(11);
+    let cameras = ring(&mut random, 5);
+    let solve = |shots: &[BoardShot], bend| {
+        let options = RigOptions { bend, ..RigOptions::default() };
+        calibrate_rig(&board(), &ids(&cameras), &lenses(&cameras), shots, options).unwrap()
+    };
+    let bent = bent_shots(&mut random, (&board(), 0.004), &cameras, 60, 0.1);
+    let (flat, heeded) = (solve(&bent, false), solve(&bent, true));
+    let (mm, sigma) = heeded.bend_mm.unwrap();
+    assert!((mm - 4.0).abs() < 4.0 * sigma && sigma < 0.2, "{mm} +-{sigma}");
+    assert!((0.085..0.115).contains(&heeded.sigma_px) && flat.sigma_px > 0.15, "{} {}", heeded.sigma_px, flat.sigma_px);
+    let worst = |fit: &RigFit| {
+        let errors = pose_errors(&fit.rig.cameras, &cameras);
+        errors.into_iter().map(|(_, mm)| mm).fold(0.0, f64::max)
+    };
+    assert!(worst(&heeded) < worst(&flat), "{} {}", worst(&heeded), worst(&flat));
+    // Of a flat one nothing is claimed.
+    let plain = shots(&mut random, &board(), &cameras, 60, 0.1);
+    let (mm, sigma) = solve(&plain, true).bend_mm.unwrap();
+    assert!(mm < 5.0 * sigma, "{mm} +-{sigma}");
 }
 
 /// Views of a tilted board before a camera, as far as `reach` from the optical axis, metres.

@@ -1,9 +1,11 @@
 //! `flyrig calibrate`: boards, lenses, rigs, and files of other programs.
 
+mod advice;
 mod board;
 mod color;
 mod convert;
 mod lens;
+mod live;
 mod page;
 mod person;
 mod rig;
@@ -33,6 +35,7 @@ pub fn calibrate(action: &CalibrateAction, gpu: &dyn Fn() -> Result<GpuContext>)
         CalibrateAction::Board(args) => board::board(args),
         CalibrateAction::Lens(args) => lens::lens(args, gpu),
         CalibrateAction::Rig(args) => rig::rig(args, gpu),
+        CalibrateAction::Live(args) => live::live(args, gpu),
         CalibrateAction::Person(args) => person::person(args, gpu),
         CalibrateAction::Color(args) => color::color(args, gpu),
         CalibrateAction::Convert(args) => convert::convert(args),

@@ -180,6 +180,8 @@ pub enum CalibrateAction {
     Lens(CalibrateLensArgs),
     /// Calibrate the poses, and time offsets, of all cameras from a take in which they see the board together.
     Rig(CalibrateRigArgs),
+    /// Calibrate lenses and poses while the board is shown, with hints what to show next, in the terminal and on a local page.
+    Live(CalibrateLiveArgs),
     /// Refine poses and time offsets of calibrated cameras from one person who moves before them.
     Person(CalibratePersonArgs),
     /// Match the colours of calibrated cameras: exposure, white balance, response and vignetting, from people before them.
@@ -345,6 +347,51 @@ pub struct CalibratePersonArgs {
     /// Replace a calibration that is there.
     #[arg(long)]
     pub force: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct CalibrateLiveArgs {
+    /// A configuration (*.toml), a recording (*.mcap), a folder with images/CAM, or the videos of all cameras.
+    #[arg(required = true)]
+    pub input: Vec<PathBuf>,
+    /// The board's description, as `flyrig calibrate board` writes it.
+    #[arg(long, default_value = "board/board.toml")]
+    pub board: PathBuf,
+    /// Folder of the calibration.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Folder of `flyrig calibrate lens`, or of any calibration; the lenses are calibrated from the same boards otherwise.
+    #[arg(long)]
+    pub lenses: Option<PathBuf>,
+    /// Ends once every camera is known to this in the middle of the boards, millimetres (one standard deviation).
+    #[arg(long, default_value_t = 1.0, value_parser = parse_target_mm)]
+    pub target_mm: f64,
+    /// Address of the page; other computers and telephones reach it at 0.0.0.0:8090.
+    #[arg(long, default_value = "127.0.0.1:8090")]
+    pub listen: String,
+    /// Seconds that are looked at, at most.
+    #[arg(long, default_value_t = 1800.0, value_parser = parse_seconds)]
+    pub secs: f64,
+    /// Time from one set that is looked at to the next, milliseconds.
+    #[arg(long, default_value_t = 100.0, value_parser = parse_most_ms)]
+    pub every_ms: f64,
+    /// Frame rate of a folder.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    /// The take begins with the board on the floor, face up: it gives height 0 and the direction up.
+    #[arg(long)]
+    pub floor: bool,
+    /// Take the cameras' stamps as they are.
+    #[arg(long)]
+    pub no_offsets: bool,
+    /// Replace a calibration that is there.
+    #[arg(long)]
+    pub force: bool,
+}
+
+fn parse_target_mm(text: &str) -> Result<f64, String> {
+    let target = text.parse().ok().filter(|target| (0.01..=1000.0).contains(target));
+    target.ok_or_else(|| "expected millimetres, between 0.01 and 1000".to_owned())
 }
 
 #[derive(Debug, Args)]

@@ -1,9 +1,10 @@
 //! Health of a running rig: the metrics page, the table of cameras in the terminal, and the service manager's watchdog.
 
-mod metrics_server;
 mod metrics_text;
 mod monitor;
+mod page_server;
 mod table;
 
 pub use monitor::{Arrivals, Monitor, ended_by_itself};
+pub use page_server::PageServer;
 pub use table::effort;

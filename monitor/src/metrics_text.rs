@@ -14,6 +14,9 @@ use prometheus_client::{
 
 use crate::table;
 
+/// Media type of the text.
+pub const KIND: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+
 /// Formats a snapshot, and the state of a recording where there is one, as OpenMetrics text.
 pub fn prometheus(health: &Health, recorded: Option<&Recorded>) -> String {
     let mut registry = Registry::with_prefix("flyrig");

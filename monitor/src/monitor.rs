@@ -14,14 +14,14 @@ use flyrig_fusion::{CameraHealth, Health, STUCK_AFTER, resident_mib};
 use flyrig_gpu::GpuContext;
 use flyrig_types::CameraId;
 
-use crate::{metrics_server::MetricsServer, metrics_text, table};
+use crate::{metrics_text, page_server::PageServer, table};
 
 /// How often the health is reported.
 const EVERY: Duration = Duration::from_secs(1);
 
 /// Reports the health of a command from its first second to its last. Every loop of the command calls [`Self::look`].
 pub struct Monitor {
-    metrics: Option<MetricsServer>,
+    metrics: Option<PageServer>,
     show_table: bool,
     looked: Option<Instant>,
     watchdog: Watchdog,
@@ -38,7 +38,11 @@ impl Monitor {
     /// # Errors
     /// Names the address when it cannot be listened on.
     pub fn start(listen: &str, show_table: bool) -> Result<Self> {
-        let metrics = if listen.is_empty() { None } else { Some(MetricsServer::start(listen)?) };
+        let metrics = if listen.is_empty() {
+            None
+        } else {
+            Some(PageServer::start("health.listen", listen, metrics_text::KIND)?)
+        };
         if let Some(metrics) = &metrics {
             eprintln!("metrics at http://{}/metrics", metrics.address());
             let health = Health { resident_mib: resident_mib(), ..Health::default() };

@@ -14,6 +14,8 @@ use crate::plot::{Line, Plot, Series};
 pub struct Report {
     /// Heading of the page.
     pub title: String,
+    /// Seconds after which browsers load the page again; `None` for a page that stays as it is.
+    pub refresh_secs: Option<u32>,
     /// Name and value pairs: adapter, commit, frame rate, counts.
     pub facts: Vec<(String, String)>,
     /// Sentences below the heading: what the page says in short.
@@ -81,6 +83,9 @@ impl Report {
             page,
             "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content=\"width=device-width\"><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
         );
+        if let Some(secs) = self.refresh_secs {
+            let _ = write!(page, "<meta http-equiv=refresh content={secs}>");
+        }
         for sentence in &self.sentences {
             let _ = write!(page, "<p>{}", escape(sentence));
         }
@@ -213,6 +218,7 @@ mod tests {
     #[test]
     fn the_page_holds_what_it_was_given_and_nothing_unescaped() {
         let report = Report {
+            refresh_secs: Some(2),
             title: "a <b>".to_owned(),
             facts: vec![("adapter".to_owned(), "x & y".to_owned())],
             curves: vec![Curve {

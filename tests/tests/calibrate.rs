@@ -90,6 +90,15 @@ fn a_printed_board_calibrates_lenses_and_rig() {
         assert!(height.abs() < 0.01, "{}: {height} m above the true height", truth.id);
     }
 
+    // The same with hints on the way, from the boards that differ.
+    let live = command("calibrate live take --fps 1 --lenses lenses --out live --floor --listen 127.0.0.1:0");
+    assert_eq!(live.code, Some(0), "{}{}", live.stdout, live.stderr);
+    assert!(live.stderr.contains("progress at http://127.0.0.1:") && live.stderr.contains("next: "), "{}", live.stderr);
+    let hinted = load_calibration(&folder.path().join("live"), &|_| None).unwrap();
+    for (a, b) in hinted.cameras.iter().zip(&found.cameras) {
+        assert!(a.position().distance(b.position()) < 0.004, "{}: {} {}", a.id, a.position(), b.position());
+    }
+
     let page = std::fs::read_to_string(folder.path().join("calibration/calibration.html")).unwrap();
     assert_eq!(page.matches("<svg").count(), 5, "from above, three images, and the boards");
     assert!(

@@ -71,6 +71,7 @@ fn worst_px(rig: &Rig, truth: &Rig) -> f64 {
 #[test]
 fn cameras_that_are_a_degree_off_and_late_are_found() {
     let lags = [0.0, 0.053, -0.031, 0.012];
+    let mut ratios = Vec::new();
     for (seed, with_outlines, most_px, most_s) in [(5, false, 1.5, 0.006), (6, true, 1.0, 0.004), (7, true, 1.0, 0.004)]
     {
         let (truth, believed, tracks) = scene(seed, 4, 1.0, &lags, with_outlines);
@@ -82,9 +83,18 @@ fn cameras_that_are_a_degree_off_and_late_are_found() {
             println!("offset {:.1} ms, in truth {:.1}", 1e3 * camera.lag_s.0, 1e3 * lag);
             assert!((camera.lag_s.0 - lag).abs() < most_s, "seed {seed}: {camera:?} {lag}");
         }
+        for ((found, truth), camera) in motions(&fit.rig).iter().zip(motions(&truth)).zip(&fit.cameras) {
+            let turn = log_rotation(found.rotation * truth.rotation.inverse()).length().to_degrees();
+            let place = 1e3 * found.inverse().translation.distance(truth.inverse().translation);
+            println!("off by {turn:.3} degrees and {place:.1} mm, deviations {:?}", camera.deviation);
+            ratios.extend([turn / camera.deviation.0, place / camera.deviation.1]);
+        }
         // The world stays where it was: cameras move by about what they were off.
         assert!(fit.cameras.iter().all(|camera| camera.moved.1 < 60.0), "{:?}", fit.cameras);
     }
+    // Standard deviations are neither far too small nor far too large.
+    let mean = (ratios.iter().map(|ratio| ratio * ratio).sum::<f64>() / ratios.len() as f64).sqrt();
+    assert!((0.25..2.0).contains(&mean) && ratios.iter().all(|ratio| *ratio < 4.0), "{mean}: {ratios:?}");
 }
 
 #[test]

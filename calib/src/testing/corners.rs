@@ -73,6 +73,18 @@ pub fn view(
     world_from_board: &Isometry,
     noise_px: f64,
 ) -> Option<BoardView> {
+    bent_view(random, (board, 0.0), camera, slot, world_from_board, noise_px)
+}
+
+/// The same for a board whose left and right edges lie so many metres behind its middle, on a parabola.
+fn bent_view(
+    random: &mut Random,
+    (board, bend_m): (&Board, f64),
+    camera: &Camera,
+    slot: usize,
+    world_from_board: &Isometry,
+    noise_px: f64,
+) -> Option<BoardView> {
     let normal = world_from_board.rotation * DVec3::Z;
     let sight = world_from_board.transform_point(board.middle()) - camera.position();
     if normal.dot(sight.normalize()) < 0.25 {
@@ -81,7 +93,9 @@ pub fn view(
     let inside = |p: DVec2| p.x > 5.0 && p.y > 5.0 && p.x < f64::from(SIZE[0]) - 6.0 && p.y < f64::from(SIZE[1]) - 6.0;
     let corners: Vec<SeenCorner> = (0..board.corner_count())
         .filter_map(|index| {
-            let pixel = camera.project(world_from_board.transform_point(board.corner(index)))?;
+            let (corner, middle) = (board.corner(index), board.middle());
+            let bent = corner + DVec3::Z * bend_m * ((corner.x - middle.x) / middle.x).powi(2);
+            let pixel = camera.project(world_from_board.transform_point(bent))?;
             let pixel = pixel + DVec2::new(random.normal(), random.normal()) * noise_px;
             inside(pixel).then_some(SeenCorner { index, pixel })
         })
@@ -99,6 +113,18 @@ fn board_pose(random: &mut Random, board: &Board) -> Isometry {
 /// Shots of random boards that at least two cameras see.
 #[must_use]
 pub fn shots(random: &mut Random, board: &Board, cameras: &[Camera], count: usize, noise_px: f64) -> Vec<BoardShot> {
+    bent_shots(random, (board, 0.0), cameras, count, noise_px)
+}
+
+/// The same with a board whose left and right edges lie so many metres behind its middle.
+#[must_use]
+pub fn bent_shots(
+    random: &mut Random,
+    (board, bend_m): (&Board, f64),
+    cameras: &[Camera],
+    count: usize,
+    noise_px: f64,
+) -> Vec<BoardShot> {
     let mut shots = Vec::new();
     while shots.len() < count {
         let pose = board_pose(random, board);
@@ -106,7 +132,7 @@ pub fn shots(random: &mut Random, board: &Board, cameras: &[Camera], count: usiz
         let mut views: Vec<BoardView> = cameras
             .iter()
             .enumerate()
-            .filter_map(|(slot, camera)| view(random, board, camera, slot, &pose, noise_px))
+            .filter_map(|(slot, camera)| bent_view(random, (board, bend_m), camera, slot, &pose, noise_px))
             .collect();
         views.iter_mut().for_each(|view| view.nanos = nanos);
         if views.len() > 1 {

@@ -4,8 +4,10 @@ use std::fmt::Write as _;
 
 use flyrig_calib::{RigCamera, RigFit};
 use flyrig_report::{Curve, Report, Table};
-use flyrig_types::{Camera, CameraId};
+use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry};
 use glam::{DVec2, DVec3};
+
+use super::advice::Progress;
 
 /// Errors are drawn so many times as long as they are.
 const LONGER: f64 = 50.0;
@@ -15,9 +17,9 @@ const MOST_ERRORS: usize = 1500;
 const WIDTH: f64 = 380.0;
 const ABOVE: f64 = 460.0;
 /// Shared boards from which on two cameras are well linked.
-const WELL_LINKED: usize = 12;
+pub(super) const WELL_LINKED: usize = 12;
 /// Columns and rows of cells that say where a camera has seen the board.
-const CELLS: [usize; 2] = [8, 6];
+pub(super) const CELLS: [usize; 2] = [8, 6];
 
 /// Builds the page. `sentences` are those that the terminal shows.
 pub(super) fn page(ids: &[CameraId], fit: &RigFit, sentences: Vec<String>) -> Report {
@@ -106,6 +108,74 @@ fn pairs(ids: &[CameraId], fit: &RigFit) -> Table {
     }
 }
 
+/// Builds the page of a calibration under way, which browsers load again by themselves.
+pub(super) fn live(progress: &Progress<'_>, sentence: &str) -> Report {
+    let rows = progress.ids.iter().enumerate().map(|(slot, id)| {
+        let covered = format!("{:.0} %", 100.0 * progress.covered(slot));
+        vec![id.to_string(), progress.boards(slot).to_string(), covered, progress.known(slot)]
+    });
+    let head = ["camera", "boards", "image covered", "known, mm"];
+    let images = (0..progress.ids.len()).filter_map(|slot| {
+        let [width, height] = progress.sizes[slot]?;
+        let of = Camera {
+            id: progress.ids[slot].clone(),
+            intrinsics: Intrinsics::pinhole(width, height, f64::from(width)),
+            camera_from_world: Isometry::IDENTITY,
+            time_offset_nanos: 0,
+            color: ColorMatch::NONE,
+        };
+        Some(covered_image(&of, &progress.corners(slot), progress.boards(slot)))
+    });
+    Report {
+        title: sentence.to_owned(),
+        refresh_secs: Some(1),
+        tables: vec![Table { title: "Cameras".to_owned(), head: head.map(str::to_owned).into(), rows: rows.collect() }],
+        drawings: vec![
+            (format!("Boards that cameras share: orange below {WELL_LINKED}"), links(progress)),
+            ("Images: corners that were seen, cells without a corner grey".to_owned(), images.collect()),
+        ],
+        ..Report::default()
+    }
+}
+
+/// Cameras on a circle; lines join those that share boards, with their number.
+fn links(progress: &Progress<'_>) -> String {
+    let count = progress.ids.len();
+    let place = |slot: usize| {
+        let angle = std::f64::consts::TAU * slot as f64 / count as f64;
+        DVec2::splat(ABOVE / 2.0) + DVec2::new(angle.sin(), -angle.cos()) * (0.38 * ABOVE)
+    };
+    let mut svg = format!("<svg width=\"{ABOVE}\" height=\"{ABOVE}\" viewBox=\"0 0 {ABOVE} {ABOVE}\">");
+    for (a, b) in (0..count).flat_map(|a| (a + 1..count).map(move |b| (a, b))) {
+        let shared = progress.shared(a, b);
+        if shared == 0 {
+            continue;
+        }
+        let (from, to) = (place(a), place(b));
+        let middle = from.lerp(to, 0.42);
+        let color = if shared < WELL_LINKED { "#d97706" } else { "#9db8d6" };
+        let _ = write!(
+            svg,
+            "<line x1=\"{:.1}\" y1=\"{:.1}\" x2=\"{:.1}\" y2=\"{:.1}\" stroke=\"{color}\" stroke-width=\"3\"/><text x=\"{:.1}\" \
+             y=\"{:.1}\" font-size=\"12\" fill=\"#5a6675\">{shared}</text>",
+            from.x, from.y, to.x, to.y, middle.x, middle.y
+        );
+    }
+    for (slot, id) in progress.ids.iter().enumerate() {
+        let at = place(slot);
+        let _ = write!(
+            svg,
+            "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"6\" fill=\"#1c2430\"/><text x=\"{:.1}\" y=\"{:.1}\" font-size=\"14\">{}</text>",
+            at.x,
+            at.y,
+            at.x + 9.0,
+            at.y - 9.0,
+            escape(id)
+        );
+    }
+    svg + "</svg>"
+}
+
 /// Cameras from above, x to the right, y up; lines join those that share boards, the thicker the more.
 fn above(ids: &[CameraId], fit: &RigFit) -> String {
     let places: Vec<DVec2> = fit.rig.cameras.iter().map(|camera| camera.position().truncate()).collect();
@@ -143,8 +213,25 @@ fn above(ids: &[CameraId], fit: &RigFit) -> String {
     svg + "</svg>"
 }
 
-/// An image with its corners and their errors.
-fn image(id: &CameraId, of: &Camera, camera: &RigCamera) -> String {
+/// An image with the corners that were seen.
+fn covered_image(of: &Camera, corners: &[DVec2], boards: usize) -> String {
+    let scale = WIDTH / f64::from(of.intrinsics.width);
+    let mut svg = cells(of, &|| corners.iter().copied());
+    for corner in corners.iter().step_by(corners.len().div_ceil(MOST_ERRORS).max(1)) {
+        let at = *corner * scale;
+        let _ = write!(svg, "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"1\" fill=\"#2563a8\"/>", at.x, at.y);
+    }
+    let below = f64::from(of.intrinsics.height) * scale + 15.0;
+    let _ = write!(
+        svg,
+        "<text x=\"2\" y=\"{below:.0}\" font-size=\"13\">camera {}: {boards} boards</text></svg>",
+        escape(&of.id)
+    );
+    svg
+}
+
+/// Begins the drawing of an image: cells without a corner are grey.
+fn cells<I: Iterator<Item = DVec2>>(of: &Camera, corners: &dyn Fn() -> I) -> String {
     let [width, height] = of.size().map(f64::from);
     let scale = WIDTH / width;
     let mut svg = format!(
@@ -154,7 +241,7 @@ fn image(id: &CameraId, of: &Camera, camera: &RigCamera) -> String {
     );
     let seen = |column: usize, row: usize| {
         let cell = |pixel: DVec2| pixel / DVec2::new(width, height) * DVec2::new(CELLS[0] as f64, CELLS[1] as f64);
-        camera.corners.iter().any(|corner| cell(corner.pixel).floor() == DVec2::new(column as f64, row as f64))
+        corners().any(|pixel| cell(pixel).floor() == DVec2::new(column as f64, row as f64))
     };
     let cell = DVec2::new(WIDTH / CELLS[0] as f64, height * scale / CELLS[1] as f64);
     for (column, row) in (0..CELLS[0]).flat_map(|column| (0..CELLS[1]).map(move |row| (column, row))) {
@@ -169,6 +256,14 @@ fn image(id: &CameraId, of: &Camera, camera: &RigCamera) -> String {
             );
         }
     }
+    svg
+}
+
+/// An image with its corners and their errors.
+fn image(id: &CameraId, of: &Camera, camera: &RigCamera) -> String {
+    let [width, height] = of.size().map(f64::from);
+    let scale = WIDTH / width;
+    let mut svg = cells(of, &|| camera.corners.iter().map(|corner| corner.pixel));
     let every = camera.corners.len().div_ceil(MOST_ERRORS).max(1);
     for corner in camera.corners.iter().step_by(every) {
         let (from, to) = (corner.pixel * scale, (corner.pixel + corner.off_px * LONGER) * scale);

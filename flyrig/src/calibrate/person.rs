@@ -3,7 +3,7 @@
 use anyhow::{Context as _, Result, ensure};
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_calib::{
-    OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person, save_calibration,
+    Deviation, OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person, save_calibration,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
@@ -103,7 +103,12 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
         }
     }
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    save_calibration(&args.out, &better, &[])?;
+    let deviation = |camera: &PersonCamera| {
+        let (rotation_deg, position_mm) = camera.deviation;
+        let time_offset_ms = options.lags.then_some(1e3 * camera.lag_s.1);
+        Some(Deviation { rotation_deg, position_mm, time_offset_ms })
+    };
+    save_calibration(&args.out, &better, &fit.cameras.iter().map(deviation).collect::<Vec<_>>())?;
     write_whole(&args.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(&rig, &fit))?)?;
     println!("{}: {}", args.out.display(), FILES.join(", "));
     Ok(())
@@ -155,16 +160,25 @@ fn look_through(
 
 fn print(rig: &Rig, tracks: &PersonTracks, fit: &PersonFit) {
     println!(
-        "{:<14} {:>6} {:>16} {:>18} {:>9} {:>10} {:>16} {:>10}",
-        "camera", "images", "error px", "moved deg, mm", "moved px", "halves px", "offset ms", "halves ms"
+        "{:<14} {:>6} {:>16} {:>18} {:>14} {:>9} {:>10} {:>16} {:>10}",
+        "camera",
+        "images",
+        "error px",
+        "moved deg, mm",
+        "+- deg, mm",
+        "moved px",
+        "halves px",
+        "offset ms",
+        "halves ms"
     );
     for (slot, (camera, solved)) in rig.cameras.iter().zip(&fit.cameras).enumerate() {
         println!(
-            "{:<14} {:>6} {:>16} {:>18} {:>9.2} {:>10} {:>16} {:>10}",
+            "{:<14} {:>6} {:>16} {:>18} {:>14} {:>9.2} {:>10} {:>16} {:>10}",
             camera.id,
             tracks.images(slot),
             format!("{:.2} -> {:.2}", solved.error_px.0, solved.error_px.1),
             format!("{:.3} {:.1}", solved.moved.0, solved.moved.1),
+            format!("{:.3} {:.1}", solved.deviation.0, solved.deviation.1),
             solved.moved_px,
             solved.halves_px.map_or_else(|| "?".to_owned(), |px| format!("{px:.2}")),
             format!("{:.1} +-{:.1}", 1e3 * solved.lag_s.0, 1e3 * solved.lag_s.1),
@@ -231,6 +245,7 @@ fn report(rig: &Rig, fit: &PersonFit) -> serde_json::Value {
             "error_px_before": solved.error_px.0,
             "error_px": solved.error_px.1,
             "moved_deg_mm": solved.moved,
+            "deviation_deg_mm": solved.deviation,
             "moved_px": solved.moved_px,
             "halves_px": solved.halves_px,
             "offset_secs": solved.lag_s.0,

@@ -1,5 +1,7 @@
 //! `flyrig calibrate rig`: poses of all cameras from a board that they see together.
 
+use std::path::Path;
+
 use anyhow::{Context as _, Result, ensure};
 use flyrig_calib::{Board, Deviation, LensModel, RigFit, RigOptions, calibrate_rig, load_lenses, save_calibration};
 use flyrig_gpu::GpuContext;
@@ -12,15 +14,25 @@ use super::{FILES, lens, page, refuse_existing, views::Seen};
 use crate::cli::CalibrateRigArgs;
 
 /// Name of the page about the calibration.
-const PAGE: &str = "calibration.html";
+pub(super) const PAGE: &str = "calibration.html";
 /// Time offsets are kept where they lower the noise to this share.
 const OFFSETS_PAY: f64 = 0.95;
+/// A bend is kept where it lowers the noise to this share, and is this many times its standard deviation.
+const BEND_PAYS: f64 = 0.95;
+const BEND_SIGMAS: f64 = 5.0;
 /// A take with `--floor` shows the board within so many seconds.
 const FLOOR_WITHIN_SECS: f64 = 2.0;
 /// Cameras look down on a floor by less than this, degrees.
 const MOST_TILT_DEG: f64 = 70.0;
 /// Halves of the shots may differ by so many times what noise explains.
 const MOST_DISAGREEMENT: f64 = 1.5;
+
+/// Where results go, and how the rig is solved.
+pub(super) struct Target<'a> {
+    pub out: &'a Path,
+    pub floor: bool,
+    pub no_offsets: bool,
+}
 
 /// Runs the command.
 pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
@@ -29,7 +41,16 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
     refuse_existing(&args.out, &[&FILES[..], &[PAGE]].concat(), args.force)?;
     let seen = Seen::find(&args.take, &board, gpu)?;
     ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
-    if args.floor {
+    check_floor(args.floor, &seen)?;
+    let lenses = lenses(args.lenses.as_deref(), &board, &seen)?;
+    let refine = args.refine_lenses.then_some(LensModel::RadialTangential);
+    let target = Target { out: &args.out, floor: args.floor, no_offsets: args.no_offsets };
+    solve_and_write(&target, &board, &seen, &lenses, refine)
+}
+
+/// Checks that a take with `--floor` begins with the board.
+pub(super) fn check_floor(floor: bool, seen: &Seen) -> Result<()> {
+    if floor {
         let first = seen.shots.first().map_or(i64::MAX, |shot| shot.nanos);
         let late_secs = first.saturating_sub(seen.begin_nanos) as f64 * 1e-9;
         ensure!(
@@ -38,15 +59,24 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
              camera that looks down on it"
         );
     }
-    let lenses = lenses(args, &board, &seen)?;
-    let refine = args.refine_lenses.then_some(LensModel::RadialTangential);
-    let solve = |lags| {
-        let options = RigOptions { lens: refine, lags, floor_first: args.floor };
-        calibrate_rig(&board, &seen.ids, &lenses, &seen.shots, options)
+    Ok(())
+}
+
+/// Calibrates the poses, prints them, and writes all files.
+pub(super) fn solve_and_write(
+    args: &Target<'_>,
+    board: &Board,
+    seen: &Seen,
+    lenses: &[Intrinsics],
+    refine: Option<LensModel>,
+) -> Result<()> {
+    let solve = |lags, bend| {
+        let options = RigOptions { lens: refine, lags, bend, floor_first: args.floor };
+        calibrate_rig(board, &seen.ids, lenses, &seen.shots, options)
     };
-    let plain = solve(false)?;
+    let plain = solve(false, false)?;
     // Offsets only where the board moved, and where they explain something.
-    let with_offsets = if args.no_offsets { None } else { solve(true).ok() };
+    let with_offsets = if args.no_offsets { None } else { solve(true, false).ok() };
     let better = |fit: &RigFit| {
         fit.sigma_px < OFFSETS_PAY * plain.sigma_px && fit.cameras.iter().all(|camera| camera.deviation.is_some())
     };
@@ -55,6 +85,10 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
         Some(fit) => (fit, true),
         None => (plain, false),
     };
+    let is_bent = |bent: &RigFit| {
+        bent.sigma_px < BEND_PAYS * fit.sigma_px && bent.bend_mm.is_some_and(|(mm, sigma)| mm > BEND_SIGMAS * sigma)
+    };
+    let fit = solve(has_offsets, true).ok().filter(is_bent).unwrap_or(fit);
     let above =
         fit.rig.cameras.iter().map(|camera| camera.camera_from_world.rotation.inverse() * DVec3::NEG_Y).sum::<DVec3>();
     let tilt_deg = above.angle_between(fit.rig.world_up).to_degrees();
@@ -63,10 +97,10 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
         "--floor: the first board stands {tilt_deg:.0} degrees off what the cameras have above them; begin the take with the board on \
          the floor, face up"
     );
-    print(&seen, &fit, has_offsets);
-    let sentences = sentences(&seen, &fit, has_offsets.then_some(noise_before));
+    print(seen, &fit, has_offsets);
+    let sentences = sentences(seen, &fit, has_offsets.then_some(noise_before));
     sentences.iter().for_each(|sentence| println!("{sentence}"));
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    std::fs::create_dir_all(args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     let mut rig = fit.rig.clone();
     let mut deviations = Vec::new();
     for (camera, solved) in rig.cameras.iter_mut().zip(&fit.cameras) {
@@ -80,8 +114,8 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
             time_offset_ms: has_offsets.then_some(1e3 * sigma_s),
         }));
     }
-    save_calibration(&args.out, &rig, &deviations)?;
-    write_whole(&args.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(&seen, &fit))?)?;
+    save_calibration(args.out, &rig, &deviations)?;
+    write_whole(&args.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(seen, &fit))?)?;
     page::page(&seen.ids, &fit, sentences).save(&args.out.join(PAGE))?;
     println!("{}: {}, {PAGE}", args.out.display(), FILES.join(", "));
     println!(
@@ -93,8 +127,8 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
 }
 
 /// The lenses of a folder, or as calibrated from this take.
-fn lenses(args: &CalibrateRigArgs, board: &Board, seen: &Seen) -> Result<Vec<Intrinsics>> {
-    let Some(folder) = &args.lenses else {
+pub(super) fn lenses(folder: Option<&Path>, board: &Board, seen: &Seen) -> Result<Vec<Intrinsics>> {
+    let Some(folder) = folder else {
         return Ok(lens::solve(board, seen)?.into_iter().map(|(_, intrinsics)| intrinsics).collect());
     };
     let size = |id: &_| {
@@ -154,6 +188,12 @@ fn sentences(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) -> V
              applied wherever it is read"
         ));
     }
+    if let Some((mm, sigma)) = fit.bend_mm {
+        lines.push(format!(
+            "the board is bent by {mm:.2} +-{sigma:.2} mm, which the poses heed; glue it to something flat and stiff, and calibrate the lenses \
+             with it again"
+        ));
+    }
     lines.push(match fit.worst_disagreement() {
         Some((slot, ratio)) if ratio > MOST_DISAGREEMENT => format!(
             "warning: two solves from either half of the boards differ by {ratio:.1} times what noise explains, most for camera {}: \
@@ -204,6 +244,7 @@ fn report(seen: &Seen, fit: &RigFit) -> serde_json::Value {
     json!({
         "rms_px": fit.rms_px,
         "sigma_px": fit.sigma_px,
+        "bend_mm": fit.bend_mm,
         "cameras": cameras,
         "pairs": fit.pairs,
         "boards": fit.shots.iter().map(|(nanos, px)| json!({ "nanos": nanos, "rms_px": px })).collect::<Vec<_>>(),

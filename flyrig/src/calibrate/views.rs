@@ -2,6 +2,7 @@
 
 use std::{
     collections::BTreeMap,
+    ops::ControlFlow,
     time::{Duration, Instant},
 };
 
@@ -41,12 +42,24 @@ pub struct Seen {
 impl Seen {
     /// Opens a take and looks for the board; every camera must see it. `gpu` opens a graphics adapter, for simulated cameras alone.
     pub fn find(args: &TakeArgs, board: &Board, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
-        let seen = Self::look_through(take::open(&args.input, args.fps, gpu)?, board, args)?;
+        let bar = progress_bar((args.secs * 1e3) as u64, "boards, ms of the take");
+        let seen = Self::look_through(take::open(&args.input, args.fps, gpu)?, board, args, |seen, at| {
+            bar.set_position((at * 1e3) as u64);
+            bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
+            Ok(ControlFlow::Continue(()))
+        })?;
+        bar.finish_and_clear();
         seen.check(board)?;
         Ok(seen)
     }
 
-    fn look_through(take: Take, board: &Board, args: &TakeArgs) -> Result<Self> {
+    /// Looks for the board in a take until it ends; `each` is called with what was seen so far and the seconds of the take, and may end it.
+    pub fn look_through(
+        take: Take,
+        board: &Board,
+        args: &TakeArgs,
+        mut each: impl FnMut(&Self, f64) -> Result<ControlFlow<()>>,
+    ) -> Result<Self> {
         let (secs, every_nanos) = (args.secs, args.every_ms * 1e6);
         let detector = detector(board).map_err(|reason| anyhow!(reason))?;
         let ids: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
@@ -55,7 +68,6 @@ impl Seen {
             Self { ids, sizes: vec![None; count], shots: Vec::new(), images: vec![0; count], begin_nanos: 0 };
         let mut intake =
             Intake::start_opening(take.sources, InputFormat::AnySize, &SyncSettings::default(), take.pacing)?;
-        let bar = progress_bar((secs * 1e3) as u64, "boards, ms of the take");
         let started = Instant::now();
         let (mut first, mut next, mut batch) = (None, i64::MIN, Vec::new());
         while !intake.ended() && !stop::requested() {
@@ -72,7 +84,6 @@ impl Seen {
             if at > secs {
                 break;
             }
-            bar.set_position((at * 1e3) as u64);
             // A little early is the right set where stamps jitter.
             if set.master_nanos < next {
                 continue;
@@ -82,12 +93,13 @@ impl Seen {
             if batch.len() * count >= BATCH {
                 seen.look(&batch, detector.as_ref())?;
                 batch.clear();
-                bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
+                if each(&seen, at)?.is_break() {
+                    break;
+                }
             }
         }
         seen.begin_nanos = first.unwrap_or(0);
         seen.look(&batch, detector.as_ref())?;
-        bar.finish_and_clear();
         for (slot, id) in seen.ids.iter().enumerate() {
             match intake.last_error(slot) {
                 Some(error) if seen.images[slot] == 0 => {
@@ -142,7 +154,7 @@ impl Seen {
     }
 
     /// Checks that every camera saw the board at all.
-    fn check(&self, board: &Board) -> Result<()> {
+    pub fn check(&self, board: &Board) -> Result<()> {
         for (slot, id) in self.ids.iter().enumerate() {
             ensure!(
                 !self.of_camera(slot).is_empty(),

@@ -1,4 +1,4 @@
-//! The HTTP server of the metrics page.
+//! The HTTP server of one page: the metrics, or the progress of a calibration.
 
 use std::{
     convert::Infallible,
@@ -36,7 +36,7 @@ const CONNECTIONS: usize = 32;
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// Answers HTTP requests with the text published last, in one thread.
-pub struct MetricsServer {
+pub struct PageServer {
     text: Arc<Mutex<String>>,
     address: SocketAddr,
     /// Dropping it ends the thread.
@@ -44,14 +44,13 @@ pub struct MetricsServer {
     thread: Option<JoinHandle<()>>,
 }
 
-impl MetricsServer {
-    /// Listens on an address; port 0 takes a free one.
+impl PageServer {
+    /// Listens on an address; port 0 takes a free one. `option` names it in errors, `kind` is the text's media type.
     ///
     /// # Errors
     /// Names the address when it is taken.
-    pub fn start(address: &str) -> Result<Self> {
-        let listener =
-            TcpListener::bind(address).with_context(|| format!("health.listen: cannot listen on {address}"))?;
+    pub fn start(option: &str, address: &str, kind: &'static str) -> Result<Self> {
+        let listener = TcpListener::bind(address).with_context(|| format!("{option}: cannot listen on {address}"))?;
         listener.set_nonblocking(true)?;
         let address = listener.local_addr()?;
         let runtime = runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
@@ -63,13 +62,13 @@ impl MetricsServer {
             runtime.block_on(async {
                 tokio::select! {
                     _ = stopped => {}
-                    ended = serve(listener, &of_thread) => if let Err(error) = ended {
-                        tracing::error!("the metrics page has ended: {error}");
+                    ended = serve(listener, &of_thread, kind) => if let Err(error) = ended {
+                        tracing::error!("the page has ended: {error}");
                     }
                 }
             });
         };
-        let thread = Builder::new().name("metrics".to_owned()).spawn(work)?;
+        let thread = Builder::new().name("page".to_owned()).spawn(work)?;
         Ok(Self { text, address, stop: Some(stop), thread: Some(thread) })
     }
 
@@ -84,7 +83,7 @@ impl MetricsServer {
     }
 }
 
-impl Drop for MetricsServer {
+impl Drop for PageServer {
     fn drop(&mut self) {
         drop(self.stop.take());
         if let Some(thread) = self.thread.take() {
@@ -98,7 +97,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 /// Accepts clients, no more than [`CONNECTIONS`] at a time, and answers each in a task.
-async fn serve(listener: TcpListener, text: &Arc<Mutex<String>>) -> std::io::Result<()> {
+async fn serve(listener: TcpListener, text: &Arc<Mutex<String>>, kind: &'static str) -> std::io::Result<()> {
     let listener = tokio::net::TcpListener::from_std(listener)?;
     let places = Arc::new(Semaphore::new(CONNECTIONS));
     while let Ok(place) = Arc::clone(&places).acquire_owned().await {
@@ -108,7 +107,7 @@ async fn serve(listener: TcpListener, text: &Arc<Mutex<String>>) -> std::io::Res
                 tokio::spawn(async move {
                     let _place = place;
                     // A client that asks badly or reads slowly is its own loss.
-                    let _ = timeout(LONGEST, answer(client, &text)).await;
+                    let _ = timeout(LONGEST, answer(client, &text, kind)).await;
                 });
             }
             Err(_) => sleep(PAUSE).await,
@@ -118,8 +117,8 @@ async fn serve(listener: TcpListener, text: &Arc<Mutex<String>>) -> std::io::Res
 }
 
 /// Answers one request.
-async fn answer(client: TcpStream, text: &Mutex<String>) -> hyper::Result<()> {
-    let service = service_fn(async |request| Ok::<_, Infallible>(page(&request, text)));
+async fn answer(client: TcpStream, text: &Mutex<String>, kind: &'static str) -> hyper::Result<()> {
+    let service = service_fn(async |request| Ok::<_, Infallible>(page(&request, text, kind)));
     http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(PATIENCE)
@@ -129,14 +128,13 @@ async fn answer(client: TcpStream, text: &Mutex<String>) -> hyper::Result<()> {
         .await
 }
 
-fn page(request: &Request<Incoming>, text: &Mutex<String>) -> Response<String> {
+fn page(request: &Request<Incoming>, text: &Mutex<String>, kind: &'static str) -> Response<String> {
     if request.method() == Method::GET && matches!(request.uri().path(), "/metrics" | "/") {
         let mut response = Response::new(lock(text).clone());
-        let kind = HeaderValue::from_static("application/openmetrics-text; version=1.0.0; charset=utf-8");
-        response.headers_mut().insert(CONTENT_TYPE, kind);
+        response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(kind));
         return response;
     }
-    let mut response = Response::new("the metrics are at /metrics\n".to_owned());
+    let mut response = Response::new("the page is at /\n".to_owned());
     *response.status_mut() = StatusCode::NOT_FOUND;
     response
 }
@@ -150,7 +148,11 @@ mod tests {
 
     use super::*;
 
-    fn ask(server: &MetricsServer, request: &str) -> String {
+    fn start(address: &str) -> Result<PageServer> {
+        PageServer::start("health.listen", address, "text/plain")
+    }
+
+    fn ask(server: &PageServer, request: &str) -> String {
         let mut client = TcpStream::connect(server.address()).unwrap();
         client.write_all(request.as_bytes()).unwrap();
         let mut answer = String::new();
@@ -160,7 +162,7 @@ mod tests {
 
     #[test]
     fn clients_get_the_newest_text_and_bad_ones_do_no_harm() {
-        let server = MetricsServer::start("127.0.0.1:0").unwrap();
+        let server = start("127.0.0.1:0").unwrap();
         server.publish("flyrig_frames_total 1\n".to_owned());
         // Gone before the answer.
         drop(TcpStream::connect(server.address()).unwrap());
@@ -172,13 +174,13 @@ mod tests {
         assert!(ask(&server, "GET /secrets HTTP/1.1\r\n\r\n").starts_with("HTTP/1.1 404"));
         server.publish("flyrig_frames_total 2\n".to_owned());
         assert!(ask(&server, "GET / HTTP/1.0\r\n\r\n").ends_with("flyrig_frames_total 2\n"));
-        let taken = MetricsServer::start(&server.address().to_string()).err().unwrap();
+        let taken = start(&server.address().to_string()).err().unwrap();
         assert!(format!("{taken:#}").contains("health.listen: cannot listen on 127.0.0.1"), "{taken:#}");
     }
 
     #[test]
     fn a_client_that_dawdles_holds_nobody_up() {
-        let server = MetricsServer::start("127.0.0.1:0").unwrap();
+        let server = start("127.0.0.1:0").unwrap();
         server.publish("flyrig_frames_total 1\n".to_owned());
         let mut slow = TcpStream::connect(server.address()).unwrap();
         let writer = Builder::new().name("slow client".to_owned()).spawn(move || {
@@ -198,7 +200,7 @@ mod tests {
 
     #[test]
     fn clients_are_answered_while_others_keep_their_connection_open() {
-        let server = MetricsServer::start("127.0.0.1:0").unwrap();
+        let server = start("127.0.0.1:0").unwrap();
         server.publish("flyrig_frames_total 1\n".to_owned());
         let connect = || TcpStream::connect(server.address()).unwrap();
         let silent: Vec<TcpStream> = (1..CONNECTIONS).map(|_| connect()).collect();
@@ -219,7 +221,7 @@ mod tests {
 
     #[test]
     fn a_client_that_does_not_read_is_hung_up_on() {
-        let server = MetricsServer::start("127.0.0.1:0").unwrap();
+        let server = start("127.0.0.1:0").unwrap();
         // More than the buffers of both ends hold.
         let text = "flyrig_frames_total 1\n".repeat(2_000_000);
         server.publish(text.clone());
@@ -233,7 +235,7 @@ mod tests {
 
     #[test]
     fn a_request_without_end_is_refused() {
-        let server = MetricsServer::start("127.0.0.1:0").unwrap();
+        let server = start("127.0.0.1:0").unwrap();
         let mut endless = TcpStream::connect(server.address()).unwrap();
         let (mut sent, most) = (0, 64 << 20);
         while sent < most && endless.write_all(&[b'G'; 4096]).is_ok() {
@@ -244,7 +246,7 @@ mod tests {
 
     #[test]
     fn the_server_ends_with_its_owner() {
-        let server = MetricsServer::start("127.0.0.1:0").unwrap();
+        let server = start("127.0.0.1:0").unwrap();
         let (address, _silent) = (server.address(), TcpStream::connect(server.address()).unwrap());
         drop(server);
         assert!(TcpStream::connect(address).is_err());
