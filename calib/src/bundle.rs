@@ -326,8 +326,8 @@ mod tests {
             let bundle = Bundle::new(&points, &shots, &motions, cameras.len(), free, 0.7);
             for index in 0..bundle.residual_count() {
                 let error = jacobian_error(&bundle, &at, index, 1e-6).unwrap();
-                // The board's step is taken before its movement during the shot.
-                assert!(error < 1e-2, "residual {index}: {error}");
+                // The board's step is taken before its movement during the shot, a turn of up to 0.02 here.
+                assert!(error < 3e-2, "residual {index}: {error}");
             }
             let still = vec![BoardMotion::default(); shots.len()];
             let bundle = Bundle::new(&points, &shots, &still, cameras.len(), free, 0.7);

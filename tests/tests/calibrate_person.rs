@@ -1,4 +1,4 @@
-//! A rig whose calibration is a degree off is mended by a person who walks before it.
+//! A rig whose calibration is a degree off, and whose cameras differ in colour, is mended by a person who walks before it.
 #![allow(clippy::unwrap_used)] // helpers of tests
 
 use flyrig_calib::{load_calibration, testing::rig_errors};
@@ -7,7 +7,9 @@ use flyrig_tests::run;
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
 const SIM: &str = "[sim]\nseed = 511\nwidth = 256\nheight = 256\n[sim.motion]\nkind = \"walk\"\n[sim.cameras]\ncount = 4\n\
-                   [sim.calibration_error]\nrotation_deg = 1.0\ntranslation_mm = 20.0\n";
+                   [sim.calibration_error]\nrotation_deg = 1.0\ntranslation_mm = 20.0\n\
+                   [[sim.sensors]]\n[[sim.sensors]]\nexposure = 0.8\nwhite_balance = [1.2, 1.0, 0.85]\n\
+                   [[sim.sensors]]\n[[sim.sensors]]\n";
 
 #[test]
 fn somebody_who_walks_mends_the_calibration() {
@@ -29,6 +31,17 @@ fn somebody_who_walks_mends_the_calibration() {
     let (before, after) = (worst("take"), worst("better"));
     assert!(before > 4.0 && after < 0.3 * before, "{before} px before, {after} px after\n{}", person.stdout);
     assert!(person.stdout.contains("was off: the person lies"), "{}", person.stdout);
+
+    // The second camera's colours are brought to those of the others.
+    let color = command("calibrate color take --calibration better --secs 2 --out matched");
+    assert_eq!(color.code, Some(0), "{}{}", color.stdout, color.stderr);
+    let matched = load("matched");
+    for (k, light) in [0.8 * 1.2, 0.8, 0.8 * 0.85].into_iter().enumerate() {
+        let grey = |slot: usize| matched.cameras[slot].color.apply([0.5; 3], 0.0)[k];
+        let others = (grey(0) * grey(2) * grey(3)).cbrt();
+        let off = grey(1) / others * light - 1.0;
+        assert!(off.abs() < 0.06, "channel {k}: {:.1} % off\n{}", 100.0 * off, color.stdout);
+    }
 
     // What is wrong is said in one line, and nothing is written.
     let again = command("calibrate person take --out better");

@@ -26,7 +26,7 @@ const POINTS: usize = 2000;
 /// Sets from one whose colours are taken to the next.
 const EVERY: u64 = 4;
 /// Weight of the angle (Eq. 7), and nearness to the drawn surface exp(-k d), that a point needs in a view.
-const LEAST_WEIGHT: f32 = 0.3;
+const LEAST_WEIGHT: f32 = 0.1;
 const LEAST_NEARNESS: f32 = 0.85;
 /// A surface is looked at within a square that reaches this share of the image's width to each side.
 const REACH: u32 = 200;
