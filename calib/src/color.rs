@@ -26,6 +26,8 @@ const RIDGE: f64 = 1e-6;
 const FIXED: f64 = 1e3;
 /// Falloffs are sought where such a share of each camera's samples lies so far out: beyond the samples they would be guesses.
 const OUTSIDE: (f64, f64) = (0.05, 0.4);
+/// Exponents, and factors in the corners, that cameras have; others explain something else, such as shine.
+const PLAUSIBLE: (std::ops::RangeInclusive<f64>, std::ops::RangeInclusive<f64>) = (0.7..=1.4, 0.8..=3.0);
 /// A middle grey, sRGB.
 const GREY: f64 = 0.5;
 /// sRGB values up to which the code is linear (IEC 61966-2-1).
@@ -114,9 +116,11 @@ pub fn match_colors(ids: &[CameraId], points: &[ColorPoint]) -> Result<ColorFit,
     // The richest model that pays on what it was not fitted to.
     let kept_out = |model| {
         let fitted = solve(ids.len(), &halves[0], model);
-        typical(differences(&halves[1], &fitted).into_iter().map(|(_, off)| off))
+        let error = typical(differences(&halves[1], &fitted).into_iter().map(|(_, off)| off));
+        if fitted.iter().all(is_plausible) { error } else { f64::INFINITY }
     };
-    let mut best = (ColorModel::ALL[0], kept_out(ColorModel::ALL[0]));
+    let gains = ColorModel::ALL[0];
+    let mut best = (gains, kept_out(gains));
     let reaches_out = (0..ids.len()).all(|slot| {
         let of = || usable.iter().flat_map(|point| &point.samples).filter(|sample| sample.camera == slot);
         of().filter(|sample| sample.r2 > OUTSIDE.1).count() as f64 >= OUTSIDE.0 * of().count() as f64
@@ -127,8 +131,10 @@ pub fn match_colors(ids: &[CameraId], points: &[ColorPoint]) -> Result<ColorFit,
             best = (*model, error);
         }
     }
-    let model = best.0;
-    let solved = solve(ids.len(), &usable, model);
+    let (mut model, mut solved) = (best.0, solve(ids.len(), &usable, best.0));
+    if !solved.iter().all(is_plausible) {
+        (model, solved) = (gains, solve(ids.len(), &usable, gains));
+    }
     let by_half = halves.each_ref().map(|half| solve(ids.len(), half, model));
     let (before, after) = (differences(&usable, &vec![ColorMatch::NONE; ids.len()]), differences(&usable, &solved));
     let of = |slot: usize, all: &[(usize, f64)]| typical(all.iter().filter(|(of, _)| *of == slot).map(|(_, off)| *off));
@@ -143,6 +149,10 @@ pub fn match_colors(ids: &[CameraId], points: &[ColorPoint]) -> Result<ColorFit,
         difference: (of(slot, &before), of(slot, &after)),
     };
     Ok(ColorFit { cameras: (0..ids.len()).map(camera).collect(), model })
+}
+
+fn is_plausible(color: &ColorMatch) -> bool {
+    PLAUSIBLE.0.contains(&color.exponent) && PLAUSIBLE.1.contains(&(color.falloff[0] + color.falloff[1]).exp())
 }
 
 /// Keeps the samples that say something; `None` for a point that fewer than two cameras see.
