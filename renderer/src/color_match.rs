@@ -56,7 +56,7 @@ impl ColorMatcher {
 
     /// Corrects the first three bytes of every pixel of `channels` bytes: sRGB, row by row. Pixels for which `skip` is true stay.
     pub fn correct(&self, pixels: &mut [u8], channels: usize, width: usize, skip: impl Fn(&[u8]) -> bool) {
-        let has_falloff = self.of.falloff != [0.0; 2];
+        let has_falloff = self.of.falloff.iter().any(|share| share.abs() > 0.0);
         for (y, row) in pixels.chunks_exact_mut((channels * width).max(1)).enumerate() {
             for (x, pixel) in row.chunks_exact_mut(channels.max(3)).enumerate().filter(|(_, pixel)| !skip(pixel)) {
                 let corner = if has_falloff {

@@ -5,7 +5,7 @@ use flyrig_body::{ShapeParams, default_template};
 use flyrig_calib::{CameraColors, ColorFit, ColorPoint, ColorSample, match_colors, save_calibration};
 use flyrig_fusion::{
     EstimatedPerception, Observed, Origin, PerceptionSettings, SHAPE_SECS, SHAPE_SETS, Session, SessionBuilder,
-    SessionSettings, TrackState,
+    SessionSettings, Subject, TrackState,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
@@ -60,13 +60,14 @@ pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
         ..PerceptionSettings::default()
     };
     let template = default_template(&ShapeParams::default())?;
-    let mut estimated = EstimatedPerception::new(&rig, &template, &perception, &plates)?;
+    let mut settings = SessionSettings { perception, ..SessionSettings::default() };
+    settings.body.gaussians = GAUSSIANS;
+    settings.validate()?;
+    let mut estimated = EstimatedPerception::new(&rig, &template, &settings.perception, &plates)?;
     // Somebody who comes later is measured then.
     if let Err(error) = estimated.learn_shapes(&first_sets(args, &rig, open()?)?) {
         tracing::debug!(%error, "nobody in the first sets");
     }
-    let mut settings = SessionSettings { perception, ..SessionSettings::default() };
-    settings.body.gaussians = GAUSSIANS;
     let mut session = SessionBuilder::new(gpu()?, rig.clone()).settings(settings).perception(estimated).build()?;
     session.keep_observations()?;
     let points = look_through(args, &rig, &mut session, take)?;
@@ -116,7 +117,7 @@ fn look_through(
         if !sets.is_multiple_of(EVERY) {
             return Ok(());
         }
-        let people: Vec<_> = session.subjects().iter().map(|subject| subject.id()).collect();
+        let people: Vec<_> = session.subjects().iter().map(Subject::id).collect();
         for person in people {
             if session.subject(person).is_some_and(|subject| subject.watch().state() == TrackState::Steady) {
                 points.extend(seen(rig, &session.observed(person)?, sets / EVERY));

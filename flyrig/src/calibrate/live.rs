@@ -108,6 +108,9 @@ impl<'a> Watching<'a> {
             return Ok(ControlFlow::Continue(()));
         }
         self.last_look = Some(Instant::now());
+        if self.shots.is_empty() && !seen.shots.is_empty() {
+            rig::check_floor(self.args.floor, seen)?;
+        }
         different(&seen.shots, self.looked_at, &seen.sizes, &mut self.shots);
         self.looked_at = seen.shots.len();
         if let Some(done) = self.solving.take_if(|solving| solving.is_finished()) {

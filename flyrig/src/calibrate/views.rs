@@ -80,6 +80,7 @@ impl Seen {
                 continue;
             };
             let from = *first.get_or_insert(set.master_nanos);
+            seen.begin_nanos = from;
             let at = set.master_nanos.saturating_sub(from) as f64 * 1e-9;
             if at > secs {
                 break;
@@ -98,7 +99,6 @@ impl Seen {
                 }
             }
         }
-        seen.begin_nanos = first.unwrap_or(0);
         seen.look(&batch, detector.as_ref())?;
         for (slot, id) in seen.ids.iter().enumerate() {
             match intake.last_error(slot) {
