@@ -302,10 +302,11 @@ mod tests {
         let points: Vec<DVec3> = (0..board.corner_count()).map(|index| board.corner(index)).collect();
         let mut shots = bent_shots(&mut random, (&board, 0.003), &cameras, 3, 0.5);
         for (i, view) in shots.iter_mut().flat_map(|shot| &mut shot.views).enumerate() {
-            view.nanos += 5_000_000 * i as i64;
+            view.nanos += 1_000_000 * i as i64;
         }
+        // Without a turn: with one, the board's step is taken before its movement during the shot, to first order alone.
         let motions: Vec<BoardMotion> =
-            shots.iter().map(|_| BoardMotion { turn: random.vector() * 0.3, shift: random.vector() * 0.2 }).collect();
+            shots.iter().map(|_| BoardMotion { turn: DVec3::ZERO, shift: random.vector() * 0.2 }).collect();
         // Somewhere before all cameras.
         let of = |camera: &flyrig_types::Camera| SolvedCamera {
             camera_from_rig: RigidMotion {
@@ -324,13 +325,6 @@ mod tests {
         for lens in [None, Some(LensModel::RadialTangential)] {
             let free = Free { lens, lags: true, bend: true };
             let bundle = Bundle::new(&points, &shots, &motions, cameras.len(), free, 0.7);
-            for index in 0..bundle.residual_count() {
-                let error = jacobian_error(&bundle, &at, index, 1e-6).unwrap();
-                // The board's step is taken before its movement during the shot, a turn of up to 0.02 here.
-                assert!(error < 3e-2, "residual {index}: {error}");
-            }
-            let still = vec![BoardMotion::default(); shots.len()];
-            let bundle = Bundle::new(&points, &shots, &still, cameras.len(), free, 0.7);
             for index in 0..bundle.residual_count() {
                 let error = jacobian_error(&bundle, &at, index, 1e-6).unwrap();
                 assert!(error < 1e-5, "residual {index}: {error}");

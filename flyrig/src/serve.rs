@@ -5,12 +5,24 @@ use std::time::Duration;
 use anyhow::Result;
 use flyrig_report::stop;
 use flyrig_transport::TransportConfig;
-use flyrig_web::WebServer;
+use flyrig_web::{WebConfig, WebServer};
 
 use crate::cli::ServeArgs;
 
 /// How often Ctrl-C is looked at.
 const TURN: Duration = Duration::from_millis(100);
+
+/// Prints how browsers recognise a certificate that nobody else vouches for.
+pub fn tell_fingerprint(command: &str, server: &WebServer, config: &WebConfig) {
+    let Some(fingerprint) = server.fingerprint() else { return };
+    eprintln!("{command}: SHA-256 of the certificate: {fingerprint}");
+    if config.certificate.as_os_str().is_empty() {
+        eprintln!(
+            "{command}: browsers warn of a certificate that signs itself; compare its SHA-256. It is new in each run: with --certificate and --key \
+             ([web] certificate, key) it is kept in these files, and so is one that a browser trusts"
+        );
+    }
+}
 
 /// Runs the command.
 pub fn serve(args: &ServeArgs) -> Result<()> {
@@ -18,6 +30,7 @@ pub fn serve(args: &ServeArgs) -> Result<()> {
     let transport = TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) };
     let server = WebServer::start(&args.web, transport)?;
     eprintln!("serve: rig '{}' at {}; open {} in a browser (Ctrl-C ends)", args.rig, args.connect, server.link());
+    tell_fingerprint("serve", &server, &args.web);
     let mut browsers = 0;
     while !stop::requested() {
         std::thread::sleep(TURN);

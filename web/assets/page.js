@@ -63,7 +63,7 @@ function take(buffer) {
 }
 
 function connect() {
-  const socket = new WebSocket(`ws://${location.host}/stream`);
+  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/stream`);
   socket.binaryType = "arraybuffer";
   socket.onopen = () => { linkTrouble = ""; socket.send(location.hash.slice(1)); };
   socket.onmessage = event => take(event.data);

@@ -1,8 +1,11 @@
 //! Settings of the page's server.
 
-use std::net::SocketAddr;
+use std::{net::SocketAddr, path::PathBuf};
 
-use clap::Args;
+use clap::{
+    Args,
+    builder::{OsStringValueParser, TypedValueParser as _},
+};
 use serde::{Deserialize, Serialize};
 
 use crate::WebError;
@@ -17,9 +20,18 @@ pub struct WebConfig {
     /// Address of the page; port 0 takes a free one.
     #[arg(long, default_value = "127.0.0.1:8080", value_parser = checked_address)]
     pub listen: String,
-    /// Listen where other computers reach the page, without encryption; who watches needs the link with its token.
+    /// Listen where other computers reach the page without encryption (HTTPS); who watches needs the link with its token all the same.
     #[arg(long)]
     pub insecure: bool,
+    /// Certificate of the page, PEM, in place of one for this run; it is made together with its key where both files are missing.
+    // The parser of paths refuses an empty default.
+    #[arg(long, value_name = "FILE", default_value = "", hide_default_value = true,
+        value_parser = OsStringValueParser::new().map(PathBuf::from))]
+    pub certificate: PathBuf,
+    /// Private key of the certificate, PEM.
+    #[arg(long, value_name = "FILE", default_value = "", hide_default_value = true,
+        value_parser = OsStringValueParser::new().map(PathBuf::from))]
+    pub key: PathBuf,
     /// Name by which browsers reach this computer, besides its addresses and localhost; may be repeated.
     #[arg(long = "name", value_name = "NAME")]
     pub names: Vec<String>,
@@ -31,7 +43,14 @@ pub struct WebConfig {
 impl Default for WebConfig {
     /// Listens nowhere.
     fn default() -> Self {
-        Self { listen: String::new(), insecure: false, names: Vec::new(), max_browsers: 32 }
+        Self {
+            listen: String::new(),
+            insecure: false,
+            certificate: PathBuf::new(),
+            key: PathBuf::new(),
+            names: Vec::new(),
+            max_browsers: 32,
+        }
     }
 }
 

@@ -1,6 +1,6 @@
 //! Errors of the web page's server.
 
-use std::net::SocketAddr;
+use std::{net::SocketAddr, path::PathBuf};
 
 /// Why no page is served.
 #[derive(Debug, thiserror::Error)]
@@ -8,12 +8,14 @@ pub enum WebError {
     /// A setting is not valid.
     #[error("{0}")]
     Config(String),
-    /// The address is no loopback address.
-    #[error(
-        "web: {0} can be reached from other computers, and nothing is encrypted yet; listen on 127.0.0.1, forward the port (ssh -L \
-         {port}:127.0.0.1:{port} HOST), or pass --insecure (web.insecure = true) in a network that you trust", port = .0.port()
-    )]
-    NotLoopback(SocketAddr),
+    /// A certificate or a key cannot be used.
+    #[error("{}: {problem}", file.display())]
+    Certificate {
+        /// Which file.
+        file: PathBuf,
+        /// What is wrong, and the fix.
+        problem: String,
+    },
     /// The address cannot be listened on.
     #[error("web: cannot listen on {address}: {problem}; free the port or choose another one")]
     Listen {

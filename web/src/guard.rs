@@ -41,8 +41,8 @@ impl Token {
 /// Checks the names in a request's headers; the error is shown to the one who asked.
 ///
 /// A page of another site cannot read what this server answers, but it could open a WebSocket, or make a name of its own point to
-/// this address. So the host must be an address, `localhost` or a name that was given, and the origin must be that host.
-pub(crate) fn check_names(headers: &HeaderMap, names: &[String]) -> Result<(), String> {
+/// this address. So the host must be an address, `localhost` or a name that was given, and the origin must be that host with the server's own scheme.
+pub(crate) fn check_names(headers: &HeaderMap, scheme: &str, names: &[String]) -> Result<(), String> {
     let text = |value: &HeaderValue| value.to_str().map(str::to_owned).unwrap_or_default();
     let host = headers.get(HOST).map(text).unwrap_or_default();
     let name = host_name(&host);
@@ -56,7 +56,7 @@ pub(crate) fn check_names(headers: &HeaderMap, names: &[String]) -> Result<(), S
     }
     match headers.get(ORIGIN).map(text) {
         None => Ok(()),
-        Some(origin) if origin.eq_ignore_ascii_case(&format!("http://{host}")) => Ok(()),
+        Some(origin) if origin.eq_ignore_ascii_case(&format!("{scheme}://{host}")) => Ok(()),
         Some(origin) => Err(format!("pages of {} may not watch\n", printable(&origin))),
     }
 }
@@ -87,7 +87,7 @@ mod tests {
             if !origin.is_empty() {
                 headers.insert(ORIGIN, origin.parse().unwrap());
             }
-            check_names(&headers, &["rig.local".to_owned()])
+            check_names(&headers, "http", &["rig.local".to_owned()])
         };
         for (host, origin) in [
             ("127.0.0.1:8080", ""),
@@ -111,7 +111,12 @@ mod tests {
         ] {
             assert!(check(host, origin).is_err(), "{host} {origin}");
         }
-        assert!(check_names(&HeaderMap::new(), &[]).is_err());
+        assert!(check_names(&HeaderMap::new(), "http", &[]).is_err());
+        let mut headers = HeaderMap::new();
+        headers.insert(HOST, "127.0.0.1:8443".parse().unwrap());
+        headers.insert(ORIGIN, "https://127.0.0.1:8443".parse().unwrap());
+        assert_eq!(check_names(&headers, "https", &[]), Ok(()));
+        assert!(check_names(&headers, "http", &[]).is_err(), "another scheme is another site");
     }
 
     #[test]

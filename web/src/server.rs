@@ -23,11 +23,13 @@ use hyper::{
 };
 use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::{
+    io::{AsyncRead, AsyncWrite},
     net::{TcpListener, TcpSocket, TcpStream},
     runtime,
     sync::{Semaphore, oneshot},
-    time::sleep,
+    time::{sleep, timeout},
 };
+use tokio_rustls::TlsAcceptor;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
 use crate::{
@@ -35,11 +37,15 @@ use crate::{
     assets::asset,
     guard::{Token, check_names},
     hub::Hub,
-    socket, upstream,
+    socket,
+    tls::Tls,
+    upstream,
 };
 
 /// Time that a client has to ask.
 const PATIENCE: Duration = Duration::from_secs(2);
+/// First byte of a TLS connection.
+const TLS_HANDSHAKE: u8 = 22;
 /// Longest request that is read, the smallest bound that hyper takes.
 const REQUEST_BYTES: usize = 8192;
 /// Connections at the same time; the others wait in the system's queue.
@@ -52,7 +58,7 @@ const SEND_BUFFER: u32 = 64 << 10;
 const HEADERS: [(&str, &str); 5] = [
     (
         "content-security-policy",
-        "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'unsafe-inline'; connect-src 'self' ws:; img-src data:; \
+        "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'unsafe-inline'; connect-src 'self' ws: wss:; img-src data:; \
          frame-ancestors 'none'; base-uri 'none'",
     ),
     ("x-content-type-options", "nosniff"),
@@ -67,6 +73,8 @@ const HEADERS: [(&str, &str); 5] = [
 pub struct WebServer {
     address: SocketAddr,
     token: Token,
+    /// SHA-256 of the certificate; `None` without HTTPS.
+    fingerprint: Option<String>,
     hub: Arc<Hub>,
     upstream: SupervisedThread,
     ended: Arc<AtomicBool>,
@@ -79,6 +87,7 @@ pub struct WebServer {
 struct Shared {
     hub: Arc<Hub>,
     token: Token,
+    tls: Option<TlsAcceptor>,
     names: Vec<String>,
     max_browsers: usize,
 }
@@ -87,14 +96,15 @@ impl WebServer {
     /// Starts to listen. The rig may come later; it is subscribed to while browsers watch.
     ///
     /// # Errors
-    /// [`WebError`]: settings that are not valid, an address that others reach without `insecure`, or one that is taken.
+    /// [`WebError`]: settings that are not valid, a certificate that cannot be used, or an address that is taken.
     pub fn start(config: &WebConfig, transport: TransportConfig) -> Result<Self, WebError> {
         config.validate()?;
         let wanted = config.address()?;
         let is_loopback = wanted.ip().is_loopback();
-        if !is_loopback && !config.insecure {
-            return Err(WebError::NotLoopback(wanted));
-        }
+        let with_tls = !config.certificate.as_os_str().is_empty()
+            || !config.key.as_os_str().is_empty()
+            || !is_loopback && !config.insecure;
+        let tls = with_tls.then(|| Tls::new(config, wanted)).transpose()?;
         let start = |problem: String| WebError::Start(problem);
         let token =
             if is_loopback { Token::NONE } else { Token::random().map_err(|error| start(error.to_string()))? };
@@ -105,7 +115,7 @@ impl WebServer {
             listen(wanted).map_err(|problem| WebError::Listen { address: wanted, problem })?
         };
         let address = listener.local_addr().map_err(|error| start(error.to_string()))?;
-        if !is_loopback {
+        if !is_loopback && tls.is_none() {
             tracing::warn!(
                 "the web page at {address} is not encrypted: whoever can read this network can watch. Who watches needs the whole link"
             );
@@ -113,7 +123,8 @@ impl WebServer {
         let hub = Arc::<Hub>::default();
         let names = config.names.clone();
         let most = config.max_browsers;
-        let shared = Arc::new(Shared { hub: Arc::clone(&hub), token: token.clone(), names, max_browsers: most });
+        let (tls, fingerprint) = tls.map(|Tls { acceptor, fingerprint }| (acceptor, fingerprint)).unzip();
+        let shared = Arc::new(Shared { hub: Arc::clone(&hub), token: token.clone(), tls, names, max_browsers: most });
         let (stop, stopped) = oneshot::channel::<()>();
         let work = move || {
             runtime.block_on(async {
@@ -130,7 +141,7 @@ impl WebServer {
         let (fed, until) = (Arc::clone(&hub), Arc::clone(&ended));
         let upstream = SupervisedThread::start("web upstream", move || upstream::run(&transport, &fed, &until));
         let upstream = upstream.map_err(|error| start(error.to_string()))?;
-        Ok(Self { address, token, hub, upstream, ended, stop: Some(stop), thread: Some(thread) })
+        Ok(Self { address, token, fingerprint, hub, upstream, ended, stop: Some(stop), thread: Some(thread) })
     }
 
     /// Address that is listened on.
@@ -142,7 +153,14 @@ impl WebServer {
     /// Link to the page, with the token where one is needed.
     #[must_use]
     pub fn link(&self) -> String {
-        format!("http://{}/{}", self.address, self.token.fragment())
+        let scheme = if self.fingerprint.is_some() { "https" } else { "http" };
+        format!("{scheme}://{}/{}", self.address, self.token.fragment())
+    }
+
+    /// SHA-256 of the server's certificate, as browsers write it; `None` without HTTPS.
+    #[must_use]
+    pub fn fingerprint(&self) -> Option<&str> {
+        self.fingerprint.as_deref()
     }
 
     /// Number of browsers that watch.
@@ -188,7 +206,7 @@ async fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
                 tokio::spawn(async move {
                     let _place = place;
                     // A client that asks badly is its own loss.
-                    let _ = answer(client, shared).await;
+                    let _ = greet(client, shared).await;
                 });
             }
             Err(_) => sleep(PAUSE).await,
@@ -196,8 +214,41 @@ async fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
     }
 }
 
-async fn answer(client: TcpStream, shared: Arc<Shared>) -> hyper::Result<()> {
+/// Begins TLS where it is spoken.
+async fn greet(client: TcpStream, shared: Arc<Shared>) -> hyper::Result<()> {
     let _ = client.set_nodelay(true);
+    let Some(tls) = shared.tls.clone() else { return answer(client, shared).await };
+    let mut first = [0];
+    match timeout(PATIENCE, client.peek(&mut first)).await {
+        Ok(Ok(1)) if first == [TLS_HANDSHAKE] => {}
+        Ok(Ok(1)) => return refuse_http(client).await,
+        _ => return Ok(()),
+    }
+    match timeout(PATIENCE, tls.accept(client)).await {
+        Ok(Ok(client)) => answer(client, shared).await,
+        _ => Ok(()),
+    }
+}
+
+/// Answers a browser that was sent to `http://`.
+async fn refuse_http(client: TcpStream) -> hyper::Result<()> {
+    let text = "this server speaks HTTPS: write https:// before its address\n";
+    let service = service_fn(async |_: Request<Incoming>| {
+        Ok::<_, Infallible>(page(
+            StatusCode::BAD_REQUEST,
+            "text/plain; charset=utf-8",
+            Bytes::from_static(text.as_bytes()),
+        ))
+    });
+    let mut connection = http1::Builder::new();
+    connection.timer(TokioTimer::new()).header_read_timeout(PATIENCE).max_buf_size(REQUEST_BYTES).keep_alive(false);
+    connection.serve_connection(TokioIo::new(client), service).await
+}
+
+async fn answer<C>(client: C, shared: Arc<Shared>) -> hyper::Result<()>
+where
+    C: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+{
     let service = service_fn(move |request| {
         let shared = Arc::clone(&shared);
         async move { Ok::<_, Infallible>(respond(request, &shared)) }
@@ -212,7 +263,8 @@ async fn answer(client: TcpStream, shared: Arc<Shared>) -> hyper::Result<()> {
 }
 
 fn respond(mut request: Request<Incoming>, shared: &Arc<Shared>) -> Response<Full<Bytes>> {
-    if let Err(reason) = check_names(request.headers(), &shared.names) {
+    let scheme = if shared.tls.is_some() { "https" } else { "http" };
+    if let Err(reason) = check_names(request.headers(), scheme, &shared.names) {
         return page(StatusCode::FORBIDDEN, "text/plain; charset=utf-8", Bytes::from(reason));
     }
     let text =

@@ -20,6 +20,8 @@ use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::{Camera, Intrinsics, Isometry, Rig};
 use flyrig_web::{WebConfig, WebServer};
 use glam::DVec3;
+use rustls_pki_types::{CertificateDer, ServerName, pem::PemObject as _};
+use tokio_rustls::rustls::{self, ClientConfig, ClientConnection, RootCertStore, StreamOwned};
 use tokio_tungstenite::tungstenite::{self, Message, WebSocket, client::IntoClientRequest as _};
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -105,7 +107,7 @@ fn template(size: f32) -> EncodedTemplate {
 fn server(endpoint: &str, listen: &str, insecure: bool) -> WebServer {
     let transport = TransportConfig { connect: vec![endpoint.to_owned()], ..TransportConfig::subscriber(NAME) };
     let names = vec!["rig.local".to_owned()];
-    let config = WebConfig { listen: listen.to_owned(), insecure, names, max_browsers: 3 };
+    let config = WebConfig { listen: listen.to_owned(), insecure, names, max_browsers: 3, ..WebConfig::default() };
     WebServer::start(&config, transport).unwrap()
 }
 
@@ -266,8 +268,8 @@ fn other_computers_need_permission_and_a_token() {
     ] {
         assert!(refused(&config).contains(words), "{}", refused(&config));
     }
-    let refusal = refused(&listening("0.0.0.0:0"));
-    assert!(refusal.contains("--insecure") && refusal.contains("ssh -L"), "{refusal}");
+    let half = WebConfig { key: "key.pem".into(), ..listening("127.0.0.1:0") };
+    assert!(refused(&half).contains("web.certificate and web.key belong together"), "{}", refused(&half));
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let refusal = refused(&listening(&taken.local_addr().unwrap().to_string()));
     assert!(refusal.contains("cannot listen on") && refusal.contains("another"), "{refusal}");
@@ -283,6 +285,53 @@ fn other_computers_need_permission_and_a_token() {
         assert!(frame.reason.contains("token is wrong or missing"), "{frame}");
     }
     assert_eq!(next(&mut browser(address, &token)).0 % 4, 0, "a state or the rig comes first");
+}
+
+#[test]
+fn other_computers_are_served_through_https() {
+    let rig = TestRig::start("tcp/127.0.0.1:0", 0.5);
+    let folder = tempfile::tempdir().unwrap();
+    let transport = TransportConfig { connect: vec![rig.endpoint.clone()], ..TransportConfig::subscriber(NAME) };
+    let config = WebConfig {
+        listen: "0.0.0.0:0".to_owned(),
+        certificate: folder.path().join("cert.pem"),
+        key: folder.path().join("key.pem"),
+        ..WebConfig::default()
+    };
+    let server = WebServer::start(&config, transport).unwrap();
+    let address = SocketAddr::from(([127, 0, 0, 1], server.address().port()));
+    let link = server.link();
+    assert!(link.starts_with("https://") && server.fingerprint().is_some(), "{link}");
+    let token = link.split_once('#').unwrap().1.to_owned();
+    let answer = ask(address, "GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n");
+    assert!(answer.starts_with("HTTP/1.1 400") && answer.contains("write https://"), "{answer}");
+    // Whoever trusts the certificate gets in; whoever trusts others alone does not.
+    let connect = |roots: RootCertStore, origin: &str| {
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
+        let settings = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions().unwrap();
+        let settings = settings.with_root_certificates(roots).with_no_client_auth();
+        let name = ServerName::try_from("127.0.0.1").unwrap();
+        let stream = TcpStream::connect(address).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
+        let stream = StreamOwned::new(ClientConnection::new(Arc::new(settings), name).unwrap(), stream);
+        let mut request = format!("wss://{address}/stream").into_client_request().unwrap();
+        request.headers_mut().insert("Origin", origin.parse().unwrap());
+        tungstenite::client(request, stream).map_err(|error| error.to_string())
+    };
+    let mut roots = RootCertStore::empty();
+    roots.add(CertificateDer::from_pem_file(&config.certificate).unwrap()).unwrap();
+    let (mut socket, _) = connect(roots.clone(), &format!("https://{address}")).unwrap();
+    socket.send(Message::text(token.as_str())).unwrap();
+    let came = std::iter::repeat_with(|| socket.read().unwrap()).find(Message::is_binary).unwrap();
+    assert!(came.len() >= 8);
+    assert!(connect(roots, &format!("http://{address}")).is_err(), "another scheme is another site");
+    let unknown = connect(RootCertStore::empty(), &format!("https://{address}")).err().unwrap();
+    assert!(unknown.contains("UnknownIssuer"), "{unknown}");
+    // Nothing is said on these; they end by themselves.
+    let silent: Vec<TcpStream> = (0..100).filter_map(|_| TcpStream::connect(address).ok()).collect();
+    socket.send(Message::Ping(Default::default())).unwrap();
+    assert!(std::iter::repeat_with(|| socket.read().unwrap()).take(10_000).any(|message| message.is_pong()));
+    drop(silent);
 }
 
 #[test]
