@@ -216,7 +216,7 @@ fn print(ids: &[CameraId], fit: &ColorFit) {
     for (id, _) in ids.iter().zip(&fit.cameras).filter(|(_, camera)| camera.halves > MOST_HALVES) {
         println!(
             "warning: camera {id}: the two halves of the take disagree by more than {:.0} %: its exposure or white balance may be \
-             automatic (flyrig doctor), or the light changed",
+             automatic (fix them in [[source.cameras]]), or the light changed",
             100.0 * MOST_HALVES
         );
     }
