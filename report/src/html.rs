@@ -218,7 +218,6 @@ mod tests {
     #[test]
     fn the_page_holds_what_it_was_given_and_nothing_unescaped() {
         let report = Report {
-            refresh_secs: Some(2),
             title: "a <b>".to_owned(),
             facts: vec![("adapter".to_owned(), "x & y".to_owned())],
             curves: vec![Curve {
@@ -250,6 +249,8 @@ mod tests {
         assert!(html.contains("data:image/png;base64,AQID"));
         assert!(html.contains("<polyline") && !html.contains("NaN"));
         assert!(!html.contains("http"), "self-contained");
+        let live = Report { refresh_secs: Some(2), ..Report::default() }.html();
+        assert!(live.contains("<meta http-equiv=refresh content=2>"), "{live}");
     }
 
     #[test]
