@@ -57,7 +57,7 @@ pub struct ColorPoint {
     pub samples: Vec<ColorSample>,
 }
 
-/// Parts of [`ColorMatch`] that are sought besides the gains.
+/// Parts of [`ColorMatch`] that are solved for besides the gains.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ColorModel {
     /// The exponents.
@@ -94,7 +94,7 @@ pub struct CameraColors {
 pub struct ColorFit {
     /// In the order of the rig.
     pub cameras: Vec<CameraColors>,
-    /// What was sought besides the gains.
+    /// Unknowns that were solved for besides the gains.
     pub model: ColorModel,
 }
 
@@ -155,7 +155,7 @@ fn is_plausible(color: &ColorMatch) -> bool {
     PLAUSIBLE.0.contains(&color.exponent) && PLAUSIBLE.1.contains(&(color.falloff[0] + color.falloff[1]).exp())
 }
 
-/// Keeps the samples that say something; `None` for a point that fewer than two cameras see.
+/// Keeps the samples that are neither clipped nor too dark; `None` for a point that fewer than two cameras see.
 fn usable(point: &ColorPoint, cameras: usize) -> Option<ColorPoint> {
     let is_good = |s: &&ColorSample| {
         s.camera < cameras
@@ -168,7 +168,7 @@ fn usable(point: &ColorPoint, cameras: usize) -> Option<ColorPoint> {
     (samples.len() > 1).then_some(ColorPoint { instant: point.instant, samples })
 }
 
-/// Derivatives of a corrected sample's logarithm by the unknowns of its camera, and what it is where they all are 0, both linearised
+/// Derivatives of a corrected sample's logarithm by the unknowns of its camera, and its value where all unknowns are 0, both linearised
 /// around `exponent`.
 fn row(sample: &ColorSample, channel: usize, exponent: f64) -> ([f64; OF_CAMERA], f64) {
     let code = sample.srgb[channel].ln();
@@ -238,7 +238,7 @@ fn solve(cameras: usize, points: &[ColorPoint], model: ColorModel) -> Vec<ColorM
     colors
 }
 
-/// Fixes what samples leave open, and what the model does not seek.
+/// Constrains unknowns that samples leave open, and those that are not part of the model.
 fn fix(matrix: &mut DMatrix<f64>, right: &mut DVector<f64>, cameras: usize, model: ColorModel) {
     let scale = matrix.diagonal().mean().max(f64::MIN_POSITIVE);
     for k in 0..4 {

@@ -29,7 +29,7 @@ use crate::{
     config::{Config, WatchMode},
     pose_recording::PoseRecording,
     recording,
-    serve::tell_fingerprint,
+    serve::print_fingerprint,
     source::{self, FoundBy, Source},
 };
 
@@ -142,7 +142,7 @@ fn capture_people(
     let web = (!config.web.listen.is_empty()).then(|| WebServer::start(&config.web, own)).transpose()?;
     if let Some(web) = &web {
         eprintln!("run: people are shown at {}", web.link());
-        tell_fingerprint("run", web, &config.web);
+        print_fingerprint("run", web, &config.web);
     }
     let publisher = LivePublisher::start(publisher, config.output.jpeg_quality)?;
     let mut rig = LiveRig::new(session, intake, LiveViews::new(&config.output), Some(publisher))

@@ -12,8 +12,8 @@ use crate::cli::ServeArgs;
 /// How often Ctrl-C is looked at.
 const TURN: Duration = Duration::from_millis(100);
 
-/// Prints how browsers recognise a certificate that nobody else vouches for.
-pub fn tell_fingerprint(command: &str, server: &WebServer, config: &WebConfig) {
+/// Prints the fingerprint of the server's certificate, for comparison with the one that a browser shows.
+pub fn print_fingerprint(command: &str, server: &WebServer, config: &WebConfig) {
     let Some(fingerprint) = server.fingerprint() else { return };
     eprintln!("{command}: SHA-256 of the certificate: {fingerprint}");
     if config.certificate.as_os_str().is_empty() {
@@ -30,7 +30,7 @@ pub fn serve(args: &ServeArgs) -> Result<()> {
     let transport = TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) };
     let server = WebServer::start(&args.web, transport)?;
     eprintln!("serve: rig '{}' at {}; open {} in a browser (Ctrl-C ends)", args.rig, args.connect, server.link());
-    tell_fingerprint("serve", &server, &args.web);
+    print_fingerprint("serve", &server, &args.web);
     let mut browsers = 0;
     while !stop::requested() {
         std::thread::sleep(TURN);

@@ -14,7 +14,7 @@ pub struct ColorMatch {
     /// Response: 1 for a camera whose middle tones are as bright as those of the others.
     #[serde(default = "one")]
     pub exponent: f64,
-    /// Vignetting: what the corners gain.
+    /// Vignetting: brightening towards the corners.
     #[serde(default)]
     pub falloff: [f64; 2],
 }
@@ -23,7 +23,7 @@ impl ColorMatch {
     /// Leaves colours as they are.
     pub const NONE: Self = Self { gain: [1.0; 3], exponent: 1.0, falloff: [0.0; 2] };
 
-    /// Returns what is wrong with the numbers: the key, and the range that is expected.
+    /// Returns the first number that is out of range: its key, the value, and the expected range.
     #[must_use]
     pub fn fault(&self) -> Option<(&'static str, f64, &'static str)> {
         let outside = |value: f64, from: f64, to: f64| !(from..=to).contains(&value);

@@ -13,7 +13,7 @@ pub enum WebError {
     Certificate {
         /// Which file.
         file: PathBuf,
-        /// What is wrong, and the fix.
+        /// The fault and the fix.
         problem: String,
     },
     /// The address cannot be listened on.

@@ -18,7 +18,7 @@ const MOST_BYTES: u64 = 1 << 20;
 /// First and last year of a certificate of our own: nobody renews it.
 const YEARS: (i32, i32) = (2020, 2045);
 
-/// A server's side of TLS, and what browsers show of its certificate.
+/// The server's side of TLS, and the fingerprint that browsers show of its certificate.
 pub(crate) struct Tls {
     pub acceptor: TlsAcceptor,
     /// SHA-256 of the certificate, as browsers write it.
@@ -41,7 +41,9 @@ impl Tls {
                     [true, true] => {
                         let made = self_signed(config, address)?;
                         write_new(&config.key, &made.1, true)?;
-                        write_new(&config.certificate, &made.0, false)?;
+                        // A key without its certificate would be refused the next time.
+                        write_new(&config.certificate, &made.0, false)
+                            .inspect_err(|_| drop(std::fs::remove_file(&config.key)))?;
                         made
                     }
                     [is_certificate, _] => {
@@ -113,7 +115,9 @@ fn write_new(file: &Path, text: &str, is_secret: bool) -> Result<(), WebError> {
     options.write(true).create_new(true);
     #[cfg(unix)]
     std::os::unix::fs::OpenOptionsExt::mode(&mut options, if is_secret { 0o600 } else { 0o644 });
-    let written = options.open(file).and_then(|mut out| out.write_all(text.as_bytes()));
+    let written = options
+        .open(file)
+        .and_then(|mut out| out.write_all(text.as_bytes()).inspect_err(|_| drop(std::fs::remove_file(file))));
     written.map_err(|error| refused(file, &format!("cannot be written ({error})")))
 }
 
@@ -165,5 +169,8 @@ mod tests {
         std::fs::remove_file(&one.key).unwrap();
         let nowhere = config(&folder.path().join("none"));
         assert!(start(&nowhere).err().unwrap().contains("key.pem: cannot be written"));
+        // Nothing is left of half a pair.
+        let split = WebConfig { certificate: folder.path().join("none/cert.pem"), ..one };
+        assert!(start(&split).err().unwrap().contains("cert.pem: cannot be written") && !split.key.exists());
     }
 }

@@ -18,7 +18,7 @@ const PARTS: [[&str; 3]; 3] = [
     ["at the bottom left", "at the bottom", "at the bottom right"],
 ];
 
-/// What is known of a calibration under way.
+/// State of a calibration under way.
 pub struct Progress<'a> {
     pub ids: &'a [CameraId],
     /// By camera, pixels; `None` for one without an image.
@@ -33,7 +33,7 @@ pub struct Progress<'a> {
     pub target_mm: f64,
 }
 
-/// What to do next. Cameras are slots.
+/// Next step of whoever holds the board. Cameras are given by slot.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Step {
     /// A camera gives no image.
@@ -158,17 +158,17 @@ impl Progress<'_> {
         cells
     }
 
+    /// Returns the part of a camera's image in which most small cells have no corner.
     fn emptiest_part(&self, slot: usize) -> &'static str {
-        let empty = |(part, _): &(usize, usize)| {
-            let cells = self.cells(slot, [3 * CELLS[0], 3 * CELLS[1]]);
-            let of_part = |(at, _): &(usize, &usize)| {
-                let (column, row) = (at % (3 * CELLS[0]), at / (3 * CELLS[0]));
-                (column / CELLS[0], row / CELLS[1]) == (part % 3, part / 3)
-            };
-            cells.iter().enumerate().filter(of_part).filter(|(_, count)| **count == 0).count()
-        };
-        let parts = self.cells(slot, [3, 3]).into_iter().enumerate();
-        parts.max_by_key(|part| empty(part)).map_or("at the edges", |(part, _)| PARTS[part / 3][part % 3])
+        let mut empty = [[0; 3]; 3];
+        for (at, _) in
+            self.cells(slot, [3 * CELLS[0], 3 * CELLS[1]]).iter().enumerate().filter(|(_, count)| **count == 0)
+        {
+            let (column, row) = (at % (3 * CELLS[0]), at / (3 * CELLS[0]));
+            empty[row / CELLS[1]][column / CELLS[0]] += 1;
+        }
+        let parts = (0..9).map(|part| (part / 3, part % 3));
+        parts.max_by_key(|&(row, column)| empty[row][column]).map_or("at the edges", |(row, column)| PARTS[row][column])
     }
 
     /// Joins cameras by their strongest pairs; the pair at which too few boards are shared.
