@@ -7,6 +7,7 @@ use std::{
 };
 
 use anyhow::{Result, ensure};
+use flyrig_access::{KeyFile, Role};
 use flyrig_capture::{
     CameraStats, CaptureThreads, FrameStage, JpegEncoding, Pacing, PopError, SourceOpener, ThreadsConfig,
 };
@@ -14,7 +15,7 @@ use flyrig_fusion::{Health, check_threads};
 use flyrig_gpu::GpuContext;
 use flyrig_monitor::{Arrivals, Monitor, ended_by_itself};
 use flyrig_report::stop;
-use flyrig_transport::{CameraPublisher, CameraStatus};
+use flyrig_transport::{CameraPublisher, CameraStatus, TransportConfig};
 use flyrig_types::{CameraId, Frame};
 
 use crate::{
@@ -29,8 +30,9 @@ const PRINT_EVERY: Duration = Duration::from_secs(5);
 /// The last error of a camera without frames for so long is published.
 const SILENT: Duration = Duration::from_secs(1);
 
-/// Runs the command until it is stopped or every recorded camera has ended.
-pub fn capture(config: &Config, gpu: Option<&GpuContext>) -> Result<()> {
+/// Runs the command until it is stopped or every recorded camera has ended. With a key, the cameras go to the key's rig.
+pub fn capture(config: &Config, key: Option<&Path>, gpu: Option<&GpuContext>) -> Result<()> {
+    let key = key.map(|path| KeyFile::read(path, &[Role::Cameras])).transpose()?;
     let stop = stop::flag();
     let kind = config.source.kind;
     ensure!(kind != SourceKind::Network, "source.kind is \"network\": these cameras are on the network already");
@@ -40,13 +42,13 @@ pub fn capture(config: &Config, gpu: Option<&GpuContext>) -> Result<()> {
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
     let threads = start(config, sources)?;
     let clock = network::host_clock();
-    let publisher = CameraPublisher::open(&config.transport(), &cameras, clock.clone())?;
-    eprintln!(
-        "capture: {} cameras of rig '{}', listening on {} (Ctrl-C ends)",
-        cameras.len(),
-        config.rig.name,
-        publisher.endpoints().join(", ")
-    );
+    let transport = key.map_or_else(|| config.transport(), TransportConfig::with_key);
+    let publisher = CameraPublisher::open(&transport, &cameras, clock.clone())?;
+    let place = match transport.connect.as_slice() {
+        [] => format!("listening on {}", publisher.endpoints().join(", ")),
+        connect => format!("connecting to {}", connect.join(", ")),
+    };
+    eprintln!("capture: {} cameras of rig '{}', {place} (Ctrl-C ends)", cameras.len(), transport.rig);
     Monitor::ready();
     let host = host_name();
     // Stamps of what was recorded or simulated are of another time; played now, it is taken now.
@@ -90,6 +92,9 @@ pub fn capture(config: &Config, gpu: Option<&GpuContext>) -> Result<()> {
                 })
                 .collect();
             eprintln!("capture: {}", line.join("; "));
+            if let Some(trouble) = publisher.trouble() {
+                eprintln!("capture: {trouble}");
+            }
         }
     }
     let stats = threads.stats();

@@ -3,11 +3,13 @@
 use std::{collections::BTreeMap, net::SocketAddr, ops::Range, path::PathBuf};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use flyrig_access::{AccessError, DEFAULT_PORT, KeyFile, Role};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
 use flyrig_calib::Format;
 use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, Origin, PerceptionSettings, TrackingSettings};
 use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size, parse_speed};
 use flyrig_training::TrainArgs;
+use flyrig_transport::TransportConfig;
 use flyrig_types::CameraId;
 use flyrig_web::WebConfig;
 
@@ -61,6 +63,9 @@ pub enum Command {
     Capture {
         /// The TOML file; see `flyrig config print`.
         config: PathBuf,
+        /// Key of role "cameras" (`flyrig keys add`): connects to its rig, wherever that is, and listens nowhere.
+        #[arg(long)]
+        key: Option<PathBuf>,
     },
     /// Record the cameras of a configuration into an MCAP file, without tracking.
     Record(RecordArgs),
@@ -86,6 +91,11 @@ pub enum Command {
     View(ViewArgs),
     /// Serve a web page on which browsers show the people of a running rig. `flyrig run` does it too, where web.listen is set.
     Serve(ServeArgs),
+    /// Give keys to those who may connect to a rig from other computers: viewers, cameras, relays.
+    Keys {
+        #[command(subcommand)]
+        action: KeysAction,
+    },
     /// Publish a recorded person stream again, at its own pace, to try viewers without a rig.
     Play(PlayArgs),
     /// Watch a running rig: print rates and latency, write images or a video.
@@ -554,14 +564,120 @@ pub struct DemoArgs {
     pub listen: SocketAddr,
 }
 
+/// A running rig.
+#[derive(Debug, Args)]
+pub struct RigArgs {
+    /// Key file for a rig of another computer (`flyrig keys add`); a rig of this computer needs none.
+    pub key: Option<PathBuf>,
+    /// Name of the rig; that of the key otherwise, or "flyrig".
+    #[arg(long, conflicts_with = "key")]
+    pub rig: Option<String>,
+    /// Where the rig or a router listens (zenoh endpoint); the addresses of the key otherwise, or "tcp/127.0.0.1:7447".
+    #[arg(long)]
+    pub connect: Option<String>,
+}
+
+impl RigArgs {
+    /// Returns the settings of a session with that rig.
+    ///
+    /// # Errors
+    /// Those of the key file.
+    pub fn transport(&self) -> Result<TransportConfig, AccessError> {
+        let mut config = match &self.key {
+            Some(path) => {
+                let mut key = KeyFile::read(path, &[Role::Viewer, Role::Relay])?;
+                if let Some(address) = &self.connect {
+                    key.connect = vec![address.trim_start_matches("tls/").to_owned()];
+                }
+                return Ok(TransportConfig::with_key(key));
+            }
+            None => TransportConfig::subscriber(self.rig.as_deref().unwrap_or("flyrig")),
+        };
+        if let Some(endpoint) = &self.connect {
+            config.connect = vec![endpoint.clone()];
+        }
+        Ok(config)
+    }
+}
+
+#[derive(Debug, Args)]
+pub struct RingArgs {
+    /// Folder of the rig's keys; the only one in this folder otherwise.
+    #[arg(long)]
+    pub ring: Option<PathBuf>,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum KeysAction {
+    /// Make the folder of a rig's keys.
+    New {
+        /// Name of the rig, as rig.name in its configuration.
+        rig: String,
+        /// Name or address by which other computers reach this one; may be repeated.
+        #[arg(long = "host", required = true, value_name = "NAME")]
+        hosts: Vec<String>,
+        /// Port for viewers; cameras of other computers have the next.
+        #[arg(long, default_value_t = DEFAULT_PORT)]
+        port: u16,
+        /// The folder; RIG-keys otherwise.
+        #[arg(long)]
+        out: Option<PathBuf>,
+    },
+    /// Make a key: one file for its holder, who needs nothing else.
+    Add {
+        /// Name of the holder.
+        name: String,
+        /// What it may do: watch ("viewer"), send images of cameras ("cameras"), watch and pass on to others ("relay").
+        #[arg(long, default_value = "viewer", value_parser = parse_role)]
+        role: Role,
+        /// Days after which it is refused.
+        #[arg(long, default_value_t = 365)]
+        days: u64,
+        /// The file; NAME.key otherwise.
+        #[arg(long)]
+        out: Option<PathBuf>,
+        #[command(flatten)]
+        ring: RingArgs,
+    },
+    /// List everybody who was given a key.
+    List {
+        #[command(flatten)]
+        ring: RingArgs,
+    },
+    /// Make a new key of a holder; the old one is refused from then on.
+    Renew {
+        /// Name of the holder.
+        name: String,
+        /// Days after which it is refused.
+        #[arg(long, default_value_t = 365)]
+        days: u64,
+        /// The file; NAME.key otherwise.
+        #[arg(long)]
+        out: Option<PathBuf>,
+        #[command(flatten)]
+        ring: RingArgs,
+    },
+    /// Refuse a holder from now on; a running rig disconnects it within a second.
+    Revoke {
+        /// Name of the holder.
+        name: String,
+        #[command(flatten)]
+        ring: RingArgs,
+    },
+}
+
+fn parse_role(text: &str) -> Result<Role, String> {
+    let known = Role::ALL.map(Role::name);
+    Role::ALL
+        .into_iter()
+        .find(|role| role.name() == text)
+        .ok_or_else(|| format!("no such role; known: {}", known.join(", ")))
+}
+
 #[derive(Debug, Args)]
 pub struct WatchArgs {
-    /// Name of the rig.
-    #[arg(long, default_value = "flyrig")]
-    pub rig: String,
-    /// Where the rig or a router listens (zenoh endpoint).
-    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
-    pub connect: String,
+    #[command(flatten)]
+    pub rig: RigArgs,
     /// A published view; or ask for one of your own with --eye.
     #[arg(long, default_value = "main")]
     pub view: String,
@@ -607,9 +723,15 @@ pub struct PlayArgs {
     /// Name of the rig that it is published as.
     #[arg(long, default_value = "flyrig")]
     pub rig: String,
-    /// Where viewers connect (zenoh endpoint).
+    /// Where viewers of this computer connect (zenoh endpoint).
     #[arg(long, default_value = "tcp/127.0.0.1:7447")]
     pub listen: String,
+    /// Folder of the rig's keys: their holders connect from other computers.
+    #[arg(long)]
+    pub keys: Option<PathBuf>,
+    /// Listen on addresses that other computers reach without keys: in trusted networks only.
+    #[arg(long)]
+    pub insecure: bool,
     /// Begin again at the end, until Ctrl-C.
     #[arg(long)]
     pub repeat: bool,
@@ -623,12 +745,8 @@ pub struct PlayArgs {
 
 #[derive(Debug, Args)]
 pub struct ViewArgs {
-    /// Name of the rig.
-    #[arg(long, default_value = "flyrig")]
-    pub rig: String,
-    /// Where the rig or a router listens (zenoh endpoint).
-    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
-    pub connect: String,
+    #[command(flatten)]
+    pub rig: RigArgs,
     /// Show the newest frame at once; without it, motion is interpolated and shown a frame and a half later.
     #[arg(long)]
     pub lowest_latency: bool,
@@ -651,12 +769,8 @@ pub struct ViewArgs {
 
 #[derive(Debug, Args)]
 pub struct ServeArgs {
-    /// Name of the rig.
-    #[arg(long, default_value = "flyrig")]
-    pub rig: String,
-    /// Where the rig or a router listens (zenoh endpoint).
-    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
-    pub connect: String,
+    #[command(flatten)]
+    pub rig: RigArgs,
     #[command(flatten)]
     pub web: WebConfig,
 }

@@ -306,9 +306,11 @@ impl Config {
             "source.path is empty: name the folder of the data set, the folder of the calibration for real cameras, or the recording"
         );
         ensure!(
-            self.source.kind != SourceKind::Network || !self.transport.connect.is_empty(),
-            "source.kind is \"network\" but transport.connect is empty: name the computers with cameras, such as \
-             tcp/10.0.0.2:7447"
+            self.source.kind != SourceKind::Network
+                || !self.transport.connect.is_empty()
+                || !self.transport.keys.as_os_str().is_empty(),
+            "source.kind is \"network\" but neither transport.keys nor transport.connect is set: give the computers with \
+             cameras keys (`flyrig keys`), or name them, such as tcp/10.0.0.2:7447"
         );
         ensure!(
             self.source.kind == SourceKind::Sim

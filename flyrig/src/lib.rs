@@ -10,6 +10,7 @@ mod config;
 mod demo;
 mod doctor;
 mod eval;
+mod keys;
 mod live;
 mod network;
 mod plate;
@@ -70,11 +71,11 @@ fn dispatch(cli: &Cli) -> Result<()> {
             let gpu = (config.source.kind == SourceKind::Sim).then(|| open_gpu(adapter)).transpose()?;
             recording::record(&config, args, gpu.as_ref())
         }
-        Command::Capture { config } => {
+        Command::Capture { config, key } => {
             let config = Config::load_for_capture(config)?;
             let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
             let gpu = (config.source.kind == SourceKind::Sim).then(|| open_gpu(adapter)).transpose()?;
-            capture::capture(&config, gpu.as_ref())
+            capture::capture(&config, key.as_deref(), gpu.as_ref())
         }
         Command::Replay(args) => recording::replay(args),
         Command::SyncCheck(args) => sync_check::sync_check(args, &|| open_gpu(cli.adapter.as_deref())),
@@ -87,6 +88,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
             Some(path) => stream_recording::record(args, path),
             None => watch::watch(args),
         },
+        Command::Keys { action } => keys::keys(action),
         Command::Play(args) => stream_recording::play(args),
         Command::Eval(args) => eval::eval(args, &open_gpu(cli.adapter.as_deref())?),
         Command::Sim { action: SimAction::Export(args) } => {

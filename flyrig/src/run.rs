@@ -134,6 +134,9 @@ fn capture_people(
         session.rig().cameras.len(),
         publisher.endpoints().join(", ")
     );
+    if let Some(address) = publisher.gate() {
+        eprintln!("run: holders of keys connect at {address}");
+    }
     // It is a viewer like any other, beside the rig.
     let own = TransportConfig {
         connect: publisher.endpoints().first().map(|at| loopback_of(at)).into_iter().collect(),

@@ -4,7 +4,6 @@ use std::time::Duration;
 
 use anyhow::Result;
 use flyrig_report::stop;
-use flyrig_transport::TransportConfig;
 use flyrig_web::{WebConfig, WebServer};
 
 use crate::cli::ServeArgs;
@@ -27,9 +26,10 @@ pub fn print_fingerprint(command: &str, server: &WebServer, config: &WebConfig) 
 /// Runs the command.
 pub fn serve(args: &ServeArgs) -> Result<()> {
     stop::flag();
-    let transport = TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) };
+    let transport = args.rig.transport()?;
+    let (rig, connect) = (transport.rig.clone(), transport.connect.join(", "));
     let server = WebServer::start(&args.web, transport)?;
-    eprintln!("serve: rig '{}' at {}; open {} in a browser (Ctrl-C ends)", args.rig, args.connect, server.link());
+    eprintln!("serve: rig '{rig}' at {connect}; open {} in a browser (Ctrl-C ends)", server.link());
     print_fingerprint("serve", &server, &args.web);
     let mut browsers = 0;
     while !stop::requested() {

@@ -73,19 +73,27 @@ impl Writer<'_> {
 pub fn record(args: &WatchArgs, path: &Path) -> Result<()> {
     let stop = stop::flag();
     ensure!(!path.exists(), "{} is there already; name a new file", path.display());
-    let config = TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) };
+    let config = args.rig.transport()?;
     let subscriber = Subscriber::open(&config, &Interests { people: true, ..Interests::default() })?;
     let started = Instant::now();
     let is_over = || {
         stop.load(std::sync::atomic::Ordering::Relaxed)
             || args.seconds.is_some_and(|limit| started.elapsed().as_secs_f64() >= limit)
     };
-    eprintln!("watch: rig '{}' at {}, waiting for its calibration (Ctrl-C ends)", args.rig, args.connect);
+    eprintln!(
+        "watch: rig '{}' at {}, waiting for its calibration (Ctrl-C ends)",
+        config.rig,
+        config.connect.join(", ")
+    );
     let rig = loop {
         if let Some(rig) = subscriber.rig(Duration::from_millis(200))? {
             break rig;
         }
-        ensure!(!is_over(), "no rig '{}' at {}; check --rig and --connect", args.rig, args.connect);
+        if is_over() {
+            let none =
+                || format!("no rig '{}' at {}; check --rig and --connect", config.rig, config.connect.join(", "));
+            anyhow::bail!(subscriber.trouble().unwrap_or_else(none));
+        }
     };
     let ids: Vec<_> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     let recorder = recording::recorder(path, &ids, Some(&rig), &RecordSection::default(), Pacing::AsDelivered)?;
@@ -136,7 +144,12 @@ pub fn play(args: &PlayArgs) -> Result<()> {
         "{} has no person stream; record one with flyrig watch --record",
         args.recording.display()
     );
-    let config = TransportConfig { listen: vec![args.listen.clone()], ..TransportConfig::publisher(&args.rig) };
+    let config = TransportConfig {
+        listen: vec![args.listen.clone()],
+        keys: args.keys.clone().unwrap_or_default(),
+        insecure: args.insecure,
+        ..TransportConfig::publisher(&args.rig)
+    };
     let publisher = Publisher::open(&config)?;
     publisher.set_calibration(&rig)?;
     let endpoint = publisher.endpoints().join(", ");

@@ -3,7 +3,6 @@
 use anyhow::Result;
 use flyrig_gpu::GpuContext;
 use flyrig_report::{png, write_whole};
-use flyrig_transport::TransportConfig;
 use flyrig_viewer::{ViewOptions, open_window};
 
 use crate::cli::ViewArgs;
@@ -14,7 +13,7 @@ const SCREENSHOT_SECS: f64 = 60.0;
 /// Runs the command.
 pub fn view(args: &ViewArgs, gpu: &GpuContext) -> Result<()> {
     let options = ViewOptions {
-        transport: TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) },
+        transport: args.rig.transport()?,
         lowest_latency: args.lowest_latency,
         follow: args.follow,
         camera: args.camera.clone(),
@@ -22,7 +21,8 @@ pub fn view(args: &ViewArgs, gpu: &GpuContext) -> Result<()> {
         screenshot: args.screenshot.is_some(),
         seconds: args.seconds.or(args.screenshot.is_some().then_some(SCREENSHOT_SECS)),
     };
-    eprintln!("view: rig '{}' at {}; close the window to end", args.rig, args.connect);
+    let transport = &options.transport;
+    eprintln!("view: rig '{}' at {}; close the window to end", transport.rig, transport.connect.join(", "));
     let shot = open_window(options, &gpu.fastest())?;
     if let (Some(path), Some(shot)) = (&args.screenshot, shot) {
         write_whole(path, &png::encode_rgb(&shot.rgb, shot.width, shot.height)?)?;

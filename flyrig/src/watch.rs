@@ -74,11 +74,11 @@ impl Complaints {
 /// Runs the command.
 pub fn watch(args: &WatchArgs) -> Result<()> {
     let mut sink = args.out.as_deref().map(Sink::new).transpose()?;
-    let config = TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) };
+    let config = args.rig.transport()?;
     let views = if args.eye.is_some() { Views::None } else { Views::Named(vec![args.view.clone()]) };
     let subscriber = Subscriber::open(&config, &Interests { views, ..Interests::default() })?;
     let mut complaints = Complaints::default();
-    eprintln!("watch: rig '{}' at {}, waiting for images (Ctrl-C ends)", args.rig, args.connect);
+    eprintln!("watch: rig '{}' at {}, waiting for images (Ctrl-C ends)", config.rig, config.connect.join(", "));
     if let Some(eye) = args.eye {
         // The rig says which way is up.
         let rig = loop {
@@ -125,7 +125,7 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
         }
         if last_print.elapsed() >= PRINT_EVERY {
             last_print = Instant::now();
-            eprintln!("{}", line(&subscriber, args));
+            eprintln!("{}", line(&subscriber, &config, &args.view));
         }
     }
     if let Some(sink) = sink {
@@ -158,7 +158,7 @@ fn viewpoint(eye: [f64; 3], args: &WatchArgs, world_up: DVec3) -> Result<Camera>
     })
 }
 
-fn line(subscriber: &Subscriber, args: &WatchArgs) -> String {
+fn line(subscriber: &Subscriber, config: &TransportConfig, view: &str) -> String {
     let reports: Vec<String> = subscriber
         .reports()
         .into_iter()
@@ -176,8 +176,15 @@ fn line(subscriber: &Subscriber, args: &WatchArgs) -> String {
         })
         .collect();
     match (reports.is_empty(), subscriber.publishers()) {
-        (true, 0) => format!("watch: no rig '{}' at {} yet; check --rig and --connect", args.rig, args.connect),
-        (true, _) => format!("watch: rig '{}' is up, no image of view '{}' yet", args.rig, args.view),
+        (true, 0) => match subscriber.trouble() {
+            Some(trouble) => format!("watch: {trouble}"),
+            None => format!(
+                "watch: no rig '{}' at {} yet; check --rig and --connect",
+                config.rig,
+                config.connect.join(", ")
+            ),
+        },
+        (true, _) => format!("watch: rig '{}' is up, no image of view '{view}' yet", config.rig),
         (false, _) => format!("watch: {}", reports.join("; ")),
     }
 }

@@ -2,6 +2,7 @@
 
 use std::{sync::Arc, time::Duration};
 
+use flyrig_access::Probe;
 use flyrig_types::{CameraId, Frame, ThreadHealth};
 use prost::bytes::Bytes;
 use zenoh::{Wait, liveliness::LivelinessToken};
@@ -13,7 +14,7 @@ use crate::{
     drain::{Drain, DrainThread, Shared, empty_header},
     frame::MAX_FRAME_BYTES,
     keys,
-    publisher::open_session,
+    session::{self, Opened},
     topic::{Body, Topic},
     viewpoint::Leases,
 };
@@ -24,6 +25,7 @@ pub struct CameraPublisher {
     shared: Arc<Shared>,
     cameras: Vec<Lane>,
     endpoints: Vec<String>,
+    probe: Option<Probe>,
     drain: DrainThread,
     _alive: LivelinessToken,
 }
@@ -61,7 +63,7 @@ impl CameraPublisher {
             })
         };
         let cameras: Vec<Lane> = cameras.iter().map(lane).collect::<Result<_, TransportError>>()?;
-        let (session, endpoints) = open_session(config, LARGEST_QUESTION)?;
+        let Opened { session, endpoints, .. } = session::open(config, LARGEST_QUESTION, &[])?;
         let failed = |error: zenoh::Error| TransportError::session(format!("cameras of rig {rig}"), &error);
         let topics: Vec<_> = cameras.iter().flat_map(|lane| [lane.frames.clone(), lane.status.clone()]).collect();
         let (shared, woken) = Shared::new(rig, &session, &topics, Leases::new(0, Duration::ZERO, 0));
@@ -70,13 +72,21 @@ impl CameraPublisher {
         let alive = keys::key(rig, &format!("host/{host}"));
         let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
         let drain = DrainThread::start(Drain { shared: shared.clone(), session, woken })?;
-        Ok(Self { shared, cameras, endpoints, drain, _alive: alive })
+        let statuses: Vec<_> = cameras.iter().map(|lane| lane.status.clone()).collect();
+        let probe = session::probe(config, move || statuses.iter().any(|topic| topic.is_watched()))?;
+        Ok(Self { shared, cameras, endpoints, probe, drain, _alive: alive })
     }
 
     /// Endpoints it listens on, port 0 replaced by the real one.
     #[must_use]
     pub fn endpoints(&self) -> &[String] {
         &self.endpoints
+    }
+
+    /// Why the rig cannot be reached with the key; None while it can, without a key, and while that is not known.
+    #[must_use]
+    pub fn trouble(&self) -> Option<String> {
+        self.probe.as_ref().and_then(Probe::trouble)
     }
 
     /// Hands in a frame.

@@ -1,10 +1,12 @@
 //! The side that uses cameras of other computers.
 
 use std::{
+    net::SocketAddr,
     sync::{Arc, Condvar, Mutex, PoisonError},
     time::{Duration, Instant},
 };
 
+use flyrig_access::{Gate, Role};
 use flyrig_types::{CameraId, Frame, ThreadWatch};
 use zenoh::{Session, Wait, sample::Sample, sample::SampleKind};
 
@@ -16,7 +18,7 @@ use crate::{
     frame::MAX_FRAME_BYTES,
     header::MAX_ATTACHMENT,
     keys,
-    publisher::open_session,
+    session::{self, Opened},
     stats::MAX_JSON_BYTES,
     topic::lock,
 };
@@ -53,6 +55,8 @@ pub struct CameraSubscriber {
     asker: Asker,
     session: Session,
     connect: Vec<String>,
+    /// Admits computers with keys.
+    gate: Option<Gate>,
     closed: bool,
 }
 
@@ -81,7 +85,7 @@ impl CameraSubscriber {
         for camera in cameras {
             keys::check_name("camera", camera.as_str())?;
         }
-        let (session, _) = open_session(config, MAX_FRAME_BYTES + LARGEST_QUESTION)?;
+        let Opened { session, gate, .. } = session::open(config, MAX_FRAME_BYTES + LARGEST_QUESTION, &[Role::Cameras])?;
         let failed = |error: zenoh::Error| TransportError::session(format!("cameras of rig {rig}"), &error);
         let shared = Arc::new(Shared {
             rig: rig.clone(),
@@ -120,7 +124,15 @@ impl CameraSubscriber {
             lock(&taking.inbox).clock(host, asked, answer, answered);
         };
         let asker = Asker::start(session.clone(), clock, hosts, take)?;
-        Ok(Self { shared, asker, session, connect: config.connect.clone(), closed: false })
+        let mut connect = config.connect.clone();
+        connect.extend(gate.as_ref().map(|gate| format!("{}, with a key", gate.address())));
+        Ok(Self { shared, asker, session, connect, gate, closed: false })
+    }
+
+    /// Address where computers with keys connect; None without keys.
+    #[must_use]
+    pub fn gate(&self) -> Option<SocketAddr> {
+        self.gate.as_ref().map(Gate::address)
     }
 
     /// Returns a view of the thread that compares the clocks.

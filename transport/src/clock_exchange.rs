@@ -127,11 +127,14 @@ mod tests {
     use std::sync::atomic::AtomicU64;
 
     use super::*;
-    use crate::{TransportConfig, publisher::open_session};
+    use crate::{
+        TransportConfig,
+        session::{self, Opened},
+    };
 
     fn asker(hosts: impl Fn() -> Vec<Question> + Send + 'static) -> Asker {
         let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
-        let (session, _) = open_session(&config, 1 << 16).unwrap();
+        let Opened { session, .. } = session::open(&config, 1 << 16, &[]).unwrap();
         Asker::start(session, HostClock::new(|| 0), hosts, |_, _, _, _| {}).unwrap()
     }
 

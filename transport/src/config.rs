@@ -1,5 +1,8 @@
 //! Settings of a session.
 
+use std::path::PathBuf;
+
+use flyrig_access::KeyFile;
 use serde::{Deserialize, Serialize};
 use zenoh::Config;
 
@@ -12,9 +15,16 @@ pub struct TransportConfig {
     /// Name of the rig, part of every key: 1 to 64 of `A-Z a-z 0-9 _ . -`. A configuration has it elsewhere.
     #[serde(skip)]
     pub rig: String,
-    /// zenoh endpoints to listen on, such as `tcp/127.0.0.1:7447`; port 0 takes a free one.
-    /// There is no access control: listen on other addresses only inside a trusted network.
+    /// Folder of the rig's keys ([`flyrig_access::Ring`]): whoever holds one of them connects from other computers, through TLS, at the
+    /// address in that folder. Empty: nobody does.
+    pub keys: PathBuf,
+    /// Key that this side shows to the rig; it connects to the addresses in it. Not part of a configuration.
+    #[serde(skip)]
+    pub key: Option<KeyFile>,
+    /// zenoh endpoints to listen on, such as `tcp/127.0.0.1:7447`; port 0 takes a free one. Whoever reaches them may do everything.
     pub listen: Vec<String>,
+    /// Listen on addresses that other computers reach without keys: in trusted networks only.
+    pub insecure: bool,
     /// zenoh endpoints to connect to: publishers or routers; tried again until they answer.
     pub connect: Vec<String>,
     /// Find each other by UDP multicast on the local network.
@@ -50,6 +60,9 @@ impl Default for TransportConfig {
     fn default() -> Self {
         Self {
             rig: "flyrig".to_owned(),
+            keys: PathBuf::new(),
+            key: None,
+            insecure: false,
             listen: vec![DEFAULT_ENDPOINT.to_owned()],
             connect: vec![],
             multicast: false,
@@ -76,25 +89,58 @@ impl TransportConfig {
         Self { rig: rig.to_owned(), listen: vec![], connect: vec![DEFAULT_ENDPOINT.to_owned()], ..Self::default() }
     }
 
+    /// A session that shows a key to the rig that the key names.
+    #[must_use]
+    pub fn with_key(key: KeyFile) -> Self {
+        let connect = key.connect.iter().map(|address| format!("{TLS}{address}")).collect();
+        Self { rig: key.rig.clone(), listen: vec![], connect, key: Some(key), ..Self::default() }
+    }
+
+    /// Whether a ring of keys is named.
+    pub(crate) fn has_keys(&self) -> bool {
+        !self.keys.as_os_str().is_empty()
+    }
+
     /// Checks names, endpoints and limits.
     ///
     /// # Errors
     /// Names the setting.
     pub fn validate(&self) -> Result<(), TransportError> {
         keys::check_name("rig", &self.rig)?;
-        if self.listen.is_empty() && self.connect.is_empty() && !self.multicast {
+        if self.listen.is_empty() && self.connect.is_empty() && !self.multicast && !self.has_keys() {
             return Err(TransportError::config(
                 "listen, connect",
                 "a session without endpoints and without multicast meets nobody; give one, such as tcp/127.0.0.1:7447",
             ));
         }
         for endpoint in self.listen.iter().chain(&self.connect) {
-            if !endpoint.starts_with("tcp/") {
+            if !(endpoint.starts_with("tcp/") || self.key.is_some() && endpoint.starts_with(TLS)) {
                 return Err(TransportError::config(
                     format!("endpoint {endpoint:?}"),
-                    "only TCP is built in; write tcp/HOST:PORT",
+                    "write tcp/HOST:PORT; a rig with keys is reached with a key file",
                 ));
             }
+        }
+        if self.multicast && (self.has_keys() || self.key.is_some()) {
+            return Err(TransportError::config(
+                "multicast",
+                "a rig with keys is not found by multicast; set it to false",
+            ));
+        }
+        if let Some(open) = self.listen.iter().find(|endpoint| !is_loopback(endpoint)).filter(|_| !self.insecure) {
+            let fix = if self.has_keys() {
+                "leave it out: holders of keys connect at the address in transport.keys".to_owned()
+            } else {
+                format!(
+                    "give keys to those who may: `flyrig keys new {} --host NAME-OF-THIS-COMPUTER`, and transport.keys = \"{}-keys\"; or set \
+                     transport.insecure = true (--insecure) in a network that is yours alone",
+                    self.rig, self.rig
+                )
+            };
+            return Err(TransportError::config(
+                format!("listen {open:?}"),
+                format!("everybody who reaches this computer could watch the people; {fix}"),
+            ));
         }
         if !(100..=600_000).contains(&self.viewpoint_lease_millis) {
             return Err(TransportError::config(
@@ -122,11 +168,18 @@ impl TransportConfig {
     }
 
     /// The zenoh configuration that this means. `largest` is the size of the largest message that anybody may send to
-    /// this session, bytes: a connection with a larger one is ended by zenoh before the message is assembled.
-    pub(crate) fn zenoh(&self, listen: &[String], largest: usize) -> Result<Config, TransportError> {
+    /// this session, bytes: a connection with a larger one is ended by zenoh before the message is assembled. `secured` are settings
+    /// that keys need besides.
+    pub(crate) fn zenoh(
+        &self,
+        listen: &[String],
+        largest: usize,
+        secured: &[(&'static str, String)],
+    ) -> Result<Config, TransportError> {
         let list = |endpoints: &[String]| serde_json::json!(endpoints).to_string();
         let settings = [
-            ("mode", "\"peer\"".to_owned()),
+            // A client has one connection, to the first of its endpoints that answers.
+            ("mode", if self.key.is_some() { "\"client\"" } else { "\"peer\"" }.to_owned()),
             ("listen/endpoints", list(listen)),
             ("connect/endpoints", list(&self.connect)),
             ("connect/timeout_ms", "-1".to_owned()),
@@ -143,11 +196,21 @@ impl TransportConfig {
             ("transport/link/rx/max_message_size", largest.to_string()),
         ];
         let mut config = Config::default();
-        for (key, value) in settings {
-            config.insert_json5(key, &value).map_err(|error| TransportError::config(key, error.to_string()))?;
+        for (key, value) in settings.iter().chain(secured) {
+            config.insert_json5(key, value).map_err(|error| TransportError::config(*key, error.to_string()))?;
         }
         Ok(config)
     }
+}
+
+/// Beginning of endpoints of rigs with keys.
+const TLS: &str = "tls/";
+
+/// Whether only programs of this computer reach an endpoint.
+fn is_loopback(endpoint: &str) -> bool {
+    let address = endpoint.split_once('/').map_or(endpoint, |(_, address)| address);
+    let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
+    host.eq_ignore_ascii_case("localhost") || host.parse::<std::net::IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }
 
 #[cfg(test)]
@@ -158,7 +221,7 @@ mod tests {
     fn every_setting_is_known_to_zenoh() {
         for config in [TransportConfig::publisher("a"), TransportConfig::subscriber("a")] {
             config.validate().unwrap();
-            config.zenoh(&config.listen, LARGEST_QUESTION).unwrap();
+            config.zenoh(&config.listen, LARGEST_QUESTION, &[]).unwrap();
         }
     }
 
@@ -170,6 +233,24 @@ mod tests {
         assert!(refused(TransportConfig { rig: String::new(), ..good.clone() }).contains("rig"));
         assert!(refused(TransportConfig { listen: vec!["udp/1.2.3.4:5".into()], ..good.clone() }).contains("udp/"));
         assert!(refused(TransportConfig { listen: vec![], ..good.clone() }).contains("meets nobody"));
+        for open in ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/10.0.0.1:7447", "tcp/studio:7447"] {
+            let listen = vec![open.to_owned()];
+            let reason = refused(TransportConfig { listen: listen.clone(), ..good.clone() });
+            assert!(
+                reason.contains("flyrig keys new a --host") && reason.contains("transport.insecure = true"),
+                "{reason}"
+            );
+            let keys = PathBuf::from("a-keys");
+            assert!(refused(TransportConfig { listen: listen.clone(), keys, ..good.clone() }).contains("leave it out"));
+            TransportConfig { listen, insecure: true, ..good.clone() }.validate().unwrap();
+        }
+        for own in ["tcp/127.0.0.1:0", "tcp/[::1]:7447", "tcp/localhost:7447"] {
+            TransportConfig { listen: vec![own.to_owned()], ..good.clone() }.validate().unwrap();
+        }
+        let keys = PathBuf::from("a-keys");
+        assert!(refused(TransportConfig { multicast: true, keys: keys.clone(), ..good.clone() }).contains("multicast"));
+        TransportConfig { listen: vec![], keys, ..good.clone() }.validate().unwrap();
+        assert!(refused(TransportConfig { connect: vec!["tls/a:1".into()], ..good.clone() }).contains("key file"));
         assert!(refused(TransportConfig { viewpoint_lease_millis: 0, ..good.clone() }).contains("lease"));
         for inbox_bytes in [0, 1000, u64::MAX] {
             assert!(refused(TransportConfig { inbox_bytes, ..good.clone() }).contains("inbox_bytes"));

@@ -32,6 +32,7 @@
 //! - Text of other programs reaches the caller [`printable`].
 //! - A subscriber may start before the publisher, stall, die, come back; a publisher may restart.
 
+mod access_rules;
 mod calibration;
 mod camera_inbox;
 mod camera_publisher;
@@ -50,6 +51,7 @@ mod printable;
 mod publisher;
 mod renewal;
 mod report;
+mod session;
 mod splats;
 mod stats;
 mod subscriber;

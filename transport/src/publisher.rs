@@ -2,15 +2,16 @@
 
 use std::{
     collections::BTreeSet,
-    net::TcpListener,
+    net::SocketAddr,
     sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
+use flyrig_access::{Gate, Role};
 use flyrig_stream::Stamp;
 use flyrig_types::{Rig, ThreadHealth};
 use prost::bytes::Bytes;
-use zenoh::{Session, Wait, liveliness::LivelinessToken, query::Query, sample::SampleKind};
+use zenoh::{Wait, liveliness::LivelinessToken, query::Query, sample::SampleKind};
 
 use crate::{
     Header, MessageKind, RigStats, SplatState, TransportConfig, TransportError, ViewFrame, Viewpoint,
@@ -20,6 +21,7 @@ use crate::{
     keys::{self, VIEWER_PREFIX},
     people::{People, answer_template},
     printable,
+    session::{self, Opened},
     splats::MAX_PERSON_TOPICS,
     stats::{MAX_JSON_BYTES, from_json, to_json},
     topic::{Body, PublishOutcome, Topic, TopicCounts, lock},
@@ -51,6 +53,8 @@ pub struct Publisher {
     people: Arc<People>,
     stats: Arc<Topic>,
     endpoints: Vec<String>,
+    /// Admits holders of keys.
+    gate: Option<Gate>,
     drain: DrainThread,
     _alive: LivelinessToken,
 }
@@ -72,7 +76,8 @@ impl Publisher {
     pub fn open(config: &TransportConfig) -> Result<Self, TransportError> {
         config.validate()?;
         let rig = &config.rig;
-        let (session, endpoints) = open_session(config, LARGEST_QUESTION)?;
+        let Opened { session, endpoints, gate } =
+            session::open(config, LARGEST_QUESTION, &[Role::Viewer, Role::Relay])?;
         let failed = |error: zenoh::Error| TransportError::session(format!("publisher of rig {rig}"), &error);
 
         let splats = Arc::new(Topic::new("splats".to_owned(), "splats".to_owned(), MessageKind::Splats));
@@ -117,13 +122,19 @@ impl Publisher {
 
         let drain = DrainThread::start(Drain { shared: shared.clone(), session, woken })?;
         let persons = Mutex::default();
-        Ok(Self { shared, splats, persons, people, stats, endpoints, drain, _alive: alive })
+        Ok(Self { shared, splats, persons, people, stats, endpoints, gate, drain, _alive: alive })
     }
 
     /// Endpoints it listens on, port 0 replaced by the real one.
     #[must_use]
     pub fn endpoints(&self) -> &[String] {
         &self.endpoints
+    }
+
+    /// Address where holders of keys connect; None without keys.
+    #[must_use]
+    pub fn gate(&self) -> Option<SocketAddr> {
+        self.gate.as_ref().map(Gate::address)
     }
 
     /// Makes a view known so that subscribers of it are noticed before its first image.
@@ -337,34 +348,6 @@ impl Publisher {
         topics.insert(label, topic.clone());
         Ok(Some(topic))
     }
-}
-
-/// Opens a session; a port 0 is looked up first because zenoh's stable interface does not tell which it took.
-/// `largest` bytes are the most that a message to this session may have.
-pub(crate) fn open_session(config: &TransportConfig, largest: usize) -> Result<(Session, Vec<String>), TransportError> {
-    let mut attempts = 5;
-    loop {
-        attempts -= 1;
-        let endpoints: Vec<String> = config.listen.iter().map(|endpoint| with_free_port(endpoint)).collect();
-        match zenoh::open(config.zenoh(&endpoints, largest)?).wait() {
-            Ok(session) => return Ok((session, endpoints)),
-            // Somebody else was faster to take the port.
-            Err(_) if attempts > 0 && endpoints != config.listen => {}
-            Err(error) => {
-                let text = format!("{error}; is another publisher running there? Choose another listen endpoint");
-                return Err(TransportError::session(endpoints.join(", "), &text));
-            }
-        }
-    }
-}
-
-fn with_free_port(endpoint: &str) -> String {
-    let free = || {
-        let host = endpoint.strip_prefix("tcp/")?.strip_suffix(":0")?;
-        let port = TcpListener::bind((host.trim_matches(['[', ']']), 0)).ok()?.local_addr().ok()?.port();
-        Some(format!("tcp/{host}:{port}"))
-    };
-    free().unwrap_or_else(|| endpoint.to_owned())
 }
 
 /// Runs on a zenoh thread: short, no waiting.

@@ -2,6 +2,7 @@
 
 use std::{sync::Arc, time::Duration};
 
+use flyrig_access::Probe;
 use flyrig_types::{Camera, Rig};
 use prost::bytes::Bytes;
 use zenoh::{Session, Wait, liveliness::LivelinessToken, sample::SampleKind};
@@ -14,6 +15,7 @@ use crate::{
     keys::{self, VIEWER_PREFIX},
     people::{self, PersonMessage},
     renewal::Renewal,
+    session::{self, Opened},
     splats,
     view::MAX_MESSAGE_BYTES,
     viewpoint::check_camera,
@@ -65,6 +67,7 @@ pub struct Subscriber {
     id: String,
     rig: String,
     renewal: Renewal,
+    probe: Option<Probe>,
     session: Session,
     closed: bool,
     _alive: LivelinessToken,
@@ -86,8 +89,9 @@ impl Subscriber {
         let rig = &config.rig;
         let failed = |error: zenoh::Error| TransportError::session(format!("subscriber of rig {rig}"), &error);
         let largest = MAX_MESSAGE_BYTES.max(splats::MAX_BYTES) + LARGEST_QUESTION;
-        let session = zenoh::open(config.zenoh(&config.listen, largest)?).wait().map_err(failed)?;
+        let Opened { session, .. } = session::open(config, largest, &[])?;
         let id = session.zid().to_string();
+        let id = config.key.as_ref().map_or_else(|| id.clone(), |key| format!("{}.{id}", key.topic_name));
         let inbox = Arc::new(Inbox::new(format!("{VIEWER_PREFIX}{id}"), config.inbox_bytes));
 
         let mut labels = vec!["calibration/*".to_owned(), "transforms".to_owned(), format!("viewer/{id}/view")];
@@ -130,7 +134,9 @@ impl Subscriber {
         let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
         let key = keys::key(rig, &format!("viewpoint/{id}"));
         let renewal = Renewal::start(session.clone(), key, format!("{VIEWER_PREFIX}{id}"))?;
-        Ok(Self { inbox, id, rig: rig.clone(), renewal, session, closed: false, _alive: alive })
+        let connected = inbox.clone();
+        let probe = session::probe(config, move || connected.publishers() > 0)?;
+        Ok(Self { inbox, id, rig: rig.clone(), renewal, probe, session, closed: false, _alive: alive })
     }
 
     /// Our name towards the publisher.
@@ -239,6 +245,12 @@ impl Subscriber {
     #[must_use]
     pub fn publishers(&self) -> usize {
         self.inbox.publishers()
+    }
+
+    /// Why the rig cannot be reached with the key; None while it can, without a key, and while that is not known.
+    #[must_use]
+    pub fn trouble(&self) -> Option<String> {
+        self.probe.as_ref().and_then(Probe::trouble)
     }
 
     /// What came in, a topic each (`view/NAME`, `viewer/SUBSCRIBER/view`, `splats`, ...).

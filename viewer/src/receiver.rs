@@ -37,6 +37,8 @@ pub struct ReceiverState {
     pub problem: Option<(Instant, String)>,
     /// Number of publishers of this rig that live now.
     pub publishers: usize,
+    /// Why the rig cannot be reached with the key, while it cannot.
+    pub refusal: Option<String>,
     /// Age of the newest motion when it came, seconds, and whether both ends run on one host so that it is exact.
     pub age: Option<(f64, bool)>,
     /// Arrival, bytes and whether it was a motion, of the last messages.
@@ -57,9 +59,9 @@ impl ReceiverState {
     #[must_use]
     pub fn trouble(&self, rig: &str, endpoint: &str) -> Option<String> {
         if self.publishers == 0 {
-            return Some(format!(
-                "No rig '{rig}' at {endpoint} yet: check that `flyrig run` is up, --rig and --connect"
-            ));
+            return self.refusal.clone().or_else(|| {
+                Some(format!("No rig '{rig}' at {endpoint} yet: check that `flyrig run` is up, --rig and --connect"))
+            });
         }
         if self.rig.is_none() {
             return Some("Waiting for the rig's calibration".to_owned());
@@ -193,6 +195,7 @@ impl Link<'_> {
         let rig = self.subscriber.rig(Duration::ZERO);
         let mut state = lock(self.state);
         state.publishers = self.subscriber.publishers();
+        state.refusal = self.subscriber.trouble();
         for error in [stats.as_ref().err(), rig.as_ref().err()].into_iter().flatten() {
             state.complain(error.to_string());
         }

@@ -124,7 +124,10 @@ impl Link {
             hub.rig(&json);
         }
         let trouble = match (is_up, &rig) {
-            (false, _) => Some(format!("No rig '{}' yet: check that `flyrig run` is up", config.rig)),
+            (false, _) => self
+                .subscriber
+                .trouble()
+                .or_else(|| Some(format!("No rig '{}' yet: check that `flyrig run` is up", config.rig))),
             (true, None) => Some("Waiting for the rig's calibration".to_owned()),
             (true, Some(_)) => None,
         };

@@ -1,0 +1,453 @@
+//! The gate: admits holders of keys, and passes their connections on.
+
+use std::{
+    collections::HashMap,
+    net::{IpAddr, Ipv4Addr, SocketAddr},
+    path::PathBuf,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    thread::{Builder, JoinHandle},
+    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
+};
+
+use rustls_pki_types::{CertificateDer, ServerName, UnixTime};
+use tokio::{
+    io::{AsyncReadExt as _, AsyncWriteExt as _, copy_bidirectional_with_sizes},
+    net::{TcpListener, TcpSocket, TcpStream},
+    runtime,
+    sync::{oneshot, watch},
+    time::{sleep, timeout},
+};
+use tokio_rustls::{
+    TlsAcceptor, TlsConnector,
+    rustls::{
+        CertificateError, DigitallySignedStruct, DistinguishedName, Error as TlsError, SignatureScheme,
+        client::danger::HandshakeSignatureValid,
+        server::danger::{ClientCertVerified, ClientCertVerifier},
+    },
+};
+
+use crate::{
+    AccessError, Holder, Ring, Role,
+    issue::{Authority, Pair, Side},
+    limits::Limits,
+    ring_folder::{fingerprint, list_time, read_holders},
+    tls,
+};
+
+/// Time in which a client must show its key.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// How often the list of holders is looked at, and how long a key outlives its end.
+const LOOK_EVERY: Duration = Duration::from_millis(500);
+/// Connections of one key at a time.
+const CONNECTIONS_OF_ONE: usize = 16;
+/// Connections at a time.
+const CONNECTIONS: usize = 512;
+/// Pause after a connection could not be accepted.
+const PAUSE: Duration = Duration::from_millis(100);
+/// Bytes of a copy from one side to the other.
+const COPY_BYTES: usize = 16 << 10;
+/// Bytes that the system keeps for a viewer: what lies there cannot be overtaken by newer motion. It is doubled by Linux.
+const SEND_BUFFER: u32 = 128 << 10;
+/// The same between the session and the gate.
+const INNER_BUFFER: u32 = 64 << 10;
+/// Years that certificates between gate and session are valid; they live as long as the program.
+const INNER_SECS: u64 = 20 * 365 * 86_400;
+
+/// Certificates between a gate and the session behind it: made anew for each gate, and known to nobody else.
+pub struct Inner {
+    authority: Authority,
+    own: Pair,
+}
+
+impl std::fmt::Debug for Inner {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Inner").finish_non_exhaustive()
+    }
+}
+
+impl Inner {
+    /// Makes new certificates.
+    ///
+    /// # Errors
+    /// [`AccessError::System`].
+    pub fn new() -> Result<Self, AccessError> {
+        let authority = Authority::new("flyrig gate", (now_secs(), now_secs() + INNER_SECS))?.0;
+        let hosts = [Ipv4Addr::LOCALHOST.to_string()];
+        let own = authority.sign("flyrig session", &hosts, Side::Server, (now_secs(), now_secs() + INNER_SECS))?;
+        Ok(Self { authority, own })
+    }
+
+    /// Returns the authority whose clients the session must require, PEM.
+    #[must_use]
+    pub fn authority(&self) -> &str {
+        &self.authority.certificate
+    }
+
+    /// Returns the session's certificate and private key, PEM.
+    #[must_use]
+    pub fn certificate_and_key(&self) -> (&str, &str) {
+        (&self.own.certificate, &self.own.key)
+    }
+
+    /// Returns the common name of a holder's certificate towards the session.
+    #[must_use]
+    pub fn name(role: Role, number: usize) -> String {
+        format!("{}-{number}", role.name())
+    }
+}
+
+/// Admits holders until it is dropped.
+#[derive(Debug)]
+pub struct Gate {
+    address: SocketAddr,
+    /// Dropping it ends the thread.
+    stop: Option<oneshot::Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Gate {
+    /// Starts to listen on `address` for holders of these roles, whose connections go to a session at `session`.
+    ///
+    /// # Errors
+    /// [`AccessError::Listen`], or [`AccessError::File`] for a ring whose certificates are damaged.
+    pub fn start(
+        ring: &Ring,
+        roles: &[Role],
+        address: SocketAddr,
+        inner: Inner,
+        session: SocketAddr,
+    ) -> Result<Self, AccessError> {
+        let damaged = |problem: String| AccessError::file(ring.folder(), format!("is damaged ({problem})"));
+        let chain = tls::client_verifier(&ring.authority().certificate).map_err(damaged)?;
+        let list = Arc::new(List {
+            folder: ring.folder().to_owned(),
+            roles: roles.to_vec(),
+            holders: Mutex::new(ring.holders().to_vec()),
+            changes: watch::Sender::new(0),
+        });
+        let verifier = Arc::new(Admission { chain, list: Arc::clone(&list) });
+        let own = ring.own();
+        let server = tls::server(verifier, &own.certificate, &own.key).map_err(damaged)?;
+        let runtime = runtime::Builder::new_current_thread().enable_io().enable_time().build();
+        let runtime = runtime.map_err(AccessError::system)?;
+        let listener = {
+            let _inside = runtime.enter();
+            listen(address).map_err(|problem| AccessError::Listen { address, problem })?
+        };
+        let address = listener.local_addr().map_err(AccessError::system)?;
+        let shared = Arc::new(Shared {
+            acceptor: TlsAcceptor::from(Arc::new(server)),
+            list,
+            inner,
+            session,
+            limits: Mutex::default(),
+            connections: Mutex::default(),
+            refusals: Mutex::default(),
+        });
+        let (stop, stopped) = oneshot::channel::<()>();
+        let work = move || {
+            runtime.block_on(async {
+                tokio::select! {
+                    () = accept(&listener, &shared) => {}
+                    () = follow(&shared.list) => {}
+                    _ = stopped => {}
+                }
+            });
+            runtime.shutdown_timeout(PAUSE);
+        };
+        let thread = Builder::new().name("gate".to_owned()).spawn(work).map_err(AccessError::system)?;
+        Ok(Self { address, stop: Some(stop), thread: Some(thread) })
+    }
+
+    /// Returns the address that is listened on.
+    #[must_use]
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+}
+
+impl Drop for Gate {
+    fn drop(&mut self) {
+        drop(self.stop.take());
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+fn now_secs() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
+}
+
+/// A lock whose data stays whole even when a holder panics.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The list of holders as it was read last.
+#[derive(Debug)]
+struct List {
+    folder: PathBuf,
+    roles: Vec<Role>,
+    holders: Mutex<Vec<Holder>>,
+    /// Counts changes.
+    changes: watch::Sender<u64>,
+}
+
+impl List {
+    fn find(&self, certificate: &CertificateDer<'_>) -> Option<Holder> {
+        let print = fingerprint(certificate);
+        lock(&self.holders).iter().find(|of| of.fingerprint == print).cloned()
+    }
+
+    /// Reason why a certificate is not admitted, for TLS.
+    fn refusal(&self, certificate: &CertificateDer<'_>) -> Option<CertificateError> {
+        match self.find(certificate) {
+            None => Some(CertificateError::Revoked),
+            Some(holder) if holder.revoked => Some(CertificateError::Revoked),
+            Some(holder) if !self.roles.contains(&holder.role) => {
+                Some(CertificateError::ApplicationVerificationFailure)
+            }
+            Some(_) => None,
+        }
+    }
+}
+
+/// Reads the list again when it has changed.
+async fn follow(list: &List) {
+    let mut read_at = list_time(&list.folder);
+    loop {
+        sleep(LOOK_EVERY).await;
+        let now = list_time(&list.folder);
+        if now == read_at || now.is_none() {
+            continue;
+        }
+        read_at = now;
+        match read_holders(&list.folder) {
+            Ok(holders) => {
+                *lock(&list.holders) = holders;
+                list.changes.send_modify(|count| *count += 1);
+            }
+            Err(error) => tracing::warn!("the keys stay as they were: {error}"),
+        }
+    }
+}
+
+/// Asks the authority, then the list.
+#[derive(Debug)]
+struct Admission {
+    chain: Arc<dyn ClientCertVerifier>,
+    list: Arc<List>,
+}
+
+impl ClientCertVerifier for Admission {
+    fn root_hint_subjects(&self) -> &[DistinguishedName] {
+        self.chain.root_hint_subjects()
+    }
+
+    fn verify_client_cert(
+        &self,
+        end_entity: &CertificateDer<'_>,
+        intermediates: &[CertificateDer<'_>],
+        now: UnixTime,
+    ) -> Result<ClientCertVerified, TlsError> {
+        let verified = self.chain.verify_client_cert(end_entity, intermediates, now)?;
+        self.list.refusal(end_entity).map_or(Ok(verified), |reason| Err(TlsError::InvalidCertificate(reason)))
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, TlsError> {
+        self.chain.verify_tls12_signature(message, certificate, signed)
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signed: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, TlsError> {
+        self.chain.verify_tls13_signature(message, certificate, signed)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        self.chain.supported_verify_schemes()
+    }
+}
+
+/// State of all connections.
+struct Shared {
+    acceptor: TlsAcceptor,
+    list: Arc<List>,
+    inner: Inner,
+    session: SocketAddr,
+    limits: Mutex<Limits>,
+    /// By fingerprint.
+    connections: Mutex<HashMap<String, usize>>,
+    /// By their words.
+    refusals: Mutex<HashMap<&'static str, u64>>,
+}
+
+impl Shared {
+    /// Reports a refusal the 1st, 2nd, 4th time of its kind, whoever it was.
+    fn refuse(&self, who: &str, why: &'static str) {
+        let mut refusals = lock(&self.refusals);
+        let count = refusals.entry(why).or_default();
+        *count += 1;
+        if count.is_power_of_two() {
+            tracing::warn!("keys: {who} was refused: {why} ({count} so far)");
+        }
+    }
+
+    /// Takes one of a key's connections; None when it has enough.
+    fn connect(self: &Arc<Self>, fingerprint: &str) -> Option<Place> {
+        let mut connections = lock(&self.connections);
+        let all: usize = connections.values().sum();
+        let own = connections.entry(fingerprint.to_owned()).or_default();
+        if *own >= CONNECTIONS_OF_ONE || all >= CONNECTIONS {
+            return None;
+        }
+        *own += 1;
+        Some(Place { shared: Arc::clone(self), fingerprint: fingerprint.to_owned() })
+    }
+}
+
+/// One connection of a key.
+struct Place {
+    shared: Arc<Shared>,
+    fingerprint: String,
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let mut connections = lock(&self.shared.connections);
+        if let Some(count) = connections.get_mut(&self.fingerprint) {
+            *count -= 1;
+            if *count == 0 {
+                connections.remove(&self.fingerprint);
+            }
+        }
+    }
+}
+
+/// Must be called inside of the runtime.
+fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
+    let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() }?;
+    socket.set_reuseaddr(cfg!(unix))?;
+    // Connections inherit it.
+    socket.set_send_buffer_size(SEND_BUFFER)?;
+    socket.bind(address)?;
+    socket.listen(1024)
+}
+
+async fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
+    loop {
+        match listener.accept().await {
+            Ok((client, address)) => {
+                if !lock(&shared.limits).begin(address.ip(), Instant::now()) {
+                    shared.refuse(&address.ip().to_string(), "too many connections without a key");
+                    continue;
+                }
+                tokio::spawn(greet(client, address, Arc::clone(shared)));
+            }
+            // With no file descriptor left, trying at once only costs time.
+            Err(_) => sleep(PAUSE).await,
+        }
+    }
+}
+
+async fn greet(client: TcpStream, address: SocketAddr, shared: Arc<Shared>) {
+    let _ = client.set_nodelay(true);
+    let shaken = timeout(PATIENCE, shared.acceptor.accept(client)).await;
+    lock(&shared.limits).end(address.ip());
+    let who = address.ip().to_string();
+    let mut client = match shaken {
+        Ok(Ok(client)) => client,
+        Ok(Err(error)) => return shared.refuse(&who, words(&error)),
+        Err(_) => return shared.refuse(&who, "it showed no key in time"),
+    };
+    let certificate = client.get_ref().1.peer_certificates().and_then(<[_]>::first).map(|of| of.clone().into_owned());
+    let Some((certificate, holder)) = certificate.and_then(|of| shared.list.find(&of).map(|holder| (of, holder)))
+    else {
+        return shared.refuse(&who, "its key was revoked");
+    };
+    let who = format!("'{}' at {}", holder.name, address.ip());
+    let Some(_place) = shared.connect(&holder.fingerprint) else {
+        return shared.refuse(&who, "all connections of its key, or of the gate, are taken");
+    };
+    // Whoever only wants to know whether its key is admitted says nothing.
+    let mut first = [0; COPY_BYTES];
+    let count = match timeout(PATIENCE, client.read(&mut first)).await {
+        Ok(Ok(count)) if count > 0 => count,
+        _ => return,
+    };
+    let session = async {
+        let mut session = pass_on(&holder, &shared).await?;
+        session.write_all(first.get(..count).unwrap_or_default()).await.map(|()| session)
+    };
+    let mut session = match session.await {
+        Ok(session) => session,
+        Err(error) => return tracing::warn!("keys: {who} cannot be passed on: {error}"),
+    };
+    tracing::info!("keys: {who} ({}) connected", holder.role.name());
+    tokio::select! {
+        _ = copy_bidirectional_with_sizes(&mut client, &mut session, COPY_BYTES, COPY_BYTES) => tracing::info!("keys: {who} left"),
+        why = until_refused(&certificate, &holder, &shared.list) => tracing::warn!("keys: {who} was disconnected: {why}"),
+    }
+}
+
+/// Returns why the holder of an open connection is not admitted any more, once it is not.
+async fn until_refused(certificate: &CertificateDer<'_>, holder: &Holder, list: &List) -> &'static str {
+    let mut changes = list.changes.subscribe();
+    loop {
+        if list.refusal(certificate).is_some() {
+            return "its key was revoked";
+        }
+        // By the wall clock: it may be set.
+        if SystemTime::now() >= holder.expires_at() {
+            return "its key has expired";
+        }
+        let _ = timeout(LOOK_EVERY, changes.changed()).await;
+    }
+}
+
+/// Connects to the session under the holder's name there.
+async fn pass_on(holder: &Holder, shared: &Shared) -> std::io::Result<tokio_rustls::client::TlsStream<TcpStream>> {
+    let failed = |error: String| std::io::Error::other(error);
+    let name = Inner::name(holder.role, holder.number);
+    let pair = shared
+        .inner
+        .authority
+        .sign(&name, &[], Side::Client, (now_secs(), now_secs() + INNER_SECS))
+        .map_err(|error| failed(error.to_string()))?;
+    let config = tls::client(shared.inner.authority(), &pair.certificate, &pair.key).map_err(failed)?;
+    let socket = TcpSocket::new_v4()?;
+    socket.set_recv_buffer_size(INNER_BUFFER)?;
+    let stream = socket.connect(shared.session).await?;
+    stream.set_nodelay(true)?;
+    let name = ServerName::IpAddress(IpAddr::from(Ipv4Addr::LOCALHOST).into());
+    timeout(PATIENCE, TlsConnector::from(Arc::new(config)).connect(name, stream)).await?
+}
+
+/// Why a handshake failed.
+fn words(error: &std::io::Error) -> &'static str {
+    let tls = error.get_ref().and_then(|inner| inner.downcast_ref::<TlsError>());
+    match tls {
+        Some(TlsError::NoCertificatesPresented) => "it has no key",
+        Some(TlsError::InvalidCertificate(reason)) => match reason {
+            CertificateError::Expired | CertificateError::ExpiredContext { .. } => "its key has expired",
+            CertificateError::NotValidYet | CertificateError::NotValidYetContext { .. } => {
+                "its key is not valid yet; compare the computers' clocks"
+            }
+            CertificateError::Revoked => "its key was revoked",
+            CertificateError::ApplicationVerificationFailure => "its key is for another role, which has another port",
+            _ => "its key is of another rig",
+        },
+        Some(TlsError::AlertReceived(_)) => "it does not trust this rig: its key is of another one",
+        Some(_) => "it does not speak TLS 1.3",
+        None => "it hung up",
+    }
+}

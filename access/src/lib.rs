@@ -1,0 +1,24 @@
+//! Access of other computers to a rig: keys of those who may connect, and the gate that admits them.
+//!
+//! A [`Ring`] is the folder of a rig's keys: an authority that signs certificates, the rig's own certificate, and the list of holders.
+//! A [`KeyFile`] is what one holder gets: certificate, private key, and where the rig is. A [`Gate`] listens for holders, requires a
+//! certificate of the ring from each (TLS 1.3 on both sides), looks every one up in the list, and passes the connection on to a session
+//! of this computer under a name by which that session knows what the holder may do. The list is read again while the gate is open: a
+//! key that is revoked is disconnected at once.
+
+mod error;
+mod gate;
+mod issue;
+mod key_file;
+mod limits;
+mod probe;
+mod ring_folder;
+mod role;
+mod tls;
+
+pub use error::AccessError;
+pub use gate::{Gate, Inner};
+pub use key_file::{KeyFile, MAX_KEY_FILE_BYTES};
+pub use probe::Probe;
+pub use ring_folder::{DEFAULT_PORT, Holder, MAX_HOLDERS, Ring};
+pub use role::Role;

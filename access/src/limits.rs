@@ -1,0 +1,127 @@
+//! Bounds on connections of those who have not shown a key yet.
+
+use std::{
+    collections::HashMap,
+    net::IpAddr,
+    time::{Duration, Instant},
+};
+
+/// Connections a second that one address may begin, in the long run.
+const PER_SECOND: f64 = 20.0;
+/// Connections that one address may begin at once.
+const BURST: f64 = 40.0;
+/// Handshakes of one address at a time.
+const PENDING_OF_ONE: usize = 16;
+/// Handshakes at a time.
+const PENDING: usize = 256;
+/// Addresses that are remembered.
+const ADDRESSES: usize = 4096;
+/// Bits of an IPv6 address that one network is given.
+const V6_NETWORK: u128 = !0 << 64;
+
+#[derive(Debug)]
+struct Visitor {
+    left: f64,
+    at: Instant,
+    pending: usize,
+}
+
+/// Who has knocked, and how often.
+#[derive(Debug, Default)]
+pub(crate) struct Limits {
+    visitors: HashMap<IpAddr, Visitor>,
+    pending: usize,
+}
+
+fn network(address: IpAddr) -> IpAddr {
+    match address {
+        IpAddr::V4(_) => address,
+        IpAddr::V6(v6) => v6.to_ipv4_mapped().map_or_else(
+            || IpAddr::V6((u128::from_be_bytes(v6.octets()) & V6_NETWORK).to_be_bytes().into()),
+            IpAddr::V4,
+        ),
+    }
+}
+
+impl Limits {
+    /// Whether an address may begin a handshake now; [`Self::end`] must follow then.
+    pub fn begin(&mut self, address: IpAddr, now: Instant) -> bool {
+        if self.visitors.len() >= ADDRESSES {
+            // Whoever has been away for so long has everything again.
+            let full = Duration::from_secs_f64(BURST / PER_SECOND);
+            self.visitors.retain(|_, visitor| visitor.pending > 0 || now.duration_since(visitor.at) < full);
+        }
+        let network = network(address);
+        if self.visitors.len() >= ADDRESSES && !self.visitors.contains_key(&network) {
+            return false;
+        }
+        let visitor = self.visitors.entry(network).or_insert(Visitor { left: BURST, at: now, pending: 0 });
+        let since = now.duration_since(visitor.at).as_secs_f64();
+        visitor.left = (visitor.left + since * PER_SECOND).min(BURST);
+        visitor.at = now;
+        if visitor.left < 1.0 || visitor.pending >= PENDING_OF_ONE || self.pending >= PENDING {
+            return false;
+        }
+        visitor.left -= 1.0;
+        visitor.pending += 1;
+        self.pending += 1;
+        true
+    }
+
+    /// Ends a handshake.
+    pub fn end(&mut self, address: IpAddr) {
+        if let Some(visitor) = self.visitors.get_mut(&network(address)) {
+            visitor.pending = visitor.pending.saturating_sub(1);
+        }
+        self.pending = self.pending.saturating_sub(1);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_address_does_not_use_up_the_places_of_others() {
+        let (mut limits, now) = (Limits::default(), Instant::now());
+        let (noisy, calm) = (IpAddr::from([10, 0, 0, 1]), IpAddr::from([10, 0, 0, 2]));
+        assert_eq!((0..1000).filter(|_| limits.begin(noisy, now)).count(), PENDING_OF_ONE);
+        assert!(limits.begin(calm, now));
+        // Handshakes that end make place, until the burst is used up.
+        (0..PENDING_OF_ONE).for_each(|_| limits.end(noisy));
+        let mut begun = PENDING_OF_ONE;
+        while limits.begin(noisy, now) {
+            limits.end(noisy);
+            begun += 1;
+        }
+        assert_eq!(begun, BURST as usize);
+        // Then so many a second.
+        let later = |tenths: u64| now + Duration::from_millis(100 * tenths);
+        let slow = (1..=100).filter(|tenth| (0..50).any(|_| limits.begin(noisy, later(*tenth)))).count();
+        assert!(slow >= 14, "{slow}");
+    }
+
+    #[test]
+    fn many_addresses_are_bounded_and_forgotten() {
+        let (mut limits, now) = (Limits::default(), Instant::now());
+        let mut begun = 0;
+        for n in 0..100_000u32 {
+            begun += usize::from(limits.begin(IpAddr::from(n.to_be_bytes()), now));
+        }
+        assert_eq!(begun, PENDING);
+        assert!(limits.visitors.len() <= ADDRESSES);
+        let later = now + Duration::from_secs(60);
+        (0..PENDING as u32).for_each(|n| limits.end(IpAddr::from(n.to_be_bytes())));
+        assert!(limits.begin(IpAddr::from([1, 2, 3, 4]), later));
+        assert!(limits.visitors.len() < 10);
+    }
+
+    #[test]
+    fn an_ipv6_network_is_one_visitor() {
+        let (mut limits, now) = (Limits::default(), Instant::now());
+        let of = |host: u16| IpAddr::from([0x2001, 0xdb8, 0, 1, 0, 0, 0, host]);
+        assert_eq!((0..1000).filter(|host| limits.begin(of(*host), now)).count(), PENDING_OF_ONE);
+        assert!(limits.begin(IpAddr::from([0x2001, 0xdb8, 0, 2, 0, 0, 0, 1]), now));
+        assert_eq!(network("::ffff:10.0.0.1".parse().unwrap()), IpAddr::from([10, 0, 0, 1]));
+    }
+}

@@ -1,0 +1,173 @@
+//! Why a rig does not admit a key, in words.
+
+use std::{
+    io::{ErrorKind, Read as _, Write as _},
+    net::{TcpStream, ToSocketAddrs as _},
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread::{Builder, JoinHandle, park_timeout},
+    time::Duration,
+};
+
+use rustls_pki_types::ServerName;
+use tokio_rustls::rustls::{AlertDescription, CertificateError, ClientConnection, Error as TlsError, Stream};
+
+use crate::{AccessError, KeyFile, Role, tls};
+
+/// Time for an answer of the rig.
+const PATIENCE: Duration = Duration::from_secs(3);
+/// A refusal comes within this after the handshake; silence admits.
+const SILENCE: Duration = Duration::from_millis(1000);
+/// Pause between two attempts.
+const EVERY: Duration = Duration::from_secs(2);
+
+impl KeyFile {
+    /// Knocks at the rig: connects to its addresses in turn, shows the key, and hangs up.
+    ///
+    /// # Errors
+    /// [`AccessError::Refused`] with the reason of the last address, when none admits the key.
+    pub fn knock(&self) -> Result<(), AccessError> {
+        let mut why = "the key names no address".to_owned();
+        for address in &self.connect {
+            match self.knock_at(address) {
+                Ok(()) => return Ok(()),
+                Err(problem) => why = problem,
+            }
+        }
+        Err(AccessError::Refused(why))
+    }
+
+    fn knock_at(&self, address: &str) -> Result<(), String> {
+        let rig = &self.rig;
+        let config = tls::client(&self.authority, &self.certificate, &self.private_key)?;
+        let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
+        let name = ServerName::try_from(host.to_owned()).map_err(|_| format!("{address} is no address"))?;
+        let known: Vec<_> =
+            address.to_socket_addrs().map_err(|error| format!("{address} is not known here ({error})"))?.collect();
+        let mut stream = None;
+        let mut problem = format!("{address} is not known here");
+        for at in known {
+            match TcpStream::connect_timeout(&at, PATIENCE) {
+                Ok(connected) => {
+                    stream = Some(connected);
+                    break;
+                }
+                Err(error) => {
+                    let source = if self.role == Role::Cameras { " and source.kind = \"network\"" } else { "" };
+                    problem = format!(
+                        "nobody answers at {address} ({error}); is `flyrig run` up there, with transport.keys{source}?"
+                    );
+                }
+            }
+        }
+        let Some(mut stream) = stream else { return Err(problem) };
+        let of = |error: std::io::Error| self.words(address, &error);
+        stream.set_read_timeout(Some(PATIENCE)).map_err(of)?;
+        stream.set_write_timeout(Some(PATIENCE)).map_err(of)?;
+        let mut connection = ClientConnection::new(Arc::new(config), name).map_err(|error| error.to_string())?;
+        while connection.is_handshaking() {
+            connection.complete_io(&mut stream).map_err(of)?;
+        }
+        stream.set_read_timeout(Some(SILENCE)).map_err(of)?;
+        let mut tls = Stream::new(&mut connection, &mut stream);
+        tls.flush().map_err(of)?;
+        match tls.read(&mut [0]) {
+            // It says nothing before its client does.
+            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => Ok(()),
+            Ok(0) => Err(format!("the rig '{rig}' at {address} hung up; try again")),
+            Ok(_) => Ok(()),
+            Err(error) => Err(of(error)),
+        }
+    }
+
+    fn words(&self, address: &str, error: &std::io::Error) -> String {
+        let Self { rig, holder, expires, .. } = self;
+        let tls = error.get_ref().and_then(|inner| inner.downcast_ref::<TlsError>());
+        let refuses = format!("the rig '{rig}' refuses the key of '{holder}'");
+        match tls {
+            Some(TlsError::AlertReceived(alert)) => match alert {
+                AlertDescription::CertificateRevoked => {
+                    format!("{refuses}: it was revoked or renewed; ask for the new one (`flyrig keys add` or `renew`)")
+                }
+                AlertDescription::CertificateExpired => {
+                    format!("{refuses}: it expired on {expires}; ask for a new one (`flyrig keys renew {holder}`)")
+                }
+                AlertDescription::AccessDenied => {
+                    format!("{refuses}: a key of role {} has another port than {address}", self.role.name())
+                }
+                AlertDescription::UnknownCA | AlertDescription::BadCertificate | AlertDescription::DecryptError => {
+                    format!("{refuses}: it is of another rig")
+                }
+                other => format!("{refuses} ({other:?})"),
+            },
+            Some(TlsError::InvalidCertificate(reason)) => match reason {
+                CertificateError::NotValidForName | CertificateError::NotValidForNameContext { .. } => format!(
+                    "the certificate of the rig '{rig}' is for other names than that of {address}; make its keys with `flyrig keys new --host NAME`"
+                ),
+                CertificateError::Expired | CertificateError::ExpiredContext { .. } => {
+                    format!("the certificate of the rig '{rig}' has expired; compare the clocks, or make new keys")
+                }
+                CertificateError::NotValidYet | CertificateError::NotValidYetContext { .. } => {
+                    format!("the certificate of the rig '{rig}' is not valid yet; compare the computers' clocks")
+                }
+                _ => format!("{address} is not the rig '{rig}': its certificate is signed by somebody else"),
+            },
+            Some(other) => format!("{address} does not speak as a rig with keys does ({other})"),
+            None if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
+                format!("{address} does not answer")
+            }
+            None => format!("{address} hung up ({error}); is it a rig with keys?"),
+        }
+    }
+}
+
+/// Knocks at the rig again and again while nothing comes from it, to know why.
+#[derive(Debug)]
+pub struct Probe {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    trouble: Mutex<Option<String>>,
+    stop: AtomicBool,
+}
+
+impl Probe {
+    /// Starts the thread, which is idle while `is_connected`.
+    ///
+    /// # Errors
+    /// [`AccessError::System`] when there is no thread.
+    pub fn start(key: KeyFile, is_connected: impl Fn() -> bool + Send + 'static) -> Result<Self, AccessError> {
+        let shared = Arc::<Shared>::default();
+        let of_thread = Arc::clone(&shared);
+        let work = move || {
+            while !of_thread.stop.load(Ordering::Relaxed) {
+                let trouble = if is_connected() { None } else { key.knock().err().map(|error| error.to_string()) };
+                *of_thread.trouble.lock().unwrap_or_else(PoisonError::into_inner) = trouble;
+                park_timeout(EVERY);
+            }
+        };
+        let thread = Builder::new().name("flyrig-probe".to_owned()).spawn(work).map_err(AccessError::system)?;
+        Ok(Self { shared, thread: Some(thread) })
+    }
+
+    /// Returns why the rig cannot be reached; None while it can, or while that is not known.
+    #[must_use]
+    pub fn trouble(&self) -> Option<String> {
+        self.shared.trouble.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+/// Does not wait for an attempt under way.
+impl Drop for Probe {
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            thread.thread().unpark();
+        }
+    }
+}

@@ -1,0 +1,388 @@
+//! The folder of a rig's keys.
+
+use std::{
+    io::Write as _,
+    net::SocketAddr,
+    path::{Path, PathBuf},
+    time::{Duration, SystemTime, UNIX_EPOCH},
+};
+
+use rustls_pki_types::{CertificateDer, pem::PemObject as _};
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    AccessError, KeyFile, Role,
+    issue::{Authority, Pair, Side},
+};
+
+/// Port of the gate for viewers unless another one is chosen; cameras have the next.
+pub const DEFAULT_PORT: u16 = 7450;
+/// Most holders of a role.
+pub const MAX_HOLDERS: usize = 256;
+/// Largest file that is read, bytes.
+const MAX_BYTES: u64 = 1 << 20;
+/// Version of the format.
+const VERSION: u32 = 1;
+/// Days that authority and rig are valid.
+const RING_DAYS: u64 = 3650;
+const LIST: &str = "ring.toml";
+const AUTHORITY: [&str; 2] = ["authority.pem", "authority-key.pem"];
+const OWN: [&str; 2] = ["rig.pem", "rig-key.pem"];
+
+/// Holder of a key.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Holder {
+    /// Its name.
+    pub name: String,
+    /// What it may do.
+    pub role: Role,
+    /// Its number among the holders of its role, 0..[`MAX_HOLDERS`].
+    pub number: usize,
+    /// Time after which it is refused, RFC 3339.
+    pub expires: String,
+    /// SHA-256 of its certificate, hexadecimal.
+    pub fingerprint: String,
+    /// Whether it is refused.
+    #[serde(default)]
+    pub revoked: bool,
+}
+
+impl Holder {
+    /// Returns the time after which it is refused; a time that cannot be read is in the past.
+    #[must_use]
+    pub fn expires_at(&self) -> SystemTime {
+        humantime::parse_rfc3339(&self.expires).unwrap_or(UNIX_EPOCH)
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct List {
+    version: u32,
+    rig: String,
+    /// Hexadecimal; part of names in certificates and topics.
+    id: String,
+    hosts: Vec<String>,
+    listen: SocketAddr,
+    #[serde(default)]
+    holders: Vec<Holder>,
+}
+
+/// Folder of a rig's keys.
+pub struct Ring {
+    folder: PathBuf,
+    list: List,
+    authority: Authority,
+    own: Pair,
+}
+
+/// Without secrets.
+impl std::fmt::Debug for Ring {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Ring").field("folder", &self.folder).field("list", &self.list).finish_non_exhaustive()
+    }
+}
+
+/// SHA-256 of a certificate, hexadecimal.
+pub(crate) fn fingerprint(certificate: &[u8]) -> String {
+    let digest = ring::digest::digest(&ring::digest::SHA256, certificate);
+    digest.as_ref().iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn unix_secs() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
+}
+
+/// Writes a file for its owner alone; it must not be there.
+pub(crate) fn write_secret(path: &Path, text: &str) -> Result<(), AccessError> {
+    let mut options = std::fs::OpenOptions::new();
+    options.write(true).create_new(true);
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
+    let written = options
+        .open(path)
+        .and_then(|mut out| out.write_all(text.as_bytes()).inspect_err(|_| drop(std::fs::remove_file(path))));
+    written.map_err(|error| match error.kind() {
+        std::io::ErrorKind::AlreadyExists => {
+            AccessError::file(path, "is there already; choose another name, or move it away")
+        }
+        _ => AccessError::file(path, format!("cannot be written ({error})")),
+    })
+}
+
+fn read(path: &Path) -> Result<String, AccessError> {
+    let of = |error: std::io::Error| {
+        AccessError::file(path, format!("cannot be read ({error}); make a ring with `flyrig keys new`"))
+    };
+    if std::fs::metadata(path).map_err(of)?.len() > MAX_BYTES {
+        return Err(AccessError::file(path, "is too large for a file of a ring"));
+    }
+    std::fs::read_to_string(path).map_err(of)
+}
+
+/// Checks a name of a rig or holder.
+fn check_name(what: &str, name: &str) -> Result<(), AccessError> {
+    if (1..=64).contains(&name.len()) && name.bytes().all(|b| b.is_ascii_alphanumeric() || b"_-".contains(&b)) {
+        return Ok(());
+    }
+    Err(AccessError::Request(format!("{what} '{name}': use 1 to 64 of the characters A-Z a-z 0-9 _ -")))
+}
+
+/// Reads the list of holders alone; the gate does it again and again.
+pub(crate) fn read_holders(folder: &Path) -> Result<Vec<Holder>, AccessError> {
+    read_list(folder).map(|list| list.holders)
+}
+
+fn read_list(folder: &Path) -> Result<List, AccessError> {
+    let path = folder.join(LIST);
+    let list: List = toml::from_str(&read(&path)?)
+        .map_err(|error| AccessError::file(&path, format!("is no list of keys ({})", error.message())))?;
+    if list.version != VERSION {
+        let problem = format!("is of version {}, this program knows {VERSION}; update flyrig", list.version);
+        return Err(AccessError::file(&path, problem));
+    }
+    Ok(list)
+}
+
+/// File name and modification time of the list, by which a change is noticed.
+pub(crate) fn list_time(folder: &Path) -> Option<SystemTime> {
+    std::fs::metadata(folder.join(LIST)).and_then(|of| of.modified()).ok()
+}
+
+impl Ring {
+    /// Makes a new ring in a folder that is not there yet. `hosts` are names and addresses by which other computers reach the rig.
+    ///
+    /// # Errors
+    /// [`AccessError::Request`] for a bad name or no host, [`AccessError::File`] when the folder is there or cannot be written.
+    pub fn create(folder: &Path, rig: &str, hosts: &[String], port: u16) -> Result<Self, AccessError> {
+        check_name("rig", rig)?;
+        if hosts.is_empty() {
+            return Err(AccessError::Request(
+                "a ring needs a name or address by which other computers reach the rig; give --host".to_owned(),
+            ));
+        }
+        check_hosts(hosts)?;
+        if port == 0 || port == u16::MAX {
+            return Err(AccessError::Request(format!("--port {port}: use 1 to 65534; cameras have the port after it")));
+        }
+        let mut id = [0u8; 4];
+        getrandom::fill(&mut id).map_err(AccessError::system)?;
+        let id: String = id.iter().map(|byte| format!("{byte:02x}")).collect();
+        let list = List {
+            version: VERSION,
+            rig: rig.to_owned(),
+            id,
+            hosts: hosts.to_vec(),
+            listen: SocketAddr::from(([0, 0, 0, 0], port)),
+            holders: Vec::new(),
+        };
+        let now = unix_secs();
+        let valid = (now, now + RING_DAYS * 86_400);
+        let (authority, secret) = Authority::new(&authority_name(&list), valid)?;
+        let own = authority.sign(&own_name(&list), hosts, Side::Server, valid)?;
+        let failed = |error: std::io::Error| match error.kind() {
+            std::io::ErrorKind::AlreadyExists => {
+                AccessError::file(folder, "is there already; name a new folder with --out")
+            }
+            _ => AccessError::file(folder, format!("cannot be made ({error})")),
+        };
+        std::fs::create_dir(folder).map_err(failed)?;
+        let ring = Self { folder: folder.to_owned(), list, authority, own };
+        let write = || {
+            write_secret(&folder.join(AUTHORITY[1]), &secret)?;
+            write_secret(&folder.join(AUTHORITY[0]), &ring.authority.certificate)?;
+            write_secret(&folder.join(OWN[1]), &ring.own.key)?;
+            write_secret(&folder.join(OWN[0]), &ring.own.certificate)?;
+            ring.save()
+        };
+        // It was made just now and holds nothing else.
+        write().inspect_err(|_| drop(std::fs::remove_dir_all(folder)))?;
+        Ok(ring)
+    }
+
+    /// Opens a ring.
+    ///
+    /// # Errors
+    /// [`AccessError::File`] with the file that is missing or damaged.
+    pub fn open(folder: &Path) -> Result<Self, AccessError> {
+        let list = read_list(folder)?;
+        let pair = |names: [&str; 2]| {
+            Ok::<_, AccessError>(Pair {
+                certificate: read(&folder.join(names[0]))?,
+                key: read(&folder.join(names[1]))?,
+            })
+        };
+        let authority = Authority::resume(&authority_name(&list), pair(AUTHORITY)?)
+            .map_err(|error| AccessError::file(folder.join(AUTHORITY[1]), format!("is damaged ({error})")))?;
+        Ok(Self { folder: folder.to_owned(), list, authority, own: pair(OWN)? })
+    }
+
+    /// Returns the name of the rig.
+    #[must_use]
+    pub fn rig(&self) -> &str {
+        &self.list.rig
+    }
+
+    /// Returns the folder.
+    #[must_use]
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Returns the names and addresses by which other computers reach the rig.
+    #[must_use]
+    pub fn hosts(&self) -> &[String] {
+        &self.list.hosts
+    }
+
+    /// Returns everybody who was given a key.
+    #[must_use]
+    pub fn holders(&self) -> &[Holder] {
+        &self.list.holders
+    }
+
+    /// Returns the address that a gate listens on: the ring's for viewers and relays, the next port for cameras.
+    #[must_use]
+    pub fn address(&self, role: Role) -> SocketAddr {
+        let mut address = self.list.listen;
+        if role == Role::Cameras {
+            address.set_port(address.port().saturating_add(1));
+        }
+        address
+    }
+
+    /// Returns the names in topics of a viewer's sessions, as a zenoh key expression of one part.
+    #[must_use]
+    pub fn names_of(&self, number: usize) -> String {
+        format!("{}.$*", self.topic_name(number))
+    }
+
+    fn topic_name(&self, number: usize) -> String {
+        format!("{}-{number}", self.list.id)
+    }
+
+    pub(crate) fn own(&self) -> &Pair {
+        &self.own
+    }
+
+    pub(crate) fn authority(&self) -> &Authority {
+        &self.authority
+    }
+
+    /// Makes a key, valid for `days`.
+    ///
+    /// # Errors
+    /// [`AccessError::Request`] for a bad name, a name that is taken, or more holders than there is room for.
+    pub fn add(&mut self, name: &str, role: Role, days: u64) -> Result<KeyFile, AccessError> {
+        check_name("holder", name)?;
+        if self.valid_holder(name).is_some() {
+            return Err(AccessError::Request(format!(
+                "'{name}' has a key already; make a new one with `flyrig keys renew {name}`, or take it away with `flyrig keys revoke {name}`"
+            )));
+        }
+        // Numbers of holders who are revoked are free: they are refused by their certificates.
+        let taken =
+            |number: &usize| self.list.holders.iter().any(|of| of.role == role && of.number == *number && !of.revoked);
+        let Some(number) = (0..MAX_HOLDERS).find(|number| !taken(number)) else {
+            return Err(AccessError::Request(format!("there are {MAX_HOLDERS} keys of this role already; revoke one")));
+        };
+        self.issue(name, role, number, days)
+    }
+
+    /// Makes a new key of a holder, valid for `days`; the old one is refused from now on.
+    ///
+    /// # Errors
+    /// [`AccessError::Request`] when nobody of this name has a key.
+    pub fn renew(&mut self, name: &str, days: u64) -> Result<KeyFile, AccessError> {
+        let Some(Holder { role, number, .. }) = self.valid_holder(name).cloned() else { return Err(self.nobody(name)) };
+        self.mark_revoked(name);
+        self.issue(name, role, number, days)
+    }
+
+    /// Refuses a holder from now on; an open gate disconnects it.
+    ///
+    /// # Errors
+    /// [`AccessError::Request`] when nobody of this name has a key.
+    pub fn revoke(&mut self, name: &str) -> Result<(), AccessError> {
+        if self.valid_holder(name).is_none() {
+            return Err(self.nobody(name));
+        }
+        self.mark_revoked(name);
+        self.save()
+    }
+
+    fn valid_holder(&self, name: &str) -> Option<&Holder> {
+        self.list.holders.iter().find(|of| of.name == name && !of.revoked)
+    }
+
+    fn nobody(&self, name: &str) -> AccessError {
+        let names: Vec<&str> = self.list.holders.iter().filter(|of| !of.revoked).map(|of| of.name.as_str()).collect();
+        let known = if names.is_empty() { "nobody has one".to_owned() } else { format!("known: {}", names.join(", ")) };
+        AccessError::Request(format!("'{name}' has no key; {known}"))
+    }
+
+    fn mark_revoked(&mut self, name: &str) {
+        self.list.holders.iter_mut().filter(|of| of.name == name).for_each(|of| of.revoked = true);
+    }
+
+    fn issue(&mut self, name: &str, role: Role, number: usize, days: u64) -> Result<KeyFile, AccessError> {
+        let now = unix_secs();
+        let Some(end) =
+            days.checked_mul(86_400).and_then(|secs| now.checked_add(secs)).filter(|_| (1..=36_500).contains(&days))
+        else {
+            return Err(AccessError::Request(format!("--days {days}: use 1 to 36500")));
+        };
+        let pair = self.authority.sign(name, &[], Side::Client, (now, end))?;
+        let der = CertificateDer::from_pem_slice(pair.certificate.as_bytes()).map_err(AccessError::system)?;
+        let expires = humantime::format_rfc3339_seconds(UNIX_EPOCH + Duration::from_secs(end)).to_string();
+        let holder =
+            Holder { name: name.to_owned(), role, number, expires, fingerprint: fingerprint(&der), revoked: false };
+        let port = self.address(role).port();
+        let connect = self.list.hosts.iter().map(|host| host_and_port(host, port)).collect();
+        let topic_name = self.topic_name(number);
+        let authority = self.authority.certificate.clone();
+        let file = KeyFile::new(&self.list.rig, &holder, topic_name, connect, own_name(&self.list), authority, pair);
+        self.list.holders.push(holder);
+        self.save()?;
+        Ok(file)
+    }
+
+    fn save(&self) -> Result<(), AccessError> {
+        let path = self.folder.join(LIST);
+        let body = toml::to_string(&self.list).map_err(AccessError::system)?;
+        let text = format!(
+            "# Keys of the rig '{}'. `flyrig keys` writes this file. `listen` may be changed: keys that were given away name its port.\n{body}",
+            self.list.rig
+        );
+        flyrig_types::write_whole(&path, |out| out.write_all(text.as_bytes()))
+            .map_err(|error| AccessError::file(&path, format!("cannot be written ({error})")))
+    }
+}
+
+/// Name in the certificate of the authority.
+fn authority_name(list: &List) -> String {
+    format!("flyrig authority of {} {}", list.rig, list.id)
+}
+
+/// Name in the rig's certificate. It is no host's: no public authority signs one.
+fn own_name(list: &List) -> String {
+    format!("flyrig rig {} {}", list.rig, list.id)
+}
+
+fn check_hosts(hosts: &[String]) -> Result<(), AccessError> {
+    let good = |host: &String| {
+        host.parse::<std::net::IpAddr>().is_ok()
+            || (1..=253).contains(&host.len()) && host.bytes().all(|b| b.is_ascii_alphanumeric() || b"-.".contains(&b))
+    };
+    match hosts.iter().find(|host| !good(host)) {
+        None => Ok(()),
+        Some(host) => Err(AccessError::Request(format!(
+            "--host {host}: give a name or address without a port, such as rig.local or 10.0.0.5"
+        ))),
+    }
+}
+
+fn host_and_port(host: &str, port: u16) -> String {
+    if host.contains(':') { format!("[{host}]:{port}") } else { format!("{host}:{port}") }
+}

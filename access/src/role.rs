@@ -1,0 +1,30 @@
+//! Roles of holders.
+
+use serde::{Deserialize, Serialize};
+
+/// Role of a key's holder: what it may do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Role {
+    /// Watches: receives people, views, statistics and calibration, and may have a viewpoint of its own. Publishes nothing.
+    Viewer,
+    /// Sends images of cameras. Receives nothing but questions for its clock.
+    Cameras,
+    /// Watches, and passes everything on to viewers that have a key of the relay's own ring.
+    Relay,
+}
+
+impl Role {
+    /// Every role.
+    pub const ALL: [Self; 3] = [Self::Viewer, Self::Cameras, Self::Relay];
+
+    /// Returns the role's name in files and on the command line.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Viewer => "viewer",
+            Self::Cameras => "cameras",
+            Self::Relay => "relay",
+        }
+    }
+}

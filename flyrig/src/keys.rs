@@ -1,0 +1,112 @@
+//! `flyrig keys`: who may connect to a rig from other computers.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, Result};
+use flyrig_access::{Holder, KeyFile, Ring, Role};
+
+use crate::cli::{KeysAction, RingArgs};
+
+/// End of the names of folders of keys.
+const FOLDER_END: &str = "-keys";
+
+/// Runs the command.
+pub fn keys(action: &KeysAction) -> Result<()> {
+    match action {
+        KeysAction::New { rig, hosts, port, out } => {
+            let folder = out.clone().unwrap_or_else(|| PathBuf::from(format!("{rig}{FOLDER_END}")));
+            let ring = Ring::create(&folder, rig, hosts, *port)?;
+            println!("{}", folder.display());
+            let (viewers, cameras) = (ring.address(Role::Viewer).port(), ring.address(Role::Cameras).port());
+            eprintln!(
+                "keys: the keys of rig '{rig}' lie in {0}. Keep that folder secret, and on this computer.\n\
+                 Name it in the rig's configuration:\n\n    [rig]\n    name = \"{rig}\"\n    [transport]\n    keys = \"{0}\"\n\n\
+                 and let ports {viewers} (viewers) and {cameras} (cameras of other computers) through the firewall.\n\
+                 Next: flyrig keys add NAME --ring {0}",
+                folder.display()
+            );
+        }
+        KeysAction::Add { name, role, days, out, ring } => {
+            let mut ring = open(ring)?;
+            let path = new_file(out.as_deref(), name)?;
+            write(&ring.add(name, *role, *days)?, &path)?;
+        }
+        KeysAction::Renew { name, days, out, ring } => {
+            let mut ring = open(ring)?;
+            let path = new_file(out.as_deref(), name)?;
+            write(&ring.renew(name, *days)?, &path)?;
+            eprintln!("keys: the old key of '{name}' is refused from now on");
+        }
+        KeysAction::Revoke { name, ring } => {
+            open(ring)?.revoke(name)?;
+            eprintln!("keys: '{name}' is refused from now on, and disconnected if it is connected");
+        }
+        KeysAction::List { ring } => {
+            let ring = open(ring)?;
+            println!("rig '{}', reached at {}", ring.rig(), ring.hosts().join(", "));
+            println!("{:<24} {:<8} {:<21} state", "name", "role", "valid until");
+            ring.holders().iter().for_each(|holder| println!("{}", line(holder)));
+        }
+    }
+    Ok(())
+}
+
+fn line(holder: &Holder) -> String {
+    let state = match holder {
+        Holder { revoked: true, .. } => "revoked",
+        _ if holder.expires_at() <= std::time::SystemTime::now() => "expired",
+        _ => "valid",
+    };
+    format!("{:<24} {:<8} {:<21} {state}", holder.name, holder.role.name(), holder.expires)
+}
+
+/// Opens the ring that was named, or the only one in this folder.
+fn open(RingArgs { ring }: &RingArgs) -> Result<Ring> {
+    if let Some(folder) = ring {
+        return Ok(Ring::open(folder)?);
+    }
+    let entries = std::fs::read_dir(".").context("cannot look for keys in this folder; name theirs with --ring")?;
+    let mut found: Vec<PathBuf> = entries
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(|path| path.join("ring.toml").is_file())
+        .map(|path| path.strip_prefix("./").map(Path::to_owned).unwrap_or(path))
+        .collect();
+    found.sort();
+    match found.as_slice() {
+        [only] => Ok(Ring::open(only)?),
+        [] => anyhow::bail!(
+            "there are no keys in this folder; make some with `flyrig keys new RIG --host NAME`, or name their folder with --ring"
+        ),
+        several => {
+            let names: Vec<_> = several.iter().map(|path| path.display().to_string()).collect();
+            anyhow::bail!("there are several rings of keys here ({}); name one with --ring", names.join(", "))
+        }
+    }
+}
+
+/// Refuses to overwrite a key before anything is done.
+fn new_file(out: Option<&Path>, name: &str) -> Result<PathBuf> {
+    let path = out.map_or_else(|| PathBuf::from(format!("{name}.key")), Path::to_owned);
+    anyhow::ensure!(
+        !path.exists(),
+        "{} is there already; move it away, or name another file with --out",
+        path.display()
+    );
+    Ok(path)
+}
+
+fn write(key: &KeyFile, path: &Path) -> Result<()> {
+    key.write_new(path)?;
+    println!("{}", path.display());
+    let file = path.display();
+    let with = match key.role {
+        Role::Viewer => format!("flyrig view {file}, or flyrig watch {file}"),
+        Role::Cameras => format!("flyrig capture rig.toml --key {file}"),
+        Role::Relay => format!("flyrig serve {file}"),
+    };
+    eprintln!(
+        "keys: give {file} to '{}' over a channel you trust; it is used with `{with}` and valid until {}",
+        key.holder, key.expires
+    );
+    Ok(())
+}
