@@ -122,6 +122,7 @@ impl Gate {
         let list = Arc::new(List {
             folder: ring.folder().to_owned(),
             roles: roles.to_vec(),
+            read_at: Mutex::default(),
             holders: Mutex::new(ring.holders().to_vec()),
             changes: watch::Sender::new(0),
         });
@@ -189,6 +190,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 struct List {
     folder: PathBuf,
     roles: Vec<Role>,
+    read_at: Mutex<Option<SystemTime>>,
     holders: Mutex<Vec<Holder>>,
     /// Counts changes.
     changes: watch::Sender<u64>,
@@ -197,7 +199,27 @@ struct List {
 impl List {
     fn find(&self, certificate: &CertificateDer<'_>) -> Option<Holder> {
         let print = fingerprint(certificate);
-        lock(&self.holders).iter().find(|of| of.fingerprint == print).cloned()
+        let find = || lock(&self.holders).iter().find(|of| of.fingerprint == print).cloned();
+        // Of those that the authority has signed, one that is not known was added just now.
+        find().or_else(|| {
+            self.look();
+            find()
+        })
+    }
+
+    /// Reads the list again if it has changed.
+    fn look(&self) {
+        let now = list_time(&self.folder);
+        if now.is_none() || std::mem::replace(&mut *lock(&self.read_at), now) == now {
+            return;
+        }
+        match read_holders(&self.folder) {
+            Ok(holders) => {
+                *lock(&self.holders) = holders;
+                self.changes.send_modify(|count| *count += 1);
+            }
+            Err(error) => tracing::warn!("the keys stay as they were: {error}"),
+        }
     }
 
     /// Reason why a certificate is not admitted, for TLS.
@@ -213,23 +235,11 @@ impl List {
     }
 }
 
-/// Reads the list again when it has changed.
+/// Looks at the list again and again.
 async fn follow(list: &List) {
-    let mut read_at = list_time(&list.folder);
     loop {
         sleep(LOOK_EVERY).await;
-        let now = list_time(&list.folder);
-        if now == read_at || now.is_none() {
-            continue;
-        }
-        read_at = now;
-        match read_holders(&list.folder) {
-            Ok(holders) => {
-                *lock(&list.holders) = holders;
-                list.changes.send_modify(|count| *count += 1);
-            }
-            Err(error) => tracing::warn!("the keys stay as they were: {error}"),
-        }
+        list.look();
     }
 }
 
@@ -451,3 +461,8 @@ fn words(error: &std::io::Error) -> &'static str {
         None => "it hung up",
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+#[path = "gate_tests.rs"]
+mod tests;

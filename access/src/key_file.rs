@@ -15,7 +15,8 @@ const VERSION: u32 = 1;
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KeyFile {
-    version: u32,
+    /// Version of the format.
+    pub version: u32,
     /// Name of the rig.
     pub rig: String,
     /// Name of the holder.

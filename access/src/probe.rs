@@ -39,6 +39,14 @@ impl KeyFile {
         Err(AccessError::Refused(why))
     }
 
+    /// Returns the first address where the rig admits the key, or the first of all. Asks only where there are several.
+    #[must_use]
+    pub fn address(&self) -> &str {
+        let all = self.connect.as_slice();
+        let admits = |address: &&String| all.len() > 1 && self.knock_at(address).is_ok();
+        all.iter().find(admits).or(all.first()).map_or("", String::as_str)
+    }
+
     fn knock_at(&self, address: &str) -> Result<(), String> {
         let rig = &self.rig;
         let config = tls::client(&self.authority, &self.certificate, &self.private_key)?;

@@ -89,10 +89,10 @@ impl TransportConfig {
         Self { rig: rig.to_owned(), listen: vec![], connect: vec![DEFAULT_ENDPOINT.to_owned()], ..Self::default() }
     }
 
-    /// A session that shows a key to the rig that the key names.
+    /// A session that shows a key to the rig that the key names: at the first of its addresses that admits it.
     #[must_use]
     pub fn with_key(key: KeyFile) -> Self {
-        let connect = key.connect.iter().map(|address| format!("{TLS}{address}")).collect();
+        let connect = key.connect.iter().map(|address| tls_endpoint(address)).collect();
         Self { rig: key.rig.clone(), listen: vec![], connect, key: Some(key), ..Self::default() }
     }
 
@@ -173,15 +173,15 @@ impl TransportConfig {
     pub(crate) fn zenoh(
         &self,
         listen: &[String],
+        connect: &[String],
         largest: usize,
         secured: &[(&'static str, String)],
     ) -> Result<Config, TransportError> {
         let list = |endpoints: &[String]| serde_json::json!(endpoints).to_string();
         let settings = [
-            // A client has one connection, to the first of its endpoints that answers.
-            ("mode", if self.key.is_some() { "\"client\"" } else { "\"peer\"" }.to_owned()),
+            ("mode", "\"peer\"".to_owned()),
             ("listen/endpoints", list(listen)),
-            ("connect/endpoints", list(&self.connect)),
+            ("connect/endpoints", list(connect)),
             ("connect/timeout_ms", "-1".to_owned()),
             ("connect/exit_on_failure", "false".to_owned()),
             ("connect/retry", r#"{"period_init_ms":100,"period_max_ms":1000,"period_increase_factor":2}"#.to_owned()),
@@ -206,6 +206,11 @@ impl TransportConfig {
 /// Beginning of endpoints of rigs with keys.
 const TLS: &str = "tls/";
 
+/// Endpoint of a rig with keys.
+pub(crate) fn tls_endpoint(address: &str) -> String {
+    format!("{TLS}{address}")
+}
+
 /// Whether only programs of this computer reach an endpoint.
 fn is_loopback(endpoint: &str) -> bool {
     let address = endpoint.split_once('/').map_or(endpoint, |(_, address)| address);
@@ -221,7 +226,7 @@ mod tests {
     fn every_setting_is_known_to_zenoh() {
         for config in [TransportConfig::publisher("a"), TransportConfig::subscriber("a")] {
             config.validate().unwrap();
-            config.zenoh(&config.listen, LARGEST_QUESTION, &[]).unwrap();
+            config.zenoh(&config.listen, &config.connect, LARGEST_QUESTION, &[]).unwrap();
         }
     }
 

@@ -7,7 +7,7 @@ use flyrig_access::{AccessError, Gate, Inner, KeyFile, Probe, Ring, Role};
 use serde_json::json;
 use zenoh::{Session, Wait};
 
-use crate::{TransportConfig, TransportError, access_rules};
+use crate::{TransportConfig, TransportError, access_rules, config::tls_endpoint};
 
 /// Attempts at ports that somebody else takes in between.
 const ATTEMPTS: usize = 5;
@@ -46,18 +46,23 @@ pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> 
             config.rig
         );
     }
+    let connect = match &config.key {
+        // zenoh would take the others for further rigs, and connect to them again and again.
+        Some(key) => vec![tls_endpoint(key.address())],
+        None => config.connect.clone(),
+    };
     for attempt in 1.. {
         let endpoints: Vec<String> = config.listen.iter().map(|endpoint| with_free_port(endpoint)).collect();
         let behind =
             ring.as_ref().map(|ring| Ok::<_, TransportError>((ring, Inner::new()?, free_port()?))).transpose()?;
         let (mut listen, mut secured) = (endpoints.clone(), Vec::new());
         if let Some((ring, inner, port)) = &behind {
-            listen.push(format!("tls/{}", SocketAddr::from((Ipv4Addr::LOCALHOST, *port))));
+            listen.push(tls_endpoint(&SocketAddr::from((Ipv4Addr::LOCALHOST, *port)).to_string()));
             secured = behind_gate(ring, inner, roles);
         } else if let Some(key) = &config.key {
             secured = with_key(key);
         }
-        let session = match zenoh::open(config.zenoh(&listen, largest, &secured)?).wait() {
+        let session = match zenoh::open(config.zenoh(&listen, &connect, largest, &secured)?).wait() {
             Ok(session) => session,
             // Somebody else was faster to take the port.
             Err(_) if attempt < ATTEMPTS && listen != config.listen => continue,

@@ -25,7 +25,7 @@ pub fn our_clock() -> HostClock {
 }
 
 /// A computer whose clock is an hour ahead.
-fn host_clock() -> HostClock {
+pub fn host_clock() -> HostClock {
     HostClock::new(|| now_nanos() + 3_600_000_000_000)
 }
 
@@ -57,7 +57,7 @@ fn frame(camera: &str, sequence: u64) -> Frame {
 }
 
 /// Publishes frames with growing numbers until one comes out; gives it and how far its time is from the truth.
-fn publish_until_seen(host: &CameraPublisher, there: &CameraSubscriber, camera: &str, sequence: &mut u64) -> Frame {
+pub fn publish_until_seen(host: &CameraPublisher, there: &CameraSubscriber, camera: &str, sequence: &mut u64) -> Frame {
     wait_for(&format!("a frame of {camera}"), || {
         *sequence += 1;
         host.publish(frame(camera, *sequence)).unwrap();

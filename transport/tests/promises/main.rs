@@ -5,6 +5,7 @@
 mod calibration;
 mod cameras;
 mod clocks;
+mod keys;
 mod malformed;
 mod people;
 mod processes;

@@ -1,0 +1,162 @@
+//! A gate before a session that sends back what it gets.
+
+use std::{
+    io::{Read as _, Write as _},
+    net::{SocketAddr, TcpListener, TcpStream},
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use rustls_pki_types::ServerName;
+use tokio_rustls::rustls::{ClientConnection, ServerConnection, StreamOwned};
+
+use super::*;
+use crate::KeyFile;
+
+struct Place {
+    _folder: tempfile::TempDir,
+    ring: Ring,
+    gate: Gate,
+}
+
+/// A session that greets with the common name that it was shown, then sends back what it gets.
+fn session(inner: &Inner) -> SocketAddr {
+    let (certificate, key) = inner.certificate_and_key();
+    let config = tls::server(tls::client_verifier(inner.authority()).unwrap(), certificate, key).unwrap();
+    let config = Arc::new(config);
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap();
+    std::thread::spawn(move || {
+        for stream in listener.incoming() {
+            let config = Arc::clone(&config);
+            std::thread::spawn(move || {
+                let connection = ServerConnection::new(config).unwrap();
+                let mut stream = StreamOwned::new(connection, stream.unwrap());
+                let mut bytes = [0; 4096];
+                while let Ok(count @ 1..) = stream.read(&mut bytes) {
+                    let names = stream.conn.peer_certificates().unwrap()[0].to_vec();
+                    let is_viewer = names.windows(8).any(|part| part == b"viewer-0");
+                    stream.write_all(if is_viewer { b"v" } else { b"?" }).unwrap();
+                    stream.write_all(&bytes[..count]).unwrap();
+                }
+            });
+        }
+    });
+    address
+}
+
+fn place() -> Place {
+    let folder = tempfile::tempdir().unwrap();
+    let ring = Ring::create(&folder.path().join("keys"), "studio", &["127.0.0.1".to_owned()], 7450).unwrap();
+    let inner = Inner::new().unwrap();
+    let session = session(&inner);
+    let any = SocketAddr::from(([127, 0, 0, 1], 0));
+    let gate = Gate::start(&ring, &[Role::Viewer], any, inner, session).unwrap();
+    Place { _folder: folder, ring, gate }
+}
+
+impl Place {
+    fn here(&self, key: KeyFile) -> KeyFile {
+        KeyFile { connect: vec![self.gate.address().to_string()], ..key }
+    }
+
+    fn add(&mut self, name: &str) -> KeyFile {
+        let key = self.ring.add(name, Role::Viewer, 1).unwrap();
+        self.here(key)
+    }
+
+    /// A key that ends at a time, in seconds since 1970.
+    fn add_until(&mut self, name: &str, end: u64) -> KeyFile {
+        self.add(name);
+        let key = self.ring.replace_validity(name, end);
+        self.here(key)
+    }
+}
+
+fn connect(key: &KeyFile) -> StreamOwned<ClientConnection, TcpStream> {
+    let config = tls::client(&key.authority, &key.certificate, &key.private_key).unwrap();
+    let stream = TcpStream::connect(&key.connect[0]).unwrap();
+    stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+    let name = ServerName::try_from("127.0.0.1").unwrap();
+    StreamOwned::new(ClientConnection::new(Arc::new(config), name).unwrap(), stream)
+}
+
+fn echo(stream: &mut StreamOwned<ClientConnection, TcpStream>, text: &[u8]) -> Vec<u8> {
+    stream.write_all(text).unwrap();
+    let mut back = vec![0; text.len() + 1];
+    stream.read_exact(&mut back).unwrap();
+    back
+}
+
+#[test]
+fn holders_are_passed_on_under_their_number() {
+    let mut place = place();
+    let mut stream = connect(&place.add("desk"));
+    assert_eq!(echo(&mut stream, b"hello"), b"vhello");
+    let mut stream = connect(&place.add("two"));
+    assert_eq!(echo(&mut stream, b"hello"), b"?hello", "another number");
+}
+
+#[test]
+fn a_key_that_expires_is_refused_and_an_open_connection_ends() {
+    let mut place = place();
+    let why = place.add_until("old", now_secs() - 10).knock().unwrap_err().to_string();
+    assert!(why.contains("refuses the key of 'old': it expired on "), "{why}");
+    // One that ends in the middle.
+    let mut stream = connect(&place.add_until("soon", now_secs() + 3));
+    echo(&mut stream, b"hello");
+    let begun = Instant::now();
+    assert!(!matches!(stream.read(&mut [0; 9]), Ok(1..)), "nothing more comes");
+    assert!(begun.elapsed() < Duration::from_secs(8));
+}
+
+#[test]
+fn a_list_that_cannot_be_read_changes_nothing() {
+    let mut place = place();
+    let key = place.add("desk");
+    let mut stream = connect(&key);
+    echo(&mut stream, b"hello");
+    std::fs::write(place.ring.folder().join("ring.toml"), "half a li").unwrap();
+    std::thread::sleep(2 * LOOK_EVERY);
+    assert_eq!(echo(&mut stream, b"again"), b"vagain");
+    key.knock().unwrap();
+}
+
+#[test]
+fn one_key_has_its_share_of_connections() {
+    let mut place = place();
+    let key = place.add("greedy");
+    let other = place.add("other");
+    let mut open: Vec<_> = (0..CONNECTIONS_OF_ONE).map(|_| connect(&key)).collect();
+    for stream in &mut open {
+        echo(stream, b"x");
+    }
+    let mut more = connect(&key);
+    let _ = more.write_all(b"x");
+    assert!(!matches!(more.read(&mut [0; 9]), Ok(1..)));
+    assert_eq!(echo(&mut connect(&other), b"x"), b"?x");
+    drop(open);
+    // Places are given back.
+    let end = Instant::now() + Duration::from_secs(20);
+    loop {
+        let mut stream = connect(&key);
+        if stream.write_all(b"x").is_ok() && matches!(stream.read(&mut [0; 9]), Ok(1..)) {
+            break;
+        }
+        assert!(Instant::now() < end, "no place became free");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}
+
+#[test]
+fn noise_and_plain_text_get_nothing() {
+    let place = place();
+    for text in [&b"GET / HTTP/1.1\r\n\r\n"[..], &[0; 3000], &[0x16, 3, 1, 0xff, 0xff, 1, 0, 0, 1]] {
+        let mut stream = TcpStream::connect(place.gate.address()).unwrap();
+        stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+        let _ = stream.write_all(text);
+        let mut back = Vec::new();
+        let _ = stream.read_to_end(&mut back);
+        assert!(back.len() < 100, "{} bytes", back.len());
+    }
+}

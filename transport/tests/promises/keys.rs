@@ -1,0 +1,326 @@
+//! Keys: their holders do what their role lets them, from wherever they connect, and nobody else does anything.
+
+use std::{
+    net::{Ipv4Addr, SocketAddr, TcpListener},
+    path::Path,
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use flyrig_access::{KeyFile, Ring, Role};
+use flyrig_transport::{
+    CameraPublisher, CameraSubscriber, Interests, Publisher, Subscriber, TransportConfig, ViewpointStatus, Views,
+};
+use flyrig_types::Lens;
+use tempfile::TempDir;
+use zenoh::{Session, Wait, sample::SampleKind};
+
+use crate::{
+    cameras::{self, host_clock, our_clock},
+    support::*,
+};
+
+/// A new ring at a port that is free, and so is the next.
+fn ring() -> (TempDir, Ring) {
+    let folder = tempfile::tempdir().unwrap();
+    let port = wait_for("two free ports", || {
+        let port = TcpListener::bind("0.0.0.0:0").unwrap().local_addr().unwrap().port();
+        TcpListener::bind(("0.0.0.0", port.checked_add(1)?)).is_ok().then_some(port)
+    });
+    let ring = Ring::create(&folder.path().join("keys"), "test", &["127.0.0.1".to_owned()], port).unwrap();
+    (folder, ring)
+}
+
+fn open_rig(ring: &Ring) -> Publisher {
+    open_publisher(|config| config.keys = ring.folder().to_owned())
+}
+
+fn open_viewer(key: &KeyFile, interests: &Interests) -> Subscriber {
+    Subscriber::open(&TransportConfig::with_key(key.clone()), interests).unwrap()
+}
+
+fn everything() -> Interests {
+    Interests { views: Views::All, splats: true, people: true, stats: true }
+}
+
+/// A session of somebody who has a key and sticks to no rules.
+fn outlaw(key: &KeyFile) -> Session {
+    use base64::{Engine as _, engine::general_purpose::STANDARD};
+    let quoted = |text: &str| serde_json::json!(STANDARD.encode(text)).to_string();
+    let endpoints: Vec<String> = key.connect.iter().map(|address| format!("tls/{address}")).collect();
+    let mut config = zenoh::Config::default();
+    for (name, value) in [
+        ("mode", "\"peer\"".to_owned()),
+        ("listen/endpoints", "[]".to_owned()),
+        ("connect/endpoints", serde_json::json!(endpoints).to_string()),
+        ("scouting/multicast/enabled", "false".to_owned()),
+        ("transport/link/tls/enable_mtls", "true".to_owned()),
+        ("transport/link/tls/root_ca_certificate_base64", quoted(&key.authority)),
+        ("transport/link/tls/connect_certificate_base64", quoted(&key.certificate)),
+        ("transport/link/tls/connect_private_key_base64", quoted(&key.private_key)),
+    ] {
+        config.insert_json5(name, &value).unwrap();
+    }
+    zenoh::open(config).wait().unwrap()
+}
+
+/// Payload of what an outlaw sends.
+const OWN: &str = "false";
+
+/// Counts what a session receives for an expression, but for what `known` is of another subscription of its own.
+fn count(session: &Session, expression: &str, known: fn(&str) -> bool) -> Arc<AtomicU64> {
+    let counter = Arc::<AtomicU64>::default();
+    let counted = counter.clone();
+    session
+        .declare_subscriber(expression)
+        .callback(move |sample| {
+            // Its own messages come back to it without leaving.
+            let is_own = sample.payload().to_bytes() == OWN.as_bytes();
+            if !known(sample.key_expr().as_str()) && sample.kind() == SampleKind::Put && !is_own {
+                counted.fetch_add(1, Ordering::Relaxed);
+            }
+        })
+        .background()
+        .wait()
+        .unwrap();
+    counter
+}
+
+#[test]
+fn a_key_is_all_that_a_viewer_needs() {
+    let (_folder, mut ring) = ring();
+    let rig = open_rig(&ring);
+    // Added while the rig runs.
+    let key = ring.add("desk", Role::Viewer, 10).unwrap();
+    let file = ring.folder().join("desk.key");
+    key.write_new(&file).unwrap();
+    let key = KeyFile::read(&file, &[Role::Viewer]).unwrap();
+    let viewer = open_viewer(&key, &everything());
+    publish_until_seen(&rig, &viewer, "main", &mut 0);
+    rig.set_calibration(&crate::support::rig()).unwrap();
+    wait_for("the calibration", || viewer.rig(Duration::ZERO).unwrap());
+    assert_eq!(viewer.publishers(), 1);
+    assert_eq!(viewer.trouble(), None);
+    // A viewpoint of its own.
+    viewer.request_viewpoint(&camera("mine", Lens::PINHOLE), 15.0).unwrap();
+    let asked = wait_for("the request", || rig.requested_viewpoints().pop());
+    assert!(asked.subscriber.starts_with(&format!("{}.", key.topic_name)), "{}", asked.subscriber);
+    wait_until("the answer", || matches!(viewer.viewpoint_status(), ViewpointStatus::Granted { .. }));
+    publish_until_seen(&rig, &viewer, &asked.view, &mut 0);
+    // It leaves no trace.
+    drop(viewer);
+    wait_until("the end of its viewpoint", || rig.requested_viewpoints().is_empty());
+}
+
+#[test]
+fn programs_of_the_same_computer_need_no_key() {
+    let (_folder, ring) = ring();
+    let rig = open_rig(&ring);
+    let viewer = open_subscriber(&rig, &everything());
+    publish_until_seen(&rig, &viewer, "main", &mut 0);
+}
+
+#[test]
+fn a_viewer_reads_nobody_elses_viewpoint_and_publishes_nothing() {
+    let (_folder, mut ring) = ring();
+    let rig = open_rig(&ring);
+    let (honest, spy) = (ring.add("desk", Role::Viewer, 10).unwrap(), ring.add("spy", Role::Viewer, 10).unwrap());
+    let viewer = open_viewer(&honest, &everything());
+    viewer.request_viewpoint(&camera("mine", Lens::PINHOLE), 15.0).unwrap();
+    let asked = wait_for("the request", || rig.requested_viewpoints().pop());
+
+    let spy = outlaw(&spy);
+    let all = count(&spy, "**", |key| key.contains("/view/"));
+    let theirs = count(&spy, "flyrig/v1/test/viewer/*/view", |_| false);
+    let allowed = count(&spy, "flyrig/v1/test/view/*", |_| false);
+    let cameras = count(&spy, "flyrig/v1/test/camera/*", |_| false);
+    // It sends under every name of the rig's.
+    let mut frame = 0;
+    let end = Instant::now() + PATIENCE;
+    while allowed.load(Ordering::Relaxed) < 20 {
+        assert!(Instant::now() < end, "the views that it may have did not come");
+        for key in ["view/main", "person/0/motion", "stats", "transforms", "camera/a", "splats"] {
+            spy.put(format!("flyrig/v1/test/{key}"), OWN).wait().unwrap();
+        }
+        let renewed = spy.get(format!("flyrig/v1/test/viewpoint/{}", viewer.id())).payload("{}").wait().unwrap();
+        assert!(renewed.recv_timeout(Duration::from_millis(2)).ok().flatten().is_none());
+        publish_until_seen(&rig, &viewer, &asked.view, &mut frame);
+        publish_until_seen(&rig, &viewer, "main", &mut frame);
+    }
+    for (counter, what) in [(all, "everything"), (theirs, "viewpoints"), (cameras, "cameras")] {
+        assert_eq!(counter.load(Ordering::Relaxed), 0, "{what}");
+    }
+    // Nothing of the spy's has come, neither here nor at the rig: nothing was unreadable.
+    assert_eq!(viewer.unreadable(), 0);
+    assert_eq!(rig.requested_viewpoints().len(), 1);
+    assert_eq!(rig.viewpoint_counts().refused, 0, "its questions did not even arrive");
+}
+
+#[test]
+fn a_revoked_key_is_disconnected_within_two_seconds_and_its_number_may_be_given_again() {
+    let (_folder, mut ring) = ring();
+    let rig = open_rig(&ring);
+    let (gone, stays) = (ring.add("gone", Role::Viewer, 10).unwrap(), ring.add("stays", Role::Viewer, 10).unwrap());
+    let (one, two) = (open_viewer(&gone, &everything()), open_viewer(&stays, &everything()));
+    let mut frame = 0;
+    publish_until_seen(&rig, &one, "main", &mut frame);
+    publish_until_seen(&rig, &two, "main", &mut frame);
+    ring.revoke("gone").unwrap();
+    let revoked = Instant::now();
+    wait_until("the end of the connection", || one.publishers() == 0);
+    assert!(revoked.elapsed() < Duration::from_secs(2), "{:?}", revoked.elapsed());
+    let trouble = wait_for("the reason", || one.trouble());
+    assert!(trouble.contains("refuses the key of 'gone': it was revoked"), "{trouble}");
+    publish_until_seen(&rig, &two, "main", &mut frame);
+    // The number is free; the old certificate stays refused.
+    let next = ring.add("next", Role::Viewer, 10).unwrap();
+    assert_eq!(next.topic_name, gone.topic_name);
+    publish_until_seen(&rig, &open_viewer(&next, &everything()), "main", &mut frame);
+    assert!(gone.knock().unwrap_err().to_string().contains("it was revoked"));
+    // A renewed key takes the old one's place.
+    let renewed = ring.renew("stays", 10).unwrap();
+    wait_until("the end of the old one", || two.publishers() == 0);
+    publish_until_seen(&rig, &open_viewer(&renewed, &everything()), "main", &mut frame);
+}
+
+#[test]
+fn whoever_has_no_key_of_this_rig_is_told_so() {
+    let (_folder, mut ring) = ring();
+    let (_other_folder, mut other) = self::ring();
+    let rig = open_rig(&ring);
+    let (desk, cameras) = (ring.add("desk", Role::Viewer, 10).unwrap(), ring.add("cams", Role::Cameras, 10).unwrap());
+    let spy = other.add("spy", Role::Viewer, 10).unwrap();
+    let refused = |key: KeyFile| wait_for("a refusal", || key.knock().err()).to_string();
+    // Key of another rig, which expects that one here.
+    let at_ours = |key: &KeyFile| KeyFile { connect: desk.connect.clone(), ..key.clone() };
+    let reason = refused(at_ours(&spy));
+    assert!(reason.contains("is not the rig 'test': its certificate is signed by somebody else"), "{reason}");
+    // Key of another rig, whose holder knows our authority.
+    let forged = KeyFile { authority: desk.authority.clone(), ..at_ours(&spy) };
+    assert!(refused(forged.clone()).contains("refuses the key of 'spy': it is of another rig"));
+    let reason = refused(at_ours(&cameras));
+    assert!(reason.contains("has another port"), "{reason}");
+    let nowhere = KeyFile { connect: vec!["127.0.0.1:1".to_owned()], ..desk.clone() };
+    assert!(refused(nowhere).contains("nobody answers at 127.0.0.1:1"));
+    desk.knock().unwrap();
+    // Nothing comes to any of them.
+    for key in [at_ours(&spy), forged] {
+        let (viewer, mut frame) = (open_viewer(&key, &everything()), 0);
+        let trouble = wait_for("the reason", || viewer.trouble());
+        assert!(trouble.contains("test"), "{trouble}");
+        for _ in 0..50 {
+            frame += 1;
+            rig.publish_view("main", view(frame, 9)).unwrap();
+            assert!(viewer.next_view(Duration::from_millis(2)).unwrap().is_none());
+        }
+        assert_eq!(viewer.publishers(), 0);
+    }
+}
+
+/// As one with a certificate of a public authority would be, which zenoh trusts.
+#[test]
+fn a_server_that_is_not_the_rig_gets_nothing_and_gives_nothing() {
+    let (_folder, mut ring) = ring();
+    let (_other_folder, mut other) = self::ring();
+    let false_rig = open_rig(&other);
+    let (mine, theirs) = (ring.add("desk", Role::Viewer, 10).unwrap(), other.add("desk", Role::Viewer, 10).unwrap());
+    // It admits this viewer, and the viewer trusts its authority; it has another name.
+    let misled = KeyFile { rig_certificate_name: mine.rig_certificate_name, ..theirs.clone() };
+    let (viewer, mut frame) = (open_viewer(&misled, &everything()), 0);
+    let honest = open_viewer(&theirs, &everything());
+    viewer.request_viewpoint(&camera("mine", Lens::PINHOLE), 15.0).unwrap();
+    for _ in 0..20 {
+        publish_until_seen(&false_rig, &honest, "main", &mut frame);
+        assert!(viewer.next_view(Duration::from_millis(2)).unwrap().is_none());
+    }
+    assert_eq!(viewer.publishers(), 0);
+    assert!(false_rig.requested_viewpoints().is_empty(), "not even a question leaves");
+}
+
+#[test]
+fn cameras_of_another_computer_need_a_key_alone_and_read_nothing() {
+    let (_folder, mut ring) = ring();
+    let key = ring.add("cams", Role::Cameras, 10).unwrap();
+    let config =
+        TransportConfig { keys: ring.folder().to_owned(), listen: Vec::new(), ..TransportConfig::publisher("test") };
+    let there = CameraSubscriber::open(&config, &["a".into()], our_clock()).unwrap();
+    let here = CameraPublisher::open(&TransportConfig::with_key(key.clone()), &["a".into()], host_clock()).unwrap();
+    let mut sequence = 0;
+    cameras::publish_until_seen(&here, &there, "a", &mut sequence);
+    assert!(there.link(&"a".into()).clock.is_some(), "the clock was compared");
+    // Nobody else's camera, nothing of the people, even where both are on one computer.
+    let rig = open_publisher(|config| config.connect = Vec::new());
+    let outlaw = outlaw(&key);
+    let all = count(&outlaw, "**", |_| false);
+    let images = count(&outlaw, "flyrig/v1/test/camera/*", |_| false);
+    for _ in 0..30 {
+        outlaw.put("flyrig/v1/test/view/main", OWN).wait().unwrap();
+        rig.publish_view("main", view(1, 9)).unwrap();
+        cameras::publish_until_seen(&here, &there, "a", &mut sequence);
+    }
+    assert_eq!((all.load(Ordering::Relaxed), images.load(Ordering::Relaxed)), (0, 0));
+    ring.revoke("cams").unwrap();
+    wait_until("the word that it is gone", || there.absence(&"a".into()).contains("gone from the network"));
+    let trouble = wait_for("the reason", || here.trouble());
+    assert!(trouble.contains("it was revoked"), "{trouble}");
+}
+
+#[test]
+fn viewers_come_back_when_the_rig_does() {
+    let (_folder, mut ring) = ring();
+    let key = ring.add("desk", Role::Viewer, 10).unwrap();
+    // First of all, the viewer.
+    let viewer = open_viewer(&key, &everything());
+    let trouble = wait_for("a reason", || viewer.trouble());
+    assert!(trouble.contains("nobody answers at 127.0.0.1"), "{trouble}");
+    let mut frame = 0;
+    for _ in 0..2 {
+        let rig = open_rig(&ring);
+        publish_until_seen(&rig, &viewer, "main", &mut frame);
+        wait_until("no more trouble", || viewer.trouble().is_none());
+        drop(rig);
+        wait_until("the end of the rig", || viewer.publishers() == 0);
+    }
+}
+
+#[test]
+fn half_open_connections_of_others_keep_nobody_out() {
+    let (_folder, mut ring) = ring();
+    let rig = open_rig(&ring);
+    let key = ring.add("desk", Role::Viewer, 10).unwrap();
+    let gate = SocketAddr::from((Ipv4Addr::LOCALHOST, rig.gate().unwrap().port()));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build().unwrap();
+    let connect = || {
+        // From an address of their own.
+        let socket = tokio::net::TcpSocket::new_v4()?;
+        socket.bind(SocketAddr::from(([127, 0, 0, 2], 0)))?;
+        runtime.block_on(socket.connect(gate))
+    };
+    let silent: Vec<_> = (0..300).map(|_| connect().unwrap()).collect();
+    let begun = Instant::now();
+    let viewer = open_viewer(&key, &everything());
+    publish_until_seen(&rig, &viewer, "main", &mut 0);
+    assert!(begun.elapsed() < Duration::from_secs(3), "{:?}", begun.elapsed());
+    drop(silent);
+}
+
+#[test]
+fn keys_of_another_rig_or_none_are_named() {
+    let (_folder, ring) = ring();
+    let config = TransportConfig {
+        listen: vec!["tcp/127.0.0.1:0".to_owned()],
+        keys: ring.folder().to_owned(),
+        ..TransportConfig::publisher("another")
+    };
+    let refused = |config: &TransportConfig| Publisher::open(config).unwrap_err().to_string();
+    assert!(refused(&config).contains("these are of the rig 'test', not of 'another'"), "{}", refused(&config));
+    let config = TransportConfig { keys: Path::new("/none/at/all").to_owned(), rig: "test".to_owned(), ..config };
+    assert!(refused(&config).contains("/none/at/all/ring.toml: cannot be read"), "{}", refused(&config));
+    // Two rigs cannot have one gate.
+    let _first = open_rig(&ring);
+    let config = TransportConfig { keys: ring.folder().to_owned(), ..config };
+    assert!(refused(&config).contains("is another rig with keys running?"), "{}", refused(&config));
+}
