@@ -17,7 +17,7 @@ use crate::{
 
 /// Port of the gate for viewers unless another one is chosen; cameras have the next.
 pub const DEFAULT_PORT: u16 = 7450;
-/// Most holders of a role.
+/// Most holders at a time.
 pub const MAX_HOLDERS: usize = 256;
 /// Largest file that is read, bytes.
 const MAX_BYTES: u64 = 1 << 20;
@@ -37,7 +37,7 @@ pub struct Holder {
     pub name: String,
     /// What it may do.
     pub role: Role,
-    /// Its number among the holders of its role, 0..[`MAX_HOLDERS`].
+    /// Its number among the holders, 0..[`MAX_HOLDERS`].
     pub number: usize,
     /// Time after which it is refused, RFC 3339.
     pub expires: String,
@@ -282,10 +282,9 @@ impl Ring {
             )));
         }
         // Numbers of holders who are revoked are free: they are refused by their certificates.
-        let taken =
-            |number: &usize| self.list.holders.iter().any(|of| of.role == role && of.number == *number && !of.revoked);
+        let taken = |number: &usize| self.list.holders.iter().any(|of| of.number == *number && !of.revoked);
         let Some(number) = (0..MAX_HOLDERS).find(|number| !taken(number)) else {
-            return Err(AccessError::Request(format!("there are {MAX_HOLDERS} keys of this role already; revoke one")));
+            return Err(AccessError::Request(format!("there are {MAX_HOLDERS} keys already; revoke one")));
         };
         self.issue(name, role, number, days)
     }

@@ -10,7 +10,7 @@ pub enum Role {
     Viewer,
     /// Sends images of cameras. Receives nothing but questions for its clock.
     Cameras,
-    /// Watches, and passes everything on to viewers that have a key of the relay's own ring.
+    /// Watches as a viewer does, and may pass people on to viewers of its own.
     Relay,
 }
 

@@ -568,9 +568,10 @@ pub struct DemoArgs {
 #[derive(Debug, Args)]
 pub struct RigArgs {
     /// Key file for a rig of another computer (`flyrig keys add`); a rig of this computer needs none.
+    #[arg(id = "key_file", value_name = "KEY")]
     pub key: Option<PathBuf>,
     /// Name of the rig; that of the key otherwise, or "flyrig".
-    #[arg(long, conflicts_with = "key")]
+    #[arg(long, conflicts_with = "key_file")]
     pub rig: Option<String>,
     /// Where the rig or a router listens (zenoh endpoint); the addresses of the key otherwise, or "tcp/127.0.0.1:7447".
     #[arg(long)]
@@ -771,6 +772,9 @@ pub struct ViewArgs {
 pub struct ServeArgs {
     #[command(flatten)]
     pub rig: RigArgs,
+    /// Folder of keys of this relay (`flyrig keys new RIG --host THIS-COMPUTER`): their holders watch the rig through it with `flyrig view`.
+    #[arg(long, value_name = "FOLDER")]
+    pub keys: Option<PathBuf>,
     #[command(flatten)]
     pub web: WebConfig,
 }

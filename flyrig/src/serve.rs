@@ -1,9 +1,13 @@
 //! `flyrig serve`: a web page on which browsers show the people of a running rig.
 
-use std::time::Duration;
+use std::{
+    net::{Ipv4Addr, TcpListener},
+    time::Duration,
+};
 
-use anyhow::Result;
+use anyhow::{Context as _, Result};
 use flyrig_report::stop;
+use flyrig_transport::{Relay, TransportConfig};
 use flyrig_web::{WebConfig, WebServer};
 
 use crate::cli::ServeArgs;
@@ -23,20 +27,47 @@ pub fn print_fingerprint(command: &str, server: &WebServer, config: &WebConfig) 
     }
 }
 
+/// Endpoint where the page finds the relay beside it, for as long as the program runs.
+fn free_endpoint() -> Result<String> {
+    let free = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).and_then(|listener| listener.local_addr());
+    Ok(format!("tcp/{}", free.context("no free port on this computer")?))
+}
+
 /// Runs the command.
 pub fn serve(args: &ServeArgs) -> Result<()> {
     stop::flag();
-    let transport = args.rig.transport()?;
+    let mut transport = args.rig.transport()?;
     let (rig, connect) = (transport.rig.clone(), transport.connect.join(", "));
+    let relay = args.keys.clone().map(|keys| -> Result<Relay> {
+        let listen = vec![free_endpoint()?];
+        let relay = Relay::start(
+            &transport,
+            &TransportConfig { keys, listen: listen.clone(), ..TransportConfig::publisher(&rig) },
+        )?;
+        // Browsers and viewers share what the rig sends.
+        transport = TransportConfig { connect: listen, ..TransportConfig::subscriber(&rig) };
+        Ok(relay)
+    });
+    let relay = relay.transpose()?;
     let server = WebServer::start(&args.web, transport)?;
     eprintln!("serve: rig '{rig}' at {connect}; open {} in a browser (Ctrl-C ends)", server.link());
     print_fingerprint("serve", &server, &args.web);
-    let mut browsers = 0;
+    let (mut browsers, mut state) = (0, String::new());
     while !stop::requested() {
         std::thread::sleep(TURN);
         let now = server.browsers();
         if std::mem::replace(&mut browsers, now) != now {
             eprintln!("serve: {now} browsers");
+        }
+        let Some(relay) = &relay else { continue };
+        let now = match (relay.trouble(), relay.gate()) {
+            (Some(trouble), _) => trouble,
+            (None, Some(gate)) => format!("passing rig '{rig}' on to holders of this relay's keys at {gate}"),
+            (None, None) => continue,
+        };
+        if now != state {
+            eprintln!("serve: {now}");
+            state = now;
         }
     }
     Ok(())

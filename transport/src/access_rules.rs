@@ -27,16 +27,45 @@ fn rule(id: &str, flow: &str, messages: &[&str], key_exprs: &[String]) -> Value 
     json!({ "id": id, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": key_exprs })
 }
 
-/// Rules of the side behind a gate: programs of this computer may do everything, holders what their role lets them.
+/// Rules of a session as zenoh's `access_control`.
+#[derive(Default)]
+struct Rules {
+    rules: Vec<Value>,
+    subjects: Vec<Value>,
+    policies: Vec<Value>,
+}
+
+impl Rules {
+    /// Lets a subject do everything, in both directions.
+    fn allow_everything(&mut self, name: &str, subject: Value) {
+        let both = [(FROM, format!("{name}-from")), (TO, format!("{name}-to"))];
+        self.rules.extend(both.iter().map(|(flow, id)| rule(id, flow, &ALL, &["**".to_owned()])));
+        self.policies.push(json!({ "rules": both.map(|(_, id)| id), "subjects": [name] }));
+        self.subjects.push(subject);
+    }
+
+    fn control(self) -> Value {
+        let Self { rules, subjects, policies } = self;
+        json!({ "enabled": true, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies })
+    }
+}
+
+/// Rules of a session with a key: only the rig's own certificate counts. zenoh trusts the web's public authorities, too.
+pub(crate) fn with_key(key: &KeyFile) -> Value {
+    let mut rules = Rules::default();
+    rules.allow_everything("rig", json!({ "id": "rig", "cert_common_names": [key.rig_certificate_name] }));
+    rules.control()
+}
+
+/// Rules of a session behind a gate: programs of this computer may do everything, holders of these roles what their role lets them, each
+/// by its number.
 pub(crate) fn behind_gate(ring: &Ring, roles: &[Role]) -> Value {
+    let mut all = Rules::default();
+    all.allow_everything("local", json!({ "id": "local", "link_protocols": ["tcp"] }));
+    let Rules { rules, subjects, policies } = &mut all;
     let rig = ring.rig();
     let key = |rest: &str| keys::key(rig, rest);
     let alive = [keys::any_version_alive(rig)];
-    let mut rules =
-        vec![rule("local-from", FROM, &ALL, &["**".to_owned()]), rule("local-to", TO, &ALL, &["**".to_owned()])];
-    let mut subjects = vec![json!({ "id": "local", "link_protocols": ["tcp"] })];
-    let mut policies = vec![json!({ "rules": ["local-from", "local-to"], "subjects": ["local"] })];
-
     let watched: Vec<String> =
         ["person/**", "view/*", "stats", "calibration/*", "transforms", "splats", "splats/*"].map(key).to_vec();
     let templates = [key("template/*")];
@@ -72,8 +101,7 @@ pub(crate) fn behind_gate(ring: &Ring, roles: &[Role]) -> Value {
             match role {
                 Role::Cameras => allowed.extend(sending.map(str::to_owned)),
                 Role::Viewer | Role::Relay => {
-                    // A relay's viewers have names of its own ring, which it keeps apart itself.
-                    let own = if *role == Role::Viewer { ring.names_of(number) } else { "*".to_owned() };
+                    let own = ring.names_of(number);
                     let view = [key(&format!("viewer/{own}/view"))];
                     let viewpoint = [key(&format!("viewpoint/{own}"))];
                     let token = [key(&format!("viewer/{own}/alive"))];
@@ -93,19 +121,5 @@ pub(crate) fn behind_gate(ring: &Ring, roles: &[Role]) -> Value {
             policies.push(json!({ "rules": allowed, "subjects": [name] }));
         }
     }
-    control(rules, subjects, policies)
-}
-
-/// Rules of the side with a key: only the rig's own certificate counts. zenoh trusts the web's public authorities, too.
-pub(crate) fn with_key(key: &KeyFile) -> Value {
-    let everything = ["**".to_owned()];
-    control(
-        vec![rule("rig-from", FROM, &ALL, &everything), rule("rig-to", TO, &ALL, &everything)],
-        vec![json!({ "id": "rig", "cert_common_names": [key.rig_certificate_name] })],
-        vec![json!({ "rules": ["rig-from", "rig-to"], "subjects": ["rig"] })],
-    )
-}
-
-fn control(rules: Vec<Value>, subjects: Vec<Value>, policies: Vec<Value>) -> Value {
-    json!({ "enabled": true, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies })
+    all.control()
 }

@@ -121,6 +121,9 @@ impl TransportConfig {
                 ));
             }
         }
+        if self.has_keys() && self.key.is_some() {
+            return Err(TransportError::config("keys", "a session either shows a key or admits holders of keys"));
+        }
         if self.multicast && (self.has_keys() || self.key.is_some()) {
             return Err(TransportError::config(
                 "multicast",
@@ -168,14 +171,14 @@ impl TransportConfig {
     }
 
     /// The zenoh configuration that this means. `largest` is the size of the largest message that anybody may send to
-    /// this session, bytes: a connection with a larger one is ended by zenoh before the message is assembled. `secured` are settings
-    /// that keys need besides.
+    /// this session, bytes: a connection with a larger one is ended by zenoh before the message is assembled. `others` are
+    /// further settings, which keys need.
     pub(crate) fn zenoh(
         &self,
         listen: &[String],
         connect: &[String],
         largest: usize,
-        secured: &[(&'static str, String)],
+        others: &[(&'static str, String)],
     ) -> Result<Config, TransportError> {
         let list = |endpoints: &[String]| serde_json::json!(endpoints).to_string();
         let settings = [
@@ -196,7 +199,7 @@ impl TransportConfig {
             ("transport/link/rx/max_message_size", largest.to_string()),
         ];
         let mut config = Config::default();
-        for (key, value) in settings.iter().chain(secured) {
+        for (key, value) in settings.iter().chain(others) {
             config.insert_json5(key, value).map_err(|error| TransportError::config(*key, error.to_string()))?;
         }
         Ok(config)
@@ -212,7 +215,7 @@ pub(crate) fn tls_endpoint(address: &str) -> String {
 }
 
 /// Whether only programs of this computer reach an endpoint.
-fn is_loopback(endpoint: &str) -> bool {
+pub(crate) fn is_loopback(endpoint: &str) -> bool {
     let address = endpoint.split_once('/').map_or(endpoint, |(_, address)| address);
     let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
     host.eq_ignore_ascii_case("localhost") || host.parse::<std::net::IpAddr>().is_ok_and(|ip| ip.is_loopback())

@@ -228,7 +228,9 @@ impl Drain {
             .ok_or_else(|| TransportError::session(topic.label.clone(), &"zenoh has not taken the topic yet"))?;
         let payload = pending.body.encode(&topic.name)?;
         let len = payload.len();
-        let header = Header { publisher: self.shared.publisher_id, host: self.shared.host_id, ..pending.header };
+        // What is passed on keeps the host whose clock its times are of.
+        let host = if pending.header.host == 0 { self.shared.host_id } else { pending.header.host };
+        let header = Header { publisher: self.shared.publisher_id, host, ..pending.header };
         let put = publisher.put(payload).attachment(pending.attachment(header));
         put.wait().map_err(|error| TransportError::session(topic.label.clone(), &error))?;
         Ok(len)

@@ -14,7 +14,8 @@ use prost::bytes::Bytes;
 use zenoh::{Wait, liveliness::LivelinessToken, query::Query, sample::SampleKind};
 
 use crate::{
-    Header, MessageKind, RigStats, SplatState, TransportConfig, TransportError, ViewFrame, Viewpoint,
+    Header, MessageKind, PersonMessage, Received, RigStats, SplatState, TransportConfig, TransportError, ViewFrame,
+    Viewpoint,
     calibration::{encode_calibration, encode_transforms},
     config::LARGEST_QUESTION,
     drain::{Drain, DrainThread, Retained, Shared, empty_header},
@@ -201,7 +202,17 @@ impl Publisher {
     /// replaced.
     pub fn publish_person(&self, stamp: &Stamp, layer: Option<usize>, bytes: Bytes) -> PublishOutcome {
         let header = Header { frame: stamp.frame, capture_nanos: stamp.capture_nanos, ..empty_header() };
-        let topics = self.people.topics(stamp.person, &self.shared);
+        self.offer_person(stamp.person, layer, bytes, header)
+    }
+
+    /// Hands in a message of the person stream of another publisher, with its times.
+    pub(crate) fn pass_on(&self, received: Received<PersonMessage>) -> PublishOutcome {
+        let PersonMessage { person, layer, bytes } = received.body;
+        self.offer_person(person, layer, bytes, received.header)
+    }
+
+    fn offer_person(&self, person: u32, layer: Option<usize>, bytes: Bytes, header: Header) -> PublishOutcome {
+        let topics = self.people.topics(person, &self.shared);
         topics
             .get(layer.map_or(0, |layer| layer + 1))
             .map_or(PublishOutcome::Unwatched, |topic| self.offer(topic, Body::Bytes(bytes), header))

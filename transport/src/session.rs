@@ -7,8 +7,13 @@ use flyrig_access::{AccessError, Gate, Inner, KeyFile, Probe, Ring, Role};
 use serde_json::json;
 use zenoh::{Session, Wait};
 
-use crate::{TransportConfig, TransportError, access_rules, config::tls_endpoint};
+use crate::{
+    TransportConfig, TransportError, access_rules,
+    config::{is_loopback, tls_endpoint},
+};
 
+/// Bytes that the system keeps between a session and its gate.
+const SEND_BUFFER: u32 = 64 << 10;
 /// Attempts at ports that somebody else takes in between.
 const ATTEMPTS: usize = 5;
 
@@ -30,8 +35,8 @@ impl From<AccessError> for TransportError {
     }
 }
 
-/// Opens a session that holders of keys of these roles may reach, where the settings name keys. `largest` bytes are the most that a
-/// message to this session may have.
+/// Opens a session of a rig, viewer or computer with cameras. Holders of keys of these roles may reach it, where the settings name keys.
+/// `largest` bytes are the most that a message to this session may have.
 pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> Result<Opened, TransportError> {
     let ring = (config.has_keys() && !roles.is_empty()).then(|| Ring::open(&config.keys)).transpose()?;
     if let Some(ring) = ring.as_ref().filter(|ring| ring.rig() != config.rig) {
@@ -39,8 +44,7 @@ pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> 
             format!("these are of the rig '{}', not of '{}'; name others, or rig.name", ring.rig(), config.rig);
         return Err(TransportError::config(format!("keys {}", config.keys.display()), problem));
     }
-    if config.insecure && !config.listen.is_empty() {
-        let listen = config.listen.join(", ");
+    if let Some(listen) = config.listen.iter().find(|endpoint| !is_loopback(endpoint)) {
         tracing::warn!(
             "INSECURE: whoever reaches {listen} can watch the people of rig '{}' and publish in its name",
             config.rig
@@ -55,14 +59,10 @@ pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> 
         let endpoints: Vec<String> = config.listen.iter().map(|endpoint| with_free_port(endpoint)).collect();
         let behind =
             ring.as_ref().map(|ring| Ok::<_, TransportError>((ring, Inner::new()?, free_port()?))).transpose()?;
-        let (mut listen, mut secured) = (endpoints.clone(), Vec::new());
-        if let Some((ring, inner, port)) = &behind {
-            listen.push(tls_endpoint(&SocketAddr::from((Ipv4Addr::LOCALHOST, *port)).to_string()));
-            secured = behind_gate(ring, inner, roles);
-        } else if let Some(key) = &config.key {
-            secured = with_key(key);
-        }
-        let session = match zenoh::open(config.zenoh(&listen, &connect, largest, &secured)?).wait() {
+        let mut listen = endpoints.clone();
+        listen.extend(behind.iter().map(|(.., port)| tls_endpoint(&at_session(*port).to_string())));
+        let settings = secured(behind.as_ref().map(|(ring, inner, _)| (*ring, inner)), roles, config.key.as_ref());
+        let session = match zenoh::open(config.zenoh(&listen, &connect, largest, &settings)?).wait() {
             Ok(session) => session,
             // Somebody else was faster to take the port.
             Err(_) if attempt < ATTEMPTS && listen != config.listen => continue,
@@ -73,7 +73,7 @@ pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> 
         };
         let gate = behind.map(|(ring, inner, port)| {
             let address = ring.address(roles.first().copied().unwrap_or(Role::Viewer));
-            Gate::start(ring, roles, address, inner, SocketAddr::from((Ipv4Addr::LOCALHOST, port)))
+            Gate::start(ring, roles, address, inner, at_session(port))
         });
         return Ok(Opened { session, endpoints, gate: gate.transpose()? });
     }
@@ -88,31 +88,40 @@ pub(crate) fn probe(
     Ok(config.key.clone().map(|key| Probe::start(key, is_connected)).transpose()?)
 }
 
-fn quoted(text: &str) -> String {
-    json!(STANDARD.encode(text)).to_string()
+/// Where a gate finds the session behind it.
+fn at_session(port: u16) -> SocketAddr {
+    SocketAddr::from((Ipv4Addr::LOCALHOST, port))
 }
 
-fn behind_gate(ring: &Ring, inner: &Inner, roles: &[Role]) -> Vec<(&'static str, String)> {
-    let (certificate, key) = inner.certificate_and_key();
-    vec![
+/// zenoh's settings of a session behind a gate, or of one that shows a key.
+fn secured(behind: Option<(&Ring, &Inner)>, roles: &[Role], key: Option<&KeyFile>) -> Vec<(&'static str, String)> {
+    let base64 = |text: &str| json!(STANDARD.encode(text)).to_string();
+    let (authority, mut settings, rules) = match (behind, key) {
+        (Some((ring, inner)), _) => {
+            let (certificate, secret) = inner.certificate_and_key();
+            let settings = vec![
+                ("transport/link/tls/listen_certificate_base64", base64(certificate)),
+                ("transport/link/tls/listen_private_key_base64", base64(secret)),
+                // What lies in the socket cannot be overtaken by newer motion.
+                ("transport/link/tls/so_sndbuf", SEND_BUFFER.to_string()),
+            ];
+            (inner.authority(), settings, access_rules::behind_gate(ring, roles))
+        }
+        (None, Some(key)) => {
+            let settings = vec![
+                ("transport/link/tls/connect_certificate_base64", base64(&key.certificate)),
+                ("transport/link/tls/connect_private_key_base64", base64(&key.private_key)),
+            ];
+            (key.authority.as_str(), settings, access_rules::with_key(key))
+        }
+        (None, None) => return Vec::new(),
+    };
+    settings.extend([
         ("transport/link/tls/enable_mtls", "true".to_owned()),
-        ("transport/link/tls/root_ca_certificate_base64", quoted(inner.authority())),
-        ("transport/link/tls/listen_certificate_base64", quoted(certificate)),
-        ("transport/link/tls/listen_private_key_base64", quoted(key)),
-        // What lies in the socket cannot be overtaken by newer motion.
-        ("transport/link/tls/so_sndbuf", (64 << 10).to_string()),
-        ("access_control", access_rules::behind_gate(ring, roles).to_string()),
-    ]
-}
-
-fn with_key(key: &KeyFile) -> Vec<(&'static str, String)> {
-    vec![
-        ("transport/link/tls/enable_mtls", "true".to_owned()),
-        ("transport/link/tls/root_ca_certificate_base64", quoted(&key.authority)),
-        ("transport/link/tls/connect_certificate_base64", quoted(&key.certificate)),
-        ("transport/link/tls/connect_private_key_base64", quoted(&key.private_key)),
-        ("access_control", access_rules::with_key(key).to_string()),
-    ]
+        ("transport/link/tls/root_ca_certificate_base64", base64(authority)),
+        ("access_control", rules.to_string()),
+    ]);
+    settings
 }
 
 fn free_port() -> Result<u16, TransportError> {

@@ -53,7 +53,7 @@ pub(crate) enum Body {
 #[derive(Debug)]
 pub(crate) struct Pending {
     pub body: Body,
-    /// Its `publisher` and `host` are filled in when it is sent.
+    /// Its `publisher` is filled in when it is sent, and its `host` unless it is another one's.
     pub header: Header,
     /// Messages of the topic before this one that did not leave.
     pub withheld: u64,
@@ -100,7 +100,9 @@ impl Topic {
         let mut state = lock(&self.state);
         header.kind = self.kind;
         header.sequence = state.sequence;
-        header.publish_unix_nanos = header::unix_nanos();
+        if header.host == 0 {
+            header.publish_unix_nanos = header::unix_nanos();
+        }
         state.sequence += 1;
         state.counts.offered += 1;
         if !self.is_watched() {

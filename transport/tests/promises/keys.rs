@@ -11,8 +11,9 @@ use std::{
 };
 
 use flyrig_access::{KeyFile, Ring, Role};
+use flyrig_stream::{Motion, MotionEncoder, Stamp};
 use flyrig_transport::{
-    CameraPublisher, CameraSubscriber, Interests, Publisher, Subscriber, TransportConfig, ViewpointStatus, Views,
+    CameraPublisher, CameraSubscriber, Interests, Publisher, Relay, Subscriber, TransportConfig, ViewpointStatus, Views,
 };
 use flyrig_types::Lens;
 use tempfile::TempDir;
@@ -20,6 +21,7 @@ use zenoh::{Session, Wait, sample::SampleKind};
 
 use crate::{
     cameras::{self, host_clock, our_clock},
+    people,
     support::*,
 };
 
@@ -323,4 +325,62 @@ fn keys_of_another_rig_or_none_are_named() {
     let _first = open_rig(&ring);
     let config = TransportConfig { keys: ring.folder().to_owned(), ..config };
     assert!(refused(&config).contains("is another rig with keys running?"), "{}", refused(&config));
+}
+
+#[test]
+fn a_relay_passes_people_on_to_its_own_viewers() {
+    let (_folder, mut ring) = ring();
+    let (_relay_folder, mut of_relay) = self::ring();
+    let key = ring.add("hall", Role::Relay, 10).unwrap();
+    let guest = of_relay.add("guest", Role::Viewer, 10).unwrap();
+    let endpoint = free_endpoint();
+    let to = TransportConfig {
+        keys: of_relay.folder().to_owned(),
+        listen: vec![endpoint.clone()],
+        ..TransportConfig::publisher("test")
+    };
+    let relay = Relay::start(&TransportConfig::with_key(key), &to).unwrap();
+    let viewer = open_viewer(&guest, &everything());
+    let beside = Subscriber::open(&subscriber_config(&[endpoint]), &everything()).unwrap();
+    let trouble = wait_for("the reason", || relay.trouble().filter(|text| text.contains("nobody answers at")));
+    assert!(trouble.contains("rig test"), "{trouble}");
+    assert_eq!(viewer.publishers(), 0);
+    for gaussians in [20_000, 30_000] {
+        // The second time with other people.
+        let rig = open_rig(&ring);
+        rig.set_calibration(&crate::support::rig()).unwrap();
+        let encoded = people::encoded(gaussians);
+        let mut encoder = MotionEncoder::new(&encoded);
+        let (hash, template) = (encoded.template.hash, encoded.bytes);
+        rig.offer_template(7, hash, template.clone().into());
+        let (mut frame, mut fetched) = (0, None);
+        let mut seen = [false; 2];
+        while seen != [true; 2] {
+            frame += 1;
+            let stamp = Stamp { person: 7, frame, capture_nanos: 5, template: hash };
+            let motion = Motion { stamp, joint_rotations: vec![[0.0, 0.0, 0.0, 1.0]], ..Motion::default() };
+            rig.publish_person(&stamp, None, encoder.encode(&motion).unwrap().into());
+            for (viewer, seen) in [&viewer, &beside].into_iter().zip(&mut seen) {
+                while let Some(received) = viewer.next_person(Duration::from_millis(20)).unwrap() {
+                    if received.header.frame > 0 && received.body.person == 7 {
+                        assert_eq!((received.header.capture_nanos, received.latency_is_exact), (5, true));
+                        *seen = true;
+                    }
+                }
+            }
+            fetched = fetched.or_else(|| viewer.template(hash, Duration::from_millis(50)).unwrap());
+        }
+        let fetched = fetched.or_else(|| viewer.template(hash, PATIENCE).unwrap());
+        assert_eq!(fetched, Some(template));
+        wait_for("the calibration", || viewer.rig(Duration::ZERO).unwrap());
+        wait_until("no more trouble", || relay.trouble().is_none());
+        drop(rig);
+        // The relay does not pretend to be the rig.
+        wait_until("the end of the rig", || viewer.publishers() == 0 && beside.publishers() == 0);
+    }
+    of_relay.revoke("guest").unwrap();
+    let rig = open_rig(&ring);
+    rig.set_calibration(&crate::support::rig()).unwrap();
+    wait_until("the relay", || beside.publishers() == 1);
+    wait_until("the reason", || viewer.trouble().is_some_and(|why| why.contains("it was revoked")));
 }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use flyrig_stream::{LAYERS, MAX_MESSAGE_BYTES, Stamp, StreamJoint, StreamTemplate, TemplateSource};
+use flyrig_stream::{EncodedTemplate, LAYERS, MAX_MESSAGE_BYTES, Stamp, StreamJoint, StreamTemplate, TemplateSource};
 use flyrig_transport::{Interests, MAX_PERSON_TOPICS, PersonMessage, PublishOutcome, Received, Subscriber};
 
 use crate::support::*;
@@ -11,8 +11,8 @@ fn people() -> Interests {
     Interests { people: true, ..Interests::default() }
 }
 
-/// Bytes of a template that takes several chunks.
-fn template(count: usize) -> Vec<u8> {
+/// A template that takes several chunks.
+pub fn encoded(count: usize) -> EncodedTemplate {
     let joint = StreamJoint {
         parent: None,
         translation: [0.0; 3],
@@ -29,7 +29,11 @@ fn template(count: usize) -> Vec<u8> {
         node_weights: &[],
         nodes: &[],
     };
-    source.encode().unwrap().bytes
+    source.encode().unwrap()
+}
+
+fn template(count: usize) -> Vec<u8> {
+    encoded(count).bytes
 }
 
 fn next(subscriber: &Subscriber) -> Option<Received<PersonMessage>> {
