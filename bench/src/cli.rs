@@ -50,6 +50,8 @@ pub enum BenchCommand {
     Watch(BenchWatchArgs),
     /// The person stream: bytes and run times against what it loses; writes a table, CSV, JSON and SVG.
     Stream(BenchStreamArgs),
+    /// What a viewer has of a take that `flyrig play --repeat` publishes at the other end of a line: rates, age, errors.
+    Receive(BenchReceiveArgs),
     /// Masks estimated in each camera independently, against which several calibrations are scored.
     Masks(BenchMasksArgs),
     /// Pose, shape and masks from images: errors, and what each of them costs in the views; writes a table and JSON.
@@ -154,6 +156,30 @@ pub struct BenchBudgetArgs {
     /// Folder of the results.
     #[arg(long, default_value = "out/bench-budget")]
     pub out: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub struct BenchReceiveArgs {
+    /// The recording that is played (`flyrig watch --record`).
+    pub take: PathBuf,
+    /// Key to the rig.
+    #[arg(long, conflicts_with_all = ["rig", "connect"])]
+    pub key: Option<PathBuf>,
+    /// Name of the rig.
+    #[arg(long, default_value = "flyrig")]
+    pub rig: String,
+    /// Where it is published (zenoh endpoint).
+    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
+    pub connect: String,
+    /// Seconds from the start to the end.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_seconds)]
+    pub seconds: f64,
+    /// Name of the line in the results.
+    #[arg(long, default_value = "loopback")]
+    pub label: String,
+    /// File of the results (JSON).
+    #[arg(long)]
+    pub out: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]

@@ -12,6 +12,7 @@ mod mask_errors;
 mod masks;
 mod perception;
 mod processor;
+mod receive;
 mod recording;
 mod rest;
 mod scale;
@@ -67,6 +68,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         BenchCommand::Hands(args) => hands::hands(args, &gpu()?),
         BenchCommand::Landmarks(args) => landmarks::landmarks(args),
         BenchCommand::Stream(args) => stream::stream(args, &gpu()?),
+        BenchCommand::Receive(args) => receive::receive(args, &gpu()?),
         BenchCommand::Watch(args) => watch::watch(args, &gpu()?),
         BenchCommand::Masks(args) => masks::masks(args),
         BenchCommand::Perception(args) => perception::perception(args, &gpu()?),

@@ -100,7 +100,7 @@ fn write(key: &KeyFile, path: &Path) -> Result<()> {
     println!("{}", path.display());
     let file = path.display();
     let with = match key.role {
-        Role::Viewer => format!("flyrig view {file}, or flyrig watch {file}"),
+        Role::Viewer => format!("flyrig view {file}"),
         Role::Cameras => format!("flyrig capture rig.toml --key {file}"),
         Role::Relay => format!("flyrig serve {file}"),
     };

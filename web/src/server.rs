@@ -2,7 +2,7 @@
 
 use std::{
     convert::Infallible,
-    net::SocketAddr,
+    net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket},
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
@@ -72,6 +72,8 @@ const HEADERS: [(&str, &str); 5] = [
 #[derive(Debug)]
 pub struct WebServer {
     address: SocketAddr,
+    /// Name of this computer.
+    name: Option<String>,
     token: Token,
     /// SHA-256 of the certificate; `None` without HTTPS.
     fingerprint: Option<String>,
@@ -104,7 +106,7 @@ impl WebServer {
         let with_tls = !config.certificate.as_os_str().is_empty()
             || !config.key.as_os_str().is_empty()
             || !is_loopback && !config.insecure;
-        let tls = with_tls.then(|| Tls::new(config, wanted)).transpose()?;
+        let tls = with_tls.then(|| Tls::new(config, reached_at(wanted))).transpose()?;
         let start = |problem: String| WebError::Start(problem);
         let token =
             if is_loopback { Token::NONE } else { Token::random().map_err(|error| start(error.to_string()))? };
@@ -141,7 +143,17 @@ impl WebServer {
         let (fed, until) = (Arc::clone(&hub), Arc::clone(&ended));
         let upstream = SupervisedThread::start("web upstream", move || upstream::run(&transport, &fed, &until));
         let upstream = upstream.map_err(|error| start(error.to_string()))?;
-        Ok(Self { address, token, fingerprint, hub, upstream, ended, stop: Some(stop), thread: Some(thread) })
+        Ok(Self {
+            address,
+            name: config.names.first().cloned(),
+            token,
+            fingerprint,
+            hub,
+            upstream,
+            ended,
+            stop: Some(stop),
+            thread: Some(thread),
+        })
     }
 
     /// Address that is listened on.
@@ -150,11 +162,15 @@ impl WebServer {
         self.address
     }
 
-    /// Link to the page, with the token where one is needed.
+    /// Link to the page, with the token where one is needed: at the first of this computer's names that were given, or at its address.
     #[must_use]
     pub fn link(&self) -> String {
         let scheme = if self.fingerprint.is_some() { "https" } else { "http" };
-        format!("{scheme}://{}/{}", self.address, self.token.fragment())
+        let host = match &self.name {
+            Some(name) if self.address.ip().is_unspecified() => format!("{name}:{}", self.address.port()),
+            _ => reached_at(self.address).to_string(),
+        };
+        format!("{scheme}://{host}/{}", self.token.fragment())
     }
 
     /// SHA-256 of the server's certificate, as browsers write it; `None` without HTTPS.
@@ -185,6 +201,21 @@ impl Drop for WebServer {
         }
         self.upstream.join();
     }
+}
+
+/// The address itself, or of one that means all: that under which this computer reaches others. Nothing is sent to find it.
+fn reached_at(address: SocketAddr) -> SocketAddr {
+    if !address.ip().is_unspecified() {
+        return address;
+    }
+    let elsewhere = if address.is_ipv4() { "192.0.2.1:9" } else { "[2001:db8::1]:9" };
+    let own = UdpSocket::bind((address.ip(), 0)).and_then(|socket| {
+        socket.connect(elsewhere)?;
+        socket.local_addr()
+    });
+    // Without a network there is loopback alone.
+    let loopback: IpAddr = if address.is_ipv4() { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() };
+    SocketAddr::new(own.map_or(loopback, |own| own.ip()), address.port())
 }
 
 /// Must be called inside of the runtime.

@@ -87,7 +87,7 @@ fn self_signed(config: &WebConfig, address: SocketAddr) -> Result<(String, Strin
     let failed = |error: rcgen::Error| WebError::Start(format!("no certificate can be made ({error})"));
     let own = [IpAddr::from([127, 0, 0, 1]), address.ip()].map(|ip| ip.to_string());
     let mut names = vec!["localhost".to_owned()];
-    names.extend(own.into_iter().filter(|ip| ip != "0.0.0.0" && ip != "::").chain(config.names.iter().cloned()));
+    names.extend(own.into_iter().chain(config.names.iter().cloned()));
     names.dedup();
     let key = KeyPair::generate().map_err(failed)?;
     let mut parameters = CertificateParams::new(names).map_err(failed)?;

@@ -301,6 +301,7 @@ fn other_computers_are_served_through_https() {
     let server = WebServer::start(&config, transport).unwrap();
     let address = SocketAddr::from(([127, 0, 0, 1], server.address().port()));
     let link = server.link();
+    assert!(!link.contains("0.0.0.0"), "{link}");
     assert!(link.starts_with("https://") && server.fingerprint().is_some(), "{link}");
     let token = link.split_once('#').unwrap().1.to_owned();
     let answer = ask(address, "GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n");

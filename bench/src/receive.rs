@@ -1,0 +1,222 @@
+//! `flyrig-bench receive`: what a viewer has of a take that `flyrig play --repeat` publishes at the other end of a line.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::{Arc, mpsc::sync_channel},
+    time::{Duration, Instant},
+};
+
+use anyhow::{Context as _, Result, ensure};
+use flyrig_access::{KeyFile, Role};
+use flyrig_capture::recorded_messages;
+use flyrig_gpu::GpuContext;
+use flyrig_metrics::{Picture, person_box, psnr};
+use flyrig_report::{progress_bar, stop, write_whole};
+use flyrig_stream::{Posed, StreamTemplate, stamp_of};
+use flyrig_transport::{FetchedTemplate, Interests, Subscriber, TransportConfig};
+use flyrig_types::{Camera, Mask, RenderedView};
+use flyrig_viewer::{Scene, clock_secs};
+use flyrig_viewing::{People, Taken};
+use serde::Serialize;
+
+use crate::cli::BenchReceiveArgs;
+
+/// Topic of `flyrig watch --record`, and its kinds of messages.
+const TOPIC: &str = "person-stream";
+const MOTION: u8 = 255;
+const TEMPLATE: u8 = 254;
+/// How often what is displayed is compared.
+const COMPARE_EVERY: Duration = Duration::from_secs(1);
+/// How often the age of what is displayed is looked at.
+const LOOK_EVERY: Duration = Duration::from_millis(10);
+
+type Colors = Arc<Vec<[f32; 4]>>;
+
+/// What a viewer had.
+#[derive(Debug, Default, Serialize)]
+struct Row {
+    line: String,
+    /// From the start to the first motion, and to all colours, seconds.
+    motion_after_secs: Option<f64>,
+    complete_after_secs: Option<f64>,
+    /// Of the time after everything was there.
+    motions_per_second: f64,
+    colors_per_second: f64,
+    kilobytes_per_second: f64,
+    /// Age of the newest motion, over all instants, milliseconds.
+    age_p50_ms: f64,
+    age_p99_ms: f64,
+    longest_gap_secs: f64,
+    /// Views of what is displayed against views of the same frame received without a line.
+    mean_db: Option<f64>,
+    worst_db: Option<f64>,
+}
+
+/// Colours after each frame, for somebody who misses nothing.
+fn reference(args: &BenchReceiveArgs) -> Result<BTreeMap<u64, Colors>> {
+    let mut people = People::default();
+    let mut known = BTreeMap::new();
+    // Colours of the first frames are complete in the second round.
+    for round in 0..2 {
+        for (_, message) in recorded_messages(&args.take, TOPIC)? {
+            let Some((&[kind, ref person @ ..], bytes)) = message.split_first_chunk::<5>() else { continue };
+            let person = u32::from_le_bytes(*person);
+            if kind == TEMPLATE {
+                if round == 0 {
+                    people.meet(person, Arc::new(StreamTemplate::decode(bytes)?));
+                }
+                continue;
+            }
+            let frame = stamp_of(bytes)?.frame;
+            people.take(person, kind == MOTION, bytes, 0.0)?;
+            if let Some(person) = people.get_mut(person).filter(|_| round == 1)
+                && let Some(motion) = person.motion_at(0.0, false)
+            {
+                known.insert(frame, person.pose(&motion, &mut Posed::default()));
+            }
+        }
+    }
+    ensure!(!known.is_empty(), "{} has no person stream; record one with flyrig watch --record", args.take.display());
+    Ok(known)
+}
+
+/// Runs the command.
+pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
+    let known = reference(args)?;
+    let config = match &args.key {
+        Some(path) => TransportConfig::with_key(KeyFile::read(path, &[Role::Viewer, Role::Relay])?),
+        None => TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) },
+    };
+    let start = Instant::now();
+    let subscriber = Subscriber::open(&config, &Interests { people: true, ..Interests::default() })?;
+    let mut templates = subscriber.template_fetcher()?;
+    let mut people = People::default();
+    let mut row = Row { line: args.label.clone(), ..Row::default() };
+    let (mut ages, mut bytes, mut motions, mut colors) = (Vec::new(), 0, 0u64, 0u64);
+    let (mut newest, mut last_motion): (Option<i64>, Option<Instant>) = (None, None);
+    let (mut looked, mut compared) = (start, start);
+    // Drawing must not keep messages waiting: only the newest of a topic waits.
+    let (views, drawn) = sync_channel::<(Posed, Colors, Colors, Camera)>(4);
+    let drawing = std::thread::spawn({
+        let gpu = gpu.fastest();
+        move || -> Result<Vec<f64>> {
+            let mut scene = Scene::new(&gpu)?;
+            let mut scores = Vec::new();
+            for (posed, ours, wanted, camera) in drawn {
+                let mut draw = |colors: &Colors| -> Result<RenderedView> {
+                    scene.set_people([(&posed, colors.as_slice())])?;
+                    Ok(scene.draw(&camera)?)
+                };
+                scores.extend(compare(&draw(&ours)?, &draw(&wanted)?)?);
+            }
+            Ok(scores)
+        }
+    });
+    let bar = progress_bar(args.seconds as u64, "bench receive");
+    while start.elapsed().as_secs_f64() < args.seconds && !stop::requested() {
+        bar.set_position(start.elapsed().as_secs());
+        if let Some(FetchedTemplate { people: of, bytes, .. }) = templates.take().unwrap_or_default() {
+            let template = Arc::new(StreamTemplate::decode(&bytes)?);
+            of.into_iter().for_each(|person| people.meet(person, Arc::clone(&template)));
+        }
+        let received = subscriber.next_person(Duration::from_millis(5))?;
+        let now = Instant::now();
+        let is_counted = row.complete_after_secs.is_some();
+        if let Some(received) = received {
+            let message = received.body;
+            let is_motion = message.layer.is_none();
+            ensure!(received.latency_is_exact, "both ends must be on one computer, whose clock ages are read from");
+            let taken = people.take(message.person, is_motion, &message.bytes, clock_secs());
+            if let Ok(Taken::Needs(hash)) = taken {
+                templates.ask(message.person, hash);
+            }
+            if is_counted {
+                bytes += message.bytes.len();
+                motions += u64::from(is_motion);
+                colors += u64::from(!is_motion);
+            }
+            if is_motion && matches!(taken, Ok(Taken::Applied)) {
+                row.motion_after_secs.get_or_insert(start.elapsed().as_secs_f64());
+                if let Some(last) = last_motion.replace(now).filter(|_| is_counted) {
+                    row.longest_gap_secs = row.longest_gap_secs.max((now - last).as_secs_f64());
+                }
+                newest = newest.max(Some(received.header.capture_nanos));
+            }
+        }
+        let Some((_, person)) = people.iter().next() else { continue };
+        if person.is_complete() && !is_counted {
+            row.complete_after_secs = Some(start.elapsed().as_secs_f64());
+        }
+        if let Some(newest) = newest.filter(|_| is_counted && looked.elapsed() >= LOOK_EVERY) {
+            looked = now;
+            ages.push(1e3 * (clock_secs() - newest as f64 / 1e9));
+        }
+        if is_counted && compared.elapsed() >= COMPARE_EVERY {
+            compared = now;
+            let number = people.iter().next().map_or(0, |(number, _)| number);
+            let camera = subscriber.rig(Duration::ZERO)?.and_then(|rig| rig.cameras.into_iter().next());
+            if let (Some(person), Some(camera)) = (people.get_mut(number), camera)
+                && let Some(motion) = person.motion_at(clock_secs(), false)
+                && let Some(wanted) = known.get(&motion.stamp.frame)
+            {
+                let mut posed = Posed::default();
+                let ours = person.pose(&motion, &mut posed);
+                // One that is not drawn in time is left out.
+                drop(views.try_send((posed, ours, Arc::clone(wanted), camera)));
+            }
+        }
+    }
+    bar.finish_and_clear();
+    drop(views);
+    let scores = drawing.join().map_err(|_| anyhow::anyhow!("drawing broke off"))??;
+    let counted = row.complete_after_secs.map_or(0.0, |after| start.elapsed().as_secs_f64() - after);
+    if counted > 0.0 {
+        row.motions_per_second = motions as f64 / counted;
+        row.colors_per_second = colors as f64 / counted;
+        row.kilobytes_per_second = bytes as f64 / counted / 1e3;
+    }
+    ages.sort_by(f64::total_cmp);
+    let rank = |share: f64| ages.get(((ages.len() as f64 * share) as usize).min(ages.len().saturating_sub(1))).copied();
+    (row.age_p50_ms, row.age_p99_ms) = (rank(0.5).unwrap_or(0.0), rank(0.99).unwrap_or(0.0));
+    row.mean_db = (!scores.is_empty()).then(|| scores.iter().sum::<f64>() / scores.len() as f64);
+    row.worst_db = scores.iter().copied().min_by(f64::total_cmp);
+    println!("{}", text(&row));
+    if let Some(out) = &args.out {
+        write_whole(out, &serde_json::to_vec_pretty(&row)?)?;
+    }
+    let frames: BTreeSet<u64> = known.keys().copied().collect();
+    row.motion_after_secs
+        .map(drop)
+        .with_context(|| format!("nothing came of the {} frames of the take: {:?}", frames.len(), subscriber.trouble()))
+}
+
+/// Decibels within the person's box; None where nobody is seen or nothing differs.
+fn compare(ours: &RenderedView, wanted: &RenderedView) -> Result<Option<f64>> {
+    let (width, height) = (wanted.width, wanted.height);
+    let mask = Mask::new(width, height, wanted.rgba.chunks_exact(4).map(|p| p[3]).collect())?;
+    let Ok(area) = person_box(&mask, 8) else { return Ok(None) };
+    let score =
+        psnr(&Picture::on_black(width, height, &ours.rgba)?, &Picture::on_black(width, height, &wanted.rgba)?, area)?;
+    // Bytes without a difference: as good as a whole view can be.
+    Ok(Some(score.min(99.0)))
+}
+
+fn text(row: &Row) -> String {
+    let number = |value: Option<f64>, digits: usize| value.map_or("-".to_owned(), |value| format!("{value:.digits$}"));
+    format!(
+        "| line | first motion s | complete s | motions/s | colours/s | KB/s | age p50 ms | p99 | longest gap s | displayed dB | worst |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|\n\
+         | {} | {} | {} | {:.1} | {:.1} | {:.0} | {:.0} | {:.0} | {:.2} | {} | {} |",
+        row.line,
+        number(row.motion_after_secs, 2),
+        number(row.complete_after_secs, 2),
+        row.motions_per_second,
+        row.colors_per_second,
+        row.kilobytes_per_second,
+        row.age_p50_ms,
+        row.age_p99_ms,
+        row.longest_gap_secs,
+        number(row.mean_db, 1),
+        number(row.worst_db, 1),
+    )
+}
