@@ -1,0 +1,98 @@
+//! Keys from the command line: whoever was given one watches or sends cameras with that file alone.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
+
+use std::{
+    net::TcpListener,
+    process::{Child, Command, Stdio},
+};
+
+use flyrig_tests::run;
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
+
+/// Ends the process when the test ends, however it does.
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A port that is free, and so is the next.
+fn free_port() -> u16 {
+    let port = || TcpListener::bind("0.0.0.0:0").unwrap().local_addr().unwrap().port();
+    (0..100).map(|_| port()).find(|port| TcpListener::bind(("0.0.0.0", port + 1)).is_ok()).unwrap()
+}
+
+#[test]
+fn a_key_file_is_all_that_another_computer_needs() {
+    let folder = tempfile::tempdir().unwrap();
+    let port = free_port().to_string();
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    let done = |args: &[&str]| {
+        let output = command(args);
+        assert_eq!(output.code, Some(0), "{args:?}: {output:?}");
+        output
+    };
+    let refused = |args: &[&str], part: &str| {
+        let output = command(args);
+        assert_eq!(output.code, Some(1), "{args:?}: {output:?}");
+        assert!(output.stderr.contains(part), "{args:?}: {}", output.stderr);
+    };
+    let simulated = "[source]\nkind = \"sim\"\ncameras = [\"00\", \"01\"]\n\
+                     [sim]\nwidth = 64\nheight = 64\ntexture_px = 64\nfps = 10.0\ncameras.count = 2\n";
+    write("cameras.toml", &format!("[rig]\nname = \"elsewhere\"\n{simulated}"));
+    done(&["sim", "export", "cameras.toml", "--out", "calibration", "--frames", "1", "--no-truth"]);
+
+    let made = done(&["keys", "new", "stage", "--host", "127.0.0.1", "--port", &port]);
+    assert!(made.stdout.trim() == "stage-keys" && made.stderr.contains("keys = \"stage-keys\""), "{made:?}");
+    done(&["keys", "add", "left-pc", "--role", "cameras"]);
+    done(&["keys", "add", "desk"]);
+    let listed = done(&["keys", "list"]).stdout;
+    for (name, role) in [("left-pc", "cameras"), ("desk", "viewer")] {
+        assert!(listed.lines().any(|line| line.starts_with(name) && line.contains(role) && line.ends_with("valid")));
+    }
+    refused(&["keys", "add", "desk"], "desk.key is there already");
+    refused(&["keys", "new", "stage", "--host", "127.0.0.1"], "stage-keys: is there already");
+    refused(&["keys", "revoke", "nobody"], "'nobody' has no key; known: left-pc, desk");
+    refused(&["capture", "cameras.toml", "--key", "desk.key"], "desk.key: is a key of role viewer");
+    refused(&["watch", "left-pc.key", "--seconds", "1"], "left-pc.key: is a key of role cameras");
+    refused(&["watch", "cameras.toml", "--seconds", "1"], "cameras.toml: is no key");
+    refused(&["watch", "desk.key", "--record", "x.mcap", "--seconds", "5"], "nobody answers at 127.0.0.1");
+
+    // The cameras' computer knows the rig from its key, and listens nowhere.
+    let mut cameras = Command::new(PROGRAM);
+    cameras.args(["capture", "cameras.toml", "--key", "left-pc.key"]).current_dir(folder.path()).stderr(Stdio::null());
+    let cameras = Running(cameras.spawn().unwrap());
+    let rig = "[rig]\nname = \"stage\"\n[source]\nkind = \"network\"\npath = \"calibration\"\ncameras = [\"00\", \"01\"]\n\
+               [perception]\npose = \"estimated\"\nmasks = \"estimated\"\n[transport]\n";
+    write("rig.toml", &format!("{rig}keys = \"stage-keys\"\n"));
+    write("open.toml", &format!("{rig}keys = \"stage-keys\"\nlisten = [\"tcp/0.0.0.0:7447\"]\n"));
+    write("bare.toml", &format!("{rig}listen = [\"tcp/0.0.0.0:7447\"]\nconnect = [\"tcp/10.0.0.2:7447\"]\n"));
+    write("other.toml", &format!("{}keys = \"stage-keys\"\n", rig.replace("stage", "hall")));
+    refused(&["config", "check", "open.toml"], "holders of keys connect at the address in transport.keys");
+    refused(&["config", "check", "bare.toml"], "flyrig keys new stage --host NAME-OF-THIS-COMPUTER");
+    refused(&["record", "other.toml", "--out", "x.mcap", "--seconds", "1"], "of the rig 'stage', not of 'hall'");
+    let take = |n: u32| format!("take{n}.mcap");
+    let sets = |n: u32| {
+        done(&["record", "rig.toml", "--out", &take(n), "--seconds", "4"]);
+        let replayed = command(&["replay", &take(n)]).stdout;
+        replayed.lines().find_map(|line| line.strip_prefix("sets: ")?.split(' ').next()?.parse::<usize>().ok())
+    };
+    assert!((0..8).filter_map(sets).any(|complete| complete > 3), "no sets came");
+
+    // Away, and back with a new key.
+    done(&["keys", "revoke", "left-pc"]);
+    assert!(
+        done(&["keys", "list"]).stdout.lines().any(|line| line.starts_with("left-pc") && line.ends_with("revoked"))
+    );
+    let silent = done(&["record", "rig.toml", "--out", "none.mcap", "--seconds", "3"]);
+    assert!(silent.stderr.contains("its key was revoked"), "{}", silent.stderr);
+    drop(cameras);
+    std::fs::remove_file(folder.path().join("desk.key")).unwrap();
+    let renewed = done(&["keys", "renew", "desk"]);
+    assert!(renewed.stderr.contains("the old key of 'desk' is refused"), "{}", renewed.stderr);
+}
