@@ -89,8 +89,10 @@ fn a_key_file_is_all_that_another_computer_needs() {
     assert!(
         done(&["keys", "list"]).stdout.lines().any(|line| line.starts_with("left-pc") && line.ends_with("revoked"))
     );
-    let silent = done(&["record", "rig.toml", "--out", "none.mcap", "--seconds", "3"]);
-    assert!(silent.stderr.contains("its key was revoked"), "{}", silent.stderr);
+    let silent = command(&["record", "rig.toml", "--out", "none.mcap", "--seconds", "3"]);
+    for part in ["its key was revoked", "run `flyrig capture rig.toml --key KEY` on it"] {
+        assert!(silent.code == Some(1) && silent.stderr.contains(part), "{}", silent.stderr);
+    }
     drop(cameras);
     std::fs::remove_file(folder.path().join("desk.key")).unwrap();
     let renewed = done(&["keys", "renew", "desk"]);

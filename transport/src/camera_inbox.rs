@@ -217,11 +217,12 @@ impl CameraInbox {
         CameraLink { clock: host.and_then(|host| host.fit.estimate(now_nanos)), ..slot.link.clone() }
     }
 
-    pub fn absence(&self, camera: &CameraId, connect: &[String]) -> String {
-        printable(&self.absence_of(camera, connect)).into_owned()
+    /// `how` says how a computer gets here.
+    pub fn absence(&self, camera: &CameraId, how: &str) -> String {
+        printable(&self.absence_of(camera, how)).into_owned()
     }
 
-    fn absence_of(&self, camera: &CameraId, connect: &[String]) -> String {
+    fn absence_of(&self, camera: &CameraId, how: &str) -> String {
         let Some(slot) = self.slots.iter().find(|slot| slot.camera == *camera) else {
             return "was not asked for".into();
         };
@@ -270,11 +271,7 @@ impl CameraInbox {
                 quoted(rigs)
             );
         }
-        format!(
-            "no computer of rig '{rig}' is there; run `flyrig capture` on it, and let transport.connect ({}) name its \
-             transport.listen",
-            connect.join(", ")
-        )
+        format!("no computer of rig '{rig}' is there; {how}")
     }
 }
 

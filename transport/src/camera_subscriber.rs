@@ -54,7 +54,8 @@ pub struct CameraSubscriber {
     shared: Arc<Shared>,
     asker: Asker,
     session: Session,
-    connect: Vec<String>,
+    /// How a computer with cameras gets here.
+    how: String,
     /// Admits computers with keys.
     gate: Option<Gate>,
     closed: bool,
@@ -124,9 +125,17 @@ impl CameraSubscriber {
             lock(&taking.inbox).clock(host, asked, answer, answered);
         };
         let asker = Asker::start(session.clone(), clock, hosts, take)?;
-        let mut connect = config.connect.clone();
-        connect.extend(gate.as_ref().map(|gate| format!("{}, with a key", gate.address())));
-        Ok(Self { shared, asker, session, connect, gate, closed: false })
+        let how = match &gate {
+            Some(gate) => format!(
+                "run `flyrig capture rig.toml --key KEY` on it, with a key of role cameras; it is expected at port {}",
+                gate.address().port()
+            ),
+            None => format!(
+                "run `flyrig capture` on it, and let transport.connect ({}) name its transport.listen",
+                config.connect.join(", ")
+            ),
+        };
+        Ok(Self { shared, asker, session, how, gate, closed: false })
     }
 
     /// Address where computers with keys connect; None without keys.
@@ -170,7 +179,7 @@ impl CameraSubscriber {
     /// Why nothing comes of a camera, and the fix.
     #[must_use]
     pub fn absence(&self, camera: &CameraId) -> String {
-        lock(&self.shared.inbox).absence(camera, &self.connect)
+        lock(&self.shared.inbox).absence(camera, &self.how)
     }
 
     /// Ends the session; dropping does the same but says nothing.

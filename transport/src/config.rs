@@ -193,7 +193,8 @@ impl TransportConfig {
             ("scouting/multicast/enabled", self.multicast.to_string()),
             // Gossip would connect the viewers of one rig to each other for nothing.
             ("scouting/gossip/enabled", self.multicast.to_string()),
-            ("transport/shared_memory/enabled", self.shared_memory.to_string()),
+            // Whoever needs a key is on another computer.
+            ("transport/shared_memory/enabled", (self.shared_memory && self.key.is_none()).to_string()),
             // zenoh's 2 batches of 64 KiB overflow when several images leave at once; 8 hold two frames of four views.
             ("transport/link/tx/queue/size/data", "8".to_owned()),
             ("transport/link/rx/max_message_size", largest.to_string()),

@@ -270,12 +270,15 @@ mod tests {
     use std::sync::atomic::AtomicU64;
 
     use super::*;
-    use crate::{TransportConfig, publisher::open_session};
+    use crate::{
+        TransportConfig,
+        session::{self, Opened},
+    };
 
     /// A drain of one topic, and how it is offered a message.
     fn drain() -> (Drain, Arc<Topic>) {
         let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
-        let (session, _) = open_session(&config, 1 << 16).unwrap();
+        let Opened { session, .. } = session::open(&config, 1 << 16, &[]).unwrap();
         let topic = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
         let leases = Leases::new(0, Duration::ZERO, 0);
         let (shared, woken) = Shared::new("drill", &session, std::slice::from_ref(&topic), leases);

@@ -13,7 +13,7 @@ use crate::{
 };
 
 /// Bytes that the system keeps between a session and its gate.
-const SEND_BUFFER: u32 = 64 << 10;
+const SEND_BUFFER: u32 = 16 << 10;
 /// Attempts at ports that somebody else takes in between.
 const ATTEMPTS: usize = 5;
 
