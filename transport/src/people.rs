@@ -25,9 +25,9 @@ use crate::{
 /// Bytes of a template in a reply: it fits in one batch of zenoh's, so that a slow line drops no fragments.
 const CHUNK: usize = 60_000;
 /// Chunks that are asked for at once.
-const AT_ONCE: u32 = 8;
+const AT_ONCE: u32 = 4;
 /// How long a chunk is waited for.
-const CHUNK_PATIENCE: Duration = Duration::from_secs(4);
+const CHUNK_PATIENCE: Duration = Duration::from_secs(2);
 
 /// A message of the person stream, as it came.
 #[derive(Debug, Clone, PartialEq)]
