@@ -26,10 +26,11 @@ fn session(inner: &Inner) -> SocketAddr {
     let config = Arc::new(config);
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap();
-    std::thread::spawn(move || {
+    let spawn = |work: Box<dyn FnOnce() + Send>| drop(Builder::new().name("session".to_owned()).spawn(work).unwrap());
+    spawn(Box::new(move || {
         for stream in listener.incoming() {
             let config = Arc::clone(&config);
-            std::thread::spawn(move || {
+            spawn(Box::new(move || {
                 let connection = ServerConnection::new(config).unwrap();
                 let mut stream = StreamOwned::new(connection, stream.unwrap());
                 let mut bytes = [0; 4096];
@@ -39,9 +40,9 @@ fn session(inner: &Inner) -> SocketAddr {
                     stream.write_all(if is_viewer { b"v" } else { b"?" }).unwrap();
                     stream.write_all(&bytes[..count]).unwrap();
                 }
-            });
+            }));
         }
-    });
+    }));
     address
 }
 

@@ -3,6 +3,7 @@
 use std::{
     collections::BTreeMap,
     sync::{Arc, mpsc::sync_channel},
+    thread::Builder,
     time::{Duration, Instant},
 };
 
@@ -102,7 +103,7 @@ pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
     let (mut looked, mut compared) = (start, start);
     // Drawing must not keep messages waiting: only the newest of a topic waits.
     let (views, drawn) = sync_channel::<(Posed, Colors, Colors, Camera)>(4);
-    let drawing = std::thread::spawn({
+    let drawing = Builder::new().name("draw".to_owned()).spawn({
         let gpu = gpu.fastest();
         move || -> Result<Vec<f64>> {
             let mut scene = Scene::new(&gpu)?;
@@ -116,7 +117,7 @@ pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
             }
             Ok(scores)
         }
-    });
+    })?;
     let bar = progress_bar(args.seconds as u64, "bench receive");
     while start.elapsed().as_secs_f64() < args.seconds && !stop::requested() {
         bar.set_position(start.elapsed().as_secs());
