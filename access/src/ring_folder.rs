@@ -19,6 +19,8 @@ use crate::{
 pub const DEFAULT_PORT: u16 = 7450;
 /// Most holders at a time.
 pub const MAX_HOLDERS: usize = 256;
+/// Revoked holders that stay listed.
+const MAX_REVOKED: usize = 256;
 /// Largest file that is read, bytes.
 const MAX_BYTES: u64 = 1 << 20;
 /// Version of the format.
@@ -355,8 +357,19 @@ impl Ring {
         let authority = self.authority.certificate.clone();
         let file = KeyFile::new(&self.list.rig, &holder, topic_name, connect, own_name(&self.list), authority, pair);
         self.list.holders.push(holder);
+        self.forget_oldest();
         self.save()?;
         Ok(file)
+    }
+
+    /// Forgets those who were revoked longest ago: whoever is not in the list is refused as well.
+    fn forget_oldest(&mut self) {
+        let mut over = self.list.holders.iter().filter(|of| of.revoked).count().saturating_sub(MAX_REVOKED);
+        self.list.holders.retain(|of| {
+            let is_forgotten = of.revoked && over > 0;
+            over -= usize::from(is_forgotten);
+            !is_forgotten
+        });
     }
 
     fn save(&self) -> Result<(), AccessError> {
@@ -449,6 +462,11 @@ mod tests {
         let valid: Vec<_> =
             ring.holders().iter().filter(|of| !of.revoked).map(|of| (of.name.as_str(), of.number)).collect();
         assert_eq!(valid, [("v0", 0), ("v3", 3), ("v4", 1), ("v2", 2), ("v1", 4)]);
+        for _ in 0..2 * MAX_REVOKED {
+            ring.renew("v0", 1).unwrap();
+        }
+        assert_eq!(ring.holders().len(), 5 + MAX_REVOKED, "the list does not grow for ever");
+        assert_eq!(Ring::open(ring.folder()).unwrap().holders(), ring.holders());
         let prints: std::collections::BTreeSet<_> = ring.holders().iter().map(|of| of.fingerprint.clone()).collect();
         assert_eq!(prints.len(), ring.holders().len());
     }

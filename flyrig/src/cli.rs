@@ -588,7 +588,8 @@ impl RigArgs {
             Some(path) => {
                 let mut key = KeyFile::read(path, &[Role::Viewer, Role::Relay])?;
                 if let Some(address) = &self.connect {
-                    key.connect = vec![address.trim_start_matches("tls/").to_owned()];
+                    let bare = ["tls/", "tcp/"].iter().find_map(|protocol| address.strip_prefix(protocol));
+                    key.connect = vec![bare.unwrap_or(address).to_owned()];
                 }
                 return Ok(TransportConfig::with_key(key));
             }

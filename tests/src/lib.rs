@@ -2,6 +2,8 @@
 
 mod command;
 mod dataset;
+mod running;
 
 pub use command::{Finished, run};
 pub use dataset::{Dataset, FRAMES, SIDE, write_dataset, write_dataset_of};
+pub use running::Running;

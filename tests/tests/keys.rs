@@ -3,22 +3,12 @@
 
 use std::{
     net::TcpListener,
-    process::{Child, Command, Stdio},
+    process::{Command, Stdio},
 };
 
-use flyrig_tests::run;
+use flyrig_tests::{Running, run};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
-
-/// Ends the process when the test ends, however it does.
-struct Running(Child);
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
 
 /// A port that is free, and so is the next.
 fn free_port() -> u16 {

@@ -7,25 +7,15 @@ use std::{
     net::{TcpListener, TcpStream},
     os::unix::net::UnixDatagram,
     path::Path,
-    process::{Child, Command, Stdio},
+    process::{Command, Stdio},
     time::{Duration, Instant},
 };
 
-use flyrig_tests::run;
+use flyrig_tests::{Running, run};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 /// Far longer than anything here takes: a hang fails instead of hanging.
 const PATIENCE: Duration = Duration::from_secs(90);
-
-/// Ends the process when the test ends, however it does.
-struct Running(Child);
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
 
 fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()

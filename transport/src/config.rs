@@ -197,6 +197,8 @@ impl TransportConfig {
             ("transport/shared_memory/enabled", (self.shared_memory && self.key.is_none()).to_string()),
             // zenoh's 2 batches of 64 KiB overflow when several images leave at once; 8 hold two frames of four views.
             ("transport/link/tx/queue/size/data", "8".to_owned()),
+            // Chunks of a template that are asked for at once: one that finds no place is missed for seconds.
+            ("transport/link/tx/queue/size/data_high", "8".to_owned()),
             ("transport/link/rx/max_message_size", largest.to_string()),
         ];
         let mut config = Config::default();
