@@ -26,6 +26,8 @@ use crate::cli::BenchReceiveArgs;
 const TOPIC: &str = "person-stream";
 const MOTION: u8 = 255;
 const TEMPLATE: u8 = 254;
+/// Time after a person is there that does not count.
+const SETTLING: Duration = Duration::from_secs(2);
 /// How often what is displayed is compared.
 const COMPARE_EVERY: Duration = Duration::from_secs(1);
 /// How often the age of what is displayed is looked at.
@@ -40,10 +42,11 @@ type Colors = Arc<Vec<[f32; 4]>>;
 #[derive(Debug, Default, Serialize)]
 struct Row {
     line: String,
-    /// From the start to the first motion, and to all colours, seconds.
+    /// From the start to the first message, to a person, and to all colours, seconds.
+    message_after_secs: Option<f64>,
     motion_after_secs: Option<f64>,
     complete_after_secs: Option<f64>,
-    /// Of the time after everything was there.
+    /// Of the time from [`SETTLING`] after the person was there.
     motions_per_second: f64,
     colors_per_second: f64,
     kilobytes_per_second: f64,
@@ -127,10 +130,12 @@ pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
         }
         let received = subscriber.next_person(Duration::from_millis(5))?;
         let now = Instant::now();
-        let is_counted = row.complete_after_secs.is_some();
+        let elapsed = start.elapsed().as_secs_f64();
+        let is_counted = row.motion_after_secs.is_some_and(|after| elapsed >= after + SETTLING.as_secs_f64());
         if let Some(received) = received {
             let message = received.body;
             let is_motion = message.layer.is_none();
+            row.message_after_secs.get_or_insert(elapsed);
             ensure!(received.latency_is_exact, "both ends must be on one computer, whose clock ages are read from");
             let taken = people.take(message.person, is_motion, &message.bytes, clock_secs());
             if let Ok(Taken::Needs(hash)) = taken {
@@ -142,7 +147,7 @@ pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
                 colors += u64::from(!is_motion);
             }
             if is_motion && matches!(taken, Ok(Taken::Applied)) {
-                row.motion_after_secs.get_or_insert(start.elapsed().as_secs_f64());
+                row.motion_after_secs.get_or_insert(elapsed);
                 if let Some(last) = last_motion.replace(now).filter(|_| is_counted) {
                     row.longest_gap_secs = row.longest_gap_secs.max((now - last).as_secs_f64());
                 }
@@ -150,8 +155,8 @@ pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
             }
         }
         let Some((_, person)) = people.iter().next() else { continue };
-        if person.is_complete() && !is_counted {
-            row.complete_after_secs = Some(start.elapsed().as_secs_f64());
+        if person.is_complete() {
+            row.complete_after_secs.get_or_insert(elapsed);
         }
         if let Some(newest) = newest.filter(|_| is_counted && looked.elapsed() >= LOOK_EVERY) {
             looked = now;
@@ -175,7 +180,8 @@ pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
     bar.finish_and_clear();
     drop(views);
     let scores = drawing.join().map_err(|_| anyhow::anyhow!("drawing broke off"))??;
-    let counted = row.complete_after_secs.map_or(0.0, |after| start.elapsed().as_secs_f64() - after);
+    let counted =
+        row.motion_after_secs.map_or(0.0, |after| start.elapsed().as_secs_f64() - after) - SETTLING.as_secs_f64();
     if counted > 0.0 {
         row.motions_per_second = motions as f64 / counted;
         row.colors_per_second = colors as f64 / counted;
@@ -208,10 +214,11 @@ fn compare(ours: &RenderedView, wanted: &RenderedView) -> Result<Option<f64>> {
 fn text(row: &Row) -> String {
     let number = |value: Option<f64>, digits: usize| value.map_or("-".to_owned(), |value| format!("{value:.digits$}"));
     format!(
-        "| line | first motion s | complete s | motions/s | colours/s | KB/s | age p50 ms | p99 | longest gap s | displayed dB | worst |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|\n\
-         | {} | {} | {} | {:.1} | {:.1} | {:.0} | {:.0} | {:.0} | {:.2} | {} | {} |",
+        "| line | first message s | person s | complete s | motions/s | colours/s | KB/s | age p50 ms | p99 | longest gap s | displayed dB | worst |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|\n\
+         | {} | {} | {} | {} | {:.1} | {:.1} | {:.0} | {:.0} | {:.0} | {:.2} | {} | {} |",
         row.line,
+        number(row.message_after_secs, 2),
         number(row.motion_after_secs, 2),
         number(row.complete_after_secs, 2),
         row.motions_per_second,

@@ -2,7 +2,7 @@
 
 use std::{
     ops::Range,
-    sync::{Arc, Mutex},
+    sync::{Arc, Mutex, Once},
     time::{Duration, Instant},
 };
 
@@ -17,6 +17,7 @@ use zenoh::{
 use crate::{
     MessageKind, TransportError,
     drain::Shared,
+    inbox::Inbox,
     keys,
     splats::MAX_PERSON_TOPICS,
     topic::{Topic, lock},
@@ -128,13 +129,46 @@ pub(crate) fn answer_template(people: &People, query: &Query) {
     }
 }
 
+/// The subscription to colours, which begins with the first template: without one they are of no use, and on a slow line they would keep
+/// the template waiting.
+#[derive(Debug)]
+pub(crate) struct ColorSubscription {
+    session: Session,
+    rig: String,
+    inbox: Arc<Inbox>,
+    begun: Once,
+}
+
+impl ColorSubscription {
+    pub fn new(session: &Session, rig: &str, inbox: &Arc<Inbox>) -> Self {
+        Self { session: session.clone(), rig: rig.to_owned(), inbox: inbox.clone(), begun: Once::new() }
+    }
+
+    /// Begins it, once.
+    fn begin(&self) {
+        self.begun.call_once(|| {
+            let inbox = self.inbox.clone();
+            let key = keys::key(&self.rig, &format!("{}*/color-$*", keys::PERSON));
+            let begun =
+                self.session.declare_subscriber(key).callback(move |sample| inbox.receive(&sample)).background().wait();
+            if let Err(error) = begun {
+                tracing::warn!(%error, "colours cannot be received");
+            }
+        });
+    }
+
+    /// Asks for a template as [`ask_template`] does; colours come from then on.
+    pub fn ask_template(&self, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
+        let answer = ask_template(&self.session, &self.rig, hash, timeout)?;
+        if answer.is_some() {
+            self.begin();
+        }
+        Ok(answer)
+    }
+}
+
 /// Asks for a template, chunk by chunk, and checks that the answer is the one.
-pub(crate) fn ask_template(
-    session: &Session,
-    rig: &str,
-    hash: u64,
-    timeout: Duration,
-) -> Result<Option<Vec<u8>>, TransportError> {
+fn ask_template(session: &Session, rig: &str, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
     let deadline = Instant::now() + timeout;
     let malformed = |problem: String| TransportError::malformed(keys::chunk_label(hash, 0), problem);
     let Some((size, mut bytes)) = ask_chunks(session, rig, hash, 0..1, deadline)?.pop() else { return Ok(None) };

@@ -13,7 +13,7 @@ use crate::{
     config::LARGEST_QUESTION,
     inbox::{Inbox, Raw, as_malformed},
     keys::{self, VIEWER_PREFIX},
-    people::{self, PersonMessage},
+    people::{ColorSubscription, PersonMessage},
     renewal::Renewal,
     session::{self, Opened},
     splats,
@@ -40,7 +40,7 @@ pub struct Interests {
     pub views: Views,
     /// The splat stream.
     pub splats: bool,
-    /// The person stream.
+    /// The person stream: motion, and colours once a template has been fetched.
     pub people: bool,
     /// The rig's statistics.
     pub stats: bool,
@@ -64,8 +64,8 @@ pub struct Received<T> {
 /// Receives a rig; the newest message of a topic waits for its reader, older ones are replaced and counted.
 pub struct Subscriber {
     inbox: Arc<Inbox>,
+    colors: Arc<ColorSubscription>,
     id: String,
-    rig: String,
     renewal: Renewal,
     probe: Option<Probe>,
     session: Session,
@@ -108,7 +108,7 @@ impl Subscriber {
         if interests.splats {
             labels.extend(["splats".to_owned(), format!("{}*", keys::PERSON_SPLATS)]);
         }
-        labels.extend(interests.people.then(|| format!("{}*/*", keys::PERSON)));
+        labels.extend(interests.people.then(|| format!("{}*/motion", keys::PERSON)));
         labels.extend(interests.stats.then(|| "stats".to_owned()));
         for label in labels {
             let inbox = inbox.clone();
@@ -136,7 +136,8 @@ impl Subscriber {
         let renewal = Renewal::start(session.clone(), key, format!("{VIEWER_PREFIX}{id}"))?;
         let connected = inbox.clone();
         let probe = session::probe(config, move || connected.publishers() > 0)?;
-        Ok(Self { inbox, id, rig: rig.clone(), renewal, probe, session, closed: false, _alive: alive })
+        let colors = Arc::new(ColorSubscription::new(&session, rig, &inbox));
+        Ok(Self { inbox, colors, id, renewal, probe, session, closed: false, _alive: alive })
     }
 
     /// Our name towards the publisher.
@@ -191,7 +192,7 @@ impl Subscriber {
     /// # Errors
     /// `Malformed` when the answer is not that template, `Session` when the question cannot be asked.
     pub fn template(&self, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
-        people::ask_template(&self.session, &self.rig, hash, timeout)
+        self.colors.ask_template(hash, timeout)
     }
 
     /// Returns a fetcher of templates that works beside us.
@@ -199,7 +200,7 @@ impl Subscriber {
     /// # Errors
     /// `Session` when no thread can be started.
     pub fn template_fetcher(&self) -> Result<TemplateFetcher, TransportError> {
-        TemplateFetcher::start(&self.session, &self.rig)
+        TemplateFetcher::start(self.colors.clone())
     }
 
     /// The newest statistics nobody has taken yet; `None` after the timeout.

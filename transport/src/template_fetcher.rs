@@ -2,15 +2,15 @@
 
 use std::{
     collections::{HashMap, HashSet},
+    sync::Arc,
     thread::Builder,
     time::{Duration, Instant},
 };
 
 use crossbeam::channel::{Receiver, Sender, bounded};
 use flyrig_types::caught;
-use zenoh::Session;
 
-use crate::{TransportError, people, splats::MAX_PERSON_TOPICS};
+use crate::{TransportError, people::ColorSubscription, splats::MAX_PERSON_TOPICS};
 
 /// How long one template may take before the next has its turn.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -34,9 +34,8 @@ pub struct TemplateFetcher {
 }
 
 impl TemplateFetcher {
-    pub(crate) fn start(session: &Session, rig: &str) -> Result<Self, TransportError> {
-        let (session, rig) = (session.clone(), rig.to_owned());
-        Self::with(move |hash| people::ask_template(&session, &rig, hash, PATIENCE))
+    pub(crate) fn start(colors: Arc<ColorSubscription>) -> Result<Self, TransportError> {
+        Self::with(move |hash| colors.ask_template(hash, PATIENCE))
     }
 
     fn with(
