@@ -45,11 +45,11 @@ const CONNECTIONS: usize = 512;
 /// Pause after a connection could not be accepted.
 const PAUSE: Duration = Duration::from_millis(100);
 /// Bytes of a copy from one side to the other.
-const COPY_BYTES: usize = 16 << 10;
+const COPY_BYTES: usize = 4 << 10;
 /// Bytes that the system keeps for a viewer, sent or not: enough for 20 Mbit/s with 200 ms. Linux doubles it.
 const SEND_BUFFER: u32 = 256 << 10;
 /// Bytes of them that are not sent yet: what lies there cannot be overtaken by newer motion.
-const UNSENT: u32 = 16 << 10;
+const UNSENT: u32 = 4 << 10;
 /// Bytes that the system keeps between the session and the gate.
 const INNER_BUFFER: u32 = 16 << 10;
 /// Years that certificates between gate and session are valid; they live as long as the program.
@@ -383,6 +383,8 @@ async fn greet(client: TcpStream, address: SocketAddr, shared: Arc<Shared>) {
         Ok(Err(error)) => return shared.refuse(&who, words(&error)),
         Err(_) => return shared.refuse(&who, "it showed no key in time"),
     };
+    // What is encrypted already cannot be overtaken either.
+    client.get_mut().1.set_buffer_limit(Some(COPY_BYTES));
     let certificate = client.get_ref().1.peer_certificates().and_then(<[_]>::first).map(|of| of.clone().into_owned());
     let Some((certificate, holder)) = certificate.and_then(|of| shared.list.find(&of).map(|holder| (of, holder)))
     else {
