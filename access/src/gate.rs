@@ -383,7 +383,7 @@ async fn greet(client: TcpStream, address: SocketAddr, shared: Arc<Shared>) {
         Ok(Err(error)) => return shared.refuse(&who, words(&error)),
         Err(_) => return shared.refuse(&who, "it showed no key in time"),
     };
-    // What is encrypted already cannot be overtaken either.
+    // Newer motion cannot overtake encrypted bytes either.
     client.get_mut().1.set_buffer_limit(Some(COPY_BYTES));
     let certificate = client.get_ref().1.peer_certificates().and_then(<[_]>::first).map(|of| of.clone().into_owned());
     let Some((certificate, holder)) = certificate.and_then(|of| shared.list.find(&of).map(|holder| (of, holder)))
@@ -448,7 +448,7 @@ async fn pass_on(holder: &Holder, shared: &Shared) -> std::io::Result<tokio_rust
     timeout(PATIENCE, TlsConnector::from(Arc::new(config)).connect(name, stream)).await?
 }
 
-/// Why a handshake failed.
+/// Describes a failed handshake.
 fn words(error: &std::io::Error) -> &'static str {
     let tls = error.get_ref().and_then(|inner| inner.downcast_ref::<TlsError>());
     match tls {

@@ -7,11 +7,11 @@ use serde::{Deserialize, Serialize};
 use crate::{AccessError, Role, ring_folder::write_secret};
 
 /// Largest key file that is read, bytes.
-pub const MAX_KEY_FILE_BYTES: u64 = 64 << 10;
+const MAX_KEY_FILE_BYTES: u64 = 64 << 10;
 /// Version of the format.
 const VERSION: u32 = 1;
 
-/// What the holder of a key has: who it is, where the rig is, and the secret.
+/// Key of one holder: its name and role, the rig's addresses, certificate and private key.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KeyFile {
@@ -21,7 +21,7 @@ pub struct KeyFile {
     pub rig: String,
     /// Name of the holder.
     pub holder: String,
-    /// What it may do.
+    /// Role: the rights of the holder.
     pub role: Role,
     /// Name in topics: the ring's identifier and the holder's number.
     pub topic_name: String,
@@ -52,7 +52,6 @@ impl std::fmt::Debug for KeyFile {
 }
 
 impl KeyFile {
-    #[allow(clippy::too_many_arguments)]
     pub(crate) fn new(
         rig: &str,
         holder: &crate::Holder,

@@ -18,7 +18,7 @@ mod tls;
 
 pub use error::AccessError;
 pub use gate::{Gate, Inner};
-pub use key_file::{KeyFile, MAX_KEY_FILE_BYTES};
+pub use key_file::KeyFile;
 pub use probe::Probe;
 pub use ring_folder::{DEFAULT_PORT, Holder, MAX_HOLDERS, Ring};
 pub use role::Role;

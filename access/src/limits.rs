@@ -26,7 +26,7 @@ struct Visitor {
     pending: usize,
 }
 
-/// Who has knocked, and how often.
+/// Counts of connections by address.
 #[derive(Debug, Default)]
 pub(crate) struct Limits {
     visitors: HashMap<IpAddr, Visitor>,

@@ -1,4 +1,4 @@
-//! Why a rig does not admit a key, in words.
+//! Finds out why a rig does not admit a key.
 
 use std::{
     io::{ErrorKind, Read as _, Write as _},

@@ -37,7 +37,7 @@ const OWN: [&str; 2] = ["rig.pem", "rig-key.pem"];
 pub struct Holder {
     /// Its name.
     pub name: String,
-    /// What it may do.
+    /// Role: the rights of the holder.
     pub role: Role,
     /// Its number among the holders, 0..[`MAX_HOLDERS`].
     pub number: usize,

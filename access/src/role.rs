@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Role of a key's holder: what it may do.
+/// Role of a key's holder: its rights.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Role {

@@ -50,7 +50,7 @@ pub enum BenchCommand {
     Watch(BenchWatchArgs),
     /// The person stream: bytes and run times against what it loses; writes a table, CSV, JSON and SVG.
     Stream(BenchStreamArgs),
-    /// What a viewer has of a take that `flyrig play --repeat` publishes at the other end of a line: rates, age, errors.
+    /// Receive a take that `flyrig play --repeat` publishes over a network: update rates, age, errors of the displayed views.
     Receive(BenchReceiveArgs),
     /// Masks estimated in each camera independently, against which several calibrations are scored.
     Masks(BenchMasksArgs),
@@ -168,7 +168,7 @@ pub struct BenchReceiveArgs {
     /// Name of the rig.
     #[arg(long, default_value = "flyrig")]
     pub rig: String,
-    /// Where it is published (zenoh endpoint).
+    /// zenoh endpoint of `flyrig play`.
     #[arg(long, default_value = "tcp/127.0.0.1:7447")]
     pub connect: String,
     /// Seconds from the start to the end.

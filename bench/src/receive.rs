@@ -1,4 +1,4 @@
-//! `flyrig-bench receive`: what a viewer has of a take that `flyrig play --repeat` publishes at the other end of a line.
+//! `flyrig-bench receive`: receives a take that `flyrig play --repeat` publishes, and measures rates, age and errors of views.
 
 use std::{
     collections::BTreeMap,
@@ -38,7 +38,7 @@ const KEPT_EVERY: u64 = 8;
 
 type Colors = Arc<Vec<[f32; 4]>>;
 
-/// What a viewer had.
+/// Results of one run.
 #[derive(Debug, Default, Serialize)]
 struct Row {
     line: String,

@@ -609,6 +609,19 @@ pub struct RingArgs {
     pub ring: Option<PathBuf>,
 }
 
+/// A key to make.
+#[derive(Debug, Args)]
+pub struct NewKeyArgs {
+    /// Days after which it is refused.
+    #[arg(long, default_value_t = 365)]
+    pub days: u64,
+    /// The file; NAME.key otherwise.
+    #[arg(long)]
+    pub out: Option<PathBuf>,
+    #[command(flatten)]
+    pub ring: RingArgs,
+}
+
 #[derive(Debug, Subcommand)]
 pub enum KeysAction {
     /// Make the folder of a rig's keys.
@@ -629,17 +642,11 @@ pub enum KeysAction {
     Add {
         /// Name of the holder.
         name: String,
-        /// What it may do: watch ("viewer"), send images of cameras ("cameras"), watch and pass on to others ("relay").
+        /// Role: "viewer" watches, "cameras" sends camera images, "relay" watches and serves other viewers.
         #[arg(long, default_value = "viewer", value_parser = parse_role)]
         role: Role,
-        /// Days after which it is refused.
-        #[arg(long, default_value_t = 365)]
-        days: u64,
-        /// The file; NAME.key otherwise.
-        #[arg(long)]
-        out: Option<PathBuf>,
         #[command(flatten)]
-        ring: RingArgs,
+        file: NewKeyArgs,
     },
     /// List everybody who was given a key.
     List {
@@ -650,14 +657,8 @@ pub enum KeysAction {
     Renew {
         /// Name of the holder.
         name: String,
-        /// Days after which it is refused.
-        #[arg(long, default_value_t = 365)]
-        days: u64,
-        /// The file; NAME.key otherwise.
-        #[arg(long)]
-        out: Option<PathBuf>,
         #[command(flatten)]
-        ring: RingArgs,
+        file: NewKeyArgs,
     },
     /// Refuse a holder from now on; a running rig disconnects it within a second.
     Revoke {

@@ -26,15 +26,15 @@ pub fn keys(action: &KeysAction) -> Result<()> {
                 folder.display()
             );
         }
-        KeysAction::Add { name, role, days, out, ring } => {
-            let mut ring = open(ring)?;
-            let path = new_file(out.as_deref(), name)?;
-            write(&ring.add(name, *role, *days)?, &path)?;
+        KeysAction::Add { name, role, file } => {
+            let mut ring = open(&file.ring)?;
+            let path = new_file(file.out.as_deref(), name)?;
+            write(&ring.add(name, *role, file.days)?, &path)?;
         }
-        KeysAction::Renew { name, days, out, ring } => {
-            let mut ring = open(ring)?;
-            let path = new_file(out.as_deref(), name)?;
-            write(&ring.renew(name, *days)?, &path)?;
+        KeysAction::Renew { name, file } => {
+            let mut ring = open(&file.ring)?;
+            let path = new_file(file.out.as_deref(), name)?;
+            write(&ring.renew(name, file.days)?, &path)?;
             eprintln!("keys: the old key of '{name}' is refused from now on");
         }
         KeysAction::Revoke { name, ring } => {

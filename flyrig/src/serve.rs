@@ -6,6 +6,7 @@ use std::{
 };
 
 use anyhow::{Context as _, Result};
+use flyrig_fusion::check_threads;
 use flyrig_report::stop;
 use flyrig_transport::{Relay, TransportConfig};
 use flyrig_web::{WebConfig, WebServer};
@@ -60,6 +61,7 @@ pub fn serve(args: &ServeArgs) -> Result<()> {
             eprintln!("serve: {now} browsers");
         }
         let Some(relay) = &relay else { continue };
+        check_threads([relay.thread()])?;
         let now = match (relay.trouble(), relay.gate()) {
             (Some(trouble), _) => trouble,
             (None, Some(gate)) => format!("passing rig '{rig}' on to holders of this relay's keys at {gate}"),

@@ -83,7 +83,7 @@ impl Relay {
         lock(&self.shared.state).gate
     }
 
-    /// What keeps people from being passed on; None while nothing does.
+    /// Returns the reason why people are not passed on; None while they are.
     #[must_use]
     pub fn trouble(&self) -> Option<String> {
         lock(&self.shared.state).trouble.clone()

@@ -88,7 +88,7 @@ pub(crate) fn probe(
     Ok(config.key.clone().map(|key| Probe::start(key, is_connected)).transpose()?)
 }
 
-/// Where a gate finds the session behind it.
+/// Address of the session behind a gate.
 fn at_session(port: u16) -> SocketAddr {
     SocketAddr::from((Ipv4Addr::LOCALHOST, port))
 }
@@ -102,7 +102,7 @@ fn secured(behind: Option<(&Ring, &Inner)>, roles: &[Role], key: Option<&KeyFile
             let settings = vec![
                 ("transport/link/tls/listen_certificate_base64", base64(certificate)),
                 ("transport/link/tls/listen_private_key_base64", base64(secret)),
-                // What lies in the socket cannot be overtaken by newer motion.
+                // Newer motion cannot overtake bytes in the socket.
                 ("transport/link/tls/so_sndbuf", SEND_BUFFER.to_string()),
             ];
             (inner.authority(), settings, access_rules::behind_gate(ring, roles))

@@ -248,7 +248,7 @@ impl Subscriber {
         self.inbox.publishers()
     }
 
-    /// Why the rig cannot be reached with the key; None while it can, without a key, and while that is not known.
+    /// Returns the reason why the rig does not admit the key; None while it does, without a key, and before the first answer.
     #[must_use]
     pub fn trouble(&self) -> Option<String> {
         self.probe.as_ref().and_then(Probe::trouble)

@@ -37,7 +37,7 @@ pub struct ReceiverState {
     pub problem: Option<(Instant, String)>,
     /// Number of publishers of this rig that live now.
     pub publishers: usize,
-    /// Why the rig cannot be reached with the key, while it cannot.
+    /// Reason why the rig does not admit the key, while it does not.
     pub refusal: Option<String>,
     /// Age of the newest motion when it came, seconds, and whether both ends run on one host so that it is exact.
     pub age: Option<(f64, bool)>,
