@@ -50,7 +50,7 @@ pub enum BenchCommand {
     Watch(BenchWatchArgs),
     /// The person stream: bytes and run times against what it loses; writes a table, CSV, JSON and SVG.
     Stream(BenchStreamArgs),
-    /// Receive a take that `flyrig play --repeat` publishes over a network: update rates, age, errors of the displayed views.
+    /// Receive the people of a rig, or of a take that `flyrig play --repeat` publishes: update rates, age, errors of the displayed views.
     Receive(BenchReceiveArgs),
     /// Masks estimated in each camera independently, against which several calibrations are scored.
     Masks(BenchMasksArgs),
@@ -160,8 +160,9 @@ pub struct BenchBudgetArgs {
 
 #[derive(Debug, Args)]
 pub struct BenchReceiveArgs {
-    /// The recording that is played (`flyrig watch --record`).
-    pub take: PathBuf,
+    /// The recording that is played (`flyrig watch --record`): views are compared with those of nothing lost. Without one every motion is
+    /// drawn as it comes, and its age then is measured as well.
+    pub take: Option<PathBuf>,
     /// Key to the rig.
     #[arg(long, conflicts_with_all = ["rig", "connect"])]
     pub key: Option<PathBuf>,

@@ -2,6 +2,8 @@
 
 use std::time::{Duration, Instant};
 
+use flyrig_capture::monotonic_nanos;
+
 /// Name of the age among the stages.
 pub(crate) const AGE: &str = "age when published";
 
@@ -10,13 +12,15 @@ pub(crate) const AGE: &str = "age when published";
 #[derive(Debug)]
 pub(crate) struct Ages {
     started: Instant,
+    /// `CLOCK_MONOTONIC` then.
+    started_nanos: i64,
     /// Least nanoseconds from a set's time to its arrival since the start; `None` before the first set.
     soonest: Option<i64>,
 }
 
 impl Ages {
     pub fn new() -> Self {
-        Self { started: Instant::now(), soonest: None }
+        Self { started: Instant::now(), started_nanos: monotonic_nanos(), soonest: None }
     }
 
     /// A set of this time has come.
@@ -29,6 +33,11 @@ impl Ages {
     pub fn of(&self, master_nanos: i64) -> Option<Duration> {
         let age = self.after(master_nanos).saturating_sub(self.soonest?);
         Some(Duration::from_nanos(u64::try_from(age).unwrap_or(0)))
+    }
+
+    /// `CLOCK_MONOTONIC` minus the cameras' clock, nanoseconds, by the set that came soonest; `None` before any has come.
+    pub fn clock_offset_nanos(&self) -> Option<i64> {
+        self.soonest.map(|soonest| self.started_nanos.saturating_add(soonest))
     }
 
     fn after(&self, master_nanos: i64) -> i64 {
@@ -51,6 +60,8 @@ mod tests {
         std::thread::sleep(Duration::from_millis(30));
         let age = ages.of(zero).unwrap_or_default();
         assert!(age >= Duration::from_millis(30), "{age:?}");
+        let by_offset = monotonic_nanos() - (zero + ages.clock_offset_nanos().unwrap_or_default());
+        assert!((by_offset - age.as_nanos() as i64).abs() < 1_000_000_000, "{by_offset} {age:?}");
         // This one took a second longer on its way than the first.
         ages.arrived(zero - 1_000_000_000);
         let late = ages.of(zero - 1_000_000_000).unwrap_or_default();

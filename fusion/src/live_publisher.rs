@@ -134,8 +134,15 @@ impl LivePublisher {
         Ok(())
     }
 
-    /// Publishes statistics once a second; returns whether it did.
-    pub fn publish_stats(&mut self, session: &Session, set: &FrameSet, frames: u64, drops: &[(String, u64)]) -> bool {
+    /// Publishes statistics once a second; returns whether it did. For `clock_offset_nanos` see [`RigStats`].
+    pub fn publish_stats(
+        &mut self,
+        session: &Session,
+        set: &FrameSet,
+        frames: u64,
+        clock_offset_nanos: Option<i64>,
+        drops: &[(String, u64)],
+    ) -> bool {
         let interval = self.last_stats.elapsed();
         if interval < STATS_EVERY {
             return false;
@@ -158,6 +165,7 @@ impl LivePublisher {
         let stats = RigStats {
             frame: set.index,
             capture_nanos: set.master_nanos,
+            clock_offset_nanos,
             uptime_secs,
             frames_per_second,
             stages: session

@@ -249,7 +249,9 @@ impl LiveRig {
             if let Some(age) = self.ages.as_ref().and_then(|ages| ages.of(set.master_nanos)) {
                 self.session.stages.add(AGE, age);
             }
-            publisher.publish_stats(&self.session, set, self.frames, &self.intake.drops());
+            let clock_offset_nanos = self.ages.as_ref().and_then(Ages::clock_offset_nanos);
+            let drops = self.intake.drops();
+            publisher.publish_stats(&self.session, set, self.frames, clock_offset_nanos, &drops);
         }
         if self.recovery.taken.is_none_or(|at| at.elapsed() >= SNAPSHOT_EVERY) && self.session.has_people() {
             self.snapshot()?;

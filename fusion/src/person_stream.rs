@@ -5,7 +5,8 @@ use std::{collections::BTreeMap, sync::Arc, time::Duration};
 use flyrig_body::{DeformationGraph, Skeleton, SurfaceGaussians};
 use flyrig_capture::{LatestQueue, PopError};
 use flyrig_stream::{
-    ColorEncoder, ColorSettings, EncodedTemplate, Motion, MotionEncoder, StreamError, StreamJoint, TemplateSource,
+    ColorEncoder, ColorSettings, EncodedTemplate, LAYERS, Motion, MotionEncoder, Stamp, StreamError, StreamJoint,
+    TemplateSource,
 };
 use flyrig_transport::Publisher;
 use flyrig_types::{PersonId, Pose, SupervisedThread, ThreadHealth};
@@ -87,18 +88,21 @@ impl Subject {
 pub struct PersonEncoder {
     hash: u64,
     motion: MotionEncoder,
-    colors: ColorEncoder,
+    settings: ColorSettings,
+    epoch: u32,
+    /// None before the first colours: motion does not wait for it.
+    colors: Option<ColorEncoder>,
 }
 
 /// Messages of one frame: motion, and the layers of the colours.
 #[derive(Debug)]
 pub struct PersonMessages {
     /// Which template, person and frame.
-    pub stamp: flyrig_stream::Stamp,
+    pub stamp: Stamp,
     /// Motion.
     pub motion: Vec<u8>,
     /// Colours.
-    pub colors: [Vec<u8>; flyrig_stream::LAYERS],
+    pub colors: [Vec<u8>; LAYERS],
 }
 
 impl PersonEncoder {
@@ -108,7 +112,9 @@ impl PersonEncoder {
         Self {
             hash: frame.template.template.hash,
             motion: MotionEncoder::new(&frame.template),
-            colors: ColorEncoder::new(&frame.template, settings, epoch),
+            settings,
+            epoch,
+            colors: None,
         }
     }
 
@@ -117,9 +123,23 @@ impl PersonEncoder {
     /// # Errors
     /// [`FusionError::Stream`].
     pub fn encode(&mut self, frame: &PersonFrame) -> Result<PersonMessages, FusionError> {
-        let stamp = flyrig_stream::Stamp { template: self.hash, ..frame.motion.stamp };
-        let motion = self.motion.encode(&frame.motion)?;
-        Ok(PersonMessages { stamp, motion, colors: self.colors.encode(stamp, &frame.colors) })
+        let (stamp, motion) = self.encode_motion(frame)?;
+        Ok(PersonMessages { stamp, motion, colors: self.encode_colors(frame) })
+    }
+
+    fn stamp(&self, frame: &PersonFrame) -> Stamp {
+        Stamp { template: self.hash, ..frame.motion.stamp }
+    }
+
+    fn encode_motion(&mut self, frame: &PersonFrame) -> Result<(Stamp, Vec<u8>), FusionError> {
+        Ok((self.stamp(frame), self.motion.encode(&frame.motion)?))
+    }
+
+    fn encode_colors(&mut self, frame: &PersonFrame) -> [Vec<u8>; LAYERS] {
+        let stamp = self.stamp(frame);
+        let (settings, epoch) = (self.settings, self.epoch);
+        let encoder = self.colors.get_or_insert_with(|| ColorEncoder::new(&frame.template, settings, epoch));
+        encoder.encode(stamp, &frame.colors)
     }
 }
 
@@ -193,10 +213,11 @@ fn publish(publisher: &Publisher, encoders: &mut BTreeMap<u32, PersonEncoder>, f
         encoders.insert(person, PersonEncoder::new(frame, ColorSettings::default(), epoch()));
     }
     let Some(encoder) = encoders.get_mut(&person) else { return };
-    match encoder.encode(frame) {
-        Ok(PersonMessages { stamp, motion, colors }) => {
+    match encoder.encode_motion(frame) {
+        Ok((stamp, motion)) => {
+            // Before the colours, which take longer to encode.
             publisher.publish_person(&stamp, None, motion.into());
-            for (layer, bytes) in colors.into_iter().enumerate() {
+            for (layer, bytes) in encoder.encode_colors(frame).into_iter().enumerate() {
                 publisher.publish_person(&stamp, Some(layer), bytes.into());
             }
         }

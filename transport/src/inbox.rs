@@ -14,6 +14,7 @@ use zenoh::sample::Sample;
 use crate::{
     Header, MessageKind, TransportError, TransportErrorKind,
     calibration::{RigTransforms, decode_calibration, decode_transforms},
+    color_layers::ColorLayers,
     header, keys,
     report::{Tally, TopicReport},
     splats::{self, MAX_PERSON_TOPICS},
@@ -73,6 +74,7 @@ pub(crate) struct Inbox {
     quota: u64,
     /// Label and name of our own viewpoint's view.
     own_view: (String, String),
+    color_layers: Mutex<ColorLayers>,
 }
 
 impl State {
@@ -113,7 +115,25 @@ impl State {
 impl Inbox {
     pub(crate) fn new(own_view_name: String, quota: u64) -> Self {
         let own_view = (keys::view_label(&own_view_name), own_view_name);
-        Self { state: Mutex::default(), changed: Condvar::new(), host: header::host_id(), quota, own_view }
+        let color_layers = Mutex::new(ColorLayers::new(Instant::now()));
+        Self {
+            state: Mutex::default(),
+            changed: Condvar::new(),
+            host: header::host_id(),
+            quota,
+            own_view,
+            color_layers,
+        }
+    }
+
+    /// Layers of colours that the line carries, from the coarsest; none before [`Self::begin_colors`].
+    pub(crate) fn color_layers(&self) -> usize {
+        lock(&self.color_layers).wanted()
+    }
+
+    /// Lets colours begin.
+    pub(crate) fn begin_colors(&self) {
+        lock(&self.color_layers).begin();
     }
 
     /// Name of a view for its reader; `None` for other topics.
@@ -223,8 +243,13 @@ impl Inbox {
         slot.arrival = arrival;
         let exact = self.host != 0 && header.host == self.host;
         let latency_nanos = unix_nanos.saturating_sub(header.publish_unix_nanos);
+        let missed_before = slot.tally.totals.missed;
         slot.tally.add(&header, payload.len(), now, latency_nanos, exact);
         slot.tally.totals.replaced += u64::from(is_replaced);
+        if expected == MessageKind::Motion {
+            let missed = slot.tally.totals.missed.saturating_sub(missed_before);
+            lock(&self.color_layers).motion(now, latency_nanos, missed);
+        }
         slot.raw = waits.then_some(Raw { header, payload, latency_nanos, exact });
         drop(state);
         self.changed.notify_all();

@@ -51,9 +51,12 @@ pub(crate) fn motion_label(person: u32) -> String {
     format!("{PERSON}{person}/motion")
 }
 
+/// Last part of the keys of layers of colours, before the layer's number.
+pub(crate) const COLOR: &str = "color-";
+
 /// Last parts of the key where a layer of a person's colours goes.
 pub(crate) fn color_label(person: u32, layer: usize) -> String {
-    format!("{PERSON}{person}/color-{layer}")
+    format!("{PERSON}{person}/{COLOR}{layer}")
 }
 
 /// The person that a label of the person stream names, and the layer of a label of colours; None for any other label.

@@ -38,6 +38,7 @@ mod camera_inbox;
 mod camera_publisher;
 mod camera_subscriber;
 mod clock_exchange;
+mod color_layers;
 mod config;
 mod drain;
 mod error;

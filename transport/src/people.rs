@@ -1,8 +1,8 @@
 //! The person stream: its topics, and templates by their hash.
 
 use std::{
-    ops::Range,
-    sync::{Arc, Mutex, Once},
+    collections::VecDeque,
+    sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
@@ -10,8 +10,9 @@ use flyrig_stream::{LAYERS, MAX_TEMPLATE_BYTES, template_hash};
 use prost::bytes::Bytes;
 use zenoh::{
     Session, Wait,
+    handlers::FifoChannelHandler,
     qos::{CongestionControl, Priority},
-    query::Query,
+    query::{Query, Reply},
 };
 
 use crate::{
@@ -25,8 +26,8 @@ use crate::{
 
 /// Bytes of a template in a reply: it fits in one batch of zenoh's, so that a slow line drops no fragments.
 const CHUNK: usize = 60_000;
-/// Chunks that are asked for at once.
-const AT_ONCE: u32 = 4;
+/// Chunks under way at once: enough for 20 Mbit/s with 100 ms, and fewer than the sender's queue has places.
+const AT_ONCE: usize = 6;
 /// How long a chunk is waited for.
 const CHUNK_PATIENCE: Duration = Duration::from_secs(2);
 
@@ -129,63 +130,75 @@ pub(crate) fn answer_template(people: &People, query: &Query) {
     }
 }
 
-/// The subscription to colours, which begins with the first template: without one they are of no use, and on a slow line they would keep
-/// the template waiting.
-#[derive(Debug)]
+/// The subscriptions to layers of colours. They begin with the first template: without one they are of no use, and on a slow line they would
+/// keep the template waiting. Then they follow [`Inbox::color_layers`].
 pub(crate) struct ColorSubscription {
     session: Session,
     rig: String,
     inbox: Arc<Inbox>,
-    begun: Once,
+    /// From the coarsest layer.
+    layers: Mutex<Vec<zenoh::pubsub::Subscriber<()>>>,
 }
 
 impl ColorSubscription {
     pub fn new(session: &Session, rig: &str, inbox: &Arc<Inbox>) -> Self {
-        Self { session: session.clone(), rig: rig.to_owned(), inbox: inbox.clone(), begun: Once::new() }
+        Self { session: session.clone(), rig: rig.to_owned(), inbox: inbox.clone(), layers: Mutex::default() }
     }
 
-    /// Begins it, once.
-    fn begin(&self) {
-        self.begun.call_once(|| {
-            let inbox = self.inbox.clone();
-            let key = keys::key(&self.rig, &format!("{}*/color-$*", keys::PERSON));
-            let begun =
-                self.session.declare_subscriber(key).callback(move |sample| inbox.receive(&sample)).background().wait();
-            if let Err(error) = begun {
-                tracing::warn!(%error, "colours cannot be received");
+    /// Subscribes to as many layers as the line carries. Never waits for the line.
+    pub fn follow(&self) {
+        let wanted = self.inbox.color_layers();
+        let mut layers = lock(&self.layers);
+        while layers.len() > wanted {
+            if let Some(Err(error)) = layers.pop().map(|layer| layer.undeclare().wait()) {
+                tracing::warn!(%error, "colours cannot be given back");
             }
-        });
+        }
+        while layers.len() < wanted {
+            let inbox = self.inbox.clone();
+            let key = keys::key(&self.rig, &format!("{}*/{}{}", keys::PERSON, keys::COLOR, layers.len()));
+            match self.session.declare_subscriber(key).callback(move |sample| inbox.receive(&sample)).wait() {
+                Ok(layer) => layers.push(layer),
+                Err(error) => return tracing::warn!(%error, "colours cannot be received"),
+            }
+        }
     }
 
     /// Asks for a template as [`ask_template`] does; colours come from then on.
     pub fn ask_template(&self, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
         let answer = ask_template(&self.session, &self.rig, hash, timeout)?;
         if answer.is_some() {
-            self.begin();
+            self.inbox.begin_colors();
+            self.follow();
         }
         Ok(answer)
     }
 }
 
-/// Asks for a template, chunk by chunk, and checks that the answer is the one.
+/// Asks for a template, chunk by chunk with some under way at once, and checks that the answer is the one.
 fn ask_template(session: &Session, rig: &str, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
     let deadline = Instant::now() + timeout;
     let malformed = |problem: String| TransportError::malformed(keys::chunk_label(hash, 0), problem);
-    let Some((size, mut bytes)) = ask_chunks(session, rig, hash, 0..1, deadline)?.pop() else { return Ok(None) };
-    if size > MAX_TEMPLATE_BYTES {
-        return Err(malformed(format!("a template of {size} bytes, at most {MAX_TEMPLATE_BYTES}")));
-    }
-    let count = size.div_ceil(CHUNK) as u32;
-    let mut next = 1;
-    while next < count {
-        let chunks = next..count.min(next + AT_ONCE);
-        let replies = ask_chunks(session, rig, hash, chunks, deadline)?;
-        if replies.is_empty() {
-            return Ok(None);
+    let ask = |chunk: u32| ask_chunk(session, &keys::key(rig, &keys::chunk_label(hash, chunk)), deadline);
+    let (mut bytes, mut count) = (Vec::new(), 1);
+    let mut under_way = VecDeque::from([ask(0)?]);
+    let mut asked = 1;
+    for chunk in 0.. {
+        let Some(replies) = under_way.pop_front() else { break };
+        let mut part = received(&replies);
+        if part.is_none() && chunk > 0 {
+            // It was dropped on the way.
+            part = received(&ask(chunk)?);
         }
-        for (_, chunk) in replies {
-            bytes.extend(chunk);
-            next += 1;
+        let Some((size, part)) = part else { return Ok(None) };
+        if size > MAX_TEMPLATE_BYTES {
+            return Err(malformed(format!("a template of {size} bytes, at most {MAX_TEMPLATE_BYTES}")));
+        }
+        bytes.extend(part);
+        count = count.max(size.div_ceil(CHUNK) as u32);
+        while asked < count && under_way.len() < AT_ONCE {
+            under_way.push_back(ask(asked)?);
+            asked += 1;
         }
     }
     if template_hash(&bytes) == hash {
@@ -195,34 +208,23 @@ fn ask_template(session: &Session, rig: &str, hash: u64, timeout: Duration) -> R
     }
 }
 
-/// Asks for chunks at once; returns the template's size and the bytes of those that came, up to the first that did not.
-fn ask_chunks(
-    session: &Session,
-    rig: &str,
-    hash: u64,
-    chunks: Range<u32>,
-    deadline: Instant,
-) -> Result<Vec<(usize, Vec<u8>)>, TransportError> {
-    let mut asked = Vec::new();
-    for chunk in chunks {
-        let key = keys::key(rig, &keys::chunk_label(hash, chunk));
-        let left = deadline.saturating_duration_since(Instant::now()).min(CHUNK_PATIENCE);
-        let replies = session
-            .get(&key)
-            // The reply inherits both: a stalled subscriber must not block the publisher's session, and motion goes first.
-            .congestion_control(CongestionControl::Drop)
-            .priority(Priority::DataHigh)
-            .timeout(left)
-            .wait()
-            .map_err(|error| TransportError::session(key, &error))?;
-        asked.push(replies);
-    }
-    let mut found = Vec::new();
-    for replies in asked {
-        let Some(payload) = replies.recv().ok().and_then(|reply| reply.into_result().ok()) else { break };
-        let payload = payload.payload().to_bytes();
-        let Some((size, chunk)) = payload.split_first_chunk().filter(|(_, chunk)| chunk.len() <= CHUNK) else { break };
-        found.push((u32::from_le_bytes(*size) as usize, chunk.to_vec()));
-    }
-    Ok(found)
+type Replies = FifoChannelHandler<Reply>;
+
+fn ask_chunk(session: &Session, key: &str, deadline: Instant) -> Result<Replies, TransportError> {
+    let left = deadline.saturating_duration_since(Instant::now()).min(CHUNK_PATIENCE);
+    session
+        .get(key)
+        // The reply inherits both: a stalled subscriber must not block the publisher's session, and motion goes first.
+        .congestion_control(CongestionControl::Drop)
+        .priority(Priority::DataHigh)
+        .timeout(left)
+        .wait()
+        .map_err(|error| TransportError::session(key, &error))
+}
+
+/// Returns the template's size and the bytes of a chunk; None when it did not come.
+fn received(replies: &Replies) -> Option<(usize, Vec<u8>)> {
+    let payload = replies.recv().ok()?.into_result().ok()?.payload().to_bytes().into_owned();
+    let (size, chunk) = payload.split_first_chunk().filter(|(_, chunk)| chunk.len() <= CHUNK)?;
+    Some((u32::from_le_bytes(*size) as usize, chunk.to_vec()))
 }

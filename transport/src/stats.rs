@@ -98,8 +98,13 @@ pub struct BudgetStats {
 pub struct RigStats {
     /// The rig's frame number.
     pub frame: u64,
-    /// `CLOCK_MONOTONIC` of the capturing host.
+    /// Time of the frame by the cameras' clock: `CLOCK_MONOTONIC` of the capturing host, or a clock of their own for recorded and simulated
+    /// cameras.
     pub capture_nanos: i64,
+    /// `CLOCK_MONOTONIC` minus the cameras' clock, nanoseconds, by the set that came soonest after its capture; `None` where sets are taken in
+    /// at another pace than they were captured, and from older programs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub clock_offset_nanos: Option<i64>,
     /// Since the rig started, seconds.
     pub uptime_secs: f64,
     /// Frame sets a second through the whole pipeline.

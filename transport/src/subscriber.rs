@@ -176,11 +176,12 @@ impl Subscriber {
     }
 
     /// The next message of the person stream that was not taken yet, topics in turns; `None` after the timeout. Take messages as
-    /// they come: only the newest of a topic waits.
+    /// they come: only the newest of a topic waits. Layers of colours come and go here, see [`Self::color_layers`].
     ///
     /// # Errors
     /// As [`Self::next_view`].
     pub fn next_person(&self, timeout: Duration) -> Result<Option<Received<PersonMessage>>, TransportError> {
+        self.colors.follow();
         let Some((label, raw)) = self.inbox.next(timeout, keys::is_person)? else { return Ok(None) };
         let (person, layer) = keys::person_in(&label).unwrap_or_default();
         self.received(label, raw, |_, _, bytes| Ok(PersonMessage { person, layer, bytes })).map(Some)
@@ -240,6 +241,13 @@ impl Subscriber {
     #[must_use]
     pub fn viewpoint_status(&self) -> ViewpointStatus {
         self.renewal.status()
+    }
+
+    /// Layers of colours that come, from the coarsest, 0..=[`flyrig_stream::LAYERS`]: fewer while motion is late or missing, none before
+    /// the first template.
+    #[must_use]
+    pub fn color_layers(&self) -> usize {
+        self.inbox.color_layers()
     }
 
     /// Number of publishers of this rig and our schema version that live now.

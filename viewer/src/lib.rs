@@ -7,6 +7,6 @@ mod receiver;
 mod scene;
 mod window;
 
-pub use receiver::{Receiver, ReceiverState, clock_secs};
+pub use receiver::{Receiver, ReceiverState, age_secs, clock_secs};
 pub use scene::Scene;
 pub use window::{Screenshot, ViewOptions, ViewerError, open_window};

@@ -12,10 +12,7 @@ use flyrig_types::{Camera, SupervisedThread, ThreadHealth};
 use flyrig_viewing::StreamPerson;
 use glam::DVec3;
 
-use crate::{
-    Receiver, Scene,
-    receiver::{age_secs, clock_secs},
-};
+use crate::{Receiver, Scene, receiver::clock_secs};
 
 /// Grey behind the people, sRGB.
 const BACKDROP: u8 = 30;
@@ -194,7 +191,7 @@ fn draw(
         height: view.height,
         rgb: composite_over(&view.rgba, &backdrop),
         frame: stamp.map_or(0, |stamp| stamp.frame),
-        age_secs: stamp.and_then(|stamp| age_secs(stamp.capture_nanos)),
+        age_secs: stamp.and_then(|stamp| receiver.state().age_of(stamp.capture_nanos)),
         place,
         people: shown,
         is_complete: is_complete && shown > 0,

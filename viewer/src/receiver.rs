@@ -39,6 +39,8 @@ pub struct ReceiverState {
     pub publishers: usize,
     /// Reason why the rig does not admit the key, while it does not.
     pub refusal: Option<String>,
+    /// Layers of colours that come, from the coarsest.
+    pub color_layers: usize,
     /// Age of the newest motion when it came, seconds, and whether both ends run on one host so that it is exact.
     pub age: Option<(f64, bool)>,
     /// Arrival, bytes and whether it was a motion, of the last messages.
@@ -70,6 +72,12 @@ impl ReceiverState {
             return Some("The rig is up; nobody has been seen yet".to_owned());
         }
         None
+    }
+
+    /// Returns the age of a capture time, seconds; None where no clock of this host is known for it.
+    #[must_use]
+    pub fn age_of(&self, capture_nanos: i64) -> Option<f64> {
+        age_secs(capture_nanos, self.stats.as_ref().and_then(|stats| stats.clock_offset_nanos))
     }
 
     fn complain(&mut self, text: String) {
@@ -173,7 +181,7 @@ impl Link<'_> {
                     state.count(now, received.body.bytes.len(), is_motion);
                     if is_motion {
                         let is_exact = received.latency_is_exact;
-                        let own_clock = is_exact.then(|| age_secs(capture_nanos)).flatten();
+                        let own_clock = is_exact.then(|| state.age_of(capture_nanos)).flatten();
                         // Of another host only the way since the publisher's hand-in is known.
                         let way = received.latency_nanos as f64 / 1e9;
                         state.age = Some((own_clock.unwrap_or(way), own_clock.is_some()));
@@ -196,6 +204,7 @@ impl Link<'_> {
         let mut state = lock(self.state);
         state.publishers = self.subscriber.publishers();
         state.refusal = self.subscriber.trouble();
+        state.color_layers = self.subscriber.color_layers();
         for error in [stats.as_ref().err(), rig.as_ref().err()].into_iter().flatten() {
             state.complain(error.to_string());
         }
@@ -240,10 +249,32 @@ pub fn clock_secs() -> f64 {
     now.tv_sec as f64 + now.tv_nsec as f64 / 1e9
 }
 
-/// Age of a capture time of this host's `CLOCK_MONOTONIC`, seconds.
-pub(crate) fn age_secs(capture_nanos: i64) -> Option<f64> {
-    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
-    let nanos = now.tv_sec.checked_mul(1_000_000_000)?.checked_add(now.tv_nsec)?;
+/// Age of a capture time, seconds: of this host's `CLOCK_MONOTONIC`, or of a clock that is `offset_nanos` behind it. None where neither can be.
+#[must_use]
+pub fn age_secs(capture_nanos: i64, offset_nanos: Option<i64>) -> Option<f64> {
+    let now = clock_secs();
+    let age = |offset: i64| Some(now - capture_nanos.saturating_add(offset) as f64 / 1e9);
+    let is_possible = |age: &f64| (0.0..60.0).contains(age);
     // A simulated or recorded source has a clock of its own.
-    Some((nanos - capture_nanos) as f64 / 1e9).filter(|age| (0.0..60.0).contains(age))
+    age(0).filter(is_possible).or_else(|| age(offset_nanos?).filter(is_possible))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ages_are_of_the_clock_that_is_possible() {
+        let now = (clock_secs() * 1e9) as i64;
+        let near = |age: Option<f64>, expected: f64| age.is_some_and(|age| (age - expected).abs() < 5.0);
+        assert!(near(age_secs(now - 20_000_000_000, None), 20.0));
+        // A camera's frame needs some time to arrive, which is part of its age.
+        assert!(near(age_secs(now - 20_000_000_000, Some(10_000_000_000)), 20.0));
+        let other = now + 3_600_000_000_000;
+        assert!(age_secs(other, None).is_none());
+        assert!(near(age_secs(other, Some(-3_630_000_000_000)), 30.0));
+        for capture in [i64::MIN, i64::MAX] {
+            assert!(age_secs(capture, Some(capture)).is_none());
+        }
+    }
 }

@@ -8,6 +8,7 @@ use std::{
 
 use eframe::egui;
 use flyrig_gpu::{GpuContext, GpuError};
+use flyrig_stream::LAYERS;
 use flyrig_transport::{TransportConfig, TransportError};
 use flyrig_viewing::Navigation;
 use glam::DVec3;
@@ -344,6 +345,10 @@ impl View {
                 false,
             ));
             lines.extend(people_lines(&state, self.shown.people));
+            if !state.people.is_empty() && state.color_layers < LAYERS {
+                let layers = state.color_layers;
+                lines.push((format!("colours: {layers} of {LAYERS} layers, as many as the line carries"), false));
+            }
         }
         if let Some((_, text)) = state.problem.as_ref().filter(|(at, _)| now.duration_since(*at) < SHOW_PROBLEM) {
             lines.push((text.clone(), true));

@@ -52,8 +52,10 @@ const REQUEST_BYTES: usize = 8192;
 const CONNECTIONS: usize = 512;
 /// Pause after a connection could not be accepted: with no file descriptor left, trying at once only costs time.
 const PAUSE: Duration = Duration::from_millis(100);
-/// Bytes that the system keeps for a connection: what lies there cannot be overtaken by newer motion.
-const SEND_BUFFER: u32 = 64 << 10;
+/// Bytes that the system keeps for a connection, sent or not: enough for 20 Mbit/s with 200 ms. Linux doubles it.
+const SEND_BUFFER: u32 = 256 << 10;
+/// Bytes of them that are not sent yet: what lies there cannot be overtaken by newer motion.
+const UNSENT: u32 = 4 << 10;
 /// Headers of every answer: nothing from elsewhere, and no frame of another page around it.
 const HEADERS: [(&str, &str); 5] = [
     (
@@ -248,6 +250,8 @@ async fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
 /// Begins TLS where it is spoken.
 async fn greet(client: TcpStream, shared: Arc<Shared>) -> hyper::Result<()> {
     let _ = client.set_nodelay(true);
+    #[cfg(target_os = "linux")]
+    let _ = socket2::SockRef::from(&client).set_tcp_notsent_lowat(UNSENT);
     let Some(tls) = shared.tls.clone() else { return answer(client, shared).await };
     let mut first = [0];
     match timeout(PATIENCE, client.peek(&mut first)).await {
