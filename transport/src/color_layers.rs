@@ -1,0 +1,260 @@
+//! Choice of the layers of colours that a line carries: fewer while motion is late or missing, more again once it is on time.
+//!
+//! The receiver alone decides, by when motion arrives: colours that are not subscribed to are not sent, so a slow line of one viewer
+//! costs nobody else anything, and a relay adapts to its own line.
+
+use std::{
+    collections::VecDeque,
+    time::{Duration, Instant},
+};
+
+use flyrig_stream::LAYERS;
+
+/// A judgement needs motion of so long, and so many.
+const WINDOW: Duration = Duration::from_millis(400);
+const MIN_MOTIONS: usize = 4;
+/// The fastest way within this time counts as the way without a queue: clocks drift, routes change.
+const FASTEST_OF: Duration = Duration::from_secs(30);
+/// Median time in queues from which a line is congested, below which it is clear, and from which all colours stop.
+const LATE_NANOS: i64 = 70_000_000;
+const CLEAR_NANOS: i64 = 35_000_000;
+const VERY_LATE_NANOS: i64 = 400_000_000;
+/// Share of motions that do not arrive on a congested line. A line with 1 % loss misses a quarter while TCP repeats.
+const MISSED_SHARE: f64 = 0.45;
+/// After a change queues drain, and the change has to reach the rig, before the next judgement.
+const SETTLING: Duration = Duration::from_millis(1200);
+/// A layer is tried after so long without congestion; after each trial that fails, twice as long as before.
+const FIRST_TRIAL: Duration = Duration::from_millis(400);
+const LATER_TRIAL: Duration = Duration::from_secs(8);
+const MOST_PATIENCE: Duration = Duration::from_secs(240);
+/// A trial that lasts so long has succeeded.
+const SUCCESS: Duration = Duration::from_secs(10);
+
+/// Decides how many layers to subscribe to.
+#[derive(Debug)]
+pub(crate) struct ColorLayers {
+    wanted: usize,
+    is_begun: bool,
+    /// Begin and least latency of each second.
+    fastest: VecDeque<(Instant, i64)>,
+    latencies: Vec<i64>,
+    missed: u64,
+    window_began: Instant,
+    /// When layers changed last, and whether that added one.
+    changed: Option<(Instant, bool)>,
+    /// Since when no window was congested.
+    clear_since: Option<Instant>,
+    patience: Duration,
+}
+
+impl ColorLayers {
+    pub fn new(now: Instant) -> Self {
+        Self {
+            wanted: 0,
+            is_begun: false,
+            fastest: VecDeque::new(),
+            latencies: Vec::new(),
+            missed: 0,
+            window_began: now,
+            changed: None,
+            clear_since: None,
+            patience: FIRST_TRIAL,
+        }
+    }
+
+    /// Number of layers to subscribe to, from the coarsest, 0..=[`LAYERS`].
+    pub fn wanted(&self) -> usize {
+        self.wanted
+    }
+
+    /// Begins with the coarsest layer; before, motion only says how fast the line is without them.
+    pub fn begin(&mut self) {
+        if !std::mem::replace(&mut self.is_begun, true) {
+            self.wanted = 1;
+        }
+    }
+
+    /// Takes in the arrival of a motion: its latency by any two clocks, and the number of motions that were missed before it.
+    pub fn motion(&mut self, now: Instant, latency_nanos: i64, missed: u64) {
+        self.note_way(now, latency_nanos);
+        self.latencies.push(latency_nanos);
+        self.missed = self.missed.saturating_add(missed);
+        if now.duration_since(self.window_began) < WINDOW || self.latencies.len() < MIN_MOTIONS {
+            return;
+        }
+        let mut latencies = std::mem::take(&mut self.latencies);
+        let missed = std::mem::take(&mut self.missed) as f64;
+        self.window_began = now;
+        if !self.is_begun {
+            return;
+        }
+        let missed_share = missed / (missed + latencies.len() as f64);
+        let middle = latencies.len() / 2;
+        let (_, median, _) = latencies.select_nth_unstable(middle);
+        let fastest = self.fastest.iter().map(|(_, nanos)| *nanos).min().unwrap_or(*median);
+        self.judge(now, median.saturating_sub(fastest), missed_share);
+    }
+
+    fn note_way(&mut self, now: Instant, latency_nanos: i64) {
+        match self.fastest.back_mut() {
+            Some((begun, least)) if now.duration_since(*begun) < Duration::from_secs(1) => {
+                *least = latency_nanos.min(*least);
+            }
+            _ => self.fastest.push_back((now, latency_nanos)),
+        }
+        while self.fastest.front().is_some_and(|(begun, _)| now.duration_since(*begun) > FASTEST_OF) {
+            self.fastest.pop_front();
+        }
+    }
+
+    fn judge(&mut self, now: Instant, queued_nanos: i64, missed_share: f64) {
+        let since_change = self.changed.map(|(at, _)| now.duration_since(at));
+        let is_trial = matches!(self.changed, Some((_, true)));
+        let is_congested = queued_nanos > LATE_NANOS || missed_share > MISSED_SHARE;
+        if is_congested {
+            self.clear_since = None;
+            // After a layer was left out, queues are still full of it; one that was added shows at once.
+            if self.wanted == 0 || (!is_trial && since_change.is_some_and(|since| since < SETTLING)) {
+                return;
+            }
+            let has_failed = is_trial && since_change.is_some_and(|since| since < SUCCESS);
+            self.patience =
+                if has_failed { (2 * self.patience).clamp(LATER_TRIAL, MOST_PATIENCE) } else { LATER_TRIAL };
+            self.wanted = if queued_nanos > VERY_LATE_NANOS { 0 } else { self.wanted - 1 };
+            self.changed = Some((now, false));
+            return;
+        }
+        if is_trial && since_change.is_some_and(|since| since >= SUCCESS) {
+            self.patience = self.patience.min(LATER_TRIAL);
+        }
+        if queued_nanos > CLEAR_NANOS {
+            self.clear_since = None;
+            return;
+        }
+        let clear_since = *self.clear_since.get_or_insert(now);
+        let is_due =
+            now.duration_since(clear_since) >= self.patience && since_change.is_none_or(|since| since >= self.patience);
+        if is_due && self.wanted < LAYERS {
+            self.wanted += 1;
+            self.changed = Some((now, true));
+            self.clear_since = None;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn begun(now: Instant) -> ColorLayers {
+        let mut layers = ColorLayers::new(now);
+        layers.begin();
+        layers
+    }
+
+    /// A line that carries so many layers: with more of them a queue fills up to half a second, and empties at the same pace.
+    struct Line {
+        now: Instant,
+        layers: ColorLayers,
+        carries: usize,
+        queue_nanos: i64,
+        /// What arrives now was sent with so many layers.
+        in_flight: VecDeque<usize>,
+    }
+
+    impl Line {
+        fn new(carries: usize) -> Self {
+            let now = Instant::now();
+            Self { now, layers: begun(now), carries, queue_nanos: 0, in_flight: VecDeque::from([1; 4]) }
+        }
+
+        /// Runs for so long at 30 motions a second; returns the share of motions that were late, and of time with each number of layers.
+        fn run(&mut self, secs: usize) -> (f64, [f64; LAYERS + 1]) {
+            let (mut late, mut counts) = (0, [0; LAYERS + 1]);
+            for _ in 0..30 * secs {
+                self.now += Duration::from_nanos(33_333_333);
+                self.in_flight.push_back(self.layers.wanted());
+                let sent = self.in_flight.pop_front().unwrap();
+                let step = if sent > self.carries { 20_000_000 } else { -20_000_000 };
+                self.queue_nanos = (self.queue_nanos + step).clamp(0, 500_000_000);
+                late += usize::from(self.queue_nanos > 100_000_000);
+                // A clock that is an hour ahead.
+                self.layers.motion(self.now, 3_600_000_000_000 + 50_000_000 + self.queue_nanos, 0);
+                counts[self.layers.wanted()] += 1;
+            }
+            let share = |count: usize| count as f64 / (30 * secs) as f64;
+            (share(late), counts.map(share))
+        }
+    }
+
+    #[test]
+    fn a_fast_line_has_all_layers_soon() {
+        let mut line = Line::new(LAYERS);
+        line.run(2);
+        assert_eq!(line.layers.wanted(), LAYERS);
+        let (late, shares) = line.run(600);
+        assert!(late <= 0.0 && shares[LAYERS] >= 1.0, "{late} {shares:?}");
+    }
+
+    #[test]
+    fn a_slow_line_has_those_it_carries_and_others_are_tried_ever_less_often() {
+        for carries in 0..LAYERS {
+            let mut line = Line::new(carries);
+            line.run(120);
+            let (late, shares) = line.run(1200);
+            assert!(shares[carries] > 0.95, "{carries}: {shares:?}");
+            assert!(late < 0.01, "{carries}: {late}");
+        }
+    }
+
+    #[test]
+    fn a_line_that_becomes_slow_or_fast_is_followed() {
+        let mut line = Line::new(LAYERS);
+        line.run(20);
+        line.carries = 1;
+        let (late, _) = line.run(10);
+        assert!(late < 0.35 && line.layers.wanted() <= 1, "{late} {}", line.layers.wanted());
+        line.carries = LAYERS;
+        line.run(300);
+        assert_eq!(line.layers.wanted(), LAYERS);
+    }
+
+    #[test]
+    fn missing_motion_is_congestion_but_a_little_is_not() {
+        let start = Instant::now();
+        for (missed_of_four, expected) in [(1, LAYERS), (4, 0)] {
+            let mut layers = begun(start);
+            for i in 0..300u32 {
+                let missed = u64::from(i % 4 < missed_of_four);
+                layers.motion(start + i * Duration::from_millis(66), 10_000_000, missed);
+            }
+            assert!(layers.wanted().abs_diff(expected) <= 1, "{missed_of_four}: {}", layers.wanted());
+        }
+    }
+
+    #[test]
+    fn nothing_counts_before_colors_begin() {
+        let now = Instant::now();
+        let mut layers = ColorLayers::new(now);
+        (0..100).for_each(|i| layers.motion(now + i * Duration::from_millis(33), 0, 9));
+        assert_eq!(layers.wanted(), 0);
+        layers.begin();
+        layers.begin();
+        assert_eq!(layers.wanted(), 1);
+    }
+
+    #[test]
+    fn clocks_that_are_set_cost_at_most_seconds() {
+        let mut line = Line::new(LAYERS);
+        line.run(10);
+        // A clock jumps ten seconds ahead, far back, and to the ends of its range.
+        for latency in [3_610_000_000_000, -5_000_000_000, i64::MIN, i64::MAX, 0] {
+            for _ in 0..30 {
+                line.now += Duration::from_millis(33);
+                line.layers.motion(line.now, latency, if latency == 0 { u64::MAX } else { 0 });
+            }
+        }
+        line.run(300);
+        assert_eq!(line.layers.wanted(), LAYERS);
+    }
+}
