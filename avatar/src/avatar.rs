@@ -1,0 +1,206 @@
+//! An avatar: body, Gaussians, and what they were learnt from.
+
+use flyrig_body::{DeformationGraph, SkinWeights, SurfaceGaussians, Template};
+use flyrig_renderer::HarmonicOrder;
+use glam::{DVec3, Quat, Vec3};
+use serde::{Deserialize, Serialize};
+
+use crate::{AvatarError, Parameters, parameters::CONSTANT_HARMONIC};
+
+/// Thickness of a Gaussian across the surface at the start, against its size along it.
+const THICKNESS: f32 = 0.5;
+/// Opacity at the start.
+const OPACITY: f32 = 0.95;
+
+/// What an avatar was learnt from, as it stands in its file.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Card {
+    /// Name of the person or take.
+    pub name: String,
+    /// How it was learnt.
+    pub method: String,
+    /// Cameras whose images were looked at.
+    pub cameras: Vec<String>,
+    /// First frame, and the one after the last.
+    pub frames: [u64; 2],
+    /// Whether poses and masks were given or estimated.
+    pub pose: String,
+    /// The same of masks.
+    pub masks: String,
+    /// Steps of gradient descent, and the seed of their order.
+    pub steps: u64,
+    /// Seed.
+    pub seed: u64,
+    /// Mean error of the training images at the end, decibels.
+    pub training_db: f64,
+}
+
+/// Gaussians on a deformation graph.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Hanging {
+    /// Canonical places of the nodes, metres.
+    pub nodes: Vec<Vec3>,
+    /// Nodes of each Gaussian.
+    pub gaussian_nodes: Vec<[u32; 4]>,
+    /// Their weights.
+    pub gaussian_weights: Vec<[f32; 4]>,
+    /// Mean translation of each node over the take, canonical metres: the shape of hair and clothes where a pose alone drives the avatar.
+    pub mean: Vec<DVec3>,
+}
+
+/// A personal avatar. All lists of Gaussians have the same length.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Avatar {
+    /// Body, clothes included.
+    pub template: Template,
+    /// Canonical places of the Gaussians on the body, metres.
+    pub places: Vec<Vec3>,
+    /// Bones that move each Gaussian.
+    pub skin: Vec<SkinWeights>,
+    /// Deformation graph; None without one.
+    pub hanging: Option<Hanging>,
+    /// What was learnt.
+    pub parameters: Parameters,
+    /// What it was learnt from.
+    pub card: Card,
+}
+
+impl Avatar {
+    /// An avatar that looks as the person is drawn live: `surface` are the Gaussians of `template`, `graph` deforms them, `colors` are
+    /// theirs in linear RGB (grey where there are none).
+    ///
+    /// # Errors
+    /// [`AvatarError::Body`] for a template or lists that do not belong together.
+    pub fn new(
+        template: &Template,
+        surface: &SurfaceGaussians,
+        graph: Option<&DeformationGraph>,
+        colors: &[[f32; 3]],
+        order: HarmonicOrder,
+    ) -> Result<Self, AvatarError> {
+        template.check()?;
+        let count = surface.len();
+        let mut parameters = Parameters::zeroed(count, order);
+        let logit = (OPACITY / (1.0 - OPACITY)).ln();
+        for i in 0..count {
+            let scale = surface.scale_m[i].max(1e-4).ln();
+            parameters.shape[i] = [scale, scale, scale + THICKNESS.ln(), logit];
+            parameters.rotation[i] = Quat::from_rotation_arc(Vec3::Z, surface.normals[i].normalize_or(Vec3::Z)).to_array();
+            let [r, g, b] = colors.get(i).copied().unwrap_or([0.2; 3]).map(|value| value / CONSTANT_HARMONIC);
+            parameters.harmonics[i * order.coefficients()] = [r, g, b, 0.0];
+        }
+        let hanging = graph.map(|graph| Hanging {
+            nodes: graph.nodes.clone(),
+            gaussian_nodes: graph.gaussian_nodes.clone(),
+            gaussian_weights: graph.gaussian_weights.clone(),
+            mean: vec![DVec3::ZERO; graph.nodes.len()],
+        });
+        Ok(Self {
+            template: template.clone(),
+            places: surface.positions.clone(),
+            skin: surface.skin.clone(),
+            hanging,
+            parameters,
+            card: Card::default(),
+        })
+    }
+
+    /// Number of Gaussians.
+    #[must_use]
+    pub fn gaussians(&self) -> usize {
+        self.places.len()
+    }
+
+    /// Sets the shape for poses alone to the mean of these translations of the nodes, one list a frame.
+    pub fn set_mean<'a>(&mut self, frames: impl IntoIterator<Item = &'a [DVec3]>) {
+        let Some(hanging) = &mut self.hanging else { return };
+        let (mut sum, mut count) = (vec![DVec3::ZERO; hanging.nodes.len()], 0);
+        for frame in frames.into_iter().filter(|frame| frame.len() == hanging.nodes.len()) {
+            sum.iter_mut().zip(frame).for_each(|(sum, translation)| *sum += *translation);
+            count += 1;
+        }
+        hanging.mean = sum.iter().map(|sum| *sum / f64::from(count.max(1))).collect();
+    }
+
+    /// Checks that all lists belong together and every number is finite.
+    pub(crate) fn check(&self) -> Result<(), String> {
+        self.template.check().map_err(|error| error.to_string())?;
+        let count = self.places.len();
+        if count == 0 || self.skin.len() != count || self.parameters.len() != count {
+            return Err(format!("lists of {count}, {} and {} Gaussians", self.skin.len(), self.parameters.len()));
+        }
+        if let Some(hanging) = &self.hanging {
+            let nodes = hanging.nodes.len();
+            let known = hanging.gaussian_nodes.iter().flatten().all(|node| (*node as usize) < nodes);
+            if hanging.gaussian_nodes.len() != count
+                || hanging.gaussian_weights.len() != count
+                || hanging.mean.len() != nodes
+                || !known
+            {
+                return Err("its deformation graph is of another avatar".to_owned());
+            }
+        }
+        let is_finite = self.places.iter().all(|place| place.is_finite()) && self.parameters.is_finite();
+        if is_finite { Ok(()) } else { Err("it holds numbers that are not finite".to_owned()) }
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
+    use flyrig_types::Pose;
+    use glam::DQuat;
+    use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
+
+    use super::*;
+
+    /// An avatar of the built-in body, with attributes at random.
+    pub(crate) fn small(gaussians: usize, nodes: usize) -> Avatar {
+        let template = default_template(&ShapeParams::default()).unwrap();
+        let surface = sample_surface(&template, gaussians, 5).unwrap();
+        let graph = build_graph(&template, &surface, nodes, DEFAULT_SIGMA2_M2).unwrap();
+        let mut avatar = Avatar::new(&template, &surface, Some(&graph), &[], HarmonicOrder::One).unwrap();
+        let mut random = StdRng::seed_from_u64(9);
+        for list in avatar.parameters.lists_mut() {
+            list.iter_mut().flatten().for_each(|value| *value += random.random_range(-0.01f32..0.01));
+        }
+        avatar
+    }
+
+    pub(crate) fn random_pose(avatar: &Avatar, seed: u64) -> (Pose, Vec<DVec3>) {
+        let mut random = StdRng::seed_from_u64(seed);
+        let mut pose = avatar.template.skeleton.rest_pose();
+        pose.root_translation = DVec3::new(0.3, -1.0, 2.0);
+        for rotation in &mut pose.joint_rotations {
+            let axis = DVec3::new(random.random(), random.random(), random.random()).normalize();
+            *rotation *= DQuat::from_axis_angle(axis, random.random_range(-0.5..0.5));
+        }
+        let nodes = avatar.hanging.as_ref().map_or(0, |hanging| hanging.nodes.len());
+        let translations = (0..nodes).map(|_| DVec3::new(random.random(), random.random(), random.random()) * 0.02);
+        (pose, translations.collect())
+    }
+
+    #[test]
+    fn lists_that_do_not_belong_together_are_named() {
+        let avatar = small(40, 7);
+        avatar.check().unwrap();
+        let with = |change: &dyn Fn(&mut Avatar)| {
+            let mut changed = avatar.clone();
+            change(&mut changed);
+            changed.check().unwrap_err()
+        };
+        assert!(with(&|avatar| drop(avatar.skin.pop())).contains("lists of"));
+        assert!(with(&|avatar| avatar.hanging.as_mut().unwrap().gaussian_nodes[3][1] = 7).contains("graph"));
+        assert!(with(&|avatar| avatar.parameters.shape[3][1] = f32::NAN).contains("not finite"));
+        assert!(with(&|avatar| avatar.template.triangles[0][0] = u32::MAX).contains("triangle"));
+        assert_eq!(Parameters::from_lists([vec![[0.0; 4]; 3], vec![[0.0; 4]; 3], vec![[0.0; 4]; 3], vec![[0.0; 4]; 13]]), None);
+    }
+
+    #[test]
+    fn the_mean_is_that_of_the_frames() {
+        let mut avatar = small(40, 2);
+        let frames = [[DVec3::X, DVec3::ZERO], [DVec3::Y, DVec3::Z]];
+        avatar.set_mean(frames.iter().map(|frame| frame.as_slice()).chain([&[DVec3::X][..]]));
+        assert_eq!(avatar.hanging.as_ref().unwrap().mean, [DVec3::new(0.5, 0.5, 0.0), DVec3::Z * 0.5]);
+    }
+}

@@ -1,0 +1,310 @@
+//! Gradient descent on the images of a take.
+
+use std::collections::BTreeMap;
+
+use flyrig_gpu::{GpuContext, StorageBuffer, read_all};
+use flyrig_renderer::{
+    AnisotropicBuffers, AnisotropicGradients, BackwardRasterizer, HarmonicOrder, ImageGradients, Outputs,
+    RasterSettings, Rasterizer, RenderTarget,
+};
+use flyrig_types::Camera;
+use glam::DVec3;
+use rand::{SeedableRng as _, rngs::StdRng, seq::SliceRandom as _};
+
+use crate::{Avatar, AvatarError, Bones, ErrorWeights, ImageError, PosedAvatar, adam::Adam, parameters::Element};
+
+/// Images are cut to the person and so many pixels around.
+const MARGIN_PX: u32 = 12;
+/// Cut images have sides of so many pixels, or a multiple: buffers are made for each size.
+const SIDE_PX: u32 = 64;
+/// Colours of higher orders than zero move more slowly.
+const HIGHER: f32 = 0.05;
+
+/// How an avatar is learnt.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FitSettings {
+    /// Seed of the order of images.
+    pub seed: u64,
+    /// Parts of the error.
+    pub weights: ErrorWeights,
+    /// Rates of the offset, of logarithms of scales, the opacity's logit, rotations and colours: at the start and at the end.
+    pub offset_rate_m: [f32; 2],
+    /// Of logarithms of scales.
+    pub scale_rate: [f32; 2],
+    /// Of logits of opacities.
+    pub opacity_rate: [f32; 2],
+    /// Of quaternions.
+    pub rotation_rate: [f32; 2],
+    /// Of coefficients of colours.
+    pub color_rate: [f32; 2],
+}
+
+impl Default for FitSettings {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            weights: ErrorWeights::default(),
+            offset_rate_m: [2e-4, 2e-5],
+            scale_rate: [1e-2, 2e-3],
+            opacity_rate: [2e-2, 5e-3],
+            rotation_rate: [5e-3, 1e-3],
+            color_rate: [1e-2, 1e-3],
+        }
+    }
+}
+
+/// A person at one instant.
+#[derive(Debug, Clone)]
+pub struct TrainingFrame {
+    /// Its pose.
+    pub bones: Bones,
+    /// Translations of the graph's nodes, canonical metres; empty without a graph.
+    pub translations: Vec<DVec3>,
+}
+
+/// An image of the person, cut to it.
+#[derive(Debug, Clone)]
+pub struct TrainingView {
+    frame: usize,
+    camera: Camera,
+    /// sRGB and mask.
+    rgba: Vec<u8>,
+}
+
+impl TrainingView {
+    /// Cuts an image, sRGB with the mask as alpha, to the person. None where nobody is in it, or its bytes are not those of the camera's
+    /// size.
+    #[must_use]
+    pub fn cut(frame: usize, camera: &Camera, rgba: &[u8]) -> Option<Self> {
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+        if width == 0 || rgba.len() != width as usize * height as usize * 4 {
+            return None;
+        }
+        let (mut least, mut most) = ([u32::MAX; 2], [0; 2]);
+        for (y, row) in (0u32..).zip(rgba.chunks_exact(4 * width as usize)) {
+            for (x, _) in (0u32..).zip(row.chunks_exact(4)).filter(|(_, pixel)| pixel[3] > 127) {
+                least = [least[0].min(x), least[1].min(y)];
+                most = [most[0].max(x), most[1].max(y)];
+            }
+        }
+        if least[0] > most[0] {
+            return None;
+        }
+        // A cut as large as its class of size, moved into the image.
+        let range = |k: usize, whole: u32| {
+            let wanted = most[k] - least[k] + 1 + 2 * MARGIN_PX;
+            let side = wanted.next_multiple_of(SIDE_PX).min(whole);
+            let first = (least[k] + most[k] + 1).saturating_sub(side) / 2;
+            (first.min(whole - side), side)
+        };
+        let ((left, columns), (top, rows)) = (range(0, width), range(1, height));
+        let mut cut = Vec::with_capacity(columns as usize * rows as usize * 4);
+        for y in top..top + rows {
+            let first = (y as usize * width as usize + left as usize) * 4;
+            cut.extend(&rgba[first..first + 4 * columns as usize]);
+        }
+        let mut camera = camera.clone();
+        camera.intrinsics.center_px -= glam::DVec2::new(f64::from(left), f64::from(top));
+        (camera.intrinsics.width, camera.intrinsics.height) = (columns, rows);
+        Some(Self { frame, camera, rgba: cut })
+    }
+
+    fn size(&self) -> [u32; 2] {
+        [self.camera.intrinsics.width, self.camera.intrinsics.height]
+    }
+}
+
+/// Result of one step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepReport {
+    /// Weighted error of the step's image.
+    pub loss: f64,
+    /// Its PSNR inside the cut, decibels.
+    pub decibels: f64,
+}
+
+/// Images of one size on the adapter.
+#[derive(Debug)]
+struct Targets {
+    drawn: RenderTarget,
+    slopes: ImageGradients,
+}
+
+/// Fits an avatar to images.
+#[derive(Debug)]
+pub struct Fit {
+    gpu: GpuContext,
+    settings: FitSettings,
+    frames: Vec<TrainingFrame>,
+    views: Vec<TrainingView>,
+    rasterizer: Rasterizer,
+    backward: BackwardRasterizer,
+    gaussians: AnisotropicBuffers,
+    gradients: AnisotropicGradients,
+    targets: BTreeMap<[u32; 2], Targets>,
+    posed: PosedAvatar,
+    moments: [Adam; 4],
+    step: u64,
+    random: StdRng,
+    /// Views that are still to come in this round.
+    round: Vec<usize>,
+}
+
+impl Fit {
+    /// For an avatar and the images of its take.
+    ///
+    /// # Errors
+    /// [`AvatarError::Images`] without an image, or with one of a frame that does not exist; [`AvatarError::Gpu`].
+    pub fn new(
+        gpu: &GpuContext,
+        avatar: &Avatar,
+        frames: Vec<TrainingFrame>,
+        views: Vec<TrainingView>,
+        settings: FitSettings,
+    ) -> Result<Self, AvatarError> {
+        if views.is_empty() {
+            return Err(AvatarError::Images("nobody is in any image; check masks, cameras and frames".to_owned()));
+        }
+        if views.iter().any(|view| view.frame >= frames.len()) {
+            return Err(AvatarError::Images("an image is of a frame without a pose".to_owned()));
+        }
+        let (count, order) = (avatar.gaussians(), avatar.parameters.order());
+        let mut targets = BTreeMap::new();
+        for view in &views {
+            let [width, height] = view.size();
+            if let std::collections::btree_map::Entry::Vacant(entry) = targets.entry([width, height]) {
+                let drawn = RenderTarget::new(gpu, width, height)?;
+                entry.insert(Targets { drawn, slopes: ImageGradients::zeroed(gpu, width, height)? });
+            }
+        }
+        Ok(Self {
+            gpu: gpu.clone(),
+            rasterizer: Rasterizer::new(gpu, count)?,
+            backward: BackwardRasterizer::new(gpu)?,
+            gaussians: AnisotropicBuffers::zeroed(gpu, count, order)?,
+            gradients: AnisotropicGradients::zeroed(gpu, count, order)?,
+            targets,
+            posed: PosedAvatar::default(),
+            moments: avatar.parameters.lists().map(|list| Adam::new(list.len())),
+            step: 0,
+            random: StdRng::seed_from_u64(settings.seed),
+            round: Vec::new(),
+            settings,
+            frames,
+            views,
+        })
+    }
+
+    /// Number of images.
+    #[must_use]
+    pub fn images(&self) -> usize {
+        self.views.len()
+    }
+
+    /// Descends by one step on the next image; `progress` in 0..=1 is the part of all steps that is done.
+    ///
+    /// # Errors
+    /// [`AvatarError::Gpu`], [`AvatarError::Backward`].
+    pub fn step(&mut self, avatar: &mut Avatar, progress: f32) -> Result<StepReport, AvatarError> {
+        if self.round.is_empty() {
+            self.round = (0..self.views.len()).collect();
+            self.round.shuffle(&mut self.random);
+        }
+        let Some(view) = self.round.pop() else { return Err(AvatarError::Images("there is no image".to_owned())) };
+        let error = self.draw(avatar, view)?;
+        let view = &self.views[view];
+        let Some(Targets { drawn, slopes }) = self.targets.get(&view.size()) else {
+            return Err(AvatarError::Images("an image has no target".to_owned()));
+        };
+        slopes.color.write(&self.gpu, &error.slope);
+        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+        self.gradients.clear(&mut encoder);
+        self.backward.encode_anisotropic(
+            &self.gpu,
+            &mut encoder,
+            &self.rasterizer,
+            &self.gaussians,
+            drawn,
+            slopes,
+            &self.gradients,
+        )?;
+        self.gpu.queue.submit([encoder.finish()]);
+        let mut found = read_all(&self.gpu, &self.gradients.attributes())?;
+        if let [centers, scales, rotations, _] = found.as_mut_slice() {
+            self.posed.to_parameters([centers, scales, rotations]);
+        }
+        self.step += 1;
+        let rates = self.rates(progress);
+        let coefficients = avatar.parameters.order().coefficients();
+        for (list, values) in avatar.parameters.lists_mut().into_iter().enumerate() {
+            if let Some(slopes) = found.get_mut(list) {
+                if list == 3 {
+                    slow_down(slopes, coefficients);
+                }
+                self.moments[list].descend(self.step, rates[list], values, slopes);
+            }
+        }
+        Ok(StepReport { loss: error.loss, decibels: -10.0 * error.squared.max(1e-10).log10() })
+    }
+
+    /// Mean PSNR over all images as the avatar is now, decibels of the mean squared error.
+    ///
+    /// # Errors
+    /// [`AvatarError::Gpu`].
+    pub fn decibels(&mut self, avatar: &Avatar) -> Result<f64, AvatarError> {
+        let mut sum = 0.0;
+        for view in 0..self.views.len() {
+            sum += self.draw(avatar, view)?.squared;
+        }
+        Ok(-10.0 * (sum / self.views.len().max(1) as f64).max(1e-10).log10())
+    }
+
+    /// Rates of all lists and columns.
+    fn rates(&self, progress: f32) -> [Element; 4] {
+        let rate = |[from, to]: [f32; 2]| from * (to / from).powf(progress.clamp(0.0, 1.0));
+        let FitSettings { offset_rate_m, scale_rate, opacity_rate, rotation_rate, color_rate, .. } = &self.settings;
+        let scale = rate(*scale_rate);
+        [
+            [rate(*offset_rate_m); 4],
+            [scale, scale, scale, rate(*opacity_rate)],
+            [rate(*rotation_rate); 4],
+            [rate(*color_rate); 4],
+        ]
+    }
+
+    fn draw(&mut self, avatar: &Avatar, view: usize) -> Result<ImageError, AvatarError> {
+        let view = &self.views[view];
+        let frame = &self.frames[view.frame];
+        let translations = (!frame.translations.is_empty()).then_some(frame.translations.as_slice());
+        avatar.pose(&frame.bones, translations, &mut self.posed);
+        write(&self.gpu, &self.gaussians, &self.posed, avatar);
+        let Some(Targets { drawn, .. }) = self.targets.get(&view.size()) else {
+            return Err(AvatarError::Images("an image has no target".to_owned()));
+        };
+        let settings = RasterSettings { outputs: Outputs { canonical: false, ..Outputs::ALL }, ..RasterSettings::default() };
+        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
+        self.rasterizer.encode(&self.gpu, &mut encoder, &self.gaussians, &view.camera, &settings, drawn)?;
+        self.gpu.queue.submit([encoder.finish()]);
+        let pixels = drawn.color.read(&self.gpu)?;
+        Ok(ImageError::of(&pixels, &view.rgba, view.size()[0] as usize, &self.settings.weights))
+    }
+}
+
+/// Writes a posed avatar into the buffers that are drawn.
+pub(crate) fn write(gpu: &GpuContext, buffers: &AnisotropicBuffers, posed: &PosedAvatar, avatar: &Avatar) {
+    let put = |buffer: &StorageBuffer<Element>, content: &[Element]| buffer.write(gpu, content);
+    put(&buffers.center, &posed.center);
+    put(&buffers.scale_opacity, &posed.scale_opacity);
+    put(&buffers.rotation, &posed.rotation);
+    put(&buffers.harmonics, &avatar.parameters.harmonics);
+}
+
+/// Adam's steps do not depend on the size of derivatives, but on that of a few against the others: of the higher coefficients a share counts.
+fn slow_down(slopes: &mut [Element], coefficients: usize) {
+    if coefficients == HarmonicOrder::Zero.coefficients() {
+        return;
+    }
+    for rows in slopes.chunks_mut(coefficients) {
+        rows.iter_mut().skip(1).flatten().for_each(|slope| *slope *= HIGHER);
+    }
+}

@@ -1,0 +1,194 @@
+//! Error of a drawn image against a photograph of the person, and its derivative.
+//!
+//! Compared are the bytes that a viewer would show: straight colours in sRGB times coverage, against the photograph times its mask
+//! (LoGAvatar Eq. 16, without the learnt perceptual term: absolute differences and structural similarity), and coverage against the mask.
+
+use rayon::prelude::*;
+
+use crate::ssim::ssim;
+
+/// Coverage below which a pixel has no colour.
+const CLEAR: f32 = 1.0 / 512.0;
+/// Colours below this have the slope of this one: at black the curve of sRGB is too steep to descend.
+const DARK: f32 = 1e-3;
+
+/// Weights of the parts of the error.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ErrorWeights {
+    /// Of absolute differences of colour.
+    pub color: f32,
+    /// Of one minus the structural similarity.
+    pub structure: f32,
+    /// Of absolute differences of coverage.
+    pub coverage: f32,
+}
+
+impl Default for ErrorWeights {
+    fn default() -> Self {
+        Self { color: 0.8, structure: 0.2, coverage: 0.3 }
+    }
+}
+
+/// Error of one image.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ImageError {
+    /// The weighted error, a mean over the pixels of the person.
+    pub loss: f64,
+    /// Mean squared difference of sRGB over all pixels that are compared, codes of 0..=1.
+    pub squared: f64,
+    /// Derivative with respect to premultiplied linear red, green, blue, and coverage; an element a pixel.
+    pub slope: Vec<[f32; 4]>,
+}
+
+fn srgb(linear: f32) -> f32 {
+    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
+}
+
+fn srgb_slope(linear: f32) -> f32 {
+    let linear = linear.max(DARK);
+    if linear <= 0.003_130_8 { 12.92 } else { 1.055 / 2.4 * linear.powf(1.0 / 2.4 - 1.0) }
+}
+
+/// A drawn pixel as it is compared: sRGB times coverage, and what is needed for its slope.
+#[derive(Debug, Clone, Copy, Default)]
+struct Shown {
+    color: [f32; 3],
+    /// Slope with respect to the premultiplied colour, and to coverage.
+    by_color: [f32; 3],
+    by_coverage: [f32; 3],
+}
+
+impl Shown {
+    fn of([r, g, b, alpha]: [f32; 4]) -> Self {
+        let mut shown = Self::default();
+        if !(alpha > CLEAR) {
+            return shown;
+        }
+        for (k, value) in [r, g, b].into_iter().enumerate() {
+            let straight = (value / alpha).clamp(0.0, 1.0);
+            let code = srgb(straight);
+            shown.color[k] = code * alpha;
+            // What is clamped does not move with the colour.
+            let moves = value > 0.0 && value < alpha;
+            shown.by_color[k] = if moves { srgb_slope(straight) } else { 0.0 };
+            shown.by_coverage[k] = code - shown.by_color[k] * straight;
+        }
+        shown
+    }
+}
+
+impl ImageError {
+    /// Compares a drawn image (premultiplied linear RGB, coverage) with bytes (sRGB, mask) of `width` pixels a row. A drawn pixel that is
+    /// not finite counts as clear and has no slope.
+    #[must_use]
+    pub fn of(drawn: &[[f32; 4]], wanted: &[u8], width: usize, weights: &ErrorWeights) -> Self {
+        let count = drawn.len().min(wanted.len() / 4);
+        let whole = |pixel: &[f32; 4]| if pixel.iter().all(|value| value.is_finite()) { *pixel } else { [0.0; 4] };
+        let pixels: Vec<[f32; 4]> = drawn[..count].iter().map(whole).collect();
+        let shown: Vec<Shown> = pixels.par_iter().with_min_len(4096).map(|pixel| Shown::of(*pixel)).collect();
+        let unit = |code: u8| f32::from(code) / 255.0;
+        let mask: Vec<f32> = wanted.chunks_exact(4).take(count).map(|pixel| unit(pixel[3])).collect();
+        // A mean over the person, so that a small one counts as much as a large one.
+        let person = mask.iter().map(|mask| f64::from(*mask)).sum::<f64>().max(1.0);
+        let scale = (1.0 / person) as f32;
+        let mut error = Self { slope: vec![[0.0; 4]; count], ..Self::default() };
+        let planes: Vec<_> = (0..3)
+            .into_par_iter()
+            .map(|k| {
+                let ours: Vec<f32> = shown.iter().map(|pixel| pixel.color[k]).collect();
+                let theirs: Vec<f32> =
+                    wanted.chunks_exact(4).zip(&mask).map(|(pixel, mask)| unit(pixel[k]) * mask).collect();
+                let (similarity, slope) =
+                    if weights.structure > 0.0 { ssim(&ours, &theirs, width) } else { (count as f64, vec![0.0; count]) };
+                (ours, theirs, similarity, slope)
+            })
+            .collect();
+        let third = scale / 3.0;
+        for (k, (ours, theirs, similarity, structure)) in planes.into_iter().enumerate() {
+            error.loss += f64::from(weights.structure) * (count as f64 - similarity) / (3.0 * person);
+            let mut absolute = 0.0;
+            for i in 0..count {
+                let difference = ours[i] - theirs[i];
+                absolute += f64::from(difference.abs());
+                error.squared += f64::from(difference * difference);
+                let sign = if difference > 0.0 { 1.0 } else { -1.0 };
+                let slope = third * (weights.color * sign - weights.structure * structure[i]);
+                let Shown { by_color, by_coverage, .. } = &shown[i];
+                error.slope[i][k] = slope * by_color[k];
+                error.slope[i][3] += slope * by_coverage[k];
+            }
+            error.loss += f64::from(weights.color) * absolute / (3.0 * person);
+        }
+        error.squared /= 3.0 * count.max(1) as f64;
+        for ((slope, pixel), mask) in error.slope.iter_mut().zip(&pixels).zip(&mask) {
+            let difference = pixel[3] - mask;
+            error.loss += f64::from(weights.coverage * difference.abs()) / person;
+            slope[3] += scale * weights.coverage * if difference > 0.0 { 1.0 } else { -1.0 };
+        }
+        for (slope, pixel) in error.slope.iter_mut().zip(drawn) {
+            if !pixel.iter().all(|value| value.is_finite()) {
+                *slope = [0.0; 4];
+            }
+        }
+        error
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
+
+    use super::*;
+
+    #[test]
+    fn slopes_are_those_of_finite_differences() {
+        let mut random = StdRng::seed_from_u64(4);
+        let width = 12;
+        let mut drawn: Vec<[f32; 4]> = (0..width * 10)
+            .map(|_| {
+                let alpha = random.random_range(0.1f32..0.99);
+                [0; 3].map(|_| alpha * random.random_range(0.05f32..0.95)).into_iter().chain([alpha]).collect::<Vec<_>>()
+            })
+            .map(|row| [row[0], row[1], row[2], row[3]])
+            .collect();
+        let wanted: Vec<u8> = (0..width * 10 * 4).map(|_| random.random()).collect();
+        let weights = ErrorWeights { color: 0.8, structure: 0.2, coverage: 0.3 };
+        let slope = ImageError::of(&drawn, &wanted, width, &weights).slope;
+        let mut worst = 0.0f64;
+        for i in (0..drawn.len()).step_by(3) {
+            for k in 0..4 {
+                let step = 1e-3;
+                let mut at = |by: f32| {
+                    drawn[i][k] += by;
+                    let loss = ImageError::of(&drawn, &wanted, width, &weights).loss;
+                    drawn[i][k] -= by;
+                    loss
+                };
+                let expected = (at(step) - at(-step)) / f64::from(2.0 * step);
+                worst = worst.max((expected - f64::from(slope[i][k])).abs() / (expected.abs() + 1e-3));
+            }
+        }
+        assert!(worst < 0.03, "{worst}");
+    }
+
+    #[test]
+    fn the_same_image_has_no_error_and_poison_is_left_out() {
+        let wanted: Vec<u8> = (0..400).flat_map(|i| [40 + (i % 100) as u8, 90, 160, 255]).collect();
+        let linear = |code: u8| {
+            let code = f32::from(code) / 255.0;
+            if code <= 0.040_45 { code / 12.92 } else { ((code + 0.055) / 1.055).powf(2.4) }
+        };
+        let mut drawn: Vec<[f32; 4]> =
+            wanted.chunks_exact(4).map(|p| [linear(p[0]), linear(p[1]), linear(p[2]), 1.0]).collect();
+        let error = ImageError::of(&drawn, &wanted, 20, &ErrorWeights::default());
+        assert!(error.loss < 1e-3 && error.squared < 1e-8, "{} {}", error.loss, error.squared);
+        drawn[3] = [f32::NAN, 0.0, 0.0, 1.0];
+        drawn[5] = [f32::INFINITY; 4];
+        let error = ImageError::of(&drawn, &wanted, 20, &ErrorWeights::default());
+        assert!(error.loss.is_finite() && error.slope[3] == [0.0; 4] && error.slope.iter().flatten().all(|v| v.is_finite()));
+        assert!(ImageError::of(&[], &[], 20, &ErrorWeights::default()).slope.is_empty());
+        // Nobody in the image: what is drawn is too much.
+        let error = ImageError::of(&[[0.5, 0.5, 0.5, 0.9]], &[0; 4], 1, &ErrorWeights::default());
+        assert!(error.loss > 0.1 && error.slope[0][3] > 0.0);
+    }
+}

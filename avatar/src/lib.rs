@@ -1,0 +1,22 @@
+//! Personal avatars: Gaussians of three scales on the surface of a person's body, fitted to the images of a take and driven by poses.
+//!
+//! An [`Avatar`] is a body with a skin, and for each Gaussian an offset, scales, a rotation, an opacity and a colour in canonical space
+//! ([`Parameters`]). [`Avatar::pose`] brings them into the world by linear blend skinning, with or without a deformation graph's
+//! translations; [`Fit`] finds them by gradient descent on images.
+
+mod adam;
+mod avatar;
+mod error;
+mod file;
+mod fit;
+mod image_error;
+mod parameters;
+mod posing;
+mod ssim;
+
+pub use avatar::{Avatar, Card, Hanging};
+pub use error::AvatarError;
+pub use fit::{Fit, FitSettings, StepReport, TrainingFrame, TrainingView};
+pub use image_error::{ErrorWeights, ImageError};
+pub use parameters::Parameters;
+pub use posing::{Bones, PosedAvatar};

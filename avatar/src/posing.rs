@@ -1,0 +1,213 @@
+//! From canonical space into the world, and derivatives back.
+//!
+//! A Gaussian's place is blended linearly from the bones that move it (FlyHuman Eq. 1 and 2), its rotation by the normalised blend of their
+//! quaternions.
+
+use flyrig_body::{SkinWeights, Skeleton, displacement};
+use flyrig_types::Pose;
+use glam::{DMat4, DVec3, Mat3, Mat4, Quat, Vec3, Vec4};
+use rayon::prelude::*;
+
+use crate::{Avatar, Parameters, parameters::Element};
+
+/// Scales beyond these are not drawn, metres: an avatar is neither dust nor a room.
+const SCALE_M: std::ops::RangeInclusive<f32> = 2e-4..=0.1;
+
+/// Rigid motions of the bones in one pose.
+#[derive(Debug, Clone)]
+pub struct Bones {
+    world_from_canonical: Vec<(Mat4, Quat)>,
+}
+
+impl Bones {
+    /// Of a skeleton in a pose.
+    #[must_use]
+    pub fn new(skeleton: &Skeleton, pose: &Pose) -> Self {
+        let of = |matrix: &DMat4| (matrix.as_mat4(), matrix.to_scale_rotation_translation().1.as_quat().normalize());
+        Self { world_from_canonical: skeleton.world_from_canonical(pose).iter().map(of).collect() }
+    }
+
+    /// Blends the bones of a Gaussian: linear part and translation, and rotation. Without any weight it stays at rest.
+    fn blend(&self, skin: &SkinWeights) -> (Mat4, Quat) {
+        let (mut matrix, mut rotation, mut sum) = (Mat4::ZERO, Vec4::ZERO, 0.0);
+        for (joint, weight) in skin.joints.iter().zip(skin.weights) {
+            let Some((bone, turn)) = self.world_from_canonical.get(usize::from(*joint)).filter(|_| weight > 0.0) else {
+                continue;
+            };
+            matrix += *bone * weight;
+            let turn = Vec4::from(*turn);
+            // A quaternion and its negative are the same turn.
+            rotation += turn * if rotation.dot(turn) < 0.0 { -weight } else { weight };
+            sum += weight;
+        }
+        if sum <= 0.0 {
+            return (Mat4::IDENTITY, Quat::IDENTITY);
+        }
+        (matrix * (1.0 / sum), Quat::from_vec4(rotation.normalize_or(Vec4::W)))
+    }
+}
+
+/// Motion of one Gaussian from canonical space into the world.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    linear: Mat3,
+    rotation: Quat,
+    /// By which its scales grow where the surface is stretched.
+    growth: f32,
+}
+
+/// An avatar in the world: elements for [`flyrig_renderer::AnisotropicBuffers`].
+#[derive(Debug, Clone, Default)]
+pub struct PosedAvatar {
+    /// World centre, metres.
+    pub center: Vec<Element>,
+    /// Standard deviations, metres; w: opacity.
+    pub scale_opacity: Vec<Element>,
+    /// Quaternion x, y, z, w, world from the Gaussian's axes.
+    pub rotation: Vec<Element>,
+    places: Vec<Place>,
+}
+
+fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + (-x).exp())
+}
+
+fn scale(logarithm: f32) -> f32 {
+    // `max` and `min` drop NaN.
+    logarithm.exp().max(*SCALE_M.start()).min(*SCALE_M.end())
+}
+
+impl Avatar {
+    /// Brings all Gaussians into the world. `translations` are those of the graph's nodes, canonical metres; without them, and where there
+    /// are none, the mean of the take holds.
+    pub fn pose(&self, bones: &Bones, translations: Option<&[DVec3]>, posed: &mut PosedAvatar) {
+        let Parameters { offset, shape, rotation, .. } = &self.parameters;
+        let nodes = self.hanging.as_ref();
+        let translations = translations.or(nodes.map(|nodes| nodes.mean.as_slice())).unwrap_or_default();
+        let of = |i: usize| {
+            let (blend, turn) = bones.blend(&self.skin[i]);
+            let moved = nodes.map_or([0.0; 4], |hanging| {
+                displacement(&hanging.nodes, translations, hanging.gaussian_nodes[i], hanging.gaussian_weights[i])
+            });
+            let canonical = self.places[i] + Vec4::from(moved).truncate() + Vec4::from(offset[i]).truncate();
+            let [x, y, z, logit] = shape[i];
+            let growth = 1.0 + moved[3];
+            let [sx, sy, sz] = [x, y, z].map(|logarithm| growth * scale(logarithm));
+            let center = blend.transform_point3(canonical).extend(0.0).to_array();
+            let turned = turn * Quat::from_array(rotation[i]);
+            let place = Place { linear: Mat3::from_mat4(blend), rotation: turn, growth };
+            ((center, [sx, sy, sz, sigmoid(logit)]), (turned.to_array(), place))
+        };
+        let rows: Vec<_> = (0..self.places.len()).into_par_iter().with_min_len(1024).map(of).collect();
+        posed.center.clear();
+        posed.scale_opacity.clear();
+        posed.rotation.clear();
+        posed.places.clear();
+        for ((center, scales), (rotation, place)) in rows {
+            posed.center.push(center);
+            posed.scale_opacity.push(scales);
+            posed.rotation.push(rotation);
+            posed.places.push(place);
+        }
+    }
+}
+
+impl PosedAvatar {
+    /// Turns derivatives with respect to centres, scales and opacities, and rotations in the world into those of the parameters, in place:
+    /// offsets, logarithms and logits, canonical rotations.
+    pub(crate) fn to_parameters(&self, derivatives: [&mut [Element]; 3]) {
+        let [centers, scales, rotations] = derivatives;
+        let rows = centers.par_iter_mut().zip(scales).zip(rotations).with_min_len(1024);
+        rows.zip(&self.places).zip(&self.scale_opacity).for_each(|(((( center, scale), rotation), place), posed)| {
+            *center = (place.linear.transpose() * Vec4::from(*center).truncate()).extend(0.0).to_array();
+            for k in 0..3 {
+                let canonical = posed[k] / place.growth;
+                // At its bounds a scale does not move.
+                let moves = canonical > *SCALE_M.start() && canonical < *SCALE_M.end();
+                scale[k] *= if moves { posed[k] } else { 0.0 };
+            }
+            scale[3] *= posed[3] * (1.0 - posed[3]);
+            *rotation = (place.rotation.conjugate() * Quat::from_array(*rotation)).to_array();
+        });
+    }
+
+    /// World centres.
+    #[must_use]
+    pub fn centers(&self) -> impl ExactSizeIterator<Item = Vec3> + '_ {
+        self.center.iter().map(|row| Vec4::from(*row).truncate())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::avatar::tests::{random_pose, small};
+
+    /// A loss that weighs every number of the posed avatar.
+    fn loss(avatar: &Avatar, bones: &Bones, translations: &[DVec3], weights: &[[Element; 3]]) -> f64 {
+        let mut posed = PosedAvatar::default();
+        avatar.pose(bones, Some(translations), &mut posed);
+        let rows = posed.center.iter().zip(&posed.scale_opacity).zip(&posed.rotation).zip(weights);
+        let dot = |a: &Element, b: &Element| a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
+        rows.map(|(((center, scales), rotation), weight)| {
+            dot(center, &weight[0]) + dot(scales, &weight[1]) + dot(rotation, &weight[2])
+        })
+        .sum()
+    }
+
+    #[test]
+    fn derivatives_are_those_of_finite_differences() {
+        let mut avatar = small(40, 7);
+        let (pose, translations) = random_pose(&avatar, 3);
+        let bones = Bones::new(&avatar.template.skeleton, &pose);
+        let weights: Vec<[Element; 3]> = (0..avatar.places.len())
+            .map(|i| [0, 1, 2].map(|list| [0, 1, 2, 3].map(|k| ((i * 12 + list * 4 + k) as f32 * 1.7).sin())))
+            .collect();
+        let mut posed = PosedAvatar::default();
+        avatar.pose(&bones, Some(&translations), &mut posed);
+        let mut slopes: [Vec<Element>; 3] = [0, 1, 2].map(|list| weights.iter().map(|row| row[list]).collect());
+        let [centers, scales, rotations] = &mut slopes;
+        posed.to_parameters([centers, scales, rotations]);
+        let step = 1e-2f32;
+        for (list, found) in slopes.iter().enumerate() {
+            for i in (0..avatar.places.len()).step_by(7) {
+                for k in 0..4 {
+                    if list == 0 && k == 3 {
+                        continue;
+                    }
+                    let mut at = |by: f32| {
+                        avatar.parameters.lists_mut()[list][i][k] += by;
+                        let found = loss(&avatar, &bones, &translations, &weights);
+                        avatar.parameters.lists_mut()[list][i][k] -= by;
+                        found
+                    };
+                    let expected = (at(step) - at(-step)) / f64::from(2.0 * step);
+                    let error = (expected - f64::from(found[i][k])).abs();
+                    assert!(error < 2e-3 * (expected.abs() + 0.05), "{list} {i} {k}: {expected} {}", found[i][k]);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_rest_pose_changes_nothing_and_poison_stays_where_it_is() {
+        let mut avatar = small(40, 7);
+        let bones = Bones::new(&avatar.template.skeleton, &avatar.template.skeleton.rest_pose());
+        let zeros = vec![DVec3::ZERO; avatar.hanging.as_ref().unwrap().nodes.len()];
+        let mut posed = PosedAvatar::default();
+        avatar.parameters.offset[1] = [f32::NAN; 4];
+        avatar.parameters.shape[2] = [f32::INFINITY, f32::NEG_INFINITY, f32::NAN, f32::NAN];
+        avatar.skin[3].weights = [0.0; 4];
+        avatar.skin[4].joints = [u16::MAX; 4];
+        avatar.pose(&bones, Some(&zeros), &mut posed);
+        for (i, center) in posed.centers().enumerate() {
+            let expected = avatar.places[i] + Vec4::from(avatar.parameters.offset[i]).truncate();
+            assert!(i == 1 || (center - expected).length() < 1e-4, "{i}: {center} {expected}");
+        }
+        assert!(posed.scale_opacity[2][..3].iter().all(|scale| scale.is_finite()));
+        // Translations that are missing count as none.
+        let mut short = PosedAvatar::default();
+        avatar.pose(&bones, Some(&[]), &mut short);
+        assert!((short.center[9][0] - posed.center[9][0]).abs() < 1e-6);
+    }
+}
