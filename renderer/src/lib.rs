@@ -1,5 +1,6 @@
 //! Splats to images and back: forward and backward rasteriser, direct appearance, splat export.
 
+mod anisotropic;
 mod appearance;
 mod buffers;
 mod color;
@@ -12,6 +13,8 @@ mod image_loss;
 mod processor;
 mod raster;
 mod raster_backward;
+mod raster_backward_device;
+mod raster_backward_kernels;
 mod raster_buffers;
 mod raster_device;
 mod raster_kernels;
@@ -22,6 +25,7 @@ mod sort;
 mod splat_rows;
 mod view_bytes;
 
+pub use anisotropic::{AnisotropicBuffers, AnisotropicGradients, Gaussians, HarmonicOrder};
 pub use appearance::{
     AppearanceError, AppearanceSettings, DiffusionHierarchy, DiffusionLevel, DirectAppearance, ObservationBuffers,
     Observations, ViewInput,
@@ -37,6 +41,6 @@ pub use raster::Rasterizer;
 pub use raster_backward::{BackwardError, BackwardRasterizer};
 pub use raster_kernels::BACKFACING_COSINE;
 pub use raster_settings::{Outputs, RasterSettings, RasterStats};
-pub use schema::{GAUSSIAN_ATTRIBUTES, GaussianAttribute, GaussianElement, PLY_PROPERTIES};
+pub use schema::{ANISOTROPIC_ATTRIBUTES, GAUSSIAN_ATTRIBUTES, GaussianAttribute, GaussianElement, PLY_PROPERTIES};
 pub use splat_rows::{PixelShares, PosedGaussians, pixel_shares};
 pub use view_bytes::ViewBytes;

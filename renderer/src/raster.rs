@@ -9,9 +9,9 @@ use wgpu::CommandEncoder;
 use crate::processor::ProcessorRasterizer;
 use crate::raster_device::DeviceRasterizer;
 use crate::raster_settings::Latest;
-use crate::{GaussianBuffers, RasterSettings, RasterStats, RenderTarget};
+use crate::{Gaussians, RasterSettings, RasterStats, RenderTarget};
 
-/// Draws isotropic Gaussians into images: projection through the camera's lens (EWA splatting), stable
+/// Draws Gaussians into images: projection through the camera's lens (EWA splatting), stable
 /// sort by depth, lists by tile, and front-to-back blending, all on the device without a wait, or on the processor when the
 /// image is recorded.
 ///
@@ -21,6 +21,7 @@ use crate::{GaussianBuffers, RasterSettings, RasterStats, RenderTarget};
 ///   finished when less than 1e-4 of the light behind it would pass.
 /// - A Gaussian with any number that is not finite, with scale or opacity not above 0, behind
 ///   [`RasterSettings::near_m`], beyond 1e9 m, or outside the lens's valid radius is not drawn.
+/// - [`AnisotropicBuffers`](crate::AnisotropicBuffers) go the same way once they are projected and coloured.
 /// - Buffers and pipelines are made once; they grow with the image and the number of Gaussians.
 #[derive(Debug)]
 pub struct Rasterizer {
@@ -53,11 +54,11 @@ impl Rasterizer {
     ///
     /// # Errors
     /// [`GpuError::TooLarge`] when buffers must grow and cannot.
-    pub fn encode(
+    pub fn encode<'a>(
         &mut self,
         gpu: &GpuContext,
         encoder: &mut CommandEncoder,
-        gaussians: &GaussianBuffers,
+        gaussians: impl Into<Gaussians<'a>>,
         camera: &Camera,
         settings: &RasterSettings,
         target: &RenderTarget,
@@ -69,21 +70,23 @@ impl Rasterizer {
     ///
     /// # Errors
     /// As [`Self::encode`].
-    pub fn encode_timed(
+    pub fn encode_timed<'a>(
         &mut self,
         gpu: &GpuContext,
         encoder: &mut CommandEncoder,
-        gaussians: &GaussianBuffers,
+        gaussians: impl Into<Gaussians<'a>>,
         (camera, settings): (&Camera, &RasterSettings),
         target: &RenderTarget,
         timer: Option<&mut GpuTimer>,
     ) -> Result<(), GpuError> {
+        let gaussians = gaussians.into();
+        let settings = settings.for_kind(gaussians);
         match &mut self.on {
             RasterizerOn::Device(device) => {
-                device.encode_timed(gpu, encoder, gaussians, (camera, settings), target, timer)
+                device.encode_timed(gpu, encoder, gaussians, (camera, &settings), target, timer)
             }
             RasterizerOn::Processor(processor) => {
-                processor.draw(gaussians, camera, settings, target);
+                processor.draw(gaussians, camera, &settings, target);
                 Ok(())
             }
         }

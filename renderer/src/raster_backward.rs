@@ -1,30 +1,16 @@
 //! Backward splat rasteriser: what a change of the Gaussians does to a loss on the images.
 
-use flyrig_gpu::{CAMERA_WGSL, ComputeKernel, GpuContext, GpuError, StorageBuffer, dispatch_1d};
-use wgpu::{CommandEncoder, ComputePassDescriptor};
+use flyrig_gpu::{GpuContext, GpuError};
+use wgpu::CommandEncoder;
 
 use crate::processor::ProcessorBackward;
 use crate::raster::RasterizerOn;
-use crate::raster_device::{DeviceRasterizer, FRAME};
-use crate::raster_kernels::{BUSY_WGSL, FRAME_WGSL, Tile};
-use crate::scan::run;
-use crate::sort::Keys;
-use crate::{Carry, GaussianBuffers, GaussianGradients, ImageGradients, Rasterizer, RenderTarget};
-
-const BACKWARD_FRAME_WGSL: &str = include_str!("raster_backward_frame.wgsl");
-const PLACES_WGSL: &str = include_str!("raster_backward_places.wgsl");
-const BLEND_WGSL: &str = include_str!("raster_backward_blend.wgsl");
-const PROJECT_WGSL: &str = include_str!("raster_backward_project.wgsl");
-
-/// Bytes of `struct PairSum`.
-const PAIR_SUM_BYTES: u64 = 48;
-/// Pairs that one tile's invocations walk over; each costs them about two iterations, and Mesa's software adapter ends all loops
-/// of an invocation after 65,535 iterations together, without a word.
-const MAX_LIST: u32 = 24_576;
-/// Tiles that one Gaussian adds up, for the same reason.
-const MAX_TILES: u32 = 60_000;
-/// Bytes of workgroup memory for partial sums; WebGPU promises 16 KiB.
-const PARTIAL_BYTES: u32 = 12 << 10;
+use crate::raster_backward_device::DeviceBackward;
+use crate::raster_settings::Latest;
+use crate::{
+    AnisotropicBuffers, AnisotropicGradients, Carry, GaussianBuffers, GaussianGradients, HarmonicOrder, ImageGradients,
+    Rasterizer, RenderTarget,
+};
 
 /// Why there is no derivative.
 #[derive(Debug, thiserror::Error)]
@@ -44,7 +30,8 @@ pub enum BackwardError {
     },
 }
 
-/// Derivatives of [`Rasterizer`]'s images with respect to the centres of the Gaussians (FlyHuman section 3.1).
+/// Derivatives of [`Rasterizer`]'s images with respect to the centres of the Gaussians (FlyHuman section 3.1), and with respect
+/// to all attributes of [`AnisotropicBuffers`].
 ///
 /// - Complete where the image is smooth: place, depth, and the size and shape of the ellipse, through the lens and
 ///   the low-pass filter. What jumps passes nothing on: a splat that enters or leaves a pixel at alpha 1/255, a pixel
@@ -67,19 +54,6 @@ enum BackwardOn {
     Processor(ProcessorBackward),
 }
 
-/// The kernels on the device.
-#[derive(Debug)]
-struct DeviceBackward {
-    place: ComputeKernel,
-    blend: [ComputeKernel; 2],
-    project: [ComputeKernel; 2],
-    places: StorageBuffer<[u32; 4]>,
-    tile_limits: StorageBuffer<u32>,
-    pair_sums: StorageBuffer<[[f32; 4]; 3]>,
-    /// Elements of `pair_sums`, in x; made again with it.
-    room: StorageBuffer<[u32; 4]>,
-}
-
 impl BackwardRasterizer {
     /// Compiles the kernels for images of any [`Rasterizer::new`] with this context; buffers grow with the images.
     ///
@@ -96,7 +70,7 @@ impl BackwardRasterizer {
 
     /// Records the derivatives of the image that `rasterizer` recorded last, with the same `gaussians` and
     /// `target`, and adds them to `out`. Views of one submission: encode a view, its loss, its derivative, the next
-    /// view. Without an image before, or with one without colour, nothing is recorded.
+    /// view. Without an image before, or with one without colour or of anisotropic Gaussians, nothing is recorded.
     ///
     /// # Errors
     /// [`BackwardError`]; nothing is recorded then.
@@ -111,157 +85,89 @@ impl BackwardRasterizer {
         (incoming, carry): (&ImageGradients, Carry),
         out: &GaussianGradients,
     ) -> Result<(), BackwardError> {
+        let onto = Onto::Isotropic { gaussians, carry, out };
+        self.add(gpu, encoder, rasterizer, target, incoming, onto)
+    }
+
+    /// As [`Self::encode`], of an image of anisotropic Gaussians; nothing is recorded for one of isotropic ones or of another
+    /// order. Pixels carry nothing but their dL/d colour: [`ImageGradients::depth_carry`] counts in x alone.
+    ///
+    /// # Errors
+    /// [`BackwardError`]; nothing is recorded then.
+    #[allow(clippy::too_many_arguments)]
+    pub fn encode_anisotropic(
+        &mut self,
+        gpu: &GpuContext,
+        encoder: &mut CommandEncoder,
+        rasterizer: &Rasterizer,
+        gaussians: &AnisotropicBuffers,
+        target: &RenderTarget,
+        incoming: &ImageGradients,
+        out: &AnisotropicGradients,
+    ) -> Result<(), BackwardError> {
+        self.add(gpu, encoder, rasterizer, target, incoming, Onto::Anisotropic { gaussians, out })
+    }
+
+    fn add(
+        &mut self,
+        gpu: &GpuContext,
+        encoder: &mut CommandEncoder,
+        rasterizer: &Rasterizer,
+        target: &RenderTarget,
+        incoming: &ImageGradients,
+        onto: Onto<'_>,
+    ) -> Result<(), BackwardError> {
         let Some(latest) = rasterizer.latest() else { return Ok(()) };
-        if !latest.outputs.color || latest.gaussians == 0 {
+        if !latest.outputs.color || latest.gaussians == 0 || latest.order != onto.order() {
             return Ok(());
         }
         let pixels = latest.size[0] as usize * latest.size[1] as usize;
         check("dL/d colour", incoming.color.len(), pixels)?;
         check("dL/d depth", incoming.depth_carry.len(), pixels)?;
         check("the drawn image", target.color.len().min(target.depth.len()), pixels)?;
-        check("the Gaussians", gaussians.count(), latest.gaussians)?;
-        check("dL/d centres", out.center.len().min(out.carried.len() / 2), latest.gaussians)?;
+        onto.check(&latest)?;
         match (&mut self.on, &rasterizer.on) {
             (BackwardOn::Device(device), RasterizerOn::Device(rasterizer)) => {
-                device.encode(gpu, encoder, rasterizer, gaussians, target, (incoming, carry), out)
+                device.encode(gpu, encoder, rasterizer, target, incoming, onto)?;
             }
             (BackwardOn::Processor(processor), RasterizerOn::Processor(rasterizer)) => {
-                processor.add(rasterizer, gaussians, target, (incoming, carry), out);
-                Ok(())
+                processor.add(rasterizer, target, incoming, onto);
             }
-            _ => Ok(()),
+            _ => {}
         }
+        Ok(())
     }
 }
 
-impl DeviceBackward {
-    fn new(gpu: &GpuContext) -> Result<Self, GpuError> {
-        let tile = Tile::for_adapter(gpu);
-        let kernel = |entry, source: String| ComputeKernel::new(gpu, entry, &[&source], entry);
-        Ok(Self {
-            place: kernel("place_gaussians", places_wgsl()),
-            blend: [false, true].map(|depth| kernel("blend_backward", blend_wgsl(tile, depth))),
-            project: [false, true].map(|lift| kernel("project_backward", project_wgsl(lift))),
-            places: StorageBuffer::zeroed(gpu, "places of sums", 0)?,
-            tile_limits: StorageBuffer::zeroed(gpu, "walked tiles", 0)?,
-            pair_sums: StorageBuffer::zeroed(gpu, "sums of pairs", 0)?,
-            room: StorageBuffer::zeroed(gpu, "room for sums of pairs", 1)?,
-        })
+/// Gaussians that derivatives are carried to, and where these are added.
+#[derive(Clone, Copy)]
+pub(crate) enum Onto<'a> {
+    Isotropic { gaussians: &'a GaussianBuffers, carry: Carry, out: &'a GaussianGradients },
+    Anisotropic { gaussians: &'a AnisotropicBuffers, out: &'a AnisotropicGradients },
+}
+
+impl Onto<'_> {
+    /// Order of the colours; None for isotropic Gaussians.
+    fn order(&self) -> Option<HarmonicOrder> {
+        match self {
+            Self::Isotropic { .. } => None,
+            Self::Anisotropic { gaussians, .. } => Some(gaussians.order()),
+        }
     }
 
-    #[allow(clippy::too_many_arguments)]
-    fn encode(
-        &mut self,
-        gpu: &GpuContext,
-        encoder: &mut CommandEncoder,
-        rasterizer: &DeviceRasterizer,
-        gaussians: &GaussianBuffers,
-        target: &RenderTarget,
-        (incoming, carry): (&ImageGradients, Carry),
-        out: &GaussianGradients,
-    ) -> Result<(), BackwardError> {
-        let (Some(picture), Some(latest)) = (&rasterizer.picture, &rasterizer.latest) else { return Ok(()) };
-        let layout = picture.layout();
-        let tiles = layout.tiles[0] as usize * layout.tiles[1] as usize;
-        self.grow(gpu, latest.gaussians, tiles, layout.pair_capacity)?;
-
-        encoder.clear_buffer(self.places.raw(), 0, None);
-        // Tiles that are not blended have walked nothing.
-        encoder.clear_buffer(self.tile_limits.raw(), 0, None);
-        let mut pass =
-            encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("backward"), ..Default::default() });
-        let by_gaussian = dispatch_1d(latest.gaussians as u32, 64);
-        run(
-            gpu,
-            &mut pass,
-            &self.place,
-            &[
-                rasterizer.constants.get(FRAME),
-                self.room.raw().as_entire_binding(),
-                rasterizer.sort.output(Keys::Scaled).raw().as_entire_binding(),
-                rasterizer.sort.valid().raw().as_entire_binding(),
-                rasterizer.rects.raw().as_entire_binding(),
-                rasterizer.pairs_before.raw().as_entire_binding(),
-                self.places.raw().as_entire_binding(),
-            ],
-            by_gaussian,
-        );
-        run(
-            gpu,
-            &mut pass,
-            &self.blend[usize::from(latest.outputs.depth)],
-            &[
-                rasterizer.constants.get(FRAME),
-                rasterizer.splats.raw().as_entire_binding(),
-                gaussians.color.raw().as_entire_binding(),
-                picture.ends.raw().as_entire_binding(),
-                picture.lists().raw().as_entire_binding(),
-                self.places.raw().as_entire_binding(),
-                target.color.raw().as_entire_binding(),
-                target.depth.raw().as_entire_binding(),
-                incoming.color.raw().as_entire_binding(),
-                incoming.depth_carry.raw().as_entire_binding(),
-                self.pair_sums.raw().as_entire_binding(),
-                self.tile_limits.raw().as_entire_binding(),
-            ],
-            <(u32, u32)>::from(latest.blended),
-        );
-        run(
-            gpu,
-            &mut pass,
-            &self.project[usize::from(carry == Carry::Lift)],
-            &[
-                rasterizer.constants.get(FRAME),
-                gaussians.center_scale.raw().as_entire_binding(),
-                self.places.raw().as_entire_binding(),
-                self.tile_limits.raw().as_entire_binding(),
-                self.pair_sums.raw().as_entire_binding(),
-                out.center.raw().as_entire_binding(),
-                out.carried.raw().as_entire_binding(),
-            ],
-            by_gaussian,
-        );
-        Ok(())
-    }
-
-    fn grow(&mut self, gpu: &GpuContext, gaussians: usize, tiles: usize, pairs: u32) -> Result<(), GpuError> {
-        if self.places.len() < gaussians {
-            self.places = StorageBuffer::zeroed(gpu, "places of sums", gaussians)?;
-        }
-        if self.tile_limits.len() < tiles {
-            self.tile_limits = StorageBuffer::zeroed(gpu, "walked tiles", tiles)?;
-        }
-        let limits = gpu.device.limits();
-        let most = limits.max_buffer_size.min(limits.max_storage_buffer_binding_size) / PAIR_SUM_BYTES;
-        let wanted = u64::from(pairs).min(most) as usize;
-        if self.pair_sums.len() < wanted {
-            self.pair_sums = StorageBuffer::zeroed(gpu, "sums of pairs", wanted)?;
-            self.room = StorageBuffer::from_slice(gpu, "room for sums of pairs", &[[wanted as u32, 0, 0, 0]])?;
-        }
-        Ok(())
+    fn check(&self, latest: &Latest) -> Result<(), BackwardError> {
+        let (count, room) = match self {
+            Self::Isotropic { gaussians, out, .. } => (gaussians.count(), out.center.len().min(out.carried.len() / 2)),
+            Self::Anisotropic { gaussians, out } => {
+                let rows = out.center.len().min(out.scale_opacity.len()).min(out.rotation.len());
+                (gaussians.count(), rows.min(out.harmonics.len() / gaussians.order().coefficients()))
+            }
+        };
+        check("the Gaussians", count, latest.gaussians)?;
+        check("dL/d Gaussians", room, latest.gaussians)
     }
 }
 
 fn check(what: &'static str, found: usize, needed: usize) -> Result<(), BackwardError> {
     if found >= needed { Ok(()) } else { Err(BackwardError::Buffer { what, found, needed }) }
-}
-
-pub(crate) fn places_wgsl() -> String {
-    let constants = format!("const MAX_TILES: u32 = {MAX_TILES}u;\n");
-    [&constants, CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, PLACES_WGSL].concat()
-}
-
-pub(crate) fn blend_wgsl(tile: Tile, with_depth: bool) -> String {
-    let invocations = tile.0 * tile.0 / 4;
-    let batch = PARTIAL_BYTES / (invocations * PAIR_SUM_BYTES as u32);
-    let constants = format!(
-        "{}const WITH_DEPTH: bool = {with_depth};\nconst BATCH: u32 = {batch}u;\nconst MAX_LIST: u32 = {MAX_LIST}u;\n",
-        tile.wgsl()
-    );
-    [&constants, CAMERA_WGSL, FRAME_WGSL, BUSY_WGSL, BACKWARD_FRAME_WGSL, BLEND_WGSL].concat()
-}
-
-pub(crate) fn project_wgsl(lift: bool) -> String {
-    let constants = format!("const LIFT: bool = {lift};\n");
-    [&constants, CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, PROJECT_WGSL].concat()
 }

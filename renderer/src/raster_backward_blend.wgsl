@@ -4,7 +4,7 @@
 //
 // A tile whose incoming gradients are all zero ends at once; a pixel without any counts as finished.
 // Prefix: camera.wgsl, raster_frame.wgsl, raster_busy.wgsl, raster_backward_frame.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE, WITH_DEPTH,
-// BATCH, MAX_LIST.
+// CARRY_COLOR, BATCH, MAX_LIST.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;
 @group(0) @binding(2) var<storage, read> color: array<vec4<f32>>;
@@ -17,7 +17,7 @@
 @group(0) @binding(7) var<storage, read> drawn_depth: array<f32>;
 // dL/d (red, green, blue, alpha)
 @group(0) @binding(8) var<storage, read> incoming_color: array<vec4<f32>>;
-// dL/d depth, and three numbers that are carried to the Gaussians
+// dL/d depth, and three numbers that are carried to the Gaussians unless CARRY_COLOR: then dL/d color is
 @group(0) @binding(9) var<storage, read> incoming_depth: array<vec4<f32>>;
 @group(0) @binding(10) var<storage, read_write> pair_sums: array<PairSum>;
 @group(0) @binding(11) var<storage, read_write> tile_limits: array<u32>;
@@ -73,6 +73,9 @@ fn blend_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invoca
             var d_depth = incoming_depth[at];
             if !WITH_DEPTH {
                 d_depth.x = 0.0;
+            }
+            if CARRY_COLOR {
+                d_depth = vec4(d_depth.x, d_color.rgb);
             }
             let matters = any(d_color != vec4(0.0)) || any(d_depth != vec4(0.0));
             if seen.w > 0.0 && matters && finite(d_color) && finite(d_depth) {

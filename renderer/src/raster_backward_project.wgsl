@@ -4,8 +4,11 @@
 // Complete where the image is smooth: position in the image, depth, and the ellipse's size and shape (with the
 // lens's second derivatives). Nothing flows through what jumps: the cut at CUT, the end at OPAQUE, the order by depth,
 // back-face culling.
-// Prefix: camera.wgsl, raster_frame.wgsl, raster_backward_frame.wgsl, const LIFT.
+// Lines between "// only isotropic" or "// only anisotropic" and "// end" belong to Gaussians of that kind.
+// Prefix: camera.wgsl, raster_frame.wgsl, raster_backward_frame.wgsl; for isotropic Gaussians raster_backward_tiles.wgsl and const
+// LIFT, for anisotropic ones raster_axes.wgsl, their first three attributes at bindings 1 to 3 and derivatives at 5 to 7.
 @group(0) @binding(0) var<storage, read> frame: Frame;
+// only isotropic
 @group(0) @binding(1) var<storage, read> center_scale: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> places: array<Place>;
 @group(0) @binding(3) var<storage, read> tile_limits: array<u32>;
@@ -14,6 +17,10 @@
 @group(0) @binding(5) var<storage, read_write> center_out: array<vec4<f32>>;
 // Two elements a Gaussian: carried numbers (LIFT false), or xx xy xz yy | yz zz of the lifted matrix.
 @group(0) @binding(6) var<storage, read_write> carried_out: array<vec4<f32>>;
+// end
+// only anisotropic
+@group(0) @binding(4) var<storage, read> sums: array<PairSum>;
+// end
 
 // 1 / (2 ln 2): the conics are for exp2.
 const HALF_LOG2_E = 0.72134752;
@@ -77,32 +84,27 @@ fn project_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgr
     if i >= frame.gaussians {
         return;
     }
+    // only isotropic
     let place = places[i];
     if place.fits == 0u {
         return;
     }
-    let width = place_width(place);
-    let tiles = width * place_height(place);
-    var tile = vec2(place.first & 0xffffu, place.first >> 16u);
-    var sums_a = vec4(0.0);
-    var sums_b = vec4(0.0);
-    var carried = vec4(0.0);
-    for (var t = 0u; t < tiles; t++) {
-        if place.offset < tile_limits[tile.y * frame.tiles.x + tile.x] {
-            sums_a += pair_sums[place.offset + t].vectors[0];
-            sums_b += pair_sums[place.offset + t].vectors[1];
-            carried += pair_sums[place.offset + t].vectors[2];
-        }
-        tile.x += 1u;
-        if tile.x > (place.last & 0xffffu) {
-            tile = vec2(place.first & 0xffffu, tile.y + 1u);
-        }
-    }
+    let total = sum_of_tiles(place);
+    let carried = total.vectors[2];
+    let world = center_scale[i].xyz;
+    let scale_m = center_scale[i].w;
+    // end
+    // only anisotropic
+    let total = sums[i];
+    let world = center[i].xyz;
+    let scale_m = scale_opacity[i].xyz;
+    // end
+    let sums_a = total.vectors[0];
+    let sums_b = total.vectors[1];
     if !(sums_b.w > 0.0) {
         return;
     }
-    let center = center_scale[i];
-    let p = (frame.camera.camera_from_world * vec4(center.xyz, 1.0)).xyz;
+    let p = (frame.camera.camera_from_world * vec4(world, 1.0)).xyz;
     let inverse_z = 1.0 / p.z;
     let ideal = p.xy * inverse_z;
     let lens = distort(frame.camera, ideal).jacobian;
@@ -111,8 +113,16 @@ fn project_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgr
     let along_x = lens[0] * f;
     let along_y = lens[1] * f;
     let along_z = -(ideal.x * along_x + ideal.y * along_y);
-    let row_x = vec3(along_x.x, along_y.x, along_z.x) * center.w;
-    let row_y = vec3(along_x.y, along_y.y, along_z.y) * center.w;
+    // only isotropic
+    let row_x = vec3(along_x.x, along_y.x, along_z.x) * scale_m;
+    let row_y = vec3(along_x.y, along_y.y, along_z.y) * scale_m;
+    // end
+    // only anisotropic
+    let axes = axes_in_camera(frame.camera, rotation[i]);
+    let along_axes = mat3x2(along_x, along_y, along_z) * axes;
+    let row_x = vec3(along_axes[0].x, along_axes[1].x, along_axes[2].x) * scale_m;
+    let row_y = vec3(along_axes[0].y, along_axes[1].y, along_axes[2].y) * scale_m;
+    // end
     let xx = dot(row_x, row_x);
     let xy = dot(row_x, row_y);
     let yy = dot(row_y, row_y);
@@ -128,11 +138,23 @@ fn project_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgr
     let moments = mat2x2(sums_b.x, sums_b.y, sums_b.y, sums_b.z);
     let d_covariance =
         (filtered_inverse * moments * filtered_inverse + plain_inverse * filtered_inverse * (s * sums_a.x)) * HALF_LOG2_E;
-    // dL/d the columns of the projection's Jacobian, covariance = scale^2 J J^T.
-    let twice = d_covariance * (2.0 * center.w * center.w);
+    // dL/d the columns of the projection's Jacobian J.
+    // only isotropic
+    // Covariance = scale^2 J J^T.
+    let twice = d_covariance * (2.0 * scale_m * scale_m);
     let d_along_z = twice * along_z;
     let d_along_x = twice * along_x - ideal.x * d_along_z;
     let d_along_y = twice * along_y - ideal.y * d_along_z;
+    // end
+    // only anisotropic
+    // Covariance = M M^T with M = J A and A = axes * scales; dL/dM = `d_rows`, dL/dJ = dL/dM A^T.
+    let d_rows = d_covariance * mat3x2(vec2(row_x.x, row_y.x), vec2(row_x.y, row_y.y), vec2(row_x.z, row_y.z)) * 2.0;
+    let scaled = mat3x3(axes[0] * scale_m.x, axes[1] * scale_m.y, axes[2] * scale_m.z);
+    let d_jacobian = d_rows * transpose(scaled);
+    let d_along_z = d_jacobian[2];
+    let d_along_x = d_jacobian[0] - ideal.x * d_along_z;
+    let d_along_y = d_jacobian[1] - ideal.y * d_along_z;
+    // end
     let d_lens = mat2x2(d_along_x * f, d_along_y * f);
     let d_ideal = through_lens_jacobian(frame.camera, ideal, d_lens)
         - vec2(dot(d_along_z, along_x), dot(d_along_z, along_y));
@@ -143,15 +165,16 @@ fn project_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgr
         dot(d_pixel, along_z) + d_z,
     );
     let m = frame.camera.camera_from_world;
-    let rotation = mat3x3(m[0].xyz, m[1].xyz, m[2].xyz);
-    let in_world = vec4(in_camera * rotation, sums_b.w);
+    let camera_from_world = mat3x3(m[0].xyz, m[1].xyz, m[2].xyz);
+    let in_world = vec4(in_camera * camera_from_world, sums_b.w);
     if finite(in_world) {
         center_out[i] += in_world;
     }
+    // only isotropic
     if LIFT {
         // J^T C J with C = (xx, xy, yy) of the image, J = d pixel / d world.
-        let du = vec3(along_x.x, along_y.x, along_z.x) * rotation;
-        let dv = vec3(along_x.y, along_y.y, along_z.y) * rotation;
+        let du = vec3(along_x.x, along_y.x, along_z.x) * camera_from_world;
+        let dv = vec3(along_x.y, along_y.y, along_z.y) * camera_from_world;
         let column_u = carried.x * du + carried.y * dv;
         let column_v = carried.y * du + carried.z * dv;
         let first = vec4(dot(vec2(du.x, dv.x), vec2(column_u.x, column_v.x)),
@@ -167,4 +190,25 @@ fn project_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgr
     } else if finite(carried) {
         carried_out[2u * i] += carried;
     }
+    // end
+    // only anisotropic
+    // An opacity above 1 counts as 1. The moments are those of the exponent log2(alpha).
+    let own_opacity = scale_opacity[i].w;
+    let d_opacity = select(0.0, 2.0 * HALF_LOG2_E * sums_a.x / own_opacity, own_opacity <= 1.0);
+    let d_scale = vec3(dot(along_axes[0], d_rows[0]), dot(along_axes[1], d_rows[1]), dot(along_axes[2], d_rows[2]));
+    if finite(vec4(d_scale, d_opacity)) {
+        scale_opacity_out[i] += vec4(d_scale, d_opacity);
+    }
+    // dL/dA = J^T dL/dM. The slope by a small turn, sum of a x dL/da over the columns, is carried to the quaternion u of unit
+    // length: du = (turn, 0) u / 2.
+    let d_scaled = transpose(mat3x2(along_x, along_y, along_z)) * d_rows;
+    let turn = (cross(scaled[0], d_scaled[0]) + cross(scaled[1], d_scaled[1]) + cross(scaled[2], d_scaled[2]))
+        * camera_from_world;
+    let inverse_length = inverseSqrt(dot(rotation[i], rotation[i]));
+    let u = rotation[i] * inverse_length;
+    let d_rotation = vec4(turn * u.w + cross(turn, u.xyz), -dot(turn, u.xyz)) * (2.0 * inverse_length);
+    if finite(d_rotation) {
+        rotation_out[i] += d_rotation;
+    }
+    // end
 }

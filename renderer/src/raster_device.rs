@@ -14,7 +14,7 @@ use crate::raster_kernels::{BINS_LANES, Frame, RasterKernels, Tile};
 use crate::raster_settings::{Latest, tile_range};
 use crate::scan::{Groups, Scan, run, run_at};
 use crate::sort::{DIGIT_BITS, KEY_BITS, Keys, MOST_ELEMENTS, RadixSort, SortPass, blocks, table_len};
-use crate::{GaussianBuffers, Outputs, RasterSettings, RasterStats, RenderTarget};
+use crate::{Gaussians, Outputs, RasterSettings, RasterStats, RenderTarget};
 
 /// [`Rasterizer`](crate::Rasterizer) on the device. Buffers and pipelines are made once; they grow with the image and the
 /// number of Gaussians.
@@ -25,6 +25,8 @@ pub(crate) struct DeviceRasterizer {
     pub(crate) sort: RadixSort,
     pub(crate) splats: StorageBuffer<[f32; 8]>,
     pub(crate) rects: StorageBuffer<[u32; 2]>,
+    /// Colours of anisotropic Gaussians as the camera sees them; grows with the first image of such.
+    pub(crate) painted: StorageBuffer<[f32; 4]>,
     pub(crate) pairs_before: StorageBuffer<u32>,
     pair_total: StorageBuffer<u32>,
     /// `struct Work` of raster_bins.wgsl.
@@ -53,6 +55,7 @@ impl DeviceRasterizer {
             sort: RadixSort::new(gpu, max_gaussians)?,
             splats: StorageBuffer::zeroed(gpu, "splats", max_gaussians)?,
             rects: StorageBuffer::zeroed(gpu, "splat rectangles", max_gaussians)?,
+            painted: StorageBuffer::zeroed(gpu, "painted splats", 0)?,
             pairs_before: StorageBuffer::zeroed(gpu, "pairs before", max_gaussians)?,
             pair_total: StorageBuffer::zeroed(gpu, "pair total", 1)?,
             work: StorageBuffer::zeroed(gpu, "work on pairs", 12)?,
@@ -66,7 +69,7 @@ impl DeviceRasterizer {
         &mut self,
         gpu: &GpuContext,
         encoder: &mut CommandEncoder,
-        gaussians: &GaussianBuffers,
+        gaussians: Gaussians<'_>,
         (camera, settings): (&Camera, &RasterSettings),
         target: &RenderTarget,
         mut timer: Option<&mut GpuTimer>,
@@ -75,7 +78,7 @@ impl DeviceRasterizer {
         if target.width == 0 || target.height == 0 {
             return Ok(());
         }
-        self.grow(gpu, gaussians.count(), target)?;
+        self.grow(gpu, gaussians, target)?;
         let Some(picture) = &self.picture else { return Ok(()) };
         let layout = picture.layout();
         let (first_tile, blended) = tile_range(settings.area, layout.tiles, self.kernels.tile.0);
@@ -105,8 +108,9 @@ impl DeviceRasterizer {
         pass("depth sort", &|pass| stages.depth_sort(pass));
         pass("tile lists", &|pass| stages.tile_lists(pass));
         pass("blend", &|pass| stages.blend(pass, &blend));
-        let (gaussians, size, outputs) = (gaussians.count(), frame.size, settings.outputs);
-        self.latest = Some(Latest { gaussians, size, blended, outputs });
+        let (count, order) = (gaussians.count(), gaussians.order());
+        let (size, outputs) = (frame.size, settings.outputs);
+        self.latest = Some(Latest { gaussians: count, order, size, blended, outputs });
         Ok(())
     }
 
@@ -116,8 +120,12 @@ impl DeviceRasterizer {
         Ok(RasterStats { visible_gaussians: get(0), pairs: get(1), overflowed_images: get(2) })
     }
 
-    fn grow(&mut self, gpu: &GpuContext, count: usize, target: &RenderTarget) -> Result<(), GpuError> {
+    fn grow(&mut self, gpu: &GpuContext, gaussians: Gaussians<'_>, target: &RenderTarget) -> Result<(), GpuError> {
+        let count = gaussians.count();
         check_count(count)?;
+        if gaussians.order().is_some() && count > self.painted.len() {
+            self.painted = StorageBuffer::zeroed(gpu, "painted splats", count)?;
+        }
         if count > self.splats.len() {
             self.sort.grow(gpu, count)?;
             self.rects = StorageBuffer::zeroed(gpu, "splat rectangles", count)?;
@@ -169,7 +177,7 @@ const MOST_TILE_PASSES: usize = u32::BITS.div_ceil(DIGIT_BITS) as usize;
 struct Stages<'a> {
     gpu: &'a GpuContext,
     rasterizer: &'a DeviceRasterizer,
-    gaussians: &'a GaussianBuffers,
+    gaussians: Gaussians<'a>,
     target: &'a RenderTarget,
     picture: &'a ImageBuffers,
     blended: [u32; 2],
@@ -177,18 +185,25 @@ struct Stages<'a> {
 
 impl Stages<'_> {
     fn project(&self, pass: &mut ComputePass<'_>) {
-        let (r, g) = (self.rasterizer, self.gaussians);
-        let resources = [
-            self.rasterizer.constants.get(FRAME),
-            g.center_scale.raw().as_entire_binding(),
-            g.normal.raw().as_entire_binding(),
-            g.color.raw().as_entire_binding(),
-            g.canonical.raw().as_entire_binding(),
-            r.splats.raw().as_entire_binding(),
-            r.rects.raw().as_entire_binding(),
-            r.sort.input().raw().as_entire_binding(),
-        ];
-        run(self.gpu, pass, &r.kernels.project, &resources, dispatch_1d(g.count() as u32, 64));
+        let r = self.rasterizer;
+        let (gpu, groups) = (self.gpu, dispatch_1d(self.gaussians.count() as u32, 64));
+        let (frame, keyed) = (r.constants.get(FRAME), r.sort.input().raw().as_entire_binding());
+        let (splats, rects) = (r.splats.raw().as_entire_binding(), r.rects.raw().as_entire_binding());
+        match self.gaussians {
+            Gaussians::Isotropic(g) => {
+                let [center_scale, normal, color, canonical] = g.attributes().map(|a| a.raw().as_entire_binding());
+                let resources = [frame, center_scale, normal, color, canonical, splats, rects, keyed];
+                run(gpu, pass, &r.kernels.project, &resources, groups);
+            }
+            Gaussians::Anisotropic(g) => {
+                let [center, scale, rotation, harmonics] = g.attributes().map(|a| a.raw().as_entire_binding());
+                let resources = [frame.clone(), center.clone(), scale, rotation, splats, rects, keyed.clone()];
+                let resources: Vec<_> = [0, 1, 2, 3, 5, 6, 7].into_iter().zip(resources).collect();
+                run_at(gpu, pass, r.kernels.project_anisotropic(gpu), &resources, groups);
+                let resources = [frame, center, harmonics, keyed, r.painted.raw().as_entire_binding()];
+                run(gpu, pass, r.kernels.paint(gpu, g.order()), &resources, groups);
+            }
+        }
     }
 
     fn depth_sort(&self, pass: &mut ComputePass<'_>) {
@@ -235,11 +250,16 @@ impl Stages<'_> {
 
     fn blend(&self, pass: &mut ComputePass<'_>, kernels: &[(Outputs, Arc<ComputeKernel>)]) {
         let (r, p, t) = (self.rasterizer, self.picture, self.target);
+        let (color, canonical) = match self.gaussians {
+            Gaussians::Isotropic(g) => (&g.color, &g.canonical),
+            // No kernel that blends anisotropic Gaussians binds canonical positions.
+            Gaussians::Anisotropic(_) => (&r.painted, &r.painted),
+        };
         let resources = [
             r.constants.get(FRAME),
             r.splats.raw().as_entire_binding(),
-            self.gaussians.color.raw().as_entire_binding(),
-            self.gaussians.canonical.raw().as_entire_binding(),
+            color.raw().as_entire_binding(),
+            canonical.raw().as_entire_binding(),
             p.ends.raw().as_entire_binding(),
             p.lists().raw().as_entire_binding(),
             t.color.raw().as_entire_binding(),

@@ -1,20 +1,23 @@
 //! Compiled kernels of the rasteriser and the numbers they are compiled with.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use bytemuck::{Pod, Zeroable};
 use flyrig_gpu::{CAMERA_WGSL, CameraConstants, ComputeKernel, GpuContext};
 
-use crate::Outputs;
-use crate::schema::bindings_wgsl;
+use crate::schema::{CENTER, GAUSSIAN_ATTRIBUTES, HARMONICS, ROTATION, SCALE_OPACITY, bindings_wgsl};
 use crate::sort::{BLOCK, DIGIT_BITS, INVALID_KEY};
+use crate::{HarmonicOrder, Outputs};
 
 pub(crate) const FRAME_WGSL: &str = include_str!("raster_frame.wgsl");
 const PROJECT_WGSL: &str = include_str!("raster_project.wgsl");
 const BINS_WGSL: &str = include_str!("raster_bins.wgsl");
 pub(crate) const BUSY_WGSL: &str = include_str!("raster_busy.wgsl");
 const BLEND_WGSL: &str = include_str!("raster_blend.wgsl");
+pub(crate) const AXES_WGSL: &str = include_str!("raster_axes.wgsl");
+const HARMONICS_WGSL: &str = include_str!("raster_harmonics.wgsl");
+const PAINT_WGSL: &str = include_str!("raster_paint.wgsl");
 
 /// Invocations of a workgroup of raster_bins.wgsl.
 pub(crate) const BINS_LANES: u32 = 256;
@@ -73,7 +76,26 @@ pub(crate) struct Frame {
 }
 
 pub(crate) fn project_wgsl(tile: Tile) -> String {
-    [&tile.wgsl(), CAMERA_WGSL, FRAME_WGSL, &bindings_wgsl(1), PROJECT_WGSL].concat()
+    let attributes = bindings_wgsl(1, &GAUSSIAN_ATTRIBUTES);
+    [&tile.wgsl(), CAMERA_WGSL, FRAME_WGSL, &attributes, &of_kind(PROJECT_WGSL, false)].concat()
+}
+
+pub(crate) fn project_anisotropic_wgsl(tile: Tile) -> String {
+    let attributes = bindings_wgsl(1, &[CENTER, SCALE_OPACITY, ROTATION]);
+    [&tile.wgsl(), CAMERA_WGSL, FRAME_WGSL, &attributes, AXES_WGSL, &of_kind(PROJECT_WGSL, true)].concat()
+}
+
+/// The kernel that colours anisotropic Gaussians.
+pub(crate) fn paint_wgsl(order: HarmonicOrder) -> String {
+    let constants = format!("const INVALID_KEY: u32 = {INVALID_KEY}u;\n");
+    let attributes = bindings_wgsl(1, &[CENTER, HARMONICS]);
+    [&constants, CAMERA_WGSL, FRAME_WGSL, &attributes, &harmonics_wgsl(order), PAINT_WGSL].concat()
+}
+
+/// Colour by direction and its derivatives.
+pub(crate) fn harmonics_wgsl(order: HarmonicOrder) -> String {
+    let coefficients = order.coefficients();
+    [&format!("const COEFFICIENTS: u32 = {coefficients}u;\n"), HARMONICS_WGSL].concat()
 }
 
 pub(crate) fn bins_wgsl() -> String {
@@ -86,19 +108,32 @@ pub(crate) fn bins_wgsl() -> String {
 /// The kernel that writes these outputs; at most two of them fit the bindings of one.
 pub(crate) fn blend_wgsl(tile: Tile, outputs: Outputs) -> String {
     let Outputs { color, depth, canonical } = outputs;
+    let of_outputs = sections(BLEND_WGSL, |name| match name {
+        "color" => color,
+        "depth" => depth,
+        _ => canonical,
+    });
+    [&tile.wgsl(), CAMERA_WGSL, FRAME_WGSL, BUSY_WGSL, &of_outputs].concat()
+}
+
+/// WGSL without the lines between `// only NAME` and `// end` where `keeps` refuses the name.
+fn sections(source: &str, keeps: impl Fn(&str) -> bool) -> String {
     let mut kept = String::new();
     let mut keep = true;
-    for line in BLEND_WGSL.lines() {
-        match line.trim() {
-            "// only color" => keep = color,
-            "// only depth" => keep = depth,
-            "// only canonical" => keep = canonical,
-            "// end" => keep = true,
+    for line in source.lines() {
+        match (line.trim(), line.trim().strip_prefix("// only ")) {
+            ("// end", _) => keep = true,
+            (_, Some(name)) => keep = keeps(name),
             _ if keep => kept.extend([line, "\n"]),
             _ => {}
         }
     }
-    [&tile.wgsl(), CAMERA_WGSL, FRAME_WGSL, BUSY_WGSL, &kept].concat()
+    kept
+}
+
+/// WGSL of one kind of Gaussians.
+pub(crate) fn of_kind(source: &str, is_anisotropic: bool) -> String {
+    sections(source, |name| (name == "anisotropic") == is_anisotropic)
 }
 
 /// The outputs of each kernel that draws `outputs`, so that none binds more than 8 buffers.
@@ -117,6 +152,9 @@ pub(crate) struct RasterKernels {
     pub write_pairs: ComputeKernel,
     pub end_lists: ComputeKernel,
     blend: Mutex<HashMap<Outputs, Arc<ComputeKernel>>>,
+    project_anisotropic: OnceLock<ComputeKernel>,
+    /// By order.
+    paint: [OnceLock<ComputeKernel>; 3],
 }
 
 impl RasterKernels {
@@ -131,6 +169,8 @@ impl RasterKernels {
             write_pairs: bin_kernel("write_pairs"),
             end_lists: bin_kernel("end_lists"),
             blend: Mutex::default(),
+            project_anisotropic: OnceLock::new(),
+            paint: Default::default(),
         };
         // What a live session draws; anything else is compiled with the first image that asks for it.
         for outputs in [Outputs::COLOR, Outputs::SURFACE] {
@@ -147,6 +187,17 @@ impl RasterKernels {
         let kernel =
             |&outputs: &Outputs| (outputs, Arc::clone(kernels.entry(outputs).or_insert_with(|| compile(outputs))));
         passes[..count].iter().map(kernel).collect()
+    }
+
+    /// The kernel that projects anisotropic Gaussians; compiled on first use.
+    pub(crate) fn project_anisotropic(&self, gpu: &GpuContext) -> &ComputeKernel {
+        let compile = || ComputeKernel::new(gpu, "project", &[&project_anisotropic_wgsl(self.tile)], "project");
+        self.project_anisotropic.get_or_init(compile)
+    }
+
+    /// The kernel that colours anisotropic Gaussians; compiled on first use.
+    pub(crate) fn paint(&self, gpu: &GpuContext, order: HarmonicOrder) -> &ComputeKernel {
+        self.paint[order as usize].get_or_init(|| ComputeKernel::new(gpu, "paint", &[&paint_wgsl(order)], "paint"))
     }
 }
 

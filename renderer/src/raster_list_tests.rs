@@ -6,6 +6,7 @@ use flyrig_types::{Intrinsics, Isometry, Lens};
 use glam::{DVec2, DVec3};
 
 use super::*;
+use crate::GaussianBuffers;
 
 #[test]
 fn every_tile_lists_its_gaussians_by_depth() {
@@ -36,7 +37,8 @@ fn every_tile_lists_its_gaussians_by_depth() {
     for side in [Tile::SOFTWARE, Tile::HARDWARE] {
         let mut rasterizer = DeviceRasterizer::with_tile(&gpu, count, side).unwrap();
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        rasterizer.encode_timed(&gpu, &mut encoder, &gaussians, (&camera, &settings), &target, None).unwrap();
+        let drawn = Gaussians::Isotropic(&gaussians);
+        rasterizer.encode_timed(&gpu, &mut encoder, drawn, (&camera, &settings), &target, None).unwrap();
         gpu.queue.submit([encoder.finish()]);
         let visible = rasterizer.sort.valid().read(&gpu).unwrap()[0] as usize;
         let ordered = rasterizer.sort.output(Keys::Scaled).read(&gpu).unwrap();

@@ -1,8 +1,10 @@
 // One invocation a Gaussian: EWA projection (Zwicker et al. 2001) through the lens, low-pass filter,
 // the rectangle of tiles it can reach, and its depth key.
-// Prefix: camera.wgsl, raster_frame.wgsl, the attributes' bindings, const TILE, INVALID_KEY, CUT, BACKFACING_COSINE.
+// Lines between "// only isotropic" or "// only anisotropic" and "// end" belong to Gaussians of that kind.
+// Prefix: camera.wgsl, raster_frame.wgsl, the attributes' bindings, raster_axes.wgsl for anisotropic Gaussians, const TILE,
+// INVALID_KEY, CUT, BACKFACING_COSINE.
 @group(0) @binding(0) var<storage, read> frame: Frame;
-// Bindings 1 to 4: the attributes of the Gaussians (schema.rs).
+// Bindings 1 to 4: the attributes of the Gaussians (schema.rs), the first three of anisotropic ones.
 @group(0) @binding(5) var<storage, read_write> splats: array<Splat>;
 // First and last tile, each x | y << 16.
 @group(0) @binding(6) var<storage, read_write> rects: array<vec2<u32>>;
@@ -22,14 +24,17 @@ fn project(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) gro
         return;
     }
     keyed[i] = vec2(INVALID_KEY, i);
-    let center = center_scale[i];
+    // only isotropic
+    let world = center_scale[i].xyz;
+    let scale_m = center_scale[i].w;
     let paint = color[i];
-    if !(finite(center) && finite(paint) && center.w > 0.0 && paint.w > 0.0) {
+    if !(finite(center_scale[i]) && finite(paint) && scale_m > 0.0 && paint.w > 0.0) {
         return;
     }
+    let own_opacity = paint.w;
     if frame.cull_backfacing != 0u {
         let n = normal[i];
-        let sight = center.xyz - frame.camera.position.xyz;
+        let sight = world - frame.camera.position.xyz;
         if !finite(n) || dot(n.xyz, sight) > BACKFACING_COSINE * length(n.xyz) * length(sight) {
             return;
         }
@@ -37,14 +42,32 @@ fn project(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) gro
     if frame.with_canonical != 0u && !finite(canonical[i]) {
         return;
     }
-    let projected = project_point(frame.camera, center.xyz, frame.near_m);
+    // end
+    // only anisotropic
+    let world = center[i].xyz;
+    let scale_m = scale_opacity[i].xyz;
+    let own_opacity = scale_opacity[i].w;
+    let is_finite = finite(vec4(world, 0.0)) && finite(scale_opacity[i]) && finite(rotation[i]);
+    if !(is_finite && all(scale_m > vec3(0.0)) && own_opacity > 0.0 && is_rotation(rotation[i])) {
+        return;
+    }
+    // end
+    let projected = project_point(frame.camera, world, frame.near_m);
     if !projected.valid {
         return;
     }
-    let in_camera = (frame.camera.camera_from_world * vec4(center.xyz, 1.0)).xyz;
+    let in_camera = (frame.camera.camera_from_world * vec4(world, 1.0)).xyz;
     let jacobian = projection_jacobian(frame.camera, in_camera);
-    let row_x = vec3(jacobian[0].x, jacobian[1].x, jacobian[2].x) * center.w;
-    let row_y = vec3(jacobian[0].y, jacobian[1].y, jacobian[2].y) * center.w;
+    // Rows of the matrix whose product with its transpose is the covariance.
+    // only isotropic
+    let row_x = vec3(jacobian[0].x, jacobian[1].x, jacobian[2].x) * scale_m;
+    let row_y = vec3(jacobian[0].y, jacobian[1].y, jacobian[2].y) * scale_m;
+    // end
+    // only anisotropic
+    let along_axes = jacobian * axes_in_camera(frame.camera, rotation[i]);
+    let row_x = vec3(along_axes[0].x, along_axes[1].x, along_axes[2].x) * scale_m;
+    let row_y = vec3(along_axes[0].y, along_axes[1].y, along_axes[2].y) * scale_m;
+    // end
     let xx = dot(row_x, row_x);
     let xy = dot(row_x, row_y);
     let yy = dot(row_y, row_y);
@@ -54,7 +77,7 @@ fn project(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) gro
     // Mip-Splatting's 2D Mip filter (Yu et al. 2024, Eq. 10): a wider ellipse of the same integral.
     let s = frame.filter_variance_px2;
     let filtered_det = det + s * (xx + yy) + s * s;
-    let opacity = min(paint.w, 1.0) * sqrt(det / filtered_det);
+    let opacity = min(own_opacity, 1.0) * sqrt(det / filtered_det);
     if !finite(vec4(projected.pixel, filtered_det, opacity)) || !(opacity > CUT) {
         return;
     }

@@ -1,5 +1,7 @@
 //! Settings of a rendering, and figures of the latest one.
 
+use crate::{Gaussians, HarmonicOrder};
+
 /// Which images of a [`crate::RenderTarget`] are written; the others keep their content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Outputs {
@@ -44,6 +46,19 @@ impl Default for RasterSettings {
     }
 }
 
+impl RasterSettings {
+    /// The settings as far as they apply to these Gaussians.
+    pub(crate) fn for_kind(&self, gaussians: Gaussians<'_>) -> Self {
+        match gaussians {
+            Gaussians::Isotropic(_) => *self,
+            Gaussians::Anisotropic(_) => {
+                let outputs = Outputs { canonical: false, ..self.outputs };
+                Self { cull_backfacing: false, outputs, ..*self }
+            }
+        }
+    }
+}
+
 /// Resources used by the latest image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RasterStats {
@@ -60,6 +75,8 @@ pub struct RasterStats {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Latest {
     pub gaussians: usize,
+    /// Order of the colours; None for isotropic Gaussians.
+    pub order: Option<HarmonicOrder>,
     pub size: [u32; 2],
     /// Columns and rows of tiles that were blended.
     pub blended: [u32; 2],

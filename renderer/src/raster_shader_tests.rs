@@ -3,7 +3,7 @@
 use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 
 use super::*;
-use crate::raster_backward;
+use crate::raster_backward_kernels as backward;
 use crate::scan::scan_wgsl;
 use crate::sort::sort_wgsl;
 
@@ -23,17 +23,25 @@ fn every_kernel_is_valid_wgsl_and_the_uniform_has_its_layout() {
     validate("view bytes", crate::view_bytes::WGSL);
     for tile in [Tile::SOFTWARE, Tile::HARDWARE] {
         validate("project", &project_wgsl(tile));
+        validate("project anisotropic", &project_anisotropic_wgsl(tile));
         for bits in 0..8 {
             let outputs = Outputs { color: bits & 1 != 0, depth: bits & 2 != 0, canonical: bits & 4 != 0 };
             validate("blend", &blend_wgsl(tile, outputs));
         }
         for switch in [false, true] {
-            validate("blend backward", &raster_backward::blend_wgsl(tile, switch));
-            validate("project backward", &raster_backward::project_wgsl(switch));
+            validate("blend backward", &backward::blend_wgsl(tile, switch, false));
+            validate("blend backward, colours carried", &backward::blend_wgsl(tile, switch, true));
+            validate("project backward", &backward::project_wgsl(switch));
         }
     }
+    for order in HarmonicOrder::ALL {
+        validate("paint", &paint_wgsl(order));
+        validate("paint backward", &backward::paint_wgsl(order));
+    }
     validate("bins", &bins_wgsl());
-    validate("places", &raster_backward::places_wgsl());
+    validate("places", &backward::places_wgsl());
+    validate("sums", &backward::sums_wgsl());
+    validate("project anisotropic backward", &backward::project_anisotropic_wgsl());
     let module = naga::front::wgsl::parse_str(&bins_wgsl()).unwrap();
     let frame = module.types.iter().find(|(_, t)| t.name.as_deref() == Some("Frame")).unwrap().1;
     let naga::TypeInner::Struct { span, .. } = frame.inner else { panic!("Frame is a struct") };
@@ -61,6 +69,8 @@ fn storage_buffers(source: &str) -> Vec<(String, usize)> {
 fn drawing_needs_no_more_storage_buffers_than_browsers_promise() {
     let tile = Tile::HARDWARE;
     let mut sources = vec![project_wgsl(tile), bins_wgsl(), scan_wgsl(), sort_wgsl()];
+    sources.extend([project_anisotropic_wgsl(tile), backward::sums_wgsl(), backward::project_anisotropic_wgsl()]);
+    sources.extend(HarmonicOrder::ALL.into_iter().flat_map(|order| [paint_wgsl(order), backward::paint_wgsl(order)]));
     for bits in 0..8 {
         let outputs = Outputs { color: bits & 1 != 0, depth: bits & 2 != 0, canonical: bits & 4 != 0 };
         let (passes, count) = blend_passes(outputs);

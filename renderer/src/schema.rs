@@ -52,8 +52,33 @@ pub const CANONICAL: GaussianAttribute = GaussianAttribute {
     unit: "metres",
 };
 
-/// All attributes, in the order of their bindings.
+/// All attributes of an isotropic Gaussian, in the order of their bindings.
 pub const GAUSSIAN_ATTRIBUTES: [GaussianAttribute; 4] = [CENTER_SCALE, NORMAL, COLOR, CANONICAL];
+
+/// World position of an anisotropic Gaussian.
+pub const CENTER: GaussianAttribute =
+    GaussianAttribute { name: "center", label: "Gaussian centres", components: ["x", "y", "z", ""], unit: "metres" };
+/// Standard deviations along the Gaussian's own axes, and opacity in 0..=1.
+pub const SCALE_OPACITY: GaussianAttribute = GaussianAttribute {
+    name: "scale_opacity",
+    label: "Gaussian scales",
+    components: ["scale x", "scale y", "scale z", "opacity"],
+    unit: "metres; none",
+};
+/// Quaternion of any length: world from the Gaussian's axes.
+pub const ROTATION: GaussianAttribute =
+    GaussianAttribute { name: "rotation", label: "Gaussian rotations", components: ["x", "y", "z", "w"], unit: "none" };
+/// Coefficients of the colour by direction, [`HarmonicOrder::coefficients`](crate::HarmonicOrder::coefficients) elements a
+/// Gaussian one after the other.
+pub const HARMONICS: GaussianAttribute = GaussianAttribute {
+    name: "harmonics",
+    label: "Gaussian harmonics",
+    components: ["red", "green", "blue", ""],
+    unit: "linear RGB",
+};
+
+/// All attributes of an anisotropic Gaussian, in the order of their bindings.
+pub const ANISOTROPIC_ATTRIBUTES: [GaussianAttribute; 4] = [CENTER, SCALE_OPACITY, ROTATION, HARMONICS];
 
 /// Properties of a splat in a PLY file, in the layout of the 3D Gaussian Splatting reference code: position, normal,
 /// degree-0 spherical harmonic of the sRGB colour, logit of the opacity, natural logarithms of the standard deviations along
@@ -73,12 +98,24 @@ impl GaussianAttribute {
     }
 }
 
-/// WGSL declarations of all attributes as read-only bindings of group 0, from binding `first` on.
-pub(crate) fn bindings_wgsl(first: u32) -> String {
+/// WGSL declarations of attributes as read-only bindings of group 0, from binding `first` on.
+pub(crate) fn bindings_wgsl(first: u32, attributes: &[GaussianAttribute]) -> String {
     let declare = |(binding, attribute): (u32, &GaussianAttribute)| {
         format!("@group(0) @binding({binding}) var<storage, read> {}: array<{WGSL_ELEMENT}>;\n", attribute.name)
     };
-    (first..).zip(&GAUSSIAN_ATTRIBUTES).map(declare).collect()
+    (first..).zip(attributes).map(declare).collect()
+}
+
+/// WGSL declarations of the attributes' derivatives, each named as its attribute with `_out`, as bindings of group 0 from
+/// binding `first` on.
+pub(crate) fn derivatives_wgsl(first: u32, attributes: &[GaussianAttribute]) -> String {
+    let declare = |(binding, attribute): (u32, &GaussianAttribute)| {
+        format!(
+            "@group(0) @binding({binding}) var<storage, read_write> {}_out: array<{WGSL_ELEMENT}>;\n",
+            attribute.name
+        )
+    };
+    (first..).zip(attributes).map(declare).collect()
 }
 
 #[cfg(test)]
@@ -87,12 +124,17 @@ mod tests {
 
     #[test]
     fn names_are_unique_and_elements_have_the_size_of_their_wgsl() {
-        let module = naga::front::wgsl::parse_str(&bindings_wgsl(1)).unwrap();
-        assert_eq!(module.global_variables.len(), GAUSSIAN_ATTRIBUTES.len());
-        for ((_, variable), attribute) in module.global_variables.iter().zip(GAUSSIAN_ATTRIBUTES) {
-            assert_eq!(variable.name.as_deref(), Some(attribute.name));
-            let naga::TypeInner::Array { stride, .. } = module.types[variable.ty].inner else { panic!("an array") };
-            assert_eq!(stride as usize, size_of::<GaussianElement>());
+        for attributes in [GAUSSIAN_ATTRIBUTES, ANISOTROPIC_ATTRIBUTES] {
+            let declared = [bindings_wgsl(1, &attributes), derivatives_wgsl(5, &attributes)].concat();
+            let module = naga::front::wgsl::parse_str(&declared).unwrap();
+            let names = attributes.iter().map(|a| a.name.to_owned());
+            let expected: Vec<_> = names.clone().chain(names.map(|name| name + "_out")).collect();
+            let found: Vec<_> = module.global_variables.iter().filter_map(|(_, v)| v.name.clone()).collect();
+            assert_eq!(found, expected);
+            for (_, variable) in module.global_variables.iter() {
+                let naga::TypeInner::Array { stride, .. } = module.types[variable.ty].inner else { panic!("an array") };
+                assert_eq!(stride as usize, size_of::<GaussianElement>());
+            }
         }
         let mut properties = PLY_PROPERTIES.to_vec();
         properties.sort_unstable();

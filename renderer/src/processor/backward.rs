@@ -1,17 +1,22 @@
-//! Backward rasteriser: `raster_backward_blend.wgsl` and `raster_backward_project.wgsl` on the processor.
+//! Backward rasteriser: `raster_backward_blend.wgsl` on the processor, and the sums by Gaussian.
 
 use std::array::from_fn;
 
-use flyrig_gpu::CameraConstants;
-use glam::{Mat2, Mat3, Mat4, Vec2, Vec3, Vec4};
+use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 
+use super::backward_project::{add_anisotropic, add_isotropic};
 use super::blend::{LOG2_CUT, TileLanes, exponents, is_opaque, rows_of};
+use super::harmonics::Harmonics;
 use super::lanes::{LANES, Lanes, exp2, sum, vectorized};
 use super::project::{Splat, TILE};
 use super::rasterizer::{Drawn, ProcessorRasterizer};
+use super::shape::Shape;
+use crate::raster_backward::Onto;
 use crate::raster_kernels::{MAX_ALPHA, OPAQUE};
-use crate::{Carry, GaussianBuffers, GaussianGradients, ImageGradients, RenderTarget};
+use crate::{
+    AnisotropicBuffers, AnisotropicGradients, Carry, GaussianBuffers, GaussianGradients, ImageGradients, RenderTarget,
+};
 
 const ROWS: usize = TILE as usize;
 /// Gaussians that one task carries to the world.
@@ -19,7 +24,7 @@ const CHUNK: usize = 1024;
 
 /// Sums over pixels for one Gaussian. With e the exponent log2(alpha), s = dL/de of a pixel, (x, y) the pixel from the
 /// splat's centre and w its blending weight: s, s x, s y, w dL/d(depth sum), s x x, s x y, s y y, w, w carried.
-type PairSum = [f32; 11];
+pub(super) type PairSum = [f32; 11];
 
 /// [`BackwardRasterizer`](crate::BackwardRasterizer) on the processor. Its arrays are used again.
 #[derive(Debug, Default)]
@@ -38,23 +43,43 @@ impl ProcessorBackward {
     pub(crate) fn add(
         &mut self,
         rasterizer: &ProcessorRasterizer,
-        gaussians: &GaussianBuffers,
         target: &RenderTarget,
-        (incoming, carry): (&ImageGradients, Carry),
-        out: &GaussianGradients,
+        incoming: &ImageGradients,
+        onto: Onto<'_>,
     ) {
-        let ProcessorRasterizer { lists, latest: Some(drawn), .. } = rasterizer else { return };
-        let (Some(color), Some(center_scale)) = (gaussians.color.slice(), gaussians.center_scale.slice()) else {
-            return;
-        };
-        let (Some(drawn_color), Some(drawn_depth)) = (target.color.slice(), target.depth.slice()) else { return };
-        let (Some(d_color), Some(d_depth)) = (incoming.color.slice(), incoming.depth_carry.slice()) else { return };
+        let Some(drawn) = &rasterizer.latest else { return };
+        match onto {
+            Onto::Isotropic { gaussians, carry, out } => {
+                let Some(color) = gaussians.color.slice() else { return };
+                if self.sum(rasterizer, (target, incoming, false), &color).is_some() {
+                    self.add_isotropic(drawn, gaussians, carry, out);
+                }
+            }
+            Onto::Anisotropic { gaussians, out } => {
+                if self.sum(rasterizer, (target, incoming, true), &rasterizer.lists.painted).is_some() {
+                    self.add_anisotropic(drawn, gaussians, out);
+                }
+            }
+        }
+    }
+
+    /// Sums over the pixels of the image for each Gaussian. `carries_color`: dL/d colour is what pixels carry.
+    fn sum(
+        &mut self,
+        rasterizer: &ProcessorRasterizer,
+        (target, incoming, carries_color): (&RenderTarget, &ImageGradients, bool),
+        color: &[[f32; 4]],
+    ) -> Option<()> {
+        let ProcessorRasterizer { lists, latest: Some(drawn), .. } = rasterizer else { return None };
+        let (drawn_color, drawn_depth) = (target.color.slice()?, target.depth.slice()?);
+        let (d_color, d_depth) = (incoming.color.slice()?, incoming.depth_carry.slice()?);
         let pixels = Pixels {
             size: drawn.size.map(|side| side as usize),
             color: &drawn_color,
             depth: drawn.settings.outputs.depth.then_some(&drawn_depth),
             d_color: &d_color,
             d_depth: &d_depth,
+            carries_color,
         };
         self.pair_sums.resize(lists.pairs.len(), [0.0; 11]);
         self.walked.clear();
@@ -83,7 +108,7 @@ impl ProcessorBackward {
                         origin: [(column * LANES) as f32, (row * ROWS) as f32],
                         list: &lists.pairs[range.clone()],
                         splats: &lists.splats,
-                        color: &color,
+                        color,
                         out: &mut part[range.start - first..range.end - first],
                     });
                 }
@@ -102,6 +127,12 @@ impl ProcessorBackward {
                 *is_touched = true;
             }
         }
+        Some(())
+    }
+
+    /// Carries the sums to isotropic Gaussians.
+    fn add_isotropic(&self, drawn: &Drawn, gaussians: &GaussianBuffers, carry: Carry, out: &GaussianGradients) {
+        let Some(center_scale) = gaussians.center_scale.slice() else { return };
         let (Some(mut center), Some(mut carried)) = (out.center.slice_mut(), out.carried.slice_mut()) else { return };
         let outs = center.par_chunks_mut(CHUNK).zip(carried.par_chunks_mut(2 * CHUNK));
         let ins = self.sums.par_chunks(CHUNK).zip(self.is_touched.par_chunks(CHUNK));
@@ -111,7 +142,37 @@ impl ProcessorBackward {
                 for (((center, carried), sums), center_scale) in
                     gaussians.zip(is_touched).filter(|(_, is_touched)| **is_touched).map(|(one, _)| one)
                 {
-                    project_backward(drawn, sums, center_scale, carry, center, carried);
+                    add_isotropic(drawn, sums, center_scale, carry, center, carried);
+                }
+            },
+        );
+    }
+
+    /// Carries the sums to anisotropic Gaussians.
+    fn add_anisotropic(&self, drawn: &Drawn, gaussians: &AnisotropicBuffers, out: &AnisotropicGradients) {
+        let slices = gaussians.attributes().map(flyrig_gpu::StorageBuffer::slice);
+        let [Some(center), Some(scale_opacity), Some(rotation), Some(harmonics)] = &slices else { return };
+        let slices = out.attributes().map(flyrig_gpu::StorageBuffer::slice_mut);
+        let [Some(mut center_out), Some(mut scale_out), Some(mut rotation_out), Some(mut harmonics_out)] = slices
+        else {
+            return;
+        };
+        let coefficients = gaussians.order().coefficients();
+        let colors = Harmonics { center, harmonics, coefficients, eye: drawn.camera.center() };
+        let shapes = center_out.par_chunks_mut(CHUNK).zip(scale_out.par_chunks_mut(CHUNK));
+        let outs =
+            shapes.zip(rotation_out.par_chunks_mut(CHUNK)).zip(harmonics_out.par_chunks_mut(CHUNK * coefficients));
+        let ins = self.sums.par_chunks(CHUNK).zip(self.is_touched.par_chunks(CHUNK));
+        outs.zip(ins).enumerate().for_each(
+            |(chunk, ((((center_out, scale_out), rotation_out), harmonics_out), ins))| {
+                for at in (0..ins.0.len()).filter(|at| ins.1[*at]) {
+                    let (sums, i) = (&ins.0[at], chunk * CHUNK + at);
+                    let Some(shape) = Shape::new(&scale_opacity[i], &rotation[i]) else { continue };
+                    let out = [&mut center_out[at], &mut scale_out[at], &mut rotation_out[at]];
+                    add_anisotropic(drawn, sums, &center[i], &shape, out);
+                    let harmonics_out = &mut harmonics_out[at * coefficients..(at + 1) * coefficients];
+                    let d_color = Vec3::new(sums[8], sums[9], sums[10]);
+                    colors.add_backward(i, d_color, &mut center_out[at], harmonics_out);
                 }
             },
         );
@@ -125,6 +186,8 @@ struct Pixels<'a> {
     depth: Option<&'a Vec<f32>>,
     d_color: &'a [[f32; 4]],
     d_depth: &'a [[f32; 4]],
+    /// dL/d colour is carried to the Gaussians in place of the last three of `d_depth`.
+    carries_color: bool,
 }
 
 /// Incoming derivatives of a tile's pixels. A pixel that cannot matter starts opaque.
@@ -162,6 +225,9 @@ impl Pixels<'_> {
                 let (seen, d_color, mut d_depth) = (self.color[at], self.d_color[at], self.d_depth[at]);
                 if self.depth.is_none() {
                     d_depth[0] = 0.0;
+                }
+                if self.carries_color {
+                    d_depth[1..].copy_from_slice(&d_color[..3]);
                 }
                 let (color, depth) = (Vec4::from(d_color), Vec4::from(d_depth));
                 let is_zero = color == Vec4::ZERO && depth == Vec4::ZERO;
@@ -264,121 +330,4 @@ impl State {
             self.transmittance[row][lane] = transmittance * (1.0 - alpha);
         }
     }
-}
-
-/// Carries a Gaussian's sums through the filtered ellipse, the lens and the camera to the world.
-fn project_backward(
-    drawn: &Drawn,
-    sums: &PairSum,
-    center_scale: &[f32; 4],
-    carry: Carry,
-    center_out: &mut [f32; 4],
-    carried_out: &mut [[f32; 4]],
-) {
-    let [slope, slope_x, slope_y, by_depth, xx_moment, xy_moment, yy_moment, weight, carried @ ..] = *sums;
-    let camera = &drawn.camera;
-    let [x, y, z, scale] = *center_scale;
-    let p = camera.to_camera(Vec3::new(x, y, z));
-    let inverse_z = 1.0 / p.z;
-    let ideal = p.truncate() * inverse_z;
-    let focal = Vec2::from(camera.focal_px) * inverse_z;
-    // Columns of d pixel / d camera-space point.
-    let [along_x, along_y, along_z] = camera.projection_jacobian(p);
-    let row_x = Vec3::new(along_x.x, along_y.x, along_z.x) * scale;
-    let row_y = Vec3::new(along_x.y, along_y.y, along_z.y) * scale;
-    let (xx, xy, yy) = (row_x.dot(row_x), row_x.dot(row_y), row_y.dot(row_y));
-    let det = row_x.cross(row_y).length_squared();
-    let s = drawn.settings.filter_variance_px2;
-    let filtered_det = det + s * (xx + yy) + s * s;
-    // 1 / (2 ln 2): the conics are for exp2.
-    let half_log2_e = 0.5 * std::f32::consts::LOG2_E;
-    // Inverse covariances after and before the filter.
-    let filtered_inverse = Mat2::from_cols_array(&[yy + s, -xy, -xy, xx + s]) * (1.0 / filtered_det);
-    let plain_inverse = Mat2::from_cols_array(&[yy, -xy, -xy, xx]) * (1.0 / det);
-    let d_pixel = filtered_inverse * Vec2::new(slope_x, slope_y) * (2.0 * half_log2_e);
-    // dL/d covariance: through the conic, and through the opacity sqrt(det / filtered_det).
-    let moments = Mat2::from_cols_array(&[xx_moment, xy_moment, xy_moment, yy_moment]);
-    let d_covariance =
-        (filtered_inverse * moments * filtered_inverse + plain_inverse * filtered_inverse * (s * slope)) * half_log2_e;
-    // dL/d the columns of the projection's Jacobian, covariance = scale^2 J J^T.
-    let twice = d_covariance * (2.0 * scale * scale);
-    let d_along_z = twice * along_z;
-    let d_along_x = twice * along_x - ideal.x * d_along_z;
-    let d_along_y = twice * along_y - ideal.y * d_along_z;
-    let d_lens = [d_along_x * focal, d_along_y * focal];
-    let d_ideal =
-        through_lens_jacobian(camera, ideal, d_lens) - Vec2::new(d_along_z.dot(along_x), d_along_z.dot(along_y));
-    let d_z = by_depth - (d_along_x.dot(along_x) + d_along_y.dot(along_y) + ideal.dot(d_ideal)) * inverse_z;
-    let in_camera = Vec3::new(
-        d_pixel.dot(along_x) + d_ideal.x * inverse_z,
-        d_pixel.dot(along_y) + d_ideal.y * inverse_z,
-        d_pixel.dot(along_z) + d_z,
-    );
-    let rotation = Mat3::from_mat4(Mat4::from_cols_array_2d(&camera.camera_from_world));
-    let world_from_camera = rotation.transpose();
-    let in_world = (world_from_camera * in_camera).extend(weight);
-    if in_world.is_finite() {
-        *center_out = (Vec4::from(*center_out) + in_world).to_array();
-    }
-    let [first, second] = match carry {
-        Carry::Sum => [Vec4::new(carried[0], carried[1], carried[2], 0.0), Vec4::ZERO],
-        Carry::Lift => {
-            // J^T C J with C = (xx, xy, yy) of the image, J = d pixel / d world.
-            let du = world_from_camera * Vec3::new(along_x.x, along_y.x, along_z.x);
-            let dv = world_from_camera * Vec3::new(along_x.y, along_y.y, along_z.y);
-            let (u, v) = (carried[0] * du + carried[1] * dv, carried[1] * du + carried[2] * dv);
-            let entry = |i: usize, j: usize| du[i] * u[j] + dv[i] * v[j];
-            [
-                Vec4::new(entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1)),
-                Vec4::new(entry(1, 2), entry(2, 2), 0.0, 0.0),
-            ]
-        }
-    };
-    if let ([out_first, out_second], true) = (carried_out, first.is_finite() && second.is_finite()) {
-        *out_first = (Vec4::from(*out_first) + first).to_array();
-        *out_second = (Vec4::from(*out_second) + second).to_array();
-    }
-}
-
-/// dL/d ideal through the lens's Jacobian, given dL/d Jacobian (columns as those of the Jacobian).
-fn through_lens_jacobian(camera: &CameraConstants, ideal: Vec2, d: [Vec2; 2]) -> Vec2 {
-    let Vec2 { x, y } = ideal;
-    let r2 = ideal.length_squared();
-    let [k1, k2, k3, k4, ..] = camera.coefficients;
-    // A radial factor s(r): first = s'/r, second = (s'/r)'/r.
-    let (first, second, p1, p2);
-    if camera.lens == 0 {
-        // s = above / below, polynomials of q = r^2: first = 2 ds/dq, second = 4 d2s/dq2.
-        let [d1, d2, d3] = [camera.coefficients[5], camera.coefficients[6], camera.coefficients[7]];
-        let below = 1.0 / (1.0 + r2 * (d1 + r2 * (d2 + r2 * d3)));
-        let below_slope = d1 + r2 * (2.0 * d2 + r2 * 3.0 * d3);
-        let s = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * below;
-        let slope = (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3) - s * below_slope) * below;
-        first = 2.0 * slope;
-        second = 4.0 * (2.0 * k2 + 6.0 * k3 * r2 - 2.0 * slope * below_slope - s * (2.0 * d2 + 6.0 * d3 * r2)) * below;
-        (p1, p2) = (camera.coefficients[3], camera.coefficients[4]);
-    } else if r2 < 1e-4 {
-        // Taylor: s = 1 + (k1 - 1/3) r^2 + O(r^4); the formulas below cancel here.
-        first = 2.0 * (k1 - 1.0 / 3.0);
-        (second, p1, p2) = (0.0, 0.0, 0.0);
-    } else {
-        let r = r2.sqrt();
-        let theta = r.atan();
-        let t2 = theta * theta;
-        let n = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)));
-        let dn = theta * (6.0 * k1 + t2 * (20.0 * k2 + t2 * (42.0 * k3 + t2 * 72.0 * k4)));
-        let s = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r;
-        let inverse = 1.0 / (1.0 + r2);
-        first = (n * inverse - s) / r2;
-        let bend = (dn - 2.0 * r * n) * inverse * inverse;
-        second = (bend / r - 3.0 * first) / r2;
-        (p1, p2) = (0.0, 0.0);
-    }
-    let u_xx = 3.0 * x * first + x * x * x * second + 6.0 * p2;
-    let u_xy = y * first + x * x * y * second + 2.0 * p1;
-    let u_yy = x * first + x * y * y * second + 2.0 * p2;
-    let v_yy = 3.0 * y * first + y * y * y * second + 6.0 * p1;
-    // v_xx = u_xy and v_xy = u_yy for all lenses.
-    let off_diagonal = d[1].x + d[0].y;
-    Vec2::new(d[0].x * u_xx + off_diagonal * u_xy + d[1].y * u_yy, d[0].x * u_xy + off_diagonal * u_yy + d[1].y * v_yy)
 }

@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
 
+use super::harmonics::Harmonics;
 use super::lanes::vectorized;
 use super::project::{Projection, Rect, Splat, TILE};
 use crate::raster_buffers::pair_capacity;
@@ -14,13 +15,61 @@ const CHUNK: usize = 4096;
 const DIGIT_BITS: u32 = 12;
 const PASSES: u32 = 2;
 
-/// The attributes of all Gaussians, as in [`GaussianBuffers`](crate::GaussianBuffers).
+/// Gaussians that can be projected.
+pub(super) trait Source: Copy + Send + Sync {
+    /// Number of Gaussians.
+    fn count(&self) -> usize;
+
+    /// The splat of Gaussian `i` and its tiles; None where it is not drawn.
+    fn splat(&self, projection: &Projection<'_>, i: usize) -> Option<(Splat, Rect)>;
+
+    /// Colours that depend on the direction.
+    fn harmonics(&self) -> Option<Harmonics<'_>> {
+        None
+    }
+}
+
+/// The attributes of isotropic Gaussians, as in [`GaussianBuffers`](crate::GaussianBuffers).
 #[derive(Clone, Copy)]
-pub(super) struct Attributes<'a> {
+pub(super) struct Isotropic<'a> {
     pub center_scale: &'a [[f32; 4]],
     pub normal: &'a [[f32; 4]],
     pub color: &'a [[f32; 4]],
     pub canonical: &'a [[f32; 4]],
+}
+
+impl Source for Isotropic<'_> {
+    fn count(&self) -> usize {
+        self.center_scale.len()
+    }
+
+    #[inline(always)]
+    fn splat(&self, projection: &Projection<'_>, i: usize) -> Option<(Splat, Rect)> {
+        projection.isotropic(&self.center_scale[i], &self.normal[i], &self.color[i], &self.canonical[i])
+    }
+}
+
+/// The attributes of anisotropic Gaussians, as in [`AnisotropicBuffers`](crate::AnisotropicBuffers).
+#[derive(Clone, Copy)]
+pub(super) struct Anisotropic<'a> {
+    pub colors: Harmonics<'a>,
+    pub scale_opacity: &'a [[f32; 4]],
+    pub rotation: &'a [[f32; 4]],
+}
+
+impl Source for Anisotropic<'_> {
+    fn count(&self) -> usize {
+        self.scale_opacity.len()
+    }
+
+    #[inline(always)]
+    fn splat(&self, projection: &Projection<'_>, i: usize) -> Option<(Splat, Rect)> {
+        projection.anisotropic(&self.colors.center[i], &self.scale_opacity[i], &self.rotation[i])
+    }
+
+    fn harmonics(&self) -> Option<Harmonics<'_>> {
+        Some(self.colors)
+    }
 }
 
 /// A Gaussian on its way through the sort. It takes its rectangle along: looked up by Gaussian, the rectangles cost more than
@@ -38,6 +87,8 @@ struct Ranked {
 pub(super) struct Lists {
     /// By Gaussian; old where it is not drawn.
     pub splats: Vec<Splat>,
+    /// Colours as the camera sees them, by Gaussian where they depend on the direction; old where one is not drawn.
+    pub painted: Vec<[f32; 4]>,
     /// Drawn Gaussians of each chunk.
     visible: Vec<Vec<Ranked>>,
     /// All of them, nearest first.
@@ -61,24 +112,41 @@ pub(super) struct Lists {
 
 impl Lists {
     /// Lists the Gaussians of an image.
-    pub fn fill(&mut self, projection: &Projection<'_>, gaussians: Attributes<'_>) {
+    pub fn fill(&mut self, projection: &Projection<'_>, gaussians: impl Source) {
         let start = Instant::now();
         self.project(projection, gaussians);
+        if let Some(harmonics) = gaussians.harmonics() {
+            self.paint(gaussians.count(), harmonics);
+        }
         let projected = Instant::now();
         self.sort();
         let sorted = Instant::now();
-        self.bin(projection.size, gaussians.center_scale.len());
+        self.bin(projection.size, gaussians.count());
         self.times = [projected - start, sorted - projected, sorted.elapsed()];
     }
 
-    fn project(&mut self, projection: &Projection<'_>, gaussians: Attributes<'_>) {
-        let count = gaussians.center_scale.len();
+    fn project(&mut self, projection: &Projection<'_>, gaussians: impl Source) {
+        let count = gaussians.count();
         self.splats.resize(count, Splat::default());
         self.visible.resize(count.div_ceil(CHUNK), Vec::new());
         let chunks = self.splats.par_chunks_mut(CHUNK).zip(&mut self.visible);
         chunks.enumerate().for_each(|(chunk, (splats, visible))| {
             visible.clear();
             vectorized(ProjectChunk { projection, gaussians, first: chunk * CHUNK, splats, visible });
+        });
+    }
+
+    /// Colours what is drawn. A colour that is not finite takes its Gaussian out of the image.
+    fn paint(&mut self, count: usize, harmonics: Harmonics<'_>) {
+        self.painted.resize(count, [0.0; 4]);
+        let chunks = self.painted.par_chunks_mut(CHUNK).zip(&mut self.visible);
+        chunks.enumerate().for_each(|(chunk, (painted, visible))| {
+            visible.retain(|one| {
+                let i = one.gaussian as usize;
+                let color = harmonics.color(i);
+                painted[i - chunk * CHUNK] = color.unwrap_or_default();
+                color.is_some()
+            });
         });
     }
 
@@ -174,25 +242,23 @@ impl Lists {
 }
 
 /// Projects the Gaussians from number `first` on.
-struct ProjectChunk<'a> {
+struct ProjectChunk<'a, S> {
     projection: &'a Projection<'a>,
-    gaussians: Attributes<'a>,
+    gaussians: S,
     first: usize,
     splats: &'a mut [Splat],
     visible: &'a mut Vec<Ranked>,
 }
 
-impl pulp::NullaryFnOnce for ProjectChunk<'_> {
+impl<S: Source> pulp::NullaryFnOnce for ProjectChunk<'_, S> {
     type Output = ();
 
     #[inline(always)]
     fn call(self) {
         let Self { projection, gaussians, first, splats, visible } = self;
-        let Attributes { center_scale, normal, color, canonical } = gaussians;
         for (offset, splat) in splats.iter_mut().enumerate() {
             let i = first + offset;
-            let drawn = projection.splat(&center_scale[i], &normal[i], &color[i], &canonical[i]);
-            if let Some((drawn, rect)) = drawn {
+            if let Some((drawn, rect)) = gaussians.splat(projection, i) {
                 *splat = drawn;
                 visible.push(Ranked { key: drawn.depth.to_bits(), gaussian: i as u32, rect });
             }

@@ -3,6 +3,7 @@
 use flyrig_gpu::CameraConstants;
 use glam::{Vec2, Vec3, Vec4};
 
+use super::shape::{Shape, rows_along, rows_of};
 use crate::RasterSettings;
 use crate::raster_kernels::{BACKFACING_COSINE, CUT};
 
@@ -47,10 +48,10 @@ pub(super) struct Projection<'a> {
 }
 
 impl Projection<'_> {
-    /// The splat of a Gaussian and its tiles; None where it is not drawn. Elements as in
+    /// The splat of an isotropic Gaussian and its tiles; None where it is not drawn. Elements as in
     /// [`GaussianBuffers`](crate::GaussianBuffers).
     #[inline(always)]
-    pub fn splat(
+    pub fn isotropic(
         &self,
         center: &[f32; 4],
         normal: &[f32; 4],
@@ -79,16 +80,40 @@ impl Projection<'_> {
             return None;
         }
         let in_camera = self.camera.to_camera(world);
-        let (pixel, [dx, dy, dz]) = self.camera.project_with_jacobian(in_camera, self.settings.near_m)?;
-        let row_x = Vec3::new(dx.x, dy.x, dz.x) * scale;
-        let row_y = Vec3::new(dx.y, dy.y, dz.y) * scale;
+        let (pixel, jacobian) = self.camera.project_with_jacobian(in_camera, self.settings.near_m)?;
+        self.splat(pixel, in_camera.z, rows_of(&jacobian).map(|row| row * scale), color[3])
+    }
+
+    /// The splat of an anisotropic Gaussian and its tiles; None where it is not drawn. Elements as in
+    /// [`AnisotropicBuffers`](crate::AnisotropicBuffers).
+    #[inline(always)]
+    pub fn anisotropic(
+        &self,
+        center: &[f32; 4],
+        scale_opacity: &[f32; 4],
+        rotation: &[f32; 4],
+    ) -> Option<(Splat, Rect)> {
+        let world = Vec4::from(*center).truncate();
+        let shape = Shape::new(scale_opacity, rotation)?;
+        if !(world.is_finite() && shape.opacity > 0.0) {
+            return None;
+        }
+        let in_camera = self.camera.to_camera(world);
+        let (pixel, jacobian) = self.camera.project_with_jacobian(in_camera, self.settings.near_m)?;
+        let rows = rows_along(&jacobian, &shape.axes_in_camera(&self.camera)).map(|row| row * shape.scale_m);
+        self.splat(pixel, in_camera.z, rows, shape.opacity)
+    }
+
+    /// The splat whose covariance before the filter is the product of a matrix of these two rows with its transpose.
+    #[inline(always)]
+    fn splat(&self, pixel: Vec2, depth: f32, [row_x, row_y]: [Vec3; 2], opacity: f32) -> Option<(Splat, Rect)> {
         let (xx, xy, yy) = (row_x.dot(row_x), row_x.dot(row_y), row_y.dot(row_y));
         // det(J J^T) by the Cauchy-Binet formula: never negative, no cancellation for thin ellipses.
         let det = row_x.cross(row_y).length_squared();
         // Mip-Splatting's 2D Mip filter (Yu et al. 2024, Eq. 10): a wider ellipse of the same integral.
         let s = self.settings.filter_variance_px2;
         let filtered_det = det + s * (xx + yy) + s * s;
-        let opacity = color[3].min(1.0) * (det / filtered_det).sqrt();
+        let opacity = opacity.min(1.0) * (det / filtered_det).sqrt();
         if !(pixel.is_finite() && filtered_det.is_finite() && opacity > CUT as f32) {
             return None;
         }
@@ -111,6 +136,6 @@ impl Projection<'_> {
         let rect = Rect { first: [tile(low.x), tile(low.y)], last: [tile(high.x), tile(high.y)] };
         let scale = 0.5 * std::f32::consts::LOG2_E / filtered_det;
         let conic = [yy * scale, -2.0 * xy * scale, xx * scale];
-        Some((Splat { pixel, depth: in_camera.z, log2_opacity, conic, reach_y: extent.y }, rect))
+        Some((Splat { pixel, depth, log2_opacity, conic, reach_y: extent.y }, rect))
     }
 }

@@ -7,11 +7,12 @@ use flyrig_types::Camera;
 use rayon::prelude::*;
 
 use super::blend::{BlendTile, Tile};
+use super::harmonics::Harmonics;
 use super::lanes::{LANES, vectorized};
-use super::lists::{Attributes, Lists};
+use super::lists::{Anisotropic, Isotropic, Lists};
 use super::project::{Projection, TILE};
 use crate::raster_settings::{Latest, tile_range};
-use crate::{GaussianBuffers, Outputs, RasterSettings, RasterStats, RenderTarget};
+use crate::{Gaussians, HarmonicOrder, Outputs, RasterSettings, RasterStats, RenderTarget};
 
 /// [`Rasterizer`](crate::Rasterizer) on the processor: draws when an image is recorded.
 #[derive(Debug, Default)]
@@ -29,6 +30,8 @@ pub(crate) struct Drawn {
     pub camera: CameraConstants,
     pub size: [u32; 2],
     pub gaussians: usize,
+    /// Order of the colours; None for isotropic Gaussians.
+    pub order: Option<HarmonicOrder>,
     pub settings: RasterSettings,
     /// First tile that was blended, and columns and rows of them.
     pub first_tile: [u32; 2],
@@ -39,22 +42,51 @@ impl ProcessorRasterizer {
     /// Draws an image. Arrays of the device are left as they are.
     pub(crate) fn draw(
         &mut self,
-        gaussians: &GaussianBuffers,
+        gaussians: Gaussians<'_>,
         camera: &Camera,
         settings: &RasterSettings,
         target: &RenderTarget,
     ) {
         self.latest = None;
         let size = [target.width, target.height];
-        let attributes = gaussians.attributes().map(flyrig_gpu::StorageBuffer::slice);
-        let [Some(center_scale), Some(normal), Some(color), Some(canonical)] = &attributes else { return };
         if size.contains(&0) {
             return;
         }
         let constants = CameraConstants::from(camera);
         let projection = Projection { camera: constants, size, settings };
-        let attributes = Attributes { center_scale, normal, color, canonical };
-        self.lists.fill(&projection, attributes);
+        let tiles = match gaussians {
+            Gaussians::Isotropic(buffers) => {
+                let slices = buffers.attributes().map(flyrig_gpu::StorageBuffer::slice);
+                let [Some(center_scale), Some(normal), Some(color), Some(canonical)] = &slices else { return };
+                self.lists.fill(&projection, Isotropic { center_scale, normal, color, canonical });
+                self.blend(&projection, color, canonical, target)
+            }
+            Gaussians::Anisotropic(buffers) => {
+                let slices = buffers.attributes().map(flyrig_gpu::StorageBuffer::slice);
+                let [Some(center), Some(scale_opacity), Some(rotation), Some(harmonics)] = &slices else { return };
+                let coefficients = buffers.order().coefficients();
+                let colors = Harmonics { center, harmonics, coefficients, eye: constants.center() };
+                self.lists.fill(&projection, Anisotropic { colors, scale_opacity, rotation });
+                let painted = std::mem::take(&mut self.lists.painted);
+                let tiles = self.blend(&projection, &painted, &[], target);
+                self.lists.painted = painted;
+                tiles
+            }
+        };
+        let Some((first_tile, blended)) = tiles else { return };
+        let (gaussians, order, settings) = (gaussians.count(), gaussians.order(), *settings);
+        self.latest = Some(Drawn { camera: constants, size, gaussians, order, settings, first_tile, blended });
+    }
+
+    /// Blends the lists into the images. Returns the first tile that was blended, and columns and rows of them.
+    fn blend(
+        &mut self,
+        projection: &Projection<'_>,
+        colors: &[[f32; 4]],
+        positions: &[[f32; 4]],
+        target: &RenderTarget,
+    ) -> Option<([u32; 2], [u32; 2])> {
+        let Projection { size, settings, .. } = *projection;
         self.overflowed_images += u32::from(self.lists.overflowed);
         let (first_tile, blended) = tile_range(settings.area, self.lists.tiles, TILE);
         let Outputs { color: with_color, depth: with_depth, canonical: with_canonical } = settings.outputs;
@@ -77,7 +109,7 @@ impl ProcessorRasterizer {
             bands.iter_mut().zip(canonical.chunks_mut(row_of_tiles)).for_each(|(band, part)| band.canonical = part);
         }
         let rows = first_tile[1] as usize..(first_tile[1] + blended[1]) as usize;
-        let Some(bands) = bands.get_mut(rows) else { return };
+        let bands = bands.get_mut(rows)?;
         let lists = &self.lists;
         bands.par_iter_mut().enumerate().for_each(|(row, band)| {
             let row = first_tile[1] + row as u32;
@@ -92,22 +124,21 @@ impl ProcessorRasterizer {
                     origin: [(column * TILE) as f32, (row * TILE) as f32],
                     list,
                     splats: &lists.splats,
-                    color: attributes.color,
-                    canonical: attributes.canonical,
+                    color: colors,
+                    canonical: positions,
                     outputs: settings.outputs,
                 });
                 band.write(&tile, size[0] as usize, left);
             }
         });
         self.blend_time = start.elapsed();
-        let gaussians = gaussians.count();
-        let settings = *settings;
-        self.latest = Some(Drawn { camera: constants, size, gaussians, settings, first_tile, blended });
+        Some((first_tile, blended))
     }
 
     pub(crate) fn latest(&self) -> Option<Latest> {
-        let Drawn { size, gaussians, settings, blended, .. } = self.latest.as_ref()?;
-        Some(Latest { gaussians: *gaussians, size: *size, blended: *blended, outputs: settings.outputs })
+        let Drawn { size, gaussians, order, settings, blended, .. } = self.latest.as_ref()?;
+        let outputs = settings.outputs;
+        Some(Latest { gaussians: *gaussians, order: *order, size: *size, blended: *blended, outputs })
     }
 
     pub(crate) fn times(&self) -> [Duration; 4] {

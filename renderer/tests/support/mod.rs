@@ -1,6 +1,8 @@
 //! Shared by the raster tests and the benchmark.
 #![allow(dead_code)]
 
+pub mod anisotropic;
+pub mod anisotropic_run;
 pub mod body_scene;
 pub mod random_scene;
 pub mod reference;

@@ -87,9 +87,19 @@ fn rgb(color: [f64; 4]) -> DVec3 {
     DVec3::new(color[0], color[1], color[2])
 }
 
+/// Colours of the splats.
+fn colors_of(scene: &Scene, splats: &[Splat]) -> Vec<DVec3> {
+    splats.iter().map(|s| vec3(scene.color[s.index])).collect()
+}
+
 /// The loss that is linear in the images with `incoming` as its derivative, with the lists of `touched` kept while
 /// `splats` may have moved.
 pub fn linear_loss(scene: &Scene, touched: &Touched, splats: &[Splat], incoming: &Incoming, width: u32) -> f64 {
+    linear_loss_of(&colors_of(scene, splats), touched, splats, incoming, width)
+}
+
+/// [`linear_loss`] with a colour for each splat.
+pub fn linear_loss_of(colors: &[DVec3], touched: &Touched, splats: &[Splat], incoming: &Incoming, width: u32) -> f64 {
     let mut loss = 0.0;
     for (at, list) in touched.lists.iter().enumerate() {
         let Some((by_color, by_depth)) = pixel(incoming, at).filter(|_| !list.is_empty()) else { continue };
@@ -98,7 +108,7 @@ pub fn linear_loss(scene: &Scene, touched: &Touched, splats: &[Splat], incoming:
         for &k in list {
             let s = &splats[k];
             let alpha = unclamped_alpha(s, x, y).min(MAX_ALPHA);
-            color += alpha * transmittance * vec3(scene.color[s.index]);
+            color += alpha * transmittance * colors[k];
             depth += alpha * transmittance * s.depth;
             transmittance *= 1.0 - alpha;
         }
@@ -108,9 +118,12 @@ pub fn linear_loss(scene: &Scene, touched: &Touched, splats: &[Splat], incoming:
     loss
 }
 
-/// Derivatives with respect to one splat's numbers.
+/// Derivatives with respect to one splat's numbers, and what its pixels carried to it.
 #[derive(Clone, Copy, Default)]
-struct SplatGradient {
+pub struct SplatGradient {
+    pub color: DVec3,
+    pub weight: f64,
+    pub carried: [f64; 3],
     pixel: DVec2,
     depth: f64,
     opacity: f64,
@@ -119,18 +132,25 @@ struct SplatGradient {
     yy: f64,
 }
 
-/// The backward pass.
-pub fn backward<T: Copy + Into<f64>>(
-    scene: &Scene,
-    camera: &Camera,
-    settings: &RasterSettings,
+impl SplatGradient {
+    /// Change of the loss when the splat becomes another, were the loss linear in the splat's numbers.
+    pub fn change(&self, from: &Splat, to: &Splat) -> f64 {
+        self.pixel.dot(to.pixel - from.pixel)
+            + self.depth * (to.depth - from.depth)
+            + self.opacity * (to.opacity - from.opacity)
+            + self.xx * (to.xx - from.xx)
+            + self.xy * (to.xy - from.xy)
+            + self.yy * (to.yy - from.yy)
+    }
+}
+
+/// Derivatives with respect to the splats, each with its colour.
+pub fn splat_gradients<T: Copy + Into<f64>>(
+    colors: &[DVec3],
     width: u32,
     touched: &Touched,
     incoming: &Incoming<T>,
-) -> Outgoing {
-    let count = scene.center_scale.len();
-    let mut out =
-        Outgoing { center: vec![DVec3::ZERO; count], weight: vec![0.0; count], carried: vec![[0.0; 3]; count] };
+) -> Vec<SplatGradient> {
     let splats = &touched.splats;
     let mut gradients = vec![SplatGradient::default(); splats.len()];
     for (at, list) in touched.lists.iter().enumerate() {
@@ -153,13 +173,14 @@ pub fn backward<T: Copy + Into<f64>>(
             let s = &splats[k];
             let unclamped = unclamped_alpha(s, x, y);
             let alpha = unclamped.min(MAX_ALPHA);
-            let value = rgb(by_color).dot(vec3(scene.color[s.index])) + by_depth * s.depth + by_alpha;
+            let value = rgb(by_color).dot(colors[k]) + by_depth * s.depth + by_alpha;
             let weight = alpha * before[place];
-            out.weight[s.index] += weight;
-            for (sum, carry) in out.carried[s.index].iter_mut().zip(&depth_carry[1..]) {
+            let g = &mut gradients[k];
+            g.color += weight * rgb(by_color);
+            g.weight += weight;
+            for (sum, carry) in g.carried.iter_mut().zip(&depth_carry[1..]) {
                 *sum += weight * carry;
             }
-            let g = &mut gradients[k];
             g.depth += weight * by_depth;
             if unclamped < MAX_ALPHA {
                 let by_this = before[place] * (value - behind);
@@ -174,19 +195,28 @@ pub fn backward<T: Copy + Into<f64>>(
             behind = alpha * value + (1.0 - alpha) * behind;
         }
     }
+    gradients
+}
+
+/// The backward pass.
+pub fn backward<T: Copy + Into<f64>>(
+    scene: &Scene,
+    camera: &Camera,
+    settings: &RasterSettings,
+    width: u32,
+    touched: &Touched,
+    incoming: &Incoming<T>,
+) -> Outgoing {
+    let count = scene.center_scale.len();
+    let mut out =
+        Outgoing { center: vec![DVec3::ZERO; count], weight: vec![0.0; count], carried: vec![[0.0; 3]; count] };
+    let splats = &touched.splats;
+    let gradients = splat_gradients(&colors_of(scene, splats), width, touched, incoming);
     for (s, g) in splats.iter().zip(&gradients) {
-        // Loss were it linear in the splat's numbers. Culling is a jump, and not to be differentiated.
+        (out.weight[s.index], out.carried[s.index]) = (g.weight, g.carried);
+        // Culling is a jump, and not to be differentiated.
         let smooth = RasterSettings { cull_backfacing: false, ..*settings };
-        let value = |center: DVec3| {
-            splat_at(scene, camera, &smooth, s.index, center).map(|m| {
-                g.pixel.dot(m.pixel - s.pixel)
-                    + g.depth * (m.depth - s.depth)
-                    + g.opacity * (m.opacity - s.opacity)
-                    + g.xx * (m.xx - s.xx)
-                    + g.xy * (m.xy - s.xy)
-                    + g.yy * (m.yy - s.yy)
-            })
-        };
+        let value = |center: DVec3| splat_at(scene, camera, &smooth, s.index, center).map(|moved| g.change(s, &moved));
         // Fourth order; the reference's own Jacobian is good to 1e-10. A splat that may vanish on the way gets
         // shorter steps.
         let slope = |axis: DVec3| {

@@ -1,0 +1,165 @@
+//! Anisotropic Gaussians: what they are made of, and derivatives with respect to all of it.
+
+use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
+use wgpu::CommandEncoder;
+
+use crate::GaussianBuffers;
+use crate::schema::{self, GaussianElement};
+
+/// Order up to which the colours of a scene depend on the direction.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum HarmonicOrder {
+    /// One colour for all directions.
+    Zero,
+    /// Linear in the direction.
+    One,
+    /// Quadratic in the direction.
+    Two,
+}
+
+impl HarmonicOrder {
+    /// All orders, the lowest first.
+    pub const ALL: [Self; 3] = [Self::Zero, Self::One, Self::Two];
+
+    /// Coefficients of one colour channel.
+    #[must_use]
+    pub const fn coefficients(self) -> usize {
+        match self {
+            Self::Zero => 1,
+            Self::One => 4,
+            Self::Two => 9,
+        }
+    }
+}
+
+/// Gaussians with three scales, a rotation, an opacity, and a colour that depends on the direction; a buffer for each of
+/// [`ANISOTROPIC_ATTRIBUTES`](crate::ANISOTROPIC_ATTRIBUTES).
+///
+/// The covariance is `R diag(scale²) R^T`. The colour is the sum of the real spherical harmonics of the direction from the
+/// camera to the centre, with the signs of the 3D Gaussian Splatting reference code and without its offset of 0.5, times
+/// their coefficients; what is below 0 becomes 0. A Gaussian with any number that is not finite, a scale or the opacity not
+/// above 0, or a quaternion whose length is not within 1e-15 to 1e15 is not drawn.
+#[derive(Debug)]
+pub struct AnisotropicBuffers {
+    /// World position, metres; w unused.
+    pub center: StorageBuffer<GaussianElement>,
+    /// Standard deviations along the Gaussian's own axes, metres; w: opacity in 0..=1.
+    pub scale_opacity: StorageBuffer<GaussianElement>,
+    /// Quaternion x, y, z, w of any length: world from the Gaussian's axes.
+    pub rotation: StorageBuffer<GaussianElement>,
+    /// Coefficients of linear RGB; w unused. Those of one Gaussian follow each other.
+    pub harmonics: StorageBuffer<GaussianElement>,
+    order: HarmonicOrder,
+}
+
+impl AnisotropicBuffers {
+    /// Room for `count` Gaussians, all zero.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn zeroed(gpu: &GpuContext, count: usize, order: HarmonicOrder) -> Result<Self, GpuError> {
+        Ok(Self {
+            center: schema::CENTER.zeroed(gpu, count)?,
+            scale_opacity: schema::SCALE_OPACITY.zeroed(gpu, count)?,
+            rotation: schema::ROTATION.zeroed(gpu, count)?,
+            harmonics: schema::HARMONICS.zeroed(gpu, count * order.coefficients())?,
+            order,
+        })
+    }
+
+    /// Number of Gaussians.
+    #[must_use]
+    pub fn count(&self) -> usize {
+        self.center.len()
+    }
+
+    /// Order of the colours.
+    #[must_use]
+    pub fn order(&self) -> HarmonicOrder {
+        self.order
+    }
+
+    /// The buffers in the order of [`ANISOTROPIC_ATTRIBUTES`](crate::ANISOTROPIC_ATTRIBUTES).
+    #[must_use]
+    pub fn attributes(&self) -> [&StorageBuffer<GaussianElement>; 4] {
+        [&self.center, &self.scale_opacity, &self.rotation, &self.harmonics]
+    }
+}
+
+/// Derivatives of a loss L with respect to [`AnisotropicBuffers`], element for element as there, summed over the views since
+/// [`Self::clear`].
+#[derive(Debug)]
+pub struct AnisotropicGradients {
+    /// dL/d world centre, per metre; w: blending weight in the pixels that had a gradient (0: it cannot matter).
+    pub center: StorageBuffer<GaussianElement>,
+    /// dL/d scales, per metre; w: dL/d opacity, 0 where it is above 1.
+    pub scale_opacity: StorageBuffer<GaussianElement>,
+    /// dL/d quaternion as it is stored. It has no part along the quaternion: the length does not matter.
+    pub rotation: StorageBuffer<GaussianElement>,
+    /// dL/d coefficients, 0 where the colour is clamped at 0; w: 0.
+    pub harmonics: StorageBuffer<GaussianElement>,
+}
+
+impl AnisotropicGradients {
+    /// For `count` Gaussians, all zero.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn zeroed(gpu: &GpuContext, count: usize, order: HarmonicOrder) -> Result<Self, GpuError> {
+        let AnisotropicBuffers { center, scale_opacity, rotation, harmonics, .. } =
+            AnisotropicBuffers::zeroed(gpu, count, order)?;
+        Ok(Self { center, scale_opacity, rotation, harmonics })
+    }
+
+    /// Records setting everything to zero.
+    pub fn clear(&self, encoder: &mut CommandEncoder) {
+        self.attributes().into_iter().for_each(|buffer| buffer.encode_clear(encoder));
+    }
+
+    /// The buffers in the order of [`ANISOTROPIC_ATTRIBUTES`](crate::ANISOTROPIC_ATTRIBUTES).
+    #[must_use]
+    pub fn attributes(&self) -> [&StorageBuffer<GaussianElement>; 4] {
+        [&self.center, &self.scale_opacity, &self.rotation, &self.harmonics]
+    }
+}
+
+/// Gaussians that a rasteriser draws.
+#[derive(Debug, Clone, Copy)]
+pub enum Gaussians<'a> {
+    /// Surface Gaussians of one scale and one colour each.
+    Isotropic(&'a GaussianBuffers),
+    /// Gaussians of three scales and colours by direction. They have no normals and no canonical positions: none is culled, and
+    /// [`RenderTarget::canonical`](crate::RenderTarget::canonical) keeps its content.
+    Anisotropic(&'a AnisotropicBuffers),
+}
+
+impl Gaussians<'_> {
+    /// Number of Gaussians.
+    #[must_use]
+    pub fn count(&self) -> usize {
+        match self {
+            Self::Isotropic(gaussians) => gaussians.count(),
+            Self::Anisotropic(gaussians) => gaussians.count(),
+        }
+    }
+
+    /// Order of the colours; None for isotropic Gaussians.
+    pub(crate) fn order(&self) -> Option<HarmonicOrder> {
+        match self {
+            Self::Isotropic(_) => None,
+            Self::Anisotropic(gaussians) => Some(gaussians.order()),
+        }
+    }
+}
+
+impl<'a> From<&'a GaussianBuffers> for Gaussians<'a> {
+    fn from(gaussians: &'a GaussianBuffers) -> Self {
+        Self::Isotropic(gaussians)
+    }
+}
+
+impl<'a> From<&'a AnisotropicBuffers> for Gaussians<'a> {
+    fn from(gaussians: &'a AnisotropicBuffers) -> Self {
+        Self::Anisotropic(gaussians)
+    }
+}
