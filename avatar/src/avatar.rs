@@ -85,7 +85,8 @@ impl Avatar {
         for i in 0..count {
             let scale = surface.scale_m[i].max(1e-4).ln();
             parameters.shape[i] = [scale, scale, scale + THICKNESS.ln(), logit];
-            parameters.rotation[i] = Quat::from_rotation_arc(Vec3::Z, surface.normals[i].normalize_or(Vec3::Z)).to_array();
+            parameters.rotation[i] =
+                Quat::from_rotation_arc(Vec3::Z, surface.normals[i].normalize_or(Vec3::Z)).to_array();
             let [r, g, b] = colors.get(i).copied().unwrap_or([0.2; 3]).map(|value| value / CONSTANT_HARMONIC);
             parameters.harmonics[i * order.coefficients()] = [r, g, b, 0.0];
         }
@@ -193,7 +194,10 @@ pub(crate) mod tests {
         assert!(with(&|avatar| avatar.hanging.as_mut().unwrap().gaussian_nodes[3][1] = 7).contains("graph"));
         assert!(with(&|avatar| avatar.parameters.shape[3][1] = f32::NAN).contains("not finite"));
         assert!(with(&|avatar| avatar.template.triangles[0][0] = u32::MAX).contains("triangle"));
-        assert_eq!(Parameters::from_lists([vec![[0.0; 4]; 3], vec![[0.0; 4]; 3], vec![[0.0; 4]; 3], vec![[0.0; 4]; 13]]), None);
+        assert_eq!(
+            Parameters::from_lists([vec![[0.0; 4]; 3], vec![[0.0; 4]; 3], vec![[0.0; 4]; 3], vec![[0.0; 4]; 13]]),
+            None
+        );
     }
 
     #[test]

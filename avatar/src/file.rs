@@ -3,7 +3,7 @@
 use std::{collections::HashMap, io::Write as _, path::Path};
 
 use bytemuck::Pod;
-use flyrig_body::{Joint, Part, SkinWeights, Skeleton, Template};
+use flyrig_body::{Joint, Part, Skeleton, SkinWeights, Template};
 use flyrig_types::write_whole;
 use glam::{DMat4, DQuat, DVec3, Vec2, Vec3};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
@@ -166,7 +166,8 @@ impl Avatar {
         let foreign = || "is no avatar; build one with `flyrig avatar build`".to_owned();
         let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|_| foreign())?;
         let header = metadata.metadata().as_ref().and_then(|all| all.get(HEADER)).ok_or_else(foreign)?;
-        let found = serde_json::from_str::<VersionOnly>(header).map_err(|error| format!("is damaged: {error}"))?.version;
+        let found =
+            serde_json::from_str::<VersionOnly>(header).map_err(|error| format!("is damaged: {error}"))?.version;
         if found != VERSION {
             return Err(format!("has version {found} of the format, this program reads {VERSION}; build it again"));
         }

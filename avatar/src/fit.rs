@@ -281,7 +281,8 @@ impl Fit {
         let Some(Targets { drawn, .. }) = self.targets.get(&view.size()) else {
             return Err(AvatarError::Images("an image has no target".to_owned()));
         };
-        let settings = RasterSettings { outputs: Outputs { canonical: false, ..Outputs::ALL }, ..RasterSettings::default() };
+        let settings =
+            RasterSettings { outputs: Outputs { canonical: false, ..Outputs::ALL }, ..RasterSettings::default() };
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         self.rasterizer.encode(&self.gpu, &mut encoder, &self.gaussians, &view.camera, &settings, drawn)?;
         self.gpu.queue.submit([encoder.finish()]);

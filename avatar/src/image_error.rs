@@ -98,8 +98,11 @@ impl ImageError {
                 let ours: Vec<f32> = shown.iter().map(|pixel| pixel.color[k]).collect();
                 let theirs: Vec<f32> =
                     wanted.chunks_exact(4).zip(&mask).map(|(pixel, mask)| unit(pixel[k]) * mask).collect();
-                let (similarity, slope) =
-                    if weights.structure > 0.0 { ssim(&ours, &theirs, width) } else { (count as f64, vec![0.0; count]) };
+                let (similarity, slope) = if weights.structure > 0.0 {
+                    ssim(&ours, &theirs, width)
+                } else {
+                    (count as f64, vec![0.0; count])
+                };
                 (ours, theirs, similarity, slope)
             })
             .collect();
@@ -147,7 +150,11 @@ mod tests {
         let mut drawn: Vec<[f32; 4]> = (0..width * 10)
             .map(|_| {
                 let alpha = random.random_range(0.1f32..0.99);
-                [0; 3].map(|_| alpha * random.random_range(0.05f32..0.95)).into_iter().chain([alpha]).collect::<Vec<_>>()
+                [0; 3]
+                    .map(|_| alpha * random.random_range(0.05f32..0.95))
+                    .into_iter()
+                    .chain([alpha])
+                    .collect::<Vec<_>>()
             })
             .map(|row| [row[0], row[1], row[2], row[3]])
             .collect();
@@ -185,7 +192,9 @@ mod tests {
         drawn[3] = [f32::NAN, 0.0, 0.0, 1.0];
         drawn[5] = [f32::INFINITY; 4];
         let error = ImageError::of(&drawn, &wanted, 20, &ErrorWeights::default());
-        assert!(error.loss.is_finite() && error.slope[3] == [0.0; 4] && error.slope.iter().flatten().all(|v| v.is_finite()));
+        assert!(
+            error.loss.is_finite() && error.slope[3] == [0.0; 4] && error.slope.iter().flatten().all(|v| v.is_finite())
+        );
         assert!(ImageError::of(&[], &[], 20, &ErrorWeights::default()).slope.is_empty());
         // Nobody in the image: what is drawn is too much.
         let error = ImageError::of(&[[0.5, 0.5, 0.5, 0.9]], &[0; 4], 1, &ErrorWeights::default());

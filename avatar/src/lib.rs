@@ -12,11 +12,13 @@ mod fit;
 mod image_error;
 mod parameters;
 mod posing;
+mod scene;
 mod ssim;
 
 pub use avatar::{Avatar, Card, Hanging};
 pub use error::AvatarError;
 pub use fit::{Fit, FitSettings, StepReport, TrainingFrame, TrainingView};
 pub use image_error::{ErrorWeights, ImageError};
-pub use parameters::Parameters;
+pub use parameters::{CONSTANT_HARMONIC, Parameters};
 pub use posing::{Bones, PosedAvatar};
+pub use scene::AvatarScene;

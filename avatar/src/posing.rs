@@ -3,7 +3,7 @@
 //! A Gaussian's place is blended linearly from the bones that move it (FlyHuman Eq. 1 and 2), its rotation by the normalised blend of their
 //! quaternions.
 
-use flyrig_body::{SkinWeights, Skeleton, displacement};
+use flyrig_body::{Skeleton, SkinWeights, displacement};
 use flyrig_types::Pose;
 use glam::{DMat4, DVec3, Mat3, Mat4, Quat, Vec3, Vec4};
 use rayon::prelude::*;
@@ -118,7 +118,7 @@ impl PosedAvatar {
     pub(crate) fn to_parameters(&self, derivatives: [&mut [Element]; 3]) {
         let [centers, scales, rotations] = derivatives;
         let rows = centers.par_iter_mut().zip(scales).zip(rotations).with_min_len(1024);
-        rows.zip(&self.places).zip(&self.scale_opacity).for_each(|(((( center, scale), rotation), place), posed)| {
+        rows.zip(&self.places).zip(&self.scale_opacity).for_each(|((((center, scale), rotation), place), posed)| {
             *center = (place.linear.transpose() * Vec4::from(*center).truncate()).extend(0.0).to_array();
             for k in 0..3 {
                 let canonical = posed[k] / place.growth;

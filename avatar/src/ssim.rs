@@ -59,11 +59,8 @@ pub(crate) fn ssim(drawn: &[f32], wanted: &[f32], width: usize) -> (f64, Vec<f32
     let blur = Blur { window: window(), width };
     let product = |a: &[f32], b: &[f32]| -> Vec<f32> { a.iter().zip(b).map(|(a, b)| a * b).collect() };
     let (mean_x, mean_y) = (blur.apply(drawn), blur.apply(wanted));
-    let (xx, yy, xy) = (
-        blur.apply(&product(drawn, drawn)),
-        blur.apply(&product(wanted, wanted)),
-        blur.apply(&product(drawn, wanted)),
-    );
+    let (xx, yy, xy) =
+        (blur.apply(&product(drawn, drawn)), blur.apply(&product(wanted, wanted)), blur.apply(&product(drawn, wanted)));
     let (mut by_mean, mut by_square, mut by_product) = (vec![0.0; count], vec![0.0; count], vec![0.0; count]);
     let mut sum = 0.0;
     for i in 0..count {

@@ -13,6 +13,8 @@ use flyrig_transport::TransportConfig;
 use flyrig_types::CameraId;
 use flyrig_web::WebConfig;
 
+use crate::avatar::arguments::AvatarAction;
+
 /// Live free-viewpoint video of a person from a few cameras.
 ///
 /// Start with `flyrig demo`: it runs a simulated rig, publishes the result, watches it from a second process and
@@ -102,6 +104,11 @@ pub enum Command {
     Watch(WatchArgs),
     /// Replay a data set, render its held-out cameras and score them.
     Eval(EvalArgs),
+    /// Build a person's avatar, score it, drive it by recorded motion, export it.
+    Avatar {
+        #[command(subcommand)]
+        action: AvatarAction,
+    },
     /// Use the simulated rig by itself.
     Sim {
         #[command(subcommand)]
@@ -128,7 +135,7 @@ pub struct RecordArgs {
     pub seconds: Option<f64>,
 }
 
-#[derive(Debug, Default, Args)]
+#[derive(Debug, Clone, Default, Args)]
 pub struct LagArgs {
     /// Time offset of a camera's timestamps against the other cameras', milliseconds, as CAM=MS; may be repeated. `flyrig
     /// sync-check` estimates it.

@@ -2,6 +2,7 @@
 //!
 //! A library only so that the end-to-end tests can build the same program; its documentation is `--help`.
 
+mod avatar;
 mod calibrate;
 mod cameras;
 mod capture;
@@ -90,6 +91,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         },
         Command::Keys { action } => keys::keys(action),
         Command::Play(args) => stream_recording::play(args),
+        Command::Avatar { action } => avatar::avatar(action, &|| open_gpu(cli.adapter.as_deref())),
         Command::Eval(args) => eval::eval(args, &open_gpu(cli.adapter.as_deref())?),
         Command::Sim { action: SimAction::Export(args) } => {
             let config = args.config.as_deref().map(Config::load).transpose()?.unwrap_or_default();

@@ -60,7 +60,7 @@ pub use settings::{
 };
 pub use stage_times::{StageSummary, StageTimes, processor_time, resident_mib};
 pub use stage_trace::{TracedStage, start_stage_trace, take_stage_trace};
-pub use subject::{Observed, PROCESSOR_STAGE, Subject};
+pub use subject::{Observed, PROCESSOR_STAGE, Subject, person_surface};
 pub use track_state::{Remedy, TrackState, TrackWatch};
 pub use viewpoints::orbit;
 

@@ -3,8 +3,8 @@
 use std::{sync::Arc, time::Instant};
 
 use flyrig_body::{
-    DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, Outfit, SurfaceGaussians, Template, build_graph, sample_surface,
-    skin_mesh,
+    BodyError, DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, Outfit, SurfaceGaussians, Template, build_graph,
+    sample_surface, skin_mesh,
 };
 use flyrig_capture::to_rgb8;
 use flyrig_gpu::{GpuContext, StageTimer, StorageBuffer};
@@ -18,7 +18,7 @@ use flyrig_tracker::{DeformReport, EdgeColor};
 use flyrig_types::{Camera, Image, Mask, PersonId, Pose, Rig};
 
 use crate::{
-    Effort, FusionError, NetworksOn, PersonMemory, SessionSettings, StageTimes, TrackWatch,
+    BodySettings, Effort, FusionError, NetworksOn, PersonMemory, SessionSettings, StageTimes, TrackWatch,
     deformation::{DeformTimes, Deformation, Instants, TrackedView},
     memory::NetworkMemory,
     person_stream::encode_template,
@@ -132,6 +132,20 @@ pub struct Subject {
     pub(crate) viewed: Vec<usize>,
 }
 
+/// Samples a template's Gaussians as a [`Subject`] does, and the graph that deforms them. Where it is deformed, they are drawn
+/// [inset](SurfaceGaussians::inset).
+///
+/// # Errors
+/// [`BodyError`] for a template that is not valid.
+pub fn person_surface(
+    template: &Template,
+    body: &BodySettings,
+) -> Result<(SurfaceGaussians, DeformationGraph), BodyError> {
+    let surface = sample_surface(template, body.gaussians, SURFACE_SEED)?;
+    let graph = build_graph(template, &surface, body.nodes, DEFAULT_SIGMA2_M2)?;
+    Ok((surface, graph))
+}
+
 impl Subject {
     /// Samples the template's surface and prepares the GPU for the input cameras of `rig`. Takes a few seconds.
     pub(crate) fn new(
@@ -143,8 +157,7 @@ impl Subject {
     ) -> Result<Self, FusionError> {
         let body = &settings.body;
         let template = outfit.on(&shape)?;
-        let surface = sample_surface(&template, body.gaussians, SURFACE_SEED)?;
-        let graph = build_graph(&template, &surface, body.nodes, DEFAULT_SIGMA2_M2)?;
+        let (surface, graph) = person_surface(&template, body)?;
         let mut subject = Self::from_parts(gpu, id, template, &surface, &graph, rig, settings)?;
         subject.undressed = (!outfit.is_bare()).then_some((shape, outfit));
         if let Some(networks) = settings.appearance.load_networks()? {
@@ -256,7 +269,8 @@ impl Subject {
     }
 
     /// Canonical translations of the deformation graph's nodes, metres; empty without a deformation.
-    pub(crate) fn node_translations(&self) -> &[glam::DVec3] {
+    #[must_use]
+    pub fn node_translations(&self) -> &[glam::DVec3] {
         self.deformation.as_ref().map_or(&[], Deformation::translations)
     }
 

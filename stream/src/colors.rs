@@ -38,13 +38,13 @@ pub struct ColorSettings {
     pub step: f32,
     /// Within this time every segment is refreshed, seconds.
     pub refresh_secs: f32,
-    /// Most bytes of a frame in all layers.
+    /// Most bytes of a frame in all layers: what a person who is new, or an encoder that begins anew, sends at most.
     pub max_frame_bytes: usize,
 }
 
 impl Default for ColorSettings {
     fn default() -> Self {
-        Self { step: 8.0, refresh_secs: 1.0, max_frame_bytes: 60_000 }
+        Self { step: 8.0, refresh_secs: 1.0, max_frame_bytes: 32_000 }
     }
 }
 

@@ -149,6 +149,9 @@ impl ColorSubscription {
     pub fn follow(&self) {
         let wanted = self.inbox.color_layers();
         let mut layers = lock(&self.layers);
+        if layers.len() != wanted {
+            tracing::debug!(before = layers.len(), wanted, "layers of colours");
+        }
         while layers.len() > wanted {
             if let Some(Err(error)) = layers.pop().map(|layer| layer.undeclare().wait()) {
                 tracing::warn!(%error, "colours cannot be given back");

@@ -1,0 +1,66 @@
+//! `flyrig avatar`: personal avatars.
+
+pub mod arguments;
+mod build;
+mod eval;
+mod render;
+
+use std::path::Path;
+
+use anyhow::Result;
+use flyrig_avatar::Avatar;
+use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, SessionSettings};
+use flyrig_gpu::GpuContext;
+use flyrig_report::{Replay, ReplaySettings};
+
+use arguments::{AvatarAction, TakeArgs};
+
+/// Runs the command.
+pub fn avatar(action: &AvatarAction, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
+    match action {
+        // Kernels of the processor where there is no GPU: a software adapter is slower.
+        AvatarAction::Build(args) => build::build(args, &gpu()?.fastest()),
+        AvatarAction::Eval(args) => eval::eval(args, &gpu()?.fastest()),
+        AvatarAction::Render(args) => render::render(args, &gpu()?.fastest()),
+        AvatarAction::Export(args) => render::export(args),
+        AvatarAction::Info { avatar } => {
+            let avatar = load(avatar)?;
+            let (nodes, joints) =
+                (avatar.hanging.as_ref().map_or(0, |graph| graph.nodes.len()), avatar.template.skeleton.joints().len());
+            println!("{}", serde_json::to_string_pretty(&avatar.card)?);
+            println!(
+                "{} Gaussians, harmonics of order {:?}, {nodes} nodes, {joints} joints, {} vertices",
+                avatar.gaussians(),
+                avatar.parameters.order(),
+                avatar.template.positions.len()
+            );
+            Ok(())
+        }
+    }
+}
+
+fn load(path: &Path) -> Result<Avatar> {
+    Ok(Avatar::load(path)?)
+}
+
+/// Opens a take to be tracked.
+fn open_replay(take: &TakeArgs, holdout: &[String], body: &BodySettings, gpu: &GpuContext) -> Result<Replay> {
+    let settings = ReplaySettings {
+        dataset: take.dataset.clone(),
+        inputs: take.inputs.clone(),
+        holdout: holdout.to_vec(),
+        session: SessionSettings {
+            perception: take.perception.clone(),
+            body: body.clone(),
+            tracking: take.tracking.clone(),
+            appearance: AppearanceOptions::default(),
+            budget: BudgetSettings::default(),
+        },
+        fps: take.fps,
+        frames: take.frames.clone(),
+        lags_nanos: take.lags.nanos(),
+        true_masks: false,
+        true_joints: Vec::new(),
+    };
+    Replay::open(&settings, gpu)
+}

@@ -1,0 +1,140 @@
+//! Arguments of `flyrig avatar`.
+
+use std::{ops::Range, path::PathBuf};
+
+use clap::{Args, Subcommand, ValueEnum};
+use flyrig_body::DEFAULT_NODE_COUNT;
+use flyrig_fusion::{PerceptionSettings, TrackingSettings};
+use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_size};
+
+use crate::cli::LagArgs;
+
+/// About 7 mm apart on an adult.
+const GAUSSIANS: u32 = 41_000;
+
+#[derive(Debug, Subcommand)]
+pub enum AvatarAction {
+    /// Build a person's avatar from the images of a take: it is tracked as live, then fitted to all images together.
+    Build(BuildArgs),
+    /// Drive an avatar by the poses of a take, render the held-out cameras and score them.
+    Eval(EvalArgs),
+    /// Drive an avatar by a recorded motion and write images.
+    Render(RenderArgs),
+    /// Write an avatar in a pose as splats (PLY), for other programs.
+    Export(ExportArgs),
+    /// Print what an avatar was learnt from.
+    Info {
+        /// The avatar (*.flyavatar).
+        avatar: PathBuf,
+    },
+}
+
+/// A take and how its person is found.
+#[derive(Debug, Clone, Args)]
+pub struct TakeArgs {
+    /// Folder in EasyMocap layout: a calibration, images/CAM, optional mask/CAM and a skinned *.glb.
+    pub dataset: PathBuf,
+    /// Cameras that are looked at, comma separated.
+    #[arg(long, value_delimiter = ',', required = true)]
+    pub inputs: Vec<String>,
+    /// Frames FIRST..END, END excluded; all of them otherwise.
+    #[arg(long, value_parser = parse_range)]
+    pub frames: Option<Range<u64>>,
+    /// Frame rate of the folder.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+    #[command(flatten)]
+    pub perception: PerceptionSettings,
+    #[command(flatten)]
+    pub tracking: TrackingSettings,
+    #[command(flatten)]
+    pub lags: LagArgs,
+}
+
+/// Order of spherical harmonics.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Order {
+    #[value(name = "0")]
+    Zero,
+    #[value(name = "1")]
+    One,
+    #[value(name = "2")]
+    Two,
+}
+
+#[derive(Debug, Args)]
+pub struct BuildArgs {
+    #[command(flatten)]
+    pub take: TakeArgs,
+    /// The avatar to write (*.flyavatar).
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = GAUSSIANS, value_parser = clap::value_parser!(u32).range(1000..=1_000_000))]
+    pub gaussians: u32,
+    /// Nodes of the deformation graph.
+    #[arg(long, default_value_t = DEFAULT_NODE_COUNT)]
+    pub nodes: usize,
+    /// Order of spherical harmonics of the colours: how much they may depend on the direction.
+    #[arg(long, value_enum, default_value = "0")]
+    pub harmonics: Order,
+    /// Minutes of fitting; tracking comes before.
+    #[arg(long, default_value_t = 5.0, value_parser = parse_minutes, conflicts_with = "steps")]
+    pub minutes: f64,
+    /// Steps of fitting in place of minutes: the same steps and seed give the same bytes.
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub steps: Option<u64>,
+    /// Seed of the order of images.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+}
+
+#[derive(Debug, Args)]
+pub struct EvalArgs {
+    /// The avatar (*.flyavatar).
+    pub avatar: PathBuf,
+    #[command(flatten)]
+    pub take: TakeArgs,
+    /// Cameras to render and score, comma separated.
+    #[arg(long, value_delimiter = ',', required = true)]
+    pub holdout: Vec<String>,
+    /// Folder for images and scores.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Move its clothes as the images show it, in place of the pose alone.
+    #[arg(long)]
+    pub deformed: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct RenderArgs {
+    /// The avatar (*.flyavatar).
+    pub avatar: PathBuf,
+    /// Recorded motion: BVH or animated glTF.
+    #[arg(long)]
+    pub motion: PathBuf,
+    /// Folder for images.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Frames of the motion FIRST..END, END excluded, at 30 a second.
+    #[arg(long, default_value = "0..30", value_parser = parse_range)]
+    pub frames: Range<u64>,
+    /// Size of the images, pixels.
+    #[arg(long, default_value = "512x768", value_parser = parse_size)]
+    pub size: (u32, u32),
+}
+
+#[derive(Debug, Args)]
+pub struct ExportArgs {
+    /// The avatar (*.flyavatar).
+    pub avatar: PathBuf,
+    /// The file to write (*.ply).
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Motion that it is posed by (BVH or glTF); at rest otherwise.
+    #[arg(long)]
+    pub motion: Option<PathBuf>,
+    /// Frame of the motion, at 30 a second.
+    #[arg(long, default_value_t = 0)]
+    pub frame: u64,
+}

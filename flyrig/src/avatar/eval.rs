@@ -1,0 +1,113 @@
+//! `flyrig avatar eval`: an avatar against held-out cameras.
+
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, ensure};
+use flyrig_avatar::{Avatar, AvatarScene, Bones};
+use flyrig_fusion::{BodySettings, Outcome, PersonId, Solver};
+use flyrig_gpu::GpuContext;
+use flyrig_metrics::{CameraScore, FrameScore, ScoreSheet, error_parts, score_view};
+use flyrig_report::{frame_number, png, progress_bar, write_whole};
+use serde::Serialize;
+
+use super::{arguments::EvalArgs, load, open_replay};
+
+#[derive(Debug, Serialize)]
+struct Metrics<'a> {
+    avatar: String,
+    inputs: &'a [String],
+    holdout: &'a [String],
+    deformed: bool,
+    gaussians: usize,
+    adapter: String,
+    mean: Option<CameraScore>,
+    cameras: Vec<CameraScore>,
+    per_frame: &'a [FrameScore],
+    /// Mean time of posing and drawing a view, reading back included, milliseconds.
+    view_ms: f64,
+}
+
+/// Runs the command.
+pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
+    let avatar = load(&args.avatar)?;
+    let nodes = avatar.hanging.as_ref().map_or(1, |hanging| hanging.nodes.len());
+    let body = BodySettings { gaussians: avatar.gaussians(), nodes, ..BodySettings::default() };
+    let mut take = args.take.clone();
+    if !args.deformed {
+        take.tracking.solver = Solver::None;
+    }
+    let mut replay = open_replay(&take, &args.holdout, &body, gpu)?;
+    let holdout = replay.holdout.clone();
+    for camera in &holdout {
+        let folder = args.out.join(camera.id.as_str());
+        std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
+    }
+    let mut scene = AvatarScene::new(gpu, &avatar)?;
+    let bar = progress_bar(replay.count as u64, "avatar eval");
+    let (mut sheet, mut spent, mut drawn) = (ScoreSheet::default(), Duration::ZERO, 0u32);
+    while let Some(set) = replay.next_set()? {
+        bar.inc(1);
+        let number = frame_number(&set);
+        if let Outcome::Held(reason) = replay.session.process(&set)? {
+            tracing::warn!(frame = number, %reason, "frame not used");
+        }
+        let subject = replay.session.subject(PersonId::default());
+        let Some((subject, pose)) = subject.and_then(|subject| Some((subject, subject.pose()?))) else { continue };
+        fits(&avatar, &subject.template().skeleton, pose)?;
+        let start = Instant::now();
+        let translations = args.deformed.then(|| subject.node_translations()).filter(|all| !all.is_empty());
+        scene.pose(&avatar, &Bones::new(&avatar.template.skeleton, pose), translations);
+        let views = holdout.iter().map(|camera| scene.draw(camera)).collect::<Result<Vec<_>, _>>()?;
+        spent += start.elapsed();
+        drawn += views.len() as u32;
+        let truths = replay.truth.at(set.master_nanos)?;
+        for ((camera, view), truth) in holdout.iter().zip(&views).zip(&truths) {
+            png::write_view(&args.out.join(camera.id.as_str()).join(format!("{number:06}.png")), view)?;
+            let Some(truth) = truth else { continue };
+            let mut score = score_view(&camera.id, number, view, &truth.image, truth.mask.as_ref())?;
+            if let (Some(score), Some(mask)) = (&mut score, &truth.mask) {
+                score.parts = error_parts(view, &truth.image, mask)?;
+            }
+            sheet.extend(score);
+        }
+        bar.set_message(sheet.progress());
+    }
+    bar.finish_and_clear();
+    ensure!(drawn > 0, "nobody was found in {}; run with -v to see why", args.take.dataset.display());
+    let view_ms = 1e3 * spent.as_secs_f64() / f64::from(drawn);
+    let metrics = Metrics {
+        avatar: args.avatar.display().to_string(),
+        inputs: &args.take.inputs,
+        holdout: &args.holdout,
+        deformed: args.deformed,
+        gaussians: avatar.gaussians(),
+        adapter: gpu.adapter_name(),
+        mean: sheet.mean(),
+        cameras: sheet.per_camera(),
+        per_frame: sheet.frames(),
+        view_ms,
+    };
+    write_whole(&args.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
+    print!("{}", sheet.table());
+    println!(
+        "\n{drawn} views of {} Gaussians, {view_ms:.1} ms each; images in {}",
+        avatar.gaussians(),
+        args.out.display()
+    );
+    Ok(())
+}
+
+/// Checks that a pose is one of the avatar's skeleton.
+fn fits(avatar: &Avatar, skeleton: &flyrig_body::Skeleton, pose: &flyrig_types::Pose) -> Result<()> {
+    let names = |skeleton: &flyrig_body::Skeleton| -> Vec<String> {
+        skeleton.joints().iter().map(|joint| joint.name.clone()).collect()
+    };
+    let (own, found) = (names(&avatar.template.skeleton), names(skeleton));
+    ensure!(
+        own == found,
+        "the avatar has {} joints, the take's person {}, or others; use the take it was built from, or one with the same body",
+        own.len(),
+        found.len()
+    );
+    Ok(avatar.template.skeleton.check_pose(pose)?)
+}

@@ -1,0 +1,109 @@
+//! `flyrig avatar render` and `export`: an avatar driven by a recorded motion.
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result, bail};
+use flyrig_avatar::{Avatar, AvatarScene, Bones, CONSTANT_HARMONIC, PosedAvatar};
+use flyrig_body::{RetargetOptions, load_bvh, load_gltf};
+use flyrig_gpu::GpuContext;
+use flyrig_renderer::{Splat, write_splat_ply};
+use flyrig_report::{png, progress_bar, stop};
+use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose, PoseTrack};
+use glam::{DQuat, DVec2, DVec3};
+
+use super::{
+    arguments::{ExportArgs, RenderArgs},
+    load,
+};
+
+/// Frames a second of the images.
+const FPS: f64 = 30.0;
+/// Where the camera stands from the person, metres, and how high.
+const AWAY_M: f64 = 3.6;
+const HEIGHT_M: f64 = 1.1;
+
+/// Runs `render`.
+pub fn render(args: &RenderArgs, gpu: &GpuContext) -> Result<()> {
+    let avatar = load(&args.avatar)?;
+    let track = motion(&avatar, &args.motion)?;
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    let mut scene = AvatarScene::new(gpu, &avatar)?;
+    let bar = progress_bar(args.frames.end - args.frames.start, "avatar render");
+    for frame in args.frames.clone() {
+        if stop::requested() {
+            break;
+        }
+        let pose = pose_at(&track, frame);
+        scene.pose(&avatar, &Bones::new(&avatar.template.skeleton, &pose), None);
+        let view = scene.draw(&camera(args.size, pose.root_translation))?;
+        png::write_view(&args.out.join(format!("{frame:06}.png")), &view)?;
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    println!("images in {}", args.out.display());
+    Ok(())
+}
+
+/// Runs `export`.
+pub fn export(args: &ExportArgs) -> Result<()> {
+    let avatar = load(&args.avatar)?;
+    let pose = match &args.motion {
+        Some(path) => pose_at(&motion(&avatar, path)?, args.frame),
+        None => avatar.template.skeleton.rest_pose(),
+    };
+    let mut posed = PosedAvatar::default();
+    avatar.pose(&Bones::new(&avatar.template.skeleton, &pose), None, &mut posed);
+    let coefficients = avatar.parameters.order().coefficients();
+    let rows = posed.center.iter().zip(&posed.scale_opacity).zip(&posed.rotation);
+    let splats: Vec<Splat> = rows
+        .zip(avatar.parameters.harmonics.chunks(coefficients))
+        .map(|(((center, scales), [x, y, z, w]), harmonics)| Splat {
+            position: [center[0], center[1], center[2]],
+            normal: [0.0; 3],
+            color: harmonics.first().map_or([0.0; 3], |row| [row[0], row[1], row[2]].map(|v| v * CONSTANT_HARMONIC)),
+            opacity: scales[3],
+            scale_m: [scales[0], scales[1], scales[2]],
+            rotation_wxyz: [*w, *x, *y, *z],
+        })
+        .collect();
+    let count = write_splat_ply(&args.out, &splats)?;
+    println!("{count} splats in {}", args.out.display());
+    Ok(())
+}
+
+/// Brings a recorded motion onto the avatar's skeleton.
+fn motion(avatar: &Avatar, path: &Path) -> Result<PoseTrack> {
+    let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase()).unwrap_or_default();
+    let clip = match ending.as_str() {
+        "bvh" => load_bvh(path)?.motion(),
+        "glb" | "gltf" => load_gltf(path)?.motion()?,
+        _ => bail!("{} is neither BVH nor glTF (*.bvh, *.glb, *.gltf)", path.display()),
+    };
+    let options = RetargetOptions { reach_m: Some(0.5), ..RetargetOptions::default() };
+    Ok(clip.retarget(&avatar.template.skeleton, &options)?)
+}
+
+fn pose_at(track: &PoseTrack, frame: u64) -> Pose {
+    track.at((frame as f64 / FPS * 1e9) as i64)
+}
+
+/// A camera before the person, at its height.
+fn camera((width, height): (u32, u32), root: DVec3) -> Camera {
+    let focal = 1.4 * f64::from(height);
+    let place = DVec3::new(root.x, root.y - AWAY_M, HEIGHT_M);
+    // The world's z is up; a camera looks along its own z, with y down.
+    let camera_from_world = DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
+    Camera {
+        id: "view".into(),
+        intrinsics: Intrinsics {
+            width,
+            height,
+            focal_px: DVec2::splat(focal),
+            center_px: DVec2::new(f64::from(width), f64::from(height)) * 0.5,
+            lens: Lens::PINHOLE,
+        },
+        camera_from_world: Isometry { rotation: camera_from_world, translation: -(camera_from_world * place) },
+        time_offset_nanos: 0,
+        color: Default::default(),
+    }
+}
