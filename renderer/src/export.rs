@@ -77,36 +77,57 @@ pub fn read_splats(gpu: &GpuContext, gaussians: &GaussianBuffers) -> Result<Vec<
 /// # Errors
 /// [`ExportError::Io`] names the file; the old one, if any, is then untouched.
 pub fn write_splat_ply(path: &Path, splats: &[Splat]) -> Result<usize, ExportError> {
-    /// Y_0^0.
-    const SH_DEGREE_0: f32 = 0.282_094_8;
-    /// Opacity 1 has an infinite logit.
-    const OPACITY_MARGIN: f32 = 1e-4;
-    const SMALLEST_SCALE_M: f32 = 1e-9;
+    let row = |splat: &Splat| {
+        splat
+            .position
+            .into_iter()
+            .chain(splat.normal)
+            .chain(splat.color.map(|c| (srgb_from_linear(c) - 0.5) / SH_DEGREE_0))
+            .chain([opacity_logit(splat.opacity)])
+            .chain(splat.scale_m.map(log_scale))
+            .chain(splat.rotation_wxyz)
+    };
     let count = splats.iter().filter(|splat| splat.is_finite()).count();
+    let rows = splats.iter().filter(|splat| splat.is_finite()).map(row);
+    write_ply(path, PLY_PROPERTIES.iter().copied(), count, rows)?;
+    Ok(count)
+}
+
+/// Y_0^0.
+pub(crate) const SH_DEGREE_0: f32 = 0.282_094_8;
+
+/// Opacity in a PLY file; 1 would have an infinite logit.
+pub(crate) fn opacity_logit(opacity: f32) -> f32 {
+    const MARGIN: f32 = 1e-4;
+    let opacity = opacity.clamp(MARGIN, 1.0 - MARGIN);
+    (opacity / (1.0 - opacity)).ln()
+}
+
+/// Standard deviation in a PLY file.
+pub(crate) fn log_scale(scale_m: f32) -> f32 {
+    const SMALLEST_M: f32 = 1e-9;
+    scale_m.max(SMALLEST_M).ln()
+}
+
+/// Writes `count` rows of floats, one for each property.
+pub(crate) fn write_ply<'a, R: IntoIterator<Item = f32>>(
+    path: &Path,
+    properties: impl Iterator<Item = &'a str>,
+    count: usize,
+    rows: impl Iterator<Item = R>,
+) -> Result<(), ExportError> {
     write_whole(path, |out| {
         write!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n")?;
-        for property in PLY_PROPERTIES {
+        for property in properties {
             writeln!(out, "property float {property}")?;
         }
         writeln!(out, "end_header")?;
-        for splat in splats.iter().filter(|splat| splat.is_finite()) {
-            let opacity = splat.opacity.clamp(OPACITY_MARGIN, 1.0 - OPACITY_MARGIN);
-            let row = splat
-                .position
-                .into_iter()
-                .chain(splat.normal)
-                .chain(splat.color.map(|c| (srgb_from_linear(c) - 0.5) / SH_DEGREE_0))
-                .chain([(opacity / (1.0 - opacity)).ln()])
-                .chain(splat.scale_m.map(|s| s.max(SMALLEST_SCALE_M).ln()))
-                .chain(splat.rotation_wxyz);
-            for value in row {
-                out.write_all(&value.to_le_bytes())?;
-            }
+        for value in rows.flatten() {
+            out.write_all(&value.to_le_bytes())?;
         }
         Ok(())
     })
-    .map_err(|source| ExportError::Io { path: path.to_owned(), source })?;
-    Ok(count)
+    .map_err(|source| ExportError::Io { path: path.to_owned(), source })
 }
 
 #[cfg(test)]

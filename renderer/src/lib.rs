@@ -1,6 +1,8 @@
-//! Splats to images and back: forward and backward rasteriser, direct appearance, splat export.
+//! Splats to images and back: forward and backward rasteriser, direct appearance, splat files.
 
 mod anisotropic;
+mod anisotropic_ply;
+mod anisotropic_splats;
 mod appearance;
 mod buffers;
 mod color;
@@ -26,6 +28,8 @@ mod splat_rows;
 mod view_bytes;
 
 pub use anisotropic::{AnisotropicBuffers, AnisotropicGradients, Gaussians, HarmonicOrder};
+pub use anisotropic_ply::{PlyError, parse_anisotropic_ply, write_anisotropic_ply};
+pub use anisotropic_splats::AnisotropicSplats;
 pub use appearance::{
     AppearanceError, AppearanceSettings, DiffusionHierarchy, DiffusionLevel, DirectAppearance, ObservationBuffers,
     Observations, ViewInput,

@@ -5,6 +5,8 @@
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 
+use crate::HarmonicOrder;
+
 /// Element of every attribute's buffer.
 pub type GaussianElement = [f32; 4];
 /// The same in WGSL.
@@ -87,6 +89,15 @@ pub const PLY_PROPERTIES: [&str; 17] = [
     "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0",
     "rot_1", "rot_2", "rot_3",
 ];
+
+/// Properties of an anisotropic Gaussian in a PLY file: [`PLY_PROPERTIES`] with the further harmonics after the constant ones, all
+/// coefficients of red, then of green, then of blue.
+pub(crate) fn anisotropic_ply_properties(order: HarmonicOrder) -> Vec<String> {
+    const CONSTANT: usize = 9;
+    let rest = (0..3 * (order.coefficients() - 1)).map(|k| format!("f_rest_{k}"));
+    let [before, after] = [&PLY_PROPERTIES[..CONSTANT], &PLY_PROPERTIES[CONSTANT..]];
+    before.iter().map(ToString::to_string).chain(rest).chain(after.iter().map(ToString::to_string)).collect()
+}
 
 impl GaussianAttribute {
     /// Creates the attribute's buffer for `count` Gaussians, all zero.

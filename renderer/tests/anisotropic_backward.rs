@@ -4,12 +4,14 @@
 mod support;
 
 use flyrig_gpu::{GpuContext, testing::on_both};
-use flyrig_renderer::{HarmonicOrder, RasterSettings};
+use flyrig_renderer::{
+    AnisotropicGradients, BackwardRasterizer, HarmonicOrder, ImageGradients, RasterSettings, Rasterizer, RenderTarget,
+};
 use flyrig_types::{Camera, Lens};
 use glam::DVec3;
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use support::anisotropic::{ATTRIBUTES, Ellipsoid, Ellipsoids, backward, errors, poison, random_ellipsoids};
+use support::anisotropic::{ATTRIBUTES, Ellipsoid, Ellipsoids, backward, errors, poison, random_ellipsoids, upload};
 use support::anisotropic_run::{Kernels, random_incoming, random_round, summary};
 use support::random_scene::{LENSES, random_camera, straight};
 use support::reference_backward::{Incoming, linear_loss_of, touched_by};
@@ -105,6 +107,9 @@ fn random_scenes_agree_with_the_reference() {
     });
 }
 
+/// Changes Gaussian number so and so.
+type Change<'a> = &'a dyn Fn(usize, &mut Ellipsoids);
+
 fn check(gpu: &GpuContext, name: &str, scene: &Ellipsoids, camera: &Camera, poisoned_pixels: bool) {
     let mut rng = StdRng::seed_from_u64(4);
     let mut scene = scene.clone();
@@ -141,12 +146,12 @@ fn hard_cases_agree_with_the_reference_and_stay_finite() {
         let mut poisoned = scene.clone();
         poison(&mut rng, &mut poisoned);
         check(gpu, "poisoned Gaussians", &poisoned, &camera, false);
-        let changed = |change: &dyn Fn(usize, &mut Ellipsoids)| {
+        let changed = |change: Change<'_>| {
             let mut other = scene.clone();
             (0..other.count()).for_each(|i| change(i, &mut other));
             other
         };
-        let cases: [(&str, &dyn Fn(usize, &mut Ellipsoids)); 12] = [
+        let cases: [(&str, Change<'_>); 12] = [
             ("zero scales", &|i, s| s.scale_opacity[i][i % 3] = 0.0),
             ("zero quaternions", &|i, s| s.rotation[i] = [0.0; 4]),
             ("very short quaternions", &|i, s| s.rotation[i] = s.rotation[i].map(|v| v * 1e-9)),
@@ -167,6 +172,61 @@ fn hard_cases_agree_with_the_reference_and_stay_finite() {
         for (name, change) in cases {
             check(gpu, name, &changed(change), &camera, false);
         }
+    });
+}
+
+#[test]
+fn from_millimetres_to_kilometres_slopes_agree_with_the_reference() {
+    on_both(|gpu| {
+        let mut kernels = Kernels::new(gpu).unwrap();
+        for unit in [1e-6, 1e-3, 1.0, 1e3, 1e6] {
+            let mut rng = StdRng::seed_from_u64(8);
+            let mut worst = [0.0f64; 5];
+            for lens in LENSES {
+                let mut camera = random_camera(&mut rng, lens, 31, 23);
+                let mut scene = random_ellipsoids(&mut rng, 60, HarmonicOrder::Two);
+                scene.center.as_flattened_mut().iter_mut().for_each(|v| *v *= unit as f32);
+                scene.scale_opacity.iter_mut().for_each(|s| s[..3].iter_mut().for_each(|v| *v *= unit as f32));
+                camera.camera_from_world.translation *= unit;
+                let settings = RasterSettings { near_m: SETTINGS.near_m * unit as f32, ..SETTINGS };
+                scene.clear_of_clamp(&camera);
+                let touched = touched_by(scene.splats(&camera, &settings), (31, 23));
+                let mut incoming = random_incoming(&mut rng, 31 * 23);
+                // The loss's slope by depth belongs to the unit as well.
+                incoming.depth_carry.iter_mut().for_each(|d| d[0] /= unit as f32);
+                incoming.only_clear(&touched.unclear);
+                let expected = backward(&scene, &camera, &settings, 31, &touched, &incoming);
+                let ours = kernels.run(&scene, &[(&camera, &incoming)], &settings).unwrap();
+                assert!(touched.splats.len() > 10, "something is seen");
+                worst.iter_mut().zip(errors(&ours, &expected)).for_each(|(worst, error)| *worst = worst.max(error));
+            }
+            println!("unit {unit:.0e} m: {}", worst.map(|e| format!("{e:.1e}")).join(" "));
+            assert!(worst.iter().all(|error| *error < 1e-3), "{unit}: {worst:?}");
+        }
+    });
+}
+
+#[test]
+fn after_the_first_image_no_gpu_object_is_made() {
+    on_both(|gpu| {
+        let mut rng = StdRng::seed_from_u64(9);
+        let scene = upload(gpu, &random_ellipsoids(&mut rng, 300, HarmonicOrder::Two)).unwrap();
+        let camera = random_camera(&mut rng, LENSES[1], 64, 48);
+        let (mut forward, mut back) = (Rasterizer::new(gpu, 1).unwrap(), BackwardRasterizer::new(gpu).unwrap());
+        let target = RenderTarget::new(gpu, 64, 48).unwrap();
+        let gradients = ImageGradients::zeroed(gpu, 64, 48).unwrap();
+        gradients.color.write(gpu, &random_incoming(&mut rng, 64 * 48).color);
+        let out = AnisotropicGradients::zeroed(gpu, 300, HarmonicOrder::Two).unwrap();
+        let mut image = || {
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            forward.encode(gpu, &mut encoder, &scene, &camera, &SETTINGS, &target).unwrap();
+            back.encode_anisotropic(gpu, &mut encoder, &forward, &scene, &target, &gradients, &out).unwrap();
+            gpu.queue.submit([encoder.finish()]);
+            gpu.wait().unwrap();
+            gpu.objects()
+        };
+        let first = image();
+        assert_eq!([image(), image()], [first; 2]);
     });
 }
 

@@ -7,6 +7,7 @@ use flyrig_body::{load_gltf, parse_bvh};
 use flyrig_calib::load_easymocap;
 use flyrig_capture::{CameraSource as _, FolderOptions, FolderReplay, McapReplay, recorded_notes, to_rgb8};
 use flyrig_page::{MessageKind, Page};
+use flyrig_renderer::{PlyError, parse_anisotropic_ply};
 use flyrig_transport::{
     CameraStatus, FRAME_HEADER_BYTES, FrameHeader, HEADER_BYTES, Header, RigStats, SplatState, ViewFrame,
     decode_calibration, decode_transforms,
@@ -20,7 +21,7 @@ pub struct Target {
     pub run: fn(&[u8]) -> Result<String, String>,
 }
 
-pub const TARGETS: [Target; 11] = [
+pub const TARGETS: [Target; 12] = [
     Target { name: "pixels", words: &[], run: pixels },
     Target { name: "jpeg", words: &["\u{fffd}\u{fffd}", "JFIF", "Exif", "Adobe"], run: jpeg },
     Target { name: "image", words: &["IHDR", "IDAT", "IEND", "PLTE", "tRNS"], run: picture },
@@ -30,6 +31,7 @@ pub const TARGETS: [Target; 11] = [
     Target { name: "wire", words: &["schema_version", "FLYR", "null", "{", "[", "1e999"], run: wire },
     Target { name: "network-frame", words: &["FLYR"], run: network_frame },
     Target { name: "splats", words: &[], run: splats },
+    Target { name: "ply", words: PLY_WORDS, run: ply },
     Target { name: "stream", words: &["FLT", "FLM", "FLC", "cameras", "world_up", "1e999"], run: stream },
     Target {
         name: "motion",
@@ -69,6 +71,18 @@ const CONFIG_WORDS: &[&str] = &[
     "[sim.faults]\n",
     "0x",
     "1979-05-27T07:32:00Z",
+];
+
+const PLY_WORDS: &[&str] = &[
+    "ply\n",
+    "format binary_little_endian 1.0\n",
+    "element vertex ",
+    "element face 1\n",
+    "property float ",
+    "property list uchar int ",
+    "comment ",
+    "f_rest_",
+    "end_header\n",
 ];
 
 fn told<T, E: std::fmt::Display>(result: Result<T, E>, ok: &str) -> Result<String, String> {
@@ -221,6 +235,16 @@ fn network_frame(input: &[u8]) -> Result<String, String> {
         return Err("large".into());
     }
     told(to_rgb8(&frame.image), &format!("{:?}", frame.image.format()))
+}
+
+fn ply(bytes: &[u8]) -> Result<String, String> {
+    let splats = parse_anisotropic_ply(bytes).map_err(|error| match error {
+        // Their texts repeat the input, and no two would be alike.
+        PlyError::Header(_) => "a header of something else".to_owned(),
+        PlyError::Short { .. } => "cut off".to_owned(),
+        other => other.to_string(),
+    })?;
+    Ok(format!("{} Gaussians of order {:?}", splats.count(), splats.order))
 }
 
 fn splats(input: &[u8]) -> Result<String, String> {
