@@ -1,4 +1,7 @@
 //! Adam (Kingma and Ba 2015), for lists of four numbers each.
+//!
+//! Its steps do not depend on the size of derivatives: a Gaussian that hardly shows would move as far as any other, by noise. Here the
+//! constant in the denominator is a share of the derivatives' usual size in the list, so that such a Gaussian moves little.
 
 use rayon::prelude::*;
 
@@ -7,6 +10,8 @@ use crate::parameters::Element;
 const BETA_1: f32 = 0.9;
 const BETA_2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;
+/// Of the root mean square of a column's derivatives, added in the denominator.
+const SHARE_OF_USUAL: f32 = 0.3;
 /// Elements that one thread updates at once.
 const CHUNK: usize = 4096;
 
@@ -22,11 +27,25 @@ impl Adam {
         Self { first: vec![[0.0; 4]; len], second: vec![[0.0; 4]; len] }
     }
 
+    /// Mean square of the derivatives of each column, over the rows that ever had one.
+    pub fn usual(&self) -> Element {
+        let (mut sum, mut count) = ([0.0f64; 4], [0u32; 4]);
+        for row in &self.second {
+            for k in 0..4 {
+                sum[k] += f64::from(row[k]);
+                count[k] += u32::from(row[k] > 0.0);
+            }
+        }
+        std::array::from_fn(|k| (sum[k] / f64::from(count[k].max(1))) as f32)
+    }
+
     /// Descends by one step; `step` counts from 1, `rates` are those of the four columns. A derivative that is not finite counts as zero.
     pub fn descend(&mut self, step: u64, rates: Element, values: &mut [Element], derivatives: &[Element]) {
         let step = step.min(1 << 20) as i32;
         let (correct_1, correct_2) = (1.0 - BETA_1.powi(step), 1.0 - BETA_2.powi(step));
         let rates = rates.map(|rate| rate / correct_1);
+        let usual = self.usual();
+        let floor: Element = std::array::from_fn(|k| SHARE_OF_USUAL * (usual[k] / correct_2).sqrt() + EPSILON);
         values
             .par_chunks_mut(CHUNK)
             .zip(derivatives.par_chunks(CHUNK))
@@ -37,7 +56,7 @@ impl Adam {
                         let slope = if slope[k].is_finite() { slope[k] } else { 0.0 };
                         first[k] = BETA_1 * first[k] + (1.0 - BETA_1) * slope;
                         second[k] = BETA_2 * second[k] + (1.0 - BETA_2) * slope * slope;
-                        value[k] -= rates[k] * first[k] / ((second[k] / correct_2).sqrt() + EPSILON);
+                        value[k] -= rates[k] * first[k] / ((second[k] / correct_2).sqrt() + floor[k]);
                     }
                 }
             });
@@ -52,7 +71,7 @@ mod tests {
     fn a_bowl_is_descended_and_poison_is_left_out() {
         let mut values = vec![[3.0, -2.0, 0.5, 1.0]; 10_000];
         let mut adam = Adam::new(values.len());
-        for step in 1..=2000 {
+        for step in 1..=3000 {
             let mut slopes: Vec<Element> = values.iter().map(|row| row.map(|v| 2.0 * (v - 1.0))).collect();
             slopes[7] = [f32::NAN, f32::INFINITY, 0.0, 0.0];
             adam.descend(step, [1e-2; 4], &mut values, &slopes);
@@ -62,7 +81,7 @@ mod tests {
         assert!((values[7][0] - 3.0).abs() < 1e-6);
     }
 
-    /// The formula as it is published, in f64.
+    /// The formula as it is published, but for the denominator, in f64.
     #[test]
     fn steps_are_those_of_the_formula() {
         let slopes = [0.5f64, -0.2, 0.1, 0.7, -1.5];
@@ -73,7 +92,9 @@ mod tests {
             let t = i as i32 + 1;
             m = 0.9 * m + 0.1 * slope;
             v = 0.999 * v + 0.001 * slope * slope;
-            x -= 0.01 * (m / (1.0 - 0.9f64.powi(t))) / ((v / (1.0 - 0.999f64.powi(t))).sqrt() + 1e-15);
+            let before = (v - 0.001 * slope * slope) / 0.999;
+            let floor = 0.3 * (before / (1.0 - 0.999f64.powi(t))).sqrt() + 1e-15;
+            x -= 0.01 * (m / (1.0 - 0.9f64.powi(t))) / ((v / (1.0 - 0.999f64.powi(t))).sqrt() + floor);
             adam.descend(t as u64, [0.01; 4], &mut values, &[[*slope as f32; 4]]);
         }
         assert!((f64::from(values[0][2]) - x).abs() < 1e-5, "{values:?} {x}");

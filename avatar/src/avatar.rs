@@ -10,7 +10,7 @@ use crate::{AvatarError, Parameters, parameters::CONSTANT_HARMONIC};
 /// Thickness of a Gaussian across the surface at the start, against its size along it.
 const THICKNESS: f32 = 0.5;
 /// Opacity at the start.
-const OPACITY: f32 = 0.95;
+const OPACITY: f32 = 0.99;
 
 /// What an avatar was learnt from, as it stands in its file.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]

@@ -10,6 +10,7 @@ mod error;
 mod file;
 mod fit;
 mod image_error;
+mod neighbors;
 mod parameters;
 mod posing;
 mod scene;

@@ -84,9 +84,19 @@ pub struct BuildArgs {
     /// Steps of fitting in place of minutes: the same steps and seed give the same bytes.
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub steps: Option<u64>,
+    /// How much neighbouring Gaussians pull each other; 0 for not at all.
+    #[arg(long, default_value_t = 1.0, value_parser = parse_pull)]
+    pub pull: f32,
     /// Seed of the order of images.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
+}
+
+fn parse_pull(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(pull) if (0.0..=1000.0).contains(&pull) => Ok(pull),
+        _ => Err(format!("'{text}' is not between 0 and 1000")),
+    }
 }
 
 #[derive(Debug, Args)]

@@ -56,7 +56,13 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
         png::write_view(&picture_path, &scene.draw(&camera)?)
     };
     picture(&avatar)?;
-    let mut fit = Fit::new(gpu, &avatar, frames, views, FitSettings { seed: args.seed, ..FitSettings::default() })?;
+    let mut fit = Fit::new(
+        gpu,
+        &avatar,
+        frames,
+        views,
+        FitSettings { seed: args.seed, pull: args.pull, ..FitSettings::default() },
+    )?;
     let before = fit.decibels(&avatar)?;
     let fitting = Instant::now();
     let mut total = args.steps;
