@@ -1,0 +1,108 @@
+//! Fitting finds an avatar that explains its images, and does the same again.
+
+#![allow(clippy::unwrap_used)]
+
+use flyrig_avatar::{Avatar, AvatarError, AvatarScene, Bones, Fit, FitSettings, TrainingFrame, TrainingView};
+use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
+use flyrig_gpu::{GpuContext, testing::on_both};
+use flyrig_renderer::HarmonicOrder;
+use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
+use glam::{DQuat, DVec2, DVec3};
+
+const SIZE: u32 = 96;
+
+fn avatar(color: impl Fn(usize) -> [f32; 3], gaussians: usize) -> Avatar {
+    let template = default_template(&ShapeParams::default()).unwrap();
+    let surface = sample_surface(&template, gaussians, 1).unwrap();
+    let graph = build_graph(&template, &surface, 30, DEFAULT_SIGMA2_M2).unwrap();
+    let colors: Vec<[f32; 3]> = (0..surface.len()).map(color).collect();
+    Avatar::new(&template, &surface, Some(&graph), &colors, HarmonicOrder::One).unwrap()
+}
+
+/// Around a body that stands at the origin with y up.
+fn camera(angle: f64) -> Camera {
+    let rotation = DQuat::from_rotation_x(std::f64::consts::PI) * DQuat::from_rotation_y(angle);
+    let place = rotation.inverse() * DVec3::new(0.0, 0.0, -2.6) + DVec3::Y * 0.9;
+    Camera {
+        id: "view".into(),
+        intrinsics: Intrinsics {
+            width: SIZE,
+            height: SIZE,
+            focal_px: DVec2::splat(110.0),
+            center_px: DVec2::splat(f64::from(SIZE) / 2.0),
+            lens: Lens::PINHOLE,
+        },
+        camera_from_world: Isometry { rotation, translation: -(rotation * place) },
+        time_offset_nanos: 0,
+        color: Default::default(),
+    }
+}
+
+/// Frames and images of an avatar.
+fn take(gpu: &GpuContext, truth: &Avatar) -> (Vec<TrainingFrame>, Vec<TrainingView>) {
+    let mut scene = AvatarScene::new(gpu, truth).unwrap();
+    let (mut frames, mut views) = (Vec::new(), Vec::new());
+    for turn in [0.0, 0.4] {
+        let skeleton = &truth.template.skeleton;
+        let mut pose = skeleton.rest_pose();
+        pose.joint_rotations.iter_mut().skip(3).step_by(4).for_each(|joint| *joint *= DQuat::from_rotation_z(turn));
+        let bones = Bones::new(skeleton, &pose);
+        scene.pose(truth, &bones, None);
+        for angle in [0.0, 2.1, 4.2] {
+            let camera = camera(angle);
+            let view = scene.draw(&camera).unwrap();
+            views.push(TrainingView::cut(frames.len(), &camera, &view.rgba).unwrap());
+        }
+        frames.push(TrainingFrame { bones, translations: Vec::new() });
+    }
+    (frames, views)
+}
+
+#[test]
+fn a_fit_explains_its_images_and_the_same_steps_give_the_same_bytes() {
+    on_both(|gpu| {
+        let truth = avatar(|i| [[0.5, 0.1, 0.1], [0.1, 0.4, 0.6], [0.6, 0.6, 0.2]][i / 40 % 3], 1500);
+        let (frames, views) = take(gpu, &truth);
+        let run = |steps: u32| {
+            let mut ours = avatar(|_| [0.2; 3], 1500);
+            let settings = FitSettings { color_rate: [5e-2, 1e-2], ..FitSettings::default() };
+            let mut fit = Fit::new(gpu, &ours, frames.clone(), views.clone(), settings).unwrap();
+            assert_eq!(fit.images(), 6);
+            let before = fit.decibels(&ours).unwrap();
+            for step in 0..steps {
+                let report = fit.step(&mut ours, step as f32 / steps as f32).unwrap();
+                assert!(report.loss.is_finite() && report.decibels.is_finite());
+            }
+            (before, fit.decibels(&ours).unwrap(), ours)
+        };
+        let (before, after, _) = run(120);
+        assert!(after > before + 4.0, "{before} {after}");
+        assert!(run(7).2.to_bytes().unwrap() == run(7).2.to_bytes().unwrap());
+    });
+}
+
+#[test]
+fn images_that_show_nobody_and_frames_that_are_missing_are_refused() {
+    let gpu = flyrig_gpu::testing::device().on_processor();
+    let ours = avatar(|_| [0.2; 3], 1000);
+    let all = vec![255; SIZE as usize * SIZE as usize * 4];
+    assert!(TrainingView::cut(0, &camera(0.0), &[]).is_none());
+    assert!(TrainingView::cut(0, &camera(0.0), &vec![0; all.len()]).is_none());
+    let refused = |views: Vec<TrainingView>| match Fit::new(&gpu, &ours, Vec::new(), views, FitSettings::default()) {
+        Err(AvatarError::Images(text)) => text,
+        other => panic!("{other:?}"),
+    };
+    assert!(refused(Vec::new()).contains("nobody is in any image"));
+    assert!(refused(vec![TrainingView::cut(3, &camera(0.0), &all).unwrap()]).contains("without a pose"));
+    // A broken avatar stays where it is; the image that fills everything is cut to itself.
+    let mut broken = ours.clone();
+    broken.parameters.shape.fill([f32::NAN; 4]);
+    let frames = vec![TrainingFrame {
+        bones: Bones::new(&ours.template.skeleton, &ours.template.skeleton.rest_pose()),
+        translations: Vec::new(),
+    }];
+    let views = vec![TrainingView::cut(0, &camera(0.0), &all).unwrap()];
+    let mut fit = Fit::new(&gpu, &broken, frames, views, FitSettings::default()).unwrap();
+    assert!(fit.step(&mut broken, f32::NAN).unwrap().loss.is_finite());
+    broken.to_bytes().unwrap_err();
+}
