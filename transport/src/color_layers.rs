@@ -11,20 +11,22 @@ use std::{
 use flyrig_stream::LAYERS;
 
 /// A judgement needs motion of so long, and so many.
-const WINDOW: Duration = Duration::from_millis(400);
+const WINDOW: Duration = Duration::from_millis(600);
 const MIN_MOTIONS: usize = 4;
+/// This share of a window's motions, the fastest, shows how long queues are: lost packets delay the others for a moment.
+const FASTEST_SHARE: f64 = 0.2;
 /// The fastest way within this time counts as the way without a queue: clocks drift, routes change.
 const FASTEST_OF: Duration = Duration::from_secs(30);
-/// Median time in queues from which a line is congested, below which it is clear, and from which all colours stop.
+/// Time in queues from which a line is congested, below which it is clear, and from which all colours stop.
 const LATE_NANOS: i64 = 70_000_000;
 const CLEAR_NANOS: i64 = 35_000_000;
 const VERY_LATE_NANOS: i64 = 400_000_000;
 /// Share of motions that do not arrive on a congested line. A line with 1 % loss misses a quarter while TCP repeats.
 const MISSED_SHARE: f64 = 0.45;
 /// After a change queues drain, and the change has to reach the rig, before the next judgement.
-const SETTLING: Duration = Duration::from_millis(1200);
+const SETTLING: Duration = Duration::from_millis(1500);
 /// A layer is tried after so long without congestion; after each trial that fails, twice as long as before.
-const FIRST_TRIAL: Duration = Duration::from_millis(400);
+const FIRST_TRIAL: Duration = Duration::from_millis(500);
 const LATER_TRIAL: Duration = Duration::from_secs(8);
 const MOST_PATIENCE: Duration = Duration::from_secs(240);
 /// A trial that lasts so long has succeeded.
@@ -89,10 +91,10 @@ impl ColorLayers {
             return;
         }
         let missed_share = missed / (missed + latencies.len() as f64);
-        let middle = latencies.len() / 2;
-        let (_, median, _) = latencies.select_nth_unstable(middle);
-        let fastest = self.fastest.iter().map(|(_, nanos)| *nanos).min().unwrap_or(*median);
-        self.judge(now, median.saturating_sub(fastest), missed_share);
+        let at = (FASTEST_SHARE * latencies.len() as f64) as usize;
+        let (_, fast, _) = latencies.select_nth_unstable(at);
+        let fastest = self.fastest.iter().map(|(_, nanos)| *nanos).min().unwrap_or(*fast);
+        self.judge(now, fast.saturating_sub(fastest), missed_share);
     }
 
     fn note_way(&mut self, now: Instant, latency_nanos: i64) {
@@ -108,6 +110,7 @@ impl ColorLayers {
     }
 
     fn judge(&mut self, now: Instant, queued_nanos: i64, missed_share: f64) {
+        tracing::trace!(queued_ms = queued_nanos / 1_000_000, missed_share, layers = self.wanted, "line");
         let since_change = self.changed.map(|(at, _)| now.duration_since(at));
         let is_trial = matches!(self.changed, Some((_, true)));
         let is_congested = queued_nanos > LATE_NANOS || missed_share > MISSED_SHARE;
