@@ -3,7 +3,7 @@
 //!
 //! `cargo run --release -p flyrig-renderer --example bench_anisotropic [COUNT...]`
 //!
-//! With `scenes N` in place of counts: errors of the derivatives over N small random scenes.
+//! With `scenes N` in place of counts: errors of the derivatives over N small random scenes, and for ever longer needles.
 
 #[path = "../tests/support/mod.rs"]
 mod support;
@@ -20,9 +20,10 @@ use flyrig_types::Camera;
 use glam::{Quat, Vec3};
 use rand::rngs::StdRng;
 use rand::{RngExt, SeedableRng};
-use support::anisotropic::{ATTRIBUTES, Ellipsoids, backward, errors, harmonics, upload};
+use support::anisotropic::{ATTRIBUTES, Ellipsoids, backward, errors, harmonics, random_ellipsoids, upload};
 use support::anisotropic_run::{Kernels, random_incoming, random_round, summary};
 use support::body_scene::{body, camera};
+use support::random_scene::{LENSES, random_camera};
 use support::reference::{Picture, Scene, render, vec3};
 use support::reference_backward::{Incoming, backward as isotropic_backward, touched, touched_by};
 
@@ -76,10 +77,24 @@ fn main() -> Result<(), Box<dyn Error>> {
 fn random_scenes(gpu: &GpuContext, count: usize) -> Result<(), Box<dyn Error>> {
     let mut rng = StdRng::seed_from_u64(2);
     let mut kernels = Kernels::new(gpu)?;
-    let errors = (0..count).map(|round| random_round(&mut rng, &mut kernels, round)).collect::<Result<Vec<_>, _>>()?;
+    let all = (0..count).map(|round| random_round(&mut rng, &mut kernels, round)).collect::<Result<Vec<_>, _>>()?;
     println!("{count} random scenes on {}", gpu.adapter_name());
-    for (name, [median, high, worst]) in ATTRIBUTES.iter().zip(summary(&errors)) {
+    for (name, [median, high, worst]) in ATTRIBUTES.iter().zip(summary(&all)) {
         println!("{name:10} median {median:.1e}, 99 % {high:.1e}, worst {worst:.1e}");
+    }
+    for (long, thin) in [(0.03, 3e-3), (0.1, 3e-3), (0.3, 3e-3), (0.3, 3e-4)] {
+        let view = random_camera(&mut rng, LENSES[1], SIZE, SIZE);
+        let mut scene = random_ellipsoids(&mut rng, 300, HarmonicOrder::Two);
+        scene.scale_opacity.fill([long, thin, thin, 0.7]);
+        scene.clear_of_clamp(&view);
+        let lists = touched_by(scene.splats(&view, &SETTINGS), (SIZE, SIZE));
+        let mut incoming = random_incoming(&mut rng, (SIZE * SIZE) as usize);
+        incoming.depth_carry.fill([0.0; 4]);
+        incoming.only_clear(&lists.unclear);
+        let slopes = backward(&scene, &view, &SETTINGS, SIZE, &lists, &incoming);
+        let found = kernels.run(&scene, &[(&view, &incoming)], &SETTINGS)?;
+        let errors = errors(&found, &slopes).map(|e| format!("{e:.0e}")).join(" ");
+        println!("needles of {long} m by {thin} m, {SIZE}x{SIZE}: {errors}");
     }
     Ok(())
 }

@@ -62,6 +62,8 @@ fn the_layout_is_that_of_the_reference_code() {
     for (name, expected) in [("f_rest_1", 0.1), ("f_rest_4", 0.2), ("f_rest_7", 0.3), ("f_rest_0", 0.0)] {
         near(value(name), expected * 1.055 / 2.4);
     }
+    // Within its range the curve is that of isotropic splats.
+    (0..=20).for_each(|i| near(encode(0.05 * i as f32).0, crate::srgb_from_linear(0.05 * i as f32)));
     near(value("opacity"), 0.0);
     near(value("scale_0"), 0.01f32.ln());
     near(value("rot_0"), 1.0);

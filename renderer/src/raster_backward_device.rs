@@ -21,6 +21,7 @@ pub(crate) struct DeviceBackward {
     place: ComputeKernel,
     /// By whether depth was drawn, as all that blend.
     blend: [ComputeKernel; 2],
+    sum: ComputeKernel,
     project: [ComputeKernel; 2],
     /// Compiled on first use.
     anisotropic: OnceLock<AnisotropicKernels>,
@@ -29,14 +30,13 @@ pub(crate) struct DeviceBackward {
     pair_sums: StorageBuffer<[[f32; 4]; 3]>,
     /// Elements of `pair_sums`, in x; made again with it.
     room: StorageBuffer<[u32; 4]>,
-    /// By Gaussian; grows with the first image of anisotropic ones.
+    /// By Gaussian.
     sums: StorageBuffer<[[f32; 4]; 3]>,
 }
 
 #[derive(Debug)]
 struct AnisotropicKernels {
     blend: [ComputeKernel; 2],
-    sum: ComputeKernel,
     project: ComputeKernel,
     /// By order.
     paint: [ComputeKernel; 3],
@@ -47,7 +47,6 @@ impl AnisotropicKernels {
         let tile = Tile::for_adapter(gpu);
         Self {
             blend: [false, true].map(|depth| kernel(gpu, "blend_backward", &kernels::blend_wgsl(tile, depth, true))),
-            sum: kernel(gpu, "sum_tiles", &kernels::sums_wgsl()),
             project: kernel(gpu, "project_backward", &kernels::project_anisotropic_wgsl()),
             paint: HarmonicOrder::ALL.map(|order| kernel(gpu, "paint_backward", &kernels::paint_wgsl(order))),
         }
@@ -74,6 +73,7 @@ impl DeviceBackward {
         Ok(Self {
             place: kernel(gpu, "place_gaussians", &kernels::places_wgsl()),
             blend: [false, true].map(|depth| kernel(gpu, "blend_backward", &kernels::blend_wgsl(tile, depth, false))),
+            sum: kernel(gpu, "sum_tiles", &kernels::sums_wgsl()),
             project: [false, true].map(|lift| kernel(gpu, "project_backward", &kernels::project_wgsl(lift))),
             anisotropic: OnceLock::new(),
             places: StorageBuffer::zeroed(gpu, "places of sums", 0)?,
@@ -106,6 +106,7 @@ impl DeviceBackward {
             encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("backward"), ..Default::default() });
         self.place(&view, &mut pass);
         self.blend(&view, &mut pass, onto);
+        self.sum(&view, &mut pass);
         self.project(&view, &mut pass, onto);
         Ok(())
     }
@@ -147,32 +148,38 @@ impl DeviceBackward {
         run(view.gpu, pass, kernel, &resources, <(u32, u32)>::from(view.latest.blended));
     }
 
+    fn sum(&self, view: &View<'_>, pass: &mut ComputePass<'_>) {
+        let resources = [
+            view.rasterizer.constants.get(FRAME),
+            self.places.raw().as_entire_binding(),
+            self.tile_limits.raw().as_entire_binding(),
+            self.pair_sums.raw().as_entire_binding(),
+            self.sums.raw().as_entire_binding(),
+        ];
+        run(view.gpu, pass, &self.sum, &resources, view.by_gaussian());
+    }
+
     fn project(&self, view: &View<'_>, pass: &mut ComputePass<'_>, onto: Onto<'_>) {
         let (gpu, groups, frame) = (view.gpu, view.by_gaussian(), view.rasterizer.constants.get(FRAME));
-        let places = self.places.raw().as_entire_binding();
-        let limits = self.tile_limits.raw().as_entire_binding();
-        let pair_sums = self.pair_sums.raw().as_entire_binding();
+        let sums = self.sums.raw().as_entire_binding();
         match onto {
             Onto::Isotropic { gaussians, carry, out } => {
                 let kernel = &self.project[usize::from(carry == Carry::Lift)];
-                let center_scale = gaussians.center_scale.raw().as_entire_binding();
-                let [center, carried] = [&out.center, &out.carried].map(|buffer| buffer.raw().as_entire_binding());
-                run(gpu, pass, kernel, &[frame, center_scale, places, limits, pair_sums, center, carried], groups);
+                let buffers = [&gaussians.center_scale, &out.center, &out.carried];
+                let [center_scale, center, carried] = buffers.map(|buffer| buffer.raw().as_entire_binding());
+                run(gpu, pass, kernel, &[frame, sums, center_scale, center, carried], groups);
             }
             Onto::Anisotropic { gaussians, out } => {
                 let kernels = self.anisotropic(gpu);
-                let sums = self.sums.raw().as_entire_binding();
-                run(gpu, pass, &kernels.sum, &[frame.clone(), places, limits, pair_sums, sums.clone()], groups);
                 let [center, scale, rotation, harmonics] =
                     gaussians.attributes().map(|buffer| buffer.raw().as_entire_binding());
                 let [center_out, scale_out, rotation_out, harmonics_out] =
                     out.attributes().map(|buffer| buffer.raw().as_entire_binding());
-                let inputs = [frame.clone(), center.clone(), scale, rotation, sums.clone()];
+                let inputs = [frame.clone(), sums.clone(), center.clone(), scale, rotation];
                 let resources: Vec<_> =
                     inputs.into_iter().chain([center_out.clone(), scale_out, rotation_out]).collect();
                 run(gpu, pass, &kernels.project, &resources, groups);
                 let kernel = &kernels.paint[gaussians.order() as usize];
-                // The lowest order passes nothing on to the centres.
                 let resources = [frame, center, harmonics, sums, center_out, harmonics_out];
                 run(gpu, pass, kernel, &resources, groups);
             }
@@ -186,8 +193,6 @@ impl DeviceBackward {
     fn grow(&mut self, gpu: &GpuContext, latest: &Latest, tiles: usize, pairs: u32) -> Result<(), GpuError> {
         if self.places.len() < latest.gaussians {
             self.places = StorageBuffer::zeroed(gpu, "places of sums", latest.gaussians)?;
-        }
-        if latest.order.is_some() && self.sums.len() < latest.gaussians {
             self.sums = StorageBuffer::zeroed(gpu, "sums of Gaussians", latest.gaussians)?;
         }
         if self.tile_limits.len() < tiles {

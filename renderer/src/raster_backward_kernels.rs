@@ -9,7 +9,6 @@ use crate::schema::{CENTER, HARMONICS, ROTATION, SCALE_OPACITY, bindings_wgsl, d
 const BACKWARD_FRAME_WGSL: &str = include_str!("raster_backward_frame.wgsl");
 const PLACES_WGSL: &str = include_str!("raster_backward_places.wgsl");
 const BLEND_WGSL: &str = include_str!("raster_backward_blend.wgsl");
-const TILES_WGSL: &str = include_str!("raster_backward_tiles.wgsl");
 const PROJECT_WGSL: &str = include_str!("raster_backward_project.wgsl");
 const SUMS_WGSL: &str = include_str!("raster_backward_sums.wgsl");
 const PAINT_WGSL: &str = include_str!("raster_backward_paint.wgsl");
@@ -44,16 +43,16 @@ pub(crate) fn blend_wgsl(tile: Tile, with_depth: bool, carry_color: bool) -> Str
 pub(crate) fn project_wgsl(lift: bool) -> String {
     let constants = format!("const LIFT: bool = {lift};\n");
     let project = of_kind(PROJECT_WGSL, false);
-    [&constants, CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, TILES_WGSL, &project].concat()
+    [&constants, CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, &project].concat()
 }
 
 pub(crate) fn sums_wgsl() -> String {
-    [CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, TILES_WGSL, SUMS_WGSL].concat()
+    [CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, SUMS_WGSL].concat()
 }
 
 pub(crate) fn project_anisotropic_wgsl() -> String {
     let attributes = [CENTER, SCALE_OPACITY, ROTATION];
-    let bindings = [bindings_wgsl(1, &attributes), derivatives_wgsl(5, &attributes)].concat();
+    let bindings = [bindings_wgsl(2, &attributes), derivatives_wgsl(5, &attributes)].concat();
     let project = of_kind(PROJECT_WGSL, true);
     [CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, &bindings, AXES_WGSL, &project].concat()
 }

@@ -1,25 +1,20 @@
-// Derivative of the projection: one invocation a Gaussian adds up its tiles row by row and carries the sums through
-// the filtered ellipse, the lens and the camera to the world. Adds to the outputs, so that views can follow each other.
+// Derivative of the projection: one invocation a Gaussian carries its sums through the filtered ellipse, the lens and the
+// camera to the world. Adds to the outputs, so that views can follow each other.
 //
 // Complete where the image is smooth: position in the image, depth, and the ellipse's size and shape (with the
 // lens's second derivatives). Nothing flows through what jumps: the cut at CUT, the end at OPAQUE, the order by depth,
 // back-face culling.
 // Lines between "// only isotropic" or "// only anisotropic" and "// end" belong to Gaussians of that kind.
-// Prefix: camera.wgsl, raster_frame.wgsl, raster_backward_frame.wgsl; for isotropic Gaussians raster_backward_tiles.wgsl and const
-// LIFT, for anisotropic ones raster_axes.wgsl, their first three attributes at bindings 1 to 3 and derivatives at 5 to 7.
+// Prefix: camera.wgsl, raster_frame.wgsl, raster_backward_frame.wgsl; for isotropic Gaussians const LIFT, for anisotropic ones
+// raster_axes.wgsl, their first three attributes at bindings 2 to 4 and derivatives at 5 to 7.
 @group(0) @binding(0) var<storage, read> frame: Frame;
+@group(0) @binding(1) var<storage, read> sums: array<PairSum>;
 // only isotropic
-@group(0) @binding(1) var<storage, read> center_scale: array<vec4<f32>>;
-@group(0) @binding(2) var<storage, read> places: array<Place>;
-@group(0) @binding(3) var<storage, read> tile_limits: array<u32>;
-@group(0) @binding(4) var<storage, read> pair_sums: array<PairSum>;
+@group(0) @binding(2) var<storage, read> center_scale: array<vec4<f32>>;
 // xyz: dL/d centre; w: blending weight over the pixels that matter.
-@group(0) @binding(5) var<storage, read_write> center_out: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> center_out: array<vec4<f32>>;
 // Two elements a Gaussian: carried numbers (LIFT false), or xx xy xz yy | yz zz of the lifted matrix.
-@group(0) @binding(6) var<storage, read_write> carried_out: array<vec4<f32>>;
-// end
-// only anisotropic
-@group(0) @binding(4) var<storage, read> sums: array<PairSum>;
+@group(0) @binding(4) var<storage, read_write> carried_out: array<vec4<f32>>;
 // end
 
 // 1 / (2 ln 2): the conics are for exp2.
@@ -84,26 +79,19 @@ fn project_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgr
     if i >= frame.gaussians {
         return;
     }
-    // only isotropic
-    let place = places[i];
-    if place.fits == 0u {
+    let sums_a = sums[i].vectors[0];
+    let sums_b = sums[i].vectors[1];
+    if !(sums_b.w > 0.0) {
         return;
     }
-    let total = sum_of_tiles(place);
-    let carried = total.vectors[2];
+    // only isotropic
     let world = center_scale[i].xyz;
     let scale_m = center_scale[i].w;
     // end
     // only anisotropic
-    let total = sums[i];
     let world = center[i].xyz;
     let scale_m = scale_opacity[i].xyz;
     // end
-    let sums_a = total.vectors[0];
-    let sums_b = total.vectors[1];
-    if !(sums_b.w > 0.0) {
-        return;
-    }
     let p = (frame.camera.camera_from_world * vec4(world, 1.0)).xyz;
     let inverse_z = 1.0 / p.z;
     let ideal = p.xy * inverse_z;
@@ -171,6 +159,7 @@ fn project_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgr
         center_out[i] += in_world;
     }
     // only isotropic
+    let carried = sums[i].vectors[2];
     if LIFT {
         // J^T C J with C = (xx, xy, yy) of the image, J = d pixel / d world.
         let du = vec3(along_x.x, along_y.x, along_z.x) * camera_from_world;
