@@ -194,11 +194,7 @@ pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
             if is_motion && matches!(taken, Ok(Taken::Applied)) {
                 row.motion_after_secs.get_or_insert(elapsed);
                 if let Some(last) = last_motion.replace(now).filter(|_| is_counted) {
-                    let gap = (now - last).as_secs_f64();
-                    row.longest_gap_secs = row.longest_gap_secs.max(gap);
-                    if gap > 0.15 {
-                        eprintln!("no motion for {gap:.2} s at {elapsed:.2} s, layers {}", subscriber.color_layers());
-                    }
+                    row.longest_gap_secs = row.longest_gap_secs.max((now - last).as_secs_f64());
                 }
                 newest = newest.max(Some(received.header.capture_nanos));
                 is_new = true;

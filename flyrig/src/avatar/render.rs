@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use anyhow::{Context as _, Result, bail};
-use flyrig_avatar::{Avatar, AvatarScene, Bones, CONSTANT_HARMONIC, PosedAvatar};
+use flyrig_avatar::{Avatar, AvatarScene, Bones, PosedAvatar};
 use flyrig_body::{RetargetOptions, load_bvh, load_gltf};
 use flyrig_gpu::GpuContext;
-use flyrig_renderer::{Splat, write_splat_ply};
+use flyrig_renderer::{AnisotropicSplats, write_anisotropic_ply};
 use flyrig_report::{png, progress_bar, stop};
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose, PoseTrack};
 use glam::{DQuat, DVec2, DVec3};
@@ -53,20 +53,14 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     };
     let mut posed = PosedAvatar::default();
     avatar.pose(&Bones::new(&avatar.template.skeleton, &pose), None, &mut posed);
-    let coefficients = avatar.parameters.order().coefficients();
-    let rows = posed.center.iter().zip(&posed.scale_opacity).zip(&posed.rotation);
-    let splats: Vec<Splat> = rows
-        .zip(avatar.parameters.harmonics.chunks(coefficients))
-        .map(|(((center, scales), [x, y, z, w]), harmonics)| Splat {
-            position: [center[0], center[1], center[2]],
-            normal: [0.0; 3],
-            color: harmonics.first().map_or([0.0; 3], |row| [row[0], row[1], row[2]].map(|v| v * CONSTANT_HARMONIC)),
-            opacity: scales[3],
-            scale_m: [scales[0], scales[1], scales[2]],
-            rotation_wxyz: [*w, *x, *y, *z],
-        })
-        .collect();
-    let count = write_splat_ply(&args.out, &splats)?;
+    let splats = AnisotropicSplats {
+        center: posed.center,
+        scale_opacity: posed.scale_opacity,
+        rotation: posed.rotation,
+        harmonics: avatar.parameters.harmonics.clone(),
+        order: avatar.parameters.order(),
+    };
+    let count = write_anisotropic_ply(&args.out, &splats)?;
     println!("{count} splats in {}", args.out.display());
     Ok(())
 }
