@@ -73,8 +73,8 @@ fn beam(lamp: Lamp, world: vec3<f32>, normal: vec3<f32>, to_eye: vec3<f32>, shar
 // needs comes with it: loads in fragments are slow on Mesa's software adapter.
 struct Lit {
     @builtin(position) clip: vec4<f32>,
-    // uv, layer, alpha
-    @location(0) @interpolate(perspective, centroid) paint: vec4<f32>,
+    // uv, alpha
+    @location(0) @interpolate(perspective, centroid) paint: vec3<f32>,
     // Light from everywhere, how much of it shines
     @location(1) @interpolate(perspective, centroid) around: vec4<f32>,
     @location(2) @interpolate(perspective, centroid) light_a: vec4<f32>,
@@ -83,6 +83,9 @@ struct Lit {
     @location(5) @interpolate(perspective, centroid) place_a: vec3<f32>,
     @location(6) @interpolate(perspective, centroid) place_b: vec3<f32>,
     @location(7) @interpolate(perspective, centroid) place_c: vec3<f32>,
+    // Of the textures. Rounded down in the fragment instead, NVIDIA's driver took every second layer's neighbour: it rounds the index
+    // once more, to even.
+    @location(8) @interpolate(flat) layer: u32,
 }
 
 @vertex
@@ -111,7 +114,8 @@ fn vs_lit(vertex: Vertex) -> Lit {
     let around = row.around.rgb * openness;
     var out: Lit;
     out.clip = clip_of(seen.pixel, seen.depth_m);
-    out.paint = vec4(vertex.paint.xyz, select(0.5, 1.0, vertex.paint.w > 0.5));
+    out.paint = vec3(vertex.paint.xy, select(0.5, 1.0, vertex.paint.w > 0.5));
+    out.layer = u32(vertex.paint.z + 0.5);
     out.around = vec4(around * hemisphere(normal, sky, ground), grazing * 0.35);
     out.light_a = a.light;
     out.light_b = b.light;
@@ -131,7 +135,7 @@ fn reaching(l: u32, place: vec3<f32>) -> f32 {
 
 @fragment
 fn fs_lit(in: Lit, @builtin(front_facing) front: bool) -> @location(0) vec4<f32> {
-    var painted = textureSampleBias(textures, smooth_sampler, in.paint.xy, u32(in.paint.z + 0.5), -0.5);
+    var painted = textureSampleBias(textures, smooth_sampler, in.paint.xy, in.layer, -0.5);
     painted = vec4(painted.rgb * painted.rgb, painted.a);
     let gloss = (1.0 - painted.a) * 0.8;
     var sum = in.around.rgb * (painted.rgb + gloss * in.around.a);
@@ -148,7 +152,7 @@ fn fs_lit(in: Lit, @builtin(front_facing) front: bool) -> @location(0) vec4<f32>
             sum += painted.rgb * c + gloss * c * in.light_c.a;
         }
     }
-    return vec4(sum, in.paint.w);
+    return vec4(sum, in.paint.z);
 }
 
 struct Told {
