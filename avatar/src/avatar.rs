@@ -204,7 +204,7 @@ pub(crate) mod tests {
     fn the_mean_is_that_of_the_frames() {
         let mut avatar = small(40, 2);
         let frames = [[DVec3::X, DVec3::ZERO], [DVec3::Y, DVec3::Z]];
-        avatar.set_mean(frames.iter().map(|frame| frame.as_slice()).chain([&[DVec3::X][..]]));
+        avatar.set_mean(frames.iter().map(<[DVec3; 2]>::as_slice).chain([&[DVec3::X][..]]));
         assert_eq!(avatar.hanging.as_ref().unwrap().mean, [DVec3::new(0.5, 0.5, 0.0), DVec3::Z * 0.5]);
     }
 }

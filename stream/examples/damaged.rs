@@ -163,7 +163,7 @@ fn main() -> Result<ExitCode, Box<dyn std::error::Error>> {
             let x: f32 = random.random_range(-0.4..0.4);
             [x, 0.0, 0.0, (1.0 - x * x).sqrt()]
         });
-        let nodes = (0..known.nodes).map(|_| [0; 3].map(|_| random.random_range(-0.02..0.02))).collect();
+        let nodes = (0..known.nodes()).map(|_| [0; 3].map(|_| random.random_range(-0.02..0.02))).collect();
         let motion =
             Motion { stamp, root_translation: [0.1, 0.2, 0.3], joint_rotations: joint_rotations.collect(), nodes };
         motions.push(motion_encoder.encode(&motion)?);
