@@ -20,7 +20,7 @@ const FASTEST_OF: Duration = Duration::from_secs(30);
 /// Time in queues from which a line is congested, below which it is clear, and from which all colours stop.
 const LATE_NANOS: i64 = 70_000_000;
 const CLEAR_NANOS: i64 = 35_000_000;
-const VERY_LATE_NANOS: i64 = 400_000_000;
+const VERY_LATE_NANOS: i64 = 300_000_000;
 /// Share of motions that do not arrive on a congested line. A line with 1 % loss misses a quarter while TCP repeats.
 const MISSED_SHARE: f64 = 0.45;
 /// After a change queues drain, and the change has to reach the rig, before the next judgement.
@@ -36,6 +36,8 @@ const SUCCESS: Duration = Duration::from_secs(10);
 #[derive(Debug)]
 pub(crate) struct ColorLayers {
     wanted: usize,
+    /// Number of layers to go back to when queues are empty again.
+    carried: usize,
     is_begun: bool,
     /// Begin and least latency of each second.
     fastest: VecDeque<(Instant, i64)>,
@@ -53,6 +55,7 @@ impl ColorLayers {
     pub fn new(now: Instant) -> Self {
         Self {
             wanted: 0,
+            carried: 0,
             is_begun: false,
             fastest: VecDeque::new(),
             latencies: Vec::new(),
@@ -72,7 +75,7 @@ impl ColorLayers {
     /// Begins with the coarsest layer; before, motion only says how fast the line is without them.
     pub fn begin(&mut self) {
         if !std::mem::replace(&mut self.is_begun, true) {
-            self.wanted = 1;
+            (self.wanted, self.carried) = (1, 1);
         }
     }
 
@@ -123,7 +126,9 @@ impl ColorLayers {
             let has_failed = is_trial && since_change.is_some_and(|since| since < SUCCESS);
             self.patience =
                 if has_failed { (2 * self.patience).clamp(LATER_TRIAL, MOST_PATIENCE) } else { LATER_TRIAL };
-            self.wanted = if queued_nanos > VERY_LATE_NANOS { 0 } else { self.wanted - 1 };
+            self.carried = self.wanted - 1;
+            // Long queues empty sooner without any colours.
+            self.wanted = if queued_nanos > VERY_LATE_NANOS { 0 } else { self.carried };
             self.changed = Some((now, false));
             return;
         }
@@ -135,10 +140,16 @@ impl ColorLayers {
             return;
         }
         let clear_since = *self.clear_since.get_or_insert(now);
+        if self.wanted < self.carried {
+            self.wanted = self.carried;
+            self.changed = Some((now, false));
+            return;
+        }
         let is_due =
             now.duration_since(clear_since) >= self.patience && since_change.is_none_or(|since| since >= self.patience);
         if is_due && self.wanted < LAYERS {
             self.wanted += 1;
+            self.carried = self.wanted;
             self.changed = Some((now, true));
             self.clear_since = None;
         }
@@ -193,7 +204,7 @@ mod tests {
     #[test]
     fn a_fast_line_has_all_layers_soon() {
         let mut line = Line::new(LAYERS);
-        line.run(2);
+        line.run(3);
         assert_eq!(line.layers.wanted(), LAYERS);
         let (late, shares) = line.run(600);
         assert!(late <= 0.0 && shares[LAYERS] >= 1.0, "{late} {shares:?}");

@@ -29,7 +29,7 @@ const CHUNK: usize = 60_000;
 /// Chunks under way at once: enough for 20 Mbit/s with 100 ms, and fewer than the sender's queue has places.
 const AT_ONCE: usize = 6;
 /// How long a chunk is waited for.
-const CHUNK_PATIENCE: Duration = Duration::from_secs(2);
+const CHUNK_PATIENCE: Duration = Duration::from_secs(5);
 
 /// A message of the person stream, as it came.
 #[derive(Debug, Clone, PartialEq)]

@@ -13,7 +13,7 @@ use flyrig_types::caught;
 use crate::{TransportError, people::ColorSubscription, splats::MAX_PERSON_TOPICS};
 
 /// How long one template may take before the next has its turn.
-const PATIENCE: Duration = Duration::from_secs(10);
+const PATIENCE: Duration = Duration::from_secs(30);
 /// Pause after a template that did not come.
 const RETRY: Duration = Duration::from_millis(500);
 /// Templates that wait for their turn; what does not fit is asked for again by a later motion.
