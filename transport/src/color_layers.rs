@@ -23,6 +23,8 @@ const CLEAR_NANOS: i64 = 35_000_000;
 const VERY_LATE_NANOS: i64 = 300_000_000;
 /// Share of motions that do not arrive on a congested line. A line with 1 % loss misses a quarter while TCP repeats.
 const MISSED_SHARE: f64 = 0.45;
+/// What is missed in a longer pause says nothing: the line was cut, or nobody subscribed.
+const PAUSE: Duration = Duration::from_secs(1);
 /// After a change queues drain, and the change has to reach the rig, before the next judgement.
 const SETTLING: Duration = Duration::from_millis(1500);
 /// A layer is tried after so long without congestion; after each trial that fails, twice as long as before.
@@ -43,6 +45,8 @@ pub(crate) struct ColorLayers {
     fastest: VecDeque<(Instant, i64)>,
     latencies: Vec<i64>,
     missed: u64,
+    /// When the last motion arrived.
+    last: Option<Instant>,
     window_began: Instant,
     /// When layers changed last, and whether that added one.
     changed: Option<(Instant, bool)>,
@@ -60,6 +64,7 @@ impl ColorLayers {
             fastest: VecDeque::new(),
             latencies: Vec::new(),
             missed: 0,
+            last: None,
             window_began: now,
             changed: None,
             clear_since: None,
@@ -72,6 +77,11 @@ impl ColorLayers {
         self.wanted
     }
 
+    /// Whether [`Self::begin`] was called.
+    pub fn has_begun(&self) -> bool {
+        self.is_begun
+    }
+
     /// Begins with the coarsest layer; before, motion only says how fast the line is without them.
     pub fn begin(&mut self) {
         if !std::mem::replace(&mut self.is_begun, true) {
@@ -82,6 +92,8 @@ impl ColorLayers {
     /// Takes in the arrival of a motion: its latency by any two clocks, and the number of motions that were missed before it.
     pub fn motion(&mut self, now: Instant, latency_nanos: i64, missed: u64) {
         self.note_way(now, latency_nanos);
+        let is_pause = self.last.replace(now).is_some_and(|last| now.duration_since(last) > PAUSE);
+        let missed = if is_pause { 0 } else { missed };
         self.latencies.push(latency_nanos);
         self.missed = self.missed.saturating_add(missed);
         if now.duration_since(self.window_began) < WINDOW || self.latencies.len() < MIN_MOTIONS {
@@ -244,6 +256,18 @@ mod tests {
             }
             assert!(layers.wanted().abs_diff(expected) <= 1, "{missed_of_four}: {}", layers.wanted());
         }
+    }
+
+    #[test]
+    fn what_is_missed_in_a_pause_does_not_count() {
+        let mut line = Line::new(LAYERS);
+        for _ in 0..5 {
+            line.run(10);
+            line.now += Duration::from_secs(3);
+            line.layers.motion(line.now, 3_600_050_000_000, 90);
+        }
+        line.run(1);
+        assert_eq!(line.layers.wanted(), LAYERS);
     }
 
     #[test]

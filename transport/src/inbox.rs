@@ -131,6 +131,10 @@ impl Inbox {
         lock(&self.color_layers).wanted()
     }
 
+    pub(crate) fn have_colors_begun(&self) -> bool {
+        lock(&self.color_layers).has_begun()
+    }
+
     /// Lets colours begin.
     pub(crate) fn begin_colors(&self) {
         lock(&self.color_layers).begin();

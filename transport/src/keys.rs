@@ -48,8 +48,11 @@ pub(crate) const PERSON: &str = "person/";
 
 /// Last parts of the key where a person's motion goes.
 pub(crate) fn motion_label(person: u32) -> String {
-    format!("{PERSON}{person}/motion")
+    format!("{PERSON}{person}/{MOTION}")
 }
+
+/// Last part of the keys of motion.
+pub(crate) const MOTION: &str = "motion";
 
 /// Last part of the keys of layers of colours, before the layer's number.
 pub(crate) const COLOR: &str = "color-";

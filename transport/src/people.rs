@@ -130,19 +130,42 @@ pub(crate) fn answer_template(people: &People, query: &Query) {
     }
 }
 
-/// The subscriptions to layers of colours. They begin with the first template: without one they are of no use, and on a slow line they would
-/// keep the template waiting. Then they follow [`Inbox::color_layers`].
-pub(crate) struct ColorSubscription {
+type Subscription = zenoh::pubsub::Subscriber<()>;
+
+/// The subscriptions to people. Until the first template is there, nothing else is of use, and on a slow line it would keep the template
+/// waiting: motion pauses while one is fetched, and colours begin with it. Their layers follow [`Inbox::color_layers`].
+pub(crate) struct PersonSubscription {
     session: Session,
     rig: String,
     inbox: Arc<Inbox>,
+    motion: Mutex<Option<Subscription>>,
     /// From the coarsest layer.
-    layers: Mutex<Vec<zenoh::pubsub::Subscriber<()>>>,
+    layers: Mutex<Vec<Subscription>>,
 }
 
-impl ColorSubscription {
+impl PersonSubscription {
     pub fn new(session: &Session, rig: &str, inbox: &Arc<Inbox>) -> Self {
-        Self { session: session.clone(), rig: rig.to_owned(), inbox: inbox.clone(), layers: Mutex::default() }
+        let (session, rig, inbox) = (session.clone(), rig.to_owned(), inbox.clone());
+        Self { session, rig, inbox, motion: Mutex::default(), layers: Mutex::default() }
+    }
+
+    fn subscribe(&self, part: &str) -> Result<Subscription, TransportError> {
+        let inbox = self.inbox.clone();
+        let key = keys::key(&self.rig, &format!("{}*/{part}", keys::PERSON));
+        self.session
+            .declare_subscriber(&key)
+            .callback(move |sample| inbox.receive(&sample))
+            .wait()
+            .map_err(|error| TransportError::session(key, &error))
+    }
+
+    /// Subscribes to motion, unless that is so already.
+    pub fn begin_motion(&self) -> Result<(), TransportError> {
+        let mut motion = lock(&self.motion);
+        if motion.is_none() {
+            *motion = Some(self.subscribe(keys::MOTION)?);
+        }
+        Ok(())
     }
 
     /// Subscribes to as many layers as the line carries. Never waits for the line.
@@ -158,9 +181,7 @@ impl ColorSubscription {
             }
         }
         while layers.len() < wanted {
-            let inbox = self.inbox.clone();
-            let key = keys::key(&self.rig, &format!("{}*/{}{}", keys::PERSON, keys::COLOR, layers.len()));
-            match self.session.declare_subscriber(key).callback(move |sample| inbox.receive(&sample)).wait() {
+            match self.subscribe(&format!("{}{}", keys::COLOR, layers.len())) {
                 Ok(layer) => layers.push(layer),
                 Err(error) => return tracing::warn!(%error, "colours cannot be received"),
             }
@@ -169,7 +190,15 @@ impl ColorSubscription {
 
     /// Asks for a template as [`ask_template`] does; colours come from then on.
     pub fn ask_template(&self, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
-        let answer = ask_template(&self.session, &self.rig, hash, timeout)?;
+        // Somebody who is shown already goes on moving.
+        let paused = if self.inbox.have_colors_begun() { None } else { lock(&self.motion).take() };
+        let was_watching = paused.is_some();
+        drop(paused);
+        let answer = ask_template(&self.session, &self.rig, hash, timeout);
+        if was_watching {
+            self.begin_motion()?;
+        }
+        let answer = answer?;
         if answer.is_some() {
             self.inbox.begin_colors();
             self.follow();

@@ -13,7 +13,7 @@ use crate::{
     config::LARGEST_QUESTION,
     inbox::{Inbox, Raw, as_malformed},
     keys::{self, VIEWER_PREFIX},
-    people::{ColorSubscription, PersonMessage},
+    people::{PersonMessage, PersonSubscription},
     renewal::Renewal,
     session::{self, Opened},
     splats,
@@ -64,7 +64,7 @@ pub struct Received<T> {
 /// Receives a rig; the newest message of a topic waits for its reader, older ones are replaced and counted.
 pub struct Subscriber {
     inbox: Arc<Inbox>,
-    colors: Arc<ColorSubscription>,
+    people: Arc<PersonSubscription>,
     id: String,
     renewal: Renewal,
     probe: Option<Probe>,
@@ -108,7 +108,6 @@ impl Subscriber {
         if interests.splats {
             labels.extend(["splats".to_owned(), format!("{}*", keys::PERSON_SPLATS)]);
         }
-        labels.extend(interests.people.then(|| format!("{}*/motion", keys::PERSON)));
         labels.extend(interests.stats.then(|| "stats".to_owned()));
         for label in labels {
             let inbox = inbox.clone();
@@ -136,8 +135,11 @@ impl Subscriber {
         let renewal = Renewal::start(session.clone(), key, format!("{VIEWER_PREFIX}{id}"))?;
         let connected = inbox.clone();
         let probe = session::probe(config, move || connected.publishers() > 0)?;
-        let colors = Arc::new(ColorSubscription::new(&session, rig, &inbox));
-        Ok(Self { inbox, colors, id, renewal, probe, session, closed: false, _alive: alive })
+        let people = Arc::new(PersonSubscription::new(&session, rig, &inbox));
+        if interests.people {
+            people.begin_motion()?;
+        }
+        Ok(Self { inbox, people, id, renewal, probe, session, closed: false, _alive: alive })
     }
 
     /// Our name towards the publisher.
@@ -181,7 +183,7 @@ impl Subscriber {
     /// # Errors
     /// As [`Self::next_view`].
     pub fn next_person(&self, timeout: Duration) -> Result<Option<Received<PersonMessage>>, TransportError> {
-        self.colors.follow();
+        self.people.follow();
         let Some((label, raw)) = self.inbox.next(timeout, keys::is_person)? else { return Ok(None) };
         let (person, layer) = keys::person_in(&label).unwrap_or_default();
         self.received(label, raw, |_, _, bytes| Ok(PersonMessage { person, layer, bytes })).map(Some)
@@ -193,7 +195,7 @@ impl Subscriber {
     /// # Errors
     /// `Malformed` when the answer is not that template, `Session` when the question cannot be asked.
     pub fn template(&self, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
-        self.colors.ask_template(hash, timeout)
+        self.people.ask_template(hash, timeout)
     }
 
     /// Returns a fetcher of templates that works beside us.
@@ -201,7 +203,7 @@ impl Subscriber {
     /// # Errors
     /// `Session` when no thread can be started.
     pub fn template_fetcher(&self) -> Result<TemplateFetcher, TransportError> {
-        TemplateFetcher::start(self.colors.clone())
+        TemplateFetcher::start(self.people.clone())
     }
 
     /// The newest statistics nobody has taken yet; `None` after the timeout.

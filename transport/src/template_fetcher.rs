@@ -10,7 +10,7 @@ use std::{
 use crossbeam::channel::{Receiver, Sender, bounded};
 use flyrig_types::caught;
 
-use crate::{TransportError, people::ColorSubscription, splats::MAX_PERSON_TOPICS};
+use crate::{TransportError, people::PersonSubscription, splats::MAX_PERSON_TOPICS};
 
 /// How long one template may take before the next has its turn.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -34,8 +34,8 @@ pub struct TemplateFetcher {
 }
 
 impl TemplateFetcher {
-    pub(crate) fn start(colors: Arc<ColorSubscription>) -> Result<Self, TransportError> {
-        Self::with(move |hash| colors.ask_template(hash, PATIENCE))
+    pub(crate) fn start(people: Arc<PersonSubscription>) -> Result<Self, TransportError> {
+        Self::with(move |hash| people.ask_template(hash, PATIENCE))
     }
 
     fn with(

@@ -1,0 +1,71 @@
+//! Avatars are built from a take, scored, driven by a motion, exported; what cannot be is named.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
+
+use flyrig_tests::{run, write_dataset};
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
+const GIVEN: [&str; 4] = ["--pose", "given", "--masks", "given"];
+
+#[test]
+fn an_avatar_is_built_scored_driven_and_exported() {
+    let data = write_dataset().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let take = data.root.to_string_lossy().into_owned();
+    let avatar = |args: &[&str]| run(PROGRAM, &[&["avatar"], args].concat(), folder.path()).unwrap();
+    let build = |out: &str, more: &[&str]| {
+        let args = ["build", &take, "--inputs", "00,02,04", "--frames", "0..4", "--out", out, "--gaussians", "4000"];
+        avatar(&[&args[..], &["--nodes", "100", "--harmonics", "1"], &GIVEN, more].concat())
+    };
+    let built = build("a.flyavatar", &["--steps", "60"]);
+    assert_eq!(built.code, Some(0), "{built:?}");
+    assert!(folder.path().join("a.png").exists());
+    // "training images B -> A dB".
+    let figures = built.stdout.split("training images ").nth(1).unwrap();
+    let figures: Vec<f64> = figures.split([' ', ';']).filter_map(|word| word.parse().ok()).take(2).collect();
+    assert!(figures[1] > figures[0] + 1.0, "{}", built.stdout);
+    assert_eq!(build("b.flyavatar", &["--steps", "60"]).code, Some(0));
+    let bytes = |name: &str| std::fs::read(folder.path().join(name)).unwrap();
+    assert!(bytes("a.flyavatar") == bytes("b.flyavatar"), "the same steps gave other bytes");
+
+    let info = avatar(&["info", "a.flyavatar"]);
+    assert!(info.stdout.contains("\"steps\": 60") && info.stdout.contains("4000 Gaussians"), "{}", info.stdout);
+    let eval = |more: &[&str]| {
+        let args =
+            ["eval", "a.flyavatar", &take, "--inputs", "00,02,04", "--holdout", "01", "--frames", "0..4", "--out", "e"];
+        avatar(&[&args[..], &GIVEN, more].concat())
+    };
+    for more in [&[][..], &["--deformed"]] {
+        let scored = eval(more);
+        assert_eq!(scored.code, Some(0), "{scored:?}");
+        let metrics: serde_json::Value = serde_json::from_slice(&bytes("e/metrics.json")).unwrap();
+        assert!(metrics["mean"]["psnr_db"].as_f64().unwrap() > 15.0, "{metrics}");
+        assert_eq!(metrics["per_frame"].as_array().unwrap().len(), 4);
+    }
+    assert!(folder.path().join("e/01/000003.png").exists());
+
+    let motion = data.root.join("subject.glb").to_string_lossy().into_owned();
+    let drawn =
+        avatar(&["render", "a.flyavatar", "--motion", &motion, "--out", "r", "--frames", "0..2", "--size", "64x96"]);
+    assert_eq!(drawn.code, Some(0), "{drawn:?}");
+    let shown = image::open(folder.path().join("r/000001.png")).unwrap().to_rgba8();
+    assert!(shown.pixels().filter(|pixel| pixel.0[3] > 200).count() > 200, "nobody is in the image");
+    let exported = avatar(&["export", "a.flyavatar", "--out", "a.ply", "--motion", &motion]);
+    assert!(exported.stdout.contains("4000 splats in a.ply"), "{exported:?}");
+
+    // What cannot be.
+    let refused = |args: &[&str], expected: &str| {
+        let finished = avatar(args);
+        assert_eq!(finished.code, Some(1), "{finished:?}");
+        assert!(finished.stderr.contains(expected), "{}", finished.stderr);
+    };
+    std::fs::write(folder.path().join("broken.flyavatar"), &bytes("a.flyavatar")[..4000]).unwrap();
+    refused(&["info", "broken.flyavatar"], "broken.flyavatar: is no avatar");
+    refused(&["info", "nowhere.flyavatar"], "nowhere.flyavatar: No such file");
+    refused(&["render", "a.flyavatar", "--motion", "a.png", "--out", "r"], "a.png is neither BVH nor glTF");
+    refused(
+        &[&["build", &take, "--inputs", "00,02", "--out", "no/folder/a.flyavatar"], &GIVEN[..]].concat(),
+        "the folder no/folder does not exist",
+    );
+    refused(&[&["build", &take, "--inputs", "00,77", "--out", "c.flyavatar"], &GIVEN[..]].concat(), "77");
+    assert!(!folder.path().join("c.flyavatar").exists());
+}
