@@ -159,10 +159,8 @@ fn main() -> Result<ExitCode, Box<dyn std::error::Error>> {
     let mut color_encoder = ColorEncoder::new(&encoded, ColorSettings::default(), 7);
     for frame in 0..MESSAGES {
         let stamp = Stamp { frame, capture_nanos: 33_333_333 * frame as i64, ..Stamp::default() };
-        let joint_rotations = (0..JOINTS).map(|_| {
-            let x: f32 = random.random_range(-0.4..0.4);
-            [x, 0.0, 0.0, (1.0 - x * x).sqrt()]
-        });
+        let turns: Vec<f32> = (0..JOINTS).map(|_| random.random_range(-0.4..0.4)).collect();
+        let joint_rotations = turns.iter().map(|x| [*x, 0.0, 0.0, (1.0 - x * x).sqrt()]);
         let nodes = (0..known.nodes()).map(|_| [0; 3].map(|_| random.random_range(-0.02..0.02))).collect();
         let motion =
             Motion { stamp, root_translation: [0.1, 0.2, 0.3], joint_rotations: joint_rotations.collect(), nodes };

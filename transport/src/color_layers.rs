@@ -45,6 +45,8 @@ pub(crate) struct ColorLayers {
     fastest: VecDeque<(Instant, i64)>,
     latencies: Vec<i64>,
     missed: u64,
+    /// Templates that are being fetched: they fill the line, whatever it carries.
+    fetches: usize,
     /// When the last motion arrived.
     last: Option<Instant>,
     window_began: Instant,
@@ -64,6 +66,7 @@ impl ColorLayers {
             fastest: VecDeque::new(),
             latencies: Vec::new(),
             missed: 0,
+            fetches: 0,
             last: None,
             window_began: now,
             changed: None,
@@ -89,6 +92,13 @@ impl ColorLayers {
         }
     }
 
+    /// A template is being fetched from now on, or has come. Nothing is judged meanwhile, nor until queues are empty again.
+    pub fn fetch(&mut self, now: Instant, begins: bool) {
+        self.fetches = if begins { self.fetches + 1 } else { self.fetches.saturating_sub(1) };
+        self.changed = Some((now, false));
+        self.clear_since = None;
+    }
+
     /// Takes in the arrival of a motion: its latency by any two clocks, and the number of motions that were missed before it.
     pub fn motion(&mut self, now: Instant, latency_nanos: i64, missed: u64) {
         self.note_way(now, latency_nanos);
@@ -102,7 +112,7 @@ impl ColorLayers {
         let mut latencies = std::mem::take(&mut self.latencies);
         let missed = std::mem::take(&mut self.missed) as f64;
         self.window_began = now;
-        if !self.is_begun {
+        if !self.is_begun || self.fetches > 0 {
             return;
         }
         let missed_share = missed / (missed + latencies.len() as f64);
@@ -256,6 +266,19 @@ mod tests {
             }
             assert!(layers.wanted().abs_diff(expected) <= 1, "{missed_of_four}: {}", layers.wanted());
         }
+    }
+
+    #[test]
+    fn a_template_fills_the_line_without_a_judgement() {
+        let mut line = Line::new(LAYERS);
+        line.run(10);
+        line.layers.fetch(line.now, true);
+        line.carries = 0;
+        line.run(5);
+        line.layers.fetch(line.now, false);
+        line.carries = LAYERS;
+        line.run(5);
+        assert_eq!(line.layers.wanted(), LAYERS);
     }
 
     #[test]

@@ -131,6 +131,11 @@ impl Inbox {
         lock(&self.color_layers).wanted()
     }
 
+    /// A template is being fetched from now on, or has come.
+    pub(crate) fn fetch(&self, begins: bool) {
+        lock(&self.color_layers).fetch(Instant::now(), begins);
+    }
+
     pub(crate) fn have_colors_begun(&self) -> bool {
         lock(&self.color_layers).has_begun()
     }

@@ -194,7 +194,9 @@ impl PersonSubscription {
         let paused = if self.inbox.have_colors_begun() { None } else { lock(&self.motion).take() };
         let was_watching = paused.is_some();
         drop(paused);
+        self.inbox.fetch(true);
         let answer = ask_template(&self.session, &self.rig, hash, timeout);
+        self.inbox.fetch(false);
         if was_watching {
             self.begin_motion()?;
         }
