@@ -59,7 +59,7 @@ impl Default for FitSettings {
             opacity_rate: [2e-2, 5e-3],
             rotation_rate: [5e-3, 1e-3],
             color_rate: [1e-2, 1e-3],
-            pull: 1.0,
+            pull: 5.0,
         }
     }
 }

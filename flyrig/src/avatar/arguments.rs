@@ -78,14 +78,14 @@ pub struct BuildArgs {
     /// Order of spherical harmonics of the colours: how much they may depend on the direction.
     #[arg(long, value_enum, default_value = "0")]
     pub harmonics: Order,
-    /// Minutes of fitting; tracking comes before.
-    #[arg(long, default_value_t = 5.0, value_parser = parse_minutes, conflicts_with = "steps")]
+    /// Minutes of fitting; tracking comes before. Longer fits explain the take's images better, and others worse.
+    #[arg(long, default_value_t = 1.5, value_parser = parse_minutes, conflicts_with = "steps")]
     pub minutes: f64,
     /// Steps of fitting in place of minutes: the same steps and seed give the same bytes.
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub steps: Option<u64>,
     /// How much neighbouring Gaussians pull each other; 0 for not at all.
-    #[arg(long, default_value_t = 1.0, value_parser = parse_pull)]
+    #[arg(long, default_value_t = 5.0, value_parser = parse_pull)]
     pub pull: f32,
     /// Seed of the order of images.
     #[arg(long, default_value_t = 1)]
