@@ -131,7 +131,7 @@ pub struct RenderArgs {
     pub frames: Range<u64>,
     /// Size of the images, pixels.
     #[arg(long, default_value = "512x768", value_parser = parse_size)]
-    pub size: (u32, u32),
+    pub size: [u32; 2],
 }
 
 #[derive(Debug, Args)]

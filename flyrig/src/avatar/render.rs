@@ -82,7 +82,7 @@ fn pose_at(track: &PoseTrack, frame: u64) -> Pose {
 }
 
 /// A camera before the person, at its height.
-fn camera((width, height): (u32, u32), root: DVec3) -> Camera {
+fn camera([width, height]: [u32; 2], root: DVec3) -> Camera {
     let focal = 1.4 * f64::from(height);
     let place = DVec3::new(root.x, root.y - AWAY_M, HEIGHT_M);
     // The world's z is up; a camera looks along its own z, with y down.
