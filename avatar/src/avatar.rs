@@ -1,4 +1,4 @@
-//! An avatar: body, Gaussians, and what they were learnt from.
+//! An avatar: body, Gaussians, and their provenance.
 
 use flyrig_body::{DeformationGraph, SkinWeights, SurfaceGaussians, Template};
 use flyrig_renderer::HarmonicOrder;
@@ -12,7 +12,7 @@ const THICKNESS: f32 = 0.5;
 /// Opacity at the start.
 const OPACITY: f32 = 0.99;
 
-/// What an avatar was learnt from, as it stands in its file.
+/// Provenance of an avatar: its take and how it was fitted. Stored in the file.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Card {
     /// Name of the person or take.
@@ -59,15 +59,15 @@ pub struct Avatar {
     pub skin: Vec<SkinWeights>,
     /// Deformation graph; None without one.
     pub hanging: Option<Hanging>,
-    /// What was learnt.
+    /// Fitted attributes of the Gaussians.
     pub parameters: Parameters,
-    /// What it was learnt from.
+    /// Provenance.
     pub card: Card,
 }
 
 impl Avatar {
     /// An avatar that looks as the person is drawn live: `surface` are the Gaussians of `template`, `graph` deforms them, `colors` are
-    /// theirs in linear RGB (grey where there are none).
+    /// linear RGB, one value per Gaussian (grey where missing).
     ///
     /// # Errors
     /// [`AvatarError::Body`] for a template or lists that do not belong together.

@@ -31,7 +31,7 @@ pub enum AvatarError {
     Format {
         /// Which file.
         path: PathBuf,
-        /// What is wrong, and what to do.
+        /// The fault, and how to fix it.
         problem: String,
     },
     /// Nothing to learn from.

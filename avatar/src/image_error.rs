@@ -68,7 +68,7 @@ impl Shown {
             let straight = (value / alpha).clamp(0.0, 1.0);
             let code = srgb(straight);
             shown.color[k] = code * alpha;
-            // What is clamped does not move with the colour.
+            // A clamped value has no slope.
             let moves = value > 0.0 && value < alpha;
             shown.by_color[k] = if moves { srgb_slope(straight) } else { 0.0 };
             shown.by_coverage[k] = code - shown.by_color[k] * straight;

@@ -99,7 +99,7 @@ fn random_scenes(gpu: &GpuContext, count: usize) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// What is drawn, its f64 image, and the f64 derivatives for an incoming gradient.
+/// A scene, its reference image in f64, and reference derivatives for an incoming gradient.
 struct Variant<G> {
     scene: G,
     picture: Picture,

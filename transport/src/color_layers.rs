@@ -23,7 +23,7 @@ const CLEAR_NANOS: i64 = 35_000_000;
 const VERY_LATE_NANOS: i64 = 300_000_000;
 /// Share of motions that do not arrive on a congested line. A line with 1 % loss misses a quarter while TCP repeats.
 const MISSED_SHARE: f64 = 0.45;
-/// What is missed in a longer pause says nothing: the line was cut, or nobody subscribed.
+/// Motions missed in a longer pause are no sign of congestion: the line was cut, or nobody subscribed.
 const PAUSE: Duration = Duration::from_secs(1);
 /// After a change queues drain, and the change has to reach the rig, before the next judgement.
 const SETTLING: Duration = Duration::from_millis(1500);
@@ -194,7 +194,7 @@ mod tests {
         layers: ColorLayers,
         carries: usize,
         queue_nanos: i64,
-        /// What arrives now was sent with so many layers.
+        /// Number of layers with which each motion in flight was sent.
         in_flight: VecDeque<usize>,
     }
 

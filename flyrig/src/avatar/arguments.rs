@@ -22,7 +22,7 @@ pub enum AvatarAction {
     Render(RenderArgs),
     /// Write an avatar in a pose as splats (PLY), for other programs.
     Export(ExportArgs),
-    /// Print what an avatar was learnt from.
+    /// Print the provenance and size of an avatar.
     Info {
         /// The avatar (*.flyavatar).
         avatar: PathBuf,

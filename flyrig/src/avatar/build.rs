@@ -23,7 +23,7 @@ const SHOW_EVERY: u64 = 20;
 /// Pictures that are written while it is fitted.
 const PICTURES: u64 = 10;
 
-/// What tracking has found.
+/// Results of tracking.
 struct Tracked {
     frames: Vec<TrainingFrame>,
     views: Vec<TrainingView>,
