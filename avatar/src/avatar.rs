@@ -1,11 +1,11 @@
 //! An avatar: body, Gaussians, and their provenance.
 
 use flyrig_body::{DeformationGraph, SkinWeights, SurfaceGaussians, Template};
-use flyrig_renderer::HarmonicOrder;
+use flyrig_renderer::{HarmonicOrder, SH_DEGREE_0};
 use glam::{DVec3, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
-use crate::{AvatarError, Parameters, parameters::CONSTANT_HARMONIC};
+use crate::{AvatarError, Parameters};
 
 /// Thickness of a Gaussian across the surface at the start, against its size along it.
 const THICKNESS: f32 = 0.5;
@@ -87,7 +87,7 @@ impl Avatar {
             parameters.shape[i] = [scale, scale, scale + THICKNESS.ln(), logit];
             parameters.rotation[i] =
                 Quat::from_rotation_arc(Vec3::Z, surface.normals[i].normalize_or(Vec3::Z)).to_array();
-            let [r, g, b] = colors.get(i).copied().unwrap_or([0.2; 3]).map(|value| value / CONSTANT_HARMONIC);
+            let [r, g, b] = colors.get(i).copied().unwrap_or([0.2; 3]).map(|value| value / SH_DEGREE_0);
             parameters.harmonics[i * order.coefficients()] = [r, g, b, 0.0];
         }
         let hanging = graph.map(|graph| Hanging {

@@ -3,6 +3,7 @@
 //! Compared are the bytes that a viewer would show: straight colours in sRGB times coverage, against the photograph times its mask
 //! (LoGAvatar Eq. 16, without the learnt perceptual term: absolute differences and structural similarity), and coverage against the mask.
 
+use flyrig_renderer::srgb_from_linear;
 use rayon::prelude::*;
 
 use crate::ssim::ssim;
@@ -40,10 +41,6 @@ pub struct ImageError {
     pub slope: Vec<[f32; 4]>,
 }
 
-fn srgb(linear: f32) -> f32 {
-    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
-}
-
 fn srgb_slope(linear: f32) -> f32 {
     let linear = linear.max(DARK);
     if linear <= 0.003_130_8 { 12.92 } else { 1.055 / 2.4 * linear.powf(1.0 / 2.4 - 1.0) }
@@ -66,7 +63,7 @@ impl Shown {
         }
         for (k, value) in [r, g, b].into_iter().enumerate() {
             let straight = (value / alpha).clamp(0.0, 1.0);
-            let code = srgb(straight);
+            let code = srgb_from_linear(straight);
             shown.color[k] = code * alpha;
             // A clamped value has no slope.
             let moves = value > 0.0 && value < alpha;

@@ -20,6 +20,6 @@ pub use avatar::{Avatar, Card, Hanging};
 pub use error::AvatarError;
 pub use fit::{Fit, FitSettings, StepReport, TrainingFrame, TrainingView};
 pub use image_error::{ErrorWeights, ImageError};
-pub use parameters::{CONSTANT_HARMONIC, Parameters};
+pub use parameters::Parameters;
 pub use posing::{Bones, PosedAvatar};
 pub use scene::AvatarScene;

@@ -6,9 +6,6 @@ use rayon::prelude::*;
 /// An element of every list: four numbers.
 pub(crate) type Element = [f32; 4];
 
-/// Value of the constant spherical harmonic: a colour is this times its coefficient.
-pub const CONSTANT_HARMONIC: f32 = 0.282_094_8;
-
 /// Learnt attributes: a row a Gaussian, but as many rows of harmonics as their order has coefficients. Derivatives have the same form.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
@@ -76,16 +73,5 @@ impl Parameters {
     #[must_use]
     pub fn is_finite(&self) -> bool {
         self.lists().iter().all(|list| list.par_iter().all(|row| row.iter().all(|value| value.is_finite())))
-    }
-
-    /// The same with another order of colours: new coefficients are zero.
-    #[must_use]
-    pub fn with_order(&self, order: HarmonicOrder) -> Self {
-        let (from, to) = (self.order.coefficients(), order.coefficients());
-        let mut harmonics = vec![[0.0; 4]; self.len() * to];
-        for (old, new) in self.harmonics.chunks(from).zip(harmonics.chunks_mut(to)) {
-            new.iter_mut().zip(old).for_each(|(new, old)| *new = *old);
-        }
-        Self { harmonics, order, ..self.clone() }
     }
 }

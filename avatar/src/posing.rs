@@ -5,7 +5,7 @@
 
 use flyrig_body::{Skeleton, SkinWeights, displacement};
 use flyrig_types::Pose;
-use glam::{DMat4, DVec3, Mat3, Mat4, Quat, Vec3, Vec4};
+use glam::{DMat4, DVec3, Mat3, Mat4, Quat, Vec4};
 use rayon::prelude::*;
 
 use crate::{Avatar, Parameters, parameters::Element};
@@ -130,12 +130,6 @@ impl PosedAvatar {
             *rotation = (place.rotation.conjugate() * Quat::from_array(*rotation)).to_array();
         });
     }
-
-    /// World centres.
-    #[must_use]
-    pub fn centers(&self) -> impl ExactSizeIterator<Item = Vec3> + '_ {
-        self.center.iter().map(|row| Vec4::from(*row).truncate())
-    }
 }
 
 #[cfg(test)]
@@ -200,7 +194,7 @@ mod tests {
         avatar.skin[3].weights = [0.0; 4];
         avatar.skin[4].joints = [u16::MAX; 4];
         avatar.pose(&bones, Some(&zeros), &mut posed);
-        for (i, center) in posed.centers().enumerate() {
+        for (i, center) in posed.center.iter().map(|row| Vec4::from(*row).truncate()).enumerate() {
             let expected = avatar.places[i] + Vec4::from(avatar.parameters.offset[i]).truncate();
             assert!(i == 1 || (center - expected).length() < 1e-4, "{i}: {center} {expected}");
         }

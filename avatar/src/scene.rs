@@ -1,7 +1,7 @@
 //! An avatar drawn into views.
 
 use flyrig_gpu::{GpuContext, GpuError};
-use flyrig_renderer::{AnisotropicBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, ViewBytes};
+use flyrig_renderer::{AnisotropicBuffers, ViewPainter};
 use flyrig_types::{Camera, RenderedView};
 use glam::DVec3;
 
@@ -11,11 +11,9 @@ use crate::{Avatar, Bones, PosedAvatar, fit::write};
 #[derive(Debug)]
 pub struct AvatarScene {
     gpu: GpuContext,
-    rasterizer: Rasterizer,
+    painter: ViewPainter,
     gaussians: AnisotropicBuffers,
     posed: PosedAvatar,
-    target: RenderTarget,
-    bytes: ViewBytes,
 }
 
 impl AvatarScene {
@@ -27,11 +25,9 @@ impl AvatarScene {
         let count = avatar.gaussians();
         Ok(Self {
             gpu: gpu.clone(),
-            rasterizer: Rasterizer::new(gpu, count)?,
+            painter: ViewPainter::new(gpu, count)?,
             gaussians: AnisotropicBuffers::zeroed(gpu, count, avatar.parameters.order())?,
             posed: PosedAvatar::default(),
-            target: RenderTarget::of_color(gpu, 16, 16)?,
-            bytes: ViewBytes::new(gpu)?,
         })
     }
 
@@ -41,26 +37,11 @@ impl AvatarScene {
         write(&self.gpu, &self.gaussians, &self.posed, avatar);
     }
 
-    /// The avatar as it is posed.
-    #[must_use]
-    pub fn posed(&self) -> &PosedAvatar {
-        &self.posed
-    }
-
     /// Draws the avatar as a camera sees it, at its size; straight alpha.
     ///
     /// # Errors
     /// [`GpuError`].
     pub fn draw(&mut self, camera: &Camera) -> Result<RenderedView, GpuError> {
-        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
-        if (self.target.width, self.target.height) != (width, height) {
-            self.target = RenderTarget::of_color(&self.gpu, width, height)?;
-        }
-        let settings = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
-        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-        self.rasterizer.encode(&self.gpu, &mut encoder, &self.gaussians, camera, &settings, &self.target)?;
-        self.bytes.encode(&self.gpu, &mut encoder, &self.target)?;
-        self.gpu.queue.submit([encoder.finish()]);
-        Ok(RenderedView { width, height, rgba: self.bytes.read(&self.gpu, &self.target)? })
+        self.painter.draw(&self.gaussians, camera)
     }
 }

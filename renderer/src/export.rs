@@ -94,7 +94,7 @@ pub fn write_splat_ply(path: &Path, splats: &[Splat]) -> Result<usize, ExportErr
 }
 
 /// Y_0^0.
-pub(crate) const SH_DEGREE_0: f32 = 0.282_094_8;
+pub const SH_DEGREE_0: f32 = 0.282_094_8;
 
 /// Opacity in a PLY file; 1 would have an infinite logit.
 pub(crate) fn opacity_logit(opacity: f32) -> f32 {

@@ -1,7 +1,7 @@
 //! People of the stream, drawn into a view.
 
 use flyrig_gpu::{GpuContext, GpuError};
-use flyrig_renderer::{GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, ViewBytes};
+use flyrig_renderer::{GaussianBuffers, ViewPainter};
 use flyrig_stream::Posed;
 use flyrig_types::{Camera, RenderedView};
 
@@ -9,10 +9,8 @@ use flyrig_types::{Camera, RenderedView};
 #[derive(Debug)]
 pub struct Scene {
     gpu: GpuContext,
-    rasterizer: Rasterizer,
+    painter: ViewPainter,
     gaussians: GaussianBuffers,
-    target: RenderTarget,
-    bytes: ViewBytes,
 }
 
 impl Scene {
@@ -21,13 +19,7 @@ impl Scene {
     /// # Errors
     /// [`GpuError::TooLarge`].
     pub fn new(gpu: &GpuContext) -> Result<Self, GpuError> {
-        Ok(Self {
-            gpu: gpu.clone(),
-            rasterizer: Rasterizer::new(gpu, 1)?,
-            gaussians: GaussianBuffers::zeroed(gpu, 1)?,
-            target: RenderTarget::of_color(gpu, 16, 16)?,
-            bytes: ViewBytes::new(gpu)?,
-        })
+        Ok(Self { gpu: gpu.clone(), painter: ViewPainter::new(gpu, 1)?, gaussians: GaussianBuffers::zeroed(gpu, 1)? })
     }
 
     /// Puts people into the scene, in place of those before: centres and normals, and linear colours of as many Gaussians.
@@ -71,15 +63,6 @@ impl Scene {
     /// # Errors
     /// [`GpuError`].
     pub fn draw(&mut self, camera: &Camera) -> Result<RenderedView, GpuError> {
-        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
-        if (self.target.width, self.target.height) != (width, height) {
-            self.target = RenderTarget::of_color(&self.gpu, width, height)?;
-        }
-        let settings = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
-        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-        self.rasterizer.encode(&self.gpu, &mut encoder, &self.gaussians, camera, &settings, &self.target)?;
-        self.bytes.encode(&self.gpu, &mut encoder, &self.target)?;
-        self.gpu.queue.submit([encoder.finish()]);
-        Ok(RenderedView { width, height, rgba: self.bytes.read(&self.gpu, &self.target)? })
+        self.painter.draw(&self.gaussians, camera)
     }
 }
