@@ -96,7 +96,7 @@ pub fn budget(args: &BenchBudgetArgs, gpu: &GpuContext) -> Result<()> {
 
 fn run(args: &BenchBudgetArgs, gpu: &GpuContext, way: Way) -> Result<Row> {
     let Way { name, budget, solver } = way;
-    let mut settings = args.replay.settings(&args.dataset, args.pose, budget);
+    let mut settings = args.replay.settings(&args.dataset, args.pose, args.gaussians, budget);
     settings.session.tracking.solver = solver;
     let mut replay = Replay::open(&settings, gpu)?;
     let (mut sheet, mut millis, mut levels) = (ScoreSheet::default(), Vec::new(), Vec::new());

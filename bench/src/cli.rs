@@ -13,6 +13,8 @@ use flyrig_report::{
     arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size},
 };
 
+use crate::stream::Subject;
+
 /// Measure run time against error on simulated people.
 #[derive(Debug, Parser)]
 #[command(name = "flyrig-bench", version)]
@@ -117,16 +119,13 @@ pub struct ReplayArgs {
     /// Frames a second of the data sets.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
-    /// Gaussians on the person's surface.
-    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
-    pub gaussians: usize,
 }
 
 impl ReplayArgs {
     /// Returns settings for one data set, with poses and masks from `origin`.
-    pub fn settings(&self, dataset: &Path, origin: Origin, budget: BudgetSettings) -> ReplaySettings {
+    pub fn settings(&self, dataset: &Path, origin: Origin, gaussians: usize, budget: BudgetSettings) -> ReplaySettings {
         let perception = PerceptionSettings { pose: origin, masks: origin, ..PerceptionSettings::default() };
-        let body = BodySettings { gaussians: self.gaussians, ..BodySettings::default() };
+        let body = BodySettings { gaussians, ..BodySettings::default() };
         ReplaySettings {
             dataset: dataset.to_owned(),
             inputs: self.inputs.clone(),
@@ -150,6 +149,9 @@ pub struct BenchBudgetArgs {
     /// Where pose and masks come from.
     #[arg(long, value_enum, default_value = "estimated")]
     pub pose: Origin,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
     /// Budgets, sets a second, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "1,2,3,4,5,6,8,10,15,30")]
     pub budgets: Vec<f64>,
@@ -185,17 +187,30 @@ pub struct BenchReceiveArgs {
 
 #[derive(Debug, Args)]
 pub struct BenchStreamArgs {
-    /// Data sets in EasyMocap layout, as `flyrig eval` and `flyrig sim export` know them.
+    /// Data sets in EasyMocap layout, as `flyrig eval` and `flyrig sim export` know them, or simulated people: sim:turn, sim:dance, sim:walk,
+    /// sim:still and so on.
     #[arg(required = true)]
-    pub datasets: Vec<PathBuf>,
+    pub datasets: Vec<Subject>,
     #[command(flatten)]
     pub replay: ReplayArgs,
-    /// Where pose and masks come from.
-    #[arg(long, value_enum, default_value = "given")]
-    pub pose: Origin,
+    /// Seed of the first simulated person; the others follow.
+    #[arg(long, default_value_t = 811)]
+    pub seed: u64,
+    /// Pixels of a simulated image's side.
+    #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub side: u32,
+    /// Where pose and masks come from, comma separated.
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "given")]
+    pub pose: Vec<Origin>,
+    /// Numbers of Gaussians on the person's surface, comma separated.
+    #[arg(long, value_delimiter = ',', default_values_t = [DEFAULT_GAUSSIAN_COUNT], value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: Vec<usize>,
     /// Quantisation steps of the colours, codes of 255, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "4,8,12,16")]
     pub steps: Vec<f32>,
+    /// Qualities of the colours as a video, 0 (best) to 63, comma separated; needs the program ffmpeg.
+    #[arg(long, value_delimiter = ',', default_value = "10,20,30", value_parser = clap::value_parser!(u8).range(0..=63))]
+    pub crf: Vec<u8>,
     /// Folder of the results.
     #[arg(long, default_value = "out/bench-stream")]
     pub out: PathBuf,

@@ -175,7 +175,7 @@ impl Row {
 }
 
 /// Exponent p of `y = c x^p` through points, by least squares of the logarithms; NaN without two places.
-fn exponent(points: &[(f64, f64)]) -> f64 {
+pub(crate) fn exponent(points: &[(f64, f64)]) -> f64 {
     let logs: Vec<(f64, f64)> = points.iter().map(|(x, y)| (x.ln(), y.ln())).collect();
     let count = logs.len() as f64;
     let (mean_x, mean_y) =

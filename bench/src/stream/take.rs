@@ -1,0 +1,177 @@
+//! People to code: what a session gives of a data set, kept so that every form codes the same.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, ensure};
+use flyrig_fusion::{BudgetSettings, Origin, Outcome, PersonFrame, PersonId, Session};
+use flyrig_gpu::GpuContext;
+use flyrig_metrics::{ScoreSheet, score_view};
+use flyrig_report::{Replay, frame_number, progress_bar, stop};
+use flyrig_sim::{ExportOptions, MotionConfig, MotionKind, SimConfig, Simulator, export};
+use flyrig_transport::SplatState;
+use flyrig_types::{Camera, Image, Mask, RenderedView};
+use serde::{Deserialize as _, de::IntoDeserializer as _};
+
+use crate::{cli::BenchStreamArgs, stress::copy};
+
+/// Sets that are neither counted nor scored: colours are sent for the first time.
+const WARM_UP: usize = 12;
+/// Frames of a simulated person, where no range is given.
+const SIMULATED_FRAMES: u64 = 40;
+/// Starts the name of a simulated person.
+const SIMULATED: &str = "sim:";
+
+/// A data set to code.
+#[derive(Debug, Clone)]
+pub enum Subject {
+    /// A folder in EasyMocap layout.
+    Folder(PathBuf),
+    /// A simulated person with this motion.
+    Simulated(MotionKind, String),
+}
+
+impl std::str::FromStr for Subject {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let Some(name) = text.strip_prefix(SIMULATED) else { return Ok(Self::Folder(text.into())) };
+        let kind: Result<MotionKind, serde::de::value::Error> = MotionKind::deserialize(name.into_deserializer());
+        Ok(Self::Simulated(kind.map_err(|error| error.to_string())?, name.to_owned()))
+    }
+}
+
+/// Returns name and folder of every data set; simulated people are exported to the folder of the results first, unless they are
+/// there already. Each has a seed of its own.
+pub fn folders(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<Vec<(String, PathBuf)>> {
+    let mut seed = args.seed;
+    let mut folders = Vec::new();
+    for subject in &args.datasets {
+        folders.push(match subject {
+            Subject::Folder(path) => {
+                let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
+                (name.unwrap_or_else(|| path.display().to_string()), path.clone())
+            }
+            Subject::Simulated(kind, motion) => {
+                let frames = args.replay.frames.as_ref().map_or(SIMULATED_FRAMES, |frames| frames.end);
+                let folder = args.out.join("takes").join(format!("{motion}-{seed}-{}-{frames}", args.side));
+                simulate(gpu, &folder, *kind, seed, args.side, frames)?;
+                seed += 1;
+                (format!("{SIMULATED}{motion}"), folder)
+            }
+        });
+    }
+    Ok(folders)
+}
+
+fn simulate(gpu: &GpuContext, folder: &Path, kind: MotionKind, seed: u64, side: u32, frames: u64) -> Result<()> {
+    if folder.is_dir() {
+        return Ok(());
+    }
+    let parent = folder.parent().context("the folder of the results has no name")?;
+    std::fs::create_dir_all(parent).with_context(|| format!("cannot create {}", parent.display()))?;
+    let motion = MotionConfig { kind, ..MotionConfig::default() };
+    let config = SimConfig { seed, motion, width: side, height: side, ..SimConfig::default() };
+    let bar = progress_bar(frames, "simulate");
+    let options = ExportOptions { frames, truth: false };
+    export(&mut Simulator::new(gpu, &config)?, folder, options, &mut |done| {
+        bar.set_position(done);
+        !stop::requested()
+    })?;
+    bar.finish_and_clear();
+    Ok(())
+}
+
+/// A person's frames with the held-out views of them.
+pub struct Take {
+    /// Name of the data set.
+    pub name: String,
+    /// Where pose and masks came from.
+    pub pose: Origin,
+    /// Held-out cameras.
+    pub cameras: Vec<Camera>,
+    /// Frames in which the person is there.
+    pub kept: Vec<Kept>,
+    /// Scores of the uncoded person.
+    pub uncoded: ScoreSheet,
+}
+
+/// One frame.
+pub struct Kept {
+    /// Number of the frame in the data set.
+    pub number: u64,
+    /// What the stream's encoder takes.
+    pub frame: PersonFrame,
+    /// Centres, standard deviations and colours, in the order of the session.
+    pub splats: SplatState,
+    /// Unit normals; w: 0.
+    pub normals: Vec<[f32; 4]>,
+    /// A view for each held-out camera; none while the stream warms up.
+    pub views: Vec<KeptView>,
+}
+
+/// A view of a held-out camera.
+pub struct KeptView {
+    /// The person, uncoded.
+    pub uncoded: RenderedView,
+    /// The camera's image, with its mask if there is one.
+    pub truth: Option<(Image, Option<Mask>)>,
+}
+
+impl Take {
+    /// Replays a data set.
+    ///
+    /// # Errors
+    /// Names what cannot be read, or says that nobody was found.
+    pub fn record(
+        args: &BenchStreamArgs,
+        gpu: &GpuContext,
+        (name, folder): &(String, PathBuf),
+        pose: Origin,
+        gaussians: usize,
+    ) -> Result<Self> {
+        let settings = args.replay.settings(folder, pose, gaussians, BudgetSettings::default());
+        let mut replay = Replay::open(&settings, gpu)?;
+        let cameras = replay.holdout.clone();
+        let mut take = Self { name: name.clone(), pose, cameras, kept: Vec::new(), uncoded: ScoreSheet::default() };
+        let bar = progress_bar(replay.count as u64, "replay");
+        bar.set_message(name.clone());
+        while let Some(set) = replay.next_set()? {
+            bar.inc(1);
+            if stop::requested() || matches!(replay.session.process(&set)?, Outcome::Held(_)) {
+                continue;
+            }
+            let Some(frame) = replay.session.person_frame(PersonId::default(), &set)? else { continue };
+            let number = frame_number(&set);
+            let (splats, normals) = splats(&replay.session)?;
+            let mut views = Vec::new();
+            if take.kept.len() >= WARM_UP {
+                let truth = replay.truth.at(set.master_nanos)?;
+                for (camera, truth) in take.cameras.iter().zip(truth) {
+                    let uncoded = replay.session.render(camera)?;
+                    let truth = truth.map(|frame| Ok::<_, anyhow::Error>((copy(&frame.image)?, frame.mask.clone())));
+                    let truth = truth.transpose()?;
+                    if let Some((image, mask)) = &truth {
+                        take.uncoded.extend(score_view(&camera.id, number, &uncoded, image, mask.as_ref())?);
+                    }
+                    views.push(KeptView { uncoded, truth });
+                }
+            }
+            take.kept.push(Kept { number, frame, splats, normals, views });
+        }
+        bar.finish_and_clear();
+        let found = take.kept.len();
+        ensure!(found > WARM_UP, "{name}: a person in more than {WARM_UP} frames is needed, found {found}");
+        Ok(take)
+    }
+}
+
+/// The person's Gaussians as they were drawn last, with normals.
+fn splats(session: &Session) -> Result<(SplatState, Vec<[f32; 4]>)> {
+    let splats = session.splats(PersonId::default())?;
+    let state = SplatState {
+        center_scale: splats.iter().map(|s| [s.position[0], s.position[1], s.position[2], s.scale_m[0]]).collect(),
+        color: splats.iter().map(|s| [s.color[0], s.color[1], s.color[2], s.opacity]).collect(),
+        ..SplatState::default()
+    };
+    Ok((state, splats.iter().map(|s| [s.normal[0], s.normal[1], s.normal[2], 0.0]).collect()))
+}
