@@ -75,7 +75,7 @@ impl Layout {
 
     /// The Gaussian that a cell shows: each has one cell or two.
     fn gaussian(self, cell: usize) -> usize {
-        cell * self.gaussians >> self.bits
+        (cell * self.gaussians) >> self.bits
     }
 
     /// First cell of a Gaussian.
