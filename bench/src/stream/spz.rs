@@ -119,14 +119,15 @@ mod tests {
         let bytes = encode(&splats, &normals, &colors).unwrap();
         let (posed, back) = decode(&bytes).unwrap();
         assert_eq!((posed.center_scale.len(), posed.normal.len(), back.len()), (500, 500, 500));
-        for i in 0..500 {
+        for (i, ((splat, color), back)) in splats.iter().zip(&colors).zip(&back).enumerate() {
+            let found = posed.center_scale[i];
             for axis in 0..3 {
-                assert!((posed.center_scale[i][axis] - splats[i][axis]).abs() <= 0.5 / 4096.0 + 1e-4);
-                let codes = 255.0 * (srgb_from_linear(back[i][axis]) - srgb_from_linear(colors[i][axis]));
+                assert!((found[axis] - splat[axis]).abs() <= 0.5 / 4096.0 + 1e-4);
+                let codes = 255.0 * (srgb_from_linear(back[axis]) - srgb_from_linear(color[axis]));
                 assert!(codes.abs() < 0.5 * HARMONIC / COLOR_FACTOR + 0.01, "{codes} codes of 255");
             }
-            assert!((posed.center_scale[i][3] / splats[i][3]).ln().abs() <= 0.5 * LOG_STEP + 1e-3);
-            assert!((back[i][3] - colors[i][3]).abs() <= 0.5 / 255.0 + 1e-6);
+            assert!((found[3] / splat[3]).ln().abs() <= 0.5 * LOG_STEP + 1e-3);
+            assert!((back[3] - color[3]).abs() <= 0.5 / 255.0 + 1e-6);
             // w is the root of a small difference where the rotation is by nearly half a turn.
             let turned = Vec3::from_slice(&posed.normal[i][..3]);
             assert!(turned.dot(normal(i)) > 0.98, "{turned} for {}", normal(i));
