@@ -75,7 +75,11 @@ fn run(args: &BenchStreamArgs, gpu: &GpuContext, take: &Take, has_codec: bool) -
         for (at, kept) in take.kept.iter().enumerate() {
             bar.inc(1);
             let coded = form.code(at, kept)?;
-            if !kept.views.is_empty() && !stop::requested() {
+            if stop::requested() {
+                bar.finish_and_clear();
+                return Ok(rows);
+            }
+            if !kept.views.is_empty() {
                 tally.add(take, kept, &coded, &mut scene)?;
             }
         }
