@@ -33,6 +33,9 @@ pub struct Card {
     pub seed: u64,
     /// Mean error of the training images at the end, decibels.
     pub training_db: f64,
+    /// Later changes of texture and shape, in order.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub edits: Vec<String>,
 }
 
 /// Gaussians on a deformation graph.
@@ -48,6 +51,26 @@ pub struct Hanging {
     pub mean: Vec<DVec3>,
 }
 
+/// Where a Gaussian hangs on the template's surface.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Attachment {
+    /// Triangle of the template.
+    pub triangle: u32,
+    /// Weights of the triangle's corners, sum 1.
+    pub barycentric: [f32; 3],
+}
+
+impl Attachment {
+    /// Blends values of the template's vertices.
+    pub(crate) fn blend(&self, template: &Template, values: &[Vec3]) -> Vec3 {
+        template.triangles[self.triangle as usize]
+            .iter()
+            .zip(self.barycentric)
+            .map(|(&corner, weight)| values[corner as usize] * weight)
+            .sum()
+    }
+}
+
 /// A personal avatar. All lists of Gaussians have the same length.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Avatar {
@@ -55,6 +78,8 @@ pub struct Avatar {
     pub template: Template,
     /// Canonical places of the Gaussians on the body, metres.
     pub places: Vec<Vec3>,
+    /// Where they hang on the body's surface; those that are inset lie below it.
+    pub attachments: Vec<Attachment>,
     /// Bones that move each Gaussian.
     pub skin: Vec<SkinWeights>,
     /// Deformation graph; None without one.
@@ -99,6 +124,12 @@ impl Avatar {
         Ok(Self {
             template: template.clone(),
             places: surface.positions.clone(),
+            attachments: surface
+                .triangle
+                .iter()
+                .zip(&surface.barycentric)
+                .map(|(&triangle, &barycentric)| Attachment { triangle, barycentric })
+                .collect(),
             skin: surface.skin.clone(),
             hanging,
             parameters,
@@ -129,6 +160,13 @@ impl Avatar {
         let count = self.places.len();
         if count == 0 || self.skin.len() != count || self.parameters.len() != count {
             return Err(format!("lists of {count}, {} and {} Gaussians", self.skin.len(), self.parameters.len()));
+        }
+        let hangs = |attachment: &Attachment| {
+            (attachment.triangle as usize) < self.template.triangles.len()
+                && attachment.barycentric.iter().all(|weight| (-0.01..=1.01).contains(weight))
+        };
+        if self.attachments.len() != count || !self.attachments.iter().all(hangs) {
+            return Err("its Gaussians do not hang on its body".to_owned());
         }
         if let Some(hanging) = &self.hanging {
             let nodes = hanging.nodes.len();
@@ -192,6 +230,8 @@ pub(crate) mod tests {
         };
         assert!(with(&|avatar| avatar.skin.truncate(9)).contains("lists of"));
         assert!(with(&|avatar| avatar.hanging.as_mut().unwrap().gaussian_nodes[3][1] = 7).contains("graph"));
+        assert!(with(&|avatar| avatar.attachments[3].triangle = u32::MAX).contains("hang"));
+        assert!(with(&|avatar| avatar.attachments[3].barycentric[1] = f32::NAN).contains("hang"));
         assert!(with(&|avatar| avatar.parameters.shape[3][1] = f32::NAN).contains("not finite"));
         assert!(with(&|avatar| avatar.template.triangles[0][0] = u32::MAX).contains("triangle"));
         assert_eq!(

@@ -34,6 +34,9 @@ pub enum AvatarError {
         /// The fault, and how to fix it.
         problem: String,
     },
+    /// A texture that does not fit the avatar.
+    #[error("{0}")]
+    Texture(String),
     /// Nothing to learn from.
     #[error("{0}")]
     Images(String),

@@ -9,10 +9,10 @@ use glam::{DMat4, DQuat, DVec3, Vec2, Vec3};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 
-use crate::{Avatar, AvatarError, Card, Hanging, Parameters};
+use crate::{Attachment, Avatar, AvatarError, Card, Hanging, Parameters};
 
 /// Version of the format; a file of another one is refused.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 /// Key of the header in the file's metadata.
 const HEADER: &str = "flyavatar";
 /// A larger file is no avatar, bytes.
@@ -124,6 +124,10 @@ impl Avatar {
         let part = |part: &Part| Part::ALL.iter().position(|known| known == part).unwrap_or_default() as u8;
         arrays.push("body.parts", Dtype::U8, 1, &parts.iter().map(part).collect::<Vec<_>>());
         arrays.push("gaussians.places", Dtype::F32, 3, &flat(&self.places));
+        let triangles: Vec<u32> = self.attachments.iter().map(|attachment| attachment.triangle).collect();
+        arrays.push("gaussians.triangles", Dtype::U32, 1, &triangles);
+        let corners: Vec<[f32; 3]> = self.attachments.iter().map(|attachment| attachment.barycentric).collect();
+        arrays.push("gaussians.barycentric", Dtype::F32, 3, &corners);
         arrays.skin(["gaussians.joints", "gaussians.weights"], &self.skin);
         for (name, list) in LISTS.into_iter().zip(self.parameters.lists()) {
             arrays.push(name, Dtype::F32, 4, list);
@@ -222,9 +226,14 @@ impl Avatar {
                 gaussian_weights: rows::<f32, 4>(&file, "graph.gaussian_weights", Dtype::F32)?,
             }),
         };
+        let triangles = rows::<u32, 1>(&file, "gaussians.triangles", Dtype::U32)?;
+        let corners = rows::<f32, 3>(&file, "gaussians.barycentric", Dtype::F32)?;
+        let attachments =
+            triangles.into_iter().zip(corners).map(|([triangle], barycentric)| Attachment { triangle, barycentric });
         let avatar = Self {
             template,
             places: vectors(&file, "gaussians.places")?,
+            attachments: attachments.collect(),
             skin: skin(&file, ["gaussians.joints", "gaussians.weights"])?,
             hanging,
             parameters,
@@ -276,7 +285,7 @@ mod tests {
             changed[at..at + to.len()].copy_from_slice(to.as_bytes());
             Avatar::from_bytes(&changed).unwrap_err()
         };
-        assert!(replaced("\\\"version\\\":1", "\\\"version\\\":2").contains("version 2"));
+        assert!(replaced("\\\"version\\\":2", "\\\"version\\\":1").contains("version 1"));
         assert!(replaced("gaussians.shape", "gaussians.shade").contains("is damaged"));
         // Bytes at random: an error or an avatar, never a panic.
         let mut random = StdRng::seed_from_u64(1);

@@ -5,21 +5,28 @@
 //! translations; [`Fit`] finds them by gradient descent on images.
 
 mod adam;
+mod atlas;
 mod avatar;
 mod error;
 mod file;
 mod fit;
 mod image_error;
 mod neighbors;
+mod paint;
 mod parameters;
 mod posing;
+mod reshape;
 mod scene;
+mod splat_glb;
 mod ssim;
 
-pub use avatar::{Avatar, Card, Hanging};
+pub use atlas::{Atlas, DEFAULT_ATLAS_SIDE};
+pub use avatar::{Attachment, Avatar, Card, Hanging};
 pub use error::AvatarError;
 pub use fit::{Fit, FitSettings, StepReport, TrainingFrame, TrainingView};
 pub use image_error::{ErrorWeights, ImageError};
+pub use paint::Painted;
 pub use parameters::Parameters;
 pub use posing::{Bones, PosedAvatar};
 pub use scene::AvatarScene;
+pub use splat_glb::write_splat_glb;

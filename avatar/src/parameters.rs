@@ -69,6 +69,15 @@ impl Parameters {
         [&mut self.offset, &mut self.shape, &mut self.rotation, &mut self.harmonics]
     }
 
+    /// Appends a Gaussian of one colour: coefficients of order zero, linear RGB.
+    pub(crate) fn push(&mut self, shape: Element, rotation: Element, constant: Element) {
+        self.offset.push([0.0; 4]);
+        self.shape.push(shape);
+        self.rotation.push(rotation);
+        self.harmonics.push(constant);
+        self.harmonics.resize(self.len() * self.order.coefficients(), [0.0; 4]);
+    }
+
     /// Whether every number is finite.
     #[must_use]
     pub fn is_finite(&self) -> bool {

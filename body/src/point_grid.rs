@@ -6,7 +6,8 @@ use glam::{IVec3, Vec3};
 const MAX_CELLS: f64 = 16e6;
 
 /// Finite points sorted into cubes.
-pub(crate) struct PointGrid<'a> {
+#[derive(Debug)]
+pub struct PointGrid<'a> {
     points: &'a [Vec3],
     origin: Vec3,
     cell: f32,
@@ -17,7 +18,8 @@ pub(crate) struct PointGrid<'a> {
 }
 
 impl<'a> PointGrid<'a> {
-    /// `cell`: side of a cube, best the radius that will be asked for.
+    /// Sorts points; `cell` is the side of a cube, best the radius that will be asked for.
+    #[must_use]
     pub fn new(points: &'a [Vec3], cell: f32) -> Self {
         let min = points.iter().copied().reduce(Vec3::min).unwrap_or(Vec3::ZERO);
         let max = points.iter().copied().reduce(Vec3::max).unwrap_or(Vec3::ZERO);

@@ -2,7 +2,9 @@
 
 pub mod arguments;
 mod build;
+mod edit;
 mod eval;
+mod export;
 mod render;
 
 use std::path::Path;
@@ -22,7 +24,8 @@ pub fn avatar(action: &AvatarAction, gpu: &dyn Fn() -> Result<GpuContext>) -> Re
         AvatarAction::Build(args) => build::build(args, &gpu()?.fastest()),
         AvatarAction::Eval(args) => eval::eval(args, &gpu()?.fastest()),
         AvatarAction::Render(args) => render::render(args, &gpu()?.fastest()),
-        AvatarAction::Export(args) => render::export(args),
+        AvatarAction::Edit(args) => edit::edit(args),
+        AvatarAction::Export(args) => export::export(args),
         AvatarAction::Info { avatar } => {
             let avatar = load(avatar)?;
             let (nodes, joints) =

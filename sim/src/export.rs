@@ -4,7 +4,7 @@ use std::fs;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-use flyrig_body::{write_glb, write_mesh_ply};
+use flyrig_body::{GlbContents, write_glb, write_mesh_ply};
 use flyrig_calib::save_export;
 use flyrig_types::{CameraId, write_whole};
 use image::{ExtendedColorType, ImageEncoder as _};
@@ -116,7 +116,11 @@ impl Folder {
         }
         let last = simulator.frame_nanos(options.frames.saturating_sub(1));
         let track = simulator.track().repeated_until(last);
-        write_glb(&self.root.join("subject.glb"), simulator.template(), &track)?;
+        write_glb(
+            &self.root.join("subject.glb"),
+            simulator.template(),
+            GlbContents { track: Some(&track), texture: None },
+        )?;
         let config = toml::to_string(simulator.config())
             .map_err(|error| refused(&self.root.join("simulation.toml"), &error.to_string()))?;
         self.text("simulation.toml", &config)?;

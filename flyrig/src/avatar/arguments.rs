@@ -3,6 +3,7 @@
 use std::{ops::Range, path::PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
+use flyrig_avatar::DEFAULT_ATLAS_SIDE;
 use flyrig_body::DEFAULT_NODE_COUNT;
 use flyrig_fusion::{PerceptionSettings, TrackingSettings};
 use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_size};
@@ -20,7 +21,9 @@ pub enum AvatarAction {
     Eval(EvalArgs),
     /// Drive an avatar by a recorded motion and write images.
     Render(RenderArgs),
-    /// Write an avatar in a pose as splats (PLY), for other programs.
+    /// Change an avatar's colours by a painted texture, or its shape.
+    Edit(EditArgs),
+    /// Write an avatar for other programs: splats in a pose (PLY, glTF), a textured mesh with bones (glTF), the texture (PNG).
     Export(ExportArgs),
     /// Print the provenance and size of an avatar.
     Info {
@@ -135,16 +138,46 @@ pub struct RenderArgs {
 }
 
 #[derive(Debug, Args)]
+pub struct EditArgs {
+    /// The avatar (*.flyavatar).
+    pub avatar: PathBuf,
+    /// The edited avatar to write (*.flyavatar).
+    #[arg(long)]
+    pub out: PathBuf,
+    /// A texture as `flyrig avatar export --out TEXTURE.png` writes it, with colours painted over: texels that differ are taken over.
+    #[arg(long)]
+    pub texture: Option<PathBuf>,
+    /// Texels along a side of the texture.
+    #[arg(long, default_value_t = DEFAULT_ATLAS_SIDE)]
+    pub side: u32,
+    /// Shape targets NAME=VALUE, comma separated, against the average body, such as stomach-tone=-0.8,upperarm-scale-vert=0.5.
+    #[arg(long, value_delimiter = ',', value_parser = parse_target)]
+    pub shape: Vec<(String, f32)>,
+}
+
+fn parse_target(text: &str) -> Result<(String, f32), String> {
+    let fail = || format!("'{text}' is not NAME=VALUE, such as stomach-tone=-0.8");
+    let (name, value) = text.split_once('=').ok_or_else(fail)?;
+    Ok((name.trim().to_owned(), value.trim().parse().map_err(|_| fail())?))
+}
+
+#[derive(Debug, Args)]
 pub struct ExportArgs {
     /// The avatar (*.flyavatar).
     pub avatar: PathBuf,
-    /// The file to write (*.ply).
+    /// The file to write: splats as *.ply, or as *.glb (KHR_gaussian_splatting); the texture as *.png.
     #[arg(long)]
     pub out: PathBuf,
+    /// Write a textured mesh with bones in place of splats (*.glb), animated by --motion.
+    #[arg(long)]
+    pub mesh: bool,
+    /// Texels along a side of the texture.
+    #[arg(long, default_value_t = DEFAULT_ATLAS_SIDE)]
+    pub side: u32,
     /// Motion that it is posed by (BVH or glTF); at rest otherwise.
     #[arg(long)]
     pub motion: Option<PathBuf>,
-    /// Frame of the motion, at 30 a second.
+    /// Frame of the motion that splats show, at 30 a second.
     #[arg(long, default_value_t = 0)]
     pub frame: u64,
 }

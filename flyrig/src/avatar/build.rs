@@ -103,6 +103,7 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
         steps: done,
         seed: args.seed,
         training_db,
+        edits: Vec::new(),
     };
     avatar.save(&args.out)?;
     println!(

@@ -1,23 +1,19 @@
-//! `flyrig avatar render` and `export`: an avatar driven by a recorded motion.
+//! `flyrig avatar render`: an avatar driven by a recorded motion.
 
 use std::path::Path;
 
 use anyhow::{Context as _, Result, bail};
-use flyrig_avatar::{Avatar, AvatarScene, Bones, PosedAvatar};
+use flyrig_avatar::{Avatar, AvatarScene, Bones};
 use flyrig_body::{RetargetOptions, load_bvh, load_gltf};
 use flyrig_gpu::GpuContext;
-use flyrig_renderer::{AnisotropicSplats, write_anisotropic_ply};
 use flyrig_report::{png, progress_bar, stop};
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose, PoseTrack};
 use glam::{DQuat, DVec2, DVec3};
 
-use super::{
-    arguments::{ExportArgs, RenderArgs},
-    load,
-};
+use super::{arguments::RenderArgs, load};
 
 /// Frames a second of the images.
-const FPS: f64 = 30.0;
+pub(super) const FPS: f64 = 30.0;
 /// Where the camera stands from the person, metres, and how high.
 const AWAY_M: f64 = 3.6;
 const HEIGHT_M: f64 = 1.1;
@@ -44,29 +40,8 @@ pub fn render(args: &RenderArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-/// Runs `export`.
-pub fn export(args: &ExportArgs) -> Result<()> {
-    let avatar = load(&args.avatar)?;
-    let pose = match &args.motion {
-        Some(path) => pose_at(&motion(&avatar, path)?, args.frame),
-        None => avatar.template.skeleton.rest_pose(),
-    };
-    let mut posed = PosedAvatar::default();
-    avatar.pose(&Bones::new(&avatar.template.skeleton, &pose), None, &mut posed);
-    let splats = AnisotropicSplats {
-        center: posed.center,
-        scale_opacity: posed.scale_opacity,
-        rotation: posed.rotation,
-        harmonics: avatar.parameters.harmonics.clone(),
-        order: avatar.parameters.order(),
-    };
-    let count = write_anisotropic_ply(&args.out, &splats)?;
-    println!("{count} splats in {}", args.out.display());
-    Ok(())
-}
-
 /// Brings a recorded motion onto the avatar's skeleton.
-fn motion(avatar: &Avatar, path: &Path) -> Result<PoseTrack> {
+pub(super) fn motion(avatar: &Avatar, path: &Path) -> Result<PoseTrack> {
     let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase()).unwrap_or_default();
     let clip = match ending.as_str() {
         "bvh" => load_bvh(path)?.motion(),
@@ -77,7 +52,8 @@ fn motion(avatar: &Avatar, path: &Path) -> Result<PoseTrack> {
     Ok(clip.retarget(&avatar.template.skeleton, &options)?)
 }
 
-fn pose_at(track: &PoseTrack, frame: u64) -> Pose {
+/// The pose of a frame.
+pub(super) fn pose_at(track: &PoseTrack, frame: u64) -> Pose {
     track.at((frame as f64 / FPS * 1e9) as i64)
 }
 

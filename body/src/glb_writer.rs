@@ -1,0 +1,97 @@
+//! Binary glTF files.
+
+use std::{io::Write as _, path::Path};
+
+use flyrig_types::write_whole;
+use glam::Vec3;
+use serde_json::{Value, json};
+
+use crate::BodyError;
+
+/// Collects typed data into one buffer with a view and an accessor each, then writes it with a document as binary glTF 2.0.
+#[derive(Debug, Default)]
+pub struct GlbWriter {
+    bytes: Vec<u8>,
+    views: Vec<Value>,
+    accessors: Vec<Value>,
+}
+
+impl GlbWriter {
+    /// Adds bytes that are no accessor's, such as an image. Returns the view's index.
+    pub fn bytes(&mut self, data: &[u8]) -> usize {
+        self.bytes.resize(self.bytes.len().next_multiple_of(4), 0);
+        self.views.push(json!({ "buffer": 0, "byteOffset": self.bytes.len(), "byteLength": data.len() }));
+        self.bytes.extend_from_slice(data);
+        self.views.len() - 1
+    }
+
+    fn add(&mut self, data: &[u8], component: u32, kind: &str, count: usize, bounds: Option<[Value; 2]>) -> usize {
+        let view = self.bytes(data);
+        let mut accessor = json!({ "bufferView": view, "componentType": component, "count": count, "type": kind });
+        if let Some([min, max]) = bounds {
+            accessor["min"] = min;
+            accessor["max"] = max;
+        }
+        self.accessors.push(accessor);
+        self.accessors.len() - 1
+    }
+
+    /// Adds positions with their bounds. Returns the accessor's index, as the others do.
+    pub fn positions(&mut self, positions: &[Vec3]) -> usize {
+        let low = positions.iter().fold(Vec3::INFINITY, |a, b| a.min(*b));
+        let high = positions.iter().fold(Vec3::NEG_INFINITY, |a, b| a.max(*b));
+        let bounds = [low, high].map(|bound| json!(bound.to_array()));
+        self.add(bytemuck::cast_slice(positions), 5126, "VEC3", positions.len(), Some(bounds))
+    }
+
+    /// Adds rows of `width` numbers; `kind` is the format's name of such a row.
+    pub fn floats(&mut self, data: &[f32], kind: &str, width: usize) -> usize {
+        let bounds = (kind == "SCALAR").then(|| {
+            let low = data.iter().copied().fold(f32::INFINITY, f32::min);
+            let high = data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+            [json!([low]), json!([high])]
+        });
+        self.add(bytemuck::cast_slice(data), 5126, kind, data.len() / width, bounds)
+    }
+
+    /// Adds rows of `width` numbers of 16 bits.
+    pub fn shorts(&mut self, data: &[u16], kind: &str, width: usize) -> usize {
+        self.add(bytemuck::cast_slice(data), 5123, kind, data.len() / width, None)
+    }
+
+    /// Adds indices of vertices.
+    pub fn indices(&mut self, data: &[u32]) -> usize {
+        self.add(bytemuck::cast_slice(data), 5125, "SCALAR", data.len(), None)
+    }
+
+    /// Writes the file: `document` completed by asset, buffer, views and accessors. It appears whole or not at all.
+    ///
+    /// # Errors
+    /// [`BodyError::Unwritten`] when the file would be larger than the format allows, or the system refuses.
+    pub fn write(mut self, path: &Path, mut document: Value) -> Result<(), BodyError> {
+        let unwritten = |message| BodyError::Unwritten { path: path.to_owned(), message };
+        document["asset"] = json!({ "version": "2.0", "generator": "flyrig" });
+        document["buffers"] = json!([{ "byteLength": self.bytes.len() }]);
+        document["bufferViews"] = json!(self.views);
+        document["accessors"] = json!(self.accessors);
+        let mut text = document.to_string().into_bytes();
+        text.resize(text.len().next_multiple_of(4), b' ');
+        self.bytes.resize(self.bytes.len().next_multiple_of(4), 0);
+        let length =
+            |bytes: usize| u32::try_from(bytes).map_err(|_| unwritten("4 GiB are the most it can hold".to_owned()));
+        let total = length(12 + 8 + text.len() + 8 + self.bytes.len())?;
+        let [text_length, bytes_length] = [length(text.len())?, length(self.bytes.len())?];
+        write_whole(path, |out| {
+            out.write_all(b"glTF")?;
+            for word in [2, total, text_length] {
+                out.write_all(&word.to_le_bytes())?;
+            }
+            out.write_all(b"JSON")?;
+            out.write_all(&text)?;
+            out.write_all(&bytes_length.to_le_bytes())?;
+            out.write_all(b"BIN\0")?;
+            out.write_all(&self.bytes)
+        })
+        .map_err(|source| unwritten(source.to_string()))
+    }
+}

@@ -1,0 +1,96 @@
+//! `flyrig avatar export`: an avatar for other programs.
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result, bail, ensure};
+use flyrig_avatar::{Atlas, Avatar, Bones, PosedAvatar, write_splat_glb};
+use flyrig_body::{GlbContents, write_glb};
+use flyrig_renderer::{AnisotropicSplats, write_anisotropic_ply};
+use flyrig_report::{png, write_whole};
+use glam::Quat;
+
+use super::{
+    arguments::ExportArgs,
+    load,
+    render::{motion, pose_at},
+};
+
+/// Runs the command.
+pub fn export(args: &ExportArgs) -> Result<()> {
+    let avatar = load(&args.avatar)?;
+    let ending = args.out.extension().map(|ending| ending.to_string_lossy().to_lowercase()).unwrap_or_default();
+    ensure!(
+        !args.mesh || ending == "glb",
+        "--mesh writes glTF; name the file {}",
+        args.out.with_extension("glb").display()
+    );
+    match ending.as_str() {
+        "png" => texture(&avatar, args),
+        "glb" if args.mesh => mesh(&avatar, args),
+        "ply" | "glb" => splats(&avatar, args, &ending),
+        _ => bail!("{} is neither *.ply, *.glb nor *.png", args.out.display()),
+    }
+}
+
+fn texture(avatar: &Avatar, args: &ExportArgs) -> Result<()> {
+    let atlas = avatar.atlas(args.side)?;
+    write_whole(&args.out, &encode(&atlas)?)?;
+    println!(
+        "texture of {0} x {0} texels, {1} of them on the body, in {2}; paint it, then: flyrig avatar edit {3} --texture {2} --out NEW.flyavatar",
+        atlas.side,
+        atlas.covered,
+        args.out.display(),
+        args.avatar.display()
+    );
+    Ok(())
+}
+
+fn encode(atlas: &Atlas) -> Result<Vec<u8>> {
+    png::encode_rgb(&atlas.rgb, atlas.side, atlas.side)
+}
+
+fn mesh(avatar: &Avatar, args: &ExportArgs) -> Result<()> {
+    let texture = encode(&avatar.atlas(args.side)?)?;
+    let track = args.motion.as_deref().map(|path| motion(avatar, path)).transpose()?;
+    write_glb(&args.out, &avatar.template, GlbContents { track: track.as_ref(), texture: Some(&texture) })?;
+    let (vertices, joints) = (avatar.template.positions.len(), avatar.template.skeleton.joints().len());
+    println!("textured mesh of {vertices} vertices with {joints} joints in {}", args.out.display());
+    Ok(())
+}
+
+fn splats(avatar: &Avatar, args: &ExportArgs, ending: &str) -> Result<()> {
+    let pose = match &args.motion {
+        Some(path) => pose_at(&motion(avatar, path)?, args.frame),
+        None => avatar.template.skeleton.rest_pose(),
+    };
+    let mut posed = PosedAvatar::default();
+    avatar.pose(&Bones::new(&avatar.template.skeleton, &pose), None, &mut posed);
+    let splats = AnisotropicSplats {
+        center: posed.center,
+        scale_opacity: posed.scale_opacity,
+        rotation: posed.rotation,
+        harmonics: avatar.parameters.harmonics.clone(),
+        order: avatar.parameters.order(),
+    };
+    let count = if ending == "ply" {
+        write_anisotropic_ply(&args.out, &splats)?
+    } else {
+        // Motions have z up, the body at rest y.
+        let turn = if args.motion.is_some() { -std::f32::consts::FRAC_PI_2 } else { 0.0 };
+        write_splat_glb(&args.out, &splats, Quat::from_rotation_x(turn))?
+    };
+    println!("{count} splats in {}", args.out.display());
+    Ok(())
+}
+
+/// Reads an edited texture, which must have `side` texels a side.
+pub(super) fn read_texture(path: &Path, side: u32) -> Result<Atlas> {
+    let image = image::open(path).with_context(|| format!("cannot read the texture {}", path.display()))?.into_rgb8();
+    let (width, height) = image.dimensions();
+    ensure!(
+        (width, height) == (side, side),
+        "{} has {width}x{height} texels, the avatar's texture {side}x{side}; export it again, or give the --side that it was exported with",
+        path.display()
+    );
+    Ok(Atlas { side, rgb: image.into_raw(), covered: 0 })
+}
