@@ -34,13 +34,13 @@ struct Browser {
 }
 
 impl Browser {
-    fn open(url: &str, folder: &std::path::Path, port: u16) -> Self {
+    fn open(url: &str, folder: &std::path::Path, port: u16, drawing: &str) -> Self {
         let (port_text, profile) =
             (format!("--remote-debugging-port={port}"), format!("--user-data-dir={}/profile", folder.display()));
         let args = [
             "--headless=new",
             "--no-sandbox",
-            "--use-angle=swiftshader",
+            drawing,
             "--enable-unsafe-swiftshader",
             "--remote-allow-origins=*",
             &port_text,
@@ -114,7 +114,7 @@ fn a_browser_shows_the_person_as_the_rig_draws_it() {
     let receiver = Receiver::start(&subscriber, || {}).unwrap();
     let started = Instant::now();
     let url = format!("http://127.0.0.1:{web}/?bare&fixed&lowest-latency&camera=00");
-    let mut browser = Browser::open(&url, folder.path(), debugging);
+    let mut browser = Browser::open(&url, folder.path(), debugging, "--use-angle=swiftshader");
     let size = json!({ "width": SIDE, "height": SIDE, "deviceScaleFactor": 1, "mobile": false });
     browser.call("Emulation.setDeviceMetricsOverride", &size);
 
@@ -186,4 +186,25 @@ fn a_browser_shows_the_person_as_the_rig_draws_it() {
     }
     assert!(count / 3 > 5000, "{count}");
     assert!(psnr > 35.0, "{psnr} dB");
+}
+
+#[test]
+#[ignore = "needs Chromium; make test-browser"]
+fn a_browser_without_webgl2_is_told_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let port = || std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let (web, debugging) = (port(), port());
+    let listen = format!("127.0.0.1:{web}");
+    let _server = Process::start(
+        PROGRAM,
+        &["serve", "--connect", "tcp/127.0.0.1:1", "--listen", &listen],
+        folder.path(),
+        "serve",
+    );
+    wait_until("the page", || TcpStream::connect(("127.0.0.1", web)).is_ok());
+    let mut browser = Browser::open(&format!("http://{listen}/"), folder.path(), debugging, "--disable-3d-apis");
+    wait_until("words about WebGL2", || {
+        let text = browser.evaluate("document.getElementById('trouble')?.textContent ?? ''");
+        text.as_str().is_some_and(|text| text.contains("This browser has no WebGL2"))
+    });
 }

@@ -13,13 +13,20 @@ const stateText = document.getElementById("state");
 const troubleText = document.getElementById("trouble");
 const text = new TextDecoder();
 
+// What the browser lacks, or a fault of the page, which cannot go on.
+let fault = "";
+addEventListener("error", ({ error, message }) => {
+  const isFault = error instanceof WebAssembly.RuntimeError;
+  fault = troubleText.textContent = isFault ? `The page failed (${error.message}); load it again.` : error?.message ?? message;
+});
+
 const { instance } = await WebAssembly.instantiate(await (await fetch("page.wasm")).arrayBuffer(), {});
 const wasm = instance.exports;
 const floats = (address, count) => new Float32Array(wasm.memory.buffer, address, count);
 const now = () => performance.now() / 1000;
 
 let drawing = new Drawing(canvas);
-let state = { trouble: "Connecting", sets_per_second: 0, people: [] };
+let state = { trouble: "Connecting", sets_per_second: 0, people: [], color_layers: [0, 0] };
 let linkTrouble = "";
 let interpolates = !parameters.has("lowest-latency");
 let scale = 1; // canvas pixels for a pixel of the screen
@@ -202,15 +209,18 @@ function showState(time) {
   const bits = recent.reduce((sum, [, bytes]) => sum + bytes, 0) * 8 / SHOWN_OVER_MS / 1000;
   const people = wasm.people();
   const shown = people & 255, complete = (people & 256) !== 0;
-  const nobody = shown === 0 && !state.trouble ? "The rig is up; nobody is seen now." : "";
+  const missing = state.people.length > 0 ? "A person is on the way." : "The rig is up; nobody is seen now.";
+  const nobody = shown === 0 && !state.trouble ? missing : "";
   const quality = state.people.filter(([, quality]) => quality !== null).map(([, quality]) => `${Math.round(100 * quality)} %`);
-  troubleText.textContent = linkTrouble || state.trouble || nobody;
+  const [layers, all] = state.color_layers;
+  troubleText.textContent = fault || linkTrouble || state.trouble || nobody;
   stateText.textContent = parameters.has("bare") ? "" : [
     state.rig ?? "",
     `${rate(drawn).toFixed(0)} images/s` + (state.sets_per_second > 0 ? `, rig ${state.sets_per_second.toFixed(1)} sets/s` : "")
       + `, ${bits.toFixed(1)} Mbit/s`,
     `decode ${spent.decode.toFixed(1)} ms, pose and sort ${spent.pose.toFixed(1)} ms, draw ${spent.draw.toFixed(1)} ms`,
     quality.length > 0 ? `tracking ${quality.join(", ")}` : "",
+    shown > 0 && layers < all ? `colours: ${layers} of ${all} layers, as many as the line to the rig carries` : "",
     shown > 0 && !complete ? "colours are still coming" : "",
   ].filter(line => line).join("\n");
   document.documentElement.dataset.ready = shown > 0 && complete && !troubleText.textContent ? "yes" : "no";

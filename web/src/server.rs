@@ -211,13 +211,36 @@ fn reached_at(address: SocketAddr) -> SocketAddr {
         return address;
     }
     let elsewhere = if address.is_ipv4() { "192.0.2.1:9" } else { "[2001:db8::1]:9" };
-    let own = UdpSocket::bind((address.ip(), 0)).and_then(|socket| {
+    let routed = UdpSocket::bind((address.ip(), 0)).and_then(|socket| {
         socket.connect(elsewhere)?;
         socket.local_addr()
     });
+    let own = routed.map(|own| own.ip()).ok().or_else(|| reachable(address.is_ipv4(), interfaces()));
     // Without a network there is loopback alone.
     let loopback: IpAddr = if address.is_ipv4() { Ipv4Addr::LOCALHOST.into() } else { Ipv6Addr::LOCALHOST.into() };
-    SocketAddr::new(own.map_or(loopback, |own| own.ip()), address.port())
+    SocketAddr::new(own.unwrap_or(loopback), address.port())
+}
+
+/// Addresses of this computer's interfaces that are up. A network without a way to others has no route that would name one.
+fn interfaces() -> Vec<IpAddr> {
+    #[cfg(unix)]
+    let of_all = pnet_datalink::interfaces()
+        .into_iter()
+        .filter(|interface| interface.is_up())
+        .flat_map(|interface| interface.ips)
+        .map(|network| network.ip())
+        .collect();
+    #[cfg(not(unix))]
+    let of_all = Vec::new();
+    of_all
+}
+
+/// The first address that other computers may reach; one that is valid on a single link needs the link's name, which browsers do not take.
+fn reachable(is_ipv4: bool, addresses: Vec<IpAddr>) -> Option<IpAddr> {
+    addresses.into_iter().find(|address| match address {
+        IpAddr::V4(v4) => is_ipv4 && !v4.is_loopback(),
+        IpAddr::V6(v6) => !is_ipv4 && !v6.is_loopback() && !v6.is_unicast_link_local(),
+    })
 }
 
 /// Must be called inside of the runtime.
@@ -350,4 +373,22 @@ fn page(status: StatusCode, kind: &'static str, body: Bytes) -> Response<Full<By
         headers.insert(HeaderName::from_static(name), HeaderValue::from_static(value));
     }
     response
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_address_that_others_reach_is_found_without_a_route() {
+        let of = |texts: &[&str]| texts.iter().map(|text| text.parse().unwrap()).collect::<Vec<IpAddr>>();
+        let all = of(&["127.0.0.1", "::1", "fe80::1", "10.0.0.5", "fd00::5", "10.0.0.6"]);
+        assert_eq!(reachable(true, all.clone()), Some("10.0.0.5".parse().unwrap()));
+        assert_eq!(reachable(false, all), Some("fd00::5".parse().unwrap()));
+        assert_eq!(reachable(true, of(&["127.0.0.1", "fd00::5"])), None);
+        assert_eq!(reached_at("10.1.2.3:80".parse().unwrap()), "10.1.2.3:80".parse().unwrap());
+        #[cfg(unix)]
+        assert!(interfaces().iter().any(IpAddr::is_loopback));
+    }
 }

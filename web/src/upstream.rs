@@ -8,7 +8,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_stream::stamp_of;
+use flyrig_stream::{LAYERS, stamp_of};
 use flyrig_transport::{
     FetchedTemplate, Interests, PersonMessage, RigStats, Subscriber, TemplateFetcher, TransportConfig, TransportError,
 };
@@ -34,6 +34,8 @@ struct State<'a> {
     sets_per_second: f64,
     /// Quality of tracking of each person, 0..=1.
     people: Vec<(u32, Option<f64>)>,
+    /// Layers of colours that the rig's line carries, and all that there are.
+    color_layers: (usize, usize),
 }
 
 /// Feeds browsers until `stop` is set.
@@ -55,7 +57,7 @@ pub(crate) fn run(config: &TransportConfig, hub: &Arc<Hub>, stop: &AtomicBool) {
             None => match Link::open(config) {
                 Ok(opened) => link = Some(opened),
                 Err(error) => {
-                    tell(hub, &config.rig, Some(error.to_string()), None);
+                    tell(hub, &config.rig, Some(error.to_string()), None, LAYERS);
                     std::thread::sleep(SESSION_RETRY);
                 }
             },
@@ -131,14 +133,15 @@ impl Link {
             (true, None) => Some("Waiting for the rig's calibration".to_owned()),
             (true, Some(_)) => None,
         };
-        tell(hub, &config.rig, trouble, self.stats.as_ref());
+        tell(hub, &config.rig, trouble, self.stats.as_ref(), self.subscriber.color_layers());
     }
 }
 
-fn tell(hub: &Hub, rig: &str, trouble: Option<String>, stats: Option<&RigStats>) {
+fn tell(hub: &Hub, rig: &str, trouble: Option<String>, stats: Option<&RigStats>, layers: usize) {
     let people = stats.map(|stats| stats.subjects.iter().map(|of| (of.person, of.quality)).collect());
     let sets_per_second = stats.map_or(0.0, |stats| stats.frames_per_second);
-    let state = State { rig, trouble, sets_per_second, people: people.unwrap_or_default() };
+    let state =
+        State { rig, trouble, sets_per_second, people: people.unwrap_or_default(), color_layers: (layers, LAYERS) };
     if let Ok(json) = serde_json::to_vec(&state) {
         hub.state(&json);
     }

@@ -173,7 +173,7 @@ fn browsers_see_a_rig_that_comes_late_goes_and_comes_again_as_another() {
     let rig = TestRig::start(&endpoint, 0.25);
     assert_eq!(rig.endpoint, endpoint);
     watch(&mut socket, &mut page, "the person", |page, state| {
-        stands_at(page, 0.25) && state.contains("\"trouble\":null")
+        stands_at(page, 0.25) && state.contains("\"trouble\":null") && state.contains("\"color_layers\":[3,3]")
     });
     assert!((page.colors()[7][0] - 0.5).abs() < 0.05 && page.order(320, 240).len() == GAUSSIANS);
     // A second browser joins a stream under way.
