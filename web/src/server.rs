@@ -226,7 +226,7 @@ fn interfaces() -> Vec<IpAddr> {
     #[cfg(unix)]
     let of_all = pnet_datalink::interfaces()
         .into_iter()
-        .filter(|interface| interface.is_up())
+        .filter(pnet_datalink::NetworkInterface::is_up)
         .flat_map(|interface| interface.ips)
         .map(|network| network.ip())
         .collect();
