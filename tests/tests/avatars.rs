@@ -52,6 +52,35 @@ fn an_avatar_is_built_scored_driven_and_exported() {
     let exported = avatar(&["export", "a.flyavatar", "--out", "a.ply", "--motion", &motion]);
     assert!(exported.stdout.contains("4000 splats in a.ply"), "{exported:?}");
 
+    // Textures: untouched nothing changes, painted the avatar does.
+    let done = |args: &[&str]| {
+        let finished = avatar(args);
+        assert_eq!(finished.code, Some(0), "{finished:?}");
+        finished.stdout
+    };
+    done(&["export", "a.flyavatar", "--out", "a-texture.png", "--side", "128"]);
+    let edit = |texture: &str, out: &str| {
+        done(&["edit", "a.flyavatar", "--texture", texture, "--side", "128", "--out", out])
+    };
+    assert!(edit("a-texture.png", "same.flyavatar").contains("0 texels differ"));
+    assert!(bytes("same.flyavatar") == bytes("a.flyavatar"));
+    let mut texture = image::open(folder.path().join("a-texture.png")).unwrap().into_rgb8();
+    texture.pixels_mut().for_each(|pixel| pixel.0 = [0, 255, 0]);
+    texture.save(folder.path().join("green.png")).unwrap();
+    edit("green.png", "green.flyavatar");
+    done(&["render", "green.flyavatar", "--motion", &motion, "--out", "g", "--frames", "0..1", "--size", "64x96"]);
+    let shown = image::open(folder.path().join("g/000000.png")).unwrap().to_rgba8();
+    let opaque = || shown.pixels().filter(|pixel| pixel.0[3] > 200);
+    let green = opaque().filter(|pixel| pixel.0[1] > 2 * pixel.0[0].max(pixel.0[2])).count();
+    assert!(green * 10 > opaque().count() * 7, "{green} of {}", opaque().count());
+    // Shapes, meshes and splats for other programs.
+    let height = done(&["edit", "a.flyavatar", "--shape", "height=0.7", "--out", "tall.flyavatar"]);
+    let heights: Vec<f64> = height.split_whitespace().filter_map(|word| word.parse().ok()).take(2).collect();
+    assert!(heights[1] > heights[0] + 0.05, "{height}");
+    done(&["export", "tall.flyavatar", "--out", "tall.glb", "--mesh", "--motion", &motion, "--side", "128"]);
+    done(&["render", "a.flyavatar", "--motion", "tall.glb", "--out", "t", "--frames", "0..1", "--size", "64x96"]);
+    assert!(done(&["export", "a.flyavatar", "--out", "a.glb"]).contains("4000 splats"));
+
     // What cannot be.
     let refused = |args: &[&str], expected: &str| {
         let finished = avatar(args);
@@ -60,6 +89,15 @@ fn an_avatar_is_built_scored_driven_and_exported() {
     };
     std::fs::write(folder.path().join("broken.flyavatar"), &bytes("a.flyavatar")[..4000]).unwrap();
     refused(&["info", "broken.flyavatar"], "broken.flyavatar: is no avatar");
+    refused(
+        &["edit", "a.flyavatar", "--texture", "a-texture.png", "--out", "no.flyavatar"],
+        "a-texture.png has 128x128 texels, the avatar's texture 1024x1024",
+    );
+    refused(&["edit", "a.flyavatar", "--shape", "hight=1", "--out", "no.flyavatar"], "did you mean height");
+    refused(&["edit", "a.flyavatar", "--out", "no.flyavatar"], "nothing to edit");
+    refused(&["export", "a.flyavatar", "--out", "a.ply", "--mesh"], "name the file a.glb");
+    refused(&["export", "a.flyavatar", "--out", "a.obj"], "a.obj is neither");
+    assert!(!folder.path().join("no.flyavatar").exists());
     refused(&["info", "nowhere.flyavatar"], "nowhere.flyavatar: No such file");
     refused(&["render", "a.flyavatar", "--motion", "a.png", "--out", "r"], "a.png is neither BVH nor glTF");
     refused(
