@@ -8,12 +8,12 @@ use flyrig_renderer::{
     RasterSettings, Rasterizer, RenderTarget,
 };
 use flyrig_types::Camera;
-use glam::DVec3;
+use glam::{DVec3, Vec2};
 use rand::{SeedableRng as _, rngs::StdRng, seq::SliceRandom as _};
 
 use crate::{
-    Avatar, AvatarError, Bones, ErrorWeights, ImageError, PosedAvatar, adam::Adam, neighbors::Neighbors,
-    parameters::Element,
+    Avatar, AvatarError, Bones, ErrorWeights, ImageError, LocalSettings, PosedAvatar, adam::Adam, local::Local,
+    neighbors::Neighbors, parameters::Element,
 };
 
 /// Images are cut to the person and so many pixels around.
@@ -156,6 +156,8 @@ pub struct Fit {
     posed: PosedAvatar,
     moments: [Adam; 4],
     neighbors: Neighbors,
+    /// Networks whose outputs the lists are; None where the lists themselves are learnt.
+    local: Option<Local>,
     step: u64,
     random: StdRng,
     /// Views that are still to come in this round.
@@ -199,6 +201,7 @@ impl Fit {
             posed: PosedAvatar::default(),
             moments: avatar.parameters.lists().map(|list| Adam::new(list.len())),
             neighbors: Neighbors::new(&avatar.places),
+            local: None,
             step: 0,
             random: StdRng::seed_from_u64(settings.seed),
             round: Vec::new(),
@@ -206,6 +209,25 @@ impl Fit {
             frames,
             views,
         })
+    }
+
+    /// Makes the avatar's lists outputs of local networks, which are learnt in their place, and returns how many numbers these have. The
+    /// lists start as they are, but for colours, which are looked up in an atlas. `uvs`: texture coordinates of the Gaussians, empty
+    /// without any.
+    ///
+    /// # Errors
+    /// [`AvatarError::Images`] where an atlas by texture coordinates is asked for and there are none.
+    pub fn use_networks(
+        &mut self,
+        avatar: &mut Avatar,
+        uvs: &[Vec2],
+        settings: &LocalSettings,
+    ) -> Result<usize, AvatarError> {
+        let mut local = Local::new(avatar, uvs, settings, self.settings.seed)?;
+        local.evaluate(&mut avatar.parameters);
+        let numbers = local.numbers();
+        self.local = Some(local);
+        Ok(numbers)
     }
 
     /// Number of images.
@@ -258,8 +280,15 @@ impl Fit {
                 let weights = std::array::from_fn(|k| self.settings.pull * usual[k].sqrt() / DIFFERENCES[list][k]);
                 let stride = if list == 3 { coefficients } else { 1 };
                 self.neighbors.pull(values, slopes, stride, weights);
-                self.moments[list].descend(self.step, rates[list], values, slopes);
+                // Networks move the lists themselves; the usual size of the derivatives is wanted all the same.
+                let rates = if self.local.is_some() { [0.0; 4] } else { rates[list] };
+                self.moments[list].descend(self.step, rates, values, slopes);
             }
+        }
+        if let Some(local) = &mut self.local {
+            local.descend(&found, progress);
+            local.refresh(&avatar.parameters);
+            local.evaluate(&mut avatar.parameters);
         }
         Ok(StepReport { loss: error.loss, decibels: -10.0 * error.squared.max(1e-10).log10() })
     }

@@ -1,12 +1,13 @@
 //! Error of a drawn image against a photograph of the person, and its derivative.
 //!
 //! Compared are the bytes that a viewer would show: straight colours in sRGB times coverage, against the photograph times its mask
-//! (LoGAvatar Eq. 16, without the learnt perceptual term: absolute differences and structural similarity), and coverage against the mask.
+//! (LoGAvatar Eq. 16, without the learnt perceptual term: absolute differences, structural similarity, and differences of what sharpening
+//! adds, Eq. 17), and coverage against the mask.
 
 use flyrig_renderer::srgb_from_linear;
 use rayon::prelude::*;
 
-use crate::ssim::ssim;
+use crate::ssim::{Blur, ssim};
 
 /// Coverage below which a pixel has no colour.
 const CLEAR: f32 = 1.0 / 512.0;
@@ -22,11 +23,13 @@ pub struct ErrorWeights {
     pub structure: f32,
     /// Of absolute differences of coverage.
     pub coverage: f32,
+    /// Of absolute differences of the images less their smoothed selves: an unsharp mask, so that fine detail counts more.
+    pub sharpness: f32,
 }
 
 impl Default for ErrorWeights {
     fn default() -> Self {
-        Self { color: 0.8, structure: 0.2, coverage: 0.3 }
+        Self { color: 0.8, structure: 0.2, coverage: 0.3, sharpness: 0.0 }
     }
 }
 
@@ -74,6 +77,22 @@ impl Shown {
     }
 }
 
+/// Returns the sum of absolute differences of two planes, each less its smoothed self (LoGAvatar Eq. 17), and its derivative with respect to
+/// `drawn`.
+fn sharpness(drawn: &[f32], wanted: &[f32], width: usize) -> (f64, Vec<f32>) {
+    let count = drawn.len().min(wanted.len());
+    if width == 0 || count < width {
+        return (0.0, vec![0.0; drawn.len()]);
+    }
+    let blur = Blur::new(width);
+    // Linear and its own transpose.
+    let detail = |plane: Vec<f32>| -> Vec<f32> { plane.iter().zip(blur.apply(&plane)).map(|(a, b)| a - b).collect() };
+    let difference = detail(drawn.iter().zip(wanted).map(|(a, b)| a - b).collect());
+    let sum = difference.iter().map(|value| f64::from(value.abs())).sum();
+    let sign = |value: &f32| if *value > 0.0 { 1.0 } else { -1.0 };
+    (sum, detail(difference.iter().map(sign).collect()))
+}
+
 impl ImageError {
     /// Compares a drawn image (premultiplied linear RGB, coverage) with bytes (sRGB, mask) of `width` pixels a row. A drawn pixel that is
     /// not finite counts as clear and has no slope.
@@ -100,19 +119,23 @@ impl ImageError {
                 } else {
                     (count as f64, vec![0.0; count])
                 };
-                (ours, theirs, similarity, slope)
+                let (sharp, sharp_slope) =
+                    if weights.sharpness > 0.0 { sharpness(&ours, &theirs, width) } else { (0.0, vec![0.0; count]) };
+                (ours, theirs, [similarity, sharp], [slope, sharp_slope])
             })
             .collect();
         let third = scale / 3.0;
-        for (k, (ours, theirs, similarity, structure)) in planes.into_iter().enumerate() {
+        for (k, (ours, theirs, [similarity, sharp], [structure, sharpening])) in planes.into_iter().enumerate() {
             error.loss += f64::from(weights.structure) * (count as f64 - similarity) / (3.0 * person);
+            error.loss += f64::from(weights.sharpness) * sharp / (3.0 * person);
             let mut absolute = 0.0;
             for i in 0..count {
                 let difference = ours[i] - theirs[i];
                 absolute += f64::from(difference.abs());
                 error.squared += f64::from(difference * difference);
                 let sign = if difference > 0.0 { 1.0 } else { -1.0 };
-                let slope = third * (weights.color * sign - weights.structure * structure[i]);
+                let slope = third
+                    * (weights.color * sign - weights.structure * structure[i] + weights.sharpness * sharpening[i]);
                 let Shown { by_color, by_coverage, .. } = &shown[i];
                 error.slope[i][k] = slope * by_color[k];
                 error.slope[i][3] += slope * by_coverage[k];
@@ -156,7 +179,7 @@ mod tests {
             .map(|row| [row[0], row[1], row[2], row[3]])
             .collect();
         let wanted: Vec<u8> = (0..width * 10 * 4).map(|_| random.random()).collect();
-        let weights = ErrorWeights { color: 0.8, structure: 0.2, coverage: 0.3 };
+        let weights = ErrorWeights { color: 0.8, structure: 0.2, coverage: 0.3, sharpness: 0.7 };
         let slope = ImageError::of(&drawn, &wanted, width, &weights).slope;
         let mut worst = 0.0f64;
         for i in (0..drawn.len()).step_by(3) {
@@ -173,6 +196,45 @@ mod tests {
             }
         }
         assert!(worst < 0.03, "{worst}");
+    }
+
+    #[test]
+    fn sharpness_sees_detail_alone_and_its_derivative_is_that_of_finite_differences() {
+        let mut random = StdRng::seed_from_u64(6);
+        let (width, height) = (40, 30);
+        let wanted: Vec<f32> = (0..width * height).map(|_| random.random()).collect();
+        let mut drawn: Vec<f32> = (0..width * height).map(|_| random.random()).collect();
+        let (sum, slope) = sharpness(&drawn, &wanted, width);
+        // The definition, in f64 and two dimensions.
+        let weight = |d: f64| (-0.5 * (d / 1.5f64).powi(2)).exp();
+        let total: f64 = (-5..=5).map(|d| weight(f64::from(d))).sum();
+        let mut expected = 0.0;
+        for y in 0..height as i64 {
+            for x in 0..width as i64 {
+                let at = |x: i64, y: i64| {
+                    let inside = (0..width as i64).contains(&x) && (0..height as i64).contains(&y);
+                    let i = (y * width as i64 + x) as usize;
+                    if inside { f64::from(drawn[i]) - f64::from(wanted[i]) } else { 0.0 }
+                };
+                let taps = (-5..=5i64).flat_map(|dy| (-5..=5i64).map(move |dx| (dx, dy)));
+                let smooth: f64 = taps.map(|(dx, dy)| weight(dx as f64) * weight(dy as f64) * at(x + dx, y + dy)).sum();
+                expected += (at(x, y) - smooth / (total * total)).abs();
+            }
+        }
+        assert!((sum - expected).abs() < 1e-3 * expected, "{sum} {expected}");
+        for i in (0..drawn.len()).step_by(17) {
+            let step = 1e-3;
+            drawn[i] += step;
+            let more = sharpness(&drawn, &wanted, width).0;
+            drawn[i] -= 2.0 * step;
+            let expected = (more - sharpness(&drawn, &wanted, width).0) / f64::from(2.0 * step);
+            drawn[i] += step;
+            assert!((expected - f64::from(slope[i])).abs() < 0.2, "{i}: {expected} {}", slope[i]);
+        }
+        // A smooth difference hardly counts inside.
+        let ramp: Vec<f32> = (0..width * height).map(|i| wanted[i] + (i % width) as f32 * 0.01).collect();
+        assert!(sharpness(&ramp, &wanted, width).0 < 0.15 * ramp.len() as f64);
+        assert!(sharpness(&[], &[], 5).0.abs() <= 0.0 && sharpness(&[1.0], &[0.0], 0).0.abs() <= 0.0);
     }
 
     #[test]

@@ -2,7 +2,8 @@
 //!
 //! An [`Avatar`] is a body with a skin, and for each Gaussian an offset, scales, a rotation, an opacity and a colour in canonical space
 //! ([`Parameters`]). [`Avatar::pose`] brings them into the world by linear blend skinning, with or without a deformation graph's
-//! translations; [`Fit`] finds them by gradient descent on images.
+//! translations; [`Fit`] finds them by gradient descent on images, each number by itself or as outputs of local networks
+//! ([`Fit::use_networks`]).
 
 mod adam;
 mod atlas;
@@ -11,6 +12,7 @@ mod error;
 mod file;
 mod fit;
 mod image_error;
+mod local;
 mod neighbors;
 mod paint;
 mod parameters;
@@ -25,6 +27,7 @@ pub use avatar::{Attachment, Avatar, Card, Hanging};
 pub use error::AvatarError;
 pub use fit::{Fit, FitSettings, StepReport, TrainingFrame, TrainingView};
 pub use image_error::{ErrorWeights, ImageError};
+pub use local::{AtlasLayout, LocalSettings};
 pub use paint::Painted;
 pub use parameters::Parameters;
 pub use posing::{Bones, PosedAvatar};

@@ -17,14 +17,19 @@ fn window() -> [f32; RADIUS + 1] {
 
 /// Smooths planes of one size.
 #[derive(Debug)]
-struct Blur {
+pub(crate) struct Blur {
     window: [f32; RADIUS + 1],
     width: usize,
 }
 
 impl Blur {
-    /// Convolves a plane with the window, which is its own transpose.
-    fn apply(&self, plane: &[f32]) -> Vec<f32> {
+    /// For planes with rows of `width` pixels.
+    pub(crate) fn new(width: usize) -> Self {
+        Self { window: window(), width }
+    }
+
+    /// Convolves a plane with the window, which is its own transpose. The plane has whole rows, and more than none.
+    pub(crate) fn apply(&self, plane: &[f32]) -> Vec<f32> {
         let (width, window) = (self.width, &self.window);
         let height = plane.len() / width.max(1);
         let mut across = vec![0.0f32; plane.len()];
@@ -56,7 +61,7 @@ pub(crate) fn ssim(drawn: &[f32], wanted: &[f32], width: usize) -> (f64, Vec<f32
     if width == 0 || count < width {
         return (0.0, vec![0.0; drawn.len()]);
     }
-    let blur = Blur { window: window(), width };
+    let blur = Blur::new(width);
     let product = |a: &[f32], b: &[f32]| -> Vec<f32> { a.iter().zip(b).map(|(a, b)| a * b).collect() };
     let (mean_x, mean_y) = (blur.apply(drawn), blur.apply(wanted));
     let (xx, yy, xy) =

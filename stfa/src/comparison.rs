@@ -1,6 +1,9 @@
 //! Pixels of a camera that was no input: the Gaussians' colours drawn there, beside the truth.
 
-use burn_tensor::{Device, Tensor};
+use flyrig_learn::{
+    burn_tensor::{Device, Tensor},
+    to_vec,
+};
 use flyrig_renderer::AppearanceSettings;
 
 use crate::{
@@ -8,7 +11,6 @@ use crate::{
     body_graph::PLACE,
     inputs::{NODE, STATE},
     network::{Network, feature_maps, linear_from_srgb, srgb_from_linear},
-    parameters::to_vec,
     sample::{SHARES, Target, TrainingSample},
     structure::{fine_contrast, structural_similarity},
     taps::Taps,

@@ -1,7 +1,7 @@
 //! One frame through the networks without leaving their device: what [`frame_inputs`](crate::frame_inputs), sampling and
 //! memory do on the processor, as tensors.
 
-use burn_tensor::{Device, Int, Tensor, TensorData, module, ops::ConvOptions};
+use flyrig_learn::burn_tensor::{Device, Int, Tensor, TensorData, module, ops::ConvOptions};
 #[cfg(test)]
 use flyrig_renderer::Observations;
 use flyrig_renderer::{AppearanceSettings, linear_from_srgb as linear};

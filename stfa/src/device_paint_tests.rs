@@ -1,12 +1,12 @@
 //! The two ways through the networks give the same colours.
 
-use burn_tensor::Device;
 use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
+use flyrig_learn::{burn_tensor::Device, to_vec};
 use flyrig_renderer::{AppearanceSettings, Observations};
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
 use super::*;
-use crate::{LearnedAppearance, NetworkSize, crops::ViewImage, parameters::to_vec};
+use crate::{LearnedAppearance, NetworkSize, crops::ViewImage};
 
 const SIZES: [[u32; 2]; 3] = [[61, 90], [48, 64], [50, 40]];
 

@@ -1,8 +1,6 @@
 //! Learned appearance: networks of spatial-temporal feature aggregation (FlyHuman, section 3.2), trained on simulated
 //! people, that add to direct appearance.
 //!
-//! A crate of its own because of the build time of `burn`, which only this one needs.
-//!
 //! # What goes through
 //!
 //! 1. **Encoder**: three scales of feature maps over the person's box of every image.

@@ -1,13 +1,16 @@
 //! The networks: encoder, graph transformer, filling (Eq. 9), colour. Written on burn's tensors, for training and painting
 //! alike.
 
-use burn_tensor::{Device, Int, Tensor, TensorData, activation, module, ops::ConvOptions};
+use flyrig_learn::{
+    Tensors,
+    burn_tensor::{Device, Int, Tensor, TensorData, activation, module, ops::ConvOptions},
+    to_vec,
+};
 
 use crate::{
     BodyGraph, NetworkSize,
     body_graph::{EDGES, PLACE},
     inputs::{CANDIDATES, NODE, STATE},
-    parameters::{Tensors, to_vec},
     taps::FeatureMaps,
 };
 

@@ -1,7 +1,7 @@
 //! Where the networks are trained.
 
-use burn_tensor::Device;
 use flyrig_gpu::GpuContext;
+use flyrig_learn::burn_tensor::Device;
 
 use crate::{StfaError, shared};
 

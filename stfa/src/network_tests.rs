@@ -1,6 +1,6 @@
 //! The networks against plain loops in f64.
 
-use burn_tensor::Device;
+use flyrig_learn::burn_tensor::Device;
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
 use super::*;

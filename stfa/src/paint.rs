@@ -2,7 +2,10 @@
 
 use std::ops::Range;
 
-use burn_tensor::{Device, Int, Tensor};
+use flyrig_learn::{
+    burn_tensor::{Device, Int, Tensor},
+    to_vec,
+};
 use flyrig_renderer::{AppearanceSettings, Observations, linear_from_srgb, srgb_from_linear};
 use rayon::prelude::*;
 
@@ -12,7 +15,6 @@ use crate::{
     inputs::{FrameInputs, STATE, frame_inputs},
     memory::FeatureMemory,
     network::{Network, feature_maps},
-    parameters::to_vec,
     taps::{FeatureMaps, Taps},
 };
 

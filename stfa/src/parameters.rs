@@ -1,9 +1,8 @@
-//! The networks' numbers: what there is, how it starts, and its way into tensors.
+//! The networks' numbers: what there is, and how it starts.
 
 use std::collections::BTreeMap;
 
-use burn_tensor::{Device, Gradients, Tensor, TensorData};
-use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
+use flyrig_learn::{Parameter, Start, Tensors, burn_tensor::Device, drawn};
 use serde::{Deserialize, Serialize};
 
 use crate::{
@@ -49,7 +48,7 @@ impl NetworkSize {
     }
 
     /// Name, shape and spread at the start (0: all zero, negative: all one) of every parameter.
-    pub(crate) fn parameters(&self) -> Vec<(String, Vec<usize>, f32)> {
+    pub(crate) fn parameters(&self) -> Vec<Start> {
         let mut list = Vec::new();
         let he = |fan_in: usize| (2.0 / fan_in as f32).sqrt();
         let [full, half, quarter] = self.channels;
@@ -89,13 +88,6 @@ impl NetworkSize {
 /// What the colour network gives: how far towards each candidate, and three residuals.
 pub(crate) const OUTPUTS: usize = CANDIDATES + 3;
 
-/// One parameter.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Parameter {
-    pub(crate) shape: Vec<usize>,
-    pub(crate) values: Vec<f32>,
-}
-
 /// All parameters by name.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
@@ -108,80 +100,22 @@ impl Parameters {
     /// Untrained: paints as direct appearance does.
     #[must_use]
     pub fn untrained(size: NetworkSize, seed: u64) -> Self {
-        let mut rng = SmallRng::seed_from_u64(seed);
-        let by_name = size
-            .parameters()
-            .into_iter()
-            .map(|(name, shape, spread)| {
-                let count = shape.iter().product();
-                // Uniform of the wanted standard deviation.
-                let mut draw =
-                    || if spread > 0.0 { rng.random_range(-1.0f32..1.0) * spread * 3f32.sqrt() } else { -spread };
-                let values = (0..count).map(|_| draw()).collect();
-                (name, Parameter { shape, values })
-            })
-            .collect();
-        Self { size, by_name }
+        Self { size, by_name: drawn(size.parameters(), seed) }
     }
 
     /// How many numbers there are.
     #[must_use]
     pub fn count(&self) -> usize {
-        self.by_name.values().map(|p| p.values.len()).sum()
+        flyrig_learn::count(&self.by_name)
     }
 
     /// Whether every number is one.
     #[must_use]
     pub fn is_finite(&self) -> bool {
-        self.by_name.values().all(|p| p.values.iter().all(|v| v.is_finite()))
+        flyrig_learn::is_finite(&self.by_name)
     }
 
     pub(crate) fn tensors(&self, device: &Device, trained: bool) -> Tensors {
-        let tensor = |p: &Parameter| {
-            let flat = Tensor::<1>::from_data(TensorData::new(p.values.clone(), [p.values.len()]), device);
-            (if trained { flat.require_grad() } else { flat }, p.shape.clone())
-        };
-        Tensors { by_name: self.by_name.iter().map(|(name, p)| (name.clone(), tensor(p))).collect() }
+        Tensors::new(&self.by_name, device, trained)
     }
-}
-
-/// Parameters as flat tensors on a device.
-#[derive(Debug, Clone)]
-pub(crate) struct Tensors {
-    by_name: BTreeMap<String, (Tensor<1>, Vec<usize>)>,
-}
-
-impl Tensors {
-    /// The parameter in its shape. Every name comes from [`NetworkSize::parameters`]; another one gives zeros.
-    pub(crate) fn get<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
-        match self
-            .by_name
-            .get(name)
-            .and_then(|(flat, shape)| Some((flat, <[usize; D]>::try_from(shape.as_slice()).ok()?)))
-        {
-            Some((flat, shape)) => flat.clone().reshape(shape),
-            None => {
-                debug_assert!(false, "{name}");
-                Tensor::zeros([1; D], device)
-            }
-        }
-    }
-
-    /// Adds dL/d parameters; those that took no part stay.
-    pub(crate) fn add_gradients(&self, gradients: &Gradients, into: &mut BTreeMap<String, Vec<f32>>) {
-        for (name, (flat, _)) in &self.by_name {
-            let Some(gradient) = flat.grad(gradients) else { continue };
-            let values = to_vec(gradient);
-            let sum = into.entry(name.clone()).or_insert_with(|| vec![0.0; values.len()]);
-            for (sum, value) in sum.iter_mut().zip(values) {
-                *sum += value;
-            }
-        }
-    }
-}
-
-/// The tensor's numbers in order.
-pub(crate) fn to_vec<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    // Tensors here are f32 on the CPU: the conversion cannot fail.
-    tensor.into_data().try_into_vec::<f32>().unwrap_or_default()
 }

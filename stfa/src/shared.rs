@@ -7,8 +7,8 @@ use burn_cubecl::{
     CubeBackend,
     cubecl::wgpu::{AutoCompiler, WgpuServer},
 };
-use burn_tensor::{Device, Tensor, wgpu::WgpuSetup};
 use flyrig_gpu::{GpuContext, StorageBuffer};
+use flyrig_learn::burn_tensor::{Device, Tensor, wgpu::WgpuSetup};
 use flyrig_renderer::{AppearanceSettings, DirectAppearance, GaussianBuffers};
 
 use crate::{

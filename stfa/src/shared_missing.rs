@@ -1,7 +1,7 @@
 //! Stands in for [`SharedAppearance`] where flyrig was built without the feature `wgpu`: there is none then.
 
-use burn_tensor::Device;
 use flyrig_gpu::GpuContext;
+use flyrig_learn::burn_tensor::Device;
 use flyrig_renderer::{AppearanceSettings, DirectAppearance, GaussianBuffers};
 
 use crate::{BodyGraph, Parameters, StfaError, ViewImage};

@@ -1,6 +1,6 @@
 //! Structural similarity (Wang et al. 2004) of patches, with box windows, and how much fine contrast they have.
 
-use burn_tensor::{Tensor, module, ops::AvgPoolOptions};
+use flyrig_learn::burn_tensor::{Tensor, module, ops::AvgPoolOptions};
 
 use crate::sample::PATCH;
 
@@ -46,7 +46,7 @@ pub(crate) fn structural_similarity(ours: Tensor<2>, truth: Tensor<2>) -> Tensor
 
 #[cfg(test)]
 mod tests {
-    use burn_tensor::{Device, TensorData};
+    use flyrig_learn::burn_tensor::{Device, TensorData};
     use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
     use super::*;
@@ -54,7 +54,7 @@ mod tests {
     fn measured(a: &[f32], b: &[f32]) -> f64 {
         let rows =
             |of: &[f32]| Tensor::<2>::from_data(TensorData::new(of.to_vec(), [of.len() / 3, 3]), &Device::flex());
-        f64::from(crate::parameters::to_vec(structural_similarity(rows(a), rows(b)))[0])
+        f64::from(flyrig_learn::to_vec(structural_similarity(rows(a), rows(b)))[0])
     }
 
     /// Window by window, from differences to the mean.
@@ -94,7 +94,7 @@ mod tests {
         let found = fine_contrast(rows);
         let side = (PATCH - FINE) / FINE_STRIDE + 1;
         assert_eq!(found.dims(), [2, 3, side, side]);
-        let found = crate::parameters::to_vec(found);
+        let found = flyrig_learn::to_vec(found);
         for (i, found) in found.iter().enumerate() {
             let (x, y, c, patch) = (i % side, i / side % side, i / (side * side) % 3, i / (3 * side * side));
             let expected = window_contrast(&a, patch * PATCH + y * FINE_STRIDE, x * FINE_STRIDE, c);
@@ -109,7 +109,7 @@ mod tests {
         let leaf = Tensor::<2>::from_data(TensorData::new(a.clone(), [size / 3, 3]), &Device::flex().autodiff());
         let leaf = leaf.require_grad();
         let gradients = value(leaf.clone()).backward();
-        let found = crate::parameters::to_vec(leaf.grad(&gradients).unwrap());
+        let found = flyrig_learn::to_vec(leaf.grad(&gradients).unwrap());
         let largest = found.iter().fold(0.0f32, |m, v| m.max(v.abs()));
         let step = 1e-3;
         (0..size).step_by(17).fold(0.0, |worst: f64, at| {

@@ -6,7 +6,11 @@
 
 use std::{collections::BTreeMap, path::Path};
 
-use burn_tensor::{Tensor, TensorData};
+use flyrig_learn::{
+    AdamStep, Moments,
+    burn_tensor::{Tensor, TensorData},
+    to_vec,
+};
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng, seq::SliceRandom as _};
 use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
@@ -15,7 +19,6 @@ use crate::{
     NetworkDevice, Parameters, StfaError,
     comparison::{Comparison, PixelLoss, planes},
     network::{Network, feature_maps},
-    parameters::to_vec,
     sample::{Target, TrainingSample},
     taps::Taps,
     tensor_file::{TensorFile, array, read},
@@ -90,7 +93,7 @@ pub struct Trainer {
     /// Where.
     pub device: NetworkDevice,
     /// Mean and mean square of each gradient.
-    moments: BTreeMap<String, [Vec<f32>; 2]>,
+    moments: BTreeMap<String, Moments>,
 }
 
 impl Trainer {
@@ -185,22 +188,18 @@ impl Trainer {
         let shorten = (MAX_GRADIENT / length.max(1e-12)).min(1.0);
         let progress = (step as f32 / self.settings.steps.max(1) as f32).min(1.0);
         let rate = self.settings.rate * 0.5 * (1.0 + (std::f32::consts::PI * progress).cos());
-        let count = i32::try_from(step + 1).unwrap_or(i32::MAX);
-        let unbias = BETAS.map(|beta| 1.0 - beta.powi(count));
         for (name, gradient) in gradients {
-            let (Some(parameter), Some([mean, square])) =
-                (self.parameters.by_name.get_mut(name), self.moments.get_mut(name))
+            let (Some(parameter), Some(moments)) = (self.parameters.by_name.get_mut(name), self.moments.get_mut(name))
             else {
                 continue;
             };
             // Biases and scales have one dimension.
             let decay = if parameter.shape.len() > 1 { rate * self.settings.decay } else { 0.0 };
-            for (((value, mean), square), gradient) in parameter.values.iter_mut().zip(mean).zip(square).zip(gradient) {
-                let gradient = gradient * shorten;
-                *mean = BETAS[0] * *mean + (1.0 - BETAS[0]) * gradient;
-                *square = BETAS[1] * *square + (1.0 - BETAS[1]) * gradient * gradient;
-                *value -= decay * *value + rate * (*mean / unbias[0]) / ((*square / unbias[1]).sqrt() + 1e-8);
-            }
+            AdamStep { betas: BETAS, count: step + 1, rate, decay, scale: shorten, share: 0.0 }.descend(
+                &mut parameter.values,
+                moments,
+                gradient,
+            );
         }
     }
 

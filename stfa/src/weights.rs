@@ -2,11 +2,11 @@
 
 use std::{collections::HashMap, path::Path};
 
+use flyrig_learn::Parameter;
 use safetensors::SafeTensors;
 
 use crate::{
     NetworkSize, Parameters, StfaError,
-    parameters::Parameter,
     tensor_file::{TensorFile, array, read},
 };
 

@@ -59,9 +59,8 @@ fn an_avatar_is_built_scored_driven_and_exported() {
         finished.stdout
     };
     done(&["export", "a.flyavatar", "--out", "a-texture.png", "--side", "128"]);
-    let edit = |texture: &str, out: &str| {
-        done(&["edit", "a.flyavatar", "--texture", texture, "--side", "128", "--out", out])
-    };
+    let edit =
+        |texture: &str, out: &str| done(&["edit", "a.flyavatar", "--texture", texture, "--side", "128", "--out", out]);
     assert!(edit("a-texture.png", "same.flyavatar").contains("0 texels differ"));
     assert!(bytes("same.flyavatar") == bytes("a.flyavatar"));
     let mut texture = image::open(folder.path().join("a-texture.png")).unwrap().into_rgb8();

@@ -65,6 +65,42 @@ pub enum Order {
     Two,
 }
 
+/// How an avatar is learnt.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Method {
+    /// Every number of every Gaussian by itself.
+    Direct,
+    /// Networks that neighbouring Gaussians share, and an atlas of colours (LoGAvatar).
+    #[value(name = "logavatar")]
+    LogAvatar,
+}
+
+/// How the surface lies in the atlas.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Atlas {
+    /// By the body's texture coordinates.
+    Uv,
+    /// Seen from the front and from the back.
+    FrontBack,
+}
+
+/// Settings of `--method logavatar`.
+#[derive(Debug, Args)]
+pub struct LocalArgs {
+    /// Gaussians around an anchor (--method logavatar).
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=64))]
+    pub group: u8,
+    /// Stages that geometry is predicted in (--method logavatar).
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=8))]
+    pub stages: u8,
+    /// How the surface lies in the atlas of colours (--method logavatar).
+    #[arg(long, value_enum, default_value = "uv")]
+    pub atlas: Atlas,
+    /// Texels along a side of the atlas (--method logavatar).
+    #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u16).range(16..=2048))]
+    pub texels: u16,
+}
+
 #[derive(Debug, Args)]
 pub struct BuildArgs {
     #[command(flatten)]
@@ -90,9 +126,24 @@ pub struct BuildArgs {
     /// How much neighbouring Gaussians pull each other; 0 for not at all.
     #[arg(long, default_value_t = 5.0, value_parser = parse_pull)]
     pub pull: f32,
-    /// Seed of the order of images.
+    /// How the avatar is learnt.
+    #[arg(long, value_enum, default_value = "direct")]
+    pub method: Method,
+    #[command(flatten)]
+    pub local: LocalArgs,
+    /// Weight of the error of fine detail (unsharp mask); 0 for none.
+    #[arg(long, default_value_t = 0.0, value_parser = parse_sharpen)]
+    pub sharpen: f32,
+    /// Seed of the order of images, and of networks.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
+}
+
+fn parse_sharpen(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(weight) if (0.0..=100.0).contains(&weight) => Ok(weight),
+        _ => Err(format!("'{text}' is not between 0 and 100")),
+    }
 }
 
 fn parse_pull(text: &str) -> Result<f32, String> {

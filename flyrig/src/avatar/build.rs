@@ -3,16 +3,19 @@
 use std::{path::Path, time::Instant};
 
 use anyhow::{Context as _, Result, ensure};
-use flyrig_avatar::{Avatar, AvatarScene, Bones, Card, Fit, FitSettings, TrainingFrame, TrainingView};
+use flyrig_avatar::{
+    AtlasLayout, Avatar, AvatarScene, Bones, Card, ErrorWeights, Fit, FitSettings, LocalSettings, TrainingFrame,
+    TrainingView,
+};
 use flyrig_fusion::{BodySettings, Outcome, PersonId, person_surface};
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
 use flyrig_report::{frame_number, png, progress_bar, stop};
 use flyrig_types::Camera;
-use glam::DVec3;
+use glam::{DVec3, Vec2};
 
 use super::{
-    arguments::{BuildArgs, Order},
+    arguments::{Atlas, BuildArgs, LocalArgs, Method, Order},
     open_replay,
 };
 
@@ -28,6 +31,8 @@ struct Tracked {
     frames: Vec<TrainingFrame>,
     views: Vec<TrainingView>,
     avatar: Avatar,
+    /// Texture coordinates of its Gaussians.
+    uvs: Vec<Vec2>,
     numbers: [u64; 2],
     /// First camera, for pictures.
     camera: Camera,
@@ -38,7 +43,7 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
     let folder = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     ensure!(folder.is_dir(), "the folder {} does not exist; make it, or choose another --out", folder.display());
     let started = Instant::now();
-    let Tracked { frames, views, mut avatar, numbers, camera } = track(args, gpu)?;
+    let Tracked { frames, views, mut avatar, uvs, numbers, camera } = track(args, gpu)?;
     let tracked = started.elapsed();
     println!(
         "tracked {} frames in {:.0} s; fitting {} Gaussians to {} images on {}",
@@ -61,8 +66,18 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
         &avatar,
         frames,
         views,
-        FitSettings { seed: args.seed, pull: args.pull, ..FitSettings::default() },
+        FitSettings {
+            seed: args.seed,
+            pull: args.pull,
+            weights: ErrorWeights { sharpness: args.sharpen, ..ErrorWeights::default() },
+            ..FitSettings::default()
+        },
     )?;
+    if args.method == Method::LogAvatar {
+        let numbers = fit.use_networks(&mut avatar, &uvs, &local_settings(&args.local))?;
+        println!("local networks of {numbers} numbers");
+        picture(&avatar)?;
+    }
     let before = fit.decibels(&avatar)?;
     let fitting = Instant::now();
     let mut total = args.steps;
@@ -95,7 +110,7 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
     let training_db = fit.decibels(&avatar)?;
     avatar.card = Card {
         name: args.take.dataset.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned()),
-        method: "gaussians".to_owned(),
+        method: method(args),
         cameras: args.take.inputs.clone(),
         frames: numbers,
         pose: format!("{:?}", args.take.perception.pose).to_lowercase(),
@@ -114,6 +129,31 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
         picture_path.display()
     );
     Ok(())
+}
+
+fn local_settings(args: &LocalArgs) -> LocalSettings {
+    LocalSettings {
+        group: args.group.into(),
+        stages: args.stages.into(),
+        layout: match args.atlas {
+            Atlas::Uv => AtlasLayout::Uv,
+            Atlas::FrontBack => AtlasLayout::FrontBack,
+        },
+        side: args.texels.into(),
+        ..LocalSettings::default()
+    }
+}
+
+/// The method, for the card.
+fn method(args: &BuildArgs) -> String {
+    let LocalArgs { group, stages, atlas, texels } = &args.local;
+    match args.method {
+        Method::Direct => "gaussians".to_owned(),
+        Method::LogAvatar => {
+            let atlas = if *atlas == Atlas::Uv { "uv" } else { "front-back" };
+            format!("logavatar: {group} Gaussians an anchor, {stages} stages, atlas {atlas} of {texels} texels")
+        }
+    }
 }
 
 /// Tracks the person, as live.
@@ -163,5 +203,5 @@ fn track(args: &BuildArgs, gpu: &GpuContext) -> Result<Tracked> {
     let mut avatar = Avatar::new(subject.template(), &surface, deforms.then_some(&graph), &colors, order)?;
     avatar.set_mean(frames.iter().map(|frame: &TrainingFrame| frame.translations.as_slice() as &[DVec3]));
     let camera = replay.session.rig().cameras.first().cloned().context("no camera")?;
-    Ok(Tracked { frames, views, avatar, numbers: [*first, last + 1], camera })
+    Ok(Tracked { frames, views, avatar, uvs: surface.uvs, numbers: [*first, last + 1], camera })
 }

@@ -1,0 +1,347 @@
+//! LoGAvatar's local networks: the lists of an avatar's Gaussians as outputs of networks that neighbours share.
+//!
+//! Geometry: anchors spread over the surface, a group of Gaussians around each with displacements of their own (Eq. 11), and a hash
+//! encoding whose features three decoders turn into scales, rotations and opacities (Eq. 12). Further stages take the Gaussians of the stage
+//! before as their anchors and predict offsets too (Eq. 13). Texture: a neural texture, a convolutional encoder, and an atlas of spherical
+//! harmonics, in which each Gaussian looks its colour up (Eq. 14).
+//!
+//! Networks predict what is added to the start, and start at zero: the first picture is that of the avatar as it was made. They are
+//! evaluated in every step into the avatar's lists, so that at the end nothing else is needed. Encoding, groups and query are linear: their
+//! derivatives are carried back by hand, those of the layers by burn.
+
+mod atlas_map;
+mod decoders;
+mod groups;
+mod hash;
+mod texture;
+
+use std::collections::BTreeMap;
+
+use flyrig_learn::{
+    AdamStep, Moments, Parameter, Tensors,
+    burn_tensor::{Device, Tensor, TensorData},
+    drawn, to_vec,
+};
+use glam::{Vec2, Vec3, Vec4};
+
+pub use atlas_map::AtlasLayout;
+use atlas_map::AtlasMap;
+use decoders::{OFFSET_M, branches, decode};
+use groups::{Groups, farthest};
+use hash::{Box3, FEATURES, HashEncoding, LEVELS, ROWS, WIDTH};
+
+use crate::{Avatar, AvatarError, Parameters, parameters::Element};
+
+/// Exponential means of Adam.
+const BETAS: [f32; 2] = [0.9, 0.99];
+/// Share of the usual derivatives in Adam's denominator, for numbers that belong to one place: see the direct fit's Adam.
+const SHARE: f32 = 0.3;
+/// Steps after which later stages look anew where the Gaussians before them are.
+const REFRESH: u64 = 200;
+/// Derivatives are smaller than this.
+const LARGEST: f32 = 1e6;
+/// Spread of the hash tables at the start.
+const TABLE_SPREAD: f32 = 0.1;
+
+/// Settings of the local networks. Rates are at the start and at the end.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LocalSettings {
+    /// Gaussians around an anchor, in the mean.
+    pub group: usize,
+    /// Stages; all have about the same number of Gaussians.
+    pub stages: usize,
+    /// How the surface lies in the atlas.
+    pub layout: AtlasLayout,
+    /// Texels along a side of a chart.
+    pub side: usize,
+    /// Rate of displacements, metres.
+    pub displacement_rate_m: [f32; 2],
+    /// Of hash tables.
+    pub table_rate: [f32; 2],
+    /// Of decoders.
+    pub decoder_rate: [f32; 2],
+    /// Of the neural texture.
+    pub texture_rate: [f32; 2],
+    /// Of its encoder.
+    pub encoder_rate: [f32; 2],
+}
+
+impl Default for LocalSettings {
+    fn default() -> Self {
+        Self {
+            group: 4,
+            stages: 1,
+            layout: AtlasLayout::Uv,
+            side: 256,
+            displacement_rate_m: [2e-4, 2e-5],
+            table_rate: [1e-2, 1e-3],
+            decoder_rate: [2e-3, 2e-4],
+            texture_rate: [2e-2, 2e-3],
+            encoder_rate: [2e-3, 2e-4],
+        }
+    }
+}
+
+/// A stage of the geometry.
+#[derive(Debug)]
+struct Stage {
+    groups: Groups,
+    /// Places that are encoded: Gaussians of the stage before, as indices.
+    inputs: Vec<u32>,
+    encoding: HashEncoding,
+}
+
+/// Results of an evaluation that its derivatives need.
+#[derive(Debug)]
+struct Tape {
+    tensors: Tensors,
+    /// For each stage: features, outputs of all branches.
+    stages: Vec<(Tensor<2>, Vec<Tensor<2>>)>,
+    atlas: Tensor<4>,
+}
+
+/// Local networks of one avatar.
+#[derive(Debug)]
+pub(crate) struct Local {
+    settings: LocalSettings,
+    device: Device,
+    /// Lists of the avatar as it was made, without colours, and places of its Gaussians.
+    start: Parameters,
+    places: Vec<Vec3>,
+    around: Box3,
+    stages: Vec<Stage>,
+    map: AtlasMap,
+    first_atlas: Vec<f32>,
+    /// Numbers that go through burn.
+    networks: BTreeMap<String, Parameter>,
+    /// Displacements and hash tables.
+    tables: BTreeMap<String, Parameter>,
+    moments: BTreeMap<String, Moments>,
+    tape: Option<Tape>,
+    step: u64,
+}
+
+impl Local {
+    /// Networks for an avatar as it was made; `uvs` are the texture coordinates of its Gaussians, empty without any.
+    pub fn new(avatar: &Avatar, uvs: &[Vec2], settings: &LocalSettings, seed: u64) -> Result<Self, AvatarError> {
+        let places = avatar.places.clone();
+        let (count, order) = (places.len(), avatar.parameters.order());
+        let (stage_count, group) = (settings.stages.clamp(1, 8), settings.group.max(1));
+        // The first ones of farthest-point sampling are spread evenly, and so are the next ones: anchors and stages alike.
+        let size = count.div_ceil(stage_count).max(1);
+        let anchors = size.div_ceil(group);
+        let mut sampled = farthest(&places, if stage_count > 1 { size * (stage_count - 1) } else { anchors });
+        let inputs = sampled[..anchors.min(sampled.len())].to_vec();
+        let mut is_sampled = vec![false; count];
+        sampled.iter().for_each(|i| is_sampled[*i as usize] = true);
+        sampled.extend((0..count as u32).filter(|i| !is_sampled[*i as usize]));
+        let around = Box3::around(&places);
+        let mut stages: Vec<Stage> = Vec::new();
+        let mut networks = Vec::new();
+        let mut tables = vec![("displacement".to_owned(), vec![count, 4], 0.0)];
+        let mut inputs = inputs;
+        for (stage, members) in sampled.chunks(size).enumerate() {
+            let groups = Groups::new(&places, &inputs, members);
+            let encoding = HashEncoding::new(&of(&places, &inputs), around);
+            networks.extend(decoders::parameters(stage, groups.slots));
+            tables.push((format!("stage.{stage}.hash"), vec![LEVELS * ROWS, FEATURES], TABLE_SPREAD));
+            stages.push(Stage { groups, inputs: std::mem::replace(&mut inputs, members.to_vec()), encoding });
+        }
+        let map = AtlasMap::new(settings.layout, &places, uvs, settings.side)?;
+        networks.extend(texture::parameters(&map, order.coefficients()));
+        let mut start = avatar.parameters.clone();
+        let first_atlas = map.splat(&start.harmonics, order);
+        start.harmonics.fill([0.0; 4]);
+        let (networks, tables) = (drawn(networks, seed), drawn(tables, seed.wrapping_add(1)));
+        let zeros =
+            |(name, p): (&String, &Parameter)| (name.clone(), [vec![0.0; p.values.len()], vec![0.0; p.values.len()]]);
+        let moments = networks.iter().chain(&tables).map(zeros).collect();
+        Ok(Self {
+            settings: settings.clone(),
+            device: Device::flex().autodiff(),
+            start,
+            places,
+            around,
+            stages,
+            map,
+            first_atlas,
+            networks,
+            tables,
+            moments,
+            tape: None,
+            step: 0,
+        })
+    }
+
+    /// Numbers that are learnt.
+    pub fn numbers(&self) -> usize {
+        flyrig_learn::count(&self.networks) + flyrig_learn::count(&self.tables)
+    }
+
+    /// Writes what the networks say into an avatar's lists.
+    pub fn evaluate(&mut self, into: &mut Parameters) {
+        let tensors = Tensors::new(&self.networks, &self.device, true);
+        let mut lists = self.start.clone();
+        let displacement = self.tables.get("displacement").map_or(&[][..], |p| p.values.as_slice());
+        let mut stages = Vec::new();
+        for (stage, Stage { groups, inputs, encoding }) in self.stages.iter().enumerate() {
+            let table = self.tables.get(&format!("stage.{stage}.hash")).map_or(&[][..], |p| p.values.as_slice());
+            let features = table_of(encoding.encode(table), inputs.len(), WIDTH, &self.device).require_grad();
+            let outputs = decode(&tensors, &self.device, stage, &features);
+            for ((branch, columns), output) in branches(stage).iter().zip(&outputs) {
+                let values = to_vec(output.clone());
+                let (list, first, unit) = column(branch);
+                let list = &mut lists.lists_mut()[list];
+                for (cell, gaussian) in groups.cells() {
+                    let row = values.get(cell * columns..(cell + 1) * columns).unwrap_or_default();
+                    list[gaussian][first..].iter_mut().zip(row).for_each(|(value, more)| *value += unit * more);
+                }
+            }
+            if stage == 0 {
+                for (_, gaussian) in groups.cells() {
+                    let row = displacement.get(4 * gaussian..4 * gaussian + 3).unwrap_or_default();
+                    lists.offset[gaussian].iter_mut().zip(row).for_each(|(value, more)| *value += more);
+                }
+            }
+            stages.push((features, outputs));
+        }
+        let atlas = texture::encode(&tensors, &self.device);
+        let coefficients = lists.order().coefficients();
+        self.map.query(&self.first_atlas, 3, &mut lists.harmonics, coefficients);
+        self.map.query(&to_vec(atlas.clone()), 3 * coefficients, &mut lists.harmonics, coefficients);
+        *into = lists;
+        self.tape = Some(Tape { tensors, stages, atlas });
+    }
+
+    /// Descends by one step along derivatives with respect to the lists of the last evaluation. `progress` is in 0..=1.
+    pub fn descend(&mut self, slopes: &[Vec<Element>], progress: f32) {
+        let [offset, shape, rotation, harmonics] = slopes else { return };
+        let mut slopes = [offset, shape, rotation, harmonics].map(|list| finite(list));
+        self.hide_orders(&mut slopes[3], progress);
+        let gradients = self.gradients(&slopes);
+        self.step += 1;
+        for (name, gradient) in gradients {
+            let Some(rate) = self.rate(&name, progress) else { continue };
+            let (Some(parameter), Some(moments)) =
+                (self.networks.get_mut(&name).or_else(|| self.tables.get_mut(&name)), self.moments.get_mut(&name))
+            else {
+                continue;
+            };
+            // Sums of finite numbers can still be too large.
+            if gradient.len() == parameter.values.len() && gradient.iter().all(|slope| slope.is_finite()) {
+                let share = if is_local(&name) { SHARE } else { 0.0 };
+                let step = AdamStep { betas: BETAS, count: self.step, rate, decay: 0.0, scale: 1.0, share };
+                step.descend(&mut parameter.values, moments, &gradient);
+            }
+        }
+    }
+
+    /// Looks anew where the inputs of later stages are, now and then.
+    pub fn refresh(&mut self, now: &Parameters) {
+        if !self.step.is_multiple_of(REFRESH) {
+            return;
+        }
+        for stage in self.stages.iter_mut().skip(1) {
+            let moved = |i: &u32| {
+                let i = *i as usize;
+                self.places[i] + Vec4::from(now.offset[i]).truncate()
+            };
+            let places: Vec<Vec3> = stage.inputs.iter().map(moved).collect();
+            stage.encoding = HashEncoding::new(&places, self.around);
+        }
+    }
+
+    /// Derivatives with respect to all numbers from those with respect to the lists.
+    fn gradients(&mut self, slopes: &[Vec<Element>; 4]) -> BTreeMap<String, Vec<f32>> {
+        let mut gradients = BTreeMap::new();
+        let Some(Tape { tensors, stages, atlas }) = self.tape.take() else { return gradients };
+        let coefficients = self.start.order().coefficients();
+        let shape = atlas.dims();
+        let wanted = TensorData::new(self.map.backward(&slopes[3], coefficients), shape);
+        let mut total = (atlas * Tensor::<4>::from_data(wanted, &self.device)).sum();
+        let mut displacement = vec![0.0; 4 * self.places.len()];
+        for (stage, (Stage { groups, inputs, .. }, (_, outputs))) in self.stages.iter().zip(&stages).enumerate() {
+            for ((branch, columns), output) in branches(stage).iter().zip(outputs) {
+                let (list, first, unit) = column(branch);
+                let mut wanted = vec![0.0; groups.members.len() * columns];
+                for (cell, gaussian) in groups.cells() {
+                    let row = &slopes[list][gaussian][first..first + columns];
+                    wanted[cell * columns..].iter_mut().zip(row).for_each(|(out, slope)| *out = unit * slope);
+                }
+                let wanted = table_of(wanted, inputs.len(), groups.slots * columns, &self.device);
+                total = total + (output.clone() * wanted).sum();
+            }
+            if stage == 0 {
+                for (_, gaussian) in groups.cells() {
+                    displacement[4 * gaussian..4 * gaussian + 3].copy_from_slice(&slopes[0][gaussian][..3]);
+                }
+            }
+        }
+        let found = total.backward();
+        tensors.add_gradients(&found, &mut gradients);
+        for (stage, (features, _)) in stages.iter().enumerate() {
+            if let Some(slope) = features.grad(&found) {
+                gradients.insert(format!("stage.{stage}.hash"), self.stages[stage].encoding.backward(&to_vec(slope)));
+            }
+        }
+        gradients.insert("displacement".to_owned(), displacement);
+        gradients
+    }
+
+    /// Colours of higher orders come later: the first third of the steps learns order 0 alone, if there are three.
+    fn hide_orders(&self, slopes: &mut [Element], progress: f32) {
+        let order = self.start.order();
+        let orders = order.coefficients().isqrt();
+        let shown = ((progress.clamp(0.0, 1.0) * orders as f32) as usize + 1).min(orders);
+        for rows in slopes.chunks_mut(order.coefficients()) {
+            rows.iter_mut().skip(shown * shown).for_each(|row| *row = [0.0; 4]);
+        }
+    }
+
+    fn rate(&self, name: &str, progress: f32) -> Option<f32> {
+        let LocalSettings { displacement_rate_m, table_rate, decoder_rate, texture_rate, encoder_rate, .. } =
+            &self.settings;
+        let [from, to] = match name {
+            "displacement" => displacement_rate_m,
+            "texture" => texture_rate,
+            name if name.ends_with("hash") => table_rate,
+            name if name.starts_with("stage") => decoder_rate,
+            name if name.starts_with("encoder") => encoder_rate,
+            _ => return None,
+        };
+        Some(from * (to / from).powf(progress.clamp(0.0, 1.0)))
+    }
+}
+
+/// Whether numbers belong to places, so that few of them show in an image.
+fn is_local(name: &str) -> bool {
+    name == "displacement" || name == "texture" || name.ends_with("hash")
+}
+
+/// List and first column that a branch writes, and the size of one unit.
+fn column(branch: &str) -> (usize, usize, f32) {
+    match branch {
+        "offset" => (0, 0, OFFSET_M),
+        "opacity" => (1, 3, 1.0),
+        "rotation" => (2, 0, 1.0),
+        _ => (1, 0, 1.0),
+    }
+}
+
+/// The places of these.
+fn of(places: &[Vec3], indices: &[u32]) -> Vec<Vec3> {
+    indices.iter().map(|i| places[*i as usize]).collect()
+}
+
+fn table_of(values: Vec<f32>, rows: usize, columns: usize, device: &Device) -> Tensor<2> {
+    Tensor::from_data(TensorData::new(values, [rows, columns]), device)
+}
+
+/// Derivatives with those that no image gives as zero, NaN among them: through the networks one would spoil all Gaussians.
+fn finite(list: &[Element]) -> Vec<Element> {
+    list.iter().map(|row| row.map(|slope| if slope.abs() < LARGEST { slope } else { 0.0 })).collect()
+}
+
+#[cfg(test)]
+#[path = "local_tests.rs"]
+mod tests;

@@ -1,0 +1,44 @@
+//! Neural texture and its convolutional encoder: an atlas of coefficients of spherical harmonics.
+
+use flyrig_learn::{
+    Start, Tensors,
+    burn_tensor::{Device, Tensor, activation, module, ops::ConvOptions},
+};
+
+use super::{atlas_map::AtlasMap, decoders::he};
+
+/// Features of a texel of the neural texture.
+pub(super) const FEATURES: usize = 8;
+/// Channels of the encoder's hidden layers.
+pub(super) const HIDDEN: usize = 16;
+/// Spread of the neural texture at the start: little, or its noise shows where no image corrects it.
+const SPREAD: f32 = 0.05;
+/// Spread of the hidden layers' shifts: a texture without contrast has features too.
+const SHIFT: f32 = 0.3;
+
+/// Parameters for an atlas of so many coefficients. The last layer is zero: nothing is added to the first atlas.
+pub(super) fn parameters(map: &AtlasMap, coefficients: usize) -> Vec<Start> {
+    let mut list = vec![("texture".to_owned(), vec![map.charts, FEATURES, map.side, map.side], SPREAD)];
+    let layers = [
+        (FEATURES, HIDDEN, he(9 * FEATURES), SHIFT),
+        (HIDDEN, HIDDEN, he(9 * HIDDEN), SHIFT),
+        (HIDDEN, 3 * coefficients, 0.0, 0.0),
+    ];
+    for (layer, (from, to, spread, shift)) in layers.into_iter().enumerate() {
+        list.push((format!("encoder.{layer}.weight"), vec![to, from, 3, 3], spread));
+        list.push((format!("encoder.{layer}.bias"), vec![to], shift));
+    }
+    list
+}
+
+/// The atlas (chart, channel, row, column), without the first one.
+pub(super) fn encode(tensors: &Tensors, device: &Device) -> Tensor<4> {
+    let conv = |x: Tensor<4>, layer: usize| {
+        let weight = tensors.get(&format!("encoder.{layer}.weight"), device);
+        let bias = tensors.get(&format!("encoder.{layer}.bias"), device);
+        module::conv2d(x, weight, Some(bias), ConvOptions::new([1; 2], [1; 2], [1; 2], 1))
+    };
+    let x = activation::relu(conv(tensors.get("texture", device), 0));
+    let x = activation::relu(conv(x, 1));
+    conv(x, 2)
+}
