@@ -188,7 +188,7 @@ fn composite(mut near: Vec<(f32, usize, f32)>, shown: &Shown, colors: &[Vec3]) -
 /// Calls `visit(index, barycentric)` for the texels whose centres lie in a triangle.
 fn each_texel([a, b, c]: [Vec2; 3], side: u32, mut visit: impl FnMut(usize, [f32; 3])) {
     let area = (b - a).perp_dot(c - a);
-    if !(area.abs() > 1e-12) {
+    if area.abs() < 1e-12 || !area.is_finite() {
         return;
     }
     let range = |low: f32, high: f32| (low.floor().max(0.0) as u32, (high.ceil().max(0.0) as u32).min(side));

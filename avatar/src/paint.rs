@@ -277,7 +277,8 @@ mod tests {
         for i in (0..6000).filter(|i| shown.place[*i].distance(chest) > 0.3) {
             assert!(
                 avatar.places[i] == before.places[i]
-                    && avatar.parameters.harmonics[4 * i] == before.parameters.harmonics[4 * i]
+                    && avatar.parameters.harmonics[4 * i].map(f32::to_bits)
+                        == before.parameters.harmonics[4 * i].map(f32::to_bits)
             );
         }
     }

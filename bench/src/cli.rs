@@ -136,6 +136,7 @@ impl ReplayArgs {
             lags_nanos: Default::default(),
             true_masks: false,
             true_joints: Vec::new(),
+            body: None,
         }
     }
 }

@@ -133,6 +133,7 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         lags_nanos: BTreeMap::new(),
         true_masks: true,
         true_joints: args.true_joints.clone(),
+        body: None,
     };
     let mut replay = Replay::open(&settings, gpu)?;
     let holdout = replay.holdout.clone();

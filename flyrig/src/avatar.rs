@@ -11,6 +11,7 @@ use std::path::Path;
 
 use anyhow::Result;
 use flyrig_avatar::Avatar;
+use flyrig_body::Template;
 use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, SessionSettings};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{Replay, ReplaySettings};
@@ -47,7 +48,14 @@ fn load(path: &Path) -> Result<Avatar> {
 }
 
 /// Opens a take to be tracked.
-fn open_replay(take: &TakeArgs, holdout: &[String], body: &BodySettings, gpu: &GpuContext) -> Result<Replay> {
+///
+/// With a known body an estimated pose moves that one.
+fn open_replay(
+    take: &TakeArgs,
+    holdout: &[String],
+    (body, known): (&BodySettings, Option<&Template>),
+    gpu: &GpuContext,
+) -> Result<Replay> {
     let settings = ReplaySettings {
         dataset: take.dataset.clone(),
         inputs: take.inputs.clone(),
@@ -64,6 +72,7 @@ fn open_replay(take: &TakeArgs, holdout: &[String], body: &BodySettings, gpu: &G
         lags_nanos: take.lags.nanos(),
         true_masks: false,
         true_joints: Vec::new(),
+        body: known.cloned(),
     };
     Replay::open(&settings, gpu)
 }

@@ -67,6 +67,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         lags_nanos: args.lags.nanos(),
         true_masks: false,
         true_joints: Vec::new(),
+        body: None,
     };
     let mut replay = Replay::open(&settings, gpu)?;
     let holdout = replay.holdout.clone();

@@ -7,11 +7,11 @@ use std::{
 };
 
 use anyhow::{Context, Result, bail};
-use flyrig_body::{ShapeParams, default_template, load_gltf};
+use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
 use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay, to_rgb8};
 use flyrig_fusion::{
-    EstimatedPerception, GivenPerception, GivenPerson, Origin, PersonId, SHAPE_SECS, SHAPE_SETS, Session,
-    SessionBuilder, SessionSettings, SetReader, next_frame,
+    EstimatedPerception, GivenPerception, GivenPerson, Origin, PerceptionSettings, PersonId, SHAPE_SECS, SHAPE_SETS,
+    Session, SessionBuilder, SessionSettings, SetReader, next_frame,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::ColorMatcher;
@@ -42,6 +42,8 @@ pub struct ReplaySettings {
     /// Parts of the names of joints whose estimated orientation is replaced by the true one; "place" for the root's position. Needs an
     /// estimated pose and the given shape.
     pub true_joints: Vec<String>,
+    /// The person's body where it is known, dressed: an estimated pose then moves it, and no shape is learnt.
+    pub body: Option<Template>,
 }
 
 /// A data set that is replayed into a session.
@@ -82,7 +84,10 @@ impl Replay {
                 builder.perception(perception)
             }
             Origin::Estimated => {
-                if perceived.shape() == Origin::Given {
+                if let Some(body) = &settings.body {
+                    let perceived = PerceptionSettings { shape: Some(Origin::Given), ..perceived.clone() };
+                    builder.perception(EstimatedPerception::new(&rig, body, &perceived, &plates)?)
+                } else if perceived.shape() == Origin::Given {
                     let GivenPerson { template, track, .. } = given_person(&settings.dataset)?;
                     let mut inner = EstimatedPerception::new(&rig, &template, perceived, &plates)?;
                     inner.find_outfits(&first_sets(settings, &rig)?)?;

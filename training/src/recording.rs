@@ -62,6 +62,7 @@ fn leave_out(
         lags_nanos: BTreeMap::new(),
         true_masks: false,
         true_joints: Vec::new(),
+        body: None,
     };
     let appearance = settings.session.appearance.mode.settings();
     let mut replay = Replay::open(&settings, gpu)?;

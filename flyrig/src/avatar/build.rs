@@ -159,7 +159,7 @@ fn method(args: &BuildArgs) -> String {
 /// Tracks the person, as live.
 fn track(args: &BuildArgs, gpu: &GpuContext) -> Result<Tracked> {
     let body = BodySettings { gaussians: args.gaussians as usize, nodes: args.nodes, ..BodySettings::default() };
-    let mut replay = open_replay(&args.take, &[], &body, gpu)?;
+    let mut replay = open_replay(&args.take, &[], (&body, None), gpu)?;
     let person = PersonId::default();
     let (mut frames, mut views, mut numbers) = (Vec::new(), Vec::new(), Vec::new());
     let bar = progress_bar(replay.count as u64, "track");

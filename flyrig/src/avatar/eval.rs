@@ -36,7 +36,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     if !args.deformed {
         take.tracking.solver = Solver::None;
     }
-    let mut replay = open_replay(&take, &args.holdout, &body, gpu)?;
+    let mut replay = open_replay(&take, &args.holdout, (&body, Some(&avatar.template)), gpu)?;
     let holdout = replay.holdout.clone();
     for camera in &holdout {
         let folder = args.out.join(camera.id.as_str());
