@@ -50,7 +50,10 @@ use flyrig_report::{
 
 use crate::cli::{BenchCommand, Cli};
 
+#[allow(unsafe_code)]
 fn main() -> ExitCode {
+    // SAFETY: no other thread runs yet.
+    unsafe { flyrig_transport::use_one_network_thread() };
     let cli = Cli::parse();
     program::start_log(cli.verbose, false);
     program::exit_code(traced(cli.trace.as_deref(), || dispatch(&cli)))

@@ -50,9 +50,12 @@ pub fn check_config(text: &str) -> Result<(), String> {
     Config::parse(text).map(|_| ()).map_err(|error| program::one_line(&error))
 }
 
-/// Runs the command line of this process.
+/// Runs the command line of this process. For the beginning of `main`, before any other thread runs.
 #[must_use]
+#[allow(unsafe_code)]
 pub fn main() -> ExitCode {
+    // SAFETY: no other thread runs yet.
+    unsafe { flyrig_transport::use_one_network_thread() };
     let cli = Cli::parse();
     program::start_log(cli.verbose, cli.log_json);
     program::exit_code(traced(cli.trace.as_deref(), || dispatch(&cli)))

@@ -10,6 +10,7 @@ use zenoh::{Session, Wait};
 use crate::{
     TransportConfig, TransportError, access_rules,
     config::{is_loopback, tls_endpoint},
+    network_threads::check_network_threads,
 };
 
 /// Bytes that the system keeps between a session and its gate.
@@ -57,6 +58,9 @@ pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> 
         Some(key) => vec![tls_endpoint(key.address())],
         None => config.connect.clone(),
     };
+    if ring.is_some() || config.key.is_some() {
+        check_network_threads();
+    }
     for attempt in 1.. {
         let endpoints: Vec<String> = config.listen.iter().map(|endpoint| with_free_port(endpoint)).collect();
         let behind =
