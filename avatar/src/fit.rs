@@ -2,10 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use flyrig_gpu::{GpuContext, StorageBuffer, read_all};
+use flyrig_gpu::{GpuContext, read_all};
 use flyrig_renderer::{
-    AnisotropicBuffers, AnisotropicGradients, BackwardRasterizer, HarmonicOrder, ImageGradients, Outputs,
-    RasterSettings, Rasterizer, RenderTarget,
+    AnisotropicGradients, BackwardRasterizer, HarmonicOrder, ImageGradients, Outputs, RasterSettings, Rasterizer,
+    RenderTarget,
 };
 use flyrig_types::Camera;
 use glam::{DVec3, Vec2};
@@ -13,7 +13,7 @@ use rand::{SeedableRng as _, rngs::StdRng, seq::SliceRandom as _};
 
 use crate::{
     Avatar, AvatarError, Bones, ErrorWeights, ImageError, LocalSettings, PosedAvatar, adam::Adam, local::Local,
-    neighbors::Neighbors, parameters::Element,
+    neighbors::Neighbors, parameters::Element, scene::AvatarBuffers,
 };
 
 /// Images are cut to the person and so many pixels around.
@@ -150,7 +150,7 @@ pub struct Fit {
     views: Vec<TrainingView>,
     rasterizer: Rasterizer,
     backward: BackwardRasterizer,
-    gaussians: AnisotropicBuffers,
+    buffers: AvatarBuffers,
     gradients: AnisotropicGradients,
     targets: BTreeMap<[u32; 2], Targets>,
     posed: PosedAvatar,
@@ -195,7 +195,7 @@ impl Fit {
             gpu: gpu.clone(),
             rasterizer: Rasterizer::new(gpu, count)?,
             backward: BackwardRasterizer::new(gpu)?,
-            gaussians: AnisotropicBuffers::zeroed(gpu, count, order)?,
+            buffers: AvatarBuffers::new(gpu, avatar)?,
             gradients: AnisotropicGradients::zeroed(gpu, count, order)?,
             targets,
             posed: PosedAvatar::default(),
@@ -258,7 +258,7 @@ impl Fit {
             &self.gpu,
             &mut encoder,
             &self.rasterizer,
-            &self.gaussians,
+            &self.buffers.gaussians,
             drawn,
             slopes,
             &self.gradients,
@@ -323,27 +323,19 @@ impl Fit {
         let frame = &self.frames[view.frame];
         let translations = (!frame.translations.is_empty()).then_some(frame.translations.as_slice());
         avatar.pose(&frame.bones, translations, &mut self.posed);
-        write(&self.gpu, &self.gaussians, &self.posed, avatar);
+        self.buffers.pose(&self.gpu, &self.posed, avatar);
+        self.buffers.look(&self.gpu, &self.posed, &view.camera);
         let Some(Targets { drawn, .. }) = self.targets.get(&view.size()) else {
             return Err(AvatarError::Images("an image has no target".to_owned()));
         };
         let settings =
             RasterSettings { outputs: Outputs { canonical: false, ..Outputs::ALL }, ..RasterSettings::default() };
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-        self.rasterizer.encode(&self.gpu, &mut encoder, &self.gaussians, &view.camera, &settings, drawn)?;
+        self.rasterizer.encode(&self.gpu, &mut encoder, &self.buffers.gaussians, &view.camera, &settings, drawn)?;
         self.gpu.queue.submit([encoder.finish()]);
         let pixels = drawn.color.read(&self.gpu)?;
         Ok(ImageError::of(&pixels, &view.rgba, view.size()[0] as usize, &self.settings.weights))
     }
-}
-
-/// Writes a posed avatar into the buffers that are drawn.
-pub(crate) fn write(gpu: &GpuContext, buffers: &AnisotropicBuffers, posed: &PosedAvatar, avatar: &Avatar) {
-    let put = |buffer: &StorageBuffer<Element>, content: &[Element]| buffer.write(gpu, content);
-    put(&buffers.center, &posed.center);
-    put(&buffers.scale_opacity, &posed.scale_opacity);
-    put(&buffers.rotation, &posed.rotation);
-    put(&buffers.harmonics, &avatar.parameters.harmonics);
 }
 
 /// Adam's steps do not depend on the size of derivatives, but on that of a few against the others: of the higher coefficients a share counts.

@@ -4,8 +4,9 @@
 //! quaternions.
 
 use flyrig_body::{Skeleton, SkinWeights, displacement};
+use flyrig_renderer::BACKFACING_COSINE;
 use flyrig_types::Pose;
-use glam::{DMat4, DVec3, Mat3, Mat4, Quat, Vec4};
+use glam::{DMat4, DVec3, Mat3, Mat4, Quat, Vec3, Vec4};
 use rayon::prelude::*;
 
 use crate::{Avatar, Parameters, parameters::Element};
@@ -54,6 +55,8 @@ struct Place {
     rotation: Quat,
     /// By which its scales grow where the surface is stretched.
     growth: f32,
+    /// Normal of the surface that it hangs on.
+    normal: Vec3,
 }
 
 /// An avatar in the world: elements for [`flyrig_renderer::AnisotropicBuffers`].
@@ -95,7 +98,8 @@ impl Avatar {
             let [sx, sy, sz] = [x, y, z].map(|logarithm| growth * scale(logarithm));
             let center = blend.transform_point3(canonical).extend(0.0).to_array();
             let turned = turn * Quat::from_array(rotation[i]);
-            let place = Place { linear: Mat3::from_mat4(blend), rotation: turn, growth };
+            let normal = turn * self.attachments[i].blend(&self.template, &self.template.normals).normalize_or_zero();
+            let place = Place { linear: Mat3::from_mat4(blend), rotation: turn, growth, normal };
             ((center, [sx, sy, sz, sigmoid(logit)]), (turned.to_array(), place))
         };
         let rows: Vec<_> = (0..self.places.len()).into_par_iter().with_min_len(1024).map(of).collect();
@@ -113,6 +117,21 @@ impl Avatar {
 }
 
 impl PosedAvatar {
+    /// Copies scales and opacities; Gaussians of a surface that faces away from `eye` have none there. Opacities stay below 1, so that the far
+    /// side of the body would show through the near one. Returns how many were left out.
+    pub(crate) fn facing(&self, eye: Vec3, scale_opacity: &mut Vec<Element>) -> usize {
+        scale_opacity.clone_from(&self.scale_opacity);
+        let mut hidden = 0;
+        for ((row, center), place) in scale_opacity.iter_mut().zip(&self.center).zip(&self.places) {
+            let away = Vec4::from(*center).truncate() - eye;
+            if place.normal.dot(away) > BACKFACING_COSINE as f32 * away.length() {
+                row[3] = 0.0;
+                hidden += 1;
+            }
+        }
+        hidden
+    }
+
     /// Turns derivatives with respect to centres, scales and opacities, and rotations in the world into those of the parameters, in place:
     /// offsets, logarithms and logits, canonical rotations.
     pub(crate) fn to_parameters(&self, derivatives: [&mut [Element]; 3]) {
@@ -181,6 +200,24 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn the_far_side_is_left_out() {
+        let avatar = small(2000, 7);
+        let bones = Bones::new(&avatar.template.skeleton, &avatar.template.skeleton.rest_pose());
+        let mut posed = PosedAvatar::default();
+        avatar.pose(&bones, None, &mut posed);
+        let mut shown = Vec::new();
+        // From the front, and from behind: together they draw every Gaussian, and those at the sides twice.
+        let mut count = |z: f32| {
+            let hidden = posed.facing(Vec3::new(0.0, 1.0, z), &mut shown);
+            assert_eq!(hidden, shown.iter().filter(|row| row[3] <= 0.0).count());
+            2000 - hidden
+        };
+        let (front, back) = (count(4.0), count(-4.0));
+        assert!(front + back > 2000 && front < 1600 && back < 1600, "{front} {back}");
+        assert_eq!(posed.facing(Vec3::NAN, &mut shown), 0);
     }
 
     #[test]

@@ -154,6 +154,9 @@ pub fn play(args: &PlayArgs) -> Result<()> {
     publisher.set_calibration(&rig)?;
     let endpoint = publisher.endpoints().join(", ");
     eprintln!("play: rig '{}' on {endpoint}; flyrig view --rig {0} --connect {endpoint} shows it", args.rig);
+    if let Some(address) = publisher.gate() {
+        eprintln!("play: holders of keys connect at {address}");
+    }
     let stopped = || stop.load(std::sync::atomic::Ordering::Relaxed);
     if args.wait {
         eprintln!("play: waiting for a viewer");

@@ -44,7 +44,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     }
     let mut scene = AvatarScene::new(gpu, &avatar)?;
     let bar = progress_bar(replay.count as u64, "avatar eval");
-    let (mut sheet, mut spent, mut drawn) = (ScoreSheet::default(), Duration::ZERO, 0u32);
+    let (mut sheet, mut spent, mut drawn, mut hidden) = (ScoreSheet::default(), Duration::ZERO, 0u32, 0);
     while let Some(set) = replay.next_set()? {
         bar.inc(1);
         let number = frame_number(&set);
@@ -57,7 +57,11 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         let start = Instant::now();
         let translations = args.deformed.then(|| subject.node_translations()).filter(|all| !all.is_empty());
         scene.pose(&avatar, &Bones::new(&avatar.template.skeleton, pose), translations);
-        let views = holdout.iter().map(|camera| scene.draw(camera)).collect::<Result<Vec<_>, _>>()?;
+        let mut views = Vec::new();
+        for camera in &holdout {
+            views.push(scene.draw(camera)?);
+            hidden += scene.hidden();
+        }
         spent += start.elapsed();
         drawn += views.len() as u32;
         let truths = replay.truth.at(set.master_nanos)?;
@@ -90,8 +94,9 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     write_whole(&args.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
     print!("{}", sheet.table());
     println!(
-        "\n{drawn} views of {} Gaussians, {view_ms:.1} ms each; images in {}",
+        "\n{drawn} views of {} Gaussians, {:.0} % of them left out as they face away, {view_ms:.1} ms each; images in {}",
         avatar.gaussians(),
+        100.0 * hidden as f64 / f64::from(drawn) / avatar.gaussians() as f64,
         args.out.display()
     );
     Ok(())
