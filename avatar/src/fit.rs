@@ -324,7 +324,6 @@ impl Fit {
         let translations = (!frame.translations.is_empty()).then_some(frame.translations.as_slice());
         avatar.pose(&frame.bones, translations, &mut self.posed);
         self.buffers.pose(&self.gpu, &self.posed, avatar);
-        self.buffers.look(&self.gpu, &self.posed, &view.camera);
         let Some(Targets { drawn, .. }) = self.targets.get(&view.size()) else {
             return Err(AvatarError::Images("an image has no target".to_owned()));
         };

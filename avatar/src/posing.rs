@@ -4,7 +4,6 @@
 //! quaternions.
 
 use flyrig_body::{Skeleton, SkinWeights, displacement};
-use flyrig_renderer::BACKFACING_COSINE;
 use flyrig_types::Pose;
 use glam::{DMat4, DVec3, Mat3, Mat4, Quat, Vec3, Vec4};
 use rayon::prelude::*;
@@ -13,6 +12,10 @@ use crate::{Avatar, Parameters, parameters::Element};
 
 /// Scales beyond these are not drawn, metres: an avatar is neither dust nor a room.
 const SCALE_M: std::ops::RangeInclusive<f32> = 2e-4..=0.1;
+
+/// Cosine between a surface's normal and the direction of sight from which it is not drawn. Lower ones cut the silhouette, where fitted
+/// Gaussians are rounder than the mesh: 0.35 costs 0.09 dB on d1 (docs/benchmarks/avatar.md).
+const AWAY: f32 = 0.7;
 
 /// Rigid motions of the bones in one pose.
 #[derive(Debug, Clone)]
@@ -124,7 +127,7 @@ impl PosedAvatar {
         let mut hidden = 0;
         for ((row, center), place) in scale_opacity.iter_mut().zip(&self.center).zip(&self.places) {
             let away = Vec4::from(*center).truncate() - eye;
-            if place.normal.dot(away) > BACKFACING_COSINE as f32 * away.length() {
+            if place.normal.dot(away) > AWAY * away.length() {
                 row[3] = 0.0;
                 hidden += 1;
             }
@@ -216,7 +219,7 @@ mod tests {
             2000 - hidden
         };
         let (front, back) = (count(4.0), count(-4.0));
-        assert!(front + back > 2000 && front < 1600 && back < 1600, "{front} {back}");
+        assert!(front + back > 2000 && front < 1800 && back < 1800, "{front} {back}");
         assert_eq!(posed.facing(Vec3::NAN, &mut shown), 0);
     }
 

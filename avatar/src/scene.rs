@@ -22,6 +22,7 @@ impl AvatarBuffers {
 
     pub fn pose(&self, gpu: &GpuContext, posed: &PosedAvatar, avatar: &Avatar) {
         self.gaussians.center.write(gpu, &posed.center);
+        self.gaussians.scale_opacity.write(gpu, &posed.scale_opacity);
         self.gaussians.rotation.write(gpu, &posed.rotation);
         self.gaussians.harmonics.write(gpu, &avatar.parameters.harmonics);
     }

@@ -33,6 +33,13 @@ const LATER_TRIAL: Duration = Duration::from_secs(8);
 const MOST_PATIENCE: Duration = Duration::from_secs(240);
 /// A trial that lasts so long has succeeded.
 const SUCCESS: Duration = Duration::from_secs(10);
+/// A template fills the line, so it shows the bytes a second that are carried, if it has so many bytes, for so long.
+const LEAST_FETCH_BYTES: usize = 200_000;
+const CARRIED_FOR: Duration = Duration::from_secs(300);
+/// Growth of the bytes a second that a layer brings at least: where the line does not carry that, a trial would stop motion for seconds, and
+/// comes after this patience alone.
+const GROWTH: f64 = 1.6;
+const UNLIKELY_TRIAL: Duration = Duration::from_secs(60);
 
 /// Decides how many layers to subscribe to.
 #[derive(Debug)]
@@ -47,6 +54,13 @@ pub(crate) struct ColorLayers {
     missed: u64,
     /// Templates that are being fetched: they fill the line, whatever it carries.
     fetches: usize,
+    /// Since when, and bytes that came since then.
+    fetched: Option<(Instant, usize)>,
+    /// Bytes a second that the last ones came with, and when.
+    carries: Option<(Instant, f64)>,
+    /// Bytes of motion and colours in this window, and a second in the last one.
+    bytes: usize,
+    bytes_per_sec: f64,
     /// When the last motion arrived.
     last: Option<Instant>,
     window_began: Instant,
@@ -67,6 +81,10 @@ impl ColorLayers {
             latencies: Vec::new(),
             missed: 0,
             fetches: 0,
+            fetched: None,
+            carries: None,
+            bytes: 0,
+            bytes_per_sec: 0.0,
             last: None,
             window_began: now,
             changed: None,
@@ -92,11 +110,33 @@ impl ColorLayers {
         }
     }
 
-    /// A template is being fetched from now on, or has come. Nothing is judged meanwhile, nor until queues are empty again.
-    pub fn fetch(&mut self, now: Instant, begins: bool) {
-        self.fetches = if begins { self.fetches + 1 } else { self.fetches.saturating_sub(1) };
+    /// A template is being fetched from now on. Nothing is judged meanwhile, nor until queues are empty again.
+    pub fn fetch_begins(&mut self, now: Instant) {
+        self.fetches += 1;
+        self.fetched.get_or_insert((now, 0));
         self.changed = Some((now, false));
         self.clear_since = None;
+    }
+
+    /// A template has come with so many bytes; none where it has not.
+    pub fn fetch_ends(&mut self, now: Instant, bytes: usize) {
+        self.fetches = self.fetches.saturating_sub(1);
+        self.changed = Some((now, false));
+        self.clear_since = None;
+        let Some((begun, sum)) = &mut self.fetched else { return };
+        *sum = sum.saturating_add(bytes);
+        if self.fetches == 0 {
+            if *sum >= LEAST_FETCH_BYTES {
+                let secs = now.duration_since(*begun).as_secs_f64().max(1e-3);
+                self.carries = Some((now, *sum as f64 / secs));
+            }
+            self.fetched = None;
+        }
+    }
+
+    /// Counts the bytes of a message of motion or colours.
+    pub fn count(&mut self, bytes: usize) {
+        self.bytes = self.bytes.saturating_add(bytes);
     }
 
     /// Takes in the arrival of a motion: its latency by any two clocks, and the number of motions that were missed before it.
@@ -111,6 +151,8 @@ impl ColorLayers {
         }
         let mut latencies = std::mem::take(&mut self.latencies);
         let missed = std::mem::take(&mut self.missed) as f64;
+        self.bytes_per_sec =
+            std::mem::take(&mut self.bytes) as f64 / now.duration_since(self.window_began).as_secs_f64();
         self.window_began = now;
         if !self.is_begun || self.fetches > 0 {
             return;
@@ -167,8 +209,10 @@ impl ColorLayers {
             self.changed = Some((now, false));
             return;
         }
-        let is_due =
-            now.duration_since(clear_since) >= self.patience && since_change.is_none_or(|since| since >= self.patience);
+        let carried = self.carries.filter(|(at, _)| now.duration_since(*at) < CARRIED_FOR);
+        let is_unlikely = carried.is_some_and(|(_, carried)| GROWTH * self.bytes_per_sec > carried);
+        let patience = if is_unlikely { self.patience.max(UNLIKELY_TRIAL) } else { self.patience };
+        let is_due = now.duration_since(clear_since) >= patience && since_change.is_none_or(|since| since >= patience);
         if is_due && self.wanted < LAYERS {
             self.wanted += 1;
             self.carried = self.wanted;
@@ -187,6 +231,9 @@ mod tests {
         layers.begin();
         layers
     }
+
+    /// Bytes of a motion, and of each layer.
+    const BYTES: [usize; LAYERS + 1] = [4_000, 1_700, 4_000, 13_000];
 
     /// A line that carries so many layers: with more of them a queue fills up to half a second, and empties at the same pace.
     struct Line {
@@ -215,6 +262,7 @@ mod tests {
                 self.queue_nanos = (self.queue_nanos + step).clamp(0, 500_000_000);
                 late += usize::from(self.queue_nanos > 100_000_000);
                 // A clock that is an hour ahead.
+                self.layers.count(BYTES[..=sent].iter().sum());
                 self.layers.motion(self.now, 3_600_000_000_000 + 50_000_000 + self.queue_nanos, 0);
                 counts[self.layers.wanted()] += 1;
             }
@@ -272,13 +320,47 @@ mod tests {
     fn a_template_fills_the_line_without_a_judgement() {
         let mut line = Line::new(LAYERS);
         line.run(10);
-        line.layers.fetch(line.now, true);
+        line.layers.fetch_begins(line.now);
         line.carries = 0;
         line.run(5);
-        line.layers.fetch(line.now, false);
+        line.layers.fetch_ends(line.now, 0);
         line.carries = LAYERS;
         line.run(5);
         assert_eq!(line.layers.wanted(), LAYERS);
+    }
+
+    /// Fetches a template of 1.2 MB with so many bytes a second.
+    fn fetch(line: &mut Line, bytes_per_sec: f64) {
+        line.layers.fetch_begins(line.now);
+        line.now += Duration::from_secs_f64(1.2e6 / bytes_per_sec);
+        line.layers.fetch_ends(line.now, 1_200_000);
+        line.run(1);
+    }
+
+    #[test]
+    fn a_layer_that_the_template_showed_not_to_fit_is_not_tried_at_once() {
+        let mut line = Line::new(2);
+        fetch(&mut line, 330e3);
+        let (late, shares) = line.run(45);
+        assert!(late <= 0.0 && shares[2] > 0.7 && shares[3] <= 0.0, "{late} {shares:?}");
+        // The line may have become faster.
+        line.carries = LAYERS;
+        line.run(60);
+        assert_eq!(line.layers.wanted(), LAYERS);
+    }
+
+    #[test]
+    fn a_fast_template_delays_no_layer_and_a_small_one_shows_nothing() {
+        for (rate, bytes) in [(1.2e6, 1_200_000), (1e3, 1_000)] {
+            let mut line = Line::new(LAYERS);
+            line.layers.fetch_begins(line.now);
+            line.layers.fetch_begins(line.now);
+            line.now += Duration::from_secs_f64(bytes as f64 / rate);
+            line.layers.fetch_ends(line.now, 0);
+            line.layers.fetch_ends(line.now, bytes);
+            line.run(5);
+            assert_eq!(line.layers.wanted(), LAYERS, "{rate}");
+        }
     }
 
     #[test]

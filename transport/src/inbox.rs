@@ -131,9 +131,14 @@ impl Inbox {
         lock(&self.color_layers).wanted()
     }
 
-    /// A template is being fetched from now on, or has come.
-    pub(crate) fn fetch(&self, begins: bool) {
-        lock(&self.color_layers).fetch(Instant::now(), begins);
+    /// A template is being fetched from now on.
+    pub(crate) fn fetch_begins(&self) {
+        lock(&self.color_layers).fetch_begins(Instant::now());
+    }
+
+    /// A template has come with so many bytes; none where it has not.
+    pub(crate) fn fetch_ends(&self, bytes: usize) {
+        lock(&self.color_layers).fetch_ends(Instant::now(), bytes);
     }
 
     pub(crate) fn have_colors_begun(&self) -> bool {
@@ -255,6 +260,9 @@ impl Inbox {
         let missed_before = slot.tally.totals.missed;
         slot.tally.add(&header, payload.len(), now, latency_nanos, exact);
         slot.tally.totals.replaced += u64::from(is_replaced);
+        if matches!(expected, MessageKind::Motion | MessageKind::Colors) {
+            lock(&self.color_layers).count(payload.len());
+        }
         if expected == MessageKind::Motion {
             let missed = slot.tally.totals.missed.saturating_sub(missed_before);
             lock(&self.color_layers).motion(now, latency_nanos, missed);

@@ -194,9 +194,10 @@ impl PersonSubscription {
         let paused = if self.inbox.have_colors_begun() { None } else { lock(&self.motion).take() };
         let was_watching = paused.is_some();
         drop(paused);
-        self.inbox.fetch(true);
+        self.inbox.fetch_begins();
         let answer = ask_template(&self.session, &self.rig, hash, timeout);
-        self.inbox.fetch(false);
+        let bytes = answer.as_ref().ok().and_then(Option::as_ref).map_or(0, Vec::len);
+        self.inbox.fetch_ends(bytes);
         if was_watching {
             self.begin_motion()?;
         }
