@@ -7,7 +7,8 @@ use flyrig_avatar::{Atlas, Avatar, Bones, PosedAvatar, write_splat_glb};
 use flyrig_body::{GlbContents, write_glb};
 use flyrig_renderer::{AnisotropicSplats, write_anisotropic_ply};
 use flyrig_report::{png, write_whole};
-use glam::Quat;
+use flyrig_types::PoseTrack;
+use glam::{DQuat, Quat};
 
 use super::{
     arguments::ExportArgs,
@@ -51,11 +52,25 @@ fn encode(atlas: &Atlas) -> Result<Vec<u8>> {
 
 fn mesh(avatar: &Avatar, args: &ExportArgs) -> Result<()> {
     let texture = encode(&avatar.atlas(args.side)?)?;
-    let track = args.motion.as_deref().map(|path| motion(avatar, path)).transpose()?;
+    let track = args.motion.as_deref().map(|path| y_up(&motion(avatar, path)?)).transpose()?;
     write_glb(&args.out, &avatar.template, GlbContents { track: track.as_ref(), texture: Some(&texture) })?;
     let (vertices, joints) = (avatar.template.positions.len(), avatar.template.skeleton.joints().len());
     println!("textured mesh of {vertices} vertices with {joints} joints in {}", args.out.display());
     Ok(())
+}
+
+/// Turns a motion, which has z up, to glTF's y.
+fn y_up(track: &PoseTrack) -> Result<PoseTrack> {
+    let turn = DQuat::from_rotation_x(-std::f64::consts::FRAC_PI_2);
+    let turned = track.keys().iter().map(|(nanos, pose)| {
+        let mut pose = pose.clone();
+        pose.root_translation = turn * pose.root_translation;
+        if let Some(root) = pose.joint_rotations.first_mut() {
+            *root = (turn * *root).normalize();
+        }
+        (*nanos, pose)
+    });
+    Ok(PoseTrack::new(turned.collect())?)
 }
 
 fn splats(avatar: &Avatar, args: &ExportArgs, ending: &str) -> Result<()> {
