@@ -99,7 +99,7 @@ pub struct Take {
 pub struct Kept {
     /// Number of the frame in the data set.
     pub number: u64,
-    /// What the stream's encoder takes.
+    /// Input of the stream's encoder.
     pub frame: PersonFrame,
     /// Centres, standard deviations and colours, in the order of the session.
     pub splats: SplatState,
