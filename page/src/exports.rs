@@ -88,6 +88,12 @@ pub extern "C" fn centers() -> *const [f32; 4] {
     with(|state| state.page.centers().as_ptr())
 }
 
+/// Address of the normals, four floats a Gaussian.
+#[unsafe(no_mangle)]
+pub extern "C" fn normals() -> *const [f32; 4] {
+    with(|state| state.page.normals().as_ptr())
+}
+
 /// Address of the linear RGB and opacities, four floats a Gaussian.
 #[unsafe(no_mangle)]
 pub extern "C" fn colors() -> *const [f32; 4] {
@@ -114,7 +120,13 @@ pub extern "C" fn order_length() -> usize {
     ORDERED.get()
 }
 
-/// Address of the camera of the last [`order`], [`crate::CAMERA_FLOATS`] floats.
+/// [`Page::look`]; returns 1 once the rig is known.
+#[unsafe(no_mangle)]
+pub extern "C" fn look(width: u32, height: u32) -> u32 {
+    with(|state| state.page.look(width, height).is_some().into())
+}
+
+/// Address of the camera of the last [`look`] or [`order`], [`crate::CAMERA_FLOATS`] floats.
 #[unsafe(no_mangle)]
 pub extern "C" fn camera() -> *const f32 {
     with(|state| state.page.camera().as_ptr())

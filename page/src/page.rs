@@ -3,7 +3,7 @@
 use std::{fmt, sync::Arc};
 
 use flyrig_stream::{Posed, StreamError, StreamTemplate};
-use flyrig_types::Rig;
+use flyrig_types::{Camera, Rig};
 use flyrig_viewing::{Navigation, People, Taken};
 use glam::DVec3;
 
@@ -158,7 +158,15 @@ impl Page {
 
     /// Returns the indices of the Gaussians to draw into an image of this size, farthest first; nothing before the rig is known.
     pub fn order(&mut self, width: u32, height: u32) -> &[u32] {
-        let Some(navigation) = &self.navigation else { return &[] };
+        match self.look(width, height) {
+            Some(camera) => self.order.sort(&camera, &self.centers, &self.normals),
+            None => &[],
+        }
+    }
+
+    /// Returns the camera for an image of this size and keeps its numbers ([`Self::camera`]); nothing before the rig is known.
+    pub fn look(&mut self, width: u32, height: u32) -> Option<Camera> {
+        let navigation = self.navigation.as_ref()?;
         let camera = navigation.camera(width.clamp(1, 16_384), height.clamp(1, 16_384));
         let from_world = camera.camera_from_world;
         let matrix = glam::DMat4::from_rotation_translation(from_world.rotation, from_world.translation);
@@ -170,10 +178,10 @@ impl Page {
         for (to, from) in self.camera[16..].iter_mut().zip(rest) {
             *to = from as f32;
         }
-        self.order.sort(&camera, &self.centers, &self.normals)
+        Some(camera)
     }
 
-    /// Camera of the last [`Self::order`].
+    /// Camera of the last [`Self::look`] or [`Self::order`].
     #[must_use]
     pub fn camera(&self) -> &[f32; CAMERA_FLOATS] {
         &self.camera
@@ -183,6 +191,12 @@ impl Page {
     #[must_use]
     pub fn centers(&self) -> &[[f32; 4]] {
         &self.centers
+    }
+
+    /// Unit normal of each Gaussian's surface, world; the fourth number is its depth below the surface, metres.
+    #[must_use]
+    pub fn normals(&self) -> &[[f32; 4]] {
+        &self.normals
     }
 
     /// Linear RGB and opacity of each Gaussian.

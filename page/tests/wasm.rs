@@ -108,6 +108,8 @@ fn the_shipped_module_decodes_poses_and_sorts_as_this_crate_does() {
         let (centers, painted) = (shipped.call("centers", ()), shipped.call("colors", ()));
         assert_eq!(shipped.read::<Bits>(centers, 4 * GAUSSIANS), bits(ours.centers()));
         assert_eq!(shipped.read::<Bits>(painted, 4 * GAUSSIANS), bits(ours.colors()));
+        let normals = shipped.call("normals", ());
+        assert_eq!(shipped.read::<Bits>(normals, 4 * GAUSSIANS), bits(ours.normals()));
         shipped.call::<_, ()>("orbit", (0.3, 0.1));
         ours.navigation().unwrap().orbit(0.3, 0.1);
         let order: u32 = shipped.call("order", (640u32, 480u32));
@@ -122,6 +124,8 @@ fn the_shipped_module_decodes_poses_and_sorts_as_this_crate_does() {
             "{same} of {}",
             expected.len()
         );
+        assert_eq!(shipped.call::<_, u32>("look", (320u32, 480u32)), 1);
+        ours.look(320, 480).unwrap();
         let address: u32 = shipped.call("camera", ());
         let numbers = shipped.read::<Bits>(address, CAMERA_FLOATS);
         for (ours, shipped) in ours.camera().iter().zip(numbers) {

@@ -4,6 +4,7 @@ mod anisotropic;
 mod anisotropic_ply;
 mod anisotropic_splats;
 mod appearance;
+mod browser_kernels;
 mod buffers;
 mod color;
 mod color_match;
@@ -35,6 +36,7 @@ pub use appearance::{
     AppearanceError, AppearanceSettings, DiffusionHierarchy, DiffusionLevel, DirectAppearance, ObservationBuffers,
     Observations, ViewInput,
 };
+pub use browser_kernels::BrowserKernels;
 pub use buffers::{GaussianBuffers, RenderTarget};
 pub use color::{composite_over, linear_from_srgb, rgba8_from_target, srgb_from_linear};
 pub use color_match::ColorMatcher;

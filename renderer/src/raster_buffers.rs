@@ -7,9 +7,9 @@ use crate::sort::{Keys, RadixSort};
 
 /// Room for pairs of a Gaussian and a tile. A body-like surface needs about three a Gaussian; the share
 /// of the tiles is for a few Gaussians that cover the whole image.
-const PAIRS_PER_GAUSSIAN: u64 = 16;
-const PAIRS_PER_TILE: u64 = 64;
-const MIN_PAIRS: u64 = 1 << 18;
+pub(crate) const PAIRS_PER_GAUSSIAN: u64 = 16;
+pub(crate) const PAIRS_PER_TILE: u64 = 64;
+pub(crate) const MIN_PAIRS: u64 = 1 << 18;
 /// Most pairs that one dispatch of the kernel that writes them can reach.
 const MOST_PAIRS: u64 = MAX_WORKGROUPS_PER_DIMENSION as u64 * BINS_LANES as u64;
 

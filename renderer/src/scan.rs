@@ -5,7 +5,7 @@ use wgpu::{BindGroup, BindingResource, ComputePass};
 
 const SCAN_WGSL: &str = include_str!("scan.wgsl");
 /// Workgroups that share a scan.
-const SEGMENTS: u32 = 128;
+pub(crate) const SEGMENTS: u32 = 128;
 /// Sums stop here: two of them do not overflow.
 const MOST: u32 = (1 << 31) - 1;
 

@@ -25,6 +25,8 @@ use tokio_tungstenite::tungstenite::{self, Message, WebSocket, client::IntoClien
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 const SIDE: u32 = 512;
 const BACKGROUND: [u8; 3] = [27, 29, 32];
+/// JavaScript: the rig's frame number of the image on the page's canvas.
+const SHOWN_FRAME: &str = "Number(document.documentElement.dataset.frame)";
 
 /// A page, controlled by the browser's debugging protocol.
 struct Browser {
@@ -34,19 +36,12 @@ struct Browser {
 }
 
 impl Browser {
-    fn open(url: &str, folder: &std::path::Path, port: u16, drawing: &str) -> Self {
+    fn open(url: &str, folder: &std::path::Path, port: u16, drawing: &[&str]) -> Self {
         let (port_text, profile) =
             (format!("--remote-debugging-port={port}"), format!("--user-data-dir={}/profile", folder.display()));
-        let args = [
-            "--headless=new",
-            "--no-sandbox",
-            drawing,
-            "--enable-unsafe-swiftshader",
-            "--remote-allow-origins=*",
-            &port_text,
-            &profile,
-            url,
-        ];
+        let mut args = vec!["--headless=new", "--no-sandbox", "--enable-unsafe-swiftshader", "--hide-scrollbars"];
+        args.extend(drawing);
+        args.extend(["--force-color-profile=srgb", "--remote-allow-origins=*", &port_text, &profile, url]);
         let process = Process::start("chromium", &args, folder, "chromium");
         let mut address = None;
         wait_until("the browser", || {
@@ -94,6 +89,22 @@ fn page_address(port: u16) -> Option<String> {
 #[test]
 #[ignore = "needs Chromium; make test-browser"]
 fn a_browser_shows_the_person_as_the_rig_draws_it() {
+    let psnr = psnr_of_browser("webgl2", &["--use-angle=swiftshader"]);
+    assert!(psnr > 35.0, "{psnr} dB");
+}
+
+#[test]
+#[ignore = "needs Chromium; make test-browser"]
+fn a_browser_with_webgpu_shows_the_person_as_the_rig_draws_it() {
+    let software = ["--use-webgpu-adapter=swiftshader", "--use-angle=swiftshader", "--use-vulkan=swiftshader"];
+    let psnr =
+        psnr_of_browser("webgpu", &[&["--enable-unsafe-webgpu", "--enable-features=Vulkan"][..], &software].concat());
+    assert!(psnr > 40.0, "{psnr} dB");
+}
+
+/// Returns the PSNR of the page in a browser of these options against the rig's own drawing of the same motion and colours, on the pixels of
+/// the person, dB. The page draws with `drawing`, "webgl2" or "webgpu".
+fn psnr_of_browser(drawing: &str, options: &[&str]) -> f64 {
     assert!(
         Command::new("chromium").arg("--version").output().is_ok(),
         "chromium is missing: make test-browser installs it"
@@ -113,8 +124,8 @@ fn a_browser_shows_the_person_as_the_rig_draws_it() {
     let subscriber = TransportConfig { connect: vec![endpoint], ..TransportConfig::subscriber("browser") };
     let receiver = Receiver::start(&subscriber, || {}).unwrap();
     let started = Instant::now();
-    let url = format!("http://127.0.0.1:{web}/?bare&fixed&lowest-latency&camera=00");
-    let mut browser = Browser::open(&url, folder.path(), debugging, "--use-angle=swiftshader");
+    let url = format!("http://127.0.0.1:{web}/?bare&fixed&lowest-latency&camera=00&draw={drawing}");
+    let mut browser = Browser::open(&url, folder.path(), debugging, options);
     let size = json!({ "width": SIDE, "height": SIDE, "deviceScaleFactor": 1, "mobile": false });
     browser.call("Emulation.setDeviceMetricsOverride", &size);
 
@@ -138,19 +149,26 @@ fn a_browser_shows_the_person_as_the_rig_draws_it() {
         note(&receiver);
         std::thread::sleep(Duration::from_millis(20));
     }
-    let shown = browser.evaluate(
-        "({frame: Number(document.documentElement.dataset.frame), image: document.getElementById('view').toDataURL('image/png')})",
-    );
+    // The frame on the screenshot is known where it is the same before and after.
+    let (mut frame, mut encoded) = (0, String::new());
+    wait_until("a screenshot between two frames", || {
+        note(&receiver);
+        let before = browser.evaluate(SHOWN_FRAME).as_u64().unwrap();
+        let image = browser.call("Page.captureScreenshot", &json!({ "format": "png" }));
+        (frame, encoded) = (before, image["data"].as_str().unwrap().to_owned());
+        browser.evaluate(SHOWN_FRAME).as_u64() == Some(before)
+    });
+    let drawn = browser.evaluate("document.documentElement.dataset.drawing");
+    assert_eq!(drawn.as_str().map(str::to_lowercase).as_deref(), Some(drawing));
     let until = Instant::now() + Duration::from_secs(1);
     while Instant::now() < until {
         note(&receiver);
         std::thread::sleep(Duration::from_millis(20));
     }
-    let encoded = shown["image"].as_str().unwrap().strip_prefix("data:image/png;base64,").unwrap();
     let bytes = base64::engine::general_purpose::STANDARD.decode(encoded).unwrap();
     let browsers = image::load_from_memory(&bytes).unwrap().into_rgb8();
     assert_eq!(browsers.dimensions(), (SIDE, SIDE));
-    let (motion, colors) = known.get(&shown["frame"].as_u64().unwrap()).unwrap();
+    let (motion, colors) = known.get(&frame).unwrap();
 
     let mut state = receiver.state();
     let rig = state.rig.clone().unwrap();
@@ -177,15 +195,15 @@ fn a_browser_shows_the_person_as_the_rig_draws_it() {
     }
     let psnr = -10.0 * (sum / count as f64 / 255.0f64.powi(2)).log10();
     println!(
-        "a person with all colours {seconds:.1} s after the browser was started; {psnr:.2} dB on {} pixels of the person",
+        "{drawing}: a person with all colours {seconds:.1} s after the browser was started; {psnr:.2} dB on {} pixels of the person",
         count / 3
     );
     if let Ok(out) = std::env::var("FLYRIG_TEST_OUT") {
-        browsers.save(format!("{out}/browser.png")).unwrap();
+        browsers.save(format!("{out}/browser-{drawing}.png")).unwrap();
         image::RgbImage::from_raw(SIDE, SIDE, on_grey).unwrap().save(format!("{out}/rig.png")).unwrap();
     }
     assert!(count / 3 > 5000, "{count}");
-    assert!(psnr > 35.0, "{psnr} dB");
+    psnr
 }
 
 #[test]
@@ -202,7 +220,7 @@ fn a_browser_without_webgl2_is_told_so() {
         "serve",
     );
     wait_until("the page", || TcpStream::connect(("127.0.0.1", web)).is_ok());
-    let mut browser = Browser::open(&format!("http://{listen}/"), folder.path(), debugging, "--disable-3d-apis");
+    let mut browser = Browser::open(&format!("http://{listen}/"), folder.path(), debugging, &["--disable-3d-apis"]);
     wait_until("words about WebGL2", || {
         let text = browser.evaluate("document.getElementById('trouble')?.textContent ?? ''");
         text.as_str().is_some_and(|text| text.contains("This browser has no WebGL2"))

@@ -1,5 +1,7 @@
-// The page: messages of the rig in, people on the canvas. page.wasm decodes, poses and sorts; draw.js draws.
-import { Drawing } from "./draw.js";
+// The page: messages of the rig in, people on the canvas. page.wasm decodes and poses; draw_webgpu.js draws with the rig's kernels, or
+// draw_webgl2.js where there is no WebGPU, or only one that a processor computes.
+import { WebGl2Drawing } from "./draw_webgl2.js";
+import { WebGpuDrawing, openWebGpu } from "./draw_webgpu.js";
 
 const KIND = { rig: 0, state: 4, forget: 5 };
 const BACKGROUND = [27 / 255, 29 / 255, 32 / 255];
@@ -15,17 +17,44 @@ const text = new TextDecoder();
 
 // What the browser lacks, or a fault of the page, which cannot go on.
 let fault = "";
-addEventListener("error", ({ error, message }) => {
+function fail(problem) { fault = troubleText.textContent = problem; }
+function explain(error, message) {
   const isFault = error instanceof WebAssembly.RuntimeError;
-  fault = troubleText.textContent = isFault ? `The page failed (${error.message}); load it again.` : error?.message ?? message;
-});
+  fail(isFault ? `The page failed (${error.message}); load it again.` : error?.message ?? message);
+}
+addEventListener("error", ({ error, message }) => explain(error, message));
+addEventListener("unhandledrejection", ({ reason }) => explain(reason, String(reason)));
 
 const { instance } = await WebAssembly.instantiate(await (await fetch("page.wasm")).arrayBuffer(), {});
 const wasm = instance.exports;
 const floats = (address, count) => new Float32Array(wasm.memory.buffer, address, count);
 const now = () => performance.now() / 1000;
 
-let drawing = new Drawing(canvas);
+// "draw=webgl2" and "draw=webgpu" in the address choose. By itself, the page leaves a WebGPU that a processor computes alone.
+const wantedDrawing = parameters.get("draw");
+let drawing = null; // none while the graphics processor is lost
+let uploaded = false; // whether it has the Gaussians
+
+async function openDrawing(hadWebGpu) {
+  const opened = wantedDrawing === "webgl2" ? null
+    : await openWebGpu(wantedDrawing === "webgpu").catch(error => console.warn(`WebGPU: ${error.message}`));
+  if (!opened) {
+    // A canvas stays what it was first.
+    if (hadWebGpu) throw new Error("The graphics processor was lost; load the page again.");
+    if (wantedDrawing === "webgpu") throw new Error("This browser offers no WebGPU here; take draw=webgpu out of the address.");
+    return new WebGl2Drawing(canvas);
+  }
+  const { device } = opened;
+  device.onuncapturederror = ({ error }) => fail(`WebGPU failed (${error.message}); load the page with ?draw=webgl2.`);
+  device.lost.then(async () => {
+    drawing = null;
+    drawing = await openDrawing(true);
+    uploaded = false;
+  });
+  return new WebGpuDrawing(canvas, opened);
+}
+
+drawing = await openDrawing(false);
 let state = { trouble: "Connecting", sets_per_second: 0, people: [], color_layers: [0, 0] };
 let linkTrouble = "";
 let interpolates = !parameters.has("lowest-latency");
@@ -156,9 +185,8 @@ addEventListener("blur", () => held.clear());
 // --- Images ---
 
 canvas.addEventListener("webglcontextlost", event => { event.preventDefault(); drawing = null; });
-canvas.addEventListener("webglcontextrestored", () => { drawing = new Drawing(canvas); uploaded = false; dirty = true; });
+canvas.addEventListener("webglcontextrestored", () => { drawing = new WebGl2Drawing(canvas); uploaded = false; });
 
-let uploaded = false;
 let lastTick = performance.now();
 
 /** Fewer pixels where drawing takes long, more where there is time. */
@@ -176,7 +204,7 @@ function tick(time) {
     if (FLY[key]) { wasm.fly(...FLY[key].map(axis => axis * step * 1.5)); dirty = true; }
   }
   showState(time);
-  if (!drawing) return;
+  if (!drawing || drawing.isBusy) return;
   const ratio = (parameters.has("fixed") ? 1 : devicePixelRatio * scale);
   const [width, height] = [canvas.clientWidth, canvas.clientHeight].map(side => Math.max(1, Math.round(side * ratio)));
   if (canvas.width !== width || canvas.height !== height) {
@@ -187,17 +215,19 @@ function tick(time) {
   const count = wasm.pose(now(), interpolates ? 1 : 0);
   const changes = uploaded ? wasm.changes() : 3;
   if (changes === 0 && !dirty) return;
-  const order = wasm.order(width, height);
-  const length = wasm.order_length();
+  wasm.look(width, height);
+  const order = drawing.sorts ? 0 : wasm.order(width, height);
   spent.pose += 0.05 * (performance.now() - start - spent.pose);
   timed("draw", () => {
     // The memory may have moved until here.
-    if (changes & 1) drawing.setCenters(floats(wasm.centers(), 4 * count), count);
+    if (changes & 1) drawing.setCenters(floats(wasm.centers(), 4 * count), floats(wasm.normals(), 4 * count), count);
     if (changes & 2) drawing.setColors(floats(wasm.colors(), 4 * count), count);
-    drawing.draw(new Uint32Array(wasm.memory.buffer, order, length), floats(wasm.camera(), 19), BACKGROUND);
+    const ordered = drawing.sorts ? null : new Uint32Array(wasm.memory.buffer, order, wasm.order_length());
+    drawing.draw(floats(wasm.camera(), 19), BACKGROUND, ordered);
   });
   [uploaded, dirty] = [true, false];
   document.documentElement.dataset.frame = wasm.frame();
+  document.documentElement.dataset.drawing = drawing.kind;
   drawn.push(time);
   if (drawn.length > 200) drawn.splice(0, 100);
   if (!parameters.has("fixed")) adapt();
@@ -218,7 +248,7 @@ function showState(time) {
     state.rig ?? "",
     `${rate(drawn).toFixed(0)} images/s` + (state.sets_per_second > 0 ? `, rig ${state.sets_per_second.toFixed(1)} sets/s` : "")
       + `, ${bits.toFixed(1)} Mbit/s`,
-    `decode ${spent.decode.toFixed(1)} ms, pose and sort ${spent.pose.toFixed(1)} ms, draw ${spent.draw.toFixed(1)} ms`,
+    `decode ${spent.decode.toFixed(1)} ms, pose and sort ${spent.pose.toFixed(1)} ms, ${drawing?.kind ?? "graphics lost"} ${spent.draw.toFixed(1)} ms`,
     quality.length > 0 ? `tracking ${quality.join(", ")}` : "",
     shown > 0 && layers < all ? `colours: ${layers} of ${all} layers, as many as the line to the rig carries` : "",
     shown > 0 && !complete ? "colours are still coming" : "",

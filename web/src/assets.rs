@@ -1,21 +1,44 @@
 //! Files of the page, in the program itself.
 
+use std::sync::LazyLock;
+
+use flyrig_renderer::BrowserKernels;
+use hyper::body::Bytes;
+use serde_json::{Map, Value, json};
+
 /// A file of the page.
 pub(crate) struct Asset {
     pub path: &'static str,
     pub kind: &'static str,
-    pub bytes: &'static [u8],
+    pub bytes: Bytes,
 }
 
+const SCRIPT: &str = "text/javascript; charset=utf-8";
+
 /// All files.
-const ASSETS: [Asset; 4] = [
-    Asset { path: "/", kind: "text/html; charset=utf-8", bytes: include_bytes!("../assets/index.html") },
-    Asset { path: "/page.js", kind: "text/javascript; charset=utf-8", bytes: include_bytes!("../assets/page.js") },
-    Asset { path: "/draw.js", kind: "text/javascript; charset=utf-8", bytes: include_bytes!("../assets/draw.js") },
-    Asset { path: "/page.wasm", kind: "application/wasm", bytes: include_bytes!("../assets/page.wasm") },
-];
+static ASSETS: LazyLock<[Asset; 6]> = LazyLock::new(|| {
+    let file = |path, kind, bytes| Asset { path, kind, bytes: Bytes::from_static(bytes) };
+    [
+        file("/", "text/html; charset=utf-8", include_bytes!("../assets/index.html").as_slice()),
+        file("/page.js", SCRIPT, include_bytes!("../assets/page.js")),
+        file("/draw_webgl2.js", SCRIPT, include_bytes!("../assets/draw_webgl2.js")),
+        file("/draw_webgpu.js", SCRIPT, include_bytes!("../assets/draw_webgpu.js")),
+        file("/page.wasm", "application/wasm", include_bytes!("../assets/page.wasm")),
+        Asset { path: "/kernels.json", kind: "application/json", bytes: kernels().into() },
+    ]
+});
 
 /// Returns the file of a path.
 pub(crate) fn asset(path: &str) -> Option<&'static Asset> {
     ASSETS.iter().find(|asset| asset.path == path)
+}
+
+/// Returns [`BrowserKernels`] as JSON, with an object of each list.
+fn kernels() -> String {
+    let BrowserKernels { modules, numbers, frame } = BrowserKernels::new();
+    let modules: Map<String, Value> = modules.map(|(name, wgsl)| (name.to_owned(), wgsl.into())).into_iter().collect();
+    let numbers: Map<String, Value> =
+        numbers.map(|(name, value)| (name.to_owned(), value.into())).into_iter().collect();
+    let frame: Map<String, Value> = frame.map(|(name, offset)| (name.to_owned(), offset.into())).into_iter().collect();
+    json!({ "modules": modules, "numbers": numbers, "frame": frame }).to_string()
 }

@@ -357,7 +357,7 @@ fn respond(mut request: Request<Incoming>, shared: &Arc<Shared>) -> Response<Ful
         return response;
     }
     match asset(request.uri().path()) {
-        Some(asset) => page(StatusCode::OK, asset.kind, Bytes::from_static(asset.bytes)),
+        Some(asset) => page(StatusCode::OK, asset.kind, asset.bytes.clone()),
         None => text(StatusCode::NOT_FOUND, "there is nothing here; the page is at /\n"),
     }
 }

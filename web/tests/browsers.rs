@@ -228,7 +228,13 @@ fn strangers_are_refused_in_words() {
         page.starts_with("HTTP/1.1 200") && page.contains("content-security-policy") && page.contains("<canvas"),
         "{page}"
     );
-    for (path, kind) in [("/page.js", "javascript"), ("/draw.js", "javascript"), ("/page.wasm", "application/wasm")] {
+    for (path, kind) in [
+        ("/page.js", "javascript"),
+        ("/draw_webgl2.js", "javascript"),
+        ("/draw_webgpu.js", "javascript"),
+        ("/page.wasm", "application/wasm"),
+        ("/kernels.json", "application/json"),
+    ] {
         let answer = get(path, "");
         assert!(answer.starts_with("HTTP/1.1 200") && answer.contains(kind), "{path}");
     }

@@ -103,8 +103,9 @@ function program(gl, vertex, fragment) {
 }
 
 /** A drawing of one canvas. Make a new one after the context was lost. */
-export class Drawing {
+export class WebGl2Drawing {
   constructor(canvas) {
+    [this.kind, this.sorts, this.isBusy] = ["WebGL2", false, false];
     const options = { alpha: false, antialias: false, depth: false, stencil: false, preserveDrawingBuffer: true };
     const gl = this.gl = canvas.getContext("webgl2", options);
     if (!gl) throw new Error("This browser has no WebGL2; update it, or switch hardware acceleration on.");
@@ -156,11 +157,11 @@ export class Drawing {
     this.capacity = count;
   }
 
-  setCenters(floats, count) { this.upload(this.centers, floats, count, this.four); this.reserve(count); }
+  setCenters(centers, normals, count) { this.upload(this.centers, centers, count, this.four); this.reserve(count); }
   setColors(floats, count) { this.upload(this.colors, floats, count, this.four); }
 
   /** Draws the Gaussians of `order`, farthest first, with a camera of 19 numbers (page/src/page.rs). */
-  draw(order, camera, background) {
+  draw(camera, background, order) {
     const gl = this.gl;
     const width = gl.drawingBufferWidth, height = gl.drawingBufferHeight;
     if (this.size[0] !== width || this.size[1] !== height) {
