@@ -27,6 +27,11 @@ impl Adam {
         Self { first: vec![[0.0; 4]; len], second: vec![[0.0; 4]; len] }
     }
 
+    /// Both moments, the first one first.
+    pub fn lists_mut(&mut self) -> [&mut [Element]; 2] {
+        [&mut self.first, &mut self.second]
+    }
+
     /// Mean square of the derivatives of each column, over the rows that ever had one.
     pub fn usual(&self) -> Element {
         let (mut sum, mut count) = ([0.0f64; 4], [0u32; 4]);

@@ -2,10 +2,11 @@
 
 use flyrig_body::{DeformationGraph, SkinWeights, SurfaceGaussians, Template};
 use flyrig_renderer::{HarmonicOrder, SH_DEGREE_0};
+use flyrig_types::Pose;
 use glam::{DVec3, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
-use crate::{AvatarError, Parameters};
+use crate::{AvatarError, Examples, Parameters};
 
 /// Thickness of a Gaussian across the surface at the start, against its size along it.
 const THICKNESS: f32 = 0.5;
@@ -84,6 +85,8 @@ pub struct Avatar {
     pub skin: Vec<SkinWeights>,
     /// Deformation graph; None without one.
     pub hanging: Option<Hanging>,
+    /// Shapes of clothes and hair in the poses of the take; None without a graph.
+    pub examples: Option<Examples>,
     /// Fitted attributes of the Gaussians.
     pub parameters: Parameters,
     /// Provenance.
@@ -132,6 +135,7 @@ impl Avatar {
                 .collect(),
             skin: surface.skin.clone(),
             hanging,
+            examples: None,
             parameters,
             card: Card::default(),
         })
@@ -143,8 +147,15 @@ impl Avatar {
         self.places.len()
     }
 
-    /// Sets the shape for poses alone to the mean of these translations of the nodes, one list a frame.
-    pub fn set_mean<'a>(&mut self, frames: impl IntoIterator<Item = &'a [DVec3]>) {
+    /// Learns the shapes of clothes and hair for poses alone from the frames of a take: poses, and the translations of the nodes in them.
+    pub fn learn_clothes<'a>(&mut self, frames: impl IntoIterator<Item = (&'a Pose, &'a [DVec3])> + Clone) {
+        self.set_mean(frames.clone().into_iter().map(|(_, translations)| translations));
+        let Some(hanging) = &self.hanging else { return };
+        self.examples = Examples::learn(hanging, &self.skin, &self.template.skeleton, frames);
+    }
+
+    /// Sets the mean of these translations of the nodes, one list a frame.
+    fn set_mean<'a>(&mut self, frames: impl IntoIterator<Item = &'a [DVec3]>) {
         let Some(hanging) = &mut self.hanging else { return };
         let (mut sum, mut count) = (vec![DVec3::ZERO; hanging.nodes.len()], 0);
         for frame in frames.into_iter().filter(|frame| frame.len() == hanging.nodes.len()) {
@@ -178,6 +189,15 @@ impl Avatar {
             {
                 return Err("its deformation graph is of another avatar".to_owned());
             }
+            let joints = self.template.skeleton.joints().len();
+            let belongs = |examples: &Examples| {
+                examples.rotations.len() == examples.translations.len()
+                    && examples.rotations.iter().all(|frame| frame.len() == joints)
+                    && examples.translations.iter().all(|frame| frame.len() == nodes)
+            };
+            if self.examples.as_ref().is_some_and(|examples| !belongs(examples)) {
+                return Err("the shapes of its clothes are of another avatar".to_owned());
+            }
         }
         let is_finite = self.places.iter().all(|place| place.is_finite()) && self.parameters.is_finite();
         if is_finite { Ok(()) } else { Err("it holds numbers that are not finite".to_owned()) }
@@ -187,7 +207,6 @@ impl Avatar {
 #[cfg(test)]
 pub(crate) mod tests {
     use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
-    use flyrig_types::Pose;
     use glam::DQuat;
     use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 

@@ -5,11 +5,11 @@ use std::{collections::HashMap, io::Write as _, path::Path};
 use bytemuck::Pod;
 use flyrig_body::{Joint, Part, Skeleton, SkinWeights, Template};
 use flyrig_types::write_whole;
-use glam::{DMat4, DQuat, DVec3, Vec2, Vec3};
+use glam::{DMat4, DQuat, DVec3, Quat, Vec2, Vec3};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 
-use crate::{Attachment, Avatar, AvatarError, Card, Hanging, Parameters};
+use crate::{Attachment, Avatar, AvatarError, Card, Examples, Hanging, Parameters};
 
 /// Version of the format; a file of another one is refused.
 const VERSION: u32 = 2;
@@ -139,6 +139,13 @@ impl Avatar {
             arrays.push("graph.gaussian_nodes", Dtype::U32, 4, &hanging.gaussian_nodes);
             arrays.push("graph.gaussian_weights", Dtype::F32, 4, &hanging.gaussian_weights);
         }
+        if let Some(Examples { rotations, translations, width_rad, .. }) = &self.examples {
+            let rotations: Vec<[f32; 4]> = rotations.iter().flatten().map(|turn| turn.as_quat().to_array()).collect();
+            arrays.push("examples.rotations", Dtype::F32, 4, &rotations);
+            let translations: Vec<_> = translations.iter().flatten().map(|moved| moved.as_vec3().to_array()).collect();
+            arrays.push("examples.translations", Dtype::F32, 3, &translations);
+            arrays.push("examples.width", Dtype::F64, 1, &[*width_rad]);
+        }
         let joints = skeleton.joints().iter().map(|joint| JointRow { name: joint.name.clone(), parent: joint.parent });
         let header =
             Header { version: VERSION, card: self.card.clone(), template: name.clone(), joints: joints.collect() };
@@ -230,18 +237,49 @@ impl Avatar {
         let corners = rows::<f32, 3>(&file, "gaussians.barycentric", Dtype::F32)?;
         let attachments =
             triangles.into_iter().zip(corners).map(|([triangle], barycentric)| Attachment { triangle, barycentric });
+        let skin = skin(&file, ["gaussians.joints", "gaussians.weights"])?;
+        let examples = match &hanging {
+            Some(hanging) if file.tensor("examples.width").is_ok() => {
+                examples(&file, hanging, &skin, &template.skeleton)?
+            }
+            _ => None,
+        };
         let avatar = Self {
             template,
             places: vectors(&file, "gaussians.places")?,
             attachments: attachments.collect(),
-            skin: skin(&file, ["gaussians.joints", "gaussians.weights"])?,
+            skin,
             hanging,
+            examples,
             parameters,
             card,
         };
         avatar.check()?;
         Ok(avatar)
     }
+}
+
+/// Reads the shapes of clothes; rows of a frame follow each other.
+fn examples(
+    file: &SafeTensors<'_>,
+    hanging: &Hanging,
+    skin: &[SkinWeights],
+    skeleton: &Skeleton,
+) -> Result<Option<Examples>, String> {
+    let rotations = rows::<f32, 4>(file, "examples.rotations", Dtype::F32)?;
+    let rotations = rotations.into_iter().map(|turn| Quat::from_array(turn).as_dquat()).collect::<Vec<_>>();
+    let translations: Vec<DVec3> = vectors(file, "examples.translations")?.into_iter().map(Vec3::as_dvec3).collect();
+    let width = rows::<f64, 1>(file, "examples.width", Dtype::F64)?;
+    let [width] = width.first().copied().filter(|[width]| *width > 0.0).ok_or("the clothes have no width")?;
+    if !rotations.iter().all(|turn| turn.is_finite()) || !translations.iter().all(|moved| moved.is_finite()) {
+        return Err("the shapes of its clothes are not finite".to_owned());
+    }
+    let (joints, nodes) = (skeleton.joints().len().max(1), hanging.nodes.len().max(1));
+    let frames = (
+        rotations.chunks(joints).map(<[DQuat]>::to_vec).collect(),
+        translations.chunks(nodes).map(<[DVec3]>::to_vec).collect(),
+    );
+    Ok(Examples::new(hanging, skin, skeleton, frames, width))
 }
 
 /// Names of the learnt lists.
@@ -252,17 +290,21 @@ mod tests {
     use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
     use super::*;
-    use crate::avatar::tests::small;
+    use crate::avatar::tests::{random_pose, small};
 
     #[test]
     fn avatars_come_back_and_the_same_gives_the_same_bytes() {
         let mut avatar = small(200, 9);
+        let frames = [1, 2, 3].map(|seed| random_pose(&avatar, seed));
+        avatar.learn_clothes(frames.iter().map(|(pose, nodes)| (pose, nodes.as_slice())));
+        avatar.hanging.as_mut().unwrap().mean.fill(DVec3::ZERO); // which the file rounds
+        assert!(avatar.examples.is_some());
         avatar.card = Card { name: "A".to_owned(), cameras: vec!["00".to_owned()], steps: 3, ..Card::default() };
         let bytes = avatar.to_bytes().unwrap();
         // Printed in full they would fill screens.
         assert!(bytes == avatar.clone().to_bytes().unwrap());
         assert!(Avatar::from_bytes(&bytes).unwrap() == avatar);
-        avatar.hanging = None;
+        (avatar.hanging, avatar.examples) = (None, None);
         let folder = tempfile();
         avatar.save(&folder).unwrap();
         assert!(Avatar::load(&folder).unwrap() == avatar);

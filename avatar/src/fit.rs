@@ -27,6 +27,9 @@ const DIFFERENCES: [Element; 4] =
 /// Colours of higher orders than zero move more slowly.
 const HIGHER: f32 = 0.05;
 
+/// Keeps the rounds of one seed apart from those of the next ones.
+const ROUND_SEED: u64 = 0x9e37_79b9_7f4a_7c15;
+
 /// How an avatar is learnt.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitSettings {
@@ -154,14 +157,13 @@ pub struct Fit {
     gradients: AnisotropicGradients,
     targets: BTreeMap<[u32; 2], Targets>,
     posed: PosedAvatar,
-    moments: [Adam; 4],
+    pub(crate) moments: [Adam; 4],
     neighbors: Neighbors,
     /// Networks whose outputs the lists are; None where the lists themselves are learnt.
-    local: Option<Local>,
-    step: u64,
-    random: StdRng,
-    /// Views that are still to come in this round.
-    round: Vec<usize>,
+    pub(crate) local: Option<Local>,
+    pub(crate) step: u64,
+    /// Views in the order of a round, and its number.
+    round: (Vec<usize>, u64),
 }
 
 impl Fit {
@@ -203,8 +205,7 @@ impl Fit {
             neighbors: Neighbors::new(&avatar.places),
             local: None,
             step: 0,
-            random: StdRng::seed_from_u64(settings.seed),
-            round: Vec::new(),
+            round: (Vec::new(), 0),
             settings,
             frames,
             views,
@@ -241,11 +242,7 @@ impl Fit {
     /// # Errors
     /// [`AvatarError::Gpu`], [`AvatarError::Backward`].
     pub fn step(&mut self, avatar: &mut Avatar, progress: f32) -> Result<StepReport, AvatarError> {
-        if self.round.is_empty() {
-            self.round = (0..self.views.len()).collect();
-            self.round.shuffle(&mut self.random);
-        }
-        let Some(view) = self.round.pop() else { return Err(AvatarError::Images("there is no image".to_owned())) };
+        let view = self.next_view();
         let error = self.draw(avatar, view)?;
         let view = &self.views[view];
         let Some(Targets { drawn, slopes }) = self.targets.get(&view.size()) else {
@@ -291,6 +288,18 @@ impl Fit {
             local.evaluate(&mut avatar.parameters);
         }
         Ok(StepReport { loss: error.loss, decibels: -10.0 * error.squared.max(1e-10).log10() })
+    }
+
+    /// The view of this step. Rounds are shuffled by their number, so that a fit that goes on from a checkpoint sees the same ones.
+    fn next_view(&mut self) -> usize {
+        let count = self.views.len().max(1) as u64;
+        let (number, at) = (self.step / count, (self.step % count) as usize);
+        if self.round.0.is_empty() || self.round.1 != number {
+            let mut order: Vec<usize> = (0..self.views.len()).collect();
+            order.shuffle(&mut StdRng::seed_from_u64(self.settings.seed.wrapping_add(number.wrapping_mul(ROUND_SEED))));
+            self.round = (order, number);
+        }
+        self.round.0[at]
     }
 
     /// Mean PSNR over all images as the avatar is now, decibels of the mean squared error.

@@ -8,7 +8,9 @@
 mod adam;
 mod atlas;
 mod avatar;
+mod checkpoint;
 mod error;
+mod examples;
 mod file;
 mod fit;
 mod image_error;
@@ -24,7 +26,9 @@ mod ssim;
 
 pub use atlas::{Atlas, DEFAULT_ATLAS_SIDE};
 pub use avatar::{Attachment, Avatar, Card, Hanging};
+pub use checkpoint::FitProgress;
 pub use error::AvatarError;
+pub use examples::Examples;
 pub use fit::{Fit, FitSettings, StepReport, TrainingFrame, TrainingView};
 pub use image_error::{ErrorWeights, ImageError};
 pub use local::{AtlasLayout, LocalSettings};

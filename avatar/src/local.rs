@@ -88,6 +88,8 @@ struct Stage {
     groups: Groups,
     /// Places that are encoded: Gaussians of the stage before, as indices.
     inputs: Vec<u32>,
+    /// Where they were when they were encoded last.
+    encoded: Vec<[f32; 3]>,
     encoding: HashEncoding,
 }
 
@@ -142,10 +144,11 @@ impl Local {
         let mut inputs = inputs;
         for (stage, members) in sampled.chunks(size).enumerate() {
             let groups = Groups::new(&places, &inputs, members);
-            let encoding = HashEncoding::new(&of(&places, &inputs), around);
+            let at = of(&places, &inputs);
+            let (encoded, encoding) = (at.iter().map(Vec3::to_array).collect(), HashEncoding::new(&at, around));
             networks.extend(decoders::parameters(stage, groups.slots));
             tables.push((format!("stage.{stage}.hash"), vec![LEVELS * ROWS, FEATURES], TABLE_SPREAD));
-            stages.push(Stage { groups, inputs: std::mem::replace(&mut inputs, members.to_vec()), encoding });
+            stages.push(Stage { groups, inputs: std::mem::replace(&mut inputs, members.to_vec()), encoded, encoding });
         }
         let map = AtlasMap::new(settings.layout, &places, uvs, settings.side)?;
         networks.extend(texture::parameters(&map, order.coefficients()));
@@ -184,7 +187,7 @@ impl Local {
         let mut lists = self.start.clone();
         let displacement = self.tables.get("displacement").map_or(&[][..], |p| p.values.as_slice());
         let mut stages = Vec::new();
-        for (stage, Stage { groups, inputs, encoding }) in self.stages.iter().enumerate() {
+        for (stage, Stage { groups, inputs, encoding, .. }) in self.stages.iter().enumerate() {
             let table = self.tables.get(&format!("stage.{stage}.hash")).map_or(&[][..], |p| p.values.as_slice());
             let features = table_of(encoding.encode(table), inputs.len(), WIDTH, &self.device).require_grad();
             let outputs = decode(&tensors, &self.device, stage, &features);
@@ -244,11 +247,42 @@ impl Local {
         for stage in self.stages.iter_mut().skip(1) {
             let moved = |i: &u32| {
                 let i = *i as usize;
-                self.places[i] + Vec4::from(now.offset[i]).truncate()
+                (self.places[i] + Vec4::from(now.offset[i]).truncate()).to_array()
             };
-            let places: Vec<Vec3> = stage.inputs.iter().map(moved).collect();
+            stage.encoded = stage.inputs.iter().map(moved).collect();
+        }
+        self.encode_places();
+    }
+
+    fn encode_places(&mut self) {
+        for stage in self.stages.iter_mut().skip(1) {
+            let places: Vec<Vec3> = stage.encoded.iter().copied().map(Vec3::from).collect();
             stage.encoding = HashEncoding::new(&places, self.around);
         }
+    }
+
+    /// All numbers that change from step to step, by name.
+    pub fn state(&mut self) -> Vec<(String, &mut [f32])> {
+        let mut all = Vec::new();
+        for (name, parameter) in self.networks.iter_mut().chain(&mut self.tables) {
+            all.push((format!("network.{name}"), parameter.values.as_mut_slice()));
+        }
+        for (name, moments) in &mut self.moments {
+            for (k, moment) in moments.iter_mut().enumerate() {
+                all.push((format!("moment.{k}.{name}"), moment.as_mut_slice()));
+            }
+        }
+        for (number, stage) in self.stages.iter_mut().enumerate().skip(1) {
+            all.push((format!("encoded.{number}"), stage.encoded.as_flattened_mut()));
+        }
+        all
+    }
+
+    /// Goes on after [`Self::state`] was overwritten by that of a fit that had done so many steps.
+    pub fn resume(&mut self, step: u64, into: &mut Parameters) {
+        self.step = step;
+        self.encode_places();
+        self.evaluate(into);
     }
 
     /// Derivatives with respect to all numbers from those with respect to the lists.

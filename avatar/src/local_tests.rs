@@ -31,7 +31,7 @@ type Numbers = BTreeMap<String, Vec<f64>>;
 fn reference(local: &Local, numbers: &Numbers) -> [Vec<[f64; 4]>; 4] {
     let wide = |list: &[Element]| -> Vec<[f64; 4]> { list.iter().map(|row| row.map(f64::from)).collect() };
     let mut lists = local.start.lists().map(wide);
-    for (stage, Stage { groups, inputs, encoding }) in local.stages.iter().enumerate() {
+    for (stage, Stage { groups, inputs, encoding, .. }) in local.stages.iter().enumerate() {
         let table = &numbers[&format!("stage.{stage}.hash")];
         let features = encoding_in_f64(encoding, table);
         for (branch, columns) in branches(stage) {

@@ -1,11 +1,12 @@
 //! An avatar drawn into views.
 
+use flyrig_body::Part;
 use flyrig_gpu::{GpuContext, GpuError};
 use flyrig_renderer::{AnisotropicBuffers, ViewPainter};
-use flyrig_types::{Camera, RenderedView};
-use glam::DVec3;
+use flyrig_types::{Camera, Pose, RenderedView};
+use glam::{DVec2, DVec3};
 
-use crate::{Avatar, Bones, PosedAvatar, parameters::Element};
+use crate::{Attachment, Avatar, Bones, PosedAvatar, parameters::Element};
 
 /// A posed avatar on the adapter, as one camera sees it.
 #[derive(Debug)]
@@ -68,6 +69,12 @@ impl AvatarScene {
         self.buffers.pose(&self.gpu, &self.posed, avatar);
     }
 
+    /// Poses the avatar by a pose alone: clothes and hair take the shapes that they had in such poses.
+    pub fn drive(&mut self, avatar: &Avatar, pose: &Pose) {
+        let translations = avatar.examples.as_ref().map(|examples| examples.translations(pose));
+        self.pose(avatar, &Bones::new(&avatar.template.skeleton, pose), translations.as_deref());
+    }
+
     /// Draws the avatar as a camera sees it, at its size; straight alpha.
     ///
     /// # Errors
@@ -77,9 +84,73 @@ impl AvatarScene {
         self.painter.draw(&self.buffers.gaussians, camera)
     }
 
+    /// Returns the box `[x0, y0, x1, y1]` (ends excluded, pixels) around the centres of some parts' Gaussians as a camera sees them, and
+    /// `margin_px` around, within the image; None where they are not in it.
+    #[must_use]
+    pub fn part_box(&self, avatar: &Avatar, parts: &[Part], camera: &Camera, margin_px: f64) -> Option<[u32; 4]> {
+        let body = &avatar.template;
+        let is_part = |attachment: &Attachment| {
+            let corner = body.triangles[attachment.triangle as usize][0];
+            body.parts.get(corner as usize).is_some_and(|part| parts.contains(part))
+        };
+        let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+        for (attachment, center) in avatar.attachments.iter().zip(&self.posed.center) {
+            if !is_part(attachment) {
+                continue;
+            }
+            let [x, y, z, _] = center.map(f64::from);
+            if let Some(pixel) = camera.project(DVec3::new(x, y, z)) {
+                (low, high) = (low.min(pixel), high.max(pixel));
+            }
+        }
+        let size = DVec2::new(f64::from(camera.intrinsics.width), f64::from(camera.intrinsics.height));
+        let low = (low - margin_px).floor().max(DVec2::ZERO);
+        let high = (high + 1.0 + margin_px).ceil().min(size);
+        low.cmplt(high).all().then(|| [low.x as u32, low.y as u32, high.x as u32, high.y as u32])
+    }
+
     /// Returns the number of Gaussians that the last view left out, as they face away.
     #[must_use]
     pub fn hidden(&self) -> usize {
         self.hidden
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_types::{Intrinsics, Isometry};
+
+    use super::*;
+    use crate::avatar::tests::small;
+
+    #[test]
+    fn boxes_are_around_the_part_and_within_the_image() {
+        let avatar = small(4000, 7);
+        let gpu = flyrig_gpu::testing::device().on_processor();
+        let mut scene = AvatarScene::new(&gpu, &avatar).unwrap();
+        let pose = avatar.template.skeleton.rest_pose();
+        scene.drive(&avatar, &pose);
+        // The body at rest has y up and looks along z.
+        let camera_at = |eye: DVec3| Camera {
+            id: "view".into(),
+            intrinsics: Intrinsics::pinhole(200, 300, 300.0),
+            camera_from_world: Isometry::look_at(eye, DVec3::new(eye.x, eye.y, 0.0), DVec3::Y),
+            time_offset_nanos: 0,
+            color: Default::default(),
+        };
+        let camera = camera_at(DVec3::new(0.0, 0.9, 3.5));
+        let area = |parts: &[Part]| scene.part_box(&avatar, parts, &camera, 2.0).unwrap();
+        let ([_, head_top, _, head_end], [_, feet_top, _, _]) =
+            (area(&[Part::Head]), area(&[Part::LeftFoot, Part::RightFoot]));
+        let [left, top, right, bottom] = area(&Part::ALL);
+        assert!(head_top == top && head_end < feet_top && head_end - head_top < (bottom - top) / 3);
+        assert!(left < right && right <= 200 && bottom <= 300);
+        // It stands behind the camera, or no part is asked for.
+        let turned = Camera {
+            camera_from_world: Isometry::look_at(DVec3::new(0.0, 0.9, 3.5), DVec3::new(0.0, 0.9, 9.0), DVec3::Y),
+            ..camera.clone()
+        };
+        assert_eq!(scene.part_box(&avatar, &Part::ALL, &turned, 2.0), None);
+        assert_eq!(scene.part_box(&avatar, &[], &camera, 2.0), None);
     }
 }

@@ -2,7 +2,9 @@
 
 #![allow(clippy::unwrap_used)]
 
-use flyrig_avatar::{Avatar, AvatarError, AvatarScene, Bones, Fit, FitSettings, TrainingFrame, TrainingView};
+use flyrig_avatar::{
+    AtlasLayout, Avatar, AvatarError, AvatarScene, Bones, Fit, FitSettings, LocalSettings, TrainingFrame, TrainingView,
+};
 use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
 use flyrig_gpu::{GpuContext, testing::on_both};
 use flyrig_renderer::HarmonicOrder;
@@ -79,6 +81,55 @@ fn a_fit_explains_its_images_and_the_same_steps_give_the_same_bytes() {
         assert!(after > before + 4.0, "{before} {after}");
         assert!(run(7).2.to_bytes().unwrap() == run(7).2.to_bytes().unwrap());
     });
+}
+
+#[test]
+fn a_fit_that_was_killed_ends_as_one_that_was_not() {
+    let gpu = flyrig_gpu::testing::device().on_processor();
+    let truth = avatar(|i| [[0.5, 0.1, 0.1], [0.1, 0.4, 0.6], [0.6, 0.6, 0.2]][i / 40 % 3], 1500);
+    let (frames, views) = take(&gpu, &truth);
+    let networks = LocalSettings { stages: 2, layout: AtlasLayout::FrontBack, side: 32, ..LocalSettings::default() };
+    for networks in [None, Some(networks)] {
+        let begin = || {
+            let mut ours = avatar(|_| [0.2; 3], 1500);
+            let mut fit = Fit::new(&gpu, &ours, frames.clone(), views.clone(), FitSettings::default()).unwrap();
+            if let Some(networks) = &networks {
+                fit.use_networks(&mut ours, &[], networks).unwrap();
+            }
+            (fit, ours)
+        };
+        // Past the round of six images.
+        let run = |(fit, ours): &mut (Fit, Avatar), steps: std::ops::Range<u32>| {
+            for step in steps {
+                fit.step(ours, step as f32 / 20.0).unwrap();
+            }
+        };
+        let mut whole = begin();
+        run(&mut whole, 0..20);
+        let mut killed = begin();
+        run(&mut killed, 0..11);
+        let state = killed.0.checkpoint(&mut killed.1, "a take", 20).unwrap();
+        drop(killed);
+        let mut resumed = begin();
+        let progress = resumed.0.resume(&mut resumed.1, &state, "a take").unwrap();
+        assert_eq!((progress.done, progress.total), (11, 20));
+        run(&mut resumed, 11..20);
+        assert!(whole.1.to_bytes().unwrap() == resumed.1.to_bytes().unwrap(), "{networks:?}");
+
+        // What is refused changes nothing.
+        let mut other = begin();
+        let before = other.1.to_bytes().unwrap();
+        let mut refused = |bytes: &[u8], settings: &str| other.0.resume(&mut other.1, bytes, settings).unwrap_err();
+        assert!(refused(&state, "another take").contains("another take"));
+        assert!(refused(b"", "a take").contains("no state of a fit"));
+        assert!(refused(&before, "a take").contains("no state of a fit"));
+        assert!(refused(&state[..state.len() - 4], "a take").contains("no state of a fit"));
+        let mut poisoned = state.clone();
+        let last = poisoned.len() - 4;
+        poisoned[last..].copy_from_slice(&f32::NAN.to_le_bytes());
+        assert!(refused(&poisoned, "a take").contains("is damaged"));
+        assert!(before == other.1.to_bytes().unwrap());
+    }
 }
 
 #[test]

@@ -40,6 +40,8 @@ pub enum BenchCommand {
     Endure(BenchEndureArgs),
     /// Appearance: every mode on simulated people that nobody trained on; writes CSV, JSON and SVG.
     Appearance(BenchAppearanceArgs),
+    /// Avatars: error against the time of their fit, time and memory by the number of Gaussians; writes a table, JSON and SVG.
+    Avatar(BenchAvatarArgs),
     /// Budgets of time: what each kind of work that may be left out costs in views, and the run time it saves.
     Budget(BenchBudgetArgs),
     /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to whole sets.
@@ -139,6 +141,35 @@ impl ReplayArgs {
             body: None,
         }
     }
+}
+
+#[derive(Debug, Args)]
+pub struct BenchAvatarArgs {
+    /// Data set in EasyMocap layout, as `flyrig eval` and `flyrig sim export` know it.
+    pub dataset: PathBuf,
+    #[command(flatten)]
+    pub replay: ReplayArgs,
+    /// Frames of poses that avatars are not fitted to; they are fitted to --frames, the first 30 without it.
+    #[arg(long, default_value = "30..60", value_parser = parse_range)]
+    pub novel: Range<u64>,
+    /// Frames from one that is scored to the next.
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub every: u32,
+    /// Where pose and masks come from.
+    #[arg(long, value_enum, default_value = "given")]
+    pub pose: Origin,
+    /// Numbers of Gaussians, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "10000,41000,164000", value_parser = clap::value_parser!(u32).range(1000..=1_000_000).map(|n| n as usize))]
+    pub gaussians: Vec<usize>,
+    /// Seconds of fitting after which they are scored, comma separated; the last ones end the fit.
+    #[arg(long, value_delimiter = ',', default_value = "5,15,30,60,120", value_parser = parse_seconds)]
+    pub seconds: Vec<f64>,
+    /// As in `flyrig avatar build`.
+    #[arg(long, default_value_t = 5.0)]
+    pub pull: f32,
+    /// Folder of the results.
+    #[arg(long, default_value = "out/bench-avatar")]
+    pub out: PathBuf,
 }
 
 #[derive(Debug, Args)]

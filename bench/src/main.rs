@@ -1,6 +1,7 @@
 //! `flyrig-bench`: benchmarks that print run time beside error.
 
 mod appearance;
+mod avatar;
 mod budget;
 mod capture;
 mod case;
@@ -65,6 +66,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         BenchCommand::Track(args) => track::track(args, &gpu()?),
         BenchCommand::Endure(args) => endure::endure(args, &gpu()?),
         BenchCommand::Appearance(args) => appearance::appearance(args, &gpu()?),
+        BenchCommand::Avatar(args) => avatar::avatar(args, &gpu()?),
         BenchCommand::Budget(args) => budget::budget(args, &gpu()?),
         BenchCommand::Capture(args) => capture::capture(args),
         BenchCommand::Stress(args) => stress::stress(args, &gpu()?),

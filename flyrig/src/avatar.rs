@@ -2,9 +2,11 @@
 
 pub mod arguments;
 mod build;
+mod checkpoint;
 mod edit;
 mod eval;
 mod export;
+mod parts;
 mod render;
 
 use std::path::Path;

@@ -1,6 +1,7 @@
 //! Shared by the programs: HTML reports, plots, images, progress bars, logging, arguments, and Ctrl-C as a flag.
 
 pub mod arguments;
+mod avatar_take;
 mod contact;
 pub mod dataset;
 mod html;
@@ -14,6 +15,7 @@ pub mod stop;
 mod trace;
 mod true_joints;
 
+pub use avatar_take::AvatarTake;
 pub use contact::contact_images;
 pub use html::{ContactRow, Curve, Report, Table, write_whole};
 pub use outlines::{outlined_inputs, paint_outline};

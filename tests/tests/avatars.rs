@@ -106,3 +106,32 @@ fn an_avatar_is_built_scored_driven_and_exported() {
     refused(&[&["build", &take, "--inputs", "00,77", "--out", "c.flyavatar"], &GIVEN[..]].concat(), "77");
     assert!(!folder.path().join("c.flyavatar").exists());
 }
+
+#[test]
+fn a_build_that_was_killed_goes_on() {
+    let data = write_dataset().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let take = data.root.to_string_lossy().into_owned();
+    let args = ["avatar", "build", &take, "--inputs", "00,02", "--frames", "0..2", "--out", "a.flyavatar"];
+    let args = [&args[..], &["--steps", "700", "--gaussians", "1000", "--nodes", "50"], &GIVEN].concat();
+    let build = || {
+        let finished = run(PROGRAM, &args, folder.path()).unwrap();
+        assert_eq!(finished.code, Some(0), "{finished:?}");
+        (finished.stdout, std::fs::read(folder.path().join("a.flyavatar")).unwrap())
+    };
+    let (_, whole) = build();
+    std::fs::remove_file(folder.path().join("a.flyavatar")).unwrap();
+    let state = folder.path().join("a.fit");
+    let mut killed = std::process::Command::new(PROGRAM).args(&args).current_dir(folder.path()).spawn().unwrap();
+    while !state.exists() && killed.try_wait().unwrap().is_none() {
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    killed.kill().unwrap(); // SIGKILL
+    killed.wait().unwrap();
+    assert!(state.exists(), "the build ended before it could be killed");
+    assert!(!folder.path().join("a.flyavatar").exists(), "an avatar of a build that was killed");
+    let (printed, resumed) = build();
+    assert!(printed.contains("going on after 500 of 700 steps"), "{printed}");
+    assert!(whole == resumed, "it ended with other bytes");
+    assert!(!state.exists());
+}

@@ -153,6 +153,15 @@ fn parse_pull(text: &str) -> Result<f32, String> {
     }
 }
 
+/// Shape of clothes and hair of an avatar that a pose alone drives.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Clothes {
+    /// As they were in the most alike poses of the take.
+    Pose,
+    /// Their mean over the take.
+    Mean,
+}
+
 #[derive(Debug, Args)]
 pub struct EvalArgs {
     /// The avatar (*.flyavatar).
@@ -168,6 +177,9 @@ pub struct EvalArgs {
     /// Move its clothes as the images show it, in place of the pose alone.
     #[arg(long)]
     pub deformed: bool,
+    /// Shape of clothes and hair where the pose alone drives it.
+    #[arg(long, value_enum, default_value = "pose", conflicts_with = "deformed")]
+    pub clothes: Clothes,
 }
 
 #[derive(Debug, Args)]

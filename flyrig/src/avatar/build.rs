@@ -1,21 +1,20 @@
 //! `flyrig avatar build`: tracks the person of a take, then fits an avatar to its images.
 
-use std::{path::Path, time::Instant};
+use std::{
+    path::Path,
+    time::{Duration, Instant},
+};
 
 use anyhow::{Context as _, Result, ensure};
-use flyrig_avatar::{
-    AtlasLayout, Avatar, AvatarScene, Bones, Card, ErrorWeights, Fit, FitSettings, LocalSettings, TrainingFrame,
-    TrainingView,
-};
-use flyrig_fusion::{BodySettings, Outcome, PersonId, person_surface};
+use flyrig_avatar::{AtlasLayout, Avatar, AvatarScene, Card, ErrorWeights, Fit, FitSettings, LocalSettings};
+use flyrig_fusion::BodySettings;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
-use flyrig_report::{frame_number, png, progress_bar, stop};
-use flyrig_types::Camera;
-use glam::{DVec3, Vec2};
+use flyrig_report::{AvatarTake, png, progress_bar, stop};
 
 use super::{
     arguments::{Atlas, BuildArgs, LocalArgs, Method, Order},
+    checkpoint::Checkpoint,
     open_replay,
 };
 
@@ -23,27 +22,28 @@ use super::{
 const MEASURED_STEPS: u64 = 20;
 /// Steps between updates of the progress.
 const SHOW_EVERY: u64 = 20;
+/// Steps, and time, between savings of the state.
+const SAVE_STEPS: u64 = 500;
+const SAVE_EVERY: Duration = Duration::from_secs(30);
 /// Pictures that are written while it is fitted.
 const PICTURES: u64 = 10;
-
-/// Results of tracking.
-struct Tracked {
-    frames: Vec<TrainingFrame>,
-    views: Vec<TrainingView>,
-    avatar: Avatar,
-    /// Texture coordinates of its Gaussians.
-    uvs: Vec<Vec2>,
-    numbers: [u64; 2],
-    /// First camera, for pictures.
-    camera: Camera,
-}
 
 /// Runs the command.
 pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
     let folder = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     ensure!(folder.is_dir(), "the folder {} does not exist; make it, or choose another --out", folder.display());
     let started = Instant::now();
-    let Tracked { frames, views, mut avatar, uvs, numbers, camera } = track(args, gpu)?;
+    let body = BodySettings { gaussians: args.gaussians as usize, nodes: args.nodes, ..BodySettings::default() };
+    let mut replay = open_replay(&args.take, &[], (&body, None), gpu)?;
+    let order = match args.harmonics {
+        Order::Zero => HarmonicOrder::Zero,
+        Order::One => HarmonicOrder::One,
+        Order::Two => HarmonicOrder::Two,
+    };
+    let tracked = AvatarTake::track(&mut replay, &body, order, |_, _| Ok(()))
+        .with_context(|| format!("no avatar of {}", args.take.dataset.display()))?;
+    drop(replay);
+    let AvatarTake { frames, views, mut avatar, uvs, numbers, camera, .. } = tracked;
     let tracked = started.elapsed();
     println!(
         "tracked {} frames in {:.0} s; fitting {} Gaussians to {} images on {}",
@@ -78,11 +78,16 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
         println!("local networks of {numbers} numbers");
         picture(&avatar)?;
     }
+    let state = Checkpoint::new(args, fit.images());
+    let (mut done, mut total) = (0, args.steps);
+    if let Some(progress) = state.resume(&mut fit, &mut avatar)? {
+        (done, total) = (progress.done, Some(progress.total));
+    }
     let before = fit.decibels(&avatar)?;
-    let fitting = Instant::now();
-    let mut total = args.steps;
+    let (fitting, resumed_at) = (Instant::now(), done);
+    let mut saved = (Instant::now(), done);
     let bar = progress_bar(total.unwrap_or(MEASURED_STEPS), "avatar build");
-    let mut done = 0;
+    bar.set_position(done);
     let (mut sum, mut pictured) = (0.0, 0);
     while total.is_none_or(|total| done < total) && !stop::requested() {
         let progress = total.map_or(0.0, |total| done as f32 / total as f32);
@@ -93,6 +98,10 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
             let all = ((args.minutes * 60.0 / step_secs) as u64).max(done);
             bar.set_length(all);
             total = Some(all);
+        }
+        if let Some(total) = total.filter(|_| done >= saved.1 + SAVE_STEPS || saved.0.elapsed() > SAVE_EVERY) {
+            state.save(&mut fit, &mut avatar, total)?;
+            saved = (Instant::now(), done);
         }
         if done % SHOW_EVERY == 0 {
             bar.set_message(format!("{:.1} dB, {}", sum / SHOW_EVERY as f64, picture_path.display()));
@@ -106,6 +115,10 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
         }
     }
     bar.finish_and_clear();
+    if let Some(total) = total.filter(|total| done < *total) {
+        state.save(&mut fit, &mut avatar, total)?;
+        println!("stopped after {done} of {total} steps; the same command goes on from there");
+    }
     let seconds = fitting.elapsed().as_secs_f64();
     let training_db = fit.decibels(&avatar)?;
     avatar.card = Card {
@@ -121,9 +134,12 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
         edits: Vec::new(),
     };
     avatar.save(&args.out)?;
+    if total.is_none_or(|total| done >= total) {
+        state.remove()?;
+    }
     println!(
         "{done} steps in {seconds:.0} s ({:.1} ms each); training images {before:.2} -> {training_db:.2} dB; {} ({:.1} MB) and {}",
-        1e3 * seconds / done.max(1) as f64,
+        1e3 * seconds / (done - resumed_at).max(1) as f64,
         args.out.display(),
         std::fs::metadata(&args.out).map_or(0.0, |file| file.len() as f64 / 1e6),
         picture_path.display()
@@ -154,54 +170,4 @@ fn method(args: &BuildArgs) -> String {
             format!("logavatar: {group} Gaussians an anchor, {stages} stages, atlas {atlas} of {texels} texels")
         }
     }
-}
-
-/// Tracks the person, as live.
-fn track(args: &BuildArgs, gpu: &GpuContext) -> Result<Tracked> {
-    let body = BodySettings { gaussians: args.gaussians as usize, nodes: args.nodes, ..BodySettings::default() };
-    let mut replay = open_replay(&args.take, &[], (&body, None), gpu)?;
-    let person = PersonId::default();
-    let (mut frames, mut views, mut numbers) = (Vec::new(), Vec::new(), Vec::new());
-    let bar = progress_bar(replay.count as u64, "track");
-    while let Some(set) = replay.next_set()?.filter(|_| !stop::requested()) {
-        bar.inc(1);
-        if let Outcome::Held(reason) = replay.session.process(&set)? {
-            tracing::warn!(frame = frame_number(&set), %reason, "frame not used");
-            continue;
-        }
-        let Some((subject, pose)) = replay.session.subject(person).and_then(|subject| Some((subject, subject.pose()?)))
-        else {
-            continue;
-        };
-        let cameras = replay.session.viewed(person);
-        views.extend(
-            cameras
-                .iter()
-                .enumerate()
-                .filter_map(|(k, camera)| TrainingView::cut(frames.len(), camera, subject.input(k))),
-        );
-        frames.push(TrainingFrame {
-            bones: Bones::new(&subject.template().skeleton, pose),
-            translations: subject.node_translations().to_vec(),
-        });
-        numbers.push(frame_number(&set));
-    }
-    bar.finish_and_clear();
-    let subject = replay.session.subject(person);
-    let (Some(subject), Some(first), Some(last)) = (subject, numbers.first(), numbers.last()) else {
-        anyhow::bail!("nobody was found in {}; run with -v to see why", args.take.dataset.display());
-    };
-    let (surface, graph) = person_surface(subject.template(), &body)?;
-    let deforms = frames.iter().any(|frame| !frame.translations.is_empty());
-    let surface = if deforms { surface.inset() } else { surface };
-    let colors: Vec<[f32; 3]> = replay.session.splats(person)?.iter().map(|splat| splat.color).collect();
-    let order = match args.harmonics {
-        Order::Zero => HarmonicOrder::Zero,
-        Order::One => HarmonicOrder::One,
-        Order::Two => HarmonicOrder::Two,
-    };
-    let mut avatar = Avatar::new(subject.template(), &surface, deforms.then_some(&graph), &colors, order)?;
-    avatar.set_mean(frames.iter().map(|frame: &TrainingFrame| frame.translations.as_slice() as &[DVec3]));
-    let camera = replay.session.rig().cameras.first().cloned().context("no camera")?;
-    Ok(Tracked { frames, views, avatar, uvs: surface.uvs, numbers: [*first, last + 1], camera })
 }

@@ -10,7 +10,11 @@ use flyrig_metrics::{CameraScore, FrameScore, ScoreSheet, error_parts, score_vie
 use flyrig_report::{frame_number, png, progress_bar, write_whole};
 use serde::Serialize;
 
-use super::{arguments::EvalArgs, load, open_replay};
+use super::{
+    arguments::{Clothes, EvalArgs},
+    load, open_replay,
+    parts::score_parts,
+};
 
 #[derive(Debug, Serialize)]
 struct Metrics<'a> {
@@ -23,6 +27,10 @@ struct Metrics<'a> {
     mean: Option<CameraScore>,
     cameras: Vec<CameraScore>,
     per_frame: &'a [FrameScore],
+    /// Boxes around head and hands.
+    parts: Vec<CameraScore>,
+    /// Mean share of the clothes in poses unlike those of the take.
+    far_share: f64,
     /// Mean time of posing and drawing a view, reading back included, milliseconds.
     view_ms: f64,
 }
@@ -45,6 +53,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let mut scene = AvatarScene::new(gpu, &avatar)?;
     let bar = progress_bar(replay.count as u64, "avatar eval");
     let (mut sheet, mut spent, mut drawn, mut hidden) = (ScoreSheet::default(), Duration::ZERO, 0u32, 0);
+    let (mut parts, mut far, mut frames) = (ScoreSheet::default(), 0.0, 0u32);
     while let Some(set) = replay.next_set()? {
         bar.inc(1);
         let number = frame_number(&set);
@@ -55,8 +64,13 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         let Some((subject, pose)) = subject.and_then(|subject| Some((subject, subject.pose()?))) else { continue };
         fits(&avatar, &subject.template().skeleton, pose)?;
         let start = Instant::now();
-        let translations = args.deformed.then(|| subject.node_translations()).filter(|all| !all.is_empty());
-        scene.pose(&avatar, &Bones::new(&avatar.template.skeleton, pose), translations);
+        let deformed = Some(subject.node_translations()).filter(|all| args.deformed && !all.is_empty());
+        match deformed {
+            None if args.clothes == Clothes::Pose => scene.drive(&avatar, pose),
+            translations => scene.pose(&avatar, &Bones::new(&avatar.template.skeleton, pose), translations),
+        }
+        far += avatar.examples.as_ref().map_or(0.0, |examples| examples.far_share(pose));
+        frames += 1;
         let mut views = Vec::new();
         for camera in &holdout {
             views.push(scene.draw(camera)?);
@@ -68,6 +82,9 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         for ((camera, view), truth) in holdout.iter().zip(&views).zip(&truths) {
             png::write_view(&args.out.join(camera.id.as_str()).join(format!("{number:06}.png")), view)?;
             let Some(truth) = truth else { continue };
+            if let Some(mask) = &truth.mask {
+                parts.extend(score_parts((&avatar, &scene, camera), number, view, &truth.image, mask)?);
+            }
             let mut score = score_view(&camera.id, number, view, &truth.image, truth.mask.as_ref())?;
             if let (Some(score), Some(mask)) = (&mut score, &truth.mask) {
                 score.parts = error_parts(view, &truth.image, mask)?;
@@ -78,6 +95,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     }
     bar.finish_and_clear();
     ensure!(drawn > 0, "nobody was found in {}; run with -v to see why", args.take.dataset.display());
+    let far_share = far / f64::from(frames.max(1));
     let view_ms = 1e3 * spent.as_secs_f64() / f64::from(drawn);
     let metrics = Metrics {
         avatar: args.avatar.display().to_string(),
@@ -89,16 +107,27 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         mean: sheet.mean(),
         cameras: sheet.per_camera(),
         per_frame: sheet.frames(),
+        parts: parts.per_camera(),
+        far_share,
         view_ms,
     };
     write_whole(&args.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
     print!("{}", sheet.table());
+    for CameraScore { camera: part, frames, psnr_db, ssim, flip, .. } in parts.per_camera() {
+        println!("{part:<8} {frames:>6} {psnr_db:>9.2} {ssim:>8.4} {flip:>8.4}");
+    }
     println!(
         "\n{drawn} views of {} Gaussians, {:.0} % of them left out as they face away, {view_ms:.1} ms each; images in {}",
         avatar.gaussians(),
         100.0 * hidden as f64 / f64::from(drawn) / avatar.gaussians() as f64,
         args.out.display()
     );
+    if far_share > 0.0 {
+        println!(
+            "{:.1} % of the body was in poses unlike those that the avatar was built from (over 30 degrees from all of them)",
+            100.0 * far_share
+        );
+    }
     Ok(())
 }
 

@@ -79,7 +79,8 @@ fn splats(avatar: &Avatar, args: &ExportArgs, ending: &str) -> Result<()> {
         None => avatar.template.skeleton.rest_pose(),
     };
     let mut posed = PosedAvatar::default();
-    avatar.pose(&Bones::new(&avatar.template.skeleton, &pose), None, &mut posed);
+    let clothes = avatar.examples.as_ref().map(|examples| examples.translations(&pose));
+    avatar.pose(&Bones::new(&avatar.template.skeleton, &pose), clothes.as_deref(), &mut posed);
     let splats = AnisotropicSplats {
         center: posed.center,
         scale_opacity: posed.scale_opacity,

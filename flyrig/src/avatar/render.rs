@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::{Context as _, Result, bail};
-use flyrig_avatar::{Avatar, AvatarScene, Bones};
+use flyrig_avatar::{Avatar, AvatarScene};
 use flyrig_body::{RetargetOptions, load_bvh, load_gltf};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{png, progress_bar, stop};
@@ -30,7 +30,7 @@ pub fn render(args: &RenderArgs, gpu: &GpuContext) -> Result<()> {
             break;
         }
         let pose = pose_at(&track, frame);
-        scene.pose(&avatar, &Bones::new(&avatar.template.skeleton, &pose), None);
+        scene.drive(&avatar, &pose);
         let view = scene.draw(&camera(args.size, pose.root_translation))?;
         png::write_view(&args.out.join(format!("{frame:06}.png")), &view)?;
         bar.inc(1);
@@ -69,7 +69,8 @@ fn camera([width, height]: [u32; 2], root: DVec3) -> Camera {
             width,
             height,
             focal_px: DVec2::splat(focal),
-            center_px: DVec2::new(f64::from(width), f64::from(height)) * 0.5,
+            // Pixel centres are at integers.
+            center_px: DVec2::new(f64::from(width) - 1.0, f64::from(height) - 1.0) * 0.5,
             lens: Lens::PINHOLE,
         },
         camera_from_world: Isometry { rotation: camera_from_world, translation: -(camera_from_world * place) },

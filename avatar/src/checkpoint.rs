@@ -1,0 +1,96 @@
+//! State of a fit between two steps: one that was killed goes on from there, and ends with the bytes of one that was not.
+
+use std::collections::HashMap;
+
+use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+use serde::{Deserialize, Serialize};
+
+use crate::{Avatar, AvatarError, Fit};
+
+/// Key of the description in the file's metadata.
+const HEADER: &str = "flyrig-fit";
+
+/// Steps of a fit that are done, and steps that it is to have.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FitProgress {
+    /// Description of take and settings; another one is another fit.
+    pub settings: String,
+    /// Steps that are done.
+    pub done: u64,
+    /// Steps in all.
+    pub total: u64,
+}
+
+impl Fit {
+    /// Returns the state after the last step as a file's bytes, with the avatar as it is then.
+    ///
+    /// # Errors
+    /// [`AvatarError::Format`] for a description that cannot be written.
+    pub fn checkpoint(&mut self, avatar: &mut Avatar, settings: &str, total: u64) -> Result<Vec<u8>, AvatarError> {
+        let fail = |problem: String| AvatarError::Format { path: "checkpoint".into(), problem };
+        let progress = FitProgress { settings: settings.to_owned(), done: self.step, total };
+        let header = serde_json::to_string(&progress).map_err(|error| fail(error.to_string()))?;
+        let state = self.state(avatar);
+        let views: Vec<_> = state
+            .iter()
+            .map(|(name, values)| {
+                let view = TensorView::new(Dtype::F32, vec![values.len()], bytemuck::cast_slice(values))?;
+                Ok((name.as_str(), view))
+            })
+            .collect::<Result<_, safetensors::SafeTensorError>>()
+            .map_err(|error| fail(error.to_string()))?;
+        safetensors::serialize(views, Some(HashMap::from([(HEADER.to_owned(), header)])))
+            .map_err(|error| fail(error.to_string()))
+    }
+
+    /// Takes the state of a [`Self::checkpoint`] over. Nothing is changed where it is refused.
+    ///
+    /// # Errors
+    /// Text: the file is none, it is damaged, or it is of another take or of other settings.
+    pub fn resume(&mut self, avatar: &mut Avatar, bytes: &[u8], settings: &str) -> Result<FitProgress, String> {
+        let none = || "is no state of a fit".to_owned();
+        let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|_| none())?;
+        let header = metadata.metadata().as_ref().and_then(|all| all.get(HEADER)).ok_or_else(none)?;
+        let progress: FitProgress = serde_json::from_str(header).map_err(|error| format!("is damaged: {error}"))?;
+        if progress.settings != settings {
+            return Err("is of another take or of other settings".to_owned());
+        }
+        let file = SafeTensors::deserialize(bytes).map_err(|error| format!("is damaged: {error}"))?;
+        let mut found = HashMap::new();
+        for (name, tensor) in file.iter() {
+            let values: Vec<f32> = tensor.data().chunks_exact(4).map(bytemuck::pod_read_unaligned).collect();
+            found.insert(name.to_owned(), values);
+        }
+        let state = self.state(avatar);
+        for (name, own) in &state {
+            let belongs =
+                |values: &&Vec<f32>| values.len() == own.len() && values.iter().all(|value| value.is_finite());
+            found.get(name).filter(belongs).ok_or_else(|| format!("is damaged: {name} is missing or another"))?;
+        }
+        for (name, own) in state {
+            if let Some(values) = found.get(&name) {
+                own.copy_from_slice(values);
+            }
+        }
+        self.step = progress.done;
+        if let Some(local) = &mut self.local {
+            local.resume(progress.done, &mut avatar.parameters);
+        }
+        Ok(progress)
+    }
+
+    /// All numbers that change from step to step, by name.
+    fn state<'a>(&'a mut self, avatar: &'a mut Avatar) -> Vec<(String, &'a mut [f32])> {
+        let mut all = Vec::new();
+        for (number, list) in avatar.parameters.lists_mut().into_iter().enumerate() {
+            all.push((format!("list.{number}"), list.as_flattened_mut()));
+        }
+        for (number, adam) in self.moments.iter_mut().enumerate() {
+            for (k, list) in adam.lists_mut().into_iter().enumerate() {
+                all.push((format!("adam.{k}.{number}"), list.as_flattened_mut()));
+            }
+        }
+        all.extend(self.local.iter_mut().flat_map(|local| local.state()));
+        all
+    }
+}

@@ -1,0 +1,80 @@
+//! The person of a take, tracked as live, for an avatar that is fitted to its images.
+
+use anyhow::{Context as _, Result, bail};
+use flyrig_avatar::Bones;
+use flyrig_avatar::{Avatar, TrainingFrame, TrainingView};
+use flyrig_fusion::{BodySettings, Outcome, PersonId, person_surface};
+use flyrig_renderer::HarmonicOrder;
+use flyrig_types::{Camera, FrameSet, Pose};
+use glam::Vec2;
+
+use crate::{Replay, frame_number, progress_bar, stop};
+
+/// A tracked take.
+#[derive(Debug)]
+pub struct AvatarTake {
+    /// Frames in which the person was found.
+    pub frames: Vec<TrainingFrame>,
+    /// Poses of these frames.
+    pub poses: Vec<Pose>,
+    /// Images of the person, cut to it.
+    pub views: Vec<TrainingView>,
+    /// The avatar as the person is drawn live.
+    pub avatar: Avatar,
+    /// Texture coordinates of its Gaussians, empty without any.
+    pub uvs: Vec<Vec2>,
+    /// First frame, and the one after the last.
+    pub numbers: [u64; 2],
+    /// First camera.
+    pub camera: Camera,
+}
+
+impl AvatarTake {
+    /// Tracks the person of a replay whose session draws it with `body`, until the end or Ctrl-C. `each` sees every frame in which it was
+    /// found, after it was taken in.
+    ///
+    /// # Errors
+    /// Nobody was found; what the session or the data set reports; errors of `each`.
+    pub fn track(
+        replay: &mut Replay,
+        body: &BodySettings,
+        order: HarmonicOrder,
+        mut each: impl FnMut(&mut Replay, &FrameSet) -> Result<()>,
+    ) -> Result<Self> {
+        let person = PersonId::default();
+        let (mut frames, mut views, mut numbers, mut poses) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        let bar = progress_bar(replay.count as u64, "track");
+        while let Some(set) = replay.next_set()?.filter(|_| !stop::requested()) {
+            bar.inc(1);
+            if let Outcome::Held(reason) = replay.session.process(&set)? {
+                tracing::warn!(frame = frame_number(&set), %reason, "frame not used");
+                continue;
+            }
+            let subject = replay.session.subject(person);
+            let Some((subject, pose)) = subject.and_then(|subject| Some((subject, subject.pose()?))) else { continue };
+            let cameras = replay.session.viewed(person);
+            let cut = |(k, camera)| TrainingView::cut(frames.len(), camera, subject.input(k));
+            views.extend(cameras.iter().enumerate().filter_map(cut));
+            frames.push(TrainingFrame {
+                bones: Bones::new(&subject.template().skeleton, pose),
+                translations: subject.node_translations().to_vec(),
+            });
+            poses.push(pose.clone());
+            numbers.push(frame_number(&set));
+            each(replay, &set)?;
+        }
+        bar.finish_and_clear();
+        let subject = replay.session.subject(person);
+        let (Some(subject), Some(first), Some(last)) = (subject, numbers.first(), numbers.last()) else {
+            bail!("nobody was found in the take; run with -v to see why");
+        };
+        let (surface, graph) = person_surface(subject.template(), body)?;
+        let deforms = frames.iter().any(|frame| !frame.translations.is_empty());
+        let surface = if deforms { surface.inset() } else { surface };
+        let colors: Vec<[f32; 3]> = replay.session.splats(person)?.iter().map(|splat| splat.color).collect();
+        let mut avatar = Avatar::new(subject.template(), &surface, deforms.then_some(&graph), &colors, order)?;
+        avatar.learn_clothes(poses.iter().zip(&frames).map(|(pose, frame)| (pose, frame.translations.as_slice())));
+        let camera = replay.session.rig().cameras.first().cloned().context("no camera")?;
+        Ok(Self { frames, poses, views, avatar, uvs: surface.uvs, numbers: [*first, last + 1], camera })
+    }
+}
