@@ -3,10 +3,10 @@
 use flyrig_body::{DeformationGraph, SkinWeights, SurfaceGaussians, Template};
 use flyrig_renderer::{HarmonicOrder, SH_DEGREE_0};
 use flyrig_types::Pose;
-use glam::{DVec3, Quat, Vec3};
+use glam::{DQuat, DVec3, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
-use crate::{AvatarError, Examples, Parameters};
+use crate::{AvatarError, KnownPoses, Light, Parameters};
 
 /// Thickness of a Gaussian across the surface at the start, against its size along it.
 const THICKNESS: f32 = 0.5;
@@ -85,10 +85,12 @@ pub struct Avatar {
     pub skin: Vec<SkinWeights>,
     /// Deformation graph; None without one.
     pub hanging: Option<Hanging>,
-    /// Shapes of clothes and hair in the poses of the take; None without a graph.
-    pub examples: Option<Examples>,
+    /// Poses of the take.
+    pub known_poses: KnownPoses,
     /// Fitted attributes of the Gaussians.
     pub parameters: Parameters,
+    /// Light of the take's room.
+    pub light: Light,
     /// Provenance.
     pub card: Card,
 }
@@ -135,8 +137,9 @@ impl Avatar {
                 .collect(),
             skin: surface.skin.clone(),
             hanging,
-            examples: None,
+            known_poses: KnownPoses::default(),
             parameters,
+            light: Light::default(),
             card: Card::default(),
         })
     }
@@ -147,15 +150,14 @@ impl Avatar {
         self.places.len()
     }
 
-    /// Learns the shapes of clothes and hair for poses alone from the frames of a take: poses, and the translations of the nodes in them.
-    pub fn learn_clothes<'a>(&mut self, frames: impl IntoIterator<Item = (&'a Pose, &'a [DVec3])> + Clone) {
-        self.set_mean(frames.clone().into_iter().map(|(_, translations)| translations));
-        let Some(hanging) = &self.hanging else { return };
-        self.examples = Examples::learn(hanging, &self.skin, &self.template.skeleton, frames);
+    /// Returns the share of the Gaussians that are in a pose unlike those of the take, see [`KnownPoses::far_share`].
+    #[must_use]
+    pub fn far_share(&self, pose: &Pose) -> f64 {
+        self.known_poses.far_share(&self.template.skeleton, &self.skin, pose)
     }
 
-    /// Sets the mean of these translations of the nodes, one list a frame.
-    fn set_mean<'a>(&mut self, frames: impl IntoIterator<Item = &'a [DVec3]>) {
+    /// Sets the shape for poses alone to the mean of these translations of the nodes, one list a frame.
+    pub fn set_mean<'a>(&mut self, frames: impl IntoIterator<Item = &'a [DVec3]>) {
         let Some(hanging) = &mut self.hanging else { return };
         let (mut sum, mut count) = (vec![DVec3::ZERO; hanging.nodes.len()], 0);
         for frame in frames.into_iter().filter(|frame| frame.len() == hanging.nodes.len()) {
@@ -189,17 +191,14 @@ impl Avatar {
             {
                 return Err("its deformation graph is of another avatar".to_owned());
             }
-            let joints = self.template.skeleton.joints().len();
-            let belongs = |examples: &Examples| {
-                examples.rotations.len() == examples.translations.len()
-                    && examples.rotations.iter().all(|frame| frame.len() == joints)
-                    && examples.translations.iter().all(|frame| frame.len() == nodes)
-            };
-            if self.examples.as_ref().is_some_and(|examples| !belongs(examples)) {
-                return Err("the shapes of its clothes are of another avatar".to_owned());
-            }
         }
-        let is_finite = self.places.iter().all(|place| place.is_finite()) && self.parameters.is_finite();
+        let joints = self.template.skeleton.joints().len();
+        let is_pose = |frame: &Vec<DQuat>| frame.len() == joints && frame.iter().all(|turn| turn.is_finite());
+        if !self.known_poses.0.iter().all(is_pose) {
+            return Err("the poses of its take are of another body".to_owned());
+        }
+        let is_lit = self.light.terms.as_flattened().iter().all(|term| term.is_finite());
+        let is_finite = is_lit && self.places.iter().all(|place| place.is_finite()) && self.parameters.is_finite();
         if is_finite { Ok(()) } else { Err("it holds numbers that are not finite".to_owned()) }
     }
 }
@@ -207,7 +206,6 @@ impl Avatar {
 #[cfg(test)]
 pub(crate) mod tests {
     use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
-    use glam::DQuat;
     use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
     use super::*;

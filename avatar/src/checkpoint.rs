@@ -85,6 +85,10 @@ impl Fit {
         for (number, list) in avatar.parameters.lists_mut().into_iter().enumerate() {
             all.push((format!("list.{number}"), list.as_flattened_mut()));
         }
+        all.push(("light".to_owned(), avatar.light.terms.as_flattened_mut()));
+        for (number, moment) in self.light.moments.iter_mut().enumerate() {
+            all.push((format!("light.{number}"), moment.as_mut_slice()));
+        }
         for (number, adam) in self.moments.iter_mut().enumerate() {
             for (k, list) in adam.lists_mut().into_iter().enumerate() {
                 all.push((format!("adam.{k}.{number}"), list.as_flattened_mut()));

@@ -9,7 +9,7 @@ use glam::{DMat4, DQuat, DVec3, Quat, Vec2, Vec3};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 
-use crate::{Attachment, Avatar, AvatarError, Card, Examples, Hanging, Parameters};
+use crate::{Attachment, Avatar, AvatarError, Card, Hanging, KnownPoses, Light, Parameters};
 
 /// Version of the format; a file of another one is refused.
 const VERSION: u32 = 2;
@@ -132,6 +132,7 @@ impl Avatar {
         for (name, list) in LISTS.into_iter().zip(self.parameters.lists()) {
             arrays.push(name, Dtype::F32, 4, list);
         }
+        arrays.push("light", Dtype::F32, 3, &self.light.terms);
         if let Some(hanging) = &self.hanging {
             arrays.push("graph.nodes", Dtype::F32, 3, &flat(&hanging.nodes));
             let mean: Vec<[f32; 3]> = hanging.mean.iter().map(|v| v.as_vec3().to_array()).collect();
@@ -139,13 +140,8 @@ impl Avatar {
             arrays.push("graph.gaussian_nodes", Dtype::U32, 4, &hanging.gaussian_nodes);
             arrays.push("graph.gaussian_weights", Dtype::F32, 4, &hanging.gaussian_weights);
         }
-        if let Some(Examples { rotations, translations, width_rad, .. }) = &self.examples {
-            let rotations: Vec<[f32; 4]> = rotations.iter().flatten().map(|turn| turn.as_quat().to_array()).collect();
-            arrays.push("examples.rotations", Dtype::F32, 4, &rotations);
-            let translations: Vec<_> = translations.iter().flatten().map(|moved| moved.as_vec3().to_array()).collect();
-            arrays.push("examples.translations", Dtype::F32, 3, &translations);
-            arrays.push("examples.width", Dtype::F64, 1, &[*width_rad]);
-        }
+        let poses: Vec<[f32; 4]> = self.known_poses.0.iter().flatten().map(|turn| turn.as_quat().to_array()).collect();
+        arrays.push("poses", Dtype::F32, 4, &poses);
         let joints = skeleton.joints().iter().map(|joint| JointRow { name: joint.name.clone(), parent: joint.parent });
         let header =
             Header { version: VERSION, card: self.card.clone(), template: name.clone(), joints: joints.collect() };
@@ -224,6 +220,14 @@ impl Avatar {
         let [offset, shape, rotation, harmonics] = lists;
         let parameters = Parameters::from_lists([offset?, shape?, rotation?, harmonics?])
             .ok_or("its lists of Gaussians have different lengths")?;
+        let light = match file.tensor("light") {
+            // Avatars of before have none.
+            Err(_) => Light::default(),
+            Ok(_) => {
+                let terms = rows::<f32, 3>(&file, "light", Dtype::F32)?;
+                Light { terms: terms.try_into().map_err(|_| "its light has another number of terms")? }
+            }
+        };
         let hanging = match file.tensor("graph.nodes") {
             Err(_) => None,
             Ok(_) => Some(Hanging {
@@ -237,49 +241,32 @@ impl Avatar {
         let corners = rows::<f32, 3>(&file, "gaussians.barycentric", Dtype::F32)?;
         let attachments =
             triangles.into_iter().zip(corners).map(|([triangle], barycentric)| Attachment { triangle, barycentric });
-        let skin = skin(&file, ["gaussians.joints", "gaussians.weights"])?;
-        let examples = match &hanging {
-            Some(hanging) if file.tensor("examples.width").is_ok() => {
-                examples(&file, hanging, &skin, &template.skeleton)?
+        let joints = template.skeleton.joints().len().max(1);
+        let known_poses = match file.tensor("poses") {
+            // Avatars of before have none.
+            Err(_) => KnownPoses::default(),
+            Ok(_) => {
+                let turns: Vec<DQuat> = rows::<f32, 4>(&file, "poses", Dtype::F32)?
+                    .into_iter()
+                    .map(|turn| Quat::from_array(turn).as_dquat())
+                    .collect();
+                KnownPoses(turns.chunks(joints).map(<[DQuat]>::to_vec).collect())
             }
-            _ => None,
         };
         let avatar = Self {
             template,
             places: vectors(&file, "gaussians.places")?,
             attachments: attachments.collect(),
-            skin,
+            skin: skin(&file, ["gaussians.joints", "gaussians.weights"])?,
             hanging,
-            examples,
+            known_poses,
             parameters,
+            light,
             card,
         };
         avatar.check()?;
         Ok(avatar)
     }
-}
-
-/// Reads the shapes of clothes; rows of a frame follow each other.
-fn examples(
-    file: &SafeTensors<'_>,
-    hanging: &Hanging,
-    skin: &[SkinWeights],
-    skeleton: &Skeleton,
-) -> Result<Option<Examples>, String> {
-    let rotations = rows::<f32, 4>(file, "examples.rotations", Dtype::F32)?;
-    let rotations = rotations.into_iter().map(|turn| Quat::from_array(turn).as_dquat()).collect::<Vec<_>>();
-    let translations: Vec<DVec3> = vectors(file, "examples.translations")?.into_iter().map(Vec3::as_dvec3).collect();
-    let width = rows::<f64, 1>(file, "examples.width", Dtype::F64)?;
-    let [width] = width.first().copied().filter(|[width]| *width > 0.0).ok_or("the clothes have no width")?;
-    if !rotations.iter().all(|turn| turn.is_finite()) || !translations.iter().all(|moved| moved.is_finite()) {
-        return Err("the shapes of its clothes are not finite".to_owned());
-    }
-    let (joints, nodes) = (skeleton.joints().len().max(1), hanging.nodes.len().max(1));
-    let frames = (
-        rotations.chunks(joints).map(<[DQuat]>::to_vec).collect(),
-        translations.chunks(nodes).map(<[DVec3]>::to_vec).collect(),
-    );
-    Ok(Examples::new(hanging, skin, skeleton, frames, width))
 }
 
 /// Names of the learnt lists.
@@ -295,16 +282,14 @@ mod tests {
     #[test]
     fn avatars_come_back_and_the_same_gives_the_same_bytes() {
         let mut avatar = small(200, 9);
-        let frames = [1, 2, 3].map(|seed| random_pose(&avatar, seed));
-        avatar.learn_clothes(frames.iter().map(|(pose, nodes)| (pose, nodes.as_slice())));
-        avatar.hanging.as_mut().unwrap().mean.fill(DVec3::ZERO); // which the file rounds
-        assert!(avatar.examples.is_some());
+        avatar.known_poses = KnownPoses::new(&[1, 2, 3].map(|seed| random_pose(&avatar, seed).0));
+        avatar.light.terms[3] = [0.1, 0.2, 0.3];
         avatar.card = Card { name: "A".to_owned(), cameras: vec!["00".to_owned()], steps: 3, ..Card::default() };
         let bytes = avatar.to_bytes().unwrap();
         // Printed in full they would fill screens.
         assert!(bytes == avatar.clone().to_bytes().unwrap());
         assert!(Avatar::from_bytes(&bytes).unwrap() == avatar);
-        (avatar.hanging, avatar.examples) = (None, None);
+        avatar.hanging = None;
         let folder = tempfile();
         avatar.save(&folder).unwrap();
         assert!(Avatar::load(&folder).unwrap() == avatar);

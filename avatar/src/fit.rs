@@ -12,8 +12,8 @@ use glam::{DVec3, Vec2};
 use rand::{SeedableRng as _, rngs::StdRng, seq::SliceRandom as _};
 
 use crate::{
-    Avatar, AvatarError, Bones, ErrorWeights, ImageError, LocalSettings, PosedAvatar, adam::Adam, local::Local,
-    neighbors::Neighbors, parameters::Element, scene::AvatarBuffers,
+    Avatar, AvatarError, Bones, ErrorWeights, ImageError, LocalSettings, PosedAvatar, adam::Adam, light::LightFit,
+    local::Local, neighbors::Neighbors, parameters::Element, scene::AvatarBuffers,
 };
 
 /// Images are cut to the person and so many pixels around.
@@ -50,6 +50,8 @@ pub struct FitSettings {
     /// How much neighbours pull each other; 0 for not at all. At 1 the pull is as strong as images usually are where an offset differs by
     /// 5 mm from the neighbours', a scale by a factor of two, a colour by a fifth of the range.
     pub pull: f32,
+    /// Whether the room's light is learnt.
+    pub light: bool,
 }
 
 impl Default for FitSettings {
@@ -63,6 +65,7 @@ impl Default for FitSettings {
             rotation_rate: [5e-3, 1e-3],
             color_rate: [1e-2, 1e-3],
             pull: 5.0,
+            light: true,
         }
     }
 }
@@ -158,6 +161,7 @@ pub struct Fit {
     targets: BTreeMap<[u32; 2], Targets>,
     posed: PosedAvatar,
     pub(crate) moments: [Adam; 4],
+    pub(crate) light: LightFit,
     neighbors: Neighbors,
     /// Networks whose outputs the lists are; None where the lists themselves are learnt.
     pub(crate) local: Option<Local>,
@@ -201,6 +205,7 @@ impl Fit {
             gradients: AnisotropicGradients::zeroed(gpu, count, order)?,
             targets,
             posed: PosedAvatar::default(),
+            light: LightFit::new(),
             moments: avatar.parameters.lists().map(|list| Adam::new(list.len())),
             neighbors: Neighbors::new(&avatar.places),
             local: None,
@@ -266,6 +271,10 @@ impl Fit {
             self.posed.to_parameters([centers, scales, rotations]);
         }
         self.step += 1;
+        if let Some(colors) = found.last_mut().filter(|_| self.settings.light) {
+            let slopes = self.posed.to_light(avatar, colors);
+            self.light.descend(&mut avatar.light, &slopes, self.step, progress);
+        }
         let rates = self.rates(progress);
         let coefficients = avatar.parameters.order().coefficients();
         for (list, values) in avatar.parameters.lists_mut().into_iter().enumerate() {
@@ -332,7 +341,7 @@ impl Fit {
         let frame = &self.frames[view.frame];
         let translations = (!frame.translations.is_empty()).then_some(frame.translations.as_slice());
         avatar.pose(&frame.bones, translations, &mut self.posed);
-        self.buffers.pose(&self.gpu, &self.posed, avatar);
+        self.buffers.pose(&self.gpu, &self.posed);
         let Some(Targets { drawn, .. }) = self.targets.get(&view.size()) else {
             return Err(AvatarError::Images("an image has no target".to_owned()));
         };

@@ -71,6 +71,8 @@ pub struct PosedAvatar {
     pub scale_opacity: Vec<Element>,
     /// Quaternion x, y, z, w, world from the Gaussian's axes.
     pub rotation: Vec<Element>,
+    /// Coefficients of the colours, lit, as in [`Parameters::harmonics`].
+    pub harmonics: Vec<Element>,
     places: Vec<Place>,
 }
 
@@ -87,7 +89,7 @@ impl Avatar {
     /// Brings all Gaussians into the world. `translations` are those of the graph's nodes, canonical metres; without them, and where there
     /// are none, the mean of the take holds.
     pub fn pose(&self, bones: &Bones, translations: Option<&[DVec3]>, posed: &mut PosedAvatar) {
-        let Parameters { offset, shape, rotation, .. } = &self.parameters;
+        let Parameters { offset, shape, rotation, harmonics, .. } = &self.parameters;
         let nodes = self.hanging.as_ref();
         let translations = translations.or(nodes.map(|nodes| nodes.mean.as_slice())).unwrap_or_default();
         let of = |i: usize| {
@@ -116,6 +118,12 @@ impl Avatar {
             posed.rotation.push(rotation);
             posed.places.push(place);
         }
+        let coefficients = self.parameters.order().coefficients();
+        posed.harmonics.clone_from(harmonics);
+        posed.harmonics.par_chunks_mut(coefficients).zip(&posed.places).with_min_len(1024).for_each(|(rows, place)| {
+            let shade = self.light.shade(place.normal);
+            rows.iter_mut().for_each(|row| (0..3).for_each(|k| row[k] *= shade[k]));
+        });
     }
 }
 
@@ -133,6 +141,13 @@ impl PosedAvatar {
             }
         }
         hidden
+    }
+
+    /// Turns derivatives with respect to the lit colours into those of the unlit ones, in place, and returns those of the light's terms.
+    pub(crate) fn to_light(&self, avatar: &Avatar, slopes: &mut [Element]) -> [[f32; 3]; 9] {
+        let Parameters { harmonics, .. } = &avatar.parameters;
+        let normal = |i: usize| self.places.get(i).map_or(Vec3::ZERO, |place| place.normal);
+        avatar.light.backward(normal, harmonics, slopes, avatar.parameters.order().coefficients())
     }
 
     /// Turns derivatives with respect to centres, scales and opacities, and rotations in the world into those of the parameters, in place:

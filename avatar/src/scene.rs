@@ -21,11 +21,11 @@ impl AvatarBuffers {
         Ok(Self { gaussians, scale_opacity: Vec::new() })
     }
 
-    pub fn pose(&self, gpu: &GpuContext, posed: &PosedAvatar, avatar: &Avatar) {
+    pub fn pose(&self, gpu: &GpuContext, posed: &PosedAvatar) {
         self.gaussians.center.write(gpu, &posed.center);
         self.gaussians.scale_opacity.write(gpu, &posed.scale_opacity);
         self.gaussians.rotation.write(gpu, &posed.rotation);
-        self.gaussians.harmonics.write(gpu, &avatar.parameters.harmonics);
+        self.gaussians.harmonics.write(gpu, &posed.harmonics);
     }
 
     /// Leaves out Gaussians that face away from a camera. Returns how many.
@@ -66,13 +66,12 @@ impl AvatarScene {
     /// Poses the avatar for the views to come; see [`Avatar::pose`].
     pub fn pose(&mut self, avatar: &Avatar, bones: &Bones, translations: Option<&[DVec3]>) {
         avatar.pose(bones, translations, &mut self.posed);
-        self.buffers.pose(&self.gpu, &self.posed, avatar);
+        self.buffers.pose(&self.gpu, &self.posed);
     }
 
-    /// Poses the avatar by a pose alone: clothes and hair take the shapes that they had in such poses.
+    /// Poses the avatar by a pose alone.
     pub fn drive(&mut self, avatar: &Avatar, pose: &Pose) {
-        let translations = avatar.examples.as_ref().map(|examples| examples.translations(pose));
-        self.pose(avatar, &Bones::new(&avatar.template.skeleton, pose), translations.as_deref());
+        self.pose(avatar, &Bones::new(&avatar.template.skeleton, pose), None);
     }
 
     /// Draws the avatar as a camera sees it, at its size; straight alpha.

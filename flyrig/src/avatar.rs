@@ -49,6 +49,17 @@ fn load(path: &Path) -> Result<Avatar> {
     Ok(Avatar::load(path)?)
 }
 
+/// Says how much of the body was in poses that the avatar was never seen in, in the mean of all frames.
+fn print_far(share: f64) {
+    if share > 0.0 {
+        println!(
+            "{:.1} % of the body was in poses unlike those that the avatar was built from (over 30 degrees from all of them); a take that \
+             shows such poses makes it better",
+            100.0 * share
+        );
+    }
+}
+
 /// Opens a take to be tracked.
 ///
 /// With a known body an estimated pose moves that one.

@@ -1,11 +1,10 @@
 //! The person of a take, tracked as live, for an avatar that is fitted to its images.
 
 use anyhow::{Context as _, Result, bail};
-use flyrig_avatar::Bones;
-use flyrig_avatar::{Avatar, TrainingFrame, TrainingView};
+use flyrig_avatar::{Avatar, Bones, KnownPoses, TrainingFrame, TrainingView};
 use flyrig_fusion::{BodySettings, Outcome, PersonId, person_surface};
 use flyrig_renderer::HarmonicOrder;
-use flyrig_types::{Camera, FrameSet, Pose};
+use flyrig_types::{Camera, FrameSet};
 use glam::Vec2;
 
 use crate::{Replay, frame_number, progress_bar, stop};
@@ -15,8 +14,6 @@ use crate::{Replay, frame_number, progress_bar, stop};
 pub struct AvatarTake {
     /// Frames in which the person was found.
     pub frames: Vec<TrainingFrame>,
-    /// Poses of these frames.
-    pub poses: Vec<Pose>,
     /// Images of the person, cut to it.
     pub views: Vec<TrainingView>,
     /// The avatar as the person is drawn live.
@@ -73,8 +70,9 @@ impl AvatarTake {
         let surface = if deforms { surface.inset() } else { surface };
         let colors: Vec<[f32; 3]> = replay.session.splats(person)?.iter().map(|splat| splat.color).collect();
         let mut avatar = Avatar::new(subject.template(), &surface, deforms.then_some(&graph), &colors, order)?;
-        avatar.learn_clothes(poses.iter().zip(&frames).map(|(pose, frame)| (pose, frame.translations.as_slice())));
+        avatar.set_mean(frames.iter().map(|frame: &TrainingFrame| frame.translations.as_slice()));
+        avatar.known_poses = KnownPoses::new(&poses);
         let camera = replay.session.rig().cameras.first().cloned().context("no camera")?;
-        Ok(Self { frames, poses, views, avatar, uvs: surface.uvs, numbers: [*first, last + 1], camera })
+        Ok(Self { frames, views, avatar, uvs: surface.uvs, numbers: [*first, last + 1], camera })
     }
 }

@@ -126,6 +126,9 @@ pub struct BuildArgs {
     /// How much neighbouring Gaussians pull each other; 0 for not at all.
     #[arg(long, default_value_t = 5.0, value_parser = parse_pull)]
     pub pull: f32,
+    /// Whether to learn the light of the take's room apart from the colours.
+    #[arg(long, default_value_t = true, action = clap::ArgAction::Set)]
+    pub light: bool,
     /// How the avatar is learnt.
     #[arg(long, value_enum, default_value = "direct")]
     pub method: Method,
@@ -153,15 +156,6 @@ fn parse_pull(text: &str) -> Result<f32, String> {
     }
 }
 
-/// Shape of clothes and hair of an avatar that a pose alone drives.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum Clothes {
-    /// As they were in the most alike poses of the take.
-    Pose,
-    /// Their mean over the take.
-    Mean,
-}
-
 #[derive(Debug, Args)]
 pub struct EvalArgs {
     /// The avatar (*.flyavatar).
@@ -177,9 +171,6 @@ pub struct EvalArgs {
     /// Move its clothes as the images show it, in place of the pose alone.
     #[arg(long)]
     pub deformed: bool,
-    /// Shape of clothes and hair where the pose alone drives it.
-    #[arg(long, value_enum, default_value = "pose", conflicts_with = "deformed")]
-    pub clothes: Clothes,
 }
 
 #[derive(Debug, Args)]

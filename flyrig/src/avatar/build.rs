@@ -69,6 +69,7 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
         FitSettings {
             seed: args.seed,
             pull: args.pull,
+            light: args.light,
             weights: ErrorWeights { sharpness: args.sharpen, ..ErrorWeights::default() },
             ..FitSettings::default()
         },

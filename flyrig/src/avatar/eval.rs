@@ -10,11 +10,7 @@ use flyrig_metrics::{CameraScore, FrameScore, ScoreSheet, error_parts, score_vie
 use flyrig_report::{frame_number, png, progress_bar, write_whole};
 use serde::Serialize;
 
-use super::{
-    arguments::{Clothes, EvalArgs},
-    load, open_replay,
-    parts::score_parts,
-};
+use super::{arguments::EvalArgs, load, open_replay, parts::score_parts, print_far};
 
 #[derive(Debug, Serialize)]
 struct Metrics<'a> {
@@ -29,7 +25,7 @@ struct Metrics<'a> {
     per_frame: &'a [FrameScore],
     /// Boxes around head and hands.
     parts: Vec<CameraScore>,
-    /// Mean share of the clothes in poses unlike those of the take.
+    /// Mean share of the Gaussians in poses unlike those of the take.
     far_share: f64,
     /// Mean time of posing and drawing a view, reading back included, milliseconds.
     view_ms: f64,
@@ -65,11 +61,8 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         fits(&avatar, &subject.template().skeleton, pose)?;
         let start = Instant::now();
         let deformed = Some(subject.node_translations()).filter(|all| args.deformed && !all.is_empty());
-        match deformed {
-            None if args.clothes == Clothes::Pose => scene.drive(&avatar, pose),
-            translations => scene.pose(&avatar, &Bones::new(&avatar.template.skeleton, pose), translations),
-        }
-        far += avatar.examples.as_ref().map_or(0.0, |examples| examples.far_share(pose));
+        scene.pose(&avatar, &Bones::new(&avatar.template.skeleton, pose), deformed);
+        far += avatar.far_share(pose);
         frames += 1;
         let mut views = Vec::new();
         for camera in &holdout {
@@ -122,12 +115,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         100.0 * hidden as f64 / f64::from(drawn) / avatar.gaussians() as f64,
         args.out.display()
     );
-    if far_share > 0.0 {
-        println!(
-            "{:.1} % of the body was in poses unlike those that the avatar was built from (over 30 degrees from all of them)",
-            100.0 * far_share
-        );
-    }
+    print_far(far_share);
     Ok(())
 }
 

@@ -79,13 +79,12 @@ fn splats(avatar: &Avatar, args: &ExportArgs, ending: &str) -> Result<()> {
         None => avatar.template.skeleton.rest_pose(),
     };
     let mut posed = PosedAvatar::default();
-    let clothes = avatar.examples.as_ref().map(|examples| examples.translations(&pose));
-    avatar.pose(&Bones::new(&avatar.template.skeleton, &pose), clothes.as_deref(), &mut posed);
+    avatar.pose(&Bones::new(&avatar.template.skeleton, &pose), None, &mut posed);
     let splats = AnisotropicSplats {
         center: posed.center,
         scale_opacity: posed.scale_opacity,
         rotation: posed.rotation,
-        harmonics: avatar.parameters.harmonics.clone(),
+        harmonics: posed.harmonics,
         order: avatar.parameters.order(),
     };
     let count = if ending == "ply" {

@@ -10,7 +10,7 @@ use flyrig_report::{png, progress_bar, stop};
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose, PoseTrack};
 use glam::{DQuat, DVec2, DVec3};
 
-use super::{arguments::RenderArgs, load};
+use super::{arguments::RenderArgs, load, print_far};
 
 /// Frames a second of the images.
 pub(super) const FPS: f64 = 30.0;
@@ -25,18 +25,21 @@ pub fn render(args: &RenderArgs, gpu: &GpuContext) -> Result<()> {
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     let mut scene = AvatarScene::new(gpu, &avatar)?;
     let bar = progress_bar(args.frames.end - args.frames.start, "avatar render");
+    let mut far = 0.0;
     for frame in args.frames.clone() {
         if stop::requested() {
             break;
         }
         let pose = pose_at(&track, frame);
         scene.drive(&avatar, &pose);
+        far += avatar.far_share(&pose);
         let view = scene.draw(&camera(args.size, pose.root_translation))?;
         png::write_view(&args.out.join(format!("{frame:06}.png")), &view)?;
         bar.inc(1);
     }
     bar.finish_and_clear();
     println!("images in {}", args.out.display());
+    print_far(far / (args.frames.end - args.frames.start).max(1) as f64);
     Ok(())
 }
 

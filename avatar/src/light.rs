@@ -1,0 +1,192 @@
+//! Light of the take's room: how bright a surface is by the direction that it faces. Colours of Gaussians are those of the surface, so that
+//! somebody who turns does not get the mean of lit and unlit sides.
+//!
+//! A polynomial of second degree in the world's normal describes what distant lamps do to matte surfaces (Ramamoorthi and Hanrahan 2001);
+//! shadows that parts of the body cast on others are not in it.
+
+use flyrig_learn::{AdamStep, Moments};
+use glam::Vec3;
+
+use crate::parameters::Element;
+
+/// Terms of the polynomial.
+const TERMS: usize = 9;
+/// Surfaces are not darker or brighter than this, against the light of the mean direction.
+const SHADE: std::ops::RangeInclusive<f32> = 0.05..=4.0;
+/// Rates at the start and at the end.
+const RATE: [f32; 2] = [1e-2, 1e-3];
+const BETAS: [f32; 2] = [0.9, 0.99];
+/// Gaussians that one thread sums up at once.
+const CHUNK: usize = 4096;
+
+/// Light by direction.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Light {
+    /// Red, green and blue of each term: 1, x, y, z, xy, yz, 3zz - 1, xz, xx - yy of the normal.
+    pub terms: [[f32; 3]; TERMS],
+}
+
+impl Default for Light {
+    /// The same from everywhere.
+    fn default() -> Self {
+        let mut terms = [[0.0; 3]; TERMS];
+        terms[0] = [1.0; 3];
+        Self { terms }
+    }
+}
+
+fn basis(n: Vec3) -> [f32; TERMS] {
+    let Vec3 { x, y, z } = n;
+    [1.0, x, y, z, x * y, y * z, 3.0 * z * z - 1.0, x * z, x * x - y * y]
+}
+
+impl Light {
+    /// Returns by what the colours of a surface with this world normal are multiplied. A normal that is not finite gets the mean.
+    #[must_use]
+    pub fn shade(&self, normal: Vec3) -> [f32; 3] {
+        self.unbounded(normal).map(|value| value.clamp(*SHADE.start(), *SHADE.end()))
+    }
+
+    fn unbounded(&self, normal: Vec3) -> [f32; 3] {
+        let basis = basis(if normal.is_finite() { normal } else { Vec3::ZERO });
+        std::array::from_fn(|k| self.terms.iter().zip(basis).map(|(term, value)| term[k] * value).sum())
+    }
+
+    /// Returns dL/d terms from dL/d the lit colours, with the unlit ones and the normals; `stride` rows belong to a Gaussian. In `slopes`
+    /// are dL/d the unlit colours afterwards.
+    pub(crate) fn backward(
+        &self,
+        normals: impl Fn(usize) -> Vec3 + Sync,
+        unlit: &[Element],
+        slopes: &mut [Element],
+        stride: usize,
+    ) -> [[f32; 3]; TERMS] {
+        use rayon::prelude::*;
+        let chunk = |(chunk, (slopes, unlit)): (usize, (&mut [Element], &[Element]))| {
+            let mut sums = [[0.0f64; 3]; TERMS];
+            for (i, (slopes, unlit)) in slopes.chunks_mut(stride).zip(unlit.chunks(stride)).enumerate() {
+                let normal = normals(chunk * CHUNK + i);
+                let (shade, free) = (self.shade(normal), self.unbounded(normal));
+                let basis = basis(if normal.is_finite() { normal } else { Vec3::ZERO });
+                for k in 0..3 {
+                    let by_shade: f32 = slopes.iter().zip(unlit).map(|(slope, color)| slope[k] * color[k]).sum();
+                    // At its bounds it does not move.
+                    if by_shade.is_finite() && SHADE.contains(&free[k]) {
+                        sums.iter_mut().zip(basis).for_each(|(sum, value)| sum[k] += f64::from(by_shade * value));
+                    }
+                    slopes.iter_mut().for_each(|slope| slope[k] *= shade[k]);
+                }
+            }
+            sums
+        };
+        let rows = slopes.par_chunks_mut(CHUNK * stride).zip(unlit.par_chunks(CHUNK * stride)).enumerate();
+        // Summed in order: the same input gives the same bytes.
+        let parts: Vec<_> = rows.map(chunk).collect();
+        std::array::from_fn(|term| std::array::from_fn(|k| parts.iter().map(|part| part[term][k]).sum::<f64>() as f32))
+    }
+}
+
+/// Learns a light.
+#[derive(Debug, Clone)]
+pub(crate) struct LightFit {
+    pub moments: Moments,
+}
+
+impl LightFit {
+    pub fn new() -> Self {
+        Self { moments: [vec![0.0; 3 * TERMS], vec![0.0; 3 * TERMS]] }
+    }
+
+    /// Descends by one step, the `count`th from 1, along dL/d terms. The constant term stays: colours have its freedom.
+    pub fn descend(&mut self, light: &mut Light, slopes: &[[f32; 3]; TERMS], count: u64, progress: f32) {
+        let rate = RATE[0] * (RATE[1] / RATE[0]).powf(progress.clamp(0.0, 1.0));
+        let step = AdamStep { betas: BETAS, count, rate, decay: 0.0, scale: 1.0, share: 0.0 };
+        let mut values = light.terms.as_flattened().to_vec();
+        let mut slopes = slopes.as_flattened().to_vec();
+        slopes[..3].fill(0.0);
+        step.descend(&mut values, &mut self.moments, &slopes);
+        light.terms.as_flattened_mut().copy_from_slice(&values);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
+
+    use super::*;
+
+    #[test]
+    fn derivatives_are_those_of_finite_differences() {
+        let mut random = StdRng::seed_from_u64(3);
+        let mut draw = || random.random_range(-1.0f32..1.0);
+        let (count, stride) = (CHUNK + 40, 4);
+        let mut light = Light::default();
+        light.terms.iter_mut().skip(1).flatten().for_each(|value| *value = 0.2 * draw());
+        light.terms[3] = [3.0; 3]; // some are out of bounds
+        let normals: Vec<Vec3> = (0..count).map(|_| Vec3::new(draw(), draw(), draw()).normalize()).collect();
+        let unlit: Vec<Element> = (0..count * stride).map(|_| [draw(), draw(), draw(), 0.0]).collect();
+        let weights: Vec<Element> = (0..count * stride).map(|_| [draw(), draw(), draw(), 7.0]).collect();
+        let loss = |light: &Light, unlit: &[Element]| -> f64 {
+            let rows = unlit.chunks(stride).zip(weights.chunks(stride)).zip(&normals);
+            rows.map(|((colors, weights), normal)| {
+                let shade = light.shade(*normal);
+                let pairs = colors.iter().zip(weights);
+                pairs
+                    .flat_map(|(c, w)| (0..3).map(move |k| f64::from(c[k]) * f64::from(w[k]) * f64::from(shade[k])))
+                    .sum::<f64>()
+            })
+            .sum()
+        };
+        let mut slopes = weights.clone();
+        let found = light.backward(|i| normals[i], &unlit, &mut slopes, stride);
+        for term in 0..TERMS {
+            for k in 0..3 {
+                let at = |by: f32| {
+                    let mut moved = light.clone();
+                    moved.terms[term][k] += by;
+                    loss(&moved, &unlit)
+                };
+                let expected = (at(1e-3) - at(-1e-3)) / 2e-3;
+                let error = (expected - f64::from(found[term][k])).abs();
+                assert!(error < 0.05 + 2e-2 * expected.abs(), "{term} {k}: {expected} {}", found[term][k]);
+            }
+        }
+        for i in (0..count * stride).step_by(311) {
+            let shade = light.shade(normals[i / stride]);
+            for k in 0..3 {
+                assert!((slopes[i][k] - weights[i][k] * shade[k]).abs() < 1e-5);
+            }
+            assert!((slopes[i][3] - 7.0).abs() <= 0.0);
+        }
+    }
+
+    #[test]
+    fn poison_is_left_out_and_the_mean_has_no_direction() {
+        let light = Light { terms: [[f32::MAX; 3]; TERMS] };
+        assert!(light.shade(Vec3::NAN).iter().all(|shade| SHADE.contains(shade)));
+        assert_eq!(Light::default().shade(Vec3::X), [1.0; 3]);
+        let mut slopes = vec![[f32::NAN; 4], [1.0; 4]];
+        let found = Light::default().backward(|_| Vec3::Y, &[[0.5; 4]; 2], &mut slopes, 1);
+        assert!(found.as_flattened().iter().all(|slope| slope.is_finite()) && (found[2][0] - 0.5).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_lamp_is_found() {
+        let mut random = StdRng::seed_from_u64(5);
+        let mut draw = || random.random_range(-1.0f32..1.0);
+        let normals: Vec<Vec3> = (0..500).map(|_| Vec3::new(draw(), draw(), draw()).normalize()).collect();
+        let (mut light, mut fit) = (Light::default(), LightFit::new());
+        for count in 1..=600 {
+            let seen = |normal: &Vec3| 1.0 + 0.5 * normal.y;
+            let mut slopes: Vec<Element> = normals
+                .iter()
+                .map(|normal| light.shade(*normal).map(|shade| 0.4 * (0.4 * shade - 0.4 * seen(normal))))
+                .map(|[r, g, b]| [r, g, b, 0.0])
+                .collect();
+            let found = light.backward(|i| normals[i], &vec![[0.4; 4]; 500], &mut slopes, 1);
+            fit.descend(&mut light, &found, count, count as f32 / 600.0);
+        }
+        assert!((light.terms[2][1] - 0.5).abs() < 0.02 && light.terms[1][1].abs() < 0.02, "{:?}", light.terms);
+        assert_eq!(light.terms[0], [1.0; 3]);
+    }
+}
