@@ -186,6 +186,7 @@ fn poisoned_templates_are_refused() {
     refused(TemplateSource { joints: &[], ..good.source() }, "one joint");
     refused(TemplateSource { normals: &good.normals[1..], ..good.source() }, "differ in length");
     refused(TemplateSource { nodes: &good.nodes[..1], ..good.source() }, "node that does not exist");
+    refused(TemplateSource { nodes: &[[0.0; 3]; 51], ..good.source() }, "more nodes than Gaussians");
     refused(TemplateSource { joints: &good.joints[..1], ..good.source() }, "joint that does not exist");
     let mut bad = Person::tube(50, 5);
     bad.center_scale[3][1] = f32::NAN;
@@ -196,6 +197,26 @@ fn poisoned_templates_are_refused() {
     let mut bad = Person::tube(50, 5);
     bad.joints[1].parent = Some(2);
     refused(bad.source(), "before its parent");
+}
+
+#[test]
+fn a_template_claims_no_more_gaussians_than_its_bytes_hold() {
+    // All Gaussians the same: a valid template, however few bytes they would take.
+    let mut person = Person::tube(3000, 0);
+    let first = (person.center_scale[0], person.normals[0], person.skin[0]);
+    person.center_scale.fill(first.0);
+    person.normals.fill(first.1);
+    person.skin.fill(first.2);
+    let encoded = person.encode();
+    assert_eq!(StreamTemplate::decode(&encoded.bytes).unwrap().gaussians(), 3000);
+    let mut bytes = encoded.bytes;
+    for (claim, is_valid) in [(3000u32, true), (3001, false), (1 << 20, false)] {
+        bytes[8..12].copy_from_slice(&claim.to_le_bytes());
+        let error = StreamTemplate::decode(&bytes).err();
+        let problem = "it claims more Gaussians than its bytes can hold";
+        let refused = StreamError::Malformed { what: "template", problem };
+        assert_eq!(error, (!is_valid).then_some(refused), "{claim}");
+    }
 }
 
 #[test]
