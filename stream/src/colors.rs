@@ -15,7 +15,7 @@ use crate::{
     bytes::Fields,
     coefficients::{CoefficientModel, GROUP, Levels},
     integers::MOST,
-    motion::{quantise, step_at},
+    quantise::quantise,
     range_coder::{BitCoder, Probability, RangeDecoder, RangeEncoder},
     srgb::Srgb,
     tree::{CHANNELS, HaarTree},
@@ -267,6 +267,11 @@ impl ColorEncoder {
 fn coefficient_steps(tree: &HaarTree, step: f32) -> Vec<f32> {
     let (mean_step, steps) = tree.steps(step);
     (0..tree.coefficients()).map(|place| step_at(tree, place, mean_step, &steps)).collect()
+}
+
+/// Step of the coefficient at a place.
+fn step_at(tree: &HaarTree, place: usize, mean_step: f32, steps: &[f32]) -> f32 {
+    if place < tree.segments() { mean_step } else { steps[(place.ilog2() - tree.levels().start) as usize] }
 }
 
 /// Decodes the colours of one person and template.

@@ -29,6 +29,50 @@ impl MagnitudeModel {
     }
 }
 
+/// Steps of a residual's upper part that have a probability of their own.
+const UPPER_STEPS: usize = 12;
+/// Sizes that are expected, two to each doubling.
+const SIZES: usize = 32;
+/// Largest magnitude of a residual.
+const MOST_RESIDUAL: i32 = 4 * MOST;
+
+/// Differences from a prediction, by the size that is expected: what remains of their magnitude after division by that size takes steps up
+/// from 0, as in a Golomb code whose decisions adapt.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct ResidualModel([(MagnitudeSteps, Probability); SIZES]);
+
+type MagnitudeSteps = [Probability; UPPER_STEPS];
+
+impl ResidualModel {
+    /// Codes a value of at most [`MOST_RESIDUAL`]; `expected` is four times the magnitude that is expected.
+    pub fn code(&mut self, coder: &mut impl BitCoder, value: i32, expected: u32) -> i32 {
+        let expected = expected.max(1);
+        let doublings = expected.ilog2();
+        let size = 2 * doublings + (expected << 1 >> doublings & 1);
+        let (steps, highest_below) = &mut self.0[(size as usize).min(SIZES - 1)];
+        let below = doublings.saturating_sub(2).min(24);
+        let magnitude = value.unsigned_abs();
+        let upper = magnitude >> below;
+        let mut found = 0;
+        for step in steps.iter_mut() {
+            if !coder.bit(step, upper > found) {
+                break;
+            }
+            found += 1;
+        }
+        if found == UPPER_STEPS as u32 {
+            found += gamma(coder, upper.saturating_sub(found));
+        }
+        if below > 0 {
+            found = found << 1 | u32::from(coder.bit(highest_below, magnitude >> (below - 1) & 1 == 1));
+            let lower = coder.raw(below - 1, magnitude & ((1 << (below - 1)) - 1));
+            found = (u64::from(found) << (below - 1)).min(MOST_RESIDUAL as u64) as u32 | lower;
+        }
+        let found = found.min(MOST_RESIDUAL as u32) as i32;
+        if found != 0 && coder.raw(1, u32::from(value < 0)) == 1 { -found } else { found }
+    }
+}
+
 /// Elias gamma code of `value + 1`, for values below 2^23.
 fn gamma(coder: &mut impl BitCoder, value: u32) -> u32 {
     let bits = (value + 1).ilog2();
@@ -95,7 +139,12 @@ mod tests {
             (0..21).flat_map(|bits| [1 << bits, (1 << bits) - 1, -(1 << bits), 1 - (1 << bits)]).collect();
         let mut encoder = RangeEncoder::new(Vec::new());
         let (mut magnitudes, mut numbers) = (MagnitudeModel::default(), NumberModel::default());
+        let mut residuals = ResidualModel::default();
+        let expected = [0, 1, 3, 4, 7, 900, 1 << 23, u32::MAX];
         for value in &values {
+            for expected in expected {
+                residuals.code(&mut encoder, *value, expected);
+            }
             if *value != 0 {
                 magnitudes.code(&mut encoder, *value);
             }
@@ -105,7 +154,11 @@ mod tests {
         let bytes = encoder.finish();
         let mut decoder = RangeDecoder::new(&bytes);
         let (mut magnitudes, mut numbers) = (MagnitudeModel::default(), NumberModel::default());
+        let mut residuals = ResidualModel::default();
         for value in &values {
+            for expected in expected {
+                assert_eq!(residuals.code(&mut decoder, 0, expected), *value, "{expected}");
+            }
             if *value != 0 {
                 assert_eq!(magnitudes.code(&mut decoder, 1), *value);
             }

@@ -28,11 +28,13 @@ mod colors;
 mod error;
 mod integers;
 mod motion;
+mod nodes;
 mod order;
 mod planes;
 mod pose;
 #[cfg(test)]
 mod pose_tests;
+mod quantise;
 mod range_coder;
 mod srgb;
 mod stamp;
@@ -50,7 +52,7 @@ pub use stamp::{Stamp, restamp, stamp_of};
 pub use template::{EncodedTemplate, MAX_TEMPLATE_BYTES, StreamJoint, StreamTemplate, TemplateSource, template_hash};
 
 /// Version of every message of this codec.
-pub const CODEC_VERSION: u8 = 1;
+pub const CODEC_VERSION: u8 = 2;
 
 /// Most bytes of a message that is not a template: with zenoh's own header it fits in one of its batches of 65,535 bytes.
 pub const MAX_MESSAGE_BYTES: usize = 65_000;

@@ -5,18 +5,15 @@ use alloc::{vec, vec::Vec};
 use crate::{
     EncodedTemplate, MAX_MESSAGE_BYTES, Stamp, StreamError, StreamTemplate,
     bytes::Fields,
-    coefficients::{CoefficientModel, GROUP, Levels},
-    integers::MOST,
-    range_coder::{BitCoder, RangeDecoder, RangeEncoder},
-    tree::HaarTree,
+    nodes::{Prediction, code_nodes},
+    quantise::quantise,
+    range_coder::{RangeDecoder, RangeEncoder},
 };
 
 pub(crate) const MAGIC: [u8; 3] = *b"FLM";
 const WHAT: &str = "motion";
-/// Step of node translations, metres: an error of 0.14 mm.
-const NODE_STEP_M: f32 = 5e-4;
-/// Share of a step below which a coefficient counts as zero.
-const ROUND_UP: f32 = 0.4;
+/// Step of node translations, metres: an error of 0.12 mm.
+const NODE_STEP_M: f32 = 4e-4;
 /// Step of the root's translation, metres.
 const ROOT_STEP_M: f64 = 1e-4;
 /// Steps of a quaternion's component, of 1/sqrt(2) to either side.
@@ -41,27 +38,20 @@ pub struct MotionEncoder {
     template: u64,
     joints: usize,
     node_order: Vec<u32>,
-    tree: HaarTree,
-    nodes: Vec<[f32; 3]>,
-    coefficients: Vec<[f32; 3]>,
-    means: Vec<[f32; 3]>,
-    levels: Vec<Levels>,
+    predictions: Vec<Prediction>,
+    levels: Vec<[i32; 3]>,
 }
 
 impl MotionEncoder {
     /// For a template.
     #[must_use]
     pub fn new(template: &EncodedTemplate) -> Self {
-        let tree = HaarTree::new(template.template.nodes);
         Self {
             template: template.template.hash,
             joints: template.template.joints.len(),
             node_order: template.node_order.clone(),
-            nodes: vec![[0.0; 3]; tree.items()],
-            coefficients: vec![[0.0; 3]; tree.coefficients()],
-            levels: vec![[0; 3]; tree.coefficients()],
-            means: Vec::new(),
-            tree,
+            predictions: template.template.predictions.clone(),
+            levels: vec![[0; 3]; template.template.nodes],
         }
     }
 
@@ -88,18 +78,13 @@ impl MotionEncoder {
         if self.node_order.is_empty() {
             return Ok(bytes);
         }
-        for (node, &from) in self.nodes.iter_mut().zip(&self.node_order) {
+        for (levels, &from) in self.levels.iter_mut().zip(&self.node_order) {
             let moved = motion.nodes.get(from as usize).copied().unwrap_or_default();
-            *node = if moved.iter().all(|v| v.abs() < 1e3) { moved } else { [0.0; 3] };
-        }
-        self.tree.forward(&self.nodes, &mut self.coefficients, &mut self.means);
-        let (mean_step, steps) = self.tree.steps(NODE_STEP_M);
-        for (place, (levels, coefficient)) in self.levels.iter_mut().zip(&self.coefficients).enumerate() {
-            let step = step_at(&self.tree, place, mean_step, &steps);
-            *levels = coefficient.map(|v| quantise(v / step, ROUND_UP));
+            let moved = if moved.iter().all(|v| v.abs() < 1e3) { moved } else { [0.0; 3] };
+            *levels = moved.map(|v| quantise(v / NODE_STEP_M, 0.5));
         }
         let mut encoder = RangeEncoder::new(bytes);
-        code_nodes(&mut encoder, &self.tree, &mut self.levels);
+        code_nodes(&mut encoder, &self.predictions, &mut self.levels);
         let bytes = encoder.finish();
         if bytes.len() > MAX_MESSAGE_BYTES {
             return fail("it has more nodes than fit in a message; use fewer");
@@ -129,15 +114,9 @@ impl Motion {
             let [a, b, c, d, e, f] = fields.take()?;
             joint_rotations.push(unpack(u64::from_le_bytes([a, b, c, d, e, f, 0, 0])));
         }
-        let mut nodes = vec![[0.0; 3]; template.nodes];
-        if template.nodes > 0 {
-            let tree = HaarTree::new(template.nodes);
-            let mut levels = vec![[0; 3]; tree.coefficients()];
-            code_nodes(&mut RangeDecoder::new(fields.bytes), &tree, &mut levels);
-            let (mean_step, steps) = tree.steps(NODE_STEP_M);
-            let at = |place: usize| levels[place].map(|v| v as f32 * step_at(&tree, place, mean_step, &steps));
-            tree.inverse(at, &mut Vec::new(), |i, item| nodes[i] = item);
-        }
+        let mut levels = vec![[0; 3]; template.nodes];
+        code_nodes(&mut RangeDecoder::new(fields.bytes), &template.predictions, &mut levels);
+        let nodes = levels.iter().map(|levels| levels.map(|v| v as f32 * NODE_STEP_M)).collect();
         Ok(Self { stamp, root_translation, joint_rotations, nodes })
     }
 
@@ -169,31 +148,6 @@ impl Motion {
             nodes: pairs(&self.nodes, &other.nodes),
         }
     }
-}
-
-fn code_nodes(coder: &mut impl BitCoder, tree: &HaarTree, levels: &mut [Levels]) {
-    let mut model = CoefficientModel::default();
-    for mean in &mut levels[..tree.segments()] {
-        model.code_mean(coder, mean);
-    }
-    for first in tree.levels().step_by(GROUP as usize) {
-        let group = first..(first + GROUP).min(tree.levels().end);
-        for segment in 0..tree.segments() {
-            model.code_group(coder, tree, group.clone(), segment, levels);
-        }
-    }
-}
-
-/// Step of the coefficient at a place.
-pub(crate) fn step_at(tree: &HaarTree, place: usize, mean_step: f32, steps: &[f32]) -> f32 {
-    if place < tree.segments() { mean_step } else { steps[(place.ilog2() - tree.levels().start) as usize] }
-}
-
-/// Nearest level of a value in steps; values up to `1 - round_up` beyond a level fall to it.
-pub(crate) fn quantise(value: f32, round_up: f32) -> i32 {
-    // The cast saturates, and takes NaN to 0.
-    let magnitude = ((value.abs() + round_up) as i32).min(MOST);
-    if value < 0.0 { -magnitude } else { magnitude }
 }
 
 /// A rotation in 47 bits: which component is largest, and the three others. None when it is not of unit length.

@@ -5,7 +5,7 @@
 use std::{string::ToString as _, vec::Vec};
 
 use crate::{
-    Motion, MotionEncoder, Posed, StreamError, StreamTemplate, TemplateSource,
+    CODEC_VERSION, Motion, MotionEncoder, Posed, StreamError, StreamTemplate, TemplateSource,
     testing::{Person, damaged},
 };
 
@@ -241,10 +241,10 @@ fn damaged_templates_and_motions_are_no_panic() {
             );
         }
     });
-    let mut newer = motion.clone();
-    newer[3] = 2;
-    let error = Motion::decode(&newer, &encoded.template).unwrap_err();
-    assert_eq!(error, StreamError::Version { what: "motion", found: 2 });
+    let mut older = motion.clone();
+    older[3] = CODEC_VERSION - 1;
+    let error = Motion::decode(&older, &encoded.template).unwrap_err();
+    assert_eq!(error, StreamError::Version { what: "motion", found: CODEC_VERSION - 1 });
     assert!(error.to_string().contains("update the older of the two"), "{error}");
     let other = Person::tube(301, 20).encode();
     assert_eq!(Motion::decode(&motion, &other.template), Err(StreamError::OtherTemplate { what: "motion" }));

@@ -5,6 +5,7 @@ use alloc::vec::Vec;
 use crate::{
     CODEC_VERSION, StreamError,
     bytes::Fields,
+    nodes::{Prediction, predictions},
     order::spatial_order,
     planes::{
         GaussianModel, Influences, NORMAL_LEVELS, POSITION_LEVELS, Quantised, SCALE_LEVELS, normal_of, octahedral,
@@ -70,6 +71,8 @@ pub struct StreamTemplate {
     pub(crate) node_weights: Vec<Influences>,
     /// Canonical positions of the nodes, metres: each that of the Gaussian which hangs on it most.
     pub(crate) node_places: Vec<[f32; 3]>,
+    /// What each node of a motion is predicted from.
+    pub(crate) predictions: Vec<Prediction>,
 }
 
 /// A template with its bytes and the source's order.
@@ -246,8 +249,10 @@ impl StreamTemplate {
             skin: Vec::with_capacity(count),
             node_weights: Vec::with_capacity(if nodes > 0 { count } else { 0 }),
             node_places: alloc::vec![[0.0; 3]; nodes],
+            predictions: Vec::new(),
         };
-        let mut most = alloc::vec![0; nodes];
+        // Largest weight on each node, and the normal of that Gaussian.
+        let mut most = alloc::vec![(0, [0.0; 3]); nodes];
         let (step, scale_step) = (extent / POSITION_LEVELS, largest / SCALE_LEVELS);
         for _ in 0..count {
             before = model.code(&mut decoder, &before, &Quantised::default(), nodes > 0);
@@ -266,13 +271,16 @@ impl StreamTemplate {
             if nodes > 0 {
                 for (node, weight) in on_nodes.index.into_iter().zip(on_nodes.weight) {
                     let node = node as usize;
-                    if weight > most[node] {
-                        (most[node], template.node_places[node]) = (weight, [at(0), at(1), at(2)]);
+                    if weight > most[node].0 {
+                        most[node] = (weight, normal_of(normal));
+                        template.node_places[node] = [at(0), at(1), at(2)];
                     }
                 }
                 template.node_weights.push(on_nodes);
             }
         }
+        let normals: Vec<[f32; 3]> = most.iter().map(|(_, normal)| *normal).collect();
+        template.predictions = predictions(&template.node_places, &normals, &template.node_weights);
         Ok(template)
     }
 
