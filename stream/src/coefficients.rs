@@ -14,6 +14,10 @@ pub(crate) type Levels = [i32; CHANNELS];
 /// Levels in a group.
 pub(crate) const GROUP: u32 = 3;
 
+/// Most nodes of a block, and the level of each below the first.
+const BLOCK: usize = (1 << GROUP) - 1;
+const LEVEL: [usize; BLOCK] = [0, 1, 1, 2, 2, 2, 2];
+
 /// Probabilities of one message, which adapt from its beginning to its end.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct CoefficientModel {
@@ -37,76 +41,81 @@ impl CoefficientModel {
         }
     }
 
-    /// Codes the coefficients of some levels of a segment, at most [`GROUP`]. `values` is the list of all coefficients;
-    /// those that have no item stay as they are.
-    pub fn code_group(
+    /// Codes the coefficients of some levels of a segment, at most [`GROUP`]. `values` is the list of all coefficients; those that
+    /// have no item must be 0.
+    pub fn code_group<C: BitCoder>(
         &mut self,
-        coder: &mut impl BitCoder,
+        coder: &mut C,
         tree: &HaarTree,
         levels: Range<u32>,
         segment: usize,
         values: &mut [Levels],
     ) {
         let mut history = 0;
+        let depth = levels.end - levels.start;
         for root in tree.places(levels.start, segment) {
-            history = (history << 1 | usize::from(self.code_block(coder, tree, (&levels, root), history, values))) & 3;
+            // Nodes below one another lie side by side: the node, its two halves, their halves.
+            let is_any = C::WRITES
+                && (0..depth).any(|below| {
+                    let nodes = &values[root << below..(root + 1) << below];
+                    nodes.as_flattened().iter().fold(0, |bits, value| bits | value) != 0
+                });
+            let is_any = coder.bit(&mut self.block[history], is_any);
+            if is_any {
+                self.code_block(coder, tree, (&levels, root), values);
+            } else if !C::WRITES {
+                (0..depth).for_each(|below| values[root << below..(root + 1) << below].fill([0; CHANNELS]));
+            }
+            history = (history << 1 | usize::from(is_any)) & 3;
         }
     }
 
-    /// Codes a node and those below it; returns whether any is not zero.
-    fn code_block(
+    /// Codes a node and those below it, of which one is not zero.
+    fn code_block<C: BitCoder>(
         &mut self,
-        coder: &mut impl BitCoder,
+        coder: &mut C,
         tree: &HaarTree,
         (levels, root): (&Range<u32>, usize),
-        history: usize,
         values: &mut [Levels],
-    ) -> bool {
-        // A heap: the node, its two halves, their halves. Nodes of one item have no difference.
-        let depth = levels.end - levels.start;
-        let mut places = [(0, false); (1 << GROUP) - 1];
-        let places = &mut places[..(1 << depth) - 1];
-        for (i, slot) in places.iter_mut().enumerate() {
-            let below = (i + 1).ilog2();
-            let place = (root << below) + (i + 1 - (1 << below));
-            *slot = (place, levels.start + below < tree.deepest() || tree.is_pair(place));
-        }
-        let is_any = places.iter().any(|(place, has_value)| *has_value && values[*place] != [0; CHANNELS]);
-        if !coder.bit(&mut self.block[history], is_any) {
-            for (place, _) in places.iter() {
-                values[*place] = [0; CHANNELS];
+    ) {
+        let count = (1 << (levels.end - levels.start)) - 1;
+        let place = |i: usize| (root << LEVEL[i]) + (i + 1 - (1 << LEVEL[i]));
+        // Nodes of one item have no difference.
+        let mut has_value = [true; BLOCK];
+        let mut block = [[0; CHANNELS]; BLOCK];
+        for i in 0..count {
+            has_value[i] = levels.start + (LEVEL[i] as u32) < tree.deepest() || tree.is_pair(place(i));
+            if C::WRITES {
+                block[i] = values[place(i)];
             }
-            return false;
         }
-        let mut active = [0; (1 << GROUP) - 1];
+        let mut active = [false; BLOCK];
         let mut active_channels = 0;
         let models = self.channel.iter_mut().zip(&mut self.nonzero).zip(&mut self.magnitude);
         for (c, ((channel, nonzero), magnitude)) in models.enumerate() {
-            let is_any = places.iter().any(|(place, has_value)| *has_value && values[*place][c] != 0);
+            let is_any = C::WRITES && block.iter().any(|value| value[c] != 0);
             if !coder.bit(&mut channel[active_channels], is_any) {
-                for (place, _) in places.iter() {
-                    values[*place][c] = 0;
-                }
                 continue;
             }
             active_channels += 1;
-            let mut is_nonzero = [false; (1 << GROUP) - 1];
-            for (i, (place, has_value)) in places.iter().enumerate() {
-                let value = &mut values[*place][c];
-                if !has_value {
-                    *value = 0;
-                    continue;
-                }
+            let mut is_nonzero = [false; BLOCK];
+            for i in (0..count).filter(|i| has_value[*i]) {
                 let above = i > 0 && is_nonzero[(i - 1) / 2];
                 let before = i > 0 && is_nonzero[i - 1];
-                let context = usize::from(above) + usize::from(before) + usize::from(active[i] > 0);
-                let level = (i + 1).ilog2() as usize;
-                is_nonzero[i] = coder.bit(&mut nonzero[level][context], *value != 0);
-                *value = if is_nonzero[i] { magnitude[level].code(coder, *value) } else { 0 };
-                active[i] += u8::from(is_nonzero[i]);
+                let context = usize::from(above) + usize::from(before) + usize::from(active[i]);
+                let value = &mut block[i][c];
+                is_nonzero[i] = coder.bit(&mut nonzero[LEVEL[i]][context], *value != 0);
+                if is_nonzero[i] {
+                    *value = magnitude[LEVEL[i]].code(coder, *value);
+                }
+                active[i] |= is_nonzero[i];
             }
         }
-        true
+        if !C::WRITES {
+            for (i, value) in block.iter().enumerate().take(count) {
+                values[place(i)] = *value;
+            }
+        }
     }
 }
 

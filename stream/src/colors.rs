@@ -18,7 +18,7 @@ use crate::{
     quantise::quantise,
     range_coder::{BitCoder, Probability, RangeDecoder, RangeEncoder},
     srgb::Srgb,
-    tree::{CHANNELS, HaarTree},
+    tree::{CHANNELS, HaarTree, Steps},
 };
 
 /// Layers, from coarse to fine: a viewer can show any number of the first ones.
@@ -95,13 +95,13 @@ impl Model {
     }
 }
 
-/// Calls `each` with the places of a segment's coefficients in a layer.
-fn each_place(tree: &HaarTree, layer: usize, segment: usize, mut each: impl FnMut(usize)) {
+/// Calls `each` with the places of a segment's coefficients in a layer, level by level, and their step.
+fn each_level(tree: &HaarTree, steps: &Steps, layer: usize, segment: usize, mut each: impl FnMut(Range<usize>, f32)) {
     if layer == 0 {
-        each(segment);
+        each(segment..segment + 1, steps.mean);
     }
     for level in layer_levels(tree, layer) {
-        tree.places(level, segment).for_each(&mut each);
+        each(tree.places(level, segment), steps.of_level(level));
     }
 }
 
@@ -126,13 +126,12 @@ pub struct ColorEncoder {
     order: Vec<u32>,
     tree: HaarTree,
     srgb: Srgb,
-    steps: Vec<f32>,
+    steps: Steps,
     state: Vec<Levels>,
     changes: Vec<Levels>,
     layers: [LayerState; LAYERS],
     /// Capture time of the message before.
     last_nanos: Option<i64>,
-    items: Vec<[f32; 3]>,
     coefficients: Vec<[f32; 3]>,
     means: Vec<[f32; 3]>,
 }
@@ -167,12 +166,11 @@ impl ColorEncoder {
             epoch,
             order: template.gaussian_order.clone(),
             srgb: Srgb::new(),
-            steps: coefficient_steps(&tree, settings.step),
+            steps: tree.steps(settings.step),
             state: vec![[0; CHANNELS]; tree.coefficients()],
             changes: vec![[0; CHANNELS]; tree.coefficients()],
             layers: core::array::from_fn(|_| layer.clone()),
             last_nanos: None,
-            items: vec![[0.0; 3]; tree.items()],
             coefficients: vec![[0.0; 3]; tree.coefficients()],
             means: Vec::new(),
             tree,
@@ -183,11 +181,11 @@ impl ColorEncoder {
     /// or not finite counts as black.
     pub fn encode(&mut self, stamp: Stamp, colors: &[[f32; 4]]) -> [Vec<u8>; LAYERS] {
         let stamp = Stamp { template: self.template, ..stamp };
-        for (item, &from) in self.items.iter_mut().zip(&self.order) {
-            let [r, g, b, _] = colors.get(from as usize).copied().unwrap_or_default();
-            *item = differences_of([r, g, b].map(|linear| self.srgb.code(linear)));
-        }
-        self.tree.forward(&self.items, &mut self.coefficients, &mut self.means);
+        let item = |i: usize| {
+            let [r, g, b, _] = colors.get(self.order[i] as usize).copied().unwrap_or_default();
+            differences_of([r, g, b].map(|linear| self.srgb.code(linear)))
+        };
+        self.tree.forward(item, &mut self.coefficients, &mut self.means);
         let elapsed = self.last_nanos.map_or(0.0, |last| stamp.capture_nanos.saturating_sub(last) as f32 / 1e9);
         self.last_nanos = Some(stamp.capture_nanos);
         let refreshed = self.tree.segments() as f32 * (elapsed / self.settings.refresh_secs).clamp(0.0, 1.0);
@@ -222,16 +220,11 @@ impl ColorEncoder {
             let segment = (first + i) % segments;
             let is_refresh = is_due(segment) || !self.layers[layer].is_known[segment];
             let mark = encoder.mark();
-            let (coefficients, state, steps) = (&self.coefficients, &self.state, &self.steps);
-            let changes = &mut self.changes;
-            each_place(&self.tree, layer, segment, |place| {
-                let step = 1.0 / steps[place];
-                changes[place] = core::array::from_fn(|c| {
-                    let (value, old) = (coefficients[place][c] * step, state[place][c]);
-                    let change = quantise(value - old as f32, ROUND_UP);
-                    let new = (old + change).clamp(-MOST, MOST);
-                    if is_refresh { new } else { (new - old).clamp(-MOST, MOST) }
-                });
+            let (coefficients, state, changes) = (&self.coefficients, &self.state, &mut self.changes);
+            each_level(&self.tree, &self.steps, layer, segment, |places, step| {
+                let values = coefficients[places.clone()].as_flattened();
+                let old = state[places.clone()].as_flattened();
+                change(values, old, 1.0 / step, is_refresh, changes[places].as_flattened_mut());
             });
             model.code(&mut encoder, &self.tree, (layer, segment), is_refresh, &mut self.changes);
             if encoder.len() > max_bytes {
@@ -239,9 +232,8 @@ impl ColorEncoder {
                 break;
             }
             let (state, changes) = (&mut self.state, &self.changes);
-            each_place(&self.tree, layer, segment, |place| {
-                state[place] =
-                    core::array::from_fn(|c| changes[place][c] + if is_refresh { 0 } else { state[place][c] });
+            each_level(&self.tree, &self.steps, layer, segment, |places, _| {
+                add(&changes[places.clone()], is_refresh, &mut state[places]);
             });
             self.layers[layer].is_known[segment] = true;
             count += 1;
@@ -263,15 +255,24 @@ impl ColorEncoder {
     }
 }
 
-/// Step of each coefficient.
-fn coefficient_steps(tree: &HaarTree, step: f32) -> Vec<f32> {
-    let (mean_step, steps) = tree.steps(step);
-    (0..tree.coefficients()).map(|place| step_at(tree, place, mean_step, &steps)).collect()
+/// Writes the changes in whole steps, or for a refresh the new states, that bring the old states to the values.
+fn change(values: &[f32], old: &[i32], per_step: f32, is_refresh: bool, changes: &mut [i32]) {
+    for ((change, value), &old) in changes.iter_mut().zip(values).zip(old) {
+        let by = quantise(value * per_step - old as f32, ROUND_UP);
+        // States are at most MOST, so that nothing wraps; a check at each number would cost more than all of this.
+        let new = old.wrapping_add(by).clamp(-MOST, MOST);
+        *change = if is_refresh { new } else { new.wrapping_sub(old).clamp(-MOST, MOST) };
+    }
 }
 
-/// Step of the coefficient at a place.
-fn step_at(tree: &HaarTree, place: usize, mean_step: f32, steps: &[f32]) -> f32 {
-    if place < tree.segments() { mean_step } else { steps[(place.ilog2() - tree.levels().start) as usize] }
+/// Adds changes to states, or for a refresh puts them in their place.
+fn add(changes: &[Levels], is_refresh: bool, state: &mut [Levels]) {
+    if is_refresh {
+        return state.copy_from_slice(changes);
+    }
+    for (state, change) in state.as_flattened_mut().iter_mut().zip(changes.as_flattened()) {
+        *state = state.wrapping_add(*change).clamp(-MOST, MOST);
+    }
 }
 
 /// Decodes the colours of one person and template.
@@ -281,7 +282,7 @@ pub struct ColorDecoder {
     tree: HaarTree,
     srgb: Srgb,
     step: f32,
-    steps: Vec<f32>,
+    steps: Steps,
     epoch: Option<u32>,
     state: Vec<Levels>,
     values: Vec<Levels>,
@@ -306,7 +307,7 @@ impl ColorDecoder {
             template: template.hash,
             srgb: Srgb::new(),
             step: 0.0,
-            steps: Vec::new(),
+            steps: Steps::default(),
             epoch: None,
             state: vec![[0; CHANNELS]; tree.coefficients()],
             values: vec![[0; CHANNELS]; tree.coefficients()],
@@ -350,11 +351,8 @@ impl ColorDecoder {
                 continue;
             }
             let (state, values) = (&mut self.state, &self.values);
-            each_place(&self.tree, layer, segment, |place| {
-                state[place] = core::array::from_fn(|c| {
-                    let old = if is_refresh { 0 } else { state[place][c] };
-                    (old + values[place][c]).clamp(-MOST, MOST)
-                });
+            each_level(&self.tree, &self.steps, layer, segment, |places, _| {
+                add(&values[places.clone()], is_refresh, &mut state[places]);
             });
         }
         Ok(stamp)
@@ -363,7 +361,7 @@ impl ColorDecoder {
     /// The encoder began anew.
     fn begin(&mut self, epoch: u32, step: f32) {
         (self.epoch, self.step) = (Some(epoch), step);
-        self.steps = coefficient_steps(&self.tree, step);
+        self.steps = self.tree.steps(step);
         self.state.fill([0; CHANNELS]);
         for layer in &mut self.layers {
             layer.is_known.fill(false);
@@ -387,18 +385,15 @@ impl ColorDecoder {
 
     /// Writes the linear colours, opacity 1, in the template's order. Segments that have not come yet are grey.
     pub fn colors(&mut self, colors: &mut Vec<[f32; 4]>) {
-        colors.clear();
-        colors.resize(self.tree.items(), [0.0, 0.0, 0.0, 1.0]);
-        let (state, steps, base) = (&self.state, &self.steps, &self.layers[0].is_known);
-        let at = |place: usize| {
-            if place < base.len() && !base[place] {
-                return [128.0, 0.0, 0.0];
-            }
-            let step = steps.get(place).copied().unwrap_or(0.0);
-            state[place].map(|v| v as f32 * step)
+        colors.resize(self.tree.items(), [0.0; 4]);
+        let (state, base, mean_step) = (&self.state, &self.layers[0].is_known, self.steps.mean);
+        let mean = |segment: usize| match base.get(segment) {
+            Some(true) => state[segment].map(|v| v as f32 * mean_step),
+            _ => [128.0, 0.0, 0.0],
         };
+        let difference = |place: usize, step: f32| state[place].map(|v| v as f32 * step);
         let srgb = &self.srgb;
-        self.tree.inverse(at, &mut self.means, |i, item| {
+        self.tree.inverse(&self.steps, mean, difference, &mut self.means, |i, item| {
             let [r, g, b] = color_of(item).map(|code| srgb.linear(code));
             colors[i] = [r, g, b, 1.0];
         });

@@ -43,6 +43,9 @@ impl Probability {
 
 /// Codes decisions in one direction. Code that is generic over it describes a format once, for writing and for reading.
 pub(crate) trait BitCoder {
+    /// Whether it writes: what is read is then known already.
+    const WRITES: bool;
+
     /// Codes a decision: writes `bit` and returns it, or ignores it and returns what was written.
     fn bit(&mut self, probability: &mut Probability, bit: bool) -> bool;
 
@@ -135,6 +138,8 @@ impl RangeEncoder {
 }
 
 impl BitCoder for RangeEncoder {
+    const WRITES: bool = true;
+
     #[inline]
     fn bit(&mut self, probability: &mut Probability, bit: bool) -> bool {
         let bound = (self.range >> BITS) * probability.of_false();
@@ -193,6 +198,8 @@ impl<'a> RangeDecoder<'a> {
 }
 
 impl BitCoder for RangeDecoder<'_> {
+    const WRITES: bool = false;
+
     #[inline]
     fn bit(&mut self, probability: &mut Probability, _: bool) -> bool {
         let bound = (self.range >> BITS) * probability.of_false();

@@ -1,6 +1,6 @@
 //! sRGB by tables.
 
-use alloc::vec::Vec;
+use alloc::{boxed::Box, vec::Vec};
 
 /// Steps of linear light in the table of codes.
 const LINEAR_STEPS: usize = 4096;
@@ -10,7 +10,8 @@ const CODE_STEPS: usize = 1020;
 /// Both directions of the sRGB curve (IEC 61966-2-1) on 0..=1, without a power at each value.
 #[derive(Debug, Clone)]
 pub(crate) struct Srgb {
-    code: Vec<f32>,
+    /// Code at each step, and how much further the next one is.
+    code: Box<[[f32; 2]; LINEAR_STEPS + 1]>,
     linear: Vec<f32>,
 }
 
@@ -20,18 +21,20 @@ impl Srgb {
             if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * libm::powf(linear, 1.0 / 2.4) - 0.055 }
         };
         let linear = |code: f32| if code <= 0.040_45 { code / 12.92 } else { libm::powf((code + 0.055) / 1.055, 2.4) };
+        let at_step = |i: usize| 255.0 * code((i as f32 / LINEAR_STEPS as f32).min(1.0));
         Self {
-            code: (0..=LINEAR_STEPS + 1).map(|i| 255.0 * code((i as f32 / LINEAR_STEPS as f32).min(1.0))).collect(),
+            code: Box::new(core::array::from_fn(|i| [at_step(i), at_step(i + 1) - at_step(i)])),
             linear: (0..=CODE_STEPS).map(|i| linear(i as f32 / CODE_STEPS as f32)).collect(),
         }
     }
 
     /// Returns the code, 0..=255 and not rounded, of linear light; 0 for NaN.
     pub fn code(&self, linear: f32) -> f32 {
-        let at = if linear > 0.0 { linear.min(1.0) * LINEAR_STEPS as f32 } else { 0.0 };
-        let below = at as usize;
-        let (a, b) = (self.code[below], self.code[below + 1]);
-        a + (b - a) * (at - below as f32)
+        // The maximum takes NaN to 0.
+        let at = (linear.max(0.0) * LINEAR_STEPS as f32).min(LINEAR_STEPS as f32);
+        let below = (at as u16).min(LINEAR_STEPS as u16);
+        let [code, further] = self.code[usize::from(below)];
+        code + further * (at - f32::from(below))
     }
 
     /// Returns the linear light of a code, to a quarter of a code.

@@ -76,77 +76,103 @@ impl HaarTree {
         self.deepest
     }
 
-    /// Returns the quantisation steps of the means and of each of [`Self::levels`], for an error of items that a step of
-    /// `step` would cause in an orthonormal transform: what moves n items is n times as fine in squares.
-    pub fn steps(&self, step: f32) -> (f32, Vec<f32>) {
+    /// Returns the quantisation steps for an error of items that a step of `step` would cause in an orthonormal transform: what moves
+    /// n items is n times as fine in squares.
+    pub fn steps(&self, step: f32) -> Steps {
         let items = |level: u32| self.items as f32 / (1u32 << level) as f32;
         let of_level = |level: u32| 2.0 * step / libm::sqrtf(items(level).max(2.0));
-        (step / libm::sqrtf(items(self.segment_level)), self.levels().map(of_level).collect())
+        let mean = step / libm::sqrtf(items(self.segment_level));
+        Steps { mean, first: self.segment_level, differences: self.levels().map(of_level).collect() }
     }
 
-    /// Writes the coefficients of the items.
-    pub fn forward(&self, items: &[[f32; CHANNELS]], coefficients: &mut [[f32; CHANNELS]], means: &mut Vec<[f32; 3]>) {
+    /// Writes the coefficients of the items, each of which `item` is asked for once, in order; those that no item belongs to are 0.
+    /// `means` is scratch.
+    pub fn forward(
+        &self,
+        mut item: impl FnMut(usize) -> [f32; CHANNELS],
+        coefficients: &mut [[f32; CHANNELS]],
+        means: &mut Vec<[f32; CHANNELS]>,
+    ) {
         let first = 1usize << self.deepest;
-        means.clear();
-        for (node, pair) in self.starts.windows(2).enumerate() {
-            let a = items[pair[0] as usize];
+        means.resize(first, [0.0; CHANNELS]);
+        let nodes = coefficients[first..].iter_mut().zip(means.iter_mut()).zip(self.starts.windows(2));
+        for ((coefficient, mean), pair) in nodes {
+            let a = item(pair[0] as usize);
             if pair[1] - pair[0] == 2 {
-                let b = items[pair[0] as usize + 1];
-                coefficients[first + node] = core::array::from_fn(|c| a[c] - b[c]);
-                means.push(core::array::from_fn(|c| 0.5 * (a[c] + b[c])));
+                let b = item(pair[0] as usize + 1);
+                (*coefficient, *mean) = split(a, b);
             } else {
-                coefficients[first + node] = [0.0; CHANNELS];
-                means.push(a);
+                (*coefficient, *mean) = ([0.0; CHANNELS], a);
             }
         }
         for level in (self.segment_level..self.deepest).rev() {
             let first = 1usize << level;
-            for node in 0..first {
-                let (a, b) = (means[2 * node], means[2 * node + 1]);
-                coefficients[first + node] = core::array::from_fn(|c| a[c] - b[c]);
-                means[node] = core::array::from_fn(|c| 0.5 * (a[c] + b[c]));
+            for (node, coefficient) in coefficients[first..2 * first].iter_mut().enumerate() {
+                (*coefficient, means[node]) = split(means[2 * node], means[2 * node + 1]);
             }
         }
         coefficients[..self.segments()].copy_from_slice(&means[..self.segments()]);
     }
 
-    /// Calls `set` with each item, in order, whose coefficients `at` returns by their place; `means` is scratch.
+    /// Calls `set` with each item, in order. `mean` returns the mean of a segment, `difference` the difference at a place of a level whose
+    /// step is given with it; `means` is scratch.
     pub fn inverse(
         &self,
-        at: impl Fn(usize) -> [f32; CHANNELS],
+        steps: &Steps,
+        mean: impl Fn(usize) -> [f32; CHANNELS],
+        difference: impl Fn(usize, f32) -> [f32; CHANNELS],
         means: &mut Vec<[f32; CHANNELS]>,
         mut set: impl FnMut(usize, [f32; CHANNELS]),
     ) {
-        let halves = |mean: [f32; CHANNELS], difference: [f32; CHANNELS]| -> [[f32; CHANNELS]; 2] {
-            [
-                core::array::from_fn(|c| mean[c] + 0.5 * difference[c]),
-                core::array::from_fn(|c| mean[c] - 0.5 * difference[c]),
-            ]
-        };
-        means.clear();
         means.resize(1 << self.deepest, [0.0; CHANNELS]);
-        for (segment, mean) in means.iter_mut().take(self.segments()).enumerate() {
-            *mean = at(segment);
+        for (segment, slot) in means.iter_mut().take(self.segments()).enumerate() {
+            *slot = mean(segment);
         }
         for level in self.segment_level..self.deepest {
-            let first = 1usize << level;
+            let (first, step) = (1usize << level, steps.of_level(level));
             for node in (0..first).rev() {
-                let [a, b] = halves(means[node], at(first + node));
+                let [a, b] = halves(means[node], difference(first + node, step));
                 means[2 * node] = a;
                 means[2 * node + 1] = b;
             }
         }
-        let first = 1usize << self.deepest;
-        for (node, pair) in self.starts.windows(2).enumerate() {
+        let (first, step) = (1usize << self.deepest, steps.of_level(self.deepest));
+        for ((node, pair), mean) in self.starts.windows(2).enumerate().zip(means.iter()) {
             if pair[1] - pair[0] == 2 {
-                let [a, b] = halves(means[node], at(first + node));
+                let [a, b] = halves(*mean, difference(first + node, step));
                 set(pair[0] as usize, a);
                 set(pair[0] as usize + 1, b);
             } else {
-                set(pair[0] as usize, means[node]);
+                set(pair[0] as usize, *mean);
             }
         }
     }
+}
+
+/// Quantisation steps of a tree's coefficients.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Steps {
+    /// Of the segments' means.
+    pub mean: f32,
+    /// Level of the first of `differences`.
+    first: u32,
+    differences: Vec<f32>,
+}
+
+impl Steps {
+    /// Returns the step of a level's differences.
+    pub fn of_level(&self, level: u32) -> f32 {
+        self.differences.get(level.wrapping_sub(self.first) as usize).copied().unwrap_or(0.0)
+    }
+}
+
+/// Difference and mean of two halves.
+fn split(a: [f32; CHANNELS], b: [f32; CHANNELS]) -> ([f32; CHANNELS], [f32; CHANNELS]) {
+    (core::array::from_fn(|c| a[c] - b[c]), core::array::from_fn(|c| 0.5 * (a[c] + b[c])))
+}
+
+fn halves(mean: [f32; CHANNELS], difference: [f32; CHANNELS]) -> [[f32; CHANNELS]; 2] {
+    [core::array::from_fn(|c| mean[c] + 0.5 * difference[c]), core::array::from_fn(|c| mean[c] - 0.5 * difference[c])]
 }
 
 #[cfg(test)]
@@ -163,9 +189,10 @@ mod tests {
             let items: Vec<[f32; 3]> = (0..count).map(|_| [0; 3].map(|_| random.random_range(-9.0..9.0))).collect();
             let mut coefficients = vec![[0.0; 3]; tree.coefficients()];
             let mut scratch = Vec::new();
-            tree.forward(&items, &mut coefficients, &mut scratch);
+            tree.forward(|i| items[i], &mut coefficients, &mut scratch);
             let mut back = vec![[f32::NAN; 3]; count];
-            tree.inverse(|place| coefficients[place], &mut scratch, |i, item| back[i] = item);
+            let (mean, difference) = (|i: usize| coefficients[i], |i: usize, _: f32| coefficients[i]);
+            tree.inverse(&Steps::default(), mean, difference, &mut scratch, |i, item| back[i] = item);
             for (a, b) in items.iter().flatten().zip(back.iter().flatten()) {
                 assert!((a - b).abs() < 1e-4, "{count}");
             }
@@ -186,14 +213,14 @@ mod tests {
         // Uniform noise of one step in each coefficient: items must err by the same step's noise.
         let mut random = StdRng::seed_from_u64(4);
         let tree = HaarTree::new(6000);
-        let (mean_step, steps) = tree.steps(3.0);
-        let step_of = |place: usize| if place < 32 { mean_step } else { steps[(place.ilog2() - 5) as usize] };
-        let noise: Vec<f32> =
-            (0..tree.coefficients()).map(|place| step_of(place) * random.random_range(-0.5..0.5)).collect();
+        let steps = tree.steps(3.0);
+        let noise: Vec<f32> = (0..tree.coefficients()).map(|_| random.random_range(-0.5..0.5)).collect();
         let (mut sum, mut count) = (0.0, 0);
         let mut scratch = Vec::new();
         tree.inverse(
-            |place| [noise[place], 0.0, 0.0],
+            &steps,
+            |segment| [steps.mean * noise[segment], 0.0, 0.0],
+            |place, step| [step * noise[place], 0.0, 0.0],
             &mut scratch,
             |_, item| {
                 sum += f64::from(item[0]).powi(2);
