@@ -43,9 +43,20 @@ impl Influences {
         Self { index: pairs.map(|(i, _)| i), weight: pairs.map(|(_, w)| w) }
     }
 
-    /// Weights as shares of 1.
-    pub fn shares(&self) -> [f32; 4] {
-        self.weight.map(|w| w as f32 / WEIGHT_SUM as f32)
+    /// Returns the same, those that have a weight first.
+    pub fn heavy_first(&self) -> Self {
+        let mut found = Self::default();
+        let order = (0..4).filter(|k| self.weight[*k] > 0).chain((0..4).filter(|k| self.weight[*k] <= 0));
+        for (to, from) in order.enumerate() {
+            (found.index[to], found.weight[to]) = (self.index[from], self.weight[from]);
+        }
+        found
+    }
+
+    /// Returns indices and shares of 1 of those that have a weight, if they come first.
+    pub fn shares(&self) -> impl Iterator<Item = (usize, f32)> {
+        let pairs = self.index.into_iter().zip(self.weight).take_while(|(_, weight)| *weight > 0);
+        pairs.map(|(index, weight)| (index as usize, weight as f32 * (1.0 / WEIGHT_SUM as f32)))
     }
 }
 

@@ -18,6 +18,47 @@ pub struct Posed {
     pub normal: Vec<[f32; 4]>,
 }
 
+/// A node in canonical space.
+#[derive(Clone, Copy)]
+struct Node {
+    /// Position, metres.
+    place: [f32; 3],
+    /// Translation from its position at rest, metres.
+    by: [f32; 3],
+}
+
+impl Node {
+    fn new(rest: [f32; 3], motion: &Motion, node: usize) -> Self {
+        let by = motion.nodes.get(node).copied().unwrap_or_default();
+        Self { place: core::array::from_fn(|k| rest[k] + by[k]), by }
+    }
+}
+
+/// Sum of the squared distances between the nodes of a Gaussian that have a weight, square metres; those must come first.
+#[inline]
+pub(crate) fn spread(on: &Influences, place: impl Fn(usize) -> [f32; 3]) -> f32 {
+    // From the first of n nodes at distances d: n times the sum of |d|^2, less |sum of d|^2.
+    let first = place(on.index[0] as usize);
+    let (mut sum, mut squares, mut count) = ([0.0; 3], 0.0, 1.0);
+    for (node, _) in on.shares().skip(1) {
+        let other = place(node);
+        for k in 0..3 {
+            let apart = other[k] - first[k];
+            sum[k] += apart;
+            squares += apart * apart;
+        }
+        count += 1.0;
+    }
+    count * squares - sum.iter().map(|v| v * v).sum::<f32>()
+}
+
+/// Returns the factor by which a Gaussian grows with the surface between its nodes, by their spread at rest and now: the formula and the
+/// constants of `displacement` in the crate `body`, which this crate cannot use (`no_std`).
+fn growth_of(rest: f32, now: f32) -> f32 {
+    let is_longer = rest > 0.0 && now.is_finite() && now > CLOSED * CLOSED * rest;
+    if is_longer { (libm::sqrtf(now / rest) / CLOSED).min(MOST_GROWTH) } else { 1.0 }
+}
+
 /// Three rows of an affine motion.
 type Rows = [[f32; 4]; 3];
 
@@ -26,59 +67,38 @@ impl StreamTemplate {
     /// than at rest. A motion that lacks joints or nodes leaves them at rest.
     pub fn pose(&self, motion: &Motion, posed: &mut Posed) {
         let matrices = self.world_from_canonical(motion);
-        posed.center_scale.clear();
-        posed.normal.clear();
-        for (i, (&[x, y, z, scale], normal)) in self.center_scale.iter().zip(&self.normals).enumerate() {
+        let nodes: Vec<Node> =
+            self.node_places.iter().enumerate().map(|(i, place)| Node::new(*place, motion, i)).collect();
+        posed.center_scale.resize(self.gaussians(), [0.0; 4]);
+        posed.normal.resize(self.gaussians(), [0.0; 4]);
+        let at_rest = self.center_scale.iter().zip(&self.normals).zip(&self.skin);
+        let into = posed.center_scale.iter_mut().zip(&mut posed.normal);
+        for (i, (((&[x, y, z, scale], normal), skin), (center_scale, turned))) in at_rest.zip(into).enumerate() {
             let mut point = [x, y, z];
             let mut growth = 1.0;
-            if let Some(nodes) = self.node_weights.get(i) {
-                for (node, share) in nodes.index.into_iter().zip(nodes.shares()) {
-                    if let Some(by) = motion.nodes.get(node as usize) {
-                        for k in 0..3 {
-                            point[k] += share * by[k];
-                        }
+            if let (Some(on), Some(rest)) = (self.node_weights.get(i), self.rest_spread.get(i)) {
+                for (node, share) in on.shares() {
+                    for (value, by) in point.iter_mut().zip(nodes[node].by) {
+                        *value += share * by;
                     }
                 }
-                growth = self.growth(motion, nodes);
+                growth = growth_of(*rest, spread(on, |node| nodes[node].place));
             }
             let mut rows: Rows = [[0.0; 4]; 3];
-            let skin = &self.skin[i];
-            for (joint, share) in skin.index.into_iter().zip(skin.shares()).filter(|(_, share)| *share > 0.0) {
-                for (row, of_joint) in rows.iter_mut().zip(&matrices[joint as usize]) {
+            for (joint, share) in skin.shares() {
+                for (row, of_joint) in rows.iter_mut().zip(&matrices[joint]) {
                     for k in 0..4 {
                         row[k] += share * of_joint[k];
                     }
                 }
             }
             let [px, py, pz] = rows.map(|[a, b, c, d]| a * point[0] + b * point[1] + c * point[2] + d);
-            posed.center_scale.push([px, py, pz, growth * scale]);
-            let turned = rows.map(|[a, b, c, _]| a * normal[0] + b * normal[1] + c * normal[2]);
-            let squared = turned.iter().map(|v| v * v).sum::<f32>();
+            *center_scale = [px, py, pz, growth * scale];
+            let [nx, ny, nz] = rows.map(|[a, b, c, _]| a * normal[0] + b * normal[1] + c * normal[2]);
+            let squared = nx * nx + ny * ny + nz * nz;
             let by = if squared > 1e-20 { 1.0 / libm::sqrtf(squared) } else { 0.0 };
-            posed.normal.push([turned[0] * by, turned[1] * by, turned[2] * by, 0.0]);
+            *turned = [nx * by, ny * by, nz * by, 0.0];
         }
-    }
-
-    /// Returns the factor by which a Gaussian grows with the surface between its nodes: the formula and the constants of
-    /// `displacement` in the crate `body`, which this crate cannot use (`no_std`).
-    fn growth(&self, motion: &Motion, nodes: &Influences) -> f32 {
-        let (mut then, mut now) = (0.0, 0.0);
-        for (a, b) in [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)] {
-            if nodes.weight[a] == 0 || nodes.weight[b] == 0 {
-                continue;
-            }
-            let (a, b) = (nodes.index[a] as usize, nodes.index[b] as usize);
-            let (Some(first), Some(other)) = (self.node_places.get(a), self.node_places.get(b)) else { continue };
-            let still = [0.0; 3];
-            let (from, to) = (motion.nodes.get(a).unwrap_or(&still), motion.nodes.get(b).unwrap_or(&still));
-            for k in 0..3 {
-                let apart = other[k] - first[k];
-                let moved = apart + to[k] - from[k];
-                (then, now) = (then + apart * apart, now + moved * moved);
-            }
-        }
-        let longer = if then > 0.0 && now.is_finite() { libm::sqrtf(now / then) / CLOSED } else { 1.0 };
-        longer.clamp(1.0, MOST_GROWTH)
     }
 
     /// Skinning matrices of all joints.

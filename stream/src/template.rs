@@ -10,6 +10,7 @@ use crate::{
     planes::{
         GaussianModel, Influences, NORMAL_LEVELS, POSITION_LEVELS, Quantised, SCALE_LEVELS, normal_of, octahedral,
     },
+    pose::spread,
     range_coder::{RangeDecoder, RangeEncoder},
 };
 
@@ -67,8 +68,11 @@ pub struct StreamTemplate {
     /// Centre and standard deviation, metres.
     pub(crate) center_scale: Vec<[f32; 4]>,
     pub(crate) normals: Vec<[f32; 3]>,
+    /// Joints and nodes that move a Gaussian, those that have a weight first.
     pub(crate) skin: Vec<Influences>,
     pub(crate) node_weights: Vec<Influences>,
+    /// Spread of a Gaussian's nodes at rest, square metres: see [`crate::pose::spread`].
+    pub(crate) rest_spread: Vec<f32>,
     /// Canonical positions of the nodes, metres: each that of the Gaussian which hangs on it most.
     pub(crate) node_places: Vec<[f32; 3]>,
     /// What each node of a motion is predicted from.
@@ -248,6 +252,7 @@ impl StreamTemplate {
             normals: Vec::with_capacity(count),
             skin: Vec::with_capacity(count),
             node_weights: Vec::with_capacity(if nodes > 0 { count } else { 0 }),
+            rest_spread: Vec::new(),
             node_places: alloc::vec![[0.0; 3]; nodes],
             predictions: Vec::new(),
         };
@@ -267,7 +272,7 @@ impl StreamTemplate {
             let at = |axis: usize| min[axis] + step * position[axis] as f32;
             template.center_scale.push([at(0), at(1), at(2), scale_step * scale as f32]);
             template.normals.push(normal_of(normal));
-            template.skin.push(joints);
+            template.skin.push(joints.heavy_first());
             if nodes > 0 {
                 for (node, weight) in on_nodes.index.into_iter().zip(on_nodes.weight) {
                     let node = node as usize;
@@ -276,10 +281,12 @@ impl StreamTemplate {
                         template.node_places[node] = [at(0), at(1), at(2)];
                     }
                 }
-                template.node_weights.push(on_nodes);
+                template.node_weights.push(on_nodes.heavy_first());
             }
         }
         let normals: Vec<[f32; 3]> = most.iter().map(|(_, normal)| *normal).collect();
+        let places = &template.node_places;
+        template.rest_spread = template.node_weights.iter().map(|on| spread(on, |node| places[node])).collect();
         template.predictions = predictions(&template.node_places, &normals, &template.node_weights);
         Ok(template)
     }
