@@ -1,7 +1,8 @@
 //! Choice of the layers of colours that a line carries: fewer while motion is late or missing, more again once it is on time.
 //!
 //! The receiver alone decides, by when motion arrives: colours that are not subscribed to are not sent, so a slow line of one viewer
-//! costs nobody else anything, and a relay adapts to its own line.
+//! costs nobody else anything, and a relay adapts to its own line. Where the receiver's own computer is overloaded, its threads take messages
+//! in late whatever the line does: a thread that only waits shows by how much (`wake_lag.rs`).
 
 use std::{
     collections::VecDeque,
@@ -21,6 +22,15 @@ const FASTEST_OF: Duration = Duration::from_secs(30);
 const LATE_NANOS: i64 = 70_000_000;
 const CLEAR_NANOS: i64 = 35_000_000;
 const VERY_LATE_NANOS: i64 = 300_000_000;
+/// A thread that takes messages in has more to do than one that only waits, and may run so many times as late.
+const BUSIER: i64 = 2;
+/// From this lag on, motions that are missing are no sign of congestion.
+const STARVED_NANOS: i64 = 10_000_000;
+/// A judgement needs motion for as long as so many of the longest lag: one by one they say little. At most so long.
+const LAGS_IN_WINDOW: u32 = 6;
+const LONGEST_WINDOW: Duration = Duration::from_secs(15);
+/// Lags that are kept while no motion comes.
+const MOST_LAGS: usize = 1024;
 /// Share of motions that do not arrive on a congested line. A line with 1 % loss misses a quarter while TCP repeats.
 const MISSED_SHARE: f64 = 0.45;
 /// Motions missed in a longer pause are no sign of congestion: the line was cut, or nobody subscribed.
@@ -51,6 +61,8 @@ pub(crate) struct ColorLayers {
     /// Begin and least latency of each second.
     fastest: VecDeque<(Instant, i64)>,
     latencies: Vec<i64>,
+    /// How late threads of this computer ran, nanoseconds.
+    lags: Vec<i64>,
     missed: u64,
     /// Templates that are being fetched: they fill the line, whatever it carries.
     fetches: usize,
@@ -79,6 +91,7 @@ impl ColorLayers {
             is_begun: false,
             fastest: VecDeque::new(),
             latencies: Vec::new(),
+            lags: Vec::new(),
             missed: 0,
             fetches: 0,
             fetched: None,
@@ -139,6 +152,13 @@ impl ColorLayers {
         self.bytes = self.bytes.saturating_add(bytes);
     }
 
+    /// A thread of this computer that only waited ran so late.
+    pub fn woke_late(&mut self, by: Duration) {
+        if self.lags.len() < MOST_LAGS {
+            self.lags.push(i64::try_from(by.as_nanos()).unwrap_or(i64::MAX));
+        }
+    }
+
     /// Takes in the arrival of a motion: its latency by any two clocks, and the number of motions that were missed before it.
     pub fn motion(&mut self, now: Instant, latency_nanos: i64, missed: u64) {
         self.note_way(now, latency_nanos);
@@ -146,10 +166,14 @@ impl ColorLayers {
         let missed = if is_pause { 0 } else { missed };
         self.latencies.push(latency_nanos);
         self.missed = self.missed.saturating_add(missed);
-        if now.duration_since(self.window_began) < WINDOW || self.latencies.len() < MIN_MOTIONS {
+        let longest = self.lags.iter().copied().max().unwrap_or(0);
+        let lags = Duration::from_nanos(longest.unsigned_abs()).saturating_mul(LAGS_IN_WINDOW);
+        let window = WINDOW.max(lags.min(LONGEST_WINDOW));
+        if now.duration_since(self.window_began) < window || self.latencies.len() < MIN_MOTIONS {
             return;
         }
         let mut latencies = std::mem::take(&mut self.latencies);
+        let mut lags = std::mem::take(&mut self.lags);
         let missed = std::mem::take(&mut self.missed) as f64;
         self.bytes_per_sec =
             std::mem::take(&mut self.bytes) as f64 / now.duration_since(self.window_began).as_secs_f64();
@@ -158,10 +182,9 @@ impl ColorLayers {
             return;
         }
         let missed_share = missed / (missed + latencies.len() as f64);
-        let at = (FASTEST_SHARE * latencies.len() as f64) as usize;
-        let (_, fast, _) = latencies.select_nth_unstable(at);
-        let fastest = self.fastest.iter().map(|(_, nanos)| *nanos).min().unwrap_or(*fast);
-        self.judge(now, fast.saturating_sub(fastest), missed_share);
+        let fast = fast_of(&mut latencies);
+        let fastest = self.fastest.iter().map(|(_, nanos)| *nanos).min().unwrap_or(fast);
+        self.judge(now, fast.saturating_sub(fastest), fast_of(&mut lags), missed_share);
     }
 
     fn note_way(&mut self, now: Instant, latency_nanos: i64) {
@@ -176,11 +199,14 @@ impl ColorLayers {
         }
     }
 
-    fn judge(&mut self, now: Instant, queued_nanos: i64, missed_share: f64) {
-        tracing::trace!(queued_ms = queued_nanos / 1_000_000, missed_share, layers = self.wanted, "line");
+    fn judge(&mut self, now: Instant, late_nanos: i64, lag_nanos: i64, missed_share: f64) {
+        let queued_nanos = late_nanos.saturating_sub(lag_nanos.saturating_mul(BUSIER));
+        let (queued_ms, lag_ms) = (queued_nanos / 1_000_000, lag_nanos / 1_000_000);
+        tracing::trace!(queued_ms, lag_ms, missed_share, layers = self.wanted, "line");
         let since_change = self.changed.map(|(at, _)| now.duration_since(at));
         let is_trial = matches!(self.changed, Some((_, true)));
-        let is_congested = queued_nanos > LATE_NANOS || missed_share > MISSED_SHARE;
+        let is_missing = missed_share > MISSED_SHARE && lag_nanos < STARVED_NANOS;
+        let is_congested = queued_nanos > LATE_NANOS || is_missing;
         if is_congested {
             self.clear_since = None;
             // After a layer was left out, queues are still full of it; one that was added shows at once.
@@ -222,9 +248,16 @@ impl ColorLayers {
     }
 }
 
+/// Returns the time that the fastest share stays within; 0 of none.
+fn fast_of(nanos: &mut [i64]) -> i64 {
+    let at = (FASTEST_SHARE * nanos.len() as f64) as usize;
+    if at < nanos.len() { *nanos.select_nth_unstable(at).1 } else { 0 }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::wake_lag::Ticks;
 
     fn begun(now: Instant) -> ColorLayers {
         let mut layers = ColorLayers::new(now);
@@ -243,17 +276,41 @@ mod tests {
         queue_nanos: i64,
         /// Number of layers with which each motion in flight was sent.
         in_flight: VecDeque<usize>,
+        /// Longest pauses between two turns of the threads that take messages in and that only wait; none where they run at once.
+        pauses: [Duration; 2],
+        turns: [Instant; 2],
+        ticks: Ticks,
+        /// State of a generator of pauses.
+        random: u64,
     }
 
     impl Line {
         fn new(carries: usize) -> Self {
             let now = Instant::now();
-            Self { now, layers: begun(now), carries, queue_nanos: 0, in_flight: VecDeque::from([1; 4]) }
+            let (pauses, turns, ticks) = ([Duration::ZERO; 2], [now; 2], Ticks::new(now));
+            let in_flight = VecDeque::from([1; 4]);
+            Self { now, layers: begun(now), carries, queue_nanos: 0, in_flight, pauses, turns, ticks, random: 1 }
+        }
+
+        /// The first turn of a thread from `at` on.
+        fn turn(&mut self, thread: usize, at: Instant) -> Instant {
+            while self.turns[thread] < at {
+                if self.pauses[thread].is_zero() {
+                    self.turns[thread] = at;
+                    break;
+                }
+                self.random =
+                    self.random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+                let share = (self.random >> 33) as f64 / f64::from(1u32 << 31);
+                self.turns[thread] += self.pauses[thread].mul_f64(0.1 + 0.9 * share);
+            }
+            self.turns[thread]
         }
 
         /// Runs for so long at 30 motions a second; returns the share of motions that were late, and of time with each number of layers.
         fn run(&mut self, secs: usize) -> (f64, [f64; LAYERS + 1]) {
             let (mut late, mut counts) = (0, [0; LAYERS + 1]);
+            self.ticks = Ticks::new(self.now);
             for _ in 0..30 * secs {
                 self.now += Duration::from_nanos(33_333_333);
                 self.in_flight.push_back(self.layers.wanted());
@@ -261,9 +318,13 @@ mod tests {
                 let step = if sent > self.carries { 20_000_000 } else { -20_000_000 };
                 self.queue_nanos = (self.queue_nanos + step).clamp(0, 500_000_000);
                 late += usize::from(self.queue_nanos > 100_000_000);
-                // A clock that is an hour ahead.
                 self.layers.count(BYTES[..=sent].iter().sum());
-                self.layers.motion(self.now, 3_600_000_000_000 + 50_000_000 + self.queue_nanos, 0);
+                let taken = self.turn(0, self.now);
+                let woken = self.turn(1, self.now);
+                self.ticks.run(woken, |by| self.layers.woke_late(by));
+                let waited = taken.duration_since(self.now).as_nanos() as i64;
+                // A clock that is an hour ahead.
+                self.layers.motion(taken, 3_600_000_000_000 + 50_000_000 + self.queue_nanos + waited, 0);
                 counts[self.layers.wanted()] += 1;
             }
             let share = |count: usize| count as f64 / (30 * secs) as f64;
@@ -289,6 +350,66 @@ mod tests {
             assert!(shares[carries] > 0.95, "{carries}: {shares:?}");
             assert!(late < 0.01, "{carries}: {late}");
         }
+    }
+
+    #[test]
+    fn an_overloaded_computer_takes_its_own_lateness_for_no_slow_line() {
+        for pauses in [[100, 100], [400, 400], [1000, 1000], [2000, 2000], [400, 200]] {
+            let mut line = Line::new(LAYERS);
+            line.run(20);
+            line.pauses = pauses.map(Duration::from_millis);
+            let (_, shares) = line.run(600);
+            assert!(shares[LAYERS] > 0.9, "{pauses:?}: {shares:?}");
+            line.pauses = [Duration::ZERO; 2];
+            line.run(20);
+            assert_eq!(line.layers.wanted(), LAYERS, "{pauses:?}");
+        }
+        // The same, as it looks to somebody who does not know how late threads run.
+        let mut line = Line::new(LAYERS);
+        line.run(20);
+        line.pauses = [Duration::from_millis(1000), Duration::ZERO];
+        let (_, shares) = line.run(600);
+        assert!(shares[LAYERS] < 0.3, "{shares:?}");
+    }
+
+    #[test]
+    fn an_overloaded_computer_begins_with_colours() {
+        let mut line = Line::new(LAYERS);
+        line.pauses = [Duration::from_millis(700); 2];
+        line.run(60);
+        assert_eq!(line.layers.wanted(), LAYERS);
+    }
+
+    #[test]
+    fn a_slow_line_shows_on_an_overloaded_computer_too() {
+        let mut line = Line::new(1);
+        line.pauses = [Duration::from_millis(300); 2];
+        line.run(120);
+        let (late, shares) = line.run(1200);
+        assert!(shares[0] + shares[1] > 0.9 && late < 0.1, "{late} {shares:?}");
+    }
+
+    #[test]
+    fn missing_motion_is_no_congestion_where_threads_run_late() {
+        let start = Instant::now();
+        for (lag_millis, expected) in [(0, 0), (200, LAYERS)] {
+            let mut layers = begun(start);
+            for i in 0..600u32 {
+                (0..3).for_each(|_| layers.woke_late(Duration::from_millis(lag_millis)));
+                layers.motion(start + i * Duration::from_millis(66), 10_000_000, 1);
+            }
+            assert!(layers.wanted().abs_diff(expected) <= 1, "{lag_millis}: {}", layers.wanted());
+        }
+    }
+
+    #[test]
+    fn lags_without_motion_are_bounded() {
+        let now = Instant::now();
+        let mut layers = begun(now);
+        (0..100_000).for_each(|_| layers.woke_late(Duration::MAX));
+        assert!(layers.lags.len() <= MOST_LAGS);
+        (0..1000).for_each(|i| layers.motion(now + i * Duration::from_millis(33), i64::MIN, u64::MAX));
+        assert!(layers.lags.is_empty());
     }
 
     #[test]

@@ -131,6 +131,11 @@ impl Inbox {
         lock(&self.color_layers).wanted()
     }
 
+    /// A thread that only waited ran so late.
+    pub(crate) fn woke_late(&self, by: Duration) {
+        lock(&self.color_layers).woke_late(by);
+    }
+
     /// A template is being fetched from now on.
     pub(crate) fn fetch_begins(&self) {
         lock(&self.color_layers).fetch_begins(Instant::now());

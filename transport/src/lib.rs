@@ -62,6 +62,7 @@ mod template_fetcher;
 mod topic;
 mod view;
 mod viewpoint;
+mod wake_lag;
 
 pub use calibration::{RigTransforms, decode_calibration, decode_transforms, encode_calibration, encode_transforms};
 pub use camera_publisher::CameraPublisher;

@@ -22,6 +22,7 @@ use crate::{
     keys,
     splats::MAX_PERSON_TOPICS,
     topic::{Topic, lock},
+    wake_lag::WakeLag,
 };
 
 /// Bytes of a template in a reply: it fits in one batch of zenoh's, so that a slow line drops no fragments.
@@ -141,12 +142,14 @@ pub(crate) struct PersonSubscription {
     motion: Mutex<Option<Subscription>>,
     /// From the coarsest layer.
     layers: Mutex<Vec<Subscription>>,
+    /// Begins with motion.
+    wake_lag: Mutex<Option<WakeLag>>,
 }
 
 impl PersonSubscription {
     pub fn new(session: &Session, rig: &str, inbox: &Arc<Inbox>) -> Self {
         let (session, rig, inbox) = (session.clone(), rig.to_owned(), inbox.clone());
-        Self { session, rig, inbox, motion: Mutex::default(), layers: Mutex::default() }
+        Self { session, rig, inbox, motion: Mutex::default(), layers: Mutex::default(), wake_lag: Mutex::default() }
     }
 
     fn subscribe(&self, part: &str) -> Result<Subscription, TransportError> {
@@ -161,6 +164,18 @@ impl PersonSubscription {
 
     /// Subscribes to motion, unless that is so already.
     pub fn begin_motion(&self) -> Result<(), TransportError> {
+        let mut wake_lag = lock(&self.wake_lag);
+        if wake_lag.is_none() {
+            let inbox = Arc::downgrade(&self.inbox);
+            let measure = move |by| inbox.upgrade().into_iter().for_each(|inbox| inbox.woke_late(by));
+            match WakeLag::start(measure) {
+                Ok(started) => *wake_lag = Some(started),
+                Err(error) => {
+                    tracing::warn!(%error, "no thread measures how late threads run: on a busy computer colours may stop");
+                }
+            }
+        }
+        drop(wake_lag);
         let mut motion = lock(&self.motion);
         if motion.is_none() {
             *motion = Some(self.subscribe(keys::MOTION)?);
