@@ -139,17 +139,15 @@ mod tests {
         };
         let mut slopes = weights.clone();
         let found = light.backward(|i| normals[i], &unlit, &mut slopes, stride);
-        for term in 0..TERMS {
-            for k in 0..3 {
-                let at = |by: f32| {
-                    let mut moved = light.clone();
-                    moved.terms[term][k] += by;
-                    loss(&moved, &unlit)
-                };
-                let expected = (at(1e-3) - at(-1e-3)) / 2e-3;
-                let error = (expected - f64::from(found[term][k])).abs();
-                assert!(error < 0.05 + 2e-2 * expected.abs(), "{term} {k}: {expected} {}", found[term][k]);
-            }
+        for (at, found) in found.as_flattened().iter().enumerate() {
+            let moved = |by: f32| {
+                let mut moved = light.clone();
+                moved.terms.as_flattened_mut()[at] += by;
+                loss(&moved, &unlit)
+            };
+            let expected = (moved(1e-3) - moved(-1e-3)) / 2e-3;
+            let error = (expected - f64::from(*found)).abs();
+            assert!(error < 0.05 + 2e-2 * expected.abs(), "{at}: {expected} {found}");
         }
         for i in (0..count * stride).step_by(311) {
             let shade = light.shade(normals[i / stride]);
@@ -164,7 +162,7 @@ mod tests {
     fn poison_is_left_out_and_the_mean_has_no_direction() {
         let light = Light { terms: [[f32::MAX; 3]; TERMS] };
         assert!(light.shade(Vec3::NAN).iter().all(|shade| SHADE.contains(shade)));
-        assert_eq!(Light::default().shade(Vec3::X), [1.0; 3]);
+        assert!(Light::default().shade(Vec3::X).iter().all(|shade| (shade - 1.0).abs() <= 0.0));
         let mut slopes = vec![[f32::NAN; 4], [1.0; 4]];
         let found = Light::default().backward(|_| Vec3::Y, &[[0.5; 4]; 2], &mut slopes, 1);
         assert!(found.as_flattened().iter().all(|slope| slope.is_finite()) && (found[2][0] - 0.5).abs() < 1e-6);
@@ -187,6 +185,6 @@ mod tests {
             fit.descend(&mut light, &found, count, count as f32 / 600.0);
         }
         assert!((light.terms[2][1] - 0.5).abs() < 0.02 && light.terms[1][1].abs() < 0.02, "{:?}", light.terms);
-        assert_eq!(light.terms[0], [1.0; 3]);
+        assert!(light.terms[0].iter().all(|term| (term - 1.0).abs() <= 0.0));
     }
 }

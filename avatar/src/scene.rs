@@ -105,7 +105,7 @@ impl AvatarScene {
         let size = DVec2::new(f64::from(camera.intrinsics.width), f64::from(camera.intrinsics.height));
         let low = (low - margin_px).floor().max(DVec2::ZERO);
         let high = (high + 1.0 + margin_px).ceil().min(size);
-        low.cmplt(high).all().then(|| [low.x as u32, low.y as u32, high.x as u32, high.y as u32])
+        low.cmplt(high).all().then_some([low.x as u32, low.y as u32, high.x as u32, high.y as u32])
     }
 
     /// Returns the number of Gaussians that the last view left out, as they face away.
