@@ -4,6 +4,7 @@
 //! |---|---|---|
 //! | [`StreamTemplate`] | Gaussians at rest, skin and node weights, skeleton | once a viewer, by its hash |
 //! | [`Motion`] | pose, translations of the deformation graph's nodes | every frame, readable by itself |
+//! | the same with axes and colours ([`AvatarSource`]) | an avatar, which a pose alone moves | once a viewer; then no colours |
 //! | colours, in [`LAYERS`] layers | changes since the message before, from coarse to fine | every frame |
 //!
 //! The viewer poses the Gaussians itself ([`StreamTemplate::pose`]): FlyHuman Eq. 2 is linear in the node translations, and a pose is
@@ -20,6 +21,7 @@ extern crate alloc;
 #[cfg(test)]
 extern crate std;
 
+mod avatar;
 mod bytes;
 mod coefficients;
 #[cfg(test)]
@@ -44,6 +46,7 @@ mod template;
 mod testing;
 mod tree;
 
+pub use avatar::{AvatarGaussian, AvatarSource, PosedAxes};
 pub use colors::{ColorDecoder, ColorEncoder, ColorSettings, LAYERS};
 pub use error::StreamError;
 pub use motion::{Motion, MotionEncoder};

@@ -102,7 +102,7 @@ impl StreamTemplate {
     }
 
     /// Skinning matrices of all joints.
-    fn world_from_canonical(&self, motion: &Motion) -> Vec<Rows> {
+    pub(crate) fn world_from_canonical(&self, motion: &Motion) -> Vec<Rows> {
         let mut world: Vec<Rows> = Vec::with_capacity(self.joints.len());
         for (i, joint) in self.joints.iter().enumerate() {
             let rotation = motion.joint_rotations.get(i).copied().unwrap_or([0.0, 0.0, 0.0, 1.0]);

@@ -4,6 +4,7 @@ use alloc::vec::Vec;
 
 use crate::{
     CODEC_VERSION, StreamError,
+    avatar::{self, Avatar},
     bytes::Fields,
     nodes::{Prediction, predictions},
     order::spatial_order,
@@ -77,10 +78,12 @@ pub struct StreamTemplate {
     pub(crate) node_places: Vec<[f32; 3]>,
     /// What each node of a motion is predicted from.
     pub(crate) predictions: Vec<Prediction>,
+    /// Axes and colours of a person who is driven by poses alone.
+    pub(crate) avatar: Option<Avatar>,
 }
 
 /// A template with its bytes and the source's order.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct EncodedTemplate {
     /// As a decoder will have it.
     pub template: StreamTemplate,
@@ -205,11 +208,15 @@ fn is_parent(parent: Option<u16>, index: usize) -> bool {
 }
 
 impl StreamTemplate {
-    /// Reads a template's bytes.
+    /// Reads a template's bytes, or an avatar's.
     ///
     /// # Errors
     /// [`StreamError::Version`] or [`StreamError::Malformed`].
     pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
+        if bytes.starts_with(&avatar::MAGIC) { avatar::decode(bytes) } else { Self::decode_surface(bytes) }
+    }
+
+    pub(crate) fn decode_surface(bytes: &[u8]) -> Result<Self, StreamError> {
         let mut fields = Fields::of(WHAT, MAGIC, bytes)?;
         fields.check(bytes.len() <= MAX_TEMPLATE_BYTES, "it is too large")?;
         let planes = fields.u32()?;
@@ -255,6 +262,7 @@ impl StreamTemplate {
             rest_spread: Vec::new(),
             node_places: alloc::vec![[0.0; 3]; nodes],
             predictions: Vec::new(),
+            avatar: None,
         };
         // Largest weight on each node, and the normal of that Gaussian.
         let mut most = alloc::vec![(0, [0.0; 3]); nodes];

@@ -2,11 +2,12 @@
 //!
 //! [`Receiver`] keeps the people of a rig, [`Scene`] draws them, [`open_window`] shows them.
 
+mod ellipsoids;
 mod painter;
 mod receiver;
 mod scene;
 mod window;
 
 pub use receiver::{Receiver, ReceiverState, age_secs, clock_secs};
-pub use scene::Scene;
+pub use scene::{Scene, ShownPerson};
 pub use window::{Screenshot, ViewOptions, ViewerError, open_window};

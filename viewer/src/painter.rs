@@ -7,12 +7,12 @@ use std::{
 
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::composite_over;
-use flyrig_stream::{Posed, Stamp};
+use flyrig_stream::{Posed, PosedAxes, Stamp};
 use flyrig_types::{Camera, SupervisedThread, ThreadHealth};
 use flyrig_viewing::StreamPerson;
 use glam::DVec3;
 
-use crate::{Receiver, Scene, receiver::clock_secs};
+use crate::{Receiver, Scene, ShownPerson, receiver::clock_secs};
 
 /// Grey behind the people, sRGB.
 const BACKDROP: u8 = 30;
@@ -141,11 +141,21 @@ impl Shared {
 /// Everything that a view depends on: the same again need not be drawn. Of each person its number, stamp and colours.
 type Content = (Request, Vec<(u32, Stamp, u64)>);
 
+/// A person as it is drawn; memory is kept from one view to the next.
+#[derive(Debug, Default)]
+struct PosedPerson {
+    posed: Posed,
+    axes: PosedAxes,
+    /// Whether it is an avatar, whose axes hold.
+    is_avatar: bool,
+    colors: Arc<Vec<[f32; 4]>>,
+}
+
 /// Draws a view, unless it would be the same as the `last` one.
 fn draw(
     gpu: &GpuContext,
     scene: &mut Option<Scene>,
-    posed: &mut Vec<(Posed, Arc<Vec<[f32; 4]>>)>,
+    posed: &mut Vec<PosedPerson>,
     receiver: &Receiver,
     request: &Request,
     last: &mut Option<Content>,
@@ -169,10 +179,11 @@ fn draw(
         for (number, motion) in motions {
             let Some(person) = state.people.get_mut(number) else { continue };
             if posed.len() <= shown {
-                posed.push(Default::default());
+                posed.push(PosedPerson::default());
             }
-            let (centers, colors) = &mut posed[shown];
-            *colors = person.pose(&motion, centers);
+            let drawn = &mut posed[shown];
+            drawn.colors = person.pose(&motion, &mut drawn.posed);
+            drawn.is_avatar = person.pose_axes(&motion, &mut drawn.axes);
             shown += 1;
             is_complete &= person.is_complete();
             place = place.or_else(|| Some(DVec3::from(motion.root_translation.map(f64::from))));
@@ -183,7 +194,11 @@ fn draw(
         Some(scene) => scene,
         none => none.insert(Scene::new(gpu)?),
     };
-    scene.set_people(posed[..shown].iter().map(|(posed, colors)| (posed, colors.as_slice())))?;
+    scene.set_people(posed[..shown].iter().map(|PosedPerson { posed, axes, is_avatar, colors }| ShownPerson {
+        posed,
+        colors,
+        axes: is_avatar.then_some(axes),
+    }))?;
     let view = scene.draw(&request.camera)?;
     let backdrop = vec![BACKDROP; view.width as usize * view.height as usize * 3];
     Ok(Some(Drawn {

@@ -2,8 +2,34 @@
 
 use flyrig_gpu::{GpuContext, GpuError};
 use flyrig_renderer::{GaussianBuffers, ViewPainter};
-use flyrig_stream::Posed;
+use flyrig_stream::{Posed, PosedAxes};
 use flyrig_types::{Camera, RenderedView};
+
+use crate::ellipsoids::Ellipsoids;
+
+/// One person to draw.
+#[derive(Debug, Clone, Copy)]
+pub struct ShownPerson<'a> {
+    /// Centres and normals.
+    pub posed: &'a Posed,
+    /// Linear RGB and opacity of as many Gaussians.
+    pub colors: &'a [[f32; 4]],
+    /// Axes of as many Gaussians; None where they are isotropic.
+    pub axes: Option<&'a PosedAxes>,
+}
+
+impl<'a> From<(&'a Posed, &'a [[f32; 4]])> for ShownPerson<'a> {
+    fn from((posed, colors): (&'a Posed, &'a [[f32; 4]])) -> Self {
+        Self { posed, colors, axes: None }
+    }
+}
+
+impl ShownPerson<'_> {
+    /// Number of Gaussians that all lists have.
+    pub(crate) fn count(&self) -> usize {
+        self.posed.center_scale.len().min(self.posed.normal.len()).min(self.colors.len())
+    }
+}
 
 /// A rasteriser with room for the people that are shown.
 #[derive(Debug)]
@@ -11,6 +37,8 @@ pub struct Scene {
     gpu: GpuContext,
     painter: ViewPainter,
     gaussians: GaussianBuffers,
+    /// In place of those where somebody is an avatar.
+    ellipsoids: Option<Ellipsoids>,
 }
 
 impl Scene {
@@ -19,20 +47,28 @@ impl Scene {
     /// # Errors
     /// [`GpuError::TooLarge`].
     pub fn new(gpu: &GpuContext) -> Result<Self, GpuError> {
-        Ok(Self { gpu: gpu.clone(), painter: ViewPainter::new(gpu, 1)?, gaussians: GaussianBuffers::zeroed(gpu, 1)? })
+        let (painter, gaussians) = (ViewPainter::new(gpu, 1)?, GaussianBuffers::zeroed(gpu, 1)?);
+        Ok(Self { gpu: gpu.clone(), painter, gaussians, ellipsoids: None })
     }
 
-    /// Puts people into the scene, in place of those before: centres and normals, and linear colours of as many Gaussians.
+    /// Puts people into the scene, in place of those before. Once one of them is an avatar, all are drawn as Gaussians of three axes.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
-    pub fn set_people<'a>(
+    pub fn set_people<'a, P: Into<ShownPerson<'a>>>(
         &mut self,
-        people: impl IntoIterator<Item = (&'a Posed, &'a [[f32; 4]])>,
+        people: impl IntoIterator<Item = P>,
     ) -> Result<(), GpuError> {
-        let mut people = people.into_iter().map(|(posed, colors)| {
-            let count = posed.center_scale.len().min(colors.len());
-            (&posed.center_scale[..count], &posed.normal[..count], &colors[..count])
+        let people: Vec<ShownPerson<'_>> = people.into_iter().map(Into::into).collect();
+        let has_avatar = people.iter().any(|person| person.axes.is_some());
+        let before = self.ellipsoids.take();
+        self.ellipsoids = has_avatar.then(|| Ellipsoids::new(&self.gpu, &people, before)).transpose()?;
+        if has_avatar {
+            return Ok(());
+        }
+        let mut people = people.iter().map(|person| {
+            let (posed, count) = (person.posed, person.count());
+            (&posed.center_scale[..count], &posed.normal[..count], &person.colors[..count])
         });
         let first = people.next().unwrap_or_default();
         let Some(second) = people.next() else { return self.write(first.0, first.1, first.2) };
@@ -63,6 +99,9 @@ impl Scene {
     /// # Errors
     /// [`GpuError`].
     pub fn draw(&mut self, camera: &Camera) -> Result<RenderedView, GpuError> {
-        self.painter.draw(&self.gaussians, camera)
+        match &mut self.ellipsoids {
+            Some(ellipsoids) => self.painter.draw(ellipsoids.seen_by(&self.gpu, camera), camera),
+            None => self.painter.draw(&self.gaussians, camera),
+        }
     }
 }

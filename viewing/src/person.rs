@@ -2,7 +2,7 @@
 
 use std::{collections::VecDeque, sync::Arc};
 
-use flyrig_stream::{ColorDecoder, Motion, Posed, Stamp, StreamError, StreamTemplate};
+use flyrig_stream::{ColorDecoder, Motion, Posed, PosedAxes, Stamp, StreamError, StreamTemplate};
 
 /// Motions that are kept to interpolate between.
 const KEPT: usize = 16;
@@ -37,7 +37,7 @@ impl StreamPerson {
     pub fn new(template: Arc<StreamTemplate>) -> Self {
         Self {
             decoder: ColorDecoder::new(&template),
-            colors: Arc::default(),
+            colors: Arc::new(template.avatar_colors().unwrap_or_default().to_vec()),
             colors_are_current: false,
             color_changes: 0,
             motions: VecDeque::new(),
@@ -121,16 +121,25 @@ impl StreamPerson {
     /// Poses the person and returns its colours, an element a Gaussian each.
     pub fn pose(&mut self, motion: &Motion, posed: &mut Posed) -> Arc<Vec<[f32; 4]>> {
         self.template.pose(motion, posed);
+        if self.template.avatar_colors().is_some() {
+            return Arc::clone(&self.colors);
+        }
         if !std::mem::replace(&mut self.colors_are_current, true) {
             self.decoder.colors(Arc::make_mut(&mut self.colors));
         }
         Arc::clone(&self.colors)
     }
 
+    /// Poses the three axes of an avatar's Gaussians. Returns false for a person of isotropic ones.
+    pub fn pose_axes(&self, motion: &Motion, axes: &mut PosedAxes) -> bool {
+        self.template.pose_axes(motion, axes)
+    }
+
     /// Whether every part of the person has its colours, down to the finest layer.
     #[must_use]
     pub fn is_complete(&self) -> bool {
-        (0..flyrig_stream::LAYERS).all(|layer| self.decoder.known(layer) >= 1.0)
+        self.template.avatar_colors().is_some()
+            || (0..flyrig_stream::LAYERS).all(|layer| self.decoder.known(layer) >= 1.0)
     }
 
     /// Number of colour messages so far: the same number means the same colours.
