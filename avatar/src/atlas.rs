@@ -14,7 +14,7 @@ const SIDES: std::ops::RangeInclusive<u32> = 16..=4096;
 /// A texel sees Gaussians as bell curves of so many of their own deviations: narrower than they are drawn, so that detail stays.
 pub(crate) const KERNEL: f32 = 0.6;
 /// Gaussians further away than so many mean distances do not count.
-const REACH: f32 = 3.0;
+pub(crate) const REACH: f32 = 3.0;
 /// Share of what lies below that a Gaussian hides in its middle, and share that all must hide together for their mix to count.
 const MOST_ALPHA: f32 = 0.9;
 const LEAST_ALPHA: f32 = 0.05;
@@ -66,11 +66,7 @@ pub(crate) struct Shown {
 impl Shown {
     pub fn of(avatar: &Avatar) -> Self {
         let template = &avatar.template;
-        let normals: Vec<Vec3> = avatar
-            .attachments
-            .iter()
-            .map(|attachment| attachment.blend(template, &template.normals).normalize_or(Vec3::Y))
-            .collect();
+        let normals = avatar.normals();
         let rows = avatar.attachments.iter().zip(&normals).zip(avatar.places.iter().zip(&avatar.parameters.offset));
         let (place, height) = rows
             .map(|((attachment, normal), (place, [x, y, z, _]))| {
@@ -87,6 +83,24 @@ impl Shown {
             (0.5 * (scales[1] + scales[2])).exp().clamp(1e-4, 0.05)
         });
         Self { place, height, deviation: deviation.collect(), normal: normals }
+    }
+
+    /// Linear colour of the surface at a canonical place with this normal, of Gaussians within `radius`; None where none faces the same
+    /// way. `grid` holds their places, `colors` are linear RGB.
+    pub fn color_at(
+        &self,
+        grid: &PointGrid<'_>,
+        radius: f32,
+        (place, normal): (Vec3, Vec3),
+        colors: &[Vec3],
+    ) -> Option<Vec3> {
+        let mut near = Vec::new();
+        grid.within(place, radius, |i, squared| {
+            if self.normal[i].dot(normal) > 0.0 {
+                near.push((self.height[i], i, squared));
+            }
+        });
+        composite(near, self, colors)
     }
 
     /// Mean distance of neighbours, metres.
@@ -106,15 +120,7 @@ impl Avatar {
         let colors: Vec<Vec3> = self.constant_colors();
         let radius = REACH * shown.spacing(self);
         let grid = PointGrid::new(&shown.place, radius);
-        let color = |texel: &Texel| {
-            let mut near = Vec::new();
-            grid.within(texel.place, radius, |i, squared| {
-                if shown.normal[i].dot(texel.normal) > 0.0 {
-                    near.push((shown.height[i], i, squared));
-                }
-            });
-            composite(near, &shown, &colors).map(encode)
-        };
+        let color = |texel: &Texel| shown.color_at(&grid, radius, (texel.place, texel.normal), &colors).map(encode);
         let found: Vec<Option<[u8; 3]>> = texels.par_iter().with_min_len(1024).map(color).collect();
         let mut image = vec![None; (side * side) as usize];
         for (texel, color) in texels.iter().zip(&found) {

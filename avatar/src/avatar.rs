@@ -150,6 +150,16 @@ impl Avatar {
         self.places.len()
     }
 
+    /// Returns the unit normal of the body's surface where each Gaussian hangs, canonical.
+    #[must_use]
+    pub fn normals(&self) -> Vec<Vec3> {
+        let normals = &self.template.normals;
+        self.attachments
+            .iter()
+            .map(|attachment| attachment.blend(&self.template, normals).normalize_or(Vec3::Y))
+            .collect()
+    }
+
     /// Returns the share of the Gaussians that are in a pose unlike those of the take, see [`KnownPoses::far_share`].
     #[must_use]
     pub fn far_share(&self, pose: &Pose) -> f64 {

@@ -189,10 +189,15 @@ impl Avatar {
         let header = metadata.metadata().as_ref().and_then(|all| all.get(HEADER)).ok_or_else(foreign)?;
         let found =
             serde_json::from_str::<VersionOnly>(header).map_err(|error| format!("is damaged: {error}"))?.version;
-        if found != VERSION {
+        if found > VERSION {
+            return Err(format!(
+                "has version {found} of the format, this program reads {VERSION}; update flyrig, or build it again"
+            ));
+        }
+        if found < VERSION {
             return Err(format!("has version {found} of the format, this program reads {VERSION}; build it again"));
         }
-        Self::read(bytes, header).map_err(|problem| format!("is damaged: {problem}"))
+        Self::read(bytes, header).map_err(|problem| format!("is damaged: {problem}; build it again"))
     }
 
     fn read(bytes: &[u8], header: &str) -> Result<Self, String> {

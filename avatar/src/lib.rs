@@ -24,6 +24,7 @@ mod reshape;
 mod scene;
 mod splat_glb;
 mod ssim;
+mod surface;
 
 pub use atlas::{Atlas, DEFAULT_ATLAS_SIDE};
 pub use avatar::{Attachment, Avatar, Card, Hanging};

@@ -31,6 +31,12 @@ impl Bones {
         Self { world_from_canonical: skeleton.world_from_canonical(pose).iter().map(of).collect() }
     }
 
+    /// Bones that leave everything in canonical space.
+    #[must_use]
+    pub fn at_rest(skeleton: &Skeleton) -> Self {
+        Self { world_from_canonical: vec![(Mat4::IDENTITY, Quat::IDENTITY); skeleton.joints().len()] }
+    }
+
     /// Blends the bones of a Gaussian: linear part and translation, and rotation. Without any weight it stays at rest.
     fn blend(&self, skin: &SkinWeights) -> (Mat4, Quat) {
         let (mut matrix, mut rotation, mut sum) = (Mat4::ZERO, Vec4::ZERO, 0.0);

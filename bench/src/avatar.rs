@@ -84,7 +84,7 @@ pub fn avatar(args: &BenchAvatarArgs, gpu: &GpuContext) -> Result<()> {
         if others.is_none() {
             let mut settings = settings(gaussians, &args.novel);
             settings.session.tracking.solver = Solver::None;
-            settings.body = Some(take.avatar.template.clone());
+            settings.body = Some(take.avatar.template.clone().into());
             others = Some(track(args, &settings, gpu)?.1);
         }
         let novel = others.as_deref().unwrap_or_default();

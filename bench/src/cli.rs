@@ -243,6 +243,9 @@ pub struct BenchStreamArgs {
     /// Qualities of the colours as a video, 0 (best) to 63, comma separated; needs the program ffmpeg.
     #[arg(long, value_delimiter = ',', default_value = "10,20,30", value_parser = clap::value_parser!(u8).range(0..=63))]
     pub crf: Vec<u8>,
+    /// The person's avatar (`flyrig avatar build`): tracking starts from it, and it is sent once, then poses alone.
+    #[arg(long, value_name = "FILE")]
+    pub avatar: Option<PathBuf>,
     /// Folder of the results.
     #[arg(long, default_value = "out/bench-stream")]
     pub out: PathBuf,

@@ -16,7 +16,7 @@ use flyrig_viewer::Scene;
 
 use crate::cli::BenchStreamArgs;
 use atlas::Atlas;
-use forms::{Form, Packed, Spz, Stream};
+use forms::{AvatarPoses, Form, Packed, Spz, Stream};
 use score::Tally;
 use table::Row;
 use take::Take;
@@ -60,6 +60,10 @@ fn run(args: &BenchStreamArgs, gpu: &GpuContext, take: &Take, has_codec: bool) -
     let mut forms: Vec<Box<dyn Form>> = Vec::new();
     for &step in &args.steps {
         forms.push(Box::new(Stream::new(step)));
+    }
+    if let Some(avatar) = &take.avatar {
+        forms.push(Box::new(AvatarPoses::new(avatar, false)));
+        forms.push(Box::new(AvatarPoses::new(avatar, true)));
     }
     forms.push(Box::new(Packed));
     forms.push(Box::new(Spz));

@@ -44,6 +44,7 @@ mod skirt;
 mod surface;
 mod surface_links;
 mod template;
+mod vertex_means;
 
 pub use bvh::{BvhChannel, BvhClip, BvhJoint, load_bvh, parse_bvh};
 pub use coarse::{CoarseSurface, coarsen};
@@ -69,3 +70,4 @@ pub use skinning::{skin_jacobian_f64, skin_mesh, skin_normal_f64, skin_point_f64
 pub use skirt::Skirt;
 pub use surface::{DEFAULT_GAUSSIAN_COUNT, SurfaceGaussians, sample_surface};
 pub use template::{Part, SkinWeights, Template};
+pub use vertex_means::VertexMeans;

@@ -141,6 +141,24 @@ impl Template {
         Ok(())
     }
 
+    /// Checks that poses of `other` are poses of this body: joints of the same names in the same order.
+    ///
+    /// # Errors
+    /// [`BodyError::Skeleton`] with both numbers, or the first name that differs.
+    pub fn check_same_joints(&self, other: &Self) -> Result<(), BodyError> {
+        let (own, others) = (self.skeleton.joints(), other.skeleton.joints());
+        let differ = own.iter().zip(others).find(|(a, b)| a.name != b.name);
+        let difference = match differ {
+            Some((a, b)) => format!("'{}' in place of '{}' among its joints", a.name, b.name),
+            None if own.len() != others.len() => format!("{} joints in place of {}", own.len(), others.len()),
+            None => return Ok(()),
+        };
+        Err(BodyError::Skeleton(format!(
+            "the body '{}' has {difference}, so that poses of '{}' do not fit it; use the same body for both",
+            self.name, other.name
+        )))
+    }
+
     /// Maps each vertex to its position class: vertices split at UV seams share one.
     #[must_use]
     pub fn welded(&self) -> Vec<u32> {

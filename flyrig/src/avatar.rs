@@ -85,7 +85,7 @@ fn open_replay(
         lags_nanos: take.lags.nanos(),
         true_masks: false,
         true_joints: Vec::new(),
-        body: known.cloned(),
+        body: known.map(|template| template.clone().into()),
     };
     Replay::open(&settings, gpu)
 }

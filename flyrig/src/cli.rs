@@ -805,6 +805,9 @@ pub struct EvalArgs {
     pub perception: PerceptionSettings,
     #[command(flatten)]
     pub body: BodySettings,
+    /// The person's avatar (`flyrig avatar build`): tracking and colours start from it.
+    #[arg(long, value_name = "FILE")]
+    pub avatar: Option<PathBuf>,
     #[command(flatten)]
     pub tracking: TrackingSettings,
     #[command(flatten)]

@@ -275,6 +275,10 @@ impl Config {
         self.sim.validate().context("in [sim]")?;
         self.session().validate()?;
         self.output.validate()?;
+        ensure!(
+            !self.output.avatar || self.body.avatar_file().is_some(),
+            "output.avatar is true but body.avatar is empty: name the avatar that viewers draw, or set output.avatar = false"
+        );
         range("capture.jpeg_quality", f64::from(self.capture.jpeg_quality), 0.0, 100.0)?;
         range("record.jpeg_quality", f64::from(self.record.jpeg_quality), 0.0, 100.0)?;
         self.web.validate()?;
@@ -393,6 +397,8 @@ mod tests {
             ("[source]\nkind = \"folder\"\n", "source.path is empty"),
             ("[source]\nkind = \"folder\"\npath = \"x\"\n[perception]\npose = \"given\"\n", "body.template is empty"),
             ("[rig]\nname = \"a/b\"\n", "rig.name is 'a/b'"),
+            ("[output]\navatar = true\n", "output.avatar is true but body.avatar is empty: name the avatar"),
+            ("[body]\navatar = \"a\"\nperson = \"b\"\n", "body.avatar (a) and body.person (b) both say"),
             ("[transport]\ninbox_bytes = 1000\n", "in [rig] or [transport]: inbox_bytes: is 1000, expected 65536 to"),
             (
                 "[transport]\nviewpoint_pixels_per_second = 1000000000000\n",

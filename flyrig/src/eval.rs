@@ -4,11 +4,13 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 use flyrig_body::write_mesh_ply;
-use flyrig_fusion::{AppearanceMode, Counts, Origin, Outcome, PersonId, SessionSettings, Solver, StageSummary};
+use flyrig_fusion::{
+    AppearanceMode, BodySettings, Counts, Origin, Outcome, PersonId, SessionSettings, Solver, StageSummary,
+};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, FrameScore, ScoreSheet, error_parts, score_view};
 use flyrig_report::{
-    ContactRow, Curve, Replay, ReplaySettings, Report, contact_images, frame_number, outlined_inputs, png,
+    ContactRow, Curve, Replay, ReplaySettings, Report, contact_images, frame_number, known_body, outlined_inputs, png,
     progress_bar, write_whole,
 };
 use flyrig_types::{Camera, Frame, RenderedView};
@@ -34,6 +36,8 @@ struct Metrics<'a> {
     appearance: AppearanceMode,
     gaussians: usize,
     nodes: usize,
+    /// File that tracking and colours started from.
+    avatar: Option<String>,
     adapter: String,
     frames: usize,
     seconds: f64,
@@ -51,13 +55,14 @@ struct Metrics<'a> {
 /// Runs the command.
 pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let started = Instant::now();
+    let body = BodySettings { avatar: args.avatar.clone().unwrap_or_default(), ..args.body.clone() };
     let settings = ReplaySettings {
         dataset: args.dataset.clone(),
         inputs: args.inputs.clone(),
         holdout: args.holdout.clone(),
         session: SessionSettings {
             perception: args.perception.clone(),
-            body: args.body.clone(),
+            body: body.clone(),
             tracking: args.tracking.clone(),
             appearance: args.appearance.clone(),
             budget: args.budget,
@@ -67,7 +72,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         lags_nanos: args.lags.nanos(),
         true_masks: false,
         true_joints: Vec::new(),
-        body: None,
+        body: known_body(&body, false)?,
     };
     let mut replay = Replay::open(&settings, gpu)?;
     let holdout = replay.holdout.clone();
@@ -149,6 +154,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         appearance: args.appearance.mode,
         gaussians: args.body.gaussians,
         nodes: args.body.nodes,
+        avatar: args.avatar.as_ref().map(|path| path.display().to_string()),
         adapter: replay.session.gpu().adapter_name(),
         frames: processed as usize,
         seconds,

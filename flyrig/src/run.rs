@@ -18,7 +18,7 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_monitor::{Monitor, effort, ended_by_itself};
-use flyrig_report::{dataset, stop};
+use flyrig_report::{KnownBody, dataset, known_body, stop};
 use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::Image;
 use flyrig_web::WebServer;
@@ -98,10 +98,22 @@ fn capture_people(
     let mut builder = SessionBuilder::new(gpu.clone(), source.rig.clone()).settings(config.session());
     let saved = config.body.person_file().filter(|path| path.exists()).map(PersonMemory::load).transpose()?;
     let outfit = saved.as_ref().map(PersonMemory::outfit).unwrap_or_default();
-    let learnt = saved.as_ref().map(|memory| memory.template(&source.template)).transpose()?;
+    let mut learnt = saved.as_ref().map(|memory| memory.template(&source.template)).transpose()?;
     if let Some(memory) = saved {
         builder = builder.person(PersonId::default(), memory);
         eprintln!("run: the person is resumed from {}", config.body.person.display());
+    }
+    let has_avatar = config.body.avatar_file().is_some();
+    if let Some(KnownBody { template, memory }) = known_body(&config.body, config.output.avatar)? {
+        // Poses of a track, or of the body that the configuration names, must be poses of the avatar.
+        if config.perception.pose == Origin::Given || !config.body.template.as_os_str().is_empty() {
+            template.check_same_joints(&source.template).context("body.avatar")?;
+        }
+        if let Some(memory) = memory {
+            builder = builder.person(PersonId::default(), memory);
+        }
+        learnt = Some(template);
+        eprintln!("run: the person starts from the avatar {}", config.body.avatar.display());
     }
     let threads = std::mem::take(&mut source.threads);
     let watch = rig_watch(config.calibration.watch, &source)?;
@@ -112,6 +124,7 @@ fn capture_people(
         source.template = learnt.clone();
     }
     builder = match source.perception(config)? {
+        FoundBy::Given(perception) if has_avatar => builder.perception(perception.dressed()),
         FoundBy::Given(perception) => builder.perception(perception),
         FoundBy::Estimated(mut perception) => {
             eprintln!("run: looking for people; each is measured for a moment, then drawn");

@@ -6,7 +6,6 @@ mod choose;
 mod images;
 mod motion;
 mod options;
-mod vertex_means;
 
 use std::time::{Duration, Instant};
 

@@ -50,7 +50,7 @@ pub use perception::{
     EstimatedPerception, GivenPerception, GivenPerson, KnownPerson, Observation, Perception, SHAPE_SECS, SHAPE_SETS,
     SeenPerson, ViewObservation,
 };
-pub use person_stream::{PersonEncoder, PersonFrame, PersonMessages};
+pub use person_stream::{PersonEncoder, PersonFrame, PersonMessages, stream_joints};
 pub use rig_watch::{Correction, RigWatch, WatchEvent};
 pub use session::{Counts, Outcome, Session, SessionBuilder};
 pub use set_reader::{SetReader, next_frame};
@@ -60,7 +60,7 @@ pub use settings::{
 };
 pub use stage_times::{StageSummary, StageTimes, processor_time, resident_mib};
 pub use stage_trace::{TracedStage, start_stage_trace, take_stage_trace};
-pub use subject::{Observed, PROCESSOR_STAGE, Subject, person_surface};
+pub use subject::{Observed, PROCESSOR_STAGE, Subject, person_gaussians, person_surface};
 pub use track_state::{Remedy, TrackState, TrackWatch};
 pub use viewpoints::orbit;
 

@@ -24,11 +24,13 @@ pub struct OutputSettings {
     pub jpeg_quality: u8,
     /// Whether the Gaussians are published as well.
     pub splats: bool,
+    /// Whether viewers get the first person's avatar once and then its pose alone, in place of its surface, motion and colours.
+    pub avatar: bool,
 }
 
 impl Default for OutputSettings {
     fn default() -> Self {
-        Self { views: 1, width: 512, height: 512, jpeg_quality: 85, splats: true }
+        Self { views: 1, width: 512, height: 512, jpeg_quality: 85, splats: true, avatar: false }
     }
 }
 

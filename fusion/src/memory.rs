@@ -1,10 +1,11 @@
 //! Learnt shape, deformation and colours of a person. A session resumes from it after a restart of the program or
 //! the loss of the graphics device.
 
-use std::{collections::HashMap, io::Write as _, path::Path};
+use std::{collections::HashMap, io::Write as _, path::Path, sync::Arc};
 
 use flyrig_body::{Joint, Outfit, Shoes, Skeleton, Skirt, Template};
 use flyrig_stfa::FeatureMemory;
+use flyrig_stream::EncodedTemplate;
 use glam::{DMat4, DQuat, DVec3, Vec3};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 
@@ -22,6 +23,8 @@ const NETWORKS_KEY: &str = "networks";
 const SKIRT_KEY: &str = "skirt";
 /// Key of the soles' thickness in metres, where the person wears shoes.
 const SHOES_KEY: &str = "shoes";
+/// Weight of colours that are known before the first image: that of colours seen for long.
+const KNOWN_WEIGHT: f32 = 8.0;
 /// A larger file is no saved person, bytes.
 const MOST_BYTES: u64 = 1 << 30;
 
@@ -41,6 +44,10 @@ pub struct PersonMemory {
     pub(crate) colors: Vec<[f32; 4]>,
     /// Features that learned appearance has accumulated on the processor.
     pub(crate) networks: Option<NetworkMemory>,
+    /// Whether the person is as known here at every start, also after a long absence.
+    pub(crate) is_start: bool,
+    /// Avatar that viewers draw from poses alone, in place of the surface with colours that are sent.
+    pub(crate) stream: Option<Arc<EncodedTemplate>>,
 }
 
 /// Features that networks have accumulated.
@@ -62,7 +69,48 @@ impl PersonMemory {
     ) -> Self {
         let joints = template.skeleton.joints().to_vec();
         let (positions, normals) = (template.positions.clone(), template.normals.clone());
-        Self { positions, normals, joints, outfit, translations, memory, colors, networks }
+        Self {
+            positions,
+            normals,
+            joints,
+            outfit,
+            translations,
+            memory,
+            colors,
+            networks,
+            is_start: false,
+            stream: None,
+        }
+    }
+
+    /// A person who is known before the first image, at rest: `template` is the body dressed, `colors` hold linear RGB of each Gaussian
+    /// of [`crate::person_surface`]. They stay where no camera looks and yield to images elsewhere; a person who is lost for long starts
+    /// from them again. Numbers that are not finite become mid grey.
+    #[must_use]
+    pub fn of_colors(template: &Template, colors: &[[f32; 3]]) -> Self {
+        let finite = |value: f32| if value.is_finite() { value } else { 0.5 };
+        let with = |w: f32| {
+            colors
+                .iter()
+                .map(|rgb| {
+                    let [r, g, b] = rgb.map(finite);
+                    [r, g, b, w]
+                })
+                .collect()
+        };
+        let (memory, shown) = (with(KNOWN_WEIGHT), with(1.0));
+        Self { is_start: true, ..Self::new((template, Outfit::default()), Vec::new(), memory, shown, None) }
+    }
+
+    /// Lets viewers draw the person as this avatar, from poses alone. It must have the joints of the person's body.
+    #[must_use]
+    pub fn with_stream(self, avatar: EncodedTemplate) -> Self {
+        Self { stream: Some(Arc::new(avatar)), ..self }
+    }
+
+    /// Takes the avatar of [`Self::with_stream`] out: viewers get the surface that is tracked.
+    pub fn take_stream(&mut self) -> Option<Arc<EncodedTemplate>> {
+        self.stream.take()
     }
 
     /// Returns the person's clothes.
@@ -254,6 +302,8 @@ impl PersonMemory {
             memory: vec4("memory")?,
             colors: vec4("colors")?,
             networks,
+            is_start: false,
+            stream: None,
         })
     }
 }

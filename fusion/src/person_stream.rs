@@ -17,18 +17,24 @@ use crate::{FusionError, Subject};
 /// Frames of people that may wait for the encoder.
 const WAITING: usize = 4;
 
+/// Returns a skeleton's joints as the stream has them.
+#[must_use]
+pub fn stream_joints(skeleton: &Skeleton) -> Vec<StreamJoint> {
+    let joint = |joint: &flyrig_body::Joint| StreamJoint {
+        parent: joint.parent.map(|parent| parent as u16),
+        translation: joint.rest_translation.as_vec3().to_array(),
+        joint_from_canonical: [0, 1, 2].map(|row| joint.joint_from_canonical.row(row).as_vec4().to_array()),
+    };
+    skeleton.joints().iter().map(joint).collect()
+}
+
 /// Encodes a person's template: `surface` as it is skinned, and the graph that deforms it, if one does.
 pub(crate) fn encode_template(
     surface: &SurfaceGaussians,
     graph: Option<&DeformationGraph>,
     skeleton: &Skeleton,
 ) -> Result<EncodedTemplate, StreamError> {
-    let joint = |joint: &flyrig_body::Joint| StreamJoint {
-        parent: joint.parent.map(|parent| parent as u16),
-        translation: joint.rest_translation.as_vec3().to_array(),
-        joint_from_canonical: [0, 1, 2].map(|row| joint.joint_from_canonical.row(row).as_vec4().to_array()),
-    };
-    let joints: Vec<StreamJoint> = skeleton.joints().iter().map(joint).collect();
+    let joints = stream_joints(skeleton);
     let center_scale: Vec<[f32; 4]> =
         surface.positions.iter().zip(&surface.scale_m).map(|(p, scale)| p.extend(*scale).to_array()).collect();
     let normals: Vec<[f32; 3]> = surface.normals.iter().map(glam::Vec3::to_array).collect();
@@ -64,6 +70,7 @@ pub(crate) fn motion(pose: &Pose, translations: &[DVec3]) -> Motion {
 pub struct PersonFrame {
     template: Arc<EncodedTemplate>,
     motion: Motion,
+    /// None of an avatar.
     colors: Vec<[f32; 4]>,
 }
 
@@ -79,8 +86,17 @@ impl Subject {
         let mut motion = motion(pose, self.node_translations());
         motion.stamp.person = self.id().0;
         (motion.stamp.frame, motion.stamp.capture_nanos) = (frame, capture_nanos);
-        Ok(Some(PersonFrame { template: self.stream_template(), motion, colors: self.gaussians().color.read(gpu)? }))
+        let template = self.stream_template();
+        if template.template.avatar_colors().is_some() {
+            return Ok(Some(avatar_frame(template, &motion)));
+        }
+        Ok(Some(PersonFrame { template, motion, colors: self.gaussians().color.read(gpu)? }))
     }
+}
+
+/// A person who is driven by a pose alone: the avatar has its colours.
+fn avatar_frame(template: Arc<EncodedTemplate>, motion: &Motion) -> PersonFrame {
+    PersonFrame { template, motion: Motion { nodes: Vec::new(), ..motion.clone() }, colors: Vec::new() }
 }
 
 /// One person's encoders.
@@ -135,7 +151,11 @@ impl PersonEncoder {
         Ok((self.stamp(frame), self.motion.encode(&frame.motion)?))
     }
 
+    /// Empty messages for an avatar.
     fn encode_colors(&mut self, frame: &PersonFrame) -> [Vec<u8>; LAYERS] {
+        if frame.colors.is_empty() {
+            return Default::default();
+        }
         let stamp = self.stamp(frame);
         let (settings, epoch) = (self.settings, self.epoch);
         let encoder = self.colors.get_or_insert_with(|| ColorEncoder::new(&frame.template, settings, epoch));
@@ -144,6 +164,12 @@ impl PersonEncoder {
 }
 
 impl PersonFrame {
+    /// The same pose for viewers who draw an avatar of the same joints.
+    #[must_use]
+    pub fn of_avatar(&self, avatar: &Arc<EncodedTemplate>) -> Self {
+        avatar_frame(Arc::clone(avatar), &self.motion)
+    }
+
     /// The person's template.
     #[must_use]
     pub fn template(&self) -> &EncodedTemplate {
@@ -217,7 +243,8 @@ fn publish(publisher: &Publisher, encoders: &mut BTreeMap<u32, PersonEncoder>, f
         Ok((stamp, motion)) => {
             // Before the colours, which take longer to encode.
             publisher.publish_person(&stamp, None, motion.into());
-            for (layer, bytes) in encoder.encode_colors(frame).into_iter().enumerate() {
+            let colors = encoder.encode_colors(frame).into_iter().enumerate();
+            for (layer, bytes) in colors.filter(|(_, bytes)| !bytes.is_empty()) {
                 publisher.publish_person(&stamp, Some(layer), bytes.into());
             }
         }

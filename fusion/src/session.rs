@@ -375,7 +375,7 @@ impl Session {
             subject.watch.away(set.master_nanos);
         } else {
             match subject.watch.arrive(set.master_nanos, pose) {
-                Remedy::Forget => subject.forget(),
+                Remedy::Forget => subject.forget(&self.gpu)?,
                 Remedy::Restart => subject.restart(),
                 Remedy::None => {}
             }

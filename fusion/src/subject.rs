@@ -122,6 +122,8 @@ pub struct Subject {
     judged: Vec<Option<(f64, bool)>>,
     /// Updates since the person was met.
     updates: u32,
+    /// Shape and colours that the person starts with, where they are known before the first image.
+    start: Option<Arc<PersonMemory>>,
     /// Times of the last poses that were used, for what lies between and beyond them.
     pub(crate) curve: PoseCurve,
     pub(crate) watch: TrackWatch,
@@ -130,6 +132,14 @@ pub struct Subject {
     pub(crate) confidence: f64,
     /// Slots of the views that the last update took in.
     pub(crate) viewed: Vec<usize>,
+}
+
+/// Samples a template's Gaussians as a [`Subject`] does, on the surface.
+///
+/// # Errors
+/// [`BodyError`] for a template that is not valid.
+pub fn person_gaussians(template: &Template, body: &BodySettings) -> Result<SurfaceGaussians, BodyError> {
+    sample_surface(template, body.gaussians, SURFACE_SEED)
 }
 
 /// Samples a template's Gaussians as a [`Subject`] does, and the graph that deforms them. Where it is deformed, they are drawn
@@ -141,7 +151,7 @@ pub fn person_surface(
     template: &Template,
     body: &BodySettings,
 ) -> Result<(SurfaceGaussians, DeformationGraph), BodyError> {
-    let surface = sample_surface(template, body.gaussians, SURFACE_SEED)?;
+    let surface = person_gaussians(template, body)?;
     let graph = build_graph(template, &surface, body.nodes, DEFAULT_SIGMA2_M2)?;
     Ok((surface, graph))
 }
@@ -209,6 +219,7 @@ impl Subject {
             posed: Vec::new(),
             judged: Vec::new(),
             updates: 0,
+            start: None,
             visibility: Vec::new(),
             inputs: Vec::new(),
             curve: PoseCurve::default(),
@@ -557,8 +568,8 @@ impl Subject {
         Ok(())
     }
 
-    /// Forgets clothes and colours: another person may come.
-    pub(crate) fn forget(&mut self) {
+    /// Forgets clothes and colours: another person may come. Returns to those known before the first image, where there are any.
+    pub(crate) fn forget(&mut self, gpu: &GpuContext) -> Result<(), FusionError> {
         self.updates = 0;
         if let Some(deformation) = &mut self.deformation {
             deformation.reset();
@@ -568,6 +579,10 @@ impl Subject {
             Some(Networks::Processor(learned)) => learned.reset(),
             Some(Networks::Adapter(learned)) => learned.reset(),
             None => {}
+        }
+        match self.start.clone() {
+            Some(start) => self.show(gpu, &start),
+            None => Ok(()),
         }
     }
 
@@ -600,13 +615,9 @@ impl Subject {
                 ),
             });
         }
-        if let Some(deformation) = self.deformation.as_mut().filter(|_| !memory.translations.is_empty()) {
-            deformation.resume(gpu, &memory.translations)?;
-        }
-        self.appearance.resume(gpu, &memory.memory)?;
-        self.gaussians.color.write(gpu, &memory.colors);
-        if let Some(direct) = &self.direct_colors {
-            direct.write(gpu, &memory.colors);
+        self.show(gpu, memory)?;
+        if memory.is_start {
+            self.start_from(Arc::new(memory.clone()));
         }
         if let (Some(Networks::Processor(learned)), Some(of)) = (&mut self.networks, &memory.networks)
             && learned.digest() == of.digest
@@ -617,12 +628,43 @@ impl Subject {
         Ok(())
     }
 
+    /// Keeps what is known before the first image.
+    fn start_from(&mut self, start: Arc<PersonMemory>) {
+        if let Some(avatar) = &start.stream {
+            if avatar.template.joints().len() == self.template.skeleton.joints().len() {
+                self.stream_template = Arc::clone(avatar);
+            } else {
+                tracing::warn!("person {} has other joints than the avatar: viewers get surface and colours", self.id);
+            }
+        }
+        self.start = Some(start);
+    }
+
+    /// Takes deformation and colours from a memory of as many Gaussians.
+    fn show(&mut self, gpu: &GpuContext, memory: &PersonMemory) -> Result<(), FusionError> {
+        if let Some(deformation) = &mut self.deformation {
+            // A memory without deformation is of a body at rest.
+            let rest = vec![glam::DVec3::ZERO; deformation.translations().len()];
+            let known = if memory.translations.is_empty() { &rest } else { &memory.translations };
+            deformation.resume(gpu, known)?;
+        }
+        self.appearance.resume(gpu, &memory.memory)?;
+        self.gaussians.color.write(gpu, &memory.colors);
+        if let Some(direct) = &self.direct_colors {
+            direct.write(gpu, &memory.colors);
+        }
+        Ok(())
+    }
+
     /// Takes over what belongs to no device: poses, tracking quality, and the memory of networks on the processor. For the same person on another device.
     pub(crate) fn take_over(&mut self, old: &Self) {
         let resumed = self.watch.is_resumed();
         self.curve.clone_from(&old.curve);
         self.last_pose.clone_from(&old.last_pose);
         self.viewed.clone_from(&old.viewed);
+        if let Some(start) = &old.start {
+            self.start_from(Arc::clone(start));
+        }
         (self.confidence, self.shape_held, self.shape) = (old.confidence, old.shape_held, old.shape);
         if resumed {
             self.watch.clone_from(&old.watch);

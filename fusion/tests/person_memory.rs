@@ -5,7 +5,7 @@ mod support;
 
 use flyrig_fusion::{AppearanceMode, PersonId, PersonMemory, Session, SessionBuilder, TrackState};
 
-use support::{frame_set, gpu, images, people, rig, session, settings};
+use support::{frame_set, gpu, images, people, rig, session, settings, template};
 
 const ME: PersonId = PersonId(0);
 
@@ -39,6 +39,44 @@ fn a_session_resumes_a_saved_person_and_refuses_one_that_does_not_fit() {
 
     let refused = resume(2000).err().unwrap().to_string();
     assert!(refused.contains("3000 Gaussians") && refused.contains("body.gaussians"), "{refused}");
+}
+
+#[test]
+fn colors_known_beforehand_stay_where_nobody_looks_yield_to_images_and_return_after_an_absence() {
+    // Blue all around; the only camera that delivers stands in front and sees green.
+    let known = PersonMemory::of_colors(&template(), &vec![[0.02, 0.04, 0.6]; 3000]);
+    let builder = SessionBuilder::new(gpu(), rig()).settings(settings(3000));
+    let mut session = builder.perception(people(&rig(), &[(0, 0.0)]).dressed()).person(ME, known).build().unwrap();
+    let images = images(&[(0.0, [30, 160, 60])]);
+    let front = |index: u64| {
+        let mut set = frame_set(index, &images);
+        set.frames[1..].fill(None);
+        set
+    };
+    let count = |session: &Session, is: fn(&[f32; 3]) -> bool| colors(session).iter().filter(|color| is(color)).count();
+    let (blue, green) = (|c: &[f32; 3]| c[2] > 3.0 * c[1], |c: &[f32; 3]| c[1] > c[2]);
+    assert_eq!(count(&session, blue), 3000, "before any image");
+    for index in 0..10 {
+        session.process(&front(index)).unwrap();
+    }
+    let (unseen, seen) = (count(&session, blue), count(&session, green));
+    assert!(unseen > 1000 && seen > 500, "{unseen} blue, {seen} green");
+    // Nobody is there for two seconds, and whoever comes back starts from blue again.
+    let mut nobody = images.clone();
+    nobody.iter_mut().for_each(|(_, mask)| mask.fill(0));
+    session.process(&frame_set(10, &nobody)).unwrap();
+    let mut back = frame_set(71, &images);
+    back.frames[..3].fill(None);
+    session.process(&back).unwrap();
+    let (before, [unseen, seen]) = (unseen, [count(&session, blue), count(&session, green)]);
+    assert!(unseen > 1000 && seen > 100, "{unseen} blue ({before} before), {seen} green");
+    assert_eq!(session.subjects()[0].watch().state(), TrackState::First);
+
+    let poisoned = PersonMemory::of_colors(&template(), &vec![[f32::NAN, f32::INFINITY, 0.5]; 3000]);
+    let builder = SessionBuilder::new(gpu(), rig()).settings(settings(3000));
+    let mut session = builder.perception(people(&rig(), &[(0, 0.0)]).dressed()).person(ME, poisoned).build().unwrap();
+    session.process(&front(0)).unwrap();
+    assert!(colors(&session).iter().flatten().all(|value| value.is_finite()));
 }
 
 #[test]

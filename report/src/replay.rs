@@ -7,11 +7,11 @@ use std::{
 };
 
 use anyhow::{Context, Result, bail};
-use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
+use flyrig_body::{Outfit, ShapeParams, Template, default_template, load_gltf};
 use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay, to_rgb8};
 use flyrig_fusion::{
-    EstimatedPerception, GivenPerception, GivenPerson, Origin, PerceptionSettings, PersonId, SHAPE_SECS, SHAPE_SETS,
-    Session, SessionBuilder, SessionSettings, SetReader, next_frame,
+    EstimatedPerception, GivenPerception, GivenPerson, Origin, PerceptionSettings, PersonId, PersonMemory, SHAPE_SECS,
+    SHAPE_SETS, Session, SessionBuilder, SessionSettings, SetReader, next_frame,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::ColorMatcher;
@@ -42,8 +42,23 @@ pub struct ReplaySettings {
     /// Parts of the names of joints whose estimated orientation is replaced by the true one; "place" for the root's position. Needs an
     /// estimated pose and the given shape.
     pub true_joints: Vec<String>,
-    /// The person's body where it is known, dressed: an estimated pose then moves it, and no shape is learnt.
-    pub body: Option<Template>,
+    /// The person's body where it is known: given and estimated poses then move it, and neither shape nor clothes are looked for.
+    pub body: Option<KnownBody>,
+}
+
+/// A person who is known before the first image.
+#[derive(Debug, Clone)]
+pub struct KnownBody {
+    /// The body, dressed.
+    pub template: Template,
+    /// Colours to start with; None: those of the images.
+    pub memory: Option<PersonMemory>,
+}
+
+impl From<Template> for KnownBody {
+    fn from(template: Template) -> Self {
+        Self { template, memory: None }
+    }
 }
 
 /// A data set that is replayed into a session.
@@ -75,18 +90,30 @@ impl Replay {
         let perceived = &settings.session.perception;
         let plates = dataset::plates(&dataset::plate_folder(&settings.dataset, perceived), &rig)?;
         dataset::require_masks(perceived, &plates)?;
-        let builder = SessionBuilder::new(gpu.clone(), rig.clone()).settings(settings.session.clone());
+        let mut builder = SessionBuilder::new(gpu.clone(), rig.clone()).settings(settings.session.clone());
+        if let Some(memory) = settings.body.as_ref().and_then(|body| body.memory.clone()) {
+            builder = builder.person(PersonId::default(), memory);
+        }
         let session = match perceived.pose {
             Origin::Given => {
-                let person = given_person(&settings.dataset)?;
-                let mut perception = GivenPerception::new(&rig, vec![person]).with_masks(perceived, &plates)?;
-                perception.find_outfits(&first_sets(settings, &rig)?)?;
-                builder.perception(perception)
+                let mut person = given_person(&settings.dataset)?;
+                if let Some(KnownBody { template, .. }) = &settings.body {
+                    template.check_same_joints(&person.template)?;
+                    person.template = template.clone();
+                    let perception = GivenPerception::new(&rig, vec![person]).with_masks(perceived, &plates)?;
+                    builder.perception(perception.dressed())
+                } else {
+                    let mut perception = GivenPerception::new(&rig, vec![person]).with_masks(perceived, &plates)?;
+                    perception.find_outfits(&first_sets(settings, &rig)?)?;
+                    builder.perception(perception)
+                }
             }
             Origin::Estimated => {
-                if let Some(body) = &settings.body {
+                if let Some(KnownBody { template, .. }) = &settings.body {
                     let perceived = PerceptionSettings { shape: Some(Origin::Given), ..perceived.clone() };
-                    builder.perception(EstimatedPerception::new(&rig, body, &perceived, &plates)?)
+                    let mut perception = EstimatedPerception::new(&rig, template, &perceived, &plates)?;
+                    perception.know_shape(template, Outfit::default())?;
+                    builder.perception(perception)
                 } else if perceived.shape() == Origin::Given {
                     let GivenPerson { template, track, .. } = given_person(&settings.dataset)?;
                     let mut inner = EstimatedPerception::new(&rig, &template, perceived, &plates)?;

@@ -1,7 +1,13 @@
 //! Avatars are built from a take, scored, driven by a motion, exported; what cannot be is named.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
+mod support;
+
+use flyrig_gpu::{AdapterChoice, GpuContext};
+use flyrig_stream::{Posed, PosedAxes};
 use flyrig_tests::{run, write_dataset};
+use flyrig_transport::TransportConfig;
+use flyrig_viewer::{Receiver, Scene, ShownPerson, clock_secs};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 const GIVEN: [&str; 4] = ["--pose", "given", "--masks", "given"];
@@ -134,4 +140,103 @@ fn a_build_that_was_killed_goes_on() {
     assert!(printed.contains("going on after 500 of 700 steps"), "{printed}");
     assert!(whole == resumed, "it ended with other bytes");
     assert!(!state.exists());
+}
+
+#[test]
+fn the_live_rig_starts_from_an_avatar() {
+    let data = write_dataset().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let take = data.root.to_string_lossy().into_owned();
+    let flyrig = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    let args = ["avatar", "build", &take, "--inputs", "00,02,04,05", "--frames", "0..4", "--out", "a.flyavatar"];
+    let built = flyrig(&[&args[..], &["--gaussians", "4000", "--nodes", "100", "--steps", "60"], &GIVEN].concat());
+    assert_eq!(built.code, Some(0), "{built:?}");
+
+    // One camera sees the person; another one that nobody looked through is scored, in the first frame after the avatar's take.
+    let eval = |more: &[&str]| {
+        let args = ["eval", &take, "--inputs", "00", "--holdout", "03", "--frames", "4..5", "--out", "e"];
+        flyrig(&[&args[..], &["--gaussians", "6000", "--nodes", "200"], &GIVEN, more].concat())
+    };
+    let score = |more: &[&str]| {
+        let scored = eval(more);
+        assert_eq!(scored.code, Some(0), "{scored:?}");
+        let metrics = std::fs::read(folder.path().join("e/metrics.json")).unwrap();
+        let metrics: serde_json::Value = serde_json::from_slice(&metrics).unwrap();
+        assert_eq!(metrics["avatar"].is_string(), !more.is_empty());
+        metrics["per_frame"][0]["psnr_db"].as_f64().unwrap()
+    };
+    let (without, with) = (score(&[]), score(&["--avatar", "a.flyavatar"]));
+    assert!(with > without + 1.0, "{with} dB with the avatar, {without} without");
+
+    // A rig that runs, with the body and the poses of the take.
+    let endpoint = support::small_rig("avatars", folder.path(), "");
+    let simulated = std::fs::read_to_string(folder.path().join("rig.toml")).unwrap();
+    let simulated = simulated.replace("texture_px = 128\n", "texture_px = 128\nframes = 3\n");
+    let simulated = simulated.replace("[source]\n", "[source]\nreal_time = false\n");
+    let config = simulated.replace("[source]\n", &format!("[source]\nkind = \"folder\"\npath = {take:?}\n"));
+    let config = config.replace("[body]\n", &format!("[body]\ntemplate = {:?}\n", format!("{take}/subject.glb")));
+    let with = |keys: &str| {
+        let text = config.replace("nodes = 100\n", &format!("nodes = 100\n{keys}\n"));
+        std::fs::write(folder.path().join("rig.toml"), text).unwrap();
+        flyrig(&["run", "rig.toml"])
+    };
+    let ran = with("avatar = \"a.flyavatar\"");
+    assert_eq!(ran.code, Some(0), "{}", ran.stderr);
+    assert!(ran.stderr.contains("the person starts from the avatar a.flyavatar"), "{}", ran.stderr);
+
+    // Viewers who draw the avatar themselves: it comes once, then poses alone.
+    let text = config.replace("nodes = 100\n", "nodes = 100\navatar = \"a.flyavatar\"\n");
+    let text = text.replace("real_time = false\n", "fps = 0.5\n").replace("[output]\n", "[output]\navatar = true\n");
+    std::fs::write(folder.path().join("rig.toml"), text).unwrap();
+    let _rig = support::Process::start(PROGRAM, &["run", "rig.toml"], folder.path(), "avatars");
+    let viewer = TransportConfig { connect: vec![endpoint], ..TransportConfig::subscriber("avatars") };
+    let receiver = Receiver::start(&viewer, || {}).unwrap();
+    support::wait_until("an avatar that moves", || {
+        let state = receiver.state();
+        let person = state.people.get(0);
+        person.is_some_and(|person| person.is_complete() && person.motion_at(clock_secs(), false).is_some())
+    });
+    std::thread::sleep(std::time::Duration::from_secs(2));
+    {
+        let mut state = receiver.state();
+        let mut camera = state.rig.clone().unwrap().cameras[0].clone();
+        camera.intrinsics.lens = flyrig_types::Lens::PINHOLE;
+        let person = state.people.get_mut(0).unwrap();
+        assert_eq!(person.color_changes(), 0, "colours are sent beside the avatar");
+        let motion = person.motion_at(clock_secs(), false).unwrap();
+        assert!(motion.nodes.is_empty());
+        let (mut posed, mut axes) = (Posed::default(), PosedAxes::default());
+        let colors = person.pose(&motion, &mut posed);
+        assert!(person.pose_axes(&motion, &mut axes) && axes.rotation.len() == 4000);
+        let gpu = GpuContext::new(&AdapterChoice::Best).unwrap().fastest();
+        let mut scene = Scene::new(&gpu).unwrap();
+        scene.set_people([ShownPerson { posed: &posed, colors: &colors, axes: Some(&axes) }]).unwrap();
+        let view = scene.draw(&camera).unwrap();
+        let shown = view.rgba.chunks_exact(4).filter(|pixel| pixel[3] > 200).count();
+        assert!(shown > 300, "{shown} pixels show somebody");
+    }
+    drop(receiver);
+
+    // What cannot be: one line with the fix.
+    let refused = |finished: flyrig_tests::Finished, expected: &[&str]| {
+        assert_eq!(finished.code, Some(1), "{finished:?}");
+        let line = finished.stderr.lines().find(|line| line.starts_with("error:")).unwrap_or_default();
+        assert!(expected.iter().all(|part| line.contains(part)), "{}", finished.stderr);
+    };
+    let bytes = std::fs::read(folder.path().join("a.flyavatar")).unwrap();
+    std::fs::write(folder.path().join("cut.flyavatar"), &bytes[..bytes.len() / 2]).unwrap();
+    let newer = bytes.windows(13).position(|part| part == b"\\\"version\\\":2").unwrap();
+    let mut other = bytes.clone();
+    other[newer + 12] = b'9';
+    std::fs::write(folder.path().join("newer.flyavatar"), other).unwrap();
+    refused(with("avatar = \"none.flyavatar\""), &["body.avatar: none.flyavatar: ", "flyrig avatar build"]);
+    refused(with("avatar = \"cut.flyavatar\""), &["body.avatar: cut.flyavatar: ", "flyrig avatar build"]);
+    refused(with("avatar = \"newer.flyavatar\""), &["newer.flyavatar: has version 9", "update flyrig"]);
+    let both = "avatar = \"a.flyavatar\"\nperson = \"me.person\"";
+    refused(with(both), &["body.avatar (a.flyavatar) and body.person (me.person)", "leave one of them empty"]);
+    refused(eval(&["--avatar", "none.flyavatar"]), &["body.avatar: none.flyavatar: "]);
+    // The simulator's own person has its joints in another order than an exported one.
+    let text = simulated.replace("nodes = 100\n", "nodes = 100\navatar = \"a.flyavatar\"\n");
+    std::fs::write(folder.path().join("rig.toml"), text).unwrap();
+    refused(flyrig(&["run", "rig.toml"]), &["body.avatar: ", "among its joints", "use the same body for both"]);
 }

@@ -4,7 +4,7 @@ use std::{sync::Arc, time::Duration};
 
 use anyhow::{Context, Result};
 use flyrig_fusion::{PersonEncoder, PersonMessages};
-use flyrig_stream::{ColorSettings, Posed};
+use flyrig_stream::{ColorSettings, EncodedTemplate, Posed, PosedAxes};
 use flyrig_transport::SplatState;
 use flyrig_viewing::StreamPerson;
 
@@ -17,6 +17,8 @@ const ZSTD_LEVEL: i32 = 3;
 pub struct Coded {
     /// Centres, standard deviations and normals.
     pub posed: Posed,
+    /// Axes of an avatar.
+    pub axes: Option<PosedAxes>,
     /// Linear colours and opacities.
     pub colors: Arc<Vec<[f32; 4]>>,
     /// All bytes of the frame, those of the motion alone, and those sent once.
@@ -83,6 +85,7 @@ impl Form for Stream {
         let pose_ms = start.millis();
         Ok(Coded {
             posed,
+            axes: None,
             colors: known,
             bytes: motion.len() + colors.iter().map(Vec::len).sum::<usize>(),
             motion_bytes: motion.len(),
@@ -90,6 +93,55 @@ impl Form for Stream {
             encode_ms,
             decode_ms: (all_ms - pose_ms).max(0.0),
             pose_ms,
+        })
+    }
+}
+
+/// The person's avatar once, then poses alone.
+pub struct AvatarPoses {
+    avatar: Arc<EncodedTemplate>,
+    person: StreamPerson,
+    encoder: Option<PersonEncoder>,
+    /// Whether it is drawn by isotropic Gaussians, as in a browser.
+    is_round: bool,
+}
+
+impl AvatarPoses {
+    pub fn new(avatar: &Arc<EncodedTemplate>, is_round: bool) -> Self {
+        let person = StreamPerson::new(Arc::new(avatar.template.clone()));
+        Self { avatar: Arc::clone(avatar), person, encoder: None, is_round }
+    }
+}
+
+impl Form for AvatarPoses {
+    fn name(&self) -> String {
+        if self.is_round { "avatar, poses, isotropic" } else { "avatar, poses" }.to_owned()
+    }
+
+    fn code(&mut self, _at: usize, kept: &Kept) -> Result<Coded> {
+        let start = Start::now();
+        let frame = kept.frame.of_avatar(&self.avatar);
+        let encoder = self.encoder.get_or_insert_with(|| PersonEncoder::new(&frame, ColorSettings::default(), 1));
+        let motion = encoder.encode(&frame)?.motion;
+        let encode_ms = start.millis();
+        let start = Start::now();
+        self.person.take_motion(&motion, 0.0)?;
+        let received = self.person.motion_at(0.0, false).context("no motion was received")?;
+        let decode_ms = start.millis();
+        let start = Start::now();
+        let (mut posed, mut axes) = (Posed::default(), PosedAxes::default());
+        let colors = self.person.pose(&received, &mut posed);
+        let has_axes = !self.is_round && self.person.pose_axes(&received, &mut axes);
+        Ok(Coded {
+            posed,
+            axes: has_axes.then_some(axes),
+            colors,
+            bytes: motion.len(),
+            motion_bytes: motion.len(),
+            template_bytes: self.avatar.bytes.len(),
+            encode_ms,
+            decode_ms,
+            pose_ms: start.millis(),
         })
     }
 }
@@ -134,7 +186,17 @@ impl Form for Spz {
 /// A frame that holds everything.
 fn whole(posed: Posed, colors: Vec<[f32; 4]>, bytes: usize, [encode_ms, decode_ms]: [f64; 2]) -> Coded {
     let (motion_bytes, template_bytes, pose_ms) = (0, 0, 0.0);
-    Coded { posed, colors: Arc::new(colors), bytes, motion_bytes, template_bytes, encode_ms, decode_ms, pose_ms }
+    Coded {
+        posed,
+        axes: None,
+        colors: Arc::new(colors),
+        bytes,
+        motion_bytes,
+        template_bytes,
+        encode_ms,
+        decode_ms,
+        pose_ms,
+    }
 }
 
 /// Processor time of the thread: other programs do not count.

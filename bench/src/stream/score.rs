@@ -3,7 +3,7 @@
 use anyhow::Result;
 use flyrig_metrics::{CameraScore, Picture, ScoreSheet, person_box, psnr, score_view};
 use flyrig_types::{Mask, RenderedView};
-use flyrig_viewer::Scene;
+use flyrig_viewer::{Scene, ShownPerson};
 
 use super::{
     forms::Coded,
@@ -43,7 +43,7 @@ impl Tally {
         for (sum, time) in self.times.iter_mut().zip([coded.encode_ms, coded.decode_ms, coded.pose_ms]) {
             *sum += time;
         }
-        scene.set_people([(&coded.posed, coded.colors.as_slice())])?;
+        scene.set_people([ShownPerson { posed: &coded.posed, colors: &coded.colors, axes: coded.axes.as_ref() }])?;
         for (at, (camera, wanted)) in take.cameras.iter().zip(&kept.views).enumerate() {
             let view = scene.draw(camera)?;
             self.compare(at, &view, &wanted.uncoded)?;

@@ -1,13 +1,17 @@
 //! People to code: what a session gives of a data set, kept so that every form codes the same.
 
-use std::path::{Path, PathBuf};
+use std::{
+    path::{Path, PathBuf},
+    sync::Arc,
+};
 
 use anyhow::{Context, Result, ensure};
 use flyrig_fusion::{BudgetSettings, Origin, Outcome, PersonFrame, PersonId, Session};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
-use flyrig_report::{Replay, frame_number, progress_bar, stop};
+use flyrig_report::{Replay, frame_number, known_body, progress_bar, stop};
 use flyrig_sim::{ExportOptions, MotionConfig, MotionKind, SimConfig, Simulator, export};
+use flyrig_stream::EncodedTemplate;
 use flyrig_transport::SplatState;
 use flyrig_types::{Camera, Image, Mask, RenderedView};
 use serde::{Deserialize as _, de::IntoDeserializer as _};
@@ -93,6 +97,8 @@ pub struct Take {
     pub kept: Vec<Kept>,
     /// Scores of the uncoded person.
     pub uncoded: ScoreSheet,
+    /// The person's avatar as it is sent.
+    pub avatar: Option<Arc<EncodedTemplate>>,
 }
 
 /// One frame.
@@ -129,10 +135,21 @@ impl Take {
         pose: Origin,
         gaussians: usize,
     ) -> Result<Self> {
-        let settings = args.replay.settings(folder, pose, gaussians, BudgetSettings::default());
+        let mut settings = args.replay.settings(folder, pose, gaussians, BudgetSettings::default());
+        settings.session.body.avatar = args.avatar.clone().unwrap_or_default();
+        settings.body = known_body(&settings.session.body, true)?;
+        // The other forms send the surface that is tracked.
+        let stream = settings.body.as_mut().and_then(|body| body.memory.as_mut()?.take_stream());
         let mut replay = Replay::open(&settings, gpu)?;
         let cameras = replay.holdout.clone();
-        let mut take = Self { name: name.clone(), pose, cameras, kept: Vec::new(), uncoded: ScoreSheet::default() };
+        let mut take = Self {
+            name: name.clone(),
+            pose,
+            cameras,
+            kept: Vec::new(),
+            uncoded: ScoreSheet::default(),
+            avatar: stream,
+        };
         let bar = progress_bar(replay.count as u64, "replay");
         bar.set_message(name.clone());
         while let Some(set) = replay.next_set()? {

@@ -1,10 +1,8 @@
 //! From the nodes to all Gaussians, and to the template's vertices.
 
-use flyrig_body::{DeformationGraph, SurfaceGaussians, Template, displacement};
+use flyrig_body::{DeformationGraph, SurfaceGaussians, Template, VertexMeans, displacement};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
-
-use super::vertex_means::VertexMeans;
 
 /// Eq. 2 for every Gaussian, whether the solver looks at it or not.
 #[derive(Debug)]
@@ -23,7 +21,10 @@ impl MeshMotion {
             nodes: graph.gaussian_nodes.clone(),
             weights: graph.gaussian_weights.clone(),
             displacement: vec![[0.0; 4]; surface.len()],
-            vertices: VertexMeans::new(template, surface),
+            vertices: VertexMeans::new(
+                template,
+                surface.triangle.iter().copied().zip(surface.barycentric.iter().copied()),
+            ),
         }
     }
 

@@ -207,14 +207,14 @@ impl EstimatedPerception {
         })
     }
 
-    /// Starts with the shape and outfit of the first person, as an earlier session has learnt them. Where shapes are estimated, whoever comes
-    /// is compared with it.
+    /// Starts with the shape and outfit of the first person, as an earlier session or an avatar has them. Where shapes are estimated, whoever
+    /// comes is compared with it.
     ///
     /// # Errors
     /// [`FusionError::Track`] when the template cannot be used.
     pub fn know_shape(&mut self, template: &Template, outfit: Outfit) -> Result<(), FusionError> {
         if let Some(place) = self.places.first_mut() {
-            place.outfit = outfit;
+            (place.outfit, place.outfit_search) = (outfit, None);
             place.estimator.set_template(template)?;
             place.know()?;
             // Whoever comes first may be somebody else.

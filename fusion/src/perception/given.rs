@@ -65,6 +65,12 @@ impl GivenPerception {
         Self::new(rig, vec![GivenPerson { person: PersonId::default(), template, track, repeat: true }])
     }
 
+    /// The people's templates are dressed already: clothes are not looked for.
+    #[must_use]
+    pub fn dressed(self) -> Self {
+        Self { outfits: vec![OutfitSearch::over(); self.people.len()], ..self }
+    }
+
     /// Makes masks from the difference to images of the empty scene, one slot a camera, or to the settings' key colour, where
     /// the settings estimate masks.
     ///

@@ -20,6 +20,11 @@ pub(crate) struct OutfitSearch {
 }
 
 impl OutfitSearch {
+    /// Returns a search that is over, for a template that wears its clothes already.
+    pub fn over() -> Self {
+        Self { is_over: true, ..Self::default() }
+    }
+
     /// Returns the clothes that were found.
     pub fn outfit(&self) -> Outfit {
         self.outfit

@@ -28,6 +28,9 @@ pub struct BodySettings {
     /// File of what was learnt about the person; empty: none.
     #[arg(skip)]
     pub person: PathBuf,
+    /// File of the first person's avatar: tracking and colours start from it; empty: none.
+    #[arg(skip)]
+    pub avatar: PathBuf,
 }
 
 impl Default for BodySettings {
@@ -37,6 +40,7 @@ impl Default for BodySettings {
             gaussians: DEFAULT_GAUSSIAN_COUNT,
             nodes: DEFAULT_NODE_COUNT,
             person: PathBuf::new(),
+            avatar: PathBuf::new(),
         }
     }
 }
@@ -54,6 +58,12 @@ impl BodySettings {
         Some(self.person.as_path()).filter(|path| !path.as_os_str().is_empty())
     }
 
+    /// The file of the first person's avatar, where one is named.
+    #[must_use]
+    pub fn avatar_file(&self) -> Option<&Path> {
+        Some(self.avatar.as_path()).filter(|path| !path.as_os_str().is_empty())
+    }
+
     /// Checks every value.
     ///
     /// # Errors
@@ -65,6 +75,13 @@ impl BodySettings {
             return Err(FusionError::Setting(format!(
                 "body.nodes is {}, more than body.gaussians ({}): nodes are chosen among the Gaussians",
                 self.nodes, self.gaussians
+            )));
+        }
+        if let (Some(avatar), Some(person)) = (self.avatar_file(), self.person_file()) {
+            return Err(FusionError::Setting(format!(
+                "body.avatar ({}) and body.person ({}) both say what the person looks like; leave one of them empty",
+                avatar.display(),
+                person.display()
             )));
         }
         Ok(())
