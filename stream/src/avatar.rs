@@ -155,8 +155,8 @@ impl StreamTemplate {
         posed.rotation.clear();
         posed.rotation.extend(self.skin.iter().zip(&avatar.rotation).map(|(skin, own)| {
             let mut sum = [0.0f32; 4];
-            for (joint, share) in skin.index.into_iter().zip(skin.shares()).filter(|(_, share)| *share > 0.0) {
-                let turn = turns.get(joint as usize).copied().unwrap_or(IDENTITY);
+            for (joint, share) in skin.shares() {
+                let turn = turns.get(joint).copied().unwrap_or(IDENTITY);
                 // A quaternion and its negative are the same turn.
                 let along: f32 = sum.iter().zip(turn).map(|(a, b)| a * b).sum();
                 let share = if along < 0.0 { -share } else { share };
