@@ -87,7 +87,7 @@ impl Subject {
         motion.stamp.person = self.id().0;
         (motion.stamp.frame, motion.stamp.capture_nanos) = (frame, capture_nanos);
         let template = self.stream_template();
-        if template.template.avatar_colors().is_some() {
+        if template.template.is_avatar() {
             return Ok(Some(avatar_frame(template, &motion)));
         }
         Ok(Some(PersonFrame { template, motion, colors: self.gaussians().color.read(gpu)? }))

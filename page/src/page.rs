@@ -139,13 +139,15 @@ impl Page {
                 && shown.len() == self.shown.len()
                 && shown.iter().zip(&self.shown).all(|(a, b)| part(a) == part(b))
         };
-        let (moved, recolored) = (!same(|key| (key.0, key.1)), !same(|key| (key.0, key.2)));
+        let (moved, mut recolored) = (!same(|key| (key.0, key.1)), !same(|key| (key.0, key.2)));
         for list in [&mut self.centers, &mut self.normals, &mut self.colors] {
             list.clear();
         }
         for ((number, ..), motion) in &motions {
             let Some(person) = self.people.get_mut(*number) else { continue };
             let colors = person.pose(motion, &mut self.posed);
+            // An avatar's light shows its colours differently in each pose.
+            recolored |= moved && person.template().is_avatar();
             let count = self.posed.center_scale.len().min(colors.len());
             self.centers.extend_from_slice(&self.posed.center_scale[..count]);
             self.normals.extend_from_slice(&self.posed.normal[..count]);

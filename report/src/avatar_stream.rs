@@ -15,15 +15,13 @@ pub fn encode_avatar(avatar: &Avatar) -> Result<EncodedTemplate> {
     let template = &avatar.template;
     let mut rest = PosedAvatar::default();
     avatar.pose(&Bones::at_rest(&template.skeleton), None, &mut rest);
-    // In the mean light of all directions.
-    let [light, ..] = avatar.light.terms;
     let coefficients = avatar.parameters.order().coefficients();
     let constants = avatar.parameters.harmonics.chunks(coefficients);
     let rows = rest.scale_opacity.iter().zip(&rest.rotation).zip(constants);
     let gaussians: Vec<AvatarGaussian> = rows
         .map(|((&[x, y, z, opacity], &rotation), constant)| {
             let color = constant.first().copied().unwrap_or_default();
-            let color = [0, 1, 2].map(|k| (SH_DEGREE_0 * color[k] * light[k]).clamp(0.0, 1.0));
+            let color = [0, 1, 2].map(|k| (SH_DEGREE_0 * color[k]).clamp(0.0, 1.0));
             AvatarGaussian { scale_m: [x, y, z], opacity, rotation, color }
         })
         .collect();
@@ -45,7 +43,9 @@ pub fn encode_avatar(avatar: &Avatar) -> Result<EncodedTemplate> {
         node_weights: &[],
         nodes: &[],
     };
-    AvatarSource { template, gaussians: &gaussians }.encode().context("the avatar cannot be sent to viewers")
+    AvatarSource { template, gaussians: &gaussians, light: avatar.light.terms }
+        .encode()
+        .context("the avatar cannot be sent to viewers")
 }
 
 #[cfg(test)]
@@ -73,6 +73,10 @@ mod tests {
             shape[i % 2] += 0.5;
             avatar.parameters.offset[i] = [0.002 * (i as f32).sin(), 0.0, 0.001, 0.0];
         }
+        // A lamp from the side, and a red one from above.
+        avatar.light.terms[1] = [0.4; 3];
+        avatar.light.terms[8] = [-0.1; 3];
+        avatar.light.terms[2][0] = 0.3;
         avatar.hanging.as_mut().unwrap().mean.iter_mut().for_each(|by| *by = DVec3::Z * 0.03);
         avatar
     }
@@ -103,7 +107,9 @@ mod tests {
         assert!(template.pose_axes(&motion, &mut axes));
 
         let mut ours = Scene::new(&gpu).unwrap();
-        let colors = template.avatar_colors().unwrap();
+        let mut colors = Vec::new();
+        assert!(template.avatar_colors(&posed, &mut colors));
+        let colors = colors.as_slice();
         let shown = ShownPerson { posed: &posed, colors, axes: Some(&axes) };
         let mut theirs = AvatarScene::new(&gpu, &avatar).unwrap();
         theirs.pose(&avatar, &Bones::new(skeleton, &pose), None);

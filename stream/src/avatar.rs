@@ -1,14 +1,14 @@
 //! The template of a person who is driven by poses alone: Gaussians of three scales with their colours, once.
 //!
-//! A message is `FLA`, the codec's version, the length of a template without nodes and that template, then planes of bytes, one element a
-//! Gaussian in the template's order: three of logarithms of scales, four of a rotation, one of the opacity, three of sRGB. The template
+//! A message is `FLA`, the codec's version, the length of a template without nodes and that template, the terms of the light as 27 `f32`, then
+//! planes of bytes, one element a Gaussian in the template's order: three of logarithms of scales, four of a rotation, one of the opacity, three of sRGB. The template
 //! inside holds centres, skin, normals and one round size for viewers that draw isotropic Gaussians. Its hash is that of the whole
 //! message.
 
 use alloc::vec::Vec;
 
 use crate::{
-    CODEC_VERSION, EncodedTemplate, Motion, StreamError, StreamTemplate, TemplateSource,
+    CODEC_VERSION, EncodedTemplate, Motion, Posed, StreamError, StreamTemplate, TemplateSource,
     bytes::Fields,
     srgb::Srgb,
     template::{MAX_TEMPLATE_BYTES, template_hash},
@@ -21,6 +21,10 @@ const LEAST_SCALE_M: f32 = 2e-4;
 const SCALE_RANGE: f32 = 6.214_608;
 /// Planes of bytes.
 const PLANES: usize = 11;
+/// Terms of the light: 1, x, y, z, xy, yz, 3zz - 1, xz, xx - yy of the world's normal.
+pub const LIGHT_TERMS: usize = 9;
+/// By this the light multiplies colours at least and at most.
+const SHADE: core::ops::RangeInclusive<f32> = 0.05..=4.0;
 /// Steps of a component of a rotation, whose range is 1/sqrt(2) to either side.
 const ROTATION_STEPS: f32 = 1023.0;
 
@@ -44,6 +48,8 @@ pub struct AvatarSource<'a> {
     pub template: TemplateSource<'a>,
     /// As many Gaussians.
     pub gaussians: &'a [AvatarGaussian],
+    /// By what colours are multiplied, by the direction that the surface faces in the world: red, green and blue of each term.
+    pub light: [[f32; 3]; LIGHT_TERMS],
 }
 
 /// What a template holds of an avatar, in the template's order.
@@ -53,8 +59,9 @@ pub(crate) struct Avatar {
     scale_opacity: Vec<[f32; 4]>,
     /// Canonical from the Gaussian's axes, a unit quaternion x, y, z, w.
     rotation: Vec<[f32; 4]>,
-    /// Linear RGB; w: opacity.
+    /// Linear RGB without the light; w: opacity.
     colors: Vec<[f32; 4]>,
+    light: [[f32; 3]; LIGHT_TERMS],
 }
 
 /// Shapes of an avatar's Gaussians in the world; both lists have one element a Gaussian.
@@ -79,6 +86,7 @@ impl AvatarSource<'_> {
             g.scale_m.iter().chain(&g.rotation).chain(&g.color).chain([&g.opacity]).all(|v| v.is_finite())
         };
         check(self.gaussians.iter().all(numbers), "a Gaussian is not finite")?;
+        check(self.light.as_flattened().iter().all(|term| term.is_finite()), "its light is not finite")?;
         let inner = self.template.encode()?;
         let srgb = Srgb::new();
         let mut bytes = Vec::new();
@@ -86,6 +94,7 @@ impl AvatarSource<'_> {
         bytes.push(CODEC_VERSION);
         bytes.extend((inner.bytes.len() as u32).to_le_bytes());
         bytes.extend(&inner.bytes);
+        bytes.extend(self.light.as_flattened().iter().flat_map(|term| term.to_le_bytes()));
         let rows: Vec<[u8; PLANES]> = inner
             .gaussian_order
             .iter()
@@ -114,7 +123,14 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<StreamTemplate, StreamError> {
     fields.check(bytes.len() <= MAX_TEMPLATE_BYTES, "it is too large")?;
     let length = fields.u32()? as usize;
     fields.check(length <= fields.bytes.len(), "it is cut short")?;
-    let (inner, planes) = fields.bytes.split_at(length);
+    let (inner, rest) = fields.bytes.split_at(length);
+    fields.check(rest.len() >= LIGHT_BYTES, "it is cut short")?;
+    let (terms, planes) = rest.split_at(LIGHT_BYTES);
+    let mut light = [[0.0; 3]; LIGHT_TERMS];
+    for (term, bytes) in light.as_flattened_mut().iter_mut().zip(terms.as_chunks().0) {
+        *term = f32::from_le_bytes(*bytes);
+    }
+    fields.check(light.as_flattened().iter().all(|term| term.is_finite()), "its light is not finite")?;
     let mut template = StreamTemplate::decode_surface(inner)?;
     fields.check(template.nodes() == 0, "it has nodes")?;
     let count = template.gaussians();
@@ -125,6 +141,7 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<StreamTemplate, StreamError> {
         scale_opacity: Vec::with_capacity(count),
         rotation: Vec::with_capacity(count),
         colors: Vec::with_capacity(count),
+        light,
     };
     for i in 0..count {
         let opacity = f32::from(at(7, i)) / 255.0;
@@ -140,10 +157,22 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<StreamTemplate, StreamError> {
 }
 
 impl StreamTemplate {
-    /// Returns the avatar's colours, linear RGB and opacity of each Gaussian; None for a template whose colours are sent apart.
+    /// Whether the template has the colours: they are not sent apart.
     #[must_use]
-    pub fn avatar_colors(&self) -> Option<&[[f32; 4]]> {
-        self.avatar.as_ref().map(|avatar| avatar.colors.as_slice())
+    pub fn is_avatar(&self) -> bool {
+        self.avatar.is_some()
+    }
+
+    /// Returns the avatar's colours, linear RGB and opacity of each Gaussian, as its light shows them in a pose of [`Self::pose`]. Returns
+    /// false, and changes nothing, for a template whose colours are sent apart.
+    pub fn avatar_colors(&self, posed: &Posed, colors: &mut Vec<[f32; 4]>) -> bool {
+        let Some(avatar) = &self.avatar else { return false };
+        colors.clone_from(&avatar.colors);
+        for (color, normal) in colors.iter_mut().zip(&posed.normal) {
+            let shade = shade(&avatar.light, normal);
+            color.iter_mut().zip(shade).for_each(|(value, shade)| *value *= shade);
+        }
+        true
     }
 
     /// Poses the shapes of an avatar's Gaussians; centres are those of [`Self::pose`]. A rotation is the normalised blend of the joints'
@@ -166,6 +195,19 @@ impl StreamTemplate {
         }));
         true
     }
+}
+
+/// Bytes of the light.
+const LIGHT_BYTES: usize = 4 * 3 * LIGHT_TERMS;
+
+/// By what a surface's colours are multiplied; a normal that is not finite counts as none.
+fn shade(light: &[[f32; 3]; LIGHT_TERMS], &[x, y, z, _]: &[f32; 4]) -> [f32; 3] {
+    let [x, y, z] = if (x + y + z).is_finite() { [x, y, z] } else { [0.0; 3] };
+    let basis = [1.0, x, y, z, x * y, y * z, 3.0 * z * z - 1.0, x * z, x * x - y * y];
+    core::array::from_fn(|k| {
+        let sum: f32 = light.iter().zip(basis).map(|(term, value)| term[k] * value).sum();
+        sum.clamp(*SHADE.start(), *SHADE.end())
+    })
 }
 
 const IDENTITY: [f32; 4] = [0.0, 0.0, 0.0, 1.0];

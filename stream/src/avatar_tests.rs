@@ -7,8 +7,18 @@ use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
 use super::*;
 use crate::{
-    MotionEncoder, Posed,
+    MotionEncoder,
     testing::{Person, damaged},
+};
+
+/// Darker from the left, red from above.
+const LIGHT: [[f32; 3]; LIGHT_TERMS] = {
+    let mut light = [[0.0; 3]; LIGHT_TERMS];
+    light[0] = [1.0; 3];
+    light[1] = [0.5; 3];
+    light[3][0] = 0.25;
+    light[6] = [0.1; 3];
+    light
 };
 
 fn gaussians(count: usize) -> Vec<AvatarGaussian> {
@@ -23,7 +33,7 @@ fn gaussians(count: usize) -> Vec<AvatarGaussian> {
 }
 
 fn encoded(person: &Person, gaussians: &[AvatarGaussian]) -> EncodedTemplate {
-    AvatarSource { template: person.source(), gaussians }.encode().unwrap()
+    AvatarSource { template: person.source(), gaussians, light: LIGHT }.encode().unwrap()
 }
 
 /// Rows of a unit quaternion's matrix in f64.
@@ -72,6 +82,8 @@ fn shapes_and_colors_come_back_and_turn_as_the_reference() {
     let (mut axes, mut posed) = (PosedAxes::default(), Posed::default());
     assert!(decoded.pose_axes(&motion, &mut axes));
     decoded.pose(&motion, &mut posed);
+    let mut colors = Vec::new();
+    assert!(decoded.avatar_colors(&posed, &mut colors));
     assert_eq!((axes.rotation.len(), axes.scale_opacity.len(), posed.center_scale.len()), (2000, 2000, 2000));
     let srgb = |linear: f64| if linear <= 0.0031308 { linear * 12.92 } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
     for (i, &from) in encoded.gaussian_order.iter().enumerate() {
@@ -79,7 +91,9 @@ fn shapes_and_colors_come_back_and_turn_as_the_reference() {
         for k in 0..3 {
             let off = f64::from(axes.scale_opacity[i][k] / scale_m[k]).ln().abs();
             assert!(off < 0.0125, "{i}: {off}");
-            let found = f64::from(decoded.avatar_colors().unwrap()[i][k]);
+            let [x, _, z] = [0, 1, 2].map(|axis| f64::from(posed.normal[i][axis]));
+            let lit = 1.0 + 0.5 * x + if k == 0 { 0.25 * z } else { 0.0 } + 0.1 * (3.0 * z * z - 1.0);
+            let found = f64::from(colors[i][k]) / lit;
             assert!((srgb(found) - srgb(f64::from(color[k]))).abs() < 0.75 / 255.0, "{i}: {found} {}", color[k]);
         }
         assert!((axes.scale_opacity[i][3] - opacity).abs() < 0.51 / 255.0);
@@ -98,7 +112,7 @@ fn shapes_and_colors_come_back_and_turn_as_the_reference() {
     }
     // Other templates have no axes, and a pose is a few dozen bytes.
     let plain = person.encode();
-    assert!(!plain.template.pose_axes(&motion, &mut axes) && plain.template.avatar_colors().is_none());
+    assert!(!plain.template.pose_axes(&motion, &mut axes) && !plain.template.avatar_colors(&posed, &mut colors));
     let bytes = MotionEncoder::new(&encoded).encode(&motion).unwrap();
     assert!(bytes.len() < 100, "{}", bytes.len());
     assert_eq!(Motion::decode(&bytes, &decoded).unwrap().stamp.template, decoded.hash);
@@ -128,9 +142,14 @@ fn every_rotation_survives_its_code() {
 fn poisoned_avatars_are_refused() {
     let person = Person::tube(60, 0);
     let refused = |person: &Person, gaussians: &[AvatarGaussian], text: &str| {
-        let error = AvatarSource { template: person.source(), gaussians }.encode().unwrap_err().to_string();
+        let source = AvatarSource { template: person.source(), gaussians, light: LIGHT };
+        let error = source.encode().unwrap_err().to_string();
         assert!(error.contains(text), "{error}");
     };
+    let mut dark = LIGHT;
+    dark[4][1] = f32::NAN;
+    let source = AvatarSource { template: person.source(), gaussians: &gaussians(60), light: dark };
+    assert!(source.encode().unwrap_err().to_string().contains("light is not finite"));
     refused(&person, &gaussians(59), "differ in length");
     refused(&Person::tube(60, 4), &gaussians(60), "no nodes");
     refused(&Person::tube(0, 0), &[], "one Gaussian");
@@ -157,6 +176,10 @@ fn damaged_avatars_are_no_panic() {
             let mut axes = PosedAxes::default();
             if template.pose_axes(&person.motion(1), &mut axes) {
                 let numbers = axes.rotation.iter().chain(&axes.scale_opacity).flatten();
+                let (mut posed, mut colors) = (Posed::default(), Vec::new());
+                template.pose(&person.motion(1), &mut posed);
+                assert!(template.avatar_colors(&posed, &mut colors));
+                assert!(colors.iter().flatten().all(|value| value.is_finite()));
                 assert!(numbers.into_iter().all(|v| v.is_finite()) && axes.rotation.len() == template.gaussians());
             }
         }

@@ -46,7 +46,7 @@ mod template;
 mod testing;
 mod tree;
 
-pub use avatar::{AvatarGaussian, AvatarSource, PosedAxes};
+pub use avatar::{AvatarGaussian, AvatarSource, LIGHT_TERMS, PosedAxes};
 pub use colors::{ColorDecoder, ColorEncoder, ColorSettings, LAYERS};
 pub use error::StreamError;
 pub use motion::{Motion, MotionEncoder};

@@ -37,7 +37,7 @@ impl StreamPerson {
     pub fn new(template: Arc<StreamTemplate>) -> Self {
         Self {
             decoder: ColorDecoder::new(&template),
-            colors: Arc::new(template.avatar_colors().unwrap_or_default().to_vec()),
+            colors: Arc::default(),
             colors_are_current: false,
             color_changes: 0,
             motions: VecDeque::new(),
@@ -121,7 +121,9 @@ impl StreamPerson {
     /// Poses the person and returns its colours, an element a Gaussian each.
     pub fn pose(&mut self, motion: &Motion, posed: &mut Posed) -> Arc<Vec<[f32; 4]>> {
         self.template.pose(motion, posed);
-        if self.template.avatar_colors().is_some() {
+        if self.template.is_avatar() {
+            // Its light shows them differently in each pose.
+            self.template.avatar_colors(posed, Arc::make_mut(&mut self.colors));
             return Arc::clone(&self.colors);
         }
         if !std::mem::replace(&mut self.colors_are_current, true) {
@@ -138,8 +140,7 @@ impl StreamPerson {
     /// Whether every part of the person has its colours, down to the finest layer.
     #[must_use]
     pub fn is_complete(&self) -> bool {
-        self.template.avatar_colors().is_some()
-            || (0..flyrig_stream::LAYERS).all(|layer| self.decoder.known(layer) >= 1.0)
+        self.template.is_avatar() || (0..flyrig_stream::LAYERS).all(|layer| self.decoder.known(layer) >= 1.0)
     }
 
     /// Number of colour messages so far: the same number means the same colours.
