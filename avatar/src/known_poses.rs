@@ -65,7 +65,7 @@ mod tests {
     fn poses_unlike_those_of_the_take_are_counted() {
         let avatar = small(2000, 7);
         let skeleton = &avatar.template.skeleton;
-        let elbow = skeleton.joints().iter().position(|joint| joint.name.contains("lowerarm")).unwrap();
+        let elbow = skeleton.joints().iter().position(|joint| joint.name == "LeftForeArm").unwrap();
         let bent = |bend: f64| {
             let mut pose = skeleton.rest_pose();
             pose.joint_rotations[elbow] *= DQuat::from_rotation_x(bend);
