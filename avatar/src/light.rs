@@ -1,4 +1,4 @@
-//! Light of the take's room: how bright a surface is by the direction that it faces. Colours of Gaussians are those of the surface, so that
+//! Light of the take's room: the brightness of a surface by the direction that it faces. Colours of Gaussians are those without it, so that
 //! somebody who turns does not get the mean of lit and unlit sides.
 //!
 //! A polynomial of second degree in the world's normal describes what distant lamps do to matte surfaces (Ramamoorthi and Hanrahan 2001);
@@ -41,7 +41,7 @@ fn basis(n: Vec3) -> [f32; TERMS] {
 }
 
 impl Light {
-    /// Returns by what the colours of a surface with this world normal are multiplied. A normal that is not finite gets the mean.
+    /// Returns the factors of red, green and blue for a surface with this world normal. One that is not finite counts as zero.
     #[must_use]
     pub fn shade(&self, normal: Vec3) -> [f32; 3] {
         self.unbounded(normal).map(|value| value.clamp(*SHADE.start(), *SHADE.end()))
@@ -52,8 +52,8 @@ impl Light {
         std::array::from_fn(|k| self.terms.iter().zip(basis).map(|(term, value)| term[k] * value).sum())
     }
 
-    /// Returns dL/d terms from dL/d the lit colours, with the unlit ones and the normals; `stride` rows belong to a Gaussian. In `slopes`
-    /// are dL/d the unlit colours afterwards.
+    /// Returns dL/d terms. `slopes` are dL/d lit colours, afterwards dL/d unlit ones; `unlit` are those, `stride` rows a Gaussian, `normals` by
+    /// Gaussian.
     pub(crate) fn backward(
         &self,
         normals: impl Fn(usize) -> Vec3 + Sync,

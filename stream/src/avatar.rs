@@ -23,7 +23,7 @@ const SCALE_RANGE: f32 = 6.214_608;
 const PLANES: usize = 11;
 /// Terms of the light: 1, x, y, z, xy, yz, 3zz - 1, xz, xx - yy of the world's normal.
 pub const LIGHT_TERMS: usize = 9;
-/// By this the light multiplies colours at least and at most.
+/// Smallest and largest factor of the light.
 const SHADE: core::ops::RangeInclusive<f32> = 0.05..=4.0;
 /// Steps of a component of a rotation, whose range is 1/sqrt(2) to either side.
 const ROTATION_STEPS: f32 = 1023.0;
@@ -48,7 +48,7 @@ pub struct AvatarSource<'a> {
     pub template: TemplateSource<'a>,
     /// As many Gaussians.
     pub gaussians: &'a [AvatarGaussian],
-    /// By what colours are multiplied, by the direction that the surface faces in the world: red, green and blue of each term.
+    /// Factors of the colours by the direction that the surface faces in the world: red, green and blue of each term.
     pub light: [[f32; 3]; LIGHT_TERMS],
 }
 
@@ -200,7 +200,7 @@ impl StreamTemplate {
 /// Bytes of the light.
 const LIGHT_BYTES: usize = 4 * 3 * LIGHT_TERMS;
 
-/// By what a surface's colours are multiplied; a normal that is not finite counts as none.
+/// Factors of the colours of a surface; a normal that is not finite counts as zero.
 fn shade(light: &[[f32; 3]; LIGHT_TERMS], &[x, y, z, _]: &[f32; 4]) -> [f32; 3] {
     let [x, y, z] = if (x + y + z).is_finite() { [x, y, z] } else { [0.0; 3] };
     let basis = [1.0, x, y, z, x * y, y * z, 3.0 * z * z - 1.0, x * z, x * x - y * y];
