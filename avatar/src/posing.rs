@@ -133,6 +133,30 @@ impl Avatar {
     }
 }
 
+/// Poses of the take that a mean shade is taken over.
+const SHADED_POSES: usize = 8;
+
+impl Avatar {
+    /// Returns the factors by which the light showed the colours of each Gaussian in the mean of the take's poses; those of the mean direction
+    /// where no pose is known.
+    pub(crate) fn mean_shades(&self) -> Vec<Vec3> {
+        let poses = &self.known_poses.0;
+        let [constant, ..] = self.light.terms;
+        let mut sums = vec![if poses.is_empty() { Vec3::from(constant) } else { Vec3::ZERO }; self.places.len()];
+        let chosen: Vec<_> = poses.iter().step_by(poses.len().div_ceil(SHADED_POSES).max(1)).collect();
+        for rotations in &chosen {
+            let pose = Pose { root_translation: DVec3::ZERO, joint_rotations: rotations.to_vec() };
+            let bones = Bones::new(&self.template.skeleton, &pose);
+            let rows = sums.par_iter_mut().zip(&self.skin).zip(&self.attachments).with_min_len(1024);
+            rows.for_each(|((sum, skin), attachment)| {
+                let normal = attachment.blend(&self.template, &self.template.normals).normalize_or_zero();
+                *sum += Vec3::from(self.light.shade(bones.blend(skin).1 * normal)) / chosen.len() as f32;
+            });
+        }
+        sums
+    }
+}
+
 impl PosedAvatar {
     /// Copies scales and opacities; Gaussians of a surface that faces away from `eye` have none there. Opacities stay below 1, so that the far
     /// side of the body would show through the near one. Returns how many were left out.
@@ -223,6 +247,28 @@ mod tests {
                     assert!(error < 2e-3 * (expected.abs() + 0.05), "{list} {i} {k}: {expected} {}", found[i][k]);
                 }
             }
+        }
+    }
+
+    #[test]
+    fn mean_shades_are_those_of_the_poses() {
+        let mut avatar = small(400, 7);
+        avatar.light.terms[1] = [0.5, 0.2, -0.3];
+        avatar.light.terms[4] = [0.1; 3];
+        let constant = Vec3::from(avatar.light.terms[0]);
+        assert!(avatar.mean_shades().iter().all(|shade| shade.distance(constant) < 1e-6));
+        let poses = [1, 2].map(|seed| random_pose(&avatar, seed).0);
+        avatar.known_poses = crate::KnownPoses::new(&poses);
+        avatar.parameters.harmonics.fill([1.0; 4]);
+        let lit = poses.map(|pose| {
+            let mut posed = PosedAvatar::default();
+            avatar.pose(&Bones::new(&avatar.template.skeleton, &pose), None, &mut posed);
+            posed.harmonics
+        });
+        let coefficients = avatar.parameters.order().coefficients();
+        for (i, shade) in avatar.mean_shades().into_iter().enumerate() {
+            let expected = lit.each_ref().map(|lit| Vec3::from_slice(&lit[i * coefficients]));
+            assert!(shade.distance((expected[0] + expected[1]) / 2.0) < 1e-4, "{i}: {shade}");
         }
     }
 

@@ -46,9 +46,9 @@ impl Avatar {
     #[must_use]
     pub fn surface_colors(&self, surface: &SurfaceGaussians) -> Vec<[f32; 3]> {
         let shown = Shown::of(self);
-        // In the mean light of all directions: where the surface will face is not known yet.
-        let [light, ..] = self.light.terms;
-        let colors: Vec<Vec3> = self.constant_colors().into_iter().map(|color| color * Vec3::from(light)).collect();
+        // As the take's light showed them in the mean: where the surface will face is not known yet.
+        let colors: Vec<Vec3> =
+            self.constant_colors().into_iter().zip(self.mean_shades()).map(|(color, shade)| color * shade).collect();
         let mean = colors.iter().sum::<Vec3>() / colors.len().max(1) as f32;
         let radius = REACH * shown.spacing(self);
         let grid = PointGrid::new(&shown.place, radius);
