@@ -145,7 +145,7 @@ impl Avatar {
         let mut sums = vec![if poses.is_empty() { Vec3::from(constant) } else { Vec3::ZERO }; self.places.len()];
         let chosen: Vec<_> = poses.iter().step_by(poses.len().div_ceil(SHADED_POSES).max(1)).collect();
         for rotations in &chosen {
-            let pose = Pose { root_translation: DVec3::ZERO, joint_rotations: rotations.to_vec() };
+            let pose = Pose { root_translation: DVec3::ZERO, joint_rotations: (*rotations).clone() };
             let bones = Bones::new(&self.template.skeleton, &pose);
             let rows = sums.par_iter_mut().zip(&self.skin).zip(&self.attachments).with_min_len(1024);
             rows.for_each(|((sum, skin), attachment)| {
