@@ -143,14 +143,14 @@ impl Avatar {
         let poses = &self.known_poses.0;
         let [constant, ..] = self.light.terms;
         let mut sums = vec![if poses.is_empty() { Vec3::from(constant) } else { Vec3::ZERO }; self.places.len()];
+        let normals = self.normals();
         let chosen: Vec<_> = poses.iter().step_by(poses.len().div_ceil(SHADED_POSES).max(1)).collect();
         for rotations in &chosen {
             let pose = Pose { root_translation: DVec3::ZERO, joint_rotations: (*rotations).clone() };
             let bones = Bones::new(&self.template.skeleton, &pose);
-            let rows = sums.par_iter_mut().zip(&self.skin).zip(&self.attachments).with_min_len(1024);
-            rows.for_each(|((sum, skin), attachment)| {
-                let normal = attachment.blend(&self.template, &self.template.normals).normalize_or_zero();
-                *sum += Vec3::from(self.light.shade(bones.blend(skin).1 * normal)) / chosen.len() as f32;
+            let rows = sums.par_iter_mut().zip(&self.skin).zip(&normals).with_min_len(1024);
+            rows.for_each(|((sum, skin), normal)| {
+                *sum += Vec3::from(self.light.shade(bones.blend(skin).1 * *normal)) / chosen.len() as f32;
             });
         }
         sums

@@ -116,7 +116,7 @@ fn a_fit_that_was_killed_ends_as_one_that_was_not() {
         run(&mut resumed, 11..20);
         assert!(whole.1.to_bytes().unwrap() == resumed.1.to_bytes().unwrap(), "{networks:?}");
 
-        // What is refused changes nothing.
+        // A refused state changes nothing.
         let mut other = begin();
         let before = other.1.to_bytes().unwrap();
         let mut refused = |bytes: &[u8], settings: &str| other.0.resume(&mut other.1, bytes, settings).unwrap_err();

@@ -52,7 +52,7 @@ pub struct AvatarSource<'a> {
     pub light: [[f32; 3]; LIGHT_TERMS],
 }
 
-/// What a template holds of an avatar, in the template's order.
+/// Shapes, colours and light of an avatar, in the template's order of Gaussians.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Avatar {
     /// Standard deviations, metres; w: opacity.

@@ -76,7 +76,7 @@ pub struct StreamTemplate {
     pub(crate) rest_spread: Vec<f32>,
     /// Canonical positions of the nodes, metres: each that of the Gaussian which hangs on it most.
     pub(crate) node_places: Vec<[f32; 3]>,
-    /// What each node of a motion is predicted from.
+    /// Prediction of each node of a motion.
     pub(crate) predictions: Vec<Prediction>,
     /// Axes and colours of a person who is driven by poses alone.
     pub(crate) avatar: Option<Avatar>,

@@ -217,7 +217,7 @@ fn the_live_rig_starts_from_an_avatar() {
     }
     drop(receiver);
 
-    // What cannot be: one line with the fix.
+    // Refusals: one line with the fix.
     let refused = |finished: flyrig_tests::Finished, expected: &[&str]| {
         assert_eq!(finished.code, Some(1), "{finished:?}");
         let line = finished.stderr.lines().find(|line| line.starts_with("error:")).unwrap_or_default();
