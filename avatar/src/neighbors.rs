@@ -28,6 +28,11 @@ impl Neighbors {
         Self(nearest.into_iter().map(|(_, nearest)| nearest).collect())
     }
 
+    /// The nearest others of each Gaussian, nearest first.
+    pub fn of_each(&self) -> &[[u32; NEAREST]] {
+        &self.0
+    }
+
     /// Adds the derivatives of a pull to the mean of the neighbours: `weights` times the difference, by column. Rows of one Gaussian are
     /// `stride` apart; the first one counts.
     pub fn pull(&self, values: &[Element], slopes: &mut [Element], stride: usize, weights: Element) {

@@ -22,7 +22,11 @@ use flyrig_types::{Camera, FrameSet, Image, Mask, Pose, RenderedView};
 use glam::DVec3;
 use serde::Serialize;
 
-use crate::{cli::BenchAvatarArgs, scale::exponent};
+use crate::{
+    avatar_detail::{self, SmallViews, small_views},
+    cli::BenchAvatarArgs,
+    scale::exponent,
+};
 
 /// Images of the held-out cameras at one instant, and the person then.
 struct Held {
@@ -61,6 +65,8 @@ struct Cost {
     resident_mib: f64,
     /// Held-out cameras in the frames of the fit, at the end.
     psnr_db: f64,
+    /// The avatar in small images.
+    small: Vec<SmallViews>,
 }
 
 /// Runs the command.
@@ -136,6 +142,7 @@ fn live(args: &BenchAvatarArgs, settings: &ReplaySettings, gpu: &GpuContext) -> 
         file_mb: f64::NAN,
         resident_mib: resident_mib().unwrap_or(f64::NAN),
         psnr_db: score.psnr_db,
+        small: Vec::new(),
     })
 }
 
@@ -248,6 +255,8 @@ fn fit(
         rows.push(Row { gaussians, seconds: spent, steps, view: view.0, pose });
     }
     bar.finish_and_clear();
+    let poses: Vec<_> = held.iter().map(|held| (&held.pose, held.translations.as_slice())).collect();
+    let small = small_views(gpu, &avatar, &poses, cameras)?;
     Ok(Cost {
         name: "avatar".to_owned(),
         gaussians,
@@ -258,6 +267,7 @@ fn fit(
         file_mb: avatar.to_bytes()?.len() as f64 / 1e6,
         resident_mib: resident_mib().unwrap_or(f64::NAN),
         psnr_db,
+        small,
     })
 }
 
@@ -292,6 +302,9 @@ fn table(rows: &[Row], costs: &[Cost]) -> String {
         );
     }
     let avatars: Vec<&Cost> = costs.iter().filter(|cost| cost.name == "avatar").collect();
+    for avatar in &avatars {
+        let _ = write!(text, "\nThe {} in small images:\n\n{}", avatar.gaussians, avatar_detail::table(&avatar.small));
+    }
     if avatars.len() > 1 {
         let power = |value: fn(&Cost) -> f64| {
             exponent(&avatars.iter().map(|cost| (cost.gaussians as f64, value(cost))).collect::<Vec<_>>())

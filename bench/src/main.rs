@@ -2,6 +2,7 @@
 
 mod appearance;
 mod avatar;
+mod avatar_detail;
 mod budget;
 mod capture;
 mod case;

@@ -46,9 +46,12 @@ const SUCCESS: Duration = Duration::from_secs(10);
 /// A template fills the line, so it shows the bytes a second that are carried, if it has so many bytes, for so long.
 const LEAST_FETCH_BYTES: usize = 200_000;
 const CARRIED_FOR: Duration = Duration::from_secs(300);
-/// Growth of the bytes a second that a layer brings at least: where the line does not carry that, a trial would stop motion for seconds, and
-/// comes after this patience alone.
-const GROWTH: f64 = 1.6;
+/// A layer has at least so many times the bytes of the one before it, and the coarsest so many times those of motion: where the line does not
+/// carry that, a trial would stop motion for seconds, and comes after this patience alone.
+const NEXT_LAYER: f64 = 2.3;
+const FIRST_LAYER: f64 = 0.2;
+/// Bytes a second count as those of the busiest window, less this share for each window since: somebody who moves more is sent more.
+const FORGOTTEN: f64 = 0.05;
 const UNLIKELY_TRIAL: Duration = Duration::from_secs(60);
 
 /// Decides how many layers to subscribe to.
@@ -70,9 +73,9 @@ pub(crate) struct ColorLayers {
     fetched: Option<(Instant, usize)>,
     /// Bytes a second that the last ones came with, and when.
     carries: Option<(Instant, f64)>,
-    /// Bytes of motion and colours in this window, and a second in the last one.
-    bytes: usize,
-    bytes_per_sec: f64,
+    /// Bytes of motion and of each layer in this window, and a second in the busiest of the last ones.
+    bytes: [usize; 1 + LAYERS],
+    bytes_per_sec: [f64; 1 + LAYERS],
     /// When the last motion arrived.
     last: Option<Instant>,
     window_began: Instant,
@@ -96,8 +99,8 @@ impl ColorLayers {
             fetches: 0,
             fetched: None,
             carries: None,
-            bytes: 0,
-            bytes_per_sec: 0.0,
+            bytes: [0; 1 + LAYERS],
+            bytes_per_sec: [0.0; 1 + LAYERS],
             last: None,
             window_began: now,
             changed: None,
@@ -147,9 +150,18 @@ impl ColorLayers {
         }
     }
 
-    /// Counts the bytes of a message of motion or colours.
-    pub fn count(&mut self, bytes: usize) {
-        self.bytes = self.bytes.saturating_add(bytes);
+    /// Counts the bytes of a message of a layer of colours, or of motion.
+    pub fn count(&mut self, layer: Option<usize>, bytes: usize) {
+        if let Some(sum) = self.bytes.get_mut(layer.map_or(0, |layer| 1 + layer)) {
+            *sum = sum.saturating_add(bytes);
+        }
+    }
+
+    /// Bytes a second of what is subscribed to and one layer more.
+    fn with_one_more(&self) -> f64 {
+        let subscribed = &self.bytes_per_sec[..=self.wanted.min(LAYERS)];
+        let growth = if self.wanted == 0 { FIRST_LAYER } else { NEXT_LAYER };
+        subscribed.iter().sum::<f64>() + growth * subscribed.last().copied().unwrap_or(0.0)
     }
 
     /// A thread of this computer that only waited ran so late.
@@ -175,8 +187,10 @@ impl ColorLayers {
         let mut latencies = std::mem::take(&mut self.latencies);
         let mut lags = std::mem::take(&mut self.lags);
         let missed = std::mem::take(&mut self.missed) as f64;
-        self.bytes_per_sec =
-            std::mem::take(&mut self.bytes) as f64 / now.duration_since(self.window_began).as_secs_f64();
+        let secs = now.duration_since(self.window_began).as_secs_f64();
+        for (busiest, bytes) in self.bytes_per_sec.iter_mut().zip(std::mem::take(&mut self.bytes)) {
+            *busiest = (bytes as f64 / secs).max((1.0 - FORGOTTEN) * *busiest);
+        }
         self.window_began = now;
         if !self.is_begun || self.fetches > 0 {
             return;
@@ -236,7 +250,7 @@ impl ColorLayers {
             return;
         }
         let carried = self.carries.filter(|(at, _)| now.duration_since(*at) < CARRIED_FOR);
-        let is_unlikely = carried.is_some_and(|(_, carried)| GROWTH * self.bytes_per_sec > carried);
+        let is_unlikely = carried.is_some_and(|(_, carried)| self.with_one_more() > carried);
         let patience = if is_unlikely { self.patience.max(UNLIKELY_TRIAL) } else { self.patience };
         let is_due = now.duration_since(clear_since) >= patience && since_change.is_none_or(|since| since >= patience);
         if is_due && self.wanted < LAYERS {
@@ -282,6 +296,8 @@ mod tests {
         ticks: Ticks,
         /// State of a generator of pauses.
         random: u64,
+        /// Bytes against those of [`BYTES`].
+        busy: f64,
     }
 
     impl Line {
@@ -289,7 +305,18 @@ mod tests {
             let now = Instant::now();
             let (pauses, turns, ticks) = ([Duration::ZERO; 2], [now; 2], Ticks::new(now));
             let in_flight = VecDeque::from([1; 4]);
-            Self { now, layers: begun(now), carries, queue_nanos: 0, in_flight, pauses, turns, ticks, random: 1 }
+            Self {
+                now,
+                layers: begun(now),
+                carries,
+                queue_nanos: 0,
+                in_flight,
+                pauses,
+                turns,
+                ticks,
+                random: 1,
+                busy: 1.0,
+            }
         }
 
         /// The first turn of a thread from `at` on.
@@ -318,7 +345,9 @@ mod tests {
                 let step = if sent > self.carries { 20_000_000 } else { -20_000_000 };
                 self.queue_nanos = (self.queue_nanos + step).clamp(0, 500_000_000);
                 late += usize::from(self.queue_nanos > 100_000_000);
-                self.layers.count(BYTES[..=sent].iter().sum());
+                for (kind, bytes) in BYTES.iter().enumerate().take(sent + 1) {
+                    self.layers.count(kind.checked_sub(1), (*bytes as f64 * self.busy) as usize);
+                }
                 let taken = self.turn(0, self.now);
                 let woken = self.turn(1, self.now);
                 self.ticks.run(woken, |by| self.layers.woke_late(by));
@@ -468,6 +497,20 @@ mod tests {
         line.carries = LAYERS;
         line.run(60);
         assert_eq!(line.layers.wanted(), LAYERS);
+    }
+
+    #[test]
+    fn a_layer_is_not_tried_in_a_quiet_moment() {
+        let mut line = Line::new(2);
+        fetch(&mut line, 330e3);
+        for _ in 0..20 {
+            line.busy = 1.0;
+            line.run(2);
+            // Not even all layers would be too many for the line now.
+            line.busy = 0.4;
+            let (late, shares) = line.run(1);
+            assert!(late <= 0.0 && shares[3] <= 0.0, "{late} {shares:?}");
+        }
     }
 
     #[test]

@@ -266,7 +266,8 @@ impl Inbox {
         slot.tally.add(&header, payload.len(), now, latency_nanos, exact);
         slot.tally.totals.replaced += u64::from(is_replaced);
         if matches!(expected, MessageKind::Motion | MessageKind::Colors) {
-            lock(&self.color_layers).count(payload.len());
+            let layer = keys::person_in(label).and_then(|(_, layer)| layer);
+            lock(&self.color_layers).count(layer, payload.len());
         }
         if expected == MessageKind::Motion {
             let missed = slot.tally.totals.missed.saturating_sub(missed_before);

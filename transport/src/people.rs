@@ -210,8 +210,15 @@ impl PersonSubscription {
         let was_watching = paused.is_some();
         drop(paused);
         self.inbox.fetch_begins();
+        let begun = Instant::now();
         let answer = ask_template(&self.session, &self.rig, hash, timeout);
         let bytes = answer.as_ref().ok().and_then(Option::as_ref).map_or(0, Vec::len);
+        tracing::debug!(
+            hash = format!("{hash:016x}"),
+            bytes,
+            secs = begun.elapsed().as_secs_f64(),
+            "asked for a template"
+        );
         self.inbox.fetch_ends(bytes);
         if was_watching {
             self.begin_motion()?;

@@ -1,7 +1,7 @@
 //! Fetches templates on a thread of its own, so that one that is late delays nobody's motion.
 
 use std::{
-    collections::{HashMap, HashSet},
+    collections::{HashMap, HashSet, VecDeque},
     sync::Arc,
     thread::Builder,
     time::{Duration, Instant},
@@ -18,6 +18,9 @@ const PATIENCE: Duration = Duration::from_secs(30);
 const RETRY: Duration = Duration::from_millis(500);
 /// Templates that wait for their turn; what does not fit is asked for again by a later motion.
 const MAX_WAITING: usize = MAX_PERSON_TOPICS + 1;
+/// Templates that are kept, and their bytes at most: somebody who comes back, or wears a coat again, is shown at once.
+const MAX_KEPT: usize = 8;
+const MAX_KEPT_BYTES: usize = 16 << 20;
 
 type Fetched = (u64, Result<Option<Vec<u8>>, TransportError>);
 
@@ -31,6 +34,10 @@ pub struct TemplateFetcher {
     waiting: HashMap<u64, HashSet<u32>>,
     /// When templates failed last.
     failed: HashMap<u64, Instant>,
+    /// Templates that came, the one that was asked for last at the end.
+    kept: VecDeque<(u64, Vec<u8>)>,
+    /// People who asked for one of these since.
+    ready: VecDeque<(u32, u64)>,
 }
 
 impl TemplateFetcher {
@@ -57,11 +64,24 @@ impl TemplateFetcher {
             .name("flyrig-templates".to_owned())
             .spawn(work)
             .map_err(|error| TransportError::session("template thread", &error))?;
-        Ok(Self { wanted, fetched, waiting: HashMap::new(), failed: HashMap::new() })
+        Ok(Self {
+            wanted,
+            fetched,
+            waiting: HashMap::new(),
+            failed: HashMap::new(),
+            kept: VecDeque::new(),
+            ready: VecDeque::new(),
+        })
     }
 
     /// Asks for a person's template unless it is on its way or failed just now. Never waits.
     pub fn ask(&mut self, person: u32, hash: u64) {
+        if self.kept.iter().any(|(kept, _)| *kept == hash) {
+            if !self.ready.contains(&(person, hash)) {
+                self.ready.push_back((person, hash));
+            }
+            return;
+        }
         if self.failed.get(&hash).is_some_and(|at| at.elapsed() < RETRY) {
             return;
         }
@@ -74,6 +94,7 @@ impl TemplateFetcher {
 
     /// Notes that a template is of no use, so that the motions that name it do not fetch it again at once.
     pub fn refuse(&mut self, hash: u64) {
+        self.kept.retain(|(kept, _)| *kept != hash);
         self.failed.insert(hash, Instant::now());
     }
 
@@ -82,11 +103,19 @@ impl TemplateFetcher {
     /// # Errors
     /// As [`crate::Subscriber::template`]; the template is asked for again when [`Self::ask`] is called again.
     pub fn take(&mut self) -> Result<Option<FetchedTemplate>, TransportError> {
+        while let Some((person, hash)) = self.ready.pop_front() {
+            if let Some(at) = self.kept.iter().position(|(kept, _)| *kept == hash) {
+                self.kept.make_contiguous()[at..].rotate_left(1);
+                let bytes = self.kept.back().map(|(_, bytes)| bytes.clone()).unwrap_or_default();
+                return Ok(Some(FetchedTemplate { people: vec![person], hash, bytes }));
+            }
+        }
         while let Ok((hash, answer)) = self.fetched.try_recv() {
             let people = self.waiting.remove(&hash).unwrap_or_default();
             self.failed.retain(|_, at| at.elapsed() < RETRY);
             match answer {
                 Ok(Some(bytes)) => {
+                    self.keep(hash, &bytes);
                     return Ok(Some(FetchedTemplate { people: people.into_iter().collect(), hash, bytes }));
                 }
                 Ok(None) => self.refuse(hash),
@@ -97,6 +126,17 @@ impl TemplateFetcher {
             }
         }
         Ok(None)
+    }
+
+    fn keep(&mut self, hash: u64, bytes: &[u8]) {
+        if bytes.len() > MAX_KEPT_BYTES {
+            return;
+        }
+        self.kept.push_back((hash, bytes.to_vec()));
+        let size = |kept: &VecDeque<(u64, Vec<u8>)>| kept.iter().map(|(_, bytes)| bytes.len()).sum::<usize>();
+        while self.kept.len() > MAX_KEPT || size(&self.kept) > MAX_KEPT_BYTES {
+            self.kept.pop_front();
+        }
     }
 }
 
@@ -180,6 +220,42 @@ mod tests {
         assert_eq!((fetched.people, errors.len()), (vec![0], 2), "{errors:?}");
         assert!(errors[0].contains("cut") && errors[1].contains("out of luck"), "{errors:?}");
         assert!(start.elapsed() >= 3 * RETRY);
+    }
+
+    #[test]
+    fn templates_that_came_are_kept_within_bounds_and_not_fetched_again() {
+        let (count, asked) = bounded(999);
+        let mut fetcher = TemplateFetcher::with(move |hash| {
+            count.send(hash).unwrap();
+            // The last one is larger than all that is kept.
+            Ok(Some(vec![hash as u8; if hash == 99 { MAX_KEPT_BYTES + 1 } else { 3 }]))
+        })
+        .unwrap();
+        let mut fetch = |person: u32, hash: u64| {
+            fetcher.ask(person, hash);
+            fetcher.ask(person, hash);
+            let found = next_within(&mut fetcher, Duration::from_secs(20)).unwrap().unwrap();
+            assert_eq!((&found.people, found.hash, found.bytes[0]), (&vec![person], hash, hash as u8));
+            assert_eq!(fetcher.take().unwrap(), None);
+        };
+        for hash in 1..=MAX_KEPT as u64 {
+            fetch(7, hash);
+        }
+        // Asked for again, by somebody else as well; the first one is used now and then, so the second is forgotten for another.
+        fetch(7, 1);
+        fetch(8, 1);
+        assert_eq!(asked.try_iter().count(), MAX_KEPT);
+        fetch(7, 50);
+        fetch(7, 1);
+        fetch(7, 2);
+        assert_eq!(asked.try_iter().collect::<Vec<_>>(), [50, 2]);
+        // One that nobody keeps, and one that was of no use, are fetched anew.
+        fetch(7, 99);
+        fetch(7, 99);
+        fetcher.ask(7, 1);
+        fetcher.refuse(1);
+        assert_eq!(fetcher.take().unwrap(), None);
+        assert!(asked.try_iter().filter(|hash| *hash == 99).count() == 2 && fetcher.kept.len() <= MAX_KEPT);
     }
 
     #[test]

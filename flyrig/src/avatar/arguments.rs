@@ -171,6 +171,9 @@ pub struct EvalArgs {
     /// Move its clothes as the images show it, in place of the pose alone.
     #[arg(long)]
     pub deformed: bool,
+    /// Whether Gaussians that lie closer than the view's pixels are merged: small images are drawn faster.
+    #[arg(long, default_value_t = true, action = clap::ArgAction::Set)]
+    pub level_of_detail: bool,
 }
 
 #[derive(Debug, Args)]
@@ -189,6 +192,9 @@ pub struct RenderArgs {
     /// Size of the images, pixels.
     #[arg(long, default_value = "512x768", value_parser = parse_size)]
     pub size: [u32; 2],
+    /// Whether Gaussians that lie closer than the view's pixels are merged: small images are drawn faster.
+    #[arg(long, default_value_t = true, action = clap::ArgAction::Set)]
+    pub level_of_detail: bool,
 }
 
 #[derive(Debug, Args)]

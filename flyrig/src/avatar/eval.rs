@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
-use flyrig_avatar::{Avatar, AvatarScene, Bones};
+use flyrig_avatar::{Avatar, DetailedScene};
 use flyrig_fusion::{BodySettings, Outcome, PersonId, Solver};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, FrameScore, ScoreSheet, error_parts, score_view};
@@ -19,6 +19,8 @@ struct Metrics<'a> {
     holdout: &'a [String],
     deformed: bool,
     gaussians: usize,
+    /// Gaussians of a view, after those that pixels do not tell apart were merged.
+    mean_drawn: f64,
     adapter: String,
     mean: Option<CameraScore>,
     cameras: Vec<CameraScore>,
@@ -46,9 +48,12 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         let folder = args.out.join(camera.id.as_str());
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
     }
-    let mut scene = AvatarScene::new(gpu, &avatar)?;
+    let mut scene = DetailedScene::new(gpu, avatar, args.level_of_detail)?;
+    let gaussians = scene.avatar().gaussians();
     let bar = progress_bar(replay.count as u64, "avatar eval");
-    let (mut sheet, mut spent, mut drawn, mut hidden) = (ScoreSheet::default(), Duration::ZERO, 0u32, 0);
+    let (mut sheet, mut spent, mut views_drawn) = (ScoreSheet::default(), Duration::ZERO, 0u32);
+    // Gaussians of all views, and those among them that face away.
+    let (mut drawn, mut hidden) = (0, 0);
     let (mut parts, mut far, mut frames) = (ScoreSheet::default(), 0.0, 0u32);
     while let Some(set) = replay.next_set()? {
         bar.inc(1);
@@ -58,25 +63,26 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         }
         let subject = replay.session.subject(PersonId::default());
         let Some((subject, pose)) = subject.and_then(|subject| Some((subject, subject.pose()?))) else { continue };
-        fits(&avatar, &subject.template().skeleton, pose)?;
+        fits(scene.avatar(), &subject.template().skeleton, pose)?;
         let start = Instant::now();
         let deformed = Some(subject.node_translations()).filter(|all| args.deformed && !all.is_empty());
-        scene.pose(&avatar, &Bones::new(&avatar.template.skeleton, pose), deformed);
-        far += avatar.far_share(pose);
+        scene.pose(pose, deformed);
+        far += scene.avatar().far_share(pose);
         frames += 1;
         let mut views = Vec::new();
         for camera in &holdout {
             views.push(scene.draw(camera)?);
-            hidden += scene.hidden();
+            let (seen, away) = scene.drawn();
+            (drawn, hidden) = (drawn + seen, hidden + away);
         }
         spent += start.elapsed();
-        drawn += views.len() as u32;
+        views_drawn += views.len() as u32;
         let truths = replay.truth.at(set.master_nanos)?;
         for ((camera, view), truth) in holdout.iter().zip(&views).zip(&truths) {
             png::write_view(&args.out.join(camera.id.as_str()).join(format!("{number:06}.png")), view)?;
             let Some(truth) = truth else { continue };
             if let Some(mask) = &truth.mask {
-                parts.extend(score_parts((&avatar, &scene, camera), number, view, &truth.image, mask)?);
+                parts.extend(score_parts((&scene, camera), number, view, &truth.image, mask)?);
             }
             let mut score = score_view(&camera.id, number, view, &truth.image, truth.mask.as_ref())?;
             if let (Some(score), Some(mask)) = (&mut score, &truth.mask) {
@@ -87,15 +93,17 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         bar.set_message(sheet.progress());
     }
     bar.finish_and_clear();
-    ensure!(drawn > 0, "nobody was found in {}; run with -v to see why", args.take.dataset.display());
+    ensure!(views_drawn > 0, "nobody was found in {}; run with -v to see why", args.take.dataset.display());
     let far_share = far / f64::from(frames.max(1));
-    let view_ms = 1e3 * spent.as_secs_f64() / f64::from(drawn);
+    let view_ms = 1e3 * spent.as_secs_f64() / f64::from(views_drawn);
+    let mean_drawn = drawn as f64 / f64::from(views_drawn);
     let metrics = Metrics {
         avatar: args.avatar.display().to_string(),
         inputs: &args.take.inputs,
         holdout: &args.holdout,
         deformed: args.deformed,
-        gaussians: avatar.gaussians(),
+        gaussians,
+        mean_drawn,
         adapter: gpu.adapter_name(),
         mean: sheet.mean(),
         cameras: sheet.per_camera(),
@@ -110,9 +118,9 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         println!("{part:<8} {frames:>6} {psnr_db:>9.2} {ssim:>8.4} {flip:>8.4}");
     }
     println!(
-        "\n{drawn} views of {} Gaussians, {:.0} % of them left out as they face away, {view_ms:.1} ms each; images in {}",
-        avatar.gaussians(),
-        100.0 * hidden as f64 / f64::from(drawn) / avatar.gaussians() as f64,
+        "\n{views_drawn} views of {mean_drawn:.0} of {gaussians} Gaussians, {:.0} % of them left out as they face away, {view_ms:.1} ms \
+         each; images in {}",
+        100.0 * hidden as f64 / drawn.max(1) as f64,
         args.out.display()
     );
     print_far(far_share);

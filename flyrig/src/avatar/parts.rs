@@ -1,7 +1,7 @@
 //! Head and hands scored by themselves: they are small, and looked at first.
 
 use anyhow::Result;
-use flyrig_avatar::{Avatar, AvatarScene};
+use flyrig_avatar::DetailedScene;
 use flyrig_body::Part;
 use flyrig_metrics::{FrameScore, score_view};
 use flyrig_types::{Camera, Image, Mask, RenderedView};
@@ -13,7 +13,7 @@ const PARTS: [(&str, Part); 3] = [("head", Part::Head), ("hands", Part::LeftHand
 
 /// Scores the boxes around head and hands of a view; their names are in place of the camera's.
 pub(super) fn score_parts(
-    (avatar, scene, camera): (&Avatar, &AvatarScene, &Camera),
+    (scene, camera): (&DetailedScene, &Camera),
     frame: u64,
     view: &RenderedView,
     truth: &Image,
@@ -21,7 +21,7 @@ pub(super) fn score_parts(
 ) -> Result<Vec<FrameScore>> {
     let mut scores = Vec::new();
     for (name, part) in PARTS {
-        let Some(area) = scene.part_box(avatar, &[part], camera, MARGIN_PX) else { continue };
+        let Some(area) = scene.part_box(&[part], camera, MARGIN_PX) else { continue };
         let view = RenderedView { rgba: cut(&view.rgba, view.width, 4, area), ..view.clone() };
         let mask = Mask::new(mask.width(), mask.height(), cut(mask.coverage(), mask.width(), 1, area))?;
         scores.extend(score_view(&name.into(), frame, &view, truth, Some(&mask))?);

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use anyhow::{Context as _, Result, bail};
-use flyrig_avatar::{Avatar, AvatarScene};
+use flyrig_avatar::{Avatar, DetailedScene};
 use flyrig_body::{RetargetOptions, load_bvh, load_gltf};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{png, progress_bar, stop};
@@ -23,23 +23,26 @@ pub fn render(args: &RenderArgs, gpu: &GpuContext) -> Result<()> {
     let avatar = load(&args.avatar)?;
     let track = motion(&avatar, &args.motion)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let mut scene = AvatarScene::new(gpu, &avatar)?;
+    let mut scene = DetailedScene::new(gpu, avatar, args.level_of_detail)?;
     let bar = progress_bar(args.frames.end - args.frames.start, "avatar render");
-    let mut far = 0.0;
+    let (mut far, mut drawn) = (0.0, 0);
     for frame in args.frames.clone() {
         if stop::requested() {
             break;
         }
         let pose = pose_at(&track, frame);
-        scene.drive(&avatar, &pose);
-        far += avatar.far_share(&pose);
+        scene.pose(&pose, None);
+        far += scene.avatar().far_share(&pose);
         let view = scene.draw(&camera(args.size, pose.root_translation))?;
+        drawn += scene.drawn().0;
         png::write_view(&args.out.join(format!("{frame:06}.png")), &view)?;
         bar.inc(1);
     }
     bar.finish_and_clear();
-    println!("images in {}", args.out.display());
-    print_far(far / (args.frames.end - args.frames.start).max(1) as f64);
+    let frames = (args.frames.end - args.frames.start).max(1) as f64;
+    let gaussians = scene.avatar().gaussians();
+    println!("images of {:.0} of {gaussians} Gaussians in {}", drawn as f64 / frames, args.out.display());
+    print_far(far / frames);
     Ok(())
 }
 

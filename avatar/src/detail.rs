@@ -1,0 +1,200 @@
+//! Drawing with no more Gaussians than a camera's pixels resolve.
+
+use flyrig_body::Part;
+use flyrig_gpu::{GpuContext, GpuError};
+use flyrig_types::{Camera, Pose, RenderedView};
+use glam::DVec3;
+
+use crate::{Avatar, AvatarScene, Bones};
+
+/// Distance between Gaussians that are not worth telling apart, pixels.
+const FINE_PX: f64 = 0.8;
+/// Halvings of the number of Gaussians at most, and the least number that is halved.
+const MOST_LEVELS: usize = 5;
+const LEAST_GAUSSIANS: usize = 2000;
+/// Surface that may lie before the joints, metres.
+const AROUND_JOINTS_M: f64 = 0.2;
+
+/// Draws one avatar, in small images with fewer Gaussians.
+#[derive(Debug)]
+pub struct DetailedScene {
+    gpu: GpuContext,
+    /// From the finest; the others are made when they are needed.
+    levels: Vec<Level>,
+    is_detailed: bool,
+    /// Bones, and translations of the graph's nodes.
+    posed: Option<(Bones, Option<Vec<DVec3>>)>,
+    /// The joints' places in the world.
+    joints: Vec<DVec3>,
+    /// Level of the last view.
+    drawn: usize,
+}
+
+#[derive(Debug)]
+struct Level {
+    avatar: Avatar,
+    scene: AvatarScene,
+    spacing_m: f64,
+    is_posed: bool,
+}
+
+impl Level {
+    fn new(gpu: &GpuContext, avatar: Avatar) -> Result<Self, GpuError> {
+        let spacing_m = (avatar.template.area_m2() / avatar.gaussians().max(1) as f64).sqrt();
+        Ok(Self { scene: AvatarScene::new(gpu, &avatar)?, avatar, spacing_m, is_posed: false })
+    }
+}
+
+impl DetailedScene {
+    /// Takes an avatar over. Without `is_detailed` every view is drawn with all Gaussians.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn new(gpu: &GpuContext, avatar: Avatar, is_detailed: bool) -> Result<Self, GpuError> {
+        let levels = vec![Level::new(gpu, avatar)?];
+        Ok(Self { gpu: gpu.clone(), levels, is_detailed, posed: None, joints: Vec::new(), drawn: 0 })
+    }
+
+    /// The avatar with all Gaussians.
+    #[must_use]
+    pub fn avatar(&self) -> &Avatar {
+        &self.levels[0].avatar
+    }
+
+    /// Poses the avatar for the views to come; `translations` as in [`Avatar::pose`].
+    pub fn pose(&mut self, pose: &Pose, translations: Option<&[DVec3]>) {
+        let skeleton = &self.levels[0].avatar.template.skeleton;
+        self.joints = skeleton.world_from_joint(pose).iter().map(|joint| joint.w_axis.truncate()).collect();
+        self.posed = Some((Bones::new(skeleton, pose), translations.map(<[DVec3]>::to_vec)));
+        self.levels.iter_mut().for_each(|level| level.is_posed = false);
+    }
+
+    /// Draws the avatar as a camera sees it, at its size; straight alpha. Before the first pose nothing is there.
+    ///
+    /// # Errors
+    /// [`GpuError`].
+    pub fn draw(&mut self, camera: &Camera) -> Result<RenderedView, GpuError> {
+        self.drawn = self.level_for(camera)?;
+        let level = &mut self.levels[self.drawn];
+        if let Some((bones, translations)) = self.posed.as_ref().filter(|_| !level.is_posed) {
+            level.scene.pose(&level.avatar, bones, translations.as_deref());
+            level.is_posed = true;
+        }
+        level.scene.draw(camera)
+    }
+
+    /// The coarsest level whose Gaussians lie closer than the nearest pixels of a camera.
+    fn level_for(&mut self, camera: &Camera) -> Result<usize, GpuError> {
+        if !self.is_detailed {
+            return Ok(0);
+        }
+        let depths =
+            self.joints.iter().map(|joint| camera.camera_from_world.transform_point(*joint).z - AROUND_JOINTS_M);
+        let depth_m = depths.fold(f64::INFINITY, f64::min);
+        let allowed_m = FINE_PX * depth_m / camera.intrinsics.focal_px.max_element();
+        if !allowed_m.is_finite() || allowed_m <= 0.0 {
+            return Ok(0);
+        }
+        let mut level = 0;
+        while level < MOST_LEVELS {
+            if self.levels.len() == level + 1 {
+                let finer = &self.levels[level].avatar;
+                // About half as many: not made unless it is likely to be drawn.
+                if finer.gaussians() < LEAST_GAUSSIANS || self.levels[level].spacing_m * 1.3 > allowed_m {
+                    break;
+                }
+                let coarser = Level::new(&self.gpu, finer.coarser())?;
+                self.levels.push(coarser);
+            }
+            if self.levels[level + 1].spacing_m > allowed_m {
+                break;
+            }
+            level += 1;
+        }
+        Ok(level)
+    }
+
+    /// [`AvatarScene::part_box`] by the Gaussians of the last view.
+    #[must_use]
+    pub fn part_box(&self, parts: &[Part], camera: &Camera, margin_px: f64) -> Option<[u32; 4]> {
+        let level = &self.levels[self.drawn];
+        level.scene.part_box(&level.avatar, parts, camera, margin_px)
+    }
+
+    /// Returns the Gaussians of the last view, and how many of them it left out as they face away.
+    #[must_use]
+    pub fn drawn(&self) -> (usize, usize) {
+        let level = &self.levels[self.drawn];
+        (level.avatar.gaussians(), level.scene.hidden())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_types::{Intrinsics, Isometry};
+
+    use super::*;
+    use crate::avatar::tests::small;
+
+    fn camera(pixels: u32, away_m: f64) -> Camera {
+        Camera {
+            id: "view".into(),
+            intrinsics: Intrinsics::pinhole(pixels, pixels, 1.4 * f64::from(pixels)),
+            camera_from_world: Isometry::look_at(DVec3::new(0.0, 0.9, away_m), DVec3::new(0.0, 0.9, 0.0), DVec3::Y),
+            time_offset_nanos: 0,
+            color: Default::default(),
+        }
+    }
+
+    #[test]
+    fn small_images_get_fewer_gaussians_and_look_the_same() {
+        let mut avatar = small(12_000, 7);
+        let order = avatar.parameters.order();
+        // Stripes of a hand's width.
+        for (i, place) in avatar.places.iter().enumerate() {
+            let value = if (place.y * 10.0).fract() < 0.5 { 0.6 } else { 0.2 };
+            avatar.parameters.harmonics[i * order.coefficients()] = [value, value, 1.0, 0.0];
+        }
+        let gpu = flyrig_gpu::testing::device().on_processor();
+        let pose = avatar.template.skeleton.rest_pose();
+        let mut all = DetailedScene::new(&gpu, avatar.clone(), false).unwrap();
+        let mut some = DetailedScene::new(&gpu, avatar, true).unwrap();
+        all.pose(&pose, None);
+        some.pose(&pose, None);
+        let mut before = usize::MAX;
+        for (pixels, levels) in [(512, 0..1), (96, 1..4), (48, 2..6)] {
+            let camera = camera(pixels, 3.6);
+            let (expected, found) = (all.draw(&camera).unwrap(), some.draw(&camera).unwrap());
+            assert_eq!(all.drawn().0, 12_000);
+            let (drawn, _) = some.drawn();
+            assert!(levels.contains(&some.drawn) && drawn < before, "{pixels} {drawn} level {}", some.drawn);
+            before = drawn;
+            let squares = expected.rgba.iter().zip(&found.rgba).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2));
+            let decibels = -10.0 * (squares.sum::<f64>() / (expected.rgba.len() as f64 * 255.0 * 255.0)).log10();
+            assert!(decibels > 36.0, "{pixels}: {decibels}");
+        }
+        // Back to the large image: the finest level is still posed.
+        assert_eq!(all.draw(&camera(512, 3.6)).unwrap().rgba, some.draw(&camera(512, 3.6)).unwrap().rgba);
+    }
+
+    #[test]
+    fn behind_the_camera_and_before_the_first_pose_nothing_is_there() {
+        let gpu = flyrig_gpu::testing::device().on_processor();
+        let avatar = small(3000, 7);
+        let pose = avatar.template.skeleton.rest_pose();
+        let mut scene = DetailedScene::new(&gpu, avatar, true).unwrap();
+        let is_empty = |view: &RenderedView| view.rgba.chunks_exact(4).all(|pixel| pixel[3] == 0);
+        assert!(is_empty(&scene.draw(&camera(64, 3.0)).unwrap()));
+        scene.pose(&pose, None);
+        assert!(!is_empty(&scene.draw(&camera(64, 3.0)).unwrap()));
+        let mut behind = camera(64, -3.0);
+        behind.camera_from_world = Isometry::look_at(DVec3::new(0.0, 0.9, 3.0), DVec3::new(0.0, 0.9, 9.0), DVec3::Y);
+        assert!(is_empty(&scene.draw(&behind).unwrap()));
+        assert_eq!(scene.drawn().0, 3000);
+        // A pose that is not finite.
+        let mut lost = pose;
+        lost.root_translation = DVec3::NAN;
+        scene.pose(&lost, None);
+        assert!(is_empty(&scene.draw(&camera(64, 3.0)).unwrap()));
+    }
+}
