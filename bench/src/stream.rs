@@ -62,8 +62,7 @@ fn run(args: &BenchStreamArgs, gpu: &GpuContext, take: &Take, has_codec: bool) -
         forms.push(Box::new(Stream::new(step)));
     }
     if let Some(avatar) = &take.avatar {
-        forms.push(Box::new(AvatarPoses::new(avatar, false)));
-        forms.push(Box::new(AvatarPoses::new(avatar, true)));
+        forms.push(Box::new(AvatarPoses::new(avatar)));
     }
     forms.push(Box::new(Packed));
     forms.push(Box::new(Spz));

@@ -100,6 +100,22 @@ pub extern "C" fn colors() -> *const [f32; 4] {
     with(|state| state.page.colors().as_ptr())
 }
 
+/// Address of [`Page::scales`] as of the last [`look`] or [`order`], four floats a Gaussian; 0 while nobody is an avatar.
+#[unsafe(no_mangle)]
+pub extern "C" fn scales() -> *const [f32; 4] {
+    with(|state| address_of(state.page.scales()))
+}
+
+/// Address of [`Page::rotations`], four floats a Gaussian; 0 while nobody is an avatar.
+#[unsafe(no_mangle)]
+pub extern "C" fn rotations() -> *const [f32; 4] {
+    with(|state| address_of(state.page.rotations()))
+}
+
+fn address_of(rows: &[[f32; 4]]) -> *const [f32; 4] {
+    if rows.is_empty() { std::ptr::null() } else { rows.as_ptr() }
+}
+
 /// [`Page::order`]; returns its address. [`order_length`] is valid afterwards.
 #[unsafe(no_mangle)]
 pub extern "C" fn order(width: u32, height: u32) -> *const u32 {

@@ -1,12 +1,11 @@
 //! The order in which Gaussians are drawn.
 
 use flyrig_types::Camera;
+use flyrig_viewing::{BACKFACING_COSINE, faces_away};
 use glam::{DVec3, Vec3, Vec4};
 
 /// Gaussians whose centre is closer to the camera's plane are not drawn, metres; as on the rig.
 const NEAR_M: f32 = 0.05;
-/// Gaussians are not drawn when the cosine between their normal and the line of sight is above this; as on the rig.
-const BACKFACING_COSINE: f32 = 0.35;
 /// Steps of depth; equal ones keep the order of the Gaussians.
 const STEPS: usize = 1 << 16;
 
@@ -19,22 +18,32 @@ pub struct DrawOrder {
 }
 
 impl DrawOrder {
-    /// Sorts by depth, to 1/65536 of the depth of the whole scene. Gaussians that face away, lie behind the camera or hold numbers
-    /// that are not finite are left out.
+    /// Sorts isotropic Gaussians as [`Self::sort_shown`] does; those that face away or have a normal that is not finite are left out.
     pub fn sort(&mut self, camera: &Camera, center_scale: &[[f32; 4]], normals: &[[f32; 4]]) -> &[u32] {
+        let count = center_scale.len().min(normals.len());
+        self.sort_shown(camera, &center_scale[..count], |index, sight| {
+            let normal = Vec3::from_slice(&normals[index]);
+            normal.is_finite() && !faces_away(normal, sight, BACKFACING_COSINE)
+        })
+    }
+
+    /// Sorts by depth, to 1/65536 of the depth of the whole scene, the Gaussians that `is_shown` keeps by their index and the line of
+    /// sight to their centre. Those that lie behind the camera or hold numbers that are not finite are left out.
+    pub fn sort_shown(
+        &mut self,
+        camera: &Camera,
+        center_scale: &[[f32; 4]],
+        is_shown: impl Fn(usize, Vec3) -> bool,
+    ) -> &[u32] {
         let eye = camera.position().as_vec3();
         let ahead = (camera.camera_from_world.rotation.inverse() * DVec3::Z).as_vec3();
         self.seen.clear();
         let (mut least, mut most) = (f32::INFINITY, f32::NEG_INFINITY);
-        for (index, (center, normal)) in center_scale.iter().zip(normals).enumerate() {
-            let (center, normal) = (Vec4::from(*center), Vec3::from_slice(normal));
+        for (index, center) in center_scale.iter().enumerate() {
+            let center = Vec4::from(*center);
             let sight = center.truncate() - eye;
             let depth = sight.dot(ahead);
-            let along = normal.dot(sight);
-            let faces_away = along > 0.0
-                && along * along
-                    > BACKFACING_COSINE * BACKFACING_COSINE * normal.length_squared() * sight.length_squared();
-            if center.is_finite() && normal.is_finite() && center.w > 0.0 && depth >= NEAR_M && !faces_away {
+            if center.is_finite() && center.w > 0.0 && depth >= NEAR_M && is_shown(index, sight) {
                 (least, most) = (least.min(depth), most.max(depth));
                 self.seen.push((index as u32, depth));
             }

@@ -2,9 +2,9 @@
 
 use std::{fmt, sync::Arc};
 
-use flyrig_stream::{Posed, StreamError, StreamTemplate};
+use flyrig_stream::{Posed, PosedAxes, StreamError, StreamTemplate};
 use flyrig_types::{Camera, Rig};
-use flyrig_viewing::{Navigation, People, Taken};
+use flyrig_viewing::{Ellipsoids, Navigation, People, Taken};
 use glam::DVec3;
 
 use crate::DrawOrder;
@@ -70,6 +70,9 @@ pub struct Page {
     /// The rig's frame number of the first person's motion.
     frame: u64,
     posed: Posed,
+    axes: PosedAxes,
+    /// Shapes of the Gaussians; empty while nobody is an avatar.
+    ellipsoids: Ellipsoids,
     order: DrawOrder,
     camera: [f32; CAMERA_FLOATS],
 }
@@ -143,6 +146,9 @@ impl Page {
         for list in [&mut self.centers, &mut self.normals, &mut self.colors] {
             list.clear();
         }
+        self.ellipsoids.clear();
+        let is_avatar = |number: u32| self.people.get(number).is_some_and(|person| person.template().is_avatar());
+        let has_avatar = motions.iter().any(|((number, ..), _)| is_avatar(*number));
         for ((number, ..), motion) in &motions {
             let Some(person) = self.people.get_mut(*number) else { continue };
             let colors = person.pose(motion, &mut self.posed);
@@ -152,6 +158,10 @@ impl Page {
             self.centers.extend_from_slice(&self.posed.center_scale[..count]);
             self.normals.extend_from_slice(&self.posed.normal[..count]);
             self.colors.extend_from_slice(&colors[..count]);
+            if has_avatar {
+                let axes = person.pose_axes(motion, &mut self.axes).then_some(&self.axes);
+                self.ellipsoids.push(&self.posed.center_scale[..count], &colors[..count], axes);
+            }
         }
         self.frame = motions.first().map_or(0, |(_, motion)| motion.stamp.frame);
         self.shown = shown;
@@ -160,13 +170,16 @@ impl Page {
 
     /// Returns the indices of the Gaussians to draw into an image of this size, farthest first; nothing before the rig is known.
     pub fn order(&mut self, width: u32, height: u32) -> &[u32] {
-        match self.look(width, height) {
-            Some(camera) => self.order.sort(&camera, &self.centers, &self.normals),
-            None => &[],
+        let Some(camera) = self.look(width, height) else { return &[] };
+        if self.ellipsoids.is_empty() {
+            return self.order.sort(&camera, &self.centers, &self.normals);
         }
+        let seen = self.ellipsoids.seen();
+        self.order.sort_shown(&camera, &self.centers, |index, _| seen.get(index).is_some_and(|shape| shape[3] > 0.0))
     }
 
-    /// Returns the camera for an image of this size and keeps its numbers ([`Self::camera`]); nothing before the rig is known.
+    /// Returns the camera for an image of this size and keeps its numbers ([`Self::camera`]) and the shapes that it sees
+    /// ([`Self::scales`]); nothing before the rig is known.
     pub fn look(&mut self, width: u32, height: u32) -> Option<Camera> {
         let navigation = self.navigation.as_ref()?;
         let camera = navigation.camera(width.clamp(1, 16_384), height.clamp(1, 16_384));
@@ -180,6 +193,7 @@ impl Page {
         for (to, from) in self.camera[16..].iter_mut().zip(rest) {
             *to = from as f32;
         }
+        self.ellipsoids.seen_from(camera.position().as_vec3(), &self.centers, &self.normals);
         Some(camera)
     }
 
@@ -205,6 +219,19 @@ impl Page {
     #[must_use]
     pub fn colors(&self) -> &[[f32; 4]] {
         &self.colors
+    }
+
+    /// Standard deviations along the axes of each Gaussian, metres, and its opacity, 0 for one that faces away from the camera of the last
+    /// [`Self::look`] or [`Self::order`]; empty while nobody is an avatar.
+    #[must_use]
+    pub fn scales(&self) -> &[[f32; 4]] {
+        self.ellipsoids.seen()
+    }
+
+    /// Unit quaternion x, y, z, w of each Gaussian, world from its axes; empty while nobody is an avatar, and all Gaussians are isotropic.
+    #[must_use]
+    pub fn rotations(&self) -> &[[f32; 4]] {
+        self.ellipsoids.rotations()
     }
 
     /// The viewpoint, once the rig is known.

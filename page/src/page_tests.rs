@@ -1,5 +1,6 @@
 use flyrig_stream::{
-    ColorEncoder, ColorSettings, EncodedTemplate, Motion, MotionEncoder, Stamp, StreamJoint, TemplateSource,
+    AvatarGaussian, AvatarSource, ColorEncoder, ColorSettings, EncodedTemplate, LIGHT_TERMS, Motion, MotionEncoder,
+    Stamp, StreamJoint, TemplateSource,
 };
 use flyrig_types::{Camera, Intrinsics, Isometry};
 
@@ -8,14 +9,37 @@ use super::*;
 const GAUSSIANS: usize = 60;
 
 fn template(size: f32) -> EncodedTemplate {
+    encode(size, [-1.0, -1.0], |source| source.encode())
+}
+
+/// Of needles that lie in all directions; every other one faces away from the cameras.
+fn avatar() -> EncodedTemplate {
+    let gaussians: Vec<AvatarGaussian> = (0..GAUSSIANS)
+        .map(|i| AvatarGaussian {
+            scale_m: [0.02, 0.004, 0.001 + 1e-4 * i as f32],
+            opacity: 0.8,
+            rotation: [(i as f32).sin(), (2.0 * i as f32).cos(), 0.3, 0.5],
+            color: [0.5, 0.2, 0.1],
+        })
+        .collect();
+    let mut light = [[0.0; 3]; LIGHT_TERMS];
+    light[0] = [1.0; 3];
+    encode(1.0, [-1.0, 1.0], |template| AvatarSource { template, gaussians: &gaussians, light }.encode())
+}
+
+/// `facing`: y of the normals of every other Gaussian.
+fn encode(
+    size: f32,
+    facing: [f32; 2],
+    finish: impl Fn(TemplateSource<'_>) -> Result<EncodedTemplate, StreamError>,
+) -> EncodedTemplate {
     let rows = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
     let joints = [StreamJoint { parent: None, translation: [0.0; 3], joint_from_canonical: rows }];
     let center_scale: Vec<[f32; 4]> = (0..GAUSSIANS).map(|i| [size * i as f32 / 60.0, 0.0, 0.0, 0.01]).collect();
     let skin = vec![([0; 4], [1.0, 0.0, 0.0, 0.0]); GAUSSIANS];
-    let normals = vec![[0.0, -1.0, 0.0]; GAUSSIANS];
+    let normals: Vec<[f32; 3]> = (0..GAUSSIANS).map(|i| [0.0, facing[i % 2], 0.0]).collect();
     let (center_scale, normals, skin) = (&center_scale, &normals, &skin);
-    let source = TemplateSource { joints: &joints, center_scale, normals, skin, node_weights: &[], nodes: &[] };
-    source.encode().unwrap()
+    finish(TemplateSource { joints: &joints, center_scale, normals, skin, node_weights: &[], nodes: &[] }).unwrap()
 }
 
 fn motion(template: &EncodedTemplate, frame: u64, x: f32) -> Vec<u8> {
@@ -144,4 +168,55 @@ fn damaged_messages_are_refused_and_change_nothing() {
     let error = page.take(MessageKind::Rig, 0, rig.as_bytes(), 0.0).unwrap_err().to_string();
     assert!(error.starts_with("the rig's calibration is damaged"), "{error}");
     assert_eq!(MessageKind::of(4), None);
+}
+
+#[test]
+fn an_avatar_has_the_axes_of_its_template_and_hides_what_faces_away() {
+    let (mut page, encoded, plain) = (page(), avatar(), template(1.0));
+    page.take(MessageKind::Template, 0, &encoded.bytes, 0.0).unwrap();
+    let bytes = motion(&encoded, 1, 0.5);
+    page.take(MessageKind::Motion, 0, &bytes, 0.0).unwrap();
+    assert_eq!(page.pose(0.0, false), (true, true));
+    assert!(page.is_complete());
+    let received = Motion::decode(&bytes, &encoded.template).unwrap();
+    let (mut posed, mut axes) = (Posed::default(), PosedAxes::default());
+    encoded.template.pose(&received, &mut posed);
+    assert!(encoded.template.pose_axes(&received, &mut axes));
+    assert_eq!((page.rotations(), page.centers()), (axes.rotation.as_slice(), posed.center_scale.as_slice()));
+    let mut order = page.order(640, 480).to_vec();
+    order.sort_unstable();
+    let toward: Vec<u32> = (0..GAUSSIANS as u32).filter(|&i| posed.normal[i as usize][1] < 0.0).collect();
+    assert!(order == toward && toward.len() == GAUSSIANS / 2, "{order:?}");
+    for (i, (scales, whole)) in page.scales().iter().zip(&axes.scale_opacity).enumerate() {
+        let opacity = if order.contains(&(i as u32)) { whole[3] } else { 0.0 };
+        let expected = [whole[0], whole[1], whole[2], opacity];
+        assert_eq!(scales.map(f32::to_bits), expected.map(f32::to_bits), "{i}");
+    }
+
+    // From behind, the others; beside somebody who is no avatar, both.
+    let from_behind = page.navigation().map(|view| view.orbit(std::f64::consts::PI, 0.0)).and(page.look(640, 480));
+    assert!(from_behind.unwrap().position().y > 1.0);
+    let mut order = page.order(640, 480).to_vec();
+    order.sort_unstable();
+    assert!(order.len() == GAUSSIANS / 2 && order.iter().all(|i| !toward.contains(i)), "{order:?}");
+    page.take(MessageKind::Template, 1, &plain.bytes, 0.0).unwrap();
+    page.take(MessageKind::Motion, 1, &motion(&plain, 1, 0.5), 0.0).unwrap();
+    page.take(MessageKind::Motion, 0, &motion(&encoded, 2, 0.5), 0.1).unwrap();
+    let mut colors = ColorEncoder::new(&plain, ColorSettings::default(), 7);
+    for layer in &colors.encode(Stamp::default(), &[[0.5, 0.2, 0.1, 1.0]; GAUSSIANS]) {
+        page.take(MessageKind::Colors, 1, layer, 0.0).unwrap();
+    }
+    page.pose(0.1, false);
+    page.look(640, 480).unwrap();
+    assert!(page.rotations().len() == 2 * GAUSSIANS && page.rotations()[..GAUSSIANS] == axes.rotation[..]);
+    let ([x, y, z, _], size) = (page.scales()[GAUSSIANS], page.centers()[GAUSSIANS][3]);
+    assert_eq!(([x, y, z], page.rotations()[GAUSSIANS]), ([size; 3], [0.0, 0.0, 0.0, 1.0]));
+
+    // Without the avatar nothing has axes.
+    page.forget_people();
+    page.take(MessageKind::Template, 1, &plain.bytes, 0.2).unwrap();
+    page.take(MessageKind::Motion, 1, &motion(&plain, 2, 0.5), 0.2).unwrap();
+    page.pose(0.2, false);
+    page.look(640, 480).unwrap();
+    assert!(!page.centers().is_empty() && page.rotations().is_empty() && page.scales().is_empty());
 }

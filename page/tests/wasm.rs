@@ -2,7 +2,10 @@
 #![allow(clippy::unwrap_used)] // a test may fail by panicking, in its helpers too
 
 use flyrig_page::{CAMERA_FLOATS, MessageKind, Page};
-use flyrig_stream::{ColorEncoder, ColorSettings, Motion, MotionEncoder, Stamp, StreamJoint, TemplateSource};
+use flyrig_stream::{
+    AvatarGaussian, AvatarSource, ColorEncoder, ColorSettings, LIGHT_TERMS, Motion, MotionEncoder, Stamp, StreamJoint,
+    TemplateSource,
+};
 use flyrig_types::{Camera, Intrinsics, Isometry, Rig};
 use glam::DVec3;
 use wasmi::{Engine, Instance, Linker, Module, Store, WasmParams, WasmResults};
@@ -73,6 +76,16 @@ fn the_shipped_module_decodes_poses_and_sorts_as_this_crate_does() {
     let (center_scale, normals, skin) = (&center_scale, &normals, &skin);
     let source = TemplateSource { joints: &joints, center_scale, normals, skin, node_weights: &[], nodes: &[] };
     let encoded = source.encode().unwrap();
+    let gaussians: Vec<AvatarGaussian> = (0..GAUSSIANS)
+        .map(|_| AvatarGaussian {
+            scale_m: [0.01 * random().abs(), 0.01, 0.002],
+            opacity: random().abs(),
+            rotation: [random(), random(), random(), random()],
+            color: [random().abs(), random().abs(), random().abs()],
+        })
+        .collect();
+    let avatar =
+        AvatarSource { template: source, gaussians: &gaussians, light: [[0.5; 3]; LIGHT_TERMS] }.encode().unwrap();
     let colors: Vec<[f32; 4]> = (0..GAUSSIANS).map(|_| [random().abs(), random().abs(), random().abs(), 1.0]).collect();
     let camera = Camera {
         time_offset_nanos: 0,
@@ -133,6 +146,27 @@ fn the_shipped_module_decodes_poses_and_sorts_as_this_crate_does() {
         }
     }
     assert_eq!(shipped.call::<_, u32>("people", ()), 1 | 256);
+    assert_eq!((shipped.call::<_, u32>("rotations", ()), shipped.call::<_, u32>("scales", ())), (0, 0));
+
+    // An avatar beside the same person.
+    let stamp = Stamp { frame: 4, capture_nanos: 160_000_000, person: 2, ..Stamp::default() };
+    let joint_rotations = vec![[0.0, 0.0, 0.1, 0.995], [0.1, 0.0, 0.0, 0.995]];
+    let motion = Motion { stamp, root_translation: [1.0, 0.0, 1.0], joint_rotations, nodes: Vec::new() };
+    let motion = MotionEncoder::new(&avatar).encode(&motion).unwrap();
+    for (kind, bytes) in [(1, &avatar.bytes), (2, &motion)] {
+        ours.take(MessageKind::of(kind).unwrap(), 2, bytes, 0.16).unwrap();
+        assert_eq!(shipped.take(kind, 2, bytes, 0.16), 0);
+    }
+    ours.pose(0.16, false);
+    ours.look(640, 480).unwrap();
+    assert_eq!(shipped.call::<_, u32>("pose", (0.16, 0u32)), 2 * GAUSSIANS as u32);
+    assert_eq!(shipped.call::<_, u32>("look", (640u32, 480u32)), 1);
+    let (rotations, scales) = (shipped.call("rotations", ()), shipped.call("scales", ()));
+    assert_eq!(shipped.read::<Bits>(rotations, 8 * GAUSSIANS), bits(ours.rotations()));
+    let (found, expected) = (shipped.read::<Bits>(scales, 8 * GAUSSIANS), bits(ours.scales()));
+    // At the limit, the libraries' sines decide who faces away.
+    let differ = found.iter().zip(&expected).filter(|(a, b)| a != b).count();
+    assert!(differ <= 4 && expected.iter().filter(|bits| bits.0 == 0).count() > GAUSSIANS / 8, "{differ} differ");
 
     // What is damaged is refused in words; what is too long gets no memory.
     assert_eq!(shipped.take(2, 1, b"FLM", 0.2), 1);

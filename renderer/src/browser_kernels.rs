@@ -3,17 +3,18 @@
 use std::mem::offset_of;
 
 use crate::raster_buffers::{MIN_PAIRS, PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE};
-use crate::raster_kernels::{BINS_LANES, Frame, Tile, bins_wgsl, blend_wgsl, project_wgsl};
+use crate::raster_kernels::{BINS_LANES, Frame, Tile, bins_wgsl, blend_wgsl, project_anisotropic_wgsl, project_wgsl};
 use crate::scan::{SEGMENTS, scan_wgsl};
 use crate::sort::{BLOCK, DIGIT_BITS, KEY_BITS, sort_wgsl};
 use crate::{Outputs, RasterSettings};
 
-/// WGSL and numbers for a host that draws isotropic Gaussians as [`crate::Rasterizer`] does on a device, colour and alpha only.
+/// WGSL and numbers for a host that draws Gaussians as [`crate::Rasterizer`] does on a device, colour and alpha only: isotropic ones, or
+/// anisotropic ones of one colour each, which the host hands to `blend` in place of what `raster_paint.wgsl` would write.
 /// Bindings and their order are those of `raster_device.rs`; no entry point binds more than 8 storage buffers.
 #[derive(Debug, Clone)]
 pub struct BrowserKernels {
     /// Name and WGSL of each module.
-    pub modules: [(&'static str, String); 5],
+    pub modules: [(&'static str, String); 6],
     /// Name and value of the numbers that the host needs: workgroup sizes, room for pairs, settings of the drawing.
     pub numbers: [(&'static str, f64); 11],
     /// Name and byte offset of the fields of an image's constants, and their size. The matrix of the camera is first.
@@ -29,6 +30,7 @@ impl BrowserKernels {
         Self {
             modules: [
                 ("project", project_wgsl(tile)),
+                ("projectAxes", project_anisotropic_wgsl(tile)),
                 ("bins", bins_wgsl()),
                 ("scan", scan_wgsl()),
                 ("sort", sort_wgsl()),

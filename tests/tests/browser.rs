@@ -8,15 +8,18 @@ use std::{
     collections::BTreeMap,
     io::{Read as _, Write as _},
     net::TcpStream,
+    path::Path,
     process::Command,
     time::{Duration, Instant},
 };
 
 use base64::Engine as _;
 use flyrig_gpu::{AdapterChoice, GpuContext};
-use flyrig_stream::{Motion, Posed};
+use flyrig_renderer::composite_over;
+use flyrig_stream::{Motion, Posed, PosedAxes};
+use flyrig_tests::{Dataset, run, write_dataset};
 use flyrig_transport::TransportConfig;
-use flyrig_viewer::{Receiver, Scene, clock_secs};
+use flyrig_viewer::{Receiver, Scene, ShownPerson, clock_secs};
 use flyrig_viewing::Navigation;
 use serde_json::{Value, json};
 use support::{Process, small_rig, wait_until};
@@ -36,7 +39,7 @@ struct Browser {
 }
 
 impl Browser {
-    fn open(url: &str, folder: &std::path::Path, port: u16, drawing: &[&str]) -> Self {
+    fn open(url: &str, folder: &Path, port: u16, drawing: &[&str]) -> Self {
         let (port_text, profile) =
             (format!("--remote-debugging-port={port}"), format!("--user-data-dir={}/profile", folder.display()));
         let mut args = vec!["--headless=new", "--no-sandbox", "--enable-unsafe-swiftshader", "--hide-scrollbars"];
@@ -86,25 +89,91 @@ fn page_address(port: u16) -> Option<String> {
     page["webSocketDebuggerUrl"].as_str().map(str::to_owned)
 }
 
+/// Options of a browser whose WebGL2 a processor computes.
+const WEBGL2: &[&str] = &["--use-angle=swiftshader"];
+/// The same for WebGPU.
+const WEBGPU: &[&str] = &[
+    "--enable-unsafe-webgpu",
+    "--enable-features=Vulkan",
+    "--use-webgpu-adapter=swiftshader",
+    "--use-angle=swiftshader",
+    "--use-vulkan=swiftshader",
+];
+
 #[test]
 #[ignore = "needs Chromium; make test-browser"]
 fn a_browser_shows_the_person_as_the_rig_draws_it() {
-    let psnr = psnr_of_browser("webgl2", &["--use-angle=swiftshader"]);
+    let psnr = psnr_of_browser(Shown::Person, "webgl2", WEBGL2);
     assert!(psnr > 35.0, "{psnr} dB");
 }
 
 #[test]
 #[ignore = "needs Chromium; make test-browser"]
 fn a_browser_with_webgpu_shows_the_person_as_the_rig_draws_it() {
-    let software = ["--use-webgpu-adapter=swiftshader", "--use-angle=swiftshader", "--use-vulkan=swiftshader"];
-    let psnr =
-        psnr_of_browser("webgpu", &[&["--enable-unsafe-webgpu", "--enable-features=Vulkan"][..], &software].concat());
+    let psnr = psnr_of_browser(Shown::Person, "webgpu", WEBGPU);
     assert!(psnr > 40.0, "{psnr} dB");
+}
+
+#[test]
+#[ignore = "needs Chromium; make test-browser"]
+fn a_browser_shows_an_avatar_as_the_rig_draws_it() {
+    let psnr = psnr_of_browser(Shown::Avatar, "webgl2", WEBGL2);
+    assert!(psnr > 35.0, "{psnr} dB");
+}
+
+#[test]
+#[ignore = "needs Chromium; make test-browser"]
+fn a_browser_with_webgpu_shows_an_avatar_as_the_rig_draws_it() {
+    let psnr = psnr_of_browser(Shown::Avatar, "webgpu", WEBGPU);
+    assert!(psnr > 40.0, "{psnr} dB");
+}
+
+/// Who is shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Shown {
+    /// A simulated person, with colours of each frame.
+    Person,
+    /// The avatar of the person of a data set, once and then poses.
+    Avatar,
+}
+
+impl Shown {
+    fn name(self) -> &'static str {
+        if self == Self::Person { "person" } else { "avatar" }
+    }
+
+    /// Writes `rig.toml` and returns its endpoint, and the data set where there is one.
+    fn configure(self, folder: &Path, web: u16) -> (String, Option<Dataset>) {
+        let file = folder.join("rig.toml");
+        if self == Self::Person {
+            let more = format!("[sim.motion]\nkind = \"still\"\n[web]\nlisten = \"127.0.0.1:{web}\"\n");
+            let endpoint = small_rig("browser", folder, &more);
+            let text = std::fs::read_to_string(&file).unwrap();
+            let text = text.replace("width = 96\nheight = 96\ntexture_px = 128", "width = 384\nheight = 384\nfps = 4");
+            std::fs::write(&file, text.replace("gaussians = 3000", "gaussians = 40000")).unwrap();
+            return (endpoint, None);
+        }
+        let data = write_dataset().unwrap();
+        let take = data.root.to_string_lossy().into_owned();
+        let args = ["avatar", "build", &take, "--inputs", "00,02,04,05", "--frames", "0..4", "--out", "a.flyavatar"];
+        let more = ["--gaussians", "12000", "--nodes", "100", "--steps", "60", "--pose", "given", "--masks", "given"];
+        let built = run(PROGRAM, &[&args[..], &more].concat(), folder).unwrap();
+        assert_eq!(built.code, Some(0), "{built:?}");
+        let endpoint = small_rig("browser", folder, "");
+        let text = std::fs::read_to_string(&file).unwrap();
+        // Six frames that last until the browser has drawn one.
+        let source = format!("[source]\nkind = \"folder\"\npath = {take:?}\nfps = 0.2\n");
+        let text = text.replace("[source]\n", &source);
+        let body = format!("[body]\ntemplate = {:?}\navatar = \"a.flyavatar\"\n", format!("{take}/subject.glb"));
+        let text = text.replace("[body]\n", &body).replace("[output]\n", "[output]\navatar = true\n");
+        std::fs::write(&file, text).unwrap();
+        (endpoint, Some(data))
+    }
 }
 
 /// Returns the PSNR of the page in a browser of these options against the rig's own drawing of the same motion and colours, on the pixels of
 /// the person, dB. The page draws with `drawing`, "webgl2" or "webgpu".
-fn psnr_of_browser(drawing: &str, options: &[&str]) -> f64 {
+fn psnr_of_browser(who: Shown, drawing: &str, options: &[&str]) -> f64 {
     assert!(
         Command::new("chromium").arg("--version").output().is_ok(),
         "chromium is missing: make test-browser installs it"
@@ -112,22 +181,28 @@ fn psnr_of_browser(drawing: &str, options: &[&str]) -> f64 {
     let folder = tempfile::tempdir().unwrap();
     let port = || std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let (web, debugging) = (port(), port());
-    let more = format!("[sim.motion]\nkind = \"still\"\n[web]\nlisten = \"127.0.0.1:{web}\"\n");
-    let endpoint = small_rig("browser", folder.path(), &more);
-    let config = std::fs::read_to_string(folder.path().join("rig.toml")).unwrap();
-    let config = config.replace("width = 96\nheight = 96\ntexture_px = 128", "width = 384\nheight = 384\nfps = 4");
-    std::fs::write(folder.path().join("rig.toml"), config.replace("gaussians = 3000", "gaussians = 40000")).unwrap();
-    let _rig = Process::start(PROGRAM, &["run", "rig.toml"], folder.path(), "run");
+    let (endpoint, _data) = who.configure(folder.path(), web);
+    let start_rig = || Process::start(PROGRAM, &["run", "rig.toml"], folder.path(), "run");
+    let listen = format!("127.0.0.1:{web}");
+    // The data set is short: its rig starts once the browser is there.
+    let _server = match who {
+        Shown::Person => start_rig(),
+        Shown::Avatar => {
+            let args = ["serve", "--connect", &endpoint, "--rig", "browser", "--listen", &listen];
+            Process::start(PROGRAM, &args, folder.path(), "serve")
+        }
+    };
     wait_until("the page", || TcpStream::connect(("127.0.0.1", web)).is_ok());
 
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     let subscriber = TransportConfig { connect: vec![endpoint], ..TransportConfig::subscriber("browser") };
     let receiver = Receiver::start(&subscriber, || {}).unwrap();
     let started = Instant::now();
-    let url = format!("http://127.0.0.1:{web}/?bare&fixed&lowest-latency&camera=00&draw={drawing}");
+    let url = format!("http://{listen}/?bare&fixed&lowest-latency&camera=00&draw={drawing}");
     let mut browser = Browser::open(&url, folder.path(), debugging, options);
     let size = json!({ "width": SIDE, "height": SIDE, "deviceScaleFactor": 1, "mobile": false });
     browser.call("Emulation.setDeviceMetricsOverride", &size);
+    let _rig = (who == Shown::Avatar).then(start_rig);
 
     // Motions and colours by frame, as this program received them.
     let mut known: BTreeMap<u64, (Motion, Vec<[f32; 4]>)> = BTreeMap::new();
@@ -174,36 +249,63 @@ fn psnr_of_browser(drawing: &str, options: &[&str]) -> f64 {
     let rig = state.rig.clone().unwrap();
     let mut navigation = Navigation::new(&rig);
     navigation.jump(&rig.cameras[0]);
-    let mut posed = Posed::default();
-    state.people.get_mut(0).unwrap().template().pose(motion, &mut posed);
+    let (mut posed, mut axes) = (Posed::default(), PosedAxes::default());
+    let template = state.people.get_mut(0).unwrap().template();
+    template.pose(motion, &mut posed);
+    let has_axes = template.pose_axes(motion, &mut axes);
+    assert_eq!(has_axes, who == Shown::Avatar);
     drop(state);
     let mut scene = Scene::new(&gpu.fastest()).unwrap();
-    scene.set_people([(&posed, colors.as_slice())]).unwrap();
-    let ours = scene.draw(&navigation.camera(SIDE, SIDE)).unwrap();
+    let mut draw = |axes: Option<&PosedAxes>| {
+        scene.set_people([ShownPerson { posed: &posed, colors, axes }]).unwrap();
+        scene.draw(&navigation.camera(SIDE, SIDE)).unwrap()
+    };
+    let spheres = draw(None);
+    let ours = draw(has_axes.then_some(&axes));
     let behind: Vec<u8> = BACKGROUND.repeat((SIDE * SIDE) as usize);
-    let on_grey = flyrig_renderer::composite_over(&ours.rgba, &behind);
+    let on_grey = composite_over(&ours.rgba, &behind);
 
-    // On the person alone: the background would flatter.
-    let (mut sum, mut count) = (0.0, 0usize);
-    for (pixel, (a, b)) in ours.rgba.chunks_exact(4).zip(on_grey.chunks_exact(3).zip(browsers.as_raw().chunks_exact(3)))
-    {
-        let is_grey = b.iter().zip(BACKGROUND).all(|(b, grey)| b.abs_diff(grey) <= 1);
-        if pixel[3] > 0 || !is_grey {
-            sum += a.iter().zip(b).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum::<f64>();
-            count += 3;
-        }
+    let count = of_person(&ours.rgba, browsers.as_raw()).count();
+    let psnr = psnr_of_person(&ours.rgba, &on_grey, browsers.as_raw());
+    let mut notes = format!("{psnr:.2} dB on {count} pixels of the person");
+    if who == Shown::Avatar {
+        // Drawing spheres would not do.
+        let spheres = composite_over(&spheres.rgba, &behind);
+        let without = psnr_of_person(&ours.rgba, &on_grey, &spheres);
+        notes += &format!(", spheres in place of its Gaussians {without:.2} dB");
+        assert!(without < 35.0 && psnr > without + 5.0, "{notes}");
     }
-    let psnr = -10.0 * (sum / count as f64 / 255.0f64.powi(2)).log10();
-    println!(
-        "{drawing}: a person with all colours {seconds:.1} s after the browser was started; {psnr:.2} dB on {} pixels of the person",
-        count / 3
-    );
+    println!("{drawing}: the {} {seconds:.1} s after the browser was started; {notes}", who.name());
     if let Ok(out) = std::env::var("FLYRIG_TEST_OUT") {
-        browsers.save(format!("{out}/browser-{drawing}.png")).unwrap();
-        image::RgbImage::from_raw(SIDE, SIDE, on_grey).unwrap().save(format!("{out}/rig.png")).unwrap();
+        browsers.save(format!("{out}/{}-{drawing}.png", who.name())).unwrap();
+        image::RgbImage::from_raw(SIDE, SIDE, on_grey).unwrap().save(format!("{out}/{}-rig.png", who.name())).unwrap();
     }
-    assert!(count / 3 > 5000, "{count}");
+    assert!(count > 5000, "{count}");
     psnr
+}
+
+/// Pixels that show the person in either image, of `rgba` and of RGB over the background: the background alone would flatter.
+fn of_person<'a>(rgba: &'a [u8], rgb: &'a [u8]) -> impl Iterator<Item = usize> + 'a {
+    let pixels = rgba.chunks_exact(4).zip(rgb.chunks_exact(3)).enumerate();
+    pixels.filter_map(|(at, (ours, theirs))| {
+        let is_grey = theirs.iter().zip(BACKGROUND).all(|(value, grey)| value.abs_diff(grey) <= 1);
+        (ours[3] > 0 || !is_grey).then_some(at)
+    })
+}
+
+/// PSNR of `theirs` against `on_grey`, which is `ours` over the background, on the pixels of the person, dB.
+fn psnr_of_person(ours: &[u8], on_grey: &[u8], theirs: &[u8]) -> f64 {
+    let (mut sum, mut count) = (0.0, 0usize);
+    for at in of_person(ours, theirs) {
+        let numbers = 3 * at..3 * at + 3;
+        sum += on_grey[numbers.clone()]
+            .iter()
+            .zip(&theirs[numbers])
+            .map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2))
+            .sum::<f64>();
+        count += 3;
+    }
+    -10.0 * (sum / count as f64 / 255.0f64.powi(2)).log10()
 }
 
 #[test]

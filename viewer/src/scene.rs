@@ -5,7 +5,7 @@ use flyrig_renderer::{GaussianBuffers, ViewPainter};
 use flyrig_stream::{Posed, PosedAxes};
 use flyrig_types::{Camera, RenderedView};
 
-use crate::ellipsoids::Ellipsoids;
+use crate::ellipsoids::EllipsoidBuffers;
 
 /// One person to draw.
 #[derive(Debug, Clone, Copy)]
@@ -38,7 +38,7 @@ pub struct Scene {
     painter: ViewPainter,
     gaussians: GaussianBuffers,
     /// In place of those where somebody is an avatar.
-    ellipsoids: Option<Ellipsoids>,
+    ellipsoids: Option<EllipsoidBuffers>,
 }
 
 impl Scene {
@@ -62,7 +62,7 @@ impl Scene {
         let people: Vec<ShownPerson<'_>> = people.into_iter().map(Into::into).collect();
         let has_avatar = people.iter().any(|person| person.axes.is_some());
         let before = self.ellipsoids.take();
-        self.ellipsoids = has_avatar.then(|| Ellipsoids::new(&self.gpu, &people, before)).transpose()?;
+        self.ellipsoids = has_avatar.then(|| EllipsoidBuffers::new(&self.gpu, &people, before)).transpose()?;
         if has_avatar {
             return Ok(());
         }

@@ -4,12 +4,24 @@
 const TEXELS = 1024; // Gaussians in a row of the data textures
 const FILTER_PX2 = 0.1; // RasterSettings::filter_variance_px2
 
-const PROJECT = `#version 300 es
+// Of isotropic Gaussians, or of those of three axes.
+const project = hasAxes => `#version 300 es
 precision highp float;
 precision highp sampler2D;
 uniform sampler2D centers;
 uniform sampler2D colors;
 uniform highp usampler2D order;
+${hasAxes ? `uniform sampler2D scales;
+uniform sampler2D rotations;
+// Columns: the axes of a Gaussian of a unit quaternion, in the world.
+mat3 axes(vec4 q) {
+  vec3 d = q.xyz * q.xyz, w = q.w * q.xyz;
+  float xy = q.x * q.y, yz = q.y * q.z, zx = q.z * q.x;
+  return mat3(
+    1.0 - 2.0 * (d.y + d.z), 2.0 * (xy + w.z), 2.0 * (zx - w.y),
+    2.0 * (xy - w.z), 1.0 - 2.0 * (d.x + d.z), 2.0 * (yz + w.x),
+    2.0 * (zx + w.y), 2.0 * (yz - w.x), 1.0 - 2.0 * (d.x + d.y));
+}` : ""}
 uniform mat4 cameraFromWorld;
 uniform vec3 lens; // focal length and principal point, pixels; pixel centres are at integers
 uniform vec2 size;
@@ -30,8 +42,14 @@ void main() {
   vec3 p = (cameraFromWorld * vec4(center.xyz, 1.0)).xyz;
   float focal = lens.x / p.z;
   vec2 pixel = focal * p.xy + lens.yz;
-  vec3 rowX = vec3(focal, 0.0, -focal * p.x / p.z) * center.w;
-  vec3 rowY = vec3(0.0, focal, -focal * p.y / p.z) * center.w;
+  // Rows of the matrix whose product with its transpose is the covariance.
+  vec3 rowX = vec3(focal, 0.0, -focal * p.x / p.z);
+  vec3 rowY = vec3(0.0, focal, -focal * p.y / p.z);
+  ${hasAxes ? `mat3 alongAxes = mat3(cameraFromWorld) * axes(texelFetch(rotations, at, 0));
+  vec3 scale = texelFetch(scales, at, 0).xyz;
+  rowX = rowX * alongAxes * scale;
+  rowY = rowY * alongAxes * scale;` : `rowX *= center.w;
+  rowY *= center.w;`}
   float xx = dot(rowX, rowX), xy = dot(rowX, rowY), yy = dot(rowY, rowY);
   vec3 normal = cross(rowX, rowY);
   float det = dot(normal, normal);
@@ -112,7 +130,9 @@ export class WebGl2Drawing {
     // Without half floats, 8 bits of sRGB with linear blending.
     this.format = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float")
       ? gl.RGBA16F : gl.SRGB8_ALPHA8;
-    this.splats = program(gl, PROJECT, BLEND);
+    this.splats = program(gl, project(false), BLEND);
+    this.ellipsoids = null; // the same for Gaussians of three axes, once there are some
+    this.hasAxes = false;
     this.compose = program(gl, WHOLE, COMPOSE);
     // No attributes: vertices are numbered. Instances of four vertices would be slow on some drivers, most of all on software.
     this.vertices = gl.createVertexArray();
@@ -121,6 +141,8 @@ export class WebGl2Drawing {
     this.order = { texture: gl.createTexture(), rows: 0 };
     this.centers = { texture: gl.createTexture(), rows: 0 };
     this.colors = { texture: gl.createTexture(), rows: 0 };
+    this.scales = { texture: gl.createTexture(), rows: 0 };
+    this.rotations = { texture: gl.createTexture(), rows: 0 };
     this.four = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
     this.one = [gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, 1];
     this.light = gl.createTexture();
@@ -160,6 +182,17 @@ export class WebGl2Drawing {
   setCenters(centers, normals, count) { this.upload(this.centers, centers, count, this.four); this.reserve(count); }
   setColors(floats, count) { this.upload(this.colors, floats, count, this.four); }
 
+  /** Rotations of the Gaussians' axes; null where all are isotropic. */
+  setRotations(rotations, count) {
+    this.hasAxes = rotations !== null;
+    if (!this.hasAxes) return;
+    this.ellipsoids ??= program(this.gl, project(true), BLEND);
+    this.upload(this.rotations, rotations, count, this.four);
+  }
+
+  /** Standard deviations along the axes; opacities are those of the colours, and `order` leaves out who faces away. */
+  setScales(scales, count) { this.upload(this.scales, scales, count, this.four); }
+
   /** Draws the Gaussians of `order`, farthest first, with a camera of 19 numbers (page/src/page.rs). */
   draw(camera, background, order) {
     const gl = this.gl;
@@ -181,17 +214,18 @@ export class WebGl2Drawing {
     if (order.length > 0 && this.centers.rows > 0 && this.colors.rows > 0) {
       gl.activeTexture(gl.TEXTURE2);
       this.upload(this.order, order, order.length, this.one);
-      gl.useProgram(this.splats.made);
-      gl.activeTexture(gl.TEXTURE1);
-      gl.bindTexture(gl.TEXTURE_2D, this.colors.texture);
-      gl.activeTexture(gl.TEXTURE0);
-      gl.bindTexture(gl.TEXTURE_2D, this.centers.texture);
-      gl.uniform1i(this.splats.place("centers"), 0);
-      gl.uniform1i(this.splats.place("colors"), 1);
-      gl.uniform1i(this.splats.place("order"), 2);
-      gl.uniformMatrix4fv(this.splats.place("cameraFromWorld"), false, camera.subarray(0, 16));
-      gl.uniform3fv(this.splats.place("lens"), camera.subarray(16, 19));
-      gl.uniform2f(this.splats.place("size"), width, height);
+      const splats = this.hasAxes ? this.ellipsoids : this.splats;
+      gl.useProgram(splats.made);
+      gl.uniform1i(splats.place("order"), 2);
+      const lists = this.hasAxes ? [[3, "scales"], [4, "rotations"], [1, "colors"], [0, "centers"]] : [[1, "colors"], [0, "centers"]];
+      for (const [unit, name] of lists) {
+        gl.activeTexture(gl.TEXTURE0 + unit);
+        gl.bindTexture(gl.TEXTURE_2D, this[name].texture);
+        gl.uniform1i(splats.place(name), unit);
+      }
+      gl.uniformMatrix4fv(splats.place("cameraFromWorld"), false, camera.subarray(0, 16));
+      gl.uniform3fv(splats.place("lens"), camera.subarray(16, 19));
+      gl.uniform2f(splats.place("size"), width, height);
       gl.enable(gl.BLEND);
       gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
       gl.drawElements(gl.TRIANGLES, 6 * Math.min(order.length, this.capacity), gl.UNSIGNED_INT, 0);

@@ -22,8 +22,9 @@ fn srgb(linear: vec3<f32>) -> vec3<f32> {
   return vec4(mix(view.background.rgb, person, min(seen.a, 1.0)), 1.0);
 }`;
 
+// Modules and their entry points. A kernel is named after its entry point, or after a module that has only one.
 const ENTRIES = {
-  project: ["project"], bins: ["count_pairs", "keep_pairs", "write_pairs", "end_lists"], scan: ["reduce", "apply"],
+  project: ["project"], projectAxes: ["project"], bins: ["count_pairs", "keep_pairs", "write_pairs", "end_lists"], scan: ["reduce", "apply"],
   sort: ["find_range", "count_digits", "scatter"], blend: ["blend"],
 };
 
@@ -40,7 +41,7 @@ export async function openWebGpu(takesSoftware) {
   await Promise.all(Object.entries(ENTRIES).flatMap(([name, entries]) => {
     const module = device.createShaderModule({ code: modules[name] });
     return entries.map(async entryPoint => {
-      kernels[entryPoint] = await device.createComputePipelineAsync({ layout: "auto", compute: { module, entryPoint } });
+      kernels[entries.length === 1 ? name : entryPoint] = await device.createComputePipelineAsync({ layout: "auto", compute: { module, entryPoint } });
     });
   }));
   return { device, kernels, numbers, frame };
@@ -66,7 +67,8 @@ export class WebGpuDrawing {
     });
     this.buffers = new Map(); // by name
     this.count = 0;
-    this.planned = ""; // count and size that the steps are for
+    this.hasAxes = false;
+    this.planned = ""; // count, size and kind that the steps are for
     this.waiting = 0; // images that the device has not finished
   }
 
@@ -95,6 +97,15 @@ export class WebGpuDrawing {
 
   setColors(colors) { this.write("colors", colors); }
 
+  /** Rotations of the Gaussians' axes; null where all are isotropic. */
+  setRotations(rotations) {
+    this.hasAxes = rotations !== null;
+    if (this.hasAxes) this.write("rotations", rotations);
+  }
+
+  /** Standard deviations along the axes, and opacities as the camera sees them. */
+  setScales(scales) { this.write("scales", scales); }
+
   /** Makes the steps of an image: kernel, bind group, and workgroups or the place in "work" where their number stands. */
   plan(width, height) {
     const { count, kernels, device } = this;
@@ -107,7 +118,8 @@ export class WebGpuDrawing {
 
     const own = {};
     const make = (name, bytes, usage) => { own[name] = this.buffer(name, bytes, usage); };
-    for (const name of ["centers", "normals", "colors"]) make(name, 16 * count);
+    const attributes = ["centers", "normals", "colors", ...(this.hasAxes ? ["scales", "rotations"] : [])];
+    for (const name of attributes) make(name, 16 * count);
     make("splats", 32 * count);
     make("rects", 8 * count);
     make("pairsBefore", 4 * count);
@@ -162,8 +174,10 @@ export class WebGpuDrawing {
 
     const frame = this.frame = constant(new Uint8Array(this.offsets.bytes));
     const { centers, normals, colors, splats, rects, pairsBefore, pairTotal, work } = own;
+    const projected = { 0: frame, 1: centers, 5: splats, 6: rects, 7: own.depthElements };
+    if (this.hasAxes) step("projectAxes", { ...projected, 2: own.scales, 3: own.rotations }, groupsFor(count, 64));
     // No canonical positions are drawn; something must be bound.
-    step("project", { 0: frame, 1: centers, 2: normals, 3: colors, 4: normals, 5: splats, 6: rects, 7: own.depthElements }, groupsFor(count, 64));
+    else step("project", { ...projected, 2: normals, 3: colors, 4: normals }, groupsFor(count, 64));
     const depthLength = constant(new Uint32Array([tableLength(count), 0, 0, 0]));
     const ordered = sort("depth", count, Math.ceil(keyBits / digitBits), true, depthLength, [blocks(count), 1]);
     const visible = own.depthValid, kept = own.listValid;
@@ -214,7 +228,7 @@ export class WebGpuDrawing {
     const { width, height } = this.canvas;
     const encoder = device.createCommandEncoder();
     if (count > 0 && camera[16] > 0) {
-      const wanted = `${count} ${width} ${height}`;
+      const wanted = `${count} ${width} ${height} ${this.hasAxes}`;
       if (this.planned !== wanted) {
         this.plan(width, height);
         this.planned = wanted;

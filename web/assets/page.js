@@ -215,13 +215,21 @@ function tick(time) {
   const count = wasm.pose(now(), interpolates ? 1 : 0);
   const changes = uploaded ? wasm.changes() : 3;
   if (changes === 0 && !dirty) return;
-  wasm.look(width, height);
-  const order = drawing.sorts ? 0 : wasm.order(width, height);
+  let order = 0;
+  if (drawing.sorts) wasm.look(width, height);
+  else order = wasm.order(width, height);
   spent.pose += 0.05 * (performance.now() - start - spent.pose);
   timed("draw", () => {
     // The memory may have moved until here.
-    if (changes & 1) drawing.setCenters(floats(wasm.centers(), 4 * count), floats(wasm.normals(), 4 * count), count);
-    if (changes & 2) drawing.setColors(floats(wasm.colors(), 4 * count), count);
+    const list = address => floats(address, 4 * count);
+    const rotations = wasm.rotations(); // 0 while all Gaussians are isotropic
+    if (changes & 1) {
+      drawing.setCenters(list(wasm.centers()), list(wasm.normals()), count);
+      drawing.setRotations(rotations ? list(rotations) : null, count);
+    }
+    if (changes & 2) drawing.setColors(list(wasm.colors()), count);
+    // Opacities depend on the camera; a drawing that takes the order does without them.
+    if (rotations && (changes & 1 || drawing.sorts)) drawing.setScales(list(wasm.scales()), count);
     const ordered = drawing.sorts ? null : new Uint32Array(wasm.memory.buffer, order, wasm.order_length());
     drawing.draw(floats(wasm.camera(), 19), BACKGROUND, ordered);
   });

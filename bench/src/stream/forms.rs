@@ -102,20 +102,18 @@ pub struct AvatarPoses {
     avatar: Arc<EncodedTemplate>,
     person: StreamPerson,
     encoder: Option<PersonEncoder>,
-    /// Whether it is drawn by isotropic Gaussians, as in a browser.
-    is_round: bool,
 }
 
 impl AvatarPoses {
-    pub fn new(avatar: &Arc<EncodedTemplate>, is_round: bool) -> Self {
+    pub fn new(avatar: &Arc<EncodedTemplate>) -> Self {
         let person = StreamPerson::new(Arc::new(avatar.template.clone()));
-        Self { avatar: Arc::clone(avatar), person, encoder: None, is_round }
+        Self { avatar: Arc::clone(avatar), person, encoder: None }
     }
 }
 
 impl Form for AvatarPoses {
     fn name(&self) -> String {
-        if self.is_round { "avatar, poses, isotropic" } else { "avatar, poses" }.to_owned()
+        "avatar, poses".to_owned()
     }
 
     fn code(&mut self, _at: usize, kept: &Kept) -> Result<Coded> {
@@ -131,7 +129,7 @@ impl Form for AvatarPoses {
         let start = Start::now();
         let (mut posed, mut axes) = (Posed::default(), PosedAxes::default());
         let colors = self.person.pose(&received, &mut posed);
-        let has_axes = !self.is_round && self.person.pose_axes(&received, &mut axes);
+        let has_axes = self.person.pose_axes(&received, &mut axes);
         Ok(Coded {
             posed,
             axes: has_axes.then_some(axes),
