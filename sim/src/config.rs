@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use flyrig_body::{ShapeParams, default_template};
 use serde::{Deserialize, Serialize};
 
 use crate::error::check;
@@ -70,6 +71,8 @@ pub struct PersonConfig {
     pub build: Build,
     /// Whether the body has finger joints, which make gestures. Poses then have 28 more joints.
     pub fingers: bool,
+    /// Shape targets of the body in place of the seed's, all others and the clothes, face and colours being those of the seed.
+    pub shape: ShapeParams,
 }
 
 /// Kind of motion. All but the clips from files are made for the body, need no file, and close without a seam.
@@ -245,6 +248,9 @@ impl SimConfig {
         check("cameras.place_jitter_m", ring.place_jitter_m, 0.0, 0.4, "0 to 0.4 metres")?;
         check("cameras.aim_jitter_deg", ring.aim_jitter_deg, 0.0, 45.0, "0 to 45 degrees")?;
         check("cameras.focal_jitter_percent", ring.focal_jitter_percent, 0.0, 50.0, "0 to 50 percent")?;
+        if !self.person.shape.0.is_empty() {
+            default_template(&self.person.shape).map_err(SimError::Shape)?;
+        }
         self.optics.iter().try_for_each(OpticsConfig::validate)?;
         self.calibration_error.validate()?;
         self.scene.validate(ring.radius_m)?;

@@ -20,6 +20,9 @@ pub enum SimError {
         /// What would be right.
         expected: &'static str,
     },
+    /// A shape target of the person that there is not, or out of its range.
+    #[error("simulation: person.shape: {0}")]
+    Shape(BodyError),
     /// The motion clip is not there.
     #[error("motion clip {} not found; {mend}", path.display())]
     NoClip {

@@ -87,7 +87,8 @@ impl Dice {
 impl Look {
     pub(crate) fn new(config: &SimConfig) -> Self {
         let mut dice = Dice(StdRng::seed_from_u64(config.seed));
-        let (shape, female, age) = body_shape(config, &mut dice);
+        let (mut shape, female, age) = body_shape(config, &mut dice);
+        shape.0.extend(config.person.shape.0.clone());
         let tone = dice.within(0.0, SKINS.len() as f32 - 1.001);
         let (low, t) = (tone as usize, tone.fract());
         let warm = dice.within(-0.015, 0.015);
@@ -351,5 +352,25 @@ fn footwear(dice: &mut Dice) -> Shoes {
         colours,
         sock: if dice.chance(0.4) { white } else { dice.colour(&CLOTHS) },
         sock_m: dice.pick(&[0.0, 0.14, 0.20, 0.36]),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_given_shape_changes_those_targets_alone() {
+        let look = |shape: ShapeParams| {
+            let mut config = SimConfig { seed: 11, ..SimConfig::default() };
+            config.person.shape = shape;
+            Look::new(&config)
+        };
+        let of_seed = look(ShapeParams::default());
+        let mut found = look(ShapeParams::default().with("weight", 0.9).with("stomach-pregnant", 0.5));
+        assert_eq!((found.shape.0["weight"], found.shape.0.remove("stomach-pregnant")), (0.9, Some(0.5)));
+        found.shape.0.insert("weight".to_owned(), of_seed.shape.0["weight"]);
+        assert!((of_seed.shape.0["weight"] - 0.9).abs() > 1e-3);
+        assert_eq!(format!("{found:?}"), format!("{of_seed:?}"));
     }
 }

@@ -23,6 +23,14 @@ fn numbers_out_of_range_are_named_with_their_range() {
     assert!(refusal(|c| c.cameras.radial = [f64::INFINITY, 0.0]).contains("cameras.radial"));
     assert!(refusal(|c| c.cameras.radius_m = -1.0).contains("cameras.radius_m"));
     assert!(refusal(|c| c.motion.turn_secs = f64::NAN).contains("motion.turn_secs"));
+    let shape = |name: &str, weight| {
+        let name = name.to_owned();
+        refusal(move |c| c.person.shape.0.extend([(name.clone(), weight)]))
+    };
+    let unknown = shape("hight", 0.5);
+    assert!(unknown.starts_with("simulation: person.shape: ") && unknown.contains("did you mean height"), "{unknown}");
+    assert!(shape("weight", 1.5).contains("'weight' has the weight 1.5; it must lie in 0..=1"));
+    assert!(shape("weight", f32::NAN).contains("person.shape"));
 }
 
 #[test]
@@ -30,8 +38,10 @@ fn unknown_keys_are_refused_and_defaults_fill_the_rest() {
     let error = toml::from_str::<SimConfig>("seed = 3\nwidht = 640\n").unwrap_err().to_string();
     assert!(error.contains("widht") && error.contains("width"), "{error}");
     assert!(toml::from_str::<SimConfig>("[cameras]\nnumber = 4\n").unwrap_err().to_string().contains("number"));
-    let config: SimConfig =
-        toml::from_str("seed = 3\n[person]\nbuild = \"heavy-man\"\n[motion]\nkind = \"bvh\"\n").unwrap();
+    let config: SimConfig = toml::from_str(
+        "seed = 3\n[person]\nbuild = \"heavy-man\"\nshape = { weight = 0.9 }\n[motion]\nkind = \"bvh\"\n",
+    )
+    .unwrap();
     assert_eq!((config.seed, config.width, config.motion.kind), (3, 512, MotionKind::Bvh));
     let text = toml::to_string(&config).unwrap();
     assert_eq!(toml::from_str::<SimConfig>(&text).unwrap(), config);
