@@ -146,7 +146,7 @@ mod tests {
         let means = average(&view, 2);
         assert_eq!(means.len(), 6);
         assert!((means[0][0] - 0.75).abs() < 1e-12 && (means[1][3] - 1.0).abs() < 1e-12);
-        let (sum, count) = difference(&means, &vec![[1.0; 4]; 6]);
+        let (sum, count) = difference(&means, &[[1.0; 4]; 6]);
         assert!((sum - 3.0 * 0.0625).abs() < 1e-12 && count == 18);
     }
 
