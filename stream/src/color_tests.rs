@@ -138,6 +138,38 @@ fn an_encoder_that_begins_anew_is_followed() {
 }
 
 #[test]
+fn colours_stay_until_an_encoder_that_begins_anew_has_sent_others() {
+    let person = Person::tube(9000, 0);
+    let encoded = person.encode();
+    let mut decoder = ColorDecoder::new(&encoded.template);
+    let colors = person.colors(0.0);
+    let messages = |step: f32, epoch: u32| {
+        ColorEncoder::new(&encoded, ColorSettings { step, ..ColorSettings::default() }, epoch).encode(stamp(0), &colors)
+    };
+    let whole = messages(8.0, 1);
+    for message in whole {
+        decoder.take(&message).unwrap();
+    }
+    let before = rms(&mut decoder, &encoded, &colors);
+    // A message without any segment: nothing is known of the new encoder, and nothing turns grey.
+    let empty = |step: f32, epoch: u32| {
+        let none = ColorSettings { step, max_frame_bytes: 0, ..ColorSettings::default() };
+        ColorEncoder::new(&encoded, none, epoch).encode(stamp(1), &colors)
+    };
+    decoder.take(&empty(8.0, 2)[0]).unwrap();
+    assert_eq!(decoder.known(0), 0.0);
+    assert!((rms(&mut decoder, &encoded, &colors) - before).abs() < 1e-9);
+    for message in messages(8.0, 2) {
+        decoder.take(&message).unwrap();
+    }
+    assert_eq!((decoder.known(0), decoder.known(2)), (1.0, 1.0));
+    assert!((rms(&mut decoder, &encoded, &colors) - before).abs() < 1e-9);
+    // Of other steps the old numbers mean something else.
+    decoder.take(&empty(4.0, 3)[0]).unwrap();
+    assert!(rms(&mut decoder, &encoded, &colors) > 3.0 * before);
+}
+
+#[test]
 fn poisoned_colours_and_sizes_are_no_panic() {
     for count in [1, 2, 5, 33, 1000] {
         let person = Person::tube(count, 0);

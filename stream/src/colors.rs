@@ -287,6 +287,8 @@ pub struct ColorDecoder {
     state: Vec<Levels>,
     values: Vec<Levels>,
     layers: [DecodedLayer; LAYERS],
+    /// Segments of the coarsest layer that have come since the steps were these, from an earlier encoder as well.
+    is_shown: Vec<bool>,
     means: Vec<[f32; 3]>,
 }
 
@@ -311,6 +313,7 @@ impl ColorDecoder {
             epoch: None,
             state: vec![[0; CHANNELS]; tree.coefficients()],
             values: vec![[0; CHANNELS]; tree.coefficients()],
+            is_shown: layer.is_known.clone(),
             layers: core::array::from_fn(|_| layer.clone()),
             means: Vec::new(),
             tree,
@@ -350,6 +353,7 @@ impl ColorDecoder {
             if !*is_known {
                 continue;
             }
+            self.is_shown[segment] |= layer == 0;
             let (state, values) = (&mut self.state, &self.values);
             each_level(&self.tree, &self.steps, layer, segment, |places, _| {
                 add(&values[places.clone()], is_refresh, &mut state[places]);
@@ -358,11 +362,14 @@ impl ColorDecoder {
         Ok(stamp)
     }
 
-    /// The encoder began anew.
+    /// The encoder began anew. Colours of the one before are shown until others come.
     fn begin(&mut self, epoch: u32, step: f32) {
+        if self.step.to_bits() != step.to_bits() {
+            self.steps = self.tree.steps(step);
+            self.state.fill([0; CHANNELS]);
+            self.is_shown.fill(false);
+        }
         (self.epoch, self.step) = (Some(epoch), step);
-        self.steps = self.tree.steps(step);
-        self.state.fill([0; CHANNELS]);
         for layer in &mut self.layers {
             layer.is_known.fill(false);
             layer.sequence = None;
@@ -386,7 +393,7 @@ impl ColorDecoder {
     /// Writes the linear colours, opacity 1, in the template's order. Segments that have not come yet are grey.
     pub fn colors(&mut self, colors: &mut Vec<[f32; 4]>) {
         colors.resize(self.tree.items(), [0.0; 4]);
-        let (state, base, mean_step) = (&self.state, &self.layers[0].is_known, self.steps.mean);
+        let (state, base, mean_step) = (&self.state, &self.is_shown, self.steps.mean);
         let mean = |segment: usize| match base.get(segment) {
             Some(true) => state[segment].map(|v| v as f32 * mean_step),
             _ => [128.0, 0.0, 0.0],
