@@ -73,6 +73,9 @@ impl Fit {
             }
         }
         self.step = progress.done;
+        if let Some(skin) = &self.skin {
+            skin.bake(&mut avatar.skin);
+        }
         if let Some(local) = &mut self.local {
             local.resume(progress.done, &mut avatar.parameters);
         }
@@ -88,6 +91,16 @@ impl Fit {
         all.push(("light".to_owned(), avatar.light.terms.as_flattened_mut()));
         for (number, moment) in self.light.moments.iter_mut().enumerate() {
             all.push((format!("light.{number}"), moment.as_mut_slice()));
+        }
+        if let Some(poses) = &mut self.poses {
+            all.push(("poses".to_owned(), poses.corrections.as_mut_slice()));
+            all.push(("poses.squares".to_owned(), poses.squares.as_mut_slice()));
+        }
+        if let Some(skin) = &mut self.skin {
+            all.push(("skin".to_owned(), skin.factors.as_flattened_mut()));
+            for (k, list) in skin.adam.lists_mut().into_iter().enumerate() {
+                all.push((format!("skin.adam.{k}"), list.as_flattened_mut()));
+            }
         }
         for (number, adam) in self.moments.iter_mut().enumerate() {
             for (k, list) in adam.lists_mut().into_iter().enumerate() {

@@ -7,13 +7,14 @@ use flyrig_renderer::{
     AnisotropicGradients, BackwardRasterizer, HarmonicOrder, ImageGradients, Outputs, RasterSettings, Rasterizer,
     RenderTarget,
 };
-use flyrig_types::Camera;
+use flyrig_types::{Camera, Pose};
 use glam::{DVec3, Vec2};
 use rand::{SeedableRng as _, rngs::StdRng, seq::SliceRandom as _};
 
 use crate::{
     Avatar, AvatarError, Bones, ErrorWeights, ImageError, LocalSettings, PosedAvatar, adam::Adam, light::LightFit,
-    local::Local, neighbors::Neighbors, parameters::Element, scene::AvatarBuffers,
+    local::Local, neighbors::Neighbors, parameters::Element, pose_fit::PoseFit, scene::AvatarBuffers,
+    skin_fit::SkinFit,
 };
 
 /// Images are cut to the person and so many pixels around.
@@ -52,6 +53,10 @@ pub struct FitSettings {
     pub pull: f32,
     /// Whether the room's light is learnt.
     pub light: bool,
+    /// Whether each frame's pose is corrected while the avatar is learnt.
+    pub refine_poses: bool,
+    /// Whether the skin weights are corrected.
+    pub skin_correction: bool,
 }
 
 impl Default for FitSettings {
@@ -66,6 +71,8 @@ impl Default for FitSettings {
             color_rate: [1e-2, 1e-3],
             pull: 5.0,
             light: true,
+            refine_poses: false,
+            skin_correction: false,
         }
     }
 }
@@ -74,7 +81,7 @@ impl Default for FitSettings {
 #[derive(Debug, Clone)]
 pub struct TrainingFrame {
     /// Its pose.
-    pub bones: Bones,
+    pub pose: Pose,
     /// Translations of the graph's nodes, canonical metres; empty without a graph.
     pub translations: Vec<DVec3>,
 }
@@ -162,6 +169,10 @@ pub struct Fit {
     posed: PosedAvatar,
     pub(crate) moments: [Adam; 4],
     pub(crate) light: LightFit,
+    /// None where poses stay as they are.
+    pub(crate) poses: Option<PoseFit>,
+    /// None where skin weights stay as they are.
+    pub(crate) skin: Option<SkinFit>,
     neighbors: Neighbors,
     /// Networks whose outputs the lists are; None where the lists themselves are learnt.
     pub(crate) local: Option<Local>,
@@ -206,6 +217,8 @@ impl Fit {
             targets,
             posed: PosedAvatar::default(),
             light: LightFit::new(),
+            poses: settings.refine_poses.then(|| PoseFit::new(frames.len(), avatar.template.skeleton.joints().len())),
+            skin: settings.skin_correction.then(|| SkinFit::new(&avatar.skin)),
             moments: avatar.parameters.lists().map(|list| Adam::new(list.len())),
             neighbors: Neighbors::new(&avatar.places),
             local: None,
@@ -242,13 +255,20 @@ impl Fit {
         self.views.len()
     }
 
+    /// Returns the pose of a frame as it is corrected so far; None for a frame that does not exist.
+    #[must_use]
+    pub fn pose(&self, frame: usize) -> Option<Pose> {
+        let pose = &self.frames.get(frame)?.pose;
+        Some(self.poses.as_ref().map_or_else(|| pose.clone(), |poses| poses.corrected(frame, pose)))
+    }
+
     /// Descends by one step on the next image; `progress` in 0..=1 is the part of all steps that is done.
     ///
     /// # Errors
     /// [`AvatarError::Gpu`], [`AvatarError::Backward`].
     pub fn step(&mut self, avatar: &mut Avatar, progress: f32) -> Result<StepReport, AvatarError> {
         let view = self.next_view();
-        let error = self.draw(avatar, view)?;
+        let (error, bones) = self.draw(avatar, view)?;
         let view = &self.views[view];
         let Some(Targets { drawn, slopes }) = self.targets.get(&view.size()) else {
             return Err(AvatarError::Images("an image has no target".to_owned()));
@@ -267,10 +287,20 @@ impl Fit {
         )?;
         self.gpu.queue.submit([encoder.finish()]);
         let mut found = read_all(&self.gpu, &self.gradients.attributes())?;
+        self.step += 1;
         if let [centers, scales, rotations, _] = found.as_mut_slice() {
+            if let Some(poses) = &mut self.poses {
+                let slopes = avatar.bone_slopes(&bones, &self.posed, centers, rotations);
+                let pose = (&avatar.template.skeleton, &self.frames[view.frame].pose);
+                poses.descend(view.frame, pose, &slopes, self.step, progress);
+            }
+            if let Some(skin) = &mut self.skin {
+                let mut slopes = avatar.weight_slopes(&bones, &self.posed, centers, rotations);
+                skin.descend(&mut slopes, &self.neighbors, self.step, progress);
+                skin.bake(&mut avatar.skin);
+            }
             self.posed.to_parameters([centers, scales, rotations]);
         }
-        self.step += 1;
         if let Some(colors) = found.last_mut().filter(|_| self.settings.light) {
             let slopes = self.posed.to_light(avatar, colors);
             self.light.descend(&mut avatar.light, &slopes, self.step, progress);
@@ -318,7 +348,7 @@ impl Fit {
     pub fn decibels(&mut self, avatar: &Avatar) -> Result<f64, AvatarError> {
         let mut sum = 0.0;
         for view in 0..self.views.len() {
-            sum += self.draw(avatar, view)?.squared;
+            sum += self.draw(avatar, view)?.0.squared;
         }
         Ok(-10.0 * (sum / self.views.len().max(1) as f64).max(1e-10).log10())
     }
@@ -336,11 +366,14 @@ impl Fit {
         ]
     }
 
-    fn draw(&mut self, avatar: &Avatar, view: usize) -> Result<ImageError, AvatarError> {
+    /// Draws a view and compares it with its image. Returns the bones as well.
+    fn draw(&mut self, avatar: &Avatar, view: usize) -> Result<(ImageError, Bones), AvatarError> {
         let view = &self.views[view];
         let frame = &self.frames[view.frame];
+        let pose = self.pose(view.frame).unwrap_or_else(|| frame.pose.clone());
+        let bones = Bones::new(&avatar.template.skeleton, &pose);
         let translations = (!frame.translations.is_empty()).then_some(frame.translations.as_slice());
-        avatar.pose(&frame.bones, translations, &mut self.posed);
+        avatar.pose(&bones, translations, &mut self.posed);
         self.buffers.pose(&self.gpu, &self.posed);
         let Some(Targets { drawn, .. }) = self.targets.get(&view.size()) else {
             return Err(AvatarError::Images("an image has no target".to_owned()));
@@ -351,7 +384,7 @@ impl Fit {
         self.rasterizer.encode(&self.gpu, &mut encoder, &self.buffers.gaussians, &view.camera, &settings, drawn)?;
         self.gpu.queue.submit([encoder.finish()]);
         let pixels = drawn.color.read(&self.gpu)?;
-        Ok(ImageError::of(&pixels, &view.rgba, view.size()[0] as usize, &self.settings.weights))
+        Ok((ImageError::of(&pixels, &view.rgba, view.size()[0] as usize, &self.settings.weights), bones))
     }
 }
 

@@ -33,6 +33,11 @@ impl Neighbors {
         &self.0
     }
 
+    /// Returns the neighbours of a Gaussian.
+    pub fn of(&self, i: usize) -> &[u32] {
+        self.0.get(i).map_or(&[], |nearest| nearest.as_slice())
+    }
+
     /// Adds the derivatives of a pull to the mean of the neighbours: `weights` times the difference, by column. Rows of one Gaussian are
     /// `stride` apart; the first one counts.
     pub fn pull(&self, values: &[Element], slopes: &mut [Element], stride: usize, weights: Element) {

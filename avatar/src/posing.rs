@@ -37,18 +37,27 @@ impl Bones {
         Self { world_from_canonical: vec![(Mat4::IDENTITY, Quat::IDENTITY); skeleton.joints().len()] }
     }
 
+    /// Returns the bones that move a Gaussian, in the order of its weights.
+    pub(crate) fn influences<'a>(&'a self, skin: &'a SkinWeights) -> impl Iterator<Item = Influence<'a>> {
+        let mut sum = Vec4::ZERO;
+        skin.joints.iter().zip(skin.weights).enumerate().filter_map(move |(slot, (&joint, weight))| {
+            let joint = usize::from(joint);
+            let (matrix, turn) = self.world_from_canonical.get(joint).filter(|_| weight > 0.0)?;
+            let turn = Vec4::from(*turn);
+            // A quaternion and its negative are the same turn.
+            let turn = if sum.dot(turn) < 0.0 { -turn } else { turn };
+            sum += turn * weight;
+            Some(Influence { slot, joint, weight, matrix, turn })
+        })
+    }
+
     /// Blends the bones of a Gaussian: linear part and translation, and rotation. Without any weight it stays at rest.
     fn blend(&self, skin: &SkinWeights) -> (Mat4, Quat) {
         let (mut matrix, mut rotation, mut sum) = (Mat4::ZERO, Vec4::ZERO, 0.0);
-        for (joint, weight) in skin.joints.iter().zip(skin.weights) {
-            let Some((bone, turn)) = self.world_from_canonical.get(usize::from(*joint)).filter(|_| weight > 0.0) else {
-                continue;
-            };
-            matrix += *bone * weight;
-            let turn = Vec4::from(*turn);
-            // A quaternion and its negative are the same turn.
-            rotation += turn * if rotation.dot(turn) < 0.0 { -weight } else { weight };
-            sum += weight;
+        for bone in self.influences(skin) {
+            matrix += *bone.matrix * bone.weight;
+            rotation += bone.turn * bone.weight;
+            sum += bone.weight;
         }
         if sum <= 0.0 {
             return (Mat4::IDENTITY, Quat::IDENTITY);
@@ -57,9 +66,24 @@ impl Bones {
     }
 }
 
+/// A bone that moves a Gaussian.
+pub(crate) struct Influence<'a> {
+    /// Place in the Gaussian's list of weights.
+    pub slot: usize,
+    /// Number of the bone.
+    pub joint: usize,
+    /// Its weight, above 0; those of a Gaussian need not have the sum 1.
+    pub weight: f32,
+    /// World from canonical space.
+    pub matrix: &'a Mat4,
+    /// Quaternion of the same turn, with the sign in which it is blended.
+    pub turn: Vec4,
+}
+
 /// Motion of one Gaussian from canonical space into the world.
 #[derive(Debug, Clone, Copy)]
 struct Place {
+    canonical: Vec3,
     linear: Mat3,
     rotation: Quat,
     /// By which its scales grow where the surface is stretched.
@@ -110,7 +134,7 @@ impl Avatar {
             let center = blend.transform_point3(canonical).extend(0.0).to_array();
             let turned = turn * Quat::from_array(rotation[i]);
             let normal = turn * self.attachments[i].blend(&self.template, &self.template.normals).normalize_or_zero();
-            let place = Place { linear: Mat3::from_mat4(blend), rotation: turn, growth, normal };
+            let place = Place { canonical, linear: Mat3::from_mat4(blend), rotation: turn, growth, normal };
             ((center, [sx, sy, sz, sigmoid(logit)]), (turned.to_array(), place))
         };
         let rows: Vec<_> = (0..self.places.len()).into_par_iter().with_min_len(1024).map(of).collect();
@@ -178,6 +202,11 @@ impl PosedAvatar {
         let Parameters { harmonics, .. } = &avatar.parameters;
         let normal = |i: usize| self.places.get(i).map_or(Vec3::ZERO, |place| place.normal);
         avatar.light.backward(normal, harmonics, slopes, avatar.parameters.order().coefficients())
+    }
+
+    /// Returns the canonical place of each Gaussian that was brought into the world, deformation and offset included, metres.
+    pub(crate) fn canonical(&self) -> impl ExactSizeIterator<Item = Vec3> {
+        self.places.iter().map(|place| place.canonical)
     }
 
     /// Turns derivatives with respect to centres, scales and opacities, and rotations in the world into those of the parameters, in place:

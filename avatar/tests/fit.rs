@@ -8,7 +8,7 @@ use flyrig_avatar::{
 use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
 use flyrig_gpu::{GpuContext, testing::on_both};
 use flyrig_renderer::HarmonicOrder;
-use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
+use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose};
 use glam::{DQuat, DVec2, DVec3};
 
 const SIZE: u32 = 96;
@@ -55,7 +55,7 @@ fn take(gpu: &GpuContext, truth: &Avatar) -> (Vec<TrainingFrame>, Vec<TrainingVi
             let view = scene.draw(&camera).unwrap();
             views.push(TrainingView::cut(frames.len(), &camera, &view.rgba).unwrap());
         }
-        frames.push(TrainingFrame { bones, translations: Vec::new() });
+        frames.push(TrainingFrame { pose, translations: Vec::new() });
     }
     (frames, views)
 }
@@ -92,7 +92,8 @@ fn a_fit_that_was_killed_ends_as_one_that_was_not() {
     for networks in [None, Some(networks)] {
         let begin = || {
             let mut ours = avatar(|_| [0.2; 3], 1500);
-            let mut fit = Fit::new(&gpu, &ours, frames.clone(), views.clone(), FitSettings::default()).unwrap();
+            let settings = FitSettings { refine_poses: true, skin_correction: true, ..FitSettings::default() };
+            let mut fit = Fit::new(&gpu, &ours, frames.clone(), views.clone(), settings).unwrap();
             if let Some(networks) = &networks {
                 fit.use_networks(&mut ours, &[], networks).unwrap();
             }
@@ -133,6 +134,44 @@ fn a_fit_that_was_killed_ends_as_one_that_was_not() {
 }
 
 #[test]
+fn wrong_poses_are_corrected() {
+    let gpu = flyrig_gpu::testing::device().on_processor();
+    let truth = avatar(|i| [[0.5, 0.1, 0.1], [0.1, 0.4, 0.6], [0.6, 0.6, 0.2]][i / 40 % 3], 1500);
+    let (frames, views) = take(&gpu, &truth);
+    let joints = truth.template.skeleton.joints();
+    let arms: Vec<usize> = (0..joints.len()).filter(|i| joints[*i].name.ends_with("Arm")).collect();
+    let hands = ["LeftHand", "RightHand"].map(|name| truth.template.skeleton.joint(name).unwrap());
+    let mut wrong = frames.clone();
+    for (frame, turn) in wrong.iter_mut().zip([0.08, -0.08]) {
+        arms.iter().for_each(|arm| frame.pose.joint_rotations[*arm] *= DQuat::from_rotation_z(turn));
+        frame.pose.root_translation += DVec3::X * turn * 0.2;
+    }
+    let run = |refine_poses: bool| {
+        let mut ours = truth.clone();
+        let settings = FitSettings { refine_poses, skin_correction: false, ..FitSettings::default() };
+        let mut fit = Fit::new(&gpu, &ours, wrong.clone(), views.clone(), settings).unwrap();
+        for step in 0..200 {
+            fit.step(&mut ours, step as f32 / 200.0).unwrap();
+        }
+        // Shoulder and upper arm may share a turn: what counts is where it brings the wrist.
+        let wrists = |pose: &Pose| {
+            let world = truth.template.skeleton.world_from_joint(pose);
+            hands.each_ref().map(|hand| world[*hand].w_axis.truncate())
+        };
+        let mut off = 0.0;
+        for (i, frame) in frames.iter().enumerate() {
+            let (found, right) = (wrists(&fit.pose(i).unwrap()), wrists(&frame.pose));
+            off += found.iter().zip(&right).map(|(found, right)| found.distance(*right)).sum::<f64>() / 4.0;
+        }
+        assert!(fit.pose(frames.len()).is_none());
+        (off, fit.decibels(&ours).unwrap())
+    };
+    let (without, with) = (run(false), run(true));
+    assert!(without.0 > 0.02 && with.0 < 0.4 * without.0, "{without:?} {with:?}");
+    assert!(with.1 > without.1 + 3.0, "{without:?} {with:?}");
+}
+
+#[test]
 fn images_that_show_nobody_and_frames_that_are_missing_are_refused() {
     let gpu = flyrig_gpu::testing::device().on_processor();
     let ours = avatar(|_| [0.2; 3], 1000);
@@ -148,10 +187,7 @@ fn images_that_show_nobody_and_frames_that_are_missing_are_refused() {
     // A broken avatar stays where it is; the image that fills everything is cut to itself.
     let mut broken = ours.clone();
     broken.parameters.shape.fill([f32::NAN; 4]);
-    let frames = vec![TrainingFrame {
-        bones: Bones::new(&ours.template.skeleton, &ours.template.skeleton.rest_pose()),
-        translations: Vec::new(),
-    }];
+    let frames = vec![TrainingFrame { pose: ours.template.skeleton.rest_pose(), translations: Vec::new() }];
     let views = vec![TrainingView::cut(0, &camera(0.0), &all).unwrap()];
     let mut fit = Fit::new(&gpu, &broken, frames, views, FitSettings::default()).unwrap();
     assert!(fit.step(&mut broken, f32::NAN).unwrap().loss.is_finite());

@@ -1,7 +1,7 @@
 //! The person of a take, tracked as live, for an avatar that is fitted to its images.
 
 use anyhow::{Context as _, Result, bail};
-use flyrig_avatar::{Avatar, Bones, KnownPoses, TrainingFrame, TrainingView};
+use flyrig_avatar::{Avatar, KnownPoses, TrainingFrame, TrainingView};
 use flyrig_fusion::{BodySettings, Outcome, PersonId, person_surface};
 use flyrig_renderer::HarmonicOrder;
 use flyrig_types::{Camera, FrameSet};
@@ -52,10 +52,7 @@ impl AvatarTake {
             let cameras = replay.session.viewed(person);
             let cut = |(k, camera)| TrainingView::cut(frames.len(), camera, subject.input(k));
             views.extend(cameras.iter().enumerate().filter_map(cut));
-            frames.push(TrainingFrame {
-                bones: Bones::new(&subject.template().skeleton, pose),
-                translations: subject.node_translations().to_vec(),
-            });
+            frames.push(TrainingFrame { pose: pose.clone(), translations: subject.node_translations().to_vec() });
             poses.push(pose.clone());
             numbers.push(frame_number(&set));
             each(replay, &set)?;

@@ -129,6 +129,12 @@ pub struct BuildArgs {
     /// Whether to learn the light of the take's room apart from the colours.
     #[arg(long, default_value_t = true, action = clap::ArgAction::Set)]
     pub light: bool,
+    /// Whether to correct the poses of the take while the avatar is learnt.
+    #[arg(long, default_value_t = false, action = clap::ArgAction::Set)]
+    pub refine_poses: bool,
+    /// Whether to correct the weights by which the bones move each Gaussian.
+    #[arg(long, default_value_t = false, action = clap::ArgAction::Set)]
+    pub skin_correction: bool,
     /// How the avatar is learnt.
     #[arg(long, value_enum, default_value = "direct")]
     pub method: Method,

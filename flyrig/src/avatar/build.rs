@@ -6,7 +6,7 @@ use std::{
 };
 
 use anyhow::{Context as _, Result, ensure};
-use flyrig_avatar::{AtlasLayout, Avatar, AvatarScene, Card, ErrorWeights, Fit, FitSettings, LocalSettings};
+use flyrig_avatar::{AtlasLayout, Avatar, AvatarScene, Bones, Card, ErrorWeights, Fit, FitSettings, LocalSettings};
 use flyrig_fusion::BodySettings;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
@@ -57,7 +57,7 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
     let mut scene = AvatarScene::new(gpu, &avatar)?;
     let picture_path = args.out.with_extension("png");
     let mut picture = |avatar: &Avatar| -> Result<()> {
-        scene.pose(avatar, &first.bones, Some(&first.translations));
+        scene.pose(avatar, &Bones::new(&avatar.template.skeleton, &first.pose), Some(&first.translations));
         png::write_view(&picture_path, &scene.draw(&camera)?)
     };
     picture(&avatar)?;
@@ -70,6 +70,8 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
             seed: args.seed,
             pull: args.pull,
             light: args.light,
+            refine_poses: args.refine_poses,
+            skin_correction: args.skin_correction,
             weights: ErrorWeights { sharpness: args.sharpen, ..ErrorWeights::default() },
             ..FitSettings::default()
         },
