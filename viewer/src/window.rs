@@ -345,7 +345,9 @@ impl View {
                 false,
             ));
             lines.extend(people_lines(&state, self.shown.people));
-            if !state.people.is_empty() && state.color_layers < LAYERS {
+            // An avatar brings its colours.
+            let are_colors_sent = state.people.iter().any(|(_, person)| !person.template().is_avatar());
+            if are_colors_sent && state.color_layers < LAYERS {
                 let layers = state.color_layers;
                 lines.push((format!("colours: {layers} of {LAYERS} layers, as many as the line carries"), false));
             }

@@ -258,7 +258,8 @@ function showState(time) {
       + `, ${bits.toFixed(1)} Mbit/s`,
     `decode ${spent.decode.toFixed(1)} ms, pose and sort ${spent.pose.toFixed(1)} ms, ${drawing?.kind ?? "graphics lost"} ${spent.draw.toFixed(1)} ms`,
     quality.length > 0 ? `tracking ${quality.join(", ")}` : "",
-    shown > 0 && layers < all ? `colours: ${layers} of ${all} layers, as many as the line to the rig carries` : "",
+    // An avatar brings its colours.
+    shown > 0 && layers < all && wasm.scales() === 0 ? `colours: ${layers} of ${all} layers, as many as the line to the rig carries` : "",
     shown > 0 && !complete ? "colours are still coming" : "",
   ].filter(line => line).join("\n");
   document.documentElement.dataset.ready = shown > 0 && complete && !troubleText.textContent ? "yes" : "no";
