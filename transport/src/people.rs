@@ -6,6 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use crossbeam::channel::bounded;
 use flyrig_stream::{LAYERS, MAX_TEMPLATE_BYTES, template_hash};
 use prost::bytes::Bytes;
 use zenoh::{
@@ -29,6 +30,8 @@ use crate::{
 const CHUNK: usize = 60_000;
 /// Chunks under way at once: enough for 20 Mbit/s with 100 ms, and fewer than the sender's queue has places.
 const AT_ONCE: usize = 6;
+/// Requests for chunks of all viewers that may wait for their answer.
+const MAX_QUERIES: usize = 1024;
 /// How long a chunk is waited for.
 const CHUNK_PATIENCE: Duration = Duration::from_secs(5);
 
@@ -123,8 +126,20 @@ impl People {
     }
 }
 
-/// Runs on a zenoh thread. A template that is not known is not answered: another publisher may have it.
-pub(crate) fn answer_template(people: &People, query: &Query) {
+/// Starts a thread that answers requests for templates, and returns what hands them in without waiting. It ends when that is dropped. The
+/// network's thread must not answer: where it also sends, replies find no room until it has sent some.
+pub(crate) fn answer_templates(people: Arc<People>) -> Result<impl Fn(Query) + Send + Sync + 'static, TransportError> {
+    let (queries, waiting) = bounded::<Query>(MAX_QUERIES);
+    std::thread::Builder::new()
+        .name("flyrig-answers".to_owned())
+        .spawn(move || waiting.into_iter().for_each(|query| answer_template(&people, &query)))
+        .map_err(|error| TransportError::session("thread for templates", &error))?;
+    // One that does not fit is not answered, and asked again.
+    Ok(move |query| drop(queries.try_send(query)))
+}
+
+/// A template that is not known is not answered: another publisher may have it.
+fn answer_template(people: &People, query: &Query) {
     let Some(reply) = keys::label_in(query.key_expr().as_str()).and_then(|label| people.chunk(label)) else { return };
     if let Err(error) = query.reply(query.key_expr(), reply).wait() {
         tracing::warn!(%error, "could not answer a request for a template");

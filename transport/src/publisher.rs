@@ -20,7 +20,7 @@ use crate::{
     config::LARGEST_QUESTION,
     drain::{Drain, DrainThread, Retained, Shared, empty_header},
     keys::{self, VIEWER_PREFIX},
-    people::{People, answer_template},
+    people::{People, answer_templates},
     printable,
     session::{self, Opened},
     splats::MAX_PERSON_TOPICS,
@@ -111,10 +111,9 @@ impl Publisher {
             .background()
             .wait()
             .map_err(failed)?;
-        let templates = people.clone();
         session
             .declare_queryable(keys::key(rig, "template/*"))
-            .callback(move |query| answer_template(&templates, &query))
+            .callback(answer_templates(people.clone())?)
             .background()
             .wait()
             .map_err(failed)?;

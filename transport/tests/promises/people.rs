@@ -77,6 +77,29 @@ fn a_person_arrives_with_its_template() {
     });
 }
 
+/// The programs let zenoh read and write on one thread: a publisher that answered on it had no room for more than a few chunks.
+#[test]
+fn a_large_template_comes_whole_with_one_network_thread() {
+    let variable = "ZENOH_RUNTIME";
+    if std::env::var_os(variable).is_none() {
+        let inside = std::process::Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", "people::a_large_template_comes_whole_with_one_network_thread"])
+            .env(variable, "(rx: (worker_threads: 1), tx: (handover: rx), acc: (handover: rx))")
+            .status();
+        assert!(inside.unwrap().success());
+        return;
+    }
+    let publisher = open_publisher(|_| {});
+    let subscriber = open_subscriber(&publisher, &people());
+    wait_until("the subscription", || publisher.has_person_subscribers());
+    let bytes: Vec<u8> = (0..1_500_000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
+    let hash = flyrig_stream::template_hash(&bytes);
+    publisher.offer_template(0, hash, bytes.clone().into());
+    // A chunk that is lost is asked for again after five seconds.
+    let fetched = wait_for("the template", || subscriber.template(hash, Duration::from_secs(4)).unwrap());
+    assert!(fetched == bytes);
+}
+
 #[test]
 fn any_number_of_people_come_and_go() {
     let publisher = open_publisher(|_| {});
