@@ -57,8 +57,9 @@ impl Avatar {
         let normals = self.normals();
         let centers: Vec<Vec3> = (0..count).map(|i| self.center(i)).collect();
         let mut edges: Vec<(f32, [usize; 2])> = Vec::new();
-        for (i, nearest) in Neighbors::new(&centers).of_each().iter().enumerate() {
-            for j in nearest.iter().map(|j| *j as usize).filter(|j| *j != i) {
+        let neighbors = Neighbors::new(&centers);
+        for i in 0..count {
+            for j in neighbors.of(i).iter().map(|j| *j as usize).filter(|j| *j != i) {
                 if normals[i].dot(normals[j]) > SAME_SIDE && shared_weight(&self.skin[i], &self.skin[j]) > SAME_BONES {
                     edges.push((centers[i].distance_squared(centers[j]), [i.min(j), i.max(j)]));
                 }

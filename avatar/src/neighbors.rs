@@ -28,12 +28,7 @@ impl Neighbors {
         Self(nearest.into_iter().map(|(_, nearest)| nearest).collect())
     }
 
-    /// The nearest others of each Gaussian, nearest first.
-    pub fn of_each(&self) -> &[[u32; NEAREST]] {
-        &self.0
-    }
-
-    /// Returns the neighbours of a Gaussian.
+    /// Returns the nearest others of a Gaussian, nearest first.
     pub fn of(&self, i: usize) -> &[u32] {
         self.0.get(i).map_or(&[], |nearest| nearest.as_slice())
     }
