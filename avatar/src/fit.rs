@@ -231,8 +231,8 @@ impl Fit {
     }
 
     /// Makes the avatar's lists outputs of local networks, which are learnt in their place, and returns how many numbers these have. The
-    /// lists start as they are, but for colours, which are looked up in an atlas. `uvs`: texture coordinates of the Gaussians, empty
-    /// without any.
+    /// lists start as they are, but for colours, which are looked up in an atlas. Lists whose networks the settings leave out are learnt by
+    /// themselves. `uvs`: texture coordinates of the Gaussians, empty without any.
     ///
     /// # Errors
     /// [`AvatarError::Images`] where an atlas by texture coordinates is asked for and there are none.
@@ -317,7 +317,8 @@ impl Fit {
                 let stride = if list == 3 { coefficients } else { 1 };
                 self.neighbors.pull(values, slopes, stride, weights);
                 // Networks move the lists themselves; the usual size of the derivatives is wanted all the same.
-                let rates = if self.local.is_some() { [0.0; 4] } else { rates[list] };
+                let is_predicted = self.local.as_ref().is_some_and(|local| local.predicts(list));
+                let rates = if is_predicted { [0.0; 4] } else { rates[list] };
                 self.moments[list].descend(self.step, rates, values, slopes);
             }
         }

@@ -46,6 +46,10 @@ const TABLE_SPREAD: f32 = 0.1;
 /// Settings of the local networks. Rates are at the start and at the end.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LocalSettings {
+    /// Whether networks predict places, scales, rotations and opacities; otherwise each Gaussian's are learnt by themselves.
+    pub geometry: bool,
+    /// Whether colours are looked up in an atlas; otherwise each Gaussian's are learnt by themselves.
+    pub colors: bool,
     /// Gaussians around an anchor, in the mean.
     pub group: usize,
     /// Stages; all have about the same number of Gaussians.
@@ -69,6 +73,8 @@ pub struct LocalSettings {
 impl Default for LocalSettings {
     fn default() -> Self {
         Self {
+            geometry: true,
+            colors: true,
             group: 4,
             stages: 1,
             layout: AtlasLayout::Uv,
@@ -99,7 +105,7 @@ struct Tape {
     tensors: Tensors,
     /// For each stage: features, outputs of all branches.
     stages: Vec<(Tensor<2>, Vec<Tensor<2>>)>,
-    atlas: Tensor<4>,
+    atlas: Option<Tensor<4>>,
 }
 
 /// Local networks of one avatar.
@@ -112,8 +118,8 @@ pub(crate) struct Local {
     places: Vec<Vec3>,
     around: Box3,
     stages: Vec<Stage>,
-    map: AtlasMap,
-    first_atlas: Vec<f32>,
+    /// The atlas, and what it starts as; None where colours are learnt by themselves.
+    atlas: Option<(AtlasMap, Vec<f32>)>,
     /// Numbers that go through burn.
     networks: BTreeMap<String, Parameter>,
     /// Displacements and hash tables.
@@ -140,9 +146,12 @@ impl Local {
         let around = Box3::around(&places);
         let mut stages: Vec<Stage> = Vec::new();
         let mut networks = Vec::new();
-        let mut tables = vec![("displacement".to_owned(), vec![count, 4], 0.0)];
+        let mut tables = Vec::new();
+        if settings.geometry {
+            tables.push(("displacement".to_owned(), vec![count, 4], 0.0));
+        }
         let mut inputs = inputs;
-        for (stage, members) in sampled.chunks(size).enumerate() {
+        for (stage, members) in sampled.chunks(size).enumerate().filter(|_| settings.geometry) {
             let groups = Groups::new(&places, &inputs, members);
             let at = of(&places, &inputs);
             let (encoded, encoding) = (at.iter().map(Vec3::to_array).collect(), HashEncoding::new(&at, around));
@@ -150,11 +159,15 @@ impl Local {
             tables.push((format!("stage.{stage}.hash"), vec![LEVELS * ROWS, FEATURES], TABLE_SPREAD));
             stages.push(Stage { groups, inputs: std::mem::replace(&mut inputs, members.to_vec()), encoded, encoding });
         }
-        let map = AtlasMap::new(settings.layout, &places, uvs, settings.side)?;
-        networks.extend(texture::parameters(&map, order.coefficients()));
         let mut start = avatar.parameters.clone();
-        let first_atlas = map.splat(&start.harmonics, order);
-        start.harmonics.fill([0.0; 4]);
+        let mut atlas = None;
+        if settings.colors {
+            let map = AtlasMap::new(settings.layout, &places, uvs, settings.side)?;
+            networks.extend(texture::parameters(&map, order.coefficients()));
+            let first = map.splat(&start.harmonics, order);
+            start.harmonics.fill([0.0; 4]);
+            atlas = Some((map, first));
+        }
         let (networks, tables) = (drawn(networks, seed), drawn(tables, seed.wrapping_add(1)));
         let zeros =
             |(name, p): (&String, &Parameter)| (name.clone(), [vec![0.0; p.values.len()], vec![0.0; p.values.len()]]);
@@ -166,8 +179,7 @@ impl Local {
             places,
             around,
             stages,
-            map,
-            first_atlas,
+            atlas,
             networks,
             tables,
             moments,
@@ -181,10 +193,20 @@ impl Local {
         flyrig_learn::count(&self.networks) + flyrig_learn::count(&self.tables)
     }
 
-    /// Writes what the networks say into an avatar's lists.
+    /// Whether a list of [`Parameters::lists`] is predicted. Others are learnt by themselves.
+    pub fn predicts(&self, list: usize) -> bool {
+        if list == 3 { self.settings.colors } else { self.settings.geometry }
+    }
+
+    /// Writes what the networks say into an avatar's lists. Lists that they do not predict stay as they are.
     pub fn evaluate(&mut self, into: &mut Parameters) {
         let tensors = Tensors::new(&self.networks, &self.device, true);
         let mut lists = self.start.clone();
+        for (list, (to, from)) in lists.lists_mut().into_iter().zip(into.lists()).enumerate() {
+            if !self.predicts(list) {
+                to.iter_mut().zip(from).for_each(|(to, from)| *to = *from);
+            }
+        }
         let displacement = self.tables.get("displacement").map_or(&[][..], |p| p.values.as_slice());
         let mut stages = Vec::new();
         for (stage, Stage { groups, inputs, encoding, .. }) in self.stages.iter().enumerate() {
@@ -208,10 +230,13 @@ impl Local {
             }
             stages.push((features, outputs));
         }
-        let atlas = texture::encode(&tensors, &self.device);
         let coefficients = lists.order().coefficients();
-        self.map.query(&self.first_atlas, 3, &mut lists.harmonics, coefficients);
-        self.map.query(&to_vec(atlas.clone()), 3 * coefficients, &mut lists.harmonics, coefficients);
+        let atlas = self.atlas.as_ref().map(|(map, first)| {
+            let atlas = texture::encode(&tensors, &self.device);
+            map.query(first, 3, &mut lists.harmonics, coefficients);
+            map.query(&to_vec(atlas.clone()), 3 * coefficients, &mut lists.harmonics, coefficients);
+            atlas
+        });
         *into = lists;
         self.tape = Some(Tape { tensors, stages, atlas });
     }
@@ -290,9 +315,11 @@ impl Local {
         let mut gradients = BTreeMap::new();
         let Some(Tape { tensors, stages, atlas }) = self.tape.take() else { return gradients };
         let coefficients = self.start.order().coefficients();
-        let shape = atlas.dims();
-        let wanted = TensorData::new(self.map.backward(&slopes[3], coefficients), shape);
-        let mut total = (atlas * Tensor::<4>::from_data(wanted, &self.device)).sum();
+        let mut totals: Vec<Tensor<1>> = Vec::new();
+        if let (Some(atlas), Some((map, _))) = (atlas, &self.atlas) {
+            let wanted = TensorData::new(map.backward(&slopes[3], coefficients), atlas.dims());
+            totals.push((atlas * Tensor::<4>::from_data(wanted, &self.device)).sum());
+        }
         let mut displacement = vec![0.0; 4 * self.places.len()];
         for (stage, (Stage { groups, inputs, .. }, (_, outputs))) in self.stages.iter().zip(&stages).enumerate() {
             for ((branch, columns), output) in branches(stage).iter().zip(outputs) {
@@ -303,7 +330,7 @@ impl Local {
                     wanted[cell * columns..].iter_mut().zip(row).for_each(|(out, slope)| *out = unit * slope);
                 }
                 let wanted = table_of(wanted, inputs.len(), groups.slots * columns, &self.device);
-                total = total + (output.clone() * wanted).sum();
+                totals.push((output.clone() * wanted).sum());
             }
             if stage == 0 {
                 for (_, gaussian) in groups.cells() {
@@ -311,6 +338,7 @@ impl Local {
                 }
             }
         }
+        let Some(total) = totals.into_iter().reduce(|a, b| a + b) else { return gradients };
         let found = total.backward();
         tensors.add_gradients(&found, &mut gradients);
         for (stage, (features, _)) in stages.iter().enumerate() {

@@ -65,7 +65,8 @@ fn reference(local: &Local, numbers: &Numbers) -> [Vec<[f64; 4]>; 4] {
             }
         }
     }
-    let (side, coefficients) = (local.map.side as i64, local.start.order().coefficients());
+    let (map, first_atlas) = local.atlas.as_ref().unwrap();
+    let (side, coefficients) = (map.side as i64, local.start.order().coefficients());
     let mut planes = numbers["texture"].clone();
     let mut from = texture::FEATURES;
     for layer in 0..3 {
@@ -76,7 +77,7 @@ fn reference(local: &Local, numbers: &Numbers) -> [Vec<[f64; 4]>; 4] {
             if inside { planes[((chart * from + channel) as i64 * side * side + y * side + x) as usize] } else { 0.0 }
         };
         let mut next = Vec::new();
-        for chart in 0..local.map.charts {
+        for chart in 0..map.charts {
             for out in 0..to {
                 for y in 0..side {
                     for x in 0..side {
@@ -94,12 +95,12 @@ fn reference(local: &Local, numbers: &Numbers) -> [Vec<[f64; 4]>; 4] {
         }
         (planes, from) = (next, to);
     }
-    let texels = local.map.texels();
-    for (gaussian, taps) in local.map.taps.iter().enumerate() {
+    let texels = map.texels();
+    for (gaussian, taps) in map.taps.iter().enumerate() {
         for channel in 0..3 * coefficients {
             for (texel, share) in taps {
                 let (chart, texel) = (*texel as usize / texels, *texel as usize % texels);
-                let first = if channel < 3 { local.first_atlas[(chart * 3 + channel) * texels + texel] } else { 0.0 };
+                let first = if channel < 3 { first_atlas[(chart * 3 + channel) * texels + texel] } else { 0.0 };
                 let value = planes[(chart * 3 * coefficients + channel) * texels + texel] + f64::from(first);
                 lists[3][gaussian * coefficients + channel / 3][channel % 3] += f64::from(*share) * value;
             }
@@ -209,6 +210,35 @@ fn learn(local: &mut Local, wanted: &Parameters, now: &mut Parameters, steps: us
     }
     local.evaluate(now);
     sum
+}
+
+#[test]
+fn lists_without_networks_stay_as_they_are() {
+    let (avatar, uvs) = avatar(200, HarmonicOrder::Zero);
+    let mut own = avatar.parameters.clone();
+    own.lists_mut().into_iter().flatten().flatten().for_each(|value| *value += 0.25);
+    for (geometry, colors) in [(true, false), (false, true), (false, false)] {
+        let settings = LocalSettings { geometry, colors, ..settings(2) };
+        // An atlas alone needs texture coordinates.
+        let mut local = Local::new(&avatar, if colors { &uvs } else { &[] }, &settings, 1).unwrap();
+        let has = |part: &str| local.networks.keys().chain(local.tables.keys()).any(|name| name.contains(part));
+        assert_eq!(
+            [has("displacement"), has("hash"), has("stage"), has("texture")],
+            [geometry, geometry, geometry, colors]
+        );
+        let mut now = own.clone();
+        for step in 0..3 {
+            local.evaluate(&mut now);
+            for (list, (now, own)) in now.lists().into_iter().zip(own.lists()).enumerate() {
+                assert!(local.predicts(list) || now == own, "{list}");
+                let moved = now.iter().flatten().zip(own.iter().flatten()).any(|(a, b)| (a - b).abs() > 0.1);
+                assert_eq!(moved, local.predicts(list), "{list}");
+            }
+            let slopes = now.lists().map(|list| vec![[0.1 * step as f32; 4]; list.len()]);
+            local.descend(&slopes, 0.5);
+        }
+        assert!(now.is_finite() && flyrig_learn::is_finite(&local.networks));
+    }
 }
 
 #[test]

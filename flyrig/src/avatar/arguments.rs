@@ -73,6 +73,10 @@ pub enum Method {
     /// Networks that neighbouring Gaussians share, and an atlas of colours (LoGAvatar).
     #[value(name = "logavatar")]
     LogAvatar,
+    /// Of these the networks alone: the colours of every Gaussian by themselves.
+    LocalGeometry,
+    /// Of these the atlas alone: place, size and opacity of every Gaussian by themselves.
+    LocalColors,
 }
 
 /// How the surface lies in the atlas.
@@ -84,19 +88,19 @@ pub enum Atlas {
     FrontBack,
 }
 
-/// Settings of `--method logavatar`.
+/// Settings of the methods with networks.
 #[derive(Debug, Args)]
 pub struct LocalArgs {
-    /// Gaussians around an anchor (--method logavatar).
+    /// Gaussians around an anchor (--method logavatar or local-geometry).
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=64))]
     pub group: u8,
-    /// Stages that geometry is predicted in (--method logavatar).
+    /// Stages that geometry is predicted in (--method logavatar or local-geometry).
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=8))]
     pub stages: u8,
-    /// How the surface lies in the atlas of colours (--method logavatar).
+    /// How the surface lies in the atlas of colours (--method logavatar or local-colors).
     #[arg(long, value_enum, default_value = "uv")]
     pub atlas: Atlas,
-    /// Texels along a side of the atlas (--method logavatar).
+    /// Texels along a side of the atlas (--method logavatar or local-colors).
     #[arg(long, default_value_t = 256, value_parser = clap::value_parser!(u16).range(16..=2048))]
     pub texels: u16,
 }

@@ -76,8 +76,8 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
             ..FitSettings::default()
         },
     )?;
-    if args.method == Method::LogAvatar {
-        let numbers = fit.use_networks(&mut avatar, &uvs, &local_settings(&args.local))?;
+    if args.method != Method::Direct {
+        let numbers = fit.use_networks(&mut avatar, &uvs, &local_settings(args.method, &args.local))?;
         println!("local networks of {numbers} numbers");
         picture(&avatar)?;
     }
@@ -150,8 +150,10 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-fn local_settings(args: &LocalArgs) -> LocalSettings {
+fn local_settings(method: Method, args: &LocalArgs) -> LocalSettings {
     LocalSettings {
+        geometry: method != Method::LocalColors,
+        colors: method != Method::LocalGeometry,
         group: args.group.into(),
         stages: args.stages.into(),
         layout: match args.atlas {
@@ -166,11 +168,13 @@ fn local_settings(args: &LocalArgs) -> LocalSettings {
 /// The method, for the card.
 fn method(args: &BuildArgs) -> String {
     let LocalArgs { group, stages, atlas, texels } = &args.local;
+    let geometry = format!("{group} Gaussians an anchor, {stages} stages");
+    let atlas = if *atlas == Atlas::Uv { "uv" } else { "front-back" };
+    let colors = format!("atlas {atlas} of {texels} texels");
     match args.method {
         Method::Direct => "gaussians".to_owned(),
-        Method::LogAvatar => {
-            let atlas = if *atlas == Atlas::Uv { "uv" } else { "front-back" };
-            format!("logavatar: {group} Gaussians an anchor, {stages} stages, atlas {atlas} of {texels} texels")
-        }
+        Method::LogAvatar => format!("logavatar: {geometry}, {colors}"),
+        Method::LocalGeometry => format!("local geometry: {geometry}"),
+        Method::LocalColors => format!("local colors: {colors}"),
     }
 }
