@@ -19,6 +19,8 @@ pub struct FitProgress {
     pub done: u64,
     /// Steps in all.
     pub total: u64,
+    /// Images that were drawn or left out.
+    turn: u64,
 }
 
 impl Fit {
@@ -28,7 +30,7 @@ impl Fit {
     /// [`AvatarError::Format`] for a description that cannot be written.
     pub fn checkpoint(&mut self, avatar: &mut Avatar, settings: &str, total: u64) -> Result<Vec<u8>, AvatarError> {
         let fail = |problem: String| AvatarError::Format { path: "checkpoint".into(), problem };
-        let progress = FitProgress { settings: settings.to_owned(), done: self.step, total };
+        let progress = FitProgress { settings: settings.to_owned(), done: self.step, total, turn: self.turn };
         let header = serde_json::to_string(&progress).map_err(|error| fail(error.to_string()))?;
         let state = self.state(avatar);
         let views: Vec<_> = state
@@ -72,7 +74,7 @@ impl Fit {
                 own.copy_from_slice(values);
             }
         }
-        self.step = progress.done;
+        (self.step, self.turn) = (progress.done, progress.turn);
         if let Some(skin) = &self.skin {
             skin.bake(&mut avatar.skin);
         }
@@ -107,6 +109,8 @@ impl Fit {
                 all.push((format!("adam.{k}.{number}"), list.as_flattened_mut()));
             }
         }
+        all.push(("rest.errors".to_owned(), self.rest.errors.as_mut_slice()));
+        all.push(("rest.until".to_owned(), self.rest.until.as_mut_slice()));
         all.extend(self.local.iter_mut().flat_map(|local| local.state()));
         all
     }

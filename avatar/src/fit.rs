@@ -1,26 +1,32 @@
 //! Gradient descent on the images of a take.
 
-use std::collections::BTreeMap;
+use std::{
+    collections::{BTreeMap, btree_map::Entry},
+    ops::Range,
+};
 
 use flyrig_gpu::{GpuContext, read_all};
 use flyrig_renderer::{
     AnisotropicGradients, BackwardRasterizer, HarmonicOrder, ImageGradients, Outputs, RasterSettings, Rasterizer,
     RenderTarget,
 };
-use flyrig_types::{Camera, Pose};
+use flyrig_types::Pose;
 use glam::{DVec3, Vec2};
 use rand::{SeedableRng as _, rngs::StdRng, seq::SliceRandom as _};
 
 use crate::{
-    Avatar, AvatarError, Bones, ErrorWeights, ImageError, LocalSettings, PosedAvatar, adam::Adam, light::LightFit,
-    local::Local, neighbors::Neighbors, parameters::Element, pose_fit::PoseFit, scene::AvatarBuffers,
+    Avatar, AvatarError, Bones, ErrorWeights, ImageError, LocalSettings, PosedAvatar, TrainingView,
+    adam::Adam,
+    light::LightFit,
+    local::Local,
+    neighbors::Neighbors,
+    parameters::Element,
+    pose_fit::PoseFit,
+    rest::{Drawn, Rest},
+    scene::AvatarBuffers,
     skin_fit::SkinFit,
 };
 
-/// Images are cut to the person and so many pixels around.
-const MARGIN_PX: u32 = 12;
-/// Cut images have sides of so many pixels, or a multiple: buffers are made for each size.
-const SIDE_PX: u32 = 64;
 /// Differences to neighbours of the lists' columns at which their pull is as strong as images usually are. Rotations do not pull: a
 /// quaternion and its negative are the same.
 const DIFFERENCES: [Element; 4] =
@@ -57,6 +63,8 @@ pub struct FitSettings {
     pub refine_poses: bool,
     /// Whether the skin weights are corrected.
     pub skin_correction: bool,
+    /// Whether parts of images whose error does not change any more are drawn less often.
+    pub rest: bool,
 }
 
 impl Default for FitSettings {
@@ -73,6 +81,7 @@ impl Default for FitSettings {
             light: true,
             refine_poses: false,
             skin_correction: false,
+            rest: false,
         }
     }
 }
@@ -84,58 +93,6 @@ pub struct TrainingFrame {
     pub pose: Pose,
     /// Translations of the graph's nodes, canonical metres; empty without a graph.
     pub translations: Vec<DVec3>,
-}
-
-/// An image of the person, cut to it.
-#[derive(Debug, Clone)]
-pub struct TrainingView {
-    frame: usize,
-    camera: Camera,
-    /// sRGB and mask.
-    rgba: Vec<u8>,
-}
-
-impl TrainingView {
-    /// Cuts an image, sRGB with the mask as alpha, to the person. None where nobody is in it, or its bytes are not those of the camera's
-    /// size.
-    #[must_use]
-    pub fn cut(frame: usize, camera: &Camera, rgba: &[u8]) -> Option<Self> {
-        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
-        if width == 0 || rgba.len() != width as usize * height as usize * 4 {
-            return None;
-        }
-        let (mut least, mut most) = ([u32::MAX; 2], [0; 2]);
-        for (y, row) in (0u32..).zip(rgba.chunks_exact(4 * width as usize)) {
-            for (x, _) in (0u32..).zip(row.chunks_exact(4)).filter(|(_, pixel)| pixel[3] > 127) {
-                least = [least[0].min(x), least[1].min(y)];
-                most = [most[0].max(x), most[1].max(y)];
-            }
-        }
-        if least[0] > most[0] {
-            return None;
-        }
-        // A cut as large as its class of size, moved into the image.
-        let range = |k: usize, whole: u32| {
-            let wanted = most[k] - least[k] + 1 + 2 * MARGIN_PX;
-            let side = wanted.next_multiple_of(SIDE_PX).min(whole);
-            let first = (least[k] + most[k] + 1).saturating_sub(side) / 2;
-            (first.min(whole - side), side)
-        };
-        let ((left, columns), (top, rows)) = (range(0, width), range(1, height));
-        let mut cut = Vec::with_capacity(columns as usize * rows as usize * 4);
-        for y in top..top + rows {
-            let first = (y as usize * width as usize + left as usize) * 4;
-            cut.extend(&rgba[first..first + 4 * columns as usize]);
-        }
-        let mut camera = camera.clone();
-        camera.intrinsics.center_px -= glam::DVec2::new(f64::from(left), f64::from(top));
-        (camera.intrinsics.width, camera.intrinsics.height) = (columns, rows);
-        Some(Self { frame, camera, rgba: cut })
-    }
-
-    fn size(&self) -> [u32; 2] {
-        [self.camera.intrinsics.width, self.camera.intrinsics.height]
-    }
 }
 
 /// Result of one step.
@@ -152,6 +109,13 @@ pub struct StepReport {
 struct Targets {
     drawn: RenderTarget,
     slopes: ImageGradients,
+}
+
+impl Targets {
+    fn new(gpu: &GpuContext, [width, height]: [u32; 2]) -> Result<Self, AvatarError> {
+        let drawn = RenderTarget::new(gpu, width, height)?;
+        Ok(Self { drawn, slopes: ImageGradients::zeroed(gpu, width, height)? })
+    }
 }
 
 /// Fits an avatar to images.
@@ -177,6 +141,9 @@ pub struct Fit {
     /// Networks whose outputs the lists are; None where the lists themselves are learnt.
     pub(crate) local: Option<Local>,
     pub(crate) step: u64,
+    /// Views that were drawn or left out, and parts of them that rest.
+    pub(crate) turn: u64,
+    pub(crate) rest: Rest,
     /// Views in the order of a round, and its number.
     round: (Vec<usize>, u64),
 }
@@ -202,10 +169,8 @@ impl Fit {
         let (count, order) = (avatar.gaussians(), avatar.parameters.order());
         let mut targets = BTreeMap::new();
         for view in &views {
-            let [width, height] = view.size();
-            if let std::collections::btree_map::Entry::Vacant(entry) = targets.entry([width, height]) {
-                let drawn = RenderTarget::new(gpu, width, height)?;
-                entry.insert(Targets { drawn, slopes: ImageGradients::zeroed(gpu, width, height)? });
+            if let Entry::Vacant(entry) = targets.entry(view.size()) {
+                entry.insert(Targets::new(gpu, view.size())?);
             }
         }
         Ok(Self {
@@ -223,6 +188,8 @@ impl Fit {
             neighbors: Neighbors::new(&avatar.places),
             local: None,
             step: 0,
+            turn: 0,
+            rest: Rest::new(views.iter().map(|view| view.size()[1]), settings.rest),
             round: (Vec::new(), 0),
             settings,
             frames,
@@ -267,10 +234,12 @@ impl Fit {
     /// # Errors
     /// [`AvatarError::Gpu`], [`AvatarError::Backward`].
     pub fn step(&mut self, avatar: &mut Avatar, progress: f32) -> Result<StepReport, AvatarError> {
-        let view = self.next_view();
-        let (error, bones) = self.draw(avatar, view)?;
-        let view = &self.views[view];
-        let Some(Targets { drawn, slopes }) = self.targets.get(&view.size()) else {
+        let (index, rows, round) = self.next_view();
+        let (error, bones) = self.draw(avatar, index, &rows)?;
+        let view = &self.views[index];
+        let width = view.size()[0];
+        self.rest.judge(index, round, rows.start, &error.pixels, width as usize);
+        let Some(Targets { drawn, slopes }) = self.targets.get(&[width, rows.end - rows.start]) else {
             return Err(AvatarError::Images("an image has no target".to_owned()));
         };
         slopes.color.write(&self.gpu, &error.slope);
@@ -330,16 +299,30 @@ impl Fit {
         Ok(StepReport { loss: error.loss, decibels: -10.0 * error.squared.max(1e-10).log10() })
     }
 
-    /// The view of this step. Rounds are shuffled by their number, so that a fit that goes on from a checkpoint sees the same ones.
-    fn next_view(&mut self) -> usize {
+    /// The view of this step, its rows that are drawn, and the round. Rounds are shuffled by their number, so that a fit that goes on from a
+    /// checkpoint sees the same ones.
+    fn next_view(&mut self) -> (usize, Range<u32>, u64) {
         let count = self.views.len().max(1) as u64;
-        let (number, at) = (self.step / count, (self.step % count) as usize);
-        if self.round.0.is_empty() || self.round.1 != number {
-            let mut order: Vec<usize> = (0..self.views.len()).collect();
-            order.shuffle(&mut StdRng::seed_from_u64(self.settings.seed.wrapping_add(number.wrapping_mul(ROUND_SEED))));
-            self.round = (order, number);
+        loop {
+            let (number, at) = (self.turn / count, (self.turn % count) as usize);
+            if self.round.0.is_empty() || self.round.1 != number {
+                let mut order: Vec<usize> = (0..self.views.len()).collect();
+                let seed = self.settings.seed.wrapping_add(number.wrapping_mul(ROUND_SEED));
+                order.shuffle(&mut StdRng::seed_from_u64(seed));
+                self.round = (order, number);
+            }
+            self.turn += 1;
+            let view = self.round.0[at];
+            if let Some(rows) = self.rest.rows(view, number) {
+                return (view, rows, number);
+            }
         }
-        self.round.0[at]
+    }
+
+    /// Returns how much of the images was drawn by the steps since the fit was made.
+    #[must_use]
+    pub fn drawn(&self) -> Drawn {
+        self.rest.drawn
     }
 
     /// Mean PSNR over all images as the avatar is now, decibels of the mean squared error.
@@ -349,7 +332,8 @@ impl Fit {
     pub fn decibels(&mut self, avatar: &Avatar) -> Result<f64, AvatarError> {
         let mut sum = 0.0;
         for view in 0..self.views.len() {
-            sum += self.draw(avatar, view)?.0.squared;
+            let rows = 0..self.views[view].size()[1];
+            sum += self.draw(avatar, view, &rows)?.0.squared;
         }
         Ok(-10.0 * (sum / self.views.len().max(1) as f64).max(1e-10).log10())
     }
@@ -367,8 +351,8 @@ impl Fit {
         ]
     }
 
-    /// Draws a view and compares it with its image. Returns the bones as well.
-    fn draw(&mut self, avatar: &Avatar, view: usize) -> Result<(ImageError, Bones), AvatarError> {
+    /// Draws some rows of a view and compares them with its image. Returns the bones as well.
+    fn draw(&mut self, avatar: &Avatar, view: usize, rows: &Range<u32>) -> Result<(ImageError, Bones), AvatarError> {
         let view = &self.views[view];
         let frame = &self.frames[view.frame];
         let pose = self.pose(view.frame).unwrap_or_else(|| frame.pose.clone());
@@ -376,16 +360,26 @@ impl Fit {
         let translations = (!frame.translations.is_empty()).then_some(frame.translations.as_slice());
         avatar.pose(&bones, translations, &mut self.posed);
         self.buffers.pose(&self.gpu, &self.posed);
-        let Some(Targets { drawn, .. }) = self.targets.get(&view.size()) else {
-            return Err(AvatarError::Images("an image has no target".to_owned()));
+        let (camera, wanted) = view.rows(rows);
+        let size = [camera.intrinsics.width, camera.intrinsics.height];
+        let Targets { drawn, .. } = match self.targets.entry(size) {
+            Entry::Occupied(entry) => entry.into_mut(),
+            Entry::Vacant(entry) => entry.insert(Targets::new(&self.gpu, size)?),
         };
         let settings =
             RasterSettings { outputs: Outputs { canonical: false, ..Outputs::ALL }, ..RasterSettings::default() };
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-        self.rasterizer.encode(&self.gpu, &mut encoder, &self.buffers.gaussians, &view.camera, &settings, drawn)?;
+        self.rasterizer.encode(&self.gpu, &mut encoder, &self.buffers.gaussians, &camera, &settings, drawn)?;
         self.gpu.queue.submit([encoder.finish()]);
         let pixels = drawn.color.read(&self.gpu)?;
-        Ok((ImageError::of(&pixels, &view.rgba, view.size()[0] as usize, &self.settings.weights), bones))
+        let mut error = ImageError::of(&pixels, wanted, size[0] as usize, &self.settings.weights);
+        // A pixel counts as much as in the whole image.
+        let whole = 0..view.size()[1];
+        if *rows != whole {
+            let share = (view.person(rows).max(1.0) / view.person(&whole).max(1.0)) as f32;
+            error.slope.iter_mut().flatten().for_each(|slope| *slope *= share);
+        }
+        Ok((error, bones))
     }
 }
 

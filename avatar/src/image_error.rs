@@ -40,6 +40,8 @@ pub struct ImageError {
     pub loss: f64,
     /// Mean squared difference of sRGB over all pixels that are compared, codes of 0..=1.
     pub squared: f64,
+    /// The same of each pixel.
+    pub pixels: Vec<f32>,
     /// Derivative with respect to premultiplied linear red, green, blue, and coverage; an element a pixel.
     pub slope: Vec<[f32; 4]>,
 }
@@ -107,7 +109,7 @@ impl ImageError {
         // A mean over the person, so that a small one counts as much as a large one.
         let person = mask.iter().map(|mask| f64::from(*mask)).sum::<f64>().max(1.0);
         let scale = (1.0 / person) as f32;
-        let mut error = Self { slope: vec![[0.0; 4]; count], ..Self::default() };
+        let mut error = Self { slope: vec![[0.0; 4]; count], pixels: vec![0.0; count], ..Self::default() };
         let planes: Vec<_> = (0..3)
             .into_par_iter()
             .map(|k| {
@@ -133,6 +135,7 @@ impl ImageError {
                 let difference = ours[i] - theirs[i];
                 absolute += f64::from(difference.abs());
                 error.squared += f64::from(difference * difference);
+                error.pixels[i] += difference * difference / 3.0;
                 let sign = if difference > 0.0 { 1.0 } else { -1.0 };
                 let slope = third
                     * (weights.color * sign - weights.structure * structure[i] + weights.sharpness * sharpening[i]);

@@ -89,32 +89,35 @@ fn a_fit_that_was_killed_ends_as_one_that_was_not() {
     let truth = avatar(|i| [[0.5, 0.1, 0.1], [0.1, 0.4, 0.6], [0.6, 0.6, 0.2]][i / 40 % 3], 1500);
     let (frames, views) = take(&gpu, &truth);
     let networks = LocalSettings { stages: 2, layout: AtlasLayout::FrontBack, side: 32, ..LocalSettings::default() };
-    for networks in [None, Some(networks)] {
+    let geometry = LocalSettings { colors: false, ..networks.clone() };
+    for networks in [None, Some(networks), Some(geometry)] {
         let begin = || {
             let mut ours = avatar(|_| [0.2; 3], 1500);
-            let settings = FitSettings { refine_poses: true, skin_correction: true, ..FitSettings::default() };
+            let settings =
+                FitSettings { refine_poses: true, skin_correction: true, rest: true, ..FitSettings::default() };
             let mut fit = Fit::new(&gpu, &ours, frames.clone(), views.clone(), settings).unwrap();
             if let Some(networks) = &networks {
                 fit.use_networks(&mut ours, &[], networks).unwrap();
             }
             (fit, ours)
         };
-        // Past the round of six images.
+        // Past the round of six images, and into the ones in which images rest.
         let run = |(fit, ours): &mut (Fit, Avatar), steps: std::ops::Range<u32>| {
             for step in steps {
-                fit.step(ours, step as f32 / 20.0).unwrap();
+                fit.step(ours, step as f32 / 40.0).unwrap();
             }
         };
         let mut whole = begin();
-        run(&mut whole, 0..20);
+        run(&mut whole, 0..40);
+        assert!(whole.0.drawn().left_out > 0, "{:?}", whole.0.drawn());
         let mut killed = begin();
-        run(&mut killed, 0..11);
-        let state = killed.0.checkpoint(&mut killed.1, "a take", 20).unwrap();
+        run(&mut killed, 0..31);
+        let state = killed.0.checkpoint(&mut killed.1, "a take", 40).unwrap();
         drop(killed);
         let mut resumed = begin();
         let progress = resumed.0.resume(&mut resumed.1, &state, "a take").unwrap();
-        assert_eq!((progress.done, progress.total), (11, 20));
-        run(&mut resumed, 11..20);
+        assert_eq!((progress.done, progress.total), (31, 40));
+        run(&mut resumed, 31..40);
         assert!(whole.1.to_bytes().unwrap() == resumed.1.to_bytes().unwrap(), "{networks:?}");
 
         // A refused state changes nothing.

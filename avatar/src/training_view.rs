@@ -1,0 +1,81 @@
+//! Images of a take, cut to the person.
+
+use std::ops::Range;
+
+use flyrig_types::Camera;
+
+use crate::rest::BAND_PX;
+
+/// Images are cut to the person and so many pixels around.
+const MARGIN_PX: u32 = 12;
+/// Cut images have sides of so many pixels, or a multiple: buffers are made for each size.
+const SIDE_PX: u32 = BAND_PX;
+
+/// An image of the person, cut to it.
+#[derive(Debug, Clone)]
+pub struct TrainingView {
+    pub(crate) frame: usize,
+    pub(crate) camera: Camera,
+    /// sRGB and mask.
+    rgba: Vec<u8>,
+}
+
+impl TrainingView {
+    /// Cuts an image, sRGB with the mask as alpha, to the person. None where nobody is in it, or its bytes are not those of the camera's
+    /// size.
+    #[must_use]
+    pub fn cut(frame: usize, camera: &Camera, rgba: &[u8]) -> Option<Self> {
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+        if width == 0 || rgba.len() != width as usize * height as usize * 4 {
+            return None;
+        }
+        let (mut least, mut most) = ([u32::MAX; 2], [0; 2]);
+        for (y, row) in (0u32..).zip(rgba.chunks_exact(4 * width as usize)) {
+            for (x, _) in (0u32..).zip(row.chunks_exact(4)).filter(|(_, pixel)| pixel[3] > 127) {
+                least = [least[0].min(x), least[1].min(y)];
+                most = [most[0].max(x), most[1].max(y)];
+            }
+        }
+        if least[0] > most[0] {
+            return None;
+        }
+        // A cut as large as its class of size, moved into the image.
+        let range = |k: usize, whole: u32| {
+            let wanted = most[k] - least[k] + 1 + 2 * MARGIN_PX;
+            let side = wanted.next_multiple_of(SIDE_PX).min(whole);
+            let first = (least[k] + most[k] + 1).saturating_sub(side) / 2;
+            (first.min(whole - side), side)
+        };
+        let ((left, columns), (top, rows)) = (range(0, width), range(1, height));
+        let mut cut = Vec::with_capacity(columns as usize * rows as usize * 4);
+        for y in top..top + rows {
+            let first = (y as usize * width as usize + left as usize) * 4;
+            cut.extend(&rgba[first..first + 4 * columns as usize]);
+        }
+        let mut camera = camera.clone();
+        camera.intrinsics.center_px -= glam::DVec2::new(f64::from(left), f64::from(top));
+        (camera.intrinsics.width, camera.intrinsics.height) = (columns, rows);
+        Some(Self { frame, camera, rgba: cut })
+    }
+
+    /// Width and height, pixels.
+    pub(crate) fn size(&self) -> [u32; 2] {
+        [self.camera.intrinsics.width, self.camera.intrinsics.height]
+    }
+
+    /// Camera and bytes of some of its rows.
+    pub(crate) fn rows(&self, rows: &Range<u32>) -> (Camera, &[u8]) {
+        let [width, height] = self.size();
+        let rows = rows.start.min(height)..rows.end.min(height);
+        let mut camera = self.camera.clone();
+        camera.intrinsics.center_px.y -= f64::from(rows.start);
+        camera.intrinsics.height = rows.end.saturating_sub(rows.start);
+        let byte = |row: u32| row as usize * width as usize * 4;
+        (camera, self.rgba.get(byte(rows.start)..byte(rows.end)).unwrap_or_default())
+    }
+
+    /// Pixels of the person in some rows: the sum of the mask's coverage.
+    pub(crate) fn person(&self, rows: &Range<u32>) -> f64 {
+        self.rows(rows).1.chunks_exact(4).map(|pixel| f64::from(pixel[3]) / 255.0).sum()
+    }
+}
