@@ -130,6 +130,7 @@ impl ReplayArgs {
         let body = BodySettings { gaussians, ..BodySettings::default() };
         ReplaySettings {
             dataset: dataset.to_owned(),
+            recorded: None,
             inputs: self.inputs.clone(),
             holdout: self.holdout.clone(),
             session: SessionSettings { perception, body, budget, ..SessionSettings::default() },

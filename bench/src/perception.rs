@@ -125,6 +125,7 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
     let body = BodySettings::with_gaussians(args.gaussians);
     let settings = ReplaySettings {
         dataset: folder.to_owned(),
+        recorded: None,
         inputs: args.inputs.clone(),
         holdout: if args.no_views { Vec::new() } else { args.holdout.clone() },
         session: SessionSettings { perception, body, ..SessionSettings::default() },

@@ -18,6 +18,7 @@ use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, SessionSett
 use flyrig_gpu::GpuContext;
 use flyrig_report::{Replay, ReplaySettings};
 
+use crate::recording;
 use arguments::{AvatarAction, TakeArgs};
 
 /// Runs the command.
@@ -71,6 +72,7 @@ fn open_replay(
 ) -> Result<Replay> {
     let settings = ReplaySettings {
         dataset: take.dataset.clone(),
+        recorded: recording::rig_of_take(&take.dataset)?,
         inputs: take.inputs.clone(),
         holdout: holdout.to_vec(),
         session: SessionSettings {

@@ -790,7 +790,8 @@ pub struct ServeArgs {
 
 #[derive(Debug, Args)]
 pub struct EvalArgs {
-    /// Folder in EasyMocap layout: intri.yml, extri.yml, images/CAM, optional mask/CAM and a skinned *.glb.
+    /// Folder in EasyMocap layout: intri.yml, extri.yml, images/CAM, optional mask/CAM and a skinned *.glb. Or a calibrated recording,
+    /// *.mcap.
     pub dataset: PathBuf,
     /// Cameras that go in, comma separated.
     #[arg(long, value_delimiter = ',', required = true)]
@@ -817,7 +818,7 @@ pub struct EvalArgs {
     /// Frames FIRST..END, END excluded; all of them otherwise.
     #[arg(long, value_parser = parse_range)]
     pub frames: Option<Range<u64>>,
-    /// Frame rate of the folder.
+    /// Frame rate of the cameras.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
     #[command(flatten)]

@@ -17,7 +17,7 @@ use flyrig_types::{Camera, Frame, RenderedView};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::cli::EvalArgs;
+use crate::{cli::EvalArgs, recording};
 
 /// Every so many frames the tracked surface is written.
 const SURFACE_EVERY: u64 = 10;
@@ -58,6 +58,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let body = BodySettings { avatar: args.avatar.clone().unwrap_or_default(), ..args.body.clone() };
     let settings = ReplaySettings {
         dataset: args.dataset.clone(),
+        recorded: recording::rig_of_take(&args.dataset)?,
         inputs: args.inputs.clone(),
         holdout: args.holdout.clone(),
         session: SessionSettings {

@@ -118,6 +118,12 @@ pub fn recorded_rig(path: &Path) -> Result<Rig> {
     })
 }
 
+/// The rig of a take that is a recording; None for a folder.
+pub fn rig_of_take(path: &Path) -> Result<Option<Rig>> {
+    let is_recording = path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("mcap"));
+    is_recording.then(|| recorded_rig(path)).transpose()
+}
+
 /// The rig of recordings of earlier versions.
 fn rig_of_messages(path: &Path, notes: &[(String, Vec<u8>)]) -> Result<Option<Rig>> {
     let named = |text: &str| format!("{}: {text}", path.display());

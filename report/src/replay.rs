@@ -4,11 +4,12 @@ use std::{
     collections::BTreeMap,
     ops::Range,
     path::{Path, PathBuf},
+    sync::Arc,
 };
 
 use anyhow::{Context, Result, bail};
 use flyrig_body::{Outfit, ShapeParams, Template, default_template, load_gltf};
-use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay, to_rgb8};
+use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay, McapReplay, to_rgb8};
 use flyrig_fusion::{
     EstimatedPerception, GivenPerception, GivenPerson, Origin, PerceptionSettings, PersonId, PersonMemory, SHAPE_SECS,
     SHAPE_SETS, Session, SessionBuilder, SessionSettings, SetReader, next_frame,
@@ -23,17 +24,19 @@ use crate::{dataset, true_joints::TrueJoints};
 /// Settings of a replayed data set.
 #[derive(Debug, Clone)]
 pub struct ReplaySettings {
-    /// Folder in EasyMocap's layout.
+    /// Folder in EasyMocap's layout, or a recording of `flyrig record`.
     pub dataset: PathBuf,
+    /// Cameras of a recording; None for a folder, which has its own calibration.
+    pub recorded: Option<Rig>,
     /// Input cameras.
     pub inputs: Vec<String>,
     /// Cameras that are scored; may be none.
     pub holdout: Vec<String>,
     /// Settings of the session; its origins decide what is read from the data set.
     pub session: SessionSettings,
-    /// Frame rate of the folder.
+    /// Frame rate of the cameras.
     pub fps: f64,
-    /// All frames where `None`.
+    /// All frames where `None`. Those of a recording count from its first set of images.
     pub frames: Option<Range<u64>>,
     /// Time offsets that are subtracted from the timestamps, nanoseconds, in place of the calibration's.
     pub lags_nanos: BTreeMap<CameraId, i64>,
@@ -66,6 +69,8 @@ pub struct Replay {
     /// The session.
     pub session: Session,
     sets: SetReader,
+    /// Sets of a recording that are taken.
+    recorded: Option<Range<u64>>,
     /// Number of frames.
     pub count: usize,
     /// The held-out cameras.
@@ -81,6 +86,13 @@ impl Replay {
     /// Names the missing file, camera or person.
     pub fn open(settings: &ReplaySettings, gpu: &GpuContext) -> Result<Self> {
         settings.session.validate()?;
+        let perceived = &settings.session.perception;
+        if settings.recorded.is_some() && [perceived.pose, perceived.masks].contains(&Origin::Given) {
+            bail!(
+                "the recording {} holds no pose and no masks; add --pose estimated --masks estimated",
+                settings.dataset.display()
+            );
+        }
         let (rig, holdout) = load_rigs(settings)?;
         let sync = SyncSettings { lags_nanos: settings.lags_nanos.clone(), ..SyncSettings::default() };
         let lags_nanos = sync.with_offsets_of(&rig.cameras).with_offsets_of(&holdout).lags_nanos;
@@ -134,7 +146,8 @@ impl Replay {
                 }
             }
         };
-        Ok(Self { session: session.build()?, sets, count, holdout, truth })
+        let recorded = settings.recorded.is_some().then(|| settings.frames.clone().unwrap_or(0..u64::MAX));
+        Ok(Self { session: session.build()?, sets, recorded, count, holdout, truth })
     }
 
     /// Returns the next set; `None` at the end.
@@ -142,7 +155,7 @@ impl Replay {
     /// # Errors
     /// Names the image that cannot be read.
     pub fn next_set(&mut self) -> Result<Option<FrameSet>> {
-        Ok(self.sets.next_set()?)
+        next_of(&mut self.sets, self.recorded.as_ref())
     }
 
     /// Counts of complete and partial sets and of broken images.
@@ -156,7 +169,10 @@ impl Replay {
 
 fn load_rigs(args: &ReplaySettings) -> Result<(Rig, Vec<Camera>)> {
     let chosen: Vec<CameraId> = args.inputs.iter().chain(&args.holdout).map(|name| name.as_str().into()).collect();
-    let all = dataset::load_rig(&args.dataset, &chosen)?;
+    let all = match &args.recorded {
+        Some(rig) => rig.clone(),
+        None => dataset::load_rig(&args.dataset, &chosen)?,
+    };
     let whose = format!("the calibration of {}", args.dataset.display());
     let rig = dataset::pick(&all, &args.inputs, &whose)?;
     // No name would pick all cameras.
@@ -179,14 +195,30 @@ fn first_sets(settings: &ReplaySettings, rig: &Rig) -> Result<Vec<FrameSet>> {
     let (mut reader, count) = open_inputs(settings, rig)?;
     let span = ((SHAPE_SECS * settings.fps) as usize).min(count);
     let every = span.div_ceil(SHAPE_SETS).max(1);
+    let recorded = settings.recorded.is_some().then(|| settings.frames.clone().unwrap_or(0..u64::MAX));
     let mut sets = Vec::new();
     for index in 0..span {
-        let Some(set) = reader.next_set()? else { break };
+        let Some(set) = next_of(&mut reader, recorded.as_ref())? else { break };
         if index % every == 0 {
             sets.push(set);
         }
     }
     Ok(sets)
+}
+
+/// The next set of a reader. Those of a recording are numbered in their order, and counted from its first.
+fn next_of(sets: &mut SetReader, recorded: Option<&Range<u64>>) -> Result<Option<FrameSet>> {
+    let Some(range) = recorded else { return Ok(sets.next_set()?) };
+    while let Some(mut set) = sets.next_set()?.filter(|set| set.index < range.end) {
+        if set.index >= range.start {
+            // Nobody else holds them yet.
+            for frame in set.frames.iter_mut().flatten().filter_map(Arc::get_mut) {
+                frame.sequence = set.index;
+            }
+            return Ok(Some(set));
+        }
+    }
+    Ok(None)
 }
 
 /// The person of the data set's glTF file.
@@ -199,18 +231,35 @@ fn given_person(root: &Path) -> Result<GivenPerson> {
 
 /// Opens the input cameras; returns their number of frames as well.
 fn open_inputs(settings: &ReplaySettings, rig: &Rig) -> Result<(SetReader, usize)> {
-    let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     let with_masks = settings.true_masks || settings.session.perception.masks == Origin::Given;
-    let options = FolderOptions { fps: settings.fps, frames: settings.frames.clone(), with_masks };
-    let sources = FolderReplay::open(&settings.dataset, Some(&ids), &options)?;
-    let count = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);
+    let (sources, count) = open_sources(settings, &rig.cameras, with_masks)?;
     let sync = SyncSettings {
         window_nanos: Some(half_period_nanos(settings.fps)),
         lags_nanos: settings.lags_nanos.clone(),
         ..SyncSettings::default()
     };
-    let sources = sources.into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect();
     Ok((SetReader::new(sources, &sync), count))
+}
+
+/// Opens cameras of a folder or a recording; returns their number of frames as well.
+fn open_sources(
+    settings: &ReplaySettings,
+    cameras: &[Camera],
+    with_masks: bool,
+) -> Result<(Vec<Box<dyn CameraSource>>, usize)> {
+    let ids: Vec<CameraId> = cameras.iter().map(|camera| camera.id.clone()).collect();
+    let path = &settings.dataset;
+    if settings.recorded.is_none() {
+        let options = FolderOptions { fps: settings.fps, frames: settings.frames.clone(), with_masks };
+        let sources = FolderReplay::open(path, Some(&ids), &options)?;
+        let count = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);
+        return Ok((sources.into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect(), count));
+    }
+    let recorded = ids.first().map(|id| McapReplay::count(id, path)).transpose()?.unwrap_or(0);
+    let range = settings.frames.clone().unwrap_or(0..u64::MAX);
+    let count = (recorded as u64).min(range.end).saturating_sub(range.start) as usize;
+    let open = |id: &CameraId| Ok(Box::new(McapReplay::open(id, path)?) as Box<dyn CameraSource>);
+    Ok((ids.iter().map(open).collect::<Result<_>>()?, count))
 }
 
 /// Reads the held-out cameras alongside, never ahead of what is scored.
@@ -221,7 +270,7 @@ pub struct TruthReader {
 
 /// Images of one held-out camera.
 struct TrueImages {
-    source: FolderReplay,
+    source: Box<dyn CameraSource>,
     /// Is taken off the stamps, nanoseconds.
     lag_nanos: i64,
     matcher: Option<ColorMatcher>,
@@ -246,9 +295,8 @@ impl TruthReader {
     fn open(args: &ReplaySettings, holdout: &[Camera]) -> Result<Self> {
         let ids: Vec<CameraId> = holdout.iter().map(|camera| camera.id.clone()).collect();
         let with_masks = ids.iter().all(|id| args.dataset.join("mask").join(id.as_str()).is_dir());
-        let options = FolderOptions { fps: args.fps, frames: args.frames.clone(), with_masks };
-        let sources = FolderReplay::open(&args.dataset, Some(&ids), &options)?;
-        let of = |(source, camera): (FolderReplay, &Camera)| TrueImages {
+        let (sources, _) = open_sources(args, holdout, with_masks)?;
+        let of = |(source, camera): (Box<dyn CameraSource>, &Camera)| TrueImages {
             source,
             lag_nanos: args.lags_nanos.get(&camera.id).copied().unwrap_or_default(),
             matcher: ColorMatcher::new(camera),
@@ -266,7 +314,7 @@ impl TruthReader {
         for images in &mut self.sources {
             let earliest = nanos.saturating_sub_unsigned(self.window_nanos);
             while images.current.as_ref().is_none_or(|frame| frame.capture_nanos < earliest) {
-                match next_frame(&mut images.source) {
+                match next_frame(images.source.as_mut()) {
                     Ok(Some(frame)) => images.current = Some(images.corrected(frame)?),
                     Ok(None) => break,
                     Err(error) if error.kind == CaptureErrorKind::Corrupt => {

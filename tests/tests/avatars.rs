@@ -143,6 +143,41 @@ fn a_build_that_was_killed_goes_on() {
 }
 
 #[test]
+fn a_recording_gives_the_same_avatar_as_its_exported_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let rig = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = [\"00\", \"02\", \"04\"]\n\
+        [perception]\npose = \"given\"\nmasks = \"given\"\n[record]\njpeg_quality = 0\n\
+        [sim]\nseed = 5\nwidth = 192\nheight = 192\ntexture_px = 128\nframes = 6\ncameras.count = 6\n";
+    std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
+    let flyrig = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    for args in
+        [&["record", "rig.toml", "--out", "take.mcap"][..], &["replay", "take.mcap", "--export", "folder/take.mcap"]]
+    {
+        let finished = flyrig(args);
+        assert_eq!(finished.code, Some(0), "{finished:?}");
+    }
+    let build = |take: &str, out: &str, more: &[&str]| {
+        let args =
+            ["avatar", "build", take, "--inputs", "00,02,04", "--out", out, "--gaussians", "2000", "--nodes", "50"];
+        flyrig(&[&args[..], &["--steps", "40", "--frames", "1..5"], more].concat())
+    };
+    let estimated = ["--pose", "estimated", "--masks", "estimated"];
+    let bytes = ["take.mcap", "folder/take.mcap"].map(|take| {
+        let built = build(take, "a.flyavatar", &estimated);
+        assert_eq!(built.code, Some(0), "{built:?}");
+        std::fs::read(folder.path().join("a.flyavatar")).unwrap()
+    });
+    assert!(bytes[0] == bytes[1], "the folder gave another avatar");
+
+    let refused = build("take.mcap", "no.flyavatar", &[]);
+    assert_eq!(refused.code, Some(1), "{refused:?}");
+    assert!(refused.stderr.contains("add --pose estimated --masks estimated"), "{}", refused.stderr);
+    let missing = build("nothing.mcap", "no.flyavatar", &estimated);
+    assert!(missing.code == Some(1) && missing.stderr.contains("nothing.mcap"), "{missing:?}");
+    assert!(!folder.path().join("no.flyavatar").exists());
+}
+
+#[test]
 fn the_live_rig_starts_from_an_avatar() {
     let data = write_dataset().unwrap();
     let folder = tempfile::tempdir().unwrap();

@@ -50,6 +50,7 @@ fn leave_out(
     ensure!(mask.is_dir(), "there are no masks of it; write them to {}", mask.display());
     let settings = ReplaySettings {
         dataset: root.to_owned(),
+        recorded: None,
         inputs: cameras.iter().filter(|camera| *camera != left_out).cloned().collect(),
         holdout: vec![left_out.clone()],
         session: SessionSettings {

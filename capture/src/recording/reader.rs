@@ -84,6 +84,15 @@ impl McapReplay {
         })
     }
 
+    /// Returns the number of a camera's frames in a recording, which is read to its end.
+    ///
+    /// # Errors
+    /// `NotFound` without the file.
+    pub fn count(camera: &CameraId, path: &Path) -> Result<usize, CaptureError> {
+        let topic = format!("{TOPIC}{camera}");
+        Ok(Parts::open(path)?.map_while(Result::ok).filter(|message| message.channel.topic == topic).count())
+    }
+
     fn end(&mut self) -> CaptureError {
         self.is_over = true;
         CaptureError::new(&self.camera, CaptureErrorKind::EndOfStream, "the recording is over")

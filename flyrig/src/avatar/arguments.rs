@@ -35,7 +35,7 @@ pub enum AvatarAction {
 /// A take and how its person is found.
 #[derive(Debug, Clone, Args)]
 pub struct TakeArgs {
-    /// Folder in EasyMocap layout: a calibration, images/CAM, optional mask/CAM and a skinned *.glb.
+    /// Folder in EasyMocap layout: a calibration, images/CAM, optional mask/CAM and a skinned *.glb. Or a calibrated recording, *.mcap.
     pub dataset: PathBuf,
     /// Cameras that are looked at, comma separated.
     #[arg(long, value_delimiter = ',', required = true)]
@@ -43,7 +43,7 @@ pub struct TakeArgs {
     /// Frames FIRST..END, END excluded; all of them otherwise.
     #[arg(long, value_parser = parse_range)]
     pub frames: Option<Range<u64>>,
-    /// Frame rate of the folder.
+    /// Frame rate of the cameras.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
     #[command(flatten)]
