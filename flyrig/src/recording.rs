@@ -120,8 +120,8 @@ pub fn recorded_rig(path: &Path) -> Result<Rig> {
 
 /// The rig of a take that is a recording; None for a folder.
 pub fn rig_of_take(path: &Path) -> Result<Option<Rig>> {
-    let is_recording = path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("mcap"));
-    is_recording.then(|| recorded_rig(path)).transpose()
+    let ends_so = path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("mcap"));
+    (ends_so && !path.is_dir()).then(|| recorded_rig(path)).transpose()
 }
 
 /// The rig of recordings of earlier versions.
