@@ -95,11 +95,22 @@ fn sharpness(drawn: &[f32], wanted: &[f32], width: usize) -> (f64, Vec<f32>) {
     (sum, detail(difference.iter().map(sign).collect()))
 }
 
+/// Pixels of a photograph.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Photograph<'a> {
+    /// sRGB and mask.
+    pub rgba: &'a [u8],
+    /// Pixels whose colour is not the person's alone and is not compared; none where the list is shorter.
+    pub mixed: &'a [bool],
+}
+
 impl ImageError {
-    /// Compares a drawn image (premultiplied linear RGB, coverage) with bytes (sRGB, mask) of `width` pixels a row. A drawn pixel that is
-    /// not finite counts as clear and has no slope.
+    /// Compares a drawn image (premultiplied linear RGB, coverage) with a photograph of `width` pixels a row. A drawn pixel that is not
+    /// finite counts as clear and has no slope.
     #[must_use]
-    pub fn of(drawn: &[[f32; 4]], wanted: &[u8], width: usize, weights: &ErrorWeights) -> Self {
+    pub fn of(drawn: &[[f32; 4]], photograph: Photograph<'_>, width: usize, weights: &ErrorWeights) -> Self {
+        let wanted = photograph.rgba;
+        let is_mixed = |i: usize| photograph.mixed.get(i).is_some_and(|mixed| *mixed);
         let count = drawn.len().min(wanted.len() / 4);
         let whole = |pixel: &[f32; 4]| if pixel.iter().all(|value| value.is_finite()) { *pixel } else { [0.0; 4] };
         let pixels: Vec<[f32; 4]> = drawn[..count].iter().map(whole).collect();
@@ -114,8 +125,11 @@ impl ImageError {
             .into_par_iter()
             .map(|k| {
                 let ours: Vec<f32> = shown.iter().map(|pixel| pixel.color[k]).collect();
-                let theirs: Vec<f32> =
-                    wanted.chunks_exact(4).zip(&mask).map(|(pixel, mask)| unit(pixel[k]) * mask).collect();
+                // What is not compared is as wanted.
+                let theirs = wanted.chunks_exact(4).zip(&mask).zip(ours.iter().enumerate());
+                let theirs: Vec<f32> = theirs
+                    .map(|((pixel, mask), (i, ours))| if is_mixed(i) { *ours } else { unit(pixel[k]) * mask })
+                    .collect();
                 let (similarity, slope) = if weights.structure > 0.0 {
                     ssim(&ours, &theirs, width)
                 } else {
@@ -131,7 +145,7 @@ impl ImageError {
             error.loss += f64::from(weights.structure) * (count as f64 - similarity) / (3.0 * person);
             error.loss += f64::from(weights.sharpness) * sharp / (3.0 * person);
             let mut absolute = 0.0;
-            for i in 0..count {
+            for i in (0..count).filter(|i| !is_mixed(*i)) {
                 let difference = ours[i] - theirs[i];
                 absolute += f64::from(difference.abs());
                 error.squared += f64::from(difference * difference);
@@ -166,6 +180,10 @@ mod tests {
 
     use super::*;
 
+    fn photograph(rgba: &[u8]) -> Photograph<'_> {
+        Photograph { rgba, mixed: &[] }
+    }
+
     #[test]
     fn slopes_are_those_of_finite_differences() {
         let mut random = StdRng::seed_from_u64(4);
@@ -183,14 +201,14 @@ mod tests {
             .collect();
         let wanted: Vec<u8> = (0..width * 10 * 4).map(|_| random.random()).collect();
         let weights = ErrorWeights { color: 0.8, structure: 0.2, coverage: 0.3, sharpness: 0.7 };
-        let slope = ImageError::of(&drawn, &wanted, width, &weights).slope;
+        let slope = ImageError::of(&drawn, photograph(&wanted), width, &weights).slope;
         let mut worst = 0.0f64;
         for i in (0..drawn.len()).step_by(3) {
             for k in 0..4 {
                 let step = 1e-3;
                 let mut at = |by: f32| {
                     drawn[i][k] += by;
-                    let loss = ImageError::of(&drawn, &wanted, width, &weights).loss;
+                    let loss = ImageError::of(&drawn, photograph(&wanted), width, &weights).loss;
                     drawn[i][k] -= by;
                     loss
                 };
@@ -199,6 +217,27 @@ mod tests {
             }
         }
         assert!(worst < 0.03, "{worst}");
+    }
+
+    #[test]
+    fn the_color_of_mixed_pixels_does_not_count_and_their_coverage_does() {
+        let mut random = StdRng::seed_from_u64(8);
+        let width = 14;
+        let drawn: Vec<[f32; 4]> = (0..width * 12).map(|_| [0.1, 0.2, 0.3, random.random_range(0.4..0.9)]).collect();
+        let mut rgba: Vec<u8> = (0..drawn.len() * 4).map(|_| random.random()).collect();
+        let mixed: Vec<bool> = (0..drawn.len()).map(|_| random.random()).collect();
+        let weights = ErrorWeights { sharpness: 0.5, ..ErrorWeights::default() };
+        let of = |rgba: &[u8]| ImageError::of(&drawn, Photograph { rgba, mixed: &mixed }, width, &weights);
+        let before = of(&rgba);
+        for (pixel, _) in rgba.chunks_exact_mut(4).zip(&mixed).filter(|(_, mixed)| **mixed) {
+            pixel[..3].iter_mut().for_each(|code| *code = !*code);
+        }
+        assert_eq!(before, of(&rgba));
+        let scale = weights.coverage / rgba.chunks_exact(4).map(|pixel| f32::from(pixel[3]) / 255.0).sum::<f32>();
+        for (slope, _) in before.slope.iter().zip(&mixed).filter(|(_, mixed)| **mixed) {
+            assert!(slope[..3].iter().all(|slope| slope.abs() <= 0.0) && (slope[3].abs() - scale).abs() < 1e-3 * scale);
+        }
+        assert!(before != ImageError::of(&drawn, photograph(&rgba), width, &weights));
     }
 
     #[test]
@@ -249,19 +288,19 @@ mod tests {
         };
         let mut drawn: Vec<[f32; 4]> =
             wanted.chunks_exact(4).map(|p| [linear(p[0]), linear(p[1]), linear(p[2]), 1.0]).collect();
-        let error = ImageError::of(&drawn, &wanted, 20, &ErrorWeights::default());
+        let error = ImageError::of(&drawn, photograph(&wanted), 20, &ErrorWeights::default());
         assert!(error.loss < 1e-3 && error.squared < 1e-8, "{} {}", error.loss, error.squared);
         drawn[3] = [f32::NAN, 0.0, 0.0, 1.0];
         drawn[5] = [f32::INFINITY; 4];
-        let error = ImageError::of(&drawn, &wanted, 20, &ErrorWeights::default());
+        let error = ImageError::of(&drawn, photograph(&wanted), 20, &ErrorWeights::default());
         assert!(
             error.loss.is_finite()
                 && error.slope[3].iter().all(|v| v.abs() <= 0.0)
                 && error.slope.iter().flatten().all(|v| v.is_finite())
         );
-        assert!(ImageError::of(&[], &[], 20, &ErrorWeights::default()).slope.is_empty());
+        assert!(ImageError::of(&[], photograph(&[]), 20, &ErrorWeights::default()).slope.is_empty());
         // Nobody in the image: what is drawn is too much.
-        let error = ImageError::of(&[[0.5, 0.5, 0.5, 0.9]], &[0; 4], 1, &ErrorWeights::default());
+        let error = ImageError::of(&[[0.5, 0.5, 0.5, 0.9]], photograph(&[0; 4]), 1, &ErrorWeights::default());
         assert!(error.loss > 0.1 && error.slope[0][3] > 0.0);
     }
 }

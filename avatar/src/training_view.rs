@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use flyrig_types::Camera;
 
-use crate::rest::BAND_PX;
+use crate::{image_error::Photograph, outline::mixed, rest::BAND_PX};
 
 /// Images are cut to the person and so many pixels around.
 const MARGIN_PX: u32 = 12;
@@ -18,6 +18,8 @@ pub struct TrainingView {
     pub(crate) camera: Camera,
     /// sRGB and mask.
     rgba: Vec<u8>,
+    /// Pixels whose colour is not the person's alone.
+    mixed: Vec<bool>,
 }
 
 impl TrainingView {
@@ -52,10 +54,11 @@ impl TrainingView {
             let first = (y as usize * width as usize + left as usize) * 4;
             cut.extend(&rgba[first..first + 4 * columns as usize]);
         }
+        let mixed = mixed(&cut, columns as usize);
         let mut camera = camera.clone();
         camera.intrinsics.center_px -= glam::DVec2::new(f64::from(left), f64::from(top));
         (camera.intrinsics.width, camera.intrinsics.height) = (columns, rows);
-        Some(Self { frame, camera, rgba: cut })
+        Some(Self { frame, camera, rgba: cut, mixed })
     }
 
     /// Width and height, pixels.
@@ -64,18 +67,20 @@ impl TrainingView {
     }
 
     /// Camera and bytes of some of its rows.
-    pub(crate) fn rows(&self, rows: &Range<u32>) -> (Camera, &[u8]) {
+    pub(crate) fn rows(&self, rows: &Range<u32>) -> (Camera, Photograph<'_>) {
         let [width, height] = self.size();
         let rows = rows.start.min(height)..rows.end.min(height);
         let mut camera = self.camera.clone();
         camera.intrinsics.center_px.y -= f64::from(rows.start);
         camera.intrinsics.height = rows.end.saturating_sub(rows.start);
-        let byte = |row: u32| row as usize * width as usize * 4;
-        (camera, self.rgba.get(byte(rows.start)..byte(rows.end)).unwrap_or_default())
+        let pixel = |row: u32| row as usize * width as usize;
+        let (first, end) = (pixel(rows.start), pixel(rows.end));
+        let rgba = self.rgba.get(4 * first..4 * end).unwrap_or_default();
+        (camera, Photograph { rgba, mixed: self.mixed.get(first..end).unwrap_or_default() })
     }
 
     /// Pixels of the person in some rows: the sum of the mask's coverage.
     pub(crate) fn person(&self, rows: &Range<u32>) -> f64 {
-        self.rows(rows).1.chunks_exact(4).map(|pixel| f64::from(pixel[3]) / 255.0).sum()
+        self.rows(rows).1.rgba.chunks_exact(4).map(|pixel| f64::from(pixel[3]) / 255.0).sum()
     }
 }
