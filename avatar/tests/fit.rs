@@ -104,21 +104,21 @@ fn a_fit_that_was_killed_ends_as_one_that_was_not() {
         // Past the round of six images, and into the ones in which images rest.
         let run = |(fit, ours): &mut (Fit, Avatar), steps: std::ops::Range<u32>| {
             for step in steps {
-                fit.step(ours, step as f32 / 40.0).unwrap();
+                fit.step(ours, step as f32 / 120.0).unwrap();
             }
         };
         let mut whole = begin();
-        run(&mut whole, 0..40);
+        run(&mut whole, 0..120);
         let [rows, all] = whole.0.drawn().rows;
         assert!(rows < all, "nothing rested");
         let mut killed = begin();
-        run(&mut killed, 0..31);
-        let state = killed.0.checkpoint(&mut killed.1, "a take", 40).unwrap();
+        run(&mut killed, 0..91);
+        let state = killed.0.checkpoint(&mut killed.1, "a take", 120).unwrap();
         drop(killed);
         let mut resumed = begin();
         let progress = resumed.0.resume(&mut resumed.1, &state, "a take").unwrap();
-        assert_eq!((progress.done, progress.total), (31, 40));
-        run(&mut resumed, 31..40);
+        assert_eq!((progress.done, progress.total), (91, 120));
+        run(&mut resumed, 91..120);
         assert!(whole.1.to_bytes().unwrap() == resumed.1.to_bytes().unwrap(), "{networks:?}");
 
         // A refused state changes nothing.
@@ -154,8 +154,8 @@ fn wrong_poses_are_corrected() {
         let mut ours = truth.clone();
         let settings = FitSettings { refine_poses, skin_correction: false, ..FitSettings::default() };
         let mut fit = Fit::new(&gpu, &ours, wrong.clone(), views.clone(), settings).unwrap();
-        for step in 0..200 {
-            fit.step(&mut ours, step as f32 / 200.0).unwrap();
+        for step in 0..300 {
+            fit.step(&mut ours, step as f32 / 300.0).unwrap();
         }
         // Shoulder and upper arm may share a turn: what counts is where it brings the wrist.
         let wrists = |pose: &Pose| {
