@@ -143,7 +143,7 @@ fn a_build_that_was_killed_goes_on() {
 }
 
 #[test]
-fn a_recording_gives_the_same_avatar_as_its_exported_folder() {
+fn a_recording_gives_the_avatar_of_its_exported_folder() {
     let folder = tempfile::tempdir().unwrap();
     let rig = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = [\"00\", \"02\", \"04\"]\n\
         [perception]\npose = \"given\"\nmasks = \"given\"\n[record]\njpeg_quality = 0\n\
@@ -162,12 +162,18 @@ fn a_recording_gives_the_same_avatar_as_its_exported_folder() {
         flyrig(&[&args[..], &["--steps", "40", "--frames", "1..5"], more].concat())
     };
     let estimated = ["--pose", "estimated", "--masks", "estimated"];
-    let bytes = ["take.mcap", "folder/take.mcap"].map(|take| {
+    // Names of cards are those of the takes. Calibration and timestamps are rounded in a folder, so that bytes may differ.
+    let cards = ["take.mcap", "folder/take.mcap"].map(|take| {
         let built = build(take, "a.flyavatar", &estimated);
         assert_eq!(built.code, Some(0), "{built:?}");
-        std::fs::read(folder.path().join("a.flyavatar")).unwrap()
+        let info = flyrig(&["avatar", "info", "a.flyavatar"]).stdout;
+        let mut card: serde_json::Value = serde_json::from_str(&info[..=info.rfind('}').unwrap()]).unwrap();
+        let decibels = card["training_db"].take().as_f64().unwrap();
+        (card, decibels)
     });
-    assert!(bytes[0] == bytes[1], "the folder gave another avatar");
+    let [(recorded, of_recording), (exported, of_folder)] = &cards;
+    assert!(recorded == exported && recorded["frames"] == serde_json::json!([1, 5]), "{cards:?}");
+    assert!(*of_recording > 30.0 && (of_recording - of_folder).abs() < 0.5, "{cards:?}");
 
     let refused = build("take.mcap", "no.flyavatar", &[]);
     assert_eq!(refused.code, Some(1), "{refused:?}");
