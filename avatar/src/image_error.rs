@@ -40,7 +40,7 @@ pub struct ImageError {
     pub loss: f64,
     /// Mean squared difference of sRGB over all pixels that are compared, codes of 0..=1.
     pub squared: f64,
-    /// The same of each pixel.
+    /// The same of each pixel, 0 where it is not compared.
     pub pixels: Vec<f32>,
     /// Derivative with respect to premultiplied linear red, green, blue, and coverage; an element a pixel.
     pub slope: Vec<[f32; 4]>,
@@ -159,7 +159,8 @@ impl ImageError {
             }
             error.loss += f64::from(weights.color) * absolute / (3.0 * person);
         }
-        error.squared /= 3.0 * count.max(1) as f64;
+        let compared = (0..count).filter(|i| !is_mixed(*i)).count();
+        error.squared /= 3.0 * compared.max(1) as f64;
         for ((slope, pixel), mask) in error.slope.iter_mut().zip(&pixels).zip(&mask) {
             let difference = pixel[3] - mask;
             error.loss += f64::from(weights.coverage * difference.abs()) / person;
