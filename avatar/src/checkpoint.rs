@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 
-use crate::{Avatar, AvatarError, Fit};
+use crate::{Avatar, AvatarError, Fit, rest::Rest};
 
 /// Key of the description in the file's metadata.
 const HEADER: &str = "flyrig-fit";
@@ -63,11 +63,19 @@ impl Fit {
             let values: Vec<f32> = tensor.data().chunks_exact(4).map(bytemuck::pod_read_unaligned).collect();
             found.insert(name.to_owned(), values);
         }
+        let images = self.images().max(1) as u64;
         let state = self.state(avatar);
         for (name, own) in &state {
             let belongs =
                 |values: &&Vec<f32>| values.len() == own.len() && values.iter().all(|value| value.is_finite());
             found.get(name).filter(belongs).ok_or_else(|| format!("is damaged: {name} is missing or another"))?;
+        }
+        let round = progress.turn / images;
+        // No image rests for longer than three rounds.
+        let turns = progress.done..=5 * progress.done.min(u64::MAX / 8).saturating_add(images);
+        let until = found.get("rest.until");
+        if !turns.contains(&progress.turn) || !until.is_some_and(|until| Rest::is_possible(until, round)) {
+            return Err("is damaged: its rounds are impossible".to_owned());
         }
         for (name, own) in state {
             if let Some(values) = found.get(&name) {

@@ -34,6 +34,9 @@ const DIFFERENCES: [Element; 4] =
 /// Colours of higher orders than zero move more slowly.
 const HIGHER: f32 = 0.05;
 
+/// Buffers of so many sizes are kept for images that are drawn in part, beside those of whole ones.
+const PARTIAL_SIZES: usize = 8;
+
 /// Keeps the rounds of one seed apart from those of the next ones.
 const ROUND_SEED: u64 = 0x9e37_79b9_7f4a_7c15;
 
@@ -98,9 +101,9 @@ pub struct TrainingFrame {
 /// Result of one step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepReport {
-    /// Weighted error of the step's image.
+    /// Weighted error of what was drawn of the step's image, as a part of the whole image's.
     pub loss: f64,
-    /// Its PSNR inside the cut, decibels.
+    /// PSNR of what was drawn of it, decibels.
     pub decibels: f64,
 }
 
@@ -362,6 +365,12 @@ impl Fit {
         self.buffers.pose(&self.gpu, &self.posed);
         let (camera, wanted) = view.rows(rows);
         let size = [camera.intrinsics.width, camera.intrinsics.height];
+        if !self.targets.contains_key(&size) {
+            let is_whole = |size: &[u32; 2]| self.views.iter().any(|view| view.size() == *size);
+            if self.targets.keys().filter(|size| !is_whole(size)).count() >= PARTIAL_SIZES {
+                self.targets.retain(|size, _| is_whole(size));
+            }
+        }
         let Targets { drawn, .. } = match self.targets.entry(size) {
             Entry::Occupied(entry) => entry.into_mut(),
             Entry::Vacant(entry) => entry.insert(Targets::new(&self.gpu, size)?),
@@ -376,8 +385,9 @@ impl Fit {
         // A pixel counts as much as in the whole image.
         let whole = 0..view.size()[1];
         if *rows != whole {
-            let share = (view.person(rows).max(1.0) / view.person(&whole).max(1.0)) as f32;
-            error.slope.iter_mut().flatten().for_each(|slope| *slope *= share);
+            let share = view.person(rows).max(1.0) / view.person(&whole).max(1.0);
+            error.loss *= share;
+            error.slope.iter_mut().flatten().for_each(|slope| *slope *= share as f32);
         }
         Ok((error, bones))
     }

@@ -138,7 +138,8 @@ impl Local {
         // The first ones of farthest-point sampling are spread evenly, and so are the next ones: anchors and stages alike.
         let size = count.div_ceil(stage_count).max(1);
         let anchors = size.div_ceil(group);
-        let mut sampled = farthest(&places, if stage_count > 1 { size * (stage_count - 1) } else { anchors });
+        let wanted = if stage_count > 1 { size * (stage_count - 1) } else { anchors };
+        let mut sampled = farthest(&places, if settings.geometry { wanted } else { 0 });
         let inputs = sampled[..anchors.min(sampled.len())].to_vec();
         let mut is_sampled = vec![false; count];
         sampled.iter().for_each(|i| is_sampled[*i as usize] = true);

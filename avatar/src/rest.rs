@@ -50,6 +50,11 @@ impl Rest {
         Self { errors: vec![-1.0; bands], until: vec![0.0; bands], first, rows, is_on, drawn: Drawn::default() }
     }
 
+    /// Whether `until` can be the state of these bands in a round.
+    pub fn is_possible(until: &[f32], round: u64) -> bool {
+        until.iter().all(|until| *until <= round as f32 + 1.0 + ROUNDS)
+    }
+
     fn bands(&self, image: usize) -> Range<usize> {
         let at = |image: usize| self.first.get(image).copied().unwrap_or(0);
         at(image)..at(image + 1).max(at(image))
@@ -120,6 +125,8 @@ mod tests {
         let drawn =
             Drawn { images: 7, left_out: 2, rows: [u64::from(15 * BAND_PX) + 100, u64::from(18 * BAND_PX) + 100] };
         assert_eq!(rest.drawn, drawn);
+        assert!(Rest::is_possible(&rest.until, 3) && !Rest::is_possible(&rest.until, 2));
+        assert!(!Rest::is_possible(&[f32::NAN], 9));
     }
 
     #[test]

@@ -41,8 +41,8 @@ pub use nokhwa_camera::{NokhwaCamera, NokhwaDevice, NokhwaOptions, nokhwa_camera
 pub use pool::BufferPool;
 pub use queue::{LatestQueue, PopError};
 pub use recording::{
-    Compression, McapReplay, MessageTap, Note, RESERVE_BYTES, Recorded, Recorder, RecorderConfig, Recording, Rotation,
-    RotationError, SourceTap, recorded_messages, recorded_notes,
+    Compression, McapReplay, MessageTap, Note, RESERVE_BYTES, Recorded, RecordedSpan, Recorder, RecorderConfig,
+    Recording, Rotation, RotationError, SourceTap, recorded_messages, recorded_notes, recorded_spans,
 };
 pub use rgb::{to_rgb8, to_rgb8_into};
 pub use source::{CameraSource, NetworkHealth, SourceHealth};

@@ -14,6 +14,7 @@ pub mod program;
 mod progress;
 mod replay;
 pub mod stop;
+mod take_sets;
 mod trace;
 mod true_joints;
 

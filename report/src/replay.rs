@@ -4,12 +4,13 @@ use std::{
     collections::BTreeMap,
     ops::Range,
     path::{Path, PathBuf},
-    sync::Arc,
 };
 
 use anyhow::{Context, Result, bail};
 use flyrig_body::{Outfit, ShapeParams, Template, default_template, load_gltf};
-use flyrig_capture::{CameraSource, CaptureErrorKind, FolderOptions, FolderReplay, McapReplay, to_rgb8};
+use flyrig_capture::{
+    CameraSource, CaptureErrorKind, Decoding, FolderOptions, FolderReplay, McapReplay, recorded_spans, to_rgb8,
+};
 use flyrig_fusion::{
     EstimatedPerception, GivenPerception, GivenPerson, Origin, PerceptionSettings, PersonId, PersonMemory, SHAPE_SECS,
     SHAPE_SETS, Session, SessionBuilder, SessionSettings, SetReader, next_frame,
@@ -19,7 +20,11 @@ use flyrig_renderer::ColorMatcher;
 use flyrig_sync::SyncSettings;
 use flyrig_types::{Camera, CameraId, Frame, FrameSet, Image, PixelFormat, Rig};
 
-use crate::{dataset, true_joints::TrueJoints};
+use crate::{
+    dataset,
+    take_sets::{TakeSets, decoded},
+    true_joints::TrueJoints,
+};
 
 /// Settings of a replayed data set.
 #[derive(Debug, Clone)]
@@ -34,7 +39,7 @@ pub struct ReplaySettings {
     pub holdout: Vec<String>,
     /// Settings of the session; its origins decide what is read from the data set.
     pub session: SessionSettings,
-    /// Frame rate of the cameras.
+    /// Frame rate of the folder; a recording has its own.
     pub fps: f64,
     /// All frames where `None`. Those of a recording count from its first set of images.
     pub frames: Option<Range<u64>>,
@@ -68,9 +73,7 @@ impl From<Template> for KnownBody {
 pub struct Replay {
     /// The session.
     pub session: Session,
-    sets: SetReader,
-    /// Sets of a recording that are taken.
-    recorded: Option<Range<u64>>,
+    sets: TakeSets,
     /// Number of frames.
     pub count: usize,
     /// The held-out cameras.
@@ -86,18 +89,17 @@ impl Replay {
     /// Names the missing file, camera or person.
     pub fn open(settings: &ReplaySettings, gpu: &GpuContext) -> Result<Self> {
         settings.session.validate()?;
-        let perceived = &settings.session.perception;
-        if settings.recorded.is_some() && [perceived.pose, perceived.masks].contains(&Origin::Given) {
-            bail!(
-                "the recording {} holds no pose and no masks; add --pose estimated --masks estimated",
-                settings.dataset.display()
-            );
-        }
         let (rig, holdout) = load_rigs(settings)?;
         let sync = SyncSettings { lags_nanos: settings.lags_nanos.clone(), ..SyncSettings::default() };
         let lags_nanos = sync.with_offsets_of(&rig.cameras).with_offsets_of(&holdout).lags_nanos;
-        let settings = &ReplaySettings { lags_nanos, ..settings.clone() };
-        let (sets, count) = open_inputs(settings, &rig)?;
+        let mut settings = ReplaySettings { lags_nanos, ..settings.clone() };
+        let recorded = settings.recorded.is_some().then(|| measure_recording(&settings, &rig)).transpose()?;
+        if let Some((fps, _)) = recorded {
+            settings.fps = fps;
+        }
+        let settings = &settings;
+        let (sets, in_folder) = open_inputs(settings, &rig)?;
+        let count = recorded.map_or(in_folder, |(_, count)| count);
         let truth = TruthReader::open(settings, &holdout)?;
         let perceived = &settings.session.perception;
         let plates = dataset::plates(&dataset::plate_folder(&settings.dataset, perceived), &rig)?;
@@ -146,8 +148,7 @@ impl Replay {
                 }
             }
         };
-        let recorded = settings.recorded.is_some().then(|| settings.frames.clone().unwrap_or(0..u64::MAX));
-        Ok(Self { session: session.build()?, sets, recorded, count, holdout, truth })
+        Ok(Self { session: session.build()?, sets, count, holdout, truth })
     }
 
     /// Returns the next set; `None` at the end.
@@ -155,15 +156,13 @@ impl Replay {
     /// # Errors
     /// Names the image that cannot be read.
     pub fn next_set(&mut self) -> Result<Option<FrameSet>> {
-        next_of(&mut self.sets, self.recorded.as_ref())
+        self.sets.next_set()
     }
 
     /// Counts of complete and partial sets and of broken images.
     #[must_use]
     pub fn sync_summary(&self) -> serde_json::Value {
-        let counts = self.sets.counts();
-        let damaged = self.sets.damaged();
-        serde_json::json!({ "complete": counts.complete, "partial": counts.partial, "broken_images": damaged })
+        self.sets.summary()
     }
 }
 
@@ -195,10 +194,9 @@ fn first_sets(settings: &ReplaySettings, rig: &Rig) -> Result<Vec<FrameSet>> {
     let (mut reader, count) = open_inputs(settings, rig)?;
     let span = ((SHAPE_SECS * settings.fps) as usize).min(count);
     let every = span.div_ceil(SHAPE_SETS).max(1);
-    let recorded = settings.recorded.is_some().then(|| settings.frames.clone().unwrap_or(0..u64::MAX));
     let mut sets = Vec::new();
     for index in 0..span {
-        let Some(set) = next_of(&mut reader, recorded.as_ref())? else { break };
+        let Some(set) = reader.next_set()? else { break };
         if index % every == 0 {
             sets.push(set);
         }
@@ -206,19 +204,26 @@ fn first_sets(settings: &ReplaySettings, rig: &Rig) -> Result<Vec<FrameSet>> {
     Ok(sets)
 }
 
-/// The next set of a reader. Those of a recording are numbered in their order, and counted from its first.
-fn next_of(sets: &mut SetReader, recorded: Option<&Range<u64>>) -> Result<Option<FrameSet>> {
-    let Some(range) = recorded else { return Ok(sets.next_set()?) };
-    while let Some(mut set) = sets.next_set()?.filter(|set| set.index < range.end) {
-        if set.index >= range.start {
-            // Nobody else holds them yet.
-            for frame in set.frames.iter_mut().flatten().filter_map(Arc::get_mut) {
-                frame.sequence = set.index;
-            }
-            return Ok(Some(set));
-        }
+/// Returns the frame rate of a recording and the number of sets that are taken of it.
+fn measure_recording(settings: &ReplaySettings, rig: &Rig) -> Result<(f64, usize)> {
+    let (path, perceived) = (settings.dataset.display(), &settings.session.perception);
+    if [perceived.pose, perceived.masks].contains(&Origin::Given) {
+        bail!("the recording {path} holds no pose and no masks; add --pose estimated --masks estimated");
     }
-    Ok(None)
+    if settings.body.is_none() && perceived.shape() == Origin::Given {
+        bail!("the recording {path} holds no body; leave --shape out, or use a folder with a glTF file");
+    }
+    let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+    let spans = recorded_spans(&settings.dataset, &ids)?;
+    let Some(longest) = spans.iter().max_by_key(|span| span.frames).filter(|span| span.frames > 0) else {
+        bail!("the recording {path} holds no image of the cameras {}", settings.inputs.join(", "));
+    };
+    let Range { start, end } = settings.frames.clone().unwrap_or(0..u64::MAX);
+    let frames = longest.frames as u64;
+    if start >= frames {
+        bail!("no frame of {path} is in {start}..{end}; there are frames 0 to {}", frames - 1);
+    }
+    Ok((longest.fps().unwrap_or(settings.fps), (frames.min(end) - start) as usize))
 }
 
 /// The person of the data set's glTF file.
@@ -229,19 +234,24 @@ fn given_person(root: &Path) -> Result<GivenPerson> {
     Ok(GivenPerson { person: PersonId::default(), template: human.template, track, repeat: false })
 }
 
-/// Opens the input cameras; returns their number of frames as well.
-fn open_inputs(settings: &ReplaySettings, rig: &Rig) -> Result<(SetReader, usize)> {
+/// Opens the input cameras; returns a folder's number of frames as well.
+fn open_inputs(settings: &ReplaySettings, rig: &Rig) -> Result<(TakeSets, usize)> {
     let with_masks = settings.true_masks || settings.session.perception.masks == Origin::Given;
     let (sources, count) = open_sources(settings, &rig.cameras, with_masks)?;
+    let is_folder = settings.recorded.is_none();
     let sync = SyncSettings {
-        window_nanos: Some(half_period_nanos(settings.fps)),
+        // A folder's frames have the times of their numbers, those of a recording come as they come.
+        window_nanos: is_folder.then(|| half_period_nanos(settings.fps)),
         lags_nanos: settings.lags_nanos.clone(),
         ..SyncSettings::default()
     };
-    Ok((SetReader::new(sources, &sync), count))
+    let reader = SetReader::new(sources, &sync);
+    let range = settings.frames.clone().unwrap_or(0..u64::MAX);
+    let sets = if is_folder { TakeSets::folder(reader) } else { TakeSets::recording(reader, &rig.cameras, range) };
+    Ok((sets, count))
 }
 
-/// Opens cameras of a folder or a recording; returns their number of frames as well.
+/// Opens cameras of a folder, or of a recording; returns a folder's number of frames as well.
 fn open_sources(
     settings: &ReplaySettings,
     cameras: &[Camera],
@@ -249,17 +259,14 @@ fn open_sources(
 ) -> Result<(Vec<Box<dyn CameraSource>>, usize)> {
     let ids: Vec<CameraId> = cameras.iter().map(|camera| camera.id.clone()).collect();
     let path = &settings.dataset;
-    if settings.recorded.is_none() {
-        let options = FolderOptions { fps: settings.fps, frames: settings.frames.clone(), with_masks };
-        let sources = FolderReplay::open(path, Some(&ids), &options)?;
-        let count = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);
-        return Ok((sources.into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect(), count));
+    if settings.recorded.is_some() {
+        let open = |id: &CameraId| Ok(Box::new(McapReplay::open(id, path)?) as Box<dyn CameraSource>);
+        return Ok((ids.iter().map(open).collect::<Result<_>>()?, 0));
     }
-    let recorded = ids.first().map(|id| McapReplay::count(id, path)).transpose()?.unwrap_or(0);
-    let range = settings.frames.clone().unwrap_or(0..u64::MAX);
-    let count = (recorded as u64).min(range.end).saturating_sub(range.start) as usize;
-    let open = |id: &CameraId| Ok(Box::new(McapReplay::open(id, path)?) as Box<dyn CameraSource>);
-    Ok((ids.iter().map(open).collect::<Result<_>>()?, count))
+    let options = FolderOptions { fps: settings.fps, frames: settings.frames.clone(), with_masks };
+    let sources = FolderReplay::open(path, Some(&ids), &options)?;
+    let count = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);
+    Ok((sources.into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect(), count))
 }
 
 /// Reads the held-out cameras alongside, never ahead of what is scored.
@@ -274,20 +281,56 @@ struct TrueImages {
     /// Is taken off the stamps, nanoseconds.
     lag_nanos: i64,
     matcher: Option<ColorMatcher>,
-    /// Frame of the last time.
-    current: Option<Frame>,
+    /// Of a recording.
+    decoding: Option<Decoding>,
+    /// Next frame that was read.
+    ahead: Option<Frame>,
+    /// Frame nearest to the last time, and whether its image is decoded and corrected.
+    current: Option<(Frame, bool)>,
 }
 
 impl TrueImages {
-    /// Corrects time and colours of a frame as those of an input camera are corrected.
-    fn corrected(&self, frame: Frame) -> Result<Frame> {
-        let capture_nanos = frame.capture_nanos.saturating_sub(self.lag_nanos);
-        let Some(matcher) = &self.matcher else { return Ok(Frame { capture_nanos, ..frame }) };
-        let (width, height) = (frame.image.width(), frame.image.height());
-        let mut rgb = to_rgb8(&frame.image)?;
-        matcher.correct(&mut rgb, 3, width as usize, |_| false);
-        let image = Image::new(width, height, PixelFormat::Rgb8, rgb)?;
-        Ok(Frame { capture_nanos, image, ..frame })
+    /// Goes on to the frame nearest to a time.
+    fn seek(&mut self, nanos: i64) -> Result<()> {
+        loop {
+            if self.ahead.is_none() {
+                match next_frame(self.source.as_mut()) {
+                    Ok(Some(frame)) => {
+                        let capture_nanos = frame.capture_nanos.saturating_sub(self.lag_nanos);
+                        self.ahead = Some(Frame { capture_nanos, ..frame });
+                    }
+                    Ok(None) => return Ok(()),
+                    Err(error) if error.kind == CaptureErrorKind::Corrupt => {
+                        tracing::warn!("held-out {error}; that frame is not scored");
+                        continue;
+                    }
+                    Err(error) => return Err(error.into()),
+                }
+            }
+            let away = |frame: &Frame| frame.capture_nanos.abs_diff(nanos);
+            let is_nearer = |ahead: &Frame| self.current.as_ref().is_none_or(|(now, _)| away(ahead) <= away(now));
+            match self.ahead.take_if(|ahead| is_nearer(ahead)) {
+                Some(frame) => self.current = Some((frame, false)),
+                None => return Ok(()),
+            }
+        }
+    }
+
+    /// Decodes the frame and corrects its colours as those of an input camera are corrected.
+    fn prepare(&mut self) -> Result<()> {
+        let Some((mut frame, false)) = self.current.take_if(|(_, is_ready)| !*is_ready) else { return Ok(()) };
+        if let Some(decoding) = &mut self.decoding {
+            let Some(found) = decoded(decoding, frame)? else { return Ok(()) };
+            frame = found;
+        }
+        if let Some(matcher) = &self.matcher {
+            let (width, height) = (frame.image.width(), frame.image.height());
+            let mut rgb = to_rgb8(&frame.image)?;
+            matcher.correct(&mut rgb, 3, width as usize, |_| false);
+            frame.image = Image::new(width, height, PixelFormat::Rgb8, rgb)?;
+        }
+        self.current = Some((frame, true));
+        Ok(())
     }
 }
 
@@ -300,6 +343,8 @@ impl TruthReader {
             source,
             lag_nanos: args.lags_nanos.get(&camera.id).copied().unwrap_or_default(),
             matcher: ColorMatcher::new(camera),
+            decoding: args.recorded.is_some().then(|| Decoding::new(Some(camera.size()))),
+            ahead: None,
             current: None,
         };
         let sources = sources.into_iter().zip(holdout).map(of).collect();
@@ -311,21 +356,16 @@ impl TruthReader {
     /// # Errors
     /// Names the image that cannot be read; one that is broken is left out.
     pub fn at(&mut self, nanos: i64) -> Result<Vec<Option<&Frame>>> {
+        let window = self.window_nanos;
+        let is_near = |frame: &Frame| frame.capture_nanos.abs_diff(nanos) <= window;
         for images in &mut self.sources {
-            let earliest = nanos.saturating_sub_unsigned(self.window_nanos);
-            while images.current.as_ref().is_none_or(|frame| frame.capture_nanos < earliest) {
-                match next_frame(images.source.as_mut()) {
-                    Ok(Some(frame)) => images.current = Some(images.corrected(frame)?),
-                    Ok(None) => break,
-                    Err(error) if error.kind == CaptureErrorKind::Corrupt => {
-                        tracing::warn!("held-out {error}; that frame is not scored");
-                    }
-                    Err(error) => return Err(error.into()),
-                }
+            images.seek(nanos)?;
+            if images.current.as_ref().is_some_and(|(frame, _)| is_near(frame)) {
+                images.prepare()?;
             }
         }
-        let near = |frame: &&Frame| frame.capture_nanos.abs_diff(nanos) <= self.window_nanos;
-        Ok(self.sources.iter().map(|images| images.current.as_ref().filter(near)).collect())
+        let sources = self.sources.iter().map(|images| images.current.as_ref());
+        Ok(sources.map(|current| current.map(|(frame, _)| frame).filter(|frame| is_near(frame))).collect())
     }
 }
 

@@ -146,7 +146,7 @@ fn a_build_that_was_killed_goes_on() {
 fn a_recording_gives_the_avatar_of_its_exported_folder() {
     let folder = tempfile::tempdir().unwrap();
     let rig = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = [\"00\", \"02\", \"04\"]\n\
-        [perception]\npose = \"given\"\nmasks = \"given\"\n[record]\njpeg_quality = 0\n\
+        [perception]\npose = \"given\"\nmasks = \"given\"\n[record]\njpeg_quality = 95\n\
         [sim]\nseed = 5\nwidth = 192\nheight = 192\ntexture_px = 128\nframes = 6\ncameras.count = 6\n";
     std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
     let flyrig = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
@@ -175,9 +175,27 @@ fn a_recording_gives_the_avatar_of_its_exported_folder() {
     assert!(recorded == exported && recorded["frames"] == serde_json::json!([1, 5]), "{cards:?}");
     assert!(*of_recording > 30.0 && (of_recording - of_folder).abs() < 0.5, "{cards:?}");
 
+    // Held-out cameras of a recording are scored as those of its folder.
+    let eval = |take: &str| {
+        let args = ["avatar", "eval", "a.flyavatar", take, "--inputs", "00,02", "--holdout", "04", "--out", "e"];
+        let scored = flyrig(&[&args[..], &["--frames", "2..4"], &estimated].concat());
+        assert_eq!(scored.code, Some(0), "{scored:?}");
+        let metrics = std::fs::read(folder.path().join("e/metrics.json")).unwrap();
+        let metrics: serde_json::Value = serde_json::from_slice(&metrics).unwrap();
+        assert!(folder.path().join("e/04/000003.png").exists());
+        (metrics["per_frame"].as_array().unwrap().len(), metrics["mean"]["psnr_db"].as_f64().unwrap())
+    };
+    let (recorded, exported) = (eval("take.mcap"), eval("folder/take.mcap"));
+    assert!(recorded.0 == 2 && exported.0 == 2 && (recorded.1 - exported.1).abs() < 0.5, "{recorded:?} {exported:?}");
+
     let refused = build("take.mcap", "no.flyavatar", &[]);
     assert_eq!(refused.code, Some(1), "{refused:?}");
     assert!(refused.stderr.contains("add --pose estimated --masks estimated"), "{}", refused.stderr);
+    let refused = build("take.mcap", "no.flyavatar", &[&estimated[..], &["--shape", "given"]].concat());
+    assert!(refused.code == Some(1) && refused.stderr.contains("holds no body"), "{}", refused.stderr);
+    let beyond = ["eval", "take.mcap", "--inputs", "00,02", "--holdout", "04", "--frames", "9..12", "--out", "e"];
+    let beyond = flyrig(&[&beyond[..], &estimated].concat());
+    assert!(beyond.code == Some(1) && beyond.stderr.contains("there are frames 0 to 5"), "{}", beyond.stderr);
     let missing = build("nothing.mcap", "no.flyavatar", &estimated);
     assert!(missing.code == Some(1) && missing.stderr.contains("nothing.mcap"), "{missing:?}");
     assert!(!folder.path().join("no.flyavatar").exists());

@@ -23,7 +23,7 @@ mod writer;
 pub use self::{
     compress::Compression,
     outlet::{Note, Recorded},
-    reader::{McapReplay, recorded_messages, recorded_notes},
+    reader::{McapReplay, RecordedSpan, recorded_messages, recorded_notes, recorded_spans},
     rotation::{Rotation, RotationError},
     tap::{MessageTap, Recording, SourceTap},
     writer::{RESERVE_BYTES, Recorder, RecorderConfig},

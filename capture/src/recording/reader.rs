@@ -68,6 +68,41 @@ pub fn recorded_messages(path: &Path, topic: &str) -> Result<impl Iterator<Item 
     Ok(messages.map(|message| (i64::try_from(message.log_time).unwrap_or(i64::MAX), message.data.into_owned())))
 }
 
+/// Frames of a camera in a recording.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct RecordedSpan {
+    /// How many.
+    pub frames: usize,
+    /// Timestamps of the first and the last one, nanoseconds.
+    pub nanos: [i64; 2],
+}
+
+impl RecordedSpan {
+    /// Frames a second; None with fewer than two, or where time stands still.
+    #[must_use]
+    pub fn fps(&self) -> Option<f64> {
+        let nanos = self.nanos[1].saturating_sub(self.nanos[0]);
+        (self.frames > 1 && nanos > 0).then(|| (self.frames - 1) as f64 * 1e9 / nanos as f64)
+    }
+}
+
+/// Returns what a recording has of each camera; it is read to its end, images are not decoded.
+///
+/// # Errors
+/// `NotFound` without the file.
+pub fn recorded_spans(path: &Path, cameras: &[CameraId]) -> Result<Vec<RecordedSpan>, CaptureError> {
+    let topics: Vec<String> = cameras.iter().map(|camera| format!("{TOPIC}{camera}")).collect();
+    let mut spans = vec![RecordedSpan::default(); cameras.len()];
+    for message in Parts::open(path)?.map_while(Result::ok) {
+        for (span, _) in spans.iter_mut().zip(&topics).filter(|(_, topic)| **topic == message.channel.topic) {
+            let nanos = i64::try_from(message.log_time).unwrap_or(i64::MAX);
+            span.nanos = [if span.frames == 0 { nanos } else { span.nanos[0] }, nanos];
+            span.frames += 1;
+        }
+    }
+    Ok(spans)
+}
+
 impl McapReplay {
     /// Opens a file for one camera; each camera reads the file by itself.
     ///
@@ -82,15 +117,6 @@ impl McapReplay {
             last: None,
             is_over: false,
         })
-    }
-
-    /// Returns the number of a camera's frames in a recording, which is read to its end.
-    ///
-    /// # Errors
-    /// `NotFound` without the file.
-    pub fn count(camera: &CameraId, path: &Path) -> Result<usize, CaptureError> {
-        let topic = format!("{TOPIC}{camera}");
-        Ok(Parts::open(path)?.map_while(Result::ok).filter(|message| message.channel.topic == topic).count())
     }
 
     fn end(&mut self) -> CaptureError {
