@@ -1,7 +1,7 @@
 //! Error of a drawn image against a photograph of the person, and its derivative.
 //!
 //! Compared are the bytes that a viewer would show: straight colours in sRGB times coverage, against the photograph times its mask
-//! (LoGAvatar Eq. 16, without the learnt perceptual term: absolute differences, structural similarity, and differences of what sharpening
+//! (LoGAvatar Eq. 16, without the learnt perceptual term: distances of colours, structural similarity, and differences of what sharpening
 //! adds, Eq. 17), and coverage against the mask.
 
 use flyrig_renderer::srgb_from_linear;
@@ -14,10 +14,13 @@ const CLEAR: f32 = 1.0 / 512.0;
 /// Colours below this have the slope of this one: at black the curve of sRGB is too steep to descend.
 const DARK: f32 = 1e-3;
 
+/// Distances of colours below this have no direction, codes of 0..=1.
+const LEAST: f32 = 1e-4;
+
 /// Weights of the parts of the error.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ErrorWeights {
-    /// Of absolute differences of colour.
+    /// Of distances of colours, root mean squares of the three channels.
     pub color: f32,
     /// Of one minus the structural similarity.
     pub structure: f32,
@@ -140,25 +143,34 @@ impl ImageError {
                 (ours, theirs, [similarity, sharp], [slope, sharp_slope])
             })
             .collect();
+        // The distance of two colours, so that a pixel that shows one cloth in some images and another in others gets a colour between them:
+        // each channel by itself would go to either, and both together to a third colour.
+        let mut distance = 0.0;
+        let inverse_lengths: Vec<f32> = (0..count)
+            .map(|i| {
+                let squares: f32 = planes.iter().map(|(ours, theirs, ..)| (ours[i] - theirs[i]).powi(2)).sum();
+                let length = (squares / 3.0).sqrt();
+                distance += f64::from(length);
+                1.0 / length.max(LEAST)
+            })
+            .collect();
         let third = scale / 3.0;
         for (k, (ours, theirs, [similarity, sharp], [structure, sharpening])) in planes.into_iter().enumerate() {
             error.loss += f64::from(weights.structure) * (count as f64 - similarity) / (3.0 * person);
             error.loss += f64::from(weights.sharpness) * sharp / (3.0 * person);
-            let mut absolute = 0.0;
             for i in (0..count).filter(|i| !is_mixed(*i)) {
                 let difference = ours[i] - theirs[i];
-                absolute += f64::from(difference.abs());
                 error.squared += f64::from(difference * difference);
                 error.pixels[i] += difference * difference / 3.0;
-                let sign = if difference > 0.0 { 1.0 } else { -1.0 };
+                let along = difference * inverse_lengths[i];
                 let slope = third
-                    * (weights.color * sign - weights.structure * structure[i] + weights.sharpness * sharpening[i]);
+                    * (weights.color * along - weights.structure * structure[i] + weights.sharpness * sharpening[i]);
                 let Shown { by_color, by_coverage, .. } = &shown[i];
                 error.slope[i][k] = slope * by_color[k];
                 error.slope[i][3] += slope * by_coverage[k];
             }
-            error.loss += f64::from(weights.color) * absolute / (3.0 * person);
         }
+        error.loss += f64::from(weights.color) * distance / person;
         let compared = (0..count).filter(|i| !is_mixed(*i)).count();
         error.squared /= 3.0 * compared.max(1) as f64;
         for ((slope, pixel), mask) in error.slope.iter_mut().zip(&pixels).zip(&mask) {

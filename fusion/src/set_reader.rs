@@ -167,6 +167,6 @@ mod tests {
         let (sets, _, error) = read(vec![vec![Ok(0), Err(CaptureErrorKind::NotFound)], frames(0..3, 0)]);
         assert!(sets.is_empty() && error.unwrap().kind == CaptureErrorKind::NotFound);
         assert!(read(vec![]).0.is_empty() && read(vec![vec![], vec![]]).0.is_empty());
-        assert_eq!(read(vec![vec![], frames(0..3, 0)]).0.len(), 3);
+        assert!(read(vec![vec![], frames(0..90, 0)]).0.len() > 80, "one camera never came");
     }
 }
