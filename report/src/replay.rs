@@ -118,7 +118,7 @@ impl Replay {
                     builder.perception(perception.dressed())
                 } else {
                     let mut perception = GivenPerception::new(&rig, vec![person]).with_masks(perceived, &plates)?;
-                    perception.find_outfits(&first_sets(settings, &rig)?)?;
+                    perception.find_outfits(&first_sets(settings, &rig, count)?)?;
                     builder.perception(perception)
                 }
             }
@@ -131,7 +131,7 @@ impl Replay {
                 } else if perceived.shape() == Origin::Given {
                     let GivenPerson { template, track, .. } = given_person(&settings.dataset)?;
                     let mut inner = EstimatedPerception::new(&rig, &template, perceived, &plates)?;
-                    inner.find_outfits(&first_sets(settings, &rig)?)?;
+                    inner.find_outfits(&first_sets(settings, &rig, count)?)?;
                     match settings.true_joints.as_slice() {
                         [] => builder.perception(inner),
                         names => builder.perception(TrueJoints { inner, template, track, names: names.to_vec() }),
@@ -140,7 +140,7 @@ impl Replay {
                     let template = default_template(&ShapeParams::default())?;
                     let mut perception = EstimatedPerception::new(&rig, &template, perceived, &plates)?;
                     eprintln!("learning the person's shape from {SHAPE_SETS} frames of the first {SHAPE_SECS} seconds");
-                    let first = first_sets(settings, &rig)?;
+                    let first = first_sets(settings, &rig, count)?;
                     for fit in perception.learn_shapes(&first).context("no person found in the first frames")? {
                         eprintln!("the person is {fit}");
                     }
@@ -190,8 +190,8 @@ fn load_rigs(args: &ReplaySettings) -> Result<(Rig, Vec<Camera>)> {
 }
 
 /// Sets spread over the first seconds, in which the person is seen in several poses.
-fn first_sets(settings: &ReplaySettings, rig: &Rig) -> Result<Vec<FrameSet>> {
-    let (mut reader, count) = open_inputs(settings, rig)?;
+fn first_sets(settings: &ReplaySettings, rig: &Rig, count: usize) -> Result<Vec<FrameSet>> {
+    let (mut reader, _) = open_inputs(settings, rig)?;
     let span = ((SHAPE_SECS * settings.fps) as usize).min(count);
     let every = span.div_ceil(SHAPE_SETS).max(1);
     let mut sets = Vec::new();
