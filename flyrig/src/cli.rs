@@ -818,7 +818,7 @@ pub struct EvalArgs {
     /// Frames FIRST..END, END excluded; all of them otherwise.
     #[arg(long, value_parser = parse_range)]
     pub frames: Option<Range<u64>>,
-    /// Frame rate of the cameras.
+    /// Frame rate of the folder; a recording has its own.
     #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
     pub fps: f64,
     #[command(flatten)]
