@@ -80,6 +80,9 @@ impl Rest {
 
     /// Takes note of the squared error of the pixels that were drawn, `width` in a row, from a band's first row on.
     pub fn judge(&mut self, image: usize, round: u64, from_row: u32, squares: &[f32], width: usize) {
+        if !self.is_on {
+            return;
+        }
         let first = self.bands(image).start + (from_row / BAND_PX) as usize;
         let end = self.bands(image).end;
         for (band, pixels) in (first..end).zip(squares.chunks((width * BAND_PX as usize).max(1))) {
