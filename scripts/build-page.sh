@@ -1,5 +1,5 @@
 #!/bin/sh
-# Builds the web page's WebAssembly, web/assets/page.wasm, from page/. Needed after changes of page/, viewing/ or stream/; the test
+# Builds the web page's WebAssembly, viewer/web/assets/page.wasm, from page/. Needed after changes of page/, viewing/ or stream/; the test
 # `cargo test -p flyrig-page --test wasm` compares the file with the sources.
 set -eu
 cd "$(dirname "$0")/.."
@@ -12,5 +12,5 @@ if ! test -d "$libraries" && ! rustup target add wasm32-unknown-unknown; then
     exit 1
 fi
 RUSTFLAGS="$flags" cargo build --locked --profile page --target wasm32-unknown-unknown -p flyrig-page --target-dir "$target"
-cp "$target/wasm32-unknown-unknown/page/flyrig_page.wasm" web/assets/page.wasm
-ls -l web/assets/page.wasm
+cp "$target/wasm32-unknown-unknown/page/flyrig_page.wasm" viewer/web/assets/page.wasm
+ls -l viewer/web/assets/page.wasm

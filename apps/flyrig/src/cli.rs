@@ -888,7 +888,7 @@ mod tests {
 
     #[test]
     fn the_service_file_starts_what_there_is() {
-        let service = include_str!("../../packaging/flyrig.service");
+        let service = include_str!("../../../packaging/flyrig.service");
         let start = service.lines().find_map(|line| line.strip_prefix("ExecStart=")).unwrap();
         let cli = Cli::try_parse_from(start.split_whitespace()).unwrap();
         assert!(matches!(cli.command, Command::Run { .. }));

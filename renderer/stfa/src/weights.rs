@@ -57,7 +57,7 @@ impl Parameters {
         ])
     }
 
-    /// The weights that come with this version, by the name of one of [`EMBEDDED`] (`stfa/weights` has cards that tell how they
+    /// The weights that come with this version, by the name of one of [`EMBEDDED`] (`renderer/stfa/weights` has cards that tell how they
     /// were made), or those of a file.
     ///
     /// # Errors

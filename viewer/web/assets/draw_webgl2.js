@@ -1,4 +1,4 @@
-// Draws Gaussians with WebGL2, as renderer/src/raster_project.wgsl and raster_blend.wgsl do: EWA projection, Mip filter, blending in
+// Draws Gaussians with WebGL2, as renderer/renderer/src/raster_project.wgsl and raster_blend.wgsl do: EWA projection, Mip filter, blending in
 // linear light. Gaussians come sorted, farthest first.
 
 const TEXELS = 1024; // Gaussians in a row of the data textures
@@ -193,7 +193,7 @@ export class WebGl2Drawing {
   /** Standard deviations along the axes; opacities are those of the colours, and `order` leaves out who faces away. */
   setScales(scales, count) { this.upload(this.scales, scales, count, this.four); }
 
-  /** Draws the Gaussians of `order`, farthest first, with a camera of 19 numbers (page/src/page.rs). */
+  /** Draws the Gaussians of `order`, farthest first, with a camera of 19 numbers (viewer/page/src/page.rs). */
   draw(camera, background, order) {
     const gl = this.gl;
     const width = gl.drawingBufferWidth, height = gl.drawingBufferHeight;

@@ -1,5 +1,5 @@
-// Draws Gaussians with WebGPU by the rig's own kernels (kernels.json is made of renderer/src/*.wgsl): projection, stable sort by depth,
-// lists by tile, blending. Numbers of bindings and the order of dispatches are those of renderer/src/raster_device.rs.
+// Draws Gaussians with WebGPU by the rig's own kernels (kernels.json is made of renderer/renderer/src/*.wgsl): projection, stable sort by depth,
+// lists by tile, blending. Numbers of bindings and the order of dispatches are those of renderer/renderer/src/raster_device.rs.
 
 const SLOT_BYTES = 256; // constants lie this far apart: offsets of bindings may be any multiple of it
 const MOST_GROUPS = 65535; // workgroups of a dispatch in one dimension
@@ -198,7 +198,7 @@ export class WebGpuDrawing {
     this.composed = device.createBindGroup({ layout: this.compose.getBindGroupLayout(0), entries });
   }
 
-  /** Constants of an image with a camera of 19 numbers (page/src/page.rs), for kernels that take any lens. */
+  /** Constants of an image with a camera of 19 numbers (viewer/page/src/page.rs), for kernels that take any lens. */
   frameConstants(camera, width, height) {
     const { offsets, numbers } = this;
     const bytes = new ArrayBuffer(offsets.bytes);
@@ -222,7 +222,7 @@ export class WebGpuDrawing {
     return bytes;
   }
 
-  /** Draws all Gaussians with a camera of 19 numbers (page/src/page.rs). */
+  /** Draws all Gaussians with a camera of 19 numbers (viewer/page/src/page.rs). */
   draw(camera, background) {
     const { device, count } = this;
     const { width, height } = this.canvas;

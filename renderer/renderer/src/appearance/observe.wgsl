@@ -58,7 +58,7 @@ fn main(
     if i >= arrayLength(&seen) {
         return;
     }
-    // The drawn surface lies above the centre (body/src/inset.rs): what a camera sees of the Gaussian is there.
+    // The drawn surface lies above the centre (base/body/src/inset.rs): what a camera sees of the Gaussian is there.
     let position = center_scale[i].xyz + normals[i].w * normals[i].xyz;
     let angle = angle_weight(normals[i].xyz, position - camera.position.xyz);
     if settings.view_weight == 0.0 && !(angle > 0.0) {

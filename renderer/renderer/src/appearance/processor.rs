@@ -67,7 +67,7 @@ pub(super) fn observe(
         for (offset, (seen, quality)) in seen.iter_mut().zip(quality).enumerate() {
             let i = chunk * CHUNK + offset;
             let (normal, depth) = (Vec4::from(normal[i]).truncate(), normal[i][3]);
-            // The drawn surface lies above the centre (body/src/inset.rs): what a camera sees of the Gaussian is there.
+            // The drawn surface lies above the centre (base/body/src/inset.rs): what a camera sees of the Gaussian is there.
             let position = Vec4::from(center_scale[i]).truncate() + depth * normal;
             let at = Vec4::from(positions[i]).truncate();
             let last = Vec4::from(last[i]).truncate();

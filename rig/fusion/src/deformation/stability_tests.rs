@@ -4,9 +4,9 @@ mod chain;
 mod hard;
 mod small_scene;
 
-#[path = "../../../renderer/tests/support/reference.rs"]
+#[path = "../../../../renderer/renderer/tests/support/reference.rs"]
 mod reference;
-#[path = "../../../renderer/tests/support/reference_backward.rs"]
+#[path = "../../../../renderer/renderer/tests/support/reference_backward.rs"]
 mod reference_backward;
 
 use std::fmt::Write as _;
