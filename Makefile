@@ -19,7 +19,7 @@ help:
 	@echo "make test-browser  the web page in Chromium, which it installs"
 	@echo "make soak    four plain cameras for MINUTES (30): memory, latency, processor time"
 	@echo "make fuzz    damaged input for everything that reads foreign bytes, MINUTES (30) for each"
-	@echo "make check   format, lints and documentation, as CI runs them"
+	@echo "make check   spelling, format, lints and documentation, as CI runs them"
 	@echo "make setup   only install what is missing"
 
 setup:
@@ -53,7 +53,9 @@ soak: setup
 fuzz: setup
 	$(CARGO) run --release --locked -q --bin fuzz -- --minutes $(MINUTES)
 
-check: setup
+check:
+	@scripts/setup.sh codespell
+	codespell
 	$(CARGO) fmt --all -- --check
 	$(CARGO) clippy --release --locked --workspace --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --release --locked --workspace --no-deps

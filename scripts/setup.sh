@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Installs what flyrig needs and this machine lacks; says what and why. Safe to run again: it then does nothing.
-# Usage: scripts/setup.sh [--check] [chromium]   (--check only tells, and fails when something is missing; chromium is for test-browser)
+# Usage: scripts/setup.sh [--check] [chromium] [codespell]   (--check only reports, and fails when something is missing; chromium is for
+# test-browser, codespell for check)
 set -euo pipefail
 
 check_only=false
@@ -22,6 +23,9 @@ fi
 # Recorded motion for the simulated people.
 wanted+=("assimp-testmodels:holds a captured walk (CMU 01_01.bvh) for the simulated people")
 
+case " $* " in
+  *" codespell "*) wanted+=("codespell:finds spelling mistakes in source and documents") ;;
+esac
 case " $* " in
   *" chromium "*) wanted+=("chromium:a browser, for the test of the web page") ;;
 esac
