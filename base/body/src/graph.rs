@@ -3,6 +3,7 @@
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
+use flyrig_model::stretch::growth;
 use glam::{DVec3, Vec3};
 
 use crate::surface_links::SurfaceLinks;
@@ -100,15 +101,9 @@ pub fn displacement(rest: &[Vec3], translations: &[DVec3], nodes: [u32; 4], weig
             now += (apart + moved[b] - moved[a]).length_squared();
         }
     }
-    let longer = if then > 0.0 && now.is_finite() { (now / then).sqrt() / CLOSED } else { 1.0 };
-    let longer = longer.clamp(1.0, MOST_GROWTH) - 1.0;
-    by.as_vec3().extend(longer as f32).to_array()
+    by.as_vec3().extend((growth(then, now, f64::sqrt) - 1.0) as f32).to_array()
 }
 
-/// Gaussians overlap enough to close a surface that is longer than at rest by this factor; larger ones would only blur it.
-const CLOSED: f64 = 1.25;
-/// Most that a Gaussian grows, as a factor.
-const MOST_GROWTH: f64 = 4.0;
 /// Weights below this are 0 in the person stream, which has 255 steps: its viewers do not know which node it was.
 const LEAST_WEIGHT: f32 = 0.5 / 255.0;
 

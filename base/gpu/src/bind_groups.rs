@@ -9,7 +9,7 @@ use wgpu::{
     BindGroup, BindGroupDescriptor, BindGroupEntry, BindingResource, Buffer, BufferSize, ComputePipeline, Device,
 };
 
-use crate::objects::{Counters, lock};
+use crate::objects::Counters;
 
 /// Bind groups kept; one person before eight cameras needs about 350. Beyond, the less recently used half goes.
 const MOST: usize = 4096;

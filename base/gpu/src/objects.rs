@@ -1,9 +1,6 @@
-//! Numbers of GPU objects, and the lock that the caches of them share.
+//! Counts of created GPU objects.
 
-use std::sync::{
-    Mutex, MutexGuard, PoisonError,
-    atomic::{AtomicU64, Ordering},
-};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Numbers of GPU objects that were created since the device was opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -43,9 +40,4 @@ impl Counters {
             bind_groups: get(bind_groups),
         }
     }
-}
-
-/// Locks a mutex, even a poisoned one: the values behind these locks are consistent at every step.
-pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -9,11 +9,7 @@ use std::{
 use wgpu::{Buffer, BufferDescriptor, BufferUsages, ComputePipeline, Device};
 
 use crate::{
-    GpuError, GpuObjects,
-    bind_groups::BindGroups,
-    objects::{Counters, lock},
-    traffic::TrafficCounters,
-    uploads::Uploads,
+    GpuError, GpuObjects, bind_groups::BindGroups, objects::Counters, traffic::TrafficCounters, uploads::Uploads,
 };
 
 /// Read-back buffers kept for later reads; a frame uses a few sizes.

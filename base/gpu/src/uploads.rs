@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, atomic::Ordering};
 
 use wgpu::{Buffer, BufferDescriptor, BufferUsages, CommandEncoder, Device, MapMode};
 
-use crate::objects::{Counters, lock};
+use crate::objects::Counters;
 
 /// Sizes are multiples of this, bytes; the constants of most encodings fit one.
 const STEP: u64 = 2048;

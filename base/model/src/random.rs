@@ -24,6 +24,21 @@ impl SplitMix64 {
         self.next_u64() % end.max(1)
     }
 
+    /// Returns an index of a list of `len` elements; 0 for an empty one.
+    pub fn index(&mut self, len: usize) -> usize {
+        self.below(len as u64) as usize
+    }
+
+    /// Returns true in `percent` of 100 calls.
+    pub fn chance(&mut self, percent: u64) -> bool {
+        self.below(100) < percent
+    }
+
+    /// Returns a whole number from `-most` to `most`, for a `most` that is not negative.
+    pub fn jitter(&mut self, most: i64) -> i64 {
+        self.below(2 * most as u64 + 1) as i64 - most
+    }
+
     /// Returns a uniform number in 0..1 with 53 random bits.
     pub fn unit(&mut self) -> f64 {
         (self.next_u64() >> 11) as f64 / (1u64 << 53) as f64

@@ -115,9 +115,10 @@ fn align(pairs: &[PointPair], with_scale: bool) -> Option<Alignment> {
 mod tests {
     use super::*;
     use crate::rotation::exp_rotation;
-    use crate::testing::Random;
+    use crate::testing::RandomGeometry as _;
+    use flyrig_model::SplitMix64;
 
-    fn pairs(random: &mut Random, count: usize, place: impl Fn(DVec3) -> DVec3) -> Vec<PointPair> {
+    fn pairs(random: &mut SplitMix64, count: usize, place: impl Fn(DVec3) -> DVec3) -> Vec<PointPair> {
         (0..count)
             .map(|_| {
                 let from = random.vector();
@@ -132,7 +133,7 @@ mod tests {
 
     #[test]
     fn exact_pairs_give_the_motion_and_scale_back() {
-        let mut random = Random(11);
+        let mut random = SplitMix64(11);
         for count in [3, 4, 30] {
             for _ in 0..30 {
                 let (rotation, shift) = (random.rotation(), random.vector() * 100.0);
@@ -151,7 +152,7 @@ mod tests {
 
     #[test]
     fn noisy_pairs_cost_less_than_at_any_motion_nearby_and_weights_count() {
-        let mut random = Random(12);
+        let mut random = SplitMix64(12);
         for _ in 0..20 {
             let rotation = random.rotation();
             let mut noisy = pairs(&mut random, 9, |x| rotation * x);
@@ -179,7 +180,7 @@ mod tests {
 
     #[test]
     fn flat_and_mirrored_sets_get_a_proper_rotation() {
-        let mut random = Random(13);
+        let mut random = SplitMix64(13);
         for _ in 0..30 {
             let rotation = random.rotation();
             let flat: Vec<PointPair> = (0..5)

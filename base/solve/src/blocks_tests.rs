@@ -8,7 +8,8 @@ use crate::minimize::Stop;
 use crate::motion::RigidMotion;
 use crate::normal::NormalEquations;
 use crate::rotation::{exp_rotation, left_jacobian_inverse, log_rotation};
-use crate::testing::Random;
+use crate::testing::RandomGeometry as _;
+use flyrig_model::SplitMix64;
 
 const FOCAL: f64 = 500.0;
 
@@ -110,7 +111,7 @@ impl Bundle {
 
 /// Cameras on a ring around a cloud of points, with pixel noise; the truth and a start beside it.
 fn bundle(cameras: usize, points: usize, noise_px: f64, seed: u64) -> (Bundle, Scene, Scene) {
-    let mut random = Random(seed);
+    let mut random = SplitMix64(seed);
     let truth = Scene {
         cameras: (0..cameras)
             .map(|i| {
@@ -212,7 +213,7 @@ fn covariance_predicts_the_spread_of_the_focal_length() {
         // Uniform noise of ±1 pixel has a variance of a third.
         bundle.seen.iter_mut().for_each(|seen| seen.3 = 3.0);
         // The anchors' standard deviation is 1 mm and 1 mrad.
-        let mut random = Random(seed);
+        let mut random = SplitMix64(seed);
         let mut noise = || random.vector() * (3f64.sqrt() * 1e-3);
         bundle.anchors.iter_mut().for_each(|anchor| *anchor = anchor.moved(noise(), noise()));
         let solution = minimize_blocks(&bundle, &start, &Convergence::default()).unwrap();
@@ -227,7 +228,7 @@ fn covariance_predicts_the_spread_of_the_focal_length() {
 #[test]
 fn robust_kernels_bear_a_tenth_of_wrong_pixels_and_squares_do_not() {
     let (mut bundle, truth, start) = bundle(5, 20, 0.2, 44);
-    let mut random = Random(45);
+    let mut random = SplitMix64(45);
     for seen in bundle.seen.iter_mut().step_by(11) {
         seen.2 = [seen.2[0] + 60.0 + 40.0 * random.signed(), seen.2[1] - 50.0];
     }

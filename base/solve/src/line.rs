@@ -156,7 +156,7 @@ fn least_squares(points: &[[f64; 3]], options: &LineOptions) -> Option<(f64, f64
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::Random;
+    use flyrig_model::SplitMix64;
 
     const SECOND: i64 = 1_000_000_000;
 
@@ -182,7 +182,7 @@ mod tests {
 
     #[test]
     fn weighted_fit_with_a_prior_matches_cramers_rule() {
-        let mut random = Random(21);
+        let mut random = SplitMix64(21);
         for round in 0..200 {
             let base = (random.signed() * 1e18) as i64;
             let anchor = (random.signed() * 1e18) as i64;
@@ -223,7 +223,7 @@ mod tests {
 
     #[test]
     fn a_tenth_of_outliers_is_rejected() {
-        let mut random = Random(22);
+        let mut random = SplitMix64(22);
         let samples: Vec<LineSample> = (0..300)
             .map(|i| {
                 let wild = if i % 10 == 0 { 50_000_000 + (random.signed() * 4e7) as i64 } else { 0 };

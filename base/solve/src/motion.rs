@@ -77,15 +77,16 @@ impl Mul for RigidMotion {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::Random;
+    use crate::testing::RandomGeometry as _;
+    use flyrig_model::SplitMix64;
 
-    fn random_motion(random: &mut Random) -> RigidMotion {
+    fn random_motion(random: &mut SplitMix64) -> RigidMotion {
         RigidMotion { rotation: random.rotation(), translation: random.vector() * 3.0 }
     }
 
     #[test]
     fn exponential_is_the_limit_of_many_small_motions_and_logarithm_inverts_it() {
-        let mut random = Random(4);
+        let mut random = SplitMix64(4);
         for size in [0.0, 1e-9, 1e-3, 1.0, 3.1] {
             let (turn, shift) = (random.vector().normalize() * size, random.vector());
             let motion = RigidMotion::exp(turn, shift);
@@ -101,7 +102,7 @@ mod tests {
 
     #[test]
     fn motions_form_a_group() {
-        let mut random = Random(5);
+        let mut random = SplitMix64(5);
         for _ in 0..100 {
             let (a, b, point) = (random_motion(&mut random), random_motion(&mut random), random.vector());
             assert!(((a * b).apply(point) - a.apply(b.apply(point))).length() < 1e-14);
@@ -113,7 +114,7 @@ mod tests {
     #[test]
     fn jacobians_match_differences() {
         const STEP: f64 = 1e-6;
-        let mut random = Random(6);
+        let mut random = SplitMix64(6);
         for _ in 0..50 {
             let (motion, point) = (random_motion(&mut random), random.vector());
             let jacobians = motion.apply_jacobian(point);

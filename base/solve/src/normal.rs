@@ -203,10 +203,10 @@ fn column(vector: &DVector<f64>) -> DMatrix<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::Random;
+    use flyrig_model::SplitMix64;
 
     /// Rows of random residuals that see one of the eliminated blocks each, and the dense equations of all.
-    fn arrow(random: &mut Random, kept: [usize; 3], eliminated: usize, rows: usize) -> (ArrowNormal, DenseNormal) {
+    fn arrow(random: &mut SplitMix64, kept: [usize; 3], eliminated: usize, rows: usize) -> (ArrowNormal, DenseNormal) {
         let size: usize = kept.iter().sum();
         let mut dense = DenseNormal::zeros(size + 3 * eliminated);
         let starts = [0, kept[0], kept[0] + kept[1]];
@@ -244,7 +244,7 @@ mod tests {
 
     #[test]
     fn eliminating_blocks_changes_neither_step_nor_covariance() {
-        let mut random = Random(31);
+        let mut random = SplitMix64(31);
         for kept in [[3, 6, 15], [1, 1, 1], [6, 6, 6]] {
             let (arrow, dense) = arrow(&mut random, kept, 5, 90);
             for damping in [0.0, 1e-3, 10.0] {
@@ -261,7 +261,7 @@ mod tests {
 
     #[test]
     fn factors_match_lu_whatever_the_units() {
-        let mut random = Random(32);
+        let mut random = SplitMix64(32);
         for units in [1.0, 1e9] {
             let rows = DMatrix::from_fn(12, 6, |_, c| random.signed() * if c < 3 { units } else { 1.0 / units });
             let normal = DenseNormal { matrix: rows.transpose() * &rows, gradient: DVector::zeros(6) };

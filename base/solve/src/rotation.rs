@@ -106,7 +106,8 @@ mod tests {
     use std::f64::consts::PI;
 
     use super::*;
-    use crate::testing::Random;
+    use crate::testing::RandomGeometry as _;
+    use flyrig_model::SplitMix64;
 
     /// The exponential by its power series after halving the angle, which shares nothing with the quaternions.
     fn series(v: DVec3) -> DMat3 {
@@ -120,7 +121,7 @@ mod tests {
     }
 
     fn vectors() -> Vec<DVec3> {
-        let mut random = Random(3);
+        let mut random = SplitMix64(3);
         let axes: Vec<DVec3> = (0..20).map(|_| random.vector().normalize()).chain([DVec3::X, DVec3::NEG_Z]).collect();
         let angles = [0.0, 1e-300, 1e-160, 1e-13, 1e-12, 1e-9, 1e-7, 1e-4, 0.09999, 0.1, 0.5, 2.0, 3.0];
         let near_pi = [PI - 1e-3, PI - 1e-7, PI - 1e-12];
@@ -164,7 +165,7 @@ mod tests {
 
     #[test]
     fn mean_has_the_least_chordal_distance() {
-        let mut random = Random(8);
+        let mut random = SplitMix64(8);
         for _ in 0..50 {
             let center = random.rotation();
             let rotations: Vec<(DQuat, f64)> = (0..7)

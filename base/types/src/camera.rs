@@ -326,6 +326,42 @@ impl Camera {
         self.camera_from_world.inverse().translation
     }
 
+    /// Returns the camera of images that are halved `level` times, each pixel the mean of four. Pixel centres lie at integers; an odd
+    /// last row or column is dropped.
+    ///
+    /// ```
+    /// use flyrig_types::{Camera, ColorMatch, Intrinsics, Isometry, Lens};
+    /// use glam::DVec2;
+    ///
+    /// let camera = Camera {
+    ///     id: "front".into(),
+    ///     intrinsics: Intrinsics {
+    ///         width: 1280,
+    ///         height: 720,
+    ///         focal_px: DVec2::splat(900.0),
+    ///         center_px: DVec2::new(639.5, 359.5),
+    ///         lens: Lens::PINHOLE,
+    ///     },
+    ///     camera_from_world: Isometry::IDENTITY,
+    ///     time_offset_nanos: 0,
+    ///     color: ColorMatch::NONE,
+    /// };
+    /// let half = camera.halved(1);
+    /// assert_eq!(half.size(), [640, 360]);
+    /// assert_eq!(half.intrinsics.center_px, DVec2::new(319.5, 179.5));
+    /// ```
+    #[must_use]
+    pub fn halved(&self, level: u32) -> Self {
+        let mut camera = self.clone();
+        let share = 0.5f64.powi(level as i32);
+        let intrinsics = &mut camera.intrinsics;
+        intrinsics.focal_px *= share;
+        intrinsics.center_px = (intrinsics.center_px + 0.5) * share - 0.5;
+        intrinsics.width >>= level;
+        intrinsics.height >>= level;
+        camera
+    }
+
     /// Checks every number.
     ///
     /// # Errors

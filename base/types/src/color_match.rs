@@ -1,5 +1,6 @@
 //! Correction of a camera's colours towards those of the other cameras of its rig.
 
+use flyrig_model::srgb;
 use serde::{Deserialize, Serialize};
 
 /// Turns the colours of one camera into those that the rig's cameras agree on.
@@ -41,8 +42,7 @@ impl ColorMatch {
         let corner = (self.falloff[0] * r2 + self.falloff[1] * r2 * r2).exp();
         std::array::from_fn(|k| {
             let bent = srgb[k].clamp(0.0, 1.0).powf(self.exponent);
-            let light = if bent <= 0.040_45 { bent / 12.92 } else { ((bent + 0.055) / 1.055).powf(2.4) };
-            let corrected = self.gain[k] * light * corner;
+            let corrected = self.gain[k] * srgb::decode(bent, f64::powf) * corner;
             // NaN fails the comparison.
             if corrected > 0.0 { corrected.min(1.0) } else { 0.0 }
         })

@@ -2,12 +2,14 @@
 
 use std::{
     io,
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Mutex, MutexGuard},
     thread::{Builder, JoinHandle, Thread},
     time::Instant,
 };
 
-use crate::{Restarts, caught};
+use crate::locks::lock;
+use crate::panics::caught;
+use crate::restarts::Restarts;
 
 /// Health of a thread.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -34,7 +36,7 @@ impl ThreadWatch {
     }
 
     fn lock(&self) -> MutexGuard<'_, ThreadHealth> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 }
 
