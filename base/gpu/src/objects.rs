@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Numbers of GPU objects that were created since the device was opened.
+/// Numbers of GPU objects created since the device was opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct GpuObjects {
     /// Compiled compute pipelines.
@@ -17,7 +17,7 @@ pub struct GpuObjects {
     pub bind_groups: u64,
 }
 
-/// [`GpuObjects`] while they are counted.
+/// Counters of [`GpuObjects`].
 #[derive(Debug, Default)]
 pub(crate) struct Counters {
     pub pipelines: AtomicU64,

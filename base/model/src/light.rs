@@ -1,7 +1,7 @@
 //! Brightness of a matte surface by the direction that it faces.
 //!
 //! A polynomial of second degree in the world's normal describes the irradiance from distant lamps (Ramamoorthi and Hanrahan
-//! 2001, Eq. 11, with real coefficients per colour channel). Shadows that parts of a body cast on others are not in it.
+//! 2001). Shadows that parts of a body cast on others are not in it.
 //!
 //! ```
 //! use flyrig_model::light;

@@ -1,4 +1,4 @@
-//! Bundle adjustment of cameras and points in small, against the dense solution and the truth.
+//! Small bundle adjustment of cameras and points, against the dense solution and the truth.
 
 use glam::DVec3;
 use nalgebra::{DMatrix, DVector};
@@ -27,11 +27,11 @@ struct Bundle {
     cameras: usize,
     is_schur: bool,
     kernel: Kernel,
-    /// Camera, point, pixel, weight.
+    /// Observations: camera, point, pixel, weight.
     seen: Vec<(usize, usize, [f64; 2], f64)>,
-    /// Where the first two cameras are believed to be, which fixes the gauge.
+    /// Prior poses of the first two cameras, which fix the gauge.
     anchors: Vec<RigidMotion>,
-    /// Residuals that lie about their shape.
+    /// Residuals with a wrong shape.
     lie: Option<(usize, usize)>,
 }
 
@@ -109,7 +109,7 @@ impl Bundle {
     }
 }
 
-/// Cameras on a ring around a cloud of points, with pixel noise; the truth and a start beside it.
+/// Returns cameras on a ring around a cloud of points, with pixel noise; the truth and a perturbed start.
 fn bundle(cameras: usize, points: usize, noise_px: f64, seed: u64) -> (Bundle, Scene, Scene) {
     let mut random = SplitMix64(seed);
     let truth = Scene {

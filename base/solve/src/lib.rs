@@ -1,7 +1,7 @@
-//! Numeric core: rotations, rigid alignment, robust line fits and robust nonlinear least squares.
+//! Numerical algorithms: rotations, rigid alignment, robust line fits and robust nonlinear least squares.
 //!
-//! Everything is `f64`, single-threaded and deterministic: equal inputs give equal bits on one machine. Inputs that are
-//! not finite or that leave the answer open give `None` or an error, never NaN.
+//! All computations are in `f64`, single-threaded and deterministic: equal inputs give equal bits on one machine. Inputs that are
+//! not finite or leave the solution undetermined give `None` or an error, never NaN.
 
 mod align;
 mod blocks;
@@ -23,4 +23,4 @@ pub use minimize::{Convergence, Problem, Solution, Stop, minimize};
 pub use motion::RigidMotion;
 pub use normal::{ArrowNormal, DenseNormal, EliminatedBlock, Factor, NormalEquations};
 pub use percentile::{median, percentile};
-pub use rotation::{exp_rotation, left_jacobian, left_jacobian_inverse, log_rotation, mean_rotation, skew};
+pub use rotation::{exp_rotation, left_jacobian, left_jacobian_inverse, log_rotation, skew};

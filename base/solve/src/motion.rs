@@ -6,41 +6,41 @@ use glam::{DMat3, DQuat, DVec3};
 
 use crate::rotation::{exp_rotation, left_jacobian, left_jacobian_inverse, log_rotation};
 
-/// Rotation, then translation: `x -> R x + t`.
+/// Rotation followed by a translation: `x -> R x + t`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RigidMotion {
     /// Unit quaternion of `R`.
     pub rotation: DQuat,
-    /// `t`.
+    /// Translation `t`.
     pub translation: DVec3,
 }
 
 impl RigidMotion {
-    /// Moves nothing.
+    /// Motion that moves nothing.
     pub const IDENTITY: Self = Self { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
 
-    /// Returns the exponential of a twist: rotation vector in radians, and the translation's part, which the rotation
-    /// bends (`t = J shift`, with the left Jacobian `J`).
+    /// Returns the exponential of a twist: rotation vector `turn`, radians, and `shift`, from which the translation follows as
+    /// `t = J shift` with the left Jacobian `J`.
     #[must_use]
     pub fn exp(turn: DVec3, shift: DVec3) -> Self {
         Self { rotation: exp_rotation(turn), translation: left_jacobian(turn) * shift }
     }
 
-    /// Returns the twist (turn, shift) of which this is the exponential, with a turn of at most π.
+    /// Returns the twist (turn, shift) whose exponential this is, with a turn of at most π.
     #[must_use]
     pub fn log(&self) -> (DVec3, DVec3) {
         let turn = log_rotation(self.rotation);
         (turn, left_jacobian_inverse(turn) * self.translation)
     }
 
-    /// Returns the motion back.
+    /// Returns the inverse motion.
     #[must_use]
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.inverse();
         Self { rotation, translation: -(rotation * self.translation) }
     }
 
-    /// Moves a point.
+    /// Transforms a point.
     #[must_use]
     pub fn apply(&self, point: DVec3) -> DVec3 {
         self.rotation * point + self.translation
@@ -65,7 +65,7 @@ impl RigidMotion {
 impl Mul for RigidMotion {
     type Output = Self;
 
-    /// The right motion first, then the left one.
+    /// Chains two motions: the right one is applied first.
     fn mul(self, first: Self) -> Self {
         Self {
             rotation: (self.rotation * first.rotation).normalize(),
@@ -76,9 +76,10 @@ impl Mul for RigidMotion {
 
 #[cfg(test)]
 mod tests {
+    use flyrig_model::SplitMix64;
+
     use super::*;
     use crate::testing::RandomGeometry as _;
-    use flyrig_model::SplitMix64;
 
     fn random_motion(random: &mut SplitMix64) -> RigidMotion {
         RigidMotion { rotation: random.rotation(), translation: random.vector() * 3.0 }

@@ -11,8 +11,8 @@ pub fn median(values: &mut [f64]) -> Option<f64> {
     Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-/// Returns the value below which the share `share`, 0..=1, of the values lies, rounded down to a value that occurs, and reorders
-/// the values; `None` for an empty slice. NaN sorts above infinity.
+/// Returns the largest value with at most the fraction `share`, 0..=1, of the others below it, and reorders the values; `None` for an
+/// empty slice. NaN sorts above infinity.
 ///
 /// ```
 /// let mut errors_mm = [4.0, 1.0, 9.0, 2.0, 3.0];
@@ -29,8 +29,9 @@ pub fn percentile(values: &mut [f64], share: f64) -> Option<f64> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use flyrig_model::SplitMix64;
+
+    use super::*;
 
     #[test]
     fn medians_and_percentiles_match_a_sorted_copy() {

@@ -1,15 +1,15 @@
-//! The words every flyrig crate speaks: ids, clocks, images, frames, camera models and poses.
+//! Types of all crates: ids, images, frames, camera models, poses; locks and supervised threads.
 //!
 //! # Conventions
 //!
-//! - **World**: right-handed, metres. The rig states which way is up ([`Rig::world_up`]); our own
-//!   rigs use z up, a data set keeps its own axes.
+//! - **World**: right-handed, metres. The rig states the direction of up ([`Rig::world_up`]): z in rigs that this program
+//!   calibrates; data sets keep their own axes.
 //! - **Camera**: OpenCV axes, x right, y down, z forward. Pixel centres lie at integer coordinates.
 //! - **Transforms** are named `dst_from_src`: `camera_from_world * point_in_world = point_in_camera`.
-//! - **Clock**: nanoseconds of `CLOCK_MONOTONIC` of the host that captured; names end in `_nanos`.
-//!   An image's time is the middle of its exposure.
-//! - **Angles** are radians, other units stand in the name.
-//! - **Colour** is sRGB with 8 bits on the outside and linear `f32` inside.
+//! - **Clock**: nanoseconds of `CLOCK_MONOTONIC` of the capturing host; names end in `_nanos`. The time of an image is the
+//!   middle of its exposure.
+//! - **Angles** are radians; other units stand in the name.
+//! - **Colour** is 8-bit sRGB in files and messages, linear `f32` in computations.
 
 mod camera;
 mod color_match;
