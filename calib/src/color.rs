@@ -291,12 +291,7 @@ fn differences(points: &[ColorPoint], colors: &[ColorMatch]) -> Vec<(usize, f64)
 
 /// Standard deviation of values around 0 by their median, which outliers do not move.
 fn typical(values: impl Iterator<Item = f64>) -> f64 {
-    let mut values: Vec<f64> = values.collect();
-    if values.is_empty() {
-        return 0.0;
-    }
-    let middle = values.len() / 2;
-    1.4826 * *values.select_nth_unstable_by(middle, f64::total_cmp).1
+    1.4826 * flyrig_solve::median(&mut values.collect::<Vec<f64>>()).unwrap_or(0.0)
 }
 
 #[cfg(test)]

@@ -1,3 +1,5 @@
+use flyrig_model::srgb;
+
 use super::*;
 
 /// Numbers of 0..1, the same on every run.
@@ -37,7 +39,16 @@ fn cameras(count: usize, model: ColorModel, dice: &mut Dice) -> Vec<ColorMatch> 
 }
 
 fn srgb(light: f64) -> f64 {
-    if light <= 0.003_130_8 { 12.92 * light } else { 1.055 * light.powf(1.0 / 2.4) - 0.055 }
+    srgb::encode(light, f64::powf)
+}
+
+#[test]
+fn logarithm_form_of_srgb_agrees_with_the_curve() {
+    for i in 1..=2000 {
+        let code = f64::from(i) / 2000.0;
+        let expected = srgb::decode(code, f64::powf).ln();
+        assert!((log_light(code.ln()) - expected).abs() < 1e-12, "{code}: {expected}");
+    }
 }
 
 /// Points that every camera sees with probability 0.6: light with noise of a share, and of a tenth of the samples twice as much.

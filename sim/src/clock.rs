@@ -1,7 +1,9 @@
 //! Which instant the simulated cameras take next.
 
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
+
+use flyrig_types::{lock, wait_timeout};
 
 /// An instant that took long to draw is followed by a rest, so that drawing takes this part of the time at most: real
 /// cameras leave the machine to the reconstruction.
@@ -66,7 +68,7 @@ impl RealClock {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     /// The next instant for the camera in `slot`: the one that the others are taking where it lacks that, else a new
@@ -101,7 +103,7 @@ impl RealClock {
                 return None;
             }
             let wait = until.saturating_duration_since(now);
-            state = self.changed.wait_timeout(state, wait).unwrap_or_else(PoisonError::into_inner).0;
+            state = wait_timeout(&self.changed, state, wait);
         }
     }
 

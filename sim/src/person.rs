@@ -187,16 +187,7 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
 }
 
 fn assemble(body: Template, layers: Vec<Layer>) -> Person {
-    let mut clothed = Template {
-        name: "clothed body".to_owned(),
-        positions: Vec::new(),
-        normals: Vec::new(),
-        uvs: Vec::new(),
-        triangles: Vec::new(),
-        skin: Vec::new(),
-        parts: Vec::new(),
-        skeleton: body.skeleton.clone(),
-    };
+    let mut clothed = Template::empty("clothed body", body.skeleton.clone());
     let (mut carriers, mut layer_and_openness, mut textures) = (Vec::new(), Vec::new(), Vec::new());
     let (mut free_m, mut ranges) = (Vec::new(), Vec::new());
     let mut shoe_vertices = 0..0;

@@ -177,12 +177,9 @@ fn through_jpeg(rgb: &[u8], width: u32, height: u32, quality: u8) -> Result<Vec<
     Ok(decoded.into_rgb8().into_raw())
 }
 
-/// A hash of two numbers with full avalanche: splitmix64's finisher.
+/// Returns a hash of two numbers with full avalanche.
 pub(crate) fn hash(key: u64, index: u64) -> u64 {
-    let mut h = key ^ index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-    h = (h ^ (h >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    h = (h ^ (h >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    h ^ (h >> 31)
+    flyrig_model::mix(key ^ index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15))
 }
 
 /// Evenly in 0..1, never 0.

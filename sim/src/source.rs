@@ -1,12 +1,12 @@
 //! Simulated cameras behind the capture trait.
 
 use std::{
-    sync::{Arc, Mutex, PoisonError},
+    sync::{Arc, Mutex},
     time::Duration,
 };
 
 use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind};
-use flyrig_types::{CameraId, Frame, Image};
+use flyrig_types::{CameraId, Frame, Image, lock};
 
 use crate::clock::RealClock;
 use crate::{Delivery, FramePlan, Shot, SimError, SimTime, Simulator};
@@ -38,7 +38,7 @@ const MOST_DROPPED: u32 = 64;
 /// wait for each other.
 #[must_use]
 pub fn sources(simulator: &Arc<Mutex<Simulator>>, time: SimTime) -> Vec<SimSource> {
-    let guard = simulator.lock().unwrap_or_else(PoisonError::into_inner);
+    let guard = lock(simulator);
     let (frames, fps) = (guard.config().frames, guard.config().fps);
     let clock = match time {
         SimTime::Exact => None,
@@ -118,7 +118,7 @@ impl SimSource {
             }
             self.next_index += 1;
             let shared = Arc::clone(&self.simulator);
-            let mut simulator = shared.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut simulator = lock(&shared);
             let plan = simulator
                 .plan(self.slot, index)
                 .map_err(|error| CaptureError::new(&self.camera, CaptureErrorKind::Unsupported, error.to_string()))?;

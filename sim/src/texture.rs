@@ -1,5 +1,6 @@
 //! Painting textures through the mesh's own texture coordinates.
 
+use flyrig_model::srgb;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
@@ -97,7 +98,7 @@ impl Texture {
     /// Half the side, averaged in linear light.
     pub(crate) fn halved(&self) -> Self {
         let side = (self.side / 2).max(1);
-        let table: Vec<f32> = (0..=255).map(|v| linear_from_srgb(v as f32 / 255.0)).collect();
+        let table: [f32; 256] = srgb::byte_table(f32::powf);
         let at = |x: usize, y: usize| self.pixels[y.min(self.side - 1) * self.side + x.min(self.side - 1)];
         let pixels = (0..side * side)
             .into_par_iter()
@@ -119,14 +120,14 @@ fn to_bytes(colour: Srgb) -> [u8; 4] {
     [r, g, b, 255]
 }
 
-/// IEC 61966-2-1.
+/// Returns the linear light of an sRGB value, both in 0..=1.
 pub(crate) fn linear_from_srgb(c: f32) -> f32 {
-    if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
+    srgb::decode(c, f32::powf)
 }
 
-/// IEC 61966-2-1.
+/// Returns the sRGB value of linear light, both in 0..=1.
 pub(crate) fn srgb_from_linear(c: f32) -> f32 {
-    if c <= 0.003_130_8 { c * 12.92 } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 }
+    srgb::encode(c, f32::powf)
 }
 
 pub(crate) fn mix3(a: Srgb, b: Srgb, t: f32) -> Srgb {

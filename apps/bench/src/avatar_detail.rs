@@ -46,7 +46,7 @@ pub fn small_views(
             whole.pose(pose, Some(translations));
             for camera in cameras {
                 let reference = average(&whole.draw(camera)?, 1 << level);
-                let small = halved(camera, level);
+                let small = camera.halved(level);
                 for (k, scene) in scenes.iter_mut().enumerate() {
                     let start = Instant::now();
                     scene.pose(pose, Some(translations));
@@ -86,18 +86,6 @@ pub fn table(rows: &[SmallViews]) -> String {
         );
     }
     text
-}
-
-/// The same camera with sides halved so often; pixel centres are at integers.
-fn halved(camera: &Camera, level: u32) -> Camera {
-    let mut camera = camera.clone();
-    let share = 0.5f64.powi(level as i32);
-    let intrinsics = &mut camera.intrinsics;
-    intrinsics.focal_px *= share;
-    intrinsics.center_px = (intrinsics.center_px + 0.5) * share - 0.5;
-    intrinsics.width >>= level;
-    intrinsics.height >>= level;
-    camera
 }
 
 /// Means over squares of `side` pixels of sRGB times coverage, and of coverage, 0..=1.
@@ -160,7 +148,7 @@ mod tests {
             color: Default::default(),
         };
         let place = DVec3::new(0.3, -0.2, 2.0);
-        let (large, small) = (camera.project(place).unwrap(), halved(&camera, 1).project(place).unwrap());
+        let (large, small) = (camera.project(place).unwrap(), camera.halved(1).project(place).unwrap());
         assert!((small - (large - 0.5) / 2.0).length() < 1e-12);
     }
 }

@@ -211,8 +211,7 @@ fn mean(values: &[f64]) -> f64 {
 }
 
 fn quantile(values: &mut [f64], share: f64) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(((values.len() as f64 - 1.0) * share) as usize).copied().unwrap_or(f64::NAN)
+    flyrig_solve::percentile(values, share).unwrap_or(f64::NAN)
 }
 
 fn print_row(px: f64, cameras: usize, name: &str, errors: &mut Errors) {

@@ -242,9 +242,7 @@ impl JointErrors {
     }
 
     fn percentile_mm(&self, share: f64) -> f64 {
-        let mut all = self.all();
-        all.sort_by(f64::total_cmp);
-        all.get(((all.len().max(1) - 1) as f64 * share) as usize).copied().unwrap_or(f64::NAN)
+        flyrig_solve::percentile(&mut self.all(), share).unwrap_or(f64::NAN)
     }
 
     fn by_joint_mm(&self) -> BTreeMap<String, f64> {

@@ -378,7 +378,5 @@ fn write_sheet(path: &Path, rows: &[Vec<Image>]) -> Result<()> {
 }
 
 fn percentile(values: &[f64], share: f64) -> f64 {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted.get(((sorted.len().max(1) - 1) as f64 * share) as usize).copied().unwrap_or(f64::NAN)
+    flyrig_solve::percentile(&mut values.to_vec(), share).unwrap_or(f64::NAN)
 }

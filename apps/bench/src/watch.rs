@@ -73,8 +73,8 @@ pub fn watch(args: &BenchWatchArgs, gpu: &GpuContext) -> Result<()> {
     }
     bar.finish_and_clear();
     let median = |values: &mut Vec<f64>| {
-        values.sort_by(f64::total_cmp);
-        (values.get(values.len() / 2).copied().unwrap_or(f64::NAN), values.last().copied().unwrap_or(f64::NAN))
+        let [median, worst] = [flyrig_solve::median(values), flyrig_solve::percentile(values, 1.0)];
+        (median.unwrap_or(f64::NAN), worst.unwrap_or(f64::NAN))
     };
     let ((late, latest), (share, worst)) = (median(&mut late_secs), median(&mut shares));
     println!(

@@ -1,4 +1,4 @@
-//! The built-in body's file: see assets/make_template.py for its layout.
+//! File of the built-in body; `assets/make_template.py` describes its layout.
 
 use std::collections::BTreeMap;
 use std::io::Read;
@@ -11,23 +11,23 @@ use crate::BodyError;
 static FILE: &[u8] = include_bytes!("../assets/template.bin.gz");
 const MAGIC: &[u8] = b"FLYBODY1";
 
-/// What the file holds, as stored.
+/// Content of the file, as stored.
 #[derive(Debug)]
 pub(crate) struct BodyAsset {
-    /// Base positions, metres; the body's first, then those that only joints are measured from.
+    /// Base positions, metres: those of the body, then those that only serve to place joints.
     pub vertices: Vec<[f32; 3]>,
     pub body_vertices: usize,
-    /// Body vertex of each (vertex, texture coordinate) pair.
+    /// Body vertex of each corner, a pair of vertex and texture coordinate.
     pub corner_vertex: Vec<u16>,
     pub uvs: Vec<[f32; 2]>,
-    /// Of corners.
+    /// Corner indices.
     pub triangles: Vec<[u16; 3]>,
-    /// Per body vertex.
+    /// Joints of each body vertex.
     pub skin_joints: Vec<[u8; 4]>,
-    /// Per body vertex, sum 65535.
+    /// Weights of each body vertex; their sum is 65535.
     pub skin_weights: Vec<[u16; 4]>,
     pub joints: Vec<AssetJoint>,
-    /// Macro axis -> where each tag peaks.
+    /// Tags of each macro axis with the value at which each peaks.
     pub axes: BTreeMap<String, Vec<(f32, String)>>,
     pub targets: Vec<Target>,
 }
@@ -36,24 +36,24 @@ pub(crate) struct BodyAsset {
 pub(crate) struct AssetJoint {
     pub name: String,
     pub parent: Option<usize>,
-    /// The joint's origin is their mean.
+    /// Vertices whose mean is the joint's origin.
     pub vertices: Vec<usize>,
 }
 
-/// A sparse displacement.
+/// Sparse displacement of vertices.
 #[derive(Debug)]
 pub(crate) struct Target {
     pub kind: TargetKind,
     pub vertices: Vec<u32>,
-    /// At weight 1, metres.
+    /// Displacement of each vertex at weight 1, metres.
     pub displacement: Vec<[f32; 3]>,
 }
 
 #[derive(Debug)]
 pub(crate) enum TargetKind {
-    /// Weight is the product of the axes' hat functions.
+    /// Target whose weight is the product of the axes' hat functions.
     Macro(Vec<String>),
-    /// Weight is the part of the parameter with this sign.
+    /// Target whose weight is the part of the parameter with this sign.
     Local { name: String, sign: f32 },
 }
 
@@ -78,7 +78,7 @@ struct TargetHeader {
     step_m: f32,
 }
 
-/// The file, unpacked once.
+/// Returns the file's content, unpacked on first use.
 pub(crate) fn body_asset() -> Result<&'static BodyAsset, BodyError> {
     static ASSET: OnceLock<Result<BodyAsset, String>> = OnceLock::new();
     ASSET.get_or_init(|| unpack(FILE)).as_ref().map_err(|message| BodyError::Asset(message.clone()))
@@ -138,7 +138,7 @@ fn unpack(file: &[u8]) -> Result<BodyAsset, String> {
     if rest.0.is_empty() { Ok(asset) } else { Err("left-over bytes".to_owned()) }
 }
 
-/// Every index points at something, so that later code may index freely.
+/// Checks that all indices are in range, so that later code may index freely.
 fn check(asset: &BodyAsset) -> Result<(), String> {
     let vertices = asset.vertices.len();
     let joints = asset.joints.len();
@@ -161,7 +161,7 @@ impl<'a> Cursor<'a> {
         Ok(taken)
     }
 
-    /// `count` items of `N` numbers of `SIZE` bytes each.
+    /// Reads `count` items of `N` numbers of `SIZE` bytes each.
     fn array<const SIZE: usize, const N: usize, T: Copy>(
         &mut self,
         count: usize,

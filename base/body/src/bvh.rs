@@ -6,10 +6,10 @@ use glam::{DQuat, DVec3};
 
 use crate::BodyError;
 
-/// A clip longer than this is taken for a damaged header.
+/// Longest clip, frames; a longer one has a damaged header.
 const MAX_FRAMES: usize = 10_000_000;
 
-/// What a number of a motion line moves.
+/// Degree of freedom that one number of a motion line drives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BvhChannel {
     /// Translation along x, y, z (0, 1, 2), the clip's units.
@@ -18,35 +18,35 @@ pub enum BvhChannel {
     Rotation(usize),
 }
 
-/// One joint of a clip.
+/// Joint of a clip.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BvhJoint {
     /// Name.
     pub name: String,
-    /// Index of the parent, smaller than the joint's own; none for the root.
+    /// Index of the parent, smaller than the joint's own; `None` for the root.
     pub parent: Option<usize>,
-    /// Place in the parent when nothing is turned, the clip's units.
+    /// Position in the parent at rest, in the clip's units.
     pub offset: DVec3,
-    /// In the order of the motion lines; rotations apply in this order, the first outermost.
+    /// Channels in the order of the motion lines; the first rotation is the outermost.
     pub channels: Vec<BvhChannel>,
-    /// Place of the limb's end in this joint, when the file gives an end site.
+    /// Position of the limb's end in this joint, where the file gives an end site.
     pub end_site: Option<DVec3>,
 }
 
-/// A motion clip: a skeleton and one line of numbers a frame. Lengths have no unit in BVH.
+/// Motion clip: a skeleton and one line of numbers per frame. Lengths have no unit in BVH.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BvhClip {
-    /// Where it came from, for messages.
+    /// File, for messages.
     pub path: PathBuf,
     /// Joints, parents first, the root at 0.
     pub joints: Vec<BvhJoint>,
     /// Time between frames, seconds.
     pub frame_secs: f64,
-    /// Per frame the numbers of all joints' channels in order.
+    /// Numbers of each frame: all joints' channels in order.
     pub frames: Vec<Vec<f64>>,
 }
 
-/// A joint of a frame: place and `parent_from_joint` rotation.
+/// Joint in a frame: position and `parent_from_joint` rotation.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct BvhLocal {
     pub translation: DVec3,
@@ -54,7 +54,7 @@ pub(crate) struct BvhLocal {
 }
 
 impl BvhClip {
-    /// Local transform of every joint in a frame; at rest when `frame` does not exist.
+    /// Returns the local transform of each joint in a frame; at rest where `frame` does not exist.
     pub(crate) fn locals(&self, frame: usize) -> Vec<BvhLocal> {
         let mut numbers = self.frames.get(frame).into_iter().flatten().copied();
         let local = |joint: &BvhJoint| {
@@ -170,7 +170,7 @@ fn channels(words: &mut Words<'_>) -> Result<Vec<BvhChannel>, BodyError> {
     Ok(channels)
 }
 
-/// Words of a text that know their line.
+/// Words of a text with their line numbers.
 struct Words<'a> {
     path: &'a Path,
     line: usize,

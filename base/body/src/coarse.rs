@@ -1,4 +1,4 @@
-//! Fewer, larger Gaussians that stand for the fine ones.
+//! Subset of larger Gaussians that represents the fine ones at a coarse image scale.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -8,27 +8,26 @@ use crate::point_grid::PointGrid;
 use crate::surface::scales;
 use crate::{BodyError, DeformationGraph, SurfaceGaussians, Template};
 
-/// Some of the Gaussians of a surface, evenly spaced and larger, that stand for all of them where a pixel covers
-/// several.
+/// Evenly spaced, larger subset of the Gaussians of a surface, for images in which a pixel covers several of them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CoarseSurface {
-    /// The chosen ones, with the scale that their own spacing asks for.
+    /// Chosen Gaussians, with scales that fit their spacing.
     pub gaussians: SurfaceGaussians,
-    /// Mean distance of neighbours among them: root of the surface's area a Gaussian, metres.
+    /// Mean spacing of the chosen Gaussians: square root of the surface area per Gaussian, metres.
     pub spacing_m: f64,
-    /// The same nodes; [`DeformationGraph::gaussian_nodes`] and their weights are the chosen ones'.
-    /// [`DeformationGraph::node_gaussian`] still counts the fine ones.
+    /// Graph with unchanged nodes. [`DeformationGraph::gaussian_nodes`] and their weights are those of the chosen Gaussians;
+    /// [`DeformationGraph::node_gaussian`] still refers to the fine ones.
     pub graph: DeformationGraph,
-    /// Of each chosen one the first of its `children`, and their number at the end.
+    /// Index in `children` of the first child of each chosen Gaussian; the last element is their number.
     pub first_child: Vec<u32>,
-    /// Fine Gaussians by the chosen one that lies nearest on the same side of the body.
+    /// Fine Gaussians, grouped by the nearest chosen one on the same side of the body.
     pub children: Vec<u32>,
 }
 
-/// Keeps `count` (at least 1, at most all) of the Gaussians; every fine one becomes the child of one that stays.
+/// Chooses `count` (at least 1, at most all) of the Gaussians; each fine one becomes a child of a chosen one.
 ///
 /// # Errors
-/// [`BodyError::Mesh`] when there are no Gaussians or the graph is not theirs.
+/// [`BodyError::Mesh`] when there are no Gaussians or the graph belongs to others.
 pub fn coarsen(
     template: &Template,
     surface: &SurfaceGaussians,

@@ -1,4 +1,4 @@
-//! The built-in body: MakeHuman's CC0 base mesh in any shape, its skeleton refitted to it.
+//! Built-in body: MakeHuman's CC0 base mesh in any shape, with a skeleton refitted to it.
 
 use glam::{DMat4, DQuat, DVec3, Vec2, Vec3};
 
@@ -10,14 +10,14 @@ use crate::{BodyError, Joint, ShapeParams, Skeleton, SkinWeights, Template};
 const BUILT_IN: &str = "built-in body";
 
 impl Template {
-    /// Whether this is the built-in body, in any shape: [`default_template`] makes others of its kind.
+    /// Returns whether this is the built-in body, in any shape ([`default_template`]).
     #[must_use]
     pub fn is_built_in(&self) -> bool {
         self.name == BUILT_IN && body_asset().is_ok_and(|asset| asset.corner_vertex.len() == self.positions.len())
     }
 }
 
-/// A knob of the built-in body's shape.
+/// Parameter of the built-in body's shape.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ShapeTarget {
     /// Key in [`ShapeParams`].
@@ -30,7 +30,7 @@ pub struct ShapeTarget {
     pub default: f32,
 }
 
-/// The knobs that [`default_template`] understands, macro shape first.
+/// Returns the parameters of [`default_template`], macro targets first.
 ///
 /// # Errors
 /// [`BodyError::Asset`].
@@ -48,9 +48,9 @@ pub fn shape_targets() -> Result<Vec<ShapeTarget>, BodyError> {
     Ok(targets)
 }
 
-/// The built-in body in the given shape: 14,517 vertices, 26,756 triangles, 31 joints with the names of the
-/// CMU motion capture skeleton. It stands on y = 0 in an A pose; at rest every joint's axes are the canonical
-/// ones and its origin is measured from the shaped mesh.
+/// Creates the built-in body in the given shape: 14,517 vertices, 26,756 triangles, 31 joints with the names of the
+/// CMU motion capture skeleton. It stands on y = 0 in an A pose; at rest all joints have the canonical axes, and their origins are
+/// measured from the shaped mesh.
 ///
 /// # Errors
 /// [`BodyError::UnknownTarget`] names the nearest targets, [`BodyError::TargetWeight`] the range,
@@ -120,7 +120,7 @@ fn shaped_vertices(asset: &BodyAsset, shape: &ShapeParams) -> Vec<Vec3> {
     vertices
 }
 
-/// Hat function of a tag on its macro axis: 1 at its own place, falling to 0 at its neighbours'.
+/// Evaluates the hat function of a tag on its macro axis: 1 at its own value, falling to 0 at its neighbours'.
 fn tag_weight(asset: &BodyAsset, tag: &str, given: &impl Fn(&str) -> Option<f32>) -> f32 {
     for (axis, peaks) in &asset.axes {
         if let Some(index) = peaks.iter().position(|(_, name)| name == tag) {
@@ -136,7 +136,7 @@ fn tag_weight(asset: &BodyAsset, tag: &str, given: &impl Fn(&str) -> Option<f32>
     0.0
 }
 
-/// Area-weighted vertex normals over UV seams.
+/// Computes area-weighted vertex normals across UV seams.
 fn vertex_normals(asset: &BodyAsset, vertices: &[Vec3]) -> Vec<Vec3> {
     let mut normals = vec![Vec3::ZERO; vertices.len()];
     for triangle in &asset.triangles {

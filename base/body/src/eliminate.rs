@@ -1,4 +1,4 @@
-//! Even spacing by leaving out points: weighted sample elimination (C. Yuksel, "Sample Elimination for
+//! Even spacing by removal of points: weighted sample elimination (C. Yuksel, "Sample Elimination for
 //! Generating Poisson Disk Sample Sets", Computer Graphics Forum 34(2), 2015).
 
 use std::cmp::Ordering;
@@ -9,14 +9,14 @@ use rayon::prelude::*;
 
 use crate::point_grid::PointGrid;
 
-/// Weight function of the paper: (1 - d / 2 r_max)^ALPHA, with distances below
+/// Parameters of the paper's weight function (1 - d / 2 r_max)^ALPHA, with distances below
 /// 2 r_min = 2 r_max (1 - (N / M)^GAMMA) BETA taken as 2 r_min.
 const ALPHA: i32 = 8;
 const BETA: f32 = 0.65;
 const GAMMA: f32 = 1.5;
 
-/// Indices, ascending, of `keep` of the points such that they lie evenly on a surface of `area` square metres.
-/// Points whose normals oppose each other lie on different sheets and do not push each other away.
+/// Selects `keep` of the points that lie evenly on a surface of `area` square metres; returns their indices, ascending. Points
+/// whose normals oppose each other lie on different sheets and do not repel each other.
 pub(crate) fn eliminate(points: &[Vec3], normals: &[Vec3], keep: usize, area: f64) -> Vec<usize> {
     if keep >= points.len() {
         return (0..points.len()).collect();
@@ -47,7 +47,7 @@ pub(crate) fn eliminate(points: &[Vec3], normals: &[Vec3], keep: usize, area: f6
     let mut left = points.len();
     while left > keep {
         let Some(Entry { weight, index }) = heap.pop() else { break };
-        // Weights only fall, so an entry of old is too high: put it back where it belongs.
+        // Weights only fall: an outdated entry is too high and goes back to its place.
         if weight > weights[index] {
             heap.push(Entry { weight: weights[index], index });
             continue;

@@ -1,99 +1,99 @@
-//! What can go wrong with bodies and motion.
+//! Errors of bodies, clips and poses.
 
 use std::path::PathBuf;
 
 use flyrig_types::PoseError;
 
-/// Why a body, a clip or a pose was refused.
+/// Error of a body, a motion clip or a pose.
 #[derive(Debug, thiserror::Error)]
 pub enum BodyError {
     /// A file could not be read.
     #[error("cannot read {}: {source}", path.display())]
     Io {
-        /// Which file.
+        /// File.
         path: PathBuf,
-        /// The system's word.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// A file that was not written; the old one, if any, is untouched.
+    /// A file was not written; an old one is untouched.
     #[error("{}: not written, {message}", path.display())]
     Unwritten {
-        /// Which file.
+        /// File.
         path: PathBuf,
-        /// Why.
+        /// Reason.
         message: String,
     },
-    /// A glTF file that is damaged or holds no skinned human.
+    /// A glTF file is damaged or holds no skinned human.
     #[error("{}: {message}", path.display())]
     Gltf {
-        /// Which file.
+        /// File.
         path: PathBuf,
         /// Problem and fix.
         message: String,
     },
-    /// A BVH file that is damaged.
+    /// A BVH file is damaged.
     #[error("{} line {line}: {message}", path.display())]
     Bvh {
-        /// Which file.
+        /// File.
         path: PathBuf,
         /// Line, counted from 1.
         line: usize,
         /// Problem and fix.
         message: String,
     },
-    /// A shape target that the built-in body does not have.
+    /// The built-in body has no such shape target.
     #[error("the built-in body has no shape target '{name}'; did you mean {nearest}?")]
     UnknownTarget {
-        /// The name asked for.
+        /// Requested name.
         name: String,
-        /// The closest names there are.
+        /// Most similar names of targets.
         nearest: String,
     },
-    /// A shape weight that is not a number or out of range.
+    /// A shape weight is NaN or out of range.
     #[error("shape target '{name}' has the weight {weight}; it must lie in {min}..={max}")]
     TargetWeight {
-        /// Which target.
+        /// Name of the target.
         name: String,
-        /// The weight given.
+        /// Given weight.
         weight: f32,
-        /// Smallest weight allowed.
+        /// Smallest permitted weight.
         min: f32,
-        /// Largest weight allowed.
+        /// Largest permitted weight.
         max: f32,
     },
     /// The body file inside this program is damaged.
     #[error("the built-in body is damaged ({0}); build flyrig again from a clean checkout")]
     Asset(String),
-    /// A mesh that cannot carry Gaussians or a graph.
+    /// A mesh cannot carry Gaussians, a graph or clothes.
     #[error("mesh '{name}': {message}")]
     Mesh {
-        /// Which template.
+        /// Name of the template.
         name: String,
         /// Problem and fix.
         message: String,
     },
-    /// A skeleton that makes no tree or does not fit.
+    /// A skeleton is no tree or does not fit.
     #[error("skeleton: {0}")]
     Skeleton(String),
-    /// A pose that does not fit the skeleton or is not finite.
+    /// A pose does not fit the skeleton or is not finite.
     #[error("pose: {0}")]
     Pose(String),
-    /// A GPU buffer of another number of Gaussians.
+    /// A device buffer has room for too few Gaussians.
     #[error("the buffer of {what} has room for {found} Gaussians, {needed} are needed")]
     Buffer {
-        /// What it holds.
+        /// Content of the buffer.
         what: &'static str,
-        /// Its length.
+        /// Elements of the buffer.
         found: usize,
-        /// Gaussians.
+        /// Number of Gaussians.
         needed: usize,
     },
-    /// Key poses that make no track.
+    /// Key poses form no track.
     #[error("{what}: {source}")]
     Track {
-        /// Which clip.
+        /// Name of the clip.
         what: String,
-        /// Which key and why.
+        /// Faulty key.
         source: PoseError,
     },
 }

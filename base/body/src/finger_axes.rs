@@ -1,20 +1,20 @@
-//! Axes that fingers bend and spread about.
+//! Axes of flexion and spread of fingers.
 
 use glam::{DQuat, DVec3};
 
 use crate::{FingerJoints, Skeleton, find_fingers};
 
-/// Axes of a finger at rest, unit vectors in canonical axes.
+/// Axes of a finger at rest: unit vectors in canonical axes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FingerAxes {
-    /// A positive turn bends the finger towards the palm, the thumb towards the little finger.
+    /// Axis about which a positive rotation bends the finger towards the palm, the thumb towards the little finger.
     pub flexion: DVec3,
-    /// A positive turn moves the finger towards the thumb's side, the thumb away from the palm's plane.
+    /// Axis about which a positive rotation moves the finger towards the thumb's side, the thumb away from the palm's plane.
     pub spread: DVec3,
 }
 
 impl FingerAxes {
-    /// Turn of a joint away from rest: bent by `flexion` about its own axis, then spread, radians.
+    /// Returns the rotation of a joint away from rest: first `flexion`, then `spread`, radians.
     #[must_use]
     pub fn turn(&self, flexion: f64, spread: f64) -> DQuat {
         DQuat::from_axis_angle(self.spread, spread) * DQuat::from_axis_angle(self.flexion, flexion)

@@ -1,4 +1,4 @@
-//! Finger joints: found by name in any skeleton, added to the built-in body.
+//! Finger joints, found by name in any skeleton and added to the built-in body.
 
 use std::io::Read;
 use std::sync::OnceLock;
@@ -12,10 +12,10 @@ use crate::{BodyError, Joint, Skeleton, SkinWeights, Template};
 
 static FILE: &[u8] = include_bytes!("../assets/fingers.json.gz");
 
-/// Fingers of a hand, thumb first; each word is part of its joints' names.
+/// Words in the joint names of each finger, thumb first.
 const FINGER_WORDS: [&[&str]; 5] = [&["thumb"], &["index"], &["middle"], &["ring"], &["pinky", "little"]];
 
-/// Joints of the fingers of both hands: left, right; thumb to little finger; from the palm to the tip.
+/// Joint indices of the fingers of both hands: left, right; thumb to little finger; from the palm to the tip.
 pub type FingerJoints = [[[usize; 3]; 5]; 2];
 
 /// Finds three joints of each finger by their names: "LeftHandIndex1" (Mixamo), "leftIndexProximal" (VRM), "index_01_l"
@@ -52,8 +52,8 @@ pub fn find_fingers(skeleton: &Skeleton) -> Option<FingerJoints> {
 }
 
 impl Template {
-    /// Returns the template with three joints in each finger: itself where it has them, the built-in body (in any shape)
-    /// with [`find_fingers`]'s joints added behind its own.
+    /// Returns the template with three joints in each finger: a copy where it has them, the built-in body (in any shape) with
+    /// the joints of [`find_fingers`] appended to its own.
     ///
     /// The added joints share the weights of the joints that move a whole hand, so a pose without rotations for them puts
     /// every vertex where the template without fingers has it.
@@ -105,13 +105,13 @@ impl Template {
     }
 }
 
-/// See assets/make_fingers.py.
+/// Content of the file that `assets/make_fingers.py` writes.
 #[derive(Debug, Deserialize)]
 struct FingerAsset {
     joints: Vec<AddedJoint>,
-    /// Body vertices whose weights change.
+    /// Body vertices with new skin weights.
     vertices: Vec<usize>,
-    /// Pairs of joint and weight; weights add up to 65535.
+    /// Joints and weights of each vertex; the weights add up to 65535.
     skin: Vec<Vec<(u16, u16)>>,
 }
 
@@ -119,7 +119,7 @@ struct FingerAsset {
 struct AddedJoint {
     name: String,
     parent: String,
-    /// The joint's origin is the mean of these body vertices with the weights `shares`.
+    /// Body vertices whose mean with the weights `shares` is the joint's origin.
     vertices: Vec<usize>,
     shares: Vec<f64>,
 }

@@ -1,30 +1,30 @@
-//! Where a recorded motion's feet stand, and how ours are held there.
+//! Foot contacts of a recorded motion, and their transfer to the template's feet.
 
 use flyrig_types::Pose;
 use glam::{DMat4, DQuat, DVec2, DVec3};
 
 use crate::Skeleton;
 
-/// A standing joint of the source is no higher than this above its lowest places, metres.
+/// Largest height of a standing joint of the source above its lowest positions, metres.
 const LOW_M: f64 = 0.050;
-/// And no faster, metres a second.
+/// Largest speed of a standing joint, metres per second.
 const SLOW_M_A_SEC: f64 = 0.35;
-/// Speed is measured over this time.
+/// Time over which speed is measured, nanoseconds.
 const SPEED_NANOS: i64 = 50_000_000;
-/// Shorter stands are none, shorter swings neither.
+/// Shortest contact, and shortest interruption of one, nanoseconds.
 const SHORTEST_NANOS: i64 = 70_000_000;
-/// Hips are lowered and raised within about this time around where the legs need it.
+/// Approximate time in which the hips are lowered and raised around frames whose legs need it, nanoseconds.
 const SOFT_NANOS: i64 = 120_000_000;
-/// Legs are not stretched farther than this share of their length.
+/// Largest extension of a leg, as a fraction of its length.
 const STRETCH: f64 = 0.999;
 
-/// Places of a foot of the source, y up, metres, a frame each.
+/// Positions of a foot of the source, one per frame, y up, metres.
 pub(crate) struct FootSource {
     pub ankle: Vec<DVec3>,
     pub toe: Option<Vec<DVec3>>,
 }
 
-/// What a foot stands on.
+/// Part of a foot that is in contact with the floor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stand {
     Nothing,
@@ -32,14 +32,14 @@ enum Stand {
     Ball,
 }
 
-/// Points of a sole, in the bind pose from the ankle joint, canonical axes: heel, ball and tip of the toes, and both
-/// edges of each.
+/// Sole of a foot in the bind pose, relative to the ankle joint, canonical axes: heel, ball and tip of the toes, with the distance
+/// of both edges from them.
 struct Sole {
     canonical: [DVec3; 3],
     half_width: f64,
 }
 
-/// Holds both feet (hip, knee, ankle, toe joints) of z-up poses where the source stands, soles on z = 0.
+/// Holds both feet of z-up poses in place where the source stands, soles on z = 0. `legs` are hip, knee, ankle and toe joints.
 pub(crate) fn plant_feet(
     skeleton: &Skeleton,
     legs: &[[usize; 4]; 2],
@@ -83,7 +83,7 @@ pub(crate) fn plant_feet(
 }
 
 impl Sole {
-    /// As long as feet are for the distance of ankle and toe joints, on the bind pose's floor or in shoes below it.
+    /// Estimates a sole from the distance of ankle and toe joints, on the bind pose's floor or `sole_m` below it.
     fn new(origins: &[DVec3], leg: &[usize; 4], sole_m: f64) -> Self {
         let (ankle, toe) = (origins[leg[2]], origins[leg[3]]);
         let long = if leg[2] == leg[3] { 0.13 } else { (toe.z - ankle.z).abs().max(0.05) };
@@ -94,7 +94,7 @@ impl Sole {
         Self { canonical, half_width: 0.28 * long + 0.25 * sole_m }
     }
 
-    /// Heel and ball in the world, and the height of the lowest point.
+    /// Returns the sole in the world.
     fn at(&self, skeleton: &Skeleton, leg: &[usize; 4], world: &[DMat4]) -> Standing {
         let joints = skeleton.joints();
         let ankle = joints[leg[2]].joint_from_canonical.inverse().w_axis.truncate();
@@ -109,7 +109,7 @@ impl Sole {
     }
 }
 
-/// A sole in the world: heel and ball, and the height of its lowest point, metres.
+/// Sole in the world: heel and ball, and the height of its lowest point, metres.
 struct Standing {
     points: [DVec3; 2],
     lowest: f64,
@@ -119,14 +119,14 @@ fn at(world: &[DMat4], joint: usize) -> DVec3 {
     world[joint].w_axis.truncate()
 }
 
-/// Frames on either side that a time covers.
+/// Returns the number of frames within `time` on either side.
 fn radius(nanos: &[i64], time: i64) -> usize {
     let (Some(first), Some(last)) = (nanos.first(), nanos.last()) else { return 1 };
     let frame = ((last - first) / (nanos.len().max(2) as i64 - 1)).max(1);
     (time / frame).clamp(1, 60) as usize
 }
 
-/// What each frame stands on.
+/// Classifies the contact in each frame.
 fn stands(nanos: &[i64], foot: &FootSource) -> Vec<Stand> {
     let still = |places: &[DVec3]| -> Vec<bool> {
         let mut heights: Vec<f64> = places.iter().map(|place| place.y).collect();
@@ -154,7 +154,7 @@ fn stands(nanos: &[i64], foot: &FootSource) -> Vec<Stand> {
     heel.iter().zip(&ball).map(stand).collect()
 }
 
-/// Turns runs of `what` that are too short into the other.
+/// Inverts runs of `what` that are shorter than [`SHORTEST_NANOS`].
 fn fill_short(still: &mut [bool], nanos: &[i64], what: bool) {
     let mut start = 0;
     while start < still.len() {
@@ -167,7 +167,7 @@ fn fill_short(still: &mut [bool], nanos: &[i64], what: bool) {
     }
 }
 
-/// How far the ankle has to move in each frame for the foot to stay where it stands, z up, metres.
+/// Returns the displacement of the ankle in each frame that keeps a standing foot in place, z up, metres.
 fn foot_moves(skeleton: &Skeleton, sole: &Sole, leg: &[usize; 4], stands: &[Stand], poses: &[Pose]) -> Vec<DVec3> {
     let points: Vec<Standing> =
         poses.iter().map(|pose| sole.at(skeleton, leg, &skeleton.world_from_joint(pose))).collect();
@@ -223,7 +223,7 @@ fn foot_moves(skeleton: &Skeleton, sole: &Sole, leg: &[usize; 4], stands: &[Stan
         .collect()
 }
 
-/// Ranges of neighbours for which `inside` holds.
+/// Returns the ranges of neighbouring items for which `inside` holds.
 fn runs<T>(items: &[T], inside: impl Fn(&T) -> bool) -> Vec<(usize, usize)> {
     let mut found = Vec::new();
     let mut start = None;
@@ -240,7 +240,7 @@ fn runs<T>(items: &[T], inside: impl Fn(&T) -> bool) -> Vec<(usize, usize)> {
     found
 }
 
-/// Two-bone inverse kinematics: moves the ankle, bends the knee the way it bends, keeps the foot's direction.
+/// Moves the ankle by two-bone inverse kinematics; the knee keeps its side, the foot its direction.
 fn move_ankle(skeleton: &Skeleton, leg: &[usize; 4], moved: DVec3, pose: &mut Pose) {
     let world = skeleton.world_from_joint(pose);
     let [hip, knee, ankle] = [leg[0], leg[1], leg[2]].map(|joint| at(&world, joint));
@@ -276,7 +276,7 @@ fn move_ankle(skeleton: &Skeleton, leg: &[usize; 4], moved: DVec3, pose: &mut Po
     }
 }
 
-/// A smooth sequence nowhere below the given one: the largest of the neighbours, averaged over as many.
+/// Returns a smooth sequence that is nowhere below `values`: the maximum within `radius`, averaged over as many neighbours.
 fn smooth_above(values: &[f64], radius: usize) -> Vec<f64> {
     let around = |i: usize| i.saturating_sub(radius)..(i + radius + 1).min(values.len());
     let largest: Vec<f64> = (0..values.len()).map(|i| values[around(i)].iter().copied().fold(0.0, f64::max)).collect();

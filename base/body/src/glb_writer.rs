@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use crate::BodyError;
 
-/// Collects typed data into one buffer with a view and an accessor each, then writes it with a document as binary glTF 2.0.
+/// Writer of binary glTF 2.0: collects typed data in one buffer, with a view and an accessor each.
 #[derive(Debug, Default)]
 pub struct GlbWriter {
     bytes: Vec<u8>,
@@ -17,7 +17,7 @@ pub struct GlbWriter {
 }
 
 impl GlbWriter {
-    /// Adds bytes that are no accessor's, such as an image. Returns the view's index.
+    /// Adds bytes without an accessor, such as an image. Returns the view's index.
     pub fn bytes(&mut self, data: &[u8]) -> usize {
         self.bytes.resize(self.bytes.len().next_multiple_of(4), 0);
         self.views.push(json!({ "buffer": 0, "byteOffset": self.bytes.len(), "byteLength": data.len() }));
@@ -36,7 +36,7 @@ impl GlbWriter {
         self.accessors.len() - 1
     }
 
-    /// Adds positions with their bounds. Returns the accessor's index, as the others do.
+    /// Adds positions with their bounds. Returns the accessor's index.
     pub fn positions(&mut self, positions: &[Vec3]) -> usize {
         let low = positions.iter().fold(Vec3::INFINITY, |a, b| a.min(*b));
         let high = positions.iter().fold(Vec3::NEG_INFINITY, |a, b| a.max(*b));
@@ -44,7 +44,7 @@ impl GlbWriter {
         self.add(bytemuck::cast_slice(positions), 5126, "VEC3", positions.len(), Some(bounds))
     }
 
-    /// Adds rows of `width` numbers; `kind` is the format's name of such a row.
+    /// Adds rows of `width` numbers; `kind` is glTF's name of such a row, `VEC4` for example. Returns the accessor's index.
     pub fn floats(&mut self, data: &[f32], kind: &str, width: usize) -> usize {
         let bounds = (kind == "SCALAR").then(|| {
             let low = data.iter().copied().fold(f32::INFINITY, f32::min);
@@ -54,20 +54,20 @@ impl GlbWriter {
         self.add(bytemuck::cast_slice(data), 5126, kind, data.len() / width, bounds)
     }
 
-    /// Adds rows of `width` numbers of 16 bits.
+    /// Adds rows of `width` numbers of 16 bits. Returns the accessor's index.
     pub fn shorts(&mut self, data: &[u16], kind: &str, width: usize) -> usize {
         self.add(bytemuck::cast_slice(data), 5123, kind, data.len() / width, None)
     }
 
-    /// Adds indices of vertices.
+    /// Adds vertex indices. Returns the accessor's index.
     pub fn indices(&mut self, data: &[u32]) -> usize {
         self.add(bytemuck::cast_slice(data), 5125, "SCALAR", data.len(), None)
     }
 
-    /// Writes the file: `document` completed by asset, buffer, views and accessors. It appears whole or not at all.
+    /// Writes the file atomically: `document` completed by asset, buffer, views and accessors.
     ///
     /// # Errors
-    /// [`BodyError::Unwritten`] when the file would be larger than the format allows, or the system refuses.
+    /// [`BodyError::Unwritten`] when the file would be larger than the format allows, or the system fails.
     pub fn write(mut self, path: &Path, mut document: Value) -> Result<(), BodyError> {
         let unwritten = |message| BodyError::Unwritten { path: path.to_owned(), message };
         document["asset"] = json!({ "version": "2.0", "generator": "flyrig" });

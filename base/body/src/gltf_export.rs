@@ -1,4 +1,4 @@
-//! A template with its motion and texture as binary glTF.
+//! Export of a template with motion and texture as binary glTF.
 
 use std::path::Path;
 
@@ -7,20 +7,20 @@ use serde_json::{Value, json};
 
 use crate::{BodyError, GlbWriter, Template};
 
-/// Contents of a glTF file beside the skinned mesh.
+/// Optional content of a glTF file beside the skinned mesh.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct GlbContents<'a> {
-    /// Motion, written as one animation: times and world axes are those of the track.
+    /// Motion, written as one animation with the track's times and world axes.
     pub track: Option<&'a PoseTrack>,
-    /// PNG file of the colours, drawn without lighting.
+    /// Texture as a PNG file; the material is unlit.
     pub texture: Option<&'a [u8]>,
 }
 
-/// Writes a skinned mesh as [`crate::load_gltf`] reads it. The file appears whole or not at all.
+/// Writes a skinned mesh atomically, in the form that [`crate::load_gltf`] reads.
 ///
 /// # Errors
 /// [`BodyError::Unwritten`] when the poses do not fit the skeleton, the file would be larger than the format allows,
-/// or the system refuses.
+/// or the system fails.
 pub fn write_glb(path: &Path, template: &Template, contents: GlbContents<'_>) -> Result<(), BodyError> {
     let bones = template.skeleton.joints();
     let keys = contents.track.map(PoseTrack::keys).unwrap_or_default();

@@ -1,4 +1,4 @@
-//! glTF files as bytes: buffers and accessors, every length checked.
+//! Buffers and accessors of glTF files, with all lengths checked.
 
 use std::path::{Path, PathBuf};
 
@@ -10,7 +10,7 @@ use gltf::json::validation::Checked;
 use crate::gltf_limits::{MAX_FILE_BYTES, MAX_JSON_ENTRIES};
 use crate::{BodyError, gltf_uri};
 
-/// A parsed file with its buffers.
+/// Parsed file with its buffers.
 pub(crate) struct GltfFile<'a> {
     pub path: &'a Path,
     pub document: gltf::Document,
@@ -18,7 +18,7 @@ pub(crate) struct GltfFile<'a> {
 }
 
 impl<'a> GltfFile<'a> {
-    /// Reads a `.glb`, or a `.gltf` with its buffers as data URIs or in files of its folder.
+    /// Reads a `.glb`, or a `.gltf` whose buffers are data URIs or files in its folder.
     pub fn open(path: &'a Path) -> Result<Self, BodyError> {
         let fail = |message: String| BodyError::Gltf { path: path.into(), message };
         let bytes = gltf_uri::read(path, MAX_FILE_BYTES)?;
@@ -59,17 +59,17 @@ impl<'a> GltfFile<'a> {
         Ok(Self { path, document, buffers })
     }
 
-    /// An error about this file.
+    /// Creates an error about this file.
     pub fn fail(&self, message: impl Into<String>) -> BodyError {
         BodyError::Gltf { path: self.path.into(), message: message.into() }
     }
 
-    /// An error unless `found` is at most `limit`.
+    /// Checks that `found` is at most `limit`.
     pub fn check_count(&self, what: &str, found: usize, limit: usize) -> Result<(), BodyError> {
         if found > limit { Err(self.fail(too_many(what, found, limit))) } else { Ok(()) }
     }
 
-    /// At most `limit` items of `N` numbers; normalised integers become fractions, other numbers keep their value.
+    /// Reads at most `limit` items of `N` numbers; normalised integers become fractions, other numbers keep their value.
     pub fn numbers<const N: usize>(
         &self,
         accessor: &gltf::Accessor<'_>,
@@ -117,7 +117,7 @@ impl<'a> GltfFile<'a> {
         Ok((0..count).map(item).collect())
     }
 
-    /// As [`Self::numbers`], and none may be NaN or infinite.
+    /// Reads numbers as [`Self::numbers`] does and checks that all are finite.
     pub fn finite<const N: usize>(
         &self,
         accessor: &gltf::Accessor<'_>,
@@ -132,13 +132,13 @@ impl<'a> GltfFile<'a> {
     }
 }
 
-/// The base64 part of a data URI.
+/// Returns the base64 part of a data URI.
 fn embedded(uri: &str) -> Option<&str> {
     uri.strip_prefix("data:")?.split_once("base64,").map(|(_, data)| data)
 }
 
-/// Path of each buffer that lies in a file of its own. Checks the sum of their sizes before any is read: many buffers may
-/// name one file.
+/// Returns the path of each buffer in a file of its own. Checks the sum of their sizes before any is read: many buffers may name
+/// one file.
 fn external_buffers(path: &Path, document: &gltf::Document) -> Result<Vec<Option<PathBuf>>, BodyError> {
     let mut total = 0u64;
     let beside = document.buffers().map(|buffer| {
@@ -163,7 +163,7 @@ fn too_many(what: &str, found: impl std::fmt::Display, limit: impl std::fmt::Dis
     format!("{what}: {found}, at most {limit} are allowed; export the body alone, with a shorter animation")
 }
 
-/// The JSON of either form of a file; the parser refuses what is cut off.
+/// Returns the JSON of either form of a file; truncated JSON is left to the parser.
 fn json_part(bytes: &[u8]) -> &[u8] {
     match (bytes.starts_with(b"glTF"), bytes.get(12..20)) {
         (true, Some(&[a, b, c, d, ..])) => {
@@ -174,7 +174,7 @@ fn json_part(bytes: &[u8]) -> &[u8] {
     }
 }
 
-/// Upper bound of the objects, arrays and their entries in JSON text, without parsing it.
+/// Returns an upper bound of the number of objects, arrays and entries in JSON text, without parsing it.
 fn json_entries(text: &[u8]) -> usize {
     let (mut entries, mut is_string, mut is_escaped) = (0, false, false);
     for byte in text {
@@ -189,7 +189,7 @@ fn json_entries(text: &[u8]) -> usize {
     entries
 }
 
-/// What gltf 1.4 trusts without checking it first.
+/// Checks the parts of a document that gltf 1.4 uses without validation.
 fn check_trusted(json: &gltf::json::Root) -> Result<(), String> {
     let primitives = json.meshes.iter().flat_map(|mesh| &mesh.primitives);
     if primitives.flat_map(|primitive| primitive.attributes.values()).any(|index| index.value() >= json.accessors.len())
@@ -204,7 +204,7 @@ fn check_trusted(json: &gltf::json::Root) -> Result<(), String> {
     Ok(())
 }
 
-/// One little-endian number; `bytes` has the type's size.
+/// Reads one little-endian number; `bytes` has the type's size.
 fn number(bytes: &[u8], data_type: DataType, normalized: bool) -> f64 {
     let mut padded = [0; 4];
     padded[..bytes.len()].copy_from_slice(bytes);

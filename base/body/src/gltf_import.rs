@@ -1,4 +1,4 @@
-//! glTF 2.0 import of a skinned human as template and pose track.
+//! Import of a skinned human from glTF 2.0 as template and pose track.
 
 use std::path::Path;
 
@@ -11,25 +11,24 @@ use crate::gltf_nodes::{Nodes, Placement};
 use crate::part::part_of_joints;
 use crate::{BodyError, Joint, Skeleton, SkinWeights, Template};
 
-/// A body and its motion from one file.
+/// Body and motion from one file.
 #[derive(Debug, Clone)]
 pub struct GltfHuman {
-    /// The body. Its skeleton rests in the file's node transforms.
+    /// Body; its skeleton rests in the file's node transforms.
     pub template: Template,
-    /// The first animation; world is the file's own (y up), metres.
+    /// First animation, in the file's world (y up), metres.
     pub track: Option<PoseTrack>,
 }
 
-/// Reads the first skin of a `.glb` or `.gltf` file with all triangle meshes that hang on it, and the first
-/// animation.
+/// Reads the first skin of a `.glb` or `.gltf` file with all triangle meshes attached to it, and the first animation.
 ///
-/// Up to eight influences a vertex are reduced to the strongest four. Transforms above the root joint, even
+/// Influences of a vertex are reduced to the strongest four. Transforms above the root joint, even
 /// scale included, are folded into the root; a leading joint that moves nothing but its only child is folded
 /// too. Joints keep their rest distance from their parents: animated translations of other joints than the
-/// root, and animated scale, are not followed. Morph targets are ignored, and so is what is animated elsewhere.
+/// root, and animated scale, are not followed. Morph targets and animations of other nodes are ignored.
 ///
-/// External buffers must lie in the folder of the file or below it. Memory is bounded by the limits in `gltf_limits.rs`,
-/// whatever the file claims.
+/// External buffers must lie in the folder of the file or below it. The limits in `gltf_limits.rs` bound the memory for any
+/// file.
 ///
 /// # Errors
 /// [`BodyError::Io`]; [`BodyError::Gltf`] for a damaged file, one without skin or mesh, numbers that are not
@@ -107,7 +106,7 @@ fn joint_name(file: &GltfFile<'_>, node: usize) -> String {
     name.unwrap_or_else(|| format!("node {node}"))
 }
 
-/// Puts parents first, drops leading joints that do nothing, and says where each old joint went.
+/// Orders joints with parents first and drops leading joints without effect; returns the new index of each old joint.
 fn order_joints(
     file: &GltfFile<'_>,
     nodes: &Nodes,
@@ -158,7 +157,7 @@ fn order_joints(
     Ok(new_from_old)
 }
 
-/// Nearest ancestor of each joint that is a joint too.
+/// Returns the nearest ancestor of each joint that is itself a joint.
 fn joint_parents(nodes: &Nodes, joint_nodes: &[usize]) -> Vec<Option<usize>> {
     let mut joint_at = vec![None; nodes.parents.len()];
     for (joint, &node) in joint_nodes.iter().enumerate().rev() {
@@ -195,8 +194,8 @@ fn pose_of(placements: &[Placement], parents: &[Option<usize>]) -> Pose {
     }
 }
 
-/// Scale to metres and the quarter turns that bring the bind pose upright when the mesh was stored along
-/// other axes than the world's.
+/// Returns the scale to metres and the quarter turns that bring the bind pose upright, for meshes stored along other axes than
+/// the world's.
 fn canonical_from_mesh(file: &GltfFile<'_>, root: &Placement, inverse_bind: &DMat4) -> Result<DMat4, BodyError> {
     let world_from_root = DMat4::from_rotation_translation(root.rotation, root.translation);
     let world_from_mesh = world_from_root * DMat4::from_scale(DVec3::splat(root.scale)) * *inverse_bind;
@@ -228,11 +227,11 @@ struct Mesh {
     normals: Vec<Vec3>,
     uvs: Vec<Vec2>,
     triangles: Vec<[u32; 3]>,
-    /// Joints as the skin numbers them.
+    /// Influences with the joint numbers of the file's skin.
     skin: Vec<SkinWeights>,
 }
 
-/// Merges all triangle primitives of the nodes with this skin.
+/// Merges all triangle primitives of nodes with this skin.
 fn read_meshes(file: &GltfFile<'_>, skin: &gltf::Skin<'_>) -> Result<Mesh, BodyError> {
     let mut mesh = Mesh::default();
     let uses = |node: &gltf::Node<'_>| node.skin().is_some_and(|s| s.index() == skin.index());
@@ -257,7 +256,7 @@ fn read_meshes(file: &GltfFile<'_>, skin: &gltf::Skin<'_>) -> Result<Mesh, BodyE
     Ok(mesh)
 }
 
-/// Checks the sums over all meshes before anything is read: primitives may share their data, and nodes their mesh.
+/// Checks the total sizes of all meshes before anything is read: primitives may share data, and nodes a mesh.
 fn check_sizes<'a>(file: &GltfFile<'_>, nodes: impl Iterator<Item = gltf::Node<'a>>) -> Result<(), BodyError> {
     let (mut vertices, mut corners) = (0usize, 0usize);
     for mesh in nodes.filter_map(|node| node.mesh()) {

@@ -7,10 +7,10 @@ use crate::BodyError;
 use crate::gltf_file::GltfFile;
 use crate::gltf_limits::{MAX_ANIMATION_KEYS, MAX_KEY_SECS, MAX_NODES, MAX_POSED_NODES};
 
-/// Between two keys of a cubic curve poses are taken this often.
+/// Interval of poses between two keys of a cubic curve, nanoseconds.
 const CUBIC_STEP_NANOS: i64 = 1_000_000_000 / 120;
 
-/// Translation, rotation, scale of a node in its parent.
+/// Transform of a node in its parent: translation, rotation, scale.
 #[derive(Debug, Clone, Copy)]
 struct Local {
     translation: DVec3,
@@ -18,15 +18,15 @@ struct Local {
     scale: DVec3,
 }
 
-/// All nodes, in file order.
+/// All nodes of a file, in file order.
 pub(crate) struct Nodes {
     locals: Vec<Local>,
     pub parents: Vec<Option<usize>>,
-    /// Parents before children.
+    /// Node indices, parents before children.
     pub order: Vec<usize>,
 }
 
-/// A rotation, a translation and one scale: what a joint may be in the world.
+/// Permitted pose of a joint in the world: rotation, translation and one scale.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Placement {
     pub rotation: DQuat,
@@ -74,7 +74,7 @@ impl Nodes {
         Ok(Self { locals, parents, order })
     }
 
-    /// `world_from_node` of every node at rest.
+    /// Returns `world_from_node` of all nodes at rest.
     pub fn rest(&self) -> Vec<DMat4> {
         let mut world = vec![DMat4::IDENTITY; self.locals.len()];
         self.update_world(&self.order, &self.locals, &mut world);
@@ -90,7 +90,7 @@ impl Nodes {
         }
     }
 
-    /// The joints and the nodes above them, parents before children.
+    /// Returns the joints and the nodes above them, parents before children.
     fn moving(&self, joint_nodes: &[usize]) -> Vec<usize> {
         let mut moves = vec![false; self.parents.len()];
         for &joint in joint_nodes {
@@ -104,8 +104,8 @@ impl Nodes {
     }
 
     /// Calls `pose` with the time in nanoseconds and `world_from_node` of the joints and the nodes above them, for each
-    /// key of the first animation in the order of time. Never when there is no animation or it moves no joint. Other
-    /// nodes' matrices hold no meaning.
+    /// key of the first animation in order of time; not at all without an animation that moves a joint. Matrices of other nodes
+    /// have no meaning.
     pub fn animate(
         &self,
         file: &GltfFile<'_>,
@@ -131,7 +131,7 @@ impl Nodes {
         Ok(())
     }
 
-    /// The channels of the first animation that move one of these nodes.
+    /// Reads the channels of the first animation that move one of these nodes.
     fn curves(&self, file: &GltfFile<'_>, moving: &[usize]) -> Result<Vec<Curve>, BodyError> {
         let Some(animation) = file.document.animations().next() else { return Ok(Vec::new()) };
         let mut is_free: Vec<Option<[bool; 3]>> = vec![None; self.parents.len()];
@@ -185,7 +185,7 @@ impl Nodes {
     }
 }
 
-/// Times of the track's poses, growing: each curve is followed by straight pieces between them.
+/// Returns the times of the track's poses, increasing, so that linear interpolation follows all curves.
 fn pose_times(file: &GltfFile<'_>, curves: &[Curve], moving: usize) -> Result<Vec<i64>, BodyError> {
     let limit = MAX_POSED_NODES / moving.max(1);
     let what = format!("poses of an animation of {moving} nodes");
@@ -203,7 +203,7 @@ fn pose_times(file: &GltfFile<'_>, curves: &[Curve], moving: usize) -> Result<Ve
 }
 
 impl Placement {
-    /// None when the matrix shears, mirrors or scales its axes differently (by more than 1 %).
+    /// Decomposes a matrix; `None` when it shears, mirrors or scales its axes differently (by more than 1 %).
     pub fn from_matrix(matrix: &DMat4) -> Option<Self> {
         let linear = DMat3::from_mat4(*matrix);
         let scale = linear.determinant().cbrt();
@@ -222,19 +222,19 @@ struct Curve {
     node: usize,
     property: Property,
     nanos: Vec<i64>,
-    /// Per key one value, or in-tangent, value and out-tangent.
+    /// One value per key, or in-tangent, value and out-tangent.
     values: Vec<[f64; 4]>,
     interpolation: Interpolation,
 }
 
 impl Curve {
-    /// Straight pieces that follow the curve between two keys.
+    /// Returns the number of linear pieces that follow a cubic curve between two keys.
     fn pieces(pair: &[i64]) -> i64 {
         // A gap of minutes between two keys does not need thousands of poses.
         ((pair[1] - pair[0]) / CUBIC_STEP_NANOS + 1).min(1000)
     }
 
-    /// Length of [`Self::times_needed`].
+    /// Returns the length of [`Self::times_needed`].
     fn count_needed(&self) -> usize {
         let between = match self.interpolation {
             Interpolation::Linear => 0,
@@ -244,7 +244,7 @@ impl Curve {
         self.nanos.len() + between
     }
 
-    /// Where a track with straight pieces has to have keys to follow this curve.
+    /// Returns the times at which a linearly interpolated track needs keys to follow this curve.
     fn times_needed(&self) -> Vec<i64> {
         let mut times = self.nanos.clone();
         for pair in self.nanos.windows(2) {

@@ -1,17 +1,17 @@
-//! External buffers of glTF files: relative URIs, confined to the folder of the `.gltf` file.
+//! External buffers of glTF files: relative URIs confined to the folder of the `.gltf` file.
 
 use std::io::Read;
 use std::path::{Component, Path, PathBuf};
 
 use crate::BodyError;
 
-/// Characters of a URI that an error repeats.
+/// Characters of a URI that an error quotes.
 const SHOWN: usize = 80;
 
 /// Resolves the URI of a buffer to a canonical path below the folder of `gltf`.
 ///
 /// # Errors
-/// [`BodyError::Gltf`] for absolute paths, schemes, escapes that are no text, and paths or symbolic links that leave the
+/// [`BodyError::Gltf`] for absolute paths, schemes, escapes that are not UTF-8, and paths or symbolic links that leave the
 /// folder; [`BodyError::Io`] when there is no such file.
 pub(crate) fn resolve(gltf: &Path, uri: &str) -> Result<PathBuf, BodyError> {
     let refuse = |why: &str| {
@@ -72,7 +72,7 @@ pub(crate) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, BodyError> {
     }
 }
 
-/// RFC 3986, section 2.1; none for an escape without two hexadecimal digits or bytes that are not UTF-8.
+/// Decodes percent escapes (RFC 3986, section 2.1); `None` for an escape without two hexadecimal digits or bytes that are not UTF-8.
 fn percent_decode(uri: &str) -> Option<String> {
     let hex = |digit: u8| char::from(digit).to_digit(16).map(|digit| digit as u8);
     let mut bytes = Vec::with_capacity(uri.len());

@@ -1,4 +1,4 @@
-//! Linear blend skinning of surface Gaussians, on the device or on the processor.
+//! Linear blend skinning of surface Gaussians on the device or the processor.
 
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer, dispatch_1d};
 use flyrig_types::Pose;
@@ -11,11 +11,11 @@ const WGSL: &str = include_str!("skin.wgsl");
 /// Default of the kernel's `WORKGROUP_SIZE`.
 const WORKGROUP_SIZE: u32 = 64;
 
-/// Poses surface Gaussians where they lie: world = LBS(x + t_x), FlyHuman section 3.1. What stays constant is
-/// uploaded once; a frame uploads 48 bytes a joint.
+/// Skinning of surface Gaussians in device memory: world = LBS(x + t_x), FlyHuman section 3.1. Constant data is uploaded once; a
+/// frame uploads 48 bytes per joint.
 #[derive(Debug)]
 pub struct GpuSkinner {
-    /// None on the processor.
+    /// Compiled kernel; `None` on the processor.
     kernel: Option<ComputeKernel>,
     count: usize,
     joint_rows: StorageBuffer<[f32; 4]>,
@@ -27,7 +27,7 @@ pub struct GpuSkinner {
 }
 
 impl GpuSkinner {
-    /// For these Gaussians on a skeleton with as many joints as this one.
+    /// Uploads these Gaussians, for poses of a skeleton with as many joints as this one.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -52,17 +52,16 @@ impl GpuSkinner {
         })
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     #[must_use]
     pub fn count(&self) -> usize {
         self.count
     }
 
-    /// Records the kernel: writes world position and scale to `center_scale`, world normals and
-    /// [`SurfaceGaussians::depth_m`] to `normal`, one
-    /// element a Gaussian. `displacement` holds t_x, canonical metres; its w is the share by which a Gaussian and its depth below the
-    /// surface grow ([`crate::displacement`]). An element that is not finite counts as zero. The pose is uploaded among the
-    /// encoder's commands: several poses may go into one encoder.
+    /// Records the kernel, which writes world position and scale to `center_scale`, world normal and
+    /// [`SurfaceGaussians::depth_m`] to `normal`, one element per Gaussian. `displacement` holds t_x, canonical metres; its w is the
+    /// relative growth of a Gaussian and of its depth below the surface ([`crate::displacement`]). Elements that are not finite
+    /// count as zero. The pose is uploaded among the encoder's commands: one encoder may take several poses.
     ///
     /// # Errors
     /// [`BodyError::Pose`] when the pose does not fit or is not finite, [`BodyError::Buffer`] when a buffer is too
@@ -125,7 +124,7 @@ impl GpuSkinner {
         Ok(())
     }
 
-    /// The kernel on the processor.
+    /// Runs the kernel on the processor.
     fn skin(
         &self,
         world_from_canonical: &[DMat4],

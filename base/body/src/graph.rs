@@ -1,8 +1,9 @@
-//! Deformation graph: nodes on the surface, their neighbours, and what hangs on them.
+//! Deformation graph: nodes on the surface, their neighbours, and the Gaussians that they move.
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
+use flyrig_model::stretch::growth;
 use glam::{DVec3, Vec3};
 
 use crate::surface_links::SurfaceLinks;
@@ -11,36 +12,44 @@ use crate::{BodyError, SurfaceGaussians, Template};
 /// Nodes of the graph in FlyHuman, section 4.1.
 pub const DEFAULT_NODE_COUNT: usize = 1620;
 
-/// sigma^2 of Eq. 2, square metres. The paper's sigma = 0.001 can only be meant so: as a length in metres it
-/// would leave no weight at the nodes' real spacing of about 3.4 cm.
+/// sigma^2 of Eq. 2, square metres. The paper's sigma = 0.001 must be meant as this square: as a length in metres it would leave no
+/// weight at the nodes' real spacing of about 3.4 cm.
 pub const DEFAULT_SIGMA2_M2: f64 = 0.001;
 
-/// Nodes each Gaussian hangs on, and neighbours of each node.
+/// Number of nodes that move a Gaussian, and of neighbours of a node.
 const NEAREST: usize = 4;
 
 /// Nodes on the surface with their neighbours, and the nodes that move each Gaussian.
+///
+/// ```
+/// use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
+///
+/// let template = default_template(&ShapeParams::default())?;
+/// let gaussians = sample_surface(&template, 400, 1)?;
+/// let graph = build_graph(&template, &gaussians, 20, DEFAULT_SIGMA2_M2)?;
+/// assert_eq!((graph.nodes.len(), graph.gaussian_nodes.len()), (20, 400));
+/// # Ok::<(), flyrig_body::BodyError>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct DeformationGraph {
-    /// Canonical, metres.
+    /// Canonical positions, metres.
     pub nodes: Vec<Vec3>,
-    /// Which Gaussian each node is.
+    /// Gaussian at each node.
     pub node_gaussian: Vec<u32>,
-    /// Neighbours of each node along the surface, nearest first; its own index where it has fewer than 4.
-    /// Not always mutual.
+    /// Neighbours of each node along the surface, nearest first; its own index where it has fewer than 4. Not always mutual.
     pub neighbors: Vec<[u32; 4]>,
-    /// Nodes of each Gaussian, nearest along the surface first; the first one again where it has fewer than 4.
+    /// Nodes that move each Gaussian, nearest along the surface first; the first again where there are fewer than 4.
     pub gaussian_nodes: Vec<[u32; 4]>,
     /// Weights of FlyHuman Eq. 2, divided by their sum; 0 where a Gaussian has fewer than 4 nodes.
     pub gaussian_weights: Vec<[f32; 4]>,
 }
 
-/// Spreads `node_count` nodes (at most one a Gaussian) over the surface, each as far as can be from the ones
-/// before it, and hangs every Gaussian on the nearest 4 by Eq. 2 with `sigma2_m2` square metres. Distances are
-/// measured along the surface, so parts that only touch are not linked; Eq. 2 itself takes straight distances.
-/// A part of the surface without any node hangs on the node nearest in space.
+/// Builds a graph of `node_count` nodes (at most one per Gaussian) by farthest-point sampling, and weights the nearest 4 nodes of each
+/// Gaussian by FlyHuman Eq. 2 with `sigma2_m2` square metres. Distances are measured along the surface, so that parts which only
+/// touch are not linked; Eq. 2 itself takes straight distances. Parts of the surface without a node use the node nearest in space.
 ///
 /// # Errors
-/// [`BodyError::Mesh`] when the template is not valid, the Gaussians are none, not finite or not the template's,
+/// [`BodyError::Mesh`] when the template is not valid, there are no Gaussians or they are not finite or not the template's,
 /// `node_count` is 0, or `sigma2_m2` is not positive.
 pub fn build_graph(
     template: &Template,
@@ -81,10 +90,10 @@ pub fn build_graph(
     Ok(DeformationGraph { nodes, node_gaussian, neighbors, gaussian_nodes, gaussian_weights })
 }
 
-/// Returns the canonical displacement of a Gaussian by the translations of its nodes (FlyHuman Eq. 2), metres, and in w the share by
-/// which the Gaussian grows, so that a stretched surface (skirts, coats) has no holes. The stretch is the root mean square distance
-/// between the Gaussian's nodes over that at rest, without nodes of next to no weight; growth starts at a stretch of 1.25. `rest` holds
-/// the canonical positions of all nodes, metres; nodes that are missing there or in `translations` count as at rest.
+/// Returns the canonical displacement of a Gaussian by the translations of its nodes (FlyHuman Eq. 2), metres, and in w its relative
+/// growth ([`flyrig_model::stretch`]), which closes the holes of a stretched surface (skirts, coats). The stretch is the root mean
+/// square distance between the Gaussian's nodes over that at rest, without nodes of negligible weight. `rest` holds the canonical
+/// positions of all nodes, metres; nodes that are missing there or in `translations` count as at rest.
 #[must_use]
 pub fn displacement(rest: &[Vec3], translations: &[DVec3], nodes: [u32; 4], weights: [f32; 4]) -> [f32; 4] {
     let moved = nodes.map(|node| translations.get(node as usize).copied().unwrap_or(DVec3::ZERO));
@@ -100,23 +109,18 @@ pub fn displacement(rest: &[Vec3], translations: &[DVec3], nodes: [u32; 4], weig
             now += (apart + moved[b] - moved[a]).length_squared();
         }
     }
-    let longer = if then > 0.0 && now.is_finite() { (now / then).sqrt() / CLOSED } else { 1.0 };
-    let longer = longer.clamp(1.0, MOST_GROWTH) - 1.0;
-    by.as_vec3().extend(longer as f32).to_array()
+    by.as_vec3().extend((growth(then, now, f64::sqrt) - 1.0) as f32).to_array()
 }
 
-/// Gaussians overlap enough to close a surface that is longer than at rest by this factor; larger ones would only blur it.
-const CLOSED: f64 = 1.25;
-/// Most that a Gaussian grows, as a factor.
-const MOST_GROWTH: f64 = 4.0;
-/// Weights below this are 0 in the person stream, which has 255 steps: its viewers do not know which node it was.
+/// Smallest weight that counts. Smaller ones are 0 in the person stream, which has 255 steps, so that its viewers do not know the
+/// node.
 const LEAST_WEIGHT: f32 = 0.5 / 255.0;
 
-/// No node.
+/// Marker of a missing node.
 const NONE: u32 = u32::MAX;
 
-/// Nodes and Eq. 2 weights of a point. The largest exponent is subtracted from all, which changes no
-/// normalised weight and keeps the sum at 1 or more.
+/// Returns the nodes and Eq. 2 weights of a point. The largest exponent is subtracted from all, which changes no normalised weight
+/// and keeps the sum at 1 or more.
 fn hang(point: Vec3, nearest: &[u32; NEAREST + 1], nodes: &[Vec3], sigma2_m2: f64) -> ([u32; 4], [f32; 4]) {
     let squared = |node: u32| nodes[node as usize].as_dvec3().distance_squared(point.as_dvec3());
     let mut found: Vec<u32> = nearest[..NEAREST].iter().copied().filter(|&node| node != NONE).collect();
@@ -134,7 +138,7 @@ fn hang(point: Vec3, nearest: &[u32; NEAREST + 1], nodes: &[Vec3], sigma2_m2: f6
     )
 }
 
-/// A point reached over the surface; the nearest comes first out of a heap.
+/// Point reached along the surface; the nearest leaves a heap first.
 struct Reached {
     distance: f32,
     gaussian: u32,
@@ -162,18 +166,18 @@ impl PartialEq for Reached {
 
 impl Eq for Reached {}
 
-/// Farthest point sampling along the surface. Each component gets its first node before any gets a second.
+/// Selects points by farthest-point sampling along the surface. Each component gets its first node before any gets a second.
 fn farthest_points(links: &SurfaceLinks, count: usize, nodes: usize) -> Vec<u32> {
     let mut distance = vec![f32::INFINITY; count];
-    // Distances only fall: an entry that is too far goes back where it belongs. Lower indices first.
+    // Distances only fall: an outdated entry goes back to its place. Lower indices first.
     let mut farthest: BinaryHeap<(Far, std::cmp::Reverse<u32>)> =
         (0..count as u32).map(|i| (Far(f32::INFINITY), std::cmp::Reverse(i))).collect();
     let mut chosen = Vec::with_capacity(nodes);
     let mut front = BinaryHeap::new();
     while chosen.len() < nodes {
-        let Some((Far(told), std::cmp::Reverse(gaussian))) = farthest.pop() else { break };
+        let Some((Far(known), std::cmp::Reverse(gaussian))) = farthest.pop() else { break };
         let now = distance[gaussian as usize];
-        if now < told {
+        if now < known {
             farthest.push((Far(now), std::cmp::Reverse(gaussian)));
             continue;
         }
@@ -213,10 +217,10 @@ impl Ord for Far {
     }
 }
 
-/// The five nearest nodes of every Gaussian along the surface, nearest first, [`NONE`] where there are fewer: one Dijkstra search
-/// from all nodes at once that lets five of them pass each point.
+/// Returns the five nearest nodes of each Gaussian along the surface, nearest first, [`NONE`] where there are fewer: one Dijkstra
+/// search from all nodes at once, in which five of them may pass each point.
 fn nearest_nodes(links: &SurfaceLinks, count: usize, node_gaussian: &[u32]) -> Vec<[u32; NEAREST + 1]> {
-    // The shortest ways found so far, nearest first: they only become shorter, so whatever is longer than all five leads nowhere.
+    // The shortest paths found so far, nearest first: they only become shorter, so a path longer than all five leads nowhere.
     let mut nearest = vec![[(f32::INFINITY, NONE); NEAREST + 1]; count];
     let mut front: BinaryHeap<Reached> = BinaryHeap::new();
     for (&gaussian, node) in node_gaussian.iter().zip(0..) {
@@ -237,7 +241,7 @@ fn nearest_nodes(links: &SurfaceLinks, count: usize, node_gaussian: &[u32]) -> V
     nearest.into_iter().map(|ways| ways.map(|(_, node)| node)).collect()
 }
 
-/// Enters a way to a node among the shortest ones; returns whether it is one.
+/// Inserts a path to a node among the shortest ones; returns whether it is one of them.
 fn shorten(ways: &mut [(f32, u32); NEAREST + 1], distance: f32, node: u32) -> bool {
     let place = ways.iter().position(|&(_, known)| known == node).unwrap_or(NEAREST);
     // Of two nodes as far away, the one of the lower index counts as nearer.

@@ -1,20 +1,20 @@
-//! Gaussians below the surface that they draw.
+//! Insetting of Gaussians below the surface that they render.
 
 use rayon::prelude::*;
 
 use crate::SurfaceGaussians;
 use crate::point_grid::PointGrid;
 
-/// What is drawn of a closed surface of Gaussians ends about so many scales outside of their centres (alpha one half).
+/// Distance of the rendered silhouette (alpha one half) of a closed surface of Gaussians from their centres, in scales.
 const DRAWN_BEYOND: f32 = 1.7;
-/// Thinner parts than this are looked for, metres.
+/// Largest thickness that is measured, metres.
 const THICKEST_M: f32 = 0.05;
-/// No Gaussian's scale falls below this share of its own: it would leave holes.
+/// Smallest remaining fraction of a Gaussian's scale; smaller ones would leave holes.
 const LEAST_SCALE: f32 = 0.6;
 
 impl SurfaceGaussians {
-    /// The same Gaussians, each moved inwards, so that what they draw ends where the surface does. In parts thinner than
-    /// that (fingers, ears) they move to the middle and shrink.
+    /// Returns the Gaussians moved inwards, so that their rendered silhouette ends at the surface. In thinner parts (fingers, ears)
+    /// they move to the middle and shrink.
     #[must_use]
     pub fn inset(&self) -> Self {
         let mut moved = self.clone();

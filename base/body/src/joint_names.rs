@@ -1,10 +1,10 @@
-//! Which joint of a foreign skeleton is which of ours, by the names of the usual rigs.
+//! Correspondence of the joints of another skeleton with those of ours, by the names of the usual rigs.
 
 use crate::{BodyError, Skeleton};
 
-/// What a side's joints are called, in small letters without separators, `?` in place of the side's word: as in
-/// CMU, Mixamo and BVH clips of other programs, SMPL, VRM, Unreal and Blender. Where two rigs call different joints by
-/// the same name, the joint that is looked for first takes it: SMPL's shoulder is an arm and its foot a toe.
+/// Names of the joints of one side, lower case without separators, with `?` for the side's word: those of CMU, Mixamo, SMPL, VRM,
+/// Unreal, Blender and BVH clips. Where two rigs give different joints one name, the joint that stands first here takes it:
+/// SMPL's shoulder is an arm and its foot a toe.
 const SIDED: [(&str, &[&str]); 8] = [
     ("UpLeg", &["?upleg", "?upperleg", "upperleg?", "?thigh", "thigh?", "?hip"]),
     ("Leg", &["?lowerleg", "lowerleg?", "?knee", "?calf", "calf?", "?shin", "shin?", "?leg"]),
@@ -16,19 +16,19 @@ const SIDED: [(&str, &[&str]); 8] = [
     ("Shoulder", &["?collar", "?clavicle", "clavicle?", "?shoulder", "shoulder?"]),
 ];
 
-/// Without these there is no scale and no walking.
+/// Required joints, without which there is no scale and no gait.
 const NEEDED: [&str; 6] = ["LeftUpLeg", "LeftLeg", "LeftFoot", "RightUpLeg", "RightLeg", "RightFoot"];
 
-/// A joint of a foreign skeleton.
+/// Joint of another skeleton.
 pub(crate) struct Named<'a> {
     pub name: &'a str,
     pub parent: Option<usize>,
 }
 
-/// For each joint of `skeleton` the index of the foreign joint that moves it; the roots belong together.
+/// Returns for each joint of `skeleton` the index of the foreign joint that drives it; the roots correspond.
 ///
 /// # Errors
-/// [`BodyError::Skeleton`] lists the legs' joints that were not found on either side.
+/// [`BodyError::Skeleton`] lists missing joints of the legs.
 pub(crate) fn match_joints(
     skeleton: &Skeleton,
     foreign: &[Named<'_>],
@@ -96,7 +96,7 @@ pub(crate) fn match_joints(
     Ok(source)
 }
 
-/// The free foreign joint with the first of these names that there is.
+/// Returns the free foreign joint with the first of these names that occurs.
 fn find(plain_names: &[String], taken: &[bool], names: &[&str], side: [&str; 2]) -> Option<usize> {
     let called = |name: &&str| {
         side.iter().find_map(|word| {
@@ -107,7 +107,7 @@ fn find(plain_names: &[String], taken: &[bool], names: &[&str], side: [&str; 2])
     names.iter().find_map(called)
 }
 
-/// Spreads the joints between the hips and the neck over our spine when their names are not ours.
+/// Distributes the joints between hips and neck over our spine where their names differ from ours.
 fn match_spine(
     skeleton: &Skeleton,
     foreign: &[Named<'_>],
@@ -136,7 +136,7 @@ fn match_spine(
     }
 }
 
-/// "mixamorig:Left_Arm" -> "leftarm", "J_Bip_L_UpperLeg" -> "lupperleg".
+/// Normalises a name: "mixamorig:Left_Arm" -> "leftarm", "J_Bip_L_UpperLeg" -> "lupperleg".
 fn plain(name: &str) -> String {
     let name: String =
         name.rsplit(':').next().unwrap_or(name).to_lowercase().chars().filter(char::is_ascii_alphanumeric).collect();

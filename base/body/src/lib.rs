@@ -1,12 +1,23 @@
-//! The human template: a skinned mesh with a skeleton, the surface Gaussians and the deformation
-//! graph that hang on it, linear blend skinning, and the importers that bring bodies and motion in.
+//! Human template: a skinned mesh with a skeleton, surface Gaussians and a deformation graph attached to it, linear blend
+//! skinning, clothes, and importers of bodies and motion.
+//!
+//! ```
+//! use flyrig_body::{ShapeParams, default_template, sample_surface, skin_mesh};
+//!
+//! let template = default_template(&ShapeParams::woman().with("height", 0.7))?;
+//! let gaussians = sample_surface(&template, 500, 1)?;
+//! assert_eq!(gaussians.len(), 500);
+//! let (positions, normals) = skin_mesh(&template, &template.skeleton.rest_pose());
+//! assert_eq!((positions.len(), normals.len()), (template.positions.len(), template.positions.len()));
+//! # Ok::<(), flyrig_body::BodyError>(())
+//! ```
 //!
 //! # Conventions
 //!
 //! - **Canonical space** is the bind pose of the mesh in metres, glTF axes: y up, the body faces +z,
 //!   its left hand points to +x. The built-in body stands on y = 0.
-//! - **Skinning matrices** are `world_from_canonical`, one a joint: `world_from_joint * joint_from_canonical`.
-//! - **World** of a pose track is that of its source: y up for glTF, z up for BVH.
+//! - **Skinning matrices** are `world_from_canonical`, one per joint: `world_from_joint * joint_from_canonical`.
+//! - **World** of a pose track is that of its source: y up for glTF, z up after retargeting.
 
 mod body_asset;
 mod bvh;

@@ -1,4 +1,4 @@
-//! Meshes as PLY files that other tools open.
+//! Export of meshes as PLY files.
 
 use std::io::Write as _;
 use std::path::Path;
@@ -8,11 +8,11 @@ use glam::Vec3;
 
 use crate::BodyError;
 
-/// Writes a triangle mesh with normals as binary PLY, positions in metres. Each of `more` is the name of a property and
-/// its value at each vertex. The file appears whole or not at all.
+/// Writes a triangle mesh with normals atomically as binary PLY, positions in metres. Each element of `more` is the name of a
+/// property and its value at each vertex.
 ///
 /// # Errors
-/// [`BodyError::Unwritten`] when the lists do not fit together, a number is not finite, or the system refuses.
+/// [`BodyError::Unwritten`] when the lists differ in length, a number is not finite, or the system fails.
 pub fn write_mesh_ply(
     path: &Path,
     positions: &[Vec3],

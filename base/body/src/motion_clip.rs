@@ -1,34 +1,33 @@
-//! A recorded motion of any skeleton, before it is brought onto ours.
+//! Recorded motion of any skeleton, before retargeting.
 
 use glam::{DQuat, DVec3};
 
 use crate::bvh::BvhLocal;
-use crate::retarget::bind_rotation;
 use crate::{BodyError, BvhClip, GltfHuman};
 
-/// A joint in a frame: place, and rotation away from the rest pose, both in the file's world (y up).
+/// Joint in a frame: position, and rotation away from the rest pose, both in the file's world (y up).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Moved {
     pub position: DVec3,
     pub turned: DQuat,
 }
 
-/// A motion with its skeleton, from a BVH clip ([`BvhClip::motion`]) or a glTF file ([`GltfHuman::motion`]); bring it
-/// onto a body with [`MotionClip::retarget`].
+/// Motion with its skeleton, from a BVH clip ([`BvhClip::motion`]) or a glTF file ([`GltfHuman::motion`]);
+/// [`MotionClip::retarget`] transfers it to a body.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotionClip {
-    /// Where it came from, for messages.
+    /// Source, for messages.
     pub(crate) what: String,
     pub(crate) names: Vec<String>,
     pub(crate) parents: Vec<Option<usize>>,
-    /// Places of the joints at rest, y up, the file's units.
+    /// Positions of the joints at rest, y up, in the file's units.
     pub(crate) origins: Vec<DVec3>,
-    /// Nanoseconds and joints.
+    /// Time, nanoseconds, and joints of each frame.
     pub(crate) frames: Vec<(i64, Vec<Moved>)>,
 }
 
 impl BvhClip {
-    /// The clip as a motion to be retargeted.
+    /// Returns the clip as a motion for retargeting.
     #[must_use]
     pub fn motion(&self) -> MotionClip {
         let mut origins: Vec<DVec3> = Vec::with_capacity(self.joints.len());
@@ -61,7 +60,7 @@ impl BvhClip {
 }
 
 impl GltfHuman {
-    /// The file's first animation as a motion to be retargeted; its rest is the bind pose.
+    /// Returns the file's first animation as a motion for retargeting; its rest pose is the bind pose.
     ///
     /// # Errors
     /// [`BodyError::Skeleton`] when the file has no animation.
@@ -71,7 +70,7 @@ impl GltfHuman {
             return Err(BodyError::Skeleton(format!("{what} has no animation; export one with the body")));
         };
         let joints = template.skeleton.joints();
-        let rest: Vec<DQuat> = joints.iter().map(|joint| bind_rotation(joint).inverse()).collect();
+        let rest: Vec<DQuat> = joints.iter().map(|joint| joint.bind_rotation().inverse()).collect();
         let frame = |(nanos, pose): &(i64, flyrig_types::Pose)| {
             let world = template.skeleton.world_from_joint(pose);
             let moved = world.iter().zip(&rest).map(|(world, rest)| Moved {

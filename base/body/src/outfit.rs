@@ -1,27 +1,27 @@
-//! Clothes that the body's own surface cannot take the shape of: skirts, long coats, shoes.
+//! Clothes whose shape the body's surface cannot take: skirts, long coats, shoes.
 
 use crate::{BodyError, Shoes, Skirt, Template};
 
-/// Clothes with a surface of their own; others follow the body and its deformation.
+/// Clothes with a surface of their own; others are part of the body and its deformation.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Outfit {
-    /// Skirt or long coat; `None` without one.
+    /// Skirt or long coat, if any.
     pub skirt: Option<Skirt>,
-    /// `None` for bare feet.
+    /// Shoes; `None` for bare feet.
     pub shoes: Option<Shoes>,
 }
 
 impl Outfit {
-    /// Returns whether there is nothing to put on.
+    /// Returns whether the outfit is empty.
     #[must_use]
     pub fn is_bare(self) -> bool {
         self == Self::default()
     }
 
-    /// Returns the body in this outfit; joints are the same.
+    /// Returns the body in this outfit, with unchanged joints.
     ///
     /// # Errors
-    /// Those of [`Skirt::on`] and [`Shoes::on`].
+    /// As [`Skirt::on`] and [`Shoes::on`].
     pub fn on(self, body: &Template) -> Result<Template, BodyError> {
         let shod = self.shoes.map(|shoes| shoes.on(body)).transpose()?;
         let shod = shod.as_ref().unwrap_or(body);

@@ -2,8 +2,8 @@
 
 use crate::{Part, Skeleton};
 
-/// Part of each joint, from its name in the usual rigs' words (CMU, Mixamo, SMPL, VRM, Unreal). A joint whose
-/// name says nothing, a finger say, belongs to its parent's part; a nameless root to the torso.
+/// Returns the part of each joint, by its name in the usual rigs (CMU, Mixamo, SMPL, VRM, Unreal). A joint with another name belongs
+/// to its parent's part, a root to the torso.
 pub(crate) fn part_of_joints(skeleton: &Skeleton) -> Vec<Part> {
     let mut parts: Vec<Part> = Vec::with_capacity(skeleton.joints().len());
     for joint in skeleton.joints() {

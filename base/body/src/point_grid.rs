@@ -1,24 +1,36 @@
-//! Points in a grid of cubes, for questions about who is near.
+//! Grid of points for neighbour queries.
 
 use glam::{IVec3, Vec3};
 
-/// Cells beyond this many would cost more memory than they save time.
+/// Largest number of cells; more would cost more memory than they save time.
 const MAX_CELLS: f64 = 16e6;
 
-/// Finite points sorted into cubes.
+/// Finite points sorted into cubes, for queries of neighbours.
+///
+/// ```
+/// use flyrig_body::PointGrid;
+/// use glam::Vec3;
+///
+/// let points = [Vec3::ZERO, Vec3::X, Vec3::X * 1.1];
+/// let grid = PointGrid::new(&points, 0.2);
+/// let mut near = Vec::new();
+/// grid.within(Vec3::X, 0.2, |index, _| near.push(index));
+/// near.sort();
+/// assert_eq!(near, [1, 2]);
+/// ```
 #[derive(Debug)]
 pub struct PointGrid<'a> {
     points: &'a [Vec3],
     origin: Vec3,
     cell: f32,
     size: IVec3,
-    /// Where each cell's points begin in `sorted`, one more than cells.
+    /// First point of each cell in `sorted`; one element more than cells.
     starts: Vec<u32>,
     sorted: Vec<u32>,
 }
 
 impl<'a> PointGrid<'a> {
-    /// Sorts points; `cell` is the side of a cube, best the radius that will be asked for.
+    /// Sorts points into cubes of side `cell`, best the radius of later queries.
     #[must_use]
     pub fn new(points: &'a [Vec3], cell: f32) -> Self {
         let min = points.iter().copied().reduce(Vec3::min).unwrap_or(Vec3::ZERO);
@@ -56,7 +68,7 @@ impl<'a> PointGrid<'a> {
         ((cell.z * self.size.y + cell.y) * self.size.x + cell.x) as usize
     }
 
-    /// Calls `visit(index, squared distance)` for every point within `radius`, in a fixed order.
+    /// Calls `visit(index, squared distance)` for each point within `radius`, in a fixed order.
     pub fn within(&self, centre: Vec3, radius: f32, mut visit: impl FnMut(usize, f32)) {
         let low = self.cell_of(centre - radius);
         let high = self.cell_of(centre + radius);

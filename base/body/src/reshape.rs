@@ -1,4 +1,4 @@
-//! A change of shape, brought from the built-in body onto a body that shares its texture coordinates.
+//! Transfer of a change of shape from the built-in body to a body with the same texture coordinates.
 
 use std::collections::HashMap;
 
@@ -6,31 +6,31 @@ use glam::{DMat4, DVec3, Quat, Vec2, Vec3};
 
 use crate::{BodyError, Joint, ShapeParams, Skeleton, SkinWeights, Template, default_template, point_grid::PointGrid};
 
-/// Steps to which texture coordinates are rounded when they are compared.
+/// Steps per unit to which texture coordinates are rounded for comparison.
 const UV_STEPS: f32 = 1e5;
-/// Vertices of clothes, which have no place on the built-in body, follow so many near ones that have.
+/// Number of near vertices that a vertex of clothes, which the built-in body lacks, follows.
 const NEAREST: usize = 4;
-/// They are looked for within this distance, metres, then twice it, and so on.
+/// First search radius for them, metres; it doubles until vertices are found.
 const NEAR_M: f32 = 0.03;
-/// A body whose normals agree less with the built-in one's, on average, rests in another pose.
+/// Smallest mean agreement of normals with the built-in body's; a body with less rests in another pose.
 const LEAST_AGREEMENT: f32 = 0.7;
 
-/// A template in another shape.
+/// Template in another shape.
 #[derive(Debug, Clone)]
 pub struct Reshaped {
-    /// In the new shape; its skeleton is refitted.
+    /// Body in the new shape, with a refitted skeleton.
     pub template: Template,
-    /// By how much each vertex moved, canonical metres.
+    /// Displacement of each vertex, canonical metres.
     pub displacement: Vec<Vec3>,
 }
 
 impl Template {
-    /// Changes the shape: every vertex moves as the vertex of the built-in body with the same texture coordinates does between the average
-    /// shape and `change`, and joints with it (LoGAvatar, section 5.4). Vertices of clothes follow those of the body near them; joints that
+    /// Changes the shape: each vertex moves as the vertex of the built-in body with the same texture coordinates does between the average
+    /// shape and `change`, and joints accordingly (LoGAvatar, section 5.4). Vertices of clothes follow those of the body near them; joints that
     /// the built-in body lacks follow the vertices that they share with their parent.
     ///
-    /// Local measures add up, so the result is exact for them whatever shape the body has. Macro targets (`weight`, `age`, ...) move it as
-    /// they would the average body.
+    /// Local measures add up: their result is exact for a body of any shape. Macro targets (`weight`, `age`, ...) move it as they
+    /// would the average body.
     ///
     /// # Errors
     /// [`BodyError::UnknownTarget`], [`BodyError::TargetWeight`]; [`BodyError::Mesh`] for a body that does not share the built-in one's
@@ -95,7 +95,8 @@ fn follow(positions: &[Vec3], partners: &[Option<usize>], displacement: &mut [Ve
     }
 }
 
-/// The skeleton in the new shape: joints of the built-in body move as it says, others as the vertices that they share with their parent.
+/// Returns the skeleton in the new shape: joints that the built-in body has move as there, others with the vertices that they share
+/// with their parent.
 fn refit(template: &Template, displacement: &[Vec3], [from, to]: [&Skeleton; 2]) -> Result<Skeleton, BodyError> {
     let origin = |joint: &Joint| joint.joint_from_canonical.inverse().w_axis.truncate();
     let bones = template.skeleton.joints();
@@ -120,7 +121,8 @@ fn refit(template: &Template, displacement: &[Vec3], [from, to]: [&Skeleton; 2])
     Skeleton::new(joints.collect())
 }
 
-/// Mean displacement of the vertices that a joint shares with its parent, weighted by the smaller share; of its own where there are none.
+/// Returns the mean displacement of the vertices that a joint shares with its parent, weighted by the smaller share; of the joint's
+/// own vertices where it shares none.
 fn shared_displacement(template: &Template, displacement: &[Vec3], joint: usize) -> DVec3 {
     let parent = template.skeleton.joints()[joint].parent;
     let share = |skin: &SkinWeights, of: usize| -> f32 {
@@ -141,7 +143,7 @@ fn shared_displacement(template: &Template, displacement: &[Vec3], joint: usize)
         .unwrap_or_default()
 }
 
-/// Normals turned as the surface around each vertex turns; copies of a vertex on both sides of a seam turn alike.
+/// Returns the normals, rotated as the surface around each vertex is; copies of a vertex at a seam rotate alike.
 fn turned(template: &Template, positions: &[Vec3]) -> Vec<Vec3> {
     let bits = |place: &Vec3| place.to_array().map(f32::to_bits);
     let mut first: HashMap<[u32; 3], usize> = HashMap::new();

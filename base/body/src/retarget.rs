@@ -1,4 +1,4 @@
-//! A recorded motion on a body.
+//! Retargeting of a recorded motion to a body.
 
 use flyrig_types::{Pose, PoseTrack};
 use glam::{DQuat, DVec2, DVec3};
@@ -9,33 +9,33 @@ use crate::motion_clip::{MotionClip, Moved};
 use crate::part::part_of_joints;
 use crate::{BodyError, BvhClip, Part, Skeleton};
 
-/// Files are y up, our pose tracks are z up.
+/// Rotation about x from the files' y up to the z up of our pose tracks, radians.
 const Z_UP_FROM_Y_UP: f64 = std::f64::consts::FRAC_PI_2;
 
-/// Where feet that touch the floor lie among the heights of a clip.
+/// Quantile of the lowest foot heights of a clip that is taken as floor.
 const FLOOR_QUANTILE: f64 = 0.05;
 
-/// Height of the toe joint above the sole when the bind pose does not tell.
+/// Height of the toe joint above the sole where the bind pose gives none, metres.
 const USUAL_TOE_HEIGHT_M: f64 = 0.03;
 
-/// Root, hips and legs: without these there is no scale.
+/// Joints of the legs, which give the scale.
 const LEGS: [[&str; 4]; 2] =
     [["LeftUpLeg", "LeftLeg", "LeftFoot", "LeftToeBase"], ["RightUpLeg", "RightLeg", "RightFoot", "RightToeBase"]];
 
-/// What part of a motion is taken, and where it happens.
+/// Part of a motion to take, and its place in the world.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct RetargetOptions {
     /// Seconds of the motion to skip.
     pub start_secs: f64,
-    /// The middle of the way is moved to the origin, and a way that leads farther than this from it, metres, is
-    /// shrunk, steps and all: they become shorter, feet do not slide. Without it the motion stays where it is.
+    /// Largest distance from the origin, metres: the middle of the path is moved to the origin, and a longer path is scaled down
+    /// together with its steps, so that feet do not slide. `None` leaves the motion in place.
     pub reach_m: Option<f64>,
-    /// How thick the soles under the feet are, metres: they stand on the floor, the feet above them.
+    /// Thickness of soles between feet and floor, metres.
     pub sole_m: f64,
 }
 
 impl BvhClip {
-    /// [`MotionClip::retarget`] of the whole clip, where it is.
+    /// Retargets the whole clip in place, see [`MotionClip::retarget`].
     ///
     /// # Errors
     /// As [`MotionClip::retarget`].
@@ -45,14 +45,13 @@ impl BvhClip {
 }
 
 impl MotionClip {
-    /// The motion on another skeleton, by the joints' names in the usual rigs (case, separators and a `prefix:` do not
-    /// matter). World: z up, the floor at z = 0, a motion that faces +z of the file faces -y.
+    /// Transfers the motion to another skeleton, by the joints' names in the usual rigs (case, separators and a `prefix:` do not
+    /// matter). World: z up, the floor at z = 0; a motion that faces +z of the file faces -y.
     ///
-    /// A joint turns in the world as the source's does from its rest. The source may rest in another pose than our
-    /// bind pose, so arms and legs are first turned to its rest directions; hands go along with the arms; the trunk
-    /// and the feet keep their own shape. Joints that the source does not know stay at rest. The way of the hips is
-    /// scaled by the length of the legs, and lifted such that the feet are on the floor when they are lowest (5 % of
-    /// the frames). Where a foot of the source stands (low and slow), ours is held in place and on the floor by
+    /// A joint rotates in the world as the source's does from its rest pose. The source may rest in another pose than our bind pose:
+    /// arms and legs are first turned to its rest directions, hands follow the arms, trunk and feet keep their own shape. Joints that
+    /// the source lacks stay at rest. The path of the hips is scaled by the length of the legs, and lifted so that the feet are on the
+    /// floor when they are lowest (5 % of the frames). Where a foot of the source stands (low and slow), ours is held in place and on the floor by
     /// two-bone inverse kinematics, and hips too high for that are lowered smoothly.
     ///
     /// # Errors
@@ -91,7 +90,7 @@ impl MotionClip {
     }
 }
 
-/// Moves the middle of the way to the origin and shrinks it to `reach_m`.
+/// Moves the middle of the path to the origin and scales it down to `reach_m`.
 fn shrink_way(poses: &mut [Pose], reach_m: f64) {
     let way = || poses.iter().map(|pose| pose.root_translation.truncate());
     let low = way().fold(DVec2::INFINITY, DVec2::min);
@@ -105,7 +104,7 @@ fn shrink_way(poses: &mut [Pose], reach_m: f64) {
     }
 }
 
-/// A leg on both sides: hip, knee, ankle, and our toe joint.
+/// Leg of both skeletons: hip, knee, ankle, and our toe joint.
 #[derive(Debug, Clone, Copy)]
 struct LegMap {
     ours: [usize; 4],
@@ -113,7 +112,7 @@ struct LegMap {
     their_toe: Option<usize>,
 }
 
-/// How a motion's joints drive a skeleton's.
+/// Mapping from a motion's joints to a skeleton's.
 struct Map<'a> {
     skeleton: &'a Skeleton,
     /// Source joint of each of our joints.
@@ -183,7 +182,8 @@ impl<'a> Map<'a> {
                 _ => DQuat::IDENTITY,
             });
         }
-        let at_source_rest = joints.iter().zip(&turned).map(|(joint, turned)| *turned * bind_rotation(joint)).collect();
+        let at_source_rest =
+            joints.iter().zip(&turned).map(|(joint, turned)| *turned * joint.bind_rotation()).collect();
         let is_foot = |part: &Part| matches!(part, Part::LeftFoot | Part::RightFoot);
         let feet: Vec<usize> = (0..joints.len()).filter(|&index| is_foot(&parts[index])).collect();
         let lowest = feet.iter().map(|&foot| origins[foot].y).fold(f64::INFINITY, f64::min);
@@ -198,7 +198,7 @@ impl<'a> Map<'a> {
         })
     }
 
-    /// One frame, y up, hips where the source has them.
+    /// Returns the pose of one frame, y up, with the hips at the source's position.
     fn pose(&self, moved: &[Moved]) -> Pose {
         let joints = self.skeleton.joints();
         let mut world: Vec<DQuat> = Vec::with_capacity(joints.len());
@@ -226,10 +226,4 @@ impl<'a> Map<'a> {
         let world = self.skeleton.world_from_joint(pose);
         self.feet.iter().map(|&foot| world[foot].w_axis.y).fold(f64::INFINITY, f64::min)
     }
-}
-
-/// `canonical_from_joint` rotation in the bind pose.
-pub(crate) fn bind_rotation(joint: &crate::Joint) -> DQuat {
-    let (_, rotation, _) = joint.joint_from_canonical.inverse().to_scale_rotation_translation();
-    rotation.normalize()
 }

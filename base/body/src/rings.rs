@@ -1,4 +1,4 @@
-//! Surfaces around parts of the body, as rings of vertices from top to bottom: skirts, shoes.
+//! Surfaces around parts of the body (skirts, shoes) as rings of vertices from top to bottom.
 
 use std::f32::consts::TAU;
 
@@ -6,7 +6,8 @@ use glam::{Vec2, Vec3};
 
 use crate::{Part, SkinWeights, Template};
 
-/// Direction of one of `N` vertices around, x to the left and z (as y) to the front; indices run so that triangles face outwards.
+/// Returns the direction of vertex `k` of `N` around a ring, x to the left and z (as y) to the front, in the order in which triangles
+/// face outwards.
 pub(crate) fn direction<const N: usize>(k: usize) -> Vec2 {
     let angle = -TAU * k as f32 / N as f32;
     Vec2::new(angle.cos(), angle.sin())
@@ -27,7 +28,7 @@ pub(crate) fn cut(body: &Template, triangles: &[[u32; 3]], y: f32) -> Vec<Vec2> 
     cut
 }
 
-/// Distances from a centre to the convex outline of points, by direction; 0 where it has none.
+/// Returns the distances from a centre to the convex outline of points, by direction; 0 where there is none.
 pub(crate) fn convex_radii<const N: usize>(points: &[Vec2], centre: Vec2) -> [f32; N] {
     // The convex outline's distance in a direction is the least, over all half-planes that hold the points, to their edge.
     let supports: Vec<(Vec2, f32)> = (0..4 * N)
@@ -47,7 +48,7 @@ pub(crate) fn convex_radii<const N: usize>(points: &[Vec2], centre: Vec2) -> [f3
     })
 }
 
-/// The template with only these triangles and the vertices that they use.
+/// Returns the template with only these triangles and their vertices.
 pub(crate) fn kept(body: &Template, triangles: &[[u32; 3]]) -> Template {
     let mut number = vec![u32::MAX; body.positions.len()];
     let mut used = Vec::new();
@@ -69,7 +70,7 @@ pub(crate) fn kept(body: &Template, triangles: &[[u32; 3]]) -> Template {
     }
 }
 
-/// Adds rings of `N` points each, top first, joined to a surface.
+/// Adds rings of `N` points each, top first, joined into a surface.
 pub(crate) fn add_rings<const N: usize>(
     dressed: &mut Template,
     points: &[Vec3],

@@ -1,4 +1,4 @@
-//! Shoes: one smooth surface around each foot, where a bare one has toes.
+//! Shoes: one smooth surface around each foot.
 
 use glam::{Vec2, Vec3};
 
@@ -6,41 +6,41 @@ use crate::part::part_of_joints;
 use crate::rings::{add_rings, convex_radii, cut, direction, kept};
 use crate::{BodyError, Part, SkinWeights, Template};
 
-/// Vertices around, and metres between two rings.
+/// Vertices around a ring, and distance between two rings, metres.
 const AROUND: usize = 48;
 const RING_M: f32 = 0.01;
-/// A shoe covers the foot up to this share of the ankle's height; the foot reaches below it, so that no gap opens.
+/// Height of a shoe as a fraction of the ankle's; the foot reaches below it, so that no gap opens.
 const COLLAR: f32 = 0.85;
 const OVERLAP_M: f32 = 0.015;
-/// An upper lies so far outside of the foot, metres.
+/// Distance of the upper from the foot, metres.
 const UPPER_M: f32 = 0.006;
-/// The sole's edge beyond the foot: at the sides and the heel, and in front of the toes, where a shoe leaves room, metres.
+/// Width of the sole's edge beyond the foot, metres: at the sides and the heel, and in front of the toes.
 const WELT_M: f32 = 0.007;
 const TOE_ROOM_M: f32 = 0.013;
 /// Height of the toe cap above the ground that the bare foot stands on, metres.
 const CAP_M: f32 = 0.06;
-/// The part of the foot below this height stands on the sole, metres.
+/// Height below which the foot stands on the sole, metres.
 const STANDS_M: f32 = 0.03;
 
-/// Soles that shoes may have.
+/// Permitted thickness of soles, metres.
 const SOLES: std::ops::RangeInclusive<f32> = 0.0..=0.08;
 
 /// Shape of a pair of shoes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shoes {
-    /// How far the soles reach below the bare feet, metres.
+    /// Thickness of the soles below the bare feet, metres.
     pub sole_m: f32,
 }
 
 impl Default for Shoes {
-    /// Shoes with soles as most have them.
+    /// Returns shoes with soles of usual thickness.
     fn default() -> Self {
         Self { sole_m: 0.022 }
     }
 }
 
 impl Shoes {
-    /// Returns the body in these shoes: the surface of the feet below the ankles is gone, joints are the same.
+    /// Returns the body in these shoes, without the surface of the feet below the ankles and with unchanged joints.
     ///
     /// Each shoe is a stack of convex outlines around the foot at its height, with room before the toes, on a sole of even thickness.
     /// It moves as the nearest places of the foot do, so that it bends at the toes.
@@ -75,9 +75,9 @@ impl Shoes {
     }
 }
 
-/// One foot, canonical.
+/// One foot, canonical metres.
 struct Foot {
-    /// Foot and leg.
+    /// Parts of foot and leg.
     parts: [Part; 2],
     triangles: Vec<[u32; 3]>,
     vertices: Vec<usize>,
@@ -116,7 +116,7 @@ impl Foot {
         })
     }
 
-    /// Points of the shoe, from the collar down to the middle of the sole.
+    /// Returns the points of the shoe, from the collar down to the middle of the sole.
     fn rings(&self, body: &Template, sole_m: f32) -> Vec<Vec3> {
         let edge: Vec<Vec2> = self
             .vertices
@@ -166,7 +166,7 @@ impl Foot {
         points
     }
 
-    /// Skin weights of the nearest place of the foot.
+    /// Returns the skin weights of the nearest point of the foot.
     fn skin(&self, body: &Template, point: Vec3) -> SkinWeights {
         let nearest = self
             .vertices

@@ -5,29 +5,37 @@ use glam::{DMat4, DQuat, DVec3};
 
 use crate::BodyError;
 
-/// One joint of a skeleton.
+/// Joint of a skeleton.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Joint {
     /// Name, unique in its skeleton.
     pub name: String,
-    /// Index of the parent, always smaller than the joint's own; none for the root alone.
+    /// Index of the parent, smaller than the joint's own; `None` for the root alone.
     pub parent: Option<usize>,
-    /// Origin of the joint in its parent's frame at rest (root: in the world), metres.
+    /// Origin in the parent's frame at rest (root: in the world), metres.
     pub rest_translation: DVec3,
-    /// `parent_from_joint` rotation at rest (root: `world_from_joint`).
+    /// Rotation `parent_from_joint` at rest (root: `world_from_joint`).
     pub rest_rotation: DQuat,
-    /// Inverse bind matrix: canonical mesh space into the joint's frame.
+    /// Inverse bind matrix: from canonical mesh space to the joint's frame.
     pub joint_from_canonical: DMat4,
 }
 
-/// A tree of joints, parents before children, the root at index 0.
+impl Joint {
+    /// Returns the rotation `canonical_from_joint` in the bind pose.
+    pub(crate) fn bind_rotation(&self) -> DQuat {
+        let (_, rotation, _) = self.joint_from_canonical.inverse().to_scale_rotation_translation();
+        rotation.normalize()
+    }
+}
+
+/// Tree of joints, parents before children, the root at index 0.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Skeleton {
     joints: Vec<Joint>,
 }
 
 impl Skeleton {
-    /// From joints in order.
+    /// Creates a skeleton from joints in order.
     ///
     /// # Errors
     /// [`BodyError::Skeleton`] when there is no joint, a parent does not come before its child, there is a
@@ -69,19 +77,19 @@ impl Skeleton {
         Ok(Self { joints })
     }
 
-    /// The joints, parents before children.
+    /// Returns the joints, parents before children.
     #[must_use]
     pub fn joints(&self) -> &[Joint] {
         &self.joints
     }
 
-    /// Index of a joint by its exact name.
+    /// Returns the index of the joint with this exact name.
     #[must_use]
     pub fn joint(&self, name: &str) -> Option<usize> {
         self.joints.iter().position(|joint| joint.name == name)
     }
 
-    /// The pose at rest. For the built-in body this is the bind pose; a glTF file may rest in another one.
+    /// Returns the rest pose: the bind pose for the built-in body; a glTF file may rest in another one.
     #[must_use]
     pub fn rest_pose(&self) -> Pose {
         Pose {
@@ -90,10 +98,10 @@ impl Skeleton {
         }
     }
 
-    /// Whether the pose has a rotation for each joint and is finite.
+    /// Checks that the pose has one rotation per joint and is finite.
     ///
     /// # Errors
-    /// [`BodyError::Pose`] says which of the two.
+    /// [`BodyError::Pose`] names the fault.
     pub fn check_pose(&self, pose: &Pose) -> Result<(), BodyError> {
         let (found, expected) = (pose.joint_rotations.len(), self.joints.len());
         if found != expected {
@@ -105,9 +113,8 @@ impl Skeleton {
         Ok(())
     }
 
-    /// Forward kinematics: `world_from_joint` of every joint. A non-root joint sits at its rest translation
-    /// in its parent's frame; the root at the pose's root translation. A joint that the pose has no rotation
-    /// for stays at rest.
+    /// Computes forward kinematics: `world_from_joint` of each joint. The root lies at the pose's root translation, other joints at
+    /// their rest translation in the parent's frame. Joints without a rotation in the pose stay at rest.
     #[must_use]
     pub fn world_from_joint(&self, pose: &Pose) -> Vec<DMat4> {
         let mut world: Vec<DMat4> = Vec::with_capacity(self.joints.len());
@@ -121,7 +128,7 @@ impl Skeleton {
         world
     }
 
-    /// Skinning matrices: `world_from_joint * joint_from_canonical` of every joint.
+    /// Returns the skinning matrix `world_from_joint * joint_from_canonical` of each joint.
     #[must_use]
     pub fn world_from_canonical(&self, pose: &Pose) -> Vec<DMat4> {
         self.world_from_joint(pose)
@@ -131,13 +138,13 @@ impl Skeleton {
             .collect()
     }
 
-    /// Origin of every joint in canonical space, metres.
+    /// Returns the origin of each joint in canonical space, metres.
     #[must_use]
     pub fn canonical_origins(&self) -> Vec<DVec3> {
         self.joints.iter().map(|joint| joint.joint_from_canonical.inverse().w_axis.truncate()).collect()
     }
 
-    /// Indices of the direct children of a joint.
+    /// Iterates over the indices of the direct children of a joint.
     pub fn children(&self, joint: usize) -> impl Iterator<Item = usize> + '_ {
         self.joints.iter().enumerate().filter(move |(_, j)| j.parent == Some(joint)).map(|(index, _)| index)
     }

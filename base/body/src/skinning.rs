@@ -1,4 +1,4 @@
-//! Linear blend skinning on the CPU.
+//! Linear blend skinning on the processor.
 
 use flyrig_types::Pose;
 use glam::{DMat3, DMat4, DVec3, Mat3, Mat4, Vec3};
@@ -6,21 +6,20 @@ use rayon::prelude::*;
 
 use crate::{SkinWeights, Template};
 
-/// Linear blend skinning of one canonical point, the plain reference. Joints beyond the matrices and
-/// non-positive weights count nothing; with no weight at all the point stays where it is.
+/// Skins one canonical point by linear blend skinning; the reference for faster forms. Joints beyond the matrices and weights that
+/// are not positive are ignored; without any weight the point stays in place.
 #[must_use]
 pub fn skin_point_f64(matrices: &[DMat4], skin: &SkinWeights, point: DVec3) -> DVec3 {
     blend_f64(matrices, skin).transform_point3(point)
 }
 
-/// Linear blend skinning of one canonical normal (rotation part of the blend, normalised).
+/// Skins one canonical normal by the linear part of the blend, normalised.
 #[must_use]
 pub fn skin_normal_f64(matrices: &[DMat4], skin: &SkinWeights, normal: DVec3) -> DVec3 {
     (DMat3::from_mat4(blend_f64(matrices, skin)) * normal).normalize_or_zero()
 }
 
-/// Derivative of the skinned point by the canonical point: the linear part of the blended bone matrices, as
-/// [`skin_point_f64`] takes them.
+/// Returns the derivative of [`skin_point_f64`] by the canonical point: the linear part of the blended matrices.
 #[must_use]
 pub fn skin_jacobian_f64(matrices: &[DMat4], skin: &SkinWeights) -> DMat3 {
     DMat3::from_mat4(blend_f64(matrices, skin))
@@ -38,7 +37,7 @@ fn blend_f64(matrices: &[DMat4], skin: &SkinWeights) -> DMat4 {
     if total > 0.0 { sum * (1.0 / total) } else { DMat4::IDENTITY }
 }
 
-/// Posed positions (world, metres) and unit normals of a template's vertices.
+/// Returns the posed positions (world, metres) and unit normals of a template's vertices.
 #[must_use]
 pub fn skin_mesh(template: &Template, pose: &Pose) -> (Vec<Vec3>, Vec<Vec3>) {
     let matrices: Vec<Mat4> = template.skeleton.world_from_canonical(pose).iter().map(DMat4::as_mat4).collect();

@@ -1,4 +1,4 @@
-//! A skirt or the lower half of a coat: one surface around both legs, where the body has two.
+//! Skirt or lower half of a coat: one surface around both legs.
 
 use glam::{Vec2, Vec3};
 
@@ -6,36 +6,36 @@ use crate::part::part_of_joints;
 use crate::rings::{add_rings, convex_radii, cut, direction, kept};
 use crate::{BodyError, Part, Skeleton, SkinWeights, Template};
 
-/// Vertices around, and metres between two rings.
+/// Vertices around a ring, and distance between two rings, metres.
 const AROUND: usize = 60;
 const RING_M: f32 = 0.025;
-/// The skirt begins so far above the hip joints, metres: the body reaches below it, so that no gap opens at the waist.
+/// Height of the waistband above the hip joints, metres; the body reaches below it, so that no gap opens.
 const ABOVE_HIPS_M: f32 = 0.06;
 const OVERLAP_M: f32 = 0.05;
-/// The skirt hangs so far outside of the body, metres.
+/// Distance of the skirt from the body, metres.
 const CLEARANCE_M: f32 = 0.004;
-/// Share of the thighs' movement that a skirt follows at the knees; less above.
+/// Fraction of the thighs' movement that a skirt follows at the knees; less above.
 const FOLLOWS_THIGHS: f32 = 0.8;
-/// Half of the width over which left turns into right, metres.
+/// Half of the width over which the weights blend from left to right, metres.
 const BLEND_M: f32 = 0.12;
 
 /// Shape of a skirt.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Skirt {
-    /// Height of the hem below the hip joints, as a share of the way to the ankles: 0.55 ends at the knees.
+    /// Height of the hem below the hip joints, as a fraction of the distance to the ankles: 0.55 ends at the knees.
     pub length: f32,
-    /// Metres outwards for each metre down, beyond a skirt that hangs straight from the hips.
+    /// Flare, metres outwards per metre down, relative to a skirt that hangs straight from the hips.
     pub flare: f32,
 }
 
-/// Lengths and flares that a skirt may have.
+/// Permitted lengths and flares.
 const LENGTHS: std::ops::RangeInclusive<f32> = 0.15..=1.0;
 const FLARES: std::ops::RangeInclusive<f32> = 0.0..=1.0;
 
 impl Skirt {
-    /// Returns the body in this skirt: the surface of hips and legs that it hides is gone, joints are the same.
+    /// Returns the body in this skirt, without the hidden surface of hips and legs and with unchanged joints.
     ///
-    /// The skirt hangs straight down from the widest place above, around the convex outline of both legs, and flares. Its skin weights
+    /// The skirt hangs straight down from the widest point above, around the convex outline of both legs, and flares. Its skin weights
     /// blend from the left to the right thigh, and from hips to thighs on the way down.
     ///
     /// # Errors
@@ -95,14 +95,14 @@ impl Skirt {
     }
 }
 
-/// Where the legs are, canonical.
+/// Geometry of the legs, canonical metres.
 struct Legs {
     hips: u16,
     left: u16,
     right: u16,
     hip_y: f32,
     ankle_y: f32,
-    /// The middle between the hip joints (x, z).
+    /// Middle between the hip joints (x, z).
     centre: Vec2,
 }
 

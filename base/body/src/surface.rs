@@ -1,4 +1,4 @@
-//! Evenly spaced Gaussians on the surface.
+//! Evenly spaced Gaussians on a template's surface.
 
 use glam::{Vec2, Vec3};
 use rand::{RngExt, SeedableRng};
@@ -9,24 +9,24 @@ use crate::part::part_of_joints;
 use crate::point_grid::PointGrid;
 use crate::{BodyError, Part, SkinWeights, Template};
 
-/// About 4 mm apart on an adult (FlyHuman, section 3.1).
+/// Default number of Gaussians: about 4 mm apart on an adult (FlyHuman, section 3.1).
 pub const DEFAULT_GAUSSIAN_COUNT: usize = 115_000;
 
-/// More would not fit the memory of any machine this runs on.
+/// Largest number of Gaussians, bounded by memory.
 const MAX_GAUSSIANS: usize = 10_000_000;
 
-/// Random points thrown for each one kept; more make the spacing evener and take longer.
+/// Random candidates per Gaussian; more make the spacing evener and take longer.
 const CANDIDATES_PER_GAUSSIAN: usize = 4;
 
 /// Standard deviation of a Gaussian over the distance to its nearest neighbour: 0.75 of the mean spacing (FlyHuman,
 /// section 3.1), which blue noise puts at 1.3 times the nearest distance. Smaller ones let the back of the body
-/// shine through: at 0.75 of the nearest distance the front's alpha is 0.98, here 0.999.
+/// show through: at 0.75 of the nearest distance the front's alpha is 0.98, here 0.999.
 const SCALE_OF_NEAREST: f32 = 0.975;
 
 /// Gaussians on the canonical surface; all lists have the same length.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SurfaceGaussians {
-    /// Canonical, metres.
+    /// Canonical positions, metres.
     pub positions: Vec<Vec3>,
     /// Canonical unit normals, interpolated.
     pub normals: Vec<Vec3>,
@@ -38,7 +38,7 @@ pub struct SurfaceGaussians {
     pub skin: Vec<SkinWeights>,
     /// Standard deviation, metres: 0.975 of the distance to the nearest neighbour on the same side of the body.
     pub scale_m: Vec<f32>,
-    /// How far the centre lies below the surface that is drawn, along the normal, metres; 0 as sampled ([`Self::inset`]).
+    /// Depth of the centre below the rendered surface, along the normal, metres; 0 as sampled ([`Self::inset`]).
     pub depth_m: Vec<f32>,
     /// Triangle of the template, ascending.
     pub triangle: Vec<u32>,
@@ -47,24 +47,24 @@ pub struct SurfaceGaussians {
 }
 
 impl SurfaceGaussians {
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     #[must_use]
     pub fn len(&self) -> usize {
         self.positions.len()
     }
 
-    /// Whether there are none.
+    /// Returns whether there are none.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.positions.is_empty()
     }
 }
 
-/// `count` Gaussians, evenly spaced over the template's surface (blue noise). The same template, count and
-/// seed give the same Gaussians.
+/// Samples `count` Gaussians, evenly spaced over the template's surface (blue noise). Equal templates, counts and seeds give equal
+/// Gaussians.
 ///
 /// # Errors
-/// [`BodyError::Mesh`] when the template's lists disagree, a number is not finite, the surface has no area, or
+/// [`BodyError::Mesh`] when the template's lists differ in length, a number is not finite, the surface has no area, or
 /// `count` is 0 or above ten million.
 pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<SurfaceGaussians, BodyError> {
     template.check()?;
@@ -136,7 +136,7 @@ pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<Su
     })
 }
 
-/// Standard deviations of Gaussians about `spacing` apart.
+/// Returns the standard deviations of Gaussians that are about `spacing` apart, metres.
 pub(crate) fn scales(positions: &[Vec3], normals: &[Vec3], spacing: f32) -> Vec<f32> {
     nearest_distances(positions, normals, spacing).into_iter().map(|distance| distance * SCALE_OF_NEAREST).collect()
 }
@@ -155,8 +155,8 @@ fn blend_skin(template: &Template, (triangle, weights): (u32, [f32; 3])) -> Skin
     SkinWeights::strongest(&influences).unwrap_or(SkinWeights { joints: [0; 4], weights: [1.0, 0.0, 0.0, 0.0] })
 }
 
-/// Distance of each point to the nearest other one whose normal does not oppose its own; `spacing` where
-/// there is none within 8 spacings.
+/// Returns the distance of each point to the nearest other one whose normal does not oppose its own; `spacing` where there is none
+/// within 8 spacings.
 fn nearest_distances(points: &[Vec3], normals: &[Vec3], spacing: f32) -> Vec<f32> {
     let grid = PointGrid::new(points, spacing);
     let nearest = |i: usize| {

@@ -1,25 +1,25 @@
-//! Which Gaussians are neighbours along the surface.
+//! Neighbours of Gaussians along the surface.
 
 use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::{SurfaceGaussians, Template};
 
-/// Nearest neighbours that each Gaussian links to; links count in both directions.
+/// Nearest neighbours that each Gaussian links to; links go both ways.
 const LINKS: usize = 8;
 
-/// Reach of a link in mean spacings. Evenly spaced points have several neighbours within it.
+/// Longest link, in mean spacings. Evenly spaced points have several neighbours within it.
 const REACH_SPACINGS: f32 = 2.5;
 
-/// Undirected weighted links in compressed rows: of `i` they are `links[starts[i]..starts[i + 1]]`.
+/// Undirected weighted links in compressed rows; those of `i` are `links[starts[i]..starts[i + 1]]`.
 pub(crate) struct SurfaceLinks {
     starts: Vec<u32>,
     links: Vec<(u32, f32)>,
 }
 
 impl SurfaceLinks {
-    /// Links each Gaussian to the nearest ones that the mesh reaches without leaving their neighbourhood: lips,
-    /// toes or thighs that touch stay apart, because the way around along the mesh is longer.
+    /// Links each Gaussian to the nearest ones that the mesh reaches within their neighbourhood. Lips, toes or thighs that touch are
+    /// not linked, because the path along the mesh is longer.
     pub fn new(template: &Template, gaussians: &SurfaceGaussians) -> Self {
         let mesh = MeshNeighborhoods::new(template);
         let reach = REACH_SPACINGS * (mesh.area / gaussians.len() as f32).sqrt();
@@ -60,7 +60,7 @@ impl SurfaceLinks {
         Self { starts, links }
     }
 
-    /// Neighbours of one Gaussian with their distances, metres.
+    /// Returns the neighbours of one Gaussian with their distances, metres.
     pub fn of(&self, gaussian: usize) -> &[(u32, f32)] {
         &self.links[self.starts[gaussian] as usize..self.starts[gaussian + 1] as usize]
     }
@@ -81,7 +81,7 @@ fn nearest_of(gaussians: &SurfaceGaussians, i: u32, near: &[u32], reach: f32) ->
     list
 }
 
-/// Triangles and who shares a corner with whom.
+/// Triangles of a mesh and their neighbours over shared corners.
 struct MeshNeighborhoods {
     /// Position class of each corner.
     corners: Vec<[u32; 3]>,
@@ -127,7 +127,7 @@ impl MeshNeighborhoods {
         Self { corners, fan_starts, fans, centre, radius, area }
     }
 
-    /// Triangles that can be reached from one over shared corners without leaving the ball of `reach` around it.
+    /// Returns the triangles connected to one over shared corners within the ball of `reach` around it.
     fn around(&self, triangle: usize, reach: f32) -> Vec<u32> {
         let mut found = vec![triangle as u32];
         let mut seen = std::collections::HashSet::from([triangle as u32]);

@@ -1,21 +1,29 @@
-//! A body at rest: mesh, skin and skeleton.
+//! Body at rest: mesh, skin and skeleton.
 
 use glam::{Vec2, Vec3};
 
 use crate::{BodyError, Skeleton};
 
-/// Which joints move a point, the strongest four; the weights add up to 1.
+/// The four strongest joints that move a point; their weights add up to 1.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SkinWeights {
     /// Joint indices; 0 where the weight is 0.
     pub joints: [u16; 4],
-    /// Weights in falling order.
+    /// Weights in descending order.
     pub weights: [f32; 4],
 }
 
 impl SkinWeights {
-    /// The four strongest of any number of (joint, weight) pairs, scaled to the sum 1; repeated joints are added
-    /// up. None when no weight is positive and finite.
+    /// Selects the four strongest of any number of (joint, weight) pairs and scales them to the sum 1; repeated joints are added up.
+    /// `None` when no weight is positive and finite.
+    ///
+    /// ```
+    /// use flyrig_body::SkinWeights;
+    ///
+    /// let skin = SkinWeights::strongest(&[(3, 0.2), (7, 0.5), (3, 0.3)]).unwrap();
+    /// assert_eq!((skin.joints, skin.weights), ([3, 7, 0, 0], [0.5, 0.5, 0.0, 0.0]));
+    /// assert!(SkinWeights::strongest(&[(3, f32::NAN)]).is_none());
+    /// ```
     #[must_use]
     pub fn strongest(influences: &[(u16, f32)]) -> Option<Self> {
         let mut merged: Vec<(u16, f32)> = Vec::with_capacity(influences.len());
@@ -37,7 +45,7 @@ impl SkinWeights {
     }
 }
 
-/// Coarse part of the body, from the joint that moves a point most.
+/// Coarse part of the body, by the joint that moves a point most.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Part {
     /// Head and neck.
@@ -63,7 +71,7 @@ pub enum Part {
 }
 
 impl Part {
-    /// Every part, in the order that shipped networks know them in.
+    /// All parts, in the order of the shipped networks' outputs.
     pub const ALL: [Self; 10] = [
         Self::Head,
         Self::Torso,
@@ -78,11 +86,10 @@ impl Part {
     ];
 }
 
-/// A skinned human at rest. All vertex lists have the same length; vertices may be split at UV seams
-/// (see [`Template::welded`]).
+/// Skinned human at rest. All vertex lists have the same length; vertices may be split at UV seams ([`Template::welded`]).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Template {
-    /// Name for messages.
+    /// Name, for messages.
     pub name: String,
     /// Canonical positions (bind pose), metres, y up, facing +z.
     pub positions: Vec<Vec3>,
@@ -92,16 +99,31 @@ pub struct Template {
     pub uvs: Vec<Vec2>,
     /// Vertex indices, counter-clockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,
-    /// Per vertex.
+    /// Skin weights of each vertex.
     pub skin: Vec<SkinWeights>,
-    /// Per vertex.
+    /// Body part of each vertex.
     pub parts: Vec<Part>,
-    /// The joints that the skin speaks of.
+    /// Joints that the skin weights refer to.
     pub skeleton: Skeleton,
 }
 
 impl Template {
-    /// Area of the canonical surface, square metres; triangles whose corners do not exist count nothing.
+    /// Creates a body without vertices.
+    #[must_use]
+    pub fn empty(name: &str, skeleton: Skeleton) -> Self {
+        Self {
+            name: name.to_owned(),
+            positions: Vec::new(),
+            normals: Vec::new(),
+            uvs: Vec::new(),
+            triangles: Vec::new(),
+            skin: Vec::new(),
+            parts: Vec::new(),
+            skeleton,
+        }
+    }
+
+    /// Returns the area of the canonical surface, square metres; triangles with out-of-range indices are ignored.
     #[must_use]
     pub fn area_m2(&self) -> f64 {
         let area = |t: &[u32; 3]| {
@@ -111,10 +133,10 @@ impl Template {
         self.triangles.iter().filter_map(area).sum()
     }
 
-    /// Whether the lists agree, every index points at something and every number is finite.
+    /// Checks that the lists agree in length, all indices are in range and all numbers are finite.
     ///
     /// # Errors
-    /// [`BodyError::Mesh`] says what is wrong.
+    /// [`BodyError::Mesh`] names the fault.
     pub fn check(&self) -> Result<(), BodyError> {
         let fail = |message: &str| Err(BodyError::Mesh { name: self.name.clone(), message: message.to_owned() });
         let count = self.positions.len();
@@ -144,7 +166,7 @@ impl Template {
     /// Checks that poses of `other` are poses of this body: joints of the same names in the same order.
     ///
     /// # Errors
-    /// [`BodyError::Skeleton`] with both numbers, or the first name that differs.
+    /// [`BodyError::Skeleton`] with both numbers of joints, or the first name that differs.
     pub fn check_same_joints(&self, other: &Self) -> Result<(), BodyError> {
         let (own, others) = (self.skeleton.joints(), other.skeleton.joints());
         let differ = own.iter().zip(others).find(|(a, b)| a.name != b.name);

@@ -1,4 +1,4 @@
-//! From Gaussians back to the template's vertices.
+//! Means of Gaussians at the template's vertices.
 
 use glam::Vec3;
 
@@ -8,14 +8,14 @@ use crate::Template;
 #[derive(Debug)]
 pub struct VertexMeans {
     triangles: Vec<[u32; 3]>,
-    /// Triangle's corners and weights of each Gaussian.
+    /// Corners of the triangle and weights of each Gaussian.
     corners: Vec<([u32; 3], [f32; 3])>,
     vertices: usize,
 }
 
 impl VertexMeans {
-    /// Of Gaussians that hang on a template, one element each: triangle, and weights of its corners (sum 1). One on a triangle that does
-    /// not exist counts nothing.
+    /// Prepares the means for Gaussians on a template, one element each: triangle, and weights of its corners (sum 1). Gaussians on
+    /// triangles out of range are ignored.
     #[must_use]
     pub fn new(template: &Template, hung: impl IntoIterator<Item = (u32, [f32; 3])>) -> Self {
         let corner = |(triangle, weights): (u32, [f32; 3])| {
@@ -28,8 +28,8 @@ impl VertexMeans {
         }
     }
 
-    /// Returns the displacement of each vertex, in the unit of the Gaussians' own, whose fourth number is left alone. Vertices that no
-    /// Gaussian lies next to follow their neighbours; 0 where there are none.
+    /// Returns the displacement of each vertex, in the unit of `displacement`, whose fourth component is ignored. Vertices without a
+    /// Gaussian next to them follow their neighbours; 0 where there are none.
     #[must_use]
     pub fn of(&self, displacement: &[[f32; 4]]) -> Vec<Vec3> {
         let mut sums = vec![Vec3::ZERO.extend(0.0); self.vertices];
@@ -38,7 +38,7 @@ impl VertexMeans {
                 sums[corner as usize] += Vec3::new(d[0], d[1], d[2]).extend(1.0) * weight;
             }
         }
-        // A vertex that no Gaussian lies next to takes its neighbours' mean, from the rim of the hole inwards.
+        // A vertex without a Gaussian next to it takes its neighbours' mean, from the rim of the hole inwards.
         while sums.iter().any(|s| s.w <= 0.0) {
             let mut more = vec![Vec3::ZERO.extend(0.0); self.vertices];
             for triangle in &self.triangles {

@@ -1,4 +1,4 @@
-//! Retargeted feet stand where the source's stand.
+//! Retargeted feet stand where those of the source stand.
 #![allow(clippy::unwrap_used)]
 
 use std::fmt::Write;
@@ -12,7 +12,7 @@ const STRIDE_SECS: f64 = 1.2;
 const STEP: f64 = 9.0;
 const STANCE: f64 = 0.62;
 
-/// Phase in the stride, and the ankle's place along the way and above the floor, of a foot of the walker.
+/// Returns the phase in the stride of a foot of the walker, and its ankle's position along the path and above the floor.
 fn foot(secs: f64, right: bool) -> (f64, f64, f64) {
     let strides = secs / STRIDE_SECS + if right { 0.5 } else { 0.0 };
     let (index, phase) = (strides.floor(), strides.fract());
@@ -22,7 +22,7 @@ fn foot(secs: f64, right: bool) -> (f64, f64, f64) {
     (phase, planted + 2.0 * STEP * moved, 1.6 + 2.2 * (std::f64::consts::PI * swing).sin().powi(2))
 }
 
-/// Somebody in inches who walks along +z with flat feet that stand for the first 62 % of each stride.
+/// Returns a walk along +z, in inches, with flat feet that stand for the first 62 % of each stride.
 fn walker(secs: f64) -> MotionClip {
     let mut text = "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation\n".to_owned();
     for (side, x) in [("Left", 3.6), ("Right", -3.6)] {
@@ -59,7 +59,7 @@ fn walker(secs: f64) -> MotionClip {
     parse_bvh(&text, Path::new("walker.bvh")).unwrap().motion()
 }
 
-/// The farthest that a standing foot's joints move over the floor, and the deepest that its sole is below, metres.
+/// Returns the largest movement of a standing foot's joints over the floor, and the largest depth of its sole below it, metres.
 fn slide_and_depth(skeleton: &Skeleton, options: &RetargetOptions) -> (f64, f64) {
     let track = walker(4.0).retarget(skeleton, options).unwrap();
     let origins = skeleton.canonical_origins();

@@ -1,4 +1,4 @@
-//! The built-in body: whole, in metres, in any shape, with a skeleton that follows the shape.
+//! The built-in body is complete, in metres, in any shape, with a skeleton that follows the shape.
 // Helpers of tests may stop a test.
 #![allow(clippy::unwrap_used, clippy::panic)]
 

@@ -17,7 +17,7 @@ fn graph_of(template: &Template, gaussians: usize, nodes: usize) -> (SurfaceGaus
     (gaussians, graph)
 }
 
-/// What holds for every graph.
+/// Checks the invariants of any graph.
 fn check(gaussians: &SurfaceGaussians, graph: &DeformationGraph) {
     let nodes = graph.nodes.len() as u32;
     assert_eq!(graph.node_gaussian.len(), nodes as usize);
@@ -210,8 +210,8 @@ fn bad_input_is_refused() {
     assert!(refused(&foreign, 5, 0.001).contains("sample its surface again"));
 }
 
-/// Gaussians grow with the surface once that is much longer than at rest, and no rigid motion makes them grow. One that hangs on a single
-/// node, as far as the person stream can tell, has nothing to measure and keeps its size.
+/// Gaussians grow with the surface once that is much longer than at rest, and no rigid motion makes them grow. A Gaussian
+/// with one node of more than negligible weight has nothing to measure and keeps its size.
 #[test]
 fn gaussians_grow_with_a_surface_that_is_stretched() {
     const NODES: usize = 300;

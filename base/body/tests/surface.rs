@@ -7,7 +7,7 @@ mod common;
 use flyrig_body::{BodyError, ShapeParams, default_template, sample_surface};
 use glam::Vec3;
 
-/// Mean and coefficient of variation of the distance to the nearest other point, by a plain search.
+/// Returns mean and coefficient of variation of the distance to the nearest other point, by a plain search.
 fn nearest_statistics(points: &[Vec3]) -> (f64, f64) {
     let distances: Vec<f64> = points
         .iter()

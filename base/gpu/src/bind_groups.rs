@@ -1,21 +1,22 @@
-//! Bind groups by pipeline and bound buffer ranges.
+//! Cache of bind groups by pipeline and bound buffer ranges.
 
 use std::{
     collections::HashMap,
     sync::{Mutex, atomic::Ordering},
 };
 
+use flyrig_types::lock;
 use wgpu::{
     BindGroup, BindGroupDescriptor, BindGroupEntry, BindingResource, Buffer, BufferSize, ComputePipeline, Device,
 };
 
-use crate::objects::{Counters, lock};
+use crate::objects::Counters;
 
-/// Bind groups kept; one person before eight cameras needs about 350. Beyond, the less recently used half goes.
+/// Largest number of cached groups, beyond which the less recently used half is dropped. One person before eight cameras needs about 350.
 const MOST: usize = 4096;
 
-/// A pipeline and what is bound to it. Holds the objects themselves, so that no other object can have the same identity
-/// while the key is there.
+/// Pipeline and bound resources. Holds the objects themselves, so that no other object can get the same identity while the key
+/// exists.
 #[derive(Debug, PartialEq, Eq, Hash)]
 struct Key {
     pipeline: ComputePipeline,
@@ -34,8 +35,8 @@ struct Cache {
     uses: u64,
 }
 
-/// Cache of bind groups. A group is dropped with the first of its [`crate::StorageBuffer`]s: it keeps no memory alive that
-/// nobody else holds.
+/// Cache of bind groups. A group is dropped with the first of its [`crate::StorageBuffer`]s, so that it keeps no unused memory
+/// alive.
 #[derive(Debug, Default)]
 pub(crate) struct BindGroups(Mutex<Cache>);
 

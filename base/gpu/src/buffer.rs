@@ -10,21 +10,31 @@ use wgpu::{Buffer, BufferDescriptor, BufferUsages, CommandEncoder};
 
 use crate::{GpuContext, GpuError, shared::Shared};
 
-/// An array of `T` on the device, usable as storage, copy source and copy target, or in the processor's memory for a context
-/// whose kernels run there ([`GpuContext::on_processor`]). Clones share the array.
+/// Array of `T` on the device, usable as storage, copy source and copy target; or in the processor's memory for a context whose
+/// kernels run there ([`GpuContext::on_processor`]). Clones share the array.
+///
+/// ```no_run
+/// use flyrig_gpu::{AdapterChoice, GpuContext, StorageBuffer};
+///
+/// let gpu = GpuContext::new(&AdapterChoice::Best)?;
+/// let centers = StorageBuffer::from_slice(&gpu, "centres", &[[0.0f32; 4]; 100])?;
+/// centers.write(&gpu, &[[1.0, 2.0, 3.0, 0.0]]);
+/// assert_eq!(centers.read_first(&gpu, 1)?, [[1.0, 2.0, 3.0, 0.0]]);
+/// # Ok::<(), flyrig_gpu::GpuError>(())
+/// ```
 #[derive(Debug, Clone)]
 pub struct StorageBuffer<T> {
     owner: Arc<Owner>,
-    /// The content where the kernels run on the processor.
+    /// Elements, where the kernels run on the processor.
     content: Option<Arc<RwLock<Vec<T>>>>,
     len: usize,
     element: PhantomData<T>,
 }
 
-/// Size of the device's stand-in for an array in the processor's memory.
+/// Size of the device's stand-in for an array in the processor's memory, bytes.
 const STAND_IN_BYTES: u64 = 16;
 
-/// The buffer of all clones. The last one takes the bind groups along.
+/// Buffer of all clones; the last one dropped removes the bind groups.
 #[derive(Debug)]
 struct Owner {
     buffer: Buffer,
@@ -40,7 +50,7 @@ impl Drop for Owner {
 }
 
 impl<T: Pod> StorageBuffer<T> {
-    /// `len` zeroed elements (room for at least one, since empty buffers cannot be bound).
+    /// Creates `len` zeroed elements (room for at least one, since empty buffers cannot be bound).
     ///
     /// # Errors
     /// [`GpuError::TooLarge`] when the adapter cannot bind that many.
@@ -64,20 +74,20 @@ impl<T: Pod> StorageBuffer<T> {
         Ok(Self { owner, content, len, element: PhantomData })
     }
 
-    /// The elements, while nobody changes them; None for an array on the device.
+    /// Locks the elements for reading; `None` for an array on the device.
     #[must_use]
     pub fn slice(&self) -> Option<RwLockReadGuard<'_, Vec<T>>> {
         self.content.as_ref().map(|content| content.read().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// The elements, to change them; None for an array on the device. Waits while somebody else holds the elements: one thread
-    /// at a time records the kernels of an array.
+    /// Locks the elements for writing; `None` for an array on the device. Waits for other holders: one thread at a time records the
+    /// kernels of an array.
     #[must_use]
     pub fn slice_mut(&self) -> Option<RwLockWriteGuard<'_, Vec<T>>> {
         self.content.as_ref().map(|content| content.write().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// A buffer with the given content.
+    /// Creates a buffer with the given content.
     ///
     /// # Errors
     /// As [`Self::zeroed`].
@@ -87,7 +97,7 @@ impl<T: Pod> StorageBuffer<T> {
         Ok(buffer)
     }
 
-    /// Queues a copy of the first elements (extra ones are ignored).
+    /// Queues a write of the first elements (extra ones are ignored).
     pub fn write(&self, gpu: &GpuContext, content: &[T]) {
         let count = content.len().min(self.len);
         if let Some(mut elements) = self.slice_mut() {
@@ -99,8 +109,8 @@ impl<T: Pod> StorageBuffer<T> {
         }
     }
 
-    /// Records a copy of the first elements (extra ones are ignored): the commands recorded before see the old content,
-    /// those after it the new one. Creates no buffer in the long run. Elements of a multiple of 4 bytes only.
+    /// Records a write of the first elements (extra ones are ignored): commands recorded before see the old content, later ones the
+    /// new one. Reuses staging buffers. The size of an element must be a multiple of 4 bytes.
     pub fn encode_write(&self, gpu: &GpuContext, encoder: &mut CommandEncoder, content: &[T]) {
         let count = content.len().min(self.len);
         if self.content.is_some() {
@@ -112,8 +122,8 @@ impl<T: Pod> StorageBuffer<T> {
         }
     }
 
-    /// Queues a copy of little-endian bytes to the start of the buffer (extra ones are ignored). The bytes need no
-    /// alignment, their number must be a multiple of 4. Creates no buffer in the long run, for contents of one size.
+    /// Queues a write of little-endian bytes to the start of the buffer (extra ones are ignored). The bytes need no alignment; their
+    /// number must be a multiple of 4. Reuses staging buffers for contents of one size.
     pub fn write_bytes(&self, gpu: &GpuContext, bytes: &[u8]) {
         let count = bytes.len().min(self.len * size_of::<T>()) & !3;
         if let Some(mut elements) = self.slice_mut() {
@@ -132,14 +142,14 @@ impl<T: Pod> StorageBuffer<T> {
         }
     }
 
-    /// Queues a copy of the elements that both have room for.
+    /// Queues a copy of as many elements as both arrays have room for.
     pub fn copy_to(&self, gpu: &GpuContext, other: &Self) {
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         self.encode_copy(&mut encoder, other, 0);
         gpu.queue.submit([encoder.finish()]);
     }
 
-    /// Records a copy to the elements of another array from `first` on, as many as there is room for.
+    /// Records a copy to another array, from its element `first` on, of as many elements as there is room for.
     pub fn encode_copy(&self, encoder: &mut CommandEncoder, other: &Self, first: usize) {
         let count = self.len.min(other.len.saturating_sub(first));
         if let Some((from, to)) = self.content.as_ref().zip(other.content.as_ref()) {
@@ -162,19 +172,19 @@ impl<T: Pod> StorageBuffer<T> {
         }
     }
 
-    /// Elements.
+    /// Returns the number of elements.
     #[must_use]
     pub fn len(&self) -> usize {
         self.len
     }
 
-    /// Whether there are none.
+    /// Returns whether there are none.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// wgpu's buffer; a stand-in without content for an array in the processor's memory.
+    /// Returns wgpu's buffer; a stand-in without content for an array in the processor's memory.
     #[must_use]
     pub fn raw(&self) -> &Buffer {
         &self.owner.buffer
@@ -218,7 +228,7 @@ pub fn read_all<T: Pod>(gpu: &GpuContext, arrays: &[&StorageBuffer<T>]) -> Resul
 }
 
 impl StorageBuffer<u32> {
-    /// A buffer of little-endian words; up to three bytes at the end that fill none are left out.
+    /// Creates a buffer of little-endian words; up to three bytes at the end that fill no word are ignored.
     ///
     /// # Errors
     /// As [`Self::zeroed`].

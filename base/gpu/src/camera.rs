@@ -1,32 +1,32 @@
-//! The camera model of `flyrig-types` as a uniform, and its WGSL.
+//! Camera model of `flyrig-types` as constants of a kernel, and its WGSL.
 
 use bytemuck::{Pod, Zeroable};
 use flyrig_types::{Camera, Lens};
 use glam::{Mat2, Mat4, Vec2, Vec3, Vec4};
 
-/// WGSL: `struct Camera`, `fn project_point`, `fn distort`, `fn projection_jacobian`. Prepend it to a
-/// kernel that declares a `Camera` binding; it declares no bindings itself.
+/// WGSL of `struct Camera`, `fn project_point`, `fn distort` and `fn projection_jacobian`, for a kernel that declares a binding of type
+/// `Camera`; it declares no bindings itself.
 pub const CAMERA_WGSL: &str = include_str!("camera.wgsl");
 
-/// [`Camera`] for the GPU; layout of `struct Camera` in [`CAMERA_WGSL`] (std140, 144 bytes).
+/// [`Camera`] in the layout of `struct Camera` in [`CAMERA_WGSL`] (std140, 144 bytes).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub struct CameraConstants {
-    /// Columns of the homogeneous matrix.
+    /// Columns of the homogeneous matrix, camera axes from world axes.
     pub camera_from_world: [[f32; 4]; 4],
     /// Camera centre in the world, metres; w is unused.
     pub position: [f32; 4],
-    /// Pixels.
+    /// Focal lengths fx, fy, pixels.
     pub focal_px: [f32; 2],
-    /// Pixels, centres at integers.
+    /// Principal point, pixels; pixel centres lie at integers.
     pub center_px: [f32; 2],
-    /// Pixels.
+    /// Width and height, pixels.
     pub size: [u32; 2],
-    /// 0 radial-tangential or rational, 1 fisheye.
+    /// Lens model: 0 radial-tangential or rational, 1 fisheye.
     pub lens: u32,
-    /// See [`Lens::valid_radius`].
+    /// Radius of [`Lens::valid_radius`].
     pub valid_radius: f32,
-    /// k1 k2 k3 p1 p2 k4 k5 k6, or the fisheye's k1 to k4.
+    /// Coefficients k1 k2 k3 p1 p2 k4 k5 k6, or the fisheye's k1 to k4.
     pub coefficients: [f32; 8],
 }
 
@@ -55,18 +55,18 @@ impl From<&Camera> for CameraConstants {
     }
 }
 
-/// Distortion of a point of the ideal image plane.
+/// Distorted point of the image plane with its derivative.
 #[derive(Debug, Clone, Copy)]
 pub struct Distorted {
-    /// The distorted point.
+    /// Distorted point.
     pub point: Vec2,
-    /// Its derivative, columns d/dx and d/dy.
+    /// Derivative by the ideal point: columns d/dx and d/dy.
     pub jacobian: Mat2,
 }
 
-/// The functions of [`CAMERA_WGSL`] for kernels on the processor, step by step the same.
+/// Functions of [`CAMERA_WGSL`] for kernels on the processor, with the same operations.
 impl CameraConstants {
-    /// World to camera axes (x right, y down, z forward), metres.
+    /// Transforms a world point to camera axes (x right, y down, z forward), metres.
     #[must_use]
     #[inline(always)]
     pub fn to_camera(&self, world: Vec3) -> Vec3 {
@@ -118,15 +118,15 @@ impl CameraConstants {
         Distorted { point: ideal * scale, jacobian }
     }
 
-    /// Pixel of a point in camera axes. None within `near` of the camera's plane or behind it, farther than 1e9 m, beyond the
-    /// lens's valid radius, or for what is no number.
+    /// Projects a point in camera axes to a pixel. `None` closer than `near` to the camera's plane or behind it, farther than 1e9 m,
+    /// beyond the lens's valid radius, and for NaN.
     #[must_use]
     #[inline(always)]
     pub fn project(&self, in_camera: Vec3, near: f32) -> Option<Vec2> {
         self.project_with_jacobian(in_camera, near).map(|(pixel, _)| pixel)
     }
 
-    /// As [`Self::project`], with [`Self::projection_jacobian`].
+    /// Projects as [`Self::project`] does and returns the [`Self::projection_jacobian`] as well.
     #[must_use]
     #[inline(always)]
     pub fn project_with_jacobian(&self, in_camera: Vec3, near: f32) -> Option<(Vec2, [Vec2; 3])> {
@@ -142,7 +142,7 @@ impl CameraConstants {
         })
     }
 
-    /// Derivative of the pixel by the point in camera axes (z > 0): columns d/dx, d/dy, d/dz.
+    /// Returns the derivative of the pixel by the point in camera axes (z > 0): columns d/dx, d/dy, d/dz.
     #[must_use]
     #[inline(always)]
     pub fn projection_jacobian(&self, in_camera: Vec3) -> [Vec2; 3] {
@@ -158,7 +158,7 @@ impl CameraConstants {
         [dx, dy, -(ideal.x * dx + ideal.y * dy)]
     }
 
-    /// Camera centre in the world, metres.
+    /// Returns the camera's centre in the world, metres.
     #[must_use]
     #[inline(always)]
     pub fn center(&self) -> Vec3 {

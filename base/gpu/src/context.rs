@@ -1,4 +1,4 @@
-//! Finding an adapter and opening a device.
+//! Choice of an adapter and opening of a device.
 
 use std::sync::Arc;
 
@@ -6,17 +6,17 @@ use wgpu::{Adapter, AdapterInfo, Backends, Device, DeviceType, Features, Instanc
 
 use crate::{GpuError, GpuObjects, shared::Shared};
 
-/// Which adapter to open.
+/// Adapter to open.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum AdapterChoice {
-    /// The fastest kind there is: discrete, integrated, virtual, then software.
+    /// Adapter of the fastest available kind: discrete, integrated, virtual, then software.
     #[default]
     Best,
-    /// The first whose name contains this text, ignoring case.
+    /// First adapter whose name contains this text, ignoring case.
     Named(String),
 }
 
-/// An open device with its queue. Clones share both.
+/// Open device with its queue. Clones share both.
 #[derive(Debug, Clone)]
 pub struct GpuContext {
     /// wgpu's device.
@@ -35,7 +35,7 @@ impl GpuContext {
     /// Opens the chosen adapter.
     ///
     /// # Errors
-    /// [`GpuError`] says what is missing and what to install.
+    /// [`GpuError`] names what is missing and what to install.
     pub fn new(choice: &AdapterChoice) -> Result<Self, GpuError> {
         pollster::block_on(Self::open(choice))
     }
@@ -93,7 +93,7 @@ impl GpuContext {
         Ok(Self { device, queue, instance, adapter, info, choice, on_processor: false, shared })
     }
 
-    /// Opens the same choice of adapter once more, for a device that is lost. Nothing is shared with this one.
+    /// Opens the chosen adapter again, after the loss of a device. The new context shares nothing with this one.
     ///
     /// # Errors
     /// As [`Self::new`].
@@ -101,29 +101,29 @@ impl GpuContext {
         Ok(Self { on_processor: self.on_processor, ..Self::new(&self.choice)? })
     }
 
-    /// The same context for kernels that run natively on the processor: arrays made with it lie in the processor's memory
-    /// ([`StorageBuffer::slice`](crate::StorageBuffer::slice)), and kernels made with it compute when they are recorded.
-    /// Kernels and arrays of the two sorts do not mix.
+    /// Returns this context for kernels that run natively on the processor: its arrays lie in the processor's memory
+    /// ([`StorageBuffer::slice`](crate::StorageBuffer::slice)), and its kernels compute when they are recorded. Kernels and arrays of
+    /// the two kinds do not mix.
     #[must_use]
     pub fn on_processor(&self) -> Self {
         Self { on_processor: true, ..self.clone() }
     }
 
-    /// Whether kernels run natively on the processor.
+    /// Returns whether kernels run natively on the processor.
     #[must_use]
     pub fn is_on_processor(&self) -> bool {
         self.on_processor
     }
 
-    /// The same context with the kernels where they run fastest: [`Self::on_processor`] where the adapter is a processor in
-    /// disguise and nobody asked for it by its name, else on the adapter.
+    /// Returns this context with kernels where they run fastest: [`Self::on_processor`] for a software adapter that was not chosen by
+    /// name, else on the adapter.
     #[must_use]
     pub fn fastest(&self) -> Self {
         let is_named = matches!(self.choice, AdapterChoice::Named(_));
         if self.is_software() && !is_named { self.on_processor() } else { self.clone() }
     }
 
-    /// Fails when the device was lost, ran out of memory or rejected a command.
+    /// Checks that the device was not lost, did not run out of memory and rejected no command.
     ///
     /// # Errors
     /// The first fault since the device was opened.
@@ -131,18 +131,18 @@ impl GpuContext {
         self.shared.fault.check()
     }
 
-    /// Destroys the device, as a driver's reset would. For tests of what follows.
+    /// Destroys the device, as a driver's reset would; for tests of the recovery.
     pub fn simulate_loss(&self) {
         self.device.destroy();
     }
 
-    /// Counts the GPU objects created so far.
+    /// Returns the numbers of GPU objects created so far.
     #[must_use]
     pub fn objects(&self) -> GpuObjects {
         self.shared.objects()
     }
 
-    /// Name, backend and driver of the adapter, for reports.
+    /// Returns name, backend and driver of the adapter, for reports.
     #[must_use]
     pub fn adapter_name(&self) -> String {
         if self.on_processor {
@@ -152,13 +152,13 @@ impl GpuContext {
         format!("{} ({}, {})", self.info.name, self.info.backend, self.info.driver_info)
     }
 
-    /// What the device was opened on, for libraries that share it.
+    /// Returns instance and adapter of the device, for libraries that share it.
     #[must_use]
     pub fn handles(&self) -> (&Instance, &Adapter) {
         (&self.instance, &self.adapter)
     }
 
-    /// Whether the adapter is a CPU in disguise.
+    /// Returns whether the adapter is implemented in software.
     #[must_use]
     pub fn is_software(&self) -> bool {
         self.info.device_type == DeviceType::Cpu
@@ -179,7 +179,7 @@ impl GpuContext {
     }
 }
 
-/// Every adapter, the fastest kind first.
+/// Lists all adapters, the fastest kind first.
 async fn adapters() -> (Instance, Vec<Adapter>) {
     let instance = Instance::new(InstanceDescriptor {
         backends: Backends::VULKAN | Backends::METAL | Backends::DX12,
@@ -190,7 +190,7 @@ async fn adapters() -> (Instance, Vec<Adapter>) {
     (instance, adapters)
 }
 
-/// Name, backend, driver and kind of every adapter, in the order of [`AdapterChoice::Best`].
+/// Returns name, backend, driver and kind of each adapter, in the order of [`AdapterChoice::Best`].
 #[must_use]
 pub fn adapter_names() -> Vec<String> {
     let name = |adapter: Adapter| {

@@ -1,57 +1,57 @@
 //! Errors of the graphics device.
 
-/// Why there is no GPU to work with, or what it refused.
+/// Error of opening or using a graphics device.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum GpuError {
-    /// No adapter at all.
+    /// There is no adapter.
     #[error(
         "no graphics adapter found. Install a Vulkan driver: the GPU maker's, or Mesa's software one with \
          `apt-get install mesa-vulkan-drivers libvulkan1`, then try again"
     )]
     NoAdapter,
-    /// None of that name.
+    /// There is no adapter of that name.
     #[error("no graphics adapter has '{wanted}' in its name; there are: {found}")]
     NoSuchAdapter {
-        /// The name asked for.
+        /// Requested name.
         wanted: String,
-        /// Names found, comma separated.
+        /// Names of the adapters, separated by commas.
         found: String,
     },
-    /// The adapter cannot do what we need.
+    /// A limit of the adapter is too low.
     #[error(
         "adapter {adapter}: {limit} is {found}, flyrig needs {needed}; choose another adapter or update its driver"
     )]
     Limit {
-        /// Which adapter.
+        /// Name of the adapter.
         adapter: String,
-        /// Which limit.
+        /// Name of the limit.
         limit: &'static str,
-        /// What it offers.
+        /// Value of the adapter.
         found: u64,
-        /// What we need.
+        /// Required value.
         needed: u64,
     },
     /// The driver did not open the device.
     #[error("adapter {adapter} did not open: {source}")]
     Open {
-        /// Which adapter.
+        /// Name of the adapter.
         adapter: String,
-        /// The driver's word.
+        /// Error of the driver.
         source: wgpu::RequestDeviceError,
     },
-    /// Too large for one buffer.
+    /// Content is too large for one buffer.
     #[error(
         "{what} needs {needed} bytes, more than the {limit} bytes one buffer may have on this adapter; use fewer Gaussians, pixels or views"
     )]
     TooLarge {
-        /// What was to be stored.
+        /// Content.
         what: String,
-        /// Bytes.
+        /// Required bytes.
         needed: u64,
-        /// Bytes.
+        /// Bytes that one buffer may have.
         limit: u64,
     },
-    /// Device lost or a wait failed.
+    /// The device was lost or a wait failed.
     #[error("the graphics device is lost ({0}); check the driver's log when it happens again")]
     Lost(String),
     /// The device's memory is full.
@@ -59,13 +59,13 @@ pub enum GpuError {
         "the graphics device is out of memory; end other programs that use it, or use fewer Gaussians, views or people"
     )]
     OutOfMemory,
-    /// The device rejected a command: a mistake of ours or of the driver.
+    /// The device rejected a command: a bug in this program or the driver.
     #[error("the graphics device rejected a command ({0}); please report it with the adapter's name")]
     Rejected(String),
 }
 
 impl GpuError {
-    /// Whether the device can no longer be relied on, so that everything on it must be rebuilt.
+    /// Returns whether the device is unusable, so that everything on it must be rebuilt.
     #[must_use]
     pub fn is_device_fault(&self) -> bool {
         matches!(self, Self::Lost(_) | Self::OutOfMemory | Self::Rejected(_))

@@ -1,11 +1,8 @@
-//! Numbers of GPU objects, and the lock that the caches of them share.
+//! Counts of created GPU objects.
 
-use std::sync::{
-    Mutex, MutexGuard, PoisonError,
-    atomic::{AtomicU64, Ordering},
-};
+use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Numbers of GPU objects that were created since the device was opened.
+/// Numbers of GPU objects created since the device was opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct GpuObjects {
     /// Compiled compute pipelines.
@@ -20,7 +17,7 @@ pub struct GpuObjects {
     pub bind_groups: u64,
 }
 
-/// [`GpuObjects`] while they are counted.
+/// Counters of [`GpuObjects`].
 #[derive(Debug, Default)]
 pub(crate) struct Counters {
     pub pipelines: AtomicU64,
@@ -43,9 +40,4 @@ impl Counters {
             bind_groups: get(bind_groups),
         }
     }
-}
-
-/// Locks a mutex, even a poisoned one: the values behind these locks are consistent at every step.
-pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

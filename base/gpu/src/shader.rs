@@ -1,13 +1,13 @@
-//! Compute kernels with fewer words.
+//! Compute kernels with derived layouts.
 
 use wgpu::{BindGroup, BindingResource, ComputePipeline};
 
 use crate::GpuContext;
 
-/// wgpu's promise on every adapter.
+/// Largest number of workgroups per dimension, which wgpu guarantees on all adapters.
 pub const MAX_WORKGROUPS_PER_DIMENSION: u32 = 65_535;
 
-/// A compute pipeline whose layout is derived from its WGSL; all bindings stand in group 0.
+/// Compute pipeline whose layout is derived from its WGSL; all bindings are in group 0.
 #[derive(Debug)]
 pub struct ComputeKernel {
     /// wgpu's pipeline.
@@ -15,8 +15,8 @@ pub struct ComputeKernel {
 }
 
 impl ComputeKernel {
-    /// Compiles `entry` of the concatenated `sources`, or returns the pipeline that this device has compiled from them
-    /// before. A mistake in our own WGSL reaches wgpu's error handler; the naga test of each crate catches it before.
+    /// Compiles `entry` of the concatenated `sources`, or returns the pipeline that this device has already compiled from them. Errors in
+    /// the WGSL reach wgpu's error handler; each crate's naga test finds them earlier.
     #[must_use]
     pub fn new(gpu: &GpuContext, label: &str, sources: &[&str], entry: &str) -> Self {
         let compile = |source: &str| Self::compile(gpu, label, source, entry);
@@ -38,29 +38,37 @@ impl ComputeKernel {
         })
     }
 
-    /// Returns bind group 0 with the resources at bindings 0, 1, 2, ...; the one of an earlier call with the same resources
-    /// where there is one.
+    /// Returns bind group 0 with the resources at bindings 0, 1, 2, ...; from the cache where an earlier call had the same resources.
     #[must_use]
     pub fn bind(&self, gpu: &GpuContext, resources: &[BindingResource<'_>]) -> BindGroup {
         bind(gpu, &self.pipeline, resources)
     }
 
-    /// As [`Self::bind`], with the number of each binding. A kernel's layout has only the bindings that its entry point uses.
+    /// Returns a group as [`Self::bind`] does, with explicit binding numbers. A kernel's layout has only the bindings that its entry point
+    /// uses.
     #[must_use]
     pub fn bind_at(&self, gpu: &GpuContext, resources: &[(u32, BindingResource<'_>)]) -> BindGroup {
         gpu.shared.bind_groups.get(&gpu.device, &gpu.shared.counters, &self.pipeline, resources)
     }
 }
 
-/// As [`ComputeKernel::bind`], for any pipeline with derived layout.
+/// Returns a group as [`ComputeKernel::bind`] does, for any pipeline with derived layout.
 #[must_use]
 pub fn bind(gpu: &GpuContext, pipeline: &ComputePipeline, resources: &[BindingResource<'_>]) -> BindGroup {
     let numbered: Vec<_> = (0..).zip(resources.iter().cloned()).collect();
     gpu.shared.bind_groups.get(&gpu.device, &gpu.shared.counters, pipeline, &numbered)
 }
 
-/// Workgroup counts (x, y) for `items` at `group_size` a workgroup. The kernel's linear workgroup index is
+/// Returns workgroup counts (x, y) for `items` at `group_size` per workgroup. The kernel's linear workgroup index is
 /// `workgroup_id.y * num_workgroups.x + workgroup_id.x`, and it must check its item against the count.
+///
+/// ```
+/// use flyrig_gpu::dispatch_1d;
+///
+/// assert_eq!(dispatch_1d(100, 64), (2, 1));
+/// let (x, y) = dispatch_1d(1 << 24, 64);
+/// assert!(x <= 65_535 && u64::from(x) * u64::from(y) * 64 >= 1 << 24);
+/// ```
 #[must_use]
 pub fn dispatch_1d(items: u32, group_size: u32) -> (u32, u32) {
     let groups = items.div_ceil(group_size).max(1);

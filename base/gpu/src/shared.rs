@@ -1,25 +1,22 @@
-//! Shared by all clones of a [`crate::GpuContext`]: compiled pipelines, bind groups, staging buffers, and the device's first
-//! fault.
+//! State that all clones of a [`crate::GpuContext`] share: compiled pipelines, bind groups, staging buffers, and the device's
+//! first fault.
 
 use std::{
     collections::HashMap,
     sync::{Arc, Mutex, atomic::Ordering},
 };
 
+use flyrig_types::lock;
 use wgpu::{Buffer, BufferDescriptor, BufferUsages, ComputePipeline, Device};
 
 use crate::{
-    GpuError, GpuObjects,
-    bind_groups::BindGroups,
-    objects::{Counters, lock},
-    traffic::TrafficCounters,
-    uploads::Uploads,
+    GpuError, GpuObjects, bind_groups::BindGroups, objects::Counters, traffic::TrafficCounters, uploads::Uploads,
 };
 
-/// Read-back buffers kept for later reads; a frame uses a few sizes.
+/// Largest number of idle read-back buffers; a frame uses a few sizes.
 const IDLE_READ_BACKS: usize = 24;
 
-/// The device's first fault, written by wgpu's callbacks. It holds no wgpu object, which would keep the device alive.
+/// First fault of the device, written by wgpu's callbacks. Holds no wgpu object, which would keep the device alive.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct FaultSlot(Arc<Mutex<Option<GpuError>>>);
 
@@ -32,7 +29,7 @@ impl FaultSlot {
         }
     }
 
-    /// Registers the callbacks. Without them wgpu panics on the first error that nobody asked for.
+    /// Registers the callbacks. Without them wgpu panics on the first uncaught error.
     pub fn watch(&self, device: &Device) {
         let slot = self.clone();
         device.set_device_lost_callback(move |reason, message| {
@@ -49,13 +46,13 @@ impl FaultSlot {
         }));
     }
 
-    /// The first fault, if there was one.
+    /// Returns the first fault as an error, if there was one.
     pub fn check(&self) -> Result<(), GpuError> {
         lock(&self.0).clone().map_or(Ok(()), Err)
     }
 }
 
-/// Longer messages of drivers end here, characters.
+/// Characters after which messages of drivers are cut.
 const LONGEST: usize = 300;
 
 fn first_line(message: &str) -> String {
@@ -67,9 +64,9 @@ fn first_line(message: &str) -> String {
 #[derive(Debug, Default)]
 pub(crate) struct Shared {
     pub fault: FaultSlot,
-    /// By WGSL and entry point.
+    /// Pipelines by WGSL and entry point.
     pipelines: Mutex<HashMap<(String, String), ComputePipeline>>,
-    /// Not mapped, of any size.
+    /// Idle read-back buffers of any size, not mapped.
     read_backs: Mutex<Vec<Buffer>>,
     pub uploads: Uploads,
     pub bind_groups: BindGroups,
@@ -95,7 +92,7 @@ impl Shared {
         lock(&self.pipelines).entry(key).or_insert(pipeline).clone()
     }
 
-    /// Takes a buffer to read `size` bytes back with, an idle one of that size where there is one.
+    /// Takes a buffer for reading `size` bytes back, an idle one of that size where there is one.
     pub fn take_read_back(&self, device: &Device, size: u64) -> Buffer {
         let idle = {
             let mut idle = lock(&self.read_backs);
@@ -113,7 +110,7 @@ impl Shared {
         })
     }
 
-    /// Gives an unmapped buffer back; the one that waited longest makes room.
+    /// Returns an unmapped buffer; the longest idle one makes room.
     pub fn give_read_back(&self, buffer: Buffer) {
         let mut idle = lock(&self.read_backs);
         if idle.len() >= IDLE_READ_BACKS {

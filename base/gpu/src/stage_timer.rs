@@ -1,4 +1,4 @@
-//! Run times of a frame's stages on the GPU without a wait.
+//! Run times of a frame's stages on the GPU, without waits.
 
 use std::{
     sync::{
@@ -15,32 +15,38 @@ use wgpu::{
 
 use crate::{GpuContext, StageTime};
 
-/// Frames whose timestamps may be under way at once; a frame beyond them is not measured.
+/// Frames whose timestamps may be pending at once; further frames are not measured.
 const FRAMES: usize = 4;
 
 const IDLE: u8 = 0;
 const UNDER_WAY: u8 = 1;
 const MAPPED: u8 = 2;
 
-/// Timestamps between the stages of a frame, collected when they have arrived: nobody waits for the GPU to know how long
-/// it took.
+/// Timestamps between the stages of a frame, collected after they have arrived, so that nothing waits for the GPU.
 ///
-/// ```ignore
-/// timer.begin(&mut encoder);                 // in the frame's first encoder
-/// timer.mark(&mut encoder, "skinning");      // after the stage's last command, in the same or a later encoder
+/// ```no_run
+/// # use flyrig_gpu::{AdapterChoice, GpuContext, StageTimer};
+/// # let gpu = GpuContext::new(&AdapterChoice::Best)?;
+/// let mut timer = StageTimer::new(&gpu, 2);
+/// let mut encoder = gpu.device.create_command_encoder(&Default::default());
+/// timer.begin(&mut encoder); // in the frame's first encoder
+/// timer.mark(&mut encoder, "skinning"); // after the stage's last command, in this or a later encoder
 /// timer.mark(&mut encoder, "appearance");
-/// timer.finish(&mut encoder);                // in the frame's last encoder, before it is submitted
+/// timer.finish(&mut encoder); // in the frame's last encoder, before it is submitted
 /// gpu.queue.submit([encoder.finish()]);
-/// for stage in timer.collect() { .. }        // frames whose timestamps arrived with an earlier wait or read-back
+/// for stage in timer.collect() {
+///     println!("{} {:?}", stage.name, stage.time); // frames whose timestamps arrived with an earlier wait or read-back
+/// }
+/// # Ok::<(), flyrig_gpu::GpuError>(())
 /// ```
 ///
-/// A stage lasts from the mark before it, or from the frame's begin, to its own mark; the GPU's pauses between submissions
-/// count. On an adapter without `TIMESTAMP_QUERY` nothing is measured ([`Self::is_supported`]).
+/// A stage lasts from the previous mark, or from the frame's begin, to its own mark, pauses of the GPU between submissions included.
+/// On an adapter without `TIMESTAMP_QUERY` nothing is measured ([`Self::is_supported`]).
 #[derive(Debug)]
 pub struct StageTimer {
-    /// Empty where the adapter has no timestamps.
+    /// Pending and idle frames; empty where the adapter has no timestamps.
     frames: Vec<Frame>,
-    /// Index of the frame that is being recorded.
+    /// Index of the frame being recorded.
     recorded: Option<usize>,
     marks: u32,
     period_nanos: f64,
@@ -51,16 +57,16 @@ struct Frame {
     queries: QuerySet,
     resolved: Buffer,
     read_back: Buffer,
-    /// Of its marks, after the begin.
+    /// Names of the frame's marks.
     names: Vec<&'static str>,
     state: Arc<AtomicU8>,
-    /// Order of the frames.
+    /// Sequence number of the frame.
     number: u64,
 }
 
 impl StageTimer {
-    /// Room for `stages` marks a frame; more are not measured. Nothing is where kernels run on the processor: its own clock
-    /// measures them.
+    /// Creates a timer for `stages` marks per frame; further marks are not measured. Measures nothing where kernels run on the
+    /// processor, whose own clock serves.
     #[must_use]
     pub fn new(gpu: &GpuContext, stages: u32) -> Self {
         let marks = stages + 1;
@@ -95,13 +101,13 @@ impl StageTimer {
         }
     }
 
-    /// Whether the adapter can measure.
+    /// Returns whether the adapter has timestamps.
     #[must_use]
     pub fn is_supported(&self) -> bool {
         !self.frames.is_empty()
     }
 
-    /// Records the begin of a frame. One that was begun and not finished is given up.
+    /// Records the begin of a frame. An unfinished frame is discarded.
     pub fn begin(&mut self, encoder: &mut CommandEncoder) {
         let number = self.frames.iter().map(|frame| frame.number).max().unwrap_or(0) + 1;
         self.recorded = self.frames.iter().position(|frame| frame.state.load(Ordering::Acquire) == IDLE);
@@ -123,8 +129,8 @@ impl StageTimer {
         }
     }
 
-    /// Records that the frame's timestamps are read back when `encoder` has been executed. A frame whose encoder is dropped
-    /// is not measured.
+    /// Records the read-back of the frame's timestamps, which takes place once `encoder` was executed. A frame whose encoder is
+    /// dropped is not measured.
     pub fn finish(&mut self, encoder: &mut CommandEncoder) {
         let Some(frame) = self.recorded.take().and_then(|index| self.frames.get_mut(index)) else { return };
         let count = frame.names.len() as u32 + 1;
@@ -139,8 +145,8 @@ impl StageTimer {
         });
     }
 
-    /// Returns the stages of the frames that have arrived since the last call, oldest frame first. Never waits: what is
-    /// still under way comes with a later call, after any wait or read-back on this device.
+    /// Returns the stages of the frames that have arrived since the last call, oldest frame first. Never waits: pending frames follow
+    /// with a later call, after any wait or read-back on this device.
     pub fn collect(&mut self) -> Vec<StageTime> {
         let mut arrived: Vec<&mut Frame> =
             self.frames.iter_mut().filter(|frame| frame.state.load(Ordering::Acquire) == MAPPED).collect();
@@ -162,7 +168,7 @@ impl StageTimer {
     }
 }
 
-/// The callback of a frame under way. Dropped without success, it makes the frame idle.
+/// Callback of a pending frame. Dropped without success, it makes the frame idle.
 #[derive(Debug)]
 struct Arrival(Arc<AtomicU8>);
 
@@ -172,8 +178,7 @@ impl Drop for Arrival {
     }
 }
 
-/// Writes a timestamp when everything recorded before is done. A pass without a dispatch needs no feature beyond
-/// `TIMESTAMP_QUERY`.
+/// Records a timestamp after all earlier commands, by a pass without a dispatch, which needs no feature beyond `TIMESTAMP_QUERY`.
 fn stamp(encoder: &mut CommandEncoder, queries: &QuerySet, index: u32) {
     let timestamp_writes = ComputePassTimestampWrites {
         query_set: queries,

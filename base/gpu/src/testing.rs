@@ -1,8 +1,8 @@
-//! Helpers of this and other crates' tests.
+//! Helpers for the tests of this and other crates.
 
 use crate::{AdapterChoice, GpuContext};
 
-/// Opens the best adapter by its name: sessions run their kernels on it even where it is a processor in disguise.
+/// Opens the best adapter by its name, so that sessions run their kernels on it even where it is implemented in software.
 ///
 /// # Panics
 /// Without an adapter.

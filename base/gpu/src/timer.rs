@@ -1,4 +1,4 @@
-//! Where the GPU's time goes.
+//! Run times of compute passes on the GPU.
 
 use std::time::Duration;
 
@@ -8,16 +8,16 @@ use wgpu::{
 
 use crate::{GpuContext, GpuError, read_back};
 
-/// Time of one named stage.
+/// Run time of one named stage.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StageTime {
     /// Name given to [`GpuTimer::stage`].
     pub name: &'static str,
-    /// Between the begin and the end of its pass.
+    /// Time from begin to end.
     pub time: Duration,
 }
 
-/// Timestamp queries around compute passes. Without the adapter's support it measures nothing.
+/// Timestamp queries around compute passes. Measures nothing on an adapter without them.
 #[derive(Debug)]
 pub struct GpuTimer {
     queries: Option<(QuerySet, Buffer)>,
@@ -27,7 +27,7 @@ pub struct GpuTimer {
 }
 
 impl GpuTimer {
-    /// Room for `capacity` stages a frame.
+    /// Creates a timer for `capacity` stages per frame.
     #[must_use]
     pub fn new(gpu: &GpuContext, capacity: u32) -> Self {
         let queries = gpu.device.features().contains(Features::TIMESTAMP_QUERY).then(|| {
@@ -47,7 +47,7 @@ impl GpuTimer {
         Self { queries, names: Vec::new(), capacity, period_nanos: gpu.queue.get_timestamp_period() }
     }
 
-    /// Timestamp writes for the next compute pass; stages beyond the capacity are not measured.
+    /// Returns the timestamp writes of the next compute pass; stages beyond the capacity are not measured.
     pub fn stage(&mut self, name: &'static str) -> Option<ComputePassTimestampWrites<'_>> {
         let index = self.names.len() as u32;
         let (set, _) = self.queries.as_ref()?;
@@ -62,7 +62,7 @@ impl GpuTimer {
         })
     }
 
-    /// Call after the last pass, before submitting.
+    /// Records the resolution of the timestamps, after the last pass and before the submission.
     pub fn resolve(&self, encoder: &mut CommandEncoder) {
         if let (Some((set, resolved)), true) = (&self.queries, !self.names.is_empty()) {
             encoder.resolve_query_set(set, 0..self.names.len() as u32 * 2, resolved, 0);

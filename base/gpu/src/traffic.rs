@@ -1,10 +1,10 @@
-//! Counts of the work given to the device, and of the data that goes to it and comes back.
+//! Counts of the device's work and of data transfers.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::GpuContext;
 
-/// Work given to the device, and data copied to it and back, since it was opened.
+/// Work and data transfers of the device since it was opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct GpuTraffic {
     /// Dispatches of compute kernels.
@@ -13,12 +13,12 @@ pub struct GpuTraffic {
     pub waits: u64,
     /// Bytes of arrays copied to the device.
     pub uploaded_bytes: u64,
-    /// Bytes read back from it.
+    /// Bytes read back from the device.
     pub read_bytes: u64,
 }
 
 impl GpuTraffic {
-    /// Returns what has been added since an earlier count.
+    /// Returns the difference from an earlier count.
     #[must_use]
     pub fn since(self, earlier: Self) -> Self {
         Self {
@@ -30,7 +30,7 @@ impl GpuTraffic {
     }
 }
 
-/// [`GpuTraffic`] while it is counted.
+/// Counters of [`GpuTraffic`].
 #[derive(Debug, Default)]
 pub(crate) struct TrafficCounters {
     dispatches: AtomicU64,
@@ -58,8 +58,8 @@ impl TrafficCounters {
 }
 
 impl GpuContext {
-    /// Returns the counts so far, of all clones of this context: a simulator that draws on the same device counts as well. All are 0
-    /// where kernels run on the processor.
+    /// Returns the counts so far of all clones of this context, a simulator on the same device included. All are 0 where kernels run on
+    /// the processor.
     #[must_use]
     pub fn traffic(&self) -> GpuTraffic {
         if self.is_on_processor() {
@@ -75,7 +75,7 @@ impl GpuContext {
         }
     }
 
-    /// Counts a dispatch for [`Self::traffic`].
+    /// Adds a dispatch to [`Self::traffic`].
     pub fn count_dispatch(&self) {
         self.shared.traffic.dispatch();
     }

@@ -1,27 +1,27 @@
-//! Buffers that carry constants and images from the processor into a command encoder.
+//! Staging buffers for constants and images that are uploaded within a command encoder.
 
 use std::sync::{Arc, Mutex, atomic::Ordering};
 
+use flyrig_types::lock;
 use wgpu::{Buffer, BufferDescriptor, BufferUsages, CommandEncoder, Device, MapMode};
 
-use crate::objects::{Counters, lock};
+use crate::objects::Counters;
 
-/// Sizes are multiples of this, bytes; the constants of most encodings fit one.
+/// Granularity of sizes, bytes; the constants of most encodings fit one step.
 const STEP: u64 = 2048;
-/// Bytes that are created together when no buffer is idle, in [`BATCHES`] buffers, so that the exact moment at which the GPU
-/// finishes does not decide whether a frame creates one.
+/// Bytes that are created together when no buffer is idle, in [`BATCHES`] buffers, so that whether a frame creates one does not depend
+/// on the exact moment at which the GPU finishes.
 const BATCH_BYTES: u64 = 1 << 20;
-/// Least and most buffers that are created together: images, and constants.
+/// Smallest and largest number of buffers that are created together: for images, and for constants.
 const BATCHES: [u64; 2] = [2, 16];
-/// Idle buffers kept.
+/// Largest number of idle buffers.
 const IDLE: usize = 256;
 
-/// Staging buffers that are mapped for writing whenever they are idle.
+/// Pool of staging buffers that are mapped for writing while idle.
 ///
-/// A buffer belongs to one encoder from [`Uploads::record`] until the GPU has executed that encoder: it is mapped again by
-/// the submission itself, and comes back when the mapping is granted. An encoder that is dropped drops its buffers. So
-/// neither the order of submissions nor the number of threads matters, and wgpu rejects a submission that reads a buffer
-/// which somebody can write.
+/// A buffer belongs to one encoder from [`Uploads::record`] until the GPU has executed that encoder: the submission itself maps it
+/// again, and it returns to the pool once the mapping is granted. A dropped encoder drops its buffers. Therefore neither the order of
+/// submissions nor the number of threads matters, and wgpu rejects a submission that reads a mapped buffer.
 #[derive(Debug, Default)]
 pub(crate) struct Uploads(Arc<Mutex<Vec<Buffer>>>);
 

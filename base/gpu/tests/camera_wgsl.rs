@@ -1,4 +1,4 @@
-//! The camera model in WGSL and on the processor against the f64 one.
+//! Camera model in WGSL and on the processor against the one in f64.
 
 use flyrig_gpu::{AdapterChoice, CAMERA_WGSL, CameraConstants, ComputeKernel, GpuContext, StorageBuffer, dispatch_1d};
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};

@@ -1,4 +1,4 @@
-//! A device that rejects a command or is out of memory says so; nothing panics.
+//! A device that rejects a command or is out of memory gives an error; nothing panics.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
 
 use std::process::Command;
@@ -17,7 +17,7 @@ fn a_rejected_command_is_a_fault_of_the_device() {
     assert!(gpu.reopen().unwrap().wait().is_ok());
 }
 
-/// Address space of the process that runs out of it, KiB: enough to open a software adapter.
+/// Address space of the process that exhausts it, KiB: enough to open a software adapter.
 const LIMIT_KIB: u32 = 6_000_000;
 
 #[test]

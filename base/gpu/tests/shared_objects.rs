@@ -1,10 +1,10 @@
-//! Constants that are uploaded within encoders, and bind groups that are used again.
+//! Uploads of constants within encoders, and reuse of bind groups.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking, in its helpers too
 
 use flyrig_gpu::{AdapterChoice, ComputeKernel, GpuContext, GpuTraffic, StorageBuffer, read_all};
 use wgpu::{Buffer, CommandEncoder};
 
-/// Writes `constants[1]` to the place `constants[0]`.
+/// Kernel that writes `constants[1]` to element `constants[0]`.
 const WGSL: &str = "
 @group(0) @binding(0) var<storage, read> constants: vec2<u32>;
 @group(0) @binding(1) var<storage, read_write> out: array<u32>;

@@ -1,4 +1,4 @@
-//! Stage times that nobody waits for.
+//! Stage times without waits.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking, in its helpers too
 
 use std::time::{Duration, Instant};

@@ -1,33 +1,46 @@
-//! Adam (Kingma and Ba 2015), with decay of the weights beside it (Loshchilov and Hutter 2019).
+//! Adam (Kingma and Ba 2015) with decoupled weight decay (Loshchilov and Hutter 2019).
 
 use rayon::prelude::*;
 
-/// Means of a parameter's derivatives and of their squares.
+/// Exponential means of a parameter's derivatives and of their squares.
 pub type Moments = [Vec<f32>; 2];
 
-/// Elements that one thread updates at once.
+/// Elements per task of a thread.
 const CHUNK: usize = 1 << 14;
 
 /// Settings of one step.
+///
+/// ```
+/// use flyrig_learn::AdamStep;
+///
+/// // Minimises (x - 3)².
+/// let (mut x, mut moments) = (vec![0.0f32], [vec![0.0], vec![0.0]]);
+/// for count in 1..=500 {
+///     let step = AdamStep { betas: [0.9, 0.99], count, rate: 0.05, decay: 0.0, scale: 1.0, share: 0.0 };
+///     let gradient = [2.0 * (x[0] - 3.0)];
+///     step.descend(&mut x, &mut moments, &gradient);
+/// }
+/// assert!((x[0] - 3.0).abs() < 0.05);
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamStep {
-    /// Exponential means.
+    /// Decay rates of the two exponential means.
     pub betas: [f32; 2],
     /// Number of this step, from 1.
     pub count: u64,
-    /// Rate.
+    /// Learning rate.
     pub rate: f32,
-    /// Share of a value that goes away in this step.
+    /// Fraction by which values decay in this step.
     pub decay: f32,
-    /// By which all derivatives are multiplied first.
+    /// Factor of all derivatives.
     pub scale: f32,
-    /// Share of the root mean square of the parameter's derivatives that is added in the denominator: with 0, numbers whose derivatives are
-    /// a hundredth of the usual ones move as far as any others, by noise.
+    /// Multiple of the root mean square of the parameter's derivatives that is added to the denominator. With 0, values whose derivatives
+    /// are a hundredth of the usual ones move as far as others, driven by noise.
     pub share: f32,
 }
 
 impl AdamStep {
-    /// Descends by one step.
+    /// Updates values and moments by one step along the gradient.
     pub fn descend(&self, values: &mut [f32], [mean, square]: &mut Moments, gradient: &[f32]) {
         let Self { betas, rate, decay, scale, .. } = *self;
         let count = i32::try_from(self.count).unwrap_or(i32::MAX);
@@ -48,7 +61,7 @@ impl AdamStep {
     }
 }
 
-/// Mean square over the numbers that ever had a derivative.
+/// Returns the mean square over the values that ever had a derivative.
 fn usual(square: &[f32]) -> f32 {
     let (sum, count) =
         square.iter().filter(|v| **v > 0.0).fold((0.0f64, 0u32), |(sum, n), v| (sum + f64::from(*v), n + 1));

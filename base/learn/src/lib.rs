@@ -1,6 +1,6 @@
-//! Gradient descent on networks, for learned appearance and avatars alike: parameters by name, their way into tensors and back, Adam.
+//! Gradient descent for networks and avatars: parameters by name, their conversion to tensors and back, Adam.
 //!
-//! A crate of its own because of the build time of `burn`: other crates use it through this one.
+//! A crate of its own because of the build time of `burn`, which other crates use through this one.
 
 mod adam;
 mod parameters;

@@ -1,23 +1,31 @@
-//! Numbers of networks: their start, and their way into tensors.
+//! Parameters of networks: initialisation, and conversion to tensors.
 
 use std::collections::BTreeMap;
 
 use burn_tensor::{Device, Gradients, Tensor, TensorData};
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
-/// One parameter.
+/// Values of one parameter.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameter {
-    /// Rows, columns and so on; their product is the number of values.
+    /// Shape: rows, columns and so on; their product is the number of values.
     pub shape: Vec<usize>,
-    /// Row by row.
+    /// Values, row by row.
     pub values: Vec<f32>,
 }
 
-/// Name, shape and spread at the start (0: all zero, negative: all one) of a parameter.
+/// Name, shape and initial standard deviation (0: all zero, negative: all one) of a parameter.
 pub type Start = (String, Vec<usize>, f32);
 
-/// Draws parameters, uniform with the wanted standard deviation. The same list and seed give the same numbers.
+/// Draws parameters from uniform distributions with the given standard deviations. Equal lists and seeds give equal values.
+///
+/// ```
+/// let list = || vec![("weight".to_owned(), vec![3, 2], 0.1), ("bias".to_owned(), vec![2], 0.0)];
+/// let parameters = flyrig_learn::drawn(list(), 7);
+/// assert_eq!(flyrig_learn::count(&parameters), 8);
+/// assert_eq!(parameters["bias"].values, [0.0, 0.0]);
+/// assert_eq!(parameters["weight"].values, flyrig_learn::drawn(list(), 7)["weight"].values);
+/// ```
 #[must_use]
 pub fn drawn(list: Vec<Start>, seed: u64) -> BTreeMap<String, Parameter> {
     let mut rng = SmallRng::seed_from_u64(seed);
@@ -32,13 +40,13 @@ pub fn drawn(list: Vec<Start>, seed: u64) -> BTreeMap<String, Parameter> {
         .collect()
 }
 
-/// Number of values in all parameters.
+/// Returns the number of values in all parameters.
 #[must_use]
 pub fn count(parameters: &BTreeMap<String, Parameter>) -> usize {
     parameters.values().map(|p| p.values.len()).sum()
 }
 
-/// Whether every value is finite.
+/// Returns whether all values are finite.
 #[must_use]
 pub fn is_finite(parameters: &BTreeMap<String, Parameter>) -> bool {
     parameters.values().all(|p| p.values.iter().all(|v| v.is_finite()))
@@ -51,7 +59,7 @@ pub struct Tensors {
 }
 
 impl Tensors {
-    /// Copies parameters to a device; `trained` ones take part in derivatives.
+    /// Copies parameters to a device; with `trained`, they take part in derivatives.
     #[must_use]
     pub fn new(parameters: &BTreeMap<String, Parameter>, device: &Device, trained: bool) -> Self {
         let tensor = |p: &Parameter| {
@@ -61,7 +69,7 @@ impl Tensors {
         Self { by_name: parameters.iter().map(|(name, p)| (name.clone(), tensor(p))).collect() }
     }
 
-    /// Returns the parameter in its shape. An unknown name, a mistake of the caller, gives zeros.
+    /// Returns a parameter in its shape; zeros for an unknown name, which is a bug of the caller.
     #[must_use]
     pub fn get<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
         match self
@@ -77,7 +85,7 @@ impl Tensors {
         }
     }
 
-    /// Adds dL/d parameters; those that took no part stay.
+    /// Adds dL/d parameters to `into`; parameters without a gradient keep theirs.
     pub fn add_gradients(&self, gradients: &Gradients, into: &mut BTreeMap<String, Vec<f32>>) {
         for (name, (flat, _)) in &self.by_name {
             let Some(gradient) = flat.grad(gradients) else { continue };
@@ -90,7 +98,7 @@ impl Tensors {
     }
 }
 
-/// The tensor's numbers in order.
+/// Returns the tensor's values in order.
 #[must_use]
 pub fn to_vec<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     // Tensors here are f32 on the CPU: the conversion cannot fail.

@@ -5,23 +5,23 @@ use nalgebra::{Matrix3, RowVector3, Vector3};
 
 use crate::motion::RigidMotion;
 
-/// Ratio of singular values below which the points count as collinear: the ratio of widths is its root.
+/// Ratio of singular values below which points are collinear; the ratio of widths is its root.
 const LEAST_RATIO: f64 = 1e-12;
-/// Spread of the points over the size of their coordinates below which they count as coincident.
+/// Spread of points over the size of their coordinates below which they are coincident.
 const LEAST_SPREAD: f64 = 1e-12;
 
-/// A point before and after the motion.
+/// Point before and after the motion.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointPair {
-    /// Before.
+    /// Point before the motion.
     pub from: DVec3,
-    /// After.
+    /// Point after the motion.
     pub to: DVec3,
-    /// Importance of the squared distance; pairs of weight 0 are left out.
+    /// Weight of the squared distance; pairs of weight 0 are ignored.
     pub weight: f64,
 }
 
-/// The motion that brings one point set onto another, about the sets' centroids.
+/// Motion that aligns one point set with another, about the sets' centroids.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Alignment {
     /// Unit quaternion.
@@ -35,13 +35,13 @@ pub struct Alignment {
 }
 
 impl Alignment {
-    /// Moves a point.
+    /// Transforms a point.
     #[must_use]
     pub fn apply(&self, point: DVec3) -> DVec3 {
         self.to_centroid + self.rotation * ((point - self.from_centroid) * self.scale)
     }
 
-    /// Returns the motion after which the scale is applied to `from`: `apply(x) == motion.apply(scale * x)`.
+    /// Returns the rigid motion that follows the scaling: `apply(x) == motion.apply(scale * x)`.
     #[must_use]
     pub fn motion(&self) -> RigidMotion {
         let translation = self.to_centroid - self.rotation * (self.from_centroid * self.scale);
@@ -51,9 +51,22 @@ impl Alignment {
 
 /// Returns the rotation and translation with the least weighted sum of squared distances.
 ///
-/// `None` when they are not determined: fewer than three pairs of positive weight, coincident or collinear points, a set
-/// and a mirror image of it whose best rotation is ambiguous; and when a point or weight is not finite or a weight is
-/// negative. Mirrored sets otherwise get the best proper rotation.
+/// ```
+/// use flyrig_solve::{PointPair, align_rigid};
+/// use glam::{DQuat, DVec3};
+///
+/// let turn = DQuat::from_rotation_z(0.4);
+/// let points = [DVec3::ZERO, DVec3::X, DVec3::Y, DVec3::Z];
+/// let pairs = points.map(|from| PointPair { from, to: turn * from + DVec3::X, weight: 1.0 });
+/// let found = align_rigid(&pairs).unwrap();
+/// assert!(found.rotation.angle_between(turn) < 1e-7);
+/// assert!(found.apply(DVec3::ZERO).distance(DVec3::X) < 1e-12);
+/// assert!(align_rigid(&pairs[..2]).is_none(), "two points leave a rotation open");
+/// ```
+///
+/// `None` when they are not determined (fewer than three pairs of positive weight, coincident or collinear points, a set and a mirror
+/// image of it whose best rotation is ambiguous), when a point or weight is not finite, and when a weight is negative. Other
+/// mirrored sets get the best proper rotation.
 #[must_use]
 pub fn align_rigid(pairs: &[PointPair]) -> Option<Alignment> {
     align(pairs, false)
@@ -115,9 +128,10 @@ fn align(pairs: &[PointPair], with_scale: bool) -> Option<Alignment> {
 mod tests {
     use super::*;
     use crate::rotation::exp_rotation;
-    use crate::testing::Random;
+    use crate::testing::RandomGeometry as _;
+    use flyrig_model::SplitMix64;
 
-    fn pairs(random: &mut Random, count: usize, place: impl Fn(DVec3) -> DVec3) -> Vec<PointPair> {
+    fn pairs(random: &mut SplitMix64, count: usize, place: impl Fn(DVec3) -> DVec3) -> Vec<PointPair> {
         (0..count)
             .map(|_| {
                 let from = random.vector();
@@ -132,7 +146,7 @@ mod tests {
 
     #[test]
     fn exact_pairs_give_the_motion_and_scale_back() {
-        let mut random = Random(11);
+        let mut random = SplitMix64(11);
         for count in [3, 4, 30] {
             for _ in 0..30 {
                 let (rotation, shift) = (random.rotation(), random.vector() * 100.0);
@@ -151,7 +165,7 @@ mod tests {
 
     #[test]
     fn noisy_pairs_cost_less_than_at_any_motion_nearby_and_weights_count() {
-        let mut random = Random(12);
+        let mut random = SplitMix64(12);
         for _ in 0..20 {
             let rotation = random.rotation();
             let mut noisy = pairs(&mut random, 9, |x| rotation * x);
@@ -179,7 +193,7 @@ mod tests {
 
     #[test]
     fn flat_and_mirrored_sets_get_a_proper_rotation() {
-        let mut random = Random(13);
+        let mut random = SplitMix64(13);
         for _ in 0..30 {
             let rotation = random.rotation();
             let flat: Vec<PointPair> = (0..5)

@@ -6,30 +6,30 @@ use crate::kernel::Kernel;
 use crate::minimize::{Convergence, Problem, Solution, minimize};
 use crate::normal::{ArrowNormal, DenseNormal, EliminatedBlock};
 
-/// One residual block and its derivatives.
+/// Residual block and its derivatives.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Residual {
     /// Elements in units of their standard deviation.
     pub error: DVector<f64>,
-    /// Block of unknowns, and the error's derivative by that block's step (rows of the error, columns of the block). Each
-    /// block once, at most one of them eliminated; may be empty where no derivatives are asked for.
+    /// Blocks of unknowns with the error's derivative by their steps (rows of the error, columns of the block). Each block occurs once,
+    /// at most one of them is eliminated; may be empty where no derivatives are requested.
     pub jacobians: Vec<(usize, DMatrix<f64>)>,
     /// Robust kernel of the error's norm.
     pub kernel: Kernel,
-    /// Importance, at least 0; 0 leaves the residual out, whatever its error.
+    /// Weight, at least 0; a residual of weight 0 is ignored, even where its error is not finite.
     pub weight: f64,
 }
 
-/// A robust least squares problem over blocks of unknowns: half the sum of `weight ρ(|error|²)`.
+/// Robust least squares problem over blocks of unknowns: half the sum of `weight ρ(|error|²)`.
 pub trait BlockProblem {
-    /// What is sought, with whatever manifold it lives on.
+    /// Unknowns, on any manifold.
     type Unknowns: Clone;
 
-    /// Returns the number of parameters of a step by block. A step is the blocks' steps one after another.
+    /// Returns the number of step parameters of each block. A step is the concatenation of the blocks' steps.
     fn block_sizes(&self) -> &[usize];
 
-    /// Returns the first eliminated block; it and all after it are eliminated (Schur complement), which pays where they are
-    /// many and small. None are by default.
+    /// Returns the first eliminated block; it and all later ones are eliminated (Schur complement), which pays where they are many and
+    /// small. By default none are.
     fn first_eliminated(&self) -> usize {
         self.block_sizes().len()
     }
@@ -37,23 +37,23 @@ pub trait BlockProblem {
     /// Returns the number of residual blocks.
     fn residual_count(&self) -> usize;
 
-    /// Returns a residual block, with derivatives if asked; `None` where it is undefined (a point behind its camera), which
-    /// makes the cost infinite: steps there are refused.
+    /// Returns a residual block, with derivatives on request; `None` where it is undefined (a point behind its camera), which makes the
+    /// cost infinite, so that steps there are rejected.
     fn residual(&self, at: &Self::Unknowns, index: usize, with_jacobians: bool) -> Option<Residual>;
 
     /// Returns the unknowns after a step.
     fn moved(&self, at: &Self::Unknowns, step: &[f64]) -> Self::Unknowns;
 }
 
-/// Why a block problem has no solution.
+/// Error of a block problem.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum BlockError {
     /// A residual block does not fit the unknowns.
     #[error("residual block {index}: {fault}; return Jacobians that match `block_sizes` and the error")]
     Shape {
-        /// Which residual.
+        /// Index of the residual.
         index: usize,
-        /// What does not fit.
+        /// Fault.
         fault: String,
     },
     /// The cost of the start is not finite.
@@ -62,7 +62,7 @@ pub enum BlockError {
          of at least 0 and a positive kernel scale"
     )]
     Start {
-        /// Which residual.
+        /// Index of the residual.
         index: usize,
     },
     /// The sum of all costs is not finite.
@@ -71,6 +71,37 @@ pub enum BlockError {
 }
 
 /// Minimizes a block problem from a start, see [`minimize`].
+///
+/// ```
+/// use flyrig_solve::{BlockProblem, Convergence, Kernel, Residual, minimize_blocks};
+/// use nalgebra::{DMatrix, DVector};
+///
+/// /// Position on a line, measured several times; one measurement is an outlier.
+/// struct Position(Vec<f64>);
+///
+/// impl BlockProblem for Position {
+///     type Unknowns = f64;
+///     fn block_sizes(&self) -> &[usize] {
+///         &[1]
+///     }
+///     fn residual_count(&self) -> usize {
+///         self.0.len()
+///     }
+///     fn residual(&self, at: &f64, index: usize, _: bool) -> Option<Residual> {
+///         let error = DVector::from_element(1, at - self.0[index]);
+///         let jacobians = vec![(0, DMatrix::from_element(1, 1, 1.0))];
+///         Some(Residual { error, jacobians, kernel: Kernel::Cauchy(0.1), weight: 1.0 })
+///     }
+///     fn moved(&self, at: &f64, step: &[f64]) -> f64 {
+///         at + step[0]
+///     }
+/// }
+///
+/// let problem = Position(vec![1.0, 1.02, 0.98, 9.0]);
+/// let found = minimize_blocks(&problem, &2.0, &Convergence::default())?;
+/// assert!((found.unknowns - 1.0).abs() < 0.02);
+/// # Ok::<(), flyrig_solve::BlockError>(())
+/// ```
 ///
 /// # Errors
 /// When a residual block does not fit the unknowns, or has no finite cost at the start.
@@ -89,16 +120,16 @@ pub fn minimize_blocks<P: BlockProblem>(
     minimize(&Assembled(problem), start, options).ok_or(BlockError::Overflow)
 }
 
-/// Returns the covariance of the kept unknowns at a solution, if the weights are inverse variances, by step parameters.
-/// `None` where the residuals leave unknowns open (a free gauge, an eliminated block that too few residuals see).
+/// Returns the covariance of the kept unknowns' step parameters at a solution, for weights that are inverse variances. `None` where the
+/// residuals leave unknowns undetermined (a free gauge, an eliminated block in too few residuals).
 #[must_use]
 pub fn block_covariance<P: BlockProblem>(problem: &P, at: &P::Unknowns) -> Option<DMatrix<f64>> {
     Assembled(problem).linearize(at)?.covariance()
 }
 
-/// Returns the largest difference between a residual block's Jacobians and central differences of its error with a step, over
-/// the larger of 1 and the difference quotient; for the tests of problems. `None` where the residual is undefined or does not
-/// fit the unknowns.
+/// Returns the largest difference between a residual block's Jacobians and central differences of its error with a step, relative to
+/// the larger of 1 and the difference quotient; for tests of problems. `None` where the residual is undefined or does not fit the
+/// unknowns.
 #[must_use]
 pub fn jacobian_error<P: BlockProblem>(problem: &P, at: &P::Unknowns, index: usize, step: f64) -> Option<f64> {
     let residual = problem.residual(at, index, true)?;
@@ -126,7 +157,7 @@ pub fn jacobian_error<P: BlockProblem>(problem: &P, at: &P::Unknowns, index: usi
     Some(worst)
 }
 
-/// First step parameter of each block, and their total.
+/// Returns the first step parameter of each block, and their total number.
 fn offsets(sizes: &[usize]) -> Vec<usize> {
     let ends = sizes.iter().scan(0, |end, size| {
         *end += size;
@@ -164,7 +195,7 @@ fn cost(residual: &Residual) -> f64 {
     residual.kernel.weigh(residual.error.norm_squared(), residual.weight).0
 }
 
-/// A block problem as one with normal equations.
+/// Block problem as a [`Problem`] with normal equations.
 struct Assembled<'a, P>(&'a P);
 
 impl<P: BlockProblem> Problem for Assembled<'_, P> {

@@ -1,4 +1,4 @@
-//! Bundle adjustment of cameras and points in small, against the dense solution and the truth.
+//! Small bundle adjustment of cameras and points, against the dense solution and the truth.
 
 use glam::DVec3;
 use nalgebra::{DMatrix, DVector};
@@ -8,7 +8,8 @@ use crate::minimize::Stop;
 use crate::motion::RigidMotion;
 use crate::normal::NormalEquations;
 use crate::rotation::{exp_rotation, left_jacobian_inverse, log_rotation};
-use crate::testing::Random;
+use crate::testing::RandomGeometry as _;
+use flyrig_model::SplitMix64;
 
 const FOCAL: f64 = 500.0;
 
@@ -26,11 +27,11 @@ struct Bundle {
     cameras: usize,
     is_schur: bool,
     kernel: Kernel,
-    /// Camera, point, pixel, weight.
+    /// Observations: camera, point, pixel, weight.
     seen: Vec<(usize, usize, [f64; 2], f64)>,
-    /// Where the first two cameras are believed to be, which fixes the gauge.
+    /// Prior poses of the first two cameras, which fix the gauge.
     anchors: Vec<RigidMotion>,
-    /// Residuals that lie about their shape.
+    /// Residuals with a wrong shape.
     lie: Option<(usize, usize)>,
 }
 
@@ -108,9 +109,9 @@ impl Bundle {
     }
 }
 
-/// Cameras on a ring around a cloud of points, with pixel noise; the truth and a start beside it.
+/// Returns cameras on a ring around a cloud of points, with pixel noise; the truth and a perturbed start.
 fn bundle(cameras: usize, points: usize, noise_px: f64, seed: u64) -> (Bundle, Scene, Scene) {
-    let mut random = Random(seed);
+    let mut random = SplitMix64(seed);
     let truth = Scene {
         cameras: (0..cameras)
             .map(|i| {
@@ -212,7 +213,7 @@ fn covariance_predicts_the_spread_of_the_focal_length() {
         // Uniform noise of ±1 pixel has a variance of a third.
         bundle.seen.iter_mut().for_each(|seen| seen.3 = 3.0);
         // The anchors' standard deviation is 1 mm and 1 mrad.
-        let mut random = Random(seed);
+        let mut random = SplitMix64(seed);
         let mut noise = || random.vector() * (3f64.sqrt() * 1e-3);
         bundle.anchors.iter_mut().for_each(|anchor| *anchor = anchor.moved(noise(), noise()));
         let solution = minimize_blocks(&bundle, &start, &Convergence::default()).unwrap();
@@ -227,7 +228,7 @@ fn covariance_predicts_the_spread_of_the_focal_length() {
 #[test]
 fn robust_kernels_bear_a_tenth_of_wrong_pixels_and_squares_do_not() {
     let (mut bundle, truth, start) = bundle(5, 20, 0.2, 44);
-    let mut random = Random(45);
+    let mut random = SplitMix64(45);
     for seen in bundle.seen.iter_mut().step_by(11) {
         seen.2 = [seen.2[0] + 60.0 + 40.0 * random.signed(), seen.2[1] - 50.0];
     }

@@ -1,10 +1,10 @@
-//! Robust kernels: how the cost of a residual grows.
+//! Robust kernels of residuals.
 
-/// The cost `ρ(s)` of a squared residual norm `s`, close to `s` for small ones. Scales are in units of the residual's norm
-/// and must be positive; otherwise costs are not finite, which [`crate::minimize`] refuses.
+/// Cost `ρ(s)` of a squared residual norm `s`, close to `s` for small ones. Scales are in units of the residual's norm and must be
+/// positive; otherwise costs are not finite, which [`crate::minimize`] rejects.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Kernel {
-    /// `ρ(s) = s`: least squares.
+    /// Least squares: `ρ(s) = s`.
     Squares,
     /// Linear beyond the scale.
     Huber(f64),
@@ -46,7 +46,7 @@ impl Kernel {
     }
 }
 
-/// Square of a scale; NaN where it is not positive.
+/// Returns the square of a scale; NaN where it is not positive.
 fn check(scale: f64) -> f64 {
     if scale > 0.0 { scale * scale } else { f64::NAN }
 }

@@ -1,7 +1,7 @@
-//! Offset and drift between two clocks: a robust weighted line through integer nanoseconds.
+//! Offset and drift between two clocks: robust weighted line fit to integer nanoseconds.
 //!
 //! Times and offsets of clocks exceed the 53 bits of an `f64`. The fit subtracts an anchor time and a base offset in
-//! integers first, and only the small rest becomes a float. Differences are taken modulo 2⁶⁴: they must be below 2⁶³ ns
+//! integers first; only the small remainder becomes a float. Differences are taken modulo 2⁶⁴: they must be below 2⁶³ ns
 //! (292 years), the times themselves may be anywhere.
 
 use crate::median::median;
@@ -9,30 +9,30 @@ use crate::median::median;
 /// Standard deviation of a normal distribution over the median of its absolute values.
 const SIGMA_PER_MEDIAN: f64 = 1.4826;
 
-/// One comparison of two clocks.
+/// Comparison of two clocks.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LineSample {
     /// Time of the first clock, nanoseconds.
     pub time_nanos: i64,
     /// Second clock minus first clock at that time, nanoseconds.
     pub offset_nanos: i64,
-    /// Inverse variance, in any unit; samples of weight 0 are left out.
+    /// Inverse variance, in any unit; samples of weight 0 are ignored.
     pub weight: f64,
 }
 
-/// `offset(time) = offset_nanos + drift * (time - anchor_nanos)`.
+/// Clock offset as a line: `offset(time) = offset_nanos + drift * (time - anchor_nanos)`.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct ClockLine {
-    /// Time at which the offset is exactly `offset_nanos`.
+    /// Time at which the offset is `offset_nanos`, nanoseconds.
     pub anchor_nanos: i64,
     /// Offset at the anchor, nanoseconds.
     pub offset_nanos: i64,
-    /// Slope: 1e-6 is a part per million.
+    /// Slope; 1e-6 is one part per million.
     pub drift: f64,
 }
 
 impl ClockLine {
-    /// Returns by how much the offset differs from the anchor's at a time, nanoseconds.
+    /// Returns the difference of the offset at a time from that at the anchor, nanoseconds.
     #[must_use]
     pub fn drifted_nanos(&self, time_nanos: i64) -> i64 {
         (self.drift * time_nanos.wrapping_sub(self.anchor_nanos) as f64).round() as i64
@@ -45,24 +45,24 @@ impl ClockLine {
     }
 }
 
-/// Outlier rejection of a line fit. The first fit sees all samples, so that outliers must be few: about a fifth where they
-/// lie on one side.
+/// Outlier rejection of a line fit. The first fit uses all samples, so that outliers must be few: at most about a fifth where they lie
+/// on one side.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LineGate {
-    /// Fits, each without the outliers of the one before; at least 1.
+    /// Number of fits, each without the outliers of the previous one; at least 1.
     pub rounds: usize,
-    /// Samples farther from the line than this many standard deviations (1.4826 times the median distance) are outliers.
+    /// Distance from the line beyond which samples are outliers, in standard deviations (1.4826 times the median distance).
     pub sigmas: f64,
-    /// Samples this near to the line are never outliers, nanoseconds.
+    /// Distance from the line within which samples are never outliers, nanoseconds.
     pub least_nanos: f64,
 }
 
 /// Options of [`fit_line`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LineOptions {
-    /// Samples with which the drift is fitted; it is 0 with fewer.
+    /// Smallest number of samples for which the drift is fitted; it is 0 with fewer.
     pub least_drift_samples: usize,
-    /// Prior for a drift of 0: standard deviation of a sample of weight 1, in seconds, over that of the drift. 0 for none.
+    /// Prior for a drift of 0: standard deviation of a sample of weight 1, seconds, over that of the drift. 0 for no prior.
     pub drift_prior_secs: f64,
     /// Largest drift; steeper fits are clamped. Infinite for no limit.
     pub max_drift: f64,
@@ -79,16 +79,27 @@ impl Default for LineOptions {
 /// Result of [`fit_line`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LineFit {
-    /// The line, with the anchor that was given.
+    /// Line with the given anchor.
     pub line: ClockLine,
     /// Weighted root mean square distance of the inliers, nanoseconds.
     pub residual_nanos: f64,
-    /// Samples that the line was not rejected for.
+    /// Number of samples that are not outliers.
     pub inliers: usize,
 }
 
-/// Fits offset and drift by weighted least squares around an anchor time and a base offset (near the samples, for
-/// precision).
+/// Fits offset and drift by weighted least squares around an anchor time and a base offset (near the samples, for precision).
+///
+/// ```
+/// use flyrig_solve::{LineOptions, LineSample, fit_line};
+///
+/// // The second clock is 5 ms ahead and gains 20 parts per million.
+/// let sample = |i: i64| LineSample { time_nanos: i * 1_000_000_000, offset_nanos: 5_000_000 + 20_000 * i, weight: 1.0 };
+/// let samples: Vec<LineSample> = (0..10).map(sample).collect();
+/// let options = LineOptions { least_drift_samples: 2, drift_prior_secs: 0.0, max_drift: f64::INFINITY, gate: None };
+/// let fit = fit_line(&samples, 0, 5_000_000, &options).unwrap();
+/// assert_eq!(fit.line.offset_at(100_000_000_000), 7_000_000);
+/// assert!((fit.line.drift - 20e-6).abs() < 1e-12);
+/// ```
 ///
 /// `None` without a sample of positive weight, and when a weight is negative or not finite or the fit is not finite.
 #[must_use]
@@ -137,7 +148,7 @@ pub fn fit_line(
     })
 }
 
-/// Intercept and slope (nanoseconds, and nanoseconds a second) of points (x, y, weight), centred for precision.
+/// Returns intercept and slope (nanoseconds, and nanoseconds per second) of points (x, y, weight), centred for precision.
 fn least_squares(points: &[[f64; 3]], options: &LineOptions) -> Option<(f64, f64)> {
     let total: f64 = points.iter().map(|[.., weight]| weight).sum();
     let (mx, my) =
@@ -155,8 +166,9 @@ fn least_squares(points: &[[f64; 3]], options: &LineOptions) -> Option<(f64, f64
 
 #[cfg(test)]
 mod tests {
+    use flyrig_model::SplitMix64;
+
     use super::*;
-    use crate::testing::Random;
 
     const SECOND: i64 = 1_000_000_000;
 
@@ -164,7 +176,7 @@ mod tests {
         LineSample { time_nanos, offset_nanos, weight: 1.0 }
     }
 
-    /// The normal equations with the prior as a row of its own, uncentred, by Cramer's rule.
+    /// Solves the uncentred normal equations, with the prior as a row of its own, by Cramer's rule.
     fn reference(samples: &[LineSample], anchor: i64, base: i64, prior: f64) -> (f64, f64) {
         let [mut w, mut x, mut y, mut xx, mut xy] = [0.0, 0.0, 0.0, prior * prior, 0.0];
         for sample in samples {
@@ -182,7 +194,7 @@ mod tests {
 
     #[test]
     fn weighted_fit_with_a_prior_matches_cramers_rule() {
-        let mut random = Random(21);
+        let mut random = SplitMix64(21);
         for round in 0..200 {
             let base = (random.signed() * 1e18) as i64;
             let anchor = (random.signed() * 1e18) as i64;
@@ -223,7 +235,7 @@ mod tests {
 
     #[test]
     fn a_tenth_of_outliers_is_rejected() {
-        let mut random = Random(22);
+        let mut random = SplitMix64(22);
         let samples: Vec<LineSample> = (0..300)
             .map(|i| {
                 let wild = if i % 10 == 0 { 50_000_000 + (random.signed() * 4e7) as i64 } else { 0 };

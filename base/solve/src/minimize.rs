@@ -1,17 +1,17 @@
-//! Levenberg-Marquardt.
+//! Levenberg-Marquardt minimization.
 
 use nalgebra::DVector;
 
 use crate::normal::NormalEquations;
 
-/// A cost to minimize.
+/// Cost to minimize.
 pub trait Problem {
-    /// What is sought.
+    /// Unknowns, on any manifold.
     type Unknowns: Clone;
     /// Form of the normal equations.
     type Normal: NormalEquations;
 
-    /// Returns the cost, half a robust sum of squares; not finite where the unknowns make no sense.
+    /// Returns the cost, half a robust sum of squares; not finite where it is undefined.
     fn cost(&self, at: &Self::Unknowns) -> f64;
 
     /// Returns the normal equations of a step from `at`; `None` where there are none.
@@ -24,19 +24,19 @@ pub trait Problem {
 /// Damping and convergence criteria.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Convergence {
-    /// Steps tried at most.
+    /// Largest number of attempted steps.
     pub max_steps: usize,
-    /// Converged when an accepted step lowers the cost by less than this share of it.
+    /// Relative decrease of the cost by an accepted step below which the minimization has converged.
     pub min_gain: f64,
-    /// Converged when every element of the gradient is smaller; 0 for no such criterion.
+    /// Largest element of the gradient below which the minimization has converged; 0 disables the criterion.
     pub max_gradient: f64,
-    /// First damping, as a share of the diagonal.
+    /// Initial damping, as a fraction of the diagonal.
     pub damping: f64,
-    /// Range of the damping; no step is found when more would be needed.
+    /// Range of the damping; the minimization ends when more would be needed.
     pub damping_range: (f64, f64),
-    /// Factors of the damping after an accepted and after a refused step.
+    /// Factors of the damping after an accepted and after a rejected step.
     pub damping_factors: (f64, f64),
-    /// Added to the diagonal, so that unknowns that nothing depends on stay where they are.
+    /// Term added to the diagonal, which keeps unknowns in place that nothing depends on.
     pub floor: f64,
 }
 
@@ -54,14 +54,14 @@ impl Default for Convergence {
     }
 }
 
-/// Why a minimization ended.
+/// Reason for the end of a minimization.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stop {
-    /// The gradient vanished, or an accepted step gained next to nothing.
+    /// The gradient vanished, or an accepted step gained less than [`Convergence::min_gain`].
     Converged,
-    /// No step lowers the cost, however damped: a minimum up to rounding, or a derivative that is wrong.
+    /// No step of any damping lowers the cost: a minimum up to rounding, or a wrong derivative.
     NoDescent,
-    /// The steps are used up.
+    /// The number of steps reached its limit.
     StepLimit,
     /// The normal equations could not be formed.
     NoEquations,
@@ -70,18 +70,18 @@ pub enum Stop {
 /// Result of a minimization.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Solution<U> {
-    /// The best unknowns found.
+    /// Best unknowns found.
     pub unknowns: U,
-    /// Their cost, at most the start's.
+    /// Cost of the unknowns, at most that of the start.
     pub cost: f64,
-    /// Steps tried, refused ones included.
+    /// Number of attempted steps, rejected ones included.
     pub steps: usize,
-    /// Why it ended.
+    /// Reason for the end.
     pub stop: Stop,
 }
 
-/// Minimizes a cost from a start by damped Gauss-Newton steps, of which only those that lower the cost are taken. `None`
-/// when the start has no finite cost.
+/// Minimizes a cost from a start by damped Gauss-Newton steps; only steps that lower the cost are accepted. `None` when the start has no
+/// finite cost.
 pub fn minimize<P: Problem>(problem: &P, start: &P::Unknowns, options: &Convergence) -> Option<Solution<P::Unknowns>> {
     let mut unknowns = start.clone();
     let mut cost = problem.cost(&unknowns);

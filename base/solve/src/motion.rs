@@ -6,41 +6,41 @@ use glam::{DMat3, DQuat, DVec3};
 
 use crate::rotation::{exp_rotation, left_jacobian, left_jacobian_inverse, log_rotation};
 
-/// Rotation, then translation: `x -> R x + t`.
+/// Rotation followed by a translation: `x -> R x + t`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RigidMotion {
     /// Unit quaternion of `R`.
     pub rotation: DQuat,
-    /// `t`.
+    /// Translation `t`.
     pub translation: DVec3,
 }
 
 impl RigidMotion {
-    /// Moves nothing.
+    /// Motion that moves nothing.
     pub const IDENTITY: Self = Self { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
 
-    /// Returns the exponential of a twist: rotation vector in radians, and the translation's part, which the rotation
-    /// bends (`t = J shift`, with the left Jacobian `J`).
+    /// Returns the exponential of a twist: rotation vector `turn`, radians, and `shift`, from which the translation follows as
+    /// `t = J shift` with the left Jacobian `J`.
     #[must_use]
     pub fn exp(turn: DVec3, shift: DVec3) -> Self {
         Self { rotation: exp_rotation(turn), translation: left_jacobian(turn) * shift }
     }
 
-    /// Returns the twist (turn, shift) of which this is the exponential, with a turn of at most π.
+    /// Returns the twist (turn, shift) whose exponential this is, with a turn of at most π.
     #[must_use]
     pub fn log(&self) -> (DVec3, DVec3) {
         let turn = log_rotation(self.rotation);
         (turn, left_jacobian_inverse(turn) * self.translation)
     }
 
-    /// Returns the motion back.
+    /// Returns the inverse motion.
     #[must_use]
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.inverse();
         Self { rotation, translation: -(rotation * self.translation) }
     }
 
-    /// Moves a point.
+    /// Transforms a point.
     #[must_use]
     pub fn apply(&self, point: DVec3) -> DVec3 {
         self.rotation * point + self.translation
@@ -65,7 +65,7 @@ impl RigidMotion {
 impl Mul for RigidMotion {
     type Output = Self;
 
-    /// The right motion first, then the left one.
+    /// Chains two motions: the right one is applied first.
     fn mul(self, first: Self) -> Self {
         Self {
             rotation: (self.rotation * first.rotation).normalize(),
@@ -76,16 +76,18 @@ impl Mul for RigidMotion {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::testing::Random;
+    use flyrig_model::SplitMix64;
 
-    fn random_motion(random: &mut Random) -> RigidMotion {
+    use super::*;
+    use crate::testing::RandomGeometry as _;
+
+    fn random_motion(random: &mut SplitMix64) -> RigidMotion {
         RigidMotion { rotation: random.rotation(), translation: random.vector() * 3.0 }
     }
 
     #[test]
     fn exponential_is_the_limit_of_many_small_motions_and_logarithm_inverts_it() {
-        let mut random = Random(4);
+        let mut random = SplitMix64(4);
         for size in [0.0, 1e-9, 1e-3, 1.0, 3.1] {
             let (turn, shift) = (random.vector().normalize() * size, random.vector());
             let motion = RigidMotion::exp(turn, shift);
@@ -101,7 +103,7 @@ mod tests {
 
     #[test]
     fn motions_form_a_group() {
-        let mut random = Random(5);
+        let mut random = SplitMix64(5);
         for _ in 0..100 {
             let (a, b, point) = (random_motion(&mut random), random_motion(&mut random), random.vector());
             assert!(((a * b).apply(point) - a.apply(b.apply(point))).length() < 1e-14);
@@ -113,7 +115,7 @@ mod tests {
     #[test]
     fn jacobians_match_differences() {
         const STEP: f64 = 1e-6;
-        let mut random = Random(6);
+        let mut random = SplitMix64(6);
         for _ in 0..50 {
             let (motion, point) = (random_motion(&mut random), random.vector());
             let jacobians = motion.apply_jacobian(point);

@@ -1,27 +1,26 @@
-//! Normal equations of least squares: dense, and with a class of blocks that is eliminated (Schur complement).
+//! Normal equations of least squares: dense, and with eliminated blocks (Schur complement).
 
 use nalgebra::{Cholesky, DMatrix, DVector, DVectorView, Dyn};
 
-/// Squared pivot of the matrix scaled to a unit diagonal below which it counts as rank-deficient: 1 - R² of an unknown
-/// given those before it.
+/// Squared pivot of the matrix scaled to a unit diagonal below which it is rank-deficient: 1 - R² of an unknown given the previous
+/// ones.
 const LEAST_PIVOT: f64 = 1e-12;
 
 /// Operations of a Levenberg-Marquardt step on a linearized problem.
 pub trait NormalEquations {
-    /// Largest absolute element of the gradient.
+    /// Returns the largest absolute element of the gradient.
     fn gradient_max(&self) -> f64;
 
-    /// Returns the solution `x` of `(N + damping diag(N) + floor I) x = -gradient`; `None` where there is none that is
-    /// finite.
+    /// Returns the solution `x` of `(N + damping diag(N) + floor I) x = -gradient`; `None` where there is no finite one.
     fn step(&self, damping: f64, floor: f64) -> Option<DVector<f64>>;
 }
 
-/// A symmetric matrix and a gradient.
+/// Symmetric matrix and gradient.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DenseNormal {
-    /// `JᵀWJ`; the lower triangle counts.
+    /// Matrix `JᵀWJ`, of which the lower triangle is used.
     pub matrix: DMatrix<f64>,
-    /// `JᵀWe`.
+    /// Gradient `JᵀWe`.
     pub gradient: DVector<f64>,
 }
 
@@ -32,7 +31,7 @@ impl DenseNormal {
         Self { matrix: DMatrix::zeros(size, size), gradient: DVector::zeros(size) }
     }
 
-    /// Factors the matrix as it is, without damping; `None` when it is rank-deficient or not finite.
+    /// Factors the undamped matrix; `None` when it is rank-deficient or not finite.
     #[must_use]
     pub fn factor(&self) -> Option<Factor> {
         Factor::new(&self.matrix)
@@ -75,13 +74,12 @@ fn damped(matrix: &DMatrix<f64>, damping: f64, floor: f64) -> DMatrix<f64> {
 #[derive(Debug, Clone)]
 pub struct Factor {
     cholesky: Cholesky<f64, Dyn>,
-    /// 1 / sqrt of the diagonal.
+    /// Inverse square root of the diagonal.
     scale: DVector<f64>,
 }
 
 impl Factor {
-    /// Factors a symmetric matrix, of which the lower triangle counts; `None` when it is not square, rank-deficient or
-    /// not finite.
+    /// Factors a symmetric matrix, of which the lower triangle is used; `None` when it is not square, rank-deficient or not finite.
     #[must_use]
     pub fn new(matrix: &DMatrix<f64>) -> Option<Self> {
         if !matrix.is_square() {
@@ -109,7 +107,7 @@ impl Factor {
         solution
     }
 
-    /// Returns the inverse of the matrix: the covariance of the unknowns if the weights are inverse variances.
+    /// Returns the inverse of the matrix: the covariance of the unknowns for weights that are inverse variances.
     #[must_use]
     pub fn covariance(&self) -> DMatrix<f64> {
         let mut inverse = self.cholesky.inverse();
@@ -122,28 +120,27 @@ impl Factor {
     }
 }
 
-/// A block of unknowns that is coupled to kept unknowns only, such as a point that cameras see.
+/// Block of unknowns that is coupled to kept unknowns only, such as a point in view of cameras.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EliminatedBlock {
-    /// The block's own equations.
+    /// Equations of the block alone.
     pub normal: DenseNormal,
-    /// First kept unknown, and the matrix between kept unknowns from there on (rows) and the block (columns).
+    /// First kept unknown, and the matrix that couples the kept unknowns from there on (rows) with the block (columns).
     pub coupling: Vec<(usize, DMatrix<f64>)>,
 }
 
-/// Normal equations in which some blocks are coupled to kept unknowns only, and never to each other. Their unknowns come
-/// after the kept ones.
+/// Normal equations in which some blocks are coupled to kept unknowns only, never to each other. Their unknowns follow the kept ones.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ArrowNormal {
-    /// The kept unknowns' own equations.
+    /// Equations of the kept unknowns alone.
     pub kept: DenseNormal,
-    /// The others, in order.
+    /// Eliminated blocks, in order.
     pub eliminated: Vec<EliminatedBlock>,
 }
 
 impl ArrowNormal {
-    /// Eliminates: equations of the kept unknowns alone, and the factors of each eliminated block. `None` when one of those
-    /// is rank-deficient.
+    /// Eliminates the blocks: returns the equations of the kept unknowns and the factors of each block. `None` when a block is
+    /// rank-deficient.
     fn reduced(&self, damping: f64, floor: f64) -> Option<(DenseNormal, Vec<Factor>)> {
         let mut kept =
             DenseNormal { matrix: damped(&self.kept.matrix, damping, floor), gradient: self.kept.gradient.clone() };
@@ -168,8 +165,8 @@ impl ArrowNormal {
         Some((kept, factors))
     }
 
-    /// Returns the covariance of the kept unknowns, with the eliminated ones free; `None` when the equations are
-    /// rank-deficient (a free gauge, a point that one camera sees).
+    /// Returns the marginal covariance of the kept unknowns; `None` when the equations are rank-deficient (a free gauge, a point in view
+    /// of one camera).
     #[must_use]
     pub fn covariance(&self) -> Option<DMatrix<f64>> {
         Some(self.reduced(0.0, 0.0)?.0.factor()?.covariance())
@@ -202,11 +199,12 @@ fn column(vector: &DVector<f64>) -> DMatrix<f64> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::testing::Random;
+    use flyrig_model::SplitMix64;
 
-    /// Rows of random residuals that see one of the eliminated blocks each, and the dense equations of all.
-    fn arrow(random: &mut Random, kept: [usize; 3], eliminated: usize, rows: usize) -> (ArrowNormal, DenseNormal) {
+    use super::*;
+
+    /// Returns equations of random residuals with one eliminated block each, in arrow form and dense.
+    fn arrow(random: &mut SplitMix64, kept: [usize; 3], eliminated: usize, rows: usize) -> (ArrowNormal, DenseNormal) {
         let size: usize = kept.iter().sum();
         let mut dense = DenseNormal::zeros(size + 3 * eliminated);
         let starts = [0, kept[0], kept[0] + kept[1]];
@@ -244,7 +242,7 @@ mod tests {
 
     #[test]
     fn eliminating_blocks_changes_neither_step_nor_covariance() {
-        let mut random = Random(31);
+        let mut random = SplitMix64(31);
         for kept in [[3, 6, 15], [1, 1, 1], [6, 6, 6]] {
             let (arrow, dense) = arrow(&mut random, kept, 5, 90);
             for damping in [0.0, 1e-3, 10.0] {
@@ -261,7 +259,7 @@ mod tests {
 
     #[test]
     fn factors_match_lu_whatever_the_units() {
-        let mut random = Random(32);
+        let mut random = SplitMix64(32);
         for units in [1.0, 1e9] {
             let rows = DMatrix::from_fn(12, 6, |_, c| random.signed() * if c < 3 { units } else { 1.0 / units });
             let normal = DenseNormal { matrix: rows.transpose() * &rows, gradient: DVector::zeros(6) };

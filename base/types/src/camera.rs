@@ -1,17 +1,17 @@
-//! Camera models: pinhole with lens distortion, pose in the world, rigs.
+//! Camera models: pinhole with lens distortion, pose in the world; rigs of cameras.
 
 use glam::{DMat3, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::{CameraId, ColorMatch, Isometry};
 
-/// Largest image side that anything in flyrig accepts, pixels.
+/// Largest side of an image, pixels.
 pub const MAX_IMAGE_SIDE: u32 = 16_384;
 
 /// Largest time offset between cameras, milliseconds.
 const MAX_TIME_OFFSET_MS: f64 = 1000.0;
 
-/// Distortion from the ideal image plane `(x/z, y/z)`, OpenCV's coefficients.
+/// Lens distortion: from the ideal image plane `(x/z, y/z)` to the distorted one, with OpenCV's coefficients.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Lens {
@@ -37,10 +37,10 @@ pub enum Lens {
 }
 
 impl Lens {
-    /// No distortion at all.
+    /// Lens without distortion.
     pub const PINHOLE: Self = Self::RadialTangential { radial: [0.0; 3], tangential: [0.0; 2] };
 
-    /// Returns k1 to k6, p1 and p2 of a lens that is not a fisheye; k4 to k6 are 0 for [`Self::RadialTangential`].
+    /// Returns k1 to k6, p1 and p2; k4 to k6 are 0 for [`Self::RadialTangential`]. `None` for a fisheye.
     #[must_use]
     pub fn rational(&self) -> Option<([f64; 6], [f64; 2])> {
         match *self {
@@ -83,8 +83,8 @@ impl Lens {
         )
     }
 
-    /// Radius on the ideal plane up to which the radial part grows, so that no two directions share
-    /// a pixel; points beyond it must not be projected. At most `1e3`.
+    /// Returns the radius on the ideal plane up to which the radial part grows, so that no two directions share a pixel, at most
+    /// `1e3`. Points beyond it must not be projected.
     #[must_use]
     pub fn valid_radius(&self) -> f64 {
         const LIMIT: f64 = 1e3;
@@ -113,15 +113,15 @@ impl Lens {
         LIMIT
     }
 
-    /// Whether a point of the ideal plane may be projected: not beyond [`Self::valid_radius`].
+    /// Returns whether a point of the ideal plane may be projected: not beyond [`Self::valid_radius`].
     #[must_use]
     pub fn is_valid(&self, ideal: DVec2) -> bool {
         let radius = ideal.length();
         self.surely_grows(radius) || radius <= self.valid_radius()
     }
 
-    /// Quick and on the safe side: counting the negative coefficients alone, each condition shrinks with the radius, so where
-    /// it is positive it is so all the way there.
+    /// Returns true only where the radial part grows up to `radius`: a quick, conservative test. With its negative coefficients
+    /// alone each condition falls with the radius; where it is positive, it is positive at all smaller radii.
     fn surely_grows(&self, radius: f64) -> bool {
         let s = self.squared_argument(radius);
         self.conditions().iter().all(|condition| {
@@ -130,7 +130,7 @@ impl Lens {
         })
     }
 
-    /// Variable of [`Self::conditions`] at a radius of the ideal plane: its square, or that of the angle for a fisheye.
+    /// Returns the variable of [`Self::conditions`] at a radius of the ideal plane: its square, or the squared angle for a fisheye.
     fn squared_argument(&self, radius: f64) -> f64 {
         match self {
             Self::Fisheye { .. } => radius.atan().powi(2),
@@ -138,7 +138,7 @@ impl Lens {
         }
     }
 
-    /// Polynomials that are positive where the radial part grows: the numerator of its derivative, and its denominator.
+    /// Returns two polynomials that are positive where the radial part grows: the numerator of its derivative, and its denominator.
     fn conditions(&self) -> [[f64; 7]; 2] {
         let mut slope = [0.0; 7];
         let mut denominator = [0.0; 7];
@@ -161,8 +161,7 @@ impl Lens {
         [slope, denominator]
     }
 
-    /// Inverse of [`Self::distort`] by damped fixed-point and Newton steps; `None` when nothing on
-    /// the valid part of the plane maps there.
+    /// Inverts [`Self::distort`] by damped Newton steps; `None` when no point of the valid part of the plane maps there.
     #[must_use]
     pub fn undistort(&self, distorted: DVec2) -> Option<DVec2> {
         // The valid radius takes a search; mostly it is enough to know that it is larger than what is needed.
@@ -171,7 +170,7 @@ impl Lens {
         quick.or_else(|| self.undistort_within(distorted, self.valid_radius()))
     }
 
-    /// [`Self::undistort`] among points of at most this radius.
+    /// Inverts [`Self::distort`] among points of at most the radius `valid`.
     fn undistort_within(&self, distorted: DVec2, valid: f64) -> Option<DVec2> {
         let mut ideal = distorted.clamp_length_max(valid * 0.99);
         for _ in 0..100 {
@@ -202,28 +201,28 @@ fn series(coefficients: &[f64]) -> [f64; 5] {
     std::array::from_fn(|i| if i == 0 { 1.0 } else { coefficients.get(i - 1).copied().unwrap_or_default() })
 }
 
-/// Value of a polynomial, lowest power first.
+/// Evaluates a polynomial, lowest power first.
 fn polynomial(coefficients: &[f64], at: f64) -> f64 {
     coefficients.iter().rev().fold(0.0, |sum, c| sum * at + c)
 }
 
-/// What a camera does to a point in front of it.
+/// Projection of a camera, from camera axes to pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Intrinsics {
-    /// Pixels.
+    /// Width of the images, pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height of the images, pixels.
     pub height: u32,
-    /// Focal lengths fx, fy in pixels.
+    /// Focal lengths fx, fy, pixels.
     pub focal_px: DVec2,
-    /// Principal point in pixels; pixel centres at integers.
+    /// Principal point, pixels; pixel centres lie at integers.
     pub center_px: DVec2,
     /// Distortion.
     pub lens: Lens,
 }
 
 impl Intrinsics {
-    /// A pinhole of square pixels with the principal point in the middle.
+    /// Creates a pinhole with square pixels and the principal point in the middle.
     #[must_use]
     pub fn pinhole(width: u32, height: u32, focal_px: f64) -> Self {
         Self {
@@ -236,30 +235,30 @@ impl Intrinsics {
     }
 }
 
-/// Why a camera model is refused.
+/// Error of a camera model or rig.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CameraError {
     /// A number is NaN or infinite.
     #[error("camera {camera}: {field} is not a finite number; re-export or redo its calibration")]
     NotFinite {
-        /// Which camera.
+        /// Camera.
         camera: CameraId,
-        /// What was wrong.
+        /// Faulty quantity.
         field: &'static str,
     },
     /// A number is out of its range.
     #[error("camera {camera}: {field} is {value}, expected {expected}")]
     OutOfRange {
-        /// Which camera.
+        /// Camera.
         camera: CameraId,
-        /// What was wrong.
+        /// Faulty quantity.
         field: &'static str,
-        /// What was found.
+        /// Its value.
         value: f64,
-        /// What would be right.
+        /// Permitted range.
         expected: &'static str,
     },
-    /// Two cameras share a name.
+    /// Two cameras have one name.
     #[error("camera {0} appears twice in the rig")]
     Duplicate(CameraId),
 }
@@ -267,17 +266,17 @@ pub enum CameraError {
 /// A calibrated camera.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
-    /// Name.
+    /// Name, unique in a rig.
     pub id: CameraId,
-    /// Lens and sensor.
+    /// Sensor and lens.
     pub intrinsics: Intrinsics,
-    /// World to camera axes.
+    /// Pose: camera axes from world axes.
     pub camera_from_world: Isometry,
-    /// Time offset of its timestamps against the other cameras', nanoseconds: subtracted before frames are joined. 0 for
-    /// cameras that are only drawn.
+    /// Offset of the camera's timestamps against those of the other cameras, nanoseconds; subtracted before frames are joined.
+    /// 0 for cameras that are only rendered.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub time_offset_nanos: i64,
-    /// Correction of its colours towards those of the other cameras, before they are used.
+    /// Correction of the camera's colours towards those of the other cameras.
     #[serde(default, skip_serializing_if = "is_unmatched")]
     pub color: ColorMatch,
 }
@@ -291,14 +290,31 @@ fn is_unmatched(color: &ColorMatch) -> bool {
 }
 
 impl Camera {
-    /// Width and height of its images, pixels.
+    /// Creates a camera without time offset or colour correction.
+    ///
+    /// ```
+    /// use flyrig_types::{Camera, Intrinsics, Isometry};
+    /// use glam::{DVec2, DVec3};
+    ///
+    /// let pose = Isometry::look_at(DVec3::new(0.0, -3.0, 1.0), DVec3::Z, DVec3::Z);
+    /// let camera = Camera::new("front", Intrinsics::pinhole(640, 480, 500.0), pose);
+    /// let pixel = camera.project(DVec3::new(0.3, 0.0, 1.0)).unwrap();
+    /// assert!(pixel.distance(DVec2::new(369.5, 239.5)) < 1e-9);
+    /// assert!(camera.project(DVec3::new(0.0, -4.0, 1.0)).is_none(), "behind the camera");
+    /// ```
+    #[must_use]
+    pub fn new(id: impl Into<CameraId>, intrinsics: Intrinsics, camera_from_world: Isometry) -> Self {
+        Self { id: id.into(), intrinsics, camera_from_world, time_offset_nanos: 0, color: ColorMatch::NONE }
+    }
+
+    /// Returns the width and height of the images, pixels.
     #[must_use]
     pub fn size(&self) -> [u32; 2] {
         [self.intrinsics.width, self.intrinsics.height]
     }
 
-    /// Pixel of a world point; `None` behind the camera, closer than 1 mm to its plane, or beyond
-    /// the lens model's valid radius.
+    /// Projects a world point, metres, to a pixel; `None` behind the camera, less than 1 mm in front of it, or beyond the lens's
+    /// valid radius.
     #[must_use]
     pub fn project(&self, world: DVec3) -> Option<DVec2> {
         let point = self.camera_from_world.transform_point(world);
@@ -312,7 +328,7 @@ impl Camera {
         Some(self.intrinsics.lens.distort(ideal) * self.intrinsics.focal_px + self.intrinsics.center_px)
     }
 
-    /// Unit direction in world axes of the ray through a pixel; `None` where the lens has none.
+    /// Returns the unit direction, world axes, of the ray through a pixel; `None` where the lens has none.
     #[must_use]
     pub fn ray(&self, pixel: DVec2) -> Option<DVec3> {
         let distorted = (pixel - self.intrinsics.center_px) / self.intrinsics.focal_px;
@@ -320,16 +336,39 @@ impl Camera {
         Some((self.camera_from_world.rotation.inverse() * ideal.extend(1.0)).normalize())
     }
 
-    /// Camera centre in the world, metres.
+    /// Returns the camera's centre in the world, metres.
     #[must_use]
     pub fn position(&self) -> DVec3 {
         self.camera_from_world.inverse().translation
     }
 
-    /// Checks every number.
+    /// Returns the camera of images that are halved `level` times, each pixel the mean of four. Pixel centres lie at integers; an odd
+    /// last row or column is dropped.
+    ///
+    /// ```
+    /// use flyrig_types::{Camera, Intrinsics, Isometry};
+    /// use glam::DVec2;
+    ///
+    /// let half = Camera::new("front", Intrinsics::pinhole(1280, 720, 900.0), Isometry::IDENTITY).halved(1);
+    /// assert_eq!(half.size(), [640, 360]);
+    /// assert_eq!(half.intrinsics.center_px, DVec2::new(319.5, 179.5));
+    /// ```
+    #[must_use]
+    pub fn halved(&self, level: u32) -> Self {
+        let mut camera = self.clone();
+        let share = 0.5f64.powi(level as i32);
+        let intrinsics = &mut camera.intrinsics;
+        intrinsics.focal_px *= share;
+        intrinsics.center_px = (intrinsics.center_px + 0.5) * share - 0.5;
+        intrinsics.width >>= level;
+        intrinsics.height >>= level;
+        camera
+    }
+
+    /// Checks all numbers.
     ///
     /// # Errors
-    /// [`CameraError`] names the field.
+    /// [`CameraError`] names camera and field.
     pub fn validate(&self) -> Result<(), CameraError> {
         let camera = || self.id.clone();
         let i = &self.intrinsics;
@@ -362,17 +401,17 @@ impl Camera {
     }
 }
 
-/// The cameras of a capture, in a fixed order that frame sets follow.
+/// Cameras of a capture, in a fixed order that frame sets follow.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Rig {
-    /// In rig order.
+    /// Cameras in rig order.
     pub cameras: Vec<Camera>,
-    /// Unit vector against gravity, world axes.
+    /// Unit vector against gravity, in world axes.
     pub world_up: DVec3,
 }
 
 impl Rig {
-    /// Returns the point that the cameras look at: closest to all optical axes, in the least-squares sense; world metres.
+    /// Returns the point closest to all optical axes in the least-squares sense, world metres.
     #[must_use]
     pub fn center_of_attention(&self) -> DVec3 {
         let mut normal = DMat3::from_diagonal(DVec3::splat(1e-6));
@@ -392,7 +431,7 @@ impl Rig {
         center
     }
 
-    /// Checks every camera and that names are unique.
+    /// Checks all cameras, and that their names are unique.
     ///
     /// # Errors
     /// [`CameraError`] names camera and field.
@@ -406,13 +445,13 @@ impl Rig {
         Ok(())
     }
 
-    /// Slot of a camera.
+    /// Returns the slot of a camera, `None` if the rig has none of this name.
     #[must_use]
     pub fn slot(&self, id: &CameraId) -> Option<usize> {
         self.cameras.iter().position(|camera| camera.id == *id)
     }
 
-    /// World axis closest to "up" in the cameras' images: what a data set that does not say means.
+    /// Returns the world axis closest to "up" in the cameras' images, for data sets that do not state it.
     #[must_use]
     pub fn guess_world_up(cameras: &[Camera]) -> DVec3 {
         let up: DVec3 = cameras.iter().map(|c| c.camera_from_world.rotation.inverse() * DVec3::NEG_Y).sum();

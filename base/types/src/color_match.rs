@@ -1,29 +1,30 @@
-//! Correction of a camera's colours towards those of the other cameras of its rig.
+//! Correction of a camera's colours towards those of its rig.
 
+use flyrig_model::srgb;
 use serde::{Deserialize, Serialize};
 
-/// Turns the colours of one camera into those that the rig's cameras agree on.
+/// Colour correction of one camera towards the colours that the rig's cameras agree on.
 ///
-/// For the sRGB value `s` in 0..=1 of a channel, at the distance `r` from the principal point as a share of half the image's diagonal,
+/// For the sRGB value `s` in 0..=1 of a channel, at the distance `r` from the principal point in halves of the image's diagonal,
 /// the corrected light is `gain · linear(s^exponent) · exp(falloff[0] r² + falloff[1] r⁴)`, where `linear` decodes sRGB.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ColorMatch {
-    /// Factors of red, green and blue: exposure and white balance.
+    /// Factors of red, green and blue light: exposure and white balance.
     pub gain: [f64; 3],
-    /// Response: 1 for a camera whose middle tones are as bright as those of the others.
+    /// Response; 1 for a camera whose middle tones are as bright as those of the others.
     #[serde(default = "one")]
     pub exponent: f64,
-    /// Vignetting: brightening towards the corners.
+    /// Compensation of vignetting: brightening towards the corners.
     #[serde(default)]
     pub falloff: [f64; 2],
 }
 
 impl ColorMatch {
-    /// Leaves colours as they are.
+    /// Correction that leaves colours as they are.
     pub const NONE: Self = Self { gain: [1.0; 3], exponent: 1.0, falloff: [0.0; 2] };
 
-    /// Returns the first number that is out of range: its key, the value, and the expected range.
+    /// Returns the first number out of range: its key, its value, and the permitted range.
     #[must_use]
     pub fn fault(&self) -> Option<(&'static str, f64, &'static str)> {
         let outside = |value: f64, from: f64, to: f64| !(from..=to).contains(&value);
@@ -41,8 +42,7 @@ impl ColorMatch {
         let corner = (self.falloff[0] * r2 + self.falloff[1] * r2 * r2).exp();
         std::array::from_fn(|k| {
             let bent = srgb[k].clamp(0.0, 1.0).powf(self.exponent);
-            let light = if bent <= 0.040_45 { bent / 12.92 } else { ((bent + 0.055) / 1.055).powf(2.4) };
-            let corrected = self.gain[k] * light * corner;
+            let corrected = self.gain[k] * srgb::decode(bent, f64::powf) * corner;
             // NaN fails the comparison.
             if corrected > 0.0 { corrected.min(1.0) } else { 0.0 }
         })

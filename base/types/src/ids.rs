@@ -1,4 +1,4 @@
-//! Identities that survive reconnects and files.
+//! Camera names, which survive reconnects and files.
 
 use std::{fmt, sync::Arc};
 
@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 pub struct CameraId(Arc<str>);
 
 impl CameraId {
-    /// The id as text.
+    /// Returns the name as text.
     #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0

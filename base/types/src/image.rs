@@ -1,10 +1,10 @@
-//! Pixels: what they mean is a type, not a guess.
+//! Images and masks whose pixel format is part of the type.
 
 use std::{fmt, ops::Deref, sync::Arc};
 
 use crate::camera::MAX_IMAGE_SIDE;
 
-/// Layout and meaning of the bytes of an [`Image`].
+/// Layout and colour space of the bytes of an [`Image`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum PixelFormat {
     /// 3 bytes a pixel, sRGB red green blue.
@@ -34,7 +34,7 @@ pub enum PixelFormat {
 }
 
 impl PixelFormat {
-    /// Bytes of a `width` x `height` image without row padding; `None` for compressed formats.
+    /// Returns the bytes of a `width` x `height` image without row padding; `None` for compressed formats.
     #[must_use]
     pub fn byte_len(self, width: u32, height: u32) -> Option<usize> {
         let pixels = width as usize * height as usize;
@@ -49,9 +49,9 @@ impl PixelFormat {
     }
 }
 
-/// Takes the bytes of a dropped [`PixelBuffer`] back: a pool, or a driver's queue.
+/// Owner of leased bytes, which it takes back from a dropped [`PixelBuffer`]: a pool, or a driver's queue.
 pub trait Recycle: Send + Sync {
-    /// Called once, from whichever thread drops the last user of the bytes.
+    /// Takes the bytes back. Called once, on the thread that drops the buffer.
     fn recycle(&self, bytes: Vec<u8>);
 }
 
@@ -62,7 +62,7 @@ pub struct PixelBuffer {
 }
 
 impl PixelBuffer {
-    /// Bytes that go back to `owner` when dropped.
+    /// Creates a buffer whose bytes go back to `owner` when it is dropped.
     #[must_use]
     pub fn leased(bytes: Vec<u8>, owner: Arc<dyn Recycle>) -> Self {
         Self { bytes, owner: Some(owner) }
@@ -97,7 +97,7 @@ impl fmt::Debug for PixelBuffer {
     }
 }
 
-/// Why bytes are not an image.
+/// Error of bytes that are not an image or mask of the stated size.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ImageError {
     /// A side is 0 or beyond [`MAX_IMAGE_SIDE`].
@@ -111,17 +111,34 @@ pub enum ImageError {
     /// The byte count does not fit the size and format.
     #[error("{format:?} image of {width}x{height} needs {needed} bytes but has {found}")]
     ByteCount {
-        /// What the bytes were said to be.
+        /// Stated format.
         format: PixelFormat,
         /// Pixels.
         width: u32,
         /// Pixels.
         height: u32,
-        /// Bytes the format needs.
+        /// Bytes that the format needs.
         needed: usize,
         /// Bytes given.
         found: usize,
     },
+}
+
+/// Accessors of the fields `width` and `height`.
+macro_rules! sides {
+    () => {
+        /// Returns the width, pixels.
+        #[must_use]
+        pub fn width(&self) -> u32 {
+            self.width
+        }
+
+        /// Returns the height, pixels.
+        #[must_use]
+        pub fn height(&self) -> u32 {
+            self.height
+        }
+    };
 }
 
 /// One image in memory, rows top to bottom without padding.
@@ -134,10 +151,19 @@ pub struct Image {
 }
 
 impl Image {
-    /// Checks the size against the byte count.
+    /// Creates an image from bytes of matching size.
+    ///
+    /// ```
+    /// use flyrig_types::{Image, PixelFormat};
+    ///
+    /// let image = Image::new(4, 2, PixelFormat::Rgb8, vec![128; 24])?;
+    /// assert_eq!((image.width(), image.height()), (4, 2));
+    /// assert!(Image::new(4, 2, PixelFormat::Rgb8, vec![128; 23]).is_err());
+    /// # Ok::<(), flyrig_types::ImageError>(())
+    /// ```
     ///
     /// # Errors
-    /// [`ImageError`] when a side is 0 or absurd, or the byte count does not fit.
+    /// [`ImageError`] when a side is 0 or above [`MAX_IMAGE_SIDE`], or the byte count does not fit.
     pub fn new(
         width: u32,
         height: u32,
@@ -154,25 +180,15 @@ impl Image {
         }
     }
 
-    /// Pixels.
-    #[must_use]
-    pub fn width(&self) -> u32 {
-        self.width
-    }
+    sides!();
 
-    /// Pixels.
-    #[must_use]
-    pub fn height(&self) -> u32 {
-        self.height
-    }
-
-    /// What the bytes mean.
+    /// Returns the pixel format.
     #[must_use]
     pub fn format(&self) -> PixelFormat {
         self.format
     }
 
-    /// The bytes, see [`PixelFormat`].
+    /// Returns the bytes in the layout of [`PixelFormat`].
     #[must_use]
     pub fn bytes(&self) -> &[u8] {
         &self.bytes
@@ -188,10 +204,10 @@ pub struct Mask {
 }
 
 impl Mask {
-    /// Checks the size against the byte count.
+    /// Creates a mask from one byte of coverage per pixel.
     ///
     /// # Errors
-    /// [`ImageError`] when a side is 0 or absurd, or the byte count does not fit.
+    /// [`ImageError`] when a side is 0 or above [`MAX_IMAGE_SIDE`], or the byte count does not fit.
     pub fn new(width: u32, height: u32, coverage: Vec<u8>) -> Result<Self, ImageError> {
         check_size(width, height)?;
         let needed = width as usize * height as usize;
@@ -207,31 +223,21 @@ impl Mask {
         Ok(Self { width, height, coverage })
     }
 
-    /// Pixels.
-    #[must_use]
-    pub fn width(&self) -> u32 {
-        self.width
-    }
+    sides!();
 
-    /// Pixels.
-    #[must_use]
-    pub fn height(&self) -> u32 {
-        self.height
-    }
-
-    /// Coverage, row by row.
+    /// Returns the coverage, row by row.
     #[must_use]
     pub fn coverage(&self) -> &[u8] {
         &self.coverage
     }
 
-    /// Pixels with at least half coverage.
+    /// Counts the pixels of at least half coverage.
     #[must_use]
     pub fn area_px(&self) -> usize {
         self.coverage.iter().filter(|&&c| c >= 128).count()
     }
 
-    /// Smallest box around pixels of at least half coverage as `[x0, y0, x1, y1]`, ends excluded;
+    /// Returns the smallest box around the pixels of at least half coverage as `[x0, y0, x1, y1]`, ends excluded;
     /// `None` when the mask is empty.
     #[must_use]
     pub fn bounding_box(&self) -> Option<[u32; 4]> {

@@ -13,23 +13,34 @@ pub struct Isometry {
 }
 
 impl Isometry {
-    /// The motion that moves nothing.
+    /// Motion that moves nothing.
     pub const IDENTITY: Self = Self { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
 
-    /// From a rotation and a translation.
+    /// Creates a motion from a unit quaternion and a translation, metres.
     #[must_use]
     pub fn new(rotation: DQuat, translation: DVec3) -> Self {
         Self { rotation, translation }
     }
 
-    /// From a rotation matrix (orthonormal, determinant 1) and a translation.
+    /// Creates a motion from a rotation matrix (orthonormal, determinant 1) and a translation, metres.
     #[must_use]
     pub fn from_matrix(rotation: DMat3, translation: DVec3) -> Self {
         Self { rotation: DQuat::from_mat3(&rotation).normalize(), translation }
     }
 
-    /// `camera_from_world` of a camera at `eye` that looks at `target`; `up` is a world direction
-    /// that is not parallel to the line of sight.
+    /// Returns `camera_from_world` of a camera at `eye` that looks at `target`, world metres; `up` is a world direction that is
+    /// not parallel to the line of sight.
+    ///
+    /// ```
+    /// use flyrig_types::Isometry;
+    /// use glam::DVec3;
+    ///
+    /// let eye = DVec3::new(0.0, -3.0, 1.0);
+    /// let camera_from_world = Isometry::look_at(eye, DVec3::Z, DVec3::Z);
+    /// assert!(camera_from_world.transform_point(DVec3::Z).distance(DVec3::new(0.0, 0.0, 3.0)) < 1e-12);
+    /// let world_from_camera = camera_from_world.inverse();
+    /// assert!(world_from_camera.translation.distance(eye) < 1e-12);
+    /// ```
     #[must_use]
     pub fn look_at(eye: DVec3, target: DVec3, up: DVec3) -> Self {
         let forward = (target - eye).normalize_or(DVec3::X);
@@ -39,26 +50,26 @@ impl Isometry {
         Self::from_matrix(camera_from_world, -(camera_from_world * eye))
     }
 
-    /// The reverse motion.
+    /// Returns the reverse motion.
     #[must_use]
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.inverse();
         Self { rotation, translation: -(rotation * self.translation) }
     }
 
-    /// Moves a point.
+    /// Transforms a point, metres.
     #[must_use]
     pub fn transform_point(&self, point: DVec3) -> DVec3 {
         self.rotation * point + self.translation
     }
 
-    /// As a homogeneous matrix.
+    /// Returns the homogeneous matrix.
     #[must_use]
     pub fn to_matrix(&self) -> DMat4 {
         DMat4::from_rotation_translation(self.rotation, self.translation)
     }
 
-    /// Whether every number is finite.
+    /// Returns whether all numbers are finite.
     #[must_use]
     pub fn is_finite(&self) -> bool {
         self.rotation.is_finite() && self.translation.is_finite()
@@ -68,7 +79,7 @@ impl Isometry {
 impl std::ops::Mul for Isometry {
     type Output = Self;
 
-    /// `a_from_b * b_from_c = a_from_c`.
+    /// Chains two motions: `a_from_b * b_from_c = a_from_c`.
     fn mul(self, rhs: Self) -> Self {
         Self {
             rotation: (self.rotation * rhs.rotation).normalize(),

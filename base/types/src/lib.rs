@@ -1,15 +1,15 @@
-//! The words every flyrig crate speaks: ids, clocks, images, frames, camera models and poses.
+//! Types of all crates: ids, images, frames, camera models, poses; locks and supervised threads.
 //!
 //! # Conventions
 //!
-//! - **World**: right-handed, metres. The rig states which way is up ([`Rig::world_up`]); our own
-//!   rigs use z up, a data set keeps its own axes.
+//! - **World**: right-handed, metres. The rig states the direction of up ([`Rig::world_up`]): z in rigs that this program
+//!   calibrates; data sets keep their own axes.
 //! - **Camera**: OpenCV axes, x right, y down, z forward. Pixel centres lie at integer coordinates.
 //! - **Transforms** are named `dst_from_src`: `camera_from_world * point_in_world = point_in_camera`.
-//! - **Clock**: nanoseconds of `CLOCK_MONOTONIC` of the host that captured; names end in `_nanos`.
-//!   An image's time is the middle of its exposure.
-//! - **Angles** are radians, other units stand in the name.
-//! - **Colour** is sRGB with 8 bits on the outside and linear `f32` inside.
+//! - **Clock**: nanoseconds of `CLOCK_MONOTONIC` of the capturing host; names end in `_nanos`. The time of an image is the
+//!   middle of its exposure.
+//! - **Angles** are radians; other units stand in the name.
+//! - **Colour** is 8-bit sRGB in files and messages, linear `f32` in computations.
 
 mod camera;
 mod color_match;
@@ -17,6 +17,7 @@ mod frame;
 mod ids;
 mod image;
 mod isometry;
+mod locks;
 mod panics;
 mod person;
 mod pose;
@@ -31,6 +32,7 @@ pub use frame::{Frame, FrameSet, SetKind};
 pub use ids::CameraId;
 pub use image::{Image, ImageError, Mask, PixelBuffer, PixelFormat, Recycle};
 pub use isometry::Isometry;
+pub use locks::{lock, wait, wait_timeout};
 pub use panics::caught;
 pub use person::PersonId;
 pub use pose::{Pose, PoseError, PoseTrack};

@@ -1,4 +1,4 @@
-//! Panics, caught.
+//! Panics as errors.
 
 use std::{
     any::Any,
@@ -10,14 +10,14 @@ fn panic_text(panic: &(dyn Any + Send)) -> &str {
     panic.downcast_ref::<&str>().copied().or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("?")
 }
 
-/// Runs a call. Everything that the call has touched must be whole after a panic, or dropped.
+/// Runs `call` and returns its result. After a panic, all state that the call has touched must be consistent, or be dropped.
 ///
 /// # Errors
-/// The text of its panic.
+/// The panic's text.
 pub fn caught<T>(call: impl FnOnce() -> T) -> Result<T, String> {
     catch_unwind(AssertUnwindSafe(call)).map_err(|panic| {
         let text = panic_text(&*panic).to_owned();
-        // What the panic carries is somebody else's code too.
+        // Dropping the payload runs foreign code, which may panic too.
         let _ = catch_unwind(AssertUnwindSafe(|| drop(panic)));
         text
     })

@@ -4,8 +4,8 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// Identifies a person within a session and on the wire; the first person is 0. An id is never given to another person
-/// while the session lives.
+/// Number of a person within a session and on the wire; the first person is 0. No number is given to a second person in a
+/// session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct PersonId(pub u32);

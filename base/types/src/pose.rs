@@ -1,58 +1,58 @@
-//! Body poses and how they move in time.
+//! Poses of a body and their course over time.
 
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// Pose of a skeleton: where its root is in the world, and how each joint is turned.
+/// Pose of a skeleton: position of its root in the world and rotation of each joint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Pose {
     /// Position of the root joint in the world, metres.
     pub root_translation: DVec3,
-    /// Per joint `parent_from_joint` rotation in the skeleton's order; of the root joint `world_from_joint`.
+    /// Rotation `parent_from_joint` of each joint in the skeleton's order; `world_from_joint` for the root.
     pub joint_rotations: Vec<DQuat>,
 }
 
-/// Why poses are refused.
+/// Error of poses that form no [`PoseTrack`].
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PoseError {
-    /// No key poses at all.
+    /// The track has no keys.
     #[error("the pose track is empty")]
     Empty,
-    /// Times must grow.
+    /// Times do not increase.
     #[error("pose {index} of the track is at {nanos} ns, not after the pose before it")]
     Order {
-        /// Which pose.
+        /// Index of the pose.
         index: usize,
-        /// Its time.
+        /// Time of the pose, nanoseconds.
         nanos: i64,
     },
-    /// A pose of another skeleton.
+    /// A pose has another number of joints than the first.
     #[error("pose {index} of the track has {found} joints, the first pose has {expected}")]
     JointCount {
-        /// Which pose.
+        /// Index of the pose.
         index: usize,
         /// Joints found.
         found: usize,
         /// Joints of the first pose.
         expected: usize,
     },
-    /// NaN, infinite or not a rotation.
+    /// A number is NaN or infinite, or a quaternion is no rotation.
     #[error("pose {index} of the track holds a number that is not finite or a rotation that is not of unit length")]
     NotFinite {
-        /// Which pose.
+        /// Index of the pose.
         index: usize,
     },
 }
 
 impl Pose {
-    /// Whether every number is finite and every rotation is of unit length.
+    /// Returns whether all numbers are finite and all rotations have unit length.
     #[must_use]
     pub fn is_valid(&self) -> bool {
         self.root_translation.is_finite()
             && self.joint_rotations.iter().all(|q| q.is_finite() && (q.length_squared() - 1.0).abs() < 1e-4)
     }
 
-    /// Between two poses of one skeleton, `t` in 0..=1 (shortest arc a joint).
+    /// Interpolates between two poses of one skeleton, `t` in 0..=1, along the shortest arc of each joint.
     #[must_use]
     pub fn interpolate(&self, other: &Self, t: f64) -> Self {
         Self {
@@ -67,14 +67,25 @@ impl Pose {
     }
 }
 
-/// A pose as a curve in time.
+/// Motion of a skeleton: key poses with times, at least one.
+///
+/// ```
+/// use flyrig_types::{Pose, PoseTrack};
+/// use glam::{DQuat, DVec3};
+///
+/// let pose = |x: f64| Pose { root_translation: DVec3::X * x, joint_rotations: vec![DQuat::IDENTITY] };
+/// let track = PoseTrack::new(vec![(0, pose(0.0)), (1_000_000_000, pose(2.0))])?;
+/// assert_eq!(track.at(250_000_000).root_translation.x, 0.5);
+/// assert_eq!(track.at(5_000_000_000).root_translation.x, 2.0);
+/// # Ok::<(), flyrig_types::PoseError>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PoseTrack {
     keys: Vec<(i64, Pose)>,
 }
 
 impl PoseTrack {
-    /// From poses at growing times (nanoseconds).
+    /// Creates a track from poses at increasing times, nanoseconds.
     ///
     /// # Errors
     /// [`PoseError`] names the pose.
@@ -95,7 +106,7 @@ impl PoseTrack {
         Ok(Self { keys })
     }
 
-    /// Pose at a time; held constant before the first and after the last key.
+    /// Returns the pose at a time, nanoseconds; constant before the first and after the last key.
     #[must_use]
     pub fn at(&self, nanos: i64) -> Pose {
         let next = self.keys.partition_point(|(t, _)| *t <= nanos);
@@ -106,7 +117,7 @@ impl PoseTrack {
         before.interpolate(after, since(nanos) / since(*t1))
     }
 
-    /// Pose at a time of a motion that starts over after its end, and ran before its start too.
+    /// Returns the pose at a time, nanoseconds, of the motion repeated without end in both directions.
     #[must_use]
     pub fn at_repeated(&self, nanos: i64) -> Pose {
         let (first, last) = self.span_nanos();
@@ -115,8 +126,8 @@ impl PoseTrack {
         self.at(i64::try_from(i128::from(first) + into).unwrap_or(first))
     }
 
-    /// The motion laid end to end until it covers `until_nanos` too; where its end does not meet its start it jumps
-    /// within a nanosecond, as [`Self::at_repeated`] does.
+    /// Returns the motion repeated until it covers `until_nanos`. Where its end does not meet its start it jumps within a
+    /// nanosecond, as [`Self::at_repeated`] does.
     #[must_use]
     pub fn repeated_until(&self, until_nanos: i64) -> Self {
         let (first, last) = self.span_nanos();
@@ -134,13 +145,13 @@ impl PoseTrack {
         Self { keys }
     }
 
-    /// Time of the first and the last key.
+    /// Returns the times of the first and last key, nanoseconds.
     #[must_use]
     pub fn span_nanos(&self) -> (i64, i64) {
         (self.keys[0].0, self.keys[self.keys.len() - 1].0)
     }
 
-    /// The keys.
+    /// Returns the keys: time, nanoseconds, and pose.
     #[must_use]
     pub fn keys(&self) -> &[(i64, Pose)] {
         &self.keys

@@ -1,12 +1,12 @@
-//! An image drawn by flyrig.
+//! Rendered images.
 
 /// A rendered view: sRGB with straight alpha, 4 bytes a pixel, row by row.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RenderedView {
-    /// Pixels.
+    /// Width, pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height, pixels.
     pub height: u32,
-    /// `4 * width * height` bytes.
+    /// Red, green, blue and alpha of each pixel: `4 * width * height` bytes.
     pub rgba: Vec<u8>,
 }

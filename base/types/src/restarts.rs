@@ -1,16 +1,26 @@
-//! How often work that failed is restarted.
+//! Rate limit for restarts of failed work.
 
 use std::time::{Duration, Instant};
 
-/// So many restarts follow each other at once, each of work that lasted for less than [`WINDOW`].
+/// Restarts in a row without a long pause, each of work that lasted for less than [`WINDOW`].
 const AT_ONCE: u32 = 5;
-/// After these one restart is made in so long.
+/// Pause between further restarts.
 const WINDOW: Duration = Duration::from_secs(60);
-/// A restart is never earlier after the failure.
+/// Shortest pause between a failure and the restart.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// Spaces the restarts of one source or thread out: one that fails for ever must not keep a core and a bus busy. Five follow
-/// each other at once, then one a minute; whoever cannot wait so long gives up when they are [exhausted](Self::are_exhausted).
+/// Rate limit for the restarts of one source or thread, so that one that always fails keeps neither a core nor a bus busy.
+/// Five restarts follow each other at once, then one per minute. Callers that cannot wait so long give up once the restarts are
+/// [exhausted](Self::are_exhausted).
+///
+/// ```
+/// use std::time::{Duration, Instant};
+///
+/// let mut restarts = flyrig_types::Restarts::default();
+/// let failed = Instant::now();
+/// assert_eq!(restarts.after_failure(failed), failed + Duration::from_millis(100));
+/// assert!(!restarts.are_exhausted());
+/// ```
 #[derive(Debug, Default)]
 pub struct Restarts {
     last: Option<Instant>,
@@ -18,7 +28,7 @@ pub struct Restarts {
 }
 
 impl Restarts {
-    /// Returns when work that has failed `now` may be restarted, and counts that restart.
+    /// Returns the time at which work that has failed `now` may be restarted, and counts that restart.
     pub fn after_failure(&mut self, now: Instant) -> Instant {
         if self.last.is_some_and(|last| now.saturating_duration_since(last) >= WINDOW) {
             self.in_a_row = 0;
@@ -32,7 +42,7 @@ impl Restarts {
         due
     }
 
-    /// Returns whether the restart counted last is beyond those that may follow each other at once.
+    /// Returns whether the latest restart is beyond those that may follow each other at once.
     #[must_use]
     pub fn are_exhausted(&self) -> bool {
         self.in_a_row > AT_ONCE

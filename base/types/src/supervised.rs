@@ -2,27 +2,29 @@
 
 use std::{
     io,
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Mutex, MutexGuard},
     thread::{Builder, JoinHandle, Thread},
     time::Instant,
 };
 
-use crate::{Restarts, caught};
+use crate::locks::lock;
+use crate::panics::caught;
+use crate::restarts::Restarts;
 
 /// Health of a thread.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ThreadHealth {
     /// The thread's name.
     pub name: String,
-    /// Times that its work was restarted after a panic.
+    /// Number of restarts after a panic.
     pub restarts: u64,
     /// Text of the last panic.
     pub panic: Option<String>,
-    /// Whether its work has ended for good, after more panics than [`Restarts`] lets follow each other at once.
+    /// Whether the work has ended for good, after more panics in a row than [`Restarts`] allows.
     pub has_failed: bool,
 }
 
-/// View of a [`SupervisedThread`] for those who do not own it.
+/// Shared view of the health of a [`SupervisedThread`].
 #[derive(Debug, Clone)]
 pub struct ThreadWatch(Arc<Mutex<ThreadHealth>>);
 
@@ -34,11 +36,18 @@ impl ThreadWatch {
     }
 
     fn lock(&self) -> MutexGuard<'_, ThreadHealth> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 }
 
-/// Thread whose work is restarted after a panic, as often as [`Restarts`] lets it at once; then it has failed for good.
+/// Thread whose work is restarted after a panic, as often in a row as [`Restarts`] allows; then it has failed for good.
+///
+/// ```
+/// let mut thread = flyrig_types::SupervisedThread::start("worker", || ())?;
+/// thread.join();
+/// assert_eq!(thread.health().restarts, 0);
+/// # Ok::<(), std::io::Error>(())
+/// ```
 #[derive(Debug)]
 pub struct SupervisedThread {
     watch: ThreadWatch,
@@ -46,11 +55,11 @@ pub struct SupervisedThread {
 }
 
 impl SupervisedThread {
-    /// Starts a thread that does `work` until it returns. After a panic `work` is called again, shortly afterwards; everything
-    /// that it has touched must be whole then.
+    /// Starts a thread that runs `work` until it returns. Shortly after a panic `work` is called again; all state that it has
+    /// touched must be consistent then.
     ///
     /// # Errors
-    /// The system's when it gives no thread.
+    /// Error of the system when it starts no thread.
     pub fn start(name: &str, mut work: impl FnMut() + Send + 'static) -> io::Result<Self> {
         let health = ThreadHealth { name: name.to_owned(), ..ThreadHealth::default() };
         let watch = ThreadWatch(Arc::new(Mutex::new(health)));
@@ -75,7 +84,7 @@ impl SupervisedThread {
         Ok(Self { watch, thread: Some(thread) })
     }
 
-    /// Returns a view of the thread that may outlive this.
+    /// Returns a view of the thread's health that may outlive this.
     #[must_use]
     pub fn watch(&self) -> &ThreadWatch {
         &self.watch
@@ -87,13 +96,13 @@ impl SupervisedThread {
         self.watch.health()
     }
 
-    /// Returns the thread, to wake it; `None` once it was joined.
+    /// Returns the thread, to unpark it; `None` once it was joined.
     #[must_use]
     pub fn thread(&self) -> Option<&Thread> {
         self.thread.as_ref().map(JoinHandle::thread)
     }
 
-    /// Waits for the end of the work; the second time nothing.
+    /// Waits for the end of the work. Does nothing when called again.
     pub fn join(&mut self) {
         // Panics of the work were caught inside.
         let _ = self.thread.take().map(JoinHandle::join);

@@ -1,4 +1,4 @@
-//! Files that appear whole or not at all.
+//! Atomic replacement of files.
 
 use std::{
     fs,
@@ -6,10 +6,10 @@ use std::{
     path::Path,
 };
 
-/// Writes beside the target, then renames over it, so that a reader never meets half a file.
+/// Writes a file beside `path`, then renames it over `path`, so that readers never meet half a file.
 ///
 /// # Errors
-/// The system's; the old file, if any, is then untouched.
+/// Error of the system or of `content`; an old file is then untouched.
 pub fn write_whole(
     path: &Path,
     content: impl FnOnce(&mut BufWriter<fs::File>) -> io::Result<()>,
@@ -28,7 +28,7 @@ pub fn write_whole(
         fs::rename(&partial, path)
     };
     write().inspect_err(|_| {
-        // Nothing more can be done when even that fails; the first error is the one worth telling.
+        // The first error is the one to report, even if this fails too.
         let _ = fs::remove_file(&partial);
     })
 }

@@ -2,9 +2,11 @@
 
 use std::{
     collections::VecDeque,
-    sync::{Condvar, Mutex, MutexGuard, PoisonError},
+    sync::{Condvar, Mutex, MutexGuard},
     time::{Duration, Instant},
 };
+
+use flyrig_types::{lock, wait, wait_timeout};
 
 /// Why [`LatestQueue::pop`] gave nothing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -44,7 +46,7 @@ impl<T> LatestQueue<T> {
 
     /// No code of ours panics with the lock held, and the state is whole at every step.
     fn lock(&self) -> MutexGuard<'_, State<T>> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     /// Puts an element in, at once. Gives the oldest one back, as dropped, when the queue was full.
@@ -71,7 +73,7 @@ impl<T> LatestQueue<T> {
     pub fn push_wait(&self, item: T) -> Result<(), T> {
         let mut state = self.lock();
         while !state.closed && state.items.len() >= self.capacity {
-            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+            state = wait(&self.changed, state);
         }
         if state.closed {
             return Err(item);
@@ -103,11 +105,8 @@ impl<T> LatestQueue<T> {
             if left.is_zero() {
                 return Err(PopError::Timeout);
             }
-            state = if deadline.is_none() {
-                self.changed.wait(state).unwrap_or_else(PoisonError::into_inner)
-            } else {
-                self.changed.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0
-            };
+            state =
+                if deadline.is_none() { wait(&self.changed, state) } else { wait_timeout(&self.changed, state, left) };
         }
     }
 

@@ -1,6 +1,8 @@
 //! Puts the frames of several threads into the order of capture.
 
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Condvar, Mutex, MutexGuard};
+
+use flyrig_types::{lock, wait};
 
 /// A merge by time: a thread with a frame waits until no other can have an earlier one. Reading and
 /// decoding go on in parallel. Assumes that each thread's times grow; where they do not, the order
@@ -27,7 +29,7 @@ impl Turns {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     /// Waits until the frame at `nanos`, or the time until which the thread has none, is the earliest of all, the lower slot first
@@ -46,7 +48,7 @@ impl Turns {
             if is_first {
                 return true;
             }
-            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+            state = wait(&self.changed, state);
         }
         false
     }

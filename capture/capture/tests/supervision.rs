@@ -17,6 +17,7 @@ use flyrig_capture::{
     CameraSource, CameraStats, CaptureError, CaptureErrorKind, CaptureThreads, FrameStage, Pacing, PopError,
     SourceHealth, SourceOpener, ThreadsConfig,
 };
+use flyrig_model::SplitMix64;
 use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
 const MINUTE: Duration = Duration::from_secs(60);
@@ -438,15 +439,16 @@ fn what_is_read_without_loss_is_opened_first_and_never_anew() {
     }
 }
 
-/// A generator of small numbers (splitmix64).
-struct Random(u64);
+/// Seeded behaviour of a source or stage.
+struct Random(SplitMix64);
 
 impl Random {
+    fn new(seed: u64) -> Self {
+        Self(SplitMix64(seed))
+    }
+
     fn below(&mut self, end: u64) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let x = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        (x ^ (x >> 31)) % end
+        self.0.below(end)
     }
 
     fn step(&mut self, gate: &Arc<Gate>) -> Step {
@@ -483,12 +485,12 @@ impl FrameStage for Moody {
 #[test]
 fn whatever_cameras_do_the_end_comes() {
     for seed in 0..40 {
-        let mut random = Random(seed);
+        let mut random = Random::new(seed);
         let (gate, in_opener) = (Arc::new(Gate::default()), Arc::new(Gate::default()));
         let openers = (0..3).map(|camera| {
             let name = camera.to_string();
             let (gate, in_opener) = (Arc::clone(&gate), Arc::clone(&in_opener));
-            let mut random = Random(seed * 100 + camera);
+            let mut random = Random::new(seed * 100 + camera);
             let is_ready = random.below(3) == 0;
             let mut open = move || -> Result<Box<dyn CameraSource>, CaptureError> {
                 match random.below(if is_ready { 1 } else { 8 }) {
@@ -517,7 +519,7 @@ fn whatever_cameras_do_the_end_comes() {
         let of_stage = Arc::clone(&gate);
         let stage = move |camera: &CameraId| {
             let seed = camera.as_str().len() as u64 + seed;
-            Box::new(Moody(Random(seed), Arc::clone(&of_stage))) as Box<dyn FrameStage>
+            Box::new(Moody(Random::new(seed), Arc::clone(&of_stage))) as Box<dyn FrameStage>
         };
         let threads = if random.below(2) == 0 {
             CaptureThreads::start_opening_staged(openers, stage, config)

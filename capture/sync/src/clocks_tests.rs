@@ -2,8 +2,8 @@
 
 use flyrig_types::{CameraId, Frame, FrameSet, Image, PixelFormat};
 
-use crate::random::Random;
 use crate::{ClockAligner, SyncSettings, Synchronizer};
+use flyrig_model::SplitMix64;
 
 const PERIOD: i64 = 33_333_333;
 const SECOND: i64 = 1_000_000_000;
@@ -14,10 +14,10 @@ type Arrival = (usize, i64, i64);
 
 /// Frames of cameras that are triggered together; `stamp` makes the camera's stamp of a true time, `none` loses it.
 fn arrivals(
-    random: &mut Random,
+    random: &mut SplitMix64,
     cameras: usize,
     ticks: i64,
-    mut stamp: impl FnMut(&mut Random, usize, i64, i64) -> Option<i64>,
+    mut stamp: impl FnMut(&mut SplitMix64, usize, i64, i64) -> Option<i64>,
 ) -> Vec<Arrival> {
     let mut frames = Vec::new();
     for tick in 0..ticks {
@@ -87,7 +87,7 @@ fn worst(run: &Run, from: i64, master: impl Fn(i64) -> i64) -> i64 {
 fn an_hour_of_drift_with_lost_frames_leaves_less_than_a_millisecond() {
     let ppm = [0, 100, -100, 60];
     let start = [0, 4_000_000, -9_000_000, 12_000_000];
-    let mut random = Random(1);
+    let mut random = SplitMix64(1);
     let frames = arrivals(&mut random, 4, HOUR_FRAMES, |random, camera, _, truth| {
         let lost = random.chance(2);
         let drifted = truth + truth / 1_000_000 * ppm[camera] + start[camera];
@@ -110,7 +110,7 @@ fn an_hour_of_drift_with_lost_frames_leaves_less_than_a_millisecond() {
 #[test]
 fn clocks_with_nothing_in_common_are_matched_by_arrival() {
     let start = [5_000 * SECOND, -7_777_777_777_777, 123, i64::MAX / 2];
-    let mut random = Random(2);
+    let mut random = SplitMix64(2);
     let frames =
         arrivals(&mut random, 4, 3000, |random, camera, _, truth| Some(truth + start[camera] + random.jitter(100_000)));
     let run = run(4, &frames);
@@ -125,7 +125,7 @@ fn clocks_with_nothing_in_common_are_matched_by_arrival() {
 fn a_step_of_any_clock_costs_no_set() {
     for (stepped, step) in [(1, 10 * SECOND), (1, -10 * SECOND), (2, 190_000_000), (0, 10 * SECOND), (0, -10 * SECOND)]
     {
-        let mut random = Random(3);
+        let mut random = SplitMix64(3);
         let frames = arrivals(&mut random, 3, 1500, |random, camera, tick, truth| {
             let stepped = if camera == stepped && tick >= 700 { step } else { 0 };
             Some(truth + stepped + random.jitter(100_000))
@@ -142,7 +142,7 @@ fn a_step_of_any_clock_costs_no_set() {
 #[test]
 fn stamps_that_jump_or_wrap_for_a_moment_are_replaced() {
     for wild in [i64::MIN, i64::MAX, 0, -1, 3 * PERIOD / 2] {
-        let mut random = Random(4);
+        let mut random = SplitMix64(4);
         let frames = arrivals(&mut random, 3, 900, |random, camera, tick, truth| {
             let jump = camera == 1 && tick % 100 == 99;
             Some(if jump { wild } else { truth + random.jitter(100_000) })
@@ -157,7 +157,7 @@ fn stamps_that_jump_or_wrap_for_a_moment_are_replaced() {
 #[test]
 fn the_others_go_on_while_the_master_is_away() {
     for cameras in 2..=4 {
-        let mut random = Random(9);
+        let mut random = SplitMix64(9);
         // The master is away for half a minute.
         let frames = arrivals(&mut random, cameras, 1800, |random, camera, tick, truth| {
             let away = camera == 0 && (300..1200).contains(&tick);
@@ -174,7 +174,7 @@ fn the_others_go_on_while_the_master_is_away() {
 
 #[test]
 fn a_clock_that_wraps_goes_on() {
-    let mut random = Random(5);
+    let mut random = SplitMix64(5);
     let frames = arrivals(&mut random, 2, 1500, |random, camera, _, truth| {
         let base = if camera == 1 { i64::MAX - 800 * PERIOD } else { 0 };
         Some(base.wrapping_add(truth + random.jitter(100_000)))
@@ -190,7 +190,7 @@ fn a_clock_that_wraps_goes_on() {
 
 #[test]
 fn ten_percent_loss_is_counted_frame_by_frame() {
-    let mut random = Random(6);
+    let mut random = SplitMix64(6);
     let mut lost = [0u64; 4];
     let mut lost_instants = 0;
     let mut dropped = [false; 4];
@@ -217,7 +217,7 @@ fn ten_percent_loss_is_counted_frame_by_frame() {
 #[test]
 fn a_camera_that_halves_its_rate_stays_in_every_second_set() {
     for halved in [0, 1] {
-        let mut random = Random(7);
+        let mut random = SplitMix64(7);
         let mut numbers = [0u64; 3];
         let ids = ids(3);
         let mut aligner = ClockAligner::new(&ids, None);
@@ -243,15 +243,15 @@ fn a_camera_that_halves_its_rate_stays_in_every_second_set() {
 fn what_makes_no_sense_does_no_harm() {
     let ids = ids(2);
     let mut aligner = ClockAligner::new(&ids, Some(&"nobody".into()));
-    let mut random = Random(8);
+    let mut random = SplitMix64(8);
     for n in 0..20_000u64 {
         let nanos = match n % 7 {
             0 => i64::MAX,
             1 => i64::MIN,
             2 => 0,
-            _ => random.next() as i64,
+            _ => random.next_u64() as i64,
         };
-        let sequence = if n % 3 == 0 { u64::MAX } else { random.next() };
+        let sequence = if n % 3 == 0 { u64::MAX } else { random.next_u64() };
         let _ = aligner.align(frame(&ids[(n % 2) as usize], sequence, nanos));
     }
     assert!(aligner.clocks().all(|(_, clock)| clock.drift_ppm.is_finite() && clock.residual_nanos.is_finite()));

@@ -298,13 +298,13 @@ fn pair_lag(a: &MotionSignal, b: &MotionSignal, most: i64) -> Option<(f64, f64)>
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Random;
+    use flyrig_model::SplitMix64;
 
     const PERIOD: i64 = 33_333_333;
 
     /// Where two hands of a person are: sums of slow swings.
     fn hands(seed: u64) -> impl Fn(f64) -> [f64; 4] {
-        let mut random = Random(seed);
+        let mut random = SplitMix64(seed);
         let swings: Vec<[f64; 3]> =
             (0..24).map(|_| [0.3 + 1.5 * random.unit(), 6.3 * random.unit(), 3.0 + 3.0 * random.unit()]).collect();
         move |t| {
@@ -339,7 +339,7 @@ mod tests {
     }
 
     fn signal(seed: u64, camera: usize, lag: i64, seconds: i64) -> MotionSignal {
-        let (hands, mut random) = (hands(seed), Random(seed * 100 + camera as u64));
+        let (hands, mut random) = (hands(seed), SplitMix64(seed * 100 + camera as u64));
         let mut signal = MotionSignal::new(format!("cam{camera}").into());
         let (side, angle) = (96usize, camera as f64 * 0.8);
         let phase = (random.unit() * PERIOD as f64) as i64;
@@ -365,7 +365,7 @@ mod tests {
 
     #[test]
     fn random_lags_are_found_within_a_few_milliseconds() {
-        let mut random = Random(9);
+        let mut random = SplitMix64(9);
         let mut worst = 0.0f64;
         for seed in 1..4 {
             let lags: Vec<i64> =

@@ -7,8 +7,6 @@ mod clocks;
 mod clocks_tests;
 mod hull;
 mod lags;
-#[cfg(test)]
-mod random;
 mod settings;
 mod silhouette_lags;
 mod sync;

@@ -5,7 +5,7 @@ use flyrig_types::{Intrinsics, Isometry, Lens};
 use glam::DVec2;
 
 use super::*;
-use crate::random::Random;
+use flyrig_model::SplitMix64;
 
 const PERIOD: i64 = 33_333_333;
 
@@ -33,7 +33,7 @@ fn ring(count: usize) -> Vec<Camera> {
 
 /// Balls (centre, radius): a trunk, a head and two hands that somebody jumps and waves with.
 fn balls(secs: f64, seed: u64) -> Vec<(DVec3, f64)> {
-    let mut random = Random(seed);
+    let mut random = SplitMix64(seed);
     let mut swing = |size: f64| {
         let parts: Vec<[f64; 3]> =
             (0..4).map(|_| [1.0 + 8.0 * random.unit(), 6.3 * random.unit(), size * random.unit()]).collect();
@@ -67,7 +67,7 @@ fn mask(camera: &Camera, rays: &[DVec3], balls: &[(DVec3, f64)]) -> Mask {
 }
 
 /// Eight seconds of one camera; a frame is now and then missing, or its mask is wrong.
-fn track(camera: &Camera, lag: i64, phase: i64, seed: u64, random: &mut Random) -> SilhouetteTrack {
+fn track(camera: &Camera, lag: i64, phase: i64, seed: u64, random: &mut SplitMix64) -> SilhouetteTrack {
     let (mut track, rays) = (SilhouetteTrack::new(camera), rays(camera));
     for n in 0..240 {
         let truth = n * PERIOD + phase;
@@ -86,7 +86,7 @@ fn track(camera: &Camera, lag: i64, phase: i64, seed: u64, random: &mut Random) 
 
 #[test]
 fn random_lags_are_found_within_a_millisecond() {
-    let mut random = Random(3);
+    let mut random = SplitMix64(3);
     for (seed, count) in [(1, 2), (2, 4), (3, 5)] {
         let lags: Vec<i64> =
             (0..count).map(|i| if i == 0 { 0 } else { ((random.unit() - 0.5) * 200e6) as i64 }).collect();
@@ -162,7 +162,7 @@ fn what_the_image_cuts_off_is_not_compared() {
 
 #[test]
 fn a_camera_that_sees_another_movement_is_told_nothing_of() {
-    let mut random = Random(8);
+    let mut random = SplitMix64(8);
     let cameras = ring(4);
     let seeds = [4, 4, 4, 77];
     let tracks: Vec<SilhouetteTrack> =
@@ -175,7 +175,7 @@ fn a_camera_that_sees_another_movement_is_told_nothing_of() {
 #[test]
 fn nothing_that_moves_tells_nothing() {
     let cameras = ring(3);
-    let mut random = Random(11);
+    let mut random = SplitMix64(11);
     let tracks: Vec<SilhouetteTrack> = cameras
         .iter()
         .map(|camera| {

@@ -4,13 +4,13 @@ use std::collections::HashMap;
 
 use flyrig_types::{CameraId, Frame, FrameSet, Image, PixelFormat};
 
-use crate::random::Random;
 use crate::{DropCounts, SyncSettings, Synchronizer};
+use flyrig_model::SplitMix64;
 
 const PERIOD: i64 = 33_333_333;
 
 /// A rig's frames in the order of arrival: `(camera, time, serial number)`.
-fn arrivals(random: &mut Random, cameras: usize) -> Vec<(usize, i64, u64)> {
+fn arrivals(random: &mut SplitMix64, cameras: usize) -> Vec<(usize, i64, u64)> {
     let (drop, twice, jitter) = (random.below(40), random.below(10), 1 + random.below(15_000_000));
     let late = random.below(4) * 40_000_000;
     let mut frames = Vec::new();
@@ -53,7 +53,7 @@ fn run(ids: &[CameraId], config: &SyncSettings, arrivals: &[(usize, i64, u64)]) 
 fn random_rigs_keep_every_promise() {
     let mut complete = 0;
     for seed in 0..300 {
-        let mut random = Random(seed);
+        let mut random = SplitMix64(seed);
         let ids: Vec<CameraId> = (0..1 + random.below(6)).map(|i| format!("cam{i}").into()).collect();
         let config = SyncSettings {
             master: random.chance(50).then(|| ids[random.below(ids.len() as u64) as usize].clone()),
@@ -103,7 +103,7 @@ fn random_rigs_keep_every_promise() {
 #[test]
 fn a_sound_rig_gets_the_nearest_frame_of_every_camera() {
     for seed in 0..50 {
-        let mut random = Random(1000 + seed);
+        let mut random = SplitMix64(1000 + seed);
         let ids: Vec<CameraId> = (0..4).map(|i| format!("cam{i}").into()).collect();
         let mut frames = Vec::new();
         for camera in 0..ids.len() {

@@ -133,7 +133,7 @@ fn free_running(
     jitter: u64,
     keep: impl Fn(usize, i64) -> bool,
 ) -> (Vec<FrameSet>, SyncCounts) {
-    let mut random = crate::random::Random(9);
+    let mut random = flyrig_model::SplitMix64(9);
     let mut frames = Vec::new();
     for tick in 0..ticks {
         for (slot, name) in ["a", "b", "c"].into_iter().enumerate().filter(|&(slot, _)| keep(slot, tick)) {

@@ -4,6 +4,7 @@
 //! (LoGAvatar Eq. 16, without the learnt perceptual term: distances of colours, structural similarity, and differences of what sharpening
 //! adds, Eq. 17), and coverage against the mask.
 
+use flyrig_model::srgb;
 use flyrig_renderer::srgb_from_linear;
 use rayon::prelude::*;
 
@@ -50,8 +51,7 @@ pub struct ImageError {
 }
 
 fn srgb_slope(linear: f32) -> f32 {
-    let linear = linear.max(DARK);
-    if linear <= 0.003_130_8 { 12.92 } else { 1.055 / 2.4 * linear.powf(1.0 / 2.4 - 1.0) }
+    srgb::slope(linear.max(DARK), f32::powf)
 }
 
 /// A drawn pixel as it is compared: sRGB times coverage, and what is needed for its slope.

@@ -1,18 +1,14 @@
 //! Light of the take's room: the brightness of a surface by the direction that it faces. Colours of Gaussians are those without it, so that
 //! somebody who turns does not get the mean of lit and unlit sides.
 //!
-//! A polynomial of second degree in the world's normal describes what distant lamps do to matte surfaces (Ramamoorthi and Hanrahan 2001);
-//! shadows that parts of the body cast on others are not in it.
+//! The polynomial is that of [`flyrig_model::light`].
 
 use flyrig_learn::{AdamStep, Moments};
+use flyrig_model::light::{self, SHADE, TERMS, Terms};
 use glam::Vec3;
 
 use crate::parameters::Element;
 
-/// Terms of the polynomial.
-const TERMS: usize = 9;
-/// Surfaces are not darker or brighter than this, against the light of the mean direction.
-const SHADE: std::ops::RangeInclusive<f32> = 0.05..=4.0;
 /// Rates at the start and at the end.
 const RATE: [f32; 2] = [1e-2, 1e-3];
 const BETAS: [f32; 2] = [0.9, 0.99];
@@ -22,34 +18,22 @@ const CHUNK: usize = 4096;
 /// Light by direction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Light {
-    /// Red, green and blue of each term: 1, x, y, z, xy, yz, 3zz - 1, xz, xx - yy of the normal.
-    pub terms: [[f32; 3]; TERMS],
+    /// Coefficients of the polynomial.
+    pub terms: Terms,
 }
 
 impl Default for Light {
-    /// The same from everywhere.
+    /// Returns the light that is equal from all directions.
     fn default() -> Self {
-        let mut terms = [[0.0; 3]; TERMS];
-        terms[0] = [1.0; 3];
-        Self { terms }
+        Self { terms: light::UNIFORM }
     }
-}
-
-fn basis(n: Vec3) -> [f32; TERMS] {
-    let Vec3 { x, y, z } = n;
-    [1.0, x, y, z, x * y, y * z, 3.0 * z * z - 1.0, x * z, x * x - y * y]
 }
 
 impl Light {
     /// Returns the factors of red, green and blue for a surface with this world normal. One that is not finite counts as zero.
     #[must_use]
     pub fn shade(&self, normal: Vec3) -> [f32; 3] {
-        self.unbounded(normal).map(|value| value.clamp(*SHADE.start(), *SHADE.end()))
-    }
-
-    fn unbounded(&self, normal: Vec3) -> [f32; 3] {
-        let basis = basis(if normal.is_finite() { normal } else { Vec3::ZERO });
-        std::array::from_fn(|k| self.terms.iter().zip(basis).map(|(term, value)| term[k] * value).sum())
+        light::shade(&self.terms, normal.to_array())
     }
 
     /// Returns dL/d terms. `slopes` are dL/d lit colours, afterwards dL/d unlit ones; `unlit` are those, `stride` rows a Gaussian, `normals` by
@@ -60,14 +44,15 @@ impl Light {
         unlit: &[Element],
         slopes: &mut [Element],
         stride: usize,
-    ) -> [[f32; 3]; TERMS] {
+    ) -> Terms {
         use rayon::prelude::*;
         let chunk = |(chunk, (slopes, unlit)): (usize, (&mut [Element], &[Element]))| {
             let mut sums = [[0.0f64; 3]; TERMS];
             for (i, (slopes, unlit)) in slopes.chunks_mut(stride).zip(unlit.chunks(stride)).enumerate() {
                 let normal = normals(chunk * CHUNK + i);
-                let (shade, free) = (self.shade(normal), self.unbounded(normal));
-                let basis = basis(if normal.is_finite() { normal } else { Vec3::ZERO });
+                let basis = light::basis(normal.to_array());
+                let free = light::sum(&self.terms, basis);
+                let shade = light::bounded(free);
                 for k in 0..3 {
                     let by_shade: f32 = slopes.iter().zip(unlit).map(|(slope, color)| slope[k] * color[k]).sum();
                     // At its bounds it does not move.
@@ -98,7 +83,7 @@ impl LightFit {
     }
 
     /// Descends by one step, the `count`th from 1, along dL/d terms. The constant term stays: colours have its freedom.
-    pub fn descend(&mut self, light: &mut Light, slopes: &[[f32; 3]; TERMS], count: u64, progress: f32) {
+    pub fn descend(&mut self, light: &mut Light, slopes: &Terms, count: u64, progress: f32) {
         let rate = RATE[0] * (RATE[1] / RATE[0]).powf(progress.clamp(0.0, 1.0));
         let step = AdamStep { betas: BETAS, count, rate, decay: 0.0, scale: 1.0, share: 0.0 };
         let mut values = light.terms.as_flattened().to_vec();

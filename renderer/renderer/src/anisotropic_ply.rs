@@ -6,6 +6,8 @@
 
 use std::path::Path;
 
+use flyrig_model::srgb;
+
 use crate::export::{SH_DEGREE_0, log_scale, opacity_logit, write_ply};
 use crate::schema::anisotropic_ply_properties;
 use crate::{AnisotropicSplats, ExportError, HarmonicOrder, PLY_PROPERTIES};
@@ -133,18 +135,12 @@ fn all_finite(values: &[f32]) -> bool {
 /// sRGB value of a linear one and the slope there. The curve goes on above 1, and below 0 as above it.
 fn encode(linear: f32) -> (f32, f32) {
     let x = linear.abs();
-    if x <= 0.003_130_8 {
-        return (linear * 12.92, 12.92);
-    }
-    let value = 1.055 * x.powf(1.0 / 2.4) - 0.055;
-    (value.copysign(linear), 1.055 / 2.4 * x.powf(1.0 / 2.4 - 1.0))
+    (srgb::encode(x, f32::powf).copysign(linear), srgb::slope(x, f32::powf))
 }
 
 /// Linear value of an sRGB one, the inverse of [`encode`].
-fn decode(srgb: f32) -> f32 {
-    let x = srgb.abs();
-    let linear = if x <= 0.040_45 { x / 12.92 } else { ((x + 0.055) / 1.055).powf(2.4) };
-    linear.copysign(srgb)
+fn decode(code: f32) -> f32 {
+    srgb::decode(code.abs(), f32::powf).copysign(code)
 }
 
 struct Header<'a> {

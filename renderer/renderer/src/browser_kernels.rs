@@ -13,8 +13,8 @@ use crate::{Outputs, RasterSettings};
 /// Bindings and their order are those of `raster_device.rs`; no entry point binds more than 8 storage buffers.
 #[derive(Debug, Clone)]
 pub struct BrowserKernels {
-    /// Name and WGSL of each module.
-    pub modules: [(&'static str, String); 6],
+    /// Name and WGSL of each module, and of `srgb`, a function for the host's own modules.
+    pub modules: [(&'static str, String); 7],
     /// Name and value of the numbers that the host needs: workgroup sizes, room for pairs, settings of the drawing.
     pub numbers: [(&'static str, f64); 11],
     /// Name and byte offset of the fields of an image's constants, and their size. The matrix of the camera is first.
@@ -35,6 +35,7 @@ impl BrowserKernels {
                 ("scan", scan_wgsl()),
                 ("sort", sort_wgsl()),
                 ("blend", blend_wgsl(tile, Outputs::COLOR)),
+                ("srgb", flyrig_model::srgb::WGSL.to_owned()),
             ],
             numbers: [
                 ("tile", tile.0.into()),

@@ -1,17 +1,17 @@
 //! sRGB on the outside, linear light inside, and the way between.
 
+use flyrig_model::srgb;
+
 /// sRGB value (0..=1) of a linear one (IEC 61966-2-1); clamps, NaN becomes 0.
 #[must_use]
 pub fn srgb_from_linear(linear: f32) -> f32 {
-    let x = unit(linear);
-    if x <= 0.003_130_8 { x * 12.92 } else { 1.055 * x.powf(1.0 / 2.4) - 0.055 }
+    srgb::encode(unit(linear), f32::powf)
 }
 
 /// Linear value of an sRGB one (0..=1); clamps, NaN becomes 0.
 #[must_use]
-pub fn linear_from_srgb(srgb: f32) -> f32 {
-    let x = unit(srgb);
-    if x <= 0.040_45 { x / 12.92 } else { ((x + 0.055) / 1.055).powf(2.4) }
+pub fn linear_from_srgb(code: f32) -> f32 {
+    srgb::decode(unit(code), f32::powf)
 }
 
 /// Clamped to 0..=1; NaN fails the comparison.

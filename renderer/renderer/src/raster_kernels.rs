@@ -1,7 +1,9 @@
 //! Compiled kernels of the rasteriser and the numbers they are compiled with.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock};
+
+use flyrig_types::lock;
 
 use bytemuck::{Pod, Zeroable};
 use flyrig_gpu::{CAMERA_WGSL, CameraConstants, ComputeKernel, GpuContext};
@@ -182,7 +184,7 @@ impl RasterKernels {
     /// The blending kernels that write these outputs, and what each of them writes; compiled on first use.
     pub(crate) fn blend(&self, gpu: &GpuContext, outputs: Outputs) -> Vec<(Outputs, Arc<ComputeKernel>)> {
         let (passes, count) = blend_passes(outputs);
-        let mut kernels = self.blend.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut kernels = lock(&self.blend);
         let compile = |outputs| Arc::new(ComputeKernel::new(gpu, "blend", &[&blend_wgsl(self.tile, outputs)], "blend"));
         let kernel =
             |&outputs: &Outputs| (outputs, Arc::clone(kernels.entry(outputs).or_insert_with(|| compile(outputs))));

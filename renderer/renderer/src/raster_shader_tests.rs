@@ -20,7 +20,7 @@ fn validate(name: &str, source: &str) {
 fn every_kernel_is_valid_wgsl_and_the_uniform_has_its_layout() {
     validate("scan", &scan_wgsl());
     validate("sort", &sort_wgsl());
-    validate("view bytes", crate::view_bytes::WGSL);
+    validate("view bytes", &[flyrig_model::srgb::WGSL, crate::view_bytes::WGSL].concat());
     for tile in [Tile::SOFTWARE, Tile::HARDWARE] {
         validate("project", &project_wgsl(tile));
         validate("project anisotropic", &project_anisotropic_wgsl(tile));

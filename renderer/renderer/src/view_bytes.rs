@@ -1,6 +1,7 @@
 //! Drawn views as bytes.
 
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer, dispatch_1d};
+use flyrig_model::srgb;
 use wgpu::{CommandEncoder, ComputePassDescriptor};
 
 use crate::scan::run;
@@ -26,7 +27,7 @@ impl ViewBytes {
     pub fn new(gpu: &GpuContext) -> Result<Self, GpuError> {
         let on_device = !gpu.is_on_processor();
         Ok(Self {
-            kernel: on_device.then(|| ComputeKernel::new(gpu, "view bytes", &[WGSL], "write_bytes")),
+            kernel: on_device.then(|| ComputeKernel::new(gpu, "view bytes", &[srgb::WGSL, WGSL], "write_bytes")),
             bytes: StorageBuffer::zeroed(gpu, "view bytes", 0)?,
             count: StorageBuffer::zeroed(gpu, "pixels of a view", 1)?,
         })

@@ -1,4 +1,5 @@
 // Straight-alpha sRGB bytes of premultiplied linear colour, as rgba8_from_target (color.rs) makes them: one invocation a pixel.
+// After srgb_from_linear of flyrig_model.
 @group(0) @binding(0) var<storage, read> color: array<vec4<f32>>;
 // Red in the lowest byte.
 @group(0) @binding(1) var<storage, read_write> bytes: array<u32>;
@@ -20,9 +21,7 @@ fn byte(value: f32) -> u32 {
 }
 
 fn encoded(linear: f32) -> u32 {
-    let x = clamp(linear, 0.0, 1.0);
-    let srgb = select(1.055 * pow(x, 1.0 / 2.4) - 0.055, x * 12.92, x <= 0.0031308);
-    return select(byte(srgb), 0u, is_nan(linear));
+    return select(byte(srgb_from_linear(clamp(linear, 0.0, 1.0))), 0u, is_nan(linear));
 }
 
 @compute @workgroup_size(256)

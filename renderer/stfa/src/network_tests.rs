@@ -1,6 +1,7 @@
 //! The networks against plain loops in f64.
 
 use flyrig_learn::burn_tensor::Device;
+use flyrig_model::srgb;
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
 use super::*;
@@ -165,8 +166,18 @@ fn graph_layers_follow_the_paper() {
 }
 
 fn encode(linear: f64) -> f64 {
-    let x = linear.clamp(0.0, 1.0);
-    if x <= 0.003_130_8 { x * 12.92 } else { 1.055 * x.powf(1.0 / 2.4) - 0.055 }
+    srgb::encode(linear.clamp(0.0, 1.0), f64::powf)
+}
+
+#[test]
+fn tensor_form_of_srgb_agrees_with_the_curve() {
+    let values: Vec<f32> = (-200..=2200).map(|i| i as f32 / 2000.0).collect();
+    let net = network(&parameters());
+    let tensor = || net.table(values.clone(), 1);
+    let expected: Vec<f64> = values.iter().map(|v| encode(f64::from(*v))).collect();
+    close(&to_vec(srgb_from_linear(tensor())), &expected, 2e-6);
+    let expected: Vec<f64> = values.iter().map(|v| srgb::decode(f64::from(*v).clamp(0.0, 1.0), f64::powf)).collect();
+    close(&to_vec(linear_from_srgb(tensor())), &expected, 2e-6);
 }
 
 #[test]

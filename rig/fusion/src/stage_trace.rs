@@ -78,7 +78,7 @@ pub(crate) fn trace_adapter(name: &'static str, time: Duration) {
 }
 
 fn lock() -> std::sync::MutexGuard<'static, Option<StageTrace>> {
-    TRACE.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+    flyrig_types::lock(&TRACE)
 }
 
 impl StageTrace {

@@ -10,8 +10,8 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::{GpuContext, testing::device};
 use flyrig_renderer::{GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, rgba8_from_target};
-use flyrig_types::{Camera, Frame, Image, Intrinsics, Isometry, Lens, Mask, PixelFormat, Pose, PoseTrack, Rig};
-use glam::{DVec2, DVec3};
+use flyrig_types::{Camera, Frame, Image, Intrinsics, Isometry, Mask, PixelFormat, Pose, PoseTrack, Rig};
+use glam::DVec3;
 
 const FRAME_NANOS: i64 = 33_000_000;
 const SIDE: u32 = 128;
@@ -20,19 +20,8 @@ const SIDE: u32 = 128;
 fn camera(azimuth: f64, side: u32) -> Camera {
     let middle = DVec3::new(0.0, 0.9, 0.0);
     let eye = middle + DVec3::new(azimuth.sin(), 0.15, azimuth.cos()) * 3.0;
-    Camera {
-        time_offset_nanos: 0,
-        color: Default::default(),
-        id: format!("{azimuth}").into(),
-        intrinsics: Intrinsics {
-            width: side,
-            height: side,
-            focal_px: DVec2::splat(1.2 * f64::from(side)),
-            center_px: DVec2::splat(0.5 * f64::from(side) - 0.5),
-            lens: Lens::PINHOLE,
-        },
-        camera_from_world: Isometry::look_at(eye, middle, DVec3::Y),
-    }
+    let intrinsics = Intrinsics::pinhole(side, side, 1.2 * f64::from(side));
+    Camera::new(format!("{azimuth}"), intrinsics, Isometry::look_at(eye, middle, DVec3::Y))
 }
 
 /// A person who sways, and is displaced by `shift`; drawn on a device of its own.

@@ -3,10 +3,12 @@
 use std::{
     convert::Infallible,
     net::{SocketAddr, TcpListener},
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Mutex},
     thread::{Builder, JoinHandle},
     time::Duration,
 };
+
+use flyrig_types::lock;
 
 use anyhow::{Context as _, Result};
 use hyper::{
@@ -90,10 +92,6 @@ impl Drop for PageServer {
             let _ = thread.join();
         }
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Accepts clients, no more than [`CONNECTIONS`] at a time, and answers each in a task.

@@ -16,9 +16,11 @@ use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     path::{Path, PathBuf},
     process::ExitCode,
-    sync::{Mutex, PoisonError},
+    sync::Mutex,
     time::{Duration, Instant},
 };
+
+use flyrig_types::lock;
 
 use fuzz::{
     mutate::Mutator,
@@ -79,7 +81,7 @@ fn run(target: &Target, corpus: &Path, time: Duration, seed: u64) -> Result<Stri
             _ => random.child(&inputs, LONGEST),
         };
         let begin = Instant::now();
-        *CURRENT.lock().unwrap_or_else(PoisonError::into_inner) = Some((target.name, begin, input.clone()));
+        *lock(&CURRENT) = Some((target.name, begin, input.clone()));
         let outcome = catch_unwind(AssertUnwindSafe(|| (target.run)(&input)));
         let took = begin.elapsed();
         tried += 1;
@@ -103,7 +105,7 @@ fn run(target: &Target, corpus: &Path, time: Duration, seed: u64) -> Result<Stri
             inputs.push(input);
         }
     }
-    *CURRENT.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    *lock(&CURRENT) = None;
     Ok(format!(
         "{tried} inputs in {:.0} s from {seeds} seeds, {taken} read, {} different outcomes, slowest {:.0} ms, peak {:.0} MiB",
         started.elapsed().as_secs_f64(),
@@ -117,7 +119,7 @@ fn run(target: &Target, corpus: &Path, time: Duration, seed: u64) -> Result<Stri
 fn watch() {
     loop {
         std::thread::sleep(Duration::from_secs(1));
-        let current = CURRENT.lock().unwrap_or_else(PoisonError::into_inner);
+        let current = lock(&CURRENT);
         if let Some((target, since, input)) = &*current
             && since.elapsed() > 3 * SLOW
         {

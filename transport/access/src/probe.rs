@@ -4,12 +4,14 @@ use std::{
     io::{ErrorKind, Read as _, Write as _},
     net::{TcpStream, ToSocketAddrs as _},
     sync::{
-        Arc, Mutex, PoisonError,
+        Arc, Mutex,
         atomic::{AtomicBool, Ordering},
     },
     thread::{Builder, JoinHandle, park_timeout},
     time::Duration,
 };
+
+use flyrig_types::lock;
 
 use rustls_pki_types::ServerName;
 use tokio_rustls::rustls::{AlertDescription, CertificateError, ClientConnection, Error as TlsError, Stream};
@@ -155,7 +157,7 @@ impl Probe {
         let work = move || {
             while !of_thread.stop.load(Ordering::Relaxed) {
                 let trouble = if is_connected() { None } else { key.knock().err().map(|error| error.to_string()) };
-                *of_thread.trouble.lock().unwrap_or_else(PoisonError::into_inner) = trouble;
+                *lock(&of_thread.trouble) = trouble;
                 park_timeout(EVERY);
             }
         };
@@ -166,7 +168,7 @@ impl Probe {
     /// Returns why the rig cannot be reached; None while it can, or while that is not known.
     #[must_use]
     pub fn trouble(&self) -> Option<String> {
-        self.shared.trouble.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        lock(&self.shared.trouble).clone()
     }
 }
 

@@ -7,6 +7,11 @@
 
 use alloc::vec::Vec;
 
+use flyrig_model::{
+    light,
+    quaternion::{IDENTITY, from_rows, product, unit},
+};
+
 use crate::{
     CODEC_VERSION, EncodedTemplate, Motion, Posed, StreamError, StreamTemplate, TemplateSource,
     bytes::Fields,
@@ -21,10 +26,8 @@ const LEAST_SCALE_M: f32 = 2e-4;
 const SCALE_RANGE: f32 = 6.214_608;
 /// Planes of bytes.
 const PLANES: usize = 11;
-/// Terms of the light: 1, x, y, z, xy, yz, 3zz - 1, xz, xx - yy of the world's normal.
-pub const LIGHT_TERMS: usize = 9;
-/// Smallest and largest factor of the light.
-const SHADE: core::ops::RangeInclusive<f32> = 0.05..=4.0;
+/// Number of terms of an avatar's light, see [`light::Terms`].
+pub const LIGHT_TERMS: usize = light::TERMS;
 /// Steps of a component of a rotation, whose range is 1/sqrt(2) to either side.
 const ROTATION_STEPS: f32 = 1023.0;
 
@@ -49,7 +52,7 @@ pub struct AvatarSource<'a> {
     /// As many Gaussians.
     pub gaussians: &'a [AvatarGaussian],
     /// Factors of the colours by the direction that the surface faces in the world: red, green and blue of each term.
-    pub light: [[f32; 3]; LIGHT_TERMS],
+    pub light: light::Terms,
 }
 
 /// Shapes, colours and light of an avatar, in the template's order of Gaussians.
@@ -61,7 +64,7 @@ pub(crate) struct Avatar {
     rotation: Vec<[f32; 4]>,
     /// Linear RGB without the light; w: opacity.
     colors: Vec<[f32; 4]>,
-    light: [[f32; 3]; LIGHT_TERMS],
+    light: light::Terms,
 }
 
 /// Shapes of an avatar's Gaussians in the world; both lists have one element a Gaussian.
@@ -126,7 +129,7 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<StreamTemplate, StreamError> {
     let (inner, rest) = fields.bytes.split_at(length);
     fields.check(rest.len() >= LIGHT_BYTES, "it is cut short")?;
     let (terms, planes) = rest.split_at(LIGHT_BYTES);
-    let mut light = [[0.0; 3]; LIGHT_TERMS];
+    let mut light = [[0.0; 3]; light::TERMS];
     for (term, bytes) in light.as_flattened_mut().iter_mut().zip(terms.as_chunks().0) {
         *term = f32::from_le_bytes(*bytes);
     }
@@ -169,7 +172,7 @@ impl StreamTemplate {
         let Some(avatar) = &self.avatar else { return false };
         colors.clone_from(&avatar.colors);
         for (color, normal) in colors.iter_mut().zip(&posed.normal) {
-            let shade = shade(&avatar.light, normal);
+            let shade = light::shade(&avatar.light, [normal[0], normal[1], normal[2]]);
             color.iter_mut().zip(shade).for_each(|(value, shade)| *value *= shade);
         }
         true
@@ -179,7 +182,7 @@ impl StreamTemplate {
     /// quaternions. Returns false, and changes nothing, for a template of isotropic Gaussians.
     pub fn pose_axes(&self, motion: &Motion, posed: &mut PosedAxes) -> bool {
         let Some(avatar) = &self.avatar else { return false };
-        let turns: Vec<[f32; 4]> = self.world_from_canonical(motion).iter().map(quaternion_of).collect();
+        let turns: Vec<[f32; 4]> = self.world_from_canonical(motion).iter().map(rotation_part).collect();
         posed.scale_opacity.clone_from(&avatar.scale_opacity);
         posed.rotation.clear();
         posed.rotation.extend(self.skin.iter().zip(&avatar.rotation).map(|(skin, own)| {
@@ -198,48 +201,11 @@ impl StreamTemplate {
 }
 
 /// Bytes of the light.
-const LIGHT_BYTES: usize = 4 * 3 * LIGHT_TERMS;
+const LIGHT_BYTES: usize = 4 * 3 * light::TERMS;
 
-/// Factors of the colours of a surface; a normal that is not finite counts as zero.
-fn shade(light: &[[f32; 3]; LIGHT_TERMS], &[x, y, z, _]: &[f32; 4]) -> [f32; 3] {
-    let [x, y, z] = if (x + y + z).is_finite() { [x, y, z] } else { [0.0; 3] };
-    let basis = [1.0, x, y, z, x * y, y * z, 3.0 * z * z - 1.0, x * z, x * x - y * y];
-    core::array::from_fn(|k| {
-        let sum: f32 = light.iter().zip(basis).map(|(term, value)| term[k] * value).sum();
-        sum.clamp(*SHADE.start(), *SHADE.end())
-    })
-}
-
-const IDENTITY: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
-
-/// The quaternion scaled to length 1; the identity for one without a length.
-fn unit(q: [f32; 4]) -> [f32; 4] {
-    let squared = q.iter().map(|v| v * v).sum::<f32>();
-    if squared > 1e-20 && squared.is_finite() { q.map(|v| v / libm::sqrtf(squared)) } else { IDENTITY }
-}
-
-/// Product of two quaternions: first `b`, then `a`.
-fn product([ax, ay, az, aw]: [f32; 4], [bx, by, bz, bw]: [f32; 4]) -> [f32; 4] {
-    [
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    ]
-}
-
-/// Unit quaternion of the linear part of a rigid motion.
-fn quaternion_of([[xx, xy, xz, _], [yx, yy, yz, _], [zx, zy, zz, _]]: &[[f32; 4]; 3]) -> [f32; 4] {
-    // The largest component first, so that nothing is divided by a small number.
-    unit(if xx + yy + zz > 0.0 {
-        [zy - yz, xz - zx, yx - xy, 1.0 + xx + yy + zz]
-    } else if xx > yy && xx > zz {
-        [1.0 + xx - yy - zz, xy + yx, xz + zx, zy - yz]
-    } else if yy > zz {
-        [xy + yx, 1.0 + yy - xx - zz, yz + zy, xz - zx]
-    } else {
-        [xz + zx, yz + zy, 1.0 + zz - xx - yy, yx - xy]
-    })
+/// Returns the unit quaternion of the linear part of a rigid motion.
+fn rotation_part(rows: &[[f32; 4]; 3]) -> [f32; 4] {
+    from_rows(rows.map(|[x, y, z, _]| [x, y, z]))
 }
 
 fn scale_code(scale_m: f32) -> u8 {

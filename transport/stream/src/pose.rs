@@ -2,12 +2,9 @@
 
 use alloc::vec::Vec;
 
-use crate::{Motion, StreamTemplate, planes::Influences};
+use flyrig_model::{quaternion, stretch};
 
-/// Gaussians overlap enough to close a surface that is longer than at rest by this factor.
-const CLOSED: f32 = 1.25;
-/// Most that a Gaussian grows, as a factor.
-const MOST_GROWTH: f32 = 4.0;
+use crate::{Motion, StreamTemplate, planes::Influences};
 
 /// Gaussians in the world; both lists have one element a Gaussian.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -52,13 +49,6 @@ pub(crate) fn spread(on: &Influences, place: impl Fn(usize) -> [f32; 3]) -> f32 
     count * squares - sum.iter().map(|v| v * v).sum::<f32>()
 }
 
-/// Returns the factor by which a Gaussian grows with the surface between its nodes, by their spread at rest and now: the formula and the
-/// constants of `displacement` in the crate `body`, which this crate cannot use (`no_std`).
-fn growth_of(rest: f32, now: f32) -> f32 {
-    let is_longer = rest > 0.0 && now.is_finite() && now > CLOSED * CLOSED * rest;
-    if is_longer { (libm::sqrtf(now / rest) / CLOSED).min(MOST_GROWTH) } else { 1.0 }
-}
-
 /// Three rows of an affine motion.
 type Rows = [[f32; 4]; 3];
 
@@ -82,7 +72,7 @@ impl StreamTemplate {
                         *value += share * by;
                     }
                 }
-                growth = growth_of(*rest, spread(on, |node| nodes[node].place));
+                growth = stretch::growth(*rest, spread(on, |node| nodes[node].place), libm::sqrtf);
             }
             let mut rows: Rows = [[0.0; 4]; 3];
             for (joint, share) in skin.shares() {
@@ -116,13 +106,10 @@ impl StreamTemplate {
     }
 }
 
-/// Of a unit quaternion x, y, z, w and a translation.
-fn rigid([x, y, z, w]: [f32; 4], [tx, ty, tz]: [f32; 3]) -> Rows {
-    [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w), tx],
-        [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w), ty],
-        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y), tz],
-    ]
+/// Returns the rows of the rigid motion by a unit quaternion x, y, z, w and a translation.
+fn rigid(rotation: [f32; 4], [tx, ty, tz]: [f32; 3]) -> Rows {
+    let [[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]] = quaternion::matrix(rotation);
+    [[xx, xy, xz, tx], [yx, yy, yz, ty], [zx, zy, zz, tz]]
 }
 
 fn product(a: &Rows, b: &Rows) -> Rows {

@@ -2,6 +2,8 @@
 
 use alloc::{boxed::Box, vec::Vec};
 
+use flyrig_model::srgb;
+
 /// Steps of linear light in the table of codes.
 const LINEAR_STEPS: usize = 4096;
 /// Steps of codes in the table of linear light, four to each of 256.
@@ -17,14 +19,10 @@ pub(crate) struct Srgb {
 
 impl Srgb {
     pub fn new() -> Self {
-        let code = |linear: f32| {
-            if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * libm::powf(linear, 1.0 / 2.4) - 0.055 }
-        };
-        let linear = |code: f32| if code <= 0.040_45 { code / 12.92 } else { libm::powf((code + 0.055) / 1.055, 2.4) };
-        let at_step = |i: usize| 255.0 * code((i as f32 / LINEAR_STEPS as f32).min(1.0));
+        let at_step = |i: usize| 255.0 * srgb::encode((i as f32 / LINEAR_STEPS as f32).min(1.0), libm::powf);
         Self {
             code: Box::new(core::array::from_fn(|i| [at_step(i), at_step(i + 1) - at_step(i)])),
-            linear: (0..=CODE_STEPS).map(|i| linear(i as f32 / CODE_STEPS as f32)).collect(),
+            linear: (0..=CODE_STEPS).map(|i| srgb::decode(i as f32 / CODE_STEPS as f32, libm::powf)).collect(),
         }
     }
 

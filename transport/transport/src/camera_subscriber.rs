@@ -2,12 +2,12 @@
 
 use std::{
     net::SocketAddr,
-    sync::{Arc, Condvar, Mutex, PoisonError},
+    sync::{Arc, Condvar, Mutex},
     time::{Duration, Instant},
 };
 
 use flyrig_access::{Gate, Role};
-use flyrig_types::{CameraId, Frame, ThreadWatch};
+use flyrig_types::{CameraId, Frame, ThreadWatch, wait_timeout};
 use zenoh::{Session, Wait, sample::Sample, sample::SampleKind};
 
 use crate::{
@@ -166,7 +166,7 @@ impl CameraSubscriber {
             if left.is_zero() {
                 return Ok(None);
             }
-            inbox = self.shared.changed.wait_timeout(inbox, left).unwrap_or_else(PoisonError::into_inner).0;
+            inbox = wait_timeout(&self.shared.changed, inbox, left);
         }
     }
 

@@ -3,11 +3,11 @@
 use std::{
     collections::{BTreeMap, VecDeque},
     ops::Bound,
-    sync::{Condvar, Mutex, MutexGuard, PoisonError},
+    sync::{Condvar, Mutex, MutexGuard},
     time::{Duration, Instant},
 };
 
-use flyrig_types::{Camera, CameraId, Intrinsics, Rig};
+use flyrig_types::{Camera, CameraId, Intrinsics, Rig, wait_timeout};
 use prost::bytes::Bytes;
 use zenoh::sample::Sample;
 
@@ -386,7 +386,7 @@ impl Inbox {
             if left.is_zero() {
                 return Ok(None);
             }
-            state = self.changed.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+            state = wait_timeout(&self.changed, state, left);
         }
     }
 

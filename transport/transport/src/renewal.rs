@@ -1,12 +1,12 @@
 //! The subscriber's thread that asks for its viewpoint and renews the lease.
 
 use std::{
-    sync::{Arc, Condvar, Mutex, PoisonError},
+    sync::{Arc, Condvar, Mutex},
     thread::JoinHandle,
     time::Duration,
 };
 
-use flyrig_types::Camera;
+use flyrig_types::{Camera, wait, wait_timeout};
 use zenoh::{Session, Wait, qos::CongestionControl};
 
 use crate::{
@@ -91,8 +91,8 @@ fn run(shared: &Shared, session: &Session, key: &str, view: &str) {
         let mut state = lock(&shared.state);
         if !state.changed && !state.stop {
             state = match pause {
-                Some(pause) => shared.wake.wait_timeout(state, pause).unwrap_or_else(PoisonError::into_inner).0,
-                None => shared.wake.wait(state).unwrap_or_else(PoisonError::into_inner),
+                Some(pause) => wait_timeout(&shared.wake, state, pause),
+                None => wait(&shared.wake, state),
             };
         }
         let wanted = if state.stop { None } else { state.wanted.clone() };

@@ -15,6 +15,8 @@
 
 use std::sync::LazyLock;
 
+use flyrig_model::srgb;
+
 use crate::{SCHEMA_VERSION, TransportError, header::Reader};
 
 /// Most Gaussians in a state.
@@ -242,16 +244,13 @@ struct SrgbTable {
 
 static SRGB: LazyLock<SrgbTable> = LazyLock::new(SrgbTable::new);
 
-fn linear_from_srgb(srgb: f64) -> f64 {
-    if srgb <= 0.040_45 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) }
-}
-
 impl SrgbTable {
     const STEPS: usize = 4096;
 
     fn new() -> Self {
-        let linear = std::array::from_fn(|code| linear_from_srgb(code as f64 / 255.0) as f32);
-        let boundary: [f32; 255] = std::array::from_fn(|code| linear_from_srgb((code as f64 + 0.5) / 255.0) as f32);
+        let light = |code: f64| srgb::decode(code / 255.0, f64::powf) as f32;
+        let linear = std::array::from_fn(|code| light(code as f64));
+        let boundary: [f32; 255] = std::array::from_fn(|code| light(code as f64 + 0.5));
         let guess = (0..Self::STEPS)
             .map(|step| boundary.partition_point(|edge| *edge <= step as f32 / Self::STEPS as f32) as u8)
             .collect();

@@ -1,7 +1,7 @@
 //! A topic of the publisher: one slot that the newest message wins, and its counts.
 
 use std::sync::{
-    Arc, Mutex, MutexGuard, PoisonError,
+    Arc, Mutex,
     atomic::{AtomicBool, Ordering},
 };
 
@@ -10,6 +10,7 @@ use prost::bytes::Bytes;
 use zenoh::{bytes::Encoding, qos::Priority};
 
 use crate::{FrameHeader, Header, MessageKind, SplatState, TransportError, ViewFrame, header};
+pub(crate) use flyrig_types::lock;
 
 /// What became of a message that was handed in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -75,11 +76,6 @@ pub(crate) struct Topic {
     pub kind: MessageKind,
     watched: AtomicBool,
     state: Mutex<State>,
-}
-
-/// A lock whose data stays whole even when a holder panics: every change is a plain assignment.
-pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Topic {

@@ -1,14 +1,14 @@
 //! Draws the people on a thread of its own, so that the window answers at once.
 
 use std::{
-    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Condvar, Mutex, MutexGuard},
     time::{Duration, Instant},
 };
 
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::composite_over;
 use flyrig_stream::{Posed, PosedAxes, Stamp};
-use flyrig_types::{Camera, SupervisedThread, ThreadHealth};
+use flyrig_types::{Camera, SupervisedThread, ThreadHealth, lock, wait};
 use flyrig_viewing::StreamPerson;
 use glam::DVec3;
 
@@ -120,7 +120,7 @@ impl Drop for Painter {
 
 impl Shared {
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     /// Waits for the next request; None at the end.
@@ -133,7 +133,7 @@ impl Shared {
             if let Some(request) = state.request.take() {
                 return Some(request);
             }
-            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+            state = wait(&self.changed, state);
         }
     }
 }

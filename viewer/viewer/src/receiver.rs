@@ -3,7 +3,7 @@
 use std::{
     collections::VecDeque,
     sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
+        Arc, Mutex, MutexGuard,
         atomic::{AtomicBool, Ordering},
     },
     time::{Duration, Instant},
@@ -13,7 +13,7 @@ use flyrig_stream::StreamTemplate;
 use flyrig_transport::{
     FetchedTemplate, Interests, PersonMessage, RigStats, Subscriber, TemplateFetcher, TransportConfig, TransportError,
 };
-use flyrig_types::{Rig, SupervisedThread, ThreadHealth};
+use flyrig_types::{Rig, SupervisedThread, ThreadHealth, lock};
 use flyrig_viewing::{People, Taken};
 
 /// How long a message is waited for.
@@ -144,11 +144,6 @@ impl Drop for Receiver {
         self.stop.store(true, Ordering::Relaxed);
         self.thread.join();
     }
-}
-
-/// Every change of the state is whole at each step.
-fn lock(state: &Mutex<ReceiverState>) -> MutexGuard<'_, ReceiverState> {
-    state.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// State of the receiving thread.

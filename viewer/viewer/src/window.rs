@@ -2,9 +2,11 @@
 
 use std::{
     collections::VecDeque,
-    sync::{Arc, Mutex, OnceLock, PoisonError},
+    sync::{Arc, Mutex, OnceLock},
     time::{Duration, Instant},
 };
+
+use flyrig_types::lock;
 
 use eframe::egui;
 use flyrig_gpu::{GpuContext, GpuError};
@@ -151,7 +153,7 @@ pub fn open_window(options: ViewOptions, gpu: &GpuContext) -> Result<Option<Scre
         }),
     );
     opened.map_err(|error| ViewerError::Window(error.to_string()))?;
-    let shot = shot.lock().unwrap_or_else(PoisonError::into_inner).take();
+    let shot = lock(&shot).take();
     if let (true, None, Some(limit)) = (wants_shot, &shot, limit) {
         let trouble = receiver.state().trouble(&rig, &endpoint);
         return Err(ViewerError::NothingShown(
@@ -218,7 +220,7 @@ impl eframe::App for View {
         }
         let is_over = self.options.seconds.is_some_and(|limit| self.started.elapsed().as_secs_f64() >= limit);
         self.take_shot(&context);
-        let has_shot = self.shot.lock().unwrap_or_else(PoisonError::into_inner).is_some();
+        let has_shot = lock(&self.shot).is_some();
         if is_over || has_shot {
             context.send_viewport_cmd(egui::ViewportCommand::Close);
         }
@@ -387,7 +389,7 @@ impl View {
         let callback = egui::ScreenshotCallback::new(move |image| {
             let rgb = image.pixels.iter().flat_map(|pixel| [pixel.r(), pixel.g(), pixel.b()]).collect();
             let [width, height] = image.size.map(|side| side as u32);
-            *shot.lock().unwrap_or_else(PoisonError::into_inner) = Some(Screenshot { width, height, rgb });
+            *lock(&shot) = Some(Screenshot { width, height, rgb });
             repaint.request_repaint();
         });
         context.send_viewport_cmd(egui::ViewportCommand::Screenshot(callback));

@@ -4,7 +4,7 @@
 const SLOT_BYTES = 256; // constants lie this far apart: offsets of bindings may be any multiple of it
 const MOST_GROUPS = 65535; // workgroups of a dispatch in one dimension
 
-// Straight alpha over the background, on sRGB values, as in the images of the rig.
+// Straight alpha over the background, on sRGB values, as in the images of the rig. After the module `srgb`.
 const COMPOSE = `
 struct View { background: vec4<f32>, width: u32 }
 @group(0) @binding(0) var<storage, read> light: array<vec4<f32>>;
@@ -14,7 +14,7 @@ struct View { background: vec4<f32>, width: u32 }
 }
 fn srgb(linear: vec3<f32>) -> vec3<f32> {
   let c = clamp(linear, vec3(0.0), vec3(1.0));
-  return select(1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, 12.92 * c, c < vec3(0.0031308));
+  return vec3(srgb_from_linear(c.r), srgb_from_linear(c.g), srgb_from_linear(c.b));
 }
 @fragment fn compose(@builtin(position) at: vec4<f32>) -> @location(0) vec4<f32> {
   let seen = light[u32(at.y) * view.width + u32(at.x)];
@@ -44,7 +44,7 @@ export async function openWebGpu(takesSoftware) {
       kernels[entries.length === 1 ? name : entryPoint] = await device.createComputePipelineAsync({ layout: "auto", compute: { module, entryPoint } });
     });
   }));
-  return { device, kernels, numbers, frame };
+  return { device, kernels, numbers, frame, srgb: modules.srgb };
 }
 
 /** Workgroups in x and y for so many invocations, as flyrig_gpu::dispatch_1d. */
@@ -56,12 +56,12 @@ function groupsFor(items, lanes) {
 
 /** A drawing of one canvas with what `openWebGpu` opened. Make a new one after `device.lost`. */
 export class WebGpuDrawing {
-  constructor(canvas, { device, kernels, numbers, frame }) {
+  constructor(canvas, { device, kernels, numbers, frame, srgb }) {
     Object.assign(this, { canvas, device, kernels, numbers, offsets: frame, sorts: true, kind: "WebGPU" });
     this.context = canvas.getContext("webgpu");
     const format = navigator.gpu.getPreferredCanvasFormat();
     this.context.configure({ device, format, alphaMode: "opaque" });
-    const module = device.createShaderModule({ code: COMPOSE });
+    const module = device.createShaderModule({ code: srgb + COMPOSE });
     this.compose = device.createRenderPipeline({
       layout: "auto", vertex: { module, entryPoint: "whole" }, fragment: { module, entryPoint: "compose", targets: [{ format }] },
     });

@@ -2,8 +2,10 @@
 
 use std::{
     collections::{BTreeMap, VecDeque},
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Mutex, MutexGuard},
 };
+
+use flyrig_types::lock;
 
 use bytes::{BufMut as _, Bytes, BytesMut};
 use tokio::sync::Notify;
@@ -91,7 +93,7 @@ impl Browser {
 
 impl Hub {
     fn lock(&self) -> MutexGuard<'_, Inner> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 
     /// Number of browsers.

@@ -4,7 +4,7 @@
 use flyrig_body::{Joint, Part, Skeleton, SkinWeights, Template};
 use glam::{DMat4, DQuat, DVec3, Vec2, Vec3};
 
-/// A skeleton with one joint at the origin.
+/// Returns a skeleton with one joint at the origin.
 pub fn one_joint() -> Skeleton {
     Skeleton::new(vec![Joint {
         name: "root".to_owned(),
@@ -16,7 +16,7 @@ pub fn one_joint() -> Skeleton {
     .unwrap()
 }
 
-/// A grid of `columns` x `rows` vertices bent by `place(u, v)` with u, v in 0..=1.
+/// Returns a grid of `columns` x `rows` vertices bent by `place(u, v)` with u, v in 0..=1.
 pub fn sheet(columns: usize, rows: usize, place: impl Fn(f32, f32) -> Vec3) -> Template {
     let mut template = empty();
     add_sheet(&mut template, columns, rows, place);
@@ -24,16 +24,7 @@ pub fn sheet(columns: usize, rows: usize, place: impl Fn(f32, f32) -> Vec3) -> T
 }
 
 pub fn empty() -> Template {
-    Template {
-        name: "hand-made".to_owned(),
-        positions: Vec::new(),
-        normals: Vec::new(),
-        uvs: Vec::new(),
-        triangles: Vec::new(),
-        skin: Vec::new(),
-        parts: Vec::new(),
-        skeleton: one_joint(),
-    }
+    Template::empty("hand-made", one_joint())
 }
 
 pub fn add_sheet(template: &mut Template, columns: usize, rows: usize, place: impl Fn(f32, f32) -> Vec3) {
@@ -59,7 +50,7 @@ pub fn add_sheet(template: &mut Template, columns: usize, rows: usize, place: im
     }
 }
 
-/// A flat square of one metre.
+/// Returns a flat square of one metre.
 pub fn square() -> Template {
     sheet(11, 11, |u, v| Vec3::new(u, v, 0.0))
 }

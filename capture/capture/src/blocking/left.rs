@@ -1,6 +1,6 @@
 //! Threads that still hang in a driver after their camera was given up.
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use super::worker::Line;
 
@@ -8,7 +8,7 @@ use super::worker::Line;
 static LEFT: Mutex<Vec<(String, Arc<Line>)>> = Mutex::new(Vec::new());
 
 fn lock() -> MutexGuard<'static, Vec<(String, Arc<Line>)>> {
-    LEFT.lock().unwrap_or_else(PoisonError::into_inner)
+    flyrig_types::lock(&LEFT)
 }
 
 /// Hands the threads of a device over to whoever opens it next.

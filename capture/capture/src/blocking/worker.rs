@@ -2,13 +2,13 @@
 
 use std::{
     sync::{
-        Arc, Mutex, OnceLock, PoisonError,
+        Arc, Mutex, OnceLock,
         atomic::{AtomicBool, Ordering},
     },
     thread::Builder,
 };
 
-use flyrig_types::{CameraId, PixelBuffer, caught};
+use flyrig_types::{CameraId, PixelBuffer, caught, lock};
 
 use super::{BlockingCamera, Opener, Shot};
 use crate::{BufferPool, CaptureError, CaptureErrorKind, LatestQueue};
@@ -46,7 +46,7 @@ impl Line {
 
     /// Why the thread has ended.
     pub fn end(&self) -> CaptureError {
-        let end = self.end.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let end = lock(&self.end).clone();
         end.unwrap_or_else(|| CaptureError::general(CaptureErrorKind::Disconnected, "was closed"))
     }
 }
@@ -69,7 +69,7 @@ pub(super) fn start<O: Opener>(
     let (of_thread, opener, pool) = (Arc::clone(&line), Arc::clone(opener), Arc::clone(pool));
     let work = move || {
         let end = work(&*opener, &pool, &of_thread);
-        *of_thread.end.lock().unwrap_or_else(PoisonError::into_inner) = end.err();
+        *lock(&of_thread.end) = end.err();
         of_thread.events.close();
     };
     Builder::new()

@@ -3,14 +3,14 @@
 use std::{
     path::PathBuf,
     sync::{
-        Arc, Mutex, MutexGuard, OnceLock, PoisonError,
+        Arc, Mutex, MutexGuard, OnceLock,
         atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     time::{Duration, Instant},
 };
 
 use crossbeam::channel::{Sender, TrySendError};
-use flyrig_types::Frame;
+use flyrig_types::{Frame, lock};
 
 use super::message::{self, Channel};
 
@@ -84,7 +84,7 @@ pub(super) struct Outlet {
 
 impl Shared {
     pub fn lock(&self) -> MutexGuard<'_, Recorded> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     /// Frames that are in the file now.

@@ -1,12 +1,12 @@
 //! State shared by the threads of a rig, and the body of a camera's thread.
 
 use std::{
-    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
+    sync::{Arc, Condvar, Mutex},
     time::{Duration, Instant},
 };
 
 use crossbeam::channel::RecvTimeoutError;
-use flyrig_types::{CameraId, Frame, Restarts, caught};
+use flyrig_types::{CameraId, Frame, Restarts, caught, wait_timeout};
 
 use super::{
     course::Course,
@@ -15,6 +15,7 @@ use super::{
     stats::{CameraStats, Pacing},
 };
 use crate::{CameraSource, CaptureError, CaptureErrorKind, LatestQueue, stage::Hand, turns::Turns};
+pub(super) use flyrig_types::lock;
 
 /// How long a source may wait for a frame before its thread looks whether it shall stop.
 const POLL: Duration = Duration::from_millis(200);
@@ -75,11 +76,6 @@ enum End {
     /// There are no more frames, or nobody wants them.
     Over,
     Failed,
-}
-
-/// Locks a mutex, even a poisoned one: the values behind these locks are consistent at every step.
-pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Shared {
@@ -314,7 +310,7 @@ impl Shared {
             if left.is_zero() {
                 return;
             }
-            stopped = self.stop.wait_timeout(stopped, left.min(TURN)).unwrap_or_else(PoisonError::into_inner).0;
+            stopped = wait_timeout(&self.stop, stopped, left.min(TURN));
         }
     }
 

@@ -110,7 +110,7 @@ impl<'a> Images<'a> {
             kernels.loss.prepare(scene.gpu, &mut encoder, &buffers.wanted, view.words, settings);
         }
         scene.gpu.queue.submit([encoder.finish()]);
-        let cameras = views.iter().zip(plans).map(|(view, plan)| halved(view.camera, plan.level)).collect();
+        let cameras = views.iter().zip(plans).map(|(view, plan)| view.camera.halved(plan.level)).collect();
         let (draw_time, derivatives_time) = Default::default();
         Self {
             scene,
@@ -239,16 +239,4 @@ impl DataTerm for Images<'_> {
 /// Share of the person that is where the image shows it, less what is drawn elsewhere, 0..=1.
 fn agreement(sums: &ImageSums) -> f64 {
     if sums.wanted > 0.0 && sums.mask.is_finite() { (1.0 - sums.mask / sums.wanted).max(0.0) } else { 0.0 }
-}
-
-/// The same camera with images halved so often; pixel centres are at integers.
-fn halved(camera: &Camera, level: u32) -> Camera {
-    let mut camera = camera.clone();
-    let share = 0.5f64.powi(level as i32);
-    let intrinsics = &mut camera.intrinsics;
-    intrinsics.focal_px *= share;
-    intrinsics.center_px = (intrinsics.center_px + 0.5) * share - 0.5;
-    intrinsics.width >>= level;
-    intrinsics.height >>= level;
-    camera
 }

@@ -1,5 +1,7 @@
 //! Damage to inputs.
 
+use flyrig_model::SplitMix64;
+
 /// Numbers that hurt, as text and as bytes.
 const NUMBERS: [i64; 16] = [
     0,
@@ -25,27 +27,18 @@ const WORDS: [&str; 10] =
 
 /// Makes children of inputs; the same seed makes the same ones.
 pub struct Mutator {
-    state: u64,
+    random: SplitMix64,
     /// Words of the target's language.
     words: &'static [&'static str],
 }
 
 impl Mutator {
     pub fn new(seed: u64, words: &'static [&'static str]) -> Self {
-        Self { state: seed.wrapping_mul(2).wrapping_add(1), words }
-    }
-
-    /// splitmix64.
-    fn next(&mut self) -> u64 {
-        self.state = self.state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.state;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
+        Self { random: SplitMix64(seed.wrapping_mul(2).wrapping_add(1)), words }
     }
 
     fn below(&mut self, end: usize) -> usize {
-        (self.next() % end.max(1) as u64) as usize
+        self.random.index(end)
     }
 
     /// A stretch of at most so many bytes.
@@ -70,7 +63,7 @@ impl Mutator {
         let at = self.below(bytes.len() + 1);
         match self.below(11) {
             0 if at < bytes.len() => bytes[at] ^= 1 << self.below(8),
-            1 if at < bytes.len() => bytes[at] = self.next() as u8,
+            1 if at < bytes.len() => bytes[at] = self.random.next_u64() as u8,
             2 => bytes.truncate(at),
             3 => {
                 let range = self.stretch(bytes.len(), 64);

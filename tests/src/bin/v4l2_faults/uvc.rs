@@ -7,12 +7,14 @@ use std::{
     io::{self, Cursor, Read, Write},
     os::{fd::AsRawFd as _, unix::net::UnixStream},
     sync::{
-        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        Arc, Condvar, Mutex,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
     thread::{self, Builder, JoinHandle},
     time::{Duration, Instant},
 };
+
+use flyrig_types::{lock, wait_timeout};
 
 const ATTACH: &str = "/sys/devices/platform/vhci_hcd.0/attach";
 const WIDTH: u16 = 640;
@@ -46,10 +48,6 @@ struct Shared {
 pub struct UvcCamera {
     shared: Arc<Shared>,
     threads: Vec<JoinHandle<()>>,
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl UvcCamera {
@@ -193,7 +191,7 @@ fn send_images(shared: &Shared, pictures: &[Vec<u8>]) -> io::Result<()> {
                 if shared.gone.load(Ordering::Relaxed) {
                     return Ok(());
                 }
-                waiting = shared.changed.wait_timeout(waiting, PERIOD).unwrap_or_else(PoisonError::into_inner).0;
+                waiting = wait_timeout(&shared.changed, waiting, PERIOD);
             }
             let Some((sequence, room)) = waiting.pop_front() else { continue };
             let (now, later) = rest.split_at(rest.len().min(room));

@@ -5,6 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use flyrig_model::SplitMix64;
 use flyrig_transport::{
     CameraPublisher, CameraStatus, CameraSubscriber, FrameHeader, HEADER_BYTES, Header, HostClock, MessageKind,
     PublishOutcome, TransportConfig, TransportErrorKind,
@@ -240,7 +241,7 @@ fn hostile_messages_are_refused_and_the_camera_goes_on() {
     let stranger = stranger(&config.listen);
     let mut sequence = 0;
     publish_until_seen(&host, &there, "a", &mut sequence);
-    let mut random = Random(3);
+    let mut random = SplitMix64(3);
     let _token = stranger.liveliness().declare_token("flyrig/v1/test/host/666").wait().unwrap();
     let put = |key: &str, payload: Vec<u8>, attachment: Vec<u8>| {
         stranger.put(key, payload).attachment(attachment).wait().unwrap();
@@ -250,17 +251,17 @@ fn hostile_messages_are_refused_and_the_camera_goes_on() {
         let mut attachment = good_header(n).encode().to_vec();
         let mut payload = vec![0; 8];
         match n % 7 {
-            0 => attachment.truncate(random.below(88)),
-            1 => attachment = random.bytes(88),
-            2 => attachment[random.below(HEADER_BYTES)] ^= 1 << random.below(8),
-            3 => payload.truncate(random.below(8)),
-            4 => attachment[HEADER_BYTES + 16] = random.next() as u8,
+            0 => attachment.truncate(random.index(88)),
+            1 => attachment = random_bytes(&mut random, 88),
+            2 => attachment[random.index(HEADER_BYTES)] ^= 1 << random.index(8),
+            3 => payload.truncate(random.index(8)),
+            4 => attachment[HEADER_BYTES + 16] = random.next_u64() as u8,
             5 => attachment[56..64].copy_from_slice(&[0xff; 8]),
             // Of an age that cannot be.
             _ => attachment[24..32].copy_from_slice(&i64::MAX.to_le_bytes()),
         }
         put("flyrig/v1/test/camera/a", payload, attachment);
-        put("flyrig/v1/test/camera-status/a", random.bytes(50), vec![]);
+        put("flyrig/v1/test/camera-status/a", random_bytes(&mut random, 50), vec![]);
     }
     wait_until("the refusals", || there.link(&a).refused > before + 100);
     let mut told = 0;

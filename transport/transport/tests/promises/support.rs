@@ -5,6 +5,7 @@ use std::{
     time::{Duration, Instant},
 };
 
+use flyrig_model::SplitMix64;
 use flyrig_transport::{
     ImageFormat, Interests, Publisher, Received, SplatState, Subscriber, TransportConfig, ViewFrame, Views,
 };
@@ -65,8 +66,9 @@ pub fn view(frame: u64, len: usize) -> ViewFrame {
 }
 
 pub fn splats(frame: u64, count: usize) -> SplatState {
-    let mut random = Random(frame + 1);
-    let mut vector = |low: f32, high: f32| -> [f32; 4] { std::array::from_fn(|_| low + (high - low) * random.unit()) };
+    let mut random = SplitMix64(frame + 1);
+    let mut unit = || (random.next_u64() >> 40) as f32 / (1u64 << 24) as f32;
+    let mut vector = |low: f32, high: f32| -> [f32; 4] { std::array::from_fn(|_| low + (high - low) * unit()) };
     let center_scale = (0..count).map(|_| vector(-1.0, 1.0).map(f32::abs)).collect();
     let color = (0..count).map(|_| vector(0.0, 1.0)).collect();
     SplatState { person: 0, frame, capture_nanos: -7, center_scale, color, invalid: 0 }
@@ -123,27 +125,6 @@ pub fn assert_same_rig(a: &Rig, b: &Rig) {
     }
 }
 
-/// splitmix64: the same numbers on every machine.
-pub struct Random(pub u64);
-
-impl Random {
-    pub fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    pub fn below(&mut self, end: usize) -> usize {
-        (self.next() % end.max(1) as u64) as usize
-    }
-
-    pub fn unit(&mut self) -> f32 {
-        (self.next() >> 40) as f32 / (1u64 << 24) as f32
-    }
-
-    pub fn bytes(&mut self, len: usize) -> Vec<u8> {
-        (0..len).map(|_| self.next() as u8).collect()
-    }
+pub fn random_bytes(random: &mut SplitMix64, len: usize) -> Vec<u8> {
+    (0..len).map(|_| random.next_u64() as u8).collect()
 }

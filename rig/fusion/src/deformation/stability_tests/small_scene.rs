@@ -8,7 +8,7 @@ use flyrig_gpu::{GpuContext, StorageBuffer};
 use flyrig_renderer::{GaussianBuffers, RasterSettings, srgb_from_linear};
 use flyrig_tracker::DeformReport;
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose};
-use glam::{DMat4, DQuat, DVec2, DVec3, Vec3};
+use glam::{DMat4, DQuat, DVec3, Vec3};
 
 use super::super::{DeformOptions, Deformation, Instants, TrackedView};
 use super::reference::{self, blend, sorted_splats_at};
@@ -121,19 +121,9 @@ impl SmallScene {
 fn camera(azimuth: f64, side: u32) -> Camera {
     let middle = DVec3::new(0.0, 0.9, 0.0);
     let eye = middle + DVec3::new(azimuth.sin(), 0.15, azimuth.cos()) * 3.0;
-    Camera {
-        time_offset_nanos: 0,
-        color: Default::default(),
-        id: format!("{azimuth}").into(),
-        intrinsics: Intrinsics {
-            width: side,
-            height: side,
-            focal_px: DVec2::splat(1.2 * f64::from(side)),
-            center_px: DVec2::splat(0.5 * f64::from(side) - 0.5),
-            lens: Lens::RadialTangential { radial: [-0.05, 0.01, 0.0], tangential: [0.0005, -0.0005] },
-        },
-        camera_from_world: Isometry::look_at(eye, middle, DVec3::Y),
-    }
+    let lens = Lens::RadialTangential { radial: [-0.05, 0.01, 0.0], tangential: [0.0005, -0.0005] };
+    let intrinsics = Intrinsics { lens, ..Intrinsics::pinhole(side, side, 1.2 * f64::from(side)) };
+    Camera::new(format!("{azimuth}"), intrinsics, Isometry::look_at(eye, middle, DVec3::Y))
 }
 
 /// The deformation as the engine runs it.
