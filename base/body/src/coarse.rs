@@ -54,7 +54,7 @@ pub fn coarsen(
         .map(|i| {
             let (point, normal) = (surface.positions[i], surface.normals[i]);
             let mut radius = 2.0 * spacing;
-            // Far from any neighbour of its side a Gaussian takes the nearest of all.
+            // A Gaussian without a near neighbour on its side takes the nearest of all.
             for sides_count in [true, true, true, false] {
                 let mut best = (f32::INFINITY, 0);
                 grid.within(point, radius, |j, squared| {

@@ -34,7 +34,7 @@ pub fn find_fingers(skeleton: &Skeleton) -> Option<FingerJoints> {
             continue;
         }
         let chain = &mut chains[usize::from(!is_left(name))][finger];
-        // Parents come before their children; a joint beside the chain is a helper.
+        // Parents come before their children; a joint outside the chain is a helper.
         let below = |ancestor: usize| {
             std::iter::successors(joint.parent, |&p| skeleton.joints()[p].parent).any(|p| p == ancestor)
         };

@@ -54,7 +54,7 @@ pub(crate) fn plant_feet(
         .zip(source)
         .map(|(leg, foot)| foot_moves(skeleton, &Sole::new(&origins, leg, sole_m), leg, &stands(nanos, foot), poses))
         .collect();
-    // Hips come down where a leg would be too short.
+    // Lowers the hips where a leg would be too short.
     let mut too_high = vec![0.0f64; poses.len()];
     for (leg, moves) in legs.iter().zip(&moves) {
         let length: f64 = (0..2).map(|bone| origins[leg[bone]].distance(origins[leg[bone + 1]])).sum();
@@ -87,7 +87,7 @@ impl Sole {
     fn new(origins: &[DVec3], leg: &[usize; 4], sole_m: f64) -> Self {
         let (ankle, toe) = (origins[leg[2]], origins[leg[3]]);
         let long = if leg[2] == leg[3] { 0.13 } else { (toe.z - ankle.z).abs().max(0.05) };
-        // Shoes are longer, by about half of what they are thick.
+        // Shoes are longer by about half the sole's thickness.
         let point = |x: f64, along: f64| DVec3::new(x, -ankle.y - sole_m, along * long + 0.5 * sole_m * along.signum());
         let across = if leg[2] == leg[3] { 0.0 } else { toe.x - ankle.x };
         let canonical = [point(0.0, -0.55), point(across, 1.0), point(across, 1.55)];
@@ -186,13 +186,13 @@ fn foot_moves(skeleton: &Skeleton, sole: &Sole, leg: &[usize; 4], stands: &[Stan
             pieces
         };
         let point = |frame: usize| points[frame].points[usize::from(stands[frame] == Stand::Ball)].truncate();
-        // The longest piece on the ball, or else the longest, stands where it stands on average.
+        // The longest piece on the ball, or else the longest, is fixed at its mean position.
         let key = |piece: &(usize, usize)| (stands[piece.0] == Stand::Ball, piece.1 - piece.0);
         let Some(anchor) = (0..pieces.len()).max_by_key(|&i| key(&pieces[i])) else { continue };
         let (from, to) = pieces[anchor];
         let place = (from..to).map(point).sum::<DVec2>() / (to - from) as f64;
         (from..to).for_each(|i| flat[i] = Some(place - point(i)));
-        // Its neighbours stand where they are when it hands over to them.
+        // Its neighbours are fixed at their position at the transition.
         for &(from, to) in &pieces[anchor + 1..] {
             let place = point(from) + flat[from - 1].unwrap_or_default();
             (from..to).for_each(|i| flat[i] = Some(place - point(i)));
@@ -202,7 +202,7 @@ fn foot_moves(skeleton: &Skeleton, sole: &Sole, leg: &[usize; 4], stands: &[Stan
             (from..to).for_each(|i| flat[i] = Some(place - point(i)));
         }
     }
-    // Between stands the way from one correction to the next; never through the floor.
+    // Between contacts the correction is interpolated, never through the floor.
     let known: Vec<(usize, DVec3)> =
         flat.iter().enumerate().filter_map(|(i, flat)| Some((i, flat.as_ref()?.extend(-lowest(i))))).collect();
     (0..poses.len())
@@ -249,7 +249,7 @@ fn move_ankle(skeleton: &Skeleton, leg: &[usize; 4], moved: DVec3, pose: &mut Po
     let target = ankle + moved - hip;
     let distance = target.length().clamp((thigh - shank).abs() + 1e-4, (thigh + shank) * 0.9999);
     let along = target.normalize_or(DVec3::NEG_Z);
-    // A straight leg bends to where its foot points.
+    // A straight leg bends in the direction of its foot.
     let toes = at(&world, leg[3]) - ankle;
     let pole = (knee - hip) * 4.0 + toes.normalize_or(DVec3::NEG_Y) * 0.02;
     let bend = (pole - along * pole.dot(along)).normalize_or(along.any_orthonormal_vector());

@@ -73,7 +73,7 @@ pub fn write_glb(path: &Path, template: &Template, contents: GlbContents<'_>) ->
     if let Some(png) = contents.texture {
         primitive["material"] = json!(0);
         let view = glb.bytes(png);
-        // Photographs hold their light already.
+        // The photographed texture already contains the lighting.
         document["extensionsUsed"] = json!(["KHR_materials_unlit"]);
         document["images"] = json!([{ "bufferView": view, "mimeType": "image/png" }]);
         document["textures"] = json!([{ "source": 0 }]);
@@ -133,7 +133,7 @@ mod tests {
         let read = human.track.unwrap();
         assert_eq!(read.span_nanos(), track.span_nanos());
         for nanos in [0, 200_000_000, 500_000_000] {
-            // The importer may order the joints in its own way; the surface tells.
+            // The importer may reorder the joints, so the surfaces are compared.
             let (a, _) = skin_mesh(&human.template, &read.at(nanos));
             let (b, _) = skin_mesh(&template, &track.at(nanos));
             for (a, b) in a.iter().zip(&b) {

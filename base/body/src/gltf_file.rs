@@ -22,12 +22,12 @@ impl<'a> GltfFile<'a> {
     pub fn open(path: &'a Path) -> Result<Self, BodyError> {
         let fail = |message: String| BodyError::Gltf { path: path.into(), message };
         let bytes = gltf_uri::read(path, MAX_FILE_BYTES)?;
-        // The length stands in the header; the parser would take its word for it.
-        if let Some(told) = bytes.get(8..12).filter(|_| bytes.starts_with(b"glTF")) {
-            let told = u32::from_le_bytes([told[0], told[1], told[2], told[3]]) as usize;
-            if !(20..=bytes.len()).contains(&told) {
+        // The parser would trust the length in the header.
+        if let Some(stated) = bytes.get(8..12).filter(|_| bytes.starts_with(b"glTF")) {
+            let stated = u32::from_le_bytes([stated[0], stated[1], stated[2], stated[3]]) as usize;
+            if !(20..=bytes.len()).contains(&stated) {
                 let found = bytes.len();
-                return Err(fail(format!("cut off: {found} of {told} bytes; copy the file again")));
+                return Err(fail(format!("cut off: {found} of {stated} bytes; copy the file again")));
             }
         }
         let entries = json_entries(json_part(&bytes));
@@ -50,9 +50,9 @@ impl<'a> GltfFile<'a> {
                     .decode(embedded(uri).unwrap_or_default())
                     .map_err(|error| fail(format!("buffer {index}: {error}")))?,
             };
-            let (found, told) = (data.len(), buffer.length());
-            if found < told {
-                return Err(fail(format!("buffer {index} is cut off: {found} of {told} bytes")));
+            let (found, stated) = (data.len(), buffer.length());
+            if found < stated {
+                return Err(fail(format!("buffer {index} is cut off: {found} of {stated} bytes")));
             }
             buffers.push(data);
         }

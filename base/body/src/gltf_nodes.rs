@@ -67,7 +67,7 @@ impl Nodes {
             order.extend(&children[node]);
             next += 1;
         }
-        // With one parent each, nodes that no root reaches hang in a circle.
+        // Each node has one parent, so nodes that no root reaches form a cycle.
         if order.len() < count {
             return Err(file.fail("the node hierarchy runs in a circle"));
         }
@@ -191,7 +191,7 @@ fn pose_times(file: &GltfFile<'_>, curves: &[Curve], moving: usize) -> Result<Ve
     let what = format!("poses of an animation of {moving} nodes");
     let mut nanos = Vec::new();
     for curve in curves {
-        // Counted before they are made: a cubic curve has up to a thousand a key.
+        // Counted first: a cubic curve has up to a thousand per key.
         file.check_count(&what, curve.count_needed(), limit)?;
         nanos.extend(curve.times_needed());
         // Merges the sorted runs.

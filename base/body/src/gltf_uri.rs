@@ -54,7 +54,7 @@ pub(crate) fn resolve(gltf: &Path, uri: &str) -> Result<PathBuf, BodyError> {
 pub(crate) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, BodyError> {
     let io = |source| BodyError::Io { path: path.into(), source };
     let refuse = |message: String| BodyError::Gltf { path: path.into(), message };
-    // Before opening: that of a pipe would wait for a writer.
+    // Before opening: opening a pipe would wait for a writer.
     let meta = std::fs::metadata(path).map_err(io)?;
     if !meta.is_file() {
         return Err(refuse("is not a regular file".to_owned()));

@@ -67,7 +67,7 @@ pub(crate) fn match_joints(
             {
                 (source[index], taken[theirs]) = (Some(theirs), true);
             }
-            // Where only a shoulder is called by name it is the arm's.
+            // A rig that names only a shoulder means the upper arm.
             if joint == "Arm"
                 && source[index].is_none()
                 && let Some(shoulder) = skeleton.joint(&format!("{side}Shoulder"))

@@ -210,7 +210,7 @@ mod tests {
                 let ([left, right], [back, front]) = (reach(|p| p.x), reach(|p| p.z));
                 assert!((left..=right).contains(&point.x) && (back..=front).contains(&point.z), "{point} of {part:?}");
             }
-            // A shoe is longer than the foot, as shops have it.
+            // A shoe is longer than the foot by a usual amount.
             let length = |t: &Template| {
                 let feet = t.positions.iter().filter(|p| p.x > 0.0 && p.y < 0.04).map(|p| p.z);
                 feet.clone().fold(f32::NEG_INFINITY, f32::max) - feet.fold(f32::INFINITY, f32::min)

@@ -1,24 +1,24 @@
 // Linear blend skinning of surface Gaussians: world = LBS(x + t_x), FlyHuman section 3.1.
-// One invocation a Gaussian. A displacement or growth that is not finite counts as none; a buffer of one element
-// displaces nobody else.
+// One invocation per Gaussian. A displacement or growth that is not finite counts as none; Gaussians beyond the buffer's end are
+// not displaced.
 
-// Three rows of world_from_canonical a joint.
+// Three rows of world_from_canonical per joint.
 @group(0) @binding(0) var<storage, read> joint_rows: array<vec4f>;
 // Canonical position; w: scale.
 @group(0) @binding(1) var<storage, read> rest: array<vec4f>;
-// w: depth below the surface that is drawn.
+// Canonical normal; w: depth below the rendered surface, metres.
 @group(0) @binding(2) var<storage, read> rest_normal: array<vec4f>;
 // Four joint indices of 16 bits.
 @group(0) @binding(3) var<storage, read> skin_joints: array<vec2u>;
 @group(0) @binding(4) var<storage, read> skin_weights: array<vec4f>;
-// w: share by which the surface, its Gaussians and their depth are larger than at rest.
+// Canonical displacement; w: relative growth of the surface, its Gaussians and their depth.
 @group(0) @binding(5) var<storage, read> displacement: array<vec4f>;
 @group(0) @binding(6) var<storage, read_write> center_scale: array<vec4f>;
 @group(0) @binding(7) var<storage, read_write> normal: array<vec4f>;
 
 override WORKGROUP_SIZE: u32 = 64u;
 
-// By its bits, since compilers may assume that no float is NaN.
+// Tests the bits, since compilers may assume that no float is NaN.
 fn finite(v: vec3f) -> bool {
     let exponents = bitcast<vec3u>(v) & vec3u(0x7f800000u);
     return all(exponents != vec3u(0x7f800000u));

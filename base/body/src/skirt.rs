@@ -196,7 +196,7 @@ mod tests {
                 assert!(from.length() < radius + 0.003, "{point} is outside of the skirt");
             }
         }
-        // Legs that are lifted carry the hem's front along.
+        // Lifted legs carry the hem's front along.
         let mut pose = body.skeleton.rest_pose();
         for name in ["LeftUpLeg", "RightUpLeg"] {
             pose.joint_rotations[body.skeleton.joint(name).unwrap()] = DQuat::from_rotation_x(-1.0);

@@ -79,7 +79,7 @@ mod tests {
         let hung = || surface.triangle.iter().copied().zip(surface.barycentric.iter().copied());
         let given: Vec<[f32; 4]> = surface.positions.iter().map(|p| by(*p).extend(9.0).to_array()).collect();
         let found = VertexMeans::new(&template, hung()).of(&given);
-        // Means of what lies within a triangle: exact up to the slope times its size.
+        // Means over a triangle are exact up to the slope times its size.
         let worst = template.positions.iter().zip(&found).map(|(p, found)| (by(*p) - *found).length());
         assert!(worst.fold(0.0, f32::max) < 1.5e-3);
 
@@ -88,7 +88,7 @@ mod tests {
             hung().zip(&surface.positions).filter(|(_, p)| p.y > 1.0).map(|(hung, _)| hung).collect();
         let means = VertexMeans::new(&template, upper.iter().copied());
         let found = means.of(&vec![[0.01, 0.0, 0.0, 0.0]; upper.len()]);
-        // Pieces that no triangle joins to one with a Gaussian (teeth, eyes, parts of the skin that are cut off at seams) stay where they are.
+        // Pieces without a Gaussian that no triangle connects to one (teeth, eyes, skin cut off at seams) stay in place.
         let mut reached = vec![false; found.len()];
         for (triangle, weights) in &upper {
             let corners = template.triangles[*triangle as usize].iter().zip(weights);

@@ -70,7 +70,7 @@ impl GpuContext {
         };
         check("max_storage_buffers_per_shader_stage", limits.max_storage_buffers_per_shader_stage.into(), 13)?;
         check("max_compute_invocations_per_workgroup", limits.max_compute_invocations_per_workgroup.into(), 256)?;
-        // The networks' library takes for granted that of these, whatever the adapter can is switched on.
+        // The networks' library assumes that these features are enabled wherever the adapter has them.
         let networks = Features::SUBGROUP
             | Features::SHADER_F16
             | Features::SHADER_F64

@@ -134,8 +134,8 @@ mod tests {
 
     #[test]
     fn every_bit_is_that_of_the_written_out_formula_in_f32() {
-        // Each 61st number of both signs, with the infinities and NaN.
-        for bits in (0..=u32::MAX).step_by(61) {
+        // Each 997th number of both signs, with the infinities and NaN.
+        for bits in (0..=u32::MAX).step_by(997) {
             let x = f32::from_bits(bits);
             for powf in [f32::powf, libm::powf] {
                 let ours = [encode(x, powf), decode(x, powf), slope(x, powf), inverse_slope(x, powf)];

@@ -55,8 +55,11 @@ mod tests {
     }
 
     fn check(rest: f64, now: f64) {
-        let (ours, theirs) = (growth(rest, now, f64::sqrt), of_body(rest, now));
-        assert_eq!(ours.to_bits(), theirs.to_bits(), "{rest} {now}: {ours} {theirs}");
+        // Sums of squares in `body` are never negative; differences in `stream` may be, by rounding.
+        if now.is_nan() || now >= 0.0 {
+            let (ours, theirs) = (growth(rest, now, f64::sqrt), of_body(rest, now));
+            assert_eq!(ours.to_bits(), theirs.to_bits(), "{rest} {now}: {ours} {theirs}");
+        }
         let (rest, now) = (rest as f32, now as f32);
         let (ours, theirs) = (growth(rest, now, libm::sqrtf), of_stream(rest, now));
         assert_eq!(ours.to_bits(), theirs.to_bits(), "{rest} {now}: {ours} {theirs}");

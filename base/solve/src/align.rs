@@ -109,7 +109,7 @@ fn align(pairs: &[PointPair], with_scale: bool) -> Option<Alignment> {
     let rounding = total * (LEAST_SPREAD * size.0) * (LEAST_SPREAD * size.1);
     let least = rounding.max(LEAST_RATIO * values[0]);
     let sign = (u * v_t).determinant().signum();
-    // With a mirror image, the third axis turns against its wish; that is undecided where the second wishes as little.
+    // For a mirror image the axis of the least singular value is reversed; that is ambiguous where the second is as small.
     let is_open = values[1] <= least || (sign < 0.0 && values[1] - values[2] <= least);
     if is_open {
         return None;
@@ -226,7 +226,7 @@ mod tests {
             same(&[axis * 1000.0; 6]),
             same(&[axis * 0.1 + axis * 1e5; 3]),
             same(&[DVec3::ZERO, axis, axis * 2.0, axis * -3.5]),
-            // Inverted through the centre: every axis turns alike badly.
+            // Inverted through the centre: all axes fit equally badly.
             cube.iter().map(|p| pair(*p, -*p, 1.0)).collect(),
             // One side collinear.
             corners.iter().map(|p| pair(*p, axis * p.x, 1.0)).collect(),

@@ -149,7 +149,7 @@ pub fn jacobian_error<P: BlockProblem>(problem: &P, at: &P::Unknowns, index: usi
                 let numeric = (above.get(row)? - below.get(row)?) / (2.0 * step);
                 let analytic = analytic.map_or(0.0, |jacobian| jacobian[(row, k)]);
                 let off = (analytic - numeric).abs() / numeric.abs().max(1.0);
-                // NaN is as wrong as can be.
+                // NaN counts as an infinite difference.
                 worst = if off.is_nan() { f64::INFINITY } else { worst.max(off) };
             }
         }

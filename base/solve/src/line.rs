@@ -4,7 +4,7 @@
 //! integers first; only the small remainder becomes a float. Differences are taken modulo 2⁶⁴: they must be below 2⁶³ ns
 //! (292 years), the times themselves may be anywhere.
 
-use crate::median::median;
+use crate::percentile::median;
 
 /// Standard deviation of a normal distribution over the median of its absolute values.
 const SIGMA_PER_MEDIAN: f64 = 1.4826;

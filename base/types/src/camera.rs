@@ -164,7 +164,7 @@ impl Lens {
     /// Inverts [`Self::distort`] by damped Newton steps; `None` when no point of the valid part of the plane maps there.
     #[must_use]
     pub fn undistort(&self, distorted: DVec2) -> Option<DVec2> {
-        // The valid radius takes a search; mostly it is enough to know that it is larger than what is needed.
+        // The valid radius takes a search; mostly it suffices to know that it exceeds the required one.
         let near = 2.0 * distorted.length() + 0.1;
         let quick = self.surely_grows(near).then(|| self.undistort_within(distorted, near)).flatten();
         quick.or_else(|| self.undistort_within(distorted, self.valid_radius()))

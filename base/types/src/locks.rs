@@ -37,12 +37,12 @@ mod tests {
     fn a_poisoned_lock_still_opens() {
         let value = Arc::new(Mutex::new(1));
         let held = Arc::clone(&value);
-        let panicked = std::thread::spawn(move || {
+        let panicked = std::thread::Builder::new().spawn(move || {
             let mut value = lock(&held);
             *value = 2;
             panic!("while it holds the lock");
         });
-        assert!(panicked.join().is_err() && value.is_poisoned());
+        assert!(panicked.unwrap().join().is_err() && value.is_poisoned());
         assert_eq!(*lock(&value), 2);
         assert_eq!(*wait_timeout(&Condvar::new(), lock(&value), Duration::from_millis(1)), 2);
     }

@@ -136,7 +136,7 @@ impl PoseTrack {
         let mut shift: i64 = 0;
         while span > 1 && last.saturating_add(shift) < until_nanos {
             shift = shift.saturating_add(span);
-            // The last key and the first of the next round would have one time.
+            // Otherwise the last key and the first of the next repetition would have the same time.
             if let Some((end, _)) = keys.last_mut() {
                 *end -= 1;
             }

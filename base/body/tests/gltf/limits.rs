@@ -3,7 +3,7 @@
 use flyrig_body::{BodyError, GltfHuman, load_gltf};
 use serde_json::{Value, json};
 
-use crate::file::{animate, armature, load_bytes};
+use crate::file::{File, animate, armature, load_bytes};
 
 /// Loads a `.gltf` whose only buffer is `uri`, from a folder of its own in which `prepare` puts further files.
 fn load_with_buffer(uri: &str, prepare: impl Fn(&std::path::Path, &[u8])) -> Result<GltfHuman, BodyError> {
