@@ -7,6 +7,7 @@
 
 mod problem;
 mod rays;
+mod smoothing;
 mod tangents;
 mod tracks;
 mod untangle;

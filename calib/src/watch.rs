@@ -4,6 +4,7 @@
 //! brightness of each patch brought to mean 0 and length 1, so that lights and exposure change nothing), and one rotation of the
 //! camera must explain most of them. People and moved furniture agree on no rotation.
 
+mod image;
 mod patches;
 #[cfg(test)]
 mod tests;
@@ -12,6 +13,7 @@ use flyrig_solve::exp_rotation;
 use flyrig_types::{Camera, Intrinsics, Isometry};
 use glam::{DMat3, DVec2, DVec3};
 
+pub use self::image::WatchedImage;
 use self::patches::{Patch, Pyramid, choose, coarse_shift, track};
 use crate::{
     LensModel,
@@ -79,19 +81,6 @@ pub struct CameraWatch {
     /// Motions of the last looks, newest last.
     recent: Vec<CameraMotion>,
     state: WatchState,
-}
-
-/// An RGB or grey image: bytes, `channels` for each pixel, row by row.
-#[derive(Debug, Clone, Copy)]
-pub struct WatchedImage<'a> {
-    /// Pixels.
-    pub width: usize,
-    /// Pixels.
-    pub height: usize,
-    /// 1 or 3.
-    pub channels: usize,
-    /// `width * height * channels` bytes.
-    pub bytes: &'a [u8],
 }
 
 impl CameraWatch {

@@ -6,12 +6,13 @@ use flyrig_body::{Part, Template};
 use flyrig_gpu::GpuContext;
 use flyrig_types::{Camera, Image, Mask, PixelFormat, Pose, PoseTrack, Rig};
 
-use crate::actor::Shape;
-use crate::cast::Cast;
-use crate::draw::{Drawing, Raw, Take};
-use crate::person::Person;
-use crate::scene::Scene;
-use crate::sensor::{hash, linear_of_half};
+use crate::camera::sensor::{hash, linear_of_half};
+use crate::draw::cast::Cast;
+use crate::draw::drawing::Drawing;
+use crate::draw::moment::{ImageRequest, RawImage};
+use crate::person::actor::Shape;
+use crate::person::assembly::Person;
+use crate::room::scene::Scene;
 use crate::{FramePlan, OpticsConfig, SensorConfig, Shot, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring};
 
 /// A person, a motion, a room and cameras.
@@ -31,7 +32,7 @@ pub struct Simulator {
 struct Kept {
     /// Instant that was asked for last.
     asked_nanos: Option<i64>,
-    drawn: Option<(i64, Raw)>,
+    drawn: Option<(i64, RawImage)>,
 }
 
 impl fmt::Debug for Simulator {
@@ -53,7 +54,7 @@ impl Simulator {
         let cameras = rig.cameras.iter().map(|_| Kept::default()).collect();
         let mut new = Self { config: config.clone(), rig, cast, plates: Vec::new(), drawing, posed: None, cameras };
         for slot in 0..new.rig.cameras.len() {
-            let take = Take { people: false, ..new.take(&Shot::new(0, slot))? };
+            let take = ImageRequest { people: false, ..new.take(&Shot::new(0, slot))? };
             for raw in new.drawing.pictures(&[take])? {
                 // An instant that no frame has.
                 let plate = new.develop(&raw, &Shot::new(i64::MIN, slot))?;
@@ -209,7 +210,7 @@ impl Simulator {
     }
 
     /// Light and coverage of a shot, drawn unless it was.
-    fn raw(&mut self, shot: &Shot) -> Result<Raw, SimError> {
+    fn raw(&mut self, shot: &Shot) -> Result<RawImage, SimError> {
         shot.validate()?;
         let take = self.take(shot)?;
         if shot.camera_shift.is_some() {
@@ -247,7 +248,7 @@ impl Simulator {
         }
         let each = self.config.width as usize * self.config.height as usize * size_of::<[u16; 4]>();
         for slots in missing.chunks((BATCH_BYTES / each).max(1)) {
-            let takes: Vec<Take> =
+            let takes: Vec<ImageRequest> =
                 slots.iter().map(|&slot| self.take(&Shot::new(nanos, slot))).collect::<Result<_, _>>()?;
             self.set_moment(nanos, takes.iter().map(|take| take.optics.reach_secs()).fold(0.0, f64::max))?;
             for (&slot, raw) in slots.iter().zip(self.drawing.pictures(&takes)?) {
@@ -267,7 +268,7 @@ impl Simulator {
         Ok(())
     }
 
-    fn take(&self, shot: &Shot) -> Result<Take, SimError> {
+    fn take(&self, shot: &Shot) -> Result<ImageRequest, SimError> {
         let mut camera = self.camera(shot.slot)?.clone();
         if let Some(shift) = shot.camera_shift {
             camera.camera_from_world = shift * camera.camera_from_world;
@@ -276,7 +277,7 @@ impl Simulator {
             0 => OpticsConfig::default(),
             count => self.config.optics[shot.slot % count].clone(),
         };
-        Ok(Take { nanos: shot.nanos, camera, optics, people: true })
+        Ok(ImageRequest { nanos: shot.nanos, camera, optics, people: true })
     }
 
     fn finished(&self, raw: &[[u16; 4]], shot: &Shot) -> Result<(Image, Mask), SimError> {

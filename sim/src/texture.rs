@@ -3,8 +3,8 @@
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::sheet::Sheet;
-use crate::wardrobe::Srgb;
+use crate::clothes::sheet::Sheet;
+use crate::clothes::wardrobe::Srgb;
 
 /// A square sRGB image.
 #[derive(Debug, Clone)]

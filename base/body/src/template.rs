@@ -101,6 +101,21 @@ pub struct Template {
 }
 
 impl Template {
+    /// Returns a template without vertices.
+    #[must_use]
+    pub fn empty(name: impl Into<String>, skeleton: Skeleton) -> Self {
+        Self {
+            name: name.into(),
+            positions: Vec::new(),
+            normals: Vec::new(),
+            uvs: Vec::new(),
+            triangles: Vec::new(),
+            skin: Vec::new(),
+            parts: Vec::new(),
+            skeleton,
+        }
+    }
+
     /// Area of the canonical surface, square metres; triangles whose corners do not exist count nothing.
     #[must_use]
     pub fn area_m2(&self) -> f64 {

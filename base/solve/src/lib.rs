@@ -23,4 +23,4 @@ pub use median::median;
 pub use minimize::{Convergence, Problem, Solution, Stop, minimize};
 pub use motion::RigidMotion;
 pub use normal::{ArrowNormal, DenseNormal, EliminatedBlock, Factor, NormalEquations};
-pub use rotation::{exp_rotation, left_jacobian, left_jacobian_inverse, log_rotation, mean_rotation, skew};
+pub use rotation::{exp_rotation, left_jacobian, left_jacobian_inverse, log_rotation, skew};

@@ -1,14 +1,11 @@
-//! Exponential, logarithm, Jacobians and mean of rotations, SO(3).
+//! Exponential, logarithm and Jacobians of rotations, SO(3).
 //!
 //! A rotation vector is axis times angle in radians. Perturbations are on the left: `exp(δ) R`.
 
 use glam::{DMat3, DQuat, DVec3};
-use nalgebra::{Matrix4, SymmetricEigen, Vector4};
 
 /// Angles below this use the Taylor series of the left Jacobian, radians.
 const SERIES_ANGLE: f64 = 0.1;
-/// Relative gap between the two largest eigenvalues below which a mean rotation is ambiguous.
-const LEAST_GAP: f64 = 1e-9;
 
 /// Returns the unit quaternion of a rotation vector.
 #[must_use]
@@ -67,38 +64,6 @@ pub fn left_jacobian_inverse(v: DVec3) -> DMat3 {
     // (1 - (θ/2) cot(θ/2)) / θ², by its series near 0.
     let factor = if angle < 1e-4 { 1.0 / 12.0 } else { (1.0 - 0.5 * angle / (0.5 * angle).tan()) / (angle * angle) };
     DMat3::IDENTITY - cross * 0.5 + cross * cross * factor
-}
-
-/// Returns the weighted chordal mean of rotations: the rotation with the least sum of squared Frobenius distances
-/// (Markley et al. 2007). Both quaternions of a rotation count alike.
-///
-/// `None` when a rotation or weight is not finite, a weight is negative, all weights are 0, or the mean is ambiguous (as
-/// of two rotations that are π apart).
-#[must_use]
-pub fn mean_rotation(rotations: &[(DQuat, f64)]) -> Option<DQuat> {
-    let mut sum = Matrix4::zeros();
-    let mut total = 0.0;
-    for (rotation, weight) in rotations {
-        let q = Vector4::from(rotation.normalize().to_array());
-        if !(*weight >= 0.0 && weight.is_finite() && q.iter().all(|v| v.is_finite())) {
-            return None;
-        }
-        sum += q * q.transpose() * *weight;
-        total += weight;
-    }
-    if !(total > 0.0 && total.is_finite()) {
-        return None;
-    }
-    let eigen = SymmetricEigen::try_new(sum / total, 1e-15, 1000)?;
-    let mut order = [0, 1, 2, 3];
-    order.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
-    let [largest, next, ..] = order;
-    if eigen.eigenvalues[largest] - eigen.eigenvalues[next] <= LEAST_GAP {
-        return None;
-    }
-    let v = eigen.eigenvectors.column(largest);
-    let mean = DQuat::from_xyzw(v[0], v[1], v[2], v[3]).normalize();
-    mean.is_finite().then_some(if mean.w < 0.0 { -mean } else { mean })
 }
 
 #[cfg(test)]
@@ -163,48 +128,8 @@ mod tests {
     }
 
     #[test]
-    fn mean_has_the_least_chordal_distance() {
-        let mut random = Random(8);
-        for _ in 0..50 {
-            let center = random.rotation();
-            let rotations: Vec<(DQuat, f64)> = (0..7)
-                .map(|i| {
-                    let q = exp_rotation(random.vector() * 0.7) * center;
-                    (if i % 2 == 0 { q } else { -q }, 0.1 + random.signed().abs())
-                })
-                .collect();
-            let mean = mean_rotation(&rotations).unwrap();
-            let cost = |q: DQuat| {
-                rotations.iter().fold(0.0, |sum, (r, w)| {
-                    let d = DMat3::from_quat(q) - DMat3::from_quat(*r);
-                    sum + w * d.to_cols_array().iter().map(|v| v * v).sum::<f64>()
-                })
-            };
-            let least = cost(mean);
-            for _ in 0..200 {
-                assert!(cost(exp_rotation(random.vector() * 0.02) * mean) > least);
-            }
-            assert!(mean_rotation(&[(center, 2.0)]).unwrap().dot(center).abs() > 1.0 - 1e-15);
-        }
-    }
-
-    #[test]
-    fn mean_of_nothing_of_opposites_and_of_poison_is_none() {
-        let half_turn = exp_rotation(DVec3::X * PI);
+    fn logarithm_and_exponential_keep_values_that_are_not_finite() {
         let nan = DQuat::from_xyzw(f64::NAN, 0.0, 0.0, 1.0);
-        let id = DQuat::IDENTITY;
-        for bad in [
-            vec![],
-            vec![(id, 0.0)],
-            vec![(id, -1.0), (id, 2.0)],
-            vec![(id, f64::NAN)],
-            vec![(id, f64::INFINITY)],
-            vec![(nan, 1.0)],
-            vec![(DQuat::from_xyzw(0.0, 0.0, 0.0, 0.0), 1.0)],
-            vec![(id, 1.0), (half_turn, 1.0)],
-        ] {
-            assert_eq!(mean_rotation(&bad), None, "{bad:?}");
-        }
         assert!(!log_rotation(nan).is_finite() && !exp_rotation(DVec3::NAN).is_finite());
     }
 }

@@ -4,7 +4,7 @@
 use flyrig_solve::RigidMotion;
 use glam::DVec3;
 
-use super::tracks::parabola_weights;
+use super::smoothing::parabola_weights;
 
 /// Smallest sine of the angle between the baseline and the viewing direction: near the baseline the angle is ill-conditioned.
 const LEAST_APART: f64 = 0.35;

@@ -2,7 +2,7 @@
 
 use glam::{DVec2, DVec3};
 
-use super::WatchedImage;
+use super::image::WatchedImage;
 
 /// Half the side of a patch, and its side, pixels.
 const HALF: usize = 7;

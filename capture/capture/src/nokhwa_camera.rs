@@ -6,7 +6,7 @@ use std::{
 };
 
 use crossbeam::channel::bounded;
-use flyrig_types::{CameraId, Frame, PixelFormat};
+use flyrig_types::{CameraId, PixelFormat};
 use nokhwa::{
     Camera, NokhwaError, nokhwa_check, nokhwa_initialize, query,
     utils::{
@@ -16,10 +16,11 @@ use nokhwa::{
 };
 
 use crate::{
-    CameraSource, CaptureError, CaptureErrorKind, FormatChoice, SourceHealth,
+    CaptureError, CaptureErrorKind, FormatChoice,
     blocking::{BlockingCamera, Expected, Opener, Shot, Watched},
     clock::monotonic_nanos,
     image_file, mjpeg,
+    source::forward_source,
 };
 
 /// Formats that the crate knows and what we call them, in the order in which [`FormatChoice::Auto`] takes them.
@@ -103,19 +104,7 @@ impl NokhwaCamera {
     }
 }
 
-impl CameraSource for NokhwaCamera {
-    fn camera(&self) -> &CameraId {
-        self.0.camera()
-    }
-
-    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
-        self.0.next_frame(timeout)
-    }
-
-    fn health(&self) -> SourceHealth {
-        self.0.health()
-    }
-}
+forward_source!(NokhwaCamera);
 
 /// Number and name of every camera that `nokhwa` sees.
 ///

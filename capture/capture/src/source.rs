@@ -97,3 +97,26 @@ impl<S: CameraSource + ?Sized> CameraSource for Box<S> {
         (**self).health()
     }
 }
+
+/// Implements [`CameraSource`] for a newtype by forwarding to its field, which has methods of the same names.
+macro_rules! forward_source {
+    ($source:ty) => {
+        impl $crate::CameraSource for $source {
+            fn camera(&self) -> &flyrig_types::CameraId {
+                self.0.camera()
+            }
+
+            fn next_frame(
+                &mut self,
+                timeout: std::time::Duration,
+            ) -> Result<flyrig_types::Frame, $crate::CaptureError> {
+                self.0.next_frame(timeout)
+            }
+
+            fn health(&self) -> $crate::SourceHealth {
+                self.0.health()
+            }
+        }
+    };
+}
+pub(crate) use forward_source;

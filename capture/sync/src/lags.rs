@@ -64,16 +64,10 @@ impl MotionSignal {
         self.last = Some((capture_nanos, bands));
     }
 
-    /// Images that were compared.
+    /// Number of image pairs compared so far.
     #[must_use]
-    pub fn len(&self) -> usize {
+    pub fn comparisons(&self) -> usize {
         self.samples.len()
-    }
-
-    /// Whether nothing was compared yet.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.samples.is_empty()
     }
 
     /// Every zone, every [`STEP`] from `start` on, without what is slower than [`TREND`].
@@ -403,7 +397,7 @@ mod tests {
         odd.add(i64::MAX, &[1, 2, 9], 1, 1);
         odd.add(i64::MIN, &[1, 2, 3], 1, 1);
         odd.add(i64::MAX, &[0; 12], 2, 2);
-        assert_eq!(odd.len(), 1);
+        assert_eq!(odd.comparisons(), 1);
         let estimates = estimate_lags(&[odd.clone(), odd.clone(), MotionSignal::new("none".into())], i64::MAX);
         assert_eq!(estimates[2].lag_nanos, None);
         assert_eq!(estimates[0].lag_nanos, Some(0));

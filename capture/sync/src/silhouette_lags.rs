@@ -68,16 +68,10 @@ impl SilhouetteTrack {
         }
     }
 
-    /// Masks that were added.
+    /// Number of masks added so far.
     #[must_use]
-    pub fn len(&self) -> usize {
+    pub fn masks(&self) -> usize {
         self.samples.len()
-    }
-
-    /// Whether no mask was added yet.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.samples.is_empty()
     }
 
     /// Half of the median time between two masks, nanoseconds.

@@ -5,8 +5,8 @@ use glam::{DQuat, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::SimError;
+use crate::camera::sensor::{gaussian, hash};
 use crate::error::check;
-use crate::sensor::{gaussian, hash};
 
 /// How far the reported cameras are off the true ones: each error is drawn for each camera from a Gaussian of this
 /// standard deviation (an axis, for rotation, translation and centre).

@@ -20,9 +20,9 @@ use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::SimError;
+use crate::camera::ring::camera_name;
+use crate::camera::sensor::{gaussian, hash, uniform};
 use crate::error::check;
-use crate::ring::camera_name;
-use crate::sensor::{gaussian, hash, uniform};
 
 /// Kind of a [`Fault`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

@@ -4,8 +4,8 @@ use glam::Vec2;
 use serde::{Deserialize, Serialize};
 
 use crate::SimError;
+use crate::camera::sensor::uniform;
 use crate::error::check;
-use crate::sensor::uniform;
 
 /// One camera's shutter and aperture; the default is an instant and a pinhole.
 ///

@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Lens, Rig};
 use glam::{DQuat, DVec2, DVec3, EulerRot};
 
-use crate::sensor::{hash, uniform};
+use crate::camera::sensor::{hash, uniform};
 use crate::{SimConfig, SimError};
 
 /// Name of a camera of the ring.

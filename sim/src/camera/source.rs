@@ -8,7 +8,7 @@ use std::{
 use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind};
 use flyrig_types::{CameraId, Frame, Image};
 
-use crate::clock::RealClock;
+use crate::camera::clock::RealClock;
 use crate::{Delivery, FramePlan, Shot, SimError, SimTime, Simulator};
 
 /// One camera of a [`Simulator`]. All sources of a simulator see the same instants but for what the configured faults

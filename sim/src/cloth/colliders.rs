@@ -3,7 +3,7 @@
 use flyrig_body::Part;
 use glam::{DMat4, Vec3};
 
-use crate::person::Person;
+use crate::person::assembly::Person;
 
 /// Cloth keeps this far from what is below it, metres.
 const APART_M: f32 = 0.007;

@@ -16,7 +16,7 @@ mod tests;
 use flyrig_types::PoseTrack;
 use glam::Vec3;
 
-use crate::person::Person;
+use crate::person::assembly::Person;
 use colliders::Colliders;
 use pieces::Pieces;
 use replay::Replay;

@@ -8,7 +8,7 @@ use glam::Vec3;
 use super::colliders::Capsule;
 use super::solver::{Link, Particle, Particles};
 use crate::noise::smoothstep;
-use crate::person::{Person, SheetRange};
+use crate::person::assembly::{Person, SheetRange};
 
 /// Distance of control particles, metres.
 const SPACING_M: f32 = 0.030;

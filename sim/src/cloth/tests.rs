@@ -7,9 +7,9 @@ use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use super::solver::{Carried, Link, Particle, Particles, State, pull, step};
 use super::*;
-use crate::actor::{Actor, Shape};
-use crate::look::Look;
-use crate::wardrobe::{Bottom, HairCut};
+use crate::clothes::wardrobe::{Bottom, HairCut};
+use crate::person::actor::{Actor, Shape};
+use crate::person::look::Look;
 use crate::{MotionKind, SimConfig, describe_person};
 
 /// Somebody in a coat, and somebody in a skirt.

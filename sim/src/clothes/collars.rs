@@ -2,9 +2,9 @@
 
 use glam::Vec3;
 
+use crate::clothes::sheet::{Node, Sheet};
+use crate::clothes::wardrobe::Outer;
 use crate::noise::smoothstep;
-use crate::sheet::{Node, Sheet};
-use crate::wardrobe::Outer;
 
 /// Whether a point of a garment's edge is at its neckline.
 fn at_neck(node: &Node) -> bool {

@@ -2,11 +2,11 @@
 
 use flyrig_body::Part;
 
-use crate::look::Look;
+use crate::clothes::sheet::Node;
+use crate::clothes::wardrobe::{Bottom, Outer, ShoeKind, Top, TopKind};
 use crate::noise::{lerp, smoothstep};
-use crate::regions::{along_arm, below_neckline};
-use crate::sheet::Node;
-use crate::wardrobe::{Bottom, Outer, ShoeKind, Top, TopKind};
+use crate::person::look::Look;
+use crate::person::regions::{along_arm, below_neckline};
 
 /// Far outside of any cloth.
 const OUTSIDE_M: f32 = -0.05;

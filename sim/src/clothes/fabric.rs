@@ -2,10 +2,10 @@
 
 use glam::{Vec2, Vec3};
 
-use crate::glyphs::word_at;
+use crate::clothes::glyphs::word_at;
+use crate::clothes::wardrobe::{Cloth, Fabric, Print, Srgb};
 use crate::noise::{Noise, smoothstep};
 use crate::texture::{mix3, scale3};
-use crate::wardrobe::{Cloth, Fabric, Print, Srgb};
 
 /// Where a point lies on a piece of cloth.
 #[derive(Debug, Clone, Copy)]

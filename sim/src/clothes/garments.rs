@@ -3,14 +3,14 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
-use crate::collars::{hood, lapels, shirt_collar};
-use crate::cuts::{inside_boot, inside_bottom, inside_outer, inside_top, is_arm, under_hanging, under_tails};
-use crate::look::Look;
-use crate::loose::{free_bottom, free_outer, free_top, hang_free};
+use crate::clothes::collars::{hood, lapels, shirt_collar};
+use crate::clothes::cuts::{inside_boot, inside_bottom, inside_outer, inside_top, is_arm, under_hanging, under_tails};
+use crate::clothes::loose::{free_bottom, free_outer, free_top, hang_free};
+use crate::clothes::sheet::{Node, Sheet};
+use crate::clothes::wardrobe::{Bottom, HairCut, Outer, ShoeKind, Top, TopKind};
 use crate::noise::{Noise, lerp, smoothstep};
-use crate::regions::{ANKLE_TOP_M, along_arm, below_neckline, is_ear};
-use crate::sheet::{Node, Sheet};
-use crate::wardrobe::{Bottom, HairCut, Outer, ShoeKind, Top, TopKind};
+use crate::person::look::Look;
+use crate::person::regions::{ANKLE_TOP_M, along_arm, below_neckline, is_ear};
 
 /// Cloth this deep inside another is not drawn.
 const HIDDEN_M: f32 = 0.028;

@@ -5,9 +5,9 @@ use std::f32::consts::{PI, TAU};
 use flyrig_body::{Part, SkinWeights};
 use glam::{Vec2, Vec3};
 
-use crate::garments::Tailor;
+use crate::clothes::garments::Tailor;
+use crate::clothes::sheet::{Node, Sheet, mix_skin};
 use crate::noise::smoothstep;
-use crate::sheet::{Node, Sheet, mix_skin};
 
 /// A tube of cloth; heights in metres on the average body.
 #[derive(Debug, Clone, Copy)]

@@ -3,7 +3,7 @@
 use flyrig_body::Part;
 use glam::Vec3;
 
-use crate::sheet::{Node, Sheet};
+use crate::clothes::sheet::{Node, Sheet};
 
 /// Puts things made for the average head onto a person's.
 pub(crate) struct HeadLift<'a> {

@@ -1,11 +1,11 @@
 //! How freely cloth hangs: the length, metres, of the pendulum that a point of a garment is; 0 where it is held.
 
-use crate::cuts::{is_arm, opening_m};
-use crate::look::Look;
+use crate::clothes::cuts::{is_arm, opening_m};
+use crate::clothes::sheet::{Node, Sheet};
+use crate::clothes::wardrobe::{Bottom, Fabric, Outer, TopKind};
 use crate::noise::{lerp, smoothstep};
-use crate::regions::along_arm;
-use crate::sheet::{Node, Sheet};
-use crate::wardrobe::{Bottom, Fabric, Outer, TopKind};
+use crate::person::look::Look;
+use crate::person::regions::along_arm;
 
 /// Sets the lengths of a sheet's points.
 pub(crate) fn hang_free(sheet: &mut Sheet, free_m: impl Fn(&Node) -> f32) {

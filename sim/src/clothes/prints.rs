@@ -2,12 +2,12 @@
 
 use glam::{Vec2, Vec3};
 
-use crate::fabric::{ClothPoint, cloth_colour};
-use crate::look::Look;
+use crate::clothes::fabric::{ClothPoint, cloth_colour};
+use crate::clothes::wardrobe::{Bottom, Cloth, Fabric, Outer, ShoeKind, Srgb, Top, TopKind};
 use crate::noise::{Noise, smoothstep};
-use crate::regions::{along_arm, around_arm, on_sleeve};
+use crate::person::look::Look;
+use crate::person::regions::{along_arm, around_arm, on_sleeve};
 use crate::texture::{mix3, scale3};
-use crate::wardrobe::{Bottom, Cloth, Fabric, Outer, ShoeKind, Srgb, Top, TopKind};
 
 /// A seam's line, 1 on it.
 fn line(distance: f32, half_m: f32) -> f32 {

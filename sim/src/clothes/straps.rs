@@ -3,8 +3,8 @@
 use flyrig_body::Part;
 use glam::{Vec2, Vec3};
 
-use crate::garments::Tailor;
-use crate::sheet::{Node, Sheet};
+use crate::clothes::garments::Tailor;
+use crate::clothes::sheet::{Node, Sheet};
 
 /// Half the width of a strap, metres.
 const HALF_WIDTH_M: f32 = 0.0165;

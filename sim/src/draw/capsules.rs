@@ -4,8 +4,8 @@ use flyrig_types::Pose;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-use crate::constants::Capsule;
-use crate::person::Person;
+use crate::draw::moment::Capsule;
+use crate::person::assembly::Person;
 
 /// Capsules of a person at rest, and which of them shade a vertex.
 #[derive(Debug)]

@@ -3,12 +3,11 @@
 use flyrig_types::Pose;
 use glam::Vec3;
 
-use crate::actor::{Actor, Shape};
-use crate::capsules::Limbs;
-use crate::constants::Bound;
-use crate::draw::Moment;
-use crate::figure::Figured;
-use crate::passer::passer_by;
+use crate::draw::capsules::Limbs;
+use crate::draw::figure::Figured;
+use crate::draw::moment::{Bound, Moment};
+use crate::person::actor::{Actor, Shape};
+use crate::person::passer::passer_by;
 use crate::{SimConfig, SimError};
 
 /// Seconds between keys, at most, as long as there are not more keys than [`MOST_KEYS`].

@@ -3,18 +3,18 @@
 use bytemuck::{Pod, Zeroable};
 use flyrig_types::{Camera, Lens};
 
-use crate::draw::Moment;
-use crate::gpu_parts::SAMPLES;
-use crate::lamps::{LAMP_NEAR_M, cone_cosines};
-use crate::optics::SubFrame;
-use crate::plates::{GRID_CELL_PX, grid_columns};
-use crate::scene::Scene;
-use crate::scene_config::MAX_LAMPS;
+use crate::camera::optics::SubFrame;
+use crate::draw::gpu_parts::SAMPLES;
+use crate::draw::moment::{Bound, Capsule, Moment};
+use crate::draw::plates::{GRID_CELL_PX, grid_columns};
+use crate::room::lamps::{LAMP_NEAR_M, cone_cosines};
+use crate::room::scene::Scene;
+use crate::room::scene_config::MAX_LAMPS;
 
 /// Nothing closer to a camera is drawn, metres.
 pub(crate) const NEAR_M: f32 = 0.1;
-/// Capsules that stand for people.
-pub(crate) const MAX_CAPSULES: usize = 64;
+/// Most capsules that stand for people.
+const MAX_CAPSULES: usize = 64;
 /// Steps to the row in which a moving point is seen.
 const ROW_STEPS: u32 = 5;
 /// Taps of a soft shadow.
@@ -87,25 +87,6 @@ impl ViewHead {
         view.moment[0] = frame.secs as f32;
         view
     }
-}
-
-/// A part of a person that keeps light from its surroundings: a line with a radius, metres.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-pub(crate) struct Capsule {
-    pub a: [f32; 3],
-    pub radius: f32,
-    pub b: [f32; 3],
-    pub padding: f32,
-}
-
-/// An upright cylinder from the floor around a person, metres.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-pub(crate) struct Bound {
-    pub center: [f32; 2],
-    pub radius: f32,
-    pub top: f32,
 }
 
 const NOBODY: Bound = Bound { center: [0.0; 2], radius: -1e4, top: -1e4 };

@@ -1,159 +1,66 @@
 //! The drawing of one instant: shadow maps, plates, people before them, truth at pixel centres. All images of an
 //! instant are drawn in one submission and read back at once.
 
-use bytemuck::Zeroable;
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer, read_back};
-use flyrig_types::Camera;
-use glam::{Vec2, Vec3};
+use glam::Vec2;
 use wgpu::util::DeviceExt;
 use wgpu::{
-    BindGroup, BindGroupLayout, BindingResource, Buffer, BufferUsages, Color, CommandEncoder, CompareFunction,
-    ComputePipeline, LoadOp, Operations, RenderPassColorAttachment, RenderPassDepthStencilAttachment, RenderPipeline,
-    Sampler, StoreOp, Texture, TextureUsages, TextureView, VertexFormat,
+    BindGroup, BindingResource, Buffer, BufferUsages, CompareFunction, LoadOp, Sampler, Texture, TextureUsages,
 };
 
-use crate::actor::Shape;
-use crate::constants::{Blocks, Bound, Capsule, LightBlock, ViewHead, shader_sources};
-use crate::figure::{Figure, Figured};
-use crate::gpu_parts::{
-    DEPTH, Drawn, LIGHT, SAMPLES, Slot, TRUTH, array_view, bind, compute, layer_view, layout, pipeline, target,
-    upload_textures, view_of,
+use crate::camera::optics::SubFrame;
+use crate::draw::constants::{Blocks, LightBlock, ViewHead};
+use crate::draw::figure::Figure;
+use crate::draw::gpu_parts::{
+    DEPTH, LIGHT, SAMPLES, TRUTH, array_view, begin_pass, bind, target, upload_textures, view_of,
 };
-use crate::optics::{OpticsConfig, SubFrame};
-use crate::person::Person;
-use crate::plates::{Plate, Plates};
-use crate::scene::Scene;
+use crate::draw::moment::{ImageRequest, Moment, RawImage, Step, Truth, steps};
+use crate::draw::pipelines::{Layouts, Pipelines};
+use crate::draw::plates::Plates;
+use crate::person::actor::Shape;
+use crate::person::assembly::Person;
+use crate::room::scene::Scene;
 
 /// Sides of the lamps' images of people and of the room, pixels.
 const PEOPLE_MAP_PX: u32 = 512;
 const ROOM_MAP_PX: u32 = 2048;
 
-/// The people around an instant.
-#[derive(Debug, Clone)]
-pub(crate) struct Moment {
-    /// First key's seconds from the instant, and keys a second; the keys are evenly spaced.
-    pub first_secs: f64,
-    pub keys_a_second: f64,
-    pub people: Vec<Figured>,
-    /// A ball around everybody at all keys.
-    pub ball: (Vec3, f32),
-    /// Around each.
-    pub bounds: Vec<Bound>,
-    pub capsules: Vec<Capsule>,
-}
-
-/// One image to draw.
-#[derive(Debug, Clone)]
-pub(crate) struct Take {
-    pub nanos: i64,
-    pub camera: Camera,
-    pub optics: OpticsConfig,
-    /// Without people: the plate.
-    pub people: bool,
-}
-
-/// Linear light and coverage by the person as halves.
-pub(crate) type Raw = Vec<[u16; 4]>;
-
-/// Truth at pixel centres.
-pub(crate) struct Truth {
-    /// Canonical position and camera-space z.
-    pub canonical_depth: Vec<[f32; 4]>,
-    /// World normal; part index plus one, 0 where the person is not seen.
-    pub normal_part: Vec<[f32; 4]>,
-}
-
-/// Layouts of the groups.
-#[derive(Debug)]
-struct Layouts {
-    constants: BindGroupLayout,
-    points: BindGroupLayout,
-    shade: BindGroupLayout,
-    person: BindGroupLayout,
-    room: BindGroupLayout,
-    plate: BindGroupLayout,
-    picture: BindGroupLayout,
-}
-
-#[derive(Debug)]
-struct Pipelines {
-    person_shadow: RenderPipeline,
-    person_lit: RenderPipeline,
-    person_truth: RenderPipeline,
-    room_shadow: RenderPipeline,
-    room_layer: RenderPipeline,
-    room_depth: RenderPipeline,
-    shade: ComputePipeline,
-    plate: ComputePipeline,
-    picture: ComputePipeline,
-}
-
 /// Everything on the GPU.
 #[derive(Debug)]
 pub(crate) struct Drawing {
-    gpu: GpuContext,
-    size: [u32; 2],
-    scene: Scene,
+    pub(super) gpu: GpuContext,
+    pub(super) size: [u32; 2],
+    pub(super) scene: Scene,
     glows: bool,
-    layouts: Layouts,
-    pipelines: Pipelines,
-    people: Vec<(Figure, BindGroup)>,
-    room_vertices: Buffer,
-    room_indices: Buffer,
-    room_bind: BindGroup,
-    people_maps: Texture,
-    room_maps: Texture,
-    compare: Sampler,
-    samples: Texture,
-    depth: Texture,
+    pub(super) layouts: Layouts,
+    pub(super) pipelines: Pipelines,
+    pub(super) people: Vec<(Figure, BindGroup)>,
+    pub(super) room_vertices: Buffer,
+    pub(super) room_indices: Buffer,
+    pub(super) room_bind: BindGroup,
+    pub(super) people_maps: Texture,
+    pub(super) room_maps: Texture,
+    pub(super) compare: Sampler,
+    pub(super) samples: Texture,
+    pub(super) depth: Texture,
     truth_depth: Texture,
     canonical_depth: Texture,
     normal_part: Texture,
-    pixels: Buffer,
+    pub(super) pixels: Buffer,
     sums: Vec<Buffer>,
     plates: Plates,
     moment: Moment,
     /// Whether furniture may shade the people of the moment before and of this one.
-    shaded: [bool; 2],
+    pub(super) shaded: [bool; 2],
 }
 
 /// Where one pass finds its constants.
-type Offsets = [u32; 2];
-
-/// A step of a batch: one sub-frame of one take.
-struct Step {
-    secs: f64,
-    take: usize,
-    frame: SubFrame,
-    first: bool,
-    last: bool,
-}
+pub(crate) type Offsets = [u32; 2];
 
 impl Drawing {
     pub(crate) fn new(gpu: &GpuContext, size: [u32; 2], scene: Scene, people: &[&Person]) -> Result<Self, GpuError> {
         let device = &gpu.device;
-        let layouts = Layouts {
-            constants: layout(gpu, "constants", &[Slot::Constants, Slot::Constants]),
-            points: layout(gpu, "points", &[Slot::Read, Slot::Read]),
-            shade: layout(gpu, "shade", &[Slot::Read, Slot::Write, Slot::DepthMaps, Slot::Compare]),
-            person: layout(gpu, "surface of a person", &[Slot::Textures, Slot::Smooth, Slot::DepthMaps, Slot::Compare]),
-            room: layout(gpu, "surface of the room", &[Slot::Textures, Slot::Smooth, Slot::DepthMaps, Slot::Compare]),
-            plate: layout(gpu, "plate", &[Slot::ManySamples, Slot::Write]),
-            picture: layout(
-                gpu,
-                "image",
-                &[
-                    Slot::ManySamples,
-                    Slot::ManyDepths,
-                    Slot::Read,
-                    Slot::Read,
-                    Slot::DepthMaps,
-                    Slot::Compare,
-                    Slot::Write,
-                    Slot::Write,
-                ],
-            ),
-        };
+        let layouts = Layouts::new(gpu);
         let pipelines = Pipelines::new(gpu, &layouts, scene.lamps.len());
         let [width, height] = size;
         let bound = TextureUsages::TEXTURE_BINDING;
@@ -242,7 +149,7 @@ impl Drawing {
                 first_secs: 0.0,
                 keys_a_second: 0.0,
                 people: Vec::new(),
-                ball: (crate::lamps::STAGE, 1.0),
+                ball: (crate::room::lamps::STAGE, 1.0),
                 bounds: Vec::new(),
                 capsules: Vec::new(),
             },
@@ -273,7 +180,7 @@ impl Drawing {
     }
 
     /// Draws images of one instant.
-    pub(crate) fn pictures(&mut self, takes: &[Take]) -> Result<Vec<Raw>, GpuError> {
+    pub(crate) fn pictures(&mut self, takes: &[ImageRequest]) -> Result<Vec<RawImage>, GpuError> {
         let steps = steps(takes);
         self.plates.next_round();
         let mut blocks = Blocks::default();
@@ -328,7 +235,7 @@ impl Drawing {
     }
 
     /// Truth of one image: of the middle of its exposure through the lens's middle, each row at its own time.
-    pub(crate) fn truth(&mut self, take: &Take) -> Result<Truth, GpuError> {
+    pub(crate) fn truth(&mut self, take: &ImageRequest) -> Result<Truth, GpuError> {
         let frame = SubFrame { secs: 0.0, lens_point: Vec2::ZERO };
         let step = Step { secs: 0.0, take: 0, frame, first: true, last: true };
         let mut blocks = Blocks::default();
@@ -342,7 +249,7 @@ impl Drawing {
                 let [width, height] = self.size;
                 let usage = TextureUsages::COPY_SRC;
                 let depth = target(&self.gpu, "depth at centres", [width, height, 1], 1, DEPTH, usage);
-                let mut pass = pass(&mut encoder, &[], &view_of(&depth), LoadOp::Clear(1.0));
+                let mut pass = begin_pass(&mut encoder, &[], &view_of(&depth), LoadOp::Clear(1.0));
                 pass.set_pipeline(&self.pipelines.room_depth);
                 pass.set_bind_group(0, &constants, &[view, light]);
                 self.draw_room(&mut pass, 0, 0..1);
@@ -358,7 +265,7 @@ impl Drawing {
         );
         let targets = [&view_of(&self.canonical_depth), &view_of(&self.normal_part)];
         {
-            let mut pass = pass(&mut encoder, &targets, &view_of(&self.truth_depth), LoadOp::Load);
+            let mut pass = begin_pass(&mut encoder, &targets, &view_of(&self.truth_depth), LoadOp::Load);
             pass.set_pipeline(&self.pipelines.person_truth);
             pass.set_bind_group(0, &constants, &[view, light]);
             for (figure, surface) in &self.people {
@@ -377,7 +284,7 @@ impl Drawing {
         1 + self.scene.lamps.len() + usize::from(self.glows)
     }
 
-    fn head(&self, take: &Take, step: &Step) -> ViewHead {
+    fn head(&self, take: &ImageRequest, step: &Step) -> ViewHead {
         let mut head = ViewHead::new(&take.camera, take.optics.focus_m, step.frame);
         let rows = f64::from(self.size[1]);
         head.moment[1] = (take.optics.readout_ms * 1e-3 / (rows - 1.0)) as f32;
@@ -391,7 +298,7 @@ impl Drawing {
     }
 
     /// Each lamp's level and the light from everywhere at the time of each row.
-    fn rows(&self, take: &Take, frame: SubFrame) -> Vec<[f32; 8]> {
+    fn rows(&self, take: &ImageRequest, frame: SubFrame) -> Vec<[f32; 8]> {
         let rows = f64::from(self.size[1]);
         let row_secs = take.optics.readout_ms * 1e-3 / (rows - 1.0);
         let middle = take.nanos as f64 * 1e-9 + frame.secs;
@@ -410,19 +317,19 @@ impl Drawing {
             .collect()
     }
 
-    fn view_offset(&self, blocks: &mut Blocks, head: ViewHead, rows: &[[f32; 8]]) -> u32 {
+    pub(super) fn view_offset(&self, blocks: &mut Blocks, head: ViewHead, rows: &[[f32; 8]]) -> u32 {
         let mut rows = rows.to_vec();
         rows.resize(self.size[1] as usize, [0.0; 8]);
         blocks.push(&[bytemuck::bytes_of(&head), bytemuck::cast_slice(&rows)])
     }
 
-    fn light_offset(&self, blocks: &mut Blocks) -> u32 {
+    pub(super) fn light_offset(&self, blocks: &mut Blocks) -> u32 {
         let light = LightBlock::new(&self.scene, self.glows, &self.moment);
         blocks.push(&[bytemuck::bytes_of(&light)])
     }
 
     /// Group 0 over blocks.
-    fn upload(&self, blocks: &Blocks) -> BindGroup {
+    pub(super) fn upload(&self, blocks: &Blocks) -> BindGroup {
         let buffer = self.gpu.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
             label: Some("constants of a batch"),
             contents: &blocks.bytes,
@@ -447,137 +354,6 @@ impl Drawing {
             self.sums[take] = sums.raw().clone();
         }
         Ok(self.sums[take].clone())
-    }
-
-    fn draw_room_maps(&self) {
-        let mut blocks = Blocks::default();
-        let light = self.light_offset(&mut blocks);
-        let view = self.view_offset(&mut blocks, ViewHead::zeroed(), &[]);
-        let constants = self.upload(&blocks);
-        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-        for lamp in 0..self.scene.lamps.len() as u32 {
-            let mut pass = pass(&mut encoder, &[], &layer_view(&self.room_maps, lamp), LoadOp::Clear(1.0));
-            pass.set_pipeline(&self.pipelines.room_shadow);
-            pass.set_bind_group(0, &constants, &[view, light]);
-            self.draw_room(&mut pass, self.scene.mesh.first_caster, lamp..lamp + 1);
-        }
-        self.gpu.queue.submit([encoder.finish()]);
-    }
-
-    /// The shadows that people cast at a time, and those of the furniture on them.
-    fn shade_people(&self, encoder: &mut CommandEncoder, constants: &BindGroup, offsets: Offsets) {
-        let shaded = if self.shaded == [false; 2] { &[][..] } else { &self.people };
-        for (figure, _) in shaded {
-            let ([points, shares], count) = figure.buffers();
-            let group = [
-                points,
-                shares,
-                BindingResource::TextureView(&array_view(&self.room_maps)),
-                BindingResource::Sampler(&self.compare),
-            ];
-            let mut pass = encoder.begin_compute_pass(&Default::default());
-            pass.set_pipeline(&self.pipelines.shade);
-            pass.set_bind_group(0, constants, &offsets);
-            pass.set_bind_group(1, &bind(&self.gpu, &self.layouts.shade, &group), &[]);
-            pass.dispatch_workgroups(count.div_ceil(64), 1, 1);
-        }
-        for lamp in 0..self.scene.lamps.len() as u32 {
-            let mut pass = pass(encoder, &[], &layer_view(&self.people_maps, lamp), LoadOp::Clear(1.0));
-            pass.set_pipeline(&self.pipelines.person_shadow);
-            pass.set_bind_group(0, constants, &offsets);
-            for (figure, _) in &self.people {
-                figure.draw(&mut pass, lamp..lamp + 1);
-            }
-        }
-    }
-
-    fn bake(&self, encoder: &mut CommandEncoder, constants: &BindGroup, plate: &Plate, layers: &[Offsets]) {
-        let (samples, depth) = (view_of(&self.samples), view_of(&plate.depth));
-        let group = [BindingResource::TextureView(&samples), plate.layers.as_entire_binding()];
-        for (layer, offsets) in layers.iter().enumerate() {
-            let load = if layer == 0 { LoadOp::Clear(1.0) } else { LoadOp::Load };
-            {
-                let mut pass = pass(encoder, &[&samples], &depth, load);
-                pass.set_pipeline(&self.pipelines.room_layer);
-                pass.set_bind_group(0, constants, offsets);
-                pass.set_bind_group(1, &self.room_bind, &[]);
-                self.draw_room(&mut pass, 0, 0..1);
-            }
-            let group = bind(&self.gpu, &self.layouts.plate, &group);
-            self.dispatch(encoder, &self.pipelines.plate, constants, *offsets, &group);
-        }
-    }
-
-    fn draw_people(
-        &self,
-        encoder: &mut CommandEncoder,
-        constants: &BindGroup,
-        plate: &Plate,
-        offsets: Offsets,
-        people: bool,
-    ) {
-        encoder.copy_texture_to_texture(plate.depth.as_image_copy(), self.depth.as_image_copy(), self.depth.size());
-        let mut pass = pass(encoder, &[&view_of(&self.samples)], &view_of(&self.depth), LoadOp::Load);
-        if !people {
-            return;
-        }
-        pass.set_pipeline(&self.pipelines.person_lit);
-        pass.set_bind_group(0, constants, &offsets);
-        for (figure, surface) in &self.people {
-            pass.set_bind_group(2, surface, &[]);
-            figure.draw(&mut pass, 0..1);
-        }
-    }
-
-    fn compose(
-        &self,
-        encoder: &mut CommandEncoder,
-        constants: &BindGroup,
-        plate: &Plate,
-        offsets: Offsets,
-        sums: &Buffer,
-    ) {
-        let group = bind(
-            &self.gpu,
-            &self.layouts.picture,
-            &[
-                BindingResource::TextureView(&view_of(&self.samples)),
-                BindingResource::TextureView(&view_of(&plate.depth)),
-                plate.layers.as_entire_binding(),
-                plate.directions.as_entire_binding(),
-                BindingResource::TextureView(&array_view(&self.people_maps)),
-                BindingResource::Sampler(&self.compare),
-                sums.as_entire_binding(),
-                self.pixels.as_entire_binding(),
-            ],
-        );
-        self.dispatch(encoder, &self.pipelines.picture, constants, offsets, &group);
-    }
-
-    /// Runs a kernel over all pixels.
-    fn dispatch(
-        &self,
-        encoder: &mut CommandEncoder,
-        pipeline: &ComputePipeline,
-        constants: &BindGroup,
-        offsets: Offsets,
-        group: &BindGroup,
-    ) {
-        let mut pass = encoder.begin_compute_pass(&Default::default());
-        pass.set_pipeline(pipeline);
-        pass.set_bind_group(0, constants, &offsets);
-        pass.set_bind_group(1, group, &[]);
-        pass.dispatch_workgroups(self.size[0].div_ceil(8), self.size[1].div_ceil(8), 1);
-    }
-
-    fn draw_room(&self, pass: &mut wgpu::RenderPass<'_>, first_triangle: usize, instances: std::ops::Range<u32>) {
-        let range = first_triangle as u32 * 3..self.scene.mesh.triangles.len() as u32 * 3;
-        if range.is_empty() {
-            return;
-        }
-        pass.set_vertex_buffer(0, self.room_vertices.slice(..));
-        pass.set_index_buffer(self.room_indices.slice(..), wgpu::IndexFormat::Uint32);
-        pass.draw_indexed(range, 0, instances);
     }
 
     /// Pixels of a texture without row padding.
@@ -609,100 +385,17 @@ impl Drawing {
     }
 }
 
-impl Pipelines {
-    fn new(gpu: &GpuContext, layouts: &Layouts, lamps: usize) -> Self {
-        let [people, shade, room, plate, picture] = shader_sources(lamps).map(|(label, source)| {
-            gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
-                label: Some(label),
-                source: wgpu::ShaderSource::Wgsl(source.into()),
-            })
-        });
-        let Layouts { constants, points, person, room: room_layout, .. } = layouts;
-        let figure = |vertex, fragment, layouts, targets, samples| {
-            let attributes = &[VertexFormat::Float32x4, VertexFormat::Float32x4];
-            let drawn =
-                Drawn { module: &people, layouts, vertex, fragment, attributes, interleaved: false, targets, samples };
-            pipeline(gpu, drawn)
-        };
-        let standing = |vertex, fragment, layouts, targets, samples| {
-            let attributes = &[
-                VertexFormat::Float32x3,
-                VertexFormat::Float32x3,
-                VertexFormat::Float32x4,
-                VertexFormat::Float32x4,
-                VertexFormat::Float32x2,
-            ];
-            let drawn =
-                Drawn { module: &room, layouts, vertex, fragment, attributes, interleaved: true, targets, samples };
-            pipeline(gpu, drawn)
-        };
-        Self {
-            person_shadow: figure("vs_shadow", None, &[constants, points], &[], 1),
-            person_lit: figure("vs_lit", Some("fs_lit"), &[constants, points, person], &[LIGHT], SAMPLES),
-            person_truth: figure("vs_truth", Some("fs_truth"), &[constants, points, person], &[TRUTH, TRUTH], 1),
-            room_shadow: standing("vs_room_shadow", None, &[constants], &[], 1),
-            room_layer: standing("vs_room", Some("fs_layer"), &[constants, room_layout], &[LIGHT], SAMPLES),
-            room_depth: standing("vs_room", None, &[constants], &[], 1),
-            shade: compute(gpu, &shade, &[constants, &layouts.shade], "shade"),
-            plate: compute(gpu, &plate, &[constants, &layouts.plate], "keep"),
-            picture: compute(gpu, &picture, &[constants, &layouts.picture], "compose"),
-        }
-    }
-}
-
-/// All sub-frames, those of one time together.
-fn steps(takes: &[Take]) -> Vec<Step> {
-    let mut steps: Vec<Step> = Vec::new();
-    for (take, of) in takes.iter().enumerate() {
-        let frames = of.optics.sub_frames();
-        steps.extend(frames.into_iter().map(|frame| Step { secs: frame.secs, take, frame, first: false, last: false }));
-    }
-    steps.sort_by(|a, b| a.secs.total_cmp(&b.secs).then(a.take.cmp(&b.take)));
-    for take in 0..takes.len() {
-        if let Some(step) = steps.iter_mut().find(|step| step.take == take) {
-            step.first = true;
-        }
-        if let Some(step) = steps.iter_mut().rfind(|step| step.take == take) {
-            step.last = true;
-        }
-    }
-    steps
-}
-
-fn pass<'a>(
-    encoder: &'a mut CommandEncoder,
-    targets: &[&TextureView],
-    depth: &TextureView,
-    depth_load: LoadOp<f32>,
-) -> wgpu::RenderPass<'a> {
-    let colors: Vec<_> = targets
-        .iter()
-        .map(|&view| {
-            let ops = Operations { load: LoadOp::Clear(Color::TRANSPARENT), store: StoreOp::Store };
-            Some(RenderPassColorAttachment { view, depth_slice: None, resolve_target: None, ops })
-        })
-        .collect();
-    encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
-        label: None,
-        color_attachments: &colors,
-        depth_stencil_attachment: Some(RenderPassDepthStencilAttachment {
-            view: depth,
-            depth_ops: Some(Operations { load: depth_load, store: StoreOp::Store }),
-            stencil_ops: None,
-        }),
-        ..Default::default()
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use flyrig_gpu::AdapterChoice;
     use flyrig_types::{CameraId, Intrinsics, Isometry, Lens};
     use glam::{DVec2, DVec3};
 
+    use glam::Vec3;
+
     use super::*;
-    use crate::scene_mesh::{Coat, SceneMesh};
-    use crate::surfaces::Surface;
+    use crate::room::scene_mesh::{Coat, SceneMesh};
+    use crate::room::surfaces::Surface;
     use crate::texture::Texture as Picture;
 
     /// A glowing square in the dark: the middle of its light against the f64 model's, for each lens model and each
@@ -748,11 +441,12 @@ mod tests {
                     ground: Vec3::ZERO,
                 };
                 let mut drawing = Drawing::new(&gpu, [200, 160], scene, &[]).unwrap();
-                let take = Take { nanos: 0, camera: camera.clone(), optics: OpticsConfig::default(), people: false };
+                let take =
+                    ImageRequest { nanos: 0, camera: camera.clone(), optics: OpticsConfig::default(), people: false };
                 let raw = drawing.pictures(&[take]).unwrap().remove(0);
                 let (mut sum, mut light) = (DVec2::ZERO, 0.0);
                 for (i, pixel) in raw.iter().enumerate() {
-                    let here = f64::from(crate::sensor::linear_of_half(pixel[1]));
+                    let here = f64::from(crate::camera::sensor::linear_of_half(pixel[1]));
                     sum += DVec2::new((i % 200) as f64, (i / 200) as f64) * here;
                     light += here;
                 }

@@ -4,9 +4,9 @@ use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 use wgpu::util::DeviceExt;
 use wgpu::{BindGroup, BindGroupLayout, Buffer, BufferUsages, RenderPass, TextureView};
 
-use crate::actor::Shape;
-use crate::gpu_parts::{bind, upload_textures};
-use crate::person::Person;
+use crate::draw::gpu_parts::{bind, upload_textures};
+use crate::person::actor::Shape;
+use crate::person::assembly::Person;
 
 /// A person's surface around an instant.
 #[derive(Debug, Clone)]

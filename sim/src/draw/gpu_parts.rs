@@ -2,10 +2,11 @@
 
 use flyrig_gpu::GpuContext;
 use wgpu::{
-    BindGroup, BindGroupLayout, BindGroupLayoutEntry, BindingResource, BindingType, BufferBindingType, CompareFunction,
-    ComputePipeline, RenderPipeline, SamplerBindingType, ShaderModule, ShaderStages, Texture, TextureDescriptor,
-    TextureDimension, TextureFormat, TextureSampleType, TextureUsages, TextureView, TextureViewDimension,
-    VertexAttribute, VertexBufferLayout, VertexFormat, VertexStepMode,
+    BindGroup, BindGroupLayout, BindGroupLayoutEntry, BindingResource, BindingType, BufferBindingType, Color,
+    CommandEncoder, CompareFunction, ComputePipeline, LoadOp, Operations, RenderPass, RenderPassColorAttachment,
+    RenderPassDepthStencilAttachment, RenderPipeline, SamplerBindingType, ShaderModule, ShaderStages, StoreOp, Texture,
+    TextureDescriptor, TextureDimension, TextureFormat, TextureSampleType, TextureUsages, TextureView,
+    TextureViewDimension, VertexAttribute, VertexBufferLayout, VertexFormat, VertexStepMode,
 };
 
 use crate::texture::{Texture as Picture, linear_from_srgb};
@@ -248,5 +249,31 @@ fn pipeline_layout(gpu: &GpuContext, layouts: &[&BindGroupLayout]) -> wgpu::Pipe
         label: None,
         bind_group_layouts: &layouts,
         immediate_size: 0,
+    })
+}
+
+/// Begins a render pass that clears `targets` and loads depth as given.
+pub(crate) fn begin_pass<'a>(
+    encoder: &'a mut CommandEncoder,
+    targets: &[&TextureView],
+    depth: &TextureView,
+    depth_load: LoadOp<f32>,
+) -> RenderPass<'a> {
+    let colors: Vec<_> = targets
+        .iter()
+        .map(|&view| {
+            let ops = Operations { load: LoadOp::Clear(Color::TRANSPARENT), store: StoreOp::Store };
+            Some(RenderPassColorAttachment { view, depth_slice: None, resolve_target: None, ops })
+        })
+        .collect();
+    encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+        label: None,
+        color_attachments: &colors,
+        depth_stencil_attachment: Some(RenderPassDepthStencilAttachment {
+            view: depth,
+            depth_ops: Some(Operations { load: depth_load, store: StoreOp::Store }),
+            stencil_ops: None,
+        }),
+        ..Default::default()
     })
 }

@@ -6,7 +6,7 @@ use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 use wgpu::{Texture, TextureUsages};
 
-use crate::gpu_parts::{DEPTH, SAMPLES, target};
+use crate::draw::gpu_parts::{DEPTH, SAMPLES, target};
 
 /// Side of the cells of the grid of directions, pixels.
 pub(crate) const GRID_CELL_PX: f64 = 8.0;

@@ -10,8 +10,8 @@ use flyrig_types::{CameraId, write_whole};
 use image::{ExtendedColorType, ImageEncoder as _};
 use serde_json::json;
 
-use crate::source::{shot, spoilt};
-use crate::truth_file::write_truth;
+use crate::camera::source::{shot, spoilt};
+use crate::files::truth_file::write_truth;
 use crate::{Delivery, FramePlan, SimError, Simulator};
 
 /// What to export.

@@ -5,10 +5,10 @@ use flyrig_gpu::GpuContext;
 use flyrig_types::Rig;
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
+use crate::camera::ring::camera_name;
+use crate::camera::sensor::hash;
+use crate::camera::source::shot;
 use crate::error::check;
-use crate::ring::camera_name;
-use crate::sensor::hash;
-use crate::source::shot;
 use crate::{
     CalibrationError, Delivery, Fault, FaultKind, FaultScript, MotionConfig, MotionKind, OpticsConfig, RingConfig,
     SceneConfig, SceneKind, SensorConfig, SimConfig, SimError, SimFrame, Simulator,

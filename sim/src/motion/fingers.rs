@@ -6,7 +6,7 @@ use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use crate::SimError;
-use crate::curve::ease;
+use crate::motion::curve::ease;
 
 /// Seconds that a gesture lasts, with the way to the next one.
 const GESTURE_SECS: f64 = 1.2;

@@ -7,9 +7,9 @@ use flyrig_types::Pose;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use crate::SimError;
-use crate::curve::ease;
-use crate::posture::{Arm, Foot, Posture};
-use crate::shoes::SOLE_M;
+use crate::motion::curve::ease;
+use crate::motion::posture::{Arm, Foot, Posture};
+use crate::person::shoes::SOLE_M;
 
 /// Height of a shoe's sole below the bare foot, metres.
 const SOLE: f64 = SOLE_M as f64;

@@ -2,8 +2,8 @@
 
 use glam::DVec2;
 
-use crate::curve::{closed, ease, hump};
-use crate::posture::Foot;
+use crate::motion::curve::{closed, ease, hump};
+use crate::motion::posture::Foot;
 
 /// Share of a walking foot's cycle that it stands (Perry, Gait Analysis, 1992).
 pub(crate) const STANCE: f64 = 0.62;

@@ -5,9 +5,10 @@ use flyrig_types::{Pose, PoseTrack};
 use glam::Vec3;
 
 use crate::cloth::Cloth;
-use crate::look::Look;
-use crate::person::Person;
-use crate::{SimConfig, SimError, motion};
+use crate::motion::choice;
+use crate::person::assembly::Person;
+use crate::person::look::Look;
+use crate::{SimConfig, SimError};
 
 /// A dressed person with a motion.
 pub(crate) struct Actor {
@@ -29,7 +30,7 @@ pub(crate) struct Shape {
 impl Actor {
     pub(crate) fn new(config: &SimConfig) -> Result<Self, SimError> {
         let person = Person::new(&Look::new(config), config.seed, config.texture_px as usize, config.person.fingers)?;
-        let track = motion::track(config, &person)?;
+        let track = choice::track(config, &person)?;
         let cloth = Cloth::new(&person);
         Ok(Self { person, track, cloth })
     }

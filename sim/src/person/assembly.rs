@@ -4,22 +4,22 @@ use flyrig_body::{ShapeParams, Template, default_template};
 use glam::{Vec2, Vec3};
 
 use crate::SimError;
-use crate::cuts::{COAT_SEAM_M, inside_bottom, inside_outer, inside_top, waist_m};
-use crate::fabric::gloss;
-use crate::face::{eye_colour, skin_colour};
-use crate::garments::{Tailor, visible_skin};
-use crate::hanging::Hanging;
-use crate::hats::{hat, hat_cloth};
-use crate::look::Look;
-use crate::loose::stiffness;
-use crate::noise::{Noise, smoothstep};
-use crate::prints::{
+use crate::clothes::cuts::{COAT_SEAM_M, inside_bottom, inside_outer, inside_top, waist_m};
+use crate::clothes::fabric::gloss;
+use crate::clothes::garments::{Tailor, visible_skin};
+use crate::clothes::hanging::Hanging;
+use crate::clothes::loose::stiffness;
+use crate::clothes::prints::{
     bottom_colour, hair_colour, hanging_colour, hat_colour, outer_colour, sole_colour, top_colour, upper_colour,
 };
-use crate::sheet::{Node, Sheet};
-use crate::shoes::{eyes, shoes};
+use crate::clothes::sheet::{Node, Sheet};
+use crate::clothes::wardrobe::{Bottom, Fabric, ShoeKind};
+use crate::noise::{Noise, smoothstep};
+use crate::person::face::{eye_colour, skin_colour};
+use crate::person::hats::{hat, hat_cloth};
+use crate::person::look::Look;
+use crate::person::shoes::{eyes, shoes};
 use crate::texture::{Texture, UvMap};
-use crate::wardrobe::{Bottom, Fabric, ShoeKind};
 
 /// The clothed body at rest.
 pub(crate) struct Person {
@@ -187,16 +187,7 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
 }
 
 fn assemble(body: Template, layers: Vec<Layer>) -> Person {
-    let mut clothed = Template {
-        name: "clothed body".to_owned(),
-        positions: Vec::new(),
-        normals: Vec::new(),
-        uvs: Vec::new(),
-        triangles: Vec::new(),
-        skin: Vec::new(),
-        parts: Vec::new(),
-        skeleton: body.skeleton.clone(),
-    };
+    let mut clothed = Template::empty("clothed body", body.skeleton.clone());
     let (mut carriers, mut layer_and_openness, mut textures) = (Vec::new(), Vec::new(), Vec::new());
     let (mut free_m, mut ranges) = (Vec::new(), Vec::new());
     let mut shoe_vertices = 0..0;

@@ -1,8 +1,8 @@
 //! A person in words.
 
 use crate::SimConfig;
-use crate::look::Look;
-use crate::wardrobe::{Beard, Bottom, Cloth, Hat};
+use crate::clothes::wardrobe::{Beard, Bottom, Cloth, Hat};
+use crate::person::look::Look;
 
 /// What the configuration's person looks like, in a line of words; two people of the same words may still
 /// differ in shape and colours. Nothing is drawn.

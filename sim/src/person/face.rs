@@ -2,12 +2,12 @@
 
 use glam::{Vec2, Vec3};
 
-use crate::features::LIPS_Y;
-use crate::look::Look;
+use crate::clothes::wardrobe::{HairCut, ShoeKind, Srgb};
 use crate::noise::{Noise, smoothstep};
-use crate::regions::{EYE, above_hairline};
+use crate::person::features::LIPS_Y;
+use crate::person::look::Look;
+use crate::person::regions::{EYE, above_hairline};
 use crate::texture::{mix3, scale3};
-use crate::wardrobe::{HairCut, ShoeKind, Srgb};
 
 /// Colour of the skin at a point of the average body.
 pub(crate) fn skin_colour(look: &Look, noise: Noise, p: Vec3) -> Srgb {

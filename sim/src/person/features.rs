@@ -4,7 +4,7 @@
 use glam::Vec3;
 use rand::{RngExt, rngs::StdRng};
 
-use crate::regions::EYE;
+use crate::person::regions::EYE;
 
 /// Height of the line between the lips of the average face, metres.
 pub(crate) const LIPS_Y: f32 = 1.4858;

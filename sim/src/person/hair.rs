@@ -5,14 +5,14 @@ use std::f32::consts::{PI, TAU};
 use flyrig_body::Part;
 use glam::{Vec2, Vec3};
 
-use crate::garments::Tailor;
-use crate::hats::rim_height_m;
-use crate::lift::HeadLift;
-use crate::look::Look;
+use crate::clothes::garments::Tailor;
+use crate::clothes::lift::HeadLift;
+use crate::clothes::sheet::{Node, Sheet};
+use crate::clothes::wardrobe::{Beard, HairCut, Hat};
 use crate::noise::{Noise, lerp, smoothstep};
-use crate::regions::{above_hairline, inside_beard};
-use crate::sheet::{Node, Sheet};
-use crate::wardrobe::{Beard, HairCut, Hat};
+use crate::person::hats::rim_height_m;
+use crate::person::look::Look;
+use crate::person::regions::{above_hairline, inside_beard};
 
 impl Tailor {
     /// A cap of hair, with what hangs from it.

@@ -4,10 +4,10 @@ use std::f32::consts::{FRAC_PI_2, TAU};
 
 use glam::{Vec2, Vec3};
 
-use crate::lift::HeadLift;
+use crate::clothes::lift::HeadLift;
+use crate::clothes::sheet::{Node, Sheet};
+use crate::clothes::wardrobe::{Cloth, Hat};
 use crate::noise::{Noise, smoothstep};
-use crate::sheet::{Node, Sheet};
-use crate::wardrobe::{Cloth, Hat};
 
 /// Middle of the head seen from above, metres on the average body.
 const MIDDLE_Z_M: f32 = 0.047;

@@ -3,9 +3,11 @@
 use flyrig_body::ShapeParams;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
-use crate::features::Features;
-use crate::palette::{CHINOS, CLOTHS, DENIMS, HAIRS, IRISES, LEATHERS, SHOES, SKINS};
-use crate::wardrobe::{Beard, Bottom, Cloth, Fabric, HairCut, Hat, Outer, Print, ShoeKind, Shoes, Srgb, Top, TopKind};
+use crate::clothes::wardrobe::{
+    Beard, Bottom, Cloth, Fabric, HairCut, Hat, Outer, Print, ShoeKind, Shoes, Srgb, Top, TopKind,
+};
+use crate::person::features::Features;
+use crate::person::palette::{CHINOS, CLOTHS, DENIMS, HAIRS, IRISES, LEATHERS, SHOES, SKINS};
 use crate::{Build, SimConfig};
 
 /// Everything about the person's looks.

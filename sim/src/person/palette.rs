@@ -1,6 +1,6 @@
 //! Colours people and clothes come in, sRGB.
 
-use crate::wardrobe::Srgb;
+use crate::clothes::wardrobe::Srgb;
 
 /// From light to dark.
 pub(crate) const SKINS: [Srgb; 7] = [

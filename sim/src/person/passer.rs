@@ -1,8 +1,9 @@
 //! A second person who walks through.
 
-use crate::actor::Actor;
-use crate::sensor::hash;
-use crate::{MotionConfig, MotionKind, PersonConfig, SimConfig, SimError, motion};
+use crate::camera::sensor::hash;
+use crate::motion::choice;
+use crate::person::actor::Actor;
+use crate::{MotionConfig, MotionKind, PersonConfig, SimConfig, SimError};
 
 /// Another person than the configuration's, who walks to and fro past the middle.
 pub(crate) fn passer_by(config: &SimConfig) -> Result<Actor, SimError> {
@@ -16,6 +17,6 @@ pub(crate) fn passer_by(config: &SimConfig) -> Result<Actor, SimError> {
     };
     let mut actor = Actor::new(&own)?;
     // Turns round inside of the ring, lest a camera stands in its way.
-    actor.track = motion::pass_by(&actor.person, seed, 0.75 * config.cameras.radius_m)?;
+    actor.track = choice::pass_by(&actor.person, seed, 0.75 * config.cameras.radius_m)?;
     Ok(actor)
 }

@@ -2,8 +2,8 @@
 
 use glam::Vec3;
 
+use crate::clothes::wardrobe::Beard;
 use crate::noise::{lerp, smoothstep};
-use crate::wardrobe::Beard;
 
 /// Centre and radius of the left eyeball (the right one mirrors it).
 pub(crate) const EYE: (Vec3, f32) = (Vec3::new(0.0293, 1.5520, 0.1178), 0.0140);

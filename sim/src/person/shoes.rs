@@ -3,10 +3,10 @@
 use flyrig_body::Part;
 use glam::{Vec2, Vec3};
 
-use crate::hair::ball;
+use crate::clothes::sheet::{Node, Sheet};
 use crate::noise::smoothstep;
-use crate::regions::{ANKLE_TOP_M, EYE};
-use crate::sheet::{Node, Sheet};
+use crate::person::hair::ball;
+use crate::person::regions::{ANKLE_TOP_M, EYE};
 
 /// How far a shoe's sole reaches below the bare foot, metres.
 pub(crate) const SOLE_M: f32 = 0.020;

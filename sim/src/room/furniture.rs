@@ -4,9 +4,9 @@ use std::f32::consts::{PI, TAU};
 
 use glam::Vec3;
 
-use crate::scene::Plan;
-use crate::scene_mesh::{Coat, SceneMesh};
-use crate::surfaces::Surface;
+use crate::room::plan::Plan;
+use crate::room::scene_mesh::{Coat, SceneMesh};
+use crate::room::surfaces::Surface;
 
 fn metal() -> Coat {
     Coat::new(Surface::Plain, Vec3::splat(0.05)).glossy(0.25)

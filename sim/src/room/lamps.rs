@@ -2,7 +2,7 @@
 
 use glam::{Mat4, Vec3};
 
-use crate::scene_config::LightConfig;
+use crate::room::scene_config::LightConfig;
 
 /// Half the angle of a lamp's cone, and where its light begins to fall, degrees.
 const CONE_DEG: [f32; 2] = [74.0, 30.0];

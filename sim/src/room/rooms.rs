@@ -5,12 +5,12 @@ use std::f32::consts::{PI, TAU};
 
 use glam::{Vec2, Vec3};
 
-use crate::furniture::{self, TABLE_M};
-use crate::lamps::{Lamp, STAGE};
-use crate::scene::{HEIGHT_M, Plan, RoomLight, shell};
-use crate::scene_config::LightConfig;
-use crate::scene_mesh::{Coat, SceneMesh};
-use crate::surfaces::Surface;
+use crate::room::furniture::{self, TABLE_M};
+use crate::room::lamps::{Lamp, STAGE};
+use crate::room::plan::{HEIGHT_M, Plan, RoomLight, shell};
+use crate::room::scene_config::LightConfig;
+use crate::room::scene_mesh::{Coat, SceneMesh};
+use crate::room::surfaces::Surface;
 
 const POSTERS: [Surface; 4] = [Surface::PosterA, Surface::PosterB, Surface::PosterC, Surface::PosterD];
 /// Share of a lamp's light that comes back from everywhere.

@@ -4,16 +4,14 @@ use flyrig_types::Rig;
 use glam::Vec3;
 
 use crate::SimConfig;
-use crate::lamps::Lamp;
-use crate::rooms;
-use crate::scene_config::SceneKind;
-use crate::scene_mesh::{Coat, SceneMesh};
-use crate::sensor::{hash, uniform};
-use crate::surfaces::Surface;
+use crate::camera::sensor::{hash, uniform};
+use crate::room::lamps::Lamp;
+use crate::room::plan::{HEIGHT_M, Plan};
+use crate::room::rooms;
+use crate::room::scene_config::SceneKind;
+use crate::room::scene_mesh::SceneMesh;
+use crate::room::surfaces::Surface;
 use crate::texture::Texture;
-
-/// Ceiling height, metres.
-pub(crate) const HEIGHT_M: f32 = 3.6;
 
 /// Everything that stands still.
 #[derive(Debug, Clone)]
@@ -27,32 +25,6 @@ pub(crate) struct Scene {
     /// Shares of the light from everywhere that come from above and from below.
     pub sky: Vec3,
     pub ground: Vec3,
-}
-
-/// What a room's maker knows.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Plan {
-    key: u64,
-    /// Half the room's side, metres.
-    pub half_m: f32,
-    /// Radius of the ring of cameras, outside of which furniture stands.
-    pub ring_m: f32,
-    /// How many pieces stand between cameras and person.
-    pub occluders: u32,
-    /// Cameras of the ring.
-    pub cameras: usize,
-}
-
-impl Plan {
-    /// Evenly in `low..high`; one number an index.
-    pub(crate) fn draw(&self, index: u64, low: f32, high: f32) -> f32 {
-        low + (high - low) * uniform(self.key, index) as f32
-    }
-
-    /// One of several; one choice an index.
-    pub(crate) fn pick<T: Copy>(&self, index: u64, of: &[T]) -> Option<T> {
-        of.get((uniform(self.key, index) * of.len() as f64) as usize).copied()
-    }
 }
 
 impl Scene {
@@ -94,14 +66,6 @@ impl Scene {
     }
 }
 
-/// A room's light.
-pub(crate) struct RoomLight {
-    pub lamps: Vec<Lamp>,
-    pub steady: Vec3,
-    pub sky: Vec3,
-    pub ground: Vec3,
-}
-
 /// Longest side of a cell at which straight edges between its corners stay within a twentieth of a pixel of the bent
 /// lens's curves, a metre and a half away.
 fn cell_m(rig: &Rig) -> f32 {
@@ -124,25 +88,4 @@ fn cell_m(rig: &Rig) -> f32 {
         cell = cell.min(angle * DISTANCE_M);
     }
     cell.max(0.04) as f32
-}
-
-/// Floor, ceiling and walls; the things that cast no shadow.
-pub(crate) fn shell(plan: &Plan, mesh: &mut SceneMesh, floor: Coat, walls: [Coat; 4], trim: Coat) {
-    let h = plan.half_m;
-    let side = 2.0 * h;
-    mesh.quad(Vec3::new(-h, -h, 0.0), Vec3::X * side, Vec3::Y * side, floor);
-    let white = Coat::new(Surface::Plaster, Vec3::splat(0.78));
-    mesh.quad(Vec3::new(-h, h, HEIGHT_M), Vec3::X * side, -Vec3::Y * side, white);
-    let corners = [Vec3::new(h, h, 0.0), Vec3::new(-h, h, 0.0), Vec3::new(-h, -h, 0.0), Vec3::new(h, -h, 0.0)];
-    for (wall, coat) in walls.into_iter().enumerate() {
-        let from = corners[wall];
-        let along = corners[(wall + 1) % 4] - from;
-        mesh.quad(from, along, Vec3::Z * HEIGHT_M, coat);
-        let inward = Vec3::Z.cross(along).normalize_or(Vec3::X);
-        // The skirting board.
-        let (height, thick) = (0.11, 0.015);
-        mesh.quad(from + inward * thick, along, Vec3::Z * height, trim);
-        mesh.quad(from + inward * thick + Vec3::Z * height, along, -inward * thick, trim);
-    }
-    mesh.first_caster = mesh.triangles.len();
 }

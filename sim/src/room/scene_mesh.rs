@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 use glam::{Affine3A, Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::surfaces::Surface;
+use crate::room::surfaces::Surface;
 
 /// A vertex as the room's shader reads it.
 #[repr(C)]

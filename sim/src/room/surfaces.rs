@@ -2,9 +2,9 @@
 
 use glam::{Vec2, Vec3};
 
+use crate::clothes::wardrobe::Srgb;
 use crate::noise::{Noise, smoothstep};
 use crate::texture::{Texture, mix3, scale3};
-use crate::wardrobe::Srgb;
 
 /// A texture; its place in the array of textures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -24,16 +24,7 @@ pub fn sheet(columns: usize, rows: usize, place: impl Fn(f32, f32) -> Vec3) -> T
 }
 
 pub fn empty() -> Template {
-    Template {
-        name: "hand-made".to_owned(),
-        positions: Vec::new(),
-        normals: Vec::new(),
-        uvs: Vec::new(),
-        triangles: Vec::new(),
-        skin: Vec::new(),
-        parts: Vec::new(),
-        skeleton: one_joint(),
-    }
+    Template::empty("hand-made", one_joint())
 }
 
 pub fn add_sheet(template: &mut Template, columns: usize, rows: usize, place: impl Fn(f32, f32) -> Vec3) {

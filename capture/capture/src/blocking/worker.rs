@@ -10,7 +10,7 @@ use std::{
 
 use flyrig_types::{CameraId, PixelBuffer, caught};
 
-use super::{BlockingCamera, Opener, Shot};
+use super::camera::{BlockingCamera, Opener, Shot};
 use crate::{BufferPool, CaptureError, CaptureErrorKind, LatestQueue};
 
 /// Frames that may wait for the camera's own thread: one to take next, one for jitter.

@@ -16,9 +16,9 @@ mod stream;
 mod stream_tests;
 mod sys;
 
-use std::{io, path::PathBuf, time::Duration};
+use std::{io, path::PathBuf};
 
-use flyrig_types::{CameraId, Frame};
+use flyrig_types::CameraId;
 
 use self::{
     controls::ControlDevice,
@@ -31,7 +31,7 @@ pub use self::{
     report::{BusPlan, CameraReport, FormatReport, camera_reports, plan_buses},
     sys::monotonic_nanos,
 };
-use crate::{CameraIdentity, CameraOptions, CameraSource, CaptureError, SourceHealth};
+use crate::{CameraIdentity, CameraOptions, CaptureError, source::forward_source};
 
 /// A camera of this computer. Frames come in the camera's own pixel format; [`crate::Decoding`] makes RGB of them.
 ///
@@ -54,19 +54,7 @@ impl V4l2Camera {
     }
 }
 
-impl CameraSource for V4l2Camera {
-    fn camera(&self) -> &CameraId {
-        self.0.camera()
-    }
-
-    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
-        self.0.next_frame(timeout)
-    }
-
-    fn health(&self) -> SourceHealth {
-        self.0.health()
-    }
-}
+forward_source!(V4l2Camera);
 
 /// This computer.
 #[derive(Debug)]

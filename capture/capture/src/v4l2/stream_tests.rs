@@ -13,11 +13,11 @@ use v4l::v4l_sys::V4L2_CID_GAIN;
 use super::{
     controls::{ControlDevice, tests::FakeControls},
     queue::{
-        BufferDevice, Delivered,
+        BufferDevice, Delivered, MAX_PLANES,
         tests::{Fake, Step},
     },
     stream::{CameraDevice, Host, Stream},
-    sys::{ActiveFormat, ControlRange, MAX_PLANES, SizeRange},
+    sys::{ActiveFormat, ControlRange, SizeRange},
 };
 use crate::{
     CameraControls, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, FormatChoice,

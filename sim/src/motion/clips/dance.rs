@@ -6,10 +6,10 @@ use glam::{DVec2, DVec3};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use super::Clip;
-use crate::curve::{ease, hump};
-use crate::posture::{Arm, Posture};
-use crate::puppet::Puppet;
-use crate::steps::{Gait, Plant, foot};
+use crate::motion::curve::{ease, hump};
+use crate::motion::posture::{Arm, Posture};
+use crate::motion::puppet::Puppet;
+use crate::motion::steps::{Gait, Plant, foot};
 
 const BARS: usize = 8;
 const BEATS_A_BAR: usize = 4;

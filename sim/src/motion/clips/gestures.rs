@@ -5,9 +5,9 @@ use std::f64::consts::TAU;
 use glam::DVec3;
 
 use super::Clip;
-use crate::curve::{closed, ease, hump};
-use crate::posture::{Arm, Posture};
-use crate::puppet::Puppet;
+use crate::motion::curve::{closed, ease, hump};
+use crate::motion::posture::{Arm, Posture};
+use crate::motion::puppet::Puppet;
 
 /// Standing still.
 pub(crate) fn still<'a>(puppet: &'a Puppet<'_>) -> Clip<'a> {

@@ -4,9 +4,9 @@ use glam::DVec3;
 
 use super::Clip;
 use super::gestures::breathe;
-use crate::curve::{closed, ease, hermite};
-use crate::posture::Arm;
-use crate::puppet::Puppet;
+use crate::motion::curve::{closed, ease, hermite};
+use crate::motion::posture::Arm;
+use crate::motion::puppet::Puppet;
 
 /// Crouches, swings the arms, flies as gravity has it, lands softly and stands up.
 pub(crate) fn jump<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {

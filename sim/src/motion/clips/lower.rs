@@ -4,9 +4,9 @@ use glam::{DVec2, DVec3};
 
 use super::Clip;
 use super::gestures::{breathe, settle};
-use crate::curve::{closed, hump};
-use crate::posture::Arm;
-use crate::puppet::Puppet;
+use crate::motion::curve::{closed, hump};
+use crate::motion::posture::Arm;
+use crate::motion::puppet::Puppet;
 
 /// Two squats, the second deeper, the arms in front for balance.
 pub(crate) fn squat<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {

@@ -9,9 +9,9 @@ mod walk;
 
 use flyrig_types::PoseTrack;
 
-use crate::curve::smooth_above;
-use crate::posture::Posture;
-use crate::puppet::Puppet;
+use crate::motion::curve::smooth_above;
+use crate::motion::posture::Posture;
+use crate::motion::puppet::Puppet;
 use crate::{MotionKind, SimError};
 
 pub(crate) use walk::passing;

@@ -4,9 +4,9 @@ use flyrig_body::skin_mesh;
 use glam::{DVec3, Vec3};
 
 use super::*;
-use crate::look::Look;
-use crate::motion::pass_by;
-use crate::person::Person;
+use crate::motion::choice::pass_by;
+use crate::person::assembly::Person;
+use crate::person::look::Look;
 use crate::{Build, SimConfig};
 
 const ALL: [MotionKind; 10] = [
@@ -176,7 +176,7 @@ fn debians_clip_keeps_its_feet_on_the_floor_when_it_is_installed() {
         for reach_m in [0.2, 10.0] {
             let mut config = SimConfig::default();
             (config.motion.kind, config.motion.start_secs, config.motion.reach_m) = (MotionKind::Bvh, 1.0, reach_m);
-            let track = crate::motion::track(&config, &person).unwrap();
+            let track = crate::motion::choice::track(&config, &person).unwrap();
             let (slide, depth) = slide_and_depth_of_rests(&person, &track);
             println!("within {reach_m} m: slides {:.1} mm, sinks {:.1} mm", slide * 1e3, depth * 1e3);
             assert!(slide < 5e-3 && depth < 5e-3, "slides {slide} m, sinks {depth} m");
@@ -191,15 +191,15 @@ fn a_seed_chooses_kind_speed_and_phase_and_speed_0_stands_still() {
     for seed in 0..12 {
         let mut config = SimConfig { seed, ..SimConfig::default() };
         config.motion.kind = MotionKind::BySeed;
-        let track = crate::motion::track(&config, &person).unwrap();
+        let track = crate::motion::choice::track(&config, &person).unwrap();
         lengths.insert(track.span_nanos().1);
-        assert_eq!(track, crate::motion::track(&config, &person).unwrap());
+        assert_eq!(track, crate::motion::choice::track(&config, &person).unwrap());
     }
     assert!(lengths.len() > 9, "{lengths:?}");
     for kind in ALL {
         let mut config = SimConfig::default();
         (config.motion.kind, config.motion.speed, config.motion.phase) = (kind, 0.0, 0.3);
-        let track = crate::motion::track(&config, &person).unwrap();
+        let track = crate::motion::choice::track(&config, &person).unwrap();
         assert_eq!(track.at_repeated(0), track.at_repeated(3_456_789_012));
     }
 }

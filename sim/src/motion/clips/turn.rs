@@ -5,9 +5,9 @@ use std::f64::consts::{PI, TAU};
 use glam::{DVec2, DVec3};
 
 use super::Clip;
-use crate::posture::Arm;
-use crate::puppet::Puppet;
-use crate::steps::{Gait, Plant, foot};
+use crate::motion::posture::Arm;
+use crate::motion::puppet::Puppet;
+use crate::motion::steps::{Gait, Plant, foot};
 
 /// Steps of a full turn; even, so that the clip closes.
 const STEPS: f64 = 12.0;

@@ -1,9 +1,8 @@
 //! Buffers that a driver fills: asked for, mapped, queued and taken out.
 
 use std::{
-    ffi::c_void,
     io,
-    os::fd::{AsRawFd as _, RawFd},
+    os::fd::AsRawFd as _,
     ptr,
     time::{Duration, Instant},
 };
@@ -17,43 +16,10 @@ use v4l::{
     v4l2::{self, vidioc},
 };
 
-use super::{Device, MAX_PLANES, MULTI_PLANAR, Plain};
-use crate::{
-    stamps::StampSource,
-    v4l2::queue::{BufferDevice, Delivered},
-};
-
-/// Memory of one plane of one buffer, shared with the driver.
-#[derive(Debug)]
-pub(super) struct Mapping {
-    start: *mut c_void,
-    length: usize,
-}
-
-// SAFETY: the address range belongs to the process, not to a thread.
-unsafe impl Send for Mapping {}
-
-impl Mapping {
-    fn new(fd: RawFd, length: usize, offset: u32) -> io::Result<Self> {
-        let protection = libc::PROT_READ | libc::PROT_WRITE;
-        // SAFETY: a new mapping at an address of the kernel's choice touches no memory of ours.
-        let start = unsafe { v4l2::mmap(ptr::null_mut(), length, protection, libc::MAP_SHARED, fd, offset.into()) }?;
-        Ok(Self { start, length })
-    }
-
-    fn bytes(&self) -> &[u8] {
-        // SAFETY: `start` is mapped for `length` bytes until Drop. The driver writes to it only while the buffer is
-        // queued, and the queue hands these bytes out only while it is not.
-        unsafe { std::slice::from_raw_parts(self.start.cast::<u8>(), self.length) }
-    }
-}
-
-impl Drop for Mapping {
-    fn drop(&mut self) {
-        // SAFETY: ours, mapped once, and unmapped here alone. It fails only for ranges that are not mapped.
-        let _ = unsafe { v4l2::munmap(self.start, self.length) };
-    }
-}
+use super::device::{Device, MULTI_PLANAR, Plain};
+use super::mapping::Mapping;
+use crate::stamps::StampSource;
+use crate::v4l2::queue::{BufferDevice, Delivered, MAX_PLANES};
 
 impl Device {
     /// A buffer to ask the driver about; with its planes where there are any.

@@ -4,36 +4,18 @@ use std::io;
 
 use v4l::{
     v4l_sys::{
-        V4L2_CAP_DEVICE_CAPS, V4L2_CAP_STREAMING, V4L2_CAP_TIMEPERFRAME, V4L2_CAP_VIDEO_CAPTURE,
-        V4L2_CAP_VIDEO_CAPTURE_MPLANE, v4l2_capability, v4l2_control, v4l2_fmtdesc, v4l2_format, v4l2_fract,
-        v4l2_frmivalenum, v4l2_frmivaltypes_V4L2_FRMIVAL_TYPE_DISCRETE as INTERVAL_DISCRETE, v4l2_frmsizeenum,
+        V4L2_CAP_TIMEPERFRAME, v4l2_control, v4l2_fmtdesc, v4l2_format, v4l2_fract, v4l2_frmivalenum,
+        v4l2_frmivaltypes_V4L2_FRMIVAL_TYPE_DISCRETE as INTERVAL_DISCRETE, v4l2_frmsizeenum,
         v4l2_frmsizetypes_V4L2_FRMSIZE_TYPE_DISCRETE as SIZE_DISCRETE, v4l2_queryctrl, v4l2_streamparm,
     },
     v4l2::vidioc,
 };
 
-use super::{Device, MAX_PLANES, MULTI_PLANAR, Plain, invalid, text};
+use super::device::{Device, MULTI_PLANAR, Plain, invalid};
+use crate::v4l2::queue::MAX_PLANES;
 
 /// Most entries of an enumeration that we read: a driver that never says the end must not hang us.
 const MAX_ENTRIES: u32 = 512;
-
-/// What a device says of itself (`VIDIOC_QUERYCAP`).
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Capability {
-    pub driver: String,
-    pub card: String,
-    pub bus_info: String,
-    /// Whether it gives images through memory-mapped buffers.
-    pub captures: bool,
-    pub(super) multi_planar: bool,
-}
-
-#[cfg(test)]
-impl Capability {
-    pub fn test(bus_info: &str, captures: bool) -> Self {
-        Self { driver: "test".into(), card: "Test".into(), bus_info: bus_info.into(), captures, multi_planar: false }
-    }
-}
 
 /// A format in force (`VIDIOC_S_FMT` as answered).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -64,20 +46,6 @@ pub(crate) enum SizeRange {
 }
 
 impl Device {
-    pub fn capability(&self) -> io::Result<Capability> {
-        let mut raw = v4l2_capability::zeroed();
-        self.ioctl(vidioc::VIDIOC_QUERYCAP, &mut raw)?;
-        let caps = if raw.capabilities & V4L2_CAP_DEVICE_CAPS == 0 { raw.capabilities } else { raw.device_caps };
-        let (single, multi) = (caps & V4L2_CAP_VIDEO_CAPTURE != 0, caps & V4L2_CAP_VIDEO_CAPTURE_MPLANE != 0);
-        Ok(Capability {
-            driver: text(&raw.driver),
-            card: text(&raw.card),
-            bus_info: text(&raw.bus_info),
-            captures: (single || multi) && caps & V4L2_CAP_STREAMING != 0,
-            multi_planar: multi && !single,
-        })
-    }
-
     /// Pixel formats, in the driver's order.
     pub fn formats(&self) -> io::Result<Vec<[u8; 4]>> {
         let mut formats = Vec::new();
