@@ -1,6 +1,6 @@
 //! Run time of finding boards in photographs of 1280x720, and how many corners are found, by pattern.
 //!
-//!     cargo run --release -p flyrig-calib --example bench_detect [IMAGES]
+//!     cargo bench -p flyrig-calib --bench detect [-- IMAGES]
 
 use std::{error::Error, time::Instant};
 
@@ -10,7 +10,7 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let images: u64 = std::env::args().nth(1).map_or(Ok(200), |text| text.parse())?;
+    let images: u64 = std::env::args().skip(1).find(|text| text != "--bench").map_or(Ok(200), |text| text.parse())?;
     println!(
         "| board | images | with a board | corners of those | distance from the truth, px | all images s | an image ms |"
     );

@@ -1,6 +1,6 @@
 //! Run time and errors of a rig's calibration over cameras, boards and noise, on simulated corners.
 //!
-//!     cargo run --release -p flyrig-calib --example bench_rig
+//!     cargo bench -p flyrig-calib --bench rig
 
 use std::{error::Error, time::Instant};
 

@@ -1,6 +1,6 @@
 //! What loose cloth costs.
 //!
-//! `cargo run --release -p flyrig-sim --example cloth_cost -- [CLIP] [SECS] [SEED ...]`
+//! `cargo bench -p flyrig-sim --bench cloth_cost -- [CLIP] [SECS] [SEED ...]`
 //!
 //! Asks for the clothed surface at 30 frames a second, twice: first the cloth is computed, then it is only looked up.
 
@@ -11,7 +11,7 @@ use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{SimConfig, Simulator, describe_person};
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let args: Vec<String> = std::env::args().skip(1).collect();
+    let args: Vec<String> = std::env::args().skip(1).filter(|text| text != "--bench").collect();
     let clip = args.first().map_or("dance", String::as_str);
     let secs: f64 = args.get(1).map_or(Ok(8.0), |text| text.parse())?;
     let seeds: Vec<u64> = args.iter().skip(2).map(|text| text.parse()).collect::<Result<_, _>>()?;

@@ -1,6 +1,6 @@
 //! Prints frames a second and memory of simulated cameras on the adapter at hand, as the rows of a table.
 //!
-//! `cargo run --release -p flyrig-sim --example frame_times -- [INSTANTS] [WIDTH HEIGHT CAMERAS [OPTION...]]`, options:
+//! `cargo bench -p flyrig-sim --bench frame_times -- [INSTANTS] [WIDTH HEIGHT CAMERAS [OPTION...]]`, options:
 //! `blur`, `rolling`, `defocus`, `noise`, `truth`, `office`, `cluttered`, `passer-by`. Without a size: all sizes and
 //! numbers of cameras, plain, with blur and with noise, each in a process of its own.
 
@@ -12,7 +12,7 @@ use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{OpticsConfig, SceneKind, SensorConfig, SimConfig, Simulator};
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let args: Vec<String> = std::env::args().skip(1).collect();
+    let args: Vec<String> = std::env::args().skip(1).filter(|text| text != "--bench").collect();
     let instants = args.first().map_or(Ok(5), |text| text.parse::<u64>())?;
     if let [_, width, height, cameras, options @ ..] = &args[..] {
         return measure(instants, [width.parse()?, height.parse()?], cameras.parse()?, options);

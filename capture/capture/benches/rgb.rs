@@ -1,6 +1,6 @@
 //! Run time and error of the conversion of uncompressed images to RGB.
 //!
-//!     cargo run --release -p flyrig-capture --example bench_rgb
+//!     cargo bench -p flyrig-capture --bench rgb
 #![allow(clippy::unwrap_used)] // a benchmark may end by panicking
 
 use std::time::Instant;
