@@ -11,7 +11,7 @@ use flyrig_types::{Image, PixelFormat};
 const SIZE: [u32; 2] = [1280, 720];
 const RUNS: usize = 101;
 
-/// BT.601 with limited range, from its definition.
+/// Converts by the definition of BT.601 with limited range.
 fn reference([y, u, v]: [u8; 3]) -> [f64; 3] {
     let (kr, kb) = (0.299, 0.114);
     let y = (f64::from(y) - 16.0) / 219.0;

@@ -1,10 +1,9 @@
-//! Frames come from here: one trait for cameras and recordings, both of these, and the threads
-//! that read them.
+//! Frame sources (cameras, recordings, folders, videos) behind one trait, and the threads that read them.
 //!
-//! A [`CameraSource`] gives [`flyrig_types::Frame`]s with capture time, sequence number and camera
-//! name, or a [`CaptureError`] whose kind says what to do. [`CaptureThreads`] reads every source in
-//! a thread of its own into one [`LatestQueue`], with a [`FrameStage`] (decoding, compressing) in a
-//! second thread between them where one is asked for. A [`SourceOpener`] is a camera that may come later.
+//! A [`CameraSource`] yields [`flyrig_types::Frame`]s with capture time, sequence number and camera name, or a
+//! [`CaptureError`] whose kind determines the reaction. [`CaptureThreads`] reads every source in a thread of its own
+//! into one [`LatestQueue`], optionally through a [`FrameStage`] (decoding, compression) in a second thread per camera.
+//! A [`SourceOpener`] opens a camera that may be missing at the start.
 
 mod blocking;
 mod camera_options;

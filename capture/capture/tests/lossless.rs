@@ -42,7 +42,7 @@ fn what_is_read_without_loss_is_opened_first_and_never_anew() {
     }
 }
 
-/// A camera of a thousand frames a second that gives none for a while, and knows the time all the same.
+/// Camera of a thousand frames per second that is silent for a while, but knows the time.
 struct Silent {
     camera: CameraId,
     next: i64,

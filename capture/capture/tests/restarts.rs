@@ -70,7 +70,7 @@ fn a_source_that_may_come_back_by_itself_is_left_alone() {
     assert!(threads.queue().is_closed());
 }
 
-/// Panics at its third frame.
+/// Stage that panics at its third frame.
 struct Fragile(u64);
 
 impl FrameStage for Fragile {

@@ -17,7 +17,7 @@ use flyrig_capture::{
 use flyrig_types::{CameraId, Frame};
 use scripted::{Gate, MINUTE, Step, dropped, flows, frames, healthy, live, source};
 
-/// Hangs with the frames of one camera.
+/// Stage that hangs with the frames of one camera.
 struct Hanging(Option<Arc<Gate>>);
 
 impl FrameStage for Hanging {
@@ -85,7 +85,7 @@ fn the_end_leaves_behind_what_hangs_in_a_driver() {
     gate.open();
 }
 
-/// A generator of small numbers (splitmix64).
+/// Generator of small numbers (SplitMix64).
 struct Random(u64);
 
 impl Random {
@@ -112,7 +112,7 @@ impl Random {
     }
 }
 
-/// Fails, panics and hangs now and then.
+/// Stage that fails, panics and hangs at random.
 struct Moody(Random, Arc<Gate>);
 
 impl FrameStage for Moody {

@@ -1,4 +1,4 @@
-//! Random numbers for tests: a few lines instead of a dependency.
+//! Random numbers for tests, without a dependency.
 
 /// SplitMix64.
 pub(crate) struct Random(pub(crate) u64);

@@ -1,4 +1,4 @@
-//! Lags that are known, found again in silhouettes of balls that move.
+//! Known time offsets, recovered from silhouettes of moving balls.
 
 use flyrig_types::{Intrinsics, Isometry, Lens};
 
@@ -22,7 +22,7 @@ fn camera(name: &str, eye: DVec3, target: DVec3) -> Camera {
     }
 }
 
-/// Cameras around the origin, at different heights.
+/// Places cameras around the origin, at different heights.
 fn ring(count: usize) -> Vec<Camera> {
     let eye = |slot: usize| {
         let angle = slot as f64 * 1.1 + 0.3;
@@ -31,7 +31,7 @@ fn ring(count: usize) -> Vec<Camera> {
     (0..count).map(|slot| camera(&format!("cam{slot}"), eye(slot), DVec3::Z)).collect()
 }
 
-/// Balls (centre, radius): a trunk, a head and two hands that somebody jumps and waves with.
+/// Returns balls (centre, radius) that stand for a person: a trunk, a head and two hands, jumping and waving.
 fn balls(secs: f64, seed: u64) -> Vec<(DVec3, f64)> {
     let mut random = Random(seed);
     let mut swing = |size: f64| {
@@ -45,14 +45,14 @@ fn balls(secs: f64, seed: u64) -> Vec<(DVec3, f64)> {
     vec![(base + DVec3::Z, 0.35), (base + DVec3::Z * 1.55, 0.14), (left, 0.1), (right, 0.1)]
 }
 
-/// Rays of a camera's pixels.
+/// Returns the rays of a camera's pixels.
 fn rays(camera: &Camera) -> Vec<DVec3> {
     let [width, height] = camera.size();
     let pixel = |i: u32| DVec2::new(f64::from(i % width), f64::from(i / width));
     (0..width * height).map(|i| camera.ray(pixel(i)).unwrap()).collect()
 }
 
-/// What a camera sees of balls: coverage by the distance of a pixel's ray from the nearest ball's outline.
+/// Renders a camera's mask of balls: coverage from the distance of a pixel's ray to the nearest ball's outline.
 fn mask(camera: &Camera, rays: &[DVec3], balls: &[(DVec3, f64)]) -> Mask {
     let [width, height] = camera.size();
     let to = |center: DVec3| center - camera.position();
@@ -66,7 +66,7 @@ fn mask(camera: &Camera, rays: &[DVec3], balls: &[(DVec3, f64)]) -> Mask {
     Mask::new(width, height, coverage.collect()).unwrap()
 }
 
-/// Eight seconds of one camera; a frame is now and then missing, or its mask is wrong.
+/// Simulates eight seconds of one camera; now and then a frame is missing or its mask is wrong.
 fn track(camera: &Camera, lag: i64, phase: i64, seed: u64, random: &mut Random) -> SilhouetteTrack {
     let (mut track, rays) = (SilhouetteTrack::new(camera), rays(camera));
     for n in 0..240 {

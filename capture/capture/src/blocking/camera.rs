@@ -4,36 +4,36 @@ use flyrig_types::PixelFormat;
 
 use crate::CaptureError;
 
-/// A camera that is open. It lives and dies in one thread.
+/// An open camera, used by a single thread from opening to drop.
 pub(crate) trait BlockingCamera {
-    /// Format, size and rate, for people.
+    /// Returns format, size and rate as text for logs.
     fn mode(&self) -> String;
 
-    /// Waits for the next image as long as it takes, and puts its bytes into `bytes`, which are empty.
+    /// Blocks until the next image and writes its bytes into `bytes`, which is empty on entry.
     ///
     /// # Errors
-    /// `Corrupt` costs the image; after every other kind the camera is closed.
+    /// `Corrupt` loses this image only; after any other kind the camera is closed.
     fn read(&mut self, bytes: &mut Vec<u8>) -> Result<Shot, CaptureError>;
 }
 
-/// What a camera is opened with: once at first and again whenever it was lost, each time in a new thread.
+/// Factory of a blocking camera. Called at the start and after every loss, each time in a new thread.
 pub(crate) trait Opener: Send + Sync + 'static {
     type Camera: BlockingCamera;
 
-    /// Names what is opened, the same at every attempt.
+    /// Returns a name of the device that is stable across attempts.
     fn device(&self) -> String;
 
-    /// Takes as long as it takes.
+    /// Opens the camera; may block indefinitely.
     fn open(&self) -> Result<Self::Camera, CaptureError>;
 }
 
-/// An image without its bytes.
+/// Metadata of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Shot {
     pub size: (u32, u32),
     pub format: PixelFormat,
-    /// When the system says that it was taken.
+    /// Timestamp from the system, nanoseconds, where it provides one.
     pub stamp_nanos: Option<i64>,
-    /// When the call returned.
+    /// Time at which the read returned, nanoseconds.
     pub arrival_nanos: i64,
 }

@@ -1,4 +1,5 @@
-//! Cameras whose reading waits for ever: each is read in a thread that a watchdog looks after and, if need be, abandons.
+//! Supervision of cameras whose reads may never return: each is read in a thread of its own, which a watchdog abandons
+//! when it hangs. A device that hangs holds at most two threads.
 
 mod camera;
 mod left;
@@ -20,40 +21,41 @@ use crate::{
     stamps::{StampSource, Stamps},
 };
 
-/// A camera that has sent frames is silent after so many periods without one, but not before [`SILENT_AFTER`].
+/// Periods without a frame after which a streaming camera counts as silent, but never less than [`SILENT_AFTER`].
 const SILENT_PERIODS: f64 = 5.0;
 const SILENT_AFTER: Duration = Duration::from_millis(500);
-/// A camera may take so long to be opened, and so long again until its first frame.
+/// Time limit of an opening, and of the first frame after it.
 const FIRST_FRAME: Duration = Duration::from_secs(5);
-/// Threads of one camera that may be left behind in calls that do not return. There is one more at most, which is not left.
+/// Most threads of one camera that are abandoned in calls that do not return; one more may hang without being
+/// abandoned.
 const MOST_ABANDONED: usize = 1;
-/// How long an orderly end waits for the camera to be closed.
+/// Time that an orderly shutdown allows the camera to close.
 const CLOSING: Duration = Duration::from_secs(1);
-/// Free buffers that are kept for frames to come.
+/// Free buffers kept for later frames.
 const POOLED_FRAMES: usize = 16;
 
-/// What is expected of a camera.
+/// Expected properties of a camera's frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Expected {
     pub size: (u32, u32),
-    /// Frames a second.
+    /// Frames per second.
     pub fps: f64,
-    /// How much later than the truth its stamps are, seconds; taken off.
+    /// Latency of the timestamps, seconds; subtracted from them.
     pub lag_secs: f64,
 }
 
-/// Such a camera as a source.
+/// Frame source over a blocking camera.
 ///
-/// A read or an opening that takes too long is left alone in its thread, which ends as soon as its call returns, and the
-/// camera is opened again in a new one. When that hangs as well it is kept: a camera never has more than two threads in
-/// its driver, however often it fails and is opened again.
+/// A read or an opening that takes too long is abandoned in its thread, which ends as soon as the call returns, and the
+/// camera is opened again in a new thread. If that one hangs too it is kept: a camera never has more than two threads
+/// in its driver, however often it fails and is reopened.
 #[derive(Debug)]
 pub(crate) struct Watched<O: Opener> {
     camera: CameraId,
     expected: Expected,
     opener: Arc<O>,
     session: Option<Session>,
-    /// Threads that were left behind and have not come back yet.
+    /// Abandoned threads that have not returned yet.
     abandoned: Vec<Arc<Line>>,
     stamps: Stamps,
     frames: u64,
@@ -61,19 +63,19 @@ pub(crate) struct Watched<O: Opener> {
     pool: Arc<BufferPool>,
 }
 
-/// From one opening to its end.
+/// State between an opening and its end.
 #[derive(Debug)]
 struct Session {
     line: Arc<Line>,
-    /// When something came last, or when it was started.
+    /// Time of the last event, or of the start.
     heard: Instant,
     is_flowing: bool,
-    /// Whether its first frame is that of a camera that has come back.
+    /// Whether the next frame is the first one after a reconnect.
     is_back: bool,
     was_asked: bool,
-    /// Whether it hangs and may not be left behind.
+    /// Whether the camera hangs and cannot be abandoned.
     is_stuck: bool,
-    /// Frames that newer ones overtook, as counted so far.
+    /// Frames overtaken by newer ones, as counted so far.
     overtaken: u64,
 }
 
@@ -88,7 +90,7 @@ impl Session {
 }
 
 impl<O: Opener> Watched<O> {
-    /// Opens at once, so that errors are reported at the start.
+    /// Opens the camera immediately, so that errors are reported at the start.
     pub fn open(camera: &CameraId, expected: Expected, opener: O) -> Result<Self, CaptureError> {
         let abandoned = left::take(&opener.device());
         let mut watched = Self {
@@ -219,7 +221,7 @@ impl<O: Opener> Watched<O> {
         })
     }
 
-    /// The camera says nothing: it is left behind, if that is allowed.
+    /// Handles a silent camera: abandons its thread where that is allowed.
     fn silent(&mut self, silent_after: Duration) -> CaptureError {
         let disconnected = |text: String| CaptureError::general(CaptureErrorKind::Disconnected, text);
         let Some(session) = &mut self.session else { return disconnected("is not open".to_owned()) };
@@ -262,8 +264,8 @@ impl<O: Opener> CameraSource for Watched<O> {
 }
 
 impl<O: Opener> Drop for Watched<O> {
-    /// The camera is closed with its next frame; one that hangs stays in its thread until the process ends, and counts
-    /// when its device is opened again.
+    /// Lets the thread close the camera with its next frame. A thread that hangs lives until the process ends, and
+    /// counts against its device when that is opened again.
     fn drop(&mut self) {
         if let Some(session) = self.session.take() {
             session.line.abandon();

@@ -40,9 +40,9 @@ pub enum Step {
     Frame,
     Fail(CaptureErrorKind),
     Panic,
-    /// Panics, and once more when it is dropped for that.
+    /// Panics, and again in the drop during unwinding.
     PanicTwice,
-    /// Does not return before the gate is open.
+    /// Blocks until the gate is open.
     Hang(Arc<Gate>),
     /// Repeats the previous frame.
     Again,

@@ -1,4 +1,4 @@
-//! Buffers that a driver fills: asked for, mapped, queued and taken out.
+//! Buffers filled by a driver: allocation, mapping, queueing and dequeueing.
 
 use std::{
     io,
@@ -22,7 +22,7 @@ use crate::stamps::StampSource;
 use crate::v4l2::queue::{BufferDevice, Delivered, MAX_PLANES};
 
 impl Device {
-    /// A buffer to ask the driver about; with its planes where there are any.
+    /// Prepares the buffer argument of a request, with its planes where there are any.
     fn buffer(&self, index: u32, planes: &mut [v4l2_plane; MAX_PLANES]) -> v4l2_buffer {
         let mut raw = v4l2_buffer { index, type_: self.buffer_type, memory: MEMORY_MMAP, ..Plain::zeroed() };
         if self.buffer_type == MULTI_PLANAR {

@@ -1,4 +1,4 @@
-//! An open capture device: its calls with typed arguments, and its capabilities.
+//! Open capture device: typed `ioctl`s and capabilities.
 
 use std::{
     fs::{File, OpenOptions},
@@ -22,7 +22,7 @@ use super::mapping::Mapping;
 
 pub(super) use v4l::v4l_sys::v4l2_buf_type_V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE as MULTI_PLANAR;
 
-/// Plain data of the kernel's interface, for which all zeros is a value.
+/// Plain data of the kernel's interface, for which all zeros is a valid value.
 ///
 /// # Safety
 /// Only for `repr(C)` types of integers, arrays, unions of these, and pointers.
@@ -53,13 +53,13 @@ plain!(
     v4l2_streamparm,
 );
 
-/// An open capture device.
+/// Open capture device.
 #[derive(Debug)]
 pub(crate) struct Device {
     pub(super) file: File,
     pub(super) buffer_type: u32,
     pub(super) memory_planes: usize,
-    /// By buffer, then by plane.
+    /// Per buffer, then per plane.
     pub(super) mappings: Vec<Vec<Mapping>>,
 }
 
@@ -72,13 +72,13 @@ pub(super) fn invalid(error: &io::Error) -> bool {
     matches!(error.raw_os_error(), Some(libc::EINVAL | libc::ENOTTY | libc::ENODATA))
 }
 
-/// What a device says of itself (`VIDIOC_QUERYCAP`).
+/// Capabilities of a device (`VIDIOC_QUERYCAP`).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Capability {
     pub driver: String,
     pub card: String,
     pub bus_info: String,
-    /// Whether it gives images through memory-mapped buffers.
+    /// Whether the device captures images through memory-mapped buffers.
     pub captures: bool,
     pub(super) multi_planar: bool,
 }
@@ -91,7 +91,7 @@ impl Capability {
 }
 
 impl Device {
-    /// Opens a node without waiting, for this process alone (`O_CLOEXEC` is the standard library's).
+    /// Opens a node without blocking, for this process alone (the standard library sets `O_CLOEXEC`).
     pub fn open(path: &Path) -> io::Result<Self> {
         let file = OpenOptions::new().read(true).write(true).custom_flags(libc::O_NONBLOCK).open(path)?;
         let mut device = Self { file, buffer_type: SINGLE_PLANAR, memory_planes: 1, mappings: Vec::new() };
@@ -115,7 +115,7 @@ impl Device {
         })
     }
 
-    /// `request` must be the number for `T`.
+    /// Calls `ioctl`; `request` must be the number for `T`.
     pub(super) fn ioctl<T: Plain>(&self, request: vidioc::_IOC_TYPE, argument: &mut T) -> io::Result<()> {
         loop {
             // SAFETY: every caller passes the argument type that the request number is made of; pointers inside of it
@@ -128,7 +128,7 @@ impl Device {
         }
     }
 
-    /// Whether the answers of an enumeration go on.
+    /// Requests the next entry of an enumeration; returns false at its end.
     pub(super) fn listed<T: Plain>(&self, request: vidioc::_IOC_TYPE, argument: &mut T) -> io::Result<bool> {
         match self.ioctl(request, argument) {
             Ok(()) => Ok(true),

@@ -1,4 +1,4 @@
-//! Memory that a driver and this process share.
+//! Memory shared between a driver and this process.
 
 use std::{ffi::c_void, io, os::fd::RawFd, ptr};
 

@@ -1,8 +1,8 @@
-//! The kernel's V4L2 calls as safe functions. The only module of this crate with `unsafe` in it.
+//! Safe wrappers of the kernel's V4L2 calls. The only module of this crate with `unsafe` code.
 //!
-//! Safety rests on three things: every `ioctl` number carries the size of its own argument type; a [`Mapping`] lives no
+//! Safety rests on three invariants: every `ioctl` number encodes the size of its own argument type; a mapping lives no
 //! longer than its address range; and mapped bytes are read only between `DQBUF` and `QBUF`, which
-//! [`super::queue::BufferQueue`] sees to.
+//! [`super::queue::BufferQueue`] ensures.
 #![allow(unsafe_code)]
 
 mod buffers;
@@ -13,7 +13,7 @@ mod settings;
 pub(crate) use self::device::{Capability, Device};
 pub(crate) use self::settings::{ActiveFormat, ControlRange, SizeRange};
 
-/// Time of `CLOCK_MONOTONIC`, nanoseconds: the clock of live frames' capture times.
+/// Returns the time of `CLOCK_MONOTONIC`, nanoseconds: the clock of the capture times of live frames.
 #[must_use]
 #[allow(clippy::useless_conversion)] // Narrower on 32-bit systems.
 pub fn monotonic_nanos() -> i64 {

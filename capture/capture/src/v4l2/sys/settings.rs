@@ -1,4 +1,4 @@
-//! What a device has and how it is set: formats, sizes, rates and controls.
+//! Modes and controls of a device: formats, sizes, rates and settings.
 
 use std::io;
 
@@ -14,21 +14,21 @@ use v4l::{
 use super::device::{Device, MULTI_PLANAR, Plain, invalid};
 use crate::v4l2::queue::MAX_PLANES;
 
-/// Most entries of an enumeration that we read: a driver that never says the end must not hang us.
+/// Most entries read of an enumeration, against a driver that never signals its end.
 const MAX_ENTRIES: u32 = 512;
 
-/// A format in force (`VIDIOC_S_FMT` as answered).
+/// Format in effect (`VIDIOC_S_FMT` as answered).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct ActiveFormat {
     pub fourcc: [u8; 4],
     pub width: u32,
     pub height: u32,
-    /// Bytes from a row to the next in each memory plane; 0 where it does not apply.
+    /// Bytes from one row to the next in each memory plane; 0 where it does not apply.
     pub stride: [u32; MAX_PLANES],
     pub planes: usize,
 }
 
-/// An integer control (`VIDIOC_QUERYCTRL`).
+/// Integer control (`VIDIOC_QUERYCTRL`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct ControlRange {
     pub minimum: i32,
@@ -46,7 +46,7 @@ pub(crate) enum SizeRange {
 }
 
 impl Device {
-    /// Pixel formats, in the driver's order.
+    /// Lists the pixel formats, in the driver's order.
     pub fn formats(&self) -> io::Result<Vec<[u8; 4]>> {
         let mut formats = Vec::new();
         for index in 0..MAX_ENTRIES {
@@ -59,7 +59,7 @@ impl Device {
         Ok(formats)
     }
 
-    /// Sizes of a format; empty where the driver does not tell.
+    /// Lists the sizes of a format; empty where the driver does not report them.
     pub fn sizes(&self, fourcc: [u8; 4]) -> io::Result<Vec<SizeRange>> {
         let mut sizes = Vec::new();
         for index in 0..MAX_ENTRIES {
@@ -81,8 +81,8 @@ impl Device {
         Ok(sizes)
     }
 
-    /// Frame rates of a format and size, frames a second; only the fastest and the slowest where the driver has a
-    /// continuous range, empty where it does not tell.
+    /// Lists the rates of a format and size, frames per second; only the fastest and the slowest where the driver has a
+    /// continuous range, empty where it does not report them.
     pub fn rates(&self, fourcc: [u8; 4], width: u32, height: u32) -> io::Result<Vec<f64>> {
         let rate = |interval: v4l2_fract| f64::from(interval.denominator) / f64::from(interval.numerator.max(1));
         let mut rates = Vec::new();
@@ -103,7 +103,7 @@ impl Device {
         Ok(rates)
     }
 
-    /// Sets format and size; the driver may answer with others.
+    /// Sets format and size; returns those in effect, which may differ.
     pub fn set_format(&mut self, fourcc: [u8; 4], width: u32, height: u32) -> io::Result<ActiveFormat> {
         const FIELD_NONE: u32 = 1;
         let pixelformat = u32::from_le_bytes(fourcc);
@@ -142,7 +142,7 @@ impl Device {
         Ok(active)
     }
 
-    /// Asks for a frame rate and gives the one in force; `None` where the driver has no say in it.
+    /// Requests a frame rate and returns the one in effect; `None` where the driver does not support it.
     pub fn set_rate(&self, fps: f64) -> io::Result<Option<f64>> {
         let mut raw = v4l2_streamparm { type_: self.buffer_type, ..Plain::zeroed() };
         match self.ioctl(vidioc::VIDIOC_G_PARM, &mut raw) {
@@ -164,7 +164,7 @@ impl Device {
         Ok(known.then(|| f64::from(interval.denominator) / f64::from(interval.numerator)))
     }
 
-    /// Range of a control; `None` when the camera does not have it.
+    /// Returns the range of a control; `None` when the camera lacks it.
     pub fn control_range(&self, id: u32) -> io::Result<Option<ControlRange>> {
         let mut raw = v4l2_queryctrl { id, ..Plain::zeroed() };
         let (exists, r) = (self.listed(vidioc::VIDIOC_QUERYCTRL, &mut raw)?, raw);
