@@ -1,4 +1,4 @@
-//! Run time of finding boards in photographs of 1280x720, and how many corners are found, by pattern.
+//! Benchmark of board detection in photographs of 1280x720: run time and detected corners, by pattern.
 //!
 //!     cargo bench -p flyrig-calib --bench detect [-- IMAGES]
 
@@ -61,7 +61,7 @@ fn row(name: &str, board: &Board, images: u64) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// A board somewhere in the image, 1.6 to 3.5 m away and tilted by up to half a radian.
+/// Returns a random board pose in the image, 1.6 to 3.5 m away and tilted by up to half a radian.
 fn pose(board: &Board, random: &mut Random) -> Isometry {
     let mut tilt = || random.between(-0.5, 0.5);
     // The camera looks along z, and so does the back of the board.

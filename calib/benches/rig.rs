@@ -1,4 +1,4 @@
-//! Run time and errors of a rig's calibration over cameras, boards and noise, on simulated corners.
+//! Benchmark of a rig's calibration on simulated corners: run time and errors over cameras, boards and noise.
 //!
 //!     cargo bench -p flyrig-calib --bench rig
 
@@ -10,7 +10,7 @@ use flyrig_calib::{
 };
 use flyrig_types::{CameraId, Intrinsics};
 
-/// Simulated rigs in each row.
+/// Simulated rigs per row.
 const SEEDS: u64 = 4;
 
 fn main() -> Result<(), Box<dyn Error>> {

@@ -20,7 +20,7 @@ use crate::{
 /// Name of the file in a calibration folder.
 pub(crate) const FILE: &str = "calibration.toml";
 const VERSION: u32 = 1;
-/// Calibrations are small; larger files are something else.
+/// Maximum file size: calibrations are small, larger files are something else.
 const MAX_BYTES: u64 = 16 << 20;
 
 /// Standard deviations of a camera's pose and time offset.
@@ -30,7 +30,7 @@ pub struct Deviation {
     pub rotation_deg: f64,
     /// Position, millimetres.
     pub position_mm: f64,
-    /// Time offset, milliseconds, where one was sought.
+    /// Time offset, milliseconds, where one was estimated.
     pub time_offset_ms: Option<f64>,
 }
 
@@ -57,7 +57,7 @@ struct Entry {
     time_offset_ms: f64,
     #[serde(default)]
     color: ColorMatch,
-    /// For readers; nothing is computed from it.
+    /// Deviations for human readers; not read back.
     #[serde(rename = "deviation")]
     _deviation: Option<DeviationEntry>,
 }
@@ -161,10 +161,10 @@ fn camera(path: &Path, entry: Entry) -> Result<ImportedCamera, CalibError> {
     Ok(ImportedCamera { id, intrinsics, pose, time_offset_nanos, color: entry.color })
 }
 
-/// Returns the text of a `calibration.toml`; `deviations` by slot, as far as they are known.
+/// Returns the text of a `calibration.toml`; `deviations` per slot, where they are known.
 ///
 /// # Errors
-/// [`CalibError::Camera`] for a rig that is not valid.
+/// [`CalibError::Camera`] for an invalid rig.
 pub fn calibration_toml(rig: &Rig, deviations: &[Option<Deviation>]) -> Result<String, CalibError> {
     rig.validate().map_err(|source| CalibError::Camera { path: FILE.into(), source })?;
     let mut text = header();

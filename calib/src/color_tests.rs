@@ -1,6 +1,6 @@
 use super::*;
 
-/// Numbers of 0..1, the same on every run.
+/// Repeatable random numbers in 0..1.
 struct Dice(u64);
 
 impl Dice {
@@ -18,7 +18,7 @@ fn ids(count: usize) -> Vec<CameraId> {
     (0..count).map(|slot| CameraId::from(format!("{slot:02}"))).collect()
 }
 
-/// Cameras whose corrections have a mean gain and a mean exponent of 1.
+/// Returns cameras whose corrections have a mean gain and a mean exponent of 1.
 fn cameras(count: usize, model: ColorModel, dice: &mut Dice) -> Vec<ColorMatch> {
     let mut colors: Vec<ColorMatch> = (0..count)
         .map(|_| ColorMatch {
@@ -40,7 +40,8 @@ fn srgb(light: f64) -> f64 {
     if light <= 0.003_130_8 { 12.92 * light } else { 1.055 * light.powf(1.0 / 2.4) - 0.055 }
 }
 
-/// Points that every camera sees with probability 0.6: light with noise of a share, and of a tenth of the samples twice as much.
+/// Simulates points that every camera sees with probability 0.6, with relative noise, doubled in a tenth of the
+/// samples.
 fn points(truth: &[ColorMatch], count: usize, noise: f64, dice: &mut Dice) -> Vec<ColorPoint> {
     (0..count as u64)
         .map(|instant| {

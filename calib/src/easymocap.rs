@@ -1,7 +1,7 @@
 //! Calibration in the format of EasyMocap and ZJU-MoCap: `intri.yml` and `extri.yml`.
 //!
-//! Per camera `x`: `K_x` 3x3, `dist_x` (k1 k2 p1 p2 k3, or with k4 k5 k6 of the rational model), `Rot_x` 3x3 or `R_x` as a Rodrigues
-//! vector, `T_x`; `x_camera = Rot x_world + T`. Image sizes `H_x`, `W_x` are optional.
+//! Per camera `x`: `K_x` 3x3, `dist_x` (k1 k2 p1 p2 k3, or with k4 k5 k6 of the rational model), `Rot_x` 3x3 or `R_x`
+//! as a Rodrigues vector, `T_x`; `x_camera = Rot x_world + T`. Image sizes `H_x`, `W_x` are optional.
 
 use std::{
     collections::BTreeSet,
@@ -20,10 +20,9 @@ use crate::{
 const INTRINSICS: &str = "intri.yml";
 const EXTRINSICS: &str = "extri.yml";
 
-/// Reads `intri.yml` and `extri.yml` of a folder. `image_size` gives width and height of a
-/// camera's images in pixels for files that do not say it, and is checked against those that do.
-/// The world's axes stay as they are; which of them is up is guessed from the cameras
-/// ([`Rig::guess_world_up`]).
+/// Reads `intri.yml` and `extri.yml` of a folder. `image_size` gives width and height of a camera's images in pixels
+/// for files that lack them, and is checked against those that contain them. The world's axes stay as they are; the up
+/// direction is estimated from the cameras ([`Rig::guess_world_up`]).
 ///
 /// # Errors
 /// [`CalibError`] names the file, the camera and the fix.
@@ -58,7 +57,7 @@ fn validate(rig: &Rig, dir: &Path) -> Result<(), CalibError> {
     rig.validate().map_err(|source: CameraError| CalibError::Camera { path: dir.to_owned(), source })
 }
 
-/// The cameras of a file: its `names`, or the rest of every key that begins with `prefix`.
+/// Returns the cameras of a file: its `names`, or the suffix of every key that begins with `prefix`.
 fn camera_names(file: &YamlFile, prefix: &str, expected: &'static str) -> Result<Vec<CameraId>, CalibError> {
     let keys = file.keys()?;
     let names = file.strings("names").unwrap_or_else(|| {
@@ -72,7 +71,7 @@ fn camera_names(file: &YamlFile, prefix: &str, expected: &'static str) -> Result
     Ok(names.into_iter().map(CameraId::from).collect())
 }
 
-/// One value of one camera in one file, to say errors of.
+/// Value of one camera in one file, with the context of its errors.
 struct Entry<'a> {
     file: &'a YamlFile,
     camera: &'a CameraId,
@@ -199,12 +198,12 @@ fn rotation(entry: &Entry<'_>, matrix: &Matrix) -> Result<DQuat, CalibError> {
         .map_err(|problem| entry.wrong(problem, "export the calibration again; a mirrored axis gives determinant -1"))
 }
 
-/// Writes a rig as `intri.yml` and `extri.yml` with image sizes, so that [`load_easymocap`] reads
-/// the same cameras back. The format has no place for [`Rig::world_up`] and time offsets. Both files are made before
-/// the first one is written.
+/// Writes a rig as `intri.yml` and `extri.yml` with image sizes, so that [`load_easymocap`] reads the same cameras
+/// back. The format cannot hold [`Rig::world_up`] and time offsets. Both files are composed before the first one is
+/// written.
 ///
 /// # Errors
-/// [`CalibError`] when a camera is bad or a fisheye, or the folder cannot be written.
+/// [`CalibError`] when a camera is invalid or a fisheye, or the folder cannot be written.
 pub fn save_easymocap(dir: &Path, rig: &Rig) -> Result<(), CalibError> {
     validate(rig, dir)?;
     let mut intri = YamlWriter::new(dir.join(INTRINSICS));

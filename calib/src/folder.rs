@@ -6,8 +6,8 @@ use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Lens, Rig};
 
 use crate::{CalibError, calibration_file, easymocap};
 
-/// Reads the rig of a folder. `image_size` gives width and height of a camera's images in pixels, for files that do not say it; it is
-/// checked against those that do.
+/// Reads the rig of a folder. `image_size` gives width and height of a camera's images in pixels for files that lack
+/// them; it is checked against those that contain them.
 ///
 /// # Errors
 /// [`CalibError`] names the file, the camera and the fix.
@@ -67,8 +67,9 @@ fn check_sizes<'a>(
     Ok(())
 }
 
-/// Writes the rig of exported images: EasyMocap's files, which other programs read too, or `calibration.toml` where those cannot
-/// hold a lens or a colour correction. Time offsets are left out, since exported images have no timestamps of their own.
+/// Writes the rig of exported images: EasyMocap's files, which other programs read too, or `calibration.toml` where
+/// those cannot represent a lens or a colour correction. Time offsets are omitted, since exported images have no
+/// timestamps of their own.
 ///
 /// # Errors
 /// As [`crate::save_calibration`].

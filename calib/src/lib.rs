@@ -1,4 +1,4 @@
-//! Where the cameras are: calibration from boards, and calibration files.
+//! Camera calibration: from boards, from a moving person, of colours, and calibration files.
 //!
 //! Conventions are those of `flyrig_types`: OpenCV camera axes, pixel centres at integers, metres.
 

@@ -1,4 +1,4 @@
-//! Calibration of a rig from one person who moves before it: better poses of the cameras and their time offsets.
+//! Calibration of a rig from one person who moves in front of it: better poses of the cameras and their time offsets.
 //!
 //! Landmarks and silhouettes of the person are found in each camera independently. The unknowns are the cameras' poses, one time
 //! offset per camera, and the positions of the landmarks at up to a few hundred instants. The residuals are reprojection errors of the
@@ -24,15 +24,15 @@ pub use tangents::OutlineCorner;
 pub use tracks::PersonTracks;
 use untangle::untangled;
 
-/// Time between two instants at least, seconds.
+/// Minimum interval between two instants, seconds.
 const INSTANT_S: f64 = 0.025;
-/// Instants times cameras, at most.
+/// Maximum number of instants times cameras.
 const MOST_IMAGES: usize = 800;
 /// Number of instants with independent errors; more instants share this weight, since the network repeats its errors in similar images.
 const INDEPENDENT: f64 = 3.0;
-/// Landmarks seen by two cameras that an instant needs.
+/// Fewest landmarks seen by two cameras at an instant.
 const LEAST_LANDMARKS: usize = 6;
-/// Instants that a solve needs.
+/// Fewest instants of a solve.
 const LEAST_INSTANTS: usize = 10;
 /// Rounds of estimating spreads and lengths.
 const ROUNDS: usize = 5;
@@ -46,7 +46,7 @@ const LEAST_SIGMA_PX: f64 = 0.5;
 const POOLED: f64 = 10.0;
 /// Least standard deviation of a limb's length, metres: landmarks lie on clothes and skin.
 const LEAST_LIMB_M: f64 = 0.005;
-/// A quarter of the landmarks must move over more than this, metres.
+/// Least extent over which a quarter of the landmarks must move, metres.
 const LEAST_EXTENT_M: f64 = 0.1;
 /// Least standard deviation of the angle between tangent planes, radians.
 const LEAST_TOUCH: f64 = 5e-4;
@@ -69,7 +69,7 @@ impl Default for PersonOptions {
     }
 }
 
-/// A camera after [`calibrate_person`].
+/// Camera after [`calibrate_person`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct PersonCamera {
     /// Median reprojection error of the landmarks with the old calibration and now, pixels.
@@ -80,7 +80,8 @@ pub struct PersonCamera {
     pub deviation: (f64, f64),
     /// Mean displacement of the person in this camera's image caused by the change of pose, pixels.
     pub moved_px: f64,
-    /// The same between solves of the first and the second half of the take; `None` if one of them fails.
+    /// Mean displacement between solves of the first and the second half of the take, pixels; `None` if one of them
+    /// fails.
     pub halves_px: Option<f64>,
     /// Time offset, to be subtracted from the timestamps, and its standard deviation; seconds.
     pub lag_s: (f64, f64),
@@ -93,7 +94,7 @@ pub struct PersonCamera {
 pub struct PersonFit {
     /// The refined rig in the world frame of the old calibration.
     pub rig: Rig,
-    /// By slot.
+    /// Cameras per slot.
     pub cameras: Vec<PersonCamera>,
     /// Number of instants used.
     pub instants: usize,
@@ -110,8 +111,8 @@ pub struct PersonFit {
 /// groups of (left, right) landmarks that the network confuses together.
 ///
 /// # Errors
-/// [`CalibError::PersonTracks`] for tracks of another rig, [`CalibError::PersonOpen`] when too few cameras see the person at the same time,
-/// [`CalibError::PersonStill`] when nobody moves.
+/// [`CalibError::PersonTracks`] for tracks of another rig, [`CalibError::PersonOpen`] when too few cameras see the
+/// person at the same time, [`CalibError::PersonStill`] when the person stands still.
 pub fn calibrate_person(
     rig: &Rig,
     tracks: &PersonTracks,

@@ -1,4 +1,4 @@
-//! Watches whether a camera still stands as it stood when its reference image was taken.
+//! Detection of bumped cameras: tracks corners of one camera's background against a reference image.
 //!
 //! Corners of the static background are tracked by gradient descent on normalised brightness (Lucas and Kanade 1981, with the
 //! brightness of each patch brought to mean 0 and length 1, so that lights and exposure change nothing), and one rotation of the
@@ -20,18 +20,18 @@ use crate::{
     projection::{project, project_with_derivatives},
 };
 
-/// Images are reduced until their width is at most this, pixels.
+/// Largest width of the reduced image, pixels.
 const WIDTH: usize = 640;
-/// Patches agree with a rotation within this distance, pixels of the reduced image.
+/// Distance within which a patch agrees with a rotation, pixels of the reduced image.
 const AGREE_PX: f64 = 0.75;
-/// Fewest patches, and least share of those that were found again, that must agree.
+/// Fewest agreeing patches, and least fraction of the tracked ones.
 const LEAST_PATCHES: usize = 12;
 const LEAST_SHARE: f64 = 0.4;
-/// Share of the patches that must be found again before a large shift is looked for.
+/// Fraction of tracked patches below which a large shift is searched for.
 const FEW_FOUND: f64 = 0.3;
-/// Mean motion of the image that counts, pixels of the reduced image.
+/// Least mean motion of the image that is reported, pixels of the reduced image.
 const LEAST_MOTION_PX: f64 = 0.5;
-/// Consecutive looks that must agree on a motion, within this share of it.
+/// Consecutive images that must agree on a motion, and their relative tolerance.
 const LOOKS: usize = 3;
 const SAME_SHARE: f64 = 0.3;
 /// Steps of the robust fit.
@@ -40,16 +40,16 @@ const STEPS: usize = 10;
 /// Motion of a camera against its reference.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CameraMotion {
-    /// Rotation vector of the camera in its own axes, radians. A small translation shows as rotation too.
+    /// Rotation vector of the camera in its own axes, radians. A small translation appears as rotation too.
     pub rotation: DVec3,
     /// Mean motion of the image, pixels.
     pub pixels: f64,
-    /// Patches that agree, of those of the reference.
+    /// Agreeing patches, and all patches of the reference.
     pub agreeing: (usize, usize),
 }
 
 impl CameraMotion {
-    /// The camera after this motion.
+    /// Returns the camera after this motion.
     #[must_use]
     pub fn applied_to(&self, camera: &Camera) -> Camera {
         // What stands still turns the other way in the camera's axes.
@@ -58,33 +58,33 @@ impl CameraMotion {
     }
 }
 
-/// State of a camera.
+/// State of a watched camera.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum WatchState {
-    /// Too little of the background is seen, or nothing was compared yet.
+    /// Too little of the background is visible, or nothing was compared yet.
     #[default]
     Unknown,
-    /// It stands as in the reference.
+    /// The camera stands as in the reference.
     Steady,
-    /// It was moved.
+    /// The camera was moved.
     Moved(CameraMotion),
 }
 
-/// Compares the images of one camera with a reference.
+/// Comparison of one camera's images with a reference.
 #[derive(Debug, Clone)]
 pub struct CameraWatch {
     intrinsics: Intrinsics,
-    /// Pixels of the image in one of the reduced image.
+    /// Reduction factor of the image.
     factor: f64,
     patches: Vec<Patch>,
     rotation: DVec3,
-    /// Motions of the last looks, newest last.
+    /// Motions in recent images, newest last.
     recent: Vec<CameraMotion>,
     state: WatchState,
 }
 
 impl CameraWatch {
-    /// Takes a reference image; `None` where it is not of the calibrated size, or shows too few corners.
+    /// Creates a watch from a reference image; `None` if it is not of the calibrated size, or shows too few corners.
     #[must_use]
     pub fn new(intrinsics: &Intrinsics, reference: &WatchedImage<'_>) -> Option<Self> {
         if [reference.width, reference.height] != [intrinsics.width as usize, intrinsics.height as usize] {
@@ -108,20 +108,21 @@ impl CameraWatch {
         })
     }
 
-    /// State after the last look.
+    /// Returns the state after the last image.
     #[must_use]
     pub fn state(&self) -> WatchState {
         self.state
     }
 
-    /// Motion in the last image in which enough of the background was found again, whether it counts or not.
+    /// Returns the motion in the last image in which enough of the background was tracked, whether it is reported or
+    /// not.
     #[must_use]
     pub fn last_motion(&self) -> Option<CameraMotion> {
         self.recent.last().copied()
     }
 
-    /// Compares an image, about once a second, and returns the new state. A motion is reported once three looks agree on it; an image in
-    /// which too little of the background is found again changes nothing.
+    /// Compares an image, about once per second, and returns the new state. A motion is reported once three images
+    /// agree on it; an image in which too little of the background is tracked changes nothing.
     pub fn look(&mut self, image: &WatchedImage<'_>) -> WatchState {
         let is_of_size =
             [image.width, image.height] == [self.intrinsics.width as usize, self.intrinsics.height as usize];
@@ -149,7 +150,7 @@ impl CameraWatch {
         self.state
     }
 
-    /// Rotation that most patches agree on; `None` without one.
+    /// Estimates the rotation that most patches agree on; `None` without one.
     fn motion(&self, pyramid: &Pyramid) -> Option<CameraMotion> {
         let predicted = |rotation: DVec3| {
             let shift = |patch: &Patch| {
@@ -180,12 +181,12 @@ impl CameraWatch {
         Some(CameraMotion { rotation, pixels, agreeing: (agreeing, self.patches.len()) })
     }
 
-    /// Pixel of a patch after the camera turned. What stands still turns the other way in the camera's axes.
+    /// Returns the pixel of a patch after the camera turned. In the camera's axes the static world turns the other way.
     fn pixel(&self, patch: &Patch, rotation: DVec3) -> Option<DVec2> {
         project(&self.intrinsics, exp_rotation(-rotation) * patch.ray)
     }
 
-    /// Derivative of the pixel by the rotation vector, columns.
+    /// Returns the derivative of the pixel by the rotation vector, as columns.
     fn by_rotation(&self, patch: &Patch, rotation: DVec3) -> Option<(DVec2, [DVec2; 3])> {
         let ray = exp_rotation(-rotation) * patch.ray;
         let projected = project_with_derivatives(&self.intrinsics, LensModel::Radial1, ray)?;
@@ -196,7 +197,7 @@ impl CameraWatch {
         Some((projected.pixel, [column(DVec3::X), column(DVec3::Y), column(DVec3::Z)]))
     }
 
-    /// Rotation that most pairs of a patch and its pixel agree on, and how many do.
+    /// Finds the rotation that most pairs of a patch and its pixel agree on, and their number.
     fn consensus(&self, pairs: &[(&Patch, DVec2)]) -> Option<(DVec3, usize)> {
         let tolerance = AGREE_PX * self.factor;
         let agreeing = |rotation: DVec3| {

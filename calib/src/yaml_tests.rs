@@ -1,4 +1,4 @@
-//! What the reader of YAML files takes and what it refuses.
+//! Accepted and rejected input of the YAML reader.
 
 use super::*;
 

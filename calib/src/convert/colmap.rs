@@ -1,6 +1,6 @@
-//! COLMAP's text model: `cameras.txt` and `images.txt`, one image for each camera.
+//! COLMAP's text model: `cameras.txt` and `images.txt`, one image per camera.
 //!
-//! COLMAP puts the centre of the first pixel at (0.5, 0.5): half a pixel is taken off its principal point.
+//! COLMAP puts the centre of the first pixel at (0.5, 0.5): half a pixel is subtracted from its principal point.
 
 use std::{
     collections::BTreeMap,
@@ -19,7 +19,7 @@ use crate::{CalibError, calibration_file};
 
 pub(super) const CAMERAS: &str = "cameras.txt";
 const IMAGES: &str = "images.txt";
-/// Poses of one camera in two images differ by less than this, metres of the file and radians.
+/// Largest difference between the poses of one camera in two images, units of the file and radians.
 const SAME_POSE: f64 = 1e-6;
 
 pub(super) fn read(dir: &Path) -> Result<Imported, CalibError> {

@@ -1,7 +1,7 @@
 //! Kalibr: `camchain.yaml`. Poses form a chain, `T_cn_cnm1` takes points from the camera before; the world is cam0.
 //!
-//! Kalibr numbers its cameras; their names are taken from and put into `rostopic`. `timeshift_cam_imu` gives time offsets:
-//! `t_imu = t_cam + shift`.
+//! Kalibr numbers its cameras; their names are read from and written to `rostopic`. `timeshift_cam_imu` gives time
+//! offsets: `t_imu = t_cam + shift`.
 
 use std::{fmt::Write as _, path::Path};
 

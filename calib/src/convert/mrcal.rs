@@ -1,4 +1,4 @@
-//! mrcal: one file `CAM.cameramodel` for each camera, a dictionary of Python with `lensmodel`, `intrinsics`, `extrinsics` (the
+//! mrcal: one file `CAM.cameramodel` per camera, a Python dictionary with `lensmodel`, `intrinsics`, `extrinsics` (the
 //! camera from the reference: Rodrigues vector and translation) and `imagersize`.
 
 use std::path::Path;

@@ -16,7 +16,7 @@ use crate::{CalibError, calibration_file};
 
 pub(super) const FILE: &str = "transforms.json";
 
-/// Half a turn about x: from axes x right, y up, z backward to x right, y down, z forward, and back.
+/// Returns half a turn about x: from axes x right, y up, z backward to x right, y down, z forward, and back.
 pub(super) fn flip() -> DQuat {
     DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0)
 }

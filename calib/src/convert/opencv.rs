@@ -1,4 +1,4 @@
-//! OpenCV: one FileStorage file `CAM.yml` for each camera, with the keys of OpenCV's calibration sample.
+//! OpenCV: one FileStorage file `CAM.yml` per camera, with the keys of OpenCV's calibration sample.
 //!
 //! `image_width`, `image_height`, `camera_matrix`, `distortion_coefficients`, `fisheye_model` (1 for a fisheye), and for the pose
 //! `rvec` (or `R`) and `tvec` (or `T`), `x_camera = R x_world + T`.

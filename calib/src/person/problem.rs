@@ -12,10 +12,10 @@ use crate::{
     projection::{project, project_with_derivatives},
 };
 
-/// A landmark at this many standard deviations loses half its weight.
+/// Robust kernel of landmarks, which lose half their weight at 2 standard deviations.
 const LANDMARK_KERNEL: Kernel = Kernel::Cauchy(2.0);
 const LIMB_KERNEL: Kernel = Kernel::Cauchy(2.0);
-/// A camera that was bumped pulls the others along only a little.
+/// Robust kernel of priors, so that a bumped camera shifts the others only a little.
 const PRIOR_KERNEL: Kernel = Kernel::Huber(1.0);
 /// Weight of a landmark relative to a tangent plane: the network's errors depend on the viewing direction and persist over time,
 /// those of silhouettes hardly do (docs/benchmarks/calibration.md).
@@ -29,7 +29,7 @@ pub(crate) struct Estimate {
     pub cameras: Vec<RigidMotion>,
     /// Time offsets, subtracted from the timestamps, seconds; the first camera's is fixed.
     pub lags_s: Vec<f64>,
-    /// By instant and landmark, metres in the world.
+    /// Landmarks per instant, metres in the world.
     pub points: Vec<Vec<DVec3>>,
 }
 
@@ -76,7 +76,7 @@ pub(crate) struct Known<'a> {
 /// Standard deviations, estimated alternately with the unknowns.
 #[derive(Debug, Clone)]
 pub(crate) struct Spread {
-    /// By landmark, pixels.
+    /// Per landmark, pixels.
     pub landmark_px: Vec<f64>,
     /// Length of each limb and its standard deviation, metres.
     pub limbs_m: Vec<Option<(f64, f64)>>,

@@ -12,7 +12,7 @@ const ROBUST_M: f64 = 0.05;
 pub(crate) struct Ray {
     /// Camera centre, metres.
     pub center: DVec3,
-    /// Length 1.
+    /// Unit direction.
     pub direction: DVec3,
     /// Confidence of the observation, 0 to 1.
     pub confidence: f64,
@@ -26,7 +26,7 @@ impl Ray {
         Some(Self { center: camera.inverse().translation, direction, confidence })
     }
 
-    /// Projection onto the plane perpendicular to the ray.
+    /// Returns the projection onto the plane perpendicular to the ray.
     fn across(&self) -> DMat3 {
         let d = self.direction;
         DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z)

@@ -7,7 +7,7 @@ const SMOOTH_S: f64 = 0.03;
 const SMOOTH_INTERVALS: f64 = 1.0;
 /// Radius of the window in standard deviations.
 const REACH: f64 = 2.5;
-/// Samples that a smoothed value needs.
+/// Fewest samples of a smoothed value.
 const LEAST_SAMPLES: usize = 4;
 
 /// Samples in a window, with their weights in the fitted value and in its slope.

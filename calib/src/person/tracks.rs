@@ -1,4 +1,4 @@
-//! Image tracks of a person's landmarks and silhouettes, one set per camera.
+//! Image tracks of a person's landmarks and silhouettes, per camera.
 
 use glam::DVec2;
 
@@ -16,9 +16,9 @@ pub(crate) struct Track {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Place {
     pub pixel: DVec2,
-    /// Pixels a second.
+    /// Pixels per second.
     pub velocity: DVec2,
-    /// 0 to 1.
+    /// Confidence in 0..=1.
     pub confidence: f64,
 }
 
@@ -60,8 +60,8 @@ impl PersonTracks {
         Self { landmarks, cameras: vec![empty; cameras] }
     }
 
-    /// Adds the landmarks of an image: pixel and confidence (0 to 1), `None` for unseen ones. Ignores images out of order, unknown
-    /// cameras, and values that are not finite.
+    /// Adds the landmarks of an image: pixel and confidence (in 0..=1), `None` for unseen ones. Ignores images out of
+    /// order, unknown cameras, and values that are not finite.
     pub fn add(&mut self, camera: usize, nanos: i64, landmarks: &[Option<(DVec2, f64)>]) {
         let Some(camera) = self.cameras.get_mut(camera) else { return };
         if camera.nanos.last().is_some_and(|last| *last >= nanos) {

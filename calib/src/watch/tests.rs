@@ -1,4 +1,4 @@
-//! Watching a textured room whose camera, lights and people move.
+//! Watch of a textured room with moving camera, lights and people.
 
 use flyrig_types::{Camera, Isometry, Lens};
 
@@ -23,7 +23,7 @@ fn camera() -> Camera {
     }
 }
 
-/// A camera that was turned in its own axes (degrees) and shifted (millimetres).
+/// Returns a camera turned in its own axes (degrees) and shifted (millimetres).
 fn bumped(camera: &Camera, degrees: DVec3, mm: DVec3) -> Camera {
     let turn = Isometry::new(exp_rotation(-degrees * std::f64::consts::PI / 180.0), -mm * 1e-3);
     Camera { camera_from_world: turn * camera.camera_from_world, ..camera.clone() }
@@ -36,7 +36,7 @@ fn hash(x: i64, y: i64, salt: i64) -> f64 {
     ((h >> 40) & 0xffff) as f64 / 65535.0
 }
 
-/// Smooth noise with cells of `cell` metres.
+/// Returns smooth noise with cells of `cell` metres.
 fn noise(u: f64, v: f64, cell: f64, salt: i64) -> f64 {
     let (x, y) = (u / cell, v / cell);
     let (x0, y0) = (x.floor(), y.floor());
@@ -54,14 +54,14 @@ struct Scene {
     /// Brightness of each of the six walls and floors, and a shadow's edge on the floor.
     lights: [f64; 6],
     shadow: f64,
-    /// Pixels of a person's middle and half width, pixels; none at 0.
+    /// Position and half width of a person, pixels; none at 0.
     person: (f64, f64),
     noise: f64,
 }
 
 const CALM: Scene = Scene { gain: 1.0, lights: [1.0; 6], shadow: -9.0, person: (0.0, 0.0), noise: 2.0 };
 
-/// Draws the inside of a box of 6 x 6 x 3 m with patterned walls.
+/// Renders the inside of a box of 6 x 6 x 3 m with patterned walls.
 fn draw(camera: &Camera, scene: &Scene, random: &mut Random) -> Vec<u8> {
     let world_from_camera = camera.camera_from_world.inverse();
     let eye = world_from_camera.translation;
