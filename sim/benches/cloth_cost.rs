@@ -1,8 +1,9 @@
-//! What loose cloth costs.
+//! Benchmark of loose cloth.
 //!
 //! `cargo bench -p flyrig-sim --bench cloth_cost -- [CLIP] [SECS] [SEED ...]`
 //!
-//! Asks for the clothed surface at 30 frames a second, twice: first the cloth is computed, then it is only looked up.
+//! Requests the clothed surface at 30 frames per second, twice: first the cloth is simulated, then it is read from the
+//! cache.
 
 use std::error::Error;
 use std::time::Instant;

@@ -1,8 +1,8 @@
-//! Prints frames a second and memory of simulated cameras on the adapter at hand, as the rows of a table.
+//! Prints frames per second and memory of simulated cameras on the available adapter, as the rows of a table.
 //!
-//! `cargo bench -p flyrig-sim --bench frame_times -- [INSTANTS] [WIDTH HEIGHT CAMERAS [OPTION...]]`, options:
-//! `blur`, `rolling`, `defocus`, `noise`, `truth`, `office`, `cluttered`, `passer-by`. Without a size: all sizes and
-//! numbers of cameras, plain, with blur and with noise, each in a process of its own.
+//! `cargo bench -p flyrig-sim --bench frame_times -- [INSTANTS] [WIDTH HEIGHT CAMERAS [OPTION...]]`, options: `blur`,
+//! `rolling`, `defocus`, `noise`, `truth`, `office`, `cluttered`, `passer-by`. Without a size: all sizes and numbers of
+//! cameras, plain, with blur and with noise, each in a process of its own.
 
 use std::error::Error;
 use std::process::Command;

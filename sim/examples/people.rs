@@ -1,4 +1,4 @@
-//! Writes a sheet of simulated people, a seed each.
+//! Writes a sheet of simulated people, one per seed.
 //!
 //! `cargo run --release -p flyrig-sim --example people -- OUT.jpg [COUNT] [COLUMNS] [FIRST_SEED] [HEIGHT_PX] [FOCAL_HEIGHTS] [TARGET_HEIGHT_M] [DEGREES]`
 

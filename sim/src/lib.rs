@@ -1,9 +1,10 @@
-//! Synthetic people in front of synthetic cameras, with the truth about every pixel.
+//! Synthetic people in front of synthetic cameras, with ground truth for every pixel.
 //!
-//! A seed makes a person: body, face, hair, hat, layered clothes, cloth and shoes. The person moves by a clip
-//! or turns around on the spot, stands in a lit room, and is seen by a ring of cameras with radial distortion or
-//! fisheye lenses, whose sensors and clocks have the configured errors. Images are made by an ordinary textured-triangle
-//! rasteriser with a z-buffer; this crate knows nothing of splats, so that no method is judged on its own drawings.
+//! A seed determines a person: body, face, hair, hat, layered clothes, cloth and shoes. The person moves by a clip or
+//! turns around on the spot, stands in a lit room, and is seen by a ring of cameras with radial distortion or fisheye
+//! lenses, whose sensors and clocks have the configured errors. Images come from an ordinary textured-triangle
+//! rasteriser with a z-buffer; this crate shares no drawing code with the splat renderer, so that no method is judged
+//! by its own rendering.
 //!
 //! # Conventions
 //!

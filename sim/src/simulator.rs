@@ -1,4 +1,4 @@
-//! The simulation itself.
+//! Simulator of a capture.
 
 use std::fmt;
 
@@ -15,22 +15,22 @@ use crate::person::assembly::Person;
 use crate::room::scene::Scene;
 use crate::{FramePlan, OpticsConfig, SensorConfig, Shot, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring};
 
-/// A person, a motion, a room and cameras.
+/// Simulator of a person, a motion, a room and cameras.
 pub struct Simulator {
     config: SimConfig,
     rig: Rig,
     cast: Cast,
     plates: Vec<Image>,
     drawing: Drawing,
-    /// Instant and reach of what the drawing's people do.
+    /// Instant and reach of the people last set in the drawing.
     posed: Option<(i64, f64)>,
     cameras: Vec<Kept>,
 }
 
-/// What is remembered of a camera.
+/// Cached state of a camera.
 #[derive(Debug, Default)]
 struct Kept {
-    /// Instant that was asked for last.
+    /// Instant requested last.
     asked_nanos: Option<i64>,
     drawn: Option<(i64, RawImage)>,
 }
@@ -42,7 +42,7 @@ impl fmt::Debug for Simulator {
 }
 
 impl Simulator {
-    /// Makes the person, the room and the cameras.
+    /// Creates the person, the room and the cameras.
     ///
     /// # Errors
     /// [`SimError`] names the setting, the missing file or the adapter's limit.
@@ -64,43 +64,43 @@ impl Simulator {
         Ok(new)
     }
 
-    /// The configuration.
+    /// Returns the configuration.
     #[must_use]
     pub fn config(&self) -> &SimConfig {
         &self.config
     }
 
-    /// The cameras as they are, z up.
+    /// Returns the true cameras, z up.
     #[must_use]
     pub fn rig(&self) -> &Rig {
         &self.rig
     }
 
-    /// The cameras as a calibration with the configured error reports them.
+    /// Returns the cameras as a calibration with the configured error reports them.
     #[must_use]
     pub fn reported_rig(&self) -> Rig {
         self.config.calibration_error.reported(&self.rig, self.config.seed)
     }
 
-    /// The body without clothes: what a tracker is given.
+    /// Returns the body without clothes: input of a tracker.
     #[must_use]
     pub fn template(&self) -> &Template {
         &self.cast.main.person.body
     }
 
-    /// One round of the motion; see [`Self::pose`] for later times.
+    /// Returns one cycle of the motion; see [`Self::pose`] for later times.
     #[must_use]
     pub fn track(&self) -> &PoseTrack {
         &self.cast.main.track
     }
 
-    /// Pose at a time; the motion starts over after its end.
+    /// Returns the pose at a time; the motion repeats.
     #[must_use]
     pub fn pose(&self, nanos: i64) -> Pose {
         self.cast.pose(nanos)
     }
 
-    /// The room without people at time 0, as camera `slot` sees it.
+    /// Returns the room without people at time 0, as camera `slot` sees it.
     ///
     /// # Errors
     /// [`SimError::NoSlot`].
@@ -108,13 +108,13 @@ impl Simulator {
         self.plates.get(slot).ok_or(SimError::NoSlot { slot, count: self.rig.cameras.len() })
     }
 
-    /// Time of frame `index` of every camera.
+    /// Returns the time of frame `index` of every camera, nanoseconds.
     #[must_use]
     pub fn frame_nanos(&self, index: u64) -> i64 {
         (index as f64 * 1e9 / self.config.fps) as i64
     }
 
-    /// What the fault script does to frame `index` of camera `slot`.
+    /// Returns the fault script's effect on frame `index` of camera `slot`.
     ///
     /// # Errors
     /// [`SimError::NoSlot`].
@@ -122,7 +122,7 @@ impl Simulator {
         Ok(self.config.faults.plan(&self.camera(slot)?.id, index, |index| self.frame_nanos(index)))
     }
 
-    /// Image and truth of one camera at a time.
+    /// Renders image and truth of one camera at a time.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
@@ -130,7 +130,7 @@ impl Simulator {
         self.render_with(&Shot::new(nanos, slot))
     }
 
-    /// Image and truth of a shot.
+    /// Renders image and truth of a shot.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Config`] for a shot out of range, [`SimError::Gpu`].
@@ -155,8 +155,8 @@ impl Simulator {
         Ok(frame)
     }
 
-    /// Image and mask only, at less cost than [`Self::render`]. Cameras that were asked for the same instants before
-    /// are drawn together, when the first of them is asked for.
+    /// Renders image and mask only, at lower cost than [`Self::render`]. Cameras that were requested for the same
+    /// instants before are rendered together, at the first request.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
@@ -164,7 +164,7 @@ impl Simulator {
         self.capture_with(&Shot::new(nanos, slot))
     }
 
-    /// Image and mask of a shot.
+    /// Renders image and mask of a shot.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Config`] for a shot out of range, [`SimError::Gpu`].
@@ -173,7 +173,7 @@ impl Simulator {
         self.finished(&raw, shot)
     }
 
-    /// Images and masks of several cameras at one time, drawn in one pass.
+    /// Renders images and masks of several cameras at one time, in one pass.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
@@ -182,7 +182,8 @@ impl Simulator {
         slots.iter().map(|&slot| self.capture(nanos, slot)).collect()
     }
 
-    /// Linear light on the sensor of a shot, before exposure, noise and code: RGB, 1 is the brightest sRGB value.
+    /// Renders the linear light on the sensor of a shot, before exposure, noise and encoding: RGB, 1 is the brightest
+    /// sRGB value.
     ///
     /// # Errors
     /// As [`Self::capture_with`].
@@ -191,7 +192,7 @@ impl Simulator {
         Ok(raw.iter().map(|&[r, g, b, _]| [r, g, b].map(linear_of_half)).collect())
     }
 
-    /// What the cameras see of the person at a time, as a mesh.
+    /// Returns the person's visible surface at a time, as a mesh.
     pub fn clothed_surface(&mut self, nanos: i64) -> SurfaceMesh {
         let Shape { positions, normals, displacement } = self.cast.main.shape(nanos);
         let Person { clothed, carriers, .. } = &self.cast.main.person;
@@ -209,7 +210,7 @@ impl Simulator {
         self.rig.cameras.get(slot).ok_or(SimError::NoSlot { slot, count: self.rig.cameras.len() })
     }
 
-    /// Light and coverage of a shot, drawn unless it was.
+    /// Returns light and coverage of a shot, rendered unless cached.
     fn raw(&mut self, shot: &Shot) -> Result<RawImage, SimError> {
         shot.validate()?;
         let take = self.take(shot)?;
@@ -234,9 +235,9 @@ impl Simulator {
         Ok(self.cameras[slot].drawn.as_ref().map(|(_, raw)| raw.clone()).unwrap_or_default())
     }
 
-    /// Draws what of an instant is not drawn yet.
+    /// Renders the images of an instant that are not cached.
     fn draw_all(&mut self, nanos: i64, slots: &[usize]) -> Result<(), SimError> {
-        /// Bytes that are read back at once.
+        /// Bytes that are read back together.
         const BATCH_BYTES: usize = 256 << 20;
         let mut missing: Vec<usize> = Vec::new();
         for &slot in slots {
@@ -285,7 +286,7 @@ impl Simulator {
         Ok((self.develop(raw, shot)?, Mask::new(self.config.width, self.config.height, coverage)?))
     }
 
-    /// What the camera's sensor makes of light.
+    /// Applies the camera's sensor to light.
     fn develop(&self, raw: &[[u16; 4]], shot: &Shot) -> Result<Image, SimError> {
         let mut sensor = match self.config.sensors.len() {
             0 => SensorConfig::default(),
@@ -299,7 +300,7 @@ impl Simulator {
     }
 }
 
-/// Inverse of `part as u32 + 1`.
+/// Inverts `part as u32 + 1`.
 fn part_of_index(index: u32) -> Option<Part> {
     Part::ALL.into_iter().find(|&part| part as u32 + 1 == index)
 }

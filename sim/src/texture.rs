@@ -1,4 +1,4 @@
-//! Painting textures through the mesh's own texture coordinates.
+//! Painting of textures through a mesh's own texture coordinates.
 
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
@@ -6,21 +6,21 @@ use rayon::prelude::*;
 use crate::clothes::sheet::Sheet;
 use crate::clothes::wardrobe::Srgb;
 
-/// A square sRGB image.
+/// Square sRGB image.
 #[derive(Debug, Clone)]
 pub(crate) struct Texture {
     pub side: usize,
     pub pixels: Vec<[u8; 4]>,
 }
 
-/// What lies under a texel: index of the triangle plus one (0: nothing) and two of its barycentric coordinates.
+/// Coverage of a texel: index of the triangle plus one (0: none) and two of its barycentric coordinates.
 pub(crate) struct UvMap {
     side: usize,
     texels: Vec<(u32, Vec2)>,
 }
 
 impl UvMap {
-    /// Draws the sheet's triangles in texture space; texels around the charts take the closest chart's point.
+    /// Rasterises the sheet's triangles in texture space; texels around the charts take the closest chart's point.
     pub(crate) fn new(sheet: &Sheet, side: usize) -> Self {
         let mut texels = vec![(0u32, Vec2::ZERO); side * side];
         for (triangle, index) in sheet.triangles.iter().zip(1u32..) {
@@ -61,7 +61,7 @@ impl UvMap {
         Self { side, texels }
     }
 
-    /// Colours each texel by what is under it: three corner nodes' indices and the weights of the corners.
+    /// Colours each texel by its surface point: three corner nodes' indices and the weights of the corners.
     pub(crate) fn paint(&self, sheet: &Sheet, colour: impl Fn([u32; 3], Vec3) -> Srgb + Sync) -> Texture {
         let pixels = self
             .texels
@@ -76,7 +76,7 @@ impl UvMap {
 }
 
 impl Texture {
-    /// A texture from a function of texture coordinates.
+    /// Creates a texture from a function of texture coordinates.
     pub(crate) fn from_fn(side: usize, colour: impl Fn(Vec2) -> Srgb + Sync) -> Self {
         let pixels = (0..side * side)
             .into_par_iter()
@@ -85,7 +85,7 @@ impl Texture {
         Self { side, pixels }
     }
 
-    /// The same image of a glossy surface, 0..=1; the gloss is what the fourth channel lacks to full.
+    /// Sets the gloss, in 0..=1; the fourth channel holds its complement.
     pub(crate) fn glossy(mut self, gloss: f32) -> Self {
         let fourth = ((1.0 - gloss.clamp(0.0, 1.0)) * 255.0).round() as u8;
         for pixel in &mut self.pixels {
@@ -94,7 +94,7 @@ impl Texture {
         self
     }
 
-    /// Half the side, averaged in linear light.
+    /// Returns an image of half the side, averaged in linear light.
     pub(crate) fn halved(&self) -> Self {
         let side = (self.side / 2).max(1);
         let table: Vec<f32> = (0..=255).map(|v| linear_from_srgb(v as f32 / 255.0)).collect();

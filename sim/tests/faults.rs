@@ -1,4 +1,4 @@
-//! A fault script does to the frames what it says.
+//! Effects of a fault script on the frames.
 
 #![allow(clippy::unwrap_used)]
 
@@ -18,7 +18,7 @@ fn nanos_of(index: u64) -> i64 {
     (index as f64 * 1e9 / FPS) as i64
 }
 
-/// The cameras 00 and 01 of a simulation with these faults, and one without any.
+/// Returns cameras 00 and 01 of a simulation with these faults, and a simulator without any.
 fn rig(script: &str) -> (Vec<SimSource>, Simulator) {
     let mut config = small_config(2);
     config.frames = Some(12);

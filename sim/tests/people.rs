@@ -1,4 +1,4 @@
-//! A seed makes a person, other seeds other people; all of them are made of sound surfaces.
+//! A seed determines a person, other seeds give other people; all of them consist of valid surfaces.
 
 #![allow(clippy::unwrap_used)]
 

@@ -1,4 +1,4 @@
-//! What a calibration gets wrong.
+//! Errors of the reported calibration.
 
 use flyrig_types::{Camera, Isometry, Rig};
 use glam::{DQuat, DVec2, DVec3};
@@ -8,16 +8,16 @@ use crate::SimError;
 use crate::camera::sensor::{gaussian, hash};
 use crate::error::check;
 
-/// How far the reported cameras are off the true ones: each error is drawn for each camera from a Gaussian of this
-/// standard deviation (an axis, for rotation, translation and centre).
+/// Deviations of the reported cameras from the true ones, drawn per camera from Gaussians of these standard deviations
+/// (per axis for rotation, translation and centre).
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CalibrationError {
-    /// Draws the errors; without it, the simulation's seed does.
+    /// Seed of the errors; the simulation's when `None`.
     pub seed: Option<u64>,
     /// Rotation about each axis of the camera, degrees.
     pub rotation_deg: f64,
-    /// Place of the camera along each axis, millimetres.
+    /// Position of the camera along each axis, millimetres.
     pub translation_mm: f64,
     /// Focal length, percent.
     pub focal_percent: f64,
@@ -33,7 +33,7 @@ impl CalibrationError {
         check("calibration_error.center_px", self.center_px, 0.0, 500.0, "0 to 500 pixels")
     }
 
-    /// What a calibration with these errors reports of a rig.
+    /// Returns a rig as a calibration with these errors reports it.
     pub(crate) fn reported(&self, rig: &Rig, seed: u64) -> Rig {
         if *self == (Self { seed: self.seed, ..Self::default() }) {
             return rig.clone();

@@ -1,23 +1,23 @@
-//! Which instant the simulated cameras take next.
+//! Clock of the simulated cameras, which decides the next instant.
 
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-/// An instant that took long to draw is followed by a rest, so that drawing takes this part of the time at most: real
-/// cameras leave the machine to the reconstruction.
+/// Fraction of the time spent rendering, at most: a pause follows each instant, since real cameras leave the machine to
+/// the reconstruction.
 const DRAWING_PART: u32 = 2;
 
-/// How simulated time goes on.
+/// Progress of simulated time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SimTime {
-    /// By one frame interval a call of each source, whatever the wall clock does: every instant is simulated.
+    /// One frame interval per call of each source, regardless of the wall clock: every instant is simulated.
     Exact,
-    /// With the wall clock. Where drawing is slower than the frame rate, whole instants are skipped, by all cameras
-    /// alike, as a slower rig would.
+    /// Wall clock. Where rendering is slower than the frame rate, all cameras skip whole instants, as a slower rig
+    /// would.
     Real,
 }
 
-/// Gives the sources of one simulator their instants in [`SimTime::Real`].
+/// Clock that assigns instants to the sources of one simulator in [`SimTime::Real`].
 #[derive(Debug)]
 pub(crate) struct RealClock {
     interval: Duration,
@@ -27,13 +27,13 @@ pub(crate) struct RealClock {
 
 #[derive(Debug)]
 struct State {
-    /// When the instant 0 was due.
+    /// Wall time of instant 0.
     origin: Option<Instant>,
-    /// The instant that is being taken; none before the first.
+    /// Instant being taken; `None` before the first.
     index: Option<u64>,
-    /// When it was begun.
+    /// Wall time of its begin.
     began: Option<Instant>,
-    /// End of the rest after it, once all have delivered it.
+    /// End of the pause after it, once all cameras have delivered it.
     rest_until: Option<Instant>,
     cameras: Vec<Progress>,
     skipped: u64,
@@ -41,11 +41,11 @@ struct State {
 
 #[derive(Debug, Clone, Default)]
 struct Progress {
-    /// The instant it took last.
+    /// Last instant taken.
     last: Option<u64>,
-    /// It has not delivered that one's frame yet.
+    /// Whether its frame is still to be delivered.
     busy: bool,
-    /// Gone for good or for a while: nobody waits for it.
+    /// Whether the camera is gone, for good or for a while, so that the others do not wait for it.
     away: bool,
 }
 
@@ -69,8 +69,8 @@ impl RealClock {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The next instant for the camera in `slot`: the one that the others are taking where it lacks that, else a new
-    /// one as soon as all have delivered the last and it is due. `None` when that is not within `timeout`.
+    /// Returns the next instant for the camera in `slot`: the one that the others are taking if it lacks that,
+    /// otherwise a new one once all have delivered the last and it is due. `None` when that is not within `timeout`.
     pub(crate) fn next(&self, slot: usize, timeout: Duration) -> Option<u64> {
         let deadline = Instant::now() + timeout;
         let mut state = self.lock();
@@ -105,7 +105,7 @@ impl RealClock {
         }
     }
 
-    /// Nobody waits for the camera until it asks again.
+    /// Excludes the camera until it asks again.
     pub(crate) fn leave(&self, slot: usize) {
         self.lock().cameras[slot].away = true;
         self.changed.notify_all();
@@ -113,7 +113,7 @@ impl RealClock {
 }
 
 impl State {
-    /// End of the rest after the instant that all have delivered.
+    /// Returns the end of the pause after the instant that all have delivered.
     fn rest_until(&mut self, now: Instant) -> Instant {
         let Some(began) = self.began else { return now };
         *self.rest_until.get_or_insert_with(|| began + now.duration_since(began) * DRAWING_PART)
@@ -142,7 +142,7 @@ mod tests {
     const NOW: Duration = Duration::ZERO;
     const LONG: Duration = Duration::from_secs(20);
 
-    /// A clock whose instants are all due.
+    /// Returns a clock whose instants are all due.
     fn late(cameras: usize) -> RealClock {
         let clock = RealClock::new(cameras, 1000.0);
         clock.lock().origin = Instant::now().checked_sub(Duration::from_secs(5));

@@ -1,4 +1,4 @@
-//! What goes wrong with cameras and clocks, by a script.
+//! Scripted faults of cameras and clocks.
 //!
 //! ```toml
 //! seed = 7
@@ -28,57 +28,57 @@ use crate::error::check;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FaultKind {
-    /// The camera's clock is `ms` ahead: stamps are later than the instants.
+    /// The camera's clock is `ms` ahead: timestamps are later than the instants.
     Offset,
-    /// The camera's clock runs fast by `ppm`: stamps go ahead of the instants as time goes by.
+    /// The camera's clock runs fast by `ppm`: timestamps advance against the instants over time.
     Drift,
-    /// Stamps err by a Gaussian of standard deviation `ms`.
+    /// Timestamps have a Gaussian error of standard deviation `ms`.
     Jitter,
-    /// The camera exposes `ms` after the others, and its stamps say so.
+    /// The camera exposes `ms` after the others, with matching timestamps.
     Lag,
     /// The frame is lost; the sequence numbers show a gap.
     Drop,
-    /// The image of the frame before, under this frame's sequence number and stamp.
+    /// The previous image is repeated under this frame's sequence number and timestamp.
     Duplicate,
-    /// The source times out in place of the frame.
+    /// The source times out instead of yielding the frame.
     Stall,
-    /// The source is disconnected in place of the frame; when it returns, its sequence numbers start at 0.
+    /// The source is disconnected instead of yielding the frame; afterwards its sequence numbers restart at 0.
     Disconnect,
-    /// The stamp of a single frame is off by `ms`.
+    /// The timestamp of a single frame is off by `ms`.
     WrongTimestamp,
-    /// The lower part of the image, from a random row on, is garbage.
+    /// The lower part of the image, from a random row on, is noise.
     Corrupt,
-    /// The frame cannot be decoded: an error in its place.
+    /// The frame cannot be decoded: an error takes its place.
     Undecodable,
     /// The exposure is multiplied by `factor`.
     ExposureJump,
-    /// The camera was bumped: it stands `mm` aside and is turned by `deg`, both in a direction drawn by the seed, and
-    /// its calibration does not know.
+    /// The camera was bumped: it is displaced by `mm` and rotated by `deg`, both in directions drawn by the seed, while
+    /// its calibration stays the same.
     Bump,
 }
 
-/// One thing that goes wrong.
+/// Fault of a script.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Fault {
-    /// What.
+    /// Kind of the fault.
     pub kind: FaultKind,
-    /// Which camera; without it, all.
+    /// Name of the camera; all when `None`.
     #[serde(default)]
     pub camera: Option<String>,
-    /// First frame that it can hit.
+    /// First frame that it can affect.
     #[serde(default)]
     pub from_frame: u64,
-    /// Number of frames from there on that it can hit; without it, all.
+    /// Number of frames from there on that it can affect; all when `None`.
     #[serde(default)]
     pub frames: Option<u64>,
-    /// Share of those frames that it hits, drawn by the seed for each camera and frame.
+    /// Probability per frame, drawn by the seed for each camera and frame.
     #[serde(default = "always")]
     pub probability: f64,
-    /// Milliseconds, of offset, jitter, lag and wrong-timestamp.
+    /// Milliseconds of offset, jitter, lag and wrong-timestamp.
     #[serde(default)]
     pub ms: Option<f64>,
-    /// Parts in a million, of drift.
+    /// Parts per million of drift.
     #[serde(default)]
     pub ppm: Option<f64>,
     /// Factor of an exposure-jump.
@@ -93,7 +93,7 @@ pub struct Fault {
 }
 
 impl Fault {
-    /// A fault of a kind that hits every frame of every camera, without numbers.
+    /// Creates a fault that affects every frame of every camera, without numbers.
     #[must_use]
     pub fn new(kind: FaultKind) -> Self {
         Self {
@@ -115,61 +115,61 @@ fn always() -> f64 {
     1.0
 }
 
-/// A seeded list of faults. The same script hits the same frames in every run.
+/// Seeded list of faults. A script affects the same frames in every run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FaultScript {
-    /// Draws which frames are hit, and how.
+    /// Seed of the affected frames and random values.
     pub seed: u64,
-    /// The faults.
+    /// Faults of the script.
     #[serde(rename = "fault")]
     pub faults: Vec<Fault>,
 }
 
-/// What a source gives in a frame's turn.
+/// Result of a source for one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Delivery {
-    /// The frame.
+    /// The frame is delivered.
     Frame,
-    /// Nothing; the next frame takes the turn.
+    /// The frame is lost; the next frame follows.
     Dropped,
-    /// A timeout.
+    /// The source times out.
     Stalled,
-    /// A disconnection.
+    /// The source is disconnected.
     Disconnected,
-    /// An error about a frame that cannot be decoded.
+    /// The frame cannot be decoded.
     Undecodable,
 }
 
-/// What the script does to one frame of one camera: the truth about its time.
+/// Effect of the script on one frame of one camera: the truth about its time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FramePlan {
-    /// What the source gives.
+    /// Result of the source.
     pub delivery: Delivery,
-    /// The instant that the image shows.
+    /// True time of the image.
     pub true_nanos: i64,
-    /// The time that the frame claims.
+    /// Timestamp of the frame.
     pub stamp_nanos: i64,
-    /// On the sensor's exposure.
+    /// Factor on the sensor's exposure.
     pub exposure: f64,
-    /// Share of the image's rows above the garbage, where there is some.
+    /// Fraction of the image's rows above the noise, where there is some.
     pub sound_share: Option<f64>,
-    /// From the axes of the camera where it was set up to those of the camera where it is now.
+    /// Transform from the axes of the camera as set up to those of the camera after a bump.
     pub bump: Option<Isometry>,
 }
 
 impl FaultScript {
-    /// Reads and checks a script.
+    /// Parses and validates a script.
     ///
     /// # Errors
-    /// [`SimError::Script`] for what is no script (it names unknown keys), [`SimError::Config`] for numbers out of range.
+    /// [`SimError::Script`] for malformed text (it names unknown keys), [`SimError::Config`] for numbers out of range.
     pub fn parse(text: &str) -> Result<Self, SimError> {
         let script: Self = toml::from_str(text)?;
         script.validate()?;
         Ok(script)
     }
 
-    /// Checks that every fault's camera stands in a ring of `count` cameras.
+    /// Checks that every fault's camera exists in a ring of `count` cameras.
     pub(crate) fn check_cameras(&self, count: usize) -> Result<(), SimError> {
         let stands = |name: &String| (0..count).any(|slot| camera_name(slot) == *name);
         match self.faults.iter().filter_map(|fault| fault.camera.as_ref()).find(|name| !stands(name)) {
@@ -208,7 +208,8 @@ impl FaultScript {
         Ok(())
     }
 
-    /// What happens to frame `index` of a camera, which all cameras without faults take at `nanos_of(index)`.
+    /// Returns the script's effect on frame `index` of a camera; all cameras without faults take it at
+    /// `nanos_of(index)`.
     #[must_use]
     pub fn plan(&self, camera: &CameraId, index: u64, nanos_of: impl Fn(u64) -> i64) -> FramePlan {
         let mut shown = index;
@@ -262,7 +263,7 @@ impl FaultScript {
         }
     }
 
-    /// Garbage over the rows of an RGB image below `sound_share` of its height.
+    /// Overwrites the rows of an RGB image below `sound_share` of its height with noise.
     pub(crate) fn spoil(&self, rgb: &mut [u8], sound_share: f64, index: u64) {
         let from = (rgb.len() as f64 * sound_share) as usize;
         let key = hash(hash(self.seed, 3), index);

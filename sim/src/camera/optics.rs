@@ -1,4 +1,4 @@
-//! What a camera's shutter and the opening of its lens do to a moving, deep world.
+//! Shutter and aperture: blur of moving objects, rolling shutter and defocus.
 
 use glam::Vec2;
 use serde::{Deserialize, Serialize};
@@ -7,22 +7,22 @@ use crate::SimError;
 use crate::camera::sensor::uniform;
 use crate::error::check;
 
-/// One camera's shutter and aperture; the default is an instant and a pinhole.
+/// Shutter and aperture of a camera; the default is instantaneous and a pinhole.
 ///
 /// A frame's time is the middle of the middle row's exposure. Blur and defocus are means of `samples` images in linear
-/// light; they are as bright as a sharp one: how much light there is stands in [`crate::SensorConfig::exposure`].
+/// light, as bright as a sharp one: the amount of light is [`crate::SensorConfig::exposure`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct OpticsConfig {
-    /// How long a row gathers light, milliseconds.
+    /// Exposure time of a row, milliseconds.
     pub exposure_ms: f64,
-    /// From the first row's time to the last one's, milliseconds: the top is seen earlier. 0 for a global shutter.
+    /// Time between the first row and the last one, milliseconds: the top is exposed earlier. 0 for a global shutter.
     pub readout_ms: f64,
-    /// Diameter of the lens's opening, millimetres; 0 for a pinhole.
+    /// Diameter of the aperture, millimetres; 0 for a pinhole.
     pub aperture_mm: f64,
-    /// Distance of the plane that is sharp, metres.
+    /// Distance of the focal plane, metres.
     pub focus_m: f64,
-    /// Images that make one with blur or defocus.
+    /// Images averaged for blur or defocus.
     pub samples: u32,
 }
 
@@ -32,12 +32,12 @@ impl Default for OpticsConfig {
     }
 }
 
-/// One of the images of which an image is the mean.
+/// One of the images that are averaged.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct SubFrame {
     /// Seconds from the shot's instant.
     pub secs: f64,
-    /// Where the light goes through the lens, metres, camera axes.
+    /// Position of the ray in the aperture, metres, camera axes.
     pub lens_point: Vec2,
 }
 
@@ -50,7 +50,8 @@ impl OpticsConfig {
         check("optics.samples", self.samples.into(), 1.0, 256.0, "1 to 256")
     }
 
-    /// The images to take: evenly over the exposure, and over the lens in an order that has nothing to do with time.
+    /// Returns the images to average: evenly spaced over the exposure, and over the lens in an order independent of
+    /// time.
     pub(crate) fn sub_frames(&self) -> Vec<SubFrame> {
         if self.exposure_ms == 0.0 && self.aperture_mm == 0.0 {
             return vec![SubFrame { secs: 0.0, lens_point: Vec2::ZERO }];
@@ -68,7 +69,7 @@ impl OpticsConfig {
         (0..count).zip(order).map(frame).collect()
     }
 
-    /// Half the time from the first light of the first row to the last of the last, seconds.
+    /// Returns half the time from the first light of the first row to the last of the last, seconds.
     pub(crate) fn reach_secs(&self) -> f64 {
         0.5e-3 * (self.exposure_ms + self.readout_ms)
     }

@@ -1,4 +1,4 @@
-//! Cameras on a ring.
+//! Ring of cameras.
 
 use std::f64::consts::TAU;
 
@@ -8,12 +8,12 @@ use glam::{DQuat, DVec2, DVec3, EulerRot};
 use crate::camera::sensor::{hash, uniform};
 use crate::{SimConfig, SimError};
 
-/// Name of a camera of the ring.
+/// Returns the name of a camera of the ring.
 pub(crate) fn camera_name(slot: usize) -> String {
     format!("{slot:02}")
 }
 
-/// The ring of a configuration: `00`, `01`, ... counter-clockwise seen from above, `00` at -y, z up.
+/// Returns the configured ring: `00`, `01`, ... counter-clockwise seen from above, `00` at -y, z up.
 ///
 /// # Errors
 /// [`SimError::Config`] for settings out of range and for a lens that folds the image.
@@ -60,7 +60,7 @@ pub fn camera_ring(config: &SimConfig) -> Result<Rig, SimError> {
     Ok(rig)
 }
 
-/// Refuses a lens that has no direction for a corner of the image.
+/// Rejects a lens that has no direction for a corner of the image.
 fn unfolded(config: &SimConfig, intrinsics: &Intrinsics) -> Result<(), SimError> {
     let ring = &config.cameras;
     let (width, height) = (f64::from(config.width), f64::from(config.height));

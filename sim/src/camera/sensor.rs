@@ -1,4 +1,4 @@
-//! What a camera's sensor and its encoder do to light.
+//! Sensor and encoder of a camera.
 
 use std::sync::OnceLock;
 
@@ -11,15 +11,15 @@ use crate::SimError;
 use crate::error::check;
 use crate::texture::linear_from_srgb;
 
-/// One camera's sensor; the default changes nothing.
+/// Sensor of a camera; the default changes nothing.
 ///
-/// Light (linear, 1 is the brightest sRGB value) is multiplied by `exposure` and falls off towards the corners, is
-/// counted as electrons with their noise, amplified by `gain` and `white_balance`, clipped, and coded as sRGB to the
-/// power of `gamma`.
+/// Light (linear, 1 is the brightest sRGB value) is multiplied by `exposure`, falls off towards the corners, is
+/// converted to electrons with their noise, amplified by `gain` and `white_balance`, clipped, and encoded as sRGB to
+/// the power of `gamma`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SensorConfig {
-    /// Light gathered, 1 for the drawn image's.
+    /// Exposure relative to the rendered image.
     pub exposure: f64,
     /// Amplification after the noise.
     pub gain: f64,
@@ -27,14 +27,15 @@ pub struct SensorConfig {
     pub gamma: f64,
     /// Factors of red, green and blue.
     pub white_balance: [f64; 3],
-    /// Share of the light that is lost in the corners, growing with the fourth power of the distance from the middle.
+    /// Fraction of the light that is lost in the corners, growing with the fourth power of the distance from the
+    /// centre.
     pub vignetting: f64,
-    /// Electrons at light 1: the shot noise's variance, in electrons, is their number (drawn as a Gaussian). Without it
-    /// there is no noise.
+    /// Electrons at light 1: the variance of the shot noise, in electrons, is their number (drawn as a Gaussian).
+    /// `None` disables noise.
     pub full_well_electrons: Option<f64>,
-    /// Standard deviation of the noise of reading, electrons.
+    /// Standard deviation of the read noise, electrons.
     pub read_noise_electrons: f64,
-    /// Quality of the JPEG code that the image goes through, 1 to 100; without it there is none.
+    /// Quality of a JPEG round trip, 1 to 100; none when `None`.
     pub jpeg_quality: Option<u8>,
 }
 
@@ -72,7 +73,7 @@ impl SensorConfig {
         check("sensors.jpeg_quality", self.jpeg_quality.unwrap_or(50).into(), 1.0, 100.0, "1 to 100")
     }
 
-    /// What the sensor makes of light (halves: linear RGB and something else) as RGB bytes; `key` makes the noise.
+    /// Converts light (halves: linear RGB and a fourth channel) to RGB bytes; `key` seeds the noise.
     pub(crate) fn develop(&self, light: &[[u16; 4]], width: u32, height: u32, key: u64) -> Result<Vec<u8>, SimError> {
         let row = width as usize;
         let mut bytes = vec![0u8; row * height as usize * 3];
@@ -104,7 +105,7 @@ impl SensorConfig {
         }
     }
 
-    /// Light as read from the sensor: with noise, and no more than the full well.
+    /// Returns the light as read from the sensor: with noise, clipped at the full well.
     fn read(&self, light: f32, key: u64, pixel: u64) -> f32 {
         let Some(full) = self.full_well_electrons else { return light };
         let full = full as f32;
@@ -114,11 +115,11 @@ impl SensorConfig {
     }
 }
 
-/// The nearest byte to sRGB code to the power of a gamma.
+/// Encoder to the nearest byte of the sRGB code to the power of a gamma.
 struct Coder {
-    /// Light from which on the next byte is nearer.
+    /// Light above which the next byte is nearer.
     thresholds: Vec<f32>,
-    /// A byte not above the one of a light in steps of 1 / 1024.
+    /// Lower bound of the byte for light in steps of 1 / 1024.
     starts: Vec<u8>,
 }
 
@@ -141,7 +142,7 @@ impl Coder {
     }
 }
 
-/// A half-precision number (IEEE 754 binary16).
+/// Converts a half-precision number (IEEE 754 binary16).
 pub(crate) fn linear_of_half(half: u16) -> f32 {
     static TABLE: OnceLock<Vec<f32>> = OnceLock::new();
     TABLE.get_or_init(|| {
@@ -159,7 +160,7 @@ pub(crate) fn linear_of_half(half: u16) -> f32 {
     })[usize::from(half)]
 }
 
-/// sRGB bytes of all halves.
+/// Returns the sRGB bytes of all halves.
 fn codes_of_halves() -> &'static [u8] {
     static TABLE: OnceLock<Vec<u8>> = OnceLock::new();
     TABLE.get_or_init(|| {
@@ -168,7 +169,7 @@ fn codes_of_halves() -> &'static [u8] {
     })
 }
 
-/// Coded and decoded again.
+/// Encodes and decodes an image as JPEG.
 fn through_jpeg(rgb: &[u8], width: u32, height: u32, quality: u8) -> Result<Vec<u8>, SimError> {
     let mut code = Vec::new();
     let encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut code, quality);
@@ -177,7 +178,7 @@ fn through_jpeg(rgb: &[u8], width: u32, height: u32, quality: u8) -> Result<Vec<
     Ok(decoded.into_rgb8().into_raw())
 }
 
-/// A hash of two numbers with full avalanche: splitmix64's finisher.
+/// Hashes two numbers with full avalanche (SplitMix64's finaliser).
 pub(crate) fn hash(key: u64, index: u64) -> u64 {
     let mut h = key ^ index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
     h = (h ^ (h >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -185,12 +186,12 @@ pub(crate) fn hash(key: u64, index: u64) -> u64 {
     h ^ (h >> 31)
 }
 
-/// Evenly in 0..1, never 0.
+/// Returns a uniform number in 0..1, never 0.
 pub(crate) fn uniform(key: u64, index: u64) -> f64 {
     ((hash(key, index) >> 11) as f64 + 0.5) / (1u64 << 53) as f64
 }
 
-/// Mean 0, variance 1 (Box and Muller's transform).
+/// Returns a standard normal number (Box and Muller's transform).
 pub(crate) fn gaussian(key: u64, index: u64) -> f32 {
     let h = hash(key, index);
     let (a, b) = ((h >> 32) as f32 + 0.5, (h & 0xffff_ffff) as f32);

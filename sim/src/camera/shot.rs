@@ -1,25 +1,25 @@
-//! What a camera is asked for.
+//! Request for an image of a camera.
 
 use flyrig_types::Isometry;
 
 use crate::SimError;
 use crate::error::check;
 
-/// One image to take.
+/// Request for one image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shot {
     /// Middle of the middle row's exposure, nanoseconds.
     pub nanos: i64,
-    /// Place of the camera in the rig.
+    /// Slot of the camera in the rig.
     pub slot: usize,
     /// Factor on the sensor's exposure.
     pub exposure: f64,
-    /// `moved_from_camera`: how the camera stands off its place in the rig (somebody bumped into it), in its own axes.
+    /// `moved_from_camera`: displacement of a bumped camera from its place in the rig, in its own axes.
     pub camera_shift: Option<Isometry>,
 }
 
 impl Shot {
-    /// A shot of an undisturbed camera.
+    /// Creates a shot of an undisturbed camera.
     #[must_use]
     pub fn new(nanos: i64, slot: usize) -> Self {
         Self { nanos, slot, exposure: 1.0, camera_shift: None }

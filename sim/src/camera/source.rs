@@ -1,4 +1,4 @@
-//! Simulated cameras behind the capture trait.
+//! Frame sources of simulated cameras.
 
 use std::{
     sync::{Arc, Mutex, PoisonError},
@@ -11,31 +11,31 @@ use flyrig_types::{CameraId, Frame, Image};
 use crate::camera::clock::RealClock;
 use crate::{Delivery, FramePlan, Shot, SimError, SimTime, Simulator};
 
-/// One camera of a [`Simulator`]. All sources of a simulator see the same instants but for what the configured faults
-/// do. Dropping it takes the camera out of the rig.
+/// Frame source of one camera of a [`Simulator`]. All sources of a simulator see the same instants except for the
+/// configured faults. Dropping it removes the camera from the rig.
 #[derive(Debug)]
 pub struct SimSource {
     simulator: Arc<Mutex<Simulator>>,
-    /// In [`SimTime::Real`].
+    /// Clock in [`SimTime::Real`].
     clock: Option<Arc<RealClock>>,
     camera: CameraId,
     slot: usize,
     next_index: u64,
-    /// Frame that has the sequence number 0.
+    /// Index of the frame with sequence number 0.
     first_index: u64,
-    /// The instant that the frame given last was due at.
+    /// Due time of the last frame.
     order_nanos: Option<i64>,
     disconnected: bool,
     frames: Option<u64>,
-    /// Frames a second.
+    /// Frames per second.
     fps: f64,
 }
 
-/// Frames lost in a row after which a call returns: nobody waits for ever.
+/// Consecutive lost frames after which a call returns, so that it never blocks for ever.
 const MOST_DROPPED: u32 = 64;
 
-/// A source for every camera of the rig, in rig order. In [`SimTime::Real`] each needs a thread of its own, since all
-/// wait for each other.
+/// Creates a source for every camera of the rig, in rig order. In [`SimTime::Real`] each needs a thread of its own,
+/// since all wait for each other.
 #[must_use]
 pub fn sources(simulator: &Arc<Mutex<Simulator>>, time: SimTime) -> Vec<SimSource> {
     let guard = simulator.lock().unwrap_or_else(PoisonError::into_inner);
@@ -63,7 +63,7 @@ pub fn sources(simulator: &Arc<Mutex<Simulator>>, time: SimTime) -> Vec<SimSourc
 }
 
 impl SimSource {
-    /// Place of the camera in the rig.
+    /// Returns the slot of the camera in the rig.
     #[must_use]
     pub fn slot(&self) -> usize {
         self.slot
@@ -92,7 +92,7 @@ impl CameraSource for SimSource {
         result
     }
 
-    /// The instant that the frame was due at: stamps may be wrong, the order in which frames arrive is not.
+    /// Returns the due time of the frame: timestamps may be wrong, but not the order in which frames arrive.
     fn order_nanos(&self, frame: &Frame) -> i64 {
         self.order_nanos.unwrap_or(frame.capture_nanos)
     }
@@ -171,12 +171,12 @@ impl SimSource {
     }
 }
 
-/// What a fault script makes of a camera's shot.
+/// Returns the shot that a fault script makes of a frame.
 pub(crate) fn shot(plan: &FramePlan, slot: usize) -> Shot {
     Shot { exposure: plan.exposure, camera_shift: plan.bump, ..Shot::new(plan.true_nanos, slot) }
 }
 
-/// Garbage over an image, where the fault script says so.
+/// Returns an image with noise over its lower part, where the fault script says so.
 pub(crate) fn spoilt(simulator: &Simulator, plan: &FramePlan, index: u64, image: Image) -> Result<Image, SimError> {
     let Some(share) = plan.sound_share else { return Ok(image) };
     let mut rgb = image.bytes().to_vec();

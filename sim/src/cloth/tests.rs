@@ -12,7 +12,7 @@ use crate::person::actor::{Actor, Shape};
 use crate::person::look::Look;
 use crate::{MotionKind, SimConfig, describe_person};
 
-/// Somebody in a coat, and somebody in a skirt.
+/// Seeds of a person in a coat, and of one in a skirt.
 const COAT: u64 = 16;
 const SKIRT: u64 = 5;
 
@@ -26,7 +26,7 @@ fn largest(shape: &Shape) -> f32 {
     shape.displacement.iter().map(|d| d.length()).fold(0.0, f32::max)
 }
 
-/// Largest displacement over eight seconds.
+/// Returns the largest displacement over eight seconds.
 fn swing(actor: &mut Actor) -> f32 {
     (0..40).map(|i| largest(&actor.shape(1_000_000_000 + i * 200_000_000))).fold(0.0, f32::max)
 }
@@ -65,7 +65,7 @@ fn a_skirt_swings_as_its_wearer_walks_and_dances_and_stays_out_of_the_body() {
     }
 }
 
-/// Share of the skirt's points that are more than 4 mm below the skin of the nearest part of the legs.
+/// Returns the fraction of the skirt's points that are more than 4 mm below the skin of the nearest part of the legs.
 fn share_inside(actor: &mut Actor, nanos: i64) -> f64 {
     let shape = actor.shape(nanos);
     let body = &actor.person.body;
@@ -151,7 +151,7 @@ fn tight_clothes_cost_nothing() {
     assert!(Cloth::new(&actor(SKIRT, MotionKind::Still, 1.0).person).unwrap().particle_count() > 100);
 }
 
-/// A chain hanging from its first particle, with something to bump into.
+/// Returns a chain hanging from its first particle, with an obstacle.
 fn chain(count: usize) -> (Particles, Vec<Carried>) {
     let free = |i: usize| i as f32 * 0.05;
     let points = (0..count)
@@ -170,7 +170,7 @@ fn chain(count: usize) -> (Particles, Vec<Carried>) {
     (Particles { points, links }, carried)
 }
 
-/// The same step, written again in f64 from its description.
+/// Performs the step in f64, written independently from its description.
 fn plain_step(particles: &Particles, carried: &[Carried], capsule: &colliders::Capsule, state: &State) -> Vec<DVec3> {
     let (dt, gravity) = (1.0 / 120.0, 9.81);
     let d = |v: Vec3| v.as_dvec3();

@@ -1,4 +1,4 @@
-//! Collars, lapels and hoods: cloth that grows out of a neckline.
+//! Collars, lapels and hoods: cloth extruded from a neckline.
 
 use glam::Vec3;
 
@@ -6,12 +6,12 @@ use crate::clothes::sheet::{Node, Sheet};
 use crate::clothes::wardrobe::Outer;
 use crate::noise::smoothstep;
 
-/// Whether a point of a garment's edge is at its neckline.
+/// Returns whether a point of a garment's edge is at its neckline.
 fn at_neck(node: &Node) -> bool {
     node.average.y > 1.26 && node.average.x.abs() < 0.125
 }
 
-/// Middle of the neckline, metres.
+/// Returns the centre of the neckline, metres.
 fn neck_centre(cloth: &Sheet) -> Vec3 {
     let edge: Vec<Vec3> = cloth
         .boundary()
@@ -23,12 +23,12 @@ fn neck_centre(cloth: &Sheet) -> Vec3 {
     edge.iter().sum::<Vec3>() / edge.len().max(1) as f32
 }
 
-/// Horizontal unit vector away from the neck.
+/// Returns the horizontal unit vector away from the neck.
 fn outwards(node: &Node, centre: Vec3) -> Vec3 {
     ((node.position - centre) * Vec3::new(1.0, 0.0, 1.0)).normalize_or(Vec3::Z)
 }
 
-/// A turned-down collar with points in front.
+/// Adds a turned-down collar with points in front.
 pub(crate) fn shirt_collar(cloth: &mut Sheet) {
     let centre = neck_centre(cloth);
     let stands = |node: &Node| at_neck(node) && (node.average.z < 0.0 || node.average.x.abs() > 0.010);
@@ -44,7 +44,7 @@ pub(crate) fn shirt_collar(cloth: &mut Sheet) {
     });
 }
 
-/// The collar and the turned-back edges of a jacket.
+/// Adds the collar and the turned-back edges of a jacket.
 pub(crate) fn lapels(cloth: &mut Sheet, outer: &Outer) {
     let centre = neck_centre(cloth);
     let wide = outer.collar_m;
@@ -63,7 +63,7 @@ pub(crate) fn lapels(cloth: &mut Sheet, outer: &Outer) {
     );
 }
 
-/// A hood that lies on the back.
+/// Adds a hood that lies on the back.
 pub(crate) fn hood(cloth: &mut Sheet) {
     let centre = neck_centre(cloth);
     cloth.extrude(12, at_neck, |node, t| {

@@ -1,4 +1,4 @@
-//! Where garments end: signed distances on the average body, metres, positive inside the cloth.
+//! Cuts of garments: signed distances on the average body, metres, positive inside the cloth.
 
 use flyrig_body::Part;
 
@@ -8,7 +8,7 @@ use crate::noise::{lerp, smoothstep};
 use crate::person::look::Look;
 use crate::person::regions::{along_arm, below_neckline};
 
-/// Far outside of any cloth.
+/// Value far outside any cloth.
 const OUTSIDE_M: f32 = -0.05;
 /// Upper edge of trousers and skirts, metres above the sole: over a tucked-in top, or under a loose one.
 const HIGH_WAIST_M: f32 = 0.985;
@@ -17,7 +17,7 @@ const WAIST_M: f32 = 0.925;
 pub(crate) const BOOT_M: f32 = 0.20;
 /// Where the hanging part of skirts and coats begins.
 pub(crate) const COAT_SEAM_M: f32 = 0.90;
-/// How far hems swing up and show what is below.
+/// Height above a hem that becomes visible when it swings.
 const SWING_M: f32 = 0.24;
 /// Radius of a jacket's neck opening.
 const OUTER_NECK_M: f32 = 0.094;
@@ -34,7 +34,7 @@ pub(crate) fn waist_m(look: &Look) -> f32 {
     if look.top.tucked { HIGH_WAIST_M } else { WAIST_M }
 }
 
-/// Ends the cloth above `hem_m` on the trunk, and `sleeve_m` along the arm.
+/// Cuts the cloth at `hem_m` on the trunk and at `sleeve_m` along the arm.
 fn within_hem_and_sleeve(node: &Node, inside: f32, hem_m: f32, sleeve_m: f32) -> f32 {
     let p = node.average;
     let inside = inside.min(p.y - hem_m);
@@ -75,12 +75,12 @@ pub(crate) fn inside_outer(outer: &Outer, node: &Node) -> f32 {
     within_hem_and_sleeve(node, inside, hem_m, 0.468)
 }
 
-/// Half the width of the opening of a jacket at a height.
+/// Returns half the width of a jacket's opening at a height.
 pub(crate) fn opening_m(outer: &Outer, y: f32) -> f32 {
     if outer.open_m > 0.0 { outer.open_m * lerp(1.0, 0.62, smoothstep(0.9, 1.3, y)) } else { OUTSIDE_M }
 }
 
-/// Of trousers and overalls: skirts hang free of the legs.
+/// Returns the cut of trousers and overalls; skirts are built separately.
 pub(crate) fn inside_bottom(look: &Look, node: &Node) -> f32 {
     if is_arm(node.part) || is_hand(node.part) {
         return OUTSIDE_M;
@@ -105,7 +105,7 @@ pub(crate) fn inside_boot(look: &Look, node: &Node) -> f32 {
     }
 }
 
-/// Below a skirt, or behind the tails of a coat.
+/// Returns the region below a skirt, or behind the tails of a coat.
 pub(crate) fn under_hanging(look: &Look, node: &Node) -> f32 {
     let p = node.average;
     if is_arm(node.part) || is_hand(node.part) {
@@ -117,7 +117,7 @@ pub(crate) fn under_hanging(look: &Look, node: &Node) -> f32 {
     OUTSIDE_M
 }
 
-/// Inside the sides and the back of a coat's tails, which no camera sees into.
+/// Returns the region inside the sides and the back of a coat's tails, which no camera sees.
 pub(crate) fn under_tails(look: &Look, node: &Node) -> f32 {
     match look.outer {
         Some(outer) if outer.hem_m < 0.7 && !is_arm(node.part) && !is_hand(node.part) => {

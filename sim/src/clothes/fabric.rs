@@ -7,26 +7,26 @@ use crate::clothes::wardrobe::{Cloth, Fabric, Print, Srgb};
 use crate::noise::{Noise, smoothstep};
 use crate::texture::{mix3, scale3};
 
-/// Where a point lies on a piece of cloth.
+/// Position of a point on a piece of cloth.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ClothPoint {
     /// Across and down, metres.
     pub at: Vec2,
-    /// In space, metres: what noise goes by.
+    /// Position in space, metres, for noise.
     pub space: Vec3,
-    /// 0 at the upper end, 1 at the lower.
+    /// Height along the garment, 0 at the upper end, 1 at the lower.
     pub fall: f32,
-    /// On the chest: offset from the middle of a motif, x to the reader's right, y up, metres.
+    /// On the chest: offset from the centre of a motif, x to the reader's right, y up, metres.
     pub chest: Option<Vec2>,
 }
 
-/// 1 in the first `share` of each period.
+/// Returns 1 in the first `share` of each period.
 fn band(at: f32, period: f32, share: f32) -> f32 {
     let phase = (at / period).rem_euclid(1.0);
     smoothstep(0.0, 0.04, phase) * smoothstep(share + 0.04, share, phase)
 }
 
-/// Colour of a cloth, without seams.
+/// Returns the colour of a cloth, without seams.
 pub(crate) fn cloth_colour(cloth: &Cloth, noise: Noise, point: ClothPoint) -> Srgb {
     let Vec2 { x: across, y: down } = point.at;
     let [ground, print, accent] = cloth.colours;
@@ -89,7 +89,7 @@ pub(crate) fn cloth_colour(cloth: &Cloth, noise: Noise, point: ClothPoint) -> Sr
     }
 }
 
-/// Gloss of a cloth, 0..=1.
+/// Returns the gloss of a cloth, in 0..=1.
 pub(crate) fn gloss(fabric: Fabric) -> f32 {
     match fabric {
         Fabric::Leather => 0.55,
@@ -98,7 +98,7 @@ pub(crate) fn gloss(fabric: Fabric) -> f32 {
     }
 }
 
-/// Patches of four shades of the ground's hue.
+/// Returns the colour of patches in four shades of the ground's hue.
 fn camouflage(ground: Srgb, noise: Noise, p: Vec3) -> Srgb {
     let field = |stretch: Vec3, frequency: f32| noise.sum(p * stretch * frequency, 3);
     let green = mix3(ground, [0.36, 0.38, 0.24], 0.65);
@@ -115,7 +115,7 @@ fn camouflage(ground: Srgb, noise: Noise, p: Vec3) -> Srgb {
     colour
 }
 
-/// Coverage of one of six marks at an offset from its centre, metres.
+/// Returns the coverage of one of six marks at an offset from its centre, metres.
 fn mark(which: u8, at: Vec2) -> f32 {
     let r = at.length();
     let angle = at.y.atan2(at.x);

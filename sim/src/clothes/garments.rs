@@ -1,4 +1,4 @@
-//! Clothes that lie on the body: offset surfaces cut out of it.
+//! Close-fitting clothes: offset surfaces cut from the body.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -12,14 +12,14 @@ use crate::noise::{Noise, lerp, smoothstep};
 use crate::person::look::Look;
 use crate::person::regions::{ANKLE_TOP_M, along_arm, below_neckline, is_ear};
 
-/// Cloth this deep inside another is not drawn.
+/// Depth inside another layer below which cloth is omitted.
 const HIDDEN_M: f32 = 0.028;
 
-/// The body twice as fine, and two smoothed copies of it as the base of loose cloth.
+/// The subdivided body, and two smoothed copies of it as the base of loose cloth.
 pub(crate) struct Tailor {
     pub(crate) body: Sheet,
     normals: Vec<Vec3>,
-    /// The body without its smallest forms, which no cloth follows.
+    /// Body without its smallest forms, which no cloth follows.
     firm: Vec<Vec3>,
     loose: Vec<Vec3>,
     pub(crate) loose_normals: Vec<Vec3>,
@@ -36,7 +36,7 @@ impl Tailor {
         Self { body, normals, firm, loose, loose_normals, noise: Noise::new(seed, 10) }
     }
 
-    /// The body twice as fine with each node moved.
+    /// Returns the subdivided body with each node moved.
     pub(crate) fn draped(&self, cloth: impl Fn(usize, &Node) -> Vec3 + Sync) -> Sheet {
         let nodes = self
             .body
@@ -48,7 +48,7 @@ impl Tailor {
         Sheet { nodes, triangles: self.body.triangles.clone() }
     }
 
-    /// Loose cloth that bridges hollows and stays `offset` outside of the body.
+    /// Returns a point of loose cloth that bridges hollows and stays `offset` outside the body.
     fn over(&self, i: usize, offset: f32) -> Vec3 {
         let normal = self.loose_normals[i];
         // Smoothing shrinks limbs: push back out to where the body is.
@@ -61,7 +61,7 @@ impl Tailor {
         sheet.cut(&inside).compacted()
     }
 
-    /// Distance of a top's cloth from the body, metres.
+    /// Returns the distance of a top's cloth from the body, metres.
     fn top_offset(&self, top: &Top, female: bool, node: &Node) -> f32 {
         let p = node.average;
         let mut offset = top.offset_m;
@@ -104,7 +104,7 @@ impl Tailor {
         if top.kind == TopKind::Turtleneck { offset.max(0.006) } else { lerp(0.008, offset.max(0.006), rim) }
     }
 
-    /// T-shirt, shirt, jumper or the upper part of a dress.
+    /// Builds a T-shirt, shirt, jumper or the upper part of a dress.
     pub(crate) fn top(&self, look: &Look) -> Sheet {
         let top = &look.top;
         let sheet = self.draped(|i, node| self.over(i, self.top_offset(top, look.female, node)));
@@ -125,7 +125,7 @@ impl Tailor {
         seen.compacted()
     }
 
-    /// Jacket, or a coat down to the hip.
+    /// Builds a jacket, or a coat down to the hip.
     pub(crate) fn outer(&self, look: &Look, outer: &Outer) -> Sheet {
         let sheet = self.draped(|i, node| {
             let p = node.average;
@@ -159,7 +159,7 @@ impl Tailor {
         cloth
     }
 
-    /// Trousers, shorts or overalls.
+    /// Builds trousers, shorts or overalls.
     pub(crate) fn bottom(&self, look: &Look) -> Option<Sheet> {
         let (hem_m, wide_m) = match look.bottom {
             Bottom::Trousers { hem_m, wide_m, .. } => (hem_m, wide_m),
@@ -208,7 +208,7 @@ impl Tailor {
         Some(seen.compacted())
     }
 
-    /// Shafts of boots.
+    /// Builds the shafts of boots.
     pub(crate) fn boot_shafts(&self, look: &Look) -> Option<Sheet> {
         (look.shoes.kind == ShoeKind::Boots).then(|| {
             let sheet = self.draped(|i, node| {
@@ -222,7 +222,7 @@ impl Tailor {
     }
 }
 
-/// What remains to be drawn of the naked body.
+/// Returns the part of the naked body that remains visible.
 pub(crate) fn visible_skin(body: &Sheet, look: &Look) -> Sheet {
     const MARGIN_M: f32 = 0.025;
     let covered = |node: &Node| {

@@ -1,10 +1,10 @@
 //! Letters of five by seven dots, for words on clothes.
 
-/// Words that are printed on chests.
+/// Words printed on chests.
 const WORDS: [&str; 12] =
     ["WAVE", "NORTH", "RIVER", "SOUL", "MOTO", "CLUB 7", "SURF", "LUNA", "ZEBRA", "HELLO", "JAZZ", "PEAK"];
 
-/// Rows from above, the leftmost dot in bit 4.
+/// Returns the rows from above, the leftmost dot in bit 4.
 fn rows(letter: char) -> [u8; 7] {
     match letter {
         'A' => [14, 17, 17, 31, 17, 17, 17],
@@ -33,8 +33,8 @@ fn rows(letter: char) -> [u8; 7] {
     }
 }
 
-/// Coverage (0 or 1) of the word `which` at `x` metres to the reader's right and `y` metres up from its centre;
-/// the word is `width_m` wide.
+/// Returns the coverage (0 or 1) of the word `which` at `x` metres to the reader's right and `y` metres up from its
+/// centre; the word is `width_m` wide.
 pub(crate) fn word_at(which: u8, width_m: f32, x: f32, y: f32) -> f32 {
     let word = WORDS[usize::from(which) % WORDS.len()];
     let columns = word.chars().count() * 6 - 1;

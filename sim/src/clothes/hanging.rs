@@ -9,14 +9,14 @@ use crate::clothes::garments::Tailor;
 use crate::clothes::sheet::{Node, Sheet, mix_skin};
 use crate::noise::smoothstep;
 
-/// A tube of cloth; heights in metres on the average body.
+/// Tube of cloth; heights in metres on the average body.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Hanging {
     pub top_m: f32,
     pub hem_m: f32,
     /// Distance from the body at the top and the bottom, metres.
     pub offset_m: [f32; 2],
-    /// Metres outwards a metre down.
+    /// Metres outwards per metre down.
     pub flare: f32,
     pub pleats: f32,
     pub fold_m: f32,
@@ -24,13 +24,13 @@ pub(crate) struct Hanging {
     pub open_rad: f32,
 }
 
-/// How much of it hangs from the hips (the root joint) and not from the legs.
+/// Weight of the hips (the root joint) against the legs.
 const BY_HIPS: f32 = 0.2;
-/// Below this the cloth no longer follows the legs, metres on the average body.
+/// Height below which the cloth no longer follows the legs, metres on the average body.
 const FOLLOWS_M: f32 = 0.64;
 
 impl Tailor {
-    /// The tube, textured by u around and v down.
+    /// Builds the tube, textured by u around and v down.
     pub(crate) fn hang(&self, cloth: &Hanging) -> Sheet {
         const COLUMNS: u32 = 112;
         let rows = ((cloth.top_m - cloth.hem_m) / 0.016).ceil().max(4.0) as u32;
@@ -98,7 +98,7 @@ impl Tailor {
         sheet
     }
 
-    /// Nodes of trunk and legs at a height of the average body.
+    /// Returns the nodes of trunk and legs at a height of the average body.
     fn trunk_at(&self, level: f32) -> Vec<&Node> {
         let nodes = self.body.nodes.iter();
         nodes
@@ -108,7 +108,7 @@ impl Tailor {
     }
 }
 
-/// The closest body point, moved by the hips and both legs: in the middle by each of them half.
+/// Returns the closest body point, carried by the hips and both legs: in the middle half by each leg.
 fn carried(band: &[&Node], carriers: &[&Node], position: Vec3) -> Option<Node> {
     let nearest = |nodes: &[&Node], left: bool| {
         let side = nodes.iter().filter(|node| (node.position.x >= 0.0) == left);
@@ -123,7 +123,7 @@ fn carried(band: &[&Node], carriers: &[&Node], position: Vec3) -> Option<Node> {
     Some(Node { skin, ..body })
 }
 
-/// Counter-clockwise corners of the hull (monotone chain).
+/// Returns the counter-clockwise corners of the hull (monotone chain).
 fn convex_hull(mut points: Vec<Vec2>) -> Vec<Vec2> {
     points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
     points.dedup();
@@ -148,7 +148,7 @@ fn convex_hull(mut points: Vec<Vec2>) -> Vec<Vec2> {
     hull
 }
 
-/// How far a ray from inside runs to the hull's edge; 0 where it misses.
+/// Returns the distance along a ray from inside to the hull's edge; 0 where it misses.
 fn distance_to_hull(hull: &[Vec2], from: Vec2, direction: Vec2) -> f32 {
     let mut farthest = 0.0f32;
     for (i, &a) in hull.iter().enumerate() {

@@ -1,11 +1,11 @@
-//! From the average body to a person's.
+//! Transfer from the average body to a person's.
 
 use flyrig_body::Part;
 use glam::Vec3;
 
 use crate::clothes::sheet::{Node, Sheet};
 
-/// Puts things made for the average head onto a person's.
+/// Transfer of objects made for the average head to a person's.
 pub(crate) struct HeadLift<'a> {
     head: Vec<&'a Node>,
 }
@@ -15,12 +15,12 @@ impl<'a> HeadLift<'a> {
         Self { head: body.nodes.iter().filter(|node| node.part == Part::Head && node.average.y > 1.46).collect() }
     }
 
-    /// Height of the average head's crown, metres.
+    /// Returns the height of the average head's crown, metres.
     pub(crate) fn top_m(&self) -> f32 {
         self.head.iter().map(|node| node.average.y).fold(0.0, f32::max)
     }
 
-    /// A point near the average head, moved like the head's points around it and carried by the closest one.
+    /// Moves a point near the average head like the head's points around it; carried by the closest one.
     pub(crate) fn node(&self, average: Vec3) -> Option<Node> {
         const REACH_M: f32 = 0.035;
         let (closest, nearest) = self

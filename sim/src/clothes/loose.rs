@@ -1,4 +1,4 @@
-//! How freely cloth hangs: the length, metres, of the pendulum that a point of a garment is; 0 where it is held.
+//! Free length of cloth, metres: that of the pendulum that a point of a garment forms; 0 where it is fixed.
 
 use crate::clothes::cuts::{is_arm, opening_m};
 use crate::clothes::sheet::{Node, Sheet};
@@ -7,14 +7,14 @@ use crate::noise::{lerp, smoothstep};
 use crate::person::look::Look;
 use crate::person::regions::along_arm;
 
-/// Sets the lengths of a sheet's points.
+/// Sets the free lengths of a sheet's points.
 pub(crate) fn hang_free(sheet: &mut Sheet, free_m: impl Fn(&Node) -> f32) {
     for node in &mut sheet.nodes {
         node.free_m = free_m(node);
     }
 }
 
-/// Stiffness of a cloth against that of a plain weave: what it pulls back with.
+/// Returns the stiffness of a cloth relative to that of a plain weave.
 pub(crate) fn stiffness(fabric: Fabric) -> f32 {
     match fabric {
         Fabric::Jersey => 0.9,
@@ -25,7 +25,7 @@ pub(crate) fn stiffness(fabric: Fabric) -> f32 {
     }
 }
 
-/// Hems and wide short sleeves of what is worn on top and not tucked in.
+/// Returns the free length of hems and wide short sleeves of the outermost top that is not tucked in.
 pub(crate) fn free_top(look: &Look, node: &Node) -> f32 {
     let (top, p) = (&look.top, node.average);
     // A close fit does not swing.
@@ -43,7 +43,7 @@ pub(crate) fn free_top(look: &Look, node: &Node) -> f32 {
     long * loose * smoothstep(1.10, top.hem_m, p.y)
 }
 
-/// The fronts of an open jacket, and its hem; the upper part of a coat is held by its tails.
+/// Returns the free length of an open jacket's fronts and its hem; the upper part of a coat is held by its tails.
 pub(crate) fn free_outer(outer: &Outer, node: &Node) -> f32 {
     let p = node.average;
     if outer.hem_m < 0.7 || is_arm(node.part) {
@@ -55,7 +55,7 @@ pub(crate) fn free_outer(outer: &Outer, node: &Node) -> f32 {
     0.025 * smoothstep(1.0, outer.hem_m, p.y) + 0.13 * front * down
 }
 
-/// Wide trouser legs and shorts.
+/// Returns the free length of wide trouser legs and shorts.
 pub(crate) fn free_bottom(look: &Look, node: &Node) -> f32 {
     if look.outer.is_some_and(|outer| outer.hem_m < 0.7) {
         // Under a coat.

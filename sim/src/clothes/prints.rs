@@ -9,17 +9,17 @@ use crate::person::look::Look;
 use crate::person::regions::{along_arm, around_arm, on_sleeve};
 use crate::texture::{mix3, scale3};
 
-/// A seam's line, 1 on it.
+/// Returns a seam's line, 1 on it.
 fn line(distance: f32, half_m: f32) -> f32 {
     smoothstep(half_m + 0.0006, half_m, distance.abs())
 }
 
-/// Seams are darker than the cloth, on denim orange.
+/// Returns the colour of seams: darker than the cloth, orange on denim.
 fn stitch(cloth: &Cloth) -> Srgb {
     if cloth.fabric == Fabric::Denim { [0.72, 0.55, 0.30] } else { scale3(cloth.colours[0], 0.55) }
 }
 
-/// The cloth of the upper body at a point of the average body.
+/// Returns the cloth of the upper body at a point of the average body.
 fn upper_cloth(cloth: &Cloth, noise: Noise, p: Vec3, hem_m: f32) -> Srgb {
     let arm = on_sleeve(p);
     // Across, down. Sleeves have their own piece of cloth.
@@ -34,7 +34,7 @@ fn upper_cloth(cloth: &Cloth, noise: Noise, p: Vec3, hem_m: f32) -> Srgb {
     cloth_colour(cloth, noise, ClothPoint { at, space: p, fall, chest })
 }
 
-/// Colour of the top at a point of the average body, `inside` metres from the cloth's edge.
+/// Returns the colour of the top at a point of the average body, `inside` metres from the cloth's edge.
 pub(crate) fn top_colour(top: &Top, noise: Noise, p: Vec3, inside: f32) -> Srgb {
     let mut colour = upper_cloth(&top.cloth, noise, p, top.hem_m);
     let ground = top.cloth.colours[0];
@@ -66,7 +66,7 @@ pub(crate) fn top_colour(top: &Top, noise: Noise, p: Vec3, inside: f32) -> Srgb 
     colour
 }
 
-/// Colour of a jacket or a coat's upper part.
+/// Returns the colour of a jacket or a coat's upper part.
 pub(crate) fn outer_colour(outer: &Outer, noise: Noise, p: Vec3, inside: f32) -> Srgb {
     let mut colour = upper_cloth(&outer.cloth, noise, p, outer.hem_m);
     let dark = stitch(&outer.cloth);
@@ -85,7 +85,7 @@ pub(crate) fn outer_colour(outer: &Outer, noise: Noise, p: Vec3, inside: f32) ->
     mix3(colour, dark, 0.6 * line(inside - 0.012, 0.0009))
 }
 
-/// Colour of the trousers at a point of the average body, `inside` metres from the cloth's edge.
+/// Returns the colour of the trousers at a point of the average body, `inside` metres from the cloth's edge.
 pub(crate) fn bottom_colour(look: &Look, noise: Noise, p: Vec3, inside: f32) -> Srgb {
     let (cloth, hem_m, bib) = match &look.bottom {
         Bottom::Trousers { cloth, hem_m, .. } => (cloth, *hem_m, false),
@@ -131,7 +131,7 @@ pub(crate) fn bottom_colour(look: &Look, noise: Noise, p: Vec3, inside: f32) -> 
     mix3(colour, stitch(cloth), 0.75 * lines)
 }
 
-/// Colour of a skirt or a coat's tails, which are `high_m` high; `uv` runs around from the front and down.
+/// Returns the colour of a skirt or a coat's tails, which are `high_m` high; `uv` runs around from the front and down.
 pub(crate) fn hanging_colour(cloth: &Cloth, noise: Noise, uv: Vec2, high_m: f32, waistband: bool) -> Srgb {
     let turn = uv.x * std::f32::consts::TAU;
     let at = Vec2::new(uv.x * 1.12, uv.y * high_m);
@@ -145,7 +145,7 @@ pub(crate) fn hanging_colour(cloth: &Cloth, noise: Noise, uv: Vec2, high_m: f32,
     mix3(colour, dark, 0.6 * hem)
 }
 
-/// Colour of a hat.
+/// Returns the colour of a hat.
 pub(crate) fn hat_colour(cloth: &Cloth, noise: Noise, uv: Vec2) -> Srgb {
     let turn = uv.x * std::f32::consts::TAU;
     let at = Vec2::new(uv.x * 0.60, (1.0 - uv.y) * 0.16);
@@ -159,7 +159,7 @@ pub(crate) fn hat_colour(cloth: &Cloth, noise: Noise, uv: Vec2) -> Srgb {
     mix3(colour, scale3(colour, 0.6), panel.max(band))
 }
 
-/// Colour of hair.
+/// Returns the colour of hair.
 pub(crate) fn hair_colour(look: &Look, noise: Noise, p: Vec3) -> Srgb {
     let around = p.x.atan2(p.z - 0.04);
     let top = smoothstep(1.60, 1.65, p.y);
@@ -172,7 +172,7 @@ pub(crate) fn hair_colour(look: &Look, noise: Noise, p: Vec3) -> Srgb {
     scale3(sheen, light * depth * 1.15)
 }
 
-/// Colour of a shoe's upper; `uv` runs around (0 at the outer side, 0.25 on top) and from heel to toe.
+/// Returns the colour of a shoe's upper; `uv` runs around (0 at the outer side, 0.25 on top) and from heel to toe.
 pub(crate) fn upper_colour(look: &Look, noise: Noise, uv: Vec2) -> Srgb {
     let [main, accent] = look.shoes.colours;
     let side = (uv.x - 0.25).abs();
@@ -201,7 +201,7 @@ pub(crate) fn upper_colour(look: &Look, noise: Noise, uv: Vec2) -> Srgb {
     scale3(colour, 1.0 + 0.03 * noise.sum(Vec3::new(uv.x * 80.0, uv.y * 120.0, 5.0), 2))
 }
 
-/// Colour of a shoe's sole.
+/// Returns the colour of a shoe's sole.
 pub(crate) fn sole_colour(look: &Look, noise: Noise, uv: Vec2) -> Srgb {
     let base = match look.shoes.kind {
         ShoeKind::Trainers if look.shoes.colours[0][0] > 0.8 => [0.80, 0.79, 0.76],

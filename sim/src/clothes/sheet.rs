@@ -1,23 +1,23 @@
-//! Surfaces that hang on the body: subdividing, smoothing, cutting and thickening them.
+//! Surfaces on the body: subdivision, smoothing, cutting and thickening.
 
 use std::collections::HashMap;
 
 use flyrig_body::{Part, SkinWeights, Template};
 use glam::{Vec2, Vec3};
 
-/// A vertex of a surface on the body.
+/// Vertex of a surface on the body.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Node {
     /// Canonical position of the surface, metres.
     pub position: Vec3,
     /// Canonical position of the body point that carries it, metres.
     pub body: Vec3,
-    /// Where that point lies on the average body: all cutting and painting goes by it, metres.
+    /// Position of that point on the average body, by which everything is cut and painted, metres.
     pub average: Vec3,
     pub uv: Vec2,
     pub skin: SkinWeights,
     pub part: Part,
-    /// How long it hangs free, metres; 0 where it is held (see [`crate::loose`]).
+    /// Free length, metres; 0 where it is fixed (see [`crate::clothes::loose`]).
     pub free_m: f32,
 }
 
@@ -35,7 +35,7 @@ impl Node {
     }
 }
 
-/// A triangle mesh of nodes.
+/// Triangle mesh of nodes.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Sheet {
     pub nodes: Vec<Node>,
@@ -43,7 +43,7 @@ pub(crate) struct Sheet {
 }
 
 impl Sheet {
-    /// The body itself; `average` holds the positions of the average body.
+    /// Returns the body itself; `average` holds the positions of the average body.
     pub(crate) fn of_body(template: &Template, average: &[Vec3]) -> Self {
         let nodes = template
             .positions
@@ -63,7 +63,7 @@ impl Sheet {
         Self { nodes, triangles: template.triangles.clone() }
     }
 
-    /// Each triangle in four.
+    /// Divides each triangle into four.
     pub(crate) fn subdivided(&self) -> Self {
         let mut nodes = self.nodes.clone();
         let mut middles = HashMap::new();
@@ -83,7 +83,7 @@ impl Sheet {
         Self { nodes, triangles }
     }
 
-    /// Class of nodes on the same body point, and the number of classes.
+    /// Returns the class of each node by its body point, and the number of classes.
     pub(crate) fn welded(&self) -> (Vec<u32>, usize) {
         let mut classes = HashMap::new();
         let class = self
@@ -98,7 +98,7 @@ impl Sheet {
         (class, classes.len())
     }
 
-    /// Positions after `rounds` of averaging with their neighbours (UV seams stay closed).
+    /// Returns the positions after `rounds` of averaging with their neighbours (UV seams stay closed).
     pub(crate) fn smoothed(&self, rounds: usize) -> Vec<Vec3> {
         let (class, count) = self.welded();
         let mut positions = vec![Vec3::ZERO; count];
@@ -123,7 +123,7 @@ impl Sheet {
         class.iter().map(|&c| positions[c as usize]).collect()
     }
 
-    /// Area-weighted unit normals for given positions of the nodes.
+    /// Returns area-weighted unit normals for given positions of the nodes.
     pub(crate) fn normals(&self, positions: &[Vec3]) -> Vec<Vec3> {
         let (class, count) = self.welded();
         let mut normals = vec![Vec3::ZERO; count];
@@ -137,7 +137,7 @@ impl Sheet {
         class.iter().map(|&c| normals[c as usize].normalize_or(Vec3::Y)).collect()
     }
 
-    /// The part where `inside` (per node) is positive, cut along its zero line.
+    /// Returns the part where `inside` (per node) is positive, cut along its zero line.
     pub(crate) fn cut(&self, inside: &[f32]) -> Self {
         let mut cut = Self::default();
         let mut kept: HashMap<u32, u32> = HashMap::new();
@@ -170,13 +170,13 @@ impl Sheet {
         cut
     }
 
-    /// The triangles for which `keep` holds.
+    /// Returns the triangles for which `keep` holds.
     pub(crate) fn filtered(&self, keep: impl Fn([&Node; 3]) -> bool) -> Self {
         let kept = self.triangles.iter().filter(|t| keep(t.map(|v| &self.nodes[v as usize]))).copied().collect();
         Self { nodes: self.nodes.clone(), triangles: kept }
     }
 
-    /// Edges with a triangle on one side only, in that triangle's direction; UV seams are no boundary.
+    /// Returns the edges with a triangle on one side only, in that triangle's direction; UV seams are no boundary.
     pub(crate) fn boundary(&self) -> Vec<[u32; 2]> {
         let (class, _) = self.welded();
         let directed = |[a, b]: [u32; 2]| (class[a as usize], class[b as usize]);
@@ -190,7 +190,7 @@ impl Sheet {
             .collect()
     }
 
-    /// Turns the cloth in at its boundary, down to the body: what gives a hem its thickness.
+    /// Turns the cloth in at its boundary, down to the body, which gives a hem its thickness.
     pub(crate) fn add_lip(&mut self) {
         let mut inner: HashMap<u32, u32> = HashMap::new();
         for edge in self.boundary() {
@@ -206,8 +206,8 @@ impl Sheet {
         }
     }
 
-    /// Grows `rows` rows of cloth from the boundary's edges whose ends are both in `keep`; `at` says where a
-    /// boundary node's row lies, 0 at the edge and 1 at the far end.
+    /// Extrudes `rows` rows of cloth from the boundary's edges whose ends are both in `keep`; `at` returns the position
+    /// of a boundary node's row, 0 at the edge and 1 at the far end.
     pub(crate) fn extrude(&mut self, rows: u32, keep: impl Fn(&Node) -> bool, at: impl Fn(&Node, f32) -> Vec3) {
         let mut columns: HashMap<u32, u32> = HashMap::new();
         for edge in self.boundary() {
@@ -232,7 +232,7 @@ impl Sheet {
         }
     }
 
-    /// Turns the cloth in at its boundary by `thick_m` along its normals: the hem of cloth that hangs free.
+    /// Turns the cloth in at its boundary by `thick_m` along its normals: the hem of hanging cloth.
     pub(crate) fn add_rim(&mut self, thick_m: f32) {
         let positions: Vec<Vec3> = self.nodes.iter().map(|node| node.position).collect();
         let normals = self.normals(&positions);
@@ -250,8 +250,8 @@ impl Sheet {
         }
     }
 
-    /// A grid of `rows` by `columns` cells from nodes row by row; seen from outside, columns run
-    /// counter-clockwise and rows upwards.
+    /// Adds a grid of `rows` by `columns` cells from nodes row by row; seen from outside, columns run counter-clockwise
+    /// and rows upwards.
     pub(crate) fn add_grid(&mut self, rows: u32, columns: u32, mut node: impl FnMut(f32, f32) -> Node) {
         let first = self.nodes.len() as u32;
         for row in 0..=rows {
@@ -284,7 +284,7 @@ impl Sheet {
     }
 }
 
-/// Weights between two, `t` of the way from `a` to `b`.
+/// Interpolates weights, `t` of the way from `a` to `b`.
 pub(crate) fn mix_skin(a: &SkinWeights, b: &SkinWeights, t: f32) -> SkinWeights {
     let mut sums: Vec<(u16, f32)> = Vec::with_capacity(8);
     for (skin, share) in [(a, 1.0 - t), (b, t)] {

@@ -1,4 +1,4 @@
-//! Straps over the shoulders: ribbons on what is worn below.
+//! Straps over the shoulders: ribbons on the layer below.
 
 use flyrig_body::Part;
 use glam::{Vec2, Vec3};
@@ -10,13 +10,13 @@ use crate::clothes::sheet::{Node, Sheet};
 const HALF_WIDTH_M: f32 = 0.0165;
 /// Distance of a strap from the middle of the body in front and behind.
 const ASIDE_M: [f32; 2] = [0.088, 0.066];
-/// Around this line along x straps run over the shoulder (y, z of the average body).
+/// Line along x around which straps run over the shoulder (y, z of the average body).
 const AXIS: Vec2 = Vec2::new(1.215, 0.020);
-/// From the bib up and over to the back, radians from the front.
+/// Range from the bib over the shoulder to the back, radians from the front.
 const FROM_TO: [f32; 2] = [-0.10, 3.75];
 
 impl Tailor {
-    /// Adds both straps; `place` says where the strap lies above a node of the body.
+    /// Adds both straps; `place` returns the strap's position above a node of the body.
     pub(crate) fn add_straps(&self, cloth: &mut Sheet, place: impl Fn(usize) -> Vec3) {
         const ROWS: u32 = 40;
         const COLUMNS: u32 = 4;

@@ -1,9 +1,9 @@
-//! What people wear: kinds of garments, hair and hats, and the cloth they are made of.
+//! Kinds of garments, hair and hats, and the cloth they are made of.
 
-/// sRGB in 0..=1.
+/// sRGB colour in 0..=1.
 pub(crate) type Srgb = [f32; 3];
 
-/// How a cloth is made.
+/// Structure of a cloth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Fabric {
     /// Smooth cotton jersey.
@@ -15,34 +15,34 @@ pub(crate) enum Fabric {
     Leather,
 }
 
-/// What is printed or woven into a cloth.
+/// Printed or woven pattern of a cloth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Print {
     Plain,
-    /// Across the body.
+    /// Stripes across the body.
     Stripes,
-    /// Down the body.
+    /// Stripes down the body.
     Pinstripes,
     Checks,
     Plaid,
     Dots,
     Camouflage,
-    /// From the first colour above to the second below.
+    /// Gradient from the first colour above to the second below.
     Gradient,
-    /// One of the words of [`crate::glyphs`] on the chest.
+    /// One of the words of [`crate::clothes::glyphs`] on the chest.
     Text(u8),
-    /// One of the marks of [`crate::fabric`] on the chest.
+    /// One of the marks of [`crate::clothes::fabric`] on the chest.
     Logo(u8),
 }
 
-/// A cloth.
+/// Cloth with its pattern and colours.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Cloth {
     pub fabric: Fabric,
     pub print: Print,
-    /// Ground, print, accent.
+    /// Colours of ground, print and accent.
     pub colours: [Srgb; 3],
-    /// Size of the print, 1 for a common one.
+    /// Scale of the print relative to a common one.
     pub scale: f32,
 }
 
@@ -56,12 +56,12 @@ pub(crate) enum TopKind {
     Hoodie,
 }
 
-/// A garment of the upper body; lengths in metres on the average body.
+/// Garment of the upper body; lengths in metres on the average body.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Top {
     pub kind: TopKind,
     pub cloth: Cloth,
-    /// Along the arm from the shoulder joint; the wrist is at 0.48.
+    /// Length along the arm from the shoulder joint; the wrist is at 0.48.
     pub sleeve_m: f32,
     pub v_neck_m: f32,
     /// Radius of the neck opening.
@@ -70,29 +70,28 @@ pub(crate) struct Top {
     pub hem_m: f32,
     /// Distance from the body.
     pub offset_m: f32,
-    /// Its hem is under the waistband.
+    /// Whether its hem is under the waistband.
     pub tucked: bool,
 }
 
-/// A garment of the lower body; lengths in metres on the average body.
+/// Garment of the lower body; lengths in metres on the average body.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Bottom {
-    /// Trousers and shorts. `wide_m` is how much farther from the leg the hem is than the hip.
+    /// Trousers and shorts. `wide_m` is the additional distance of the hem from the leg, compared with the hip's.
     Trousers { cloth: Cloth, hem_m: f32, wide_m: f32 },
     /// Trousers with a bib and straps.
     Overalls { cloth: Cloth, hem_m: f32 },
-    /// A skirt of its own, or that of a dress (whose top is of the same cloth). `flare` is metres outwards a
-    /// metre down.
+    /// Separate skirt, or that of a dress (whose top is of the same cloth). `flare` is metres outwards per metre down.
     Skirt { cloth: Cloth, hem_m: f32, flare: f32, pleats: u8 },
 }
 
-/// A garment over all others.
+/// Garment over all others.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Outer {
     pub cloth: Cloth,
     /// Height of the hem, metres on the average body; below the hip the garment is a coat.
     pub hem_m: f32,
-    /// Half the width of the opening in front at the hem, metres; 0 for a closed one.
+    /// Half the width of the front opening at the hem, metres; 0 for a closed one.
     pub open_m: f32,
     pub collar_m: f32,
 }
@@ -110,7 +109,7 @@ pub(crate) enum HairCut {
     Ponytail,
 }
 
-/// Hair on the face.
+/// Facial hair.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Beard {
     None,
@@ -120,7 +119,7 @@ pub(crate) enum Beard {
     Long,
 }
 
-/// What is on the head.
+/// Headwear.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Hat {
     None,

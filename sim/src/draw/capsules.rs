@@ -1,4 +1,4 @@
-//! Capsules that stand for a person's limbs where only their shade matters: on the person and on the floor.
+//! Capsules that approximate a person's limbs for ambient occlusion: on the person and on the floor.
 
 use flyrig_types::Pose;
 use glam::{DVec3, Vec3};
@@ -7,31 +7,31 @@ use rayon::prelude::*;
 use crate::draw::moment::Capsule;
 use crate::person::assembly::Person;
 
-/// Capsules of a person at rest, and which of them shade a vertex.
+/// Capsules of a person at rest, and the capsules that occlude each vertex.
 #[derive(Debug)]
 pub(crate) struct Limbs {
     limbs: Vec<Limb>,
-    /// Per vertex of the clothed surface: its joint.
+    /// Joint per vertex of the clothed surface.
     joint: Vec<usize>,
-    /// Per joint: limbs that it belongs to or hangs on.
+    /// Per joint: bit set of the limbs that it belongs to or hangs on.
     own: Vec<u64>,
 }
 
 #[derive(Debug)]
 struct Limb {
     joint: usize,
-    /// Canonical, metres.
+    /// Canonical positions, metres.
     a: DVec3,
     b: DVec3,
     radius_m: f32,
 }
 
 impl Limbs {
-    /// The thickest bones' capsules.
+    /// Creates capsules of the thickest bones.
     pub(crate) fn new(person: &Person) -> Self {
-        /// As many as fit twice into the shader's list, and into a set of bits.
+        /// Most capsules: they fit twice into the shader's list, and into a bit set.
         const MOST: usize = 24;
-        /// Thinner limbs shade nothing that would be seen.
+        /// Radius below which a limb's occlusion is invisible, metres.
         const THIN_M: f32 = 0.02;
         let skeleton = &person.body.skeleton;
         let joints = skeleton.joints().len();
@@ -74,7 +74,7 @@ impl Limbs {
         Self { limbs, joint, own }
     }
 
-    /// The capsules of a pose, world metres.
+    /// Returns the capsules of a pose, world metres.
     pub(crate) fn posed(&self, person: &Person, pose: &Pose) -> Vec<Capsule> {
         let world_from_canonical = person.body.skeleton.world_from_canonical(pose);
         let at = |joint: usize, p: DVec3| world_from_canonical[joint].transform_point3(p).as_vec3().to_array();
@@ -89,7 +89,7 @@ impl Limbs {
             .collect()
     }
 
-    /// Per vertex: what creases and other limbs leave free of the surroundings.
+    /// Returns per vertex the fraction of the surroundings that creases and other limbs leave free.
     pub(crate) fn openness(
         &self,
         person: &Person,
@@ -109,8 +109,8 @@ impl Limbs {
     }
 }
 
-/// Share of the cosine-weighted surroundings of a surface point that a ball at the capsule's closest point covers
-/// (a ball of radius r above the horizon at distance d covers r² / d² times the cosine of its direction).
+/// Returns the fraction of the cosine-weighted surroundings of a surface point that a ball at the capsule's closest
+/// point covers (a ball of radius r above the horizon at distance d covers r² / d² times the cosine of its direction).
 fn covered(capsule: &Capsule, p: Vec3, n: Vec3) -> f32 {
     let (a, b) = (Vec3::from(capsule.a), Vec3::from(capsule.b));
     let along = b - a;
@@ -137,7 +137,7 @@ fn distance_to_segment(p: DVec3, a: DVec3, b: DVec3) -> f64 {
 mod tests {
     use super::*;
 
-    /// Against rays over the hemisphere, f64.
+    /// Compares with rays over the hemisphere, in f64.
     #[test]
     fn a_ball_covers_as_much_as_rays_say() {
         let ball = |x: f32, z: f32, radius: f32| Capsule { a: [x, 0.0, z], radius, b: [x, 0.0, z], padding: 0.0 };

@@ -1,4 +1,4 @@
-//! Who is in the room, at all times.
+//! People in the room over time.
 
 use flyrig_types::Pose;
 use glam::Vec3;
@@ -10,11 +10,11 @@ use crate::person::actor::{Actor, Shape};
 use crate::person::passer::passer_by;
 use crate::{SimConfig, SimError};
 
-/// Seconds between keys, at most, as long as there are not more keys than [`MOST_KEYS`].
+/// Longest interval between keys, seconds, as long as there are at most [`MOST_KEYS`].
 const KEY_SECS: f64 = 0.008;
 const MOST_KEYS: usize = 65;
 
-/// The person and who else is there.
+/// The person and an optional passer-by.
 pub(crate) struct Cast {
     pub main: Actor,
     limbs: Limbs,
@@ -33,7 +33,7 @@ impl Cast {
         Ok(Self { main, limbs, other })
     }
 
-    /// The actors, the person first.
+    /// Iterates over the actors, the person first.
     pub(crate) fn actors(&self) -> impl Iterator<Item = &Actor> {
         std::iter::once(&self.main).chain(self.other.iter().map(|(actor, _)| actor))
     }
@@ -42,7 +42,7 @@ impl Cast {
         self.main.pose(nanos)
     }
 
-    /// Everybody from `reach_secs` before an instant to as long after it.
+    /// Returns all people from `reach_secs` before an instant to as long after it.
     pub(crate) fn moment(&mut self, nanos: i64, reach_secs: f64) -> Moment {
         let count = match reach_secs {
             reach if reach <= 0.0 => 1,

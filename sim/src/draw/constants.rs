@@ -1,4 +1,4 @@
-//! Constants of the shaders, in their layouts.
+//! Constants of the shaders, in the shaders' memory layouts.
 
 use bytemuck::{Pod, Zeroable};
 use flyrig_types::{Camera, Lens};
@@ -11,18 +11,18 @@ use crate::room::lamps::{LAMP_NEAR_M, cone_cosines};
 use crate::room::scene::Scene;
 use crate::room::scene_config::MAX_LAMPS;
 
-/// Nothing closer to a camera is drawn, metres.
+/// Near plane of the cameras, metres.
 pub(crate) const NEAR_M: f32 = 0.1;
-/// Most capsules that stand for people.
+/// Most capsules of all people.
 const MAX_CAPSULES: usize = 64;
-/// Steps to the row in which a moving point is seen.
+/// Iterations that find the row in which a moving point is exposed.
 const ROW_STEPS: u32 = 5;
-/// Taps of a soft shadow.
+/// Samples of a soft shadow.
 const SHADOW_TAPS: u32 = 12;
-/// Brightest light of a plate's layer.
+/// Largest light that a plate's layer represents.
 const PLATE_WHITE: f32 = 4.0;
 
-/// WGSL of all passes, for a number of lamps.
+/// Returns the WGSL of all passes, for a number of lamps.
 pub(crate) fn shader_sources(lamps: usize) -> [(&'static str, String); 5] {
     let constants = format!(
         "const NEAR_M: f32 = {NEAR_M:?};\nconst LAMP_NEAR_M: f32 = {LAMP_NEAR_M:?};\nconst SAMPLES: i32 = {SAMPLES};\n\
@@ -39,7 +39,7 @@ pub(crate) fn shader_sources(lamps: usize) -> [(&'static str, String); 5] {
     ]
 }
 
-/// `struct View` of view.wgsl without its rows.
+/// Mirror of `struct View` of view.wgsl without its rows.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(crate) struct ViewHead {
@@ -102,7 +102,7 @@ struct LampBlock {
     tangents: [f32; 4],
 }
 
-/// `struct Light` of light.wgsl.
+/// Mirror of `struct Light` of light.wgsl.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(crate) struct LightBlock {
@@ -115,7 +115,7 @@ pub(crate) struct LightBlock {
 }
 
 impl LightBlock {
-    /// The scene's lamps with people within a ball.
+    /// Fills the block with the scene's lamps, and people within a ball.
     pub(crate) fn new(scene: &Scene, glows: bool, moment: &Moment) -> Self {
         let Moment { ball: (center, radius), bounds, capsules, .. } = moment;
         let mut block = Self::zeroed();
@@ -146,17 +146,17 @@ impl LightBlock {
     }
 }
 
-/// Blocks of constants in one buffer, each at an offset that can be bound.
+/// Blocks of constants in one buffer, each at a bindable offset.
 #[derive(Debug, Default)]
 pub(crate) struct Blocks {
     pub bytes: Vec<u8>,
 }
 
 impl Blocks {
-    /// What every adapter allows as an offset.
+    /// Offset alignment that every adapter supports.
     const ALIGNMENT: usize = 256;
 
-    /// Offset of a new block.
+    /// Appends a block and returns its offset.
     pub(crate) fn push(&mut self, parts: &[&[u8]]) -> u32 {
         let offset = self.bytes.len();
         for part in parts {

@@ -1,5 +1,5 @@
-//! The drawing of one instant: shadow maps, plates, people before them, truth at pixel centres. All images of an
-//! instant are drawn in one submission and read back at once.
+//! Rendering of one instant: shadow maps, plates, people in front of them, truth at pixel centres. All images of an
+//! instant are rendered in one submission and read back together.
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer, read_back};
 use glam::Vec2;
@@ -21,11 +21,11 @@ use crate::person::actor::Shape;
 use crate::person::assembly::Person;
 use crate::room::scene::Scene;
 
-/// Sides of the lamps' images of people and of the room, pixels.
+/// Sides of the shadow maps of people and of the room, pixels.
 const PEOPLE_MAP_PX: u32 = 512;
 const ROOM_MAP_PX: u32 = 2048;
 
-/// Everything on the GPU.
+/// Renderer of a scene with all of its GPU resources.
 #[derive(Debug)]
 pub(crate) struct Drawing {
     pub(super) gpu: GpuContext,
@@ -50,11 +50,11 @@ pub(crate) struct Drawing {
     sums: Vec<Buffer>,
     plates: Plates,
     moment: Moment,
-    /// Whether furniture may shade the people of the moment before and of this one.
+    /// Whether furniture may shade the people of the previous moment and of this one.
     pub(super) shaded: [bool; 2],
 }
 
-/// Where one pass finds its constants.
+/// Offsets of a pass's constants: view and light.
 pub(crate) type Offsets = [u32; 2];
 
 impl Drawing {
@@ -161,7 +161,7 @@ impl Drawing {
         Ok(drawing)
     }
 
-    /// Puts the people around an instant; serves all cameras of that instant.
+    /// Sets the people around an instant, for all cameras of that instant.
     pub(crate) fn set_moment(&mut self, moment: Moment) -> Result<(), GpuError> {
         for ((figure, _), figured) in self.people.iter_mut().zip(&moment.people) {
             figure.pose(&self.gpu, &self.layouts.points, figured)?;
@@ -179,7 +179,7 @@ impl Drawing {
         Ok(())
     }
 
-    /// Draws images of one instant.
+    /// Renders images of one instant.
     pub(crate) fn pictures(&mut self, takes: &[ImageRequest]) -> Result<Vec<RawImage>, GpuError> {
         let steps = steps(takes);
         self.plates.next_round();
@@ -234,7 +234,8 @@ impl Drawing {
         Ok(all.chunks_exact(pixels).map(<[_]>::to_vec).collect())
     }
 
-    /// Truth of one image: of the middle of its exposure through the lens's middle, each row at its own time.
+    /// Renders the truth of one image: at the middle of its exposure through the middle of the lens, each row at its
+    /// own time.
     pub(crate) fn truth(&mut self, take: &ImageRequest) -> Result<Truth, GpuError> {
         let frame = SubFrame { secs: 0.0, lens_point: Vec2::ZERO };
         let step = Step { secs: 0.0, take: 0, frame, first: true, last: true };
@@ -297,7 +298,7 @@ impl Drawing {
         head
     }
 
-    /// Each lamp's level and the light from everywhere at the time of each row.
+    /// Returns each lamp's level and the ambient light at the time of each row.
     fn rows(&self, take: &ImageRequest, frame: SubFrame) -> Vec<[f32; 8]> {
         let rows = f64::from(self.size[1]);
         let row_secs = take.optics.readout_ms * 1e-3 / (rows - 1.0);
@@ -328,7 +329,7 @@ impl Drawing {
         blocks.push(&[bytemuck::bytes_of(&light)])
     }
 
-    /// Group 0 over blocks.
+    /// Uploads the blocks and binds them as group 0.
     pub(super) fn upload(&self, blocks: &Blocks) -> BindGroup {
         let buffer = self.gpu.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
             label: Some("constants of a batch"),
@@ -356,7 +357,7 @@ impl Drawing {
         Ok(self.sums[take].clone())
     }
 
-    /// Pixels of a texture without row padding.
+    /// Reads the pixels of a texture back, without row padding.
     fn read_truth(&self, texture: &Texture) -> Result<Vec<[f32; 4]>, GpuError> {
         let [width, height] = self.size;
         let row = width as usize * 16;
@@ -398,8 +399,8 @@ mod tests {
     use crate::room::surfaces::Surface;
     use crate::texture::Texture as Picture;
 
-    /// A glowing square in the dark: the middle of its light against the f64 model's, for each lens model and each
-    /// corner of the image.
+    /// Compares the centre of light of a glowing square in the dark with the f64 camera model's, for each lens model
+    /// and each corner of the image.
     #[test]
     fn furniture_lands_where_each_lens_puts_it() {
         let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();

@@ -1,4 +1,4 @@
-//! A person on the graphics adapter.
+//! GPU buffers of a person.
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 use wgpu::util::DeviceExt;
@@ -8,19 +8,19 @@ use crate::draw::gpu_parts::{bind, upload_textures};
 use crate::person::actor::Shape;
 use crate::person::assembly::Person;
 
-/// A person's surface around an instant.
+/// Surface of a person around an instant.
 #[derive(Debug, Clone)]
 pub(crate) struct Figured {
-    /// At each key.
+    /// Shape at each key.
     pub keys: Vec<Shape>,
-    /// Per vertex: share of the surroundings that is free, 0..=1.
+    /// Per vertex: unoccluded fraction of the surroundings, in 0..=1.
     pub openness: Vec<f32>,
 }
 
 #[derive(Debug)]
 pub(crate) struct Figure {
     points: StorageBuffer<[f32; 8]>,
-    /// Share of each lamp's light that furniture lets through.
+    /// Fraction of each lamp's light that furniture lets through.
     shares: StorageBuffer<[f32; 4]>,
     points_bind: BindGroup,
     paint: Buffer,
@@ -32,7 +32,7 @@ pub(crate) struct Figure {
 }
 
 impl Figure {
-    /// `main`: whether the truth is about this person.
+    /// Uploads a person; `main` marks the one whose truth is rendered.
     pub(crate) fn new(
         gpu: &GpuContext,
         layout: &BindGroupLayout,
@@ -65,7 +65,7 @@ impl Figure {
         })
     }
 
-    /// Puts the person at the keys of a moment.
+    /// Uploads the person's shapes at the keys of a moment.
     pub(crate) fn pose(
         &mut self,
         gpu: &GpuContext,
@@ -88,12 +88,12 @@ impl Figure {
         Ok(())
     }
 
-    /// Points and shares, to compute on; and the number of points.
+    /// Returns points and shares as resources of a kernel, and the number of points.
     pub(crate) fn buffers(&self) -> ([wgpu::BindingResource<'_>; 2], u32) {
         ([self.points.raw().as_entire_binding(), self.shares.raw().as_entire_binding()], self.vertex_count as u32)
     }
 
-    /// Draws `instances`; pipeline and groups but for the points are set.
+    /// Draws `instances`; the caller has set the pipeline and all groups except the points.
     pub(crate) fn draw(&self, pass: &mut RenderPass<'_>, instances: std::ops::Range<u32>) {
         pass.set_bind_group(1, &self.points_bind, &[]);
         pass.set_vertex_buffer(0, self.paint.slice(..));

@@ -1,4 +1,4 @@
-//! Textures, layouts and pipelines in wgpu's words.
+//! Textures, bind group layouts and pipelines in terms of wgpu.
 
 use flyrig_gpu::GpuContext;
 use wgpu::{
@@ -11,21 +11,21 @@ use wgpu::{
 
 use crate::texture::{Texture as Picture, linear_from_srgb};
 
-/// Of drawn light.
+/// Format of rendered light.
 pub(crate) const LIGHT: TextureFormat = TextureFormat::Rgba16Float;
-/// Of textures: square roots of linear colour, which Mesa's software adapter filters faster than sRGB.
+/// Format of textures: square roots of linear colour, which Mesa's software adapter filters faster than sRGB.
 const PAINT: TextureFormat = TextureFormat::Rgba8Unorm;
-/// Of depth images.
+/// Format of depth images.
 pub(crate) const DEPTH: TextureFormat = TextureFormat::Depth32Float;
-/// Of truth.
+/// Format of truth images.
 pub(crate) const TRUTH: TextureFormat = TextureFormat::Rgba32Float;
-/// Samples of a pixel.
+/// Samples per pixel.
 pub(crate) const SAMPLES: u32 = 4;
 
-/// What is bound, in the order of the bindings of a group.
+/// Kind of a binding, in the order of a group's bindings.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Slot {
-    /// A storage buffer at an offset given when it is set.
+    /// Storage buffer with a dynamic offset.
     Constants,
     Read,
     Write,
@@ -74,7 +74,7 @@ pub(crate) fn layout(gpu: &GpuContext, label: &str, slots: &[Slot]) -> BindGroup
     gpu.device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(label), entries: &entries })
 }
 
-/// Resources at bindings 0, 1, 2, ...
+/// Creates a bind group of resources at bindings 0, 1, 2, ...
 pub(crate) fn bind(gpu: &GpuContext, layout: &BindGroupLayout, resources: &[BindingResource<'_>]) -> BindGroup {
     let entries: Vec<_> = (0..)
         .zip(resources)
@@ -94,7 +94,7 @@ pub(crate) fn array_view(texture: &Texture) -> TextureView {
     })
 }
 
-/// One layer of an array, to draw into.
+/// Returns a view of one layer of an array, as a render target.
 pub(crate) fn layer_view(texture: &Texture, layer: u32) -> TextureView {
     texture.create_view(&wgpu::TextureViewDescriptor {
         dimension: Some(TextureViewDimension::D2),
@@ -124,7 +124,7 @@ pub(crate) fn target(
     })
 }
 
-/// All of one side, with their mip levels.
+/// Uploads textures of equal size as an array with mip levels.
 pub(crate) fn upload_textures(gpu: &GpuContext, label: &str, pictures: &[Picture]) -> TextureView {
     let roots: Vec<u8> = (0..=255).map(|v| (linear_from_srgb(v as f32 / 255.0).sqrt() * 255.0).round() as u8).collect();
     let side = pictures.first().map_or(1, |picture| picture.side) as u32;
@@ -162,14 +162,14 @@ pub(crate) fn upload_textures(gpu: &GpuContext, label: &str, pictures: &[Picture
     array_view(&array)
 }
 
-/// What a render pipeline is made of.
+/// Parts of a render pipeline.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Drawn<'a> {
     pub module: &'a ShaderModule,
     pub layouts: &'a [&'a BindGroupLayout],
     pub vertex: &'a str,
     pub fragment: Option<&'a str>,
-    /// Vertex attributes and whether each has a buffer of its own.
+    /// Vertex attributes, and whether they share one buffer.
     pub attributes: &'a [VertexFormat],
     pub interleaved: bool,
     pub targets: &'a [TextureFormat],

@@ -7,34 +7,34 @@ use glam::Vec3;
 use crate::camera::optics::{OpticsConfig, SubFrame};
 use crate::draw::figure::Figured;
 
-/// The people around an instant.
+/// People around an instant.
 #[derive(Debug, Clone)]
 pub(crate) struct Moment {
-    /// First key's seconds from the instant, and keys a second; the keys are evenly spaced.
+    /// Time of the first key from the instant, seconds, and keys per second; the keys are evenly spaced.
     pub first_secs: f64,
     pub keys_a_second: f64,
     pub people: Vec<Figured>,
-    /// A ball around everybody at all keys.
+    /// Bounding ball of all people at all keys.
     pub ball: (Vec3, f32),
-    /// Around each.
+    /// Bounding cylinder of each person.
     pub bounds: Vec<Bound>,
     pub capsules: Vec<Capsule>,
 }
 
-/// One image to draw.
+/// Image to render.
 #[derive(Debug, Clone)]
 pub(crate) struct ImageRequest {
     pub nanos: i64,
     pub camera: Camera,
     pub optics: OpticsConfig,
-    /// Without people: the plate.
+    /// Whether to render people; the plate otherwise.
     pub people: bool,
 }
 
-/// Linear light and coverage by the person as halves.
+/// Linear light and coverage by the person, as halves.
 pub(crate) type RawImage = Vec<[u16; 4]>;
 
-/// Truth at pixel centres.
+/// Ground truth at pixel centres.
 pub(crate) struct Truth {
     /// Canonical position and camera-space z.
     pub canonical_depth: Vec<[f32; 4]>,
@@ -42,7 +42,7 @@ pub(crate) struct Truth {
     pub normal_part: Vec<[f32; 4]>,
 }
 
-/// A part of a person that keeps light from its surroundings: a line with a radius, metres.
+/// Part of a person that occludes the ambient light: a line with a radius, metres.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(crate) struct Capsule {
@@ -52,7 +52,7 @@ pub(crate) struct Capsule {
     pub padding: f32,
 }
 
-/// An upright cylinder from the floor around a person, metres.
+/// Upright cylinder from the floor around a person, metres.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(crate) struct Bound {
@@ -61,7 +61,7 @@ pub(crate) struct Bound {
     pub top: f32,
 }
 
-/// One step of a batch: one sub-frame of one requested image.
+/// Step of a batch: one sub-frame of one requested image.
 pub(crate) struct Step {
     pub secs: f64,
     pub take: usize,
@@ -70,7 +70,7 @@ pub(crate) struct Step {
     pub last: bool,
 }
 
-/// All sub-frames, those of one time together.
+/// Lists all sub-frames, those of equal time together.
 pub(crate) fn steps(takes: &[ImageRequest]) -> Vec<Step> {
     let mut steps: Vec<Step> = Vec::new();
     for (take, of) in takes.iter().enumerate() {

@@ -24,7 +24,7 @@ impl Drawing {
         self.gpu.queue.submit([encoder.finish()]);
     }
 
-    /// The shadows that people cast at a time, and those of the furniture on them.
+    /// Renders the shadow maps of people at a time, and the furniture's shade on them.
     pub(super) fn shade_people(&self, encoder: &mut CommandEncoder, constants: &BindGroup, offsets: Offsets) {
         let shaded = if self.shaded == [false; 2] { &[][..] } else { &self.people };
         for (figure, _) in shaded {

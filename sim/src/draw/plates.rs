@@ -1,4 +1,4 @@
-//! Plates: what a camera sees of the empty room, kept as long as there is room for it.
+//! Plates: cached views of the empty room per camera, with the light of each lamp baked in.
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 use flyrig_types::{Camera, Intrinsics};
@@ -10,33 +10,33 @@ use crate::draw::gpu_parts::{DEPTH, SAMPLES, target};
 
 /// Side of the cells of the grid of directions, pixels.
 pub(crate) const GRID_CELL_PX: f64 = 8.0;
-/// More cameras than a rig has.
+/// Most cached cameras, more than a rig has.
 const MOST: usize = 129;
-/// Memory that plates may take, bytes.
+/// Memory budget of plates, bytes.
 const BUDGET: u64 = 1 << 30;
 
-/// A camera's view of the empty room through one point of its lens.
+/// View of the empty room of a camera through one point of its lens.
 #[derive(Debug, Clone)]
 pub(crate) struct Plate {
     camera: Camera,
     lens_point: Vec2,
     focus_m: f64,
-    /// Packed light, a layer after the other: from everywhere, from each lamp, what glows.
+    /// Packed light, layer by layer: ambient, each lamp, glowing objects.
     pub layers: wgpu::Buffer,
-    /// Of every sample.
+    /// Depth of every sample.
     pub depth: Texture,
     pub directions: wgpu::Buffer,
     used: u64,
 }
 
-/// The plates of one image size and scene.
+/// Plates of one image size and scene.
 #[derive(Debug)]
 pub(crate) struct Plates {
     size: [u32; 2],
     layers: usize,
     kept: Vec<Plate>,
     scratch: Option<Plate>,
-    /// Depth at pixel centres, of the cameras whose truth was asked for.
+    /// Depth at pixel centres, of the cameras whose truth was requested.
     centre_depths: Vec<(Camera, Texture)>,
     directions: Vec<(Intrinsics, wgpu::Buffer)>,
     round: u64,
@@ -55,12 +55,12 @@ impl Plates {
         }
     }
 
-    /// Plates of earlier rounds may make way for new ones.
+    /// Allows plates of earlier rounds to be replaced.
     pub(crate) fn next_round(&mut self) {
         self.round += 1;
     }
 
-    /// The plate of a view, and whether it is still to be drawn.
+    /// Returns the plate of a view, and whether it still has to be rendered.
     pub(crate) fn find(
         &mut self,
         gpu: &GpuContext,
@@ -99,12 +99,12 @@ impl Plates {
         Ok((plate, true))
     }
 
-    /// Depth at pixel centres, where it was kept.
+    /// Returns the cached depth at pixel centres.
     pub(crate) fn centre_depth(&self, camera: &Camera) -> Option<Texture> {
         self.centre_depths.iter().find(|(known, _)| known == camera).map(|(_, depth)| depth.clone())
     }
 
-    /// Keeps depth at pixel centres.
+    /// Caches depth at pixel centres.
     pub(crate) fn keep_centre_depth(&mut self, camera: &Camera, depth: &Texture) {
         if self.centre_depths.len() >= MOST {
             self.centre_depths.clear();
@@ -151,7 +151,7 @@ impl Plates {
     }
 }
 
-/// Corners of the grid's cells along a side of the image.
+/// Returns the number of corners of the grid's cells along a side of the image.
 pub(crate) fn grid_columns(side: u32) -> usize {
     (f64::from(side) / GRID_CELL_PX).ceil() as usize + 2
 }

@@ -1,4 +1,4 @@
-//! A simulated capture as a folder: EasyMocap layout, with the truth beside.
+//! Export of a simulated capture to a folder: EasyMocap layout, with the truth beside it.
 
 use std::fs;
 use std::io::Write as _;
@@ -14,21 +14,21 @@ use crate::camera::source::{shot, spoilt};
 use crate::files::truth_file::write_truth;
 use crate::{Delivery, FramePlan, SimError, Simulator};
 
-/// What to export.
+/// Options of an export.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ExportOptions {
-    /// Frames of every camera.
+    /// Number of frames per camera.
     pub frames: u64,
-    /// Whether the folder `truth` is written as well.
+    /// Whether to write the folder `truth` as well.
     pub truth: bool,
 }
 
-/// What was exported.
+/// Summary of an export.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Exported {
     /// Images of all cameras.
     pub pictures: u64,
-    /// Frames that the fault script lost.
+    /// Frames lost by the fault script.
     pub lost: u64,
 }
 
@@ -36,19 +36,20 @@ pub struct Exported {
 ///
 /// - `intri.yml`, `extri.yml`, `images/CAM/000000.png`, `mask/CAM/000000.png`, `background/CAM.png` (EasyMocap layout),
 /// - `subject.glb`: the body without clothes and its motion, z up,
-/// - `simulation.toml`: the configuration that makes the same capture again,
-/// - `truth/intri.yml`, `truth/extri.yml`: the cameras as they are, without the calibration error,
-/// - `truth/frames.csv`: when each frame was taken, what its stamp said, and whether it came,
-/// - `truth/poses.jsonl`: a line a frame with pose and joints,
-/// - `truth/surface/000000.ply`: the clothed surface with canonical positions and how far the cloth swings (`cloth_*`, metres),
-/// - `truth/CAM/000000.exr`: depth, normal, canonical position and part at each pixel, as the image shows them.
+/// - `simulation.toml`: the configuration that reproduces the capture,
+/// - `truth/intri.yml`, `truth/extri.yml`: the true cameras, without the calibration error,
+/// - `truth/frames.csv`: true time, timestamp and delivery of each frame,
+/// - `truth/poses.jsonl`: one line per frame with pose and joints,
+/// - `truth/surface/000000.ply`: the clothed surface with canonical positions and displacement of the cloth (`cloth_*`,
+///   metres),
+/// - `truth/CAM/000000.exr`: depth, normal, canonical position and part at each pixel of the image.
 ///
-/// A frame that the fault script loses has no image. `go_on` gets the number of frames done, and ends the export by
-/// returning false. Everything is written beside the folder first: it appears whole or not at all.
+/// A frame that the fault script loses has no image. `go_on` receives the number of completed frames, and ends the
+/// export by returning false. Everything is written next to the folder first: it appears whole or not at all.
 ///
 /// # Errors
-/// [`SimError::Export`] names the file and the fix, [`SimError::Stopped`] after `go_on` said so; others when an image
-/// cannot be drawn.
+/// [`SimError::Export`] names the file and the fix, [`SimError::Stopped`] after `go_on` returned false; others when an
+/// image cannot be rendered.
 pub fn export(
     simulator: &mut Simulator,
     folder: &Path,
@@ -207,7 +208,7 @@ impl Folder {
     }
 }
 
-/// Pose and joints of an instant as a line of JSON.
+/// Returns pose and joints of an instant as a line of JSON.
 fn pose_line(simulator: &Simulator, frame: u64, nanos: i64) -> String {
     let pose = simulator.pose(nanos);
     let skeleton = &simulator.template().skeleton;

@@ -1,4 +1,4 @@
-//! Endless random captures for training; nothing goes to a disk.
+//! Endless random captures for training, without files.
 
 use flyrig_body::Template;
 use flyrig_gpu::GpuContext;
@@ -14,20 +14,20 @@ use crate::{
     SceneConfig, SceneKind, SensorConfig, SimConfig, SimError, SimFrame, Simulator,
 };
 
-/// What [`TrainingSamples`] makes.
+/// Configuration of [`TrainingSamples`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingConfig {
-    /// Makes everything.
+    /// Seed of everything.
     pub seed: u64,
-    /// Cameras of each rig, 1 to 128.
+    /// Number of cameras per rig, 1 to 128.
     pub cameras: usize,
     /// Size of the images, pixels.
     pub size: [u32; 2],
     /// Side of each texture, pixels.
     pub texture_px: u32,
-    /// Consecutive instants of a sample, 1 to 1000.
+    /// Consecutive instants per sample, 1 to 1000.
     pub instants: usize,
-    /// Samples of one person in one rig (making them costs about as much as a dozen images), at least 1.
+    /// Samples per person and rig (creating these costs about as much as a dozen images), at least 1.
     pub samples_a_person: usize,
 }
 
@@ -37,30 +37,30 @@ impl Default for TrainingConfig {
     }
 }
 
-/// A few consecutive instants of somebody, seen by all cameras of a rig.
+/// A few consecutive instants of a person, seen by all cameras of a rig.
 #[derive(Debug)]
 pub struct SimSample {
-    /// What makes it again.
+    /// Configuration that reproduces the sample.
     pub config: SimConfig,
-    /// The cameras as their calibration reports them: what a method is given.
+    /// Cameras as their calibration reports them: input of a method.
     pub reported_rig: Rig,
-    /// The cameras as they are: what a method is compared with.
+    /// True cameras: reference of a method.
     pub rig: Rig,
-    /// The body without clothes.
+    /// Body without clothes.
     pub template: Template,
     /// Index of the first instant; instant `i` is due at [`Simulator::frame_nanos`]`(first + i)`.
     pub first: u64,
-    /// Per instant a frame a camera in rig order. Cameras may lag behind the instant; each frame knows its time.
+    /// Per instant one frame per camera in rig order. Cameras may lag behind the instant; each frame knows its time.
     pub instants: Vec<Vec<SimFrame>>,
 }
 
-/// An endless iterator of samples: random people in random clothes move at random before random cameras in random rooms.
-/// The same configuration gives the same samples on the same adapter.
+/// Endless iterator of samples: random people in random clothes with random motion, cameras and rooms. A configuration
+/// gives the same samples in every run on the same adapter.
 #[derive(Debug)]
 pub struct TrainingSamples {
     gpu: GpuContext,
     config: TrainingConfig,
-    /// Samples given so far.
+    /// Number of samples returned so far.
     given: u64,
     simulator: Option<Simulator>,
 }
@@ -110,7 +110,7 @@ impl TrainingSamples {
 impl Iterator for TrainingSamples {
     type Item = Result<SimSample, SimError>;
 
-    /// The next sample. After an error the next call goes on with another person.
+    /// Returns the next sample. After an error the next call continues with another person.
     fn next(&mut self) -> Option<Self::Item> {
         let sample = self.sample();
         let a_person = self.config.samples_a_person as u64;
@@ -119,7 +119,7 @@ impl Iterator for TrainingSamples {
     }
 }
 
-/// The capture of person `person`: everything that a method shall not rely on is random.
+/// Returns the configuration of person `person`, randomised in everything that a method must not rely on.
 #[must_use]
 pub fn random_config(training: &TrainingConfig, person: u64) -> SimConfig {
     let seed = hash(training.seed, person);

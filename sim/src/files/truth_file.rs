@@ -1,4 +1,4 @@
-//! The truth about an image as an OpenEXR file.
+//! Ground truth of an image as an OpenEXR file.
 
 use std::path::Path;
 
@@ -8,8 +8,8 @@ use exr::prelude::{
 
 use crate::{SimError, SimFrame};
 
-/// Channels `Z` (camera-space depth, metres), `N.X`, `.Y`, `.Z` (world normal), `canonical.X`, `.Y`, `.Z` (metres) and
-/// `part` (index + 1; 0 is no person).
+/// Writes the channels `Z` (camera-space depth, metres), `N.X`, `.Y`, `.Z` (world normal), `canonical.X`, `.Y`, `.Z`
+/// (metres) and `part` (index + 1; 0 is no person).
 pub(crate) fn write_truth(path: &Path, frame: &SimFrame) -> Result<(), SimError> {
     let axis = |axis: usize| FlatSamples::F32(frame.canonical.iter().map(|p| p[axis]).collect());
     let normal = |axis: usize| FlatSamples::F32(frame.normal.iter().map(|n| n[axis]).collect());

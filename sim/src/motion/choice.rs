@@ -1,4 +1,4 @@
-//! The pose track of a simulation.
+//! Pose track of a simulation: a clip or a file, chosen by the configuration or the seed.
 
 use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
@@ -17,7 +17,7 @@ use crate::{MotionConfig, MotionKind, SimConfig, SimError};
 
 const DEBIAN_CLIP: &str = "/usr/share/assimp/models/BVH/01_01.bvh";
 
-/// The walking clip 01_01 of the CMU motion capture database in Debian's `assimp-testmodels`.
+/// Finds the walking clip 01_01 of the CMU motion capture database in Debian's `assimp-testmodels`.
 ///
 /// # Errors
 /// [`SimError::NoClip`] names the package.
@@ -37,7 +37,7 @@ fn existing(path: &Path) -> Result<PathBuf, SimError> {
     Err(SimError::NoClip { path: path.to_owned(), mend })
 }
 
-/// The configured motion of a person, standing on the floor, around the configured place.
+/// Returns the configured motion of a person, standing on the floor, around the configured position.
 pub(crate) fn track(config: &SimConfig, person: &Person) -> Result<PoseTrack, SimError> {
     let mut track = track_around_origin(config, person)?;
     if config.person.fingers {
@@ -81,7 +81,7 @@ fn track_around_origin(config: &SimConfig, person: &Person) -> Result<PoseTrack,
     }
 }
 
-/// The seed's choice of clip, speed and phase.
+/// Draws clip, speed and phase from the seed.
 fn by_seed(config: &SimConfig) -> MotionConfig {
     use MotionKind::{CrossArms, Dance, Jump, Reach, Sit, Squat, Still, Turn, Walk, Wave};
     const KINDS: [MotionKind; 13] =
@@ -92,9 +92,9 @@ fn by_seed(config: &SimConfig) -> MotionConfig {
     MotionConfig { kind, speed, phase: dice.random_range(0.0..1.0), ..config.motion.clone() }
 }
 
-/// Somebody who walks straight through the room, back on another line 0.8 m farther from the centre, and so on. The
-/// seed chooses the direction, the pace, and whether the line runs 0.7 m or up to 1.2 m beside the centre.
-/// `reach_m` is how far from the centre they turn round.
+/// Returns the track of a person who walks straight through the room, back on another line 0.8 m farther from the
+/// centre, and so on. The seed chooses the direction, the pace, and whether the line passes the centre at 0.7 m or up
+/// to 1.2 m. `reach_m` is the distance from the centre at which they turn round.
 ///
 /// # Errors
 /// [`SimError::NoJoint`], [`SimError::Pose`].
@@ -106,7 +106,8 @@ pub(crate) fn pass_by(person: &Person, seed: u64, reach_m: f64) -> Result<PoseTr
     clip.track(&puppet, dice.random_range(0.0..1.0))
 }
 
-/// A recorded motion on a person, around the origin, the shoes' soles on the floor.
+/// Retargets a recorded motion to a person, around the origin, with the shoes' soles on the floor. Feet stay where the
+/// source's stand.
 fn recorded(clip: &MotionClip, skeleton: &Skeleton, motion: &MotionConfig) -> Result<PoseTrack, SimError> {
     let (start_secs, reach_m, sole_m) = (motion.start_secs, Some(motion.reach_m), f64::from(SOLE_M));
     let options = RetargetOptions { start_secs, reach_m, sole_m };

@@ -1,11 +1,11 @@
-//! Closed curves through a few knots: what the clips are drawn with.
+//! Closed curves through a few knots, of which the clips are made.
 
 use std::f64::consts::PI;
 
-/// Value at `phase` (its whole part does not matter) of the closed curve through `(phase, value)` knots with
-/// growing phases in 0..1. Once differentiable everywhere, the seam included, and never beyond its knots: a
-/// piecewise cubic with the slopes of Fritsch and Butland (A Method for Constructing Local Monotone Piecewise
-/// Cubic Interpolants, SIAM J. Sci. Stat. Comput. 5, 1984).
+/// Evaluates at `phase` (modulo 1) the closed curve through `(phase, value)` knots with increasing phases in 0..1. Once
+/// differentiable everywhere, the seam included, and never beyond its knots: a piecewise cubic with the slopes of
+/// Fritsch and Butland (A Method for Constructing Local Monotone Piecewise Cubic Interpolants, SIAM J. Sci. Stat.
+/// Comput. 5, 1984).
 pub(crate) fn closed(phase: f64, knots: &[(f64, f64)]) -> f64 {
     let count = knots.len();
     if count < 2 {
@@ -36,26 +36,26 @@ pub(crate) fn closed(phase: f64, knots: &[(f64, f64)]) -> f64 {
     hermite(s, [v0, v0 + rise * width], [slope(at) * width, slope(at + 1) * width])
 }
 
-/// From 0 at `t <= 0` to 1 at `t >= 1`, with no speed at either end.
+/// Rises from 0 at `t <= 0` to 1 at `t >= 1`, with zero slope at either end.
 pub(crate) fn ease(t: f64) -> f64 {
     let t = t.clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
 }
 
-/// The cubic from `values[0]` to `values[1]` over `t` in 0..=1 with these slopes at the ends.
+/// Evaluates the cubic from `values[0]` to `values[1]` over `t` in 0..=1 with these slopes at the ends.
 pub(crate) fn hermite(t: f64, values: [f64; 2], slopes: [f64; 2]) -> f64 {
     let rise = values[1] - values[0];
     values[0]
         + t * (slopes[0] + t * (3.0 * rise - 2.0 * slopes[0] - slopes[1] + t * (slopes[0] + slopes[1] - 2.0 * rise)))
 }
 
-/// A hump: 0 at both ends of 0..=1, 1 in the middle, no speed at the ends.
+/// Evaluates a bump: 0 at both ends of 0..=1, 1 in the middle, zero slope at the ends.
 pub(crate) fn hump(t: f64) -> f64 {
     (PI * t.clamp(0.0, 1.0)).sin().powi(2)
 }
 
-/// A smooth closed sequence nowhere below the given one: the largest of `2 * radius + 1` neighbours, averaged over as
-/// many with a cosine window.
+/// Returns a smooth closed sequence nowhere below the given one: the largest of `2 * radius + 1` neighbours, averaged
+/// over as many with a cosine window.
 pub(crate) fn smooth_above(values: &[f64], radius: usize) -> Vec<f64> {
     let count = values.len();
     let around = |i: usize| (0..=2 * radius).map(move |k| (i + count * (radius + 1) + k - radius) % count);

@@ -1,4 +1,4 @@
-//! Motion of the fingers: gestures one after another, another sequence for each hand and seed.
+//! Motion of the fingers: sequences of gestures that depend on hand and seed.
 
 use flyrig_body::{FingerAxes, Skeleton, finger_axes};
 use flyrig_types::{Pose, PoseTrack};
@@ -8,17 +8,17 @@ use rand::{RngExt, SeedableRng, rngs::StdRng};
 use crate::SimError;
 use crate::motion::curve::ease;
 
-/// Seconds that a gesture lasts, with the way to the next one.
+/// Duration of a gesture including the transition to the next one, seconds.
 const GESTURE_SECS: f64 = 1.2;
-/// Length of a round where the body does not move, seconds, and its keys a second.
+/// Duration of a cycle where the body does not move, seconds, and its keys per second.
 const STILL_SECS: f64 = 9.6;
 const STILL_KEYS: f64 = 30.0;
-/// Turn of a stretched and of a fully bent joint, radians, from the palm to the tip.
+/// Rotation from a stretched to a fully bent joint, radians, from the palm to the tip.
 const BENT: [f64; 3] = [1.35, 1.55, 0.95];
 const THUMB_BENT: [f64; 3] = [0.45, 0.65, 0.8];
 /// Largest spread, radians: thumb to little finger.
 const SPREAD: [f64; 5] = [0.45, 0.22, 0.05, -0.14, -0.28];
-/// Axes of a person's joints lie off those of the average hand by up to so much, radians.
+/// Largest deviation of a person's joint axes from those of the average hand, radians.
 const AXIS_JITTER_RAD: f64 = 0.08;
 
 /// Bend of each finger (0 stretched, 1 a fist), thumb first, and spread (0 together, 1 wide).
@@ -88,7 +88,7 @@ pub(crate) fn with_fingers(track: &PoseTrack, skeleton: &Skeleton, seed: u64) ->
     Ok(PoseTrack::new(keys.into_iter().map(moved).collect())?)
 }
 
-/// Gesture at a place in a closed sequence: held for half of the time, then on the way to the next one.
+/// Returns the gesture at a position in a closed sequence: held for half of the time, then blended to the next one.
 fn gesture(sequence: &[usize], at: f64) -> Gesture {
     let index = at.floor() as usize % sequence.len();
     let (from, to) = (&GESTURES[sequence[index]], &GESTURES[sequence[(index + 1) % sequence.len()]]);

@@ -1,57 +1,57 @@
-//! What a clip says about a body at an instant: where hips and feet are, how the trunk bends, where arms point.
+//! Posture of a body at an instant in terms of a clip: hips, feet, bend of the trunk, directions of the arms.
 
 use glam::{DQuat, DVec2, DVec3};
 
-/// A foot. Lengths are those of the average body; the frame is canonical axes on the ground, the body at the start
-/// facing +z.
+/// Posture of a foot. Lengths are those of the average body; the frame is canonical axes on the ground, the body at the
+/// start facing +z.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Foot {
-    /// Place of the ankle of the flat foot on the ground (x, z), metres.
+    /// Position of the ankle of the flat foot on the ground (x, z), metres.
     pub at: DVec2,
     /// Height of the flat foot above the ground, metres.
     pub lift: f64,
-    /// Where it points, radians from +z to +x.
+    /// Heading, radians from +z to +x.
     pub yaw: f64,
     /// Heel up (positive) or toes up (negative), radians.
     pub roll: f64,
-    /// What stays in place when it rolls: the heel at 0, the ball at 1.
+    /// Pivot of the roll: the heel at 0, the ball at 1.
     pub pivot: f64,
 }
 
-/// An arm in the chest's frame, x away from the body's middle, y up, z to the front.
+/// Posture of an arm in the chest's frame, x away from the body's middle, y up, z to the front.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Arm {
     /// Direction of the upper arm.
     pub upper: DVec3,
     /// Direction of the forearm.
     pub fore: DVec3,
-    /// Wrist: bent to the palm, turned palm up, radians.
+    /// Flexion of the wrist towards the palm and rotation palm up, radians.
     pub hand: [f64; 2],
-    /// Fingers, 0 stretched to 1 a fist.
+    /// Bend of the fingers, 0 stretched to 1 a fist.
     pub curl: f64,
 }
 
-/// A whole body. Pairs are left, right.
+/// Posture of a whole body. Pairs are left, right.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Posture {
     /// Hips on the ground (x, z), and above the height of straight legs on flat feet, metres of the average body.
     pub hips: DVec3,
-    /// Where the hips face, radians from +z to +x.
+    /// Heading of the hips, radians from +z to +x.
     pub yaw: f64,
     /// Hips bent forward, tilted to the left, turned to the left of `yaw`, radians.
     pub pelvis: DVec3,
-    /// The trunk bent forward, tilted to the left, twisted to the left, on top of the hips, radians.
+    /// Trunk bent forward, tilted to the left, twisted to the left, on top of the hips, radians.
     pub trunk: DVec3,
-    /// The head nods, tilts to the left, looks left, on top of the trunk, radians.
+    /// Head nodding, tilted to the left, looking left, on top of the trunk, radians.
     pub head: DVec3,
     pub feet: [Foot; 2],
     pub arms: [Arm; 2],
-    /// How far the knees point outwards of the feet, radians.
+    /// Outward rotation of the knees from the feet, radians.
     pub knees_out: f64,
 }
 
 impl Foot {
-    /// Flat on the ground.
+    /// Returns a foot flat on the ground.
     pub(crate) fn planted(at: DVec2, yaw: f64) -> Self {
         Self { at, lift: 0.0, yaw, roll: 0.0, pivot: 1.0 }
     }
@@ -69,8 +69,8 @@ impl Foot {
 }
 
 impl Arm {
-    /// From angles: how far the upper arm is raised to the front and to the side, how far the elbow bends and
-    /// towards where (0 to the front, positive inwards), radians.
+    /// Returns an arm from angles: elevation of the upper arm to the front and to the side, bend of the elbow and its
+    /// direction (0 to the front, positive inwards), radians.
     pub(crate) fn angled(forward: f64, out: f64, bend: f64, inwards: f64) -> Self {
         let upper = DQuat::from_rotation_z(out) * DQuat::from_rotation_x(-forward);
         let fore = upper * DQuat::from_rotation_y(-inwards) * DQuat::from_rotation_x(-bend);
@@ -94,7 +94,7 @@ impl Arm {
 }
 
 impl Posture {
-    /// Upright at the origin, feet side by side, arms hanging `out` radians from the body.
+    /// Returns an upright posture at the origin, feet side by side, arms hanging `out` radians from the body.
     pub(crate) fn standing(out: f64) -> Self {
         const HALF_STANCE_M: f64 = 0.105;
         let foot = |side: f64| Foot::planted(DVec2::new(side * HALF_STANCE_M, 0.0), side * 0.14);
@@ -111,7 +111,7 @@ impl Posture {
         }
     }
 
-    /// Between two, `t` of the way to the other.
+    /// Interpolates, `t` of the way to the other.
     pub(crate) fn mix(&self, other: &Self, t: f64) -> Self {
         Self {
             hips: self.hips.lerp(other.hips, t),

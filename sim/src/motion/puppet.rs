@@ -1,4 +1,4 @@
-//! A skeleton on strings: a pose from a posture, by two-bone inverse kinematics for the legs.
+//! Conversion of postures to poses, with two-bone inverse kinematics for the legs.
 
 use std::f64::consts::PI;
 
@@ -13,12 +13,12 @@ use crate::person::shoes::SOLE_M;
 
 /// Height of a shoe's sole below the bare foot, metres.
 const SOLE: f64 = SOLE_M as f64;
-/// Length of the average body's leg, hip to ankle, metres: what a posture's lengths are measured by.
+/// Length of the average body's leg, hip to ankle, metres: unit of a posture's lengths.
 const AVERAGE_LEG_M: f64 = 0.80;
-/// Legs are never stretched farther than this share of their length: knees stay soft, feet stay reachable.
+/// Largest extension of the legs relative to their length: knees stay soft, feet stay reachable.
 const STRETCH: f64 = 0.995;
 
-/// World (z up) from canonical (y up, facing +z) axes; the body then faces -y.
+/// Returns the rotation to world axes (z up) from canonical ones (y up, facing +z); the body then faces -y.
 pub(crate) fn world_from_canonical_axes() -> DQuat {
     DQuat::from_rotation_x(PI / 2.0)
 }
@@ -39,7 +39,7 @@ struct ArmJoints {
     thumb: usize,
 }
 
-/// The skeleton with the joints that the clips move, and measures of its owner.
+/// Skeleton with the joints that the clips move, and measures of its owner.
 pub(crate) struct Puppet<'a> {
     skeleton: &'a Skeleton,
     origins: Vec<DVec3>,
@@ -48,17 +48,17 @@ pub(crate) struct Puppet<'a> {
     neck: [usize; 2],
     head: usize,
     arms: [ArmJoints; 2],
-    /// Metres of this body for one of the average body.
+    /// Metres of this body per metre of the average body.
     scale: f64,
     leg_m: f64,
     hang_out: f64,
     chest_m: f64,
-    /// How far the sole reaches behind the ankle, metres.
+    /// Distance of the sole's end behind the ankle, metres.
     heel_m: f64,
 }
 
 impl<'a> Puppet<'a> {
-    /// Of a skeleton whose owner's surface is `clothed` (at rest).
+    /// Creates the puppet of a skeleton whose owner's surface is `clothed` (at rest).
     pub(crate) fn new(skeleton: &'a Skeleton, clothed: &Template) -> Result<Self, SimError> {
         let find = |name: &'static str| skeleton.joint(name).ok_or(SimError::NoJoint(name));
         let origins = skeleton.canonical_origins();
@@ -104,28 +104,28 @@ impl<'a> Puppet<'a> {
         })
     }
 
-    /// Metres of this body for one of the average body.
+    /// Returns the metres of this body per metre of the average body.
     pub(crate) fn scale(&self) -> f64 {
         self.scale
     }
 
-    /// Standing upright, arms hanging free of hips and clothes.
+    /// Returns an upright posture with the arms hanging free of hips and clothes.
     pub(crate) fn standing(&self) -> Posture {
         Posture::standing(self.hang_out)
     }
 
-    /// How far hanging arms point to the side, radians.
+    /// Returns the angle of hanging arms to the side, radians.
     pub(crate) fn hang_out(&self) -> f64 {
         self.hang_out
     }
 
-    /// How far the clothed chest reaches in front of the shoulders, metres of the average body.
+    /// Returns the distance of the clothed chest in front of the shoulders, metres of the average body.
     pub(crate) fn chest_m(&self) -> f64 {
         self.chest_m
     }
 
-    /// An arm whose wrist is at a place of the chest's frame (metres of the average body from the middle between
-    /// the shoulders, x away from the body's middle), its elbow towards `elbow`.
+    /// Returns an arm with its wrist at a position of the chest's frame (metres of the average body from the middle
+    /// between the shoulders, x away from the body's middle) and its elbow towards `elbow`.
     pub(crate) fn reach(&self, wrist: DVec3, elbow: DVec3) -> Arm {
         let [shoulder, fore, hand] =
             [self.arms[0].shoulder, self.arms[0].elbow, self.arms[0].hand].map(|joint| self.origins[joint]);
@@ -137,7 +137,7 @@ impl<'a> Puppet<'a> {
         Arm { upper, fore: (wrist_at - upper * a).normalize_or(upper), hand: [0.0; 2], curl: 0.35 }
     }
 
-    /// The pose, its hips lowered by `lower_m` (see [`Self::too_high_m`]).
+    /// Returns the pose, with hips lowered by `lower_m` (see [`Self::too_high_m`]).
     pub(crate) fn pose(&self, posture: &Posture, lower_m: f64) -> Pose {
         let root = root_turn(posture);
         let ankles = [0, 1].map(|i| self.ankle(i, &posture.feet[i]));
@@ -173,7 +173,7 @@ impl<'a> Puppet<'a> {
         self.assemble(root_at, &delta)
     }
 
-    /// Where the ankle is, canonical axes on the ground, metres.
+    /// Returns the position of the ankle, canonical axes on the ground, metres.
     fn ankle(&self, side: usize, foot: &Foot) -> DVec3 {
         let leg = &self.legs[side];
         let (ankle, toe) = (self.origins[leg.ankle], self.origins[leg.toe]);
@@ -186,7 +186,7 @@ impl<'a> Puppet<'a> {
         DVec3::new(at.x, foot.lift * self.scale, at.y) + DQuat::from_rotation_y(foot.yaw) * rolled
     }
 
-    /// How much lower than wanted the hips must be for both feet to be reached, metres.
+    /// Returns the distance by which the hips must be lowered for both feet to be reached, metres.
     pub(crate) fn too_high_m(&self, posture: &Posture) -> f64 {
         let root = root_turn(posture);
         let wanted = self.root_at(posture);
@@ -203,14 +203,14 @@ impl<'a> Puppet<'a> {
         (wanted.y - limits.fold(f64::INFINITY, f64::min)).max(0.0)
     }
 
-    /// Hips where the posture wants them, canonical axes on the ground, metres.
+    /// Returns the position of the hips, canonical axes on the ground, metres.
     fn root_at(&self, posture: &Posture) -> DVec3 {
         let hip_y = self.origins[self.legs[0].hip].y - self.origins[0].y;
         let straight = self.origins[self.legs[0].ankle].y + SOLE + STRETCH * self.leg_m - hip_y;
         posture.hips * self.scale + DVec3::Y * straight
     }
 
-    /// The ankle to its place, the knee forward.
+    /// Places the ankle by rotating the leg, with the knee forward.
     fn place_leg(
         &self,
         leg: &Leg,
@@ -265,7 +265,7 @@ impl<'a> Puppet<'a> {
         delta[joints.fingers[1]] = Some(trunk * palm * bent(arm.hand[0] + 1.6 * curl));
     }
 
-    /// Local rotations from rotations away from rest; a joint without one follows its parent.
+    /// Returns the pose of rotations away from rest; a joint without one follows its parent.
     fn assemble(&self, root_at: DVec3, delta: &[Option<DQuat>]) -> Pose {
         let world = world_from_canonical_axes();
         let joints = self.skeleton.joints();
@@ -288,7 +288,7 @@ impl<'a> Puppet<'a> {
     }
 }
 
-/// Bent forward, tilted to the left and turned to the left, in this order.
+/// Returns the rotation that bends forward, tilts to the left and turns to the left, in this order.
 fn bend(angles: DVec3) -> DQuat {
     DQuat::from_rotation_y(angles.z) * DQuat::from_rotation_z(-angles.y) * DQuat::from_rotation_x(angles.x)
 }
@@ -297,7 +297,7 @@ fn root_turn(posture: &Posture) -> DQuat {
     DQuat::from_rotation_y(posture.yaw) * bend(posture.pelvis)
 }
 
-/// How far an arm must point to the side to hang free of hips and clothes, radians.
+/// Returns the angle to the side at which an arm hangs free of hips and clothes, radians.
 fn hanging_angle(origins: &[DVec3], arm: &ArmJoints, clothed: &Template) -> f64 {
     use flyrig_body::Part::{LeftLeg, RightLeg, Torso};
     let [shoulder, elbow, hand] = [arm.shoulder, arm.elbow, arm.hand].map(|joint| origins[joint]);
@@ -317,7 +317,7 @@ fn hanging_angle(origins: &[DVec3], arm: &ArmJoints, clothed: &Template) -> f64 
     widest.fold(0.10, f64::max).min(0.55)
 }
 
-/// How far the sole under the left foot reaches behind the ankle, metres.
+/// Returns the distance of the sole's end behind the ankle of the left foot, metres.
 fn heel_depth(ankle: DVec3, clothed: &Template) -> f64 {
     let behind = |(p, part): (&glam::Vec3, &flyrig_body::Part)| {
         let here = *part == flyrig_body::Part::LeftFoot && f64::from(p.y) < 0.004 - SOLE;
@@ -326,7 +326,7 @@ fn heel_depth(ankle: DVec3, clothed: &Template) -> f64 {
     clothed.positions.iter().zip(&clothed.parts).filter_map(behind).fold(0.03, f64::max).min(0.12)
 }
 
-/// How far the clothed chest reaches in front of the shoulders, metres.
+/// Returns the distance of the clothed chest in front of the shoulders, metres.
 fn chest_depth(origins: &[DVec3], arm: &ArmJoints, clothed: &Template) -> f64 {
     let [shoulder, elbow] = [arm.shoulder, arm.elbow].map(|joint| origins[joint]);
     let long = shoulder.distance(elbow);
@@ -338,8 +338,8 @@ fn chest_depth(origins: &[DVec3], arm: &ArmJoints, clothed: &Template) -> f64 {
     clothed.positions.iter().zip(&clothed.parts).filter_map(front).fold(0.05, f64::max).min(0.35)
 }
 
-/// Direction to a target within reach of two bones, direction of the bend (towards `pole`), and cosine and sine of
-/// the first bone's angle to the line.
+/// Solves two-bone inverse kinematics: direction to a target within reach, direction of the bend (towards `pole`), and
+/// cosine and sine of the first bone's angle to the line.
 fn two_bones(first: f64, second: f64, target: DVec3, pole: DVec3) -> (DVec3, DVec3, f64, f64) {
     let distance = target.length().clamp((first - second).abs() + 1e-3, (first + second) * 0.9995);
     let along = target.normalize_or(DVec3::NEG_Y);
@@ -348,8 +348,8 @@ fn two_bones(first: f64, second: f64, target: DVec3, pole: DVec3) -> (DVec3, DVe
     (along, bend, cos, (1.0 - cos * cos).sqrt())
 }
 
-/// Rotation that takes the resting direction of a leg's bone to a new one, and its hinge (canonical +x at rest)
-/// with it.
+/// Returns the rotation that takes the resting direction of a leg's bone to a new one, and its hinge (canonical +x at
+/// rest) with it.
 fn bone_rotation(rest: DVec3, now: DVec3, hinge: DVec3) -> DQuat {
     let frame = |bone: DVec3, hinge: DVec3| {
         let down = bone.normalize_or(DVec3::NEG_Y);

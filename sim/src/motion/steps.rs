@@ -5,23 +5,23 @@ use glam::DVec2;
 use crate::motion::curve::{closed, ease, hump};
 use crate::motion::posture::Foot;
 
-/// Share of a walking foot's cycle that it stands (Perry, Gait Analysis, 1992).
+/// Stance fraction of a walking foot's cycle (Perry, Gait Analysis, 1992).
 pub(crate) const STANCE: f64 = 0.62;
 
-/// A place where a foot stands. Phases run over a closed clip.
+/// Place where a foot stands. Phases run over a closed clip.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Plant {
-    /// When the foot leaves the plant before this one.
+    /// Phase at which the foot leaves the previous plant.
     pub leaves: f64,
-    /// When it comes to stand here.
+    /// Phase at which the foot lands here.
     pub lands: f64,
     /// Ankle on the ground (x, z), metres of the average body.
     pub at: DVec2,
-    /// Radians.
+    /// Heading, radians.
     pub yaw: f64,
 }
 
-/// How feet are lifted.
+/// Lift of swinging feet.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Gait {
     /// Height of a swinging foot, metres of the average body.
@@ -32,7 +32,8 @@ pub(crate) struct Gait {
     pub strike: f64,
 }
 
-/// The foot at a phase of a closed clip whose plants land one after the other; each round turns by `turn` radians.
+/// Returns the foot at a phase of a closed clip whose plants land one after the other; each cycle turns by `turn`
+/// radians.
 pub(crate) fn foot(plants: &[Plant], phase: f64, turn: f64, gait: Gait) -> Foot {
     // The plant of any round, -1 being the round before.
     let count = plants.len() as i64;

@@ -1,4 +1,4 @@
-//! A person who moves.
+//! Person with a motion.
 
 use flyrig_body::skin_mesh;
 use flyrig_types::{Pose, PoseTrack};
@@ -10,20 +10,20 @@ use crate::person::assembly::Person;
 use crate::person::look::Look;
 use crate::{SimConfig, SimError};
 
-/// A dressed person with a motion.
+/// Dressed person with a motion.
 pub(crate) struct Actor {
     pub person: Person,
     pub track: PoseTrack,
-    /// None for a person who wears nothing loose.
+    /// Loose cloth; `None` for a person without any.
     cloth: Option<Cloth>,
 }
 
-/// The surface that the cameras see, world metres, in the order of [`Person::clothed`].
+/// Visible surface, world metres, in the order of [`Person::clothed`].
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Shape {
     pub positions: Vec<Vec3>,
     pub normals: Vec<Vec3>,
-    /// How far each vertex is from where skinning alone would put it, world metres.
+    /// Displacement of each vertex from its skinned position, world metres.
     pub displacement: Vec<Vec3>,
 }
 
@@ -35,12 +35,12 @@ impl Actor {
         Ok(Self { person, track, cloth })
     }
 
-    /// Pose at a time; the motion starts over after its end.
+    /// Returns the pose at a time; the motion repeats.
     pub(crate) fn pose(&self, nanos: i64) -> Pose {
         self.track.at_repeated(nanos)
     }
 
-    /// The surface at a time.
+    /// Returns the surface at a time.
     pub(crate) fn shape(&mut self, nanos: i64) -> Shape {
         let (mut positions, mut normals) = skin_mesh(&self.person.clothed, &self.pose(nanos));
         let displacement = match &mut self.cloth {

@@ -1,4 +1,4 @@
-//! A dressed person: all surfaces in one mesh with its textures.
+//! Assembly of a dressed person: all surfaces in one mesh with its textures.
 
 use flyrig_body::{ShapeParams, Template, default_template};
 use glam::{Vec2, Vec3};
@@ -21,34 +21,34 @@ use crate::person::look::Look;
 use crate::person::shoes::{eyes, shoes};
 use crate::texture::{Texture, UvMap};
 
-/// The clothed body at rest.
+/// Clothed body at rest.
 pub(crate) struct Person {
-    /// The body under the clothes.
+    /// Body under the clothes.
     pub body: Template,
-    /// The surface seen by the cameras, skinned by the body's joints.
+    /// Surface seen by the cameras, skinned by the body's joints.
     pub clothed: Template,
     /// Per vertex of the clothed surface: the body point that carries it, canonical metres.
     pub carriers: Vec<Vec3>,
-    /// Per vertex: texture, and how open the surface is to the sky (0..=1).
+    /// Per vertex: texture, and openness of the surface to the sky (0..=1).
     pub layer_and_openness: Vec<(u32, f32)>,
     /// sRGB, all of one size.
     pub textures: Vec<Texture>,
-    /// Per vertex: how long it hangs free, metres (see [`crate::loose`]).
+    /// Per vertex: free length, metres (see [`crate::clothes::loose`]).
     pub free_m: Vec<f32>,
-    /// The sheets that the surface is made of.
+    /// Sheets that the surface is made of.
     pub sheets: Vec<SheetRange>,
     /// Vertices of the shoes.
     #[cfg_attr(not(test), expect(dead_code, reason = "tests of motions ask where the feet stand"))]
     pub shoe_vertices: std::ops::Range<usize>,
 }
 
-/// A connected garment among a person's surfaces.
+/// Connected garment among a person's surfaces.
 pub(crate) struct SheetRange {
     pub vertices: std::ops::Range<usize>,
     pub triangles: std::ops::Range<usize>,
     /// See [`stiffness`].
     pub stiff: f32,
-    /// Hangs around the body and is not laid on it.
+    /// Whether it hangs around the body instead of lying on it.
     pub hangs: bool,
 }
 
@@ -61,7 +61,7 @@ struct Layer {
 }
 
 impl Layer {
-    /// What lies on the body and does not move of its own.
+    /// Creates a layer that lies on the body without motion of its own.
     fn held(sheets: Vec<Sheet>, texture: Texture) -> Self {
         Self { sheets, texture, stiff: 1.0, hangs: false }
     }
@@ -92,7 +92,7 @@ impl Person {
     }
 }
 
-/// Everything seen of a person; the last sheet of the last layer are the shoes.
+/// Returns all visible layers of a person; the last sheet of the last layer are the shoes.
 fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
     let tailor = Tailor::new(naked, seed);
     let map = UvMap::new(naked, side);

@@ -1,11 +1,11 @@
-//! A person in words.
+//! Description of a person in words.
 
 use crate::SimConfig;
 use crate::clothes::wardrobe::{Beard, Bottom, Cloth, Hat};
 use crate::person::look::Look;
 
-/// What the configuration's person looks like, in a line of words; two people of the same words may still
-/// differ in shape and colours. Nothing is drawn.
+/// Describes the configured person in a line of words; two people of the same words may still differ in shape and
+/// colours. Renders nothing.
 #[must_use]
 pub fn describe_person(config: &SimConfig) -> String {
     let look = Look::new(config);
@@ -49,8 +49,8 @@ pub fn describe_person(config: &SimConfig) -> String {
     words.join(", ").to_lowercase()
 }
 
-/// A number for everything about the configuration's person, down to the last shade; people of different
-/// numbers differ. Nothing is drawn.
+/// Returns a hash of everything about the configured person, down to the last shade; people of different hashes differ.
+/// Renders nothing.
 #[must_use]
 pub fn person_fingerprint(config: &SimConfig) -> u64 {
     // FNV-1a, which is the same on every machine.

@@ -1,4 +1,4 @@
-//! Skin and face paint on the average body's coordinates.
+//! Paint of skin and face in coordinates of the average body.
 
 use glam::{Vec2, Vec3};
 
@@ -9,7 +9,7 @@ use crate::person::look::Look;
 use crate::person::regions::{EYE, above_hairline};
 use crate::texture::{mix3, scale3};
 
-/// Colour of the skin at a point of the average body.
+/// Returns the colour of the skin at a point of the average body.
 pub(crate) fn skin_colour(look: &Look, noise: Noise, p: Vec3) -> Srgb {
     let blotch = noise.sum(p * 22.0, 3);
     let pores = noise.at(p * 420.0);
@@ -109,7 +109,7 @@ fn brows(look: &Look, noise: Noise, colour: Srgb, p: Vec3, front: f32) -> Srgb {
     mix3(colour, scale3(look.hair, 0.85), scalp * under)
 }
 
-/// Colour of an eyeball; `at` is the offset from the pupil in eyeball radii, x to the image's right.
+/// Returns the colour of an eyeball; `at` is the offset from the pupil in eyeball radii, x to the image's right.
 pub(crate) fn eye_colour(look: &Look, at: Vec2) -> Srgb {
     let r = at.length();
     let white = mix3([0.90, 0.88, 0.86], [0.72, 0.58, 0.55], smoothstep(0.55, 1.0, r));

@@ -1,5 +1,5 @@
-//! What makes a face one's own beyond the body's shape: nose, mouth, eyes, brows, cheeks and jaw, moved by smooth fields
-//! on the average body's coordinates.
+//! Individual features of a face beyond the body's shape: nose, mouth, eyes, brows, cheeks and jaw, moved by smooth
+//! fields in coordinates of the average body.
 
 use glam::Vec3;
 use rand::{RngExt, rngs::StdRng};
@@ -9,7 +9,7 @@ use crate::person::regions::EYE;
 /// Height of the line between the lips of the average face, metres.
 pub(crate) const LIPS_Y: f32 = 1.4858;
 
-/// Each about -1 to 1, 0 for the average face.
+/// Strength of each feature, about -1 to 1, 0 for the average face.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct Features {
     pub nose_wide: f32,
@@ -17,15 +17,15 @@ pub(crate) struct Features {
     pub nose_up: f32,
     pub bridge: f32,
     pub mouth_wide: f32,
-    /// Corners of the mouth up.
+    /// Raise of the corners of the mouth.
     pub smile: f32,
     pub lips_full: f32,
     pub eyes_apart: f32,
     pub eyes_large: f32,
-    /// Outer corners up.
+    /// Raise of the outer corners.
     pub eyes_slant: f32,
     pub brows_high: f32,
-    /// Paint: how much the brows arch, how thick they are, and how far their inner ends are raised.
+    /// Paint of the brows: arch, thickness, and raise of their inner ends.
     pub brows_arched: f32,
     pub brows_thick: f32,
     pub brows_open: f32,
@@ -34,7 +34,7 @@ pub(crate) struct Features {
 }
 
 impl Features {
-    /// By a seed's numbers; most people are close to the middle in most things.
+    /// Draws features from a seed's numbers; most people are close to the average in most of them.
     pub(crate) fn drawn(dice: &mut StdRng) -> Self {
         let mut one = || 0.65 * (dice.random_range(-1.0f32..1.0) + dice.random_range(-1.0f32..1.0));
         Self {
@@ -58,7 +58,7 @@ impl Features {
         }
     }
 
-    /// How far a point moves, given its place on the average body, metres.
+    /// Returns the displacement of a point, given its position on the average body, metres.
     pub(crate) fn moved(&self, average: Vec3) -> Vec3 {
         if average.y < 1.40 || average.z < 0.0 {
             return Vec3::ZERO;

@@ -15,7 +15,7 @@ use crate::person::look::Look;
 use crate::person::regions::{above_hairline, inside_beard};
 
 impl Tailor {
-    /// A cap of hair, with what hangs from it.
+    /// Builds a cap of hair with its hanging parts.
     pub(crate) fn hair(&self, look: &Look, naked: &Sheet) -> Option<Sheet> {
         let (thick, rough) = match look.cut {
             HairCut::Bald => return None,
@@ -60,7 +60,7 @@ impl Tailor {
         Some(hair)
     }
 
-    /// Lets the hair hang from the hairline at the sides and the back, there down to `bottom_m`.
+    /// Adds hair that hangs from the hairline at the sides and the back, there down to `bottom_m`.
     fn add_curtain(&self, hair: &mut Sheet, bottom_m: f32) {
         let rows = if bottom_m < 1.4 { 14 } else { 7 };
         let around = |p: Vec3| p.x.atan2(p.z - 0.040);
@@ -105,7 +105,7 @@ impl Tailor {
         }
     }
 
-    /// Hair on the face.
+    /// Builds a beard.
     pub(crate) fn beard(&self, look: &Look) -> Option<Sheet> {
         let (thick, long) = match look.beard {
             Beard::None => return None,
@@ -136,14 +136,14 @@ impl Tailor {
     }
 }
 
-/// A place on the head where the hair's texture is painted with strands.
+/// Returns a texture coordinate on the head where the hair's texture has strands.
 fn strands_uv(hair: &Sheet) -> Vec2 {
     let beside = Vec3::new(0.045, 1.615, 0.0);
     let by_distance = |a: &&Node, b: &&Node| a.average.distance(beside).total_cmp(&b.average.distance(beside));
     hair.nodes.iter().min_by(by_distance).map_or(Vec2::ZERO, |node| node.uv)
 }
 
-/// A ball of hair at the back of the head.
+/// Adds a bun at the back of the head.
 fn add_bun(hair: &mut Sheet) {
     let centre_average = Vec3::new(0.0, 1.605, -0.045);
     let Some(near) = hair
@@ -167,7 +167,7 @@ fn add_bun(hair: &mut Sheet) {
     }
 }
 
-/// A tail of hair bound at the back of the head.
+/// Adds a ponytail at the back of the head.
 fn add_tail(hair: &mut Sheet, lift: &HeadLift<'_>, noise: Noise) {
     let patch = strands_uv(hair);
     let path = |t: f32| {

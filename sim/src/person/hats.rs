@@ -9,18 +9,18 @@ use crate::clothes::sheet::{Node, Sheet};
 use crate::clothes::wardrobe::{Cloth, Hat};
 use crate::noise::{Noise, smoothstep};
 
-/// Middle of the head seen from above, metres on the average body.
+/// Centre of the head seen from above, metres on the average body.
 const MIDDLE_Z_M: f32 = 0.047;
 /// Half axes of a hat at its rim.
 const HALF_M: Vec2 = Vec2::new(0.0905, 0.1090);
 
-/// Height of a hat's rim in the direction of a point of the average head: lower at the back.
+/// Returns the height of a hat's rim in the direction of a point of the average head: lower at the back.
 pub(crate) fn rim_height_m(p: Vec3) -> f32 {
     let around = p.x.abs().atan2(p.z - MIDDLE_Z_M);
     1.574 + 0.020 * around.cos()
 }
 
-/// The cloth of a hat.
+/// Returns the cloth of a hat.
 pub(crate) fn hat_cloth(hat: &Hat) -> Option<&Cloth> {
     match hat {
         Hat::None => None,
@@ -28,7 +28,7 @@ pub(crate) fn hat_cloth(hat: &Hat) -> Option<&Cloth> {
     }
 }
 
-/// The hat, textured by u around from the front and v from the rim (0.1) to the apex (1); below 0.1 lie brims.
+/// Builds the hat, textured by u around from the front and v from the rim (0.1) to the apex (1); below 0.1 lie brims.
 pub(crate) fn hat(hat: &Hat, body: &Sheet, noise: Noise) -> Sheet {
     const COLUMNS: u32 = 56;
     let lift = HeadLift::new(body);

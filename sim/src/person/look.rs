@@ -1,4 +1,4 @@
-//! What a seed decides about a person.
+//! Appearance of a person, drawn from a seed.
 
 use flyrig_body::ShapeParams;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
@@ -10,7 +10,7 @@ use crate::person::features::Features;
 use crate::person::palette::{CHINOS, CLOTHS, DENIMS, HAIRS, IRISES, LEATHERS, SHOES, SKINS};
 use crate::{Build, SimConfig};
 
-/// Everything about the person's looks.
+/// Appearance of a person.
 #[derive(Debug, Clone)]
 pub(crate) struct Look {
     pub shape: ShapeParams,
@@ -34,7 +34,7 @@ pub(crate) struct Look {
     pub features: Features,
 }
 
-/// Draws from a seed's numbers.
+/// Random choices from a seed.
 struct Dice(StdRng);
 
 impl Dice {
@@ -46,7 +46,7 @@ impl Dice {
         self.0.random_range(low..high)
     }
 
-    /// Denser in the middle of the range.
+    /// Returns a number in a range, denser in its middle.
     fn middling(&mut self, low: f32, high: f32) -> f32 {
         0.5 * (self.within(low, high) + self.within(low, high))
     }
@@ -55,7 +55,7 @@ impl Dice {
         self.within(0.0, 1.0) < share
     }
 
-    /// A colour close to one of a palette.
+    /// Returns a colour close to one of a palette.
     fn colour(&mut self, of: &[Srgb]) -> Srgb {
         let light = self.within(-0.05, 0.05);
         self.pick(of).map(|c| (c + light + self.within(-0.025, 0.025)).clamp(0.02, 0.97))
@@ -136,7 +136,7 @@ impl Look {
     }
 }
 
-/// Shape, whether to dress as a woman, and the age axis.
+/// Returns shape, whether to dress as a woman, and the age axis.
 fn body_shape(config: &SimConfig, dice: &mut Dice) -> (ShapeParams, bool, f32) {
     let female = dice.chance(0.5);
     let age = if dice.chance(0.12) {

@@ -1,8 +1,8 @@
-//! Colours people and clothes come in, sRGB.
+//! Palettes of people and clothes, sRGB.
 
 use crate::clothes::wardrobe::Srgb;
 
-/// From light to dark.
+/// Skin colours from light to dark.
 pub(crate) const SKINS: [Srgb; 7] = [
     [0.92, 0.76, 0.67],
     [0.90, 0.73, 0.63],
@@ -12,7 +12,7 @@ pub(crate) const SKINS: [Srgb; 7] = [
     [0.46, 0.30, 0.22],
     [0.34, 0.22, 0.17],
 ];
-/// The first two go with every skin.
+/// Hair colours, of which the first two go with every skin.
 pub(crate) const HAIRS: [Srgb; 8] = [
     [0.10, 0.08, 0.07],
     [0.17, 0.11, 0.08],
@@ -23,7 +23,7 @@ pub(crate) const HAIRS: [Srgb; 8] = [
     [0.50, 0.22, 0.10],
     [0.42, 0.40, 0.38],
 ];
-/// The first two go with every skin.
+/// Iris colours, of which the first two go with every skin.
 pub(crate) const IRISES: [Srgb; 5] =
     [[0.18, 0.11, 0.07], [0.30, 0.19, 0.11], [0.25, 0.38, 0.52], [0.30, 0.42, 0.28], [0.42, 0.46, 0.48]];
 pub(crate) const CLOTHS: [Srgb; 22] = [

@@ -1,11 +1,11 @@
-//! A second person who walks through.
+//! Second person who walks through the room.
 
 use crate::camera::sensor::hash;
 use crate::motion::choice;
 use crate::person::actor::Actor;
 use crate::{MotionConfig, MotionKind, PersonConfig, SimConfig, SimError};
 
-/// Another person than the configuration's, who walks to and fro past the middle.
+/// Creates a person other than the configured one, who walks to and fro past the centre.
 pub(crate) fn passer_by(config: &SimConfig) -> Result<Actor, SimError> {
     let seed = hash(config.seed, 0x9a55_e12b);
     let own = SimConfig {

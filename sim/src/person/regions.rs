@@ -1,4 +1,4 @@
-//! Where things are on the average built-in body: canonical metres, y up, facing +z, standing on y = 0.
+//! Regions of the average built-in body: canonical metres, y up, facing +z, standing on y = 0.
 
 use glam::Vec3;
 
@@ -10,10 +10,11 @@ pub(crate) const EYE: (Vec3, f32) = (Vec3::new(0.0293, 1.5520, 0.1178), 0.0140);
 pub(crate) const SHOULDER: Vec3 = Vec3::new(0.170, 1.320, 0.019);
 pub(crate) const ELBOW: Vec3 = Vec3::new(0.331, 1.139, 0.020);
 pub(crate) const WRIST: Vec3 = Vec3::new(0.453, 1.015, 0.183);
-/// The body below is inside the shoe.
+/// Height below which the body is inside the shoe.
 pub(crate) const ANKLE_TOP_M: f32 = 0.085;
 
-/// Distance along the arm from the shoulder joint (elbow at 0.242, wrist at 0.482 m), and distance from its axis.
+/// Returns the distance along the arm from the shoulder joint (elbow at 0.242, wrist at 0.482 m), and the distance from
+/// its axis.
 pub(crate) fn along_arm(p: Vec3) -> (f32, f32) {
     let p = Vec3::new(p.x.abs(), p.y, p.z);
     let upper = ELBOW - SHOULDER;
@@ -27,7 +28,7 @@ pub(crate) fn along_arm(p: Vec3) -> (f32, f32) {
     if du < df { (s.min(upper_m), du) } else { (upper_m + f.max(0.0), df) }
 }
 
-/// How far inside the neck opening's edge a point of a top is, metres.
+/// Returns the signed distance of a point of a top from the edge of the neck opening, metres, positive inside.
 pub(crate) fn below_neckline(p: Vec3, v_neck_m: f32, radius_m: f32) -> f32 {
     let round = p.distance(Vec3::new(0.0, 1.45, 0.035)) - radius_m;
     if v_neck_m <= 0.0 || p.z < 0.0 {
@@ -39,7 +40,8 @@ pub(crate) fn below_neckline(p: Vec3, v_neck_m: f32, radius_m: f32) -> f32 {
     round.min(p.x.abs() - half_width)
 }
 
-/// Height of the hairline by direction around the head, metres; positive return: on the scalp.
+/// Returns the signed distance of a point from the hairline, metres, by direction around the head; positive on the
+/// scalp.
 pub(crate) fn above_hairline(p: Vec3, recede_m: f32) -> f32 {
     const LINE: [(f32, f32); 10] = [
         (0.0, 1.617),
@@ -62,18 +64,18 @@ pub(crate) fn above_hairline(p: Vec3, recede_m: f32) -> f32 {
     if is_ear(p) { above.min(-0.012) } else { above }
 }
 
-/// Whether a point of the average body is on an ear.
+/// Returns whether a point of the average body is on an ear.
 pub(crate) fn is_ear(p: Vec3) -> bool {
     p.x.abs() > 0.0665 && (1.495..1.562).contains(&p.y) && (0.012..0.075).contains(&p.z)
 }
 
-/// Whether a point of a top belongs to its sleeve.
+/// Returns whether a point of a top belongs to its sleeve.
 pub(crate) fn on_sleeve(p: Vec3) -> bool {
     let (along, from_axis) = along_arm(p);
     along > 0.012 && from_axis < 0.078 && p.x.abs() > 0.13
 }
 
-/// Angle around the upper arm's axis, 0 on its outer side.
+/// Returns the angle around the upper arm's axis, 0 on its outer side.
 pub(crate) fn around_arm(p: Vec3) -> f32 {
     let p = Vec3::new(p.x.abs(), p.y, p.z);
     let outward = Vec3::new(SHOULDER.y - ELBOW.y, ELBOW.x - SHOULDER.x, 0.0).normalize_or(Vec3::X);
@@ -82,7 +84,7 @@ pub(crate) fn around_arm(p: Vec3) -> f32 {
     (from_axis.z - forward).atan2(from_axis.dot(outward))
 }
 
-/// How far inside a beard's edge a point of the face is, metres.
+/// Returns the signed distance of a point of the face from a beard's edge, metres, positive inside.
 pub(crate) fn inside_beard(p: Vec3, beard: Beard) -> f32 {
     if is_ear(p) {
         return -0.01;

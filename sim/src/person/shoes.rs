@@ -8,13 +8,13 @@ use crate::noise::smoothstep;
 use crate::person::hair::ball;
 use crate::person::regions::{ANKLE_TOP_M, EYE};
 
-/// How far a shoe's sole reaches below the bare foot, metres.
+/// Thickness of a shoe's sole below the bare foot, metres.
 pub(crate) const SOLE_M: f32 = 0.020;
 
 /// Texture of uppers: the left half of the extras texture; soles: its upper right quarter; eyes: lower right.
 const UPPER_U: f32 = 0.5;
 
-/// Both shoes.
+/// Builds both shoes.
 pub(crate) fn shoes(body: &Sheet) -> Sheet {
     let mut shoes = Sheet::default();
     for left in [true, false] {
@@ -127,7 +127,7 @@ fn add_shoe(shoes: &mut Sheet, foot: &[&Node]) {
     add(true);
 }
 
-/// Both eyeballs, textured by the lower right quarter of the extras.
+/// Builds both eyeballs, textured by the lower right quarter of the extras.
 pub(crate) fn eyes(body: &Sheet) -> Sheet {
     let mut eyes = Sheet::default();
     for side in [1.0, -1.0] {

@@ -1,4 +1,4 @@
-//! Furniture and other things, each standing on the floor around its own origin; its front looks along -y.
+//! Furniture and other objects, each standing on the floor around its own origin, with its front towards -y.
 
 use std::f32::consts::{PI, TAU};
 
@@ -19,7 +19,7 @@ fn wood(tint: Vec3) -> Coat {
 /// Height of a table's top, metres.
 pub(crate) const TABLE_M: f32 = 0.74;
 
-/// A table on four legs.
+/// Adds a table on four legs.
 pub(crate) fn table(mesh: &mut SceneMesh, half: [f32; 2], top: Coat, legs: Coat) {
     let [x, y] = half;
     mesh.block(Vec3::new(0.0, 0.0, TABLE_M - 0.016), Vec3::new(x, y, 0.016), top);
@@ -30,7 +30,7 @@ pub(crate) fn table(mesh: &mut SceneMesh, half: [f32; 2], top: Coat, legs: Coat)
     }
 }
 
-/// A desk with a cabinet of drawers.
+/// Adds a desk with a cabinet of drawers.
 pub(crate) fn desk(mesh: &mut SceneMesh, plan: &Plan, index: u64) {
     let top = wood(Vec3::splat(plan.draw(index, 0.55, 0.9)));
     let body = Coat::new(Surface::Plain, Vec3::splat(plan.draw(index + 1, 0.12, 0.7)));
@@ -45,7 +45,7 @@ pub(crate) fn desk(mesh: &mut SceneMesh, plan: &Plan, index: u64) {
     }
 }
 
-/// A chair that swivels on five wheels.
+/// Adds a swivel chair on five wheels.
 pub(crate) fn office_chair(mesh: &mut SceneMesh, cloth: Vec3) {
     let cloth = Coat::new(Surface::Weave, cloth);
     for leg in 0..5 {
@@ -64,7 +64,7 @@ pub(crate) fn office_chair(mesh: &mut SceneMesh, cloth: Vec3) {
     }
 }
 
-/// A wooden chair.
+/// Adds a wooden chair.
 pub(crate) fn chair(mesh: &mut SceneMesh, tint: Vec3) {
     let coat = wood(tint);
     mesh.block(Vec3::new(0.0, 0.0, 0.445), Vec3::new(0.21, 0.205, 0.016), coat);
@@ -80,7 +80,7 @@ pub(crate) fn chair(mesh: &mut SceneMesh, tint: Vec3) {
     }
 }
 
-/// A screen on its foot; `lit` is the light of its image, `layer` the plate's layer of what glows.
+/// Adds a screen on its foot; `lit` is the light of its image, `layer` the plate's layer of that light.
 pub(crate) fn screen(mesh: &mut SceneMesh, at: Vec3, picture: Surface, lit: f32, layer: usize) {
     let case = metal();
     mesh.block(at + Vec3::new(0.0, 0.02, 0.008), Vec3::new(0.12, 0.09, 0.008), case);
@@ -90,7 +90,7 @@ pub(crate) fn screen(mesh: &mut SceneMesh, at: Vec3, picture: Surface, lit: f32,
     mesh.quad(at + Vec3::new(-0.275, 0.0045, 0.17), Vec3::X * 0.55, Vec3::Z * 0.32, glow);
 }
 
-/// A keyboard, a mouse, a mug and a pile of paper.
+/// Adds a keyboard, a mouse, a mug and a pile of paper.
 pub(crate) fn desk_things(mesh: &mut SceneMesh, at: Vec3, plan: &Plan, index: u64) {
     let dark = Coat::new(Surface::Plain, Vec3::splat(0.06));
     mesh.block(at + Vec3::new(0.0, -0.20, 0.009), Vec3::new(0.21, 0.065, 0.009), dark);
@@ -116,7 +116,7 @@ pub(crate) fn desk_things(mesh: &mut SceneMesh, at: Vec3, plan: &Plan, index: u6
     }
 }
 
-/// A clear colour.
+/// Returns a saturated colour.
 pub(crate) fn colour(plan: &Plan, index: u64) -> Vec3 {
     const COLOURS: [[f32; 3]; 10] = [
         [0.45, 0.06, 0.05],
@@ -133,7 +133,7 @@ pub(crate) fn colour(plan: &Plan, index: u64) -> Vec3 {
     Vec3::from(plan.pick(index, &COLOURS).unwrap_or([0.5; 3])) * plan.draw(index + 1000, 0.7, 1.2)
 }
 
-/// A shelf of `levels` boards, `half_m` half as wide, with books and things.
+/// Adds a shelf of `levels` boards with half width `half_m`, with books and other objects.
 pub(crate) fn shelf(mesh: &mut SceneMesh, plan: &Plan, index: u64, half_m: f32, levels: u32) {
     let coat = wood(Vec3::splat(plan.draw(index, 0.45, 1.0)));
     let height = 0.06 + 0.36 * levels as f32;
@@ -200,7 +200,7 @@ pub(crate) fn shelf(mesh: &mut SceneMesh, plan: &Plan, index: u64, half_m: f32, 
     }
 }
 
-/// A cardboard box with a strip of tape.
+/// Adds a cardboard box with a strip of tape.
 pub(crate) fn carton(mesh: &mut SceneMesh, half: Vec3, base_m: f32, tint: f32) {
     let middle = Vec3::Z * (half.z + base_m);
     mesh.block(middle, half, Coat::new(Surface::Card, Vec3::splat(tint)));
@@ -209,7 +209,7 @@ pub(crate) fn carton(mesh: &mut SceneMesh, half: Vec3, base_m: f32, tint: f32) {
     mesh.block(middle + Vec3::Z * (half.z * 0.75), Vec3::new(half.x + 0.001, 0.025, half.z * 0.25), tape);
 }
 
-/// A plant in a pot.
+/// Adds a potted plant.
 pub(crate) fn plant(mesh: &mut SceneMesh, plan: &Plan, index: u64, height_m: f32) {
     mesh.shading = false;
     let pot = Coat::new(Surface::Plain, colour(plan, index)).glossy(0.15);
@@ -236,7 +236,7 @@ pub(crate) fn plant(mesh: &mut SceneMesh, plan: &Plan, index: u64, height_m: f32
     mesh.shading = true;
 }
 
-/// A sofa for two.
+/// Adds a sofa for two.
 pub(crate) fn sofa(mesh: &mut SceneMesh, cloth: Vec3) {
     let coat = Coat::new(Surface::Weave, cloth);
     mesh.cushion(Vec3::new(0.0, 0.0, 0.20), Vec3::new(0.86, 0.40, 0.14), 0.8, coat);
@@ -253,7 +253,7 @@ pub(crate) fn sofa(mesh: &mut SceneMesh, cloth: Vec3) {
     mesh.cushion(Vec3::new(0.48, 0.05, 0.60), Vec3::new(0.19, 0.07, 0.18), 0.45, pillow);
 }
 
-/// A floor lamp; its shade glows with the lamp of this layer.
+/// Adds a floor lamp; its shade glows with the lamp of this layer.
 pub(crate) fn floor_lamp(mesh: &mut SceneMesh, height_m: f32, glow: f32, layer: usize) {
     mesh.rod(Vec3::ZERO, Vec3::Z * 0.025, [0.15, 0.15], metal());
     mesh.rod(Vec3::Z * 0.02, Vec3::Z * height_m, [0.011, 0.011], metal());
@@ -262,7 +262,8 @@ pub(crate) fn floor_lamp(mesh: &mut SceneMesh, height_m: f32, glow: f32, layer: 
     mesh.rod(low, high, [0.21, 0.15], shade);
 }
 
-/// A stand with a soft box at a height, looking at `aim` (in the stand's axes); it glows with the lamp of this layer.
+/// Adds a stand with a soft box at a height, aimed at `aim` (in the stand's axes); it glows with the lamp of this
+/// layer.
 pub(crate) fn soft_box(mesh: &mut SceneMesh, head: Vec3, aim: Vec3, side_m: f32, glow: f32, layer: usize) {
     let forward = (aim - head).normalize_or(-Vec3::Y);
     let right = forward.cross(Vec3::Z).normalize_or(Vec3::X);
@@ -289,7 +290,7 @@ pub(crate) fn soft_box(mesh: &mut SceneMesh, head: Vec3, aim: Vec3, side_m: f32,
     mesh.cushion(head - forward * 0.42, Vec3::splat(0.09), 0.4, metal());
 }
 
-/// Three legs and a column up to a point.
+/// Adds three legs and a column up to a point.
 pub(crate) fn tripod(mesh: &mut SceneMesh, foot: Vec3, top: Vec3) {
     let hub = foot + Vec3::Z * (0.45f32).min(top.z * 0.6);
     for leg in 0..3 {
@@ -300,7 +301,7 @@ pub(crate) fn tripod(mesh: &mut SceneMesh, foot: Vec3, top: Vec3) {
     mesh.rod(Vec3::new(foot.x, foot.y, top.z), top, [0.010, 0.010], metal());
 }
 
-/// A case for gear on wheels.
+/// Adds a flight case on wheels.
 pub(crate) fn flight_case(mesh: &mut SceneMesh, half: Vec3) {
     let shell = Coat::new(Surface::Plain, Vec3::splat(0.035)).glossy(0.12);
     let edge = Coat::new(Surface::Plain, Vec3::splat(0.40)).glossy(0.4);
@@ -319,7 +320,7 @@ pub(crate) fn flight_case(mesh: &mut SceneMesh, half: Vec3) {
     }
 }
 
-/// A framed image on a wall behind it.
+/// Adds a framed image on a wall behind it.
 pub(crate) fn poster(mesh: &mut SceneMesh, middle: Vec3, half: [f32; 2], picture: Surface) {
     let frame = Coat::new(Surface::Plain, Vec3::splat(0.05)).glossy(0.1);
     let [x, z] = half;
@@ -328,7 +329,7 @@ pub(crate) fn poster(mesh: &mut SceneMesh, middle: Vec3, half: [f32; 2], picture
     mesh.quad(middle + Vec3::new(-x, -0.0095, -z), Vec3::X * 2.0 * x, Vec3::Z * 2.0 * z, coat);
 }
 
-/// A rug on the floor.
+/// Adds a rug on the floor.
 pub(crate) fn rug(mesh: &mut SceneMesh, half: [f32; 2]) {
     let [x, y] = half;
     let low = Coat::new(Surface::Carpet, Vec3::new(0.35, 0.28, 0.2));
@@ -344,7 +345,7 @@ pub(crate) fn rug(mesh: &mut SceneMesh, half: [f32; 2]) {
     }
 }
 
-/// A window in a wall behind it; it glows with the lamp of this layer.
+/// Adds a window in a wall behind it; it glows with the lamp of this layer.
 pub(crate) fn window(mesh: &mut SceneMesh, middle: Vec3, half: [f32; 2], glow: f32, layer: usize) {
     let [x, z] = half;
     let white = Coat::new(Surface::Plain, Vec3::splat(0.75)).glossy(0.1);
@@ -364,7 +365,7 @@ pub(crate) fn window(mesh: &mut SceneMesh, middle: Vec3, half: [f32; 2], glow: f
     }
 }
 
-/// A stool with a round seat.
+/// Adds a stool with a round seat.
 pub(crate) fn stool(mesh: &mut SceneMesh, tint: Vec3) {
     mesh.rod(Vec3::Z * 0.62, Vec3::Z * 0.65, [0.17, 0.17], wood(tint));
     for leg in 0..4 {

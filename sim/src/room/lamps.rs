@@ -1,32 +1,32 @@
-//! Lamps: where they stand, what they see of the room and of the people, how bright they are at a time.
+//! Lamps: positions, shadow map views of room and people, and brightness over time.
 
 use glam::{Mat4, Vec3};
 
 use crate::room::scene_config::LightConfig;
 
-/// Half the angle of a lamp's cone, and where its light begins to fall, degrees.
+/// Half the angle of a lamp's cone, and the angle at which its light begins to fall, degrees.
 const CONE_DEG: [f32; 2] = [74.0, 30.0];
-/// Nothing closer to a lamp than this casts a shadow, metres.
+/// Near plane of shadow maps, metres.
 pub(crate) const LAMP_NEAR_M: f32 = 0.3;
-/// What lamps light, unless told otherwise.
+/// Default target of a lamp.
 pub(crate) const STAGE: Vec3 = Vec3::new(0.0, 0.0, 0.9);
 
-/// A lamp with its place.
+/// Lamp with its position.
 #[derive(Debug, Clone)]
 pub(crate) struct Lamp {
     pub place: Vec3,
-    /// Unit direction in which it shines.
+    /// Unit direction of its light.
     pub axis: Vec3,
     /// Light on a white surface facing it, times the squared distance of that surface.
     pub power: Vec3,
     pub size_m: f32,
-    /// What the room sends back of it from everywhere.
+    /// Ambient light that the room reflects of it.
     pub bounce: Vec3,
     pub config: LightConfig,
 }
 
 impl Lamp {
-    /// A lamp that shines at `aim` as its configuration says, in a room that sends back the share `bounce`.
+    /// Creates a lamp aimed at `aim`, in a room that reflects the fraction `bounce`.
     pub(crate) fn new(config: &LightConfig, aim: Vec3, bounce: f32) -> Self {
         let (sin, cos) = (config.elevation_deg.to_radians() as f32).sin_cos();
         let (y, x) = (config.azimuth_deg.to_radians() as f32).sin_cos();
@@ -44,18 +44,18 @@ impl Lamp {
         }
     }
 
-    /// Factor on its light.
+    /// Returns the factor on its light at a time.
     pub(crate) fn level(&self, secs: f64) -> f32 {
         self.config.level(secs) as f32
     }
 
-    /// The lamp's image of the room, and the tangent of half its angle.
+    /// Returns the transform of the room's shadow map, and the tangent of half its angle.
     pub(crate) fn room_view(&self) -> (Mat4, f32) {
         let tangent = CONE_DEG[0].to_radians().tan();
         (clip_from_world(self.place, self.axis, tangent), tangent)
     }
 
-    /// The same of a ball.
+    /// Returns the same for the shadow map of a ball.
     pub(crate) fn ball_view(&self, center: Vec3, radius: f32) -> (Mat4, f32) {
         let towards = center - self.place;
         let sine = (radius / towards.length().max(1e-3)).min(0.94);
@@ -64,12 +64,12 @@ impl Lamp {
     }
 }
 
-/// Cosines of the angles where a lamp's light ends and where it begins to fall.
+/// Returns the cosines of the angles where a lamp's light ends and where it begins to fall.
 pub(crate) fn cone_cosines() -> [f32; 2] {
     CONE_DEG.map(|degrees| degrees.to_radians().cos())
 }
 
-/// Perspective from a place in a direction; the device's depth is 1 - near / z.
+/// Returns the perspective from a position in a direction; the device's depth is 1 - near / z.
 fn clip_from_world(place: Vec3, forward: Vec3, tangent: f32) -> Mat4 {
     let right = forward.cross(Vec3::Z).normalize_or(Vec3::X);
     let up = right.cross(forward);

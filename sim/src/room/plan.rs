@@ -10,7 +10,7 @@ use crate::room::surfaces::Surface;
 /// Ceiling height, metres.
 pub(crate) const HEIGHT_M: f32 = 3.6;
 
-/// What a room's maker knows.
+/// Dimensions and random choices of a room.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Plan {
     pub key: u64,
@@ -18,25 +18,25 @@ pub(crate) struct Plan {
     pub half_m: f32,
     /// Radius of the ring of cameras, outside of which furniture stands.
     pub ring_m: f32,
-    /// How many pieces stand between cameras and person.
+    /// Pieces of furniture between cameras and person.
     pub occluders: u32,
-    /// Cameras of the ring.
+    /// Number of cameras of the ring.
     pub cameras: usize,
 }
 
 impl Plan {
-    /// Evenly in `low..high`; one number an index.
+    /// Returns a uniform number in `low..high`; one per index.
     pub(crate) fn draw(&self, index: u64, low: f32, high: f32) -> f32 {
         low + (high - low) * uniform(self.key, index) as f32
     }
 
-    /// One of several; one choice an index.
+    /// Returns one of several values; one choice per index.
     pub(crate) fn pick<T: Copy>(&self, index: u64, of: &[T]) -> Option<T> {
         of.get((uniform(self.key, index) * of.len() as f64) as usize).copied()
     }
 }
 
-/// A room's light.
+/// Light of a room.
 pub(crate) struct RoomLight {
     pub lamps: Vec<Lamp>,
     pub steady: Vec3,
@@ -44,7 +44,7 @@ pub(crate) struct RoomLight {
     pub ground: Vec3,
 }
 
-/// Floor, ceiling and walls; the things that cast no shadow.
+/// Adds floor, ceiling and walls, which cast no shadow.
 pub(crate) fn shell(plan: &Plan, mesh: &mut SceneMesh, floor: Coat, walls: [Coat; 4], trim: Coat) {
     let h = plan.half_m;
     let side = 2.0 * h;

@@ -1,5 +1,5 @@
-//! Rooms: a studio, an office, a room full of things. Furniture stands outside of the ring of cameras, but for what is
-//! meant to stand in their way.
+//! Rooms: a studio, an office, a cluttered room. Furniture stands outside the ring of cameras, except for intended
+//! occluders.
 
 use std::f32::consts::{PI, TAU};
 
@@ -13,10 +13,10 @@ use crate::room::scene_mesh::{Coat, SceneMesh};
 use crate::room::surfaces::Surface;
 
 const POSTERS: [Surface; 4] = [Surface::PosterA, Surface::PosterB, Surface::PosterC, Surface::PosterD];
-/// Share of a lamp's light that comes back from everywhere.
+/// Fraction of a lamp's light that returns as ambient light.
 const BOUNCE: f32 = 0.26;
 
-/// Puts what follows with its back to a wall: 0 at +y, 1 at +x, 2 at -y, 3 at -x; `aside_m` to its left.
+/// Places the following objects with their back to a wall: 0 at +y, 1 at +x, 2 at -y, 3 at -x; `aside_m` to its left.
 fn against(mesh: &mut SceneMesh, plan: &Plan, wall: usize, aside_m: f32, deep_m: f32) {
     let yaw = -0.5 * PI * wall as f32;
     let (sin, cos) = yaw.sin_cos();
@@ -24,7 +24,7 @@ fn against(mesh: &mut SceneMesh, plan: &Plan, wall: usize, aside_m: f32, deep_m:
     mesh.place(Vec3::new(x * cos - y * sin, x * sin + y * cos, 0.0), yaw);
 }
 
-/// A lamp at a place, seen from what it lights.
+/// Returns a lamp's configuration at a position, aimed at its target.
 fn lamp_at(place: Vec3, aim: Vec3, intensity: f32, colour: [f32; 3], size_m: f32) -> (LightConfig, Vec3) {
     let away = place - aim;
     let config = LightConfig {
@@ -39,7 +39,7 @@ fn lamp_at(place: Vec3, aim: Vec3, intensity: f32, colour: [f32; 3], size_m: f32
     (config, aim)
 }
 
-/// The configured lamps, or else the room's own.
+/// Returns the configured lamps, or otherwise the room's own.
 fn lamps(configured: &[LightConfig], own: &[(LightConfig, Vec3)]) -> Vec<Lamp> {
     if configured.is_empty() {
         own.iter().map(|(config, aim)| Lamp::new(config, *aim, BOUNCE)).collect()
@@ -48,7 +48,7 @@ fn lamps(configured: &[LightConfig], own: &[(LightConfig, Vec3)]) -> Vec<Lamp> {
     }
 }
 
-/// Layer of a plate in which a thing glows with a lamp, or does not without it.
+/// Returns the layer of a plate in which an object glows with a lamp, or the constant layer without it.
 fn layer_of(lamps: &[Lamp], lamp: usize) -> usize {
     const NONE: usize = 99;
     if lamp < lamps.len() { lamp + 1 } else { NONE }
@@ -114,7 +114,7 @@ pub(crate) fn studio(plan: &Plan, mesh: &mut SceneMesh, lights: &[LightConfig]) 
     RoomLight { lamps, steady: Vec3::splat(0.02), sky: Vec3::new(1.0, 1.02, 1.06), ground: Vec3::new(0.52, 0.46, 0.40) }
 }
 
-/// A wide roll of paper between two stands that runs out over the floor.
+/// Adds a wide roll of paper between two stands that runs out over the floor.
 fn backdrop(mesh: &mut SceneMesh, plan: &Plan, wall: usize, aside_m: f32, half_m: f32, tint: Vec3) {
     const HIGH_M: f32 = 2.75;
     const BEND_M: f32 = 0.5;
@@ -304,7 +304,7 @@ pub(crate) fn cluttered(plan: &Plan, mesh: &mut SceneMesh, lights: &[LightConfig
     }
 }
 
-/// What stands between cameras and the person.
+/// Adds the objects between cameras and person.
 fn obstacles(plan: &Plan, mesh: &mut SceneMesh) {
     let distance = (0.6 * plan.ring_m).max(1.75).min(plan.ring_m - 0.5);
     for piece in 0..plan.occluders {

@@ -1,4 +1,4 @@
-//! The room around the person with its furniture and lamps.
+//! Scene around the person: room, furniture and lamps.
 
 use flyrig_types::Rig;
 use glam::Vec3;
@@ -13,16 +13,16 @@ use crate::room::scene_mesh::SceneMesh;
 use crate::room::surfaces::Surface;
 use crate::texture::Texture;
 
-/// Everything that stands still.
+/// All static objects, their textures and light.
 #[derive(Debug, Clone)]
 pub(crate) struct Scene {
     pub mesh: SceneMesh,
-    /// One for each [`Surface`].
+    /// Textures, one per [`Surface`].
     pub textures: Vec<Texture>,
     pub lamps: Vec<Lamp>,
-    /// Light from everywhere that no lamp makes.
+    /// Ambient light that no lamp causes.
     pub steady: Vec3,
-    /// Shares of the light from everywhere that come from above and from below.
+    /// Fractions of the ambient light from above and from below.
     pub sky: Vec3,
     pub ground: Vec3,
 }
@@ -59,15 +59,15 @@ impl Scene {
         Self { mesh, textures, lamps: light.lamps, steady: light.steady, sky: light.sky, ground: light.ground }
     }
 
-    /// Whether something glows that no lamp makes.
+    /// Returns whether an object glows independently of the lamps.
     pub(crate) fn glows(&self) -> bool {
         let layer = self.lamps.len() as u32 + 1;
         self.mesh.vertices.iter().any(|vertex| vertex.glow[0] > 0.0 && vertex.glow[1] as u32 == layer)
     }
 }
 
-/// Longest side of a cell at which straight edges between its corners stay within a twentieth of a pixel of the bent
-/// lens's curves, a metre and a half away.
+/// Returns the longest side of a cell at which straight edges between its corners stay within a twentieth of a pixel of
+/// the bent lens's curves, at a distance of a metre and a half.
 fn cell_m(rig: &Rig) -> f32 {
     const ERROR_PX: f64 = 0.05;
     const DISTANCE_M: f64 = 1.5;

@@ -1,69 +1,69 @@
-//! What stands around the person, and what lights it.
+//! Configuration of the scene and its lamps.
 
 use serde::{Deserialize, Serialize};
 
 use crate::SimError;
 use crate::error::check;
 
-/// Lamps with shadows that a scene can have.
+/// Most lamps of a scene.
 pub(crate) const MAX_LAMPS: usize = 3;
 
-/// What kind of room.
+/// Kind of room.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum SceneKind {
-    /// A studio with a plank floor, a paper backdrop, stands, cases and soft boxes.
+    /// Studio with a plank floor, a paper backdrop, stands, cases and soft boxes.
     #[default]
     Studio,
-    /// Desks, chairs, screens, shelves of books, plants, panels of light in the ceiling and a window.
+    /// Office with desks, chairs, screens, bookshelves, plants, ceiling panels and a window.
     Office,
-    /// A room full of things: shelves, boxes, a sofa, rugs, posters, plants, lamps.
+    /// Room full of objects: shelves, boxes, a sofa, rugs, posters, plants, lamps.
     Cluttered,
-    /// One of the others.
+    /// One of the others, chosen by the seed.
     BySeed,
 }
 
-/// The room and who else is in it.
+/// Room and other people in it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SceneConfig {
     /// Kind of room.
     pub kind: SceneKind,
-    /// Makes the room, its colours and its lamps; without it, the simulation's seed does.
+    /// Seed of the room, its colours and its lamps; the simulation's when `None`.
     pub seed: Option<u64>,
-    /// Pieces of furniture (0 to 6) between cameras and the person, who stays free of them within 1.15 m of the middle.
+    /// Pieces of furniture (0 to 6) between cameras and the person, none of them within 1.15 m of the centre.
     pub occluders: u32,
     /// Whether a second person walks through.
     pub passer_by: bool,
 }
 
-/// A lamp; the person stands in the middle of the ring, at azimuth -90 degrees is camera 0.
+/// Lamp; the person stands in the centre of the ring, and camera 0 is at azimuth -90 degrees.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LightConfig {
-    /// Direction from the middle, degrees counter-clockwise from the x axis seen from above.
+    /// Direction from the centre, degrees counter-clockwise from the x axis seen from above.
     pub azimuth_deg: f64,
-    /// Direction above the horizon, seen from the point that it lights, degrees.
+    /// Direction above the horizon, seen from the lamp's target, degrees.
     pub elevation_deg: f64,
-    /// Distance from the point that it lights (the middle, 0.9 m above the floor), metres.
+    /// Distance from the lamp's target (the centre, 0.9 m above the floor), metres.
     pub distance_m: f64,
-    /// Light on a white surface that faces the lamp in the middle: 1 is the brightest sRGB value at exposure 1.
+    /// Light on a white surface in the centre that faces the lamp: 1 is the brightest sRGB value at exposure 1.
     pub intensity: f64,
-    /// Linear colour; the largest part counts as 1.
+    /// Linear colour; the largest channel counts as 1.
     pub colour: [f64; 3],
-    /// Width of the lamp, which makes its shadows soft, metres.
+    /// Width of the lamp, which softens its shadows, metres.
     pub size_m: f64,
-    /// When its light changes, in order of time.
+    /// Changes of its light, in order of time.
     pub switch: Vec<LightSwitch>,
 }
 
-/// A change of a lamp's light that takes no time.
+/// Instantaneous change of a lamp's light.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LightSwitch {
     /// Seconds from the start.
     pub secs: f64,
-    /// Factor on the intensity from then on; it is 1 before the first switch.
+    /// Factor on the intensity from then on; 1 before the first switch.
     pub level: f64,
 }
 
@@ -124,7 +124,7 @@ impl LightConfig {
         Ok(())
     }
 
-    /// Factor on the intensity at a time.
+    /// Returns the factor on the intensity at a time.
     pub(crate) fn level(&self, secs: f64) -> f64 {
         self.switch.iter().rev().find(|switch| switch.secs <= secs).map_or(1.0, |switch| switch.level)
     }

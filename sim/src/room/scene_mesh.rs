@@ -1,4 +1,4 @@
-//! A mesh of flat and round things, cut into cells small enough for bent lenses.
+//! Mesh of flat and round objects, divided into cells small enough for bent lenses.
 
 use bytemuck::{Pod, Zeroable};
 use glam::{Affine3A, Vec2, Vec3};
@@ -6,30 +6,30 @@ use rayon::prelude::*;
 
 use crate::room::surfaces::Surface;
 
-/// A vertex as the room's shader reads it.
+/// Vertex in the memory layout of the room's shader.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(crate) struct SceneVertex {
     pub position: [f32; 3],
     pub normal: [f32; 3],
-    /// uv, layer of the textures, openness.
+    /// Texture coordinates, texture layer, openness.
     pub paint: [f32; 4],
     /// Linear factor on the texture, gloss.
     pub tint: [f32; 4],
-    /// Light of its own, and the layer of the plate that it belongs to.
+    /// Emitted light, and the layer of the plate that it belongs to.
     pub glow: [f32; 2],
 }
 
-/// What a thing is painted with.
+/// Material of an object.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Coat {
     pub surface: Surface,
-    /// Linear.
+    /// Linear factor on the texture.
     pub tint: Vec3,
     pub gloss: f32,
-    /// Times the texture.
+    /// Emitted light, times the texture.
     pub glow: f32,
-    /// Layer of the plate that the glow belongs to.
+    /// Layer of the plate that the emitted light belongs to.
     pub glow_layer: usize,
 }
 
@@ -47,7 +47,7 @@ impl Coat {
     }
 }
 
-/// A box that keeps light from its surroundings: to the unit cube from the world.
+/// Box that occludes ambient light, as a transform from the world to the unit cube.
 #[derive(Debug, Clone, Copy)]
 struct Solid {
     unit_from_world: Affine3A,
@@ -55,23 +55,23 @@ struct Solid {
     reach_m: f32,
 }
 
-/// Vertices and triangles, first of what casts no shadow.
+/// Vertices and triangles, first those that cast no shadow.
 #[derive(Debug, Clone)]
 pub(crate) struct SceneMesh {
     pub vertices: Vec<SceneVertex>,
     pub triangles: Vec<[u32; 3]>,
-    /// Triangles before these cast no shadow.
+    /// First triangle that casts a shadow.
     pub first_caster: usize,
     solids: Vec<Solid>,
     cell_m: f32,
-    /// Whether things put now keep light from others; too many small ones cost time and change nothing.
+    /// Whether new objects occlude ambient light; many small ones cost time without visible effect.
     pub shading: bool,
-    /// Where things are put now.
+    /// Placement of new objects.
     pub at: Affine3A,
 }
 
 impl SceneMesh {
-    /// `cell_m`: longest side of a cell.
+    /// Creates an empty mesh; `cell_m` is the longest side of a cell.
     pub(crate) fn new(cell_m: f32) -> Self {
         let at = Affine3A::IDENTITY;
         Self {
@@ -85,7 +85,7 @@ impl SceneMesh {
         }
     }
 
-    /// Puts what follows at a place on the floor, turned about the vertical.
+    /// Places the following objects on the floor, turned about the vertical.
     pub(crate) fn place(&mut self, at: Vec3, yaw: f32) {
         self.at = Affine3A::from_translation(at) * Affine3A::from_rotation_z(yaw);
     }
@@ -94,7 +94,8 @@ impl SceneMesh {
         (length / self.cell_m).ceil().clamp(1.0, 400.0) as usize
     }
 
-    /// A grid of vertices over 0..=1 squared; seen from outside, the second parameter runs to the left of the first.
+    /// Adds a grid of vertices over 0..=1 squared; seen from outside, the second parameter runs to the left of the
+    /// first.
     pub(crate) fn grid(&mut self, [across, up]: [usize; 2], coat: Coat, point: impl Fn(Vec2) -> (Vec3, Vec3, Vec2)) {
         let first = self.vertices.len() as u32;
         for j in 0..=up {
@@ -119,7 +120,7 @@ impl SceneMesh {
         }
     }
 
-    /// A flat quadrilateral from a corner along two sides; its front is where their cross product points.
+    /// Adds a flat quadrilateral from a corner along two sides; it faces along their cross product.
     pub(crate) fn quad(&mut self, corner: Vec3, u: Vec3, v: Vec3, coat: Coat) {
         let normal = u.cross(v).normalize_or(Vec3::Z);
         let size = Vec2::new(u.length(), v.length());
@@ -131,7 +132,7 @@ impl SceneMesh {
         });
     }
 
-    /// A box around a middle.
+    /// Adds a box around a centre.
     pub(crate) fn block(&mut self, middle: Vec3, half: Vec3, coat: Coat) {
         let (x, y, z) = (Vec3::X * half.x * 2.0, Vec3::Y * half.y * 2.0, Vec3::Z * half.z * 2.0);
         let (low, high) = (middle - half, middle + half);
@@ -144,7 +145,7 @@ impl SceneMesh {
         self.solid(middle, half);
     }
 
-    /// A round post or a cone cut off, from one end to the other; closed at both.
+    /// Adds a cylinder or truncated cone, from one end to the other; closed at both.
     pub(crate) fn rod(&mut self, from: Vec3, to: Vec3, radii: [f32; 2], coat: Coat) {
         let along = to - from;
         let axis = along.normalize_or(Vec3::Z);
@@ -174,7 +175,7 @@ impl SceneMesh {
         self.solid((from + to) * 0.5, half.max(Vec3::splat(0.005)));
     }
 
-    /// A cushion: a box with well-rounded edges; `square` 0 for a ball, towards 1 for a box.
+    /// Adds a cushion: a box with well-rounded edges; `square` 0 for a ball, towards 1 for a box.
     pub(crate) fn cushion(&mut self, middle: Vec3, half: Vec3, square: f32, coat: Coat) {
         // |x|ⁿ + |y|ⁿ + |z|ⁿ = 1, met by rays in the directions of a ball's points.
         let n = 2.0 / (1.0 - square.clamp(0.0, 0.8));
@@ -192,7 +193,7 @@ impl SceneMesh {
         self.solid(middle, half * 0.85);
     }
 
-    /// A leaf: a bent strip, wide in its middle, seen from both sides.
+    /// Adds a leaf: a bent strip, wide in its middle, visible from both sides.
     pub(crate) fn leaf(&mut self, root: Vec3, out: Vec3, length_m: f32, width_m: f32, droop: f32, coat: Coat) {
         let flat = Vec3::new(out.x, out.y, 0.0).normalize_or(Vec3::X);
         let side = flat.cross(Vec3::Z).normalize_or(Vec3::Y);
@@ -207,7 +208,7 @@ impl SceneMesh {
         });
     }
 
-    /// Whether a thing may stand between a lamp and a ball.
+    /// Returns whether an object may stand between a lamp and a ball.
     pub(crate) fn may_hide(&self, lamp: Vec3, center: Vec3, radius: f32) -> bool {
         let along = center - lamp;
         self.solids.iter().any(|solid| {
@@ -230,8 +231,8 @@ impl SceneMesh {
         });
     }
 
-    /// Lets every vertex know how much of its surroundings are free of things, within 0.7 m, in a room of this half
-    /// side and height.
+    /// Computes every vertex's unoccluded fraction of the surroundings, within 0.7 m, in a room of this half side and
+    /// height.
     pub(crate) fn find_openness(&mut self, half_m: f32, height_m: f32) {
         let solids = &self.solids;
         self.vertices.par_iter_mut().for_each(|vertex| {
@@ -254,7 +255,8 @@ impl SceneMesh {
     }
 }
 
-/// Share of a surface's cosine-weighted surroundings that boxes leave free; what is 0.7 m away counts no longer.
+/// Returns the fraction of a surface's cosine-weighted surroundings that boxes leave free; occluders count up to a
+/// distance of 0.7 m.
 fn openness(solids: &[Solid], p: Vec3, n: Vec3) -> f32 {
     const RAYS: u64 = 16;
     const REACH_M: f32 = 0.7;
@@ -275,7 +277,7 @@ fn openness(solids: &[Solid], p: Vec3, n: Vec3) -> f32 {
     1.0 - 0.9 * hidden / RAYS as f32
 }
 
-/// Distance along a ray to a box that it enters from outside.
+/// Returns the distance along a ray to a box that it enters from outside.
 fn hit(solid: &Solid, start: Vec3, direction: Vec3) -> Option<f32> {
     let from = solid.unit_from_world.transform_point3(start);
     let along = solid.unit_from_world.transform_vector3(direction);

@@ -6,13 +6,13 @@ use crate::clothes::wardrobe::Srgb;
 use crate::noise::{Noise, smoothstep};
 use crate::texture::{Texture, mix3, scale3};
 
-/// A texture; its place in the array of textures.
+/// Texture and its index in the array of textures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
 pub(crate) enum Surface {
     /// Paint, plastic, metal.
     Plain,
-    /// A floor of planks.
+    /// Floor of planks.
     Planks,
     Plaster,
     Carpet,
@@ -23,14 +23,14 @@ pub(crate) enum Surface {
     Concrete,
     Leaf,
     Rug,
-    /// Images fill the thing that they are on.
+    /// Image that fills its object.
     PosterA,
     PosterB,
     PosterC,
     PosterD,
     ScreenA,
     ScreenB,
-    /// What is seen through a window.
+    /// View through a window.
     Outside,
 }
 
@@ -55,7 +55,7 @@ impl Surface {
         Self::Outside,
     ];
 
-    /// How often the texture comes in a metre; none for images that fill what they are on.
+    /// Returns the repetitions per metre; `None` for images that fill their object.
     pub(crate) fn repeats_a_metre(self) -> Option<f32> {
         match self {
             Self::Plain | Self::Plaster => Some(0.7),
@@ -68,7 +68,7 @@ impl Surface {
         }
     }
 
-    /// The texture, `side` pixels wide.
+    /// Paints the texture, `side` pixels wide.
     pub(crate) fn texture(self, side: usize, seed: u64) -> Texture {
         let noise = Noise::new(seed, 60 + self as u32);
         Texture::from_fn(side, |uv| match self {
@@ -104,7 +104,7 @@ fn grey(value: f32) -> Srgb {
     [value; 3]
 }
 
-/// Noise of `cells` a side that meets itself at the edges, -1..=1.
+/// Returns noise of `cells` per side that is periodic at the edges, in -1..=1.
 fn tiled(noise: Noise, uv: Vec2, cells: i32, octaves: u32) -> f32 {
     let (mut sum, mut weight, mut height, mut cells) = (0.0, 0.0, 1.0, cells);
     for octave in 0..octaves {
@@ -133,7 +133,7 @@ fn wood(noise: Noise, uv: Vec2, contrast: f32) -> Srgb {
     scale3([0.86, 0.74, 0.58], tone)
 }
 
-/// Fine streaks along u.
+/// Returns fine streaks along u.
 fn stretched(noise: Noise, uv: Vec2, rows: i32) -> f32 {
     let y = uv.y * rows as f32;
     let (low, x) = (y.floor(), uv.x * 6.0);

@@ -1,4 +1,4 @@
-//! A dance: a seed's mixture of moves over steps from side to side.
+//! Dance: a seed's mixture of moves over steps from side to side.
 
 use std::f64::consts::{PI, TAU};
 
@@ -15,7 +15,7 @@ const BARS: usize = 8;
 const BEATS_A_BAR: usize = 4;
 const BEATS_A_MINUTE: f64 = 112.0;
 
-/// What hips, trunk and arms do for a bar.
+/// Motion of hips, trunk and arms during a bar.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Move {
     /// Hips from side to side, arms swinging along.
@@ -34,18 +34,18 @@ enum Move {
 
 const MOVES: [Move; 6] = [Move::Sway, Move::Twist, Move::ArmsUp, Move::Bounce, Move::Point, Move::Ripple];
 
-/// What the feet do for a bar.
+/// Motion of the feet during a bar.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Footwork {
-    /// To the side and the other foot follows, back again.
+    /// A step to the side, the other foot follows, and back.
     SideTouch,
-    /// On the spot.
+    /// Steps on the spot.
     March,
-    /// Around by half a turn.
+    /// Half a turn.
     Spin,
 }
 
-/// Eight bars by a seed.
+/// Returns eight bars drawn from a seed.
 pub(crate) fn dance<'a>(puppet: &'a Puppet<'_>, seed: u64, speed: f64) -> Clip<'a> {
     let mut dice = StdRng::seed_from_u64(seed ^ 0x6461_6e63);
     let first = dice.random_range(0..MOVES.len());
@@ -90,7 +90,7 @@ pub(crate) fn dance<'a>(puppet: &'a Puppet<'_>, seed: u64, speed: f64) -> Clip<'
     })
 }
 
-/// Plants of both feet over all bars, a step a beat.
+/// Returns the plants of both feet over all bars, one step per beat.
 fn footsteps(bars: &[Footwork; BARS]) -> [Vec<Plant>; 2] {
     const SIDE_M: f64 = 0.24;
     let beats = (BARS * BEATS_A_BAR) as f64;
@@ -130,7 +130,7 @@ fn footsteps(bars: &[Footwork; BARS]) -> [Vec<Plant>; 2] {
     plants
 }
 
-/// Hips, trunk, head and arms of a move at a beat; feet side by side.
+/// Returns hips, trunk, head and arms of a move at a beat, with the feet side by side.
 fn style(puppet: &Puppet<'_>, what: Move, beat: f64, big: f64) -> Posture {
     let mut posture = puppet.standing();
     let half = (PI * beat).sin() * big;

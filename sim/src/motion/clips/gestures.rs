@@ -1,4 +1,4 @@
-//! Standing and moving the arms.
+//! Standing and arm gestures.
 
 use std::f64::consts::TAU;
 
@@ -9,7 +9,7 @@ use crate::motion::curve::{closed, ease, hump};
 use crate::motion::posture::{Arm, Posture};
 use crate::motion::puppet::Puppet;
 
-/// Standing still.
+/// Returns a clip of standing still.
 pub(crate) fn still<'a>(puppet: &'a Puppet<'_>) -> Clip<'a> {
     Clip::new(4.0, |_| {
         let mut posture = puppet.standing();
@@ -19,7 +19,7 @@ pub(crate) fn still<'a>(puppet: &'a Puppet<'_>) -> Clip<'a> {
     })
 }
 
-/// Puts weight on the left leg (positive) or the right one, -1..=1: hips over it, the trunk balancing.
+/// Shifts the weight to the left leg (positive) or the right one, -1..=1: hips over it, the trunk balancing.
 pub(super) fn settle(posture: &mut Posture, weight: f64) {
     posture.hips += DVec3::new(0.040 * weight, -0.006 * weight.abs(), 0.0);
     posture.pelvis.y -= 0.050 * weight;
@@ -28,7 +28,7 @@ pub(super) fn settle(posture: &mut Posture, weight: f64) {
     posture.trunk.z += 0.03 * weight;
 }
 
-/// The small movements of somebody who stands; all of them close after `secs`.
+/// Adds the small movements of a standing person; all of them close after `secs`.
 pub(super) fn breathe(posture: &mut Posture, phase: f64, secs: f64) {
     let cycles = |every: f64| (secs / every).round().max(1.0);
     let wave = |every: f64, offset: f64| (TAU * (cycles(every) * phase + offset)).sin();
@@ -41,7 +41,7 @@ pub(super) fn breathe(posture: &mut Posture, phase: f64, secs: f64) {
     }
 }
 
-/// A big wave with the right hand.
+/// Returns a big wave with the right hand.
 pub(crate) fn wave<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     const SECS: f64 = 4.5;
     Clip::new(SECS / speed, move |phase| {
@@ -68,7 +68,7 @@ pub(crate) fn wave<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     })
 }
 
-/// Up to a high shelf with the right hand, down to the floor with the left.
+/// Returns a reach up to a high shelf with the right hand and down to the floor with the left.
 pub(crate) fn reach<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     const SECS: f64 = 8.0;
     Clip::new(SECS / speed, move |phase| {
@@ -116,7 +116,7 @@ pub(crate) fn reach<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     })
 }
 
-/// Crosses the arms, waits, looks around and lets go.
+/// Returns a clip that crosses the arms, waits, looks around and lets go.
 pub(crate) fn cross_arms<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     const SECS: f64 = 7.0;
     let depth = puppet.chest_m() - 0.02;

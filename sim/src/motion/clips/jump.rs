@@ -8,13 +8,13 @@ use crate::motion::curve::{closed, ease, hermite};
 use crate::motion::posture::Arm;
 use crate::motion::puppet::Puppet;
 
-/// Crouches, swings the arms, flies as gravity has it, lands softly and stands up.
+/// Returns a jump: crouches, swings the arms, flies ballistically, lands softly and stands up.
 pub(crate) fn jump<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     const SECS: f64 = 3.2;
-    /// Phases of leaving the floor and of touching it again.
+    /// Phases of take-off and touch-down.
     const OFF: f64 = 0.40;
     const ON: f64 = 0.55;
-    /// Phases of the deepest crouch before, and after the flight; how deep they are, metres.
+    /// Phases of the deepest crouch before and after the flight, and their depths, metres.
     const BENT: f64 = 0.29;
     const LOW: f64 = 0.64;
     const DEEP_M: f64 = 0.30;

@@ -8,7 +8,7 @@ use crate::motion::curve::{closed, hump};
 use crate::motion::posture::Arm;
 use crate::motion::puppet::Puppet;
 
-/// Two squats, the second deeper, the arms in front for balance.
+/// Returns two squats, the second deeper, with the arms in front for balance.
 pub(crate) fn squat<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     const SECS: f64 = 6.0;
     Clip::new(SECS / speed, move |phase| {
@@ -46,10 +46,10 @@ pub(crate) fn squat<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     })
 }
 
-/// Height of the seat that [`sit`] uses, metres of the average body, and the middle of it behind the person's place.
+/// Height of the seat of [`sit`] and distance of its centre behind the person, metres of the average body.
 pub(crate) const SEAT_M: (f64, f64) = (0.44, 0.36);
 
-/// Sits down on a chair that stands behind, leans back, looks around and gets up.
+/// Returns a clip that sits down on a chair behind, leans back, looks around and gets up.
 pub(crate) fn sit<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     const SECS: f64 = 8.0;
     Clip::new(SECS / speed, move |phase| {
@@ -89,10 +89,10 @@ pub(crate) fn sit<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     })
 }
 
-/// Height of the hips' joint above the floor on which somebody lies, metres of the average body.
+/// Height of the hip joint of a lying person above the floor, metres of the average body.
 const LYING_M: f64 = 0.125;
 
-/// Squats down, sits on the floor, lies back with the knees up, looks around and gets up.
+/// Returns a clip that squats down, sits on the floor, lies back with the knees up, looks around and gets up.
 pub(crate) fn lie<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     const SECS: f64 = 10.0;
     Clip::new(SECS / speed, move |phase| {

@@ -1,4 +1,4 @@
-//! Motions that need no file: each a closed curve of postures.
+//! Generated motions: each is a closed curve of postures.
 
 mod dance;
 mod gestures;
@@ -18,11 +18,11 @@ pub(crate) use walk::passing;
 
 const KEYS_A_SECOND: f64 = 60.0;
 
-/// A motion that repeats.
+/// Closed motion.
 pub(crate) struct Clip<'a> {
-    /// Seconds of one round.
+    /// Duration of a cycle, seconds.
     pub secs: f64,
-    /// Posture at a phase, 0..1 of the round.
+    /// Posture at a phase in 0..1 of the cycle.
     pub posture: Box<dyn Fn(f64) -> Posture + 'a>,
 }
 
@@ -31,9 +31,9 @@ impl<'a> Clip<'a> {
         Self { secs, posture: Box::new(posture) }
     }
 
-    /// One round as poses, its end equal to its start, from a phase on.
+    /// Samples one cycle as poses, its end equal to its start, from a phase on.
     pub(crate) fn track(&self, puppet: &Puppet<'_>, phase: f64) -> Result<PoseTrack, SimError> {
-        /// Hips go down and up again within this many keys around where the legs need it.
+        /// Keys over which the hips are lowered and raised around a place where the legs require it.
         const SOFT_KEYS: usize = 6;
         let count = (self.secs * KEYS_A_SECOND).ceil().max(2.0) as usize;
         let postures: Vec<Posture> =
@@ -47,15 +47,15 @@ impl<'a> Clip<'a> {
         Ok(PoseTrack::new((0..=count).map(key).collect())?)
     }
 
-    /// The posture at a phase and no motion.
+    /// Returns the static posture at a phase.
     pub(crate) fn held(&self, puppet: &Puppet<'_>, phase: f64) -> Result<PoseTrack, SimError> {
         let posture = (self.posture)(phase.rem_euclid(1.0));
         Ok(PoseTrack::new(vec![(0, puppet.pose(&posture, puppet.too_high_m(&posture)))])?)
     }
 }
 
-/// The clip of a kind; files and the seed's choice are not clips and stand still. `turn_secs` is the time of a full
-/// turn at speed 1.
+/// Returns the clip of a kind; files and the seed's choice are not clips and stand still. `turn_secs` is the time of a
+/// full turn at speed 1.
 pub(crate) fn clip<'a>(kind: MotionKind, puppet: &'a Puppet<'_>, seed: u64, turn_secs: f64, speed: f64) -> Clip<'a> {
     let speed = speed.max(1e-3);
     match kind {

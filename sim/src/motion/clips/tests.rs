@@ -1,4 +1,4 @@
-//! What all clips keep to.
+//! Invariants of all clips.
 
 use flyrig_body::skin_mesh;
 use glam::{DVec3, Vec3};
@@ -28,7 +28,7 @@ fn person(seed: u64, build: Build) -> Person {
     Person::new(&Look::new(&config), seed, 64, false).unwrap()
 }
 
-/// The person reduced to its soles, but for the crease between foot and toes, where they bend.
+/// Returns the person's soles without the crease between foot and toes, where they bend.
 fn soles(person: &Person) -> flyrig_body::Template {
     let mut soles = person.clothed.clone();
     let shoes = person.shoe_vertices.clone();
@@ -44,8 +44,9 @@ fn soles(person: &Person) -> flyrig_body::Template {
     soles
 }
 
-/// The farthest that a foot slides over the floor while it rests there flat and slow (from frame to frame by its ball or
-/// its heel, whichever moves less: a foot may turn about either), and the deepest that any point of its sole goes below.
+/// Returns the farthest that a foot slides over the floor while it rests flat and slow (from frame to frame by its ball
+/// or its heel, whichever moves less: a foot may turn about either), and the deepest that any point of its sole goes
+/// below.
 fn slide_and_depth_of_rests(person: &Person, track: &PoseTrack) -> (f32, f32) {
     const FPS: f32 = 60.0;
     let soles = soles(person);
@@ -87,7 +88,8 @@ fn slide_and_depth_of_rests(person: &Person, track: &PoseTrack) -> (f32, f32) {
     (slide, depth)
 }
 
-/// The farthest that a point of the soles moves over the floor while it touches it, and the deepest it goes below.
+/// Returns the farthest that a point of the soles moves over the floor while touching it, and the deepest it goes
+/// below.
 fn slide_and_depth(person: &Person, track: &PoseTrack) -> (f32, f32) {
     const TOUCHES_M: f32 = 0.002;
     let soles = soles(person);

@@ -12,7 +12,7 @@ use crate::motion::steps::{Gait, Plant, foot};
 /// Steps of a full turn; even, so that the clip closes.
 const STEPS: f64 = 12.0;
 
-/// One full turn to the left: weight goes from foot to foot, the head looks ahead, the arms gesture.
+/// Returns one full turn to the left: weight goes from foot to foot, the head looks ahead, the arms gesture.
 pub(crate) fn turn<'a>(puppet: &'a Puppet<'_>, secs: f64) -> Clip<'a> {
     const STEP_ANGLE: f64 = TAU / STEPS;
     let plants = [0usize, 1].map(|side| {

@@ -11,18 +11,18 @@ use crate::motion::steps::{Gait, Plant, STANCE, foot};
 
 /// Lengths in metres of the average body.
 const CIRCLE_M: f64 = 0.78;
-/// At speed 1.
+/// Length of a step at speed 1.
 const STEP_M: f64 = 0.56;
 const STEPS_A_SECOND: f64 = 1.85;
-/// Feet beside the path.
+/// Distance of the feet from the path.
 const BESIDE_M: f64 = 0.058;
 
-/// A closed path on the ground (x, z).
+/// Closed path on the ground (x, z).
 #[derive(Debug, Clone, Copy)]
 enum Path {
-    /// Around the origin, to the left.
+    /// Counter-clockwise circle around the origin.
     Circle { radius: f64 },
-    /// There on one line and back on another, with half circles at the ends.
+    /// Two parallel lines, there and back, with half circles at the ends.
     Lanes { half_length: f64, radius: f64, near: f64, yaw: f64 },
 }
 
@@ -34,7 +34,7 @@ impl Path {
         }
     }
 
-    /// Place and heading after `s` metres; the heading grows by a turn a round.
+    /// Returns position and heading after `s` metres; the heading grows by a turn per cycle.
     fn at(self, s: f64) -> (DVec2, f64) {
         let round = (s / self.length()).floor();
         let s = s - round * self.length();
@@ -66,7 +66,7 @@ impl Path {
         }
     }
 
-    /// Heading averaged over a step before and after: people turn before their path does.
+    /// Returns the heading averaged over a step before and after: people turn before their path does.
     fn facing(self, s: f64, step_m: f64) -> f64 {
         let headings = (-4..=4).map(|i| self.at(s + f64::from(i) * 0.3 * step_m).1);
         headings.sum::<f64>() / 9.0
@@ -81,13 +81,13 @@ fn left_of(yaw: f64) -> DVec2 {
     DVec2::new(yaw.cos(), -yaw.sin())
 }
 
-/// Around the ring's centre. Faster walkers take longer steps and more of them.
+/// Returns a walk around the ring's centre. Faster walkers take longer steps and more of them.
 pub(crate) fn circle<'a>(puppet: &'a Puppet<'_>, speed: f64) -> Clip<'a> {
     walk(puppet, Path::Circle { radius: CIRCLE_M }, speed, 1.0)
 }
 
-/// Straight through the room in the direction `yaw` with the centre `near_m` metres to the right, from `reach_m`
-/// before the centre to `reach_m` behind it, and back the same number of metres farther from the centre.
+/// Returns a walk straight through the room in the direction `yaw` with the centre `near_m` metres to the right, from
+/// `reach_m` before the centre to `reach_m` behind it, and back at the same distance farther from the centre.
 pub(crate) fn passing<'a>(
     puppet: &'a Puppet<'_>,
     near_m: f64,
