@@ -18,7 +18,7 @@ use glam::DVec3;
 use nalgebra::SMatrix;
 
 use crate::{CalibError, projection::project, uncertainty::pose_deviation};
-use problem::{Estimate, Known, PersonProblem, Spread};
+use problem::{Known, PersonEstimate, PersonProblem, Spread};
 use rays::{Ray, nearest};
 pub use tangents::OutlineCorner;
 pub use tracks::PersonTracks;
@@ -189,7 +189,7 @@ fn motions(rig: &Rig) -> Vec<RigidMotion> {
 
 /// Result of one solve.
 struct Solved {
-    estimate: Estimate,
+    estimate: PersonEstimate,
     lag_sigma_s: Vec<f64>,
     /// Covariance of each camera's pose: rotation vector, then shift, applied on the left.
     poses: Vec<SMatrix<f64, 6, 6>>,
@@ -244,13 +244,13 @@ fn solve(
     tracks: &PersonTracks,
     limbs: &[(usize, usize)],
     options: PersonOptions,
-    start: Option<&Estimate>,
+    start: Option<&PersonEstimate>,
 ) -> Option<Solved> {
     let cameras = rig.cameras.len();
     let intrinsics: Vec<Intrinsics> = rig.cameras.iter().map(|camera| camera.intrinsics).collect();
     let intervals_s: Vec<f64> = (0..cameras).map(|slot| tracks.interval_s(slot)).collect();
     let old = motions(rig);
-    let mut estimate = Estimate {
+    let mut estimate = PersonEstimate {
         cameras: start.map_or_else(|| old.clone(), |start| start.cameras.clone()),
         lags_s: start.map_or_else(|| vec![0.0; cameras], |start| start.lags_s.clone()),
         points: Vec::new(),
@@ -263,7 +263,7 @@ fn solve(
         intervals_s: &intervals_s,
         instants: &instants,
         limbs,
-        before: Estimate { cameras: old, lags_s: vec![0.0; cameras], points: Vec::new() },
+        before: PersonEstimate { cameras: old, lags_s: vec![0.0; cameras], points: Vec::new() },
         prior: (options.turn_sigma, options.place_sigma_m),
         lag_sigma_s: options.lag_sigma_s,
         lags: options.lags,
@@ -312,7 +312,12 @@ fn solve(
 }
 
 /// Returns evenly spaced times at which two cameras see enough landmarks.
-fn instants(intrinsics: &[Intrinsics], tracks: &PersonTracks, intervals_s: &[f64], at: &Estimate) -> Option<Vec<i64>> {
+fn instants(
+    intrinsics: &[Intrinsics],
+    tracks: &PersonTracks,
+    intervals_s: &[f64],
+    at: &PersonEstimate,
+) -> Option<Vec<i64>> {
     let (first, last) = tracks.span()?;
     let span_s = last.saturating_sub(first) as f64 * 1e-9;
     let most = (MOST_IMAGES / intrinsics.len().max(1)).max(LEAST_INSTANTS);
@@ -333,7 +338,7 @@ fn instants(intrinsics: &[Intrinsics], tracks: &PersonTracks, intervals_s: &[f64
 }
 
 /// Triangulates all landmarks with the current poses.
-fn triangulate(known: &Known<'_>, estimate: &mut Estimate) {
+fn triangulate(known: &Known<'_>, estimate: &mut PersonEstimate) {
     let mut points = estimate.points.clone();
     for (instant, points) in points.iter_mut().enumerate() {
         for (landmark, point) in points.iter_mut().enumerate() {
@@ -351,14 +356,14 @@ fn triangulate(known: &Known<'_>, estimate: &mut Estimate) {
 }
 
 /// Returns the median reprojection error by camera, over landmarks seen by two cameras.
-fn errors_by_camera(known: &Known<'_>, at: &Estimate) -> Vec<f64> {
+fn errors_by_camera(known: &Known<'_>, at: &PersonEstimate) -> Vec<f64> {
     let mut errors = vec![Vec::new(); at.cameras.len()];
     each_error(known, at, |camera, _, px| errors[camera].push(px));
     errors.iter_mut().map(|errors| median(errors).unwrap_or(f64::NAN)).collect()
 }
 
 /// Calls `each` with camera, landmark and reprojection error of landmarks seen by at least two cameras.
-fn each_error(known: &Known<'_>, at: &Estimate, mut each: impl FnMut(usize, usize, f64)) {
+fn each_error(known: &Known<'_>, at: &PersonEstimate, mut each: impl FnMut(usize, usize, f64)) {
     for instant in 0..at.points.len() {
         for landmark in 0..known.tracks.landmarks() {
             let errors: Vec<(usize, f64)> = (0..at.cameras.len())
@@ -372,14 +377,14 @@ fn each_error(known: &Known<'_>, at: &Estimate, mut each: impl FnMut(usize, usiz
 }
 
 /// Returns the robust standard deviation of the angles between outermost tangent planes, radians; `None` without silhouettes.
-fn planes_rad(known: &Known<'_>, at: &Estimate) -> Option<f64> {
+fn planes_rad(known: &Known<'_>, at: &PersonEstimate) -> Option<f64> {
     let touches = (0..at.points.len()).flat_map(|instant| known.touches(at, instant));
     let mut angles: Vec<f64> = touches.map(|(.., found)| found.angle.abs()).collect();
     Some(SIGMA_PER_DEVIATION * median(&mut angles)?)
 }
 
 /// Estimates the standard deviations of landmarks, planes and limb lengths from the residuals.
-fn estimate_spread(known: &Known<'_>, at: &Estimate, spread: &mut Spread, with_limbs: bool) {
+fn estimate_spread(known: &Known<'_>, at: &PersonEstimate, spread: &mut Spread, with_limbs: bool) {
     let mut errors = vec![Vec::new(); known.tracks.landmarks()];
     each_error(known, at, |_, landmark, px| errors[landmark].push(px));
     let mut all: Vec<f64> = errors.iter().flatten().copied().collect();

@@ -10,7 +10,7 @@ use crate::camera::sensor::{hash, linear_of_half};
 use crate::draw::cast::Cast;
 use crate::draw::drawing::Drawing;
 use crate::draw::moment::{ImageRequest, RawImage};
-use crate::person::actor::Shape;
+use crate::person::actor::ActorShape;
 use crate::person::assembly::Person;
 use crate::room::scene::Scene;
 use crate::{FramePlan, OpticsConfig, SensorConfig, Shot, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring};
@@ -194,7 +194,7 @@ impl Simulator {
 
     /// Returns the person's visible surface at a time, as a mesh.
     pub fn clothed_surface(&mut self, nanos: i64) -> SurfaceMesh {
-        let Shape { positions, normals, displacement } = self.cast.main.shape(nanos);
+        let ActorShape { positions, normals, displacement } = self.cast.main.shape(nanos);
         let Person { clothed, carriers, .. } = &self.cast.main.person;
         SurfaceMesh {
             positions,

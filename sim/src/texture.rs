@@ -4,11 +4,11 @@ use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
 use crate::clothes::sheet::Sheet;
-use crate::clothes::wardrobe::Srgb;
+use crate::clothes::wardrobe::SrgbColor;
 
 /// Square sRGB image.
 #[derive(Debug, Clone)]
-pub(crate) struct Texture {
+pub(crate) struct TextureImage {
     pub side: usize,
     pub pixels: Vec<[u8; 4]>,
 }
@@ -62,7 +62,7 @@ impl UvMap {
     }
 
     /// Colours each texel by its surface point: three corner nodes' indices and the weights of the corners.
-    pub(crate) fn paint(&self, sheet: &Sheet, colour: impl Fn([u32; 3], Vec3) -> Srgb + Sync) -> Texture {
+    pub(crate) fn paint(&self, sheet: &Sheet, colour: impl Fn([u32; 3], Vec3) -> SrgbColor + Sync) -> TextureImage {
         let pixels = self
             .texels
             .par_iter()
@@ -71,13 +71,13 @@ impl UvMap {
                 None => [128, 128, 128, 255],
             })
             .collect();
-        Texture { side: self.side, pixels }
+        TextureImage { side: self.side, pixels }
     }
 }
 
-impl Texture {
+impl TextureImage {
     /// Creates a texture from a function of texture coordinates.
-    pub(crate) fn from_fn(side: usize, colour: impl Fn(Vec2) -> Srgb + Sync) -> Self {
+    pub(crate) fn from_fn(side: usize, colour: impl Fn(Vec2) -> SrgbColor + Sync) -> Self {
         let pixels = (0..side * side)
             .into_par_iter()
             .map(|i| to_bytes(colour((Vec2::new((i % side) as f32, (i / side) as f32) + 0.5) / side as f32)))
@@ -114,7 +114,7 @@ impl Texture {
     }
 }
 
-fn to_bytes(colour: Srgb) -> [u8; 4] {
+fn to_bytes(colour: SrgbColor) -> [u8; 4] {
     let [r, g, b] = colour.map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8);
     [r, g, b, 255]
 }
@@ -129,10 +129,10 @@ pub(crate) fn srgb_from_linear(c: f32) -> f32 {
     if c <= 0.003_130_8 { c * 12.92 } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 }
 }
 
-pub(crate) fn mix3(a: Srgb, b: Srgb, t: f32) -> Srgb {
+pub(crate) fn mix3(a: SrgbColor, b: SrgbColor, t: f32) -> SrgbColor {
     std::array::from_fn(|i| a[i] + (b[i] - a[i]) * t)
 }
 
-pub(crate) fn scale3(a: Srgb, by: f32) -> Srgb {
+pub(crate) fn scale3(a: SrgbColor, by: f32) -> SrgbColor {
     a.map(|c| c * by)
 }

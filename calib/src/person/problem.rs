@@ -25,7 +25,7 @@ const LOOSE_M: f64 = 2.0;
 
 /// Unknowns of the problem.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Estimate {
+pub(crate) struct PersonEstimate {
     pub cameras: Vec<RigidMotion>,
     /// Time offsets, subtracted from the timestamps, seconds; the first camera's is fixed.
     pub lags_s: Vec<f64>,
@@ -62,7 +62,7 @@ pub(crate) struct Known<'a> {
     /// Pairs of landmarks at a constant distance.
     pub limbs: &'a [(usize, usize)],
     /// The old calibration.
-    pub before: Estimate,
+    pub before: PersonEstimate,
     /// Standard deviations of a camera's orientation and position there: radians, metres.
     pub prior: (f64, f64),
     /// Standard deviation of a time offset, seconds.
@@ -95,7 +95,7 @@ pub(crate) struct PersonProblem<'a> {
 }
 
 impl<'a> PersonProblem<'a> {
-    pub fn new(known: &'a Known<'a>, spread: &'a Spread, at: &Estimate) -> Self {
+    pub fn new(known: &'a Known<'a>, spread: &'a Spread, at: &PersonEstimate) -> Self {
         let (cameras, landmarks) = (known.intrinsics.len(), known.tracks.landmarks());
         let mut terms: Vec<Term> = (0..cameras).map(Term::Camera).collect();
         if known.lags {
@@ -144,7 +144,7 @@ impl<'a> PersonProblem<'a> {
 
     fn seen_residual(
         &self,
-        at: &Estimate,
+        at: &PersonEstimate,
         [instant, camera, landmark]: [usize; 3],
         with_jacobians: bool,
     ) -> Option<Residual> {
@@ -185,7 +185,7 @@ impl<'a> PersonProblem<'a> {
 
     fn touch_residual(
         &self,
-        at: &Estimate,
+        at: &PersonEstimate,
         instant: usize,
         cameras: [usize; 2],
         side: Side,
@@ -214,7 +214,7 @@ impl<'a> PersonProblem<'a> {
         (self.known.lags && camera > 0).then(|| self.known.intrinsics.len() + camera - 1)
     }
 
-    fn limb_residual(&self, at: &Estimate, instant: usize, limb: usize) -> Option<Residual> {
+    fn limb_residual(&self, at: &PersonEstimate, instant: usize, limb: usize) -> Option<Residual> {
         let (a, b) = self.known.limbs[limb];
         let (length, sigma) = self.spread.limbs_m[limb]?;
         let points = &at.points[instant];
@@ -231,7 +231,7 @@ impl<'a> PersonProblem<'a> {
         })
     }
 
-    fn camera_residual(&self, at: &Estimate, camera: usize) -> Residual {
+    fn camera_residual(&self, at: &PersonEstimate, camera: usize) -> Residual {
         let (turn_sigma, place_sigma) = self.known.prior;
         let (now, before) = (&at.cameras[camera], &self.known.before.cameras[camera]);
         let quaternion = now.rotation * before.rotation.inverse();
@@ -261,7 +261,7 @@ impl Known<'_> {
     /// Compares the outermost tangent planes of all pairs of cameras at an instant.
     pub fn touches<'b>(
         &'b self,
-        at: &'b Estimate,
+        at: &'b PersonEstimate,
         instant: usize,
     ) -> impl Iterator<Item = ([usize; 2], Side, Tangency)> + 'b {
         let count = self.intrinsics.len();
@@ -272,7 +272,7 @@ impl Known<'_> {
 
     fn tangency(
         &self,
-        at: &Estimate,
+        at: &PersonEstimate,
         instant: usize,
         cameras: [usize; 2],
         side: Side,
@@ -290,17 +290,17 @@ impl Known<'_> {
         tangency(cameras.map(eye), side, middle.try_normalize()?, with_derivatives)
     }
 
-    fn stamp(&self, at: &Estimate, instant: usize, camera: usize) -> i64 {
+    fn stamp(&self, at: &PersonEstimate, instant: usize, camera: usize) -> i64 {
         self.instants[instant].saturating_add((at.lags_s[camera] * 1e9) as i64)
     }
 
     /// Returns the smoothed landmark of a camera at an instant.
-    pub fn place(&self, at: &Estimate, instant: usize, camera: usize, landmark: usize) -> Option<Place> {
+    pub fn place(&self, at: &PersonEstimate, instant: usize, camera: usize, landmark: usize) -> Option<Place> {
         self.tracks.track(camera, landmark).at(self.stamp(at, instant, camera), self.intervals_s[camera])
     }
 
     /// Returns the reprojection error of a landmark, pixels; `None` where it is not seen or cannot be projected.
-    pub fn error(&self, at: &Estimate, instant: usize, camera: usize, landmark: usize) -> Option<DVec2> {
+    pub fn error(&self, at: &PersonEstimate, instant: usize, camera: usize, landmark: usize) -> Option<DVec2> {
         let place = self.place(at, instant, camera, landmark)?;
         let local = at.cameras[camera].apply(at.points[instant][landmark]);
         Some(project(&self.intrinsics[camera], local)? - place.pixel)
@@ -308,7 +308,7 @@ impl Known<'_> {
 }
 
 impl BlockProblem for PersonProblem<'_> {
-    type Unknowns = Estimate;
+    type Unknowns = PersonEstimate;
 
     fn block_sizes(&self) -> &[usize] {
         &self.sizes
@@ -322,7 +322,7 @@ impl BlockProblem for PersonProblem<'_> {
         self.terms.len()
     }
 
-    fn residual(&self, at: &Estimate, index: usize, with_jacobians: bool) -> Option<Residual> {
+    fn residual(&self, at: &PersonEstimate, index: usize, with_jacobians: bool) -> Option<Residual> {
         match self.terms[index] {
             Term::Seen { instant, camera, landmark } => {
                 self.seen_residual(at, [instant, camera, landmark], with_jacobians)
@@ -357,7 +357,7 @@ impl BlockProblem for PersonProblem<'_> {
         }
     }
 
-    fn moved(&self, at: &Estimate, step: &[f64]) -> Estimate {
+    fn moved(&self, at: &PersonEstimate, step: &[f64]) -> PersonEstimate {
         let mut at = at.clone();
         let mut vectors = step.chunks_exact(3).map(|v| DVec3::new(v[0], v[1], v[2]));
         let mut next = || vectors.next().unwrap_or_default();

@@ -47,7 +47,7 @@ impl Default for FolderOptions {
 pub struct FolderReplay {
     camera: CameraId,
     fps: f64,
-    shots: Arc<[Shot]>,
+    shots: Arc<[FolderFrame]>,
     pictures: BTreeMap<String, PathBuf>,
     masks: Option<BTreeMap<String, PathBuf>>,
     next: usize,
@@ -56,7 +56,7 @@ pub struct FolderReplay {
 
 /// Frame that at least one camera has.
 #[derive(Debug)]
-struct Shot {
+struct FolderFrame {
     number: u64,
     /// File stems of this number: `1` and `0001` can be two cameras' names for it.
     stems: Vec<String>,
@@ -97,7 +97,7 @@ impl FolderReplay {
         self.shots.len() - self.next
     }
 
-    fn read(&self, shot: &Shot) -> Result<Frame, CaptureError> {
+    fn read(&self, shot: &FolderFrame) -> Result<Frame, CaptureError> {
         let file = |files: &BTreeMap<String, PathBuf>, what: &str| {
             shot.stems.iter().find_map(|stem| files.get(stem)).cloned().ok_or_else(|| {
                 let message = format!("frame {} has no {what}, though others have; restore the file", shot.number);
@@ -231,7 +231,7 @@ fn two_of_one(camera: &CameraId, a: &Path, b: &Path) -> CaptureError {
 }
 
 /// Lists the frames in the range that any camera has, by number.
-fn shots(sources: &[FolderReplay], range: Option<&Range<u64>>) -> Result<Arc<[Shot]>, CaptureError> {
+fn shots(sources: &[FolderReplay], range: Option<&Range<u64>>) -> Result<Arc<[FolderFrame]>, CaptureError> {
     let stems: BTreeSet<&String> = sources.iter().flat_map(|source| source.pictures.keys()).collect();
     let numbers: Option<Vec<u64>> = stems.iter().map(|stem| stem.parse().ok()).collect();
     let numbers = numbers.unwrap_or_else(|| (0..stems.len() as u64).collect());
@@ -249,10 +249,10 @@ fn shots(sources: &[FolderReplay], range: Option<&Range<u64>>) -> Result<Arc<[Sh
     }
     let ends =
         by_number.first_key_value().zip(by_number.last_key_value()).map(|((first, _), (last, _))| (*first, *last));
-    let shots: Arc<[Shot]> = by_number
+    let shots: Arc<[FolderFrame]> = by_number
         .into_iter()
         .filter(|(number, _)| range.is_none_or(|range| range.contains(number)))
-        .map(|(number, stems)| Shot { number, stems })
+        .map(|(number, stems)| FolderFrame { number, stems })
         .collect();
     match (range, ends) {
         (Some(range), Some((first, last))) if shots.is_empty() => Err(CaptureError::general(

@@ -17,7 +17,7 @@ use nokhwa::{
 
 use crate::{
     CaptureError, CaptureErrorKind, FormatChoice,
-    blocking::{BlockingCamera, Expected, Opener, Shot, Watched},
+    blocking::{BlockingCamera, DriverImage, Expected, Opener, Watched},
     clock::monotonic_nanos,
     image_file, mjpeg,
     source::forward_source,
@@ -232,7 +232,7 @@ impl BlockingCamera for OpenCamera {
         format!("{} {} at {} through nokhwa", format.format(), format.resolution(), format.frame_rate())
     }
 
-    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<Shot, CaptureError> {
+    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<DriverImage, CaptureError> {
         let buffer = self.0.frame().map_err(|error| explain(&error))?;
         let arrival_nanos = monotonic_nanos();
         let stamp_nanos = buffer.capture_timestamp().and_then(|taken| {
@@ -246,7 +246,7 @@ impl BlockingCamera for OpenCamera {
             return Err(CaptureError::general(CaptureErrorKind::Corrupt, format!("{format} cannot be read")));
         };
         let size = cut(*format, (resolution.width(), resolution.height()), buffer.buffer(), bytes)?;
-        Ok(Shot { size, format: *format, stamp_nanos, arrival_nanos })
+        Ok(DriverImage { size, format: *format, stamp_nanos, arrival_nanos })
     }
 }
 

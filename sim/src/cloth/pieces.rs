@@ -6,7 +6,7 @@ use flyrig_body::SkinWeights;
 use glam::Vec3;
 
 use super::colliders::Capsule;
-use super::solver::{Link, Particle, Particles};
+use super::solver::{Particle, ParticleLink, Particles};
 use crate::noise::smoothstep;
 use crate::person::assembly::{Person, SheetRange};
 
@@ -155,14 +155,18 @@ impl Pieces {
         for (a, all) in (0u32..).zip(joined) {
             for &b in all.iter().filter(|&&b| b > a) {
                 let rest_m = at(a, &self.particles).distance(at(b, &self.particles));
-                links.push(Link { ends: [a + offset, b + offset], rest_m, soft: 1.0 });
+                links.push(ParticleLink { ends: [a + offset, b + offset], rest_m, soft: 1.0 });
             }
             // Pairs of neighbours on opposite sides.
             for &b in all {
                 for &c in all.iter().filter(|&&c| c > b) {
                     let [p, q, r] = [a, b, c].map(|i| at(i, &self.particles));
                     if (q - p).normalize_or_zero().dot((r - p).normalize_or_zero()) < -0.8 {
-                        links.push(Link { ends: [b + offset, c + offset], rest_m: q.distance(r), soft: BEND_SOFT });
+                        links.push(ParticleLink {
+                            ends: [b + offset, c + offset],
+                            rest_m: q.distance(r),
+                            soft: BEND_SOFT,
+                        });
                     }
                 }
             }

@@ -12,7 +12,7 @@ use glam::{Mat3, Mat4, Vec3};
 
 use super::colliders::{Capsule, Colliders};
 use super::pieces::Rigging;
-use super::solver::{Carried, STEPS_A_SECOND, State, step};
+use super::solver::{STEPS_A_SECOND, SkinnedParticle, State, step};
 
 const STEP_NANOS: i64 = 1_000_000_000 / STEPS_A_SECOND;
 /// Steps of a window, of the lead-in before it, and of blending with the previous window.
@@ -111,7 +111,7 @@ impl Replay {
     }
 
     /// Returns the skinned positions of the particles, and the skinning matrices.
-    fn carried(&self, track: &PoseTrack, nanos: i64) -> (Vec<Carried>, Vec<glam::DMat4>) {
+    fn carried(&self, track: &PoseTrack, nanos: i64) -> (Vec<SkinnedParticle>, Vec<glam::DMat4>) {
         let matrices = self.skeleton.world_from_canonical(&track.at_repeated(nanos));
         let small: Vec<Mat4> = matrices.iter().map(glam::DMat4::as_mat4).collect();
         let carried = self
@@ -123,7 +123,7 @@ impl Replay {
             .map(|((&position, &normal), skin)| {
                 let blend = blended(&small, skin);
                 let linear = Mat3::from_mat4(blend);
-                Carried {
+                SkinnedParticle {
                     place: blend.transform_point3(position),
                     // Canonical space is y up.
                     up: (linear * Vec3::Y).normalize_or(Vec3::Z),

@@ -30,7 +30,7 @@ const FLOOR_M: f32 = 0.004;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Particles {
     pub points: Vec<Particle>,
-    pub links: Vec<Link>,
+    pub links: Vec<ParticleLink>,
 }
 
 /// Control particle.
@@ -48,7 +48,7 @@ pub(crate) struct Particle {
 
 /// Two particles and their rest distance, metres; `soft` multiplies the compliance (bending).
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Link {
+pub(crate) struct ParticleLink {
     pub ends: [u32; 2],
     pub rest_m: f32,
     pub soft: f32,
@@ -56,7 +56,7 @@ pub(crate) struct Link {
 
 /// Skinned state of a particle at a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Carried {
+pub(crate) struct SkinnedParticle {
     /// Skinned position.
     pub place: Vec3,
     /// Direction that was up at rest.
@@ -76,7 +76,7 @@ pub(crate) struct State {
 
 impl State {
     /// Returns the state at rest on the body.
-    pub(crate) fn at_rest(carried: &[Carried]) -> Self {
+    pub(crate) fn at_rest(carried: &[SkinnedParticle]) -> Self {
         let places: Vec<Vec3> = carried.iter().map(|c| c.place).collect();
         Self { speeds: vec![Vec3::ZERO; places.len()], carried: places.clone(), places }
     }
@@ -89,7 +89,7 @@ pub(crate) fn pull(particle: &Particle) -> f32 {
 }
 
 /// Advances the particles by [`STEP_SECS`].
-pub(crate) fn step(particles: &Particles, carried: &[Carried], capsules: &[Capsule], state: &mut State) {
+pub(crate) fn step(particles: &Particles, carried: &[SkinnedParticle], capsules: &[Capsule], state: &mut State) {
     const DT: f32 = STEP_SECS;
     let before = state.places.clone();
     for (i, (particle, now)) in particles.points.iter().zip(carried).enumerate() {
@@ -153,7 +153,7 @@ pub(crate) fn step(particles: &Particles, carried: &[Carried], capsules: &[Capsu
 
 /// Applies a distance constraint: Eq. 18 of XPBD with the multiplier reset to zero each step; all free particles have
 /// equal mass.
-fn hold(particles: &Particles, link: &Link, places: &mut [Vec3]) {
+fn hold(particles: &Particles, link: &ParticleLink, places: &mut [Vec3]) {
     let [a, b] = link.ends.map(|end| end as usize);
     let weight = |i: usize| f32::from(u8::from(particles.points[i].free_m > 0.0));
     let (wa, wb) = (weight(a), weight(b));

@@ -5,11 +5,11 @@ use flyrig_types::PoseTrack;
 use glam::{DQuat, DVec3, Vec3};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
-use super::solver::{Carried, Link, Particle, Particles, State, pull, step};
+use super::solver::{Particle, ParticleLink, Particles, SkinnedParticle, State, pull, step};
 use super::*;
 use crate::clothes::wardrobe::{Bottom, HairCut};
-use crate::person::actor::{Actor, Shape};
-use crate::person::look::Look;
+use crate::person::actor::{Actor, ActorShape};
+use crate::person::look::PersonLook;
 use crate::{MotionKind, SimConfig, describe_person};
 
 /// Seeds of a person in a coat, and of one in a skirt.
@@ -22,7 +22,7 @@ fn actor(seed: u64, kind: MotionKind, speed: f64) -> Actor {
     Actor::new(&config).unwrap()
 }
 
-fn largest(shape: &Shape) -> f32 {
+fn largest(shape: &ActorShape) -> f32 {
     shape.displacement.iter().map(|d| d.length()).fold(0.0, f32::max)
 }
 
@@ -38,8 +38,8 @@ fn a_coat_swings_the_more_the_faster_its_wearer_turns_and_rests_when_still() {
     let mut resting = actor(COAT, MotionKind::Still, 1.0);
     let pose = resting.pose(0);
     resting.track = PoseTrack::new(vec![(0, pose.clone()), (8_000_000_000, pose)]).unwrap();
-    let rests: Vec<Shape> = (0..16).map(|i| resting.shape(i * 500_000_000)).collect();
-    let drift = |shape: &Shape| {
+    let rests: Vec<ActorShape> = (0..16).map(|i| resting.shape(i * 500_000_000)).collect();
+    let drift = |shape: &ActorShape| {
         shape.positions.iter().zip(&rests[0].positions).map(|(a, b)| a.distance(*b)).fold(0.0f32, f32::max)
     };
     let still = rests.iter().map(drift).fold(0.0, f32::max);
@@ -88,7 +88,7 @@ fn share_inside(actor: &mut Actor, nanos: i64) -> f64 {
 fn the_order_of_asking_does_not_matter_and_nothing_pops() {
     let times: Vec<i64> = (0..12).map(|i| i * 1_234_567_891 % 23_000_000_000 - 3_000_000_000).collect();
     let mut forwards = actor(SKIRT, MotionKind::Turn, 1.3);
-    let shapes: Vec<Shape> = times.iter().map(|&t| forwards.shape(t)).collect();
+    let shapes: Vec<ActorShape> = times.iter().map(|&t| forwards.shape(t)).collect();
     let mut backwards = actor(SKIRT, MotionKind::Turn, 1.3);
     for (i, &t) in times.iter().enumerate().rev() {
         let again = backwards.shape(t);
@@ -138,7 +138,7 @@ fn a_teleporting_wearer_is_followed() {
 #[test]
 fn tight_clothes_cost_nothing() {
     let config = SimConfig::default();
-    let mut look = Look::new(&config);
+    let mut look = PersonLook::new(&config);
     look.cut = HairCut::Crop;
     look.outer = None;
     (look.top.offset_m, look.top.tucked, look.top.sleeve_m) = (0.006, true, 0.465);
@@ -152,7 +152,7 @@ fn tight_clothes_cost_nothing() {
 }
 
 /// Returns a chain hanging from its first particle, with an obstacle.
-fn chain(count: usize) -> (Particles, Vec<Carried>) {
+fn chain(count: usize) -> (Particles, Vec<SkinnedParticle>) {
     let free = |i: usize| i as f32 * 0.05;
     let points = (0..count)
         .map(|i| Particle {
@@ -162,16 +162,21 @@ fn chain(count: usize) -> (Particles, Vec<Carried>) {
             inside_m: Some(0.001),
         })
         .collect();
-    let link = |a: usize, b: usize, soft| Link { ends: [a as u32, b as u32], rest_m: free(b) - free(a), soft };
+    let link = |a: usize, b: usize, soft| ParticleLink { ends: [a as u32, b as u32], rest_m: free(b) - free(a), soft };
     let links = (1..count).map(|i| link(i - 1, i, 1.0)).chain((2..count).map(|i| link(i - 2, i, 12.0))).collect();
     let carried = (0..count)
-        .map(|i| Carried { place: Vec3::new(0.0, 0.0, 1.0 - free(i)), up: Vec3::Z, normal: Vec3::X })
+        .map(|i| SkinnedParticle { place: Vec3::new(0.0, 0.0, 1.0 - free(i)), up: Vec3::Z, normal: Vec3::X })
         .collect();
     (Particles { points, links }, carried)
 }
 
 /// Performs the step in f64, written independently from its description.
-fn plain_step(particles: &Particles, carried: &[Carried], capsule: &colliders::Capsule, state: &State) -> Vec<DVec3> {
+fn plain_step(
+    particles: &Particles,
+    carried: &[SkinnedParticle],
+    capsule: &colliders::Capsule,
+    state: &State,
+) -> Vec<DVec3> {
     let (dt, gravity) = (1.0 / 120.0, 9.81);
     let d = |v: Vec3| v.as_dvec3();
     let held = |i: usize| particles.points[i].free_m == 0.0;

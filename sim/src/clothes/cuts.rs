@@ -5,7 +5,7 @@ use flyrig_body::Part;
 use crate::clothes::sheet::Node;
 use crate::clothes::wardrobe::{Bottom, Outer, ShoeKind, Top, TopKind};
 use crate::noise::{lerp, smoothstep};
-use crate::person::look::Look;
+use crate::person::look::PersonLook;
 use crate::person::regions::{along_arm, below_neckline};
 
 /// Value far outside any cloth.
@@ -30,7 +30,7 @@ pub(crate) fn is_hand(part: Part) -> bool {
     matches!(part, Part::LeftHand | Part::RightHand)
 }
 
-pub(crate) fn waist_m(look: &Look) -> f32 {
+pub(crate) fn waist_m(look: &PersonLook) -> f32 {
     if look.top.tucked { HIGH_WAIST_M } else { WAIST_M }
 }
 
@@ -81,7 +81,7 @@ pub(crate) fn opening_m(outer: &Outer, y: f32) -> f32 {
 }
 
 /// Returns the cut of trousers and overalls; skirts are built separately.
-pub(crate) fn inside_bottom(look: &Look, node: &Node) -> f32 {
+pub(crate) fn inside_bottom(look: &PersonLook, node: &Node) -> f32 {
     if is_arm(node.part) || is_hand(node.part) {
         return OUTSIDE_M;
     }
@@ -97,7 +97,7 @@ pub(crate) fn inside_bottom(look: &Look, node: &Node) -> f32 {
     }
 }
 
-pub(crate) fn inside_boot(look: &Look, node: &Node) -> f32 {
+pub(crate) fn inside_boot(look: &PersonLook, node: &Node) -> f32 {
     if look.shoes.kind == ShoeKind::Boots && !is_hand(node.part) {
         (BOOT_M - node.average.y).min(node.average.y - 0.05)
     } else {
@@ -106,7 +106,7 @@ pub(crate) fn inside_boot(look: &Look, node: &Node) -> f32 {
 }
 
 /// Returns the region below a skirt, or behind the tails of a coat.
-pub(crate) fn under_hanging(look: &Look, node: &Node) -> f32 {
+pub(crate) fn under_hanging(look: &PersonLook, node: &Node) -> f32 {
     let p = node.average;
     if is_arm(node.part) || is_hand(node.part) {
         return OUTSIDE_M;
@@ -118,7 +118,7 @@ pub(crate) fn under_hanging(look: &Look, node: &Node) -> f32 {
 }
 
 /// Returns the region inside the sides and the back of a coat's tails, which no camera sees.
-pub(crate) fn under_tails(look: &Look, node: &Node) -> f32 {
+pub(crate) fn under_tails(look: &PersonLook, node: &Node) -> f32 {
     match look.outer {
         Some(outer) if outer.hem_m < 0.7 && !is_arm(node.part) && !is_hand(node.part) => {
             let p = node.average;

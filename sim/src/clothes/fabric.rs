@@ -3,7 +3,7 @@
 use glam::{Vec2, Vec3};
 
 use crate::clothes::glyphs::word_at;
-use crate::clothes::wardrobe::{Cloth, Fabric, Print, Srgb};
+use crate::clothes::wardrobe::{Fabric, Print, SrgbColor, Textile};
 use crate::noise::{Noise, smoothstep};
 use crate::texture::{mix3, scale3};
 
@@ -27,7 +27,7 @@ fn band(at: f32, period: f32, share: f32) -> f32 {
 }
 
 /// Returns the colour of a cloth, without seams.
-pub(crate) fn cloth_colour(cloth: &Cloth, noise: Noise, point: ClothPoint) -> Srgb {
+pub(crate) fn cloth_colour(cloth: &Textile, noise: Noise, point: ClothPoint) -> SrgbColor {
     let Vec2 { x: across, y: down } = point.at;
     let [ground, print, accent] = cloth.colours;
     let size = cloth.scale;
@@ -99,7 +99,7 @@ pub(crate) fn gloss(fabric: Fabric) -> f32 {
 }
 
 /// Returns the colour of patches in four shades of the ground's hue.
-fn camouflage(ground: Srgb, noise: Noise, p: Vec3) -> Srgb {
+fn camouflage(ground: SrgbColor, noise: Noise, p: Vec3) -> SrgbColor {
     let field = |stretch: Vec3, frequency: f32| noise.sum(p * stretch * frequency, 3);
     let green = mix3(ground, [0.36, 0.38, 0.24], 0.65);
     let mut colour = mix3(green, [0.68, 0.62, 0.46], 0.75);

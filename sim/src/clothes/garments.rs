@@ -9,7 +9,7 @@ use crate::clothes::loose::{free_bottom, free_outer, free_top, hang_free};
 use crate::clothes::sheet::{Node, Sheet};
 use crate::clothes::wardrobe::{Bottom, HairCut, Outer, ShoeKind, Top, TopKind};
 use crate::noise::{Noise, lerp, smoothstep};
-use crate::person::look::Look;
+use crate::person::look::PersonLook;
 use crate::person::regions::{ANKLE_TOP_M, along_arm, below_neckline, is_ear};
 
 /// Depth inside another layer below which cloth is omitted.
@@ -105,7 +105,7 @@ impl Tailor {
     }
 
     /// Builds a T-shirt, shirt, jumper or the upper part of a dress.
-    pub(crate) fn top(&self, look: &Look) -> Sheet {
+    pub(crate) fn top(&self, look: &PersonLook) -> Sheet {
         let top = &look.top;
         let sheet = self.draped(|i, node| self.over(i, self.top_offset(top, look.female, node)));
         let mut cloth = self.cut(&sheet, |node| inside_top(top, node));
@@ -126,7 +126,7 @@ impl Tailor {
     }
 
     /// Builds a jacket, or a coat down to the hip.
-    pub(crate) fn outer(&self, look: &Look, outer: &Outer) -> Sheet {
+    pub(crate) fn outer(&self, look: &PersonLook, outer: &Outer) -> Sheet {
         let sheet = self.draped(|i, node| {
             let p = node.average;
             let under = self.top_offset(&look.top, look.female, node);
@@ -160,7 +160,7 @@ impl Tailor {
     }
 
     /// Builds trousers, shorts or overalls.
-    pub(crate) fn bottom(&self, look: &Look) -> Option<Sheet> {
+    pub(crate) fn bottom(&self, look: &PersonLook) -> Option<Sheet> {
         let (hem_m, wide_m) = match look.bottom {
             Bottom::Trousers { hem_m, wide_m, .. } => (hem_m, wide_m),
             Bottom::Overalls { hem_m, .. } => (hem_m, 0.012),
@@ -209,7 +209,7 @@ impl Tailor {
     }
 
     /// Builds the shafts of boots.
-    pub(crate) fn boot_shafts(&self, look: &Look) -> Option<Sheet> {
+    pub(crate) fn boot_shafts(&self, look: &PersonLook) -> Option<Sheet> {
         (look.shoes.kind == ShoeKind::Boots).then(|| {
             let sheet = self.draped(|i, node| {
                 let offset = 0.007 + 0.002 * self.noise.sum(node.average * 16.0, 2);
@@ -223,7 +223,7 @@ impl Tailor {
 }
 
 /// Returns the part of the naked body that remains visible.
-pub(crate) fn visible_skin(body: &Sheet, look: &Look) -> Sheet {
+pub(crate) fn visible_skin(body: &Sheet, look: &PersonLook) -> Sheet {
     const MARGIN_M: f32 = 0.025;
     let covered = |node: &Node| {
         inside_top(&look.top, node) > MARGIN_M

@@ -11,7 +11,7 @@ use crate::noise::smoothstep;
 
 /// Tube of cloth; heights in metres on the average body.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Hanging {
+pub(crate) struct ClothTube {
     pub top_m: f32,
     pub hem_m: f32,
     /// Distance from the body at the top and the bottom, metres.
@@ -31,7 +31,7 @@ const FOLLOWS_M: f32 = 0.64;
 
 impl Tailor {
     /// Builds the tube, textured by u around and v down.
-    pub(crate) fn hang(&self, cloth: &Hanging) -> Sheet {
+    pub(crate) fn hang(&self, cloth: &ClothTube) -> Sheet {
         const COLUMNS: u32 = 112;
         let rows = ((cloth.top_m - cloth.hem_m) / 0.016).ceil().max(4.0) as u32;
         let mut sheet = Sheet::default();

@@ -4,7 +4,7 @@ use crate::clothes::cuts::{is_arm, opening_m};
 use crate::clothes::sheet::{Node, Sheet};
 use crate::clothes::wardrobe::{Bottom, Fabric, Outer, TopKind};
 use crate::noise::{lerp, smoothstep};
-use crate::person::look::Look;
+use crate::person::look::PersonLook;
 use crate::person::regions::along_arm;
 
 /// Sets the free lengths of a sheet's points.
@@ -26,7 +26,7 @@ pub(crate) fn stiffness(fabric: Fabric) -> f32 {
 }
 
 /// Returns the free length of hems and wide short sleeves of the outermost top that is not tucked in.
-pub(crate) fn free_top(look: &Look, node: &Node) -> f32 {
+pub(crate) fn free_top(look: &PersonLook, node: &Node) -> f32 {
     let (top, p) = (&look.top, node.average);
     // A close fit does not swing.
     let loose = smoothstep(0.007, 0.013, top.offset_m);
@@ -56,7 +56,7 @@ pub(crate) fn free_outer(outer: &Outer, node: &Node) -> f32 {
 }
 
 /// Returns the free length of wide trouser legs and shorts.
-pub(crate) fn free_bottom(look: &Look, node: &Node) -> f32 {
+pub(crate) fn free_bottom(look: &PersonLook, node: &Node) -> f32 {
     if look.outer.is_some_and(|outer| outer.hem_m < 0.7) {
         // Under a coat.
         return 0.0;

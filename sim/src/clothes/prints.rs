@@ -3,9 +3,9 @@
 use glam::{Vec2, Vec3};
 
 use crate::clothes::fabric::{ClothPoint, cloth_colour};
-use crate::clothes::wardrobe::{Bottom, Cloth, Fabric, Outer, ShoeKind, Srgb, Top, TopKind};
+use crate::clothes::wardrobe::{Bottom, Fabric, Outer, ShoeKind, SrgbColor, Textile, Top, TopKind};
 use crate::noise::{Noise, smoothstep};
-use crate::person::look::Look;
+use crate::person::look::PersonLook;
 use crate::person::regions::{along_arm, around_arm, on_sleeve};
 use crate::texture::{mix3, scale3};
 
@@ -15,12 +15,12 @@ fn line(distance: f32, half_m: f32) -> f32 {
 }
 
 /// Returns the colour of seams: darker than the cloth, orange on denim.
-fn stitch(cloth: &Cloth) -> Srgb {
+fn stitch(cloth: &Textile) -> SrgbColor {
     if cloth.fabric == Fabric::Denim { [0.72, 0.55, 0.30] } else { scale3(cloth.colours[0], 0.55) }
 }
 
 /// Returns the cloth of the upper body at a point of the average body.
-fn upper_cloth(cloth: &Cloth, noise: Noise, p: Vec3, hem_m: f32) -> Srgb {
+fn upper_cloth(cloth: &Textile, noise: Noise, p: Vec3, hem_m: f32) -> SrgbColor {
     let arm = on_sleeve(p);
     // Across, down. Sleeves have their own piece of cloth.
     let at = if arm {
@@ -35,7 +35,7 @@ fn upper_cloth(cloth: &Cloth, noise: Noise, p: Vec3, hem_m: f32) -> Srgb {
 }
 
 /// Returns the colour of the top at a point of the average body, `inside` metres from the cloth's edge.
-pub(crate) fn top_colour(top: &Top, noise: Noise, p: Vec3, inside: f32) -> Srgb {
+pub(crate) fn top_colour(top: &Top, noise: Noise, p: Vec3, inside: f32) -> SrgbColor {
     let mut colour = upper_cloth(&top.cloth, noise, p, top.hem_m);
     let ground = top.cloth.colours[0];
     let dark = stitch(&top.cloth);
@@ -67,7 +67,7 @@ pub(crate) fn top_colour(top: &Top, noise: Noise, p: Vec3, inside: f32) -> Srgb 
 }
 
 /// Returns the colour of a jacket or a coat's upper part.
-pub(crate) fn outer_colour(outer: &Outer, noise: Noise, p: Vec3, inside: f32) -> Srgb {
+pub(crate) fn outer_colour(outer: &Outer, noise: Noise, p: Vec3, inside: f32) -> SrgbColor {
     let mut colour = upper_cloth(&outer.cloth, noise, p, outer.hem_m);
     let dark = stitch(&outer.cloth);
     if p.z > 0.0 && !on_sleeve(p) {
@@ -86,7 +86,7 @@ pub(crate) fn outer_colour(outer: &Outer, noise: Noise, p: Vec3, inside: f32) ->
 }
 
 /// Returns the colour of the trousers at a point of the average body, `inside` metres from the cloth's edge.
-pub(crate) fn bottom_colour(look: &Look, noise: Noise, p: Vec3, inside: f32) -> Srgb {
+pub(crate) fn bottom_colour(look: &PersonLook, noise: Noise, p: Vec3, inside: f32) -> SrgbColor {
     let (cloth, hem_m, bib) = match &look.bottom {
         Bottom::Trousers { cloth, hem_m, .. } => (cloth, *hem_m, false),
         Bottom::Overalls { cloth, hem_m } => (cloth, *hem_m, true),
@@ -132,7 +132,7 @@ pub(crate) fn bottom_colour(look: &Look, noise: Noise, p: Vec3, inside: f32) -> 
 }
 
 /// Returns the colour of a skirt or a coat's tails, which are `high_m` high; `uv` runs around from the front and down.
-pub(crate) fn hanging_colour(cloth: &Cloth, noise: Noise, uv: Vec2, high_m: f32, waistband: bool) -> Srgb {
+pub(crate) fn hanging_colour(cloth: &Textile, noise: Noise, uv: Vec2, high_m: f32, waistband: bool) -> SrgbColor {
     let turn = uv.x * std::f32::consts::TAU;
     let at = Vec2::new(uv.x * 1.12, uv.y * high_m);
     let space = Vec3::new(turn.sin() * 0.18, -at.y, turn.cos() * 0.18);
@@ -146,7 +146,7 @@ pub(crate) fn hanging_colour(cloth: &Cloth, noise: Noise, uv: Vec2, high_m: f32,
 }
 
 /// Returns the colour of a hat.
-pub(crate) fn hat_colour(cloth: &Cloth, noise: Noise, uv: Vec2) -> Srgb {
+pub(crate) fn hat_colour(cloth: &Textile, noise: Noise, uv: Vec2) -> SrgbColor {
     let turn = uv.x * std::f32::consts::TAU;
     let at = Vec2::new(uv.x * 0.60, (1.0 - uv.y) * 0.16);
     let space = Vec3::new(turn.sin() * 0.1, uv.y * 0.16, turn.cos() * 0.1);
@@ -160,7 +160,7 @@ pub(crate) fn hat_colour(cloth: &Cloth, noise: Noise, uv: Vec2) -> Srgb {
 }
 
 /// Returns the colour of hair.
-pub(crate) fn hair_colour(look: &Look, noise: Noise, p: Vec3) -> Srgb {
+pub(crate) fn hair_colour(look: &PersonLook, noise: Noise, p: Vec3) -> SrgbColor {
     let around = p.x.atan2(p.z - 0.04);
     let top = smoothstep(1.60, 1.65, p.y);
     let side = noise.sum(Vec3::new(around * 46.0, p.y * 14.0, 1.0), 3);
@@ -173,7 +173,7 @@ pub(crate) fn hair_colour(look: &Look, noise: Noise, p: Vec3) -> Srgb {
 }
 
 /// Returns the colour of a shoe's upper; `uv` runs around (0 at the outer side, 0.25 on top) and from heel to toe.
-pub(crate) fn upper_colour(look: &Look, noise: Noise, uv: Vec2) -> Srgb {
+pub(crate) fn upper_colour(look: &PersonLook, noise: Noise, uv: Vec2) -> SrgbColor {
     let [main, accent] = look.shoes.colours;
     let side = (uv.x - 0.25).abs();
     let top = smoothstep(0.115, 0.10, side);
@@ -202,7 +202,7 @@ pub(crate) fn upper_colour(look: &Look, noise: Noise, uv: Vec2) -> Srgb {
 }
 
 /// Returns the colour of a shoe's sole.
-pub(crate) fn sole_colour(look: &Look, noise: Noise, uv: Vec2) -> Srgb {
+pub(crate) fn sole_colour(look: &PersonLook, noise: Noise, uv: Vec2) -> SrgbColor {
     let base = match look.shoes.kind {
         ShoeKind::Trainers if look.shoes.colours[0][0] > 0.8 => [0.80, 0.79, 0.76],
         ShoeKind::Trainers => [0.88, 0.87, 0.84],

@@ -1,7 +1,7 @@
 //! Kinds of garments, hair and hats, and the cloth they are made of.
 
 /// sRGB colour in 0..=1.
-pub(crate) type Srgb = [f32; 3];
+pub(crate) type SrgbColor = [f32; 3];
 
 /// Structure of a cloth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,11 +37,11 @@ pub(crate) enum Print {
 
 /// Cloth with its pattern and colours.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Cloth {
+pub(crate) struct Textile {
     pub fabric: Fabric,
     pub print: Print,
     /// Colours of ground, print and accent.
-    pub colours: [Srgb; 3],
+    pub colours: [SrgbColor; 3],
     /// Scale of the print relative to a common one.
     pub scale: f32,
 }
@@ -60,7 +60,7 @@ pub(crate) enum TopKind {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Top {
     pub kind: TopKind,
-    pub cloth: Cloth,
+    pub cloth: Textile,
     /// Length along the arm from the shoulder joint; the wrist is at 0.48.
     pub sleeve_m: f32,
     pub v_neck_m: f32,
@@ -78,17 +78,17 @@ pub(crate) struct Top {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Bottom {
     /// Trousers and shorts. `wide_m` is the additional distance of the hem from the leg, compared with the hip's.
-    Trousers { cloth: Cloth, hem_m: f32, wide_m: f32 },
+    Trousers { cloth: Textile, hem_m: f32, wide_m: f32 },
     /// Trousers with a bib and straps.
-    Overalls { cloth: Cloth, hem_m: f32 },
+    Overalls { cloth: Textile, hem_m: f32 },
     /// Separate skirt, or that of a dress (whose top is of the same cloth). `flare` is metres outwards per metre down.
-    Skirt { cloth: Cloth, hem_m: f32, flare: f32, pleats: u8 },
+    Skirt { cloth: Textile, hem_m: f32, flare: f32, pleats: u8 },
 }
 
 /// Garment over all others.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Outer {
-    pub cloth: Cloth,
+    pub cloth: Textile,
     /// Height of the hem, metres on the average body; below the hip the garment is a coat.
     pub hem_m: f32,
     /// Half the width of the front opening at the hem, metres; 0 for a closed one.
@@ -123,9 +123,9 @@ pub(crate) enum Beard {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Hat {
     None,
-    Beanie(Cloth),
-    Cap(Cloth),
-    Brimmed(Cloth),
+    Beanie(Textile),
+    Cap(Textile),
+    Brimmed(Textile),
 }
 
 /// Kind of shoes.
@@ -138,11 +138,11 @@ pub(crate) enum ShoeKind {
 
 /// Shoes and socks.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Shoes {
+pub(crate) struct Footwear {
     pub kind: ShoeKind,
     /// Upper and accents.
-    pub colours: [Srgb; 2],
-    pub sock: Srgb,
+    pub colours: [SrgbColor; 2],
+    pub sock: SrgbColor,
     /// Height of the socks, metres on the average body.
     pub sock_m: f32,
 }

@@ -4,7 +4,7 @@ use flyrig_types::Pose;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-use crate::draw::moment::Capsule;
+use crate::draw::moment::ShadeCapsule;
 use crate::person::assembly::Person;
 
 /// Capsules of a person at rest, and the capsules that occlude each vertex.
@@ -75,12 +75,12 @@ impl Limbs {
     }
 
     /// Returns the capsules of a pose, world metres.
-    pub(crate) fn posed(&self, person: &Person, pose: &Pose) -> Vec<Capsule> {
+    pub(crate) fn posed(&self, person: &Person, pose: &Pose) -> Vec<ShadeCapsule> {
         let world_from_canonical = person.body.skeleton.world_from_canonical(pose);
         let at = |joint: usize, p: DVec3| world_from_canonical[joint].transform_point3(p).as_vec3().to_array();
         self.limbs
             .iter()
-            .map(|limb| Capsule {
+            .map(|limb| ShadeCapsule {
                 a: at(limb.joint, limb.a),
                 radius: limb.radius_m,
                 b: at(limb.joint, limb.b),
@@ -95,7 +95,7 @@ impl Limbs {
         person: &Person,
         positions: &[Vec3],
         normals: &[Vec3],
-        capsules: &[Capsule],
+        capsules: &[ShadeCapsule],
     ) -> Vec<f32> {
         let creases = person.layer_and_openness.par_iter().map(|&(_, open)| open);
         (positions.par_iter().zip(normals).zip(&self.joint).zip(creases))
@@ -111,7 +111,7 @@ impl Limbs {
 
 /// Returns the fraction of the cosine-weighted surroundings of a surface point that a ball at the capsule's closest
 /// point covers (a ball of radius r above the horizon at distance d covers r² / d² times the cosine of its direction).
-fn covered(capsule: &Capsule, p: Vec3, n: Vec3) -> f32 {
+fn covered(capsule: &ShadeCapsule, p: Vec3, n: Vec3) -> f32 {
     let (a, b) = (Vec3::from(capsule.a), Vec3::from(capsule.b));
     let along = b - a;
     let t = ((p - a).dot(along) / along.length_squared().max(1e-9)).clamp(0.0, 1.0);
@@ -140,7 +140,7 @@ mod tests {
     /// Compares with rays over the hemisphere, in f64.
     #[test]
     fn a_ball_covers_as_much_as_rays_say() {
-        let ball = |x: f32, z: f32, radius: f32| Capsule { a: [x, 0.0, z], radius, b: [x, 0.0, z], padding: 0.0 };
+        let ball = |x: f32, z: f32, radius: f32| ShadeCapsule { a: [x, 0.0, z], radius, b: [x, 0.0, z], padding: 0.0 };
         for (x, z, radius) in [(0.0, 0.3, 0.1), (0.2, 0.3, 0.12), (0.4, 0.25, 0.1)] {
             let (mut hit, mut all) = (0.0, 0.0);
             for i in 0..400 {

@@ -6,7 +6,7 @@ use glam::Vec3;
 use crate::draw::capsules::Limbs;
 use crate::draw::figure::Figured;
 use crate::draw::moment::{Bound, Moment};
-use crate::person::actor::{Actor, Shape};
+use crate::person::actor::{Actor, ActorShape};
 use crate::person::passer::passer_by;
 use crate::{SimConfig, SimError};
 
@@ -64,7 +64,7 @@ impl Cast {
         let everybody = std::iter::once((&mut self.main, &self.limbs))
             .chain(self.other.iter_mut().map(|(actor, limbs)| (actor, &*limbs)));
         for (actor, limbs) in everybody {
-            let keys: Vec<Shape> = times.iter().map(|&at| actor.shape(at)).collect();
+            let keys: Vec<ActorShape> = times.iter().map(|&at| actor.shape(at)).collect();
             let capsules = limbs.posed(&actor.person, &actor.pose(nanos));
             // Shade changes little within an exposure: the middle's serves all keys.
             let middle = &keys[count / 2];

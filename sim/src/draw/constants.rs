@@ -5,7 +5,7 @@ use flyrig_types::{Camera, Lens};
 
 use crate::camera::optics::SubFrame;
 use crate::draw::gpu_parts::SAMPLES;
-use crate::draw::moment::{Bound, Capsule, Moment};
+use crate::draw::moment::{Bound, Moment, ShadeCapsule};
 use crate::draw::plates::{GRID_CELL_PX, grid_columns};
 use crate::room::lamps::{LAMP_NEAR_M, cone_cosines};
 use crate::room::scene::Scene;
@@ -111,7 +111,7 @@ pub(crate) struct LightBlock {
     ground: [f32; 4],
     people: [Bound; 2],
     counts: [u32; 4],
-    capsules: [Capsule; MAX_CAPSULES],
+    capsules: [ShadeCapsule; MAX_CAPSULES],
 }
 
 impl LightBlock {

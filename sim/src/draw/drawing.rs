@@ -17,7 +17,7 @@ use crate::draw::gpu_parts::{
 use crate::draw::moment::{ImageRequest, Moment, RawImage, Step, Truth, steps};
 use crate::draw::pipelines::{Layouts, Pipelines};
 use crate::draw::plates::Plates;
-use crate::person::actor::Shape;
+use crate::person::actor::ActorShape;
 use crate::person::assembly::Person;
 use crate::room::scene::Scene;
 
@@ -173,7 +173,7 @@ impl Drawing {
         self.moment = moment;
         // They are on the adapter now; what is left is their number.
         for figured in &mut self.moment.people {
-            figured.keys.iter_mut().for_each(|key| *key = Shape::default());
+            figured.keys.iter_mut().for_each(|key| *key = ActorShape::default());
             figured.openness = Vec::new();
         }
         Ok(())
@@ -397,7 +397,7 @@ mod tests {
     use super::*;
     use crate::room::scene_mesh::{Coat, SceneMesh};
     use crate::room::surfaces::Surface;
-    use crate::texture::Texture as Picture;
+    use crate::texture::TextureImage;
 
     /// Compares the centre of light of a glowing square in the dark with the f64 camera model's, for each lens model
     /// and each corner of the image.
@@ -435,7 +435,7 @@ mod tests {
                 mesh.quad((corner - u * 0.5 - v * 0.5).as_vec3(), u.as_vec3(), v.as_vec3(), glow);
                 let scene = Scene {
                     mesh,
-                    textures: vec![Picture { side: 1, pixels: vec![[255; 4]] }],
+                    textures: vec![TextureImage { side: 1, pixels: vec![[255; 4]] }],
                     lamps: Vec::new(),
                     steady: Vec3::ZERO,
                     sky: Vec3::ZERO,

@@ -5,14 +5,14 @@ use wgpu::util::DeviceExt;
 use wgpu::{BindGroup, BindGroupLayout, Buffer, BufferUsages, RenderPass, TextureView};
 
 use crate::draw::gpu_parts::{bind, upload_textures};
-use crate::person::actor::Shape;
+use crate::person::actor::ActorShape;
 use crate::person::assembly::Person;
 
 /// Surface of a person around an instant.
 #[derive(Debug, Clone)]
 pub(crate) struct Figured {
     /// Shape at each key.
-    pub keys: Vec<Shape>,
+    pub keys: Vec<ActorShape>,
     /// Per vertex: unoccluded fraction of the surroundings, in 0..=1.
     pub openness: Vec<f32>,
 }
@@ -79,7 +79,7 @@ impl Figure {
             self.points_bind = bind(gpu, layout, &buffers);
         }
         let mut points = Vec::with_capacity(needed);
-        for Shape { positions, normals, .. } in &figured.keys {
+        for ActorShape { positions, normals, .. } in &figured.keys {
             for ((p, n), open) in positions.iter().zip(normals).zip(&figured.openness) {
                 points.push([p.x, p.y, p.z, *open, n.x, n.y, n.z, 0.0]);
             }

@@ -9,7 +9,7 @@ use wgpu::{
     TextureViewDimension, VertexAttribute, VertexBufferLayout, VertexFormat, VertexStepMode,
 };
 
-use crate::texture::{Texture as Picture, linear_from_srgb};
+use crate::texture::{TextureImage, linear_from_srgb};
 
 /// Format of rendered light.
 pub(crate) const LIGHT: TextureFormat = TextureFormat::Rgba16Float;
@@ -125,7 +125,7 @@ pub(crate) fn target(
 }
 
 /// Uploads textures of equal size as an array with mip levels.
-pub(crate) fn upload_textures(gpu: &GpuContext, label: &str, pictures: &[Picture]) -> TextureView {
+pub(crate) fn upload_textures(gpu: &GpuContext, label: &str, pictures: &[TextureImage]) -> TextureView {
     let roots: Vec<u8> = (0..=255).map(|v| (linear_from_srgb(v as f32 / 255.0).sqrt() * 255.0).round() as u8).collect();
     let side = pictures.first().map_or(1, |picture| picture.side) as u32;
     let array = gpu.device.create_texture(&TextureDescriptor {
@@ -164,7 +164,7 @@ pub(crate) fn upload_textures(gpu: &GpuContext, label: &str, pictures: &[Picture
 
 /// Parts of a render pipeline.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Drawn<'a> {
+pub(crate) struct PipelineParts<'a> {
     pub module: &'a ShaderModule,
     pub layouts: &'a [&'a BindGroupLayout],
     pub vertex: &'a str,
@@ -176,7 +176,7 @@ pub(crate) struct Drawn<'a> {
     pub samples: u32,
 }
 
-pub(crate) fn pipeline(gpu: &GpuContext, drawn: Drawn<'_>) -> RenderPipeline {
+pub(crate) fn pipeline(gpu: &GpuContext, drawn: PipelineParts<'_>) -> RenderPipeline {
     let mut offset = 0;
     let attributes: Vec<VertexAttribute> = (0..)
         .zip(drawn.attributes)

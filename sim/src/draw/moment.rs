@@ -18,7 +18,7 @@ pub(crate) struct Moment {
     pub ball: (Vec3, f32),
     /// Bounding cylinder of each person.
     pub bounds: Vec<Bound>,
-    pub capsules: Vec<Capsule>,
+    pub capsules: Vec<ShadeCapsule>,
 }
 
 /// Image to render.
@@ -45,7 +45,7 @@ pub(crate) struct Truth {
 /// Part of a person that occludes the ambient light: a line with a radius, metres.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
-pub(crate) struct Capsule {
+pub(crate) struct ShadeCapsule {
     pub a: [f32; 3],
     pub radius: f32,
     pub b: [f32; 3],

@@ -6,7 +6,7 @@ use wgpu::{BindGroup, BindingResource, Buffer, CommandEncoder, ComputePipeline, 
 use crate::draw::constants::{Blocks, ViewHead};
 use crate::draw::drawing::{Drawing, Offsets};
 use crate::draw::gpu_parts::{array_view, begin_pass, bind, layer_view, view_of};
-use crate::draw::plates::Plate;
+use crate::draw::plates::RoomPlate;
 
 impl Drawing {
     pub(super) fn draw_room_maps(&self) {
@@ -51,7 +51,13 @@ impl Drawing {
         }
     }
 
-    pub(super) fn bake(&self, encoder: &mut CommandEncoder, constants: &BindGroup, plate: &Plate, layers: &[Offsets]) {
+    pub(super) fn bake(
+        &self,
+        encoder: &mut CommandEncoder,
+        constants: &BindGroup,
+        plate: &RoomPlate,
+        layers: &[Offsets],
+    ) {
         let (samples, depth) = (view_of(&self.samples), view_of(&plate.depth));
         let group = [BindingResource::TextureView(&samples), plate.layers.as_entire_binding()];
         for (layer, offsets) in layers.iter().enumerate() {
@@ -72,7 +78,7 @@ impl Drawing {
         &self,
         encoder: &mut CommandEncoder,
         constants: &BindGroup,
-        plate: &Plate,
+        plate: &RoomPlate,
         offsets: Offsets,
         people: bool,
     ) {
@@ -93,7 +99,7 @@ impl Drawing {
         &self,
         encoder: &mut CommandEncoder,
         constants: &BindGroup,
-        plate: &Plate,
+        plate: &RoomPlate,
         offsets: Offsets,
         sums: &Buffer,
     ) {

@@ -4,7 +4,7 @@ use flyrig_gpu::GpuContext;
 use wgpu::{BindGroupLayout, ComputePipeline, RenderPipeline, VertexFormat};
 
 use crate::draw::constants::shader_sources;
-use crate::draw::gpu_parts::{Drawn, LIGHT, SAMPLES, Slot, TRUTH, compute, layout, pipeline};
+use crate::draw::gpu_parts::{LIGHT, PipelineParts, SAMPLES, Slot, TRUTH, compute, layout, pipeline};
 
 /// Bind group layouts, one per kind of pass.
 #[derive(Debug)]
@@ -70,8 +70,16 @@ impl Pipelines {
         let Layouts { constants, points, person, room: room_layout, .. } = layouts;
         let figure = |vertex, fragment, layouts, targets, samples| {
             let attributes = &[VertexFormat::Float32x4, VertexFormat::Float32x4];
-            let drawn =
-                Drawn { module: &people, layouts, vertex, fragment, attributes, interleaved: false, targets, samples };
+            let drawn = PipelineParts {
+                module: &people,
+                layouts,
+                vertex,
+                fragment,
+                attributes,
+                interleaved: false,
+                targets,
+                samples,
+            };
             pipeline(gpu, drawn)
         };
         let standing = |vertex, fragment, layouts, targets, samples| {
@@ -82,8 +90,16 @@ impl Pipelines {
                 VertexFormat::Float32x4,
                 VertexFormat::Float32x2,
             ];
-            let drawn =
-                Drawn { module: &room, layouts, vertex, fragment, attributes, interleaved: true, targets, samples };
+            let drawn = PipelineParts {
+                module: &room,
+                layouts,
+                vertex,
+                fragment,
+                attributes,
+                interleaved: true,
+                targets,
+                samples,
+            };
             pipeline(gpu, drawn)
         };
         Self {

@@ -17,7 +17,7 @@ const BUDGET: u64 = 1 << 30;
 
 /// View of the empty room of a camera through one point of its lens.
 #[derive(Debug, Clone)]
-pub(crate) struct Plate {
+pub(crate) struct RoomPlate {
     camera: Camera,
     lens_point: Vec2,
     focus_m: f64,
@@ -34,8 +34,8 @@ pub(crate) struct Plate {
 pub(crate) struct Plates {
     size: [u32; 2],
     layers: usize,
-    kept: Vec<Plate>,
-    scratch: Option<Plate>,
+    kept: Vec<RoomPlate>,
+    scratch: Option<RoomPlate>,
     /// Depth at pixel centres, of the cameras whose truth was requested.
     centre_depths: Vec<(Camera, Texture)>,
     directions: Vec<(Intrinsics, wgpu::Buffer)>,
@@ -67,8 +67,8 @@ impl Plates {
         camera: &Camera,
         focus_m: f64,
         lens_point: Vec2,
-    ) -> Result<(Plate, bool), GpuError> {
-        let same = |plate: &Plate| {
+    ) -> Result<(RoomPlate, bool), GpuError> {
+        let same = |plate: &RoomPlate| {
             // Without a way off the lens's middle the focus changes nothing.
             let focus = plate.focus_m.to_bits() == focus_m.to_bits() || lens_point == Vec2::ZERO;
             plate.lens_point == lens_point && focus && plate.camera == *camera
@@ -112,12 +112,18 @@ impl Plates {
         self.centre_depths.push((camera.clone(), depth.clone()));
     }
 
-    fn fresh(&mut self, gpu: &GpuContext, camera: &Camera, focus_m: f64, lens_point: Vec2) -> Result<Plate, GpuError> {
+    fn fresh(
+        &mut self,
+        gpu: &GpuContext,
+        camera: &Camera,
+        focus_m: f64,
+        lens_point: Vec2,
+    ) -> Result<RoomPlate, GpuError> {
         let [width, height] = self.size;
         let pixels = width as usize * height as usize;
         let layers = StorageBuffer::<u32>::zeroed(gpu, "layers of the room's light", pixels * self.layers)?;
         let usage = TextureUsages::COPY_SRC | TextureUsages::TEXTURE_BINDING;
-        Ok(Plate {
+        Ok(RoomPlate {
             camera: camera.clone(),
             lens_point,
             focus_m,

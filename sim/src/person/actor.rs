@@ -7,7 +7,7 @@ use glam::Vec3;
 use crate::cloth::Cloth;
 use crate::motion::choice;
 use crate::person::assembly::Person;
-use crate::person::look::Look;
+use crate::person::look::PersonLook;
 use crate::{SimConfig, SimError};
 
 /// Dressed person with a motion.
@@ -20,7 +20,7 @@ pub(crate) struct Actor {
 
 /// Visible surface, world metres, in the order of [`Person::clothed`].
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Shape {
+pub(crate) struct ActorShape {
     pub positions: Vec<Vec3>,
     pub normals: Vec<Vec3>,
     /// Displacement of each vertex from its skinned position, world metres.
@@ -29,7 +29,8 @@ pub(crate) struct Shape {
 
 impl Actor {
     pub(crate) fn new(config: &SimConfig) -> Result<Self, SimError> {
-        let person = Person::new(&Look::new(config), config.seed, config.texture_px as usize, config.person.fingers)?;
+        let person =
+            Person::new(&PersonLook::new(config), config.seed, config.texture_px as usize, config.person.fingers)?;
         let track = choice::track(config, &person)?;
         let cloth = Cloth::new(&person);
         Ok(Self { person, track, cloth })
@@ -41,12 +42,12 @@ impl Actor {
     }
 
     /// Returns the surface at a time.
-    pub(crate) fn shape(&mut self, nanos: i64) -> Shape {
+    pub(crate) fn shape(&mut self, nanos: i64) -> ActorShape {
         let (mut positions, mut normals) = skin_mesh(&self.person.clothed, &self.pose(nanos));
         let displacement = match &mut self.cloth {
             Some(cloth) => cloth.apply(&self.track, nanos, &mut positions, &mut normals),
             None => vec![Vec3::ZERO; positions.len()],
         };
-        Shape { positions, normals, displacement }
+        ActorShape { positions, normals, displacement }
     }
 }

@@ -7,7 +7,7 @@ use crate::SimError;
 use crate::clothes::cuts::{COAT_SEAM_M, inside_bottom, inside_outer, inside_top, waist_m};
 use crate::clothes::fabric::gloss;
 use crate::clothes::garments::{Tailor, visible_skin};
-use crate::clothes::hanging::Hanging;
+use crate::clothes::hanging::ClothTube;
 use crate::clothes::loose::stiffness;
 use crate::clothes::prints::{
     bottom_colour, hair_colour, hanging_colour, hat_colour, outer_colour, sole_colour, top_colour, upper_colour,
@@ -17,9 +17,9 @@ use crate::clothes::wardrobe::{Bottom, Fabric, ShoeKind};
 use crate::noise::{Noise, smoothstep};
 use crate::person::face::{eye_colour, skin_colour};
 use crate::person::hats::{hat, hat_cloth};
-use crate::person::look::Look;
+use crate::person::look::PersonLook;
 use crate::person::shoes::{eyes, shoes};
-use crate::texture::{Texture, UvMap};
+use crate::texture::{TextureImage, UvMap};
 
 /// Clothed body at rest.
 pub(crate) struct Person {
@@ -32,7 +32,7 @@ pub(crate) struct Person {
     /// Per vertex: texture, and openness of the surface to the sky (0..=1).
     pub layer_and_openness: Vec<(u32, f32)>,
     /// sRGB, all of one size.
-    pub textures: Vec<Texture>,
+    pub textures: Vec<TextureImage>,
     /// Per vertex: free length, metres (see [`crate::clothes::loose`]).
     pub free_m: Vec<f32>,
     /// Sheets that the surface is made of.
@@ -55,28 +55,28 @@ pub(crate) struct SheetRange {
 /// Surfaces that share a texture.
 struct Layer {
     sheets: Vec<Sheet>,
-    texture: Texture,
+    texture: TextureImage,
     stiff: f32,
     hangs: bool,
 }
 
 impl Layer {
     /// Creates a layer that lies on the body without motion of its own.
-    fn held(sheets: Vec<Sheet>, texture: Texture) -> Self {
+    fn held(sheets: Vec<Sheet>, texture: TextureImage) -> Self {
         Self { sheets, texture, stiff: 1.0, hangs: false }
     }
 
-    fn worn(sheets: Vec<Sheet>, texture: Texture, fabric: Fabric) -> Self {
+    fn worn(sheets: Vec<Sheet>, texture: TextureImage, fabric: Fabric) -> Self {
         Self { sheets, texture: texture.glossy(gloss(fabric)), stiff: stiffness(fabric), hangs: false }
     }
 
-    fn hanging(sheets: Vec<Sheet>, texture: Texture, stiff: f32) -> Self {
+    fn hanging(sheets: Vec<Sheet>, texture: TextureImage, stiff: f32) -> Self {
         Self { sheets, texture, stiff, hangs: true }
     }
 }
 
 impl Person {
-    pub(crate) fn new(look: &Look, seed: u64, texture_px: usize, fingers: bool) -> Result<Self, SimError> {
+    pub(crate) fn new(look: &PersonLook, seed: u64, texture_px: usize, fingers: bool) -> Result<Self, SimError> {
         let mut body = default_template(&look.shape)?;
         let average = default_template(&ShapeParams::default())?;
         for (position, average) in body.positions.iter_mut().zip(&average.positions) {
@@ -93,7 +93,7 @@ impl Person {
 }
 
 /// Returns all visible layers of a person; the last sheet of the last layer are the shoes.
-fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
+fn dress(look: &PersonLook, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
     let tailor = Tailor::new(naked, seed);
     let map = UvMap::new(naked, side);
     let noise = |stream| Noise::new(seed, stream);
@@ -122,7 +122,7 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
         Bottom::Skirt { cloth, hem_m, flare, pleats } => {
             let top_m = waist_m(look);
             let fold_m = 0.010 + 0.055 * flare;
-            let hanging = Hanging {
+            let hanging = ClothTube {
                 top_m,
                 hem_m,
                 offset_m: [0.012, 0.016],
@@ -131,7 +131,7 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
                 fold_m,
                 open_rad: 0.0,
             };
-            let texture = Texture::from_fn(side, |uv| hanging_colour(&cloth, noise(22), uv, top_m - hem_m, true));
+            let texture = TextureImage::from_fn(side, |uv| hanging_colour(&cloth, noise(22), uv, top_m - hem_m, true));
             let (texture, stiff) = (texture.glossy(gloss(cloth.fabric)), stiffness(cloth.fabric));
             layers.push(Layer::hanging(vec![tailor.hang(&hanging)], texture, stiff));
         }
@@ -144,7 +144,7 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
         layers.push(Layer::worn(vec![tailor.outer(look, outer)], texture, outer.cloth.fabric));
         if outer.hem_m < 0.7 {
             let wide_m = if let Bottom::Trousers { wide_m, .. } = look.bottom { wide_m } else { 0.0 };
-            let tails = Hanging {
+            let tails = ClothTube {
                 top_m: COAT_SEAM_M,
                 hem_m: outer.hem_m,
                 // Over wide trousers.
@@ -154,7 +154,7 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
                 fold_m: 0.014,
                 open_rad: if outer.open_m > 0.0 { outer.open_m / 0.17 } else { 0.0 },
             };
-            let texture = Texture::from_fn(side, |uv| {
+            let texture = TextureImage::from_fn(side, |uv| {
                 hanging_colour(&outer.cloth, noise(26), uv, tails.top_m - tails.hem_m, false)
             });
             let stiff = stiffness(outer.cloth.fabric);
@@ -167,11 +167,11 @@ fn dress(look: &Look, seed: u64, naked: &Sheet, side: usize) -> Vec<Layer> {
         layers.push(Layer::hanging(hairs, texture.glossy(0.12), 1.6));
     }
     if let Some(cloth) = hat_cloth(&look.hat) {
-        let texture = Texture::from_fn(side, |uv| hat_colour(cloth, noise(27), uv));
+        let texture = TextureImage::from_fn(side, |uv| hat_colour(cloth, noise(27), uv));
         layers.push(Layer::worn(vec![hat(&look.hat, naked, noise(28))], texture, cloth.fabric));
     }
     let leather = if look.shoes.kind == ShoeKind::Trainers { 0.08 } else { gloss(Fabric::Leather) };
-    let extras = Texture::from_fn(side, |uv: Vec2| match (uv.x < 0.5, uv.y < 0.5) {
+    let extras = TextureImage::from_fn(side, |uv: Vec2| match (uv.x < 0.5, uv.y < 0.5) {
         (true, _) => upper_colour(look, noise(24), Vec2::new((uv.x - 0.01) / 0.48, (uv.y - 0.02) / 0.96)),
         (false, true) => sole_colour(look, noise(25), uv),
         (false, false) => eye_colour(look, (uv - 0.75) / 0.12),

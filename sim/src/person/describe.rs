@@ -1,14 +1,14 @@
 //! Description of a person in words.
 
 use crate::SimConfig;
-use crate::clothes::wardrobe::{Beard, Bottom, Cloth, Hat};
-use crate::person::look::Look;
+use crate::clothes::wardrobe::{Beard, Bottom, Hat, Textile};
+use crate::person::look::PersonLook;
 
 /// Describes the configured person in a line of words; two people of the same words may still differ in shape and
 /// colours. Renders nothing.
 #[must_use]
 pub fn describe_person(config: &SimConfig) -> String {
-    let look = Look::new(config);
+    let look = PersonLook::new(config);
     let age = look.shape.0.get("age").copied().unwrap_or(0.5);
     let who = match (look.female, age) {
         (true, age) if age < 0.36 => "girl",
@@ -54,11 +54,11 @@ pub fn describe_person(config: &SimConfig) -> String {
 #[must_use]
 pub fn person_fingerprint(config: &SimConfig) -> u64 {
     // FNV-1a, which is the same on every machine.
-    let text = format!("{:?}", Look::new(config));
+    let text = format!("{:?}", PersonLook::new(config));
     text.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
 }
 
-fn cloth_words(cloth: &Cloth) -> String {
+fn cloth_words(cloth: &Textile) -> String {
     let print = format!("{:?}", cloth.print);
     let print = print.split('(').next().unwrap_or_default();
     format!("{print} {:?}", cloth.fabric)

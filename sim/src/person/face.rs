@@ -2,19 +2,19 @@
 
 use glam::{Vec2, Vec3};
 
-use crate::clothes::wardrobe::{HairCut, ShoeKind, Srgb};
+use crate::clothes::wardrobe::{HairCut, ShoeKind, SrgbColor};
 use crate::noise::{Noise, smoothstep};
 use crate::person::features::LIPS_Y;
-use crate::person::look::Look;
+use crate::person::look::PersonLook;
 use crate::person::regions::{EYE, above_hairline};
 use crate::texture::{mix3, scale3};
 
 /// Returns the colour of the skin at a point of the average body.
-pub(crate) fn skin_colour(look: &Look, noise: Noise, p: Vec3) -> Srgb {
+pub(crate) fn skin_colour(look: &PersonLook, noise: Noise, p: Vec3) -> SrgbColor {
     let blotch = noise.sum(p * 22.0, 3);
     let pores = noise.at(p * 420.0);
     let mut colour = scale3(look.skin, 1.0 + 0.035 * blotch + 0.018 * pores);
-    let red = |colour: Srgb, by: f32| {
+    let red = |colour: SrgbColor, by: f32| {
         [colour[0] * (1.0 + 0.10 * by), colour[1] * (1.0 - 0.13 * by), colour[2] * (1.0 - 0.12 * by)]
     };
     // Knuckles and fingertips.
@@ -53,7 +53,7 @@ pub(crate) fn skin_colour(look: &Look, noise: Noise, p: Vec3) -> Srgb {
     brows(look, noise, colour, p, front)
 }
 
-fn lips(look: &Look, colour: Srgb, p: Vec3, front: f32) -> Srgb {
+fn lips(look: &PersonLook, colour: SrgbColor, p: Vec3, front: f32) -> SrgbColor {
     let face = look.features;
     let x = p.x.abs() / 0.0240;
     if x > 1.15 {
@@ -73,7 +73,7 @@ fn lips(look: &Look, colour: Srgb, p: Vec3, front: f32) -> Srgb {
     mix3(coloured, scale3(lip, 0.30), front * (0.75 * line).max(behind))
 }
 
-fn stubble(look: &Look, noise: Noise, colour: Srgb, p: Vec3) -> Srgb {
+fn stubble(look: &PersonLook, noise: Noise, colour: SrgbColor, p: Vec3) -> SrgbColor {
     if look.stubble <= 0.0 {
         return colour;
     }
@@ -84,7 +84,7 @@ fn stubble(look: &Look, noise: Noise, colour: Srgb, p: Vec3) -> Srgb {
     mix3(colour, scale3(look.hair, 0.8), look.stubble * 0.42 * jaw * grain)
 }
 
-fn brows(look: &Look, noise: Noise, colour: Srgb, p: Vec3, front: f32) -> Srgb {
+fn brows(look: &PersonLook, noise: Noise, colour: SrgbColor, p: Vec3, front: f32) -> SrgbColor {
     let t = (p.x.abs() - 0.011) / 0.038;
     let mut colour = colour;
     if (0.0..1.0).contains(&t) && (1.55..1.61).contains(&p.y) {
@@ -110,7 +110,7 @@ fn brows(look: &Look, noise: Noise, colour: Srgb, p: Vec3, front: f32) -> Srgb {
 }
 
 /// Returns the colour of an eyeball; `at` is the offset from the pupil in eyeball radii, x to the image's right.
-pub(crate) fn eye_colour(look: &Look, at: Vec2) -> Srgb {
+pub(crate) fn eye_colour(look: &PersonLook, at: Vec2) -> SrgbColor {
     let r = at.length();
     let white = mix3([0.90, 0.88, 0.86], [0.72, 0.58, 0.55], smoothstep(0.55, 1.0, r));
     let ring = (at.y.atan2(at.x) * 17.0).sin() * 0.08;

@@ -11,12 +11,12 @@ use crate::clothes::sheet::{Node, Sheet};
 use crate::clothes::wardrobe::{Beard, HairCut, Hat};
 use crate::noise::{Noise, lerp, smoothstep};
 use crate::person::hats::rim_height_m;
-use crate::person::look::Look;
+use crate::person::look::PersonLook;
 use crate::person::regions::{above_hairline, inside_beard};
 
 impl Tailor {
     /// Builds a cap of hair with its hanging parts.
-    pub(crate) fn hair(&self, look: &Look, naked: &Sheet) -> Option<Sheet> {
+    pub(crate) fn hair(&self, look: &PersonLook, naked: &Sheet) -> Option<Sheet> {
         let (thick, rough) = match look.cut {
             HairCut::Bald => return None,
             HairCut::Crop => (0.005, 0.002),
@@ -106,7 +106,7 @@ impl Tailor {
     }
 
     /// Builds a beard.
-    pub(crate) fn beard(&self, look: &Look) -> Option<Sheet> {
+    pub(crate) fn beard(&self, look: &PersonLook) -> Option<Sheet> {
         let (thick, long) = match look.beard {
             Beard::None => return None,
             Beard::Moustache => (0.005, 0.001),

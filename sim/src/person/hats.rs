@@ -6,7 +6,7 @@ use glam::{Vec2, Vec3};
 
 use crate::clothes::lift::HeadLift;
 use crate::clothes::sheet::{Node, Sheet};
-use crate::clothes::wardrobe::{Cloth, Hat};
+use crate::clothes::wardrobe::{Hat, Textile};
 use crate::noise::{Noise, smoothstep};
 
 /// Centre of the head seen from above, metres on the average body.
@@ -21,7 +21,7 @@ pub(crate) fn rim_height_m(p: Vec3) -> f32 {
 }
 
 /// Returns the cloth of a hat.
-pub(crate) fn hat_cloth(hat: &Hat) -> Option<&Cloth> {
+pub(crate) fn hat_cloth(hat: &Hat) -> Option<&Textile> {
     match hat {
         Hat::None => None,
         Hat::Beanie(cloth) | Hat::Cap(cloth) | Hat::Brimmed(cloth) => Some(cloth),

@@ -4,7 +4,7 @@ use flyrig_body::ShapeParams;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use crate::clothes::wardrobe::{
-    Beard, Bottom, Cloth, Fabric, HairCut, Hat, Outer, Print, ShoeKind, Shoes, Srgb, Top, TopKind,
+    Beard, Bottom, Fabric, Footwear, HairCut, Hat, Outer, Print, ShoeKind, SrgbColor, Textile, Top, TopKind,
 };
 use crate::person::features::Features;
 use crate::person::palette::{CHINOS, CLOTHS, DENIMS, HAIRS, IRISES, LEATHERS, SHOES, SKINS};
@@ -12,16 +12,16 @@ use crate::{Build, SimConfig};
 
 /// Appearance of a person.
 #[derive(Debug, Clone)]
-pub(crate) struct Look {
+pub(crate) struct PersonLook {
     pub shape: ShapeParams,
     pub female: bool,
-    pub skin: Srgb,
+    pub skin: SrgbColor,
     /// Strength of freckles and moles, 0..=1.
     pub freckles: f32,
     /// Strength of the lips' colour, 0..=1.
     pub lips: f32,
-    pub hair: Srgb,
-    pub iris: Srgb,
+    pub hair: SrgbColor,
+    pub iris: SrgbColor,
     pub cut: HairCut,
     pub recede_m: f32,
     pub stubble: f32,
@@ -30,7 +30,7 @@ pub(crate) struct Look {
     pub top: Top,
     pub bottom: Bottom,
     pub outer: Option<Outer>,
-    pub shoes: Shoes,
+    pub shoes: Footwear,
     pub features: Features,
 }
 
@@ -56,14 +56,14 @@ impl Dice {
     }
 
     /// Returns a colour close to one of a palette.
-    fn colour(&mut self, of: &[Srgb]) -> Srgb {
+    fn colour(&mut self, of: &[SrgbColor]) -> SrgbColor {
         let light = self.within(-0.05, 0.05);
         self.pick(of).map(|c| (c + light + self.within(-0.025, 0.025)).clamp(0.02, 0.97))
     }
 
-    fn cloth(&mut self, fabric: Fabric, prints: &[Print]) -> Cloth {
+    fn cloth(&mut self, fabric: Fabric, prints: &[Print]) -> Textile {
         let ground = self.colour(&CLOTHS);
-        let far = |other: Srgb| (0..3).map(|i| (other[i] - ground[i]).abs()).sum::<f32>();
+        let far = |other: SrgbColor| (0..3).map(|i| (other[i] - ground[i]).abs()).sum::<f32>();
         // A print has to be seen: the farthest of four colours.
         let mut print = self.colour(&CLOTHS);
         for _ in 0..3 {
@@ -77,7 +77,7 @@ impl Dice {
             Print::Logo(_) => Print::Logo(self.0.random_range(0..=255)),
             other => other,
         };
-        Cloth {
+        Textile {
             fabric,
             print: print_kind,
             colours: [ground, print, self.colour(&CLOTHS)],
@@ -86,7 +86,7 @@ impl Dice {
     }
 }
 
-impl Look {
+impl PersonLook {
     pub(crate) fn new(config: &SimConfig) -> Self {
         let mut dice = Dice(StdRng::seed_from_u64(config.seed));
         let (mut shape, female, age) = body_shape(config, &mut dice);
@@ -94,7 +94,7 @@ impl Look {
         let tone = dice.within(0.0, SKINS.len() as f32 - 1.001);
         let (low, t) = (tone as usize, tone.fract());
         let warm = dice.within(-0.015, 0.015);
-        let mut skin: Srgb = std::array::from_fn(|i| SKINS[low][i] + (SKINS[low + 1][i] - SKINS[low][i]) * t);
+        let mut skin: SrgbColor = std::array::from_fn(|i| SKINS[low][i] + (SKINS[low + 1][i] - SKINS[low][i]) * t);
         skin[0] += warm;
         skin[2] -= warm;
         let dark = tone > 2.4;
@@ -212,14 +212,14 @@ fn hat(dice: &mut Dice, cut: HairCut) -> Hat {
     }
 }
 
-fn trousers_cloth(dice: &mut Dice) -> Cloth {
+fn trousers_cloth(dice: &mut Dice) -> Textile {
     let mut cloth = dice.cloth(
         Fabric::Weave,
         &[Print::Plain, Print::Plain, Print::Plain, Print::Plain, Print::Pinstripes, Print::Camouflage, Print::Plaid],
     );
     if dice.chance(0.45) {
         let ground = dice.colour(&DENIMS);
-        return Cloth { fabric: Fabric::Denim, print: Print::Plain, colours: [ground; 3], ..cloth };
+        return Textile { fabric: Fabric::Denim, print: Print::Plain, colours: [ground; 3], ..cloth };
     }
     cloth.colours[0] = dice.colour(&CHINOS);
     cloth.colours[1] = cloth.colours[0].map(|c| if c > 0.4 { c * 0.7 } else { c * 1.4 + 0.05 });
@@ -296,9 +296,9 @@ fn clothes(dice: &mut Dice, female: bool) -> (Top, Bottom) {
         top.offset_m = top.offset_m.min(0.010);
         let mut cloth = dice.cloth(Fabric::Weave, &[Plain, Plain, Plaid, Dots, Checks, Stripes]);
         if dice.chance(0.2) {
-            cloth = Cloth { fabric: Fabric::Denim, print: Plain, colours: [dice.colour(&DENIMS); 3], ..cloth };
+            cloth = Textile { fabric: Fabric::Denim, print: Plain, colours: [dice.colour(&DENIMS); 3], ..cloth };
         } else if dice.chance(0.15) {
-            cloth = Cloth { fabric: Fabric::Leather, print: Plain, colours: [dice.colour(&LEATHERS); 3], ..cloth };
+            cloth = Textile { fabric: Fabric::Leather, print: Plain, colours: [dice.colour(&LEATHERS); 3], ..cloth };
         }
         return (top, Bottom::Skirt { cloth, hem_m, flare, pleats });
     }
@@ -323,9 +323,9 @@ fn outer(dice: &mut Dice, bottom: &Bottom) -> Option<Outer> {
     let kind = dice.within(0.0, 1.0);
     if kind < 0.35 {
         let ground = dice.colour(&LEATHERS);
-        cloth = Cloth { fabric: Fabric::Leather, print: Print::Plain, colours: [ground; 3], ..cloth };
+        cloth = Textile { fabric: Fabric::Leather, print: Print::Plain, colours: [ground; 3], ..cloth };
     } else if kind < 0.55 && !coat {
-        cloth = Cloth { fabric: Fabric::Denim, print: Print::Plain, colours: [dice.colour(&DENIMS); 3], ..cloth };
+        cloth = Textile { fabric: Fabric::Denim, print: Print::Plain, colours: [dice.colour(&DENIMS); 3], ..cloth };
     } else {
         cloth.colours[0] = dice.colour(&CHINOS);
         cloth.colours[1] = cloth.colours[0].map(|c| if c > 0.4 { c * 0.72 } else { c * 1.5 + 0.06 });
@@ -338,7 +338,7 @@ fn outer(dice: &mut Dice, bottom: &Bottom) -> Option<Outer> {
     })
 }
 
-fn footwear(dice: &mut Dice) -> Shoes {
+fn footwear(dice: &mut Dice) -> Footwear {
     let kind =
         dice.pick(&[ShoeKind::Trainers, ShoeKind::Trainers, ShoeKind::Trainers, ShoeKind::Leather, ShoeKind::Boots]);
     let colours = match kind {
@@ -349,7 +349,7 @@ fn footwear(dice: &mut Dice) -> Shoes {
         ShoeKind::Leather | ShoeKind::Boots => [dice.colour(&LEATHERS); 2],
     };
     let white = [0.88, 0.87, 0.85];
-    Shoes {
+    Footwear {
         kind,
         colours,
         sock: if dice.chance(0.4) { white } else { dice.colour(&CLOTHS) },
@@ -366,7 +366,7 @@ mod tests {
         let look = |shape: ShapeParams| {
             let mut config = SimConfig { seed: 11, ..SimConfig::default() };
             config.person.shape = shape;
-            Look::new(&config)
+            PersonLook::new(&config)
         };
         let of_seed = look(ShapeParams::default());
         let mut found = look(ShapeParams::default().with("weight", 0.9).with("stomach-pregnant", 0.5));

@@ -1,9 +1,9 @@
 //! Palettes of people and clothes, sRGB.
 
-use crate::clothes::wardrobe::Srgb;
+use crate::clothes::wardrobe::SrgbColor;
 
 /// Skin colours from light to dark.
-pub(crate) const SKINS: [Srgb; 7] = [
+pub(crate) const SKINS: [SrgbColor; 7] = [
     [0.92, 0.76, 0.67],
     [0.90, 0.73, 0.63],
     [0.84, 0.64, 0.52],
@@ -13,7 +13,7 @@ pub(crate) const SKINS: [Srgb; 7] = [
     [0.34, 0.22, 0.17],
 ];
 /// Hair colours, of which the first two go with every skin.
-pub(crate) const HAIRS: [Srgb; 8] = [
+pub(crate) const HAIRS: [SrgbColor; 8] = [
     [0.10, 0.08, 0.07],
     [0.17, 0.11, 0.08],
     [0.24, 0.15, 0.10],
@@ -24,9 +24,9 @@ pub(crate) const HAIRS: [Srgb; 8] = [
     [0.42, 0.40, 0.38],
 ];
 /// Iris colours, of which the first two go with every skin.
-pub(crate) const IRISES: [Srgb; 5] =
+pub(crate) const IRISES: [SrgbColor; 5] =
     [[0.18, 0.11, 0.07], [0.30, 0.19, 0.11], [0.25, 0.38, 0.52], [0.30, 0.42, 0.28], [0.42, 0.46, 0.48]];
-pub(crate) const CLOTHS: [Srgb; 22] = [
+pub(crate) const CLOTHS: [SrgbColor; 22] = [
     [0.92, 0.91, 0.88],
     [0.88, 0.84, 0.74],
     [0.60, 0.60, 0.60],
@@ -50,7 +50,7 @@ pub(crate) const CLOTHS: [Srgb; 22] = [
     [0.68, 0.60, 0.80],
     [0.45, 0.30, 0.20],
 ];
-pub(crate) const CHINOS: [Srgb; 9] = [
+pub(crate) const CHINOS: [SrgbColor; 9] = [
     [0.66, 0.58, 0.45],
     [0.30, 0.32, 0.25],
     [0.20, 0.21, 0.25],
@@ -61,11 +61,11 @@ pub(crate) const CHINOS: [Srgb; 9] = [
     [0.44, 0.20, 0.18],
     [0.16, 0.22, 0.36],
 ];
-pub(crate) const DENIMS: [Srgb; 5] =
+pub(crate) const DENIMS: [SrgbColor; 5] =
     [[0.17, 0.25, 0.41], [0.11, 0.15, 0.26], [0.30, 0.42, 0.58], [0.46, 0.57, 0.70], [0.14, 0.14, 0.16]];
-pub(crate) const LEATHERS: [Srgb; 5] =
+pub(crate) const LEATHERS: [SrgbColor; 5] =
     [[0.10, 0.09, 0.09], [0.26, 0.15, 0.10], [0.42, 0.25, 0.14], [0.36, 0.11, 0.10], [0.22, 0.21, 0.20]];
-pub(crate) const SHOES: [[Srgb; 2]; 7] = [
+pub(crate) const SHOES: [[SrgbColor; 2]; 7] = [
     [[0.88, 0.88, 0.86], [0.20, 0.35, 0.55]],
     [[0.16, 0.16, 0.18], [0.85, 0.85, 0.83]],
     [[0.60, 0.20, 0.18], [0.92, 0.90, 0.86]],

@@ -11,14 +11,14 @@ use crate::room::rooms;
 use crate::room::scene_config::SceneKind;
 use crate::room::scene_mesh::SceneMesh;
 use crate::room::surfaces::Surface;
-use crate::texture::Texture;
+use crate::texture::TextureImage;
 
 /// All static objects, their textures and light.
 #[derive(Debug, Clone)]
 pub(crate) struct Scene {
     pub mesh: SceneMesh,
     /// Textures, one per [`Surface`].
-    pub textures: Vec<Texture>,
+    pub textures: Vec<TextureImage>,
     pub lamps: Vec<Lamp>,
     /// Ambient light that no lamp causes.
     pub steady: Vec3,
@@ -51,7 +51,7 @@ impl Scene {
         let side = config.texture_px.clamp(64, if config.height > 700 { 1024 } else { 512 }) as usize;
         let side = side.next_power_of_two();
         let used = |surface: Surface| mesh.vertices.iter().any(|vertex| vertex.paint[2] as u32 == surface as u32);
-        let unused = || Texture { side, pixels: vec![[128; 4]; side * side] };
+        let unused = || TextureImage { side, pixels: vec![[128; 4]; side * side] };
         let textures = Surface::ALL
             .iter()
             .map(|&surface| if used(surface) { surface.texture(side, seed) } else { unused() })

@@ -2,9 +2,9 @@
 
 use glam::{Vec2, Vec3};
 
-use crate::clothes::wardrobe::Srgb;
+use crate::clothes::wardrobe::SrgbColor;
 use crate::noise::{Noise, smoothstep};
-use crate::texture::{Texture, mix3, scale3};
+use crate::texture::{TextureImage, mix3, scale3};
 
 /// Texture and its index in the array of textures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -69,9 +69,9 @@ impl Surface {
     }
 
     /// Paints the texture, `side` pixels wide.
-    pub(crate) fn texture(self, side: usize, seed: u64) -> Texture {
+    pub(crate) fn texture(self, side: usize, seed: u64) -> TextureImage {
         let noise = Noise::new(seed, 60 + self as u32);
-        Texture::from_fn(side, |uv| match self {
+        TextureImage::from_fn(side, |uv| match self {
             Self::Plain => grey(0.985 + 0.015 * tiled(noise, uv, 9, 2)),
             Self::Planks => planks(noise, uv),
             Self::Plaster => grey(0.955 + 0.03 * tiled(noise, uv, 5, 3) + 0.012 * tiled(noise, uv, 90, 1)),
@@ -100,7 +100,7 @@ impl Surface {
     }
 }
 
-fn grey(value: f32) -> Srgb {
+fn grey(value: f32) -> SrgbColor {
     [value; 3]
 }
 
@@ -125,7 +125,7 @@ fn tiled(noise: Noise, uv: Vec2, cells: i32, octaves: u32) -> f32 {
     sum / weight
 }
 
-fn wood(noise: Noise, uv: Vec2, contrast: f32) -> Srgb {
+fn wood(noise: Noise, uv: Vec2, contrast: f32) -> SrgbColor {
     let warp = 0.05 * tiled(noise, Vec2::new(uv.x, uv.y), 3, 2);
     let rings = ((uv.y + warp) * 14.0 * std::f32::consts::TAU).sin() * 0.5 + 0.5;
     let fibre = tiled(noise, Vec2::new(uv.x, uv.y), 4, 1) * 0.3 + stretched(noise, uv, 120) * 0.7;
@@ -147,7 +147,7 @@ fn stretched(noise: Noise, uv: Vec2, rows: i32) -> f32 {
     at(low) * (1.0 - t) + at(low + 1.0) * t
 }
 
-fn planks(noise: Noise, uv: Vec2) -> Srgb {
+fn planks(noise: Noise, uv: Vec2) -> SrgbColor {
     const ROWS: f32 = 16.0;
     const EACH: f32 = 2.0;
     let row = (uv.y * ROWS).floor();
@@ -165,7 +165,7 @@ fn planks(noise: Noise, uv: Vec2) -> Srgb {
     scale3(wood, (1.0 + 0.10 * grain) * (1.0 - 0.5 * gap))
 }
 
-fn weave(noise: Noise, uv: Vec2) -> Srgb {
+fn weave(noise: Noise, uv: Vec2) -> SrgbColor {
     let p = uv * 24.0;
     let over = ((p.x.floor() + p.y.floor()) as i32).rem_euclid(2) == 0;
     let t = p - p.floor() - 0.5;
@@ -173,7 +173,7 @@ fn weave(noise: Noise, uv: Vec2) -> Srgb {
     grey((0.86 + 0.04 * tiled(noise, uv, 12, 2)) * bump + 0.04)
 }
 
-fn rug(noise: Noise, uv: Vec2) -> Srgb {
+fn rug(noise: Noise, uv: Vec2) -> SrgbColor {
     let edge = uv.min(Vec2::ONE - uv);
     let from_edge = edge.min_element();
     let field = [0.50, 0.17, 0.16];
@@ -201,7 +201,7 @@ fn rug(noise: Noise, uv: Vec2) -> Srgb {
     colour
 }
 
-fn landscape(noise: Noise, uv: Vec2) -> Srgb {
+fn landscape(noise: Noise, uv: Vec2) -> SrgbColor {
     let ridge = |base: f32, height: f32, seed: f32| base + height * noise.sum(Vec3::new(uv.x * 3.2, seed, 1.0), 5);
     let sky = mix3([0.98, 0.80, 0.62], [0.42, 0.58, 0.75], smoothstep(0.65, 0.0, uv.y));
     let sun = smoothstep(0.085, 0.08, uv.distance(Vec2::new(0.66, 0.36)));
@@ -217,7 +217,7 @@ fn landscape(noise: Noise, uv: Vec2) -> Srgb {
     framed(colour, uv, 0.05)
 }
 
-fn outside(noise: Noise, uv: Vec2) -> Srgb {
+fn outside(noise: Noise, uv: Vec2) -> SrgbColor {
     let cloud = smoothstep(0.0, 0.6, noise.sum(Vec3::new(uv.x * 3.0, uv.y * 6.0, 2.0), 4));
     let mut colour = mix3(mix3([0.62, 0.76, 0.92], [0.86, 0.91, 0.95], uv.y), [0.97, 0.97, 0.96], cloud);
     // Roofs, then the tops of trees before them.
@@ -245,11 +245,11 @@ fn outside(noise: Noise, uv: Vec2) -> Srgb {
     colour
 }
 
-fn framed(colour: Srgb, uv: Vec2, margin: f32) -> Srgb {
+fn framed(colour: SrgbColor, uv: Vec2, margin: f32) -> SrgbColor {
     if uv.min(Vec2::ONE - uv).min_element() < margin { [0.93, 0.92, 0.88] } else { colour }
 }
 
-fn shapes(noise: Noise, uv: Vec2) -> Srgb {
+fn shapes(noise: Noise, uv: Vec2) -> SrgbColor {
     let paints = [[0.86, 0.24, 0.18], [0.95, 0.74, 0.20], [0.13, 0.29, 0.52], [0.12, 0.12, 0.13]];
     let mut colour = [0.93, 0.89, 0.80];
     for k in 0..7 {
@@ -266,7 +266,7 @@ fn shapes(noise: Noise, uv: Vec2) -> Srgb {
     colour
 }
 
-fn print_with_text(noise: Noise, uv: Vec2) -> Srgb {
+fn print_with_text(noise: Noise, uv: Vec2) -> SrgbColor {
     let (paper, ink) = ([0.90, 0.88, 0.82], [0.12, 0.13, 0.16]);
     let mut colour = paper;
     if (0.10..0.55).contains(&uv.y) && (0.12..0.88).contains(&uv.x) {
@@ -292,14 +292,14 @@ fn print_with_text(noise: Noise, uv: Vec2) -> Srgb {
     colour
 }
 
-fn waves(noise: Noise, uv: Vec2) -> Srgb {
+fn waves(noise: Noise, uv: Vec2) -> SrgbColor {
     let warp = noise.sum(Vec3::new(uv.x * 2.5, uv.y * 2.5, 3.0), 4);
     let band = ((uv.y * 5.0 + 1.6 * warp).fract() - 0.5).abs() * 2.0;
     let tone = mix3([0.09, 0.20, 0.34], [0.80, 0.86, 0.84], band);
     framed(mix3(tone, [0.90, 0.52, 0.34], smoothstep(0.35, 0.5, warp)), uv, 0.04)
 }
 
-fn editor(noise: Noise, uv: Vec2) -> Srgb {
+fn editor(noise: Noise, uv: Vec2) -> SrgbColor {
     let back = [0.11, 0.12, 0.16];
     if uv.y < 0.05 {
         return [0.20, 0.21, 0.26];
@@ -330,7 +330,7 @@ fn editor(noise: Noise, uv: Vec2) -> Srgb {
     inks[((noise.cell(word / 3, row, 6) * 0.5 + 0.5) * 3.99) as usize]
 }
 
-fn charts(noise: Noise, uv: Vec2) -> Srgb {
+fn charts(noise: Noise, uv: Vec2) -> SrgbColor {
     let back = [0.94, 0.95, 0.96];
     if uv.y < 0.07 {
         return [0.23, 0.42, 0.62];

@@ -13,7 +13,7 @@ pub(crate) trait BlockingCamera {
     ///
     /// # Errors
     /// `Corrupt` loses this image only; after any other kind the camera is closed.
-    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<Shot, CaptureError>;
+    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<DriverImage, CaptureError>;
 }
 
 /// Factory of a blocking camera. Called at the start and after every loss, each time in a new thread.
@@ -29,7 +29,7 @@ pub(crate) trait Opener: Send + Sync + 'static {
 
 /// Metadata of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Shot {
+pub(crate) struct DriverImage {
     pub size: (u32, u32),
     pub format: PixelFormat,
     /// Timestamp from the system, nanoseconds, where it provides one.

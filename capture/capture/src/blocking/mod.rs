@@ -14,7 +14,7 @@ use std::{
 
 use flyrig_types::{CameraId, Frame, Image, PixelBuffer, PixelFormat};
 
-pub(crate) use self::camera::{BlockingCamera, Opener, Shot};
+pub(crate) use self::camera::{BlockingCamera, DriverImage, Opener};
 use self::worker::{Event, Line};
 use crate::{
     BufferPool, CameraSource, CaptureError, CaptureErrorKind, PopError, SourceHealth,
@@ -177,7 +177,7 @@ impl<O: Opener> Watched<O> {
             match event {
                 Event::Opened => {}
                 Event::Damaged(error) => return Err(error),
-                Event::Shot(shot, bytes) => {
+                Event::Image(shot, bytes) => {
                     (session.is_flowing, session.is_stuck) = (true, false);
                     let line = Arc::clone(&session.line);
                     if std::mem::take(&mut session.is_back) {
@@ -190,7 +190,7 @@ impl<O: Opener> Watched<O> {
         }
     }
 
-    fn frame(&mut self, line: &Line, shot: Shot, bytes: PixelBuffer) -> Result<Frame, CaptureError> {
+    fn frame(&mut self, line: &Line, shot: DriverImage, bytes: PixelBuffer) -> Result<Frame, CaptureError> {
         let number = self.frames + self.health.lost_by_driver;
         self.frames += 1;
         let corrupt =

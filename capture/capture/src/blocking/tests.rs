@@ -100,10 +100,10 @@ impl BlockingCamera for Fake {
         "FAKE 4x2 at 50".to_owned()
     }
 
-    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<Shot, CaptureError> {
+    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<DriverImage, CaptureError> {
         assert!(bytes.is_empty());
         let arrival_nanos = monotonic_nanos();
-        let mut shot = Shot { size: SIZE, format: PixelFormat::Yuyv, stamp_nanos: None, arrival_nanos };
+        let mut shot = DriverImage { size: SIZE, format: PixelFormat::Yuyv, stamp_nanos: None, arrival_nanos };
         match self.steps.pop_front().unwrap_or(Step::Hangs) {
             Step::Frame => std::thread::sleep(Duration::from_millis(2)),
             Step::Sized(width, height) => shot.size = (width, height),

@@ -10,7 +10,7 @@ use std::{
 
 use flyrig_types::{CameraId, PixelBuffer, caught};
 
-use super::camera::{BlockingCamera, Opener, Shot};
+use super::camera::{BlockingCamera, DriverImage, Opener};
 use crate::{BufferPool, CaptureError, CaptureErrorKind, LatestQueue};
 
 /// Queued events between driver thread and camera thread: one to read next, one for jitter.
@@ -21,7 +21,7 @@ const WAITING: usize = 2;
 pub(super) enum Event {
     /// The camera is open and has a mode.
     Opened,
-    Shot(Shot, PixelBuffer),
+    Image(DriverImage, PixelBuffer),
     /// An image was lost.
     Damaged(CaptureError),
 }
@@ -108,7 +108,7 @@ fn read(camera: &mut impl BlockingCamera, pool: &Arc<BufferPool>, line: &Line) -
         }
         let mut bytes = pool.take();
         event = match guarded(|| camera.read(&mut bytes)) {
-            Ok(shot) => Event::Shot(shot, pool.lease(bytes)),
+            Ok(shot) => Event::Image(shot, pool.lease(bytes)),
             Err(error) if error.kind == CaptureErrorKind::Corrupt => Event::Damaged(error),
             Err(error) => return Err(error),
         };

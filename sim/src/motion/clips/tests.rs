@@ -6,7 +6,7 @@ use glam::{DVec3, Vec3};
 use super::*;
 use crate::motion::choice::pass_by;
 use crate::person::assembly::Person;
-use crate::person::look::Look;
+use crate::person::look::PersonLook;
 use crate::{Build, SimConfig};
 
 const ALL: [MotionKind; 10] = [
@@ -25,7 +25,7 @@ const ALL: [MotionKind; 10] = [
 fn person(seed: u64, build: Build) -> Person {
     let mut config = SimConfig { seed, texture_px: 64, ..SimConfig::default() };
     config.person.build = build;
-    Person::new(&Look::new(&config), seed, 64, false).unwrap()
+    Person::new(&PersonLook::new(&config), seed, 64, false).unwrap()
 }
 
 /// Returns the person's soles without the crease between foot and toes, where they bend.
