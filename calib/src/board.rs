@@ -32,6 +32,17 @@ pub enum Pattern {
 /// Flat board of squares; the one at the top left is black.
 ///
 /// Board axes: x right and y down along the printed side, z into the board; the origin is the inner corner at the top left.
+///
+/// ```
+/// use flyrig_calib::{Board, Pattern};
+///
+/// let board = Board { columns: 9, rows: 6, square_mm: 30.0, pattern: Pattern::Chessboard };
+/// board.check()?;
+/// let points: Vec<_> = (0..board.corner_count()).map(|index| board.corner(index)).collect();
+/// assert_eq!(points.len(), 8 * 5);
+/// assert!((points[1].x - 0.03).abs() < 1e-12 && points[1].y == 0.0, "metres along x");
+/// # Ok::<(), String>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Board {
     /// Squares along x.

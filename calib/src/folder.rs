@@ -24,6 +24,29 @@ pub fn load_calibration(dir: &Path, image_size: &dyn Fn(&CameraId) -> Option<(u3
 
 /// Reads a rig from the text of a `calibration.toml`; `path` is for errors.
 ///
+/// ```
+/// use flyrig_calib::{calibration_toml, parse_calibration};
+///
+/// let text = r#"
+/// version = 1
+/// up = [0.0, 0.0, 1.0]
+///
+/// [[cameras]]
+/// name = "front"
+/// size = [1280, 720]
+/// focal_px = [900.0, 900.0]
+/// center_px = [639.5, 359.5]
+/// lens = { model = "radial-tangential", radial = [-0.1, 0.02, 0.0], tangential = [0.0, 0.0] }
+/// rotation = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+/// translation_m = [0.0, 1.2, 3.0]
+/// "#;
+/// let rig = parse_calibration("calibration.toml".as_ref(), text)?;
+/// let eye = rig.cameras[0].position();
+/// assert!((eye.y + 3.0).abs() < 1e-12 && (eye.z - 1.2).abs() < 1e-12, "in front of the origin, above the floor");
+/// assert!(calibration_toml(&rig, &[])?.contains("name = \"front\""));
+/// # Ok::<(), flyrig_calib::CalibError>(())
+/// ```
+///
 /// # Errors
 /// As [`load_calibration`].
 pub fn parse_calibration(path: &Path, text: &str) -> Result<Rig, CalibError> {

@@ -16,6 +16,16 @@ const TEXT_MM: f64 = 2.6;
 const POINTS_PER_MM: f64 = 72.0 / 25.4;
 
 /// Sheet of black rectangles and lines of text, millimetres from its top left.
+///
+/// ```
+/// use flyrig_calib::{Board, BoardSheet};
+///
+/// let a4 = [210.0, 297.0];
+/// let sheet = BoardSheet::new(&Board { square_mm: 25.0, ..Board::default() }, Some(a4))?;
+/// assert_eq!(sheet.size_mm, [297.0, 210.0], "turned along the board");
+/// assert!(sheet.to_svg().starts_with("<svg"));
+/// # Ok::<(), String>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct BoardSheet {
     /// Width and height of the sheet.

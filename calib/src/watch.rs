@@ -32,7 +32,7 @@ const FEW_FOUND: f64 = 0.3;
 /// Least mean motion of the image that is reported, pixels of the reduced image.
 const LEAST_MOTION_PX: f64 = 0.5;
 /// Consecutive images that must agree on a motion, and their relative tolerance.
-const LOOKS: usize = 3;
+const CONFIRMATIONS: usize = 3;
 const SAME_SHARE: f64 = 0.3;
 /// Steps of the robust fit.
 const STEPS: usize = 10;
@@ -123,20 +123,20 @@ impl CameraWatch {
 
     /// Compares an image, about once per second, and returns the new state. A motion is reported once three images
     /// agree on it; an image in which too little of the background is tracked changes nothing.
-    pub fn look(&mut self, image: &WatchedImage<'_>) -> WatchState {
+    pub fn compare(&mut self, image: &WatchedImage<'_>) -> WatchState {
         let is_of_size =
             [image.width, image.height] == [self.intrinsics.width as usize, self.intrinsics.height as usize];
         let pyramid = Some(image).filter(|_| is_of_size).and_then(|image| Pyramid::new(image, self.factor as usize));
         let Some(motion) = pyramid.and_then(|pyramid| self.motion(&pyramid)) else { return self.state };
         self.rotation = motion.rotation;
         self.recent.push(motion);
-        if self.recent.len() > LOOKS {
+        if self.recent.len() > CONFIRMATIONS {
             self.recent.remove(0);
         }
         let least = LEAST_MOTION_PX * self.factor;
         let focal = self.intrinsics.focal_px.max_element();
         let apart = |a: &CameraMotion, b: &CameraMotion| focal * a.rotation.distance(b.rotation);
-        if self.recent.len() == LOOKS {
+        if self.recent.len() == CONFIRMATIONS {
             if self.recent.iter().all(|motion| motion.pixels < least) {
                 self.state = WatchState::Steady;
             } else if self

@@ -11,6 +11,39 @@
 //! - **World**: z up, the floor is z = 0, metres. At the start the person faces -y, towards camera 0.
 //! - **Clock**: nanoseconds from the start of the simulation; frame `i` is taken at exactly
 //!   `i * 1e9 / fps`, rounded down ([`Simulator::frame_nanos`]), by all cameras at once.
+//!
+//! # Example
+//!
+//! The cameras of a configuration, without rendering:
+//!
+//! ```
+//! use flyrig_sim::{SimConfig, camera_ring};
+//!
+//! let config: SimConfig = toml::from_str(
+//!     "seed = 7
+//!      [cameras]
+//!      count = 6
+//!      [motion]
+//!      kind = \"walk\"",
+//! )?;
+//! let rig = camera_ring(&config)?;
+//! assert_eq!(rig.cameras.len(), 6);
+//! assert!(rig.cameras[0].position().y < 0.0, "camera 00 sees the person's front");
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
+//! Images and their ground truth:
+//!
+//! ```no_run
+//! use flyrig_gpu::{AdapterChoice, GpuContext};
+//! use flyrig_sim::{SimConfig, Simulator};
+//!
+//! let gpu = GpuContext::new(&AdapterChoice::Best)?;
+//! let mut simulator = Simulator::new(&gpu, &SimConfig::default())?;
+//! let frame = simulator.render(simulator.frame_nanos(30), 0)?;
+//! println!("{} pixels of the person, pose at {} ns", frame.mask.area_px(), frame.nanos);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 mod camera;
 mod cloth;
@@ -40,6 +73,6 @@ pub use error::SimError;
 pub use files::export::{ExportOptions, Exported, export};
 pub use files::training::{SimSample, TrainingConfig, TrainingSamples, random_config};
 pub use motion::choice::find_debian_clip;
-pub use person::describe::{describe_person, person_fingerprint};
+pub use person::describe::describe_person;
 pub use room::scene_config::{LightConfig, LightSwitch, SceneConfig, SceneKind};
 pub use simulator::Simulator;

@@ -19,6 +19,19 @@ pub enum PopError {
 
 /// Bounded FIFO queue: [`Self::push`] into a full queue drops the oldest element and counts it. Shared through an
 /// `Arc`.
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use flyrig_capture::LatestQueue;
+///
+/// let queue = LatestQueue::new(2);
+/// for frame in 0..3 {
+///     queue.push(frame)?;
+/// }
+/// assert_eq!((queue.pop(Duration::ZERO), queue.dropped()), (Ok(1), 1));
+/// # Ok::<(), i32>(())
+/// ```
 #[derive(Debug)]
 pub struct LatestQueue<T> {
     state: Mutex<State<T>>,

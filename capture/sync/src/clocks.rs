@@ -62,6 +62,29 @@ pub struct ClockState {
 /// the offset follows. (A step by whole periods of less than half a second is indistinguishable from missing frames.)
 /// The trigger's beat leaves the offset ambiguous by whole periods: clocks that differ by more than half a period at
 /// the start are matched by the order in which frames arrive, which the cameras' latencies can make wrong by a frame.
+///
+/// ```
+/// use flyrig_sync::ClockAligner;
+/// use flyrig_types::{CameraId, Frame, Image, PixelFormat};
+///
+/// let cameras: [CameraId; 2] = ["master".into(), "other".into()];
+/// let mut aligner = ClockAligner::new(&cameras, None);
+/// for n in 0..300 {
+///     let truth = n * 33_333_333;
+///     // The other camera's clock is 5 ms ahead and 40 ppm fast.
+///     let stamps = [truth, truth + 5_000_000 + truth / 25_000];
+///     for (camera, capture_nanos) in cameras.iter().zip(stamps) {
+///         let image = Image::new(1, 1, PixelFormat::Gray8, vec![0])?;
+///         let (camera, sequence) = (camera.clone(), n as u64);
+///         let frame = Frame { camera, sequence, capture_nanos, exposure_nanos: None, image, mask: None };
+///         let aligned = aligner.align(frame);
+///         if n > 150 {
+///             assert!((aligned.capture_nanos - truth).abs() < 100_000, "within 0.1 ms");
+///         }
+///     }
+/// }
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug)]
 pub struct ClockAligner {
     cameras: Vec<(CameraId, Clock)>,

@@ -68,6 +68,29 @@ pub struct SyncCounts {
 /// A frame is used at most once, the times of frame sets increase strictly, and a frame set that follows another
 /// camera's clock than the previous one lies more than the window after it. All cameras must share one clock; create a
 /// new synchroniser when that clock restarts.
+///
+/// ```
+/// use flyrig_sync::{SyncSettings, Synchronizer};
+/// use flyrig_types::{CameraId, Frame, Image, PixelFormat};
+///
+/// let frame = |camera: &CameraId, sequence: u64, capture_nanos: i64| -> Result<Frame, Box<dyn std::error::Error>> {
+///     let image = Image::new(1, 1, PixelFormat::Gray8, vec![0])?;
+///     Ok(Frame { camera: camera.clone(), sequence, capture_nanos, exposure_nanos: None, image, mask: None })
+/// };
+/// let cameras: [CameraId; 2] = ["left".into(), "right".into()];
+/// let mut synchronizer = Synchronizer::new(&cameras, &SyncSettings::default());
+/// let mut sets = Vec::new();
+/// for n in 0..10 {
+///     let nanos = n as i64 * 33_333_333;
+///     // The second camera runs 4 ms behind.
+///     sets.extend(synchronizer.push(frame(&cameras[0], n, nanos)?));
+///     sets.extend(synchronizer.push(frame(&cameras[1], n, nanos + 4_000_000)?));
+/// }
+/// sets.extend(synchronizer.flush());
+/// assert_eq!(sets.len(), 10);
+/// assert_eq!(synchronizer.counts().complete, 10);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug)]
 pub struct Synchronizer {
     cameras: Vec<Camera>,

@@ -116,6 +116,23 @@ fn always() -> f64 {
 }
 
 /// Seeded list of faults. A script affects the same frames in every run.
+///
+/// ```
+/// use flyrig_sim::{Delivery, FaultScript};
+///
+/// let script = FaultScript::parse(
+///     "[[fault]]
+///      kind = \"drop\"
+///      camera = \"01\"
+///      from_frame = 30
+///      frames = 60",
+/// )?;
+/// let period = 33_333_333;
+/// let plan = |camera: &str, frame| script.plan(&camera.into(), frame, |index| index as i64 * period);
+/// assert_eq!(plan("01", 30).delivery, Delivery::Dropped);
+/// assert_eq!(plan("00", 30).delivery, Delivery::Frame);
+/// # Ok::<(), flyrig_sim::SimError>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FaultScript {

@@ -49,17 +49,28 @@ pub fn describe_person(config: &SimConfig) -> String {
     words.join(", ").to_lowercase()
 }
 
-/// Returns a hash of everything about the configured person, down to the last shade; people of different hashes differ.
-/// Renders nothing.
-#[must_use]
-pub fn person_fingerprint(config: &SimConfig) -> u64 {
-    // FNV-1a, which is the same on every machine.
-    let text = format!("{:?}", PersonLook::new(config));
-    text.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3))
-}
-
 fn cloth_words(cloth: &Textile) -> String {
     let print = format!("{:?}", cloth.print);
     let print = print.split('(').next().unwrap_or_default();
     format!("{print} {:?}", cloth.fabric)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::*;
+    use crate::Build;
+
+    #[test]
+    fn a_thousand_seeds_make_a_thousand_people() {
+        let of_seed = |seed| SimConfig { seed, ..SimConfig::default() };
+        let shown = |config: &SimConfig| format!("{:?}", PersonLook::new(config));
+        let people: HashSet<String> = (0..1000).map(|seed| shown(&of_seed(seed))).collect();
+        assert_eq!(people.len(), 1000);
+        assert_eq!(shown(&of_seed(5)), shown(&of_seed(5)));
+        let mut broad = of_seed(5);
+        broad.person.build = Build::BroadMan;
+        assert_ne!(shown(&broad), shown(&of_seed(5)));
+    }
 }

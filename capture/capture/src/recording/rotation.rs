@@ -25,6 +25,17 @@ const TIMES: [(&str, f64); 3] = [("h", 3600.0), ("min", 60.0), ("s", 1.0)];
 
 /// Limits of one file of a recording, which continues in a new file when either is reached. In settings a string:
 /// `"off"`, `"4GB"`, `"30min"`, `"4GB 30min"`.
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use flyrig_capture::Rotation;
+///
+/// let rotation: Rotation = "4GB 30min".parse()?;
+/// assert_eq!(rotation.max_bytes, Some(4_000_000_000));
+/// assert_eq!(rotation.max_time, Some(Duration::from_secs(1800)));
+/// # Ok::<(), flyrig_capture::RotationError>(())
+/// ```
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Rotation {
