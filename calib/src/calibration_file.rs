@@ -113,8 +113,9 @@ pub(crate) fn parse(path: &Path, text: &str) -> Result<Imported, CalibError> {
     }
     let cameras = file.cameras.into_iter().map(|entry| camera(path, entry)).collect::<Result<Vec<_>, _>>()?;
     let direction = |up: [f64; 3]| DVec3::from(up).try_normalize().filter(|up| up.is_finite());
-    let up =
-        file.up.map(|up| direction(up).ok_or_else(|| refused("up is no direction; give [0, 0, 1], say".to_owned())));
+    let up = file.up.map(|up| {
+        direction(up).ok_or_else(|| refused("up is not a direction; give [0, 0, 1], for example".to_owned()))
+    });
     Ok(Imported { cameras, up: up.transpose()? })
 }
 
@@ -150,7 +151,7 @@ fn camera(path: &Path, entry: Entry) -> Result<ImportedCamera, CalibError> {
         (rotation, _) => {
             let (has, misses) =
                 if rotation.is_some() { ("rotation", "translation_m") } else { ("translation_m", "rotation") };
-            return Err(wrong(has, format!("stands there without {misses}"), "give both, or neither"));
+            return Err(wrong(has, format!("is given without {misses}"), "give both, or neither"));
         }
     };
     if !entry.time_offset_ms.is_finite() {

@@ -142,7 +142,7 @@ pub enum CalibError {
     },
     /// Views that leave the lens undetermined.
     #[error(
-        "camera {camera}: the views leave the focal length open; tilt the board by 30 to 45 degrees, and check columns, rows \
+        "camera {camera}: the views do not determine the focal length; tilt the board by 30 to 45 degrees, and check columns, rows \
          and dictionary of board.toml"
     )]
     LensOpen {
@@ -156,7 +156,7 @@ pub enum CalibError {
         groups: String,
     },
     /// Boards that leave the rig undetermined.
-    #[error("the boards do not fix the cameras' poses; show the board in more places and tilts")]
+    #[error("the boards do not determine the cameras' poses; show the board in more places and tilts")]
     RigOpen,
     /// Tracks of a person that leave the rig undetermined.
     #[error(
@@ -174,8 +174,8 @@ pub enum CalibError {
     },
     /// Camera whose colours cannot be compared with those of the others.
     #[error(
-        "camera {camera}: {found} points of people are seen by it and another camera at once, and {needed} are needed; let somebody walk where \
-         it looks together with the others, in light that neither clips nor drowns"
+        "camera {camera}: {found} points of people are seen by it and another camera at once, and {needed} are needed; let a person walk where \
+         its view overlaps with the others', in light that is neither clipped nor too dark"
     )]
     ColorsOpen {
         /// Name of the camera.

@@ -53,7 +53,7 @@ pub fn parse_calibration(path: &Path, text: &str) -> Result<Rig, CalibError> {
     let imported = calibration_file::parse(path, text)?;
     let rig = imported.rig(path)?.ok_or_else(|| CalibError::Format {
         path: path.to_owned(),
-        problem: "holds lenses alone, no poses; run flyrig calibrate rig with --lenses".to_owned(),
+        problem: "holds lenses only, no poses; run flyrig calibrate rig with --lenses".to_owned(),
     })?;
     rig.validate().map_err(|source| CalibError::Camera { path: path.to_owned(), source })?;
     Ok(rig)

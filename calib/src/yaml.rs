@@ -204,7 +204,7 @@ impl<'a> Lines<'a> {
     fn map(mut self) -> Result<Vec<(String, Value)>, String> {
         let entries = self.entries(0, true)?;
         match self.lines.get(self.at) {
-            Some((number, ..)) => Err(format!("line {number} is indented, but belongs to nothing")),
+            Some((number, ..)) => Err(format!("line {number} is indented without a key above it")),
             None => Ok(entries),
         }
     }
@@ -256,7 +256,7 @@ impl<'a> Lines<'a> {
             return Ok(Value::Scalar(String::new(), false));
         }
         if !is_top {
-            return Err(format!("line {number} lies deeper than a calibration goes"));
+            return Err(format!("line {number} is nested deeper than a calibration"));
         }
         Ok(Value::Map(self.entries(inner, false)?))
     }

@@ -276,7 +276,7 @@ fn damaged_files_are_named_with_the_fix() {
         ("fisheye", "omni", "unknown variant `omni`"),
         ("name", "nome", "unknown field `nome`"),
         ("[[1,0,0]", "[[2,0,0]", "camera a: rotation is no rotation"),
-        ("translation_m = [0, 0, 0]\n", "", "rotation stands there without translation_m"),
+        ("translation_m = [0, 0, 0]\n", "", "rotation is given without translation_m"),
         (
             "translation_m = [0, 0, 0]\n",
             "translation_m = [0, 0, 0]\ntime_offset_ms = 1e9\n",
@@ -322,7 +322,7 @@ fn a_calibration_folder_is_read_whatever_it_holds() {
     save_lenses(dir.path(), &lenses).unwrap();
     assert_eq!(load_lenses(dir.path(), &NO_SIZE).unwrap(), lenses);
     let text = load_calibration(dir.path(), &NO_SIZE).unwrap_err().to_string();
-    assert!(text.contains("holds lenses alone, no poses; run flyrig calibrate rig"), "{text}");
+    assert!(text.contains("holds lenses only, no poses; run flyrig calibrate rig"), "{text}");
 
     // EasyMocap's files count where there is no calibration.toml; nothing at all names both.
     let text = load_calibration(Path::new("/no/such/folder"), &NO_SIZE).unwrap_err().to_string();

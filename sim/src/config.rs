@@ -232,7 +232,7 @@ impl SimConfig {
         let (ring, motion) = (&self.cameras, &self.motion);
         check("width", self.width.into(), 16.0, 4096.0, "16 to 4096 pixels")?;
         check("height", self.height.into(), 16.0, 4096.0, "16 to 4096 pixels")?;
-        check("fps", self.fps, 0.1, 1000.0, "0.1 to 1000 frames a second")?;
+        check("fps", self.fps, 0.1, 1000.0, "0.1 to 1000 frames per second")?;
         check("texture_px", self.texture_px.into(), 64.0, 4096.0, "64 to 4096 pixels")?;
         check("cameras.count", ring.count as f64, 1.0, 128.0, "1 to 128 cameras")?;
         check("cameras.radius_m", ring.radius_m, 0.8, 6.0, "0.8 to 6 metres")?;

@@ -58,7 +58,7 @@ pub enum SimError {
     #[error(transparent)]
     Image(#[from] ImageError),
     /// Error of an image's JPEG or PNG codec.
-    #[error("coding a simulated image: {0}")]
+    #[error("encoding a simulated image: {0}")]
     Code(#[from] image::ImageError),
     /// Error of a folder or file of an export.
     #[error("{} {message}", path.display())]

@@ -55,8 +55,7 @@ pub(super) fn read(dir: &Path) -> Result<Imported, CalibError> {
             continue;
         };
         if !same_pose(known, &camera) {
-            let problem =
-                format!("line {number}: camera {} stands in two places; give one image of each camera", camera.id);
+            let problem = format!("line {number}: camera {} has two poses; give one image of each camera", camera.id);
             return Err(bad(&images_path, problem));
         }
     }

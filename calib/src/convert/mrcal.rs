@@ -21,7 +21,7 @@ pub(super) fn read(path: &Path) -> Result<Imported, CalibError> {
     let camera = |file: &std::path::PathBuf| {
         let text = calibration_file::read(file)?;
         let root: Value = serde_json::from_str(&python::to_json(&text))
-            .map_err(|error| bad(file, format!("is no dictionary of Python: {error}; export it again")))?;
+            .map_err(|error| bad(file, format!("is not a Python dictionary: {error}; export it again")))?;
         let id = CameraId::from(file.file_stem().unwrap_or_default().to_string_lossy().as_ref());
         model(id, &root).map_err(|problem| bad(file, problem))
     };

@@ -37,7 +37,7 @@ pub(super) fn read(path: &Path) -> Result<Imported, CalibError> {
             continue;
         };
         if !same_pose(known, &camera) {
-            let problem = format!("camera {} stands in two places; give one frame of each camera", camera.id);
+            let problem = format!("camera {} has two poses; give one frame of each camera", camera.id);
             return Err(bad(path, format!("frame {number}: {problem}")));
         }
     }

@@ -160,7 +160,7 @@ impl DeviceSettings {
         for (format, text) in [(FormatChoice::Uyvy, "uyvy"), (FormatChoice::Bayer8, "bayer8")] {
             if self.format == format {
                 return Err(self.wrong(format!(
-                    "format \"{text}\" cannot be had through nokhwa; set another, or name the camera by serial, path or bus"
+                    "format \"{text}\" is not available through nokhwa; set another, or name the camera by serial, path or bus"
                 )));
             }
         }

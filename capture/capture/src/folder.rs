@@ -70,7 +70,7 @@ impl FolderReplay {
     /// for an invalid rate or two images of one number; `Io`.
     pub fn open(root: &Path, cameras: Option<&[CameraId]>, options: &FolderOptions) -> Result<Vec<Self>, CaptureError> {
         if !options.fps.is_finite() || options.fps <= 0.0 {
-            let message = format!("the frame rate is {}, expected a positive number of frames a second", options.fps);
+            let message = format!("the frame rate is {}, expected a positive number of frames per second", options.fps);
             return Err(CaptureError::general(CaptureErrorKind::Unsupported, message));
         }
         let cameras = match cameras {

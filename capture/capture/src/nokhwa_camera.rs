@@ -143,7 +143,7 @@ fn find(infos: &[CameraInfo], device: &NokhwaDevice) -> Result<CameraIndex, Capt
     let there: Vec<String> =
         infos.iter().map(|info| format!("{} \"{}\"", info.index().as_string(), info.human_name())).collect();
     let there = if there.is_empty() { "none".to_owned() } else { there.join(", ") };
-    let text = format!("no camera with {device} is there; plug it in, or set nokhwa to one of these: {there}");
+    let text = format!("no camera with {device} was found; plug it in, or set nokhwa to one of these: {there}");
     Err(CaptureError::general(CaptureErrorKind::NotFound, text))
 }
 

@@ -10,7 +10,7 @@ use std::{
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum PopError {
     /// No element arrived in time.
-    #[error("nothing came in time")]
+    #[error("no element arrived in time")]
     Timeout,
     /// The queue is closed and empty.
     #[error("the queue is closed")]

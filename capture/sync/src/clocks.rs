@@ -271,7 +271,7 @@ impl ClockAligner {
                     // The 1st, 2nd, 4th ...: a clock that steps all night must not fill the disk.
                     if clock.state.steps.is_power_of_two() {
                         let (ms, count) = (-(off as f64) * 1e-6, clock.state.steps);
-                        tracing::warn!(camera = %id, count, "the clock stepped by {ms:.1} ms, which is taken off");
+                        tracing::warn!(camera = %id, count, "the clock stepped by {ms:.1} ms, which is compensated");
                     }
                 }
                 time = told;

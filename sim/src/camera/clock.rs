@@ -128,8 +128,8 @@ impl State {
         if before.checked_ilog2() != self.skipped.checked_ilog2() {
             tracing::warn!(
                 skipped = self.skipped,
-                "this machine cannot draw the simulated cameras at their rate; instants are skipped. Lower sim.fps or the \
-                 images' size, or set source.real_time = false to have every instant"
+                "this machine cannot render the simulated cameras at their rate; instants are skipped. Lower sim.fps or the \
+                 images' size, or set source.real_time = false to get every instant"
             );
         }
     }

@@ -217,7 +217,7 @@ impl FaultScript {
             let timed = matches!(kind, Offset | Jitter | Lag | WrongTimestamp);
             let low = if matches!(kind, Jitter) { 0.0 } else { -1e5 };
             number("fault.ms", fault.ms, timed, low, 1e5, "-100000 to 100000 milliseconds (jitter: from 0)")?;
-            number("fault.ppm", fault.ppm, kind == Drift, -1e5, 1e5, "-100000 to 100000 parts in a million")?;
+            number("fault.ppm", fault.ppm, kind == Drift, -1e5, 1e5, "-100000 to 100000 parts per million")?;
             number("fault.factor", fault.factor, kind == ExposureJump, 0.0, 64.0, "0 to 64")?;
             number("fault.mm", fault.mm, kind == Bump, 0.0, 1000.0, "0 to 1000 millimetres")?;
             number("fault.deg", fault.deg, kind == Bump, 0.0, 180.0, "0 to 180 degrees")?;

@@ -66,7 +66,7 @@ impl SensorConfig {
         if let Some(electrons) = self.full_well_electrons {
             check("sensors.full_well_electrons", electrons, 10.0, 1e7, "10 to 10000000 electrons")?;
         } else if self.read_noise_electrons > 0.0 {
-            let expected = "0 without full_well_electrons, which says what an electron is worth";
+            let expected = "0 without full_well_electrons, which scales electrons to light";
             check("sensors.read_noise_electrons", self.read_noise_electrons, 0.0, 0.0, expected)?;
         }
         check("sensors.read_noise_electrons", self.read_noise_electrons, 0.0, 1e5, "0 to 100000 electrons")?;

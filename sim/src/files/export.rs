@@ -65,7 +65,10 @@ pub fn export(
     partial_name.push(".partial");
     let partial = folder.with_file_name(partial_name);
     if partial.exists() {
-        return Err(refused(&partial, "is left of an export that runs or was killed; remove it if none runs"));
+        return Err(refused(
+            &partial,
+            "is left over from an export that still runs or was killed; remove it if none runs",
+        ));
     }
     let mut written = Folder { root: partial, pictures: 0, lost: 0 }.write(simulator, options, go_on);
     let partial = folder.with_file_name(format!("{}.partial", name.to_string_lossy()));

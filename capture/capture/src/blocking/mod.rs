@@ -12,7 +12,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_types::{CameraId, Frame, Image, PixelBuffer, PixelFormat};
+use flyrig_types::{CameraId, Frame, Image, PixelBuffer};
 
 pub(crate) use self::camera::{BlockingCamera, DriverImage, Opener};
 use self::worker::{Event, Line};

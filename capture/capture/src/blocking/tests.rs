@@ -8,6 +8,8 @@ use std::{
     },
 };
 
+use flyrig_types::PixelFormat;
+
 use super::*;
 use crate::clock::monotonic_nanos;
 

@@ -78,7 +78,7 @@ impl Compressor {
             // The 1st, 2nd, 4th ...: a machine that is too slow all night must not fill the disk.
             if state.dropped.is_power_of_two() {
                 let count = state.dropped;
-                tracing::warn!(count, "camera {}: a frame was not recorded: compressing takes too long", self.camera);
+                tracing::warn!(count, "camera {}: a frame was not recorded: compression is too slow", self.camera);
             }
         }
     }

@@ -78,7 +78,7 @@ pub(crate) fn ladder(
     if !has_rate(offer, fps) {
         let rates: Vec<String> = offer.rates.iter().map(|rate| format!("{rate:.4}")).collect();
         return Err(format!(
-            "has no {fps} frames a second at {choice:?} {width}x{height}; it has {}; set fps to one of them",
+            "has no {fps} frames per second at {choice:?} {width}x{height}; it has {}; set fps to one of them",
             rates.iter().map(|rate| rate.trim_end_matches('0').trim_end_matches('.')).collect::<Vec<_>>().join(", ")
         ));
     }
@@ -163,7 +163,7 @@ mod tests {
         let error = ladder(FormatChoice::Nv12, 30.0, SIZE, &offers(), None).unwrap_err();
         assert_eq!(error, "has no Nv12 images of 640x360; its formats at that size: MJPG, YUYV");
         let error = ladder(FormatChoice::Mjpeg, 60.0, SIZE, &offers(), None).unwrap_err();
-        assert_eq!(error, "has no 60 frames a second at Mjpeg 640x360; it has 30, 15; set fps to one of them");
+        assert_eq!(error, "has no 60 frames per second at Mjpeg 640x360; it has 30, 15; set fps to one of them");
         assert!(ladder(FormatChoice::Auto, 30.0, SIZE, &[], None).unwrap_err().ends_with("none"));
     }
 }

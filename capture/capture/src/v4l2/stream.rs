@@ -137,7 +137,7 @@ impl<H: Host> Stream<H> {
             let fps = rate.map_err(|error| explain(&error, "does not take its frame rate", &node))?.unwrap_or(mode.fps);
             if (fps / mode.fps - 1.0).abs() > SAME_RATE {
                 tracing::warn!(
-                    "camera {}: {:.2} frames a second were asked for, it runs at {fps:.2}",
+                    "camera {}: {:.2} frames per second were requested, it runs at {fps:.2}",
                     self.camera,
                     mode.fps
                 );
@@ -239,7 +239,7 @@ impl<H: Host> Stream<H> {
         let corrupt =
             |text: String| CaptureError::general(CaptureErrorKind::Corrupt, format!("frame {number}: {text}"));
         if lease.buffer.is_broken {
-            return Err(corrupt("the driver says that it is damaged".to_owned()));
+            return Err(corrupt("the driver flags it as damaged".to_owned()));
         }
         let mut bytes = self.pool.take();
         let packed = pack(&session.active, |plane| lease.plane(plane), &mut bytes);
@@ -303,7 +303,7 @@ impl<H: Host> CameraSource for Stream<H> {
 }
 
 fn describe(mode: &Mode) -> String {
-    format!("{} at {:.2} frames a second", fourcc_text(mode.fourcc), mode.fps)
+    format!("{} at {:.2} frames per second", fourcc_text(mode.fourcc), mode.fps)
 }
 
 /// Lists the formats that a device has at a size.
