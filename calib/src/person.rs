@@ -19,7 +19,7 @@ use nalgebra::SMatrix;
 
 use crate::{CalibError, projection::project, uncertainty::pose_deviation};
 use problem::{Known, PersonEstimate, PersonProblem, Spread};
-use rays::{Ray, nearest};
+use rays::{Ray, motions, nearest};
 pub use tangents::OutlineCorner;
 pub use tracks::PersonTracks;
 use untangle::untangled;
@@ -177,14 +177,6 @@ pub fn calibrate_person(
         planes_rad: whole.planes_rad,
         corrections,
     })
-}
-
-fn motions(rig: &Rig) -> Vec<RigidMotion> {
-    let of = |camera: &Camera| RigidMotion {
-        rotation: camera.camera_from_world.rotation,
-        translation: camera.camera_from_world.translation,
-    };
-    rig.cameras.iter().map(of).collect()
 }
 
 /// Result of one solve.

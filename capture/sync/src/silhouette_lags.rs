@@ -147,7 +147,7 @@ fn standard_errors(lags: &[Balance], pairs: &[PairLag]) -> Vec<f64> {
 struct Fit {
     /// Time offset of the second camera, nanoseconds: from all stretches, from the even and from the odd ones.
     lags: [Option<f64>; 3],
-    /// How much better that offset fits than the mean of all, in 0..=1.
+    /// Contrast: improvement of the fit over the mean of all offsets, in 0..=1.
     contrast: f64,
     /// Inverse variance of the lag, 1/ns².
     weight: f64,

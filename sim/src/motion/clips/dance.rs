@@ -5,7 +5,7 @@ use std::f64::consts::{PI, TAU};
 use glam::{DVec2, DVec3};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
-use super::Clip;
+use super::clip::Clip;
 use crate::motion::curve::{ease, hump};
 use crate::motion::posture::{Arm, Posture};
 use crate::motion::puppet::Puppet;

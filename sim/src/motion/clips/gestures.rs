@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use glam::DVec3;
 
-use super::Clip;
+use super::clip::Clip;
 use crate::motion::curve::{closed, ease, hump};
 use crate::motion::posture::{Arm, Posture};
 use crate::motion::puppet::Puppet;

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use super::Clip;
+use super::clip::Clip;
 use super::gestures::breathe;
 use crate::motion::curve::{closed, ease, hermite};
 use crate::motion::posture::Arm;

@@ -2,7 +2,7 @@
 
 use glam::{DVec2, DVec3};
 
-use super::Clip;
+use super::clip::Clip;
 use super::gestures::{breathe, settle};
 use crate::motion::curve::{closed, hump};
 use crate::motion::posture::Arm;

@@ -4,7 +4,7 @@ use std::f64::consts::{PI, TAU};
 
 use glam::{DVec2, DVec3};
 
-use super::Clip;
+use super::clip::Clip;
 use crate::motion::posture::Arm;
 use crate::motion::puppet::Puppet;
 use crate::motion::steps::{Gait, Plant, foot};
