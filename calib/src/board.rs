@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use crate::CalibError;
+use crate::error::CalibError;
 
 /// Allowed number of squares along a side.
 const SQUARES: std::ops::RangeInclusive<u32> = 3..=40;
@@ -122,7 +122,7 @@ impl Board {
                 if !MARKER.contains(marker) {
                     return Err(format!("marker is {marker}, expected {} to {}", MARKER.start(), MARKER.end()));
                 }
-                crate::detect::check_dictionary(dictionary, self.marker_count())
+                crate::dictionary::check_dictionary(dictionary, self.marker_count())
             }
         }
     }

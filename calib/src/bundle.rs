@@ -6,10 +6,8 @@ use flyrig_types::Intrinsics;
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
 
-use crate::{
-    LensModel, SeenCorner,
-    projection::{project, project_with_derivatives},
-};
+use crate::detect::SeenCorner;
+use crate::projection::{LensModel, project, project_with_derivatives};
 
 /// Robust kernel, which reduces the weight of corners beyond 3 standard deviations.
 const KERNEL: Kernel = Kernel::Cauchy(3.0);
@@ -294,10 +292,8 @@ mod tests {
     use flyrig_solve::jacobian_error;
 
     use super::*;
-    use crate::{
-        Board,
-        testing::{Random, bent_shots, ring},
-    };
+    use crate::board::Board;
+    use crate::testing::{Random, bent_shots, ring};
 
     #[test]
     fn derivatives_are_those_of_finite_differences() {

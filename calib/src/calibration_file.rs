@@ -9,13 +9,11 @@ use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry, Lens, Rig
 use glam::{DMat3, DVec2, DVec3};
 use serde::Deserialize;
 
-use crate::{
-    CalibError,
-    convert::{
-        imported::{Imported, ImportedCamera},
-        shared::rotation_of,
-    },
+use crate::convert::{
+    imported::{Imported, ImportedCamera},
+    shared::rotation_of,
 };
+use crate::error::CalibError;
 
 /// Name of the file in a calibration folder.
 pub(crate) const FILE: &str = "calibration.toml";

@@ -9,7 +9,7 @@
 use flyrig_types::{CameraId, ColorMatch};
 use nalgebra::{DMatrix, DVector};
 
-use crate::CalibError;
+use crate::error::CalibError;
 
 /// Usable sRGB values: shadows are coarse, highlights clipped.
 const USABLE: std::ops::RangeInclusive<f64> = 0.06..=0.95;

@@ -20,7 +20,9 @@ use flyrig_types::{CameraId, Rig, write_whole};
 
 pub use self::imported::{Imported, ImportedCamera};
 use self::shared::{bad, files_with, inside, one_file};
-use crate::{CalibError, calibration_file, easymocap};
+use crate::calibration_file;
+use crate::easymocap;
+use crate::error::CalibError;
 
 /// Calibration format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -1,6 +1,6 @@
 //! Detection of boards in images, through the crates `calib-targets-*`.
 
-use calib_targets_charuco::{CharucoBoardSpec, CharucoDetector, CharucoParams, Dictionary, resolve_dictionary};
+use calib_targets_charuco::{CharucoBoardSpec, CharucoDetector, CharucoParams};
 use calib_targets_chessboard::{
     ChessboardDetector, ChessboardParams, DetectorConfig, GrayImageView, default_chess_config, detect_corner_frame,
 };
@@ -8,7 +8,7 @@ use calib_targets_core::ImageRefiner;
 use flyrig_types::{Image, PixelFormat};
 use glam::DVec2;
 
-use crate::{Board, Pattern};
+use crate::board::{Board, Pattern};
 
 /// Fewest corners at which a partly visible board is used.
 const LEAST_CORNERS: usize = 6;
@@ -98,7 +98,7 @@ pub fn detector(board: &Board) -> Result<Box<dyn BoardDetector>, String> {
                 board.columns,
                 board.square_mm as f32,
                 *marker as f32,
-                self::dictionary(dictionary)?,
+                crate::dictionary::dictionary(dictionary)?,
             );
             let mut params = CharucoParams::for_board(spec);
             params.chess = corner_config();
@@ -112,24 +112,6 @@ pub fn detector(board: &Board) -> Result<Box<dyn BoardDetector>, String> {
 /// accurate as the detector's own centres of mass.
 fn corner_config() -> DetectorConfig {
     default_chess_config().with_refiner(ImageRefiner::saddle_point())
-}
-
-/// Returns a dictionary by its name.
-pub(crate) fn dictionary(name: &str) -> Result<Dictionary, String> {
-    resolve_dictionary(name).ok_or_else(|| {
-        format!(
-            "dictionary is {name:?}, which is unknown; expected a name of OpenCV's, such as DICT_4X4_50 or DICT_5X5_100"
-        )
-    })
-}
-
-/// Checks that a dictionary has enough markers.
-pub(crate) fn check_dictionary(name: &str, needed: usize) -> Result<(), String> {
-    let has = dictionary(name)?.codes().len();
-    if has < needed {
-        return Err(format!("dictionary {name} has {has} markers, but the board needs {needed}; take a larger one"));
-    }
-    Ok(())
 }
 
 struct Charuco {

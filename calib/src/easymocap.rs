@@ -11,11 +11,9 @@ use std::{
 use flyrig_types::{Camera, CameraError, CameraId, Intrinsics, Isometry, Lens, MAX_IMAGE_SIDE, Rig};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
-use crate::{
-    CalibError,
-    convert::shared::{opencv_coefficients, opencv_lens, rotation_of},
-    yaml::{Matrix, YamlFile, YamlWriter},
-};
+use crate::convert::shared::{opencv_coefficients, opencv_lens, rotation_of};
+use crate::error::CalibError;
+use crate::yaml::{Matrix, YamlFile, YamlWriter};
 
 const INTRINSICS: &str = "intri.yml";
 const EXTRINSICS: &str = "extri.yml";

@@ -4,7 +4,9 @@ use std::path::Path;
 
 use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Lens, Rig};
 
-use crate::{CalibError, calibration_file, easymocap};
+use crate::calibration_file;
+use crate::easymocap;
+use crate::error::CalibError;
 
 /// Reads the rig of a folder. `image_size` gives width and height of a camera's images in pixels for files that lack
 /// them; it is checked against those that contain them.

@@ -4,13 +4,13 @@ use flyrig_solve::RigidMotion;
 use flyrig_types::{CameraId, Intrinsics, Lens};
 use glam::{DVec2, DVec3};
 
-use crate::{
-    Board, BoardShot, BoardView, CalibError, LensModel,
-    adjust::{Adjusted, adjust},
-    bundle::{Estimate, Free, SolvedCamera},
-    homography::{focal_length, homography},
-    start::{board_poses, rms},
-};
+use crate::adjust::{Adjusted, adjust};
+use crate::board::Board;
+use crate::bundle::{BoardShot, BoardView, Estimate, Free, SolvedCamera};
+use crate::error::CalibError;
+use crate::homography::{focal_length, homography};
+use crate::projection::LensModel;
+use crate::start::{board_poses, rms};
 
 /// Most views in a solve, those that differ most.
 const MOST_VIEWS: usize = 60;

@@ -19,6 +19,7 @@ mod calibration_file;
 mod color;
 mod convert;
 mod detect;
+mod dictionary;
 mod easymocap;
 mod error;
 mod folder;

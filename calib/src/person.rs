@@ -17,7 +17,9 @@ use flyrig_types::{Camera, Intrinsics, Isometry, Rig};
 use glam::DVec3;
 use nalgebra::SMatrix;
 
-use crate::{CalibError, projection::project, uncertainty::pose_deviation};
+use crate::error::CalibError;
+use crate::projection::project;
+use crate::uncertainty::pose_deviation;
 use problem::{Known, PersonEstimate, PersonProblem, Spread};
 use rays::{Ray, motions, nearest};
 pub use tangents::OutlineCorner;

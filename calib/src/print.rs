@@ -4,7 +4,8 @@ use std::fmt::Write as _;
 
 use pdf_writer::{Content, Finish as _, Name, Pdf, Rect, Ref, Str};
 
-use crate::{Board, Pattern, detect::dictionary};
+use crate::board::{Board, Pattern};
+use crate::dictionary::dictionary;
 
 /// Least white margin around the board, millimetres: detectors need some, printers leave some unprinted.
 const MARGIN_MM: f64 = 12.0;

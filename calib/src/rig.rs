@@ -6,13 +6,13 @@ use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Rig};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use nalgebra::SMatrix;
 
-use crate::{
-    Board, BoardShot, BoardView, CalibError, LensModel, Pair, Uncertainty,
-    adjust::{Adjusted, adjust},
-    bundle::{Estimate, Free, bend_shares},
-    start::{rig_start, rms},
-    uncertainty::pose_deviation,
-};
+use crate::adjust::{Adjusted, adjust};
+use crate::board::Board;
+use crate::bundle::{BoardShot, BoardView, Estimate, Free, bend_shares};
+use crate::error::CalibError;
+use crate::projection::LensModel;
+use crate::start::{Pair, rig_start, rms};
+use crate::uncertainty::{Uncertainty, pose_deviation};
 
 /// Options of [`calibrate_rig`].
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

@@ -7,12 +7,11 @@ use flyrig_solve::{RigidMotion, log_rotation};
 use flyrig_types::{CameraId, Intrinsics};
 use glam::{DVec2, DVec3};
 
-use crate::{
-    Board, BoardShot, BoardView, CalibError,
-    adjust::adjust,
-    bundle::{Estimate, Free, SolvedCamera},
-    homography::{homography, plane_poses, spread_out},
-};
+use crate::adjust::adjust;
+use crate::board::Board;
+use crate::bundle::{BoardShot, BoardView, Estimate, Free, SolvedCamera};
+use crate::error::CalibError;
+use crate::homography::{homography, plane_poses, spread_out};
 
 /// Largest angle, radians, and relative distance by which two estimates of a camera's pose agree.
 const AGREE_RAD: f64 = 0.05;

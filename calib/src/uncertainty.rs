@@ -6,7 +6,7 @@ use flyrig_types::Intrinsics;
 use glam::{DVec2, DVec3};
 use nalgebra::SMatrix;
 
-use crate::{LensModel, projection::project_with_derivatives};
+use crate::projection::{LensModel, project_with_derivatives};
 
 /// Grid of positions along the width and the height of an image.
 const GRID: [usize; 2] = [9, 7];

@@ -15,10 +15,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 pub use self::image::WatchedImage;
 use self::patches::{Patch, Pyramid, choose, coarse_shift, track};
-use crate::{
-    LensModel,
-    projection::{project, project_with_derivatives},
-};
+use crate::projection::{LensModel, project, project_with_derivatives};
 
 /// Largest width of the reduced image, pixels.
 const WIDTH: usize = 640;

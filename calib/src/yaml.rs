@@ -10,7 +10,7 @@ use std::{
 
 use flyrig_types::CameraId;
 
-use crate::CalibError;
+use crate::error::CalibError;
 
 /// Maximum file size: calibrations are small, larger files are something else.
 const MAX_BYTES: usize = 16 << 20;

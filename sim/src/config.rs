@@ -5,8 +5,13 @@ use std::path::PathBuf;
 use flyrig_body::{ShapeParams, default_template};
 use serde::{Deserialize, Serialize};
 
+use crate::camera::calibration_error::CalibrationError;
+use crate::camera::faults::FaultScript;
+use crate::camera::optics::OpticsConfig;
+use crate::camera::sensor::SensorConfig;
+use crate::error::SimError;
 use crate::error::check;
-use crate::{CalibrationError, FaultScript, LightConfig, OpticsConfig, SceneConfig, SensorConfig, SimError};
+use crate::room::scene_config::{LightConfig, SceneConfig};
 
 /// Simulated capture. A configuration gives the same bytes in every run on the same graphics adapter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -6,14 +6,21 @@ use flyrig_body::{Part, Template};
 use flyrig_gpu::GpuContext;
 use flyrig_types::{Camera, Image, Mask, PixelFormat, Pose, PoseTrack, Rig};
 
+use crate::camera::faults::FramePlan;
+use crate::camera::frame::{SimFrame, SurfaceMesh};
+use crate::camera::optics::OpticsConfig;
+use crate::camera::ring::camera_ring;
+use crate::camera::sensor::SensorConfig;
 use crate::camera::sensor::{hash, linear_of_half};
+use crate::camera::shot::Shot;
+use crate::config::SimConfig;
 use crate::draw::cast::Cast;
 use crate::draw::drawing::Drawing;
 use crate::draw::moment::{ImageRequest, RawImage};
+use crate::error::SimError;
 use crate::person::actor::ActorShape;
 use crate::person::assembly::Person;
 use crate::room::scene::Scene;
-use crate::{FramePlan, OpticsConfig, SensorConfig, Shot, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring};
 
 /// Simulator of a person, a motion, a room and cameras.
 pub struct Simulator {

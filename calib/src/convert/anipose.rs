@@ -12,7 +12,8 @@ use super::{
     imported::{Imported, ImportedCamera},
     shared::{bad, intrinsics, opencv_coefficients, opencv_lens, rotation_of},
 };
-use crate::{CalibError, calibration_file};
+use crate::calibration_file;
+use crate::error::CalibError;
 
 pub(super) const FILE: &str = "anipose.toml";
 

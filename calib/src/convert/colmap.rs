@@ -15,7 +15,8 @@ use super::{
     imported::{Imported, ImportedCamera},
     shared::{bad, camera_of_image, intrinsics},
 };
-use crate::{CalibError, calibration_file};
+use crate::calibration_file;
+use crate::error::CalibError;
 
 pub(super) const CAMERAS: &str = "cameras.txt";
 const IMAGES: &str = "images.txt";

@@ -6,7 +6,7 @@ use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry, Rig};
 use glam::DVec3;
 
 use super::shared::bad;
-use crate::CalibError;
+use crate::error::CalibError;
 
 /// Largest spread of a level rig's right-hand axes out of their common plane, relative to their spread within it.
 const LEVEL_SHARE: f64 = 0.2;

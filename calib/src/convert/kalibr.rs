@@ -12,10 +12,8 @@ use super::{
     imported::{Imported, ImportedCamera},
     shared::{bad, intrinsics, motion_of, rows4},
 };
-use crate::{
-    CalibError,
-    yaml::{Value, parse_tree},
-};
+use crate::error::CalibError;
+use crate::yaml::{Value, parse_tree};
 
 pub(super) const FILE: &str = "camchain.yaml";
 

@@ -12,7 +12,8 @@ use super::{
     python,
     shared::{bad, files_with, intrinsics, opencv_coefficients, opencv_lens},
 };
-use crate::{CalibError, calibration_file};
+use crate::calibration_file;
+use crate::error::CalibError;
 
 const ENDING: &str = ".cameramodel";
 

@@ -12,7 +12,8 @@ use super::{
     imported::{Imported, ImportedCamera},
     shared::{bad, camera_of_image, intrinsics, motion_of, rows4},
 };
-use crate::{CalibError, calibration_file};
+use crate::calibration_file;
+use crate::error::CalibError;
 
 pub(super) const FILE: &str = "transforms.json";
 

@@ -12,10 +12,8 @@ use super::{
     imported::{Imported, ImportedCamera},
     shared::{bad, files_with, intrinsics, opencv_coefficients, opencv_lens, rotation_of},
 };
-use crate::{
-    CalibError,
-    yaml::{Matrix, YamlFile, YamlWriter},
-};
+use crate::error::CalibError;
+use crate::yaml::{Matrix, YamlFile, YamlWriter};
 
 pub(super) fn read(path: &Path) -> Result<Imported, CalibError> {
     let files = if path.is_dir() { files_with(path, ".yml")? } else { vec![path.to_owned()] };

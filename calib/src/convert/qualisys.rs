@@ -15,7 +15,8 @@ use super::{
     nerfstudio::flip,
     shared::{bad, intrinsics, opencv_lens, rotation_of},
 };
-use crate::{CalibError, calibration_file};
+use crate::calibration_file;
+use crate::error::CalibError;
 
 const SUBPIXELS: f64 = 64.0;
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use flyrig_types::{CameraId, Intrinsics, Isometry, Lens};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
-use crate::CalibError;
+use crate::error::CalibError;
 
 /// Largest entry of `RᵀR - 1` that is attributed to rounding in a text file.
 const ROTATION_TOLERANCE: f64 = 1e-3;

@@ -7,10 +7,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::tangents::{Eye, Side, Tangency, tangency};
 use super::tracks::{PersonTracks, Place};
-use crate::{
-    LensModel,
-    projection::{project, project_with_derivatives},
-};
+use crate::projection::{LensModel, project, project_with_derivatives};
 
 /// Robust kernel of landmarks, which lose half their weight at 2 standard deviations.
 const LANDMARK_KERNEL: Kernel = Kernel::Cauchy(2.0);

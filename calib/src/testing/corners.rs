@@ -3,7 +3,9 @@
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
 use glam::{DQuat, DVec2, DVec3};
 
-use crate::{Board, BoardShot, BoardView, SeenCorner};
+use crate::board::Board;
+use crate::bundle::{BoardShot, BoardView};
+use crate::detect::SeenCorner;
 
 /// Size of every image, pixels.
 const SIZE: [u32; 2] = [1280, 720];

@@ -3,7 +3,9 @@
 use flyrig_types::{Camera, Isometry};
 use glam::DVec2;
 
-use crate::{Board, BoardSheet, GrayImage};
+use crate::board::Board;
+use crate::detect::GrayImage;
+use crate::print::BoardSheet;
 
 /// Resolution of the scanned sheet, pixels per millimetre, and samples along a side of an image's pixel.
 const SCAN: f64 = 8.0;

@@ -4,7 +4,11 @@ use std::sync::Arc;
 
 use flyrig_types::{Frame, Image, PixelFormat};
 
-use crate::{BufferPool, CaptureError, CaptureErrorKind, FrameStage, mjpeg::JpegScratch, rgb};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::mjpeg::JpegScratch;
+use crate::pool::BufferPool;
+use crate::rgb;
+use crate::stage::FrameStage;
 
 /// Free buffers kept for later frames.
 const POOLED_FRAMES: usize = 16;

@@ -3,10 +3,10 @@
 use flyrig_types::CameraId;
 use serde::{Deserialize, Serialize};
 
-use crate::{
-    CameraControls, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, FormatChoice,
-    NokhwaCamera, NokhwaDevice, NokhwaOptions,
-};
+use crate::camera_options::{CameraControls, CameraIdentity, CameraOptions, FormatChoice};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::nokhwa_camera::{NokhwaCamera, NokhwaDevice, NokhwaOptions};
+use crate::source::CameraSource;
 
 /// Capture API of a camera, with its options.
 #[derive(Debug, Clone, PartialEq)]

@@ -7,7 +7,10 @@ use opencv::{
     imgproc::{COLOR_RGB2BGR, cvt_color_def},
 };
 
-use crate::{CaptureError, CaptureErrorKind, FrameStage, mjpeg::JpegScratch, rgb};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::mjpeg::JpegScratch;
+use crate::rgb;
+use crate::stage::FrameStage;
 
 /// Stage that compresses a camera's frames; frames that are JPEG already pass unchanged.
 #[derive(Debug)]
@@ -60,7 +63,7 @@ impl FrameStage for JpegEncoding {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::to_rgb8;
+    use crate::rgb::to_rgb8;
 
     fn frame(format: PixelFormat, bytes: Vec<u8>) -> Frame {
         let image = Image::new(48, 32, format, bytes).unwrap();

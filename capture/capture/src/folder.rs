@@ -11,10 +11,9 @@ use std::{
 
 use flyrig_types::{CameraId, Frame, Image, Mask, PixelFormat};
 
-use crate::{
-    CameraSource, CaptureError, CaptureErrorKind,
-    image_file::{self, IMAGE_ENDINGS},
-};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::image_file::{self, IMAGE_ENDINGS};
+use crate::source::CameraSource;
 
 /// Options of a folder's replay.
 #[derive(Debug, Clone, PartialEq)]

@@ -5,7 +5,7 @@ use std::{io::Cursor, path::Path};
 use flyrig_types::MAX_IMAGE_SIDE;
 use image::{DynamicImage, ImageFormat, ImageReader, Limits};
 
-use crate::{CaptureError, CaptureErrorKind};
+use crate::error::{CaptureError, CaptureErrorKind};
 
 /// Extensions of image files, lower case.
 pub(crate) const IMAGE_ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];

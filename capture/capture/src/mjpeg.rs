@@ -5,7 +5,8 @@ use zune_jpeg::{
     zune_core::{bytestream::ZCursor, colorspace::ColorSpace, options::DecoderOptions},
 };
 
-use crate::{CaptureError, CaptureErrorKind, image_file};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::image_file;
 
 /// Decodes into `rgb`, `3 * width * height` bytes. Strict: damage that a lenient decoder fills with grey is an error,
 /// so that a broken image never colours a person.

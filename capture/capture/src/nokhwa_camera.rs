@@ -15,13 +15,13 @@ use nokhwa::{
     },
 };
 
-use crate::{
-    CaptureError, CaptureErrorKind, FormatChoice,
-    blocking::{BlockingCamera, DriverImage, Expected, Opener, Watched},
-    clock::monotonic_nanos,
-    image_file, mjpeg,
-    source::forward_source,
-};
+use crate::blocking::{BlockingCamera, DriverImage, Expected, Opener, Watched};
+use crate::camera_options::FormatChoice;
+use crate::clock::monotonic_nanos;
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::image_file;
+use crate::mjpeg;
+use crate::source::forward_source;
 
 /// Formats of nokhwa and their equivalents, in the order of preference of [`FormatChoice::Auto`].
 const FORMATS: [(FrameFormat, FormatChoice, PixelFormat); 6] = [

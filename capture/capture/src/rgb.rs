@@ -7,10 +7,8 @@ use std::array::from_fn;
 
 use flyrig_types::{Image, PixelFormat};
 
-use crate::{
-    CaptureError, CaptureErrorKind,
-    mjpeg::{self, JpegScratch},
-};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::mjpeg::{self, JpegScratch};
 
 /// Converts an image to `width * height` pixels of 3 bytes, sRGB red green blue. Alpha is dropped, grey replicated, YUV
 /// is BT.601 with limited range, Bayer is interpolated bilinearly, JPEG decoded.

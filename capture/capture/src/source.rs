@@ -4,7 +4,7 @@ use std::{sync::Arc, time::Duration};
 
 use flyrig_types::{CameraId, Frame};
 
-use crate::CaptureError;
+use crate::error::CaptureError;
 
 /// Health of a source beyond its frames and errors; counts since its creation.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]

@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use flyrig_types::{CameraId, Frame, caught};
 
-use crate::{CaptureError, LatestQueue};
+use crate::error::CaptureError;
+use crate::queue::LatestQueue;
 
 /// Queued frames of a stage: one to process next, one for jitter. More would only add latency.
 const WAITING: usize = 2;

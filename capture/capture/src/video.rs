@@ -17,7 +17,9 @@ use opencv::{
     },
 };
 
-use crate::{BufferPool, CameraSource, CaptureError, CaptureErrorKind};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::pool::BufferPool;
+use crate::source::CameraSource;
 
 /// Options of a video's replay.
 #[derive(Debug, Clone, Default, PartialEq)]

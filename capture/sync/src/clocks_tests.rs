@@ -2,8 +2,10 @@
 
 use flyrig_types::{CameraId, Frame, FrameSet, Image, PixelFormat};
 
+use crate::clocks::ClockAligner;
 use crate::random::Random;
-use crate::{ClockAligner, SyncSettings, Synchronizer};
+use crate::settings::SyncSettings;
+use crate::sync::Synchronizer;
 
 const PERIOD: i64 = 33_333_333;
 const SECOND: i64 = 1_000_000_000;

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use flyrig_types::{Camera, CameraId};
 use serde::{Deserialize, Serialize};
 
-use crate::ClockKind;
+use crate::clocks::ClockKind;
 
 /// Settings of frame sets. Serialised in milliseconds, 0 meaning "automatic"; kept in whole nanoseconds.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]

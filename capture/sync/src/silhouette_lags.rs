@@ -9,8 +9,8 @@ use flyrig_solve::median;
 use flyrig_types::{Camera, Mask};
 use glam::DVec3;
 
-use crate::LagEstimate;
 use crate::hull::{HullCorner, silhouette_hull};
+use crate::lags::LagEstimate;
 use crate::lags::{Balance, PairLag, balanced};
 
 /// Sampling interval of the curves, nanoseconds.

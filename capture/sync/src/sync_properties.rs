@@ -5,7 +5,8 @@ use std::collections::HashMap;
 use flyrig_types::{CameraId, Frame, FrameSet, Image, PixelFormat};
 
 use crate::random::Random;
-use crate::{DropCounts, SyncSettings, Synchronizer};
+use crate::settings::SyncSettings;
+use crate::sync::{DropCounts, Synchronizer};
 
 const PERIOD: i64 = 33_333_333;
 

@@ -4,8 +4,8 @@ use flyrig_types::{Camera, Isometry, Rig};
 use glam::{DQuat, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::SimError;
 use crate::camera::sensor::{gaussian, hash};
+use crate::error::SimError;
 use crate::error::check;
 
 /// Deviations of the reported cameras from the true ones, drawn per camera from Gaussians of these standard deviations

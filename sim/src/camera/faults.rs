@@ -19,9 +19,9 @@ use flyrig_types::{CameraId, Isometry};
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::SimError;
-use crate::camera::ring::camera_name;
+use crate::camera::name::camera_name;
 use crate::camera::sensor::{gaussian, hash, uniform};
+use crate::error::SimError;
 use crate::error::check;
 
 /// Kind of a [`Fault`].

@@ -4,6 +4,7 @@ pub(crate) mod calibration_error;
 pub(crate) mod clock;
 pub(crate) mod faults;
 pub(crate) mod frame;
+pub(crate) mod name;
 pub(crate) mod optics;
 pub(crate) mod ring;
 pub(crate) mod sensor;

@@ -3,8 +3,8 @@
 use glam::Vec2;
 use serde::{Deserialize, Serialize};
 
-use crate::SimError;
 use crate::camera::sensor::uniform;
+use crate::error::SimError;
 use crate::error::check;
 
 /// Shutter and aperture of a camera; the default is instantaneous and a pinhole.

@@ -5,13 +5,10 @@ use std::f64::consts::TAU;
 use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Lens, Rig};
 use glam::{DQuat, DVec2, DVec3, EulerRot};
 
+use crate::camera::name::camera_name;
 use crate::camera::sensor::{hash, uniform};
-use crate::{SimConfig, SimError};
-
-/// Returns the name of a camera of the ring.
-pub(crate) fn camera_name(slot: usize) -> String {
-    format!("{slot:02}")
-}
+use crate::config::SimConfig;
+use crate::error::SimError;
 
 /// Returns the configured ring: `00`, `01`, ... counter-clockwise seen from above, `00` at -y, z up.
 ///

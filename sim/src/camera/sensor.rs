@@ -7,7 +7,7 @@ use image::ImageEncoder as _;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::SimError;
+use crate::error::SimError;
 use crate::error::check;
 use crate::texture::linear_from_srgb;
 

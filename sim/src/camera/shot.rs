@@ -2,7 +2,7 @@
 
 use flyrig_types::Isometry;
 
-use crate::SimError;
+use crate::error::SimError;
 use crate::error::check;
 
 /// Request for one image.

@@ -9,7 +9,11 @@ use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind};
 use flyrig_types::{CameraId, Frame, Image};
 
 use crate::camera::clock::RealClock;
-use crate::{Delivery, FramePlan, Shot, SimError, SimTime, Simulator};
+use crate::camera::clock::SimTime;
+use crate::camera::faults::{Delivery, FramePlan};
+use crate::camera::shot::Shot;
+use crate::error::SimError;
+use crate::simulator::Simulator;
 
 /// Frame source of one camera of a [`Simulator`]. All sources of a simulator see the same instants except for the
 /// configured faults. Dropping it removes the camera from the rig.

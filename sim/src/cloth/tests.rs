@@ -8,9 +8,10 @@ use rand::{RngExt, SeedableRng, rngs::StdRng};
 use super::solver::{Particle, ParticleLink, Particles, SkinnedParticle, State, pull, step};
 use super::*;
 use crate::clothes::wardrobe::{Bottom, HairCut};
+use crate::config::{MotionKind, SimConfig};
 use crate::person::actor::{Actor, ActorShape};
+use crate::person::describe::describe_person;
 use crate::person::look::PersonLook;
-use crate::{MotionKind, SimConfig, describe_person};
 
 /// Seeds of a person in a coat, and of one in a skirt.
 const COAT: u64 = 16;

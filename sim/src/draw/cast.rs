@@ -3,12 +3,13 @@
 use flyrig_types::Pose;
 use glam::Vec3;
 
+use crate::config::SimConfig;
 use crate::draw::capsules::Limbs;
 use crate::draw::figure::Figured;
 use crate::draw::moment::{Bound, Moment};
+use crate::error::SimError;
 use crate::person::actor::{Actor, ActorShape};
 use crate::person::passer::passer_by;
-use crate::{SimConfig, SimError};
 
 /// Longest interval between keys, seconds, as long as there are at most [`MOST_KEYS`].
 const KEY_SECS: f64 = 0.008;

@@ -10,9 +10,11 @@ use flyrig_types::{CameraId, write_whole};
 use image::{ExtendedColorType, ImageEncoder as _};
 use serde_json::json;
 
+use crate::camera::faults::{Delivery, FramePlan};
 use crate::camera::source::{shot, spoilt};
+use crate::error::SimError;
 use crate::files::truth_file::write_truth;
-use crate::{Delivery, FramePlan, SimError, Simulator};
+use crate::simulator::Simulator;
 
 /// Options of an export.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

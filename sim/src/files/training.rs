@@ -5,14 +5,19 @@ use flyrig_gpu::GpuContext;
 use flyrig_types::Rig;
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
-use crate::camera::ring::camera_name;
+use crate::camera::calibration_error::CalibrationError;
+use crate::camera::faults::{Delivery, Fault, FaultKind, FaultScript};
+use crate::camera::frame::SimFrame;
+use crate::camera::name::camera_name;
+use crate::camera::optics::OpticsConfig;
+use crate::camera::sensor::SensorConfig;
 use crate::camera::sensor::hash;
 use crate::camera::source::shot;
+use crate::config::{MotionConfig, MotionKind, RingConfig, SimConfig};
+use crate::error::SimError;
 use crate::error::check;
-use crate::{
-    CalibrationError, Delivery, Fault, FaultKind, FaultScript, MotionConfig, MotionKind, OpticsConfig, RingConfig,
-    SceneConfig, SceneKind, SensorConfig, SimConfig, SimError, SimFrame, Simulator,
-};
+use crate::room::scene_config::{SceneConfig, SceneKind};
+use crate::simulator::Simulator;
 
 /// Configuration of [`TrainingSamples`].
 #[derive(Debug, Clone, PartialEq)]

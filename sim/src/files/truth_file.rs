@@ -6,7 +6,8 @@ use exr::prelude::{
     AnyChannel, AnyChannels, Encoding, FlatSamples, Image, Layer, LayerAttributes, SmallVec, Vec2, WritableImage as _,
 };
 
-use crate::{SimError, SimFrame};
+use crate::camera::frame::SimFrame;
+use crate::error::SimError;
 
 /// Writes the channels `Z` (camera-space depth, metres), `N.X`, `.Y`, `.Z` (world normal), `canonical.X`, `.Y`, `.Z`
 /// (metres) and `part` (index + 1; 0 is no person).

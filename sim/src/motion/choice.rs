@@ -8,12 +8,13 @@ use flyrig_types::{Pose, PoseTrack};
 use glam::DVec3;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
+use crate::config::{MotionConfig, MotionKind, SimConfig};
+use crate::error::SimError;
 use crate::motion::clips::{clip, passing};
 use crate::motion::fingers::with_fingers;
 use crate::motion::puppet::Puppet;
 use crate::person::assembly::Person;
 use crate::person::shoes::SOLE_M;
-use crate::{MotionConfig, MotionKind, SimConfig, SimError};
 
 const DEBIAN_CLIP: &str = "/usr/share/assimp/models/BVH/01_01.bvh";
 

@@ -5,7 +5,7 @@ use flyrig_types::{Pose, PoseTrack};
 use glam::{DQuat, DVec3};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
-use crate::SimError;
+use crate::error::SimError;
 use crate::motion::curve::ease;
 
 /// Duration of a gesture including the transition to the next one, seconds.

@@ -6,7 +6,7 @@ use flyrig_body::{Skeleton, Template};
 use flyrig_types::Pose;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
-use crate::SimError;
+use crate::error::SimError;
 use crate::motion::curve::ease;
 use crate::motion::posture::{Arm, Foot, Posture};
 use crate::person::shoes::SOLE_M;

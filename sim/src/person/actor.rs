@@ -5,10 +5,11 @@ use flyrig_types::{Pose, PoseTrack};
 use glam::Vec3;
 
 use crate::cloth::Cloth;
+use crate::config::SimConfig;
+use crate::error::SimError;
 use crate::motion::choice;
 use crate::person::assembly::Person;
 use crate::person::look::PersonLook;
-use crate::{SimConfig, SimError};
 
 /// Dressed person with a motion.
 pub(crate) struct Actor {

@@ -3,7 +3,6 @@
 use flyrig_body::{ShapeParams, Template, default_template};
 use glam::{Vec2, Vec3};
 
-use crate::SimError;
 use crate::clothes::cuts::{COAT_SEAM_M, inside_bottom, inside_outer, inside_top, waist_m};
 use crate::clothes::fabric::gloss;
 use crate::clothes::garments::{Tailor, visible_skin};
@@ -14,6 +13,7 @@ use crate::clothes::prints::{
 };
 use crate::clothes::sheet::{Node, Sheet};
 use crate::clothes::wardrobe::{Bottom, Fabric, ShoeKind};
+use crate::error::SimError;
 use crate::noise::{Noise, smoothstep};
 use crate::person::face::{eye_colour, skin_colour};
 use crate::person::hats::{hat, hat_cloth};

@@ -1,7 +1,7 @@
 //! Description of a person in words.
 
-use crate::SimConfig;
 use crate::clothes::wardrobe::{Beard, Bottom, Hat, Textile};
+use crate::config::SimConfig;
 use crate::person::look::PersonLook;
 
 /// Describes the configured person in a line of words; two people of the same words may still differ in shape and
@@ -60,7 +60,7 @@ mod tests {
     use std::collections::HashSet;
 
     use super::*;
-    use crate::Build;
+    use crate::config::Build;
 
     #[test]
     fn a_thousand_seeds_make_a_thousand_people() {

@@ -6,9 +6,9 @@ use rand::{RngExt, SeedableRng, rngs::StdRng};
 use crate::clothes::wardrobe::{
     Beard, Bottom, Fabric, Footwear, HairCut, Hat, Outer, Print, ShoeKind, SrgbColor, Textile, Top, TopKind,
 };
+use crate::config::{Build, SimConfig};
 use crate::person::features::Features;
 use crate::person::palette::{CHINOS, CLOTHS, DENIMS, HAIRS, IRISES, LEATHERS, SHOES, SKINS};
-use crate::{Build, SimConfig};
 
 /// Appearance of a person.
 #[derive(Debug, Clone)]

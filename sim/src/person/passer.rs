@@ -1,9 +1,10 @@
 //! Second person who walks through the room.
 
 use crate::camera::sensor::hash;
+use crate::config::{MotionConfig, MotionKind, PersonConfig, SimConfig};
+use crate::error::SimError;
 use crate::motion::choice;
 use crate::person::actor::Actor;
-use crate::{MotionConfig, MotionKind, PersonConfig, SimConfig, SimError};
 
 /// Creates a person other than the configured one, who walks to and fro past the centre.
 pub(crate) fn passer_by(config: &SimConfig) -> Result<Actor, SimError> {

@@ -3,8 +3,8 @@
 use flyrig_types::Rig;
 use glam::Vec3;
 
-use crate::SimConfig;
 use crate::camera::sensor::{hash, uniform};
+use crate::config::SimConfig;
 use crate::room::lamps::Lamp;
 use crate::room::plan::{HEIGHT_M, Plan};
 use crate::room::rooms;

@@ -2,7 +2,7 @@
 
 use flyrig_types::PixelFormat;
 
-use crate::CaptureError;
+use crate::error::CaptureError;
 
 /// An open camera, used by a single thread from opening to drop.
 pub(crate) trait BlockingCamera {

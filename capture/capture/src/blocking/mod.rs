@@ -16,10 +16,11 @@ use flyrig_types::{CameraId, Frame, Image, PixelBuffer};
 
 pub(crate) use self::camera::{BlockingCamera, DriverImage, Opener};
 use self::worker::{Event, Line};
-use crate::{
-    BufferPool, CameraSource, CaptureError, CaptureErrorKind, PopError, SourceHealth,
-    stamps::{StampSource, Stamps},
-};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::pool::BufferPool;
+use crate::queue::PopError;
+use crate::source::{CameraSource, SourceHealth};
+use crate::stamps::{StampSource, Stamps};
 
 /// Periods without a frame after which a streaming camera counts as silent, but never less than [`SILENT_AFTER`].
 const SILENT_PERIODS: f64 = 5.0;

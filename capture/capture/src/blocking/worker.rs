@@ -11,7 +11,9 @@ use std::{
 use flyrig_types::{CameraId, PixelBuffer, caught};
 
 use super::camera::{BlockingCamera, DriverImage, Opener};
-use crate::{BufferPool, CaptureError, CaptureErrorKind, LatestQueue};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::pool::BufferPool;
+use crate::queue::LatestQueue;
 
 /// Queued events between driver thread and camera thread: one to read next, one for jitter.
 const WAITING: usize = 2;

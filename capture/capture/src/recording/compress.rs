@@ -9,7 +9,10 @@ use std::{
 use flyrig_types::{CameraId, Frame, Image, caught};
 
 use super::outlet::Outlet;
-use crate::{BufferPool, CaptureError, CaptureErrorKind, JpegEncoding, LatestQueue};
+use crate::encoding::JpegEncoding;
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::pool::BufferPool;
+use crate::queue::LatestQueue;
 
 /// Images of a camera that may wait for compression: a quarter of a second at 30 frames per second.
 const WAITING: usize = 8;

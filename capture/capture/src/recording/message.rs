@@ -9,7 +9,8 @@ use foxglove::{
 };
 use prost::bytes::Bytes;
 
-use crate::{CaptureError, CaptureErrorKind, mjpeg};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::mjpeg;
 
 /// Prefix of the topics of images.
 pub(super) const TOPIC: &str = "camera/";

@@ -9,7 +9,7 @@ use std::{
 use mcap::{McapResult, Message, io::MessageReader, sans_io::LinearReaderOptions};
 
 use super::{disk::part_path, part::Link};
-use crate::{CaptureError, CaptureErrorKind};
+use crate::error::{CaptureError, CaptureErrorKind};
 
 /// Bytes per read.
 const BUFFER: usize = 1 << 20;

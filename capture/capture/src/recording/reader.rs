@@ -11,7 +11,8 @@ use super::{
     message::{self, TOPIC},
     parts::Parts,
 };
-use crate::{CameraSource, CaptureError, CaptureErrorKind};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::source::CameraSource;
 
 /// Most messages and bytes before the first frame: recordings of other programs may have no frame at all.
 const MOST_NOTES: usize = 4096;

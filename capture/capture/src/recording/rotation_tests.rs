@@ -14,7 +14,8 @@ use super::{
     recorded_messages, recorded_notes,
     tests::{Script, frame, note, pass, replayed, same},
 };
-use crate::{CameraSource, CaptureErrorKind};
+use crate::error::CaptureErrorKind;
+use crate::source::CameraSource;
 
 const MINUTE: Duration = Duration::from_secs(60);
 

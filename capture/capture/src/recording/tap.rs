@@ -9,7 +9,8 @@ use super::{
     message::Channel,
     outlet::Outlet,
 };
-use crate::{CameraSource, CaptureError, SourceHealth};
+use crate::error::CaptureError;
+use crate::source::{CameraSource, SourceHealth};
 
 /// Attaches a recording to sources, wherever they are opened. Cheap to clone; does not keep the recording from ending.
 #[derive(Debug, Clone)]

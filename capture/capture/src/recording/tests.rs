@@ -10,7 +10,9 @@ use std::{
 use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
 use super::{Compression, McapReplay, Note, Recorder, RecorderConfig, disk::Disk, recorded_notes};
-use crate::{CameraSource, CaptureError, CaptureErrorKind, to_rgb8};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::rgb::to_rgb8;
+use crate::source::CameraSource;
 
 pub(super) struct Script(pub CameraId, pub u64, pub u64);
 

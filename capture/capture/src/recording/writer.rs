@@ -23,7 +23,8 @@ use super::{
     rotation::Rotation,
     tap::{MessageTap, Recording, SourceTap},
 };
-use crate::{CameraSource, CaptureError, CaptureErrorKind};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::source::CameraSource;
 
 /// Free space that a recording leaves on its file system by default, bytes: room for its index and for other programs.
 pub const RESERVE_BYTES: u64 = 1 << 30;

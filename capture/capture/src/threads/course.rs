@@ -2,7 +2,7 @@
 
 use flyrig_types::Frame;
 
-use crate::{NetworkHealth, SourceHealth};
+use crate::source::{NetworkHealth, SourceHealth};
 
 /// Continuation of sequence numbers and counts across sources, each of which starts at 0.
 #[derive(Debug, Default)]

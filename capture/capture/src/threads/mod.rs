@@ -23,11 +23,11 @@ use self::{
     pulse::Pulse,
     shared::{Pulses, Supply, ThreadsState, lock},
 };
-use crate::{
-    CameraSource, CaptureError, CaptureErrorKind, FrameStage, LatestQueue, SourceHealth,
-    stage::{Hand, Stage, StageMaker},
-    turns::Turns,
-};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::queue::LatestQueue;
+use crate::source::{CameraSource, SourceHealth};
+use crate::stage::{FrameStage, Hand, Stage, StageMaker};
+use crate::turns::Turns;
 
 /// Time that dropping allows threads inside foreign code before it abandons them.
 const CLOSING: Duration = Duration::from_secs(15);

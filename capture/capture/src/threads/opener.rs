@@ -6,7 +6,9 @@ use crossbeam::channel::{Receiver, Sender, bounded};
 use flyrig_types::{CameraId, caught};
 
 use super::pulse::Pulse;
-use crate::{CameraSource, CaptureError, CaptureErrorKind, SourceTap};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::recording::SourceTap;
+use crate::source::CameraSource;
 
 type Source = Box<dyn CameraSource>;
 type Open = Box<dyn FnMut() -> Result<Source, CaptureError> + Send>;

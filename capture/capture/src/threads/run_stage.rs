@@ -5,7 +5,9 @@ use std::time::Duration;
 use flyrig_types::caught;
 
 use super::shared::ThreadsState;
-use crate::{CaptureError, CaptureErrorKind, PopError, stage::Stage};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::queue::PopError;
+use crate::stage::Stage;
 
 /// Interval of the heartbeats of an idle stage.
 const TURN: Duration = Duration::from_millis(500);

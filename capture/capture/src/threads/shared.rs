@@ -14,7 +14,11 @@ use super::{
     pulse::Pulse,
     stats::{CameraStats, Pacing},
 };
-use crate::{CameraSource, CaptureError, CaptureErrorKind, LatestQueue, stage::Hand, turns::Turns};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::queue::LatestQueue;
+use crate::source::CameraSource;
+use crate::stage::Hand;
+use crate::turns::Turns;
 
 /// Timeout of a source's call, after which its thread checks for a stop request.
 const POLL: Duration = Duration::from_millis(200);

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 
 use flyrig_types::CameraId;
 
-use crate::{CaptureError, CaptureErrorKind, SourceHealth};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::source::SourceHealth;
 
 /// Timing of frames into the queue, and behaviour when it is full.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

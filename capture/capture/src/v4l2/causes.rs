@@ -3,7 +3,7 @@
 use std::{fs, io, path::Path};
 
 use super::identity;
-use crate::{CaptureError, CaptureErrorKind};
+use crate::error::{CaptureError, CaptureErrorKind};
 
 /// Builds the error of a stream that broke.
 pub(crate) fn lost(error: &io::Error) -> CaptureError {

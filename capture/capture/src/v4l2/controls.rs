@@ -9,7 +9,7 @@ use v4l::v4l_sys::{
 };
 
 use super::sys::ControlRange;
-use crate::CameraControls;
+use crate::camera_options::CameraControls;
 
 /// Unit of `V4L2_CID_EXPOSURE_ABSOLUTE`.
 const EXPOSURE_UNIT_NANOS: i64 = 100_000;

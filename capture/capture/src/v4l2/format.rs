@@ -3,7 +3,7 @@
 use flyrig_types::PixelFormat;
 
 use super::sys::ActiveFormat;
-use crate::FormatChoice;
+use crate::camera_options::FormatChoice;
 
 impl FormatChoice {
     /// Every choice but [`Self::Auto`], in the order of preference of [`Self::Auto`].

@@ -6,7 +6,8 @@ use std::{
 };
 
 use super::sys::{Capability, Device};
-use crate::{CameraIdentity, CaptureError, CaptureErrorKind};
+use crate::camera_options::CameraIdentity;
+use crate::error::{CaptureError, CaptureErrorKind};
 
 /// USB device behind a node.
 #[derive(Debug, Clone, PartialEq, Eq)]

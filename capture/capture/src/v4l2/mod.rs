@@ -34,7 +34,9 @@ pub use self::{
     report::{BusPlan, CameraReport, FormatReport, camera_reports, plan_buses},
     sys::monotonic_nanos,
 };
-use crate::{CameraIdentity, CameraOptions, CaptureError, source::forward_source};
+use crate::camera_options::{CameraIdentity, CameraOptions};
+use crate::error::CaptureError;
+use crate::source::forward_source;
 
 /// Camera of this computer. Frames have the camera's own pixel format; [`crate::Decoding`] converts them to RGB.
 ///

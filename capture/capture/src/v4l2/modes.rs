@@ -1,6 +1,6 @@
 //! Choice of a camera's mode, and of fallbacks when the bus lacks bandwidth.
 
-use crate::FormatChoice;
+use crate::camera_options::FormatChoice;
 
 /// Bytes per second that are guaranteed to one USB 2 camera: three packets of 1024 bytes in each of 8000 microframes.
 const USB2_CAMERA_BYTES: u64 = 24_576_000;

@@ -9,7 +9,8 @@ use super::{
     modes,
     sys::{Device, SizeRange},
 };
-use crate::{CaptureError, FormatChoice};
+use crate::camera_options::FormatChoice;
+use crate::error::CaptureError;
 
 /// Most sizes per format that are queried for their rates: a driver may list dozens.
 const REPORTED_SIZES: usize = 24;

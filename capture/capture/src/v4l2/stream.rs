@@ -18,10 +18,11 @@ use super::{
     sequence::Sequence,
     sys::{ActiveFormat, SizeRange},
 };
-use crate::{
-    BufferPool, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, SourceHealth,
-    stamps::Stamps,
-};
+use crate::camera_options::{CameraIdentity, CameraOptions};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::pool::BufferPool;
+use crate::source::{CameraSource, SourceHealth};
+use crate::stamps::Stamps;
 
 /// Periods without a frame after which a streaming camera counts as silent, but never less than [`SILENT_AFTER`].
 const SILENT_PERIODS: f64 = 5.0;

@@ -19,9 +19,9 @@ use super::{
     stream::{CameraDevice, Host, Stream},
     sys::{ActiveFormat, ControlRange, SizeRange},
 };
-use crate::{
-    CameraControls, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, FormatChoice,
-};
+use crate::camera_options::{CameraControls, CameraIdentity, CameraOptions, FormatChoice};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::source::CameraSource;
 
 const POLL: Duration = Duration::from_millis(200);
 const MS: i64 = 1_000_000;

@@ -2,7 +2,7 @@
 
 use flyrig_types::PoseTrack;
 
-use crate::SimError;
+use crate::error::SimError;
 use crate::motion::curve::smooth_above;
 use crate::motion::posture::Posture;
 use crate::motion::puppet::Puppet;

@@ -8,7 +8,7 @@ mod lower;
 mod turn;
 mod walk;
 
-use crate::MotionKind;
+use crate::config::MotionKind;
 use crate::motion::puppet::Puppet;
 
 pub(crate) use clip::Clip;

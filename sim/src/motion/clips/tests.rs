@@ -4,10 +4,10 @@ use flyrig_body::skin_mesh;
 use glam::{DVec3, Vec3};
 
 use super::*;
+use crate::config::{Build, SimConfig};
 use crate::motion::choice::pass_by;
 use crate::person::assembly::Person;
 use crate::person::look::PersonLook;
-use crate::{Build, SimConfig};
 
 const ALL: [MotionKind; 10] = [
     MotionKind::Turn,
