@@ -1,12 +1,12 @@
-// Puts the people's samples before the plate, lit by the lamps of the moment and shaded by the people, and sums
+// Composes the people's samples with the plate, relit by the lamps of the moment and shaded by the people, and sums
 // sub-frames in linear light. Prepended: constants, view.wgsl and light.wgsl.
 
 @group(0) @binding(0) var<storage, read> view: View;
 @group(0) @binding(1) var<storage, read> light: Light;
-// Light of people; alpha is 1 for the person, a half for others, 0 where the room is seen.
+// Light of people; alpha is 1 for the person, a half for others, 0 for the room.
 @group(1) @binding(0) var samples: texture_multisampled_2d<f32>;
 @group(1) @binding(1) var room_depth: texture_depth_multisampled_2d;
-// See plate.wgsl; a layer after the other.
+// Packed light (see plate.wgsl), layer by layer.
 @group(1) @binding(2) var<storage, read> plate: array<u32>;
 // Ideal image plane at the corners of cells of pixels.
 @group(1) @binding(3) var<storage, read> directions: array<vec2<f32>>;
@@ -27,7 +27,7 @@ fn depth_m(device: f32) -> f32 {
     return NEAR_M / max(1.0 - device, 1e-6);
 }
 
-// What is the same for all pixels, loaded once before any branch.
+// Values common to all pixels, loaded once before any branch.
 struct Same {
     camera_from_world: mat4x4<f32>,
     lens: vec3<f32>,
@@ -39,7 +39,7 @@ struct Same {
     near: bool,
 }
 
-// World position of what the room shows at a pixel.
+// World position of the room's surface at a pixel.
 fn room_point(same: Same, at: vec2<u32>, z: f32) -> vec3<f32> {
     let cell = (vec2<f32>(at) + 0.5) / same.grid.y;
     let low = floor(cell);
@@ -54,7 +54,7 @@ fn room_point(same: Same, at: vec2<u32>, z: f32) -> vec3<f32> {
     return transpose(rotation) * (camera - m[3].xyz);
 }
 
-// How much of the sky people leave free over a point of the floor.
+// Fraction of the sky that people leave free over a point of the floor.
 fn floor_openness(world: vec3<f32>, count: u32) -> f32 {
     var open = 1.0;
     for (var i = 0u; i < count; i++) {
@@ -117,7 +117,7 @@ fn room_light(same: Same, at: vec2<u32>, row: Row, turn: f32) -> vec3<f32> {
     return sum;
 }
 
-// A neighbour that shows nothing but the surface at this depth, or the pixel itself.
+// A neighbour that shows only the surface at this depth, or the pixel itself.
 fn like_minded(at: vec2<u32>, device: f32) -> vec2<u32> {
     let size = vec2<i32>(view.size_px);
     let many = i32(textureNumSamples(room_depth));
@@ -169,7 +169,7 @@ fn compose(@builtin(global_invocation_id) id: vec3<u32>) {
             free += 1;
         }
     }
-    // Each free sample shows its own surface: the plate's mean would let what the person hides shine through.
+    // Each uncovered sample shows its own surface: the plate's mean would let hidden surfaces shine through.
     var pixel = array(id.xy, id.xy);
     var count = array(f32(free), 0.0);
     let looked_at = select(0, i32(textureNumSamples(samples)), free > 0 && free < SAMPLES);

@@ -1,8 +1,8 @@
-// The lamps, their shadows, and what people take of the room's light. Prepended: `LAMPS`, `MAX_LAMPS`, `MAX_CAPSULES`,
+// Lamps, their shadows, and occlusion of the ambient light by people. Prepended: `LAMPS`, `MAX_LAMPS`, `MAX_CAPSULES`,
 // `LAMP_NEAR_M`.
 
 struct Lamp {
-    // The lamp's image of the room, and of the people alone.
+    // Transforms of the shadow maps of the room, and of the people alone.
     room_from_world: mat4x4<f32>,
     people_from_world: mat4x4<f32>,
     // World position, metres; w: the lamp's width, metres.
@@ -11,7 +11,7 @@ struct Lamp {
     axis: vec4<f32>,
     // Light times squared metres; w: cosine of the angle where its light begins to fall.
     color: vec4<f32>,
-    // Tangents of half the angle of the two images.
+    // Tangents of half the angle of the two shadow maps.
     tangents: vec4<f32>,
 }
 
@@ -30,11 +30,11 @@ struct Bound {
 
 struct Light {
     lamps: array<Lamp, MAX_LAMPS>,
-    // Shares of the light from everywhere that come from above and below.
+    // Fractions of the ambient light from above and below.
     sky: vec4<f32>,
     ground: vec4<f32>,
     people: array<Bound, 2>,
-    // Number of capsules, 1 where something glows by itself, nothing, taps of a shadow.
+    // Number of capsules, 1 if an object glows by itself, unused, samples of a shadow.
     counts: vec4<u32>,
     capsules: array<Capsule, MAX_CAPSULES>,
 }
@@ -47,7 +47,7 @@ fn hemisphere(normal: vec3<f32>, sky: vec3<f32>, ground: vec3<f32>) -> vec3<f32>
     return mix(ground, sky, normal.z * 0.5 + 0.5);
 }
 
-// What a surface facing a lamp would get at a point, without shadows.
+// Light of a lamp on a surface that faces it, without shadows.
 fn arriving(lamp: Lamp, world: vec3<f32>) -> vec3<f32> {
     let away = world - lamp.place.xyz;
     let d2 = max(dot(away, away), 0.04);
@@ -55,12 +55,12 @@ fn arriving(lamp: Lamp, world: vec3<f32>) -> vec3<f32> {
     return lamp.color.rgb / d2 * smoothstep(lamp.axis.w, lamp.color.w, angle);
 }
 
-// How far the light of a wide lamp reaches around a corner.
+// Reach of a wide lamp's light around a corner.
 fn wrap_of(lamp: Lamp, world: vec3<f32>) -> f32 {
     return min(0.5 * lamp.place.w / distance(world, lamp.place.xyz), 0.5);
 }
 
-// Share of a wide lamp's light by the cosine of the angle to its middle.
+// Fraction of a wide lamp's light by the cosine of the angle to its centre.
 fn facing_share(wrap: f32, cosine: f32) -> f32 {
     return max((cosine + wrap) / (1.0 + wrap), 0.0);
 }
@@ -72,8 +72,8 @@ fn lamp_depth(z: f32) -> f32 {
 // Turns by the golden angle, whose multiples fill a circle evenly.
 const GOLDEN = mat2x2<f32>(vec2(-0.7373688, 0.6754903), vec2(-0.6754903, -0.7373688));
 
-// Share of a lamp's light that passes, at a point of its image: with a penumbra as wide as the lamp and the distance
-// to what is in its way make it.
+// Fraction of a lamp's light that reaches a point of its shadow map: the width of the penumbra follows from the lamp's
+// width and the distance of the occluder.
 fn soft_share(
     map: texture_depth_2d_array,
     compare: sampler_comparison,
@@ -92,7 +92,7 @@ fn soft_share(
     let at = clip.xy / z * vec2(0.5, -0.5) + 0.5;
     let pixels = vec2<f32>(textureDimensions(map));
     let depth = lamp_depth(z - bias_m);
-    // What lies in the way, on average: looked for as wide as something half-way would be.
+    // Mean depth of the occluders, searched over the width of the penumbra of one half-way.
     let search = clamp(0.5 * size_m / (2.0 * z * tangent), 2.0 / pixels.x, 0.1);
     let start = vec2(cos(turn), sin(turn));
     var way = 0.0;

@@ -4,7 +4,7 @@
 @group(0) @binding(1) var<storage, read> light: Light;
 // All points at the first key, at the second, and so on.
 @group(1) @binding(0) var<storage, read> points: array<Point>;
-// Share of each lamp's light that furniture lets through, see shade.wgsl.
+// Fraction of each lamp's light that furniture lets through, see shade.wgsl.
 @group(1) @binding(1) var<storage, read> shares: array<vec4<f32>>;
 @group(2) @binding(0) var textures: texture_2d_array<f32>;
 @group(2) @binding(1) var smooth_sampler: sampler;
@@ -13,7 +13,7 @@
 
 struct Vertex {
     @builtin(vertex_index) index: u32,
-    // uv, layer, part + 1 (0: somebody else)
+    // uv, layer, part + 1 (0: another person)
     @location(0) paint: vec4<f32>,
     // Canonical position of the carrying body point
     @location(1) truth: vec4<f32>,
@@ -54,7 +54,7 @@ fn vs_shadow(vertex: Vertex, @builtin(instance_index) lamp: u32) -> @builtin(pos
     return light.lamps[lamp].people_from_world * vec4(place, 1.0);
 }
 
-// Of one lamp: diffuse light with the ratio of gloss to it, and where to look its shadow up (x, y and w).
+// Contribution of one lamp: diffuse light with the ratio of gloss to it, and shadow map coordinates (x, y and w).
 struct Beam {
     light: vec4<f32>,
     place: vec3<f32>,
@@ -75,7 +75,7 @@ struct Lit {
     @builtin(position) clip: vec4<f32>,
     // uv, alpha
     @location(0) @interpolate(perspective, centroid) paint: vec3<f32>,
-    // Light from everywhere, how much of it shines
+    // Ambient light, its glossy fraction
     @location(1) @interpolate(perspective, centroid) around: vec4<f32>,
     @location(2) @interpolate(perspective, centroid) light_a: vec4<f32>,
     @location(3) @interpolate(perspective, centroid) light_b: vec4<f32>,
@@ -83,7 +83,7 @@ struct Lit {
     @location(5) @interpolate(perspective, centroid) place_a: vec3<f32>,
     @location(6) @interpolate(perspective, centroid) place_b: vec3<f32>,
     @location(7) @interpolate(perspective, centroid) place_c: vec3<f32>,
-    // Of the textures. Rounded down in the fragment instead, NVIDIA's driver took every second layer's neighbour: it rounds the index
+    // Layer of the textures. Rounded down in the fragment instead, NVIDIA's driver took every second layer's neighbour: it rounds the index
     // once more, to even.
     @location(8) @interpolate(flat) layer: u32,
 }
@@ -126,7 +126,7 @@ fn vs_lit(vertex: Vertex) -> Lit {
     return out;
 }
 
-// Share of a lamp's light that reaches a point: one filtered tap of its image, whose texels are as wide as the edges of
+// Fraction of a lamp's light that reaches a point: one filtered sample of its map, whose texels are as wide as the edges of
 // soft shadows on a body.
 fn reaching(l: u32, place: vec3<f32>) -> f32 {
     let at = place.xy / place.z * vec2(0.5, -0.5) + 0.5;
@@ -139,7 +139,7 @@ fn fs_lit(in: Lit, @builtin(front_facing) front: bool) -> @location(0) vec4<f32>
     painted = vec4(painted.rgb * painted.rgb, painted.a);
     let gloss = (1.0 - painted.a) * 0.8;
     var sum = in.around.rgb * (painted.rgb + gloss * in.around.a);
-    // The inner side of a hem has the light from everywhere alone.
+    // The inner side of a hem has ambient light only.
     if (front) {
         let a = in.light_a.rgb * reaching(0u, in.place_a);
         sum += painted.rgb * a + gloss * a * in.light_a.a;

@@ -1,10 +1,10 @@
-// Keeps a drawn layer of a plate: the mean of each pixel's samples. Prepended: constants and view.wgsl.
+// Stores a rendered layer of a plate: the mean of each pixel's samples. Prepended: constants and view.wgsl.
 
 @group(0) @binding(0) var<storage, read> view: View;
 @group(1) @binding(0) var samples: texture_multisampled_2d<f32>;
 @group(1) @binding(1) var<storage, read_write> plate: array<u32>;
 
-// Square roots in 11, 11 and 10 bits: even steps to the eye, up to `PLATE_WHITE`.
+// Square roots in 11, 11 and 10 bits: perceptually even steps, up to `PLATE_WHITE`.
 fn pack_light(light: vec3<f32>) -> u32 {
     let root = sqrt(clamp(light / PLATE_WHITE, vec3(0.0), vec3(1.0)));
     let q = vec3<u32>(round(root * vec3(2047.0, 2047.0, 1023.0)));

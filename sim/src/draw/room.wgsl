@@ -15,7 +15,7 @@ struct Vertex {
     @location(2) paint: vec4<f32>,
     // Linear factor on the texture, gloss
     @location(3) tint: vec4<f32>,
-    // Light of its own, and which layer of the plate it belongs to
+    // Emitted light, and the layer of the plate that it belongs to
     @location(4) glow: vec2<f32>,
 }
 
@@ -46,11 +46,11 @@ fn vs_room_shadow(vertex: Vertex, @builtin(instance_index) lamp: u32) -> @builti
     return light.lamps[lamp].room_from_world * vec4(vertex.position, 1.0);
 }
 
-// What the layer `view.moment.w` of the plate adds: 0 the light from everywhere, then a lamp each, then what glows
-// at all times.
+// Light of the plate's layer `view.moment.w`: 0 is ambient light, then one lamp per layer, then objects that always
+// glow.
 @fragment
 fn fs_layer(in: Fragment, @builtin(front_facing) front: bool) -> @location(0) vec4<f32> {
-    // Four places of the pixel: floors are seen at flat angles.
+    // Four samples of the pixel: floors are seen at grazing angles.
     let dx = dpdx(in.uv) * 0.5;
     let dy = dpdy(in.uv) * 0.5;
     var painted = vec3(0.0);

@@ -1,5 +1,5 @@
-// How much of each lamp's light furniture lets through to the points of a person. Prepended: constants, view.wgsl,
-// light.wgsl and points.wgsl.
+// Computes the fraction of each lamp's light that furniture lets through to the points of a person. Prepended:
+// constants, view.wgsl, light.wgsl and points.wgsl.
 
 @group(0) @binding(0) var<storage, read> view: View;
 @group(0) @binding(1) var<storage, read> light: Light;

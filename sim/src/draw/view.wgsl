@@ -1,6 +1,6 @@
-// One sub-frame of one camera, and how it maps points to pixels. Prepended: `NEAR_M`.
+// Sub-frame of a camera, and its projection of points to pixels. Prepended: `NEAR_M`.
 
-// The light at a row's time: each lamp's level, and the light from everywhere.
+// Light at a row's time: each lamp's level, and the ambient light.
 struct Row {
     levels: vec4<f32>,
     around: vec4<f32>,
@@ -8,7 +8,7 @@ struct Row {
 
 struct View {
     camera_from_world: mat4x4<f32>,
-    // World position of the lens's middle.
+    // World position of the lens's centre.
     eye: vec4<f32>,
     focal_px: vec2<f32>,
     center_px: vec2<f32>,
@@ -21,15 +21,15 @@ struct View {
     tangential: vec4<f32>,
     // k1 to k4 of a fisheye; else k4, k5, k6 of a rational lens.
     fisheye: vec4<f32>,
-    // xy: point on the lens in camera axes, metres; z: 1 / distance of sharpness.
+    // xy: point on the lens in camera axes, metres; z: 1 / focal distance.
     lens_point: vec4<f32>,
     // x: the middle row's seconds from the shot's instant; y: seconds from row to row; z: the middle row;
     // w: layer of the plate that is being baked.
     moment: vec4<f32>,
-    // First key's seconds from the shot's instant, keys a second, number of keys.
+    // First key's seconds from the shot's instant, keys per second, number of keys.
     keys: vec4<f32>,
-    // x: share of this sub-frame in its image; y, z: 1 for the first and for the last sub-frame;
-    // w: 1 where people are there.
+    // x: weight of this sub-frame in its image; y, z: 1 for the first and for the last sub-frame;
+    // w: 1 if people are rendered.
     sum: vec4<f32>,
     rows: array<Row>,
 }
