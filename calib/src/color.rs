@@ -5,6 +5,9 @@
 //! linear in all unknowns but the exponent, which each round linearises; the number itself is eliminated as the
 //! samples' mean. Two degrees of freedom stay open and are fixed: the mean gain of a channel is 1 (geometric), and so
 //! is the mean exponent.
+//!
+//! In a session the points are Gaussians that several cameras see. The result is a field of `flyrig_types::Camera`, which
+//! the renderer applies where images enter a session.
 
 use flyrig_types::{CameraId, ColorMatch};
 use nalgebra::{DMatrix, DVector};

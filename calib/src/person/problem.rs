@@ -1,4 +1,6 @@
 //! Least squares of cameras, time offsets and the landmarks of a moving person.
+//!
+//! All landmarks of an instant are eliminated together, since limbs join them.
 
 use flyrig_solve::{BlockProblem, Kernel, Residual, RigidMotion, skew};
 use flyrig_types::Intrinsics;

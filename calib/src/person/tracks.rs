@@ -1,4 +1,4 @@
-//! Image tracks of a person's landmarks and silhouettes, per camera.
+//! Image tracks of a person's landmarks and silhouettes, per camera, resampled at common instants.
 
 use glam::DVec2;
 
