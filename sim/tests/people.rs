@@ -7,7 +7,7 @@ mod common;
 use std::collections::HashSet;
 
 use common::{simulator, small_config};
-use flyrig_sim::{Build, SimConfig, describe_person};
+use flyrig_sim::{SimConfig, describe_person};
 
 fn of_seed(seed: u64) -> SimConfig {
     SimConfig { seed, ..SimConfig::default() }

@@ -13,8 +13,7 @@ use std::{
 };
 
 use flyrig_capture::{CaptureError, CaptureErrorKind, CaptureThreads, SourceOpener};
-use flyrig_types::Frame;
-use scripted::{Gate, dropped, flows, healthy, live, source, stats, until};
+use scripted::{Gate, Step, dropped, flows, healthy, live, source, stats, until};
 
 #[test]
 fn a_camera_that_is_missing_at_the_start_joins_when_it_comes() {

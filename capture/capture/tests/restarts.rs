@@ -14,7 +14,7 @@ use std::{
 
 use flyrig_capture::{CaptureError, CaptureErrorKind, CaptureThreads, FrameStage, Pacing, SourceOpener, ThreadsConfig};
 use flyrig_types::{CameraId, Frame};
-use scripted::{dropped, flows, frames, healthy, live, source, stats, until};
+use scripted::{Step, dropped, flows, frames, healthy, live, source, stats, until};
 
 #[test]
 fn a_source_that_panics_is_opened_anew_up_to_a_cap() {

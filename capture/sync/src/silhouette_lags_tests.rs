@@ -200,14 +200,14 @@ fn too_little_and_senseless_input_is_borne() {
     let mut odd = SilhouetteTrack::new(&cameras[0]);
     odd.add(5, &Mask::new(width, height, vec![0; (width * height) as usize]).unwrap());
     odd.add(5, &Mask::new(height, width, vec![255; (width * height) as usize]).unwrap());
-    assert!(odd.is_empty());
+    assert!(odd.masks() == 0);
     odd.add(5, &good);
     odd.add(5, &good);
     odd.add(4, &good);
-    assert_eq!(odd.len(), 1);
+    assert_eq!(odd.masks(), 1);
     // All of the image: every corner is cut.
     odd.add(i64::MAX, &Mask::new(width, height, vec![255; (width * height) as usize]).unwrap());
-    assert_eq!(odd.len(), 2);
+    assert_eq!(odd.masks(), 2);
     let mut blind = SilhouetteTrack::new(&Camera {
         intrinsics: Intrinsics { focal_px: DVec2::splat(f64::NAN), ..cameras[0].intrinsics },
         ..cameras[0].clone()

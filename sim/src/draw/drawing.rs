@@ -389,12 +389,13 @@ impl Drawing {
 #[cfg(test)]
 mod tests {
     use flyrig_gpu::AdapterChoice;
-    use flyrig_types::{CameraId, Intrinsics, Isometry, Lens};
+    use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Lens};
     use glam::{DVec2, DVec3};
 
     use glam::Vec3;
 
     use super::*;
+    use crate::camera::optics::OpticsConfig;
     use crate::room::scene_mesh::{Coat, SceneMesh};
     use crate::room::surfaces::Surface;
     use crate::texture::TextureImage;

@@ -1,6 +1,7 @@
 //! Invariants of all clips.
 
 use flyrig_body::skin_mesh;
+use flyrig_types::PoseTrack;
 use glam::{DVec3, Vec3};
 
 use super::*;
