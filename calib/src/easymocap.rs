@@ -122,7 +122,7 @@ fn read_intrinsics(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>)
     let entry = Entry::new(file, id, "K");
     let k = entry.matrix3(&entry.required("calibrate this camera")?)?.transpose();
     let [[fx, skew, cx], [zero_a, fy, cy], last] = k.to_cols_array_2d();
-    // A skew of a hundredth of a pixel moves nothing that anybody could measure.
+    // A skew of a hundredth of a pixel has no measurable effect.
     if skew.abs() > 0.01 || zero_a.abs() > 1e-9 || DVec3::from(last) != DVec3::Z {
         return Err(entry.wrong(
             format!("has skew {skew} or an unusual shape, expected [fx 0 cx; 0 fy cy; 0 0 1]"),

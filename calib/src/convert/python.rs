@@ -61,7 +61,7 @@ fn string(quote: char, rest: &mut impl Iterator<Item = char>, out: &mut String) 
             '\\' => match rest.next() {
                 Some(next @ ('"' | '\\' | '/' | 'n' | 't' | 'r')) => out.extend(['\\', next]),
                 Some(next) if next == quote => out.push(next),
-                // Other escapes stand in bytes that nobody reads.
+                // Other escapes occur only in bytes that are not read.
                 _ => {}
             },
             c if c == quote => break,

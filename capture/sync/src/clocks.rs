@@ -225,7 +225,7 @@ impl ClockAligner {
         self.arrivals += 1;
         let period = self.beat(slot);
         let is_master = slot == self.master;
-        // The newest instant that is known without this camera. A master that is silent holds nobody back.
+        // The newest instant known without this camera. A silent master delays no other camera.
         let of_master = self.instants.back().copied().filter(|_| !is_master && !self.is_silent(self.master));
         let now = of_master.or_else(|| self.others_now(slot));
         let (arrivals, instants) = (self.arrivals, &self.instants);

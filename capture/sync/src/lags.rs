@@ -149,7 +149,7 @@ pub fn estimate_lags(signals: &[MotionSignal], most_nanos: i64) -> Vec<LagEstima
             }
         }
     }
-    settled(count, &pairs)
+    accepted_offsets(count, &pairs)
         .into_iter()
         .zip(signals)
         .enumerate()
@@ -232,7 +232,7 @@ pub(crate) fn balanced(count: usize, pairs: &[PairLag]) -> Vec<Balance> {
 
 /// Returns each camera's accepted offset from the first one and the disagreement of its pairs. A pair is two cameras,
 /// the offset of the second, and the correlation there.
-fn settled(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>, f64)> {
+fn accepted_offsets(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>, f64)> {
     let linked = |a: usize, b: usize| {
         pairs.iter().any(|pair| (pair.0, pair.1) == (a.min(b), a.max(b)) && pair.3 >= LEAST_CORRELATION)
     };
@@ -311,11 +311,11 @@ mod tests {
 
     /// Returns the accepted offsets, rounded.
     fn lags(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<Option<f64>> {
-        settled(count, pairs).into_iter().map(|(lag, _)| lag.map(f64::round)).collect()
+        accepted_offsets(count, pairs).into_iter().map(|(lag, _)| lag.map(f64::round)).collect()
     }
 
     #[test]
-    fn lags_are_told_only_where_something_vouches_for_them() {
+    fn offsets_are_reported_only_where_other_pairs_support_them() {
         let known = |ms: f64| Some(ms * 1e6);
         // A loop of weak pairs that agree, and one that does not.
         let loop_of = |third: f64| [(0, 1, 5e6, 0.5), (1, 2, 7e6, 0.5), (0, 2, third, 0.5)];
@@ -326,7 +326,7 @@ mod tests {
         assert_eq!(lags(4, &beside), [known(0.0), None, None, None]);
         // A chain of weak pairs: nothing could contradict them.
         assert_eq!(lags(3, &[(0, 1, 5e6, 0.5), (1, 2, 7e6, 0.5)]), [known(0.0), None, None]);
-        // Strong pairs need nobody.
+        // Strong pairs need no support.
         assert_eq!(lags(3, &[(0, 1, 5e6, 0.9), (1, 2, 7e6, 0.8)]), [known(0.0), known(5.0), known(12.0)]);
         // A strong pair that hangs on a weak one.
         assert_eq!(lags(3, &[(0, 1, 5e6, 0.5), (1, 2, 7e6, 0.9)]), [known(0.0), None, None]);
@@ -378,7 +378,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_sees_nothing_of_it_is_told() {
+    fn a_camera_without_the_motion_gets_no_offset() {
         let mut signals: Vec<MotionSignal> = (0..2).map(|camera| signal(5, camera, 0, 12)).collect();
         let mut still = MotionSignal::new("wall".into());
         for n in 0..360 {

@@ -115,7 +115,7 @@ pub fn estimate_silhouette_lags(tracks: &[SilhouetteTrack], most_nanos: i64) -> 
         .map(|slot| {
             let of_times = match (even[slot].lag, odd[slot].lag) {
                 (Some(even), Some(odd)) => (even - odd).abs() / 2.0,
-                // Half of the time tells nothing, or of a lag beyond those that are tried.
+                // One half is uninformative, or its offset lies beyond the tested ones.
                 _ => f64::INFINITY,
             };
             let error = errors[slot].max(of_times);

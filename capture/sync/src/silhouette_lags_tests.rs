@@ -219,7 +219,7 @@ fn too_little_and_senseless_input_is_borne() {
 }
 
 #[test]
-fn regular_movement_has_more_than_one_lag_and_none_is_told() {
+fn regular_movement_has_more_than_one_lag_and_none_is_reported() {
     let cameras = ring(2);
     let rays: Vec<Vec<DVec3>> = cameras.iter().map(rays).collect();
     let told = |rate: f64| {

@@ -217,7 +217,7 @@ impl Synchronizer {
         let near = |suspect: &Arc<Frame>| suspect.capture_nanos.abs_diff(nanos) <= plausible;
         let own = self.cameras[slot].suspect.as_ref().is_some_and(|suspect| suspect.capture_nanos < nanos);
         if !far_ahead {
-            // Its clock tells an ordinary time again.
+            // Its clock is plausible again.
             let before = self.cameras[slot].suspect.take();
             self.counts.dropped_frames[slot].wild += u64::from(before.is_some());
         } else if own || self.suspects().any(near) {
@@ -244,7 +244,7 @@ impl Synchronizer {
         let nanos = frame.capture_nanos;
         self.first_nanos.get_or_insert(nanos);
         for other in &mut self.cameras {
-            // Of the same instant, it tells nothing.
+            // It belongs to the same instant and adds no information.
             let later = other.latest.is_none_or(|latest| nanos > latest && nanos.abs_diff(latest) > self.window);
             other.missed[slot] += u64::from(later);
         }

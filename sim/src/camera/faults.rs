@@ -281,7 +281,7 @@ impl FaultScript {
     }
 
     /// Overwrites the rows of an RGB image below `sound_share` of its height with noise.
-    pub(crate) fn spoil(&self, rgb: &mut [u8], sound_share: f64, index: u64) {
+    pub(crate) fn corrupt(&self, rgb: &mut [u8], sound_share: f64, index: u64) {
         let from = (rgb.len() as f64 * sound_share) as usize;
         let key = hash(hash(self.seed, 3), index);
         for (place, byte) in (0u64..).zip(rgb.iter_mut().skip(from)) {

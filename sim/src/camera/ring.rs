@@ -42,7 +42,7 @@ pub fn camera_ring(config: &SimConfig) -> Result<Rig, SimError> {
             let turn = Isometry::new(DQuat::from_euler(EulerRot::ZYX, turn.z, turn.y, turn.x), DVec3::ZERO);
             let mut intrinsics = intrinsics;
             intrinsics.focal_px *= 1.0 + draw(6) * ring.focal_jitter_percent * 0.01;
-            unfolded(config, &intrinsics)?;
+            check_lens(config, &intrinsics)?;
             Ok(Camera {
                 time_offset_nanos: 0,
                 color: Default::default(),
@@ -58,7 +58,7 @@ pub fn camera_ring(config: &SimConfig) -> Result<Rig, SimError> {
 }
 
 /// Rejects a lens that has no direction for a corner of the image.
-fn unfolded(config: &SimConfig, intrinsics: &Intrinsics) -> Result<(), SimError> {
+fn check_lens(config: &SimConfig, intrinsics: &Intrinsics) -> Result<(), SimError> {
     let ring = &config.cameras;
     let (width, height) = (f64::from(config.width), f64::from(config.height));
     // A margin of a grid's cell.

@@ -156,7 +156,7 @@ impl SimSource {
     fn taken(&self, simulator: &mut Simulator, index: u64, plan: FramePlan) -> Result<Frame, CaptureError> {
         let taken = simulator
             .capture_with(&shot(&plan, self.slot))
-            .and_then(|(image, mask)| Ok((spoilt(simulator, &plan, index, image)?, mask)));
+            .and_then(|(image, mask)| Ok((corrupted(simulator, &plan, index, image)?, mask)));
         let (image, mask) = taken.map_err(|error| {
             let kind = match error {
                 SimError::Gpu(_) => CaptureErrorKind::Disconnected,
@@ -181,9 +181,9 @@ pub(crate) fn shot(plan: &FramePlan, slot: usize) -> Shot {
 }
 
 /// Returns an image with noise over its lower part, where the fault script says so.
-pub(crate) fn spoilt(simulator: &Simulator, plan: &FramePlan, index: u64, image: Image) -> Result<Image, SimError> {
+pub(crate) fn corrupted(simulator: &Simulator, plan: &FramePlan, index: u64, image: Image) -> Result<Image, SimError> {
     let Some(share) = plan.sound_share else { return Ok(image) };
     let mut rgb = image.bytes().to_vec();
-    simulator.config().faults.spoil(&mut rgb, share, index);
+    simulator.config().faults.corrupt(&mut rgb, share, index);
     Ok(Image::new(image.width(), image.height(), image.format(), rgb)?)
 }

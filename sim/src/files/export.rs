@@ -11,7 +11,7 @@ use image::{ExtendedColorType, ImageEncoder as _};
 use serde_json::json;
 
 use crate::camera::faults::{Delivery, FramePlan};
-use crate::camera::source::{shot, spoilt};
+use crate::camera::source::{corrupted, shot};
 use crate::error::SimError;
 use crate::files::truth_file::write_truth;
 use crate::simulator::Simulator;
@@ -188,7 +188,7 @@ impl Folder {
         } else {
             simulator.capture_with(&shot)?
         };
-        let picture = spoilt(simulator, plan, frame, picture)?;
+        let picture = corrupted(simulator, plan, frame, picture)?;
         let size = [picture.width(), picture.height()];
         self.png(&format!("images/{camera}/{frame:06}.png"), picture.bytes(), size, ExtendedColorType::Rgb8)?;
         self.png(&format!("mask/{camera}/{frame:06}.png"), mask.coverage(), size, ExtendedColorType::L8)?;

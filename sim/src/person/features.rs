@@ -35,7 +35,7 @@ pub(crate) struct Features {
 
 impl Features {
     /// Draws features from a seed's numbers; most people are close to the average in most of them.
-    pub(crate) fn drawn(dice: &mut StdRng) -> Self {
+    pub(crate) fn random(dice: &mut StdRng) -> Self {
         let mut one = || 0.65 * (dice.random_range(-1.0f32..1.0) + dice.random_range(-1.0f32..1.0));
         Self {
             nose_wide: one(),
@@ -105,7 +105,7 @@ mod tests {
     #[test]
     fn faces_differ_by_millimetres_and_stay_symmetric_and_smooth() {
         let mut dice = StdRng::seed_from_u64(1);
-        let all: Vec<Features> = (0..50).map(|_| Features::drawn(&mut dice)).collect();
+        let all: Vec<Features> = (0..50).map(|_| Features::random(&mut dice)).collect();
         let tip = Vec3::new(0.0, 1.516, 0.156);
         assert!(all.iter().any(|f| f.moved(tip).z > 0.002) && all.iter().any(|f| f.moved(tip).z < -0.002));
         for features in &all {

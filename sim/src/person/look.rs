@@ -131,7 +131,7 @@ impl PersonLook {
             bottom,
             outer,
             shoes: footwear(&mut dice),
-            features: Features::drawn(&mut dice.0),
+            features: Features::random(&mut dice.0),
         }
     }
 }

@@ -17,7 +17,7 @@ pub(crate) fn passer_by(config: &SimConfig) -> Result<Actor, SimError> {
         ..config.clone()
     };
     let mut actor = Actor::new(&own)?;
-    // Turns round inside of the ring, lest a camera stands in its way.
+    // Turns round inside the ring, so that no camera is in the way.
     actor.track = choice::pass_by(&actor.person, seed, 0.75 * config.cameras.radius_m)?;
     Ok(actor)
 }

@@ -153,7 +153,7 @@ impl<O: Opener> Watched<O> {
                 return Err(CaptureError::general(CaptureErrorKind::Disconnected, "is not open"));
             };
             if !std::mem::replace(&mut session.was_asked, true) {
-                // What was overtaken before anybody asked is no loss.
+                // Frames overtaken before the first request are no loss.
                 session.overtaken = session.line.events.dropped();
             }
             let left = deadline.saturating_duration_since(Instant::now());
@@ -204,14 +204,14 @@ impl<O: Opener> Watched<O> {
         }
         let image = Image::new(width, height, shot.format, bytes).map_err(|error| corrupt(error.to_string()))?;
         let half_period = (0.5e9 / self.expected.fps.clamp(0.1, 1e6)) as i64;
-        let (stamp, source, told) = match shot.stamp_nanos {
+        let (stamp, source, note) = match shot.stamp_nanos {
             Some(stamp) => (stamp, StampSource::EndOfFrame, ", stamped by the system"),
             None => (0, StampSource::Other, ", stamped at arrival less half a period"),
         };
         let half = if source == StampSource::Other { half_period } else { 0 };
         let capture = self.stamps.capture_nanos(stamp, source, shot.arrival_nanos, half);
         self.health.stamps_replaced = self.stamps.replaced;
-        self.report_mode(line, told);
+        self.report_mode(line, note);
         Ok(Frame {
             camera: self.camera.clone(),
             sequence: number,
@@ -234,7 +234,7 @@ impl<O: Opener> Watched<O> {
             self.session = None;
             return disconnected(format!("gave no frame for {} ms; opening it again", silent_after.as_millis()));
         }
-        // Asked again after a while, and told again.
+        // The next silence is reported again.
         (session.is_stuck, session.is_flowing, session.heard) = (true, false, Instant::now());
         disconnected(
             "hangs in its driver, and so does the attempt to open it again; no other is made until one of them returns: \

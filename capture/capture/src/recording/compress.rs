@@ -73,7 +73,7 @@ impl Compressor {
         let Frame { sequence, capture_nanos, exposure_nanos, .. } = *frame;
         let copy = Frame { camera: self.camera.clone(), sequence, capture_nanos, exposure_nanos, image, mask: None };
         if self.keep_all {
-            // Closed when the thread has ended, which it has told.
+            // Closed when the thread has ended, which it has logged.
             let _ = self.queue.push_wait(copy);
         } else if let Ok(Some(_)) = self.queue.push(copy) {
             let mut state = self.outlet.shared.lock();

@@ -125,7 +125,7 @@ impl Outlet {
         match sender.try_send(item) {
             Ok(()) => {}
             Err(TrySendError::Full(_)) => too_slow(),
-            // The thread has told why it ended.
+            // The thread has logged why it ended.
             Err(TrySendError::Disconnected(_)) => self.sender = None,
         }
     }

@@ -147,7 +147,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_reads_back_otherwise_is_told() {
+    fn a_value_that_reads_back_differently_is_reported() {
         let controls = CameraControls { exposure_secs: Some(0.0083), ..CameraControls::default() };
         let (exposure, warnings) = apply(&controls, &mut webcam()).unwrap();
         assert_eq!(exposure, Some(8_000_000));

@@ -110,7 +110,7 @@ fn describe(roots: &Roots, name: &str, links: &[(String, String)]) -> CameraNode
         usb: usb_device.map(|usb| UsbPlace {
             bus: number(&usb.join("busnum")).unwrap_or(0),
             port: usb.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
-            // Low speed is told as 1.5.
+            // Low speed is reported as 1.5.
             speed_mbit: line(&usb.join("speed"))
                 .and_then(|text| text.parse::<f64>().ok())
                 .map_or(0, |speed| speed as u32),

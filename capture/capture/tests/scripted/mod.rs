@@ -82,7 +82,7 @@ impl CameraSource for Script {
                 return Err(CaptureError::new(&self.camera, CaptureErrorKind::Timeout, "late"));
             }
         }
-        // A camera of a thousand frames a second.
+        // A camera of a thousand frames per second.
         std::thread::sleep(Duration::from_millis(1));
         Ok(Frame {
             camera: self.camera.clone(),

@@ -122,7 +122,7 @@ impl BufferDevice for Device {
         let deadline = Instant::now().checked_add(timeout);
         loop {
             let left = deadline.map_or(timeout, |deadline| deadline.saturating_duration_since(Instant::now()));
-            // Rounded up, lest the last millisecond is spent turning.
+            // Rounded up, so that the last millisecond is not spent polling.
             let millis = i32::try_from(left.as_micros().div_ceil(1000)).unwrap_or(i32::MAX);
             let mut poll = libc::pollfd { fd: self.file.as_raw_fd(), events: libc::POLLIN, revents: 0 };
             // SAFETY: one pollfd of ours.
