@@ -84,10 +84,11 @@ pub struct NokhwaOptions {
 /// one per camera, so that a camera never has more than two threads.
 ///
 /// The capture time is the system's timestamp where there is one, otherwise the arrival minus half a period, which is
-/// accurate to about half a frame; [`SourceHealth::mode`] reports which applies. The system does not document the
-/// instant that its timestamp refers to: it may be off by exposure and readout, which `lag_secs` corrects. nokhwa has
-/// no sequence numbers: frames are counted on arrival, so that losses in the driver are not detected. Exposure and
-/// other controls stay as the camera has them. Padded rows cannot be distinguished and look sheared.
+/// accurate to about half a frame; [`SourceHealth::mode`](crate::SourceHealth::mode) reports which applies. The system
+/// does not document the instant that its timestamp refers to: it may be off by exposure and readout, which `lag_secs`
+/// corrects. nokhwa has no sequence numbers: frames are counted on arrival, so that losses in the driver are not
+/// detected. Exposure and other controls stay as the camera has them. Padded rows cannot be distinguished and look
+/// sheared.
 #[derive(Debug)]
 pub struct NokhwaCamera(Watched<System>);
 
