@@ -1,4 +1,5 @@
-//! Calibrates the extrinsic take of a caliscope project from its own corners, and compares with its published array.
+//! Calibrates the extrinsic take of a caliscope project from its own corners and compares the result with its published
+//! array.
 //!
 //!     cargo run --release -p flyrig-calib --example caliscope -- PROJECT
 //!

@@ -1,9 +1,10 @@
-//! Errors of matched colours against the sensors of a simulation.
+//! Prints the errors of matched colours against the sensors of a simulation.
 //!
 //!     cargo run --release -p flyrig-calib --example color_errors -- SIM.toml CALIBRATION
 //!
-//! SIM.toml has one table of `sim.sensors` a camera; CALIBRATION is the folder that `flyrig calibrate color` wrote. For light of three
-//! brightnesses and each channel, prints how far each camera's light lies from the geometric mean of all, before and after correction.
+//! SIM.toml has one table of `sim.sensors` per camera; CALIBRATION is the folder written by `flyrig calibrate color`.
+//! For light of three intensities and each channel, prints the deviation of each camera's light from the geometric mean
+//! of all, before and after correction.
 
 use std::{error::Error, path::Path};
 
@@ -11,7 +12,7 @@ use flyrig_calib::load_calibration;
 use flyrig_types::ColorMatch;
 
 const LIGHTS: [f64; 3] = [0.05, 0.15, 0.4];
-/// Squares of distances from the middle, over half the diagonal.
+/// Squared distances from the centre, relative to half the diagonal.
 const PLACES: [f64; 3] = [0.02, 0.2, 0.5];
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -46,7 +47,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// sRGB value, 0..=1, that a simulated sensor without noise gives for light.
+/// Returns the sRGB value, in 0..=1, of a noiseless simulated sensor for an intensity.
 fn code(sensor: &toml::Value, light: f64, channel: usize, r2: f64) -> f64 {
     let number = |value: &toml::Value| value.as_float().or(value.as_integer().map(|i| i as f64));
     let of = |key: &str, default: f64| sensor.get(key).and_then(number).unwrap_or(default);

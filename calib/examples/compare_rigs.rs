@@ -1,5 +1,5 @@
-//! Errors of calibrations whose truth is known: `cargo run --release -p flyrig-calib --example compare_rigs -- TRUTH FOUND...`, folders
-//! of calibrations.
+//! Prints the errors of calibrations against a known truth: `cargo run --release -p flyrig-calib --example compare_rigs
+//! -- TRUTH FOUND...`, folders of calibrations.
 
 use std::{error::Error, path::Path};
 

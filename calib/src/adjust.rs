@@ -1,4 +1,5 @@
-//! Rounds of bundle adjustment: noise, movement of the boards, and wrong views are estimated in turn with the unknowns.
+//! Rounds of bundle adjustment, in which noise, board velocities and outlier views are estimated in turn with the
+//! unknowns.
 
 use flyrig_solve::{Convergence, RigidMotion, block_covariance, log_rotation, median, minimize_blocks};
 use glam::{DVec2, DVec3};
@@ -6,13 +7,13 @@ use nalgebra::DMatrix;
 
 use crate::bundle::{BoardMotion, BoardShot, Bundle, Estimate, Free, seconds};
 
-/// Rounds of estimating noise and movement.
+/// Rounds of estimating noise and velocities.
 const ROUNDS: usize = 4;
 /// Standard deviation of a corner's coordinate over the median distance of a two-dimensional normal error.
 const SIGMA_PER_MEDIAN: f64 = 1.0 / 1.177;
 /// Range of a corner's standard deviation, pixels.
 const SIGMA_PX: (f64, f64) = (0.02, 20.0);
-/// Shots farther apart say nothing about a board's velocity, seconds.
+/// Longest gap between shots from which a board's velocity is estimated, seconds.
 const LONGEST_GAP_S: f64 = 0.5;
 
 /// Result of [`adjust`].
@@ -20,9 +21,10 @@ pub(crate) struct Adjusted {
     pub estimate: Estimate,
     /// Standard deviation of a corner's coordinate, pixels.
     pub sigma_px: f64,
-    /// By shot, view, corner: the drawn corner from the seen one, pixels.
+    /// Reprojection error of each corner (projected minus observed), pixels, per shot, view and corner.
     pub off_px: Vec<Vec<Vec<DVec2>>>,
-    /// Of the free unknowns but the boards, in the order of the blocks; `None` where views leave some open.
+    /// Covariance of the free unknowns except the boards, in block order; `None` where the views leave some
+    /// undetermined.
     pub covariance: Option<DMatrix<f64>>,
 }
 
@@ -58,7 +60,7 @@ pub(crate) fn adjust(points: &[DVec3], shots: &[BoardShot], start: Estimate, fre
 }
 
 impl Adjusted {
-    /// Distances of drawn corners from seen ones, pixels.
+    /// Iterates over the reprojection errors, pixels.
     pub fn errors_px(&self) -> impl Iterator<Item = f64> {
         self.off_px.iter().flatten().flatten().map(|off| off.length())
     }
@@ -75,7 +77,8 @@ fn off_px(bundle: &Bundle<'_>, shots: &[BoardShot], at: &Estimate) -> Option<Vec
     shots.iter().enumerate().map(of_shot).collect()
 }
 
-/// Velocities of the boards from the shots before and after. Accelerations would follow the noise: they were tried.
+/// Estimates the boards' velocities from the previous and the next shot. Accelerations were tried and followed the
+/// noise.
 fn board_motions(shots: &[BoardShot], boards: &[RigidMotion]) -> Vec<BoardMotion> {
     let between = |a: usize, b: usize| {
         let secs = seconds(shots[b].nanos, shots[a].nanos);

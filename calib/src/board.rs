@@ -5,33 +5,44 @@ use std::path::Path;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use crate::CalibError;
+use crate::error::CalibError;
 
-/// Squares along a side.
+/// Allowed number of squares along a side.
 const SQUARES: std::ops::RangeInclusive<u32> = 3..=40;
-/// Side of a square, millimetres.
+/// Allowed side of a square, millimetres.
 const SQUARE_MM: std::ops::RangeInclusive<f64> = 5.0..=1000.0;
-/// Side of a marker as a share of the square's.
+/// Allowed side of a marker relative to the square's.
 const MARKER: std::ops::RangeInclusive<f64> = 0.4..=0.9;
 
-/// Print on a board.
+/// Pattern on a board.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "pattern", rename_all = "lowercase", deny_unknown_fields)]
 pub enum Pattern {
-    /// Black and white squares alone. The whole board must be in the image.
+    /// Black and white squares only. The whole board must be in the image.
     Chessboard,
     /// Squares with ArUco markers in the white ones: any part of the board is recognised.
     Charuco {
         /// Name of the markers' dictionary, such as "DICT_4X4_50".
         dictionary: String,
-        /// Side of a marker as a share of the square's.
+        /// Side of a marker relative to the square's.
         marker: f64,
     },
 }
 
-/// A flat board of squares; the one at the top left is black.
+/// Flat board of squares; the one at the top left is black.
 ///
 /// Board axes: x right and y down along the printed side, z into the board; the origin is the inner corner at the top left.
+///
+/// ```
+/// use flyrig_calib::{Board, Pattern};
+///
+/// let board = Board { columns: 9, rows: 6, square_mm: 30.0, pattern: Pattern::Chessboard };
+/// board.check()?;
+/// let points: Vec<_> = (0..board.corner_count()).map(|index| board.corner(index)).collect();
+/// assert_eq!(points.len(), 8 * 5);
+/// assert!((points[1].x - 0.03).abs() < 1e-12 && points[1].y == 0.0, "metres along x");
+/// # Ok::<(), String>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Board {
     /// Squares along x.
@@ -40,7 +51,7 @@ pub struct Board {
     pub rows: u32,
     /// Side of a square, millimetres: measure it on the print.
     pub square_mm: f64,
-    /// Print.
+    /// Pattern.
     #[serde(flatten)]
     pub pattern: Pattern,
 }
@@ -83,10 +94,10 @@ impl Board {
         text
     }
 
-    /// Checks every value; the text names key and mend.
+    /// Checks every value; the error text names the key and the fix.
     ///
     /// # Errors
-    /// Names the wrong key.
+    /// Names the invalid key.
     pub fn check(&self) -> Result<(), String> {
         for (key, count) in [("columns", self.columns), ("rows", self.rows)] {
             if !SQUARES.contains(&count) {
@@ -111,37 +122,37 @@ impl Board {
                 if !MARKER.contains(marker) {
                     return Err(format!("marker is {marker}, expected {} to {}", MARKER.start(), MARKER.end()));
                 }
-                crate::detect::check_dictionary(dictionary, self.marker_count())
+                crate::dictionary::check_dictionary(dictionary, self.marker_count())
             }
         }
     }
 
-    /// Number of white squares.
+    /// Returns the number of white squares.
     #[must_use]
     pub fn marker_count(&self) -> usize {
         (self.columns as usize * self.rows as usize) / 2
     }
 
-    /// Inner corners along x and y.
+    /// Returns the number of inner corners along x and y.
     #[must_use]
     pub fn inner(&self) -> [u32; 2] {
         [self.columns.saturating_sub(1), self.rows.saturating_sub(1)]
     }
 
-    /// Number of inner corners.
+    /// Returns the number of inner corners.
     #[must_use]
     pub fn corner_count(&self) -> usize {
         self.inner().into_iter().map(|n| n as usize).product()
     }
 
-    /// Place of an inner corner, board axes, metres; corners count along x first.
+    /// Returns the position of an inner corner in board axes, metres; corners are numbered along x first.
     #[must_use]
     pub fn corner(&self, index: usize) -> DVec3 {
         let across = self.inner()[0].max(1) as usize;
         DVec3::new((index % across) as f64, (index / across) as f64, 0.0) * (1e-3 * self.square_mm)
     }
 
-    /// Middle of the inner corners, board axes, metres.
+    /// Returns the centre of the inner corners in board axes, metres.
     #[must_use]
     pub fn middle(&self) -> DVec3 {
         let [x, y] = self.inner();

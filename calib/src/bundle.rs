@@ -1,58 +1,59 @@
-//! Bundle adjustment of cameras, lenses, time offsets and boards.
+//! Bundle adjustment of cameras, lenses, time offsets and boards: a least squares problem with analytic derivatives,
+//! from which the boards are eliminated.
 
 use flyrig_solve::{BlockProblem, Kernel, Residual, RigidMotion};
 use flyrig_types::Intrinsics;
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
 
-use crate::{
-    LensModel, SeenCorner,
-    projection::{project, project_with_derivatives},
-};
+use crate::detect::SeenCorner;
+use crate::projection::{LensModel, project, project_with_derivatives};
 
-/// Beyond so many standard deviations a corner loses weight.
+/// Robust kernel, which reduces the weight of corners beyond 3 standard deviations.
 const KERNEL: Kernel = Kernel::Cauchy(3.0);
 
-/// A board in the image of one camera.
+/// Board in the image of one camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BoardView {
     /// Slot of the camera.
     pub camera: usize,
-    /// Time stamp of the image, nanoseconds.
+    /// Timestamp of the image, nanoseconds.
     pub nanos: i64,
-    /// The corners that are seen.
+    /// Detected corners.
     pub corners: Vec<SeenCorner>,
 }
 
-/// A board that several cameras saw at about the same time.
+/// Board that several cameras saw at about the same time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BoardShot {
     /// Time of the shot, nanoseconds.
     pub nanos: i64,
-    /// At most one view of each camera.
+    /// Views, at most one per camera.
     pub views: Vec<BoardView>,
 }
 
-/// One camera of an estimate.
+/// Camera of an estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct SolvedCamera {
     pub camera_from_rig: RigidMotion,
     pub intrinsics: Intrinsics,
-    /// Time offset: subtracted from the camera's stamps, seconds.
+    /// Time offset, subtracted from the camera's timestamps, seconds.
     pub lag_s: f64,
 }
 
-/// Everything that is sought. The rig's axes are those of its first camera.
+/// All unknowns. The rig's axes are those of its first camera.
 #[derive(Debug, Clone)]
 pub(crate) struct Estimate {
     pub cameras: Vec<SolvedCamera>,
-    /// `rig_from_board` by shot.
+    /// `rig_from_board` per shot.
     pub boards: Vec<RigidMotion>,
-    /// Depth of the board's surface behind its plane at a corner: these times [`bend_shares`], metres.
+    /// Coefficients of the bend: times [`bend_shares`] they give the depth of the surface behind the board's plane,
+    /// metres.
     pub bend_m: [f64; 3],
 }
 
-/// u², u v and v² of each corner, where (u, v) is its place from the middle of all as a share of half their diagonal.
+/// Returns u², u v and v² of each corner, where (u, v) is its position from the centre of all, relative to half their
+/// diagonal.
 pub(crate) fn bend_shares(points: &[DVec3]) -> Vec<[f64; 3]> {
     let (least, most) = points.iter().fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(a, b), p| (a.min(*p), b.max(*p)));
     let (middle, reach) = (0.5 * (least + most), 0.5 * least.distance(most));
@@ -63,16 +64,16 @@ pub(crate) fn bend_shares(points: &[DVec3]) -> Vec<[f64; 3]> {
     points.iter().map(share).collect()
 }
 
-/// Movement of a board during a shot.
+/// Velocity of a board during a shot.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct BoardMotion {
-    /// Rotation vector a second.
+    /// Rotation vector per second.
     pub turn: DVec3,
-    /// Metres a second.
+    /// Metres per second.
     pub shift: DVec3,
 }
 
-/// Which unknowns are free besides poses of cameras and boards.
+/// Selection of the unknowns that are free besides the poses of cameras and boards.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct Free {
     pub lens: Option<LensModel>,
@@ -97,7 +98,7 @@ pub(crate) struct Bundle<'a> {
 }
 
 impl<'a> Bundle<'a> {
-    /// `points` are the board's corners, `motions` one a shot.
+    /// Creates the problem from the board's corners and one velocity per shot.
     pub fn new(
         points: &'a [DVec3],
         shots: &'a [BoardShot],
@@ -147,20 +148,21 @@ impl<'a> Bundle<'a> {
         (self.free.lags && camera > 0).then(|| self.cameras - 1 + lenses + camera - 1)
     }
 
-    /// A corner on the bent board, board axes, metres.
+    /// Returns a corner on the bent board in board axes, metres.
     fn bent(&self, at: &Estimate, corner: &SeenCorner) -> Option<DVec3> {
         let (point, shares) = (self.points.get(corner.index)?, self.bend_shares.get(corner.index)?);
         Some(*point + DVec3::Z * at.bend_m.iter().zip(shares).map(|(bend, share)| bend * share).sum::<f64>())
     }
 
-    /// Pose of a shot's board at the time of a view.
+    /// Returns the pose of a shot's board at the time of a view.
     fn board_at(&self, at: &Estimate, shot: usize, view: &BoardView) -> RigidMotion {
         let motion = &self.motions[shot];
         let secs = seconds(view.nanos, self.shots[shot].nanos) - at.cameras[view.camera].lag_s;
         at.boards[shot].moved(motion.turn * secs, motion.shift * secs)
     }
 
-    /// Difference of a drawn and a seen corner, pixels; `None` where it cannot be drawn.
+    /// Returns the reprojection error of a corner (projected minus observed), pixels; `None` where it cannot be
+    /// projected.
     pub fn error_px(&self, at: &Estimate, shot: usize, view: &BoardView, corner: &SeenCorner) -> Option<DVec2> {
         let camera = &at.cameras[view.camera];
         let place = self.board_at(at, shot, view).apply(self.bent(at, corner)?);
@@ -168,7 +170,7 @@ impl<'a> Bundle<'a> {
     }
 }
 
-/// Seconds from one time to another.
+/// Returns the seconds from one time to another.
 pub(crate) fn seconds(nanos: i64, from: i64) -> f64 {
     nanos.saturating_sub(from) as f64 * 1e-9
 }
@@ -290,10 +292,8 @@ mod tests {
     use flyrig_solve::jacobian_error;
 
     use super::*;
-    use crate::{
-        Board,
-        testing::{Random, bent_shots, ring},
-    };
+    use crate::board::Board;
+    use crate::testing::{Random, bent_shots, ring};
 
     #[test]
     fn derivatives_are_those_of_finite_differences() {

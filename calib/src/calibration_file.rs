@@ -9,18 +9,16 @@ use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry, Lens, Rig
 use glam::{DMat3, DVec2, DVec3};
 use serde::Deserialize;
 
-use crate::{
-    CalibError,
-    convert::{
-        imported::{Imported, ImportedCamera},
-        shared::rotation_of,
-    },
+use crate::convert::{
+    imported::{Imported, ImportedCamera},
+    shared::rotation_of,
 };
+use crate::error::CalibError;
 
 /// Name of the file in a calibration folder.
 pub(crate) const FILE: &str = "calibration.toml";
 const VERSION: u32 = 1;
-/// Calibrations are small; larger files are something else.
+/// Maximum file size: calibrations are small, larger files are something else.
 const MAX_BYTES: u64 = 16 << 20;
 
 /// Standard deviations of a camera's pose and time offset.
@@ -30,7 +28,7 @@ pub struct Deviation {
     pub rotation_deg: f64,
     /// Position, millimetres.
     pub position_mm: f64,
-    /// Time offset, milliseconds, where one was sought.
+    /// Time offset, milliseconds, where one was estimated.
     pub time_offset_ms: Option<f64>,
 }
 
@@ -57,7 +55,7 @@ struct Entry {
     time_offset_ms: f64,
     #[serde(default)]
     color: ColorMatch,
-    /// For readers; nothing is computed from it.
+    /// Deviations for human readers; not read back.
     #[serde(rename = "deviation")]
     _deviation: Option<DeviationEntry>,
 }
@@ -113,8 +111,9 @@ pub(crate) fn parse(path: &Path, text: &str) -> Result<Imported, CalibError> {
     }
     let cameras = file.cameras.into_iter().map(|entry| camera(path, entry)).collect::<Result<Vec<_>, _>>()?;
     let direction = |up: [f64; 3]| DVec3::from(up).try_normalize().filter(|up| up.is_finite());
-    let up =
-        file.up.map(|up| direction(up).ok_or_else(|| refused("up is no direction; give [0, 0, 1], say".to_owned())));
+    let up = file.up.map(|up| {
+        direction(up).ok_or_else(|| refused("up is not a direction; give [0, 0, 1], for example".to_owned()))
+    });
     Ok(Imported { cameras, up: up.transpose()? })
 }
 
@@ -150,7 +149,7 @@ fn camera(path: &Path, entry: Entry) -> Result<ImportedCamera, CalibError> {
         (rotation, _) => {
             let (has, misses) =
                 if rotation.is_some() { ("rotation", "translation_m") } else { ("translation_m", "rotation") };
-            return Err(wrong(has, format!("stands there without {misses}"), "give both, or neither"));
+            return Err(wrong(has, format!("is given without {misses}"), "give both, or neither"));
         }
     };
     if !entry.time_offset_ms.is_finite() {
@@ -161,10 +160,10 @@ fn camera(path: &Path, entry: Entry) -> Result<ImportedCamera, CalibError> {
     Ok(ImportedCamera { id, intrinsics, pose, time_offset_nanos, color: entry.color })
 }
 
-/// Returns the text of a `calibration.toml`; `deviations` by slot, as far as they are known.
+/// Returns the text of a `calibration.toml`; `deviations` per slot, where they are known.
 ///
 /// # Errors
-/// [`CalibError::Camera`] for a rig that is not valid.
+/// [`CalibError::Camera`] for an invalid rig.
 pub fn calibration_toml(rig: &Rig, deviations: &[Option<Deviation>]) -> Result<String, CalibError> {
     rig.validate().map_err(|source| CalibError::Camera { path: FILE.into(), source })?;
     let mut text = header();

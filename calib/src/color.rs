@@ -1,73 +1,78 @@
-//! Colours of cameras, matched by surface points that several of them see.
+//! Colour matching of cameras from surface points that several of them see.
 //!
-//! The light of a point is the same for every camera, so that for camera `c` and channel `k` (see [`ColorMatch`])
-//! `ln linear(s^exponent_c) + ln gain_ck + falloff_c · (r², r⁴)` is the same number for all samples of the point. That is linear in all
-//! unknowns but the exponent, which each round linearises; the number itself is eliminated as the samples' mean. Two things stay open
-//! and are fixed: the mean gain of a channel is 1 (geometric), and so is the mean exponent.
+//! The light of a point is the same for every camera, so that for camera `c` and channel `k` (see [`ColorMatch`]) `ln
+//! linear(s^exponent_c) + ln gain_ck + falloff_c · (r², r⁴)` is the same number for all samples of the point. That is
+//! linear in all unknowns but the exponent, which each round linearises; the number itself is eliminated as the
+//! samples' mean. Two degrees of freedom stay open and are fixed: the mean gain of a channel is 1 (geometric), and so
+//! is the mean exponent.
+//!
+//! In a session the points are Gaussians that several cameras see. The result is a field of `flyrig_types::Camera`, which
+//! the renderer applies where images enter a session.
 
 use flyrig_types::{CameraId, ColorMatch};
 use nalgebra::{DMatrix, DVector};
 
-use crate::CalibError;
+use crate::error::CalibError;
 
-/// sRGB values below and above which a sample is not used: shadows are coarse, highlights clipped.
+/// Usable sRGB values: shadows are coarse, highlights clipped.
 const USABLE: std::ops::RangeInclusive<f64> = 0.06..=0.95;
-/// Points that a camera must share with others.
+/// Fewest points that a camera must share with others.
 const LEAST_POINTS: usize = 200;
-/// A richer model is taken where it lowers the differences of samples that were kept out to this share.
+/// Fraction of the held-out error of the simpler model below which a richer one is chosen.
 const PAYS: f64 = 0.97;
-/// Reweighted solves.
+/// Number of reweighted solves.
 const ROUNDS: usize = 8;
-/// Residuals beyond so many standard deviations count less (Huber).
+/// Huber threshold, standard deviations.
 const HUBER: f64 = 1.345;
-/// Unknowns that samples leave open stay 0, as a share of the mean diagonal.
+/// Regularisation of undetermined unknowns towards 0, relative to the mean diagonal.
 const RIDGE: f64 = 1e-6;
-/// Weight of what is fixed, as a share of the mean diagonal.
+/// Weight of the fixed degrees of freedom, relative to the mean diagonal.
 const FIXED: f64 = 1e3;
-/// Falloffs are sought where such a share of each camera's samples lies so far out: beyond the samples they would be guesses.
+/// Fraction of each camera's samples that must lie beyond this squared radius for its falloff to be estimated: outside
+/// the samples it would be a guess.
 const OUTSIDE: (f64, f64) = (0.05, 0.4);
-/// Exponents, and factors in the corners, that cameras have; others explain something else, such as shine.
+/// Plausible exponents, and plausible gains in the corners; others come from effects such as shine.
 const PLAUSIBLE: (std::ops::RangeInclusive<f64>, std::ops::RangeInclusive<f64>) = (0.7..=1.4, 0.8..=3.0);
-/// A middle grey, sRGB.
+/// Middle grey, sRGB.
 const GREY: f64 = 0.5;
-/// sRGB values up to which the code is linear (IEC 61966-2-1).
+/// Largest sRGB value of the linear segment (IEC 61966-2-1).
 const LINEAR_TO: f64 = 0.040_45;
-/// Unknowns of a camera: three gains, the exponent less 1, two of the falloff.
+/// Unknowns per camera: three gains, the exponent minus 1, two of the falloff.
 const OF_CAMERA: usize = 6;
 
-/// A surface point in the image of one camera.
+/// Surface point in the image of one camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ColorSample {
     /// Slot of the camera.
     pub camera: usize,
-    /// sRGB values of red, green and blue, 0..=1.
+    /// sRGB values of red, green and blue, in 0..=1.
     pub srgb: [f64; 3],
-    /// Square of the distance from the principal point over half the image's diagonal.
+    /// Squared distance from the principal point, relative to half the image's diagonal.
     pub r2: f64,
-    /// How much it counts, above 0.
+    /// Weight in the fit, above 0.
     pub weight: f64,
 }
 
-/// A surface point at one instant, as several cameras see it.
+/// Surface point at one instant, as several cameras see it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ColorPoint {
     /// Number of the instant.
     pub instant: u64,
-    /// At most one of each camera.
+    /// Samples, at most one per camera.
     pub samples: Vec<ColorSample>,
 }
 
-/// Parts of [`ColorMatch`] that are solved for besides the gains.
+/// Parts of [`ColorMatch`] that are estimated besides the gains.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ColorModel {
-    /// The exponents.
+    /// Whether exponents are estimated.
     pub response: bool,
-    /// The falloffs.
+    /// Whether falloffs are estimated.
     pub falloff: bool,
 }
 
 impl ColorModel {
-    /// From poor to rich.
+    /// All models, from poor to rich.
     const ALL: [Self; 4] = [
         Self { response: false, falloff: false },
         Self { response: true, falloff: false },
@@ -76,25 +81,27 @@ impl ColorModel {
     ];
 }
 
-/// Matched colours of one camera.
+/// Colour match of one camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CameraColors {
-    /// The correction.
+    /// Correction of its colours.
     pub color: ColorMatch,
     /// Points that it shares with other cameras.
     pub points: usize,
-    /// Largest difference of a channel's corrected light of a middle grey between the solves from every second instant, as a share.
+    /// Largest difference of a channel's corrected light of a middle grey between the solves from alternating instants,
+    /// as a fraction.
     pub halves: f64,
-    /// Typical difference of its light from the mean of the cameras that see the same point, as a share: before and after.
+    /// Typical difference of its light from the mean of the cameras that see the same point, as a fraction: before and
+    /// after correction.
     pub difference: (f64, f64),
 }
 
-/// Matched colours of a rig.
+/// Colour match of a rig.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ColorFit {
-    /// In the order of the rig.
+    /// Cameras in rig order.
     pub cameras: Vec<CameraColors>,
-    /// Unknowns that were solved for besides the gains.
+    /// Unknowns that were estimated besides the gains.
     pub model: ColorModel,
 }
 
@@ -168,8 +175,8 @@ fn usable(point: &ColorPoint, cameras: usize) -> Option<ColorPoint> {
     (samples.len() > 1).then_some(ColorPoint { instant: point.instant, samples })
 }
 
-/// Derivatives of a corrected sample's logarithm by the unknowns of its camera, and its value where all unknowns are 0, both linearised
-/// around `exponent`.
+/// Returns the derivatives of a corrected sample's logarithm by the unknowns of its camera, and its value where all
+/// unknowns are 0, both linearised around `exponent`.
 fn row(sample: &ColorSample, channel: usize, exponent: f64) -> ([f64; OF_CAMERA], f64) {
     let code = sample.srgb[channel].ln();
     let bent = (exponent * code).exp();
@@ -183,7 +190,7 @@ fn row(sample: &ColorSample, channel: usize, exponent: f64) -> ([f64; OF_CAMERA]
     (row, value)
 }
 
-/// Least squares with Huber weights.
+/// Solves the least squares problem with Huber weights.
 fn solve(cameras: usize, points: &[ColorPoint], model: ColorModel) -> Vec<ColorMatch> {
     let count = OF_CAMERA * cameras;
     let mut colors = vec![ColorMatch::NONE; cameras];
@@ -238,7 +245,7 @@ fn solve(cameras: usize, points: &[ColorPoint], model: ColorModel) -> Vec<ColorM
     colors
 }
 
-/// Constrains unknowns that samples leave open, and those that are not part of the model.
+/// Constrains unknowns that the samples leave undetermined, and those outside the model.
 fn fix(matrix: &mut DMatrix<f64>, right: &mut DVector<f64>, cameras: usize, model: ColorModel) {
     let scale = matrix.diagonal().mean().max(f64::MIN_POSITIVE);
     for k in 0..4 {
@@ -259,7 +266,7 @@ fn fix(matrix: &mut DMatrix<f64>, right: &mut DVector<f64>, cameras: usize, mode
     }
 }
 
-/// Logarithm of the light of an sRGB value, by the value's logarithm.
+/// Returns the logarithm of the light of an sRGB value, given the value's logarithm.
 fn log_light(code: f64) -> f64 {
     let value = code.exp();
     if value <= LINEAR_TO { code - 12.92f64.ln() } else { 2.4 * ((value + 0.055) / 1.055).ln() }
@@ -276,7 +283,8 @@ fn mean(point: &ColorPoint, channel: usize, colors: &[ColorMatch]) -> f64 {
     point.samples.iter().map(|sample| sample.weight * corrected(sample, channel, colors)).sum::<f64>() / all
 }
 
-/// By sample and channel: the camera, and how far the corrected sample lies from its point's mean, in logarithms.
+/// Returns per sample and channel: the camera, and the deviation of the corrected sample from its point's mean, in
+/// logarithms.
 fn differences(points: &[ColorPoint], colors: &[ColorMatch]) -> Vec<(usize, f64)> {
     let of = |point: &ColorPoint| -> Vec<(usize, f64)> {
         (0..3)
@@ -289,7 +297,7 @@ fn differences(points: &[ColorPoint], colors: &[ColorMatch]) -> Vec<(usize, f64)
     points.iter().flat_map(of).collect()
 }
 
-/// Standard deviation of values around 0 by their median, which outliers do not move.
+/// Returns the standard deviation of values around 0, robustly from their median.
 fn typical(values: impl Iterator<Item = f64>) -> f64 {
     1.4826 * flyrig_solve::median(&mut values.collect::<Vec<f64>>()).unwrap_or(0.0)
 }

@@ -2,7 +2,7 @@ use flyrig_model::srgb;
 
 use super::*;
 
-/// Numbers of 0..1, the same on every run.
+/// Repeatable random numbers in 0..1.
 struct Dice(u64);
 
 impl Dice {
@@ -20,7 +20,7 @@ fn ids(count: usize) -> Vec<CameraId> {
     (0..count).map(|slot| CameraId::from(format!("{slot:02}"))).collect()
 }
 
-/// Cameras whose corrections have a mean gain and a mean exponent of 1.
+/// Returns cameras whose corrections have a mean gain and a mean exponent of 1.
 fn cameras(count: usize, model: ColorModel, dice: &mut Dice) -> Vec<ColorMatch> {
     let mut colors: Vec<ColorMatch> = (0..count)
         .map(|_| ColorMatch {
@@ -51,7 +51,8 @@ fn logarithm_form_of_srgb_agrees_with_the_curve() {
     }
 }
 
-/// Points that every camera sees with probability 0.6: light with noise of a share, and of a tenth of the samples twice as much.
+/// Simulates points that every camera sees with probability 0.6, with relative noise, doubled in a tenth of the
+/// samples.
 fn points(truth: &[ColorMatch], count: usize, noise: f64, dice: &mut Dice) -> Vec<ColorPoint> {
     (0..count as u64)
         .map(|instant| {

@@ -1,4 +1,4 @@
-//! Calibrations of other programs, read and written.
+//! Readers and writers of other programs' calibrations; each foreign format has a file below `convert/`.
 //!
 //! Every reader returns flyrig's conventions: OpenCV camera axes, metres, pixel centres at integers. The world's axes stay those of
 //! the file.
@@ -20,16 +20,18 @@ use flyrig_types::{CameraId, Rig, write_whole};
 
 pub use self::imported::{Imported, ImportedCamera};
 use self::shared::{bad, files_with, inside, one_file};
-use crate::{CalibError, calibration_file, easymocap};
+use crate::calibration_file;
+use crate::easymocap;
+use crate::error::CalibError;
 
-/// A calibration format.
+/// Calibration format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// `calibration.toml`.
     Flyrig,
     /// `intri.yml` and `extri.yml`; also ZJU-MoCap's.
     EasyMocap,
-    /// A file `CAM.yml` of FileStorage for each camera, with the keys of OpenCV's calibration sample, and `rvec`, `tvec`.
+    /// One file `CAM.yml` of FileStorage per camera, with the keys of OpenCV's calibration sample, and `rvec`, `tvec`.
     OpenCv,
     /// `camchain.yaml`.
     Kalibr,
@@ -41,7 +43,7 @@ pub enum Format {
     Qualisys,
     /// TOML of anipose, Pose2Sim and caliscope.
     Anipose,
-    /// A file `CAM.cameramodel` for each camera.
+    /// One file `CAM.cameramodel` per camera.
     Mrcal,
 }
 
@@ -59,7 +61,7 @@ impl Format {
         Self::Mrcal,
     ];
 
-    /// Name on the command line.
+    /// Returns the name on the command line.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -75,7 +77,7 @@ impl Format {
         }
     }
 
-    /// Returns camera axes, pixel origin, world and unit of the format in a line.
+    /// Returns a line on camera axes, pixel origin, world and unit of the format.
     #[must_use]
     pub fn conventions(self) -> &'static str {
         match self {
@@ -101,7 +103,7 @@ impl Format {
         }
     }
 
-    /// Recognises the format of a file or folder by its name and contents.
+    /// Detects the format of a file or folder from its name and contents.
     #[must_use]
     pub fn detect(path: &Path) -> Option<Self> {
         let has = |name: &str| path.join(name).is_file();
@@ -143,8 +145,8 @@ impl Format {
         }
     }
 
-    /// Reads a calibration from a file or a folder. `image_size` gives width and height of a camera's images for formats that may
-    /// leave them out. Lengths are multiplied by `scale`.
+    /// Reads a calibration from a file or a folder. `image_size` gives width and height of a camera's images for
+    /// formats that may omit them. Lengths are multiplied by `scale`.
     ///
     /// # Errors
     /// [`CalibError`] names the file, the camera and the fix.
@@ -194,7 +196,8 @@ impl Format {
         Ok(imported)
     }
 
-    /// Writes a rig into a folder and returns the names of the files. Nothing is written where the format cannot hold a camera.
+    /// Writes a rig into a folder and returns the names of the files. Writes nothing where the format cannot represent
+    /// a camera.
     ///
     /// # Errors
     /// [`CalibError`] names the camera and what the format lacks.

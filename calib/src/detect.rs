@@ -1,6 +1,6 @@
-//! Boards in images.
+//! Detection of boards in images, through the crates `calib-targets-*`.
 
-use calib_targets_charuco::{CharucoBoardSpec, CharucoDetector, CharucoParams, Dictionary, resolve_dictionary};
+use calib_targets_charuco::{CharucoBoardSpec, CharucoDetector, CharucoParams};
 use calib_targets_chessboard::{
     ChessboardDetector, ChessboardParams, DetectorConfig, GrayImageView, default_chess_config, detect_corner_frame,
 };
@@ -8,15 +8,15 @@ use calib_targets_core::ImageRefiner;
 use flyrig_types::{Image, PixelFormat};
 use glam::DVec2;
 
-use crate::{Board, Pattern};
+use crate::board::{Board, Pattern};
 
-/// Fewest corners of a part of a board that are used.
+/// Fewest corners at which a partly visible board is used.
 const LEAST_CORNERS: usize = 6;
 
-/// Images whose side is shorter show no board, pixels.
+/// Smallest side of an image that can show a board, pixels.
 const LEAST_SIDE: usize = 32;
 
-/// An inner corner of a board in an image.
+/// Inner corner of a board in an image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SeenCorner {
     /// Number of the corner, see [`Board::corner`].
@@ -25,25 +25,25 @@ pub struct SeenCorner {
     pub pixel: DVec2,
 }
 
-/// Finds a board in images.
+/// Detector of a board in images.
 pub trait BoardDetector: Send + Sync {
-    /// Returns the corners that are seen, in ascending order; none where no board is recognised.
+    /// Returns the detected corners, in ascending order; none where no board is recognised.
     fn detect(&self, gray: &GrayImage) -> Vec<SeenCorner>;
 }
 
-/// An 8-bit image without colour.
+/// 8-bit grey image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GrayImage {
     /// Pixels.
     pub width: usize,
     /// Pixels.
     pub height: usize,
-    /// Row by row.
+    /// Pixels, row by row.
     pub pixels: Vec<u8>,
 }
 
 impl GrayImage {
-    /// Takes the brightness of a decoded image; `None` for compressed and raw sensor formats.
+    /// Converts a decoded image to grey; `None` for compressed and raw sensor formats.
     #[must_use]
     pub fn of(image: &Image) -> Option<Self> {
         let bytes = image.bytes();
@@ -57,7 +57,7 @@ impl GrayImage {
         (pixels.len() == width * height).then_some(Self { width, height, pixels })
     }
 
-    /// Whether the image is large enough to show a board, and has all of its pixels: the detectors trust both.
+    /// Returns whether the image is large enough to show a board and complete: the detectors check neither.
     fn is_usable(&self) -> bool {
         self.width.min(self.height) >= LEAST_SIDE && self.pixels.len() == self.width * self.height
     }
@@ -66,7 +66,7 @@ impl GrayImage {
         GrayImageView { width: self.width, height: self.height, data: &self.pixels }
     }
 
-    /// Brightness at a pixel, bilinear; `None` outside.
+    /// Returns the bilinear brightness at a pixel; `None` outside.
     fn at(&self, pixel: DVec2) -> Option<f64> {
         let base = pixel.floor();
         let inside =
@@ -98,7 +98,7 @@ pub fn detector(board: &Board) -> Result<Box<dyn BoardDetector>, String> {
                 board.columns,
                 board.square_mm as f32,
                 *marker as f32,
-                self::dictionary(dictionary)?,
+                crate::dictionary::dictionary(dictionary)?,
             );
             let mut params = CharucoParams::for_board(spec);
             params.chess = corner_config();
@@ -108,27 +108,10 @@ pub fn detector(board: &Board) -> Result<Box<dyn BoardDetector>, String> {
     }
 }
 
-/// Corners are saddle points of the brightness: on sharp images twice as accurate as the detector's own centres of mass.
+/// Returns the settings of the corner refinement. Corners are saddle points of the brightness: on sharp images twice as
+/// accurate as the detector's own centres of mass.
 fn corner_config() -> DetectorConfig {
     default_chess_config().with_refiner(ImageRefiner::saddle_point())
-}
-
-/// Returns a dictionary by its name.
-pub(crate) fn dictionary(name: &str) -> Result<Dictionary, String> {
-    resolve_dictionary(name).ok_or_else(|| {
-        format!(
-            "dictionary is {name:?}, which is unknown; expected a name of OpenCV's, such as DICT_4X4_50 or DICT_5X5_100"
-        )
-    })
-}
-
-/// Checks that a dictionary has enough markers.
-pub(crate) fn check_dictionary(name: &str, needed: usize) -> Result<(), String> {
-    let has = dictionary(name)?.codes().len();
-    if has < needed {
-        return Err(format!("dictionary {name} has {has} markers, but the board needs {needed}; take a larger one"));
-    }
-    Ok(())
 }
 
 struct Charuco {
@@ -198,7 +181,7 @@ impl Chessboard {
         })
     }
 
-    /// Whether the squares whose numbers have an even sum are the dark ones.
+    /// Returns whether the squares whose numbers have an even sum are the dark ones.
     fn is_black_first(&self, places: &[DVec2], gray: &GrayImage) -> bool {
         let [across, down] = self.board.inner().map(|n| n as usize);
         let (mut even, mut odd) = ((0.0, 0.0), (0.0, 0.0));

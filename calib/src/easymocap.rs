@@ -1,7 +1,7 @@
 //! Calibration in the format of EasyMocap and ZJU-MoCap: `intri.yml` and `extri.yml`.
 //!
-//! Per camera `x`: `K_x` 3x3, `dist_x` (k1 k2 p1 p2 k3, or with k4 k5 k6 of the rational model), `Rot_x` 3x3 or `R_x` as a Rodrigues
-//! vector, `T_x`; `x_camera = Rot x_world + T`. Image sizes `H_x`, `W_x` are optional.
+//! Per camera `x`: `K_x` 3x3, `dist_x` (k1 k2 p1 p2 k3, or with k4 k5 k6 of the rational model), `Rot_x` 3x3 or `R_x`
+//! as a Rodrigues vector, `T_x`; `x_camera = Rot x_world + T`. Image sizes `H_x`, `W_x` are optional.
 
 use std::{
     collections::BTreeSet,
@@ -11,19 +11,16 @@ use std::{
 use flyrig_types::{Camera, CameraError, CameraId, Intrinsics, Isometry, Lens, MAX_IMAGE_SIDE, Rig};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
-use crate::{
-    CalibError,
-    convert::shared::{opencv_coefficients, opencv_lens, rotation_of},
-    yaml::{Matrix, YamlFile, YamlWriter},
-};
+use crate::convert::shared::{opencv_coefficients, opencv_lens, rotation_of};
+use crate::error::CalibError;
+use crate::yaml::{Matrix, YamlFile, YamlWriter};
 
 const INTRINSICS: &str = "intri.yml";
 const EXTRINSICS: &str = "extri.yml";
 
-/// Reads `intri.yml` and `extri.yml` of a folder. `image_size` gives width and height of a
-/// camera's images in pixels for files that do not say it, and is checked against those that do.
-/// The world's axes stay as they are; which of them is up is guessed from the cameras
-/// ([`Rig::guess_world_up`]).
+/// Reads `intri.yml` and `extri.yml` of a folder. `image_size` gives width and height of a camera's images in pixels
+/// for files that lack them, and is checked against those that contain them. The world's axes stay as they are; the up
+/// direction is estimated from the cameras ([`Rig::guess_world_up`]).
 ///
 /// # Errors
 /// [`CalibError`] names the file, the camera and the fix.
@@ -58,7 +55,7 @@ fn validate(rig: &Rig, dir: &Path) -> Result<(), CalibError> {
     rig.validate().map_err(|source: CameraError| CalibError::Camera { path: dir.to_owned(), source })
 }
 
-/// The cameras of a file: its `names`, or the rest of every key that begins with `prefix`.
+/// Returns the cameras of a file: its `names`, or the suffix of every key that begins with `prefix`.
 fn camera_names(file: &YamlFile, prefix: &str, expected: &'static str) -> Result<Vec<CameraId>, CalibError> {
     let keys = file.keys()?;
     let names = file.strings("names").unwrap_or_else(|| {
@@ -72,7 +69,7 @@ fn camera_names(file: &YamlFile, prefix: &str, expected: &'static str) -> Result
     Ok(names.into_iter().map(CameraId::from).collect())
 }
 
-/// One value of one camera in one file, to say errors of.
+/// Value of one camera in one file, with the context of its errors.
 struct Entry<'a> {
     file: &'a YamlFile,
     camera: &'a CameraId,
@@ -125,7 +122,7 @@ fn read_intrinsics(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>)
     let entry = Entry::new(file, id, "K");
     let k = entry.matrix3(&entry.required("calibrate this camera")?)?.transpose();
     let [[fx, skew, cx], [zero_a, fy, cy], last] = k.to_cols_array_2d();
-    // A skew of a hundredth of a pixel moves nothing that anybody could measure.
+    // A skew of a hundredth of a pixel has no measurable effect.
     if skew.abs() > 0.01 || zero_a.abs() > 1e-9 || DVec3::from(last) != DVec3::Z {
         return Err(entry.wrong(
             format!("has skew {skew} or an unusual shape, expected [fx 0 cx; 0 fy cy; 0 0 1]"),
@@ -199,12 +196,12 @@ fn rotation(entry: &Entry<'_>, matrix: &Matrix) -> Result<DQuat, CalibError> {
         .map_err(|problem| entry.wrong(problem, "export the calibration again; a mirrored axis gives determinant -1"))
 }
 
-/// Writes a rig as `intri.yml` and `extri.yml` with image sizes, so that [`load_easymocap`] reads
-/// the same cameras back. The format has no place for [`Rig::world_up`] and time offsets. Both files are made before
-/// the first one is written.
+/// Writes a rig as `intri.yml` and `extri.yml` with image sizes, so that [`load_easymocap`] reads the same cameras
+/// back. The format cannot hold [`Rig::world_up`] and time offsets. Both files are composed before the first one is
+/// written.
 ///
 /// # Errors
-/// [`CalibError`] when a camera is bad or a fisheye, or the folder cannot be written.
+/// [`CalibError`] when a camera is invalid or a fisheye, or the folder cannot be written.
 pub fn save_easymocap(dir: &Path, rig: &Rig) -> Result<(), CalibError> {
     validate(rig, dir)?;
     let mut intri = YamlWriter::new(dir.join(INTRINSICS));

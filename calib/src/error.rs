@@ -1,170 +1,170 @@
-//! Why a calibration is refused.
+//! Errors of calibrations.
 
 use std::path::PathBuf;
 
 use flyrig_types::{CameraError, CameraId};
 
-/// Each text names the file, the camera where there is one, and the fix.
+/// Error of a calibration or a calibration file; each text names the file, the camera where there is one, and the fix.
 #[derive(Debug, thiserror::Error)]
 pub enum CalibError {
     /// The file cannot be read.
     #[error("{}: cannot be read: {source}; a calibration folder holds calibration.toml, or intri.yml and extri.yml", path.display())]
     Read {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
     /// The file cannot be written.
     #[error("{}: cannot be written: {reason}", path.display())]
     Write {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What went wrong.
+        /// Cause.
         reason: String,
     },
-    /// A file that is not what it should be, in any format.
+    /// Malformed file, in any format.
     #[error("{}: {problem}", path.display())]
     Format {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// The fault and the fix.
+        /// Fault and fix.
         problem: String,
     },
     /// Not a file of OpenCV's FileStorage.
     #[error("{}: is not a YAML file of OpenCV's FileStorage ({reason}); export the calibration again", path.display())]
     Parse {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Cause.
         reason: String,
     },
-    /// No camera in it.
+    /// File without cameras.
     #[error("{}: names no camera; expected a list `names` or matrices {expected}", path.display())]
     NoCameras {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
         /// Keys that would name cameras.
         expected: &'static str,
     },
-    /// A camera that only the other file has.
+    /// Camera that only the other file has.
     #[error(
         "{}: camera {camera} is missing, but {} has it; calibrate it or take it out of both files",
         path.display(), other.display()
     )]
     OnlyInOther {
-        /// The file without it.
+        /// Path of the file without it.
         path: PathBuf,
-        /// The file with it.
+        /// Path of the file with it.
         other: PathBuf,
-        /// Which camera.
+        /// Name of the camera.
         camera: CameraId,
     },
-    /// A key that must be there.
+    /// Missing key.
     #[error("{}: camera {camera}: {key} is missing; {mend}", path.display())]
     Missing {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Which camera.
+        /// Name of the camera.
         camera: CameraId,
-        /// Which key.
+        /// Name of the key.
         key: String,
-        /// What to do.
+        /// Fix.
         mend: &'static str,
     },
-    /// A value that cannot be right, or that we cannot model.
+    /// Invalid value, or one that flyrig cannot model.
     #[error("{}: camera {camera}: {key} {problem}; {mend}", path.display())]
     Value {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Which camera.
+        /// Name of the camera.
         camera: CameraId,
-        /// Which key.
+        /// Name of the key.
         key: String,
-        /// What is wrong, with the value.
+        /// Fault, with the value.
         problem: String,
-        /// What to do.
+        /// Fix.
         mend: &'static str,
     },
-    /// Nothing says how large the images are.
+    /// Unknown size of the images.
     #[error("{}: camera {camera}: the image size is unknown; add H_{camera} and W_{camera}, or give images", path.display())]
     UnknownSize {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Which camera.
+        /// Name of the camera.
         camera: CameraId,
     },
-    /// The calibration is for images of another size.
+    /// Calibration for images of another size.
     #[error(
         "{}: camera {camera}: calibrated for images of {}x{}, but they are {}x{}; scale K with the images or replace them",
         path.display(), calibrated.0, calibrated.1, pictures.0, pictures.1
     )]
     OtherSize {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Which camera.
+        /// Name of the camera.
         camera: CameraId,
         /// Width and height in the file.
         calibrated: (u32, u32),
         /// Width and height of the images.
         pictures: (u32, u32),
     },
-    /// A camera model that no camera has.
+    /// Invalid camera model.
     #[error("{}: {source}", path.display())]
     Camera {
-        /// Which folder.
+        /// Path of the folder.
         path: PathBuf,
-        /// What is wrong.
+        /// Fault of the camera.
         source: CameraError,
     },
-    /// A description of a board that is of no use.
+    /// Invalid description of a board.
     #[error("{}: {reason}", path.display())]
     Board {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// The wrong key and the fix.
+        /// Invalid key and fix.
         reason: String,
     },
-    /// Too few views of the board to know a lens.
+    /// Too few views of the board to calibrate a lens.
     #[error(
         "camera {camera}: the board is seen in {found} images, {different} of them different; show it in at least {needed} poses, \
          near and far, tilted, in all corners of the image"
     )]
     TooFewViews {
-        /// Which camera.
+        /// Name of the camera.
         camera: CameraId,
         /// Images with the board.
         found: usize,
-        /// Of them, those that differ.
+        /// Images among them that differ from each other.
         different: usize,
-        /// How many are needed.
+        /// Required images.
         needed: usize,
     },
-    /// The boards do not fix the lens.
+    /// Views that leave the lens undetermined.
     #[error(
-        "camera {camera}: the views leave the focal length open; tilt the board by 30 to 45 degrees, and check columns, rows \
+        "camera {camera}: the views do not determine the focal length; tilt the board by 30 to 45 degrees, and check columns, rows \
          and dictionary of board.toml"
     )]
     LensOpen {
-        /// Which camera.
+        /// Name of the camera.
         camera: CameraId,
     },
-    /// Cameras that no board joins.
+    /// Cameras that no board links.
     #[error("no board joins the groups of cameras {groups}; show it between them, seen by a camera of each at once")]
     NotLinked {
-        /// The groups.
+        /// Groups of linked cameras.
         groups: String,
     },
-    /// The boards do not fix the rig.
-    #[error("the boards do not fix the cameras' poses; show the board in more places and tilts")]
+    /// Boards that leave the rig undetermined.
+    #[error("the boards do not determine the cameras' poses; show the board in more places and tilts")]
     RigOpen,
-    /// The person does not fix the rig.
+    /// Tracks of a person that leave the rig undetermined.
     #[error(
         "the person is not seen by two cameras at once for long enough; let one person move for ten seconds where all cameras see \
          them whole, and check that the old calibration is roughly right"
     )]
     PersonOpen,
-    /// The person stands still.
+    /// Person who stands still.
     #[error(
         "the person hardly moves ({extent_mm:.0} mm); let one person walk through the whole volume, with raised and lowered arms, and jump"
     )]
@@ -172,20 +172,20 @@ pub enum CalibError {
         /// Extent of the movement, millimetres.
         extent_mm: f64,
     },
-    /// A camera's colours cannot be compared with those of the others.
+    /// Camera whose colours cannot be compared with those of the others.
     #[error(
-        "camera {camera}: {found} points of people are seen by it and another camera at once, and {needed} are needed; let somebody walk where \
-         it looks together with the others, in light that neither clips nor drowns"
+        "camera {camera}: {found} points of people are seen by it and another camera at once, and {needed} are needed; let a person walk where \
+         its view overlaps with the others', in light that is neither clipped nor too dark"
     )]
     ColorsOpen {
-        /// Which camera.
+        /// Name of the camera.
         camera: CameraId,
-        /// Points that it shares.
+        /// Points that it shares with others.
         found: usize,
-        /// How many are needed.
+        /// Required points.
         needed: usize,
     },
-    /// Tracks, limbs or mirrored landmarks do not belong to the rig.
+    /// Tracks, limbs or mirrored landmarks that do not match the rig.
     #[error(
         "tracks of {cameras} cameras with {landmarks} landmarks for a rig of {expected} cameras; give tracks of this rig, and limbs and \
          mirrored pairs of these landmarks"
@@ -198,10 +198,10 @@ pub enum CalibError {
         /// Landmarks of the tracks.
         landmarks: usize,
     },
-    /// The format has no place for this lens.
+    /// Lens that the format cannot represent.
     #[error("camera {camera}: EasyMocap's format has no fisheye lens; write calibration.toml, or another format")]
     FisheyeUnsupported {
-        /// Which camera.
+        /// Name of the camera.
         camera: CameraId,
     },
 }

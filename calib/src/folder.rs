@@ -4,10 +4,12 @@ use std::path::Path;
 
 use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Lens, Rig};
 
-use crate::{CalibError, calibration_file, easymocap};
+use crate::calibration_file;
+use crate::easymocap;
+use crate::error::CalibError;
 
-/// Reads the rig of a folder. `image_size` gives width and height of a camera's images in pixels, for files that do not say it; it is
-/// checked against those that do.
+/// Reads the rig of a folder. `image_size` gives width and height of a camera's images in pixels for files that lack
+/// them; it is checked against those that contain them.
 ///
 /// # Errors
 /// [`CalibError`] names the file, the camera and the fix.
@@ -24,13 +26,36 @@ pub fn load_calibration(dir: &Path, image_size: &dyn Fn(&CameraId) -> Option<(u3
 
 /// Reads a rig from the text of a `calibration.toml`; `path` is for errors.
 ///
+/// ```
+/// use flyrig_calib::{calibration_toml, parse_calibration};
+///
+/// let text = r#"
+/// version = 1
+/// up = [0.0, 0.0, 1.0]
+///
+/// [[cameras]]
+/// name = "front"
+/// size = [1280, 720]
+/// focal_px = [900.0, 900.0]
+/// center_px = [639.5, 359.5]
+/// lens = { model = "radial-tangential", radial = [-0.1, 0.02, 0.0], tangential = [0.0, 0.0] }
+/// rotation = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+/// translation_m = [0.0, 1.2, 3.0]
+/// "#;
+/// let rig = parse_calibration("calibration.toml".as_ref(), text)?;
+/// let eye = rig.cameras[0].position();
+/// assert!((eye.y + 3.0).abs() < 1e-12 && (eye.z - 1.2).abs() < 1e-12, "in front of the origin, above the floor");
+/// assert!(calibration_toml(&rig, &[])?.contains("name = \"front\""));
+/// # Ok::<(), flyrig_calib::CalibError>(())
+/// ```
+///
 /// # Errors
 /// As [`load_calibration`].
 pub fn parse_calibration(path: &Path, text: &str) -> Result<Rig, CalibError> {
     let imported = calibration_file::parse(path, text)?;
     let rig = imported.rig(path)?.ok_or_else(|| CalibError::Format {
         path: path.to_owned(),
-        problem: "holds lenses alone, no poses; run flyrig calibrate rig with --lenses".to_owned(),
+        problem: "holds lenses only, no poses; run flyrig calibrate rig with --lenses".to_owned(),
     })?;
     rig.validate().map_err(|source| CalibError::Camera { path: path.to_owned(), source })?;
     Ok(rig)
@@ -67,8 +92,9 @@ fn check_sizes<'a>(
     Ok(())
 }
 
-/// Writes the rig of exported images: EasyMocap's files, which other programs read too, or `calibration.toml` where those cannot
-/// hold a lens or a colour correction. Time offsets are left out, since exported images have no timestamps of their own.
+/// Writes the rig of exported images: EasyMocap's files, which other programs read too, or `calibration.toml` where
+/// those cannot represent a lens or a colour correction. Time offsets are omitted, since exported images have no
+/// timestamps of their own.
 ///
 /// # Errors
 /// As [`crate::save_calibration`].

@@ -1,10 +1,10 @@
-//! Homographies of a plane, and what they say about focal length and pose.
+//! Homographies of a plane, and focal length and pose from them.
 
 use flyrig_solve::RigidMotion;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use nalgebra::DMatrix;
 
-/// Fewest points, and least spread of them relative to their largest extent, that fix a homography.
+/// Fewest points, and least spread relative to their largest extent, that determine a homography.
 const LEAST_POINTS: usize = 4;
 const LEAST_SPREAD: f64 = 1e-3;
 
@@ -43,7 +43,7 @@ pub(crate) fn homography(pairs: &[(DVec2, DVec2)]) -> Option<DMat3> {
     result.is_finite().then_some(result)
 }
 
-/// Moves points to mean 0 and mean distance √2.
+/// Returns the similarity that moves points to mean 0 and mean distance √2.
 fn normalisation(points: impl Iterator<Item = DVec2> + Clone) -> Option<DMat3> {
     let count = points.clone().count() as f64;
     let center = points.clone().sum::<DVec2>() / count;
@@ -55,8 +55,9 @@ fn normalisation(points: impl Iterator<Item = DVec2> + Clone) -> Option<DMat3> {
     Some(DMat3::from_cols(DVec3::X * scale, DVec3::Y * scale, (-center * scale).extend(1.0)))
 }
 
-/// Returns the focal length in pixels that explains homographies from planes of equal units to pixels about the principal point
-/// (Zhang 2000, with square pixels and a known centre); `None` where they leave it open, as boards without tilt do.
+/// Returns the focal length in pixels that explains homographies from planes of equal units to pixels about the
+/// principal point (Zhang 2000, with square pixels and a known centre); `None` where they leave it undetermined, as
+/// boards without tilt do.
 pub(crate) fn focal_length(homographies: &[DMat3]) -> Option<f64> {
     // Of w = 1/f²: a w = b, for each view twice.
     let (mut aa, mut ab) = (0.0, 0.0);
@@ -75,8 +76,8 @@ pub(crate) fn focal_length(homographies: &[DMat3]) -> Option<f64> {
     (focal.is_finite() && focal > 0.0).then_some(focal)
 }
 
-/// Returns the motion from the plane's axes to those of a camera with focal length 1 (`h` maps the plane to its ideal plane),
-/// and the one with the plane's tilt mirrored about the line of sight: from few pixels both look alike.
+/// Returns the motion from the plane's axes to those of a camera with focal length 1 (`h` maps the plane to its ideal
+/// plane), and the one with the plane's tilt mirrored about the line of sight: a small image cannot distinguish them.
 pub(crate) fn plane_poses(h: &DMat3) -> Option<[RigidMotion; 2]> {
     let scale = 2.0 / (h.x_axis.length() + h.y_axis.length());
     let scale = if h.z_axis.z < 0.0 { -scale } else { scale };
@@ -99,7 +100,7 @@ pub(crate) fn plane_poses(h: &DMat3) -> Option<[RigidMotion; 2]> {
     usable.then_some([pose, other])
 }
 
-/// Whether points spread over a plane, not along a line.
+/// Returns whether points spread over a plane instead of along a line.
 pub(crate) fn spread_out(points: &[DVec2]) -> bool {
     let count = points.len() as f64;
     let center = points.iter().sum::<DVec2>() / count.max(1.0);

@@ -1,65 +1,65 @@
-//! Calibration of one lens from a board that is shown in many poses.
+//! Calibration of one lens from a board in many poses; the lens model is chosen by the error of held-out views.
 
 use flyrig_solve::RigidMotion;
 use flyrig_types::{CameraId, Intrinsics, Lens};
 use glam::{DVec2, DVec3};
 
-use crate::{
-    Board, BoardShot, BoardView, CalibError, LensModel,
-    adjust::{Adjusted, adjust},
-    bundle::{Estimate, Free, SolvedCamera},
-    homography::{focal_length, homography},
-    start::{board_poses, rms},
-};
+use crate::adjust::{Adjusted, adjust};
+use crate::board::Board;
+use crate::bundle::{BoardShot, BoardView, Estimate, Free, SolvedCamera};
+use crate::error::CalibError;
+use crate::homography::{focal_length, homography};
+use crate::projection::LensModel;
+use crate::start::{board_poses, rms};
 
-/// Views that are solved for at most, those that differ most.
+/// Most views in a solve, those that differ most.
 const MOST_VIEWS: usize = 60;
-/// Fewest views of a board that fix a lens.
+/// Fewest views that determine a lens.
 const LEAST_VIEWS: usize = 4;
-/// Views whose corners move by less than this from one to the next show the same, pixels.
+/// Largest movement of corners between two views that count as equal, pixels.
 const SAME_PX: f64 = 1.0;
-/// Every so many views are kept out of the solves that choose the lens model.
+/// Interval of the views that are held out of the solves that choose the lens model.
 const HOLD_OUT_EVERY: usize = 4;
-/// A richer lens model is taken where it lowers the error of the views that were kept out to this share.
+/// Fraction of the held-out error of the simpler model below which a richer one is chosen.
 const WORTH: f64 = 0.97;
-/// Focal lengths that are tried besides the estimated one, in widths of the image.
+/// Initial focal lengths tried besides the estimated one, in widths of the image.
 const FOCAL_WIDTHS: [f64; 5] = [0.33, 0.5, 0.8, 1.2, 2.0];
-/// A fisheye is tried where corners lie farther than this from the optical axis, radians: closer to it, all lenses are alike.
+/// Angle of corners from the optical axis above which a fisheye is tried, radians: closer to it, all lenses are alike.
 const FISHEYE_FROM_RAD: f64 = 0.45;
-/// Largest standard deviation of the focal length that is a result, as a share of it.
+/// Largest accepted standard deviation of the focal length, relative to it.
 const MOST_FOCAL_SHARE: f64 = 0.02;
-/// A view is named as wrong where its error is larger than this multiple of the median view's.
+/// Multiple of the median view's error above which a view is reported as suspect.
 const SUSPECT: f64 = 3.0;
 /// Cells of the image, across and down, that corners should cover.
 const CELLS: (usize, usize) = (8, 6);
 
-/// A lens and how well it is known.
+/// Calibrated lens and its accuracy.
 #[derive(Debug, Clone)]
 pub struct LensFit {
     /// The lens.
     pub intrinsics: Intrinsics,
-    /// Which coefficients it has.
+    /// Model of its coefficients.
     pub model: LensModel,
-    /// Root mean square distance of drawn and seen corners, pixels.
+    /// Root mean square reprojection error, pixels.
     pub rms_px: f64,
     /// Standard deviation of a corner's coordinate without outliers, pixels.
     pub sigma_px: f64,
     /// Standard deviations of fx, fy, cx, cy, pixels.
     pub deviations_px: [f64; 4],
-    /// Error of views that were kept out, by lens model, pixels.
+    /// Error of held-out views per lens model, pixels.
     pub held_out_px: Vec<(LensModel, f64)>,
-    /// Time stamps of the views that were used and their errors, pixels.
+    /// Timestamps of the views that were used and their errors, pixels.
     pub views: Vec<(i64, f64)>,
-    /// Time stamps of views that fit far worse than the others.
+    /// Timestamps of views that fit far worse than the others.
     pub suspects: Vec<i64>,
-    /// Share of the image's cells that corners cover, 0..=1.
+    /// Fraction of the image's cells that corners cover, in 0..=1.
     pub coverage: f64,
 }
 
 /// Calibrates a lens.
 ///
 /// # Errors
-/// [`CalibError::TooFewViews`], [`CalibError::LensOpen`] where the boards leave it open.
+/// [`CalibError::TooFewViews`], [`CalibError::LensOpen`] where the boards leave it undetermined.
 pub fn calibrate_lens(
     board: &Board,
     camera: &CameraId,
@@ -123,7 +123,7 @@ pub fn calibrate_lens(
     })
 }
 
-/// Share of the image's cells with a corner.
+/// Returns the fraction of the image's cells with a corner.
 fn coverage(size: [u32; 2], views: &[BoardView]) -> f64 {
     let mut cells = vec![false; CELLS.0 * CELLS.1];
     for corner in views.iter().flat_map(|view| &view.corners) {
@@ -134,7 +134,7 @@ fn coverage(size: [u32; 2], views: &[BoardView]) -> f64 {
     cells.iter().filter(|cell| **cell).count() as f64 / cells.len() as f64
 }
 
-/// Views that show the board differently from each other, at most so many, in the order of time.
+/// Selects up to `most` views that show the board differently from each other, in the order of time.
 pub(crate) fn different_views(views: &[BoardView], most: usize) -> Vec<BoardView> {
     // Four numbers that change with the board's place, size and tilt, pixels.
     let sketch = |view: &BoardView| -> [DVec2; 4] {
@@ -164,7 +164,7 @@ pub(crate) fn different_views(views: &[BoardView], most: usize) -> Vec<BoardView
     chosen.into_iter().map(|i| views[i].clone()).collect()
 }
 
-/// Largest angle between the optical axis and a corner's ray, radians; 90 degrees where a corner has none.
+/// Returns the largest angle between the optical axis and a corner's ray, radians; 90 degrees where a corner has none.
 fn widest_angle(lens: &Intrinsics, views: &[BoardView]) -> f64 {
     let angle = |pixel: DVec2| {
         let ideal = lens.lens.undistort((pixel - lens.center_px) / lens.focal_px);
@@ -173,7 +173,7 @@ fn widest_angle(lens: &Intrinsics, views: &[BoardView]) -> f64 {
     views.iter().flat_map(|view| &view.corners).map(|corner| angle(corner.pixel)).fold(0.0, f64::max)
 }
 
-/// A lens of few coefficients that explains the views best, from several focal lengths.
+/// Fits a lens of few coefficients from several focal lengths and returns the best.
 fn first_guess(
     board: &Board,
     points: &[DVec3],

@@ -1,6 +1,16 @@
-//! Where the cameras are: calibration from boards, and calibration files.
+//! Camera calibration: from boards, from a moving person, of colours, and calibration files.
 //!
 //! Conventions are those of `flyrig_types`: OpenCV camera axes, pixel centres at integers, metres.
+//!
+//! - **Boards**: [`Board`] describes one, [`BoardSheet`] prints it, [`detector`] finds it in images. [`calibrate_lens`]
+//!   and [`calibrate_rig`] start from homographies and refine by bundle adjustment (poses, lenses, a time offset per
+//!   camera, the board's bend), which estimates noise and board velocities in turn with the unknowns.
+//! - **Person**: [`calibrate_person`] refines poses and time offsets from the [`PersonTracks`] of one moving person.
+//! - **Colours**: [`match_colors`] matches cameras by surface points that several of them see; the result is the field
+//!   `color` of `flyrig_types::Camera`.
+//! - **Watch**: [`CameraWatch`] detects a bumped camera from one rotation of its background.
+//! - **Files**: [`load_calibration`] chooses between `calibration.toml` and EasyMocap's files, [`Format`] converts
+//!   those of other programs. A camera's time offset is a field of `flyrig_types::Camera`.
 
 mod adjust;
 mod board;
@@ -9,6 +19,7 @@ mod calibration_file;
 mod color;
 mod convert;
 mod detect;
+mod dictionary;
 mod easymocap;
 mod error;
 mod folder;

@@ -1,4 +1,4 @@
-//! Calibration of a rig from one person who moves before it: better poses of the cameras and their time offsets.
+//! Calibration of a rig from one person who moves in front of it: better poses of the cameras and their time offsets.
 //!
 //! Landmarks and silhouettes of the person are found in each camera independently. The unknowns are the cameras' poses, one time
 //! offset per camera, and the positions of the landmarks at up to a few hundred instants. The residuals are reprojection errors of the
@@ -7,6 +7,7 @@
 
 mod problem;
 mod rays;
+mod smoothing;
 mod tangents;
 mod tracks;
 mod untangle;
@@ -16,22 +17,24 @@ use flyrig_types::{Camera, Intrinsics, Isometry, Rig};
 use glam::DVec3;
 use nalgebra::SMatrix;
 
-use crate::{CalibError, projection::project, uncertainty::pose_deviation};
-use problem::{Estimate, Known, PersonProblem, Spread};
-use rays::{Ray, nearest};
+use crate::error::CalibError;
+use crate::projection::project;
+use crate::uncertainty::pose_deviation;
+use problem::{Known, PersonEstimate, PersonProblem, Spread};
+use rays::{Ray, motions, nearest};
 pub use tangents::OutlineCorner;
 pub use tracks::PersonTracks;
 use untangle::untangled;
 
-/// Time between two instants at least, seconds.
+/// Minimum interval between two instants, seconds.
 const INSTANT_S: f64 = 0.025;
-/// Instants times cameras, at most.
+/// Maximum number of instants times cameras.
 const MOST_IMAGES: usize = 800;
 /// Number of instants with independent errors; more instants share this weight, since the network repeats its errors in similar images.
 const INDEPENDENT: f64 = 3.0;
-/// Landmarks seen by two cameras that an instant needs.
+/// Fewest landmarks seen by two cameras at an instant.
 const LEAST_LANDMARKS: usize = 6;
-/// Instants that a solve needs.
+/// Fewest instants of a solve.
 const LEAST_INSTANTS: usize = 10;
 /// Rounds of estimating spreads and lengths.
 const ROUNDS: usize = 5;
@@ -45,7 +48,7 @@ const LEAST_SIGMA_PX: f64 = 0.5;
 const POOLED: f64 = 10.0;
 /// Least standard deviation of a limb's length, metres: landmarks lie on clothes and skin.
 const LEAST_LIMB_M: f64 = 0.005;
-/// A quarter of the landmarks must move over more than this, metres.
+/// Least extent over which a quarter of the landmarks must move, metres.
 const LEAST_EXTENT_M: f64 = 0.1;
 /// Least standard deviation of the angle between tangent planes, radians.
 const LEAST_TOUCH: f64 = 5e-4;
@@ -68,7 +71,7 @@ impl Default for PersonOptions {
     }
 }
 
-/// A camera after [`calibrate_person`].
+/// Camera after [`calibrate_person`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct PersonCamera {
     /// Median reprojection error of the landmarks with the old calibration and now, pixels.
@@ -79,7 +82,8 @@ pub struct PersonCamera {
     pub deviation: (f64, f64),
     /// Mean displacement of the person in this camera's image caused by the change of pose, pixels.
     pub moved_px: f64,
-    /// The same between solves of the first and the second half of the take; `None` if one of them fails.
+    /// Mean displacement between solves of the first and the second half of the take, pixels; `None` if one of them
+    /// fails.
     pub halves_px: Option<f64>,
     /// Time offset, to be subtracted from the timestamps, and its standard deviation; seconds.
     pub lag_s: (f64, f64),
@@ -92,7 +96,7 @@ pub struct PersonCamera {
 pub struct PersonFit {
     /// The refined rig in the world frame of the old calibration.
     pub rig: Rig,
-    /// By slot.
+    /// Cameras per slot.
     pub cameras: Vec<PersonCamera>,
     /// Number of instants used.
     pub instants: usize,
@@ -109,8 +113,8 @@ pub struct PersonFit {
 /// groups of (left, right) landmarks that the network confuses together.
 ///
 /// # Errors
-/// [`CalibError::PersonTracks`] for tracks of another rig, [`CalibError::PersonOpen`] when too few cameras see the person at the same time,
-/// [`CalibError::PersonStill`] when nobody moves.
+/// [`CalibError::PersonTracks`] for tracks of another rig, [`CalibError::PersonOpen`] when too few cameras see the
+/// person at the same time, [`CalibError::PersonStill`] when the person stands still.
 pub fn calibrate_person(
     rig: &Rig,
     tracks: &PersonTracks,
@@ -177,17 +181,9 @@ pub fn calibrate_person(
     })
 }
 
-fn motions(rig: &Rig) -> Vec<RigidMotion> {
-    let of = |camera: &Camera| RigidMotion {
-        rotation: camera.camera_from_world.rotation,
-        translation: camera.camera_from_world.translation,
-    };
-    rig.cameras.iter().map(of).collect()
-}
-
 /// Result of one solve.
 struct Solved {
-    estimate: Estimate,
+    estimate: PersonEstimate,
     lag_sigma_s: Vec<f64>,
     /// Covariance of each camera's pose: rotation vector, then shift, applied on the left.
     poses: Vec<SMatrix<f64, 6, 6>>,
@@ -242,13 +238,13 @@ fn solve(
     tracks: &PersonTracks,
     limbs: &[(usize, usize)],
     options: PersonOptions,
-    start: Option<&Estimate>,
+    start: Option<&PersonEstimate>,
 ) -> Option<Solved> {
     let cameras = rig.cameras.len();
     let intrinsics: Vec<Intrinsics> = rig.cameras.iter().map(|camera| camera.intrinsics).collect();
     let intervals_s: Vec<f64> = (0..cameras).map(|slot| tracks.interval_s(slot)).collect();
     let old = motions(rig);
-    let mut estimate = Estimate {
+    let mut estimate = PersonEstimate {
         cameras: start.map_or_else(|| old.clone(), |start| start.cameras.clone()),
         lags_s: start.map_or_else(|| vec![0.0; cameras], |start| start.lags_s.clone()),
         points: Vec::new(),
@@ -261,7 +257,7 @@ fn solve(
         intervals_s: &intervals_s,
         instants: &instants,
         limbs,
-        before: Estimate { cameras: old, lags_s: vec![0.0; cameras], points: Vec::new() },
+        before: PersonEstimate { cameras: old, lags_s: vec![0.0; cameras], points: Vec::new() },
         prior: (options.turn_sigma, options.place_sigma_m),
         lag_sigma_s: options.lag_sigma_s,
         lags: options.lags,
@@ -310,7 +306,12 @@ fn solve(
 }
 
 /// Returns evenly spaced times at which two cameras see enough landmarks.
-fn instants(intrinsics: &[Intrinsics], tracks: &PersonTracks, intervals_s: &[f64], at: &Estimate) -> Option<Vec<i64>> {
+fn instants(
+    intrinsics: &[Intrinsics],
+    tracks: &PersonTracks,
+    intervals_s: &[f64],
+    at: &PersonEstimate,
+) -> Option<Vec<i64>> {
     let (first, last) = tracks.span()?;
     let span_s = last.saturating_sub(first) as f64 * 1e-9;
     let most = (MOST_IMAGES / intrinsics.len().max(1)).max(LEAST_INSTANTS);
@@ -331,7 +332,7 @@ fn instants(intrinsics: &[Intrinsics], tracks: &PersonTracks, intervals_s: &[f64
 }
 
 /// Triangulates all landmarks with the current poses.
-fn triangulate(known: &Known<'_>, estimate: &mut Estimate) {
+fn triangulate(known: &Known<'_>, estimate: &mut PersonEstimate) {
     let mut points = estimate.points.clone();
     for (instant, points) in points.iter_mut().enumerate() {
         for (landmark, point) in points.iter_mut().enumerate() {
@@ -349,14 +350,14 @@ fn triangulate(known: &Known<'_>, estimate: &mut Estimate) {
 }
 
 /// Returns the median reprojection error by camera, over landmarks seen by two cameras.
-fn errors_by_camera(known: &Known<'_>, at: &Estimate) -> Vec<f64> {
+fn errors_by_camera(known: &Known<'_>, at: &PersonEstimate) -> Vec<f64> {
     let mut errors = vec![Vec::new(); at.cameras.len()];
     each_error(known, at, |camera, _, px| errors[camera].push(px));
     errors.iter_mut().map(|errors| median(errors).unwrap_or(f64::NAN)).collect()
 }
 
 /// Calls `each` with camera, landmark and reprojection error of landmarks seen by at least two cameras.
-fn each_error(known: &Known<'_>, at: &Estimate, mut each: impl FnMut(usize, usize, f64)) {
+fn each_error(known: &Known<'_>, at: &PersonEstimate, mut each: impl FnMut(usize, usize, f64)) {
     for instant in 0..at.points.len() {
         for landmark in 0..known.tracks.landmarks() {
             let errors: Vec<(usize, f64)> = (0..at.cameras.len())
@@ -370,14 +371,14 @@ fn each_error(known: &Known<'_>, at: &Estimate, mut each: impl FnMut(usize, usiz
 }
 
 /// Returns the robust standard deviation of the angles between outermost tangent planes, radians; `None` without silhouettes.
-fn planes_rad(known: &Known<'_>, at: &Estimate) -> Option<f64> {
+fn planes_rad(known: &Known<'_>, at: &PersonEstimate) -> Option<f64> {
     let touches = (0..at.points.len()).flat_map(|instant| known.touches(at, instant));
     let mut angles: Vec<f64> = touches.map(|(.., found)| found.angle.abs()).collect();
     Some(SIGMA_PER_DEVIATION * median(&mut angles)?)
 }
 
 /// Estimates the standard deviations of landmarks, planes and limb lengths from the residuals.
-fn estimate_spread(known: &Known<'_>, at: &Estimate, spread: &mut Spread, with_limbs: bool) {
+fn estimate_spread(known: &Known<'_>, at: &PersonEstimate, spread: &mut Spread, with_limbs: bool) {
     let mut errors = vec![Vec::new(); known.tracks.landmarks()];
     each_error(known, at, |_, landmark, px| errors[landmark].push(px));
     let mut all: Vec<f64> = errors.iter().flatten().copied().collect();

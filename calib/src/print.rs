@@ -1,39 +1,50 @@
-//! Boards as files that are printed at true scale.
+//! Boards as files for printing at true scale.
 
 use std::fmt::Write as _;
 
 use pdf_writer::{Content, Finish as _, Name, Pdf, Rect, Ref, Str};
 
-use crate::{Board, Pattern, detect::dictionary};
+use crate::board::{Board, Pattern};
+use crate::dictionary::dictionary;
 
-/// Least white around the board, millimetres: a detector needs some, a printer leaves some empty.
+/// Least white margin around the board, millimetres: detectors need some, printers leave some unprinted.
 const MARGIN_MM: f64 = 12.0;
-/// Length of the printed ruler and the distance of its marks, millimetres.
+/// Length of the printed ruler and the spacing of its marks, millimetres.
 const RULER_MM: f64 = 100.0;
 const MARK_MM: f64 = 10.0;
 /// Height of text, millimetres.
 const TEXT_MM: f64 = 2.6;
 const POINTS_PER_MM: f64 = 72.0 / 25.4;
 
-/// Black rectangles and a line of text, millimetres from the top left of a sheet.
+/// Sheet of black rectangles and lines of text, millimetres from its top left.
+///
+/// ```
+/// use flyrig_calib::{Board, BoardSheet};
+///
+/// let a4 = [210.0, 297.0];
+/// let sheet = BoardSheet::new(&Board { square_mm: 25.0, ..Board::default() }, Some(a4))?;
+/// assert_eq!(sheet.size_mm, [297.0, 210.0], "turned along the board");
+/// assert!(sheet.to_svg().starts_with("<svg"));
+/// # Ok::<(), String>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct BoardSheet {
     /// Width and height of the sheet.
     pub size_mm: [f64; 2],
-    /// Place of the board's top left corner.
+    /// Position of the board's top left corner.
     pub board_at_mm: [f64; 2],
-    /// x, y, width, height; black.
+    /// Black rectangles: x, y, width, height.
     pub rectangles: Vec<[f64; 4]>,
-    /// x, y of the baseline's left end, text.
+    /// Lines of text: x, y of the baseline's left end, text.
     texts: Vec<([f64; 2], String)>,
 }
 
 impl BoardSheet {
-    /// Lays a board out in the middle of a sheet, the long side of the sheet along the long side of the board; on a sheet of its
-    /// own size where none is given.
+    /// Lays a board out in the centre of a sheet, long side along long side; on a sheet of its own size where none is
+    /// given.
     ///
     /// # Errors
-    /// As [`Board::check`]; or the sheet is too small for the board.
+    /// As [`Board::check`]; also when the sheet is too small for the board.
     pub fn new(board: &Board, sheet_mm: Option<[f64; 2]>) -> Result<Self, String> {
         board.check()?;
         let side = board.square_mm;
@@ -97,7 +108,7 @@ impl BoardSheet {
         Ok(())
     }
 
-    /// Draws a ruler and what to do with it below the board.
+    /// Draws a ruler with instructions below the board.
     fn ruler(&mut self, board: &Board) {
         let (left, y) = (MARGIN_MM, self.size_mm[1] - MARGIN_MM * 0.55);
         self.rectangles.push([left, y, RULER_MM, 0.2]);

@@ -3,11 +3,11 @@
 use flyrig_types::{Intrinsics, Lens};
 use glam::{DMat2, DVec2, DVec3};
 
-/// Smallest depth of a point that is projected, metres.
+/// Smallest depth of a projected point, metres.
 const LEAST_DEPTH_M: f64 = 1e-3;
 
-/// Which coefficients of a lens are sought, from few to many. A fisheye is a family of its own; of a fisheye lens, any other
-/// model means its first coefficients.
+/// Coefficients of a lens that are estimated, from few to many. Fisheyes are a family of their own; applied to a
+/// fisheye lens, any other model means its first coefficients.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LensModel {
@@ -25,7 +25,7 @@ pub enum LensModel {
     Rational,
 }
 
-/// Parameters that every model has: fx, fy, cx, cy.
+/// Common parameters of all models: fx, fy, cx, cy.
 const COMMON: usize = 4;
 /// Most coefficients of a model.
 const COEFFICIENTS: usize = 8;
@@ -35,7 +35,7 @@ impl LensModel {
     pub const ALL: [Self; 6] =
         [Self::Radial1, Self::Radial2, Self::RadialTangential, Self::RadialTangential3, Self::Fisheye, Self::Rational];
 
-    /// Name for reports.
+    /// Returns the name for reports.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -48,7 +48,7 @@ impl LensModel {
         }
     }
 
-    /// Number of parameters, focal lengths and centre included.
+    /// Returns the number of parameters, including focal lengths and centre.
     #[must_use]
     pub fn parameters(self) -> usize {
         COMMON
@@ -61,7 +61,7 @@ impl LensModel {
             }
     }
 
-    /// Returns the lens as one whose coefficients this model can change. A fisheye stays what it is.
+    /// Returns the lens in a form whose coefficients this model can change. A fisheye stays a fisheye.
     pub(crate) fn start(self, lens: Lens) -> Lens {
         match (self, lens.rational()) {
             (Self::Rational, Some((radial, tangential))) => Lens::Rational { radial, tangential },
@@ -99,12 +99,12 @@ impl LensModel {
     }
 }
 
-/// Pixel of a point and its derivatives.
+/// Pixel of a point with its derivatives.
 pub(crate) struct Projected {
     pub pixel: DVec2,
-    /// By x, y, z of the point.
+    /// Derivatives by x, y, z of the point.
     pub by_point: [DVec2; 3],
-    /// By the parameters of the lens model.
+    /// Derivatives by the parameters of the lens model.
     pub by_lens: Vec<DVec2>,
 }
 
@@ -123,7 +123,7 @@ fn ideal(intrinsics: &Intrinsics, point: DVec3) -> Option<DVec2> {
     usable.then_some(ideal)
 }
 
-/// The same with derivatives.
+/// Projects as [`project`], with derivatives.
 pub(crate) fn project_with_derivatives(intrinsics: &Intrinsics, model: LensModel, point: DVec3) -> Option<Projected> {
     let ideal = ideal(intrinsics, point)?;
     let focal = intrinsics.focal_px;
@@ -136,7 +136,7 @@ pub(crate) fn project_with_derivatives(intrinsics: &Intrinsics, model: LensModel
     Some(Projected { pixel: distorted * focal + intrinsics.center_px, by_point, by_lens })
 }
 
-/// Derivatives of the distorted point by the ideal one, and by the coefficients in the order of the models.
+/// Returns the derivatives of the distorted point by the ideal one, and by the coefficients in the order of the models.
 fn derivatives(lens: &Lens, ideal: DVec2) -> (DMat2, [DVec2; COEFFICIENTS]) {
     let (x, y) = (ideal.x, ideal.y);
     let r2 = ideal.length_squared();

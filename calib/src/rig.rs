@@ -1,82 +1,85 @@
-//! Calibration of a whole rig from a board that its cameras see together.
+//! Calibration of a whole rig from a board that its cameras see together. The rig is also solved from either half of
+//! the shots, as a check.
 
 use flyrig_solve::{RigidMotion, log_rotation};
 use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Rig};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use nalgebra::SMatrix;
 
-use crate::{
-    Board, BoardShot, BoardView, CalibError, LensModel, Pair, Uncertainty,
-    adjust::{Adjusted, adjust},
-    bundle::{Estimate, Free, bend_shares},
-    start::{rig_start, rms},
-    uncertainty::pose_deviation,
-};
+use crate::adjust::{Adjusted, adjust};
+use crate::board::Board;
+use crate::bundle::{BoardShot, BoardView, Estimate, Free, bend_shares};
+use crate::error::CalibError;
+use crate::projection::LensModel;
+use crate::start::{Pair, rig_start, rms};
+use crate::uncertainty::{Uncertainty, pose_deviation};
 
 /// Options of [`calibrate_rig`].
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct RigOptions {
-    /// Also refines the lenses, with these coefficients.
+    /// Lens coefficients to refine; `None` keeps the lenses.
     pub lens: Option<LensModel>,
-    /// Also finds a time offset for each camera.
+    /// Whether to estimate a time offset per camera.
     pub lags: bool,
-    /// Also finds how the board is bent.
+    /// Whether to estimate the bend of the board.
     pub bend: bool,
-    /// The first shot's board lies on the floor: it gives height 0 and the direction up.
+    /// Whether the first shot's board lies on the floor, which gives height 0 and the up direction.
     pub floor_first: bool,
 }
 
-/// A camera of a calibrated rig.
+/// Camera of a calibrated rig.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RigCamera {
-    /// Root mean square distance of drawn and seen corners, pixels.
+    /// Root mean square reprojection error, pixels.
     pub rms_px: f64,
-    /// The corners that it saw, of all shots.
+    /// Corners that it saw, of all shots.
     pub corners: Vec<CornerError>,
-    /// Views of the board.
+    /// Number of views of the board.
     pub views: usize,
-    /// Standard deviation of its direction and place against the first camera's: degrees, millimetres. `None` where views
-    /// leave it open.
+    /// Standard deviation of its orientation and position relative to the first camera: degrees, millimetres. `None`
+    /// where the views leave it undetermined.
     pub deviation: Option<(f64, f64)>,
-    /// The same as deviations across its image and in the middle of the boards; `None` where views leave the pose open.
+    /// Uncertainty across its image and in the centre of the boards; `None` where the views leave the pose
+    /// undetermined.
     pub uncertainty: Option<Uncertainty>,
-    /// Difference of its direction and place between the solves from either half of the shots: degrees, millimetres.
+    /// Difference of its orientation and position between the solves from either half of the shots: degrees,
+    /// millimetres.
     pub halves: Option<(f64, f64)>,
-    /// Time offset, subtracted from its stamps, and the standard deviation; seconds.
+    /// Time offset, subtracted from its timestamps, and its standard deviation; seconds.
     pub lag_s: (f64, f64),
 }
 
-/// A corner of a board as a camera saw it, and as it is drawn after the solve.
+/// Observed corner of a board and its reprojection error.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CornerError {
-    /// Pixel where it is seen.
+    /// Observed pixel.
     pub pixel: DVec2,
-    /// The drawn corner from the seen one, pixels.
+    /// Reprojection error (projected minus observed), pixels.
     pub off_px: DVec2,
 }
 
-/// A calibrated rig and how well it is known.
+/// Calibrated rig and its accuracy.
 #[derive(Debug, Clone)]
 pub struct RigFit {
-    /// The cameras; world metres, z up.
+    /// Cameras, in a world in metres with z up.
     pub rig: Rig,
-    /// In the order of the rig.
+    /// Results per camera, in rig order.
     pub cameras: Vec<RigCamera>,
     /// Pairs of cameras that saw the board together.
     pub pairs: Vec<Pair>,
-    /// Root mean square distance of drawn and seen corners, pixels.
+    /// Root mean square reprojection error, pixels.
     pub rms_px: f64,
     /// Standard deviation of a corner's coordinate without outliers, pixels.
     pub sigma_px: f64,
-    /// Deepest place of the board's surface behind its highest, and the standard deviation, where a bend was sought; millimetres.
+    /// Depth range of the board's surface and its standard deviation, where a bend was estimated; millimetres.
     pub bend_mm: Option<(f64, f64)>,
     /// Times of the shots, nanoseconds, and their errors, pixels.
     pub shots: Vec<(i64, f64)>,
 }
 
 impl RigFit {
-    /// Largest ratio of the difference between the halves to what noise explains (two standard deviations of each), with
-    /// its camera; above 1 something else is wrong: a time offset, blur, a bent board, a lens.
+    /// Returns the largest ratio of the difference between the halves to the part that noise explains (two standard
+    /// deviations of each), with its camera. Above 1 there is another cause: a time offset, blur, a bent board, a lens.
     #[must_use]
     pub fn worst_disagreement(&self) -> Option<(usize, f64)> {
         let ratio = |camera: &RigCamera| {
@@ -89,7 +92,7 @@ impl RigFit {
     }
 }
 
-/// Calibrates a rig whose lenses are known at least roughly.
+/// Calibrates a rig whose lenses are at least roughly known.
 ///
 /// # Errors
 /// [`CalibError::NotLinked`], [`CalibError::RigOpen`].
@@ -147,7 +150,7 @@ pub fn calibrate_rig(
     })
 }
 
-/// Solves again from every second shot.
+/// Solves again from alternate shots.
 fn half_solve(points: &[DVec3], shots: &[BoardShot], at: &Estimate, free: Free, half: usize) -> Option<Estimate> {
     let every_second = |i: &usize| i % 2 == half;
     let part: Vec<BoardShot> = (0..shots.len()).filter(every_second).map(|i| shots[i].clone()).collect();
@@ -214,7 +217,8 @@ fn camera(
     }
 }
 
-/// How much of a bend there is: the range of the surface's depth over the corners, and the deviation of the corner that is known worst.
+/// Returns the size of the bend: the depth range of the surface over the corners, and the standard deviation of the
+/// least certain corner.
 fn bend_mm(points: &[DVec3], fit: &Adjusted) -> (f64, f64) {
     let shares = bend_shares(points);
     let depth = |share: &[f64; 3]| fit.estimate.bend_m.iter().zip(share).map(|(bend, share)| bend * share).sum::<f64>();
@@ -231,7 +235,7 @@ fn bend_mm(points: &[DVec3], fit: &Adjusted) -> (f64, f64) {
     (1e3 * (most - least), 1e3 * deviation)
 }
 
-/// Direction up in the rig's axes: off the board on the floor, or what most cameras have above.
+/// Returns the up direction in the rig's axes: normal to the board on the floor, or the cameras' mean up direction.
 fn world_up(fit: &Adjusted, floor_first: bool) -> DVec3 {
     match fit.estimate.boards.first().filter(|_| floor_first) {
         Some(first) => first.rotation * DVec3::NEG_Z,
@@ -242,7 +246,8 @@ fn world_up(fit: &Adjusted, floor_first: bool) -> DVec3 {
     }
 }
 
-/// World axes: z up; the origin is the middle of the board on the floor, or of all boards; the first camera looks along y.
+/// Returns the transform to world axes: z up; the origin is the centre of the board on the floor, or of all boards; the
+/// first camera looks along y.
 fn world_from_rig(board: &Board, fit: &Adjusted, up: DVec3, floor_first: bool) -> RigidMotion {
     let middle = |pose: &RigidMotion| pose.apply(board.middle());
     let boards = &fit.estimate.boards;

@@ -1,4 +1,5 @@
-//! First guesses: focal lengths, boards before each camera, cameras to each other.
+//! Initial values: focal lengths, board poses, and camera poses by the vote of the shots, joined along the strongest
+//! pairs.
 
 use std::collections::BTreeMap;
 
@@ -6,22 +7,22 @@ use flyrig_solve::{RigidMotion, log_rotation};
 use flyrig_types::{CameraId, Intrinsics};
 use glam::{DVec2, DVec3};
 
-use crate::{
-    Board, BoardShot, BoardView, CalibError,
-    adjust::adjust,
-    bundle::{Estimate, Free, SolvedCamera},
-    homography::{homography, plane_poses, spread_out},
-};
+use crate::adjust::adjust;
+use crate::board::Board;
+use crate::bundle::{BoardShot, BoardView, Estimate, Free, SolvedCamera};
+use crate::error::CalibError;
+use crate::homography::{homography, plane_poses, spread_out};
 
-/// Two ways of placing a camera agree within this angle, radians, and share of the distance.
+/// Largest angle, radians, and relative distance by which two estimates of a camera's pose agree.
 const AGREE_RAD: f64 = 0.05;
 const AGREE_SHARE: f64 = 0.05;
-/// A pose of a flat board is a rival of the best one if its error is no larger than this multiple.
+/// Multiple of the best pose's error up to which the other pose of a flat board is kept.
 const RIVAL: f64 = 3.0;
-/// A view is refused where the best pose of the board leaves more, as a share of the image's width.
+/// Error of the best board pose above which a view is rejected, relative to the image's width.
 const MOST_ERROR: f64 = 0.01;
 
-/// Poses of the board before one camera that explain a view, best first: one, or two where the view is too flat to tell.
+/// Estimates the board poses that explain a view, best first: one, or two where the view is too flat to distinguish
+/// them.
 pub(crate) fn board_poses(board: &Board, intrinsics: &Intrinsics, view: &BoardView) -> Vec<RigidMotion> {
     let ideal: Vec<(DVec2, DVec2)> = view
         .corners
@@ -57,7 +58,7 @@ pub(crate) fn board_poses(board: &Board, intrinsics: &Intrinsics, view: &BoardVi
     found.iter().enumerate().filter(|&item| is_rival(item)).map(|(_, (_, pose))| *pose).collect()
 }
 
-/// Root mean square.
+/// Returns the root mean square.
 pub(crate) fn rms(values: impl Iterator<Item = f64>) -> f64 {
     let (sum, count) = values.fold((0.0, 0usize), |(sum, count), value| (sum + value * value, count + 1));
     if count == 0 { 0.0 } else { (sum / count as f64).sqrt() }
@@ -69,18 +70,18 @@ fn agree(a: &RigidMotion, b: &RigidMotion) -> bool {
     turn < AGREE_RAD && a.translation.distance(b.translation) < AGREE_SHARE * far
 }
 
-/// A pair of cameras that saw the board together.
+/// Pair of cameras that saw the board together.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct Pair {
     /// Slots of the cameras, ascending.
     pub cameras: (usize, usize),
     /// Shots that both saw.
     pub shots: usize,
-    /// Shots that agree on how the cameras stand to each other.
+    /// Shots that agree on the cameras' relative pose.
     pub agreeing: usize,
 }
 
-/// First guess of all poses, the first camera's axes being the rig's, with the pairs that it rests on.
+/// Estimates initial poses in the axes of the first camera, with the pairs that they rest on.
 ///
 /// # Errors
 /// [`CalibError::NotLinked`] lists the groups of cameras that never saw the board together.
@@ -179,7 +180,7 @@ pub(crate) fn rig_start(
     Ok((Estimate { cameras, boards, bend_m: [0.0; 3] }, pairs, kept))
 }
 
-/// Groups of cameras that links join, by name.
+/// Returns the groups of linked cameras, by name.
 fn groups(ids: &[CameraId], links: &[(usize, usize, usize, RigidMotion)]) -> String {
     let mut group: Vec<usize> = (0..ids.len()).collect();
     for &(_, a, b, _) in links {

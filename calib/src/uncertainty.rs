@@ -1,27 +1,28 @@
-//! Propagates the covariance of a camera's pose: to pixels across its image, and to millimetres in the middle of the boards.
+//! Propagation of the covariance of a camera's pose to pixels across its image, and to millimetres in the centre of the
+//! boards.
 
 use flyrig_solve::RigidMotion;
 use flyrig_types::Intrinsics;
 use glam::{DVec2, DVec3};
 use nalgebra::SMatrix;
 
-use crate::{LensModel, projection::project_with_derivatives};
+use crate::projection::{LensModel, project_with_derivatives};
 
-/// Places along the width and the height of an image.
+/// Grid of positions along the width and the height of an image.
 const GRID: [usize; 2] = [9, 7];
 
-/// Standard deviations of a camera's projections that follow from the covariance of its pose against the first camera's.
+/// Standard deviations of a camera's projections from the covariance of its pose relative to the first camera.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Uncertainty {
-    /// Pixels all over the image, and the deviation there of points that are as far away as the boards were; pixels.
+    /// Pixels across the image, with the standard deviation there of points at the boards' distance; pixels.
     pub image_px: Vec<(DVec2, f64)>,
-    /// Deviation of the place of a point in the middle of the boards, in the camera's axes; millimetres.
+    /// Standard deviation of the position of a point in the centre of the boards, camera axes; millimetres.
     pub middle_mm: f64,
 }
 
 impl Uncertainty {
-    /// From the covariance of a step (rotation vector, then shift) that is applied to a camera's pose on the left
-    /// ([`RigidMotion::moved`]); `middle` is a point in the axes that the pose starts from.
+    /// Propagates the covariance of a step (rotation vector, then shift) that is applied to a camera's pose on the left
+    /// ([`RigidMotion::moved`]); `middle` is a point in the axes that the pose maps from.
     pub(crate) fn new(
         covariance: &SMatrix<f64, 6, 6>,
         camera_from_rig: &RigidMotion,
@@ -49,14 +50,14 @@ impl Uncertainty {
         }
     }
 
-    /// Largest deviation in the image, pixels; 0 without any.
+    /// Returns the largest deviation in the image, pixels; 0 without any.
     #[must_use]
     pub fn worst_px(&self) -> f64 {
         self.image_px.iter().map(|(_, px)| *px).fold(0.0, f64::max)
     }
 }
 
-/// Derivative of a point in the camera's axes by the step: `exp(turn) (point - t) + t + shift`.
+/// Returns the derivative of a point in camera axes by the step: `exp(turn) (point - t) + t + shift`.
 fn by_point_of_step(camera_from_rig: &RigidMotion, point: DVec3) -> SMatrix<f64, 3, 6> {
     let by_turn = -flyrig_solve::skew(point - camera_from_rig.translation);
     let by_turn = by_turn.to_cols_array();
@@ -66,8 +67,8 @@ fn by_point_of_step(camera_from_rig: &RigidMotion, point: DVec3) -> SMatrix<f64,
     })
 }
 
-/// Standard deviations of a camera's direction, degrees, and place, millimetres, from the covariance of a step that is applied to its pose
-/// on the left.
+/// Returns the standard deviations of a camera's orientation, degrees, and position, millimetres, from the covariance
+/// of a step that is applied to its pose on the left.
 pub(crate) fn pose_deviation(block: &SMatrix<f64, 6, 6>, pose: &RigidMotion) -> (f64, f64) {
     let turn = (block[(0, 0)] + block[(1, 1)] + block[(2, 2)]).max(0.0).sqrt().to_degrees();
     // place = -Rᵀ t; lengths do not change with Rᵀ. After exp(δ) R and t + s: t + s + t × δ.
@@ -79,7 +80,7 @@ pub(crate) fn pose_deviation(block: &SMatrix<f64, 6, 6>, pose: &RigidMotion) -> 
     (turn, 1e3 * place.trace().max(0.0).sqrt())
 }
 
-/// Root of the trace of `J C Jᵀ`.
+/// Returns the root of the trace of `J C Jᵀ`.
 fn deviation<const N: usize>(by_step: &SMatrix<f64, N, 6>, covariance: &SMatrix<f64, 6, 6>) -> f64 {
     (by_step * covariance * by_step.transpose()).trace().max(0.0).sqrt()
 }
@@ -92,7 +93,7 @@ mod tests {
     use super::*;
     use crate::projection::project;
 
-    /// Sum over the columns of a root of the covariance of the squared motion of `f`, by finite differences.
+    /// Returns the squared motion of `f`, summed over the columns of a root of the covariance, by finite differences.
     fn reference(root: &SMatrix<f64, 6, 6>, f: impl Fn(DVec3, DVec3) -> DVec3) -> f64 {
         let column = |k: usize| {
             let step = |sign: f64| {

@@ -1,9 +1,10 @@
-//! Watches whether a camera still stands as it stood when its reference image was taken.
+//! Detection of bumped cameras: tracks corners of one camera's background against a reference image.
 //!
 //! Corners of the static background are tracked by gradient descent on normalised brightness (Lucas and Kanade 1981, with the
 //! brightness of each patch brought to mean 0 and length 1, so that lights and exposure change nothing), and one rotation of the
 //! camera must explain most of them. People and moved furniture agree on no rotation.
 
+mod image;
 mod patches;
 #[cfg(test)]
 mod tests;
@@ -12,25 +13,23 @@ use flyrig_solve::exp_rotation;
 use flyrig_types::{Camera, Intrinsics, Isometry};
 use glam::{DMat3, DVec2, DVec3};
 
+pub use self::image::WatchedImage;
 use self::patches::{Patch, Pyramid, choose, coarse_shift, track};
-use crate::{
-    LensModel,
-    projection::{project, project_with_derivatives},
-};
+use crate::projection::{LensModel, project, project_with_derivatives};
 
-/// Images are reduced until their width is at most this, pixels.
+/// Largest width of the reduced image, pixels.
 const WIDTH: usize = 640;
-/// Patches agree with a rotation within this distance, pixels of the reduced image.
+/// Distance within which a patch agrees with a rotation, pixels of the reduced image.
 const AGREE_PX: f64 = 0.75;
-/// Fewest patches, and least share of those that were found again, that must agree.
+/// Fewest agreeing patches, and least fraction of the tracked ones.
 const LEAST_PATCHES: usize = 12;
 const LEAST_SHARE: f64 = 0.4;
-/// Share of the patches that must be found again before a large shift is looked for.
+/// Fraction of tracked patches below which a large shift is searched for.
 const FEW_FOUND: f64 = 0.3;
-/// Mean motion of the image that counts, pixels of the reduced image.
+/// Least mean motion of the image that is reported, pixels of the reduced image.
 const LEAST_MOTION_PX: f64 = 0.5;
-/// Consecutive looks that must agree on a motion, within this share of it.
-const LOOKS: usize = 3;
+/// Consecutive images that must agree on a motion, and their relative tolerance.
+const CONFIRMATIONS: usize = 3;
 const SAME_SHARE: f64 = 0.3;
 /// Steps of the robust fit.
 const STEPS: usize = 10;
@@ -38,16 +37,16 @@ const STEPS: usize = 10;
 /// Motion of a camera against its reference.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CameraMotion {
-    /// Rotation vector of the camera in its own axes, radians. A small translation shows as rotation too.
+    /// Rotation vector of the camera in its own axes, radians. A small translation appears as rotation too.
     pub rotation: DVec3,
     /// Mean motion of the image, pixels.
     pub pixels: f64,
-    /// Patches that agree, of those of the reference.
+    /// Agreeing patches, and all patches of the reference.
     pub agreeing: (usize, usize),
 }
 
 impl CameraMotion {
-    /// The camera after this motion.
+    /// Returns the camera after this motion.
     #[must_use]
     pub fn applied_to(&self, camera: &Camera) -> Camera {
         // What stands still turns the other way in the camera's axes.
@@ -56,46 +55,33 @@ impl CameraMotion {
     }
 }
 
-/// State of a camera.
+/// State of a watched camera.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum WatchState {
-    /// Too little of the background is seen, or nothing was compared yet.
+    /// Too little of the background is visible, or nothing was compared yet.
     #[default]
     Unknown,
-    /// It stands as in the reference.
+    /// The camera stands as in the reference.
     Steady,
-    /// It was moved.
+    /// The camera was moved.
     Moved(CameraMotion),
 }
 
-/// Compares the images of one camera with a reference.
+/// Comparison of one camera's images with a reference.
 #[derive(Debug, Clone)]
 pub struct CameraWatch {
     intrinsics: Intrinsics,
-    /// Pixels of the image in one of the reduced image.
+    /// Reduction factor of the image.
     factor: f64,
     patches: Vec<Patch>,
     rotation: DVec3,
-    /// Motions of the last looks, newest last.
+    /// Motions in recent images, newest last.
     recent: Vec<CameraMotion>,
     state: WatchState,
 }
 
-/// An RGB or grey image: bytes, `channels` for each pixel, row by row.
-#[derive(Debug, Clone, Copy)]
-pub struct WatchedImage<'a> {
-    /// Pixels.
-    pub width: usize,
-    /// Pixels.
-    pub height: usize,
-    /// 1 or 3.
-    pub channels: usize,
-    /// `width * height * channels` bytes.
-    pub bytes: &'a [u8],
-}
-
 impl CameraWatch {
-    /// Takes a reference image; `None` where it is not of the calibrated size, or shows too few corners.
+    /// Creates a watch from a reference image; `None` if it is not of the calibrated size, or shows too few corners.
     #[must_use]
     pub fn new(intrinsics: &Intrinsics, reference: &WatchedImage<'_>) -> Option<Self> {
         if [reference.width, reference.height] != [intrinsics.width as usize, intrinsics.height as usize] {
@@ -119,34 +105,35 @@ impl CameraWatch {
         })
     }
 
-    /// State after the last look.
+    /// Returns the state after the last image.
     #[must_use]
     pub fn state(&self) -> WatchState {
         self.state
     }
 
-    /// Motion in the last image in which enough of the background was found again, whether it counts or not.
+    /// Returns the motion in the last image in which enough of the background was tracked, whether it is reported or
+    /// not.
     #[must_use]
     pub fn last_motion(&self) -> Option<CameraMotion> {
         self.recent.last().copied()
     }
 
-    /// Compares an image, about once a second, and returns the new state. A motion is reported once three looks agree on it; an image in
-    /// which too little of the background is found again changes nothing.
-    pub fn look(&mut self, image: &WatchedImage<'_>) -> WatchState {
+    /// Compares an image, about once per second, and returns the new state. A motion is reported once three images
+    /// agree on it; an image in which too little of the background is tracked changes nothing.
+    pub fn compare(&mut self, image: &WatchedImage<'_>) -> WatchState {
         let is_of_size =
             [image.width, image.height] == [self.intrinsics.width as usize, self.intrinsics.height as usize];
         let pyramid = Some(image).filter(|_| is_of_size).and_then(|image| Pyramid::new(image, self.factor as usize));
         let Some(motion) = pyramid.and_then(|pyramid| self.motion(&pyramid)) else { return self.state };
         self.rotation = motion.rotation;
         self.recent.push(motion);
-        if self.recent.len() > LOOKS {
+        if self.recent.len() > CONFIRMATIONS {
             self.recent.remove(0);
         }
         let least = LEAST_MOTION_PX * self.factor;
         let focal = self.intrinsics.focal_px.max_element();
         let apart = |a: &CameraMotion, b: &CameraMotion| focal * a.rotation.distance(b.rotation);
-        if self.recent.len() == LOOKS {
+        if self.recent.len() == CONFIRMATIONS {
             if self.recent.iter().all(|motion| motion.pixels < least) {
                 self.state = WatchState::Steady;
             } else if self
@@ -160,7 +147,7 @@ impl CameraWatch {
         self.state
     }
 
-    /// Rotation that most patches agree on; `None` without one.
+    /// Estimates the rotation that most patches agree on; `None` without one.
     fn motion(&self, pyramid: &Pyramid) -> Option<CameraMotion> {
         let predicted = |rotation: DVec3| {
             let shift = |patch: &Patch| {
@@ -191,12 +178,12 @@ impl CameraWatch {
         Some(CameraMotion { rotation, pixels, agreeing: (agreeing, self.patches.len()) })
     }
 
-    /// Pixel of a patch after the camera turned. What stands still turns the other way in the camera's axes.
+    /// Returns the pixel of a patch after the camera turned. In the camera's axes the static world turns the other way.
     fn pixel(&self, patch: &Patch, rotation: DVec3) -> Option<DVec2> {
         project(&self.intrinsics, exp_rotation(-rotation) * patch.ray)
     }
 
-    /// Derivative of the pixel by the rotation vector, columns.
+    /// Returns the derivative of the pixel by the rotation vector, as columns.
     fn by_rotation(&self, patch: &Patch, rotation: DVec3) -> Option<(DVec2, [DVec2; 3])> {
         let ray = exp_rotation(-rotation) * patch.ray;
         let projected = project_with_derivatives(&self.intrinsics, LensModel::Radial1, ray)?;
@@ -207,7 +194,7 @@ impl CameraWatch {
         Some((projected.pixel, [column(DVec3::X), column(DVec3::Y), column(DVec3::Z)]))
     }
 
-    /// Rotation that most pairs of a patch and its pixel agree on, and how many do.
+    /// Finds the rotation that most pairs of a patch and its pixel agree on, and their number.
     fn consensus(&self, pairs: &[(&Patch, DVec2)]) -> Option<(DVec3, usize)> {
         let tolerance = AGREE_PX * self.factor;
         let agreeing = |rotation: DVec3| {

@@ -1,6 +1,6 @@
-//! The YAML that OpenCV's FileStorage writes, and nothing more of YAML: keys, scalars, lists, matrices.
+//! Reader and writer of the YAML subset of OpenCV's FileStorage: keys, scalars, lists, matrices.
 //!
-//! OpenCV's own reader stands still for ever before some damaged files, so this is read here.
+//! OpenCV's own reader hangs on some damaged files; hence this one.
 
 use std::{
     fmt::Write as _,
@@ -10,12 +10,12 @@ use std::{
 
 use flyrig_types::CameraId;
 
-use crate::CalibError;
+use crate::error::CalibError;
 
-/// Calibrations are small; larger files are something else.
+/// Maximum file size: calibrations are small, larger files are something else.
 const MAX_BYTES: usize = 16 << 20;
 
-/// A matrix of a file, row by row.
+/// Matrix of a file, row by row.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Matrix {
     pub rows: usize,
@@ -23,17 +23,17 @@ pub(crate) struct Matrix {
     pub values: Vec<f64>,
 }
 
-/// A value of a file.
+/// Value of a file.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Value {
-    /// As it stands; whether it was quoted.
+    /// Scalar text, and whether it was quoted.
     Scalar(String, bool),
     List(Vec<Value>),
     Map(Vec<(String, Value)>),
 }
 
 impl Value {
-    /// A number; `None` for anything else.
+    /// Returns a number; `None` for anything else.
     pub fn number(&self) -> Option<f64> {
         let Self::Scalar(text, false) = self else { return None };
         match text.as_str() {
@@ -46,32 +46,32 @@ impl Value {
         }
     }
 
-    /// A value of a map.
+    /// Returns a value of a map.
     pub fn get(&self, key: &str) -> Option<&Self> {
         let Self::Map(entries) = self else { return None };
         entries.iter().find(|(name, _)| name == key).map(|(_, value)| value)
     }
 
-    /// A word, quoted or not.
+    /// Returns a scalar as text, quoted or not.
     pub fn word(&self) -> Option<&str> {
         let Self::Scalar(text, _) = self else { return None };
         Some(text)
     }
 
-    /// A list of numbers.
+    /// Returns a list of numbers.
     pub fn numbers(&self) -> Option<Vec<f64>> {
         let Self::List(values) = self else { return None };
         values.iter().map(Self::number).collect()
     }
 
-    /// A list of lists of numbers.
+    /// Returns a list of lists of numbers.
     pub fn rows(&self) -> Option<Vec<Vec<f64>>> {
         let Self::List(values) = self else { return None };
         values.iter().map(Self::numbers).collect()
     }
 }
 
-/// Reads a plain YAML file, of maps in maps with lists, as Kalibr writes them.
+/// Reads a plain YAML file of nested maps and lists, as Kalibr writes them.
 pub(crate) fn parse_tree(path: &Path) -> Result<Value, CalibError> {
     let bytes = std::fs::read(path).map_err(|source| CalibError::Read { path: path.to_owned(), source })?;
     let parsed = text_of(&bytes).and_then(|text| Lines::new(text).map());
@@ -81,7 +81,7 @@ pub(crate) fn parse_tree(path: &Path) -> Result<Value, CalibError> {
     })
 }
 
-/// Checks that bytes are text of a sensible length.
+/// Checks that bytes are UTF-8 text of an acceptable length.
 fn text_of(bytes: &[u8]) -> Result<&str, String> {
     if bytes.len() > MAX_BYTES {
         return Err(format!("it has {} bytes, at most {MAX_BYTES}", bytes.len()));
@@ -90,7 +90,7 @@ fn text_of(bytes: &[u8]) -> Result<&str, String> {
     Ok(text.trim_start_matches('\u{feff}'))
 }
 
-/// A parsed file.
+/// Parsed file.
 pub(crate) struct YamlFile {
     path: PathBuf,
     entries: Vec<(String, Value)>,
@@ -124,7 +124,7 @@ impl YamlFile {
         self.entries.iter().find(|(name, _)| name == key).map(|(_, value)| value)
     }
 
-    /// Every key of the top level.
+    /// Returns every key of the top level.
     pub fn keys(&self) -> Result<Vec<String>, CalibError> {
         if self.entries.is_empty() {
             return Err(CalibError::Parse { path: self.path.clone(), reason: "no keys in it".to_owned() });
@@ -132,8 +132,8 @@ impl YamlFile {
         Ok(self.entries.iter().map(|(key, _)| key.clone()).collect())
     }
 
-    /// A list of strings; `None` when it is missing or holds anything else (YAML reads a bare 00 as
-    /// the number 0).
+    /// Returns a list of strings; `None` when it is missing or holds anything else (YAML reads a bare 00 as the number
+    /// 0).
     pub fn strings(&self, key: &str) -> Option<Vec<String>> {
         let Some(Value::List(values)) = self.get(key) else { return None };
         values
@@ -145,12 +145,12 @@ impl YamlFile {
             .collect()
     }
 
-    /// A number; `None` when it is missing or no number.
+    /// Returns a number; `None` when it is missing or no number.
     pub fn number(&self, key: &str) -> Option<f64> {
         self.get(key)?.number()
     }
 
-    /// A matrix of finite numbers, `None` when the key is missing.
+    /// Returns a matrix of finite numbers, `None` when the key is missing.
     pub fn matrix(&self, camera: &CameraId, key: &str) -> Result<Option<Matrix>, CalibError> {
         let broken = |problem: String| CalibError::Value {
             path: self.path.clone(),
@@ -184,7 +184,7 @@ impl YamlFile {
     }
 }
 
-/// The lines that hold something, with their number and indentation.
+/// Non-empty lines, with number and indentation.
 struct Lines<'a> {
     lines: Vec<(usize, usize, &'a str)>,
     at: usize,
@@ -200,16 +200,17 @@ impl<'a> Lines<'a> {
         Self { lines: text.lines().enumerate().filter_map(line).collect(), at: 0 }
     }
 
-    /// The top level.
+    /// Parses the top level.
     fn map(mut self) -> Result<Vec<(String, Value)>, String> {
         let entries = self.entries(0, true)?;
         match self.lines.get(self.at) {
-            Some((number, ..)) => Err(format!("line {number} is indented, but belongs to nothing")),
+            Some((number, ..)) => Err(format!("line {number} is indented without a key above it")),
             None => Ok(entries),
         }
     }
 
-    /// Keys at one indentation. Only those of the top level may hold keys themselves: nothing lies deeper in these files.
+    /// Parses the keys at one indentation. Only those of the top level may hold keys themselves: these files nest no
+    /// deeper.
     fn entries(&mut self, indent: usize, is_top: bool) -> Result<Vec<(String, Value)>, String> {
         let mut entries: Vec<(String, Value)> = Vec::new();
         while let Some(&(number, found, body)) = self.lines.get(self.at).filter(|line| line.1 == indent) {
@@ -234,7 +235,7 @@ impl<'a> Lines<'a> {
         Ok(entries)
     }
 
-    /// What follows a key without a value.
+    /// Parses the value below a key.
     fn below(&mut self, indent: usize, is_top: bool) -> Result<Value, String> {
         let Some(&(number, inner, body)) = self.lines.get(self.at) else {
             return Ok(Value::Scalar(String::new(), false));
@@ -255,12 +256,12 @@ impl<'a> Lines<'a> {
             return Ok(Value::Scalar(String::new(), false));
         }
         if !is_top {
-            return Err(format!("line {number} lies deeper than a calibration goes"));
+            return Err(format!("line {number} is nested deeper than a calibration"));
         }
         Ok(Value::Map(self.entries(inner, false)?))
     }
 
-    /// `[ a, b, c ]`, over as many lines as it takes.
+    /// Parses `[ a, b, c ]`, over any number of lines.
     fn flow(&mut self, number: usize, first: &str) -> Result<Value, String> {
         let mut items = Vec::new();
         let mut rest = &first[1..];
@@ -282,7 +283,7 @@ impl<'a> Lines<'a> {
     }
 }
 
-/// `key: rest`; the key may stand in quotes.
+/// Splits `key: rest`; the key may be quoted.
 fn key(body: &str) -> Option<(String, &str)> {
     let (key, rest) = match body.strip_prefix('"') {
         Some(quoted) => {
@@ -309,7 +310,7 @@ fn shortened(text: &str) -> String {
     text.chars().take(40).collect()
 }
 
-/// A file in the making.
+/// File under construction.
 pub(crate) struct YamlWriter {
     path: PathBuf,
     text: String,

@@ -1,4 +1,4 @@
-//! What the reader of YAML files takes and what it refuses.
+//! Accepted and rejected input of the YAML reader.
 
 use super::*;
 
@@ -25,10 +25,10 @@ fn the_ways_in_which_opencv_and_people_write() {
 fn damage_is_named_with_its_line() {
     for (text, expected) in [
         ("K\n", "line 3: expected a key, found \"K\""),
-        ("a: 1\n  b: 2\n", "line 4 is indented, but belongs to nothing"),
+        ("a: 1\n  b: 2\n", "line 4 is indented without a key above it"),
         ("a: [ 1,\n 2\n", "line 3: a list without its end"),
         ("a: [ 1, [ 2 ] ]\n", "line 3: a list inside of a list"),
-        ("a:\n  b:\n    c:\n      d: 1\n", "line 5 lies deeper than a calibration goes"),
+        ("a:\n  b:\n    c:\n      d: 1\n", "line 5 is nested deeper than a calibration"),
         ("- 1\n", "line 3: expected a key"),
     ] {
         let found = parse(text).err().unwrap();

@@ -1,4 +1,4 @@
-//! Calibration from simulated corners, against the truth.
+//! Calibration from simulated corners against the truth.
 
 use flyrig_calib::{
     Board, BoardShot, BoardView, CalibError, LensModel, Pattern, RigFit, RigOptions, calibrate_lens, calibrate_rig,
@@ -68,7 +68,7 @@ fn a_bent_board_is_found_out() {
     assert!(mm < 5.0 * sigma, "{mm} +-{sigma}");
 }
 
-/// Views of a tilted board before a camera, as far as `reach` from the optical axis, metres.
+/// Simulates views of a tilted board in front of a camera, up to `reach` metres from the optical axis.
 fn before(random: &mut Random, camera: &Camera, count: usize, reach: f64) -> Vec<BoardView> {
     let mut views = Vec::new();
     while views.len() < count {

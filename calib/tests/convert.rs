@@ -1,4 +1,4 @@
-//! Calibrations of other programs: what they mean, round trips, and damaged files.
+//! Calibrations of other programs: conventions, round trips, and damaged files.
 #![allow(clippy::unwrap_used)] // helpers of tests
 
 use std::{fs, path::Path};
@@ -25,7 +25,7 @@ fn camera(name: &str, eye: DVec3, lens: Lens) -> Camera {
     }
 }
 
-/// Three cameras that look down by different angles, with these lenses in turn.
+/// Returns three cameras with different pitches and these lenses in turn.
 fn rig(lenses: &[Lens]) -> Rig {
     let eyes = [DVec3::new(3.0, 0.5, 1.2), DVec3::new(-1.0, 2.8, 2.0), DVec3::new(-1.5, -2.5, 1.6)];
     let named = ["left", "00", "side.b"].into_iter().zip(eyes).enumerate();
@@ -38,7 +38,7 @@ const CUBIC: Lens = Lens::RadialTangential { radial: [-0.1, 0.02, 0.003], tangen
 const RATIONAL: Lens = Lens::Rational { radial: [0.5, 0.12, 0.01, 0.8, 0.25, 0.02], tangential: [0.002, -0.001] };
 const FISHEYE: Lens = Lens::Fisheye { coefficients: [0.05, -0.01, 0.002, -0.0005] };
 
-/// Lenses that a format can hold.
+/// Returns the lenses that a format can represent.
 fn lenses_of(format: Format) -> Vec<Lens> {
     match format {
         Format::Flyrig | Format::OpenCv | Format::Colmap | Format::Anipose => vec![CUBIC, RATIONAL, FISHEYE],
@@ -48,7 +48,7 @@ fn lenses_of(format: Format) -> Vec<Lens> {
     }
 }
 
-/// Largest distance of pixels at which two rigs see the same points; both in the axes of their first cameras.
+/// Returns the largest distance of pixels at which two rigs see the same points, in the axes of their first cameras.
 fn difference_px(a: &Rig, b: &Rig) -> f64 {
     let mut worst = 0.0f64;
     let first = b.cameras.iter().find(|camera| camera.id == a.cameras[0].id).unwrap();
@@ -276,7 +276,7 @@ fn damaged_files_are_named_with_the_fix() {
         ("fisheye", "omni", "unknown variant `omni`"),
         ("name", "nome", "unknown field `nome`"),
         ("[[1,0,0]", "[[2,0,0]", "camera a: rotation is no rotation"),
-        ("translation_m = [0, 0, 0]\n", "", "rotation stands there without translation_m"),
+        ("translation_m = [0, 0, 0]\n", "", "rotation is given without translation_m"),
         (
             "translation_m = [0, 0, 0]\n",
             "translation_m = [0, 0, 0]\ntime_offset_ms = 1e9\n",
@@ -322,7 +322,7 @@ fn a_calibration_folder_is_read_whatever_it_holds() {
     save_lenses(dir.path(), &lenses).unwrap();
     assert_eq!(load_lenses(dir.path(), &NO_SIZE).unwrap(), lenses);
     let text = load_calibration(dir.path(), &NO_SIZE).unwrap_err().to_string();
-    assert!(text.contains("holds lenses alone, no poses; run flyrig calibrate rig"), "{text}");
+    assert!(text.contains("holds lenses only, no poses; run flyrig calibrate rig"), "{text}");
 
     // EasyMocap's files count where there is no calibration.toml; nothing at all names both.
     let text = load_calibration(Path::new("/no/such/folder"), &NO_SIZE).unwrap_err().to_string();

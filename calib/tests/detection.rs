@@ -1,4 +1,4 @@
-//! Printed boards, seen by a camera: every corner has the right number and place.
+//! Detection of printed boards: every corner has the right number and position.
 #![allow(clippy::unwrap_used)] // helpers of tests
 
 use flyrig_calib::{Board, BoardSheet, GrayImage, Pattern, detector, testing::photograph};
@@ -31,13 +31,13 @@ fn camera() -> Camera {
     }
 }
 
-/// The board's middle at a place before the camera, turned.
+/// Places the board's centre in front of the camera, turned.
 fn pose(board: &Board, turn: DVec3, middle: DVec3) -> Isometry {
     let rotation = DQuat::from_scaled_axis(turn);
     Isometry::new(rotation, middle - rotation * board.middle())
 }
 
-/// Number of corners, and the largest distance from the truth, pixels.
+/// Returns the number of corners and their largest error, pixels.
 fn check(board: &Board, at: &Isometry) -> (usize, f64) {
     let camera = camera();
     let seen = detector(board).unwrap().detect(&photograph(board, &camera, at, false).unwrap());

@@ -1,4 +1,4 @@
-//! Calibration files: what is read, what is written, and what is said about broken ones.
+//! Calibration files: reading, writing, and the errors of broken ones.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
@@ -71,7 +71,7 @@ fn folder(intri: &str, extri: &str) -> tempfile::TempDir {
     dir
 }
 
-/// What a user reads, without the folder's random name.
+/// Returns the error text as a user sees it, without the random name of the folder.
 fn refusal(intri: &str, extri: &str) -> String {
     let dir = folder(intri, extri);
     let text = load_easymocap(dir.path(), &SIZE).unwrap_err().to_string();
@@ -259,7 +259,7 @@ fn distortion_that_we_cannot_model_is_refused_but_zeros_are_fine() {
     assert!(text.contains("camera 00: dist_00 is 1x3, expected a row of 4, 5, 8, 12 or 14 numbers"), "{text}");
 }
 
-/// Whatever the bytes are, they are refused in words or read as sound cameras.
+/// Damages files at random: they are rejected with an error or read as valid cameras.
 #[test]
 fn cut_and_flipped_files_never_panic() {
     let mut state = 1u64;

@@ -1,4 +1,5 @@
-//! Writes a contact sheet of simulated people: a row a seed, a column a camera, time moving on from row to row.
+//! Writes a contact sheet of simulated people: one row per seed, one column per camera, with time advancing from row to
+//! row.
 //!
 //! `cargo run --release -p flyrig-sim --example contact_sheet -- OUT.png [SEEDS] [CAMERAS] [SIDE_PX] [FOCAL_HEIGHTS [TARGET_HEIGHT_M]]`
 

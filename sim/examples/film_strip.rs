@@ -1,10 +1,10 @@
-//! Writes film strips of a simulated person: a row a clip, time moving on from left to right.
+//! Writes film strips of a simulated person: one row per clip, with time advancing from left to right.
 //!
 //! `cargo run --release -p flyrig-sim --example film_strip -- OUT SEED CLIP [CLIP ...] [--columns N] [--height PX]
 //! [--secs S] [--speed S] [--orbit DEGREES] [--focal HEIGHTS]`
 //!
 //! CLIP is a `motion.kind`; `SEED:CLIP@FROM` takes another person for its row and starts `FROM` seconds into the clip.
-//! A row shows `--secs` seconds, otherwise one whole round; `--orbit` turns the camera around the person.
+//! A row shows `--secs` seconds, otherwise one whole cycle; `--orbit` moves the camera around the person.
 
 use std::error::Error;
 use std::path::Path;
@@ -12,7 +12,7 @@ use std::path::Path;
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{SimConfig, Simulator};
 
-/// Options behind the clips.
+/// Options after the clips.
 struct Options {
     columns: u32,
     height: u32,

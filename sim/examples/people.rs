@@ -1,4 +1,4 @@
-//! Writes a sheet of simulated people, a seed each.
+//! Writes a sheet of simulated people, one per seed.
 //!
 //! `cargo run --release -p flyrig-sim --example people -- OUT.jpg [COUNT] [COLUMNS] [FIRST_SEED] [HEIGHT_PX] [FOCAL_HEIGHTS] [TARGET_HEIGHT_M] [DEGREES]`
 
@@ -24,7 +24,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         config.cameras.target_height_m = number(6, 0.88)?;
         config.cameras.radial = [0.0; 2];
         let mut simulator = Simulator::new(&gpu, &config)?;
-        // Turned by up to 50 degrees to either side, if not told otherwise.
+        // Turned by up to 50 degrees to either side by default.
         let degrees = number(7, f64::from(index * 37 % 101) - 50.0)?;
         let nanos = (degrees.rem_euclid(360.0) / 360.0 * config.motion.turn_secs * 1e9) as i64;
         let (picture, _) = simulator.capture(nanos, 0)?;

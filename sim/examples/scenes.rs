@@ -1,5 +1,5 @@
-//! Writes a sheet of scenes, lamps and cameras: each kind of room, a lamp that switches, a passer-by, furniture in the
-//! way, and close-ups of blur, rolling shutter, defocus, a fisheye lens and noise.
+//! Writes a sheet of scenes, lamps and cameras: each kind of room, a switching lamp, a passer-by, occluding furniture,
+//! and close-ups of blur, rolling shutter, defocus, a fisheye lens and noise.
 //!
 //! `cargo run --release -p flyrig-sim --example scenes -- OUT.jpg [SEED] [SIDE_PX]`
 
@@ -12,7 +12,7 @@ use flyrig_sim::{LightConfig, LightSwitch, MotionKind, OpticsConfig, SceneKind, 
 
 const COLUMNS: u32 = 4;
 
-/// A change of the configuration, the time and the camera of an image.
+/// Change of the configuration, time and camera of an image.
 type Tile = (&'static str, fn(&mut SimConfig), f64, usize);
 
 const TILES: [Tile; 16] = [

@@ -1,44 +1,50 @@
-//! What to simulate.
+//! Configuration of a simulation.
 
 use std::path::PathBuf;
 
 use flyrig_body::{ShapeParams, default_template};
 use serde::{Deserialize, Serialize};
 
+use crate::camera::calibration_error::CalibrationError;
+use crate::camera::faults::FaultScript;
+use crate::camera::optics::OpticsConfig;
+use crate::camera::sensor::SensorConfig;
+use crate::error::SimError;
 use crate::error::check;
-use crate::{CalibrationError, FaultScript, LightConfig, OpticsConfig, SceneConfig, SensorConfig, SimError};
+use crate::room::scene_config::{LightConfig, SceneConfig};
 
-/// A simulated capture. The same configuration gives the same bytes on the same graphics adapter.
+/// Simulated capture. A configuration gives the same bytes in every run on the same graphics adapter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimConfig {
-    /// Makes the person: body, face, hair, clothes and prints.
+    /// Seed of the person: body, face, hair, clothes and prints.
     pub seed: u64,
-    /// Choices about the person that the seed does not make.
+    /// Choices about the person that override the seed's.
     pub person: PersonConfig,
-    /// How the person moves.
+    /// Motion of the person.
     pub motion: MotionConfig,
-    /// Where the cameras stand.
+    /// Placement of the cameras.
     pub cameras: RingConfig,
-    /// The cameras' sensors; camera `i` has the sensor of place `i` modulo their number. Without any, images are as drawn.
+    /// Sensors of the cameras; camera `i` has the sensor of index `i` modulo their number. Without any, images are as
+    /// rendered.
     pub sensors: Vec<SensorConfig>,
-    /// The cameras' shutters and lens openings, given to cameras like `sensors`.
+    /// Shutters and apertures of the cameras, assigned like `sensors`.
     pub optics: Vec<OpticsConfig>,
-    /// How wrong the calibration is that [`crate::Simulator::reported_rig`] reports.
+    /// Error of the calibration that [`crate::Simulator::reported_rig`] reports.
     pub calibration_error: CalibrationError,
-    /// What stands around the person.
+    /// Surroundings of the person.
     pub scene: SceneConfig,
-    /// The lamps; without any, the scene has its own.
+    /// Lamps; without any, the scene has its own.
     pub lights: Vec<LightConfig>,
-    /// What goes wrong with the cameras and their clocks.
+    /// Faults of the cameras and their clocks.
     pub faults: FaultScript,
     /// Image width, pixels.
     pub width: u32,
     /// Image height, pixels.
     pub height: u32,
-    /// Frames a second of every camera.
+    /// Frames per second of every camera.
     pub fps: f64,
-    /// Frames a source gives before its stream ends; none for an endless stream.
+    /// Frames of a source before its stream ends; endless when `None`.
     pub frames: Option<u64>,
     /// Side of each texture, pixels.
     pub texture_px: u32,
@@ -51,15 +57,15 @@ pub enum Build {
     /// Chosen by the seed.
     #[default]
     BySeed,
-    /// A slim woman.
+    /// Slim woman.
     SlimWoman,
-    /// A round woman.
+    /// Round woman.
     RoundWoman,
-    /// A slim man.
+    /// Slim man.
     SlimMan,
-    /// A broad, muscular man.
+    /// Broad, muscular man.
     BroadMan,
-    /// A heavy man.
+    /// Heavy man.
     HeavyMan,
 }
 
@@ -71,11 +77,12 @@ pub struct PersonConfig {
     pub build: Build,
     /// Whether the body has finger joints, which make gestures. Poses then have 28 more joints.
     pub fingers: bool,
-    /// Shape targets of the body in place of the seed's, all others and the clothes, face and colours being those of the seed.
+    /// Shape parameters of the body that replace the seed's; all others and the clothes, face and colours stay those of
+    /// the seed.
     pub shape: ShapeParams,
 }
 
-/// Kind of motion. All but the clips from files are made for the body, need no file, and close without a seam.
+/// Kind of motion. All but the clips from files are generated for the body, need no file, and are closed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum MotionKind {
@@ -98,27 +105,28 @@ pub enum MotionKind {
     Jump,
     /// Crosses the arms and lets go.
     CrossArms,
-    /// Dances a mixture of moves, another one each seed.
+    /// Dances a mixture of moves that depends on the seed.
     Dance,
     /// Lies down on the back, knees up, and gets up.
     Lie,
-    /// The seed chooses one of the kinds above but for lying down, its speed (0.5 to 1.5 times `motion.speed`) and where it starts.
+    /// The seed chooses one of the kinds above except lying down, its speed (0.5 to 1.5 times `motion.speed`) and its
+    /// phase.
     BySeed,
-    /// A BVH clip.
+    /// BVH clip.
     Bvh,
-    /// The first animation of a glTF file.
+    /// First animation of a glTF file.
     Gltf,
 }
 
-/// How the person moves.
+/// Motion of the person.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MotionConfig {
-    /// Kind.
+    /// Kind of motion.
     pub kind: MotionKind,
-    /// How fast: 1 as people usually do it, 0 not at all. Walkers also take longer steps.
+    /// Speed: 1 is normal, 0 still. Walkers also take longer steps.
     pub speed: f64,
-    /// Share of the clip, 0 to 1, that is over at the start. Not for clips from files, see `start_secs`.
+    /// Phase of the clip at the start, in 0..=1. Not for clips from files, see `start_secs`.
     pub phase: f64,
     /// Seconds of one full turn at speed 1.
     pub turn_secs: f64,
@@ -129,38 +137,38 @@ pub struct MotionConfig {
     pub gltf: Option<PathBuf>,
     /// Seconds of a clip from a file to skip.
     pub start_secs: f64,
-    /// Farthest that a clip from a file may walk from the ring's centre, metres; one that goes farther takes shorter
+    /// Largest distance of a clip from a file from the ring's centre, metres; one that goes farther takes shorter
     /// steps, so that the cameras keep seeing the person.
     pub reach_m: f64,
-    /// Where the person stands or the motion is centred, from the ring's centre (x, y), metres.
+    /// Position of the person or centre of the motion, from the ring's centre (x, y), metres.
     pub at_m: [f64; 2],
 }
 
-/// Cameras on a ring around the person, all looking at the same point.
+/// Cameras on a ring around the person, all aimed at the same point.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RingConfig {
-    /// Cameras, evenly spaced; camera 0 sees the person's front at the start.
+    /// Number of cameras, evenly spaced; camera 0 sees the person's front at the start.
     pub count: usize,
     /// Distance from the centre, metres.
     pub radius_m: f64,
     /// Height of the cameras above the floor, metres.
     pub height_m: f64,
-    /// Height of the point that all look at, metres.
+    /// Height of the point that all cameras are aimed at, metres.
     pub target_height_m: f64,
     /// Focal length as a multiple of the image height.
     pub focal_heights: f64,
     /// Radial distortion k1, k2 (OpenCV's).
     pub radial: [f64; 2],
-    /// Coefficients k1 to k4 of an equidistant fisheye lens (OpenCV's), in place of `radial`.
+    /// Coefficients k1 to k4 of an equidistant fisheye lens (OpenCV's), instead of `radial`.
     pub fisheye: Option<[f64; 4]>,
-    /// Tangential distortion p1, p2 (OpenCV's), beside `radial`.
+    /// Tangential distortion p1, p2 (OpenCV's), in addition to `radial`.
     pub tangential: [f64; 2],
-    /// How far each camera stands off its place on the ring, along each axis at most, metres.
+    /// Largest displacement of each camera from its place on the ring, along each axis, metres.
     pub place_jitter_m: f64,
-    /// How far each camera is turned off its aim, about each axis (roll included) at most, degrees.
+    /// Largest rotation of each camera from its aim, about each axis (roll included), degrees.
     pub aim_jitter_deg: f64,
-    /// How far each camera's focal length is off the ring's, at most, percent.
+    /// Largest deviation of each camera's focal length from the ring's, percent.
     pub focal_jitter_percent: f64,
 }
 
@@ -221,7 +229,7 @@ impl Default for RingConfig {
 }
 
 impl SimConfig {
-    /// Checks every number.
+    /// Validates every number.
     ///
     /// # Errors
     /// [`SimError::Config`] names the setting and its range.
@@ -229,7 +237,7 @@ impl SimConfig {
         let (ring, motion) = (&self.cameras, &self.motion);
         check("width", self.width.into(), 16.0, 4096.0, "16 to 4096 pixels")?;
         check("height", self.height.into(), 16.0, 4096.0, "16 to 4096 pixels")?;
-        check("fps", self.fps, 0.1, 1000.0, "0.1 to 1000 frames a second")?;
+        check("fps", self.fps, 0.1, 1000.0, "0.1 to 1000 frames per second")?;
         check("texture_px", self.texture_px.into(), 64.0, 4096.0, "64 to 4096 pixels")?;
         check("cameras.count", ring.count as f64, 1.0, 128.0, "1 to 128 cameras")?;
         check("cameras.radius_m", ring.radius_m, 0.8, 6.0, "0.8 to 6 metres")?;

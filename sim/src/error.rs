@@ -1,4 +1,4 @@
-//! What can go wrong in a simulation.
+//! Errors of a simulation.
 
 use std::path::PathBuf;
 
@@ -7,74 +7,74 @@ use flyrig_calib::CalibError;
 use flyrig_gpu::GpuError;
 use flyrig_types::{CameraError, ImageError, PoseError};
 
-/// Why there is no simulated frame.
+/// Error of a simulation.
 #[derive(Debug, thiserror::Error)]
 pub enum SimError {
-    /// A setting out of its range.
+    /// Setting out of its range.
     #[error("simulation: {field} is {found}, expected {expected}")]
     Config {
-        /// Which setting.
+        /// Name of the setting.
         field: &'static str,
-        /// What was found.
+        /// Value found.
         found: String,
-        /// What would be right.
+        /// Valid range.
         expected: &'static str,
     },
-    /// A shape target of the person that there is not, or out of its range.
+    /// Shape parameter that does not exist or is out of range.
     #[error("simulation: person.shape: {0}")]
     Shape(BodyError),
-    /// The motion clip is not there.
+    /// Missing motion clip.
     #[error("motion clip {} not found; {mend}", path.display())]
     NoClip {
-        /// Where it was looked for.
+        /// Path that was tried.
         path: PathBuf,
-        /// What to do.
+        /// Fix.
         mend: &'static str,
     },
-    /// The skeleton lacks a joint that a motion needs.
+    /// Skeleton without a joint that a motion needs.
     #[error("the body's skeleton has no joint '{0}', which the simulated motion moves")]
     NoJoint(&'static str),
-    /// No such camera.
+    /// Nonexistent camera.
     #[error("the simulated ring has {count} cameras, there is no slot {slot}")]
     NoSlot {
-        /// The slot asked for.
+        /// Requested slot.
         slot: usize,
         /// Cameras of the ring.
         count: usize,
     },
-    /// The body.
+    /// Error of the body.
     #[error(transparent)]
     Body(#[from] BodyError),
-    /// The motion.
+    /// Error of the motion.
     #[error("simulated motion: {0}")]
     Pose(#[from] PoseError),
-    /// The cameras.
+    /// Error of the cameras.
     #[error(transparent)]
     Camera(#[from] CameraError),
-    /// The graphics adapter.
+    /// Error of the graphics adapter.
     #[error(transparent)]
     Gpu(#[from] GpuError),
-    /// An image.
+    /// Error of an image.
     #[error(transparent)]
     Image(#[from] ImageError),
-    /// An image's JPEG or PNG code.
-    #[error("coding a simulated image: {0}")]
+    /// Error of an image's JPEG or PNG codec.
+    #[error("encoding a simulated image: {0}")]
     Code(#[from] image::ImageError),
-    /// A folder or a file of an export.
+    /// Error of a folder or file of an export.
     #[error("{} {message}", path.display())]
     Export {
-        /// Which.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// Problem and fix.
+        /// Fault and fix.
         message: String,
     },
-    /// An export that was told to stop.
+    /// Export stopped by its caller.
     #[error("stopped; nothing was written")]
     Stopped,
-    /// A calibration that cannot be written.
+    /// Calibration that cannot be written.
     #[error(transparent)]
     Calib(#[from] CalibError),
-    /// A fault script.
+    /// Malformed fault script.
     #[error("fault script: {0}")]
     Script(#[from] toml::de::Error),
 }

@@ -1,8 +1,8 @@
-//! Smooth random fields that depend on nothing but their seed.
+//! Smooth random fields, determined by their seed.
 
 use glam::Vec3;
 
-/// A random field over space.
+/// Random field over space.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Noise(u32);
 
@@ -11,7 +11,7 @@ impl Noise {
         Self(mix((seed ^ (seed >> 32)) as u32 ^ mix(stream.wrapping_add(0x9e37_79b9))))
     }
 
-    /// Trilinear value noise with unit cells, smoothed, in -1..=1.
+    /// Evaluates trilinear value noise with unit cells, smoothed, in -1..=1.
     pub(crate) fn at(self, p: Vec3) -> f32 {
         let cell = p.floor();
         let t = p - cell;
@@ -22,7 +22,7 @@ impl Noise {
         lerp(lerp(edge(0, 0), edge(1, 0), t.y), lerp(edge(0, 1), edge(1, 1), t.y), t.z)
     }
 
-    /// Sum of `octaves` fields, each of twice the frequency and half the height, in -1..=1.
+    /// Sums `octaves` fields, each of twice the frequency and half the amplitude, in -1..=1.
     pub(crate) fn sum(self, p: Vec3, octaves: u32) -> f32 {
         let (mut total, mut weight, mut height, mut q) = (0.0, 0.0, 1.0, p);
         for octave in 0..octaves {
@@ -34,14 +34,14 @@ impl Noise {
         total / weight
     }
 
-    /// One number in -1..=1 for a cell of a grid.
+    /// Returns a number in -1..=1 for a cell of a grid.
     pub(crate) fn cell(self, x: i32, y: i32, z: i32) -> f32 {
         let h = mix(self.0 ^ mix((x as u32).wrapping_add(mix((y as u32).wrapping_add(mix(z as u32))))));
         (h >> 8) as f32 / 8_388_607.5 - 1.0
     }
 }
 
-/// Integer hash with full avalanche (two rounds of multiply and shift).
+/// Hashes an integer with full avalanche (two rounds of multiply and shift).
 fn mix(mut h: u32) -> u32 {
     h ^= h >> 16;
     h = h.wrapping_mul(0x7feb_352d);
@@ -54,7 +54,7 @@ pub(crate) fn lerp(a: f32, b: f32, t: f32) -> f32 {
     a + (b - a) * t
 }
 
-/// 0 below `low`, 1 above `high`, smooth between; falls when `low > high`.
+/// Rises smoothly from 0 below `low` to 1 above `high`; falls when `low > high`.
 pub(crate) fn smoothstep(low: f32, high: f32, x: f32) -> f32 {
     let t = ((x - low) / (high - low)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)

@@ -1,4 +1,4 @@
-//! The simulation itself.
+//! Simulator of a capture.
 
 use std::fmt;
 
@@ -6,32 +6,40 @@ use flyrig_body::{Part, Template};
 use flyrig_gpu::GpuContext;
 use flyrig_types::{Camera, Image, Mask, PixelFormat, Pose, PoseTrack, Rig};
 
-use crate::actor::Shape;
-use crate::cast::Cast;
-use crate::draw::{Drawing, Raw, Take};
-use crate::person::Person;
-use crate::scene::Scene;
-use crate::sensor::{hash, linear_of_half};
-use crate::{FramePlan, OpticsConfig, SensorConfig, Shot, SimConfig, SimError, SimFrame, SurfaceMesh, camera_ring};
+use crate::camera::faults::FramePlan;
+use crate::camera::frame::{SimFrame, SurfaceMesh};
+use crate::camera::optics::OpticsConfig;
+use crate::camera::ring::camera_ring;
+use crate::camera::sensor::SensorConfig;
+use crate::camera::sensor::{hash, linear_of_half};
+use crate::camera::shot::Shot;
+use crate::config::SimConfig;
+use crate::draw::cast::Cast;
+use crate::draw::drawing::Drawing;
+use crate::draw::moment::{ImageRequest, RawImage};
+use crate::error::SimError;
+use crate::person::actor::ActorShape;
+use crate::person::assembly::Person;
+use crate::room::scene::Scene;
 
-/// A person, a motion, a room and cameras.
+/// Simulator of a person, a motion, a room and cameras.
 pub struct Simulator {
     config: SimConfig,
     rig: Rig,
     cast: Cast,
     plates: Vec<Image>,
     drawing: Drawing,
-    /// Instant and reach of what the drawing's people do.
+    /// Instant and reach of the people last set in the drawing.
     posed: Option<(i64, f64)>,
     cameras: Vec<Kept>,
 }
 
-/// What is remembered of a camera.
+/// Cached state of a camera.
 #[derive(Debug, Default)]
 struct Kept {
-    /// Instant that was asked for last.
+    /// Instant requested last.
     asked_nanos: Option<i64>,
-    drawn: Option<(i64, Raw)>,
+    drawn: Option<(i64, RawImage)>,
 }
 
 impl fmt::Debug for Simulator {
@@ -41,7 +49,7 @@ impl fmt::Debug for Simulator {
 }
 
 impl Simulator {
-    /// Makes the person, the room and the cameras.
+    /// Creates the person, the room and the cameras.
     ///
     /// # Errors
     /// [`SimError`] names the setting, the missing file or the adapter's limit.
@@ -53,7 +61,7 @@ impl Simulator {
         let cameras = rig.cameras.iter().map(|_| Kept::default()).collect();
         let mut new = Self { config: config.clone(), rig, cast, plates: Vec::new(), drawing, posed: None, cameras };
         for slot in 0..new.rig.cameras.len() {
-            let take = Take { people: false, ..new.take(&Shot::new(0, slot))? };
+            let take = ImageRequest { people: false, ..new.take(&Shot::new(0, slot))? };
             for raw in new.drawing.pictures(&[take])? {
                 // An instant that no frame has.
                 let plate = new.develop(&raw, &Shot::new(i64::MIN, slot))?;
@@ -63,43 +71,43 @@ impl Simulator {
         Ok(new)
     }
 
-    /// The configuration.
+    /// Returns the configuration.
     #[must_use]
     pub fn config(&self) -> &SimConfig {
         &self.config
     }
 
-    /// The cameras as they are, z up.
+    /// Returns the true cameras, z up.
     #[must_use]
     pub fn rig(&self) -> &Rig {
         &self.rig
     }
 
-    /// The cameras as a calibration with the configured error reports them.
+    /// Returns the cameras as a calibration with the configured error reports them.
     #[must_use]
     pub fn reported_rig(&self) -> Rig {
         self.config.calibration_error.reported(&self.rig, self.config.seed)
     }
 
-    /// The body without clothes: what a tracker is given.
+    /// Returns the body without clothes: input of a tracker.
     #[must_use]
     pub fn template(&self) -> &Template {
         &self.cast.main.person.body
     }
 
-    /// One round of the motion; see [`Self::pose`] for later times.
+    /// Returns one cycle of the motion; see [`Self::pose`] for later times.
     #[must_use]
     pub fn track(&self) -> &PoseTrack {
         &self.cast.main.track
     }
 
-    /// Pose at a time; the motion starts over after its end.
+    /// Returns the pose at a time; the motion repeats.
     #[must_use]
     pub fn pose(&self, nanos: i64) -> Pose {
         self.cast.pose(nanos)
     }
 
-    /// The room without people at time 0, as camera `slot` sees it.
+    /// Returns the room without people at time 0, as camera `slot` sees it.
     ///
     /// # Errors
     /// [`SimError::NoSlot`].
@@ -107,13 +115,13 @@ impl Simulator {
         self.plates.get(slot).ok_or(SimError::NoSlot { slot, count: self.rig.cameras.len() })
     }
 
-    /// Time of frame `index` of every camera.
+    /// Returns the time of frame `index` of every camera, nanoseconds.
     #[must_use]
     pub fn frame_nanos(&self, index: u64) -> i64 {
         (index as f64 * 1e9 / self.config.fps) as i64
     }
 
-    /// What the fault script does to frame `index` of camera `slot`.
+    /// Returns the fault script's effect on frame `index` of camera `slot`.
     ///
     /// # Errors
     /// [`SimError::NoSlot`].
@@ -121,7 +129,7 @@ impl Simulator {
         Ok(self.config.faults.plan(&self.camera(slot)?.id, index, |index| self.frame_nanos(index)))
     }
 
-    /// Image and truth of one camera at a time.
+    /// Renders image and truth of one camera at a time.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
@@ -129,7 +137,7 @@ impl Simulator {
         self.render_with(&Shot::new(nanos, slot))
     }
 
-    /// Image and truth of a shot.
+    /// Renders image and truth of a shot.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Config`] for a shot out of range, [`SimError::Gpu`].
@@ -154,8 +162,8 @@ impl Simulator {
         Ok(frame)
     }
 
-    /// Image and mask only, at less cost than [`Self::render`]. Cameras that were asked for the same instants before
-    /// are drawn together, when the first of them is asked for.
+    /// Renders image and mask only, at lower cost than [`Self::render`]. Cameras that were requested for the same
+    /// instants before are rendered together, at the first request.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
@@ -163,7 +171,7 @@ impl Simulator {
         self.capture_with(&Shot::new(nanos, slot))
     }
 
-    /// Image and mask of a shot.
+    /// Renders image and mask of a shot.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Config`] for a shot out of range, [`SimError::Gpu`].
@@ -172,7 +180,7 @@ impl Simulator {
         self.finished(&raw, shot)
     }
 
-    /// Images and masks of several cameras at one time, drawn in one pass.
+    /// Renders images and masks of several cameras at one time, in one pass.
     ///
     /// # Errors
     /// [`SimError::NoSlot`], [`SimError::Gpu`].
@@ -181,7 +189,8 @@ impl Simulator {
         slots.iter().map(|&slot| self.capture(nanos, slot)).collect()
     }
 
-    /// Linear light on the sensor of a shot, before exposure, noise and code: RGB, 1 is the brightest sRGB value.
+    /// Renders the linear light on the sensor of a shot, before exposure, noise and encoding: RGB, 1 is the brightest
+    /// sRGB value.
     ///
     /// # Errors
     /// As [`Self::capture_with`].
@@ -190,9 +199,9 @@ impl Simulator {
         Ok(raw.iter().map(|&[r, g, b, _]| [r, g, b].map(linear_of_half)).collect())
     }
 
-    /// What the cameras see of the person at a time, as a mesh.
+    /// Returns the person's visible surface at a time, as a mesh.
     pub fn clothed_surface(&mut self, nanos: i64) -> SurfaceMesh {
-        let Shape { positions, normals, displacement } = self.cast.main.shape(nanos);
+        let ActorShape { positions, normals, displacement } = self.cast.main.shape(nanos);
         let Person { clothed, carriers, .. } = &self.cast.main.person;
         SurfaceMesh {
             positions,
@@ -208,8 +217,8 @@ impl Simulator {
         self.rig.cameras.get(slot).ok_or(SimError::NoSlot { slot, count: self.rig.cameras.len() })
     }
 
-    /// Light and coverage of a shot, drawn unless it was.
-    fn raw(&mut self, shot: &Shot) -> Result<Raw, SimError> {
+    /// Returns light and coverage of a shot, rendered unless cached.
+    fn raw(&mut self, shot: &Shot) -> Result<RawImage, SimError> {
         shot.validate()?;
         let take = self.take(shot)?;
         if shot.camera_shift.is_some() {
@@ -233,9 +242,9 @@ impl Simulator {
         Ok(self.cameras[slot].drawn.as_ref().map(|(_, raw)| raw.clone()).unwrap_or_default())
     }
 
-    /// Draws what of an instant is not drawn yet.
+    /// Renders the images of an instant that are not cached.
     fn draw_all(&mut self, nanos: i64, slots: &[usize]) -> Result<(), SimError> {
-        /// Bytes that are read back at once.
+        /// Bytes that are read back together.
         const BATCH_BYTES: usize = 256 << 20;
         let mut missing: Vec<usize> = Vec::new();
         for &slot in slots {
@@ -247,7 +256,7 @@ impl Simulator {
         }
         let each = self.config.width as usize * self.config.height as usize * size_of::<[u16; 4]>();
         for slots in missing.chunks((BATCH_BYTES / each).max(1)) {
-            let takes: Vec<Take> =
+            let takes: Vec<ImageRequest> =
                 slots.iter().map(|&slot| self.take(&Shot::new(nanos, slot))).collect::<Result<_, _>>()?;
             self.set_moment(nanos, takes.iter().map(|take| take.optics.reach_secs()).fold(0.0, f64::max))?;
             for (&slot, raw) in slots.iter().zip(self.drawing.pictures(&takes)?) {
@@ -267,7 +276,7 @@ impl Simulator {
         Ok(())
     }
 
-    fn take(&self, shot: &Shot) -> Result<Take, SimError> {
+    fn take(&self, shot: &Shot) -> Result<ImageRequest, SimError> {
         let mut camera = self.camera(shot.slot)?.clone();
         if let Some(shift) = shot.camera_shift {
             camera.camera_from_world = shift * camera.camera_from_world;
@@ -276,7 +285,7 @@ impl Simulator {
             0 => OpticsConfig::default(),
             count => self.config.optics[shot.slot % count].clone(),
         };
-        Ok(Take { nanos: shot.nanos, camera, optics, people: true })
+        Ok(ImageRequest { nanos: shot.nanos, camera, optics, people: true })
     }
 
     fn finished(&self, raw: &[[u16; 4]], shot: &Shot) -> Result<(Image, Mask), SimError> {
@@ -284,7 +293,7 @@ impl Simulator {
         Ok((self.develop(raw, shot)?, Mask::new(self.config.width, self.config.height, coverage)?))
     }
 
-    /// What the camera's sensor makes of light.
+    /// Applies the camera's sensor to light.
     fn develop(&self, raw: &[[u16; 4]], shot: &Shot) -> Result<Image, SimError> {
         let mut sensor = match self.config.sensors.len() {
             0 => SensorConfig::default(),
@@ -298,7 +307,7 @@ impl Simulator {
     }
 }
 
-/// Inverse of `part as u32 + 1`.
+/// Inverts `part as u32 + 1`.
 fn part_of_index(index: u32) -> Option<Part> {
     Part::ALL.into_iter().find(|&part| part as u32 + 1 == index)
 }

@@ -1,27 +1,27 @@
-//! Painting textures through the mesh's own texture coordinates.
+//! Painting of textures through a mesh's own texture coordinates.
 
 use flyrig_model::srgb;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::sheet::Sheet;
-use crate::wardrobe::Srgb;
+use crate::clothes::sheet::Sheet;
+use crate::clothes::wardrobe::SrgbColor;
 
-/// A square sRGB image.
+/// Square sRGB image.
 #[derive(Debug, Clone)]
-pub(crate) struct Texture {
+pub(crate) struct TextureImage {
     pub side: usize,
     pub pixels: Vec<[u8; 4]>,
 }
 
-/// What lies under a texel: index of the triangle plus one (0: nothing) and two of its barycentric coordinates.
+/// Coverage of a texel: index of the triangle plus one (0: none) and two of its barycentric coordinates.
 pub(crate) struct UvMap {
     side: usize,
     texels: Vec<(u32, Vec2)>,
 }
 
 impl UvMap {
-    /// Draws the sheet's triangles in texture space; texels around the charts take the closest chart's point.
+    /// Rasterises the sheet's triangles in texture space; texels around the charts take the closest chart's point.
     pub(crate) fn new(sheet: &Sheet, side: usize) -> Self {
         let mut texels = vec![(0u32, Vec2::ZERO); side * side];
         for (triangle, index) in sheet.triangles.iter().zip(1u32..) {
@@ -62,8 +62,8 @@ impl UvMap {
         Self { side, texels }
     }
 
-    /// Colours each texel by what is under it: three corner nodes' indices and the weights of the corners.
-    pub(crate) fn paint(&self, sheet: &Sheet, colour: impl Fn([u32; 3], Vec3) -> Srgb + Sync) -> Texture {
+    /// Colours each texel by its surface point: three corner nodes' indices and the weights of the corners.
+    pub(crate) fn paint(&self, sheet: &Sheet, colour: impl Fn([u32; 3], Vec3) -> SrgbColor + Sync) -> TextureImage {
         let pixels = self
             .texels
             .par_iter()
@@ -72,13 +72,13 @@ impl UvMap {
                 None => [128, 128, 128, 255],
             })
             .collect();
-        Texture { side: self.side, pixels }
+        TextureImage { side: self.side, pixels }
     }
 }
 
-impl Texture {
-    /// A texture from a function of texture coordinates.
-    pub(crate) fn from_fn(side: usize, colour: impl Fn(Vec2) -> Srgb + Sync) -> Self {
+impl TextureImage {
+    /// Creates a texture from a function of texture coordinates.
+    pub(crate) fn from_fn(side: usize, colour: impl Fn(Vec2) -> SrgbColor + Sync) -> Self {
         let pixels = (0..side * side)
             .into_par_iter()
             .map(|i| to_bytes(colour((Vec2::new((i % side) as f32, (i / side) as f32) + 0.5) / side as f32)))
@@ -86,7 +86,7 @@ impl Texture {
         Self { side, pixels }
     }
 
-    /// The same image of a glossy surface, 0..=1; the gloss is what the fourth channel lacks to full.
+    /// Sets the gloss, in 0..=1; the fourth channel holds its complement.
     pub(crate) fn glossy(mut self, gloss: f32) -> Self {
         let fourth = ((1.0 - gloss.clamp(0.0, 1.0)) * 255.0).round() as u8;
         for pixel in &mut self.pixels {
@@ -95,7 +95,7 @@ impl Texture {
         self
     }
 
-    /// Half the side, averaged in linear light.
+    /// Returns an image of half the side, averaged in linear light.
     pub(crate) fn halved(&self) -> Self {
         let side = (self.side / 2).max(1);
         let table: [f32; 256] = srgb::byte_table(f32::powf);
@@ -115,7 +115,7 @@ impl Texture {
     }
 }
 
-fn to_bytes(colour: Srgb) -> [u8; 4] {
+fn to_bytes(colour: SrgbColor) -> [u8; 4] {
     let [r, g, b] = colour.map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8);
     [r, g, b, 255]
 }
@@ -130,10 +130,10 @@ pub(crate) fn srgb_from_linear(c: f32) -> f32 {
     srgb::encode(c, f32::powf)
 }
 
-pub(crate) fn mix3(a: Srgb, b: Srgb, t: f32) -> Srgb {
+pub(crate) fn mix3(a: SrgbColor, b: SrgbColor, t: f32) -> SrgbColor {
     std::array::from_fn(|i| a[i] + (b[i] - a[i]) * t)
 }
 
-pub(crate) fn scale3(a: Srgb, by: f32) -> Srgb {
+pub(crate) fn scale3(a: SrgbColor, by: f32) -> SrgbColor {
     a.map(|c| c * by)
 }

@@ -1,4 +1,4 @@
-//! Bad settings are refused by name; good ones survive a round trip.
+//! Validation of settings: bad ones are rejected by name; good ones survive a round trip.
 
 #![allow(clippy::unwrap_used)]
 
@@ -57,7 +57,7 @@ fn a_missing_clip_is_an_error_that_says_what_to_do() {
     assert!(error.starts_with("motion clip /nowhere/walk.bvh not found; "), "{error}");
 }
 
-/// Results must not be judged on drawings by the renderer under test.
+/// Checks that results are not judged by images of the renderer under test.
 #[test]
 fn the_simulation_does_not_depend_on_our_renderer() {
     let manifest: toml::Table = toml::from_str(include_str!("../Cargo.toml")).unwrap();

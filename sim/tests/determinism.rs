@@ -1,4 +1,4 @@
-//! A seed makes a person, and the same seed the same bytes.
+//! Determinism: a seed determines the person and every byte.
 
 #![allow(clippy::unwrap_used)]
 

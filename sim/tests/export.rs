@@ -1,4 +1,4 @@
-//! An exported capture is what the simulator shows.
+//! An exported capture equals the simulator's images and truth.
 
 #![allow(clippy::unwrap_used)]
 
@@ -25,7 +25,7 @@ fn png(path: &Path) -> Vec<u8> {
     image::open(path).unwrap().into_bytes()
 }
 
-/// Samples of the channels of an EXR file by name.
+/// Reads the samples of a channel of an EXR file by name.
 fn channel(path: &Path, name: &str) -> Vec<f32> {
     let image = read().no_deep_data().largest_resolution_level().all_channels().first_valid_layer().all_attributes();
     let image = image.from_file(path).unwrap();

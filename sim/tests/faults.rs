@@ -1,4 +1,4 @@
-//! A fault script does to the frames what it says.
+//! Effects of a fault script on the frames.
 
 #![allow(clippy::unwrap_used)]
 
@@ -18,7 +18,7 @@ fn nanos_of(index: u64) -> i64 {
     (index as f64 * 1e9 / FPS) as i64
 }
 
-/// The cameras 00 and 01 of a simulation with these faults, and one without any.
+/// Returns cameras 00 and 01 of a simulation with these faults, and a simulator without any.
 fn rig(script: &str) -> (Vec<SimSource>, Simulator) {
     let mut config = small_config(2);
     config.frames = Some(12);
@@ -147,12 +147,12 @@ fn a_corrupt_frame_is_garbage_below_a_row_and_an_undecodable_one_an_error() {
     let (mut cameras, mut plain) = rig("seed = 1\n[[fault]]\nkind = \"corrupt\"\nfrom_frame = 1\nframes = 1\n\
                                         [[fault]]\nkind = \"undecodable\"\nfrom_frame = 2\nframes = 1\n");
     assert_eq!(next(&mut cameras[0]).unwrap().image.bytes(), plain.capture(0, 0).unwrap().0.bytes());
-    let spoilt = next(&mut cameras[0]).unwrap().image.bytes().to_vec();
+    let corrupted = next(&mut cameras[0]).unwrap().image.bytes().to_vec();
     let sound = plain.capture(nanos_of(1), 0).unwrap().0.bytes().to_vec();
-    let first = spoilt.iter().zip(&sound).position(|(a, b)| a != b).unwrap();
-    let wrong = spoilt[first..].iter().zip(&sound[first..]).filter(|(a, b)| a.abs_diff(**b) > 20).count();
-    assert!(wrong * 2 > spoilt.len() - first, "{wrong} of {} bytes are wrong", spoilt.len() - first);
-    assert!(first < spoilt.len() * 9 / 10 + 64, "the garbage starts at {first}");
+    let first = corrupted.iter().zip(&sound).position(|(a, b)| a != b).unwrap();
+    let wrong = corrupted[first..].iter().zip(&sound[first..]).filter(|(a, b)| a.abs_diff(**b) > 20).count();
+    assert!(wrong * 2 > corrupted.len() - first, "{wrong} of {} bytes are wrong", corrupted.len() - first);
+    assert!(first < corrupted.len() * 9 / 10 + 64, "the garbage starts at {first}");
     assert_eq!(next(&mut cameras[0]).unwrap_err(), CaptureErrorKind::Corrupt);
     assert_eq!(next(&mut cameras[0]).unwrap().image.bytes(), plain.capture(nanos_of(3), 0).unwrap().0.bytes());
 }

@@ -1,4 +1,4 @@
-//! Shutters, apertures and lamps that switch do what their numbers say.
+//! Shutters, apertures and switching lamps match their numbers.
 
 #![allow(clippy::unwrap_used)]
 
@@ -64,7 +64,7 @@ fn blur_of_somebody_who_stands_still_changes_nothing() {
     assert!(worst < 0.012, "{worst}");
 }
 
-/// Truth under a rolling shutter against rays cast, f64, into the surface at each row's own time.
+/// Compares the truth under a rolling shutter with rays cast, in f64, into the surface at each row's own time.
 #[test]
 fn a_rolling_shutter_sees_each_row_at_its_own_time() {
     let mut config = small_config(3);

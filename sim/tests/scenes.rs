@@ -1,4 +1,4 @@
-//! Furniture hides and shades people, a passer-by is nobody's truth, and a seed makes the same room twice.
+//! Furniture hides and shades people, a passer-by is in no ground truth, and a seed gives the same room twice.
 
 #![allow(clippy::unwrap_used)]
 

@@ -1,4 +1,4 @@
-//! Sensors do what their numbers say, the same for the same seed, camera and frame.
+//! Sensors match their numbers, reproducibly for a seed, camera and frame.
 
 #![allow(clippy::unwrap_used)]
 
@@ -45,7 +45,8 @@ fn noise_is_the_same_for_a_seed_camera_and_frame_and_another_for_others() {
     assert_ne!(plate(&first, 0)[..3072], a[..3072]);
 }
 
-/// Variance of what the sensor read against what it counted, in bins of brightness, over the wall of many frames.
+/// Compares the variance of the sensor's reading with its electrons, in bins of brightness, over the wall of many
+/// frames.
 #[test]
 fn the_noise_has_the_variance_of_its_electrons() {
     const FULL: f64 = 1500.0;

@@ -37,7 +37,7 @@ fn all_cameras_see_the_same_instants_and_the_stream_ends_when_told() {
     assert_eq!(error.to_string(), "camera 00: the simulation ends after 3 frames");
 }
 
-/// All frames that threads deliver from these simulated cameras.
+/// Returns all frames that threads deliver from these simulated cameras.
 fn delivered(config: &SimConfig, time: SimTime, pacing: Pacing) -> Vec<Frame> {
     let shared = Arc::new(Mutex::new(simulator(config)));
     let boxed = sources(&shared, time).into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect();

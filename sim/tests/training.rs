@@ -1,4 +1,4 @@
-//! Training data without end: random, valid, and the same again.
+//! Endless training data: random, valid, and reproducible.
 
 #![allow(clippy::unwrap_used)]
 

@@ -1,4 +1,4 @@
-//! Image, mask, depth, canonical positions, surface and pose speak of the same person.
+//! Image, mask, depth, canonical positions, surface and pose agree.
 
 #![allow(clippy::unwrap_used)]
 
@@ -16,8 +16,8 @@ fn pixels(frame: &SimFrame) -> impl Iterator<Item = (usize, DVec2)> + '_ {
     (0..frame.depth.len()).map(move |i| (i, DVec2::new((i % width) as f64, (i / width) as f64)))
 }
 
-/// Compares depth and canonical positions with rays cast in f64 at every `stride`-th pixel of the person.
-/// Returns the errors in metres, sorted.
+/// Compares depth and canonical positions with rays cast in f64 at every `stride`-th pixel of the person. Returns the
+/// errors in metres, sorted.
 fn errors(simulator: &mut Simulator, slot: usize, stride: usize) -> (Vec<f64>, Vec<f64>) {
     let frame = simulator.render(NANOS, slot).unwrap();
     let mesh = simulator.clothed_surface(NANOS);

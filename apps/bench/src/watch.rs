@@ -137,7 +137,7 @@ fn apart_px(camera: &Camera, other: &Camera) -> f64 {
 
 fn look_at(watch: &mut CameraWatch, image: &Image) -> (WatchState, f64) {
     let started = Instant::now();
-    let state = watch.look(&watched(image));
+    let state = watch.compare(&watched(image));
     (state, 1e3 * started.elapsed().as_secs_f64())
 }
 

@@ -112,7 +112,7 @@ mod tests {
             ("", "camera left: serial, path, bus and nokhwa are all empty; set one"),
             ("serial = \"a\"\nbus = \"b\"", "by one of serial, path, bus and nokhwa, not by several"),
             ("nokhwa = \"0\"\ngain = 3", "camera left: gain cannot be set through nokhwa; leave it out"),
-            ("nokhwa = \"0\"\nformat = \"uyvy\"", "format \"uyvy\" cannot be had through nokhwa"),
+            ("nokhwa = \"0\"\nformat = \"uyvy\"", "format \"uyvy\" is not available through nokhwa"),
             ("serial = \"a\"\nfps = 0", "camera left: fps is 0, it must lie between 0.1 and 1000"),
             ("serial = \"a\"\nexposure_ms = nan", "camera left: exposure_ms is NaN"),
             ("serial = \"a\"\nbuffers = 1", "camera left: buffers is 1, it must lie between 3 and 32"),

@@ -113,7 +113,7 @@ fn by_motion(
     }
     drop(threads);
     let estimates = estimate_lags(&signals, (args.most_ms * 1e6) as i64);
-    Ok((estimates, signals.iter().map(MotionSignal::len).collect()))
+    Ok((estimates, signals.iter().map(MotionSignal::comparisons).collect()))
 }
 
 fn print(estimates: &[LagEstimate], frames: &[usize]) {
@@ -150,7 +150,7 @@ fn by_silhouettes(
         },
     )?;
     let tracks = silhouettes.into_tracks();
-    let frames: Vec<usize> = tracks.iter().map(SilhouetteTrack::len).collect();
+    let frames: Vec<usize> = tracks.iter().map(SilhouetteTrack::masks).collect();
     if let Some((slot, error)) =
         (0..pictures.len()).filter(|&slot| pictures[slot] == 0).find_map(|slot| Some((slot, errors.of(slot)?)))
     {

@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn poison_stays_visible() {
+    fn logarithm_and_exponential_keep_values_that_are_not_finite() {
         let nan = DQuat::from_xyzw(f64::NAN, 0.0, 0.0, 1.0);
         assert!(!log_rotation(nan).is_finite() && !exp_rotation(DVec3::NAN).is_finite());
     }

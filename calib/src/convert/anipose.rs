@@ -1,6 +1,6 @@
-//! TOML of anipose, Pose2Sim and caliscope: a table for each camera with `name`, `size`, `matrix`, `distortions`, `fisheye`,
-//! `rotation` (a Rodrigues vector, or a matrix in older files of caliscope) and `translation`. caliscope puts the tables into
-//! `[cameras]`; lengths are in the unit of the board.
+//! TOML of anipose, Pose2Sim and caliscope: one table per camera with `name`, `size`, `matrix`, `distortions`,
+//! `fisheye`, `rotation` (a Rodrigues vector, or a matrix in older files of caliscope) and `translation`. caliscope
+//! puts the tables into `[cameras]`; lengths are in the unit of the board.
 
 use std::{fmt::Write as _, path::Path};
 
@@ -12,7 +12,8 @@ use super::{
     imported::{Imported, ImportedCamera},
     shared::{bad, intrinsics, opencv_coefficients, opencv_lens, rotation_of},
 };
-use crate::{CalibError, calibration_file};
+use crate::calibration_file;
+use crate::error::CalibError;
 
 pub(super) const FILE: &str = "anipose.toml";
 

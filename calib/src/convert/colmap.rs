@@ -1,6 +1,6 @@
-//! COLMAP's text model: `cameras.txt` and `images.txt`, one image for each camera.
+//! COLMAP's text model: `cameras.txt` and `images.txt`, one image per camera.
 //!
-//! COLMAP puts the centre of the first pixel at (0.5, 0.5): half a pixel is taken off its principal point.
+//! COLMAP puts the centre of the first pixel at (0.5, 0.5): half a pixel is subtracted from its principal point.
 
 use std::{
     collections::BTreeMap,
@@ -15,11 +15,12 @@ use super::{
     imported::{Imported, ImportedCamera},
     shared::{bad, camera_of_image, intrinsics},
 };
-use crate::{CalibError, calibration_file};
+use crate::calibration_file;
+use crate::error::CalibError;
 
 pub(super) const CAMERAS: &str = "cameras.txt";
 const IMAGES: &str = "images.txt";
-/// Poses of one camera in two images differ by less than this, metres of the file and radians.
+/// Largest difference between the poses of one camera in two images, units of the file and radians.
 const SAME_POSE: f64 = 1e-6;
 
 pub(super) fn read(dir: &Path) -> Result<Imported, CalibError> {
@@ -55,8 +56,7 @@ pub(super) fn read(dir: &Path) -> Result<Imported, CalibError> {
             continue;
         };
         if !same_pose(known, &camera) {
-            let problem =
-                format!("line {number}: camera {} stands in two places; give one image of each camera", camera.id);
+            let problem = format!("line {number}: camera {} has two poses; give one image of each camera", camera.id);
             return Err(bad(&images_path, problem));
         }
     }

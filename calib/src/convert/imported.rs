@@ -1,4 +1,4 @@
-//! Cameras of a foreign file.
+//! Cameras read from a foreign file.
 
 use std::path::Path;
 
@@ -6,24 +6,24 @@ use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry, Rig};
 use glam::DVec3;
 
 use super::shared::bad;
-use crate::CalibError;
+use crate::error::CalibError;
 
-/// Right-hand axes of cameras on a level rig lie in a plane; this share of their spread may stand out of it, at most.
+/// Largest spread of a level rig's right-hand axes out of their common plane, relative to their spread within it.
 const LEVEL_SHARE: f64 = 0.2;
-/// An axis of the world this close to the estimate is up whatever the scatter, and beyond the other it never is, radians.
+/// Angles to a world axis within which it is always up, and beyond which it never is, radians.
 const LEAST_SNAP_RAD: f64 = 0.02;
 const MOST_SNAP_RAD: f64 = 0.35;
 
 /// Cameras of a file; poses may be unknown.
 #[derive(Debug, Clone)]
 pub struct Imported {
-    /// In the file's order.
+    /// Cameras in the file's order.
     pub cameras: Vec<ImportedCamera>,
-    /// Unit vector against gravity, world axes, where the format says it.
+    /// Unit vector against gravity, world axes, where the format contains it.
     pub up: Option<DVec3>,
 }
 
-/// A camera whose pose may be unknown.
+/// Camera whose pose may be unknown.
 #[derive(Debug, Clone)]
 pub struct ImportedCamera {
     /// Name.
@@ -63,7 +63,8 @@ impl ImportedCamera {
 }
 
 impl Imported {
-    /// Returns the rig, with a guess of the direction up where the file does not say it; `None` where no camera has a pose.
+    /// Returns the rig, with an estimate of the up direction where the file lacks it; `None` where no camera has a
+    /// pose.
     ///
     /// # Errors
     /// Names the camera without a pose, where others have one.
@@ -93,8 +94,9 @@ impl Imported {
     }
 }
 
-/// Direction up of cameras that are held level, however far they look down: normal to their right-hand axes, or the axis of the world
-/// that lies within their scatter about level. Where those axes are nearly parallel, the mean of what the cameras have above them.
+/// Estimates the up direction of cameras that are held level, at any pitch: normal to their right-hand axes, or the
+/// world axis within their scatter about level. Where those axes are nearly parallel, the mean of the cameras' own up
+/// directions.
 fn level_up(cameras: &[Camera]) -> DVec3 {
     let axis = |camera: &Camera, axis: DVec3| camera.camera_from_world.rotation.inverse() * axis;
     let above: DVec3 = cameras.iter().map(|camera| axis(camera, DVec3::NEG_Y)).sum();

@@ -1,7 +1,7 @@
 //! Kalibr: `camchain.yaml`. Poses form a chain, `T_cn_cnm1` takes points from the camera before; the world is cam0.
 //!
-//! Kalibr numbers its cameras; their names are taken from and put into `rostopic`. `timeshift_cam_imu` gives time offsets:
-//! `t_imu = t_cam + shift`.
+//! Kalibr numbers its cameras; their names are read from and written to `rostopic`. `timeshift_cam_imu` gives time
+//! offsets: `t_imu = t_cam + shift`.
 
 use std::{fmt::Write as _, path::Path};
 
@@ -12,10 +12,8 @@ use super::{
     imported::{Imported, ImportedCamera},
     shared::{bad, intrinsics, motion_of, rows4},
 };
-use crate::{
-    CalibError,
-    yaml::{Value, parse_tree},
-};
+use crate::error::CalibError;
+use crate::yaml::{Value, parse_tree};
 
 pub(super) const FILE: &str = "camchain.yaml";
 

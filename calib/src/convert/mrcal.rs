@@ -1,4 +1,4 @@
-//! mrcal: one file `CAM.cameramodel` for each camera, a dictionary of Python with `lensmodel`, `intrinsics`, `extrinsics` (the
+//! mrcal: one file `CAM.cameramodel` per camera, a Python dictionary with `lensmodel`, `intrinsics`, `extrinsics` (the
 //! camera from the reference: Rodrigues vector and translation) and `imagersize`.
 
 use std::path::Path;
@@ -12,7 +12,8 @@ use super::{
     python,
     shared::{bad, files_with, intrinsics, opencv_coefficients, opencv_lens},
 };
-use crate::{CalibError, calibration_file};
+use crate::calibration_file;
+use crate::error::CalibError;
 
 const ENDING: &str = ".cameramodel";
 
@@ -21,7 +22,7 @@ pub(super) fn read(path: &Path) -> Result<Imported, CalibError> {
     let camera = |file: &std::path::PathBuf| {
         let text = calibration_file::read(file)?;
         let root: Value = serde_json::from_str(&python::to_json(&text))
-            .map_err(|error| bad(file, format!("is no dictionary of Python: {error}; export it again")))?;
+            .map_err(|error| bad(file, format!("is not a Python dictionary: {error}; export it again")))?;
         let id = CameraId::from(file.file_stem().unwrap_or_default().to_string_lossy().as_ref());
         model(id, &root).map_err(|problem| bad(file, problem))
     };

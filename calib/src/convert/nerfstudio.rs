@@ -12,11 +12,12 @@ use super::{
     imported::{Imported, ImportedCamera},
     shared::{bad, camera_of_image, intrinsics, motion_of, rows4},
 };
-use crate::{CalibError, calibration_file};
+use crate::calibration_file;
+use crate::error::CalibError;
 
 pub(super) const FILE: &str = "transforms.json";
 
-/// Half a turn about x: from axes x right, y up, z backward to x right, y down, z forward, and back.
+/// Returns half a turn about x: from axes x right, y up, z backward to x right, y down, z forward, and back.
 pub(super) fn flip() -> DQuat {
     DQuat::from_xyzw(1.0, 0.0, 0.0, 0.0)
 }
@@ -37,7 +38,7 @@ pub(super) fn read(path: &Path) -> Result<Imported, CalibError> {
             continue;
         };
         if !same_pose(known, &camera) {
-            let problem = format!("camera {} stands in two places; give one frame of each camera", camera.id);
+            let problem = format!("camera {} has two poses; give one frame of each camera", camera.id);
             return Err(bad(path, format!("frame {number}: {problem}")));
         }
     }

@@ -1,4 +1,4 @@
-//! OpenCV: one FileStorage file `CAM.yml` for each camera, with the keys of OpenCV's calibration sample.
+//! OpenCV: one FileStorage file `CAM.yml` per camera, with the keys of OpenCV's calibration sample.
 //!
 //! `image_width`, `image_height`, `camera_matrix`, `distortion_coefficients`, `fisheye_model` (1 for a fisheye), and for the pose
 //! `rvec` (or `R`) and `tvec` (or `T`), `x_camera = R x_world + T`.
@@ -12,10 +12,8 @@ use super::{
     imported::{Imported, ImportedCamera},
     shared::{bad, files_with, intrinsics, opencv_coefficients, opencv_lens, rotation_of},
 };
-use crate::{
-    CalibError,
-    yaml::{Matrix, YamlFile, YamlWriter},
-};
+use crate::error::CalibError;
+use crate::yaml::{Matrix, YamlFile, YamlWriter};
 
 pub(super) fn read(path: &Path) -> Result<Imported, CalibError> {
     let files = if path.is_dir() { files_with(path, ".yml")? } else { vec![path.to_owned()] };

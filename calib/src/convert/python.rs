@@ -1,7 +1,7 @@
-//! Literals of Python, as mrcal writes them, turned into JSON.
+//! Conversion of Python literals, as mrcal writes them, to JSON.
 
-/// Returns a literal as JSON: comments and trailing commas go, quotes become double, tuples lists, bytes strings. What is no literal
-/// stays as it is, for the JSON parser to refuse.
+/// Returns a literal as JSON: without comments and trailing commas, with double quotes, tuples as lists, bytes as
+/// strings. Anything else is left for the JSON parser to reject.
 pub(super) fn to_json(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     let mut rest = text.chars().peekable();
@@ -61,7 +61,7 @@ fn string(quote: char, rest: &mut impl Iterator<Item = char>, out: &mut String) 
             '\\' => match rest.next() {
                 Some(next @ ('"' | '\\' | '/' | 'n' | 't' | 'r')) => out.extend(['\\', next]),
                 Some(next) if next == quote => out.push(next),
-                // Other escapes stand in bytes that nobody reads.
+                // Other escapes occur only in bytes that are not read.
                 _ => {}
             },
             c if c == quote => break,

@@ -1,8 +1,8 @@
 //! Qualisys Track Manager: the calibration as XML (`*.qca.txt`, or the XML of its real-time protocol).
 //!
-//! `transform` is the position in millimetres and the rotation world to camera, row by row, with camera axes x right, y up, z
-//! backward. Lengths in the image are 64ths of a pixel, counted from the image's edge (`sensorMaxU` of an image of 1920 pixels is
-//! 122879): half a pixel is taken off the principal point. Distortion coefficients are OpenCV's.
+//! `transform` is the position in millimetres and the rotation world to camera, row by row, with camera axes x right, y
+//! up, z backward. Image lengths are 64ths of a pixel, measured from the image's edge (`sensorMaxU` of an image of 1920
+//! pixels is 122879): half a pixel is subtracted from the principal point. Distortion coefficients are OpenCV's.
 
 use std::{fmt::Write as _, path::Path};
 
@@ -15,7 +15,8 @@ use super::{
     nerfstudio::flip,
     shared::{bad, intrinsics, opencv_lens, rotation_of},
 };
-use crate::{CalibError, calibration_file};
+use crate::calibration_file;
+use crate::error::CalibError;
 
 const SUBPIXELS: f64 = 64.0;
 

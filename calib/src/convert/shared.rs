@@ -1,21 +1,21 @@
-//! Parts that several formats share.
+//! Helpers shared by several formats.
 
 use std::path::{Path, PathBuf};
 
 use flyrig_types::{CameraId, Intrinsics, Isometry, Lens};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
-use crate::CalibError;
+use crate::error::CalibError;
 
-/// Largest entry of `RᵀR - 1` that rounding in a text file explains.
+/// Largest entry of `RᵀR - 1` that is attributed to rounding in a text file.
 const ROTATION_TOLERANCE: f64 = 1e-3;
 
-/// Reports a fault of a file.
+/// Builds the error of a faulty file.
 pub(super) fn bad(path: &Path, problem: impl Into<String>) -> CalibError {
     CalibError::Format { path: path.to_owned(), problem: problem.into() }
 }
 
-/// Returns the first of the names that a folder holds, or the file itself.
+/// Returns the first of the names that a folder contains, or the file itself.
 pub(super) fn inside(path: &Path, names: &[&str]) -> PathBuf {
     if !path.is_dir() {
         return path.to_owned();
@@ -24,7 +24,7 @@ pub(super) fn inside(path: &Path, names: &[&str]) -> PathBuf {
     known.unwrap_or_else(|| path.join(names.first().copied().unwrap_or_default()))
 }
 
-/// Files of a folder whose name ends so, in order.
+/// Lists the files of a folder with this ending, sorted.
 pub(super) fn files_with(dir: &Path, ending: &str) -> Result<Vec<PathBuf>, CalibError> {
     let refused = |source| CalibError::Read { path: dir.to_owned(), source };
     let mut files = Vec::new();
@@ -38,7 +38,7 @@ pub(super) fn files_with(dir: &Path, ending: &str) -> Result<Vec<PathBuf>, Calib
     Ok(files)
 }
 
-/// Returns the file, or the folder's one file with that ending.
+/// Returns the file itself, or the folder's only file with that ending.
 pub(super) fn one_file(path: &Path, ending: &str) -> Result<PathBuf, CalibError> {
     if !path.is_dir() {
         return Ok(path.to_owned());
@@ -51,7 +51,8 @@ pub(super) fn one_file(path: &Path, ending: &str) -> Result<PathBuf, CalibError>
     }
 }
 
-/// Camera of an image by its path: the folder that holds the image, or the image's name where that folder is the one of all images.
+/// Returns the camera of an image path: the folder that contains the image, or the image's name where that folder holds
+/// all images.
 pub(super) fn camera_of_image(image: &str) -> CameraId {
     let parts: Vec<&str> = image.split(['/', '\\']).filter(|part| !part.is_empty() && *part != ".").collect();
     let is_common = |folder: &str| folder.to_lowercase().starts_with("image") || folder == "..";
@@ -63,7 +64,7 @@ pub(super) fn camera_of_image(image: &str) -> CameraId {
     CameraId::from(name)
 }
 
-/// Reads a rotation matrix; the text says what is wrong with it.
+/// Reads a rotation matrix; the error text describes its fault.
 pub(crate) fn rotation_of(matrix: DMat3) -> Result<DQuat, String> {
     let excess = matrix.transpose() * matrix - DMat3::IDENTITY;
     let deviation = excess.to_cols_array().into_iter().fold(0.0, |worst: f64, value| worst.max(value.abs()));
@@ -76,7 +77,8 @@ pub(crate) fn rotation_of(matrix: DMat3) -> Result<DQuat, String> {
     Ok(DQuat::from_mat3(&matrix).normalize())
 }
 
-/// Lens of OpenCV's coefficients k1 k2 p1 p2 k3 k4 k5 k6, as many as there are; those of prisms and tilted sensors must be 0.
+/// Returns the lens of OpenCV's coefficients k1 k2 p1 p2 k3 k4 k5 k6, as many as there are; those of prisms and tilted
+/// sensors must be 0.
 pub(crate) fn opencv_lens(coefficients: &[f64]) -> Result<Lens, String> {
     if ![0, 4, 5, 8, 12, 14].contains(&coefficients.len()) {
         return Err(format!("{} distortion coefficients, expected 0, 4, 5, 8, 12 or 14", coefficients.len()));
@@ -96,20 +98,20 @@ pub(crate) fn opencv_lens(coefficients: &[f64]) -> Result<Lens, String> {
     Ok(Lens::Rational { radial: [c[0], c[1], c[4], c[5], c[6], c[7]], tangential })
 }
 
-/// OpenCV's coefficients of a lens, 5 or 8; `None` for a fisheye.
+/// Returns OpenCV's coefficients of a lens, 5 or 8; `None` for a fisheye.
 pub(crate) fn opencv_coefficients(lens: &Lens) -> Option<Vec<f64>> {
     let ([k1, k2, k3, k4, k5, k6], [p1, p2]) = lens.rational()?;
     let plain = vec![k1, k2, p1, p2, k3];
     Some(if matches!(lens, Lens::Rational { .. }) { [plain, vec![k4, k5, k6]].concat() } else { plain })
 }
 
-/// Intrinsics of a size in whole pixels; anything else is left for the check of the camera.
+/// Builds intrinsics of a size in whole pixels; other sizes are left for the check of the camera.
 pub(super) fn intrinsics([width, height]: [f64; 2], focal_px: DVec2, center_px: DVec2, lens: Lens) -> Intrinsics {
     let side = |value: f64| if value.fract() == 0.0 { value as u32 } else { 0 };
     Intrinsics { width: side(width), height: side(height), focal_px, center_px, lens }
 }
 
-/// Rotation and translation as a 4x4 matrix, row by row.
+/// Returns rotation and translation as a 4x4 matrix, row by row.
 pub(super) fn rows4(isometry: &Isometry) -> [[f64; 4]; 4] {
     let r = DMat3::from_quat(isometry.rotation).transpose().to_cols_array_2d();
     let t = isometry.translation.to_array();

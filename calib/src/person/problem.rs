@@ -1,4 +1,6 @@
 //! Least squares of cameras, time offsets and the landmarks of a moving person.
+//!
+//! All landmarks of an instant are eliminated together, since limbs join them.
 
 use flyrig_solve::{BlockProblem, Kernel, Residual, RigidMotion, skew};
 use flyrig_types::Intrinsics;
@@ -7,15 +9,12 @@ use nalgebra::{DMatrix, DVector};
 
 use super::tangents::{Eye, Side, Tangency, tangency};
 use super::tracks::{PersonTracks, Place};
-use crate::{
-    LensModel,
-    projection::{project, project_with_derivatives},
-};
+use crate::projection::{LensModel, project, project_with_derivatives};
 
-/// A landmark at this many standard deviations loses half its weight.
+/// Robust kernel of landmarks, which lose half their weight at 2 standard deviations.
 const LANDMARK_KERNEL: Kernel = Kernel::Cauchy(2.0);
 const LIMB_KERNEL: Kernel = Kernel::Cauchy(2.0);
-/// A camera that was bumped pulls the others along only a little.
+/// Robust kernel of priors, so that a bumped camera shifts the others only a little.
 const PRIOR_KERNEL: Kernel = Kernel::Huber(1.0);
 /// Weight of a landmark relative to a tangent plane: the network's errors depend on the viewing direction and persist over time,
 /// those of silhouettes hardly do (docs/benchmarks/calibration.md).
@@ -25,11 +24,11 @@ const LOOSE_M: f64 = 2.0;
 
 /// Unknowns of the problem.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Estimate {
+pub(crate) struct PersonEstimate {
     pub cameras: Vec<RigidMotion>,
     /// Time offsets, subtracted from the timestamps, seconds; the first camera's is fixed.
     pub lags_s: Vec<f64>,
-    /// By instant and landmark, metres in the world.
+    /// Landmarks per instant, metres in the world.
     pub points: Vec<Vec<DVec3>>,
 }
 
@@ -62,7 +61,7 @@ pub(crate) struct Known<'a> {
     /// Pairs of landmarks at a constant distance.
     pub limbs: &'a [(usize, usize)],
     /// The old calibration.
-    pub before: Estimate,
+    pub before: PersonEstimate,
     /// Standard deviations of a camera's orientation and position there: radians, metres.
     pub prior: (f64, f64),
     /// Standard deviation of a time offset, seconds.
@@ -76,7 +75,7 @@ pub(crate) struct Known<'a> {
 /// Standard deviations, estimated alternately with the unknowns.
 #[derive(Debug, Clone)]
 pub(crate) struct Spread {
-    /// By landmark, pixels.
+    /// Per landmark, pixels.
     pub landmark_px: Vec<f64>,
     /// Length of each limb and its standard deviation, metres.
     pub limbs_m: Vec<Option<(f64, f64)>>,
@@ -95,7 +94,7 @@ pub(crate) struct PersonProblem<'a> {
 }
 
 impl<'a> PersonProblem<'a> {
-    pub fn new(known: &'a Known<'a>, spread: &'a Spread, at: &Estimate) -> Self {
+    pub fn new(known: &'a Known<'a>, spread: &'a Spread, at: &PersonEstimate) -> Self {
         let (cameras, landmarks) = (known.intrinsics.len(), known.tracks.landmarks());
         let mut terms: Vec<Term> = (0..cameras).map(Term::Camera).collect();
         if known.lags {
@@ -144,7 +143,7 @@ impl<'a> PersonProblem<'a> {
 
     fn seen_residual(
         &self,
-        at: &Estimate,
+        at: &PersonEstimate,
         [instant, camera, landmark]: [usize; 3],
         with_jacobians: bool,
     ) -> Option<Residual> {
@@ -185,7 +184,7 @@ impl<'a> PersonProblem<'a> {
 
     fn touch_residual(
         &self,
-        at: &Estimate,
+        at: &PersonEstimate,
         instant: usize,
         cameras: [usize; 2],
         side: Side,
@@ -214,7 +213,7 @@ impl<'a> PersonProblem<'a> {
         (self.known.lags && camera > 0).then(|| self.known.intrinsics.len() + camera - 1)
     }
 
-    fn limb_residual(&self, at: &Estimate, instant: usize, limb: usize) -> Option<Residual> {
+    fn limb_residual(&self, at: &PersonEstimate, instant: usize, limb: usize) -> Option<Residual> {
         let (a, b) = self.known.limbs[limb];
         let (length, sigma) = self.spread.limbs_m[limb]?;
         let points = &at.points[instant];
@@ -231,7 +230,7 @@ impl<'a> PersonProblem<'a> {
         })
     }
 
-    fn camera_residual(&self, at: &Estimate, camera: usize) -> Residual {
+    fn camera_residual(&self, at: &PersonEstimate, camera: usize) -> Residual {
         let (turn_sigma, place_sigma) = self.known.prior;
         let (now, before) = (&at.cameras[camera], &self.known.before.cameras[camera]);
         let quaternion = now.rotation * before.rotation.inverse();
@@ -261,7 +260,7 @@ impl Known<'_> {
     /// Compares the outermost tangent planes of all pairs of cameras at an instant.
     pub fn touches<'b>(
         &'b self,
-        at: &'b Estimate,
+        at: &'b PersonEstimate,
         instant: usize,
     ) -> impl Iterator<Item = ([usize; 2], Side, Tangency)> + 'b {
         let count = self.intrinsics.len();
@@ -272,7 +271,7 @@ impl Known<'_> {
 
     fn tangency(
         &self,
-        at: &Estimate,
+        at: &PersonEstimate,
         instant: usize,
         cameras: [usize; 2],
         side: Side,
@@ -290,17 +289,17 @@ impl Known<'_> {
         tangency(cameras.map(eye), side, middle.try_normalize()?, with_derivatives)
     }
 
-    fn stamp(&self, at: &Estimate, instant: usize, camera: usize) -> i64 {
+    fn stamp(&self, at: &PersonEstimate, instant: usize, camera: usize) -> i64 {
         self.instants[instant].saturating_add((at.lags_s[camera] * 1e9) as i64)
     }
 
     /// Returns the smoothed landmark of a camera at an instant.
-    pub fn place(&self, at: &Estimate, instant: usize, camera: usize, landmark: usize) -> Option<Place> {
+    pub fn place(&self, at: &PersonEstimate, instant: usize, camera: usize, landmark: usize) -> Option<Place> {
         self.tracks.track(camera, landmark).at(self.stamp(at, instant, camera), self.intervals_s[camera])
     }
 
     /// Returns the reprojection error of a landmark, pixels; `None` where it is not seen or cannot be projected.
-    pub fn error(&self, at: &Estimate, instant: usize, camera: usize, landmark: usize) -> Option<DVec2> {
+    pub fn error(&self, at: &PersonEstimate, instant: usize, camera: usize, landmark: usize) -> Option<DVec2> {
         let place = self.place(at, instant, camera, landmark)?;
         let local = at.cameras[camera].apply(at.points[instant][landmark]);
         Some(project(&self.intrinsics[camera], local)? - place.pixel)
@@ -308,7 +307,7 @@ impl Known<'_> {
 }
 
 impl BlockProblem for PersonProblem<'_> {
-    type Unknowns = Estimate;
+    type Unknowns = PersonEstimate;
 
     fn block_sizes(&self) -> &[usize] {
         &self.sizes
@@ -322,7 +321,7 @@ impl BlockProblem for PersonProblem<'_> {
         self.terms.len()
     }
 
-    fn residual(&self, at: &Estimate, index: usize, with_jacobians: bool) -> Option<Residual> {
+    fn residual(&self, at: &PersonEstimate, index: usize, with_jacobians: bool) -> Option<Residual> {
         match self.terms[index] {
             Term::Seen { instant, camera, landmark } => {
                 self.seen_residual(at, [instant, camera, landmark], with_jacobians)
@@ -357,7 +356,7 @@ impl BlockProblem for PersonProblem<'_> {
         }
     }
 
-    fn moved(&self, at: &Estimate, step: &[f64]) -> Estimate {
+    fn moved(&self, at: &PersonEstimate, step: &[f64]) -> PersonEstimate {
         let mut at = at.clone();
         let mut vectors = step.chunks_exact(3).map(|v| DVec3::new(v[0], v[1], v[2]));
         let mut next = || vectors.next().unwrap_or_default();

@@ -1,7 +1,7 @@
-//! Rays of pixels, and the point nearest to several of them.
+//! Poses of cameras, rays of pixels, and the point nearest to several of them.
 
 use flyrig_solve::RigidMotion;
-use flyrig_types::Intrinsics;
+use flyrig_types::{Camera, Intrinsics, Rig};
 use glam::{DMat3, DVec2, DVec3};
 
 /// Distance from a ray at which it loses half its weight, metres.
@@ -12,7 +12,7 @@ const ROBUST_M: f64 = 0.05;
 pub(crate) struct Ray {
     /// Camera centre, metres.
     pub center: DVec3,
-    /// Length 1.
+    /// Unit direction.
     pub direction: DVec3,
     /// Confidence of the observation, 0 to 1.
     pub confidence: f64,
@@ -26,7 +26,7 @@ impl Ray {
         Some(Self { center: camera.inverse().translation, direction, confidence })
     }
 
-    /// Projection onto the plane perpendicular to the ray.
+    /// Returns the projection onto the plane perpendicular to the ray.
     fn across(&self) -> DMat3 {
         let d = self.direction;
         DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z)
@@ -57,4 +57,13 @@ pub(crate) fn nearest(rays: &[Ray]) -> Option<DVec3> {
     }
     let is_ahead = rays.iter().all(|ray| ray.direction.dot(point - ray.center) > 0.1);
     (is_ahead && point.is_finite()).then_some(point)
+}
+
+/// Returns the poses of a rig's cameras, camera from world.
+pub(crate) fn motions(rig: &Rig) -> Vec<RigidMotion> {
+    let of = |camera: &Camera| RigidMotion {
+        rotation: camera.camera_from_world.rotation,
+        translation: camera.camera_from_world.translation,
+    };
+    rig.cameras.iter().map(of).collect()
 }

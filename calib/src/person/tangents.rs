@@ -4,14 +4,14 @@
 use flyrig_solve::RigidMotion;
 use glam::DVec3;
 
-use super::tracks::parabola_weights;
+use super::smoothing::parabola_weights;
 
 /// Smallest sine of the angle between the baseline and the viewing direction: near the baseline the angle is ill-conditioned.
 const LEAST_APART: f64 = 0.35;
-/// A silhouette wider than this, radians about the baseline, surrounds the epipole.
+/// Largest angle of a silhouette about the baseline, radians; a wider one surrounds the epipole.
 const MOST_SPAN: f64 = 2.0;
 
-/// A corner of the convex hull of a silhouette.
+/// Corner of the convex hull of a silhouette.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OutlineCorner {
     /// Direction in the camera's axes.
@@ -30,7 +30,7 @@ pub(crate) enum Side {
     High,
 }
 
-/// One camera of a pair.
+/// Camera of a pair.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Eye<'a> {
     pub camera: RigidMotion,
@@ -47,7 +47,8 @@ struct Pencil {
 }
 
 impl Pencil {
-    /// Angle 0 points towards `ahead`, a fixed direction in the world.
+    /// Creates the frame with angle 0 towards `ahead`, a fixed direction in the world; `None` where the baseline is too
+    /// close to it.
     fn new(a: &RigidMotion, b: &RigidMotion, ahead: DVec3) -> Option<Self> {
         let line = (b.inverse().translation - a.inverse().translation).try_normalize()?;
         let front = ahead.reject_from_normalized(line);
@@ -63,7 +64,7 @@ impl Pencil {
 
 /// Hull corners at which an outermost plane is tangent, in the images around an instant.
 struct Touch {
-    /// Direction in the camera's axes; weight in the angle at the instant, and in its slope a second.
+    /// Direction in the camera's axes; weight in the angle at the instant, and in its slope per second.
     corners: Vec<(DVec3, f64, f64)>,
 }
 
@@ -94,7 +95,7 @@ impl Touch {
         self.corners.iter().map(|(ray, weight, _)| weight * pencil.angle(back * *ray)).sum()
     }
 
-    /// Radians a second.
+    /// Returns the angular velocity, radians per second.
     fn speed(&self, camera: &RigidMotion, pencil: &Pencil) -> f64 {
         let back = camera.rotation.inverse();
         self.corners.iter().map(|(ray, _, slope)| slope * pencil.angle(back * *ray)).sum()

@@ -179,7 +179,7 @@ fn derivatives_are_those_of_finite_differences() {
     let intrinsics: Vec<Intrinsics> = believed.cameras.iter().map(|camera| camera.intrinsics).collect();
     let intervals_s = [1.0 / 30.0; 3];
     let old = motions(&believed);
-    let mut estimate = Estimate { cameras: old.clone(), lags_s: vec![0.0; 3], points: Vec::new() };
+    let mut estimate = PersonEstimate { cameras: old.clone(), lags_s: vec![0.0; 3], points: Vec::new() };
     let instants = instants(&intrinsics, &tracks, &intervals_s, &estimate).unwrap()[..3].to_vec();
     estimate.points = vec![vec![DVec3::ZERO; 10]; 3];
     let mut known = Known {

@@ -1,16 +1,9 @@
-//! Image tracks of a person's landmarks and silhouettes, one set per camera.
+//! Image tracks of a person's landmarks and silhouettes, per camera, resampled at common instants.
 
-use glam::{DMat3, DVec2, DVec3};
+use glam::DVec2;
 
+use super::smoothing::parabola_weights;
 use super::tangents::{OutlineCorner, Outlines};
-
-/// Standard deviation of the smoothing window, seconds, and its least value in intervals between images.
-const SMOOTH_S: f64 = 0.03;
-const SMOOTH_INTERVALS: f64 = 1.0;
-/// Radius of the window in standard deviations.
-const REACH: f64 = 2.5;
-/// Samples that a smoothed value needs.
-const LEAST_SAMPLES: usize = 4;
 
 /// Image track of one landmark in one camera.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -23,9 +16,9 @@ pub(crate) struct Track {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Place {
     pub pixel: DVec2,
-    /// Pixels a second.
+    /// Pixels per second.
     pub velocity: DVec2,
-    /// 0 to 1.
+    /// Confidence in 0..=1.
     pub confidence: f64,
 }
 
@@ -41,46 +34,6 @@ impl Track {
         }
         (place.pixel.is_finite() && place.velocity.is_finite() && place.confidence > 0.0).then_some(place)
     }
-}
-
-/// Samples in a window, with their weights in the fitted value and in its slope.
-pub(crate) type Weighted<'a, T> = (&'a [T], Vec<(f64, f64)>);
-
-/// Returns the samples around a time with their weights in the value and the slope (per second) of the local quadratic fit there; `None`
-/// with too few samples, or samples on one side only.
-pub(crate) fn parabola_weights<T>(
-    samples: &[T],
-    time: impl Fn(&T) -> i64,
-    trust: impl Fn(&T) -> f64,
-    nanos: i64,
-    interval_s: f64,
-) -> Option<Weighted<'_, T>> {
-    let window = SMOOTH_S.max(SMOOTH_INTERVALS * interval_s);
-    let reach = (REACH * window * 1e9) as i64;
-    let from = samples.partition_point(|sample| time(sample) < nanos.saturating_sub(reach));
-    let count = samples[from..].partition_point(|sample| time(sample) <= nanos.saturating_add(reach));
-    let near = &samples[from..from + count];
-    let mut normal = DMat3::ZERO;
-    let rows: Vec<(DVec3, f64)> = near
-        .iter()
-        .map(|sample| {
-            let x = time(sample).saturating_sub(nanos) as f64 * 1e-9 / window;
-            let row = DVec3::new(1.0, x, x * x);
-            let weight = (-0.5 * x * x).exp() * trust(sample);
-            normal += DMat3::from_cols(row * row.x, row * row.y, row * row.z) * weight;
-            (row, weight)
-        })
-        .collect();
-    let is_between = rows.iter().any(|(row, _)| row.y <= 0.0) && rows.iter().any(|(row, _)| row.y >= 0.0);
-    if !is_between || near.len() < LEAST_SAMPLES || normal.determinant().abs() < 1e-9 {
-        return None;
-    }
-    let inverse = normal.inverse();
-    let weights = rows.into_iter().map(|(row, weight)| {
-        let solved = inverse * (row * weight);
-        (solved.x, solved.y / window)
-    });
-    Some((near, weights.collect()))
 }
 
 /// Landmarks and silhouettes of one person in the images of all cameras.
@@ -107,8 +60,8 @@ impl PersonTracks {
         Self { landmarks, cameras: vec![empty; cameras] }
     }
 
-    /// Adds the landmarks of an image: pixel and confidence (0 to 1), `None` for unseen ones. Ignores images out of order, unknown
-    /// cameras, and values that are not finite.
+    /// Adds the landmarks of an image: pixel and confidence (in 0..=1), `None` for unseen ones. Ignores images out of
+    /// order, unknown cameras, and values that are not finite.
     pub fn add(&mut self, camera: usize, nanos: i64, landmarks: &[Option<(DVec2, f64)>]) {
         let Some(camera) = self.cameras.get_mut(camera) else { return };
         if camera.nanos.last().is_some_and(|last| *last >= nanos) {

@@ -5,8 +5,7 @@ use flyrig_types::Rig;
 use glam::DVec2;
 
 use super::{
-    motions,
-    rays::{Ray, nearest},
+    rays::{Ray, motions, nearest},
     tracks::PersonTracks,
 };
 use crate::projection::project;

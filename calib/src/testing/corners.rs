@@ -1,11 +1,13 @@
-//! Corners of boards as cameras of a simulated ring see them.
+//! Board corners as seen by a simulated ring of cameras.
 
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
 use glam::{DQuat, DVec2, DVec3};
 
-use crate::{Board, BoardShot, BoardView, SeenCorner};
+use crate::board::Board;
+use crate::bundle::{BoardShot, BoardView};
+use crate::detect::SeenCorner;
 
-/// Pixels of every image.
+/// Size of every image, pixels.
 const SIZE: [u32; 2] = [1280, 720];
 
 /// Repeatable random numbers.
@@ -13,23 +15,23 @@ const SIZE: [u32; 2] = [1280, 720];
 pub struct Random(pub u64);
 
 impl Random {
-    /// Between 0 and 1.
+    /// Returns a number in 0..1.
     pub fn uniform(&mut self) -> f64 {
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (self.0 >> 11) as f64 / (1u64 << 53) as f64
     }
 
-    /// Between two numbers.
+    /// Returns a number between two others.
     pub fn between(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.uniform()
     }
 
-    /// Of the standard normal distribution.
+    /// Returns a sample of the standard normal distribution.
     pub fn normal(&mut self) -> f64 {
         (-2.0 * (1.0 - self.uniform()).ln()).sqrt() * (std::f64::consts::TAU * self.uniform()).cos()
     }
 
-    /// Three of them.
+    /// Returns three samples of [`Self::normal`].
     pub fn vector(&mut self) -> DVec3 {
         DVec3::new(self.normal(), self.normal(), self.normal())
     }
@@ -45,7 +47,7 @@ fn intrinsics(random: &mut Random) -> Intrinsics {
     }
 }
 
-/// Cameras on a ring of 3.2 m that look at its middle, z up.
+/// Places cameras on a ring of 3.2 m that face its centre, z up.
 #[must_use]
 pub fn ring(random: &mut Random, count: usize) -> Vec<Camera> {
     (0..count)
@@ -63,7 +65,8 @@ pub fn ring(random: &mut Random, count: usize) -> Vec<Camera> {
         .collect()
 }
 
-/// A board at `world_from_board` in the image of a camera, with noise; `None` from behind, from the edge, and outside the image.
+/// Projects a board at `world_from_board` into the image of a camera, with noise; `None` from behind, from the edge,
+/// and outside the image.
 #[must_use]
 pub fn view(
     random: &mut Random,
@@ -76,7 +79,7 @@ pub fn view(
     bent_view(random, (board, 0.0), camera, slot, world_from_board, noise_px)
 }
 
-/// The same for a board whose left and right edges lie so many metres behind its middle, on a parabola.
+/// Projects as [`view`] a board whose left and right edges lie this many metres behind its middle, on a parabola.
 fn bent_view(
     random: &mut Random,
     (board, bend_m): (&Board, f64),
@@ -103,20 +106,20 @@ fn bent_view(
     (corners.len() == board.corner_count()).then_some(BoardView { camera: slot, nanos: 0, corners })
 }
 
-/// A board around the middle of the ring in a random pose.
+/// Returns a random pose around the ring's centre.
 fn board_pose(random: &mut Random, board: &Board) -> Isometry {
     let rotation = DQuat::from_scaled_axis(random.vector().normalize() * random.between(0.0, 3.1));
     let middle = DVec3::new(random.normal(), random.normal(), random.normal() + 2.3) * 0.35;
     Isometry::new(rotation, middle - rotation * board.middle())
 }
 
-/// Shots of random boards that at least two cameras see.
+/// Simulates shots of random boards that at least two cameras see.
 #[must_use]
 pub fn shots(random: &mut Random, board: &Board, cameras: &[Camera], count: usize, noise_px: f64) -> Vec<BoardShot> {
     bent_shots(random, (board, 0.0), cameras, count, noise_px)
 }
 
-/// The same with a board whose left and right edges lie so many metres behind its middle.
+/// Simulates as [`shots`] a board whose left and right edges lie this many metres behind its middle.
 #[must_use]
 pub fn bent_shots(
     random: &mut Random,
@@ -142,7 +145,7 @@ pub fn bent_shots(
     shots
 }
 
-/// Errors of direction (degrees) and place (millimetres) of each camera relative to the first one.
+/// Returns the errors of orientation (degrees) and position (millimetres) of each camera relative to the first one.
 #[must_use]
 pub fn pose_errors(found: &[Camera], truth: &[Camera]) -> Vec<(f64, f64)> {
     let relative = |cameras: &[Camera], i: usize| {

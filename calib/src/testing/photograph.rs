@@ -1,20 +1,22 @@
-//! Photographs of printed boards.
+//! Simulated photographs of printed boards.
 
 use flyrig_types::{Camera, Isometry};
 use glam::DVec2;
 
-use crate::{Board, BoardSheet, GrayImage};
+use crate::board::Board;
+use crate::detect::GrayImage;
+use crate::print::BoardSheet;
 
-/// Pixels of the scanned sheet a millimetre, and samples along a side of an image's pixel.
+/// Resolution of the scanned sheet, pixels per millimetre, and samples along a side of an image's pixel.
 const SCAN: f64 = 8.0;
 const SAMPLES: i32 = 3;
-/// Grey levels of paper, ink and wall; noise to either side.
+/// Grey levels of paper, ink and wall; amplitude of the noise.
 const PAPER: u8 = 235;
 const INK: u8 = 20;
 const WALL: f64 = 120.0;
 const NOISE: f64 = 2.0;
 
-/// Photographs the printed board at `world_from_board` with a camera without distortion, from a mirror if asked.
+/// Photographs the printed board at `world_from_board` with a camera without distortion, optionally mirrored.
 ///
 /// # Errors
 /// As [`Board::check`].

@@ -1,4 +1,4 @@
-//! Errors of a calibration whose truth is known.
+//! Errors of a calibration with known truth.
 
 use flyrig_solve::{PointPair, align_similarity};
 use flyrig_types::Camera;
@@ -9,16 +9,16 @@ use super::Random;
 /// Error of one camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RigError {
-    /// Mean distance in its image from where all cameras together put what the true cameras see, pixels.
+    /// Mean reprojection error in its image of points placed by all cameras together, pixels.
     pub px: f64,
-    /// Of its direction after the best motion and scale of the whole rig, degrees.
+    /// Orientation error after the best motion and scale of the whole rig, degrees.
     pub deg: f64,
-    /// Of its place after that, millimetres.
+    /// Position error after the same alignment, millimetres.
     pub mm: f64,
 }
 
-/// Errors of cameras in the order of the true ones, over a volume of 1.2 x 1.2 x 1.8 m on the middle of the floor; `None` where the
-/// cameras are not the same ones, or see nothing there.
+/// Returns the errors in the order of the true cameras, over a volume of 1.2 x 1.2 x 1.8 m on the middle of the floor;
+/// `None` where the cameras differ, or see nothing there.
 #[must_use]
 pub fn rig_errors(found: &[Camera], truth: &[Camera]) -> Option<Vec<RigError>> {
     let found: Vec<&Camera> =

@@ -1,15 +1,15 @@
-//! Patches of a reference image, found again in another image.
+//! Patches of a reference image and their tracking in another image.
 
 use glam::{DVec2, DVec3};
 
-use super::WatchedImage;
+use super::image::WatchedImage;
 
 /// Half the side of a patch, and its side, pixels.
 const HALF: usize = 7;
 const SIDE: usize = 2 * HALF + 1;
-/// Levels of the pyramid, each half as large as the one before.
+/// Levels of the pyramid, each half the size of the previous one.
 const LEVELS: usize = 3;
-/// Cells of the image, across and down, and the most patches of each.
+/// Cells of the image, across and down, and the most patches per cell.
 const CELLS: (usize, usize) = (12, 8);
 const A_CELL: usize = 2;
 /// Least contrast of a patch: the smaller eigenvalue of its mean squared gradients, grey levels of 255 per pixel.
@@ -17,16 +17,16 @@ const LEAST_GRADIENT: f32 = 1.5;
 /// Steps of the descent, and the step that ends it, pixels.
 const STEPS: usize = 12;
 const SMALL_STEP: f32 = 0.01;
-/// Farthest a patch is followed from where it is expected, pixels.
+/// Farthest a patch is tracked from its expected position, pixels.
 const FAR: f64 = 8.0;
-/// Least correlation of a patch that was found again.
+/// Least correlation of a tracked patch.
 const LEAST_CORRELATION: f32 = 0.8;
-/// Farthest shift that is looked for, pixels of the coarsest level.
+/// Largest shift that is searched, pixels of the coarsest level.
 const FAR_SHIFT: isize = 14;
 
 type Gray = Vec<f32>;
 
-/// A grey image.
+/// Level of a pyramid.
 #[derive(Debug, Clone)]
 pub(super) struct Level {
     width: usize,
@@ -34,12 +34,13 @@ pub(super) struct Level {
     gray: Gray,
 }
 
-/// An image at several sizes, finest first.
+/// Image pyramid, finest level first.
 #[derive(Debug, Clone)]
 pub(super) struct Pyramid(Vec<Level>);
 
 impl Pyramid {
-    /// Reduces an image by a whole factor first; `None` for one that is too small or not as long as it says.
+    /// Reduces an image by an integer factor and builds its pyramid; `None` if it is too small or its length does not
+    /// match its size.
     pub fn new(image: &WatchedImage<'_>, factor: usize) -> Option<Self> {
         let (width, height) = (image.width / factor, image.height / factor);
         let length = image.width.checked_mul(image.height)?.checked_mul(image.channels)?;
@@ -69,7 +70,7 @@ impl Pyramid {
 }
 
 impl Level {
-    /// Weighs each pixel with its neighbours (1 2 1 across and down): noise falls to 3/8, corners stay.
+    /// Smooths each pixel with its neighbours (1 2 1 across and down): noise falls to 3/8, corners stay.
     fn smoothed(self) -> Self {
         let (width, height) = (self.width, self.height);
         let pass = |from: &Gray, step: usize, index: &dyn Fn(usize) -> (usize, usize)| -> Gray {
@@ -95,7 +96,7 @@ impl Level {
         Self { width, height, gray: (0..width * height).map(pixel).collect() }
     }
 
-    /// Brightness around a place between pixels, row by row; `None` where a part lies outside.
+    /// Samples the brightness around a subpixel position, row by row; `None` where a part lies outside.
     fn raw_patch(&self, x: f32, y: f32) -> Option<Gray> {
         let reach = HALF as f32;
         let inside =
@@ -118,7 +119,7 @@ impl Level {
         Some(values)
     }
 
-    /// Brightness of a patch, brought to mean 0 and length 1; `None` at the edge and without contrast.
+    /// Samples a patch, normalised to mean 0 and length 1; `None` at the edge and without contrast.
     fn patch(&self, x: f32, y: f32) -> Option<Gray> {
         normalised(self.raw_patch(x, y)?)
     }
@@ -135,13 +136,13 @@ fn normalised(mut values: Gray) -> Option<Gray> {
     Some(values)
 }
 
-/// A patch of the reference at one level.
+/// Reference patch at one level.
 #[derive(Debug, Clone)]
 struct Template {
     values: Gray,
     by_x: Gray,
     by_y: Gray,
-    /// Inverse of the sums of products of the derivatives: xx, xy, yy.
+    /// Inverse of the summed products of the derivatives: xx, xy, yy.
     inverse: [f32; 3],
 }
 
@@ -168,12 +169,12 @@ impl Template {
     }
 }
 
-/// A corner of the reference.
+/// Corner of the reference.
 #[derive(Debug, Clone)]
 pub(super) struct Patch {
     /// Pixel of the finest level.
     pub at: DVec2,
-    /// Its direction, camera axes.
+    /// Direction of that pixel, camera axes.
     pub ray: DVec3,
     templates: Vec<Template>,
 }
@@ -239,14 +240,14 @@ fn patch(pyramid: &Pyramid, x: f32, y: f32, ray: &dyn Fn(DVec2) -> Option<DVec3>
     Some(Patch { at, ray: ray(at)?, templates })
 }
 
-/// Place in level `k` of a pixel of the finest one: pixel centres lie at integers in both.
+/// Returns the position in level `k` of a pixel of the finest one: pixel centres lie at integers in both.
 fn reduced(x: f32, y: f32, k: usize) -> (f32, f32) {
     let factor = (1 << k) as f32;
     let place = |at: f32| (at + 0.5) / factor - 0.5;
     (place(x), place(y))
 }
 
-/// Finds patches again near their places shifted by `expected`; pixels of the finest level, or `None`.
+/// Tracks patches near their positions shifted by `expected`; pixels of the finest level, or `None`.
 pub(super) fn track(pyramid: &Pyramid, patches: &[Patch], expected: &[DVec2]) -> Vec<Option<DVec2>> {
     let one = |(patch, expected): (&Patch, &DVec2)| {
         let mut shift = [expected.x as f32, expected.y as f32];
@@ -265,7 +266,7 @@ pub(super) fn track(pyramid: &Pyramid, patches: &[Patch], expected: &[DVec2]) ->
     patches.iter().zip(expected).map(one).collect()
 }
 
-/// Moves a patch until it looks like its template; returns the shift and the correlation.
+/// Aligns a patch with its template by gradient descent; returns the shift and the correlation.
 fn descend(template: &Template, level: &Level, x: f32, y: f32, mut shift: [f32; 2]) -> Option<([f32; 2], f32)> {
     for _ in 0..STEPS {
         let values = level.patch(x + shift[0], y + shift[1])?;
@@ -293,7 +294,7 @@ fn descend(template: &Template, level: &Level, x: f32, y: f32, mut shift: [f32; 
     Some((shift, correlation))
 }
 
-/// The one shift at which most patches of the coarsest level look alike, in pixels of the finest level.
+/// Finds the shift at which most patches of the coarsest level match, in pixels of the finest level.
 pub(super) fn coarse_shift(pyramid: &Pyramid, patches: &[Patch]) -> Option<DVec2> {
     let (k, level) = pyramid.0.iter().enumerate().next_back()?;
     let score = |dx: isize, dy: isize| -> f32 {

@@ -1,4 +1,4 @@
-//! Watching a textured room whose camera, lights and people move.
+//! Watch of a textured room with moving camera, lights and people.
 
 use flyrig_types::{Camera, Isometry, Lens};
 
@@ -23,7 +23,7 @@ fn camera() -> Camera {
     }
 }
 
-/// A camera that was turned in its own axes (degrees) and shifted (millimetres).
+/// Returns a camera turned in its own axes (degrees) and shifted (millimetres).
 fn bumped(camera: &Camera, degrees: DVec3, mm: DVec3) -> Camera {
     let turn = Isometry::new(exp_rotation(-degrees * std::f64::consts::PI / 180.0), -mm * 1e-3);
     Camera { camera_from_world: turn * camera.camera_from_world, ..camera.clone() }
@@ -36,7 +36,7 @@ fn hash(x: i64, y: i64, salt: i64) -> f64 {
     ((h >> 40) & 0xffff) as f64 / 65535.0
 }
 
-/// Smooth noise with cells of `cell` metres.
+/// Returns smooth noise with cells of `cell` metres.
 fn noise(u: f64, v: f64, cell: f64, salt: i64) -> f64 {
     let (x, y) = (u / cell, v / cell);
     let (x0, y0) = (x.floor(), y.floor());
@@ -54,14 +54,14 @@ struct Scene {
     /// Brightness of each of the six walls and floors, and a shadow's edge on the floor.
     lights: [f64; 6],
     shadow: f64,
-    /// Pixels of a person's middle and half width, pixels; none at 0.
+    /// Position and half width of a person, pixels; none at 0.
     person: (f64, f64),
     noise: f64,
 }
 
 const CALM: Scene = Scene { gain: 1.0, lights: [1.0; 6], shadow: -9.0, person: (0.0, 0.0), noise: 2.0 };
 
-/// Draws the inside of a box of 6 x 6 x 3 m with patterned walls.
+/// Renders the inside of a box of 6 x 6 x 3 m with patterned walls.
 fn draw(camera: &Camera, scene: &Scene, random: &mut Random) -> Vec<u8> {
     let world_from_camera = camera.camera_from_world.inverse();
     let eye = world_from_camera.translation;
@@ -124,22 +124,22 @@ fn bumps_are_measured_and_small_ones_are_found() {
     ] {
         let mut watch = CameraWatch::new(&camera.intrinsics, &image(&reference)).unwrap();
         for _ in 0..3 {
-            assert!(!matches!(watch.look(&image(&draw(&camera, &CALM, &mut random))), WatchState::Moved(_)));
+            assert!(!matches!(watch.compare(&image(&draw(&camera, &CALM, &mut random))), WatchState::Moved(_)));
         }
         assert_eq!(watch.state(), WatchState::Steady);
         let moved = bumped(&camera, degrees, mm);
         let states: Vec<WatchState> =
-            (0..LOOKS).map(|_| watch.look(&image(&draw(&moved, &CALM, &mut random)))).collect();
-        assert!(states[..LOOKS - 1].iter().all(|state| *state == WatchState::Steady), "{states:?}");
-        let WatchState::Moved(found) = states[LOOKS - 1] else { panic!("{degrees} {mm}: {states:?}") };
+            (0..CONFIRMATIONS).map(|_| watch.compare(&image(&draw(&moved, &CALM, &mut random)))).collect();
+        assert!(states[..CONFIRMATIONS - 1].iter().all(|state| *state == WatchState::Steady), "{states:?}");
+        let WatchState::Moved(found) = states[CONFIRMATIONS - 1] else { panic!("{degrees} {mm}: {states:?}") };
         let truth = degrees * std::f64::consts::PI / 180.0;
         let off = found.rotation.distance(truth) / truth.length();
         // A shift of the camera shows as rotation: parallax at 3 m.
         let allowed = 0.05 + 1.5 * mm.length() * 1e-3 / 3.0 / truth.length();
         assert!(off < allowed, "{degrees} {mm}: {found:?}, off by {off}");
         // Put back, it is steady again.
-        for _ in 0..LOOKS {
-            watch.look(&image(&draw(&camera, &CALM, &mut random)));
+        for _ in 0..CONFIRMATIONS {
+            watch.compare(&image(&draw(&camera, &CALM, &mut random)));
         }
         assert_eq!(watch.state(), WatchState::Steady);
     }
@@ -163,7 +163,7 @@ fn lights_people_and_exposure_are_no_bump() {
         }
         let width = if look % 50 < 30 { random.between(30.0, 140.0) } else { 0.0 };
         scene.person = ((look as f64 * 7.0) % 640.0, width);
-        let state = watch.look(&image(&draw(&camera, &scene, &mut random)));
+        let state = watch.compare(&image(&draw(&camera, &scene, &mut random)));
         assert!(!matches!(state, WatchState::Moved(_)), "look {look}: {state:?}");
         steady += usize::from(state == WatchState::Steady);
     }
@@ -173,7 +173,7 @@ fn lights_people_and_exposure_are_no_bump() {
     scene.person = (200.0, 80.0);
     for _ in 0..8 {
         scene.lights = std::array::from_fn(|_| random.between(0.4, 1.4));
-        watch.look(&image(&draw(&moved, &scene, &mut random)));
+        watch.compare(&image(&draw(&moved, &scene, &mut random)));
     }
     assert!(matches!(watch.state(), WatchState::Moved(_)), "{:?}", watch.state());
 }
@@ -189,19 +189,19 @@ fn poisoned_and_blank_images_change_nothing() {
     let small = WatchedImage { width: 4, height: 4, channels: 1, bytes: &[0; 16] };
     assert!(CameraWatch::new(&camera.intrinsics, &small).is_none());
     let mut watch = CameraWatch::new(&camera.intrinsics, &image(&reference)).unwrap();
-    for _ in 0..LOOKS {
-        watch.look(&image(&reference));
+    for _ in 0..CONFIRMATIONS {
+        watch.compare(&image(&reference));
     }
     let noise: Vec<u8> = blank.iter().map(|_| (256.0 * random.uniform()) as u8).collect();
     for _ in 0..5 {
         for bytes in [&blank, &noise, &vec![0; blank.len()], &vec![255; blank.len()]] {
-            assert_eq!(watch.look(&image(bytes)), WatchState::Steady);
+            assert_eq!(watch.compare(&image(bytes)), WatchState::Steady);
         }
-        assert_eq!(watch.look(&small), WatchState::Steady);
+        assert_eq!(watch.compare(&small), WatchState::Steady);
     }
     // A lens whose numbers are no numbers projects nothing.
     let broken = Intrinsics { focal_px: DVec2::splat(f64::NAN), ..camera.intrinsics };
     if let Some(mut watch) = CameraWatch::new(&broken, &image(&reference)) {
-        assert_eq!(watch.look(&image(&reference)), WatchState::Unknown);
+        assert_eq!(watch.compare(&image(&reference)), WatchState::Unknown);
     }
 }

@@ -1,4 +1,4 @@
-//! What a real camera is asked for, whichever system it is connected to.
+//! Options of a physical camera, independent of the capture API.
 
 use std::fmt;
 
@@ -9,9 +9,10 @@ use serde::{Deserialize, Serialize};
 pub enum CameraIdentity {
     /// Serial number of the USB device.
     Serial(String),
-    /// Name of a link in `/dev/v4l/by-path`: the socket that it is plugged into.
+    /// Name of a link in `/dev/v4l/by-path`: identifies the socket the camera is plugged into.
     Path(String),
-    /// V4L2's bus information, like `usb-0000:00:14.0-3` or `platform:vivid-000`: the socket too, and known without udev.
+    /// V4L2 bus information, such as `usb-0000:00:14.0-3` or `platform:vivid-000`: identifies the socket and works
+    /// without udev.
     Bus(String),
 }
 
@@ -25,12 +26,12 @@ impl fmt::Display for CameraIdentity {
     }
 }
 
-/// What a camera is asked to send.
+/// Requested pixel format.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FormatChoice {
-    /// The first that the camera has of YUYV, UYVY, NV12, RGB24, MJPEG, Bayer and grey; MJPEG first where uncompressed
-    /// images would not fit the bus.
+    /// First available of YUYV, UYVY, NV12, RGB24, MJPEG, Bayer and grey; MJPEG first where uncompressed images would
+    /// exceed the bandwidth of the bus.
     #[default]
     Auto,
     /// 4:2:2, `YUYV`.
@@ -39,48 +40,49 @@ pub enum FormatChoice {
     Uyvy,
     /// 4:2:0 in one memory plane (`NV12`) or two (`NM12`).
     Nv12,
-    /// A JPEG image a frame, `MJPG` or `JPEG`.
+    /// One JPEG image per frame, `MJPG` or `JPEG`.
     Mjpeg,
     /// 8 bits of luminance, `GREY`.
     Grey,
-    /// Bayer mosaic of 8 bits in any phase: `RGGB`, `GRBG`, `GBRG` or `BA81`.
+    /// 8-bit Bayer mosaic in any phase: `RGGB`, `GRBG`, `GBRG` or `BA81`.
     Bayer8,
-    /// 3 bytes a pixel, `RGB3` or `BGR3`.
+    /// 3 bytes per pixel, `RGB3` or `BGR3`.
     Rgb24,
 }
 
-/// What is set on a camera; `None` leaves it as it is. Setting one turns the camera's own judgement of it off.
+/// Manual controls of a camera; `None` leaves a control unchanged. Setting a value disables the camera's automatic
+/// control of it.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CameraControls {
     /// Seconds, in steps of 0.1 ms.
     pub exposure_secs: Option<f64>,
-    /// In the camera's own unit.
+    /// Camera-specific unit.
     pub gain: Option<i32>,
     /// Kelvin.
     pub white_balance_kelvin: Option<i32>,
-    /// In the camera's own unit; 0 is usually infinity.
+    /// Camera-specific unit; 0 is usually infinity.
     pub focus: Option<i32>,
 }
 
-/// What a camera is opened as.
+/// Options with which a V4L2 camera is opened.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CameraOptions {
-    /// Which camera.
+    /// Device to open.
     pub identity: CameraIdentity,
-    /// Pixels; the calibration belongs to this size, so nothing else is taken.
+    /// Pixels. Other sizes are rejected, since the calibration holds for this one.
     pub width: u32,
     /// Pixels.
     pub height: u32,
-    /// Frames a second.
+    /// Frames per second.
     pub fps: f64,
     /// Pixel format.
     pub format: FormatChoice,
-    /// Exposure and the like; set again whenever the camera comes back.
+    /// Manual controls; applied again after every reconnect.
     pub controls: CameraControls,
-    /// Time from the first row's exposure to the last one's, seconds; 0 for a global shutter or when unknown.
+    /// Time between the exposures of the first and the last row, seconds; 0 for a global shutter or when unknown.
     pub readout_secs: f64,
-    /// How much later than the truth this camera's stamps are, seconds; taken off.
+    /// Latency of this camera's timestamps, seconds; subtracted from them.
     pub lag_secs: f64,
-    /// Buffers in the driver's hands: with too few, frames are lost whenever this process is late.
+    /// Buffers queued in the driver; with too few, frames are lost whenever this process is late.
     pub buffers: u32,
 }

@@ -1,10 +1,11 @@
-//! The clock of live frames.
+//! Clock of live frames.
 
-/// Time of `CLOCK_MONOTONIC`, nanoseconds: the clock of live frames' capture times.
+/// Returns the time of `CLOCK_MONOTONIC`, nanoseconds: the clock of the capture times of live frames.
 #[cfg(target_os = "linux")]
 pub use crate::v4l2::monotonic_nanos;
 
-/// Nanoseconds since this was asked first, by a clock that never steps: the clock of live frames' capture times.
+/// Returns the nanoseconds since the first call, by a clock that never steps: the clock of the capture times of live
+/// frames.
 #[cfg(not(target_os = "linux"))]
 #[must_use]
 pub fn monotonic_nanos() -> i64 {

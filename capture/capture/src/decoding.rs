@@ -1,29 +1,33 @@
-//! Images as cameras send them, made RGB.
+//! Conversion of camera images to RGB.
 
 use std::sync::Arc;
 
 use flyrig_types::{Frame, Image, PixelFormat};
 
-use crate::{BufferPool, CaptureError, CaptureErrorKind, FrameStage, mjpeg::JpegScratch, rgb};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::mjpeg::JpegScratch;
+use crate::pool::BufferPool;
+use crate::rgb;
+use crate::stage::FrameStage;
 
-/// Free buffers that are kept for frames to come.
+/// Free buffers kept for later frames.
 const POOLED_FRAMES: usize = 16;
 
-/// Makes `Rgb8` frames of a camera's frames, in buffers that are used again; frames that are RGB already pass.
+/// Stage that converts frames to `Rgb8` in pooled buffers; frames that are RGB already pass unchanged.
 ///
-/// An image that cannot be decoded is a `Corrupt` error, one of another size than expected an `Unsupported` one; each
-/// costs its own frame alone.
+/// An image that cannot be decoded is a `Corrupt` error, one of unexpected size an `Unsupported` one; each loses its
+/// own frame only.
 #[derive(Debug)]
 pub struct Decoding {
-    /// Width and height, where they are known.
+    /// Expected width and height, pixels, where they are known.
     size: Option<[u32; 2]>,
     pool: Arc<BufferPool>,
     scratch: JpegScratch,
 }
 
 impl Decoding {
-    /// For images of this width and height in pixels; of any without it. With it, a header that lies cannot ask for more
-    /// memory than the camera's images need.
+    /// Creates a stage for images of this width and height in pixels, or of any size with `None`. A known size keeps a
+    /// forged header from allocating more memory than the camera's images need.
     #[must_use]
     pub fn new(size: Option<[u32; 2]>) -> Self {
         Self { size, pool: BufferPool::new(POOLED_FRAMES), scratch: JpegScratch::default() }

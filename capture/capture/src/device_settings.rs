@@ -1,23 +1,23 @@
-//! Settings of a real camera, as a configuration holds them.
+//! Settings of a physical camera as a configuration file holds them.
 
 use flyrig_types::CameraId;
 use serde::{Deserialize, Serialize};
 
-use crate::{
-    CameraControls, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, FormatChoice,
-    NokhwaCamera, NokhwaDevice, NokhwaOptions,
-};
+use crate::camera_options::{CameraControls, CameraIdentity, CameraOptions, FormatChoice};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::nokhwa_camera::{NokhwaCamera, NokhwaDevice, NokhwaOptions};
+use crate::source::CameraSource;
 
-/// How a real camera is opened.
+/// Capture API of a camera, with its options.
 #[derive(Debug, Clone, PartialEq)]
 pub enum DeviceOptions {
-    /// By Linux' own interface.
+    /// Linux V4L2.
     V4l2(CameraOptions),
-    /// By the crate nokhwa, on any system.
+    /// The crate nokhwa, on any system.
     Nokhwa(NokhwaOptions),
 }
 
-/// A real camera, named by one of `serial`, `path`, `bus` and `nokhwa`.
+/// Settings of a physical camera, identified by one of `serial`, `path`, `bus` and `nokhwa`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DeviceSettings {
@@ -32,36 +32,36 @@ pub struct DeviceSettings {
     /// Place on the bus, as [`CameraIdentity::Bus`].
     #[serde(default)]
     pub bus: String,
-    /// Name or number of a device of nokhwa's.
+    /// Name or number of a nokhwa device.
     #[serde(default)]
     pub nokhwa: String,
     /// Width and height, pixels.
     pub size: [u32; 2],
-    /// Frames a second.
+    /// Frames per second.
     #[serde(default = "default_fps")]
     pub fps: f64,
     /// Pixel format.
     #[serde(default)]
     pub format: FormatChoice,
-    /// Fixed exposure, milliseconds; automatic without one.
+    /// Fixed exposure, milliseconds; automatic if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub exposure_ms: Option<f64>,
     /// Fixed gain, in the driver's unit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub gain: Option<i32>,
-    /// Fixed white balance, kelvin; automatic without one.
+    /// Fixed white balance, kelvin; automatic if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub white_balance_kelvin: Option<i32>,
-    /// Fixed focus, in the driver's unit; automatic without one.
+    /// Fixed focus, in the driver's unit; automatic if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub focus: Option<i32>,
-    /// Time from the first row's exposure to the last one's, milliseconds.
+    /// Time between the exposures of the first and the last row, milliseconds.
     #[serde(default)]
     pub readout_ms: f64,
-    /// How much later than the truth the camera's timestamps are, milliseconds.
+    /// Latency of the camera's timestamps, milliseconds; subtracted from them.
     #[serde(default)]
     pub lag_ms: f64,
-    /// Buffers in the driver's hands.
+    /// Buffers queued in the driver.
     #[serde(default = "default_buffers")]
     pub buffers: u32,
 }
@@ -75,10 +75,10 @@ fn default_buffers() -> u32 {
 }
 
 impl DeviceSettings {
-    /// Checks every value.
+    /// Validates every value.
     ///
     /// # Errors
-    /// Names the camera, the key, and what is expected.
+    /// Names the camera, the key and the valid range.
     pub fn check(&self) -> Result<(), CaptureError> {
         let range = |key: &str, value: f64, low: f64, high: f64| {
             if value.is_finite() && (low..=high).contains(&value) {
@@ -100,10 +100,11 @@ impl DeviceSettings {
         range("buffers", self.buffers.into(), 3.0, 32.0)
     }
 
-    /// Returns what the camera is opened as.
+    /// Returns the options with which the camera is opened.
     ///
     /// # Errors
-    /// When it is named in no way or in several, when nokhwa cannot do what is asked for, and when only Linux could.
+    /// When no identity or several are given, when nokhwa does not support an option, and when V4L2 is requested on
+    /// another system than Linux.
     pub fn options(&self) -> Result<DeviceOptions, CaptureError> {
         let given = [&self.serial, &self.path, &self.bus, &self.nokhwa];
         let count = given.iter().filter(|text| !text.is_empty()).count();
@@ -159,7 +160,7 @@ impl DeviceSettings {
         for (format, text) in [(FormatChoice::Uyvy, "uyvy"), (FormatChoice::Bayer8, "bayer8")] {
             if self.format == format {
                 return Err(self.wrong(format!(
-                    "format \"{text}\" cannot be had through nokhwa; set another, or name the camera by serial, path or bus"
+                    "format \"{text}\" is not available through nokhwa; set another, or name the camera by serial, path or bus"
                 )));
             }
         }
@@ -173,7 +174,7 @@ impl DeviceSettings {
         })
     }
 
-    /// Returns the error of a setting that cannot be.
+    /// Builds the error of an invalid setting.
     fn wrong(&self, message: impl Into<String>) -> CaptureError {
         CaptureError::new(&CameraId::from(self.name.as_str()), CaptureErrorKind::Unsupported, message)
     }

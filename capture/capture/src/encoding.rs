@@ -1,4 +1,4 @@
-//! Uncompressed images made JPEG, for the network and the disk.
+//! JPEG compression of uncompressed images, for the network and the disk.
 
 use flyrig_types::{Frame, Image, PixelFormat};
 use opencv::{
@@ -7,9 +7,12 @@ use opencv::{
     imgproc::{COLOR_RGB2BGR, cvt_color_def},
 };
 
-use crate::{CaptureError, CaptureErrorKind, FrameStage, mjpeg::JpegScratch, rgb};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::mjpeg::JpegScratch;
+use crate::rgb;
+use crate::stage::FrameStage;
 
-/// Compresses a camera's frames; frames that are JPEG already pass as they came.
+/// Stage that compresses a camera's frames; frames that are JPEG already pass unchanged.
 #[derive(Debug)]
 pub struct JpegEncoding {
     quality: i32,
@@ -20,17 +23,17 @@ pub struct JpegEncoding {
 }
 
 impl JpegEncoding {
-    /// Of a quality from 1 to 100 (libjpeg's scale).
+    /// Creates a stage with a quality from 1 to 100 (libjpeg's scale).
     #[must_use]
     pub fn new(quality: u8) -> Self {
         let quality = i32::from(quality.clamp(1, 100));
         Self { quality, rgb: Vec::new(), bgr: Mat::default(), jpeg: Vector::new(), scratch: JpegScratch::default() }
     }
 
-    /// A JPEG image of an image.
+    /// Compresses an image.
     ///
     /// # Errors
-    /// `Unsupported` and `Corrupt` for what cannot be made RGB first.
+    /// `Unsupported` and `Corrupt` for images that cannot be converted to RGB first.
     pub fn encode(&mut self, image: &Image) -> Result<Image, CaptureError> {
         let corrupt = |text: String| CaptureError::general(CaptureErrorKind::Corrupt, text);
         rgb::convert(image, &mut self.rgb, &mut self.scratch)?;
@@ -60,7 +63,7 @@ impl FrameStage for JpegEncoding {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::to_rgb8;
+    use crate::rgb::to_rgb8;
 
     fn frame(format: PixelFormat, bytes: Vec<u8>) -> Frame {
         let image = Image::new(48, 32, format, bytes).unwrap();

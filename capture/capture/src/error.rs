@@ -1,21 +1,21 @@
-//! What can go wrong between a camera and a frame.
+//! Errors of frame sources.
 
 use std::fmt;
 
 use flyrig_types::CameraId;
 
-/// Kind of a [`CaptureError`]: what a program does about it.
+/// Kind of a [`CaptureError`], which decides the caller's reaction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum CaptureErrorKind {
-    /// No frame came in the time given; ask again.
+    /// No frame arrived in time; ask again.
     Timeout,
     /// The source has no more frames.
     EndOfStream,
-    /// The camera or its thread is gone; a source tries to reconnect when it is asked again.
+    /// The camera or its thread is gone; a source tries to reconnect at the next call.
     Disconnected,
-    /// This frame cannot be used; the next one may be fine.
+    /// This frame is unusable; the next one may be fine.
     Corrupt,
-    /// A format, size or setting that we cannot handle.
+    /// Unsupported format, size or setting.
     Unsupported,
     /// No such camera, file or frame.
     NotFound,
@@ -24,38 +24,38 @@ pub enum CaptureErrorKind {
 }
 
 impl CaptureErrorKind {
-    /// Whether asking the same source again can help.
+    /// Returns whether another call of the same source can succeed.
     #[must_use]
     pub fn is_recoverable(self) -> bool {
         matches!(self, Self::Timeout | Self::Disconnected | Self::Corrupt | Self::Io)
     }
 }
 
-/// An error of one camera, or of a whole recording when `camera` is `None`.
+/// Error of one camera, or of a whole recording when `camera` is `None`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CaptureError {
-    /// Which camera, where it is known.
+    /// Camera at fault, where it is known.
     pub camera: Option<CameraId>,
-    /// What to do about it.
+    /// Kind of the error.
     pub kind: CaptureErrorKind,
     /// Problem and fix.
     pub message: String,
 }
 
 impl CaptureError {
-    /// An error of one camera.
+    /// Creates an error of one camera.
     #[must_use]
     pub fn new(camera: &CameraId, kind: CaptureErrorKind, message: impl Into<String>) -> Self {
         Self { camera: Some(camera.clone()), kind, message: message.into() }
     }
 
-    /// An error that belongs to no camera.
+    /// Creates an error without a camera.
     #[must_use]
     pub fn general(kind: CaptureErrorKind, message: impl Into<String>) -> Self {
         Self { camera: None, kind, message: message.into() }
     }
 
-    /// The same error, said of a camera.
+    /// Attributes the error to a camera.
     #[must_use]
     pub fn of(self, camera: &CameraId) -> Self {
         Self { camera: Some(camera.clone()), ..self }

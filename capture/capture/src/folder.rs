@@ -11,66 +11,65 @@ use std::{
 
 use flyrig_types::{CameraId, Frame, Image, Mask, PixelFormat};
 
-use crate::{
-    CameraSource, CaptureError, CaptureErrorKind,
-    image_file::{self, IMAGE_ENDINGS},
-};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::image_file::{self, IMAGE_ENDINGS};
+use crate::source::CameraSource;
 
-/// How a folder is replayed.
+/// Options of a folder's replay.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FolderOptions {
-    /// Frame `n` was taken at `n / fps` seconds.
+    /// Frames per second: frame `n` has the time `n / fps` seconds.
     pub fps: f64,
-    /// Only these frame numbers, of those there are.
+    /// Range of frame numbers to replay; all when `None`.
     pub frames: Option<Range<u64>>,
-    /// Read `mask/CAM` too; every camera must have it then.
+    /// Whether to read `mask/CAM` too, which every camera must then have.
     pub with_masks: bool,
 }
 
 impl Default for FolderOptions {
-    /// Every frame, at 30 a second, without masks.
+    /// Returns all frames at 30 per second, without masks.
     fn default() -> Self {
         Self { fps: 30.0, frames: None, with_masks: false }
     }
 }
 
-/// One camera of a folder `images/CAM/*.png|jpg|jpeg`, with `mask/CAM/*` of the same stems where
-/// asked for. It gives `Rgb8` frames.
+/// Frame source of one camera of a folder `images/CAM/*.png|jpg|jpeg`, with `mask/CAM/*` of the same stems where
+/// requested. Its frames are `Rgb8`.
 ///
-/// A frame's number is its stem where every stem of the chosen cameras is a number, else its place
-/// in the sorted list of all stems; number and rate give the time, and the number is the frame's
-/// sequence number. A number that only other cameras have, a damaged image, a mask that is
-/// missing or of another size, and an image of another size than the camera's first are `Corrupt`
-/// errors, and the next frame follows. Mask values are coverage; a mask with no value above 31 is
-/// taken for one of labels, where everything but 0 is the person. An all-zero mask is an empty one.
+/// A frame's number is its file stem where every stem of the chosen cameras is a number, otherwise its position in the
+/// sorted list of all stems. The number divided by the rate gives the time, and the number is the frame's sequence
+/// number. `Corrupt` errors, after which the next frame follows, are: a number that only other cameras have, a damaged
+/// image, a mask that is missing or of another size, and an image of another size than the camera's first. Mask values
+/// are coverage; a mask without values above 31 is taken for a label map, where everything but 0 is the person. An
+/// all-zero mask is empty.
 #[derive(Debug)]
 pub struct FolderReplay {
     camera: CameraId,
     fps: f64,
-    shots: Arc<[Shot]>,
+    shots: Arc<[FolderFrame]>,
     pictures: BTreeMap<String, PathBuf>,
     masks: Option<BTreeMap<String, PathBuf>>,
     next: usize,
     size: Option<(u32, u32)>,
 }
 
-/// A frame that at least one camera has.
+/// Frame that at least one camera has.
 #[derive(Debug)]
-struct Shot {
+struct FolderFrame {
     number: u64,
-    /// Stems that mean this number: `1` and `0001` can be two cameras' names for it.
+    /// File stems of this number: `1` and `0001` can be two cameras' names for it.
     stems: Vec<String>,
 }
 
 impl FolderReplay {
-    /// A source a camera, in the order of `cameras` (all cameras in lexical order when `None`).
+    /// Opens one source per camera, in the order of `cameras` (all cameras in lexical order when `None`).
     ///
     /// # Errors
-    /// `NotFound` names the camera and lists those there are, or says that no frame is in the range;
-    /// `Unsupported` for a bad rate or two images of one number; `Io`.
+    /// `NotFound` names the camera and lists the existing ones, or reports that the range has no frame; `Unsupported`
+    /// for an invalid rate or two images of one number; `Io`.
     pub fn open(root: &Path, cameras: Option<&[CameraId]>, options: &FolderOptions) -> Result<Vec<Self>, CaptureError> {
         if !options.fps.is_finite() || options.fps <= 0.0 {
-            let message = format!("the frame rate is {}, expected a positive number of frames a second", options.fps);
+            let message = format!("the frame rate is {}, expected a positive number of frames per second", options.fps);
             return Err(CaptureError::general(CaptureErrorKind::Unsupported, message));
         }
         let cameras = match cameras {
@@ -91,13 +90,13 @@ impl FolderReplay {
         Ok(sources)
     }
 
-    /// Frames that this source still has to give, readable or not.
+    /// Returns the number of frames that remain, readable or not.
     #[must_use]
     pub fn remaining(&self) -> usize {
         self.shots.len() - self.next
     }
 
-    fn read(&self, shot: &Shot) -> Result<Frame, CaptureError> {
+    fn read(&self, shot: &FolderFrame) -> Result<Frame, CaptureError> {
         let file = |files: &BTreeMap<String, PathBuf>, what: &str| {
             shot.stems.iter().find_map(|stem| files.get(stem)).cloned().ok_or_else(|| {
                 let message = format!("frame {} has no {what}, though others have; restore the file", shot.number);
@@ -146,8 +145,8 @@ impl CameraSource for FolderReplay {
     }
 }
 
-/// Width and height of a camera's first readable image, from its header alone; for calibration
-/// files that do not say them.
+/// Returns width and height of a camera's first readable image, from its header alone; for calibration files that lack
+/// them.
 ///
 /// # Errors
 /// `NotFound` when there is no such camera, `Corrupt` when none of its images has a header.
@@ -162,7 +161,7 @@ pub fn folder_image_size(root: &Path, camera: &CameraId) -> Result<(u32, u32), C
     })
 }
 
-/// Names of the folders in `images`.
+/// Lists the folders in `images`.
 fn list_cameras(root: &Path) -> Result<Vec<CameraId>, CaptureError> {
     let images = root.join("images");
     let fail = |error: &io::Error| match error.kind() {
@@ -197,7 +196,7 @@ fn camera_images(root: &Path, camera: &CameraId) -> Result<BTreeMap<String, Path
     camera_files(root, "images", camera)
 }
 
-/// Images in `root/kind/camera` by stem.
+/// Lists the images in `root/kind/camera` by stem.
 fn camera_files(root: &Path, kind: &str, camera: &CameraId) -> Result<BTreeMap<String, PathBuf>, CaptureError> {
     let folder = root.join(kind).join(camera.as_str());
     let fail = |error: &io::Error| {
@@ -230,8 +229,8 @@ fn two_of_one(camera: &CameraId, a: &Path, b: &Path) -> CaptureError {
     CaptureError::new(camera, CaptureErrorKind::Unsupported, message)
 }
 
-/// The frames that any camera has, by number, inside the range.
-fn shots(sources: &[FolderReplay], range: Option<&Range<u64>>) -> Result<Arc<[Shot]>, CaptureError> {
+/// Lists the frames in the range that any camera has, by number.
+fn shots(sources: &[FolderReplay], range: Option<&Range<u64>>) -> Result<Arc<[FolderFrame]>, CaptureError> {
     let stems: BTreeSet<&String> = sources.iter().flat_map(|source| source.pictures.keys()).collect();
     let numbers: Option<Vec<u64>> = stems.iter().map(|stem| stem.parse().ok()).collect();
     let numbers = numbers.unwrap_or_else(|| (0..stems.len() as u64).collect());
@@ -249,10 +248,10 @@ fn shots(sources: &[FolderReplay], range: Option<&Range<u64>>) -> Result<Arc<[Sh
     }
     let ends =
         by_number.first_key_value().zip(by_number.last_key_value()).map(|((first, _), (last, _))| (*first, *last));
-    let shots: Arc<[Shot]> = by_number
+    let shots: Arc<[FolderFrame]> = by_number
         .into_iter()
         .filter(|(number, _)| range.is_none_or(|range| range.contains(number)))
-        .map(|(number, stems)| Shot { number, stems })
+        .map(|(number, stems)| FolderFrame { number, stems })
         .collect();
     match (range, ends) {
         (Some(range), Some((first, last))) if shots.is_empty() => Err(CaptureError::general(
@@ -264,7 +263,7 @@ fn shots(sources: &[FolderReplay], range: Option<&Range<u64>>) -> Result<Arc<[Sh
 }
 
 fn read_mask(path: &Path, picture: (u32, u32)) -> Result<Mask, CaptureError> {
-    /// Largest value that is a label and no coverage.
+    /// Largest value of a label map; above it, values are coverage.
     const LAST_LABEL: u8 = 31;
     let mask = image_file::read(path)?.into_luma8();
     let (width, height) = mask.dimensions();

@@ -1,16 +1,16 @@
-//! Image files: decoding that notices what is cut off.
+//! Decoding of image files, with detection of truncated ones.
 
 use std::{io::Cursor, path::Path};
 
 use flyrig_types::MAX_IMAGE_SIDE;
 use image::{DynamicImage, ImageFormat, ImageReader, Limits};
 
-use crate::{CaptureError, CaptureErrorKind};
+use crate::error::{CaptureError, CaptureErrorKind};
 
-/// Endings of image files, lower case.
+/// Extensions of image files, lower case.
 pub(crate) const IMAGE_ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
 
-/// Decodes a whole JPEG or PNG. The text of the error has no file name in it.
+/// Decodes a whole JPEG or PNG. The error text contains no file name.
 pub(crate) fn decode(bytes: &[u8]) -> Result<DynamicImage, CaptureError> {
     let corrupt = |text: String| CaptureError::general(CaptureErrorKind::Corrupt, text);
     let format = image::guess_format(bytes).ok().filter(|f| [ImageFormat::Jpeg, ImageFormat::Png].contains(f));
@@ -35,13 +35,13 @@ pub(crate) fn read(path: &Path) -> Result<DynamicImage, CaptureError> {
     decode(&bytes).map_err(|error| CaptureError { message: format!("{} {}", path.display(), error.message), ..error })
 }
 
-/// Whether an end-of-image marker follows the first scan.
+/// Returns whether an end-of-image marker follows the first scan.
 pub(crate) fn jpeg_has_end(bytes: &[u8]) -> bool {
     jpeg_length(bytes).is_some()
 }
 
-/// Bytes up to and with the end-of-image marker after the first scan. Segments before it are stepped over, since a thumbnail
-/// in them has an end of its own.
+/// Returns the length up to and including the end-of-image marker after the first scan. Segments before it are skipped,
+/// since an embedded thumbnail has an end marker of its own.
 pub(crate) fn jpeg_length(bytes: &[u8]) -> Option<usize> {
     const SCAN: u8 = 0xda;
     let mut at = 2;

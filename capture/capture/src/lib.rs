@@ -1,10 +1,28 @@
-//! Frames come from here: one trait for cameras and recordings, both of these, and the threads
-//! that read them.
+//! Frame sources (cameras, recordings, folders, videos) behind one trait, and the threads that read them.
 //!
-//! A [`CameraSource`] gives [`flyrig_types::Frame`]s with capture time, sequence number and camera
-//! name, or a [`CaptureError`] whose kind says what to do. [`CaptureThreads`] reads every source in
-//! a thread of its own into one [`LatestQueue`], with a [`FrameStage`] (decoding, compressing) in a
-//! second thread between them where one is asked for. A [`SourceOpener`] is a camera that may come later.
+//! A [`CameraSource`] yields [`flyrig_types::Frame`]s with capture time, sequence number and camera name, or a
+//! [`CaptureError`] whose kind determines the reaction. [`CaptureThreads`] reads every source in a thread of its own
+//! into one [`LatestQueue`], optionally through a [`FrameStage`] (decoding, compression) in a second thread per camera.
+//! A [`SourceOpener`] opens a camera that may be missing at the start.
+//!
+//! # Example
+//!
+//! Reads all cameras of a folder in the order of capture, without loss:
+//!
+//! ```no_run
+//! use std::time::Duration;
+//!
+//! use flyrig_capture::{CameraSource, CaptureThreads, FolderOptions, FolderReplay, Pacing, ThreadsConfig};
+//!
+//! let replays = FolderReplay::open("take".as_ref(), None, &FolderOptions::default())?;
+//! let sources = replays.into_iter().map(|replay| Box::new(replay) as Box<dyn CameraSource>).collect();
+//! let config = ThreadsConfig { queue_capacity: 16, pacing: Pacing::Lossless };
+//! let threads = CaptureThreads::start(sources, config)?;
+//! while let Ok(frame) = threads.queue().pop(Duration::from_secs(10)) {
+//!     println!("{} {}: {} ns", frame.camera, frame.sequence, frame.capture_nanos);
+//! }
+//! # Ok::<(), flyrig_capture::CaptureError>(())
+//! ```
 
 mod blocking;
 mod camera_options;

@@ -1,17 +1,18 @@
-//! JPEG images as cameras send them: often without Huffman tables, sometimes padded, sometimes damaged.
+//! JPEG images from cameras: often without Huffman tables, sometimes padded, sometimes damaged.
 
 use zune_jpeg::{
     JpegDecoder,
     zune_core::{bytestream::ZCursor, colorspace::ColorSpace, options::DecoderOptions},
 };
 
-use crate::{CaptureError, CaptureErrorKind, image_file};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::image_file;
 
-/// Decodes into `rgb`, `3 * width * height` bytes. Strict: what a lenient decoder would paint grey is an error here, for
-/// a broken image must not colour a person.
+/// Decodes into `rgb`, `3 * width * height` bytes. Strict: damage that a lenient decoder fills with grey is an error,
+/// so that a broken image never colours a person.
 ///
 /// # Errors
-/// `Corrupt`, whatever is wrong with the bytes.
+/// `Corrupt` for any fault in the bytes.
 pub(crate) fn decode(
     bytes: &[u8],
     width: usize,
@@ -56,7 +57,7 @@ fn other_size(size: (usize, usize), width: usize, height: usize) -> CaptureError
     CaptureError::general(CaptureErrorKind::Corrupt, text)
 }
 
-/// Marker segments up to and with the first scan's header: position and marker.
+/// Iterates over the marker segments up to and including the first scan header: position and marker.
 fn segments(bytes: &[u8]) -> impl Iterator<Item = (usize, u8)> {
     let mut at = Some(2);
     std::iter::from_fn(move || {
@@ -74,20 +75,20 @@ fn segments(bytes: &[u8]) -> impl Iterator<Item = (usize, u8)> {
     })
 }
 
-/// Size by the frame header.
+/// Returns width and height from the frame header.
 pub(crate) fn jpeg_size(bytes: &[u8]) -> Option<(usize, usize)> {
     let (at, _) = segments(bytes).find(|(_, marker)| matches!(marker, 0xc0..=0xc2))?;
     let &[h1, h0, w1, w0] = bytes.get(at + 5..at + 9)? else { return None };
     Some((usize::from(u16::from_be_bytes([w1, w0])), usize::from(u16::from_be_bytes([h1, h0]))))
 }
 
-/// Memory that is used again from image to image.
+/// Scratch memory that is reused from image to image.
 #[derive(Debug, Default)]
 pub(crate) struct JpegScratch(Vec<u8>);
 
 impl JpegScratch {
-    /// Puts the standard's tables before the scan of an image that has none of its own: USB cameras leave them out. False
-    /// where nothing is missing.
+    /// Inserts the standard Huffman tables before the scan of an image without its own: USB cameras omit them. Returns
+    /// false where nothing is missing.
     fn complete(&mut self, bytes: &[u8]) -> bool {
         let mut scan = None;
         for (at, marker) in segments(bytes) {
@@ -196,7 +197,7 @@ mod tests {
         assert!(decoded(&bytes.into_inner(), 16, 16).unwrap().iter().all(|&c| c.abs_diff(77) <= 1));
     }
 
-    /// Many damaged images, from every kind of damage: none panics, and none whose scan is cut short comes through.
+    /// Decodes many images with every kind of damage: none panics, and none with a truncated scan is accepted.
     fn damage(rounds: usize) -> (usize, usize) {
         let whole = jpeg(48, 32);
         let sources = [without_tables(&whole), whole];

@@ -1,4 +1,4 @@
-//! Cameras through the `nokhwa` crate: those of macOS and Windows, and devices of Linux that V4L2 alone does not serve.
+//! Cameras through the crate `nokhwa`: those of macOS and Windows, and Linux devices that V4L2 alone does not serve.
 
 use std::{
     fmt,
@@ -6,7 +6,7 @@ use std::{
 };
 
 use crossbeam::channel::bounded;
-use flyrig_types::{CameraId, Frame, PixelFormat};
+use flyrig_types::{CameraId, PixelFormat};
 use nokhwa::{
     Camera, NokhwaError, nokhwa_check, nokhwa_initialize, query,
     utils::{
@@ -15,14 +15,15 @@ use nokhwa::{
     },
 };
 
-use crate::{
-    CameraSource, CaptureError, CaptureErrorKind, FormatChoice, SourceHealth,
-    blocking::{BlockingCamera, Expected, Opener, Shot, Watched},
-    clock::monotonic_nanos,
-    image_file, mjpeg,
-};
+use crate::blocking::{BlockingCamera, DriverImage, Expected, Opener, Watched};
+use crate::camera_options::FormatChoice;
+use crate::clock::monotonic_nanos;
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::image_file;
+use crate::mjpeg;
+use crate::source::forward_source;
 
-/// Formats that the crate knows and what we call them, in the order in which [`FormatChoice::Auto`] takes them.
+/// Formats of nokhwa and their equivalents, in the order of preference of [`FormatChoice::Auto`].
 const FORMATS: [(FrameFormat, FormatChoice, PixelFormat); 6] = [
     (FrameFormat::YUYV, FormatChoice::Yuyv, PixelFormat::Yuyv),
     (FrameFormat::NV12, FormatChoice::Nv12, PixelFormat::Nv12),
@@ -31,20 +32,20 @@ const FORMATS: [(FrameFormat, FormatChoice, PixelFormat); 6] = [
     (FrameFormat::MJPEG, FormatChoice::Mjpeg, PixelFormat::Mjpeg),
     (FrameFormat::GRAY, FormatChoice::Grey, PixelFormat::Gray8),
 ];
-/// How long the system may take to ask its user whether cameras may be used.
+/// Time limit of the system's request for the user's permission.
 const ASKING: Duration = Duration::from_secs(4);
 
-/// Identity of a camera.
+/// Identity of a nokhwa camera.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum NokhwaDevice {
-    /// Its number in the system's list; on Linux that of `/dev/video`. It may be another after a replug: prefer the name.
+    /// Number in the system's list; on Linux that of `/dev/video`. It may change after a replug: prefer the name.
     Index(u32),
-    /// Its name; the first one of several with that name.
+    /// Name; the first camera of several with that name.
     Name(String),
 }
 
 impl From<&str> for NokhwaDevice {
-    /// A number is an index.
+    /// Parses a number as an index, any other text as a name.
     fn from(text: &str) -> Self {
         text.parse().map_or_else(|_| Self::Name(text.to_owned()), Self::Index)
     }
@@ -59,43 +60,44 @@ impl fmt::Display for NokhwaDevice {
     }
 }
 
-/// What a camera is opened as.
+/// Options with which a nokhwa camera is opened.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NokhwaOptions {
-    /// Which camera.
+    /// Device to open.
     pub device: NokhwaDevice,
-    /// Pixels; the calibration belongs to this size, so nothing else is taken.
+    /// Pixels. Other sizes are rejected, since the calibration holds for this one.
     pub width: u32,
     /// Pixels.
     pub height: u32,
-    /// Frames a second, rounded: the crate knows whole rates only.
+    /// Frames per second, rounded: nokhwa supports whole rates only.
     pub fps: f64,
-    /// Pixel format; UYVY and Bayer mosaics are not to be had.
+    /// Pixel format; UYVY and Bayer mosaics are not supported.
     pub format: FormatChoice,
-    /// How much later than the truth this camera's stamps are, seconds; taken off.
+    /// Latency of this camera's timestamps, seconds; subtracted from them.
     pub lag_secs: f64,
 }
 
-/// A camera of this computer, read through `nokhwa`. Frames come in the camera's own pixel format.
+/// Camera of this computer, read through `nokhwa`. Frames have the camera's own pixel format.
 ///
-/// The crate's reads wait for ever, so they have a thread of their own. A camera that gives no frame for five periods (but
-/// not less than 500 ms) is given up and opened again; a thread that hangs in the driver is left behind, at most one of
-/// them a camera, so that a camera never has more than two threads.
+/// Reads of nokhwa may block for ever, so they run in a thread of their own. A camera that yields no frame for five
+/// periods (but not less than 500 ms) is given up and reopened; a thread that hangs in the driver is abandoned, at most
+/// one per camera, so that a camera never has more than two threads.
 ///
-/// The capture time is what the system stamps where it does, else the arrival less half a period, which is good to about
-/// half a frame; [`SourceHealth::mode`] says which. Nobody tells what the system's stamp stands for: it may be off by the
-/// exposure and the readout, which `lag_secs` corrects. The crate has no sequence numbers: frames are counted as they
-/// come, so that what the driver loses is not seen. Exposure and the like stay as the camera has them. Rows with padding
-/// cannot be told from others and look sheared.
+/// The capture time is the system's timestamp where there is one, otherwise the arrival minus half a period, which is
+/// accurate to about half a frame; [`SourceHealth::mode`](crate::SourceHealth::mode) reports which applies. The system
+/// does not document the instant that its timestamp refers to: it may be off by exposure and readout, which `lag_secs`
+/// corrects. nokhwa has no sequence numbers: frames are counted on arrival, so that losses in the driver are not
+/// detected. Exposure and other controls stay as the camera has them. Padded rows cannot be distinguished and look
+/// sheared.
 #[derive(Debug)]
 pub struct NokhwaCamera(Watched<System>);
 
 impl NokhwaCamera {
-    /// Finds the camera, sets it up and starts its stream.
+    /// Finds the camera, configures it and starts its stream.
     ///
     /// # Errors
-    /// `NotFound` when no such camera is there, `Unsupported` for what it cannot do, `Io` when it is in use, may not be
-    /// opened or hangs. Every text names the camera, the cause and the fix.
+    /// `NotFound` when there is no such camera, `Unsupported` for options that it lacks, `Io` when it is in use, access
+    /// is denied or it hangs. Every text names the camera, the cause and the fix.
     pub fn open(camera: &CameraId, options: &NokhwaOptions) -> Result<Self, CaptureError> {
         let (size, lag_secs) = ((options.width, options.height), options.lag_secs);
         let expected = Expected { size, fps: options.fps, lag_secs };
@@ -103,24 +105,12 @@ impl NokhwaCamera {
     }
 }
 
-impl CameraSource for NokhwaCamera {
-    fn camera(&self) -> &CameraId {
-        self.0.camera()
-    }
+forward_source!(NokhwaCamera);
 
-    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
-        self.0.next_frame(timeout)
-    }
-
-    fn health(&self) -> SourceHealth {
-        self.0.health()
-    }
-}
-
-/// Number and name of every camera that `nokhwa` sees.
+/// Lists number and name of every camera that `nokhwa` finds.
 ///
 /// # Errors
-/// `Io` when the system cannot be asked.
+/// `Io` when the system's list is unavailable.
 pub fn nokhwa_cameras() -> Result<Vec<(NokhwaDevice, String)>, CaptureError> {
     let infos = list()?;
     Ok(infos.iter().map(|info| (NokhwaDevice::from(info.index().as_string().as_str()), info.human_name())).collect())
@@ -154,11 +144,11 @@ fn find(infos: &[CameraInfo], device: &NokhwaDevice) -> Result<CameraIndex, Capt
     let there: Vec<String> =
         infos.iter().map(|info| format!("{} \"{}\"", info.index().as_string(), info.human_name())).collect();
     let there = if there.is_empty() { "none".to_owned() } else { there.join(", ") };
-    let text = format!("no camera with {device} is there; plug it in, or set nokhwa to one of these: {there}");
+    let text = format!("no camera with {device} was found; plug it in, or set nokhwa to one of these: {there}");
     Err(CaptureError::general(CaptureErrorKind::NotFound, text))
 }
 
-/// The crate's errors are texts; the system's number is at their end.
+/// Maps an error of nokhwa, which is plain text that ends with the system's error number.
 fn explain(error: &NokhwaError) -> CaptureError {
     let text = error.to_string();
     let has = |number: u8| text.contains(&format!("(os error {number})"));
@@ -174,7 +164,7 @@ fn explain(error: &NokhwaError) -> CaptureError {
     }
 }
 
-/// This computer.
+/// This computer's cameras.
 #[derive(Debug)]
 struct System(NokhwaOptions);
 
@@ -183,7 +173,7 @@ impl System {
         Resolution::new(self.0.width, self.0.height)
     }
 
-    /// What the camera has, for an error that helps.
+    /// Builds the error of an unsupported mode, with the modes that the camera has.
     fn lacks(&self, index: CameraIndex, error: &NokhwaError) -> CaptureError {
         let all = FORMATS.map(|(format, ..)| format);
         let opened = Camera::new(index, RequestedFormat::with_formats(RequestedFormatType::None, &all));
@@ -243,7 +233,7 @@ impl BlockingCamera for OpenCamera {
         format!("{} {} at {} through nokhwa", format.format(), format.resolution(), format.frame_rate())
     }
 
-    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<Shot, CaptureError> {
+    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<DriverImage, CaptureError> {
         let buffer = self.0.frame().map_err(|error| explain(&error))?;
         let arrival_nanos = monotonic_nanos();
         let stamp_nanos = buffer.capture_timestamp().and_then(|taken| {
@@ -257,11 +247,11 @@ impl BlockingCamera for OpenCamera {
             return Err(CaptureError::general(CaptureErrorKind::Corrupt, format!("{format} cannot be read")));
         };
         let size = cut(*format, (resolution.width(), resolution.height()), buffer.buffer(), bytes)?;
-        Ok(Shot { size, format: *format, stamp_nanos, arrival_nanos })
+        Ok(DriverImage { size, format: *format, stamp_nanos, arrival_nanos })
     }
 }
 
-/// Copies the image alone: the crate may give the driver's whole buffer. Gives its size.
+/// Copies the image without trailing bytes, since nokhwa may return the driver's whole buffer. Returns its size.
 fn cut(
     format: PixelFormat,
     (width, height): (u32, u32),

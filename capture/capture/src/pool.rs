@@ -1,30 +1,30 @@
-//! Buffers that come back.
+//! Pool of reusable byte buffers.
 
 use std::sync::Arc;
 
 use crossbeam::queue::ArrayQueue;
 use flyrig_types::{PixelBuffer, Recycle};
 
-/// A bounded pool of byte buffers: a dropped [`PixelBuffer`] comes back and is used again.
+/// Bounded pool of byte buffers, to which a dropped [`PixelBuffer`] returns.
 #[derive(Debug)]
 pub struct BufferPool {
     free: ArrayQueue<Vec<u8>>,
 }
 
 impl BufferPool {
-    /// Keeps at most `capacity` free buffers (at least one); more are let go.
+    /// Creates a pool of at most `capacity` free buffers (at least one); any more are freed.
     #[must_use]
     pub fn new(capacity: usize) -> Arc<Self> {
         Arc::new(Self { free: ArrayQueue::new(capacity.max(1)) })
     }
 
-    /// An empty buffer, with the capacity it had when it was used last.
+    /// Returns an empty buffer, with the capacity of its last use.
     #[must_use]
     pub fn take(&self) -> Vec<u8> {
         self.free.pop().unwrap_or_default()
     }
 
-    /// Bytes that come back to this pool when dropped.
+    /// Wraps bytes such that their buffer returns to this pool on drop.
     #[must_use]
     pub fn lease(self: &Arc<Self>, bytes: Vec<u8>) -> PixelBuffer {
         PixelBuffer::leased(bytes, Arc::clone(self) as Arc<dyn Recycle>)

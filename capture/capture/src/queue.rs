@@ -1,4 +1,4 @@
-//! A bounded queue between live stages that would rather lose the oldest than wait.
+//! Bounded queue between live stages that drops the oldest element instead of blocking.
 
 use std::{
     collections::VecDeque,
@@ -8,19 +8,32 @@ use std::{
 
 use flyrig_types::{lock, wait, wait_timeout};
 
-/// Why [`LatestQueue::pop`] gave nothing.
+/// Reason why [`LatestQueue::pop`] returned no element.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum PopError {
-    /// Nothing came in the time given.
-    #[error("nothing came in time")]
+    /// No element arrived in time.
+    #[error("no element arrived in time")]
     Timeout,
     /// The queue is closed and empty.
     #[error("the queue is closed")]
     Closed,
 }
 
-/// Bounded, first in first out; [`Self::push`] into a full queue drops the oldest element and
-/// counts it. Share it in an `Arc`.
+/// Bounded FIFO queue: [`Self::push`] into a full queue drops the oldest element and counts it. Shared through an
+/// `Arc`.
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use flyrig_capture::LatestQueue;
+///
+/// let queue = LatestQueue::new(2);
+/// for frame in 0..3 {
+///     queue.push(frame)?;
+/// }
+/// assert_eq!((queue.pop(Duration::ZERO), queue.dropped()), (Ok(1), 1));
+/// # Ok::<(), i32>(())
+/// ```
 #[derive(Debug)]
 pub struct LatestQueue<T> {
     state: Mutex<State<T>>,
@@ -36,7 +49,7 @@ struct State<T> {
 }
 
 impl<T> LatestQueue<T> {
-    /// An empty queue of at least one place.
+    /// Creates an empty queue with at least one slot.
     #[must_use]
     pub fn new(capacity: usize) -> Self {
         let capacity = capacity.max(1);
@@ -44,15 +57,15 @@ impl<T> LatestQueue<T> {
         Self { state: Mutex::new(state), changed: Condvar::new(), capacity }
     }
 
-    /// No code of ours panics with the lock held, and the state is whole at every step.
+    /// Locks the state, which is consistent at every step: no code panics with the lock held.
     fn lock(&self) -> MutexGuard<'_, State<T>> {
         lock(&self.state)
     }
 
-    /// Puts an element in, at once. Gives the oldest one back, as dropped, when the queue was full.
+    /// Appends an element without blocking. Returns the oldest element, as dropped, when the queue was full.
     ///
     /// # Errors
-    /// Gives the element itself back when the queue is closed, which counts as no drop.
+    /// Returns the element itself when the queue is closed, which does not count as a drop.
     pub fn push(&self, item: T) -> Result<Option<T>, T> {
         let mut state = self.lock();
         if state.closed {
@@ -66,10 +79,10 @@ impl<T> LatestQueue<T> {
         Ok(oldest)
     }
 
-    /// Puts an element in, waiting for a place (back-pressure); nothing is dropped.
+    /// Appends an element, blocking until there is room (back-pressure); nothing is dropped.
     ///
     /// # Errors
-    /// Gives the element back when the queue is closed, before or during the wait.
+    /// Returns the element when the queue is closed, before or during the wait.
     pub fn push_wait(&self, item: T) -> Result<(), T> {
         let mut state = self.lock();
         while !state.closed && state.items.len() >= self.capacity {
@@ -84,7 +97,7 @@ impl<T> LatestQueue<T> {
         Ok(())
     }
 
-    /// Takes the oldest element, waiting for one.
+    /// Removes the oldest element, blocking until there is one.
     ///
     /// # Errors
     /// [`PopError::Timeout`], or [`PopError::Closed`] once a closed queue is empty.
@@ -110,31 +123,31 @@ impl<T> LatestQueue<T> {
         }
     }
 
-    /// Refuses further elements and wakes everyone; what is in the queue can still be taken.
+    /// Rejects further elements and wakes all waiting threads; queued elements can still be removed.
     pub fn close(&self) {
         self.lock().closed = true;
         self.changed.notify_all();
     }
 
-    /// Whether [`Self::close`] was called.
+    /// Returns whether [`Self::close`] was called.
     #[must_use]
     pub fn is_closed(&self) -> bool {
         self.lock().closed
     }
 
-    /// Elements dropped because the queue was full.
+    /// Returns the number of elements dropped because the queue was full.
     #[must_use]
     pub fn dropped(&self) -> u64 {
         self.lock().dropped
     }
 
-    /// Elements waiting.
+    /// Returns the number of queued elements.
     #[must_use]
     pub fn len(&self) -> usize {
         self.lock().items.len()
     }
 
-    /// Whether nothing waits.
+    /// Returns whether the queue is empty.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0

@@ -1,19 +1,17 @@
-//! Every pixel format as 8-bit sRGB.
+//! Conversion of every pixel format to 8-bit sRGB.
 //!
-//! YUV is what cameras deliver: ITU-R BT.601 with limited range (Y 16 to 235, U and V 16 to 240),
-//! the chroma of a pair or a 2x2 block used for all of its pixels.
+//! YUV is the cameras' ITU-R BT.601 with limited range (Y 16 to 235, U and V 16 to 240); the chroma of a pair or a 2x2
+//! block applies to all of its pixels.
 
 use std::array::from_fn;
 
 use flyrig_types::{Image, PixelFormat};
 
-use crate::{
-    CaptureError, CaptureErrorKind,
-    mjpeg::{self, JpegScratch},
-};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::mjpeg::{self, JpegScratch};
 
-/// The image as `width * height` pixels of 3 bytes, sRGB red green blue. Alpha is left out, grey is
-/// repeated, YUV is BT.601 limited range, Bayer is interpolated bilinearly, JPEG decoded.
+/// Converts an image to `width * height` pixels of 3 bytes, sRGB red green blue. Alpha is dropped, grey replicated, YUV
+/// is BT.601 with limited range, Bayer is interpolated bilinearly, JPEG decoded.
 ///
 /// # Errors
 /// `Corrupt` for a damaged JPEG or one of another size, `Unsupported` for 4:2:2 of odd width and
@@ -24,7 +22,7 @@ pub fn to_rgb8(image: &Image) -> Result<Vec<u8>, CaptureError> {
     Ok(rgb)
 }
 
-/// As [`to_rgb8`], into a buffer that is used again; after an error its content is unspecified.
+/// Converts as [`to_rgb8`] into a reusable buffer, whose content is unspecified after an error.
 ///
 /// # Errors
 /// As [`to_rgb8`].
@@ -32,7 +30,7 @@ pub fn to_rgb8_into(image: &Image, rgb: &mut Vec<u8>) -> Result<(), CaptureError
     convert(image, rgb, &mut JpegScratch::default())
 }
 
-/// As [`to_rgb8_into`], with the JPEG decoder's memory.
+/// Converts as [`to_rgb8_into`], with the JPEG decoder's scratch memory.
 pub(crate) fn convert(image: &Image, rgb: &mut Vec<u8>, scratch: &mut JpegScratch) -> Result<(), CaptureError> {
     let (width, height) = (image.width() as usize, image.height() as usize);
     let bytes = image.bytes();
@@ -112,14 +110,14 @@ fn unsupported(message: String) -> CaptureError {
     CaptureError::general(CaptureErrorKind::Unsupported, message)
 }
 
-/// BT.601 limited range in 16-bit fixed point: `R = 255/219 (Y-16) + 2 (1-Kr) 255/224 (V-128)` and
-/// so on with Kr = 0.299, Kb = 0.114. Nothing here can overflow; checks for it would keep the compiler from vectors.
+/// Converts BT.601 with limited range in 16-bit fixed point: `R = 255/219 (Y-16) + 2 (1-Kr) 255/224 (V-128)` and so on
+/// with Kr = 0.299, Kb = 0.114. Nothing here can overflow; checks for it would prevent vectorisation.
 #[inline]
 fn rgb_of(y: u8, chroma: [i32; 3]) -> [u8; 3] {
     chroma.map(|c| level(scaled_luma(y).wrapping_add(c)))
 }
 
-/// Contribution of luma to red, green and blue, with half a level for rounding.
+/// Returns the contribution of luma to red, green and blue, with half a level for rounding.
 #[inline]
 fn scaled_luma(y: u8) -> i32 {
     i32::from(y).wrapping_sub(16).wrapping_mul(76_309).wrapping_add(1 << 15)
@@ -131,7 +129,7 @@ fn level(fixed: i32) -> u8 {
     (fixed >> 16).clamp(0, 255) as u8
 }
 
-/// Contributions of chroma to red, green and blue.
+/// Returns the contributions of chroma to red, green and blue.
 #[inline]
 fn chroma_of(u: u8, v: u8) -> [i32; 3] {
     let (u, v) = (i32::from(u).wrapping_sub(128), i32::from(v).wrapping_sub(128));
@@ -139,10 +137,10 @@ fn chroma_of(u: u8, v: u8) -> [i32; 3] {
     [v.wrapping_mul(104_597), green, u.wrapping_mul(132_201)]
 }
 
-/// Pixels of a block, whose arithmetic the compiler turns into vector instructions; even, so that it ends with a pair.
+/// Pixels per block, whose arithmetic the compiler vectorises; even, so that it ends with a whole pair.
 const BLOCK: usize = 32;
 
-/// Pairs of pixels with one chroma, whose four bytes are [luma, luma, U, V] at these offsets.
+/// Converts pairs of pixels with common chroma, whose four bytes are [luma, luma, U, V] at these offsets.
 fn packed_to_rgb(bytes: &[u8], [first, second, u, v]: [usize; 4], rgb: &mut [u8]) {
     let (blocks, rest) = bytes.as_chunks::<{ 2 * BLOCK }>();
     let (colors, rest_out) = rgb.as_chunks_mut::<{ 3 * BLOCK }>();
@@ -157,7 +155,7 @@ fn packed_to_rgb(bytes: &[u8], [first, second, u, v]: [usize; 4], rgb: &mut [u8]
     }
 }
 
-/// [`rgb_of`] for a block of pixels, two with one chroma.
+/// Applies [`rgb_of`] to a block of pixels, two per chroma sample.
 #[inline]
 fn block_of_yuv(luma: &[u8; BLOCK], u: &[u8; BLOCK / 2], v: &[u8; BLOCK / 2], out: &mut [u8; 3 * BLOCK]) {
     // One simple loop a step, and planes first: anything else is computed pixel by pixel.
@@ -173,8 +171,8 @@ fn block_of_yuv(luma: &[u8; BLOCK], u: &[u8; BLOCK / 2], v: &[u8; BLOCK / 2], ou
     }
 }
 
-/// Bilinear: a colour that a pixel lacks is the mean of its neighbours of that colour; the border
-/// is mirrored about the outermost pixel, which keeps the mosaic's phase.
+/// Interpolates a Bayer mosaic bilinearly: a missing colour is the mean of the neighbours of that colour; the border is
+/// mirrored about the outermost pixel, which preserves the mosaic's phase.
 fn demosaic(mosaic: &[u8], width: usize, height: usize, phase: (usize, usize), rgb: &mut Vec<u8>) {
     let mirror = |i: usize, n: usize| [if i == 0 { 1 } else { i - 1 }, if i + 1 == n { n - 2 } else { i + 1 }];
     for y in 0..height {
@@ -222,7 +220,7 @@ mod tests {
         to_rgb8(&Image::new(width, height, format, bytes).unwrap())
     }
 
-    /// From the definition of BT.601, not from its usual constants.
+    /// Converts by the definition of BT.601 instead of its usual constants.
     fn reference(y: u8, u: u8, v: u8) -> [f64; 3] {
         let (kr, kb) = (0.299, 0.114);
         let y = (f64::from(y) - 16.0) / 219.0;

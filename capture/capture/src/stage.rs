@@ -1,25 +1,26 @@
-//! Work on frames between a camera's thread and the common queue, in a thread of its own.
+//! Processing between a camera's thread and the common queue, in a thread of its own.
 
 use std::sync::Arc;
 
 use flyrig_types::{CameraId, Frame, caught};
 
-use crate::{CaptureError, LatestQueue};
+use crate::error::CaptureError;
+use crate::queue::LatestQueue;
 
-/// Frames that may wait for a stage: one to work on next, one for jitter. More would only be older.
+/// Queued frames of a stage: one to process next, one for jitter. More would only add latency.
 const WAITING: usize = 2;
 
-/// Work on every frame of a camera that shall not hold up the camera's own thread: decoding, compressing.
+/// Processing of a camera's frames that must not block the camera's own thread: decoding, compression.
 pub trait FrameStage: Send {
-    /// Makes another frame of a frame.
+    /// Transforms a frame.
     ///
     /// # Errors
-    /// Costs this frame alone and is counted; so is a panic, as `Corrupt`, after which the next frames go to a new stage
-    /// where one can be made ([`crate::CaptureThreads::start_opening_staged`]).
+    /// An error loses this frame only and is counted. So is a panic, as `Corrupt`, after which the next frames go to a
+    /// new stage where one can be created ([`crate::CaptureThreads::start_opening_staged`]).
     fn process(&mut self, frame: Frame) -> Result<Frame, CaptureError>;
 }
 
-/// From a camera's thread to its stage's: the frame and its place in the order of capture.
+/// Hand-over from a camera's thread to its stage: frame and order time, nanoseconds.
 #[derive(Debug)]
 pub(crate) struct Hand(pub LatestQueue<(Frame, i64)>);
 
@@ -33,17 +34,17 @@ impl Hand {
     }
 }
 
-/// Makes a camera's stage.
+/// Factory of a camera's stage.
 pub(crate) type StageMaker = Arc<dyn Fn(&CameraId) -> Box<dyn FrameStage> + Send + Sync>;
 
-/// A stage, and how to make another when it has panicked; without that it is used on.
+/// Stage with the factory of its successor after a panic; without one the same stage continues.
 pub(crate) struct Stage {
     pub stage: Box<dyn FrameStage>,
     pub maker: Option<StageMaker>,
 }
 
 impl Stage {
-    /// Replaces the stage, if another can be made.
+    /// Replaces the stage, if a factory exists; returns whether it did.
     pub fn renew(&mut self, camera: &CameraId) -> bool {
         let Some(maker) = &self.maker else { return false };
         let Ok(fresh) = caught(|| maker(camera)) else { return false };

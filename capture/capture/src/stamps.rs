@@ -1,44 +1,45 @@
-//! From a driver's stamps to the middle of the exposure on `CLOCK_MONOTONIC`, whatever the stamps do.
+//! Conversion of driver timestamps to the middle of the exposure on `CLOCK_MONOTONIC`, robust to implausible ones.
 
-/// What the stamp of a frame tells the time of.
+/// Instant that a frame's timestamp refers to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum StampSource {
-    /// `CLOCK_MONOTONIC` when the exposure began (for USB cameras: when the first packet came).
+    /// Start of the exposure on `CLOCK_MONOTONIC` (for USB cameras: arrival of the first packet).
     #[cfg_attr(not(target_os = "linux"), expect(dead_code))]
     StartOfExposure,
-    /// `CLOCK_MONOTONIC` when the last pixel had come.
+    /// Arrival of the last pixel on `CLOCK_MONOTONIC`.
     EndOfFrame,
-    /// Another clock, or none.
+    /// Another clock, or no timestamp.
     Other,
 }
 
-/// A believable stamp lies at most so long and an exposure before its frame's arrival, nanoseconds.
+/// Maximum age of a plausible timestamp at its frame's arrival, beyond the exposure, nanoseconds.
 const OLDEST: i64 = 1_000_000_000;
-/// And at most so long after it: clocks are read one after the other.
+/// Maximum lead of a plausible timestamp over its frame's arrival, nanoseconds: the clocks are read one after the
+/// other.
 const NEWEST: i64 = 5_000_000;
-/// Stamps off by the same amount, so many in a row, are of another clock and no accident.
+/// Consecutive timestamps with a constant offset that prove another clock instead of a glitch.
 const CONFIRMATIONS: u32 = 8;
-/// What "the same amount" is, nanoseconds: arrivals on a busy machine are uneven.
+/// Tolerance of that constant offset, nanoseconds: arrivals on a busy machine are uneven.
 const AGREEMENT: u64 = 150_000_000;
 
-/// Turns stamps into capture times.
+/// Converter from timestamps to capture times.
 ///
-/// A stamp that cannot be right (far from the arrival of its frame) is replaced by the arrival. When the stamps go on being
-/// off by one amount, as after a step of the driver's clock, that amount is taken off from then on.
+/// An implausible timestamp (far from its frame's arrival) is replaced by the arrival. When timestamps keep a constant
+/// offset, as after a step of the driver's clock, that offset is subtracted from then on.
 #[derive(Debug, Default)]
 pub(crate) struct Stamps {
-    /// Added to the driver's clock.
+    /// Correction added to the driver's clock.
     offset_nanos: i64,
     suspect: Option<Suspect>,
-    /// Stamps that were replaced.
+    /// Number of replaced timestamps.
     pub replaced: u64,
     last_nanos: Option<i64>,
 }
 
-/// Recent stamps that could not be right.
+/// Run of recent implausible timestamps.
 #[derive(Debug, Clone, Copy)]
 struct Suspect {
-    /// Least and most that they were off by, nanoseconds.
+    /// Smallest and largest offset, nanoseconds.
     least: i64,
     most: i64,
     times: u32,
@@ -46,7 +47,8 @@ struct Suspect {
 }
 
 impl Stamps {
-    /// Middle of the exposure of the middle row. `half` is half of exposure and readout together, nanoseconds.
+    /// Returns the middle of the exposure of the middle row, nanoseconds. `half` is half of exposure and readout
+    /// together, nanoseconds.
     pub fn capture_nanos(&mut self, stamp_nanos: i64, source: StampSource, arrival_nanos: i64, half: i64) -> i64 {
         let capture = match source {
             StampSource::Other => arrival_nanos.saturating_sub(half),
@@ -104,7 +106,7 @@ mod tests {
     const MS: i64 = 1_000_000;
     const SECOND: i64 = 1000 * MS;
 
-    /// Feeds frames that arrive 8 ms after their stamp should be; gives error of each capture time, nanoseconds.
+    /// Feeds frames that arrive 8 ms after their true timestamp; returns the error of each capture time, nanoseconds.
     fn errors(stamps: &mut Stamps, frames: i64, stamp: impl Fn(i64, i64) -> i64) -> Vec<i64> {
         (0..frames)
             .map(|n| {

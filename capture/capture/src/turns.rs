@@ -1,12 +1,11 @@
-//! Puts the frames of several threads into the order of capture.
+//! Merge of several threads' frames into the order of capture.
 
 use std::sync::{Condvar, Mutex, MutexGuard};
 
 use flyrig_types::{lock, wait};
 
-/// A merge by time: a thread with a frame waits until no other can have an earlier one. Reading and
-/// decoding go on in parallel. Assumes that each thread's times grow; where they do not, the order
-/// suffers, nothing else.
+/// Merge by time: a thread with a frame waits until no other can have an earlier one, while reading and decoding
+/// proceed in parallel. Assumes that each thread's times increase; where they do not, only the order suffers.
 #[derive(Debug)]
 pub(crate) struct Turns {
     state: Mutex<State>,
@@ -15,7 +14,7 @@ pub(crate) struct Turns {
 
 #[derive(Debug)]
 struct State {
-    /// Per thread the earliest time that its next frame can have; `None` when it has ended.
+    /// Per thread the earliest time of its next frame; `None` when it has ended.
     earliest: Vec<Option<i64>>,
     closed: bool,
 }
@@ -32,9 +31,8 @@ impl Turns {
         lock(&self.state)
     }
 
-    /// Waits until the frame at `nanos`, or the time until which the thread has none, is the earliest of all, the lower slot first
-    /// among equals.
-    /// `false` when closed meanwhile.
+    /// Waits until the frame at `nanos`, or the time until which the thread has none, is the earliest of all, the lower
+    /// slot first among equals. Returns false when closed meanwhile.
     pub fn wait(&self, slot: usize, nanos: i64) -> bool {
         let mut state = self.lock();
         state.earliest[slot] = Some(nanos);
@@ -53,19 +51,19 @@ impl Turns {
         false
     }
 
-    /// The frame at `nanos` is delivered; the thread's next one is later.
+    /// Marks the frame at `nanos` as delivered; the thread's next one is later.
     pub fn done(&self, slot: usize, nanos: i64) {
         self.lock().earliest[slot] = Some(nanos.saturating_add(1));
         self.changed.notify_all();
     }
 
-    /// The thread gives no more frames.
+    /// Marks that the thread yields no more frames.
     pub fn end(&self, slot: usize) {
         self.lock().earliest[slot] = None;
         self.changed.notify_all();
     }
 
-    /// Frees everyone.
+    /// Releases all waiting threads.
     pub fn close(&self) {
         self.lock().closed = true;
         self.changed.notify_all();

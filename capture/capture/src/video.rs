@@ -17,33 +17,35 @@ use opencv::{
     },
 };
 
-use crate::{BufferPool, CameraSource, CaptureError, CaptureErrorKind};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::pool::BufferPool;
+use crate::source::CameraSource;
 
-/// How a video is replayed.
+/// Options of a video's replay.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct VideoOptions {
-    /// Frames a second; the file's own times when `None`.
+    /// Frames per second; the file's own times when `None`.
     pub fps: Option<f64>,
-    /// Only these frames, counted from 0.
+    /// Range of frames to replay, counted from 0; all when `None`.
     pub frames: Option<Range<u64>>,
-    /// Added to every frame's time: how much later this camera started than the rig's clock.
+    /// Delay of this camera's start against the rig's clock, nanoseconds; added to every frame's time.
     pub offset_nanos: i64,
 }
 
-/// One camera out of a video file of any format that OpenCV's videoio decodes. It gives `Bgr8`
-/// frames, upright where the file says how, whose sequence number is their place in the file.
+/// Frame source of a video file in any format that OpenCV's videoio decodes. Its frames are `Bgr8`, rotated upright
+/// where the file says how, and their sequence number is their position in the file.
 #[derive(Debug)]
 pub struct VideoReplay {
     camera: CameraId,
     path: PathBuf,
     video: VideoCapture,
     options: VideoOptions,
-    /// Frames a second by the options or the file.
+    /// Frames per second from the options or the file.
     fps: f64,
-    /// Frames that the file's header promises.
+    /// Number of frames in the file's header.
     promised: Option<u64>,
     next: u64,
-    /// Time of the last frame by the file, milliseconds.
+    /// Time of the last frame in the file, milliseconds.
     last_msec: Option<f64>,
     size: Option<(i32, i32)>,
     ended: bool,
@@ -52,11 +54,11 @@ pub struct VideoReplay {
 }
 
 impl VideoReplay {
-    /// Opens a file.
+    /// Opens a video file.
     ///
     /// # Errors
-    /// `NotFound` without such a file, `Corrupt` when it cannot be opened as a video, `Unsupported`
-    /// when no rate is known.
+    /// `NotFound` for a missing file, `Corrupt` when it cannot be opened as a video, `Unsupported` when no rate is
+    /// known.
     pub fn open(camera: &CameraId, path: &Path, options: &VideoOptions) -> Result<Self, CaptureError> {
         // OpenCV prints what it also returns. Fails only without a logger.
         let _ = set_log_level(LogLevel::LOG_LEVEL_SILENT);
@@ -94,7 +96,7 @@ impl VideoReplay {
         })
     }
 
-    /// Width and height in pixels by the file's header.
+    /// Returns width and height in pixels from the file's header.
     #[must_use]
     pub fn image_size(&self) -> Option<(u32, u32)> {
         let side = |id| self.video.get(id).ok().filter(|pixels| *pixels >= 1.0).map(|pixels| pixels as u32);
@@ -109,7 +111,7 @@ impl VideoReplay {
         self.error(CaptureErrorKind::EndOfStream, "all frames were replayed")
     }
 
-    /// Decodes no pixels: steps over a frame.
+    /// Skips a frame without decoding its pixels.
     fn grab(&mut self) -> Result<(), CaptureError> {
         if self.video.grab().unwrap_or(false) {
             return Ok(());
@@ -125,7 +127,7 @@ impl VideoReplay {
         }
     }
 
-    /// Time of the frame grabbed last.
+    /// Returns the time of the frame grabbed last, nanoseconds.
     fn capture_nanos(&mut self, number: u64) -> i64 {
         let own = self.video.get(CAP_PROP_POS_MSEC).ok().filter(|msec| msec.is_finite());
         // Some containers carry no times: OpenCV says 0 then.

@@ -1,5 +1,5 @@
-//! Steady state of capture: camera threads, decoding, the queue. Nothing is allocated for a frame, whatever the camera's format,
-//! but inside of the JPEG decoder.
+//! Steady state of capture (camera threads, decoding, queue): no allocation per frame in any format, except inside the
+//! JPEG decoder.
 
 #![allow(unsafe_code, reason = "an allocator that counts")]
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
@@ -43,7 +43,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// As a V4L2 camera gives frames: copied out of the driver's memory into buffers that come back.
+/// Source that copies frames out of driver memory into pooled buffers, as a V4L2 camera does.
 struct Driver {
     camera: CameraId,
     format: PixelFormat,
@@ -78,7 +78,7 @@ impl CameraSource for Driver {
 }
 
 const SIDE: u32 = 64;
-/// Buffers that a camera's pool keeps.
+/// Buffers kept by a camera's pool.
 const POOL: usize = 16;
 
 fn jpeg() -> Vec<u8> {
@@ -88,7 +88,7 @@ fn jpeg() -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// Calls of the allocator and growth in bytes over so many frames of each camera, after as many to warm up.
+/// Returns allocator calls and growth in bytes over this many frames of each camera, after as many to warm up.
 fn steady(formats: &[PixelFormat], frames: u64, pacing: Pacing) -> (u64, i64) {
     let sources = formats.iter().enumerate().map(|(i, &format)| {
         let picture = format.byte_len(SIDE, SIDE).map_or_else(jpeg, |length| vec![77; length]);
@@ -114,7 +114,7 @@ fn steady(formats: &[PixelFormat], frames: u64, pacing: Pacing) -> (u64, i64) {
     (second.0 - first.0, second.1 - first.1)
 }
 
-/// One test, since the counts are of the whole process.
+/// Runs as a single test, since the counts are of the whole process.
 #[test]
 fn the_steady_state_allocates_nothing() {
     use PixelFormat::{BayerRggb8, Bgr8, Gray8, Mjpeg, Nv12, Uyvy, Yuyv};

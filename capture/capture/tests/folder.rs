@@ -1,4 +1,4 @@
-//! Replay of folders: what comes out, and what is said about broken ones.
+//! Replay of folders: frames, and the errors of broken folders.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
@@ -18,7 +18,7 @@ fn paint_mask(path: &Path, width: u32, height: u32, value: u8) {
     ImageBuffer::from_fn(width, height, |x, _| Luma([if x == 0 { 0 } else { value }])).save(path).unwrap();
 }
 
-/// Cameras 00 and 01 with frames 0 to 4 and masks; the red value is the frame's number.
+/// Creates a folder of cameras 00 and 01 with frames 0 to 4 and masks; the red value is the frame's number.
 fn folder() -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     for camera in ["00", "01"] {

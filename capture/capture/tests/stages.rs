@@ -1,4 +1,4 @@
-//! Work behind a camera's thread: it holds up nobody, and what it cannot use costs one frame.
+//! Stages behind a camera's thread: none blocks another thread, and an unusable frame is lost alone.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
@@ -18,7 +18,7 @@ use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
 const LONG: Duration = Duration::from_secs(60);
 
-/// Gives so many frames at once and counts how many were taken.
+/// Source that yields this many frames at once and counts those taken.
 struct Fast {
     camera: CameraId,
     left: u64,
@@ -58,7 +58,7 @@ fn grey(_: u64) -> Image {
     Image::new(1, 1, PixelFormat::Gray8, vec![9]).unwrap()
 }
 
-/// Every third image is cut off.
+/// Image that is truncated every third time.
 fn sometimes_damaged(sequence: u64) -> Image {
     if sequence % 3 == 1 {
         return Image::new(2, 1, PixelFormat::Mjpeg, vec![0xff, 0xd8, 1]).unwrap();
@@ -66,7 +66,7 @@ fn sometimes_damaged(sequence: u64) -> Image {
     Image::new(2, 1, PixelFormat::Yuyv, vec![235, 128, 16, 128]).unwrap()
 }
 
-/// Passes frames on once the gate is open.
+/// Stage that passes frames on once the gate is open.
 struct Gate(Arc<AtomicBool>);
 
 impl FrameStage for Gate {
@@ -133,7 +133,7 @@ fn a_stuck_decoder_holds_up_neither_its_camera_nor_another() {
     assert!(slow.ends_with(&[48, 49]), "the newest are kept: {slow:?}");
 }
 
-/// A recording: capture times lie a tenth of a second apart.
+/// Recording with capture times a tenth of a second apart.
 struct Tenths(Box<dyn CameraSource>);
 
 impl CameraSource for Tenths {

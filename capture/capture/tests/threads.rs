@@ -1,4 +1,4 @@
-//! Capture threads: order, back-pressure, counts, and cameras that fail.
+//! Capture threads: order, back-pressure, counts, and failing cameras.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
@@ -22,7 +22,7 @@ enum Step {
     At(i64),
     Fail(CaptureErrorKind),
     Panic,
-    /// Answers `Timeout` until the flag is set.
+    /// Returns `Timeout` until the flag is set.
     Until(Arc<AtomicBool>),
 }
 

@@ -11,7 +11,7 @@ use opencv::{
     videoio::{VideoWriter, VideoWriterTrait},
 };
 
-/// A video of `count` plain frames at 25 a second whose red grows by 20 a frame.
+/// Writes a video of `count` uniform frames at 25 per second whose red grows by 20 per frame.
 fn write(path: &Path, codec: [char; 4], count: u32) {
     let [a, b, c, d] = codec;
     let code = VideoWriter::fourcc(a, b, c, d).unwrap();

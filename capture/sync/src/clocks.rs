@@ -1,4 +1,4 @@
-//! Cameras that are exposed together but stamp with clocks of their own: from each clock to the master's.
+//! Clock alignment of triggered cameras: maps each camera's own clock to the master's by subtracting offset and drift.
 
 use std::collections::VecDeque;
 
@@ -6,90 +6,113 @@ use flyrig_solve::{ClockLine, LineGate, LineOptions, LineSample, fit_line};
 use flyrig_types::{CameraId, Frame};
 use serde::{Deserialize, Serialize};
 
-/// What the stamps of different cameras have to do with each other.
+/// Relation between the timestamps of different cameras.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ClockKind {
-    /// One clock stamps all frames (cameras of one computer, recordings). Nothing is corrected, since a frame that lies
-    /// between two others was really taken there.
+    /// One clock stamps all frames (cameras of one computer, recordings). Nothing is corrected, since a frame between
+    /// two others was really taken there.
     #[default]
     Shared,
-    /// A trigger exposes all cameras at once, and each stamps with a clock of its own. Offset and drift of every clock
-    /// against the master's are estimated and taken off.
+    /// A trigger exposes all cameras simultaneously, and each timestamps with a clock of its own. Offset and drift of
+    /// every clock against the master's are estimated and subtracted.
     Triggered,
 }
 
-/// A stamp farther than this from the newest frame of the master was not taken now, nanoseconds.
+/// Largest plausible distance of a timestamp from the master's newest frame, nanoseconds.
 const PLAUSIBLE: i64 = 500_000_000;
-/// Stamps that agree on another offset, in a row, before it is believed.
+/// Consecutive timestamps that must agree on another offset before it is accepted.
 const CONFIRMATIONS: usize = 3;
-/// Frames from which the first offset is taken.
+/// Frames from which the first offset is estimated.
 const ACQUISITION: usize = 15;
-/// A pair of stamps enters the fit at most so often, nanoseconds; the fit spans [`PAIRS`] of them.
+/// Minimum interval between timestamp pairs of the fit, nanoseconds; the fit spans [`PAIRS`] of them.
 const PAIR_EVERY: i64 = 100_000_000;
 const PAIRS: usize = 300;
-/// Pairs with which the drift is first believed: fewer see more jitter than drift.
+/// Pairs from which the drift is estimated: with fewer, jitter dominates drift.
 const FIRST_FIT: usize = 50;
 /// Intervals whose median is a camera's period.
 const INTERVALS: usize = 15;
-/// Clocks of cameras are within this, parts per million; a steeper fit is of wrong pairs.
+/// Largest plausible drift of a camera's clock, parts per million; a steeper fit comes from wrong pairs.
 const MOST_DRIFT_PPM: f64 = 500.0;
-/// Instants of the master that are remembered.
+/// Recent instants of the master that are kept.
 const INSTANTS: usize = 64;
-/// A camera without a frame while all together gave this many times their number tells no longer what time it is.
+/// Rounds of all cameras without a frame of one camera after which that camera is no longer taken into account.
 const SILENT_ROUNDS: u64 = 2;
 
-/// How a camera's clock differs from the master's.
+/// State of a camera's clock against the master's.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct ClockState {
-    /// Added to the camera's stamp of now, nanoseconds.
+    /// Current correction, added to the camera's timestamp, nanoseconds.
     pub offset_nanos: i64,
-    /// How much faster the master's clock runs, parts per million.
+    /// Drift of the master's clock against this one, parts per million; positive if the master's runs faster.
     pub drift_ppm: f64,
-    /// Root mean square of what the fit leaves, nanoseconds.
+    /// Root mean square of the fit's residuals, nanoseconds.
     pub residual_nanos: f64,
-    /// Steps of the clock that were taken off.
+    /// Steps of the clock that were compensated.
     pub steps: u64,
-    /// Frames whose stamp could not be right and was replaced by what the sequence number tells.
+    /// Frames with an implausible timestamp, which was replaced by the prediction from the sequence number.
     pub replaced: u64,
 }
 
-/// Puts the capture times of all cameras onto the master's clock, for [`ClockKind::Triggered`].
+/// Aligner of all cameras' capture times to the master's clock, for [`ClockKind::Triggered`].
 ///
-/// Each camera has an offset and a drift, fitted by least squares without outliers to the pairs of its stamps and the
-/// master's of the last half minute. A stamp that departs from that and from the trigger's beat is replaced by what the
-/// frame's sequence number tells; when three of them agree, the clock has made a step, and the offset follows. (A step by
-/// whole periods of less than half a second passes for frames that the camera did not take.)
-/// The trigger's beat leaves the offset open by whole periods: clocks that differ by more than half a period at the start
-/// are matched by the order in which frames arrive, which the cameras' latencies can make wrong by a frame.
+/// Each camera has an offset and a drift, fitted by least squares without outliers to the pairs of its timestamps and
+/// the master's of the last half minute. A timestamp that deviates from that fit and from the trigger's beat is
+/// replaced by the prediction from the frame's sequence number; when three of them agree, the clock has stepped, and
+/// the offset follows. (A step by whole periods of less than half a second is indistinguishable from missing frames.)
+/// The trigger's beat leaves the offset ambiguous by whole periods: clocks that differ by more than half a period at
+/// the start are matched by the order in which frames arrive, which the cameras' latencies can make wrong by a frame.
+///
+/// ```
+/// use flyrig_sync::ClockAligner;
+/// use flyrig_types::{CameraId, Frame, Image, PixelFormat};
+///
+/// let cameras: [CameraId; 2] = ["master".into(), "other".into()];
+/// let mut aligner = ClockAligner::new(&cameras, None);
+/// for n in 0..300 {
+///     let truth = n * 33_333_333;
+///     // The other camera's clock is 5 ms ahead and 40 ppm fast.
+///     let stamps = [truth, truth + 5_000_000 + truth / 25_000];
+///     for (camera, capture_nanos) in cameras.iter().zip(stamps) {
+///         let image = Image::new(1, 1, PixelFormat::Gray8, vec![0])?;
+///         let (camera, sequence) = (camera.clone(), n as u64);
+///         let frame = Frame { camera, sequence, capture_nanos, exposure_nanos: None, image, mask: None };
+///         let aligned = aligner.align(frame);
+///         if n > 150 {
+///             assert!((aligned.capture_nanos - truth).abs() < 100_000, "within 0.1 ms");
+///         }
+///     }
+/// }
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug)]
 pub struct ClockAligner {
     cameras: Vec<(CameraId, Clock)>,
     master: usize,
     /// Corrected times of the master's last frames.
     instants: VecDeque<i64>,
-    /// Frames of all cameras.
+    /// Number of frames of all cameras.
     arrivals: u64,
 }
 
 #[derive(Debug, Default)]
 struct Clock {
     state: ClockState,
-    /// Master minus stamp.
+    /// Line fit of master minus timestamp.
     line: ClockLine,
-    /// Stamp and the master's corrected time.
+    /// Timestamp and corrected time of the master.
     pairs: VecDeque<(i64, i64)>,
     /// First differences to the master's newest frame.
     acquisition: Vec<i64>,
     is_locked: bool,
-    /// Amounts that recent stamps were off by.
+    /// Deviations of recent implausible timestamps.
     suspects: Vec<i64>,
-    /// Stamp, sequence number and corrected time of the last frame.
+    /// Timestamp, sequence number and corrected time of the last frame.
     last: Option<(i64, u64, i64)>,
     intervals: VecDeque<i64>,
-    /// Waits for a master's frame at or after it.
+    /// Timestamps that wait for a frame of the master at or after them.
     unpaired: VecDeque<i64>,
-    /// Frames of all cameras when this one's last frame came.
+    /// Number of frames of all cameras at this one's last frame.
     heard: u64,
 }
 
@@ -104,7 +127,7 @@ impl Clock {
         sorted.get(sorted.len() / 2).copied()
     }
 
-    /// What the sequence number says, by the camera's own period.
+    /// Predicts the time of a frame from its sequence number and the camera's own period.
     fn expected(&self, sequence: u64) -> Option<i64> {
         let (_, before, time) = self.last?;
         let steps = i64::try_from(sequence.checked_sub(before)?).ok().filter(|steps| (1..1000).contains(steps))?;
@@ -138,7 +161,7 @@ impl Clock {
         self.unpaired.clear();
     }
 
-    /// Fits the line to the pairs, the second time without outliers.
+    /// Fits the line to the pairs, a second time without outliers.
     fn fit(&mut self) {
         const OPTIONS: LineOptions = LineOptions {
             least_drift_samples: FIRST_FIT,
@@ -161,14 +184,14 @@ impl Clock {
     }
 }
 
-/// `value` moved by whole periods to the one nearest to zero.
+/// Returns `value` shifted by whole periods to the one nearest to zero.
 fn phase(value: i64, period: i64) -> i64 {
     let rest = value.rem_euclid(period);
     if rest > period / 2 { rest - period } else { rest }
 }
 
 impl ClockAligner {
-    /// For the cameras of a rig; `master` is the name of one, or the first leads.
+    /// Creates an aligner for the cameras of a rig; `master` names one of them, otherwise the first leads.
     #[must_use]
     pub fn new(cameras: &[CameraId], master: Option<&CameraId>) -> Self {
         let slot = master.and_then(|master| cameras.iter().position(|id| id == master));
@@ -180,7 +203,7 @@ impl ClockAligner {
         }
     }
 
-    /// The same frame with its capture time on the master's clock.
+    /// Returns the frame with its capture time on the master's clock.
     #[must_use]
     pub fn align(&mut self, frame: Frame) -> Frame {
         let Some(slot) = self.cameras.iter().position(|(id, _)| *id == frame.camera) else { return frame };
@@ -188,7 +211,7 @@ impl ClockAligner {
         Frame { capture_nanos, ..frame }
     }
 
-    /// Every camera's clock, in rig order.
+    /// Returns the state of every camera's clock, in rig order.
     pub fn clocks(&self) -> impl Iterator<Item = (&CameraId, ClockState)> {
         self.cameras.iter().map(|(id, clock)| {
             let drift_ppm = clock.line.drift * 1e6;
@@ -202,7 +225,7 @@ impl ClockAligner {
         self.arrivals += 1;
         let period = self.beat(slot);
         let is_master = slot == self.master;
-        // The newest instant that is known without this camera. A master that is silent holds nobody back.
+        // The newest instant known without this camera. A silent master delays no other camera.
         let of_master = self.instants.back().copied().filter(|_| !is_master && !self.is_silent(self.master));
         let now = of_master.or_else(|| self.others_now(slot));
         let (arrivals, instants) = (self.arrivals, &self.instants);
@@ -248,7 +271,7 @@ impl ClockAligner {
                     // The 1st, 2nd, 4th ...: a clock that steps all night must not fill the disk.
                     if clock.state.steps.is_power_of_two() {
                         let (ms, count) = (-(off as f64) * 1e-6, clock.state.steps);
-                        tracing::warn!(camera = %id, count, "the clock stepped by {ms:.1} ms, which is taken off");
+                        tracing::warn!(camera = %id, count, "the clock stepped by {ms:.1} ms, which is compensated");
                     }
                 }
                 time = told;
@@ -264,7 +287,7 @@ impl ClockAligner {
         time
     }
 
-    /// The period that the trigger beats with, as far as a camera and the master show it.
+    /// Returns the trigger's period, as far as a camera and the master show it.
     fn beat(&self, slot: usize) -> Option<i64> {
         let period = |slot: usize| self.cameras.get(slot).and_then(|(_, clock)| clock.period());
         match (period(slot), period(self.master)) {
@@ -273,13 +296,14 @@ impl ClockAligner {
         }
     }
 
-    /// Whether the others went on without this camera.
+    /// Returns whether the other cameras continued without this one.
     fn is_silent(&self, slot: usize) -> bool {
         let heard = self.cameras.get(slot).map_or(0, |(_, clock)| clock.heard);
         self.arrivals.saturating_sub(heard) > SILENT_ROUNDS * self.cameras.len() as u64
     }
 
-    /// Median of the newest times of the cameras that go on, but for this one and the master: one of them may be wrong.
+    /// Returns the median of the newest times of the active cameras except this one and the master: one of them may be
+    /// wrong.
     fn others_now(&self, own: usize) -> Option<i64> {
         let others = self.cameras.iter().enumerate();
         let others = others.filter(|(slot, _)| *slot != self.master && *slot != own && !self.is_silent(*slot));
@@ -289,7 +313,7 @@ impl ClockAligner {
         times.get(times.len() / 2).copied()
     }
 
-    /// A frame of the master came.
+    /// Records an instant of the master.
     fn instant(&mut self, time: i64) {
         self.instants.push_back(time);
         if self.instants.len() > INSTANTS {
@@ -302,7 +326,7 @@ impl ClockAligner {
         }
     }
 
-    /// Pairs what lies before the master's newest instant with the nearest one.
+    /// Pairs the timestamps before the master's newest instant with the nearest instants.
     fn pair(&mut self, slot: usize) {
         let Some(period) = self.beat(slot) else { return };
         let Some(&newest) = self.instants.back() else { return };
@@ -336,8 +360,8 @@ impl ClockAligner {
     }
 }
 
-/// Learns the first offset: whole periods by the order of arrival where the clocks have nothing in common, the rest by the
-/// beat.
+/// Estimates the first offset: whole periods from the order of arrival where the clocks have nothing in common, the
+/// rest from the beat.
 fn acquire(clock: &mut Clock, stamp: i64, now: i64, period: Option<i64>, instants: &VecDeque<i64>) {
     clock.acquisition.push(now.wrapping_sub(stamp));
     if clock.acquisition.len() == 1 && now.wrapping_sub(stamp).saturating_abs() > PLAUSIBLE {

@@ -1,18 +1,21 @@
-//! Promises of the aligner on simulated clocks, and of the sets that are formed in corrected time.
+//! Properties of the aligner on simulated clocks, and of frame sets formed in corrected time.
 
 use flyrig_types::{CameraId, Frame, FrameSet, Image, PixelFormat};
 
-use crate::{ClockAligner, SyncSettings, Synchronizer};
+use crate::clocks::ClockAligner;
+use crate::settings::SyncSettings;
+use crate::sync::Synchronizer;
 use flyrig_model::SplitMix64;
 
 const PERIOD: i64 = 33_333_333;
 const SECOND: i64 = 1_000_000_000;
 const HOUR_FRAMES: i64 = 3600 * 30;
 
-/// A frame as it arrives: camera, tick, stamp by the camera's clock.
+/// Arriving frame: camera, tick, timestamp of the camera's clock.
 type Arrival = (usize, i64, i64);
 
-/// Frames of cameras that are triggered together; `stamp` makes the camera's stamp of a true time, `none` loses it.
+/// Simulates cameras that are triggered together; `stamp` maps a true time to the camera's timestamp, `None` loses the
+/// frame.
 fn arrivals(
     random: &mut SplitMix64,
     cameras: usize,
@@ -55,7 +58,7 @@ struct Run {
     times: Vec<Arrival>,
 }
 
-/// The sequence number of a frame is its tick.
+/// Runs the aligner on frames whose sequence number is their tick.
 fn run(cameras: usize, arrivals: &[Arrival]) -> Run {
     run_waiting(cameras, arrivals, None)
 }
@@ -77,7 +80,7 @@ fn run_waiting(cameras: usize, arrivals: &[Arrival], max_wait_nanos: Option<u64>
     Run { aligner, sync, sets, times }
 }
 
-/// Largest distance of a corrected time from the master's own reading of that instant, from a tick on.
+/// Returns the largest deviation of a corrected time from the master's own reading of that instant, from a tick on.
 fn worst(run: &Run, from: i64, master: impl Fn(i64) -> i64) -> i64 {
     let late = run.times.iter().filter(|(_, tick, _)| *tick >= from);
     late.map(|(_, tick, time)| (time - master(*tick)).abs()).max().unwrap()

@@ -3,13 +3,13 @@
 use flyrig_types::{Camera, Mask};
 use glam::{DVec2, DVec3};
 
-/// Coverage of a pixel that is half covered.
+/// Value of a half-covered pixel.
 const HALF: f64 = 127.5;
 
-/// A corner of the convex hull of a silhouette.
+/// Corner of the convex hull of a silhouette.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HullCorner {
-    /// Direction, of length 1.
+    /// Unit direction.
     pub ray: DVec3,
     /// Whether the corner lies on the image border, where the silhouette may continue.
     pub is_cut: bool,

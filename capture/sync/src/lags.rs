@@ -1,48 +1,49 @@
-//! Constant lags between cameras out of what moves in their images, for stamps that cannot be trusted.
+//! Constant time offsets between cameras from the motion in their images alone, for uncalibrated cameras with
+//! unreliable timestamps.
 
 use flyrig_solve::DenseNormal;
 use flyrig_types::CameraId;
 
-/// Signals are compared every so many nanoseconds.
+/// Sampling interval of the signals, nanoseconds.
 const STEP: i64 = 4_000_000;
-/// What is slower than this is light and background, not motion, nanoseconds.
+/// Period above which changes are attributed to light and background instead of motion, nanoseconds.
 const TREND: i64 = 1_000_000_000;
-/// Bands of an image whose changes are measured: fine enough for a hand, coarse enough for noise.
+/// Image bands whose changes are measured: fine enough for a hand, coarse enough against noise.
 const BANDS: usize = 64;
-/// Parts of an image from top to bottom whose changes are compared each by itself: what the hands do is not mistaken for
-/// what the feet do, so that the lag does not lean towards whatever a camera sees best.
+/// Vertical zones whose changes are correlated separately, so that motion of the hands is not confused with that of the
+/// feet, which would bias the offset towards whatever a camera sees best.
 const ZONES: usize = 16;
-/// How many zones higher or lower another camera may see the same.
+/// Largest vertical shift between the views of two cameras, zones.
 const MOST_OFFSET: usize = 4;
-/// Samples that two signals must have in common, besides the lags that are tried: in less than four seconds, different
-/// movements are too easily alike.
+/// Samples that two signals must share, besides the tested offsets: in less than four seconds, different movements are
+/// too easily alike.
 const LEAST_COMMON: usize = 1000;
-/// Correlation below which two cameras tell nothing about each other.
+/// Correlation below which a pair of cameras is uninformative.
 const LEAST_CORRELATION: f64 = 0.3;
-/// What pairs of cameras may disagree by before a camera's lag is not believed, nanoseconds: slow movements look alike over
-/// many frames, and from every side a little different.
+/// Largest disagreement between pairs at which a camera's offset is accepted, nanoseconds: slow movements look alike
+/// over many frames, and slightly different from every side.
 const MOST_DISAGREEMENT: f64 = 2e6;
-/// Correlation that is asked of a pair that no third camera can contradict.
+/// Correlation required of a pair that no third camera can contradict.
 const LONE_CORRELATION: f64 = 0.75;
 
-/// How much moves up and down in the images of one camera over time.
+/// Vertical motion in the images of one camera over time.
 #[derive(Debug, Clone)]
 pub struct MotionSignal {
     camera: CameraId,
     last: Option<(i64, Vec<f32>)>,
-    /// Time in the middle between two images, and how much changed a second, by zone.
+    /// Midpoint between two images, nanoseconds, and the change per second of each zone.
     samples: Vec<(i64, [f64; ZONES])>,
 }
 
 impl MotionSignal {
-    /// Of a camera, still empty.
+    /// Creates an empty signal of a camera.
     #[must_use]
     pub fn new(camera: CameraId) -> Self {
         Self { camera, last: None, samples: Vec::new() }
     }
 
-    /// Adds an image of `width * height` pixels of 3 bytes. Images of no size, of another size than the bytes', and out
-    /// of order are left out.
+    /// Adds an image of `width * height` pixels of 3 bytes. Ignores empty images, images whose length differs from the
+    /// size, and images out of order.
     pub fn add(&mut self, capture_nanos: i64, rgb: &[u8], width: usize, height: usize) {
         if width == 0 || height == 0 || rgb.len() != width * height * 3 {
             return;
@@ -64,19 +65,13 @@ impl MotionSignal {
         self.last = Some((capture_nanos, bands));
     }
 
-    /// Images that were compared.
+    /// Number of image pairs compared so far.
     #[must_use]
-    pub fn len(&self) -> usize {
+    pub fn comparisons(&self) -> usize {
         self.samples.len()
     }
 
-    /// Whether nothing was compared yet.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.samples.is_empty()
-    }
-
-    /// Every zone, every [`STEP`] from `start` on, without what is slower than [`TREND`].
+    /// Samples every zone each [`STEP`] from `start` on, high-pass filtered at [`TREND`].
     fn sampled(&self, start: i64, count: usize) -> Vec<Vec<f64>> {
         (0..ZONES).map(|zone| self.sampled_zone(zone, start, count)).collect()
     }
@@ -112,8 +107,8 @@ impl MotionSignal {
     }
 }
 
-/// Mean of the green channel in each of [`BANDS`] bands from top to bottom. What moves sideways stays in its band: that looks
-/// different from every side, while up and down are the same for all cameras that stand upright.
+/// Returns the mean of the green channel in each of [`BANDS`] bands from top to bottom. Horizontal motion stays within
+/// its band: it looks different from every side, while vertical motion is the same for all upright cameras.
 fn bands(rgb: &[u8], width: usize, height: usize) -> Vec<f32> {
     let count = BANDS.min(height);
     let mut sums = vec![(0u64, 0u64); count];
@@ -125,23 +120,23 @@ fn bands(rgb: &[u8], width: usize, height: usize) -> Vec<f32> {
     sums.into_iter().map(|(sum, pixels)| (sum as f64 / pixels.max(1) as f64) as f32).collect()
 }
 
-/// How much later than the first camera's a camera's stamps are.
+/// Estimated time offset of a camera from the first one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LagEstimate {
-    /// Which camera.
+    /// Name of the camera.
     pub camera: CameraId,
-    /// To be taken off its stamps, nanoseconds; none when its motion is like no other camera's, when the pairs of cameras
-    /// disagree, or when nothing but a weak pair tells of it. The first camera's is 0.
+    /// Offset to subtract from its timestamps, nanoseconds; `None` when its motion matches no other camera's, when the
+    /// pairs of cameras disagree, or when only a weak pair supports it. The first camera's is 0.
     pub lag_nanos: Option<i64>,
-    /// Best correlation of its motion with another camera's, 0 to 1.
+    /// Best correlation of its motion with another camera's, in 0..=1.
     pub correlation: f64,
-    /// Root mean square of what the pairs of cameras disagree by, nanoseconds.
+    /// Root mean square disagreement between its pairs, nanoseconds.
     pub disagreement_nanos: f64,
 }
 
-/// Lags of all cameras against the first one, each at most `most_nanos`. What moves is seen by all, from other sides: the
-/// lag of a pair is where their changes correlate best, and the lags of all follow from the pairs by weighted least
-/// squares.
+/// Estimates the time offsets of all cameras from the first one, each at most `most_nanos`. All cameras see the same
+/// motion from different sides: the offset of a pair is where the changes correlate best, and the offsets of all
+/// cameras follow from the pairs by weighted least squares.
 #[must_use]
 pub fn estimate_lags(signals: &[MotionSignal], most_nanos: i64) -> Vec<LagEstimate> {
     let count = signals.len();
@@ -154,7 +149,7 @@ pub fn estimate_lags(signals: &[MotionSignal], most_nanos: i64) -> Vec<LagEstima
             }
         }
     }
-    settled(count, &pairs)
+    accepted_offsets(count, &pairs)
         .into_iter()
         .zip(signals)
         .enumerate()
@@ -173,24 +168,24 @@ pub(crate) struct PairLag {
     /// Slots of the cameras.
     pub first: usize,
     pub second: usize,
-    /// How much later the second one's stamps are, nanoseconds.
+    /// Time offset of the second camera from the first, nanoseconds.
     pub lag: f64,
-    /// How much it is believed.
+    /// Weight in the least squares fit.
     pub weight: f64,
 }
 
-/// Estimates of one camera from its pairs.
+/// Estimate of one camera from its pairs.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Balance {
-    /// Nanoseconds after the first camera; none where no pairs reach it.
+    /// Time offset from the first camera, nanoseconds; `None` where no pair reaches it.
     pub lag: Option<f64>,
-    /// The lag's variance if the weights are inverse variances.
+    /// Variance of the offset if the weights are inverse variances.
     pub variance: f64,
-    /// Root mean square of what its pairs disagree by, nanoseconds.
+    /// Root mean square disagreement between its pairs, nanoseconds.
     pub disagreement: f64,
 }
 
-/// The lags that the pairs agree on best: weighted least squares with the first camera at 0.
+/// Solves for the offsets on which the pairs agree best: weighted least squares with the first camera at 0.
 pub(crate) fn balanced(count: usize, pairs: &[PairLag]) -> Vec<Balance> {
     let mut reached = vec![false; count];
     if let Some(first) = reached.first_mut() {
@@ -235,9 +230,9 @@ pub(crate) fn balanced(count: usize, pairs: &[PairLag]) -> Vec<Balance> {
     out
 }
 
-/// Of every camera the lag after the first one that its pairs agree on, and what they disagree by. A pair is two cameras, how
-/// much later the second is, and the correlation there.
-fn settled(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>, f64)> {
+/// Returns each camera's accepted offset from the first one and the disagreement of its pairs. A pair is two cameras,
+/// the offset of the second, and the correlation there.
+fn accepted_offsets(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>, f64)> {
     let linked = |a: usize, b: usize| {
         pairs.iter().any(|pair| (pair.0, pair.1) == (a.min(b), a.max(b)) && pair.3 >= LEAST_CORRELATION)
     };
@@ -258,8 +253,8 @@ fn settled(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<(Option<f64>
         .collect()
 }
 
-/// How much later `b`'s motion is than `a`'s, nanoseconds, and the correlation there. Cameras that see the person higher or
-/// lower in their images are compared with the offset at which they agree best.
+/// Estimates the time offset of `b` from `a`, nanoseconds, and the correlation there. Cameras that see the person
+/// higher or lower in their images are compared at the vertical shift of best agreement.
 fn pair_lag(a: &MotionSignal, b: &MotionSignal, most: i64) -> Option<(f64, f64)> {
     let ((a0, a1), (b0, b1)) = (a.span()?, b.span()?);
     let (start, end) = (a0.max(b0), a1.min(b1));
@@ -302,7 +297,7 @@ mod tests {
 
     const PERIOD: i64 = 33_333_333;
 
-    /// Where two hands of a person are: sums of slow swings.
+    /// Simulates the positions of two hands: sums of slow swings.
     fn hands(seed: u64) -> impl Fn(f64) -> [f64; 4] {
         let mut random = SplitMix64(seed);
         let swings: Vec<[f64; 3]> =
@@ -314,13 +309,13 @@ mod tests {
         }
     }
 
-    /// A camera's images: two blobs where it sees the hands from its side, and noise.
+    /// Returns the accepted offsets, rounded.
     fn lags(count: usize, pairs: &[(usize, usize, f64, f64)]) -> Vec<Option<f64>> {
-        settled(count, pairs).into_iter().map(|(lag, _)| lag.map(f64::round)).collect()
+        accepted_offsets(count, pairs).into_iter().map(|(lag, _)| lag.map(f64::round)).collect()
     }
 
     #[test]
-    fn lags_are_told_only_where_something_vouches_for_them() {
+    fn offsets_are_reported_only_where_other_pairs_support_them() {
         let known = |ms: f64| Some(ms * 1e6);
         // A loop of weak pairs that agree, and one that does not.
         let loop_of = |third: f64| [(0, 1, 5e6, 0.5), (1, 2, 7e6, 0.5), (0, 2, third, 0.5)];
@@ -331,13 +326,14 @@ mod tests {
         assert_eq!(lags(4, &beside), [known(0.0), None, None, None]);
         // A chain of weak pairs: nothing could contradict them.
         assert_eq!(lags(3, &[(0, 1, 5e6, 0.5), (1, 2, 7e6, 0.5)]), [known(0.0), None, None]);
-        // Strong pairs need nobody.
+        // Strong pairs need no support.
         assert_eq!(lags(3, &[(0, 1, 5e6, 0.9), (1, 2, 7e6, 0.8)]), [known(0.0), known(5.0), known(12.0)]);
         // A strong pair that hangs on a weak one.
         assert_eq!(lags(3, &[(0, 1, 5e6, 0.5), (1, 2, 7e6, 0.9)]), [known(0.0), None, None]);
         assert_eq!((lags(1, &[]), lags(0, &[])), (vec![known(0.0)], vec![]));
     }
 
+    /// Simulates the images of a camera: two blobs where it sees the hands from its side, and noise.
     fn signal(seed: u64, camera: usize, lag: i64, seconds: i64) -> MotionSignal {
         let (hands, mut random) = (hands(seed), SplitMix64(seed * 100 + camera as u64));
         let mut signal = MotionSignal::new(format!("cam{camera}").into());
@@ -382,7 +378,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_sees_nothing_of_it_is_told() {
+    fn a_camera_without_the_motion_gets_no_offset() {
         let mut signals: Vec<MotionSignal> = (0..2).map(|camera| signal(5, camera, 0, 12)).collect();
         let mut still = MotionSignal::new("wall".into());
         for n in 0..360 {
@@ -403,7 +399,7 @@ mod tests {
         odd.add(i64::MAX, &[1, 2, 9], 1, 1);
         odd.add(i64::MIN, &[1, 2, 3], 1, 1);
         odd.add(i64::MAX, &[0; 12], 2, 2);
-        assert_eq!(odd.len(), 1);
+        assert_eq!(odd.comparisons(), 1);
         let estimates = estimate_lags(&[odd.clone(), odd.clone(), MotionSignal::new("none".into())], i64::MAX);
         assert_eq!(estimates[2].lag_nanos, None);
         assert_eq!(estimates[0].lag_nanos, Some(0));

@@ -1,4 +1,4 @@
-//! When images were taken: frame sets of one instant, clocks of cameras and hosts, time offsets between cameras.
+//! Capture times: frame sets of one instant, clocks of cameras, time offsets between cameras.
 //!
 //! Times are nanoseconds of the capturing host's `CLOCK_MONOTONIC`; an image's time is the middle of its exposure.
 

@@ -5,28 +5,28 @@ use std::collections::BTreeMap;
 use flyrig_types::{Camera, CameraId};
 use serde::{Deserialize, Serialize};
 
-use crate::ClockKind;
+use crate::clocks::ClockKind;
 
-/// How frame sets are formed. Serialised in milliseconds, 0 meaning "automatic"; kept in whole nanoseconds.
+/// Settings of frame sets. Serialised in milliseconds, 0 meaning "automatic"; kept in whole nanoseconds.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SyncSettings {
-    /// Largest distance of a frame from its set's time; half of the master's frame period, as it is at the time, when `None`
-    /// (or, where a camera is faster than the master, three fifths of its own).
-    /// Up to that the nearest set of a frame is unambiguous. A camera that goes on at the distance it had in the set before may be
-    /// half as far again: one that runs half a period beside the master would fall out of every other set.
+    /// Largest distance of a frame from its frame set's time. When `None`, half of the master's current frame period
+    /// (or, where a camera is faster than the master, three fifths of its own); up to that the nearest frame set of a
+    /// frame is unambiguous. A camera that keeps the distance it had in the previous frame set may be half as far
+    /// again: one that runs half a period beside the master would otherwise drop out of every other frame set.
     #[serde(rename = "window_ms", with = "window")]
     pub window_nanos: Option<u64>,
-    /// Longest time, by the frames' own clock, that a set waits for a camera; three of the master's periods, but 100 ms to
-    /// 1 s, when `None`. A camera silent for longer is waited for no more, and when it is the master, the next camera's
-    /// clock takes over.
+    /// Longest time, on the frames' own clock, that a frame set waits for a camera; three of the master's periods, but
+    /// 100 ms to 1 s, when `None`. A camera silent for longer is no longer awaited, and when it is the master, the next
+    /// camera's clock takes over.
     #[serde(rename = "max_wait_ms", with = "max_wait")]
     pub max_wait_nanos: Option<u64>,
-    /// Time offset of each camera's timestamps against the other cameras'; subtracted before anything else. Sets wait longer
-    /// by the spread of the offsets. Replaces the calibration's ([`Self::with_offsets_of`]).
+    /// Time offset of each camera's timestamps against the other cameras'; subtracted before anything else. Frame sets
+    /// wait longer by the spread of the offsets. Replaces the calibration's ([`Self::with_offsets_of`]).
     #[serde(rename = "lags_ms", with = "lags")]
     pub lags_nanos: BTreeMap<CameraId, i64>,
-    /// The camera whose frames set the times of the sets; the rig's first when `None`.
+    /// Camera whose frames set the times of the frame sets; the rig's first when `None`.
     #[serde(with = "master")]
     pub master: Option<CameraId>,
     /// Whether the cameras share a clock.
@@ -73,7 +73,7 @@ macro_rules! optional_millis {
 optional_millis!(window, "window_ms", 10_000.0);
 optional_millis!(max_wait, "max_wait_ms", 60_000.0);
 
-/// Milliseconds by camera.
+/// (De)serialiser of milliseconds per camera.
 mod lags {
     use std::collections::BTreeMap;
 
@@ -94,7 +94,7 @@ mod lags {
     }
 }
 
-/// A name, empty for `None`.
+/// (De)serialiser of a name, empty for `None`.
 mod master {
     use flyrig_types::CameraId;
     use serde::{Deserialize as _, Deserializer, Serializer};

@@ -1,61 +1,61 @@
-//! Constant lags between calibrated cameras out of the silhouettes of whoever moves before them.
+//! Constant time offsets between calibrated cameras, from the silhouettes of a moving person.
 //!
-//! Planes through the centres of two cameras that touch a body touch its silhouettes in both images (epipolar tangency, e.g.
-//! Wong and Cipolla 2001; used for synchronisation by Sinha and Pollefeys 2004). How far the two outermost planes are turned
-//! is therefore the same for both cameras at one instant, whatever side they see: two curves over time for every pair of
-//! cameras that differ by nothing but the lag.
+//! A plane through the centres of two cameras that is tangent to a body is tangent to its silhouettes in both images
+//! (epipolar tangency, e.g. Wong and Cipolla 2001; used for synchronisation by Sinha and Pollefeys 2004). The angles of
+//! the two outermost tangent planes are therefore the same for both cameras at one instant, whatever side they see: two
+//! curves over time per pair of cameras that differ by the time offset only.
 
 use flyrig_solve::median;
 use flyrig_types::{Camera, Mask};
 use glam::DVec3;
 
-use crate::LagEstimate;
 use crate::hull::{HullCorner, silhouette_hull};
+use crate::lags::LagEstimate;
 use crate::lags::{Balance, PairLag, balanced};
 
-/// Curves are compared every so many nanoseconds.
+/// Sampling interval of the curves, nanoseconds.
 const STEP: i64 = 4_000_000;
-/// Smallest sine of the angle between the line through two cameras and what they see: nearer to that line, planes through it
-/// tell little.
+/// Smallest sine of the angle between the baseline and the viewing direction: near the baseline the plane's angle is
+/// ill-conditioned.
 const LEAST_APART: f64 = 0.35;
-/// A silhouette that is wider than this, radians around the line through both cameras, surrounds that line.
+/// Largest angle of a silhouette about the baseline, radians; a wider one surrounds the epipole.
 const MOST_SPAN: f64 = 2.0;
-/// Samples that two curves must have in common, besides the lags that are tried: three quarters of a second.
+/// Samples that two curves must share, besides the tested offsets: three quarters of a second.
 const LEAST_COMMON: usize = 187;
-/// Alternating stretches of time whose lags must agree, samples.
+/// Length of the alternating stretches whose offsets must agree, samples.
 const STRETCH: usize = 125;
-/// How much better than the mean of all lags a pair's best one must fit, 0 to 1: below, masks of too small images lead astray.
+/// Smallest contrast of a pair: how much better than the mean of all offsets the best one must fit, in 0..=1. Below,
+/// masks of too small images mislead.
 const LEAST_CONTRAST: f64 = 0.3;
-/// What a mask is believed to lean by where somebody moves, pixels.
+/// Assumed bias of a moving mask's outline, pixels.
 const LEANING_PX: f64 = 0.1;
 /// Standard error beyond which a time offset is not reported, nanoseconds.
 const MOST_ERROR: f64 = 5e6;
-/// Samples of a kind of stretches below which their lag is not asked for.
+/// Fewest samples of a kind of stretches for an offset of their own.
 const LEAST_STRETCH: usize = 30;
-/// How near to the best fit, of what the mean lag lacks, another lag makes it doubtful.
+/// Fraction of the way from the best to the mean fit within which another offset makes the estimate ambiguous.
 const AMBIGUOUS: f64 = 0.25;
-/// Distance in robust standard deviations from which two curves are more likely to show different things.
+/// Robust standard deviations from which a difference of two curves is more likely an outlier.
 const SCALE: f64 = 1.5;
-/// Lags looked for, at most, nanoseconds.
+/// Largest tested offset, nanoseconds.
 const MOST: i64 = 1_000_000_000;
 
 /// Silhouettes of one camera over time.
 #[derive(Debug, Clone)]
 pub struct SilhouetteTrack {
     camera: Camera,
-    /// Time, and the convex hull of the silhouette in the world's axes.
+    /// Time, nanoseconds, and convex hull of the silhouette in world axes.
     samples: Vec<(i64, Vec<HullCorner>)>,
 }
 
 impl SilhouetteTrack {
-    /// Of a camera, still empty.
+    /// Creates an empty track of a camera.
     #[must_use]
     pub fn new(camera: &Camera) -> Self {
         Self { camera: camera.clone(), samples: Vec::new() }
     }
 
-    /// Adds the mask of an image. Masks out of order, of another size than the camera's images, and empty ones are left
-    /// out.
+    /// Adds the mask of an image. Ignores masks out of order, of another size than the camera's images, and empty ones.
     pub fn add(&mut self, capture_nanos: i64, mask: &Mask) {
         let is_newer = self.samples.last().is_none_or(|(before, _)| *before < capture_nanos);
         if is_newer && [mask.width(), mask.height()] == self.camera.size() {
@@ -68,19 +68,13 @@ impl SilhouetteTrack {
         }
     }
 
-    /// Masks that were added.
+    /// Number of masks added so far.
     #[must_use]
-    pub fn len(&self) -> usize {
+    pub fn masks(&self) -> usize {
         self.samples.len()
     }
 
-    /// Whether no mask was added yet.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.samples.is_empty()
-    }
-
-    /// Half of the median time between two masks, nanoseconds.
+    /// Returns half of the median interval between masks, nanoseconds.
     fn half_interval(&self) -> f64 {
         let mut gaps: Vec<i64> = self.samples.windows(2).map(|pair| pair[1].0.saturating_sub(pair[0].0)).collect();
         gaps.sort_unstable();
@@ -92,11 +86,11 @@ impl SilhouetteTrack {
     }
 }
 
-/// Lags of all cameras against the first one, of two cameras at most `most_nanos` (at most 1 s); two cameras are enough. The
-/// correlation of an estimate is how much better than the mean of all lags the best one fits, 0 to 1; its disagreement the
-/// standard error, by the noise of the curves, by what pairs of cameras disagree on, and by what alternating half seconds
-/// disagree on. No offset is reported for a camera where that is more than 5 ms, or that has nothing in common with the first one
-/// (error infinite).
+/// Estimates the time offsets of all cameras from the first one, of each pair at most `most_nanos` (at most 1 s); two
+/// cameras are enough. The correlation of an estimate is its contrast, in 0..=1: how much better the best offset fits
+/// than the mean of all. Its disagreement is the standard error, from the noise of the curves, the disagreement of
+/// pairs of cameras, and that of alternating half seconds. No offset is reported for a camera whose standard error
+/// exceeds 5 ms, or that has nothing in common with the first one (infinite error).
 #[must_use]
 pub fn estimate_silhouette_lags(tracks: &[SilhouetteTrack], most_nanos: i64) -> Vec<LagEstimate> {
     let count = tracks.len();
@@ -121,7 +115,7 @@ pub fn estimate_silhouette_lags(tracks: &[SilhouetteTrack], most_nanos: i64) -> 
         .map(|slot| {
             let of_times = match (even[slot].lag, odd[slot].lag) {
                 (Some(even), Some(odd)) => (even - odd).abs() / 2.0,
-                // Half of the time tells nothing, or of a lag beyond those that are tried.
+                // One half is uninformative, or its offset lies beyond the tested ones.
                 _ => f64::INFINITY,
             };
             let error = errors[slot].max(of_times);
@@ -135,7 +129,8 @@ pub fn estimate_silhouette_lags(tracks: &[SilhouetteTrack], most_nanos: i64) -> 
         .collect()
 }
 
-/// Standard errors of balanced lags: what the weights (inverse variances) promise, or more where the pairs disagree by more.
+/// Returns the standard errors of balanced offsets: from the weights (inverse variances), or larger where the pairs
+/// disagree by more.
 fn standard_errors(lags: &[Balance], pairs: &[PairLag]) -> Vec<f64> {
     let squares: Vec<f64> = pairs
         .iter()
@@ -147,18 +142,18 @@ fn standard_errors(lags: &[Balance], pairs: &[PairLag]) -> Vec<f64> {
     lags.iter().map(|lag| lag.lag.map_or(f64::INFINITY, |_| (lag.variance * excess).sqrt())).collect()
 }
 
-/// What one of the two curves of a pair of cameras tells.
+/// Fit of one of the two curves of a pair of cameras.
 #[derive(Debug)]
 struct Fit {
-    /// How much later the second camera's stamps are, nanoseconds: by all of the time, by the even and by the odd stretches.
+    /// Time offset of the second camera, nanoseconds: from all stretches, from the even and from the odd ones.
     lags: [Option<f64>; 3],
-    /// How much better that lag fits than the mean of all.
+    /// Contrast: improvement of the fit over the mean of all offsets, in 0..=1.
     contrast: f64,
     /// Inverse variance of the lag, 1/ns².
     weight: f64,
 }
 
-/// Estimates from the lowest and the highest tangents of two cameras.
+/// Fits the curves of the lowest and the highest tangents of two cameras.
 fn fits(a: &SilhouetteTrack, b: &SilhouetteTrack, most: i64) -> Vec<Fit> {
     let (Some(pencil), Some((a0, a1)), Some((b0, b1))) = (Pencil::new(a, b), a.span(), b.span()) else {
         return Vec::new();
@@ -184,16 +179,17 @@ fn fits(a: &SilhouetteTrack, b: &SilhouetteTrack, most: i64) -> Vec<Fit> {
         .collect()
 }
 
-/// How far curves are believed.
+/// Reliability of the curves.
 struct Trust {
-    /// What masks lean by as somebody moves, radians.
+    /// Assumed bias of a moving outline, radians.
     leaning: f64,
-    /// Time from one independent sample to the next, nanoseconds.
+    /// Interval between independent samples, nanoseconds.
     apart_nanos: f64,
 }
 
-/// The lag between two curves that differ by noise and a constant, which calibration and masks are granted: where the mean
-/// robust (Geman-McClure) square of the difference is lowest. `b` goes on beyond `a` by equally many samples on both sides.
+/// Estimates the time offset between two curves that differ by noise and a constant (calibration and mask errors): the
+/// one with the smallest mean robust (Geman-McClure) squared difference. `b` extends beyond `a` by equally many samples
+/// on both sides.
 fn fit(a: &[f64], b: &[f64], trust: &Trust) -> Option<Fit> {
     let tries = b.len() - a.len() + 1;
     let differences = |shift: usize| a.iter().zip(&b[shift..]).map(|(x, y)| y - x);
@@ -255,7 +251,8 @@ fn fit(a: &[f64], b: &[f64], trust: &Trust) -> Option<Fit> {
     })
 }
 
-/// Whether another lag fits nearly as well, as when somebody moves regularly: `AMBIGUOUS` of the way from the best to the mean.
+/// Returns whether another offset fits nearly as well, as with periodic motion: within `AMBIGUOUS` of the way from the
+/// best to the mean.
 fn is_ambiguous(costs: &[f64], best: usize) -> bool {
     let mean = costs.iter().sum::<f64>() / costs.len() as f64;
     let nearly = costs[best] + AMBIGUOUS * (mean - costs[best]);
@@ -265,7 +262,8 @@ fn is_ambiguous(costs: &[f64], best: usize) -> bool {
     falls_again(&mut costs[best..].iter()) || falls_again(&mut costs[..=best].iter().rev())
 }
 
-/// Lag of the lowest cost, nanoseconds; none at the edge, which is a slope that goes on beyond, and where a cost is not known.
+/// Returns the offset of the lowest cost, nanoseconds; `None` at the edge of the range, where the cost may fall further
+/// beyond, and next to an unknown cost.
 fn lowest(costs: &[f64]) -> Option<f64> {
     if costs.iter().any(|cost| cost.is_nan()) {
         return None;
@@ -277,14 +275,14 @@ fn lowest(costs: &[f64]) -> Option<f64> {
     Some((best as f64 + fine - (costs.len() / 2) as f64) * STEP as f64)
 }
 
-/// The planes through the centres of two cameras, by their angle.
+/// Pencil of planes through the centres of two cameras, by angle.
 struct Pencil {
-    /// Angle 0 and a right angle, of length 1 and across the line through both cameras.
+    /// Unit axes of angle 0 and of the right angle, perpendicular to the baseline.
     axes: [DVec3; 2],
 }
 
 impl Pencil {
-    /// None for cameras at one place, and for cameras that look at each other.
+    /// Creates the pencil; `None` for cameras at the same place, and for cameras that face each other.
     fn new(a: &SilhouetteTrack, b: &SilhouetteTrack) -> Option<Self> {
         let line = (b.camera.position() - a.camera.position()).try_normalize()?;
         let mean = |track: &SilhouetteTrack| {
@@ -295,7 +293,7 @@ impl Pencil {
         Some(Self { axes: [front, line.cross(front)] })
     }
 
-    /// Angles of the two outermost planes that touch the silhouettes, with their times.
+    /// Returns the angles of the two outermost tangent planes, with their times.
     fn tangents(&self, track: &SilhouetteTrack) -> [Vec<(i64, f64)>; 2] {
         let mut sides: [Vec<(i64, f64)>; 2] = Default::default();
         for (nanos, hull) in &track.samples {
@@ -318,8 +316,9 @@ impl Pencil {
     }
 }
 
-/// A curve every [`STEP`] from `start` on: lines fitted to what is near, so that between two samples there is no less noise than
-/// at them (which would draw the lags to the middle between two images). NaN where there are no samples on both sides.
+/// Samples a curve every [`STEP`] from `start` on by local line fits, so that the noise between two samples is no lower
+/// than at them (which would bias the offsets to the middle between two images). NaN where there are no samples on both
+/// sides.
 fn smoothed(samples: &[(i64, f64)], sigma: f64, start: i64, count: usize) -> Vec<f64> {
     let reach = 3.0 * sigma;
     let mut from = 0;

@@ -1,4 +1,4 @@
-//! Lags that are known, found again in silhouettes of balls that move.
+//! Known time offsets, recovered from silhouettes of moving balls.
 
 use flyrig_types::{Intrinsics, Isometry, Lens};
 
@@ -22,7 +22,7 @@ fn camera(name: &str, eye: DVec3, target: DVec3) -> Camera {
     }
 }
 
-/// Cameras around the origin, at different heights.
+/// Places cameras around the origin, at different heights.
 fn ring(count: usize) -> Vec<Camera> {
     let eye = |slot: usize| {
         let angle = slot as f64 * 1.1 + 0.3;
@@ -31,7 +31,7 @@ fn ring(count: usize) -> Vec<Camera> {
     (0..count).map(|slot| camera(&format!("cam{slot}"), eye(slot), DVec3::Z)).collect()
 }
 
-/// Balls (centre, radius): a trunk, a head and two hands that somebody jumps and waves with.
+/// Returns balls (centre, radius) that stand for a person: a trunk, a head and two hands, jumping and waving.
 fn balls(secs: f64, seed: u64) -> Vec<(DVec3, f64)> {
     let mut random = SplitMix64(seed);
     let mut swing = |size: f64| {
@@ -45,14 +45,14 @@ fn balls(secs: f64, seed: u64) -> Vec<(DVec3, f64)> {
     vec![(base + DVec3::Z, 0.35), (base + DVec3::Z * 1.55, 0.14), (left, 0.1), (right, 0.1)]
 }
 
-/// Rays of a camera's pixels.
+/// Returns the rays of a camera's pixels.
 fn rays(camera: &Camera) -> Vec<DVec3> {
     let [width, height] = camera.size();
     let pixel = |i: u32| DVec2::new(f64::from(i % width), f64::from(i / width));
     (0..width * height).map(|i| camera.ray(pixel(i)).unwrap()).collect()
 }
 
-/// What a camera sees of balls: coverage by the distance of a pixel's ray from the nearest ball's outline.
+/// Renders a camera's mask of balls: coverage from the distance of a pixel's ray to the nearest ball's outline.
 fn mask(camera: &Camera, rays: &[DVec3], balls: &[(DVec3, f64)]) -> Mask {
     let [width, height] = camera.size();
     let to = |center: DVec3| center - camera.position();
@@ -66,7 +66,7 @@ fn mask(camera: &Camera, rays: &[DVec3], balls: &[(DVec3, f64)]) -> Mask {
     Mask::new(width, height, coverage.collect()).unwrap()
 }
 
-/// Eight seconds of one camera; a frame is now and then missing, or its mask is wrong.
+/// Simulates eight seconds of one camera; now and then a frame is missing or its mask is wrong.
 fn track(camera: &Camera, lag: i64, phase: i64, seed: u64, random: &mut SplitMix64) -> SilhouetteTrack {
     let (mut track, rays) = (SilhouetteTrack::new(camera), rays(camera));
     for n in 0..240 {
@@ -200,14 +200,14 @@ fn too_little_and_senseless_input_is_borne() {
     let mut odd = SilhouetteTrack::new(&cameras[0]);
     odd.add(5, &Mask::new(width, height, vec![0; (width * height) as usize]).unwrap());
     odd.add(5, &Mask::new(height, width, vec![255; (width * height) as usize]).unwrap());
-    assert!(odd.is_empty());
+    assert!(odd.masks() == 0);
     odd.add(5, &good);
     odd.add(5, &good);
     odd.add(4, &good);
-    assert_eq!(odd.len(), 1);
+    assert_eq!(odd.masks(), 1);
     // All of the image: every corner is cut.
     odd.add(i64::MAX, &Mask::new(width, height, vec![255; (width * height) as usize]).unwrap());
-    assert_eq!(odd.len(), 2);
+    assert_eq!(odd.masks(), 2);
     let mut blind = SilhouetteTrack::new(&Camera {
         intrinsics: Intrinsics { focal_px: DVec2::splat(f64::NAN), ..cameras[0].intrinsics },
         ..cameras[0].clone()
@@ -219,7 +219,7 @@ fn too_little_and_senseless_input_is_borne() {
 }
 
 #[test]
-fn regular_movement_has_more_than_one_lag_and_none_is_told() {
+fn regular_movement_has_more_than_one_lag_and_none_is_reported() {
     let cameras = ring(2);
     let rays: Vec<Vec<DVec3>> = cameras.iter().map(rays).collect();
     let told = |rate: f64| {

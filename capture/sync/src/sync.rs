@@ -1,4 +1,4 @@
-//! Sets of frames of one instant out of cameras that run on their own.
+//! Synchroniser: forms frame sets of one instant from free-running cameras.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -8,65 +8,89 @@ use std::{
 use flyrig_types::{CameraId, Frame, FrameSet, SetKind};
 use serde::{Deserialize, Serialize};
 
-use crate::SyncSettings;
+use crate::settings::SyncSettings;
 
-/// Most frames that wait for a set, per camera: a clock gone wild must not eat the memory.
+/// Most frames of a camera that wait for a frame set: a runaway clock must not exhaust the memory.
 const MAX_PENDING: usize = 64;
-/// One more for so much that lags differ by, nanoseconds: a period of 120 frames a second.
+/// Spread of the time offsets that allows one more waiting frame, nanoseconds: a period at 120 frames per second.
 const PENDING_STEP: u64 = 8_000_000;
 
-/// The window before the master's period is known: half a frame of 30 a second.
+/// Window before the master's period is known, nanoseconds: half a period at 30 frames per second.
 const FIRST_WINDOW: u64 = 16_666_667;
-/// The least that a set waits for a camera whose delay is not told, nanoseconds: three frames of 30 a second.
+/// Shortest wait of a frame set for a camera of unknown delay, nanoseconds: three periods at 30 frames per second.
 const LEAST_WAIT: u64 = 100_000_000;
-/// The most: one odd interval of a camera that has just started must not hold the rig up.
+/// Longest such wait: one odd interval of a camera that has just started must not stall the rig.
 const MOST_WAIT: u64 = 1_000_000_000;
 /// Intervals of a camera whose median is its period.
 const INTERVALS: usize = 9;
 
-/// Frames of one camera that came into no set.
+/// Frames of one camera that joined no frame set.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DropCounts {
-    /// Came when their set was gone already.
+    /// Frames that arrived after their frame set was emitted.
     pub too_old: u64,
-    /// Had the very time of another frame of the camera.
+    /// Frames with the exact time of another frame of the camera.
     pub duplicate: u64,
-    /// Waited, but a nearer frame was taken, or no set came near enough.
+    /// Frames that waited, but a nearer frame was used or no frame set came near enough.
     pub superseded: u64,
-    /// Claimed a time far ahead of every camera's, which neither the camera's next frame nor another camera confirmed.
+    /// Frames with a time far ahead of every camera's, which neither the camera's next frame nor another camera
+    /// confirmed.
     pub wild: u64,
 }
 
 impl DropCounts {
-    /// All of them.
+    /// Returns the total of all kinds.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.too_old + self.duplicate + self.superseded + self.wild
     }
 }
 
-/// What a [`Synchronizer`] has done so far.
+/// Counts of a [`Synchronizer`].
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SyncCounts {
-    /// Sets with every camera.
+    /// Frame sets with every camera.
     pub complete: u64,
-    /// Sets that lack a camera.
+    /// Frame sets that lack a camera.
     pub partial: u64,
-    /// Frames that came into no set, a slot a camera in rig order.
+    /// Frames that joined no frame set, per camera in rig order.
     pub dropped_frames: Vec<DropCounts>,
-    /// Frames of cameras that are not in the rig.
+    /// Frames of cameras outside the rig.
     pub unknown_camera: u64,
 }
 
-/// Makes sets of the frames nearest in time to the frames of a master camera.
+/// Synchroniser that groups the frames nearest in time to those of a master camera.
 ///
-/// A set is emitted as soon as nothing nearer can come (every camera that is not silent has
-/// delivered a frame at or past the set's time) or when it has waited
-/// [`SyncSettings::max_wait_nanos`]. A frame that claims to be farther than that ahead of all others is set aside until
-/// a second one says so: a single wrong stamp must not move the time of the whole rig. Time is the frames' own: the same
-/// frames pushed in the same order give the same sets. A frame is used once at most, the sets' times grow strictly, and a set
-/// of another clock than the set before lies more than the window after it. All cameras must share
-/// one clock; make a new synchronizer when that clock starts anew.
+/// A frame set is emitted as soon as nothing nearer can come (every camera that is not silent has delivered a frame at
+/// or past its time) or when it has waited [`SyncSettings::max_wait_nanos`]. A frame that claims to be farther than
+/// that ahead of all others is held back until a second one confirms it: a single wrong timestamp must not move the
+/// time of the whole rig. Time is the frames' own: identical frames pushed in the same order give identical frame sets.
+/// A frame is used at most once, the times of frame sets increase strictly, and a frame set that follows another
+/// camera's clock than the previous one lies more than the window after it. All cameras must share one clock; create a
+/// new synchroniser when that clock restarts.
+///
+/// ```
+/// use flyrig_sync::{SyncSettings, Synchronizer};
+/// use flyrig_types::{CameraId, Frame, Image, PixelFormat};
+///
+/// let frame = |camera: &CameraId, sequence: u64, capture_nanos: i64| -> Result<Frame, Box<dyn std::error::Error>> {
+///     let image = Image::new(1, 1, PixelFormat::Gray8, vec![0])?;
+///     Ok(Frame { camera: camera.clone(), sequence, capture_nanos, exposure_nanos: None, image, mask: None })
+/// };
+/// let cameras: [CameraId; 2] = ["left".into(), "right".into()];
+/// let mut synchronizer = Synchronizer::new(&cameras, &SyncSettings::default());
+/// let mut sets = Vec::new();
+/// for n in 0..10 {
+///     let nanos = n as i64 * 33_333_333;
+///     // The second camera runs 4 ms behind.
+///     sets.extend(synchronizer.push(frame(&cameras[0], n, nanos)?));
+///     sets.extend(synchronizer.push(frame(&cameras[1], n, nanos + 4_000_000)?));
+/// }
+/// sets.extend(synchronizer.flush());
+/// assert_eq!(sets.len(), 10);
+/// assert_eq!(synchronizer.counts().complete, 10);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug)]
 pub struct Synchronizer {
     cameras: Vec<Camera>,
@@ -76,11 +100,11 @@ pub struct Synchronizer {
     /// Whether the window is half of the master's period.
     follows_period: bool,
     max_wait: u64,
-    /// What the known lags differ by: so much later the frames of one instant come, nanoseconds.
+    /// Spread of the known time offsets, by which frames of one instant may arrive later, nanoseconds.
     spread: u64,
-    /// Whether [`Self::max_wait`] is of the master's period.
+    /// Whether [`Self::max_wait`] follows the master's period.
     waits_periods: bool,
-    /// Time of the first frame ever: cameras not seen yet are silent since then.
+    /// Time of the first frame of all: cameras not seen yet count as silent since then.
     first_nanos: Option<i64>,
     last_set: Option<(i64, usize)>,
     sets: u64,
@@ -90,28 +114,28 @@ pub struct Synchronizer {
 #[derive(Debug)]
 struct Camera {
     id: CameraId,
-    /// Taken off its stamps, nanoseconds.
+    /// Time offset, subtracted from its timestamps, nanoseconds.
     lag: i64,
-    /// By time.
+    /// Waiting frames, by time.
     pending: BTreeMap<i64, Arc<Frame>>,
-    /// Far ahead of all others, and not believed yet.
+    /// Frame far ahead of all others, not confirmed yet.
     suspect: Option<Arc<Frame>>,
-    /// Time of the frame pushed last. Not the largest: one absurd time must not last.
+    /// Time of the frame pushed last. Not the largest: one absurd time must not persist.
     latest: Option<i64>,
-    /// From the frame before to that one, nanoseconds.
+    /// Interval between the previous frame and that one, nanoseconds.
     interval: Option<u64>,
-    /// The last of those, newest last.
+    /// Recent intervals, newest last.
     intervals: VecDeque<u64>,
-    /// Frames of each camera from after that one's instant.
+    /// Per other camera, the frames since this one's last instant.
     missed: Vec<u64>,
-    /// Time of the frame that went into a set last.
+    /// Time of the last frame that joined a frame set.
     used: Option<i64>,
-    /// How much later than the set's time that was, and whose clock the set followed.
+    /// Distance of that frame from the frame set's time, and the slot whose clock the frame set followed.
     offset: Option<(usize, i64)>,
 }
 
 impl Camera {
-    /// From frame to frame, as a rule: the median of the last intervals, as a lost frame makes one of two.
+    /// Returns the frame period: the median of recent intervals, since a lost frame doubles one of them.
     fn period(&self) -> Option<u64> {
         let mut sorted = [0; INTERVALS];
         let sorted = &mut sorted[..self.intervals.len()];
@@ -120,7 +144,7 @@ impl Camera {
         sorted.get(sorted.len() / 2).copied()
     }
 
-    /// The waiting frame nearest to a time.
+    /// Returns the time of the waiting frame nearest to a time.
     fn nearest(&self, nanos: i64) -> Option<i64> {
         let before = self.pending.range(..=nanos).next_back().map(|(time, _)| *time);
         let after = self.pending.range(nanos..).next().map(|(time, _)| *time);
@@ -129,7 +153,7 @@ impl Camera {
 }
 
 impl Synchronizer {
-    /// For the cameras of a rig, in its order. A master that is not among them is ignored with a
+    /// Creates a synchroniser for the cameras of a rig, in its order. A master that is not among them is ignored with a
     /// warning, and the first camera leads.
     #[must_use]
     pub fn new(cameras: &[CameraId], settings: &SyncSettings) -> Self {
@@ -179,7 +203,7 @@ impl Synchronizer {
         }
     }
 
-    /// Takes a frame and gives the sets that became certain by it, in the order of time.
+    /// Adds a frame and returns the frame sets that it completes, in the order of time.
     pub fn push(&mut self, frame: Frame) -> Vec<FrameSet> {
         let Some(slot) = self.cameras.iter().position(|camera| camera.id == frame.camera) else {
             self.counts.unknown_camera += 1;
@@ -193,7 +217,7 @@ impl Synchronizer {
         let near = |suspect: &Arc<Frame>| suspect.capture_nanos.abs_diff(nanos) <= plausible;
         let own = self.cameras[slot].suspect.as_ref().is_some_and(|suspect| suspect.capture_nanos < nanos);
         if !far_ahead {
-            // Its clock tells an ordinary time again.
+            // Its clock is plausible again.
             let before = self.cameras[slot].suspect.take();
             self.counts.dropped_frames[slot].wild += u64::from(before.is_some());
         } else if own || self.suspects().any(near) {
@@ -220,7 +244,7 @@ impl Synchronizer {
         let nanos = frame.capture_nanos;
         self.first_nanos.get_or_insert(nanos);
         for other in &mut self.cameras {
-            // Of the same instant, it tells nothing.
+            // It belongs to the same instant and adds no information.
             let later = other.latest.is_none_or(|latest| nanos > latest && nanos.abs_diff(latest) > self.window);
             other.missed[slot] += u64::from(later);
         }
@@ -255,8 +279,7 @@ impl Synchronizer {
         }
     }
 
-    /// Gives the sets that were still waiting, at the end of a stream, and drops the frames that
-    /// came into none.
+    /// Returns the frame sets that were still waiting, at the end of a stream, and drops the frames that joined none.
     pub fn flush(&mut self) -> Vec<FrameSet> {
         let sets = self.drain(true);
         for (camera, dropped) in self.cameras.iter_mut().zip(&mut self.counts.dropped_frames) {
@@ -267,7 +290,7 @@ impl Synchronizer {
         sets
     }
 
-    /// What happened so far.
+    /// Returns the counts so far.
     #[must_use]
     pub fn counts(&self) -> &SyncCounts {
         &self.counts
@@ -290,7 +313,7 @@ impl Synchronizer {
         sets
     }
 
-    /// Time of the newest frame.
+    /// Returns the time of the newest frame.
     fn now(&self) -> Option<i64> {
         self.cameras.iter().filter_map(|camera| camera.latest).max()
     }
@@ -303,7 +326,7 @@ impl Synchronizer {
         late && camera.missed.iter().any(|&frames| frames > 1)
     }
 
-    /// The next set's time and the camera that gives it.
+    /// Returns the next frame set's time and the camera that sets it.
     fn next_tick(&self) -> Option<(usize, i64)> {
         for &slot in &self.clock_order {
             let after_last = |nanos: &&i64| self.last_set.is_none_or(|(last, _)| **nanos > last);

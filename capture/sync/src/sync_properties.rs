@@ -1,15 +1,16 @@
-//! Promises of the synchronizer under random drops, jitter, reordering and doubled frames.
+//! Properties of the synchroniser under random drops, jitter, reordering and duplicate frames.
 
 use std::collections::HashMap;
 
 use flyrig_types::{CameraId, Frame, FrameSet, Image, PixelFormat};
 
-use crate::{DropCounts, SyncSettings, Synchronizer};
+use crate::settings::SyncSettings;
+use crate::sync::{DropCounts, Synchronizer};
 use flyrig_model::SplitMix64;
 
 const PERIOD: i64 = 33_333_333;
 
-/// A rig's frames in the order of arrival: `(camera, time, serial number)`.
+/// Simulates a rig's frames in the order of arrival: `(camera, time, serial number)`.
 fn arrivals(random: &mut SplitMix64, cameras: usize) -> Vec<(usize, i64, u64)> {
     let (drop, twice, jitter) = (random.below(40), random.below(10), 1 + random.below(15_000_000));
     let late = random.below(4) * 40_000_000;
@@ -99,7 +100,7 @@ fn random_rigs_keep_every_promise() {
     assert!(complete > 1000, "the random rigs are too broken to test anything: {complete} complete sets");
 }
 
-/// Against a plain search: without loss, lateness or silence every set holds the nearest frames.
+/// Compares with a brute-force search: without loss, lateness or silence every frame set holds the nearest frames.
 #[test]
 fn a_sound_rig_gets_the_nearest_frame_of_every_camera() {
     for seed in 0..50 {

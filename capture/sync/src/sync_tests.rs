@@ -1,4 +1,4 @@
-//! What the synchronizer promises, case by case.
+//! Behaviour of the synchroniser, case by case.
 
 use flyrig_types::{Image, PixelFormat};
 
@@ -91,7 +91,7 @@ fn a_camera_slower_than_the_wait_is_no_wild_one() {
     assert_eq!(sync.counts().dropped_frames[0], DropCounts::default());
 }
 
-/// Times in ms of a set's frames.
+/// Returns the times of a frame set's frames, milliseconds.
 fn times(set: &FrameSet) -> Vec<Option<i64>> {
     set.frames.iter().map(|frame| frame.as_ref().map(|frame| frame.capture_nanos / MS)).collect()
 }
@@ -124,7 +124,8 @@ fn the_nearest_frames_are_taken_and_keep_their_own_time() {
 
 const PERIOD: i64 = 33_333_333;
 
-/// Free-running cameras, `offsets` beside the master, each stamp up to `jitter` off; `keep` says which frames there are.
+/// Simulates free-running cameras, `offsets` from the master, each timestamp off by up to `jitter`; `keep` selects
+/// frames.
 fn free_running(
     period: i64,
     ticks: i64,

@@ -119,7 +119,7 @@ impl RigWatch {
             return None;
         };
         let before = known.state();
-        let state = known.look(&as_watched(&frame.image)?);
+        let state = known.compare(&as_watched(&frame.image)?);
         let is_moved = |state: WatchState| matches!(state, WatchState::Moved(_));
         let corrected = self.corrects.then(|| watched.correction(slot, state)).flatten();
         let is_news = corrected.is_some() || is_moved(before) != is_moved(state);

@@ -1,16 +1,16 @@
-//! Tapered capsules in the body's limbs and trunk that cloth stays out of.
+//! Tapered capsules in limbs and trunk that push cloth out of the body.
 
 use flyrig_body::Part;
 use glam::{DMat4, Vec3};
 
-use crate::person::Person;
+use crate::person::assembly::Person;
 
-/// Cloth keeps this far from what is below it, metres.
+/// Distance of cloth from the surface below it, metres.
 const APART_M: f32 = 0.007;
-/// Capsules a limb, one after the other.
+/// Consecutive capsules per limb.
 const PIECES: usize = 2;
 
-/// A capsule between two points with a radius at each, fixed to a joint.
+/// Capsule between two points with a radius at each, fixed to a joint.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Limb {
     joint: usize,
@@ -18,21 +18,21 @@ struct Limb {
     radii: [f32; 2],
 }
 
-/// A capsule in the world.
+/// Capsule in the world.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Capsule {
     pub ends: [Vec3; 2],
     pub radii: [f32; 2],
 }
 
-/// The capsules of a body.
+/// Capsules of a body.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Colliders {
     limbs: Vec<Limb>,
 }
 
 impl Colliders {
-    /// Fitted to a person's body and what lies on it, at rest; bones that it does not have get none.
+    /// Fits the capsules to a person's body and tight clothes at rest; missing bones get none.
     pub(crate) fn fitted(person: &Person) -> Self {
         let body = &person.body;
         let worn = person.sheets.iter().filter(|sheet| !sheet.hangs).flat_map(|sheet| sheet.vertices.clone());
@@ -61,12 +61,12 @@ impl Colliders {
         Self { limbs }
     }
 
-    /// Where they are in canonical space.
+    /// Returns the capsules in canonical space.
     pub(crate) fn at_rest(&self) -> Vec<Capsule> {
         self.limbs.iter().map(|limb| Capsule { ends: limb.ends, radii: limb.radii }).collect()
     }
 
-    /// Where they are, given the skinning matrices.
+    /// Returns the capsules in the world, given the skinning matrices.
     pub(crate) fn placed(&self, world_from_canonical: &[DMat4]) -> Vec<Capsule> {
         let place = |limb: &Limb| {
             let matrix = world_from_canonical.get(limb.joint)?.as_mat4();
@@ -77,7 +77,7 @@ impl Colliders {
     }
 }
 
-/// A piece of a limb: at both ends as wide as 19 of 20 points around there.
+/// Fits a piece of a limb, at both ends as wide as 19 of 20 points around it.
 fn fitted_limb(points: &[(Vec3, Part)], joint: usize, ends: [Vec3; 2], parts: [Part; 2]) -> Option<Limb> {
     let [a, b] = ends;
     let axis = (b - a).try_normalize()?;
@@ -98,7 +98,7 @@ fn fitted_limb(points: &[(Vec3, Part)], joint: usize, ends: [Vec3; 2], parts: [P
     Some(Limb { joint, ends, radii: radii.map(|r| r + APART_M) })
 }
 
-/// A lying capsule as wide and deep as the trunk at a height.
+/// Fits a horizontal capsule as wide and deep as the trunk at a height.
 fn fitted_slab(points: &[(Vec3, Part)], joint: usize, y: f32, half_height_m: f32) -> Option<Limb> {
     let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
     for (p, part) in points {
@@ -117,7 +117,7 @@ fn fitted_slab(points: &[(Vec3, Part)], joint: usize, y: f32, half_height_m: f32
 }
 
 impl Capsule {
-    /// How far a point is inside, and the direction out; none outside.
+    /// Returns the depth of a point inside and the direction outwards; `None` outside.
     pub(crate) fn depth(&self, p: Vec3) -> Option<(f32, Vec3)> {
         let [a, b] = self.ends;
         let axis = b - a;

@@ -1,9 +1,9 @@
-//! Loose cloth and hair: how they swing.
+//! Simulation of loose cloth and hair.
 //!
 //! Skirts, coat tails, open jackets, hems and hair ends are carried by control particles a few centimetres apart. Each
-//! is drawn to the place that skinning gives it with the frequency of a pendulum as long as it hangs free, is held to its
-//! neighbours, and stays out of the body ([`solver`]). Surfaces follow by smooth weights ([`pieces`]); what is computed
-//! is a function of time alone ([`replay`]).
+//! is pulled towards its skinned position with the frequency of a pendulum of its free length, is constrained to its
+//! neighbours, and stays out of the body ([`solver`]). Surfaces follow by smooth weights ([`pieces`]); an instant
+//! depends on its time alone, so any order of requests gives the same bytes ([`replay`]).
 
 mod colliders;
 mod pieces;
@@ -16,19 +16,19 @@ mod tests;
 use flyrig_types::PoseTrack;
 use glam::Vec3;
 
-use crate::person::Person;
+use crate::person::assembly::Person;
 use colliders::Colliders;
 use pieces::Pieces;
 use replay::Replay;
 
-/// The loose parts of a person's clothes and hair.
+/// Loose parts of a person's clothes and hair.
 pub(crate) struct Cloth {
     pieces: Pieces,
     replay: Replay,
 }
 
 impl Cloth {
-    /// `None` for a person who wears nothing loose.
+    /// Creates the simulation; `None` for a person without loose clothes.
     pub(crate) fn new(person: &Person) -> Option<Self> {
         let colliders = Colliders::fitted(person);
         let pieces = Pieces::new(person, &colliders.at_rest())?;
@@ -36,8 +36,8 @@ impl Cloth {
         Some(Self { pieces, replay })
     }
 
-    /// Moves the skinned surface of an instant to where its loose parts are, and gives the world offset of every vertex
-    /// from its skinned place, metres.
+    /// Moves the skinned surface of an instant to its loose positions and returns the world displacement of every
+    /// vertex from its skinned position, metres.
     pub(crate) fn apply(
         &mut self,
         track: &PoseTrack,
@@ -50,7 +50,7 @@ impl Cloth {
         self.pieces.apply(&offsets, &capsules, positions, normals)
     }
 
-    /// Control particles.
+    /// Returns the number of control particles.
     #[cfg(test)]
     pub(crate) fn particle_count(&self) -> usize {
         self.pieces.particles.particles.points.len()

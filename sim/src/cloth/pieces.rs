@@ -6,24 +6,24 @@ use flyrig_body::SkinWeights;
 use glam::Vec3;
 
 use super::colliders::Capsule;
-use super::solver::{Link, Particle, Particles};
+use super::solver::{Particle, ParticleLink, Particles};
 use crate::noise::smoothstep;
-use crate::person::{Person, SheetRange};
+use crate::person::assembly::{Person, SheetRange};
 
-/// Distance of control particles, metres.
+/// Spacing of control particles, metres.
 const SPACING_M: f32 = 0.030;
-/// What hangs free for less is sewn on, metres.
+/// Free length below which a point is fixed, metres.
 const SEWN_M: f32 = 0.008;
-/// Layers are kept this far apart where they lie on the body, metres.
+/// Distance between layers that lie on the body, metres.
 const KEEP_M: f32 = 0.006;
-/// What hangs around the body goes in no farther than this: not between the legs for good, metres.
+/// Largest inward movement of cloth that hangs around the body, metres, so that it does not stay between the legs.
 const INWARDS_M: f32 = 0.09;
-/// Bending is this much softer than stretching.
+/// Ratio of bending to stretching compliance.
 const BEND_SOFT: f32 = 12.0;
-/// Particles that a vertex follows.
+/// Particles that influence a vertex.
 const FOLLOWED: usize = 10;
 
-/// Particles with what carries them; canonical space.
+/// Particles with their skinning; canonical space.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Rigging {
     pub particles: Particles,
@@ -32,7 +32,7 @@ pub(crate) struct Rigging {
     pub skin: Vec<SkinWeights>,
 }
 
-/// A vertex that follows particles.
+/// Vertex that follows particles.
 #[derive(Debug, Clone, Copy)]
 struct Follower {
     vertex: u32,
@@ -40,7 +40,7 @@ struct Follower {
     weights: [f32; FOLLOWED],
     /// As [`Particle::inside_m`].
     inside_m: Option<f32>,
-    /// 0 keeps the skinned normal, 1 takes the moved surface's.
+    /// Blend from the skinned normal (0) to the moved surface's (1).
     turned: f32,
 }
 
@@ -50,12 +50,12 @@ pub(crate) struct Pieces {
     followers: Vec<Follower>,
     /// Triangles of the loose surfaces.
     triangles: Vec<[u32; 3]>,
-    /// Of every vertex of the person the first of its sheet at the same place.
+    /// Per vertex of the person, the first vertex of its sheet at the same position.
     welded: Vec<u32>,
 }
 
 impl Pieces {
-    /// `None` when nothing is loose.
+    /// Creates the pieces; `None` when nothing is loose.
     pub(crate) fn new(person: &Person, at_rest: &[Capsule]) -> Option<Self> {
         let mut pieces = Self {
             particles: Rigging::default(),
@@ -148,21 +148,25 @@ impl Pieces {
         }
     }
 
-    /// Threads between neighbours, and softer ones over a neighbour in between, which resist bending.
+    /// Links neighbours by threads, and next neighbours by softer ones, which resist bending.
     fn link(&mut self, joined: &[BTreeSet<u32>], offset: u32) {
         let at = |i: u32, of: &Rigging| of.canonical[(i + offset) as usize];
         let mut links = Vec::new();
         for (a, all) in (0u32..).zip(joined) {
             for &b in all.iter().filter(|&&b| b > a) {
                 let rest_m = at(a, &self.particles).distance(at(b, &self.particles));
-                links.push(Link { ends: [a + offset, b + offset], rest_m, soft: 1.0 });
+                links.push(ParticleLink { ends: [a + offset, b + offset], rest_m, soft: 1.0 });
             }
             // Pairs of neighbours on opposite sides.
             for &b in all {
                 for &c in all.iter().filter(|&&c| c > b) {
                     let [p, q, r] = [a, b, c].map(|i| at(i, &self.particles));
                     if (q - p).normalize_or_zero().dot((r - p).normalize_or_zero()) < -0.8 {
-                        links.push(Link { ends: [b + offset, c + offset], rest_m: q.distance(r), soft: BEND_SOFT });
+                        links.push(ParticleLink {
+                            ends: [b + offset, c + offset],
+                            rest_m: q.distance(r),
+                            soft: BEND_SOFT,
+                        });
                     }
                 }
             }
@@ -194,7 +198,7 @@ impl Pieces {
         Follower { vertex, particles, weights, inside_m, turned: smoothstep(SEWN_M, 4.0 * SEWN_M, free_m) }
     }
 
-    /// Offsets without what neighbours do against each other: cloth makes no folds as small as the distance of particles.
+    /// Smooths offsets against alternating neighbours: cloth makes no folds as small as the particle spacing.
     fn smoothed(&self, offsets: &[Vec3]) -> Vec<Vec3> {
         const ROUNDS: usize = 3;
         let Particles { points, links } = &self.particles.particles;
@@ -215,7 +219,7 @@ impl Pieces {
         smooth
     }
 
-    /// Moves the followers; gives every vertex's offset.
+    /// Moves the followers; returns every vertex's displacement.
     pub(crate) fn apply(
         &self,
         offsets: &[Vec3],
@@ -264,8 +268,8 @@ impl Pieces {
     }
 }
 
-/// Particles about [`SPACING_M`] apart on the loose part of a welded mesh and a margin around it: each vertex's cell, and
-/// each cell's vertex.
+/// Samples particles about [`SPACING_M`] apart on the loose part of a welded mesh and a margin around it: each vertex's
+/// cell, and each cell's vertex.
 fn sampled(
     first: u32,
     weld: &[u32],
@@ -287,7 +291,7 @@ fn sampled(
             other.0.total_cmp(&self.0).then(other.1.cmp(&self.1)).then(other.2.cmp(&self.2))
         }
     }
-    /// Vertices within `limit` of sources along edges: distance and source.
+    /// Returns the vertices within `limit` of sources along edges: distance and source.
     fn flood(
         sources: &[(u32, u32)],
         limit: f32,

@@ -1,8 +1,8 @@
-//! The particles at any time, in any order of asking.
+//! Random access to the particles' motion.
 //!
-//! Time (one round of the motion) is cut into windows. Each has a run of its own that starts at rest some time before
-//! it, so that an instant costs at most a window's steps, and what an instant looks like depends on nothing but its
-//! time; from window to window runs are blended. A motion that closes has cloth that closes.
+//! Time (one cycle of the motion) is divided into windows. Each has a run of its own that starts at rest some time
+//! before it, so that an instant costs at most a window's steps and depends on its time alone; runs are blended from
+//! window to window. The cloth of a closed motion is closed.
 
 use std::collections::VecDeque;
 
@@ -12,31 +12,31 @@ use glam::{Mat3, Mat4, Vec3};
 
 use super::colliders::{Capsule, Colliders};
 use super::pieces::Rigging;
-use super::solver::{Carried, STEPS_A_SECOND, State, step};
+use super::solver::{STEPS_A_SECOND, SkinnedParticle, State, step};
 
 const STEP_NANOS: i64 = 1_000_000_000 / STEPS_A_SECOND;
-/// Steps of a window, of the run before it, and of blending with the window before.
+/// Steps of a window, of the lead-in before it, and of blending with the previous window.
 const WINDOW: i64 = 2 * STEPS_A_SECOND;
 const LEAD_IN: i64 = 3 * STEPS_A_SECOND / 2;
 const BLEND: i64 = STEPS_A_SECOND / 4;
-/// Windows kept: a minute of motion, about 100 MB for the loosest clothes.
+/// Cached windows: a minute of motion, about 100 MB for the loosest clothes.
 const KEPT: usize = 30;
 
-/// A run: offsets of all particles from their skinned places at the steps of its window.
+/// Run of a window: offsets of all particles from their skinned positions per step.
 struct Run {
     window: i64,
     state: State,
-    /// Steps done since the start of the lead-in.
+    /// Completed steps since the start of the lead-in.
     done: i64,
     offsets: Vec<Vec<Vec3>>,
 }
 
-/// Computes and keeps runs.
+/// Cache of simulated runs.
 pub(crate) struct Replay {
     skeleton: Skeleton,
     rigging: Rigging,
     colliders: Colliders,
-    /// The newest last.
+    /// Runs, newest last.
     runs: VecDeque<Run>,
 }
 
@@ -45,7 +45,7 @@ impl Replay {
         Self { skeleton, rigging, colliders, runs: VecDeque::new() }
     }
 
-    /// Offsets of the particles from their skinned places at a time of the repeated track, world metres.
+    /// Returns the particles' offsets from their skinned positions at a time of the repeated track, world metres.
     pub(crate) fn at(&mut self, track: &PoseTrack, nanos: i64) -> Vec<Vec3> {
         let (first, last) = track.span_nanos();
         let round = i128::from(last) - i128::from(first);
@@ -75,12 +75,12 @@ impl Replay {
         there.iter().zip(&here).map(|(a, b)| a.lerp(*b, t)).collect()
     }
 
-    /// The body's capsules at a time of the repeated track.
+    /// Returns the body's capsules at a time of the repeated track.
     pub(crate) fn capsules(&self, track: &PoseTrack, nanos: i64) -> Vec<Capsule> {
         self.colliders.placed(&self.skeleton.world_from_canonical(&track.at_repeated(nanos)))
     }
 
-    /// Offsets `since` nanoseconds after a window's start, by the run of that window.
+    /// Returns the offsets `since` nanoseconds after a window's start, from the run of that window.
     fn in_window(&mut self, track: &PoseTrack, window: i64, start: i64, since: i64) -> Vec<Vec3> {
         let place = self.runs.iter().position(|run| run.window == window);
         let run = place.and_then(|place| self.runs.remove(place));
@@ -110,8 +110,8 @@ impl Replay {
         offsets
     }
 
-    /// Skinned places of the particles, and the skinning matrices.
-    fn carried(&self, track: &PoseTrack, nanos: i64) -> (Vec<Carried>, Vec<glam::DMat4>) {
+    /// Returns the skinned positions of the particles, and the skinning matrices.
+    fn carried(&self, track: &PoseTrack, nanos: i64) -> (Vec<SkinnedParticle>, Vec<glam::DMat4>) {
         let matrices = self.skeleton.world_from_canonical(&track.at_repeated(nanos));
         let small: Vec<Mat4> = matrices.iter().map(glam::DMat4::as_mat4).collect();
         let carried = self
@@ -123,7 +123,7 @@ impl Replay {
             .map(|((&position, &normal), skin)| {
                 let blend = blended(&small, skin);
                 let linear = Mat3::from_mat4(blend);
-                Carried {
+                SkinnedParticle {
                     place: blend.transform_point3(position),
                     // Canonical space is y up.
                     up: (linear * Vec3::Y).normalize_or(Vec3::Z),
@@ -135,7 +135,7 @@ impl Replay {
     }
 }
 
-/// As [`flyrig_body::skin_mesh`] blends.
+/// Blends matrices as [`flyrig_body::skin_mesh`] does.
 fn blended(matrices: &[Mat4], skin: &SkinWeights) -> Mat4 {
     let mut sum = Mat4::ZERO;
     for (&joint, &weight) in skin.joints.iter().zip(&skin.weights) {

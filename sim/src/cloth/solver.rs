@@ -6,90 +6,90 @@ use glam::Vec3;
 
 use super::colliders::Capsule;
 
-/// Steps a second.
+/// Steps per second.
 pub(crate) const STEPS_A_SECOND: i64 = 120;
 pub(crate) const STEP_SECS: f32 = 1.0 / STEPS_A_SECOND as f32;
 pub(crate) const GRAVITY: f32 = 9.81;
-/// Rate at which motion against the air dies, 1/s.
+/// Damping rate of motion through air, 1/s.
 const AIR: f32 = 0.9;
-/// Rate at which motion against the wearer dies, 1/s.
+/// Damping rate of motion relative to the wearer, 1/s.
 const RUB: f32 = 1.6;
-/// Inverse stiffness of threads, and of cloth that is pushed together, per unit of mass.
+/// Inverse stiffness of threads, and of compressed cloth, per unit of mass.
 const STRETCH_COMPLIANCE: f32 = 1e-5;
 const PUSH_COMPLIANCE: f32 = 4e-4;
-/// Share of the sliding along the body that friction takes in a step.
+/// Fraction of the sliding along the body that friction removes per step.
 const FRICTION: f32 = 0.25;
-/// Faster against its wearer than this, metres a second, nothing moves.
+/// Largest velocity relative to the wearer, metres per second.
 const FASTEST: f32 = 7.0;
-/// A carrier that moves farther than this in a step is not followed but jumped to, metres.
+/// Movement of a carrier per step above which the particle is moved along rigidly, metres.
 const TELEPORT_M: f32 = 0.25;
-/// Cloth lies this far above the floor, metres.
+/// Height of resting cloth above the floor, metres.
 const FLOOR_M: f32 = 0.004;
 
-/// What does not change from step to step.
+/// Constant properties of the particles.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Particles {
     pub points: Vec<Particle>,
-    pub links: Vec<Link>,
+    pub links: Vec<ParticleLink>,
 }
 
-/// A control particle.
+/// Control particle.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Particle {
-    /// How long it hangs free, metres; 0 for one that is sewn on.
+    /// Free length, metres; 0 for a fixed particle.
     pub free_m: f32,
-    /// Stiffness of what it is made of, 1 for plain cloth.
+    /// Stiffness of its material relative to plain cloth.
     pub stiff: f32,
-    /// How far it may go in against the surface's normal, metres.
+    /// Largest movement against the surface's normal, metres.
     pub backstop_m: f32,
-    /// Whether the body's capsules push it; how deep inside them it may be, as it is at rest, metres.
+    /// Allowed depth inside the body's capsules, as at rest, metres; `None` if they do not push it.
     pub inside_m: Option<f32>,
 }
 
-/// Two particles and their distance at rest, metres; `soft` multiplies the compliance (bending).
+/// Two particles and their rest distance, metres; `soft` multiplies the compliance (bending).
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Link {
+pub(crate) struct ParticleLink {
     pub ends: [u32; 2],
     pub rest_m: f32,
     pub soft: f32,
 }
 
-/// What skinning says about a particle at a step.
+/// Skinned state of a particle at a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Carried {
-    /// Its skinned place.
+pub(crate) struct SkinnedParticle {
+    /// Skinned position.
     pub place: Vec3,
-    /// The direction that was up at rest.
+    /// Direction that was up at rest.
     pub up: Vec3,
-    /// The surface's normal.
+    /// Normal of the surface.
     pub normal: Vec3,
 }
 
-/// What changes from step to step.
+/// Simulated state of the particles.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct State {
     pub places: Vec<Vec3>,
     pub speeds: Vec<Vec3>,
-    /// Skinned places of the step before.
+    /// Skinned positions of the previous step.
     pub carried: Vec<Vec3>,
 }
 
 impl State {
-    /// At rest on the body.
-    pub(crate) fn at_rest(carried: &[Carried]) -> Self {
+    /// Returns the state at rest on the body.
+    pub(crate) fn at_rest(carried: &[SkinnedParticle]) -> Self {
         let places: Vec<Vec3> = carried.iter().map(|c| c.place).collect();
         Self { speeds: vec![Vec3::ZERO; places.len()], carried: places.clone(), places }
     }
 }
 
-/// Squared angular frequency with which a particle swings about its skinned place, 1/s^2: that of a pendulum of its
+/// Returns the squared angular frequency of a particle about its skinned position, 1/s²: that of a pendulum of its
 /// length, as gravity at rest is part of its shape.
 pub(crate) fn pull(particle: &Particle) -> f32 {
     particle.stiff * GRAVITY / particle.free_m.max(1e-3)
 }
 
-/// A step of [`STEP_SECS`].
-pub(crate) fn step(particles: &Particles, carried: &[Carried], capsules: &[Capsule], state: &mut State) {
+/// Advances the particles by [`STEP_SECS`].
+pub(crate) fn step(particles: &Particles, carried: &[SkinnedParticle], capsules: &[Capsule], state: &mut State) {
     const DT: f32 = STEP_SECS;
     let before = state.places.clone();
     for (i, (particle, now)) in particles.points.iter().zip(carried).enumerate() {
@@ -151,8 +151,9 @@ pub(crate) fn step(particles: &Particles, carried: &[Carried], capsules: &[Capsu
     }
 }
 
-/// Distance constraint: Eq. 18 of XPBD with the multiplier started at zero each step; all free particles weigh the same.
-fn hold(particles: &Particles, link: &Link, places: &mut [Vec3]) {
+/// Applies a distance constraint: Eq. 18 of XPBD with the multiplier reset to zero each step; all free particles have
+/// equal mass.
+fn hold(particles: &Particles, link: &ParticleLink, places: &mut [Vec3]) {
     let [a, b] = link.ends.map(|end| end as usize);
     let weight = |i: usize| f32::from(u8::from(particles.points[i].free_m > 0.0));
     let (wa, wb) = (weight(a), weight(b));

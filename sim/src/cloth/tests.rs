@@ -5,14 +5,15 @@ use flyrig_types::PoseTrack;
 use glam::{DQuat, DVec3, Vec3};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
-use super::solver::{Carried, Link, Particle, Particles, State, pull, step};
+use super::solver::{Particle, ParticleLink, Particles, SkinnedParticle, State, pull, step};
 use super::*;
-use crate::actor::{Actor, Shape};
-use crate::look::Look;
-use crate::wardrobe::{Bottom, HairCut};
-use crate::{MotionKind, SimConfig, describe_person};
+use crate::clothes::wardrobe::{Bottom, HairCut};
+use crate::config::{MotionKind, SimConfig};
+use crate::person::actor::{Actor, ActorShape};
+use crate::person::describe::describe_person;
+use crate::person::look::PersonLook;
 
-/// Somebody in a coat, and somebody in a skirt.
+/// Seeds of a person in a coat, and of one in a skirt.
 const COAT: u64 = 16;
 const SKIRT: u64 = 5;
 
@@ -22,11 +23,11 @@ fn actor(seed: u64, kind: MotionKind, speed: f64) -> Actor {
     Actor::new(&config).unwrap()
 }
 
-fn largest(shape: &Shape) -> f32 {
+fn largest(shape: &ActorShape) -> f32 {
     shape.displacement.iter().map(|d| d.length()).fold(0.0, f32::max)
 }
 
-/// Largest displacement over eight seconds.
+/// Returns the largest displacement over eight seconds.
 fn swing(actor: &mut Actor) -> f32 {
     (0..40).map(|i| largest(&actor.shape(1_000_000_000 + i * 200_000_000))).fold(0.0, f32::max)
 }
@@ -38,8 +39,8 @@ fn a_coat_swings_the_more_the_faster_its_wearer_turns_and_rests_when_still() {
     let mut resting = actor(COAT, MotionKind::Still, 1.0);
     let pose = resting.pose(0);
     resting.track = PoseTrack::new(vec![(0, pose.clone()), (8_000_000_000, pose)]).unwrap();
-    let rests: Vec<Shape> = (0..16).map(|i| resting.shape(i * 500_000_000)).collect();
-    let drift = |shape: &Shape| {
+    let rests: Vec<ActorShape> = (0..16).map(|i| resting.shape(i * 500_000_000)).collect();
+    let drift = |shape: &ActorShape| {
         shape.positions.iter().zip(&rests[0].positions).map(|(a, b)| a.distance(*b)).fold(0.0f32, f32::max)
     };
     let still = rests.iter().map(drift).fold(0.0, f32::max);
@@ -65,7 +66,7 @@ fn a_skirt_swings_as_its_wearer_walks_and_dances_and_stays_out_of_the_body() {
     }
 }
 
-/// Share of the skirt's points that are more than 4 mm below the skin of the nearest part of the legs.
+/// Returns the fraction of the skirt's points that are more than 4 mm below the skin of the nearest part of the legs.
 fn share_inside(actor: &mut Actor, nanos: i64) -> f64 {
     let shape = actor.shape(nanos);
     let body = &actor.person.body;
@@ -88,7 +89,7 @@ fn share_inside(actor: &mut Actor, nanos: i64) -> f64 {
 fn the_order_of_asking_does_not_matter_and_nothing_pops() {
     let times: Vec<i64> = (0..12).map(|i| i * 1_234_567_891 % 23_000_000_000 - 3_000_000_000).collect();
     let mut forwards = actor(SKIRT, MotionKind::Turn, 1.3);
-    let shapes: Vec<Shape> = times.iter().map(|&t| forwards.shape(t)).collect();
+    let shapes: Vec<ActorShape> = times.iter().map(|&t| forwards.shape(t)).collect();
     let mut backwards = actor(SKIRT, MotionKind::Turn, 1.3);
     for (i, &t) in times.iter().enumerate().rev() {
         let again = backwards.shape(t);
@@ -138,7 +139,7 @@ fn a_teleporting_wearer_is_followed() {
 #[test]
 fn tight_clothes_cost_nothing() {
     let config = SimConfig::default();
-    let mut look = Look::new(&config);
+    let mut look = PersonLook::new(&config);
     look.cut = HairCut::Crop;
     look.outer = None;
     (look.top.offset_m, look.top.tucked, look.top.sleeve_m) = (0.006, true, 0.465);
@@ -151,8 +152,8 @@ fn tight_clothes_cost_nothing() {
     assert!(Cloth::new(&actor(SKIRT, MotionKind::Still, 1.0).person).unwrap().particle_count() > 100);
 }
 
-/// A chain hanging from its first particle, with something to bump into.
-fn chain(count: usize) -> (Particles, Vec<Carried>) {
+/// Returns a chain hanging from its first particle, with an obstacle.
+fn chain(count: usize) -> (Particles, Vec<SkinnedParticle>) {
     let free = |i: usize| i as f32 * 0.05;
     let points = (0..count)
         .map(|i| Particle {
@@ -162,16 +163,21 @@ fn chain(count: usize) -> (Particles, Vec<Carried>) {
             inside_m: Some(0.001),
         })
         .collect();
-    let link = |a: usize, b: usize, soft| Link { ends: [a as u32, b as u32], rest_m: free(b) - free(a), soft };
+    let link = |a: usize, b: usize, soft| ParticleLink { ends: [a as u32, b as u32], rest_m: free(b) - free(a), soft };
     let links = (1..count).map(|i| link(i - 1, i, 1.0)).chain((2..count).map(|i| link(i - 2, i, 12.0))).collect();
     let carried = (0..count)
-        .map(|i| Carried { place: Vec3::new(0.0, 0.0, 1.0 - free(i)), up: Vec3::Z, normal: Vec3::X })
+        .map(|i| SkinnedParticle { place: Vec3::new(0.0, 0.0, 1.0 - free(i)), up: Vec3::Z, normal: Vec3::X })
         .collect();
     (Particles { points, links }, carried)
 }
 
-/// The same step, written again in f64 from its description.
-fn plain_step(particles: &Particles, carried: &[Carried], capsule: &colliders::Capsule, state: &State) -> Vec<DVec3> {
+/// Performs the step in f64, written independently from its description.
+fn plain_step(
+    particles: &Particles,
+    carried: &[SkinnedParticle],
+    capsule: &colliders::Capsule,
+    state: &State,
+) -> Vec<DVec3> {
     let (dt, gravity) = (1.0 / 120.0, 9.81);
     let d = |v: Vec3| v.as_dvec3();
     let held = |i: usize| particles.points[i].free_m == 0.0;

@@ -7,7 +7,7 @@ use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{SimConfig, Simulator, SurfaceMesh};
 use glam::DVec3;
 
-/// 128 x 128, two cameras, coarse textures.
+/// Returns a configuration of 128 x 128 pixels, two cameras, coarse textures.
 pub fn small_config(seed: u64) -> SimConfig {
     let mut config = SimConfig { seed, width: 128, height: 128, texture_px: 128, ..SimConfig::default() };
     config.cameras.count = 2;
@@ -18,7 +18,7 @@ pub fn simulator(config: &SimConfig) -> Simulator {
     Simulator::new(&GpuContext::new(&AdapterChoice::Best).unwrap(), config).unwrap()
 }
 
-/// Nearest hit of a ray with the surface, f64: distance along the ray and canonical position.
+/// Returns the nearest hit of a ray with the surface, in f64: distance along the ray and canonical position.
 pub fn cast(mesh: &SurfaceMesh, eye: DVec3, ray: DVec3) -> Option<(f64, DVec3)> {
     let mut nearest: Option<(f64, DVec3)> = None;
     for triangle in &mesh.triangles {

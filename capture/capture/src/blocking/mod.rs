@@ -1,5 +1,7 @@
-//! Cameras whose reading waits for ever: each is read in a thread that a watchdog looks after and, if need be, abandons.
+//! Supervision of cameras whose reads may never return: each is read in a thread of its own, which a watchdog abandons
+//! when it hangs. A device that hangs holds at most two threads.
 
+mod camera;
 mod left;
 #[cfg(test)]
 mod tests;
@@ -10,82 +12,51 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_types::{CameraId, Frame, Image, PixelBuffer, PixelFormat};
+use flyrig_types::{CameraId, Frame, Image, PixelBuffer};
 
+pub(crate) use self::camera::{BlockingCamera, DriverImage, Opener};
 use self::worker::{Event, Line};
-use crate::{
-    BufferPool, CameraSource, CaptureError, CaptureErrorKind, PopError, SourceHealth,
-    stamps::{StampSource, Stamps},
-};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::pool::BufferPool;
+use crate::queue::PopError;
+use crate::source::{CameraSource, SourceHealth};
+use crate::stamps::{StampSource, Stamps};
 
-/// A camera that has sent frames is silent after so many periods without one, but not before [`SILENT_AFTER`].
+/// Periods without a frame after which a streaming camera counts as silent, but never less than [`SILENT_AFTER`].
 const SILENT_PERIODS: f64 = 5.0;
 const SILENT_AFTER: Duration = Duration::from_millis(500);
-/// A camera may take so long to be opened, and so long again until its first frame.
+/// Time limit of an opening, and of the first frame after it.
 const FIRST_FRAME: Duration = Duration::from_secs(5);
-/// Threads of one camera that may be left behind in calls that do not return. There is one more at most, which is not left.
+/// Most threads of one camera that are abandoned in calls that do not return; one more may hang without being
+/// abandoned.
 const MOST_ABANDONED: usize = 1;
-/// How long an orderly end waits for the camera to be closed.
+/// Time that an orderly shutdown allows the camera to close.
 const CLOSING: Duration = Duration::from_secs(1);
-/// Free buffers that are kept for frames to come.
+/// Free buffers kept for later frames.
 const POOLED_FRAMES: usize = 16;
 
-/// A camera that is open. It lives and dies in one thread.
-pub(crate) trait BlockingCamera {
-    /// Format, size and rate, for people.
-    fn mode(&self) -> String;
-
-    /// Waits for the next image as long as it takes, and puts its bytes into `bytes`, which are empty.
-    ///
-    /// # Errors
-    /// `Corrupt` costs the image; after every other kind the camera is closed.
-    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<Shot, CaptureError>;
-}
-
-/// What a camera is opened with: once at first and again whenever it was lost, each time in a new thread.
-pub(crate) trait Opener: Send + Sync + 'static {
-    type Camera: BlockingCamera;
-
-    /// Names what is opened, the same at every attempt.
-    fn device(&self) -> String;
-
-    /// Takes as long as it takes.
-    fn open(&self) -> Result<Self::Camera, CaptureError>;
-}
-
-/// An image without its bytes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Shot {
-    pub size: (u32, u32),
-    pub format: PixelFormat,
-    /// When the system says that it was taken.
-    pub stamp_nanos: Option<i64>,
-    /// When the call returned.
-    pub arrival_nanos: i64,
-}
-
-/// What is expected of a camera.
+/// Expected properties of a camera's frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Expected {
     pub size: (u32, u32),
-    /// Frames a second.
+    /// Frames per second.
     pub fps: f64,
-    /// How much later than the truth its stamps are, seconds; taken off.
+    /// Latency of the timestamps, seconds; subtracted from them.
     pub lag_secs: f64,
 }
 
-/// Such a camera as a source.
+/// Frame source over a blocking camera.
 ///
-/// A read or an opening that takes too long is left alone in its thread, which ends as soon as its call returns, and the
-/// camera is opened again in a new one. When that hangs as well it is kept: a camera never has more than two threads in
-/// its driver, however often it fails and is opened again.
+/// A read or an opening that takes too long is abandoned in its thread, which ends as soon as the call returns, and the
+/// camera is opened again in a new thread. If that one hangs too it is kept: a camera never has more than two threads
+/// in its driver, however often it fails and is reopened.
 #[derive(Debug)]
 pub(crate) struct Watched<O: Opener> {
     camera: CameraId,
     expected: Expected,
     opener: Arc<O>,
     session: Option<Session>,
-    /// Threads that were left behind and have not come back yet.
+    /// Abandoned threads that have not returned yet.
     abandoned: Vec<Arc<Line>>,
     stamps: Stamps,
     frames: u64,
@@ -93,19 +64,19 @@ pub(crate) struct Watched<O: Opener> {
     pool: Arc<BufferPool>,
 }
 
-/// From one opening to its end.
+/// State between an opening and its end.
 #[derive(Debug)]
 struct Session {
     line: Arc<Line>,
-    /// When something came last, or when it was started.
+    /// Time of the last event, or of the start.
     heard: Instant,
     is_flowing: bool,
-    /// Whether its first frame is that of a camera that has come back.
+    /// Whether the next frame is the first one after a reconnect.
     is_back: bool,
     was_asked: bool,
-    /// Whether it hangs and may not be left behind.
+    /// Whether the camera hangs and cannot be abandoned.
     is_stuck: bool,
-    /// Frames that newer ones overtook, as counted so far.
+    /// Frames overtaken by newer ones, as counted so far.
     overtaken: u64,
 }
 
@@ -120,7 +91,7 @@ impl Session {
 }
 
 impl<O: Opener> Watched<O> {
-    /// Opens at once, so that errors are reported at the start.
+    /// Opens the camera immediately, so that errors are reported at the start.
     pub fn open(camera: &CameraId, expected: Expected, opener: O) -> Result<Self, CaptureError> {
         let abandoned = left::take(&opener.device());
         let mut watched = Self {
@@ -182,7 +153,7 @@ impl<O: Opener> Watched<O> {
                 return Err(CaptureError::general(CaptureErrorKind::Disconnected, "is not open"));
             };
             if !std::mem::replace(&mut session.was_asked, true) {
-                // What was overtaken before anybody asked is no loss.
+                // Frames overtaken before the first request are no loss.
                 session.overtaken = session.line.events.dropped();
             }
             let left = deadline.saturating_duration_since(Instant::now());
@@ -207,7 +178,7 @@ impl<O: Opener> Watched<O> {
             match event {
                 Event::Opened => {}
                 Event::Damaged(error) => return Err(error),
-                Event::Shot(shot, bytes) => {
+                Event::Image(shot, bytes) => {
                     (session.is_flowing, session.is_stuck) = (true, false);
                     let line = Arc::clone(&session.line);
                     if std::mem::take(&mut session.is_back) {
@@ -220,7 +191,7 @@ impl<O: Opener> Watched<O> {
         }
     }
 
-    fn frame(&mut self, line: &Line, shot: Shot, bytes: PixelBuffer) -> Result<Frame, CaptureError> {
+    fn frame(&mut self, line: &Line, shot: DriverImage, bytes: PixelBuffer) -> Result<Frame, CaptureError> {
         let number = self.frames + self.health.lost_by_driver;
         self.frames += 1;
         let corrupt =
@@ -233,14 +204,14 @@ impl<O: Opener> Watched<O> {
         }
         let image = Image::new(width, height, shot.format, bytes).map_err(|error| corrupt(error.to_string()))?;
         let half_period = (0.5e9 / self.expected.fps.clamp(0.1, 1e6)) as i64;
-        let (stamp, source, told) = match shot.stamp_nanos {
+        let (stamp, source, note) = match shot.stamp_nanos {
             Some(stamp) => (stamp, StampSource::EndOfFrame, ", stamped by the system"),
             None => (0, StampSource::Other, ", stamped at arrival less half a period"),
         };
         let half = if source == StampSource::Other { half_period } else { 0 };
         let capture = self.stamps.capture_nanos(stamp, source, shot.arrival_nanos, half);
         self.health.stamps_replaced = self.stamps.replaced;
-        self.report_mode(line, told);
+        self.report_mode(line, note);
         Ok(Frame {
             camera: self.camera.clone(),
             sequence: number,
@@ -251,7 +222,7 @@ impl<O: Opener> Watched<O> {
         })
     }
 
-    /// The camera says nothing: it is left behind, if that is allowed.
+    /// Handles a silent camera: abandons its thread where that is allowed.
     fn silent(&mut self, silent_after: Duration) -> CaptureError {
         let disconnected = |text: String| CaptureError::general(CaptureErrorKind::Disconnected, text);
         let Some(session) = &mut self.session else { return disconnected("is not open".to_owned()) };
@@ -263,7 +234,7 @@ impl<O: Opener> Watched<O> {
             self.session = None;
             return disconnected(format!("gave no frame for {} ms; opening it again", silent_after.as_millis()));
         }
-        // Asked again after a while, and told again.
+        // The next silence is reported again.
         (session.is_stuck, session.is_flowing, session.heard) = (true, false, Instant::now());
         disconnected(
             "hangs in its driver, and so does the attempt to open it again; no other is made until one of them returns: \
@@ -294,8 +265,8 @@ impl<O: Opener> CameraSource for Watched<O> {
 }
 
 impl<O: Opener> Drop for Watched<O> {
-    /// The camera is closed with its next frame; one that hangs stays in its thread until the process ends, and counts
-    /// when its device is opened again.
+    /// Lets the thread close the camera with its next frame. A thread that hangs lives until the process ends, and
+    /// counts against its device when that is opened again.
     fn drop(&mut self) {
         if let Some(session) = self.session.take() {
             session.line.abandon();

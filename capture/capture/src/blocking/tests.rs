@@ -1,4 +1,4 @@
-//! Cameras that do what real ones do at night.
+//! Blocking cameras that fail, hang and panic by script.
 
 use std::{
     collections::VecDeque,
@@ -8,6 +8,8 @@ use std::{
     },
 };
 
+use flyrig_types::PixelFormat;
+
 use super::*;
 use crate::clock::monotonic_nanos;
 
@@ -15,24 +17,24 @@ const SIZE: (u32, u32) = (4, 2);
 const FPS: f64 = 50.0;
 const MINUTE: Duration = Duration::from_secs(60);
 
-/// What a camera does next.
+/// Next action of a scripted camera.
 #[derive(Debug, Clone, Copy)]
 enum Step {
     Frame,
-    /// A frame of this size.
+    /// Frame of this size.
     Sized(u32, u32),
-    /// A frame with a system's stamp that is so old, nanoseconds.
+    /// Frame with a system timestamp of this age, nanoseconds.
     Stamped(i64),
     Damaged,
     Fails,
     Panics,
-    /// Panics, and once more when it is dropped for that.
+    /// Panics, and again in the drop during unwinding.
     PanicsTwice,
-    /// The call returns when [`Script::release`] is called.
+    /// Blocks until [`Script::release`] is called.
     Hangs,
 }
 
-/// What an opening does, and what the camera does after it.
+/// Outcome of an opening, and the camera's actions after it.
 #[derive(Debug, Clone)]
 enum Open {
     Camera(Vec<Step>),
@@ -44,10 +46,10 @@ enum Open {
 #[derive(Debug, Default)]
 struct Script {
     opens: Mutex<VecDeque<Open>>,
-    /// Calls that hang may return, so many of them.
+    /// Number of hanging calls that may return.
     released: Mutex<usize>,
     changed: std::sync::Condvar,
-    /// Cameras and calls that are open.
+    /// Open cameras and pending calls.
     open: AtomicUsize,
     most_open: AtomicUsize,
     tried: AtomicUsize,
@@ -74,7 +76,7 @@ impl Script {
     }
 }
 
-/// A thread that is inside of the driver.
+/// Guard of a thread inside the driver.
 struct Inside(Arc<Script>);
 
 impl Drop for Inside {
@@ -100,10 +102,10 @@ impl BlockingCamera for Fake {
         "FAKE 4x2 at 50".to_owned()
     }
 
-    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<Shot, CaptureError> {
+    fn read(&mut self, bytes: &mut Vec<u8>) -> Result<DriverImage, CaptureError> {
         assert!(bytes.is_empty());
         let arrival_nanos = monotonic_nanos();
-        let mut shot = Shot { size: SIZE, format: PixelFormat::Yuyv, stamp_nanos: None, arrival_nanos };
+        let mut shot = DriverImage { size: SIZE, format: PixelFormat::Yuyv, stamp_nanos: None, arrival_nanos };
         match self.steps.pop_front().unwrap_or(Step::Hangs) {
             Step::Frame => std::thread::sleep(Duration::from_millis(2)),
             Step::Sized(width, height) => shot.size = (width, height),
@@ -161,7 +163,7 @@ fn frames(steps: usize) -> Vec<Step> {
     vec![Step::Frame; steps]
 }
 
-/// The next that is no timeout.
+/// Returns the next result that is not a timeout.
 fn next(camera: &mut Watched<Arc<Script>>) -> Result<Frame, CaptureError> {
     loop {
         match camera.next_frame(Duration::from_millis(100)) {
@@ -171,7 +173,7 @@ fn next(camera: &mut Watched<Arc<Script>>) -> Result<Frame, CaptureError> {
     }
 }
 
-/// Until the camera has gone this way.
+/// Waits until a condition holds.
 fn until(what: &str, is_so: impl Fn() -> bool) {
     let start = Instant::now();
     while !is_so() {

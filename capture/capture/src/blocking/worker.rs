@@ -1,4 +1,4 @@
-//! The thread that waits inside of a camera's driver.
+//! Thread that blocks inside a camera's driver.
 
 use std::{
     sync::{
@@ -10,41 +10,43 @@ use std::{
 
 use flyrig_types::{CameraId, PixelBuffer, caught, lock};
 
-use super::{BlockingCamera, Opener, Shot};
-use crate::{BufferPool, CaptureError, CaptureErrorKind, LatestQueue};
+use super::camera::{BlockingCamera, DriverImage, Opener};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::pool::BufferPool;
+use crate::queue::LatestQueue;
 
-/// Frames that may wait for the camera's own thread: one to take next, one for jitter.
+/// Queued events between driver thread and camera thread: one to read next, one for jitter.
 const WAITING: usize = 2;
 
-/// What comes out of the thread.
+/// Event from the driver thread.
 #[derive(Debug)]
 pub(super) enum Event {
     /// The camera is open and has a mode.
     Opened,
-    Shot(Shot, PixelBuffer),
-    /// An image is lost.
+    Image(DriverImage, PixelBuffer),
+    /// An image was lost.
     Damaged(CaptureError),
 }
 
-/// What the thread and its watchdog share.
+/// State shared between the driver thread and its watchdog.
 #[derive(Debug)]
 pub(super) struct Line {
-    /// Closed when the thread has ended.
+    /// Queue of events, closed when the thread has ended.
     pub events: LatestQueue<Event>,
-    /// Mode of the open camera, for people.
+    /// Mode of the open camera as text for logs.
     pub mode: OnceLock<String>,
     is_abandoned: AtomicBool,
-    /// Why it has ended.
+    /// Error with which the thread ended.
     end: Mutex<Option<CaptureError>>,
 }
 
 impl Line {
-    /// The thread ends as soon as its call returns.
+    /// Makes the thread end as soon as its current call returns.
     pub fn abandon(&self) {
         self.is_abandoned.store(true, Ordering::Relaxed);
     }
 
-    /// Why the thread has ended.
+    /// Returns the reason why the thread has ended.
     pub fn end(&self) -> CaptureError {
         let end = lock(&self.end).clone();
         end.unwrap_or_else(|| CaptureError::general(CaptureErrorKind::Disconnected, "was closed"))
@@ -54,7 +56,7 @@ impl Line {
 /// Starts a thread that opens the camera and reads it.
 ///
 /// # Errors
-/// `Io` when the system gives no thread.
+/// `Io` when the system cannot start a thread.
 pub(super) fn start<O: Opener>(
     camera: &CameraId,
     opener: &Arc<O>,
@@ -79,7 +81,8 @@ pub(super) fn start<O: Opener>(
     Ok(line)
 }
 
-/// Every call by itself: a camera that is dropped while its own panic unwinds may panic again, which ends the process.
+/// Catches panics of one driver call. Every call is guarded separately: a camera that is dropped while its own panic
+/// unwinds may panic again, which would abort the process.
 fn guarded<T>(call: impl FnOnce() -> Result<T, CaptureError>) -> Result<T, CaptureError> {
     caught(call).unwrap_or_else(|text| {
         let text = format!("its driver library failed inside: {text}; opening it again");
@@ -107,7 +110,7 @@ fn read(camera: &mut impl BlockingCamera, pool: &Arc<BufferPool>, line: &Line) -
         }
         let mut bytes = pool.take();
         event = match guarded(|| camera.read(&mut bytes)) {
-            Ok(shot) => Event::Shot(shot, pool.lease(bytes)),
+            Ok(shot) => Event::Image(shot, pool.lease(bytes)),
             Err(error) if error.kind == CaptureErrorKind::Corrupt => Event::Damaged(error),
             Err(error) => return Err(error),
         };

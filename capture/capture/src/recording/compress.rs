@@ -1,4 +1,4 @@
-//! Uncompressed images made JPEG before they are recorded, in a thread of their own.
+//! JPEG compression of uncompressed images before they are recorded, in a thread per camera.
 
 use std::{
     sync::Arc,
@@ -9,22 +9,25 @@ use std::{
 use flyrig_types::{CameraId, Frame, Image, caught};
 
 use super::outlet::Outlet;
-use crate::{BufferPool, CaptureError, CaptureErrorKind, JpegEncoding, LatestQueue};
+use crate::encoding::JpegEncoding;
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::pool::BufferPool;
+use crate::queue::LatestQueue;
 
-/// Images of a camera that may wait for their compression: a quarter of a second of 30 frames a second.
+/// Images of a camera that may wait for compression: a quarter of a second at 30 frames per second.
 const WAITING: usize = 8;
 
-/// How uncompressed images are recorded.
+/// Compression of uncompressed images in a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Compression {
-    /// Of the JPEG images, 1 to 100 (libjpeg's scale).
+    /// Quality of the JPEG images, 1 to 100 (libjpeg's scale).
     pub quality: u8,
-    /// Rather make the cameras wait than lose a frame: for sources that can wait. Otherwise the oldest waiting frame is
-    /// dropped, and counted, where a machine is too slow.
+    /// Whether to block the cameras instead of losing a frame: for sources that can wait. Otherwise the oldest waiting
+    /// frame is dropped and counted when compression is too slow.
     pub keep_all: bool,
 }
 
-/// One camera's thread.
+/// Compression thread of one camera.
 #[derive(Debug)]
 pub(super) struct Compressor {
     camera: CameraId,
@@ -61,7 +64,7 @@ impl Compressor {
         })
     }
 
-    /// Takes a copy, since the frame goes on to the rig.
+    /// Queues a copy for compression, since the frame itself continues to the rig.
     pub fn record(&self, frame: &Frame) {
         let mut bytes = self.pool.take();
         bytes.extend_from_slice(frame.image.bytes());
@@ -70,7 +73,7 @@ impl Compressor {
         let Frame { sequence, capture_nanos, exposure_nanos, .. } = *frame;
         let copy = Frame { camera: self.camera.clone(), sequence, capture_nanos, exposure_nanos, image, mask: None };
         if self.keep_all {
-            // Closed when the thread has ended, which it has told.
+            // Closed when the thread has ended, which it has logged.
             let _ = self.queue.push_wait(copy);
         } else if let Ok(Some(_)) = self.queue.push(copy) {
             let mut state = self.outlet.shared.lock();
@@ -78,14 +81,14 @@ impl Compressor {
             // The 1st, 2nd, 4th ...: a machine that is too slow all night must not fill the disk.
             if state.dropped.is_power_of_two() {
                 let count = state.dropped;
-                tracing::warn!(count, "camera {}: a frame was not recorded: compressing takes too long", self.camera);
+                tracing::warn!(count, "camera {}: a frame was not recorded: compression is too slow", self.camera);
             }
         }
     }
 }
 
 impl Drop for Compressor {
-    /// Everything that waits is still recorded.
+    /// Records everything that is still queued.
     fn drop(&mut self) {
         self.queue.close();
         if let Some(thread) = self.thread.take() {

@@ -1,4 +1,4 @@
-//! The file system below a recording.
+//! File system of a recording, behind a trait that tests implement.
 
 use std::{
     fs::{File, OpenOptions},
@@ -6,10 +6,10 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// Bytes gathered before a call to the system.
+/// Bytes buffered per write.
 const BUFFER: usize = 1 << 20;
 
-/// Creates the files of a recording and makes them durable.
+/// Storage that creates the files of a recording and makes them durable.
 pub(super) trait Disk: Send + 'static {
     type File: Write + Seek + Send;
 
@@ -22,14 +22,14 @@ pub(super) trait Disk: Send + 'static {
     /// `AlreadyExists` rather than overwrite a file.
     fn create(&mut self, part: u32) -> io::Result<Self::File>;
 
-    /// Makes everything that was written to the newest file durable.
+    /// Makes everything written to the newest file durable.
     fn sync(&mut self) -> io::Result<()>;
 
-    /// Returns the bytes that a process without privileges may still write; `None` where that is unknown.
+    /// Returns the bytes that an unprivileged process may still write; `None` where that is unknown.
     fn free_bytes(&self) -> Option<u64>;
 }
 
-/// A directory of the system.
+/// Directory of the file system.
 #[derive(Debug)]
 pub(super) struct Folder {
     first: PathBuf,
@@ -37,7 +37,7 @@ pub(super) struct Folder {
 }
 
 impl Folder {
-    /// Parts are numbered after the first: `take.mcap`, `take-0001.mcap` ...
+    /// Creates the storage. Parts are numbered after the first: `take.mcap`, `take-0001.mcap` ...
     pub fn new(first: &Path) -> Self {
         Self { first: first.to_owned(), newest: None }
     }
@@ -87,7 +87,7 @@ pub(super) fn part_path(first: &Path, part: u32) -> PathBuf {
     first.with_file_name(name)
 }
 
-/// Some file systems refuse this; the file is written all the same.
+/// Makes a directory entry durable. Some file systems refuse this, which is ignored: the file is written all the same.
 #[cfg(unix)]
 fn sync_directory(directory: &Path) {
     if let Err(error) = File::open(directory).and_then(|directory| directory.sync_all()) {
@@ -95,7 +95,7 @@ fn sync_directory(directory: &Path) {
     }
 }
 
-/// Directories cannot be opened as files here.
+/// Does nothing: directories cannot be opened as files here.
 #[cfg(not(unix))]
 fn sync_directory(_: &Path) {}
 

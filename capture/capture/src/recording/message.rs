@@ -1,4 +1,4 @@
-//! Frames as foxglove messages and back.
+//! Conversion of frames to foxglove messages and back.
 
 use std::collections::BTreeMap;
 
@@ -9,13 +9,14 @@ use foxglove::{
 };
 use prost::bytes::Bytes;
 
-use crate::{CaptureError, CaptureErrorKind, mjpeg};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::mjpeg;
 
-/// Topics of images begin so.
+/// Prefix of the topics of images.
 pub(super) const TOPIC: &str = "camera/";
 const EXPOSURE: &str = "exposure_nanos";
 
-/// Everything about a camera's messages that stays the same from frame to frame.
+/// Properties of a camera's messages that stay the same from frame to frame.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Channel {
     pub topic: String,
@@ -23,7 +24,7 @@ pub(super) struct Channel {
     pub metadata: BTreeMap<String, String>,
 }
 
-/// The words of foxglove for our formats.
+/// Names of the pixel formats in foxglove.
 const ENCODINGS: [(PixelFormat, &str); 11] = [
     (PixelFormat::Rgb8, "rgb8"),
     (PixelFormat::Bgr8, "bgr8"),
@@ -43,7 +44,7 @@ fn schema<M: Encode>() -> (String, String, Vec<u8>) {
 }
 
 impl Channel {
-    /// Of the frames that look like this one.
+    /// Returns the channel for frames with the format of `frame`.
     pub fn of(frame: &Frame) -> Self {
         let exposure = frame.exposure_nanos.map(|nanos| (EXPOSURE.to_owned(), nanos.to_string()));
         Self {
@@ -57,10 +58,10 @@ impl Channel {
     }
 }
 
-/// A frame's payload.
+/// Encodes the payload of a frame.
 ///
 /// # Errors
-/// `Corrupt` when protobuf refuses it.
+/// `Corrupt` when protobuf rejects it.
 pub(super) fn encode(frame: &Frame) -> Result<Vec<u8>, CaptureError> {
     let (image, nanos) = (&frame.image, frame.capture_nanos.max(0));
     let seconds = u32::try_from(nanos / 1_000_000_000).unwrap_or(u32::MAX);
@@ -83,15 +84,15 @@ pub(super) fn encode(frame: &Frame) -> Result<Vec<u8>, CaptureError> {
     Ok(bytes)
 }
 
-/// The exposure that a channel tells.
+/// Returns the exposure in a channel's metadata, nanoseconds.
 pub(super) fn exposure_nanos(metadata: &BTreeMap<String, String>) -> Option<u64> {
     metadata.get(EXPOSURE)?.parse().ok()
 }
 
-/// The image of a message.
+/// Decodes the image of a message.
 ///
 /// # Errors
-/// `Corrupt` for what is no image, `Unsupported` for other kinds of messages and encodings.
+/// `Corrupt` for an invalid image, `Unsupported` for other kinds of messages and encodings.
 pub(super) fn decode(camera: &CameraId, schema: &str, payload: Vec<u8>) -> Result<Image, CaptureError> {
     let corrupt = |text: String| CaptureError::new(camera, CaptureErrorKind::Corrupt, text);
     let payload = Bytes::from(payload);

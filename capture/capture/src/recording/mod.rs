@@ -1,9 +1,10 @@
 //! Recordings: MCAP files of foxglove messages, which other programs open too.
 //!
-//! `camera/<name>` holds foxglove `CompressedImage` (JPEG images as the camera sent them, and what a [`Compression`] made
-//! of others) or `RawImage` (every other format, bytes as they came), protobuf, logged at capture time. A replay gives the
-//! very frames that are in the file. What else a program wants to find (calibrations) stands before the first frame.
-//! A [`Rotation`] divides a long recording into files that are complete each by itself.
+//! `camera/<name>` holds foxglove `CompressedImage` (JPEG images from the camera, or made of others by a
+//! [`Compression`]) or `RawImage` (every other format, unchanged bytes), in protobuf, logged at capture time. A replay
+//! returns exactly the frames in the file. Further data of a program (calibrations) precedes the first frame. A
+//! [`Rotation`] divides a long recording into files that are each complete; files are synced every 2 s and ended before
+//! the disk is full.
 
 mod compress;
 mod disk;

@@ -1,4 +1,4 @@
-//! The way of messages to the writer's thread: bounded, and never waiting for the disk.
+//! Bounded queue of messages to the writer's thread, which never blocks on the disk.
 
 use std::{
     path::PathBuf,
@@ -14,80 +14,80 @@ use flyrig_types::{Frame, lock};
 
 use super::message::{self, Channel};
 
-/// Frames and bytes that may wait for the disk, which stands still while it makes bytes durable.
+/// Frames and bytes that may wait for the disk, which stalls while it makes bytes durable.
 pub(super) const WAITING_FRAMES: usize = 4096;
 const WAITING_BYTES: usize = 512 << 20;
 
-/// Something to find in the file before the first frame, like a calibration.
+/// Message before the first frame of the file, such as a calibration.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Note {
     /// Topic of the message.
     pub topic: String,
     /// Name, encoding and content of the message's schema.
     pub schema: (String, String, Vec<u8>),
-    /// The message, protobuf.
+    /// Payload, protobuf.
     pub payload: Vec<u8>,
 }
 
 /// State of a recording; counts are over all of its files.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Recorded {
-    /// The newest file.
+    /// Newest file.
     pub file: PathBuf,
-    /// Files begun.
+    /// Number of files begun.
     pub files: u32,
     /// Frames in the files.
     pub frames: u64,
-    /// Their bytes in the files.
+    /// Bytes of those frames in the files.
     pub bytes: u64,
-    /// Their bytes as the cameras sent them.
+    /// Bytes of those frames as the cameras sent them.
     pub bytes_sent: u64,
-    /// Frames that were not recorded because compressing them took too long.
+    /// Frames that were not recorded because compression was too slow.
     pub dropped: u64,
-    /// Time since the start; of a recording that has ended, until then.
+    /// Time since the start; the duration of a recording that has ended.
     pub elapsed: Duration,
-    /// Free space of the file system when it was last looked at, bytes; `None` where that is unknown.
+    /// Free space of the file system at the last check, bytes; `None` where that is unknown.
     pub free_bytes: Option<u64>,
-    /// Why it has stopped, if it has. What was written before is readable.
+    /// Reason why the recording stopped by itself, if it did. Everything written before is readable.
     pub problem: Option<String>,
 }
 
-/// A message on its way to the file.
+/// Message on its way to the file.
 #[derive(Debug)]
 pub(super) struct Item {
     pub channel: Arc<Channel>,
     pub nanos: i64,
     pub sequence: u64,
     pub payload: Vec<u8>,
-    /// Bytes of the frame as its camera sent it; none for what is no frame.
+    /// Bytes of the frame as its camera sent it; `None` for other messages.
     pub bytes_sent: Option<usize>,
 }
 
 #[derive(Debug)]
-pub(super) struct Shared {
+pub(super) struct OutletState {
     pub waiting_bytes: AtomicUsize,
     pub state: Mutex<Recorded>,
     pub started: Instant,
-    /// How long it took, once it has ended.
+    /// Duration of the recording, once it has ended.
     pub took: OnceLock<Duration>,
-    /// The file ends with what waits now.
+    /// Whether the file ends with the messages queued now.
     pub is_ending: AtomicBool,
 }
 
-/// A way into the file.
+/// Sender of messages to the file.
 #[derive(Debug, Clone)]
 pub(super) struct Outlet {
-    /// None once the recording has stopped.
+    /// Queue to the writer; `None` once the recording has stopped.
     pub sender: Option<Sender<Item>>,
-    pub shared: Arc<Shared>,
+    pub shared: Arc<OutletState>,
 }
 
-impl Shared {
+impl OutletState {
     pub fn lock(&self) -> MutexGuard<'_, Recorded> {
         lock(&self.state)
     }
 
-    /// Frames that are in the file now.
+    /// Adds frames that are in the file now.
     pub fn add(&self, fresh: &Recorded) {
         let mut state = self.lock();
         state.frames += fresh.frames;
@@ -111,7 +111,7 @@ impl Shared {
 }
 
 impl Outlet {
-    /// Hands a message to the disk's thread, without waiting for it.
+    /// Queues a message without blocking.
     fn send(&mut self, item: Item) {
         let Some(sender) = &self.sender else { return };
         let too_slow = || {
@@ -125,12 +125,12 @@ impl Outlet {
         match sender.try_send(item) {
             Ok(()) => {}
             Err(TrySendError::Full(_)) => too_slow(),
-            // The thread has told why it ended.
+            // The thread has logged why it ended.
             Err(TrySendError::Disconnected(_)) => self.sender = None,
         }
     }
 
-    /// Whether anything is still recorded.
+    /// Returns whether the recording still accepts messages.
     pub fn is_open(&mut self) -> bool {
         if self.sender.is_some() && self.shared.lock().problem.is_some() {
             self.sender = None;
@@ -138,12 +138,12 @@ impl Outlet {
         self.sender.is_some()
     }
 
-    /// Records what is no frame.
+    /// Records a message other than a frame.
     pub fn message(&mut self, channel: &Arc<Channel>, nanos: i64, sequence: u64, payload: Vec<u8>) {
         self.send(Item { channel: Arc::clone(channel), nanos, sequence, payload, bytes_sent: None });
     }
 
-    /// Records an image of a frame, by its channel. `bytes_sent` is its length as the camera sent it.
+    /// Records an image of a frame on its channel. `bytes_sent` is its length as the camera sent it.
     pub fn frame(&mut self, channel: &mut Option<Arc<Channel>>, frame: &Frame, bytes_sent: usize) {
         if !self.is_open() {
             return;

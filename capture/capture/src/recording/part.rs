@@ -1,4 +1,4 @@
-//! One file of a recording while it is written.
+//! File of a recording while it is written.
 
 use std::{collections::BTreeMap, sync::Arc, time::Instant};
 
@@ -10,18 +10,18 @@ use super::{
     outlet::{Item, Note},
 };
 
-/// A message's record and its entry in the index, bytes.
+/// Overhead of a message's record and its index entry, bytes.
 const MESSAGE_BYTES: u64 = 64;
-/// Keys of the channels of a rotated recording: what joins its parts.
+/// Metadata keys of a rotated recording's channels, which link its parts.
 const RECORDING: &str = "recording";
 const PART: &str = "part";
 
-/// Joins the parts of a rotated recording.
+/// Link between the parts of a rotated recording.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Link {
-    /// The same in all parts, and in no other recording.
+    /// Identifier shared by all parts, unique to the recording.
     pub recording: String,
-    /// Counted from 0.
+    /// Number of the part, counted from 0.
     pub part: u32,
 }
 
@@ -36,18 +36,18 @@ impl Link {
     }
 }
 
-/// A file that is complete by itself: notes, schemas and channels stand in each.
-pub(super) struct Part<D: Disk> {
+/// File that is complete by itself, with notes, schemas and channels.
+pub(super) struct RecordingPart<D: Disk> {
     writer: Writer<D::File>,
     link: Option<Link>,
     channels: Vec<(Arc<Channel>, u16)>,
-    /// When the first message came that is no note.
+    /// Time of the first message after the notes.
     begun: Option<Instant>,
-    /// About the length of the file.
+    /// Approximate length of the file.
     bytes: u64,
 }
 
-impl<D: Disk> Part<D> {
+impl<D: Disk> RecordingPart<D> {
     /// Creates the file and writes the notes.
     pub fn create(disk: &mut D, number: u32, notes: &[Note], link: Option<Link>) -> McapResult<Self> {
         let target = disk.create(number)?;
@@ -85,8 +85,8 @@ impl<D: Disk> Part<D> {
         self.writer.write_to_known_channel(header, payload)
     }
 
-    /// Returns the length of the file with another message, bytes, and when its first message came; `None` as long as it
-    /// holds notes alone.
+    /// Returns the length of the file with another message, bytes, and the time of its first message; `None` as long as
+    /// it holds notes only.
     pub fn with(&self, item: &Item) -> Option<(u64, Instant)> {
         self.begun.map(|begun| (self.bytes + item.payload.len() as u64 + MESSAGE_BYTES, begun))
     }
@@ -108,7 +108,7 @@ impl<D: Disk> Part<D> {
         self.put(&header, &item.payload)
     }
 
-    /// Hands everything to the system.
+    /// Writes all buffered bytes to the file system.
     pub fn flush(&mut self) -> McapResult<()> {
         self.writer.flush()
     }

@@ -1,4 +1,4 @@
-//! Messages of a recording, over all of its files.
+//! Reader of a recording's messages over all of its files.
 
 use std::{
     fs::File,
@@ -9,20 +9,20 @@ use std::{
 use mcap::{McapResult, Message, io::MessageReader, sans_io::LinearReaderOptions};
 
 use super::{disk::part_path, part::Link};
-use crate::{CaptureError, CaptureErrorKind};
+use crate::error::{CaptureError, CaptureErrorKind};
 
-/// Bytes read at once.
+/// Bytes per read.
 const BUFFER: usize = 1 << 20;
 
-/// Reads the messages of a file and, when it is the first of a rotated recording, those of the files after it.
+/// Messages of a file and, when it is the first of a rotated recording, of the files after it.
 pub(super) struct Parts {
     first: PathBuf,
     messages: MessageReader<BufReader<File>>,
-    /// The first message of a file that was just opened.
+    /// First message of a newly opened file.
     held: Option<Message<'static>>,
     /// Whether the first message was read.
     has_begun: bool,
-    /// Of the file that is read, if others may follow it.
+    /// Link of the current file, if others may follow it.
     link: Option<Link>,
 }
 
@@ -38,7 +38,7 @@ impl Parts {
     /// Opens the first file.
     ///
     /// # Errors
-    /// `NotFound` without it.
+    /// `NotFound` if the file is missing.
     pub fn open(path: &Path) -> Result<Self, CaptureError> {
         let messages = messages(path).map_err(|error| {
             CaptureError::general(CaptureErrorKind::NotFound, format!("{} cannot be opened: {error}", path.display()))
@@ -46,7 +46,7 @@ impl Parts {
         Ok(Self { first: path.to_owned(), messages, held: None, has_begun: false, link: None })
     }
 
-    /// Goes on to the next file, if it is there and of this recording.
+    /// Continues with the next file; returns false if it is missing or belongs to another recording.
     fn advance(&mut self) -> bool {
         let Some(link) = &mut self.link else { return false };
         let Some(part) = link.part.checked_add(1) else { return false };

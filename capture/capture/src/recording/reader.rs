@@ -1,4 +1,4 @@
-//! Playing a recording.
+//! Replay of recordings.
 
 use std::{
     path::{Path, PathBuf},
@@ -11,29 +11,31 @@ use super::{
     message::{self, TOPIC},
     parts::Parts,
 };
-use crate::{CameraSource, CaptureError, CaptureErrorKind};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::source::CameraSource;
 
-/// Most messages and bytes before the first frame: other people's recordings may have no frame at all.
+/// Most messages and bytes before the first frame: recordings of other programs may have no frame at all.
 const MOST_NOTES: usize = 4096;
 const MOST_NOTE_BYTES: usize = 64 << 20;
 
-/// One camera of a recording. Frames come as they were recorded, in the order of the file; one that breaks off, as after
-/// a crash, ends there with a warning. The first file of a rotated recording ([`crate::Rotation`]) gives the frames of all
-/// its files, up to the first that is missing; any other file gives its own.
+/// Frame source of one camera of a recording. Frames have the order of the file; a truncated file, as after a crash,
+/// ends there with a warning. The first file of a rotated recording ([`crate::Rotation`]) yields the frames of all its
+/// files, up to the first missing one; any other file yields its own.
 pub struct McapReplay {
     camera: CameraId,
     path: PathBuf,
     topic: String,
     messages: Parts,
-    /// Number of the last frame in the file, of 32 bits, and in all.
+    /// Sequence number of the last frame, as 32 bits in the file and extended.
     last: Option<(u32, u64)>,
     is_over: bool,
 }
 
-/// Topic and content of everything before the first frame of a recording. Every file of a rotated one holds them.
+/// Returns topic and content of every message before the first frame of a recording. Every file of a rotated one holds
+/// them.
 ///
 /// # Errors
-/// `NotFound` without the file, `Corrupt` when it is no MCAP file.
+/// `NotFound` if the file is missing, `Corrupt` when it is no MCAP file.
 pub fn recorded_notes(path: &Path) -> Result<Vec<(String, Vec<u8>)>, CaptureError> {
     let (mut notes, mut bytes) = (Vec::new(), 0usize);
     for message in Parts::open(path)? {
@@ -57,11 +59,11 @@ pub fn recorded_notes(path: &Path) -> Result<Vec<(String, Vec<u8>)>, CaptureErro
     Ok(notes)
 }
 
-/// Time, nanoseconds, and content of every message of a topic, in the order of the file, until it breaks off; of a
-/// rotated recording, over all its files.
+/// Returns time, nanoseconds, and content of every message of a topic, in the order of the file, until it is truncated;
+/// of a rotated recording, over all its files.
 ///
 /// # Errors
-/// `NotFound` without the file.
+/// `NotFound` if the file is missing.
 pub fn recorded_messages(path: &Path, topic: &str) -> Result<impl Iterator<Item = (i64, Vec<u8>)>, CaptureError> {
     let topic = topic.to_owned();
     let messages = Parts::open(path)?.map_while(Result::ok).filter(move |message| message.channel.topic == topic);
@@ -71,14 +73,14 @@ pub fn recorded_messages(path: &Path, topic: &str) -> Result<impl Iterator<Item 
 /// Frames of a camera in a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RecordedSpan {
-    /// How many.
+    /// Number of frames.
     pub frames: usize,
     /// Timestamps of the first and the last one, nanoseconds.
     pub nanos: [i64; 2],
 }
 
 impl RecordedSpan {
-    /// Frames a second; None with fewer than two, or where time stands still.
+    /// Returns the mean frame rate, frames per second; `None` with fewer than two frames or without elapsed time.
     #[must_use]
     pub fn fps(&self) -> Option<f64> {
         let nanos = self.nanos[1].saturating_sub(self.nanos[0]);
@@ -86,10 +88,10 @@ impl RecordedSpan {
     }
 }
 
-/// Returns what a recording has of each camera; it is read to its end, images are not decoded.
+/// Returns the span of each camera. Reads the recording to its end without decoding images.
 ///
 /// # Errors
-/// `NotFound` without the file.
+/// `NotFound` if the file is missing.
 pub fn recorded_spans(path: &Path, cameras: &[CameraId]) -> Result<Vec<RecordedSpan>, CaptureError> {
     let topics: Vec<String> = cameras.iter().map(|camera| format!("{TOPIC}{camera}")).collect();
     let mut spans = vec![RecordedSpan::default(); cameras.len()];
@@ -104,10 +106,10 @@ pub fn recorded_spans(path: &Path, cameras: &[CameraId]) -> Result<Vec<RecordedS
 }
 
 impl McapReplay {
-    /// Opens a file for one camera; each camera reads the file by itself.
+    /// Opens a file for one camera; each camera reads the file independently.
     ///
     /// # Errors
-    /// `NotFound` without the file. A camera that is not in it ends at once.
+    /// `NotFound` if the file is missing. A camera that is not in it ends immediately.
     pub fn open(camera: &CameraId, path: &Path) -> Result<Self, CaptureError> {
         Ok(Self {
             camera: camera.clone(),

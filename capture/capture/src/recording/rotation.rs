@@ -1,16 +1,16 @@
-//! When a recording goes on in a new file.
+//! Limits at which a recording continues in a new file.
 
 use std::{fmt, str::FromStr, time::Duration};
 
 use serde::{Deserialize, Serialize};
 
-/// Smaller files would be a few frames each.
+/// Smallest file size, bytes; below it a file would hold a few frames.
 const LEAST_BYTES: f64 = 1e6;
 const LEAST_SECONDS: f64 = 1.0;
 const MOST_BYTES: f64 = 1e18;
 const MOST_SECONDS: f64 = 366.0 * 86_400.0;
 
-/// Bytes of a unit; the first that divides a size is the one it is printed in.
+/// Units of size with their bytes; a size is printed in the first that divides it.
 const SIZES: [(&str, f64); 7] = [
     ("TB", 1e12),
     ("GB", 1e9),
@@ -20,33 +20,44 @@ const SIZES: [(&str, f64); 7] = [
     ("MiB", (1u64 << 20) as f64),
     ("B", 1.0),
 ];
-/// Seconds of a unit.
+/// Units of time with their seconds.
 const TIMES: [(&str, f64); 3] = [("h", 3600.0), ("min", 60.0), ("s", 1.0)];
 
-/// Limits of one file of a recording, which goes on in a new file at whichever is reached first. In settings a string:
+/// Limits of one file of a recording, which continues in a new file when either is reached. In settings a string:
 /// `"off"`, `"4GB"`, `"30min"`, `"4GB 30min"`.
+///
+/// ```
+/// use std::time::Duration;
+///
+/// use flyrig_capture::Rotation;
+///
+/// let rotation: Rotation = "4GB 30min".parse()?;
+/// assert_eq!(rotation.max_bytes, Some(4_000_000_000));
+/// assert_eq!(rotation.max_time, Some(Duration::from_secs(1800)));
+/// # Ok::<(), flyrig_capture::RotationError>(())
+/// ```
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct Rotation {
-    /// Bytes of a file without its index, which adds about a thousandth. One message fits in any case.
+    /// Bytes of a file without its index, which adds about a thousandth. A single message always fits.
     pub max_bytes: Option<u64>,
     /// Time from a file's first message to the first one of the next file.
     pub max_time: Option<Duration>,
 }
 
-/// A string that is no [`Rotation`].
+/// Error of a string that is no [`Rotation`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}; expected a size such as \"4GB\", a time such as \"30min\", both (\"4GB 30min\"), or \"off\"")]
 pub struct RotationError(String);
 
 impl Rotation {
-    /// Whether there is any limit.
+    /// Returns whether there is any limit.
     #[must_use]
     pub fn is_on(&self) -> bool {
         self.max_bytes.is_some() || self.max_time.is_some()
     }
 
-    /// Whether a file that would grow to so many bytes and is so old has to end before that.
+    /// Returns whether a file of this age has to end before it grows to this size.
     pub(super) fn is_due(&self, bytes: u64, age: Duration) -> bool {
         self.max_bytes.is_some_and(|most| bytes > most) || self.max_time.is_some_and(|most| age >= most)
     }
@@ -103,7 +114,7 @@ fn split(text: &str, at: impl Fn(char) -> bool) -> (&str, &str) {
     text.split_at(text.find(at).unwrap_or(text.len()))
 }
 
-/// Prints a number in the first unit of which it is a multiple, else in the last.
+/// Formats a number in the first unit of which it is a multiple, otherwise in the last.
 fn in_unit(number: f64, units: &[(&str, f64)]) -> String {
     let whole = units.iter().find(|(_, factor)| number >= *factor && number % factor < 0.5);
     let (name, factor) = whole.or(units.last()).copied().unwrap_or(("", 1.0));

@@ -1,4 +1,4 @@
-//! Recordings of many files, on disks that fill up.
+//! Recordings of many files, also on full disks.
 
 use std::{
     fs,
@@ -14,7 +14,8 @@ use super::{
     recorded_messages, recorded_notes,
     tests::{Script, frame, note, pass, replayed, same},
 };
-use crate::{CameraSource, CaptureErrorKind};
+use crate::error::CaptureErrorKind;
+use crate::source::CameraSource;
 
 const MINUTE: Duration = Duration::from_secs(60);
 
@@ -22,7 +23,7 @@ fn rotating(max_bytes: Option<u64>, max_time: Option<Duration>) -> RecorderConfi
     RecorderConfig { rotation: Rotation { max_bytes, max_time }, reserve_bytes: 0, ..RecorderConfig::default() }
 }
 
-/// Two cameras in turn.
+/// Records two alternating cameras.
 fn record(path: &Path, frames: u64, config: &RecorderConfig) -> Recorded {
     let recorder = Recorder::create_with(path, &[note()], config).unwrap();
     let mut taps = ["a", "b"].map(|name| recorder.tap(Script(name.into(), 0, frames)).unwrap());
@@ -163,11 +164,11 @@ fn sequence_numbers_of_a_camera_that_was_opened_anew_go_on() {
     assert_eq!(found, [0, 2, 4, 5, 7, 9]);
 }
 
-/// Files in memory that count what is durable.
+/// Files in memory that count the durable bytes.
 #[derive(Debug, Default)]
 struct Files {
     files: Vec<Vec<u8>>,
-    /// By file, bytes that were there at the last sync.
+    /// Per file, bytes at the last sync.
     durable: Vec<usize>,
     syncs: usize,
     free: Option<u64>,
@@ -232,7 +233,7 @@ impl Write for MemoryFile {
     }
 }
 
-/// Nothing is ever written but at the end.
+/// Accepts seeks to the end only.
 impl Seek for MemoryFile {
     fn seek(&mut self, _: SeekFrom) -> io::Result<u64> {
         Ok(self.0.lock().unwrap().files[self.1].len() as u64)

@@ -1,4 +1,4 @@
-//! What is recorded as it passes: a camera's frames, and messages of other kinds.
+//! Recording of passing data: a camera's frames, and messages of other kinds.
 
 use std::{collections::BTreeMap, sync::Arc, time::Duration};
 
@@ -9,9 +9,10 @@ use super::{
     message::Channel,
     outlet::Outlet,
 };
-use crate::{CameraSource, CaptureError, SourceHealth};
+use crate::error::CaptureError;
+use crate::source::{CameraSource, SourceHealth};
 
-/// Makes sources record, wherever they are opened: cheap to clone, and it does not keep the recording from ending.
+/// Attaches a recording to sources, wherever they are opened. Cheap to clone; does not keep the recording from ending.
 #[derive(Debug, Clone)]
 pub struct SourceTap {
     pub(super) outlet: Outlet,
@@ -19,17 +20,17 @@ pub struct SourceTap {
 }
 
 impl SourceTap {
-    /// Records what a source gives, on its way.
+    /// Records the frames of a source as they pass.
     ///
     /// # Errors
-    /// `Io` when the system gives no thread for the compression.
+    /// `Io` when the system cannot start a thread for the compression.
     pub fn tap<S: CameraSource>(&self, source: S) -> Result<Recording<S>, CaptureError> {
         Recording::new(source, self.outlet.clone(), self.compression)
     }
 }
 
-/// A source whose frames are recorded as they pass: JPEG images as they came, others compressed where the recorder was
-/// told so. The frames themselves go on as they are.
+/// Source whose frames are recorded as they pass: JPEG images unchanged, others compressed where the recorder is
+/// configured so. The frames themselves pass unchanged.
 #[derive(Debug)]
 pub struct Recording<S> {
     source: S,
@@ -82,7 +83,7 @@ impl<S: CameraSource> CameraSource for Recording<S> {
     }
 }
 
-/// A channel of other messages than frames, like poses. What comes after the recording's end is lost.
+/// Channel of messages other than frames, such as poses. Messages after the recording's end are lost.
 #[derive(Debug)]
 pub struct MessageTap {
     outlet: Outlet,
@@ -96,8 +97,8 @@ impl MessageTap {
         Self { outlet, channel: Arc::new(channel), sequence: 0 }
     }
 
-    /// Records a message (protobuf) of an instant, nanoseconds on the clock of the frames. It never waits; once the recording
-    /// has stopped, nothing happens.
+    /// Records a message (protobuf) of an instant, nanoseconds on the clock of the frames. Never blocks; has no effect
+    /// once the recording has stopped.
     pub fn record(&mut self, nanos: i64, payload: Vec<u8>) {
         if self.outlet.is_open() {
             self.outlet.message(&self.channel, nanos, self.sequence, payload);

@@ -1,4 +1,4 @@
-//! What is recorded comes back, whatever ends the recording.
+//! Recorded frames come back, however the recording ends.
 
 use std::{
     fs,
@@ -10,7 +10,9 @@ use std::{
 use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
 use super::{Compression, McapReplay, Note, Recorder, RecorderConfig, disk::Disk, recorded_notes};
-use crate::{CameraSource, CaptureError, CaptureErrorKind, to_rgb8};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::rgb::to_rgb8;
+use crate::source::CameraSource;
 
 pub(super) struct Script(pub CameraId, pub u64, pub u64);
 
@@ -22,7 +24,7 @@ fn jpeg() -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// Frame `n` of a camera: raw images of camera "a", JPEG images of every other.
+/// Returns frame `n` of a camera: raw images for camera "a", JPEG images for every other.
 pub(super) fn frame(camera: &CameraId, n: u64) -> Frame {
     let image = if camera.as_str() == "a" {
         Image::new(4, 2, PixelFormat::Yuyv, vec![n as u8; 16])
@@ -137,7 +139,7 @@ fn a_file_is_never_written_over() {
     assert_eq!(fs::read(&path).unwrap(), b"precious");
 }
 
-/// As a killed process leaves it: cut anywhere, a prefix of the frames comes back, at most a chunk is lost.
+/// Truncates anywhere, as a killed process does: a prefix of the frames comes back, at most a chunk is lost.
 #[test]
 fn every_cut_of_a_recording_gives_the_frames_before_it() {
     let folder = tempfile::tempdir().unwrap();
@@ -169,7 +171,7 @@ fn every_cut_of_a_recording_gives_the_frames_before_it() {
     assert_eq!(recorder.finish().frames, 40);
 }
 
-/// A disk with so much room, and a file on it.
+/// Disk with this much room, and a file on it.
 struct SmallDisk(usize);
 struct Small(Cursor<Vec<u8>>, usize);
 
@@ -236,7 +238,7 @@ fn a_full_disk_stops_the_recording_and_not_the_cameras() {
     assert!(told || problem.contains("slower than the cameras"), "{problem}");
 }
 
-/// A length of eight bytes that says more than there is memory ended the process once.
+/// Corrupts a length of eight bytes to more than the available memory, which aborted the process once.
 #[test]
 fn a_damaged_length_ends_the_recording_and_nothing_else() {
     let folder = tempfile::tempdir().unwrap();
@@ -262,7 +264,7 @@ fn what_is_no_recording_is_refused() {
     assert!(replayed(&path, "a").is_empty());
 }
 
-/// Gives images that were made before.
+/// Source of prepared images.
 struct Pictures(CameraId, std::vec::IntoIter<Image>, u64);
 
 impl Pictures {
@@ -285,7 +287,7 @@ impl CameraSource for Pictures {
     }
 }
 
-/// Ramps in brightness and colour.
+/// Returns an image with ramps in brightness and colour.
 fn yuyv(width: u32, height: u32, n: u32) -> Image {
     let pixel = |x: u32, y: u32| [(16 + (x * 3 + n) % 200) as u8, (64 + (y + x % 2 * 64) % 128) as u8];
     let bytes = (0..height).flat_map(|y| (0..width).flat_map(move |x| pixel(x, y))).collect::<Vec<u8>>();

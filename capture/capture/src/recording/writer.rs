@@ -1,4 +1,4 @@
-//! Writing a recording beside a running rig.
+//! Writer of recordings, in a thread beside a running rig.
 
 use std::{
     io,
@@ -18,18 +18,18 @@ use mcap::{McapError, McapResult};
 use super::{
     compress::Compression,
     disk::{Disk, Folder},
-    outlet::{Item, Note, Outlet, Recorded, Shared, WAITING_FRAMES},
-    part::{Link, Part},
+    outlet::{Item, Note, Outlet, OutletState, Recorded, WAITING_FRAMES},
+    part::{Link, RecordingPart},
     rotation::Rotation,
     tap::{MessageTap, Recording, SourceTap},
 };
-use crate::{CameraSource, CaptureError, CaptureErrorKind};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::source::CameraSource;
 
-/// Free space that a recording leaves on its file system by default, bytes: room for its index, and for
-/// whatever else the machine writes.
+/// Free space that a recording leaves on its file system by default, bytes: room for its index and for other programs.
 pub const RESERVE_BYTES: u64 = 1 << 30;
 
-/// A chunk ends after so many bytes or so long: what a killed process loses at most.
+/// Size and duration at which a chunk ends: the most that a killed process loses.
 const CHUNK_BYTES: u64 = 8 << 20;
 const CHUNK_TIME: Duration = Duration::from_millis(500);
 /// Interval between syncs to the disk: the most that a power cut loses, besides a chunk.
@@ -38,11 +38,11 @@ const SYNC_TIME: Duration = Duration::from_secs(2);
 /// Settings of a [`Recorder`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RecorderConfig {
-    /// Without it every image is recorded as it came.
+    /// Compression of uncompressed images; without it every image is recorded unchanged.
     pub compression: Option<Compression>,
-    /// When a new file is begun.
+    /// Limits at which a new file begins.
     pub rotation: Rotation,
-    /// Free space that is left on the file system, bytes: without it no recording starts, and a running one stops there.
+    /// Free space that is left on the file system, bytes: without it no recording starts, and a running one stops.
     pub reserve_bytes: u64,
 }
 
@@ -52,8 +52,9 @@ impl Default for RecorderConfig {
     }
 }
 
-/// Writes frames to a file in a thread of its own. It never drops a frame silently: when the disk is full, gone or too
-/// slow, the recording stops and says so, and the rig goes on; what could not be compressed in time is counted.
+/// Recorder of frames to a file, in a thread of its own. It never drops a frame silently: when the disk is full, gone
+/// or too slow, the recording stops with a message and the rig continues; frames that could not be compressed in time
+/// are counted.
 #[derive(Debug)]
 pub struct Recorder {
     outlet: Outlet,
@@ -70,11 +71,11 @@ impl Recorder {
         Self::create_with(path, notes, &RecorderConfig { compression, ..RecorderConfig::default() })
     }
 
-    /// Creates a file, which must not exist yet, and writes the notes into it. With a [`Rotation`] it goes on in
-    /// `take-0001.mcap`, `take-0002.mcap` ... beside `take.mcap`, each of them complete by itself.
+    /// Creates a file, which must not exist yet, and writes the notes into it. With a [`Rotation`] it continues in
+    /// `take-0001.mcap`, `take-0002.mcap` ... beside `take.mcap`, each complete by itself.
     ///
     /// # Errors
-    /// `Io` names what the system refused, a file that is in the way, or the space that is missing.
+    /// `Io` names the system's error, an existing file, or the missing space.
     pub fn create_with(path: &Path, notes: &[Note], config: &RecorderConfig) -> Result<Self, CaptureError> {
         let io = |error: &dyn std::fmt::Display| {
             CaptureError::general(CaptureErrorKind::Io, format!("{} cannot be recorded to: {error}", path.display()))
@@ -94,9 +95,9 @@ impl Recorder {
             return Err(McapError::Io(io::Error::new(io::ErrorKind::StorageFull, shortage)));
         }
         let link = config.rotation.is_on().then(|| Link { recording: new_id(), part: 0 });
-        let part = Part::create(&mut disk, 0, notes, link.clone())?;
+        let part = RecordingPart::create(&mut disk, 0, notes, link.clone())?;
         let (sender, receiver) = bounded(WAITING_FRAMES);
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(OutletState {
             waiting_bytes: AtomicUsize::new(0),
             state: Mutex::new(Recorded { free_bytes, ..Recorded::default() }),
             started: Instant::now(),
@@ -134,7 +135,7 @@ impl Recorder {
         Ok(Self { outlet, compression: config.compression, thread: Some(thread.map_err(McapError::Io)?) })
     }
 
-    /// Returns the state as of now.
+    /// Returns the current state.
     #[must_use]
     pub fn state(&self) -> Recorded {
         let shared = &self.outlet.shared;
@@ -142,28 +143,29 @@ impl Recorder {
         Recorded { elapsed, ..shared.lock().clone() }
     }
 
-    /// Returns a way to record sources that are opened elsewhere or later.
+    /// Returns a tap to record sources that are opened elsewhere or later.
     #[must_use]
     pub fn source_tap(&self) -> SourceTap {
         SourceTap { outlet: self.outlet.clone(), compression: self.compression }
     }
 
-    /// Records what a source gives, on its way.
+    /// Records the frames of a source as they pass.
     ///
     /// # Errors
-    /// `Io` when the system gives no thread for the compression.
+    /// `Io` when the system cannot start a thread for the compression.
     pub fn tap<S: CameraSource>(&self, source: S) -> Result<Recording<S>, CaptureError> {
         self.source_tap().tap(source)
     }
 
-    /// Records messages of one kind beside the frames: topic, and name, encoding and content of their schema.
+    /// Creates a channel for messages of one kind beside the frames: topic, and name, encoding and content of their
+    /// schema.
     #[must_use]
     pub fn messages(&self, topic: &str, schema: (String, String, Vec<u8>)) -> MessageTap {
         MessageTap::new(self.outlet.clone(), topic, schema)
     }
 
-    /// Waits until everything is on the disk and closes the file with its index. What a [`Recording`] or [`MessageTap`] gives
-    /// after that is not recorded.
+    /// Waits until everything is on the disk and closes the file with its index. Later frames and messages of a
+    /// [`Recording`] or [`MessageTap`] are not recorded.
     #[must_use]
     pub fn finish(mut self) -> Recorded {
         self.end();
@@ -182,13 +184,13 @@ impl Recorder {
 }
 
 impl Drop for Recorder {
-    /// A rig that ends with an error leaves a whole file too.
+    /// Completes the file of a rig that ends with an error.
     fn drop(&mut self) {
         self.end();
     }
 }
 
-/// The library's own text says nothing of what the system said.
+/// Extracts the system's error, which the text of the mcap crate omits.
 fn cause(error: McapError) -> String {
     match error {
         McapError::Io(error) => error.to_string(),
@@ -196,7 +198,7 @@ fn cause(error: McapError) -> String {
     }
 }
 
-/// Describes what is missing when less than the reserve is free.
+/// Describes the missing space when less than the reserve is free.
 fn shortage(free_bytes: Option<u64>, reserve_bytes: u64) -> Option<String> {
     let free_bytes = free_bytes.filter(|free| *free < reserve_bytes)?;
     let mb = |bytes: u64| bytes / 1_000_000;
@@ -207,22 +209,22 @@ fn shortage(free_bytes: Option<u64>, reserve_bytes: u64) -> Option<String> {
     ))
 }
 
-/// Returns a name that no other recording of this machine has.
+/// Returns an identifier that is unique among the recordings of this machine.
 fn new_id() -> String {
     let time = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     format!("{:x}-{:x}", time.as_nanos(), std::process::id())
 }
 
-/// The recorder's thread.
+/// State of the recorder's thread.
 struct Writing<D: Disk> {
     disk: D,
     notes: Vec<Note>,
     rotation: Rotation,
     reserve_bytes: u64,
-    /// Of the current part.
+    /// Link of the current part.
     link: Option<Link>,
-    shared: Arc<Shared>,
-    /// Frames of the chunk in memory: they count once they are in the file.
+    shared: Arc<OutletState>,
+    /// Frames of the chunk in memory, which count once they are in the file.
     fresh: Recorded,
     /// Bytes of that chunk.
     unflushed: u64,
@@ -233,7 +235,7 @@ struct Writing<D: Disk> {
 }
 
 impl<D: Disk> Writing<D> {
-    fn run(&mut self, mut part: Part<D>, items: &Receiver<Item>) -> McapResult<()> {
+    fn run(&mut self, mut part: RecordingPart<D>, items: &Receiver<Item>) -> McapResult<()> {
         loop {
             match items.recv_timeout(CHUNK_TIME) {
                 Ok(item) => {
@@ -288,7 +290,7 @@ impl<D: Disk> Writing<D> {
         (self.flushed, self.unflushed) = (Instant::now(), 0);
     }
 
-    /// Whether the reserve is still free; stops the recording where it is not.
+    /// Returns whether the reserve is still free; stops the recording otherwise.
     fn has_space(&self) -> bool {
         let free_bytes = self.disk.free_bytes();
         self.shared.lock().free_bytes = free_bytes;
@@ -300,15 +302,15 @@ impl<D: Disk> Writing<D> {
         has_space
     }
 
-    fn finish(&mut self, part: Part<D>) -> McapResult<()> {
+    fn finish(&mut self, part: RecordingPart<D>) -> McapResult<()> {
         part.finish(&mut self.disk)?;
         self.now_in_file();
         (self.is_dirty, self.synced) = (false, Instant::now());
         Ok(())
     }
 
-    /// Begins the next file; none when there is no space for it.
-    fn next(&mut self) -> McapResult<Option<Part<D>>> {
+    /// Begins the next file; `None` when there is no space for it.
+    fn next(&mut self) -> McapResult<Option<RecordingPart<D>>> {
         if !self.has_space() {
             return Ok(None);
         }
@@ -318,13 +320,15 @@ impl<D: Disk> Writing<D> {
         }
         let path = self.disk.path(number);
         let part =
-            Part::create(&mut self.disk, number, &self.notes, self.link.clone()).map_err(|error| match error {
-                McapError::Io(error) => {
-                    let text = format!("{} cannot be created: {error}", path.display());
-                    McapError::Io(io::Error::new(error.kind(), text))
-                }
-                other => other,
-            })?;
+            RecordingPart::create(&mut self.disk, number, &self.notes, self.link.clone()).map_err(
+                |error| match error {
+                    McapError::Io(error) => {
+                        let text = format!("{} cannot be created: {error}", path.display());
+                        McapError::Io(io::Error::new(error.kind(), text))
+                    }
+                    other => other,
+                },
+            )?;
         self.shared.begin_file(path);
         Ok(Some(part))
     }

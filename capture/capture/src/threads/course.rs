@@ -1,27 +1,27 @@
-//! State that is kept while a camera's source is opened again.
+//! Counts and sequence numbers that persist while a camera's source is reopened.
 
 use flyrig_types::Frame;
 
-use crate::{NetworkHealth, SourceHealth};
+use crate::source::{NetworkHealth, SourceHealth};
 
-/// Goes on with numbers and counts that a new source begins at 0.
+/// Continuation of sequence numbers and counts across sources, each of which starts at 0.
 #[derive(Debug, Default)]
 pub(super) struct Course {
-    /// Counts of the sources before.
+    /// Totals of the previous sources.
     before: Option<SourceHealth>,
-    /// After the last frame's.
+    /// Sequence number after the last frame.
     next_sequence: u64,
-    /// Added to the numbers of the current source; `None` before its first frame.
+    /// Offset of the current source's numbers; `None` before its first frame.
     offset: Option<u64>,
 }
 
 impl Course {
-    /// The next source follows the one with these counts.
+    /// Begins the next source after one with these counts.
     pub fn restart(&mut self, health: SourceHealth) {
         (self.before, self.offset) = (Some(health), None);
     }
 
-    /// Numbers a frame after those of the sources before.
+    /// Renumbers a frame to follow those of the previous sources.
     pub fn number(&mut self, frame: &mut Frame) {
         let next = self.next_sequence;
         let offset = *self.offset.get_or_insert_with(|| match self.before {
@@ -32,7 +32,7 @@ impl Course {
         self.next_sequence = frame.sequence.saturating_add(1);
     }
 
-    /// Adds the counts of the sources before.
+    /// Adds the totals of the previous sources.
     pub fn health(&self, now: SourceHealth) -> SourceHealth {
         let Some(before) = &self.before else { return now };
         SourceHealth {

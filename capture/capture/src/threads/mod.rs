@@ -1,4 +1,4 @@
-//! One thread a camera, all into one queue.
+//! Threads of the cameras, one per camera, all into one queue.
 
 mod course;
 mod opener;
@@ -21,44 +21,45 @@ pub use self::stats::{CameraStats, Pacing, ThreadsConfig};
 use self::{
     opener::{How, Opening},
     pulse::Pulse,
-    shared::{Pulses, Shared, Supply, lock},
+    shared::{Pulses, Supply, ThreadsState, lock},
 };
-use crate::{
-    CameraSource, CaptureError, CaptureErrorKind, FrameStage, LatestQueue, SourceHealth,
-    stage::{Hand, Stage, StageMaker},
-    turns::Turns,
-};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::queue::LatestQueue;
+use crate::source::{CameraSource, SourceHealth};
+use crate::stage::{FrameStage, Hand, Stage, StageMaker};
+use crate::turns::Turns;
 
-/// Dropping waits so long for threads inside of somebody else's code before it leaves them behind.
+/// Time that dropping allows threads inside foreign code before it abandons them.
 const CLOSING: Duration = Duration::from_secs(15);
-/// How often it looks.
+/// Polling interval of that wait.
 const LOOK: Duration = Duration::from_millis(2);
 
-/// Reads every source in a thread of its own, named after its camera, into one queue.
+/// Threads that read every source, each named after its camera, into one queue.
 ///
-/// A thread goes on after errors that may pass, with growing pauses while a camera is gone. A source that fails for good or
-/// panics (`Disconnected`) ends that camera alone; where it came from a [`SourceOpener`] with a function, it is opened again:
-/// five times at once, then once a minute. The queue closes when all threads have ended. Dropping this stops the threads
-/// and waits for them; one that does not come out of a source's or a stage's call within 15 seconds is left behind.
+/// A thread continues after recoverable errors, with growing pauses while a camera is gone. A source that fails for
+/// good or panics (`Disconnected`) ends that camera only; if it came from a [`SourceOpener`] with a function, it is
+/// reopened: five times immediately, then once per minute. The queue closes when all threads have ended. Dropping stops
+/// the threads and waits for them; a thread that does not return from a source's or stage's call within 15 seconds is
+/// abandoned.
 ///
-/// With a [`FrameStage`] each camera has a second thread for it, so that a slow or damaged image holds up neither the
-/// driver's buffers nor another camera.
+/// With a [`FrameStage`] each camera has a second thread, so that a slow or damaged image blocks neither the driver's
+/// buffers nor another camera.
 #[derive(Debug)]
 pub struct CaptureThreads {
-    shared: Arc<Shared>,
+    shared: Arc<ThreadsState>,
     threads: Vec<JoinHandle<()>>,
 }
 
 impl CaptureThreads {
-    /// Starts the threads.
+    /// Starts a thread for each source.
     ///
     /// # Errors
-    /// `Unsupported` when two sources have one name, `Io` when the system gives no thread.
+    /// `Unsupported` when two sources have the same name, `Io` when the system cannot start a thread.
     pub fn start(sources: Vec<Box<dyn CameraSource>>, config: ThreadsConfig) -> Result<Self, CaptureError> {
         Self::start_all(sources.into_iter().map(SourceOpener::ready).collect(), Vec::new(), config)
     }
 
-    /// The same, with a stage behind every source; each runs in a thread of its own.
+    /// Starts as [`Self::start`], with a stage behind every source, each in a thread of its own.
     ///
     /// # Errors
     /// As [`Self::start`].
@@ -71,19 +72,19 @@ impl CaptureThreads {
         Self::start_all(sources.into_iter().map(SourceOpener::ready).collect(), stages, config)
     }
 
-    /// Starts the threads before the cameras are open. Each is opened in a thread of its own (`open NAME`), again with pauses
-    /// of up to 5 s as long as that fails, and joins when it comes; meanwhile its [`CameraStats`] hold the last error.
+    /// Starts the threads before the cameras are open. Each camera is opened in a thread of its own (`open NAME`),
+    /// retried with pauses of up to 5 s, and joins once it is open; until then its [`CameraStats`] hold the last error.
     ///
-    /// Only live cameras are waited for: with another pacing than [`Pacing::AsDelivered`] all sources are opened first, one
-    /// after the other, and none is opened again, since a recording would begin again.
+    /// Only live cameras are awaited: with any pacing but [`Pacing::AsDelivered`] all sources are opened first, one
+    /// after the other, and none is reopened, since a recording would start over.
     ///
     /// # Errors
-    /// As [`Self::start`]; and, where the sources are opened first, the first error of these.
+    /// As [`Self::start`]; where the sources are opened first, also the first of their errors.
     pub fn start_opening(openers: Vec<SourceOpener>, config: ThreadsConfig) -> Result<Self, CaptureError> {
         Self::start_all(openers, Vec::new(), config)
     }
 
-    /// The same, with a stage behind every source; one that panics is made again.
+    /// Starts as [`Self::start_opening`], with a stage behind every source; a stage that panics is created anew.
     ///
     /// # Errors
     /// As [`Self::start_opening`].
@@ -125,7 +126,7 @@ impl CaptureThreads {
             opened: false,
             running: true,
         };
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(ThreadsState {
             queue: Arc::new(LatestQueue::new(config.queue_capacity)),
             hands: stages.iter().map(|_| Hand::new()).collect(),
             pacing: config.pacing,
@@ -172,28 +173,28 @@ impl CaptureThreads {
         Ok(())
     }
 
-    /// Where the frames are; closed and empty after the last one.
+    /// Returns the queue of frames; closed and empty after the last one.
     #[must_use]
     pub fn queue(&self) -> &Arc<LatestQueue<Frame>> {
         &self.shared.queue
     }
 
-    /// A copy of the counts, in the order of the sources.
+    /// Returns a copy of the counts, in the order of the sources.
     #[must_use]
     pub fn stats(&self) -> Vec<CameraStats> {
         lock(&self.shared.stats).clone()
     }
 
-    /// Returns the threads that work now, by name (`camera NAME`, `stage NAME`, `open NAME`), and the time since each began
-    /// its last turn. A turn is a call of a source, a stage or an opener; threads that have ended, or wait for whoever
-    /// takes the frames without loss, are left out.
+    /// Returns the busy threads by name (`camera NAME`, `stage NAME`, `open NAME`), with the time since each began its
+    /// last turn. A turn is one call of a source, a stage or an opener. Threads that have ended, or wait for a lossless
+    /// reader, are omitted.
     #[must_use]
     pub fn activity(&self) -> Vec<(String, Duration)> {
         self.quiet().map(|(pulse, quiet)| (pulse.name().to_owned(), quiet)).collect()
     }
 
-    /// Returns the names of threads that made no turn for longer than this. A healthy camera's and stage's thread makes
-    /// several a second, also while the camera is gone; opening may take seconds.
+    /// Returns the names of threads whose last turn began longer ago than this. The threads of a healthy camera and
+    /// stage take several turns per second, also while the camera is gone; opening may take seconds.
     #[must_use]
     pub fn stuck(&self, longer_than: Duration) -> Vec<String> {
         let stuck = self.quiet().filter(|(_, quiet)| *quiet > longer_than);

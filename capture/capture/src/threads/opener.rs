@@ -1,4 +1,4 @@
-//! Opening a camera where nobody waits for it.
+//! Opening of cameras in threads of their own, so that a missing camera delays nothing.
 
 use std::{fmt, sync::Arc, thread::Builder};
 
@@ -6,12 +6,14 @@ use crossbeam::channel::{Receiver, Sender, bounded};
 use flyrig_types::{CameraId, caught};
 
 use super::pulse::Pulse;
-use crate::{CameraSource, CaptureError, CaptureErrorKind, SourceTap};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::recording::SourceTap;
+use crate::source::CameraSource;
 
 type Source = Box<dyn CameraSource>;
 type Open = Box<dyn FnMut() -> Result<Source, CaptureError> + Send>;
 
-/// A camera that may not be there yet: opens its source, again whenever it was lost.
+/// Camera that may be missing at the start: opens its source, and reopens it after a loss.
 pub struct SourceOpener {
     pub(super) camera: CameraId,
     pub(super) how: How,
@@ -23,19 +25,19 @@ pub(super) enum How {
 }
 
 impl SourceOpener {
-    /// Opens the camera with a function, which may take long, fail and panic. It has to give a source of this camera.
+    /// Creates an opener from a function, which may block, fail and panic. It must return a source of this camera.
     #[must_use]
     pub fn new(camera: &CameraId, open: impl FnMut() -> Result<Source, CaptureError> + Send + 'static) -> Self {
         Self { camera: camera.clone(), how: How::Factory(Box::new(open)) }
     }
 
-    /// Gives a source that is open already. When it fails for good its camera ends.
+    /// Wraps a source that is open already. Its camera ends when it fails for good.
     #[must_use]
     pub fn ready(source: Source) -> Self {
         Self { camera: source.camera().clone(), how: How::Ready(source) }
     }
 
-    /// Records what the camera gives, whenever it is opened.
+    /// Records the camera's frames across reopenings.
     ///
     /// # Errors
     /// As [`SourceTap::tap`], for a source that is open already.
@@ -54,7 +56,7 @@ impl SourceOpener {
         &self.camera
     }
 
-    /// Opens the source, waiting for it.
+    /// Opens the source in the calling thread.
     pub(super) fn open_now(self) -> Result<Source, CaptureError> {
         match self.how {
             How::Ready(source) => Ok(source),
@@ -83,7 +85,7 @@ fn call(camera: &CameraId, open: &mut Open) -> Result<Source, CaptureError> {
     Err(CaptureError::new(camera, CaptureErrorKind::Unsupported, message))
 }
 
-/// A thread that opens one camera as often as it is asked to. It ends after the call in which its owner has gone.
+/// Thread that opens one camera on request. It ends after the call during which its owner was dropped.
 #[derive(Debug)]
 pub(super) struct Opening {
     pub requests: Sender<()>,
@@ -94,7 +96,7 @@ impl Opening {
     /// Starts the thread.
     ///
     /// # Errors
-    /// `Io` when the system gives no thread.
+    /// `Io` when the system cannot start a thread.
     pub fn start(camera: &CameraId, mut open: Open, pulse: Arc<Pulse>) -> Result<Self, CaptureError> {
         let (requests, to_do) = bounded(1);
         let (done, results) = bounded(1);

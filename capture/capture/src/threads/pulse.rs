@@ -1,14 +1,14 @@
-//! Signs of life of threads.
+//! Heartbeats of threads.
 
 use std::{
     sync::atomic::{AtomicU64, Ordering},
     time::{Duration, Instant},
 };
 
-/// In place of a time: nothing is expected of the thread.
+/// Value in place of a time while no heartbeat is expected.
 const RESTING: u64 = u64::MAX;
 
-/// When one thread has made its last turn.
+/// Heartbeat of one thread.
 #[derive(Debug)]
 pub(crate) struct Pulse {
     name: String,
@@ -18,7 +18,7 @@ pub(crate) struct Pulse {
 }
 
 impl Pulse {
-    /// Of a thread that rests until its first turn.
+    /// Creates the heartbeat of a thread that rests until its first turn.
     pub fn new(name: String) -> Self {
         Self { name, epoch: Instant::now(), at: AtomicU64::new(RESTING) }
     }
@@ -27,13 +27,13 @@ impl Pulse {
         &self.name
     }
 
-    /// Begins a turn.
+    /// Marks the begin of a turn.
     pub fn beat(&self) {
         let nanos = u64::try_from(self.epoch.elapsed().as_nanos()).unwrap_or(RESTING - 1);
         self.at.store(nanos, Ordering::Relaxed);
     }
 
-    /// The thread has ended, or waits for somebody who may take any time.
+    /// Marks that the thread has ended, or waits for a reader that may take any time.
     pub fn rest(&self) {
         self.at.store(RESTING, Ordering::Relaxed);
     }

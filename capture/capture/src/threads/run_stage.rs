@@ -1,17 +1,19 @@
-//! The body of a stage's thread.
+//! Main loop of a stage's thread.
 
 use std::time::Duration;
 
 use flyrig_types::caught;
 
-use super::shared::Shared;
-use crate::{CaptureError, CaptureErrorKind, PopError, stage::Stage};
+use super::shared::ThreadsState;
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::queue::PopError;
+use crate::stage::Stage;
 
-/// A stage without frames shows that it lives so often.
+/// Interval of the heartbeats of an idle stage.
 const TURN: Duration = Duration::from_millis(500);
 
-impl Shared {
-    /// The body of a stage's thread.
+impl ThreadsState {
+    /// Runs a stage until its camera ends.
     pub(crate) fn run_stage(&self, slot: usize, mut stage: Stage) {
         let Some(hand) = self.hand(slot) else { return };
         let (camera, pulse) = (self.camera(slot), &self.pulses(slot).stage);

@@ -1,4 +1,4 @@
-//! State shared by the threads of a rig, and the body of a camera's thread.
+//! State shared by the threads of a rig, and the main loop of a camera's thread.
 
 use std::{
     sync::{Arc, Condvar, Mutex},
@@ -14,32 +14,36 @@ use super::{
     pulse::Pulse,
     stats::{CameraStats, Pacing},
 };
-use crate::{CameraSource, CaptureError, CaptureErrorKind, LatestQueue, stage::Hand, turns::Turns};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::queue::LatestQueue;
+use crate::source::CameraSource;
+use crate::stage::Hand;
+use crate::turns::Turns;
 pub(super) use flyrig_types::lock;
 
-/// How long a source may wait for a frame before its thread looks whether it shall stop.
+/// Timeout of a source's call, after which its thread checks for a stop request.
 const POLL: Duration = Duration::from_millis(200);
-/// Pauses before a camera that is gone is asked again: doubling from the first to the last.
+/// Pauses before a lost camera is tried again, doubling from the first to the last.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LAST_PAUSE: Duration = Duration::from_secs(2);
-/// The last pause before a camera that could not be opened is tried again.
+/// Longest pause between attempts to open a camera.
 const LAST_OPEN_PAUSE: Duration = Duration::from_secs(5);
-/// An opening that takes longer is reported, and once more whenever it has taken so long again.
+/// Duration of an opening after which it is reported, and reported again at each multiple.
 const OPENING: Duration = Duration::from_secs(5);
-/// A thread that waits for something of ours shows itself so often.
+/// Interval of the heartbeats of a waiting thread.
 const TURN: Duration = Duration::from_millis(500);
-/// Errors in a row after which a source that fails at once is slowed, lest it takes a core.
+/// Consecutive errors after which a source that fails instantly is throttled, so that it does not occupy a core.
 const PATIENCE: u32 = 1000;
 
 #[derive(Debug)]
-pub(crate) struct Shared {
+pub(crate) struct ThreadsState {
     pub(super) queue: Arc<LatestQueue<Frame>>,
-    /// By slot, between a camera's thread and its stage's; empty without stages.
+    /// Per slot: hand-over between a camera's thread and its stage; empty without stages.
     pub(super) hands: Vec<Hand>,
     pub(super) pacing: Pacing,
     pub(super) turns: Turns,
     pub(super) stats: Mutex<Vec<CameraStats>>,
-    /// By slot.
+    /// Per slot: heartbeats.
     pub(super) pulses: Vec<Pulses>,
     /// Wall time and capture time of the first frame of all, for pacing.
     pub(super) origin: Mutex<Option<(Instant, i64)>>,
@@ -47,7 +51,7 @@ pub(crate) struct Shared {
     pub(super) stop: Condvar,
 }
 
-/// Of the threads of one camera.
+/// Heartbeats of the threads of one camera.
 #[derive(Debug)]
 pub(crate) struct Pulses {
     pub camera: Arc<Pulse>,
@@ -62,24 +66,24 @@ impl Pulses {
     }
 }
 
-/// Where a camera's thread has its sources from.
+/// Origin of a camera's sources.
 pub(super) enum Supply {
-    /// One source, until it fails for good.
+    /// Single source, until it fails for good.
     Once(Option<Box<dyn CameraSource>>),
-    /// As many as it takes.
+    /// Sources from an opener, reopened as needed.
     Again(Opening),
 }
 
-/// Why a source is not read any more.
+/// Reason why a source is no longer read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum End {
-    /// There are no more frames, or nobody wants them.
+    /// There are no more frames, or the queue is closed.
     Over,
     Failed,
 }
 
-impl Shared {
-    /// The hand-over to a camera's stage.
+impl ThreadsState {
+    /// Returns the hand-over to a camera's stage.
     pub(crate) fn hand(&self, slot: usize) -> Option<&Hand> {
         self.hands.get(slot)
     }
@@ -88,7 +92,7 @@ impl Shared {
         &self.pulses[slot]
     }
 
-    /// The body of a camera's thread.
+    /// Runs a camera's thread until its camera ends.
     pub(super) fn run(&self, slot: usize, mut supply: Supply) {
         let (mut course, mut restarts) = (Course::default(), Restarts::default());
         loop {
@@ -127,7 +131,7 @@ impl Shared {
         }
     }
 
-    /// Opens a camera, as often as it takes. `None` when it has ended, or everything has.
+    /// Opens a camera, retrying as needed. `None` when the camera or the whole rig has ended.
     fn open(&self, slot: usize, opening: &Opening) -> Option<Box<dyn CameraSource>> {
         let mut pause = FIRST_PAUSE;
         while !self.is_stopped() {
@@ -148,8 +152,8 @@ impl Shared {
         None
     }
 
-    /// Waits for the camera's opener, but not through a stop. One that hangs is reported and waited for: a second call would
-    /// hang as well.
+    /// Waits for the camera's opener, but not past a stop request. An opening that hangs is reported and awaited: a
+    /// second call would hang as well.
     fn opened(&self, slot: usize, opening: &Opening) -> Option<Result<Box<dyn CameraSource>, CaptureError>> {
         let mut late = Instant::now() + OPENING;
         loop {
@@ -171,7 +175,7 @@ impl Shared {
         }
     }
 
-    /// The last frame of a camera is delivered.
+    /// Marks a camera as ended after its last frame.
     pub(crate) fn end(&self, slot: usize) {
         self.turns.end(slot);
         let mut stats = lock(&self.stats);
@@ -255,7 +259,7 @@ impl Shared {
         End::Over
     }
 
-    /// To the camera's stage; whether to go on.
+    /// Passes a frame to the camera's stage; returns whether to continue.
     fn hand_over(&self, slot: usize, hand: &Hand, frame: Frame, order_nanos: i64) -> bool {
         if self.pacing == Pacing::Lossless {
             // Whoever takes the frames may take any time.
@@ -269,7 +273,7 @@ impl Shared {
         true
     }
 
-    /// Whether to go on. The pulse is that of the calling thread.
+    /// Puts a frame into the queue; returns whether to continue. The pulse is that of the calling thread.
     pub(crate) fn deliver(&self, slot: usize, pulse: &Pulse, frame: Frame, order_nanos: i64) -> bool {
         if self.pacing == Pacing::Lossless {
             pulse.rest();
@@ -291,7 +295,7 @@ impl Shared {
         true
     }
 
-    /// Sleeps until a frame is due; the first frame of all is due at once, earlier ones too.
+    /// Sleeps until a frame is due; the first frame of all is due immediately, as are earlier ones.
     fn pace(&self, slot: usize, nanos: i64) {
         let (start, first) = *lock(&self.origin).get_or_insert_with(|| (Instant::now(), nanos));
         if nanos > first
@@ -301,7 +305,7 @@ impl Shared {
         }
     }
 
-    /// Lets a camera's thread sleep, but not through a stop.
+    /// Sleeps in a camera's thread, but not past a stop request.
     fn sleep_until(&self, slot: usize, due: Instant) {
         let mut stopped = lock(&self.stopped);
         while !*stopped {

@@ -4,25 +4,26 @@ use std::collections::BTreeMap;
 
 use flyrig_types::CameraId;
 
-use crate::{CaptureError, CaptureErrorKind, SourceHealth};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::source::SourceHealth;
 
-/// When frames go into the queue, and what happens when it is full.
+/// Timing of frames into the queue, and behaviour when it is full.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Pacing {
-    /// As the sources give them; the oldest is dropped. For live cameras.
+    /// As the sources yield them; the oldest is dropped. For live cameras.
     #[default]
     AsDelivered,
     /// At the pace of their capture times; the oldest is dropped. For a recording played as live.
     RealTime,
-    /// As fast as they are taken out, nothing is dropped, and in the order of capture over all
-    /// cameras, so that every run is the same. For evaluation.
+    /// As fast as they are consumed, without drops, in the order of capture over all cameras, so that every run is
+    /// identical. For evaluation.
     Lossless,
 }
 
 /// Settings of [`crate::CaptureThreads`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ThreadsConfig {
-    /// Frames of all cameras together that wait in the queue.
+    /// Queue capacity, frames of all cameras together.
     pub queue_capacity: usize,
     /// See [`Pacing`].
     pub pacing: Pacing,
@@ -34,28 +35,28 @@ impl Default for ThreadsConfig {
     }
 }
 
-/// Counts of one camera's thread.
+/// Counts of one camera's threads.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CameraStats {
-    /// Which camera.
+    /// Name of the camera.
     pub camera: CameraId,
     /// Frames put into the queue.
     pub frames: u64,
-    /// Frames of this camera that were dropped out of the full queue.
+    /// Frames of this camera dropped from the full queue.
     pub dropped: u64,
-    /// Frames that newer ones overtook before the camera's stage (see [`crate::FrameStage`]) came to them.
+    /// Frames overtaken by newer ones before the camera's stage (see [`crate::FrameStage`]) processed them.
     pub overtaken: u64,
-    /// Errors by kind; the end of a recording is none.
+    /// Errors by kind; the end of a recording does not count.
     pub errors: BTreeMap<CaptureErrorKind, u64>,
-    /// The error that came last.
+    /// Most recent error.
     pub last_error: Option<CaptureError>,
-    /// Health as the source reports it; counts are over all sources of the camera.
+    /// Health as the source reports it, summed over all sources of the camera.
     pub health: SourceHealth,
-    /// Times that the camera was opened anew because its source had failed for good or panicked.
+    /// Number of times that the camera was reopened because its source had failed for good or panicked.
     pub restarts: u64,
-    /// Times that its stage was made anew because it had panicked.
+    /// Number of times that its stage was created anew after a panic.
     pub stage_restarts: u64,
-    /// Whether the camera has a source now. Without one it is being opened, or, when not `running`, has ended.
+    /// Whether the camera has a source now. Without one it is being opened or, when not `running`, has ended.
     pub opened: bool,
     /// Whether the thread still reads.
     pub running: bool,

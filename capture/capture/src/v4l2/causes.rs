@@ -1,11 +1,11 @@
-//! Why a camera does not work, in words that say what to do.
+//! Translation of system errors to causes and fixes.
 
 use std::{fs, io, path::Path};
 
 use super::identity;
-use crate::{CaptureError, CaptureErrorKind};
+use crate::error::{CaptureError, CaptureErrorKind};
 
-/// A stream that broke.
+/// Builds the error of a stream that broke.
 pub(crate) fn lost(error: &io::Error) -> CaptureError {
     let text = match error.raw_os_error() {
         Some(libc::ENODEV | libc::ENXIO) => {
@@ -17,7 +17,7 @@ pub(crate) fn lost(error: &io::Error) -> CaptureError {
     CaptureError::general(CaptureErrorKind::Disconnected, text)
 }
 
-/// Why a camera cannot be set up, with the fix.
+/// Explains why a camera cannot be set up, with the fix.
 pub(crate) fn explain(error: &io::Error, what: &str, node: &Path) -> CaptureError {
     let place = node.display();
     match error.raw_os_error() {
@@ -36,7 +36,7 @@ pub(crate) fn explain(error: &io::Error, what: &str, node: &Path) -> CaptureErro
     }
 }
 
-/// Other processes that have a node open, as far as this user may see them.
+/// Lists other processes that have a node open, as far as this user may see them.
 fn holders(node: &Path) -> Vec<String> {
     let own = std::process::id();
     let numbers = fs::read_dir("/proc").into_iter().flatten().flatten();

@@ -1,4 +1,4 @@
-//! Exposure, gain, white balance and focus: set, read back, and said aloud when the camera has its own mind.
+//! Exposure, gain, white balance and focus: set, read back, and reported where the camera deviates.
 
 use std::io;
 
@@ -9,23 +9,23 @@ use v4l::v4l_sys::{
 };
 
 use super::sys::ControlRange;
-use crate::CameraControls;
+use crate::camera_options::CameraControls;
 
 /// Unit of `V4L2_CID_EXPOSURE_ABSOLUTE`.
 const EXPOSURE_UNIT_NANOS: i64 = 100_000;
 const EXPOSURE_MANUAL: i32 = 1;
 
-/// The calls for controls; a map stands in for them in tests.
+/// Control calls of a device; tests use a map instead.
 pub(crate) trait ControlDevice {
     fn range(&self, id: u32) -> io::Result<Option<ControlRange>>;
     fn get(&self, id: u32) -> io::Result<i32>;
     fn set(&mut self, id: u32, value: i32) -> io::Result<()>;
 }
 
-/// Why a control is not as asked.
+/// Reason why a control was not applied.
 #[derive(Debug)]
 pub(crate) enum ControlError {
-    /// The configuration asks for what the camera has not.
+    /// The camera lacks the requested value.
     Refused(String),
     /// The device failed.
     Io(io::Error),
@@ -37,8 +37,8 @@ impl From<io::Error> for ControlError {
     }
 }
 
-/// Sets what is asked for. Gives the exposure in force, nanoseconds, where it is fixed and known, and warnings about
-/// values that read back otherwise.
+/// Applies the requested controls. Returns the exposure in effect, nanoseconds, where it is fixed and known, and
+/// warnings about values that read back differently.
 pub(crate) fn apply(
     controls: &CameraControls,
     device: &mut impl ControlDevice,
@@ -99,7 +99,7 @@ pub(crate) mod tests {
 
     use super::*;
 
-    /// Controls by id: range, value, and how far the camera's value is off what was set.
+    /// Controls by id: range, value, and offset of the value read back from the value set.
     #[derive(Debug, Default, Clone)]
     pub(crate) struct FakeControls(pub BTreeMap<u32, (i32, i32, i32)>);
 
@@ -147,7 +147,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_reads_back_otherwise_is_told() {
+    fn a_value_that_reads_back_differently_is_reported() {
         let controls = CameraControls { exposure_secs: Some(0.0083), ..CameraControls::default() };
         let (exposure, warnings) = apply(&controls, &mut webcam()).unwrap();
         assert_eq!(exposure, Some(8_000_000));

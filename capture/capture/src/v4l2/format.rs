@@ -1,16 +1,16 @@
-//! Pixel formats of drivers, and rows without their padding.
+//! Pixel formats of drivers, and removal of row padding.
 
 use flyrig_types::PixelFormat;
 
 use super::sys::ActiveFormat;
-use crate::FormatChoice;
+use crate::camera_options::FormatChoice;
 
 impl FormatChoice {
-    /// Every choice but [`Self::Auto`], in the order in which that takes them.
+    /// Every choice but [`Self::Auto`], in the order of preference of [`Self::Auto`].
     pub(crate) const ORDER: [Self; 7] =
         [Self::Yuyv, Self::Uyvy, Self::Nv12, Self::Rgb24, Self::Mjpeg, Self::Bayer8, Self::Grey];
 
-    /// Codes that mean it, best first.
+    /// Returns the FourCCs of the format, best first.
     pub(crate) fn fourccs(self) -> &'static [[u8; 4]] {
         const CODES: [&[[u8; 4]]; 7] = [
             &[*b"YUYV"],
@@ -24,12 +24,12 @@ impl FormatChoice {
         Self::ORDER.iter().position(|&choice| choice == self).map_or(&[], |place| CODES[place])
     }
 
-    /// The choice that a driver's code belongs to.
+    /// Returns the choice that a FourCC belongs to.
     pub(crate) fn of_fourcc(fourcc: [u8; 4]) -> Option<Self> {
         Self::ORDER.into_iter().find(|choice| choice.fourccs().contains(&fourcc))
     }
 
-    /// Bytes of an image on the bus. A JPEG image is reckoned at 0.3 bytes a pixel.
+    /// Returns the bytes of an image on the bus. A JPEG image is estimated at 0.3 bytes per pixel.
     pub(crate) fn bytes_per_frame(self, width: u32, height: u32) -> u64 {
         let pixels = u64::from(width) * u64::from(height);
         match self {
@@ -42,7 +42,7 @@ impl FormatChoice {
     }
 }
 
-/// The layout of the pixels of a driver's code.
+/// Returns the pixel layout of a FourCC.
 pub(crate) fn pixel_format(fourcc: [u8; 4]) -> Option<PixelFormat> {
     Some(match &fourcc {
         b"YUYV" => PixelFormat::Yuyv,
@@ -60,15 +60,15 @@ pub(crate) fn pixel_format(fourcc: [u8; 4]) -> Option<PixelFormat> {
     })
 }
 
-/// A code as text, for messages.
+/// Formats a FourCC for messages.
 pub(crate) fn fourcc_text(fourcc: [u8; 4]) -> String {
     String::from_utf8_lossy(&fourcc).trim_end().to_owned()
 }
 
-/// Copies the pixels of a frame out of a driver's planes into `out`, rows one after the other without padding.
+/// Copies the pixels of a frame out of a driver's planes into `out`, rows without padding.
 ///
 /// # Errors
-/// A text that says what is missing.
+/// Text that says what is missing.
 pub(crate) fn pack<'a>(
     active: &ActiveFormat,
     plane: impl Fn(usize) -> &'a [u8],
@@ -105,7 +105,7 @@ pub(crate) fn pack<'a>(
     Ok(format)
 }
 
-/// Takes `row` bytes every `stride` bytes, `count` times.
+/// Appends `count` rows of `row` bytes, `stride` bytes apart.
 fn rows(bytes: &[u8], stride: usize, row: usize, count: usize, out: &mut Vec<u8>) -> Result<(), String> {
     let needed = stride * count.saturating_sub(1) + row;
     if bytes.len() < needed {

@@ -1,4 +1,4 @@
-//! Which device node is which camera: by what survives replugging, never by the number of the node.
+//! Identification of cameras by properties that survive replugging, never by the number of the node.
 
 use std::{
     fs, io,
@@ -6,39 +6,40 @@ use std::{
 };
 
 use super::sys::{Capability, Device};
-use crate::{CameraIdentity, CaptureError, CaptureErrorKind};
+use crate::camera_options::CameraIdentity;
+use crate::error::{CaptureError, CaptureErrorKind};
 
-/// The USB device behind a node.
+/// USB device behind a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct UsbPlace {
     /// Number of the root hub: cameras with the same number share its bandwidth.
     pub bus: u32,
-    /// Ports from the root hub to the device, like `1-3.2`.
+    /// Ports from the root hub to the device, such as `1-3.2`.
     pub port: String,
-    /// Megabits a second of the link: 480 is USB 2, 5000 and more USB 3.
+    /// Link speed, megabits per second: 480 is USB 2, 5000 and more USB 3.
     pub speed_mbit: u32,
-    /// Vendor and product number, like `046d:082d`.
+    /// Vendor and product number, such as `046d:082d`.
     pub id: String,
 }
 
-/// A device node of the video4linux class, as the system's files describe it; nothing is opened.
+/// Device node of the video4linux class, as described in sysfs; nothing is opened.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CameraNode {
-    /// Path of the node. Its number changes from plug to plug.
+    /// Path of the node. Its number may change with every replug.
     pub node: PathBuf,
-    /// Name that the driver gives.
+    /// Name from the driver.
     pub name: String,
-    /// Which node of its device this is: 0 is the first; others are often metadata.
+    /// Index of the node within its device: 0 is the first; others are often metadata.
     pub index: u32,
     /// Serial number of the USB device, where it has one.
     pub serial: Option<String>,
-    /// Its link in `/dev/v4l/by-path`, where udev made one.
+    /// Link in `/dev/v4l/by-path`, where udev made one.
     pub by_path: Option<String>,
-    /// Where it is plugged in, for USB cameras.
+    /// USB device, for USB cameras.
     pub usb: Option<UsbPlace>,
 }
 
-/// Where the system describes its devices; another folder in tests.
+/// Folders where the system describes its devices; others in tests.
 #[derive(Debug, Clone)]
 pub(crate) struct Roots {
     pub sys: PathBuf,
@@ -51,7 +52,7 @@ impl Default for Roots {
     }
 }
 
-/// Every node there is, in the order of their numbers; none without a camera driver.
+/// Lists all nodes in the order of their numbers; empty without a camera driver.
 pub(crate) fn scan(roots: &Roots) -> Vec<CameraNode> {
     let Ok(entries) = fs::read_dir(roots.sys.join("class/video4linux")) else { return Vec::new() };
     let number = |name: &str| name.strip_prefix("video")?.parse::<u32>().ok();
@@ -75,7 +76,7 @@ fn number(path: &Path) -> Option<u32> {
     line(path)?.parse().ok()
 }
 
-/// Name of a link and of the node that it leads to.
+/// Lists links in `by-path` with the nodes that they point to.
 fn by_path_links(dev: &Path) -> Vec<(String, String)> {
     let Ok(entries) = fs::read_dir(dev.join("v4l/by-path")) else { return Vec::new() };
     let mut links: Vec<(String, String)> = entries
@@ -109,7 +110,7 @@ fn describe(roots: &Roots, name: &str, links: &[(String, String)]) -> CameraNode
         usb: usb_device.map(|usb| UsbPlace {
             bus: number(&usb.join("busnum")).unwrap_or(0),
             port: usb.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
-            // Low speed is told as 1.5.
+            // Low speed is reported as 1.5.
             speed_mbit: line(&usb.join("speed"))
                 .and_then(|text| text.parse::<f64>().ok())
                 .map_or(0, |speed| speed as u32),
@@ -119,7 +120,7 @@ fn describe(roots: &Roots, name: &str, links: &[(String, String)]) -> CameraNode
 }
 
 impl CameraNode {
-    /// Everything that the camera can be named by.
+    /// Lists all identities of the camera.
     #[must_use]
     pub fn names(&self, bus_info: Option<&str>) -> String {
         let mut names = Vec::new();
@@ -133,19 +134,19 @@ impl CameraNode {
     }
 }
 
-/// What a node says when it is opened.
+/// Query of an opened node's capabilities.
 pub(crate) type Probe<'a> = &'a dyn Fn(&Path) -> io::Result<Capability>;
 
-/// Opens a node and asks it.
+/// Opens a node and queries it.
 pub(crate) fn probe(node: &Path) -> io::Result<Capability> {
     Device::open(node)?.capability()
 }
 
-/// The one node of a camera.
+/// Finds the single node of a camera.
 ///
 /// # Errors
-/// `NotFound` lists the cameras there are, `Unsupported` says that several match, `Io` that those which may match cannot
-/// be opened.
+/// `NotFound` lists the available cameras, `Unsupported` reports that several match, `Io` that candidates cannot be
+/// opened.
 pub(crate) fn find(
     identity: &CameraIdentity,
     nodes: &[CameraNode],
@@ -205,7 +206,7 @@ pub(crate) fn is_denied(error: &io::Error) -> bool {
     error.kind() == io::ErrorKind::PermissionDenied
 }
 
-/// What to say and do when a node may not be opened.
+/// Explains why access to a node is denied, with the fix.
 pub(crate) fn denied(node: &Path) -> CaptureError {
     let text = format!(
         "{} may not be opened by this user (permission denied); add the user to its group, usually with \
@@ -221,7 +222,7 @@ pub(crate) mod tests {
 
     use super::*;
 
-    /// A tree of two equal webcams with a metadata node each, and one of the kernel's test driver.
+    /// Creates a tree of two equal webcams with a metadata node each, and one of the kernel's test driver.
     pub(crate) fn fixture() -> (tempfile::TempDir, Roots) {
         let folder = tempfile::tempdir().unwrap();
         let roots = Roots { sys: folder.path().join("sys"), dev: folder.path().join("dev") };

@@ -1,7 +1,10 @@
-//! Cameras of Linux through V4L2: the `v4l` crate's bindings under a buffer queue of our own.
+//! Linux cameras through V4L2: the bindings of the crate `v4l` under a buffer queue of this crate.
 //!
-//! The crate's own streams wait for ever on a silent camera, cannot be used after a timeout, know single-planar formats
-//! only and panic when dropped after an unplug; see [`queue`] for ours.
+//! The streams of `v4l` block for ever on a silent camera, are unusable after a timeout, support single-planar formats
+//! only and panic when dropped after an unplug; see [`queue`] for the replacement. `identity` finds a camera, `modes`
+//! chooses a mode and steps down, `queue` keeps the driver's buffers behind a trait that tests implement,
+//! [`stamps`](crate::stamps) turns the driver's timestamps into the middle of the exposure, and `stream` joins them and
+//! reconnects after a loss. All `unsafe` code is in `sys`.
 
 mod causes;
 mod controls;
@@ -16,9 +19,9 @@ mod stream;
 mod stream_tests;
 mod sys;
 
-use std::{io, path::PathBuf, time::Duration};
+use std::{io, path::PathBuf};
 
-use flyrig_types::{CameraId, Frame};
+use flyrig_types::CameraId;
 
 use self::{
     controls::ControlDevice,
@@ -31,44 +34,34 @@ pub use self::{
     report::{BusPlan, CameraReport, FormatReport, camera_reports, plan_buses},
     sys::monotonic_nanos,
 };
-use crate::{CameraIdentity, CameraOptions, CameraSource, CaptureError, SourceHealth};
+use crate::camera_options::{CameraIdentity, CameraOptions};
+use crate::error::CaptureError;
+use crate::source::forward_source;
 
-/// A camera of this computer. Frames come in the camera's own pixel format; [`crate::Decoding`] makes RGB of them.
+/// Camera of this computer. Frames have the camera's own pixel format; [`crate::Decoding`] converts them to RGB.
 ///
-/// A camera that is unplugged, silent or failing is looked for again by its identity at every call, under whatever number
-/// it comes back, and gets its format and controls anew. Frames that the driver flags as damaged, empty ones and cut off
-/// ones are `Corrupt`. The capture time is the middle of the exposure on `CLOCK_MONOTONIC`: the driver's stamp, which tells
-/// the start of the exposure or the end of the frame, moved by half of exposure and readout. Drivers of USB cameras stamp
-/// the first packet and call it the start of the exposure; `lag_secs` corrects what that makes wrong.
+/// A camera that is unplugged, silent or failing is searched for by its identity at every call, under any node number,
+/// and its format and controls are applied again. Frames that the driver flags as damaged, empty ones and truncated
+/// ones are `Corrupt`. The capture time is the middle of the exposure on `CLOCK_MONOTONIC`: the driver's timestamp,
+/// which refers to the start of the exposure or the end of the frame, shifted by half of exposure and readout. Drivers
+/// of USB cameras timestamp the first packet as the start of the exposure; `lag_secs` corrects that error.
 #[derive(Debug)]
 pub struct V4l2Camera(Stream<System>);
 
 impl V4l2Camera {
-    /// Finds the camera, sets it up and starts its stream.
+    /// Finds the camera, configures it and starts its stream.
     ///
     /// # Errors
-    /// `NotFound` when no such camera is there, `Unsupported` for what it cannot do, `Io` when it is in use, may not be
-    /// opened, or its bus has no room. Every text names the camera, the cause and the fix.
+    /// `NotFound` when there is no such camera, `Unsupported` for options that it lacks, `Io` when it is in use, access
+    /// is denied, or its bus lacks bandwidth. Every text names the camera, the cause and the fix.
     pub fn open(camera: &CameraId, options: &CameraOptions) -> Result<Self, CaptureError> {
         Stream::open(camera, options, System).map(Self)
     }
 }
 
-impl CameraSource for V4l2Camera {
-    fn camera(&self) -> &CameraId {
-        self.0.camera()
-    }
+forward_source!(V4l2Camera);
 
-    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
-        self.0.next_frame(timeout)
-    }
-
-    fn health(&self) -> SourceHealth {
-        self.0.health()
-    }
-}
-
-/// This computer.
+/// This computer's devices and clock.
 #[derive(Debug)]
 struct System;
 

@@ -1,25 +1,25 @@
-//! Which of a camera's modes is used, and what is tried next when the bus has no room for it.
+//! Choice of a camera's mode, and of fallbacks when the bus lacks bandwidth.
 
-use crate::FormatChoice;
+use crate::camera_options::FormatChoice;
 
-/// Bytes a second that one USB 2 camera can be promised: three packets of 1024 bytes in each of 8000 microframes.
+/// Bytes per second that are guaranteed to one USB 2 camera: three packets of 1024 bytes in each of 8000 microframes.
 const USB2_CAMERA_BYTES: u64 = 24_576_000;
-/// Slowest rate that a step down goes to, frames a second.
+/// Slowest fallback rate, frames per second.
 const SLOWEST_FPS: f64 = 5.0;
-/// Shares of the wanted rate that are tried where the driver lists none.
+/// Fractions of the requested rate that are tried where the driver lists no rates.
 const SLOWER: [f64; 3] = [2.0 / 3.0, 0.5, 1.0 / 3.0];
-/// Two rates are the same within this share.
+/// Relative tolerance within which two rates are equal.
 pub(crate) const SAME_RATE: f64 = 0.02;
 
-/// What a camera has at the size that is asked for.
+/// Format that a camera offers at the requested size.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Offer {
     pub fourcc: [u8; 4],
-    /// Frames a second; empty where the driver does not tell.
+    /// Frames per second; empty where the driver does not report them.
     pub rates: Vec<f64>,
 }
 
-/// One way to run a camera; the size never changes, since the calibration belongs to it.
+/// Format and rate of a camera; the size never changes, since the calibration depends on it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Mode {
     pub choice: FormatChoice,
@@ -27,7 +27,8 @@ pub(crate) struct Mode {
     pub fps: f64,
 }
 
-/// Bytes a second of a bus by its speed in megabits, and of one camera on it; what isochronous transfers may take.
+/// Returns the bytes per second that isochronous transfers may use: of a bus by its speed in megabits per second, and
+/// of one camera on it.
 pub(crate) fn usb_capacity(speed_mbit: u32) -> (u64, u64) {
     match speed_mbit {
         0..=12 => (1_000_000, 1_000_000),
@@ -38,11 +39,11 @@ pub(crate) fn usb_capacity(speed_mbit: u32) -> (u64, u64) {
     }
 }
 
-/// The modes to try, best first: the wanted one, compressed images at the same rate, then slower rates. Each takes fewer
-/// bytes a second than the one before.
+/// Lists the modes to try, best first: the requested one, compressed images at the same rate, then slower rates. Each
+/// needs fewer bytes per second than the one before.
 ///
 /// # Errors
-/// A text that says what the camera lacks and what it has.
+/// Text that names what the camera lacks and what it offers.
 pub(crate) fn ladder(
     wanted: FormatChoice,
     fps: f64,
@@ -77,7 +78,7 @@ pub(crate) fn ladder(
     if !has_rate(offer, fps) {
         let rates: Vec<String> = offer.rates.iter().map(|rate| format!("{rate:.4}")).collect();
         return Err(format!(
-            "has no {fps} frames a second at {choice:?} {width}x{height}; it has {}; set fps to one of them",
+            "has no {fps} frames per second at {choice:?} {width}x{height}; it has {}; set fps to one of them",
             rates.iter().map(|rate| rate.trim_end_matches('0').trim_end_matches('.')).collect::<Vec<_>>().join(", ")
         ));
     }
@@ -102,12 +103,12 @@ pub(crate) fn ladder(
     Ok(modes)
 }
 
-/// Bytes a second on the bus.
+/// Returns the bytes per second on the bus.
 pub(crate) fn bytes_per_second(choice: FormatChoice, fps: f64, width: u32, height: u32) -> u64 {
     (choice.bytes_per_frame(width, height) as f64 * fps.clamp(0.0, 1e6)) as u64
 }
 
-/// A listed rate, or one between two listed ones: some drivers give only the ends of a range.
+/// Returns whether a rate is listed, or lies between two listed ones: some drivers list only the ends of a range.
 fn has_rate(offer: &Offer, fps: f64) -> bool {
     let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
     for &rate in &offer.rates {
@@ -162,7 +163,7 @@ mod tests {
         let error = ladder(FormatChoice::Nv12, 30.0, SIZE, &offers(), None).unwrap_err();
         assert_eq!(error, "has no Nv12 images of 640x360; its formats at that size: MJPG, YUYV");
         let error = ladder(FormatChoice::Mjpeg, 60.0, SIZE, &offers(), None).unwrap_err();
-        assert_eq!(error, "has no 60 frames a second at Mjpeg 640x360; it has 30, 15; set fps to one of them");
+        assert_eq!(error, "has no 60 frames per second at Mjpeg 640x360; it has 30, 15; set fps to one of them");
         assert!(ladder(FormatChoice::Auto, 30.0, SIZE, &[], None).unwrap_err().ends_with("none"));
     }
 }

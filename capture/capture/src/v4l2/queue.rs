@@ -1,4 +1,4 @@
-//! The ring of buffers that a driver fills and we empty.
+//! Ring of buffers between a driver and this process.
 
 use std::{
     io,
@@ -10,50 +10,50 @@ use crate::stamps::StampSource;
 /// Most memory planes of a buffer (`VIDEO_MAX_PLANES`).
 pub(crate) const MAX_PLANES: usize = 8;
 
-/// Fewest buffers in the driver's hands with which a stream flows; a driver without a free buffer drops frames.
+/// Fewest queued buffers for a continuous stream; a driver without a free buffer drops frames.
 const MIN_QUEUED: usize = 2;
 
-/// A buffer that the driver has given.
+/// Buffer returned by the driver.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Delivered {
     pub index: u32,
-    /// Of the driver, modulo 2^32.
+    /// Driver's sequence number, modulo 2^32.
     pub sequence: u32,
-    /// Whether the driver says that its content is damaged.
+    /// Whether the driver flags its content as damaged.
     pub is_broken: bool,
     pub stamp_nanos: i64,
     pub stamp_source: StampSource,
-    /// Start and length of the payload in each plane, bytes, as the driver says.
+    /// Start and length of the payload in each plane, bytes, as reported by the driver.
     pub ranges: [(usize, usize); MAX_PLANES],
 }
 
-/// The calls of a streaming device; a scripted one stands in for it in tests.
+/// Streaming calls of a device; tests use a scripted one.
 pub(crate) trait BufferDevice {
-    /// Makes buffers (none: frees them) and gives how many there are.
+    /// Allocates buffers (0 frees them) and returns their number.
     fn allocate(&mut self, count: u32) -> io::Result<u32>;
     fn enqueue(&mut self, index: u32) -> io::Result<()>;
     fn dequeue(&mut self) -> io::Result<Delivered>;
     fn start(&mut self) -> io::Result<()>;
-    /// Also takes every buffer out of the driver's queue.
+    /// Stops the stream and removes every buffer from the driver's queue.
     fn stop(&mut self) -> io::Result<()>;
-    /// Whether something is there to dequeue, an error included.
+    /// Waits until a buffer or an error can be dequeued; returns false on timeout.
     fn wait(&mut self, timeout: Duration) -> io::Result<bool>;
-    /// Memory of a buffer's plane; empty when there is no such one.
+    /// Returns the memory of a buffer's plane; empty for a nonexistent one.
     fn plane(&self, index: u32, plane: usize) -> &[u8];
 }
 
-/// A streaming device with all buffers in the driver's hands but for the one that is leased.
+/// Streaming device with all buffers queued in the driver but for the leased one.
 ///
-/// Frames are copied out of a [`Lease`] and the lease is dropped at once. Handing leases themselves down the pipeline
-/// would save a copy (a tenth of a millisecond for 640x360) and starve the driver: a synchronizer may hold dozens of
-/// frames, a driver has four to eight buffers.
+/// Frames are copied out of a [`Lease`], which is dropped immediately. Passing leases down the pipeline would save a
+/// copy (a tenth of a millisecond for 640x360) and starve the driver: a synchronizer may hold dozens of frames, a
+/// driver has four to eight buffers.
 #[derive(Debug)]
 pub(crate) struct BufferQueue<D: BufferDevice> {
     device: D,
-    /// Whether a buffer is in the driver's hands.
+    /// Whether the driver holds each buffer.
     queued: Vec<bool>,
     is_streaming: bool,
-    /// Why a buffer could not be given back; told by the next call.
+    /// Error of returning a buffer, reported by the next call.
     fault: Option<io::Error>,
 }
 
@@ -62,12 +62,12 @@ impl<D: BufferDevice> BufferQueue<D> {
         Self { device, queued: Vec::new(), is_streaming: false, fault: None }
     }
 
-    /// The device, for settings.
+    /// Returns the device, for settings.
     pub fn device(&mut self) -> &mut D {
         &mut self.device
     }
 
-    /// Makes buffers, gives them to the driver and starts the stream. After an error nothing is allocated.
+    /// Allocates and queues the buffers and starts the stream. After an error nothing is allocated.
     pub fn start(&mut self, count: u32) -> io::Result<()> {
         self.stop();
         let started = self.try_start(count);
@@ -96,7 +96,7 @@ impl<D: BufferDevice> BufferQueue<D> {
         Ok(())
     }
 
-    /// Stops the stream and frees the buffers; what the driver thinks of that no longer matters.
+    /// Stops the stream and frees the buffers, ignoring errors.
     pub fn stop(&mut self) {
         if self.is_streaming {
             let _ = self.device.stop();
@@ -109,7 +109,7 @@ impl<D: BufferDevice> BufferQueue<D> {
         self.fault = None;
     }
 
-    /// The next buffer, `None` when none came in time. Any error ends the stream: [`Self::start`] it again.
+    /// Returns the next buffer, `None` on timeout. Any error ends the stream: [`Self::start`] it again.
     pub fn next(&mut self, timeout: Duration) -> io::Result<Option<Lease<'_, D>>> {
         if let Some(fault) = self.fault.take() {
             return Err(fault);
@@ -165,7 +165,7 @@ impl<D: BufferDevice> Drop for BufferQueue<D> {
     }
 }
 
-/// A buffer in our hands; the driver gets it back when this is dropped.
+/// Buffer held by the reader; dropping it returns it to the driver.
 #[derive(Debug)]
 pub(crate) struct Lease<'a, D: BufferDevice> {
     queue: &'a mut BufferQueue<D>,
@@ -173,7 +173,7 @@ pub(crate) struct Lease<'a, D: BufferDevice> {
 }
 
 impl<D: BufferDevice> Lease<'_, D> {
-    /// Payload of a plane; shorter than the driver says where that is more than there is.
+    /// Returns the payload of a plane; shorter than reported where the report exceeds the memory.
     pub fn plane(&self, plane: usize) -> &[u8] {
         let memory = self.queue.device.plane(self.buffer.index, plane);
         let (start, length) = self.buffer.ranges.get(plane).copied().unwrap_or_default();

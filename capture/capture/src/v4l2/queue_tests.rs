@@ -1,27 +1,27 @@
-//! The ring of buffers against a device out of a script.
+//! Buffer queue against a scripted device.
 
 use std::collections::VecDeque;
 
 use super::*;
 
-/// What a scripted device does next.
+/// Next action of a scripted device.
 #[derive(Debug, Clone)]
 pub(crate) enum Step {
     /// The oldest queued buffer comes back with this sequence number and these bytes.
     Frame(u32, Vec<u8>),
-    /// The same, flagged as damaged.
+    /// The oldest queued buffer comes back flagged as damaged.
     Broken(u32),
     /// A buffer that was never queued.
     Stranger,
     /// DQBUF fails.
     Fail(i32),
-    /// QBUF fails from now on, so many times.
+    /// QBUF fails this many times from now on.
     RefuseBack(u32),
-    /// Nothing comes for one wait.
+    /// Nothing arrives during one wait.
     Silence,
 }
 
-/// A device out of a script. Checks that a buffer is never used by two.
+/// Scripted device. Checks that driver and reader never use a buffer at once.
 #[derive(Debug, Default)]
 pub(crate) struct Fake {
     pub script: VecDeque<Step>,

@@ -1,4 +1,4 @@
-//! What is plugged in, and whether the buses carry it: for `flyrig doctor`.
+//! Report of connected cameras and of the bandwidth of their buses, for `flyrig doctor`.
 
 use std::collections::BTreeMap;
 
@@ -9,38 +9,39 @@ use super::{
     modes,
     sys::{Device, SizeRange},
 };
-use crate::{CaptureError, FormatChoice};
+use crate::camera_options::FormatChoice;
+use crate::error::CaptureError;
 
-/// Sizes of a format that are asked for their rates: a driver may list dozens.
+/// Most sizes per format that are queried for their rates: a driver may list dozens.
 const REPORTED_SIZES: usize = 24;
 
-/// One pixel format of a camera.
+/// Pixel format of a camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FormatReport {
-    /// The driver's code.
+    /// FourCC of the driver.
     pub code: String,
-    /// What a configuration calls it; none for a format that we do not read.
+    /// Equivalent in a configuration; `None` for an unsupported format.
     pub choice: Option<FormatChoice>,
-    /// Width, height, frames a second from the fastest to the slowest.
+    /// Width, height, frames per second from the fastest to the slowest.
     pub modes: Vec<(u32, u32, Vec<f64>)>,
 }
 
-/// One camera of this computer.
+/// Report of one camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CameraReport {
-    /// Where it is.
+    /// Device node.
     pub node: CameraNode,
-    /// V4L2's bus information, when it could be opened.
+    /// V4L2 bus information, when the camera could be opened.
     pub bus_info: Option<String>,
-    /// Driver, when it could be opened.
+    /// Driver, when the camera could be opened.
     pub driver: Option<String>,
-    /// Its formats.
+    /// Available formats.
     pub formats: Vec<FormatReport>,
-    /// Why it cannot be used.
+    /// Reason why the camera is unusable.
     pub problem: Option<CaptureError>,
 }
 
-/// Every camera of this computer; nodes that give no images, like metadata, are left out.
+/// Reports every camera of this computer; nodes without images, such as metadata, are omitted.
 #[must_use]
 pub fn camera_reports() -> Vec<CameraReport> {
     identity::scan(&Roots::default()).into_iter().filter_map(report).collect()
@@ -87,34 +88,34 @@ fn formats(device: &Device) -> std::io::Result<Vec<FormatReport>> {
     Ok(formats)
 }
 
-/// What cameras ask of one USB bus.
+/// Bandwidth demands on one USB bus.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BusPlan {
     /// Number of the root hub.
     pub bus: u32,
-    /// Slowest link among its cameras, megabits a second.
+    /// Slowest link among its cameras, megabits per second.
     pub speed_mbit: u32,
-    /// Bytes a second that can be promised to all of them together.
+    /// Bytes per second that can be guaranteed to all of them together.
     pub capacity: u64,
-    /// Camera and the bytes a second that it asks for.
+    /// Cameras with the bytes per second that each requests.
     pub demands: Vec<(String, u64)>,
 }
 
 impl BusPlan {
-    /// Bytes a second of all cameras together.
+    /// Returns the bytes per second of all cameras together.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.demands.iter().map(|(_, bytes)| bytes).sum()
     }
 
-    /// Whether the bus has room for all.
+    /// Returns whether the bandwidth suffices for all.
     #[must_use]
     pub fn fits(&self) -> bool {
         self.total() <= self.capacity
     }
 }
 
-/// Plans the buses for cameras of `(name, USB bus, speed in Mbit/s, format, width, height, frames a second)`.
+/// Plans the buses for cameras of `(name, USB bus, speed in Mbit/s, format, width, height, frames per second)`.
 #[must_use]
 pub fn plan_buses<'a>(
     cameras: impl IntoIterator<Item = (&'a str, u32, u32, FormatChoice, (u32, u32), f64)>,

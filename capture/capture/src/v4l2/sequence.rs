@@ -1,19 +1,19 @@
-//! Numbers of frames that count on, whatever the driver's do.
+//! Continuous sequence numbers over wraps and restarts of the driver's.
 
-/// A number that jumps ahead by more is of a driver that counts anew.
+/// Jump above which the driver is taken to have restarted its numbers.
 const JUMP: u32 = 100_000;
 
-/// Makes the driver's 32-bit numbers count on, over wraps and reconnects.
+/// Extension of the driver's 32-bit numbers to continuous ones, across wraps and reconnects.
 #[derive(Debug, Default)]
 pub(crate) struct Sequence {
     last: Option<u32>,
     counted: u64,
-    /// Frames that the driver numbered and we never got.
+    /// Frames numbered by the driver that were never received.
     pub lost: u64,
 }
 
 impl Sequence {
-    /// The number of a frame.
+    /// Returns the continuous number of a frame.
     pub fn count(&mut self, number: u32) -> u64 {
         let ahead = self.last.map_or(1, |last| number.wrapping_sub(last));
         self.last = Some(number);
@@ -23,7 +23,7 @@ impl Sequence {
         self.counted - 1
     }
 
-    /// The driver counts anew from the next frame on.
+    /// Treats the next frame as the first of a new driver sequence.
     pub fn restart(&mut self) {
         self.last = None;
     }

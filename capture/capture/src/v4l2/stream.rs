@@ -1,4 +1,4 @@
-//! One camera's stream: connecting, watching over it, and connecting again.
+//! Stream of one camera: connecting, supervision and reconnecting.
 
 use std::{
     io,
@@ -18,22 +18,23 @@ use super::{
     sequence::Sequence,
     sys::{ActiveFormat, SizeRange},
 };
-use crate::{
-    BufferPool, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, SourceHealth,
-    stamps::Stamps,
-};
+use crate::camera_options::{CameraIdentity, CameraOptions};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::pool::BufferPool;
+use crate::source::{CameraSource, SourceHealth};
+use crate::stamps::Stamps;
 
-/// A camera that has sent frames is silent after so many periods without one, but not before [`SILENT_AFTER`].
+/// Periods without a frame after which a streaming camera counts as silent, but never less than [`SILENT_AFTER`].
 const SILENT_PERIODS: f64 = 5.0;
 const SILENT_AFTER: Duration = Duration::from_millis(500);
-/// A camera that has just been started may take so long until its first frame.
+/// Time limit of the first frame after a start.
 const FIRST_FRAME: Duration = Duration::from_secs(5);
-/// Frames older than this when the first one is asked for piled up while other cameras were opened.
+/// Age above which frames that queued up before the first request (while other cameras were opened) are discarded.
 const STALE: Duration = Duration::from_millis(200);
-/// Free buffers that are kept for frames to come.
+/// Free buffers kept for later frames.
 const POOLED_FRAMES: usize = 16;
 
-/// A device that can be set up and streamed from.
+/// Device that can be configured and streamed from.
 pub(crate) trait CameraDevice: BufferDevice + ControlDevice {
     fn formats(&self) -> io::Result<Vec<[u8; 4]>>;
     fn sizes(&self, fourcc: [u8; 4]) -> io::Result<Vec<SizeRange>>;
@@ -42,23 +43,23 @@ pub(crate) trait CameraDevice: BufferDevice + ControlDevice {
     fn set_rate(&mut self, fps: f64) -> io::Result<Option<f64>>;
 }
 
-/// The world around a stream: finds the device and tells the time; scripted in tests.
+/// Environment of a stream: finds devices and reads the clock; scripted in tests.
 pub(crate) trait Host: Send {
     type Device: CameraDevice + Send;
-    /// The device, its node, and the speed of its USB link where it has one.
+    /// Opens the device; returns it with its node and the speed of its USB link, megabits per second, where it has one.
     fn open(&mut self, identity: &CameraIdentity) -> Result<(Self::Device, PathBuf, Option<u32>), CaptureError>;
-    /// `CLOCK_MONOTONIC`.
+    /// Returns the time of `CLOCK_MONOTONIC`, nanoseconds.
     fn now_nanos(&self) -> i64;
 }
 
-/// A camera as a source of frames in its own pixel format.
+/// Camera as a source of frames in its own pixel format.
 #[derive(Debug)]
 pub(crate) struct Stream<H: Host> {
     camera: CameraId,
     options: CameraOptions,
     host: H,
     session: Option<Session<H::Device>>,
-    /// Steps down that were needed so far; they stay when the camera comes back.
+    /// Steps down in mode that were needed so far; kept across reconnects.
     rung: usize,
     stamps: Stamps,
     sequence: Sequence,
@@ -66,21 +67,21 @@ pub(crate) struct Stream<H: Host> {
     pool: Arc<BufferPool>,
 }
 
-/// From one STREAMON to its end.
+/// State between STREAMON and its end.
 #[derive(Debug)]
 struct Session<D: BufferDevice> {
     queue: BufferQueue<D>,
     active: ActiveFormat,
     fps: f64,
     exposure_nanos: Option<u64>,
-    /// Arrival of the last frame, or the start of the stream.
+    /// Arrival of the last frame, or the start of the stream, nanoseconds.
     last_nanos: i64,
     is_flowing: bool,
     was_asked: bool,
 }
 
 impl<H: Host> Stream<H> {
-    /// Connects at once, so that errors are reported at the start.
+    /// Connects immediately, so that errors are reported at the start.
     pub fn open(camera: &CameraId, options: &CameraOptions, host: H) -> Result<Self, CaptureError> {
         let mut stream = Self {
             camera: camera.clone(),
@@ -137,7 +138,7 @@ impl<H: Host> Stream<H> {
             let fps = rate.map_err(|error| explain(&error, "does not take its frame rate", &node))?.unwrap_or(mode.fps);
             if (fps / mode.fps - 1.0).abs() > SAME_RATE {
                 tracing::warn!(
-                    "camera {}: {:.2} frames a second were asked for, it runs at {fps:.2}",
+                    "camera {}: {:.2} frames per second were requested, it runs at {fps:.2}",
                     self.camera,
                     mode.fps
                 );
@@ -239,7 +240,7 @@ impl<H: Host> Stream<H> {
         let corrupt =
             |text: String| CaptureError::general(CaptureErrorKind::Corrupt, format!("frame {number}: {text}"));
         if lease.buffer.is_broken {
-            return Err(corrupt("the driver says that it is damaged".to_owned()));
+            return Err(corrupt("the driver flags it as damaged".to_owned()));
         }
         let mut bytes = self.pool.take();
         let packed = pack(&session.active, |plane| lease.plane(plane), &mut bytes);
@@ -272,7 +273,7 @@ impl<D: BufferDevice> Session<D> {
         }
     }
 
-    /// Gives back what has waited since before anybody asked.
+    /// Discards frames that queued up before the first request.
     fn discard(&mut self, buffers: u32) -> io::Result<()> {
         for _ in 0..buffers {
             if self.queue.next(Duration::ZERO)?.is_none() {
@@ -303,10 +304,10 @@ impl<H: Host> CameraSource for Stream<H> {
 }
 
 fn describe(mode: &Mode) -> String {
-    format!("{} at {:.2} frames a second", fourcc_text(mode.fourcc), mode.fps)
+    format!("{} at {:.2} frames per second", fourcc_text(mode.fourcc), mode.fps)
 }
 
-/// The formats that a device has at a size.
+/// Lists the formats that a device has at a size.
 pub(crate) fn offers(device: &impl CameraDevice, width: u32, height: u32) -> io::Result<Vec<Offer>> {
     let mut offers = Vec::new();
     for fourcc in device.formats()? {

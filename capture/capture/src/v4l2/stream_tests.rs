@@ -1,4 +1,4 @@
-//! Connecting and reconnecting, against scripted devices.
+//! Connecting and reconnecting with scripted devices.
 
 use std::{
     collections::VecDeque,
@@ -13,20 +13,20 @@ use v4l::v4l_sys::V4L2_CID_GAIN;
 use super::{
     controls::{ControlDevice, tests::FakeControls},
     queue::{
-        BufferDevice, Delivered,
+        BufferDevice, Delivered, MAX_PLANES,
         tests::{Fake, Step},
     },
     stream::{CameraDevice, Host, Stream},
-    sys::{ActiveFormat, ControlRange, MAX_PLANES, SizeRange},
+    sys::{ActiveFormat, ControlRange, SizeRange},
 };
-use crate::{
-    CameraControls, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, FormatChoice,
-};
+use crate::camera_options::{CameraControls, CameraIdentity, CameraOptions, FormatChoice};
+use crate::error::{CaptureError, CaptureErrorKind};
+use crate::source::CameraSource;
 
 const POLL: Duration = Duration::from_millis(200);
 const MS: i64 = 1_000_000;
 
-/// A webcam of 4x2 pixels with two formats, and what the test learns of it.
+/// Webcam of 4x2 pixels with two formats, and a record of its calls.
 #[derive(Debug, Default)]
 struct Webcam {
     buffers: Fake,
@@ -112,7 +112,7 @@ impl CameraDevice for Webcam {
     }
 }
 
-/// Hands out devices in turn; an errno in place of a device is what opening fails with.
+/// Supply of devices in turn; an errno in place of a device is the error of opening it.
 #[derive(Debug)]
 struct Bench {
     devices: VecDeque<Result<Webcam, i32>>,

@@ -1,9 +1,8 @@
-//! Buffers that a driver fills: asked for, mapped, queued and taken out.
+//! Buffers filled by a driver: allocation, mapping, queueing and dequeueing.
 
 use std::{
-    ffi::c_void,
     io,
-    os::fd::{AsRawFd as _, RawFd},
+    os::fd::AsRawFd as _,
     ptr,
     time::{Duration, Instant},
 };
@@ -17,46 +16,13 @@ use v4l::{
     v4l2::{self, vidioc},
 };
 
-use super::{Device, MAX_PLANES, MULTI_PLANAR, Plain};
-use crate::{
-    stamps::StampSource,
-    v4l2::queue::{BufferDevice, Delivered},
-};
-
-/// Memory of one plane of one buffer, shared with the driver.
-#[derive(Debug)]
-pub(super) struct Mapping {
-    start: *mut c_void,
-    length: usize,
-}
-
-// SAFETY: the address range belongs to the process, not to a thread.
-unsafe impl Send for Mapping {}
-
-impl Mapping {
-    fn new(fd: RawFd, length: usize, offset: u32) -> io::Result<Self> {
-        let protection = libc::PROT_READ | libc::PROT_WRITE;
-        // SAFETY: a new mapping at an address of the kernel's choice touches no memory of ours.
-        let start = unsafe { v4l2::mmap(ptr::null_mut(), length, protection, libc::MAP_SHARED, fd, offset.into()) }?;
-        Ok(Self { start, length })
-    }
-
-    fn bytes(&self) -> &[u8] {
-        // SAFETY: `start` is mapped for `length` bytes until Drop. The driver writes to it only while the buffer is
-        // queued, and the queue hands these bytes out only while it is not.
-        unsafe { std::slice::from_raw_parts(self.start.cast::<u8>(), self.length) }
-    }
-}
-
-impl Drop for Mapping {
-    fn drop(&mut self) {
-        // SAFETY: ours, mapped once, and unmapped here alone. It fails only for ranges that are not mapped.
-        let _ = unsafe { v4l2::munmap(self.start, self.length) };
-    }
-}
+use super::device::{Device, MULTI_PLANAR, Plain};
+use super::mapping::Mapping;
+use crate::stamps::StampSource;
+use crate::v4l2::queue::{BufferDevice, Delivered, MAX_PLANES};
 
 impl Device {
-    /// A buffer to ask the driver about; with its planes where there are any.
+    /// Prepares the buffer argument of a request, with its planes where there are any.
     fn buffer(&self, index: u32, planes: &mut [v4l2_plane; MAX_PLANES]) -> v4l2_buffer {
         let mut raw = v4l2_buffer { index, type_: self.buffer_type, memory: MEMORY_MMAP, ..Plain::zeroed() };
         if self.buffer_type == MULTI_PLANAR {
@@ -156,7 +122,7 @@ impl BufferDevice for Device {
         let deadline = Instant::now().checked_add(timeout);
         loop {
             let left = deadline.map_or(timeout, |deadline| deadline.saturating_duration_since(Instant::now()));
-            // Rounded up, lest the last millisecond is spent turning.
+            // Rounded up, so that the last millisecond is not spent polling.
             let millis = i32::try_from(left.as_micros().div_ceil(1000)).unwrap_or(i32::MAX);
             let mut poll = libc::pollfd { fd: self.file.as_raw_fd(), events: libc::POLLIN, revents: 0 };
             // SAFETY: one pollfd of ours.

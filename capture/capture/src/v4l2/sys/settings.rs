@@ -1,52 +1,34 @@
-//! What a device has and how it is set: formats, sizes, rates and controls.
+//! Modes and controls of a device: formats, sizes, rates and settings.
 
 use std::io;
 
 use v4l::{
     v4l_sys::{
-        V4L2_CAP_DEVICE_CAPS, V4L2_CAP_STREAMING, V4L2_CAP_TIMEPERFRAME, V4L2_CAP_VIDEO_CAPTURE,
-        V4L2_CAP_VIDEO_CAPTURE_MPLANE, v4l2_capability, v4l2_control, v4l2_fmtdesc, v4l2_format, v4l2_fract,
-        v4l2_frmivalenum, v4l2_frmivaltypes_V4L2_FRMIVAL_TYPE_DISCRETE as INTERVAL_DISCRETE, v4l2_frmsizeenum,
+        V4L2_CAP_TIMEPERFRAME, v4l2_control, v4l2_fmtdesc, v4l2_format, v4l2_fract, v4l2_frmivalenum,
+        v4l2_frmivaltypes_V4L2_FRMIVAL_TYPE_DISCRETE as INTERVAL_DISCRETE, v4l2_frmsizeenum,
         v4l2_frmsizetypes_V4L2_FRMSIZE_TYPE_DISCRETE as SIZE_DISCRETE, v4l2_queryctrl, v4l2_streamparm,
     },
     v4l2::vidioc,
 };
 
-use super::{Device, MAX_PLANES, MULTI_PLANAR, Plain, invalid, text};
+use super::device::{Device, MULTI_PLANAR, Plain, invalid};
+use crate::v4l2::queue::MAX_PLANES;
 
-/// Most entries of an enumeration that we read: a driver that never says the end must not hang us.
+/// Most entries read of an enumeration, against a driver that never signals its end.
 const MAX_ENTRIES: u32 = 512;
 
-/// What a device says of itself (`VIDIOC_QUERYCAP`).
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Capability {
-    pub driver: String,
-    pub card: String,
-    pub bus_info: String,
-    /// Whether it gives images through memory-mapped buffers.
-    pub captures: bool,
-    pub(super) multi_planar: bool,
-}
-
-#[cfg(test)]
-impl Capability {
-    pub fn test(bus_info: &str, captures: bool) -> Self {
-        Self { driver: "test".into(), card: "Test".into(), bus_info: bus_info.into(), captures, multi_planar: false }
-    }
-}
-
-/// A format in force (`VIDIOC_S_FMT` as answered).
+/// Format in effect (`VIDIOC_S_FMT` as answered).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct ActiveFormat {
     pub fourcc: [u8; 4],
     pub width: u32,
     pub height: u32,
-    /// Bytes from a row to the next in each memory plane; 0 where it does not apply.
+    /// Bytes from one row to the next in each memory plane; 0 where it does not apply.
     pub stride: [u32; MAX_PLANES],
     pub planes: usize,
 }
 
-/// An integer control (`VIDIOC_QUERYCTRL`).
+/// Integer control (`VIDIOC_QUERYCTRL`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct ControlRange {
     pub minimum: i32,
@@ -64,21 +46,7 @@ pub(crate) enum SizeRange {
 }
 
 impl Device {
-    pub fn capability(&self) -> io::Result<Capability> {
-        let mut raw = v4l2_capability::zeroed();
-        self.ioctl(vidioc::VIDIOC_QUERYCAP, &mut raw)?;
-        let caps = if raw.capabilities & V4L2_CAP_DEVICE_CAPS == 0 { raw.capabilities } else { raw.device_caps };
-        let (single, multi) = (caps & V4L2_CAP_VIDEO_CAPTURE != 0, caps & V4L2_CAP_VIDEO_CAPTURE_MPLANE != 0);
-        Ok(Capability {
-            driver: text(&raw.driver),
-            card: text(&raw.card),
-            bus_info: text(&raw.bus_info),
-            captures: (single || multi) && caps & V4L2_CAP_STREAMING != 0,
-            multi_planar: multi && !single,
-        })
-    }
-
-    /// Pixel formats, in the driver's order.
+    /// Lists the pixel formats, in the driver's order.
     pub fn formats(&self) -> io::Result<Vec<[u8; 4]>> {
         let mut formats = Vec::new();
         for index in 0..MAX_ENTRIES {
@@ -91,7 +59,7 @@ impl Device {
         Ok(formats)
     }
 
-    /// Sizes of a format; empty where the driver does not tell.
+    /// Lists the sizes of a format; empty where the driver does not report them.
     pub fn sizes(&self, fourcc: [u8; 4]) -> io::Result<Vec<SizeRange>> {
         let mut sizes = Vec::new();
         for index in 0..MAX_ENTRIES {
@@ -113,8 +81,8 @@ impl Device {
         Ok(sizes)
     }
 
-    /// Frame rates of a format and size, frames a second; only the fastest and the slowest where the driver has a
-    /// continuous range, empty where it does not tell.
+    /// Lists the rates of a format and size, frames per second; only the fastest and the slowest where the driver has a
+    /// continuous range, empty where it does not report them.
     pub fn rates(&self, fourcc: [u8; 4], width: u32, height: u32) -> io::Result<Vec<f64>> {
         let rate = |interval: v4l2_fract| f64::from(interval.denominator) / f64::from(interval.numerator.max(1));
         let mut rates = Vec::new();
@@ -135,7 +103,7 @@ impl Device {
         Ok(rates)
     }
 
-    /// Sets format and size; the driver may answer with others.
+    /// Sets format and size; returns those in effect, which may differ.
     pub fn set_format(&mut self, fourcc: [u8; 4], width: u32, height: u32) -> io::Result<ActiveFormat> {
         const FIELD_NONE: u32 = 1;
         let pixelformat = u32::from_le_bytes(fourcc);
@@ -174,7 +142,7 @@ impl Device {
         Ok(active)
     }
 
-    /// Asks for a frame rate and gives the one in force; `None` where the driver has no say in it.
+    /// Requests a frame rate and returns the one in effect; `None` where the driver does not support it.
     pub fn set_rate(&self, fps: f64) -> io::Result<Option<f64>> {
         let mut raw = v4l2_streamparm { type_: self.buffer_type, ..Plain::zeroed() };
         match self.ioctl(vidioc::VIDIOC_G_PARM, &mut raw) {
@@ -196,7 +164,7 @@ impl Device {
         Ok(known.then(|| f64::from(interval.denominator) / f64::from(interval.numerator)))
     }
 
-    /// Range of a control; `None` when the camera does not have it.
+    /// Returns the range of a control; `None` when the camera lacks it.
     pub fn control_range(&self, id: u32) -> io::Result<Option<ControlRange>> {
         let mut raw = v4l2_queryctrl { id, ..Plain::zeroed() };
         let (exists, r) = (self.listed(vidioc::VIDIOC_QUERYCTRL, &mut raw)?, raw);
