@@ -21,7 +21,7 @@ use flyrig_report::{progress_bar, stop, write_whole};
 use flyrig_stream::{Posed, StreamTemplate, stamp_of};
 use flyrig_transport::{FetchedTemplate, Interests, Subscriber, TransportConfig};
 use flyrig_types::{Camera, Mask, RenderedView};
-use flyrig_viewer::{Scene, age_secs, clock_secs};
+use flyrig_viewer::{PeopleScene, age_secs, clock_secs};
 use flyrig_viewing::{People, Taken};
 use serde::Serialize;
 
@@ -92,7 +92,7 @@ struct Results {
 
 /// Draws what comes.
 fn draw(gpu: &GpuContext, jobs: Receiver<Job>) -> Result<Results> {
-    let mut scene = Scene::new(gpu)?;
+    let mut scene = PeopleScene::new(gpu)?;
     let mut results = Results::default();
     for Job { posed, colors, camera, wanted } in jobs {
         let mut draw = |colors: &Colors| -> Result<RenderedView> {

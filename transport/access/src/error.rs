@@ -26,7 +26,7 @@ pub enum AccessError {
         /// Error of the operating system.
         problem: std::io::Error,
     },
-    /// The rig cannot be reached, or does not admit the key; for [`crate::Probe`].
+    /// The rig cannot be reached, or does not admit the key; for [`crate::KeyProbe`].
     #[error("{0}")]
     Refused(String),
     /// The system gives no thread or no random numbers, or a certificate cannot be made.

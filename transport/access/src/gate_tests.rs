@@ -4,6 +4,7 @@ use std::{
     io::{Read as _, Write as _},
     net::{SocketAddr, TcpListener, TcpStream},
     sync::Arc,
+    thread::Builder,
     time::{Duration, Instant},
 };
 

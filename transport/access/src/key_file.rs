@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{AccessError, Role, ring_folder::write_secret};
+use crate::{error::AccessError, holder::Holder, issue::CertificatePair, role::Role, secret_file::write_secret, tls};
 
 /// Largest key file that is read, bytes.
 const MAX_KEY_FILE_BYTES: u64 = 64 << 10;
@@ -54,12 +54,12 @@ impl std::fmt::Debug for KeyFile {
 impl KeyFile {
     pub(crate) fn new(
         rig: &str,
-        holder: &crate::Holder,
+        holder: &Holder,
         topic_name: String,
         connect: Vec<String>,
         rig_certificate_name: String,
         authority: String,
-        pair: crate::issue::Pair,
+        pair: CertificatePair,
     ) -> Self {
         Self {
             version: VERSION,
@@ -129,7 +129,7 @@ impl KeyFile {
         if self.rig_certificate_name.is_empty() {
             return Err("rig_certificate_name".to_owned());
         }
-        crate::tls::client(&self.authority, &self.certificate, &self.private_key).map(|_| ())
+        tls::client(&self.authority, &self.certificate, &self.private_key).map(|_| ())
     }
 
     /// Writes a file that its owner alone may read.

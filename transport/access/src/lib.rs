@@ -8,17 +8,22 @@
 
 mod error;
 mod gate;
+mod holder;
 mod issue;
 mod key_file;
 mod limits;
+mod listener;
 mod probe;
 mod ring_folder;
 mod role;
+mod secret_file;
 mod tls;
 
 pub use error::AccessError;
 pub use gate::{Gate, Inner};
+pub use holder::{Holder, MAX_HOLDERS};
 pub use key_file::KeyFile;
-pub use probe::Probe;
-pub use ring_folder::{DEFAULT_PORT, Holder, MAX_HOLDERS, Ring};
+pub use listener::{BoundListener, Bounds, Connection, ConnectionPlace, Listener, Serve};
+pub use probe::KeyProbe;
+pub use ring_folder::{DEFAULT_PORT, Ring};
 pub use role::Role;

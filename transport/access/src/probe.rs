@@ -14,7 +14,7 @@ use std::{
 use rustls_pki_types::ServerName;
 use tokio_rustls::rustls::{AlertDescription, CertificateError, ClientConnection, Error as TlsError, Stream};
 
-use crate::{AccessError, KeyFile, Role, tls};
+use crate::{error::AccessError, key_file::KeyFile, role::Role, tls};
 
 /// Time for an answer of the rig.
 const PATIENCE: Duration = Duration::from_secs(3);
@@ -133,7 +133,7 @@ impl KeyFile {
 
 /// Knocks at the rig again and again while nothing comes from it, to know why.
 #[derive(Debug)]
-pub struct Probe {
+pub struct KeyProbe {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
@@ -144,7 +144,7 @@ struct Shared {
     stop: AtomicBool,
 }
 
-impl Probe {
+impl KeyProbe {
     /// Starts the thread, which is idle while `is_connected`.
     ///
     /// # Errors
@@ -171,7 +171,7 @@ impl Probe {
 }
 
 /// Does not wait for an attempt under way.
-impl Drop for Probe {
+impl Drop for KeyProbe {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {

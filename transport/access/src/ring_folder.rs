@@ -11,14 +11,16 @@ use rustls_pki_types::{CertificateDer, pem::PemObject as _};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    AccessError, KeyFile, Role,
-    issue::{Authority, Pair, Side},
+    error::AccessError,
+    holder::{Holder, MAX_HOLDERS},
+    issue::{Authority, CertificatePair, TlsSide},
+    key_file::KeyFile,
+    role::Role,
+    secret_file::write_secret,
 };
 
 /// Port of the gate for viewers unless another one is chosen; cameras have the next.
 pub const DEFAULT_PORT: u16 = 7450;
-/// Most holders at a time.
-pub const MAX_HOLDERS: usize = 256;
 /// Revoked holders that stay listed.
 const MAX_REVOKED: usize = 256;
 /// Largest file that is read, bytes.
@@ -30,33 +32,6 @@ const RING_DAYS: u64 = 3650;
 const LIST: &str = "ring.toml";
 const AUTHORITY: [&str; 2] = ["authority.pem", "authority-key.pem"];
 const OWN: [&str; 2] = ["rig.pem", "rig-key.pem"];
-
-/// Holder of a key.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Holder {
-    /// Its name.
-    pub name: String,
-    /// Role: the rights of the holder.
-    pub role: Role,
-    /// Its number among the holders, 0..[`MAX_HOLDERS`].
-    pub number: usize,
-    /// Time after which it is refused, RFC 3339.
-    pub expires: String,
-    /// SHA-256 of its certificate, hexadecimal.
-    pub fingerprint: String,
-    /// Whether it is refused.
-    #[serde(default)]
-    pub revoked: bool,
-}
-
-impl Holder {
-    /// Returns the time after which it is refused; a time that cannot be read is in the past.
-    #[must_use]
-    pub fn expires_at(&self) -> SystemTime {
-        humantime::parse_rfc3339(&self.expires).unwrap_or(UNIX_EPOCH)
-    }
-}
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -76,7 +51,7 @@ pub struct Ring {
     folder: PathBuf,
     list: List,
     authority: Authority,
-    own: Pair,
+    own: CertificatePair,
 }
 
 /// Without secrets.
@@ -94,23 +69,6 @@ pub(crate) fn fingerprint(certificate: &[u8]) -> String {
 
 fn unix_secs() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
-}
-
-/// Writes a file for its owner alone; it must not be there.
-pub(crate) fn write_secret(path: &Path, text: &str) -> Result<(), AccessError> {
-    let mut options = std::fs::OpenOptions::new();
-    options.write(true).create_new(true);
-    #[cfg(unix)]
-    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
-    let written = options
-        .open(path)
-        .and_then(|mut out| out.write_all(text.as_bytes()).inspect_err(|_| drop(std::fs::remove_file(path))));
-    written.map_err(|error| match error.kind() {
-        std::io::ErrorKind::AlreadyExists => {
-            AccessError::file(path, "is there already; choose another name, or move it away")
-        }
-        _ => AccessError::file(path, format!("cannot be written ({error})")),
-    })
 }
 
 fn read(path: &Path) -> Result<String, AccessError> {
@@ -182,7 +140,7 @@ impl Ring {
         let now = unix_secs();
         let valid = (now, now + RING_DAYS * 86_400);
         let (authority, secret) = Authority::new(&authority_name(&list), valid)?;
-        let own = authority.sign(&own_name(&list), hosts, Side::Server, valid)?;
+        let own = authority.sign(&own_name(&list), hosts, TlsSide::Server, valid)?;
         let failed = |error: std::io::Error| match error.kind() {
             std::io::ErrorKind::AlreadyExists => {
                 AccessError::file(folder, "is there already; name a new folder with --out")
@@ -210,7 +168,7 @@ impl Ring {
     pub fn open(folder: &Path) -> Result<Self, AccessError> {
         let list = read_list(folder)?;
         let pair = |names: [&str; 2]| {
-            Ok::<_, AccessError>(Pair {
+            Ok::<_, AccessError>(CertificatePair {
                 certificate: read(&folder.join(names[0]))?,
                 key: read(&folder.join(names[1]))?,
             })
@@ -264,7 +222,7 @@ impl Ring {
         format!("{}-{number}", self.list.id)
     }
 
-    pub(crate) fn own(&self) -> &Pair {
+    pub(crate) fn own(&self) -> &CertificatePair {
         &self.own
     }
 
@@ -346,7 +304,7 @@ impl Ring {
     }
 
     fn issue_until(&mut self, name: &str, role: Role, number: usize, end: u64) -> Result<KeyFile, AccessError> {
-        let pair = self.authority.sign(name, &[], Side::Client, (unix_secs(), end))?;
+        let pair = self.authority.sign(name, &[], TlsSide::Client, (unix_secs(), end))?;
         let der = CertificateDer::from_pem_slice(pair.certificate.as_bytes()).map_err(AccessError::system)?;
         let expires = humantime::format_rfc3339_seconds(UNIX_EPOCH + Duration::from_secs(end)).to_string();
         let holder =

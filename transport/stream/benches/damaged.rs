@@ -1,8 +1,8 @@
-//! Damaged messages: run time of each decoder against that of a valid message, by the thread's processor time.
+//! Run time of each decoder on damaged messages against that on a valid message, by the thread's processor time.
 //!
-//!     cargo run --release -p flyrig-stream --example damaged [INPUTS [GAUSSIANS]]
+//!     cargo bench -p flyrig-stream --bench damaged [-- INPUTS [GAUSSIANS]]
 //!
-//! Ends with an error when a decoder panics, or takes more than four times as long as the slowest valid message.
+//! Ends with an error when a decoder panics, or takes more than four times as long as for the slowest valid message.
 
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
@@ -16,9 +16,9 @@ use flyrig_stream::{
 };
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
-/// More than a valid message may take, as a multiple of it.
+/// Largest run time, as a multiple of that of a valid message.
 const MOST_TIMES: f64 = 4.0;
-/// Attempts at an input that took long: an interrupted one counts as its fastest.
+/// Attempts at a slow input, of which the fastest counts: an attempt may be interrupted.
 const ATTEMPTS: usize = 5;
 const JOINTS: usize = 24;
 const MESSAGES: u64 = 16;
@@ -34,7 +34,7 @@ fn time(work: &mut impl FnMut(&[u8]), input: &[u8]) -> Duration {
     cpu_time().saturating_sub(start)
 }
 
-/// A tube of joints with a graph of as many nodes as a real person has for its Gaussians.
+/// Builds a tube of joints with as many graph nodes per Gaussian as a real person has.
 fn template(gaussians: usize, random: &mut StdRng) -> Result<EncodedTemplate, Box<dyn std::error::Error>> {
     let nodes: Vec<[f32; 3]> = (0..gaussians / 70 + 1).map(|_| random.random()).collect();
     let joints: Vec<StreamJoint> = (0..JOINTS)
@@ -69,7 +69,7 @@ fn template(gaussians: usize, random: &mut StdRng) -> Result<EncodedTemplate, Bo
     Ok(source.encode()?)
 }
 
-/// Flips bits, sets bytes and numbers to extremes, cuts, doubles and mixes.
+/// Damages a message: flips bits, sets bytes and numbers to extremes, cuts, doubles and mixes.
 fn damage(valid: &[Vec<u8>], random: &mut StdRng, input: &mut Vec<u8>) {
     let pick = |random: &mut StdRng| &valid[random.random_range(0..valid.len())];
     input.clear();
@@ -106,7 +106,7 @@ fn damage(valid: &[Vec<u8>], random: &mut StdRng, input: &mut Vec<u8>) {
     }
 }
 
-/// Feeds a decoder; prints a row and returns whether it held.
+/// Feeds a decoder, prints a row, and returns whether the bound held.
 fn run(name: &str, inputs: u64, valid: &[Vec<u8>], mut decode: impl FnMut(&[u8])) -> bool {
     let mut slowest_valid = Duration::ZERO;
     for message in valid {
@@ -145,8 +145,9 @@ fn run(name: &str, inputs: u64, valid: &[Vec<u8>], mut decode: impl FnMut(&[u8])
 }
 
 fn main() -> Result<ExitCode, Box<dyn std::error::Error>> {
-    let number = |n: usize| std::env::args().nth(n).map(|text| text.parse::<u64>()).transpose();
-    let (inputs, gaussians) = (number(1)?.unwrap_or(1_000_000), number(2)?.unwrap_or(400) as usize);
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
+    let number = |n: usize| arguments.get(n).map(|text| text.parse::<u64>()).transpose();
+    let (inputs, gaussians) = (number(0)?.unwrap_or(1_000_000), number(1)?.unwrap_or(400) as usize);
     let mut random = StdRng::seed_from_u64(3);
     let encoded = template(gaussians, &mut random)?;
     let others: Vec<Vec<u8>> = [gaussians / 2, gaussians / 3]

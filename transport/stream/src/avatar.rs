@@ -8,21 +8,22 @@
 use alloc::vec::Vec;
 
 use crate::{
-    CODEC_VERSION, EncodedTemplate, Motion, Posed, StreamError, StreamTemplate, TemplateSource,
+    attributes::{AvatarAttributes, LIGHT_TERMS},
     bytes::Fields,
+    error::StreamError,
+    message::{AVATAR_MAGIC, CODEC_VERSION},
+    motion::Motion,
+    pose::Posed,
     srgb::Srgb,
-    template::{MAX_TEMPLATE_BYTES, template_hash},
+    template::{EncodedTemplate, MAX_TEMPLATE_BYTES, StreamTemplate, TemplateSource, template_hash},
 };
 
-pub(crate) const MAGIC: [u8; 3] = *b"FLA";
 const WHAT: &str = "avatar";
 /// Smallest scale, metres, and natural logarithm of the largest over it (0.1 m).
 const LEAST_SCALE_M: f32 = 2e-4;
 const SCALE_RANGE: f32 = 6.214_608;
 /// Planes of bytes.
 const PLANES: usize = 11;
-/// Terms of the light: 1, x, y, z, xy, yz, 3zz - 1, xz, xx - yy of the world's normal.
-pub const LIGHT_TERMS: usize = 9;
 /// Smallest and largest factor of the light.
 const SHADE: core::ops::RangeInclusive<f32> = 0.05..=4.0;
 /// Steps of a component of a rotation, whose range is 1/sqrt(2) to either side.
@@ -52,18 +53,6 @@ pub struct AvatarSource<'a> {
     pub light: [[f32; 3]; LIGHT_TERMS],
 }
 
-/// Shapes, colours and light of an avatar, in the template's order of Gaussians.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Avatar {
-    /// Standard deviations, metres; w: opacity.
-    scale_opacity: Vec<[f32; 4]>,
-    /// Canonical from the Gaussian's axes, a unit quaternion x, y, z, w.
-    rotation: Vec<[f32; 4]>,
-    /// Linear RGB without the light; w: opacity.
-    colors: Vec<[f32; 4]>,
-    light: [[f32; 3]; LIGHT_TERMS],
-}
-
 /// Shapes of an avatar's Gaussians in the world; both lists have one element a Gaussian.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PosedAxes {
@@ -90,7 +79,7 @@ impl AvatarSource<'_> {
         let inner = self.template.encode()?;
         let srgb = Srgb::new();
         let mut bytes = Vec::new();
-        bytes.extend(MAGIC);
+        bytes.extend(AVATAR_MAGIC);
         bytes.push(CODEC_VERSION);
         bytes.extend((inner.bytes.len() as u32).to_le_bytes());
         bytes.extend(&inner.bytes);
@@ -118,8 +107,8 @@ impl AvatarSource<'_> {
 ///
 /// # Errors
 /// [`StreamError::Version`] or [`StreamError::Malformed`].
-pub(crate) fn decode(bytes: &[u8]) -> Result<StreamTemplate, StreamError> {
-    let mut fields = Fields::of(WHAT, MAGIC, bytes)?;
+fn decode(bytes: &[u8]) -> Result<StreamTemplate, StreamError> {
+    let mut fields = Fields::new(WHAT, AVATAR_MAGIC, bytes)?;
     fields.check(bytes.len() <= MAX_TEMPLATE_BYTES, "it is too large")?;
     let length = fields.u32()? as usize;
     fields.check(length <= fields.bytes.len(), "it is cut short")?;
@@ -137,7 +126,7 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<StreamTemplate, StreamError> {
     fields.check(planes.len() == PLANES * count, "its planes are of another number of Gaussians")?;
     let srgb = Srgb::new();
     let at = |plane: usize, i: usize| planes[plane * count + i];
-    let mut avatar = Avatar {
+    let mut avatar = AvatarAttributes {
         scale_opacity: Vec::with_capacity(count),
         rotation: Vec::with_capacity(count),
         colors: Vec::with_capacity(count),
@@ -157,6 +146,14 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<StreamTemplate, StreamError> {
 }
 
 impl StreamTemplate {
+    /// Decodes a template, or an avatar.
+    ///
+    /// # Errors
+    /// [`StreamError::Version`] or [`StreamError::Malformed`].
+    pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
+        if bytes.starts_with(&AVATAR_MAGIC) { decode(bytes) } else { Self::decode_surface(bytes) }
+    }
+
     /// Whether the template has the colours: they are not sent apart.
     #[must_use]
     pub fn is_avatar(&self) -> bool {

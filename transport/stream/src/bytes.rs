@@ -1,6 +1,6 @@
 //! Little-endian fields.
 
-use crate::StreamError;
+use crate::{error::StreamError, message::CODEC_VERSION};
 
 /// Takes fields off the front of a message.
 pub(crate) struct Fields<'a> {
@@ -10,14 +10,14 @@ pub(crate) struct Fields<'a> {
 }
 
 impl<'a> Fields<'a> {
-    /// Of a message that begins with a magic number and the codec's version.
-    pub fn of(what: &'static str, magic: [u8; 3], bytes: &'a [u8]) -> Result<Self, StreamError> {
+    /// Reads the first letters and the codec's version of a message, and refuses others.
+    pub fn new(what: &'static str, magic: [u8; 3], bytes: &'a [u8]) -> Result<Self, StreamError> {
         let mut fields = Self { what, bytes };
         if fields.take::<3>()? != magic {
             return Err(StreamError::Malformed { what, problem: "it does not begin with the message's three letters" });
         }
         match fields.take::<1>()? {
-            [crate::CODEC_VERSION] => Ok(fields),
+            [CODEC_VERSION] => Ok(fields),
             [found] => Err(StreamError::Version { what, found }),
         }
     }

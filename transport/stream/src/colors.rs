@@ -11,20 +11,22 @@ use alloc::{vec, vec::Vec};
 use core::ops::Range;
 
 use crate::{
-    EncodedTemplate, MAX_MESSAGE_BYTES, Stamp, StreamError, StreamTemplate,
     bytes::Fields,
     coefficients::{CoefficientModel, GROUP, Levels},
+    error::StreamError,
     integers::MOST,
+    message::{COLOR_MAGIC, MAX_MESSAGE_BYTES},
     quantise::quantise,
     range_coder::{BitCoder, Probability, RangeDecoder, RangeEncoder},
     srgb::Srgb,
+    stamp::Stamp,
+    template::{EncodedTemplate, StreamTemplate},
     tree::{CHANNELS, HaarTree, Steps},
 };
 
 /// Layers, from coarse to fine: a viewer can show any number of the first ones.
 pub const LAYERS: usize = 3;
 
-pub(crate) const MAGIC: [u8; 3] = *b"FLC";
 const WHAT: &str = "colour message";
 /// Step of the two colour differences against that of the brightness.
 const CHROMA: f32 = 1.8;
@@ -201,7 +203,7 @@ impl ColorEncoder {
     fn encode_layer(&mut self, stamp: Stamp, layer: usize, max_bytes: usize) -> Vec<u8> {
         let segments = self.tree.segments();
         let LayerState { sequence, first, .. } = self.layers[layer];
-        let mut bytes = stamp.begin(MAGIC);
+        let mut bytes = stamp.begin(COLOR_MAGIC);
         bytes.extend(self.epoch.to_le_bytes());
         bytes.extend(self.settings.step.to_le_bytes());
         bytes.extend(sequence.to_le_bytes());
@@ -325,7 +327,7 @@ impl ColorDecoder {
     /// # Errors
     /// [`StreamError`]; a message of another template changes nothing.
     pub fn take(&mut self, bytes: &[u8]) -> Result<Stamp, StreamError> {
-        let mut fields = Fields::of(WHAT, MAGIC, bytes)?;
+        let mut fields = Fields::new(WHAT, COLOR_MAGIC, bytes)?;
         fields.check(bytes.len() <= MAX_MESSAGE_BYTES, "it is too large")?;
         let stamp = Stamp::read(&mut fields)?;
         if stamp.template != self.template {

@@ -2,6 +2,8 @@
 
 use core::fmt;
 
+use crate::message::CODEC_VERSION;
+
 /// Why something cannot be encoded or decoded.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum StreamError {
@@ -35,7 +37,7 @@ impl fmt::Display for StreamError {
                 f,
                 "the {what} has version {found} of the person stream, this program reads version {}; update the older of the two \
                  programs",
-                crate::CODEC_VERSION
+                CODEC_VERSION
             ),
             Self::Malformed { what, problem } => write!(f, "the {what} is damaged: {problem}"),
             Self::OtherTemplate { what } => write!(f, "the {what} belongs to another template"),

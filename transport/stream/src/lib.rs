@@ -21,6 +21,7 @@ extern crate alloc;
 #[cfg(test)]
 extern crate std;
 
+mod attributes;
 mod avatar;
 mod bytes;
 mod coefficients;
@@ -29,6 +30,7 @@ mod color_tests;
 mod colors;
 mod error;
 mod integers;
+mod message;
 mod motion;
 mod nodes;
 mod order;
@@ -38,6 +40,7 @@ mod pose;
 mod pose_tests;
 mod quantise;
 mod range_coder;
+mod splats;
 mod srgb;
 mod stamp;
 mod template;
@@ -46,16 +49,13 @@ mod template;
 mod testing;
 mod tree;
 
-pub use avatar::{AvatarGaussian, AvatarSource, LIGHT_TERMS, PosedAxes};
+pub use attributes::LIGHT_TERMS;
+pub use avatar::{AvatarGaussian, AvatarSource, PosedAxes};
 pub use colors::{ColorDecoder, ColorEncoder, ColorSettings, LAYERS};
 pub use error::StreamError;
+pub use message::{CODEC_VERSION, MAX_MESSAGE_BYTES};
 pub use motion::{Motion, MotionEncoder};
 pub use pose::Posed;
+pub use splats::{MAX_SPLAT_BYTES, MAX_SPLATS, SplatError, SplatState};
 pub use stamp::{Stamp, restamp, stamp_of};
 pub use template::{EncodedTemplate, MAX_TEMPLATE_BYTES, StreamJoint, StreamTemplate, TemplateSource, template_hash};
-
-/// Version of every message of this codec.
-pub const CODEC_VERSION: u8 = 2;
-
-/// Most bytes of a message that is not a template: with zenoh's own header it fits in one of its batches of 65,535 bytes.
-pub const MAX_MESSAGE_BYTES: usize = 65_000;

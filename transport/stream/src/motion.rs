@@ -3,14 +3,16 @@
 use alloc::{vec, vec::Vec};
 
 use crate::{
-    EncodedTemplate, MAX_MESSAGE_BYTES, Stamp, StreamError, StreamTemplate,
     bytes::Fields,
+    error::StreamError,
+    message::{MAX_MESSAGE_BYTES, MOTION_MAGIC},
     nodes::{Prediction, code_nodes},
     quantise::quantise,
     range_coder::{RangeDecoder, RangeEncoder},
+    stamp::Stamp,
+    template::{EncodedTemplate, StreamTemplate},
 };
 
-pub(crate) const MAGIC: [u8; 3] = *b"FLM";
 const WHAT: &str = "motion";
 /// Step of node translations, metres: an error of 0.12 mm.
 const NODE_STEP_M: f32 = 4e-4;
@@ -69,7 +71,7 @@ impl MotionEncoder {
         if !root.iter().all(|v| v.abs() < f64::from(i32::MAX)) {
             return fail("the root's position is not finite");
         }
-        let mut bytes = Stamp { template: self.template, ..motion.stamp }.begin(MAGIC);
+        let mut bytes = Stamp { template: self.template, ..motion.stamp }.begin(MOTION_MAGIC);
         bytes.extend(root.iter().flat_map(|v| (*v as i32).to_le_bytes()));
         for rotation in &motion.joint_rotations {
             let Some(packed) = pack(*rotation) else { return fail("a rotation is not of unit length") };
@@ -99,7 +101,7 @@ impl Motion {
     /// # Errors
     /// [`StreamError`].
     pub fn decode(bytes: &[u8], template: &StreamTemplate) -> Result<Self, StreamError> {
-        let mut fields = Fields::of(WHAT, MAGIC, bytes)?;
+        let mut fields = Fields::new(WHAT, MOTION_MAGIC, bytes)?;
         fields.check(bytes.len() <= MAX_MESSAGE_BYTES, "it is too large")?;
         let stamp = Stamp::read(&mut fields)?;
         if stamp.template != template.hash {

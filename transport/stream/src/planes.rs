@@ -60,6 +60,24 @@ impl Influences {
     }
 }
 
+/// Sum of the squared distances between the nodes of a Gaussian that have a weight, square metres; those must come first.
+#[inline]
+pub(crate) fn spread(on: &Influences, place: impl Fn(usize) -> [f32; 3]) -> f32 {
+    // From the first of n nodes at distances d: n times the sum of |d|^2, less |sum of d|^2.
+    let first = place(on.index[0] as usize);
+    let (mut sum, mut squares, mut count) = ([0.0; 3], 0.0, 1.0);
+    for (node, _) in on.shares().skip(1) {
+        let other = place(node);
+        for k in 0..3 {
+            let apart = other[k] - first[k];
+            sum[k] += apart;
+            squares += apart * apart;
+        }
+        count += 1.0;
+    }
+    count * squares - sum.iter().map(|v| v * v).sum::<f32>()
+}
+
 /// Probabilities of all planes.
 #[derive(Debug, Default)]
 pub(crate) struct GaussianModel {

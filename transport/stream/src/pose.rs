@@ -2,7 +2,7 @@
 
 use alloc::vec::Vec;
 
-use crate::{Motion, StreamTemplate, planes::Influences};
+use crate::{motion::Motion, planes::spread, template::StreamTemplate};
 
 /// Gaussians overlap enough to close a surface that is longer than at rest by this factor.
 const CLOSED: f32 = 1.25;
@@ -32,24 +32,6 @@ impl Node {
         let by = motion.nodes.get(node).copied().unwrap_or_default();
         Self { place: core::array::from_fn(|k| rest[k] + by[k]), by }
     }
-}
-
-/// Sum of the squared distances between the nodes of a Gaussian that have a weight, square metres; those must come first.
-#[inline]
-pub(crate) fn spread(on: &Influences, place: impl Fn(usize) -> [f32; 3]) -> f32 {
-    // From the first of n nodes at distances d: n times the sum of |d|^2, less |sum of d|^2.
-    let first = place(on.index[0] as usize);
-    let (mut sum, mut squares, mut count) = ([0.0; 3], 0.0, 1.0);
-    for (node, _) in on.shares().skip(1) {
-        let other = place(node);
-        for k in 0..3 {
-            let apart = other[k] - first[k];
-            sum[k] += apart;
-            squares += apart * apart;
-        }
-        count += 1.0;
-    }
-    count * squares - sum.iter().map(|v| v * v).sum::<f32>()
 }
 
 /// Returns the factor by which a Gaussian grows with the surface between its nodes, by their spread at rest and now: the formula and the

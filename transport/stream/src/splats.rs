@@ -1,29 +1,23 @@
-//! The splat stream: the whole state of one instant, quantised.
+//! Splat state: all Gaussians of a person at one instant, quantised.
 //!
-//! Layout, little-endian: 64 bytes of header, then three planes, each one entry a Gaussian: position
-//! (3 x u16 inside the bounding box), standard deviation (u16, of the largest), colour (sRGB red,
-//! green, blue, opacity; 4 x u8).
+//! Layout, little-endian: a header of 64 bytes, then three planes with one entry per Gaussian: position (3 x u16 inside the bounding
+//! box), standard deviation (u16, relative to the largest), colour (sRGB red, green, blue, opacity; 4 x u8). A Gaussian keeps its
+//! index over time.
 //!
-//! Seam: a Gaussian keeps its index over time. A later stream can send canonical positions and
-//! skinning once and then only poses and displacements beside this one.
+//! The `flags` word of the header is 0 for person 0. Bit 1 says that the last four bytes of the header hold the number of another
+//! person. A reader refuses unknown bits, so a reader older than bit 1 refuses all persons but the first.
 //!
-//! The `flags` word of the header is 0 for the first person. Bit 1 says that the header's last four bytes hold the number
-//! of another person; a reader refuses other bits, and one older than that bit refuses other persons.
-//!
-//! No general compressor behind it: deflate at its fastest takes 115k Gaussians to 0.87 of the size, to 0.68
-//! when sorted into byte planes, for 24 to 32 ms a state, while encoding takes 3 to 4 ms.
+//! There is no general compressor behind it: on 115k Gaussians, deflate at its fastest level reaches 0.87 of the size, and 0.68 when
+//! the bytes are sorted into planes, but takes 24 to 32 ms per state; encoding takes 3 to 4 ms.
 
-use std::sync::LazyLock;
-
-use crate::{SCHEMA_VERSION, TransportError, header::Reader};
+use alloc::{borrow::ToOwned as _, format, string::String, vec::Vec};
+use core::fmt;
 
 /// Most Gaussians in a state.
 pub const MAX_SPLATS: usize = 1 << 22;
 
-/// Persons, the first one aside, whose splats have a topic at a time; beyond it the one that was published longest ago
-/// loses its topic.
-pub const MAX_PERSON_TOPICS: usize = 16;
-
+/// Version of the layout.
+const VERSION: u16 = 1;
 const MAGIC: [u8; 4] = *b"FLSP";
 const HEADER: usize = 64;
 const PER_SPLAT: usize = 12;
@@ -31,12 +25,62 @@ const PER_SPLAT: usize = 12;
 const HAS_PERSON: u16 = 2;
 
 /// Largest encoded state, bytes.
-pub(crate) const MAX_BYTES: usize = HEADER + MAX_SPLATS * PER_SPLAT;
+pub const MAX_SPLAT_BYTES: usize = HEADER + MAX_SPLATS * PER_SPLAT;
 
-/// Gaussians as the renderer keeps them; both vectors have one element a Gaussian.
+/// Error of encoding or decoding a [`SplatState`].
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum SplatError {
+    /// The state cannot be encoded.
+    State(String),
+    /// The bytes have another version of the layout.
+    Version(u16),
+    /// The bytes are damaged, or are no splat state.
+    Malformed(String),
+}
+
+impl fmt::Display for SplatError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::State(problem) | Self::Malformed(problem) => f.write_str(problem),
+            Self::Version(found) => write!(
+                f,
+                "speaks schema version {found}, this program knows version {VERSION}; run the same flyrig on both sides"
+            ),
+        }
+    }
+}
+
+impl core::error::Error for SplatError {}
+
+/// Takes fixed-size pieces off the front of a byte slice.
+struct Reader<'a>(&'a [u8]);
+
+impl Reader<'_> {
+    fn take<const N: usize>(&mut self) -> Result<[u8; N], SplatError> {
+        let short = || SplatError::Malformed("the splat header is cut short".to_owned());
+        let (piece, rest) = self.0.split_first_chunk::<N>().ok_or_else(short)?;
+        self.0 = rest;
+        Ok(*piece)
+    }
+}
+
+/// Gaussians of one person in the world; both vectors have one element per Gaussian.
+///
+/// ```
+/// use flyrig_stream::SplatState;
+///
+/// let state = SplatState {
+///     center_scale: vec![[0.0, 0.0, 1.0, 0.004], [0.1, 0.0, 1.2, 0.002]],
+///     color: vec![[0.5, 0.2, 0.1, 1.0]; 2],
+///     ..SplatState::default()
+/// };
+/// let found = SplatState::decode(&state.encode()?)?;
+/// assert!((found.center_scale[1][2] - 1.2).abs() <= state.position_error_m()[2]);
+/// # Ok::<(), flyrig_stream::SplatError>(())
+/// ```
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct SplatState {
-    /// Which person, 0 for the first; the same number is the same person as long as it is followed.
+    /// Number of the person, 0 for the first; it stays the same while the person is tracked.
     pub person: u32,
     /// The rig's frame number.
     pub frame: u64,
@@ -46,39 +90,39 @@ pub struct SplatState {
     pub center_scale: Vec<[f32; 4]>,
     /// Linear RGB in 0..=1; w: opacity in 0..=1.
     pub color: Vec<[f32; 4]>,
-    /// Gaussians that were not finite when encoded: they arrive transparent and of size 0, in their place.
+    /// Number of Gaussians that were not finite when encoded: they arrive transparent and of size 0, at their index.
     pub invalid: u32,
 }
 
 impl SplatState {
-    /// Largest error of a coordinate after [`Self::encode`] and [`Self::decode`], metres, an axis each:
-    /// half a step of the bounding box and the rounding of `f32`.
+    /// Returns the largest coordinate error after [`Self::encode`] and [`Self::decode`], metres per axis: half a step of the bounding
+    /// box plus the rounding of `f32`.
     #[must_use]
     pub fn position_error_m(&self) -> [f32; 3] {
         let Bounds { min, max, .. } = Bounds::of(self);
-        std::array::from_fn(|axis| {
+        core::array::from_fn(|axis| {
             let magnitude = min[axis].abs().max(max[axis].abs());
             0.5 * (max[axis] - min[axis]) / LEVELS + 2.0 * f32::EPSILON * magnitude
         })
     }
 
-    /// Quantises the state.
+    /// Quantises and encodes the state.
     ///
     /// # Errors
-    /// `Config` when the two vectors differ in length or hold more than [`MAX_SPLATS`].
-    pub fn encode(&self) -> Result<Vec<u8>, TransportError> {
+    /// [`SplatError::State`] when the two vectors differ in length or hold more than [`MAX_SPLATS`].
+    pub fn encode(&self) -> Result<Vec<u8>, SplatError> {
         let count = self.center_scale.len();
         if self.color.len() != count {
             let colors = self.color.len();
-            return Err(TransportError::config("splats", format!("{count} positions but {colors} colours")));
+            return Err(SplatError::State(format!("{count} positions but {colors} colours")));
         }
         if count > MAX_SPLATS {
-            return Err(TransportError::config("splats", format!("{count} Gaussians, at most {MAX_SPLATS}")));
+            return Err(SplatError::State(format!("{count} Gaussians, at most {MAX_SPLATS}")));
         }
         let bounds = Bounds::of(self);
         let mut bytes = Vec::with_capacity(HEADER + count * PER_SPLAT);
         bytes.extend_from_slice(&MAGIC);
-        bytes.extend_from_slice(&SCHEMA_VERSION.to_le_bytes());
+        bytes.extend_from_slice(&VERSION.to_le_bytes());
         let flags = if self.person == 0 { 0 } else { HAS_PERSON };
         bytes.extend_from_slice(&flags.to_le_bytes());
         bytes.extend_from_slice(&self.frame.to_le_bytes());
@@ -91,6 +135,7 @@ impl SplatState {
         bytes.extend_from_slice(&self.person.to_le_bytes());
         bytes.resize(HEADER + count * PER_SPLAT, 0);
 
+        let srgb = SrgbTable::new();
         let per_metre = bounds.extent().map(|extent| if extent > 0.0 { LEVELS / extent } else { 0.0 });
         let per_scale = if bounds.max_scale > 0.0 { LEVELS / bounds.max_scale } else { 0.0 };
         let (positions, rest) = bytes[HEADER..].split_at_mut(count * 6);
@@ -101,47 +146,46 @@ impl SplatState {
                 continue; // zeros: transparent, of size 0
             }
             for axis in 0..3 {
-                let level = ((splat[axis] - bounds.min[axis]) * per_metre[axis]).round() as u16;
+                let level = libm::roundf((splat[axis] - bounds.min[axis]) * per_metre[axis]) as u16;
                 position[2 * axis..2 * axis + 2].copy_from_slice(&level.to_le_bytes());
             }
-            scale.copy_from_slice(&((splat[3].max(0.0) * per_scale).round() as u16).to_le_bytes());
+            scale.copy_from_slice(&(libm::roundf(splat[3].max(0.0) * per_scale) as u16).to_le_bytes());
             for channel in 0..3 {
-                rgba[channel] = SRGB.encode(color[channel]);
+                rgba[channel] = srgb.encode(color[channel]);
             }
-            rgba[3] = (color[3].clamp(0.0, 1.0) * 255.0).round() as u8;
+            rgba[3] = libm::roundf(color[3].clamp(0.0, 1.0) * 255.0) as u8;
         }
         Ok(bytes)
     }
 
-    /// The state out of its bytes.
+    /// Decodes a state.
     ///
     /// # Errors
-    /// `UnknownVersion`, or `Malformed` when counts, sizes or numbers do not fit; nothing is allocated before
-    /// the count is known to fit the bytes.
-    pub fn decode(bytes: &[u8]) -> Result<Self, TransportError> {
-        let malformed = |message: String| TransportError::malformed("splats", message);
-        let short = || malformed("the splat header is cut short".to_owned());
+    /// [`SplatError::Version`], or [`SplatError::Malformed`] when counts, sizes or numbers do not fit; nothing is allocated before the
+    /// count is known to fit the bytes.
+    pub fn decode(bytes: &[u8]) -> Result<Self, SplatError> {
+        let malformed = |message: String| SplatError::Malformed(message);
         let mut reader = Reader(bytes);
-        if reader.take::<4>() != Some(MAGIC) {
+        if reader.take::<4>() != Ok(MAGIC) {
             return Err(malformed("not a splat state: wrong first four bytes".to_owned()));
         }
-        let version = reader.take().map(u16::from_le_bytes).ok_or_else(short)?;
-        if version != SCHEMA_VERSION {
-            return Err(TransportError::version("splats", version));
+        let version = u16::from_le_bytes(reader.take()?);
+        if version != VERSION {
+            return Err(SplatError::Version(version));
         }
-        let flags = reader.take().map(u16::from_le_bytes).ok_or_else(short)?;
+        let flags = u16::from_le_bytes(reader.take()?);
         if flags & !HAS_PERSON != 0 {
             return Err(malformed(format!("flags {flags:#x} are not known to this version")));
         }
-        let frame = u64::from_le_bytes(reader.take().ok_or_else(short)?);
-        let capture_nanos = i64::from_le_bytes(reader.take().ok_or_else(short)?);
-        let count = u32::from_le_bytes(reader.take().ok_or_else(short)?) as usize;
-        let invalid = u32::from_le_bytes(reader.take().ok_or_else(short)?);
+        let frame = u64::from_le_bytes(reader.take()?);
+        let capture_nanos = i64::from_le_bytes(reader.take()?);
+        let count = u32::from_le_bytes(reader.take()?) as usize;
+        let invalid = u32::from_le_bytes(reader.take()?);
         let mut numbers = [0.0f32; 7];
         for number in &mut numbers {
-            *number = f32::from_le_bytes(reader.take().ok_or_else(short)?);
+            *number = f32::from_le_bytes(reader.take()?);
         }
-        let person = u32::from_le_bytes(reader.take().ok_or_else(short)?);
+        let person = u32::from_le_bytes(reader.take()?);
         // Without the flag these bytes mean nothing.
         let person = if flags == HAS_PERSON { person } else { 0 };
         if count > MAX_SPLATS {
@@ -163,6 +207,7 @@ impl SplatState {
 
         let (positions, rest) = planes.split_at(count * 6);
         let (scales, colors) = rest.split_at(count * 2);
+        let linear = SrgbTable::linear();
         let step = bounds.extent().map(|extent| extent / LEVELS);
         let level = |pair: &[u8]| f32::from(u16::from(pair[0]) | u16::from(pair[1]) << 8);
         let center_scale = positions
@@ -176,12 +221,8 @@ impl SplatState {
         let color = colors
             .chunks_exact(4)
             .map(|c| {
-                [
-                    SRGB.linear[c[0] as usize],
-                    SRGB.linear[c[1] as usize],
-                    SRGB.linear[c[2] as usize],
-                    f32::from(c[3]) / 255.0,
-                ]
+                let [r, g, b] = [c[0], c[1], c[2]].map(|code| linear[usize::from(code)]);
+                [r, g, b, f32::from(c[3]) / 255.0]
             })
             .collect();
         Ok(Self { person, frame, capture_nanos, center_scale, color, invalid })
@@ -191,7 +232,7 @@ impl SplatState {
 /// Steps of a 16-bit code.
 const LEVELS: f32 = 65_535.0;
 
-/// Positions beyond this are treated as not finite: their box would leave nothing to the others.
+/// Largest coordinate, metres; a Gaussian beyond it counts as not finite, since its bounding box would leave no precision to the others.
 const MAX_COORDINATE_M: f32 = 1e4;
 
 fn is_valid(splat: &[f32; 4], color: &[f32; 4]) -> bool {
@@ -226,36 +267,36 @@ impl Bounds {
     }
 
     fn extent(&self) -> [f32; 3] {
-        std::array::from_fn(|axis| self.max[axis] - self.min[axis])
+        core::array::from_fn(|axis| self.max[axis] - self.min[axis])
     }
 }
 
 /// sRGB (IEC 61966-2-1) by tables: a first guess by 4096 equal steps, then the exact boundary.
 struct SrgbTable {
-    /// Linear value of each code.
-    linear: [f32; 256],
     /// Linear value from which code `i + 1` is nearer in sRGB than code `i`.
     boundary: [f32; 255],
     /// Code at the start of each of 4096 equal steps of linear light.
     guess: Vec<u8>,
 }
 
-static SRGB: LazyLock<SrgbTable> = LazyLock::new(SrgbTable::new);
-
 fn linear_from_srgb(srgb: f64) -> f64 {
-    if srgb <= 0.040_45 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) }
+    if srgb <= 0.040_45 { srgb / 12.92 } else { libm::pow((srgb + 0.055) / 1.055, 2.4) }
 }
 
 impl SrgbTable {
     const STEPS: usize = 4096;
 
+    /// Returns the linear value of each code.
+    fn linear() -> [f32; 256] {
+        core::array::from_fn(|code| linear_from_srgb(code as f64 / 255.0) as f32)
+    }
+
     fn new() -> Self {
-        let linear = std::array::from_fn(|code| linear_from_srgb(code as f64 / 255.0) as f32);
-        let boundary: [f32; 255] = std::array::from_fn(|code| linear_from_srgb((code as f64 + 0.5) / 255.0) as f32);
+        let boundary: [f32; 255] = core::array::from_fn(|code| linear_from_srgb((code as f64 + 0.5) / 255.0) as f32);
         let guess = (0..Self::STEPS)
             .map(|step| boundary.partition_point(|edge| *edge <= step as f32 / Self::STEPS as f32) as u8)
             .collect();
-        Self { linear, boundary, guess }
+        Self { boundary, guess }
     }
 
     fn encode(&self, linear: f32) -> u8 {
@@ -271,17 +312,20 @@ impl SrgbTable {
 
 #[cfg(test)]
 mod tests {
+    use std::{string::ToString as _, vec};
+
     use super::*;
 
     #[test]
     fn srgb_table_agrees_with_the_formula() {
+        let table = SrgbTable::new();
         for i in 0..=100_000 {
             let linear = i as f64 / 100_000.0;
             let srgb = if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
-            let code = f64::from(SRGB.encode(linear as f32));
+            let code = f64::from(table.encode(linear as f32));
             assert!((code - srgb * 255.0).abs() < 0.5 + 1e-3, "{linear}: {code} {}", srgb * 255.0);
         }
-        assert_eq!((SRGB.encode(-1.0), SRGB.encode(7.0), SRGB.encode(f32::NAN)), (0, 255, 0));
+        assert_eq!((table.encode(-1.0), table.encode(7.0), table.encode(f32::NAN)), (0, 255, 0));
     }
 
     #[test]
@@ -304,8 +348,19 @@ mod tests {
 
     #[test]
     fn every_colour_code_survives() {
-        for code in 0..=255u8 {
-            assert_eq!(SRGB.encode(SRGB.linear[code as usize]), code);
+        let table = SrgbTable::new();
+        for (code, linear) in (0..=255u8).zip(SrgbTable::linear()) {
+            assert_eq!(table.encode(linear), code);
+        }
+    }
+
+    /// The power of `libm` and that of the system differ at most in the last bit of `f64`, which the rounding to `f32` hides.
+    #[test]
+    fn the_tables_are_those_of_the_standard_library() {
+        let of_std = |srgb: f64| if srgb <= 0.040_45 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) };
+        for half in 0..=510 {
+            let srgb = f64::from(half) / 2.0 / 255.0;
+            assert_eq!((linear_from_srgb(srgb) as f32).to_bits(), (of_std(srgb) as f32).to_bits(), "{half}");
         }
     }
 }

@@ -2,7 +2,11 @@
 
 use alloc::vec::Vec;
 
-use crate::{CODEC_VERSION, StreamError, bytes::Fields};
+use crate::{
+    bytes::Fields,
+    error::StreamError,
+    message::{CODEC_VERSION, COLOR_MAGIC, MOTION_MAGIC},
+};
 
 /// Bytes before a stamp: three letters and the version.
 const STAMP_AT: usize = 4;
@@ -46,8 +50,8 @@ impl Stamp {
 /// # Errors
 /// [`StreamError`].
 pub fn stamp_of(bytes: &[u8]) -> Result<Stamp, StreamError> {
-    let magic = if bytes.starts_with(&crate::colors::MAGIC) { crate::colors::MAGIC } else { crate::motion::MAGIC };
-    Stamp::read(&mut Fields::of("message of the person stream", magic, bytes)?)
+    let magic = if bytes.starts_with(&COLOR_MAGIC) { COLOR_MAGIC } else { MOTION_MAGIC };
+    Stamp::read(&mut Fields::new("message of the person stream", magic, bytes)?)
 }
 
 /// Gives a motion or a message of colours another capture time, and colours another epoch: for recordings that are played
@@ -61,7 +65,7 @@ pub fn restamp(bytes: &mut [u8], capture_nanos: i64, epochs_later: u32) -> Resul
     if let Some(field) = bytes.get_mut(end - 8..end) {
         field.copy_from_slice(&capture_nanos.to_le_bytes());
     }
-    if bytes.starts_with(&crate::colors::MAGIC)
+    if bytes.starts_with(&COLOR_MAGIC)
         && let Some(field) = bytes.get_mut(end..).and_then(<[u8]>::first_chunk_mut::<4>)
     {
         *field = u32::from_le_bytes(*field).wrapping_add(epochs_later).to_le_bytes();

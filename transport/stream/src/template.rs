@@ -3,15 +3,16 @@
 use alloc::vec::Vec;
 
 use crate::{
-    CODEC_VERSION, StreamError,
-    avatar::{self, Avatar},
+    attributes::AvatarAttributes,
     bytes::Fields,
+    error::StreamError,
+    message::{CODEC_VERSION, TEMPLATE_MAGIC},
     nodes::{Prediction, predictions},
     order::spatial_order,
     planes::{
         GaussianModel, Influences, NORMAL_LEVELS, POSITION_LEVELS, Quantised, SCALE_LEVELS, normal_of, octahedral,
+        spread,
     },
-    pose::spread,
     range_coder::{RangeDecoder, RangeEncoder},
 };
 
@@ -28,7 +29,6 @@ const LEAST_BYTES: usize = 5;
 /// Largest coordinate, metres.
 const MAX_COORDINATE_M: f32 = 1e4;
 
-const MAGIC: [u8; 3] = *b"FLT";
 const WHAT: &str = "template";
 
 /// A joint of the skeleton.
@@ -72,14 +72,14 @@ pub struct StreamTemplate {
     /// Joints and nodes that move a Gaussian, those that have a weight first.
     pub(crate) skin: Vec<Influences>,
     pub(crate) node_weights: Vec<Influences>,
-    /// Spread of a Gaussian's nodes at rest, square metres: see [`crate::pose::spread`].
+    /// Spread of a Gaussian's nodes at rest, square metres: see [`spread`].
     pub(crate) rest_spread: Vec<f32>,
     /// Canonical positions of the nodes, metres: each that of the Gaussian which hangs on it most.
     pub(crate) node_places: Vec<[f32; 3]>,
     /// Prediction of each node of a motion.
     pub(crate) predictions: Vec<Prediction>,
     /// Axes and colours of a person who is driven by poses alone.
-    pub(crate) avatar: Option<Avatar>,
+    pub(crate) avatar: Option<AvatarAttributes>,
 }
 
 /// A template with its bytes and the source's order.
@@ -123,7 +123,7 @@ impl TemplateSource<'_> {
         let per_scale = if largest > 0.0 { SCALE_LEVELS / largest } else { 0.0 };
 
         let mut bytes = Vec::new();
-        bytes.extend(MAGIC);
+        bytes.extend(TEMPLATE_MAGIC);
         bytes.push(CODEC_VERSION);
         // Planes beyond those of an isotropic surface: none yet.
         bytes.extend(0u32.to_le_bytes());
@@ -161,7 +161,7 @@ impl TemplateSource<'_> {
         let mut bytes = encoder.finish();
         // Gaussians that resemble one another take fewer; a decoder reads zeros behind the end anyway.
         bytes.resize(bytes.len().max(head + LEAST_BYTES * count), 0);
-        let template = StreamTemplate::decode(&bytes)?;
+        let template = StreamTemplate::decode_surface(&bytes)?;
         Ok(EncodedTemplate { template, bytes, gaussian_order, node_order })
     }
 
@@ -208,16 +208,9 @@ fn is_parent(parent: Option<u16>, index: usize) -> bool {
 }
 
 impl StreamTemplate {
-    /// Reads a template's bytes, or an avatar's.
-    ///
-    /// # Errors
-    /// [`StreamError::Version`] or [`StreamError::Malformed`].
-    pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
-        if bytes.starts_with(&avatar::MAGIC) { avatar::decode(bytes) } else { Self::decode_surface(bytes) }
-    }
-
+    /// Decodes a template without axes and colours.
     pub(crate) fn decode_surface(bytes: &[u8]) -> Result<Self, StreamError> {
-        let mut fields = Fields::of(WHAT, MAGIC, bytes)?;
+        let mut fields = Fields::new(WHAT, TEMPLATE_MAGIC, bytes)?;
         fields.check(bytes.len() <= MAX_TEMPLATE_BYTES, "it is too large")?;
         let planes = fields.u32()?;
         fields.check(planes == 0, "it has planes that this program does not know; update it")?;

@@ -1,9 +1,8 @@
-//! What the transport takes and gives on loopback, two processes:
-//! `cargo run --release -p flyrig-transport --example throughput [-- SECONDS]`.
+//! Throughput and latency of the transport on loopback between two processes:
+//! `cargo bench -p flyrig-transport --bench throughput [-- SECONDS]`.
 //!
-//! Prints duration of the publish calls, latency from the call to the receipt in the other process,
-//! rates and losses: 60 kB images of four views and splat states of 115k Gaussians, at 30 a second and
-//! as fast as they go, with and without shared memory.
+//! Prints the duration of the publish calls, the latency from the call to the receipt in the other process, rates and losses: 60 kB
+//! images of four views and splat states of 115k Gaussians, at 30 per second and at full speed, with and without shared memory.
 
 use std::{
     io::Read,
@@ -13,7 +12,7 @@ use std::{
 };
 
 use flyrig_transport::{
-    ImageFormat, Interests, Publisher, SplatState, Subscriber, TransportConfig, TransportError, ViewFrame, Views,
+    ImageFormat, Interests, Publisher, SplatError, SplatState, Subscriber, TransportConfig, ViewFrame, Views,
 };
 
 const GAUSSIANS: usize = 115_000;
@@ -23,7 +22,7 @@ const VIEWS: [&str; 4] = ["front", "left", "back", "right"];
 type Failure = Box<dyn std::error::Error>;
 
 fn main() -> Result<(), Failure> {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
     if let [word, endpoint, shared_memory, seconds] = arguments.as_slice()
         && word == "watch"
     {
@@ -32,7 +31,7 @@ fn main() -> Result<(), Failure> {
     }
     let seconds: f64 = arguments.first().map_or(Ok(3.0), |seconds| seconds.parse())?;
     codec()?;
-    println!("\nload            shm  publish us p50/p99  latency ms p50/p99/max  MiB/s  a second  missed");
+    println!("\nload            shm  publish us p50/p99  latency ms p50/p99/max  MiB/s  per sec.  missed");
     for shared_memory in [true, false] {
         for load in [Load::Views, Load::Splats, Load::FastViews, Load::FastSplats] {
             measure(load, shared_memory, seconds)?;
@@ -49,7 +48,7 @@ enum Load {
     FastSplats,
 }
 
-/// A person-sized cloud with smooth colours.
+/// Returns a person-sized cloud with smooth colours.
 fn state(frame: u64) -> SplatState {
     let mut numbers = (0u32..).map(|i| f32::from((i.wrapping_mul(2_654_435_761) >> 16) as u16) / 65_535.0);
     let mut next = || numbers.next().unwrap_or_default();
@@ -63,17 +62,17 @@ fn state(frame: u64) -> SplatState {
     SplatState { person: 0, frame, capture_nanos: 0, center_scale, color, invalid: 0 }
 }
 
-fn codec() -> Result<(), TransportError> {
+fn codec() -> Result<(), SplatError> {
     let state = state(1);
     let bytes = state.encode()?;
-    let time = |work: &dyn Fn() -> Result<(), TransportError>| {
+    let time = |work: &dyn Fn() -> Result<(), SplatError>| {
         let mut millis = Vec::new();
         for _ in 0..20 {
             let start = Instant::now();
             work()?;
             millis.push(start.elapsed().as_secs_f64() * 1e3);
         }
-        Ok::<f64, TransportError>(percentile(&mut millis, 0.5))
+        Ok::<f64, SplatError>(percentile(&mut millis, 0.5))
     };
     let encode = time(&|| state.encode().map(drop))?;
     let decode = time(&|| SplatState::decode(&bytes).map(drop))?;
@@ -152,7 +151,7 @@ fn measure(load: Load, shared_memory: bool, seconds: f64) -> Result<(), Failure>
     Ok(())
 }
 
-/// The other process: receives for a while and prints what it saw, all topics together.
+/// Receives in the second process for a while and prints the figures of all topics together.
 fn watch(endpoint: &str, shared_memory: bool, seconds: Duration) -> Result<(), Failure> {
     let config =
         TransportConfig { connect: vec![endpoint.to_owned()], shared_memory, ..TransportConfig::subscriber("bench") };

@@ -15,10 +15,12 @@ use prost::bytes::Bytes;
 use zenoh::{Session, Wait, qos::CongestionControl};
 
 use crate::{
-    Header, MessageKind, TransportError, header,
+    error::TransportError,
+    header::{Header, MessageKind, empty_header},
+    host,
     keys::{self, VIEWER_PREFIX},
     topic::{Body, Pending, Topic, lock},
-    viewpoint::Leases,
+    views::viewpoint::Leases,
 };
 
 /// How often subscriptions and leases are looked at.
@@ -38,7 +40,7 @@ pub(crate) struct Retained {
 }
 
 /// What the handles, the zenoh callbacks and the publisher thread share.
-pub(crate) struct Shared {
+pub(crate) struct PublisherState {
     pub rig: String,
     pub publisher_id: u64,
     pub host_id: u64,
@@ -50,7 +52,7 @@ pub(crate) struct Shared {
     pub wake: Sender<()>,
 }
 
-impl Shared {
+impl PublisherState {
     /// Of a session that publishes these topics; the other end of its wake-ups.
     pub(crate) fn new(
         rig: &str,
@@ -61,8 +63,8 @@ impl Shared {
         let (wake, woken) = crossbeam::channel::bounded(1);
         let shared = Self {
             rig: rig.to_owned(),
-            publisher_id: header::fnv1a(session.zid().to_string().as_bytes()),
-            host_id: header::host_id(),
+            publisher_id: host::fnv1a(session.zid().to_string().as_bytes()),
+            host_id: host::host_id(),
             topics: Mutex::new(topics.iter().map(|topic| (topic.label.clone(), topic.clone())).collect()),
             calibration: Mutex::new(Arc::new([])),
             leases: Mutex::new(leases),
@@ -99,14 +101,14 @@ struct Lane {
 }
 
 pub(crate) struct Drain {
-    pub shared: Arc<Shared>,
+    pub shared: Arc<PublisherState>,
     pub session: Session,
     pub woken: Receiver<()>,
 }
 
 /// The thread with its session, ended together.
 pub(crate) struct DrainThread {
-    shared: Arc<Shared>,
+    shared: Arc<PublisherState>,
     session: Session,
     thread: SupervisedThread,
     is_stopped: bool,
@@ -250,47 +252,27 @@ fn update_watched(lanes: &[Lane]) -> bool {
     calibration_wanted
 }
 
-/// A header for [`Topic::offer`] to fill in.
-pub(crate) fn empty_header() -> Header {
-    Header {
-        kind: MessageKind::Stats,
-        sequence: 0,
-        frame: 0,
-        capture_nanos: 0,
-        publish_unix_nanos: header::unix_nanos(),
-        host: 0,
-        publisher: 0,
-        width: 0,
-        height: 0,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use std::sync::atomic::AtomicU64;
 
     use super::*;
     use crate::{
-        TransportConfig,
-        session::{self, Opened},
+        session::{
+            config::TransportConfig,
+            opening::{self, Opened},
+        },
+        testing::wait_until,
     };
 
     /// A drain of one topic, and how it is offered a message.
     fn drain() -> (Drain, Arc<Topic>) {
         let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
-        let Opened { session, .. } = session::open(&config, 1 << 16, &[]).unwrap();
+        let Opened { session, .. } = opening::open(&config, 1 << 16, &[]).unwrap();
         let topic = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
         let leases = Leases::new(0, Duration::ZERO, 0);
-        let (shared, woken) = Shared::new("drill", &session, std::slice::from_ref(&topic), leases);
+        let (shared, woken) = PublisherState::new("drill", &session, std::slice::from_ref(&topic), leases);
         (Drain { shared, session, woken }, topic)
-    }
-
-    fn wait_until(what: &str, is_true: impl Fn() -> bool) {
-        let deadline = Instant::now() + Duration::from_secs(20);
-        while !is_true() {
-            assert!(Instant::now() < deadline, "{what} did not happen");
-            std::thread::sleep(Duration::from_millis(10));
-        }
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! What can go wrong on the wire.
 
-use crate::printable;
+use flyrig_stream::SplatError;
+
+use crate::{printable::printable, schema::SCHEMA_VERSION};
 
 /// Sort of a [`TransportError`], for those who decide what to do next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -48,13 +50,23 @@ impl TransportError {
     }
 
     pub(crate) fn version(topic: impl Into<String>, found: impl std::fmt::Display) -> Self {
-        let ours = crate::SCHEMA_VERSION;
         Self::new(
             TransportErrorKind::UnknownVersion,
             topic,
             format!(
-                "speaks schema version {found}, this program knows version {ours}; run the same flyrig on both sides"
+                "speaks schema version {found}, this program knows version {SCHEMA_VERSION}; run the same flyrig on both sides"
             ),
         )
+    }
+}
+
+impl From<SplatError> for TransportError {
+    fn from(error: SplatError) -> Self {
+        let kind = match error {
+            SplatError::State(_) => TransportErrorKind::Config,
+            SplatError::Version(_) => TransportErrorKind::UnknownVersion,
+            SplatError::Malformed(_) => TransportErrorKind::Malformed,
+        };
+        Self::new(kind, "splats", error.to_string())
     }
 }

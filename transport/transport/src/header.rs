@@ -1,11 +1,6 @@
 //! What every message carries beside its payload, as the zenoh attachment.
 
-use std::time::{SystemTime, UNIX_EPOCH};
-
-use crate::TransportError;
-
-/// Version of keys, headers and payloads; raised by any change that an older program would misread.
-pub const SCHEMA_VERSION: u16 = 1;
+use crate::{error::TransportError, host::unix_nanos, schema::SCHEMA_VERSION};
 
 /// Bytes of an encoded [`Header`].
 pub const HEADER_BYTES: usize = 64;
@@ -20,7 +15,7 @@ const MAGIC: [u8; 4] = *b"FLYR";
 pub enum MessageKind {
     /// foxglove `CompressedImage`.
     View,
-    /// [`crate::SplatState`].
+    /// [`flyrig_stream::SplatState`].
     Splats,
     /// foxglove `CameraCalibration`.
     Calibration,
@@ -150,6 +145,21 @@ impl Header {
     }
 }
 
+/// A header for [`Topic::offer`] to fill in.
+pub(crate) fn empty_header() -> Header {
+    Header {
+        kind: MessageKind::Stats,
+        sequence: 0,
+        frame: 0,
+        capture_nanos: 0,
+        publish_unix_nanos: unix_nanos(),
+        host: 0,
+        publisher: 0,
+        width: 0,
+        height: 0,
+    }
+}
+
 /// Takes fixed-size pieces off a byte slice.
 pub(crate) struct Reader<'a>(pub &'a [u8]);
 
@@ -161,26 +171,10 @@ impl Reader<'_> {
     }
 }
 
-/// Wall clock, nanoseconds since 1970.
-pub(crate) fn unix_nanos() -> i64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
-}
-
-/// A number for this host since its last boot; 0 where the system does not tell.
-pub(crate) fn host_id() -> u64 {
-    std::fs::read("/proc/sys/kernel/random/boot_id").map_or(0, |id| fnv1a(&id))
-}
-
-/// FNV-1a, 64 bits: short, the same on every machine, not for security.
-pub(crate) fn fnv1a(bytes: &[u8]) -> u64 {
-    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &b| (hash ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::TransportErrorKind;
+    use crate::{error::TransportErrorKind, host::host_id};
 
     fn header() -> Header {
         Header {

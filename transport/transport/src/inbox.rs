@@ -12,14 +12,17 @@ use prost::bytes::Bytes;
 use zenoh::sample::Sample;
 
 use crate::{
-    Header, MessageKind, TransportError, TransportErrorKind,
-    calibration::{RigTransforms, decode_calibration, decode_transforms},
-    color_layers::ColorLayers,
-    header, keys,
+    cameras::calibration::{self, RigTransforms, decode_calibration, decode_transforms},
+    error::{TransportError, TransportErrorKind},
+    header::{self, Header, MessageKind},
+    host,
+    json::MAX_JSON_BYTES,
+    keys::{self, MAX_PERSON_TOPICS},
+    people::color_layers::ColorLayers,
     report::{Tally, TopicReport},
-    splats::{self, MAX_PERSON_TOPICS},
+    schema::SCHEMA_VERSION,
     topic::lock,
-    view,
+    views::view,
 };
 
 /// Most topics that a subscriber keeps slots for.
@@ -116,14 +119,7 @@ impl Inbox {
     pub(crate) fn new(own_view_name: String, quota: u64) -> Self {
         let own_view = (keys::view_label(&own_view_name), own_view_name);
         let color_layers = Mutex::new(ColorLayers::new(Instant::now()));
-        Self {
-            state: Mutex::default(),
-            changed: Condvar::new(),
-            host: header::host_id(),
-            quota,
-            own_view,
-            color_layers,
-        }
+        Self { state: Mutex::default(), changed: Condvar::new(), host: host::host_id(), quota, own_view, color_layers }
     }
 
     /// Layers of colours that the line carries, from the coarsest; none before [`Self::begin_colors`].
@@ -162,7 +158,7 @@ impl Inbox {
 
     /// Takes a sample in; runs on a zenoh thread.
     pub(crate) fn receive(&self, sample: &Sample) {
-        let (now, unix_nanos) = (Instant::now(), header::unix_nanos());
+        let (now, unix_nanos) = (Instant::now(), host::unix_nanos());
         let key = sample.key_expr().as_str();
         let attachment = sample.attachment().filter(|bytes| bytes.len() <= header::MAX_ATTACHMENT);
         let attachment = attachment.map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
@@ -200,15 +196,15 @@ impl Inbox {
             return Err(malformed("names no part of the person stream".to_owned()));
         }
         let (expected, limit) = match label {
-            "splats" => (MessageKind::Splats, splats::MAX_BYTES),
-            "stats" => (MessageKind::Stats, crate::stats::MAX_JSON_BYTES),
-            "transforms" => (MessageKind::Transforms, crate::calibration::MAX_BYTES),
-            _ if label.starts_with(keys::PERSON_SPLATS) => (MessageKind::Splats, splats::MAX_BYTES),
+            "splats" => (MessageKind::Splats, flyrig_stream::MAX_SPLAT_BYTES),
+            "stats" => (MessageKind::Stats, MAX_JSON_BYTES),
+            "transforms" => (MessageKind::Transforms, calibration::MAX_BYTES),
+            _ if label.starts_with(keys::PERSON_SPLATS) => (MessageKind::Splats, flyrig_stream::MAX_SPLAT_BYTES),
             _ if keys::is_person(label) && label.ends_with("/motion") => {
                 (MessageKind::Motion, flyrig_stream::MAX_MESSAGE_BYTES)
             }
             _ if keys::is_person(label) => (MessageKind::Colors, flyrig_stream::MAX_MESSAGE_BYTES),
-            _ if label.starts_with("calibration/") => (MessageKind::Calibration, crate::calibration::MAX_BYTES),
+            _ if label.starts_with("calibration/") => (MessageKind::Calibration, calibration::MAX_BYTES),
             _ => (MessageKind::View, view::MAX_MESSAGE_BYTES),
         };
         if header.kind != expected {
@@ -297,7 +293,7 @@ impl Inbox {
     /// Keeps count of publishers as their liveliness tokens come and go.
     pub(crate) fn publisher_alive(&self, key: &str, alive: bool) {
         let version = keys::version_in(key).unwrap_or_default();
-        if version != format!("v{}", crate::SCHEMA_VERSION) {
+        if version != format!("v{}", SCHEMA_VERSION) {
             if alive {
                 self.refuse(TransportError::version(key, version));
             }
@@ -416,7 +412,7 @@ mod tests {
     use flyrig_types::{Isometry, Lens};
 
     use super::*;
-    use crate::drain::empty_header;
+    use crate::header::empty_header;
 
     const QUOTA: u64 = 1 << 20;
 

@@ -2,10 +2,14 @@
 
 use flyrig_types::CameraId;
 
-use crate::{SCHEMA_VERSION, TransportError};
+use crate::{error::TransportError, schema::SCHEMA_VERSION};
 
 /// Views of this name's beginning belong to one subscriber.
 pub(crate) const VIEWER_PREFIX: &str = "viewer-";
+
+/// Persons, the first one aside, whose splats have a topic at a time; beyond it the one that was published longest ago
+/// loses its topic.
+pub const MAX_PERSON_TOPICS: usize = 16;
 
 /// Largest length of a name in a key, bytes.
 const MAX_NAME: usize = 64;

@@ -32,56 +32,53 @@
 //! - Text of other programs reaches the caller [`printable`].
 //! - A subscriber may start before the publisher, stall, die, come back; a publisher may restart.
 
-mod access_rules;
-mod calibration;
-mod camera_inbox;
-mod camera_publisher;
-mod camera_subscriber;
-mod clock_exchange;
-mod color_layers;
-mod config;
+mod cameras;
 mod drain;
 mod error;
-mod frame;
 mod header;
-mod host_clock;
+mod host;
 mod inbox;
+mod json;
 mod keys;
-mod network_threads;
 mod people;
 mod printable;
 mod publisher;
-mod relay;
-mod renewal;
 mod report;
+mod schema;
 mod session;
-mod splats;
 mod stats;
 mod subscriber;
-mod template_fetcher;
+#[cfg(test)]
+mod testing;
 mod topic;
-mod view;
-mod viewpoint;
-mod wake_lag;
+mod views;
 
-pub use calibration::{RigTransforms, decode_calibration, decode_transforms, encode_calibration, encode_transforms};
-pub use camera_publisher::CameraPublisher;
-pub use camera_subscriber::{CameraLink, CameraSubscriber};
-pub use config::TransportConfig;
+pub use cameras::{
+    calibration::{RigTransforms, decode_calibration, decode_transforms, encode_calibration, encode_transforms},
+    frame::{CameraStatus, FRAME_HEADER_BYTES, FrameHeader, MAX_FRAME_BYTES},
+    host_clock::{ClockEstimate, HostClock},
+    link::CameraLink,
+    publisher::CameraPublisher,
+    subscriber::CameraSubscriber,
+};
 pub use error::{TransportError, TransportErrorKind};
-pub use frame::{CameraStatus, FRAME_HEADER_BYTES, FrameHeader, MAX_FRAME_BYTES};
-pub use header::{HEADER_BYTES, Header, MessageKind, SCHEMA_VERSION};
-pub use host_clock::{ClockEstimate, HostClock};
-pub use network_threads::use_one_network_thread;
-pub use people::PersonMessage;
+pub use flyrig_stream::{MAX_SPLATS, SplatError, SplatState};
+pub use header::{HEADER_BYTES, Header, MessageKind};
+pub use keys::MAX_PERSON_TOPICS;
+pub use people::{
+    person_stream::PersonMessage,
+    relay::Relay,
+    template_fetcher::{FetchedTemplate, TemplateFetcher},
+};
 pub use printable::{MAX_PRINTABLE, printable};
 pub use publisher::{Publisher, ViewpointCounts};
-pub use relay::Relay;
 pub use report::{LatencyReport, TopicReport};
-pub use splats::{MAX_PERSON_TOPICS, MAX_SPLATS, SplatState};
+pub use schema::SCHEMA_VERSION;
+pub use session::{config::TransportConfig, network_threads::use_one_network_thread};
 pub use stats::{BudgetStats, RigStats, StageStats, SubjectStats, TrackingStats, ViewRate};
 pub use subscriber::{Interests, Received, Subscriber, Views};
-pub use template_fetcher::{FetchedTemplate, TemplateFetcher};
 pub use topic::{PublishOutcome, TopicCounts};
-pub use view::{ImageFormat, MAX_IMAGE_BYTES, ViewFrame};
-pub use viewpoint::{MAX_VIEWPOINT_SIDE, Viewpoint, ViewpointStatus};
+pub use views::{
+    view::{ImageFormat, MAX_IMAGE_BYTES, ViewFrame},
+    viewpoint::{MAX_VIEWPOINT_SIDE, Viewpoint, ViewpointStatus},
+};

@@ -8,25 +8,31 @@ use std::{
 };
 
 use flyrig_access::{Gate, Role};
-use flyrig_stream::Stamp;
+use flyrig_stream::{SplatState, Stamp};
 use flyrig_types::{Rig, ThreadHealth};
 use prost::bytes::Bytes;
 use zenoh::{Wait, liveliness::LivelinessToken, query::Query, sample::SampleKind};
 
 use crate::{
-    Header, MessageKind, PersonMessage, Received, RigStats, SplatState, TransportConfig, TransportError, ViewFrame,
-    Viewpoint,
-    calibration::{encode_calibration, encode_transforms},
-    config::LARGEST_QUESTION,
-    drain::{Drain, DrainThread, Retained, Shared, empty_header},
-    keys::{self, VIEWER_PREFIX},
-    people::{People, answer_templates},
-    printable,
-    session::{self, Opened},
-    splats::MAX_PERSON_TOPICS,
-    stats::{MAX_JSON_BYTES, from_json, to_json},
+    cameras::calibration::{encode_calibration, encode_transforms},
+    drain::{Drain, DrainThread, PublisherState, Retained},
+    error::TransportError,
+    header::{Header, MessageKind, empty_header},
+    json::{MAX_JSON_BYTES, from_json, to_json},
+    keys::{self, MAX_PERSON_TOPICS, VIEWER_PREFIX},
+    people::person_stream::{PersonMessage, PublishedPeople, answer_templates},
+    printable::printable,
+    session::{
+        config::{LARGEST_QUESTION, TransportConfig},
+        opening::{self, Opened},
+    },
+    stats::RigStats,
+    subscriber::Received,
     topic::{Body, PublishOutcome, Topic, TopicCounts, lock},
-    viewpoint::Leases,
+    views::{
+        view::ViewFrame,
+        viewpoint::{Leases, Viewpoint},
+    },
 };
 
 /// Most views of a rig, those of viewers not counted.
@@ -47,11 +53,11 @@ pub struct ViewpointCounts {
 
 /// Publishes a rig; no method waits for the network once it is open.
 pub struct Publisher {
-    shared: Arc<Shared>,
+    shared: Arc<PublisherState>,
     splats: Arc<Topic>,
     /// Splats of other persons than the first, the one that was published last at the end.
     persons: Mutex<Vec<(u32, Arc<Topic>)>>,
-    people: Arc<People>,
+    people: Arc<PublishedPeople>,
     stats: Arc<Topic>,
     endpoints: Vec<String>,
     /// Admits holders of keys.
@@ -78,17 +84,17 @@ impl Publisher {
         config.validate()?;
         let rig = &config.rig;
         let Opened { session, endpoints, gate } =
-            session::open(config, LARGEST_QUESTION, &[Role::Viewer, Role::Relay])?;
+            opening::open(config, LARGEST_QUESTION, &[Role::Viewer, Role::Relay])?;
         let failed = |error: zenoh::Error| TransportError::session(format!("publisher of rig {rig}"), &error);
 
         let splats = Arc::new(Topic::new("splats".to_owned(), "splats".to_owned(), MessageKind::Splats));
         let stats = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
         let lease = Duration::from_millis(config.viewpoint_lease_millis);
         let leases = Leases::new(config.max_viewers, lease, config.viewpoint_pixels_per_second);
-        let people = Arc::new(People::new());
+        let people = Arc::new(PublishedPeople::new());
         let mut topics = vec![splats.clone(), stats.clone()];
         topics.extend(people.first_topics());
-        let (shared, woken) = Shared::new(rig, &session, &topics, leases);
+        let (shared, woken) = PublisherState::new(rig, &session, &topics, leases);
 
         let state = shared.clone();
         session
@@ -361,7 +367,7 @@ impl Publisher {
 }
 
 /// Runs on a zenoh thread: short, no waiting.
-fn answer_viewpoint(shared: &Shared, query: &Query) {
+fn answer_viewpoint(shared: &PublisherState, query: &Query) {
     let key = query.key_expr().as_str();
     let Some(subscriber) = keys::name_in(key, "viewpoint", "") else { return };
     // What is too long is not even copied, and refused as empty.

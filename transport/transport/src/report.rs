@@ -2,7 +2,7 @@
 
 use std::{collections::VecDeque, time::Instant};
 
-use crate::Header;
+use crate::header::Header;
 
 /// Messages over which rates and latencies are taken.
 const WINDOW: usize = 256;
@@ -98,7 +98,7 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::drain::empty_header;
+    use crate::header::empty_header;
 
     #[test]
     fn gaps_restarts_rates_and_latencies_of_a_hand_made_stream() {

@@ -2,23 +2,32 @@
 
 use std::{sync::Arc, time::Duration};
 
-use flyrig_access::Probe;
+use flyrig_access::KeyProbe;
+use flyrig_stream::{MAX_SPLAT_BYTES, SplatState};
 use flyrig_types::{Camera, Rig};
 use prost::bytes::Bytes;
 use zenoh::{Session, Wait, liveliness::LivelinessToken, sample::SampleKind};
 
 use crate::{
-    Header, RigStats, SplatState, TemplateFetcher, TopicReport, TransportConfig, TransportError, ViewFrame,
-    ViewpointStatus,
-    config::LARGEST_QUESTION,
+    error::TransportError,
+    header::Header,
     inbox::{Inbox, Raw, as_malformed},
     keys::{self, VIEWER_PREFIX},
-    people::{PersonMessage, PersonSubscription},
-    renewal::Renewal,
-    session::{self, Opened},
-    splats,
-    view::MAX_MESSAGE_BYTES,
-    viewpoint::check_camera,
+    people::{
+        person_stream::{PersonMessage, PersonSubscription},
+        template_fetcher::TemplateFetcher,
+    },
+    report::TopicReport,
+    session::{
+        config::{LARGEST_QUESTION, TransportConfig},
+        opening::{self, Opened},
+    },
+    stats::RigStats,
+    views::{
+        renewal::Renewal,
+        view::{MAX_MESSAGE_BYTES, ViewFrame},
+        viewpoint::{ViewpointStatus, check_camera},
+    },
 };
 
 /// Which views to receive.
@@ -67,7 +76,7 @@ pub struct Subscriber {
     people: Arc<PersonSubscription>,
     id: String,
     renewal: Renewal,
-    probe: Option<Probe>,
+    probe: Option<KeyProbe>,
     session: Session,
     closed: bool,
     _alive: LivelinessToken,
@@ -88,8 +97,8 @@ impl Subscriber {
         config.validate()?;
         let rig = &config.rig;
         let failed = |error: zenoh::Error| TransportError::session(format!("subscriber of rig {rig}"), &error);
-        let largest = MAX_MESSAGE_BYTES.max(splats::MAX_BYTES) + LARGEST_QUESTION;
-        let Opened { session, .. } = session::open(config, largest, &[])?;
+        let largest = MAX_MESSAGE_BYTES.max(MAX_SPLAT_BYTES) + LARGEST_QUESTION;
+        let Opened { session, .. } = opening::open(config, largest, &[])?;
         let id = session.zid().to_string();
         let id = config.key.as_ref().map_or_else(|| id.clone(), |key| format!("{}.{id}", key.topic_name));
         let inbox = Arc::new(Inbox::new(format!("{VIEWER_PREFIX}{id}"), config.inbox_bytes));
@@ -134,7 +143,7 @@ impl Subscriber {
         let key = keys::key(rig, &format!("viewpoint/{id}"));
         let renewal = Renewal::start(session.clone(), key, format!("{VIEWER_PREFIX}{id}"))?;
         let connected = inbox.clone();
-        let probe = session::probe(config, move || connected.publishers() > 0)?;
+        let probe = opening::probe(config, move || connected.publishers() > 0)?;
         let people = Arc::new(PersonSubscription::new(&session, rig, &inbox));
         if interests.people {
             people.begin_motion()?;
@@ -174,7 +183,7 @@ impl Subscriber {
     /// As [`Self::next_view`].
     pub fn next_splats(&self, timeout: Duration) -> Result<Option<Received<SplatState>>, TransportError> {
         let Some((label, raw)) = self.inbox.next(timeout, keys::is_splats)? else { return Ok(None) };
-        self.received(label, raw, |_, _, payload| SplatState::decode(&payload)).map(Some)
+        self.received(label, raw, |_, _, payload| Ok(SplatState::decode(&payload)?)).map(Some)
     }
 
     /// The next message of the person stream that was not taken yet, topics in turns; `None` after the timeout. Take messages as
@@ -261,7 +270,7 @@ impl Subscriber {
     /// Returns the reason why the rig does not admit the key; None while it does, without a key, and before the first answer.
     #[must_use]
     pub fn trouble(&self) -> Option<String> {
-        self.probe.as_ref().and_then(Probe::trouble)
+        self.probe.as_ref().and_then(KeyProbe::trouble)
     }
 
     /// What came in, a topic each (`view/NAME`, `viewer/SUBSCRIBER/view`, `splats`, ...).

@@ -5,11 +5,18 @@ use std::sync::{
     atomic::{AtomicBool, Ordering},
 };
 
+use flyrig_stream::SplatState;
 use flyrig_types::Frame;
 use prost::bytes::Bytes;
 use zenoh::{bytes::Encoding, qos::Priority};
 
-use crate::{FrameHeader, Header, MessageKind, SplatState, TransportError, ViewFrame, header};
+use crate::{
+    cameras::frame::FrameHeader,
+    error::TransportError,
+    header::{Header, MessageKind},
+    host,
+    views::view::ViewFrame,
+};
 
 /// What became of a message that was handed in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -101,7 +108,7 @@ impl Topic {
         header.kind = self.kind;
         header.sequence = state.sequence;
         if header.host == 0 {
-            header.publish_unix_nanos = header::unix_nanos();
+            header.publish_unix_nanos = host::unix_nanos();
         }
         state.sequence += 1;
         state.counts.offered += 1;
@@ -182,7 +189,7 @@ impl Body {
     pub(crate) fn encode(&self, name: &str) -> Result<Vec<u8>, TransportError> {
         match self {
             Self::View(frame) => frame.encode(name),
-            Self::Splats(state) => state.encode(),
+            Self::Splats(state) => Ok(state.encode()?),
             Self::Frame(frame) => Ok(frame.image.bytes().to_vec()),
             Self::Bytes(bytes) => Ok(bytes.to_vec()),
         }

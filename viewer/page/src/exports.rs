@@ -3,7 +3,7 @@
 
 use std::cell::RefCell;
 
-use crate::{MAX_MESSAGE_BYTES, MessageKind, Page};
+use crate::page::{MAX_MESSAGE_BYTES, Page, PageMessageKind};
 
 #[derive(Default)]
 struct State {
@@ -39,7 +39,7 @@ pub extern "C" fn input(length: usize) -> *mut u8 {
 pub extern "C" fn take(kind: u32, person: u32, now: f64) -> u32 {
     with(|state| {
         let input = std::mem::take(&mut state.input);
-        let taken = match MessageKind::of(kind) {
+        let taken = match PageMessageKind::of(kind) {
             Some(kind) => state.page.take(kind, person, &input, now).map_err(|error| error.to_string()),
             None => Err(format!("message of unknown kind {kind}; load the page again")),
         };

@@ -10,4 +10,4 @@ mod order;
 mod page;
 
 pub use order::DrawOrder;
-pub use page::{CAMERA_FLOATS, MAX_MESSAGE_BYTES, MessageKind, Page, PageError};
+pub use page::{CAMERA_FLOATS, MAX_MESSAGE_BYTES, Page, PageError, PageMessageKind};

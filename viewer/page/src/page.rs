@@ -7,7 +7,7 @@ use flyrig_types::{Camera, Rig};
 use flyrig_viewing::{Ellipsoids, Navigation, People, Taken};
 use glam::DVec3;
 
-use crate::DrawOrder;
+use crate::order::DrawOrder;
 
 /// Longest message that is taken, bytes: a template has less.
 pub const MAX_MESSAGE_BYTES: usize = 16 << 20;
@@ -16,7 +16,7 @@ pub const CAMERA_FLOATS: usize = 19;
 
 /// Kind of a message; the number is its first byte.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum MessageKind {
+pub enum PageMessageKind {
     /// Cameras and up of the rig, JSON.
     Rig,
     /// A person's template.
@@ -27,7 +27,7 @@ pub enum MessageKind {
     Colors,
 }
 
-impl MessageKind {
+impl PageMessageKind {
     /// Returns the kind of a number.
     #[must_use]
     pub fn of(number: u32) -> Option<Self> {
@@ -82,16 +82,16 @@ impl Page {
     ///
     /// # Errors
     /// [`PageError`] for damaged bytes; what was there before stays.
-    pub fn take(&mut self, kind: MessageKind, person: u32, bytes: &[u8], now: f64) -> Result<(), PageError> {
+    pub fn take(&mut self, kind: PageMessageKind, person: u32, bytes: &[u8], now: f64) -> Result<(), PageError> {
         match kind {
-            MessageKind::Rig => return self.take_rig(bytes),
-            MessageKind::Template => {
+            PageMessageKind::Rig => return self.take_rig(bytes),
+            PageMessageKind::Template => {
                 let template = StreamTemplate::decode(bytes).map_err(PageError::Stream)?;
                 self.people.meet(person, Arc::new(template));
                 self.is_stale = true;
             }
-            MessageKind::Motion | MessageKind::Colors => {
-                let is_motion = kind == MessageKind::Motion;
+            PageMessageKind::Motion | PageMessageKind::Colors => {
+                let is_motion = kind == PageMessageKind::Motion;
                 let taken: Result<Taken, StreamError> = self.people.take(person, is_motion, bytes, now);
                 taken.map_err(PageError::Stream)?;
             }

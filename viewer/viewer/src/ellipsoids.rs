@@ -5,7 +5,7 @@ use flyrig_renderer::{AnisotropicBuffers, HarmonicOrder, SH_DEGREE_0};
 use flyrig_types::Camera;
 use flyrig_viewing::Ellipsoids;
 
-use crate::scene::ShownPerson;
+use crate::shown_person::ShownPerson;
 
 /// Gaussians on the device, as one camera sees them.
 #[derive(Debug)]

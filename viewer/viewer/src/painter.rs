@@ -12,7 +12,11 @@ use flyrig_types::{Camera, SupervisedThread, ThreadHealth};
 use flyrig_viewing::StreamPerson;
 use glam::DVec3;
 
-use crate::{Receiver, Scene, ShownPerson, receiver::clock_secs};
+use crate::{
+    receiver::{Receiver, clock_secs},
+    scene::PeopleScene,
+    shown_person::ShownPerson,
+};
 
 /// Grey behind the people, sRGB.
 const BACKDROP: u8 = 30;
@@ -26,7 +30,7 @@ pub(crate) struct Request {
 
 /// A drawn view.
 #[derive(Debug)]
-pub(crate) struct Drawn {
+pub(crate) struct PaintedView {
     pub width: u32,
     pub height: u32,
     pub rgb: Vec<u8>,
@@ -50,7 +54,7 @@ struct Shared {
 #[derive(Debug, Default)]
 struct State {
     request: Option<Request>,
-    drawn: Option<Drawn>,
+    drawn: Option<PaintedView>,
     fault: Option<String>,
     is_ended: bool,
 }
@@ -100,7 +104,7 @@ impl Painter {
     }
 
     /// Takes the view that was drawn last, once, and what kept one from being drawn.
-    pub fn take(&self) -> (Option<Drawn>, Option<String>) {
+    pub fn take(&self) -> (Option<PaintedView>, Option<String>) {
         let mut state = self.shared.lock();
         (state.drawn.take(), state.fault.clone())
     }
@@ -154,12 +158,12 @@ struct PosedPerson {
 /// Draws a view, unless it would be the same as the `last` one.
 fn draw(
     gpu: &GpuContext,
-    scene: &mut Option<Scene>,
+    scene: &mut Option<PeopleScene>,
     posed: &mut Vec<PosedPerson>,
     receiver: &Receiver,
     request: &Request,
     last: &mut Option<Content>,
-) -> Result<Option<Drawn>, flyrig_gpu::GpuError> {
+) -> Result<Option<PaintedView>, flyrig_gpu::GpuError> {
     let (start, now) = (Instant::now(), clock_secs());
     let (mut shown, mut place, mut is_complete, mut stamp) = (0, None, true, None);
     {
@@ -192,7 +196,7 @@ fn draw(
     }
     let scene = match scene {
         Some(scene) => scene,
-        none => none.insert(Scene::new(gpu)?),
+        none => none.insert(PeopleScene::new(gpu)?),
     };
     scene.set_people(posed[..shown].iter().map(|PosedPerson { posed, axes, is_avatar, colors }| ShownPerson {
         posed,
@@ -201,7 +205,7 @@ fn draw(
     }))?;
     let view = scene.draw(&request.camera)?;
     let backdrop = vec![BACKDROP; view.width as usize * view.height as usize * 3];
-    Ok(Some(Drawn {
+    Ok(Some(PaintedView {
         width: view.width,
         height: view.height,
         rgb: composite_over(&view.rgba, &backdrop),

@@ -2,38 +2,13 @@
 
 use flyrig_gpu::{GpuContext, GpuError};
 use flyrig_renderer::{GaussianBuffers, ViewPainter};
-use flyrig_stream::{Posed, PosedAxes};
 use flyrig_types::{Camera, RenderedView};
 
-use crate::ellipsoids::EllipsoidBuffers;
-
-/// One person to draw.
-#[derive(Debug, Clone, Copy)]
-pub struct ShownPerson<'a> {
-    /// Centres and normals.
-    pub posed: &'a Posed,
-    /// Linear RGB and opacity of as many Gaussians.
-    pub colors: &'a [[f32; 4]],
-    /// Axes of as many Gaussians; None where they are isotropic.
-    pub axes: Option<&'a PosedAxes>,
-}
-
-impl<'a> From<(&'a Posed, &'a [[f32; 4]])> for ShownPerson<'a> {
-    fn from((posed, colors): (&'a Posed, &'a [[f32; 4]])) -> Self {
-        Self { posed, colors, axes: None }
-    }
-}
-
-impl ShownPerson<'_> {
-    /// Number of Gaussians that all lists have.
-    pub(crate) fn count(&self) -> usize {
-        self.posed.center_scale.len().min(self.posed.normal.len()).min(self.colors.len())
-    }
-}
+use crate::{ellipsoids::EllipsoidBuffers, shown_person::ShownPerson};
 
 /// A rasteriser with room for the people that are shown.
 #[derive(Debug)]
-pub struct Scene {
+pub struct PeopleScene {
     gpu: GpuContext,
     painter: ViewPainter,
     gaussians: GaussianBuffers,
@@ -41,7 +16,7 @@ pub struct Scene {
     ellipsoids: Option<EllipsoidBuffers>,
 }
 
-impl Scene {
+impl PeopleScene {
     /// An empty scene.
     ///
     /// # Errors

@@ -14,8 +14,8 @@ use flyrig_viewing::Navigation;
 use glam::DVec3;
 
 use crate::{
-    Receiver, ReceiverState,
-    painter::{Drawn, Painter, Request},
+    painter::{PaintedView, Painter, Request},
+    receiver::{Receiver, ReceiverState},
 };
 
 /// Largest view that is drawn without a graphics adapter, pixels; larger windows show it scaled.
@@ -287,7 +287,7 @@ impl View {
     fn take_drawn(&mut self, context: &egui::Context, now: Instant) {
         let (drawn, fault) = self.painter.take();
         self.shown.fault = fault;
-        let Some(Drawn { width, height, rgb, frame, age_secs, place, people, is_complete, took }) = drawn else {
+        let Some(PaintedView { width, height, rgb, frame, age_secs, place, people, is_complete, took }) = drawn else {
             return;
         };
         let image = egui::ColorImage::from_rgb([width as usize, height as usize], &rgb);

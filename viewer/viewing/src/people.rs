@@ -7,7 +7,7 @@ use std::{
 
 use flyrig_stream::{StreamError, StreamTemplate, stamp_of};
 
-use crate::StreamPerson;
+use crate::person::StreamPerson;
 
 /// Most people that are kept; one more replaces the person of the lowest number.
 pub const MAX_PEOPLE: usize = 32;

@@ -8,7 +8,7 @@ use clap::{
 };
 use serde::{Deserialize, Serialize};
 
-use crate::WebError;
+use crate::error::WebError;
 
 /// Browsers that may be allowed at a time.
 const BROWSERS: std::ops::RangeInclusive<usize> = 1..=256;

@@ -100,7 +100,7 @@ impl Hub {
     }
 
     /// Adds a browser, unless there are so many already; it first gets what is known now.
-    pub fn join(self: &Arc<Self>, most: usize) -> Option<Place> {
+    pub fn join(self: &Arc<Self>, most: usize) -> Option<BrowserPlace> {
         let mut inner = self.lock();
         if inner.browsers.len() >= most {
             return None;
@@ -118,7 +118,7 @@ impl Hub {
         };
         wake.notify_one();
         inner.browsers.insert(number, browser);
-        Some(Place { hub: Arc::clone(self), number, wake })
+        Some(BrowserPlace { hub: Arc::clone(self), number, wake })
     }
 
     fn to_all(inner: &mut Inner, put: impl Fn(&mut Browser)) {
@@ -195,13 +195,13 @@ impl Hub {
 
 /// A browser's place among the others, until it is dropped.
 #[derive(Debug)]
-pub(crate) struct Place {
+pub(crate) struct BrowserPlace {
     hub: Arc<Hub>,
     number: u64,
     wake: Arc<Notify>,
 }
 
-impl Place {
+impl BrowserPlace {
     /// Waits for the next message of this browser.
     pub async fn next(&self) -> Bytes {
         loop {
@@ -213,7 +213,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for BrowserPlace {
     fn drop(&mut self) {
         self.hub.lock().browsers.remove(&self.number);
     }
@@ -225,7 +225,7 @@ mod tests {
     use super::*;
 
     /// All that waits for a browser.
-    fn drain(place: &Place) -> Vec<(u8, u32, Vec<u8>)> {
+    fn drain(place: &BrowserPlace) -> Vec<(u8, u32, Vec<u8>)> {
         let mut inner = place.hub.lock();
         let browser = inner.browsers.get_mut(&place.number).unwrap();
         let part = |bytes: Bytes| (bytes[0], u32::from_le_bytes(bytes[4..8].try_into().unwrap()), bytes[8..].to_vec());

@@ -7,10 +7,10 @@ use std::{
         Arc,
         atomic::{AtomicBool, Ordering},
     },
-    thread::{Builder, JoinHandle},
     time::Duration,
 };
 
+use flyrig_access::{Bounds, Connection, Listener, Serve};
 use flyrig_transport::TransportConfig;
 use flyrig_types::{SupervisedThread, ThreadHealth};
 use http_body_util::Full;
@@ -24,17 +24,16 @@ use hyper::{
 use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::{
     io::{AsyncRead, AsyncWrite},
-    net::{TcpListener, TcpSocket, TcpStream},
-    runtime,
-    sync::{Semaphore, oneshot},
-    time::{sleep, timeout},
+    net::TcpStream,
+    time::timeout,
 };
 use tokio_rustls::TlsAcceptor;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
 use crate::{
-    WebConfig, WebError,
     assets::asset,
+    config::WebConfig,
+    error::WebError,
     guard::{Token, check_names},
     hub::Hub,
     socket,
@@ -50,12 +49,6 @@ const TLS_HANDSHAKE: u8 = 22;
 const REQUEST_BYTES: usize = 8192;
 /// Connections at the same time; the others wait in the system's queue.
 const CONNECTIONS: usize = 512;
-/// Pause after a connection could not be accepted: with no file descriptor left, trying at once only costs time.
-const PAUSE: Duration = Duration::from_millis(100);
-/// Bytes that the system keeps for a connection, sent or not: enough for 20 Mbit/s with 200 ms. Linux doubles it.
-const SEND_BUFFER: u32 = 256 << 10;
-/// Bytes of them that are not sent yet: what lies there cannot be overtaken by newer motion.
-const UNSENT: u32 = 4 << 10;
 /// Headers of every answer: nothing from elsewhere, and no frame of another page around it.
 const HEADERS: [(&str, &str); 5] = [
     (
@@ -73,7 +66,7 @@ const HEADERS: [(&str, &str); 5] = [
 /// Serves the page until it is dropped.
 #[derive(Debug)]
 pub struct WebServer {
-    address: SocketAddr,
+    listener: Listener,
     /// Name of this computer.
     name: Option<String>,
     token: Token,
@@ -82,9 +75,6 @@ pub struct WebServer {
     hub: Arc<Hub>,
     upstream: SupervisedThread,
     ended: Arc<AtomicBool>,
-    /// Dropping it ends the server's thread.
-    stop: Option<oneshot::Sender<()>>,
-    thread: Option<JoinHandle<()>>,
 }
 
 /// State shared by all connections.
@@ -112,13 +102,10 @@ impl WebServer {
         let start = |problem: String| WebError::Start(problem);
         let token =
             if is_loopback { Token::NONE } else { Token::random().map_err(|error| start(error.to_string()))? };
-        let runtime = runtime::Builder::new_current_thread().enable_io().enable_time().build();
-        let runtime = runtime.map_err(|error| start(error.to_string()))?;
-        let listener = {
-            let _inside = runtime.enter();
-            listen(wanted).map_err(|problem| WebError::Listen { address: wanted, problem })?
-        };
-        let address = listener.local_addr().map_err(|error| start(error.to_string()))?;
+        let bounds = Bounds { connections: CONNECTIONS, per_address: false, is_streaming: true };
+        let listener =
+            Listener::bind(wanted, bounds).map_err(|problem| WebError::Listen { address: wanted, problem })?;
+        let address = listener.address();
         if !is_loopback && tls.is_none() {
             tracing::warn!(
                 "the web page at {address} is not encrypted: whoever can read this network can watch. Who watches needs the whole link"
@@ -129,39 +116,18 @@ impl WebServer {
         let most = config.max_browsers;
         let (tls, fingerprint) = tls.map(|Tls { acceptor, fingerprint }| (acceptor, fingerprint)).unzip();
         let shared = Arc::new(Shared { hub: Arc::clone(&hub), token: token.clone(), tls, names, max_browsers: most });
-        let (stop, stopped) = oneshot::channel::<()>();
-        let work = move || {
-            runtime.block_on(async {
-                tokio::select! {
-                    () = accept(&listener, &shared) => {}
-                    _ = stopped => {}
-                }
-            });
-            // Messages under way are dropped with the tasks.
-            runtime.shutdown_timeout(PAUSE);
-        };
-        let thread = Builder::new().name("web".to_owned()).spawn(work).map_err(|error| start(error.to_string()))?;
+        let listener = listener.start("web", shared).map_err(|error| start(error.to_string()))?;
         let ended = Arc::new(AtomicBool::new(false));
         let (fed, until) = (Arc::clone(&hub), Arc::clone(&ended));
         let upstream = SupervisedThread::start("web upstream", move || upstream::run(&transport, &fed, &until));
         let upstream = upstream.map_err(|error| start(error.to_string()))?;
-        Ok(Self {
-            address,
-            name: config.names.first().cloned(),
-            token,
-            fingerprint,
-            hub,
-            upstream,
-            ended,
-            stop: Some(stop),
-            thread: Some(thread),
-        })
+        Ok(Self { listener, name: config.names.first().cloned(), token, fingerprint, hub, upstream, ended })
     }
 
     /// Address that is listened on.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
-        self.address
+        self.listener.address()
     }
 
     /// Link to the page, with the token where one is needed: at the first of this computer's names that were given, or at its address.
@@ -169,8 +135,8 @@ impl WebServer {
     pub fn link(&self) -> String {
         let scheme = if self.fingerprint.is_some() { "https" } else { "http" };
         let host = match &self.name {
-            Some(name) if self.address.ip().is_unspecified() => format!("{name}:{}", self.address.port()),
-            _ => reached_at(self.address).to_string(),
+            Some(name) if self.address().ip().is_unspecified() => format!("{name}:{}", self.address().port()),
+            _ => reached_at(self.address()).to_string(),
         };
         format!("{scheme}://{host}/{}", self.token.fragment())
     }
@@ -197,10 +163,6 @@ impl WebServer {
 impl Drop for WebServer {
     fn drop(&mut self) {
         self.ended.store(true, Ordering::Relaxed);
-        drop(self.stop.take());
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
         self.upstream.join();
     }
 }
@@ -243,38 +205,16 @@ fn reachable(is_ipv4: bool, addresses: Vec<IpAddr>) -> Option<IpAddr> {
     })
 }
 
-/// Must be called inside of the runtime.
-fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
-    let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() }?;
-    socket.set_reuseaddr(cfg!(unix))?;
-    // Connections inherit it.
-    socket.set_send_buffer_size(SEND_BUFFER)?;
-    socket.bind(address)?;
-    socket.listen(1024)
-}
-
-async fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
-    let places = Arc::new(Semaphore::new(CONNECTIONS));
-    while let Ok(place) = Arc::clone(&places).acquire_owned().await {
-        match listener.accept().await {
-            Ok((client, _)) => {
-                let shared = Arc::clone(shared);
-                tokio::spawn(async move {
-                    let _place = place;
-                    // A client that asks badly is its own loss.
-                    let _ = greet(client, shared).await;
-                });
-            }
-            Err(_) => sleep(PAUSE).await,
-        }
+impl Serve for Shared {
+    async fn serve(self: Arc<Self>, connection: Connection) {
+        let Connection { stream, place: _place, .. } = connection;
+        // A malformed request costs its client alone.
+        let _ = greet(stream, self).await;
     }
 }
 
 /// Begins TLS where it is spoken.
 async fn greet(client: TcpStream, shared: Arc<Shared>) -> hyper::Result<()> {
-    let _ = client.set_nodelay(true);
-    #[cfg(target_os = "linux")]
-    let _ = socket2::SockRef::from(&client).set_tcp_notsent_lowat(UNSENT);
     let Some(tls) = shared.tls.clone() else { return answer(client, shared).await };
     let mut first = [0];
     match timeout(PATIENCE, client.peek(&mut first)).await {

@@ -11,7 +11,7 @@ use rcgen::{CertificateParams, KeyPair, date_time_ymd};
 use rustls_pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject as _};
 use tokio_rustls::{TlsAcceptor, rustls};
 
-use crate::{WebConfig, WebError};
+use crate::{config::WebConfig, error::WebError};
 
 /// Largest file that is read as a certificate or key, bytes.
 const MOST_BYTES: u64 = 1 << 20;

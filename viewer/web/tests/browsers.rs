@@ -12,7 +12,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_page::{MessageKind, Page};
+use flyrig_page::{Page, PageMessageKind};
 use flyrig_stream::{
     ColorEncoder, ColorSettings, EncodedTemplate, Motion, MotionEncoder, Stamp, StreamJoint, TemplateSource,
 };
@@ -142,7 +142,7 @@ fn watch(socket: &mut Socket, page: &mut Page, what: &str, mut done: impl FnMut(
             4 => state = String::from_utf8(payload).unwrap(),
             5 => page.forget_people(),
             kind => page
-                .take(MessageKind::of(kind.into()).unwrap(), person, &payload, started.elapsed().as_secs_f64())
+                .take(PageMessageKind::of(kind.into()).unwrap(), person, &payload, started.elapsed().as_secs_f64())
                 .unwrap(),
         }
         page.pose(started.elapsed().as_secs_f64(), false);

@@ -8,8 +8,9 @@ use foxglove::{
 use glam::{DQuat, DVec2, DVec3};
 
 use crate::{
-    TransportError,
-    view::{timestamp, to_bytes},
+    error::TransportError,
+    keys,
+    views::view::{timestamp, to_bytes},
 };
 
 /// Frames of the transforms message: a level frame (z up) that holds the world, which holds the cameras.
@@ -164,7 +165,7 @@ fn decode<M: Decode>(topic: &str, bytes: &[u8]) -> Result<M, TransportError> {
 }
 
 fn camera_id(topic: &str, name: &str) -> Result<CameraId, TransportError> {
-    crate::keys::check_name("camera", name).map_err(|error| TransportError::malformed(topic, error.to_string()))?;
+    keys::check_name("camera", name).map_err(|error| TransportError::malformed(topic, error.to_string()))?;
     Ok(CameraId::from(name))
 }
 

@@ -15,7 +15,7 @@ use zenoh::{
     query::{ConsolidationMode, Query},
 };
 
-use crate::{HostClock, TransportError};
+use crate::{cameras::host_clock::HostClock, error::TransportError};
 
 /// Between two questions: at first, and later.
 const EAGER: Duration = Duration::from_millis(50);
@@ -128,22 +128,17 @@ mod tests {
 
     use super::*;
     use crate::{
-        TransportConfig,
-        session::{self, Opened},
+        session::{
+            config::TransportConfig,
+            opening::{self, Opened},
+        },
+        testing::wait_until,
     };
 
     fn asker(hosts: impl Fn() -> Vec<Question> + Send + 'static) -> Asker {
         let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
-        let Opened { session, .. } = session::open(&config, 1 << 16, &[]).unwrap();
+        let Opened { session, .. } = opening::open(&config, 1 << 16, &[]).unwrap();
         Asker::start(session, HostClock::new(|| 0), hosts, |_, _, _, _| {}).unwrap()
-    }
-
-    fn wait_until(what: &str, is_true: impl Fn() -> bool) {
-        let deadline = Instant::now() + Duration::from_secs(20);
-        while !is_true() {
-            assert!(Instant::now() < deadline, "{what} did not happen");
-            std::thread::sleep(Duration::from_millis(10));
-        }
     }
 
     #[test]

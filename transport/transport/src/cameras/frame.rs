@@ -4,10 +4,10 @@ use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    HEADER_BYTES, Header, MessageKind, TransportError,
-    header::Reader,
+    error::TransportError,
+    header::{HEADER_BYTES, Header, MessageKind, Reader},
+    json::{from_json, to_json},
     printable::clean,
-    stats::{from_json, to_json},
 };
 
 /// Largest image of a camera, bytes: 16 million pixels of three.
@@ -166,7 +166,7 @@ impl CameraStatus {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{TransportErrorKind, drain::empty_header};
+    use crate::{error::TransportErrorKind, header::empty_header};
 
     fn header(format: PixelFormat) -> FrameHeader {
         let header = Header {

@@ -8,8 +8,17 @@ use std::{
 use flyrig_types::{CameraId, Frame};
 
 use crate::{
-    CameraLink, CameraStatus, FrameHeader, Header, MessageKind, SCHEMA_VERSION, TransportError,
-    clock_exchange::Question, header, host_clock::ClockFit, keys, printable,
+    cameras::{
+        clock_exchange::Question,
+        frame::{CameraStatus, FrameHeader},
+        host_clock::ClockFit,
+        link::CameraLink,
+    },
+    error::TransportError,
+    header::{Header, MessageKind},
+    host, keys,
+    printable::printable,
+    schema::SCHEMA_VERSION,
 };
 
 /// Frames of a camera that may wait for their reader.
@@ -100,7 +109,7 @@ impl CameraInbox {
             return;
         }
         let Some(name) = keys::name_in(key, "host", "") else { return };
-        let id = header::fnv1a(name.as_bytes());
+        let id = host::fnv1a(name.as_bytes());
         if !is_alive {
             self.hosts.remove(&id);
             return;

@@ -2,30 +2,36 @@
 
 use std::{sync::Arc, time::Duration};
 
-use flyrig_access::Probe;
+use flyrig_access::KeyProbe;
 use flyrig_types::{CameraId, Frame, ThreadHealth};
 use prost::bytes::Bytes;
 use zenoh::{Wait, liveliness::LivelinessToken};
 
 use crate::{
-    CameraStatus, Header, HostClock, MessageKind, PublishOutcome, TopicCounts, TransportConfig, TransportError,
-    clock_exchange,
-    config::LARGEST_QUESTION,
-    drain::{Drain, DrainThread, Shared, empty_header},
-    frame::MAX_FRAME_BYTES,
+    cameras::{
+        clock_exchange,
+        frame::{CameraStatus, MAX_FRAME_BYTES},
+        host_clock::HostClock,
+    },
+    drain::{Drain, DrainThread, PublisherState},
+    error::TransportError,
+    header::{Header, MessageKind, empty_header},
     keys,
-    session::{self, Opened},
-    topic::{Body, Topic},
-    viewpoint::Leases,
+    session::{
+        config::{LARGEST_QUESTION, TransportConfig},
+        opening::{self, Opened},
+    },
+    topic::{Body, PublishOutcome, Topic, TopicCounts},
+    views::viewpoint::Leases,
 };
 
 /// Publishes the frames of cameras, each to a topic with one slot: the newest wins, nothing waits for the network. Answers
 /// questions for its clock.
 pub struct CameraPublisher {
-    shared: Arc<Shared>,
+    shared: Arc<PublisherState>,
     cameras: Vec<Lane>,
     endpoints: Vec<String>,
-    probe: Option<Probe>,
+    probe: Option<KeyProbe>,
     drain: DrainThread,
     _alive: LivelinessToken,
 }
@@ -63,17 +69,17 @@ impl CameraPublisher {
             })
         };
         let cameras: Vec<Lane> = cameras.iter().map(lane).collect::<Result<_, TransportError>>()?;
-        let Opened { session, endpoints, .. } = session::open(config, LARGEST_QUESTION, &[])?;
+        let Opened { session, endpoints, .. } = opening::open(config, LARGEST_QUESTION, &[])?;
         let failed = |error: zenoh::Error| TransportError::session(format!("cameras of rig {rig}"), &error);
         let topics: Vec<_> = cameras.iter().flat_map(|lane| [lane.frames.clone(), lane.status.clone()]).collect();
-        let (shared, woken) = Shared::new(rig, &session, &topics, Leases::new(0, Duration::ZERO, 0));
+        let (shared, woken) = PublisherState::new(rig, &session, &topics, Leases::new(0, Duration::ZERO, 0));
         let host = session.zid().to_string();
         clock_exchange::answer(&session, keys::key(rig, &format!("clock/{host}")), clock).map_err(failed)?;
         let alive = keys::key(rig, &format!("host/{host}"));
         let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
         let drain = DrainThread::start(Drain { shared: shared.clone(), session, woken })?;
         let statuses: Vec<_> = cameras.iter().map(|lane| lane.status.clone()).collect();
-        let probe = session::probe(config, move || statuses.iter().any(|topic| topic.is_watched()))?;
+        let probe = opening::probe(config, move || statuses.iter().any(|topic| topic.is_watched()))?;
         Ok(Self { shared, cameras, endpoints, probe, drain, _alive: alive })
     }
 
@@ -86,7 +92,7 @@ impl CameraPublisher {
     /// Returns the reason why the rig does not admit the key; None while it does, without a key, and before the first answer.
     #[must_use]
     pub fn trouble(&self) -> Option<String> {
-        self.probe.as_ref().and_then(Probe::trouble)
+        self.probe.as_ref().and_then(KeyProbe::trouble)
     }
 
     /// Hands in a frame.

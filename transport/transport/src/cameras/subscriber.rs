@@ -11,41 +11,23 @@ use flyrig_types::{CameraId, Frame, ThreadWatch};
 use zenoh::{Session, Wait, sample::Sample, sample::SampleKind};
 
 use crate::{
-    CameraStatus, ClockEstimate, HostClock, TransportConfig, TransportError,
-    camera_inbox::CameraInbox,
-    clock_exchange::{Asker, Question},
-    config::LARGEST_QUESTION,
-    frame::MAX_FRAME_BYTES,
+    cameras::{
+        clock_exchange::{Asker, Question},
+        frame::MAX_FRAME_BYTES,
+        host_clock::HostClock,
+        inbox::CameraInbox,
+        link::CameraLink,
+    },
+    error::TransportError,
     header::MAX_ATTACHMENT,
+    json::MAX_JSON_BYTES,
     keys,
-    session::{self, Opened},
-    stats::MAX_JSON_BYTES,
+    session::{
+        config::{LARGEST_QUESTION, TransportConfig},
+        opening::{self, Opened},
+    },
     topic::lock,
 };
-
-/// What became of a camera's frames on their way; counts since this side was opened.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct CameraLink {
-    /// Frames that came and could be used.
-    pub frames: u64,
-    /// Frames overtaken before they left the camera's computer, or not sent because nobody listened.
-    pub withheld: u64,
-    /// Frames that left and never came.
-    pub lost: u64,
-    /// Frames that newer ones overtook here before they were read, or that were dropped because too many bytes waited over
-    /// all cameras.
-    pub overtaken: u64,
-    /// Messages that could not be used; the errors tell why.
-    pub refused: u64,
-    /// Frames that came before their computer's clock was known.
-    pub before_clock: u64,
-    /// Times that another program began to publish the camera: a restart, or another computer.
-    pub restarts: u64,
-    /// The clock of the camera's computer.
-    pub clock: Option<ClockEstimate>,
-    /// What that computer says of the camera.
-    pub status: Option<CameraStatus>,
-}
 
 /// Receives the frames of cameras of other computers, with capture times on this computer's clock.
 ///
@@ -86,7 +68,7 @@ impl CameraSubscriber {
         for camera in cameras {
             keys::check_name("camera", camera.as_str())?;
         }
-        let Opened { session, gate, .. } = session::open(config, MAX_FRAME_BYTES + LARGEST_QUESTION, &[Role::Cameras])?;
+        let Opened { session, gate, .. } = opening::open(config, MAX_FRAME_BYTES + LARGEST_QUESTION, &[Role::Cameras])?;
         let failed = |error: zenoh::Error| TransportError::session(format!("cameras of rig {rig}"), &error);
         let shared = Arc::new(Shared {
             rig: rig.clone(),

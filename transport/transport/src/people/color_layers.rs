@@ -271,7 +271,7 @@ fn fast_of(nanos: &mut [i64]) -> i64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::wake_lag::Ticks;
+    use crate::people::wake_lag::Ticks;
 
     fn begun(now: Instant) -> ColorLayers {
         let mut layers = ColorLayers::new(now);

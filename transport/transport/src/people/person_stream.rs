@@ -17,13 +17,13 @@ use zenoh::{
 };
 
 use crate::{
-    MessageKind, TransportError,
-    drain::Shared,
+    drain::PublisherState,
+    error::TransportError,
+    header::MessageKind,
     inbox::Inbox,
-    keys,
-    splats::MAX_PERSON_TOPICS,
+    keys::{self, MAX_PERSON_TOPICS},
+    people::wake_lag::WakeLag,
     topic::{Topic, lock},
-    wake_lag::WakeLag,
 };
 
 /// Bytes of a template in a reply: it fits in one batch of zenoh's, so that a slow line drops no fragments.
@@ -51,7 +51,7 @@ type Topics = [Arc<Topic>; 1 + LAYERS];
 
 /// The people whose stream is published, the one that was published last at the end.
 #[derive(Debug)]
-pub(crate) struct People {
+pub(crate) struct PublishedPeople {
     /// Person 0 always has topics, so that subscribers are noticed before anybody is seen.
     first: Topics,
     others: Mutex<Vec<(u32, Topics)>>,
@@ -69,7 +69,7 @@ fn topics_of(person: u32) -> Topics {
     })
 }
 
-impl People {
+impl PublishedPeople {
     pub fn new() -> Self {
         Self { first: topics_of(0), others: Mutex::default(), templates: Mutex::default() }
     }
@@ -85,7 +85,7 @@ impl People {
 
     /// Returns a person's topics. Those of a new one are made; beyond [`MAX_PERSON_TOPICS`] the person who was published longest
     /// ago loses them.
-    pub fn topics(&self, person: u32, shared: &Shared) -> Topics {
+    pub fn topics(&self, person: u32, shared: &PublisherState) -> Topics {
         if person == 0 {
             return self.first.clone();
         }
@@ -128,7 +128,9 @@ impl People {
 
 /// Starts a thread that answers requests for templates, and returns what hands them in without waiting. It ends when that is dropped. The
 /// network's thread must not answer: where it also sends, replies find no room until it has sent some.
-pub(crate) fn answer_templates(people: Arc<People>) -> Result<impl Fn(Query) + Send + Sync + 'static, TransportError> {
+pub(crate) fn answer_templates(
+    people: Arc<PublishedPeople>,
+) -> Result<impl Fn(Query) + Send + Sync + 'static, TransportError> {
     let (queries, waiting) = bounded::<Query>(MAX_QUERIES);
     std::thread::Builder::new()
         .name("flyrig-answers".to_owned())
@@ -139,7 +141,7 @@ pub(crate) fn answer_templates(people: Arc<People>) -> Result<impl Fn(Query) + S
 }
 
 /// A template that is not known is not answered: another publisher may have it.
-fn answer_template(people: &People, query: &Query) {
+fn answer_template(people: &PublishedPeople, query: &Query) {
     let Some(reply) = keys::label_in(query.key_expr().as_str()).and_then(|label| people.chunk(label)) else { return };
     if let Err(error) = query.reply(query.key_expr(), reply).wait() {
         tracing::warn!(%error, "could not answer a request for a template");

@@ -13,8 +13,15 @@ use flyrig_stream::stamp_of;
 use flyrig_types::{Rig, SupervisedThread, ThreadHealth};
 
 use crate::{
-    FetchedTemplate, Interests, PersonMessage, Publisher, Received, Subscriber, TemplateFetcher, TransportConfig,
-    TransportError, topic::lock,
+    error::TransportError,
+    people::{
+        person_stream::PersonMessage,
+        template_fetcher::{FetchedTemplate, TemplateFetcher},
+    },
+    publisher::Publisher,
+    session::config::TransportConfig,
+    subscriber::{Interests, Received, Subscriber},
+    topic::lock,
 };
 
 /// How long a message is waited for.

@@ -10,7 +10,7 @@ use std::{
 use crossbeam::channel::{Receiver, Sender, bounded};
 use flyrig_types::caught;
 
-use crate::{TransportError, people::PersonSubscription, splats::MAX_PERSON_TOPICS};
+use crate::{error::TransportError, keys::MAX_PERSON_TOPICS, people::person_stream::PersonSubscription};
 
 /// How long one template may take before the next has its turn.
 const PATIENCE: Duration = Duration::from_secs(30);

@@ -6,7 +6,7 @@ use flyrig_access::KeyFile;
 use serde::{Deserialize, Serialize};
 use zenoh::Config;
 
-use crate::{TransportError, keys};
+use crate::{error::TransportError, keys};
 
 /// Where a rig is found and how its sessions behave; one structure for both sides.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

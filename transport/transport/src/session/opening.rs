@@ -3,14 +3,17 @@
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 
 use base64::{Engine as _, engine::general_purpose::STANDARD};
-use flyrig_access::{AccessError, Gate, Inner, KeyFile, Probe, Ring, Role};
+use flyrig_access::{AccessError, Gate, Inner, KeyFile, KeyProbe, Ring, Role};
 use serde_json::json;
 use zenoh::{Session, Wait};
 
 use crate::{
-    TransportConfig, TransportError, access_rules,
-    config::{is_loopback, tls_endpoint},
-    network_threads::check_network_threads,
+    error::TransportError,
+    session::{
+        access_rules,
+        config::{TransportConfig, is_loopback, tls_endpoint},
+        network_threads::check_network_threads,
+    },
 };
 
 /// Bytes that the system keeps between a session and its gate.
@@ -90,8 +93,8 @@ pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> 
 pub(crate) fn probe(
     config: &TransportConfig,
     is_connected: impl Fn() -> bool + Send + 'static,
-) -> Result<Option<Probe>, TransportError> {
-    Ok(config.key.clone().map(|key| Probe::start(key, is_connected)).transpose()?)
+) -> Result<Option<KeyProbe>, TransportError> {
+    Ok(config.key.clone().map(|key| KeyProbe::start(key, is_connected)).transpose()?)
 }
 
 /// Address of the session behind a gate.

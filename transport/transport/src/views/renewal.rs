@@ -10,10 +10,10 @@ use flyrig_types::Camera;
 use zenoh::{Session, Wait, qos::CongestionControl};
 
 use crate::{
-    TransportError, ViewpointStatus,
-    stats::{MAX_JSON_BYTES, to_json},
+    error::TransportError,
+    json::{MAX_JSON_BYTES, to_json},
     topic::lock,
-    viewpoint::{ViewpointAnswer, ViewpointRequest},
+    views::viewpoint::{ViewpointAnswer, ViewpointRequest, ViewpointStatus},
 };
 
 /// How long an answer may take.

@@ -6,7 +6,7 @@ use foxglove::{
 };
 use prost::bytes::Bytes;
 
-use crate::TransportError;
+use crate::{error::TransportError, header::Header};
 
 /// Largest compressed image, bytes.
 pub const MAX_IMAGE_BYTES: usize = 32 << 20;
@@ -83,7 +83,7 @@ impl ViewFrame {
         check_len(view, self.bytes.len())
     }
 
-    /// As foxglove `CompressedImage`; size and frame number travel in the [`crate::Header`].
+    /// As foxglove `CompressedImage`; size and frame number travel in the [`Header`].
     ///
     /// # Errors
     /// `Malformed` when protobuf refuses it.
@@ -101,7 +101,7 @@ impl ViewFrame {
     ///
     /// # Errors
     /// `Malformed`.
-    pub fn decode(view: &str, header: &crate::Header, payload: Bytes) -> Result<Self, TransportError> {
+    pub fn decode(view: &str, header: &Header, payload: Bytes) -> Result<Self, TransportError> {
         if payload.len() > MAX_MESSAGE_BYTES {
             return Err(TransportError::malformed(view, format!("{} bytes are too many for an image", payload.len())));
         }

@@ -8,7 +8,7 @@ use std::{
 use flyrig_types::Camera;
 use serde::{Deserialize, Serialize};
 
-use crate::{TransportError, keys, printable::clean, stats::from_json};
+use crate::{error::TransportError, json::from_json, keys, printable::clean};
 
 /// Largest side of an image that a subscriber may ask for, pixels.
 pub const MAX_VIEWPOINT_SIDE: u32 = 4096;
