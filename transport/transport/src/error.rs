@@ -1,33 +1,33 @@
-//! What can go wrong on the wire.
+//! Errors of the transport.
 
 use flyrig_stream::SplatError;
 
 use crate::{printable::printable, schema::SCHEMA_VERSION};
 
-/// Sort of a [`TransportError`], for those who decide what to do next.
+/// Kind of a [`TransportError`], for callers that react to it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TransportErrorKind {
-    /// A setting, name or request of our own side is not usable.
+    /// Invalid setting, name or request of this side.
     Config,
-    /// The zenoh session failed.
+    /// Failure of the zenoh session.
     Session,
-    /// The other side speaks a schema version that we do not know.
+    /// Schema version of the other side that this program does not know.
     UnknownVersion,
-    /// A message cannot be what it claims to be.
+    /// Malformed message.
     Malformed,
-    /// The session is closed.
+    /// Closed session.
     Closed,
 }
 
-/// An error that names the thing and the fix. Both texts are [`printable`]: either may repeat what another program sent.
+/// Error that names the faulty item and the fix. Both texts are [`printable()`]: either may repeat what another program sent.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{topic}: {message}")]
 pub struct TransportError {
-    /// Sort.
+    /// Kind.
     pub kind: TransportErrorKind,
-    /// Key, setting or message part that is meant.
+    /// Key, setting or part of a message that is at fault.
     pub topic: String,
-    /// What is wrong and what helps.
+    /// Fault and fix.
     pub message: String,
 }
 

@@ -1,16 +1,16 @@
-//! What every message carries beside its payload, as the zenoh attachment.
+//! Header that every message carries as its zenoh attachment.
 
 use crate::{error::TransportError, host::unix_nanos, schema::SCHEMA_VERSION};
 
 /// Bytes of an encoded [`Header`].
 pub const HEADER_BYTES: usize = 64;
 
-/// Longest attachment that is looked at, bytes.
+/// Longest attachment that is read, bytes.
 pub(crate) const MAX_ATTACHMENT: usize = 4 * HEADER_BYTES;
 
 const MAGIC: [u8; 4] = *b"FLYR";
 
-/// Which payload a message has.
+/// Kind of a message's payload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MessageKind {
     /// foxglove `CompressedImage`.
@@ -23,13 +23,13 @@ pub enum MessageKind {
     Transforms,
     /// [`crate::RigStats`].
     Stats,
-    /// A camera's image, see [`crate::FrameHeader`].
+    /// Image of a camera, see [`crate::FrameHeader`].
     Frame,
     /// [`crate::CameraStatus`].
     CameraStatus,
     /// [`flyrig_stream::Motion`].
     Motion,
-    /// A layer of a person's colours, for [`flyrig_stream::ColorDecoder`].
+    /// Layer of a person's colours, for [`flyrig_stream::ColorDecoder`].
     Colors,
 }
 
@@ -61,32 +61,49 @@ impl MessageKind {
     }
 }
 
-/// Fixed little-endian layout of 64 bytes: magic `FLYR`, version u16, kind u8, 0, then the fields in
-/// their order here.
+/// Message header with a fixed little-endian layout of 64 bytes: magic `FLYR`, version u16, kind u8, 0, then the fields in this order.
+///
+/// ```
+/// use flyrig_transport::{Header, MessageKind};
+///
+/// let header = Header {
+///     kind: MessageKind::Stats,
+///     sequence: 7,
+///     frame: 120,
+///     capture_nanos: 4_000_000_000,
+///     publish_unix_nanos: 1_700_000_000_000_000_000,
+///     host: 1,
+///     publisher: 2,
+///     width: 0,
+///     height: 0,
+/// };
+/// assert_eq!(Header::decode("stats", &header.encode())?, header);
+/// # Ok::<(), flyrig_transport::TransportError>(())
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Header {
-    /// Which payload follows.
+    /// Kind of the payload.
     pub kind: MessageKind,
-    /// Counts the messages of this topic from 0; a gap is a loss on the way (or a newer one won).
+    /// Sequence number within the topic, from 0; a gap is a message that was lost, or replaced by a newer one.
     pub sequence: u64,
-    /// The rig's frame number.
+    /// Frame number of the rig.
     pub frame: u64,
-    /// `CLOCK_MONOTONIC` of the capturing host.
+    /// Capture time, `CLOCK_MONOTONIC` of the capturing host.
     pub capture_nanos: i64,
-    /// Wall clock of the publisher when the message was handed to it, since 1970.
+    /// Time at which the message was handed to the publisher, by its wall clock, nanoseconds since 1970.
     pub publish_unix_nanos: i64,
-    /// Tells hosts (and their restarts) apart: only within one host is the latency exact. 0 when unknown.
+    /// Identity of the host since its boot: only within one host is the latency exact. 0 when unknown.
     pub host: u64,
-    /// Tells publishers (and their restarts) apart.
+    /// Identity of the publisher since its start.
     pub publisher: u64,
-    /// Pixels of a view, else 0.
+    /// Width of a view, pixels; otherwise 0.
     pub width: u32,
-    /// Pixels of a view, else 0.
+    /// Height of a view, pixels; otherwise 0.
     pub height: u32,
 }
 
 impl Header {
-    /// As on the wire.
+    /// Encodes the header.
     #[must_use]
     pub fn encode(&self) -> [u8; HEADER_BYTES] {
         let mut bytes = [0; HEADER_BYTES];
@@ -109,17 +126,17 @@ impl Header {
         bytes
     }
 
-    /// From the wire.
+    /// Decodes a header; errors name `topic`.
     ///
     /// # Errors
-    /// `UnknownVersion` for another schema version, else `Malformed`; `topic` stands in the text.
+    /// `UnknownVersion` for another schema version, otherwise `Malformed`.
     pub fn decode(topic: &str, bytes: &[u8]) -> Result<Self, TransportError> {
         let malformed = |message: String| TransportError::malformed(topic, message);
         let mut reader = Reader(bytes);
         if reader.take::<4>() != Some(MAGIC) {
             return Err(malformed("the message has no flyrig header; something else publishes on this key".to_owned()));
         }
-        // The version comes before any other check: the rest may have another form.
+        // The version is checked first: the rest may have another layout.
         let version = reader.take().map(u16::from_le_bytes);
         if version.is_some_and(|version| version != SCHEMA_VERSION) {
             return Err(TransportError::version(topic, version.unwrap_or_default()));
@@ -145,7 +162,7 @@ impl Header {
     }
 }
 
-/// A header for [`Topic::offer`] to fill in.
+/// Returns a header for [`crate::topic::Topic::offer`] to fill in.
 pub(crate) fn empty_header() -> Header {
     Header {
         kind: MessageKind::Stats,
@@ -160,7 +177,7 @@ pub(crate) fn empty_header() -> Header {
     }
 }
 
-/// Takes fixed-size pieces off a byte slice.
+/// Reader of fixed-size pieces off the front of a byte slice.
 pub(crate) struct Reader<'a>(pub &'a [u8]);
 
 impl Reader<'_> {

@@ -4,10 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::{error::TransportError, schema::SCHEMA_VERSION};
 
-/// Largest JSON payload that is looked at, bytes.
+/// Largest JSON payload that is read, bytes.
 pub(crate) const MAX_JSON_BYTES: usize = 1 << 18;
 
-/// JSON with the version first, so that a reader can tell before it understands the rest.
+/// Message with its version first, so that a reader can check it before it parses the rest.
 #[derive(Serialize)]
 struct Versioned<'a, T> {
     schema_version: u16,
@@ -20,7 +20,7 @@ struct VersionOnly {
     schema_version: u64,
 }
 
-/// JSON bytes of a message with its schema version.
+/// Encodes a message as JSON with its schema version.
 pub(crate) fn to_json<T: Serialize>(topic: &str, body: &T) -> Result<Vec<u8>, TransportError> {
     let bytes = serde_json::to_vec(&Versioned { schema_version: SCHEMA_VERSION, body })
         .map_err(|error| TransportError::config(topic, error.to_string()))?;
@@ -30,7 +30,7 @@ pub(crate) fn to_json<T: Serialize>(topic: &str, body: &T) -> Result<Vec<u8>, Tr
     Ok(bytes)
 }
 
-/// Message out of JSON bytes of our schema version.
+/// Decodes a message from JSON of this schema version.
 pub(crate) fn from_json<T: serde::de::DeserializeOwned>(topic: &str, bytes: &[u8]) -> Result<T, TransportError> {
     if bytes.len() > MAX_JSON_BYTES {
         let len = bytes.len();

@@ -1,4 +1,4 @@
-//! Cameras on the wire: foxglove `CameraCalibration` for the lens, `FrameTransforms` for the places.
+//! Calibration on the wire: foxglove `CameraCalibration` for intrinsics, `FrameTransforms` for poses.
 
 use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Lens, Rig};
 use foxglove::{
@@ -13,17 +13,17 @@ use crate::{
     views::view::{timestamp, to_bytes},
 };
 
-/// Frames of the transforms message: a level frame (z up) that holds the world, which holds the cameras.
+/// Frames of the transforms message: the level frame (z up) is the parent of the world, which is the parent of the cameras.
 const LEVEL: &str = "level";
 const WORLD: &str = "world";
 
-/// Most cameras of a rig on the wire.
+/// Largest number of cameras of a rig on the wire.
 const MAX_CAMERAS: usize = 1024;
 
-/// Largest payload that is looked at, bytes.
+/// Largest payload that is read, bytes.
 pub(crate) const MAX_BYTES: usize = 1 << 18;
 
-/// Lens and sensor of a camera as foxglove `CameraCalibration` (protobuf).
+/// Encodes the intrinsics of a camera as foxglove `CameraCalibration` (protobuf).
 ///
 /// # Errors
 /// `Config` when the camera is not valid.
@@ -54,7 +54,7 @@ pub fn encode_calibration(camera: &Camera) -> Result<Vec<u8>, TransportError> {
     to_bytes("calibration", &message)
 }
 
-/// Name, lens and sensor out of a `CameraCalibration`.
+/// Decodes name and intrinsics of a camera from `CameraCalibration`.
 ///
 /// # Errors
 /// `Malformed` names the field.
@@ -102,17 +102,17 @@ pub fn decode_calibration(bytes: &[u8]) -> Result<(CameraId, Intrinsics), Transp
     Ok((id, intrinsics))
 }
 
-/// What `transforms` says: where the cameras are, in rig order, and which way is up.
+/// Poses of the cameras, in rig order, and the up direction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RigTransforms {
-    /// Per camera `camera_from_world`.
+    /// `camera_from_world` of each camera.
     pub camera_from_world: Vec<(CameraId, Isometry)>,
     /// Unit vector against gravity, world axes.
     pub world_up: DVec3,
 }
 
-/// Places of a rig's cameras as foxglove `FrameTransforms` (protobuf): `level` (z up) holds `world`
-/// holds every camera.
+/// Encodes the poses of a rig's cameras as foxglove `FrameTransforms` (protobuf): `level` (z up) is the parent of `world`, which is the
+/// parent of every camera.
 ///
 /// # Errors
 /// `Config` when the rig is not valid.
@@ -126,7 +126,7 @@ pub fn encode_transforms(rig: &Rig) -> Result<Vec<u8>, TransportError> {
     to_bytes("transforms", &FrameTransforms { transforms })
 }
 
-/// Places out of `FrameTransforms`.
+/// Decodes the poses of a rig's cameras from `FrameTransforms`.
 ///
 /// # Errors
 /// `Malformed` names the transform.

@@ -1,4 +1,4 @@
-//! Questions for another computer's clock, and their answers.
+//! Queries of other computers' clocks, and their answers.
 
 use std::{
     sync::{
@@ -17,46 +17,49 @@ use zenoh::{
 
 use crate::{cameras::host_clock::HostClock, error::TransportError};
 
-/// Between two questions: at first, and later.
+/// Interval between two queries of a clock: at first, and later.
 const EAGER: Duration = Duration::from_millis(50);
 const CALM: Duration = Duration::from_millis(250);
-/// An answer later than this is none.
+/// Time limit of an answer.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// Answers with the clock's time until the session ends.
+/// Answers queries with the clock's time until the session ends.
 pub(crate) fn answer(session: &Session, key: String, clock: HostClock) -> Result<(), zenoh::Error> {
     session
         .declare_queryable(key)
         .callback(move |query: Query| {
             let answered = query.reply(query.key_expr(), clock.now_nanos().to_le_bytes()).express(true).wait();
             if let Err(error) = answered {
-                tracing::debug!(%error, "a question for the clock was not answered");
+                tracing::debug!(%error, "could not answer a query of the clock");
             }
         })
         .background()
         .wait()
 }
 
-/// Whom to ask: a key, what to do with the answer (asked, answer, answered; our clock but for the second), and whether
-/// more answers are wanted soon.
-pub(crate) struct Question {
+/// Pending query of a clock.
+pub(crate) struct ClockQuery {
+    /// Key of the query.
     pub key: String,
+    /// Identity of the computer.
     pub host: u64,
+    /// Whether more answers are needed soon.
     pub is_urgent: bool,
 }
 
-/// Asks every host again and again, in a thread.
+/// Thread that queries the clocks of all hosts repeatedly.
 pub(crate) struct Asker {
     stop: Arc<AtomicBool>,
     thread: SupervisedThread,
 }
 
 impl Asker {
-    /// `hosts` gives whom to ask now; `take` gets host, time of the question, answer and time of the answer.
+    /// Starts the thread. `hosts` returns the queries to send now; `take` is called with the host, the local send time, the remote time and
+    /// the local receive time, nanoseconds.
     pub(crate) fn start(
         session: Session,
         clock: HostClock,
-        hosts: impl Fn() -> Vec<Question> + Send + 'static,
+        hosts: impl Fn() -> Vec<ClockQuery> + Send + 'static,
         take: impl Fn(u64, i64, i64, i64) + Send + Sync + 'static,
     ) -> Result<Self, TransportError> {
         let stop = Arc::new(AtomicBool::new(false));
@@ -65,12 +68,12 @@ impl Asker {
             let mut calm_at = Instant::now();
             while !stopped.load(Ordering::Relaxed) {
                 let now = Instant::now();
-                let everybody = now >= calm_at;
-                if everybody {
+                let all = now >= calm_at;
+                if all {
                     calm_at = now + CALM;
                 }
-                for question in hosts().into_iter().filter(|question| everybody || question.is_urgent) {
-                    ask(&session, &clock, &question, take.clone());
+                for query in hosts().into_iter().filter(|query| all || query.is_urgent) {
+                    ask(&session, &clock, &query, take.clone());
                 }
                 std::thread::park_timeout(EAGER);
             }
@@ -93,16 +96,16 @@ impl Asker {
     }
 }
 
-fn ask<T>(session: &Session, clock: &HostClock, question: &Question, take: Arc<T>)
+fn ask<T>(session: &Session, clock: &HostClock, query: &ClockQuery, take: Arc<T>)
 where
     T: Fn(u64, i64, i64, i64) + Send + Sync + 'static,
 {
-    let (host, clock) = (question.host, clock.clone());
+    let (host, clock) = (query.host, clock.clone());
     let of_answer = clock.clone();
     let asked = clock.now_nanos();
     let sent = session
-        .get(&question.key)
-        // Else the answer is held back until the question is closed, which would count as its way.
+        .get(&query.key)
+        // Otherwise the answer is held back until the query is closed, which would add to the round trip.
         .consolidation(ConsolidationMode::None)
         .congestion_control(CongestionControl::Drop)
         .priority(Priority::RealTime)
@@ -111,14 +114,14 @@ where
         .callback(move |reply| {
             let answered = of_answer.now_nanos();
             let Ok(sample) = reply.result() else { return };
-            // A length that is not ours says nothing, whoever sent it.
+            // An answer of another length is ignored.
             if let Ok(time) = <[u8; 8]>::try_from(&*sample.payload().to_bytes()) {
                 take(host, asked, i64::from_le_bytes(time), answered);
             }
         })
         .wait();
     if let Err(error) = sent {
-        tracing::debug!(%error, "a clock could not be asked");
+        tracing::debug!(%error, "could not query a clock");
     }
 }
 
@@ -135,7 +138,7 @@ mod tests {
         testing::wait_until,
     };
 
-    fn asker(hosts: impl Fn() -> Vec<Question> + Send + 'static) -> Asker {
+    fn asker(hosts: impl Fn() -> Vec<ClockQuery> + Send + 'static) -> Asker {
         let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
         let Opened { session, .. } = opening::open(&config, 1 << 16, &[]).unwrap();
         Asker::start(session, HostClock::new(|| 0), hosts, |_, _, _, _| {}).unwrap()
@@ -157,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn an_asker_that_panics_again_and_again_fails_for_good() {
+    fn an_asker_that_panics_repeatedly_fails_for_good() {
         let mut asker = asker(|| panic!("no turn works"));
         wait_until("the end", || asker.watch().health().has_failed);
         asker.stop();

@@ -1,4 +1,4 @@
-//! A camera's image on the wire: its bytes as the payload, what they are in the attachment.
+//! Image of a camera on the wire: its bytes as the payload, their description as the attachment.
 
 use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 use serde::{Deserialize, Serialize};
@@ -16,10 +16,10 @@ pub const MAX_FRAME_BYTES: usize = 48 << 20;
 /// Bytes of an encoded [`FrameHeader`].
 pub const FRAME_HEADER_BYTES: usize = HEADER_BYTES + TAIL_BYTES;
 const TAIL_BYTES: usize = 24;
-/// An exposure that is not known.
+/// Code of an unknown exposure.
 const UNKNOWN: u64 = u64::MAX;
 
-/// Numbers on the wire; never reuse one.
+/// Codes of pixel formats on the wire; never reuse one.
 const FORMATS: [(u8, PixelFormat); 12] = [
     (1, PixelFormat::Rgb8),
     (2, PixelFormat::Bgr8),
@@ -35,23 +35,23 @@ const FORMATS: [(u8, PixelFormat); 12] = [
     (12, PixelFormat::Mjpeg),
 ];
 
-/// The attachment of a camera's image: a [`Header`] (`frame` is the camera's own sequence number, `capture_nanos` the
-/// middle of the exposure by the clock of the camera's computer), then 24 bytes, little-endian: exposure u64 (nanoseconds,
-/// all ones where it is not known), messages of this topic that never left u64, pixel format u8, seven zeros.
+/// Attachment of a camera's image: a [`Header`] (`frame` is the camera's own sequence number, `capture_nanos` the middle of the exposure by
+/// the clock of the camera's computer), then 24 bytes, little-endian: exposure u64 (nanoseconds, all ones when unknown), number of messages
+/// of this topic that were not sent u64, pixel format u8, seven zeros.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FrameHeader {
-    /// As in every message.
+    /// Header as in every message.
     pub header: Header,
     /// Exposure time where the camera's source knows it, nanoseconds.
     pub exposure_nanos: Option<u64>,
-    /// Messages handed in before this one that did not leave: overtaken, unwatched or failed.
+    /// Number of earlier messages that were not sent: replaced, unwatched or failed.
     pub withheld: u64,
-    /// What the bytes are.
+    /// Pixel format of the bytes.
     pub format: PixelFormat,
 }
 
 impl FrameHeader {
-    /// As on the wire.
+    /// Encodes the attachment.
     #[must_use]
     pub fn encode(&self) -> [u8; FRAME_HEADER_BYTES] {
         let mut bytes = [0; FRAME_HEADER_BYTES];
@@ -64,7 +64,7 @@ impl FrameHeader {
         bytes
     }
 
-    /// From the wire; `topic` stands in the error's text.
+    /// Decodes an attachment; errors name `topic`.
     ///
     /// # Errors
     /// `UnknownVersion` or `Malformed`.
@@ -93,7 +93,7 @@ impl FrameHeader {
         })
     }
 
-    /// The frame that it tells of; its capture time is still that of the camera's computer.
+    /// Returns the frame; its capture time is still by the clock of the camera's computer.
     ///
     /// # Errors
     /// `Malformed` when the bytes do not fit format and size.
@@ -116,33 +116,33 @@ impl FrameHeader {
     }
 }
 
-/// How a camera is where it is plugged in, once a second; counts since its computer's program started.
+/// Status of a camera as its computer reports it once per second; counts since the program there started.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CameraStatus {
     /// Name of the camera's computer.
     pub host: String,
-    /// Format, size and rate in force.
+    /// Format, size and rate in use.
     pub mode: String,
-    /// What is wrong now; empty when frames flow.
+    /// Present fault; empty when frames flow.
     pub problem: String,
     /// Frames read.
     pub frames: u64,
     /// Errors of every kind.
     pub errors: u64,
-    /// Frames that the driver numbered and nobody got.
+    /// Frames that the driver numbered and never delivered.
     pub lost_by_driver: u64,
-    /// Times that the camera came back.
+    /// Number of times that the camera came back.
     pub reconnects: u64,
-    /// Times that it stopped without an error.
+    /// Number of times that it stopped without an error.
     pub silences: u64,
-    /// Stamps that could not be right.
+    /// Implausible timestamps that were replaced.
     pub stamps_replaced: u64,
-    /// Frames overtaken before they were sent, in that program and its outlet.
+    /// Frames replaced before they were sent, in that program and its outlet.
     pub overtaken: u64,
 }
 
 impl CameraStatus {
-    /// As JSON.
+    /// Encodes the status as JSON.
     ///
     /// # Errors
     /// `Config` when it is too long.
@@ -150,7 +150,7 @@ impl CameraStatus {
         to_json("camera status", self)
     }
 
-    /// Out of JSON; the texts are [`crate::printable`].
+    /// Decodes a status from JSON; the texts are made [`crate::printable()`].
     ///
     /// # Errors
     /// `UnknownVersion` or `Malformed`.

@@ -1,39 +1,40 @@
-//! Clocks of two computers: how far the other one is from ours, from round trips.
+//! Offset and drift between the clocks of two computers, estimated from round trips.
 //!
-//! A question leaves at `t1` and its answer is here at `t4` (our clock), and says the other clock's `t` between. Half of the
-//! round trip bounds the error of `t - (t1 + t4) / 2`, so the quickest exchanges are worth most: of every few only the
-//! quickest counts (the minimum filter of NTP, RFC 5905, section 10), and a line through those is offset and drift.
+//! A query leaves at `t1` and its answer arrives at `t4` (local clock) with the remote clock's `t` in between. Half of the round trip bounds
+//! the error of `t - (t1 + t4) / 2`, so quick exchanges are the most accurate: in every block of [`BLOCK`] exchanges only the quickest
+//! counts (the minimum filter of NTP, RFC 5905, section 10), and a line fitted to those gives offset and drift.
 
 use std::{collections::VecDeque, fmt, sync::Arc};
 
 use flyrig_solve::{ClockLine, LineOptions, LineSample, fit_line};
 
-/// Exchanges of which only the quickest counts.
+/// Number of exchanges of which only the quickest counts.
 const BLOCK: usize = 8;
-/// Quickest ones that the line goes through, about two minutes.
+/// Number of quickest exchanges that the line is fitted to, about two minutes.
 const BLOCKS: usize = 64;
-/// How far clocks of computers usually drift apart, parts per million: what few or slow exchanges say beyond is their noise.
+/// Prior of the drift between two computers, parts per million: few or slow exchanges estimate a larger drift from noise.
 const USUAL_DRIFT_PPM: f64 = 100.0;
-/// Exchanges before the first answer.
+/// Number of exchanges before the first estimate.
 const FIRST_ANSWER: usize = 3;
-/// Clocks of computers run within this of each other, parts per million.
+/// Largest drift between two computers, parts per million.
 const MOST_DRIFT_PPM: f64 = 500.0;
-/// How far an exchange may lie from the line beyond its own bound, nanoseconds, and how many in a row that do make a step.
+/// Distance of an exchange from the line beyond its own error bound from which it is an outlier, nanoseconds; and the number of
+/// consecutive agreeing outliers that make a step of the clock.
 const SLACK: f64 = 2e6;
 const CONFIRMATIONS: usize = 4;
 
-/// The clock that stamps this computer's frames: `CLOCK_MONOTONIC`, nanoseconds.
+/// Clock that stamps this computer's frames: `CLOCK_MONOTONIC`, nanoseconds.
 #[derive(Clone)]
 pub struct HostClock(Arc<dyn Fn() -> i64 + Send + Sync>);
 
 impl HostClock {
-    /// Around a function that reads it; called from several threads.
+    /// Wraps a function that reads the clock; it is called from several threads.
     #[must_use]
     pub fn new(now_nanos: impl Fn() -> i64 + Send + Sync + 'static) -> Self {
         Self(Arc::new(now_nanos))
     }
 
-    /// Its time.
+    /// Returns the current time, nanoseconds.
     #[must_use]
     pub fn now_nanos(&self) -> i64 {
         (self.0)()
@@ -46,42 +47,42 @@ impl fmt::Debug for HostClock {
     }
 }
 
-/// What is known of another computer's clock.
+/// Estimate of another computer's clock.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ClockEstimate {
-    /// That clock minus ours, now, nanoseconds.
+    /// Remote minus local clock at present, nanoseconds.
     pub offset_nanos: i64,
-    /// How much faster it runs than ours, parts per million.
+    /// Rate of the remote clock relative to the local one, parts per million; positive when it runs faster.
     pub drift_ppm: f64,
-    /// Shortest round trip of late, nanoseconds: half of it bounds the offset's error.
+    /// Shortest recent round trip, nanoseconds; half of it bounds the error of the offset.
     pub round_trip_nanos: i64,
-    /// Steps of that clock so far.
+    /// Number of steps of the remote clock so far.
     pub steps: u64,
 }
 
 #[derive(Debug, Clone, Copy)]
 struct Exchange {
-    /// Middle of the question's and the answer's time, our clock.
+    /// Midpoint of send and receive time, local clock.
     local: i64,
-    /// The other clock minus `local`.
+    /// Remote clock minus `local`.
     offset: i64,
     round_trip: i64,
 }
 
-/// Estimates one clock.
+/// Estimator of one clock.
 #[derive(Debug, Default)]
 pub(crate) struct ClockFit {
     block: Vec<Exchange>,
     best: VecDeque<Exchange>,
     outliers: Vec<Exchange>,
-    /// The other clock minus ours.
+    /// Remote minus local clock over local time.
     line: Option<ClockLine>,
     round_trip: i64,
     steps: u64,
 }
 
 impl ClockFit {
-    /// Takes an exchange in: our time of the question, the answer, our time of the answer.
+    /// Ingests an exchange: local send time, remote time, local receive time.
     pub fn add(&mut self, asked: i64, answer: i64, answered: i64) {
         let round_trip = answered.saturating_sub(asked);
         if round_trip < 0 {
@@ -93,7 +94,7 @@ impl ClockFit {
         if let Some(line) = &self.line {
             let off = offset.saturating_sub(line.offset_at(local)) as f64;
             if off.abs() > round_trip as f64 / 2.0 + SLACK {
-                // Only those that agree with each other tell of another clock.
+                // Only outliers that agree with each other indicate a step.
                 self.outliers.retain(|other| {
                     let apart = other.offset.saturating_sub(offset).unsigned_abs() as f64;
                     apart <= (other.round_trip.saturating_add(round_trip)) as f64 / 2.0 + SLACK
@@ -102,7 +103,7 @@ impl ClockFit {
                 if self.outliers.len() < CONFIRMATIONS {
                     return;
                 }
-                // The clock was set, or its computer slept: what was learned is of another clock.
+                // The clock was set, or its computer slept: earlier exchanges no longer apply.
                 self.best.clear();
                 self.block = std::mem::take(&mut self.outliers);
                 self.steps += 1;
@@ -130,7 +131,7 @@ impl ClockFit {
         let all = || self.best.iter().chain(current);
         let Some(quickest) = all().min_by_key(|exchange| exchange.round_trip).copied() else { return };
         self.round_trip = quickest.round_trip;
-        // Around the quickest exchange; each is known to half of its round trip, the drift to what is usual.
+        // The fit is centred on the quickest exchange; each is known to half of its round trip, the drift to its prior.
         let known = |exchange: &Exchange| exchange.round_trip.max(1000) as f64 / 2.0;
         let sample = |exchange: &Exchange| LineSample {
             time_nanos: exchange.local,
@@ -148,7 +149,7 @@ impl ClockFit {
         self.line = Some(fit.map_or(flat, |fit| fit.line));
     }
 
-    /// What is known at our time; none before a few exchanges.
+    /// Returns the estimate at a local time; `None` before a few exchanges.
     pub fn estimate(&self, local_nanos: i64) -> Option<ClockEstimate> {
         let line = self.line?;
         Some(ClockEstimate {
@@ -159,15 +160,15 @@ impl ClockFit {
         })
     }
 
-    /// Our time of a time of the other clock.
+    /// Converts a remote time to the local clock.
     pub fn to_local(&self, remote_nanos: i64) -> Option<i64> {
         let line = self.line?;
-        // The line takes our time; the difference of one more turn is the drift squared.
+        // The line takes local time; one more iteration would change the result by the drift squared.
         let local = remote_nanos.saturating_sub(line.offset_nanos);
         Some(remote_nanos.saturating_sub(line.offset_at(local)))
     }
 
-    /// Whether questions should come quickly.
+    /// Returns whether queries should follow each other quickly.
     pub fn is_young(&self) -> bool {
         self.best.len() < 2
     }
@@ -177,7 +178,7 @@ impl ClockFit {
 mod tests {
     use super::*;
 
-    /// The same numbers on every machine; 0 to 1.
+    /// Generator of the same numbers on every machine, 0 to 1.
     struct Random(u64);
 
     impl Random {
@@ -198,7 +199,7 @@ mod tests {
         }
     }
 
-    /// A wire of 200 us each way; every third exchange waits up to 20 ms more behind images, on one way only.
+    /// Adds an exchange over a wire of 200 us each way; every third one waits up to 20 ms more behind images, in one direction only.
     fn exchange(fit: &mut ClockFit, truth: &Truth, local: i64, random: &mut Random) {
         let mut way = || 200_000 + (random.unit() * 30_000.0) as i64;
         let (mut there, mut back) = (way(), way());

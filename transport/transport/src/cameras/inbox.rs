@@ -1,4 +1,4 @@
-//! What has come of other computers' cameras: frames that wait, clocks, and who is there.
+//! Received state of other computers' cameras: waiting frames, clocks, and which computers are present.
 
 use std::{
     collections::{BTreeMap, BTreeSet, VecDeque},
@@ -9,7 +9,7 @@ use flyrig_types::{CameraId, Frame};
 
 use crate::{
     cameras::{
-        clock_exchange::Question,
+        clock_exchange::ClockQuery,
         frame::{CameraStatus, FrameHeader},
         host_clock::ClockFit,
         link::CameraLink,
@@ -21,31 +21,32 @@ use crate::{
     schema::SCHEMA_VERSION,
 };
 
-/// Frames of a camera that may wait for their reader.
+/// Largest number of waiting frames of a camera.
 const WAITING: usize = 4;
-/// A publisher of a camera that was silent for so long may be followed by another.
+/// Silence of a camera's publisher after which another may take over.
 const SUCCESSION: Duration = Duration::from_secs(1);
-/// The same trouble is told again after this.
+/// Interval after which the same error is reported again.
 const AGAIN: Duration = Duration::from_secs(10);
-/// Frames are younger than this, and not of the future but for the clock's error; nanoseconds.
+/// Largest age of a frame, and its largest lead, due to the clock's error; nanoseconds.
 const OLDEST: i64 = 10_000_000_000;
 const EARLIEST: i64 = 500_000_000;
-/// Computers and names that are remembered.
+/// Largest number of computers and names that are remembered.
 const MAX_HOSTS: usize = 256;
-/// Names of others that an error repeats.
+/// Largest number of names of others in an error.
 const SHOWN_NAMES: usize = 8;
-/// So often a computer without answers is asked in quick succession.
+/// Number of quick queries to a computer that does not answer.
 const EAGER_QUESTIONS: u32 = 100;
 
+/// Mailbox of the cameras of other computers.
 #[derive(Debug)]
 pub(crate) struct CameraInbox {
     rig: String,
     slots: Vec<Slot>,
-    /// Most bytes of images that wait, over all cameras.
+    /// Bound of the bytes of waiting images over all cameras.
     quota: u64,
-    /// By publisher.
+    /// Computers with cameras, by publisher.
     hosts: BTreeMap<u64, Host>,
-    /// Keys of computers that we cannot use: of other rigs, of other versions.
+    /// Keys of computers of other rigs and versions.
     others: BTreeSet<String>,
 }
 
@@ -57,7 +58,7 @@ struct Host {
 }
 
 impl Host {
-    /// Whether it was asked often and never told its time.
+    /// Returns whether it was queried often and never answered.
     fn is_mute(&self) -> bool {
         self.asked >= EAGER_QUESTIONS && self.fit.is_young()
     }
@@ -70,10 +71,12 @@ struct Slot {
     link: CameraLink,
     publisher: Option<u64>,
     arrived: Option<Instant>,
-    /// Sequence and withheld count of the message before.
+    /// Sequence number and withheld count of the previous message.
     last: Option<(u64, u64)>,
+    /// Error to report.
     trouble: Option<TransportError>,
-    told: Option<(String, Instant)>,
+    /// Text and time of the last reported error.
+    reported: Option<(String, Instant)>,
 }
 
 impl CameraInbox {
@@ -86,7 +89,7 @@ impl CameraInbox {
             arrived: None,
             last: None,
             trouble: None,
-            told: None,
+            reported: None,
         };
         Self {
             rig: rig.to_owned(),
@@ -97,7 +100,7 @@ impl CameraInbox {
         }
     }
 
-    /// A computer with cameras appeared or is gone.
+    /// Notes that a computer with cameras has appeared or disappeared.
     pub fn host(&mut self, key: &str, is_alive: bool) {
         let ours = (Some(self.rig.as_str()), Some(format!("v{SCHEMA_VERSION}")));
         if (keys::rig_in(key), keys::version_in(key).map(str::to_owned)) != ours {
@@ -115,7 +118,7 @@ impl CameraInbox {
             return;
         }
         if self.hosts.len() >= MAX_HOSTS {
-            // Names that nobody answers to must not keep a real computer out.
+            // Names without a computer behind them must not keep a real computer out.
             self.hosts.retain(|_, host| !host.is_mute());
         }
         if self.hosts.len() < MAX_HOSTS {
@@ -124,21 +127,27 @@ impl CameraInbox {
         }
     }
 
-    /// Whose clock to ask for.
-    pub fn questions(&mut self) -> Vec<Question> {
-        let question = |(host, state): (&u64, &mut Host)| {
+    /// Returns the queries for clocks to send now.
+    pub fn clock_queries(&mut self) -> Vec<ClockQuery> {
+        let query = |(host, state): (&u64, &mut Host)| {
             state.asked = state.asked.saturating_add(1);
-            Question { key: state.clock_key.clone(), host: *host, is_urgent: state.fit.is_young() && !state.is_mute() }
+            ClockQuery {
+                key: state.clock_key.clone(),
+                host: *host,
+                is_urgent: state.fit.is_young() && !state.is_mute(),
+            }
         };
-        self.hosts.iter_mut().map(question).collect()
+        self.hosts.iter_mut().map(query).collect()
     }
 
+    /// Ingests an answer to a query for a clock.
     pub fn clock(&mut self, host: u64, asked: i64, answer: i64, answered: i64) {
         if let Some(host) = self.hosts.get_mut(&host) {
             host.fit.add(asked, answer, answered);
         }
     }
 
+    /// Ingests the status of a camera.
     pub fn status(
         &mut self,
         camera: &CameraId,
@@ -160,6 +169,7 @@ impl CameraInbox {
         }
     }
 
+    /// Ingests a frame of a camera; `now_nanos` is the local time.
     pub fn frame(
         &mut self,
         camera: &CameraId,
@@ -188,7 +198,8 @@ impl CameraInbox {
         let age = now_nanos.saturating_sub(capture_nanos);
         if !(-EARLIEST..=OLDEST).contains(&age) {
             let secs = age as f64 * 1e-9;
-            let text = format!("its stamp is {secs:.1} s before now, which cannot be; restart `flyrig capture` there");
+            let text =
+                format!("its timestamp is {secs:.1} s before now, which is impossible; restart `flyrig capture` there");
             return slot.refuse(TransportError::malformed(key, text));
         }
         slot.link.frames += 1;
@@ -197,12 +208,12 @@ impl CameraInbox {
             slot.link.overtaken += 1;
         }
         slot.waiting.push_back(Frame { capture_nanos, ..frame });
-        self.fit();
+        self.enforce_quota();
     }
 
     /// Drops the oldest frames of the camera with the most bytes waiting until the quota holds: a camera of huge images
     /// loses its own.
-    fn fit(&mut self) {
+    fn enforce_quota(&mut self) {
         while self.slots.iter().map(Slot::waiting_bytes).sum::<u64>() > self.quota {
             let Some(slot) = self.slots.iter_mut().max_by_key(|slot| slot.waiting_bytes()) else { return };
             slot.waiting.pop_front();
@@ -220,13 +231,14 @@ impl CameraInbox {
         Ok(slot.waiting.pop_front().map(Ok))
     }
 
+    /// Returns the state of the link to a camera at a local time.
     pub fn link(&self, camera: &CameraId, now_nanos: i64) -> CameraLink {
         let Some(slot) = self.slots.iter().find(|slot| slot.camera == *camera) else { return CameraLink::default() };
         let host = slot.publisher.and_then(|publisher| self.hosts.get(&publisher));
         CameraLink { clock: host.and_then(|host| host.fit.estimate(now_nanos)), ..slot.link.clone() }
     }
 
-    /// `how` says how a computer gets here.
+    /// Explains why no frames of a camera arrive; `how` describes how a computer connects here.
     pub fn absence(&self, camera: &CameraId, how: &str) -> String {
         printable(&self.absence_of(camera, how)).into_owned()
     }
@@ -241,16 +253,14 @@ impl CameraInbox {
         let computer = host.map_or_else(|| "its computer".to_owned(), |host| format!("its computer '{host}'"));
         let is_there = slot.publisher.map(|publisher| self.hosts.contains_key(&publisher));
         if is_there == Some(false) {
-            return format!(
-                "{computer} is gone from the network; start `flyrig capture` there again, or check the cable"
-            );
+            return format!("{computer} has left the network; start `flyrig capture` there again, or check the cable");
         }
         let problem = status.map(|status| status.problem.as_str()).filter(|problem| !problem.is_empty());
         if let Some(problem) = problem.filter(|_| !self.hosts.is_empty()) {
-            return format!("{computer} says: {problem}");
+            return format!("{computer} reports: {problem}");
         }
         if is_there.is_some() {
-            return format!("{computer} is there and sends nothing; look at the network between");
+            return format!("{computer} is present and sends nothing; check the network between");
         }
         if !self.hosts.is_empty() {
             return format!(
@@ -259,7 +269,7 @@ impl CameraInbox {
         }
         let quoted = |names: BTreeSet<&str>| {
             let more = if names.len() > SHOWN_NAMES { ", ..." } else { "" };
-            // Whoever is on the network chooses these.
+            // Any program on the network can choose these names.
             let short = |name: &str| name.chars().take(32).collect::<String>();
             let names: Vec<String> = names.into_iter().take(SHOWN_NAMES).map(|n| format!("'{}'", short(n))).collect();
             names.join(", ") + more
@@ -276,11 +286,11 @@ impl CameraInbox {
         let rigs: BTreeSet<&str> = self.others.iter().filter_map(|key| keys::rig_in(key)).collect();
         if !rigs.is_empty() {
             return format!(
-                "no computer of rig '{rig}' is there, but of {}; set rig.name alike on both sides",
+                "no computer of rig '{rig}' is present, but of {}; set the same rig.name on both sides",
                 quoted(rigs)
             );
         }
-        format!("no computer of rig '{rig}' is there; {how}")
+        format!("no computer of rig '{rig}' is present; {how}")
     }
 }
 
@@ -289,7 +299,7 @@ impl Slot {
         self.waiting.iter().map(|frame| frame.image.bytes().len() as u64).sum()
     }
 
-    /// Counts what is missing before this message. A camera has one publisher at a time.
+    /// Counts the messages missing before this one. A camera has one publisher at a time.
     fn follow(&mut self, header: &FrameHeader, hosts: &BTreeMap<u64, Host>) -> Result<(), TransportError> {
         let FrameHeader { header: Header { publisher, sequence, .. }, withheld, .. } = *header;
         if let Some(before) = self.publisher.filter(|before| *before != publisher) {
@@ -318,9 +328,9 @@ impl Slot {
     fn refuse(&mut self, error: TransportError) {
         self.link.refused += 1;
         let text = error.to_string();
-        let is_known = self.told.as_ref().is_some_and(|(told, at)| *told == text && at.elapsed() < AGAIN);
+        let is_known = self.reported.as_ref().is_some_and(|(known, at)| *known == text && at.elapsed() < AGAIN);
         if !is_known {
-            self.told = Some((text, Instant::now()));
+            self.reported = Some((text, Instant::now()));
             self.trouble = Some(error);
         }
     }

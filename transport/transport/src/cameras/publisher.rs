@@ -1,4 +1,4 @@
-//! The side of a computer with cameras.
+//! Publisher of a computer with cameras.
 
 use std::{sync::Arc, time::Duration};
 
@@ -25,8 +25,8 @@ use crate::{
     views::viewpoint::Leases,
 };
 
-/// Publishes the frames of cameras, each to a topic with one slot: the newest wins, nothing waits for the network. Answers
-/// questions for its clock.
+/// Publisher of camera frames, each camera to a topic with one slot: the newest frame wins, nothing waits for the network. It also answers
+/// queries for the clock.
 pub struct CameraPublisher {
     shared: Arc<PublisherState>,
     cameras: Vec<Lane>,
@@ -52,10 +52,10 @@ impl std::fmt::Debug for CameraPublisher {
 }
 
 impl CameraPublisher {
-    /// Opens the session and starts its thread. `clock` is the one that stamps the frames.
+    /// Opens the session and starts its thread. `clock` stamps the frames.
     ///
     /// # Errors
-    /// `Config` for names that cannot stand in a key, or `Session` when zenoh cannot listen there.
+    /// `Config` for names that cannot be part of a key, or `Session` when zenoh cannot listen there.
     pub fn open(config: &TransportConfig, cameras: &[CameraId], clock: HostClock) -> Result<Self, TransportError> {
         config.validate()?;
         let rig = &config.rig;
@@ -83,13 +83,13 @@ impl CameraPublisher {
         Ok(Self { shared, cameras, endpoints, probe, drain, _alive: alive })
     }
 
-    /// Endpoints it listens on, port 0 replaced by the real one.
+    /// Returns the endpoints that it listens on, port 0 replaced by the actual one.
     #[must_use]
     pub fn endpoints(&self) -> &[String] {
         &self.endpoints
     }
 
-    /// Returns the reason why the rig does not admit the key; None while it does, without a key, and before the first answer.
+    /// Returns why the rig rejects the key; `None` once it accepts it, without a key, and before the first answer.
     #[must_use]
     pub fn trouble(&self) -> Option<String> {
         self.probe.as_ref().and_then(KeyProbe::trouble)
@@ -98,7 +98,7 @@ impl CameraPublisher {
     /// Hands in a frame.
     ///
     /// # Errors
-    /// `Config` for a camera that was not named at the start and an image of more than [`MAX_FRAME_BYTES`].
+    /// `Config` for a camera that was not named at the start, and for an image of more than [`MAX_FRAME_BYTES`].
     pub fn publish(&self, frame: Frame) -> Result<PublishOutcome, TransportError> {
         let lane = self.lane(&frame.camera)?;
         let length = frame.image.bytes().len();
@@ -116,7 +116,7 @@ impl CameraPublisher {
         Ok(self.offer(&lane.frames, Body::Frame(Arc::new(frame)), header))
     }
 
-    /// Hands in how a camera is; what was overtaken here is added.
+    /// Hands in the status of a camera; the frames replaced here are added to it.
     ///
     /// # Errors
     /// `Config` for a camera that was not named at the start.
@@ -127,19 +127,19 @@ impl CameraPublisher {
         Ok(self.offer(&lane.status, Body::Bytes(Bytes::from(bytes)), empty_header()))
     }
 
-    /// Counts of the cameras' frames.
+    /// Returns the counts of each camera's frames.
     #[must_use]
     pub fn counts(&self) -> Vec<(CameraId, TopicCounts)> {
         self.cameras.iter().map(|lane| (lane.camera.clone(), lane.frames.counts())).collect()
     }
 
-    /// Returns the health of the thread that sends.
+    /// Returns the health of the publisher thread.
     #[must_use]
     pub fn thread(&self) -> ThreadHealth {
         self.drain.health()
     }
 
-    /// Ends the thread and the session; dropping does the same but says nothing.
+    /// Ends the thread and the session; dropping does the same without reporting errors.
     ///
     /// # Errors
     /// `Session` when the thread died or zenoh fails to close.

@@ -1,4 +1,4 @@
-//! The side that uses cameras of other computers.
+//! Subscriber of the cameras of other computers.
 
 use std::{
     net::SocketAddr,
@@ -12,7 +12,7 @@ use zenoh::{Session, Wait, sample::Sample, sample::SampleKind};
 
 use crate::{
     cameras::{
-        clock_exchange::{Asker, Question},
+        clock_exchange::{Asker, ClockQuery},
         frame::MAX_FRAME_BYTES,
         host_clock::HostClock,
         inbox::CameraInbox,
@@ -29,16 +29,16 @@ use crate::{
     topic::lock,
 };
 
-/// Receives the frames of cameras of other computers, with capture times on this computer's clock.
+/// Subscriber of cameras of other computers; capture times are on this computer's clock.
 ///
-/// A few frames a camera wait for their reader, the newest win. Computers may come later, vanish and return.
+/// A few frames per camera wait for their reader, the newest win. Computers may start later, vanish and return.
 pub struct CameraSubscriber {
     shared: Arc<Shared>,
     asker: Asker,
     session: Session,
-    /// How a computer with cameras gets here.
+    /// Instruction how a computer with cameras connects here.
     how: String,
-    /// Admits computers with keys.
+    /// Gate that admits computers with keys.
     gate: Option<Gate>,
     closed: bool,
 }
@@ -58,10 +58,10 @@ impl std::fmt::Debug for CameraSubscriber {
 }
 
 impl CameraSubscriber {
-    /// Opens the session; the cameras' computers may come later. `clock` is this computer's.
+    /// Opens the session; the computers with cameras may start later. `clock` is the local clock.
     ///
     /// # Errors
-    /// `Config` for names that cannot stand in a key, or `Session`.
+    /// `Config` for names that cannot be part of a key, or `Session`.
     pub fn open(config: &TransportConfig, cameras: &[CameraId], clock: HostClock) -> Result<Self, TransportError> {
         config.validate()?;
         let rig = &config.rig;
@@ -102,7 +102,7 @@ impl CameraSubscriber {
             .wait()
             .map_err(failed)?;
         let (asking, taking) = (shared.clone(), shared.clone());
-        let hosts = move || -> Vec<Question> { lock(&asking.inbox).questions() };
+        let hosts = move || -> Vec<ClockQuery> { lock(&asking.inbox).clock_queries() };
         let take = move |host, asked, answer, answered| {
             lock(&taking.inbox).clock(host, asked, answer, answered);
         };
@@ -120,23 +120,23 @@ impl CameraSubscriber {
         Ok(Self { shared, asker, session, how, gate, closed: false })
     }
 
-    /// Address where computers with keys connect; None without keys.
+    /// Returns the address where computers with keys connect; `None` without keys.
     #[must_use]
     pub fn gate(&self) -> Option<SocketAddr> {
         self.gate.as_ref().map(Gate::address)
     }
 
-    /// Returns a view of the thread that compares the clocks.
+    /// Returns a watch of the thread that compares the clocks.
     #[must_use]
     pub fn clock_thread(&self) -> ThreadWatch {
         self.asker.watch().clone()
     }
 
-    /// The oldest frame of a camera that waits; `None` after the timeout.
+    /// Takes the oldest waiting frame of a camera; `None` after the timeout.
     ///
     /// # Errors
-    /// `UnknownVersion` or `Malformed` for a message that could not be used, the same text once in ten seconds; it is fine
-    /// to go on. `Config` for a camera that was not named at the start.
+    /// `UnknownVersion` or `Malformed` for a message that could not be used, the same text once in ten seconds; the subscriber stays usable.
+    /// `Config` for a camera that was not named at the start.
     pub fn next_frame(&self, camera: &CameraId, timeout: Duration) -> Result<Option<Frame>, TransportError> {
         let deadline = Instant::now() + timeout;
         let mut inbox = lock(&self.shared.inbox);
@@ -152,19 +152,19 @@ impl CameraSubscriber {
         }
     }
 
-    /// How a camera's way here is; all zero for one that was not named at the start.
+    /// Returns the state of the link to a camera; all zero for one that was not named at the start.
     #[must_use]
     pub fn link(&self, camera: &CameraId) -> CameraLink {
         lock(&self.shared.inbox).link(camera, self.shared.clock.now_nanos())
     }
 
-    /// Why nothing comes of a camera, and the fix.
+    /// Explains why no frames of a camera arrive, with the fix.
     #[must_use]
     pub fn absence(&self, camera: &CameraId) -> String {
         lock(&self.shared.inbox).absence(camera, &self.how)
     }
 
-    /// Ends the session; dropping does the same but says nothing.
+    /// Ends the session; dropping does the same without reporting errors.
     ///
     /// # Errors
     /// `Session` when zenoh fails to close.
@@ -190,13 +190,13 @@ impl Drop for CameraSubscriber {
 }
 
 impl Shared {
-    /// Takes a sample in; runs on a zenoh thread.
+    /// Ingests a sample; runs on a zenoh thread.
     fn receive(&self, camera: &CameraId, sample: &Sample) {
         let key = sample.key_expr().as_str();
         let is_status = keys::label_in(key).is_some_and(|label| label.starts_with(keys::STATUS));
         let attachment = sample.attachment().filter(|bytes| bytes.len() <= MAX_ATTACHMENT);
         let attachment = attachment.map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
-        // What is too long is not even copied.
+        // A payload that is too long is not even copied.
         let length = sample.payload().len();
         let limit = match is_status {
             true => MAX_JSON_BYTES,

@@ -1,8 +1,8 @@
-//! Choice of the layers of colours that a line carries: fewer while motion is late or missing, more again once it is on time.
+//! Choice of the colour layers that a line carries: fewer while motion is late or missing, more again once it is on time.
 //!
-//! The receiver alone decides, by when motion arrives: colours that are not subscribed to are not sent, so a slow line of one viewer
-//! costs nobody else anything, and a relay adapts to its own line. Where the receiver's own computer is overloaded, its threads take messages
-//! in late whatever the line does: a thread that only waits shows by how much (`wake_lag.rs`).
+//! The receiver alone decides, from the arrival of motion: colours that are not subscribed to are not sent, so the slow line of one viewer
+//! costs the others nothing, and a relay adapts to its own line. On an overloaded computer threads ingest messages late whatever the line
+//! does: a thread that only waits measures by how much (`wake_lag.rs`).
 
 use std::{
     collections::VecDeque,
@@ -11,78 +11,81 @@ use std::{
 
 use flyrig_stream::LAYERS;
 
-/// A judgement needs motion of so long, and so many.
+/// Shortest window of a decision, and least number of motions in it.
 const WINDOW: Duration = Duration::from_millis(600);
 const MIN_MOTIONS: usize = 4;
-/// This share of a window's motions, the fastest, shows how long queues are: lost packets delay the others for a moment.
+/// Fraction of a window's motions, the fastest, that indicates the length of queues: lost packets delay the others for a moment.
 const FASTEST_SHARE: f64 = 0.2;
-/// The fastest way within this time counts as the way without a queue: clocks drift, routes change.
+/// Time over which the least latency counts as that without queues: clocks drift, routes change.
 const FASTEST_OF: Duration = Duration::from_secs(30);
-/// Time in queues from which a line is congested, below which it is clear, and from which all colours stop.
+/// Queueing delays: above the first a line is congested, below the second it is clear, above the third all colours stop.
 const LATE_NANOS: i64 = 70_000_000;
 const CLEAR_NANOS: i64 = 35_000_000;
 const VERY_LATE_NANOS: i64 = 300_000_000;
-/// A thread that takes messages in has more to do than one that only waits, and may run so many times as late.
+/// Scheduling delay of a thread that ingests messages, as a multiple of that of one that only waits.
 const BUSIER: i64 = 2;
-/// From this lag on, motions that are missing are no sign of congestion.
+/// Scheduling delay above which missing motions are no sign of congestion.
 const STARVED_NANOS: i64 = 10_000_000;
-/// A judgement needs motion for as long as so many of the longest lag: one by one they say little. At most so long.
+/// Length of a window as a multiple of the longest scheduling delay, since single delays are noisy; and its bound.
 const LAGS_IN_WINDOW: u32 = 6;
 const LONGEST_WINDOW: Duration = Duration::from_secs(15);
-/// Lags that are kept while no motion comes.
+/// Largest number of scheduling delays that are kept while no motion arrives.
 const MOST_LAGS: usize = 1024;
-/// Share of motions that do not arrive on a congested line. A line with 1 % loss misses a quarter while TCP repeats.
+/// Fraction of missing motions on a congested line. A line with 1 % loss misses a quarter while TCP retransmits.
 const MISSED_SHARE: f64 = 0.45;
-/// Motions missed in a longer pause are no sign of congestion: the line was cut, or nobody subscribed.
+/// Pause after which missed motions are no sign of congestion: the line was cut, or there was no subscription.
 const PAUSE: Duration = Duration::from_secs(1);
-/// After a change queues drain, and the change has to reach the rig, before the next judgement.
+/// Delay of the next decision after a change: queues drain, and the change has to reach the rig.
 const SETTLING: Duration = Duration::from_millis(1500);
-/// A layer is tried after so long without congestion; after each trial that fails, twice as long as before.
+/// Time without congestion before a layer is tried: at first, later, and at most; it doubles after each failed trial.
 const FIRST_TRIAL: Duration = Duration::from_millis(500);
 const LATER_TRIAL: Duration = Duration::from_secs(8);
 const MOST_PATIENCE: Duration = Duration::from_secs(240);
-/// A trial that lasts so long has succeeded.
+/// Duration after which a trial has succeeded.
 const SUCCESS: Duration = Duration::from_secs(10);
-/// A template fills the line, so it shows the bytes a second that are carried, if it has so many bytes, for so long.
+/// A template fills the line, so its transfer measures the line's throughput: least size, bytes, and validity of the measurement.
 const LEAST_FETCH_BYTES: usize = 200_000;
 const CARRIED_FOR: Duration = Duration::from_secs(300);
-/// A layer has at least so many times the bytes of the one before it, and the coarsest so many times those of motion: where the line does not
-/// carry that, a trial would stop motion for seconds, and comes after this patience alone.
+/// Least bytes of a layer as a multiple of the layer before it, and of the coarsest as a multiple of motion. Where the line does not carry
+/// that, a trial would stop motion for seconds, and comes only after [`UNLIKELY_TRIAL`].
 const NEXT_LAYER: f64 = 2.3;
 const FIRST_LAYER: f64 = 0.2;
-/// Bytes a second count as those of the busiest window, less this share for each window since: somebody who moves more is sent more.
+/// Fraction by which the byte rate of the busiest window decays per window: a person who moves more takes more bytes.
 const FORGOTTEN: f64 = 0.05;
+/// Time without congestion before a layer is tried that the line does not seem to carry.
 const UNLIKELY_TRIAL: Duration = Duration::from_secs(60);
 
-/// Decides how many layers to subscribe to.
+/// Chooses the number of layers to subscribe to.
 #[derive(Debug)]
 pub(crate) struct ColorLayers {
+    /// Number of layers to subscribe to, from the coarsest.
     wanted: usize,
-    /// Number of layers to go back to when queues are empty again.
+    /// Number of layers to return to when queues are empty again.
     carried: usize,
     is_begun: bool,
-    /// Begin and least latency of each second.
+    /// Start and least latency of each second.
     fastest: VecDeque<(Instant, i64)>,
     latencies: Vec<i64>,
-    /// How late threads of this computer ran, nanoseconds.
+    /// Scheduling delays of this computer, nanoseconds.
     lags: Vec<i64>,
     missed: u64,
-    /// Templates that are being fetched: they fill the line, whatever it carries.
+    /// Number of templates being fetched, which fill any line.
     fetches: usize,
-    /// Since when, and bytes that came since then.
+    /// Start of the fetches, and bytes received since.
     fetched: Option<(Instant, usize)>,
-    /// Bytes a second that the last ones came with, and when.
+    /// Time and result of the last measurement of throughput, bytes per second.
     carries: Option<(Instant, f64)>,
-    /// Bytes of motion and of each layer in this window, and a second in the busiest of the last ones.
+    /// Bytes of motion and of each layer in this window, and bytes per second of the busiest recent window.
     bytes: [usize; 1 + LAYERS],
     bytes_per_sec: [f64; 1 + LAYERS],
-    /// When the last motion arrived.
+    /// Arrival of the last motion.
     last: Option<Instant>,
     window_began: Instant,
-    /// When layers changed last, and whether that added one.
+    /// Time of the last change, and whether it added a layer.
     changed: Option<(Instant, bool)>,
-    /// Since when no window was congested.
+    /// Start of the time without congestion.
     clear_since: Option<Instant>,
+    /// Time without congestion before the next trial.
     patience: Duration,
 }
 
@@ -109,24 +112,24 @@ impl ColorLayers {
         }
     }
 
-    /// Number of layers to subscribe to, from the coarsest, 0..=[`LAYERS`].
+    /// Returns the number of layers to subscribe to, from the coarsest, 0..=[`LAYERS`].
     pub fn wanted(&self) -> usize {
         self.wanted
     }
 
-    /// Whether [`Self::begin`] was called.
+    /// Returns whether [`Self::begin`] was called.
     pub fn has_begun(&self) -> bool {
         self.is_begun
     }
 
-    /// Begins with the coarsest layer; before, motion only says how fast the line is without them.
+    /// Begins with the coarsest layer; before, motion only measures the line without colours.
     pub fn begin(&mut self) {
         if !std::mem::replace(&mut self.is_begun, true) {
             (self.wanted, self.carried) = (1, 1);
         }
     }
 
-    /// A template is being fetched from now on. Nothing is judged meanwhile, nor until queues are empty again.
+    /// Records the start of a template's fetch. Nothing is decided meanwhile, nor until queues are empty again.
     pub fn fetch_begins(&mut self, now: Instant) {
         self.fetches += 1;
         self.fetched.get_or_insert((now, 0));
@@ -134,7 +137,7 @@ impl ColorLayers {
         self.clear_since = None;
     }
 
-    /// A template has come with so many bytes; none where it has not.
+    /// Records the end of a fetch with `bytes` bytes; 0 where it failed.
     pub fn fetch_ends(&mut self, now: Instant, bytes: usize) {
         self.fetches = self.fetches.saturating_sub(1);
         self.changed = Some((now, false));
@@ -157,21 +160,21 @@ impl ColorLayers {
         }
     }
 
-    /// Bytes a second of what is subscribed to and one layer more.
+    /// Returns the byte rate of the current subscriptions and one more layer.
     fn with_one_more(&self) -> f64 {
         let subscribed = &self.bytes_per_sec[..=self.wanted.min(LAYERS)];
         let growth = if self.wanted == 0 { FIRST_LAYER } else { NEXT_LAYER };
         subscribed.iter().sum::<f64>() + growth * subscribed.last().copied().unwrap_or(0.0)
     }
 
-    /// A thread of this computer that only waited ran so late.
+    /// Records a scheduling delay of a thread that only waits.
     pub fn woke_late(&mut self, by: Duration) {
         if self.lags.len() < MOST_LAGS {
             self.lags.push(i64::try_from(by.as_nanos()).unwrap_or(i64::MAX));
         }
     }
 
-    /// Takes in the arrival of a motion: its latency by any two clocks, and the number of motions that were missed before it.
+    /// Ingests the arrival of a motion: its latency by any two clocks, and the number of motions missed before it.
     pub fn motion(&mut self, now: Instant, latency_nanos: i64, missed: u64) {
         self.note_way(now, latency_nanos);
         let is_pause = self.last.replace(now).is_some_and(|last| now.duration_since(last) > PAUSE);
@@ -223,7 +226,7 @@ impl ColorLayers {
         let is_congested = queued_nanos > LATE_NANOS || is_missing;
         if is_congested {
             self.clear_since = None;
-            // After a layer was left out, queues are still full of it; one that was added shows at once.
+            // After a layer is dropped, queues are still full of it; an added layer shows at once.
             if self.wanted == 0 || (!is_trial && since_change.is_some_and(|since| since < SETTLING)) {
                 return;
             }
@@ -231,7 +234,7 @@ impl ColorLayers {
             self.patience =
                 if has_failed { (2 * self.patience).clamp(LATER_TRIAL, MOST_PATIENCE) } else { LATER_TRIAL };
             self.carried = self.wanted - 1;
-            // Long queues empty sooner without any colours.
+            // Without any colours, long queues empty sooner.
             self.wanted = if queued_nanos > VERY_LATE_NANOS { 0 } else { self.carried };
             self.changed = Some((now, false));
             return;
@@ -262,7 +265,7 @@ impl ColorLayers {
     }
 }
 
-/// Returns the time that the fastest share stays within; 0 of none.
+/// Returns the quantile [`FASTEST_SHARE`] of durations; 0 for none.
 fn fast_of(nanos: &mut [i64]) -> i64 {
     let at = (FASTEST_SHARE * nanos.len() as f64) as usize;
     if at < nanos.len() { *nanos.select_nth_unstable(at).1 } else { 0 }
@@ -279,10 +282,10 @@ mod tests {
         layers
     }
 
-    /// Bytes of a motion, and of each layer.
+    /// Sizes of a motion and of each layer, bytes.
     const BYTES: [usize; LAYERS + 1] = [4_000, 1_700, 4_000, 13_000];
 
-    /// A line that carries so many layers: with more of them a queue fills up to half a second, and empties at the same pace.
+    /// Line that carries `carries` layers: with more of them a queue fills up to half a second, and empties at the same pace.
     struct Line {
         now: Instant,
         layers: ColorLayers,
@@ -290,13 +293,14 @@ mod tests {
         queue_nanos: i64,
         /// Number of layers with which each motion in flight was sent.
         in_flight: VecDeque<usize>,
-        /// Longest pauses between two turns of the threads that take messages in and that only wait; none where they run at once.
+        /// Longest pauses between two turns of the thread that ingests messages and of the one that only waits; zero where they run at
+        /// once.
         pauses: [Duration; 2],
         turns: [Instant; 2],
         ticks: Ticks,
         /// State of a generator of pauses.
         random: u64,
-        /// Bytes against those of [`BYTES`].
+        /// Sizes relative to [`BYTES`].
         busy: f64,
     }
 
@@ -319,7 +323,7 @@ mod tests {
             }
         }
 
-        /// The first turn of a thread from `at` on.
+        /// Returns the first turn of a thread from `at` on.
         fn turn(&mut self, thread: usize, at: Instant) -> Instant {
             while self.turns[thread] < at {
                 if self.pauses[thread].is_zero() {
@@ -334,7 +338,7 @@ mod tests {
             self.turns[thread]
         }
 
-        /// Runs for so long at 30 motions a second; returns the share of motions that were late, and of time with each number of layers.
+        /// Runs for `secs` at 30 motions per second; returns the fraction of late motions, and of time with each number of layers.
         fn run(&mut self, secs: usize) -> (f64, [f64; LAYERS + 1]) {
             let (mut late, mut counts) = (0, [0; LAYERS + 1]);
             self.ticks = Ticks::new(self.now);
@@ -393,7 +397,7 @@ mod tests {
             line.run(20);
             assert_eq!(line.layers.wanted(), LAYERS, "{pauses:?}");
         }
-        // The same, as it looks to somebody who does not know how late threads run.
+        // Without the measured scheduling delays, the line seems slow.
         let mut line = Line::new(LAYERS);
         line.run(20);
         line.pauses = [Duration::from_millis(1000), Duration::ZERO];

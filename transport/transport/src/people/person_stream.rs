@@ -1,4 +1,6 @@
-//! The person stream: its topics, and templates by their hash.
+//! Topics of the person stream, and templates by their hash.
+//!
+//! A template is fetched in chunks beside motion, before colours are subscribed to.
 
 use std::{
     collections::VecDeque,
@@ -26,36 +28,37 @@ use crate::{
     topic::{Topic, lock},
 };
 
-/// Bytes of a template in a reply: it fits in one batch of zenoh's, so that a slow line drops no fragments.
+/// Bytes of a template per reply, which fit in one batch of zenoh's, so that a slow line drops no fragments.
 const CHUNK: usize = 60_000;
-/// Chunks under way at once: enough for 20 Mbit/s with 100 ms, and fewer than the sender's queue has places.
+/// Chunks under way at once: enough for 20 Mbit/s with 100 ms, and fewer than the places in the sender's queue.
 const AT_ONCE: usize = 6;
-/// Requests for chunks of all viewers that may wait for their answer.
+/// Largest number of waiting queries for chunks, over all viewers.
 const MAX_QUERIES: usize = 1024;
-/// How long a chunk is waited for.
+/// Time limit of a chunk.
 const CHUNK_PATIENCE: Duration = Duration::from_secs(5);
 
-/// A message of the person stream, as it came.
+/// Message of the person stream, still encoded.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PersonMessage {
-    /// Which person.
+    /// Number of the person.
     pub person: u32,
-    /// Layer of a message of colours; None for a motion.
+    /// Layer of a message of colours; `None` for a motion.
     pub layer: Option<usize>,
-    /// For [`flyrig_stream::Motion::decode`] or [`flyrig_stream::ColorDecoder::take`].
+    /// Bytes for [`flyrig_stream::Motion::decode`] or [`flyrig_stream::ColorDecoder::take`].
     pub bytes: Bytes,
 }
 
 /// Topics of a person: motion, then the layers of colours.
 type Topics = [Arc<Topic>; 1 + LAYERS];
 
-/// The people whose stream is published, the one that was published last at the end.
+/// People whose stream is published.
 #[derive(Debug)]
 pub(crate) struct PublishedPeople {
-    /// Person 0 always has topics, so that subscribers are noticed before anybody is seen.
+    /// Topics of person 0, which always exist, so that subscribers are noticed before a person is seen.
     first: Topics,
+    /// Topics of the other people, most recently published last.
     others: Mutex<Vec<(u32, Topics)>>,
-    /// Person, hash and bytes, the newest at the end.
+    /// Person, hash and bytes of each template, newest last.
     templates: Mutex<Vec<(u32, u64, Bytes)>>,
 }
 
@@ -74,7 +77,7 @@ impl PublishedPeople {
         Self { first: topics_of(0), others: Mutex::default(), templates: Mutex::default() }
     }
 
-    /// Topics of person 0.
+    /// Returns the topics of person 0.
     pub fn first_topics(&self) -> Topics {
         self.first.clone()
     }
@@ -83,8 +86,8 @@ impl PublishedPeople {
         self.first[0].is_watched()
     }
 
-    /// Returns a person's topics. Those of a new one are made; beyond [`MAX_PERSON_TOPICS`] the person who was published longest
-    /// ago loses them.
+    /// Returns the topics of a person and creates those of a new one; beyond [`MAX_PERSON_TOPICS`] the person published least recently
+    /// loses them.
     pub fn topics(&self, person: u32, shared: &PublisherState) -> Topics {
         if person == 0 {
             return self.first.clone();
@@ -114,7 +117,7 @@ impl PublishedPeople {
         templates.push((person, hash, bytes));
     }
 
-    /// Returns a chunk of a template behind the template's size, as it is replied.
+    /// Returns the reply to a query: size of the template, u32, and a chunk of its bytes.
     fn chunk(&self, label: &str) -> Option<Vec<u8>> {
         let (hash, chunk) = keys::chunk_in(label)?;
         let bytes =
@@ -126,8 +129,8 @@ impl PublishedPeople {
     }
 }
 
-/// Starts a thread that answers requests for templates, and returns what hands them in without waiting. It ends when that is dropped. The
-/// network's thread must not answer: where it also sends, replies find no room until it has sent some.
+/// Starts a thread that answers queries for templates, and returns the callback that hands them in without waiting; the thread ends when
+/// the callback is dropped. The network's thread must not answer: where it also sends, replies find no room until it has sent some.
 pub(crate) fn answer_templates(
     people: Arc<PublishedPeople>,
 ) -> Result<impl Fn(Query) + Send + Sync + 'static, TransportError> {
@@ -136,11 +139,11 @@ pub(crate) fn answer_templates(
         .name("flyrig-answers".to_owned())
         .spawn(move || waiting.into_iter().for_each(|query| answer_template(&people, &query)))
         .map_err(|error| TransportError::session("thread for templates", &error))?;
-    // One that does not fit is not answered, and asked again.
+    // A query that does not fit is not answered, and repeated by the viewer.
     Ok(move |query| drop(queries.try_send(query)))
 }
 
-/// A template that is not known is not answered: another publisher may have it.
+/// Answers a query for a known template; another publisher may have an unknown one.
 fn answer_template(people: &PublishedPeople, query: &Query) {
     let Some(reply) = keys::label_in(query.key_expr().as_str()).and_then(|label| people.chunk(label)) else { return };
     if let Err(error) = query.reply(query.key_expr(), reply).wait() {
@@ -150,16 +153,16 @@ fn answer_template(people: &PublishedPeople, query: &Query) {
 
 type Subscription = zenoh::pubsub::Subscriber<()>;
 
-/// The subscriptions to people. Until the first template is there, nothing else is of use, and on a slow line it would keep the template
-/// waiting: motion pauses while one is fetched, and colours begin with it. Their layers follow [`Inbox::color_layers`].
+/// Subscriptions to the person stream. Until the first template has arrived, nothing else is of use, and on a slow line it would delay the
+/// template: motion pauses while it is fetched, and colours begin with it. Their layers follow [`Inbox::color_layers`].
 pub(crate) struct PersonSubscription {
     session: Session,
     rig: String,
     inbox: Arc<Inbox>,
     motion: Mutex<Option<Subscription>>,
-    /// From the coarsest layer.
+    /// Subscriptions to layers of colours, from the coarsest.
     layers: Mutex<Vec<Subscription>>,
-    /// Begins with motion.
+    /// Thread that measures scheduling delays, started with motion.
     wake_lag: Mutex<Option<WakeLag>>,
 }
 
@@ -179,7 +182,7 @@ impl PersonSubscription {
             .map_err(|error| TransportError::session(key, &error))
     }
 
-    /// Subscribes to motion, unless that is so already.
+    /// Subscribes to motion, unless it is subscribed already.
     pub fn begin_motion(&self) -> Result<(), TransportError> {
         let mut wake_lag = lock(&self.wake_lag);
         if wake_lag.is_none() {
@@ -188,7 +191,7 @@ impl PersonSubscription {
             match WakeLag::start(measure) {
                 Ok(started) => *wake_lag = Some(started),
                 Err(error) => {
-                    tracing::warn!(%error, "no thread measures how late threads run: on a busy computer colours may stop");
+                    tracing::warn!(%error, "no thread measures scheduling delays: on a busy computer colours may stop");
                 }
             }
         }
@@ -200,7 +203,7 @@ impl PersonSubscription {
         Ok(())
     }
 
-    /// Subscribes to as many layers as the line carries. Never waits for the line.
+    /// Subscribes to as many layers as the line carries; never waits for the line.
     pub fn follow(&self) {
         let wanted = self.inbox.color_layers();
         let mut layers = lock(&self.layers);
@@ -209,7 +212,7 @@ impl PersonSubscription {
         }
         while layers.len() > wanted {
             if let Some(Err(error)) = layers.pop().map(|layer| layer.undeclare().wait()) {
-                tracing::warn!(%error, "colours cannot be given back");
+                tracing::warn!(%error, "colours cannot be unsubscribed");
             }
         }
         while layers.len() < wanted {
@@ -220,9 +223,9 @@ impl PersonSubscription {
         }
     }
 
-    /// Asks for a template as [`ask_template`] does; colours come from then on.
+    /// Fetches a template as [`ask_template`] does; colours are subscribed to from then on.
     pub fn ask_template(&self, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
-        // Somebody who is shown already goes on moving.
+        // A person that is shown already keeps moving.
         let paused = if self.inbox.have_colors_begun() { None } else { lock(&self.motion).take() };
         let was_watching = paused.is_some();
         drop(paused);
@@ -234,7 +237,7 @@ impl PersonSubscription {
             hash = format!("{hash:016x}"),
             bytes,
             secs = begun.elapsed().as_secs_f64(),
-            "asked for a template"
+            "fetched a template"
         );
         self.inbox.fetch_ends(bytes);
         if was_watching {
@@ -249,7 +252,7 @@ impl PersonSubscription {
     }
 }
 
-/// Asks for a template, chunk by chunk with some under way at once, and checks that the answer is the one.
+/// Fetches a template in chunks, some of them under way at once, and checks its hash.
 fn ask_template(session: &Session, rig: &str, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
     let deadline = Instant::now() + timeout;
     let malformed = |problem: String| TransportError::malformed(keys::chunk_label(hash, 0), problem);
@@ -261,7 +264,7 @@ fn ask_template(session: &Session, rig: &str, hash: u64, timeout: Duration) -> R
         let Some(replies) = under_way.pop_front() else { break };
         let mut part = received(&replies);
         if part.is_none() && chunk > 0 {
-            // It was dropped on the way.
+            // The chunk was dropped on the way.
             part = received(&ask(chunk)?);
         }
         let Some((size, part)) = part else { return Ok(None) };
@@ -296,7 +299,7 @@ fn ask_chunk(session: &Session, key: &str, deadline: Instant) -> Result<Replies,
         .map_err(|error| TransportError::session(key, &error))
 }
 
-/// Returns the template's size and the bytes of a chunk; None when it did not come.
+/// Returns the template's size and the bytes of a chunk; `None` when it did not arrive.
 fn received(replies: &Replies) -> Option<(usize, Vec<u8>)> {
     let payload = replies.recv().ok()?.into_result().ok()?.payload().to_bytes().into_owned();
     let (size, chunk) = payload.split_first_chunk().filter(|(_, chunk)| chunk.len() <= CHUNK)?;

@@ -1,4 +1,4 @@
-//! A relay: receives people of a rig, and publishes them to viewers of its own.
+//! Relay: receives the people of a rig, and publishes them to viewers of its own.
 
 use std::{
     net::SocketAddr,
@@ -24,16 +24,16 @@ use crate::{
     topic::lock,
 };
 
-/// How long a message is waited for.
+/// Time limit of waiting for a message.
 const PATIENCE: Duration = Duration::from_millis(50);
-/// How often statistics and calibration are looked at.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
-/// Templates that are kept; beyond them the oldest is forgotten, and fetched again when a motion names it.
+/// Interval between checks of statistics and calibration.
+const CHECK_EVERY: Duration = Duration::from_millis(250);
+/// Largest number of templates kept; the oldest is forgotten, and fetched again when a motion names it.
 const MAX_TEMPLATES: usize = 64;
 
-/// Passes people, calibration and statistics of a rig on to whoever connects here: programs of this computer, and holders of keys of the
-/// relay's own ring. The rig sends them once, however many watch, and a slow viewer is the relay's alone. While the rig is away, so is
-/// the relay. Viewpoints are not passed on: viewers draw people themselves.
+/// Relay of people, calibration and statistics of a rig to programs of this computer and holders of keys of the relay's own ring. The rig
+/// sends them once for any number of viewers, and a slow viewer slows the relay alone. While the rig is absent, so is the relay. Viewpoints
+/// are not passed on: viewers draw people themselves.
 #[derive(Debug)]
 pub struct Relay {
     shared: Arc<Shared>,
@@ -53,10 +53,10 @@ struct State {
 }
 
 impl Relay {
-    /// Starts to receive from one rig, which may come later, and to publish as another config says.
+    /// Starts to receive from a rig, which may start later, with the settings `from`, and to publish with the settings `to`.
     ///
     /// # Errors
-    /// `Config` or `Session` of either side; the publishing side is tried once and ends again, since it lives with the rig.
+    /// `Config` or `Session` of either side; the publishing side is opened once and closed again, since it lives with the rig.
     pub fn start(from: &TransportConfig, to: &TransportConfig) -> Result<Self, TransportError> {
         let subscriber = Subscriber::open(from, &Interests { people: true, stats: true, ..Interests::default() })?;
         let templates = subscriber.template_fetcher()?;
@@ -71,10 +71,10 @@ impl Relay {
             outlet: None,
             known: Vec::new(),
             calibration: None,
-            looked: None,
+            checked: None,
         };
         let thread = SupervisedThread::start("relay", move || {
-            // Begun anew after a panic.
+            // The work restarts after a panic.
             work.outlet = None;
             while !work.shared.stop.load(Ordering::Relaxed) {
                 work.turn();
@@ -84,19 +84,19 @@ impl Relay {
         Ok(Self { shared, thread })
     }
 
-    /// Address where holders of keys connect; None without keys, and while the rig is away.
+    /// Returns the address where holders of keys connect; `None` without keys, and while the rig is absent.
     #[must_use]
     pub fn gate(&self) -> Option<SocketAddr> {
         lock(&self.shared.state).gate
     }
 
-    /// Returns the reason why people are not passed on; None while they are.
+    /// Returns why people are not passed on; `None` while they are.
     #[must_use]
     pub fn trouble(&self) -> Option<String> {
         lock(&self.shared.state).trouble.clone()
     }
 
-    /// Health of the thread.
+    /// Returns the health of the thread.
     #[must_use]
     pub fn thread(&self) -> ThreadHealth {
         self.thread.health()
@@ -116,23 +116,24 @@ struct Work {
     to: TransportConfig,
     shared: Arc<Shared>,
     outlet: Option<Publisher>,
-    /// Person and hash of templates that the outlet has.
+    /// Person and hash of the templates that the outlet has.
     known: Vec<(u32, u64)>,
-    /// That of the outlet.
+    /// Calibration of the outlet.
     calibration: Option<Rig>,
-    looked: Option<Instant>,
+    /// Time of the last check of statistics and calibration.
+    checked: Option<Instant>,
 }
 
 impl Work {
     fn turn(&mut self) {
-        if self.looked.is_none_or(|at| at.elapsed() >= LOOK_EVERY) {
-            self.looked = Some(Instant::now());
-            let trouble = self.look().err().map(|error| error.to_string());
+        if self.checked.is_none_or(|at| at.elapsed() >= CHECK_EVERY) {
+            self.checked = Some(Instant::now());
+            let trouble = self.follow_rig().err().map(|error| error.to_string());
             let gate = self.outlet.as_ref().and_then(Publisher::gate);
             *lock(&self.shared.state) = State { trouble, gate };
         }
         match self.templates.take() {
-            Ok(Some(fetched)) => self.meet(fetched),
+            Ok(Some(fetched)) => self.offer_template(fetched),
             Ok(None) => {}
             Err(error) => tracing::debug!("{error}"),
         }
@@ -143,15 +144,15 @@ impl Work {
         }
     }
 
-    /// Opens the outlet when the rig has come, closes it when the rig has gone, and passes calibration and statistics on.
-    fn look(&mut self) -> Result<(), TransportError> {
+    /// Opens the outlet when the rig appears, closes it when the rig disappears, and passes calibration and statistics on.
+    fn follow_rig(&mut self) -> Result<(), TransportError> {
         if self.subscriber.publishers() == 0 {
             self.outlet = None;
             let rig = &self.to.rig;
             let trouble = self
                 .subscriber
                 .trouble()
-                .unwrap_or_else(|| "is not there yet; check that `flyrig run` is up".to_owned());
+                .unwrap_or_else(|| "does not answer yet; check that `flyrig run` is up".to_owned());
             return Err(TransportError::session(format!("rig {rig}"), &trouble));
         }
         let Some(rig) = self.subscriber.rig(Duration::ZERO)? else {
@@ -173,7 +174,8 @@ impl Work {
         Ok(())
     }
 
-    fn meet(&mut self, FetchedTemplate { people, hash, bytes }: FetchedTemplate) {
+    /// Offers a template to the viewers.
+    fn offer_template(&mut self, FetchedTemplate { people, hash, bytes }: FetchedTemplate) {
         let Some(outlet) = &self.outlet else { return };
         let bytes = prost::bytes::Bytes::from(bytes);
         for person in people {
@@ -185,6 +187,7 @@ impl Work {
         self.known.drain(..over);
     }
 
+    /// Passes a message on, or requests its template.
     fn pass(&mut self, received: Received<PersonMessage>) {
         let Some(outlet) = &self.outlet else { return };
         let Ok(stamp) = stamp_of(&received.body.bytes) else { return };
@@ -192,7 +195,7 @@ impl Work {
         if self.known.contains(&(person, stamp.template)) {
             outlet.pass_on(received);
         } else {
-            // Motion and colours of a template that is not here yet come again.
+            // Motion and colours of a template that has not arrived yet are repeated.
             self.templates.ask(person, stamp.template);
         }
     }

@@ -1,4 +1,4 @@
-//! Fetches templates on a thread of its own, so that one that is late delays nobody's motion.
+//! Fetcher of templates on a thread of its own, so that a late template delays no motion.
 
 use std::{
     collections::{HashMap, HashSet, VecDeque},
@@ -12,31 +12,31 @@ use flyrig_types::caught;
 
 use crate::{error::TransportError, keys::MAX_PERSON_TOPICS, people::person_stream::PersonSubscription};
 
-/// How long one template may take before the next has its turn.
+/// Time limit of a template, after which the next one has its turn.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// Pause after a template that did not come.
+/// Pause after a template that did not arrive.
 const RETRY: Duration = Duration::from_millis(500);
-/// Templates that wait for their turn; what does not fit is asked for again by a later motion.
+/// Largest number of waiting templates; further ones are requested again by later motions.
 const MAX_WAITING: usize = MAX_PERSON_TOPICS + 1;
-/// Templates that are kept, and their bytes at most: somebody who comes back, or wears a coat again, is shown at once.
+/// Largest number and bytes of templates that are kept, so that a person who returns, or wears a coat again, is shown at once.
 const MAX_KEPT: usize = 8;
 const MAX_KEPT_BYTES: usize = 16 << 20;
 
 type Fetched = (u64, Result<Option<Vec<u8>>, TransportError>);
 
-/// Fetches the templates that motions name, each once; made by [`crate::Subscriber::template_fetcher`]. Dropping it does
-/// not wait for a fetch under way.
+/// Fetcher of the templates that motions name, each once; made by [`crate::Subscriber::template_fetcher`]. Dropping it does not wait for a
+/// fetch under way.
 #[derive(Debug)]
 pub struct TemplateFetcher {
     wanted: Sender<u64>,
     fetched: Receiver<Fetched>,
-    /// The people who wait for a template, by its hash.
+    /// People that wait for a template, by its hash.
     waiting: HashMap<u64, HashSet<u32>>,
-    /// When templates failed last.
+    /// Time of the last failure of each template.
     failed: HashMap<u64, Instant>,
-    /// Templates that came, the one that was asked for last at the end.
+    /// Templates that have arrived, most recently requested last.
     kept: VecDeque<(u64, Vec<u8>)>,
-    /// People who asked for one of these since.
+    /// People and hashes of kept templates requested since.
     ready: VecDeque<(u32, u64)>,
 }
 
@@ -59,7 +59,7 @@ impl TemplateFetcher {
                 }
             }
         };
-        // It ends when this is dropped, after the fetch under way.
+        // The thread ends when the fetcher is dropped, after the fetch under way.
         Builder::new()
             .name("flyrig-templates".to_owned())
             .spawn(work)
@@ -74,7 +74,7 @@ impl TemplateFetcher {
         })
     }
 
-    /// Asks for a person's template unless it is on its way or failed just now. Never waits.
+    /// Requests the template of a person, unless it is on its way or failed just now. Never waits.
     pub fn ask(&mut self, person: u32, hash: u64) {
         if self.kept.iter().any(|(kept, _)| *kept == hash) {
             if !self.ready.contains(&(person, hash)) {
@@ -92,16 +92,16 @@ impl TemplateFetcher {
         }
     }
 
-    /// Notes that a template is of no use, so that the motions that name it do not fetch it again at once.
+    /// Marks a template as unusable, so that motions that name it do not fetch it again at once.
     pub fn refuse(&mut self, hash: u64) {
         self.kept.retain(|(kept, _)| *kept != hash);
         self.failed.insert(hash, Instant::now());
     }
 
-    /// Returns the people of a template that has come, its hash and its bytes; None when none has come since. Never waits.
+    /// Takes the next template that has arrived; `None` without one. Never waits.
     ///
     /// # Errors
-    /// As [`crate::Subscriber::template`]; the template is asked for again when [`Self::ask`] is called again.
+    /// As [`crate::Subscriber::template`]; the next call of [`Self::ask`] requests the template again.
     pub fn take(&mut self) -> Result<Option<FetchedTemplate>, TransportError> {
         while let Some((person, hash)) = self.ready.pop_front() {
             if let Some(at) = self.kept.iter().position(|(kept, _)| *kept == hash) {
@@ -140,14 +140,14 @@ impl TemplateFetcher {
     }
 }
 
-/// A template that has come.
+/// Template that has arrived.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FetchedTemplate {
-    /// The people who were waiting for it.
+    /// People that were waiting for it.
     pub people: Vec<u32>,
-    /// Its hash.
+    /// Hash of the bytes.
     pub hash: u64,
-    /// For [`flyrig_stream::StreamTemplate::decode`].
+    /// Bytes for [`flyrig_stream::StreamTemplate::decode`].
     pub bytes: Vec<u8>,
 }
 

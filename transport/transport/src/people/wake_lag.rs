@@ -1,4 +1,4 @@
-//! How late this computer lets a thread run that only waits: a message that a busy computer takes in late was not delayed by the line.
+//! Scheduling delay of a thread that only waits: on a busy computer, messages are ingested late although the line is fast.
 
 use std::{
     io,
@@ -10,12 +10,12 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Time between the instants at which the thread should run.
+/// Interval at which the thread should run.
 pub(crate) const TICK: Duration = Duration::from_millis(20);
-/// Most instants that are reported at once: more were missed by a computer that slept.
+/// Largest number of instants reported at once: more are missed only by a computer that slept.
 const MOST_TICKS: u32 = 64;
 
-/// Instants that the thread should run at.
+/// Instants at which the thread should run.
 #[derive(Debug)]
 pub(crate) struct Ticks {
     next: Instant,
@@ -26,8 +26,8 @@ impl Ticks {
         Self { next: now + TICK }
     }
 
-    /// Calls `late` for each instant that has passed, with how long ago it was: what messages that came at these instants would have
-    /// waited for a thread that runs only now.
+    /// Calls `late` with the delay of each instant that has passed: messages that arrived at these instants would have waited as long for a
+    /// thread that runs only now.
     pub fn run(&mut self, now: Instant, mut late: impl FnMut(Duration)) {
         for _ in 0..MOST_TICKS {
             let Some(by) = now.checked_duration_since(self.next) else { return };
@@ -37,13 +37,13 @@ impl Ticks {
         self.next = self.next.max(now);
     }
 
-    /// Time until the next instant.
+    /// Returns the time until the next instant.
     pub fn wait(&self, now: Instant) -> Duration {
         self.next.saturating_duration_since(now)
     }
 }
 
-/// A thread that measures it.
+/// Thread that measures the delay.
 #[derive(Debug)]
 pub(crate) struct WakeLag {
     is_stopped: Arc<AtomicBool>,
@@ -51,7 +51,7 @@ pub(crate) struct WakeLag {
 }
 
 impl WakeLag {
-    /// Calls `late` as [`Ticks::run`] does, until it is dropped.
+    /// Starts the thread, which calls `late` as [`Ticks::run`] does until it is dropped.
     pub fn start(mut late: impl FnMut(Duration) + Send + 'static) -> io::Result<Self> {
         let is_stopped = Arc::new(AtomicBool::new(false));
         let should_stop = Arc::clone(&is_stopped);
@@ -72,7 +72,7 @@ impl Drop for WakeLag {
         if let Some(thread) = self.thread.take() {
             thread.thread().unpark();
             if thread.join().is_err() {
-                tracing::warn!("the thread that measures how late threads run has panicked");
+                tracing::warn!("the thread that measures scheduling delays has panicked");
             }
         }
     }

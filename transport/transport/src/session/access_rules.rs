@@ -1,7 +1,8 @@
-//! Rules of zenoh's access control: what holders of keys may do in a session, and what a session with a key accepts.
+//! Rules of zenoh's access control: rights of the holders of keys in a session, and what a session with a key accepts.
 //!
 //! Everything is denied that no rule allows. The gate connects each holder under a common name of its role and number
-//! ([`Inner::name`]), so rules for all numbers are there from the start: a key that is added later needs no new session.
+//! ([`Inner::name`]). zenoh reads rules only when a session is opened, and matches names literally, so rules for all numbers are
+//! there from the start: a key that is added later needs no new session.
 
 use flyrig_access::{Inner, KeyFile, MAX_HOLDERS, Ring, Role};
 use serde_json::{Value, json};
@@ -19,7 +20,7 @@ const ALL: [&str; 9] = [
     "liveliness_query",
     "declare_liveliness_subscriber",
 ];
-/// zenoh's names of what comes from a holder, and of what goes to it.
+/// zenoh's names of the flows from a holder and to it.
 const FROM: &str = "ingress";
 const TO: &str = "egress";
 
@@ -36,7 +37,7 @@ struct Rules {
 }
 
 impl Rules {
-    /// Lets a subject do everything, in both directions.
+    /// Allows a subject everything, in both directions.
     fn allow_everything(&mut self, name: &str, subject: Value) {
         let both = [(FROM, format!("{name}-from")), (TO, format!("{name}-to"))];
         self.rules.extend(both.iter().map(|(flow, id)| rule(id, flow, &ALL, &["**".to_owned()])));
@@ -50,15 +51,16 @@ impl Rules {
     }
 }
 
-/// Rules of a session with a key: only the rig's own certificate counts. zenoh trusts the web's public authorities, too.
+/// Returns the rules of a session with a key: it accepts only the rig's own certificate name, since zenoh also trusts public
+/// authorities.
 pub(crate) fn with_key(key: &KeyFile) -> Value {
     let mut rules = Rules::default();
     rules.allow_everything("rig", json!({ "id": "rig", "cert_common_names": [key.rig_certificate_name] }));
     rules.control()
 }
 
-/// Rules of a session behind a gate: programs of this computer may do everything, holders of these roles what their role lets them, each
-/// by its number.
+/// Returns the rules of a session behind a gate: programs of this computer may do everything, holders of these roles what their role
+/// allows, each under its number.
 pub(crate) fn behind_gate(ring: &Ring, roles: &[Role]) -> Value {
     let mut all = Rules::default();
     all.allow_everything("local", json!({ "id": "local", "link_protocols": ["tcp"] }));

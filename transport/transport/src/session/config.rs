@@ -8,38 +8,48 @@ use zenoh::Config;
 
 use crate::{error::TransportError, keys};
 
-/// Where a rig is found and how its sessions behave; one structure for both sides.
+/// Addresses of a rig and settings of its sessions, for both sides.
+///
+/// ```
+/// use flyrig_transport::TransportConfig;
+///
+/// let mut config = TransportConfig::publisher("studio");
+/// config.validate()?;
+/// config.listen = vec!["tcp/0.0.0.0:7447".to_owned()];
+/// assert!(config.validate().is_err(), "other computers need keys, or `insecure`");
+/// # Ok::<(), flyrig_transport::TransportError>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TransportConfig {
-    /// Name of the rig, part of every key: 1 to 64 of `A-Z a-z 0-9 _ . -`. A configuration has it elsewhere.
+    /// Name of the rig, part of every key: 1 to 64 of `A-Z a-z 0-9 _ . -`. Configuration files state it elsewhere.
     #[serde(skip)]
     pub rig: String,
-    /// Folder of the rig's keys ([`flyrig_access::Ring`]): whoever holds one of them connects from other computers, through TLS, at the
-    /// address in that folder. Empty: nobody does.
+    /// Folder of the rig's keys ([`flyrig_access::Ring`]): their holders connect from other computers, through TLS, at the address in
+    /// that folder. Empty: without keys.
     pub keys: PathBuf,
-    /// Key that this side shows to the rig; it connects to the addresses in it. Not part of a configuration.
+    /// Key that this side shows to the rig; it connects to the addresses in it. Not part of configuration files.
     #[serde(skip)]
     pub key: Option<KeyFile>,
-    /// zenoh endpoints to listen on, such as `tcp/127.0.0.1:7447`; port 0 takes a free one. Whoever reaches them may do everything.
+    /// zenoh endpoints to listen on, such as `tcp/127.0.0.1:7447`; port 0 takes a free one. Programs that reach them may do everything.
     pub listen: Vec<String>,
-    /// Listen on addresses that other computers reach without keys: in trusted networks only.
+    /// Whether to listen on addresses that other computers reach without keys: in trusted networks only.
     pub insecure: bool,
-    /// zenoh endpoints to connect to: publishers or routers; tried again until they answer.
+    /// zenoh endpoints of publishers or routers to connect to; retried until they answer.
     pub connect: Vec<String>,
-    /// Find each other by UDP multicast on the local network.
+    /// Whether rigs and viewers find each other by UDP multicast on the local network.
     pub multicast: bool,
-    /// Pass large payloads through shared memory between processes of one host.
+    /// Whether large payloads pass through shared memory between processes of one host.
     pub shared_memory: bool,
-    /// Publisher: how many subscribers may have a viewpoint of their own.
+    /// Publisher: largest number of subscribers with a viewpoint of their own.
     pub max_viewers: usize,
-    /// Publisher: how long a viewpoint lives without being renewed, milliseconds.
+    /// Publisher: lifetime of a viewpoint that is not renewed, milliseconds.
     pub viewpoint_lease_millis: u64,
-    /// Publisher: pixels a second that all viewpoints may ask for together, width * height * frame rate each; more is
-    /// refused. The default is four viewers with 512x512 pixels at 30 a second.
+    /// Publisher: pixels per second of all viewpoints together, width * height * frame rate each; requests beyond it are refused. The
+    /// default is four viewers with 512x512 pixels at 30 per second.
     pub viewpoint_pixels_per_second: u64,
-    /// Receiving side: bytes of payload that may wait for their reader, over all topics or cameras. Beyond it the largest
-    /// waiting payloads are dropped and counted; a single message over it is refused. 64 KiB to 4 GiB.
+    /// Receiving side: payload bytes that may wait for their reader, over all topics or cameras, 64 KiB to 4 GiB. Beyond it the largest
+    /// waiting payloads are dropped and counted; a single larger message is refused.
     pub inbox_bytes: u64,
 }
 
@@ -49,14 +59,14 @@ pub(crate) const LARGEST_QUESTION: usize = 1 << 20;
 /// Range of [`TransportConfig::inbox_bytes`].
 const INBOX_BYTES: std::ops::RangeInclusive<u64> = 1 << 16..=1 << 32;
 
-/// Bound of [`TransportConfig::viewpoint_pixels_per_second`].
+/// Largest [`TransportConfig::viewpoint_pixels_per_second`].
 const MOST_PIXELS_PER_SECOND: u64 = 100_000_000_000;
 
-/// Endpoint where a publisher listens unless told otherwise.
+/// Endpoint where a publisher listens by default.
 const DEFAULT_ENDPOINT: &str = "tcp/127.0.0.1:7447";
 
-/// A publisher named "flyrig" that listens on loopback, zenoh's usual port.
 impl Default for TransportConfig {
+    /// Returns the settings of a publisher named "flyrig" that listens on loopback, zenoh's usual port.
     fn default() -> Self {
         Self {
             rig: "flyrig".to_owned(),
@@ -77,26 +87,26 @@ impl Default for TransportConfig {
 }
 
 impl TransportConfig {
-    /// A publisher that listens on loopback, zenoh's usual port.
+    /// Returns the settings of a publisher that listens on loopback, zenoh's usual port.
     #[must_use]
     pub fn publisher(rig: &str) -> Self {
         Self { rig: rig.to_owned(), ..Self::default() }
     }
 
-    /// A subscriber that connects to a publisher on this host.
+    /// Returns the settings of a subscriber that connects to a publisher on this host.
     #[must_use]
     pub fn subscriber(rig: &str) -> Self {
         Self { rig: rig.to_owned(), listen: vec![], connect: vec![DEFAULT_ENDPOINT.to_owned()], ..Self::default() }
     }
 
-    /// A session that shows a key to the rig that the key names: at the first of its addresses that admits it.
+    /// Returns the settings of a session that shows a key to the rig named in it, at the first of its addresses that admits the key.
     #[must_use]
     pub fn with_key(key: KeyFile) -> Self {
         let connect = key.connect.iter().map(|address| tls_endpoint(address)).collect();
         Self { rig: key.rig.clone(), listen: vec![], connect, key: Some(key), ..Self::default() }
     }
 
-    /// Whether a ring of keys is named.
+    /// Returns whether a ring of keys is named.
     pub(crate) fn has_keys(&self) -> bool {
         !self.keys.as_os_str().is_empty()
     }
@@ -104,13 +114,13 @@ impl TransportConfig {
     /// Checks names, endpoints and limits.
     ///
     /// # Errors
-    /// Names the setting.
+    /// `Config` names the setting.
     pub fn validate(&self) -> Result<(), TransportError> {
         keys::check_name("rig", &self.rig)?;
         if self.listen.is_empty() && self.connect.is_empty() && !self.multicast && !self.has_keys() {
             return Err(TransportError::config(
                 "listen, connect",
-                "a session without endpoints and without multicast meets nobody; give one, such as tcp/127.0.0.1:7447",
+                "a session without endpoints and without multicast reaches no other; give one, such as tcp/127.0.0.1:7447",
             ));
         }
         for endpoint in self.listen.iter().chain(&self.connect) {
@@ -135,14 +145,14 @@ impl TransportConfig {
                 "leave it out: holders of keys connect at the address in transport.keys".to_owned()
             } else {
                 format!(
-                    "give keys to those who may: `flyrig keys new {} --host NAME-OF-THIS-COMPUTER`, and transport.keys = \"{}-keys\"; or set \
+                    "make keys for those who may: `flyrig keys new {} --host NAME-OF-THIS-COMPUTER`, and transport.keys = \"{}-keys\"; or set \
                      transport.insecure = true (--insecure) in a network that is yours alone",
                     self.rig, self.rig
                 )
             };
             return Err(TransportError::config(
                 format!("listen {open:?}"),
-                format!("everybody who reaches this computer could watch the people; {fix}"),
+                format!("any program that reaches this computer could watch the people; {fix}"),
             ));
         }
         if !(100..=600_000).contains(&self.viewpoint_lease_millis) {
@@ -170,9 +180,8 @@ impl TransportConfig {
         Ok(())
     }
 
-    /// The zenoh configuration that this means. `largest` is the size of the largest message that anybody may send to
-    /// this session, bytes: a connection with a larger one is ended by zenoh before the message is assembled. `others` are
-    /// further settings, which keys need.
+    /// Returns the zenoh configuration. `largest` bounds the messages to this session, bytes: zenoh ends a connection with a larger one
+    /// before the message is assembled. `others` are further settings, which keys need.
     pub(crate) fn zenoh(
         &self,
         listen: &[String],
@@ -188,16 +197,16 @@ impl TransportConfig {
             ("connect/timeout_ms", "-1".to_owned()),
             ("connect/exit_on_failure", "false".to_owned()),
             ("connect/retry", r#"{"period_init_ms":100,"period_max_ms":1000,"period_increase_factor":2}"#.to_owned()),
-            // The other side may come much later.
+            // The other side may start much later.
             ("open/return_conditions/connect_scouted", "false".to_owned()),
             ("scouting/multicast/enabled", self.multicast.to_string()),
             // Gossip would connect the viewers of one rig to each other for nothing.
             ("scouting/gossip/enabled", self.multicast.to_string()),
-            // Whoever needs a key is on another computer.
+            // A holder of a key is on another computer.
             ("transport/shared_memory/enabled", (self.shared_memory && self.key.is_none()).to_string()),
             // zenoh's 2 batches of 64 KiB overflow when several images leave at once; 8 hold two frames of four views.
             ("transport/link/tx/queue/size/data", "8".to_owned()),
-            // Chunks of a template that are asked for at once: one that finds no place is missed for seconds.
+            // Chunks of a template that are queried at once: one that finds no room is missing for seconds.
             ("transport/link/tx/queue/size/data_high", "8".to_owned()),
             ("transport/link/rx/max_message_size", largest.to_string()),
         ];
@@ -209,15 +218,15 @@ impl TransportConfig {
     }
 }
 
-/// Beginning of endpoints of rigs with keys.
+/// Prefix of the endpoints of rigs with keys.
 const TLS: &str = "tls/";
 
-/// Endpoint of a rig with keys.
+/// Returns the endpoint of a rig with keys.
 pub(crate) fn tls_endpoint(address: &str) -> String {
     format!("{TLS}{address}")
 }
 
-/// Whether only programs of this computer reach an endpoint.
+/// Returns whether only programs of this computer reach an endpoint.
 pub(crate) fn is_loopback(endpoint: &str) -> bool {
     let address = endpoint.split_once('/').map_or(endpoint, |(_, address)| address);
     let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
@@ -243,7 +252,7 @@ mod tests {
         assert!(refused(TransportConfig { rig: "a/**".into(), ..good.clone() }).contains("a/**"));
         assert!(refused(TransportConfig { rig: String::new(), ..good.clone() }).contains("rig"));
         assert!(refused(TransportConfig { listen: vec!["udp/1.2.3.4:5".into()], ..good.clone() }).contains("udp/"));
-        assert!(refused(TransportConfig { listen: vec![], ..good.clone() }).contains("meets nobody"));
+        assert!(refused(TransportConfig { listen: vec![], ..good.clone() }).contains("reaches no other"));
         for open in ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/10.0.0.1:7447", "tcp/studio:7447"] {
             let listen = vec![open.to_owned()];
             let reason = refused(TransportConfig { listen: listen.clone(), ..good.clone() });

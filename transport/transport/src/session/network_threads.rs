@@ -1,4 +1,4 @@
-//! Threads of zenoh's network.
+//! Threads of zenoh's network runtime.
 //!
 //! zenoh 1.10.2 reads and writes a TLS connection from two threads at once, without a lock
 //! (<https://github.com/eclipse-zenoh/zenoh/issues/2557>): under load that ends the connection, or the process. With one thread for both,
@@ -9,15 +9,15 @@ use std::env;
 const VARIABLE: &str = "ZENOH_RUNTIME";
 const ONE_THREAD: &str = "(rx: (worker_threads: 1), tx: (handover: rx), acc: (handover: rx))";
 
-/// Lets zenoh read and write on one thread, unless the environment says otherwise. For the beginning of `main`: sessions that hold keys
-/// need it.
+/// Makes zenoh read and write on one thread, unless the environment says otherwise. Call it at the beginning of `main`: sessions with
+/// keys need it.
 ///
 /// # Safety
 /// No other thread may run yet: it could read the environment while it changes.
 #[allow(unsafe_code)]
 pub unsafe fn use_one_network_thread() {
     if env::var_os(VARIABLE).is_none() {
-        // SAFETY: this is the only thread, the caller says.
+        // SAFETY: the caller guarantees that this is the only thread.
         unsafe { env::set_var(VARIABLE, ONE_THREAD) };
     }
 }

@@ -1,4 +1,4 @@
-//! Opening zenoh sessions: ports, keys, rules.
+//! Opening of zenoh sessions: ports, keys, rules.
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 
@@ -18,17 +18,18 @@ use crate::{
 
 /// Bytes that the system keeps between a session and its gate.
 const SEND_BUFFER: u32 = 16 << 10;
-/// Bytes that the system of a holder of a key keeps unread: enough for 20 Mbit/s with 200 ms. Its own choice grows too slowly for a template.
+/// Bytes that the system of a key's holder keeps unread: enough for 20 Mbit/s with 200 ms. The system's own choice grows too slowly for
+/// a template.
 const RECEIVE_BUFFER: u32 = 512 << 10;
-/// Attempts at ports that somebody else takes in between.
+/// Attempts at free ports, which another program may take in between.
 const ATTEMPTS: usize = 5;
 
-/// A session, and what guards it.
+/// Session with its gate.
 pub(crate) struct Opened {
     pub session: Session,
     /// Endpoints of programs of this computer, port 0 replaced by the real one.
     pub endpoints: Vec<String>,
-    /// Admits holders of keys; lives as long as the session.
+    /// Gate that admits holders of keys; lives as long as the session.
     pub gate: Option<Gate>,
 }
 
@@ -41,8 +42,8 @@ impl From<AccessError> for TransportError {
     }
 }
 
-/// Opens a session of a rig, viewer or computer with cameras. Holders of keys of these roles may reach it, where the settings name keys.
-/// `largest` bytes are the most that a message to this session may have.
+/// Opens a session of a rig, viewer or computer with cameras. Holders of keys of these roles may reach it where the settings name keys.
+/// `largest` bounds the messages to this session, bytes.
 pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> Result<Opened, TransportError> {
     let ring = (config.has_keys() && !roles.is_empty()).then(|| Ring::open(&config.keys)).transpose()?;
     if let Some(ring) = ring.as_ref().filter(|ring| ring.rig() != config.rig) {
@@ -52,12 +53,12 @@ pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> 
     }
     if let Some(listen) = config.listen.iter().find(|endpoint| !is_loopback(endpoint)) {
         tracing::warn!(
-            "INSECURE: whoever reaches {listen} can watch the people of rig '{}' and publish in its name",
+            "INSECURE: any program that reaches {listen} can watch the people of rig '{}' and publish in its name",
             config.rig
         );
     }
     let connect = match &config.key {
-        // zenoh would take the others for further rigs, and connect to them again and again.
+        // zenoh would take the other addresses for further rigs, and connect to them repeatedly.
         Some(key) => vec![tls_endpoint(key.address())],
         None => config.connect.clone(),
     };
@@ -73,7 +74,7 @@ pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> 
         let settings = secured(behind.as_ref().map(|(ring, inner, _)| (*ring, inner)), roles, config.key.as_ref());
         let session = match zenoh::open(config.zenoh(&listen, &connect, largest, &settings)?).wait() {
             Ok(session) => session,
-            // Somebody else was faster to take the port.
+            // Another program was faster to take the port.
             Err(_) if attempt < ATTEMPTS && listen != config.listen => continue,
             Err(error) => {
                 let text = format!("{error}; is another publisher running there? Choose another listen endpoint");
@@ -89,7 +90,7 @@ pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> 
     Err(TransportError::session("listen", &"no free port"))
 }
 
-/// Starts to ask why the rig does not admit the key, where there is one.
+/// Starts to probe why the rig rejects the key, where there is one.
 pub(crate) fn probe(
     config: &TransportConfig,
     is_connected: impl Fn() -> bool + Send + 'static,
@@ -97,12 +98,12 @@ pub(crate) fn probe(
     Ok(config.key.clone().map(|key| KeyProbe::start(key, is_connected)).transpose()?)
 }
 
-/// Address of the session behind a gate.
+/// Returns the address of the session behind a gate.
 fn at_session(port: u16) -> SocketAddr {
     SocketAddr::from((Ipv4Addr::LOCALHOST, port))
 }
 
-/// zenoh's settings of a session behind a gate, or of one that shows a key.
+/// Returns zenoh's settings of a session behind a gate, or of one that shows a key.
 fn secured(behind: Option<(&Ring, &Inner)>, roles: &[Role], key: Option<&KeyFile>) -> Vec<(&'static str, String)> {
     let base64 = |text: &str| json!(STANDARD.encode(text)).to_string();
     let (authority, mut settings, rules) = match (behind, key) {
@@ -139,7 +140,7 @@ fn free_port() -> Result<u16, TransportError> {
     free.map(|address| address.port()).map_err(|error| TransportError::session("listen", &error))
 }
 
-/// Replaces port 0: zenoh's stable interface does not tell which it took.
+/// Replaces port 0 by a free port: zenoh's stable interface does not report the port that it takes.
 fn with_free_port(endpoint: &str) -> String {
     let free = || {
         let host = endpoint.strip_prefix("tcp/")?.strip_suffix(":0")?;

@@ -1,4 +1,4 @@
-//! The subscriber's thread that asks for its viewpoint and renews the lease.
+//! Thread of a subscriber that requests its viewpoint and renews the lease.
 
 use std::{
     sync::{Arc, Condvar, Mutex, PoisonError},
@@ -16,10 +16,10 @@ use crate::{
     views::viewpoint::{ViewpointAnswer, ViewpointRequest, ViewpointStatus},
 };
 
-/// How long an answer may take.
+/// Time limit of an answer.
 const ANSWER: Duration = Duration::from_secs(1);
 
-/// When to ask again after no answer or a refusal.
+/// Delay before a request is repeated after no answer or a refusal.
 const RETRY: Duration = Duration::from_millis(500);
 
 #[derive(Debug)]
@@ -36,7 +36,7 @@ struct Shared {
     wake: Condvar,
 }
 
-/// Handle of the thread.
+/// Handle of the renewing thread.
 #[derive(Debug)]
 pub(crate) struct Renewal {
     shared: Arc<Shared>,
@@ -84,7 +84,7 @@ impl Renewal {
 }
 
 fn run(shared: &Shared, session: &Session, key: &str, view: &str) {
-    // Nothing is asked before something is wanted, so nothing is given back either.
+    // Without a request before, there is nothing to release.
     let mut asked = false;
     let mut pause: Option<Duration> = None;
     loop {
@@ -119,7 +119,7 @@ fn run(shared: &Shared, session: &Session, key: &str, view: &str) {
                 }
             };
             let mut state = lock(&shared.state);
-            // An answer to a question that was changed meanwhile says nothing.
+            // An answer to a request that has changed meanwhile is ignored.
             if !state.changed {
                 state.status = status;
             }
@@ -130,7 +130,7 @@ fn run(shared: &Shared, session: &Session, key: &str, view: &str) {
     }
 }
 
-/// The first answer that can be read, `None` when nobody is there.
+/// Sends a request and returns the first readable answer; `None` without a publisher.
 fn ask(session: &Session, key: &str, wanted: Option<(Camera, f64)>) -> Result<Option<ViewpointAnswer>, TransportError> {
     let (camera, max_fps) = wanted.map_or((None, 1.0), |(camera, max_fps)| (Some(camera), max_fps));
     let question = to_json(key, &ViewpointRequest { camera, max_fps })?;

@@ -1,4 +1,4 @@
-//! Images on the wire: foxglove `CompressedImage`.
+//! Images of views on the wire: foxglove `CompressedImage`.
 
 use foxglove::{
     Decode, Encode,
@@ -14,7 +14,7 @@ pub const MAX_IMAGE_BYTES: usize = 32 << 20;
 /// Largest message of a view: the image and the few fields around it, bytes.
 pub(crate) const MAX_MESSAGE_BYTES: usize = MAX_IMAGE_BYTES + (4 << 10);
 
-/// How an image is compressed.
+/// Compression of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ImageFormat {
     /// JPEG.
@@ -24,7 +24,7 @@ pub enum ImageFormat {
 }
 
 impl ImageFormat {
-    /// foxglove's word for it.
+    /// Returns foxglove's name of the format.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -38,31 +38,31 @@ impl ImageFormat {
     }
 }
 
-/// A compressed image of a view; the caller compresses and decompresses.
+/// Compressed image of a view; the caller compresses and decompresses.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ViewFrame {
-    /// Pixels.
+    /// Width, pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height, pixels.
     pub height: u32,
-    /// What `bytes` are.
+    /// Compression of `bytes`.
     pub format: ImageFormat,
-    /// The compressed image; `Bytes::from(vec)` takes a `Vec<u8>` without copying.
+    /// Compressed image; `Bytes::from(vec)` takes a `Vec<u8>` without copying.
     pub bytes: Bytes,
-    /// The rig's frame number.
+    /// Frame number of the rig.
     pub frame: u64,
-    /// Capture time of the frame set it shows, `CLOCK_MONOTONIC` of the capturing host.
+    /// Capture time of the frame set that it shows, `CLOCK_MONOTONIC` of the capturing host.
     pub capture_nanos: i64,
 }
 
-/// foxglove's time; it counts from 0 to 2^32 s, anything else is held at the ends.
+/// Converts a time to foxglove's, clamped to its range of 0 to 2^32 s.
 pub(crate) fn timestamp(nanos: i64) -> Timestamp {
     let nanos = nanos.max(0);
     let seconds = u32::try_from(nanos / 1_000_000_000).unwrap_or(u32::MAX);
     Timestamp::new(seconds, (nanos % 1_000_000_000) as u32)
 }
 
-/// Bytes of a foxglove message.
+/// Encodes a foxglove message.
 pub(crate) fn to_bytes<M: Encode>(topic: &str, message: &M) -> Result<Vec<u8>, TransportError> {
     let mut bytes = Vec::with_capacity(message.encoded_len().unwrap_or(0));
     message.encode(&mut bytes).map_err(|error| TransportError::malformed(topic, error.to_string()))?;
@@ -70,7 +70,7 @@ pub(crate) fn to_bytes<M: Encode>(topic: &str, message: &M) -> Result<Vec<u8>, T
 }
 
 impl ViewFrame {
-    /// Checks what a publisher hands in.
+    /// Checks an image that a publisher hands in.
     pub(crate) fn validate(&self, view: &str) -> Result<(), TransportError> {
         let side = 1..=flyrig_types::MAX_IMAGE_SIDE;
         if !side.contains(&self.width) || !side.contains(&self.height) {
@@ -83,7 +83,7 @@ impl ViewFrame {
         check_len(view, self.bytes.len())
     }
 
-    /// As foxglove `CompressedImage`; size and frame number travel in the [`Header`].
+    /// Encodes the image as foxglove `CompressedImage`; size and frame number travel in the [`Header`].
     ///
     /// # Errors
     /// `Malformed` when protobuf refuses it.
@@ -97,7 +97,7 @@ impl ViewFrame {
         to_bytes(view, &image)
     }
 
-    /// From the wire; size, frame and time come from the message's header.
+    /// Decodes an image; size, frame and time come from the header of its message.
     ///
     /// # Errors
     /// `Malformed`.

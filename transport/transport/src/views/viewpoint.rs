@@ -1,4 +1,4 @@
-//! Viewpoints that subscribers ask for.
+//! Viewpoints that subscribers request.
 
 use std::{
     collections::VecDeque,
@@ -13,52 +13,52 @@ use crate::{error::TransportError, json::from_json, keys, printable::clean};
 /// Largest side of an image that a subscriber may ask for, pixels.
 pub const MAX_VIEWPOINT_SIDE: u32 = 4096;
 
-/// How long a request that could not be drawn is refused.
+/// Time for which a request that could not be drawn is refused.
 const REFUSAL: Duration = Duration::from_secs(60);
 
-/// Refused requests that are remembered; the oldest is forgotten first.
+/// Largest number of refused requests that are remembered; the oldest is forgotten first.
 const MAX_REFUSALS: usize = 64;
 
-/// A camera that a subscriber wants to look through.
+/// Camera that a subscriber requests images through.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Viewpoint {
-    /// Who asked.
+    /// Name of the subscriber.
     pub subscriber: String,
     /// Name of the view to publish the images under.
     pub view: String,
-    /// Where it looks from; validated, at most 4096 pixels a side, its name printable.
+    /// Camera to draw; validated, at most 4096 pixels per side, its name printable.
     pub camera: Camera,
-    /// Images a second that the subscriber wants at most.
+    /// Largest rate that the subscriber wants, images per second.
     pub max_fps: f64,
 }
 
-/// How a subscriber's own viewpoint stands.
+/// Status of a subscriber's viewpoint.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ViewpointStatus {
-    /// None was asked for.
+    /// No viewpoint is requested.
     Idle,
-    /// No answer so far; it is asked again.
+    /// No answer so far; the request is repeated.
     Pending,
-    /// The publisher renders it under this view name.
+    /// The publisher renders the viewpoint.
     Granted {
         /// Name of the view.
         view: String,
     },
-    /// The publisher says no; it is asked again at each renewal.
+    /// The publisher refuses; the request is repeated at each renewal.
     Refused {
-        /// Why, in the publisher's words.
+        /// Reason that the publisher gives.
         reason: String,
     },
 }
 
-/// The question; an absent camera gives the viewpoint back.
+/// Request for a viewpoint; one without a camera releases it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ViewpointRequest {
     pub camera: Option<Camera>,
     pub max_fps: f64,
 }
 
-/// The answer.
+/// Answer of the publisher.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ViewpointAnswer {
     pub granted: bool,
@@ -67,7 +67,7 @@ pub(crate) struct ViewpointAnswer {
 }
 
 impl ViewpointAnswer {
-    /// Out of JSON; the reason is [`crate::printable`].
+    /// Decodes an answer from JSON; the reason is made [`crate::printable()`].
     pub(crate) fn decode(topic: &str, bytes: &[u8]) -> Result<Self, TransportError> {
         let mut answer: Self = from_json(topic, bytes)?;
         clean(&mut answer.reason);
@@ -75,7 +75,7 @@ impl ViewpointAnswer {
     }
 }
 
-/// Checks a request's numbers.
+/// Checks the numbers of a request.
 pub(crate) fn check_camera(topic: &str, camera: &Camera, max_fps: f64) -> Result<(), TransportError> {
     let refuse = |message: String| Err(TransportError::config(topic, message));
     if let Err(error) = camera.validate() {
@@ -94,37 +94,37 @@ pub(crate) fn check_camera(topic: &str, camera: &Camera, max_fps: f64) -> Result
 struct Lease {
     viewpoint: Viewpoint,
     ends: Instant,
-    /// When its next image is due; none before the first.
+    /// Time at which the next image is due; `None` before the first.
     next_due: Option<Instant>,
 }
 
 impl Lease {
-    /// Whether an image is due; then the next one is a period later.
+    /// Returns whether an image is due, and schedules the next one a period later.
     fn take_due(&mut self, now: Instant) -> bool {
         let period = Duration::from_secs_f64(1.0 / self.viewpoint.max_fps);
         let Some(due) = self.next_due else {
             self.next_due = now.checked_add(period);
             return true;
         };
-        // A rig of the same rate that comes a little early must not lose its image.
+        // A frame set of the same rate that is a little early must not lose its image.
         if now + period / 8 < due {
             return false;
         }
-        // Added up, so that the mean rate is kept whatever the jitter. Of what a pause missed, half a period is made up for.
+        // Periods add up, so that jitter does not change the mean rate. After a pause, at most half a period is made up for.
         let earliest = now.checked_sub(period / 2).unwrap_or(now);
         self.next_due = due.checked_add(period).map(|next| next.max(earliest));
         true
     }
 }
 
-/// A request that could not be drawn.
+/// Request that could not be drawn.
 struct Refusal {
     viewpoint: Viewpoint,
     reason: String,
     ends: Instant,
 }
 
-/// The viewpoints of a publisher: bounded in number and in pixels a second, each with a lease.
+/// Viewpoints of a publisher: bounded in number and in pixels per second, each with a lease.
 pub(crate) struct Leases {
     active: Vec<Lease>,
     refusals: VecDeque<Refusal>,
@@ -152,7 +152,7 @@ impl Leases {
         }
     }
 
-    /// Grants, renews, gives back or refuses.
+    /// Grants, renews, releases or refuses a viewpoint.
     pub(crate) fn ask(
         &mut self,
         subscriber: &str,
@@ -218,11 +218,11 @@ impl Leases {
         Ok(())
     }
 
-    /// Whether a viewpoint fits the largest image and, beside the other subscribers' viewpoints, the budget.
+    /// Checks that a viewpoint fits the largest image and, beside those of other subscribers, the budget.
     fn check_pixels(&self, topic: &str, viewpoint: &Viewpoint) -> Result<(), TransportError> {
         let refuse = |message: String| Err(TransportError::config(topic, message));
         let (width, height) = (viewpoint.camera.intrinsics.width, viewpoint.camera.intrinsics.height);
-        // The largest image of the same shape with so many pixels.
+        // The largest image of the same aspect ratio with `most` pixels.
         let within = |most: f64| {
             let scale = (most / pixels(viewpoint)).sqrt();
             format!("{}x{}", (f64::from(width) * scale) as u32, (f64::from(height) * scale) as u32)
@@ -240,7 +240,7 @@ impl Leases {
         let taken: f64 = others.filter(|other| other.subscriber != viewpoint.subscriber).map(pixel_rate).sum();
         let budget = self.pixels_per_second as f64;
         let left = (budget - taken).max(0.0);
-        // Sums of products of whole and of measured rates: not to the last bit.
+        // Sums of products of whole and of measured rates are not exact to the last bit.
         if pixel_rate(viewpoint) <= left * (1.0 + 1e-9) {
             return Ok(());
         }
@@ -260,7 +260,7 @@ impl Leases {
         ))
     }
 
-    /// Sets the largest image; viewpoints over it end.
+    /// Sets the largest image, pixels; larger viewpoints end.
     pub(crate) fn set_max_view_pixels(&mut self, most: u64) {
         self.max_view_pixels = most;
         let before = self.active.len();
@@ -280,14 +280,14 @@ impl Leases {
         self.refusals.push_back(Refusal { viewpoint, reason: reason.to_owned(), ends: now + REFUSAL });
     }
 
-    /// Takes the viewpoints that are watched and whose next image is due.
+    /// Takes the watched viewpoints whose next image is due.
     pub(crate) fn take_due(&mut self, now: Instant, is_watched: impl Fn(&str) -> bool) -> Vec<Viewpoint> {
         self.expire(now);
         let due = self.active.iter_mut().filter(|lease| is_watched(&lease.viewpoint.view));
         due.filter_map(|lease| lease.take_due(now).then(|| lease.viewpoint.clone())).collect()
     }
 
-    /// Forgets a subscriber that is gone.
+    /// Forgets a subscriber that has left.
     pub(crate) fn drop_subscriber(&mut self, subscriber: &str) {
         let before = self.active.len();
         self.active.retain(|lease| lease.viewpoint.subscriber != subscriber);
@@ -316,12 +316,12 @@ fn pixels(viewpoint: &Viewpoint) -> f64 {
     f64::from(intrinsics.width) * f64::from(intrinsics.height)
 }
 
-/// Pixels a second.
+/// Returns the rate of a viewpoint, pixels per second.
 fn pixel_rate(viewpoint: &Viewpoint) -> f64 {
     pixels(viewpoint) * viewpoint.max_fps
 }
 
-/// Millions, as they stand in messages.
+/// Formats a number of pixels in millions.
 fn mega(pixels: f64) -> String {
     format!("{:.1}", pixels * 1e-6)
 }
@@ -356,7 +356,7 @@ mod tests {
         }
     }
 
-    /// The reason of a refusal, empty when granted.
+    /// Returns the reason of a refusal; empty when granted.
     fn ask(leases: &mut Leases, who: &str, (width, height): (u32, u32), max_fps: f64, now: Instant) -> String {
         let request = ViewpointRequest { camera: Some(camera(width, height)), max_fps };
         let answer = leases.ask(who, Ok(request), now);
@@ -444,7 +444,8 @@ mod tests {
         assert_eq!(leases.refusals.len(), MAX_REFUSALS);
     }
 
-    /// Images that each viewer gets in 20 s of a rig of `rig_fps`, its sets up to `jitter` of an interval early or late.
+    /// Returns the number of images of each viewer in 20 s of a rig of `rig_fps`, whose frame sets are up to `jitter` of an interval early
+    /// or late.
     fn pictures(rates: &[f64], rig_fps: f64, jitter: f64) -> Vec<usize> {
         let (mut leases, start) = (Leases::new(8, LEASE, u64::MAX), Instant::now());
         let mut counts = vec![0; rates.len()];
@@ -477,7 +478,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_draws_for_a_viewer_that_does_not_watch_or_makes_up_for_a_pause() {
+    fn no_image_is_drawn_for_a_viewer_that_does_not_watch_or_to_make_up_for_a_pause() {
         let (mut leases, now) = (leases(), Instant::now());
         assert_eq!(ask(&mut leases, "a", (64, 64), 10.0, now), "");
         assert_eq!(ask(&mut leases, "b", (64, 64), 10.0, now), "");

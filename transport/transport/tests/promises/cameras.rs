@@ -92,7 +92,7 @@ fn a_frame_comes_out_as_it_went_in_with_the_time_of_this_computer() {
         host.publish_status(&right, &status).unwrap();
         there.link(&right).status.is_some_and(|found| found == status)
     });
-    assert_eq!(there.absence(&right), "its computer 'pi-2' says: was unplugged");
+    assert_eq!(there.absence(&right), "its computer 'pi-2' reports: was unplugged");
     let unknown = there.next_frame(&"nobody".into(), Duration::ZERO).unwrap_err();
     assert_eq!(unknown.kind, TransportErrorKind::Config);
     assert!(host.publish(frame("nobody", 1)).unwrap_err().to_string().contains("not one of those"));
@@ -145,12 +145,12 @@ fn a_computer_that_vanishes_and_returns_goes_on() {
     let endpoint = free_endpoint();
     let there = subscriber("test", &["a"], std::slice::from_ref(&endpoint));
     let a = CameraId::from("a");
-    assert!(there.absence(&a).starts_with("no computer of rig 'test' is there; run `flyrig capture` on it"));
+    assert!(there.absence(&a).starts_with("no computer of rig 'test' is present; run `flyrig capture` on it"));
     let mut sequence = 0;
     let first = host("test", &["a"], &endpoint);
     publish_until_seen(&first, &there, "a", &mut sequence);
     drop(first);
-    wait_until("the word that it is gone", || there.absence(&a).contains("its computer is gone from the network"));
+    wait_until("the report that it has left", || there.absence(&a).contains("its computer has left the network"));
     let second = host("test", &["a"], &endpoint);
     // As a restarted program does, it counts from the beginning.
     let found = publish_until_seen(&second, &there, "a", &mut 0);
@@ -170,7 +170,7 @@ fn rigs_of_one_network_do_not_mix_and_a_wrong_name_is_told() {
         assert!(publish_until_seen(&one, &of_one, "a", &mut sequence).sequence < 1_000_000);
     }
     wait_until("the names of the others", || of_three.absence(&"a".into()).contains("'one', 'two'"));
-    assert!(of_three.absence(&"a".into()).contains("set rig.name alike"));
+    assert!(of_three.absence(&"a".into()).contains("set the same rig.name"));
     assert!(of_three.next_frame(&"a".into(), Duration::ZERO).unwrap().is_none());
 }
 
