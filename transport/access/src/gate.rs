@@ -1,4 +1,4 @@
-//! The gate: admits holders of keys, and passes their connections on.
+//! Gate: admits holders of keys, and passes their connections on.
 
 use std::{
     collections::HashMap,
@@ -34,24 +34,24 @@ use crate::{
     tls,
 };
 
-/// Time in which a client must show its key.
+/// Time limit of a handshake, and of the client's first message.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// How often the list of holders is looked at, and how long a key outlives its end.
-const LOOK_EVERY: Duration = Duration::from_millis(500);
-/// Connections of one key at a time.
+/// Interval between checks of the list of holders, and the longest time that a key outlives its end.
+const CHECK_EVERY: Duration = Duration::from_millis(500);
+/// Largest number of connections of one key at a time.
 const CONNECTIONS_OF_ONE: usize = 16;
-/// Connections at a time.
+/// Largest number of admitted connections at a time.
 const CONNECTIONS: usize = 512;
-/// Connections and handshakes at a time: more than [`CONNECTIONS`] and the handshakes of all addresses together.
+/// Largest number of connections and handshakes at a time: more than [`CONNECTIONS`] and the handshakes of all addresses together.
 const ACCEPTED: usize = 1024;
-/// Bytes of a copy from one side to the other.
+/// Bytes copied at once from one side to the other.
 const COPY_BYTES: usize = 4 << 10;
 /// Bytes that the system keeps between the session and the gate.
 const INNER_BUFFER: u32 = 16 << 10;
-/// Years that certificates between gate and session are valid; they live as long as the program.
+/// Validity of the certificates between gate and session, seconds; they live as long as the program.
 const INNER_SECS: u64 = 20 * 365 * 86_400;
 
-/// Certificates between a gate and the session behind it: made anew for each gate, and known to nobody else.
+/// Certificates between a gate and the session behind it, made for each gate and known to nobody else.
 pub struct Inner {
     authority: Authority,
     own: CertificatePair,
@@ -64,10 +64,10 @@ impl std::fmt::Debug for Inner {
 }
 
 impl Inner {
-    /// Makes new certificates.
+    /// Issues new certificates.
     ///
     /// # Errors
-    /// [`AccessError::System`].
+    /// [`AccessError::System`] without random numbers.
     pub fn new() -> Result<Self, AccessError> {
         let authority = Authority::new("flyrig gate", (now_secs(), now_secs() + INNER_SECS))?.0;
         let hosts = [Ipv4Addr::LOCALHOST.to_string()];
@@ -75,7 +75,7 @@ impl Inner {
         Ok(Self { authority, own })
     }
 
-    /// Returns the authority whose clients the session must require, PEM.
+    /// Returns the authority that must have signed the certificates of the session's clients, PEM.
     #[must_use]
     pub fn authority(&self) -> &str {
         &self.authority.certificate
@@ -87,14 +87,14 @@ impl Inner {
         (&self.own.certificate, &self.own.key)
     }
 
-    /// Returns the common name of a holder's certificate towards the session.
+    /// Returns the common name of a holder's certificate towards the session, made of role and number.
     #[must_use]
     pub fn name(role: Role, number: usize) -> String {
         format!("{}-{number}", role.name())
     }
 }
 
-/// Admits holders until it is dropped.
+/// Gate that admits holders until it is dropped.
 #[derive(Debug)]
 pub struct Gate {
     listener: Listener,
@@ -149,19 +149,19 @@ fn now_secs() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
 }
 
-/// A lock whose data stays whole even when a holder panics.
+/// Locks a mutex whose data stays consistent even when a holder panics.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The list of holders as it was read last.
+/// List of holders as read last.
 #[derive(Debug)]
 struct List {
     folder: PathBuf,
     roles: Vec<Role>,
     read_at: Mutex<Option<SystemTime>>,
     holders: Mutex<Vec<Holder>>,
-    /// Counts changes.
+    /// Number of changes.
     changes: watch::Sender<u64>,
 }
 
@@ -169,15 +169,15 @@ impl List {
     fn find(&self, certificate: &CertificateDer<'_>) -> Option<Holder> {
         let print = fingerprint(certificate);
         let find = || lock(&self.holders).iter().find(|of| of.fingerprint == print).cloned();
-        // Of those that the authority has signed, one that is not known was added just now.
+        // The authority has signed it: an unknown holder was added just now.
         find().or_else(|| {
-            self.look();
+            self.reload();
             find()
         })
     }
 
     /// Reads the list again if it has changed.
-    fn look(&self) {
+    fn reload(&self) {
         let now = list_time(&self.folder);
         if now.is_none() || std::mem::replace(&mut *lock(&self.read_at), now) == now {
             return;
@@ -187,11 +187,11 @@ impl List {
                 *lock(&self.holders) = holders;
                 self.changes.send_modify(|count| *count += 1);
             }
-            Err(error) => tracing::warn!("the keys stay as they were: {error}"),
+            Err(error) => tracing::warn!("keys: the list cannot be read and stays as it was: {error}"),
         }
     }
 
-    /// Reason why a certificate is not admitted, for TLS.
+    /// Returns why a certificate is not admitted, for TLS; `None` when it is.
     fn refusal(&self, certificate: &CertificateDer<'_>) -> Option<CertificateError> {
         match self.find(certificate) {
             None => Some(CertificateError::Revoked),
@@ -204,15 +204,15 @@ impl List {
     }
 }
 
-/// Looks at the list again and again.
+/// Reloads the list periodically.
 async fn follow(list: &List) {
     loop {
-        sleep(LOOK_EVERY).await;
-        list.look();
+        sleep(CHECK_EVERY).await;
+        list.reload();
     }
 }
 
-/// Asks the authority, then the list.
+/// Verifier that checks the authority, then the list.
 #[derive(Debug)]
 struct Admission {
     chain: Arc<dyn ClientCertVerifier>,
@@ -263,14 +263,14 @@ struct Shared {
     list: Arc<List>,
     inner: Inner,
     session: SocketAddr,
-    /// By fingerprint.
+    /// Number of connections of each fingerprint.
     connections: Mutex<HashMap<String, usize>>,
-    /// By their words.
+    /// Number of refusals for each reason.
     refusals: Mutex<HashMap<&'static str, u64>>,
 }
 
 impl Shared {
-    /// Reports a refusal the 1st, 2nd, 4th time of its kind, whoever it was.
+    /// Logs the 1st, 2nd, 4th refusal for a reason, and so on.
     fn report_refusal(&self, who: &str, why: &'static str) {
         let mut refusals = lock(&self.refusals);
         let count = refusals.entry(why).or_default();
@@ -280,7 +280,7 @@ impl Shared {
         }
     }
 
-    /// Takes one of a key's connections; None when it has enough.
+    /// Takes one of a key's connections; `None` when all are taken.
     fn connect(self: &Arc<Self>, fingerprint: &str) -> Option<KeyPlace> {
         let mut connections = lock(&self.connections);
         let all: usize = connections.values().sum();
@@ -293,7 +293,7 @@ impl Shared {
     }
 }
 
-/// One connection of a key.
+/// Place among the connections of a key, given back when it is dropped.
 struct KeyPlace {
     shared: Arc<Shared>,
     fingerprint: String,
@@ -325,6 +325,7 @@ impl Serve for Shared {
     }
 }
 
+/// Admits a client and passes its connection on until it ends or is refused.
 async fn greet(connection: Connection, shared: Arc<Shared>) {
     let Connection { stream, address, mut place } = connection;
     let shaken = timeout(PATIENCE, shared.acceptor.accept(stream)).await;
@@ -332,7 +333,7 @@ async fn greet(connection: Connection, shared: Arc<Shared>) {
     let who = address.to_string();
     let mut client = match shaken {
         Ok(Ok(client)) => client,
-        Ok(Err(error)) => return shared.report_refusal(&who, words(&error)),
+        Ok(Err(error)) => return shared.report_refusal(&who, describe_failure(&error)),
         Err(_) => return shared.report_refusal(&who, "it showed no key in time"),
     };
     // Newer motion cannot overtake encrypted bytes either.
@@ -346,7 +347,7 @@ async fn greet(connection: Connection, shared: Arc<Shared>) {
     let Some(_of_key) = shared.connect(&holder.fingerprint) else {
         return shared.report_refusal(&who, "all connections of its key, or of the gate, are taken");
     };
-    // Whoever only wants to know whether its key is admitted says nothing.
+    // A client that only tries its key sends nothing.
     let mut first = [0; COPY_BYTES];
     let count = match timeout(PATIENCE, client.read(&mut first)).await {
         Ok(Ok(count)) if count > 0 => count,
@@ -367,18 +368,18 @@ async fn greet(connection: Connection, shared: Arc<Shared>) {
     }
 }
 
-/// Returns why the holder of an open connection is not admitted any more, once it is not.
+/// Waits until the holder of an open connection is no longer admitted, and returns the reason.
 async fn until_refused(certificate: &CertificateDer<'_>, holder: &Holder, list: &List) -> &'static str {
     let mut changes = list.changes.subscribe();
     loop {
         if list.refusal(certificate).is_some() {
             return "its key was revoked";
         }
-        // By the wall clock: it may be set.
+        // The wall clock may be set.
         if SystemTime::now() >= holder.expires_at() {
             return "its key has expired";
         }
-        let _ = timeout(LOOK_EVERY, changes.changed()).await;
+        let _ = timeout(CHECK_EVERY, changes.changed()).await;
     }
 }
 
@@ -401,7 +402,7 @@ async fn pass_on(holder: &Holder, shared: &Shared) -> std::io::Result<tokio_rust
 }
 
 /// Describes a failed handshake.
-fn words(error: &std::io::Error) -> &'static str {
+fn describe_failure(error: &std::io::Error) -> &'static str {
     let tls = error.get_ref().and_then(|inner| inner.downcast_ref::<TlsError>());
     match tls {
         Some(TlsError::NoCertificatesPresented) => "it has no key",

@@ -13,23 +13,23 @@ pub const MAX_HOLDERS: usize = 256;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Holder {
-    /// Its name.
+    /// Name of the holder.
     pub name: String,
-    /// Role: the rights of the holder.
+    /// Role of the holder.
     pub role: Role,
-    /// Its number among the holders, 0..[`MAX_HOLDERS`].
+    /// Number among the holders, 0..[`MAX_HOLDERS`].
     pub number: usize,
-    /// Time after which it is refused, RFC 3339.
+    /// Time after which the key is refused, RFC 3339.
     pub expires: String,
-    /// SHA-256 of its certificate, hexadecimal.
+    /// SHA-256 of the certificate, hexadecimal.
     pub fingerprint: String,
-    /// Whether it is refused.
+    /// Whether the key is revoked.
     #[serde(default)]
     pub revoked: bool,
 }
 
 impl Holder {
-    /// Returns the time after which it is refused; a time that cannot be read is in the past.
+    /// Returns the time after which the key is refused; one that cannot be read is in the past.
     #[must_use]
     pub fn expires_at(&self) -> SystemTime {
         humantime::parse_rfc3339(&self.expires).unwrap_or(UNIX_EPOCH)

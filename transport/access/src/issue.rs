@@ -1,4 +1,4 @@
-//! Making certificates.
+//! Issuing of certificates.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use rcgen::{
 
 use crate::error::AccessError;
 
-/// Seconds that a certificate is valid before it was made: clocks of computers differ.
+/// Seconds before its issue from which a certificate is valid: clocks of computers differ.
 const EARLY_SECS: u64 = 86_400;
 
 /// Certificate and private key, PEM.
@@ -29,7 +29,7 @@ pub(crate) enum TlsSide {
 /// Authority that signs certificates.
 pub(crate) struct Authority {
     issuer: Issuer<'static, KeyPair>,
-    /// PEM.
+    /// Certificate of the authority, PEM.
     pub certificate: String,
 }
 
@@ -50,7 +50,7 @@ fn authority_parameters(name: &str, valid_secs: (u64, u64)) -> Result<Certificat
 }
 
 impl Authority {
-    /// Makes a new one; also returns its private key, PEM.
+    /// Creates an authority; also returns its private key, PEM. Validity is in seconds since 1970.
     pub fn new(name: &str, valid_secs: (u64, u64)) -> Result<(Self, String), AccessError> {
         let key = KeyPair::generate().map_err(AccessError::system)?;
         let parameters = authority_parameters(name, valid_secs)?;
@@ -59,14 +59,14 @@ impl Authority {
         Ok((Self { issuer: Issuer::new(parameters, key), certificate }, secret))
     }
 
-    /// Takes up one that was made with the same name.
+    /// Restores an authority that was created with this name.
     pub fn resume(name: &str, pair: CertificatePair) -> Result<Self, AccessError> {
         let key = KeyPair::from_pem(&pair.key).map_err(AccessError::system)?;
         // Only its name and key identifier go into what it signs.
         Ok(Self { issuer: Issuer::new(authority_parameters(name, (0, 0))?, key), certificate: pair.certificate })
     }
 
-    /// Signs a new certificate, valid until a time in seconds since 1970.
+    /// Signs a new certificate; validity is in seconds since 1970.
     pub fn sign(
         &self,
         name: &str,

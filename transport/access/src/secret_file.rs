@@ -4,7 +4,7 @@ use std::{io::Write as _, path::Path};
 
 use crate::error::AccessError;
 
-/// Writes a file for its owner alone; it must not be there.
+/// Writes a new file for its owner alone; refuses to replace one.
 pub(crate) fn write_secret(path: &Path, text: &str) -> Result<(), AccessError> {
     let mut options = std::fs::OpenOptions::new();
     options.write(true).create_new(true);

@@ -177,6 +177,6 @@ fn main() -> Result<ExitCode, Box<dyn std::error::Error>> {
     let mut is_good = run("template", inputs, &templates, |bytes| drop(StreamTemplate::decode(bytes)));
     is_good &= run("motion", inputs, &motions, |bytes| drop(Motion::decode(bytes, known)));
     let mut decoder = ColorDecoder::new(known);
-    is_good &= run("colours", inputs, &layers, |bytes| drop(decoder.take(bytes)));
+    is_good &= run("colours", inputs, &layers, |bytes| drop(decoder.ingest(bytes)));
     Ok(if is_good { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }

@@ -1,32 +1,32 @@
-//! Why a message is refused.
+//! Errors of the codec.
 
 use core::fmt;
 
 use crate::message::CODEC_VERSION;
 
-/// Why something cannot be encoded or decoded.
+/// Error of encoding or decoding a message of the person stream.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum StreamError {
-    /// Written by a program with another form of the codec.
+    /// Message of a program with another version of the codec.
     Version {
-        /// The message.
+        /// Name of the message.
         what: &'static str,
-        /// Its version.
+        /// Version of the message.
         found: u8,
     },
-    /// Damaged, or not such a message.
+    /// Damaged message, or one of another kind.
     Malformed {
-        /// The message.
+        /// Name of the message.
         what: &'static str,
-        /// The fault.
+        /// Fault.
         problem: &'static str,
     },
-    /// Belongs to another template than the decoder's.
+    /// Message of another template than the decoder's.
     OtherTemplate {
-        /// The message.
+        /// Name of the message.
         what: &'static str,
     },
-    /// A template that cannot be made.
+    /// Template that cannot be encoded.
     Template(&'static str),
 }
 

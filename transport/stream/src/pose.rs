@@ -4,12 +4,12 @@ use alloc::vec::Vec;
 
 use crate::{motion::Motion, planes::spread, template::StreamTemplate};
 
-/// Gaussians overlap enough to close a surface that is longer than at rest by this factor.
+/// Stretch up to which Gaussians overlap enough to close the surface.
 const CLOSED: f32 = 1.25;
-/// Most that a Gaussian grows, as a factor.
+/// Largest growth factor of a Gaussian.
 const MOST_GROWTH: f32 = 4.0;
 
-/// Gaussians in the world; both lists have one element a Gaussian.
+/// Posed Gaussians in the world; both lists have one element per Gaussian.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Posed {
     /// Centre, metres, and standard deviation, metres.
@@ -18,7 +18,7 @@ pub struct Posed {
     pub normal: Vec<[f32; 4]>,
 }
 
-/// A node in canonical space.
+/// Node in canonical space.
 #[derive(Clone, Copy)]
 struct Node {
     /// Position, metres.
@@ -41,12 +41,12 @@ fn growth_of(rest: f32, now: f32) -> f32 {
     if is_longer { (libm::sqrtf(now / rest) / CLOSED).min(MOST_GROWTH) } else { 1.0 }
 }
 
-/// Three rows of an affine motion.
+/// Three rows of an affine transform.
 type Rows = [[f32; 4]; 3];
 
 impl StreamTemplate {
-    /// Poses the Gaussians: world = LBS(x + sum of w t) (FlyHuman Eq. 1 and 2). They grow where the surface around them is longer
-    /// than at rest. A motion that lacks joints or nodes leaves them at rest.
+    /// Poses the Gaussians: world = LBS(x + sum of w t) (FlyHuman Eq. 1 and 2). They grow where the surface around them is stretched. Joints
+    /// and nodes that the motion lacks stay at rest.
     pub fn pose(&self, motion: &Motion, posed: &mut Posed) {
         let matrices = self.world_from_canonical(motion);
         let nodes: Vec<Node> =
@@ -83,7 +83,7 @@ impl StreamTemplate {
         }
     }
 
-    /// Skinning matrices of all joints.
+    /// Returns the skinning matrices of all joints.
     pub(crate) fn world_from_canonical(&self, motion: &Motion) -> Vec<Rows> {
         let mut world: Vec<Rows> = Vec::with_capacity(self.joints.len());
         for (i, joint) in self.joints.iter().enumerate() {
@@ -98,7 +98,7 @@ impl StreamTemplate {
     }
 }
 
-/// Of a unit quaternion x, y, z, w and a translation.
+/// Returns the rigid transform of a unit quaternion x, y, z, w and a translation.
 fn rigid([x, y, z, w]: [f32; 4], [tx, ty, tz]: [f32; 3]) -> Rows {
     [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w), tx],

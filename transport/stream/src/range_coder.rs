@@ -4,12 +4,12 @@
 
 use alloc::vec::Vec;
 
-/// Probability of a `false`, learnt from the decisions so far.
+/// Probability of `false`, learnt from the decisions so far.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Probability {
-    /// Adapts within some 16 decisions.
+    /// Mean over about 16 decisions.
     fast: u16,
-    /// Adapts within some 128 decisions.
+    /// Mean over about 128 decisions.
     slow: u16,
 }
 
@@ -21,11 +21,11 @@ impl Default for Probability {
 
 const FAST: u16 = 4;
 const SLOW: u16 = 7;
-/// Bits of a probability as the coders see it.
+/// Bits of a probability in the coders.
 const BITS: u32 = 15;
 
 impl Probability {
-    /// Of a `false`, in 1..2^15: both means stay off the ends by the rounding of their shifts.
+    /// Returns the probability of `false`, in 1..2^15: the rounding of the shifts keeps both means off the ends.
     fn of_false(self) -> u32 {
         (u32::from(self.fast) + u32::from(self.slow)) >> 2
     }
@@ -41,9 +41,9 @@ impl Probability {
     }
 }
 
-/// Codes decisions in one direction. Code that is generic over it describes a format once, for writing and for reading.
+/// Coder of decisions in one direction. Generic code describes a format once for writing and reading.
 pub(crate) trait BitCoder {
-    /// Whether it writes: what is read is then known already.
+    /// Whether the coder writes: values are then known already.
     const WRITES: bool;
 
     /// Codes a decision: writes `bit` and returns it, or ignores it and returns what was written.
@@ -53,23 +53,23 @@ pub(crate) trait BitCoder {
     fn raw(&mut self, count: u32, bits: u32) -> u32;
 }
 
-/// Ranges below this are scaled up.
+/// Range below which the coders scale up.
 const LEAST_RANGE: u32 = 1 << 24;
 
-/// Writes.
+/// Writing coder.
 #[derive(Debug, Clone)]
 pub(crate) struct RangeEncoder {
     low: u64,
     range: u32,
-    /// The byte that a carry may still change, and how many bytes of 255 follow it.
+    /// Byte that a carry may still change, and number of bytes of 255 that follow it.
     cache: u8,
     waiting: usize,
     bytes: Vec<u8>,
-    /// Where the coded bytes begin.
+    /// Index of the first coded byte.
     start: usize,
 }
 
-/// How far an encoder had come.
+/// Position of an encoder.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Mark {
     low: u64,
@@ -80,7 +80,7 @@ pub(crate) struct Mark {
 }
 
 impl RangeEncoder {
-    /// Writes behind `bytes`.
+    /// Creates a coder that appends to `bytes`.
     pub fn new(bytes: Vec<u8>) -> Self {
         Self { low: 0, range: u32::MAX, cache: 0, waiting: 0, start: bytes.len(), bytes }
     }
@@ -90,20 +90,20 @@ impl RangeEncoder {
         self.bytes.len() + self.waiting + 6
     }
 
-    /// Remembers this point.
+    /// Returns the present position.
     pub fn mark(&self) -> Mark {
         let Self { low, range, cache, waiting, ref bytes, .. } = *self;
         Mark { low, range, cache, waiting, len: bytes.len() }
     }
 
-    /// Forgets everything since the mark. A carry since then can have changed no byte before it: those up to `len` were final.
+    /// Discards everything since the mark. A later carry cannot have changed a byte before it: those up to `len` were final.
     pub fn rewind(&mut self, mark: Mark) {
         let Mark { low, range, cache, waiting, len } = mark;
         self.bytes.truncate(len);
         (self.low, self.range, self.cache, self.waiting) = (low, range, cache, waiting);
     }
 
-    /// Returns everything written.
+    /// Returns all bytes.
     pub fn finish(mut self) -> Vec<u8> {
         for _ in 0..5 {
             self.shift();
@@ -166,7 +166,7 @@ impl BitCoder for RangeEncoder {
     }
 }
 
-/// Reads; behind the end of the bytes it reads zeros.
+/// Reading coder; behind the end of the bytes it reads zeros.
 #[derive(Debug, Clone)]
 pub(crate) struct RangeDecoder<'a> {
     range: u32,

@@ -14,7 +14,7 @@ use flyrig_transport::{
     FetchedTemplate, Interests, PersonMessage, RigStats, Subscriber, TemplateFetcher, TransportConfig, TransportError,
 };
 use flyrig_types::{Rig, SupervisedThread, ThreadHealth};
-use flyrig_viewing::{People, Taken};
+use flyrig_viewing::{Ingested, People};
 
 /// How long a message is waited for.
 const PATIENCE: Duration = Duration::from_millis(50);
@@ -218,10 +218,10 @@ impl Link<'_> {
 
     fn take(&mut self, message: &PersonMessage) {
         let is_motion = message.layer.is_none();
-        let taken = lock(self.state).people.take(message.person, is_motion, &message.bytes, clock_secs());
+        let taken = lock(self.state).people.ingest(message.person, is_motion, &message.bytes, clock_secs());
         match taken {
             // Colours wait for the motion beside them, which is shown as soon as its template is there.
-            Ok(Taken::Needs(template)) if is_motion => self.templates.ask(message.person, template),
+            Ok(Ingested::Needs(template)) if is_motion => self.templates.ask(message.person, template),
             Ok(_) => {}
             Err(error) => lock(self.state).complain(format!("person {}: {error}", message.person)),
         }
@@ -232,7 +232,7 @@ impl Link<'_> {
         match StreamTemplate::decode(&fetched.bytes).map(Arc::new) {
             Ok(template) => {
                 let mut state = lock(self.state);
-                fetched.people.iter().for_each(|person| state.people.meet(*person, Arc::clone(&template)));
+                fetched.people.iter().for_each(|person| state.people.set_template(*person, Arc::clone(&template)));
             }
             Err(error) => {
                 self.templates.refuse(fetched.hash);

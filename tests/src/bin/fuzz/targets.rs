@@ -261,10 +261,10 @@ fn stream(input: &[u8]) -> Result<String, String> {
     let mut page = Page::default();
     for known in [RIG, TEMPLATE] {
         let kind = PageMessageKind::of(known[0].into()).ok_or("no kind")?;
-        page.take(kind, 0, &known[1..], 0.0).map_err(|error| error.to_string())?;
+        page.ingest(kind, 0, &known[1..], 0.0).map_err(|error| error.to_string())?;
     }
     let kind = PageMessageKind::of(u32::from(kind % 4)).ok_or("no kind")?;
-    let taken = page.take(kind, 0, bytes, 0.1).map_err(|error| error.to_string());
+    let taken = page.ingest(kind, 0, bytes, 0.1).map_err(|error| error.to_string());
     page.pose(0.1, true);
     let shown = page.order(64, 64).len();
     taken.map(|()| format!("{kind:?} {}", if shown > 0 { "shown" } else { "hidden" }))

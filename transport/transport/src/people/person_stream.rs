@@ -44,7 +44,7 @@ pub struct PersonMessage {
     pub person: u32,
     /// Layer of a message of colours; `None` for a motion.
     pub layer: Option<usize>,
-    /// Bytes for [`flyrig_stream::Motion::decode`] or [`flyrig_stream::ColorDecoder::take`].
+    /// Bytes for [`flyrig_stream::Motion::decode`] or [`flyrig_stream::ColorDecoder::ingest`].
     pub bytes: Bytes,
 }
 

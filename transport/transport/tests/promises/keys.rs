@@ -199,7 +199,7 @@ fn whoever_has_no_key_of_this_rig_is_told_so() {
     // Key of another rig, which expects that one here.
     let at_ours = |key: &KeyFile| KeyFile { connect: desk.connect.clone(), ..key.clone() };
     let reason = refused(at_ours(&spy));
-    assert!(reason.contains("is not the rig 'test': its certificate is signed by somebody else"), "{reason}");
+    assert!(reason.contains("is not the rig 'test': its certificate is signed by another authority"), "{reason}");
     // Key of another rig, whose holder knows our authority.
     let forged = KeyFile { authority: desk.authority.clone(), ..at_ours(&spy) };
     assert!(refused(forged.clone()).contains("refuses the key of 'spy': it is of another rig"));
