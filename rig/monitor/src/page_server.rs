@@ -1,4 +1,4 @@
-//! The HTTP server of one page: the metrics, or the progress of a calibration.
+//! HTTP server of one page: the metrics, or the progress of a calibration.
 
 use std::{
     convert::Infallible,
@@ -19,16 +19,16 @@ use hyper::{
 use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::{net::TcpStream, time::timeout};
 
-/// Time that a client has to ask.
+/// Time limit of the headers of a request.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// Time from the connection to the end of the answer.
+/// Time limit from the connection to the end of the answer.
 const LONGEST: Duration = Duration::from_secs(2);
-/// Longest request that is read, the smallest bound that hyper takes.
+/// Largest request, bytes; the smallest bound that hyper takes.
 const REQUEST_BYTES: usize = 8192;
-/// Clients that are served at the same time; the others wait in the system's queue.
+/// Largest number of clients at a time; further ones wait in the system's queue.
 const CONNECTIONS: usize = 32;
 
-/// Answers HTTP requests with the text published last, in one thread.
+/// Server that answers HTTP requests with the text published last, in one thread.
 pub struct PageServer {
     page: Arc<Page>,
     listener: Listener,

@@ -35,9 +35,8 @@ impl fmt::Display for StreamError {
         match self {
             Self::Version { what, found } => write!(
                 f,
-                "the {what} has version {found} of the person stream, this program reads version {}; update the older of the two \
-                 programs",
-                CODEC_VERSION
+                "the {what} has version {found} of the person stream, this program reads version {CODEC_VERSION}; update the older of the two \
+                 programs"
             ),
             Self::Malformed { what, problem } => write!(f, "the {what} is damaged: {problem}"),
             Self::OtherTemplate { what } => write!(f, "the {what} belongs to another template"),

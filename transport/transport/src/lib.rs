@@ -1,36 +1,45 @@
-//! Wire schema, splat stream and zenoh sessions: how a rig is watched from other processes and hosts.
+//! Wire schema and zenoh sessions between a rig, its viewers, relays, and other computers with cameras.
+//!
+//! | module | content |
+//! |---|---|
+//! | `publisher`, `subscriber` | the rig's side and the viewer's side |
+//! | `topic`, `drain`, `inbox` | slots of the publisher and its thread, slots of the subscriber |
+//! | `session` | settings, opening of sessions, access rules for holders of keys ([`flyrig_access`]), zenoh's threads |
+//! | `people` | topics of the person stream ([`flyrig_stream`]), templates, choice of colour layers, relay |
+//! | `cameras` | calibration on the wire; frames, status and clocks of other computers |
+//! | `views` | rendered views, viewpoints that subscribers request |
 //!
 //! # Keys
 //!
-//! Everything of schema version 1 of the rig `studio` lives under `flyrig/v1/studio/`:
+//! All keys of schema version 1 of the rig `studio` begin with `flyrig/v1/studio/`:
 //!
 //! | key | payload |
 //! |---|---|
 //! | `view/<name>` | foxglove `CompressedImage`, protobuf |
-//! | `viewer/<subscriber>/view` | the same, a subscriber's own viewpoint |
-//! | `splats`, `splats/<person>` | [`SplatState`] of the first person and of the others, own binary layout |
+//! | `viewer/<subscriber>/view` | foxglove `CompressedImage` of a subscriber's own viewpoint |
+//! | `splats`, `splats/<person>` | [`SplatState`] of the first person and of the others |
 //! | `person/<person>/motion` | [`flyrig_stream::Motion`] |
-//! | `person/<person>/color-<layer>` | a layer of colours, for [`flyrig_stream::ColorDecoder`] |
+//! | `person/<person>/color-<layer>` | layer of colours, for [`flyrig_stream::ColorDecoder`] |
 //! | `template/<hash>-<chunk>` | query and reply: u32 size of a [`flyrig_stream::StreamTemplate`], and 60,000 of its bytes |
 //! | `calibration/<camera>` | foxglove `CameraCalibration`, protobuf |
-//! | `transforms` | foxglove `FrameTransforms`: `world_from_camera` of every camera and the world's up |
+//! | `transforms` | foxglove `FrameTransforms`: `world_from_camera` of every camera, and the up direction |
 //! | `stats` | [`RigStats`], JSON |
 //! | `viewpoint/<subscriber>` | query and reply: JSON, the request and the answer |
-//! | `camera/<camera>` | a camera's image as it came, [`FrameHeader`] as the attachment |
+//! | `camera/<camera>` | image of a camera as captured, with a [`FrameHeader`] as the attachment |
 //! | `camera-status/<camera>` | [`CameraStatus`], JSON |
-//! | `clock/<host>` | query and reply: that computer's `CLOCK_MONOTONIC`, nanoseconds, i64 little-endian |
+//! | `clock/<host>` | query and reply: `CLOCK_MONOTONIC` of a computer with cameras, nanoseconds, i64 little-endian |
 //! | `alive/<publisher>`, `viewer/<subscriber>/alive`, `host/<host>` | liveliness tokens |
 //!
 //! Every published message carries a [`Header`] as its zenoh attachment: schema version, sequence, times.
 //!
 //! # Promises
 //!
-//! - Publishing never waits for the network: each topic has one slot, the newest message wins, the
-//!   rest are counted, one named thread drains the slots.
-//! - Nothing that arrives makes a decoder panic or allocate more than its payload's size allows. What waits for a reader
-//!   is bounded in bytes ([`TransportConfig::inbox_bytes`]).
-//! - Text of other programs reaches the caller [`printable`].
-//! - A subscriber may start before the publisher, stall, die, come back; a publisher may restart.
+//! - Publishing never waits for the network: each topic has one slot, the newest message wins, replaced messages are counted, and one named
+//!   thread drains the slots.
+//! - No input makes a decoder panic or allocate more than the size of its payload allows. Payloads that wait for a reader are bounded in
+//!   bytes ([`TransportConfig::inbox_bytes`]).
+//! - Text of other programs is made [`printable()`] before it reaches the caller.
+//! - A subscriber may start before the publisher, stall, die and return; a publisher may restart.
 
 mod cameras;
 mod drain;

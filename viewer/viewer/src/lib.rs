@@ -1,6 +1,18 @@
-//! A window onto the people of a rig: receives the person stream, poses and draws the people itself, from wherever one likes.
+//! Window onto the people of a rig: receives the person stream, and poses and draws the people from any viewpoint.
 //!
 //! [`Receiver`] keeps the people of a rig, [`PeopleScene`] draws them, [`open_window`] shows them.
+//!
+//! ```no_run
+//! use flyrig_transport::TransportConfig;
+//! use flyrig_viewer::Receiver;
+//!
+//! let receiver = Receiver::start(&TransportConfig::subscriber("studio"), || println!("a motion arrived"))?;
+//! std::thread::sleep(std::time::Duration::from_secs(2));
+//! let state = receiver.state();
+//! println!("{} people", state.people.iter().count());
+//! # drop(state);
+//! # Ok::<(), flyrig_transport::TransportError>(())
+//! ```
 
 mod ellipsoids;
 mod painter;

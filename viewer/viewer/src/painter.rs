@@ -1,4 +1,4 @@
-//! Draws the people on a thread of its own, so that the window answers at once.
+//! Painter: draws the people on a thread of its own, so that the window responds at once.
 
 use std::{
     sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
@@ -18,30 +18,33 @@ use crate::{
     shown_person::ShownPerson,
 };
 
-/// Grey behind the people, sRGB.
+/// Grey of the background, sRGB.
 const BACKDROP: u8 = 30;
 
-/// A view that is wanted.
+/// View to draw.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Request {
     pub camera: Camera,
     pub interpolate: bool,
 }
 
-/// A drawn view.
+/// View that was drawn.
 #[derive(Debug)]
 pub(crate) struct PaintedView {
     pub width: u32,
     pub height: u32,
     pub rgb: Vec<u8>,
-    /// The rig's frame, capture time, and age when it was drawn, where this host's clock knows it.
+    /// Frame number of the rig.
     pub frame: u64,
+    /// Age of the frame when it was drawn, seconds; `None` where no clock of this host is known for it.
     pub age_secs: Option<f64>,
-    /// Root of the first person that is shown.
+    /// Root of the first person shown, world, metres.
     pub place: Option<DVec3>,
+    /// Number of people shown.
     pub people: usize,
-    /// Whether all colours of everybody have come.
+    /// Whether all colours of all people have arrived.
     pub is_complete: bool,
+    /// Run time of the drawing.
     pub took: Duration,
 }
 
@@ -59,7 +62,7 @@ struct State {
     is_ended: bool,
 }
 
-/// The drawing thread.
+/// Drawing thread.
 pub(crate) struct Painter {
     shared: Arc<Shared>,
     thread: SupervisedThread,
@@ -67,7 +70,7 @@ pub(crate) struct Painter {
 }
 
 impl Painter {
-    /// Starts it; `finished` is called after each view.
+    /// Starts the thread; `finished` is called after each view.
     pub fn start(
         gpu: &GpuContext,
         receiver: Arc<Receiver>,
@@ -84,7 +87,7 @@ impl Painter {
                 match drawn {
                     Ok(None) => continue,
                     Ok(Some(drawn)) => (state.drawn, state.fault) = (Some(drawn), None),
-                    // A device that is lost is not opened again here: the window says so.
+                    // A lost device is not opened again here: the window reports it.
                     Err(error) => {
                         last = None;
                         state.fault = Some(error.to_string());
@@ -97,13 +100,13 @@ impl Painter {
         Ok(Self { shared, thread: SupervisedThread::start("draw", work)?, adapter })
     }
 
-    /// Asks for a view; one that waits is replaced.
+    /// Requests a view, which replaces a waiting one.
     pub fn ask(&self, request: Request) {
         self.shared.lock().request = Some(request);
         self.shared.changed.notify_all();
     }
 
-    /// Takes the view that was drawn last, once, and what kept one from being drawn.
+    /// Takes the last view, once, and returns the fault that prevents drawing.
     pub fn take(&self) -> (Option<PaintedView>, Option<String>) {
         let mut state = self.shared.lock();
         (state.drawn.take(), state.fault.clone())
@@ -127,7 +130,7 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits for the next request; None at the end.
+    /// Waits for the next request; `None` at the end.
     fn next(&self) -> Option<Request> {
         let mut state = self.lock();
         loop {
@@ -142,20 +145,20 @@ impl Shared {
     }
 }
 
-/// Everything that a view depends on: the same again need not be drawn. Of each person its number, stamp and colours.
+/// Content of a view: the request, and the number, stamp and colour count of each person. Equal content need not be drawn again.
 type Content = (Request, Vec<(u32, Stamp, u64)>);
 
-/// A person as it is drawn; memory is kept from one view to the next.
+/// Posed person; memory is kept from one view to the next.
 #[derive(Debug, Default)]
 struct PosedPerson {
     posed: Posed,
     axes: PosedAxes,
-    /// Whether it is an avatar, whose axes hold.
+    /// Whether the person is an avatar, so that `axes` is valid.
     is_avatar: bool,
     colors: Arc<Vec<[f32; 4]>>,
 }
 
-/// Draws a view, unless it would be the same as the `last` one.
+/// Draws a view, unless it would equal the `last` one.
 fn draw(
     gpu: &GpuContext,
     scene: &mut Option<PeopleScene>,

@@ -1,15 +1,15 @@
-//! A person to draw.
+//! Person to draw.
 
 use flyrig_stream::{Posed, PosedAxes};
 
-/// One person to draw.
+/// One person to draw; borrowed lists with one element per Gaussian.
 #[derive(Debug, Clone, Copy)]
 pub struct ShownPerson<'a> {
-    /// Centres and normals.
+    /// Centres, standard deviations and normals.
     pub posed: &'a Posed,
-    /// Linear RGB and opacity of as many Gaussians.
+    /// Linear RGB and opacity.
     pub colors: &'a [[f32; 4]],
-    /// Axes of as many Gaussians; None where they are isotropic.
+    /// Axes of the Gaussians; `None` where they are isotropic.
     pub axes: Option<&'a PosedAxes>,
 }
 
@@ -20,7 +20,7 @@ impl<'a> From<(&'a Posed, &'a [[f32; 4]])> for ShownPerson<'a> {
 }
 
 impl ShownPerson<'_> {
-    /// Number of Gaussians that all lists have.
+    /// Returns the number of Gaussians that all lists have.
     pub(crate) fn count(&self) -> usize {
         self.posed.center_scale.len().min(self.posed.normal.len()).min(self.colors.len())
     }

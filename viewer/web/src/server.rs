@@ -1,4 +1,4 @@
-//! The HTTP server.
+//! HTTP server of the page.
 
 use std::{
     convert::Infallible,
@@ -41,15 +41,15 @@ use crate::{
     upstream,
 };
 
-/// Time that a client has to ask.
+/// Time limit of a handshake, and of the headers of a request.
 const PATIENCE: Duration = Duration::from_secs(2);
 /// First byte of a TLS connection.
 const TLS_HANDSHAKE: u8 = 22;
-/// Longest request that is read, the smallest bound that hyper takes.
+/// Largest request, bytes; the smallest bound that hyper takes.
 const REQUEST_BYTES: usize = 8192;
-/// Connections at the same time; the others wait in the system's queue.
+/// Largest number of connections at a time; further ones wait in the system's queue.
 const CONNECTIONS: usize = 512;
-/// Headers of every answer: nothing from elsewhere, and no frame of another page around it.
+/// Headers of every answer: the page loads nothing from elsewhere, and no other page frames it.
 const HEADERS: [(&str, &str); 5] = [
     (
         "content-security-policy",
@@ -63,11 +63,11 @@ const HEADERS: [(&str, &str); 5] = [
     ("cache-control", "no-cache"),
 ];
 
-/// Serves the page until it is dropped.
+/// Server of the page until it is dropped.
 #[derive(Debug)]
 pub struct WebServer {
     listener: Listener,
-    /// Name of this computer.
+    /// First configured name of this computer.
     name: Option<String>,
     token: Token,
     /// SHA-256 of the certificate; `None` without HTTPS.
@@ -87,10 +87,10 @@ struct Shared {
 }
 
 impl WebServer {
-    /// Starts to listen. The rig may come later; it is subscribed to while browsers watch.
+    /// Starts to listen. The rig may start later; it is subscribed to while browsers watch.
     ///
     /// # Errors
-    /// [`WebError`]: settings that are not valid, a certificate that cannot be used, or an address that is taken.
+    /// [`WebError`] for invalid settings, an unusable certificate, or an address that is taken.
     pub fn start(config: &WebConfig, transport: TransportConfig) -> Result<Self, WebError> {
         config.validate()?;
         let wanted = config.address()?;
@@ -108,7 +108,7 @@ impl WebServer {
         let address = listener.address();
         if !is_loopback && tls.is_none() {
             tracing::warn!(
-                "the web page at {address} is not encrypted: whoever can read this network can watch. Who watches needs the whole link"
+                "the web page at {address} is not encrypted: any computer that can read this network can watch. Viewers need the whole link"
             );
         }
         let hub = Arc::<Hub>::default();
@@ -124,13 +124,13 @@ impl WebServer {
         Ok(Self { listener, name: config.names.first().cloned(), token, fingerprint, hub, upstream, ended })
     }
 
-    /// Address that is listened on.
+    /// Returns the address that is listened on.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.listener.address()
     }
 
-    /// Link to the page, with the token where one is needed: at the first of this computer's names that were given, or at its address.
+    /// Returns the link to the page, with its token where one is needed, at the first configured name of this computer or at its address.
     #[must_use]
     pub fn link(&self) -> String {
         let scheme = if self.fingerprint.is_some() { "https" } else { "http" };
@@ -141,19 +141,19 @@ impl WebServer {
         format!("{scheme}://{host}/{}", self.token.fragment())
     }
 
-    /// SHA-256 of the server's certificate, as browsers write it; `None` without HTTPS.
+    /// Returns the SHA-256 of the server's certificate, as browsers write it; `None` without HTTPS.
     #[must_use]
     pub fn fingerprint(&self) -> Option<&str> {
         self.fingerprint.as_deref()
     }
 
-    /// Number of browsers that watch.
+    /// Returns the number of browsers that watch.
     #[must_use]
     pub fn browsers(&self) -> usize {
         self.hub.browsers()
     }
 
-    /// Health of the thread that receives from the rig.
+    /// Returns the health of the thread that receives from the rig.
     #[must_use]
     pub fn thread(&self) -> ThreadHealth {
         self.upstream.health()
@@ -167,7 +167,7 @@ impl Drop for WebServer {
     }
 }
 
-/// The address itself, or of one that means all: that under which this computer reaches others. Nothing is sent to find it.
+/// Returns an address, or for one that means all interfaces, that by which this computer reaches others; nothing is sent to find it.
 fn reached_at(address: SocketAddr) -> SocketAddr {
     if !address.ip().is_unspecified() {
         return address;
@@ -183,7 +183,7 @@ fn reached_at(address: SocketAddr) -> SocketAddr {
     SocketAddr::new(own.unwrap_or(loopback), address.port())
 }
 
-/// Addresses of this computer's interfaces that are up. A network without a way to others has no route that would name one.
+/// Returns the addresses of this computer's interfaces that are up: a network without a gateway has no route that names one.
 fn interfaces() -> Vec<IpAddr> {
     #[cfg(unix)]
     let of_all = pnet_datalink::interfaces()
@@ -197,7 +197,7 @@ fn interfaces() -> Vec<IpAddr> {
     of_all
 }
 
-/// The first address that other computers may reach; one that is valid on a single link needs the link's name, which browsers do not take.
+/// Returns the first address that other computers may reach. Link-local addresses need the name of the link, which browsers do not accept.
 fn reachable(is_ipv4: bool, addresses: Vec<IpAddr>) -> Option<IpAddr> {
     addresses.into_iter().find(|address| match address {
         IpAddr::V4(v4) => is_ipv4 && !v4.is_loopback(),
@@ -213,7 +213,7 @@ impl Serve for Shared {
     }
 }
 
-/// Begins TLS where it is spoken.
+/// Serves a client, through TLS where there is a certificate.
 async fn greet(client: TcpStream, shared: Arc<Shared>) -> hyper::Result<()> {
     let Some(tls) = shared.tls.clone() else { return answer(client, shared).await };
     let mut first = [0];
@@ -228,7 +228,7 @@ async fn greet(client: TcpStream, shared: Arc<Shared>) -> hyper::Result<()> {
     }
 }
 
-/// Answers a browser that was sent to `http://`.
+/// Answers a browser that speaks HTTP where HTTPS is expected.
 async fn refuse_http(client: TcpStream) -> hyper::Result<()> {
     let text = "this server speaks HTTPS: write https:// before its address\n";
     let service = service_fn(async |_: Request<Incoming>| {
@@ -268,7 +268,7 @@ fn respond(mut request: Request<Incoming>, shared: &Arc<Shared>) -> Response<Ful
     let text =
         |status, text: &'static str| page(status, "text/plain; charset=utf-8", Bytes::from_static(text.as_bytes()));
     if request.method() != Method::GET && request.method() != Method::HEAD {
-        return text(StatusCode::METHOD_NOT_ALLOWED, "only GET is answered\n");
+        return text(StatusCode::METHOD_NOT_ALLOWED, "only GET is supported\n");
     }
     if request.uri().path() == "/stream" {
         let is_upgrade =
@@ -307,7 +307,7 @@ fn page(status: StatusCode, kind: &'static str, body: Bytes) -> Response<Full<By
     *response.status_mut() = status;
     let headers = response.headers_mut();
     headers.insert(CONTENT_TYPE, HeaderValue::from_static(kind));
-    // A place is for the next one.
+    // The connection makes room for the next one.
     headers.insert(CONNECTION, HeaderValue::from_static("close"));
     for (name, value) in HEADERS {
         headers.insert(HeaderName::from_static(name), HeaderValue::from_static(value));

@@ -142,7 +142,7 @@ fn watch(socket: &mut Socket, page: &mut Page, what: &str, mut done: impl FnMut(
             4 => state = String::from_utf8(payload).unwrap(),
             5 => page.forget_people(),
             kind => page
-                .take(PageMessageKind::of(kind.into()).unwrap(), person, &payload, started.elapsed().as_secs_f64())
+                .ingest(PageMessageKind::of(kind.into()).unwrap(), person, &payload, started.elapsed().as_secs_f64())
                 .unwrap(),
         }
         page.pose(started.elapsed().as_secs_f64(), false);
@@ -259,7 +259,7 @@ fn strangers_are_refused_in_words() {
             break frame.unwrap().reason.to_string();
         }
     };
-    assert!(reason.contains("nothing to say"), "{reason}");
+    assert!(reason.contains("unexpected message"), "{reason}");
 }
 
 #[test]
