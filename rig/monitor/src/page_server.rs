@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn a_client_that_dawdles_holds_nobody_up() {
+    fn a_slow_client_delays_no_other() {
         let server = start("127.0.0.1:0").unwrap();
         server.publish("flyrig_frames_total 1\n".to_owned());
         let mut slow = TcpStream::connect(server.address()).unwrap();

@@ -27,4 +27,4 @@ while time.time()-start<secs:
                 recent.pop(0).close()
         except OSError: pass
     time.sleep(0.001)
-print('connections a second',n/secs)
+print('connections per second',n/secs)

@@ -58,15 +58,9 @@ fn template(gaussians: usize, random: &mut StdRng) -> Result<EncodedTemplate, Bo
         })
         .collect();
     let normals: Vec<[f32; 3]> = (0..gaussians).map(|i| [place(i).0.cos(), 0.0, place(i).0.sin()]).collect();
-    let source = TemplateSource {
-        joints: &joints,
-        center_scale: &center_scale,
-        normals: &normals,
-        skin: &skin,
-        node_weights: &node_weights,
-        nodes: &nodes,
-    };
-    Ok(source.encode()?)
+    let (center_scale, normals, skin) = (&center_scale, &normals, &skin);
+    let (joints, node_weights, nodes) = (&joints, &node_weights, &nodes);
+    Ok(TemplateSource { joints, center_scale, normals, skin, node_weights, nodes }.encode()?)
 }
 
 /// Damages a message: flips bits, sets bytes and numbers to extremes, cuts, doubles and mixes.

@@ -46,8 +46,16 @@ pub(crate) trait BitCoder {
     /// Whether the coder writes: values are then known already.
     const WRITES: bool;
 
-    /// Codes a decision: writes `bit` and returns it, or ignores it and returns what was written.
-    fn bit(&mut self, probability: &mut Probability, bit: bool) -> bool;
+    /// Codes a decision: writes `bit` and returns it, or ignores it and returns the written one.
+    #[inline]
+    fn bit(&mut self, probability: &mut Probability, bit: bool) -> bool {
+        let bit = self.divide(probability.of_false(), bit);
+        probability.adapt(bit);
+        bit
+    }
+
+    /// Narrows the range to one side of a decision, by the probability of `false` in 1..2^15; returns the decision.
+    fn divide(&mut self, of_false: u32, bit: bool) -> bool;
 
     /// Codes the lowest `count` (at most 24) bits of a number without a model.
     fn raw(&mut self, count: u32, bits: u32) -> u32;
@@ -141,15 +149,12 @@ impl BitCoder for RangeEncoder {
     const WRITES: bool = true;
 
     #[inline]
-    fn bit(&mut self, probability: &mut Probability, bit: bool) -> bool {
-        let bound = (self.range >> BITS) * probability.of_false();
+    fn divide(&mut self, of_false: u32, bit: bool) -> bool {
+        let bound = (self.range >> BITS) * of_false;
         if bit {
             self.low += u64::from(bound);
-            self.range -= bound;
-        } else {
-            self.range = bound;
         }
-        probability.adapt(bit);
+        self.range = if bit { self.range - bound } else { bound };
         self.normalise();
         bit
     }
@@ -201,16 +206,13 @@ impl BitCoder for RangeDecoder<'_> {
     const WRITES: bool = false;
 
     #[inline]
-    fn bit(&mut self, probability: &mut Probability, _: bool) -> bool {
-        let bound = (self.range >> BITS) * probability.of_false();
+    fn divide(&mut self, of_false: u32, _: bool) -> bool {
+        let bound = (self.range >> BITS) * of_false;
         let bit = self.code >= bound;
         if bit {
             self.code -= bound;
-            self.range -= bound;
-        } else {
-            self.range = bound;
         }
-        probability.adapt(bit);
+        self.range = if bit { self.range - bound } else { bound };
         self.normalise();
         bit
     }

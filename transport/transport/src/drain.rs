@@ -258,18 +258,11 @@ mod tests {
     use std::sync::atomic::AtomicU64;
 
     use super::*;
-    use crate::{
-        session::{
-            config::TransportConfig,
-            opening::{self, Opened},
-        },
-        testing::wait_until,
-    };
+    use crate::testing::{loopback_session, wait_until};
 
     /// Returns a drain and its only topic.
     fn drain() -> (Drain, Arc<Topic>) {
-        let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
-        let Opened { session, .. } = opening::open(&config, 1 << 16, &[]).unwrap();
+        let session = loopback_session();
         let topic = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
         let leases = Leases::new(0, Duration::ZERO, 0);
         let (shared, woken) = PublisherState::new("drill", &session, std::slice::from_ref(&topic), leases);

@@ -7,23 +7,21 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_stream::{MAX_MESSAGE_BYTES, MAX_SPLAT_BYTES};
 use flyrig_types::{Camera, CameraId, Intrinsics, Rig};
 use prost::bytes::Bytes;
 use zenoh::sample::Sample;
 
 use crate::{
-    cameras::calibration::{self, RigTransforms, decode_calibration, decode_transforms},
+    cameras::calibration::{RigTransforms, decode_calibration, decode_transforms},
     error::{TransportError, TransportErrorKind},
+    expected::{check_label, expected_payload},
     header::{self, Header, MessageKind},
     host,
-    json::MAX_JSON_BYTES,
     keys::{self, MAX_PERSON_TOPICS},
     people::color_layers::ColorLayers,
     report::{Tally, TopicReport},
     schema::SCHEMA_VERSION,
     topic::lock,
-    views::view,
 };
 
 /// Largest number of topics that a subscriber keeps slots for.
@@ -163,38 +161,6 @@ struct Observed {
     latency_nanos: i64,
     /// Messages of the topic that were missed before it.
     missed: u64,
-}
-
-/// Checks the names in a label: they reach the reader, and a slot keeps its name.
-fn check_label(key: &str, label: &str) -> Result<(), TransportError> {
-    let malformed = |message: String| TransportError::malformed(key, message);
-    for (prefix, what) in [("view/", "view"), ("calibration/", "camera")] {
-        if let Some(name) = label.strip_prefix(prefix) {
-            keys::check_name(what, name).map_err(|error| malformed(error.to_string()))?;
-        }
-    }
-    if let Some(person) = label.strip_prefix(keys::PERSON_SPLATS)
-        && person.parse().map(keys::splats_label).as_deref() != Ok(label)
-    {
-        return Err(malformed("names no person; expected a number".to_owned()));
-    }
-    if keys::is_person(label) && keys::person_in(label).is_none() {
-        return Err(malformed("names no part of the person stream".to_owned()));
-    }
-    Ok(())
-}
-
-/// Returns kind and largest length, bytes, of a topic's payload.
-fn expected_payload(label: &str) -> (MessageKind, usize) {
-    match label {
-        "stats" => (MessageKind::Stats, MAX_JSON_BYTES),
-        "transforms" => (MessageKind::Transforms, calibration::MAX_BYTES),
-        _ if keys::is_splats(label) => (MessageKind::Splats, MAX_SPLAT_BYTES),
-        _ if keys::is_person(label) && label.ends_with("/motion") => (MessageKind::Motion, MAX_MESSAGE_BYTES),
-        _ if keys::is_person(label) => (MessageKind::Colors, MAX_MESSAGE_BYTES),
-        _ if label.starts_with("calibration/") => (MessageKind::Calibration, calibration::MAX_BYTES),
-        _ => (MessageKind::View, view::MAX_MESSAGE_BYTES),
-    }
 }
 
 impl Inbox {
@@ -595,10 +561,10 @@ mod tests {
             inbox.refuse(TransportError::malformed("x", i.to_string()));
         }
         assert_eq!(inbox.unreadable(), 100);
-        let mut told = 0;
+        let mut reported = 0;
         while inbox.next(Duration::ZERO, |_| false).is_err() {
-            told += 1;
+            reported += 1;
         }
-        assert_eq!(told, MAX_ERRORS);
+        assert_eq!(reported, MAX_ERRORS);
     }
 }

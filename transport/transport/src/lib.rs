@@ -44,6 +44,7 @@
 mod cameras;
 mod drain;
 mod error;
+mod expected;
 mod header;
 mod host;
 mod inbox;

@@ -89,7 +89,7 @@ fn a_person_is_shown_once_template_motion_and_rig_are_there() {
     assert_eq!(page.pose(0.0, false), (false, false), "nothing is done twice");
     page.ingest(PageMessageKind::Motion, 2, &motion(&encoded, 2, 0.6), 0.1).unwrap();
     assert_eq!((page.pose(0.1, false), page.frame()), ((true, false), 2));
-    // Whoever is gone is not drawn.
+    // A person that is gone is not drawn.
     assert_eq!((page.pose(60.0, false), page.people_shown()), ((true, true), 0));
     page.ingest(PageMessageKind::Motion, 2, &motion(&encoded, 3, 0.6), 60.1).unwrap();
     assert!(page.pose(60.1, false).0 && !page.centers().is_empty());
@@ -193,7 +193,7 @@ fn an_avatar_has_the_axes_of_its_template_and_hides_what_faces_away() {
         assert_eq!(scales.map(f32::to_bits), expected.map(f32::to_bits), "{i}");
     }
 
-    // From behind, the others; beside somebody who is no avatar, both.
+    // From behind, the other half; beside a person that is no avatar, both kinds.
     let from_behind = page.navigation().map(|view| view.orbit(std::f64::consts::PI, 0.0)).and(page.look(640, 480));
     assert!(from_behind.unwrap().position().y > 1.0);
     let mut order = page.order(640, 480).to_vec();

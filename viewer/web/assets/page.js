@@ -248,10 +248,10 @@ function showState(time) {
   const people = wasm.people();
   const shown = people & 255, complete = (people & 256) !== 0;
   const missing = state.people.length > 0 ? "Loading a person." : "The rig is running; no person is in view.";
-  const nobody = shown === 0 && !state.trouble ? missing : "";
+  const absence = shown === 0 && !state.trouble ? missing : "";
   const quality = state.people.filter(([, quality]) => quality !== null).map(([, quality]) => `${Math.round(100 * quality)} %`);
   const [layers, all] = state.color_layers;
-  troubleText.textContent = fault || linkTrouble || state.trouble || nobody;
+  troubleText.textContent = fault || linkTrouble || state.trouble || absence;
   stateText.textContent = parameters.has("bare") ? "" : [
     state.rig ?? "",
     `${rate(drawn).toFixed(0)} images/s` + (state.sets_per_second > 0 ? `, rig ${state.sets_per_second.toFixed(1)} frame sets/s` : "")

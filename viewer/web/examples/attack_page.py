@@ -25,4 +25,4 @@ while time.time()-start<secs:
         if data: answered+=data.count(b'HTTP/1.1 ')
         else: leave(key.fileobj);closed+=1
 took=time.time()-start
-print('asked %.0f answered %.0f a second, %d connections closed'%(asked/took,answered/took,closed))
+print('asked %.0f answered %.0f per second, %d connections closed'%(asked/took,answered/took,closed))

@@ -130,18 +130,10 @@ mod tests {
     use std::sync::atomic::AtomicU64;
 
     use super::*;
-    use crate::{
-        session::{
-            config::TransportConfig,
-            opening::{self, Opened},
-        },
-        testing::wait_until,
-    };
+    use crate::testing::{loopback_session, wait_until};
 
     fn asker(hosts: impl Fn() -> Vec<ClockQuery> + Send + 'static) -> Asker {
-        let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
-        let Opened { session, .. } = opening::open(&config, 1 << 16, &[]).unwrap();
-        Asker::start(session, HostClock::new(|| 0), hosts, |_, _, _, _| {}).unwrap()
+        Asker::start(loopback_session(), HostClock::new(|| 0), hosts, |_, _, _, _| {}).unwrap()
     }
 
     #[test]

@@ -483,7 +483,7 @@ mod tests {
         assert_eq!(line.layers.wanted(), LAYERS);
     }
 
-    /// Fetches a template of 1.2 MB with so many bytes a second.
+    /// Fetches a template of 1.2 MB at a rate, bytes per second.
     fn fetch(line: &mut Line, bytes_per_sec: f64) {
         line.layers.fetch_begins(line.now);
         line.now += Duration::from_secs_f64(1.2e6 / bytes_per_sec);

@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn a_late_template_is_fetched_once_for_everybody_and_delays_nobody() {
+    fn a_late_template_is_fetched_once_for_all_and_delays_no_call() {
         let (release, held) = bounded::<()>(0);
         let (count, asked) = bounded(9);
         let mut fetcher = TemplateFetcher::with(move |hash| {
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn failures_panics_and_answers_of_nobody_are_asked_again_after_a_pause() {
+    fn failures_panics_and_missing_answers_are_retried_after_a_pause() {
         let turn = std::sync::atomic::AtomicU32::new(0);
         let fetcher = TemplateFetcher::with(move |_| match turn.fetch_add(1, std::sync::atomic::Ordering::Relaxed) {
             0 => Ok(None),
@@ -241,7 +241,7 @@ mod tests {
         for hash in 1..=MAX_KEPT as u64 {
             fetch(7, hash);
         }
-        // Asked for again, by somebody else as well; the first one is used now and then, so the second is forgotten for another.
+        // The first template is requested again, also for another person, so the second is the one to be forgotten.
         fetch(7, 1);
         fetch(8, 1);
         assert_eq!(asked.try_iter().count(), MAX_KEPT);
@@ -249,7 +249,7 @@ mod tests {
         fetch(7, 1);
         fetch(7, 2);
         assert_eq!(asked.try_iter().collect::<Vec<_>>(), [50, 2]);
-        // One that nobody keeps, and one that was of no use, are fetched anew.
+        // A template too large to keep, and one marked as unusable, are fetched anew.
         fetch(7, 99);
         fetch(7, 99);
         fetcher.ask(7, 1);

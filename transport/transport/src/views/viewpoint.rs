@@ -83,10 +83,10 @@ pub(crate) fn check_camera(topic: &str, camera: &Camera, max_fps: f64) -> Result
     }
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
     if width > MAX_VIEWPOINT_SIDE || height > MAX_VIEWPOINT_SIDE {
-        return refuse(format!("{width}x{height} pixels asked for, at most {MAX_VIEWPOINT_SIDE} a side"));
+        return refuse(format!("{width}x{height} pixels requested, at most {MAX_VIEWPOINT_SIDE} per side"));
     }
     if !(max_fps > 0.0 && max_fps <= 1000.0) {
-        return refuse(format!("{max_fps} images a second asked for, expected more than 0, at most 1000"));
+        return refuse(format!("{max_fps} images per second requested, expected more than 0, at most 1000"));
     }
     Ok(())
 }
@@ -253,7 +253,7 @@ impl Leases {
             (false, false) => "wait until another viewer leaves, or raise viewpoint-pixels-per-second".to_owned(),
         };
         refuse(format!(
-            "{width}x{height} at {max_fps} a second is {} Mpx/s; {} of the rig's {} Mpx/s are left; {fits}",
+            "{width}x{height} at {max_fps} per second is {} Mpx/s; {} of the rig's {} Mpx/s are left; {fits}",
             mega(pixel_rate(viewpoint)),
             mega(left),
             mega(budget)
@@ -375,18 +375,18 @@ mod tests {
         }
         let full = ask(&mut leases, "e", (512, 512), 30.0, now);
         assert!(
-            full.contains("512x512 at 30 a second is 7.9 Mpx/s; 0.0 of the rig's 31.5 Mpx/s are left; wait"),
+            full.contains("512x512 at 30 per second is 7.9 Mpx/s; 0.0 of the rig's 31.5 Mpx/s are left; wait"),
             "{full}"
         );
         // One that leaves makes room; a larger one learns which sizes fit, and both of them do.
         leases.drop_subscriber("d");
         let large = ask(&mut leases, "e", (1024, 1024), 30.0, now);
-        assert!(large.contains("1024x1024 at 30 a second is 31.5 Mpx/s; 7.9 of the rig's 31.5 Mpx/s"), "{large}");
+        assert!(large.contains("1024x1024 at 30 per second is 31.5 Mpx/s; 7.9 of the rig's 31.5 Mpx/s"), "{large}");
         assert!(large.ends_with("ask for 512x512 or --max-fps 7"), "{large}");
         assert_eq!(ask(&mut leases, "e", (1024, 1024), 7.0, now), "");
         leases.drop_subscriber("e");
         assert_eq!(ask(&mut leases, "e", (512, 512), 30.0, now), "");
-        // Whoever asks for more keeps what was granted, and takes nothing from the others.
+        // A subscriber that requests more keeps the granted viewpoint, and takes nothing from the others.
         assert!(!ask(&mut leases, "e", (513, 512), 30.0, now).is_empty());
         let rates: Vec<f64> = leases.viewpoints().iter().map(pixel_rate).collect();
         assert_eq!(rates, [512.0 * 512.0 * 30.0; 4]);
@@ -435,7 +435,7 @@ mod tests {
         leases.refuse("a", "out of memory", now + REFUSAL);
         assert_eq!(ask(&mut leases, "a", (256, 256), 30.0, now + REFUSAL), "");
         assert_eq!(ask(&mut leases, "a", (512, 512), 30.0, now + REFUSAL), "");
-        // However many are refused, so many are remembered.
+        // Any number of refusals is remembered within bounds.
         for n in 0..1000 {
             let who = format!("n{n}");
             assert_eq!(ask(&mut leases, &who, (64, 64), 1.0, now + REFUSAL), "");
@@ -467,7 +467,7 @@ mod tests {
     #[test]
     fn every_viewer_gets_its_own_rate() {
         for jitter in [0.0, 0.1, 0.3, 0.49] {
-            // 20 s of a rig at 30 a second: 600 sets.
+            // 20 s of a rig at 30 frame sets per second: 600.
             let counts = pictures(&[30.0, 20.0, 7.5, 1.0, 1000.0, 29.0], 30.0, jitter);
             for (count, wanted) in counts.iter().zip([600, 400, 150, 20, 600, 580]) {
                 assert!(count.abs_diff(wanted) <= 2, "jitter {jitter}: {counts:?}");
@@ -490,7 +490,7 @@ mod tests {
         assert!(due(&mut leases, 50, "viewer-a").is_empty());
         assert_eq!(due(&mut leases, 60, "viewer-b"), ["b"]);
         assert_eq!(due(&mut leases, 100, "viewer-a"), ["a"]);
-        // In the second after a pause of a second: ten, and not the ten that were missed.
+        // After a pause of one second, the next second has ten images, without the ten that were missed.
         let taken: usize = (0..100).map(|n| due(&mut leases, 1100 + 10 * n, "viewer-a").len()).sum();
         assert!((10..=12).contains(&taken), "{taken}");
         // The lease ends, as everywhere.

@@ -1,4 +1,4 @@
-//! Cameras of other computers: what goes in comes out, whoever comes, goes, lies or shares the network.
+//! Cameras of other computers: frames arrive, whichever computers join, leave, lie or share the network.
 
 use std::{
     sync::OnceLock,
@@ -224,7 +224,7 @@ fn another_version_is_told_once_and_plainly() {
     assert_eq!(error.kind, TransportErrorKind::UnknownVersion);
     stranger.put("flyrig/v1/test/camera/a", vec![0; 8]).attachment(attachment.to_vec()).wait().unwrap();
     wait_until("the second one", || there.link(&"a".into()).refused >= 2);
-    assert!(there.next_frame(&"a".into(), Duration::ZERO).unwrap().is_none(), "not told again at once");
+    assert!(there.next_frame(&"a".into(), Duration::ZERO).unwrap().is_none(), "not reported again at once");
 }
 
 #[test]
@@ -263,7 +263,7 @@ fn hostile_messages_are_refused_and_the_camera_goes_on() {
         put("flyrig/v1/test/camera-status/a", random.bytes(50), vec![]);
     }
     wait_until("the refusals", || there.link(&a).refused > before + 100);
-    let mut told = 0;
+    let mut reported = 0;
     let found = wait_for("a good frame", || {
         sequence += 1;
         host.publish(frame("a", sequence)).unwrap();
@@ -271,14 +271,14 @@ fn hostile_messages_are_refused_and_the_camera_goes_on() {
             Ok(frame) => frame,
             Err(error) => {
                 assert!(!error.to_string().is_empty());
-                told += 1;
+                reported += 1;
                 None
             }
         }
     });
     assert_eq!(found.image.width(), 4);
     assert!(there.link(&a).status.is_none());
-    println!("{} messages refused, told {told} times", there.link(&a).refused - before);
+    println!("{} messages refused, reported {reported} times", there.link(&a).refused - before);
 }
 
 #[test]
