@@ -101,7 +101,7 @@ fn a_lease_outlives_its_length_only_by_renewal() {
     assert!(ask("{".to_owned()).contains(r#""granted":false"#));
     let wide = camera.replace("640", "5000");
     let answer = ask(format!(r#"{{"schema_version":1,"max_fps":5.0,"camera":{wide}}}"#));
-    assert!(answer.contains("5000x480 pixels asked for, at most 4096 a side"), "{answer}");
+    assert!(answer.contains("5000x480 pixels requested, at most 4096 per side"), "{answer}");
     session.close().wait().unwrap();
 }
 
