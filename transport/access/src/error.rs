@@ -10,7 +10,7 @@ pub enum AccessError {
     File {
         /// Path of the file.
         file: PathBuf,
-        /// The fault and the fix.
+        /// Fault and fix.
         problem: String,
     },
     /// Impossible request.

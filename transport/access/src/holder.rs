@@ -9,7 +9,7 @@ use crate::role::Role;
 /// Largest number of holders of a ring at a time.
 pub const MAX_HOLDERS: usize = 256;
 
-/// Holder of a key.
+/// Holder of a key, as the ring lists it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Holder {

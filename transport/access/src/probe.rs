@@ -27,7 +27,7 @@ impl KeyFile {
     /// Tries the key: connects to the rig's addresses in turn, shows the key, and disconnects.
     ///
     /// # Errors
-    /// [`AccessError::Refused`] with the reason of the last address, when none admits the key.
+    /// [`AccessError::Refused`] with the reason at the last address, when none admits the key.
     pub fn knock(&self) -> Result<(), AccessError> {
         let mut why = "the key names no address".to_owned();
         for address in &self.connect {
@@ -149,7 +149,7 @@ impl KeyProbe {
     /// Starts the thread, which is idle while `is_connected`.
     ///
     /// # Errors
-    /// [`AccessError::System`] when there is no thread.
+    /// [`AccessError::System`] when no thread can be started.
     pub fn start(key: KeyFile, is_connected: impl Fn() -> bool + Send + 'static) -> Result<Self, AccessError> {
         let shared = Arc::<Shared>::default();
         let of_thread = Arc::clone(&shared);

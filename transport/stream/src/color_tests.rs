@@ -21,7 +21,7 @@ fn code(linear: f32) -> f64 {
     255.0 * if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 
-/// Root mean square error of the decoder's colours, sRGB codes.
+/// Returns the root mean square error of the decoder's colours, sRGB codes.
 fn rms(decoder: &mut ColorDecoder, encoded: &EncodedTemplate, truth: &[[f32; 4]]) -> f64 {
     let mut colors = Vec::new();
     decoder.colors(&mut colors);

@@ -13,7 +13,7 @@
 use alloc::{borrow::ToOwned as _, format, string::String, vec::Vec};
 use core::fmt;
 
-/// Most Gaussians in a state.
+/// Largest number of Gaussians in a state.
 pub const MAX_SPLATS: usize = 1 << 22;
 
 /// Version of the layout.
@@ -82,7 +82,7 @@ impl Reader<'_> {
 pub struct SplatState {
     /// Number of the person, 0 for the first; it stays the same while the person is tracked.
     pub person: u32,
-    /// The rig's frame number.
+    /// Frame number of the rig.
     pub frame: u64,
     /// Capture time of the frame set, `CLOCK_MONOTONIC` of the capturing host.
     pub capture_nanos: i64,

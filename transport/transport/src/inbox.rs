@@ -155,6 +155,7 @@ impl State {
 }
 
 /// Timing of a message that has arrived.
+#[derive(Clone, Copy)]
 struct Observed {
     now: Instant,
     /// Publisher's hand-in to arrival, by wall clocks.
@@ -306,7 +307,7 @@ impl Inbox {
     /// Counts publishers by their liveliness tokens.
     pub(crate) fn publisher_alive(&self, key: &str, alive: bool) {
         let version = keys::version_in(key).unwrap_or_default();
-        if version != format!("v{}", SCHEMA_VERSION) {
+        if version != format!("v{SCHEMA_VERSION}") {
             if alive {
                 self.refuse(TransportError::version(key, version));
             }

@@ -45,7 +45,7 @@ pub struct ViewpointCounts {
     pub active: usize,
     /// Viewpoints granted, renewals not counted.
     pub granted: u64,
-    /// Requests refused.
+    /// Number of requests refused.
     pub refused: u64,
     /// Viewpoints that ended: the lease ran out, the subscriber left, or they could not be drawn.
     pub expired: u64,
@@ -172,7 +172,7 @@ impl Publisher {
         self.splats.is_watched()
     }
 
-    /// Hands in an image.
+    /// Hands in an image of a view.
     ///
     /// # Errors
     /// `Config` for a bad name, size or more than 64 views.
@@ -260,7 +260,7 @@ impl Publisher {
     /// Sets the calibration; it is sent to the first subscriber, and once per second for later ones.
     ///
     /// # Errors
-    /// `Config` when the rig is not valid or a camera's name cannot stand in a key.
+    /// `Config` when the rig is not valid or a camera's name cannot be part of a key.
     pub fn set_calibration(&self, rig: &Rig) -> Result<(), TransportError> {
         let topic = |label: String, kind| Arc::new(Topic::new(label.clone(), label, kind));
         let transforms = topic("transforms".to_owned(), MessageKind::Transforms);

@@ -59,7 +59,7 @@ pub struct ViewRate {
 /// Tracking quality of the first person at the last frame.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrackingStats {
-    /// "searching", "first", "steady", "recovering" or "lost".
+    /// State: "searching", "first", "steady", "recovering" or "lost".
     pub state: String,
     /// Fraction of the person that agrees with the images, 0 to 1; `None` when nothing was compared.
     pub quality: Option<f64>,
@@ -110,7 +110,7 @@ pub struct RigStats {
     pub frames_per_second: f64,
     /// Stages in the order of the pipeline.
     pub stages: Vec<StageStats>,
-    /// Frames lost since the start, by place.
+    /// Number of frames lost since the start at each place of the pipeline.
     pub dropped: BTreeMap<String, u64>,
     /// Rates of the published views.
     pub views: Vec<ViewRate>,

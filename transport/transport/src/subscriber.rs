@@ -48,11 +48,11 @@ pub enum Views {
 pub struct Interests {
     /// Rendered views.
     pub views: Views,
-    /// The splat stream.
+    /// Whether to receive splat states.
     pub splats: bool,
-    /// The person stream: motion, and colours once a template has been fetched.
+    /// Whether to receive the person stream: motion, and colours once a template has been fetched.
     pub people: bool,
-    /// The rig's statistics.
+    /// Whether to receive the rig's statistics.
     pub stats: bool,
 }
 
@@ -249,7 +249,7 @@ impl Subscriber {
     /// images arrive through [`Self::next_view`] as the view [`Self::viewpoint_view`].
     ///
     /// # Errors
-    /// `Config` when the camera is not valid, larger than 4096 pixels a side, or `max_fps` is not in 0..=1000.
+    /// `Config` when the camera is not valid, larger than 4096 pixels per side, or `max_fps` is not in 0..=1000.
     pub fn request_viewpoint(&self, camera: &Camera, max_fps: f64) -> Result<(), TransportError> {
         check_camera("our viewpoint", camera, max_fps)?;
         self.renewal.want(Some((camera.clone(), max_fps)));

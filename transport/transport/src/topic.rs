@@ -78,7 +78,7 @@ struct State {
 /// Topic with its slot.
 #[derive(Debug)]
 pub(crate) struct Topic {
-    /// Last parts of the key, such as `view/front`.
+    /// Label of the key, such as `view/front`.
     pub label: String,
     /// Name of the view, otherwise the label.
     pub name: String,

@@ -22,7 +22,7 @@ impl EllipsoidBuffers {
     /// Uploads people, isotropic ones included; reuses the buffers of `before` where their size fits.
     ///
     /// # Errors
-    /// [`GpuError::TooLarge`].
+    /// [`GpuError::TooLarge`] for more Gaussians than a buffer holds.
     pub fn new(gpu: &GpuContext, people: &[ShownPerson<'_>], before: Option<Self>) -> Result<Self, GpuError> {
         let (mut center, mut normal, mut harmonics) = (Vec::new(), Vec::new(), Vec::new());
         let mut shapes = Ellipsoids::default();

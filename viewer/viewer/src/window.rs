@@ -97,10 +97,10 @@ pub enum ViewerError {
     NothingShown(f64, String),
 }
 
-/// Opens the window and shows the rig's people until it is closed. Returns the screenshot, where one is asked for.
+/// Opens the window and shows the rig's people until it is closed. Returns the screenshot where one is requested.
 ///
 /// # Errors
-/// [`ViewerError`].
+/// [`ViewerError`] without a session, device or window.
 pub fn open_window(options: ViewOptions, gpu: &GpuContext) -> Result<Option<Screenshot>, ViewerError> {
     // The receiver starts first: a bad endpoint is reported without a window.
     let repaint: Arc<OnceLock<egui::Context>> = Arc::default();

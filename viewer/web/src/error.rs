@@ -13,7 +13,7 @@ pub enum WebError {
     Certificate {
         /// Path of the file.
         file: PathBuf,
-        /// The fault and the fix.
+        /// Fault and fix.
         problem: String,
     },
     /// Address that cannot be listened on.

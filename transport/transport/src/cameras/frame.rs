@@ -42,7 +42,7 @@ const FORMATS: [(u8, PixelFormat); 12] = [
 pub struct FrameHeader {
     /// Header as in every message.
     pub header: Header,
-    /// Exposure time where the camera's source knows it, nanoseconds.
+    /// Exposure time, nanoseconds; `None` where the camera's source does not report it.
     pub exposure_nanos: Option<u64>,
     /// Number of earlier messages that were not sent: replaced, unwatched or failed.
     pub withheld: u64,
@@ -145,7 +145,7 @@ impl CameraStatus {
     /// Encodes the status as JSON.
     ///
     /// # Errors
-    /// `Config` when it is too long.
+    /// `Config` when the JSON is too long.
     pub fn encode(&self) -> Result<Vec<u8>, TransportError> {
         to_json("camera status", self)
     }

@@ -211,8 +211,7 @@ impl CameraInbox {
         self.enforce_quota();
     }
 
-    /// Drops the oldest frames of the camera with the most bytes waiting until the quota holds: a camera of huge images
-    /// loses its own.
+    /// Drops the oldest frames of the camera with the most waiting bytes until the quota holds: a camera of huge images loses its own.
     fn enforce_quota(&mut self) {
         while self.slots.iter().map(Slot::waiting_bytes).sum::<u64>() > self.quota {
             let Some(slot) = self.slots.iter_mut().max_by_key(|slot| slot.waiting_bytes()) else { return };

@@ -2,7 +2,7 @@
 //!
 //! zenoh 1.10.2 reads and writes a TLS connection from two threads at once, without a lock
 //! (<https://github.com/eclipse-zenoh/zenoh/issues/2557>): under load that ends the connection, or the process. With one thread for both,
-//! reads and writes take turns. zenoh takes the number from the environment alone, when its first session opens.
+//! reads and writes take turns. zenoh reads the number of threads only from the environment, when its first session opens.
 
 use std::env;
 

@@ -27,7 +27,7 @@ const ATTEMPTS: usize = 5;
 /// Session with its gate.
 pub(crate) struct Opened {
     pub session: Session,
-    /// Endpoints of programs of this computer, port 0 replaced by the real one.
+    /// Endpoints for programs of this computer, port 0 replaced by the actual one.
     pub endpoints: Vec<String>,
     /// Gate that admits holders of keys; lives as long as the session.
     pub gate: Option<Gate>,

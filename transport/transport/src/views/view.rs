@@ -11,7 +11,7 @@ use crate::{error::TransportError, header::Header};
 /// Largest compressed image, bytes.
 pub const MAX_IMAGE_BYTES: usize = 32 << 20;
 
-/// Largest message of a view: the image and the few fields around it, bytes.
+/// Largest message of a view, bytes: the image and the few fields around it.
 pub(crate) const MAX_MESSAGE_BYTES: usize = MAX_IMAGE_BYTES + (4 << 10);
 
 /// Compression of an image.
@@ -86,7 +86,7 @@ impl ViewFrame {
     /// Encodes the image as foxglove `CompressedImage`; size and frame number travel in the [`Header`].
     ///
     /// # Errors
-    /// `Malformed` when protobuf refuses it.
+    /// `Malformed` when it cannot be encoded as protobuf.
     pub fn encode(&self, view: &str) -> Result<Vec<u8>, TransportError> {
         let image = CompressedImage {
             timestamp: Some(timestamp(self.capture_nanos)),
@@ -100,7 +100,7 @@ impl ViewFrame {
     /// Decodes an image; size, frame and time come from the header of its message.
     ///
     /// # Errors
-    /// `Malformed`.
+    /// `Malformed` for another message, format, size or length.
     pub fn decode(view: &str, header: &Header, payload: Bytes) -> Result<Self, TransportError> {
         if payload.len() > MAX_MESSAGE_BYTES {
             return Err(TransportError::malformed(view, format!("{} bytes are too many for an image", payload.len())));

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{error::TransportError, json::from_json, keys, printable::clean};
 
-/// Largest side of an image that a subscriber may ask for, pixels.
+/// Largest side of an image that a subscriber may request, pixels.
 pub const MAX_VIEWPOINT_SIDE: u32 = 4096;
 
 /// Time for which a request that could not be drawn is refused.
